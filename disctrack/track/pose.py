@@ -98,16 +98,6 @@ def _fit(
     )
 
 
-def prepare() -> None:
-    """Compile the loop over poses, or load it."""
-    zeros = np.zeros
-    kernel.fit(
-        zeros(0, int), zeros((0, 2, 1, 2)), zeros((0, 2, 1, 2, 2)), zeros((0, 2, 1), bool), zeros((2, 9)),
-        zeros((2, 3, 3)), zeros((2, 3)), zeros((1, 3)), TOLERANCE, zeros((0, 3, 3)), zeros((0, 3)), zeros(0, bool),
-        zeros((0, 2, 1, 2)), zeros((0, 2, 1, 2)), zeros((0, 2, 1, 2, 6)),
-    )  # fmt: skip
-
-
 def whitening(covariance: Array) -> Array:
     """W (..., 2, 2) with W C W^T = 1 for covariances C (..., 2, 2); zeros where C is not a covariance."""
     a, b, c = covariance[..., 0, 0], covariance[..., 0, 1], covariance[..., 1, 1]

@@ -12,7 +12,8 @@ import numpy as np
 from calibration import Board, CalibrationSettings, CornerView, calibrate_from_corners
 from disctrack.disc import MA_2014
 from disctrack.frames import rotation_from_quaternion, vector_from_rotation
-from disctrack.track.dots.template import NoiseModel, TemplateLimits
+from disctrack.track.dots._kernels import DOT
+from disctrack.track.dots.template import NoiseModel
 from disctrack.track.follow.following import Follower, Law, Tables, TrackingSetup
 from disctrack.track.refine.assembly import Taken, TrackingSettings, assemble
 from disctrack.trajectory import FrameStatus, MarkerStatus
@@ -119,26 +120,28 @@ def poses_at(spline, times):
     return tuple(np.stack(part) for part in zip(*(laboratory.pose_at(spline, time) for time in times), strict=True))
 
 
+def tables_of(px, R, t, sigma):
+    """What following leaves of dots (n, 2, m, 2), of white noise sigma [px], and of poses."""
+    n, _, m, _ = px.shape
+    results = np.full((n, 2, m), np.nan, DOT)
+    results["u"], results["v"] = np.moveaxis(px, -1, 0)
+    results["var_u"] = results["var_v"] = sigma**2
+    results["cov_uv"], results["chi_square"], results["n_pixels"] = 0.0, 1.0, 300.0
+    measured = np.full((n, 2, m), MarkerStatus.MEASURED, np.uint8), np.full(n, FrameStatus.MEASURED, np.uint8)
+    return Tables(results, measured[0], R.copy(), t.copy(), measured[1], np.zeros((n, 2), np.uint64))
+
+
 def tracked(px, R, t, times, rig, frame_rate):
     """What tracking makes of located dots (n, 2, m, 2), followed near poses R, t."""
-    n, _, m, _ = px.shape
-    tables = Tables(
-        pixels=px.copy(),
-        covariance_px2=np.tile(DOT_PX**2 * np.eye(2), (n, 2, m, 1, 1)),
-        status=np.full((n, 2, m), MarkerStatus.MEASURED, np.uint8),
-        misfit=np.ones((n, 2, m), np.float32),
-        n_pixels=np.full((n, 2, m), 300.0, np.float32),
-        blur_px=np.full((n, 2, m), np.nan, np.float32),
-        contrast=np.full((n, 2, m), np.nan, np.float32),
-        R=R.copy(),
-        t=t.copy(),
-        frame_status=np.full(n, FrameStatus.MEASURED, np.uint8),
-        digest=np.zeros((n, 2), np.uint32),
-    )
     nothing = np.zeros((2, 1, 1))
-    setup = TrackingSetup(rig, MA_2014, TemplateLimits(), nothing, nothing)
+    setup = TrackingSetup(rig, MA_2014, nothing, nothing)
     follower = Follower(setup, Law((NoiseModel(0.64, 0.02),) * 2), measured=True)
-    return assemble([follower], tables, TrackingSettings(), Taken(range(n), times, frame_rate, laboratory.G))
+    return assemble(
+        [follower],
+        tables_of(px, R, t, DOT_PX),
+        TrackingSettings(),
+        Taken(range(len(px)), times, frame_rate, laboratory.G),
+    )
 
 
 def errors_and_variances(trajectory, R, t):

@@ -12,11 +12,13 @@ unequal shapes takes longer to compile than the loop); and only what Python call
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from calibration.kit.arrays import Array
 from calibration.kit.compiled import njit
+from disctrack.trajectory import MarkerStatus
 
 # No NaN is ever tested inside the sums, so the fast floating-point rules change the last digit only.
 _RULES: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": {"contract", "arcp", "nsz", "reassoc"}}
@@ -25,16 +27,66 @@ _entry = njit(cache=True, **_RULES)  # called from Python
 # and its caller's), and which of them runs would depend on whether the code was compiled now or loaded.
 _part = njit(**_RULES | {"no_cpython_wrapper": True, "no_cfunc_wrapper": True, "forceinline": True})
 
-# Status codes: the values of trajectory.MarkerStatus, which a test keeps equal.
-MEASURED, OUTSIDE, LOW_CONTRAST, OCCLUDED, NOT_CONVERGED, BLURRED = 0, 1, 2, 3, 4, 5
-NOT_LOOKED_FOR = 7
+MEASURED, OUTSIDE, LOW_CONTRAST, OCCLUDED, NOT_CONVERGED, BLURRED, _, NOT_LOOKED_FOR = map(int, MarkerStatus)
 
 # Template parameters, in the order of every array of eight below.
 A, B, RADIUS, SIGMA, LEVEL, SLOPE_X, SLOPE_Y, CONTRAST = range(8)
 
-# Columns of a dot's result: pixel centre, its covariance, and what is needed to judge the fit.
-U, V, VAR_U, VAR_V, COV_UV, CHI_SQUARE, FIT_SIGMA, FIT_RADIUS, FIT_LEVEL, FIT_CONTRAST, CLIPPED, N_PIXELS = range(12)
-N_RESULT = 12
+# Of a dot: pixel of its centre, covariance of that, and what is needed to judge the fit.
+_OF_DOT = ("u", "v", "var_u", "var_v", "cov_uv", "chi_square", "sigma", "radius", "level", "contrast")
+DOT = np.dtype([(name, float) for name in (*_OF_DOT, "clipped", "n_pixels")])
+
+
+class Views(NamedTuple):
+    """Where the cameras (c) stand and what they do to a point."""
+
+    map_x: Array  # (c, height, width) undistorted normalised coordinates of every pixel
+    map_y: Array
+    cameras: Array  # (c, 9) INTRINSIC_PARAMETERS
+    R_cw: Array  # (c, 3, 3)
+    t_cw: Array  # (c, 3)
+
+
+class Face(NamedTuple):
+    """The dots on the disc."""
+
+    centres: Array  # (m, 3) [m]
+    radius: float  # [m] of a dot
+    rim: float  # [m] of the edge whose blur must not reach the pixels used
+
+
+class Limits(NamedTuple):
+    """When a converged fit is refused."""
+
+    misfit: float = 6.0  # rms residual over the pixel noise; speckle of real print reaches 3
+    share: float = 0.02  # rms residual over the contrast: a misfit counts only if it exceeds this too
+    clipped: float = 0.15  # part of the pixels that do not fit: an object in front of the dot
+    radius: float = 0.20  # relative departure of the fitted radius
+    blur: float = 3.0  # fitted blur, in typical blurs (plus 1 px): an image smeared beyond use
+
+
+class Expected(NamedTuple):
+    """What dots should look like in the images of each camera."""
+
+    sigma: Array  # (c,) [px] of an edge
+    noise: Array  # (c, 3) variance = noise[0] + noise[1] grey, and the square of the grey values' step
+    limits: Limits
+
+
+class Ellipse(NamedTuple):
+    """What the blurred ellipse is made of."""
+
+    from_u: float  # [px] of the centre from that of the window
+    from_v: float
+    i00: float  # plane -> pixel
+    i01: float
+    i10: float
+    i11: float
+    axis_u: float  # unit vector of the long axis in the image
+    axis_v: float
+    long: float  # semi-axes over the radius
+    short: float
+
 
 # Rows of what is kept of every pixel: place on the plane from the expected centre [px], place in the image from the
 # expected centre [10 px], grey value, distance from the edge; derivatives by the eight parameters (from _JACOBIAN on)
@@ -63,10 +115,6 @@ _MIN_SEMI_MINOR, _MIN_SEMI_MINOR_PX = 4.5, 4.5
 _LEAST_SEMI_MINOR, _LEAST_SEMI_MINOR_PX = 1.0, 1.0  # below even that one fails: nothing but a blot is left
 _RADIUS_PRIOR = 0.1  # relative standard deviation: a blot's size, darkness and blur cannot be told apart
 _NODES = 64  # at most, over the length of an ellipse
-# What the blurred ellipse is made of: pixel of the centre from that of the window [px], plane -> pixel (2, 2), unit
-# vector of the long axis in the image, semi-axes over the radius.
-_EX, _EY, _I00, _I01, _I10, _I11, _AXIS_X, _AXIS_Y, _LONG, _SHORT = range(10)
-_ELLIPSE = 10
 # [rad] farther from the expected attitude a pair is looked at once more: 3e-3 move centres by 4e-4 to 1e-3 px, in every
 # frame alike where the prediction lags
 _ATTITUDE_TOLERANCE = 6e-4
@@ -78,10 +126,10 @@ _LEAST_BEND = _f(-0.3)
 _INV_SQRT_2PI = _f(1.0 / math.sqrt(2.0 * math.pi))
 # Abramowitz & Stegun 7.1.26: erfc(x) = (a1 t + ... + a5 t^5) exp(-x^2), t = 1 / (1 + p x), to 1.5e-7
 _T = _f(0.3275911 / math.sqrt(2.0))
-_A1, _A2, _A3, _A4, _A5 = (_f(0.5 * a) for a in (0.254829592, -0.284496736, 1.421413741, -1.453152027, 1.061405429))
+_ERFC = tuple(_f(0.5 * a) for a in (0.254829592, -0.284496736, 1.421413741, -1.453152027, 1.061405429))
 # exp(-z^2 / 2) = e^16, e = exp(-z^2 / 32) a polynomial: 6e-8 for |z| < 6
 _Z2_MAX, _PER_Z2 = _f(36.0), _f(1.0 / 32.0)
-_E0, _E1, _E2, _E3, _E4, _E5, _E6 = (
+_EXP = tuple(
     _f(c)
     for c in np.polynomial.Chebyshev.interpolate(lambda t: np.exp(-t), 6, domain=[0.0, 36.0 / 32.0])
     .convert(kind=np.polynomial.Polynomial)
@@ -90,19 +138,8 @@ _E0, _E1, _E2, _E3, _E4, _E5, _E6 = (
 
 
 @_part
-def _project_point(camera, X, Y, Z):
-    """Pixel (u, v) of one point in camera axes; camera = the nine INTRINSIC_PARAMETERS. Twin of camera.project."""
-    a, b = X / Z, Y / Z
-    r2 = a * a + b * b
-    radial = 1.0 + r2 * (camera[4] + r2 * (camera[5] + r2 * camera[8]))
-    xd = a * radial + 2 * camera[6] * a * b + camera[7] * (r2 + 2 * a * a)
-    yd = b * radial + camera[6] * (r2 + 2 * b * b) + 2 * camera[7] * a * b
-    return camera[0] * xd + camera[2], camera[1] * yd + camera[3]
-
-
-@_part
-def _project_point_jacobian(camera, X, Y, Z, J):
-    """Pixel of one point in camera axes and J (2, 3) = d pixel / d point."""
+def _project_point(camera, X, Y, Z, J):
+    """Pixel of one point in camera axes and J (2, 3) = d pixel / d point; camera = the nine INTRINSIC_PARAMETERS."""
     iz = 1.0 / Z
     a, b = X * iz, Y * iz
     r2 = a * a + b * b
@@ -204,13 +241,13 @@ def _edge_profile(z):
     """Fraction of the dot seen z sigmas outside its edge, and the bell that is minus its slope; both to 5e-7."""
     z2 = min(z * z, _Z2_MAX)
     e = z2 * _PER_Z2
-    e = _E0 + e * (_E1 + e * (_E2 + e * (_E3 + e * (_E4 + e * (_E5 + e * _E6)))))
+    e = _EXP[0] + e * (_EXP[1] + e * (_EXP[2] + e * (_EXP[3] + e * (_EXP[4] + e * (_EXP[5] + e * _EXP[6])))))
     e *= e
     e *= e
     e *= e
     e *= e
     t = _1 / (_1 + _T * abs(z))
-    tail = t * (_A1 + t * (_A2 + t * (_A3 + t * (_A4 + t * _A5)))) * e
+    tail = t * (_ERFC[0] + t * (_ERFC[1] + t * (_ERFC[2] + t * (_ERFC[3] + t * _ERFC[4])))) * e
     return tail if z > _0 else _1 - tail, _INV_SQRT_2PI * e
 
 
@@ -370,8 +407,8 @@ def _whitened_model(pixels, n, p, G, det, clip):
 
 
 @_part
-def _ellipse_of(map_x, map_y, P, G, det, start, radius, reach, u0, v0, unit, ellipse):
-    """Fill `ellipse` (_ELLIPSE,): the image of a dot as an ellipse about its own centroid, to second order of the map.
+def _ellipse_of(map_x, map_y, P, G, det, start, radius, reach, u0, v0, unit):
+    """The image of a dot as an ellipse about its own centroid, to second order of the map.
 
     reach: pixels over which the map's second derivatives are taken.
     """
@@ -382,9 +419,6 @@ def _ellipse_of(map_x, map_y, P, G, det, start, radius, reach, u0, v0, unit, ell
     spread = math.hypot(half_difference, c01)
     angle = 0.5 * math.atan2(c01, half_difference)
     longer = math.sqrt(half_sum + spread)
-    ellipse[_I00], ellipse[_I01], ellipse[_I10], ellipse[_I11] = i00, i01, i10, i11
-    ellipse[_AXIS_X], ellipse[_AXIS_Y] = math.cos(angle), math.sin(angle)
-    ellipse[_LONG], ellipse[_SHORT] = longer, 1.0 / (abs(det) * longer)
     # second derivatives of pixel -> plane, in the pixel's own frame: q = - G^-1 d2 plane
     uu_x, uu_y, vv_x, vv_y, uv_x, uv_y = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for du in range(-1, 2):
@@ -405,7 +439,8 @@ def _ellipse_of(map_x, map_y, P, G, det, start, radius, reach, u0, v0, unit, ell
     div_u, div_v = s_uu + t_uv, s_uv + t_vv
     shift_u = quarter * (0.5 * (s_uu * c00 + s_vv * c11) + s_uv * c01 + c00 * div_u + c01 * div_v)
     shift_v = quarter * (0.5 * (t_uu * c00 + t_vv * c11) + t_uv * c01 + c01 * div_u + c11 * div_v)
-    ellipse[_EX], ellipse[_EY] = start[3] - u0 + shift_u, start[4] - v0 + shift_v
+    return Ellipse(start[3] - u0 + shift_u, start[4] - v0 + shift_v, i00, i01, i10, i11, math.cos(angle),
+                   math.sin(angle), longer, 1.0 / (abs(det) * longer))  # fmt: skip
 
 
 @_part
@@ -415,7 +450,7 @@ def _whitened_ellipse(pixels, n, p, ellipse, nodes, clip):
     Along the long axis x = a sin t, where the trapezoidal rule converges exponentially; across it the error function.
     """
     in_sigma = 1.0 / p[SIGMA]
-    a, b = p[RADIUS] * ellipse[_LONG] * in_sigma, p[RADIUS] * ellipse[_SHORT] * in_sigma
+    a, b = p[RADIUS] * ellipse.long * in_sigma, p[RADIUS] * ellipse.short * in_sigma
     n_nodes = min(int(3.2 * a) + 8, _NODES)
     every = math.pi / n_nodes
     for k in range(n_nodes):
@@ -423,13 +458,13 @@ def _whitened_ellipse(pixels, n, p, ellipse, nodes, clip):
         nodes[0, k], nodes[1, k], nodes[2, k] = a * math.sin(t), b * math.cos(t), a * every * math.cos(t)
     round_edge = _f(a * b * every)
     A_px, B_px = p[A], p[B]
-    from_x = _f(ellipse[_EX] + ellipse[_I00] * A_px + ellipse[_I01] * B_px)
-    from_y = _f(ellipse[_EY] + ellipse[_I10] * A_px + ellipse[_I11] * B_px)
-    along_x, along_y = _f(ellipse[_AXIS_X] * in_sigma), _f(ellipse[_AXIS_Y] * in_sigma)
-    A_along = _f(in_sigma * (ellipse[_AXIS_X] * ellipse[_I00] + ellipse[_AXIS_Y] * ellipse[_I10]))
-    A_across = _f(in_sigma * (ellipse[_AXIS_X] * ellipse[_I10] - ellipse[_AXIS_Y] * ellipse[_I00]))
-    B_along = _f(in_sigma * (ellipse[_AXIS_X] * ellipse[_I01] + ellipse[_AXIS_Y] * ellipse[_I11]))
-    B_across = _f(in_sigma * (ellipse[_AXIS_X] * ellipse[_I11] - ellipse[_AXIS_Y] * ellipse[_I01]))
+    from_x = _f(ellipse.from_u + ellipse.i00 * A_px + ellipse.i01 * B_px)
+    from_y = _f(ellipse.from_v + ellipse.i10 * A_px + ellipse.i11 * B_px)
+    along_x, along_y = _f(ellipse.axis_u * in_sigma), _f(ellipse.axis_v * in_sigma)
+    A_along = _f(in_sigma * (ellipse.axis_u * ellipse.i00 + ellipse.axis_v * ellipse.i10))
+    A_across = _f(in_sigma * (ellipse.axis_u * ellipse.i10 - ellipse.axis_v * ellipse.i00))
+    B_along = _f(in_sigma * (ellipse.axis_u * ellipse.i01 + ellipse.axis_v * ellipse.i11))
+    B_across = _f(in_sigma * (ellipse.axis_u * ellipse.i11 - ellipse.axis_v * ellipse.i01))
     inv_radius, inv_sigma, ten = _f(1.0 / p[RADIUS]), _f(in_sigma), _f(10.0)
     contrast, level, slope_x, slope_y = _f(p[CONTRAST]), _f(p[LEVEL]), _f(p[SLOPE_X]), _f(p[SLOPE_Y])
     limit = _f(clip)
@@ -557,12 +592,12 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, neighbours, pixel
     plane; start (5,): expected centre and radius on the plane, pixel of that centre; sigma: blur to start from [px];
     noise (3,): variance = noise[0] + noise[1] grey, and the square of the grey values' step; rim: radius of an edge
     about the plane's origin whose blur must not reach the pixels used, nor that of `neighbours` (k, 2), the other dots'
-    centres; pixels and work: `scratch()`.
-    p (8,) receives the template's parameters (A, B: shift on the plane from the expected centre), result (12,) the
+    centres; pixels (_PIXEL_ROWS, any) and work (_WORK_ROWS, 8) are scratch.
+    p (8,) receives the template's parameters (A, B: shift on the plane from the expected centre), result (a DOT) the
     judgement of the fit and the centre's covariance in pixels. The caller projects the centre itself (U, V).
     """
     height, width = image.shape
-    G, ellipse = np.empty((3, 2)), np.empty(_ELLIPSE)
+    G = np.empty((3, 2))
     nodes = np.empty((3, _NODES), np.float32)
     u0, v0, radius, unit = start[3], start[4], start[2], 0.0
     for i in range(8):
@@ -605,9 +640,8 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, neighbours, pixel
         n, inside, outside = _select_pixels(
             image, map_x, map_y, P, start, window, rim, neighbours, G, unit, largest, p, u0, v0, pixels
         )
-        if blurred:
-            reach = max(1, int(0.5 * min(extent_x, extent_y)))
-            _ellipse_of(map_x, map_y, P, G, det, start, radius, reach, u0, v0, unit, ellipse)
+        reach = max(1, int(0.5 * min(extent_x, extent_y)))
+        ellipse = _ellipse_of(map_x, map_y, P, G, det, start, radius, reach, u0, v0, unit)
         if not (n >= 30 and math.isfinite(inside) and math.isfinite(outside)):
             return OCCLUDED
         if selection == 0:
@@ -662,48 +696,48 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, neighbours, pixel
     _substitute(M, x)
     _substitute(M, y)
     a, b, c, d = G[1, 1] / det, -G[0, 1] / det, -G[1, 0] / det, G[0, 0] / det
-    result[VAR_U] = a * a * x[A] + 2 * a * b * x[B] + b * b * y[B]
-    result[VAR_V] = c * c * x[A] + 2 * c * d * x[B] + d * d * y[B]
-    result[COV_UV] = a * c * x[A] + (a * d + b * c) * x[B] + b * d * y[B]
+    result.var_u = a * a * x[A] + 2 * a * b * x[B] + b * b * y[B]
+    result.var_v = c * c * x[A] + 2 * c * d * x[B] + d * d * y[B]
+    result.cov_uv = a * c * x[A] + (a * d + b * c) * x[B] + b * d * y[B]
     p[A], p[B], p[RADIUS] = unit * p[A], unit * p[B], unit * p[RADIUS]
-    result[CHI_SQUARE] = chi2 / max(n - n_clipped - 8, 1)
-    result[FIT_SIGMA], result[FIT_RADIUS] = p[SIGMA], p[RADIUS]
-    result[FIT_LEVEL], result[FIT_CONTRAST] = light * p[LEVEL], p[CONTRAST]
-    result[CLIPPED], result[N_PIXELS] = n_clipped / n, n
+    result.chi_square = chi2 / max(n - n_clipped - 8, 1)
+    result.sigma, result.radius = p[SIGMA], p[RADIUS]
+    result.level, result.contrast = light * p[LEVEL], p[CONTRAST]
+    result.clipped, result.n_pixels = n_clipped / n, n
     return MEASURED
 
 
 @_part
 def _judge_dot(result, radius, typical_sigma, noise, limits):
-    """Refuse a converged fit that does not look like the dot: limits = misfit, share, clipped, radius, blur.
+    """Refuse a converged fit that does not look like the dot.
 
     A misfit counts when it is large beside the noise and beside the contrast: the template's own small errors must not
     condemn the dots of a sensor that hardly has any noise.
     """
-    misfit = math.sqrt(max(result[CHI_SQUARE], 0.0))
-    step = abs(result[FIT_CONTRAST] * result[FIT_LEVEL])
-    middle = result[FIT_LEVEL] * (1.0 - 0.5 * result[FIT_CONTRAST])
+    misfit = math.sqrt(max(result.chi_square, 0.0))
+    step = abs(result.contrast * result.level)
+    middle = result.level * (1.0 - 0.5 * result.contrast)
     share = misfit * math.sqrt(max(noise[0] + noise[1] * middle, 0.0)) / max(step, 1e-12)
-    if (misfit > limits[0] and share > limits[1]) or result[CLIPPED] > limits[2]:
+    if (misfit > limits.misfit and share > limits.share) or result.clipped > limits.clipped:
         return OCCLUDED
-    if abs(result[FIT_RADIUS] / radius - 1.0) > limits[3]:
+    if abs(result.radius / radius - 1.0) > limits.radius:
         return OCCLUDED
-    if result[FIT_SIGMA] > limits[4] * typical_sigma + 1.0:
+    if result.sigma > limits.blur * typical_sigma + 1.0:
         return BLURRED
     return MEASURED
 
 
 @_part
-def _look(images, readable, map_x, map_y, cameras, R_cw, t_cw, centres, radius, rim, sigma, noise, limits, R, t,
-          pixels, work, results, status):  # fmt: skip
+def _look(images, readable, views, face, expected, R, t, pixels, work, results, status):
     """Locate and judge the dots in the images (cameras, H, W) of one instant, the disc being near the pose R, t.
 
-    centres (m, 3) on the body; results (cameras, m, 12) and status (cameras, m) are filled; U, V are the image of the
-    dot's own centre, not the centre of its elliptical image.
+    Filled: results (cameras, m) of DOT, status (cameras, m); u, v are the image of the dot's own centre, not the centre
+    of its elliptical image.
     """
+    centres, radius, R_cw, t_cw = face.centres, face.radius, views.R_cw, views.t_cw
     m = centres.shape[0]
     R_cb, P, M = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    point, start, p = np.empty(3), np.empty(5), np.empty(8)
+    point, start, p, J = np.empty(3), np.empty(5), np.empty(8), np.empty((2, 3))
     neighbours = np.empty((max(m - 1, 0), 2))
     for c in range(images.shape[0]):
         for i in range(3):
@@ -711,8 +745,6 @@ def _look(images, readable, map_x, map_y, cameras, R_cw, t_cw, centres, radius, 
                 R_cb[i, j] = R_cw[c, i, 0] * R[0, j] + R_cw[c, i, 1] * R[1, j] + R_cw[c, i, 2] * R[2, j]
         for i in range(m):
             result = results[c, i]
-            for k in range(N_RESULT):
-                result[k] = np.nan
             if not readable[c]:
                 status[c, i] = NOT_LOOKED_FOR
                 continue
@@ -738,17 +770,17 @@ def _look(images, readable, map_x, map_y, cameras, R_cw, t_cw, centres, radius, 
                 for j in range(3):
                     P[k, j] /= det
             start[0], start[1], start[2] = x, y, radius
-            start[3], start[4] = _project_point(cameras[c], point[0], point[1], point[2])
+            start[3], start[4] = _project_point(views.cameras[c], point[0], point[1], point[2], J)
             for k in range(m - 1):
                 other = k + 1 if k >= i else k
                 neighbours[k, 0], neighbours[k, 1] = centres[other, 0], centres[other, 1]
-            status[c, i] = _fit_dot(images[c], map_x[c], map_y[c], P, start, sigma[c], noise[c], rim, neighbours,
-                                    pixels, work, p, result)  # fmt: skip
+            status[c, i] = _fit_dot(images[c], views.map_x[c], views.map_y[c], P, start, expected.sigma[c],
+                                    expected.noise[c], face.rim, neighbours, pixels, work, p, result)  # fmt: skip
             if status[c, i] == MEASURED:
                 for k in range(3):
                     point[k] += R_cb[k, 0] * p[A] + R_cb[k, 1] * p[B]
-                result[U], result[V] = _project_point(cameras[c], point[0], point[1], point[2])
-                status[c, i] = _judge_dot(result, radius, sigma[c], noise[c], limits)
+                result.u, result.v = _project_point(views.cameras[c], point[0], point[1], point[2], J)
+                status[c, i] = _judge_dot(result, radius, expected.sigma[c], expected.noise[c], expected.limits)
 
 
 @_part
@@ -797,7 +829,7 @@ def _dot_by_pose(camera, R_cw, t_cw, centre, R, t, J, rows):
     p0 = t_cw[0] + R_cw[0, 0] * x + R_cw[0, 1] * y + R_cw[0, 2] * z
     p1 = t_cw[1] + R_cw[1, 0] * x + R_cw[1, 1] * y + R_cw[1, 2] * z
     depth = t_cw[2] + R_cw[2, 0] * x + R_cw[2, 1] * y + R_cw[2, 2] * z
-    u, v = _project_point_jacobian(camera, p0, p1, depth if depth > 0.0 else np.nan, J)
+    u, v = _project_point(camera, p0, p1, depth if depth > 0.0 else np.nan, J)
     for axis in range(2):
         row = rows[axis]
         for i in range(3):
@@ -809,7 +841,7 @@ def _dot_by_pose(camera, R_cw, t_cw, centre, R, t, J, rows):
 
 
 @_part
-def _pose_step(results, status, cameras, R_cw, t_cw, centres, R, t, step):
+def _pose_step(results, status, views, centres, R, t, step):
     """One Gauss-Newton step (translation, world rotation vector) of the disc's pose from the dots of one pair.
 
     Huber weights keep one wrong dot from pulling the prediction away. Returns the rms residual before the step [px],
@@ -824,15 +856,15 @@ def _pose_step(results, status, cameras, R_cw, t_cw, centres, R, t, step):
         for m in range(centres.shape[0]):
             if status[c, m] != MEASURED:
                 continue
-            u, v, depth = _dot_by_pose(cameras[c], R_cw[c], t_cw[c], centres[m], R, t, J, rows)
+            u, v, depth = _dot_by_pose(views.cameras[c], views.R_cw[c], views.t_cw[c], centres[m], R, t, J, rows)
             if depth <= 0.0:
                 return -1.0
-            du, dv = results[c, m, U] - u, results[c, m, V] - v
+            du, dv = results[c, m].u - u, results[c, m].v - v
             distance = math.hypot(du, dv)
             total += distance * distance
             count += 1
             # 0.05 px is added: a prediction need not follow the noise of the best dots
-            w = 1.0 / (results[c, m, VAR_U] + results[c, m, VAR_V] + 0.0025)
+            w = 1.0 / (results[c, m].var_u + results[c, m].var_v + 0.0025)
             if distance > 1.0:
                 w /= distance
             for axis in range(2):
@@ -853,25 +885,24 @@ def _predict(last, before, older, t_last, t_before, t_older, R, t):
     A disc that rolls is as far beside it as its third differences, not its second: what a prediction is off by follows
     the acceleration, and so does what it leaves of itself in the centres (band and shape of the template), 1e-4 px.
     """
-    D = np.empty((3, 3))
     for i in range(3):
         t[i] = 3.0 * (t_last[i] - t_before[i]) + t_older[i]
-        for j in range(3):  # D1
-            D[i, j] = last[i, 0] * before[j, 0] + last[i, 1] * before[j, 1] + last[i, 2] * before[j, 2]
-    for j in range(3):  # one column after the other: D1 D0^T D1 R_last, D0^T = R_older R_before^T
+    _copy(R, last)
+    _turn_on(last, before, R)
+    _turn_on(older, before, R)
+    _turn_on(last, before, R)
+
+
+@_part
+def _turn_on(to, since, R):
+    """Turn R as `since` was turned into `to`: R = to since^T R."""
+    for j in range(3):
+        x, y, z = R[0, j], R[1, j], R[2, j]
+        a = since[0, 0] * x + since[1, 0] * y + since[2, 0] * z
+        b = since[0, 1] * x + since[1, 1] * y + since[2, 1] * z
+        c = since[0, 2] * x + since[1, 2] * y + since[2, 2] * z
         for k in range(3):
-            R[k, j] = last[k, j]
-        for step in range(3):
-            x, y, z = R[0, j], R[1, j], R[2, j]
-            if step == 1:
-                a = before[0, 0] * x + before[1, 0] * y + before[2, 0] * z
-                b = before[0, 1] * x + before[1, 1] * y + before[2, 1] * z
-                c = before[0, 2] * x + before[1, 2] * y + before[2, 2] * z
-                for k in range(3):
-                    R[k, j] = older[k, 0] * a + older[k, 1] * b + older[k, 2] * c
-            else:
-                for k in range(3):
-                    R[k, j] = D[k, 0] * x + D[k, 1] * y + D[k, 2] * z
+            R[k, j] = to[k, 0] * a + to[k, 1] * b + to[k, 2] * c
 
 
 @_part
@@ -883,12 +914,12 @@ def _copy(out, values):
 
 
 @_part
-def _settle(results, status, cameras, R_cw, t_cw, centres, R, t):
+def _settle(results, status, views, centres, R, t):
     """Move the pose R, t onto the dots of one pair; returns the rms residual [px], negative without an answer."""
     step, R_new = np.empty(6), np.empty((3, 3))
     rms = -1.0
     for _ in range(5):
-        rms = _pose_step(results, status, cameras, R_cw, t_cw, centres, R, t, step)
+        rms = _pose_step(results, status, views, centres, R, t, step)
         if rms < 0.0:
             return rms
         for i in range(3):
@@ -902,16 +933,14 @@ def _settle(results, status, cameras, R_cw, t_cw, centres, R, t):
 
 
 @_entry
-def track_frames(images, readable, map_x, map_y, cameras, R_cw, t_cw, centres, radius, rim, sigma, noise, limits,
-                 R_last, t_last, R_before, t_before, R_older, t_older, results, status, R_out, t_out,
-                 max_rms):  # fmt: skip
+def track_frames(images, readable, views, face, expected, heading, results, status, R_out, t_out, max_rms):
     """Follow the disc through a block of pairs, each predicted from the three before (`_predict`).
 
-    images (n, 2, H, W); readable (n, 2); map_x, map_y (2, H, W); cameras (2, 9); sigma (2,), noise (2, 3), limits (5,)
-    for `judge_dot`. R_last ... t_older hold the last three poses and are updated. Filled: results (n, 2, m, 12), status
-    (n, 2, m), R_out (n, 3, 3), t_out (n, 3). Returns the number of frames followed; less than n where the disc was
-    lost at that frame.
+    images (n, 2, H, W); readable (n, 2); heading: the last three poses ((R, t), ...), which are updated. Filled:
+    results (n, 2, m) of DOT, status (n, 2, m), R_out (n, 3, 3), t_out (n, 3). Returns the number of frames followed;
+    less than n where the disc was lost at that frame.
     """
+    (R_last, t_last), (R_before, t_before), (R_older, t_older) = heading
     pixels, work = np.empty((_PIXEL_ROWS, _PIXELS), np.float32), np.empty((_WORK_ROWS, 8))
     R, t, R_expected = np.empty((3, 3)), np.empty(3), np.empty((3, 3))
     for f in range(images.shape[0]):
@@ -919,9 +948,8 @@ def track_frames(images, readable, map_x, map_y, cameras, R_cw, t_cw, centres, r
         rms = -1.0
         for _ in range(3):
             _copy(R_expected, R)
-            _look(images[f], readable[f], map_x, map_y, cameras, R_cw, t_cw, centres, radius, rim, sigma, noise, limits,
-                  R, t, pixels, work, results[f], status[f])  # fmt: skip
-            rms = _settle(results[f], status[f], cameras, R_cw, t_cw, centres, R, t)
+            _look(images[f], readable[f], views, face, expected, R, t, pixels, work, results[f], status[f])
+            rms = _settle(results[f], status[f], views, face.centres, R, t)
             turned = 0.0
             for i in range(3):
                 for j in range(3):
@@ -939,14 +967,8 @@ def track_frames(images, readable, map_x, map_y, cameras, R_cw, t_cw, centres, r
     return images.shape[0]
 
 
-# The same where Python calls them: compiled on their own, the first time that they are called.
-project_point = _entry(_project_point.py_func)
-project_point_jacobian = _entry(_project_point_jacobian.py_func)
-fit_dot = _entry(_fit_dot.py_func)
-judge_dot = _entry(_judge_dot.py_func)
-look = _entry(_look.py_func)
-
-
-def scratch() -> tuple[np.ndarray, np.ndarray]:
-    """Working memory of one thread: rows of pixels, and of the normal equations."""
-    return np.empty((_PIXEL_ROWS, _PIXELS), np.float32), np.empty((_WORK_ROWS, 8))
+@_entry
+def look(images, readable, views, face, expected, R, t, results, status):
+    """`_look` where Python calls it."""
+    pixels, work = np.empty((_PIXEL_ROWS, _PIXELS), np.float32), np.empty((_WORK_ROWS, 8))
+    _look(images, readable, views, face, expected, R, t, pixels, work, results, status)

@@ -21,7 +21,7 @@ from numpy.typing import DTypeLike, NDArray
 from calibration.cameras.camera import Camera, normalised_maps, project
 from calibration.kit.arrays import Array, Image
 from calibration.kit.grey_levels import full_scale, level_step
-from disctrack.disc import Disc
+from disctrack.disc import MA_2014, Disc
 from disctrack.track.dots import _kernels as kernels
 from disctrack.trajectory import MarkerStatus
 
@@ -54,42 +54,30 @@ def typical_noise(image: Image) -> NoiseModel:
 
 
 @dataclass(frozen=True)
-class TemplateLimits:
-    """When a converged fit is refused."""
-
-    misfit: float = 6.0  # rms residual over the pixel noise; speckle of real print reaches 3
-    share: float = 0.02  # rms residual over the contrast: a misfit counts only if it exceeds this too
-    clipped: float = 0.15  # part of the pixels that do not fit: an object in front of the dot
-    radius: float = 0.20  # relative departure of the fitted radius
-    blur: float = 3.0  # fitted blur, in typical blurs (plus 1 px): an image smeared beyond use
-
-    def array(self) -> Array:
-        """(5,) for the compiled kernels."""
-        return np.array([self.misfit, self.share, self.clipped, self.radius, self.blur])
-
-
-@dataclass(frozen=True)
 class DotCentres:
-    """Centres of m dots in one image."""
+    """Centres of dots (..., m) and what was found with them; NaN unless MEASURED."""
 
-    pixels: Array  # (m, 2); NaN unless MEASURED
-    covariance_px2: Array  # (m, 2, 2) from the image's noise, enlarged where the model misfits
-    status: NDArray[np.uint8]  # (m,) MarkerStatus
-    misfit: Array  # (m,) reduced chi-square of the grey values
-    blur_px: Array  # (m,) sigma of the edge
-    radius: Array  # (m,) fitted radius, plane units
-    level: Array  # (m,) grey value beside the dot
-    contrast: Array  # (m,) 1 - dark / light
+    pixels: Array  # (..., m, 2)
+    covariance_px2: Array  # (..., m, 2, 2) from the image's noise, enlarged where the model misfits
+    status: NDArray[np.uint8]  # (..., m) MarkerStatus
+    misfit: Array  # (..., m) reduced chi-square of the grey values
+    n_pixels: Array  # (..., m) grey values that it was taken over
+    blur_px: Array  # (..., m) sigma of the edge, smear of its motion included
+    radius: Array  # (..., m) fitted radius, plane units
+    level: Array  # (..., m) grey value beside the dot
+    contrast: Array  # (..., m) 1 - dark / light
 
 
-def face_edge(disc: Disc) -> float:
-    """Radius [m] within which the face is taken to be one even background for its dots.
+def face_of(disc: Disc) -> kernels.Face:
+    """The dots on the disc, and the radius [m] within which the face is one even background for them.
 
     Paper ends, and edges are bevelled, a few per cent inside the disc's radius; a dot printed farther out than that
     moves the limit with it.
     """
-    outermost = float(np.hypot(*disc.marker_centres_body[:, :2].T).max()) + 0.5 * disc.marker_diameter
-    return max(0.95 * disc.radius, min(outermost + 0.15 * disc.marker_diameter, disc.radius))
+    centres = np.ascontiguousarray(disc.marker_centres_body)
+    outermost = float(np.hypot(*centres[:, :2].T).max()) + 0.5 * disc.marker_diameter
+    rim = max(0.95 * disc.radius, min(outermost + 0.15 * disc.marker_diameter, disc.radius))
+    return kernels.Face(centres, 0.5 * disc.marker_diameter, rim)
 
 
 def locate_on_disc(
@@ -102,33 +90,22 @@ def locate_on_disc(
     maps: tuple[Array, Array] | None = None,
     noise: NoiseModel | None = None,
     blur_px: float = TYPICAL_BLUR_PX,
-    limits: TemplateLimits | None = None,
 ) -> DotCentres:
     """Locate the disc's dots in one image, the pose being known to a few pixels.
 
     image (height, width) uint8 or uint16; R_camera_body (3, 3), t_camera_body (3,) [m].
     """
     map_x, map_y = maps if maps is not None else normalised_maps(camera)
-    results = np.full((1, disc.n_markers, kernels.N_RESULT), np.nan)
-    status = np.zeros((1, disc.n_markers), np.uint8)
-    noise = noise or typical_noise(image)
+    parameters = (noise or typical_noise(image)).parameters
+    results, status = np.full((1, disc.n_markers), np.nan, kernels.DOT), np.zeros((1, disc.n_markers), np.uint8)
     kernels.look(
         np.ascontiguousarray(image)[None],
         np.ones(1, bool),
-        map_x[None],
-        map_y[None],
-        camera.parameters[None],
-        np.eye(3)[None],
-        np.zeros((1, 3)),
-        np.ascontiguousarray(disc.marker_centres_body),
-        0.5 * disc.marker_diameter,
-        face_edge(disc),
-        np.array([blur_px]),
-        noise.parameters[None],
-        (limits or TemplateLimits()).array(),
-        np.ascontiguousarray(R_camera_body),
-        np.ascontiguousarray(t_camera_body),
-        *kernels.scratch(),
+        kernels.Views(map_x[None], map_y[None], camera.parameters[None], np.eye(3)[None], np.zeros((1, 3))),
+        face_of(disc),
+        kernels.Expected(np.array([blur_px]), parameters[None], kernels.Limits()),
+        np.ascontiguousarray(R_camera_body, float),
+        np.ascontiguousarray(t_camera_body, float),
         results,
         status,
     )
@@ -137,76 +114,23 @@ def locate_on_disc(
 
 def prepare(dtype: DTypeLike = np.uint8) -> None:
     """Compile the inner loop of `locate_on_disc` for images of this type, or load it."""
-    zeros = np.zeros
-    kernels.look(
-        zeros((1, 8, 8), dtype), zeros(1, bool), zeros((1, 8, 8)), zeros((1, 8, 8)), zeros((1, 9)), zeros((1, 3, 3)),
-        zeros((1, 3)), zeros((0, 3)), 1.0, 1.0, zeros(1), zeros((1, 3)), zeros(5), zeros((3, 3)), zeros(3),
-        *kernels.scratch(), zeros((1, 0, kernels.N_RESULT)), zeros((1, 0), np.uint8),
-    )  # fmt: skip
+    camera = Camera(1.0, 1.0, 0.0, 0.0, (0.0,) * 5, (8, 8))
+    locate_on_disc(np.zeros((8, 8), dtype), camera, np.eye(3), np.zeros(3), MA_2014)
 
 
-def locate_on_plane(
-    image: Image,
-    image_from_plane: Array,
-    centres: Array,
-    radius: float,
-    *,
-    noise: NoiseModel | None = None,
-    blur_px: float = TYPICAL_BLUR_PX,
-    limits: TemplateLimits | None = None,
-) -> DotCentres:
-    """Locate round dots of a flat target whose homography is roughly known, without a calibrated camera.
-
-    image (height, width); image_from_plane (3, 3) or one per dot (m, 3, 3): homography plane -> pixel, right near each
-    dot; centres (m, 2) and radius in plane units. Lens distortion within one dot is neglected.
-    """
-    centres = np.atleast_2d(np.asarray(centres, float))
-    H = np.broadcast_to(np.asarray(image_from_plane, float), (len(centres), 3, 3))
-    height, width = image.shape
-    map_x, map_y = np.meshgrid(np.arange(width, dtype=float), np.arange(height, dtype=float))
-    noise = noise or typical_noise(image)
-    limits = limits or TemplateLimits()
-    results = np.full((len(centres), kernels.N_RESULT), np.nan)
-    status = np.zeros(len(centres), np.uint8)
-    scratch = kernels.scratch()
-    contiguous = np.ascontiguousarray(image)
-    for i, (x, y) in enumerate(centres):  # the body is one compiled call
-        p = np.empty(8)
-        u = H[i] @ (x, y, 1.0)
-        start = np.array([x, y, radius, u[0] / u[2], u[1] / u[2]])
-        others = np.delete(centres, i, axis=0)
-        near = others[np.linalg.norm(others - centres[i], axis=1) < 6 * radius]
-        status[i] = kernels.fit_dot(
-            contiguous, map_x, map_y, np.linalg.inv(H[i]), start, blur_px, noise.parameters, np.inf, near, *scratch, p,
-            results[i],
-        )  # fmt: skip
-        if status[i] == MarkerStatus.MEASURED:
-            status[i] = kernels.judge_dot(results[i], radius, blur_px, noise.parameters, limits.array())
-            u = H[i] @ (x + p[0], y + p[1], 1.0)
-            results[i, kernels.U], results[i, kernels.V] = u[:2] / u[2]
-    return dot_centres(results, status)
-
-
-def dot_centres(results: Array, status: NDArray[np.uint8]) -> DotCentres:
-    """Arrays with names from the kernels' table of results (..., m, 12) and status (..., m)."""
+def dot_centres(results: NDArray, status: NDArray[np.uint8]) -> DotCentres:
+    """Arrays with names from the kernels' table of results (..., m) of DOT and status (..., m)."""
     good = status == MarkerStatus.MEASURED
-    r = np.where(good[..., None], results, np.nan)
-    covariance = np.empty((*good.shape, 2, 2))
-    covariance[..., 0, 0], covariance[..., 1, 1] = r[..., kernels.VAR_U], r[..., kernels.VAR_V]
-    covariance[..., 0, 1] = covariance[..., 1, 0] = r[..., kernels.COV_UV]
-    misfit = r[..., kernels.CHI_SQUARE]
+
+    def of(*names: str) -> Array:
+        return np.stack([np.where(good, results[name], np.nan) for name in names], axis=-1)
+
+    misfit = of("chi_square")[..., 0]
+    covariance = of("var_u", "cov_uv", "cov_uv", "var_v").reshape(*good.shape, 2, 2)
     # grey values that scatter more than the noise model says (print, speckle, compression) scatter the centre too
     covariance *= np.maximum(misfit, 1.0)[..., None, None]
-    return DotCentres(
-        pixels=r[..., : kernels.V + 1],
-        covariance_px2=covariance,
-        status=status,
-        misfit=misfit,
-        blur_px=r[..., kernels.FIT_SIGMA],
-        radius=r[..., kernels.FIT_RADIUS],
-        level=r[..., kernels.FIT_LEVEL],
-        contrast=r[..., kernels.FIT_CONTRAST],
-    )
+    further = np.moveaxis(of("n_pixels", "sigma", "radius", "level", "contrast"), -1, 0)
+    return DotCentres(of("u", "v"), covariance, status, misfit, *further)
 
 
 def measure_noise(
@@ -265,14 +189,14 @@ def measure_noise(
     return NoiseModel(float(read), float(gain), step)
 
 
-def no_more_than_left(flat: NoiseModel, assumed: NoiseModel, results: Array) -> NoiseModel:
+def no_more_than_left(flat: NoiseModel, assumed: NoiseModel, results: NDArray) -> NoiseModel:
     """The law found in flat parts, unless dots leave less than it says: then there were no flat parts.
 
-    Dots that are small beside their blur, or beside one another, have none. results (k, N_RESULT) of fits that took the
+    Dots that are small beside their blur, or beside one another, have none. results (k,) of fits that took the
     noise as `assumed`; what they leave is noise and misfit, and so never less than the noise.
     """
-    middle = results[:, kernels.FIT_LEVEL] * (1.0 - 0.5 * results[:, kernels.FIT_CONTRAST])
-    left = float(np.median(results[:, kernels.CHI_SQUARE] * assumed.variance(middle) / flat.variance(middle)))
+    middle = results["level"] * (1.0 - 0.5 * results["contrast"])
+    left = float(np.median(results["chi_square"] * assumed.variance(middle) / flat.variance(middle)))
     if left > LESS_THAN_FLAT:  # within the scatter of both
         return flat
     return replace(flat, read=flat.read * left, gain=flat.gain * left)

@@ -7,16 +7,15 @@ fails, going back over the frames before it was found again, and measuring blur 
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from concurrent.futures import Future
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import NDArray
 
 from calibration.cameras.camera import StereoRig
-from calibration.kit.arrays import Array, Array32, Image, Mask
+from calibration.kit.arrays import Array, Image, Mask
 from calibration.kit.grey_levels import saturation_level
 from disctrack.disc import Disc
 from disctrack.track.dots import _kernels as kernels
@@ -24,9 +23,7 @@ from disctrack.track.dots.acquisition import acquire
 from disctrack.track.dots.template import (
     TYPICAL_BLUR_PX,
     NoiseModel,
-    TemplateLimits,
-    dot_centres,
-    face_edge,
+    face_of,
     measure_noise,
     no_more_than_left,
     typical_noise,
@@ -41,10 +38,9 @@ MAX_PREDICTION_RMS_PX = 2.0
 NOISE_FRAMES, NOISE_STEP = 12, 3  # frames that blur is taken from, and every third of them for the noise
 MIN_TO_BEGIN = 5  # dot images that must be measured where the disc is found anew: three fit anything
 MOST_CARRIED = 60  # frames over which the last motion is carried on; each costs one look at the dots
-FRAMES_PER_SEARCH = 60  # a search that fails costs as much as some 600 frames: ten frames' time each on average
+LONGEST_WAIT = 60  # frames between searches of a scene in which no disc was seen yet: one costs as much as some 600
 UNUSUAL = 2.0  # times the usual misfit; of dots in compressed video, one in twenty leaves 1.25 times the median
 MOST_USUAL = 0.1  # of the contrast: dots that leave more than this are not the declared ones
-DIGESTED_AT_ONCE = 8  # pairs, whose rows stay in a core's cache
 REPEAT_REACH = 4  # frames back that an image is compared with: recorders repeat from buffers of a few
 
 
@@ -57,13 +53,8 @@ class Law:
     light: tuple[tuple[float, float], tuple[float, float]] = ((200.0, 0.85), (200.0, 0.85))  # paper's grey, contrast
     misfit: float = 1.0  # rms residual over the noise that dots usually leave: compressed edges leave 4 and more
 
-    def limits(self, limits: TemplateLimits) -> TemplateLimits:
-        """A dot is refused for a misfit that is unusual in this recording."""
-        return replace(limits, misfit=max(limits.misfit, UNUSUAL * self.misfit))
 
-
-@dataclass(frozen=True)
-class Heading:
+class Heading(NamedTuple):
     """The last three poses, from which the next is predicted (`_kernels.track_frames`)."""
 
     last: Pose
@@ -97,34 +88,22 @@ class Heading:
 
 @dataclass(frozen=True)
 class Search:
-    """What may be spent on searching for the disc, and what the images showed where it was not found."""
+    """When the disc is searched for, and what the images showed where it was not found."""
 
-    credit: int = 8  # searches that may be made
-    always: bool = False  # whatever it costs
-    earned: int = 0  # frames towards the next
+    always: bool = False  # at every frame, whatever it costs
     failures: int = 0  # in succession
     since: int = 0  # frames since the last of them
     scenes: tuple[StillScene, StillScene] | None = None
 
-    def frames_later(self, n: int) -> Search:
-        """With what n more frames have earned."""
-        earned = self.earned + n
-        return replace(
-            self, credit=self.credit + earned // FRAMES_PER_SEARCH, earned=earned % FRAMES_PER_SEARCH,
-            since=self.since + n,
-        )  # fmt: skip
-
     def is_due(self, pair: Image, readable: Mask, seen: bool) -> bool:
-        """True where there is credit, and reason to hope.
+        """True where there is reason to hope.
 
         A disc that was seen before comes out from behind a hand after some frames: the wait grows by one with every
         failure. Where none was seen yet, the pair (2, height, width) must show something new, or the wait doubles.
         """
-        if self.always:
-            return True
-        if self.credit == 0 or (self.failures and self.since < self.failures):
-            return False
-        if seen or self.scenes is None or self.since >= min(2**self.failures, FRAMES_PER_SEARCH) or not readable.all():
+        if self.always or self.since < self.failures:
+            return self.always
+        if seen or self.scenes is None or self.since >= min(2**self.failures, LONGEST_WAIT) or not readable.all():
             return True
         return any(map(StillScene.differs, self.scenes, pair))
 
@@ -133,7 +112,7 @@ class Search:
         scenes = None
         if len(images) > 1 and readable[:2].all():
             scenes = StillScene(images[0, 0], images[1, 0]), StillScene(images[0, 1], images[1, 1])
-        return replace(self, credit=self.credit - 1, failures=self.failures + 1, since=0, scenes=scenes)
+        return replace(self, failures=self.failures + 1, since=0, scenes=scenes)
 
 
 @dataclass(frozen=True)
@@ -142,41 +121,24 @@ class TrackingSetup:
 
     rig: StereoRig
     disc: Disc
-    limits: TemplateLimits
     maps_x: Array  # (2, height, width) undistorted normalised coordinates of every pixel
     maps_y: Array
 
 
 @dataclass
 class Tables:
-    """What is kept of every pair until the poses are fitted: 0.9 kB with six dots."""
+    """What is kept of every pair until the poses are fitted: 1.2 kB with six dots."""
 
-    pixels: Array  # (n, 2, m, 2)
-    covariance_px2: Array  # (n, 2, m, 2, 2)
+    results: NDArray  # (n, 2, m) of `_kernels.DOT`
     status: NDArray[np.uint8]  # (n, 2, m)
-    misfit: Array32  # (n, 2, m) reduced chi-square of the grey values round each dot
-    n_pixels: Array32  # (n, 2, m) grey values that it was taken over
-    blur_px: Array32  # (n, 2, m) sigma of each dot's edge, smear of its motion included
-    contrast: Array32  # (n, 2, m) of each dot with its paper
     R: Array  # (n, 3, 3)
     t: Array  # (n, 3)
     frame_status: NDArray[np.uint8]  # (n,)
-    digest: NDArray[np.uint32]  # (n, 2) of some of each image's rows; 0 where there is no image
+    digest: NDArray[np.uint64]  # (n, 2) of some of each image's rows; 0 where there is no image
 
-
-@dataclass
-class Rows:
-    """What the loop over frames fills."""
-
-    results: Array  # (n, 2, m, 12)
-    status: NDArray[np.uint8]  # (n, 2, m)
-    R: Array  # (n, 3, 3)
-    t: Array  # (n, 3)
-
-    def part(self, start: int, stop: int | None = None) -> Rows:
-        """Views of the rows start..stop-1."""
-        rows = slice(start, stop)
-        return Rows(self.results[rows], self.status[rows], self.R[rows], self.t[rows])
+    def part(self, rows: slice) -> Tables:
+        """Views of some rows."""
+        return Tables(*(value[rows] for value in vars(self).values()))
 
 
 @dataclass
@@ -192,184 +154,100 @@ class Follower:
     acquisitions: int = 0
     first_reason: str = ""
     saturated: tuple[int | None, int | None] = (None, None)  # grey value at which the dots' brighter side is clipped
-    given: Callable[[], Law | None] = lambda: None  # noise and blur that an earlier stretch has measured
-    told: Future[Law | None] = field(default_factory=Future)  # what this stretch measured; None if it did not
-    first_row: int | None = None  # of the tables
+    first_row: int = 0  # of the tables
 
-    def keep_law(self, law: Law) -> None:
-        """Keep noise and blur as they are, and let later stretches have them."""
-        self.law, self.measured = law, True
-        self.told.set_result(law)
-
-    def finish(self) -> None:
-        """Let nobody wait for a law that was never measured."""
-        if not self.told.done():
-            self.told.set_result(None)
+    def without_pose(self) -> None:
+        """One more frame is gone in which the disc is lost."""
+        self.lost = (self.lost or 0) + 1
+        self.search = replace(self.search, since=self.search.since + 1)
 
 
 def run(
-    setup: TrackingSetup, law: Law, heading: Heading, images: Image, readable: Mask, rows: Rows
+    setup: TrackingSetup,
+    law: Law,
+    heading: Heading,
+    images: Image,
+    readable: Mask,
+    rows: Tables,
+    limits: kernels.Limits = kernels.Limits(),  # noqa: B008  # a tuple
 ) -> tuple[int, Heading]:
-    """Follow the disc through images (n, 2, height, width); returns the frames before it was lost, and the heading."""
-    poses = setup.rig.camera_poses()
-    # the loop moves them on
-    known = [np.array(part, float, order="C") for part in (*heading.last, *heading.before, *heading.older)]
+    """Follow the disc through images (n, 2, height, width); returns the frames before it was lost, and the heading.
+
+    limits : a dot is refused for a misfit that exceeds them, and is unusual in this recording
+    """
+    turns, shifts = zip(*setup.rig.camera_poses(), strict=True)
+    cameras = np.stack([camera.parameters for camera in setup.rig.cameras])
+    limits = limits._replace(misfit=max(limits.misfit, UNUSUAL * law.misfit))
+    known = Heading(*((np.array(R, order="C"), np.array(t)) for R, t in heading))  # the loop moves them on
     done = kernels.track_frames(
         images,
         readable,
-        setup.maps_x,
-        setup.maps_y,
-        np.stack([camera.parameters for camera in setup.rig.cameras]),
-        np.stack([R for R, _ in poses]),
-        np.stack([t for _, t in poses]),
-        np.ascontiguousarray(setup.disc.marker_centres_body),
-        0.5 * setup.disc.marker_diameter,
-        face_edge(setup.disc),
-        np.array(law.blur),
-        np.stack([noise.parameters for noise in law.noise]),
-        law.limits(setup.limits).array(),
-        *known,
+        kernels.Views(setup.maps_x, setup.maps_y, cameras, np.stack(turns), np.stack(shifts)),
+        face_of(setup.disc),
+        kernels.Expected(np.array(law.blur), np.stack([noise.parameters for noise in law.noise]), limits),
+        known,
         rows.results,
         rows.status,
         rows.R,
         rows.t,
         MAX_PREDICTION_RMS_PX,
     )
-    R_last, t_last, R_before, t_before, R_older, t_older = known
-    return int(done), Heading((R_last, t_last), (R_before, t_before), (R_older, t_older))
-
-
-def prepare(dtype: DTypeLike = np.uint8) -> None:
-    """Compile the loop over frames for images of this type, or load it."""
-    zeros = np.zeros
-    kernels.track_frames(
-        zeros((0, 2, 8, 8), dtype),
-        zeros((0, 2), bool),
-        zeros((2, 8, 8)),
-        zeros((2, 8, 8)),
-        zeros((2, 9)),
-        zeros((2, 3, 3)),
-        zeros((2, 3)),
-        zeros((1, 3)),
-        1.0,
-        1.0,
-        zeros(2),
-        zeros((2, 3)),
-        zeros(5),
-        *(np.eye(3), zeros(3)) * 3,
-        zeros((0, 2, 1, kernels.N_RESULT)),
-        zeros((0, 2, 1), np.uint8),
-        zeros((0, 3, 3)),
-        zeros((0, 3)),
-        MAX_PREDICTION_RMS_PX,
-    )
+    return int(done), known
 
 
 def empty_tables(n: int, m: int) -> Tables:
     """Tables of n pairs and m dots in which nothing was looked for."""
     return Tables(
-        pixels=np.full((n, 2, m, 2), np.nan),
-        covariance_px2=np.full((n, 2, m, 2, 2), np.nan),
+        results=np.full((n, 2, m), np.nan, kernels.DOT),
         status=np.full((n, 2, m), MarkerStatus.NOT_LOOKED_FOR, np.uint8),
-        misfit=np.full((n, 2, m), np.nan, np.float32),
-        n_pixels=np.full((n, 2, m), np.nan, np.float32),
-        blur_px=np.full((n, 2, m), np.nan, np.float32),
-        contrast=np.full((n, 2, m), np.nan, np.float32),
         R=np.full((n, 3, 3), np.nan),
         t=np.full((n, 3), np.nan),
         frame_status=np.full(n, FrameStatus.NOT_PROCESSED, np.uint8),
-        digest=np.zeros((n, 2), np.uint32),
+        digest=np.zeros((n, 2), np.uint64),
     )
-
-
-def clear(tables: Tables, rows: slice) -> None:
-    """Make the rows as if nothing had been looked for."""
-    empty = empty_tables(1, tables.status.shape[2])
-    for name, value in vars(empty).items():
-        getattr(tables, name)[rows] = value[0]
-
-
-def empty_rows(n: int, m: int) -> Rows:
-    """Rows of n pairs and m dots that nothing has filled."""
-    tables = empty_tables(n, m)
-    return Rows(np.full((n, 2, m, kernels.N_RESULT), np.nan), tables.status, tables.R, tables.t)
 
 
 def follow_block(follower: Follower, images: Image, readable: Mask, tables: Tables, start: int) -> None:
     """Fill the tables' rows from `start` on with what n pairs show; images (n, 2, height, width), readable (n, 2)."""
     n, i = len(images), 0
-    own = slice(start, start + n)
-    if follower.first_row is None:
-        follower.first_row = start
-    readable = readable & ~_repeated_alone(images, readable, tables, start, follower.first_row)
-    results = np.full((n, 2, follower.setup.disc.n_markers, kernels.N_RESULT), np.nan)
-    rows = Rows(results, tables.status[own], tables.R[own], tables.t[own])
-    status = tables.frame_status[own]
+    rows = tables.part(slice(start, start + n))
+    # an image of one camera alone that is a copy of an earlier one: no two are equal, by their noise. Where both are,
+    # nothing may have moved: that is judged by the motion
+    rows.digest[...] = np.where(readable, _digests(images), 0)
+    repeated = repeats(tables.digest[max(follower.first_row, start - REPEAT_REACH) : start + n])[-n:]
+    readable = readable & (~repeated | repeated.all(axis=1, keepdims=True))
     while i < n:
-        if not readable[i].any():
-            status[i] = FrameStatus.UNREADABLE
-            follower.lost = (follower.lost or 0) + 1
-            i += 1
-            continue
         anew = follower.lost is not None
-        if anew and not recover(follower, images[i:], readable[i:]):
-            status[i] = FrameStatus.MARKERS_NOT_FOUND
-            follower.lost = (follower.lost or 0) + 1
-            follower.search = follower.search.frames_later(1)
+        seen = bool(readable[i].any())
+        if not seen or (anew and not recover(follower, images[i:], readable[i:])):
+            rows.frame_status[i] = FrameStatus.MARKERS_NOT_FOUND if seen else FrameStatus.UNREADABLE
+            follower.without_pose()
             i += 1
             continue
         assert follower.heading is not None
         done, follower.heading = run(
-            follower.setup, follower.law, follower.heading, images[i:], readable[i:], rows.part(i)
+            follower.setup, follower.law, follower.heading, images[i:], readable[i:], rows.part(slice(i, None))
         )
-        status[i : i + done] = FrameStatus.MEASURED
+        rows.frame_status[i : i + done] = FrameStatus.MEASURED
         if anew and done > 1:
-            _go_back(follower, images, readable, rows, status, i)
+            _go_back(follower, images, readable, rows, i)
         i += done
-        follower.search = replace(follower.search.frames_later(done), failures=0, scenes=None)
+        follower.search = Search(follower.search.always)
         follower.lost = 0 if i < n else None
-    dots = dot_centres(results, rows.status)
-    tables.pixels[own], tables.covariance_px2[own] = dots.pixels, dots.covariance_px2
-    tables.misfit[own], tables.n_pixels[own] = dots.misfit, results[..., kernels.N_PIXELS]
-    tables.blur_px[own] = dots.blur_px
-    tables.contrast[own] = dots.contrast
 
 
-def _repeated_alone(images: Image, readable: Mask, tables: Tables, start: int, first: int) -> Mask:
-    """(n, 2) True where one camera repeats an earlier image and the other does not; the tables keep the digests.
+def _digests(images: Image) -> NDArray[np.uint64]:
+    """(n, 2) sums over words of rows enough of each image (n, 2, height, width) to tell noise from noise; not 0.
 
-    No two images of a camera are equal, by their noise. Where both repeat, nothing may have moved: that is judged by
-    the motion. first : row at which the stretch begins; those before it may not be filled yet.
+    What it costs is fetching the rows: of large images fewer will do.
     """
-    n = len(images)
-    tables.digest[start : start + n] = np.where(readable, _digests(images), 0)
-    repeated = repeats(tables.digest[max(first, start - REPEAT_REACH) : start + n])[-n:]
-    return repeated & ~repeated.all(axis=1, keepdims=True)
+    rows = np.ascontiguousarray(images[:, :, :: 16 if images.shape[2] < 512 else 32])
+    words = rows.reshape(*rows.shape[:2], -1).view(np.uint8)
+    words = words[..., : words.shape[-1] // 8 * 8].view(np.uint64)
+    return np.maximum(words.sum(axis=-1), 1)
 
 
-def _digests(images: Image) -> NDArray[np.uint32]:
-    """(n, 2) of rows enough of each image (n, 2, height, width) to tell noise from noise; not 0.
-
-    A weighted sum: four times as fast as a CRC. What it costs is fetching the rows: of large images fewer will do.
-    """
-    digests = np.empty(images.shape[:2], np.uint32)
-    step = 16 if images.shape[2] < 512 else 32
-    for first in range(0, len(images), DIGESTED_AT_ONCE):
-        some = slice(first, first + DIGESTED_AT_ONCE)
-        rows = np.ascontiguousarray(images[some, :, ::step])
-        words = rows.reshape(*rows.shape[:2], -1).view(np.uint8)
-        words = words[..., : words.shape[-1] // 8 * 8].view(np.uint64)
-        digests[some] = words @ _odd_numbers(words.shape[-1]) >> np.uint64(32)
-    return np.maximum(digests, 1)
-
-
-@cache
-def _odd_numbers(n: int) -> NDArray[np.uint64]:
-    """(n,) of 64 bits that look like chance, each invertible: no change of one word leaves the sum as it is."""
-    return np.random.default_rng(0).integers(0, 2**64, n, np.uint64) | np.uint64(1)
-
-
-def repeats(digest: NDArray[np.uint32]) -> Mask:
+def repeats(digest: NDArray[np.uint64]) -> Mask:
     """(n, 2) True where a camera's image is one of those REPEAT_REACH frames before; digest (n, 2), 0 for no image."""
     repeated = np.zeros(digest.shape, bool)
     for back in range(1, min(REPEAT_REACH, len(digest) - 1) + 1):
@@ -399,11 +277,16 @@ def recover(follower: Follower, images: Image, readable: Mask) -> bool:
 
 def _holds(follower: Follower, heading: Heading, images: Image, readable: Mask) -> bool:
     """True where the first of the pairs shows dots enough at the place where the heading leads."""
-    trial = empty_rows(1, follower.setup.disc.n_markers)
+    trial = empty_tables(1, follower.setup.disc.n_markers)
     done, _ = run(follower.setup, follower.law, heading, images[:1], readable[:1], trial)
     if done and _enough(trial.status):
         return True
-    follower.first_reason = follower.first_reason or _refusals(trial.status[0])
+    if not follower.first_reason:
+        kinds, counts = np.unique(trial.status, return_counts=True)
+        listed = ", ".join(f"{n} {MarkerStatus(k).name.lower()}" for k, n in zip(kinds, counts, strict=True))
+        follower.first_reason = (
+            f"blobs lie where the dots should be, but their grey values do not fit the dots of [markers]: {listed}"
+        )
     return False
 
 
@@ -413,41 +296,25 @@ def _enough(status: NDArray[np.uint8]) -> bool:
     return found >= min(MIN_TO_BEGIN, status.shape[-1])
 
 
-def _go_back(
-    follower: Follower,
-    images: Image,
-    readable: Mask,
-    rows: Rows,
-    status: NDArray[np.uint8],
-    found: int,
-) -> None:
+def _go_back(follower: Follower, images: Image, readable: Mask, rows: Tables, found: int) -> None:
     """Follow the disc backwards from where it was found anew, through frames of the block that have no pose."""
     first = found
-    while first > 0 and status[first - 1] == FrameStatus.MARKERS_NOT_FOUND:
+    while first > 0 and rows.frame_status[first - 1] == FrameStatus.MARKERS_NOT_FOUND:
         first -= 1
     if first == found:
         return
-    back = slice(first, found)
-    trial = empty_rows(found - first, follower.setup.disc.n_markers)
+    trial = empty_tables(found - first, follower.setup.disc.n_markers)
     heading = Heading.steady((rows.R[found], rows.t[found]), (rows.R[found + 1], rows.t[found + 1]))
-    pairs: Image = np.ascontiguousarray(images[back][::-1])  # type: ignore[assignment]  # the stubs forget the depth
-    usable = np.ascontiguousarray(readable[back][::-1])
+    pairs: Image = np.ascontiguousarray(images[first:found][::-1])  # type: ignore[assignment]  # the stubs forget it
+    usable = np.ascontiguousarray(readable[first:found][::-1])
     done, _ = run(follower.setup, follower.law, heading, pairs, usable, trial)
     for k in range(done):
         if not _enough(trial.status[k : k + 1]):
             break
         i = found - 1 - k
-        rows.results[i], rows.status[i], rows.R[i], rows.t[i] = (
-            trial.results[k], trial.status[k], trial.R[k], trial.t[k],
-        )  # fmt: skip
-        status[i] = FrameStatus.MEASURED
-
-
-def _refusals(status: NDArray[np.uint8]) -> str:
-    """Why the dots (2, m) of a pair were refused, in words."""
-    kinds, counts = np.unique(status, return_counts=True)
-    listed = ", ".join(f"{n} {MarkerStatus(k).name.lower()}" for k, n in zip(kinds, counts, strict=True))
-    return f"blobs lie where the dots should be, but their grey values do not fit the dots of [markers]: {listed}"
+        for name in ("results", "status", "R", "t"):
+            getattr(rows, name)[i] = getattr(trial, name)[k]
+        rows.frame_status[i] = FrameStatus.MEASURED
 
 
 def _search(follower: Follower, images: Image, readable: Mask) -> bool:
@@ -459,8 +326,6 @@ def _search(follower: Follower, images: Image, readable: Mask) -> bool:
     if len(images) > 1 and readable[1].any():
         following = _found(follower, images[1], readable[1])
     heading = Heading.leading_to(pose, following)
-    if not follower.measured and (law := follower.given()) is not None:
-        follower.keep_law(law)
     if not follower.measured:
         _measure_blur_and_noise(follower, images, readable, pose, heading)
     if not _holds(follower, heading, images, readable):
@@ -482,62 +347,53 @@ def _measure_blur_and_noise(follower: Follower, images: Image, readable: Mask, p
     """Measure the law of the cameras' noise and blur; where the disc is not there after all, nothing is kept."""
     setup, law = follower.setup, Law()
     n, m = min(NOISE_FRAMES, len(images)), setup.disc.n_markers
-    noise, blur, light = list(law.noise), list(law.blur), list(law.light)
-    views = list(enumerate(setup.rig.camera_poses()))
-    for camera, (R_cw, t_cw) in views:
+    noise, blur, light, misfit = list(law.noise), list(law.blur), list(law.light), law.misfit
+    saturated: list[int | None] = [None, None]
+
+    def flat_noise(camera: int, frames: Sequence[int], R: Array, t: Array, blur_px: float) -> NoiseModel:
+        """Of flat parts beside and in the dots, at poses R, t of each frame."""
+        R_cw, t_cw = setup.rig.camera_poses()[camera]
+        poses = [(R_cw @ R[k], R_cw @ t[k] + t_cw) for k in frames]
+        maps = setup.maps_x[camera], setup.maps_y[camera]
+        return measure_noise(
+            [images[k, camera] for k in frames], setup.rig.cameras[camera], poses, setup.disc, maps, blur_px
+        )
+
+    for camera in range(2):
         # a first idea of the noise, or good dots of a noisy camera, or of more than 8 bits, would look like misfits;
         # the pose found by blobs is good to a fraction of a pixel, and the flat parts keep off the edges by more
         if readable[0, camera]:
-            noise[camera] = measure_noise(
-                [images[0, camera]],
-                setup.rig.cameras[camera],
-                [(R_cw @ pose[0], R_cw @ pose[1] + t_cw)],
-                setup.disc,
-                (setup.maps_x[camera], setup.maps_y[camera]),
-            )
+            noise[camera] = flat_noise(camera, [0], pose[0][None], pose[1][None], blur[camera])
         elif readable[:n, camera].any():
             noise[camera] = typical_noise(images[int(np.argmax(readable[:n, camera])), camera])
-    misfit = 1.0
     for blur_known in (False, True):  # the second time with the blur of the first, and the misfit that is usual
         law = Law((noise[0], noise[1]), (blur[0], blur[1]), misfit=misfit)
-        trial = empty_rows(n, m)
-        limits = setup.limits if blur_known else replace(setup.limits, blur=np.inf, share=MOST_USUAL)
-        done, _ = run(replace(setup, limits=limits), law, heading, images[:n], readable[:n], trial)
+        trial = empty_tables(n, m)
+        limits = kernels.Limits() if blur_known else kernels.Limits(blur=np.inf, share=MOST_USUAL)
+        done, _ = run(setup, law, heading, images[:n], readable[:n], trial, limits)
         if done == 0 or not _enough(trial.status[:1]):
             follower.law = law  # how the noise was taken to be tells why the dots are refused
             return
         good = trial.status[:done] == MarkerStatus.MEASURED
-        for camera, (R_cw, t_cw) in views:
+        for camera in range(2):
             fits = trial.results[:done, camera][good[:, camera]]
             if not len(fits):
                 continue
-            blur[camera] = float(np.median(fits[:, kernels.FIT_SIGMA]))
-            light[camera] = tuple(np.median(fits[:, (kernels.FIT_LEVEL, kernels.FIT_CONTRAST)], axis=0).tolist())
-            misfit = max(misfit, float(np.sqrt(np.median(fits[:, kernels.CHI_SQUARE]))))
-            if not blur_known:
-                continue
-            sample = range(0, done, NOISE_STEP)
-            flat = measure_noise(
-                [images[k, camera] for k in sample],
-                setup.rig.cameras[camera],
-                [(R_cw @ trial.R[k], R_cw @ trial.t[k] + t_cw) for k in sample],
-                setup.disc,
-                (setup.maps_x[camera], setup.maps_y[camera]),
-                blur[camera],
-            )
-            noise[camera] = no_more_than_left(flat, noise[camera], fits)
-    follower.saturated = (
-        _saturated(images[:done, 0], trial.results[:done, 0], noise[0]),
-        _saturated(images[:done, 1], trial.results[:done, 1], noise[1]),
-    )
-    follower.keep_law(Law((noise[0], noise[1]), (blur[0], blur[1]), (light[0], light[1]), misfit))
+            blur[camera] = float(np.median(fits["sigma"]))
+            light[camera] = float(np.median(fits["level"])), float(np.median(fits["contrast"]))
+            misfit = max(misfit, float(np.sqrt(np.median(fits["chi_square"]))))
+            if blur_known:
+                flat = flat_noise(camera, range(0, done, NOISE_STEP), trial.R, trial.t, blur[camera])
+                noise[camera] = no_more_than_left(flat, noise[camera], fits)
+                saturated[camera] = _saturated(images[:done, camera], fits, noise[camera])
+    follower.saturated = saturated[0], saturated[1]
+    follower.law, follower.measured = Law((noise[0], noise[1]), (blur[0], blur[1]), (light[0], light[1]), misfit), True
 
 
-def _saturated(images: Image, results: Array, noise: NoiseModel) -> int | None:
-    """Grey value at which the brighter side of the edges of dots (n, m, 12) is clipped; None where it is not."""
+def _saturated(images: Image, fits: NDArray, noise: NoiseModel) -> int | None:
+    """Grey value at which the brighter side of the edges of dots (k,) of DOT is clipped; None where it is not."""
     saturation = saturation_level(images)
-    light = results[..., kernels.FIT_LEVEL] * (1.0 - np.minimum(results[..., kernels.FIT_CONTRAST], 0.0))
-    if saturation is None or not np.isfinite(light).any():
+    level = float(np.median(fits["level"] * (1.0 - np.minimum(fits["contrast"], 0.0))))
+    if saturation is None or saturation - level >= 3.0 * np.sqrt(noise.variance(np.array(level))):
         return None
-    level = float(np.nanmedian(light))
-    return saturation if saturation - level < 3.0 * np.sqrt(noise.variance(np.array(level))) else None
+    return saturation

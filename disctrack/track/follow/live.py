@@ -10,17 +10,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.cameras.camera import StereoRig, normalised_maps
-from calibration.kit.arrays import Array, Image, Mask
+from calibration.kit.arrays import Array, Image
 from disctrack import frames
 from disctrack.arguments import checked, grey_values
 from disctrack.disc import Disc
 from disctrack.errors import ArgumentError
-from disctrack.frames import POSE_COMPONENTS
 from disctrack.track.dots.template import dot_centres
-from disctrack.track.follow.following import Follower, Heading, Pose, Rows, TrackingSetup, empty_rows, recover, run
+from disctrack.track.follow.following import (
+    Follower,
+    Heading,
+    Pose,
+    Search,
+    Tables,
+    TrackingSetup,
+    empty_tables,
+    recover,
+    run,
+)
 from disctrack.track.follow.tracking import check_images
-from disctrack.track.pose import MIN_DOTS, OUTLIER_CHI_SQUARE, fit_poses, marker_pixels, whitening
-from disctrack.track.refine.assembly import MIN_GOOD_DOT_IMAGES, TrackingSettings
+from disctrack.track.pose import fit_poses
+from disctrack.track.refine.assembly import MIN_GOOD_DOT_IMAGES
 from disctrack.trajectory import FrameStatus, coordinate_sigma
 
 
@@ -56,21 +65,17 @@ class LivePose:
 class Tracker:
     """Follows the disc through pairs as they come.
 
-    rig, disc : of the set-up, from `read_rig` and a trajectory or recording
-    settings  : limits and rejection as for recordings; nothing is refined over the sequence
+    rig, disc : of the set-up, from `read_rig` and a trajectory or recording; nothing is refined over the sequence
     The first pairs compile (once per installation) and search the disc; after that a pair takes
     about a millisecond. A pair in which the disc is not found is answered with a status, and searched anew at the next.
     """
 
     @checked
-    def __init__(self, rig: StereoRig, disc: Disc, settings: TrackingSettings | None = None) -> None:
+    def __init__(self, rig: StereoRig, disc: Disc) -> None:
         self.rig, self.disc = rig, disc
         self.frame = -1
-        self._settings = settings or TrackingSettings()
-        maps_x, maps_y = (
-            np.stack(part) for part in zip(*(normalised_maps(camera) for camera in rig.cameras), strict=True)
-        )
-        self._follower = Follower(TrackingSetup(rig, disc, self._settings.limits, maps_x, maps_y))
+        maps_x, maps_y = map(np.stack, zip(*map(normalised_maps, rig.cameras), strict=True))
+        self._follower = Follower(TrackingSetup(rig, disc, maps_x, maps_y))
         self._readable = np.ones((1, 2), bool)
         self._angles: Array | None = None  # of the last pose
         self._found: Pose | None = None  # in the pair before, by a search
@@ -88,24 +93,21 @@ class Tracker:
         self.frame += 1
         images = self._as_block(left, right)
         follower, m = self._follower, self.disc.n_markers
-        rows = empty_rows(1, m)
+        rows = empty_tables(1, m)
         done = self._run(images, rows) if follower.lost is None else 0
         if not done:
             done = self._search(images, rows)
-        follower.search = follower.search.frames_later(1)
         if not done:
-            follower.lost = (follower.lost or 0) + 1
+            follower.without_pose()
             self._angles = None
             return self._without_pose(FrameStatus.MARKERS_NOT_FOUND)
-        follower.lost = None
+        follower.lost, follower.search = None, Search()
         return self._pose(rows)
 
-    def _run(self, images: NDArray, rows: Rows) -> int:
+    def _run(self, images: NDArray, rows: Tables) -> int:
         follower = self._follower
         assert follower.heading is not None
-        done, follower.heading = run(
-            follower.setup, follower.law, follower.heading, images, self._readable, rows
-        )  # fmt: skip
+        done, follower.heading = run(follower.setup, follower.law, follower.heading, images, self._readable, rows)
         return done
 
     def _as_block(self, left: Image, right: Image) -> NDArray:
@@ -121,7 +123,7 @@ class Tracker:
         self._pair[0, 0], self._pair[0, 1] = left, right
         return self._pair
 
-    def _search(self, images: NDArray, rows: Rows) -> int:
+    def _search(self, images: NDArray, rows: Tables) -> int:
         """Search the disc; the velocity comes from the pair before, if that was searched too."""
         follower, before = self._follower, self._found
         self._found = None
@@ -136,26 +138,32 @@ class Tracker:
             self._found = (rows.R[0].copy(), rows.t[0].copy())
         return done
 
-    def _pose(self, rows: Rows) -> LivePose:
+    def _pose(self, rows: Tables) -> LivePose:
         dots = dot_centres(rows.results, rows.status)
-        pixels, covariances = dots.pixels, dots.covariance_px2
-        R, t, covariance, residuals, chi_square, used = _refined(
-            pixels, covariances, self.rig, self.disc, rows.R, rows.t, self._settings.reject_outliers
-        )
-        if not np.isfinite(t).all():
+        centres = self.disc.marker_centres_body
+        fit = fit_poses(dots.pixels, dots.covariance_px2, self.rig, centres, rows.R, rows.t, with_sensitivity=False)
+        if not fit.converged[0]:
             return self._without_pose(FrameStatus.NOT_CONVERGED)
-        angles = frames.euler_from_rotation(R)
+        angles = frames.euler_from_rotation(fit.R_world_body[0])
         if self._angles is not None:
             angles = frames.unwrap_euler(np.stack([self._angles, angles]))[1]
         self._angles = angles
-        per_camera = used.sum(axis=1)
+        per_camera = fit.used[0].sum(axis=1)
         status = FrameStatus.MEASURED
         if (per_camera == 0).any():
             status = FrameStatus.ONE_CAMERA
         elif per_camera.sum() < MIN_GOOD_DOT_IMAGES:
             status = FrameStatus.FEW_MARKERS
-        q = np.concatenate([t, angles])
-        return LivePose(self.frame, q, R, covariance, status, pixels[0], residuals, chi_square)
+        return LivePose(
+            self.frame,
+            np.concatenate([fit.t_world_body[0], angles]),
+            fit.R_world_body[0],
+            fit.covariance[0],
+            status,
+            dots.pixels[0],
+            fit.residuals_px[0],
+            float(fit.reduced_chi_square[0]),
+        )
 
     def _without_pose(self, status: FrameStatus) -> LivePose:
         m, nan = self.disc.n_markers, np.nan
@@ -163,43 +171,3 @@ class Tracker:
             self.frame, np.full(6, nan), np.full((3, 3), nan), np.full((6, 6), nan), status,
             np.full((2, m, 2), nan), np.full((2, m, 2), nan), nan,
         )  # fmt: skip
-
-
-def _refined(
-    pixels: Array, covariances: Array, rig: StereoRig, disc: Disc, R: Array, t: Array, reject: bool
-) -> tuple[Array, Array, Array, Array, float, Mask]:
-    """One weighted Gauss-Newton step from the loop's pose, which is good to a hundredth of a pixel: then it is exact.
-
-    pixels (1, 2, m, 2), covariances (1, 2, m, 2, 2), R (1, 3, 3), t (1, 3); where a dot stands out, `fit_poses` judges.
-    returns : R (3, 3), t (3,), covariance (6, 6), residuals (2, m, 2), reduced chi-square, used (2, m)
-    """
-    used: Mask = np.asarray(np.isfinite(pixels).all(-1))
-    projected, J = marker_pixels(R, t, rig, disc.marker_centres_body)
-    W = whitening(np.where(used[..., None, None], covariances, np.eye(2)))
-    residual = np.where(used[..., None], pixels - projected, 0.0)
-    r = (W @ residual[..., None])[..., 0].reshape(-1)
-    A = np.where(used[..., None, None], W @ J, 0.0).reshape(-1, len(POSE_COMPONENTS))
-    count = int(used.sum())
-    if count < MIN_DOTS:
-        return (*_nothing(), np.full(pixels.shape[1:], np.nan), np.nan, used[0])
-    covariance = np.linalg.inv(A.T @ A)
-    step = covariance @ (A.T @ r)
-    left_over = r - A @ step
-    chi_square = float(left_over @ left_over)
-    freedom = max(2 * count - 6, 1)
-    worst = float((left_over.reshape(-1, 2) ** 2).sum(axis=1).max())
-    usual = max(1.0, chi_square / freedom)
-    if worst > 2 * OUTLIER_CHI_SQUARE * usual or worst > 2 * OUTLIER_CHI_SQUARE:
-        fit = fit_poses(pixels, covariances, rig, disc.marker_centres_body, R, t, reject_outliers=reject,
-                        with_sensitivity=False)  # fmt: skip
-        return (
-            fit.R_world_body[0], fit.t_world_body[0], fit.covariance[0], fit.residuals_px[0],
-            float(fit.reduced_chi_square[0]), fit.used[0],
-        )  # fmt: skip
-    residuals = np.where(used[0, ..., None], residual[0] - (J[0] @ step), np.nan)
-    turned = frames.rotation_from_vector(step[3:]) @ R[0]
-    return turned, t[0] + step[:3], covariance, residuals, chi_square / freedom, used[0]
-
-
-def _nothing() -> tuple[Array, Array, Array]:
-    return np.full((3, 3), np.nan), np.full(3, np.nan), np.full((6, 6), np.nan)

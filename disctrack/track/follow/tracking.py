@@ -3,48 +3,45 @@
 The disc is followed through each stretch in `following`; what comes of it is put together in `assembly`.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from functools import partial
-from itertools import chain, islice, pairwise
+from itertools import chain, islice
 from threading import Event, Lock
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from calibration.cameras.camera import StereoRig, normalised_maps
-from calibration.kit.arrays import Array
+from calibration.cameras.camera import Camera, StereoRig, normalised_maps
+from calibration.kit.arrays import Array, Image
 from calibration.kit.grey_levels import mosaic_gains
 from calibration.kit.stuck_pixels import repair, stuck_pixels
 from disctrack import frames
-from disctrack.disc import Disc, symmetry_order
+from disctrack.disc import MA_2014, Disc, symmetry_order
 from disctrack.errors import TrackingError
 from disctrack.findings import Finding, Kind, Severity, Subject, in_doubt
 from disctrack.recording.readers.blocks import PairBlock
-from disctrack.track import pose
-from disctrack.track.follow import following
 from disctrack.track.follow.following import (
     Follower,
-    Image,
+    Heading,
     Law,
     Search,
     Tables,
     TrackingSetup,
-    clear,
     empty_tables,
     follow_block,
+    run,
 )
 from disctrack.track.judge.doubts import MOVED
 from disctrack.track.judge.image_arrangement import arrangement_found
 from disctrack.track.judge.moved_camera import moved_camera
 from disctrack.track.judge.wrong_declaration import unlike_declared
+from disctrack.track.pose import marker_pixels
 from disctrack.track.refine.assembly import Taken, Tracking, TrackingSettings, assemble
 from disctrack.trajectory import FrameStatus
 
-SHORTEST_SPLIT = 1000  # pairs; a stretch must outweigh its own search for the disc
+SHORTEST_SPLIT = 1000  # pairs; a stretch must outweigh its own search for the disc, and measuring blur and noise
 MOST_STRETCHES = 16
-WAITED_FOR = 160  # pairs that are followed in the time that the first stretch takes to measure noise and blur for all
 FAR_PX = 1.0  # that dots miss their places by in all frames, beyond any lens: the poses are no better than none
 MOSTLY = 0.5  # of the frames: that many are not refused for gleams and hands
 # [m] off its declared place from which on a dot is looked for again, where it is. With wrong places the attitude is
@@ -61,8 +58,11 @@ ReadBlocks = Callable[[int, int], Iterable[PairBlock]]  # pairs start ... stop-1
 
 def prepare(dtype: DTypeLike = np.uint8) -> None:
     """Compile the inner loops for images of this type, or load them: some seconds once per installation."""
-    following.prepare(dtype)
-    pose.prepare()
+    camera, still = Camera(1.0, 1.0, 0.0, 0.0, (0.0,) * 5, (8, 8)), (np.eye(3), np.zeros(3))
+    setup = TrackingSetup(StereoRig(camera, camera, *still, *still), MA_2014, *np.zeros((2, 2, 8, 8)))
+    rows, nothing = empty_tables(0, MA_2014.n_markers), np.zeros((0, 2, 8, 8), dtype)
+    run(setup, Law(), Heading(still, still, still), nothing, np.zeros((0, 2), bool), rows)
+    marker_pixels(rows.R, rows.t, setup.rig, MA_2014.marker_centres_body)
 
 
 def track(
@@ -98,32 +98,28 @@ def track(
     with ThreadPoolExecutor(2) as pool:
         drawing = pool.map(normalised_maps, rig.cameras)
         read_blocks, stuck = _as_one_sensor(read_blocks, pairs)
-        maps = list(drawing)
-    maps_x, maps_y = (np.stack(part) for part in zip(*maps, strict=True))
-    setup = TrackingSetup(rig, disc, settings.limits, maps_x, maps_y)
-    edges = stretch_edges(pairs, disc)
-    followers, tables = _followed(read_blocks, edges, setup, settings, workers, progress)
-    if not np.isfinite(tables.t).any():
-        reason = next((f.first_reason for f in followers if f.first_reason), "")
-        stop = "" if reason.endswith("?") else "."
-        told = f"First search: {reason.rstrip('.')}{stop} {MOVED}" if reason else "No image could be read"
-        why = _arrangement(read_blocks, rig, disc, pairs)
-        told = f"Most likely {why[0].sentence}" if why else told
-        text = f"the disc was found in none of the pairs {pairs.start}-{pairs.stop - 1}. {told}"
-        raise TrackingError(text, findings=why)
+        maps_x, maps_y = map(np.stack, zip(*drawing, strict=True))
     if timestamps is None:
         timestamps = np.array(pairs) / frame_rate
     taken = Taken(pairs, np.asarray(timestamps, float), frame_rate, gravity)
-    tracking = assemble(followers, tables, settings, taken, workers)
-    found = tracking.trajectory.disc
-    faulty = in_doubt(f for f in tracking.findings if f.kind not in DECLARED)
-    if np.abs(found.marker_centres_body - disc.marker_centres_body).max() > LOOK_AGAIN and not faulty:
-        again = replace(setup, disc=found)
-        followers, tables = _followed(read_blocks, edges, again, settings, workers, lambda n: None)
+    setup = TrackingSetup(rig, disc, maps_x, maps_y)
+    edges = stretch_edges(pairs, disc)
+
+    def measured(looked_for: Disc, progress: Callable[[int], object]) -> tuple[Tracking, bool]:
+        """With the dots looked for at the places of a disc; and whether the images are in doubt."""
+        again = replace(setup, disc=looked_for)
+        followers, tables = _followed(read_blocks, edges, again, settings, workers, progress)
+        if not np.isfinite(tables.t).any():
+            raise _not_found(followers, pairs, _arrangement(read_blocks, rig, disc, pairs))
         for follower in followers:
             follower.setup = setup
         tracking = assemble(followers, tables, settings, taken, workers)
-        faulty = in_doubt(f for f in tracking.findings if f.kind not in DECLARED)
+        return tracking, in_doubt(f for f in tracking.findings if f.kind not in DECLARED)
+
+    tracking, faulty = measured(disc, progress)
+    found = tracking.trajectory.disc
+    if np.abs(found.marker_centres_body - disc.marker_centres_body).max() > LOOK_AGAIN and not faulty:
+        tracking, faulty = measured(found, lambda n: None)
     kinds = {finding.kind for finding in tracking.findings}
     status = tracking.trajectory.frame_status
     contradicted = Kind.ONE_SIDED in kinds or np.mean(status == FrameStatus.CONTRADICTED) > MOSTLY
@@ -139,6 +135,15 @@ def track(
     return replace(tracking, findings=tuple(replace(f, severity=doubt.get(f.kind, f.severity)) for f in noticed))
 
 
+def _not_found(followers: list[Follower], pairs: range, why: tuple[Finding, ...]) -> TrackingError:
+    """The disc was seen in no pair."""
+    reason = next((f.first_reason for f in followers if f.first_reason), "")
+    told = f"First search: {reason.rstrip('.')}{'' if reason.endswith('?') else '.'} {MOVED}"
+    told = f"Most likely {why[0].sentence}" if why else told if reason else "No image could be read"
+    text = f"the disc was found in none of the pairs {pairs.start}-{pairs.stop - 1}. {told}"
+    return TrackingError(text, findings=why)
+
+
 def _followed(
     read_blocks: ReadBlocks,
     edges: list[int],
@@ -148,59 +153,36 @@ def _followed(
     progress: Callable[[int], object],
 ) -> tuple[list[Follower], Tables]:
     """The disc followed through the stretches between edges; arguments as of `track`."""
-    pairs = range(edges[0], edges[-1])
-    tables = empty_tables(len(pairs), setup.disc.n_markers)
-    followers = [Follower(setup, search=Search(always=settings.search_always)) for _ in edges[1:]]
-    for number, follower in enumerate(followers):
-        follower.given = partial(_first_law, followers[:number])
-
+    first = edges[0]
+    tables = empty_tables(edges[-1] - first, setup.disc.n_markers)
+    search = Search(always=settings.search_always)
+    followers = [Follower(setup, search=search, first_row=edge - first) for edge in edges[:-1]]
     given_up, telling = Event(), Lock()
 
-    def follow(share: range) -> None:
-        """Follow the disc through neighbouring stretches."""
-        number = share.start
+    def follow(k: int, tell: Callable[[int], object]) -> None:
+        """Follow the disc through one of the stretches."""
+        for block in read_blocks(edges[k], edges[k + 1]):
+            if given_up.is_set():
+                break
+            check_images(block.images, setup.rig)
+            follow_block(followers[k], block.images, block.readable, tables, int(block.frames[0]) - first)
+            with telling:
+                tell(len(block.images))
+
+    with ThreadPoolExecutor(max(1, workers), thread_name_prefix="track") as pool:
         try:
-            for block in read_blocks(edges[share.start], edges[share.stop]):
-                check_images(block.images, setup.rig)
-                for part in _cut(block, edges):
-                    while part.start >= edges[number + 1]:
-                        followers[number].finish()
-                        number += 1
-                    rows = slice(part.start - int(block.frames[0]), part.stop - int(block.frames[0]))
-                    at = part.start - pairs.start
-                    follow_block(followers[number], block.images[rows], block.readable[rows], tables, at)
-                with telling:
-                    progress(len(block.images))
-                if given_up.is_set():
-                    break
-        finally:  # nobody may wait for what will not come
-            for k in share:
-                followers[k].finish()
-
-    def carry_on(before: Follower, stretch: Follower, start: int, stop: int) -> None:
-        """Follow a stretch again from where the one before it ended."""
-        stretch.heading, stretch.lost = before.heading, None
-        stretch.law, stretch.measured = before.law, True
-        clear(tables, slice(start - pairs.start, stop - pairs.start))
-        for block in read_blocks(start, stop):
-            follow_block(stretch, block.images, block.readable, tables, int(block.frames[0]) - pairs.start)
-
-    workers = max(1, min(workers, len(followers)))
-    shares = [range(k * len(followers) // workers, (k + 1) * len(followers) // workers) for k in range(workers)]
-    if workers == 1:
-        follow(shares[0])
-    else:
-        with ThreadPoolExecutor(workers, thread_name_prefix="track") as pool:
-            running = [pool.submit(follow, share) for share in shares]
-            try:
-                for share in running:
-                    share.result()
-            except BaseException:  # an interrupt must not wait for the end of the recording
-                given_up.set()
-                raise
+            list(pool.map(lambda k: follow(k, progress), range(len(followers))))
+        except BaseException:  # an interrupt must not wait for the end of the recording
+            given_up.set()
+            raise
     for k in range(1, len(followers)):
-        if _torn(tables, edges[k] - pairs.start):  # another branch of phi was found: go on from the stretch before
-            carry_on(followers[k - 1], followers[k], edges[k], edges[k + 1])
+        start, before = edges[k] - first, followers[k - 1]
+        if _torn(tables, start):  # another branch of phi was found: go on from the stretch before
+            followers[k] = replace(before, lost=None, first_row=start)
+            gone = tables.part(slice(start, edges[k + 1] - first))
+            for name, empty in vars(empty_tables(1, setup.disc.n_markers)).items():
+                getattr(gone, name)[...] = empty
+            follow(k, lambda n: None)
     return followers, tables
 
 
@@ -230,16 +212,13 @@ def _arrangement(read_blocks: ReadBlocks, rig: StereoRig, disc: Disc, pairs: ran
 def stretch_edges(pairs: range, disc: Disc) -> list[int]:
     """First pairs of the stretches that a recording is followed in, and the end of the last.
 
-    They depend on the length alone, so that the result does not depend on who follows them. The first is shorter: the
-    others wait while it measures the cameras' noise. Where the dots leave phi open by a symmetry, every new start could
-    choose another branch: then there is one stretch.
+    They depend on the length alone, so that the result does not depend on who follows them. Where the dots leave phi
+    open by a symmetry, every new start could choose another branch: then there is one stretch.
     """
     n, count = len(pairs), 1
     while n >= SHORTEST_SPLIT * count**2 and count < MOST_STRETCHES and symmetry_order(disc) == 1:
         count *= 2
-    waited = min(WAITED_FOR, n // (2 * count))
-    share = (n + waited) / count
-    return [pairs.start, *(pairs.start + round(k * share) - waited for k in range(1, count)), pairs.stop]
+    return [pairs.start + round(k * n / count) for k in range(count + 1)]
 
 
 def _as_one_sensor(read_blocks: ReadBlocks, pairs: range) -> tuple[ReadBlocks, list[Finding]]:
@@ -253,21 +232,18 @@ def _as_one_sensor(read_blocks: ReadBlocks, pairs: range) -> tuple[ReadBlocks, l
         if pattern is not None:
             images[:, camera] = _without_mosaic(images[:, camera], pattern)
     stuck = [stuck_pixels(images[:, camera]) for camera in (0, 1)]
-    told = [
-        (
-            name,
-            f"{name} camera: a colour filter lies on the sensor (gains of neighbouring pixels "
-            + " ".join(f"{gain:.2f}" for gain in pattern.ravel())
-            + "): they are divided by it, which is right for grey discs only; a monochrome camera sees more",
-        )
-        for name, pattern in zip(frames.CAMERAS, gains, strict=True)
-        if pattern is not None
-    ]
-    told += [
-        (name, f"{name} camera: {int(mask.sum())} pixels show one value whatever passes; their neighbours stand in")
-        for name, mask in zip(frames.CAMERAS, stuck, strict=True)
-        if mask is not None
-    ]
+    told: list[tuple[str, str]] = []
+    for name, pattern, mask in zip(frames.CAMERAS, gains, stuck, strict=True):
+        if pattern is not None:
+            text = (
+                f"{name} camera: a colour filter lies on the sensor (gains of neighbouring pixels "
+                f"{' '.join(f'{gain:.2f}' for gain in pattern.ravel())}): they are divided by it, which is right for "
+                "grey discs only; a monochrome camera sees more"
+            )
+            told.append((name, text))
+        if mask is not None:
+            text = f"{name} camera: {int(mask.sum())} pixels show one value whatever passes; their neighbours stand in"
+            told.append((name, text))
     if not told:
         return read_blocks, []
 
@@ -290,18 +266,6 @@ def _without_mosaic(images: NDArray, gains: NDArray) -> NDArray:
     height, width = images.shape[-2:]
     pattern = np.tile(gains, (height // 2 + 1, width // 2 + 1))[:height, :width]
     return np.clip(np.rint(images / pattern), 0, np.iinfo(images.dtype).max).astype(images.dtype)
-
-
-def _cut(block: PairBlock, edges: Sequence[int]) -> list[range]:
-    """The block's frames without any edge inside."""
-    first, stop = int(block.frames[0]), int(block.frames[-1]) + 1
-    inside = [first, *(edge for edge in edges if first < edge < stop), stop]
-    return [range(a, b) for a, b in pairwise(inside)]
-
-
-def _first_law(earlier: Sequence[Follower]) -> Law | None:
-    """Noise and blur of the first stretch that could measure them; waits for those that are not done."""
-    return next((law for follower in earlier if (law := follower.told.result()) is not None), None)
 
 
 def _torn(tables: Tables, edge: int) -> bool:

@@ -1,12 +1,11 @@
 """A camera that was moved or turned after its calibration, from images in which no disc is found for that reason.
 
 Each camera alone still sees the dots as declared. From blobs in some pairs, one pose for each pair and one turn and
-shift of the right camera for all are fitted (`as_printed`, with a rig of which nothing else is open): to a tenth of a
+shift of the right camera for all are fitted (`self_calibration.fit_shared`): to a tenth of a
 degree and a millimetre or two, as the two make up for each other; enough to say what happened.
 """
 
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,14 +16,13 @@ from disctrack.findings import NONSENSE, Finding, Kind, Number, Remedy, Severity
 from disctrack.frames import vector_from_rotation
 from disctrack.track.dots.acquisition import MIN_EXPLAINED, expected_diameter_px, seen_by_one_camera
 from disctrack.track.pose import fit_poses
-from disctrack.track.refine.self_calibration import MIN_FRAMES, refine_as_built
+from disctrack.track.refine.self_calibration import MIN_FRAMES, DotsInFrames, fit_shared
 
 BLOB_PX = 0.5  # standard deviation of a blob's centroid under uneven light
 TURN, SHIFT = np.radians(1.0), 2e-3  # [rad], [m] what cameras suffer without anybody's notice: prior sigmas
 MOST_SIGMAS = 4.0  # beyond, it is something else
 FITS_PX = 1.0  # rms of blobs about the fit
 BETTER = 3.0  # times, than with the camera where it was
-_POSE = np.r_[PAIR_TURN, PAIR_SHIFT]  # of RIG_PARAMETERS: the right camera's turn and shift
 
 
 def moved_camera(pairs: NDArray, rig: StereoRig, disc: Disc) -> Iterator[Finding]:
@@ -45,21 +43,15 @@ def moved_camera(pairs: NDArray, rig: StereoRig, disc: Disc) -> Iterator[Finding
     began = fit_poses(
         left_alone, covariance, rig, disc.marker_centres_body, R, t, reject_outliers=False, with_sensitivity=False
     )
-    free = np.zeros((N_RIG, N_RIG))
-    free[_POSE, _POSE] = np.repeat([TURN**2, SHIFT**2], 3)
-    found = refine_as_built(
-        pixels,
-        covariance,
-        replace(rig, covariance=free),
-        disc,
-        began.R_world_body,
-        began.t_world_body,
-        refine_markers=False,
-        refine_rig=True,
-    )
-    rms = BLOB_PX * np.sqrt([found.reduced_chi_square_before, found.reduced_chi_square_after])
-    turn = np.linalg.norm(vector_from_rotation(found.rig.R_right_left @ rig.R_right_left.T))
-    shift = np.linalg.norm(found.rig.t_right_left - rig.t_right_left)
+    free = np.zeros(N_RIG + 2 * disc.n_markers, bool)
+    free[PAIR_TURN] = free[PAIR_SHIFT] = True
+    information = np.diag(np.repeat([TURN**-2, SHIFT**-2], 3))
+    dots = DotsInFrames(rig, disc, pixels, covariance, began.R_world_body, began.t_world_body)
+    found = fit_shared(dots, free, information)
+    rms = BLOB_PX * np.sqrt(found.reduced_chi_square)
+    moved = rig.perturbed(found.shift[:N_RIG])
+    turn = np.linalg.norm(vector_from_rotation(moved.R_right_left @ rig.R_right_left.T))
+    shift = np.linalg.norm(moved.t_right_left - rig.t_right_left)
     if rms[-1] < FITS_PX and rms[0] > BETTER * rms[-1] and max(turn / TURN, shift / SHIFT) < MOST_SIGMAS:
         text = (
             f"the right camera was turned by about {np.degrees(turn):.1f} deg and shifted by {1e3 * shift:.0f} mm "

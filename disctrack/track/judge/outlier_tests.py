@@ -5,10 +5,9 @@ not. Levels are those of chi-square distributions; what is usual, in a recording
 taken from the frames around, so that a frame is judged by its neighbours and by nothing far away.
 """
 
+import warnings
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
-from functools import partial
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 import scipy
@@ -17,7 +16,6 @@ from numpy.typing import NDArray
 from calibration.kit.arrays import Array, Mask
 from disctrack.frames import rotation_from_vector, vector_from_rotation
 from disctrack.track.pose import PoseFits
-from disctrack.track.side_by_side import side_by_side
 from disctrack.trajectory import FrameStatus
 
 FEW = 4  # frames beside a cut that tell how large the misfit is there
@@ -75,12 +73,8 @@ def _usual(values: Array) -> tuple[Array, Array]:
 
 def _nanmedian(values: Array) -> Array:
     """Median along axis 1 without NaN; NaN where there is nothing, without a warning."""
-    ordered = np.sort(values, axis=1)  # NaN last
-    count = np.isfinite(ordered).sum(axis=1)
-    low, high = np.maximum(count - 1, 0) // 2, count // 2
-    high = np.minimum(high, values.shape[1] - 1)
-    take = [np.take_along_axis(ordered, k[:, None], axis=1)[:, 0] for k in (low, high)]
-    return np.where(count > 0, 0.5 * (take[0] + take[1]), np.nan)
+    with warnings.catch_warnings(action="ignore", category=RuntimeWarning):
+        return np.asarray(np.nanmedian(values, axis=1))
 
 
 def outlying_frames(residuals: Array) -> Mask:
@@ -153,14 +147,6 @@ def _connected(n: int, best: int, fits: Callable[[int, int, int], bool]) -> Mask
     return kept
 
 
-@dataclass(frozen=True)
-class Verdicts:
-    """What the poses of n frames are worth."""
-
-    status: NDArray[np.uint8]  # (n,) MEASURED, or why the pose is refused: REPEATED, CONTRADICTED or JUMPED
-    factor: Array  # (n,) on the pose's covariance, at least 1
-
-
 def judge_poses(
     fits: PoseFits,
     repeated: Mask,
@@ -168,13 +154,15 @@ def judge_poses(
     outlying: Mask,
     period: float,
     radius: float,
-    workers: int = 1,
-) -> Verdicts:
+) -> tuple[NDArray[np.uint8], Array]:
     """Judge every pose by its residuals and by the motion of its neighbours.
+
+    Returns of n frames MEASURED, or why the pose is refused (REPEATED, CONTRADICTED or JUMPED), and the factor, at
+    least 1, on its covariance.
 
     fits : with the covariances and chi-squares scaled as they will be told; repeated (n,): both images are those of a
     frame before; struck (n,): dots left out as outliers; outlying (n,): frames by which no other is to be judged;
-    period [s] of the frames; radius [m] of the disc; workers: threads
+    period [s] of the frames; radius [m] of the disc
     """
     status = np.full(len(struck), FrameStatus.MEASURED, np.uint8)
     freedom = fits.degrees_of_freedom
@@ -191,9 +179,7 @@ def judge_poses(
     rest = _at_rest(fits)
     lost = repeated & ~_still_over_the_repeats(repeated, rest)
     good = replace(fits, converged=fits.converged & ~contradicted & ~lost)
-    ways = (partial(departure, weights=weights) for weights in (FROM_BEFORE, FROM_AFTER, FROM_BOTH))
-    asked: tuple[Callable[[PoseFits], Any], ...] = (*ways, partial(torn_off, period=period, radius=radius))
-    *one_sided, both, torn = side_by_side(lambda judge: judge(good), asked, workers)
+    *one_sided, both = (departure(good, weights) for weights in (FROM_BEFORE, FROM_AFTER, FROM_BOTH))
     nearest = np.fmin(*one_sided)
     moved = nearest / _quiet(nearest, rest)
     # next to an end or a gap, a quadratic is all there is, and it follows a slow camera's frames far worse
@@ -201,11 +187,11 @@ def judge_poses(
     moved = np.where(np.isnan(both), moved, inner / _quiet(inner, rest))
     with np.errstate(invalid="ignore"):
         jumped = moved > _of_six(CHANCE) * 2.0  # the smallest of three, in motion that is not quite steady
-    status[jumped | torn] = FrameStatus.JUMPED
+    status[jumped | torn_off(good, period, radius)] = FrameStatus.JUMPED
     status[contradicted] = FrameStatus.CONTRADICTED
     status[lost] = FrameStatus.REPEATED
     status[~fits.converged] = FrameStatus.MEASURED  # nothing to judge
-    return Verdicts(status, np.maximum(np.nan_to_num(factor, nan=1.0), 1.0))
+    return status, np.maximum(np.nan_to_num(factor, nan=1.0), 1.0)
 
 
 def _of_six(chance: float) -> float:

@@ -27,13 +27,12 @@ from typing import NamedTuple
 import numpy as np
 
 from calibration.cameras.camera import StereoRig
-from calibration.kit.arrays import Array, Array32, Mask
+from calibration.kit.arrays import Array, Mask
 from disctrack.disc import Disc
 from disctrack.findings import Finding, Kind, Severity
 from disctrack.frames import CAMERAS
 from disctrack.track.dots.template_response import Pull, half_axes, plane_to_image, pulls_by_exposure, turned_to_axes
 from disctrack.track.pose import marker_pixels
-from disctrack.track.side_by_side import side_by_side
 
 BORROWED_FROM = 2  # frames: beside a gap, the acceleration of a neighbour up to this far away is used
 OF_SMEAR = 500  # frames at most that the smear is taken from
@@ -91,9 +90,7 @@ def shift_by_exposure(
     return np.where(np.isfinite(shift), shift, 0.0)
 
 
-def exposure_by_smear(
-    R: Array, t: Array, time: Array, blur_px: Array32, rig: StereoRig, disc: Disc, workers: int = 1
-) -> ExposureSquared:
+def exposure_by_smear(R: Array, t: Array, time: Array, blur_px: Array, rig: StereoRig, disc: Disc) -> ExposureSquared:
     """The exposures that the dots' edges tell; arguments as of `shift_by_exposure`, blur_px (n, 2, m) sigma of an edge.
 
     The squared blur is fitted by a constant of every dot, what changes with the distance (to second order), with the
@@ -115,10 +112,10 @@ def exposure_by_smear(
         distance = points @ R_camera_world[2] + t_camera_world[2]
         long, short = half_axes(affine[:, camera])
         optics = [_standardised(x) for x in (distance, *np.moveaxis(pixels[own, camera], -1, 0), short / long)]
-        squared = np.asarray(blur_px[chosen, camera], float) ** 2
+        squared = blur_px[chosen, camera] ** 2
         return _slope(squared, smear[:, camera], [optics[0] ** 2, *optics])
 
-    value, sigma = np.transpose(side_by_side(of_camera, (0, 1), workers))
+    value, sigma = np.transpose([of_camera(camera) for camera in (0, 1)])
     return ExposureSquared(value, sigma)
 
 

@@ -18,7 +18,7 @@ from numpy.polynomial.polynomial import polyder, polyval2d
 from numpy.typing import NDArray
 
 from calibration.cameras.camera import StereoRig
-from calibration.kit.arrays import Array, Array32, Mask
+from calibration.kit.arrays import Array, Mask
 from disctrack.disc import Disc
 from disctrack.track.dots.template_response import Pull, plane_to_image, pulls_by_contrast, turned_to_axes
 from disctrack.track.pose import marker_pixels
@@ -37,9 +37,7 @@ LIKELIER = 6.0  # of natural logarithms
 AT_ONCE = 4096  # poses
 
 
-def shift_by_gleam(
-    R: Array, t: Array, contrast: Array32, rig: StereoRig, disc: Disc, pulls: tuple[Pull, Pull]
-) -> Array:
+def shift_by_gleam(R: Array, t: Array, contrast: Array, rig: StereoRig, disc: Disc, pulls: tuple[Pull, Pull]) -> Array:
     """(n, 2, m, 2) [px] by which templates find the dots beside their places; zero where not known.
 
     R (n, 3, 3), t (n, 3) [m]: poses, NaN where there is none; contrast (n, 2, m) of each dot with its paper, NaN where
@@ -50,7 +48,7 @@ def shift_by_gleam(
     apart = _apart(R, t, disc)
     chosen = apart[np.unique(np.linspace(0, len(apart) - 1, min(len(apart), OF_CONTRAST)).astype(int))]
     pixels = marker_pixels(R[chosen], t[chosen], rig, disc.marker_centres_body)[0]
-    fields = [_Field.fitted(pixels[:, c], np.asarray(contrast[chosen, c], float)) for c in (0, 1)]
+    fields = [_Field.fitted(pixels[:, c], contrast[chosen, c]) for c in (0, 1)]
     for first in range(0, n if any(fields) else 0, AT_ONCE):
         rows = slice(first, first + AT_ONCE)
         places, J = marker_pixels(R[rows], t[rows], rig, disc.marker_centres_body)

@@ -11,26 +11,25 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibration.cameras.camera import INTRINSIC_PARAMETERS, N_RIG, PAIR_SHIFT, StereoRig
-from calibration.kit.arrays import Array, Mask
+from calibration.kit.arrays import Array
 from disctrack.disc import Disc
 from disctrack.track.pose import PoseFits, whitening
 from disctrack.track.refine.self_calibration import (
     DOT_SIGMA,
+    SHARED_FRAMES,
     DotsInFrames,
     declared_places_kept,
     fit_shared,
     places_sigma,
 )
+from disctrack.track.side_by_side import evenly
 
-_AT_ONCE = 4096  # frames
 MIN_FRAMES = 20
 LEAST_NOISE = 0.25  # of the variance that flat parts of the image tell: the rest may be the pixels' fixed pattern
-ITERATIONS = 3
 # How far a camera may be off: far more than any that is still of use, and enough to bound what the disc does not tell.
 _WIDE = {"fx": 20.0, "fy": 20.0, "cx": 10.0, "cy": 10.0, "k1": 0.05, "k2": 0.2, "k3": 0.5, "p1": 5e-3, "p2": 5e-3}
 _WIDE_ROTATION, _WIDE_TRANSLATION = 0.02, 0.01  # [rad], [m]
 _WIDE_DELAY = 1.0  # in frame periods
-_N_RELATIVE = PAIR_SHIFT.stop  # of RIG_PARAMETERS; the others place the world, which moves all poses alike
 
 
 @dataclass(frozen=True)
@@ -41,54 +40,38 @@ class SharedFaults:
     marker_shift: Array  # (m, 3) [m] from the declared places, body axes
     marker_shift_sigma: Array  # (m, 2) [m] of the dots against each other
     delay: float  # [frame periods] of the right camera against the left
-    n_frames: int
 
 
 def without_shared_faults(
-    markers_px: Array,
-    markers_covariance_px2: Array,
-    rig: StereoRig,
-    disc: Disc,
-    R: Array,
-    t: Array,
-    *,
-    max_frames: int = 400,
-    workers: int = 1,
+    markers_px: Array, markers_covariance_px2: Array, rig: StereoRig, disc: Disc, R: Array, t: Array
 ) -> SharedFaults | None:
     """Refine cameras, dots and delay together, with a free pose for each of n successive frames.
 
-    Shapes as in `pose.fit_poses`; workers: threads. None if fewer than MIN_FRAMES frames, with both
-    their neighbours, are complete.
+    Shapes as in `pose.fit_poses`. None if fewer than MIN_FRAMES frames, with both their neighbours, are complete.
     """
-    seen: Mask = np.asarray(np.isfinite(markers_px).all(-1))
-    steady = np.zeros(len(R), bool)
-    complete = np.asarray(seen.all(axis=(1, 2)) & np.isfinite(t).all(axis=1))
-    steady[1:-1] = complete[:-2] & complete[1:-1] & complete[2:]
-    rows = np.flatnonzero(steady)
+    complete = np.asarray(np.isfinite(markers_px).all((1, 2, 3)) & np.isfinite(t).all(axis=1))
+    rows = evenly(np.flatnonzero(complete[:-2] & complete[1:-1] & complete[2:]) + 1, SHARED_FRAMES)
     if len(rows) < MIN_FRAMES:
         return None
-    rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(max_frames, len(rows))).astype(int))]
     by_delay = 0.5 * (markers_px[rows + 1] - markers_px[rows - 1])  # per frame period
     by_delay[:, 0] = 0.0
 
     m = disc.n_markers
     wide = np.concatenate([_wide_rig(), np.full(2 * m, DOT_SIGMA), [_WIDE_DELAY]])
-    estimated = np.concatenate([np.diag(rig.covariance)[:_N_RELATIVE] > 0, np.zeros(N_RIG - _N_RELATIVE, bool)])
-    free = np.concatenate([estimated, np.ones(2 * m + 1, bool)])
+    free = np.ones(len(wide), bool)
+    free[:N_RIG] = (np.diag(rig.covariance) > 0) & (np.arange(N_RIG) < PAIR_SHIFT.stop)
     frames = DotsInFrames(
         rig, disc, markers_px[rows], markers_covariance_px2[rows], R[rows], t[rows], by_delay[..., None]
     )
-    joint = fit_shared(frames, free, np.diag(wide[free] ** -2), ITERATIONS, workers=workers)
+    joint = fit_shared(frames, free, np.diag(wide[free] ** -2))
     shift, dots = joint.shift, slice(N_RIG, N_RIG + 2 * m)
     _, fits = joint.frames.posed(shift, reject=True)
-    reduced = trimmed_reduced_chi_square(fits)
     spent = int(fits.degrees_of_freedom[fits.converged].sum())
     return SharedFaults(
-        reduced_chi_square=reduced * spent / max(spent - int(free.sum()), 1),
+        reduced_chi_square=trimmed_reduced_chi_square(fits) * spent / max(spent - int(free.sum()), 1),
         marker_shift=declared_places_kept(disc, shift[dots].reshape(m, 2)),
         marker_shift_sigma=places_sigma(disc, joint.covariance[dots, dots]),
         delay=float(shift[-1]),
-        n_frames=len(rows),
     )
 
 
@@ -117,15 +100,14 @@ def split_scatter(fits: PoseFits, markers_covariance_px2: Array, faults: SharedF
     freedom = float(np.sum(fits.degrees_of_freedom[fits.degrees_of_freedom >= 6]))
     by_chance = 3.0 * noise * np.sqrt(6.0 / max(freedom, 1.0))
     systematic = whole - noise if whole - noise > by_chance else 0.0
-    rms = (0.0, 0.0)
+    systematic_px = 0.0, 0.0
     if systematic:
         share = systematic / whole * 2 * float(fits.used.sum()) / freedom  # the poses take their part of the residuals
-        square = np.where(fits.used[..., None], fits.residuals_px**2, np.nan)
+        seen = (fits.residuals_px[:, camera][fits.used[:, camera]] for camera in (0, 1))  # nothing: it sees no dot
         # of a normal distribution the median square is 0.455 variances; smears and objects in view do not count
-        seen = [square[:, camera][np.isfinite(square[:, camera])] for camera in (0, 1)]  # none: it sees no dot
-        left, right = (float(np.sqrt(np.median(one) / 0.455 * share)) if one.size else 0.0 for one in seen)
-        rms = (left, right)
-    return Scatter(max(1.0, whole), noise, systematic, (rms[0], rms[1]))
+        left, right = (float(np.sqrt(np.median(one**2) / 0.455 * share)) if one.size else 0.0 for one in seen)
+        systematic_px = left, right
+    return Scatter(max(1.0, whole), noise, systematic, systematic_px)
 
 
 def frame_to_frame_chi_square(fits: PoseFits, markers_covariance_px2: Array) -> float | None:
@@ -140,14 +122,10 @@ def frame_to_frame_chi_square(fits: PoseFits, markers_covariance_px2: Array) -> 
     rows = np.flatnonzero(steady & (same >= 6))
     if len(rows) < MIN_FRAMES:
         return None
-    residuals, square = fits.residuals_px, []
-    for some in np.array_split(rows, len(rows) // _AT_ONCE + 1):
-        used = fits.used[some + 1]
-        bend = residuals[some] - 2.0 * residuals[some + 1] + residuals[some + 2]
-        W = whitening(np.where(used[..., None, None], markers_covariance_px2[some + 1], np.eye(2)))
-        whitened = np.where(used[..., None], (W @ np.where(used[..., None], bend, 0.0)[..., None])[..., 0], 0.0)
-        square.append(np.sum(whitened**2, axis=(1, 2, 3)))
-    return _trimmed_mean(np.concatenate(square) / (6.0 * same[rows]))
+    used, r = fits.used[rows][..., None], fits.residuals_px
+    bend = np.where(used, r[rows] - 2.0 * r[rows + 1] + r[rows + 2], 0.0)
+    whitened = (whitening(markers_covariance_px2[rows + 1]) @ bend[..., None])[..., 0]
+    return _trimmed_mean(np.sum(whitened**2, axis=(1, 2, 3)) / (6.0 * same[rows]))
 
 
 def trimmed_reduced_chi_square(fits: PoseFits) -> float:

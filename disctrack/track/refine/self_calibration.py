@@ -22,24 +22,23 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.cameras.camera import N_RIG, PAIR_SHIFT, StereoRig
 from calibration.judge.tolerances import SIZE
 from calibration.kit.arrays import Array, Mask
 from calibration.kit.least_squares import normal_of_rows, scaled_solve
 from disctrack.disc import Disc
-from disctrack.track.pose import PoseFits, fit_poses, marker_pixels, whitening
-from disctrack.track.side_by_side import side_by_side
+from disctrack.track.pose import PoseFits, fit_poses, misses, whitening
+from disctrack.track.side_by_side import evenly
 
 DOT_SIGMA = 50e-6  # [m] how far a printed dot may lie from its declared place: tens of micrometres are usual
 # The template's and the camera model's own errors (0.002 px) repeat from frame to frame, so that a long recording must
 # not be taken for as many independent measurements: this much is added to every dot's sigma per shared direction.
 SYSTEMATIC_PX = 0.002
 SIZE_FLOOR = 3e-6  # relative, of the dots as a ruler: metal and paper grow by some 1e-5 per kelvin
-ITERATIONS = 4
-_AT_ONCE = 128  # frames, whose rows stay in a core's cache
+ITERATIONS = 3
 MIN_FRAMES = 10
+SHARED_FRAMES = 400  # that enter at most: SYSTEMATIC_PX bounds what more could add
 MANY_DOTS = 5  # from which one may be left out
 SUM_OF_LENGTHS = 1.35  # variance of the pattern's place by the sum of lengths over that by the sum of squares
 
@@ -52,73 +51,43 @@ class AsBuilt:
     disc: Disc
     marker_shift: Array  # (m, 3) [m] refined minus declared, body axes; third component 0
     marker_shift_sigma: Array  # (m, 2) [m] of the dots against each other
-    rig_shift_sigmas: Array  # (30,) change of the rig's parameters in units of their prior sigma; 0 where fixed
-    reduced_chi_square_before: float
-    reduced_chi_square_after: float
-    n_frames: int  # that entered
+    reduced_chi_square: float = float("nan")  # of the dots about their poses
     size: float = 0.0  # relative, by which dots that are as declared make all lengths longer than the board does
     size_sigma: float = float("nan")  # of the dots as a ruler
     size_share: float = 0.0  # of that, which the rig has been made larger by
 
+    @classmethod
+    def as_declared(cls, rig: StereoRig, disc: Disc) -> AsBuilt:
+        """Nothing refined."""
+        m = disc.n_markers
+        return cls(rig, disc, np.zeros((m, 3)), np.full((m, 2), DOT_SIGMA))
+
 
 def refine_as_built(
-    markers_px: Array,
-    markers_covariance_px2: Array,
-    rig: StereoRig,
-    disc: Disc,
-    R: Array,
-    t: Array,
-    *,
-    refine_markers: bool = True,
-    refine_rig: bool = False,
-    max_frames: int = 2000,
+    markers_px: Array, markers_covariance_px2: Array, rig: StereoRig, disc: Disc, R: Array, t: Array
 ) -> AsBuilt:
-    """Refine dots and rig from the marker centres of n frames; shapes as in `pose.fit_poses`.
+    """Refine the dots' places, and the rig's size, from the marker centres of n frames; shapes as in `pose.fit_poses`.
 
     Frames with fewer than all dots serve too. Fewer than MIN_FRAMES frames leave everything as declared. Dots are moved
     by that share of their displacements which is theirs, not their sigma's (`share_of_places`).
     """
-    good = np.flatnonzero(np.isfinite(t).all(1) & (np.isfinite(markers_px).all(-1).sum((1, 2)) >= 4))
-    rows = good[np.unique(np.linspace(0, len(good) - 1, min(max_frames, len(good))).astype(int))] if len(good) else good
+    rows = evenly(
+        np.flatnonzero(np.isfinite(t).all(1) & (np.isfinite(markers_px).all(-1).sum((1, 2)) >= 4)), SHARED_FRAMES
+    )
+    if len(rows) < MIN_FRAMES:
+        return AsBuilt.as_declared(rig, disc)
     m = disc.n_markers
-    unchanged = AsBuilt(
-        rig, disc, np.zeros((m, 3)), np.full((m, 2), DOT_SIGMA), np.zeros(N_RIG), np.nan, np.nan, len(rows)
-    )
-    if len(rows) < MIN_FRAMES or not (refine_markers or refine_rig):
-        return unchanged
-
-    prior_sigma = np.concatenate([np.sqrt(np.diag(rig.covariance)), np.full(2 * m, DOT_SIGMA)])
-    free = np.concatenate([(prior_sigma[:N_RIG] > 0) & refine_rig, np.full(2 * m, refine_markers)])
-    frames = DotsInFrames(rig, disc, markers_px[rows], markers_covariance_px2[rows], R[rows], t[rows])
-    information = _prior_information(rig.covariance, free, m)
-    joint = fit_shared(frames, free, information, ITERATIONS, enough=0.02 * prior_sigma[free], repeats=SYSTEMATIC_PX)
-    shift, remaining, current_rig = joint.shift, joint.covariance, rig.perturbed(joint.shift[:N_RIG])
-    sigma = places_sigma(disc, remaining[N_RIG:, N_RIG:])
-    if refine_rig:
-        current_rig = replace(current_rig, covariance=remaining[:N_RIG, :N_RIG], allowances=())
-    moved = shift[N_RIG:].reshape(m, 2)
-    size, size_sigma, size_share = 0.0, float("nan"), 0.0
-    if refine_markers and not refine_rig:
-        size, size_sigma = pattern_size(disc, moved, remaining[N_RIG:, N_RIG:])
-        current_rig, size_share = sized_by_pattern(rig, size, size_sigma)
-        moved = moved + size_share * size * _from_middle(disc)
+    free = np.arange(N_RIG + 2 * m) >= N_RIG
+    dots = DotsInFrames(rig, disc, markers_px[rows], markers_covariance_px2[rows], R[rows], t[rows])
+    joint = fit_shared(dots, free, np.eye(2 * m) / DOT_SIGMA**2, repeats=SYSTEMATIC_PX)
+    moved, remaining = joint.shift[N_RIG:].reshape(m, 2), joint.covariance[N_RIG:, N_RIG:]
+    sigma = places_sigma(disc, remaining)
+    size, size_sigma = pattern_size(disc, moved, remaining)
+    rig, size_share = sized_by_pattern(rig, size, size_sigma)
+    moved = moved + size_share * size * _from_middle(disc)
     kept = share_of_places(disc, moved, sigma) * declared_places_kept(disc, moved)
-    current_disc = replace(disc, marker_centres_body=disc.marker_centres_body + kept)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        in_sigmas = np.where(free[:N_RIG], shift[:N_RIG] / prior_sigma[:N_RIG], 0.0)
-    return AsBuilt(
-        rig=current_rig,
-        disc=current_disc,
-        marker_shift=kept,
-        marker_shift_sigma=sigma,
-        rig_shift_sigmas=in_sigmas,
-        reduced_chi_square_before=joint.reduced_chi_square[0],
-        reduced_chi_square_after=joint.reduced_chi_square[-1],
-        n_frames=len(rows),
-        size=size,
-        size_sigma=size_sigma,
-        size_share=size_share,
-    )
+    disc = replace(disc, marker_centres_body=disc.marker_centres_body + kept)
+    return AsBuilt(rig, disc, kept, sigma, joint.reduced_chi_square[-1], size, size_sigma, size_share)
 
 
 @dataclass(frozen=True)
@@ -136,60 +105,41 @@ class DotsInFrames:
     t: Array  # (n, 3) [m]
     further: Array | None = None  # (n, 2, m, 2, j) derivatives of the pixels by anything else
 
-    def shifted(self, shift: Array) -> tuple[Array, StereoRig, Array]:
-        """The pixels (n, 2, m, 2) without what else moved them, the rig, and the dots' places (m, 3) [m]."""
+    def shifted(self, shift: Array) -> tuple[Array, Array, StereoRig, Array]:
+        """The pixels (n, 2, m, 2) without what else moved them, their covariance, the rig, the dots' places (m, 3)."""
         places = slice(N_RIG, N_RIG + 2 * self.disc.n_markers)
         moved = np.column_stack([shift[places].reshape(-1, 2), np.zeros(self.disc.n_markers)])
         pixels = self.pixels if self.further is None else self.pixels - self.further @ shift[places.stop :]
-        return pixels, self.rig.perturbed(shift[:N_RIG]), self.disc.marker_centres_body + moved
+        return pixels, self.covariance, self.rig.perturbed(shift[:N_RIG]), self.disc.marker_centres_body + moved
 
     def posed(self, shift: Array, reject: bool) -> tuple[DotsInFrames, PoseFits]:
         """The frames with the poses that go with the shift; where a fit fails, the pose before."""
-        pixels, rig, centres = self.shifted(shift)
-        fits = fit_poses(
-            pixels, self.covariance, rig, centres, self.R, self.t, reject_outliers=reject, with_sensitivity=False
-        )
+        fits = fit_poses(*self.shifted(shift), self.R, self.t, reject_outliers=reject, with_sensitivity=False)
         ok = fits.converged
         R = np.where(ok[:, None, None], fits.R_world_body, self.R)
         return replace(self, R=R, t=np.where(ok[:, None], fits.t_world_body, self.t)), fits
 
-    def normal(self, shift: Array, used: Mask, free: Mask, workers: int = 1) -> tuple[Array, Array]:
+    def normal(self, shift: Array, used: Mask, free: Mask) -> tuple[Array, Array]:
         """Normal matrix (k, k) and gradient (k,) of the free ones of what is shared, every frame's pose eliminated.
 
-        used : (n, 2, m) dots that count; free : (30 + 2m + j,); workers: threads
+        used : (n, 2, m) dots that count; free : (30 + 2m + j,)
         """
-        size, m = int(free.sum()), self.disc.n_markers
-        observed, rig, centres = self.shifted(shift)
-
-        def of(block: NDArray[np.intp]) -> Array:
-            """Sums (k, k + 1) over some frames: of the normal matrix, and of the gradient."""
-            R, t = self.R[block], self.t[block]
-            pixels, P = marker_pixels(R, t, rig, centres)
-            # d pixel / d point of the body = d pixel / d translation turned into body axes
-            d_body = P[..., :3] @ R[:, None, None]
-            C = np.zeros((len(block), 2, m, 2, len(free)))
-            if free[:N_RIG].any():
-                points = centres @ np.swapaxes(R, 1, 2) + t[:, None]
-                C[..., :N_RIG] = rig.project_with_jacobians(points)[2]
-            for k in range(m):
-                C[:, :, k, :, N_RIG + 2 * k : N_RIG + 2 * k + 2] = d_body[:, :, k, :, :2]
-            if self.further is not None:
-                C[..., N_RIG + 2 * m :] = self.further[block]
-            seen = used[block][..., None]
-            W = np.where(seen[..., None], whitening(np.where(seen[..., None], self.covariance[block], np.eye(2))), 0.0)
-            r = np.where(seen, observed[block] - pixels, 0.0)
-            rows = np.concatenate([P, C[..., free], r[..., None]], axis=-1)
-            whitened = np.empty_like(rows)  # W is a triangle
-            np.multiply(W[..., 0, 0, None], rows[..., 0, :], out=whitened[..., 0, :])
-            np.multiply(W[..., 1, 1, None], rows[..., 1, :], out=whitened[..., 1, :])
-            whitened[..., 1, :] += W[..., 1, 0, None] * rows[..., 0, :]
-            matrix, gradient = normal_of_rows(whitened.reshape(len(block), -1, 6 + size + 1), 6).eliminated()
-            return np.column_stack([matrix, gradient])
-
-        blocks = np.array_split(np.arange(len(self.R)), max(1, len(self.R) // _AT_ONCE))
-        sums = np.sum(side_by_side(of, blocks, workers), axis=0)
-        normal, gradient = sums[:, :-1], sums[:, -1]
-        return 0.5 * (normal + normal.T), gradient
+        _, covariance, rig, centres = shifted = self.shifted(shift)
+        residuals, by_pose, known = misses(*shifted, self.R, self.t)
+        by_shared = np.zeros((*residuals.shape, len(free)))
+        W = whitening(covariance)
+        if free[:N_RIG].any():
+            points = centres @ np.swapaxes(self.R, 1, 2) + self.t[:, None]
+            by_shared[..., :N_RIG] = W @ rig.project_with_jacobians(points)[2]
+        # a step of a dot on the body moves its image as the same step of the body, turned into the body's axes
+        by_place = by_pose[..., :3] @ self.R[:, None, None, :, :2]
+        for k in range(self.disc.n_markers):
+            by_shared[:, :, k, :, N_RIG + 2 * k : N_RIG + 2 * k + 2] = by_place[:, :, k]
+        if self.further is not None:
+            by_shared[..., -self.further.shape[-1] :] = W @ self.further
+        rows = np.concatenate([by_pose, by_shared[..., free], residuals[..., None]], axis=-1)
+        rows = np.where((used & known)[..., None, None], rows, 0.0)
+        return normal_of_rows(rows.reshape(len(rows), -1, rows.shape[-1]), 6).eliminated()
 
 
 @dataclass(frozen=True)
@@ -202,35 +152,23 @@ class SharedFit:
     frames: DotsInFrames  # with the poses before the last step
 
 
-def fit_shared(
-    frames: DotsInFrames,
-    free: Mask,
-    information: Array,
-    iterations: int,
-    *,
-    enough: Array | float = 0.0,
-    repeats: float = 0.0,
-    workers: int = 1,
-) -> SharedFit:
-    """Fit what is free (30 + 2m + j,) of what the frames share, by Gauss-Newton; workers: threads.
+def fit_shared(frames: DotsInFrames, free: Mask, information: Array, repeats: float = 0.0) -> SharedFit:
+    """Fit what is free (30 + 2m + j,) of what the frames share, by Gauss-Newton.
 
-    information : (k, k) of the prior about nought; enough : a step smaller than this (k,) is the last
+    information : (k, k) of the prior about nought
     repeats : [px] errors that are common to all frames: they bound what these tell together
     """
     shift, reduced = np.zeros(len(free)), []
-    for iteration in range(iterations):
+    for iteration in range(ITERATIONS):
         frames, fits = frames.posed(shift, reject=iteration > 0)
         ok = fits.converged
         reduced.append(float(fits.chi_square[ok].sum() / max(fits.degrees_of_freedom[ok].sum(), 1)))
         used = fits.used & ok[:, None, None]
-        normal, gradient = frames.normal(shift, used, free, workers)
+        normal, gradient = frames.normal(shift, used, free)
         # dots that scatter more than the image noise alone makes them tell accordingly less, whatever is common to them
         scale = _information_scale(frames.covariance, used, repeats) / _scatter_left(fits, normal, gradient)
         matrix = scale * normal + information
-        step = scaled_solve(matrix, scale * gradient - information @ shift[free])
-        shift[free] += step
-        if np.all(np.abs(step) < enough) and iteration > 0:
-            break
+        shift[free] += scaled_solve(matrix, scale * gradient - information @ shift[free])
     covariance = np.zeros((len(shift), len(shift)))
     covariance[np.ix_(free, free)] = scaled_solve(matrix, np.eye(len(matrix)))
     return SharedFit(shift, covariance, reduced, frames)
@@ -266,6 +204,12 @@ def pattern_place(disc: Disc, shift: Array, sigma: Array) -> tuple[float, float]
     found = float(squares.sum()) / (2 * m - 3)
     variance = max(0.0, found - float(np.mean(sigma**2))) * SUM_OF_LENGTHS * freedom / (freedom - 2)
     return variance / m, variance / float(np.sum(_from_middle(disc) ** 2))
+
+
+def by_pattern(as_built: AsBuilt, R: Array) -> Array:
+    """(n, 6, 3) change of poses R (n, 3, 3) whose dots are off as a whole, too, by one sigma of each way of it."""
+    place, turn = pattern_place(as_built.disc, as_built.marker_shift, as_built.marker_shift_sigma)
+    return motions_of_pattern(R, as_built.disc) * np.sqrt([place, place, turn])
 
 
 def motions_of_pattern(R: Array, disc: Disc) -> Array:
@@ -321,21 +265,6 @@ def _from_middle(disc: Disc) -> Array:
     """(m, 2) [m] from the middle of the dots."""
     d: Array = disc.marker_centres_body[:, :2] - disc.marker_centres_body[:, :2].mean(axis=0)
     return d
-
-
-def _prior_information(rig_covariance: Array, free: Mask, m: int) -> Array:
-    information = np.zeros((len(free), len(free)))
-    rig_free = np.flatnonzero(free[:N_RIG])
-    if rig_free.size:
-        block = rig_covariance[np.ix_(rig_free, rig_free)]
-        scale = np.sqrt(np.diag(block))
-        correlation = block / np.outer(scale, scale)
-        information[np.ix_(rig_free, rig_free)] = np.linalg.pinv(correlation, hermitian=True, rcond=1e-13) / np.outer(
-            scale, scale
-        )
-    dots = np.arange(N_RIG, N_RIG + 2 * m)
-    information[dots, dots] = DOT_SIGMA**-2
-    return information[np.ix_(free, free)]
 
 
 def declared_places_kept(disc: Disc, shift: Array) -> Array:

@@ -139,7 +139,7 @@ def table_from_disc(
     allowances = [replace(a, shift=kept @ a.shift) for a in rig.allowances]
     for cause, column in (("the disc's radius", by_disc[:, 0]), ("the disc's thickness", 0.5 * by_disc[:, 1])):
         allowances.append(Allowance(cause, M @ gain @ column))
-    allowances += [Allowance(OF_PATTERN, M @ gain @ column) for column in by_place.T]
+    allowances += [Allowance(OF_PATTERN, M @ gain @ column) for column in by_place.T if column.any()]
     covariance = 0.5 * (covariance + covariance.T)
     return moved, systematic, replace(rig, covariance=covariance, allowances=tuple(allowances)), told
 

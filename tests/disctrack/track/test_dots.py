@@ -10,15 +10,10 @@ from calibration.cameras.camera import normalised_maps
 from disctrack import frames
 from disctrack.synthetic import expected_disc, render_disc, rig_of
 from disctrack.synthetic.description import Scene
-from disctrack.track.dots import _kernels as kernels
-from disctrack.track.dots.template import (
-    NoiseModel,
-    locate_on_disc,
-    locate_on_plane,
-    measure_noise,
-)
+from disctrack.track.dots.template import NoiseModel, locate_on_disc, measure_noise
 from disctrack.trajectory import MarkerStatus
 from tests.disctrack.conftest import RenderedPairs, disc_on_table
+from tests.oracles.flat_dots import locate_on_plane
 
 SENSOR_NOISE = NoiseModel(0.64 + 1 / 12, 0.02)  # of the default scene: read noise, rounding, 50 electrons per grey
 
@@ -46,24 +41,6 @@ def locate_all(pairs, images, noise, rng=None, turned=0.0, moved=0.0, disc=None,
     centres = np.stack([dots.pixels for dots in found]).reshape(len(images), 2, -1, 2)
     covariance = np.stack([dots.covariance_px2 for dots in found]).reshape(*centres.shape, 2)
     return centres, covariance, found
-
-
-def test_status_codes_of_the_kernels_are_those_of_the_trajectory():
-    for name in ("MEASURED", "OUTSIDE", "LOW_CONTRAST", "OCCLUDED", "NOT_CONVERGED", "BLURRED", "NOT_LOOKED_FOR"):
-        assert getattr(kernels, name) == MarkerStatus[name]
-
-
-def test_compiled_projection_is_the_twin_of_the_camera_model(rendered_pairs, rng):
-    camera = rendered_pairs.rig.left
-    points = rng.uniform([-0.05, -0.05, 0.3], [0.05, 0.05, 0.6], (50, 3))
-    from calibration.cameras.camera import project_with_jacobians
-
-    pixels, d_point, _ = project_with_jacobians(points, camera)
-    for point, pixel, jacobian in zip(points, pixels, d_point, strict=True):
-        J = np.empty((2, 3))
-        assert_allclose(kernels.project_point(camera.parameters, *point), pixel, rtol=1e-13)
-        assert_allclose(kernels.project_point_jacobian(camera.parameters, *point, J), pixel, rtol=1e-13)
-        assert_allclose(J, jacobian, rtol=1e-11, atol=1e-9)
 
 
 def test_centres_have_no_bias_where_there_is_no_noise(rendered_pairs):
@@ -277,14 +254,14 @@ def test_a_dot_wider_than_the_rows_kept_for_it_loses_no_pixel():
     centre, radius, blur = np.array([148.3, 151.6]), 90.0, 12.0
     ink = np.clip(0.5 + radius - np.hypot(u - centre[0], v - centre[1]), 0, 1)
     image = np.round(256 * 200 * (1 - 0.8 * gaussian_filter(ink, blur))).astype(np.uint16)
-    result, p = np.empty(kernels.N_RESULT), np.empty(8)
-    start = np.array([148.0, 152.0, radius, 148.0, 152.0])
-    noise, others = np.array([1e4, 0, 1]), np.empty((0, 2))
-    status = kernels.fit_dot(image, u, v, np.eye(3), start, blur, noise, np.inf, others, *kernels.scratch(), p, result)
-    assert status == MarkerStatus.MEASURED
+    start = np.array([148.0, 152.0])
+    homography = np.eye(3)
+    homography[:2, 2] = start
+    found = locate_on_plane(image, homography, np.zeros((1, 2)), radius, noise=NoiseModel(1e4, 0), blur_px=blur)
+    assert found.status[0] == MarkerStatus.MEASURED
     # the band of pixels reaches from 3 blurs and 2 px inside the edge to 3 and 1 px outside
     outer, inner = radius + 3 * blur + 1, radius - 3 * blur - 2
-    assert_allclose(result[kernels.N_PIXELS], np.pi * (outer**2 - inner**2), rtol=0.01)
+    assert_allclose(found.n_pixels[0], np.pi * (outer**2 - inner**2), rtol=0.01)
     # a curved edge's blur is modelled to first order in blur over radius: an error of their ratio squared
     # of the 0.3 px by which the band of pixels is not centred
-    assert_allclose(start[:2] + p[:2], centre, atol=0.3 * (blur / radius) ** 2)
+    assert_allclose(found.pixels[0], centre, atol=0.3 * (blur / radius) ** 2)

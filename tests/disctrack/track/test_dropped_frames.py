@@ -1,30 +1,29 @@
 """Frames in which the cameras contradict each other: how many times a delay is told."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
-from disctrack.track.judge import dropped_frames as slips
+from disctrack.findings import Kind
+from disctrack.frames import rotation_from_quaternion
+from disctrack.track.judge.dropped_frames import dropped_frames
+from disctrack.track.pose import fit_poses
+from tests.oracles.measured_disc import measured
 
 
-@pytest.mark.parametrize(
-    ("delays", "sentences", "where"),
-    [((2.9, 3.0, 2.8), 1, "before frame 0"), ((2.9, 2.9), 2, "at frame 5"), ((1.0, 2.0, 3.0), 3, "at frame 5")],
-)
-def test_one_delay_in_three_stretches_is_one_sentence(monkeypatch, delays, sentences, where):
-    """Left-out images add up (1, 2, 3): the same number again and again was missing from the beginning."""
-    edges = ((5, 12), (20, 28), (40, 50))[: len(delays)]
-    stretch = np.zeros(60, int)
-    for number, (first, end) in enumerate(edges, 1):
-        stretch[first:end] = number
-
-    def delay_of_right(*given):  # between the stretches the dots of both cameras agree by chance
-        number = stretch[given[-1]].min()
-        return (delays[number - 1], 0.99) if number else (0.0, 0.0)
-
-    monkeypatch.setattr(slips, "delay_of_right", delay_of_right)
-    fits, nothing = SimpleNamespace(residuals_px=np.zeros((60, 2, 4, 2))), np.zeros(0)
-    told = slips.dropped_frames(stretch > 0, fits, nothing, nothing, None, nothing, range(60))
-    assert len(told) == sentences
-    assert where in told[0].text
+@pytest.mark.parametrize(("ahead", "said"), [((1, 1), ["right"]), ((1, -1), ["right", "left"])])
+def test_one_delay_in_several_stretches_is_one_sentence(ahead, said):
+    """Between stretches of one and the same delay the cameras only happen to agree."""
+    trajectory = measured(n=60)
+    markers, covariance = trajectory.markers_px.copy(), trajectory.markers_covariance_px2
+    refused = np.zeros(60, bool)
+    for (first, end), k in zip(((8, 18), (30, 42)), ahead, strict=True):
+        markers[first:end, 1] = trajectory.markers_px[first + k : end + k, 1]
+        refused[first:end] = True
+    rig, centres = trajectory.rig, trajectory.disc.marker_centres_body
+    start = rotation_from_quaternion(trajectory.quaternion), trajectory.q[:, :3]
+    fits = fit_poses(markers, covariance, rig, centres, *start, reject_outliers=False)
+    told = dropped_frames(refused, fits, markers, covariance, rig, centres, range(60))
+    assert [finding.kind for finding in told] == [Kind.DROPPED_FRAMES] * len(said)
+    assert [finding.subject.camera for finding in told] == said
+    assert {finding.numbers["images"].value for finding in told} == {1}
+    assert "at frame 8" in told[0].text

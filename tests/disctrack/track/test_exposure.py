@@ -11,13 +11,14 @@ from disctrack.errors import RecordingError
 from disctrack.findings import Kind, Severity
 from disctrack.synthetic import render_disc
 from disctrack.track.dots import template_response as template_pull
-from disctrack.track.dots.template import NoiseModel, locate_on_plane
+from disctrack.track.dots.template import NoiseModel
 from disctrack.track.dots.template_response import Pull
 from disctrack.track.follow.tracking import TrackingSettings
 from disctrack.track.pose import marker_pixels
 from disctrack.track.refine import exposure as smears
 from disctrack.track.refine.exposure import shift_by_exposure
 from disctrack.trajectory import FrameStatus
+from tests.oracles.flat_dots import locate_on_plane
 
 RATE, EXPOSURE = 1000.0, 1e-3  # Hz, s
 N = 40

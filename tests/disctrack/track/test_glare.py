@@ -6,10 +6,11 @@ from numpy.testing import assert_array_equal
 from scipy.ndimage import gaussian_filter
 
 from disctrack import frames, rolling
-from disctrack.track.dots.template import NoiseModel, locate_on_plane
+from disctrack.track.dots.template import NoiseModel
 from disctrack.track.dots.template_response import Pull
 from disctrack.track.pose import marker_pixels
 from disctrack.track.refine.glare import shift_by_gleam
+from tests.oracles.flat_dots import locate_on_plane
 
 N, DARK, PAPER, NOISE = 24, 8000.0, 50000.0, NoiseModel(1e4, 8.0)
 

@@ -1,7 +1,6 @@
 """What must not grow with the length of a recording, and where a long one is cut."""
 
 import tracemalloc
-from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
@@ -10,13 +9,13 @@ from numpy.testing import assert_array_equal
 
 from disctrack import frames
 from disctrack.recording.readers.blocks import iter_pair_blocks
-from disctrack.track.dots.template import NoiseModel, TemplateLimits
-from disctrack.track.follow.following import Follower, Law, TrackingSetup, empty_tables
-from disctrack.track.follow.tracking import MOST_STRETCHES, WAITED_FOR, stretch_edges
+from disctrack.track.dots.template import NoiseModel, dot_centres
+from disctrack.track.follow.following import Follower, Law, TrackingSetup
+from disctrack.track.follow.tracking import MOST_STRETCHES, stretch_edges
 from disctrack.track.pose import marker_pixels
 from disctrack.track.refine.assembly import Taken, TrackingSettings, _fit_all, assemble
-from disctrack.track.refine.self_calibration import AsBuilt
 from disctrack.trajectory import FrameStatus
+from tests.oracles.point_laboratory import tables_of
 
 
 @pytest.mark.parametrize(
@@ -26,10 +25,7 @@ def test_stretches_follow_from_the_length_alone_and_cover_it(rendered_pairs, n, 
     edges = stretch_edges(range(70, 70 + n), rendered_pairs.disc)
     assert len(edges) == stretches + 1
     assert (edges[0], edges[-1]) == (70, 70 + n)
-    first, *others = np.diff(edges)
-    assert not others or np.ptp(others) <= 1
-    # the first also measures the noise, for which the others wait
-    assert not others or abs(others[0] - first - WAITED_FOR) <= 1
+    assert np.ptp(np.diff(edges)) <= 1
 
 
 def test_dots_that_leave_phi_open_are_followed_in_one_stretch(rendered_pairs):
@@ -73,17 +69,13 @@ def test_what_the_fit_of_all_poses_needs_beside_its_result_does_not_grow_with_th
     monkeypatch.setattr("disctrack.track.refine.assembly.FITTED_AT_ONCE", 512)
     rig, disc = rendered_pairs.rig, rendered_pairs.disc
     R, t = frames.rotation_from_euler(*rendered_pairs.q[:, 3:].T), rendered_pairs.q[:, :3]
-    pixels = rendered_pairs.true_pixels
-    m = disc.n_markers
-    built = AsBuilt(rig, disc, np.zeros((m, 3)), np.zeros((m, 2)), np.zeros(30), 1.0, 1.0, 0)
     beside = []
     for n in (1536, 4608):
         k = np.arange(n) % len(R)
-        covariance = np.broadcast_to(1e-4 * np.eye(2), (n, 2, m, 2, 2)).copy()
-        status = np.zeros((n, 2, m), np.uint8)
-        tables = replace(empty_tables(n, m), pixels=pixels[k], covariance_px2=covariance, status=status, R=R[k], t=t[k])
+        tables = tables_of(rendered_pairs.true_pixels[k], R[k], t[k], 0.01)
+        dots = dot_centres(tables.results, tables.status)
         tracemalloc.start()
-        fits = _fit_all(tables, built, reject_outliers=True)
+        fits = _fit_all(tables, dots, rig, disc)
         peak = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
         assert fits.converged.all()
@@ -104,21 +96,14 @@ def test_poses_are_the_same_to_the_last_bit_whoever_puts_them_together(rendered_
     pixels += sigma * rng.standard_normal(pixels.shape)
     pixels[100, 1, 2] += 3.0  # a dot to be struck
     pixels[160:163, 0] += 0.1  # frames to be refused
-    made = replace(
-        empty_tables(n, m),
-        covariance_px2=np.tile(sigma**2 * np.eye(2), (n, 2, m, 1, 1)),
-        misfit=np.ones((n, 2, m), np.float32),
-        n_pixels=np.full((n, 2, m), 300.0, np.float32),
-        status=np.zeros((n, 2, m), np.uint8),
-        frame_status=np.full(n, FrameStatus.MEASURED, np.uint8),
-    )
-    setup = TrackingSetup(rig, disc, TemplateLimits(), *np.zeros((2, 2, 1, 1)))
+    setup = TrackingSetup(rig, disc, *np.zeros((2, 2, 1, 1)))
     taken = Taken(range(n), times, 1000.0, 9.81)
 
     def by(workers, pixels=pixels):
         follower = Follower(setup, Law((NoiseModel(0.64, 0.02),) * 2), measured=True)
-        tables = replace(deepcopy(made), pixels=pixels.copy(), R=R.copy(), t=t.copy())
-        return assemble([follower], tables, TrackingSettings(exposure=(1e-4, 1e-4)), taken, workers)
+        return assemble(
+            [follower], tables_of(pixels, R, t, sigma), TrackingSettings(exposure=(1e-4, 1e-4)), taken, workers
+        )
 
     one, three = by(1), by(3)
     assert (one.trajectory.frame_status != FrameStatus.MEASURED).any()

@@ -11,7 +11,6 @@ from disctrack import frames
 from disctrack.errors import TrackingError
 from disctrack.findings import Kind
 from disctrack.synthetic import render_disc
-from disctrack.track.dots import _kernels as kernels
 from disctrack.track.follow.tracking import STUCK_FRAMES, TrackingSettings, _as_one_sensor, track
 from disctrack.trajectory import FrameStatus, MarkerStatus
 
@@ -77,37 +76,10 @@ def test_a_rolling_disc_is_measured_to_the_predicted_sigma(rolling, rendered_pai
     assert np.allclose(R, frames.rotation_from_euler(*trajectory.q[:, 3:].T), atol=1e-9)
 
 
-def _predicted(R, t, i):
-    R_next, t_next = np.empty((3, 3)), np.empty(3)
-    kernels._predict.py_func(R[i - 1], R[i - 2], R[i - 3], t[i - 1], t[i - 2], t[i - 3], R_next, t_next)
-    return frames.vector_from_rotation(R[i] @ R_next.T), t[i] - t_next
-
-
-def test_a_prediction_lacks_what_the_acceleration_changes_by(rolling, rng):
-    """What it lacks leaves a trace in the centres, in the direction of the acceleration: in all frames alike."""
-    k = np.arange(6.0)[:, None]
-    axis = np.array([0.36, 0.48, 0.8])
-    R = frames.rotation_from_vector((0.3 + 0.2 * k + 0.05 * k**2) * axis) @ frames.rotation_from_vector(
-        rng.normal(size=3)
-    )
-    t = rng.normal(size=3) + k * rng.normal(size=3) + k**2 * rng.normal(size=3)
-    turn, shift = _predicted(R, t, 4)  # of a steady acceleration, nothing
-    assert np.abs(turn).max() < 1e-12
-    assert np.abs(shift).max() < 1e-12
-    q = rolling[1]
-    R, t = frames.rotation_from_euler(*q[:, 3:].T), q[:, :3]
-    lacks = np.array([np.linalg.norm(_predicted(R, t, i)[0]) for i in range(3, N)])
-    steady = [frames.vector_from_rotation(R[i] @ (R[i - 1] @ R[i - 2].T @ R[i - 1]).T) for i in range(3, N)]
-    assert lacks.max() < 0.15 * np.linalg.norm(steady, axis=1).min()  # psidot over the frame rate: 0.08
-    # so it stays below where the template's shape would have to follow
-    assert lacks.max() < kernels._ATTITUDE_TOLERANCE
-
-
 def test_the_number_of_workers_changes_no_bit_of_the_result(rolling, rendered_pairs, monkeypatch):
     images, _ = rolling
     whole = track(blocks_of(images), range(N), rendered_pairs.rig, rendered_pairs.disc, 1000.0)
     monkeypatch.setattr("disctrack.track.follow.tracking.SHORTEST_SPLIT", 20)
-    monkeypatch.setattr("disctrack.track.follow.tracking.WAITED_FOR", 0)  # alike, as the blocks are
     one, two = (
         track(blocks_of(images, size=15), range(N), rendered_pairs.rig, rendered_pairs.disc, 1000.0, workers=workers)
         for workers in (1, 2)
@@ -121,14 +93,13 @@ def test_the_number_of_workers_changes_no_bit_of_the_result(rolling, rendered_pa
     # a template keeps its attitude until the pose has turned by a tolerance, which moves a dot by up to 1e-3 px of a
     # scatter of 4e-3 px; when that happens hangs on the last digit of a pose, and for some frames after a start
     assert change.max() < 0.5
-    # in all other frames only single precision rounds differently: 1e-6 px
-    assert np.median(change.max(axis=1)) < 1e-3
+    # where noise and blur are taken from the same frames, only single precision rounds differently: 1e-6 px
+    assert np.median(change[: N // 2].max(axis=1)) < 1e-3
 
 
 @pytest.mark.statistical
-def test_noise_is_that_of_the_first_stretch_with_a_disc_whoever_gets_there_first(rolling, rendered_pairs, monkeypatch):
+def test_stretches_without_a_disc_change_nothing_whoever_gets_there_first(rolling, rendered_pairs, monkeypatch):
     monkeypatch.setattr("disctrack.track.follow.tracking.SHORTEST_SPLIT", 4)
-    monkeypatch.setattr("disctrack.track.follow.tracking.WAITED_FOR", 0)  # alike, as the blocks are
     images = rolling[0].copy()
     images[:20] = 85  # no disc in the first of four stretches of 15 pairs, nor at the start of the second
     runs = [
@@ -149,7 +120,6 @@ def test_a_stretch_that_begins_on_another_branch_of_phi_is_followed_again(rollin
     images, _ = rolling
     whole = track(blocks_of(images), range(N), rendered_pairs.rig, rendered_pairs.disc, 1000.0)
     monkeypatch.setattr("disctrack.track.follow.tracking.SHORTEST_SPLIT", 20)
-    monkeypatch.setattr("disctrack.track.follow.tracking.WAITED_FOR", 0)  # alike, as the blocks are
     found, third = following.acquire, np.array([[-0.5, -np.sqrt(0.75), 0], [np.sqrt(0.75), -0.5, 0], [0, 0, 1.0]])
     starts = {images[k, 0].tobytes() for k in (30, 31)}
 
