@@ -14,14 +14,12 @@ import os
 import signal
 import sys
 import tempfile
-import threading
 import time
-from collections.abc import Iterator
 from concurrent.futures import CancelledError, Executor, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from multiprocessing.context import SpawnContext, SpawnProcess
+from multiprocessing.context import SpawnProcess
 from pathlib import Path
-from types import FrameType, ModuleType
+from types import FrameType
 from typing import TYPE_CHECKING, Protocol
 
 import cv2
@@ -31,15 +29,14 @@ from disctrack.batch.plan import Job
 from disctrack.batch.reasons import reason_of, reason_of_death
 from disctrack.batch.records import Result
 from disctrack.errors import ClusterError
-from disctrack.recording.readers.blocks import ONE_THREAD
+from disctrack.processes import Spawn, end_with_parent, quietly
 
 if TYPE_CHECKING:
     from distributed import Client
 
 CONNECT = 10.0  # [s] for a scheduler to answer
-# [s] that processes have to clear up, after which they are asked once more, and that they have where nobody ends them
-_STOPPING, _ASK_AGAIN, _GRACE = 9.0, 2.0, 3.0
-_STARTING = threading.Lock()
+# [s] that processes have to clear up, and after which they are asked once more
+_STOPPING, _ASK_AGAIN = 9.0, 2.0
 
 
 class Died(Exception):
@@ -183,8 +180,8 @@ class _Worker:
 
     def __init__(self, said: Path) -> None:
         """Said : file for whatever its libraries print"""
-        context = _Spawn()
-        with _STARTING, _quietly():  # with the first one Python starts its process that clears up semaphores
+        context = Spawn()
+        with quietly():  # with the first one Python starts its process that clears up semaphores
             self.executor = ProcessPoolExecutor(1, context, _prepare, (said,))
         self._context, self._said = context, said
 
@@ -209,45 +206,6 @@ class _Worker:
         return reason_of_death(self._context.started[0].exitcode, said.splitlines()[-1] if said else "")
 
 
-class _Process(SpawnProcess):
-    """Knows nothing of Ctrl-C (the batch hears it, and ends its processes) nor of the script that runs the batch."""
-
-    def start(self) -> None:
-        with _STARTING, _quietly():
-            super().start()
-
-
-class _Spawn(SpawnContext):
-    """Remembers its processes: their exit codes tell why they ended."""
-
-    def __init__(self) -> None:
-        self.started: list[SpawnProcess] = []
-
-    def Process(self, *given: object, **named: object) -> SpawnProcess:  # type: ignore[override]
-        self.started.append(_Process(*given, **named))  # type: ignore[arg-type]
-        return self.started[-1]
-
-
-@contextlib.contextmanager
-def _quietly() -> Iterator[None]:
-    """Processes started within have one thread each, no signals of the terminal, and do not run the caller's script."""
-    script = sys.modules["__main__"]
-    before = {name: os.environ.get(name) for name in ONE_THREAD}
-    kinds = {signal.SIGINT, signal.SIGHUP} if hasattr(signal, "pthread_sigmask") else set()
-    sys.modules["__main__"] = ModuleType("__main__")
-    os.environ.update(ONE_THREAD)
-    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, kinds) if kinds else set()
-    try:
-        yield
-    finally:
-        sys.modules["__main__"] = script
-        for name, value in before.items():
-            os.environ.pop(name)
-            os.environ.update({} if value is None else {name: value})
-        if kinds:
-            signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
-
-
 def _prepare(said: Path) -> None:
     """In a new process: what its libraries print goes into a file, and it ends with the batch that started it."""
     signal.signal(signal.SIGTERM, _stop)
@@ -255,21 +213,12 @@ def _prepare(said: Path) -> None:
     for stream in (1, 2):
         os.dup2(output, stream)
     cv2.setNumThreads(1)  # the others have the cores
-    threading.Thread(target=_end_with_the_batch, daemon=True).start()
+    end_with_parent()
 
 
 def _stop(number: int, frame: FrameType | None) -> None:
     """Leave by way of the blocks that remove half-written files."""
     sys.exit(128 + number)
-
-
-def _end_with_the_batch() -> None:
-    batch = multiprocessing.parent_process()
-    assert batch is not None
-    batch.join()
-    os.kill(os.getpid(), signal.SIGTERM)
-    time.sleep(_GRACE)
-    os._exit(1)
 
 
 def _do(job: Job) -> Result:

@@ -14,7 +14,7 @@ from disctrack.diagnosis.stretch import MIN_FRAMES
 from disctrack.discrepancy.fit import Fit, fit
 from disctrack.discrepancy.held_out import HeldOut
 from disctrack.discrepancy.significance import Whiteness, ljung_box, no_memory, whiteness
-from disctrack.discrepancy.system import Subset, System, Values
+from disctrack.discrepancy.system import System, Values, subset
 from disctrack.frames import euler_jacobian
 from disctrack.rolling import Motion, simulate
 from disctrack.rolling.evaluate import effect_power, kinematics
@@ -191,7 +191,7 @@ def regimes(system: DiscSystem, judged: System, base: Fit, noise: float) -> dict
     theta = np.degrees(system.trajectory.q[system.rows, 4])
 
     def holds(rows: NDArray[np.intp]) -> bool:
-        trial = fit(Subset(judged, np.isin(np.arange(len(system.time)), rows)), base.quantities, base.values, 10)
+        trial = fit(subset(judged, np.isin(np.arange(len(system.time)), rows)), base.quantities, base.values, 10)
         limit = noise * (1.0 + 4.0 * np.sqrt(2.0 / max(trial.degrees_of_freedom, 1)))  # four sigmas of chi-square
         return bool(trial.converged and trial.reduced_chi_square <= limit)
 

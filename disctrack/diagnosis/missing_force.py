@@ -18,9 +18,9 @@ from calibration.kit.arrays import Array
 from calibration.kit.least_squares import triangle
 from disctrack.diagnosis.law_library import SHAPES, families
 from disctrack.diagnosis.motion import STATE_SCALES, THETA_END, state_of
-from disctrack.discrepancy.fit import Fit, prior_rows
+from disctrack.discrepancy.elimination import is_linear, prior_rows, projection
+from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.laws import Family, Gain, LearnedLaw, evidence, proposal
-from disctrack.discrepancy.nuisances import is_linear, projection
 from disctrack.discrepancy.system import Candidate, Quantity, Values
 from disctrack.rolling import Model, simulate
 from disctrack.rolling.effects import EffectParameter, effect_from_formulas

@@ -188,8 +188,7 @@ class Planner:
         """(m, k) what a recording says of the shared quantities, its own at their best."""
         names = [q.name for q in shared]
         start = {q.name: q.null for q in own} | dict(values)
-        scales = {q.name: q.scale for q in (*own, *shared)}
-        reduced = Reduction(system, own, start, scales).reduce(start, names)
+        reduced = Reduction(system, own, start).reduce(start, names)
         if reduced is None:
             raise AnalysisError("the motion cannot be followed")
         mixing = np.zeros((len(names), len(self.column)))
@@ -198,7 +197,7 @@ class Planner:
                 mixing[row, : system.rig_directions.shape[1]] = system.rig_directions[int(name[4:])]
             elif name in self.column:
                 mixing[row, self.column[name]] = 1.0
-        return np.asarray(triangle(reduced.matrix @ mixing) / np.sqrt(self._noise), float)
+        return np.asarray(triangle(reduced[1] @ mixing) / np.sqrt(self._noise), float)
 
     def _planned(self, proposal: Proposal) -> tuple[DiscSystem, dict[str, float]]:
         """The system of a recording as proposed, by the same cameras with the same noise, and its fitted values.

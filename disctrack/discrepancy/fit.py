@@ -7,19 +7,17 @@ import numpy as np
 
 from calibration.kit.arrays import Array
 from calibration.kit.brief import Outline
-from calibration.kit.least_squares import OwnNumbers, covariance_within, solve_bounded, triangle
-from disctrack.discrepancy.nuisances import Projection, is_linear, projection
-from disctrack.discrepancy.own import Own
+from calibration.kit.least_squares import OwnNumbers, covariance_within, solve_bounded
+from disctrack.discrepancy.elimination import Own, Projection, is_linear, prior_rows, projection
 from disctrack.discrepancy.system import Quantity, System, Values
 
 MAX_ITERATIONS = 40
 TOLERANCE = 1e-3  # a fit has converged when a full step would lower chi-square by less, over what is left per datum
-CRAWLING, CRAWLED = 1e-3, 3  # share of chi-square that a halved step gains at most, so many times in a row
 _HALVINGS = 8
 NO_DERIVATIVE = np.zeros(0)
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, repr=False, eq=False)
 class Fit(Outline):
     """Minimum of chi-square, data and priors together."""
 
@@ -78,58 +76,24 @@ class Fit(Outline):
         return np.array([found[n] for n in self.names])
 
 
-def compress(residual: Array, derivative: Array, common: Projection | None = None) -> tuple[Array, Array]:
-    """Smaller least-squares problem with the same solutions: (right side (m,), matrix (m, k)), m = k + 1 at most.
-
-    The Q of [derivative, residual] is dropped; norms and angles of all combinations of columns stay, once what linear
-    quantities in `common` absorb is taken off.
-    """
-    stacked = np.column_stack([derivative.reshape(residual.size, -1), residual.reshape(-1)])
-    R = triangle(stacked if common is None else common.cleared(stacked))
-    return R[:, -1], R[:, :-1]
-
-
-def prior_rows(quantities: Sequence[Quantity], values: Values) -> tuple[Array, Array]:
-    """Rows that priors add to a least-squares problem: (right side (p,), matrix (p, k))."""
-    with_prior = [i for i, q in enumerate(quantities) if np.isfinite(q.prior_sigma)]
-    matrix = np.zeros((len(with_prior), len(quantities)))
-    for row, i in enumerate(with_prior):
-        matrix[row, i] = 1.0 / quantities[i].prior_sigma
-    return prior_residual(quantities, values), matrix
-
-
-def prior_residual(quantities: Sequence[Quantity], values: Values) -> Array:
-    """(p,) null minus value, over its standard deviation, of those with a prior."""
-    return np.array([(q.null - values[q.name]) / q.prior_sigma for q in quantities if np.isfinite(q.prior_sigma)])
-
-
-def fit(
-    system: System,
-    quantities: Sequence[Quantity],
-    start: Values,
-    max_iterations: int = MAX_ITERATIONS,
-    may_crawl: bool = True,
-) -> Fit:
+def fit(system: System, quantities: Sequence[Quantity], start: Values, max_iterations: int = MAX_ITERATIONS) -> Fit:
     """Minimise chi-square over `quantities` from `start`; whatever else `start` holds stays as it is.
 
     A step that leads where there is no prediction, or uphill, is halved. `converged` is False where that does not help
-    or the iterations run out; or where it has to be done again and again to gain next to nothing, unless it may crawl.
+    or the iterations run out.
     """
     problem = _Problem(system, quantities, start)
-    converged, iteration, crawled = False, 0, 0
-    while np.isfinite(problem.cost) and iteration < max_iterations and not (crawled == CRAWLED and not may_crawl):
+    converged, iteration = False, 0
+    while np.isfinite(problem.cost) and iteration < max_iterations:
         iteration += 1
         step = problem.solve()
         if problem.expected < TOLERANCE * max(1.0, problem.cost / problem.n_data):
             converged = True
             break
-        before = problem.cost
-        halvings = problem.go(step)
-        if halvings is None:
+        if not problem.go(step):
             # rounding of the prediction: no step lowers chi-square although the next one promises next to nothing
             converged = bool(problem.expected < max(0.1, 1e-7 * problem.cost))
             break
-        crawled = crawled + 1 if halvings and before - problem.cost < CRAWLING * before else 0
     return problem.fit(converged, iteration)
 
 
@@ -161,10 +125,7 @@ class _Problem:
 
     def solve(self) -> Array:
         """The full step (k,)."""
-        if self.own.blocks:
-            right, matrix, self.heads = self.own.reduced(self.residual, self.derivative, self.values)
-        else:
-            right, matrix = compress(self.residual, self.derivative, self.common)
+        right, matrix, self.heads = self.own.reduced(self.residual, self.derivative, self.values, self.common)
         prior, prior_matrix = prior_rows(self.moved, self.values)
         self.right, self.matrix = right, matrix = np.concatenate([right, prior]), np.vstack([matrix, prior_matrix])
         step = solve_bounded(right, matrix, self.lower - self.x, self.upper - self.x)
@@ -172,8 +133,8 @@ class _Problem:
         self.expected = gain + sum(h.gain for h in self.heads)
         return step
 
-    def go(self, step: Array) -> int | None:
-        """Take the step, or a part of it: how often it was halved; None where none lowers chi-square."""
+    def go(self, step: Array) -> bool:
+        """Take the step, or a part of it; False where none lowers chi-square."""
         x, values, own = self.x, self.values, self.own.moved(self.heads, step)
         for halving in range(_HALVINGS):
             factor = 0.5**halving
@@ -186,12 +147,12 @@ class _Problem:
             cost = self._cost(trial, residual, derivative)
             if np.isfinite(cost) and cost < self.cost:
                 self.values, self.residual, self.derivative, self.cost = trial, residual, derivative, cost
-                return halving
-        return None
+                return True
+        return False
 
     def _strain(self, values: Values) -> float:
         local = [q for block in self.own.blocks for q in block.quantities]
-        return float(np.sum(prior_residual([*self.moved, *local], values) ** 2))
+        return float(np.sum(prior_rows([*self.moved, *local], values)[0] ** 2))
 
     def _cost(self, values: Values, residual: Array, derivative: Array) -> float:
         """Chi-square with priors, at the best values of the linear quantities; infinite where there is no prediction.

@@ -7,10 +7,10 @@ import numpy as np
 
 from calibration.kit.arrays import Array, Mask
 from calibration.kit.least_squares import OwnNumbers, triangle
+from disctrack.discrepancy.elimination import Own
 from disctrack.discrepancy.fit import Fit, fit
-from disctrack.discrepancy.own import Own
 from disctrack.discrepancy.score import INVISIBLE, cleared, span
-from disctrack.discrepancy.system import Quantity, Subset, System, Values
+from disctrack.discrepancy.system import Quantity, System, Values, subset
 
 TRAIN_FRACTION = 0.65  # of the time
 
@@ -45,14 +45,14 @@ def held_out(system: System, quantities: Sequence[Quantity], start: Values, rows
     that a quantity which the first part leaves open is not punished for it. Of quantities that a block of rows has of
     its own and that the first part says nothing of (those of a run that is kept back), what they cannot move is judged.
     """
-    train = fit(Subset(system, rows), quantities, start)
+    train = fit(subset(system, rows), quantities, start)
     test = ~rows & (system.weights > 0)
     own = Own(system, train.quantities)
     kept = [b for b in own.blocks if test[b.rows].any() and not (rows & (system.weights > 0))[b.rows].any()]
     if kept:  # near their best values the prediction is linear in them
         alone = np.zeros(len(test), bool)
         alone[np.concatenate([b.rows for b in kept])] = True
-        theirs = fit(Subset(system, alone), [q for b in kept for q in b.quantities], train.values)
+        theirs = fit(subset(system, alone), [q for b in kept for q in b.quantities], train.values)
         train = replace(train, values=theirs.values)
     residual, derivative = system.linearise(train.values, [*own.slots, *train.shared])
     n_data = int(np.sum(system.weights[test]))

@@ -287,7 +287,7 @@ def with_law(system: System, base: Fit, law: LearnedLaw, held: Collection[str] =
     """The base model's fit with the law's numbers fitted along, but for those held."""
     moved = (q for q in law.candidate.quantities if q.name not in held)
     start = base.values | dict(law.values) | dict(zip(law.candidate.names, law.candidate.start, strict=True))
-    return fit(system, (*base.quantities, *moved), start, MAX_ITERATIONS, may_crawl=False)
+    return fit(system, (*base.quantities, *moved), start, MAX_ITERATIONS)
 
 
 def _one_by_one(system: System, base: Fit, law: LearnedLaw, widths: Sequence[Quantity]) -> Fit:

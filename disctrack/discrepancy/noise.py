@@ -13,39 +13,23 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import comb
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve, solve_triangular
+from scipy.linalg import cho_factor, cho_solve, solve_toeplitz, solve_triangular
 from scipy.optimize import minimize
 
 from calibration.kit.arrays import Array, Mask
+from disctrack.discrepancy.elimination import Own, is_linear, projection
 from disctrack.discrepancy.fit import Fit
-from disctrack.discrepancy.nuisances import is_linear, projection
-from disctrack.discrepancy.own import Own
-from disctrack.discrepancy.system import System, Values, Wrapped
+from disctrack.discrepancy.system import System, Transformed
 
 if TYPE_CHECKING:
     from disctrack.discrepancy.equations.declared import Samples
 
 MARGIN = 1.5  # over the largest eigenvalue that independent noise brings (Marchenko and Pastur's edge)
 THIRD = 2.31  # samples per independent one among third differences: 1 + 2 (15^2 + 6^2 + 1) / 20^2
-
-
-class RowWhitened(Wrapped):
-    """A system whose rows are multiplied by a matrix, so that noise common to their numbers counts once."""
-
-    def __init__(self, system: System, matrix: Array) -> None:
-        """Matrix (w, w) acts on the numbers of every row."""
-        super().__init__(system)
-        self._matrix = matrix
-
-    def linearise(self, values: Values, names: Sequence[str]) -> tuple[Array, Array]:
-        """As the system's, every row multiplied."""
-        residual, derivative = super().linearise(values, names)
-        return residual @ self._matrix.T, self._matrix @ derivative
 
 
 def third_differences(system: System, fit: Fit) -> tuple[Array, NDArray[np.intp]]:
@@ -91,7 +75,7 @@ def whitened(system: System, modes: tuple[Array, Array]) -> System:
     """The system with the scatter of these directions brought down to that of the others."""
     vectors, variances = modes
     matrix = np.eye(len(vectors)) + (vectors * (1.0 / np.sqrt(variances) - 1.0)) @ vectors.T
-    return RowWhitened(system, matrix)
+    return Transformed(system, lambda both: matrix @ both)
 
 
 SHORTEST = 40  # samples from which a memory is looked for
@@ -236,9 +220,7 @@ def _minus_log_likelihood(s: SampleStretch, noise: SmoothNoise) -> float:
 
 
 _ORDERS = range(2, 7)  # of differences: the higher, the less of the motion is left in them
-ENOUGH_DIFFERENCES = 8  # by which a channel's noise is told
-FEWEST_DIFFERENCES = 3  # the same of few or uneven samples
-UNEVEN = 3.0  # of the spacings: nine in ten are no longer than so many times the one in ten that is shortest
+FEWEST_DIFFERENCES = 3  # by which a channel's noise is estimated
 MAX_MEMORY = 24  # samples over which noise may remember
 
 
@@ -259,41 +241,25 @@ def with_noise(samples: Sequence[Samples]) -> list[Samples]:
 
 
 def fast_part(values: Sequence[Array], times: Sequence[Array] | None = None) -> float:
-    """Standard deviation of white noise on smooth signals, from differences in time.
+    """Standard deviation of white noise on smooth signals, from divided differences in time.
 
-    times : of the values; few or unevenly spaced ones are differenced as they lie in time
+    times : of the values, if they are not evenly spaced
     """
+    times = times or [np.arange(len(v), dtype=float) for v in values]
+    seen = [(t[p], v[p]) for t, v in zip(times, values, strict=True) for p in [np.isfinite(v)]]
     estimates, counts = [], []
-    present = [np.isfinite(v) for v in values]
-    if times is not None and _sparse(times, present):
-        differences = [
-            [_divided(t[p], v[p], order) for t, v, p in zip(times, values, present, strict=True)] for order in _ORDERS
-        ]
-        fewest = FEWEST_DIFFERENCES
-    else:
-        differences = [
-            [np.diff(v, order) / np.sqrt(comb(2 * order, order)) for v in values if len(v) > order] for order in _ORDERS
-        ]
-        fewest = ENOUGH_DIFFERENCES
-    for parts in differences:
-        all_ = np.concatenate([p[np.isfinite(p)] for p in parts]) if parts else np.zeros(0)
-        if len(all_) >= fewest:
-            estimates.append(float(np.sqrt(np.mean(all_**2))))
-            counts.append(len(all_))
+    for order in _ORDERS:
+        differences = np.concatenate([_divided(t, v, order) for t, v in seen])
+        if len(differences) >= FEWEST_DIFFERENCES:
+            estimates.append(float(np.sqrt(np.mean(differences**2))))
+            counts.append(len(differences))
     # the first order in which no more of the motion is left than its own scatter: higher ones scatter more
     best = next(
         (a for a, b, n in zip(estimates, estimates[1:], counts, strict=False) if a <= b * (1 + 2 / np.sqrt(n))),
         estimates[-1] if estimates else 0.0,
     )
-    size = max((float(np.nanmax(np.abs(v))) for v in values if np.isfinite(v).any()), default=1.0)
+    size = max((float(np.max(np.abs(v))) for _, v in seen if len(v)), default=1.0)
     return max(best, 1e-9 * size, 1e-300)
-
-
-def _sparse(times: Sequence[Array], present: Sequence[Mask]) -> bool:
-    """Are there so few values, or so unevenly spaced ones, that differences from sample to sample mean little?"""
-    spacings = [np.diff(t[p]) for t, p in zip(times, present, strict=True) if p.sum() > 1]
-    uneven = any(np.quantile(d, 0.9) > UNEVEN * np.quantile(d, 0.1) for d in spacings)
-    return uneven or sum(len(d) for d in spacings) < ENOUGH_DIFFERENCES + max(_ORDERS)
 
 
 def _divided(time: Array, values: Array, order: int) -> Array:
@@ -322,30 +288,24 @@ def step_of(values: Sequence[Array]) -> float:
     return step if whole.all() and many > 1.2 * len(levels) else 0.0
 
 
-class Remembering(Wrapped):
-    """A system whose noise remembers: every sample minus what those before it foretell of its noise.
+def without_memory(system: System, rows: Sequence[slice], coefficients: Array, present: Mask) -> System:
+    """The system with every sample minus what those before it predict of its noise; gaps begin anew.
 
-    coefficients : (w, order) of the autoregression of each channel's whitened residual; gaps begin anew.
+    rows : of each stretch
+    coefficients : (w, order) of the autoregression of each channel's whitened residual
+    present : (n, w) where there are data
     """
 
-    def __init__(self, system: System, rows: Sequence[slice], coefficients: Array, present: Mask) -> None:
-        """Rows of each stretch; present (n, w) where there are data."""
-        super().__init__(system)
-        self._rows, self._present = tuple(rows), present
-        self._coefficients = coefficients
-
-    def linearise(self, values: Values, names: Sequence[str]) -> tuple[Array, Array]:
-        """As the system's, filtered in time along every stretch."""
-        residual, derivative = super().linearise(values, names)
-        both = np.concatenate([residual[..., None], derivative], axis=-1)
+    def innovations(both: Array) -> Array:
         out = both.copy()
-        order = self._coefficients.shape[1]
-        for rows in self._rows:
-            part, new = both[rows], out[rows]
-            for lag in range(1, min(order, len(part) - 1) + 1):
-                new[lag:] -= self._coefficients[:, lag - 1, None] * part[:-lag]
-            new *= self._present[rows][..., None]
-        return out[..., 0], out[..., 1:]
+        for of_stretch in rows:
+            part, new = both[of_stretch], out[of_stretch]
+            for lag in range(1, min(coefficients.shape[1], len(part) - 1) + 1):
+                new[lag:] -= coefficients[:, lag - 1, None] * part[:-lag]
+            new *= present[of_stretch][..., None]
+        return out
+
+    return Transformed(system, innovations)
 
 
 def autoregression(residual: Array, present: Mask, rows: Sequence[slice]) -> tuple[Array, float]:
@@ -353,36 +313,21 @@ def autoregression(residual: Array, present: Mask, rows: Sequence[slice]) -> tup
 
     Yule and Walker's equations; the order is Schwarz's choice. Missing samples count as zeros.
     """
-    w = residual.shape[1]
     n = int(present.sum(axis=0).max())
     top = int(min(MAX_MEMORY, max(1, n // 40)))
-    found, ratio = np.zeros((w, top)), 0.0
-    for c in range(w):
-        covariance = np.zeros(top + 1)
-        for part in rows:
-            x = residual[part, c]
-            for lag in range(min(top, len(x) - 1) + 1):
-                covariance[lag] += x[lag:] @ x[: len(x) - lag]
-        best, variance = np.inf, covariance[0]
-        if variance <= 0:
+    found, ratio = np.zeros((residual.shape[1], top)), 0.0
+    for c, x in enumerate(residual.T):
+        lags = [sum(float(x[r][lag:] @ x[r][: len(x[r]) - lag]) for r in rows) for lag in range(top + 1)]
+        if not lags[0] > 0:
             continue
-        # Levinson and Durbin, order by order
-        a: Array = np.zeros(0)
-        for order in range(top + 1):
-            if order > 0:
-                k = (
-                    (covariance[order] - a @ covariance[order - 1 : 0 : -1][: order - 1]) / variance
-                    if order > 1
-                    else (covariance[1] / variance)
-                )
-                a = np.concatenate([a - k * a[::-1], [k]])
-                variance *= 1 - k * k
-            criterion = n * np.log(max(variance / covariance[0], 1e-300)) + order * np.log(n)
+        covariance, best, share = np.array(lags), 0.0, 1.0
+        for order in range(1, top + 1):
+            a = solve_toeplitz(covariance[:order], covariance[1 : order + 1])
+            left = max(1.0 - float(a @ covariance[1 : order + 1]) / covariance[0], 1e-300)
+            criterion = n * np.log(left) + order * np.log(n)
             if criterion < best - 1e-9:
-                best = criterion
-                found[c] = 0.0
+                best, share = criterion, left
                 found[c, :order] = a
-                share = variance / covariance[0]
         ratio = max(ratio, share)
     return found, ratio
 
@@ -390,10 +335,7 @@ def autoregression(residual: Array, present: Mask, rows: Sequence[slice]) -> tup
 def persistence(residual: Array, rows: Sequence[slice]) -> float:
     """Samples until the autocorrelation of a residual (n, w) has fallen to 1/e, all channels and stretches together."""
     longest = max(r.stop - r.start for r in rows)
-    power = np.zeros(longest)
-    for r in rows:
-        x = residual[r]
-        spectrum = np.abs(np.fft.rfft(x, 2 * len(x), axis=0)) ** 2
-        power[: len(x)] += np.fft.irfft(spectrum, axis=0).sum(axis=1)[: len(x)]
+    spectra = [np.abs(np.fft.rfft(residual[r], 2 * longest, axis=0)) ** 2 for r in rows]
+    power = np.fft.irfft(np.sum(spectra, axis=0), axis=0).sum(axis=1)[:longest]
     below = np.flatnonzero(power < power[0] / np.e)
     return float(below[0]) if below.size else float(longest)

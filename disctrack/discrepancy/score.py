@@ -6,16 +6,14 @@ value, its sigma and the gain in chi-square follow from inner products, so that 
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import combinations
 
 import numpy as np
 
 from calibration.kit.arrays import Array
 from calibration.kit.least_squares import solve_bounded
-from disctrack.discrepancy.fit import Fit, compress, prior_rows
-from disctrack.discrepancy.nuisances import is_linear, projection
-from disctrack.discrepancy.own import Own
-from disctrack.discrepancy.system import Candidate, Quantity, System
+from disctrack.discrepancy.elimination import Own, is_linear, prior_rows, projection
+from disctrack.discrepancy.fit import Fit
+from disctrack.discrepancy.system import Candidate, System
 
 DEPENDENT = 1e-9  # singular value over the largest, below which columns are combinations of the others
 INVISIBLE = 1e-6  # share of a column left after clearing, below which the data say nothing about the effect
@@ -40,9 +38,8 @@ class Linearisation:
 
         A candidate may free what the fit holds within a prior: its column then stands beside that of the fit.
         """
-        known = {q.name: q for q in fit.quantities}
-        of_candidates = {q.name: q for c in candidates for q in c.quantities}
-        new = {n: q for n, q in of_candidates.items() if n not in known or _frees(q, known[n])}
+        held = {q.name: q.prior_sigma for q in fit.quantities}
+        new = {q.name: q for c in candidates for q in c.quantities if q.prior_sigma > held.get(q.name, 0.0)}
         common = projection(system, fit.quantities, fit.values)
         own = Own(system, fit.quantities)
         self.fitted = tuple(q for q in fit.quantities if not (is_linear(q) or q.slot))
@@ -50,10 +47,7 @@ class Linearisation:
         values |= dict(zip(common.names, common.null.tolist(), strict=True))
         names = list(dict.fromkeys([*(q.name for q in self.fitted), *new]))
         residual, derivative = system.linearise(values, [*own.slots, *names])
-        if own.blocks:
-            right, matrix, _ = own.reduced(residual, derivative, values)
-        else:
-            right, matrix = compress(residual, derivative, common)
+        right, matrix, _ = own.reduced(residual, derivative, values, common)
         everything = [*self.fitted, *new.values()]
         prior, prior_matrix = prior_rows(everything, values)
         self.right = np.concatenate([right, prior])
@@ -62,11 +56,8 @@ class Linearisation:
         self.quantities = {q.name: q for q in everything}
         self.values = values | {name: q.null for name, q in new.items()}
         self._at = np.array([*(values[q.name] for q in self.fitted), *(q.null for q in new.values())])
-        self._free = self._free_columns()
-        self._basis = np.linalg.qr(_normalised(self.matrix[:, self._free]))[0]
-
-    def _free_columns(self) -> list[int]:
-        return [i for i, q in enumerate(self.fitted) if q.lower < self._at[i] < q.upper]
+        free = [i for i, q in enumerate(self.fitted) if q.lower < self._at[i] < q.upper]
+        self._basis = np.linalg.qr(_normalised(self.matrix[:, free]))[0]
 
     def columns(self, names: Sequence[str]) -> Array:
         """Columns (m, k) as they are."""
@@ -87,10 +78,6 @@ class Linearisation:
         step = solve_bounded(self.right, A, lower, upper)
         gain = self.right @ self.right - np.sum((self.right - A @ step) ** 2)
         return float(max(gain, 0.0)), (x0 + step)[len(fitted) :]
-
-
-def _frees(q: Quantity, fitted: Quantity) -> bool:
-    return not np.isfinite(q.prior_sigma) and bool(np.isfinite(fitted.prior_sigma))
 
 
 def cleared(columns: Array, basis: Array) -> Array:
@@ -141,15 +128,6 @@ def score_all(linear: Linearisation, candidates: Sequence[Candidate]) -> list[Sc
     return sorted((score(linear, c) for c in candidates), key=lambda s: -s.gain)
 
 
-def score_pairs(linear: Linearisation, candidates: Sequence[Candidate]) -> list[tuple[float, Candidate, Candidate]]:
-    """Gain of every pair of candidates, largest first."""
-    gains = []
-    for a, b in combinations(candidates, 2):
-        names = list(dict.fromkeys([*a.names, *b.names]))
-        gains.append((linear.gain_of(names)[0], a, b))
-    return sorted(gains, key=lambda item: -item[0])
-
-
 def angle(linear: Linearisation, signal: Array, names: Sequence[str]) -> float:
     """Angle [rad] between a predicted residual (m,) and what the named quantities can predict, both cleared.
 
@@ -162,7 +140,6 @@ def angle(linear: Linearisation, signal: Array, names: Sequence[str]) -> float:
     length = float(np.linalg.norm(signal))
     if length == 0 or not keep.any():
         return float(np.pi / 2)
-    U, singular, _ = np.linalg.svd(_normalised(cleared[:, keep]), full_matrices=False)
-    U = U[:, singular > 1e-9 * singular[0]]
+    U = span(cleared[:, keep])
     within = U @ (U.T @ signal)
     return float(np.arctan2(np.linalg.norm(signal - within), np.linalg.norm(within)))

@@ -17,10 +17,11 @@ from scipy import stats
 
 from calibration.kit.arrays import Mask
 from calibration.kit.brief import Outline
-from disctrack.discrepancy.fit import Fit, fit, no_fit, prior_residual
+from disctrack.discrepancy.elimination import prior_rows
+from disctrack.discrepancy.fit import Fit, fit, no_fit
 from disctrack.discrepancy.held_out import HeldOut, held_out, training_rows
-from disctrack.discrepancy.noise import THIRD, RowWhitened, common_modes, inflation, noise_variance, whitened
-from disctrack.discrepancy.score import Linearisation, Score, angle, score_all, score_pairs
+from disctrack.discrepancy.noise import THIRD, common_modes, inflation, noise_variance, whitened
+from disctrack.discrepancy.score import Linearisation, Score, angle, score_all
 from disctrack.discrepancy.shape import WORTH_A_SHAPE, with_free_shape, with_shape
 from disctrack.discrepancy.significance import TWO_SIDED, Chance, chance, price_of_a_number
 from disctrack.discrepancy.system import (
@@ -64,6 +65,7 @@ class Explanation:
     candidates: tuple[Candidate, ...]
     fit: Fit
     credible: bool = True  # a fit that has converged, to amounts that may be
+    length: float = np.inf  # as `length` has it, once the noise is known
 
     @property
     def effects(self) -> tuple[str, ...]:
@@ -152,7 +154,9 @@ def explain(
         modes = common_modes(system, answer.after)
         if modes is not None:
             judged = whitened(system, modes)
-            answer = replace(_Search(judged, settings, rows, former).run(base), judged=judged)
+            base = fit(judged, judged.base, base.values)
+            answer = _Search(judged, settings, rows, former).run(base) if base.converged else _refusal(base, settings)
+            answer = replace(answer, judged=judged)
     return with_shapes(system, answer) if system.frees_shapes else answer
 
 
@@ -201,6 +205,8 @@ def length(system: System, settings: Settings, noise: float, fitted: Fit, picked
 
 
 class _Search:
+    """The explanations of a system's data, and what was done with each, by its names."""
+
     def __init__(
         self, system: System, settings: Settings, rows: Mask | None = None, former: Diagnosis | None = None
     ) -> None:
@@ -215,39 +221,63 @@ class _Search:
         self.noise = 1.0
         self.rough = system.several_minima
         self.pool: dict[frozenset[str], Explanation] = {}
-        self.fits: dict[frozenset[str], Fit] = {}  # by the effects fitted: each combination has one minimum
-        self.refused: set[frozenset[str]] = set()  # explanations that do not stand out from what they leave
+        self.refused: set[frozenset[str]] = set()  # they do not stand out from what they leave
         self.expanded: set[frozenset[str]] = set()
-        self.first: dict[str, tuple[float, Explanation]] = {}  # by effect: gain of its first refit, and that
         self.scored: dict[frozenset[str], tuple[Linearisation, list[Score]]] = {}
-        self.free_runs: list[tuple[Fit, HeldOut]] = []
+        self.first: dict[str, tuple[float, Explanation]] = {}  # by effect: gain of its first refit, and that
+        self.free_runs: dict[Fit, HeldOut] = {}
 
-    def run(self, start: Fit) -> Diagnosis:
-        base = start
-        if isinstance(self.system, RowWhitened):
-            base = fit(self.system, self.system.base, start.values)
-            if not base.converged:
-                return _refusal(base, self.settings)
-        self.fits[frozenset()] = base
-        nothing = self.pool[frozenset()] = Explanation((), base)
+    @property
+    def nothing(self) -> Explanation:
+        """The base model alone."""
+        return self.pool[frozenset()]
+
+    def run(self, base: Fit) -> Diagnosis:
+        self.pool[frozenset()] = Explanation((), base)
         self.noise = self._noise(base)
-        linear, scores = self._scored(nothing)
+        linear, scores = self._scored(self.nothing)
         by_chance = chance(linear, scores, self.noise) if scores else None
         best, rivals = self._settled()
         if self.system.frees_shapes and self._shapes_freed(best):
             best, rivals = self._settled()
-        if rivals is None:
-            answer = self._answer(nothing, nothing, (), scores, best.candidates)
-            return replace(answer, chance=by_chance, nearest=best.fit)
-        found = tuple(self._found(best, c, r) for c, r in zip(best.candidates, rivals, strict=True))
-        return replace(self._answer(nothing, best, found, scores), chance=by_chance)
+        after = self.nothing if rivals is None else best
+        found = tuple(self._found(best, c, r) for c, r in zip(best.candidates, rivals or (), strict=rivals is not None))
+        ranked = tuple(replace(e, length=self.length(e)) for e in self._ranked())
+        listed = ((e.effects, e.length - self.length(after)) for e in ranked)
+        partial = best if rivals is None else None
+        return Diagnosis(
+            *self._verdict(after, found),
+            found,
+            base,
+            after.fit,
+            self._held_out(base),
+            self._held_out(after.fit),
+            self.noise,
+            tuple(self._tried(s, found) for s in scores),
+            self.settings,
+            partial.candidates if partial else (),
+            partial.fit if partial else None,
+            explanations=tuple(item for item in listed if abs(item[1]) < CLASS_GAIN),
+            ranked=ranked,
+            chance=by_chance,
+        )
+
+    def _verdict(self, after: Explanation, found: tuple[Found, ...]) -> tuple[str, str]:
+        """Verdict and reason."""
+        left = f"{after.fit.reduced_chi_square:.3g} per degree of freedom at a noise of {self.noise:.3g}"
+        if not self._at_noise(after.fit):
+            return "unexplained", f"chi-square stays at {left}: no effect of the catalogue brings it to noise"
+        if not found:
+            return "nothing missing", f"chi-square is {left}, and no effect gains more than noise does"
+        ratio = self._held_out(after.fit).ratio_to_floor / np.sqrt(self.noise)
+        return "found", f"chi-square falls to {left}; the free run errs by {ratio:.2f} of its floor"
 
     def _settled(self) -> tuple[Explanation, list[list[Rival]] | None]:
         """The explanation that stands, and rivals of each of its effects; no such list where it explains too little."""
         self._explore()
         rivals: list[list[Rival]] = []
         while (best := self._shortest_that_stands()).candidates:
-            if not self._at_noise(best.fit) and not self._worth_naming(self.pool[frozenset()], best):
+            if not self._at_noise(best.fit) and not self._worth_naming(best):
                 return best, None
             if (smaller := self._without_idle(best)) is not None:
                 self.refused.add(best.names)
@@ -266,7 +296,7 @@ class _Search:
         At its null an effect whose place has to be looked for has no derivative, so that no score proposes it; beside
         another effect, a faint one that a flat of the rim makes is an inertia's or a pattern's off centre.
         """
-        at_noise, nothing, before = self._at_noise(best.fit), self.pool[frozenset()], len(self.pool)
+        at_noise, nothing, before = self._at_noise(best.fit), self.nothing, len(self.pool)
         if at_noise and len(best.candidates) < 2:
             return False
         excess = nothing.fit.chi_square - self.noise * nothing.fit.degrees_of_freedom
@@ -378,7 +408,11 @@ class _Search:
         if self._at_noise(e.fit, best):
             return proposed
         if worth and len(e.candidates) + 2 <= self.settings.max_effects:
-            proposed += self._pairs(linear, [s.candidate for s in ranked[:14] if s.visible])
+            visible = [s.candidate for s in ranked[:14] if s.visible]
+            pairs = list(combinations(visible, 2))
+            gains = [linear.gain_of(list(dict.fromkeys([*a.names, *b.names])))[0] for a, b in pairs]
+            longer = [self._price(pair) - gain / self.noise for pair, gain in zip(pairs, gains, strict=True)]
+            proposed += [pairs[i] for i in np.argsort(longer, kind="stable")[:3]]
         if with_thresholds:
             proposed += [(c,) for c in self.system.candidates if c.threshold and c.name not in e.names]
         return proposed
@@ -391,36 +425,31 @@ class _Search:
             self.scored[e.names] = linear, score_all(linear, others)
         return self.scored[e.names]
 
-    def _pairs(self, linear: Linearisation, candidates: Sequence[Candidate]) -> list[tuple[Candidate, ...]]:
-        pairs = score_pairs(linear, candidates)
-        pairs.sort(key=lambda p: self._price(p[1:]) - p[0] / self.noise)
-        return [(a, b) for _, a, b in pairs[:3]]
-
     def _shortest_that_stands(self) -> Explanation:
         """The shortest explanation that predicts what was kept back better than shorter sets of its terms do."""
         ranked = self._ranked()
         for e in [e for e in ranked if e.candidates][: self.settings.judged]:
-            if self.length(e) > self.length(self.pool[frozenset()]):
+            if self.length(e) > self.length(self.nothing):
                 break
-            parts = [other for other in ranked if other.names < e.names]
-            parent = parts[0] if parts else self.pool[frozenset()]
+            parent = next((other for other in ranked if other.names < e.names), self.nothing)
             held = self._held_out_gain(parent, e)
             enough = OBVIOUS * self._price([c for c in e.candidates if c.name not in parent.names])
             obvious = held > -CLASS_GAIN and (parent.fit.cost - e.fit.cost) / self.noise > enough
             if held > 0 or obvious:
                 return e
-        return self.pool[frozenset()]
+        return self.nothing
 
     def _held_out_gain(self, before: Explanation, after: Explanation) -> float:
         """Of twice the log density of what was kept back, in units of the noise."""
         gain = 2 * (self._held_out(after.fit).log_density - self._held_out(before.fit).log_density) / self.noise
         return -np.inf if np.isnan(gain) else float(gain)  # neither predicts anything
 
-    def _worth_naming(self, before: Explanation, after: Explanation) -> bool:
+    def _worth_naming(self, after: Explanation) -> bool:
         """Does what was found explain the residual, if not to noise then nearly all of it, in the free run too?
 
         In a residual that none of them makes, wrong effects gain a lot as well; they leave a good part of it.
         """
+        before = self.nothing
         excess = [e.fit.chi_square / self.noise - e.fit.degrees_of_freedom for e in (before, after)]
         held = [self._held_out(e.fit) for e in (before, after)]
         free = [h.chi_square / self.noise - h.expected for h in held]
@@ -434,17 +463,16 @@ class _Search:
         return tuple(q for q in self.system.base if q.name not in new) + tuple(new.values())
 
     def _held_out(self, fit_: Fit) -> HeldOut:
-        known = next((held for of, held in self.free_runs if of is fit_), None)
-        if known is None:
-            known = held_out(self.system, fit_.quantities, fit_.values, self.rows)
-            self.free_runs.append((fit_, known))
-        return known
+        if fit_ not in self.free_runs:
+            self.free_runs[fit_] = held_out(self.system, fit_.quantities, fit_.values, self.rows)
+        return self.free_runs[fit_]
 
     def _fit(self, candidates: Sequence[Candidate], start: Values, patient: bool = False) -> Fit:
         """With these effects.   patient : however long it takes; else a fit that is given up has not converged"""
         key = _names(candidates)
-        if key in self.fits and not self._better(start, self.fits[key]):
-            return self.fits[key]
+        known = self.pool[key].fit if key in self.pool else None
+        if known is not None and (known.converged or not key) and not self._better(start, known):
+            return known
         values = dict(start)
         for c in candidates:
             for name, value in zip(c.names, c.start, strict=False):
@@ -452,19 +480,16 @@ class _Search:
         quantities = self._quantities(candidates)
         try:
             with self.system.budget.trial(np.inf if patient else self.system.trial_steps):
-                found = fit(self.system, quantities, values)
+                return fit(self.system, quantities, values)
         except TrialGivenUp:
             return no_fit(quantities, values)
-        if found.converged and not any(c.threshold for c in candidates):  # beyond thresholds there are several minima
-            self.fits[key] = found
-        return found
 
     def _better(self, start: Values, known: Fit) -> bool:
         """Does a fit begin below the minimum that is known of its effects? Then that was not the lowest."""
         if not self.rough:
             return False
         values = known.values | {q.name: start.get(q.name, q.null) for q in known.quantities}
-        right = prior_residual(known.quantities, values)
+        right, _ = prior_rows(known.quantities, values)
         cost = float(np.sum(self.system.linearise(values, ())[0] ** 2) + right @ right)
         return cost < known.cost - CLASS_GAIN * self.noise
 
@@ -528,21 +553,18 @@ class _Search:
         limits = [(values[q.name], q) for c in extra if c.kind == "measurement" for q in c.quantities]
         if any(v != q.null and not q.lower < v < q.upper for v, q in limits):
             return True
-        if self.system.undo_each_other(trial.candidates, values, self.fits[frozenset()].values):
+        if self.system.undo_each_other(trial.candidates, values, self.nothing.fit.values):
             return True
         faults = [c for c in trial.candidates if c.kind == "measurement"]
         if len(faults) < 2:
             return False
-        names = [q.name for c in faults for q in c.quantities]
-        _, derivative = self.system.linearise(values, names)
-        signals, first = [], 0
+        signals = []
         for c in faults:
             amount = np.array([values[q.name] - q.null for q in c.quantities])
-            signals.append((derivative[..., first : first + len(amount)] @ amount).ravel())
-            first += len(amount)
-        powers = [float(s @ s) for s in signals]
-        pairs = combinations(range(len(faults)), 2)
-        return any(np.sum((signals[a] + signals[b]) ** 2) < CANCELLING * min(powers[a], powers[b]) for a, b in pairs)
+            signals.append(self.system.linearise(values, c.names)[1] @ amount)
+        return any(
+            np.sum((a + b) ** 2) < CANCELLING * min(np.sum(a**2), np.sum(b**2)) for a, b in combinations(signals, 2)
+        )
 
     def _without_idle(self, e: Explanation) -> Explanation | None:
         """Without the effect that gains least, if a residual with the memory of what is left may give it as much."""
@@ -557,9 +579,8 @@ class _Search:
             enough = left * self.threshold(len(c.names)) * max(factors[n] for n in c.names) ** 2
             if smaller.fit.converged or loss < enough:  # a fit that has not converged loses even less further on
                 losses.append((loss / enough, c.name, smaller))
-        if not losses or min(losses)[0] >= 1.0:
-            return None
-        return min(losses)[2]
+        least, _, smaller = min(losses, default=(np.inf, "", e))
+        return smaller if least < 1.0 else None
 
     def _rivals(self, e: Explanation, effect: Candidate) -> list[Rival]:
         """Effects that predict nearly the same residual, refitted in place of one; they join the explanations."""
@@ -596,39 +617,13 @@ class _Search:
         gain = (without.cost - e.fit.cost) / self.noise
         return Found(candidate, gain, held_gain, self.threshold(len(candidate.names)), tuple(rivals))
 
-    def _answer(
-        self, before: Explanation, after: Explanation, found: tuple[Found, ...], scores: list[Score],
-        partial: tuple[Candidate, ...] = (),
-    ) -> Diagnosis:  # fmt: skip
-        explained = self._at_noise(after.fit)
-        held = self._held_out(before.fit), self._held_out(after.fit)
-        ratio = held[1].ratio_to_floor / np.sqrt(self.noise)
-        left = f"{after.fit.reduced_chi_square:.3g} per degree of freedom at a noise of {self.noise:.3g}"
-        if explained and found:
-            verdict, reason = "found", f"chi-square falls to {left}; the free run errs by {ratio:.2f} of its floor"
-        elif explained:
-            verdict, reason = "nothing missing", f"chi-square is {left}, and no effect gains more than noise does"
-        else:
-            verdict, reason = (
-                "unexplained",
-                f"chi-square stays at {left}: no effect of the catalogue brings it to noise",
-            )
-        tried = tuple(self._tried(s, found) for s in scores)
-        shortest = self.length(after)
-        ranked = tuple(self._ranked())
-        listed = tuple((e.effects, self.length(e) - shortest) for e in ranked)
-        return Diagnosis(
-            verdict, reason, found, before.fit, after.fit, *held, self.noise, tried, self.settings, partial,
-            explanations=tuple(item for item in listed if abs(item[1]) < CLASS_GAIN), ranked=ranked,
-        )  # fmt: skip
-
     def _tried(self, score: Score, found: tuple[Found, ...]) -> Tried:
         c = score.candidate
-        gain, refitted = self.first.get(c.name, (None, None))
+        gain, trial = self.first.get(c.name, (None, None))
         held = None
-        if refitted is not None and any(of is refitted.fit for of, _ in self.free_runs):
-            held = self._held_out_gain(self.pool[frozenset()], refitted)
-        return Tried(c, score.gain / self.noise, gain, held, self._why(score, gain, held, refitted, found))
+        if trial is not None and trial.fit in self.free_runs:
+            held = self._held_out_gain(self.nothing, trial)
+        return Tried(c, score.gain / self.noise, gain, held, self._why(score, gain, held, trial, found))
 
     def _why(
         self, score: Score, gain: float | None, held: float | None, trial: Explanation | None, found: tuple[Found, ...]

@@ -13,7 +13,7 @@ import numpy as np
 from scipy import signal, special, stats
 
 from calibration.kit.arrays import Array
-from disctrack.discrepancy.score import INVISIBLE, Linearisation, Score
+from disctrack.discrepancy.score import INVISIBLE, Linearisation, Score, span
 
 TWO_SIDED = float(stats.norm.isf(0.025))  # sigmas: 95 % between both limits
 LARGE = 500.0  # chi-square beyond which its tail is taken from the asymptotic series: the probability underflows
@@ -105,12 +105,8 @@ def _directions(linear: Linearisation, names: Sequence[str]) -> Array:
     columns = linear.columns(names)
     cleared = linear.cleared(columns)
     before, after = np.linalg.norm(columns, axis=0), np.linalg.norm(cleared, axis=0)
-    cleared = cleared[:, after > INVISIBLE * np.maximum(before, 1e-300)]
-    cleared = cleared / np.linalg.norm(cleared, axis=0)
-    if cleared.shape[1] == 1:
-        return cleared
-    U, singular, _ = np.linalg.svd(cleared, full_matrices=False)
-    return np.asarray(U[:, singular > INVISIBLE * singular[0]], float)
+    seen = after > INVISIBLE * np.maximum(before, 1e-300)
+    return cleared[:, seen] / after[seen] if seen.sum() == 1 else span(cleared[:, seen])
 
 
 def _among(observed: float, sorted_draws: Array) -> Chance:

@@ -6,9 +6,8 @@ business of an adapter (`disctrack.diagnosis`, `examples`).
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +15,7 @@ import numpy as np
 from calibration.kit.arrays import Array, Mask
 
 Values = Mapping[str, float]
+Transform = Callable[[Array], Array]  # of residual and derivative side by side (n, w, 1 + k), into as many numbers
 
 
 @dataclass(frozen=True)
@@ -135,7 +135,7 @@ class System:
     trial_steps: float = np.inf  # of the budget, that one hypothesis among many may take
     several_minima: bool = False  # may fits of the same quantities end in different minima?
     frees_shapes: bool = False  # are numbers of laws' shapes tried free where no law as it is written down will do?
-    blocks: Sequence[slice] = ()  # rows that may have quantities of their own (`discrepancy.own`)
+    blocks: Sequence[slice] = ()  # rows that may have quantities of their own (`discrepancy.elimination`)
 
     def linearise(self, values: Values, names: Sequence[str]) -> tuple[Array, Array]:
         """Whitened residual (n, w), data minus prediction, zeros for missing data; its model's derivative (n, w, k).
@@ -164,65 +164,51 @@ class System:
         """
         return False
 
+    @property
+    def known_as(self) -> tuple[System, bytes]:
+        """A system, and which of its rows this is: what is computed once for all that are the same."""
+        return self, b""
+
     def over(self, system: System) -> System:
-        """Another system, seen as this one sees the one that it wraps."""
+        """Another system, whose rows pass what those of this one do."""
         return system
 
 
-class Wrapped(System):
-    """A system as another sees it: all as it is, but for what a subclass changes."""
+class Transformed(System):
+    """A system whose rows pass a linear map: some of them alone, or all with their noise made white."""
 
-    def __init__(self, system: System) -> None:
-        self._see(system)
+    def __init__(self, system: System, transform: Transform, kept: Mask | None = None) -> None:
+        """Kept : (n,) True in rows that count; all that do in the system, if not given."""
+        for name in System.__annotations__:
+            setattr(self, name, getattr(system, name))
+        if kept is not None:
+            self.weights = np.where(kept, system.weights, 0)
+        self._system, self._transform, self._kept = system, transform, kept
 
-    def _see(self, system: System) -> None:
-        self._system = system
-        self.time, self.weights, self.base, self.candidates = (
-            system.time,
-            system.weights,
-            system.base,
-            system.candidates,
-        )
-        self.several_minima, self.frees_shapes = system.several_minima, system.frees_shapes
-        self.blocks, self.budget, self.trial_steps = system.blocks, system.budget, system.trial_steps
+    @property
+    def known_as(self) -> tuple[System, bytes]:
+        """See System."""
+        return (self, b"") if self._kept is None else (self._system, self._kept.tobytes())
 
-    def over(self, system: System) -> Wrapped:
-        """The same view of another system."""
-        view = copy(self)
-        view._see(system)
-        return view
+    def over(self, system: System) -> System:
+        """See System."""
+        return Transformed(system, self._transform, self._kept)
 
     def starts(self, candidate: Candidate, values: Values, least: float = 0.0) -> Sequence[tuple[float, ...]]:
-        """As the system's."""
+        """See System."""
         return self._system.starts(candidate, values, least)
 
     def undo_each_other(self, candidates: Sequence[Candidate], values: Values, before: Values) -> bool:
-        """As the system's."""
+        """See System."""
         return self._system.undo_each_other(candidates, values, before)
 
     def linearise(self, values: Values, names: Sequence[str]) -> tuple[Array, Array]:
-        """As the system's."""
-        return self._system.linearise(values, names)
+        """See System."""
+        residual, derivative = self._system.linearise(values, names)
+        both = self._transform(np.concatenate([residual[..., None], derivative], axis=-1))
+        return both[..., 0], both[..., 1:]
 
 
-class Subset(Wrapped):
-    """The first samples of a system, or any others: the rest counts as missing."""
-
-    def __init__(self, system: System, rows: Mask) -> None:
-        """Rows (n,) True where the sample belongs to the subset."""
-        self._rows = rows
-        super().__init__(system)
-        self.key = rows.tobytes()
-
-    def _see(self, system: System) -> None:
-        super()._see(system)
-        self.whole = system
-        self.weights = np.where(self._rows, system.weights, 0)
-
-    def linearise(self, values: Values, names: Sequence[str]) -> tuple[Array, Array]:
-        """As the whole system's, zeros outside the subset, even where there is no prediction."""
-        residual, derivative = super().linearise(values, names)
-        outside = ~self._rows
-        residual, derivative = residual.copy(), derivative.copy()
-        residual[outside], derivative[outside] = 0.0, 0.0
-        return residual, derivative
+def subset(system: System, rows: Mask) -> Transformed:
+    """The system with these rows (n,) alone: the rest counts as missing, even where there is no prediction."""
+    return Transformed(system, lambda both: np.where(rows[:, None, None], both, 0.0), rows)

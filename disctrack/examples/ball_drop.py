@@ -27,7 +27,7 @@ from disctrack.discrepancy.held_out import held_out
 from disctrack.discrepancy.noise import SampleStretch, estimate
 from disctrack.discrepancy.search import CLASS_GAIN, Settings
 from disctrack.discrepancy.significance import price_of_a_number
-from disctrack.discrepancy.system import Subset
+from disctrack.discrepancy.system import subset
 from disctrack.errors import AnalysisError
 from disctrack.examples._command import Outcome, command, needed
 
@@ -197,7 +197,7 @@ def errors_of(answer: Answer, form: str) -> dict[str, dict[str, float]]:
     law = tuple(q for c in first.candidates if c.name == form for q in c.quantities)
     values = fit(first, (*first.base, *law), answer.diagnosis.before.values).values
     whole = fit(second, second.base, values).values
-    begun = fit(Subset(second, second.training), second.base, values).values
+    begun = fit(subset(second, second.training), second.base, values).values
     return {"whole": _rms(second, whole, -np.inf), "forecast": _rms(second, begun, SEEN)}
 
 

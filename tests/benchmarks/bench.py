@@ -46,9 +46,9 @@ from calibration.cameras.camera import StereoRig
 from calibration.rig_file import read_rig
 from disctrack.files.software import software_version
 from disctrack.frames import rotation_from_quaternion, rotation_from_vector, vector_from_rotation
+from disctrack.processes import ONE_THREAD
 from disctrack.recording.declaration import Recording, read_recording
 from disctrack.recording.readers import open_frames
-from disctrack.recording.readers.blocks import ONE_THREAD
 from disctrack.recording.readers.images import ImageSequence
 from disctrack.track.in_memory import measure_pairs
 from disctrack.track.measurement import ImagePairs, measure, open_pairs

@@ -59,8 +59,7 @@ class DecayMember:
 
     def share(self, own):
         mine = [q for q in self.system.base if q.name in own]
-        scales = {q.name: q.scale for c in self.system.candidates for q in c.quantities} | {"friction.g": 0.01}
-        self.reduction = Reduction(self.system, mine, self.base.values, scales)
+        self.reduction = Reduction(self.system, mine, self.base.values)
 
     def reduce(self, values, names):
         return self.reduction.reduce(values, names)

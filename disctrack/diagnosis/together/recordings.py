@@ -90,7 +90,8 @@ def _plan(answer: TogetherDiagnosis, crew: Crew) -> Plan | None:
     R = triangle(np.concatenate([rows, priors]))
     said = tuple(names), R[len(others) :, len(others) :]
     extra = sharing.local_names(longest, [n for f in diagnosis.found for n in f.candidate.names])
-    found = crew.ask(longest, "planned", sharing.local_values(longest, after.values), extra, questions, said)
+    asked = sharing.local_values(longest, after.values), extra, questions, said
+    (found,) = crew.call("planned", [asked], [longest])
     return found if isinstance(found, Plan) else None
 
 
@@ -145,8 +146,6 @@ class DiscMember:
                 f"the rolling model cannot be fitted to it alone (chi-square {self.base.reduced_chi_square:.3g})"
             )
         self.member = self._member()
-        known = [q for q in system.base if q.belongs_to] + [q for c in system.candidates for q in c.quantities]
-        self._scales = {q.name: q.scale for q in known}
 
     def told(self) -> tuple[Member, Systematic, list[Array]]:
         """What the others need of it: itself as a member, its systematic errors, and places of dots per camera [px]."""
@@ -163,7 +162,7 @@ class DiscMember:
     def share(self, own: Sequence[str]) -> None:
         """These quantities are its own, all others of the base are shared."""
         mine = [q for q in self.system.base if q.name in set(own)]
-        self._reduction = Reduction(self.system, mine, self.base.values, self._scales)
+        self._reduction = Reduction(self.system, mine, self.base.values)
 
     def reduce(self, values: Values, names: Sequence[str]) -> Reduced | None:
         """What it says of shared quantities."""
@@ -198,7 +197,7 @@ class DiscMember:
         return plan(self.system, fitted, questions, said=said)
 
     def _everything(self, shared: Values) -> dict[str, float]:
-        return {**self.base.values, **self._reduction.own_values(shared), **self.system.known, **shared}
+        return {**self.base.values, **self._reduction.own_values, **self.system.known, **shared}
 
     def _member(self) -> Member:
         system, disc = self.system, self.system.disc

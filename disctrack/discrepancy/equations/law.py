@@ -18,12 +18,13 @@ from scipy import linalg
 
 from calibration.kit.arrays import Array
 from calibration.kit.least_squares import covariance_within, solve_bounded
+from disctrack.discrepancy.elimination import compress, prior_rows
 from disctrack.discrepancy.equations.declared import Equations, Parameter, Samples, Term
 from disctrack.discrepancy.equations.expressions import Formula, parsed
 from disctrack.discrepancy.equations.formulas import Formulas, formulas
 from disctrack.discrepancy.equations.start import guessed, trusted, turn
 from disctrack.discrepancy.equations.system import EquationSystem
-from disctrack.discrepancy.fit import Fit, compress, fit, prior_rows
+from disctrack.discrepancy.fit import Fit, fit
 from disctrack.discrepancy.held_out import HeldOut, held_out
 from disctrack.discrepancy.laws import evidence
 from disctrack.discrepancy.noise import THIRD

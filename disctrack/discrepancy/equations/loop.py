@@ -9,6 +9,7 @@ from scipy.linalg import qr
 
 from calibration.kit.arrays import Array
 from calibration.kit.least_squares import solve_bounded
+from disctrack.discrepancy.elimination import Own
 from disctrack.discrepancy.equations import terms as library
 from disctrack.discrepancy.equations.declared import Equations, Run, Samples, Term, checked
 from disctrack.discrepancy.equations.expressions import Formula
@@ -19,14 +20,13 @@ from disctrack.discrepancy.equations.system import EquationSystem, cut, first_pa
 from disctrack.discrepancy.fit import Fit, fit
 from disctrack.discrepancy.held_out import held_out
 from disctrack.discrepancy.noise import (
-    Remembering,
     autoregression,
     fast_part,
     persistence,
     step_of,
     with_noise,
+    without_memory,
 )
-from disctrack.discrepancy.own import Own
 from disctrack.discrepancy.search import (
     CLASS_GAIN,
     NOT_CONVERGED,
@@ -483,7 +483,7 @@ def _with_memory(
     # so slow an error is the motion's own: that it can be foretold sample by sample does not make it noise
     as_noise = diagnosis.verdict != "unexplained" or lasting <= SLOW * shortest_turn
     as_noise &= size <= NO_SENSOR
-    remembering = Remembering(system, system.rows, coefficients, present)
+    remembering = without_memory(system, system.rows, coefficients, present)
     base = fit(remembering, system.base, diagnosis.before.values) if as_noise else None
     if diagnosis.verdict == "unexplained" and (base is None or not base.converged):
         block = max(2 * shortest_turn, 5 * lasting)

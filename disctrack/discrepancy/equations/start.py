@@ -12,11 +12,12 @@ from scipy import signal
 from scipy.optimize import least_squares
 
 from calibration.kit.arrays import Array
+from disctrack.discrepancy.elimination import prior_rows
 from disctrack.discrepancy.equations import _ode_kernel as kernel
 from disctrack.discrepancy.equations.declared import Samples
 from disctrack.discrepancy.equations.formulas import Formulas
 from disctrack.discrepancy.equations.system import EquationSystem, first_part, spread
-from disctrack.discrepancy.fit import fit, prior_rows
+from disctrack.discrepancy.fit import fit
 from disctrack.discrepancy.system import Quantity, System
 
 GROWTH = 1.7  # of the window from fit to fit: a phase that is right over it is right to a radian over the next

@@ -6,25 +6,18 @@ the number of processes. They end when they are closed, and with the process tha
 
 from __future__ import annotations
 
-import contextlib
-import multiprocessing
-import os
-import signal
-from collections.abc import Callable, Iterator, Sequence
-from multiprocessing import resource_tracker
-from multiprocessing.connection import Connection
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from typing import Any
 
-from disctrack.discrepancy.joint.joint_system import Request
-from disctrack.discrepancy.joint.reduction import Reduced
 from disctrack.errors import AnalysisError, DiscTrackError
-from disctrack.recording.readers.blocks import ONE_THREAD
+from disctrack.processes import Spawn, end_with_parent, quietly
 
 Build = Callable[[Any], Any]
 ENDED_EARLY = (
     "a process that diagnosed some of the recordings has ended early, as when memory runs out: try again with fewer "
-    'processes (-j 1). In a script of your own the call has to stand under `if __name__ == "__main__":`, as each '
-    "process reads the script"
+    "processes (-j 1)."
 )
 
 
@@ -36,135 +29,81 @@ class Crew:
 
         build : a module's function, as it has to be found by other processes
         """
-        self.n = len(items)
-        self._kept = list(range(self.n))  # numbers of the objects that are asked, in their order
+        self._kept = list(range(len(items)))  # numbers of the objects that are asked, in their order
         self._here: dict[int, Any] = {}
-        self._workers: list[tuple[Any, Connection]] = []
-        n = min(processes, self.n)
+        self._context, self._pools = Spawn(), list[ProcessPoolExecutor]()
+        n = min(processes, len(items))
         if n <= 1:
-            self._here = {i: _built(build, item) for i, item in enumerate(items)}
+            self._here = _built(build, dict(enumerate(items)))
             return
-        context = multiprocessing.get_context("spawn")
-        before = {name: os.environ.get(name) for name in ONE_THREAD}
-        os.environ.update(ONE_THREAD)
+        with quietly():
+            self._pools = [ProcessPoolExecutor(1, self._context, end_with_parent) for _ in range(n)]
         try:
-            with _without_interruptions():
-                for _ in range(n):
-                    ours, theirs = context.Pipe()
-                    process = context.Process(target=_work, args=(theirs, build), daemon=True)
-                    process.start()
-                    theirs.close()
-                    self._workers.append((process, ours))
-            # not with the arguments above: starting a process that ends before it has read them never returns
-            for k, (_, connection) in enumerate(self._workers):
-                connection.send({i: items[i] for i in range(k, self.n, n)})
+            for k, pool in enumerate(self._pools):
+                pool.submit(_begin, build, {i: items[i] for i in range(k, len(items), n)})
         except OSError as error:
             self.close()
             raise AnalysisError(ENDED_EARLY) from error
-        finally:
-            for name, value in before.items():
-                if value is None:
-                    os.environ.pop(name, None)
-                else:
-                    os.environ[name] = value
 
     def __enter__(self) -> Crew:
         return self
 
-    def __exit__(self, error: object, *_: object) -> None:
-        self.close(at_once=error is not None)
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
-    def close(self, at_once: bool = False) -> None:
-        """End the processes.   at_once : whatever they do, as after Ctrl-C"""
-        for process, connection in self._workers:
-            connection.close()
-            process.join(timeout=0 if at_once else 5)
-            if process.is_alive():
-                process.terminate()
-        self._workers = []
+    def close(self) -> None:
+        """End the processes, whatever they do."""
+        for pool in self._pools:
+            pool.shutdown(wait=False, cancel_futures=True)
+        for process in self._context.started:
+            process.terminate()
+            process.join()
 
     def keep(self, numbers: Sequence[int]) -> None:
         """From now on, number objects as these are counted: the others are asked nothing any more."""
         self._kept = list(numbers)
 
-    def call(self, method: str, arguments: Sequence[tuple[Any, ...]]) -> list[Any]:
-        """Results of a method of every object; a DiscTrackError takes the place of the result that it prevents."""
-        numbers = self._kept
-        if not self._workers:
-            return [_answer(self._here[i], method, a) for i, a in zip(numbers, arguments, strict=True)]
-        n = len(self._workers)
-        asked: list[list[int]] = [[] for _ in range(n)]
-        for i in numbers:
-            asked[i % n].append(i)
-        by_number = dict(zip(numbers, arguments, strict=True))
+    def call(
+        self, method: str, arguments: Sequence[tuple[Any, ...]], numbers: Sequence[int] | None = None
+    ) -> list[Any]:
+        """Results of a method of every object; a DiscTrackError takes the place of the result that it prevents.
+
+        numbers : of the objects that are asked, as they are counted now; all of them, if not given
+        """
+        asked = self._kept if numbers is None else [self._kept[i] for i in numbers]
+        each = list(zip(asked, arguments, strict=True))
+        if not self._pools:
+            return [_answer(self._here[i], method, given) for i, given in each]
         try:
-            for mine, (_, connection) in zip(asked, self._workers, strict=True):
-                connection.send((method, [(i, by_number[i]) for i in mine]))
-            found: dict[int, Any] = {}
-            for mine, (_, connection) in zip(asked, self._workers, strict=True):
-                found.update(zip(mine, connection.recv(), strict=True))
-        except (EOFError, OSError) as error:
+            begun = [self._pools[i % len(self._pools)].submit(_answer_of, i, method, given) for i, given in each]
+            return [future.result() for future in begun]
+        except BrokenProcessPool as error:
             raise AnalysisError(ENDED_EARLY) from error
-        return [found[i] for i in numbers]
-
-    def ask(self, number: int, method: str, *arguments: Any) -> Any:
-        """Result of a method of one object, as they are counted now."""
-        everyone = self._kept
-        self._kept = [everyone[number]]
-        try:
-            return self.call(method, [arguments])[0]
-        finally:
-            self._kept = everyone
-
-    def reduce(self, requests: Sequence[Request]) -> list[Reduced | None]:
-        """What each recording says of its shared quantities."""
-        found = self.call("reduce", [(values, names) for _, values, names in requests])
-        return [None if isinstance(answer, DiscTrackError) else answer for answer in found]
 
 
-@contextlib.contextmanager
-def _without_interruptions() -> Iterator[None]:
-    """Processes that are started within know nothing of Ctrl-C: this one hears it, once it is over, and ends them."""
-    if not hasattr(signal, "pthread_sigmask"):
-        yield
-        return
-    resource_tracker.ensure_running()  # which, where it is started with the first process, lets them through again
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+_objects: dict[int, Any] = {}  # of a process of its own
+
+
+def _begin(build: Build, items: dict[int, Any]) -> None:
+    _objects.update(_built(build, items))
+
+
+def _answer_of(number: int, method: str, arguments: tuple[Any, ...]) -> Any:
+    return _answer(_objects[number], method, arguments)
+
+
+def _built(build: Build, items: dict[int, Any]) -> dict[int, Any]:
+    return {i: _tried(build, item) for i, item in items.items()}
+
+
+def _answer(thing: Any, method: str, arguments: tuple[Any, ...]) -> Any:
+    return thing if isinstance(thing, DiscTrackError) else _tried(getattr(thing, method), *arguments)
+
+
+def _tried(function: Callable[..., Any], *arguments: Any) -> Any:
     try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-def _built(build: Build, item: Any) -> Any:
-    try:
-        return build(item)
+        return function(*arguments)
     except DiscTrackError as error:
         return error
     except Exception as error:  # whatever is wrong with one recording, the others are diagnosed
         return AnalysisError(f"{type(error).__name__}: {error}")
-
-
-def _answer(thing: Any, method: str, arguments: tuple[Any, ...]) -> Any:
-    if isinstance(thing, DiscTrackError):
-        return thing
-    try:
-        return getattr(thing, method)(*arguments)
-    except DiscTrackError as error:
-        return error
-    except Exception as error:
-        return AnalysisError(f"{type(error).__name__}: {error}")
-
-
-def _work(connection: Connection, build: Build) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        objects = {i: _built(build, item) for i, item in connection.recv().items()}
-    except (EOFError, OSError):
-        return
-    while True:
-        try:
-            method, requests = connection.recv()
-        except (EOFError, OSError):
-            return
-        connection.send([_answer(objects[i], method, arguments) for i, arguments in requests])

@@ -1,24 +1,21 @@
-"""Many recordings as one system for the engine: its samples are recordings, its rows what each says of the shared."""
+"""Many recordings as one system for the search: its samples are recordings, its rows what each says of the shared."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
 from calibration.kit.arrays import Array
-from disctrack.discrepancy.joint.reduction import Reduced
+from disctrack.discrepancy.joint.crew import Crew
 from disctrack.discrepancy.joint.sharing import Sharing
 from disctrack.discrepancy.system import Candidate, Quantity, System, Values
-
-Request = tuple[int, dict[str, float], tuple[str, ...]]  # recording, its shared values, names
-Reduce = Callable[[Sequence[Request]], list[Reduced | None]]  # what each recording says of its shared quantities
 
 
 class JointSystem(System):
     """Recordings that share quantities. A row is a recording's least-squares problem in them, its own ones at best."""
 
-    def __init__(self, sharing: Sharing, reduce: Reduce) -> None:
-        """The requests number recordings as the sharing does."""
-        self.sharing, self._reduce = sharing, reduce
+    def __init__(self, sharing: Sharing, crew: Crew) -> None:
+        """Crew : of the members of the sharing, each with a method `reduce` (`Reduction`)."""
+        self.sharing, self._crew = sharing, crew
         n = len(sharing.members)
         self.time: Array = np.arange(n, dtype=float)
         free = [sum(not np.isfinite(q.prior_sigma) for q in own) for own in sharing.own]
@@ -28,18 +25,14 @@ class JointSystem(System):
 
     def linearise(self, values: Values, names: Sequence[str]) -> tuple[Array, Array]:
         """Rows (n, w) of the recordings' reduced problems, filled up with zeros, and their derivatives (n, w, k)."""
-        requests = [
-            (i, self.sharing.local_values(i, values), self.sharing.local_names(i, names))
-            for i in range(len(self.sharing.members))
-        ]
-        found = self._reduce(requests)
-        width = max([1, *(len(r.right) for r in found if r is not None)])
-        residual, derivative = np.zeros((len(found), width)), np.zeros((len(found), width, len(names)))
-        for i, (reduced, (_, _, local)) in enumerate(zip(found, requests, strict=True)):
-            if reduced is None:
-                residual[i] = np.nan
-                continue
-            m = len(reduced.right)
-            residual[i, :m] = reduced.right
-            derivative[i, :m] = reduced.matrix @ self.sharing.mixing(i, local, names)
+        sharing, n = self.sharing, len(self.time)
+        local = [sharing.local_names(i, names) for i in range(n)]
+        found = self._crew.call("reduce", [(sharing.local_values(i, values), local[i]) for i in range(n)])
+        reduced = {i: each for i, each in enumerate(found) if isinstance(each, tuple)}
+        width = max([1, *(len(right) for right, _ in reduced.values())])
+        residual, derivative = np.full((n, width), np.nan), np.zeros((n, width, len(names)))
+        for i, (right, matrix) in reduced.items():
+            residual[i] = 0.0
+            residual[i, : len(right)] = right
+            derivative[i, : len(right)] = matrix @ sharing.mixing(i, local[i], names)
         return residual, derivative

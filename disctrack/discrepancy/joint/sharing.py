@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from disctrack.discrepancy.nuisances import is_linear
+from disctrack.discrepancy.elimination import is_linear
 from disctrack.discrepancy.system import Candidate, Quantity, Values
 
 EACH = "each its own"  # of the candidates whose amounts differ from group to group

@@ -165,7 +165,7 @@ def _search(
 ) -> tuple[JointSystem, Diagnosis]:
     sharing = Sharing(members)
     crew.call("share", [([q.name for q in own],) for own in sharing.own])
-    system = JointSystem(sharing, crew.reduce)
+    system = JointSystem(sharing, crew)
     progress(f"{len(members)} recordings together: {len(system.base)} shared quantities")
     n = len(members)
     training = np.arange(n) % TEST_EVERY != TEST_EVERY - 1 if n >= TEST_EVERY else np.arange(n) == 0

@@ -10,6 +10,7 @@ from scipy.interpolate import CubicSpline
 from scipy.linalg import null_space
 from scipy.optimize import least_squares
 
+from disctrack.discrepancy.elimination import Own
 from disctrack.discrepancy.equations import Equations, Parameter, Run, Term, diagnose, start, terms
 from disctrack.discrepancy.equations.declared import checked
 from disctrack.discrepancy.equations.formulas import formulas
@@ -19,9 +20,8 @@ from disctrack.discrepancy.equations.system import EquationSystem
 from disctrack.discrepancy.fit import fit
 from disctrack.discrepancy.held_out import held_out
 from disctrack.discrepancy.noise import inflation
-from disctrack.discrepancy.own import Own
 from disctrack.discrepancy.score import Linearisation, score_all
-from disctrack.discrepancy.system import Subset
+from disctrack.discrepancy.system import subset
 
 SIGMA = 2e-3
 SWINGS = Equations(
@@ -147,7 +147,7 @@ def test_a_number_that_nothing_in_its_run_shows_stays_as_it_is(answer):
     system = answer.system
     seen = np.ones(len(system.time), bool)
     seen[system.rows[2]] = False
-    fitted = fit(Subset(system, seen), system.base, answer.diagnosis.after.values)
+    fitted = fit(subset(system, seen), system.base, answer.diagnosis.after.values)
     assert fitted.converged
     assert fitted.values["state.x[swing 2]"] == answer.values["state.x[swing 2]"]
     assert fitted.sigma("state.x[swing 2]") == 0

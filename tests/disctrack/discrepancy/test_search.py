@@ -332,30 +332,6 @@ def test_a_fit_that_leaves_much_is_found_to_a_share_of_its_own_scatter(rng):
     assert np.abs(off / scatter).max() < np.sqrt(1e-3)
 
 
-class Kinked(System):
-    """Promises that a step of 1 removes all, but a step beyond 0.5 makes it worse, and a shorter one gains nearly 0."""
-
-    time, weights, candidates = np.zeros(1), np.ones(1), ()
-    base = (Quantity("x", "1", 0.1),)
-
-    def __init__(self):
-        self.at = 0.0
-
-    def linearise(self, values, names):
-        far = values["x"] - self.at > 0.5
-        self.at = values["x"] if names and not far else self.at
-        residual = 20.0 if far else 10.0 - 1e-4 * values["x"]
-        return np.full((1, 1), residual), np.full((1, 1, len(names)), 10.0)
-
-
-def test_a_fit_that_crawls_is_ended_only_where_it_must_not_crawl():
-    patient, not_so = (fit(Kinked(), Kinked.base, {"x": 0.0}, 30, may_crawl=may) for may in (True, False))
-    assert not patient.converged
-    assert not not_so.converged
-    assert patient.n_iterations == 30
-    assert not_so.n_iterations == 3
-
-
 def test_explanations_that_fit_alike_are_listed_with_their_odds(rng):
     answer = explain(oscillator(rng, {"drift": 0.01}), START)
     listed = dict(answer.explanations)

@@ -25,7 +25,7 @@ def joint(items, processes=1):
     crew = Crew(build, items, processes)
     sharing = Sharing([build(item).member for item in items])
     crew.call("share", [([q.name for q in own],) for own in sharing.own])
-    return JointSystem(sharing, crew.reduce), crew
+    return JointSystem(sharing, crew), crew
 
 
 def answer(items):
@@ -277,35 +277,24 @@ def test_the_number_of_processes_changes_no_bit(rng):
 
 
 @pytest.mark.slow
-def test_processes_that_end_at_once_are_an_error_and_no_silence(tmp_path):
-    """As those of a script do that starts them wherever it is read, by themselves too; what they get is large."""
-    script = tmp_path / "unguarded.py"
-    script.write_text(
-        "import numpy as np\nfrom tests.oracles.decaying_runs import build, runs\n"
-        "from disctrack.discrepancy.joint.crew import Crew\n"
-        "items = runs(np.random.default_rng(1), 200)\n"
-        "with Crew(build, items, 2) as crew:\n    crew.call('share', [(['state.a', 'state.b'],)] * 200)\n"
-    )
-    ended = subprocess.run([sys.executable, script], cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)},
-                           capture_output=True, text=True, timeout=120, check=False)  # fmt: skip
-    assert ended.returncode == 1
-    assert "AnalysisError: a process that diagnosed some of the recordings has ended early" in ended.stderr
+def test_a_process_that_ends_early_is_an_error_and_no_silence():
+    with Crew(os._exit, [1, 2], 2) as crew, pytest.raises(AnalysisError, match="has ended early"):
+        crew.call("share", [(), ()])
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
 def test_after_ctrl_c_the_processes_are_gone_without_a_word_of_their_own(tmp_path):
-    script = tmp_path / "guarded.py"  # each process reads it for 3 s, as long imports take
+    script = tmp_path / "script.py"
     script.write_text(
-        "import os, time\nfrom disctrack.discrepancy.joint.crew import Crew\n"
-        "def build(item):\n    time.sleep(100)\n"
-        "os.write(1, b'%d\\n' % os.getpid())\ntime.sleep(0.0 if __name__ == '__main__' else 3.0)\n"
-        "if __name__ == '__main__':\n    with Crew(build, [1, 2], 2) as crew:\n        crew.call('share', [(), ()])\n"
+        "from disctrack.discrepancy.joint.crew import Crew\n"
+        "item = r\"import os, time; os.write(1, b'%d\\n' % os.getpid()); time.sleep(100)\"\n"
+        "with Crew(exec, [item, item], 2) as crew:\n    crew.call('share', [(), ()])\n"
     )
     running = subprocess.Popen([sys.executable, script], env={**os.environ, "PYTHONPATH": str(ROOT)}, text=True,
                                stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True)  # fmt: skip
     assert running.stdout is not None
-    _, *started = [int(running.stdout.readline()) for _ in range(3)]
+    started = [int(running.stdout.readline()) for _ in range(2)]
     os.killpg(running.pid, signal.SIGINT)  # as a terminal does: all of them get it
     _, said = running.communicate(timeout=20)
     assert said.count("Traceback") == 1  # this script's own

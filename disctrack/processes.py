@@ -1,0 +1,84 @@
+"""Processes beside this one: how they begin, whatever they do."""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from multiprocessing.context import SpawnContext, SpawnProcess
+from types import ModuleType
+
+# Of processes side by side: one thread each, more would wait for one another.
+ONE_THREAD = {
+    name: "1"
+    for name in (
+        "OMP_NUM_THREADS",
+        "OPENBLAS_NUM_THREADS",
+        "MKL_NUM_THREADS",
+        "BLIS_NUM_THREADS",
+        "VECLIB_MAXIMUM_THREADS",
+        "NUMEXPR_NUM_THREADS",
+        "NUMBA_NUM_THREADS",
+        "OPENCV_FOR_THREADS_NUM",
+    )
+}
+_STARTING = threading.Lock()
+_GRACE = 3.0  # [s] to clear up, where nobody ends it
+
+
+@contextlib.contextmanager
+def quietly() -> Iterator[None]:
+    """Processes started within have one thread each, no signals of the terminal, and do not run the caller's script."""
+    with _STARTING:
+        script = sys.modules["__main__"]
+        before = {name: os.environ.get(name) for name in ONE_THREAD}
+        kinds = {signal.SIGINT, signal.SIGHUP} if hasattr(signal, "pthread_sigmask") else set()
+        sys.modules["__main__"] = ModuleType("__main__")
+        os.environ.update(ONE_THREAD)
+        blocked = signal.pthread_sigmask(signal.SIG_BLOCK, kinds) if kinds else set()
+        try:
+            yield
+        finally:
+            sys.modules["__main__"] = script
+            for name, value in before.items():
+                os.environ.pop(name)
+                os.environ.update({} if value is None else {name: value})
+            if kinds:
+                signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
+
+
+def end_with_parent() -> None:
+    """In a new process: it ends when the one that started it does, by way of what it does on SIGTERM."""
+    threading.Thread(target=_wait_and_end, daemon=True).start()
+
+
+def _wait_and_end() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os.kill(os.getpid(), signal.SIGTERM)
+    time.sleep(_GRACE)
+    os._exit(1)
+
+
+class _Process(SpawnProcess):
+    def start(self) -> None:
+        with quietly():
+            super().start()
+
+
+class Spawn(SpawnContext):
+    """Remembers its processes: their exit codes tell why they ended."""
+
+    def __init__(self) -> None:
+        self.started: list[SpawnProcess] = []
+
+    def Process(self, *given: object, **named: object) -> SpawnProcess:  # type: ignore[override]
+        """As the context's, begun quietly."""
+        self.started.append(_Process(*given, **named))  # type: ignore[arg-type]
+        return self.started[-1]
