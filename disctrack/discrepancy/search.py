@@ -8,7 +8,7 @@ which its fit has not seen better than the shorter sets of its terms do, and who
 what is left.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 
@@ -134,19 +134,23 @@ class Diagnosis(Outline):
     chance: Chance | None = None  # with which noise alone would let some candidate gain as much as the best does
 
 
+Former = Mapping[frozenset[str], Values]  # by names of effects
+
+
 def explain(
     system: System, start: Values, settings: Settings | None = None, rows: Mask | None = None,
-    former: Diagnosis | None = None,
+    former: Former | None = None,
 ) -> Diagnosis:  # fmt: skip
     """Fit the base model, look for what it lacks, and say how sure that is.
 
     start : values of the base quantities from which Gauss-Newton converges
     rows : (n,) samples of the fits that are judged by the others; the first part of the time, if not given
-    former : of nearly the same system: the fits of the effects that it found begin where its fits ended, too
+    former : explanations that are known to lead somewhere, as where their fits may begin: without one the base model
+        has to follow the data
     """
     settings = settings or Settings()
     base = fit(system, system.base, start)
-    if not (base.converged or _near_enough(system, base)):
+    if not (base.converged or _near_enough(system, base) or (former and np.isfinite(base.cost))):
         return _refusal(base, settings)
     answer = _Search(system, settings, rows, former).run(base)
     if settings.noise is None and answer.verdict != "unexplained":
@@ -208,14 +212,9 @@ class _Search:
     """The explanations of a system's data, and what was done with each, by its names."""
 
     def __init__(
-        self, system: System, settings: Settings, rows: Mask | None = None, former: Diagnosis | None = None
+        self, system: System, settings: Settings, rows: Mask | None = None, former: Former | None = None
     ) -> None:
-        self.system, self.settings = system, settings
-        self.former: dict[frozenset[str], Values] = {}  # by the effects fitted: where their fits ended
-        if former is not None:
-            self.former[frozenset(f.candidate.name for f in former.found)] = former.after.values
-            if former.nearest is not None:
-                self.former[frozenset(c.name for c in former.partial)] = former.nearest.values
+        self.system, self.settings, self.former = system, settings, former or {}
         self.rows = training_rows(system) if rows is None else rows
         self.candidates = tuple(c for c in system.candidates if not c.sought)
         self.noise = 1.0
@@ -235,10 +234,13 @@ class _Search:
     def run(self, base: Fit) -> Diagnosis:
         self.pool[frozenset()] = Explanation((), base)
         self.noise = self._noise(base)
-        linear, scores = self._scored(self.nothing)
+        first = self._begun()
+        if first is None:
+            return _refusal(base, self.settings)
+        linear, scores = self._scored(first)
         by_chance = chance(linear, scores, self.noise) if scores else None
         best, rivals = self._settled()
-        if self.system.frees_shapes and self._shapes_freed(best):
+        if self.system.frees_shapes and first is self.nothing and self._shapes_freed(best):
             best, rivals = self._settled()
         after = self.nothing if rivals is None else best
         found = tuple(self._found(best, c, r) for c, r in zip(best.candidates, rivals or (), strict=rivals is not None))
@@ -253,7 +255,7 @@ class _Search:
             self._held_out(base),
             self._held_out(after.fit),
             self.noise,
-            tuple(self._tried(s, found) for s in scores),
+            self._tried_all(scores, found),
             self.settings,
             partial.candidates if partial else (),
             partial.fit if partial else None,
@@ -271,6 +273,20 @@ class _Search:
             return "nothing missing", f"chi-square is {left}, and no effect gains more than noise does"
         ratio = self._held_out(after.fit).ratio_to_floor / np.sqrt(self.noise)
         return "found", f"chi-square falls to {left}; the free run errs by {ratio:.2f} of its floor"
+
+    def _begun(self) -> Explanation | None:
+        """The explanation in whose residual others are scored first; None where nothing follows the data.
+
+        Of a motion that the base model loses no first order says anything: then it is the shortest known one.
+        """
+        for names, values in self.former.items():
+            together = tuple(c for c in self.system.candidates if c.name in names)
+            fitted = self._fit(together, values)
+            self.pool[_names(together)] = Explanation(together, fitted, fitted.converged)
+        if self.nothing.fit.converged or _near_enough(self.system, self.nothing.fit):
+            return self.nothing
+        self.expanded.add(frozenset())
+        return min((e for e in self._ranked() if e.candidates), key=self.length, default=None)
 
     def _settled(self) -> tuple[Explanation, list[list[Rival]] | None]:
         """The explanation that stands, and rivals of each of its effects; no such list where it explains too little."""
@@ -506,8 +522,6 @@ class _Search:
                 if followed is not None and self._at_noise(followed):
                     return followed
         fits = [self._fit(together, current.fit.values | start) for start in starts]
-        if (ended := self.former.get(frozenset(c.name for c in together))) is not None:
-            fits.append(self._fit(together, ended))
         declared = {q.name: q.declared for q in self.system.base if q.declared is not None}
         if declared and fits and not any(f.converged for f in fits):
             # without the effect the others may have gone so far to make up for it that no step leads back
@@ -616,6 +630,12 @@ class _Search:
         held_gain = 2 * (self._held_out(e.fit).log_density - self._held_out(without).log_density) / self.noise
         gain = (without.cost - e.fit.cost) / self.noise
         return Found(candidate, gain, held_gain, self.threshold(len(candidate.names)), tuple(rivals))
+
+    def _tried_all(self, scores: Sequence[Score], found: tuple[Found, ...]) -> tuple[Tried, ...]:
+        scored = {s.candidate.name for s in scores}
+        led_by = [f for f in found if f.candidate.name not in scored]  # in whose residual the others were scored
+        chosen = (Tried(f.candidate, f.gain, f.gain, f.held_out_gain, "chosen") for f in led_by)
+        return (*chosen, *(self._tried(s, found) for s in scores))
 
     def _tried(self, score: Score, found: tuple[Found, ...]) -> Tried:
         c = score.candidate

@@ -24,7 +24,6 @@ GLITCH = 6.0  # times the median roughness, beyond which a flight is not one: a 
 RELEASE = 5.0  # sigmas by which a first sample may stand off the smooth motion before it counts as still in the hand
 MAX_RELEASE = 6  # samples
 REST = 8  # last samples of a toss
-STILL = 0.02  # [m/s] between two samples, below which a cube lies still
 AT_REST = (0.03, np.cos(np.radians(1.5)))  # [half widths] about the resting height, and cosine of a face's tilt
 
 
@@ -63,15 +62,13 @@ def read_tosses(folder: Path) -> tuple[Toss, ...]:
     """All tosses of `cube_tosses.npz`. Raises AnalysisError."""
     path = needed(folder, "cube_tosses.npz")
     with np.load(path) as file:
-        if not {"state", "offset"} <= set(file.files):
-            raise AnalysisError(f"{path}: holds {sorted(file.files)}; expected state (n, 13) and offset (tosses + 1,).")
-        state, offset = np.asarray(file["state"], float), np.asarray(file["offset"], int)
-    if state.ndim != 2 or state.shape[1] != 13 or not np.isfinite(state[:, :7]).all() or offset[-1] != len(state):
-        raise AnalysisError(f"{path}: state is {state.shape}, offset ends at {offset[-1]}; expected finite rows of 13.")
-    rotation = Rotation.from_quat(state[:, [4, 5, 6, 3]]).as_matrix()
-    return tuple(
-        Toss(i, HALF_WIDTH * state[a:b, :3], rotation[a:b]) for i, (a, b) in enumerate(pairwise(offset.tolist()))
-    )
+        try:
+            state, offset = np.asarray(file["state"], float), np.asarray(file["offset"], int)
+            pose, rotation = state[: offset[-1], :3], Rotation.from_quat(state[:, [4, 5, 6, 3]]).as_matrix()
+        except (KeyError, IndexError, ValueError) as error:
+            raise AnalysisError(f"{path}: expected state (n, 13) and offset (tosses + 1,); {error}.") from error
+    spans = pairwise(offset.tolist())
+    return tuple(Toss(i, HALF_WIDTH * pose[a:b], rotation[a:b]) for i, (a, b) in enumerate(spans))
 
 
 def without_copies(tosses: Sequence[Toss]) -> tuple[tuple[Toss, ...], int]:
@@ -100,11 +97,10 @@ def flights(tosses: Sequence[Toss]) -> tuple[tuple[Flight, ...], int]:
     sigma = 1.4826 * float(np.median([np.median(np.abs(_off(f)[2:-2])) for f in whole]))
     found = []
     for toss, end in zip(tosses, ends, strict=True):
-        for first in range(1, min(MAX_RELEASE, end - SHORTEST) + 1):
-            flight = smooth_flight(toss, first, end)
-            if np.abs(_off(flight)[0]).max() <= RELEASE * sigma:
-                found.append(flight)
-                break
+        tries = (smooth_flight(toss, first, end) for first in range(1, min(MAX_RELEASE, end - SHORTEST) + 1))
+        flight = next((f for f in tries if np.abs(_off(f)[0]).max() <= RELEASE * sigma), None)
+        if flight is not None:
+            found.append(flight)
     rough = np.array([np.sqrt(np.mean(np.diff(_off(f), 3, axis=0) ** 2)) for f in found])
     smooth = tuple(f for f, r in zip(found, rough, strict=True) if r <= GLITCH * np.median(rough))
     return smooth, len(tosses) - len(smooth)
@@ -151,7 +147,6 @@ class Resting:
 
     number: int
     height: float  # of the centre [m]
-    spin: float  # rate of turning about the vertical [rad/s]; NaN while it still slides
     normal: Array  # (2,) components of the face's normal along and across
     by_axes: Array  # (2, 3) change of the normal by a turn of the tags' axes against the cube's, about each body axis
     point: Array  # (3,) along, across, up [m]; where it would be if the declared half width were right
@@ -172,11 +167,7 @@ def resting(tosses: Sequence[Toss], flown: Sequence[Flight]) -> tuple[Resting, .
             normal = (toss.rotation[last, :, face] * np.sign(up[:, face])[:, None]).mean(axis=0)
             place = toss.position[last].mean(axis=0)
             point = np.array([*(axes @ place), HALF_WIDTH])
-            spin = np.nan
-            if np.abs(np.diff(toss.position[last], axis=0)).max() * FRAME_RATE < STILL:
-                turned = Rotation.from_matrix(toss.rotation[last] @ toss.rotation[last][0].T).as_rotvec()[:, 2]
-                spin = float(np.polyfit(np.arange(REST) / FRAME_RATE, turned, 1)[0])
             upward = np.eye(3)[face] * np.sign(up[-1, face])
             by_axes = axes @ toss.rotation[-1] @ np.cross(np.eye(3), upward).T
-            found.append(Resting(toss.number, float(place[2]), spin, axes @ normal, by_axes, point))
+            found.append(Resting(toss.number, float(place[2]), axes @ normal, by_axes, point))
     return tuple(found)

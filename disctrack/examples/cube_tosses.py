@@ -8,8 +8,6 @@ flight sees gravity, frame rate and scale of the lengths as one number; cubes at
 """
 
 import sys
-from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -20,7 +18,7 @@ from disctrack.discrepancy.search import Diagnosis, Settings, explain
 from disctrack.discrepancy.system import Values
 from disctrack.discrepancy.words import effect_text
 from disctrack.examples._command import Outcome, command
-from disctrack.examples.cube_data import FRAME_RATE, HALF_WIDTH, Toss, read_tosses
+from disctrack.examples.cube_data import FRAME_RATE, HALF_WIDTH, read_tosses
 from disctrack.examples.cube_effects import GRAVITY
 from disctrack.examples.cube_system import GROUPS, HELD_OUT, CubeTosses
 from disctrack.report.blocks import Report
@@ -30,26 +28,13 @@ from disctrack.report.terminal import full
 SETTINGS = Settings(noise=1.0, unexplained_share=0.2, max_effects=8)
 
 
-@dataclass(frozen=True)
-class CubeAnswer:
-    """Everything asked of the tosses."""
-
-    system: CubeTosses
-    diagnosis: Diagnosis
-    before: dict[str, float]  # rms of held-out flights per group of channels [m], [rad] ...
-    after: dict[str, float]  # ... with values fitted to the others
-
-
-def analyse_tosses(tosses: Sequence[Toss]) -> CubeAnswer:
-    """Diagnose, and measure errors on held-out tosses. Raises AnalysisError."""
-    system = CubeTosses(tosses)
-    diagnosis = explain(system, {}, SETTINGS, system.training_rows())
-    held = diagnosis.held_out_after
-    return CubeAnswer(system, diagnosis, rms_of(system, {}), rms_of(system, held.train.values if held else {}))
+def diagnosed(system: CubeTosses) -> Diagnosis:
+    """What the base model lacks."""
+    return explain(system, {}, SETTINGS, system.training_rows())
 
 
 def rms_of(system: CubeTosses, values: Values) -> dict[str, float]:
-    """Rms of measured minus predicted of the held-out flights, per group of channels."""
+    """Rms of measured minus predicted of the held-out flights, per group of channels [m], [rad]."""
     residuals = zip(system.flights, system.residuals(values), strict=True)
     left = [x for flight, x in residuals if flight.number % HELD_OUT == HELD_OUT - 1]
     freedom = sum(len(x) - 2 for x in left)
@@ -57,38 +42,44 @@ def rms_of(system: CubeTosses, values: Values) -> dict[str, float]:
     return {name: float(np.sqrt(np.mean(square[list(channels)]))) for name, channels in GROUPS.items()}
 
 
-def sentence(answer: CubeAnswer) -> str:
+def errors(system: CubeTosses, d: Diagnosis) -> tuple[dict[str, float], dict[str, float]]:
+    """`rms_of` the base model, and of what was found with values fitted to the other flights."""
+    held = d.held_out_after
+    return rms_of(system, {}), rms_of(system, held.train.values if held else {})
+
+
+def sentence(d: Diagnosis) -> str:
     """The answer in plain words."""
-    d = answer.diagnosis
     effects = "; ".join(effect_text(f, d) for f in d.found)
     text = f"Missing: {effects}" if effects else "No effect is claimed to be missing"
     return f"{text}. Something else is missing: {d.reason}." if d.verdict == "unexplained" else f"{text}."
 
 
-def report(answer: CubeAnswer) -> str:
+def report(system: CubeTosses, d: Diagnosis) -> str:
     """Before and after, for people."""
-    system = answer.system
+    before, after = errors(system, d)
     lines = [
         f"{len(system.flights)} flights ({system.n_left_out} tosses left out: too short, or not smooth; "
         f"{system.n_copies} copies of others turned about the vertical), {len(system.cubes)} cubes at rest; "
         "every third toss held out.",
-        sentence(answer),
+        sentence(d),
         "",
         f"{'held-out tosses':<30}{'before':>12}{'after':>12}{'white noise':>12}",
     ]
     for group, noise in system.noise.items():
         size, unit = (float(np.degrees(1e3)), "mdeg") if group == "turn" else (1e6, "um")
-        numbers = (answer.before[group], answer.after[group], noise.white)
+        numbers = (before[group], after[group], noise.white)
         lines.append(f"{f'rms {group} [{unit}]':<30}" + "".join(f"{size * x:12.1f}" for x in numbers))
-    return "\n".join([*lines, *full(Report("", "", blocks=tables(answer.diagnosis)))])
+    return "\n".join([*lines, *full(Report("", "", blocks=tables(d)))])
 
 
 def example(folder: Path) -> Outcome:
     """What do gravity and torque-free rotation lack for a tossed cube?"""
-    answer = analyse_tosses(read_tosses(folder))
+    system = CubeTosses(read_tosses(folder))
+    d = diagnosed(system)
     model = f"g = {GRAVITY} m/s^2, uniform cube, {FRAME_RATE:g} Hz, half width {HALF_WIDTH} m"
-    found = document(answer.diagnosis, model, sentence(answer), {"rms": answer.before}, {"rms": answer.after})
-    return Outcome(report(answer), found | {"noise": {k: vars(v) for k, v in answer.system.noise.items()}})
+    found = document(d, model, sentence(d), *({"rms": side} for side in errors(system, d)))
+    return Outcome(report(system, d), found | {"noise": {k: vars(v) for k, v in system.noise.items()}})
 
 
 main = partial(command, "cube_tosses", "cube_tosses.npz", example)

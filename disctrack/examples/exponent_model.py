@@ -2,9 +2,8 @@
 
 The motion is simulated from a nutation of some degrees down to collapse. Nutation, precession rate and energy are
 taken every millisecond while the time left, t_f - t, lies in the paper's window; straight lines through their
-logarithms against ln(t_f - t) have the exponents for slopes. The paper does not remove the nutation oscillation. Its
-phase differs from trial to trial, so that it enters the mean of a series to second order in its amplitude only: by less
-than 0.005 at 30 % of the nutation, by less than 0.002 at 15 %. It is therefore left out unless asked for.
+logarithms against ln(t_f - t) have the exponents for slopes. The paper does not remove the nutation oscillation; its
+phase differs from trial to trial, so that it enters the mean of a series to second order only. It is left out.
 """
 
 from collections.abc import Mapping
@@ -15,6 +14,7 @@ from scipy.interpolate import CubicSpline
 
 from calibration.kit.arrays import Array
 from disctrack.disc import MA_2014, Disc
+from disctrack.discrepancy.system import Quantity
 from disctrack.rolling import EndReason, Model, simulate, steady_precession
 
 FRAME = 1e-3  # [s] between pairs of the paper's cameras
@@ -37,19 +37,36 @@ class Setup:
     start: float = np.radians(8.0)  # [rad] nutation at which the simulation begins
     disc: Disc = MA_2014
     gravity: float = 9.81
-    share: float = 0.0  # amplitude of the nutation oscillation over the nutation, at the start
-    phase: float = 0.0  # [rad] of the oscillation there
 
 
-# What the experimenter does to the motion, and may do wrong; nought is right.
-READING = (
-    "t_f.bias",  # [s] instant called t_f minus that of collapse
-    "cut.shift",  # [s] shortest time left minus `Setup.shortest`
-    "theta_zero.shift",  # [rad] added to every nutation
-    "height_zero.shift",  # [m] added to every height
-    "attitude_noise.variance",  # [rad^2] noise of the attitude per axis and frame
-    "smoothing.square",  # [s^2] square of the span of a moving average over all quantities
-)
+# What the experimenter may do wrong; zero is right. By quantity: its title, and where the paper says so
+READING = {
+    Quantity("t_f.bias", "s", 1e-3, lower=-0.045, upper=0.045, typical=0.01): (
+        "the instant called t_f is not that of collapse",
+        "section 4a",
+    ),
+    Quantity("cut.shift", "s", 1e-3, lower=-0.04, upper=0.1, typical=0.02): (
+        "the fits end at another time left than the curves of figures 14 to 16",
+        "figures 14 to 16",
+    ),
+    Quantity("theta_zero.shift", "rad", 1e-5, typical=np.radians(0.05)): (
+        "zero of the nutation (plane of the table)",
+        "section 3b: accuracy 0.05 deg",
+    ),
+    Quantity("height_zero.shift", "m", 1e-6, typical=2e-5): (
+        "zero of the height (plane of the table)",
+        "section 3b: accuracy 5 um",
+    ),
+    Quantity("attitude_noise.variance", "rad^2", 1e-8, 0.0, 0.0, typical=np.radians(0.05) ** 2): (
+        "noise of the attitude, which central differences turn into bias",
+        "section 3b",
+    ),
+    # square of the span
+    Quantity("smoothing.square", "s^2", 1e-6, 0.0, 0.0, 0.06**2, typical=0.01**2): (
+        "moving average over the record",
+        "section 3b: 'a differential method'",
+    ),
+}
 
 
 class LastStage:
@@ -59,10 +76,7 @@ class LastStage:
         """Simulate. values : parameters of effects by "effect.parameter"; omega3 [rad/s] at the start."""
         self.setup = setup
         model = Model(setup.disc, setup.gravity).with_values(dict(values))
-        state = steady_precession(
-            setup.start, setup.disc, setup.gravity, omega3=omega3,
-            nutation_amplitude=setup.share * setup.start, nutation_phase=setup.phase,
-        )  # fmt: skip
+        state = steady_precession(setup.start, setup.disc, setup.gravity, omega3=omega3)
         motion = simulate(model, state, MAX_DURATION, rate=1 / SAMPLING, theta_end=END_SHARE * setup.start, rtol=RTOL)
         curves = _observed(motion.q, motion.qdot, setup)
         # a strong moment can stop the precession in the very last milliseconds; what is read lies before
@@ -75,10 +89,10 @@ class LastStage:
         self.curve = CubicSpline(motion.time[:n][last], curves[:n][last], axis=0) if ended else None
 
     def outcomes(self, reading: Mapping[str, float] | None = None) -> Array:
-        """(4,) OUTCOMES; NaN where there is no collapse. reading : those of READING that are not nought."""
+        """(4,) OUTCOMES; NaN where there is no collapse. reading : those of READING that are not zero."""
         if self.curve is None:
             return np.full(len(OUTCOMES), np.nan)
-        left, *quantities = self._read(self.curve, dict.fromkeys(READING, 0.0) | dict(reading or {}))
+        left, *quantities = self._read(self.curve, {q.name: 0.0 for q in READING} | dict(reading or {}))
         return np.array([*(slope(left, v) for v in quantities), np.log(self.duration)])
 
     def _read(self, curve: CubicSpline, reading: Mapping[str, float]) -> tuple[Array, Array, Array, Array]:

@@ -1,6 +1,6 @@
 """Published exponents as a system that the engine of `disctrack.diagnosis` can diagnose.
 
-A row is one exponent of one trial, cleared of what the exponents before it in the same trial foretell (Cholesky), so
+A row is one exponent of one trial, cleared of what the exponents before it in the same trial predict (Cholesky), so
 that all rows are independent with variance one. One more row per surface is the time that the last stage lasts: the
 paper's k_m is that with which its simulation collapses at the measured instant, which is all that k_m can say once
 another law acts beside it. The tables' own t_f count from the blow that starts the disc, through seconds of slip; a
@@ -16,6 +16,7 @@ from calibration.kit.arrays import Array
 from disctrack.analyse.published import SURFACES, published_table
 from disctrack.diagnosis.motion import SLIP, motion_candidates
 from disctrack.disc import MA_2014
+from disctrack.discrepancy.held_out import TRAIN_FRACTION
 from disctrack.discrepancy.system import Candidate, Quantity, System, Values
 from disctrack.errors import AnalysisError
 from disctrack.examples.exponent_model import READING, LastStage, Setup
@@ -78,23 +79,6 @@ def published_series() -> tuple[Series, ...]:
     return tuple(series_of(setup_of(s), published_table(s).exponents[:, ORDER]) for s in SURFACES)
 
 
-# What the reading may do wrong: quantity, title and source of READING's errors, in its order.
-_ERRORS_OF_READING = (
-    (Quantity("t_f.bias", "s", 1e-3, lower=-0.045, upper=0.045, typical=0.01),
-     "the instant called t_f is not that of collapse", "section 4a"),
-    (Quantity("cut.shift", "s", 1e-3, lower=-0.04, upper=0.1, typical=0.02),
-     "the fits end at another time left than the curves of figures 14 to 16", "figures 14 to 16"),
-    (Quantity("theta_zero.shift", "rad", 1e-5, typical=np.radians(0.05)),
-     "zero of the nutation (plane of the table)", "section 3b: accuracy 0.05 deg"),
-    (Quantity("height_zero.shift", "m", 1e-6, typical=2e-5),
-     "zero of the height (plane of the table)", "section 3b: accuracy 5 um"),
-    (Quantity("attitude_noise.variance", "rad^2", 1e-8, 0.0, 0.0, typical=np.radians(0.05)**2),
-     "noise of the attitude, which central differences turn into bias", "section 3b"),
-    (Quantity("smoothing.square", "s^2", 1e-6, 0.0, 0.0, 0.06**2, typical=0.01**2),
-     "moving average over the record", "section 3b: 'a differential method'"),
-)  # fmt: skip
-
-
 def at(name: str, surface: str) -> str:
     """Name of a quantity that each surface has for itself."""
     return f"{name}@{surface}"
@@ -111,7 +95,7 @@ def exponent_candidates(surfaces: Sequence[str], names: Sequence[str] | None = N
         shared = CATALOGUE[c.effect].__module__.rpartition(".")[2] in _SHARED and not c.threshold
         quantities = c.quantities if shared else tuple(q for own in c.quantities for q in _per_surface(own, surfaces))
         found.append(replace(c, quantities=quantities))
-    for quantity, title, source in _ERRORS_OF_READING:
+    for quantity, (title, source) in READING.items():
         name = quantity.owner
         found.append(Candidate(name, name, "measurement", title, source, (quantity,)))
         if len(surfaces) > 1:
@@ -129,17 +113,11 @@ class ExponentSystem(System):
         self.surfaces = tuple(dict.fromkeys(s.setup.surface for s in series))
         self.candidates = exponent_candidates(self.surfaces, candidates)  # what the model or the reading may lack
         self._stages: dict[tuple[object, ...], LastStage] = {}
-        owner, trial, number = [], [], []
-        for i, s in enumerate(self.series):
-            n = len(s.exponents)
-            owner += [i] * (3 * n + 1)
-            trial += [-1.0, *np.repeat((np.arange(n) + 0.5) / n, 3)]
-            number += [3, *np.tile(np.arange(3), n)]
-        # trials of all surfaces take turns, so that the first part of them holds a like share of each
-        order = np.lexsort((number, owner, trial))
-        self.owner, self.trial, self.number = (np.array(a)[order] for a in (owner, trial, number))
-        self.time = np.cumsum(np.concatenate([[0], (np.diff(self.trial) != 0) | (np.diff(self.owner) != 0)])) * 1.0
-        self.weights = np.ones(len(self.time))
+        # of each series its trials, three rows each, and at last the duration; of the trials the first part is fitted
+        counts = [len(s.exponents) for s in series]
+        shares = [np.repeat(np.append((np.arange(n) + 0.5) / n, 0.0), [3] * n + [1]) for n in counts]
+        self.training = np.concatenate(shares) < TRAIN_FRACTION
+        self.time, self.weights = np.arange(len(self.training), dtype=float), np.ones(len(self.training))
         self.base = tuple(
             q
             for s in self.series
@@ -148,7 +126,6 @@ class ExponentSystem(System):
                 Quantity(at(SPIN, s.setup.surface), "rad/s", 0.01, SPIN_AT_REST, prior_sigma=SPIN_SIGMA),
             )
         )
-        self._whiten = [np.linalg.inv(np.linalg.cholesky(s.covariance)) for s in self.series]
 
     @property
     def start(self) -> dict[str, float]:
@@ -162,50 +139,36 @@ class ExponentSystem(System):
     def outcomes(self, index: int, values: Values) -> Array:
         """(4,) predicted means of one series: n_theta, n_psidot, n_energy, ln duration."""
         own = self.seen_by(index, values)
-        return self._stage(index, own).outcomes({name: own[name] for name in READING if name in own})
+        return self._stage(index, own).outcomes({q.name: own[q.name] for q in READING if q.name in own})
 
     def linearise(self, values: Values, names: Sequence[str]) -> tuple[Array, Array]:
         """Whitened residual (n, 1) and derivative (n, 1, k) by central differences, one-sided at bounds."""
-        predicted = [self.outcomes(i, values) for i in range(len(self.series))]
-        residual = self._rows([self._data(i) - p for i, p in enumerate(predicted)])
         known = {q.name: q for q in (*self.base, *(q for c in self.candidates for q in c.quantities))}
+        residual = self._residual(values)
         derivative = np.zeros((len(residual), len(names)))
         for k, name in enumerate(names):
             q, value = known[name], values.get(name, 0.0)
             # central differences away from bounds: with large residuals their gradient decides about convergence
             up, down = min(value + STEP * q.scale, q.upper), max(value - STEP * q.scale, q.lower)
-            ends = [dict(values) | {name: v} for v in (up, down)]
-            change = [
-                self.outcomes(i, ends[0]) - self.outcomes(i, ends[1]) if self._concerns(i, name) else np.zeros(4)
-                for i in range(len(self.series))
-            ]
-            derivative[:, k] = self._rows(change) / (up - down)
+            change = self._residual({**values, name: down}) - self._residual({**values, name: up})
+            derivative[:, k] = change / (up - down)
         return residual[:, None], derivative[:, None]
 
-    def _data(self, index: int) -> Array:
-        """(n, 4) observed."""
-        s = self.series[index]
-        return np.column_stack([s.exponents, np.full(len(s.exponents), s.ln_duration)])
-
-    def _rows(self, differences: Sequence[Array]) -> Array:
-        """(n,) whitened rows from differences (n_trials, 4) or (4,) of each series."""
-        rows = np.zeros(len(self.time))
-        for i, (s, whiten) in enumerate(zip(self.series, self._whiten, strict=True)):
-            d = np.broadcast_to(differences[i], (len(s.exponents), 4))
-            rows[(self.owner == i) & (self.number < 3)] = (d[:, :3] @ whiten.T).ravel()
-            rows[(self.owner == i) & (self.number == 3)] = d[0, 3] / DURATION_SIGMA
-        return rows
-
-    def _concerns(self, index: int, name: str) -> bool:
-        _, mark, owner = name.partition("@")
-        return not mark or owner == self.series[index].setup.surface
+    def _residual(self, values: Values) -> Array:
+        """(n,) observed minus predicted, whitened."""
+        parts = []
+        for i, s in enumerate(self.series):
+            predicted, whiten = self.outcomes(i, values), np.linalg.inv(np.linalg.cholesky(s.covariance))
+            parts += [((s.exponents - predicted[:3]) @ whiten.T).ravel()]
+            parts += [np.array([s.ln_duration - predicted[3]]) / DURATION_SIGMA]
+        return np.concatenate(parts)
 
     def seen_by(self, index: int, values: Values) -> dict[str, float]:
         """Values that one series sees, without the surface in their names; what both have adds up."""
         own: dict[str, float] = {}
         for name, value in values.items():
-            if self._concerns(index, name):
-                plain = name.partition("@")[0]
+            plain, _, surface = name.partition("@")
+            if surface in ("", self.series[index].setup.surface):
                 own[plain] = own.get(plain, 0.0) + value
         return own
 
@@ -213,7 +176,8 @@ class ExponentSystem(System):
         own = dict(seen)
         spin = own.pop(SPIN, SPIN_AT_REST)
         inverse = own.pop(SLIP, 0.0)
-        laws = {name: value for name, value in own.items() if name not in READING and (value or name == "km.k_m")}
+        reading = {q.name for q in READING}
+        laws = {name: value for name, value in own.items() if name not in reading and (value or name == "km.k_m")}
         if inverse > 0:
             laws["slip.mu"] = 1 / inverse
         key = (index, spin, *sorted(laws.items()))

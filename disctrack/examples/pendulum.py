@@ -57,7 +57,7 @@ def rms_left(answer: Answer, run: Run) -> dict[str, tuple[float, float]]:
     kept = np.asarray(run.time) > FITTED_S
     found = {}
     for side in ("before", "after"):
-        left = np.asarray(run.data["angle"]) - answer.forecast(run, before=side == "before")["angle"]
+        left = np.asarray(run.data["angle"]) - answer.forecast(run, by=side)["angle"]
         found[side] = float(np.sqrt(np.mean(left[~kept] ** 2))), float(np.sqrt(np.mean(left[kept] ** 2)))
     return found
 

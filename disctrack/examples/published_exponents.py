@@ -9,6 +9,7 @@ contradiction, and which of them these tables cannot tell apart.
 """
 
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -36,7 +37,6 @@ class Misfit:
     """Mean exponents of one surface against a prediction without error."""
 
     surface: str
-    predicted: Array  # (3,) n_theta, n_psidot, n_energy
     mean: Array  # (3,)
     sigma: Array  # (3,) of the mean, from the scatter of the trials
     t: Array  # (3,) Student's
@@ -54,7 +54,7 @@ def misfit(surface: str, exponents: Array, predicted: Array) -> Misfit:
     t_squared = float(difference @ np.linalg.solve(covariance, difference))
     p = float(stats.f.sf(t_squared * (n - k) / (k * (n - 1)), k, n - k))
     sigmas = np.sign(t) * stats.norm.isf(stats.t.sf(np.abs(t), n - 1))
-    return Misfit(surface, predicted, mean, sigma, t, sigmas, p, float(stats.norm.isf(p / 2)))
+    return Misfit(surface, mean, sigma, t, sigmas, p, float(stats.norm.isf(p / 2)))
 
 
 @dataclass(frozen=True)
@@ -68,25 +68,17 @@ class Explanation:
     misfits: tuple[Misfit, ...]
 
 
-@dataclass(frozen=True)
-class Answer:
-    """All findings."""
-
-    diagnosis: Diagnosis
-    thin: tuple[Misfit, ...]  # against 2/3, -1/3, 2/3
-    undecided: tuple[Explanation, ...]  # what was found, and what these tables cannot tell from it
-
-
-def examine(system: ExponentSystem) -> Answer:
+def examine(system: ExponentSystem) -> tuple[Diagnosis, tuple[Explanation, ...]]:
     """Diagnosis of the trials, with what each effect that may be the one leaves of every surface."""
-    d = explain(system, system.start, SETTINGS)
+    d = explain(system, system.start, SETTINGS, system.training)
     named = [(f.candidate, d.after) for f in d.found]
     named += [(r.candidate, r.fit) for f in d.found for r in f.cannot_be_told_from]
-    return Answer(
-        d,
-        tuple(misfit(s.setup.surface, s.exponents, THIN_DISC) for s in system.series),
-        tuple(Explanation(c.name, f, c.names, d.before.cost - f.cost, left_by(system, f)) for c, f in named),
-    )
+    return d, tuple(Explanation(c.name, f, c.names, d.before.cost - f.cost, left_by(system, f)) for c, f in named)
+
+
+def against_thin_disc(system: ExponentSystem) -> tuple[Misfit, ...]:
+    """Every surface against 2/3, -1/3, 2/3."""
+    return tuple(misfit(s.setup.surface, s.exponents, THIN_DISC) for s in system.series)
 
 
 def left_by(system: ExponentSystem, fit: Fit) -> tuple[Misfit, ...]:
@@ -96,53 +88,58 @@ def left_by(system: ExponentSystem, fit: Fit) -> tuple[Misfit, ...]:
     )
 
 
-def sentence(answer: Answer) -> str:
+def sentence(d: Diagnosis, thin: Sequence[Misfit], undecided: Sequence[Explanation]) -> str:
     """The answer in plain words."""
-    if not answer.undecided:
-        return f"Nothing is claimed: {answer.diagnosis.reason}."
-    gains = [e.gain for e in answer.undecided]
-    worst = max(answer.thin, key=lambda m: m.joint_sigmas)
-    after = max(m.joint_sigmas for e in answer.undecided for m in e.misfits)
+    if not undecided:
+        return f"Nothing is claimed: {d.reason}."
+    gains = [e.gain for e in undecided]
+    worst = max(thin, key=lambda m: m.joint_sigmas)
+    after = max(m.joint_sigmas for e in undecided for m in e.misfits)
     what = "it" if len(gains) == 1 else "each of them alone"
     text = (
         f"The trials on {worst.surface} lie {worst.joint_sigmas:.1f} sigma from 2/3, -1/3, 2/3; {what} "
-        f"({', '.join(e.name for e in answer.undecided)}) brings every surface within {after:.1f} sigma, and "
+        f"({', '.join(e.name for e in undecided)}) brings every surface within {after:.1f} sigma, and "
         f"chi-square down by {min(gains):.0f} to {max(gains):.0f}"
     )
     return text + (": not identifiable from these tables." if len(gains) > 1 else ".")
 
 
-def report(answer: Answer) -> str:
+def report(d: Diagnosis, thin: Sequence[Misfit], undecided: Sequence[Explanation]) -> str:
     """The findings for people."""
-    lines = [sentence(answer), "", "Mean of the trials against 2/3, -1/3, 2/3 (thin disc, slow precession):"]
-    for m in answer.thin:
-        for name, mean, sigma, predicted, s in zip(NAMES, m.mean, m.sigma, m.predicted, m.sigmas, strict=True):
+    lines = [sentence(d, thin, undecided), "", "Mean of the trials against 2/3, -1/3, 2/3 (thin disc):"]
+    for m in thin:
+        for name, mean, sigma, predicted, s in zip(NAMES, m.mean, m.sigma, THIN_DISC, m.sigmas, strict=True):
             lines.append(f"  {m.surface:6}{name:9}{mean:8.4f} +- {sigma:.4f}   {predicted:8.4f}{s:6.1f} sigma")
         lines.append(f"  {m.surface:6}together {m.joint_sigmas:.1f} sigma (p = {m.p_value:.2g})")
     lines += ["", "Refitted: chi-square falls by; sigma left of each surface; size"]
-    for e in answer.undecided:
+    for e in undecided:
         units = {q.name: q.unit for q in e.fit.quantities}
         sizes = ", ".join(f"{n} = {measured(e.fit.values[n], e.fit.sigma(n), units[n])}" for n in e.sizes)
         left = ", ".join(f"{m.surface} {m.joint_sigmas:.1f}" for m in e.misfits)
         lines.append("; ".join(x for x in (f"  {e.name}: {e.gain:.1f}", left, sizes) if x))
-    return "\n".join([*lines, "", *full(Report("", "", blocks=tables(answer.diagnosis)))])
+    return "\n".join([*lines, "", *full(Report("", "", blocks=tables(d)))])
 
 
 def example() -> Outcome:
     """Diagnose the published exponents of Ma et al. (2014)."""
-    answer = examine(ExponentSystem(published_series()))
+    system = ExponentSystem(published_series())
+    (d, undecided), thin = examine(system), against_thin_disc(system)
     model = "rolling disc with k_m, straight lines through the logarithms in the paper's windows"
-    explained = [
-        {"name": e.name, "gain": e.gain, "parameters": {n: (e.fit.values[n], e.fit.sigma(n)) for n in e.sizes},
-         "exponents": [vars(m) for m in e.misfits]}
-        for e in answer.undecided
-    ]  # fmt: skip
-    return Outcome(report(answer), document(answer.diagnosis, model, sentence(answer)) | {
+    found = document(d, model, sentence(d, thin, undecided)) | {
         "source": "Ma, Liu, Zhao and Zhang 2014, Proc. R. Soc. A 470:20140191, tables 2 and 3",
-        "cannot_be_told_apart": [e.name for e in answer.undecided],
-        "against_thin_disc": [vars(m) for m in answer.thin],
-        "explanations": explained,
-    })  # fmt: skip
+        "cannot_be_told_apart": [e.name for e in undecided],
+        "against_thin_disc": [vars(m) for m in thin],
+        "explanations": [
+            {
+                "name": e.name,
+                "gain": e.gain,
+                "parameters": {n: (e.fit.values[n], e.fit.sigma(n)) for n in e.sizes},
+                "exponents": [vars(m) for m in e.misfits],
+            }
+            for e in undecided
+        ],
+    }
+    return Outcome(report(d, thin, undecided), found)
 
 
 main = partial(command, "published_exponents", None, example)

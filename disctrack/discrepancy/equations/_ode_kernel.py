@@ -2,41 +2,79 @@
 
 Steps follow the motion, not the sampling; between them the solution is a polynomial. Coefficients and error estimate:
 Hairer, Norsett & Wanner, Solving Ordinary Differential Equations I, sections II.5 and II.6, as SciPy's DOP853 has them.
+Where the equations are stiff (friction that holds, fast reactions) Radau's method IIA of order 5 takes over, its stages
+solved by Newton's method with the exact derivative of all of them, the sensitivities those of the step as it is
+computed: Hairer & Wanner, Solving Ordinary Differential Equations II, section IV.8, as SciPy's Radau has it.
 """
 
 from __future__ import annotations
 
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import types
 from scipy.integrate import DOP853
 
+from calibration.kit.arrays import Array
 from calibration.kit.compiled import njit
 
 _f, _v, _m, _cube = types.float64, types.float64[::1], types.float64[:, ::1], types.float64[:, :, ::1]
 # rhs(t, y, p, u, u_rate, f, J, P): f (n,), J = df/dy (n, n), P = df/dp (n, n_p) are filled in
 RHS = types.void(_f, _v, _v, _v, _v, _v, _m, _m)
-# observe(t, y, p, u, u_rate, h, H_y, H_p): what the sensors see (w,), and its derivatives (w, n), (w, n_p)
-OBSERVE = RHS
+# observe(t, y, p, u, u_rate, h, H_y, H_p): the same of what the sensors see (w,), (w, n), (w, n_p)
 RHS_TYPE = types.FunctionType(RHS)
 
-DONE, NOT_FINITE, TOO_MANY_STEPS, STIFF_CHANGES = 0, 1, 2, 3
 _STABLE = 6.1  # step times the fastest rate, up to which the method is stable (Hairer's code DOP853)
 _OFTEN = 15  # steps in a row at that limit, from which on it is the limit and not the error that holds them back
+_RAN_AWAY = 1e6  # times larger than all its states are: what becomes of such a motion nobody asks
 
-_A = np.ascontiguousarray(DOP853.A)  # (12, 12)
-_B, _C = np.ascontiguousarray(DOP853.B), np.ascontiguousarray(DOP853.C)
+_A, _B, _C = (np.ascontiguousarray(x) for x in (DOP853.A, DOP853.B, DOP853.C))  # (12, 12), (12,), (12,)
 _E3, _E5 = np.ascontiguousarray(DOP853.E3), np.ascontiguousarray(DOP853.E5)  # (13,)
 _D = np.ascontiguousarray(DOP853.D)  # (4, 16)
 _A_EXTRA, _C_EXTRA = np.ascontiguousarray(DOP853.A_EXTRA), np.ascontiguousarray(DOP853.C_EXTRA)  # (3, 16), (3,)
 _SENSITIVITY_TOLERANCE = 1e-6  # relative to the largest so far: steps of a fit need no more
 
+_S6 = 6.0**0.5
+_RADAU_C = np.array([(4.0 - _S6) / 10.0, (4.0 + _S6) / 10.0, 1.0])
+_RADAU_A = np.array(
+    [
+        [(88.0 - 7.0 * _S6) / 360.0, (296.0 - 169.0 * _S6) / 1800.0, (-2.0 + 3.0 * _S6) / 225.0],
+        [(296.0 + 169.0 * _S6) / 1800.0, (88.0 + 7.0 * _S6) / 360.0, (-2.0 - 3.0 * _S6) / 225.0],
+        [(16.0 - _S6) / 36.0, (16.0 + _S6) / 36.0, 1.0 / 9.0],
+    ]
+)
+_RADAU_E = np.array([-13.0 - 7.0 * _S6, -13.0 + 7.0 * _S6, -1.0]) / 3.0
+_REAL = 3.0 + 3.0 ** (2.0 / 3.0) - 3.0 ** (1.0 / 3.0)  # real eigenvalue of A^-1
+_NEWTON = 12  # steps of Newton's method; it converges in two to four or not at all
+_STIFF_TOLERANCE = 1e-8  # of a step: the estimate is of third order, and far above the error of fifth
+_CLOSE = 1e-3  # of the tolerance, to which Newton's method solves the stages
+_MILD = 2.0  # step times the fastest rate, below which the explicit method takes steps as long
+
 
 _RULES: dict[str, Any] = {"error_model": "numpy", "nogil": True}
 entry = njit(cache=True, **_RULES)
 part = njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **_RULES)  # called by compiled functions only
+
+
+class _Drive(NamedTuple):
+    """What a slope depends on beside instant and state, and room for what makes it up."""
+
+    p: Array
+    columns: Array
+    knots: Array
+    pieces: Array
+    u: Array
+    u_rate: Array
+    f: Array
+    J: Array
+    P: Array
+
+
+@part
+def _drive(p, columns, n, knots, pieces):
+    u, u_rate = np.zeros(len(pieces)), np.zeros(len(pieces))
+    return _Drive(p, columns, knots, pieces, u, u_rate, np.zeros(n), np.zeros((n, n)), np.zeros((n, len(p))))
 
 
 @part
@@ -79,55 +117,236 @@ def inputs_at(t, i, knots, pieces, u, u_rate):
 
 
 @part
-def _slope(rhs, t, piece, z, p, columns, knots, pieces, u, u_rate, f, J, P, out):
+def _slope(rhs, t, piece, z, drive, out):
     """Z = (y, dy/da_1, dy/da_2, ...) one after the other -> dz/dt, with the inputs of one of their pieces."""
-    n, k = len(f), len(columns)
-    inputs_at(t, piece, knots, pieces, u, u_rate)
-    rhs(t, z[:n], p, u, u_rate, f, J, P)
+    n, k = len(drive.f), len(drive.columns)
+    inputs_at(t, piece, drive.knots, drive.pieces, drive.u, drive.u_rate)
+    rhs(t, z[:n], drive.p, drive.u, drive.u_rate, drive.f, drive.J, drive.P)
     for i in range(n):
-        out[i] = f[i]
+        out[i] = drive.f[i]
     for c in range(k):
         s = n * (c + 1)
         for i in range(n):
-            total = P[i, columns[c]] if columns[c] >= 0 else 0.0
+            total = drive.P[i, drive.columns[c]] if drive.columns[c] >= 0 else 0.0
             for j in range(n):
-                total += J[i, j] * z[s + j]
+                total += drive.J[i, j] * z[s + j]
             out[s + i] = total
 
 
+@part
+def _moved(z, step, weights, K, out):
+    """`out` = z + step times the weighted sum of slopes K."""
+    for i in range(len(z)):
+        total = 0.0
+        for j in range(len(weights)):
+            total += weights[j] * K[j, i]
+        out[i] = z[i] + step * total
+
+
+@part
+def _step(rhs, t, step, piece, z, drive, K, last_stage, new):
+    """Stages K[1] to K[12] of a step from z, whose slope is K[0], to `new`; `last_stage`: a second estimate of it."""
+    for s in range(1, 12):
+        _moved(z, step, _A[s, :s], K, last_stage)
+        _slope(rhs, t + _C[s] * step, piece, last_stage, drive, K[s])
+    _moved(z, step, _B, K, new)
+    # at a knot too the inputs of the piece before it hold for this step
+    _slope(rhs, t + step, piece, new, drive, K[12])
+
+
+@part
+def _error(step, K, new, size, largest, tolerance, to_come):
+    """Largest error of a step over what is allowed, of the states and of each sensitivity; infinite without a value.
+
+    to_come : [s] of the motion, 0 in its first step. Of a sensitivity that sets in within the step (an overflow) no
+        error is small beside itself, however short the step; it is small beside what such a slope will have brought
+    """
+    n, worst = len(size), 0.0
+    for c in range(len(new) // n):
+        top = 0.0
+        if c > 0:
+            top = largest[c - 1]
+            for i in range(n):
+                scale = abs(new[n * c + i])
+                if to_come > 0.0 and largest[c - 1] == 0.0:
+                    for s in range(13):
+                        scale = max(scale, to_come * abs(K[s, n * c + i]))
+                top = max(top, scale / (size[i] + 1e-300))
+        e5, e3 = 0.0, 0.0
+        for i in range(n):
+            a5, a3 = 0.0, 0.0
+            for j in range(13):
+                a5 += _E5[j] * K[j, n * c + i]
+                a3 += _E3[j] * K[j, n * c + i]
+            if c == 0:
+                scale = tolerance * max(size[i], abs(new[i]))
+            else:
+                scale = _SENSITIVITY_TOLERANCE * (top * size[i] + 1e-300)
+            e5 += (a5 / scale) ** 2
+            e3 += (a3 / scale) ** 2
+        if not (np.isfinite(e5) and np.isfinite(e3)):
+            return np.inf
+        if e5 > 0 or e3 > 0:
+            worst = max(worst, step * e5 / np.sqrt((e5 + 0.01 * e3) * n))
+    return worst
+
+
+@part
+def _dense(rhs, t, step, piece, z, drive, K, new, F):
+    """The step's polynomial F (7, len(z)); K[13] to K[15] are worked out for it."""
+    work = np.zeros(len(z))
+    for e in range(3):
+        _moved(z, step, _A_EXTRA[e, : 13 + e], K, work)
+        _slope(rhs, t + _C_EXTRA[e] * step, piece, work, drive, K[13 + e])
+    for i in range(len(z)):
+        work[i] = 0.0
+        F[0, i] = new[i] - z[i]
+        F[1, i] = step * K[0, i] - F[0, i]
+        F[2, i] = 2.0 * F[0, i] - step * (K[12, i] + K[0, i])
+    for d in range(4):
+        _moved(work, step, _D[d], K, F[3 + d])
+
+
+@part
+def _along(F, z, x, out):
+    """The step's polynomial at the part x of it."""
+    for i in range(len(z)):
+        total = 0.0
+        for d in range(6, -1, -1):
+            total += F[d, i]
+            total *= x if d % 2 == 0 else 1.0 - x
+        out[i] = total + z[i]
+
+
+@part
+def _solve(M, b):
+    """Replace b (m, k) by M^-1 b, by elimination with pivots that uses M up; False where M has no inverse."""
+    m, k = b.shape
+    for i in range(m):
+        best = i
+        for j in range(i + 1, m):
+            if abs(M[j, i]) > abs(M[best, i]):
+                best = j
+        if M[best, i] == 0.0 or not np.isfinite(M[best, i]):
+            return False
+        for j in range(i, m):
+            M[i, j], M[best, j] = M[best, j], M[i, j]
+        for c in range(k):
+            b[i, c], b[best, c] = b[best, c], b[i, c]
+        for j in range(i + 1, m):
+            factor = M[j, i] / M[i, i]
+            for r in range(i + 1, m):
+                M[j, r] -= factor * M[i, r]
+            for c in range(k):
+                b[j, c] -= factor * b[i, c]
+    for c in range(k):
+        for i in range(m - 1, -1, -1):
+            for j in range(i + 1, m):
+                b[i, c] -= M[i, j] * b[j, c]
+            b[i, c] /= M[i, i]
+    return True
+
+
+@part
+def _stages(rhs, t, step, piece, z, Z, drive, F, J, P, M, left):
+    """What Newton's method has to make zero of stages z + Z (3 n, 1), with minus sign; M (3 n, 3 n) for its steps."""
+    n = len(drive.f)
+    for s in range(3):
+        at = t + _RADAU_C[s] * step
+        inputs_at(at, piece, drive.knots, drive.pieces, drive.u, drive.u_rate)
+        rhs(at, z[:n] + Z[s * n : (s + 1) * n, 0], drive.p, drive.u, drive.u_rate, F[s], J[s], P[s])
+    for s in range(3):
+        for i in range(n):
+            row = s * n + i
+            left[row, 0] = -Z[row, 0]
+            for r in range(3):
+                left[row, 0] += step * _RADAU_A[s, r] * F[r, i]
+                for j in range(n):
+                    M[row, r * n + j] = -step * _RADAU_A[s, r] * J[r, i, j]
+            M[row, row] += 1.0
+
+
+@part
+def _implicit_step(rhs, t, step, piece, z, drive, slope, size, W):
+    """What each stage adds to states and sensitivities, W (3, len(z)), and the error over what is allowed.
+
+    slope : at (t, z), where `drive` holds its derivative by the states
+    """
+    n, k = len(size), len(drive.columns)
+    F, J, P = np.zeros((3, n)), np.zeros((3, n, n)), np.zeros((3, n, len(drive.p)))
+    Z, M, change, own = np.zeros((3 * n, 1)), np.zeros((3 * n, 3 * n)), np.zeros((3 * n, 1)), np.zeros((3 * n, k))
+    E, error = np.zeros((n, n)), np.zeros((n, 1))
+    for _ in range(_NEWTON):
+        _stages(rhs, t, step, piece, z, Z, drive, F, J, P, M, change)
+        if not _solve(M, change):
+            return np.inf
+        moved = 0.0
+        for j in range(3 * n):
+            Z[j, 0] += change[j, 0]
+            moved = max(moved, abs(change[j, 0]) / (_STIFF_TOLERANCE * max(size[j % n], abs(z[j % n]))))
+        if not moved >= _CLOSE:
+            break
+    if not moved < _CLOSE:
+        return np.inf
+    _stages(rhs, t, step, piece, z, Z, drive, F, J, P, M, change)
+    for i in range(n):
+        error[i, 0] = slope[i]
+        for j in range(n):
+            E[i, j] = -drive.J[i, j]
+        E[i, i] += _REAL / step
+        for s in range(3):
+            error[i, 0] += _RADAU_E[s] * Z[s * n + i, 0] / step
+            W[s, i] = Z[s * n + i, 0]
+            for c in range(k):
+                rate = P[s, i, drive.columns[c]] if drive.columns[c] >= 0 else 0.0
+                for j in range(n):
+                    rate += J[s, i, j] * z[n * (c + 1) + j]
+                for r in range(3):
+                    own[r * n + i, c] += step * _RADAU_A[r, s] * rate
+    if not (_solve(E, error) and _solve(M, own)):
+        return np.inf
+    worst = 0.0
+    for i in range(n):
+        worst = max(worst, abs(error[i, 0]) / (_STIFF_TOLERANCE * max(size[i], abs(z[i]))))
+        for c in range(k):
+            for s in range(3):
+                W[s, n * (c + 1) + i] = own[s * n + i, c]
+    return worst
+
+
+@part
+def _along_stages(W, z, x, out):
+    """The implicit step's polynomial at the part x of it."""
+    c, d = _RADAU_C[0], _RADAU_C[1]
+    l1 = x * (x - d) * (x - 1.0) / (c * (c - d) * (c - 1.0))
+    l2 = x * (x - c) * (x - 1.0) / (d * (d - c) * (d - 1.0))
+    l3 = x * (x - c) * (x - d) / ((1.0 - c) * (1.0 - d))
+    for i in range(len(z)):
+        out[i] = z[i] + l1 * W[0, i] + l2 * W[1, i] + l3 * W[2, i]
+
+
 @entry
-def integrate(rhs, z, p, columns, span, n, knots, pieces, size, tolerance, max_steps, largest, pointer, samples, out):
-    """Fill out (groups, m, len(z)) with the solution at samples (groups, m), each group increasing.
+def integrate(rhs, z, p, columns, span, n, knots, pieces, size, tolerance, max_steps, samples, out):
+    """Fill out (m, len(z)) with the solution at samples (m,), which increase; False where it has no end.
 
     z : (n (1 + k),) states and their derivatives by k quantities at span[0]
     columns : (k,) index in p of each quantity; -1 for an initial state
-    span : (3,) first and last instant, and the step to begin with (0: as the slope says)
+    span : (2,) first and last instant
     size : (n,) of the states, to which the tolerance is relative
-    largest : (k,) size of each derivative so far, 0 at first
-    pointer : (groups,) how many samples are filled in
-    returns : DONE, or why not; number of steps. Where the equations have become stiff it stops (STIFF_CHANGES), with z,
-        span, largest and pointer as they are there: `_stiff_kernel.integrate` goes on from these, and this from its.
-        After max_steps (TOO_MANY_STEPS) it may be called again with them, too.
     """
-    N, n_p = len(z), len(p)
-    k = len(columns)
-    groups, m = samples.shape
-    K = np.zeros((16, N))
-    F = np.zeros((7, N))
-    f, J, P = np.zeros(n), np.zeros((n, n)), np.zeros((n, n_p))
-    u, u_rate = np.zeros(pieces.shape[0]), np.zeros(pieces.shape[0])
-    new, work, last_stage = np.zeros(N), np.zeros(N), np.zeros(n)
+    N, m = len(z), len(samples)
+    drive = _drive(p, columns, n, knots, pieces)
+    K, F, W = np.zeros((16, N)), np.zeros((7, N)), np.zeros((3, N))
+    new, last_stage, largest = np.zeros(N), np.zeros(N), np.zeros(len(columns))
     t, end = span[0], span[1]
     piece = piece_at(t, knots)
-    _slope(rhs, t, piece, z, p, columns, knots, pieces, u, u_rate, f, J, P, K[0])
-    speed = 0.0
+    _slope(rhs, t, piece, z, drive, K[0])
+    speed, most = 0.0, 0.0
     for i in range(n):
-        speed = max(speed, abs(K[0, i]) / size[i])
+        speed, most = max(speed, abs(K[0, i]) / size[i]), max(most, _RAN_AWAY * size[i])
     h = min(end - t, 0.01 / speed) if speed > 0 else 0.01 * (end - t)
-    if span[2] > 0.0:
-        h = min(end - t, span[2])
-    steps, rejected, attempts, at_limit, calm = 0, False, 0, 0, 0
-    while True:
+    filled, stiff, rejected, at_limit, calm, first = 0, False, False, 0, 0, True
+    for _ in range(max_steps):
         remaining = end - t
         last = remaining <= h * (1.0 + 1e-9)
         step = remaining if last else h
@@ -137,173 +356,91 @@ def integrate(rhs, z, p, columns, span, n, knots, pieces, size, tolerance, max_s
         if i < len(knots) and arrival > knots[i]:
             arrival = knots[i]  # to the bit: on the other side of it the inputs are others
             step, last = arrival - t, False
-        attempts += 1
-        if attempts > max_steps or step < 1e-15 * max(abs(t), 1e-3):
-            if last and remaining <= 0:
-                break
-            span[0], span[2] = t, h
-            return TOO_MANY_STEPS, steps
-        for s in range(1, 12):
-            for i in range(N):
-                total = 0.0
-                for j in range(s):
-                    total += _A[s, j] * K[j, i]
-                work[i] = z[i] + step * total
-            _slope(rhs, t + _C[s] * step, piece, work, p, columns, knots, pieces, u, u_rate, f, J, P, K[s])
-        for i in range(n):
-            last_stage[i] = work[i]
-        for i in range(N):
-            total = 0.0
-            for j in range(12):
-                total += _B[j] * K[j, i]
-            new[i] = z[i] + step * total
-        # at a knot too the inputs of the piece before it hold for this step
-        _slope(rhs, t + step, piece, new, p, columns, knots, pieces, u, u_rate, f, J, P, K[12])
-        worst = 0.0
-        for c in range(k + 1):
-            e5, e3, top = 0.0, 0.0, 0.0
-            if c > 0:
-                top = largest[c - 1]
-                for i in range(n * c, n * (c + 1)):
-                    scale = abs(new[i]) / (size[i - n * c] + 1e-300)
-                    top = max(top, scale)
-                if steps > 0 and largest[c - 1] == 0.0:
-                    # what sets in within the step (an overflow, a stop): of a start at a kink no error is small beside
-                    # itself, however short the step; it is small beside what such a slope will have brought by the end
-                    for s in range(13):
-                        for i in range(n * c, n * (c + 1)):
-                            top = max(top, (end - span[0]) * abs(K[s, i]) / (size[i - n * c] + 1e-300))
-            for i in range(n * c, n * (c + 1)):
-                a5, a3 = 0.0, 0.0
-                for j in range(13):
-                    a5 += _E5[j] * K[j, i]
-                    a3 += _E3[j] * K[j, i]
-                if c == 0:
-                    scale = tolerance * max(size[i], abs(new[i]))
-                else:
-                    scale = _SENSITIVITY_TOLERANCE * (top * size[i - n * c] + 1e-300)
-                e5 += (a5 / scale) ** 2
-                e3 += (a3 / scale) ** 2
-            if e5 > 0 or e3 > 0:
-                worst = max(worst, step * e5 / np.sqrt((e5 + 0.01 * e3) * n))
-            if not (np.isfinite(e5) and np.isfinite(e3)):
-                worst = np.inf
-        if not np.isfinite(worst):
-            h = 0.1 * step
+        if step < 1e-15 * max(abs(t), 1e-3):
+            return False
+        if stiff:
+            worst, power = _implicit_step(rhs, t, step, piece, z, drive, K[0], size, W), -0.25
+            _along_stages(W, z, 1.0, new)
+        else:
+            _step(rhs, t, step, piece, z, drive, K, last_stage, new)
+            worst, power = _error(step, K, new, size, largest, tolerance, 0.0 if first else end - span[0]), -0.125
+        if not worst <= 1.0:
+            h = step * max(0.2, 0.9 * worst**power) if np.isfinite(worst) else 0.1 * step
             rejected = True
-            if h < 1e-10 * (end - span[0]):
-                return NOT_FINITE, steps
-            continue
-        if worst > 1.0:
-            h = step * max(0.2, 0.9 * worst**-0.125)
-            rejected = True
+            if h < 1e-14 * (end - span[0]):
+                return False
             continue
         inside = False
-        for g in range(groups):
-            if pointer[g] < m and (samples[g, pointer[g]] <= t + step or last):
-                if abs(samples[g, pointer[g]] - t - step) > 1e-12 * step:
+        while filled < m and (samples[filled] <= t + step or last):
+            x = (samples[filled] - t) / step
+            if abs(x - 1.0) <= 1e-12:  # as at every one with an input's knot
+                _assign(out[filled], new)
+            elif stiff:
+                _along_stages(W, z, x, out[filled])
+            else:
+                if not inside:
+                    _dense(rhs, t, step, piece, z, drive, K, new, F)
                     inside = True
-                else:  # the step ends at the sample, as at every one with an input's knot
-                    _assign(out[g, pointer[g]], new)
-                    pointer[g] += 1
-        if inside:
-            for e in range(3):
-                for i in range(N):
-                    total = 0.0
-                    for j in range(13 + e):
-                        total += _A_EXTRA[e, j] * K[j, i]
-                    work[i] = z[i] + step * total
-                _slope(
-                    rhs, t + _C_EXTRA[e] * step, piece, work, p, columns, knots, pieces, u, u_rate, f, J, P, K[13 + e]
-                )
-            for i in range(N):
-                delta = new[i] - z[i]
-                F[0, i] = delta
-                F[1, i] = step * K[0, i] - delta
-                F[2, i] = 2.0 * delta - step * (K[12, i] + K[0, i])
-                for d in range(4):
-                    total = 0.0
-                    for j in range(16):
-                        total += _D[d, j] * K[j, i]
-                    F[3 + d, i] = step * total
-            for g in range(groups):
-                while pointer[g] < m and (samples[g, pointer[g]] <= t + step or last):
-                    x = (samples[g, pointer[g]] - t) / step
-                    for i in range(N):
-                        total = 0.0
-                        for d in range(6, -1, -1):
-                            total += F[d, i]
-                            total *= x if d % 2 == 0 else 1.0 - x
-                        out[g, pointer[g], i] = total + z[i]
-                    pointer[g] += 1
-        for c in range(k):
-            for i in range(n):
-                largest[c] = max(largest[c], abs(new[n * (c + 1) + i]) / (size[i] + 1e-300))
+                _along(F, z, x, out[filled])
+            filled += 1
         # how fast nearby motions part or meet, from two estimates of the state at the end of the step
         apart, together = 0.0, 0.0
         for i in range(n):
+            if abs(new[i]) > most:
+                return False
             apart += ((K[12, i] - K[11, i]) / size[i]) ** 2
             together += ((new[i] - last_stage[i]) / size[i]) ** 2
-        if together > 0.0 and step * np.sqrt(apart / together) > _STABLE:
-            at_limit, calm = at_limit + 1, 0
-        else:
-            calm += 1
-            if calm == 6:
-                at_limit = 0
-        steps += 1
-        t = arrival
+            for c in range(len(columns)):
+                largest[c] = max(largest[c], abs(new[n * (c + 1) + i]) / (size[i] + 1e-300))
+        t, first = arrival, False
         _assign(z, new)
         before, piece = piece, piece_at(t, knots)
-        if piece != before:
-            _slope(rhs, t, piece, z, p, columns, knots, pieces, u, u_rate, f, J, P, K[0])
-        else:
-            _assign(K[0], K[12])
-        grow = 5.0 if worst == 0.0 else min(5.0, max(0.2, 0.9 * worst**-0.125))
+        grow = 5.0 if worst == 0.0 else min(5.0, max(0.2, 0.9 * worst**power))
         if rejected:
             grow = min(1.0, grow)
         rejected = False
-        h = max(h, step) if step < h else h  # a step cut short at a knot says nothing against the next
+        # a step cut short at a knot says nothing against the next
         h = h * grow if step >= h * 0.999 else max(h, step * grow)
+        if stiff:
+            _slope(rhs, t, piece, z, drive, K[0])
+            fastest = 0.0
+            for i in range(n):
+                for j in range(n):
+                    fastest = max(fastest, abs(drive.J[i, j]) * size[j] / size[i])
+            calm = calm + 1 if h * fastest < _MILD else 0
+            stiff = calm < 3
+        else:
+            calm = 0 if together > 0.0 and step * np.sqrt(apart / together) > _STABLE else calm + 1
+            at_limit = at_limit + 1 if calm == 0 else (0 if calm == 6 else at_limit)
+            stiff = at_limit >= _OFTEN
+            if stiff or piece != before:
+                _slope(rhs, t, piece, z, drive, K[0])
+            else:
+                _assign(K[0], K[12])
+            if stiff:
+                h, at_limit, calm = step, 0, 0
         if last:
-            break
-        if at_limit >= _OFTEN:
-            span[0], span[2] = t, step
-            return STIFF_CHANGES, steps
-    return DONE, steps
+            return True
+    return False
 
 
 @entry
-def observe_all(observe, times, states, p, knots, pieces, seen, by_state, by_parameter):
-    """What the sensors see at instants (m,) in states (m, n): seen (m, w) and derivatives (m, w, n), (m, w, n_p)."""
-    u, u_rate = np.zeros(pieces.shape[0]), np.zeros(pieces.shape[0])
+def evaluate(function, times, states, p, knots, pieces, values, by_state, by_number):
+    """Rates or sensors (m, w) at instants (m,) in states (m, n), with derivatives (m, w, n) and (m, w, n_p)."""
+    u, u_rate = np.zeros(len(pieces)), np.zeros(len(pieces))
     for i in range(len(times)):
         inputs_at(times[i], piece_at(times[i], knots), knots, pieces, u, u_rate)
-        observe(times[i], states[i], p, u, u_rate, seen[i], by_state[i], by_parameter[i])
-
-
-@entry
-def rates_all(rhs, times, states, p, knots, pieces, rates, by_parameter):
-    """Rates (m, n) and their derivatives by parameters (m, n, n_p) at instants (m,) in states (m, n)."""
-    n = states.shape[1]
-    u, u_rate, J = np.zeros(pieces.shape[0]), np.zeros(pieces.shape[0]), np.zeros((n, n))
-    for i in range(len(times)):
-        inputs_at(times[i], piece_at(times[i], knots), knots, pieces, u, u_rate)
-        rhs(times[i], states[i], p, u, u_rate, rates[i], J, by_parameter[i])
-
-
-def compile_for(*wanted: tuple[Any, tuple[Any, ...]]) -> None:
-    """Compile functions for these types of arguments, and for no others; or load them."""
-    for function, arguments in wanted:
-        function.compile(arguments)
-        function.disable_compile()
+        function(times[i], states[i], p, u, u_rate, values[i], by_state[i], by_number[i])
 
 
 @cache
 def prepare() -> None:
-    """Compile what Python calls for the arrays that it is called with; or load it."""
+    """Compile what Python calls for the arrays that it is called with, and for no others; or load it."""
     whole = types.int64
-    compile_for(
-        (integrate, (RHS_TYPE, _v, _v, whole[::1], _v, whole, _v, _cube, _v, _f, whole, _v, whole[::1], _m, _cube)),
-        (observe_all, (RHS_TYPE, _v, _m, _v, _v, _cube, _m, _cube, _cube)),
-        (rates_all, (RHS_TYPE, _v, _m, _v, _v, _cube, _m, _cube)),
+    wanted: tuple[tuple[Any, tuple[Any, ...]], ...] = (
+        (integrate, (RHS_TYPE, _v, _v, whole[::1], _v, whole, _v, _cube, _v, _f, whole, _v, _m)),
+        (evaluate, (RHS_TYPE, _v, _m, _v, _v, _cube, _m, _cube, _cube)),
     )
+    for function, arguments in wanted:
+        function.compile(arguments)
+        function.disable_compile()

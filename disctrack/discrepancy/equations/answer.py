@@ -17,7 +17,7 @@ from disctrack.discrepancy.document import document, tables
 from disctrack.discrepancy.equations.declared import Equations, Run, Samples, Term, checked
 from disctrack.discrepancy.equations.forecast import Forecast, RunScore, foretold, scored
 from disctrack.discrepancy.equations.law import NAME, LearnedForce
-from disctrack.discrepancy.equations.loop import Answered, ask
+from disctrack.discrepancy.equations.loop import ask
 from disctrack.discrepancy.equations.system import EquationSystem, fitted_rows
 from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.search import Diagnosis, Settings
@@ -62,7 +62,7 @@ def diagnose(
     settings : how hard to look, and how sure to be
     Raises AnalysisError, which says what was found and what to do.
     """
-    return Answer(equations, ask(equations, [runs] if isinstance(runs, Run) else runs, terms, settings))
+    return Answer(equations, *ask(equations, [runs] if isinstance(runs, Run) else list(runs), terms, settings))
 
 
 @dataclass(frozen=True)
@@ -70,17 +70,12 @@ class Answer:
     """What is missing, how much of it, and how sure that is."""
 
     equations: Equations
-    asked: Answered
-
-    @property
-    def diagnosis(self) -> Diagnosis:
-        """The engine's answer."""
-        return self.asked.diagnosis
-
-    @property
-    def system(self) -> EquationSystem:
-        """Data and model in the stretches that were judged."""
-        return self.asked.system
+    diagnosis: Diagnosis  # the engine's answer
+    system: EquationSystem  # data and model in the stretches that were judged
+    judged: System  # the same with its noise as judged
+    remembers: bool  # is that noise with a memory?
+    remarks: tuple[str, ...]  # on the way to the answer
+    law: LearnedForce | None  # of one variable, that no term names, with its course; None where none describes the data
 
     @property
     def verdict(self) -> str:
@@ -90,12 +85,7 @@ class Answer:
     @property
     def notes(self) -> tuple[str, ...]:
         """Remarks on the data and on what they do not tell."""
-        return (*self.asked.notes, *self._what_helps_most(), *self._of_a_law(), *self._not_white(), *self._far_off())
-
-    @property
-    def law(self) -> LearnedForce | None:
-        """A law of one variable that no term names, with its course; None where none describes the data."""
-        return self.asked.law
+        return (*self.remarks, *self._what_helps_most(), *self._of_a_law(), *self._not_white(), *self._far_off())
 
     def _of_a_law(self) -> list[str]:
         """What describes the data as well as the law that is named; or the law, where it is not."""
@@ -169,9 +159,8 @@ class Answer:
         whole = not any(s.stretch for s in stretches)
         if len(stretches) < FEWEST_RUNS or not whole or self.diagnosis.held_out_before is None:
             return []
-        judged = self.asked.judged
-        residual, _ = judged.linearise(self.diagnosis.after.values, [])
-        count = np.array([max(float(np.sum(judged.weights[rows])), 1.0) for rows in self.system.rows])
+        residual, _ = self.judged.linearise(self.diagnosis.after.values, [])
+        count = np.array([max(float(np.sum(self.judged.weights[rows])), 1.0) for rows in self.system.rows])
         left = np.array([float(np.sum(residual[rows] ** 2)) for rows in self.system.rows]) / count
         level = float(np.median(left))
         by_noise = stats.chi2.isf(self.diagnosis.settings.false_alarm / len(left), count) / count
@@ -231,30 +220,26 @@ class Answer:
         stretches = zip(self.system.stretches, self.system.predictions(fit.values), strict=True)
         return [(s, np.full(s.data.shape, np.nan) if p is None else p.seen) for s, p in stretches]
 
-    def forecast(self, run: Run, *, window: float = 0.0, before: bool = False, nearest: bool = False) -> Forecast:
+    def forecast(self, run: Run, *, window: float = 0.0, by: str = "after") -> Forecast:
         """A free run of the model: what the sensors should show at the instants of a run, with a band.
 
         A run of the same name as one that was fitted begins in that one's fitted state, and may be longer; another
         begins as its `start` and `known` say. Its data are not looked at, but for their channels' names.
         window : [s] from the first sample: data to which the initial state is fitted, those and no others
-        before : by the equations as declared (and fitted)
-        nearest : with the terms that help most, where none is named
+        by : "after"; "before": the equations as declared (and fitted); "nearest": with the terms that help most
         """
-        samples = self._checked(run)
-        d, errors = self.diagnosis, self.before if before else self.after
-        fit = d.before if before else d.after
-        if nearest and not before and self.nearest and d.nearest is not None:
-            fit, errors = d.nearest, self._errors(d.nearest, None)
-        of_noise = d.verdict != "unexplained" and not before
+        d = self.diagnosis
+        fitted, errors = (d.before, self.before) if by == "before" else (d.after, self.after)
+        if by == "nearest" and self.nearest and d.nearest is not None:
+            fitted, errors = d.nearest, self._errors(d.nearest, None)
+        of_noise = d.verdict != "unexplained" and by != "before"
         left = [e.noise if of_noise else np.nanmax([e.noise, e.rms, e.held_out]) for e in errors.values()]
-        return foretold(self.system, fit, samples, np.array(left), window)
+        return foretold(self.system, fitted, self._checked(run), np.array(left), window)
 
-    def score(
-        self, run: Run, *, window: float = 0.0, before: bool = False, nearest: bool = False
-    ) -> dict[str, RunScore]:
-        """By channel, how well a free run (`forecast`) foretells the samples of a run after the window."""
-        samples, found = self._checked(run), self.forecast(run, window=window, before=before, nearest=nearest)
-        return scored(found, samples, self.system.formulas.channels, window)
+    def score(self, run: Run, *, window: float = 0.0, by: str = "after") -> dict[str, RunScore]:
+        """By channel, how well a free run (`forecast`) predicts the samples of a run after the window."""
+        found = self.forecast(run, window=window, by=by)
+        return scored(found, self._checked(run), self.system.formulas.channels, window)
 
     def _checked(self, run: Run) -> Samples:
         (samples,) = checked(self.equations, [run])
@@ -274,7 +259,7 @@ class Answer:
                 free.append((s.data - seen)[~fitted_rows(s)])
             ahead = np.sqrt(np.nanmean(np.concatenate(free) ** 2, axis=0))
         noise = np.sqrt(np.nanmean(np.concatenate([s.sigma**2 for s in self.system.stretches]), axis=0))
-        if self.asked.memory is None:  # the fast part of the data holds some of the motion, that of the residual less
+        if not self.remembers:  # the fast part of the data holds some of the motion, that of the residual less
             noise = noise * np.sqrt(self.diagnosis.noise)
         both = zip(names, rms, ahead, noise, strict=True)
         return {name: ChannelErrors(float(r), float(a), float(n)) for name, r, a, n in both}
@@ -282,7 +267,15 @@ class Answer:
     @cached_property
     def whiteness(self) -> float:
         """Probability that white noise remembers as much as what is left (Ljung and Box, every channel and stretch)."""
-        return _whiteness(self.asked.judged, self.system, self.diagnosis.after)
+        residual, _ = self.judged.linearise(self.diagnosis.after.values, [])
+        p_values = []
+        for rows, s in zip(self.system.rows, self.system.stretches, strict=True):
+            for c in range(residual.shape[1]):
+                x = residual[rows, c][np.isfinite(s.data[:, c])]
+                lags = min(LAGS, len(x) // 4)
+                if lags >= FEWEST_LAGS:
+                    p_values.append(no_memory(float(ljung_box(x[:, None], lags)[0]), len(x), lags))
+        return min(1.0, min(p_values) * len(p_values)) if p_values else float("nan")
 
     @property
     def sentence(self) -> str:
@@ -351,18 +344,6 @@ class Answer:
         write_whole(paths[0], json_file(self.document()))
         write_answer(self, paths[1])
         return paths
-
-
-def _whiteness(judged: System, system: EquationSystem, fit: Fit) -> float:
-    residual, _ = judged.linearise(fit.values, [])
-    p_values = []
-    for rows, s in zip(system.rows, system.stretches, strict=True):
-        for c in range(residual.shape[1]):
-            x = residual[rows, c][np.isfinite(s.data[:, c])]
-            lags = min(LAGS, len(x) // 4)
-            if lags >= FEWEST_LAGS:
-                p_values.append(no_memory(float(ljung_box(x[:, None], lags)[0]), len(x), lags))
-    return min(1.0, min(p_values) * len(p_values)) if p_values else float("nan")
 
 
 def _before_after(answer: Answer) -> Listing:

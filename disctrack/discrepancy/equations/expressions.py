@@ -23,7 +23,7 @@ _KNOWN = {name: getattr(sympy, name) for name in FUNCTIONS} | {"abs": sympy.Abs}
 MOST_PARTS = 4000  # of a formula as text: names, numbers and signs
 _OPERATIONS: Mapping[type, Any] = {
     ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.Div: operator.truediv,
-    ast.Pow: operator.pow, ast.USub: operator.neg, ast.UAdd: operator.pos, ast.BitAnd: sympy.And, ast.BitOr: sympy.Or,
+    ast.USub: operator.neg, ast.UAdd: operator.pos, ast.BitAnd: sympy.And, ast.BitOr: sympy.Or,
     ast.Lt: sympy.Lt, ast.LtE: sympy.Le, ast.Gt: sympy.Gt, ast.GtE: sympy.Ge, ast.Eq: sympy.Eq, ast.NotEq: sympy.Ne,
 }  # fmt: skip
 
@@ -41,7 +41,7 @@ def parsed(formula: Formula, symbols: Mapping[str, sympy.Symbol], what: str) -> 
     """The formula in these symbols. Raises AnalysisError with `what` where it cannot be read or knows another name."""
     if isinstance(formula, str):
         try:
-            found = sympy.sympify(_Reader(symbols).read(formula))
+            found = sympy.sympify(_read(formula, {**_KNOWN, **symbols}))
         except NameError as error:
             raise AnalysisError(
                 f"{what}: {unknown_name(str(error.name), [*symbols, *_KNOWN])} The formula is {formula}."
@@ -68,56 +68,45 @@ def unknown_name(name: str, known: Iterable[str]) -> str:
     return f"{name!r} is not known; {hint}"
 
 
-class _Reader:
-    """From text to an expression by the kinds of syntax that formulas need; nothing else is ever evaluated."""
+def _read(text: str, names: Mapping[str, Any]) -> Any:
+    """Raises NameError, SyntaxError, TypeError, ValueError, RecursionError."""
+    tree = ast.parse(text.strip(), mode="eval")
+    parts = sum(isinstance(node, ast.expr) for node in ast.walk(tree))
+    if parts > MOST_PARTS:
+        raise ValueError(f"it has {parts} parts, and {MOST_PARTS} are the most")
+    return _value(tree.body, names)
 
-    def __init__(self, symbols: Mapping[str, sympy.Symbol]) -> None:
-        self._names = {**_KNOWN, **symbols}
 
-    def read(self, text: str) -> Any:
-        """Raises NameError, SyntaxError, TypeError, ValueError, RecursionError."""
-        tree = ast.parse(text.strip(), mode="eval")
-        parts = sum(isinstance(node, ast.expr) for node in ast.walk(tree))
-        if parts > MOST_PARTS:
-            raise ValueError(f"it has {parts} parts, and {MOST_PARTS} are the most")
-        return self._value(tree.body)
-
-    def _value(self, node: ast.expr) -> Any:
-        match node:
-            case ast.Constant(value=bool() as value):
-                return sympy.true if value else sympy.false
-            case ast.Constant(value=int() | float() as value):
-                return sympy.sympify(value)
-            case ast.Name(id=name):
-                if name not in self._names:
-                    raise NameError(name=name)
-                return self._names[name]
-            case ast.BinOp(op=ast.Add() | ast.Sub()):
-                return self._sum(node)
-            case ast.BinOp(left=left, op=ast.Pow(), right=right):
-                return _power(self._value(left), self._value(right))
-            case ast.BinOp(left=left, op=op, right=right) if type(op) in _OPERATIONS:
-                return _OPERATIONS[type(op)](self._value(left), self._value(right))
-            case ast.UnaryOp(op=op, operand=operand) if type(op) in _OPERATIONS:
-                return _OPERATIONS[type(op)](self._value(operand))
-            case ast.Compare(left=left, ops=[op], comparators=[right]) if type(op) in _OPERATIONS:
-                return _OPERATIONS[type(op)](self._value(left), self._value(right))
-            case ast.Tuple(elts=elements):
-                return tuple(self._value(e) for e in elements)
-            case ast.Call(func=ast.Name(id=name), args=arguments, keywords=[]):
-                if name not in self._names:
-                    raise NameError(name=name)
-                return self._names[name](*(self._value(a) for a in arguments))
-        raise SyntaxError(f"{ast.unparse(node)!r} is nothing that a formula may hold")
-
-    def _sum(self, node: ast.expr) -> Any:
-        """Of terms on one level, however many."""
-        terms = []
-        while isinstance(node, ast.BinOp) and isinstance(node.op, ast.Add | ast.Sub):
-            right = self._value(node.right)
-            terms.append(right if isinstance(node.op, ast.Add) else -right)
-            node = node.left
-        return sympy.Add(self._value(node), *reversed(terms))
+def _value(node: ast.expr, names: Mapping[str, Any]) -> Any:
+    """An expression by the kinds of syntax that formulas need; nothing else is ever evaluated."""
+    match node:
+        case ast.Constant(value=bool() | int() | float() as value):
+            return sympy.sympify(value)
+        case ast.Name(id=name):
+            if name not in names:
+                raise NameError(name=name)
+            return names[name]
+        case ast.BinOp(op=ast.Add() | ast.Sub()):
+            terms: list[Any] = []  # on one level, however many
+            inner: ast.expr = node
+            while isinstance(inner, ast.BinOp) and isinstance(inner.op, ast.Add | ast.Sub):
+                right = _value(inner.right, names)
+                terms.append(right if isinstance(inner.op, ast.Add) else -right)
+                inner = inner.left
+            return sympy.Add(_value(inner, names), *reversed(terms))
+        case ast.BinOp(left=left, op=ast.Pow(), right=right):
+            return _power(_value(left, names), _value(right, names))
+        case ast.BinOp(left=left, op=op, right=right) | ast.Compare(left=left, ops=[op], comparators=[right]) if (
+            type(op) in _OPERATIONS
+        ):
+            return _OPERATIONS[type(op)](_value(left, names), _value(right, names))
+        case ast.UnaryOp(op=op, operand=operand) if type(op) in _OPERATIONS:
+            return _OPERATIONS[type(op)](_value(operand, names))
+        case ast.Tuple(elts=elements):
+            return tuple(_value(e, names) for e in elements)
+        case ast.Call(func=ast.Name() as function, args=arguments, keywords=[]):
+            return _value(function, names)(*(_value(a, names) for a in arguments))
+    raise SyntaxError(f"{ast.unparse(node)!r} is nothing that a formula may hold")
 
 
 def _power(base: Any, exponent: Any) -> Any:

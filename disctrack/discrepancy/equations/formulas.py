@@ -13,9 +13,8 @@ from numba.core.types import CompileResultWAP
 from calibration.kit.arrays import Array
 from calibration.kit.compiled import njit
 from disctrack.discrepancy.equations import _ode_kernel as kernel
-from disctrack.discrepancy.equations.declared import Equations, Parameter, Term
+from disctrack.discrepancy.equations.declared import Equations, Parameter, Samples, Term
 from disctrack.discrepancy.equations.expressions import Formula, checked_name, parsed, smooth, source_of, unknown_name
-from disctrack.discrepancy.equations.late_inputs import with_late
 from disctrack.errors import AnalysisError
 
 OWN = "own_"  # before the name of a term's parameter, in its formulas: not the equations' of that name
@@ -36,6 +35,8 @@ class Formulas:
     constants: dict[str, sympy.Symbol]
     inputs: tuple[sympy.Symbol, ...]
     input_rates: tuple[sympy.Symbol, ...]
+    forces: tuple[sympy.Expr, ...]  # as declared: without terms, and not yet divided by the masses
+    masses: tuple[sympy.Expr, ...]
     rates: tuple[sympy.Expr, ...]
     observed: tuple[sympy.Expr, ...]
     late: tuple[sympy.Expr, ...]  # by channel: true instant minus the time beside the sample, in t and numbers
@@ -59,9 +60,25 @@ class Formulas:
         return self._compiled("rates_", self.rates, ("f_", "J_", "P_"))
 
     @cached_property
-    def observe(self) -> Any:
-        """Compiled sensors with derivatives (`_ode_kernel.OBSERVE`)."""
+    def _observe(self) -> Any:
         return self._compiled("sensors_", self.observed, ("h_", "H_y", "H_p"))
+
+    def rates_at(self, s: Samples, p: Array, times: Array, states: Array) -> tuple[Array, Array, Array]:
+        """Rates (m, n) at instants (m,) in states (m, n), and their derivatives (m, n, n), (m, n, n_p)."""
+        return self._evaluated(self.rhs, len(self.states), s, p, times, states)
+
+    def sensors_at(self, s: Samples, p: Array, times: Array, states: Array) -> tuple[Array, Array, Array]:
+        """What sensors show (m, w) at instants (m,) in states (m, n), and its derivatives (m, w, n), (m, w, n_p)."""
+        return self._evaluated(self._observe, len(self.channels), s, p, times, states)
+
+    def _evaluated(
+        self, function: Any, width: int, s: Samples, p: Array, times: Array, states: Array
+    ) -> tuple[Array, Array, Array]:
+        (m, n), (knots, pieces) = states.shape, self.driven(s.knots, s.pieces, p)
+        values, by_state, by_number = np.zeros((m, width)), np.zeros((m, width, n)), np.zeros((m, width, len(p)))
+        states = np.ascontiguousarray(states)
+        kernel.evaluate(function, times, states, p, knots, pieces, values, by_state, by_number)
+        return values, by_state, by_number
 
     def _compiled(self, name: str, formulas: Sequence[sympy.Expr], out: tuple[str, str, str]) -> Any:
         value, by_state, by_number = out
@@ -88,7 +105,7 @@ class Formulas:
         """Inputs of a run (`declared.Samples`) with those that act late, for numbers p."""
         if not self.late_inputs:
             return knots, pieces
-        return with_late(knots, pieces, [which for which, _ in self.late_inputs], np.array(self._how_late(p), float))
+        return _with_late(knots, pieces, [which for which, _ in self.late_inputs], np.array(self._how_late(p), float))
 
     @cached_property
     def _how_late(self) -> Any:
@@ -146,7 +163,9 @@ def formulas(equations: Equations, terms: Sequence[Term], channels: Mapping[str,
     own = {name: symbol(name) for name in equations.parameters}
     fitted = {name: (own[name], _parameter(p)) for name, p in equations.parameters.items()}
     everything = {"t": symbol("t"), **states, **inputs, **input_rates, **constants, **own}
-    rates = [parsed(f, everything, f"equation of {name}") for name, f in equations.rates.items()]
+    forces = [parsed(f, everything, f"equation of {name}") for name, f in equations.rates.items()]
+    masses = {pair: parsed(f, everything, f"mass {pair}") for pair, f in equations.mass.items()}
+    rates = list(forces)
     without_motion = {k: v for k, v in everything.items() if k not in states and k not in inputs}
     observed = {c: parsed(f, everything, f"observed {c}") for c, f in channels.items()}
     # a term of a sensor may name the channel itself: what it shows as declared. A state of that name comes first
@@ -200,25 +219,54 @@ def formulas(equations: Equations, terms: Sequence[Term], channels: Mapping[str,
     widths: dict[sympy.Expr, sympy.Symbol] = {}
     moving = set(states.values())
     rates = [smooth(e, widths, moving) for e in rates]
-    rates = _solved(equations, rates, everything)
+    rates = _solved(list(states), masses, rates)
     return Formulas(
         equations, tuple(terms), tuple(channels), tuple(states.values()), fitted, constants, tuple(driving),
-        tuple(driving_rates), tuple(rates), tuple(smooth(e, widths, moving) for e in observed.values()),
+        tuple(driving_rates), tuple(forces), tuple(masses.values()), tuple(rates),
+        tuple(smooth(e, widths, moving) for e in observed.values()),
         tuple(late.values()), widths, along, tuple(late_inputs),
     )  # fmt: skip
 
 
-def _solved(equations: Equations, forces: list[sympy.Expr], symbols: Mapping[str, sympy.Symbol]) -> list[sympy.Expr]:
-    """M^-1 forces, where a mass matrix is declared; the states that it couples are solved together."""
-    if not equations.mass:
-        return forces
-    n, position = len(forces), {name: i for i, name in enumerate(equations.rates)}
-    M = sympy.eye(n)
-    for (a, b), f in equations.mass.items():
-        i, j = position[a], position[b]
-        M[i, j] = M[j, i] = parsed(f, symbols, f"mass ({a}, {b})")
-    coupled = [i for i in range(n) if any(M[i, j] != (1 if i == j else 0) for j in range(n))]
-    solved = M.extract(coupled, coupled).LUsolve(sympy.Matrix([forces[i] for i in coupled]))
+def _with_late(knots: Array, pieces: Array, which: list[int], late: Array) -> tuple[Array, Array]:
+    """Inputs, and some of them once more as they were `late` seconds ago, on knots that all of them share.
+
+    knots (m,), pieces (c, 5, m - 1) : as `declared.Samples` has them
+    which : index of the input that each late one is;  late : (len(which),) [s]
+    Before its first sample an input is what it is there, and after its last one what it is then.
+    """
+    both = np.concatenate([pieces, pieces[which]])
+    if not np.any(late):
+        return knots, both
+    shared = np.unique(np.concatenate([knots, *(knots + s for s in late)]))
+    # knots that agree but for rounding are one: a step between them would be as short
+    shared = shared[np.concatenate([[True], np.diff(shared) > 1e-9 * np.median(np.diff(knots))])]
+    shared = shared[(shared >= knots[0]) & (shared <= knots[-1])]
+    ends = np.zeros((len(both), 5, 2))
+    x = knots[-1] - knots[-2]
+    a, b, d, e, _ = np.moveaxis(both[..., -1], 1, 0)
+    ends[:, 3] = np.column_stack([both[:, 3, 0], ((a * x + b) * x + d) * x + e])
+    both = np.concatenate([ends[..., :1], both, ends[..., 1:]], axis=-1)
+    found = np.zeros((len(both), 5, len(shared) - 1))
+    middle = (shared[1:] + shared[:-1]) / 2
+    for c, s in enumerate(np.concatenate([np.zeros(len(pieces)), late])):
+        piece = np.searchsorted(knots, middle - s, side="right")
+        a, b, d, e, step = both[c][:, piece]
+        x = shared[:-1] - s - knots[np.maximum(piece - 1, 0)]
+        found[c] = a, 3 * a * x + b, (3 * a * x + 2 * b) * x + d, ((a * x + b) * x + d) * x + e, step
+    return shared, found
+
+
+def _solved(
+    states: list[str], masses: Mapping[tuple[str, str], sympy.Expr], forces: list[sympy.Expr]
+) -> list[sympy.Expr]:
+    """M^-1 forces, where masses are declared; the states that these couple are solved together."""
+    M = sympy.eye(len(states))
+    for (a, b), mass in masses.items():
+        i, j = states.index(a), states.index(b)
+        M[i, j] = M[j, i] = mass
+    coupled = [i for i, name in enumerate(states) if any(name in pair for pair in masses)]
+    solved = M.extract(coupled, coupled).LUsolve(sympy.Matrix([forces[i] for i in coupled])) if coupled else []
     for row, i in enumerate(coupled):
         forces[i] = solved[row]
     return forces

@@ -13,21 +13,20 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-import sympy
 from scipy import linalg
 
 from calibration.kit.arrays import Array
-from calibration.kit.least_squares import covariance_within, solve_bounded
 from disctrack.discrepancy.elimination import compress, prior_rows
-from disctrack.discrepancy.equations.declared import Equations, Parameter, Samples, Term
-from disctrack.discrepancy.equations.expressions import Formula, parsed
+from disctrack.discrepancy.equations.declared import Equations, Parameter, Term
+from disctrack.discrepancy.equations.expressions import Formula
 from disctrack.discrepancy.equations.formulas import Formulas, formulas
-from disctrack.discrepancy.equations.start import guessed, trusted, turn
-from disctrack.discrepancy.equations.system import EquationSystem
+from disctrack.discrepancy.equations.start import guessed, near_declared, trusted, turn
+from disctrack.discrepancy.equations.system import MOST_STATES, EquationSystem, cut
 from disctrack.discrepancy.fit import Fit, fit
 from disctrack.discrepancy.held_out import HeldOut, held_out
 from disctrack.discrepancy.laws import evidence
 from disctrack.discrepancy.noise import THIRD
+from disctrack.discrepancy.score import cleared, span
 from disctrack.discrepancy.search import CLASS_GAIN, Diagnosis, Found, Tried
 from disctrack.discrepancy.significance import price_of_a_number
 from disctrack.discrepancy.system import Candidate, Quantity, System, Values
@@ -38,11 +37,9 @@ MARGIN = 0.2  # of the range that is visited, beyond it: what cosines do at thei
 SMOOTH = (0.7, 1.5, 3.0, 6.0)  # wave numbers from which on amplitudes fall ...
 FALLS = (1.5, 1.0)  # ... as these powers of 1 + (wave number over it) squared: without kinks, and with some
 FINE, STRAIGHT = 0.03, 1e4  # of the largest value: the variable's inverse hyperbolic sine beyond it, or itself
-FINEST = 400  # wave number up to which the law may have waves that are not fitted
 SIZES = np.logspace(-4, 2, 31)  # prior sigma of the first amplitudes, over the rms of the equation that it stands in
 FAR = 10.0  # variances of the noise, from which on the motion is learned from in short stretches
-MOST_STATES = 80  # starts of such stretches
-FEWEST = 10  # samples of each
+FEWEST = 10  # samples of such a stretch
 MOST_SAMPLES = 2000  # with which laws compete; the one that is told is fitted to all
 A_TURN = 40  # samples of a turn that are kept at least
 MOST_LAWS = 40  # that are looked at in any case
@@ -137,8 +134,11 @@ def learn(
 
     channels : formulas of what is observed, without terms
     judged : the system with its noise as judged, if that remembers
-    None where no law describes most of what is missing, or where there are too many runs.
+    None where no law describes most of what is missing, where one known term describes it, or where there are too many
+    runs.
     """
+    if diagnosis.held_out_before is None or (diagnosis.verdict != "unexplained" and len(diagnosis.found) < 2):
+        return None
     if len(system.stretches) * len(system.formulas.states) > MOST_STATES:  # more than are fitted side by side
         return None
     whole = _knowing(system, channels)
@@ -159,7 +159,7 @@ def learn(
 class _Trial:
     along: Along
     beside: tuple[Candidate, ...]
-    quantities: tuple[Quantity, ...]  # of the law, with their priors; typical: by the roughest that is not refuted
+    quantities: tuple[Quantity, ...]  # of the law, with their priors
     fit: Fit
     length: float
     alike: tuple[Along, ...] = ()
@@ -232,19 +232,17 @@ class _Competition:
         values = self.begin
         if self.far:
             values = self.begin | self.declared | guessed(first)[0]
-            tied = tuple(q if q.is_initial else _tied(q) for q in first.base)
-            values = fit(first, tied, values, ITERATIONS).values
+            values = fit(first, [near_declared(q) for q in first.base], values, ITERATIONS).values
         scans = []
         for law in self.laws:
-            if all(law.variable not in _variables(self.system.formulas, c.name) for c in beside):
-                length, quantities = self._scanned(first, law, beside, values)
-                if np.isfinite(length):
-                    scans.append((length, law, quantities))
+            there, numbers = _set(first, law, values)
+            length, quantities = self._evidence(there, law, beside, {**values, **numbers})
+            if np.isfinite(length):
+                scans.append((length, law, quantities))
         scans.sort(key=lambda scan: scan[0])
         if not scans:
             return None
-        trials: list[_Trial] = []
-        bars = np.full(len(shots), np.inf)
+        trials, bars = [], [np.inf] * len(shots)
         for length, law, quantities in scans[:REFITTED]:
             # along short stretches that the declared equations do not follow the first order says little
             if length > scans[0][0] * (ROUGHLY if self.far else 1.0) + WORTH:
@@ -264,91 +262,69 @@ class _Competition:
     def _others(self, system: EquationSystem, beside: Sequence[Candidate]) -> tuple[Quantity, ...]:
         return (*system.base, *(q for c in beside for q in c.quantities))
 
-    def _scanned(
-        self, system: EquationSystem, law: Along, beside: Sequence[Candidate], values: Values
-    ) -> tuple[float, tuple[Quantity, ...]]:
-        """-2 log evidence to first order, and the law's quantities with the priors that bring it."""
-        there, numbers = _set(system, law, values)
-        return self._evidence(there, law, beside, {**values, **numbers})
-
     def _evidence(
         self, system: EquationSystem, law: Along, beside: Sequence[Candidate], values: Values
     ) -> tuple[float, tuple[Quantity, ...]]:
+        """-2 log evidence to first order, and the law's quantities with the priors that bring it."""
         others, own = self._others(system, beside), _amplitudes(system, law)
-        names = [*(q.name for q in others), *(q.name for q in own)]
         values = {q.name: q.null for q in (*others, *own)} | dict(values)
         view = self.view(system) if len(system.stretches) == len(self.system.stretches) else system
-        right, matrix = compress(*view.linearise(values, names))
+        right, matrix = compress(*view.linearise(values, [q.name for q in (*others, *own)]))
         if not (np.isfinite(matrix).all() and np.isfinite(right).all()):
             return np.inf, own
         prior, prior_matrix = prior_rows(others, values)
-        right = np.concatenate([right, prior])
-        matrix = np.vstack([matrix, np.column_stack([prior_matrix, np.zeros((len(prior), len(own)))])])
+        by_others, columns = np.split(matrix, [len(others)], axis=1)
         # the residual as it would be without the law
-        k = len(others)
-        right = right + matrix[:, k:] @ np.array([values[q.name] for q in own])
-        length = np.linalg.norm(matrix[:, :k], axis=0)
-        basis, R, _ = linalg.qr(matrix[:, :k] / np.where(length > 0, length, 1.0), mode="economic", pivoting=True)
-        basis = basis[:, np.abs(np.diag(R)) > 1e-9]
-        right, columns = (x - basis @ (basis.T @ x) for x in (right, matrix[:, k:]))
-        size = _size(system, law, values)
-        priors, lengths = [], []
+        right = right + columns @ np.array([values[q.name] for q in own])
+        basis = span(np.vstack([by_others, prior_matrix]))
+        right = cleared(np.concatenate([right, prior]), basis)
+        columns = cleared(np.vstack([columns, np.zeros((len(prior), len(own)))]), basis)
+        size, root, found = _size(system, law, values), np.sqrt(self.noise), []
         for smooth, fall in product(SMOOTH, FALLS):
             falls = _falls(own, smooth, fall)
             # the faster driver gives up where columns are alike
             U, singular, _ = linalg.svd(columns * falls, full_matrices=False, lapack_driver="gesvd")
-            root = np.sqrt(self.noise)
-            found = evidence(size * singular / root, U.T @ right / root, SIZES)
+            lengths = evidence(size * singular / root, U.T @ right / root, SIZES)
             # columns of nothing: no size can be told from them
-            if not (np.isfinite(found).all() and np.isfinite(right @ right / self.noise)):
+            if not (np.isfinite(lengths).all() and np.isfinite(right @ right / self.noise)):
                 return np.inf, own
-            best = int(np.argmin(found))
-            priors.append(SIZES[best] * size * falls)
-            lengths.append(float(right @ right) / self.noise + float(found[best]))
-        best_prior = priors[int(np.argmin(lengths))]
+            found.append((float(lengths.min()), SIZES[int(np.argmin(lengths))] * size * falls))
+        shortest = min(length for length, _ in found)
         # of those that the data do not refute the roughest: what it leaves open is not called known for being smooth
-        plausible = [p for p, length_ in zip(priors, lengths, strict=True) if length_ < min(lengths) + PLAUSIBLE]
-        roughest = max(plausible, key=lambda prior: float(prior[HARMONICS]))
-        return min(lengths) + self.looked, tuple(
-            replace(q, prior_sigma=float(sigma), scale=float(1e-3 * sigma), typical=float(rough))
-            for q, sigma, rough in zip(own, best_prior, roughest, strict=True)
+        plausible = [prior for length, prior in found if length < shortest + PLAUSIBLE]
+        prior = max(plausible, key=lambda prior: float(prior[HARMONICS])) / root
+        quantities = zip(own, prior.tolist(), strict=True)  # of chi-squares that are not yet in units of the noise
+        return shortest + float(right @ right) / self.noise + self.looked, tuple(
+            replace(q, prior_sigma=sigma, scale=1e-3 * sigma) for q, sigma in quantities
         )
 
     def _led(
         self, shots: Sequence[EquationSystem], law: Along, beside: tuple[Candidate, ...], own: tuple[Quantity, ...],
-        values: Values, bars: Array,
+        values: Values, bars: list[float],
     ) -> _Trial | None:  # fmt: skip
         """The law's fit to stretches that are joined two by two; None where it loses the data, or to another law.
 
-        bars : (n,) -2 log evidence of the best law so far in each of these; this one's are put in
+        bars : -2 log evidence of the best law so far in each of these; this one's are put in
         """
-        now = dict(values) | {q.name: 0.0 for q in own}
-        fitted: Fit | None = None
-        length = np.inf
-        first, numbers = _set(shots[0], law, now)
-        now |= numbers
-        for i, system in enumerate(shots):
+        first, numbers = _set(shots[0], law, values)
+        now, length = dict(values) | {q.name: 0.0 for q in own} | numbers, np.inf
+        for i, (system, longer) in enumerate(zip(shots, [*shots[1:], None], strict=True)):
             there = system.with_(widths=first.widths)
-            last = system is shots[-1]
-            others = self._others(there, beside)
-            for _ in range(ROUNDS if last else 1):
-                view = self.view(there) if last else there
+            others, view = self._others(there, beside), there if longer else self.view(there)
+            for _ in range(1 if longer else ROUNDS):
                 fitted = self._fitted(view, (*others, *own), now)
                 if not fitted.reduced_chi_square < FAR * self.noise:  # joined, it leaves more
                     return None
-                now = dict(fitted.values)
-                before = length
+                before, now = length, dict(fitted.values)
                 length, own = self._evidence(there, law, beside, now)
                 if abs(before - length) < 1.0:
                     break
             if length > bars[i] + WORTH:
                 return None
             bars[i] = min(bars[i], length)
-            if not last:
-                now |= _joining(now, there)
-        if fitted is None:
-            return None
-        fitted = self._fitted(self.view(there), (*others, *own), now)
+            if longer:
+                now |= _joining(now, there, longer)
+        fitted = self._fitted(view, (*others, *own), now)
         price = sum(self.price * len(c.names) + self.looked for c in beside)
         return _Trial(law, beside, own, fitted, length + price)
 
@@ -364,18 +340,6 @@ class _Competition:
         if self.arrived(found) or not ahead < FAR * self.noise:
             return found
         return fit(system, quantities, trusted(system, quantities, found.values, ATTEMPTS), ITERATIONS)
-
-    def _roughly(self, view: System, fitted: Fit, own: Sequence[Quantity]) -> tuple[Array, Array]:
-        """Step (k,) to where the roughest law leads that the data do not refute, and the covariance (k, k) there."""
-        rough = {q.name: q.typical for q in own}
-        quantities = [replace(q, prior_sigma=rough.get(q.name, q.prior_sigma)) for q in fitted.quantities]
-        right, matrix = compress(*view.linearise(fitted.values, fitted.names))
-        scale = np.sqrt(self.noise * max(1.0, fitted.reduced_chi_square / self.noise))
-        prior, prior_matrix = prior_rows(quantities, fitted.values)
-        right, matrix = np.concatenate([right / scale, prior]), np.vstack([matrix / scale, prior_matrix])
-        x = np.array([fitted.values[n] for n in fitted.names])
-        lower, upper = np.array([q.lower for q in quantities]), np.array([q.upper for q in quantities])
-        return solve_bounded(right, matrix, lower - x, upper - x), covariance_within(matrix, right, x, lower, upper)
 
     def told(self, best: _Trial, whole: EquationSystem) -> LearnedForce:
         """The law fitted to all data, with its course, beside the known terms that describe them too."""
@@ -393,11 +357,11 @@ class _Competition:
         part = sorted(_part_of_law(there.formulas, law, there.held))
         moved, by_number = _declared_part(there, law, part, fitted.values, x)
         force, columns = force + moved, np.column_stack([columns, by_number])
-        at = [fitted.names.index(n) for n in (*(q.name for q in best.quantities), *part)]
-        moved_by, covariance = self._roughly(view, fitted, best.quantities)
-        variance = np.einsum("ij,jk,ik->i", columns, covariance[np.ix_(at, at)], columns)
-        variance = np.maximum(variance, 0.0) + (columns @ moved_by[at]) ** 2
-        sigma = np.sqrt(variance + _of_finer_waves(best.quantities))
+        at = [fitted.shared.index(n) for n in (*(q.name for q in best.quantities), *part)]
+        variance = np.einsum("ij,jk,ik->i", columns, fitted.covariance[np.ix_(at, at)], columns)
+        # waves finer than those that are fitted go on as the inverse square of their number
+        finer = HARMONICS / 6.0 * best.quantities[HARMONICS].prior_sigma ** 2
+        sigma = np.sqrt(max(self.noise, fitted.reduced_chi_square) * np.maximum(variance, 0.0) + self.noise * finer)
         candidate = Candidate(NAME, NAME, "motion", law.title, "learned from what is left", best.quantities)
         sums = tuple(f.candidate for f in d.found) or d.partial
         of_sums = d.after if d.found else d.nearest
@@ -414,10 +378,8 @@ def _laws(system: EquationSystem, values: Values) -> Iterator[Along]:
     equations = system.formulas.equations
     everything = (*equations.states, *equations.inputs, "t")
     many = len(_forced(equations)) * len(everything) > MOST_LAWS
-    absent = {s: 0 for name, (s, _) in system.formulas.fitted.items() if "." in name}
     for equation in _forced(equations):
-        rate = system.formulas.rates[equations.states.index(equation)].subs(absent)
-        there = {s.name for s in rate.free_symbols} | {"t"}
+        there = {s.name for s in system.formulas.forces[equations.states.index(equation)].free_symbols} | {"t"}
         for variable in everything:
             if many and variable not in there:
                 continue
@@ -487,18 +449,6 @@ def _falls(own: Sequence[Quantity], smooth: float, power: float) -> Array:
     return np.array(found)
 
 
-def _of_finer_waves(own: Sequence[Quantity]) -> float:
-    """Variance of the law by waves shorter than those that are fitted, as the prior of these goes on."""
-    priors = {q.part: q.typical for q in own}
-    first, last = priors["a0"], priors[f"a{HARMONICS}"]
-    finer = np.arange(HARMONICS + 1, FINEST)
-    # the smoothness that was chosen is that whose last amplitude is this one
-    smooth, fall = min(
-        product(SMOOTH, FALLS), key=lambda sf: abs(np.log(first * (1 + (HARMONICS / sf[0]) ** 2) ** -sf[1] / last))
-    )
-    return float(0.5 * np.sum((first * (1 + (finer / smooth) ** 2) ** -fall) ** 2))
-
-
 def _columns(own: Sequence[Quantity], law: Along, x: Array, values: Values) -> Array:
     """(n, k) what each amplitude adds at these values of the variable."""
     bend = values[f"{NAME}_bend"]
@@ -555,37 +505,17 @@ def _size(system: EquationSystem, law: Along, values: Values) -> float:
     return float(np.sqrt(np.mean(own**2) / max(np.mean(acting**2), 1e-300))) or 1.0
 
 
-def _variables(f: Formulas, term: str) -> set[str]:
-    """Of what a motion's term is a function, if of one state or input alone; else nothing."""
-    numbers = [s for name, (s, _) in f.fitted.items() if name.startswith(f"{term}.")]
-    found: set[str] = set()
-    for rate in f.rates:
-        for number in numbers:
-            found |= {s.name for s in rate.diff(number).free_symbols}
-    found &= {s.name for s in (*f.states, *f.inputs)} | {"t"}
-    return found if len(found) == 1 else set()
-
-
-def _symbols(f: Formulas) -> dict[str, sympy.Symbol]:
-    """By their names all that the declared equations are made of."""
-    own = (s for name, (s, _) in f.fitted.items() if "." not in name)
-    known = {s.name: s for s in (*f.states, *f.inputs, *f.input_rates, *f.constants.values(), *own)}
-    return known | {"t": sympy.Symbol("t", real=True)}
-
-
-def _part_of_law(f: Formulas, law: Along, held: Sequence[str] = ()) -> set[str]:
+def _part_of_law(f: Formulas, law: Along, held: Sequence[str]) -> set[str]:
     """Parameters that act in the law's equation as a function of its variable alone, and nowhere else."""
-    known = _symbols(f)
-    rates = {state: parsed(rate, known, f"equation of {state}") for state, rate in f.equations.rates.items()}
-    rate = rates.pop(law.equation)
+    here = f.equations.states.index(law.equation)
+    forces = [*f.forces[:here], *f.forces[here + 1 :], *f.observed, *f.late, *f.masses]
+    elsewhere = set().union(*(e.free_symbols for e in forces))
     driving = {s.name for s in (*f.states, *f.inputs, *f.input_rates)} | {"t"}
-    elsewhere = set().union(*(e.free_symbols for e in (*rates.values(), *f.observed, *f.late)))
-    masses = {s for m in f.equations.mass.values() for s in parsed(m, known, "mass").free_symbols}
     found = set()
     for name, (symbol, parameter) in f.fitted.items():
-        if "." in name or parameter.per or name in held or symbol in elsewhere | masses:
+        if "." in name or parameter.per or name in held or symbol in elsewhere:
             continue
-        acts = rate.diff(symbol)
+        acts = f.forces[here].diff(symbol)
         if acts != 0 and {s.name for s in acts.free_symbols} & driving <= {law.variable}:
             found.add(name)
     return found
@@ -595,24 +525,23 @@ def _declared_part(
     system: EquationSystem, law: Along, part: Sequence[str], values: Values, x: Array
 ) -> tuple[Array, Array]:
     """What these parameters make where the law acts beyond their declared values (n,), and by each of them (n, k)."""
-    f = system.formulas
-    rate = parsed(f.equations.rates[law.equation], _symbols(f), f"equation of {law.equation}")
-    numbers = dict(zip(f.numbers, system.numbers(values, system.stretches[0]).tolist(), strict=True))
-    symbols = {n: f.fitted[n][0] for n in part}
-    known = {s: v for s, v in numbers.items() if s not in symbols.values()}
-    variable = sympy.Symbol(law.variable, real=True)
-    own = rate.xreplace(known)
-    own = own - own.xreplace({s: sympy.Float(f.fitted[n][1].value) for n, s in symbols.items()})
-    formulas_ = [own, *(own.diff(s) for s in symbols.values())]
-    here = {s: numbers[s] for s in symbols.values()}
-    simple = [sympy.simplify(e.xreplace(here)) for e in formulas_]
-    found = [np.broadcast_to(np.asarray(sympy.lambdify(variable, e, "numpy")(x), float), x.shape) for e in simple]
-    return found[0], np.reshape(found[1:], (len(part), len(x))).T
-
-
-def _tied(q: Quantity) -> Quantity:
-    """A parameter that short stretches do not tell stays near what was declared."""
-    return replace(q, prior_sigma=min(q.prior_sigma, max(abs(q.null), q.scale)))
+    f, s = system.formulas, system.stretches[0]
+    states = np.tile(system.start_of(values, s), (len(x), 1))
+    times = x if law.variable == "t" else np.asarray(np.arange(len(x)) + 0.5, float)
+    if law.variable in f.equations.states:
+        states[:, f.equations.states.index(law.variable)] = x
+    elif law.variable in f.equations.inputs:
+        pieces = np.zeros((len(s.pieces), 5, len(x)))
+        pieces[list(f.equations.inputs).index(law.variable), 3] = x
+        s = replace(s, knots=np.arange(len(x) + 1.0), pieces=pieces)
+    declared = {name: f.fitted[name][1].value for name in part}
+    here = f.equations.states.index(law.equation)
+    (now, _, by_number), (before, *_) = (
+        f.rates_at(s, system.numbers({**values, **changed}, s), times, states) for changed in ({}, declared)
+    )
+    acting = by_number[:, here, f.names.index(f"{NAME}.a0")]
+    own = by_number[:, here, [f.names.index(name) for name in part]]
+    return (now - before)[:, here] / acting, own / acting[:, None]
 
 
 def _thinned(system: EquationSystem) -> EquationSystem:
@@ -635,29 +564,19 @@ def _shots(system: EquationSystem) -> list[EquationSystem]:
     turns = max(float(s.time[-1] - s.time[0]) / (0.5 * turn(s)) for s in stretches)
     samples = min(len(s.time) for s in stretches) / FEWEST
     most = max(1.0, min(turns, samples, MOST_STATES / (n * len(stretches))))
-    found = []
-    for level in range(int(np.log2(most)), -1, -1):
-        found.append(system.with_(stretches=[part for s in stretches for part in _cut(s, 2**level)]))
-    return found
+    counts = [2**level for level in range(int(np.log2(most)), 0, -1)]
+    return [*(system.with_(stretches=cut(stretches, [count] * len(stretches))) for count in counts), system]
 
 
-def _cut(s: Samples, count: int) -> list[Samples]:
-    edges = np.round(np.arange(count + 1) * len(s.time) / count).astype(int)
-    # names are those of the stretch for its first part, and its own for every other
-    return [s.part(int(edges[i]), int(edges[i + 1]), s.stretch + 1000 * i) for i in range(count)]
-
-
-def _joining(values: Values, system: EquationSystem) -> dict[str, float]:
-    """Starts of stretches twice as long, from those that began there."""
+def _joining(values: Values, system: EquationSystem, longer: EquationSystem) -> dict[str, float]:
+    """Starts of longer stretches, from those that began there."""
+    begun = {(s.run, s.time[0]): s.name for s in system.stretches}
     found = {}
-    for s in system.stretches:
-        number, own = divmod(s.stretch, 1000)
-        if number % 2 == 0:
-            joined = replace(s, stretch=own + 1000 * (number // 2))
-            for state in system.formulas.equations.states:
-                key = f"state.{state}[{s.name}]"
-                if key in values:
-                    found[f"state.{state}[{joined.name}]"] = values[key]
+    for s in longer.stretches:
+        for state in system.formulas.equations.states:
+            key = f"state.{state}[{begun[s.run, s.time[0]]}]"
+            if key in values:
+                found[f"state.{state}[{s.name}]"] = values[key]
     return found
 
 

@@ -1,23 +1,20 @@
 """From equations and runs to an answer: what is missing, how much of it, and how sure that is."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
-from scipy import stats
 from scipy.linalg import qr
 
 from calibration.kit.arrays import Array
-from calibration.kit.least_squares import solve_bounded
 from disctrack.discrepancy.elimination import Own
 from disctrack.discrepancy.equations import terms as library
 from disctrack.discrepancy.equations.declared import Equations, Run, Samples, Term, checked
-from disctrack.discrepancy.equations.expressions import Formula
 from disctrack.discrepancy.equations.formulas import formulas
 from disctrack.discrepancy.equations.law import LearnedForce, learn, with_law
 from disctrack.discrepancy.equations.start import LOST, Start, guessed, led, misfit, trusted, turn
 from disctrack.discrepancy.equations.system import EquationSystem, cut, first_part, fitted_rows, spread
-from disctrack.discrepancy.fit import Fit, fit
+from disctrack.discrepancy.fit import Fit, fit, no_fit
 from disctrack.discrepancy.held_out import held_out
 from disctrack.discrepancy.noise import (
     autoregression,
@@ -27,19 +24,17 @@ from disctrack.discrepancy.noise import (
     with_noise,
     without_memory,
 )
+from disctrack.discrepancy.score import Linearisation
 from disctrack.discrepancy.search import (
-    CLASS_GAIN,
     NOT_CONVERGED,
     Diagnosis,
-    Found,
-    Rival,
+    Former,
     Settings,
-    Tried,
     explain,
     with_shapes,
 )
 from disctrack.discrepancy.significance import wald
-from disctrack.discrepancy.system import Quantity, System
+from disctrack.discrepancy.system import System
 from disctrack.errors import AnalysisError
 
 JUMP = 1e-3  # width of a jump over the rms of what jumps: it errs by 1e-6 of a friction's work
@@ -58,24 +53,15 @@ ERROR_THAT_LASTS = "sigmas are those of what is left"  # note of an error that n
 USUAL_SHARE = 0.1  # of the rms of the motion's own forces: a term of that size would surprise nobody
 
 
-@dataclass(frozen=True)
-class Answered:
-    """The search's answer with all that it was asked of."""
-
-    diagnosis: Diagnosis
-    system: EquationSystem  # in the stretches that were judged
-    judged: System  # the same with its noise as judged
-    notes: tuple[str, ...]
-    memory: Array | None  # (w, order) autoregression of the noise, where it remembers
-    law: LearnedForce | None = None  # where one describes the data: in place of known terms, or beside them
-
-
 def ask(
-    equations: Equations, runs: Run | Sequence[Run], terms: Sequence[Term] | None = None,
-    settings: Settings | None = None,
-) -> Answered:  # fmt: skip
-    """Fit the equations to the runs and look for what they lack.   terms : None: the usual ones (`terms.usual`)"""
-    runs = [runs] if isinstance(runs, Run) else list(runs)
+    equations: Equations, runs: Sequence[Run], terms: Sequence[Term] | None = None, settings: Settings | None = None
+) -> tuple[Diagnosis, EquationSystem, System, bool, tuple[str, ...], LearnedForce | None]:
+    """Fit the equations to the runs and look for what they lack.
+
+    terms : None: the usual ones (`terms.usual`)
+    returns : diagnosis, system in the stretches that were judged, the same with its noise as judged, whether that
+        remembers, remarks, and a learned law where one describes the data
+    """
     settings = settings or Settings(unexplained_share=NEARLY)
     given = checked(equations, runs)
     if all(fitted_rows(s).all() for s in given):
@@ -99,21 +85,11 @@ def ask(
             raise AnalysisError(_not_followed(system, declared))
         notes.append(_lost_soon(start, leading))
     if leading:
-        term, way = next(iter(leading.items()))
-        system, diagnosis = _whole(system.with_(promoted=(term,)), (term,), way.values, settings)
-        others = tuple(f.candidate.name for f in diagnosis.found[1:])
-        if others and _wald(diagnosis.found[0].candidate.names, diagnosis.after) <= diagnosis.found[0].threshold:
-            # it led to those that take its place
-            values = _without(diagnosis.after.values, (term,))
-            leading = {others[0]: replace(way, values=values)}
-            system, diagnosis = _whole(system.with_(promoted=others), others, values, settings)
-            notes[-1] = f"the fit goes by way of {term}, which is nothing beside what was found"
-        if diagnosis.found[0].gain > diagnosis.found[0].threshold:
-            diagnosis = _with_equals(system, diagnosis, leading)
-        else:  # it showed the way, no more: from where it leads the equations follow by themselves
-            notes[-1] = f"the fit goes by way of {term}: without it, growing windows lose the data on the way"
-            values = diagnosis.before.values
-            system, diagnosis = _searched(_sized(system, values), values, settings)
+        values = next(iter(leading.values())).values
+        former = {frozenset([name]): way.values for name, way in leading.items()}
+        system, diagnosis = _searched(_sized(system, values), values, settings, former)
+        if not diagnosis.found or not leading.keys() & {f.candidate.name for f in diagnosis.found}:
+            notes[-1] = f"the fit goes by way of {next(iter(leading))}: without it, growing windows lose the data"
     else:
         system, diagnosis, more = _as_far_as_followed(system, start, settings)
         notes += more
@@ -126,13 +102,13 @@ def ask(
         system, diagnosis, remark = _joined(system, samples, diagnosis, settings)
         notes.append(remark)
     judged: System = diagnosis.judged or system
-    memory = None
+    remembers = False
     if settings.noise is None:
-        again, memory, remark = _with_memory(system, diagnosis, settings)
+        again, remembers, remark = _with_memory(system, diagnosis, settings)
         if again is not None:
             diagnosis, judged = again, again.judged or judged
             notes.append(remark)
-    law = _law(system, diagnosis, channels, judged)
+    law = learn(system, diagnosis, channels, None if judged is system else judged)
     if law is not None and law.system is not None and law.is_named(diagnosis):
         judged = law.system if judged is system else judged.over(law.system)
         system, diagnosis = law.system, with_law(diagnosis, law)
@@ -144,16 +120,7 @@ def ask(
     if system.held:
         held_ones = ", ".join(system.held)
         notes.append(f"{held_ones} cannot be told from other numbers with these data, which hold for it as declared")
-    return Answered(diagnosis, system, judged, tuple(notes), memory, law)
-
-
-def _law(
-    system: EquationSystem, diagnosis: Diagnosis, channels: Mapping[str, Formula], judged: System
-) -> LearnedForce | None:
-    """A law of one variable where known terms leave something, or where it takes several of them to describe it."""
-    if diagnosis.held_out_before is None or (diagnosis.verdict != "unexplained" and len(diagnosis.found) < 2):
-        return None
-    return learn(system, diagnosis, channels, None if judged is system else judged)
+    return diagnosis, system, judged, remembers, tuple(notes), law
 
 
 def _as_far_as_followed(
@@ -170,43 +137,55 @@ def _as_far_as_followed(
 
 
 def _searched(
-    system: EquationSystem, values: Mapping[str, float], settings: Settings
+    system: EquationSystem, values: Mapping[str, float], settings: Settings, former: Former | None = None
 ) -> tuple[EquationSystem, Diagnosis]:
-    """The engine's search, with jumps as sharp as the motion asks, and limits where they tell most."""
+    """The engine's search, with jumps as sharp as the motion asks, and limits where they tell most.
+
+    former : as of `explain`; then the values are those of one of these
+    """
     system = _aimed(system, values)
     scans = SCANNED * len(system.formulas.along)
     if scans:  # each value that was looked at is a chance more
         share = len(system.candidates) / (len(system.candidates) + scans)
         settings = replace(settings, false_alarm=settings.false_alarm * share)
-    diagnosis = explain(system, values, settings, system.training)
+    values = {k: v for k, v in values.items() if "." not in k or k.startswith("state.")}
+    diagnosis = explain(system, values, settings, system.training, former)
     if diagnosis.held_out_before is None and np.isfinite(diagnosis.before.chi_square):
         # no step leads down: by way of others, and without what the data do not tell apart
         system = system.with_(held=(*system.held, *redundant(system, diagnosis.before.values)))
         values = trusted(system, system.base, diagnosis.before.values)
         diagnosis = explain(system, values, settings, system.training)
-    if (anew := _led_with_terms(system, diagnosis)) is not None:
-        diagnosis = explain(system, diagnosis.before.values, settings, system.training, anew)
+    if stuck := _led_with_terms(system, diagnosis):
+        diagnosis = explain(system, diagnosis.before.values, settings, system.training, stuck)
     sharper = _sharp_enough(system, diagnosis.after)
     if sharper is system:
         return system, diagnosis
-    return sharper, explain(sharper, diagnosis.before.values, settings, sharper.training, diagnosis)
+    return sharper, explain(sharper, diagnosis.before.values, settings, sharper.training, _former(diagnosis))
 
 
-def _led_with_terms(system: EquationSystem, diagnosis: Diagnosis) -> Diagnosis | None:
-    """A better description with a term whose refit did not converge: led to it over growing windows; None: none is.
+def _former(diagnosis: Diagnosis) -> Former:
+    """What an answer found or came nearest by, as where fits of nearly the same system may begin."""
+    found = {frozenset(f.candidate.name for f in diagnosis.found): diagnosis.after.values}
+    if diagnosis.nearest is not None:
+        found[frozenset(c.name for c in diagnosis.partial)] = diagnosis.nearest.values
+    return {names: values for names, values in found.items() if names}
+
+
+def _led_with_terms(system: EquationSystem, diagnosis: Diagnosis) -> Former:
+    """Better descriptions with a term whose refit did not converge: led to it over growing windows.
 
     Of an arm that friction stops, no step leads from a motion that goes on for ever to the instant at which it stops.
     """
     if diagnosis.verdict != "unexplained" or diagnosis.found:
-        return None
+        return {}
     stuck = [t for t in diagnosis.tried if t.gain is not None and t.reason == NOT_CONVERGED]
-    best, lowest = None, (diagnosis.nearest or diagnosis.before).cost
+    found, lowest = {}, (diagnosis.nearest or diagnosis.before).cost
     for t in sorted(stuck, key=lambda t: -t.score)[:MOST_LED]:
-        promoted = system.with_(promoted=(*system.promoted, t.candidate.name))
+        promoted = system.with_(promoted=(t.candidate.name,))
         fitted = fit(promoted, promoted.base, led(promoted, guessed(system)[0]).values)
         if fitted.converged and fitted.cost < lowest:
-            best, lowest = replace(diagnosis, partial=(t.candidate,), nearest=fitted), fitted.cost
-    return best
+            found[frozenset([t.candidate.name])] = fitted.values
+    return found
 
 
 def _aimed(system: EquationSystem, values: Mapping[str, float]) -> EquationSystem:
@@ -220,42 +199,25 @@ def _aimed(system: EquationSystem, values: Mapping[str, float]) -> EquationSyste
             p = system.numbers(values, s)
             found = f.scanned(s.time, list(motion.states.T), p, system.inputs_of(s))
             passed.append([np.broadcast_to(x, s.time.shape) for x in found])
-    own = Own(system, system.base)
-    names = [q.name for q in system.base if not q.slot]
-    amounts = {c.name: c for c in system.with_(aims={}).candidates if any(n.startswith(f"{c.name}.") for n in f.along)}
     best: dict[str, tuple[float, dict[str, float]]] = {}
-    # a term that every fit has keeps its limit: without an aim no fit would move it
-    kept = {n: v for n, v in system.aims.items() if n.partition(".")[0] in system.promoted}
+    amounts = [c for c in system.candidates if any(n.startswith(f"{c.name}.") for n in f.along)]
+    here = no_fit(system.base, values)
     for share in (np.arange(SCANNED) + 0.5) / SCANNED:
         tried = {}
         for i, name in enumerate(f.along):
             value = float(np.nanquantile(np.concatenate([x[i] for x in passed]), share))
             bounds = f.fitted[name][1]
             tried[name] = float(np.clip(value, bounds.lower, bounds.upper))
-        there = system.with_(aims=kept | tried)
-        asked = [*names, *(n for c in amounts.values() for n in c.names)]
-        residual, derivative = there.linearise(values, [*own.slots, *asked])
-        if not np.isfinite(derivative).all():
+        there = system.with_(aims=tried)
+        if not np.isfinite(there.linearise(values, [n for c in amounts for n in c.names])[1]).all():
             continue
-        right, matrix, _ = own.reduced(residual, derivative, values)
-        for c in amounts.values():
-            mine = [asked.index(n) for n in c.names]
-            gain, amounts_there = _first_order(right, matrix[:, : len(names)], matrix[:, mine], c.quantities)
+        linear = Linearisation(there, here, amounts)
+        for c in amounts:
+            gain, there_best = linear.gain_of(c.names)
             if gain > best.get(c.name, (0.0, {}))[0]:
                 limits = {n: v for n, v in tried.items() if n.startswith(f"{c.name}.")}
-                best[c.name] = gain, limits | dict(zip(c.names, amounts_there.tolist(), strict=True))
-    return system.with_(aims=kept | {n: v for _, aims in best.values() for n, v in aims.items()})
-
-
-def _first_order(right: Array, base: Array, columns: Array, quantities: Sequence[Quantity]) -> tuple[float, Array]:
-    """Gain of chi-square when these quantities are fitted beside the base, within their bounds; and their values."""
-    free = np.full(base.shape[1], np.inf)
-    lower, upper = ([getattr(q, side) - q.null for q in quantities] for side in ("lower", "upper"))
-    both = np.column_stack([base, columns])
-    step = solve_bounded(right, both, np.concatenate([-free, lower]), np.concatenate([free, upper]))
-    without = right - base @ solve_bounded(right, base, -free, free)
-    values = step[base.shape[1] :] + np.array([q.null for q in quantities])
-    return float(without @ without - np.sum((right - both @ step) ** 2)), values
+                best[c.name] = gain, limits | dict(zip(c.names, there_best.tolist(), strict=True))
+    return system.with_(aims={n: v for _, aims in best.values() for n, v in aims.items()})
 
 
 def _leading(system: EquationSystem, values: Mapping[str, float]) -> dict[str, Start]:
@@ -276,14 +238,10 @@ def _prepared(system: EquationSystem) -> tuple[EquationSystem, dict[str, float]]
     """With sizes of states and widths of jumps read off the data, and initial states."""
     values, sizes = guessed(system)
     system = system.with_(sizes=sizes)
-    return system.with_(widths=_widths(system, _along_guess(system, values, sizes))), values
-
-
-def _along_guess(system: EquationSystem, values: Mapping[str, float], sizes: Array) -> list[tuple[Samples, Array]]:
-    """States of the size that the data show, in place of a motion that is not known yet."""
-    s = system.stretches[0]
+    # states of the size that the data show, in place of a motion that is not known yet
     phase = 2 * np.pi * np.arange(64) / 64
-    return [(s, np.sqrt(2) * sizes * np.cos(phase[:, None] + np.arange(len(sizes))))]
+    states = np.sqrt(2) * sizes * np.cos(phase[:, None] + np.arange(len(sizes)))
+    return system.with_(widths=_widths(system, [(system.stretches[0], states)])), values
 
 
 def _widths(system: EquationSystem, along: Sequence[tuple[Samples, Array]]) -> dict[str, float]:
@@ -383,7 +341,8 @@ def _in_stretches(
     system: EquationSystem, values: Mapping[str, float], length: float
 ) -> tuple[EquationSystem, dict[str, float], str]:
     """The runs cut where the model loses them, each stretch with a start of its own."""
-    pieces = cut(system.stretches, length)
+    durations = [float(s.time[-1] - s.time[0]) for s in system.stretches]
+    pieces = cut(system.stretches, [max(1, int(np.ceil(d / length * (1 - 1e-9)))) for d in durations])
     chosen = spread(pieces, len(system.formulas.states), at_least=len(system.stretches))
     system = system.with_(stretches=chosen)
     shared = {k: v for k, v in values.items() if not k.startswith("state.")}
@@ -405,78 +364,24 @@ def _joined(
     start = led(whole, guessed(whole)[0] | diagnosis.after.values)
     if not start.whole:
         return system, diagnosis, f"with it the model follows {start.followed:.3g} s of {start.duration:.3g} s"
-    plain, merged = _whole(whole, names, start.values, settings, diagnosis)
-    return plain, merged, "with what was found the model follows the whole runs, and they are judged whole"
-
-
-def _whole(
-    whole: EquationSystem, names: tuple[str, ...], values: Mapping[str, float], settings: Settings,
-    stretches: Diagnosis | None = None,
-) -> tuple[EquationSystem, Diagnosis]:  # fmt: skip
-    """Whole runs, judged with terms that the model cannot follow them without.
-
-    stretches : where those terms were found, if not for that reason alone
-    """
-    whole, rest = _searched(_sized(whole, values), values, settings)
-    plain = whole.with_(promoted=())
-    before = fit(plain, plain.base, _without(rest.before.values, names))
-    held = held_out(plain, plain.base, before.values, plain.training)
-    found, tried = [], list(rest.tried)
-    for c in (c for c in plain.candidates if c.name in names):
-        smaller = whole.with_(promoted=tuple(n for n in names if n != c.name))
-        without = fit(smaller, smaller.base, _without(rest.before.values, (c.name,)))
-        gain = float((without.cost - rest.before.cost) / rest.noise)
-        ahead = rest.held_out_before.log_density if rest.held_out_before else -np.inf
-        limit = float(stats.chi2.isf(settings.false_alarm / len(plain.candidates), len(c.quantities)))
-        found.append(Found(c, gain, float(2 * (ahead - held.log_density) / rest.noise), limit, ()))
-        tried.insert(0, Tried(c, gain, gain, found[-1].held_out_gain, "chosen"))
-    if stretches is not None:
-        known = {f.candidate.name: f for f in stretches.found}
-        found, tried = [replace(known[f.candidate.name], gain=f.gain) for f in found], list(stretches.tried)
-    return plain, replace(
-        rest, verdict="found" if rest.verdict == "nothing missing" else rest.verdict, found=(*found, *rest.found),
-        before=before, held_out_before=held, tried=tuple(tried), reason=f"over the whole runs {rest.reason}",
-    )  # fmt: skip
-
-
-def _with_equals(system: EquationSystem, diagnosis: Diagnosis, leading: Mapping[str, Start]) -> Diagnosis:
-    """Which of the other terms that lead to the end describe the data as well as the one that was taken?"""
-    first, *others = diagnosis.found
-    rivals = []
-    for c in (c for c in system.candidates if c.name in list(leading)[1:]):
-        names = (c.name, *(f.candidate.name for f in others))
-        whole = system.with_(promoted=names)
-        values = _without(diagnosis.after.values, (first.candidate.name,)) | leading[c.name].values
-        fitted = fit(whole, whole.base, values)
-        loss = (fitted.cost - diagnosis.after.cost) / diagnosis.noise
-        if fitted.converged and loss < CLASS_GAIN:
-            ours, theirs = (
-                system.linearise(diagnosis.before.values, [])[0] - system.linearise(f.values, [])[0]
-                for f in (diagnosis.after, fitted)
-            )
-            cosine = np.sum(ours * theirs) / (np.linalg.norm(ours) * np.linalg.norm(theirs))
-            rivals.append(Rival(c, float(np.arccos(np.clip(cosine, -1.0, 1.0))), float(loss), fitted))
-    return replace(diagnosis, found=(replace(first, cannot_be_told_from=tuple(rivals)), *others))
-
-
-def _without(values: Mapping[str, float], terms: Sequence[str]) -> dict[str, float]:
-    """Values in which these terms' numbers are absent."""
-    return {k: v for k, v in values.items() if k.partition(".")[0] not in terms}
+    plain = _sized(whole, start.values).with_(promoted=())
+    joined, again = _searched(plain, start.values, settings, {frozenset(names): start.values})
+    return joined, again, "with what was found the model follows the whole runs, and they are judged whole"
 
 
 def _with_memory(
     system: EquationSystem, diagnosis: Diagnosis, settings: Settings
-) -> tuple[Diagnosis | None, Array | None, str]:
+) -> tuple[Diagnosis | None, bool, str]:
     """Search again with noise that remembers, where what is left of the best model does and is as small as noise."""
     if diagnosis.held_out_before is None:
-        return None, None, ""
+        return None, False, ""
     residual, _ = system.linearise(diagnosis.after.values, [])
     present = np.zeros(residual.shape, bool)
     for rows, s in zip(system.rows, system.stretches, strict=True):
         present[rows] = np.isfinite(s.data)
     coefficients, share = autoregression(residual, present, system.rows)
     if not coefficients.any():
-        return None, None, ""
+        return None, False, ""
     size = float(np.sqrt(np.sum(residual**2) / max(present.sum(), 1)))
     lasting = persistence(residual, system.rows) * float(np.median(np.diff(system.stretches[0].time)))
     shortest_turn = min(min(turn(s), _pace(s)) for s in system.stretches)
@@ -490,16 +395,16 @@ def _with_memory(
         reason = f"what is left is {size:.3g} times the noise and lasts for {lasting:.2g} s: no sensor's noise"
         spread = replace(_certain(system, diagnosis, block), reason=reason)
         text = f"{ERROR_THAT_LASTS} ({block:.2g} s taken as one error), not of the noise alone"
-        return spread, None, text
+        return spread, False, text
     if base is None or not base.converged:
-        return None, None, ""
+        return None, False, ""
     noise = float(share * size**2)
     scatter = 1.0 + 4.0 * float(np.sqrt(2.0 / max(base.n_data, 1)))  # of chi-square in a short recording
     known = replace(settings, noise=noise, at_noise=max(settings.at_noise, scatter))
-    again = explain(remembering, base.values, known, system.training, diagnosis)
+    again = explain(remembering, base.values, known, system.training, _former(diagnosis))
     order = int(np.max(np.nonzero(coefficients)[1])) + 1
     text = f"what the model leaves remembers {order} sample{'s' if order > 1 else ''}; sigmas allow for that"
-    return replace(again, judged=again.judged or remembering), coefficients, text
+    return replace(again, judged=again.judged or remembering), True, text
 
 
 def _pace(s: Samples) -> float:
@@ -515,38 +420,29 @@ def _pace(s: Samples) -> float:
 def _certain(system: EquationSystem, diagnosis: Diagnosis, block: float) -> Diagnosis:
     """Sigmas as what is left makes them, and of what was found only what stands out from them (Wald's test)."""
     found, after = diagnosis.found, robust(system, diagnosis.after, block)
-    while found:
-        gains = {f.candidate.name: _wald(f.candidate.names, after) for f in found}
-        certain = tuple(f for f in found if gains[f.candidate.name] > f.threshold)
-        if len(certain) == len(found):
-            found = tuple(replace(f, gain=gains[f.candidate.name]) for f in found)
-            break
-        found = certain
-        kept = {n for f in found for n in f.candidate.names}
-        if not found:  # what the others made of themselves beside terms that are gone again leads nowhere
-            after = robust(system, diagnosis.before, block)
-            break
-        start = {k: v for k, v in after.values.items() if k in kept or "." not in k or k.startswith("state.")}
-        quantities = (*system.base, *(q for f in found for q in f.candidate.quantities))
-        fits = [fit(system, quantities, values) for values in (start, diagnosis.before.values)]
-        after = robust(system, min(fits, key=lambda f: f.cost), block)
-    names = {f.candidate.name for f in found}
+    while len(certain := [f for f in found if _wald(f.candidate.names, after) > f.threshold]) < len(found):
+        found, fitted = tuple(certain), diagnosis.before
+        if found:
+            kept = {n for f in found for n in f.candidate.names}
+            start = {k: v for k, v in after.values.items() if k in kept or "." not in k or k.startswith("state.")}
+            quantities = (*system.base, *(q for f in found for q in f.candidate.quantities))
+            fits = [fit(system, quantities, values) for values in (start, diagnosis.before.values)]
+            fitted = min(fits, key=lambda f: f.cost)
+        after = robust(system, fitted, block)
     if diagnosis.found and not found:  # none of them is certain, but it is they that describe the data best
         partial = tuple(f.candidate for f in diagnosis.found)
         diagnosis = replace(diagnosis, partial=partial, nearest=robust(system, diagnosis.after, block))
-    tried = tuple(
-        replace(t, reason="does not stand out from what is left")
-        if t.reason == "chosen" and t.candidate.name not in names
-        else t
-        for t in diagnosis.tried
-    )
+    names, tried = {f.candidate.name for f in found}, []
+    for t in diagnosis.tried:
+        idle = t.reason == "chosen" and t.candidate.name not in names
+        tried.append(replace(t, reason="does not stand out from what is left") if idle else t)
     return replace(
         diagnosis,
-        found=found,
+        found=tuple(replace(f, gain=_wald(f.candidate.names, after)) for f in found),
         before=robust(system, diagnosis.before, block),
         after=after,
         held_out_after=held_out(system, after.quantities, after.values, system.training),
-        tried=tried,
+        tried=tuple(tried),
     )
 
 
@@ -568,7 +464,7 @@ def robust(system: EquationSystem, fitted: Fit, block: float) -> Fit:
     residual, full = system.linearise(fitted.values, [*own.slots, *names])
     heads = own.reduced(residual, full, fitted.values)[2]
     derivative = own.cleared(full, heads)
-    length = np.linalg.norm(derivative.reshape(-1, len(names)), axis=0)
+    length = np.linalg.norm(derivative, axis=(0, 1))
     scale = np.where(length > 0, length, 1.0)
     J = derivative / scale
     normal = np.einsum("nwi,nwj->ij", J, J)

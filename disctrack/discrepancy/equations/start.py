@@ -13,7 +13,6 @@ from scipy.optimize import least_squares
 
 from calibration.kit.arrays import Array
 from disctrack.discrepancy.elimination import prior_rows
-from disctrack.discrepancy.equations import _ode_kernel as kernel
 from disctrack.discrepancy.equations.declared import Samples
 from disctrack.discrepancy.equations.formulas import Formulas
 from disctrack.discrepancy.equations.system import EquationSystem, first_part, spread
@@ -55,18 +54,15 @@ def states_from_data(formulas: Formulas, s: Samples, p: Array, first: int, begin
 
     What neither tells stays near `begin`.
     """
-    n, w = len(formulas.states), len(formulas.channels)
+    w = len(formulas.channels)
     local = [local_polynomial(s, c, first) for c in range(w)]
     value_size = np.array([np.nanstd(s.data[:, c]) or 1.0 for c in range(w)])
     slope_size = value_size / max(turn(s), 1e-300) * 2 * np.pi
-    knots, pieces = formulas.driven(s.knots, s.pieces, p)
 
     def misfit(y: Array, slopes: float) -> Array:
-        t, y = np.array([s.time[first]]), np.ascontiguousarray(y[None])
-        h, H_y, H_p = np.zeros((1, w)), np.zeros((1, w, n)), np.zeros((1, w, len(p)))
-        f, F_p = np.zeros((1, n)), np.zeros((1, n, len(p)))
-        kernel.observe_all(formulas.observe, t, y, p, knots, pieces, h, H_y, H_p)
-        kernel.rates_all(formulas.rhs, t, y, p, knots, pieces, f, F_p)
+        t, y = np.array([s.time[first]]), y[None]
+        h, H_y, _ = formulas.sensors_at(s, p, t, y)
+        f = formulas.rates_at(s, p, t, y)[0]
         with np.errstate(all="ignore"):  # a guess may lie where a logarithm or a root has no value
             slope = H_y[0] @ f[0]
         parts = [1e-4 * (y[0] - begin) / np.maximum(np.abs(begin), 1.0)]
@@ -111,12 +107,8 @@ def guessed(system: EquationSystem) -> tuple[dict[str, float], Array]:
         p = system.numbers({}, s)
         begin = system.start_of({}, s)
         usable = np.flatnonzero(np.isfinite(s.data).any(axis=1))
-        first = np.asarray(begin, float)
-        if not all(name in s.start or name in s.known for name in names):
-            first = states_from_data(f, s, p, int(usable[0]), begin)
-            for i, name in enumerate(names):
-                if name in s.start or name in s.known:
-                    first[i] = begin[i]
+        given = np.array([name in s.start or name in s.known for name in names])
+        first = begin if given.all() else np.where(given, begin, states_from_data(f, s, p, int(usable[0]), begin))
         seen.append(first)
         values |= {f"state.{name}[{s.name}]": float(v) for name, v in zip(names, first, strict=True)}
         count = max(2, _INSTANTS // len(system.stretches)) if len(system.stretches) < _INSTANTS else 0
@@ -184,17 +176,12 @@ def _not_astray(system: EquationSystem, declared: dict[str, float], found: Start
     shift = [abs(found.values.get(q.name, q.null) - q.null) / max(abs(q.null), q.scale) for q in parameters]
     if found.whole and max(shift, default=0.0) < _FAR:
         return found
-    # a term's number is not known beforehand: nought is its absence
-    tied = tuple(
-        q if "." in q.name else replace(q, prior_sigma=min(q.prior_sigma, max(abs(q.null), q.scale)))
-        for q in parameters
-    )
-    states = tuple(q for q in system.base if q.is_initial)
     enough = LOST if found.followed >= min(turn(s) for s in system.stretches) else LOOSE
     led_to = misfit(system, found.values)
     if not found.whole and max(shift, default=0.0) >= _FAR:  # what led so far off and then lost the motion is no start
         found = replace(found, values=found.values | {q.name: declared.get(q.name, q.null) for q in parameters})
-    attempts = [lambda: fit(system, (*states, *tied), declared, max_iterations=30).values]
+    tied = [near_declared(q) for q in system.base]
+    attempts = [lambda: fit(system, tied, declared, max_iterations=30).values]
     if not system.promoted:  # for one term after the other it would take too long
         attempts.append(lambda: at_once(system, declared))
     for attempt in attempts:
@@ -205,6 +192,11 @@ def _not_astray(system: EquationSystem, declared: dict[str, float], found: Start
         if mostly or np.max(left) < min(led_to, enough):
             return Start(values, found.duration, found.duration)
     return found
+
+
+def near_declared(q: Quantity) -> Quantity:
+    """Of a parameter that the data may not tell, one that stays near; of a term's number zero is the absence."""
+    return q if "." in q.name else replace(q, prior_sigma=min(q.prior_sigma, max(abs(q.null), q.scale)))
 
 
 def at_once(system: EquationSystem, declared: Mapping[str, float]) -> dict[str, float]:
@@ -254,16 +246,14 @@ def trusted(
 
 def _led(system: EquationSystem, values: dict[str, float], window: float, duration: float) -> Start:
     values, followed, last = dict(values), 0.0, False
-    parameters = [q for q in system.base if not q.is_initial]
-    leash = {q.name: _LEASH * max(abs(q.null), q.scale) for q in parameters}
-    states = tuple(q for q in system.base if q.is_initial)
+    states = [q for q in system.base if q.is_initial]
     while not last:
         last = window >= duration
         part = system.with_(stretches=first_part(system.stretches, duration if last else window))
         if followed == 0.0:
             values |= fit(part, states, values, max_iterations=15).values
-        tied = tuple(_tied(q, values, leash) for q in parameters)
-        trial = values | fit(part, (*states, *tied), values, max_iterations=15).values
+        tied = [q if q.is_initial else _near_last(q, values) for q in system.base]
+        trial = values | fit(part, tied, values, max_iterations=15).values
         lost = misfit(part, trial)
         if lost > LOST and followed > 0.0:
             break
@@ -274,7 +264,7 @@ def _led(system: EquationSystem, values: dict[str, float], window: float, durati
     return Start(values, followed, duration)
 
 
-def _tied(q: Quantity, values: dict[str, float], leash: dict[str, float]) -> Quantity:
+def _near_last(q: Quantity, values: dict[str, float]) -> Quantity:
     """The quantity with a prior about where the last window left it: one that a short window does not tell stays."""
     value = values.get(q.name, q.null)
-    return replace(q, null=value, prior_sigma=min(q.prior_sigma, max(leash[q.name], _LEASH * abs(value))))
+    return replace(q, null=value, prior_sigma=min(q.prior_sigma, _LEASH * max(abs(q.null), q.scale, abs(value))))

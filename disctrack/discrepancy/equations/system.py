@@ -2,32 +2,30 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, pairwise
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from scipy.interpolate import PPoly
 
 from calibration.kit.arrays import Array, Mask
 from disctrack.discrepancy.equations import _ode_kernel as kernel
-from disctrack.discrepancy.equations import _stiff_kernel
 from disctrack.discrepancy.equations.declared import Parameter, Samples, Term
 from disctrack.discrepancy.equations.formulas import Formulas
 from disctrack.discrepancy.system import Candidate, Quantity, System, Values
 from disctrack.errors import AnalysisError
 
 TOLERANCE = 1e-10  # of a step, relative to the size of a state
-LEAST_STEPS, STEPS_PER_SAMPLE, MAX_STEPS = 20_000, 50, 400_000  # after which a motion is given up
-LOOK_AFTER = 0.1  # of these steps it is looked at, and given up if it ran away: it is then ...
-RAN_AWAY = 1e6  # ... times larger than all its states are
+MAX_STEPS = 400_000  # after which a motion is given up
 UNDONE = 0.1  # share of the least term's power that a sum of terms keeps, below which they undo each other ...
 LARGE = 5.0  # ... where each is so many times larger than all that moves the motion
 TURNED = 2.0  # times larger that terms make a number whose sign is not the declared one, beyond which they bend it ...
 TENTH = 0.1  # ... where its part is so much of all that moves the motion
 MOST_STATES = 80  # initial states that are fitted along where others would tell no more that is new
 EACH = "*"  # in the place of a stretch: each has a number of its own
+FEWEST = 4  # samples of a stretch
 FIRST_SHARE = 0.65  # of every stretch: what is fitted to it is judged on the rest
 
 
@@ -82,11 +80,8 @@ class EquationSystem(System):
 
     def with_(self, **changes: object) -> EquationSystem:
         """The same with other stretches, promoted terms, ..."""
-        given = {
-            "formulas": self.formulas, "stretches": self.stretches, "sizes": self.sizes, "widths": self.widths,
-            "promoted": self.promoted, "held": self.held, "typical": self.typical, "aims": self.aims,
-        } | changes  # fmt: skip
-        return EquationSystem(**given)  # type: ignore[arg-type]
+        names = ("formulas", "stretches", "sizes", "widths", "promoted", "held", "typical", "aims")
+        return EquationSystem(**{name: getattr(self, name) for name in names} | changes)
 
     def _base(self) -> list[Quantity]:
         found = []
@@ -173,7 +168,7 @@ class EquationSystem(System):
             if found is None:
                 return False
             rates, *without = (
-                self._rates(s, self.numbers(dict(values) | changed, s), s.time, found.states)[0]
+                self.formulas.rates_at(s, self.numbers(dict(values) | changed, s), s.time, found.states)[0]
                 for changed in ({}, turned, *absent)
             )
             acting = [rates - r for r in without]
@@ -256,7 +251,7 @@ class EquationSystem(System):
 
     def _predict(self, values: Values, s: Samples, own: Sequence[int]) -> Prediction | None:
         f = self.formulas
-        n, k, m = len(f.states), len(own), len(s.time)
+        n, k = len(f.states), len(own)
         p = self.numbers(values, s)
         z0 = np.zeros(n * (1 + k))
         z0[:n] = self.start_of(values, s)
@@ -264,117 +259,58 @@ class EquationSystem(System):
             if which < 0:
                 z0[n * (1 + c) + (-1 - which)] = 1.0
         columns = np.array([max(which, -1) for which in own], np.int64)
-        by_number, group_of, times = self._instants(s, p)
-        knots, pieces = f.driven(s.knots, s.pieces, p)
-        out = followed(f.rhs, z0, p, columns, (s.time[0], max(float(times.max()), s.time[0] + 1e-9)), knots, pieces,
-                       self.sizes, times)  # fmt: skip
-        if out is None:
+        late, by_number = self._lateness(s, p)
+        times, which_time = np.unique(s.time + late, return_inverse=True)
+        at = which_time.reshape(late.shape).T, np.arange(self._w)  # sensors that are late see other instants
+        span = s.time[0], max(float(times[-1]), s.time[0] + 1e-9)
+        out = np.empty((len(times), len(z0)))
+        with np.errstate(all="ignore"):
+            whole = kernel.integrate(
+                f.rhs, z0, p, columns, np.array(span), n, *f.driven(s.knots, s.pieces, p), self.sizes, TOLERANCE,
+                MAX_STEPS, times, out,
+            )  # fmt: skip
+        if not whole:
             return None
-        seen, derivative = np.zeros((m, self._w)), np.zeros((m, self._w, k))
-        h, H_y, H_p = np.zeros((m, self._w)), np.zeros((m, self._w, n)), np.zeros((m, self._w, len(p)))
-        for g in range(len(times)):
-            states = np.ascontiguousarray(out[g, :, :n])
-            kernel.observe_all(f.observe, times[g], states, p, knots, pieces, h, H_y, H_p)
-            channels = [c for c in range(self._w) if group_of[c] == g]
-            seen[:, channels] = h[:, channels]
-            if k == 0:
-                continue
-            moved = out[g, :, n:].reshape(m, k, n)
-            for c in channels:
-                derivative[:, c] = np.einsum("mn,mkn->mk", H_y[:, c], moved)
-                for j, which in enumerate(own):
-                    if which >= 0:
-                        derivative[:, c, j] += H_p[:, c, which]
-            if f.is_late:
-                slope = np.einsum("mwn,mn->mw", H_y, self._rates(s, p, times[g], states)[0])
+        states, moved = out[:, :n], out[:, n:].reshape(len(times), k, n)
+        seen, by_state, by_own = f.sensors_at(s, p, times, states)
+        derivative = np.einsum("mwn,mkn->mwk", by_state, moved)
+        for j, which in enumerate(own):
+            if which >= 0:
+                derivative[..., j] += by_own[..., which]
+        derivative = derivative[at]
+        if k and f.is_late:
+            with np.errstate(invalid="ignore"):  # a motion that ran away has no slope
+                slope = np.einsum("mwn,mn->mw", by_state, f.rates_at(s, p, times, states)[0])[at]
                 for j, which in enumerate(own):
                     if 0 <= which < by_number.shape[1]:
-                        with np.errstate(invalid="ignore"):  # a motion that ran away has no slope
-                            derivative[:, channels, j] += slope[:, channels] * by_number[channels, which].T
-        return Prediction(out[0, :, :n], seen, derivative)
+                        derivative[..., j] += slope * by_number[:, which].T
+        return Prediction(states[at[0][:, 0]], seen[at], derivative)
 
-    def _instants(self, s: Samples, p: Array) -> tuple[Array, list[int], Array]:
-        """Derivatives (w, n_fitted, m) of the lateness, each channel's group of instants, and the groups (g, m)."""
+    def _lateness(self, s: Samples, p: Array) -> tuple[Array, Array]:
+        """True instants minus those written beside the samples (w, m), and their derivatives (w, n_fitted, m)."""
         if not self.formulas.is_late:
-            return np.zeros((self._w, 0, 0)), [0] * self._w, s.time[None].copy()
+            return np.zeros((self._w, len(s.time))), np.zeros((self._w, 0, len(s.time)))
         late, by_number = self.formulas.lateness(s.time, p)
         if s.at_rest:  # what was shown before the motion began is what is shown as it begins
             before = s.time + late <= s.time[0]
             late = np.where(before, s.time[0] - s.time, late)
             by_number = np.where(before[:, None], 0.0, by_number)
-        groups: list[int] = []
-        group_of = []
-        for c in range(self._w):
-            same = next((g for g, first in enumerate(groups) if np.array_equal(late[c], late[first])), None)
-            if same is None:
-                groups.append(c)
-                same = len(groups) - 1
-            group_of.append(same)
-        return by_number, group_of, np.ascontiguousarray(s.time + late[groups])
+        return late, by_number
 
     def inputs_of(self, s: Samples, times: Array | None = None) -> list[Array]:
         """Every input (m,) at instants of a stretch (at its samples, if not said); late ones as if they were not."""
-        times = s.time if times is None else times
         if not len(s.pieces):
             return []
-        piece = np.clip(np.searchsorted(s.knots, times, side="right") - 1, 0, len(s.knots) - 2)
-        x = times - s.knots[piece]
-        found = [((a * x + b) * x + c) * x + d for a, b, c, d, _ in s.pieces[:, :, piece]]
+        found = list(PPoly(s.pieces[:, :4].transpose(1, 2, 0), s.knots)(s.time if times is None else times).T)
         return [*found, *(found[which] for which, _ in self.formulas.late_inputs)]
 
     def along(self, values: Values, s: Samples) -> tuple[Array, Array, Array, Array]:
         """Rates (m, n), their derivatives (m, n, n_p), sensors (m, w), theirs (m, w, n_p) along a stretch's motion."""
-        p, m = self.numbers(values, s), len(s.time)
-        found = self._predict(values, s, [])
-        states = np.zeros((m, len(self.formulas.states))) if found is None else found.states
-        rates, by_number = self._rates(s, p, s.time, states)
-        h, H_y, H_p = np.zeros((m, self._w)), np.zeros((m, self._w, states.shape[1])), np.zeros((m, self._w, len(p)))
-        states = np.ascontiguousarray(states)
-        knots, pieces = self.formulas.driven(s.knots, s.pieces, p)
-        kernel.observe_all(self.formulas.observe, s.time, states, p, knots, pieces, h, H_y, H_p)
-        return rates, by_number, h, H_p
-
-    def _rates(self, s: Samples, p: Array, times: Array, states: Array) -> tuple[Array, Array]:
-        """Rates (m, n) and their derivatives (m, n, n_p) along a motion."""
-        rates, by_number = np.zeros(states.shape), np.zeros((*states.shape, len(p)))
-        knots, pieces = self.formulas.driven(s.knots, s.pieces, p)
-        kernel.rates_all(self.formulas.rhs, times, np.ascontiguousarray(states), p, knots, pieces, rates, by_number)
-        return rates, by_number
-
-
-def followed(
-    rhs: Any, z: Array, p: Array, columns: NDArray[np.int64], span: tuple[float, float], knots: Array, pieces: Array,
-    sizes: Array, times: Array,
-) -> Array | None:  # fmt: skip
-    """Motion with its sensitivities (groups, m, len(z)) at times (groups, m); None where it has no end.
-
-    By an explicit method, and by an implicit one for as long as the equations are stiff: a friction that holds.
-    """
-    n, k = len(sizes), len(columns)
-    out = np.empty((*times.shape, len(z)))
-    at, largest, pointer = np.array([*span, 0.0]), np.zeros(k), np.zeros(len(times), np.int64)
-    left = min(max(LEAST_STEPS, STEPS_PER_SAMPLE * times.shape[1]), MAX_STEPS)
-    portion = int(LOOK_AFTER * left)
-    with np.errstate(all="ignore"):
-        while True:
-            done, steps = kernel.integrate(
-                rhs, z, p, columns, at, n, knots, pieces, sizes, TOLERANCE, min(portion, left), largest, pointer,
-                times, out,
-            )  # fmt: skip
-            if done == kernel.TOO_MANY_STEPS and steps > 0 and left > portion:
-                if np.abs(z[:n]).max() > RAN_AWAY * sizes.max():
-                    return None
-                left -= portion
-                continue
-            left -= steps
-            if done == kernel.STIFF_CHANGES:
-                _stiff_kernel.prepare()
-                done, steps = _stiff_kernel.integrate(
-                    rhs, z, p, columns, at, n, knots, pieces, sizes, left, pointer, times, out
-                )
-                left -= steps
-            if done != kernel.STIFF_CHANGES:
-                return out if done == kernel.DONE else None
+        p, found = self.numbers(values, s), self._predict(values, s, [])
+        states = np.zeros((len(s.time), len(self.formulas.states))) if found is None else found.states
+        rates, _, by_number = self.formulas.rates_at(s, p, s.time, states)
+        shown, _, shown_by_number = self.formulas.sensors_at(s, p, s.time, states)
+        return rates, by_number, shown, shown_by_number
 
 
 def fitted_rows(s: Samples) -> Mask:
@@ -384,14 +320,16 @@ def fitted_rows(s: Samples) -> Mask:
     return np.asarray(s.time - s.time[0] <= FIRST_SHARE * (s.time[-1] - s.time[0]), bool)
 
 
-def cut(samples: Sequence[Samples], duration: float) -> list[Samples]:
-    """Every run in stretches no longer than `duration` [s], of equal lengths."""
-    found = []
-    for s in samples:
-        count = max(1, int(np.ceil((s.time[-1] - s.time[0]) / duration * (1 - 1e-9))))
+def cut(samples: Sequence[Samples], counts: Sequence[int]) -> list[Samples]:
+    """Every stretch in so many of equal lengths."""
+    found, numbers = [], Counter[str]()
+    for s, count in zip(samples, counts, strict=True):
         edges = np.searchsorted(s.time, s.time[0] + (s.time[-1] - s.time[0]) * np.arange(count + 1) / count)
         edges[-1] = len(s.time)
-        found += [s.part(int(a), int(b), i) for i, (a, b) in enumerate(pairwise(edges)) if b - a >= 4]
+        for a, b in pairwise(edges.tolist()):
+            if b - a >= FEWEST:
+                found.append(s.part(a, b, numbers[s.run]))
+            numbers[s.run] += 1
     return found
 
 

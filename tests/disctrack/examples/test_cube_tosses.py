@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from disctrack.discrepancy.search import explain
 from disctrack.examples.cube_data import CLEARANCE, HALF_WIDTH, flights, read_tosses, without_copies
 from disctrack.examples.cube_system import CubeTosses, whitening_blind_to
-from disctrack.examples.cube_tosses import SETTINGS, analyse_tosses, main
+from disctrack.examples.cube_tosses import diagnosed, errors, main
 from tests.oracles import tossed_cube
 
 N = 50  # tosses that are simulated
@@ -25,7 +24,8 @@ def published(shared_data):
 
 @pytest.fixture(scope="module")
 def answer(published):
-    return analyse_tosses(published[:150])
+    system = CubeTosses(published[:150])
+    return system, diagnosed(system)
 
 
 def simulated(rng, folder, n=N, **hidden):
@@ -63,7 +63,7 @@ def test_what_is_judged_of_a_flight_is_white_and_blind_to_its_own_motion():
 )
 def test_what_is_hidden_in_simulated_tosses_is_named_and_sized(rng, tmp_path, hidden, expected):
     system = CubeTosses(simulated(rng, tmp_path, **hidden))
-    found = explain(system, {}, SETTINGS, system.training_rows())
+    found = diagnosed(system)
     assert named(found) == {key.partition(".")[0] for key in expected}
     assert found.verdict == ("found" if expected else "nothing missing")
     for key, value in expected.items():
@@ -74,7 +74,7 @@ def test_what_is_hidden_in_simulated_tosses_is_named_and_sized(rng, tmp_path, hi
 @pytest.mark.statistical
 def test_gravity_and_frame_rate_are_one_number_where_cubes_at_rest_deny_the_scale(rng, tmp_path):
     system = CubeTosses(simulated(rng, tmp_path, gravity=9.7))
-    found = explain(system, {}, SETTINGS, system.training_rows())
+    found = diagnosed(system)
     (effect,) = found.found
     rivals = {r.candidate.name for r in effect.cannot_be_told_from}
     assert {effect.candidate.name} | rivals == {"gravity", "frame_rate"}
@@ -83,7 +83,7 @@ def test_gravity_and_frame_rate_are_one_number_where_cubes_at_rest_deny_the_scal
 @pytest.mark.statistical
 def test_a_vertical_that_leans_with_every_toss_is_not_taken_for_one_that_leans_in_the_room(rng, tmp_path):
     system = CubeTosses(simulated(rng, tmp_path, lean=0.01))
-    found = explain(system, {}, SETTINGS, system.training_rows())
+    found = diagnosed(system)
     assert named(found) == {"toss_tilt"}
     assert abs(found.after.values["toss_tilt.across"] - 0.01) < 4 * found.after.sigma("toss_tilt.across") + 2e-4
 
@@ -110,30 +110,31 @@ def test_some_published_tosses_are_copies_of_others_turned_about_the_vertical(pu
 
 def test_published_tosses_lack_a_scale_a_vertical_and_the_place_of_the_centre_of_mass(answer):
     """The first 150 tosses; the figures of all of them are in the slow test."""
-    assert answer.diagnosis.verdict == "found"
-    assert {"length_scale", "toss_tilt", "centre_of_mass", "tag_axes"} <= named(answer.diagnosis)
-    values = answer.diagnosis.after.values
+    system, d = answer
+    assert d.verdict == "found"
+    assert {"length_scale", "toss_tilt", "centre_of_mass", "tag_axes"} <= named(d)
+    values = d.after.values
     assert values["length_scale.change"] == pytest.approx(-0.025, abs=0.003)
     assert values["toss_tilt.across"] == pytest.approx(0.0138, abs=0.002)
     assert values["centre_of_mass.c_3"] == pytest.approx(5.4e-3, abs=0.6e-3)
-    for group in ("horizontal", "vertical"):
-        assert answer.after[group] < 0.6 * answer.before[group]
+    before, after = errors(system, d)
+    assert all(after[group] < 0.6 * before[group] for group in ("horizontal", "vertical"))
 
 
 def test_what_a_flight_s_own_motion_makes_whole_leaves_no_trace(answer):
     """A delay of the positions is another start, a smoothed parabola another height: rounding once gained 172."""
-    outcome = {t.candidate.name: (t.score, t.reason) for t in answer.diagnosis.tried}
+    outcome = {t.candidate.name: (t.score, t.reason) for t in answer[1].tried}
     for name in ("clock_offset", "smoothing"):
         assert outcome[name][0] == 0
         assert "leaves no trace" in outcome[name][1]
 
 
 def test_a_wrong_effect_alone_does_not_bring_the_residual_to_noise(answer):
-    system = answer.system
+    system, _ = answer
     all_candidates = system.candidates
     try:
         system.candidates = tuple(c for c in all_candidates if c.name in ("clock_offset", "rotational_drag", "tilt"))
-        refused = explain(system, {}, SETTINGS, system.training_rows())
+        refused = diagnosed(system)
     finally:
         system.candidates = all_candidates
     assert refused.verdict == "unexplained"
@@ -141,8 +142,8 @@ def test_a_wrong_effect_alone_does_not_bring_the_residual_to_noise(answer):
 
 
 def test_shuffled_residuals_of_the_tosses_give_no_finding(answer, rng):
-    system = answer.system
-    residual, _ = system.linearise(answer.diagnosis.after.values, [])
+    system, d = answer
+    residual, _ = system.linearise(d.after.values, [])
     original = system._left
     try:
         shuffled = original.copy()
@@ -150,7 +151,7 @@ def test_shuffled_residuals_of_the_tosses_give_no_finding(answer, rng):
             shuffled[rows] = rng.permutation(residual[rows], axis=0)
         shuffled *= original != 0  # what was not measured stays so
         system._left = shuffled
-        assert not explain(system, {}, SETTINGS, system.training_rows()).found
+        assert not diagnosed(system).found
     finally:
         system._left = original
 
@@ -170,8 +171,8 @@ def test_command_writes_the_diagnosis_of_the_tosses(rng, tmp_path, capsys):
 
 @pytest.mark.slow
 def test_figures_of_all_published_tosses(published):
-    answer = analyse_tosses(published)
-    d = answer.diagnosis
+    system = CubeTosses(published)
+    d = diagnosed(system)
     assert d.before.reduced_chi_square == pytest.approx(3.4, abs=0.3)
     assert d.after.reduced_chi_square < 1.05
     assert d.held_out_after.ratio_to_floor < 1.05
@@ -180,5 +181,6 @@ def test_figures_of_all_published_tosses(published):
     assert sigma < 5e-4
     assert d.after.values["principal_moments.e_11"] == pytest.approx(0.064, abs=0.01)
     assert d.after.values["principal_moments.e_22"] == pytest.approx(0.052, abs=0.01)
-    assert answer.after["horizontal"] < 30e-6
-    assert answer.after["vertical"] < 26e-6
+    _, after = errors(system, d)
+    assert after["horizontal"] < 30e-6
+    assert after["vertical"] < 26e-6

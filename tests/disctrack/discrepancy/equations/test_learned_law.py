@@ -5,14 +5,10 @@ import json
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 
 from disctrack.discrepancy.equations import Equations, Run, diagnose, terms
-from disctrack.discrepancy.equations.declared import checked
-from disctrack.discrepancy.equations.formulas import formulas
-from disctrack.discrepancy.equations.law import HARMONICS, NAME, Along, _amplitudes, _knowing, _set
-from disctrack.discrepancy.equations.system import EquationSystem
+from disctrack.discrepancy.equations.law import NAME
 
 OSCILLATOR = Equations({"x": "v", "v": "-omega**2*x - 2*beta*v"}, {"omega": 11.5, "beta": 0.12}, units={"x": "m"})
 DECLARED = {"x": 11.5**2, "v": 0.24, "t": 0.0}  # what the declared equations pull back with, by variable
@@ -128,27 +124,6 @@ def test_a_law_is_a_force_where_a_mass_matrix_is_declared(rng):
     assert np.mean(np.abs(law.force - truth) < 3 * law.sigma) > 0.9
     assert law.sigma.max() < 0.05
     assert abs(answer.values["M"] - 1) < 3.5 * answer.sigmas["M"]
-
-
-@pytest.mark.statistical
-def test_derivatives_of_a_law_are_those_of_its_motion():
-    """By amplitudes and by the state, against differences of predictions."""
-    run = recorded(lambda x, v, t: 0.0, seed=14)
-    plain = EquationSystem(formulas(OSCILLATOR, [], {"x": "x"}), checked(OSCILLATOR, [run]), np.array([1.0, 12.0]), {})
-    start = {"state.x[run1]": 1.0, "state.v[run1]": 0.0, "omega": 12.0, "beta": 0.15}
-    law = Along("v", "v", jumps=True)
-    system, numbers = _set(_knowing(plain, {"x": "x"}), law, start)
-    # a jump this wide is smooth for the steps of the differences
-    system = system.with_(widths=dict.fromkeys(system.widths, 1.0))
-    names = [q.name for q in _amplitudes(system, law)]
-    assert len(names) == HARMONICS + 3
-    values = start | numbers | dict(zip(names, np.random.default_rng(3).normal(0, 0.1, len(names)), strict=True))
-    _, derivative = system.linearise(values, [*names, "state.x[run1]"])
-    for i, name in enumerate([*names, "state.x[run1]"]):
-        step = 1e-3
-        ahead, behind = (system.linearise(values | {name: values[name] + s}, [])[0] for s in (step, -step))
-        difference = (behind - ahead)[..., 0] / (2 * step)
-        assert_allclose(derivative[..., 0, i], difference, atol=1e-3 * np.abs(difference).max(), rtol=0)
 
 
 @pytest.mark.statistical
