@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from calibration.kit.arrays import Array
 from calibration.kit.brief import Brief, Outline
 from disctrack.analyse.contact import Contact, analyse_contact
 from disctrack.analyse.derivatives import GROUP_NAMES, MeasuredMotion, differentiate
@@ -13,7 +14,6 @@ from disctrack.analyse.power_laws import (
     NutationCount,
     PowerLaws,
     count_nutation,
-    exponents_by_window,
     fit_power_laws,
     power_law_end,
 )
@@ -83,22 +83,22 @@ def analyse(trajectory: Trajectory, window: float = WINDOW, circle_duration: flo
         )
     trajectory = _tracked_part(trajectory)
     motion = differentiate(trajectory)
-    until, sense = _end_of_rolling(motion)
+    found = propagate(motion, rates)
+    until, sense = _end_of_rolling(motion, found.value[:, 0])
     contact = analyse_contact(motion, circle_duration, until)
     if contact.onset.low > motion.time[motion.known][0]:  # the acceleration jumps where slip ends
         onset = contact.onset
-        del motion, contact  # the new ones need not stand beside them
+        del motion, contact, found  # the new ones need not stand beside them
         motion = differentiate(trajectory, breaks=(onset.time,))
         contact = replace(analyse_contact(motion, circle_duration, until), onset=onset)
-    found = propagate(motion, rates)
+        found = propagate(motion, rates)
     energy = analyse_energy(motion)
-    theta_sigma = np.sqrt(np.trace(motion.covariance[:, 3:6, 3:6], axis1=1, axis2=2) / 3)
     psi, psidot = sense * motion.euler[:, 0], sense * found.value[:, 0]
     data = (motion.time, psi, motion.euler[:, 1], psidot, energy.propagated.value[:, 5])
     scaling = Scaling(
         laws=fit_power_laws(*data, window=window),
-        by_window=exponents_by_window(*data, WINDOWS),
-        count=count_nutation(psi, motion.euler[:, 1], theta_sigma, motion.disc, motion.gravity),
+        by_window=tuple(fit_power_laws(*data, window=float(w)) for w in WINDOWS),
+        count=count_nutation(psi, motion.euler[:, 1], motion.tilt_sigma, motion.disc),
     )
     return Analysis(
         trajectory=trajectory,
@@ -119,13 +119,11 @@ def _tracked_part(trajectory: Trajectory) -> Trajectory:
     return part(trajectory, slice(int(rows[0]), int(rows[-1]) + 1))
 
 
-def _end_of_rolling(motion: MeasuredMotion) -> tuple[float, float]:
+def _end_of_rolling(motion: MeasuredMotion, psidot: Array) -> tuple[float, float]:
     """Instant [s] at which the precession is stopped (or the recording ends), and the sense of the precession."""
-    psidot = propagate(motion, rates).value[:, 0]
-    known = np.isfinite(psidot)
-    if not known.any():
+    if not np.isfinite(psidot).any():
         return np.inf, 1.0
-    sense = float(np.sign(np.sum(psidot[known]))) or 1.0
+    sense = float(np.sign(np.nansum(psidot))) or 1.0
     return power_law_end(motion.time, sense * motion.euler[:, 0], sense * psidot), sense
 
 

@@ -9,14 +9,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import least_squares
 
 from calibration.kit.arrays import Array
 from calibration.kit.brief import Outline
-from disctrack.analyse.derivatives import MeasuredMotion
-from disctrack.analyse.propagation import DerivedSeries, MotionState, Propagated, propagate
+from disctrack.analyse.derivatives import K, MeasuredMotion, MotionState
+from disctrack.analyse.propagation import DerivedSeries, Propagated, propagate
 from disctrack.disc import Disc
 
-K = np.array([0.0, 0.0, 1.0])
 CONTACT = (
     ("contact_x", "m", "contact point, x"),
     ("contact_y", "m", "contact point, y"),
@@ -31,7 +31,7 @@ CONTACT = (
     ("force_z", "N", "normal contact force"),
     ("friction_needed", "1", "horizontal over normal contact force"),
 )
-PLANE, SLIP = slice(0, 2), slice(3, 5)
+SLIP = slice(3, 5)
 
 # What a calibrated radius, thickness and table (1e-4 each) leave of slip at the rates of a rolling disc (1 to 5 m/s at
 # the edge) is a few tenths of a millimetre per second: slip below this is rolling for every purpose.
@@ -69,46 +69,27 @@ class Circle:
     end: float  # [s]
 
 
-def r_OA(state: MotionState, disc: Disc) -> Array:
-    """Arm (n, 3) from the centre to the contact, world axes [m]."""
-    _, e2, e3 = state.axes()
-    return disc.arm_to_contact(e2, e3)
+def contact_quantities(state: MotionState, disc: Disc, gravity: float) -> Array:
+    """All of CONTACT, (n, 12).
 
-
-def contact_velocity_material(state: MotionState, disc: Disc) -> Array:
-    """Velocity (n, 3) of the disc's own point at the contact, world axes [m/s]: v_O + omega x r_OA, eq. (2.3)."""
-    return state.velocity + np.cross(state.omega_world, r_OA(state, disc))
-
-
-def contact_velocity_locus(state: MotionState, disc: Disc) -> Array:
-    """Velocity (n, 3) of the moving point of touch, world axes [m/s]: v_O + Omega_R x r_OA.
-
-    Omega_R = thetadot e1 + psidot k turns the nodal frame, in which r_OA is constant.
+    slip : of the disc's own point at the contact, v_O + omega x r_OA, eq. (2.3); locus : of the moving point of touch,
+    v_O + Omega_R x r_OA, where Omega_R = thetadot e1 + psidot k turns the nodal frame, in which r_OA is constant
+    force : of the table, from Newton's law with nothing else acting, eq. (2.6)
     """
-    e1, e2, _ = state.axes()
-    thetadot = np.sum(state.omega_world * e1, axis=1)[:, None]
+    n0, e2, e3 = state.axes()
+    r_OA, m0 = disc.arm_to_contact(e2, e3), np.cross(K, n0)
+    thetadot = np.sum(state.omega_world * n0, axis=1)[:, None]
     with np.errstate(divide="ignore", invalid="ignore"):
         psidot = (np.sum(state.omega_world * e2, axis=1) / state.sine)[:, None]
-    return state.velocity + np.cross(thetadot * e1 + psidot * K, r_OA(state, disc))
-
-
-def contact_force(state: MotionState, disc: Disc, gravity: float) -> Array:
-    """Force (n, 3) of the table on the disc, world axes [N], from Newton's law with nothing else acting: eq. (2.6)."""
-    return disc.mass * (state.acceleration + gravity * K)
-
-
-def contact_quantities(state: MotionState, disc: Disc, gravity: float) -> Array:
-    """All of CONTACT, (n, 12)."""
-    n0, _, _ = state.axes()
-    m0 = np.cross(K, n0)
-    point = state.position + r_OA(state, disc)
-    slip, locus = contact_velocity_material(state, disc), contact_velocity_locus(state, disc)
-    force = contact_force(state, disc, gravity)
-    along = [np.sum(v * axis, axis=1) for v, axis in ((slip, n0), (slip, m0))]
-    along += [slip[:, 2]]
-    along += [np.sum(v * axis, axis=1) for v, axis in ((locus, n0), (locus, m0), (force, n0), (force, m0))]
-    needed = np.where(force[:, 2] > 0, np.hypot(along[-2], along[-1]) / np.abs(force[:, 2]), np.nan)
-    return np.column_stack([point, *along, force[:, 2], needed])
+    slip = state.velocity + np.cross(state.omega_world, r_OA)
+    locus = state.velocity + np.cross(thetadot * n0 + psidot * K, r_OA)
+    force = disc.mass * (state.acceleration + gravity * K)
+    (slip_n, slip_m), (locus_n, locus_m), (force_n, force_m) = (
+        [np.sum(vector * axis, axis=1) for axis in (n0, m0)] for vector in (slip, locus, force)
+    )
+    needed = np.where(force[:, 2] > 0, np.hypot(force_n, force_m) / np.abs(force[:, 2]), np.nan)
+    along = slip_n, slip_m, slip[:, 2], locus_n, locus_m, force_n, force_m, force[:, 2], needed
+    return np.column_stack([state.position + r_OA, *along])
 
 
 @dataclass(frozen=True, repr=False)
@@ -143,9 +124,10 @@ def rolling_onset(motion: MeasuredMotion, found: Propagated, until: float = np.i
     """
     frames = np.flatnonzero(np.isfinite(found.value[:, SLIP]).all(axis=1) & (motion.time <= until))
     if frames.size < 2:
-        return _no_onset("the contact velocity is not known in any two frames")
+        why = "not determined: the contact velocity is not known in any two frames"
+        return RollingOnset(*(float("nan"),) * 6, n_late_slips=0, verdict=why)
     v = found.value[frames, SLIP]
-    C = found.covariance_at(frames, SLIP) + found.calibration_covariance_at(frames, SLIP)
+    C = found.covariance_at(frames, SLIP) + found.shared_covariance_at(frames, SLIP)
     interval = float(np.median(np.diff(motion.time)))
     share = np.minimum(1.0, interval / (INDEPENDENT_AFTER_LENGTHS * motion.length.min(axis=1)[frames]))
     sizes = np.geomspace(4 * SLIP_TOLERANCE, 10.0, 60)
@@ -217,11 +199,6 @@ def _slip_distance(time: Array, v: Array, C: Array, share: Array) -> tuple[float
     return float(np.sum(speed * weight)), float(np.sqrt(variance))
 
 
-def _no_onset(reason: str) -> RollingOnset:
-    nan = float("nan")
-    return RollingOnset(nan, nan, nan, nan, nan, nan, 0, f"not determined: {reason}")
-
-
 def locus_circle(motion: MeasuredMotion, found: Propagated, duration: float, until: float = np.inf) -> Circle:
     """Circle through the contact points of the last `duration` seconds before `until`, least squares of distances.
 
@@ -229,33 +206,30 @@ def locus_circle(motion: MeasuredMotion, found: Propagated, duration: float, unt
     below a quarter turn are not given.
     """
     known = np.flatnonzero(np.isfinite(found.value[:, :2]).all(axis=1) & (motion.time <= until))
-    nan = float("nan")
-    nothing = Circle(np.full(2, nan), nan, nan, nan, nan, nan, nan, nan, nan)
-    if known.size < 8:
-        return nothing
-    frames = known[motion.time[known] >= motion.time[known[-1]] - duration]
+    frames = known[motion.time[known] >= motion.time[known[-1]] - duration] if known.size else known
+    arc = float(np.ptp(motion.euler[frames, 0])) if frames.size else 0.0
+    if arc < np.pi / 2 or frames.size < 8:
+        return Circle(np.full(2, np.nan), *(float("nan"),) * 8)
     points = found.value[frames, :2]
-    arc = float(np.ptp(motion.euler[frames, 0]))
-    if arc < np.pi / 2:
-        return nothing
     centre, radius = _fit_circle(points)
     offset = points - centre
-    distance = np.hypot(offset[:, 0], offset[:, 1])
+    distance = np.linalg.norm(offset, axis=1)
     J = np.column_stack([offset / distance[:, None], np.ones(len(frames))])
-    gain = np.linalg.solve(J.T @ J, J.T)
-    residual = distance - radius
+    gain = np.linalg.solve(J.T @ J, J.T)[2]
+    rms = float(np.sqrt(np.mean((distance - radius) ** 2)))
     independent = min(len(frames), max(4.0, arc / np.pi))
-    noise = np.einsum("i,nij,j->n", [1.0, 1.0], found.covariance_at(frames, PLANE), [1.0, 1.0]).mean() / 2
-    variance = (gain[2] @ gain[2]) * len(frames) / independent * max(float(np.mean(residual**2)), float(noise))
-    per_rig = gain[2] @ np.einsum("ni,nir->nr", J[:, :2], found.sensitivity_at(frames, PLANE))
+    noise = found.covariance_at(frames, slice(0, 2)).sum(axis=(1, 2)).mean() / 2
+    variance = gain @ gain * len(frames) / independent * max(rms**2, float(noise))
+    sensitivity = found.jacobian[frames, :2] @ motion.calibration_sensitivity[frames]
+    per_rig = gain @ np.einsum("ni,nir->nr", J[:, :2], sensitivity)
     theta = motion.euler[frames, 1]
     expected = motion.disc.radius * np.cos(theta) - motion.disc.half_thickness * np.sin(theta)
     return Circle(
         centre=centre,
-        radius=float(radius),
+        radius=radius,
         sigma=float(np.sqrt(variance)),
-        sigma_calibration=float(np.sqrt(max(0.0, per_rig @ found.rig_covariance @ per_rig))),
-        rms=float(np.sqrt(np.mean(residual**2))),
+        sigma_calibration=float(np.sqrt(max(0.0, per_rig @ motion.rig_covariance @ per_rig))),
+        rms=rms,
         arc=arc,
         expected=float(np.mean(expected)),
         start=float(motion.time[frames[0]]),
@@ -263,17 +237,9 @@ def locus_circle(motion: MeasuredMotion, found: Propagated, duration: float, unt
     )
 
 
-def _fit_circle(points: Array, iterations: int = 50) -> tuple[Array, float]:
-    """Centre (2,) and radius: algebraic start, then Gauss-Newton on the distances."""
-    A = np.column_stack([2 * points, np.ones(len(points))])
-    a, b, c = np.linalg.lstsq(A, np.sum(points**2, axis=1), rcond=None)[0]
-    centre, radius = np.array([a, b]), float(np.sqrt(max(c + a * a + b * b, 0.0)))
-    for _ in range(iterations):
-        offset = points - centre
-        distance = np.hypot(offset[:, 0], offset[:, 1])
-        J = np.column_stack([offset / distance[:, None], np.ones(len(points))])
-        step = np.linalg.lstsq(J, distance - radius, rcond=None)[0]
-        centre, radius = centre + step[:2], radius + step[2]
-        if np.abs(step).max() < 1e-14:
-            break
-    return centre, float(radius)
+def _fit_circle(points: Array) -> tuple[Array, float]:
+    """Centre (2,) and radius that leave the least squares of distances."""
+    middle = points.mean(axis=0)
+    start = *middle, float(np.linalg.norm(points - middle, axis=1).mean())
+    found = least_squares(lambda c: np.linalg.norm(points - c[:2], axis=1) - c[2], start, xtol=1e-15, x_scale=start[2])
+    return found.x[:2], float(found.x[2])

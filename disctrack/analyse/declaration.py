@@ -18,16 +18,16 @@ A finding names the declared numbers that could be wrong, likeliest first, what 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from calibration.cameras.camera import StereoRig, triangulate
 from calibration.kit.arrays import Array
-from disctrack.analyse.contact import K
-from disctrack.analyse.derivatives import MeasuredMotion, differentiate
-from disctrack.analyse.propagation import state_of
+from disctrack.analyse.derivatives import K, MeasuredMotion, differentiate
+from disctrack.analyse.energy import TOTAL, energy_quantities
 from disctrack.disc import Disc, has_mirror_axis, symmetry_order
 from disctrack.errors import AnalysisError
 from disctrack.faults.clock_jump import clock_jumps
@@ -40,7 +40,6 @@ if TYPE_CHECKING:
 
 
 SIDEWAYS = 0.5  # cosine of the angle up to which a baseline is one from left to right
-STANDARD_GRAVITY = 9.81  # [m/s^2]; 9.78 to 9.83 on the Earth's surface
 USUAL_RATES = np.outer(10.0 ** np.arange(1, 7), [1, 1.2, 1.25, 1.5, 2, 2.4, 2.5, 3, 4, 5, 6, 7.5, 8]).ravel()  # [Hz]
 STRETCHES, STRETCH, BLOCK = 4, 100, 20  # stretches looked at, frames of each, frames whose median is one estimate
 MIN_BLOCKS = 5
@@ -72,17 +71,6 @@ class Boards(NamedTuple):
     places: Mapping[int, tuple[Array, Array]]  # number of the view: R_left_board (3, 3), t_left_board (3,) [m]
     table_view: int | None
     thickness: float  # [m] of the board on the table
-
-
-@dataclass(frozen=True)
-class Balance:
-    """The gravity that satisfies the balance of moments, block by block; NaN where none is determined."""
-
-    gravity: float  # [m/s^2] median of the blocks
-    sigma: float  # [m/s^2] of it, from the blocks' scatter
-    coherent: float  # share of the blocks within COHERENT of the median
-    n_blocks: int
-    energy: Array  # (n_blocks,) [J] mechanical energy, in the order of time
 
 
 def contradictions(
@@ -119,16 +107,16 @@ def thickness(disc: Disc, board: float, noticed: Iterable[Finding]) -> tuple[Fin
     height = next((f.numbers["height"].value for f in noticed if f.doubtful and f.kind in OFF), None)
     if height is None:
         return ()
-    fits, whole = board - 1e-6 * height, 2 * disc.half_thickness
-    likely: list[tuple[float, Kind, Remedy]] = []
-    if fits > 0:
-        # nobody measures a thickness of nothing: it was forgotten
-        misfit = abs(float(np.log(fits / board))) if board else 0.0
-        remedy = Remedy("[table] board_thickness_mm", f"{1e3 * fits:.2f}", f"{1e3 * board:g}")
-        likely.append((misfit, Kind.BOARD_THICKNESS, remedy))
-    if (other := whole + 1e-6 * height) > 0:
-        remedy = Remedy("[disc] thickness_mm", f"{1e3 * other:.2f}", f"{1e3 * whole:g}")
-        likely.append((abs(float(np.log(other / whole))), Kind.THICKNESS, remedy))
+    # nobody measures a thickness of nothing: it was forgotten
+    sizes = (
+        ("[table] board_thickness_mm", Kind.BOARD_THICKNESS, board, board - 1e-6 * height),
+        ("[disc] thickness_mm", Kind.THICKNESS, 2 * disc.half_thickness, 2 * disc.half_thickness + 1e-6 * height),
+    )
+    likely = [
+        (abs(float(np.log(fits / size))) if size else 0.0, kind, Remedy(key, f"{1e3 * fits:.2f}", f"{1e3 * size:g}"))
+        for key, kind, size, fits in sizes
+        if fits > 0
+    ]
     if not likely:
         return ()
     likely.sort(key=lambda one: one[0])
@@ -154,25 +142,28 @@ def lost_pairs(trajectory: Trajectory) -> Iterator[Finding]:
 
 def motion_against_gravity(trajectory: Trajectory) -> tuple[Finding, ...]:
     """Gravity and frame rate, and an energy that grows, on some stretches of the recording."""
-    seen = balance(trajectory)
-    g = trajectory.gravity
-    if not (seen.n_blocks >= MIN_BLOCKS and seen.gravity > 0 and seen.coherent >= COHERENT_SHARE):
+    found, energy = balance(trajectory)
+    g, n = trajectory.gravity, len(found)
+    if n < MIN_BLOCKS:
         return ()
-    ratio = seen.gravity / g
-    if abs(np.log(ratio)) > np.log1p(BALANCE) and abs(seen.gravity - g) > SIGMAS * seen.sigma:
+    gravity = float(np.median(found))
+    sigma = _robust(found) * np.sqrt(np.pi / 2 / n)
+    if not (gravity > 0 and np.mean(np.abs(found - gravity) < COHERENT * gravity) >= COHERENT_SHARE):
+        return ()
+    if abs(np.log(gravity / g)) > np.log1p(BALANCE) and abs(gravity - g) > SIGMAS * sigma:
         text = (
-            f"the motion satisfies the balance of moments with a gravity of {with_sigma(seen.gravity, seen.sigma)} "
-            f"m/s^2 ({seen.n_blocks} stretches of {BLOCK} frames); expected {g:.4g} m/s^2 at {trajectory.frame_rate:g} "
-            "frames a second, nothing but the table touching the disc"
+            f"the motion satisfies the balance of moments with a gravity of {with_sigma(gravity, sigma)} m/s^2 ({n} "
+            f"stretches of {BLOCK} frames); expected {g:.4g} m/s^2 at {trajectory.frame_rate:g} frames a second, "
+            "nothing but the table touching the disc"
         )
-        found = {"gravity": Number(seen.gravity, "m/s^2", seen.sigma)}
-        remedies, kind = _of_gravity(trajectory, ratio), Kind.GRAVITY_OR_RATE
-        return (Finding(kind, Severity.DOUBT, text, numbers=found, remedies=remedies, explains=(Kind.REVERSED,)),)
-    times = np.arange(seen.n_blocks)
-    slope, start = np.polyfit(times, seen.energy, 1)
-    sigma = _robust(seen.energy - slope * times - start) / (np.std(times) * np.sqrt(len(times)))
+        numbers = {"gravity": Number(gravity, "m/s^2", sigma)}
+        remedies, kind = _of_gravity(trajectory, gravity / g), Kind.GRAVITY_OR_RATE
+        return (Finding(kind, Severity.DOUBT, text, numbers=numbers, remedies=remedies, explains=(Kind.REVERSED,)),)
+    times = np.arange(n)
+    slope, start = np.polyfit(times, energy, 1)
+    sigma = _robust(energy - slope * times - start) / (np.std(times) * np.sqrt(n))
     end = start + slope * times[-1]
-    steady = np.mean(np.diff(seen.energy) > 0) > STEADY
+    steady = np.mean(np.diff(energy) > 0) > STEADY
     if end - start > GROWTH * start and slope > SIGMAS * sigma and steady:
         text = (
             f"the mechanical energy grows from {1e3 * start:.4g} to {1e3 * end:.4g} mJ though no force but the table's "
@@ -193,7 +184,7 @@ def _of_gravity(trajectory: Trajectory, ratio: float) -> tuple[Remedy, ...]:
     unit = "if it was given in mm/s^2" if abs(np.log(1e3 * ratio)) < 0.1 else ""
     # how far from an ordinary value each would be, natural logarithm: the nearest is the likeliest
     found = [
-        (abs(np.log(g * ratio / STANDARD_GRAVITY)), Remedy("[gravity] g_m_s2", f"{g * ratio:.4g}", f"{g:g}", unit)),
+        (abs(np.log(g * ratio / 9.81)), Remedy("[gravity] g_m_s2", f"{g * ratio:.4g}", f"{g:g}", unit)),
         (departures[nearest], Remedy("[cameras] frame_rate_hz", f"{true_rate:.4g}", f"{rate:g}", usual)),
         _radius_suspected(trajectory, ratio),
     ]
@@ -224,24 +215,14 @@ def density(disc: Disc) -> tuple[Finding, ...]:
     return (Finding(Kind.DENSITY, Severity.WARNING, text, remedies=remedies),)
 
 
-def balance(trajectory: Trajectory) -> Balance:
-    """The gravity with which the moments about the centre balance along e1; see the module."""
-    gravity, energy = [], []
+def balance(trajectory: Trajectory) -> tuple[Array, Array]:
+    """Gravity [m/s^2] with which the moments about the centre balance along e1, and energy [J]: (blocks,) in order."""
+    found = [(np.empty(0), np.empty(0))]
     for rows in _stretches(trajectory):
-        try:
-            motion = differentiate(part(trajectory, rows))
-        except AnalysisError:
-            continue
-        g, e = _blocks(motion, BLOCK)
-        gravity.append(g)
-        energy.append(e)
-    found = np.concatenate([*gravity, np.empty(0)])
-    if not len(found):
-        return Balance(float("nan"), float("nan"), float("nan"), 0, found)
-    middle = float(np.median(found))
-    sigma = _robust(found) * np.sqrt(np.pi / 2 / len(found))
-    coherent = float(np.mean(np.abs(found - middle) < COHERENT * abs(middle)))
-    return Balance(middle, sigma, coherent, len(found), np.concatenate(energy))
+        with suppress(AnalysisError):
+            found.append(_blocks(differentiate(part(trajectory, rows))))
+    gravity, energy = (np.concatenate(of) for of in zip(*found, strict=True))
+    return gravity, energy
 
 
 def _stretches(trajectory: Trajectory) -> list[slice]:
@@ -256,40 +237,45 @@ def _stretches(trajectory: Trajectory) -> list[slice]:
         for piece in pieces
         for start in range(piece[0], piece[-1] + 1 - BLOCK, STRETCH)
     ]
-    chosen = np.linspace(0, len(found) - 1, min(STRETCHES, len(found))).round().astype(int)
-    return [found[i] for i in chosen]
+    return [found[i] for i in _evenly(len(found), STRETCHES)]
 
 
-def _blocks(motion: MeasuredMotion, size: int) -> tuple[Array, Array]:
+def _blocks(motion: MeasuredMotion) -> tuple[Array, Array]:
     """Medians of gravity and energy over blocks of frames of one stretch, where the balance determines gravity."""
-    disc, state = motion.disc, state_of(motion)
+    disc = motion.disc
     m, J1, J3 = disc.mass, disc.moment_diametral, disc.moment_axial
-    e1, e2, e3 = state.axes()
-    theta = np.arctan2(state.sine, e3[:, 2])
-    psi = motion.euler[:, 0]
+    e1, e2, e3 = motion.axes()
+    theta = np.arctan2(motion.sine, e3[:, 2])
     good = motion.known & motion.measured & (theta > THETA_RANGE[0]) & (theta < THETA_RANGE[1])
-    if good.sum() < size or np.ptp(psi[good]) < MIN_TURN:
+    if good.sum() < BLOCK or np.ptp(motion.euler[good, 0]) < MIN_TURN:
         return np.empty(0), np.empty(0)
+
+    def times_inertia(vector: Array) -> Array:
+        return J1 * vector + (J3 - J1) * np.sum(vector * e3, axis=1)[:, None] * e3
+
     arm = disc.arm_to_contact(e2, e3)
-    along = np.sum(motion.omega_world * e3, axis=1)[:, None] * e3
-    spin = J1 * motion.omega_world + (J3 - J1) * along
-    change = J1 * motion.alpha_world + (J3 - J1) * np.sum(motion.alpha_world * e3, axis=1)[:, None] * e3
-    moment = change + np.cross(motion.omega_world, spin)
+    moment = times_inertia(motion.alpha_world) + np.cross(motion.omega_world, times_inertia(motion.omega_world))
     left = np.sum(e1 * (moment - m * np.cross(arm, motion.acceleration)), axis=1)
     weight = m * np.sum(e1 * np.cross(arm, K), axis=1)
-    kinetic = 0.5 * m * np.sum(motion.velocity**2, axis=1) + 0.5 * np.sum(motion.omega_world * spin, axis=1)
-    energy = kinetic + m * motion.gravity * motion.position[:, 2]
-    gravity, energies = [], []
-    for start in range(0, len(motion) - size + 1, size):
-        rows = np.arange(start, start + size)[good[start : start + size]]
-        if len(rows) > size // 2:
-            gravity.append(float(np.sum(left[rows] * weight[rows]) / np.sum(weight[rows] ** 2)))
-            energies.append(float(np.mean(energy[rows])))
-    return np.array(gravity), np.array(energies)
+    energy = energy_quantities(motion, disc, motion.gravity)[:, TOTAL] + m * motion.gravity * disc.half_thickness
+    blocks = [rows[good[rows]] for rows in np.split(np.arange(len(good)), range(BLOCK, len(good), BLOCK))]
+    blocks = [rows for rows in blocks if len(rows) > BLOCK // 2]
+    gravity = [left[rows] @ weight[rows] / (weight[rows] @ weight[rows]) for rows in blocks]
+    return np.array(gravity), np.array([energy[rows].mean() for rows in blocks])
 
 
 def _robust(values: Array) -> float:
     return 1.4826 * float(np.median(np.abs(values - np.median(values))))
+
+
+def _evenly(n: int, most: int) -> Array:
+    """Numbers of at most `most` of n things, evenly over them."""
+    return np.linspace(0, n - 1, min(n, most)).round().astype(int)
+
+
+def _doubting(residual: Array) -> Array:
+    """Weights by which frames in the air, or in a hand, count less."""
+    return np.asarray(1 / (1 + (residual / (2 * np.median(np.abs(residual)) + 1e-9)) ** 2))
 
 
 def another_plane(trajectory: Trajectory, boards: Boards | None = None) -> tuple[Finding, ...]:
@@ -300,7 +286,7 @@ def another_plane(trajectory: Trajectory, boards: Boards | None = None) -> tuple
         return ()
     start = normal = e3.mean(axis=0) / np.linalg.norm(e3.mean(axis=0))  # it precesses about the normal
     weight = np.ones(len(centre))
-    for _ in range(10):  # lowest points as seen from the plane through the last ones; frames in the air count less
+    for _ in range(10):  # lowest points as seen from the plane through the last ones
         down = (e3 @ normal)[:, None] * e3 - normal
         rim = disc.radius * down / np.linalg.norm(down, axis=1, keepdims=True)
         lowest = centre + rim - disc.half_thickness * np.sign(e3 @ normal)[:, None] * e3
@@ -308,7 +294,7 @@ def another_plane(trajectory: Trajectory, boards: Boards | None = None) -> tuple
         normal = np.linalg.svd(np.sqrt(weight)[:, None] * (lowest - middle), full_matrices=False)[2][2]
         normal = normal * np.sign(normal @ start)
         gap = (lowest - middle) @ normal
-        weight = 1 / (1 + (gap / (2 * np.median(np.abs(gap)) + 1e-9)) ** 2)
+        weight = _doubting(gap)
     side, ahead = np.linalg.svd(normal[None])[2][1:] @ e3.T
     turned, precessed = np.arccos(np.clip(normal[2], -1, 1)), np.ptp(np.unwrap(np.arctan2(ahead, side)))
     rolls = precessed > MIN_ROUND and np.median(e3 @ normal) < np.cos(THETA_RANGE[0])
@@ -351,9 +337,8 @@ def rise_of_centre(trajectory: Trajectory) -> tuple[Finding, ...]:
     s = np.sin(q[:, 4])
     z = q[:, 2] - disc.half_thickness * np.cos(q[:, 4])
     slope, offset = np.polyfit(s, z, 1)
-    for _ in range(5):  # frames in the air, or a hand's, count less
-        left = np.abs(z - slope * s - offset)
-        slope, offset = np.polyfit(s, z, 1, w=1 / np.sqrt(1 + (left / (2 * np.median(left) + 1e-9)) ** 2))
+    for _ in range(5):
+        slope, offset = np.polyfit(s, z, 1, w=np.sqrt(_doubting(z - slope * s - offset)))
     scatter = _robust(z - slope * s - offset)
     sigma = scatter / (np.std(s) * np.sqrt(len(s) / BLOCK))
     ratio = float(slope / disc.radius)
@@ -397,7 +382,7 @@ def handedness(rig: StereoRig, disc: Disc) -> tuple[Finding, ...]:
 def scale_of_dots(trajectory: Trajectory, declared: Disc, square: float | None = None) -> tuple[Finding, ...]:
     """Distances of the dots, by both cameras alone, over those of their declared centres."""
     rows = np.flatnonzero(trajectory.measured)
-    rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), 50)).astype(int)] if len(rows) else rows
+    rows = rows[_evenly(len(rows), 50)]
     good = (trajectory.marker_status[rows] == MarkerStatus.MEASURED).all(axis=1)
     pixels = np.where(good[:, None, :, None], trajectory.markers_px[rows], np.nan)
     n, _, dots, _ = pixels.shape

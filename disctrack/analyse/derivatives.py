@@ -6,13 +6,14 @@ function of R_k, regular at every angle; at frame i its first two derivatives ar
 acceleration in world axes. Euler rates are then read off the angular velocity, never off the Euler angles.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.cameras.camera import N_RIG
 from calibration.kit.arrays import Array, Mask
 from calibration.kit.brief import Outline
 from disctrack.analyse.smoothing import (
@@ -28,6 +29,7 @@ from disctrack.disc import Disc
 from disctrack.errors import AnalysisError
 from disctrack.frames import (
     euler_from_rotation,
+    nodal_axes_world,
     rotation_from_quaternion,
     rotation_from_vector,
     skew,
@@ -35,6 +37,7 @@ from disctrack.frames import (
 )
 from disctrack.trajectory import FrameStatus, Trajectory
 
+K = np.array([0.0, 0.0, 1.0])
 STATE = (
     *(f"position_{axis}" for axis in "xyz"),
     *(f"rotation_{axis}" for axis in "xyz"),
@@ -45,7 +48,6 @@ STATE = (
 )
 N_STATE = len(STATE)  # 18
 CHANNEL_GROUPS = ((0, 1), (2,), (3, 4), (5,))  # horizontal, vertical, tilt, turn about the vertical: unlike spectra
-GROUP_OF_CHANNEL = np.array([0, 0, 1, 2, 2, 3])
 GROUP_NAMES = ("horizontal position", "height", "tilt", "turn about the vertical")
 FRAMES_AT_ONCE = 1024
 MIN_FRAMES = 12  # a line and a curvature per channel, and enough left over to judge the noise
@@ -55,16 +57,46 @@ KNOWN_FRACTION = 0.25  # of the process' own variance of the first derivative: a
 
 
 @dataclass(frozen=True, repr=False)
-class MeasuredMotion(Outline):
-    """Pose and its first two derivatives in every frame; NaN where the samples do not determine them."""
+class MotionState(Outline):
+    """Motion of the disc at n instants, world axes."""
 
-    time: Array  # (n,) [s]
-    position: Array  # (n, 3) centre, world axes [m]
+    position: Array  # (n, 3) centre [m]
     R_world_body: Array  # (n, 3, 3)
     velocity: Array  # (n, 3) of the centre [m/s]
     omega_world: Array  # (n, 3) [rad/s]
     acceleration: Array  # (n, 3) [m/s^2]
     alpha_world: Array  # (n, 3) d omega / dt [rad/s^2]
+
+    @property
+    def sine(self) -> Array:
+        """(n,) sin theta."""
+        return np.hypot(self.R_world_body[:, 0, 2], self.R_world_body[:, 1, 2])
+
+    def axes(self) -> tuple[Array, Array, Array]:
+        """e1, e2, e3 in world axes, (n, 3) each; e1 and e2 are NaN at theta = 0."""
+        e3 = self.R_world_body[..., 2]
+        s, c = self.sine, e3[:, 2]
+        psi = np.where(s > 0, np.arctan2(e3[:, 0], -e3[:, 1]), np.nan)
+        e1, e2, _ = nodal_axes_world(psi, np.arctan2(s, c))
+        return e1, e2, e3
+
+    def displaced(self, step: Array, rows: NDArray[np.int64]) -> MotionState:
+        """Some instants after a small change (18,) in the order of STATE."""
+        return MotionState(
+            self.position[rows] + step[0:3],
+            rotation_from_vector(step[3:6]) @ self.R_world_body[rows],
+            self.velocity[rows] + step[6:9],
+            self.omega_world[rows] + step[9:12],
+            self.acceleration[rows] + step[12:15],
+            self.alpha_world[rows] + step[15:18],
+        )
+
+
+@dataclass(frozen=True, repr=False)
+class MeasuredMotion(MotionState):
+    """Pose and its first two derivatives in every frame; NaN where the samples do not determine them."""
+
+    time: Array  # (n,) [s]
     covariance: Array  # (n, 18, 18) in the order of STATE, from the noise of the poses; rotation as in frames.py
     calibration_sensitivity: Array  # (n, 18, 30) d STATE / d RIG_PARAMETERS, common to all frames
     measured: Mask  # (n,) False where the frame was bridged
@@ -75,10 +107,15 @@ class MeasuredMotion(Outline):
     gravity: float  # [m/s^2]
     rig_covariance: Array  # (30, 30)
     systematic_covariance: Array  # (n, 6, 6) of the pose: what repeats beside the noise and is not the rig's
-    systematic_pace: Array  # (n,) [1/s] of its change: the dots' speed in the image over SYSTEMATIC_LENGTH
+    systematic_pace: float  # [1/s] of its change: the dots' speed in the image over SYSTEMATIC_LENGTH
 
     def __len__(self) -> int:
         return len(self.time)
+
+    @property
+    def tilt_sigma(self) -> Array:
+        """(n,) [rad] noise of the rotation about an axis, mean of the three."""
+        return np.sqrt(np.trace(self.covariance[:, 3:6, 3:6], axis1=1, axis2=2) / 3)
 
     @property
     def known(self) -> Mask:
@@ -90,7 +127,7 @@ class MeasuredMotion(Outline):
 
         of itself S, of its rate w^2 S, of that one's rate 3 w^4 S, and -w^2 S between the first and the last.
         """
-        S, w2 = self.systematic_covariance[frames], self.systematic_pace[frames, None, None] ** 2
+        S, w2 = self.systematic_covariance[frames], self.systematic_pace**2
         C = np.zeros((len(frames), N_STATE, N_STATE))
         for first, second, factor in ((0, 0, 1.0), (6, 6, w2), (12, 12, 3 * w2**2), (0, 12, -w2), (12, 0, -w2)):
             C[:, first : first + 6, second : second + 6] = factor * S
@@ -111,13 +148,14 @@ def differentiate(trajectory: Trajectory, breaks: Sequence[float] = ()) -> Measu
     time = np.asarray(trajectory.time, float)
     good = trajectory.measured & np.isfinite(trajectory.pose_covariance).all(axis=(1, 2))
     _require_samples(time, good)
-    interval = float(np.median(np.diff(time)))
+    interval, status = float(np.median(np.diff(time))), trajectory.frame_status
     samples = _Samples(
         ticks=(time - time[0]) / interval,
         position=np.where(good[:, None], trajectory.q[:, :3], 0.0),
         R=_bridged_rotations(time, trajectory.quaternion, good),
         covariance=np.where(good[:, None, None], trajectory.pose_covariance, 0.0),
-        sensitivity=_usable_sensitivity(trajectory, good),
+        # a pose from one camera depends on the rig in another way, and the jump must not be differentiated
+        sensitivity=_filled(trajectory.calibration_sensitivity, good & (status == FrameStatus.MEASURED), np.nan),
         good=good,
         part=_parts(time, good, breaks),
     )
@@ -146,30 +184,28 @@ def differentiate(trajectory: Trajectory, breaks: Sequence[float] = ()) -> Measu
         disc=trajectory.disc,
         gravity=trajectory.gravity,
         rig_covariance=trajectory.rig.covariance,
-        systematic_covariance=_filled(trajectory.systematic_covariance, good),
+        systematic_covariance=_filled(trajectory.systematic_covariance, good, 0.0),
         systematic_pace=_pace(trajectory),
     )
 
 
-def _filled(covariance: Array, good: NDArray[np.bool_]) -> Array:
-    """(n, 6, 6) with that of the nearest pose where there is none; 0 where no pose has one."""
-    known = np.flatnonzero(good & np.isfinite(covariance).all(axis=(1, 2)))
+def _filled(matrices: Array, good: Mask, otherwise: float) -> Array:
+    """(n, k, l) with that of the nearest good frame where there is none; a number where none is known."""
+    known = np.flatnonzero(good & np.isfinite(matrices).all(axis=(1, 2)))
     if not known.size:
-        return np.zeros_like(covariance)
-    after = np.clip(np.searchsorted(known, np.arange(len(good))), 0, len(known) - 1)
-    return np.asarray(covariance[known[after]])
+        return np.full_like(matrices, otherwise)
+    nearest = np.rint(np.interp(np.arange(len(good)), known, np.arange(len(known))))
+    return np.asarray(matrices[known[nearest.astype(int)]])
 
 
-def _pace(trajectory: Trajectory) -> Array:
-    """(n,) [1/s] at which errors that depend on the place in the image change, the dots' median over the recording."""
-    px, n = trajectory.markers_px, len(trajectory)
+def _pace(trajectory: Trajectory) -> float:
+    """[1/s] at which errors that depend on the place in the image change, the dots' rms over the recording."""
     with np.errstate(invalid="ignore"):
-        step = np.linalg.norm(np.diff(px, axis=0), axis=-1) / np.diff(trajectory.time)[:, None, None]
-    seen = np.isfinite(step)
-    if not seen.any():
-        return np.zeros(n)
+        step = np.diff(trajectory.markers_px, axis=0) / np.diff(trajectory.time)[:, None, None, None]
+    if not np.isfinite(step).any():
+        return 0.0
     length = SYSTEMATIC_LENGTH * max(max(camera.image_size) for camera in trajectory.rig.cameras)
-    return np.full(n, float(np.sqrt(np.mean(step[seen] ** 2))) / length)
+    return float(np.sqrt(2 * np.nanmean(step**2))) / length
 
 
 @dataclass(frozen=True)
@@ -206,12 +242,12 @@ def _require_samples(time: Array, good: Mask) -> None:
 
 def _parts(time: Array, good: Mask, breaks: Sequence[float]) -> NDArray[np.int64]:
     """Number of the stretch (n,) that each frame belongs to."""
-    kept: list[float] = []
+    part = np.zeros(len(time), np.int64)
     for instant in sorted(breaks):
-        since_last = good & (time < instant) & (time >= (kept[-1] if kept else -np.inf))
-        if min(since_last.sum(), (good & (time >= instant)).sum()) >= MIN_FRAMES:
-            kept.append(instant)
-    return np.searchsorted(np.array(kept), time, side="right")
+        after, last = time >= instant, part == part.max()
+        if min((good & last & ~after).sum(), (good & after).sum()) >= MIN_FRAMES:
+            part[after] += 1
+    return part
 
 
 def _bridged_rotations(time: Array, quaternion: Array, good: Mask) -> Array:
@@ -224,22 +260,6 @@ def _bridged_rotations(time: Array, quaternion: Array, good: Mask) -> Array:
         arc = Slerp(time[good], Rotation.from_matrix(R[good]))
         R[missing] = arc(np.clip(time[missing], time[good][0], time[good][-1])).as_matrix()
     return R
-
-
-def _usable_sensitivity(trajectory: Trajectory, good: Mask) -> Array:
-    """Sensitivity (n, 6, 30) to the rig; where a camera was missing, that of the nearest complete frame.
-
-    A pose from one camera depends on the rig in another way, and the jump must not be differentiated.
-    """
-    S = trajectory.calibration_sensitivity
-    complete = good & np.isfinite(S).all(axis=(1, 2)) & (trajectory.frame_status == FrameStatus.MEASURED)
-    if not complete.any():
-        return np.full((len(good), 6, N_RIG), np.nan)
-    frames = np.flatnonzero(complete)
-    after = np.clip(np.searchsorted(frames, np.arange(len(good))), 0, len(frames) - 1)
-    before = np.clip(after - 1, 0, None)
-    nearer_before = np.arange(len(good)) - frames[before] < frames[after] - np.arange(len(good))
-    return S[frames[np.where(nearer_before, before, after)]]
 
 
 def _fit_groups(samples: _Samples) -> tuple[Process, ...]:
@@ -305,6 +325,7 @@ def _smoothed(samples: _Samples, processes: tuple[Process, ...]) -> tuple[Array,
     for group, process in zip(CHANNEL_GROUPS, processes, strict=True):
         scale[list(group)] = np.sqrt(process.noise_scale)
     noise = samples.covariance * np.outer(scale, scale)
+    of_channel = np.repeat(range(len(CHANNEL_GROUPS)), [len(group) for group in CHANNEL_GROUPS])
     out = (
         np.empty((n, 3, 6)),
         np.empty((n, 3, 3)),
@@ -316,7 +337,7 @@ def _smoothed(samples: _Samples, processes: tuple[Process, ...]) -> tuple[Array,
         weights, prior, unknown = _weights_and_prior(samples, processes, half, rows)
         for k in range(0, len(rows), FRAMES_AT_ONCE // 8):
             some = slice(k, k + FRAMES_AT_ONCE // 8)
-            parts = _smoothed_rows(samples, noise, rows[some], weights[some][:, GROUP_OF_CHANNEL], half)
+            parts = _smoothed_rows(samples, noise, rows[some], weights[some][:, of_channel], half)
             for whole, part in zip(out, parts, strict=True):
                 whole[rows[some]] = part
         for channel in range(6):
@@ -357,17 +378,14 @@ def _smoothed_rows(
     noise_window = gain @ noise[window] @ gain.swapaxes(-1, -2)
     data = np.concatenate([samples.position[window], s], axis=-1)
     state = np.einsum("kcow,kwc->koc", weights, data)
-    channel = np.repeat(np.arange(6), 3)
-    by_order = np.arange(18).reshape(6, 3).T.ravel()  # to order-major, as STATE
-    covariance = np.empty((len(rows), 18, 18))
+    covariance = np.empty((len(rows), 3, 6, 3, 6))  # order and channel, as STATE
     for c in range(6):
         for d in range(c, 6):
-            a, b = channel == c, channel == d
             block = (weights[:, c] * noise_window[..., c, d][:, None]) @ weights[:, d].swapaxes(1, 2)
-            covariance[:, np.ix_(a, b)[0], np.ix_(a, b)[1]] = block
-            covariance[:, np.ix_(b, a)[0], np.ix_(b, a)[1]] = block.swapaxes(1, 2)
-    sensitivity = np.concatenate([weights[:, c] @ samples.sensitivity[window, c] for c in range(6)], axis=1)
-    return state, R, covariance[:, by_order][:, :, by_order], sensitivity[:, by_order]
+            covariance[:, :, c, :, d] = block
+            covariance[:, :, d, :, c] = block.swapaxes(1, 2)
+    sensitivity = np.stack([weights[:, c] @ samples.sensitivity[window, c] for c in range(6)], axis=2)
+    return state, R, covariance.reshape(-1, 18, 18), sensitivity.reshape(len(rows), 18, -1)
 
 
 def _rates_of_turned_frame(sensitivity: Array, omega_world: Array, alpha_world: Array) -> None:

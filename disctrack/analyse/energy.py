@@ -4,16 +4,14 @@ Equation (2.10) of Ma et al. 2014 with the datum at rest: m g (z - h) instead of
 the end is not possible.
 """
 
-import contextlib
 from dataclasses import dataclass
 
 import numpy as np
 
 from calibration.kit.arrays import Array
 from calibration.kit.brief import Outline
-from disctrack.analyse.contact import K
-from disctrack.analyse.derivatives import MeasuredMotion
-from disctrack.analyse.propagation import DerivedSeries, MotionState, Propagated, propagate
+from disctrack.analyse.derivatives import K, MeasuredMotion, MotionState
+from disctrack.analyse.propagation import DerivedSeries, Propagated, propagate
 from disctrack.disc import Disc, precession_rate
 from disctrack.errors import ModelError
 
@@ -29,7 +27,7 @@ ENERGY = (
     ("precession_level", "s-2", "psidot^2 sin theta; 4 g / r in slow steady precession of a thin disc"),
 )
 
-TOTAL = 5  # column of the mechanical energy
+TOTAL, LEVEL = 5, 8  # columns
 
 
 @dataclass(frozen=True, repr=False)
@@ -70,47 +68,40 @@ def energy_quantities(state: MotionState, disc: Disc, gravity: float) -> Array:
 def analyse_energy(motion: MeasuredMotion) -> Energy:
     """Energies with both uncertainties, loss over the recording, and the adiabatic level."""
     found = propagate(motion, lambda state: energy_quantities(state, motion.disc, motion.gravity))
-    loss, noise, common = _loss(found, TOTAL)
-    ratio, ratio_sigma = _level_ratio(motion, found.value[:, 8])
-    theta = motion.euler[np.isfinite(found.value[:, 8]), 1]
-    steady = float("nan")
-    if theta.size:
-        typical = float(np.median(theta))
-        with contextlib.suppress(
-            ModelError
-        ):  # a disc that stands nearly upright does not precess with its centre at rest
-            steady = precession_rate(typical, motion.disc, motion.gravity)[0] ** 2 * np.sin(typical)
-            steady = float(steady / (4 * motion.gravity / motion.disc.radius))
-    return Energy(found.series(ENERGY), found, loss, noise, common, ratio, ratio_sigma, steady)
+    known = np.isfinite(found.value[:, LEVEL])
+    try:
+        typical = float(np.median(motion.euler[known, 1])) if known.any() else float("nan")
+        steady = precession_rate(typical, motion.disc, motion.gravity)[0] ** 2 * np.sin(typical)
+    except ModelError:  # a disc that stands nearly upright does not precess with its centre at rest
+        steady = float("nan")
+    over = 4 * motion.gravity / motion.disc.radius
+    ratios = _level_ratio(motion, found.value[:, LEVEL] / over)
+    return Energy(found.series(ENERGY), found, *_loss(found), *ratios, float(steady / over))
 
 
-def _loss(found: Propagated, column: int) -> tuple[float, float, float]:
-    known = np.flatnonzero(np.isfinite(found.value[:, column]))
+def _loss(found: Propagated) -> tuple[float, float, float]:
+    """Energy lost between the first and the last known frame, with its two sigmas [J]."""
+    known, column = np.flatnonzero(np.isfinite(found.value[:, TOTAL])), slice(TOTAL, TOTAL + 1)
     if known.size < 2:
         return (float("nan"),) * 3
-    first, last = known[0], known[-1]
-    ends, this = known[[0, -1]], slice(column, column + 1)
-    noise = found.covariance_at(ends, this).sum()
-    before, after = found.sensitivity_at(ends, this)[:, 0]
-    difference = after - before
-    common = float(difference @ found.rig_covariance @ difference) + found.systematic_covariance_at(ends, this).sum()
-    return (
-        float(found.value[first, column] - found.value[last, column]),
-        float(np.sqrt(noise)),
-        float(np.sqrt(max(0.0, common))),
-    )
+    ends, motion = known[[0, -1]], found.motion
+    J = found.jacobian[ends, TOTAL]
+    before, after = np.einsum("ns,nsr->nr", J, motion.calibration_sensitivity[ends])
+    common = (after - before) @ motion.rig_covariance @ (after - before)
+    common += np.einsum("ns,nst,nt->", J, motion.systematic_at(ends), J)
+    noise = found.covariance_at(ends, column).sum()
+    first, last = found.value[ends, TOTAL]
+    return float(first - last), float(np.sqrt(noise)), float(np.sqrt(max(0.0, common)))
 
 
-def _level_ratio(motion: MeasuredMotion, level: Array) -> tuple[float, float]:
-    """Mean of level / (4 g / r) weighted evenly over the turns of precession, and its scatter per turn."""
-    known = np.flatnonzero(np.isfinite(level))
+def _level_ratio(motion: MeasuredMotion, ratio: Array) -> tuple[float, float]:
+    """Mean of a ratio (n,), weighted evenly over the turns of precession, and its scatter per turn."""
+    known = np.flatnonzero(np.isfinite(ratio))
     if known.size < 2:
         return float("nan"), float("nan")
-    ratio = level[known] / (4 * motion.gravity / motion.disc.radius)
+    ratio = ratio[known]
     turns = np.floor((motion.euler[known, 0] - motion.euler[known[0], 0]) / (2 * np.pi)).astype(int)
-    turns = turns - turns.min()
-    counts = np.bincount(turns)
-    means = np.bincount(turns, ratio)[counts > 0] / counts[counts > 0]
+    means = np.array([ratio[turns == turn].mean() for turn in np.unique(turns)])
     if len(means) < 2:
         return float(ratio.mean()), float(ratio.std())
     return float(means.mean()), float(means.std(ddof=1) / np.sqrt(len(means)))

@@ -1,192 +1,183 @@
 """Figures of an analysis in the manner of the paper's figures 4 to 16, drawn from this recording."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from calibration.kit.arrays import Array
 from disctrack.analyse.analysis import Analysis
-from disctrack.analyse.power_laws import MODEL_EXPONENTS, Exponent
-from disctrack.analyse.propagation import DerivedSeries
+from disctrack.analyse.power_laws import MODEL_EXPONENTS
 from disctrack.disc import MA_2014
-from disctrack.report.figures import NO_TITLE, Drawn, dress, panels
-from disctrack.report.palette import AMBER, BLUE, GREEN, INK, MUTED, RED
+from disctrack.frames import CAMERAS
+from disctrack.report.figures import Curve, Drawn, chart, dress
+from disctrack.report.palette import AMBER, BLUE, COLOURS, GREEN, INK, MUTED, RED
 
-BAND = 3.0  # sigmas shown as a band
-INSET_DURATION = 0.3  # [s] last stage, as in the paper's figures 4 and 10
-MIN_INSET_SHARE = 2.5  # the inset is drawn when the recording is this many times longer
+LAST_STAGE = 0.3  # [s] shown again in an inset, as in the paper's figures 4 and 10
+TIME, X, Y = "time (s)", "x (mm)", "y (mm)"
+SQUARE = (5.4, 4.8)  # [in] of what lies in a plane
 
 
 def all_figures(analysis: Analysis) -> tuple[Drawn, ...]:
     """Every figure that this recording has something to show in."""
-    makers: tuple[Callable[[Analysis], Drawn | None], ...] = (
-        nutation_angle, centre_path, centre_and_contact_path, nutation_count, slip_speed, contact_locus,
-        precession_rate, axial_rates, adiabatic_level, energy_against_adiabatic, energy_parts, contact_forces,
-    )  # fmt: skip
-    drawn = [make(analysis) for make in makers]
-    drawn += [*power_laws(analysis), exponents_against_window(analysis), pose_quality(analysis)]
-    return tuple(figure for figure in drawn if figure is not None)
+    drawn = [pose_quality(analysis), *path_of_centre(analysis)]
+    if np.isfinite(analysis.series("psidot").value).sum() > 1:  # else no direction of the tilt is known anywhere
+        drawn += [path_of_contact(analysis), *rates(analysis), *contact(analysis), *energy(analysis)]
+    drawn += [*nutation_count(analysis), *contact_locus(analysis)]
+    drawn += [*power_laws(analysis), *exponents_against_window(analysis)]
+    return tuple(sorted(drawn, key=lambda figure: figure.name))
 
 
-def _axes(width: float = 7.2, height: float = 3.6) -> tuple[Figure, Axes]:
-    figure, (axes,) = panels(width, height, margins=NO_TITLE)
-    return figure, axes
-
-
-def _band(axes: Axes, time: Array, series: DerivedSeries, scale: float, colour: str, label: str) -> None:
-    """Line with its band of BAND sigmas, noise and calibration together."""
+def _series(analysis: Analysis, name: str, colour: str, label: str = "", scale: float = 1.0) -> Curve:
+    """A derived quantity over time with its band, noise and calibration together."""
+    series = analysis.series(name)
     sigma = np.hypot(series.sigma, series.sigma_calibration)
-    low, high = series.value - BAND * sigma, series.value + BAND * sigma
-    axes.fill_between(time, scale * low, scale * high, color=colour, alpha=0.25, linewidth=0)
-    axes.plot(time, scale * series.value, color=colour, linewidth=1.1, label=label)
+    return Curve(analysis.motion.time, scale * series.value, colour, label, sigma=scale * sigma)
 
 
-def _inset(axes: Axes, time: Array, value: Array, bounds: tuple[float, float, float, float]) -> None:
-    known = np.flatnonzero(np.isfinite(value))
-    if known.size < 10 or np.ptp(time[known]) < MIN_INSET_SHARE * INSET_DURATION:
+def _level(time: Array, value: float, colour: str = MUTED, label: str = "", style: str = "-") -> Curve:
+    """A level to compare with."""
+    return Curve(time[[0, -1]], np.full(2, value), colour, label, style)
+
+
+def _inset(axes: Axes, curve: Curve, bounds: tuple[float, float, float, float]) -> None:
+    """The last stage once more, where it is a small part of the recording."""
+    known = np.flatnonzero(np.isfinite(curve.y))
+    if known.size < 10 or np.ptp(curve.x[known]) < 2.5 * LAST_STAGE:
         return
-    last = known[time[known] >= time[known[-1]] - INSET_DURATION]
+    last = known[curve.x[known] >= curve.x[known[-1]] - LAST_STAGE]
     inset = axes.inset_axes(bounds)
     dress(inset)
-    inset.plot(time[last], value[last], color=BLUE, linewidth=1.0)
+    inset.plot(curve.x[last], curve.y[last], color=BLUE, linewidth=1.0)
     inset.tick_params(labelsize=7)
-    inset.set_title(f"last {INSET_DURATION:g} s", fontsize=8, color=MUTED)
+    inset.set_title(f"last {LAST_STAGE:g} s", fontsize=8, color=MUTED)
 
 
-def _nothing(value: Array) -> bool:
-    return int(np.isfinite(value).sum()) < 2
+def pose_quality(analysis: Analysis) -> Drawn:
+    """Quality per frame: reprojection error and sigma of the measured poses."""
+    trajectory, time = analysis.trajectory, analysis.trajectory.time
+    rms = trajectory.reprojection_rms_px.T
+    sigma = np.sqrt(np.diagonal(trajectory.pose_covariance, axis1=1, axis2=2)).T
+    axis = tuple(zip("xyz", (BLUE, RED, GREEN), strict=True))
+    figure = chart(
+        TIME,
+        ("reprojection\nrms (px)", [Curve(time, rms[i], COLOURS[name], name, ".") for i, name in enumerate(CAMERAS)]),
+        ("σ of one\npose (µm)", [Curve(time, 1e6 * s, c, name) for s, (name, c) in zip(sigma[:3], axis, strict=True)]),
+        ("σ of one\npose (mdeg)", [Curve(time, 1e3 * np.degrees(s), c, f"about {name}")
+                                   for s, (name, c) in zip(sigma[3:], axis, strict=True)]),
+        size=(7.2, 5.4),
+    )  # fmt: skip
+    for axes in figure.axes:
+        axes.set_ylim(bottom=0)
+    caption = "Before smoothing: misfit of the dots, and the noise of each pose along and about the table's axes."
+    return Drawn("03_pose_quality", "Quality per frame", caption, figure)
 
 
-def nutation_angle(analysis: Analysis) -> Drawn | None:
-    """Paper's figure 4."""
-    motion = analysis.motion
+def path_of_centre(analysis: Analysis) -> Iterator[Drawn]:
+    """Paper's figures 4 and 5: nutation, and the centre from above."""
+    motion, x = analysis.motion, 1e3 * analysis.motion.position
+    known = np.flatnonzero(motion.known)
     theta = np.degrees(motion.euler[:, 1])
-    if _nothing(theta):
-        return None
-    figure, axes = _axes()
-    axes.plot(motion.time, theta, color=BLUE, linewidth=1.1)
-    axes.set(xlabel="time (s)", ylabel="nutation θ (deg)")
-    top = float(np.nanmax(theta))
-    axes.set_ylim(0, 1.25 * top)
-    _inset(axes, motion.time, theta, (0.58, 0.56, 0.4, 0.36))
-    sigma = np.degrees(np.sqrt(np.trace(motion.covariance[:, 3:6, 3:6], axis1=1, axis2=2) / 3))
+    sigma = np.degrees(motion.tilt_sigma)
+    curve = Curve(motion.time, theta, BLUE)
+    figure = chart(TIME, ("nutation θ (deg)", [curve]))
+    figure.axes[0].set_ylim(0, 1.25 * float(np.nanmax(theta)))
+    _inset(figure.axes[0], curve, (0.58, 0.56, 0.4, 0.36))
     caption = (
-        f"From {theta[np.isfinite(theta)][0]:.3f} to {theta[np.isfinite(theta)][-1]:.3f} deg; the noise is "
-        f"{1e3 * np.nanmedian(sigma):.2f} mdeg after smoothing, thinner than the line."
+        f"From {theta[known[0]]:.3f} to {theta[known[-1]]:.3f} deg; the noise is {1e3 * np.nanmedian(sigma):.2f} mdeg "
+        "after smoothing, thinner than the line."
     )
-    return Drawn("04_nutation_angle", "Nutation angle", caption, figure)
+    yield Drawn("04_nutation_angle", "Nutation angle", caption, figure)
+    first, last = known[:1], known[-1:]
+    path = Curve(x[:, 0], x[:, 1], RED)
+    start = Curve(x[first, 0], x[first, 1], GREEN, "start", "o")
+    end = Curve(x[last, 0], x[last, 1], INK, "end", "s")
+    figure = chart(X, (Y, [path, start, end]), size=SQUARE, equal=True)
+    yield Drawn("05_centre_path", "Path of the centre", "Centre of mass seen from above, in the table's axes.", figure)
 
 
-def centre_path(analysis: Analysis) -> Drawn | None:
-    """Paper's figure 5."""
-    x = 1e3 * analysis.motion.position
-    if _nothing(x[:, 0]):
-        return None
-    figure, axes = _axes(5.4, 4.6)
-    axes.plot(x[:, 0], x[:, 1], color=RED, linewidth=1.0)
-    _ends(axes, x)
-    axes.set(xlabel="x (mm)", ylabel="y (mm)")
-    axes.set_aspect("equal", adjustable="datalim")
-    return Drawn("05_centre_path", "Path of the centre", "Centre of mass seen from above, in the table's axes.", figure)
-
-
-def _ends(axes: Axes, x: Array) -> None:
-    known = np.flatnonzero(np.isfinite(x[:, 0]))
-    axes.plot(*x[known[0], :2], "o", color=GREEN, markersize=6, label="start")
-    axes.plot(*x[known[-1], :2], "s", color=INK, markersize=5, label="end")
-    axes.legend(frameon=False, fontsize=9)
-
-
-def centre_and_contact_path(analysis: Analysis) -> Drawn | None:
-    """Paper's figure 6."""
+def path_of_contact(analysis: Analysis) -> Drawn:
+    """Paper's figure 6: the first 0.65 s of centre and contact, from above."""
     motion = analysis.motion
     contact = 1e3 * np.column_stack([analysis.series(name).value for name in ("contact_x", "contact_y")])
-    centre = 1e3 * motion.position
     known = np.flatnonzero(np.isfinite(contact[:, 0]))
-    if known.size < 2:
-        return None
     part = known[motion.time[known] <= motion.time[known[0]] + 0.65]
-    figure, axes = _axes(5.4, 4.8)
-    axes.plot(contact[part, 0], contact[part, 1], ":", color=BLUE, linewidth=1.4, label="contact point")
-    axes.plot(centre[part, 0], centre[part, 1], color=RED, linewidth=1.2, label="centre")
+    path = Curve(contact[part, 0], contact[part, 1], BLUE, "contact point", ":")
+    centre = Curve(1e3 * motion.position[part, 0], 1e3 * motion.position[part, 1], RED, "centre")
+    figure = chart(X, (Y, [path, centre]), size=SQUARE, equal=True)
+    (axes,) = figure.axes
     theta = motion.euler[part, 1]
-    lows = np.flatnonzero((theta[1:-1] < theta[:-2]) & (theta[1:-1] <= theta[2:])) + 1
-    if len(lows) <= 12:  # more would hide the path
-        for i, low in enumerate(lows):
-            axes.annotate(
-                f"P{i + 1}", contact[part[low]], fontsize=8, color=INK, xytext=(4, 4), textcoords="offset points"
-            )
-            axes.plot(*contact[part[low]], ".", color=INK, markersize=6)
-    axes.set(xlabel="x (mm)", ylabel="y (mm)")
-    axes.set_aspect("equal", adjustable="datalim")
+    lows = part[np.flatnonzero((theta[1:-1] < theta[:-2]) & (theta[1:-1] <= theta[2:])) + 1]
+    lows = lows if len(lows) <= 12 else lows[:0]  # more would hide the path
+    for i, low in enumerate(lows):
+        axes.annotate(f"P{i + 1}", contact[low], fontsize=8, color=INK, xytext=(4, 4), textcoords="offset points")
+        axes.plot(*contact[low], ".", color=INK, markersize=6)
     axes.legend(frameon=False, fontsize=9, loc="upper left", bbox_to_anchor=(0.0, 1.02), ncols=2, borderaxespad=0.0)
-    marks = "; P marks the minima of the nutation." if 0 < len(lows) <= 12 else "."
+    marks = "; P marks the minima of the nutation." if len(lows) else "."
     caption = f"Seen from above, {motion.time[part[0]]:.3f} to {motion.time[part[-1]]:.3f} s{marks}"
     return Drawn("06_centre_and_contact", "Centre and contact point", caption, figure)
 
 
-def nutation_count(analysis: Analysis) -> Drawn | None:
+def nutation_count(analysis: Analysis) -> Iterator[Drawn]:
     """Paper's figure 7."""
     count = analysis.scaling.count
     if len(count.count) < 4:
-        return None
-    figure, axes = _axes(5.4, 3.8)
-    axes.plot(count.turns, count.count, "o", color=BLUE, markersize=4, label="maxima of θ")
+        return
     offset = float(np.mean(count.count - count.slope * count.turns))
-    ends = np.array([count.turns[0], count.turns[-1]])
-    axes.plot(ends, offset + count.slope * ends, color=RED, linewidth=1.2, label=f"slope {count.slope:.4f}")
-    axes.set(xlabel="turns of precession", ylabel="nutation oscillations")
-    axes.legend(frameon=False, fontsize=9)
+    ends = count.turns[[0, -1]]
+    maxima = Curve(count.turns, count.count, BLUE, "maxima of θ", "o")
+    line = Curve(ends, offset + count.slope * ends, RED, f"slope {count.slope:.4f}")
     low, high = sorted(count.expected)
     caption = (
         f"Maxima of θ against turns of precession: slope {count.slope:.4f} ± {count.sigma:.4f}. Small "
         f"oscillations of this disc give {low:.4f} to {high:.4f} over this range of θ, a thin disc at small θ "
-        f"{count.thin_disc:.4f}; the paper counted 0.7915."
+        f"{np.sqrt(0.6):.4f}; the paper counted 0.7915."
     )
-    return Drawn("07_nutation_count", "Nutation against precession", caption, figure)
+    figure = chart("turns of precession", ("nutation oscillations", [maxima, line]), size=SQUARE)
+    yield Drawn("07_nutation_count", "Nutation against precession", caption, figure)
 
 
-def slip_speed(analysis: Analysis) -> Drawn | None:
-    """Paper's figure 8, with a confidence in place of a threshold by eye."""
+def contact(analysis: Analysis) -> Iterator[Drawn]:
+    """Slip with a confidence in place of the threshold by eye of the paper's figure 8, and the forces of the table."""
     time, onset = analysis.motion.time, analysis.contact.onset
     n, m = analysis.series("slip_n"), analysis.series("slip_m")
-    speed = 1e3 * np.hypot(n.value, m.value)
-    if _nothing(speed):
-        return None
     sigma = np.sqrt(n.sigma**2 + m.sigma**2 + n.sigma_calibration**2 + m.sigma_calibration**2)
-    figure, axes = _axes()
-    axes.plot(time, speed, color=BLUE, linewidth=0.9, label="speed of the material point")
-    axes.plot(time, BAND * 1e3 * sigma, color=RED, linestyle="--", linewidth=1.1, label="3 σ of it")
-    if np.isfinite(onset.time) and np.isfinite(onset.high) and onset.high > onset.low:
-        axes.axvspan(onset.low, onset.high, color=AMBER, alpha=0.35, label="onset of rolling, 95 %")
-    axes.set(xlabel="time (s)", ylabel="slip (mm/s)")
+    speed = Curve(time, 1e3 * np.hypot(n.value, m.value), BLUE, "speed of the material point")
+    figure = chart(TIME, ("slip (mm/s)", [speed, Curve(time, 3e3 * sigma, RED, "3 σ of it", "--")]))
+    (axes,) = figure.axes
     axes.set_yscale("log")
-    axes.legend(frameon=False, fontsize=9, loc="upper right")
+    if onset.high > onset.low:
+        axes.axvspan(onset.low, onset.high, color=AMBER, alpha=0.35, label="onset of rolling, 95 %")
+        axes.legend(frameon=False, fontsize=9, loc="upper right")
     path = f"{1e3 * onset.slip_distance:.4f} ± {1e3 * onset.slip_distance_sigma:.4f} mm"
     caption = (
         f"Speed of the disc's own point at the contact. The disc {onset.verdict} (probability of rolling at the end: "
         f"{onset.probability:.3f}){f'; path of slip {path}' if onset.slip_distance > 0 else ''}."
     )
-    return Drawn("08_slip", "Slip at the contact", caption, figure)
+    yield Drawn("08_slip", "Slip at the contact", caption, figure)
+    forces = (("force_z", INK, "vertical"), ("force_n", BLUE, "along n0"), ("force_m", RED, "along m0"))
+    needed = _series(analysis, "friction_needed", BLUE)
+    rows = ("force (N)", [_series(analysis, *force) for force in forces]), ("friction needed", [needed])
+    figure = chart(TIME, *rows, size=(7.2, 5.0), heights=(3, 2))
+    figure.axes[1].set_ylim(bottom=0)
+    caption = (
+        "Force of the table on the disc along n0, m0 and k from Newton's law, and the friction coefficient that it "
+        f"needs: at most {np.nanmax(needed.y):.3f}, {np.nanmedian(needed.y):.3f} in the median."
+    )
+    yield Drawn("08b_contact_forces", "Contact forces", caption, figure)
 
 
-def contact_locus(analysis: Analysis) -> Drawn | None:
+def contact_locus(analysis: Analysis) -> Iterator[Drawn]:
     """Paper's figure 9."""
     circle, time = analysis.contact.circle, analysis.motion.time
     if not np.isfinite(circle.radius):
-        return None
+        return
     part = (time >= circle.start) & (time <= circle.end)
-    figure, axes = _axes(5.0, 4.8)
     x, y = (1e3 * analysis.series(name).value[part] for name in ("contact_x", "contact_y"))
-    axes.plot(x, y, ".", color=BLUE, markersize=3, label="contact")
     angle = np.linspace(0, 2 * np.pi, 361)
-    x, y = (1e3 * (c + circle.radius * f(angle)) for c, f in zip(circle.centre, (np.cos, np.sin), strict=True))
-    axes.plot(x, y, color=RED, linewidth=0.9, label=f"radius {1e3 * circle.radius:.4f} mm")
-    axes.set(xlabel="x (mm)", ylabel="y (mm)")
-    axes.set_aspect("equal", adjustable="datalim")
-    axes.legend(frameon=False, fontsize=9)
+    around = 1e3 * (circle.centre + circle.radius * np.column_stack([np.cos(angle), np.sin(angle)]))
+    fitted = Curve(around[:, 0], around[:, 1], RED, f"radius {1e3 * circle.radius:.4f} mm")
+    figure = chart(X, (Y, [Curve(x, y, BLUE, "contact", "."), fitted]), size=SQUARE, equal=True)
     same_disc = np.isclose(analysis.trajectory.disc.radius, MA_2014.radius)
     caption = (
         f"Contact point from {circle.start:.3f} to {circle.end:.3f} s with the fitted circle: radius "
@@ -195,85 +186,48 @@ def contact_locus(analysis: Analysis) -> Drawn | None:
         f"average; the locus departs from the circle by {1e3 * circle.rms:.3f} mm rms."
         + (" Ma et al. (2014) found 37.286 mm with a disc of this radius." if same_disc else "")
     )
-    return Drawn("09_contact_locus", "Locus of the contact", caption, figure)
+    yield Drawn("09_contact_locus", "Locus of the contact", caption, figure)
 
 
-def precession_rate(analysis: Analysis) -> Drawn | None:
-    """Paper's figure 10."""
-    series, time = analysis.series("psidot"), analysis.motion.time
-    if _nothing(series.value):
-        return None
-    figure, axes = _axes()
-    _band(axes, time, series, 1.0, BLUE, "precession")
-    axes.set(xlabel="time (s)", ylabel="precession rate (rad/s)")
-    _inset(axes, time, series.value, (0.08, 0.52, 0.42, 0.38))
+def rates(analysis: Analysis) -> Iterator[Drawn]:
+    """Paper's figures 10 to 12: precession, rates about the axis and the vertical, and the adiabatic condition."""
+    time, sigma = analysis.motion.time, analysis.series("psidot").sigma
+    psidot = _series(analysis, "psidot", BLUE)
+    figure = chart(TIME, ("precession rate (rad/s)", [psidot]))
+    _inset(figure.axes[0], psidot, (0.08, 0.52, 0.42, 0.38))
     caption = (
-        f"Read off the angular velocity, band ± 3 σ. σ grows as 1 / sin θ: from "
-        f"{np.nanmin(series.sigma):.3f} to {np.nanmax(series.sigma):.3f} rad/s."
+        f"Read off the angular velocity, band ± 3 σ. σ grows as 1 / sin θ: from {np.nanmin(sigma):.3f} to "
+        f"{np.nanmax(sigma):.3f} rad/s."
     )
-    return Drawn("10_precession_rate", "Precession rate", caption, figure)
-
-
-def axial_rates(analysis: Analysis) -> Drawn | None:
-    """Paper's figure 11."""
-    time = analysis.motion.time
-    w3, wz = analysis.series("omega_3"), analysis.series("omega_z")
-    if _nothing(w3.value):
-        return None
-    figure, (upper, lower) = panels(7.2, 4.4, 2, margins=NO_TITLE, sharex=True)
-    for axes, series, name in ((upper, w3, "ω along e3 (rad/s)"), (lower, wz, "ω along k (rad/s)")):
-        _band(axes, time, series, 1.0, BLUE, name)
-        axes.axhline(0, color=MUTED, linewidth=0.7)
-        axes.set_ylabel(name)
-    lower.set_xlabel("time (s)")
+    yield Drawn("10_precession_rate", "Precession rate", caption, figure)
+    names = ("omega_3", "ω along e3 (rad/s)"), ("omega_z", "ω along k (rad/s)")
+    rows = [(label, [_series(analysis, name, BLUE), _level(time, 0.0)]) for name, label in names]
     caption = "Angular velocity along the disc's axis (above) and along the vertical (below), band ± 3 σ."
-    return Drawn("11_axial_rates", "Rotation about the axis and the vertical", caption, figure)
-
-
-def adiabatic_level(analysis: Analysis) -> Drawn | None:
-    """Paper's figure 12."""
-    series, motion = analysis.series("precession_level"), analysis.motion
-    if _nothing(series.value):
-        return None
-    figure, axes = _axes()
-    _band(axes, motion.time, series, 1.0, BLUE, "ψ̇² sin θ")
-    axes.axhline(4 * motion.gravity / motion.disc.radius, color=RED, linewidth=1.2, linestyle="--", label="4 g / r")
-    axes.set(xlabel="time (s)", ylabel="ψ̇² sin θ (1/s²)")
-    axes.legend(frameon=False, fontsize=9)
-    energy = analysis.energy
+    figure = chart(TIME, *rows, size=(7.2, 4.4))
+    yield Drawn("11_axial_rates", "Rotation about the axis and the vertical", caption, figure)
+    level = _level(time, 4 * analysis.motion.gravity / analysis.motion.disc.radius, RED, "4 g / r", "--")
+    figure = chart(TIME, ("ψ̇² sin θ (1/s²)", [_series(analysis, "precession_level", BLUE, "ψ̇² sin θ"), level]))
+    found = analysis.energy
     caption = (
-        f"Adiabatic check: averaged over the turns of precession, ψ̇² sin θ is {energy.level_ratio:.4f} ± "
-        f"{energy.level_ratio_sigma:.4f} times 4 g / r. It is 1 for a thin disc at small θ; steady precession "
-        f"of this disc has {energy.level_ratio_steady:.4f} at the median θ."
+        f"Adiabatic check: averaged over the turns of precession, ψ̇² sin θ is {found.level_ratio:.4f} ± "
+        f"{found.level_ratio_sigma:.4f} times 4 g / r. It is 1 for a thin disc at small θ; steady precession "
+        f"of this disc has {found.level_ratio_steady:.4f} at the median θ."
     )
-    return Drawn("12_adiabatic_level", "Adiabatic condition", caption, figure)
+    yield Drawn("12_adiabatic_level", "Adiabatic condition", caption, figure)
 
 
-def energy_against_adiabatic(analysis: Analysis) -> Drawn | None:
-    """Paper's figure 13."""
-    total, level, time = analysis.series("total"), analysis.series("adiabatic"), analysis.motion.time
-    if _nothing(total.value):
-        return None
-    figure, axes = _axes()
-    _band(axes, time, total, 1e3, BLUE, "mechanical energy")
-    axes.plot(time, 1e3 * level.value, color=RED, linestyle="--", linewidth=1.1, label="3/2 m g r sin θ")
-    axes.set(xlabel="time (s)", ylabel="energy (mJ)")
-    axes.set_ylim(bottom=0)
-    axes.legend(frameon=False, fontsize=9)
-    energy = analysis.energy
+def energy(analysis: Analysis) -> Iterator[Drawn]:
+    """Paper's figure 13; where the energy sits, and the power lost."""
+    time, found = analysis.motion.time, analysis.energy
+    level = Curve(time, 1e3 * analysis.series("adiabatic").value, RED, "3/2 m g r sin θ", "--")
+    total = _series(analysis, "total", BLUE, "mechanical energy", 1e3)
+    figure = chart(TIME, ("energy (mJ)", [total, level]))
+    figure.axes[0].set_ylim(bottom=0)
     caption = (
-        f"Mechanical energy, zero at rest (z = h). Lost in the recording: {1e3 * energy.loss:.4f} ± "
-        f"{1e3 * energy.loss_sigma:.4f} (noise) ± {1e3 * energy.loss_sigma_calibration:.4f} (calibration) mJ."
+        f"Mechanical energy, zero at rest (z = h). Lost in the recording: {1e3 * found.loss:.4f} ± "
+        f"{1e3 * found.loss_sigma:.4f} (noise) ± {1e3 * found.loss_sigma_calibration:.4f} (calibration) mJ."
     )
-    return Drawn("13_energy", "Energy", caption, figure)
-
-
-def energy_parts(analysis: Analysis) -> Drawn | None:
-    """Where the energy sits, and the power lost."""
-    time = analysis.motion.time
-    if _nothing(analysis.series("total").value):
-        return None
-    figure, (upper, lower) = panels(7.2, 5.0, 2, margins=NO_TITLE, sharex=True, height_ratios=(3, 2))
+    yield Drawn("13_energy", "Energy", caption, figure)
     parts = (
         ("translation", AMBER, "translation"),
         ("rotation_1", GREEN, "rotation about e₁"),
@@ -281,145 +235,66 @@ def energy_parts(analysis: Analysis) -> Drawn | None:
         ("rotation_3", MUTED, "rotation about e₃"),
         ("potential", RED, "potential"),
     )
-    for name, colour, label in parts:
-        upper.plot(time, 1e3 * analysis.series(name).value, color=colour, linewidth=1.1, label=label)
-    upper.set_ylabel("energy (mJ)")
-    upper.legend(frameon=False, fontsize=8, ncols=2)
-    _band(lower, time, analysis.series("power"), 1e3, BLUE, "power")
-    lower.axhline(0, color=MUTED, linewidth=0.7)
-    lower.set(xlabel="time (s)", ylabel="dE/dt (mW)")
+    above = [Curve(time, 1e3 * analysis.series(name).value, colour, label) for name, colour, label in parts]
+    below = [_series(analysis, "power", BLUE, scale=1e3), _level(time, 0.0)]
+    figure = chart(TIME, ("energy (mJ)", above), ("dE/dt (mW)", below), size=(7.2, 5.0), heights=(3, 2))
     caption = "Where the energy sits (above), and the rate at which the sum changes (below, band ± 3 σ)."
-    return Drawn("13b_energy_parts", "Parts of the energy and power", caption, figure)
-
-
-def contact_forces(analysis: Analysis) -> Drawn | None:
-    """Contact force from the accelerations, and the friction coefficient that it needs."""
-    time = analysis.motion.time
-    if _nothing(analysis.series("force_z").value):
-        return None
-    figure, (upper, lower) = panels(7.2, 5.0, 2, margins=NO_TITLE, sharex=True, height_ratios=(3, 2))
-    for name, colour, label in (
-        ("force_z", INK, "vertical"),
-        ("force_n", BLUE, "along n0"),
-        ("force_m", RED, "along m0"),
-    ):
-        _band(upper, time, analysis.series(name), 1.0, colour, label)
-    upper.set_ylabel("force (N)")
-    upper.legend(frameon=False, fontsize=9, ncols=3)
-    _band(lower, time, analysis.series("friction_needed"), 1.0, BLUE, "needed")
-    lower.set(xlabel="time (s)", ylabel="friction needed")
-    lower.set_ylim(bottom=0)
-    needed = analysis.series("friction_needed").value
-    caption = (
-        f"Force of the table on the disc along n0, m0 and k from Newton's law, and the friction coefficient that it "
-        f"needs: at most {np.nanmax(needed):.3f}, {np.nanmedian(needed):.3f} in the median."
-    )
-    return Drawn("08b_contact_forces", "Contact forces", caption, figure)
-
-
-def _power_law(
-    analysis: Analysis, series_value: Array, exponent: Exponent, which: int, of_theta: float, label: str
-) -> Figure | None:
-    """Ln-ln plot of a quantity against the time left with the fit and the models' slopes."""
-    laws, time = analysis.scaling.laws, analysis.motion.time
-    left = laws.t_f - time
-    with np.errstate(invalid="ignore"):
-        shown = (left > 0) & (series_value > 0)
-    if not laws.determined or not np.isfinite(exponent.value) or shown.sum() < 2:
-        return None
-    figure, axes = _axes(5.8, 4.4)
-    axes.plot(np.log(left[shown]), np.log(series_value[shown]), ".", color=BLUE, markersize=2.5, label="measured")
-    ends = np.log(np.array(laws.window))
-    line = np.log(laws.prefactors[which]) + exponent.value * ends
-    half = f"{exponent.value:.4f} ± {(exponent.high - exponent.low) / 2:.4f}"
-    axes.plot(ends, line, color=RED, linewidth=1.6, label=f"fit, {half} (95 %)")
-    shift = line.mean() - 0.35 * np.sign(of_theta)
-    for (_, n), style in zip(MODEL_EXPONENTS, ((0, (1, 1)), (0, (4, 2)), (0, (6, 1, 1, 1)), "solid"), strict=True):
-        slope = of_theta * n
-        axes.plot(
-            ends,
-            shift + slope * (ends - ends.mean()),
-            color=MUTED,
-            linestyle=style,
-            linewidth=0.9,
-            label=f"{slope:.3f}",
-        )
-    axes.invert_xaxis()
-    axes.set(xlabel="ln (t_f - t), t in s", ylabel=label)
-    axes.legend(frameon=False, fontsize=8)
-    return figure
+    yield Drawn("13b_energy_parts", "Parts of the energy and power", caption, figure)
 
 
 def power_laws(analysis: Analysis) -> Iterator[Drawn]:
-    """Paper's figures 14 to 16: energy, nutation, precession rate."""
+    """Paper's figures 14 to 16: energy, nutation, precession rate against the time left, with the models' slopes."""
     laws = analysis.scaling.laws
-    for name, title, value, exponent, which, of_theta, label in (
-        ("14_energy_law", "the energy", analysis.series("total").value, laws.n_energy, 2, 1.0, "ln E, E in J"),
-        ("15_nutation_law", "the nutation", analysis.motion.euler[:, 1], laws.n_theta, 0, 1.0, "ln θ, θ in rad"),
-        (
-            "16_precession_law", "the precession rate", analysis.series("psidot").value, laws.n_psidot, 1, -0.5,
-            "ln ψ̇, ψ̇ in rad/s",
-        ),
-    ):  # fmt: skip
-        drawn = _power_law(analysis, value, exponent, which, of_theta, label)
-        if drawn:
-            caption = (
-                f"Exponent {exponent.value:.4f} ± {exponent.sigma:.4f} (95 %: {exponent.low:.4f} to "
-                f"{exponent.high:.4f}) from {laws.window[0]:.3f} to {laws.window[1]:.3f} s before t_f = {laws.t_f:.5f} "
-                f"± {laws.t_f_sigma:.5f} s. Grey: {'; '.join(name for name, _ in MODEL_EXPONENTS)}."
-            )
-            yield Drawn(name, f"Power law of {title}", caption, drawn)
+    left, ends = laws.t_f - analysis.motion.time, np.log(np.array(laws.window))
+    total, theta, psidot = analysis.series("total").value, analysis.motion.euler[:, 1], analysis.series("psidot").value
+    drawn = (
+        ("14_energy_law", "the energy", total, laws.n_energy, laws.prefactors[2], 1.0, "ln E, E in J"),
+        ("15_nutation_law", "the nutation", theta, laws.n_theta, laws.prefactors[0], 1.0, "ln θ, θ in rad"),
+        ("16_precession_law", "the precession rate", psidot, laws.n_psidot, laws.prefactors[1], -0.5, "ln ψ̇, rad/s"),
+    )  # fmt: skip
+    for name, title, value, exponent, prefactor, of_theta, label in drawn:
+        with np.errstate(invalid="ignore"):
+            shown = (left > 0) & (value > 0)
+        if not np.isfinite(exponent.value) or shown.sum() < 2:
+            continue
+        line = np.log(prefactor) + exponent.value * ends
+        said = f"fit, {exponent.value:.4f} ± {exponent.half:.4f} (95 %)"
+        curves = [Curve(np.log(left[shown]), np.log(value[shown]), BLUE, "measured", "."), Curve(ends, line, RED, said)]
+        for (_, n), style in zip(MODEL_EXPONENTS, (":", "--", "-.", "-"), strict=True):
+            slope = of_theta * n
+            below = line.mean() - 0.35 * np.sign(of_theta)
+            curves.append(Curve(ends, below + slope * (ends - ends.mean()), MUTED, f"{slope:.3f}", style))
+        figure = chart("ln (t_f - t), t in s", (label, curves), size=SQUARE)
+        figure.axes[0].invert_xaxis()
+        caption = (
+            f"Exponent {exponent.value:.4f} ± {exponent.sigma:.4f} (95 %: {exponent.low:.4f} to {exponent.high:.4f}) "
+            f"from {laws.window[0]:.3f} to {laws.window[1]:.3f} s before t_f = {laws.t_f:.5f} ± {laws.t_f_sigma:.5f} "
+            f"s. Grey: {'; '.join(name for name, _ in MODEL_EXPONENTS)}."
+        )
+        yield Drawn(name, f"Power law of {title}", caption, figure)
 
 
-def exponents_against_window(analysis: Analysis) -> Drawn | None:
+def exponents_against_window(analysis: Analysis) -> Iterator[Drawn]:
     """How the exponents depend on the window."""
-    fits = analysis.scaling.by_window
+    fits = [fit for fit in analysis.scaling.by_window if fit.determined]
     longest = np.array([fit.window[0] for fit in fits])
-    reached = np.append(True, np.diff(longest) > 1e-3)  # windows longer than the recording repeat each other
-    good = np.array([fit.determined for fit in fits]) & reached
-    if good.sum() < 2:
-        return None
-    figure, axes = _axes()
-    for name, colour, label, sign in (
+    new = np.flatnonzero(np.append(True, np.diff(longest) > 1e-3)) if fits else longest  # others repeat the recording
+    if len(new) < 2:
+        return
+    figure = chart("window before t_f (s)", ("exponent", [_level(longest[new], 2 / 3, style="--")]))
+    (axes,) = figure.axes
+    for name, colour, label, scale in (
         ("n_theta", BLUE, "nutation", 1),
         ("n_energy", RED, "energy", 1),
         ("n_psidot", GREEN, "-2 × precession rate", -2),
     ):
-        exponents = [getattr(fit, name) for fit in fits]
-        value = sign * np.array([e.value for e in exponents])[good]
-        half = abs(sign) * np.array([(e.high - e.low) / 2 for e in exponents])[good]
-        axes.errorbar(
-            longest[good], value, half, fmt="o-", color=colour, markersize=4, capsize=2, linewidth=1, label=label
-        )
-    axes.axhline(2 / 3, color=MUTED, linewidth=0.9, linestyle="--")
-    axes.set(xlabel="window before t_f (s)", ylabel="exponent")
+        exponents = [getattr(fits[i], name) for i in new]
+        value = [scale * e.value for e in exponents]
+        half = [abs(scale) * e.half for e in exponents]
+        axes.errorbar(longest[new], value, half, fmt="o-", color=colour, markersize=4, capsize=2, label=label)
     axes.legend(frameon=False, fontsize=9)
     caption = (
         "The same exponents for windows of several lengths, t_f fitted anew in each; bars are 95 % confidence, dashed "
         "2/3. All three would lie on one line if energy, nutation and precession kept to one law."
     )
-    return Drawn("16b_exponents_by_window", "Exponents against the window", caption, figure)
-
-
-def pose_quality(analysis: Analysis) -> Drawn:
-    """Quality per frame: reprojection error and sigma of the measured poses."""
-    trajectory = analysis.trajectory
-    figure, (upper, middle, lower) = panels(7.2, 5.4, 3, margins=NO_TITLE, sharex=True)
-    time = trajectory.time
-    for camera, (name, colour) in enumerate((("left", BLUE), ("right", RED))):
-        upper.plot(time, trajectory.reprojection_rms_px[:, camera], ".", color=colour, markersize=2, label=name)
-    upper.set_ylabel("reprojection\nrms (px)")
-    upper.set_ylim(bottom=0)
-    upper.legend(frameon=False, fontsize=8, ncols=2, markerscale=4)
-    sigma = np.sqrt(np.diagonal(trajectory.pose_covariance, axis1=1, axis2=2))
-    for i, (name, colour) in enumerate((("x", BLUE), ("y", RED), ("z", GREEN))):
-        middle.plot(time, 1e6 * sigma[:, i], color=colour, linewidth=1, label=name)
-        lower.plot(time, 1e3 * np.degrees(sigma[:, 3 + i]), color=colour, linewidth=1, label=f"about {name}")
-    middle.set_ylabel("σ of one\npose (µm)")
-    lower.set_ylabel("σ of one\npose (mdeg)")
-    for axes in (middle, lower):
-        axes.set_ylim(bottom=0)
-        axes.legend(frameon=False, fontsize=8, ncols=3)
-    lower.set_xlabel("time (s)")
-    caption = "Before smoothing: misfit of the dots, and the noise of each pose along and about the table's axes."
-    return Drawn("03_pose_quality", "Quality per frame", caption, figure)
+    yield Drawn("16b_exponents_by_window", "Exponents against the window", caption, figure)

@@ -8,7 +8,6 @@ import base64
 import json
 from collections.abc import Callable
 from importlib.resources import files
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -17,7 +16,6 @@ from numpy.typing import NDArray
 
 from calibration.kit.arrays import Array
 from disctrack.analyse.analysis import Analysis
-from disctrack.files.whole import write_whole
 from disctrack.findings import doubts
 from disctrack.report.blocks import Markup, Report, Text
 from disctrack.report.html import page
@@ -28,18 +26,10 @@ Drawn = Callable[[int], NDArray]  # frame -> both images with the fit on them, (
 
 MOST_ROWS = 1500  # frames on the page: every second, third, ... of longer recordings
 MOST_PICTURES = 80
-PICTURE_HEIGHT = 300  # [px] of one camera's picture
-JPEG_QUALITY = 72
-
-
-def write_motion_page(path: Path, analysis: Analysis, name: str, drawn: Drawn | None = None) -> Path:
-    """Write the page. drawn : gives the picture of a frame, where the images are at hand. Raises OutputError."""
-    write_whole(path, motion_html(analysis, name, drawn).encode())
-    return path
 
 
 def motion_html(analysis: Analysis, name: str, drawn: Drawn | None = None) -> str:
-    """The whole page."""
+    """The whole page. drawn : gives the picture of a frame, where the images are at hand"""
     content = page_data(analysis, drawn)
     data = json.dumps(content, separators=(",", ":")).replace("</", "<\\/")
     script = files("disctrack.report").joinpath("motion.js").read_text(encoding="utf-8")
@@ -152,9 +142,9 @@ def _pictures(rows: NDArray[np.intp], drawn: Drawn) -> list[dict[str, Any]]:
     found = []
     for k in chosen:
         picture = drawn(int(rows[k]))
-        scale = min(1.0, PICTURE_HEIGHT / picture.shape[0])
+        scale = min(1.0, 300 / picture.shape[0])
         small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-        good, coded = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+        good, coded = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 72])
         if good:
             uri = f"data:image/jpeg;base64,{base64.b64encode(coded.tobytes()).decode()}"
             found.append({"row": int(k), "uri": uri})

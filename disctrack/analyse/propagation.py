@@ -13,39 +13,12 @@ from numpy.typing import NDArray
 
 from calibration.kit.arrays import Array
 from calibration.kit.brief import Outline
-from disctrack.analyse.derivatives import N_STATE, MeasuredMotion
-from disctrack.frames import nodal_axes_world, rotation_from_vector
+from disctrack.analyse.derivatives import FRAMES_AT_ONCE, N_STATE, MeasuredMotion, MotionState
 
 # Steps of central differences in the order of STATE: far above round-off, far below the scale on which the derived
 # quantities bend (sin theta of a disc at rest on its patch is 1e-2). They are quadratic at most in the rates.
 STEPS = np.repeat([1e-6, 1e-6, 1e-4, 1e-3, 1e-2, 1.0], 3)
-FRAMES_AT_ONCE = 1024
 RESOLVED_TILT_SIGMAS = 5.0  # below this many sigmas of theta, the direction of precession is not determined
-
-
-@dataclass(frozen=True)
-class MotionState:
-    """Motion of the disc at n instants, world axes; see MeasuredMotion."""
-
-    position: Array  # (n, 3)
-    R_world_body: Array  # (n, 3, 3)
-    velocity: Array  # (n, 3)
-    omega_world: Array  # (n, 3)
-    acceleration: Array  # (n, 3)
-    alpha_world: Array  # (n, 3)
-
-    @property
-    def sine(self) -> Array:
-        """(n,) sin theta."""
-        return np.hypot(self.R_world_body[:, 0, 2], self.R_world_body[:, 1, 2])
-
-    def axes(self) -> tuple[Array, Array, Array]:
-        """e1, e2, e3 in world axes, (n, 3) each; e1 and e2 are NaN at theta = 0."""
-        e3 = self.R_world_body[..., 2]
-        s, c = self.sine, e3[:, 2]
-        psi = np.where(s > 0, np.arctan2(e3[:, 0], -e3[:, 1]), np.nan)
-        e1, e2, _ = nodal_axes_world(psi, np.arctan2(s, c))
-        return e1, e2, e3
 
 
 @dataclass(frozen=True, repr=False)
@@ -76,11 +49,6 @@ class Propagated:
         """(n, k, k) noise."""
         return self.covariance_at(np.arange(len(self.value)), slice(None))
 
-    @property
-    def rig_covariance(self) -> Array:
-        """(30, 30) of RIG_PARAMETERS."""
-        return self.motion.rig_covariance
-
     def covariance_at(self, frames: NDArray[np.int64], columns: slice) -> Array:
         """(f, c, c) noise of some values in some frames."""
 
@@ -90,59 +58,28 @@ class Propagated:
 
         return _by_parts(some, frames)
 
-    def sensitivity_at(self, frames: NDArray[np.int64], columns: slice) -> Array:
-        """(f, c, 30) d value / d RIG_PARAMETERS of some values in some frames."""
-        return _by_parts(
-            lambda rows: self.jacobian[rows][:, columns] @ self.motion.calibration_sensitivity[rows], frames
-        )
-
-    def calibration_covariance_at(self, frames: NDArray[np.int64], columns: slice) -> Array:
-        """(f, c, c) from the rig and from what else repeats, of some values in some frames."""
-
-        def some(rows: NDArray[np.int64]) -> Array:
-            S = self.sensitivity_at(rows, columns)
-            return np.asarray(S @ self.rig_covariance @ S.swapaxes(1, 2)) + self.systematic_covariance_at(rows, columns)
-
-        return _by_parts(some, frames)
-
-    def systematic_covariance_at(self, frames: NDArray[np.int64], columns: slice) -> Array:
-        """(f, c, c) from what repeats and is not the rig's, of some values in some frames."""
+    def shared_covariance_at(self, frames: NDArray[np.int64], columns: slice) -> Array:
+        """(f, c, c) of some values in some frames from what does not average out: the rig, and what else repeats."""
 
         def some(rows: NDArray[np.int64]) -> Array:
             J = self.jacobian[rows][:, columns]
-            return np.asarray(J @ self.motion.systematic_at(rows) @ J.swapaxes(1, 2))
+            S = J @ self.motion.calibration_sensitivity[rows]
+            by_rig = S @ self.motion.rig_covariance @ S.swapaxes(1, 2)
+            return np.asarray(by_rig + J @ self.motion.systematic_at(rows) @ J.swapaxes(1, 2))
 
         return _by_parts(some, frames)
 
     def series(self, names: Sequence[tuple[str, str, str]]) -> tuple[DerivedSeries, ...]:
         """The columns one by one; names are (name, unit, long_name)."""
-        frames, all_columns = np.arange(len(self.value)), slice(None)
 
-        def sigmas(rows: NDArray[np.int64]) -> Array:
-            noise = np.diagonal(self.covariance_at(rows, all_columns), axis1=1, axis2=2)
-            return np.stack([np.sqrt(noise), shared_sigma(self.motion, self.jacobian[rows], rows)], 1)
+        def variances(rows: NDArray[np.int64]) -> Array:
+            both = self.covariance_at(rows, slice(None)), self.shared_covariance_at(rows, slice(None))
+            return np.stack([np.diagonal(C, axis1=1, axis2=2) for C in both], axis=1)
 
-        both = _by_parts(sigmas, frames)
+        sigmas = np.sqrt(np.maximum(_by_parts(variances, np.arange(len(self.value))), 0.0))
         return tuple(
-            DerivedSeries(name, unit, text, self.value[:, i], both[:, 0, i], both[:, 1, i])
-            for i, (name, unit, text) in enumerate(names)
+            DerivedSeries(*name, self.value[:, i], sigmas[:, 0, i], sigmas[:, 1, i]) for i, name in enumerate(names)
         )
-
-
-def shared_sigma(motion: MeasuredMotion, jacobian: Array, frames: NDArray[np.int64] | None = None) -> Array:
-    """Standard deviations (f, k) of quantities of derivative (f, k, 18) by STATE, from all that does not average out.
-
-    frames : (f,) that the derivatives belong to; all without
-    """
-    frames = np.arange(len(motion)) if frames is None else frames
-
-    def some(part: NDArray[np.int64]) -> Array:
-        J, rows = jacobian[part], frames[part]
-        S = J @ motion.calibration_sensitivity[rows]
-        rig = np.sum((S @ motion.rig_covariance) * S, axis=2)
-        return np.asarray(np.sqrt(np.maximum(rig + np.sum((J @ motion.systematic_at(rows)) * J, axis=2), 0.0)))
-
-    return _by_parts(some, np.arange(len(frames)))
 
 
 def _by_parts(function: Callable[[NDArray[np.int64]], Array], frames: NDArray[np.int64]) -> Array:
@@ -151,47 +88,20 @@ def _by_parts(function: Callable[[NDArray[np.int64]], Array], frames: NDArray[np
     return np.concatenate(parts)
 
 
-def state_of(motion: MeasuredMotion) -> MotionState:
-    """The motion without its uncertainty."""
-    return MotionState(
-        motion.position,
-        motion.R_world_body,
-        motion.velocity,
-        motion.omega_world,
-        motion.acceleration,
-        motion.alpha_world,
-    )
-
-
-def displaced(state: MotionState, step: Array) -> MotionState:
-    """The state after a small change (18,) or (n, 18) in the order of derivatives.STATE."""
-    d = np.broadcast_to(step, (len(state.position), N_STATE))
-    return MotionState(
-        state.position + d[:, 0:3],
-        rotation_from_vector(d[:, 3:6]) @ state.R_world_body,
-        state.velocity + d[:, 6:9],
-        state.omega_world + d[:, 9:12],
-        state.acceleration + d[:, 12:15],
-        state.alpha_world + d[:, 15:18],
-    )
-
-
 def propagate(motion: MeasuredMotion, function: Callable[[MotionState], Array]) -> Propagated:
     """Values (n, k) of a function of the state, with noise and calibration carried through its derivative.
 
     NaN where the motion is unknown, and where theta is so small against its own sigma that e1 has no direction.
     """
-    whole = state_of(motion)
+    resolved = motion.sine > RESOLVED_TILT_SIGMAS * motion.tilt_sigma
 
     def some(rows: NDArray[np.int64]) -> Array:
-        state = MotionState(*(part[rows] for part in vars(whole).values()))
-        jacobian = np.stack(
-            [(function(displaced(state, e)) - function(displaced(state, -e))) / (2 * e.sum()) for e in np.diag(STEPS)],
-            axis=-1,
-        )  # (f, k, 18)
-        value = function(state)
-        tilt_sigma = np.sqrt(np.trace(motion.covariance[rows, 3:6, 3:6], axis1=1, axis2=2) / 3)
-        value = np.where((state.sine > RESOLVED_TILT_SIGMAS * tilt_sigma)[:, None], value, np.nan)
+        columns = []
+        for step in np.diag(STEPS):
+            up, down = (function(motion.displaced(sign * step, rows)) for sign in (1, -1))
+            columns.append((up - down) / (2 * step.sum()))
+        jacobian = np.stack(columns, axis=-1)  # (f, k, 18)
+        value = np.where(resolved[rows, None], function(motion.displaced(np.zeros(N_STATE), rows)), np.nan)
         jacobian[~np.isfinite(value)] = np.nan
         return np.concatenate([value[..., None], jacobian], axis=-1)
 

@@ -12,8 +12,9 @@ from disctrack.analyse.analysis import Analysis
 from disctrack.analyse.power_laws import MODEL_EXPONENTS, Exponent, PowerLaws
 from disctrack.analyse.propagation import DerivedSeries
 from disctrack.analyse.published import SURFACES, agreement, published_table
-from disctrack.report.blocks import Cell, Figures, Listing, Report, Said, Says, Section, Text
-from disctrack.report.numbers import Measured, measured, rounded, unit_text
+from disctrack.findings import Finding, Kind, Severity, of_kind
+from disctrack.report.blocks import Cell, Figures, Listing, Report, Section, Text
+from disctrack.report.numbers import Measured, measured, unit_text
 from disctrack.trajectory import FrameStatus
 from disctrack.trajectory.file import Provenance
 
@@ -22,15 +23,14 @@ if TYPE_CHECKING:
 
 # Below, sin and cos of the nutation are its first terms to 2e-4, and the exponents of the models are those of the law.
 ASYMPTOTIC_BELOW = np.radians(1.0)
-INSTANTS = (
-    "psidot", "thetadot", "omega_3", "omega_z", "slip_n", "slip_m", "force_z", "friction_needed", "total", "power",
-)  # fmt: skip
+RATES_SHOWN = ("psidot", "thetadot", "omega_3", "omega_z")
+CONTACT_SHOWN = ("slip_n", "slip_m", "force_z", "friction_needed", "total", "power")
 
 
 def report_of(
     analysis: Analysis,
     provenance: Provenance,
-    findings: Sequence[Says] = (),
+    findings: Sequence[Finding] = (),
     drawn: Sequence[Drawn] = (),
     files: Sequence[Path] = (),
 ) -> Report:
@@ -45,7 +45,7 @@ def report_of(
         f"{provenance.recording}: from the trajectory to the physics",
         f"The disc {analysis.contact.onset.verdict}. {_exponents_text(laws)}",
         _accuracy(analysis),
-        [*findings, *(Said(text, "warning") for text in analysis.warnings)],
+        [*findings, *of_kind(Kind.ANALYSIS, Severity.WARNING, analysis.warnings)],
         facts=[
             ("rolls without slip", _onset(analysis)),
             (
@@ -57,7 +57,7 @@ def report_of(
         ],
         blocks=[
             Text(_what_was_filmed(analysis)),
-            section("Quality of the measurement", ("03",), Text(_lab_frame(analysis)), _status_table(analysis)),
+            section("Quality of the measurement", ("03",), _status_table(analysis)),
             section("Motion", ("04", "05", "06", "07", "10", "11"), _instants_table(analysis)),
             section("Contact", ("08", "09")),
             section("Energy", ("12", "13")),
@@ -80,11 +80,9 @@ def _exponents_text(laws: PowerLaws) -> str:
 def _accuracy(analysis: Analysis) -> str:
     """Of the velocities, and of the lab frame."""
     sigma = np.sqrt(np.diagonal(analysis.motion.covariance, axis1=1, axis2=2))
-    velocity, turn = (measured(float(np.nanmedian(sigma[:, rows])), unit=unit)
-                      for rows, unit in ((slice(6, 9), "m/s"), (slice(9, 12), "rad/s")))  # fmt: skip
-    frame = _lab_frame_sigma(analysis)
-    shared = "not known" if frame is None else f"{measured(frame[0], unit='m')}, {measured(frame[1])} mdeg"
-    return f"σ of velocity {velocity} and {turn} (noise, median); of the lab frame {shared} (calibration, worst axis)"
+    velocity = measured(float(np.nanmedian(sigma[:, 6:9])), unit="m/s")
+    turn = measured(float(np.nanmedian(sigma[:, 9:12])), unit="rad/s")
+    return f"σ of velocity {velocity} and {turn} (noise, median); of the lab frame {_lab_frame(analysis)}"
 
 
 def _what_was_filmed(analysis: Analysis) -> str:
@@ -107,23 +105,14 @@ def _onset(analysis: Analysis) -> str:
     return f"from {onset.time:.4f} s"
 
 
-def _lab_frame_sigma(analysis: Analysis) -> tuple[float, float] | None:
-    """Of the worst axis, from the calibration [m], [mdeg]; None where the rig carries no covariance."""
+def _lab_frame(analysis: Analysis) -> str:
+    """What the calibration leaves of the lab frame, at the worst axis."""
     covariance = analysis.trajectory.calibration_covariance[analysis.trajectory.measured]
     sigma = np.sqrt(np.median(np.diagonal(covariance, axis1=1, axis2=2), axis=0))
     if not np.any(sigma > 0):
-        return None
-    return float(sigma[:3].max()), 1e3 * float(np.degrees(sigma[3:].max()))
-
-
-def _lab_frame(analysis: Analysis) -> str:
-    sigma = _lab_frame_sigma(analysis)
-    if sigma is None:
-        return "The rig carries no covariance: the error that the calibration puts into the lab frame is not known."
-    return (
-        f"The calibration leaves {measured(sigma[0], unit='m')} and {rounded(sigma[1])} mdeg (1 σ, worst axis) in the "
-        "lab frame, the same in all frames; the noise of single frames comes on top."
-    )
+        return "not known (the rig carries no covariance)"
+    turn = 1e3 * float(np.degrees(sigma[3:].max()))
+    return f"{measured(float(sigma[:3].max()), unit='m')}, {measured(turn)} mdeg (calibration, worst axis)"
 
 
 def _status_table(analysis: Analysis) -> Listing:
@@ -135,10 +124,8 @@ def _status_table(analysis: Analysis) -> Listing:
 def _instants_table(analysis: Analysis) -> Listing:
     known = np.flatnonzero(analysis.motion.known)
     frames = known[[0, len(known) // 2, -1]] if known.size > 2 else known[:0]
-    rows = []
-    for name in INSTANTS:
-        series = analysis.series(name)
-        rows.append((series.long_name, *(_with_both(series, frame) for frame in frames)))
+    shown = [analysis.series(name) for name in (*RATES_SHOWN, *CONTACT_SHOWN)]
+    rows = [(series.long_name, *(_with_both(series, frame) for frame in frames)) for series in shown]
     times = [f"at {analysis.motion.time[frame]:.3f} s" for frame in frames]
     caption = "Some quantities at three instants: value ± 1 σ of the noise ± 1 σ of the calibration."
     return Listing(("quantity", *times), rows if len(frames) else (), caption)
@@ -154,7 +141,7 @@ def _at_95(exponent: Exponent) -> Cell:
     """The exponent with half of its confidence interval: of two degrees of freedom 4.3 sigmas."""
     if not np.isfinite(exponent.value):
         return "not determined"
-    return measured(exponent.value, (exponent.high - exponent.low) / 2)
+    return measured(exponent.value, exponent.half)
 
 
 def _exponents(analysis: Analysis) -> list[Listing | Text]:
@@ -163,9 +150,7 @@ def _exponents(analysis: Analysis) -> list[Listing | Text]:
         return [Text(f"No exponents are given: {laws.reason}.")]
     theta = _largest_nutation(analysis)
     asymptotic = theta <= ASYMPTOTIC_BELOW
-    named = (
-        ("energy", laws.n_energy, 1.0), ("nutation", laws.n_theta, 1.0), ("precession rate", laws.n_psidot, -0.5)
-    )  # fmt: skip
+    named = ("energy", laws.n_energy, 1.0), ("nutation", laws.n_theta, 1.0), ("precession rate", laws.n_psidot, -0.5)
     rows = [
         (name, _at_95(e), measured(e.value, e.sigma), *(_agreement(e, k * n, asymptotic) for _, n in MODEL_EXPONENTS))
         for name, e, k in named
@@ -230,8 +215,9 @@ def _published_tables() -> list[Listing]:
         rows = [(case, str(trial), *(f"{e:.4f}" for e in n), f"{t_f:.3f}") for case, trial, n, t_f in columns]
         rows.append(("mean, recomputed", "", *(f"{e:.4f}" for e in printed.average), ""))
         rows.append(("mean, as printed", "", *(f"{e:.4f}" for e in printed.printed_average), ""))
-        sentences = "; ".join(a.sentence for a in agreement(printed))
-        caption = f"Ma et al. 2014, disc on {surface}. {sentences}."
+        against = zip(*agreement(printed), strict=True)
+        rows.append(("Student's t against 2/3, 2/3, -1/3", "", *(f"{t:.1f} (p = {p:.2g})" for t, p in against), ""))
+        caption = f"Ma et al. 2014, disc on {surface}."
         header = ("case", "trial", "n_E", "n_θ", "n_ψ̇", "t_f (s)")
         tables.append(Listing(header, rows, caption, folded=f"Published exponents on {surface}"))
     return tables

@@ -6,9 +6,8 @@ below a cut-off without loss and nothing above: at the signal-to-noise ratios of
 variance it predicts is the noise that passes, and the bias is far below it. Length l and amplitude A are found where
 they change, by restricted maximum likelihood in overlapping segments; the scale of the noise, in all segments together.
 
-On simulated motion this is 3 to 4 times more accurate than local polynomials and than a state-space smoother with an
-integrated Wiener process, and its variance is right where that of the latter is not (tests/physics/
-test_differentiators.py has the candidates and the figures).
+On simulated motion this is more accurate than local polynomials, which have one window for slow and fast motion, and
+than a state-space smoother with an integrated Wiener process, whose spectrum falls too slowly.
 """
 
 from collections.abc import Sequence
@@ -24,10 +23,6 @@ LENGTHS = 2.0 * 1.15 ** np.arange(20)  # l in frame intervals: 2 (content up to 
 RATIOS = 10.0 ** np.arange(0.0, 10.1, 0.5)  # (A / sigma)^2
 SEGMENT = 96  # frames in which l and A are taken as constant: 48 or 64 make the variance too small by a factor 2
 MAX_SLOPE = 0.25  # of l, in intervals per interval
-# A disc's motion is a sum of near-sinusoids, smoother than any sample of the process: the likelihood then prefers an l
-# that is a little too long. One step shorter costs 15 % in scatter and brings the squared error of accelerations from
-# 2 to 4 times the predicted variance to 0.87 to 1.0 (simulated motions at 60, 25 and 9 degrees).
-SHORTEN_STEPS = 1
 HALF_WINDOW_LENGTHS = 3.0  # half width of a window in l; 4 would gain 3 % in scatter and cost twice the time
 MIN_WINDOW_SAMPLES = 4  # a line and a curvature, and one to spare
 NOISE_SCALES = 2.0 ** np.arange(-3.0, 3.01, 0.05)  # variance found over variance stated
@@ -77,9 +72,11 @@ def fit_process(segments: Sequence[tuple[Array, Array, Array]], centres: Array, 
     sample = np.arange(n)
     between = np.interp(sample, centres, length_index.astype(float))
     length = np.exp(np.interp(between, np.arange(len(LENGTHS)), np.log(LENGTHS)))
+    # A disc's motion is a sum of near-sinusoids, smoother than any sample of the process: the likelihood prefers an l
+    # that is a little too long. One step shorter the predicted variance of accelerations is that of their errors.
     allowed = np.searchsorted(LENGTHS, np.sqrt(1.15) * _sloped(length), side="right") - 1  # nearest of the grid
     return Process(
-        length=LENGTHS[np.maximum(allowed - SHORTEN_STEPS, 0)],
+        length=LENGTHS[np.maximum(allowed - 1, 0)],
         amplitude2=np.exp(np.interp(sample, centres, np.log(amplitude2))),
         noise_scale=float(NOISE_SCALES[scale_index]),
     )

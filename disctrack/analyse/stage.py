@@ -1,5 +1,6 @@
 """From a trajectory file to the physics: motion, contact, energy and scaling laws, into the file and into a report."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -8,9 +9,9 @@ import numpy as np
 from calibration.kit.brief import Brief
 from calibration.kit.threads import one_blas_thread
 from disctrack.analyse.analysis import CIRCLE_DURATION, WINDOWS, Analysis, Scaling, analyse
-from disctrack.analyse.derivatives import GROUP_NAMES, STATE
+from disctrack.analyse.derivatives import GROUP_NAMES, N_STATE, STATE
 from disctrack.analyse.power_laws import WINDOW
-from disctrack.analyse.propagation import DerivedSeries, shared_sigma
+from disctrack.analyse.propagation import DerivedSeries, Propagated
 from disctrack.analyse.report import report_of
 from disctrack.arguments import Seconds, checked
 from disctrack.errors import AnalysisError
@@ -118,8 +119,10 @@ def write_analysis(path: Path, analysis: Analysis) -> None:
         ),
         "scaling": _scaling_group(analysis.scaling),
     }
-    axis = Variable(WINDOWS, ("scaling_window",), "s", "longest time before t_f in the fit")
-    write_groups(path, groups, axes={**_state_axes(), "scaling_window": axis})
+    axes = {"scaling_window": Variable(WINDOWS, ("scaling_window",), "s", "longest time before t_f in the fit")}
+    what = "position, rotation vector, velocity, angular velocity, acceleration, angular acceleration; world axes"
+    axes |= {name: Variable(np.array(STATE), (name,), "1", what) for name in ("state", "state_2")}
+    write_groups(path, groups, axes=axes)
 
 
 def _at_full_length(item: Variable, n: int, first: int) -> Variable:
@@ -132,61 +135,39 @@ def _at_full_length(item: Variable, n: int, first: int) -> Variable:
     return replace(item, data=out)
 
 
-def _series_variables(series: tuple[DerivedSeries, ...]) -> dict[str, Variable]:
-    variables = {}
-    for s in series:
-        variables[s.name] = Variable(s.value, ("time",), s.unit, s.long_name)
-        variables[f"{s.name}_sigma"] = Variable(
-            s.sigma, ("time",), s.unit, f"standard deviation, noise of the poses: {s.long_name}"
-        )
-        variables[f"{s.name}_sigma_calibration"] = Variable(
-            s.sigma_calibration, ("time",), s.unit, f"standard deviation, calibration: {s.long_name}"
-        )
-    return variables
-
-
-def _state_axes() -> dict[str, Variable]:
-    what = "position, rotation vector, velocity, angular velocity, acceleration, angular acceleration; world axes"
-    return {name: Variable(np.array(STATE), (name,), "1", what) for name in ("state", "state_2")}
+def _series_variables(series: Sequence[DerivedSeries]) -> dict[str, Variable]:
+    kinds = (
+        ("value", "", ""),
+        ("sigma", "_sigma", "standard deviation, noise of the poses: "),
+        ("sigma_calibration", "_sigma_calibration", "standard deviation, calibration: "),
+    )
+    return {
+        s.name + ending: Variable(getattr(s, kind), ("time",), s.unit, what + s.long_name)
+        for s in series
+        for kind, ending, what in kinds
+    }
 
 
 def _motion_variables(analysis: Analysis) -> dict[str, Variable]:
     motion = analysis.motion
-    variables = _series_variables(analysis.rates)
     vectors = (
-        ("position", motion.position, "m", "smoothed position of the centre", 0),
-        ("velocity", motion.velocity, "m s-1", "velocity of the centre", 6),
-        ("omega", motion.omega_world, "rad s-1", "angular velocity, world axes", 9),
-        ("acceleration", motion.acceleration, "m s-2", "acceleration of the centre", 12),
-        ("alpha", motion.alpha_world, "rad s-2", "angular acceleration, world axes", 15),
+        ("position", motion.position, "m", "smoothed position of the centre"),
+        ("velocity", motion.velocity, "m s-1", "velocity of the centre"),
+        ("omega", motion.omega_world, "rad s-1", "angular velocity, world axes"),
+        ("acceleration", motion.acceleration, "m s-2", "acceleration of the centre"),
+        ("alpha", motion.alpha_world, "rad s-2", "angular acceleration, world axes"),
     )
-    sigma = np.sqrt(np.diagonal(motion.covariance, axis1=1, axis2=2))
-    common = shared_sigma(motion, np.broadcast_to(np.eye(len(STATE)), motion.covariance.shape))
-    for name, values, unit, text, first in vectors:
-        for i, axis in enumerate("xyz"):
-            item = DerivedSeries(
-                f"{name}_{axis}", unit, f"{text}, {axis}", values[:, i], sigma[:, first + i], common[:, first + i]
-            )
-            variables |= _series_variables((item,))
-    J = euler_jacobian(motion.euler[:, 0], motion.euler[:, 1])
-    angle_variance = np.einsum("nij,njk,nik->ni", J, motion.covariance[:, 3:6, 3:6], J)
-    by_state = np.zeros((len(motion), 3, len(STATE)))
-    by_state[:, :, 3:6] = J
-    shared = shared_sigma(motion, by_state)
-    for i, name in enumerate(("psi", "theta", "phi")):
-        noise = np.sqrt(np.maximum(angle_variance[:, i], 0.0))
-        item = DerivedSeries(name, "rad", f"smoothed {name}, unwrapped", motion.euler[:, i], noise, shared[:, i])
-        variables |= _series_variables((item,))
-    return variables | {
-        "covariance": Variable(
-            motion.covariance, ("time", "state", "state_2"), "products of m, rad, s", "covariance, noise of the poses"
-        ),
-        "bridged": Variable(
-            (~motion.measured & motion.known).astype(np.uint8),
-            ("time",),
-            "1",
-            "1 where the frame has no pose of its own",
-        ),
+    names = [(f"{name}_{axis}", unit, f"{text}, {axis}") for name, _, unit, text in vectors for axis in "xyz"]
+    names += [(name, "rad", f"smoothed {name}, unwrapped") for name in ("psi", "theta", "phi")]
+    values = np.column_stack([*(values for _, values, *_ in vectors), motion.euler])
+    jacobian = np.zeros((len(motion), len(names), N_STATE))
+    jacobian[:, range(15), [0, 1, 2, *range(6, 18)]] = 1.0
+    jacobian[:, 15:, 3:6] = euler_jacobian(motion.euler[:, 0], motion.euler[:, 1])
+    what, bridged = "covariance, noise of the poses", (~motion.measured & motion.known).astype(np.uint8)
+    return {
+        **_series_variables((*analysis.rates, *Propagated(values, jacobian, motion).series(names))),
+        "covariance": Variable(motion.covariance, ("time", "state", "state_2"), "products of m, rad, s", what),
+        "bridged": Variable(bridged, ("time",), "1", "1 where the frame has no pose of its own"),
     }
 
 
@@ -203,19 +184,7 @@ def _motion_attributes(analysis: Analysis) -> dict[str, object]:
 
 
 def _scaling_group(scaling: Scaling) -> Group:
-    fits = scaling.by_window
-    dims = ("scaling_window",)
-    variables = {}
-    for name, text in (("n_theta", "nutation"), ("n_psidot", "precession rate"), ("n_energy", "energy")):
-        exponents = [getattr(fit, name) for fit in fits]
-        for ending, what in (("value", ""), ("sigma", "_sigma"), ("low", "_low"), ("high", "_high")):
-            values = np.array([getattr(e, ending) for e in exponents])
-            variables[name + what] = Variable(values, dims, "1", f"exponent of the {text} in t_f - t, {ending}")
-    variables["t_f"] = Variable(
-        np.array([fit.t_f for fit in fits]), dims, "s", "instant of collapse fitted in the window"
-    )
-    variables["t_f_sigma"] = Variable(np.array([fit.t_f_sigma for fit in fits]), dims, "s", "standard deviation of t_f")
-    laws, count = scaling.laws, scaling.count
+    laws, count, fits = scaling.laws, scaling.count, scaling.by_window
     attributes: dict[str, object] = {
         "window_s": np.array(laws.window),
         "t_f_s": laws.t_f,
@@ -225,9 +194,19 @@ def _scaling_group(scaling: Scaling) -> Group:
         "nutation_over_precession_counted_sigma": count.sigma,
         "nutation_over_precession_expected": np.array(count.expected),
     }
-    for name in ("n_theta", "n_psidot", "n_energy"):
+    found = {"t_f": ([fit.t_f for fit in fits], "s", "instant of collapse fitted in the window")}
+    found["t_f_sigma"] = [fit.t_f_sigma for fit in fits], "s", "standard deviation of t_f"
+    for name, text in (("n_theta", "nutation"), ("n_psidot", "precession rate"), ("n_energy", "energy")):
         exponent = getattr(laws, name)
         attributes[name] = exponent.value
         attributes[f"{name}_sigma"] = exponent.sigma
         attributes[f"{name}_confidence_95"] = np.array([exponent.low, exponent.high])
+        for part in ("value", "sigma", "low", "high"):
+            values = [getattr(getattr(fit, name), part) for fit in fits]
+            key = name if part == "value" else f"{name}_{part}"
+            found[key] = values, "1", f"exponent of the {text} in t_f - t, {part}"
+    variables = {
+        name: Variable(np.array(values), ("scaling_window",), unit, text)
+        for name, (values, unit, text) in found.items()
+    }
     return Group(variables, attributes)

@@ -5,7 +5,8 @@ from urllib.parse import quote
 
 from disctrack.batch.columns import FALSE_DISCOVERY, LACKS_SOMETHING, Row, copies
 from disctrack.batch.records import SKIPPED
-from disctrack.report.blocks import Listing, Markup, Report, Said, Section, Text
+from disctrack.findings import Kind, Severity, of_kind
+from disctrack.report.blocks import Listing, Markup, Report, Section, Text
 from disctrack.report.html import page
 from disctrack.report.numbers import measured, rounded
 
@@ -33,7 +34,7 @@ def index_page(rows: Sequence[Row], repeats: Sequence[Row] = (), together: str =
         Report(
             "Batch of recordings",
             _said(rows),
-            findings=[Said(problem, "warning") for problem in problems],
+            findings=of_kind(Kind.OTHER, Severity.WARNING, problems),
             blocks=[
                 Section("Results", [Listing(header, [_cells(row) for row in rows], classes=classes), _html(files)]),
                 Section("All recordings together", [_html(link)] if together else ()),

@@ -3,7 +3,7 @@
 import dataclasses
 import io
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,8 +22,10 @@ from disctrack.calibrate.views import TargetImages, calibrate_views, declared_vi
 from disctrack.errors import CalibrationError, OutputError, RecordingError, RigFileError
 from disctrack.files.inputs import keep, refuse_input
 from disctrack.files.whole import whole_file
+from disctrack.findings import Kind, Severity, of_kind
 from disctrack.progress import compiling, progress_bar
 from disctrack.recording.declaration import Recording
+from disctrack.report.blocks import Facts, Report
 from disctrack.track import run_summary as summary
 from disctrack.trajectory.file import Provenance
 
@@ -68,8 +70,7 @@ class CalibrationResult:
     """The rig, what to tell about it, and the files it went to."""
 
     rig: StereoRig
-    lines: list[str]
-    files: list[Path]
+    report: Report
 
 
 def source_of(recording: Recording, settings: CalibrationSettings) -> CalibrationSource:
@@ -124,7 +125,7 @@ def given_rig(file: Path) -> CalibrationResult:
     """A rig that a recording shares with others. Raises RigFileError."""
     keep(file)
     rig = read_rig(file)
-    return CalibrationResult(rig, [f"{'calibration':<13} {file}: baseline {rig.baseline * 1e3:.3f} mm"], [])
+    return CalibrationResult(rig, Report("", f"{file}: baseline {rig.baseline * 1e3:.3f} mm"))
 
 
 def calibrate_into(
@@ -138,14 +139,14 @@ def calibrate_into(
     refuse_input(path)
     provenance = source.provenance
     if path.exists() and not overwrite:
-        lines = _reusable(path, provenance)
-        if lines is None:
+        told = _reusable(path, provenance)
+        if told is None:
             raise OutputError(
                 f"{path}: exists, and is not the complete result of these views, settings and version. Keep it and "
                 "choose another place with -o, or replace it with --overwrite."
             )
-        reused = f"{'reused':<13} {path}: complete result of the same views, settings and version"
-        return CalibrationResult(read_rig(path), [reused, *lines], [path])
+        told["rows"].append(("reused", f"{path}: complete result of the same views, settings and version"))
+        return CalibrationResult(read_rig(path), _report(told, [path]))
     found, problems = _calibrate(source)
     if found.assessment.beyond_use and not force:
         said = "; ".join([found.assessment.verdict, *found.warnings])
@@ -153,7 +154,12 @@ def calibrate_into(
             f"{source.views.place}: the rig is beyond use and was not written. {said}. Take better views; `disctrack "
             "calibrate --force` writes it as it is."
         )
-    lines = summary.calibration_lines(found, problems)
+    told = {
+        "verdict": found.assessment.verdict,
+        "accuracy": summary.place_text(found),
+        "rows": summary.calibration_rows(found, problems),
+        "warnings": [*problems, *found.warnings],
+    }
     with whole_file(path, suffix=".h5") as part:
         write_rig(part, found)
         buffer = io.BytesIO(part.read_bytes())  # a disk that fills up fails in one plain write, not inside HDF5
@@ -162,7 +168,7 @@ def calibrate_into(
             file.attrs["inputs_sha256"] = json.dumps(dict(provenance.inputs))
             file.attrs["settings"] = json.dumps(dict(provenance.settings))
             file.attrs["software_version"] = provenance.version
-            file.attrs["summary"] = json.dumps(lines)
+            file.attrs["summary"] = json.dumps(told)
             file.attrs["complete"] = 1
         part.write_bytes(buffer.getbuffer())
     files = [path]
@@ -172,7 +178,13 @@ def calibrate_into(
 
         prefix = "calibration" if path.stem == "rig" else f"{path.stem}_calibration"
         files += [save_figure(make(found), path.with_name(f"{prefix}_{name}.png")) for name, make in FIGURES.items()]
-    return CalibrationResult(found.rig, lines, files)
+    return CalibrationResult(found.rig, _report(told, files))
+
+
+def _report(told: Mapping[str, Any], files: Sequence[Path]) -> Report:
+    """What a calibration tells, from what its rig file keeps of it."""
+    warnings = of_kind(Kind.CALIBRATION, Severity.WARNING, told["warnings"])
+    return Report("", told["verdict"], told["accuracy"], warnings, blocks=[Facts(told["rows"])], files=files)
 
 
 def is_rig_of(path: Path, source: CalibrationSource) -> bool:
@@ -183,12 +195,12 @@ def is_rig_of(path: Path, source: CalibrationSource) -> bool:
         return False
 
 
-def _reusable(path: Path, provenance: Provenance) -> list[str] | None:
-    """Summary of the rig in `path` if it was made, completely, from the same; None otherwise."""
+def _reusable(path: Path, provenance: Provenance) -> dict[str, Any] | None:
+    """What is told of the rig in `path` if it was made, completely, from the same; None otherwise."""
     try:
         with h5py.File(path, "r") as file:
             same = file.attrs.get("fingerprint") == provenance.fingerprint and int(file.attrs.get("complete", 0)) == 1
-            return list(json.loads(file.attrs["summary"])) if same else None
+            return dict(json.loads(file.attrs["summary"])) if same else None
     except Exception as error:  # the HDF5 library raises many kinds on damaged files
         raise RigFileError(
             f"{path}: exists and is not a readable rig file ({' '.join(str(error).split())[:120]}). Move it away, or "

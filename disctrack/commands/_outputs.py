@@ -21,11 +21,11 @@ from disctrack.files.json_text import json_file, json_text
 from disctrack.files.software import software_version
 from disctrack.files.whole import check_writable as check_writable
 from disctrack.files.whole import write_whole
-from disctrack.findings import Finding, Kind, in_doubt
+from disctrack.findings import Finding, Kind, Severity, in_doubt, leading, of_kind
 from disctrack.progress import progress_bar, times_so_far
 from disctrack.recording.changed import changed_since, told_differences
 from disctrack.recording.declaration import FILE_NAME, Recording
-from disctrack.report.blocks import Report, Said, document
+from disctrack.report.blocks import Facts, Report, document
 from disctrack.report.html import link_pages
 from disctrack.report.terminal import show
 from disctrack.track import run_summary as summary
@@ -73,15 +73,15 @@ def calibration_settings(arguments: argparse.Namespace) -> CalibrationSettings:
 
 def track_into(
     path: Path, recording: Recording, rig: StereoRig, rig_file: Path, pairs: ImagePairs, options: TrackOptions
-) -> tuple[list[str], list[Path], tuple[Finding, ...]]:
-    """Track, or reuse what is there; write trajectory, table, pictures, video.
+) -> tuple[Report, tuple[Finding, ...]]:
+    """Track, or reuse what is there; write trajectory, table, pictures, video. returns : also what was noticed
 
-    returns : lines of the summary, files, and what was noticed
     Raises OutputError if `path` holds something else and may not be replaced.
     """
     check_rig(rig, pairs, str(rig_file))
-    lines = [f"{'recording':<13} {recording.name}: {len(pairs)} pairs at {recording.frame_rate:g} Hz"]
+    rows = [("recording", f"{recording.name}: {len(pairs)} pairs at {recording.frame_rate:g} Hz")]
     trajectory, details = None, {}
+    fresh = False
     if path.exists() and not options.overwrite:
         if not storage.is_result_of(path, trajectory_provenance(recording, rig, pairs, options.settings)):
             raise OutputError(
@@ -89,7 +89,7 @@ def track_into(
                 f"{_why(path, recording)}. Keep it and choose another place with -o, or replace it with --overwrite."
             )
         trajectory, details = storage.read_trajectory(path), storage.read_details(path)
-        lines.append(f"{'reused':<13} {path}: complete result of the same images, settings and version")
+        rows.append(("reused", f"{path}: complete result of the same images, settings and version"))
     if trajectory is None:
         with progress_bar("track", len(pairs), "pair") as advance:
             boards = boards_in(rig_file, recording)
@@ -97,13 +97,19 @@ def track_into(
         trajectory, details = measurement.trajectory, measurement.details
         provenance = trajectory_provenance(recording, rig, pairs, options.settings)
         storage.write_trajectory(path, trajectory, provenance, overwrite=options.overwrite, details=details)
-        lines.append(summary.speed_line(len(pairs), measurement.seconds))
+        speed = len(pairs) / max(measurement.seconds, 1e-9)
         fresh = True
-    else:
-        fresh = False
-    lines += summary.trajectory_lines(trajectory, details)
-    files = [path, *_companions(path, trajectory, pairs, options, fresh)]
-    return lines, files, trajectory.findings
+        rows.append(("speed", f"{speed:.0f} pairs/s ({measurement.seconds:.2f} s with reading the images)"))
+    report = Report(
+        recording.name,
+        f"Frames: {summary.frames_text(trajectory)}{'' if fresh else ' (reused)'}.",
+        f"sigma {summary.sigma_text(trajectory)}",
+        leading(trajectory.findings),
+        blocks=[Facts([*rows, *summary.trajectory_rows(trajectory, details)])],
+        files=[path, *_companions(path, trajectory, pairs, options, fresh)],
+        then=f"disctrack analyse {relative(path)}",
+    )
+    return report, trajectory.findings
 
 
 def _why(path: Path, recording: Recording) -> str:
@@ -162,7 +168,7 @@ def tell(
         print(json_text(document(report), indent=1))
     elif not arguments.quiet:
         again = "reused: the complete result of the same input, settings and version"
-        said = [Said(again, "note")] if reused else []
+        said = of_kind(Kind.OTHER, Severity.NOTE, [again] if reused else [])
         page = None if report.page is None else relative(report.page)
         files = [relative(file) for file in report.files]
         text = folder / SUMMARY
@@ -171,14 +177,13 @@ def tell(
         else:
             shown = replace(report, findings=[*report.findings, *said], files=files, page=page)
             show(shown, verbose=arguments.verbose)
-    return exit_code(f for f in findings if f.doubtful)
+    return exit_code(findings)
 
 
 def link_pages_of(trajectory: Path) -> None:
     """Let the pages that were made of a recording name each other."""
     folder, stem = trajectory.parent, trajectory.stem
     link_pages({
-        "measurement": folder / "measurement.html",
         "analysis": folder / f"{stem}_analysis" / "report.html",
         "motion": folder / f"{stem}_analysis" / "motion.html",
         "diagnosis": folder / f"{stem}_diagnosis" / "diagnosis.html",

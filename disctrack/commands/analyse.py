@@ -7,10 +7,12 @@ from pathlib import Path
 from numpy.typing import NDArray
 
 from disctrack.analyse.analysis import Analysis
-from disctrack.analyse.motion_page import write_motion_page
+from disctrack.analyse.motion_page import motion_html
 from disctrack.analyse.stage import run_analyse
 from disctrack.commands import _outputs as outputs
 from disctrack.errors import RecordingError
+from disctrack.files.whole import write_whole
+from disctrack.findings import doubts
 from disctrack.progress import stage
 from disctrack.recording.declaration import FILE_NAME, read_recording
 from disctrack.track.measurement import open_pairs
@@ -29,7 +31,7 @@ def run(arguments: argparse.Namespace) -> int:
     page = folder / "motion.html"
     asked = [page, *([folder / "figures"] if arguments.figures else [])]
     if known is not None and not arguments.overwrite and all(place.exists() for place in asked):
-        return outputs.tell(known, arguments, folder, read_findings(path), reused=True)
+        return outputs.tell(known, arguments, folder, doubts(read_findings(path)), reused=True)
     with stage("analyse"):
         outcome = run_analyse(
             path,
@@ -45,7 +47,7 @@ def run(arguments: argparse.Namespace) -> int:
     report = replace(outcome.summary, files=files, then=f"disctrack diagnose {outputs.relative(path)}")
     remember(folder, origin, report, (outcome.report, page, *outcome.figures))
     outputs.link_pages_of(path)
-    return outputs.tell(report, arguments, folder, outcome.analysis.trajectory.findings)
+    return outputs.tell(report, arguments, folder, doubts(outcome.analysis.trajectory.findings))
 
 
 def _write_motion_page(page: Path, analysis: Analysis, trajectory: Path, recording: Path | None) -> None:
@@ -73,4 +75,5 @@ def _write_motion_page(page: Path, analysis: Analysis, trajectory: Path, recordi
         images = outputs.pair_of(pairs, row)
         return draw_pair(images, analysis.trajectory, row)[: images.shape[1]]  # without the strip of numbers
 
-    write_motion_page(page, analysis, read_provenance(trajectory).recording, None if pairs is None else drawn)
+    name = read_provenance(trajectory).recording
+    write_whole(page, motion_html(analysis, name, None if pairs is None else drawn).encode())

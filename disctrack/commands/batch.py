@@ -7,7 +7,6 @@ from disctrack.batch import BatchOptions, BatchOutcome, Shard, run_batch, summar
 from disctrack.commands import DONE, FAILED, INCOMPLETE
 from disctrack.commands import _outputs as outputs
 from disctrack.files.text import printable
-from disctrack.track import run_summary as summary
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -18,8 +17,8 @@ def run(arguments: argparse.Namespace) -> int:
     else:
         shard = None if arguments.shard is None else Shard(*arguments.shard)
         outcome = run_batch(arguments.folders, options, arguments.output, arguments.jobs, shard, arguments.cluster)
-    files = [outputs.relative(file) for file in outcome.files]
-    print("\n".join([*outcome.lines(), *summary.file_lines(files)]))
+    files = [f"{'' if i else 'files':<13} {outputs.relative(file)}" for i, file in enumerate(outcome.files)]
+    print("\n".join([*outcome.lines(), *files]))
     _tell_problems(outcome)
     if outcome.interrupted:
         raise KeyboardInterrupt

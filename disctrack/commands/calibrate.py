@@ -7,11 +7,9 @@ from typing import Any
 from calibration import Board
 from disctrack.calibrate.stage import CalibrationSource, calibrate_into, source_of
 from disctrack.calibrate.views import find_views
-from disctrack.commands import DONE
 from disctrack.commands import _outputs as outputs
 from disctrack.errors import RecordingError
 from disctrack.recording.declaration import read_recording
-from disctrack.track import run_summary as summary
 
 VIEWS = ("--left", "--right", "--corners", "--square-mm")
 TABLE = ("--table-view", "--board-thickness-mm")
@@ -28,8 +26,7 @@ def run(arguments: argparse.Namespace) -> int:
         path = arguments.output or arguments.recording / outputs.RESULTS / "rig.h5"
     outputs.check_writable(path.parent)
     result = calibrate_into(path, source, arguments.overwrite, figures=not arguments.no_figures, force=arguments.force)
-    print("\n".join([*result.lines, *summary.file_lines([outputs.relative(file) for file in result.files])]))
-    return DONE
+    return outputs.tell(result.report, arguments, path.parent)
 
 
 def _source_of_patterns(arguments: argparse.Namespace) -> CalibrationSource:

@@ -12,6 +12,7 @@ from disctrack.diagnosis import run_diagnose
 from disctrack.diagnosis.stage import first_to_mend
 from disctrack.diagnosis.together.stage import run_together
 from disctrack.errors import TrajectoryFileError
+from disctrack.findings import doubts
 from disctrack.progress import compiling, stage, steps
 from disctrack.recording.readers.blocks import default_threads
 from disctrack.report.blocks import Report
@@ -28,7 +29,7 @@ def run(arguments: argparse.Namespace) -> int:
     path = paths[0]
     folder = arguments.output or path.parent / f"{path.stem}_diagnosis"
     outputs.tell_stale(path)
-    findings = read_findings(path)
+    findings = doubts(read_findings(path))
     model = Path(arguments.model)
     told_model = model.read_text(encoding="utf-8") if model.is_file() else arguments.model
     origin = origin_of(path, {"model": told_model} | ({"plan": True} if arguments.plan else {}))

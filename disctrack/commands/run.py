@@ -1,14 +1,17 @@
 """`disctrack run`: the whole measurement of one recording."""
 
 import argparse
+import sys
+from dataclasses import replace
 
 from disctrack.calibrate.stage import calibrate_into, given_rig, source_of
 from disctrack.commands import _outputs as outputs
 from disctrack.files.inputs import refuse_input
 from disctrack.files.whole import write_whole
 from disctrack.recording.declaration import read_recording
+from disctrack.report.blocks import Facts, Section
+from disctrack.report.terminal import full
 from disctrack.track import measurement as pipeline
-from disctrack.track import run_summary as summary
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -17,8 +20,9 @@ def run(arguments: argparse.Namespace) -> int:
     folder = arguments.output or recording.folder / outputs.RESULTS
     options = outputs.track_options(arguments)
     pairs = pipeline.open_pairs(recording, options.frames)
-    for name in ("trajectory.h5", "summary.txt"):
-        refuse_input(folder / name)
+    summary = folder / outputs.SUMMARY
+    for path in (folder / "trajectory.h5", summary):
+        refuse_input(path)
     outputs.check_writable(folder)
     if recording.rig_file is not None:
         rig_file = recording.rig_file
@@ -27,11 +31,21 @@ def run(arguments: argparse.Namespace) -> int:
         rig_file = folder / "rig.h5"
         source = source_of(recording, outputs.calibration_settings(arguments))
         calibrated = calibrate_into(rig_file, source, options.overwrite, options.figures)
-    lines, files, findings = outputs.track_into(
+    known = calibrated.report
+    verdict = f"Calibration: {known.verdict.partition('. ')[0]}"
+    if not arguments.quiet:
+        print(verdict, file=sys.stderr, flush=True)
+    tracked, findings = outputs.track_into(
         folder / "trajectory.h5", recording, calibrated.rig, rig_file, pairs, options
     )
-    text = [*calibrated.lines, *lines]
-    write_whole(folder / "summary.txt", ("\n".join(text) + "\n").encode())
-    files = [*calibrated.files, *files, folder / "summary.txt", *outputs.write_times(folder, "run")]
-    print("\n".join([*text, *summary.file_lines([outputs.relative(file) for file in files])]))
-    return outputs.exit_code(findings)
+    whole = [("verdict", known.verdict), ("place", known.accuracy)]
+    report = replace(
+        tracked,
+        verdict=f"{tracked.verdict} {verdict}.",
+        findings=[*tracked.findings, *known.findings],
+        blocks=[Section("Calibration", [Facts(whole), *known.blocks]), Section("Tracking", tracked.blocks)],
+        files=[*known.files, *tracked.files, summary, *outputs.write_times(folder, "run")],
+        page=summary,
+    )
+    write_whole(summary, ("\n".join(full(report)) + "\n").encode())
+    return outputs.tell(report, arguments, folder, findings)

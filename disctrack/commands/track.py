@@ -1,6 +1,7 @@
 """`disctrack track`: a recording and a rig become a trajectory."""
 
 import argparse
+from dataclasses import replace
 
 from calibration.rig_file import read_rig
 from disctrack.commands import _outputs as outputs
@@ -8,7 +9,6 @@ from disctrack.errors import RecordingError
 from disctrack.files.inputs import keep, refuse_input
 from disctrack.recording.declaration import read_recording
 from disctrack.track import measurement as pipeline
-from disctrack.track import run_summary as summary
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -27,7 +27,6 @@ def run(arguments: argparse.Namespace) -> int:
     pairs = pipeline.open_pairs(recording, options.frames)
     refuse_input(path)
     outputs.check_writable(path.parent)
-    lines, files, findings = outputs.track_into(path, recording, rig, rig_file, pairs, options)
-    files += outputs.write_times(path.parent, "track")
-    print("\n".join([*lines, *summary.file_lines([outputs.relative(file) for file in files])]))
-    return outputs.exit_code(findings)
+    report, findings = outputs.track_into(path, recording, rig, rig_file, pairs, options)
+    report = replace(report, files=[*report.files, *outputs.write_times(path.parent, "track")])
+    return outputs.tell(report, arguments, path.parent, findings)

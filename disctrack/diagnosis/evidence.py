@@ -5,10 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibration.kit.arrays import Array
-from disctrack.analyse.contact import CONTACT, K, contact_quantities
-from disctrack.analyse.derivatives import differentiate
+from disctrack.analyse.contact import CONTACT, contact_quantities
+from disctrack.analyse.derivatives import K, MotionState, differentiate
 from disctrack.analyse.energy import analyse_energy
-from disctrack.analyse.propagation import RATES, MotionState, propagate, rates
+from disctrack.analyse.propagation import RATES, propagate, rates
 from disctrack.diagnosis.answer import DiscDiagnosis
 from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.diagnosis.errors import HALF_WINDOW, Ahead, energy_balance, free_run, simulated

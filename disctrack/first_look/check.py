@@ -5,7 +5,9 @@ failed is left out and named.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +21,11 @@ from calibration.rig_file import read_rig, record_of
 from disctrack.analyse.declaration import Boards, contradictions_of, turned_board
 from disctrack.calibrate.stage import boards_in, boards_of
 from disctrack.calibrate.views import calibrate_views, declared_views
+from disctrack.disc import Disc
 from disctrack.errors import DiscTrackError, RecordingError
 from disctrack.findings import (
-    MISFITS,
     Finding,
     Kind,
-    Number,
     Remedy,
     Severity,
     Subject,
@@ -34,24 +35,19 @@ from disctrack.findings import (
 )
 from disctrack.frames import CAMERAS, rotation_from_quaternion
 from disctrack.recording.declaration import Recording, read_recording
-from disctrack.recording.readers.blocks import PairBlock, iter_pair_blocks
+from disctrack.recording.readers.blocks import iter_pair_blocks
 from disctrack.report.blocks import Facts, Report, Section
-from disctrack.track.dots.template import locate_on_disc
 from disctrack.track.follow.tracking import Tracking, TrackingSettings, track
 from disctrack.track.measurement import ImagePairs, check_rig, open_pairs
-from disctrack.track.refine.intrinsic_scatter import without_shared_faults
 from disctrack.track.run_summary import left_out
-from disctrack.trajectory import MarkerStatus, Trajectory
+from disctrack.trajectory import Trajectory
 
 KEYS_EXPLAINED = Path(__file__).resolve().parents[1] / "docs" / "recording-toml.md"  # it is installed with the package
 VIEWS_LOOKED_AT = 12  # of the chessboard: half of what a good rig takes
 PLACES = (0.1, 0.5, 0.9)  # of the recording where frames are looked at
-FRAMES_AT_EACH = 40  # twice what the free refinement of the clock needs
-SLIPS = (-3, -2, -1, 1, 2, 3)  # frames that one camera may be ahead of the other
-SLIP_FRAMES = 12
+FRAMES_AT_EACH = 40
 CLAIM = 5e-6  # [m] the accuracy that is claimed for a position
 LAB_FRAME = 20e-6  # [m] to which it is known where a board on a table lies, with no particular care
-NARROW_PX = 6.0  # a dot's shorter width; below, the blur of one edge reaches the other (three sigma on each side)
 CLIPPED_SHARE = 0.002  # of an image's pixels that may be clipped: glints on the rim are
 
 
@@ -65,7 +61,7 @@ class Check:
     calibration: StereoCalibration | None = None
     boards: Boards | None = None
     shown: list[tuple[Trajectory, int, NDArray]] = field(default_factory=list)  # trajectory, row, images (2, h, w)
-    raw: NDArray | None = None  # (2, h, w) a pair in which the disc was not found
+    raw: list[NDArray] = field(default_factory=list)  # pairs in which the disc was not found
 
     def warn(self, kind: Kind, text: str, advice: str = "", severity: Severity = Severity.WARNING) -> None:
         """Add a finding, by default one that deserves a look."""
@@ -75,6 +71,14 @@ class Check:
     def refuse(self, kind: Kind, text: str, advice: str = "") -> None:
         """Add what a run would end with."""
         self.warn(kind, text, advice, Severity.REFUSAL)
+
+    @contextmanager
+    def refusing(self, kind: Kind, advice: str = "") -> Iterator[None]:
+        """An error that ends this step would end a run."""
+        try:
+            yield
+        except DiscTrackError as error:
+            self.refuse(kind, str(error), advice)
 
     def report(self, files: Sequence[Path] = ()) -> Report:
         """The causes, and with `-v` what was seen."""
@@ -97,17 +101,18 @@ def run_check(folder: Path, progress: Callable[[str], None] = lambda step: None)
 
     progress is called with what is looked at next. Raises nothing that belongs to the recording: that is a remark.
     """
-    seen = Check()
+    seen, pairs, rig = Check(), None, None
     progress("declaration")
-    try:
-        recording = seen.recording = read_recording(folder)
-    except RecordingError as error:
-        seen.refuse(Kind.DECLARATION, str(error), f"every key: {KEYS_EXPLAINED}")
+    with seen.refusing(Kind.DECLARATION, f"every key: {KEYS_EXPLAINED}"):
+        seen.recording = read_recording(folder)
+    if (recording := seen.recording) is None:
         return seen
     seen.seen.append(("declaration", f"{recording.file} is complete"))
-    pairs = _frames(seen, recording)
+    with seen.refusing(Kind.READING):
+        pairs = _frames(seen, recording)
     progress("chessboard")
-    rig = _rig(seen, recording)
+    with seen.refusing(Kind.CALIBRATION):
+        rig = _rig(seen, recording)
     if pairs is None:
         return seen
     progress("light")
@@ -117,22 +122,15 @@ def run_check(folder: Path, progress: Callable[[str], None] = lambda step: None)
             seen.findings += turned_board(recording.chessboard.inner_corners)
         seen.warn(Kind.DISC_NOT_FOUND, "the dots were not looked for: that needs the cameras' calibration")
         return seen
-    try:
+    with seen.refusing(Kind.CALIBRATION):
         check_rig(rig, pairs, "the calibration")
-    except RecordingError as error:
-        seen.refuse(Kind.CALIBRATION, str(error))
-        return seen
-    progress("dots")
-    _motion(seen, recording, rig, pairs)
+        progress("dots")
+        _motion(seen, recording, rig, pairs)
     return seen
 
 
-def _frames(seen: Check, recording: Recording) -> ImagePairs | None:
-    try:
-        pairs = open_pairs(recording)
-    except RecordingError as error:
-        seen.refuse(Kind.READING, str(error))
-        return None
+def _frames(seen: Check, recording: Recording) -> ImagePairs:
+    pairs = open_pairs(recording)
     width, height = pairs.left.image_size
     lasts = f"{len(pairs) / recording.frame_rate:.3g} s at {recording.frame_rate:g} Hz"
     seen.seen.append(("frames", f"{len(pairs)} pairs of {width} x {height} px, {pairs.left.bit_depth} bit, {lasts}"))
@@ -140,32 +138,22 @@ def _frames(seen: Check, recording: Recording) -> ImagePairs | None:
     return pairs
 
 
-def _rig(seen: Check, recording: Recording) -> StereoRig | None:
+def _rig(seen: Check, recording: Recording) -> StereoRig:
     if recording.rig_file is not None:
-        try:
-            rig = read_rig(recording.rig_file)
-        except DiscTrackError as error:
-            seen.refuse(Kind.CALIBRATION, str(error))
-            return None
+        rig = read_rig(recording.rig_file)
         seen.seen.append(("rig", f"{recording.rig_file}: baseline {1e3 * rig.baseline:.1f} mm"))
         seen.boards = boards_in(recording.rig_file, recording)
         return rig
     declared, table = recording.views, recording.table
     assert declared is not None
     assert table is not None
-    try:
-        views = declared_views(recording, declared)
-        if table.view >= len(views):
-            raise RecordingError(f"[table] view = {table.view}, but there are {len(views)} views, counted from 0")
-        chosen = sorted({*evenly(len(views), VIEWS_LOOKED_AT), table.view})
-        some = replace(views, left=tuple(views.left[i] for i in chosen), right=tuple(views.right[i] for i in chosen))
-        settings = CalibrationSettings()
-        found, problems = calibrate_views(
-            some, declared.target, chosen.index(table.view), table.board_thickness, settings
-        )
-    except DiscTrackError as error:
-        seen.refuse(Kind.CALIBRATION, str(error))
-        return None
+    views = declared_views(recording, declared)
+    if table.view >= len(views):
+        raise RecordingError(f"[table] view = {table.view}, but there are {len(views)} views, counted from 0")
+    chosen = sorted({*evenly(len(views), VIEWS_LOOKED_AT), table.view})
+    some = replace(views, left=tuple(views.left[i] for i in chosen), right=tuple(views.right[i] for i in chosen))
+    view, settings = chosen.index(table.view), CalibrationSettings()
+    found, problems = calibrate_views(some, declared.target, view, table.board_thickness, settings)
     seen.calibration, seen.boards = found, boards_of(record_of(found), some, chosen)
     used = len(chosen) - len(problems) - len(found.rejected_views)
     text = f"found in {used} of {len(chosen)} pairs of views looked at ({len(views)} in all)"
@@ -180,7 +168,7 @@ def _rig(seen: Check, recording: Recording) -> StereoRig | None:
 
 
 def _light(seen: Check, recording: Recording, pairs: ImagePairs) -> None:
-    images = _pairs_at(pairs, [round(place * (len(pairs) - 1)) for place in PLACES])
+    images = np.array(_pairs_at(pairs, [round(place * (len(pairs) - 1)) for place in PLACES]))
     if not len(images):
         seen.refuse(Kind.UNREADABLE, "none of the frames looked at can be read", "copy the frames again")
         return
@@ -214,29 +202,28 @@ def _motion(seen: Check, recording: Recording, rig: StereoRig, pairs: ImagePairs
         except DiscTrackError as error:
             lost.append(Finding(Kind.DISC_NOT_FOUND, Severity.WARNING, str(error), Subject("check")))
             lost += getattr(error, "findings", ())
-            seen.raw = seen.raw if seen.raw is not None else _first(_pairs_at(pairs, [frames.start]))
+            seen.raw += _pairs_at(pairs, [frames.start])
     seen.findings += _once(lost)
     if not done:
         seen.refuse(Kind.DISC_NOT_FOUND, "the disc was found nowhere", "compare [markers] with the picture")
         return
     for frames, tracking in done:
         row = len(frames) // 2
-        images = _first(_pairs_at(pairs, [frames[row]]))
-        if images is not None:
-            seen.shown.append((tracking.trajectory, row, images))
+        seen.shown += [(tracking.trajectory, row, images) for images in _pairs_at(pairs, [frames[row]])]
     measured = sum(int(tracking.trajectory.measured.sum()) for _, tracking in done)
     total = sum(len(frames) for frames, _ in done)
     seen.seen.append(("dots", f"disc measured in {measured} of {total} frames looked at"))
     if measured < total:
         seen.warn(Kind.FRAMES_LOST, f"the disc was measured in {measured} of {total} frames looked at")
-    _dots(seen, [tracking for _, tracking in done])
     whole = _together([tracking.trajectory for _, tracking in done])
     noticed = _once(finding for _, tracking in done for finding in tracking.findings)
     for finding in contradictions_of(recording, whole, noticed, seen.boards):
         graver = Severity.DOUBT if finding.kind == Kind.DOT_UNSEEN else finding.severity
         seen.findings.append(replace(finding, severity=graver))
-    _sharpness(seen, recording, rig, pairs, done[len(done) // 2])
-    _synchronisation(seen, recording, rig, pairs, *done[len(done) // 2])
+    tracking = done[len(done) // 2][1]
+    if tracking.trajectory.measured.any():
+        _sharpness(seen, recording.disc, tracking)
+        _accuracy(seen, tracking.trajectory)
     seen.findings += noticed
 
 
@@ -248,19 +235,12 @@ def _once(findings: Iterable[Finding]) -> list[Finding]:
     return list(first.values())
 
 
-def _track(recording: Recording, rig: StereoRig, pairs: ImagePairs, frames: range, slip: int = 0) -> Tracking:
-    """Track a stretch; slip: frames by which the right camera's are taken later than the left one's."""
-
-    def read_blocks(start: int, stop: int) -> Iterator[PairBlock]:
-        if slip == 0:
-            yield from iter_pair_blocks(pairs.left, pairs.right, start, stop)
-            return
-        images = _pairs_at(pairs, list(range(start, stop)), slip)
-        yield PairBlock(np.arange(start, start + len(images)), images)
-
-    settings = TrackingSettings(refine_markers=False, first_pass=False)
-    return track(read_blocks, frames, rig, recording.disc, recording.frame_rate, gravity=recording.gravity,
-                 settings=settings)  # fmt: skip
+def _track(recording: Recording, rig: StereoRig, pairs: ImagePairs, frames: range) -> Tracking:
+    """Track a stretch."""
+    settings = TrackingSettings(refine_markers=False, first_pass=False, table="board")
+    read_blocks = partial(iter_pair_blocks, pairs.left, pairs.right)
+    rate, gravity = recording.frame_rate, recording.gravity
+    return track(read_blocks, frames, rig, recording.disc, rate, gravity=gravity, settings=settings)
 
 
 def _together(stretches: list[Trajectory]) -> Trajectory:
@@ -271,52 +251,24 @@ def _together(stretches: list[Trajectory]) -> Trajectory:
     return replace(first, **joined)
 
 
-def _dots(seen: Check, tracks: list[Tracking]) -> None:
-    """A camera that measures no dot."""
-    status = np.concatenate([tracking.trajectory.marker_status for tracking in tracks])
-    with_pose = np.concatenate([tracking.trajectory.measured for tracking in tracks])
-    seen_share = np.mean(status[with_pose] == MarkerStatus.MEASURED, axis=0) if with_pose.any() else np.zeros((2, 1))
-    for camera, name in enumerate(CAMERAS):
-        if seen_share[camera].max() < 0.1:
-            text = f"the {name} camera measures no dot"
-            seen.warn(Kind.ONE_SIDED, text, "are left and right exchanged, does it see the upper face?", Severity.DOUBT)
-
-
-def _sharpness(
-    seen: Check, recording: Recording, rig: StereoRig, pairs: ImagePairs, looked: tuple[range, Tracking]
-) -> None:
-    frames, tracking = looked
+def _sharpness(seen: Check, disc: Disc, tracking: Tracking) -> None:
+    """Blur of the dots' edges against the dots' width, where the disc is in the middle of a stretch."""
     trajectory = tracking.trajectory
     rows = np.flatnonzero(trajectory.measured)
-    if not len(rows):
-        return
-    row = int(rows[len(rows) // 2])
-    images = _first(_pairs_at(pairs, [frames[row]]))
-    if images is None:
-        return
-    R, t = rotation_from_quaternion(trajectory.quaternion[row]), trajectory.q[row, :3]
-    for camera, (name, (R_cw, t_cw)) in enumerate(zip(CAMERAS, rig.camera_poses(), strict=True)):
-        one = rig.cameras[camera]
-        found = locate_on_disc(images[camera], one, R_cw @ R, R_cw @ t + t_cw, recording.disc,
-                               noise=tracking.noise[camera], blur_px=tracking.blur_px[camera])  # fmt: skip
-        if not np.isfinite(found.contrast).any():
-            continue
-        centre = R_cw @ t + t_cw
-        tilt = abs(float((R_cw @ R)[:, 2] @ centre)) / float(np.linalg.norm(centre))
-        width = one.fx * recording.disc.marker_diameter / float(centre[2])
-        level, contrast = float(np.nanmedian(found.level)), float(np.nanmedian(found.contrast))
-        noise = float(np.sqrt(tracking.noise[camera].variance(np.array(level))))
-        text = (
-            f"{name}: dots {width:.0f} px wide, blur {tracking.blur_px[camera]:.2f} px (sigma), contrast "
-            f"{100 * abs(contrast):.0f} %, {level * abs(contrast) / noise:.0f} times the noise"
-        )
+    row = rows[len(rows) // 2]
+    axis = rotation_from_quaternion(trajectory.quaternion[row])[:, 2]
+    for camera, (name, (R, t)) in enumerate(zip(CAMERAS, trajectory.rig.camera_poses(), strict=True)):
+        centre, blur = R @ trajectory.q[row, :3] + t, tracking.blur_px[camera]
+        width = trajectory.rig.cameras[camera].fx * disc.marker_diameter / float(centre[2])
+        across = width * abs(float(R @ axis @ centre)) / float(np.linalg.norm(centre))
+        text = f"{name}: dots {width:.0f} px wide, {across:.1f} px across, blur {blur:.2f} px (sigma)"
         seen.seen.append(("sharpness", text))
-        if width * tilt < NARROW_PX:
-            advice = "larger dots, a longer lens, or cameras that look more steeply"
-            seen.warn(Kind.SHARPNESS, f"{text}; only {width * tilt:.1f} px across", advice)
-        elif 3 * tracking.blur_px[camera] > 0.5 * width * tilt:
-            advice = "focus on the disc, close the aperture, expose for a shorter time"
+        if 6 * blur > across:  # three sigma on each side
+            advice = "larger dots, sharper focus, a shorter exposure, or cameras that look more steeply"
             seen.warn(Kind.SHARPNESS, f"{text}: the blur of opposite edges overlaps", advice)
+
+
+def _accuracy(seen: Check, trajectory: Trajectory) -> None:
     sigma = np.nanmedian(trajectory.coordinate_sigma[:, :3], axis=0)
     shared = np.nanmedian(trajectory.calibration_sigma[:, :3], axis=0)
     text = (
@@ -330,79 +282,10 @@ def _sharpness(
         seen.warn(Kind.ACCURACY, text, "more views of the board, tilted and all over; a board that is known better")
 
 
-def _synchronisation(
-    seen: Check, recording: Recording, rig: StereoRig, pairs: ImagePairs, frames: range, tracking: Tracking
-) -> None:
-    trajectory = tracking.trajectory
-    rms = float(np.sqrt(np.nanmean(trajectory.reprojection_rms_px**2)))
-    motion = np.linalg.norm(np.diff(trajectory.markers_px, axis=0), axis=-1)
-    if not np.isfinite(motion).any():
-        return
-    speed = float(np.nanmedian(motion))
-    if tracking.variance_factor > 4.0:  # dots disagree with every pose by more than twice their noise
-        better = _slip(recording, rig, pairs, frames, rms)
-        if better is not None:
-            slip, its_rms = better
-            text = (
-                f"left frame i and right frame i{slip:+d} show the same instant: that leaves {its_rms:.3f} px, the "
-                f"declared pairing {rms:.3f} px"
-            )
-            camera = CAMERAS[slip > 0]
-            advice = (Remedy(action="export the same instants of both cameras"),)
-            explains = (Kind.DELAY, Kind.DROPPED_FRAMES, *MISFITS)
-            of = Subject("check", camera)
-            seen.findings.append(
-                Finding(Kind.DROPPED_FRAMES, Severity.DOUBT, text, of, {"images": Number(slip)}, advice, explains)
-            )
-            return
-    moving = trajectory.rig.world_is_table and speed > 0.2
-    faults = None
-    if moving:
-        R = rotation_from_quaternion(trajectory.quaternion)
-        faults = without_shared_faults(trajectory.markers_px, trajectory.markers_covariance_px2, rig, recording.disc,
-                                       R, trajectory.q[:, :3])  # fmt: skip
-    if faults is None:
-        text = f"dots move by {speed:.2f} px per frame here: too few or too slow to tell a delay"
-        seen.seen.append(("clock", text))
-        return
-    offset = abs(faults.delay) * speed  # in pixels, against what the dots' noise leaves open
-    noise = float(np.sqrt(np.nanmedian(np.trace(trajectory.markers_covariance_px2, axis1=-2, axis2=-1)) / 2))
-    unsure = offset < 3 * max(noise, 0.02)  # 0.02 px: what a rig within its calibration leaves
-    text = f"right camera {faults.delay:+.3f} frame periods after the left, by the dots' motion"
-    seen.seen.append(("clock", f"no delay between the cameras shows ({text})" if unsure else text))
-    if not unsure:
-        seen.warn(Kind.DELAY, text, "are both cameras triggered by one signal, with one exposure time?")
-
-
-def _slip(
-    recording: Recording, rig: StereoRig, pairs: ImagePairs, frames: range, rms: float
-) -> tuple[int, float] | None:
-    """The slip that fits far better than none, if any, and the dots' rms [px] with it."""
-    best: tuple[int, float] | None = None
-    for slip in SLIPS:
-        some = frames[max(0, -slip) : SLIP_FRAMES + max(0, -slip)]
-        if some.stop + slip > len(pairs.right) or some.start + slip < 0:
-            continue
-        try:
-            tried = _track(recording, rig, pairs, some, slip).trajectory
-        except DiscTrackError:
-            continue
-        its = float(np.sqrt(np.nanmean(tried.reprojection_rms_px**2)))
-        if tried.measured.all() and its < 0.5 * (rms if best is None else best[1]):
-            best = (slip, its)
-    return best
-
-
-def _pairs_at(pairs: ImagePairs, indices: list[int], slip: int = 0) -> NDArray:
-    """(k, 2, h, w) images of these frames; those that cannot be read are left out."""
+def _pairs_at(pairs: ImagePairs, indices: Iterable[int]) -> list[NDArray]:
+    """(2, h, w) images of each of these frames; those that cannot be read are left out."""
     found = []
     for index in indices:
-        try:
-            found.append(np.stack([np.array(pairs.left.read(index)), np.array(pairs.right.read(index + slip))]))
-        except (RecordingError, IndexError):
-            continue
-    return np.array(found)
-
-
-def _first(images: NDArray) -> NDArray | None:
-    return images[0] if len(images) else None
+        with suppress(RecordingError):
+            found.append(np.stack([np.array(pairs.left.read(index)), np.array(pairs.right.read(index))]))
+    return found

@@ -26,23 +26,40 @@ from disctrack.recording.readers.base import FrameReader
 from disctrack.recording.readers.decoding import decode
 from disctrack.recording.readers.files import match_files, split_member
 
+HEADINGS = {  # of the sections, in their order
+    "cameras": "frame i of the left and of the right must show the same instant",
+    "disc": "",
+    "markers": "round dots on the upper face, all of one size",
+    "calibration": "synchronised views of a flat chessboard",
+    "table": "the lab frame: k up from the table, which is z = 0",
+    "gravity": "",
+}
+ROWS = (  # section, key, what may stand there, remark
+    ("cameras", "frame_rate_hz", "1000.0", "frames per second of the cameras"),
+    ("cameras", "left", "", ""),
+    ("cameras", "right", "", ""),
+    ("disc", "radius_mm", "37.5", "caliper"),
+    ("disc", "thickness_mm", "6.0", "caliper, with the paper"),
+    ("disc", "mass_g", "209.69", "balance, with the paper"),
+    ("markers", "diameter_mm", "7.0", "as printed"),
+    (
+        "markers",
+        "centres_mm",
+        "[[26.0, 0.0], [13.0, 22.5], [-13.0, 22.5]]",
+        "[x, y] of dots from the disc's centre",
+    ),
+    ("calibration", "left", '"calibration/left/*.png"', "views of a chessboard, 15 to 40 of them"),
+    ("calibration", "right", '"calibration/right/*.png"', "the same views, in the same order"),
+    ("calibration", "inner_corners", "[9, 6]", "long side first; count them"),
+    ("calibration", "square_mm", "6.0", "side of a square, measured over many squares"),
+    ("table", "view", "0", "CHECK: in this view, counted from 0, the board lies flat on the table"),
+    ("table", "board_thickness_mm", "3.0", "height of the printed face above the table"),
+    ("gravity", "g_m_s2", "9.81", "9.78 (equator) to 9.83"),
+)
+# Sections whose keys with a default hold for another recording of the same disc and board
+ALIKE = ("disc", "calibration", "table")
 
-@dataclass(frozen=True)
-class FolderContent:
-    """What the files of a folder tell."""
-
-    folder: Path
-    frames: CameraPair
-    described: str  # size, depth and number of the frames
-    frame_rate: float | None  # [Hz] where a camera's header or the frames' time stamps tell it
-    rate_source: str
-    views: CameraPair | None
-    views_count: int
-    inner_corners: tuple[int, int] | None
-    board_seen: str  # in how many of the views that were tried
-    rig_file: str | None  # where there are no views
-    parts: tuple[list[int], list[int]] | None  # x, y, width, height [px] of the cameras' images in those of the files
-    notes: tuple[str, ...]
+Told = dict[tuple[str, str], tuple[Any, str]]  # (section, key) -> value, None if not known; and a remark
 
 
 @dataclass(frozen=True)
@@ -50,7 +67,7 @@ class WrittenDeclaration:
     """What `run_init` wrote."""
 
     file: Path
-    found: FolderContent
+    seen: list[tuple[str, str]]  # headings, and what the files tell
     missing: tuple[str, ...]  # keys that the user has to fill in
 
 
@@ -66,64 +83,81 @@ def run_init(folder: Path, known: Mapping[str, float] | None = None, like: Path 
     if file.exists():
         raise OutputError(f"{file}: exists. Edit it, or move it away; `disctrack check {folder}` tells what it lacks.")
     example = {} if like is None else read_toml(like / FILE_NAME if like.is_dir() else like, RecordingError)
-    found = look_into(folder)
-    text, missing = declaration(found, known or {}, example)
+    told, seen = look_into(folder)
+    given = {"gravity": {"g_m_s2": 9.81}} | example
+    text, missing = declaration(folder.resolve().name, told, known or {}, given)
     write_whole(file, text.encode())
-    return WrittenDeclaration(file, found, missing)
+    return WrittenDeclaration(file, seen, missing)
 
 
-def look_into(folder: Path) -> FolderContent:
-    """What the frames of a folder tell. Raises RecordingError if no two cameras can be told apart."""
+def look_into(folder: Path) -> tuple[Told, list[tuple[str, str]]]:
+    """What the frames of a folder tell, and in words. Raises RecordingError if no two cameras can be told apart."""
     sequences = find_sequences(folder)
     shows_once = cache(partial(_shows_the_board_once, folder))  # seconds, for large images
-    pairs, parts = pair_cameras(sequences), None
+    pairs, half = pair_cameras(sequences), None
     if _may_be_one_camera(pairs, sequences, shows_once) and (half := _side_by_side(folder, sequences)):
-        width, height = half
-        parts = [0, 0, width, height], [width, 0, width, height]
         pairs = [CameraPair(sequence, sequence, named=True) for sequence in sequences]
     if not pairs:
         raise _no_two_cameras(folder, sequences)
-    notes = []
-    views, inner_corners, board_seen = _views_among(folder, pairs, 1 if parts is None else 2)
+    views, inner_corners, board_seen = _views_among(folder, pairs, 1 if half is None else 2)
     candidates = [pair for pair in pairs if pair is not views] or pairs
     lengths = {id(pair): _length(folder, pair.left) for pair in candidates}
     frames = max(candidates, key=lambda pair: lengths[id(pair)])
-    if views is None and parts is None and shows_once(frames):
+    if views is None and half is None and shows_once(frames):
         raise _no_two_cameras(folder, sequences)
+    if frames is views:
+        raise _views_alone(folder, frames, inner_corners or (9, 6))
+    told, seen = _of_frames(folder, frames)
     if len(candidates) > 1:
         others = ", ".join(pair.left.pattern for pair in candidates if pair is not frames)
-        notes.append(f"the longest of several pairs is taken for the recording; also there: {others}")
-    if frames is views:
-        columns, rows = inner_corners or (9, 6)
-        raise RecordingError(
-            f"{folder}: {frames.left.pattern} and {frames.right.pattern} show a chessboard, and nothing else is there. "
-            "Put the cameras' frames of the disc beside them. The cameras alone: disctrack calibrate "
-            f"--left '{folder / frames.left.pattern}' --right '{folder / frames.right.pattern}' "
-            f"--corners {columns}x{rows} --square-mm SIDE -o rig.h5"
-        )
+        seen.append(("note", f"the longest of several pairs is taken for the recording; also there: {others}"))
+    if half is not None:
+        width, height = half
+        told["cameras", "left_part"] = [0, 0, width, height], ""
+        told["cameras", "right_part"] = [width, 0, width, height], ""
+        text = "each image holds two views side by side, as the board in both halves shows: left_part, right_part"
+        seen.append(("note", text))
+    if views is not None:
+        left, right, count = views.left.pattern, views.right.pattern, _length(folder, views.left)
+        told["calibration", "left"], told["calibration", "right"] = (left, f"{count} views"), (right, "")
+        corners = ""
+        if inner_corners is not None:
+            told["calibration", "inner_corners"] = list(inner_corners), f"long side first; {board_seen}"
+            corners = f", {inner_corners[0]} x {inner_corners[1]} corners"
+        seen.append(("chessboard", f"{left}: {count} views{corners} ({board_seen})"))
+    elif (rig_file := _rig_beside(folder)) is not None:
+        told["calibration", "rig"] = rig_file, "a rig that was calibrated before"
+        seen.append(("rig", rig_file))
+    return told, seen
+
+
+def _of_frames(folder: Path, frames: CameraPair) -> tuple[Told, list[tuple[str, str]]]:
+    """What the cameras' frames tell, and in words."""
     left, right = frames.left.open(folder), frames.right.open(folder, "right")
-    rate, source = _frame_rate(left, right)
-    if parts is not None:
-        notes.append(
-            "each image holds two views side by side, as the board in both halves shows: left_part, right_part"
-        )
-    if not frames.named:
-        notes.append(f"which camera is left is a guess by the order of names: {frames.left.pattern} is taken for left")
-    rig_file = None if views is not None else _rig_beside(folder)
     width, height = left.image_size
-    return FolderContent(
-        folder,
-        frames,
-        f"{len(left)} frames of {width} x {height} px, {left.bit_depth} bit",
-        rate,
-        source,
-        views,
-        0 if views is None else _length(folder, views.left),
-        inner_corners,
-        board_seen,
-        rig_file,
-        parts,
-        tuple(notes),
+    described = f"{len(left)} frames of {width} x {height} px, {left.bit_depth} bit"
+    told: Told = {
+        ("cameras", "left"): (frames.left.pattern, described),
+        ("cameras", "right"): (frames.right.pattern, ""),
+        ("table", "view"): (0, ""),
+    }
+    seen = [("cameras", f"{frames.left.pattern} and {frames.right.pattern}: {described}")]
+    rate, source = _frame_rate(left, right)
+    if rate is not None:
+        told["cameras", "frame_rate_hz"] = rate, f"frames per second, {source}"
+        seen.append(("", f"{rate:g} Hz, {source}"))
+    if not frames.named:
+        text = f"which camera is left is a guess by the order of names: {frames.left.pattern} is taken for left"
+        seen.append(("note", text))
+    return told, seen
+
+
+def _views_alone(folder: Path, views: CameraPair, corners: tuple[int, int]) -> RecordingError:
+    return RecordingError(
+        f"{folder}: {views.left.pattern} and {views.right.pattern} show a chessboard, and nothing else is there. "
+        "Put the cameras' frames of the disc beside them. The cameras alone: disctrack calibrate "
+        f"--left '{folder / views.left.pattern}' --right '{folder / views.right.pattern}' "
+        f"--corners {corners[0]}x{corners[1]} --square-mm SIDE -o rig.h5"
     )
 
 
@@ -231,95 +265,35 @@ def _rig_beside(folder: Path) -> str | None:
 
 
 def declaration(
-    found: FolderContent, known: Mapping[str, float], example: Mapping[str, Any]
+    name: str, told: Told, known: Mapping[str, float], example: Mapping[str, Any]
 ) -> tuple[str, tuple[str, ...]]:
     """Text of the recording.toml, and the keys that nobody told."""
-    missing: list[str] = []
-
-    def line(section: str, key: str, value: Any, example_text: str, remark: str) -> str:
-        """One key: what the files tell, else what the user gave, else the example's, else left to fill in."""
-        if value is None:
-            value = known.get(key, example.get(section, {}).get(key))
-        if value is None:
-            missing.append(f"[{section}] {key}")
-            return _aligned(f"# {key} = {example_text}", f"FILL IN: {remark}")
-        return _aligned(f"{key} = {toml_value(value)}", remark)
-
-    f = found.frames
-    rate_remark = f"frames per second, {found.rate_source}" if found.rate_source else "frames per second of the cameras"
     lines = [
         "# Lengths in mm, masses in g, times in s. Every key: disctrack/docs/recording-toml.md",
-        f"name = {toml_value(found.folder.resolve().name)}",
-        "",
-        "[cameras]                       # frame i of the left and of the right must show the same instant",
-        line("cameras", "frame_rate_hz", found.frame_rate, "1000.0", rate_remark),
-        _exposure(example),
-        _aligned(f"left = {toml_value(f.left.pattern)}", found.described),
-        f"right = {toml_value(f.right.pattern)}",
-        *_part_lines(found),
-        "",
-        "[disc]",
-        line("disc", "radius_mm", None, "37.5", "caliper"),
-        line("disc", "thickness_mm", None, "6.0", "caliper, with the paper"),
-        line("disc", "mass_g", None, "209.69", "balance, with the paper"),
-        *_optional("disc", example),
-        "",
-        "[markers]                       # round dots on the upper face, all of one size",
-        line("markers", "diameter_mm", None, "7.0", "as printed"),
-        line(
-            "markers", "centres_mm", None, "[[26.0, 0.0], [13.0, 22.5], [-13.0, 22.5], [6.5, -11.3]]",
-            "[x, y] of every dot from the disc's centre",
-        ),
-        "",
-        *_calibration_lines(found, line, example),
-        "[gravity]",
-        line("gravity", "g_m_s2", example.get("gravity", {}).get("g_m_s2", 9.81), "9.81", "9.78 (equator) to 9.83"),
-    ]  # fmt: skip
+        f"name = {toml_value(name)}",
+    ]
+    missing = []
+    rig = ("calibration", "rig") in told
+    for section, heading in HEADINGS.items():
+        if rig and section == "table":
+            continue
+        lines += ["", _aligned(f"[{section}]", heading)]
+        given = example.get(section, {})
+        keys = [row[1:] for row in ROWS if row[0] == section and not (rig and section == "calibration")]
+        for key, shown, remark in keys:
+            value, source = told.get((section, key), (known.get(key, given.get(key)), ""))
+            if value is None:
+                missing.append(f"[{section}] {key}")
+                lines.append(_aligned(f"# {key} = {shown}", f"FILL IN: {remark}"))
+            else:
+                lines.append(_aligned(f"{key} = {toml_value(value)}", source or remark))
+        for key in sorted(key for key, meant in KEYS[section].items() if not meant.needed):
+            alike = (section in ALIKE and key != "rig" and not rig) or key == "exposure_us"
+            value, source = told.get((section, key), (given.get(key) if alike else None, ""))
+            if value is not None:
+                lines.append(_aligned(f"{key} = {toml_value(value)}", source))
     return "\n".join(lines) + "\n", tuple(missing)
 
 
-def _part_lines(found: FolderContent) -> list[str]:
-    if found.parts is None:
-        return []
-    left, right = map(toml_value, found.parts)
-    return [_aligned(f"left_part = {left}", "x, y, width, height in px of its images"), f"right_part = {right}"]
-
-
-def _exposure(example: Mapping[str, Any]) -> str:
-    remark = "with it, poses are those of mid exposure; else it is taken as short"
-    given = example.get("cameras", {}).get("exposure_us")
-    return _aligned("# exposure_us = 200.0" if given is None else f"exposure_us = {toml_value(given)}", remark)
-
-
-def _calibration_lines(found: FolderContent, line: Any, example: Mapping[str, Any]) -> list[str]:
-    if found.views is None and found.rig_file is not None:
-        rig = _aligned(f"rig = {toml_value(found.rig_file)}", "a rig that was calibrated before")
-        return ["[calibration]", rig, ""]
-    left, right = (None, None) if found.views is None else (found.views.left.pattern, found.views.right.pattern)
-    corners = None if found.inner_corners is None else list(found.inner_corners)
-    count = f"{found.views_count} views" if found.views is not None else "views of a chessboard, 15 to 40 of them"
-    return [
-        "[calibration]                   # synchronised views of a flat chessboard",
-        line("calibration", "left", left, '"calibration/left/*.png"', count),
-        line("calibration", "right", right, '"calibration/right/*.png"', "the same views, in the same order"),
-        line("calibration", "inner_corners", corners, "[9, 6]", f"long side first; {found.board_seen or 'count them'}"),
-        line("calibration", "square_mm", None, "6.0", "side of a square, measured over many squares"),
-        *_optional("calibration", example),
-        "",
-        "[table]                         # the lab frame: k up from the table, which is z = 0",
-        line("table", "view", 0, "0", "CHECK: in this view, counted from 0, the board lies flat on the table"),
-        line("table", "board_thickness_mm", None, "3.0", "height of the printed face above the table"),
-        *_optional("table", example),
-        "",
-    ]
-
-
-def _optional(section: str, example: Mapping[str, Any]) -> list[str]:
-    """Keys with a default, where the example gives them."""
-    given = example.get(section, {})
-    keys = [key for key, meant in sorted(KEYS[section].items()) if not meant.needed and key in given and key != "rig"]
-    return [f"{key} = {toml_value(given[key])}" for key in keys]
-
-
 def _aligned(text: str, remark: str) -> str:
-    return f"{text:<32}# {remark}" if len(text) < 32 else f"{text}  # {remark}"
+    return f"{text:<31} # {remark}" if remark else text

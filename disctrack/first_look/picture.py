@@ -25,8 +25,8 @@ def check_figure(seen: Check) -> Figure | None:
         (f"frame {trajectory.frame[row]}", draw_pair(images, trajectory, row)[..., ::-1])
         for trajectory, row, images in seen.shown
     ]
-    if not frames and seen.raw is not None:
-        frames = [("disc not found", np.hstack([_shown(image) for image in seen.raw]))]
+    if not frames:
+        frames = [("disc not found", np.hstack([_shown(image) for image in images])) for images in seen.raw[:1]]
     n = len(frames) + (table is not None)
     if n == 0:
         return None

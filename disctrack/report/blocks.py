@@ -6,9 +6,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from disctrack.files.json_text import plain
+from disctrack.findings import Finding, Kind, Severity
 from disctrack.report.numbers import Measured
 
 if TYPE_CHECKING:
@@ -16,32 +17,11 @@ if TYPE_CHECKING:
 
 Cell = str | Measured
 
-SEVERITIES = ("refusal", "doubt", "warning", "note")  # the gravest first
 _NOTHING: Mapping[str, Any] = MappingProxyType({})
 
 
 class Markup(str):
     """HTML that goes into a page as it is; no other writer shows it."""
-
-
-class Says(Protocol):
-    """What a report asks of a finding."""
-
-    @property
-    def severity(self) -> Any:
-        """One of SEVERITIES, or an enumeration of these names."""
-
-    @property
-    def sentence(self) -> str:
-        """What was found, and what to do."""
-
-
-@dataclass(frozen=True)
-class Said:
-    """A finding that is a sentence and no more."""
-
-    sentence: str
-    severity: str = "note"
 
 
 @dataclass(frozen=True)
@@ -98,7 +78,7 @@ class Report:
     title: str  # of the page
     verdict: str
     accuracy: str = ""  # in one line
-    findings: Sequence[Says] = ()
+    findings: Sequence[Finding] = ()
     facts: Sequence[tuple[str, Cell]] = ()  # the few numbers that come first on a page
     blocks: Sequence[Any] = ()  # Block
     files: Sequence[Path] = ()
@@ -106,15 +86,9 @@ class Report:
     then: str = ""  # the next command
     data: Mapping[str, Any] = field(default_factory=dict)  # of the stage, for programs: a part of the JSON document
 
-    def graver_first(self) -> list[Says]:
-        """The findings in the order in which they are told; a cause stays before what it explains."""
-        return sorted(self.findings, key=lambda finding: SEVERITIES.index(severity(finding)))
-
-
-def severity(finding: Says) -> str:
-    """One of SEVERITIES."""
-    word = str(getattr(finding.severity, "name", finding.severity)).lower()
-    return word if word in SEVERITIES else "note"
+    def graver_first(self) -> list[tuple[str, str]]:
+        """Severity and sentence of the findings as they are told; a cause stays before what it explains."""
+        return [(f.severity.name.lower(), f.sentence) for f in sorted(self.findings, key=lambda f: -f.severity)]
 
 
 def is_empty(block: Any) -> bool:
@@ -138,7 +112,7 @@ def document(report: Report) -> dict[str, Any]:
         "title": report.title,
         "verdict": report.verdict,
         "accuracy": report.accuracy,
-        "findings": [{"severity": severity(f), "sentence": f.sentence} for f in report.graver_first()],
+        "findings": [{"severity": grave, "sentence": said} for grave, said in report.graver_first()],
         "facts": {name: _cell(value) for name, value in report.facts},
         "blocks": [shown for block in report.blocks if (shown := _block(block))],
         "files": [str(file) for file in report.files],
@@ -151,7 +125,7 @@ def document(report: Report) -> dict[str, Any]:
 
 def restored(kept: Mapping[str, Any], data: Mapping[str, Any]) -> Report:
     """A report from its document, made without the stage's own data, and these."""
-    findings = [Said(f["sentence"], f["severity"]) for f in kept["findings"]]
+    findings = [Finding(Kind.OTHER, Severity[f["severity"].upper()], f["sentence"]) for f in kept["findings"]]
     files = [Path(file) for file in kept["files"]]
     page = Path(kept["page"]) if kept["page"] else None
     head = kept["title"], kept["verdict"], kept["accuracy"]

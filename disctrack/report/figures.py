@@ -2,26 +2,24 @@
 
 import base64
 import io
-import struct
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from disctrack.files.whole import whole_file, write_whole
+from calibration.kit.arrays import Array
+from disctrack.files.whole import whole_file
 from disctrack.report.palette import GRID, INK, MUTED
 
 DPI = 150
-END_OF_HEADER = 33  # of a PNG file: its signature and the chunk IHDR
 NO_TITLE = (0.95, 0.15, 0.55, 0.15)  # margins [in] of labelled axes
+BAND = 3.0  # sigmas shown as a band
 LARGE = 400_000  # [bytes] vector graphics beyond it go into a page as a bitmap: thousands of points
 
 
@@ -33,6 +31,46 @@ class Drawn:
     title: str
     caption: str
     figure: Figure
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A line of a chart, or points."""
+
+    x: Array
+    y: Array
+    colour: str
+    label: str = ""
+    style: str = "-"  # as matplotlib has it: "--", ":", ".", "o"
+    sigma: Array | None = None  # with a band of BAND of these
+
+
+def chart(
+    x_label: str,
+    *rows: tuple[str, Sequence[Curve]],
+    size: tuple[float, float] = (7.2, 3.6),
+    equal: bool = False,
+    heights: Sequence[float] | None = None,
+) -> Figure:
+    """Curves over one abscissa, row by row: the ordinate's label, and what is drawn.
+
+    size : [in];  equal : one scale along both axes, for places in a plane;  heights : of the rows, relative
+    """
+    figure, found = panels(*size, len(rows), margins=NO_TITLE, sharex=True, height_ratios=heights)
+    for axes, (y_label, curves) in zip(found, rows, strict=True):
+        for curve in curves:
+            if curve.sigma is not None:
+                low, high = curve.y - BAND * curve.sigma, curve.y + BAND * curve.sigma
+                axes.fill_between(curve.x, low, high, color=curve.colour, alpha=0.25, linewidth=0)
+            axes.plot(curve.x, curve.y, curve.style, color=curve.colour, label=curve.label, linewidth=1.1, markersize=3)
+        labelled = sum(bool(curve.label) for curve in curves)
+        if labelled:
+            axes.legend(frameon=False, fontsize=9, ncols=min(labelled, 3) if len(rows) > 1 else 1)
+        axes.set_ylabel(y_label)
+        if equal:
+            axes.set_aspect("equal", adjustable="datalim")
+    found[-1].set_xlabel(x_label)
+    return figure
 
 
 def dress(axes: Axes) -> None:
@@ -97,33 +135,11 @@ def lay_out(
 
 def save_figure(figure: Figure, path: Path) -> Path:
     """Write a figure whole; the format follows from the name. Raises OutputError."""
-    kind = path.suffix[1:]
-    if kind == "png":
-        write_whole(path, png_of(figure))
-        return path
     FigureCanvasAgg(figure)
-    options: dict[str, Any] = {"pdf": {"metadata": {"CreationDate": None}}}
+    undated = {"CreationDate": None} if path.suffix == ".pdf" else None
     with whole_file(path) as part:
-        figure.savefig(part, format=kind, dpi=DPI, **options.get(kind, {}))
+        figure.savefig(part, format=path.suffix[1:], dpi=DPI, metadata=undated)
     return path
-
-
-def png_of(figure: Figure) -> bytes:
-    """The figure as the bytes of a PNG file.
-
-    Its rows are not filtered: of lines and letters on white that takes a third of the time of matplotlib's own encoder.
-    """
-    import cv2
-
-    plain = [cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_NONE] if hasattr(cv2, "IMWRITE_PNG_FILTER") else []
-    canvas, figure.dpi = FigureCanvasAgg(figure), DPI
-    canvas.draw()
-    picture = cv2.cvtColor(np.asarray(canvas.buffer_rgba()), cv2.COLOR_RGBA2BGR)
-    png = cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 3, *plain])[1].tobytes()
-    per_metre = round(DPI / 0.0254)
-    size = b"pHYs" + struct.pack(">IIB", per_metre, per_metre, 1)
-    size = struct.pack(">I", len(size) - 4) + size + struct.pack(">I", zlib.crc32(size))
-    return png[:END_OF_HEADER] + size + png[END_OF_HEADER:]
 
 
 def draw(
@@ -145,9 +161,9 @@ def draw(
 
 def _inline(figure: Figure) -> str:
     """The figure as a data URI: vector graphics, or a bitmap where those would be larger."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="svg", dpi=DPI, metadata={"Date": None})
-    kind, content = "svg+xml", buffer.getvalue()
-    if len(content) > LARGE:
-        kind, content = "png", png_of(figure)
-    return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
+    for kind, metadata in (("svg", {"Date": None}), ("png", None)):
+        buffer = io.BytesIO()
+        figure.savefig(buffer, format=kind, dpi=DPI, metadata=metadata)
+        if len(buffer.getvalue()) < LARGE:
+            break
+    return f"data:image/{'svg+xml' if kind == 'svg' else kind};base64,{base64.b64encode(buffer.getvalue()).decode()}"

@@ -5,11 +5,12 @@ from dataclasses import dataclass
 from math import floor, inf, isfinite, log10, nan
 from types import MappingProxyType
 
+from disctrack.findings import LEAST_PROBABILITY
+
 _PREFIXES: Mapping[str, float] = MappingProxyType({"n": 1e-9, "µ": 1e-6, "m": 1e-3, "": 1.0})
 _PREFIXED = ("m", "s", "rad", "N", "Hz", "J", "W", "N m", "m/s", "m/s²")
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _LONGEST = 7  # digits before or after the point; powers of ten beyond
-_LEAST_P = 1e-300  # smaller probabilities are beyond the range of the numbers they are computed with
 
 
 @dataclass(frozen=True)
@@ -72,7 +73,7 @@ def probability(p: float) -> str:
     """The relation and the number, to stand behind "p": "= 0.57"."""
     if not isfinite(p):
         return "unknown"
-    return f"< {_ten(round(log10(_LEAST_P)))}" if p < _LEAST_P else f"= {rounded(p, 2)}"
+    return f"< {_ten(round(log10(LEAST_PROBABILITY)))}" if p < LEAST_PROBABILITY else f"= {rounded(p, 2)}"
 
 
 def unit_text(unit: str) -> str:

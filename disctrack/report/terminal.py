@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any, TextIO
 
 from disctrack.files.text import printable
-from disctrack.report.blocks import Cell, Facts, Items, Listing, Markup, Report, Section, Text, is_empty, severity
+from disctrack.report.blocks import Cell, Facts, Items, Listing, Markup, Report, Section, Text, is_empty
 
 MOST_LINES = 10
 WIDTH = 100  # of lines in a file, and at most in a terminal
@@ -21,7 +21,7 @@ def short(report: Report, width: int = WIDTH, *, colour: bool = False) -> list[s
     """Verdict, accuracy, findings, page and next command, in at most MOST_LINES."""
     first = _cut(_entry("verdict", report.verdict, width)) + _cut(_entry("accuracy", report.accuracy, width), 2)
     last = _entry("page", "" if report.page is None else str(report.page), width) + _entry("next", report.then, width)
-    entries = [_cut(_entry(severity(f), f.sentence, width)) for f in report.graver_first()]
+    entries = [_cut(_entry(grave, said, width)) for grave, said in report.graver_first()]
     room = MOST_LINES - len(first) - len(last)
     while sum(map(len, entries)) > room - (len(entries) < len(report.findings)) and entries:
         entries.pop()
@@ -35,8 +35,8 @@ def full(report: Report, width: int = WIDTH) -> list[str]:
     """All of it."""
     lines = [report.title, ""] if report.title else []
     lines += _entry("verdict", report.verdict, width) + _entry("accuracy", report.accuracy, width)
-    for finding in report.graver_first():
-        lines += _entry(severity(finding), finding.sentence, width)
+    for grave, said in report.graver_first():
+        lines += _entry(grave, said, width)
     lines += _facts(report.facts, width) + _blocks(report.blocks, width)
     lines += _entry("page", "" if report.page is None else str(report.page), width)
     for i, file in enumerate(report.files):

@@ -1,7 +1,6 @@
 """What a run tells its user at the end, in plain words."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,15 +9,15 @@ from calibration import StereoCalibration, StereoRig
 from calibration.cameras.camera import OF_LEFT, OF_RIGHT, PAIR_SHIFT, PAIR_TURN
 from calibration.kit.arrays import Array
 from calibration.kit.brief import SHOWN_RANGES, ranges
-from disctrack.findings import leading
 from disctrack.frames import CAMERAS
 from disctrack.trajectory import FrameStatus, Trajectory
 
+Row = tuple[str, str]  # a heading, and what belongs to it
 LEAST_SIZE = 1e-5  # relative: a change of the rig's size that is worth a line
 
 
-def calibration_lines(found: StereoCalibration, problems: Sequence[str] = ()) -> list[str]:
-    """Views used, misfit of views left out, baseline, what the uncertainty is, verdict, what was left out and why."""
+def calibration_rows(found: StereoCalibration, problems: Sequence[str] = ()) -> list[Row]:
+    """Views used, misfit of views left out, baseline, the model, what was left out and why."""
     n, assessment = len(found.view_names) + len(problems), found.assessment
     error = f" ({1e3 * assessment.held_out_error:.4f} mm in space)" if np.isfinite(assessment.held_out_error) else ""
     used = n - len(problems) - len(found.rejected_views)
@@ -30,8 +29,6 @@ def calibration_lines(found: StereoCalibration, problems: Sequence[str] = ()) ->
         ),
         _line("rig", _rig_text(found.rig)),
         _line("model", _model_text(found)),
-        _line("", assessment.verdict),
-        _line("place", _mostly(assessment.place_sigma, "the calibration alone, of a point over the table's board")),
     ]
     if found.lens is not None:
         (left, right), gain = found.lens.rms_px, found.lens.gain
@@ -40,9 +37,12 @@ def calibration_lines(found: StereoCalibration, problems: Sequence[str] = ()) ->
     corners = len(found.rejected_corners())
     if corners:
         lines.append(_line("", f"{corners} corners were found but not used"))
-    lines += [_line("", text) for text in left_out(found.rejected_views)]
-    lines += [_line("warning", text) for text in (*problems, *found.warnings)]
-    return lines
+    return lines + [_line("", text) for text in left_out(found.rejected_views)]
+
+
+def place_text(found: StereoCalibration) -> str:
+    """How well a place is known through a calibration."""
+    return _mostly(found.assessment.place_sigma, "the calibration alone, of a point over the table's board")
 
 
 def _rig_text(rig: StereoRig) -> str:
@@ -93,16 +93,16 @@ def left_out(rejected: Mapping[int, str]) -> list[str]:
     return [f"not used: {', '.join(views)}: {why}" for why, views in groups.items()]
 
 
-def trajectory_lines(trajectory: Trajectory, details: Mapping[str, Any]) -> list[str]:
-    """Frames measured and lost with the reasons, sigmas, reprojection error, findings."""
+def trajectory_rows(trajectory: Trajectory, details: Mapping[str, Any]) -> list[Row]:
+    """Frames measured and lost with the reasons, sigmas, reprojection error."""
     lines = [*_frame_lines(trajectory)]
     if found := details.get("first_pass"):
         looked = f" (first pass, {found['looked_at']} pairs looked at)" if found["looked_at"] else ""
         lines.append(_line("motion", f"{found['verdict']}{looked}"))
     if trajectory.measured.any():
         lines += [
-            _sigma_line("sigma", trajectory.coordinate_sigma, "median of the frames, noise of one frame"),
-            _sigma_line("", trajectory.calibration_sigma, "shared by frames: calibration, table, what repeats"),
+            _line("sigma", sigma_text(trajectory)),
+            _line("", _sigma_text(trajectory.calibration_sigma, "shared by frames: calibration, table, what repeats")),
             *_shared_lines(details),
             _fit_line(trajectory),
         ]
@@ -112,11 +112,10 @@ def trajectory_lines(trajectory: Trajectory, details: Mapping[str, Any]) -> list
             lines.append(_line("repeating", f"misfit of the dots, left {left:.4f} px, right {right:.4f} px ({what})"))
         if table := details.get("table"):
             lines.append(_line("table", table["told"]))
-    lines += [_line("image", reason) for reason in list(details.get("unreadable", []))[:SHOWN_RANGES]]
-    return lines + [_line(finding.severity.name.lower(), finding.sentence) for finding in leading(trajectory.findings)]
+    return lines + [_line("image", reason) for reason in list(details.get("unreadable", []))[:SHOWN_RANGES]]
 
 
-def _shared_lines(details: Mapping[str, Any]) -> Iterable[str]:
+def _shared_lines(details: Mapping[str, Any]) -> Iterable[Row]:
     if shared := details.get("shared_sigma"):
         yield _line("", _mostly(shared, "shared by frames"))
     size = details.get("size", {})
@@ -128,43 +127,41 @@ def _shared_lines(details: Mapping[str, Any]) -> Iterable[str]:
         )
 
 
-def file_lines(files: Sequence[Path]) -> list[str]:
-    """Where the results are."""
-    return [_line("files" if i == 0 else "", str(file)) for i, file in enumerate(files)]
-
-
-def speed_line(pairs: int, seconds: float) -> str:
-    """Pairs per second, reading included."""
-    return _line("speed", f"{pairs / max(seconds, 1e-9):.0f} pairs/s ({seconds:.2f} s with reading the images)")
-
-
-def _line(head: str, text: str) -> str:
-    return f"{head:<13} {text}"
-
-
-def _frame_lines(trajectory: Trajectory) -> Iterable[str]:
+def frames_text(trajectory: Trajectory) -> str:
+    """Frames measured and lost."""
     processed = trajectory.looked_for
     measured = int(np.sum(trajectory.measured))
     of = f" of {len(trajectory)} frames" if not processed.all() else ""
-    yield _line("frames", f"{measured} measured, {int(processed.sum()) - measured} lost{of}")
+    return f"{measured} measured, {int(processed.sum()) - measured} lost{of}"
+
+
+def sigma_text(trajectory: Trajectory) -> str:
+    """Uncertainty of a pose, in one line."""
+    return _sigma_text(trajectory.coordinate_sigma, "median of the frames, noise of one frame")
+
+
+def _line(head: str, text: str) -> Row:
+    return head, text
+
+
+def _frame_lines(trajectory: Trajectory) -> Iterable[Row]:
+    yield _line("frames", frames_text(trajectory))
     for status in FrameStatus:
         rows = np.flatnonzero(trajectory.frame_status == status)
         if status != FrameStatus.MEASURED and rows.size:
             yield _line("", f"{rows.size} {status.sentence} (frames {ranges(trajectory.frame[rows])})")
 
 
-def _sigma_line(head: str, sigma: Array, what: str) -> str:
+def _sigma_text(sigma: Array, what: str) -> str:
     known = sigma[np.isfinite(sigma).all(axis=1)]
     if not len(known):
-        return _line(head, f"not known ({what})")
+        return f"not known ({what})"
     x, y, z = np.median(known[:, :3], axis=0) * 1e6
     psi, theta, phi = np.degrees(np.median(known[:, 3:], axis=0)) * 1e3
-    return _line(
-        head, f"x {x:.2f}  y {y:.2f}  z {z:.2f} um   psi {psi:.1f}  theta {theta:.2f}  phi {phi:.1f} mdeg  ({what})"
-    )
+    return f"x {x:.2f}  y {y:.2f}  z {z:.2f} um   psi {psi:.1f}  theta {theta:.2f}  phi {phi:.1f} mdeg  ({what})"
 
 
-def _fit_line(trajectory: Trajectory) -> str:
+def _fit_line(trajectory: Trajectory) -> Row:
     rms = trajectory.reprojection_rms_px
     cameras = [
         f"{name} {np.sqrt(np.nanmean(rms[:, i] ** 2)):.4f} px" if np.isfinite(rms[:, i]).any() else f"{name} not used"

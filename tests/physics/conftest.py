@@ -14,6 +14,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 from calibration.cameras.camera import N_RIG, Camera, StereoRig
+from disctrack.analyse.derivatives import MotionState
 from disctrack.disc import MA_2014
 from disctrack.frames import (
     continuous_quaternions,
@@ -51,6 +52,11 @@ class TrueMotion:
 
     def __len__(self) -> int:
         return len(self.time)
+
+    @property
+    def state(self) -> MotionState:
+        """What quantities are derived from."""
+        return MotionState(self.position, self.R, self.velocity, self.omega, self.acceleration, self.alpha)
 
 
 def reduced_rates(_t, s, k_m):

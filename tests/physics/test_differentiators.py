@@ -5,16 +5,14 @@ Each differentiates the three coordinates of the centre of a disc that rolls fro
 
     central differences, no smoothing (as in the paper)     0.318 mm/s (1.1)    1.08 m/s2   (1.1)
     local polynomials, best by cross-validation             0.074 mm/s (1.1)    0.028 m/s2  (1.2)
-    thrice integrated Wiener process, likeliest intensity   0.098 mm/s (0.6)    0.063 m/s2  (0.4)
     Gaussian process in windows: the product                0.025 mm/s (1.0)    0.0076 m/s2 (1.0)
 
-The first two have one window for slow and fast motion; the third's spectrum falls too slowly for a sum of sinusoids.
+The first two have one window for slow and fast motion.
 `pytest -m slow -s` on this file prints the figures again; the claim that is tested is their order.
 """
 
 import numpy as np
 import pytest
-from scipy.optimize import minimize_scalar
 from scipy.signal import savgol_filter
 
 from disctrack.analyse.derivatives import differentiate
@@ -51,59 +49,12 @@ def local_polynomials(x, sigma):
     return tuple(result)
 
 
-def wiener_smoother(x, sigma):
-    """Kalman filter and Rauch-Tung-Striebel smoother of a thrice integrated Wiener process, time in intervals."""
-    n_states = 4
-    F = np.array([[1, 1, 1 / 2, 1 / 6], [0, 1, 1, 1 / 2], [0, 0, 1, 1], [0, 0, 0, 1]])
-    powers = np.arange(n_states)[::-1]
-    factorial = np.array([6.0, 2.0, 1.0, 1.0])
-    Q1 = 1 / (powers[:, None] + powers + 1) / np.outer(factorial, factorial)
-
-    def run(log_q, data, smooth):
-        Q = np.exp(log_q) * Q1
-        m, P = np.zeros((n_states, data.shape[1])), np.eye(n_states) * 1e6
-        m[0] = data[0]
-        likelihood, kept = 0.0, []
-        for y in data:
-            predicted_m, predicted_P = F @ m, F @ P @ F.T + Q
-            S = predicted_P[0, 0] + 1.0
-            gain = predicted_P[:, 0] / S
-            innovation = y - predicted_m[0]
-            likelihood += np.sum(innovation**2) / S + data.shape[1] * np.log(S)
-            m, P = predicted_m + np.outer(gain, innovation), predicted_P - np.outer(gain, predicted_P[0])
-            kept.append((m, P, predicted_m, predicted_P))
-        if not smooth:
-            return likelihood
-        states, covariances = [m], [P]
-        for k in range(len(data) - 2, -1, -1):
-            m_k, P_k, _, _ = kept[k]
-            _, _, m_next, P_next = kept[k + 1]
-            G = np.linalg.solve(P_next, F @ P_k).T
-            states.append(m_k + G @ (states[-1] - m_next))
-            covariances.append(P_k + G @ (covariances[-1] - P_next) @ G.T)
-        return np.array(states[::-1]), np.array(covariances[::-1])
-
-    data = (x - x[0]) / sigma
-    found = minimize_scalar(lambda q: run(q, data, False), bounds=(-12, 12), method="bounded", options={"maxiter": 25})
-    states, covariances = run(found.x, data, True)
-    per = sigma / INTERVAL
-    ones = np.ones((1, x.shape[1]))
-    return (
-        states[:, 1] * per,
-        states[:, 2] * per / INTERVAL,
-        covariances[:, 1, 1, None] * per**2 * ones,
-        covariances[:, 2, 2, None] * (per / INTERVAL) ** 2 * ones,
-    )
-
-
 @pytest.mark.slow
 def test_product_beats_the_other_candidates(true_motion, as_tracked, rng):
     truth = true_motion(theta_deg=9, duration=3.0)[-1400:]
     trajectory = as_tracked(truth, rng)
     motion = differentiate(trajectory)
-    candidates = {
-        f.__name__: f(trajectory.q[:, :3], 0.43e-6) for f in (central_differences, local_polynomials, wiener_smoother)
-    }
+    candidates = {f.__name__: f(trajectory.q[:, :3], 0.43e-6) for f in (central_differences, local_polynomials)}
     variance = np.diagonal(motion.covariance, axis1=1, axis2=2)
     candidates["product"] = (motion.velocity, motion.acceleration, variance[:, 6:9], variance[:, 12:15])
     inner = slice(20, -20)

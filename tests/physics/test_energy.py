@@ -7,18 +7,13 @@ from scipy.integrate import trapezoid
 
 from disctrack.analyse.derivatives import differentiate
 from disctrack.analyse.energy import analyse_energy, energy_quantities
-from disctrack.analyse.propagation import MotionState
 from disctrack.disc import MA_2014, precession_rate
 
 TOTAL, POWER, ADIABATIC, LEVEL = 5, 6, 7, 8
 
 
 def exact(truth):
-    return energy_quantities(
-        MotionState(truth.position, truth.R, truth.velocity, truth.omega, truth.acceleration, truth.alpha),
-        MA_2014,
-        9.81,
-    )
+    return energy_quantities(truth.state, MA_2014, 9.81)
 
 
 def test_energy_is_constant_without_losses(true_motion):
@@ -58,19 +53,6 @@ def test_level_of_thin_slow_precession_is_4g_over_r(true_motion):
 def test_steady_precession_rate(theta_deg, rate):
     """Corrected (2.11), evaluated elsewhere to two decimals; the printed equation is low by 0.75 % at 2 degrees."""
     assert_allclose(precession_rate(np.radians(theta_deg), MA_2014, 9.81)[0], rate, atol=0.006)
-
-
-@pytest.mark.statistical
-def test_energies_are_honest_about_their_noise(true_motion, as_tracked):
-    truth = true_motion(theta_deg=9, duration=3.0)[-700:]
-    true = exact(truth)
-    ratios = []
-    for seed in range(4):
-        found = analyse_energy(differentiate(as_tracked(truth, np.random.default_rng(seed)))).propagated
-        ratios.append(np.mean((found.value - true) ** 2 / np.diagonal(found.covariance, axis1=1, axis2=2), axis=0))
-    # 4 * 700 / 20 independent values: 12 % of scatter
-    assert np.all(np.mean(ratios, axis=0) > 0.65), np.mean(ratios, axis=0)
-    assert np.all(np.mean(ratios, axis=0) < 1.45), np.mean(ratios, axis=0)
 
 
 def test_error_of_the_table_height_is_common_and_does_not_enter_the_loss(true_motion, as_tracked, rng):

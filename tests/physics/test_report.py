@@ -1,9 +1,6 @@
 """The report: one file, complete, and readable in a real browser."""
 
 import re
-import shutil
-import subprocess
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -13,8 +10,8 @@ from disctrack.analyse.stage import run_analyse
 from disctrack.report.numbers import measured
 from disctrack.report.palette import BLUE
 from disctrack.trajectory.file import Provenance, write_trajectory
+from tests.oracles.browser import BROWSER, screenshot
 
-BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 BLUE_BGR = np.array([int(BLUE[i : i + 2], 16) for i in (5, 3, 1)])  # of the curves
 
 
@@ -70,36 +67,17 @@ def test_every_figure_is_there_as_png_and_pdf(reported):
             assert picture.std() > 5, path  # not blank
 
 
-def screenshot(page: Path, folder: Path, browser: str) -> np.ndarray:
-    picture = folder / f"{page.stem}.png"
-    flags = (
-        "--headless --no-sandbox --disable-gpu --disable-quic --no-first-run --disable-background-networking "
-        "--disable-component-update --disable-sync --hide-scrollbars --window-size=1280,6000"
-    )
-    command = [
-        browser,
-        *flags.split(),
-        f"--user-data-dir={folder / 'profile'}",
-        f"--screenshot={picture}",
-        page.as_uri(),
-    ]
-    subprocess.run(command, check=True, capture_output=True, timeout=120)
-    return cv2.imread(str(picture))
-
-
 def share_of_blue(picture: np.ndarray) -> float:
     return float(np.mean(np.abs(picture.astype(int) - BLUE_BGR).max(axis=2) < 12))
 
 
 @pytest.mark.statistical
+@pytest.mark.skipif(BROWSER is None, reason="no browser on this machine")
 def test_report_shows_its_figures_in_a_browser(reported, tmp_path):
-    browser = next((found for name in BROWSERS if (found := shutil.which(name))), None)
-    if browser is None:
-        pytest.skip(f"no browser found under the names {', '.join(BROWSERS)}")
-    picture = screenshot(reported.report, tmp_path, browser)
+    picture = screenshot(reported.report, tmp_path, (1280, 6000))
     assert picture.shape == (6000, 1280, 3)
     assert share_of_blue(picture) > 5e-4  # curves of 1 px, 500 px long, in some 15 figures
     # negative control: the same page with its pictures damaged has no curves
     damaged = tmp_path / "damaged.html"
     damaged.write_text(reported.report.read_text().replace(";base64,", ";base64,AAAA"))
-    assert share_of_blue(screenshot(damaged, tmp_path, browser)) < 0.2 * share_of_blue(picture)
+    assert share_of_blue(screenshot(damaged, tmp_path, (1280, 6000))) < 0.2 * share_of_blue(picture)

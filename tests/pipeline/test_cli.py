@@ -27,12 +27,17 @@ def test_run_calibrates_tracks_draws_and_tells(short_recording, tmp_path, capsys
     results = tmp_path / "results"
     assert main(["run", str(short_recording), "-o", str(results), "--csv"]) == 0
     output, errors = capsys.readouterr()
+    assert len(output.splitlines()) <= 10
+    for word in ("Frames: ", "Calibration: ", "sigma x", "summary.txt", "disctrack analyse"):
+        assert word in output
+    everything = (results / "summary.txt").read_text()
     files = ("trajectory.h5", "overlay.mp4", "times.json")
     for word in ("views", "stereo misfit", "baseline", "measured", "sigma", "pairs/s", *files):
-        assert word in output
-    # where stderr is no terminal: no bars, one line for each stage when it has ended
+        assert word in everything
+    # where stderr is no terminal: no bars, one line for each stage when it has ended, and how good the calibration is
     stages = "".join(line for line in errors.splitlines(True) if "inner loops" not in line)  # if compiled only now
-    assert re.fullmatch(r"( *[0-9.]+ s  (calibrate|track|figures|video): \d+ \w+\n){4}", stages), errors
+    stage = r" *[0-9.]+ s  (calibrate|track|figures|video): \d+ \w+\n"
+    assert re.fullmatch(rf"{stage}Calibration: .+\n({stage}){{3}}", stages), errors
     trajectory = read_trajectory(results / "trajectory.h5")
     assert (trajectory.frame_status == FrameStatus.MEASURED).all()
     # the height of the centre follows from the nutation in rolling contact (z = r sin theta + h cos theta)
@@ -48,7 +53,6 @@ def test_run_calibrates_tracks_draws_and_tells(short_recording, tmp_path, capsys
     video = cv2.VideoCapture(str(results / "overlay.mp4"))
     assert int(video.get(cv2.CAP_PROP_FRAME_COUNT)) == len(trajectory)
     video.release()
-    assert (results / "summary.txt").read_text().splitlines()[0] in output
 
     times = json.loads((results / "times.json").read_text())["run"]
     assert [stage["stage"] for stage in times["stages"]] == ["calibrate", "track", "figures", "video"]
@@ -57,9 +61,10 @@ def test_run_calibrates_tracks_draws_and_tells(short_recording, tmp_path, capsys
 
     before = {file.name: file.stat().st_mtime_ns for file in results.iterdir()}
     (results / "dots.png").unlink()
-    assert main(["run", str(short_recording), "-o", str(results)]) == 0
+    assert main(["run", str(short_recording), "-o", str(results), "-v"]) == 0
     output = capsys.readouterr().out
-    assert output.count("reused") == 2
+    assert output == (results / "summary.txt").read_text()
+    assert output.count("reused") == 3  # in the verdict, and which files
     assert (results / "dots.png").exists()
     after = {file.name: file.stat().st_mtime_ns for file in results.iterdir()}
     for name in ("rig.h5", "trajectory.h5", "overlay.mp4"):
@@ -70,6 +75,9 @@ def test_results_go_into_the_recording_by_default(recording, capsys):
     assert main(["run", str(recording), *QUICK]) == 0
     assert (recording / "results" / "trajectory.h5").exists()
     assert str(Path("results") / "trajectory.h5") in capsys.readouterr().out
+    for option, told in (("--quiet", ""), ("--json", "{")):
+        assert main(["run", str(recording), option, *QUICK]) == 0
+        assert capsys.readouterr().out[:1] == told
 
 
 def test_track_takes_a_range_of_frames_and_keeps_the_length(recording, rig_file, tmp_path):
@@ -171,9 +179,8 @@ def test_an_unreadable_image_is_one_lost_camera_and_the_exit_code_says_so(record
         (recording / camera / "000011.png").unlink()
         (recording / camera / "000011.png").write_bytes(b"")
     assert main(["run", str(recording), *QUICK]) == 3
-    output, errors = capsys.readouterr()
-    assert "could not be read" in errors
-    assert "000007.png" in output
+    assert "could not be read" in capsys.readouterr().err
+    assert "000007.png" in (recording / "results" / "summary.txt").read_text()
     trajectory = read_trajectory(recording / "results" / "trajectory.h5")
     assert trajectory.frame_status[11] == FrameStatus.UNREADABLE
     assert trajectory.frame_status[7] == FrameStatus.ONE_CAMERA

@@ -101,7 +101,8 @@ def test_grey_stored_as_colour_and_sixteen_bits_are_measured_and_said(recording,
                 grey = grey[..., 0] if grey.ndim == 3 else grey
                 replace(file, change(grey))
         assert main(["run", str(recording), "--overwrite", *QUICK]) == 0
-        poses.append((read_trajectory(recording / "results" / "trajectory.h5"), capsys.readouterr().out))
+        said = " ".join(capsys.readouterr().out.split())
+        poses.append((read_trajectory(recording / "results" / "trajectory.h5"), said))
     (plain, _), (colour, said_colour), (deep, said_deep) = poses
     np.testing.assert_array_equal(colour.q, plain.q)
     assert "channels of equal value" in said_colour

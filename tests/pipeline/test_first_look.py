@@ -13,7 +13,6 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from calibration.board.chessboard import BoardNotFound, find_corners
-from calibration.board.search import board_size
 from disctrack.cli import main
 from disctrack.commands.options import PAPERS
 from disctrack.disc import MA_2014
@@ -141,14 +140,6 @@ def test_stacks_in_one_hdf5_file_are_the_two_cameras(tmp_path, rng):
     assert written["cameras"] == {"frame_rate_hz": 2000.0, "left": "frames.h5:/left", "right": "frames.h5:/right"}
 
 
-@pytest.mark.slow
-def test_board_size_is_found_on_photographs_and_not_where_there_is_none(shared_data, rng):
-    folder = shared_data / "opencv_stereo_chessboard"
-    for files in (sorted(folder.glob("left*.jpg"))[:6], sorted(folder.glob("*.jpg"))[::2]):  # a rim passes for a line
-        assert board_size([cv2.imread(str(file), cv2.IMREAD_UNCHANGED) for file in files]) == ((9, 6), len(files))
-    assert board_size([rng.integers(0, 255, (240, 320), np.uint8)] * 2)[0] is None
-
-
 def drawn(figure):
     """Grey values of a sheet, and pixels per millimetre."""
     figure.set_dpi(DPI)
@@ -238,8 +229,8 @@ FAULTS = {
         lambda f: declare(declare(f, 'left = "left/', 'left = "_') or f, 'right = "right/', 'right = "left/')
         or declare(f, 'left = "_', 'left = "right/'), "the left and right images are exchanged", 1,
     ),
-    "one frame late": (renumber_right, "right frame i+1 show the same instant", 1),
-    "three frames late": (lambda f: renumber_right(f, 3), "right frame i+3 show the same instant", 1),
+    "one frame late": (renumber_right, "Number its images higher by 1", 1),
+    "three frames late": (lambda f: renumber_right(f, 3), "Number its images higher by 3", 1),
 }  # fmt: skip
 
 

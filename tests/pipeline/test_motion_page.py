@@ -2,10 +2,7 @@
 
 import json
 import re
-import shutil
-import subprocess
 
-import cv2
 import numpy as np
 import pytest
 
@@ -13,10 +10,7 @@ import disctrack
 from disctrack.analyse.analysis import analyse
 from disctrack.analyse.motion_page import motion_html
 from disctrack.track.video_overlay import draw_pair
-
-BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-FLAGS = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync",
-         "--disable-background-networking", "--disable-component-update", "--virtual-time-budget=4000"]  # fmt: skip
+from tests.oracles.browser import BROWSER, browse, screenshot
 
 
 @pytest.fixture(scope="module")
@@ -69,25 +63,17 @@ def test_gaps_are_null_and_not_numbers(measured):
     assert "were not at hand" in text
 
 
-def browse(page, *extra, output=None):
-    command = [BROWSER, *FLAGS, f"--user-data-dir={page.parent / 'profile'}", "--enable-logging=stderr", *extra]
-    done = subprocess.run([*command, f"{page.as_uri()}#frame=30"], capture_output=True, text=True, timeout=120)
-    problems = [line for line in done.stderr.splitlines() if "CONSOLE" in line and "Uncaught" in line]
-    assert not problems, problems
-    return done.stdout
-
-
 @pytest.mark.slow
-@pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine")
-def test_a_browser_shows_the_frame_that_was_asked_for(page, measured):
+@pytest.mark.skipif(BROWSER is None, reason="no browser on this machine")
+def test_a_browser_shows_the_frame_that_was_asked_for(page, measured, tmp_path):
     trajectory, *_ = measured
-    dom = browse(page, "--dump-dom")
+    dom = browse(page, tmp_path / "profile", "--dump-dom", place="#frame=30")
     assert f"frame 30   t = {trajectory.time[30]:.4f} s" in dom
     assert f"θ {np.degrees(trajectory.q[30, 4]):.3f}" in dom
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine")
+@pytest.mark.skipif(BROWSER is None, reason="no browser on this machine")
 @pytest.mark.parametrize(
     ("size", "flags", "background"),
     [
@@ -97,9 +83,7 @@ def test_a_browser_shows_the_frame_that_was_asked_for(page, measured):
     ],
 )
 def test_light_dark_and_phone_are_drawn(page, size, flags, background, tmp_path):
-    shot = tmp_path / "shot.png"
-    browse(page, f"--screenshot={shot}", f"--window-size={size[0]},{size[1]}", "--hide-scrollbars", *flags)
-    image = cv2.imread(str(shot))
+    image = screenshot(page, tmp_path, size, *flags, place="#frame=30")
     assert tuple(int(v) for v in image[3, 3]) == background
     blue, vermilion = [(178, 114, 0), (232, 185, 109)], [(0, 94, 213), (92, 154, 255)]
     for inks in (blue, vermilion):  # the curves; the cursor, in the colours of light or dark

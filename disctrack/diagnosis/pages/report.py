@@ -15,7 +15,8 @@ from disctrack.discrepancy.document import explanations_table, tried_table
 from disctrack.discrepancy.search import Found
 from disctrack.discrepancy.significance import TWO_SIDED
 from disctrack.discrepancy.words import effect_text, significance_text
-from disctrack.report.blocks import Cell, Figures, Items, Listing, Report, Said, Says, Section, Text
+from disctrack.findings import Finding, Kind, Severity, of_kind
+from disctrack.report.blocks import Cell, Figures, Items, Listing, Report, Section, Text
 from disctrack.report.numbers import Measured, in_unit, measured, probability, rounded, score
 
 if TYPE_CHECKING:
@@ -43,7 +44,7 @@ def report_of(
     beside: Evidence | None,
     recording: str,
     drawn: "Sequence[Drawn]",
-    findings: Sequence[Says],
+    findings: Sequence[Finding],
     files: Sequence[Path],
 ) -> Report:
     """All of a diagnosis. findings : of the measurement that was diagnosed;  files : that were written, page first"""
@@ -57,11 +58,12 @@ def report_of(
             f"Probability that noise alone produces this improvement: p {probability(d.chance.p_value)} "
             f"({d.chance.tests:.0f} independent candidates)."
         )
+    notes = [*result.remarks, *(f"{note[:1].upper()}{note[1:]}." for note in result.notes)]
     return Report(
         f"{recording}: what does the model lack?",
         result.verdict_text,
         result.accuracy_text,
-        [*findings, *map(Said, [*result.remarks, *(f"{note[:1].upper()}{note[1:]}." for note in result.notes)])],
+        [*findings, *of_kind(Kind.DIAGNOSIS, Severity.NOTE, notes)],
         blocks=[
             Text(f"Verdict: {d.verdict}, because {d.reason}. Model: {MODELS.get(result.model, result.model)}."),
             Section("Missing effects", [Items(effects)]),

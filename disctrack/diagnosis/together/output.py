@@ -18,7 +18,8 @@ from disctrack.discrepancy.search import Diagnosis
 from disctrack.discrepancy.system import Quantity
 from disctrack.discrepancy.words import effect_text, significance_text
 from disctrack.files.json_text import plain
-from disctrack.report.blocks import Facts, Figures, Items, Listing, Report, Said, Section, Text
+from disctrack.findings import Kind, Severity, of_kind
+from disctrack.report.blocks import Facts, Figures, Items, Listing, Report, Section, Text
 from disctrack.report.numbers import Measured, in_unit, measured, probability, rounded
 from disctrack.report.palette import AMBER, BLUE, MUTED
 
@@ -144,7 +145,7 @@ def report_of(answer: TogetherDiagnosis, drawn: Sequence[Drawn], files: Sequence
         "Many recordings: what does the model lack?",
         verdict_text(answer),
         accuracy_text(answer),
-        [Said(text, "warning") for text in (misfits_text(answer), *answer.notes) if text],
+        of_kind(Kind.DIAGNOSIS, Severity.WARNING, filter(None, (misfits_text(answer), *answer.notes))),
         blocks=[
             Text(f"Verdict: {d.verdict}, because {d.reason}."),
             Section("Missing effects", [Items(effects)]),

@@ -27,7 +27,8 @@ from disctrack.discrepancy.words import effect_text
 from disctrack.errors import OutputError
 from disctrack.files.json_text import json_file, plain
 from disctrack.files.whole import write_whole
-from disctrack.report.blocks import Figures, Items, Listing, Report, Said, Section
+from disctrack.findings import Kind, Severity, of_kind
+from disctrack.report.blocks import Figures, Items, Listing, Report, Section
 from disctrack.report.numbers import in_unit, probability, rounded
 from disctrack.report.terminal import full
 
@@ -311,7 +312,7 @@ class Answer:
         return Report(
             f"{self.equations.name}: what is missing?",
             f"Verdict: {self.verdict}. {self.sentence}",
-            findings=[Said(f"{note}.") for note in self.notes],
+            findings=of_kind(Kind.DIAGNOSIS, Severity.NOTE, (f"{note}." for note in self.notes)),
             blocks=[
                 Section("Equations", [Items(equations)]),
                 Section("Before and after", [_before_after(self)]),

@@ -1,6 +1,5 @@
 """The published exponents, recomputed."""
 
-import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
@@ -20,14 +19,6 @@ def test_all_printed_averages_are_those_of_their_rows_but_one():
 
 @pytest.mark.parametrize(("surface", "t"), [("steel", (0.1, 0.0, 3.5)), ("glass", (-2.9, -3.4, 6.0))], ids=SURFACES)
 def test_steel_agrees_with_two_thirds_and_glass_does_not(surface, t):
-    found = agreement(published_table(surface))
-    assert_allclose([a.t for a in found], t, atol=0.05)
-    energy, theta, psidot = found
-    if surface == "steel":
-        assert "agrees" in energy.sentence
-        assert "agrees" in theta.sentence
-    else:
-        assert "disagrees" in energy.sentence
-        assert "disagrees" in theta.sentence
-    assert "disagrees" in psidot.sentence
-    assert all(np.isfinite(a.p_value) for a in found)
+    found, p = agreement(published_table(surface))
+    assert_allclose(found, t, atol=0.05)
+    assert list(p < 0.05) == ([False, False, True] if surface == "steel" else [True] * 3)

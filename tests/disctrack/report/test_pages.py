@@ -4,14 +4,13 @@ import io
 import json
 from html.parser import HTMLParser
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from disctrack.diagnosis.pages.figures import candidates
 from disctrack.files.json_text import json_file, json_text, plain
+from disctrack.findings import Kind, Severity, of_kind
 from disctrack.report import palette
 from disctrack.report.blocks import (
     Facts,
@@ -20,7 +19,6 @@ from disctrack.report.blocks import (
     Listing,
     Markup,
     Report,
-    Said,
     Section,
     Text,
     document,
@@ -71,7 +69,12 @@ def report(**more):
 
 def test_a_page_is_whole_and_shows_text_as_text():
     table = Listing(["a", NASTY], [(NASTY, "1"), (Markup("<b>2</b>"), "3")], NASTY, classes=["done", "failed"])
-    found = report(title=NASTY, verdict=NASTY, findings=[Said(NASTY, "doubt")], blocks=[Section(NASTY, [table])])
+    found = report(
+        title=NASTY,
+        verdict=NASTY,
+        findings=of_kind(Kind.OTHER, Severity.DOUBT, [NASTY]),
+        blocks=[Section(NASTY, [table])],
+    )
     tree = Tree(page(found, {}))
     assert tree.open == []
     assert "script" not in tree.seen
@@ -97,7 +100,8 @@ def test_every_writer_shows_the_same_number():
 
 
 def test_a_terminal_gets_ten_lines_the_gravest_first_and_is_told_of_the_rest():
-    said = [Said(f"note {i} " + "word " * 30, "note") for i in range(9)] + [Said("doubtful", "doubt")]
+    said = of_kind(Kind.OTHER, Severity.NOTE, [f"note {i} {'word ' * 30}" for i in range(9)])
+    said += of_kind(Kind.OTHER, Severity.DOUBT, ["doubtful"])
     found = report(verdict="long " * 200, findings=said, page=Path("a page.html"), then="disctrack next")
     lines = short(found, 80)
     assert 8 <= len(lines) <= 10
@@ -122,7 +126,7 @@ def test_colour_is_for_terminals_without_no_color(monkeypatch):
     shown = {}
     for no_color, stream in (("", Terminal()), ("1", Terminal()), ("", io.StringIO())):
         monkeypatch.setenv("NO_COLOR", no_color)
-        show(report(findings=[Said("wrong", "doubt")]), stream)
+        show(report(findings=of_kind(Kind.OTHER, Severity.DOUBT, ["wrong"])), stream)
         shown[no_color, stream.isatty()] = "\x1b[31" in stream.getvalue()
     assert shown == {("", True): True, ("1", True): False, ("", False): False}
 
@@ -187,21 +191,6 @@ def test_a_figure_is_written_whole_and_shown(tmp_path):
     assert "rises &amp; falls" in shown
 
 
-def luminance(colour):
-    channels = np.array([int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)])
-    linear = np.where(channels <= 0.04045, channels / 12.92, ((channels + 0.055) / 1.055) ** 2.4)
-    return linear
-
-
-def test_colours_stay_apart_for_a_reader_without_green_receptors():
-    """Deuteranopia by the matrix of Vienot, Brettel and Mollon (1999); distances in linear light."""
-    blind = np.array([[0.29275, 0.70725, 0.0], [0.29275, 0.70725, 0.0], [-0.02234, 0.02234, 1.0]])
-    seen = [blind @ luminance(c) for c in (palette.BLUE, palette.RED, palette.GREEN, palette.AMBER, palette.SKY)]
-    apart = min(np.linalg.norm(a - b) for i, a in enumerate(seen) for b in seen[:i])
-    worst_before = np.linalg.norm(blind @ luminance("#c8553d") - blind @ luminance("#4f8a4c"))  # red, green
-    assert apart > 0.1 > worst_before
-
-
 def test_json_holds_no_number_that_json_does_not_know():
     document = {
         "a": [np.nan, np.float32(np.inf), (1, np.int64(2))],
@@ -234,22 +223,3 @@ def test_a_logarithmic_axis_shows_plain_numbers():
         shown = {t.get_text() for t in (*axes.get_yticklabels(), *axes.get_yticklabels(minor=True))} - {""}
         assert few <= shown
         assert not any("10^" in text for text in shown)
-
-
-def test_a_candidate_without_which_nothing_fits_has_the_longest_bar():
-    def tried(name, score, gain):
-        return SimpleNamespace(candidate=SimpleNamespace(name=name), score=score, gain=gain)
-
-    found = SimpleNamespace(candidate=SimpleNamespace(name="frame_rate"), cannot_be_told_from=())
-    diagnosis = SimpleNamespace(
-        tried=(tried("frame_rate", np.inf, np.inf), tried("kz", 4.0, None), tried("tilt", 900.0, 800.0)),
-        found=(found,),
-        settings=SimpleNamespace(false_alarm=0.005),
-    )
-    drawn = candidates(SimpleNamespace(diagnosis=diagnosis, system=SimpleNamespace(candidates=range(50))))
-    (axes,) = drawn.figure.axes
-    lengths = [bar.get_width() for bar in axes.patches]
-    assert lengths[1:] == [4.0, 800.0]
-    assert np.isfinite(lengths[0])
-    assert lengths[0] > 5 * max(lengths[1:])
-    assert "without it nothing fits" in [text.get_text() for text in axes.texts]
