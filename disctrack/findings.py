@@ -258,11 +258,3 @@ def with_sigma(value: float, sigma: float | None = None, unit: str = "") -> str:
     decimals -= round(sigma, decimals) >= 10.0 ** (2 - decimals)  # 0.0996 is 0.10
     shown = max(decimals, 0)
     return f"{round(value, decimals) + 0.0:.{shown}f} +- {round(sigma, decimals):.{shown}f}{ending}"
-
-
-LEAST_PROBABILITY = 1e-300  # below, differences of numbers near 1 and what a float can hold are the same
-
-
-def probability(value: float) -> str:
-    """A p value in words; none is zero."""
-    return f"p < {LEAST_PROBABILITY:g}" if value < LEAST_PROBABILITY else f"p = {value:.2g}"

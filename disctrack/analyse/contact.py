@@ -63,7 +63,6 @@ class Circle:
     sigma: float  # [m] of the radius, noise and what the locus does beside a circle
     sigma_calibration: float  # [m]
     rms: float  # [m] of the distances from the circle
-    arc: float  # [rad] travelled
     expected: float  # [m] mean of r cos theta - h sin theta, the radius when the centre rests
     start: float  # [s]
     end: float  # [s]
@@ -209,7 +208,7 @@ def locus_circle(motion: MeasuredMotion, found: Propagated, duration: float, unt
     frames = known[motion.time[known] >= motion.time[known[-1]] - duration] if known.size else known
     arc = float(np.ptp(motion.euler[frames, 0])) if frames.size else 0.0
     if arc < np.pi / 2 or frames.size < 8:
-        return Circle(np.full(2, np.nan), *(float("nan"),) * 8)
+        return Circle(np.full(2, np.nan), *(float("nan"),) * 7)
     points = found.value[frames, :2]
     centre, radius = _fit_circle(points)
     offset = points - centre
@@ -230,7 +229,6 @@ def locus_circle(motion: MeasuredMotion, found: Propagated, duration: float, unt
         sigma=float(np.sqrt(variance)),
         sigma_calibration=float(np.sqrt(max(0.0, per_rig @ motion.rig_covariance @ per_rig))),
         rms=rms,
-        arc=arc,
         expected=float(np.mean(expected)),
         start=float(motion.time[frames[0]]),
         end=float(motion.time[frames[-1]]),

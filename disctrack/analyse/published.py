@@ -18,7 +18,6 @@ SURFACES = ("steel", "glass")
 class PublishedTable:
     """Exponents of all trials on one surface."""
 
-    surface: str
     cases: tuple[str, ...]
     trials: tuple[int, ...]
     exponents: Array  # (n_trials, 3) in the order of EXPONENTS
@@ -39,7 +38,6 @@ def published_table(surface: str) -> PublishedTable:
     trials = [row for row in mine if row["case"] != "average"]
     (average,) = (row for row in mine if row["case"] == "average")
     return PublishedTable(
-        surface=surface,
         cases=tuple(row["case"] for row in trials),
         trials=tuple(int(row["trial"]) for row in trials),
         exponents=np.array([[float(row[name]) for name in EXPONENTS] for row in trials]),

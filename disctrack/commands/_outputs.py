@@ -6,7 +6,7 @@ import os
 import sys
 import time
 from collections.abc import Iterable, Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -40,39 +40,13 @@ from disctrack.trajectory.reuse import SUMMARY
 RESULTS = "results"
 
 
-@dataclass(frozen=True)
-class TrackOptions:
-    """What a user chose about tracking and its outputs."""
-
-    overwrite: bool
-    csv: bool
-    figures: bool
-    video: bool
-    threads: int | None
-    frames: tuple[int | None, int | None]  # first and one past the last to measure, None for the recording's ends
-    settings: TrackingSettings
-
-
-def track_options(arguments: argparse.Namespace) -> TrackOptions:
-    """The options of tracking as they were given."""
-    return TrackOptions(
-        arguments.overwrite,
-        arguments.csv,
-        not arguments.no_figures,
-        not arguments.no_video,
-        arguments.threads,
-        arguments.frames or (None, None),
-        TrackingSettings(first_pass=not (arguments.all or arguments.frames)),
-    )
-
-
 def calibration_settings(arguments: argparse.Namespace) -> CalibrationSettings:
     """The options of a calibration as they were given."""
     return CalibrationSettings(distortion=arguments.distortion, board=arguments.board)
 
 
 def track_into(
-    path: Path, recording: Recording, rig: StereoRig, rig_file: Path, pairs: ImagePairs, options: TrackOptions
+    path: Path, recording: Recording, rig: StereoRig, rig_file: Path, pairs: ImagePairs, arguments: argparse.Namespace
 ) -> tuple[Report, tuple[Finding, ...]]:
     """Track, or reuse what is there; write trajectory, table, pictures, video. returns : also what was noticed
 
@@ -81,9 +55,9 @@ def track_into(
     check_rig(rig, pairs, str(rig_file))
     rows = [("recording", f"{recording.name}: {len(pairs)} pairs at {recording.frame_rate:g} Hz")]
     trajectory, details = None, {}
-    fresh = False
-    if path.exists() and not options.overwrite:
-        if not storage.is_result_of(path, trajectory_provenance(recording, rig, pairs, options.settings)):
+    fresh, settings = False, TrackingSettings(first_pass=not (arguments.all or arguments.frames))
+    if path.exists() and not arguments.overwrite:
+        if not storage.is_result_of(path, trajectory_provenance(recording, rig, pairs, settings)):
             raise OutputError(
                 f"{path}: exists, and is not the complete result of these images, settings and version"
                 f"{_why(path, recording)}. Keep it and choose another place with -o, or replace it with --overwrite."
@@ -93,10 +67,10 @@ def track_into(
     if trajectory is None:
         with progress_bar("track", len(pairs), "pair") as advance:
             boards = boards_in(rig_file, recording)
-            measurement = measure(recording, rig, pairs, options.settings, options.threads, advance, boards)
+            measurement = measure(recording, rig, pairs, settings, arguments.threads, advance, boards)
         trajectory, details = measurement.trajectory, measurement.details
-        provenance = trajectory_provenance(recording, rig, pairs, options.settings)
-        storage.write_trajectory(path, trajectory, provenance, overwrite=options.overwrite, details=details)
+        provenance = trajectory_provenance(recording, rig, pairs, settings)
+        storage.write_trajectory(path, trajectory, provenance, overwrite=arguments.overwrite, details=details)
         speed = len(pairs) / max(measurement.seconds, 1e-9)
         fresh = True
         rows.append(("speed", f"{speed:.0f} pairs/s ({measurement.seconds:.2f} s with reading the images)"))
@@ -106,7 +80,7 @@ def track_into(
         f"sigma {summary.sigma_text(trajectory)}",
         leading(trajectory.findings),
         blocks=[Facts([*rows, *summary.trajectory_rows(trajectory, details)])],
-        files=[path, *_companions(path, trajectory, pairs, options, fresh)],
+        files=[path, *_companions(path, trajectory, pairs, arguments, fresh)],
         then=f"disctrack analyse {relative(path)}",
     )
     return report, trajectory.findings
@@ -192,14 +166,14 @@ def link_pages_of(trajectory: Path) -> None:
 
 
 def _companions(
-    path: Path, trajectory: Trajectory, pairs: ImagePairs, options: TrackOptions, fresh: bool
+    path: Path, trajectory: Trajectory, pairs: ImagePairs, arguments: argparse.Namespace, fresh: bool
 ) -> Iterator[Path]:
     """Table, pictures and video beside the trajectory; those that a reused result already has are kept."""
     prefix = "" if path.stem == "trajectory" else f"{path.stem}_"
-    if options.csv:
+    if arguments.csv:
         write_csv(path.with_suffix(".csv"), trajectory, overwrite=True)
         yield path.with_suffix(".csv")
-    if options.figures:
+    if not arguments.no_figures:
         from disctrack.report.figures import save_figure
         from disctrack.track.pictures import FIGURES
 
@@ -211,7 +185,7 @@ def _companions(
                     save_figure(pictures[picture](trajectory), picture)
                     advance(1)
         yield from pictures
-    if options.video:
+    if not arguments.no_video:
         video = path.with_name(f"{prefix}overlay.mp4")
         if fresh or not video.exists():
             _write_video(video, trajectory, pairs)

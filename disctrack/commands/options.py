@@ -4,7 +4,9 @@ Nothing but the parser is imported here, so that --help and a mistyped option ar
 """
 
 import argparse
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 PAPERS = ("a3", "a4", "letter")
 UNKNOWN_TO_FILES = {
@@ -18,15 +20,32 @@ UNKNOWN_TO_FILES = {
 }
 
 
+def _number(kind: type, least: float, what: str) -> Callable[[str], Any]:
+    """What reads a finite number from `least` on."""
+
+    def read(text: str) -> Any:
+        try:
+            value = kind(text)
+        except ValueError:
+            value = -1
+        if not least <= value < float("inf"):
+            raise argparse.ArgumentTypeError(f"'{text}' is not {what}")
+        return value
+
+    return read
+
+
+_positive = _number(int, 1, "a whole number above 0")
+_seed = _number(int, 0, "a whole number from 0 on")
+_positive_number = _number(float, 1e-300, "a positive number")
+_length_or_zero = _number(float, 0, "a length in mm")
+
+
 def add_init(parser: argparse.ArgumentParser) -> None:
     """Arguments of `disctrack init`."""
     parser.add_argument("folder", type=Path, help="folder with the frames of two cameras and views of a chessboard")
-    parser.add_argument(
-        "--like",
-        type=Path,
-        metavar="RECORDING",
-        help="take disc, dots, board and table from this recording.toml where the files do not tell",
-    )
+    what = "take disc, dots, board and table from this recording.toml where the files do not tell"
+    parser.add_argument("--like", type=Path, metavar="RECORDING", help=what)
     group = parser.add_argument_group("what no file tells", "left to fill in where it is not given")
     for option, what in UNKNOWN_TO_FILES.items():
         number = _length_or_zero if option == "board_thickness_mm" else _positive_number
@@ -48,12 +67,8 @@ def add_open(parser: argparse.ArgumentParser) -> None:
 
 def add_print(parser: argparse.ArgumentParser) -> None:
     """Arguments of `disctrack print`."""
-    parser.add_argument(
-        "recording",
-        type=Path,
-        nargs="?",
-        help="folder with a recording.toml (default: the disc of Ma et al. 2014 and a board of 9 x 6)",
-    )
+    what = "folder with a recording.toml (default: the disc of Ma et al. 2014 and a board of 9 x 6)"
+    parser.add_argument("recording", type=Path, nargs="?", help=what)
     parser.add_argument("-o", "--output", type=Path, default=Path(), help="folder for dots.pdf and board.pdf (here)")
     parser.add_argument("--paper", choices=PAPERS, default="a4", help="size of the sheet (%(default)s)")
     parser.add_argument("--light-dots", action="store_true", help="white dots in a black face")
@@ -112,29 +127,15 @@ def add_analyse(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "-o", "--output", type=Path, help="folder for the report (default: NAME_analysis beside the file)"
     )
-    parser.add_argument(
-        "--window",
-        type=_positive_number,
-        default=0.5,
-        metavar="S",
-        help="last seconds before collapse for the exponents (default: 0.5)",
-    )
-    parser.add_argument(
-        "--circle",
-        type=_positive_number,
-        default=0.6,
-        metavar="S",
-        help="last seconds for the circle through the contact (default: 0.6)",
-    )
+    what = "last seconds before collapse for the exponents (default: 0.5)"
+    parser.add_argument("--window", type=_positive_number, default=0.5, metavar="S", help=what)
+    what = "last seconds for the circle through the contact (default: 0.6)"
+    parser.add_argument("--circle", type=_positive_number, default=0.6, metavar="S", help=what)
     parser.add_argument(
         "--figures", action="store_true", help="also write every figure of the report as PNG and PDF, into figures/"
     )
-    parser.add_argument(
-        "--recording",
-        type=Path,
-        metavar="FOLDER",
-        help="where the images for motion.html are (default: the folder that holds results/)",
-    )
+    what = "where the images for motion.html are (default: the folder that holds results/)"
+    parser.add_argument("--recording", type=Path, metavar="FOLDER", help=what)
     parser.add_argument("--overwrite", action="store_true", help="replace an older report")
 
 
@@ -172,13 +173,8 @@ def add_batch(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--diagnose", action="store_true", help="also ask of each which effect the model lacks")
     parser.add_argument("--together", action="store_true", help="also ask it of all together: one answer for many")
     parser.add_argument("--overwrite", action="store_true", help="measure anew what is done already")
-    parser.add_argument(
-        "--window",
-        type=_positive_number,
-        default=0.5,
-        metavar="S",
-        help="last seconds for the exponents (default: 0.5)",
-    )
+    what = "last seconds for the exponents (default: 0.5)"
+    parser.add_argument("--window", type=_positive_number, default=0.5, metavar="S", help=what)
     _calibration_options(parser)
 
 
@@ -211,12 +207,8 @@ def add_render(parser: argparse.ArgumentParser) -> None:
 
 def add_convert(parser: argparse.ArgumentParser) -> None:
     """Arguments of `disctrack convert`."""
-    parser.add_argument(
-        "source",
-        type=Path,
-        nargs="+",
-        help="trajectory.h5, rig.h5, or a rig of another program; two files where it keeps one per camera, left first",
-    )
+    what = "trajectory.h5, rig.h5, or a rig of another program; two files where it keeps one per camera, left first"
+    parser.add_argument("source", type=Path, nargs="+", help=what)
     parser.add_argument(
         "target",
         type=Path,
@@ -224,21 +216,13 @@ def add_convert(parser: argparse.ArgumentParser) -> None:
         ".yml (OpenCV), .toml (Caliscope), .cameramodel (mrcal), camchain.yaml (Kalibr), .mat; these to .h5",
     )
     parser.add_argument("--as", dest="form", metavar="FORMAT", help="where the ending does not tell, e.g. Pose2Sim")
-    parser.add_argument(
-        "--table",
-        action="store_true",
-        help="the foreign rig's reference is the table, z up (else heights mean nothing)",
-    )
+    what = "the foreign rig's reference is the table, z up (else heights mean nothing)"
+    parser.add_argument("--table", action="store_true", help=what)
     parser.add_argument(
         "--cameras", nargs=2, metavar=("LEFT", "RIGHT"), help="which two cameras of a Caliscope or Anipose file"
     )
-    parser.add_argument(
-        "--image-size",
-        type=_positive,
-        nargs=2,
-        metavar=("WIDTH", "HEIGHT"),
-        help="[px] where an OpenCV file does not tell it",
-    )
+    what = "[px] where an OpenCV file does not tell it"
+    parser.add_argument("--image-size", type=_positive, nargs=2, metavar=("WIDTH", "HEIGHT"), help=what)
     parser.add_argument(
         "--unit-mm", type=_positive_number, help="length of an OpenCV file's unit, where it does not tell it"
     )
@@ -256,12 +240,8 @@ def add_validate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--imperfect", type=_positive, metavar="N", default=0, help="N of an imperfect laboratory instead"
     )
-    parser.add_argument(
-        "--diagnosis",
-        nargs="*",
-        metavar="EFFECT[=SIZE]",
-        help="instead: hide each of these effects (default: all known; nothing, prints, laboratory: none) and diagnose",
-    )
+    what = "instead: hide each of these effects (default: all known; nothing, prints, laboratory: none) and diagnose"
+    parser.add_argument("--diagnosis", nargs="*", metavar="EFFECT[=SIZE]", help=what)
     parser.add_argument("--seeds", type=_positive, default=6, help="recordings for each hidden effect (%(default)s)")
     parser.add_argument("--pairs", type=_positive, default=0, metavar="N", help="hide N pairs of effects instead")
     parser.add_argument(
@@ -281,36 +261,11 @@ def _corners(text: str) -> tuple[int, int]:
     return int(first), int(second)
 
 
-def _number(text: str) -> float:
-    """Finite and not negative. Raises ValueError."""
-    value = float(text)
-    if not 0 <= value < float("inf"):
-        raise ValueError
-    return value
-
-
-def _length_or_zero(text: str) -> float:
-    try:
-        return _number(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"'{text}' is no length in mm") from None
-
-
 def _shard(text: str) -> tuple[int, int]:
     number, slash, of = text.partition("/")
     if not (slash and number.isdecimal() and of.isdecimal() and 1 <= int(number) <= int(of)):
         raise argparse.ArgumentTypeError(f"'{text}' is no shard; give e.g. 2/8 for the second of eight (1/8 to 8/8)")
     return int(number), int(of)
-
-
-def _positive_number(text: str) -> float:
-    try:
-        value = _number(text)
-    except ValueError:
-        value = 0.0
-    if value == 0:
-        raise argparse.ArgumentTypeError(f"'{text}' is not a positive number")
-    return value
 
 
 def _output_options(parser: argparse.ArgumentParser) -> None:
@@ -323,10 +278,10 @@ def _output_options(parser: argparse.ArgumentParser) -> None:
 def _tracking_options(parser: argparse.ArgumentParser) -> None:
     """Options that `run` and `track` have in common."""
     part = parser.add_mutually_exclusive_group()
-    part.add_argument("--frames", type=_frame_range, metavar="A:B",
-                      help="measure frames A to B-1, no others; the file keeps the recording's length")  # fmt: skip
-    part.add_argument("--all", action="store_true",
-                      help="measure every frame (default: not the rest before and after the motion)")  # fmt: skip
+    what = "measure frames A to B-1, no others; the file keeps the recording's length"
+    part.add_argument("--frames", type=_frame_range, metavar="A:B", help=what)
+    what = "measure every frame (default: not the rest before and after the motion)"
+    part.add_argument("--all", action="store_true", help=what)
     parser.add_argument("--overwrite", action="store_true", help="replace results of other inputs or settings")
     parser.add_argument("--csv", action="store_true", help="also write the trajectory as a table (mm, deg)")
     parser.add_argument("--no-figures", action="store_true", help="no pictures")
@@ -349,19 +304,3 @@ def _frame_range(text: str) -> tuple[int | None, int | None]:
         return (int(first) if first else None), (int(last) if last else None)
     except ValueError:
         raise argparse.ArgumentTypeError(f"'{text}' is no range; give first:last, e.g. 100:200 or 100:") from None
-
-
-def _seed(text: str) -> int:
-    if not text.isdecimal():
-        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number from 0 on")
-    return int(text)
-
-
-def _positive(text: str) -> int:
-    try:
-        number = int(text)
-    except ValueError:
-        number = 0
-    if number < 1:
-        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number above 0")
-    return number

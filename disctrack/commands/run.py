@@ -18,8 +18,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Calibrate unless the recording names a rig, track, draw; returns the exit code."""
     recording = read_recording(arguments.recording)
     folder = arguments.output or recording.folder / outputs.RESULTS
-    options = outputs.track_options(arguments)
-    pairs = pipeline.open_pairs(recording, options.frames)
+    pairs = pipeline.open_pairs(recording, arguments.frames or (None, None))
     summary = folder / outputs.SUMMARY
     for path in (folder / "trajectory.h5", summary):
         refuse_input(path)
@@ -30,13 +29,13 @@ def run(arguments: argparse.Namespace) -> int:
     else:
         rig_file = folder / "rig.h5"
         source = source_of(recording, outputs.calibration_settings(arguments))
-        calibrated = calibrate_into(rig_file, source, options.overwrite, options.figures)
+        calibrated = calibrate_into(rig_file, source, arguments.overwrite, not arguments.no_figures)
     known = calibrated.report
     verdict = f"Calibration: {known.verdict.partition('. ')[0]}"
     if not arguments.quiet:
         print(verdict, file=sys.stderr, flush=True)
     tracked, findings = outputs.track_into(
-        folder / "trajectory.h5", recording, calibrated.rig, rig_file, pairs, options
+        folder / "trajectory.h5", recording, calibrated.rig, rig_file, pairs, arguments
     )
     whole = [("verdict", known.verdict), ("place", known.accuracy)]
     report = replace(

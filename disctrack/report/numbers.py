@@ -5,8 +5,6 @@ from dataclasses import dataclass
 from math import floor, inf, isfinite, log10, nan
 from types import MappingProxyType
 
-from disctrack.findings import LEAST_PROBABILITY
-
 _PREFIXES: Mapping[str, float] = MappingProxyType({"n": 1e-9, "µ": 1e-6, "m": 1e-3, "": 1.0})
 _PREFIXED = ("m", "s", "rad", "N", "Hz", "J", "W", "N m", "m/s", "m/s²")
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -73,7 +71,7 @@ def probability(p: float) -> str:
     """The relation and the number, to stand behind "p": "= 0.57"."""
     if not isfinite(p):
         return "unknown"
-    return f"< {_ten(round(log10(LEAST_PROBABILITY)))}" if p < LEAST_PROBABILITY else f"= {rounded(p, 2)}"
+    return "< 10⁻³⁰⁰" if p < 1e-300 else f"= {rounded(p, 2)}"  # beyond the range of the numbers it is computed with
 
 
 def unit_text(unit: str) -> str:

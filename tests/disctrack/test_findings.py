@@ -15,7 +15,6 @@ from disctrack.findings import (
     causes,
     finding_from_json,
     in_doubt,
-    probability,
     warn_of_doubts,
     with_sigma,
 )
@@ -99,8 +98,3 @@ def test_doubts_are_python_warnings_and_their_consequences_are_not():
 )
 def test_value_and_sigma_have_two_digits_of_the_sigma(value, sigma, expected):
     assert with_sigma(value, sigma) == expected
-
-
-def test_no_probability_is_zero():
-    assert probability(0.0) == "p < 1e-300"
-    assert probability(0.0312) == "p = 0.031"
