@@ -32,7 +32,7 @@ def run(arguments: argparse.Namespace) -> int:
         calibrated = calibrate_into(rig_file, source, arguments.overwrite, not arguments.no_figures)
     known = calibrated.report
     verdict = f"Calibration: {known.verdict.partition('. ')[0]}"
-    if not arguments.quiet:
+    if recording.rig_file is None and not arguments.quiet:  # before the frames, which take longer
         print(verdict, file=sys.stderr, flush=True)
     tracked, findings = outputs.track_into(
         folder / "trajectory.h5", recording, calibrated.rig, rig_file, pairs, arguments
