@@ -128,6 +128,9 @@ def look_into(folder: Path) -> tuple[Told, list[tuple[str, str]]]:
     elif (rig_file := _rig_beside(folder)) is not None:
         told["calibration", "rig"] = rig_file, "a rig that was calibrated before"
         seen.append(("rig", rig_file))
+    else:
+        text = "no views of a chessboard are there: put them into calibration/left and calibration/right, or name a rig"
+        seen.append(("note", text))
     return told, seen
 
 
@@ -142,6 +145,9 @@ def _of_frames(folder: Path, frames: CameraPair) -> tuple[Told, list[tuple[str, 
         ("table", "view"): (0, ""),
     }
     seen = [("cameras", f"{frames.left.pattern} and {frames.right.pattern}: {described}")]
+    if len(left) != len(right):
+        text = f"left has {len(left)} frames, right has {len(right)}: a run wants as many of both, of the same instants"
+        seen.append(("note", text))
     rate, source = _frame_rate(left, right)
     if rate is not None:
         told["cameras", "frame_rate_hz"] = rate, f"frames per second, {source}"

@@ -247,3 +247,14 @@ def test_check_names_the_fault(fault, sample_clip, tmp_path, capsys):
         assert code == expected, told
     if "late" in fault:  # and it is told once, not by every place looked at and by all that follows from it
         assert len(re.findall(r"(^| )(warning|doubt|refusal) ", told)) == 1, told
+
+
+def test_init_says_that_the_cameras_differ_in_number_and_that_views_are_missing(sample_clip, tmp_path, capsys):
+    for camera, n in (("left", 5), ("right", 4)):
+        (tmp_path / camera).mkdir()
+        for file in sorted((sample_clip / camera).iterdir())[:n]:
+            (tmp_path / camera / file.name).symlink_to(file)
+    assert main(["init", str(tmp_path)]) == 0
+    said = capsys.readouterr().out
+    assert "left has 5 frames, right has 4" in said
+    assert "no views of a chessboard" in said
