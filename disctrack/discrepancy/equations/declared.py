@@ -244,38 +244,29 @@ def _checked_run(equations: Equations, run: Run, name: str, channels: Sequence[s
         raise AnalysisError(
             f"run {name}: fewer than 8 samples until fit_until = {run.fit_until:g} s; a fit needs them."
         )
-    missing = [c for c in channels if c not in run.data]
-    if len(missing) == len(channels):
+    if not any(c in run.data for c in channels):
         raise AnalysisError(f"run {name}: no data for {', '.join(channels)}; there is {', '.join(run.data)}.")
-    data = np.full((n, len(channels)), np.nan)
+    given: Any = {} if run.sigma is None else run.sigma
+    if run.noise is not None:
+        given = float(np.hypot(run.noise.white, run.noise.smooth))
+    given = given if isinstance(given, Mapping) else dict.fromkeys(channels, given)
+    wanted = {"start": equations.states, "known": equations.states, "constants": equations.constants}
+    for what, known in (*wanted.items(), ("inputs", equations.inputs), ("sigma", channels)):
+        for key in given if what == "sigma" else getattr(run, what):
+            if key not in known:
+                raise AnalysisError(f"run {name}, {what}: {unknown_name(key, known)}")
+    data, sigma = np.full((2, n, len(channels)), np.nan)  # of sigma: to be found
     for i, c in enumerate(channels):
         if c in run.data:
             data[:, i] = _column(run.data[c], n, f"run {name}, {c}")
+        if c in given:
+            sigma[:, i] = given[c]
     if np.isinf(data).any():
         raise AnalysisError(f"run {name}: infinite values in the data; write NaN where a sample is missing.")
     if np.isfinite(data).any(axis=1).sum() < 8:
         raise AnalysisError(f"run {name}: fewer than 8 samples have data.")
-    given: Any = {} if run.sigma is None else run.sigma
-    if run.noise is not None:
-        given = float(np.hypot(run.noise.white, run.noise.smooth))
-    if not isinstance(given, Mapping):
-        given = dict.fromkeys(channels, given)
-    for key in given:
-        if key not in channels:
-            raise AnalysisError(f"run {name}, sigma: {unknown_name(key, channels)}")
-    sigma = np.full((n, len(channels)), np.nan)  # NaN: to be found
-    for i, c in enumerate(channels):
-        if c in given:
-            sigma[:, i] = np.broadcast_to(np.asarray(given[c], float), (n,))
-            if not np.all(sigma[:, i] > 0):
-                raise AnalysisError(f"run {name}, sigma of {c}: must be positive.")
-    for what, names, known in (
-        ("start", run.start, equations.states), ("known", run.known, equations.states),
-        ("constants", run.constants, equations.constants), ("inputs", run.inputs, equations.inputs),
-    ):  # fmt: skip
-        for key in names:
-            if key not in known:
-                raise AnalysisError(f"run {name}, {what}: {unknown_name(key, known)}")
+    if np.any(sigma <= 0):
+        raise AnalysisError(f"run {name}, sigma: must be positive.")
     known_states = {k: (v[0], v[1]) if isinstance(v, tuple) else (float(v), 0.0) for k, v in run.known.items()}
     knots, pieces = _inputs(equations, run, name, time)
     return Samples(

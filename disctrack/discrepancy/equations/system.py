@@ -21,8 +21,6 @@ TOLERANCE = 1e-10  # of a step, relative to the size of a state
 MAX_STEPS = 400_000  # after which a motion is given up
 UNDONE = 0.1  # share of the least term's power that a sum of terms keeps, below which they undo each other ...
 LARGE = 5.0  # ... where each is so many times larger than all that moves the motion
-TURNED = 2.0  # times larger that terms make a number whose sign is not the declared one, beyond which they bend it ...
-TENTH = 0.1  # ... where its part is so much of all that moves the motion
 MOST_STATES = 80  # initial states that are fitted along where others would tell no more that is new
 EACH = "*"  # in the place of a stretch: each has a number of its own
 FEWEST = 4  # samples of a stretch
@@ -149,40 +147,28 @@ class EquationSystem(System):
     def undo_each_other(self, candidates: Sequence[Candidate], values: Values, before: Values) -> bool:
         """Are there terms far larger than all that moves the motion, of which next to nothing is left together?
 
-        Or terms that turn the sign of a declared number? Enough terms of opposite signs make any law, as polynomials
-        do, over the motions that they were fitted to: such a sum describes them and says nothing of what acts.
-        values, before : as fitted with and without the terms. One term alone is believed.
+        Enough terms of opposite signs make any law, as polynomials do, over the motions that they were fitted to: such
+        a sum describes them and says nothing of what acts.   values : as fitted. One term alone is believed.
         """
         named = [c for c in candidates if c.kind != "measurement"]
-        if len(candidates) < 2:
-            return False
-        n = range(len(named))
-        sums = [own for k in n for own in combinations(n, k + 1)]
-        declared = {q.name: q.declared for q in self.base if q.declared}
-        turned = {k: 0.0 for k, d in declared.items() if values[k] * d < min(0.0, TURNED * before[k] * d)}
         absent = [{q.name: q.null for q in c.quantities} for c in named]
-        all_of_it, of_turned = np.zeros((2, len(self.sizes)))
-        powers = np.zeros((len(sums), len(self.sizes)))
-        for s in self.stretches:
+        sums = [list(own) for k in range(2, len(named) + 1) for own in combinations(range(len(named)), k)]
+        everything, alone = np.zeros(len(self.sizes)), np.zeros((len(named), len(self.sizes)))
+        together = np.zeros((len(sums), len(self.sizes)))
+        for s in self.stretches if sums else ():
             found = self._predict(values, s, [])
             if found is None:
                 return False
             rates, *without = (
-                self.formulas.rates_at(s, self.numbers(dict(values) | changed, s), s.time, found.states)[0]
-                for changed in ({}, turned, *absent)
+                self.formulas.rates_at(s, self.numbers({**values, **changed}, s), s.time, found.states)[0]
+                for changed in ({}, *absent)
             )
-            acting = [rates - r for r in without]
-            all_of_it = all_of_it + np.sum(rates**2, axis=0)
-            of_turned = of_turned + np.sum(acting[0] ** 2, axis=0)
-            for power, own in zip(powers, sums, strict=True):
-                power += np.sum(sum(acting[i + 1] for i in own) ** 2, axis=0)
-        if np.any(of_turned > TENTH**2 * all_of_it):
-            return True
-        if len(named) < 2:
-            return False
-        least = np.array([powers[[sums.index((i,)) for i in own]].min(axis=0) for own in sums])
-        several = np.array([len(own) > 1 for own in sums])
-        return bool(np.any((powers < UNDONE * least) & (least > LARGE**2 * all_of_it) & several[:, None]))
+            acting = rates - np.array(without)
+            everything += np.sum(rates**2, axis=0)
+            alone += np.sum(acting**2, axis=1)
+            together += [np.sum(acting[own].sum(axis=0) ** 2, axis=0) for own in sums]
+        least = np.array([alone[own].min(axis=0) for own in sums]).reshape(together.shape)
+        return bool(np.any((together < UNDONE * least) & (least > LARGE**2 * everything)))
 
     def linearise(self, values: Values, names: Sequence[str]) -> tuple[Array, Array]:
         """Whitened residual (n, w), data minus prediction, and the prediction's derivative (n, w, k)."""
