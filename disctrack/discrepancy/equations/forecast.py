@@ -6,13 +6,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calibration.kit.arrays import Array
+from disctrack.discrepancy.elimination import prior_rows
 from disctrack.discrepancy.equations.declared import Samples
 from disctrack.discrepancy.equations.start import guessed
 from disctrack.discrepancy.equations.system import EquationSystem
 from disctrack.discrepancy.fit import Fit, fit
 
 WITHIN_95 = 1.96  # standard deviations
-OF_SIZE = 1e3  # scales of a state make up its size: as far as a guess from few samples may be off
+OF_SIZE = 1e4  # scales of a state make up ten times its size: farther off is no guess from few samples
 
 
 @dataclass(frozen=True)
@@ -30,9 +31,9 @@ class Forecast:
 
 @dataclass(frozen=True)
 class RunScore:
-    """How well a free run foretells one channel."""
+    """How well a free run predicts one channel."""
 
-    rms: float  # of measured minus foretold, in the channel's unit
+    rms: float  # of measured minus predicted, in the channel's unit
     covered: float  # share of the samples within the 95 % band
     n_samples: int
 
@@ -61,8 +62,12 @@ def foretold(system: EquationSystem, fitted: Fit, samples: Samples, left: Array,
         values, spread, by_state = values | start.values, start.covariance, [q.name for q in states]
         numbers = [n for n in numbers if n not in by_state]
         covariance = _of(fitted, numbers)
-        _, J = seen.linearise(values, [*by_state, *numbers])
+        residual, J = seen.linearise(values, [*by_state, *numbers])
         J = J.reshape(-1, J.shape[-1])
+        # one step more: where the band is wide, a fit ends before it has reached the minimum
+        prior, by_prior = prior_rows(loose, values)
+        step = spread @ (J[:, : len(by_state)].T @ residual.ravel() + by_prior.T @ prior)
+        values |= {name: values[name] + float(d) for name, d in zip(by_state, step, strict=True)}
         # other numbers would have led to another start
         follows = -spread @ J[:, : len(by_state)].T @ J[:, len(by_state) :]
     shape = samples.data.shape
