@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicHermiteSpline
+from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
 from calibration.kit.arrays import Array, Mask
 from calibration.kit.least_squares import triangle
@@ -175,13 +175,14 @@ class DiscSystem(LawSystem):
         They are so small that their columns at the measured poses serve for every prediction. Directions of the
         calibration's covariance are in units of their own sigma.
         """
-        R, t = self._measured_poses()
-        points = self.disc.marker_centres_body @ np.swapaxes(R, 1, 2) + t[:, None]
+        q = self._as_measured().q[0]
+        R, n = rotation_from_euler(*q[:, 3:].T), len(q)
+        points = self.disc.marker_centres_body @ np.swapaxes(R, 1, 2) + q[:, None, :3]
         places, by_point, by_rig = self.rig.project_with_jacobians(points)
-        n = len(t)
-        correlation, sigma = _scaled(self.rig.covariance)
-        eigenvalues, vectors = np.linalg.eigh(correlation)
-        root = sigma[:, None] * vectors * np.sqrt(np.maximum(eigenvalues, 0.0))
+        spread = np.sqrt(np.maximum(np.diag(self.rig.covariance), 0.0))
+        safe = np.where(spread > 0, spread, 1.0)
+        eigenvalues, vectors = np.linalg.eigh(self.rig.covariance / np.outer(safe, safe))
+        root = spread[:, None] * vectors * np.sqrt(np.maximum(eigenvalues, 0.0))
         shift = (self._whiten @ by_rig).reshape(n, -1, root.shape[0]) @ root
         _, singular, V = np.linalg.svd(triangle(shift.reshape(-1, root.shape[1])))
         self.rig_directions = np.asarray(
@@ -189,19 +190,12 @@ class DiscSystem(LawSystem):
         )  # by columns of `root`, the same for one rig
         rig = shift @ self.rig_directions.T
         along = np.einsum("ncmap,npb->ncmab", by_point, R[:, :, :2])  # by the dots' places on the face
-        m = self.disc.n_markers
+        m, sizes = self.disc.n_markers, self.systematic
         dots = (self._whiten @ along)[:, :, :, :, None, :] * np.eye(m)[None, None, :, None, :, None]
-        sizes = self.systematic
-        print_sigma = float(np.hypot(DOT_SIGMA, sizes.print_m))
-        quantities = [
-            *_nuisances("rig", rig.shape[-1], "direction of the calibration's covariance", ("rig",)),
-            *(
-                replace(_nuisances(f"dot_{i}", 1, "bias common to all images of a dot")[0], name=f"dot_{i}.{a}",
-                        unit="m", scale=1e-8, prior_sigma=print_sigma, belongs_to=("disc",))
-                for i in range(m)
-                for a in "xy"
-            ),
-        ]  # fmt: skip
+        sigma, bias = float(np.hypot(DOT_SIGMA, sizes.print_m)), "bias common to all images of a dot"
+        one = Quantity("dot", "m", 1e-8, prior_sigma=sigma, meaning=bias, linear=True, belongs_to=("disc",))
+        quantities = _nuisances("rig", rig.shape[-1], "direction of the calibration's covariance", ("rig",))
+        quantities += [replace(one, name=f"dot_{i}.{axis}") for i in range(m) for axis in "xy"]
         columns = [rig, dots.reshape(n, -1, 2 * m)]
         per_px = float(np.sqrt(np.mean(self._whiten[self.used] ** 2) * 2)) if self.used.any() else 1.0
         in_common = partial(lens_columns, fields=sizes.lens_fields)
@@ -218,43 +212,35 @@ class DiscSystem(LawSystem):
                 quantities += _nuisances(name, shifts.shape[-1], meaning, belongs_to)
         return tuple(quantities), np.concatenate(columns, axis=-1)
 
-    def _measured_poses(self) -> tuple[Array, Array]:
-        """R (n, 3, 3), t (n, 3); rows without a pose, which have no dots that count either, get another's."""
-        q = np.array(self.trajectory.q[self.rows])
+    def _as_measured(self, delay: float = 0.0) -> _Path:
+        """The measured motion, by a cubic through the poses; rows without a pose get what lies between."""
+        q = self.trajectory.q[self.rows]
         known = np.isfinite(q).all(axis=1)
-        q[~known] = q[np.argmax(known)]
-        return rotation_from_euler(*q[:, 3:].T), q[:, :3]
+        course = CubicSpline(self.time[known], q[known])
+        times = np.stack([self.time, self.time + delay])
+        return _Path(course(times), course(times, 1), (), np.zeros((len(q), 6, 0)))
 
     def static_view(self, rows: NDArray[np.intp], known: Values) -> StaticView:
         """The dots of these rows about their measured poses. known : faults that the poses were found with."""
-        R, t = (np.stack([part] * 2) for part in self._measured_poses())
-        setup = setup_of(self.disc, known)
-        images, delay = predict(R, t, self.rig, self.disc, setup), setup.delay
-        pixels, by_pose = images.pixels, images.by_pose
-        by_time = np.gradient(pixels[:, 1], self.time, axis=0)
+        delay = setup_of(self.disc, known).delay
+        sight = self._sight(self._as_measured(delay), known)
         if delay:  # the right camera saw a pose earlier, or later
             rows = rows[(self.time[rows] + delay > self.time[0]) & (self.time[rows] + delay < self.time[-1])]
-            late = CubicHermiteSpline(self.time, pixels[:, 1], by_time)
-            pixels = pixels.copy()
-            pixels[:, 1] = late(self.time + delay)
-        sight = Sight(self.time, R, t, np.zeros((*t.shape[:2], 6)), self.rig, self.disc, known, images)
         faults, sizes = {}, {}
         for fault in self.faults:
             if fault.of_poses_alone:
-                shifts = [fault.column(part, sight)[rows] for part in fault.parts]
-                if fault.name == "time_offset":  # at the speed that the dots are seen to have
-                    shifts[0][:, 1] = by_time[rows]
-                sizes[fault.name] = {q.name: q.typical for q in candidate_of_fault(fault).quantities}
-                units = sizes[fault.name].values()
-                faults[fault.name] = np.stack([x * size for x, size in zip(shifts, units, strict=True)], axis=-1)
+                quantities = candidate_of_fault(fault).quantities
+                sizes[fault.name] = {q.name: q.typical for q in quantities}
+                columns = [q.typical * fault.column(q.part, sight)[rows] for q in quantities]
+                faults[fault.name] = np.stack(columns, axis=-1)
         nuisances, m = self._nuisance_columns[rows], self.disc.n_markers
-        n_rig = sum(name.startswith("rig.") for name in self._nuisance_column)
-        whitened = (self._whiten[rows] @ by_pose[rows]).reshape(len(rows), -1, 6)
+        n_rig = len(self.rig_directions)
+        whitened = (self._whiten[rows] @ sight.images.by_pose[rows]).reshape(len(rows), -1, 6)
         across = np.eye(whitened.shape[1]) - whitened @ np.linalg.pinv(whitened)
-        residual = self._rows_of(self.observed - pixels)
+        residual = self._rows_of(self.observed - sight.images.pixels)[rows]
         return StaticView(
-            residual[rows], across, nuisances[..., :n_rig], nuisances[..., n_rig : n_rig + 2 * m], faults,
-            sizes, pixels[rows], self.used[rows], self._whiten[rows],
+            residual, across, nuisances[..., :n_rig], nuisances[..., n_rig : n_rig + 2 * m], faults, sizes,
+            sight.images.pixels[rows], self.used[rows], self._whiten[rows],
         )  # fmt: skip
 
     def start(self) -> dict[str, float]:
@@ -405,37 +391,31 @@ class DiscSystem(LawSystem):
     def _path(self, values: Values, names: Sequence[str]) -> _Path:
         """Motion at the true instants of both cameras, and the derivatives that belong to it."""
         times, delay = self.instants(values), setup_of(self.disc, values).delay
-        model = self.model_with({k: v for k, v in values.items() if np.isfinite(v)})
-        components = [n.partition(".")[2] for n in names if n.startswith("state.")]
-        present = set(model.values)
-        parameters = [n for n in names if n in present or model.has_name(n)]
-        parameters = [n for n in parameters if np.isfinite(values.get(n, 0.0))]
-        slips = SLIP in names and values.get(SLIP, 0.0) > 0
-        if slips:
-            parameters.append("slip.mu")
-        state = state_of(values)
+        model, state = self.model_with({k: v for k, v in values.items() if np.isfinite(v)}), state_of(values)
         # a step of the fit may lead where no disc rolls, and where following it would take for ever
         fastest = 3 * np.sqrt(4 * model.gravity / (self.disc.radius * np.sin(THETA_END)))
-        if not THETA_END < state.theta <= np.pi / 2 or max(abs(state.psidot), abs(state.omega3)) > fastest:
-            return _nowhere(len(times))
-        if self.starts_in_slip and model.effect("slip") is None:  # 1/mu = 0: nothing slips, and no velocity is free
-            return _nowhere(len(times))
+        nowhere = not THETA_END < state.theta <= np.pi / 2 or max(abs(state.psidot), abs(state.omega3)) > fastest
+        if nowhere or (self.starts_in_slip and model.effect("slip") is None):  # 1/mu = 0: no velocity is free
+            nothing = np.full((2, len(times), 6), np.nan)
+            return _Path(nothing, nothing, (), np.zeros((len(times), 6, 0)))
+        components = [n for n in names if n.startswith("state.")]
+        parameters = {n: n for n in names if model.has_name(n) and np.isfinite(values.get(n, 0.0))}
+        if SLIP in names and values.get(SLIP, 0.0) > 0:
+            parameters[SLIP] = "slip.mu"
         limit = int(MAX_SWITCHES[0] + MAX_SWITCHES[1] * (times[-1] - times[0]))
         left = int(min(self.budget.left, MAX_SLIP_STEPS))
-        found = sensitivities(model, state, times, parameters, components, THETA_END, RTOL, limit, left)
-        self.budget.take(found.slip_steps)
-        axes = euler_rate_axes_world(found.q[:, 3], found.q[:, 4])
-        by_motion = found.dq.copy()
-        by_motion[:, 3:] = axes @ found.dq[:, 3:]
-        all_names = (*(f"state.{c}" for c in components), *parameters)
-        if slips:
-            by_motion[..., -1] *= -1.0 / values[SLIP] ** 2
-            all_names = (*all_names[:-1], SLIP)
-        q, qdot = np.stack([found.q] * 2), np.stack([found.qdot] * 2)
-        if delay and np.isfinite(found.q).all():
-            spline = CubicHermiteSpline(times, found.q, found.qdot)
+        of_state = [n.partition(".")[2] for n in components]
+        moving = sensitivities(model, state, times, tuple(parameters.values()), of_state, THETA_END, RTOL, limit, left)
+        self.budget.take(moving.slip_steps)
+        by_motion, moved = moving.dq.copy(), (*components, *parameters)
+        by_motion[:, 3:] = euler_rate_axes_world(moving.q[:, 3], moving.q[:, 4]) @ moving.dq[:, 3:]
+        if SLIP in parameters:
+            by_motion[..., moved.index(SLIP)] *= -1.0 / values[SLIP] ** 2
+        q, qdot = np.stack([moving.q] * 2), np.stack([moving.qdot] * 2)
+        if delay and np.isfinite(moving.q).all():
+            spline = CubicHermiteSpline(times, moving.q, moving.qdot)
             q[1], qdot[1] = spline(times + delay), spline(times + delay, 1)
-        return _Path(q, qdot, all_names, by_motion)
+        return _Path(q, qdot, moved, by_motion)
 
     def _sight(self, path: _Path, values: Values) -> Sight:
         """The dots as both cameras meet them on this path."""
@@ -456,16 +436,3 @@ def _nuisances(name: str, k: int, meaning: str, belongs_to: tuple[str, ...] = ()
     """Linear quantities in units of their own standard deviation."""
     one = Quantity(name, "sigma", 0.1, prior_sigma=1.0, meaning=meaning, linear=True, belongs_to=belongs_to)
     return [replace(one, name=f"{name}.{i}") for i in range(k)]
-
-
-def _nowhere(n: int) -> _Path:
-    """No motion at all."""
-    nothing = np.full((2, n, 6), np.nan)
-    return _Path(nothing, nothing, (), np.zeros((n, 6, 0)))
-
-
-def _scaled(covariance: Array) -> tuple[Array, Array]:
-    """Correlation matrix and standard deviations; zero rows stay zero."""
-    sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    safe = np.where(sigma > 0, sigma, 1.0)
-    return covariance / np.outer(safe, safe), sigma

@@ -25,6 +25,7 @@ from disctrack.diagnosis.missing_force import WIDTH, Course, Probed, probe
 from disctrack.diagnosis.motion import THETA_END, state_of
 from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.laws import LearnedLaw, evidence
+from disctrack.discrepancy.score import cleared, span
 from disctrack.discrepancy.system import Values
 from disctrack.rolling import Motion, simulate
 from disctrack.rolling.evaluate import effect_wrench, kinematics
@@ -93,14 +94,14 @@ def with_form(
     parts = _parts(system, fitted, blocks, float(np.sqrt(np.mean(np.sum(own**2, axis=1)))))
     wrong = 1.0 if remembers else form_is_another(law, beside)
     laws = by_number[:, np.any(by_number != 0.0, axis=0)]
-    Q = _solver(laws)[0] if laws.size else laws
+    own_directions = span(laws)
     U, inverse = _solver(R[:, :n])
     right = R[:, -1] - U @ (U.T @ R[:, -1])
     variance = np.sum((by_number @ fitted.covariance) * by_number, axis=1)
     mixed, another, misfit = fitted.covariance.copy(), fitted.covariance, 0.0
     for probability, some in ((1.0 - wrong, [np.concatenate(parts[:: HARMONICS + 2], axis=1)]), (wrong, parts)):
         S = np.concatenate(some, axis=1)
-        S = S - Q @ (Q.T @ S)
+        S = cleared(S, own_directions)
         B = R[:, n:-1] @ S / (WIDTH * np.sqrt(2 * np.pi))  # neighbouring probes add up to this
         taken = inverse @ (U.T @ B)  # by which the fitted numbers give way to a misfit
         second, size = _second_moment(B - U @ (U.T @ B), right, [part.shape[1] for part in some])

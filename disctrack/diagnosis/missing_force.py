@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from itertools import islice
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,6 +20,7 @@ from disctrack.diagnosis.motion import STATE_SCALES, THETA_END, state_of
 from disctrack.discrepancy.elimination import is_linear, prior_rows, projection
 from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.laws import Family, Gain, LearnedLaw, evidence, proposal
+from disctrack.discrepancy.score import cleared, span
 from disctrack.discrepancy.system import Candidate, Quantity, Values
 from disctrack.rolling import Model, simulate
 from disctrack.rolling.effects import EffectParameter, effect_from_formulas
@@ -36,7 +36,7 @@ MAX_PROBES = 90
 WIDTH = 0.7  # of a probe over the distance to the next: their sum is flat to 1e-4
 TELLING = 0.3  # share of chi-square to first order, from which on it is said what the missing moment goes with
 INSTANTS_PER_SECOND = 1000.0  # of the responses: Simpson's rule errs by 0.4 % of a hum of 150 Hz
-CHUNK = 240  # columns of the library that are held at a time
+CHUNK = 120  # families of the library that are asked for at a time
 
 
 @dataclass(frozen=True)
@@ -67,8 +67,8 @@ def missing_moment(blocks: Probed, scale: float | None = None) -> tuple[Course, 
     """
     R, k = np.vstack([blocks.data, blocks.prior]), len(blocks.time)
     right, fitted, probes = R[:, -1], R[:, : blocks.n_fitted], R[:, blocks.n_fitted : -1]
-    Q = np.linalg.qr(_unit(fitted))[0]
-    right, probes = right - Q @ (Q.T @ right), probes - Q @ (Q.T @ probes)
+    basis = span(fitted)
+    right, probes = cleared(right, basis), cleared(probes, basis)
     smooth = np.eye(k) * 1e-4 + np.diff(np.eye(k), 2, axis=0).T @ np.diff(np.eye(k), 2, axis=0)
     root = np.linalg.cholesky(np.linalg.inv(np.kron(np.eye(3), smooth)))
     U, shown, V = np.linalg.svd(probes @ root, full_matrices=False)
@@ -98,11 +98,6 @@ def what_is_missing(system: DiscSystem, fit_: Fit) -> str:
     )
     share = best.gain / scan.chi_square
     return f"{text}; {100 * share:.0f} % of it would be {best.family.title}" if share > TELLING else text
-
-
-def _unit(columns: Array) -> Array:
-    length = np.linalg.norm(columns, axis=0)
-    return columns / np.where(length > 0, length, 1.0)
 
 
 def responding(system: DiscSystem, fit_: Fit) -> tuple[Responses, NDArray[np.intp]] | None:
@@ -172,9 +167,8 @@ class DiscScan:
         right, matrix = prior_rows(moved, fit_.values)
         stacked = common.cleared(np.column_stack([derivative.reshape(residual.size, -1), residual.reshape(-1)]))
         stacked = np.vstack([stacked, np.column_stack([matrix, right])])
-        Q = np.linalg.qr(_unit(stacked[:, :-1]))[0]
-        left = stacked[:, -1] - Q @ (Q.T @ stacked[:, -1])
-        basis = Q[: residual.size]
+        basis = span(stacked[:, :-1])
+        left, basis = cleared(stacked[:, -1], basis), basis[: residual.size]
         if common.names:
             basis = np.column_stack([common.rows, basis])
         n, w = residual.shape
@@ -205,21 +199,14 @@ class DiscScan:
 
     def gains(self, chosen: Iterable[Family]) -> list[Gain]:
         """See `laws.Scan`."""
-        found: list[Gain] = []
-        waiting = iter(chosen)
-        while True:
-            chunk, n = list[Family](), 0
-            while n < CHUNK and (more := list(islice(waiting, 1))):
-                chunk += more
-                n += len(more[0].terms)
-            if not chunk:
-                return found
-            found += self._gains(chunk, n)
+        everything = list(chosen)
+        parts = (everything[first : first + CHUNK] for first in range(0, len(everything), CHUNK))
+        return [gain for part in parts for gain in self._gains(part)]
 
-    def _gains(self, chunk: Sequence[Family], n: int) -> list[Gain]:
-        courses = np.zeros((len(self.motion.time), len(COMPONENTS), n))
-        self._courses.clear()
+    def _gains(self, chunk: Sequence[Family]) -> list[Gain]:
         terms = [parts for family in chunk for parts in family.formulas()]
+        courses = np.zeros((len(self.motion.time), len(COMPONENTS), len(terms)))
+        self._courses.clear()
         for column, parts in enumerate(terms):
             for component, formula in parts.items():
                 kind, _, axis = component.partition("_")
@@ -253,29 +240,29 @@ def law_of(model: Model, chosen: Sequence[Family], values: Array) -> LearnedLaw:
     """
     names = ("learned", *(f"learned_{i}" for i in range(2, len(model.effects) + 2)))
     name = next(name for name in names if model.effect(name) is None)
-    formulas, coefficients, shapes = dict[str, str](), list[tuple[str, ...]](), list[tuple[str, ...]]()
-    quantities, parameters = list[Quantity](), list[EffectParameter]()
-    start = iter(np.asarray(values, float).tolist())
+    begin = np.asarray(values, float).tolist()
+    formulas, numbers = dict[str, str](), list[EffectParameter]()
+    coefficients, shapes = list[tuple[str, ...]](), list[tuple[str, ...]]()
     for i, family in enumerate(chosen):
-        inside = {shape: f"{shape}_{i}" for shape in family.shape}
         many = len(family.terms) > 1
-        coefficients.append(tuple(f"{name}.c_{i}_{j}" if many else f"{name}.c_{i}" for j in range(len(family.terms))))
-        shapes.append(tuple(f"{name}.{own}" for own in inside.values()))
-        for j, (parts, full) in enumerate(zip(family.terms, coefficients[-1], strict=True)):
-            value, number = next(start), full.partition(".")[2]
-            meaning = f"{family.title}, term {j + 1}"
-            quantities.append(Quantity(full, "SI", 0.01 * abs(value) or 1e-9, meaning=meaning))
-            parameters.append(EffectParameter(number, "SI", value, family.title))
+        own = [f"c_{i}_{j}" if many else f"c_{i}" for j in range(len(family.terms))]
+        inside = {shape: f"{shape}_{i}" for shape in family.shape}
+        for number, parts in zip(own, family.terms, strict=True):
+            numbers.append(EffectParameter(number, "SI", begin[len(numbers)], family.title))
             for component, formula in parts.items():
                 piece = f"{number} * ({formula.format(**inside)})"
                 formulas[component] = f"{formulas[component]} + {piece}" if component in formulas else piece
-        for shape, own in inside.items():
-            lower, upper, step = SHAPES[shape]
-            value, text = float(np.clip(next(start), lower, upper)), f"{shape} of {family.title}"
-            quantities.append(Quantity(f"{name}.{own}", "SI", step, value, lower, upper, meaning=text))
-            parameters.append(EffectParameter(own, "SI", value, text, value, lower, upper, is_shape=True))
+        for shape, number in inside.items():
+            lower, upper, _ = SHAPES[shape]
+            value, text = float(np.clip(begin[len(numbers)], lower, upper)), f"{shape} of {family.title}"
+            numbers.append(EffectParameter(number, "SI", value, text, value, lower, upper, is_shape=True))
+        coefficients.append(tuple(f"{name}.{number}" for number in own))
+        shapes.append(tuple(f"{name}.{number}" for number in inside.values()))
+    quantities = []
+    for p in numbers:
+        step = SHAPES[p.name.rpartition("_")[0]][2] if p.is_shape else 0.01 * abs(p.nominal) or 1e-9
+        quantities.append(Quantity(f"{name}.{p.name}", "SI", step, p.null, p.lower, p.upper, meaning=p.meaning))
     title, source = "; ".join(f"{k} = {v}" for k, v in formulas.items()), "regression on the residual of this recording"
-    effect = effect_from_formulas(name, formulas, tuple(parameters), title=title, source=source)
-    begin = tuple(np.asarray(values, float).tolist())
-    candidate = Candidate(name, name, "motion", effect.title, effect.source, tuple(quantities), begin)
+    effect = effect_from_formulas(name, formulas, tuple(numbers), title=title, source=source)
+    candidate = Candidate(name, name, "motion", effect.title, effect.source, tuple(quantities), tuple(begin))
     return LearnedLaw(candidate, effect, tuple(chosen), tuple(coefficients), tuple(shapes))

@@ -18,16 +18,16 @@ _PARTS: dict[str, dict[str, tuple[str, ...]]] = {
 SLIP = "slip.inverse_mu"
 THETA_END = np.radians(0.05)  # a trial fit may run into the collapse; the data end before it
 ROUGHEST = 100.0  # coefficient of friction of a disc that is known to slip; without an end to it none does
-STATE_SCALES = {
-    "x": 1e-6, "y": 1e-6, "psi": 1e-5, "theta": 1e-5, "phi": 1e-5, "thetadot": 1e-3, "omega2": 1e-3, "omega3": 1e-3,
-}  # fmt: skip
-_STATE_UNITS = dict(zip(STATE_SCALES, ("m", "m", "rad", "rad", "rad", "rad/s", "rad/s", "rad/s"), strict=True))
+STATE_SCALES = dict.fromkeys(("x", "y"), 1e-6) | dict.fromkeys(("psi", "theta", "phi"), 1e-5)
+STATE_SCALES |= dict.fromkeys(("thetadot", "omega2", "omega3"), 1e-3)  # SI, as the steps of a fit
+SLIP_VELOCITY = ("state.v_x", "state.v_y")
 
 
 def state_quantities() -> tuple[Quantity, ...]:
     """The eight numbers of the initial state."""
+    units = {1e-6: "m", 1e-5: "rad", 1e-3: "rad/s"}
     return tuple(
-        Quantity(f"state.{name}", _STATE_UNITS[name], scale, meaning="at the first instant")
+        Quantity(f"state.{name}", units[scale], scale, meaning="at the first instant")
         for name, scale in STATE_SCALES.items()
     )
 
@@ -35,9 +35,6 @@ def state_quantities() -> tuple[Quantity, ...]:
 def state_of(values: Values) -> State:
     """Initial state among the values; with v_x, v_y the disc may slip at first."""
     return State(**{k.partition(".")[2]: float(v) for k, v in values.items() if k.startswith("state.")})
-
-
-SLIP_VELOCITY = ("state.v_x", "state.v_y")
 
 
 def slipping_start_quantities(model: Model) -> tuple[Quantity, ...]:
@@ -79,23 +76,19 @@ def motion_candidates(model: Model, names: Sequence[str] | None = None) -> tuple
 
     names : only these effects, if given
     """
-    present = {effect.name for effect in model.effects}
     found = []
     for effect in CATALOGUE.values():
-        wanted = names is None or effect.name in names
-        if not (wanted and effect.candidate) or effect.name in present:
+        if not effect.candidate or model.effect(effect.name) or effect.name not in (names or CATALOGUE):
             continue
-        amounts = [p for p in effect.parameters if not p.is_shape and np.isfinite(p.null)]
-        if not amounts and effect.name != "slip":
-            continue
-        parts = _PARTS.get(effect.name, {effect.name: tuple(p.name for p in amounts)} if amounts else {})
-        for name, members in parts.items():
-            quantities = tuple(effect_quantity(effect, p) for p in amounts if p.name in members)
-            shape = tuple(effect_quantity(effect, p) for p in effect.parameters if p.is_shape)
-            told = (name, effect.name, "motion", effect.title, effect.source, quantities)
-            found.append(Candidate(*told, shape=shape, sought=effect.sought))
         if effect.name == "slip":
             found.append(slip_candidate(effect))
+            continue
+        amounts = [p for p in effect.parameters if not p.is_shape and np.isfinite(p.null)]
+        shape = tuple(effect_quantity(effect, p) for p in effect.parameters if p.is_shape)
+        for name, members in _PARTS.get(effect.name, {effect.name: tuple(p.name for p in amounts)}).items():
+            quantities = tuple(effect_quantity(effect, p) for p in amounts if p.name in members)
+            told = (name, effect.name, "motion", effect.title, effect.source, quantities)
+            found += [Candidate(*told, shape=shape, sought=effect.sought)] if quantities else []
     return tuple(found)
 
 
@@ -108,19 +101,11 @@ def slip_candidate(effect: type[Effect]) -> Candidate:
 
 def candidate_of_fault(fault: Fault) -> Candidate:
     """A fault of the measurement as the engine wants it."""
-    several = len(fault.parts) > 1
-    low, high = fault.bounds
+    several, (low, high) = len(fault.parts) > 1, fault.bounds
+    one = Quantity(fault.name, fault.unit, fault.step, lower=low, upper=high, belongs_to=fault.belongs_to)
+    one = replace(one, typical=TYPICAL_STEPS * fault.step)
     quantities = tuple(
-        Quantity(
-            name,
-            fault.unit,
-            fault.step,
-            lower=low,
-            upper=high,
-            meaning=f"{fault.meaning} ({part})" if several else fault.meaning,
-            typical=TYPICAL_STEPS * fault.step,
-            belongs_to=fault.belongs_to,
-        )
+        replace(one, name=name, meaning=f"{fault.meaning} ({part})" if several else fault.meaning)
         for name, part in zip(fault.names(), fault.parts, strict=True)
     )
     return Candidate(fault.name, fault.name, "measurement", fault.title, fault.source, quantities)
