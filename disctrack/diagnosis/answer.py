@@ -32,6 +32,11 @@ class Learned:
     misfit: float  # rms of that over the law's own, as the residual has it
 
     @property
+    def is_moment(self) -> bool:
+        """Is it no force?"""
+        return all(component.startswith("M") for component in self.law.formulas)
+
+    @property
     def text(self) -> str:
         """The law with its numbers."""
         quantities = self.law.candidate.quantities

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence, Set
 from copy import copy
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -28,7 +27,7 @@ from disctrack.diagnosis.motion import (
 )
 from disctrack.diagnosis.starts import STRETCHES, sought, start_values
 from disctrack.diagnosis.stretch import Stretch, free_stretch
-from disctrack.diagnosis.systematic import DOT_SIGMA, Systematic, dot_columns, lens_columns
+from disctrack.diagnosis.systematic import DOT_SIGMA, Systematic, field_columns
 from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.laws import Family, LawSystem, LearnedLaw
 from disctrack.discrepancy.system import Budget, Candidate, Quantity, Values
@@ -198,18 +197,16 @@ class DiscSystem(LawSystem):
         quantities += [replace(one, name=f"dot_{i}.{axis}") for i in range(m) for axis in "xy"]
         columns = [rig, dots.reshape(n, -1, 2 * m)]
         per_px = float(np.sqrt(np.mean(self._whiten[self.used] ** 2) * 2)) if self.used.any() else 1.0
-        in_common = partial(lens_columns, fields=sizes.lens_fields)
-        fields = (
-            ("lens_field", sizes.lens_px, sizes.lens_length_px, in_common, "mode of the lenses' residual fields"),
-            ("dot_field", sizes.dot_px, sizes.dot_length_px, dot_columns, "mode of the dots' own residual fields"),
-        )
-        for name, size, length, of_unit_size, meaning in fields:
+        together = sizes.lens_fields  # of all recordings of the rig
+        for name, size, length, own, meaning, fields in (
+            ("lens_field", sizes.lens_px, sizes.lens_length_px, False, "mode of the lenses' residual fields", together),
+            ("dot_field", sizes.dot_px, sizes.dot_length_px, True, "mode of the dots' own residual fields", ()),
+        ):
             if size > 0:
-                shifts = size * of_unit_size(places, self.used, length, size * per_px)
+                shifts = size * field_columns(places, self.used, length, size * per_px, own, fields)
                 whitened = np.einsum("ncmab,ncmbk->ncmak", self._whiten, shifts)
                 columns.append(whitened.reshape(n, 4 * m, shifts.shape[-1]))  # perhaps no mode at all is seen
-                belongs_to = ("rig",) if of_unit_size is in_common and sizes.lens_fields else ()
-                quantities += _nuisances(name, shifts.shape[-1], meaning, belongs_to)
+                quantities += _nuisances(name, shifts.shape[-1], meaning, ("rig",) if fields else ())
         return tuple(quantities), np.concatenate(columns, axis=-1)
 
     def _as_measured(self, delay: float = 0.0) -> _Path:

@@ -20,12 +20,13 @@ from scipy.interpolate import CubicSpline
 from scipy.linalg import solve_triangular
 
 from calibration.kit.arrays import Array
+from calibration.kit.least_squares import triangle
 from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.diagnosis.missing_force import WIDTH, Course, Probed, probe
 from disctrack.diagnosis.motion import THETA_END, state_of
 from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.laws import LearnedLaw, evidence
-from disctrack.discrepancy.score import cleared, span
+from disctrack.discrepancy.score import DEPENDENT, cleared, span
 from disctrack.discrepancy.system import Values
 from disctrack.rolling import Motion, simulate
 from disctrack.rolling.evaluate import effect_wrench, kinematics
@@ -38,7 +39,6 @@ SELDOM = 0.05  # probability that the form is another's, where no other describe
 SWEEPS = 4  # over the parts, the size of each judged beside the others
 STEP = 1e-4  # of a number, for the derivative of the course
 WITHIN = 8  # instants of a probe, at which laws are looked at
-UNSEEN = 1e-10  # share of a column's length below which the data do not show it
 
 
 def moment_about_contact(
@@ -95,16 +95,16 @@ def with_form(
     wrong = 1.0 if remembers else form_is_another(law, beside)
     laws = by_number[:, np.any(by_number != 0.0, axis=0)]
     own_directions = span(laws)
-    U, inverse = _solver(R[:, :n])
-    right = R[:, -1] - U @ (U.T @ R[:, -1])
+    fitted_columns = span(R[:, :n])
+    right = cleared(R[:, -1], fitted_columns)
     variance = np.sum((by_number @ fitted.covariance) * by_number, axis=1)
     mixed, another, misfit = fitted.covariance.copy(), fitted.covariance, 0.0
     for probability, some in ((1.0 - wrong, [np.concatenate(parts[:: HARMONICS + 2], axis=1)]), (wrong, parts)):
         S = np.concatenate(some, axis=1)
         S = cleared(S, own_directions)
         B = R[:, n:-1] @ S / (WIDTH * np.sqrt(2 * np.pi))  # neighbouring probes add up to this
-        taken = inverse @ (U.T @ B)  # by which the fitted numbers give way to a misfit
-        second, size = _second_moment(B - U @ (U.T @ B), right, [part.shape[1] for part in some])
+        taken = absorbed(R[:, :n], B)
+        second, size = _second_moment(cleared(B, fitted_columns), right, [part.shape[1] for part in some])
         moved = S - by_number @ taken
         variance += probability * np.sum((moved @ second) * moved, axis=1)
         another = fitted.covariance + taken @ second @ taken.T  # in the end that of all parts
@@ -114,6 +114,13 @@ def with_form(
     variance += wrong * _within_probes(system, fitted, blocks, course)
     found = Course(blocks.time, course, np.sqrt(variance))
     return replace(fitted, covariance=mixed), replace(fitted, covariance=another), found, float(np.sqrt(misfit))
+
+
+def absorbed(columns: Array, misfit: Array) -> Array:
+    """By how much the numbers of columns (m, n) give way to what others (m, k) do, in least squares: (n, k)."""
+    length = np.linalg.norm(columns, axis=0)
+    length = np.where(length > 0, length, 1.0)
+    return np.asarray(np.linalg.lstsq(columns / length, misfit, rcond=DEPENDENT)[0] / length[:, None], float)
 
 
 def form_is_another(law: LearnedLaw, beside: Collection[str] = ()) -> float:
@@ -175,15 +182,6 @@ def _motion(system: DiscSystem, values: Values, time: Array) -> Motion:
     return simulate(system.model_with(values), state_of(values), times=times)
 
 
-def _solver(A: Array) -> tuple[Array, Array]:
-    """Orthonormal columns U that span those of A (m, n), and the matrix from U' right to the least-squares solution."""
-    length = np.linalg.norm(A, axis=0)
-    length = np.where(length > 0, length, 1.0)
-    U, singular, V = np.linalg.svd(A / length, full_matrices=False)
-    seen = singular > UNSEEN * singular[0]
-    return U[:, seen], (V[seen] / singular[seen, None]).T / length[:, None]
-
-
 def _parts(system: DiscSystem, fitted: Fit, blocks: Probed, size: float) -> list[Array]:
     """Roots (3 k, m) of the covariances of the misfit's parts, axis by axis; their rms is that of the law, `size`."""
     time, k = blocks.time, len(blocks.time)
@@ -199,15 +197,15 @@ def _parts(system: DiscSystem, fitted: Fit, blocks: Probed, size: float) -> list
     return [size * np.kron(np.eye(3)[:, [axis]], root) for axis in range(3) for root in roots]
 
 
-def _second_moment(B: Array, right: Array, parts: Sequence[int]) -> tuple[Array, float]:
+def _second_moment(B: Array, right: Array, parts: Sequence[int], sizes: Array = SIZES) -> tuple[Array, float]:
     """E[u u'] of right = B u + noise, and the rms of u; its parts u_i = f_i v_i with normal v_i of size 1.
 
-    parts : how many columns each has. f_i is averaged over SIZES, the others' at their rms.
+    parts : how many columns each has. f_i is averaged over `sizes`, the others' at their rms.
     """
     edges = np.concatenate([[0], np.cumsum(parts)])
     own = [slice(a, b) for a, b in pairwise(edges)]
-    f2 = np.full(len(parts), SIZES[0] ** 2)
-    _, R = np.linalg.qr(np.column_stack([B, right])) if len(B) > B.shape[1] + 1 else (None, np.column_stack([B, right]))
+    f2 = np.full(len(parts), sizes[0] ** 2)
+    R = triangle(np.column_stack([B, right]))
     B, right = R[:, :-1], R[:, -1]
     for _ in range(SWEEPS):
         for i, columns in enumerate(own):
@@ -218,9 +216,9 @@ def _second_moment(B: Array, right: Array, parts: Sequence[int]) -> tuple[Array,
             L = np.linalg.cholesky(others)
             left, shown, _ = np.linalg.svd(solve_triangular(L, B[:, columns], lower=True), full_matrices=False)
             projected = left.T @ solve_triangular(L, right, lower=True)
-            density = -0.5 * evidence(shown, projected, SIZES)
+            density = -0.5 * evidence(shown, projected, sizes)
             weight = np.exp(density - density.max())
-            f2[i] = float(weight @ SIZES**2 / weight.sum())
+            f2[i] = float(weight @ sizes**2 / weight.sum())
     size = np.repeat(np.sqrt(f2), parts)
     scaled = B * size
     precision = np.eye(len(size)) + scaled.T @ scaled

@@ -5,7 +5,8 @@ records.KINEMATICS and gets a coefficient of its own. Numbers in braces are the 
 fast something hums): a grid of them is looked over, and the best is fitted along with the coefficients.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import chain, product
 
 import numpy as np
 
@@ -46,6 +47,10 @@ _ARM = "(radius * cos_theta - half_thickness * sin_theta)"
 _CONTACT_X, _CONTACT_Y = f"(x + {_ARM} * sin(psi))", f"(y - {_ARM} * cos(psi))"
 _ALONG = f"({_CONTACT_X} * cos({{direction}}) + {_CONTACT_Y} * sin({{direction}}))"
 
+
+Shape = Mapping[str, float]
+# title, kind, terms; values of the shape at which they are looked at
+Row = tuple[str, str, tuple[Parts, ...]] | tuple[str, str, tuple[Parts, ...], Iterable[Shape]]
 
 # smallest and largest value of each number of a shape, and a sensible step
 SHAPES = {
@@ -102,22 +107,22 @@ def _of_velocity(factor: str) -> Parts:
 def families(q: Array, time: Array, frame_rate: float, disc: Disc) -> Iterator[Family]:
     """The library for a motion q (N, 6) of a disc at the instants (N,) [s]."""
     path = _path_of_contact(q, disc)
-    for axis in MOMENTS:
-        for words, formula in SCALARS:
-            yield Family(f"a moment M_{axis} by {words}", ({f"M_{axis}": formula},))
-        yield from _angular(axis)
+    rows = (
+        _by_rates(), _angular(), _places(), _drags(), _magnets(), _drifts(time), _below_a_nutation(q), _instants(time),
+        _parts_of_the_table(q, path), _uneven(path), _bumps(), _hums(time, frame_rate),
+    )  # fmt: skip
+    for title, kind, terms, *shapes in chain(*rows):
+        for shape in shapes[0] if shapes else ({},):
+            yield Family(title, terms, shape, kind)
+
+
+def _by_rates() -> Iterator[Row]:
+    for words, formula in SCALARS:
+        for axis in MOMENTS:
+            yield f"a moment M_{axis} by {words}", "moment", ({f"M_{axis}": formula},)
     for words, formula in SCALARS[:FOR_FORCES]:
         for c, kind in (("X_z", "lift"), ("X_n", "force"), ("X_m", "force")):
-            yield Family(f"a force {c} by {words}", ({c: formula},), kind=kind)
-    for title, kind, terms in (*_places(), *_drags(), *_magnets()):
-        yield Family(title, terms, kind=kind)
-    yield from _drifts(time)
-    yield from _below_a_nutation(q)
-    yield from _instants(time)
-    yield from _parts_of_the_table(q, path)
-    yield from _uneven(path)
-    yield from _bumps()
-    yield from _hums(time, frame_rate)
+            yield f"a force {c} by {words}", kind, ({c: formula},)
 
 
 def _path_of_contact(q: Array, disc: Disc) -> Array:
@@ -127,17 +132,15 @@ def _path_of_contact(q: Array, disc: Disc) -> Array:
     return q[:, :2] + arm[:, None] * np.stack([np.sin(psi), -np.cos(psi)], axis=1)
 
 
-def _angular(axis: str) -> Iterator[Family]:
-    grown = (("", ""), (", times sin theta", " * sin_theta"), (", times 1 / sin theta", " * 1.0 / sin_theta"))
+def _angular() -> Iterator[Row]:
+    factors = {
+        "": "", ", times sin theta": " * sin_theta", ", times 1 / sin theta": " * 1.0 / sin_theta",
+        ", times time": " * time",
+    }  # fmt: skip
     for angle, highest in (("psi", HIGHEST_HARMONIC), ("phi", HIGHEST_HARMONIC), ("(psi + phi)", 1)):
-        for n in range(1, highest + 1):
-            for words, factor in (*grown, (", times time", " * time")):
-                pair = tuple({f"M_{axis}": f"{f}({n}.0 * {angle}){factor}"} for f in ("cos", "sin"))
-                title = f"a moment M_{axis} by the angle {n if n > 1 else ''}{angle}{words}"
-                yield Family(title, pair, kind="angle")
-
-
-Row = tuple[str, str, tuple[Parts, ...]]  # title, kind, terms
+        for axis, n, words in product(MOMENTS, range(1, highest + 1), factors):
+            pair = tuple({f"M_{axis}": f"{f}({n}.0 * {angle}){factors[words]}"} for f in ("cos", "sin"))
+            yield f"a moment M_{axis} by the angle {n if n > 1 else ''}{angle}{words}", "angle", pair
 
 
 def _places() -> Iterator[Row]:
@@ -190,7 +193,7 @@ def _magnets() -> Iterator[Row]:
             yield f"a magnet {where}, in a {direction} field", "magnet", terms
 
 
-def _drifts(time: Array) -> Iterator[Family]:
+def _drifts(time: Array) -> Iterator[Row]:
     """What changes slowly: a draught, a table that settles, a magnet that is moved away; friction, as surfaces do.
 
     Friction that lags behind the motion follows no rate of the instant, and changes with time as its mean does.
@@ -199,64 +202,59 @@ def _drifts(time: Array) -> Iterator[Family]:
     u = f"((time - {middle!r}) / {half!r})"
     powers = [" * ".join([u] * n) or "1.0" for n in range(DRIFT_DEGREE + 1)]
     for n in range(1, DRIFT_DEGREE + 1):
-        level = tuple(along(f) for f in powers[: n + 1] for along in (along_x, along_y))
-        yield Family(f"a level force that changes with time, degree {n}", level, kind="drift")
-        upright = tuple({"X_z": f} for f in powers[: n + 1])
-        yield Family(f"a vertical force that changes with time, degree {n}", upright, kind="drift Z")
+        changes, here = f"that changes with time, degree {n}", powers[: n + 1]
+        yield f"a level force {changes}", "drift", tuple(along(f) for f in here for along in (along_x, along_y))
+        yield f"a vertical force {changes}", "drift Z", tuple({"X_z": f} for f in here)
         for axis in ("m", "z"):
-            friction = tuple({f"load_{axis}": f} for f in powers[: n + 1])
-            yield Family(f"a moment M_{axis} by the load that changes with time, degree {n}", friction, kind="drift M")
+            yield f"a moment M_{axis} by the load {changes}", "drift M", tuple({f"load_{axis}": f} for f in here)
 
 
-def _below_a_nutation(q: Array) -> Iterator[Family]:
+def _below_a_nutation(q: Array) -> Iterator[Row]:
     # its tails end within some widths: one that falls as a power acts everywhere, and moves the edge
     step = "1.0 / (1.0 + exp((sin_theta - {edge}) / {softness}))"
-    for edge in np.quantile(np.sin(q[:, 4]), np.linspace(0.05, 0.95, 13)).tolist():
-        shape = {"edge": edge, "softness": max(0.03 * edge, 1e-3)}
-        for axis in MOMENTS:
-            for words, law in (("", "1.0"), (" over sin theta", "1.0 / sin_theta")):
-                title = f"a moment M_{axis} by the load{words} that acts below a nutation"
-                yield Family(title, ({f"load_{axis}": f"{step} * {law}"},), shape, "below a nutation")
+    edges = np.quantile(np.sin(q[:, 4]), np.linspace(0.05, 0.95, 13)).tolist()
+    shapes = [{"edge": edge, "softness": max(0.03 * edge, 1e-3)} for edge in edges]
+    for axis, (words, law) in product(MOMENTS, (("", "1.0"), (" over sin theta", "1.0 / sin_theta"))):
+        terms = ({f"load_{axis}": f"{step} * {law}"},)
+        yield f"a moment M_{axis} by the load{words} that acts below a nutation", "below a nutation", terms, shapes
 
 
-def _instants(time: Array) -> Iterator[Family]:
+def _instants(time: Array) -> Iterator[Row]:
     """What begins at an instant, and blows; a blow's numbers are its impulse."""
     after = "(0.5 + 0.5 * sign(time - {instant}, 0.002))"
     blow = "exp(-0.5 * ((time - {instant}) / {lasting}) ** 2) / (2.5066283 * {lasting})"
-    first, span = float(time[0]), float(time[-1] - time[0])
-    for share in np.linspace(0.03, 0.97, 32).tolist():
-        shape = {"instant": first + share * span}
-        yield Family("a force from an instant on", _push(after), shape, "from then on")
-        for axis in MOMENTS:
-            yield Family(f"a moment M_{axis} from an instant on", ({f"M_{axis}": after},), shape, "from then on")
-    for share in np.linspace(0.03, 0.97, 64).tolist():
-        shape = {"instant": first + share * span, "lasting": 0.008}
-        yield Family("a blow: a force during milliseconds", _push(blow), shape, "blow")
-        yield Family("a blow: a moment during milliseconds", _moment(blow), shape, "blow M")
+    few, many = (np.interp(np.linspace(0.03, 0.97, n), (0, 1), time[[0, -1]]).tolist() for n in (32, 64))
+    begins = [{"instant": instant} for instant in few]
+    yield "a force from an instant on", "from then on", _push(after), begins
+    for axis in MOMENTS:
+        yield f"a moment M_{axis} from an instant on", "from then on", ({f"M_{axis}": after},), begins
+    blows = [{"instant": instant, "lasting": 0.008} for instant in many]
+    yield "a blow: a force during milliseconds", "blow", _push(blow), blows
+    yield "a blow: a moment during milliseconds", "blow M", _moment(blow), blows
 
 
-def _edges(places: Array, angles: Array, shares: Array) -> Iterator[dict[str, float]]:
+def _edges(places: Array, shares: Array) -> list[Shape]:
     """Straight edges: directions, and shares of the places (N, 2) that lie before them."""
-    for angle in angles:
+    found = []
+    for angle in np.arange(0, 2 * np.pi, np.pi / 6).tolist():
         along = places @ np.array([np.cos(angle), np.sin(angle)])
-        for share in shares:
-            yield {"direction": float(angle), "edge": float(np.quantile(along, share))}
+        found += [{"direction": angle, "edge": edge} for edge in np.quantile(along, shares).tolist()]
+    return found
 
 
-def _parts_of_the_table(q: Array, path: Array) -> Iterator[Family]:
+def _parts_of_the_table(q: Array, path: Array) -> Iterator[Row]:
     """What acts beyond a straight edge, of the contact or of the centre."""
-    angles = np.arange(0, 2 * np.pi, np.pi / 6)
     step = f"(0.5 + 0.5 * sign({_ALONG} - {{edge}}, 1e-3))"
-    for shape in _edges(path, angles, np.array([0.2, 0.4, 0.6, 0.8])):
-        for axis, law in (("m", "1.0"), ("z", "sign(omega_z, 0.1)"), ("m", "1.0 / sin_theta")):
-            title = f"a moment M_{axis} by the load on a part of the table"
-            yield Family(title, ({f"load_{axis}": f"{step} * {law}"},), shape, "part of the table")
+    of_contact = _edges(path, np.array([0.2, 0.4, 0.6, 0.8]))
+    for axis, law in (("m", "1.0"), ("z", "sign(omega_z, 0.1)"), ("m", "1.0 / sin_theta")):
+        title = f"a moment M_{axis} by the load on a part of the table"
+        yield title, "part of the table", ({f"load_{axis}": f"{step} * {law}"},), of_contact
     beyond = "(0.5 + 0.5 * sign(x * cos({direction}) + y * sin({direction}) - {edge}, 3e-4))"
-    for shape in _edges(q[:, :2], angles, np.linspace(0.1, 0.9, 9)):
-        yield Family("a drag on a part of the table", (_of_velocity(f" * {beyond}"),), shape, "drag on a part")
+    of_centre = _edges(q[:, :2], np.linspace(0.1, 0.9, 9))
+    yield "a drag on a part of the table", "drag on a part", (_of_velocity(f" * {beyond}"),), of_centre
 
 
-def _uneven(path: Array) -> Iterator[Family]:
+def _uneven(path: Array) -> Iterator[Row]:
     """A table that is not flat: ridges, grooves and steps, hills and dips.
 
     The place of touch moves by r phidot along n0 only, so that a height H of the table acts as M_m = -F_z r H' / sin
@@ -267,46 +265,43 @@ def _uneven(path: Array) -> Iterator[Family]:
     slope = "radius / sin_theta * cos(psi - {direction})"
     ridge = f"2.0 * {slope} * {off} * exp(-{off} * {off}) / ({{length}} * {{length}})"
     step = f"-{slope} * exp(-{off} * {off}) / (1.7724539 * {{length}})"
-    for direction in np.arange(0, np.pi, np.pi / 12):
+    lines = list[Shape]()
+    for direction in np.arange(0, np.pi, np.pi / 12).tolist():
         across = path @ np.array([np.cos(direction), np.sin(direction)])
-        for edge in np.arange(across.min(), across.max(), 0.004):
-            for length in (0.003, 0.008):
-                shape = {"direction": float(direction), "edge": float(edge), "length": length}
-                yield Family("a ridge or groove of the table", ({"load_m": ridge},), shape, "ridge")
-                yield Family("a step of the table", ({"load_m": step},), shape, "step")
+        edges = np.arange(across.min(), across.max(), 0.004).tolist()
+        lines += [{"direction": direction, "edge": e, "length": length} for e in edges for length in (0.003, 0.008)]
+    yield "a ridge or groove of the table", "ridge", ({"load_m": ridge},), lines
+    yield "a step of the table", "step", ({"load_m": step},), lines
     from_x, from_y = f"({_CONTACT_X} - {{x0}})", f"({_CONTACT_Y} - {{y0}})"
     away2 = f"({from_x} * {from_x} + {from_y} * {from_y}) / ({{length}} * {{length}})"
     along_n0 = f"({_X} - {{x0}} * cos(psi) - {{y0}} * sin(psi))"
     over = "({length} * {length} * {length} * {length})"
     hill = f"2.0 * radius / sin_theta * {along_n0} * exp(-{away2}) / {over}"
-    for x0, y0 in np.unique(np.round(path / 0.006), axis=0) * 0.006:
-        for length in (0.005, 0.012):
-            shape = {"x0": float(x0), "y0": float(y0), "length": length}
-            yield Family("a hill or dip of the table", ({"load_m": hill},), shape, "hill")
+    places = (np.unique(np.round(path / 0.006), axis=0) * 0.006).tolist()
+    tops = [{"x0": x0, "y0": y0, "length": length} for x0, y0 in places for length in (0.005, 0.012)]
+    yield "a hill or dip of the table", "hill", ({"load_m": hill},), tops
 
 
-def _bumps() -> Iterator[Family]:
+def _bumps() -> Iterator[Row]:
     """Dents of the rim, once a turn of the disc, and of the table, once a precession: braking, or up and down again."""
+    wide = {width: np.arange(0, 2 * np.pi, max(width, 0.15)).tolist() for width in (0.08, 0.2, 0.5)}
+    shapes = [{"angle": angle, "width": width} for width, angles in wide.items() for angle in angles]
     for angle, where in (("phi", "a spot of the rim"), ("psi", "a direction of the table")):
         # over its width: what a dent does in all hardly depends on how wide it is
         bell = f"exp((cos({angle} - {{angle}}) - 1.0) / ({{width}} * {{width}})) / {{width}}"
         slope = f"sin({angle} - {{angle}}) / ({{width}} * {{width}}) * {bell}"
-        for width in (0.08, 0.2, 0.5):
-            for at in np.arange(0, 2 * np.pi, max(width, 0.15)):
-                for axis, words, law in (("m", "", bell), ("n", "", bell), ("m", ", up and down,", slope)):
-                    title = f"a moment M_{axis} by the load{words} when {where} touches"
-                    shape = {"angle": float(at), "width": width}
-                    yield Family(title, ({f"load_{axis}": law},), shape, f"bump {angle}")
+        for axis, words, law in (("m", "", bell), ("n", "", bell), ("m", ", up and down,", slope)):
+            title = f"a moment M_{axis} by the load{words} when {where} touches"
+            yield title, f"bump {angle}", ({f"load_{axis}": law},), shapes
 
 
-def _hums(time: Array, frame_rate: float) -> Iterator[Family]:
+def _hums(time: Array, frame_rate: float) -> Iterator[Row]:
     """What swings with a frequency of its own: a table that vibrates, a field that alternates."""
     span, waves = float(time[-1] - time[0]), ("cos({rate} * time)", "sin({rate} * time)")
-    level = tuple(along(w) for along in (along_x, along_y) for w in waves)
-    upright = tuple({"X_z": w} for w in waves)
-    for f in np.arange(2.0 / span, min(FASTEST_HUM, 0.45 * frame_rate), 0.6 / span):
-        shape = {"rate": float(2 * np.pi * f)}
-        for axis in MOMENTS:
-            yield Family(f"a moment M_{axis} that swings", tuple({f"M_{axis}": w} for w in waves), shape, "hum M")
-        yield Family("a vertical force that swings, as of a table that vibrates", upright, shape, "hum Z")
-        yield Family("a force that swings, as of a table that vibrates", (*level, *upright), shape, "hum X")
+    frequencies = np.arange(2.0 / span, min(FASTEST_HUM, 0.45 * frame_rate), 0.6 / span)
+    shapes = [{"rate": rate} for rate in (2 * np.pi * frequencies).tolist()]
+    for axis in MOMENTS:
+        yield f"a moment M_{axis} that swings", "hum M", tuple({f"M_{axis}": w} for w in waves), shapes
+    level, upright = tuple(along(w) for along in (along_x, along_y) for w in waves), tuple({"X_z": w} for w in waves)
+    yield "a vertical force that swings, as of a table that vibrates", "hum Z", upright, shapes
+    yield "a force that swings, as of a table that vibrates", "hum X", (*level, *upright), shapes

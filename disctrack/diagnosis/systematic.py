@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
+from scipy.stats import chi2
 
 from calibration.kit.arrays import Array, Mask
 from disctrack.diagnosis.stretch import MIN_FRAMES
@@ -27,17 +28,13 @@ if TYPE_CHECKING:
     from disctrack.discrepancy.system import Values
 
 
-MIN_DIFFERENCES = 20  # third differences from which a noise is read
-OF_THE_REST = 0.7588  # variance of a standard normal number cut at its 95th percentile in size
 INFLATED = 0.8  # variance from frame to frame over that stated, below which the statement holds more than noise
 MARGIN = 0.6  # of a field's length, by which its grid exceeds the places
 DOT_SIGMA = 3e-7  # [m] a common bias of one dot's centre in all images: 1/800 px, below what edges of dots allow
 LENS_LENGTHS = (0.3, 0.6, 0.17)  # of a camera's field, over the extent of the dots' places
 DOT_LENGTH = 0.5  # of the fields of single dots, likewise
 MAX_FRAMES = 200  # that are looked at: fields move slowly
-ROUNDS = 3  # over the sizes
 WORTH = 20.0  # of twice the log likelihood, that a fault or a field must gain: odds of 2e4
-MOST_FAULTS = 2
 WIDE = 100.0  # times its typical size, that a fault which is known to be there may have
 SEEN = 0.2  # a mode of a field that moves all dots together by less than this many sigmas is left out
 
@@ -53,15 +50,15 @@ def noise_over_stated(trajectory: Trajectory) -> float:
     seen &= np.isfinite(variance) & (variance > 0)
     scaled = np.where(seen, residual.transpose(3, 0, 1, 2) / np.sqrt(np.where(seen, variance, 1.0)), 0.0)
     together = seen[3:] & seen[2:-1] & seen[1:-2] & seen[:-3] & np.all(np.diff(trajectory.frame) == 1)
-    if together.any(axis=(1, 2)).sum() < MIN_DIFFERENCES:
+    if together.any(axis=(1, 2)).sum() < MIN_FRAMES // 2:
         return 1.0
     difference = np.diff(scaled, 3, axis=1)[:, together]
     numbers = 2.0 * seen.sum(axis=(1, 2))
     free = np.mean(np.clip((numbers - 6.0) / np.maximum(numbers, 1.0), 0.0, 1.0)[numbers > 6])
     # without the twentieth that is largest: a heavy tail of single bad frames is no noise of the others
     squares = np.sort(np.ravel(difference) ** 2)
-    kept = squares[: int(0.95 * squares.size)]
-    return float(np.mean(kept) / OF_THE_REST / 20.0 / free)
+    of_normal = chi2.cdf(chi2.ppf(0.95, 1), 3) / 0.95
+    return float(np.mean(squares[: int(0.95 * squares.size)]) / of_normal / 20.0 / free)
 
 
 def with_noise_of_frames(trajectory: Trajectory) -> Trajectory:
@@ -150,39 +147,25 @@ def _bumps(places: Array, centres: Array, length: float) -> Array:
     return np.asarray(np.exp(-0.5 * squared / length**2), float)
 
 
-def lens_columns(places: Array, used: Mask, length: float, sigmas: float, fields: Sequence[SmoothField] = ()) -> Array:
-    """(n, 2, m, 2, k) shifts [px] by fields of unit size, one for each camera and coordinate, common to its dots.
+def field_columns(
+    places: Array, used: Mask, length: float, sigmas: float, own: bool = False, fields: Sequence[SmoothField] = ()
+) -> Array:
+    """(n, 2, m, 2, k) shifts [px] by fields of unit size, one for each camera and coordinate.
 
+    own : each dot has such fields of its own; else they are common to all dots
     fields : of each camera, if they are not to be made for these places
     """
-    found = []
+    found, m = [], places.shape[2]
     for camera in range(2):
-        seen = used[:, camera]
-        camera_field = fields[camera] if fields else smooth_field(places[:, camera][seen], length, sigmas)
-        found += _along(camera_field.modes(places[:, camera]), camera, slice(None), places.shape)
-    return np.concatenate(found, axis=-1)
-
-
-def dot_columns(places: Array, used: Mask, length: float, sigmas: float) -> Array:
-    """(n, 2, m, 2, k) shifts [px] by fields of unit size, one for each dot, camera and coordinate."""
-    found = []
-    for camera in range(2):
-        for dot in range(places.shape[2]):
-            seen = used[:, camera, dot]
+        for dots in [slice(i, i + 1) for i in range(m)] if own else [slice(m)]:
+            here, seen = places[:, camera, dots], used[:, camera, dots]
             if seen.any():
-                modes = smooth_field(places[:, camera, dot][seen], length, sigmas).modes(places[:, camera, dot])
-                found += _along(modes[:, None], camera, slice(dot, dot + 1), places.shape)
+                modes = (fields[camera] if fields else smooth_field(here[seen], length, sigmas)).modes(here)
+                for axis in range(2):
+                    column = np.zeros((*places.shape, modes.shape[-1]))
+                    column[:, camera, dots, axis] = modes
+                    found.append(column)
     return np.concatenate(found, axis=-1)
-
-
-def _along(modes: Array, camera: int, dots: slice, shape: tuple[int, ...]) -> list[Array]:
-    """The modes (n, m', k) as shifts along x, and along y, of these dots in this camera."""
-    columns = []
-    for axis in range(2):
-        column = np.zeros((*shape, modes.shape[-1]))
-        column[:, camera, dots, axis] = modes
-        columns.append(column)
-    return columns
 
 
 class Likelihood:
@@ -233,9 +216,7 @@ Sizes = dict[str, float]
 def _best_sizes(evidence: Likelihood, sizes: Sizes, grids: Mapping[str, Array]) -> tuple[float, Sizes]:
     """Sizes of the groups in `grids` that make the data most probable: one after the other, up and down its grid."""
     best, before = evidence.twice_log(sizes), -np.inf
-    for _ in range(ROUNDS):
-        if best - before < 1.0:
-            break
+    while best - before >= 1.0:
         before = best
         for name, grid in grids.items():
             here = int(np.argmin(np.abs(np.log(grid / sizes[name])))) if name in sizes else -1
@@ -254,13 +235,12 @@ def _with_faults(
 ) -> tuple[float, Sizes, tuple[str, ...]]:
     """The faults that make the data more probable beside these sizes, one after the other."""
     best, chosen = evidence.twice_log(sizes), tuple[str, ...]()
-    while len(chosen) < MOST_FAULTS:
+    while True:
         trials = {name: evidence.twice_log(sizes | {name: size}) for name, size in faults.items() if name not in sizes}
         name = max(trials, key=lambda n: trials[n], default="")
         if not name or trials[name] < best + WORTH:
-            break
+            return best, sizes, chosen
         best, sizes, chosen = trials[name], sizes | {name: faults[name]}, (*chosen, name)
-    return best, sizes, chosen
 
 
 def _with_amounts(
@@ -296,7 +276,7 @@ def find_systematic(system: DiscSystem, known: Values | None = None, beside: Seq
     faults = {name: view.whitened(columns) for name, columns in view.faults.items()}
     faults = {name: columns for name, columns in faults.items() if np.linalg.norm(columns) > 3.0}
     groups = {"rig": view.across_poses(view.rig), "print": view.across_poses(view.dots), **faults}
-    groups["dot"] = view.whitened(dot_columns(view.places, view.used, DOT_LENGTH * extent, size))
+    groups["dot"] = view.whitened(field_columns(view.places, view.used, DOT_LENGTH * extent, size, own=True))
     per_px = float(np.sqrt(np.mean(view.whiten[view.used] ** 2) * 2))
     steps: Array = size / per_px * 2.0 ** np.arange(-7, 4.5, 1.0)
     grids = {"print": DOT_SIGMA * 2.0 ** np.arange(7.0), "lens": steps, "dot": steps}
@@ -309,18 +289,15 @@ def find_systematic(system: DiscSystem, known: Values | None = None, beside: Seq
     value, sizes, chosen = _with_faults(alone, start, amounts)
     best = _with_amounts(Systematic(gain=value - nothing), alone, sizes, (*given, *chosen), view)
     for share in LENS_LENGTHS:
-        evidence = Likelihood(
-            data, {**groups, "lens": view.whitened(lens_columns(view.places, view.used, share * extent, size))}
-        )
+        lens_columns = view.whitened(field_columns(view.places, view.used, share * extent, size))
+        evidence = Likelihood(data, {**groups, "lens": lens_columns})
         value, sizes = _best_sizes(evidence, dict(start), grids)
         value, sizes, chosen = _with_faults(evidence, sizes, amounts)
         if chosen:  # what a fault explains is no field
             value, sizes = _best_sizes(evidence, start | dict.fromkeys(chosen, 1.0), grids)
-        found = Systematic(
-            sizes.get("lens", 0.0), share * extent, sizes.get("dot", 0.0), DOT_LENGTH * extent,
-            sizes["print"] if sizes["print"] > DOT_SIGMA else 0.0, value - nothing,
-            left=max(1.0, evidence.left(sizes) / numbers),
-        )  # fmt: skip
+        print_m, left = sizes["print"] if sizes["print"] > DOT_SIGMA else 0.0, evidence.left(sizes) / numbers
+        lens, dot = (sizes.get("lens", 0.0), share * extent), (sizes.get("dot", 0.0), DOT_LENGTH * extent)
+        found = Systematic(*lens, *dot, print_m, value - nothing, left=max(1.0, left))
         found = _with_amounts(found, evidence, sizes, (*given, *chosen), view)
         if found.present and found.gain > best.gain + WORTH:
             best = found

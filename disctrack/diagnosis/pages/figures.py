@@ -13,7 +13,6 @@ from calibration.kit.arrays import Array
 from disctrack.diagnosis.answer import DiscDiagnosis
 from disctrack.diagnosis.errors import coordinate_errors, frequencies, simulated
 from disctrack.diagnosis.evidence import Evidence, force_of
-from disctrack.diagnosis.form_misfit import moment_about_contact
 from disctrack.diagnosis.missing_force import Course
 from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.held_out import HeldOut
@@ -21,6 +20,25 @@ from disctrack.report.figures import NO_TITLE, Drawn, dress, panels, plain_power
 from disctrack.report.palette import AMBER, BLUE, GRID, INK, MUTED, RED
 
 N_TRIED = 14
+MISSING_MOMENT = (
+    "Contact moment M_n, M_m, M_z that the model before fails to supply: what short moments would have to be for the "
+    "dots to lie where they did. A missing force, inertia or an error of the measurement shows as the moment that does "
+    "the same."
+)
+OF_LAW = (
+    " Blue is what was found, computed in the same way: within the band it is what was missing.",
+    " Blue, for a law outside the catalogue, is the whole of its moment; red holds only what the start and the other "
+    "fitted numbers cannot absorb, so that a steady part, along n0 above all, is smaller in red.",
+)
+MISSING_FORCE = (
+    "Force on the disc, measured minus that of the model before: mass times the acceleration of the centre, from the "
+    "poses alone."
+)
+COURSE_OF_LAWS = (
+    "Moment about the contact of all laws of the model and of the law outside the catalogue, a force at the centre "
+    "included as the moment that it has about the contact. The band holds what the law's form may be off by "
+    "({:.2g} % of the law) and the other laws that fit as well."
+)
 
 Side = tuple[Fit, HeldOut | None, str, str]  # the fit of a model, its free run, its name, its colour
 
@@ -39,13 +57,7 @@ def all_figures(result: DiscDiagnosis, beside: Evidence | None) -> tuple[Drawn, 
     if beside is None:
         return (candidates(result),) if result.diagnosis.tried else ()
     found = [superposed(result, beside), residuals(result), spectrum(result), free_run(result)]
-    if beside.moment is not None:
-        found.append(moment(result, beside.moment, beside.moment_of_law))
-    if beside.force is not None:
-        found.append(force(result, beside.force))
-    if result.learned is not None and result.learned.course is not None:
-        found.append(course(result.learned.course, result.learned.misfit))
-    found.append(candidates(result))
+    found += [*_missing(result, beside), candidates(result)]
     return tuple(replace(d, name=f"{i:02d}_{d.name}") for i, d in enumerate(found, start=1))
 
 
@@ -166,7 +178,7 @@ def candidates(result: DiscDiagnosis) -> Drawn:
     return Drawn("candidates", "What was tried", caption, figure)
 
 
-def _along_the_contact(known: Course, added: Course | None, scale: float, unit: str, name: str) -> Figure:
+def _along_the_contact(known: Course, added: Course | None, label: str, scale: float, unit: str) -> Figure:
     """What is missing along n0, m0 and k with its band of two sigmas, and what was found adds to it."""
     figure, grid = panels(9.5, 5.4, 3, margins=NO_TITLE, sharex=True)
     # all but the ends, where derivatives are poor and splines of short moments run away, say what is shown
@@ -175,13 +187,13 @@ def _along_the_contact(known: Course, added: Course | None, scale: float, unit: 
     for i, (axes, axis) in enumerate(zip(grid, ("n0", "m0", "k"), strict=True)):
         value, band = scale * known.values[:, i], 2 * scale * known.sigma[:, i]
         axes.fill_between(known.time, value - band, value + band, color=GRID, lw=0)
-        axes.plot(known.time, value, lw=1.2, color=RED, label=name)
-        shown = [(value - band)[inner], (value + band)[inner]]
+        axes.plot(known.time, value, lw=1.2, color=RED, label=label)
+        seen = [(value - band)[inner], (value + band)[inner]]
         if added is not None:
             law, cut = scale * added.values[:, i], len(added.time) // 20
             axes.plot(added.time, law, lw=1.0, color=BLUE, label="added by what was found")
-            shown.append(law[cut : -cut or None])
-        _frame(axes, np.concatenate(shown))
+            seen.append(law[cut : -cut or None])
+        _frame(axes, np.concatenate(seen))
         axes.axhline(0.0, color=MUTED, lw=0.7)
         axes.set_ylabel(f"along {axis} ({unit})")
     grid[0].legend(facecolor="white", edgecolor="none", fontsize=9, ncols=2, loc="upper right")
@@ -189,52 +201,26 @@ def _along_the_contact(known: Course, added: Course | None, scale: float, unit: 
     return figure
 
 
-def moment(result: DiscDiagnosis, missing: Course, of_law: Course | None) -> Drawn:
-    """Moment that the model fails to supply, with its two-sigma band, and what the effects found add to it."""
-    law = of_law if result.diagnosis.found else None
-    if result.learned is not None and all(c.startswith("M") for c in result.learned.law.formulas):
-        system, values = result.system, result.learned.fit.values
-        own = moment_about_contact(system, values, simulated(system, values), {result.learned.law.candidate.effect})
-        law = Course(system.time, own, np.zeros_like(own))
-    caption = (
-        "Contact moment M_n, M_m, M_z that the model before fails to supply: what short moments would have to be for "
-        "the dots to lie where they did. A missing force, inertia or an error of the measurement shows as the moment "
-        "that does the same."
-    )
-    if result.learned is not None:
-        caption += (
-            " Blue, for a law outside the catalogue, is the whole of its moment; red holds only what the start and the "
-            "other fitted numbers cannot absorb, so that a steady part, along n0 above all, is smaller in red."
-        )
-    elif law is not None:
-        caption += " Blue is what was found, computed in the same way: within the band it is what was missing."
-    figure = _along_the_contact(missing, law, 1e6, "µN m", "missing, ± 2 σ")
-    return Drawn("missing_moment", "The missing moment", caption, figure)
-
-
-def course(known: Course, misfit: float) -> Drawn:
-    """Moment about the contact of all laws, with the band of the learned law's coefficients and form."""
-    figure = _along_the_contact(known, None, 1e6, "µN m", "all laws, ± 2 σ")
-    caption = (
-        "Moment about the contact of all laws of the model and of the law outside the catalogue, a force at the centre "
-        "included as the moment that it has about the contact. The band holds what the law's form may be off by "
-        f"({100 * misfit:.2g} % of the law) and the other laws that fit as well."
-    )
-    return Drawn("course_of_the_laws", "How well the laws are known along the recording", caption, figure)
-
-
-def force(result: DiscDiagnosis, missing: Course) -> Drawn:
-    """Force on the disc that the model fails to supply, from the accelerations alone, and what was found adds to it."""
-    added = None
-    if result.has_more:
-        more = force_of(result.system, result.after_fit) - force_of(result.system, result.diagnosis.before)
-        added = Course(missing.time, more, np.zeros_like(more))
-    caption = (
-        "Force on the disc, measured minus that of the model before: mass times the acceleration of the centre, from "
-        "the poses alone."
-    )
-    figure = _along_the_contact(missing, added, 1e3, "mN", "missing, ± 2 σ")
-    return Drawn("missing_force", "The missing force", caption, figure)
+def _missing(result: DiscDiagnosis, beside: Evidence) -> list[Drawn]:
+    """The moment and the force that the model before fails to supply, and how well the laws are known."""
+    found, learned = list[Drawn](), result.learned
+    if beside.moment is not None:
+        law = beside.moment_of_law if result.has_more else None
+        of_law = "" if law is None else OF_LAW[learned is not None and learned.is_moment]
+        figure = _along_the_contact(beside.moment, law, "missing, ± 2 σ", 1e6, "µN m")
+        found.append(Drawn("missing_moment", "The missing moment", f"{MISSING_MOMENT}{of_law}", figure))
+    if beside.force is not None:
+        added = None
+        if result.has_more:
+            more = force_of(result.system, result.after_fit) - force_of(result.system, result.diagnosis.before)
+            added = Course(beside.force.time, more, np.zeros_like(more))
+        figure = _along_the_contact(beside.force, added, "missing, ± 2 σ", 1e3, "mN")
+        found.append(Drawn("missing_force", "The missing force", MISSING_FORCE, figure))
+    if learned is not None and learned.course is not None:
+        title, caption = "How well the laws are known along the recording", COURSE_OF_LAWS.format(100 * learned.misfit)
+        figure = _along_the_contact(learned.course, None, "all laws, ± 2 σ", 1e6, "µN m")
+        found.append(Drawn("course_of_the_laws", title, caption, figure))
+    return found
 
 
 def spectrum(result: DiscDiagnosis) -> Drawn:

@@ -13,7 +13,8 @@ from disctrack.diagnosis.errors import Ahead, Errors
 from disctrack.diagnosis.evidence import Evidence
 from disctrack.diagnosis.law_library import locked
 from disctrack.diagnosis.plan import Plan
-from disctrack.discrepancy.document import declared_json, document, effect_json, parameters_json
+from disctrack.discrepancy.document import declared_json, document, effect_json
+from disctrack.discrepancy.search import Found
 from disctrack.files.json_text import json_text, plain
 from disctrack.files.labelled_arrays import Variable
 from disctrack.frames import COORDINATES, POSE_COMPONENTS
@@ -46,22 +47,15 @@ def _learned(learned: Learned) -> dict[str, Any]:
     law, course = learned.law, {}
     if (known := learned.course) is not None:
         course = {"time_s": known.time, "N_m": known.values, "sigma_N_m": known.sigma, "misfit_of_form": learned.misfit}
-    return {
-        "name": law.candidate.effect,
-        "candidate": law.candidate.name,
+    as_found = Found(law.candidate, learned.gain, learned.held_out_gain, float("nan"), ())
+    return effect_json(as_found, learned.fit) | {
         "kind": "learned",
-        "title": law.candidate.title,
-        "source": law.candidate.source,
         "formulas": law.formulas,
         "meaning": law.title,
         "alike": list(law.alike),
         "phase_locked": locked(law),
         "mean_power_W": learned.power,
         "moment_about_contact": course,
-        "parameters": parameters_json(law.candidate.quantities, learned.fit),
-        "class": [],
-        "score": learned.gain,
-        "held_out_gain": learned.held_out_gain,
     }
 
 
@@ -70,13 +64,12 @@ def as_json(result: DiscDiagnosis, beside: Evidence | None = None) -> dict[str, 
     d, frame, rows = result.diagnosis, result.system.trajectory.frame, result.system.rows
     ahead = ([run[side] for run in beside.ahead] if beside else [] for side in range(2))
     before, after = (_errors(e, runs) for e, runs in zip((result.before, result.after), ahead, strict=True))
-    effects = [effect_json(f, d.after) for f in d.found]
-    found = document(d, result.model, result.sentence) | {
+    before["parameters"], after["parameters"] = declared_json(d.before), declared_json(result.after_fit)
+    found = document(d, result.model, result.sentence, before, after)
+    found["effects"] += [_learned(result.learned)] if result.learned else []
+    found |= {
         "notes": list(result.notes),
         "frames": [int(frame[rows.start]), int(frame[rows.stop - 1])],
-        "effects": [*effects, *([_learned(result.learned)] if result.learned else [])],
-        "before": before | {"parameters": declared_json(d.before)},
-        "after": after | {"parameters": declared_json(result.after_fit)},
         "chance": vars(d.chance) if d.chance else {},
         "holds": result.holds,
         "energy_J": result.energy,

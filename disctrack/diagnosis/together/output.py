@@ -11,7 +11,7 @@ import numpy as np
 from disctrack.diagnosis.answer import unnamed
 from disctrack.diagnosis.pages.output import plan_json
 from disctrack.diagnosis.pages.report import planned_section
-from disctrack.discrepancy.document import declared_json, document, fit_errors, tried_table
+from disctrack.discrepancy.document import declared_json, document, tried_table
 from disctrack.discrepancy.joint.covariates import Hypothesis, alike
 from disctrack.discrepancy.joint.together import Bound, Dependence, OfRecording, TogetherDiagnosis
 from disctrack.discrepancy.search import Diagnosis
@@ -88,13 +88,10 @@ def _exponents(h: Hypothesis) -> str:
 def as_json(answer: TogetherDiagnosis) -> dict[str, Any]:
     """The keys of diagnosis.json as far as they apply; and recordings, bounds, dependences."""
     d = answer.diagnosis
-    sides = {
-        key: fit_errors(fit, held) | {"parameters": declared_json(fit)}
-        for key, fit, held in (("before", d.before, d.held_out_before), ("after", d.after, d.held_out_after))
-    }
+    before, after = ({"parameters": declared_json(fit)} for fit in (d.before, d.after))
     texts = verdict_text(answer), accuracy_text(answer), misfits_text(answer)
-    found = document(d, "shared by all recordings", " ".join(text for text in texts if text)) | {
-        **sides,
+    sentence = " ".join(text for text in texts if text)
+    found = document(d, "shared by all recordings", sentence, before, after) | {
         "notes": list(answer.notes),
         "unusable": list(answer.unusable),
         "recordings": [_recording_json(r) for r in answer.recordings],

@@ -10,9 +10,7 @@ from disctrack.diagnosis.model_file import declared_model
 from disctrack.diagnosis.motion import motion_candidates
 from disctrack.discrepancy.fit import fit
 from disctrack.discrepancy.noise import common_modes
-from disctrack.discrepancy.score import Linearisation, score_all
 from disctrack.discrepancy.search import explain
-from tests.disctrack.discrepancy.test_search import START, Oscillator, oscillator
 from tests.oracles.measured_disc import measured
 
 
@@ -86,25 +84,3 @@ def test_before_the_base_fit_has_converged_nothing_is_attributed():
     assert answer.held_out_before is None
     assert "has not converged" in answer.reason
     assert [f.candidate.name for f in explain(system, good).found] == ["table_tilt"]
-
-
-class Misled(Oscillator):
-    """Derivatives by the base quantities point the wrong way: no step of the base fit lowers chi-square."""
-
-    def linearise(self, values, names):
-        residual, derivative = super().linearise(values, names)
-        wrong = np.array([-1.0 if n in START else 1.0 for n in names])
-        return residual, derivative * wrong
-
-
-def test_a_fit_that_stopped_on_its_way_attributes_nothing_although_candidates_would_gain(rng):
-    right = oscillator(rng)
-    system = Misled(right.observed, right.time)
-    answer = explain(system, START)
-    assert answer.verdict == "unexplained"
-    assert answer.found == ()
-    # the temptation is there: where the fit has stopped, the first order promises a gain far above what noise reaches
-    best = score_all(
-        Linearisation(right, replace(answer.before, quantities=right.base), right.candidates), right.candidates
-    )
-    assert best[0].gain > 100

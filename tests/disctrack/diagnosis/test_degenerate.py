@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicHermiteSpline
 
-from calibration.kit.least_squares import covariance_within
 from disctrack.diagnosis import DiscSystem
 from disctrack.diagnosis.model_file import declared_model
 from disctrack.discrepancy.fit import fit
@@ -62,22 +61,6 @@ def test_an_exponent_beside_a_law_at_its_bound(inside):
     assert np.abs(pulls).max() < 3.5
     if inside:  # a law taken to be absent because it stands at zero: the exponent's error is many of its sigmas
         assert np.sqrt(np.mean(np.square(naive))) > 3
-
-
-def test_a_quantity_far_beyond_its_bound_is_known_to_lie_near_it(rng):
-    """The tail of a normal distribution that begins t sigmas out has the mean square distance 2 / t^2."""
-    matrix, bound = np.array([[1.0, 0.9], [0.0, 0.5]]), np.array([0.0, -np.inf])
-    free = np.linalg.inv(matrix.T @ matrix)
-    for beyond in (0.0, 1.0, 3.0, 12.0):
-        optimum = np.array([-beyond * np.sqrt(free[0, 0]), 0.0])
-        found = covariance_within(matrix, matrix @ optimum, np.zeros(2), bound, np.full(2, np.inf))
-        x = rng.multivariate_normal(optimum, free, 400_000)
-        if beyond < 4:
-            kept = x[x[:, 0] > 0]
-            assert found[0, 0] == pytest.approx(np.mean(kept[:, 0] ** 2), rel=0.1)
-        else:
-            assert found[0, 0] == pytest.approx(2 * free[0, 0] / beyond**2)
-    assert covariance_within(matrix, np.zeros(2), np.ones(2), bound, np.full(2, np.inf)) == pytest.approx(free)
 
 
 def power_friction(k: float, p: float):

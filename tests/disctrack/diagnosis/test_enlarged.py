@@ -35,6 +35,11 @@ def saved(system, values, folder):
     return path
 
 
+def rolling_state(trajectory):
+    first = first_state(trajectory.time, trajectory.q)
+    return {name: value for name, value in first.items() if not name.startswith("state.v_")}
+
+
 @pytest.fixture
 def everything_wrong(short, rng):
     """Every number of every fault of the measurement, some steps from null."""
@@ -45,8 +50,7 @@ def everything_wrong(short, rng):
 
 def test_every_fault_of_the_measurement_survives_the_file(short, everything_wrong, tmp_path):
     system = DiscSystem(short, declared_model(short).model)
-    values = first_state(system.time, short.q) | {"km.k_m": 3e-8} | everything_wrong
-    values = {k: v for k, v in values.items() if not k.startswith("state.v_")}
+    values = rolling_state(short) | {"km.k_m": 3e-8} | everything_wrong
     again = declared_model(short, str(saved(system, values, tmp_path))).faults
     assert set(again) == set(everything_wrong)
     for name, value in everything_wrong.items():
@@ -56,7 +60,7 @@ def test_every_fault_of_the_measurement_survives_the_file(short, everything_wron
 def test_images_of_a_faulty_scene_are_those_that_the_diagnosis_predicts(short, everything_wrong, tmp_path):
     """The renderer moves cameras, table and dots by formulas of its own."""
     system = DiscSystem(short, declared_model(short).model)
-    state = {k: v for k, v in first_state(system.time, short.q).items() if not k.startswith("state.v_")}
+    state = rolling_state(short)
     scene = load_scene(saved(system, state | everything_wrong, tmp_path))
     rig, q = rig_of(scene), short.q[:5]
     R = rotation_from_euler(*q[:, 3:].T)
@@ -123,7 +127,7 @@ def test_slip_at_the_start_is_part_of_the_saved_model(tmp_path):
 def test_derivative_by_every_fault_agrees_with_central_differences(short, everything_wrong):
     """Through clocks, images and the motion: what each fault says of itself against the prediction as a whole."""
     system = DiscSystem(short, declared_model(short).model)
-    state = {k: v for k, v in first_state(system.time, short.q).items() if not k.startswith("state.v_")}
+    state = rolling_state(short)
     values = state | {"km.k_m": 3e-8} | {name: 0.1 * value for name, value in everything_wrong.items()}
     scale = {q.name: q.scale for c in measurement_candidates(short.disc) for q in c.quantities}
     derivative = system.linearise(values, list(scale))[1]
@@ -139,7 +143,7 @@ def test_derivative_by_every_fault_agrees_with_central_differences(short, everyt
 
 def test_table_that_the_rim_levelled_wrongly_is_no_fault_of_the_saved_scene(short, tmp_path):
     """Paper on the face lifts the table by the rim; in the file the cameras stand above the one that is rolled on."""
-    state = {k: v for k, v in first_state(short.time, short.q).items() if not k.startswith("state.v_")}
+    state = rolling_state(short)
     height, slope = -1e-4, 2e-3
     values = state | {"pattern_height.offset": 1e-4, "table_height.offset": height, "table_plane.tilt_x": slope}
 

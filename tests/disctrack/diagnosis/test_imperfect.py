@@ -15,7 +15,7 @@ from disctrack.diagnosis.model_file import declared_model
 from disctrack.diagnosis.stretch import at_rest
 from disctrack.diagnosis.systematic import find_systematic, noise_over_stated, with_noise_of_frames
 from disctrack.discrepancy.fit import fit
-from disctrack.discrepancy.noise import inflation, long_run_variance
+from disctrack.discrepancy.noise import inflation
 from disctrack.discrepancy.system import Quantity, System
 from disctrack.faults.keys import CameraFault, Faults
 from disctrack.validate.points import ORDINARY, Laboratory
@@ -84,20 +84,6 @@ def test_an_imperfect_laboratory_claims_nothing_about_the_motion():
     assert "systematic errors of 0.0" in result.sentence
 
 
-def test_memory_enlarges_the_variance_of_a_sum_as_it_should(rng):
-    """First-order autoregression with 0.8: a sum has (1 + 0.8) / (1 - 0.8) = 9 times the variance."""
-    n, ratios = 4000, []
-    for _ in range(20):
-        x = np.zeros(n)
-        noise = rng.standard_normal(n)
-        for i in range(1, n):
-            x[i] = 0.8 * x[i - 1] + noise[i]
-        ratios.append(long_run_variance(x)[0] / np.mean(x**2))
-    assert_allclose(np.mean(ratios), 9.0, rtol=0.2)  # Bartlett's weights lose a tenth
-    white = rng.standard_normal(n)
-    assert_allclose(long_run_variance(white)[0] / np.mean(white**2), 1.0, rtol=0.15)
-
-
 class Line(System):
     """Rows of 24 numbers that are a multiple of a smooth course, and noise."""
 
@@ -132,24 +118,22 @@ def test_sigmas_know_that_neighbouring_rows_err_alike(rng):
     assert_allclose(pulls(0.0), 1.0, rtol=0.18)
 
 
-def test_what_is_left_is_the_motions_only_where_the_poses_hold_it():
-    assert LeftOver(1.1, 1.0, 1e-40, 0.5, 36).of_the_motion
-    assert not LeftOver(1.1, 1.1, 1e-40, 1e-40, 36).of_the_motion
-    assert not LeftOver(1.1, 1.0, 0.5, 0.5, 36).of_the_motion
-    assert LeftOver(1.3, 1.2, 1e-9, 1e-9, 36).of_the_measurement
-    assert not LeftOver(9.0, 1.2, 1e-9, 1e-9, 36).of_the_measurement
-
-
 @pytest.mark.parametrize(
-    ("left", "doubtful"),
+    ("left", "of_the_motion", "of_the_measurement", "doubtful"),
     [
-        (LeftOver(1.00, 1.00, 0.4, 0.6, 36), False),
-        (LeftOver(1.09, 0.99, 0.02, 1.0, 36), True),  # a groove that a tilt stands in for
-        (LeftOver(1.00, 1.03, 0.3, 4e-10, 36), False),  # a misprint beside a shaken table
-        (LeftOver(1.22, 1.27, 0.4, 3e-4, 36), False),  # lenses with fields: nothing of the motion
-        (LeftOver(1.18, 1.18, 2e-3, 5e-3, 36), False),  # likewise, and seen in the poses
-        (LeftOver(1.80, 1.18, 2e-3, 5e-3, 36), True),
+        (LeftOver(1.10, 1.00, 1e-40, 0.5, 36), True, False, True),
+        (LeftOver(1.10, 1.10, 1e-40, 1e-40, 36), False, True, False),
+        (LeftOver(1.30, 1.20, 1e-9, 1e-9, 36), False, True, False),
+        (LeftOver(9.00, 1.20, 1e-9, 1e-9, 36), True, False, True),
+        (LeftOver(1.00, 1.00, 0.4, 0.6, 36), False, False, False),
+        (LeftOver(1.09, 0.99, 0.02, 1.0, 36), False, False, True),  # a groove that a tilt stands in for
+        (LeftOver(1.00, 1.03, 0.3, 4e-10, 36), False, False, False),  # a misprint beside a shaken table
+        (LeftOver(1.22, 1.27, 0.4, 3e-4, 36), False, True, False),  # lenses with fields: nothing of the motion
+        (LeftOver(1.18, 1.18, 2e-3, 5e-3, 36), False, True, False),  # likewise, and seen in the poses
+        (LeftOver(1.80, 1.18, 2e-3, 5e-3, 36), False, False, True),
     ],
 )
-def test_what_the_measurement_does_to_all_numbers_raises_no_doubt_about_the_motion(left, doubtful):
-    assert left.doubtful is doubtful
+def test_what_is_left_is_the_motions_only_where_the_poses_alone_hold_it(
+    left, of_the_motion, of_the_measurement, doubtful
+):
+    assert (left.of_the_motion, left.of_the_measurement, left.doubtful) == (of_the_motion, of_the_measurement, doubtful)

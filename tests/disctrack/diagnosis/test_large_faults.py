@@ -2,15 +2,10 @@
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
 
 from disctrack.diagnosis import diagnose
 from disctrack.diagnosis.large_faults import poses_with
-from disctrack.faults.catalogue import setup_of
 from disctrack.faults.keys import CameraFault, Faults
-from disctrack.synthetic import rig_of
-from disctrack.synthetic.cameras import rig_after_faults
-from disctrack.synthetic.description import Scene
 from disctrack.trajectory import Trajectory
 from tests.disctrack.diagnosis.test_imperfect import recording
 from tests.oracles.measured_disc import measured
@@ -18,14 +13,6 @@ from tests.oracles.measured_disc import measured
 TURN_DEG, SHIFT_MM = (0.6, -0.7, 0.4), (1.2, -1.4, 0.8)
 TURNED = {f"right_turned.rotation_{a}": float(np.radians(v)) for a, v in zip("xyz", TURN_DEG, strict=True)}
 SHIFTED = {f"right_shifted.translation_{a}": 1e-3 * v for a, v in zip("xyz", SHIFT_MM, strict=True)}
-
-
-def test_the_rig_after_a_knock_is_the_renderers():
-    scene = Scene(faults=Faults(right=CameraFault(rotation_deg=TURN_DEG, translation_mm=SHIFT_MM)))
-    ours = setup_of(scene.declared_disc, TURNED | SHIFTED).cameras_of(rig_of(scene))
-    theirs = rig_after_faults(rig_of(scene), scene)
-    points = np.random.default_rng(1).uniform(-0.03, 0.06, (20, 3))
-    assert_allclose(ours.project(points), theirs.project(points), atol=1e-8)
 
 
 def noisy(trajectory: Trajectory, sigma_px: float = 0.006) -> float:

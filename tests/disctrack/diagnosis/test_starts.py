@@ -14,7 +14,7 @@ from disctrack.discrepancy.fit import fit
 from disctrack.discrepancy.search import Settings
 from disctrack.errors import AnalysisError
 from disctrack.faults.keys import Faults
-from disctrack.rolling import Model, Regime, simulate, steady_precession
+from disctrack.rolling import Model, Regime, State, simulate, steady_precession
 from disctrack.synthetic.description import Scene
 from disctrack.trajectory import MarkerStatus
 from tests.oracles.measured_disc import K_M, measured
@@ -153,22 +153,14 @@ def test_slip_alone_is_an_answer_where_effects_beside_it_take_too_long(monkeypat
 @pytest.mark.slow
 def test_slip_that_no_coefficient_describes_is_left_out_and_said_so():
     """Friction that falls with the speed of slip, as between lubricated surfaces: not Coulomb's law."""
-    fast, slow = sliding(0.1, (0.12, 0.06)), None
+    half, weak = 0.05, PAPER.with_values({"slip.mu": 0.1})
+    at_half = State(*simulate(weak, start(slip=(0.12, 0.06)), times=[0.0, half]).end_state.tolist())
 
     def falling(times):
-        nonlocal slow
-        half = 0.05
-        if slow is None:
-            model = PAPER.with_values({"slip.mu": 0.1})
-            at_half = simulate(model, start(slip=(0.12, 0.06)), times=[0.0, half]).end_state
-            slow = at_half
-        q = fast(times)
-        late = times > half
+        q, late = sliding(0.1, (0.12, 0.06))(times), times > half
         if late.any():
-            from disctrack.rolling import State
-
             stronger = PAPER.with_values({"slip.mu": 0.35})
-            q[late] = simulate(stronger, State(*slow.tolist()), times=np.r_[half, times[late]]).q[1:]
+            q[late] = simulate(stronger, at_half, times=np.r_[half, times[late]]).q[1:]
         return q
 
     result = diagnose(measured(motion=falling, seed=44, n=400))
