@@ -31,7 +31,7 @@ from disctrack.batch.records import (
 )
 from disctrack.batch.repeats import group_of
 from disctrack.calibrate.stage import boards_in, calibrate_into, is_rig_of, source_of
-from disctrack.diagnosis.stage import first_to_mend
+from disctrack.diagnosis.recorded import first_to_mend
 from disctrack.errors import AnalysisError, DiscTrackError, OutputError
 from disctrack.files.whole import write_whole
 from disctrack.findings import Kind, leading

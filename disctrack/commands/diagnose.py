@@ -9,7 +9,7 @@ from pathlib import Path
 from disctrack.commands import INCOMPLETE
 from disctrack.commands import _outputs as outputs
 from disctrack.diagnosis import run_diagnose
-from disctrack.diagnosis.stage import first_to_mend
+from disctrack.diagnosis.recorded import first_to_mend
 from disctrack.diagnosis.together.stage import run_together
 from disctrack.errors import TrajectoryFileError
 from disctrack.findings import doubts

@@ -6,13 +6,14 @@ has to come out as one. Farther off than any printer puts it, it was declared wr
 the dots move with a place is no longer linear.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from disctrack.findings import Finding, Kind, doubts
 from disctrack.trajectory import Trajectory
 from disctrack.trajectory.file import read_details, read_provenance, read_trajectory
 
@@ -58,3 +59,10 @@ def with_declared_dots(trajectory: Trajectory, details: Mapping[str, Any]) -> Tr
     places = trajectory.disc.marker_centres_body.copy()
     places[:, :2] -= 1e-6 * shift
     return replace(trajectory, disc=replace(trajectory.disc, marker_centres_body=places))
+
+
+def first_to_mend(findings: Iterable[Finding]) -> tuple[Finding, ...]:
+    """What is declared wrongly: a missing effect would be read into it. Dots are measured where they are."""
+    return tuple(
+        f for f in doubts(findings) if f.kind != Kind.DOTS_MISPLACED and any(remedy.key for remedy in f.remedies)
+    )

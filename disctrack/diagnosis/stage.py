@@ -32,7 +32,7 @@ from disctrack.errors import AnalysisError
 from disctrack.files.inputs import keep, refuse_input
 from disctrack.files.json_text import json_file
 from disctrack.files.whole import write_whole
-from disctrack.findings import Finding, Kind, doubts
+from disctrack.findings import doubts
 from disctrack.report.blocks import Report
 from disctrack.report.html import write_page
 from disctrack.trajectory import Trajectory
@@ -84,13 +84,6 @@ def diagnose(trajectory: Trajectory, model: str = PAPER, settings: Settings | No
     after = errors(system, fit_, held)
     energy, said = energy_balance(system, fit_.values), tuple(note for note in notes if note)
     return DiscDiagnosis(system, diagnosis, declared.name, before, after, energy, learned, said, holds, left)
-
-
-def first_to_mend(findings: Iterable[Finding]) -> tuple[Finding, ...]:
-    """What is declared wrongly: a missing effect would be read into it. Dots are measured where they are."""
-    return tuple(
-        f for f in doubts(findings) if f.kind != Kind.DOTS_MISPLACED and any(remedy.key for remedy in f.remedies)
-    )
 
 
 def with_plan(result: DiscDiagnosis) -> DiscDiagnosis:

@@ -1,7 +1,6 @@
 """Recordings of the rolling disc diagnosed together, and which further one would settle what they leave open."""
 
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -9,12 +8,11 @@ import numpy as np
 
 from calibration.kit.arrays import Array
 from calibration.kit.least_squares import triangle
-from disctrack.analyse.declaration import contradictions, density
 from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.diagnosis.large_faults import find_large
 from disctrack.diagnosis.model_file import PAPER, declared_model
 from disctrack.diagnosis.plan import OPEN, Plan, Question, Say, plan
-from disctrack.diagnosis.recorded import Recorded
+from disctrack.diagnosis.recorded import Recorded, first_to_mend
 from disctrack.diagnosis.systematic import (
     Systematic,
     find_systematic,
@@ -30,8 +28,8 @@ from disctrack.discrepancy.joint.together import Alone, TogetherDiagnosis, answe
 from disctrack.discrepancy.noise import THIRD, inflation
 from disctrack.discrepancy.search import Settings
 from disctrack.discrepancy.system import Values
-from disctrack.errors import AnalysisError, DiscTrackError
-from disctrack.findings import Finding
+from disctrack.errors import AnalysisError
+from disctrack.findings import Kind
 from disctrack.trajectory import MarkerStatus, Trajectory
 
 SURE = 4.0  # sigmas of the noise that frames show, from which it is not the one stated
@@ -263,18 +261,10 @@ def in_common(told: Sequence[tuple[Member, Systematic, list[Array]]]) -> list[Sy
 
 
 def build(item: Item) -> DiscMember:
-    """For a crew. Raises AnalysisError where it cannot be used, with what was declared that may be why."""
-    trajectory = item[0].trajectory
-    heavy = density(trajectory.disc)
-    if heavy:  # laws in proportion to the load would fit it all the same
-        raise AnalysisError(heavy[0].sentence)
-    try:
-        return DiscMember(item)
-    except Exception as error:
-        wrong: Sequence[Finding] = ()
-        with suppress(Exception):  # where nothing can be said of it, that is not why it could not be used
-            wrong = contradictions(trajectory)
-        if not wrong:
-            raise
-        reason = str(error) if isinstance(error, DiscTrackError) else "the rolling model cannot be fitted to it alone"
-        raise AnalysisError("; ".join([reason, *(w.sentence for w in wrong)])) from error
+    """For a crew. Raises AnalysisError where it cannot be used, or is declared wrongly."""
+    findings = item[0].trajectory.findings
+    # laws in proportion to the load would fit a disc of any weight all the same
+    wrong = [f for f in findings if f.kind == Kind.DENSITY] or first_to_mend(findings)
+    if wrong:
+        raise AnalysisError("; ".join(f.sentence for f in wrong))
+    return DiscMember(item)
