@@ -6,19 +6,7 @@
 
 from disctrack.diagnosis.answer import DiscDiagnosis
 from disctrack.diagnosis.disc_system import DiscSystem
-from disctrack.diagnosis.stage import DiagnoseOutcome, diagnose, run_diagnose
-from disctrack.discrepancy.search import Diagnosis, Settings
-from disctrack.discrepancy.system import Candidate, Quantity, System
+from disctrack.diagnosis.stage import diagnose, run_diagnose
+from disctrack.discrepancy.search import Settings
 
-__all__ = [
-    "Candidate",
-    "DiagnoseOutcome",
-    "Diagnosis",
-    "DiscDiagnosis",
-    "DiscSystem",
-    "Quantity",
-    "Settings",
-    "System",
-    "diagnose",
-    "run_diagnose",
-]
+__all__ = ["DiscDiagnosis", "DiscSystem", "Settings", "diagnose", "run_diagnose"]

@@ -69,8 +69,7 @@ class StaticView:
     across: Array  # (k, 4 m, 4 m) takes off what a pose can take
     rig: Array  # (k, 4 m, r) by directions of the calibration's covariance, in their sigmas, whitened
     dots: Array  # (k, 4 m, 2 m) by the dots' places on the face [m], whitened
-    faults: dict[str, Array]  # (k, 2, m, 2, p) [px] by faults of the measurement, in their typical sizes
-    sizes: dict[str, dict[str, float]]  # the typical sizes of their quantities
+    faults: dict[str, Array]  # (k, 2, m, 2, p) [px] by the numbers of faults of the measurement
     places: Array  # (k, 2, m, 2) [px]
     used: Mask  # (k, 2, m)
     whiten: Array  # (k, 2, m, 2, 2)
@@ -223,20 +222,18 @@ class DiscSystem(LawSystem):
         sight = self._sight(self._as_measured(delay), known)
         if delay:  # the right camera saw a pose earlier, or later
             rows = rows[(self.time[rows] + delay > self.time[0]) & (self.time[rows] + delay < self.time[-1])]
-        faults, sizes = {}, {}
-        for fault in self.faults:
-            if fault.of_poses_alone:
-                quantities = candidate_of_fault(fault).quantities
-                sizes[fault.name] = {q.name: q.typical for q in quantities}
-                columns = [q.typical * fault.column(q.part, sight)[rows] for q in quantities]
-                faults[fault.name] = np.stack(columns, axis=-1)
+        faults = {
+            fault.name: np.stack([fault.column(part, sight)[rows] for part in fault.parts], axis=-1)
+            for fault in self.faults
+            if fault.of_poses_alone
+        }
         nuisances, m = self._nuisance_columns[rows], self.disc.n_markers
         n_rig = len(self.rig_directions)
         whitened = (self._whiten[rows] @ sight.images.by_pose[rows]).reshape(len(rows), -1, 6)
         across = np.eye(whitened.shape[1]) - whitened @ np.linalg.pinv(whitened)
         residual = self._rows_of(self.observed - sight.images.pixels)[rows]
         return StaticView(
-            residual, across, nuisances[..., :n_rig], nuisances[..., n_rig : n_rig + 2 * m], faults, sizes,
+            residual, across, nuisances[..., :n_rig], nuisances[..., n_rig : n_rig + 2 * m], faults,
             sight.images.pixels[rows], self.used[rows], self._whiten[rows],
         )  # fmt: skip
 

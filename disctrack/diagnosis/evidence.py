@@ -14,6 +14,7 @@ from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.diagnosis.errors import HALF_WINDOW, Ahead, energy_balance, free_run, simulated
 from disctrack.diagnosis.form_misfit import moment_about_contact
 from disctrack.diagnosis.missing_force import Course, missing_moment, probe
+from disctrack.diagnosis.stretch import MIN_FRAMES
 from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.held_out import held_out
 from disctrack.errors import AnalysisError
@@ -22,7 +23,6 @@ from disctrack.report.numbers import Measured
 from disctrack.trajectory import part
 
 HORIZONS = (0.1, 0.3, 0.5)  # [s] after the last frame that the fit has seen
-SHORTEST = 0.05  # [s] of frames from which a longer free run may start
 
 
 @dataclass(frozen=True)
@@ -91,17 +91,16 @@ def force_of(system: DiscSystem, fit: Fit) -> Array:
 def _ahead(result: DiscDiagnosis) -> tuple[tuple[Ahead, Ahead], ...]:
     """Errors at the horizons that the part held out reaches, and else after fits that end in time for it."""
     system, found = result.system, []
-    seen = system.time[system.weights > 0]
+    last = system.time[system.weights > 0].max()
     for horizon in HORIZONS:
-        until, runs = seen[-1] - horizon - HALF_WINDOW, list[Ahead]()
+        rows, runs = np.asarray(system.time <= last - horizon - HALF_WINDOW, bool), list[Ahead]()
         for fit, held in (
             (result.diagnosis.before, result.diagnosis.held_out_before),
             (result.after_fit, result.after_held_out),
         ):
             run = None if held is None else free_run(system, held, horizon)
-            if run is None and until >= seen[0] + SHORTEST:
-                shorter = held_out(system, fit.quantities, fit.values, np.asarray(system.time <= until, bool))
-                run = free_run(system, shorter, horizon)
+            if run is None and rows.sum() >= MIN_FRAMES:
+                run = free_run(system, held_out(system, fit.quantities, fit.values, rows), horizon)
             runs += [] if run is None else [run]
         if len(runs) == 2:
             found.append((runs[0], runs[1]))

@@ -235,7 +235,7 @@ def _instants(time: Array) -> Iterator[Row]:
 
 def _edges(places: Array, shares: Array) -> list[Shape]:
     """Straight edges: directions, and shares of the places (N, 2) that lie before them."""
-    found = []
+    found = list[Shape]()
     for angle in np.arange(0, 2 * np.pi, np.pi / 6).tolist():
         along = places @ np.array([np.cos(angle), np.sin(angle)])
         found += [{"direction": angle, "edge": edge} for edge in np.quantile(along, shares).tolist()]

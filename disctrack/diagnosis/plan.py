@@ -19,7 +19,7 @@ from disctrack.diagnosis.stretch import MIN_FRAMES, MIN_THETA, Stretch
 from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.joint.reduction import Reduction
 from disctrack.discrepancy.joint.sharing import LAWS
-from disctrack.discrepancy.score import Linearisation, cleared, score, span
+from disctrack.discrepancy.score import INVISIBLE, Linearisation, cleared, score, span
 from disctrack.discrepancy.search import Diagnosis
 from disctrack.discrepancy.system import Candidate, Quantity, Values
 from disctrack.errors import AnalysisError, DiscTrackError
@@ -36,7 +36,6 @@ CHANGES = {  # of a recording, by factors
     "numbers": ("with {:g} times the dots, or further views", (1.5, 2.0)),
 }
 NUTATION_SHARE = 0.05  # amplitude of the nutation oscillation over the nutation angle
-SEEN = 1e-6  # share of a column that is left after clearing, below which nothing is seen of it
 OPEN = 6  # questions that further recordings are sought for
 ENOUGH = 5.0  # sigmas from which on a recording answers a question
 
@@ -179,7 +178,7 @@ class Planner:
         mine, *rest = self._columns(candidate)
         column = matrix[:, mine]
         left = float(np.linalg.norm(cleared(column, span(matrix[:, [*self._base, *rest]]))))
-        return 1.0 / left if left > SEEN * float(np.linalg.norm(column)) else float("inf")
+        return 1.0 / left if left > INVISIBLE * float(np.linalg.norm(column)) else float("inf")
 
     def _columns(self, candidate: Candidate) -> list[int]:
         return [self.column[n] for n in candidate.names]

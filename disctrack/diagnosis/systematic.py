@@ -21,6 +21,7 @@ from scipy.stats import chi2
 
 from calibration.kit.arrays import Array, Mask
 from disctrack.diagnosis.stretch import MIN_FRAMES
+from disctrack.faults.catalogue import TYPICAL_STEPS, Fault
 from disctrack.trajectory import MarkerStatus, Trajectory
 
 if TYPE_CHECKING:
@@ -244,17 +245,19 @@ def _with_faults(
 
 
 def _with_amounts(
-    found: Systematic, evidence: Likelihood, sizes: Sizes, names: tuple[str, ...], view: StaticView
+    found: Systematic,
+    evidence: Likelihood,
+    sizes: Sizes,
+    names: tuple[str, ...],
+    view: StaticView,
+    faults: Sequence[Fault],
 ) -> Systematic:
     """With the faults fitted along, their most probable amounts, and what these do to the dots."""
-    amounts: dict[str, float] = {}
-    powers = 0.0
-    for name in names:
-        values = evidence.amounts(sizes, name)
-        shifts = (view.faults[name] @ values)[view.used]
-        powers += float(np.mean(shifts**2))
-        units = view.sizes[name]
-        amounts |= {key: float(v * unit) for (key, unit), v in zip(units.items(), values, strict=True)}
+    amounts, powers = dict[str, float](), 0.0
+    for fault in (f for f in faults if f.name in names):
+        values = evidence.amounts(sizes, fault.name)
+        powers += float(np.mean((view.faults[fault.name] @ values)[view.used] ** 2))
+        amounts |= dict(zip(fault.names(), values.tolist(), strict=True))
     return replace(found, beside=names, beside_px=float(np.sqrt(powers)), amounts=amounts)
 
 
@@ -273,32 +276,33 @@ def find_systematic(system: DiscSystem, known: Values | None = None, beside: Seq
     numbers = float(np.sum(system.weights[rows] - 6.0))
     size = max(float(np.sqrt(np.mean(data**2))), 1.0)
     extent = float(np.max([np.ptp(view.places[:, c][view.used[:, c]], axis=0).max() for c in range(2)]))
+    typical = {fault.name: TYPICAL_STEPS * fault.step for fault in system.faults}
     faults = {name: view.whitened(columns) for name, columns in view.faults.items()}
-    faults = {name: columns for name, columns in faults.items() if np.linalg.norm(columns) > 3.0}
+    faults = {name: columns for name, columns in faults.items() if np.linalg.norm(columns) * typical[name] > 3.0}
     groups = {"rig": view.across_poses(view.rig), "print": view.across_poses(view.dots), **faults}
     groups["dot"] = view.whitened(field_columns(view.places, view.used, DOT_LENGTH * extent, size, own=True))
     per_px = float(np.sqrt(np.mean(view.whiten[view.used] ** 2) * 2))
     steps: Array = size / per_px * 2.0 ** np.arange(-7, 4.5, 1.0)
     grids = {"print": DOT_SIGMA * 2.0 ** np.arange(7.0), "lens": steps, "dot": steps}
     given = tuple(name for name in beside or () if name in faults)
-    start = {"rig": 1.0, "print": DOT_SIGMA} | dict.fromkeys(given, WIDE)
-    amounts = dict.fromkeys(faults, 1.0) if beside is None else {}
+    start = {"rig": 1.0, "print": DOT_SIGMA} | {name: WIDE * typical[name] for name in given}
+    amounts = {name: typical[name] for name in faults} if beside is None else {}
 
     alone = Likelihood(data, groups)
     nothing = alone.twice_log(start)
     value, sizes, chosen = _with_faults(alone, start, amounts)
-    best = _with_amounts(Systematic(gain=value - nothing), alone, sizes, (*given, *chosen), view)
+    best = _with_amounts(Systematic(gain=value - nothing), alone, sizes, (*given, *chosen), view, system.faults)
     for share in LENS_LENGTHS:
         lens_columns = view.whitened(field_columns(view.places, view.used, share * extent, size))
         evidence = Likelihood(data, {**groups, "lens": lens_columns})
         value, sizes = _best_sizes(evidence, dict(start), grids)
         value, sizes, chosen = _with_faults(evidence, sizes, amounts)
         if chosen:  # what a fault explains is no field
-            value, sizes = _best_sizes(evidence, start | dict.fromkeys(chosen, 1.0), grids)
+            value, sizes = _best_sizes(evidence, start | {name: typical[name] for name in chosen}, grids)
         print_m, left = sizes["print"] if sizes["print"] > DOT_SIGMA else 0.0, evidence.left(sizes) / numbers
         lens, dot = (sizes.get("lens", 0.0), share * extent), (sizes.get("dot", 0.0), DOT_LENGTH * extent)
         found = Systematic(*lens, *dot, print_m, value - nothing, left=max(1.0, left))
-        found = _with_amounts(found, evidence, sizes, (*given, *chosen), view)
+        found = _with_amounts(found, evidence, sizes, (*given, *chosen), view, system.faults)
         if found.present and found.gain > best.gain + WORTH:
             best = found
     return best

@@ -101,13 +101,12 @@ def _before_after(result: DiscDiagnosis, beside: Evidence | None) -> list[Listin
         "free run over its noise floor": lambda e: rounded(e.ratio_to_floor, 4),
     }
     rows: list[Row] = [(name, of(before), of(after)) for name, of in shown.items()]
-    for runs in beside.ahead:
-        for what in ("theta_deg", "psi_deg", "position_mm"):
-            words = what.replace("theta_deg", "nutation [deg]").replace("psi_deg", "precession [deg]")
-            words = words.replace("position_mm", "position [mm]")
-            noise, horizon = rounded(runs[0][f"noise_{what}"], 2), runs[0]["horizon_s"]
-            name = f"free run {horizon:g} s ahead: {words}, noise {noise}"
-            rows.append((name, rounded(runs[0][what]), rounded(runs[1][what])))
+    words = {"theta_deg": "nutation [deg]", "psi_deg": "precession [deg]", "position_mm": "position [mm]"}
+    for first, last in beside.ahead:
+        for key, what in words.items():
+            noise = rounded(first[f"noise_{key}"], 2)
+            name = f"free run {first['horizon_s']:g} s ahead: {what}, noise {noise}"
+            rows.append((name, rounded(first[key]), rounded(last[key])))
     rows += [*_laws(result), *_energy(result, beside)]
     reached = [runs[0]["horizon_s"] for runs in beside.ahead]
     short = [f"{h:g}" for h in HORIZONS if h not in reached]
