@@ -8,59 +8,9 @@ from disctrack.diagnosis import DiscSystem
 from disctrack.diagnosis.model_file import declared_model
 from disctrack.discrepancy.fit import fit
 from disctrack.discrepancy.shape import profiled
-from disctrack.discrepancy.system import Quantity, System
 from disctrack.faults.keys import Faults
 from tests.oracles import newton_euler
 from tests.oracles.measured_disc import K_M, measured
-
-
-class SquareBesidePower(System):
-    """y = a t^2 + k t^p with noise; a may not be negative."""
-
-    candidates = ()
-    exponent = Quantity("p", "1", 0.1, null=1.5, lower=0.0, upper=4.0)
-
-    def __init__(self, a: float, seed: int) -> None:
-        self.time = np.linspace(0.7, 1.4, 100)
-        self.base = (Quantity("a", "1", 0.1, lower=0.0), Quantity("k", "1", 0.1, lower=0.0))
-        self.weights = np.ones(100)
-        noise = 3e-4 * np.random.default_rng(seed).standard_normal(100)
-        self.data = a * self.time**2 + self.time**1.2 + noise
-
-    def linearise(self, values, names):
-        power = self.time ** values["p"]
-        residual = self.data - values["a"] * self.time**2 - values["k"] * power
-        by = {"a": self.time**2, "k": power, "p": values["k"] * power * np.log(self.time)}
-        columns = np.zeros((100, 1, len(names)))
-        for i, name in enumerate(names):
-            columns[:, 0, i] = by[name] / 3e-4
-        return residual[:, None] / 3e-4, columns
-
-
-@pytest.mark.statistical
-@pytest.mark.parametrize("inside", [0.0, 0.003])  # up to half a standard deviation of a
-def test_an_exponent_beside_a_law_at_its_bound(inside):
-    """Where the other law comes to stand at zero the profile of the exponent has a kink."""
-    pulls, naive = [], []
-    for seed in range(24):
-        system = SquareBesidePower(inside, seed)
-        nominal = fit(system, system.base, {"p": 1.5})
-        found = profiled(system, nominal, system.exponent, 0.1)
-        truth = np.array([inside, 1.0, 1.2])
-        values = np.array([found.values[n] for n in "akp"])
-        cost = lambda x, system=system: np.sum(system.linearise(dict(zip("akp", x, strict=True)), [])[0] ** 2)  # noqa: E731
-        assert found.cost <= cost(truth) + 0.1  # the lowest point of the valley
-        pulls.append((values - truth) / [found.sigma(n) for n in "akp"])
-        if values[0] == 0.0:
-            alone = fit(system, (system.base[1], system.exponent), {"a": 0.0, "k": 1.0, "p": 1.2})
-            naive.append((values[2] - 1.2) / alone.sigma("p"))
-    rms = np.sqrt(np.mean(np.square(pulls), axis=0))
-    # half of the estimates stand at the bound and are better than their sigma, which allows for the truth inside
-    assert (rms < 1.0 + 3 / np.sqrt(48)).all()
-    assert (rms > 0.4).all()
-    assert np.abs(pulls).max() < 3.5
-    if inside:  # a law taken to be absent because it stands at zero: the exponent's error is many of its sigmas
-        assert np.sqrt(np.mean(np.square(naive))) > 3
 
 
 def power_friction(k: float, p: float):

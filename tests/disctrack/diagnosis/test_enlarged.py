@@ -124,23 +124,6 @@ def test_slip_at_the_start_is_part_of_the_saved_model(tmp_path):
     assert second.diagnosis.verdict == "nothing missing", second.sentence
 
 
-def test_derivative_by_every_fault_agrees_with_central_differences(short, everything_wrong):
-    """Through clocks, images and the motion: what each fault says of itself against the prediction as a whole."""
-    system = DiscSystem(short, declared_model(short).model)
-    state = rolling_state(short)
-    values = state | {"km.k_m": 3e-8} | {name: 0.1 * value for name, value in everything_wrong.items()}
-    scale = {q.name: q.scale for c in measurement_candidates(short.disc) for q in c.quantities}
-    derivative = system.linearise(values, list(scale))[1]
-    inner = slice(2, -2)  # an acceleration by differences is one-sided at the ends
-    for column, (name, step) in enumerate(scale.items()):
-        sides = [system.linearise(values | {name: values[name] + sign * step}, [])[0][inner] for sign in (-1, 1)]
-        expected = (sides[0] - sides[1]) / (2 * step)
-        # faults act on each other: blur on what the others move, to 1e-3 of it
-        assert_allclose(
-            derivative[inner, :, column], expected, atol=3e-3 * np.abs(expected).max(), err_msg=name, rtol=0
-        )
-
-
 def test_table_that_the_rim_levelled_wrongly_is_no_fault_of_the_saved_scene(short, tmp_path):
     """Paper on the face lifts the table by the rim; in the file the cameras stand above the one that is rolled on."""
     state = rolling_state(short)

@@ -214,14 +214,16 @@ def test_lost_frames_claim_nothing(frames):
 
 
 @pytest.mark.statistical
-def test_one_camera_for_a_while_claims_nothing():
-    assert_nothing_is_claimed(diagnose(lost(measured(seed=49, n=150), np.arange(40, 110), camera=0)))
-
-
-@pytest.mark.statistical
-@pytest.mark.parametrize("n", [45, 70, 100])
-def test_short_recordings_claim_nothing(n):
-    assert_nothing_is_claimed(diagnose(measured(seed=50 + n, n=n)))
+@pytest.mark.parametrize(
+    "trajectory",
+    [
+        lambda: lost(measured(seed=49, n=150), np.arange(40, 110), camera=0),
+        *(lambda n=n: measured(seed=50 + n, n=n) for n in (45, 70, 100)),
+    ],
+    ids=["one camera for a while", "45 frames", "70 frames", "100 frames"],
+)
+def test_little_that_is_seen_claims_nothing(trajectory):
+    assert_nothing_is_claimed(diagnose(trajectory()))
 
 
 def test_a_disc_without_a_motion_is_an_error_that_says_what_it_does():
