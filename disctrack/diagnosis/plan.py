@@ -133,8 +133,8 @@ class Planner:
         self.column = {name: j for j, name in enumerate(names)}
         self._base = [j for j, name in enumerate(names) if name not in new]
         if said is None:
-            own = [q for q in fit.quantities if not q.belongs_to and q.name not in new]
-            self.now = self._said(system, fit.values, own, [*self._shared, *self.tested])
+            kept = [q for q in fit.quantities if q.name not in new]
+            self.now = self._said(system, fit.values, [*kept, *self.tested])
         else:
             known, rows = said
             self.now = np.zeros((len(rows), len(names)))
@@ -143,24 +143,13 @@ class Planner:
                     self.now[:, self.column[name]] = rows[:, j]
 
     def with_(self, proposal: Proposal) -> tuple[Array, float] | None:
-        """Rows of this recording and of the proposed one, and how long that lasts; None where it cannot be made.
-
-        Another disc has its own k_m, its own inertia and its own dots, as in a diagnosis of both together; laws that
-        were found or are asked for have one constant.
-        """
+        """Rows of this recording and of the proposed one, and how long that lasts; None where it cannot be made."""
         try:
             planned, values = self._planned(proposal)
-            in_base = {q.name for q in planned.base}
             foreseen = {name for c in planned.candidates for name in c.names}
             found = [q for q in self._shared if q.name in foreseen]
             known = {q.name: q for q in (*planned.base, *found, *self.tested)}
-            another = proposal.mass != 1.0 or proposal.radius != 1.0
-            own, shared = list[Quantity](), list[Quantity]()
-            for q in known.values():
-                one_for_all = q.name not in in_base and any(kind in LAWS for kind in q.belongs_to)
-                with_it = q.belongs_to and not (another and "disc" in q.belongs_to and not one_for_all)
-                (shared if with_it else own).append(q)
-            said = self._said(planned, values, own, shared)
+            said = self._said(planned, values, known.values(), proposal.mass != 1.0 or proposal.radius != 1.0)
         except DiscTrackError:  # no such precession, or over at once: not a recording to propose
             return None
         return np.concatenate([self.now, said]), float(planned.time[-1] - planned.time[0])
@@ -183,8 +172,18 @@ class Planner:
     def _columns(self, candidate: Candidate) -> list[int]:
         return [self.column[n] for n in candidate.names]
 
-    def _said(self, system: DiscSystem, values: Values, own: Sequence[Quantity], shared: Sequence[Quantity]) -> Array:
-        """(m, k) what a recording says of the shared quantities, its own at their best."""
+    def _said(self, system: DiscSystem, values: Values, known: Iterable[Quantity], another: bool = False) -> Array:
+        """(m, k) what a recording says of the shared quantities among those known, its own at their best.
+
+        another : disc, which has its own k_m, its own inertia and its own dots, as in a diagnosis of both together;
+        laws that were found or are asked for have one constant
+        """
+        here, in_base = system is self.system, {q.name for q in system.base}
+        own, shared = list[Quantity](), list[Quantity]()
+        for q in known:
+            one_for_all = q.name not in in_base and any(kind in LAWS for kind in q.belongs_to)
+            its_own = not q.belongs_to or (another and "disc" in q.belongs_to and not one_for_all)
+            (own if its_own and not (here and q in self.tested) else shared).append(q)
         names = [q.name for q in shared]
         start = {q.name: q.null for q in own} | dict(values)
         reduced = Reduction(system, own, start).reduce(start, names)
