@@ -19,6 +19,8 @@ REST_SIGMAS = 6.0  # a turn between two poses that is smaller may be noise
 HAND = 0.005  # [s] next to a rest, in which what held the disc is still there, or there again
 FIRST_WINDOW = 0.02  # [s] in which the first state is read off the poses
 FIRST_POSES = 6  # in it at least: a cubic has four numbers
+HELD = "the disc is at rest or held"
+OTHERWISE = ("the disc lies flat", HELD, "the disc slips")  # what frames show that are not of a motion on its own
 
 
 @dataclass(frozen=True)
@@ -41,24 +43,35 @@ def free_stretch(trajectory: Trajectory, start: float = -np.inf) -> Stretch:
         )
     measured = np.flatnonzero(trajectory.measured)
     time, flat = trajectory.time[measured], trajectory.q[measured, 4] < MIN_THETA
-    still = at_rest(trajectory, measured)
-    first, last = _longest(~still & ~flat & (time >= start))
-    if first > 0 and still[first - 1]:
+    why = np.select([flat, at_rest(trajectory, measured), time < start], OTHERWISE, "")
+    first, last = _longest(why == "")
+    if first > 0 and why[first - 1] == HELD:
         first = int(np.searchsorted(time, time[first - 1] + HAND))
-    if last < len(measured) and still[last] and not flat[last]:
+    if last < len(measured) and why[last] == HELD:
         last = int(np.searchsorted(time, time[last] - HAND, side="right"))
     first = _dense_start(time[:last], first)
     if last - first < MIN_FRAMES:
-        raise AnalysisError(_too_short(len(trajectory), len(measured), max(last - first, 0), still, flat))
-    rows = slice(int(measured[first]), int(measured[last - 1]) + 1)
-    notes = [
-        *_left_out("first", trajectory, measured[:first], still[:first], flat[:first], start),
-        *_left_out("last", trajectory, measured[last:], still[last:], flat[last:], start),
-    ]
+        told = "; ".join([f"{len(measured)} of {len(trajectory)} frames have a pose", *_told(why)])
+        run = f"; the longest motion on its own has {max(last - first, 0)}" if last - first < len(measured) else ""
+        raise AnalysisError(
+            f"{told}{run}. A diagnosis needs {MIN_FRAMES} poses of one motion (nutation above "
+            f"{np.degrees(MIN_THETA):.1f} deg). Track more of the recording, or film it again."
+        )
+    rows, notes = slice(int(measured[first]), int(measured[last - 1]) + 1), list[str]()
+    for which, part in (("first", slice(first)), ("last", slice(last, None))):
+        if (out := time[part]).size:
+            reason = "; ".join(_told(why[part])) or "they are cut off from the longest run of frames in free motion"
+            notes.append(f"the {which} {out.size} frames ({out[0]:.4f} to {out[-1]:.4f} s) are left out: {reason}")
     lost = rows.stop - rows.start - (last - first)
     if lost:
         notes.append(f"{lost} of the {rows.stop - rows.start} frames have no pose")
     return Stretch(rows, tuple(notes))
+
+
+def _told(why: NDArray[np.str_]) -> list[str]:
+    """How many frames are not of the motion, for each reason."""
+    counts = {text: int(np.sum(why == text)) for text in OTHERWISE}
+    return [f"{text} in {n} of them" for text, n in counts.items() if n]
 
 
 def at_rest(trajectory: Trajectory, measured: Rows) -> Mask:
@@ -92,27 +105,3 @@ def _dense_start(time: Array, first: int) -> int:
     following = np.searchsorted(time, time + window, side="right") - np.arange(len(time))
     dense = np.flatnonzero(following[first:] >= FIRST_POSES)
     return first + int(dense[0]) if dense.size else len(time)
-
-
-def _left_out(which: str, trajectory: Trajectory, rows: Rows, still: Mask, flat: Mask, start: float) -> list[str]:
-    """Why frames with a pose before or after the stretch are not in it."""
-    if rows.size == 0:
-        return []
-    time = trajectory.time[rows]
-    kinds = [*_counts(flat, still), ("the disc slips", int(np.sum(time < start)))]
-    reasons = [f"{text} in {n} of them" if n < rows.size else text for text, n in kinds if n]
-    reason = "; ".join(reasons) if reasons else "they are cut off from the longest run of frames in free motion"
-    return [f"the {which} {rows.size} frames ({time[0]:.4f} to {time[-1]:.4f} s) are left out: {reason}"]
-
-
-def _counts(flat: Mask, still: Mask) -> list[tuple[str, int]]:
-    return [("the disc lies flat", int(flat.sum())), ("the disc is at rest or held", int(np.sum(still & ~flat)))]
-
-
-def _too_short(n: int, measured: int, longest: int, still: Mask, flat: Mask) -> str:
-    kinds = "".join(f"; {text} in {k} of them" for text, k in _counts(flat, still) if k)
-    run = f"; the longest motion on its own has {longest}" if longest < measured else ""
-    return (
-        f"{measured} of {n} frames have a pose{kinds}{run}. A diagnosis needs {MIN_FRAMES} poses of one motion "
-        f"(nutation above {np.degrees(MIN_THETA):.1f} deg). Track more of the recording, or film it again."
-    )
