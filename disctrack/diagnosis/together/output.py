@@ -12,7 +12,7 @@ from disctrack.diagnosis.answer import unnamed
 from disctrack.diagnosis.pages.output import plan_json
 from disctrack.diagnosis.pages.report import planned_section
 from disctrack.discrepancy.document import declared_json, document, tried_table
-from disctrack.discrepancy.joint.covariates import Hypothesis, alike
+from disctrack.discrepancy.joint.covariates import alike
 from disctrack.discrepancy.joint.together import Bound, Dependence, OfRecording, TogetherDiagnosis
 from disctrack.discrepancy.search import Diagnosis
 from disctrack.discrepancy.system import Quantity
@@ -68,21 +68,11 @@ def _free(d: Diagnosis) -> list[Quantity]:
 
 
 def _dependence(x: Dependence) -> str:
-    best = x.hypotheses[0]
-    refused = [h.text for h in x.hypotheses if not h.holds and h.parts < 2]  # the others are in the page's table
-    if not best.holds:
-        text = f"{x.quantity}: a value for each {x.by}"
-        text += ", by no rule that was tested" if len(x.hypotheses) > 1 else ""
-    else:
-        text = f"{x.quantity}: {best.text}{_exponents(best)}"
-        text += f", p {probability(best.p_value)}" if best.degrees > 0 else ""
-        text += "".join(f"; or {h.text}{_exponents(h)}: indistinguishable here" for h in alike(x.hypotheses))
-    return text + (f"; rejected: {'; '.join(refused)}" if refused else "")
-
-
-def _exponents(h: Hypothesis) -> str:
-    said = [f"{k} {Measured(*vs)}" for k, vs in h.numbers.items() if not k.startswith("constant")]
-    return f" ({', '.join(said)})" if said else ""
+    """The hypothesis that describes the values of the groups best; all that were tested are in the page's table."""
+    if not x.hypotheses[0].holds:
+        return f"{x.quantity}: a value for each {x.by}, by no rule that was tested"
+    others = "".join(f"; or {h.text}: indistinguishable here" for h in alike(x.hypotheses))
+    return f"{x.quantity}: {x.hypotheses[0].text}{others}"
 
 
 def as_json(answer: TogetherDiagnosis) -> dict[str, Any]:
