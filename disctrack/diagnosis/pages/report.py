@@ -12,7 +12,6 @@ from disctrack.diagnosis.evidence import HORIZONS, Evidence
 from disctrack.diagnosis.model_file import NONE, PAPER
 from disctrack.diagnosis.plan import ENOUGH, Plan
 from disctrack.discrepancy.document import explanations_table, tried_table
-from disctrack.discrepancy.search import Found
 from disctrack.discrepancy.significance import TWO_SIDED
 from disctrack.discrepancy.words import effect_text, significance_text
 from disctrack.findings import Finding, Kind, Severity, of_kind
@@ -49,7 +48,7 @@ def report_of(
 ) -> Report:
     """All of a diagnosis. findings : of the measurement that was diagnosed;  files : that were written, page first"""
     d = result.diagnosis
-    effects = [f"{effect_text(f, d)}. {significance_text(f)}. {_alternatives(f)}".rstrip() for f in d.found]
+    effects = [f"{effect_text(f, d)}. {significance_text(f)}." for f in d.found]
     if (learned := result.learned) is not None:
         power, gain = Measured(learned.power, unit="W"), score(learned.gain)
         effects.append(f"{learned.text}; mean power {power}; chi-square falls by {gain}.")
@@ -75,14 +74,6 @@ def report_of(
         ],
         files=files,
         page=files[0],
-    )
-
-
-def _alternatives(found: Found) -> str:
-    """Angles to the indistinguishable alternatives."""
-    return " ".join(
-        f"Its predicted residual and that of {r.candidate.name} differ by an angle of {np.degrees(r.angle):.2g} deg."
-        for r in found.cannot_be_told_from
     )
 
 
