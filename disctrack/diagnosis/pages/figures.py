@@ -16,7 +16,7 @@ from disctrack.diagnosis.evidence import Evidence, force_of
 from disctrack.diagnosis.missing_force import Course
 from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.held_out import HeldOut
-from disctrack.report.figures import NO_TITLE, Drawn, dress, panels, plain_powers
+from disctrack.report.figures import BAND, NO_TITLE, Curve, Drawn, chart, dress, panels, plain_powers
 from disctrack.report.palette import AMBER, BLUE, GRID, INK, MUTED, RED
 
 N_TRIED = 14
@@ -179,26 +179,20 @@ def candidates(result: DiscDiagnosis) -> Drawn:
 
 
 def _along_the_contact(known: Course, added: Course | None, label: str, scale: float, unit: str) -> Figure:
-    """What is missing along n0, m0 and k with its band of two sigmas, and what was found adds to it."""
-    figure, grid = panels(9.5, 5.4, 3, margins=NO_TITLE, sharex=True)
-    # all but the ends, where derivatives are poor and splines of short moments run away, say what is shown
-    edge = len(known.time) // 20 if len(known.time) > 100 else 0
-    inner = slice(edge, -edge or None)
-    for i, (axes, axis) in enumerate(zip(grid, ("n0", "m0", "k"), strict=True)):
-        value, band = scale * known.values[:, i], 2 * scale * known.sigma[:, i]
-        axes.fill_between(known.time, value - band, value + band, color=GRID, lw=0)
-        axes.plot(known.time, value, lw=1.2, color=RED, label=label)
-        seen = [(value - band)[inner], (value + band)[inner]]
+    """What is missing along n0, m0 and k with its band, and what was found adds to it.
+
+    But for the ends, where derivatives are poor and splines of short moments run away.
+    """
+    rows = []
+    for i, axis in enumerate(("n0", "m0", "k")):
+        inner = slice(len(known.time) // 20, len(known.time) - len(known.time) // 20)
+        value, sigma = scale * known.values[inner, i], scale * known.sigma[inner, i]
+        curves = [Curve(known.time[inner], value, RED, f"{label}, ± {BAND:g} σ", sigma=sigma)]
         if added is not None:
-            law, cut = scale * added.values[:, i], len(added.time) // 20
-            axes.plot(added.time, law, lw=1.0, color=BLUE, label="added by what was found")
-            seen.append(law[cut : -cut or None])
-        _frame(axes, np.concatenate(seen))
-        axes.axhline(0.0, color=MUTED, lw=0.7)
-        axes.set_ylabel(f"along {axis} ({unit})")
-    grid[0].legend(facecolor="white", edgecolor="none", fontsize=9, ncols=2, loc="upper right")
-    grid[-1].set_xlabel("time (s)")
-    return figure
+            inner = slice(len(added.time) // 20, len(added.time) - len(added.time) // 20)
+            curves.append(Curve(added.time[inner], scale * added.values[inner, i], BLUE, "added by what was found"))
+        rows.append((f"along {axis} ({unit})", curves))
+    return chart("time (s)", *rows, size=(9.5, 5.4))
 
 
 def _missing(result: DiscDiagnosis, beside: Evidence) -> list[Drawn]:
@@ -207,18 +201,18 @@ def _missing(result: DiscDiagnosis, beside: Evidence) -> list[Drawn]:
     if beside.moment is not None:
         law = beside.moment_of_law if result.has_more else None
         of_law = "" if law is None else OF_LAW[learned is not None and learned.is_moment]
-        figure = _along_the_contact(beside.moment, law, "missing, ± 2 σ", 1e6, "µN m")
+        figure = _along_the_contact(beside.moment, law, "missing", 1e6, "µN m")
         found.append(Drawn("missing_moment", "The missing moment", f"{MISSING_MOMENT}{of_law}", figure))
     if beside.force is not None:
         added = None
         if result.has_more:
             more = force_of(result.system, result.after_fit) - force_of(result.system, result.diagnosis.before)
             added = Course(beside.force.time, more, np.zeros_like(more))
-        figure = _along_the_contact(beside.force, added, "missing, ± 2 σ", 1e3, "mN")
+        figure = _along_the_contact(beside.force, added, "missing", 1e3, "mN")
         found.append(Drawn("missing_force", "The missing force", MISSING_FORCE, figure))
     if learned is not None and learned.course is not None:
         title, caption = "How well the laws are known along the recording", COURSE_OF_LAWS.format(100 * learned.misfit)
-        figure = _along_the_contact(learned.course, None, "all laws, ± 2 σ", 1e6, "µN m")
+        figure = _along_the_contact(learned.course, None, "all laws", 1e6, "µN m")
         found.append(Drawn("course_of_the_laws", title, caption, figure))
     return found
 
