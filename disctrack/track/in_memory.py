@@ -3,7 +3,6 @@
 import time
 from collections.abc import Iterator
 from dataclasses import replace
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,7 @@ from disctrack.errors import TrackingError
 from disctrack.findings import warn_of_doubts
 from disctrack.frames import CAMERAS
 from disctrack.recording.readers.blocks import PairBlock
-from disctrack.track.follow.tracking import TrackingSettings, prepare, stretch_edges, track
+from disctrack.track.follow.tracking import TrackingSettings, prepare, track
 from disctrack.track.measurement import Measurement, Progress, details_of
 
 Images = NDArray[Any]  # of any real type; uint8 and uint16 are measured where they are
@@ -58,16 +57,13 @@ def measure_pairs(
     times = None if timestamps is None else np.asarray(timestamps, float)
     if times is not None and (times.shape != (n,) or not np.all(np.diff(times) > 0)):
         raise TrackingError(f"timestamps of shape {times.shape} for {n} pairs; expected ({n},), increasing, in seconds")
-    edges = stretch_edges(range(n), disc)
     prepare(left.dtype)
 
     def read_blocks(start: int, stop: int) -> Iterator[PairBlock]:
-        cuts = sorted({start, stop, *(edge for edge in edges if start < edge < stop)})
-        for a, b in pairwise(cuts):
-            for first in range(a, b, block):
-                rows = slice(first, min(first + block, b))
-                pair = whole[rows] if whole is not None else np.stack([left[rows], right[rows]], axis=1)
-                yield PairBlock(np.arange(rows.start, rows.stop), pair)
+        for first in range(start, stop, block):
+            rows = slice(first, min(first + block, stop))
+            pair = whole[rows] if whole is not None else np.stack([left[rows], right[rows]], axis=1)
+            yield PairBlock(np.arange(rows.start, rows.stop), pair)
 
     began = time.perf_counter()
     tracking = track(

@@ -158,12 +158,11 @@ def measure(
     span = _span(pairs, rate, settings, threads)
     progress(len(pairs) - (span.stop - span.start))
     tracked = range(span.start, span.stop)
-    edges = stretch_edges(tracked, recording.disc)
-    workers = _workers(pairs, len(edges) - 1, threads)
+    workers = _workers(pairs, len(stretch_edges(tracked, recording.disc)) - 1, threads)
     readers = max(1, (threads or default_threads()) // workers)  # each worker has its own three blocks
 
     def read_blocks(start: int, stop: int) -> Iterator[PairBlock]:
-        for block in iter_pair_blocks(pairs.left, pairs.right, start, stop, threads=readers, breaks=edges):
+        for block in iter_pair_blocks(pairs.left, pairs.right, start, stop, threads=readers):
             not_read.update({(image.frame, image.camera): image for image in block.unreadable})
             yield block
 

@@ -8,20 +8,13 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, NullFormatter
 
 from calibration.kit.arrays import Array
-from disctrack.frames import CAMERAS, COORDINATES
+from disctrack.frames import CAMERAS
 from disctrack.report.figures import lay_out
 from disctrack.report.palette import COLOURS, INK, MUTED
 from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
 
 BAND = 3.0  # sigmas shown as a band: one is thinner than the line in most recordings
-_LABELS = {
-    "x": ("x", "mm", 1e3),
-    "y": ("y", "mm", 1e3),
-    "z": ("z", "mm", 1e3),
-    "psi": ("precession ψ", "deg", 180 / np.pi),
-    "theta": ("nutation θ", "deg", 180 / np.pi),
-    "phi": ("spin φ", "deg", 180 / np.pi),
-}
+_NAMES = ("x", "y", "z", "precession ψ", "nutation θ", "spin φ")
 
 
 def coordinates_figure(trajectory: Trajectory) -> Figure:
@@ -30,7 +23,7 @@ def coordinates_figure(trajectory: Trajectory) -> Figure:
     lay_out(figure, (4, 3), gaps=(0.9, 0.2))
     grid = figure.add_gridspec(4, 3, height_ratios=(3, 1.3, 3, 1.3))
     sigma, shared = trajectory.coordinate_sigma, trajectory.calibration_sigma
-    for i in range(len(COORDINATES)):
+    for i in range(len(_NAMES)):
         row, column = 2 * (i // 3), i % 3
         axes = figure.add_subplot(grid[row, column])
         below = figure.add_subplot(grid[row + 1, column], sharex=axes)
@@ -50,13 +43,13 @@ def coordinates_figure(trajectory: Trajectory) -> Figure:
 
 
 def _coordinate(axes: Axes, trajectory: Trajectory, i: int, sigma: Array) -> None:
-    label, unit, scale = _LABELS[COORDINATES[i]]
+    unit, scale = ("mm", 1e3) if i < 3 else ("deg", 180 / np.pi)
     time, values = trajectory.time, trajectory.q[:, i] * scale
     band = BAND * sigma * scale
     axes.fill_between(time, values - band, values + band, color=COLOURS["left"], alpha=0.35, linewidth=0)
     axes.plot(time, values, color=INK, linewidth=0.9)
     _mark_lost(axes, trajectory)
-    axes.set_ylabel(f"{label} ({unit})")
+    axes.set_ylabel(f"{_NAMES[i]} ({unit})")
     axes.margins(x=0.01)
     axes.grid(alpha=0.25)
 
@@ -65,13 +58,8 @@ def _sigmas(axes: Axes, trajectory: Trajectory, i: int, sigma: Array, shared: Ar
     scale, unit = (1e6, "µm") if i < 3 else (180e3 / np.pi, "mdeg")
     axes.plot(trajectory.time, sigma * scale, color=COLOURS["left"], linewidth=0.9, label="this frame's noise")
     if np.nanmax(shared, initial=0.0) > 0:
-        axes.plot(
-            trajectory.time,
-            shared * scale,
-            color=COLOURS["right"],
-            linewidth=0.9,
-            label="calibration, shared by all",
-        )
+        label = "calibration, shared by all"
+        axes.plot(trajectory.time, shared * scale, color=COLOURS["right"], linewidth=0.9, label=label)
     finite = np.concatenate([sigma, shared])
     finite = finite[np.isfinite(finite) & (finite > 0)] * scale
     if finite.size and finite.max() > 30 * finite.min():
@@ -88,8 +76,8 @@ def _sigmas(axes: Axes, trajectory: Trajectory, i: int, sigma: Array, shared: Ar
 def _mark_lost(axes: Axes, trajectory: Trajectory) -> None:
     lost = trajectory.time[~trajectory.measured]
     if lost.size:
-        axes.plot(lost, np.zeros_like(lost), "|", color=COLOURS["right"], transform=axes.get_xaxis_transform(),
-                  clip_on=False, markersize=6)  # fmt: skip
+        below = axes.get_xaxis_transform()
+        axes.plot(lost, 0 * lost, "|", color=COLOURS["right"], transform=below, clip_on=False, markersize=6)
 
 
 def reprojection_figure(trajectory: Trajectory) -> Figure:

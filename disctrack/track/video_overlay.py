@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from calibration.kit.arrays import Array, Mask
 from calibration.kit.grey_levels import full_scale
-from disctrack.disc import Disc
 from disctrack.errors import OutputError
 from disctrack.files.whole import whole_file
 from disctrack.frames import CAMERAS, rotation_from_quaternion
@@ -21,11 +20,10 @@ ColourImage = NDArray[Any]  # (height, width, 3) uint8, BGR
 
 PLAYBACK_HZ = 25.0
 MOST_FRAMES = 1500  # a minute of video; of longer recordings every second, third, ... pair is shown
-RIM_POINTS, DOT_POINTS = 120, 40  # of an outline: a dot's polygon lies within a tenth of a pixel of it
+POINTS = 120  # of an outline
 CAPTION_LINE = 18  # height of a line [px]
 CAPTION_WIDTH = 950  # of the whole caption on one line [px]
 _SUBPIXEL_BITS = 4  # OpenCV draws at fractions of 1/16 px
-_SUBPIXEL = 1 << _SUBPIXEL_BITS
 
 _TEXT = (230, 230, 230)
 # Blue, green, red as OpenCV orders them.
@@ -49,12 +47,12 @@ def write_overlay(
     first = next(stream, None)
     if first is None:
         raise OutputError(f"{path}: no frame to draw")
-    picture = _drawn(*first, trajectory)
+    picture = draw_pair(first[1], trajectory, first[0])
     with whole_file(path, suffix=".mp4") as part, _encoder(part, picture.shape[:2]) as write:
         write(picture)
         progress(1)
         for row, images in stream:
-            write(_drawn(row, images, trajectory))
+            write(draw_pair(images, trajectory, row))
             progress(1)
     return path
 
@@ -69,10 +67,6 @@ def draw_pair(images: NDArray, trajectory: Trajectory, row: int) -> ColourImage:
 
     images : (2, height, width) uint8 or uint16
     """
-    return _drawn(row, images, trajectory)
-
-
-def _drawn(row: int, images: NDArray, trajectory: Trajectory) -> ColourImage:
     height, width = images.shape[1:]
     captions = _caption_lines(trajectory, row, 2 * width)
     whole = np.zeros((height + CAPTION_LINE * len(captions) + 6, 2 * width, 3), np.uint8)
@@ -126,15 +120,16 @@ def _draw_disc(pictures: list[ColourImage], trajectory: Trajectory, row: int) ->
     disc, rig = trajectory.disc, trajectory.rig
     R, t = rotation_from_quaternion(trajectory.quaternion[row]), trajectory.q[row, :3]
     h = disc.half_thickness
-    rims, dots = (outline @ R.T + t for outline in _outlines(disc))
-    lower = rims[0]
+    lower, upper = (disc.radius * _circle() + [0.0, 0.0, z] for z in (-h, h))
+    dots = disc.marker_centres_body[:, None] + 0.5 * disc.marker_diameter * _circle()
+    outlines = np.stack([lower, upper, *dots]) @ R.T + t
+    lower = outlines[0]
     psi, theta = trajectory.q[row, 3], trajectory.q[row, 4]
     e2 = np.array([-np.sin(psi) * np.cos(theta), np.cos(psi) * np.cos(theta), np.sin(theta)])
     contact = t - disc.radius * e2 - h * R[:, 2]
-    points = np.concatenate([rims.reshape(-1, 3), dots.reshape(-1, 3), contact[None]])
+    points = np.concatenate([outlines.reshape(-1, 3), contact[None]])
     for picture, seen, (R_cw, t_cw) in zip(pictures, rig.project(points), rig.camera_poses(), strict=True):
-        lower_px, upper_px = seen[: 2 * RIM_POINTS].reshape(2, RIM_POINTS, 2)
-        dots_px = seen[2 * RIM_POINTS : -1].reshape(len(dots), DOT_POINTS, 2)
+        lower_px, upper_px, *dots_px = seen[:-1].reshape(-1, POINTS, 2)
         # the wall is seen where its outward normal faces the camera; the other half lies behind the disc
         facing = np.sum((lower - t + h * R[:, 2]) * (-R_cw.T @ t_cw - lower), axis=1) > 0
         start = int(np.argmin(facing))  # a hidden point, so that the visible ones are in one run
@@ -146,16 +141,9 @@ def _draw_disc(pictures: list[ColourImage], trajectory: Trajectory, row: int) ->
             _cross(picture, seen[-1], _CONTACT, cv2.MARKER_DIAMOND, 9)
 
 
-def _outlines(disc: Disc) -> tuple[Array, Array]:
-    """Lower and upper rim (2, RIM_POINTS, 3), and the dots (n, DOT_POINTS, 3), in body axes."""
-    h = disc.half_thickness
-    rims = np.array([[[0.0, 0.0, -h]], [[0.0, 0.0, h]]]) + disc.radius * _circle(RIM_POINTS)
-    return rims, disc.marker_centres_body[:, None] + 0.5 * disc.marker_diameter * _circle(DOT_POINTS)
-
-
-def _circle(n: int) -> Array:
-    angle = np.linspace(0, 2 * np.pi, n, endpoint=False)
-    return np.stack([np.cos(angle), np.sin(angle), np.zeros(n)], axis=-1)
+def _circle() -> Array:
+    angle = np.linspace(0, 2 * np.pi, POINTS, endpoint=False)
+    return np.stack([np.cos(angle), np.sin(angle), np.zeros(POINTS)], axis=-1)
 
 
 def _polylines(
@@ -163,7 +151,9 @@ def _polylines(
 ) -> None:
     exact = np.asarray(lines)
     finite: Mask = np.asarray(np.isfinite(exact).all(axis=2))  # not behind a camera, nor out of the lens's reach
-    whole = np.clip(np.rint(np.where(finite[..., None], _SUBPIXEL * exact, 0.0)), -(2**24), 2**24).astype(np.int32)
+    whole = np.clip(np.rint(np.where(finite[..., None], 2**_SUBPIXEL_BITS * exact, 0.0)), -(2**24), 2**24).astype(
+        np.int32
+    )
     fixed = [line[seen, None] for line, seen in zip(whole, finite, strict=True) if seen.sum() > 1]
     if fixed:
         cv2.polylines(picture, fixed, closed, colour, 1, cv2.LINE_AA, _SUBPIXEL_BITS)

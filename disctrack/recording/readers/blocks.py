@@ -4,7 +4,6 @@ import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,11 +80,8 @@ def iter_pair_blocks(
     stop: int | None = None,
     block: int | None = None,
     threads: int | None = None,
-    breaks: Sequence[int] = (),
 ) -> Iterator[PairBlock]:
     """Pairs start..stop-1 in blocks of `block` pairs, two blocks read ahead while the caller works on a third.
-
-    breaks : pairs that a block begins with, whatever came before
 
     An image that cannot be read is named in the block's `unreadable`; the others are delivered. The default block
     holds BLOCK_BYTES, so that the memory is independent of the recording's length and of the image size.
@@ -96,8 +92,7 @@ def iter_pair_blocks(
     width, height = left.image_size
     dtype = np.uint8 if left.bit_depth == 8 else np.uint16
     block = block or int(np.clip(BLOCK_BYTES // (2 * width * height * np.dtype(dtype).itemsize), 1, 256))
-    parts = [start, *(edge for edge in sorted(breaks) if start < edge < stop), stop]
-    starts = [first for a, b in pairwise(parts) for first in range(a, b, block)]
+    starts = list(range(start, stop, block))
     stops = [*starts[1:], stop]
     n_ahead = min(2, max(len(starts) - 1, 0))
     ring = [np.empty((min(block, max(stop - start, 1)), 2, height, width), dtype) for _ in range(n_ahead + 1)]

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.cameras.camera import StereoRig, normalise, triangulate
-from calibration.kit.arrays import Array, Mask
+from calibration.kit.arrays import Array
 from calibration.kit.grey_levels import level_step
 from disctrack.disc import Disc
 from disctrack.frames import euler_from_rotation, rotation_from_vector
@@ -24,6 +24,10 @@ EPIPOLAR_PX = 4.0  # centroids of blobs err by up to 1 px under glare, the rig b
 SIDE_TOLERANCE = 0.06  # of the distance between two dots: centroids err by 0.3 px, that is 0.1 mm of 13-52 mm
 INLIER_DIAMETERS = 0.35  # a blob belongs to a dot if it lies within this part of a dot's diameter
 MIN_EXPLAINED = 4
+BLOB_PX = 0.5  # standard deviation of a blob's centroid under uneven light
+CANDIDATES = 40  # poses that are refined
+
+Pose = tuple[Array, Array]  # R_world_body (3, 3), t_world_body (3,) [m]
 
 
 @dataclass(frozen=True)
@@ -51,7 +55,7 @@ def _sized_blobs(image: NDArray[np.generic], expected_diameter_px: float) -> Arr
     block = 2 * int(1.25 * expected_diameter_px) + 1
     smooth = cv2.GaussianBlur(grey, (0, 0), 1.0)
     mean = cv2.blur(smooth, (block, block), borderType=cv2.BORDER_REPLICATE)
-    spread = _median(np.abs(smooth - mean))
+    spread = np.median(np.abs(smooth - mean))
     # against the surroundings, so that a glare gradient does not matter; dim images keep a floor of three spreads
     threshold = np.maximum(0.12 * mean, 3.0 * spread)
     found = []
@@ -59,14 +63,6 @@ def _sized_blobs(image: NDArray[np.generic], expected_diameter_px: float) -> Arr
         found += _elliptical_components(mask.astype(np.uint8), expected_diameter_px)
     found.sort()
     return np.array([blob[1:] for blob in found[:MAX_BLOBS]], float).reshape(-1, 3)
-
-
-def _median(values: NDArray[np.float32]) -> float:
-    """`numpy.median` of single precision, to the last bit and four times as fast: of one order alone."""
-    middle = values.size // 2
-    ordered = np.partition(values, middle, axis=None)
-    upper, below = ordered[middle], ordered[:middle]
-    return float(upper if values.size % 2 else (below.max() + upper) / np.float32(2))
 
 
 def _elliptical_components(mask: NDArray[np.uint8], diameter: float) -> list[tuple[float, float, float, float]]:
@@ -94,8 +90,7 @@ def expected_diameter_px(rig: StereoRig, disc: Disc) -> tuple[float, float]:
     """Diameter of a dot's image in each camera where its axis meets the table, or 0.5 m away without a table."""
     result = []
     for camera, (R, t) in zip(rig.cameras, rig.camera_poses(), strict=True):
-        centre = -R.T @ t
-        distance = -centre[2] / R[2, 2] if rig.world_is_table and R[2, 2] < -0.05 else 0.5
+        distance = (R.T @ t)[2] / R[2, 2] if rig.world_is_table and R[2, 2] < -0.05 else 0.5
         result.append(camera.fx * disc.marker_diameter / distance)
     return result[0], result[1]
 
@@ -150,10 +145,10 @@ def seen_by_one_camera(
     return best
 
 
-def _candidates_from_stereo(blobs: list[Array], rig: StereoRig, disc: Disc) -> list[tuple[Array, Array]]:
+def _candidates_from_stereo(blobs: list[Array], rig: StereoRig, disc: Disc) -> list[Pose]:
     if min(len(b) for b in blobs) < 3:
         return []
-    i, j = (k.ravel() for k in np.meshgrid(range(len(blobs[0])), range(len(blobs[1])), indexing="ij"))
+    i, j = np.indices((len(blobs[0]), len(blobs[1]))).reshape(2, -1)
     pixels = np.stack([blobs[0][i], blobs[1][j]])
     with np.errstate(all="ignore"):
         points = triangulate(pixels, rig)
@@ -164,29 +159,30 @@ def _candidates_from_stereo(blobs: list[Array], rig: StereoRig, disc: Disc) -> l
     points = points[keep][np.argsort(error[keep])][:MAX_BLOBS]
     if len(points) < 3:
         return []
-    distance = np.linalg.norm(points[:, None] - points[None], axis=-1)
-    order = np.indices((len(points),) * 3).reshape(3, -1).T
-    order = order[(order != order[:, [1, 2, 0]]).all(axis=1)]
-    sides = np.stack([distance[order[:, a], order[:, b]] for a, b in ((0, 1), (1, 2), (2, 0))], axis=-1)
-    found_points, found_dots = [], []
     centres = disc.marker_centres_body
-    for triple in combinations(range(len(centres)), 3):
-        wanted = np.array(
-            [np.linalg.norm(centres[triple[a]] - centres[triple[b]]) for a, b in ((0, 1), (1, 2), (2, 0))]
-        )
-        match = np.flatnonzero(np.all(np.abs(sides / wanted - 1.0) < SIDE_TOLERANCE, axis=1))
-        found_points.append(points[order[match]])
-        found_dots.append(np.broadcast_to(centres[list(triple)], (len(match), 3, 3)))
-    P, B = np.concatenate(found_points), np.concatenate(found_dots)
-    if len(P) == 0:
-        return []
-    R, t = rigid_motions(B, P)
+    orders = np.array([*permutations(range(len(points)), 3)])
+    sides = _sides(points[orders])
+    found_points, found_dots = [], []
+    for triple in combinations(centres, 3):
+        body = np.array(triple)
+        match = orders[np.all(np.abs(sides / _sides(body) - 1.0) < SIDE_TOLERANCE, axis=1)]
+        found_points.append(points[match])
+        found_dots.append(np.broadcast_to(body, (len(match), 3, 3)))
+    R, t = rigid_motions(np.concatenate(found_dots), np.concatenate(found_points))
     # score by the points that fall on dots; keep the distinct best
     predicted = centres @ np.swapaxes(R, 1, 2) + t[:, None]
     gap = np.linalg.norm(predicted[:, :, None] - points[None, None], axis=-1).min(axis=2)
-    reach = INLIER_DIAMETERS * disc.marker_diameter
-    score = np.sum(np.clip(1 - (gap / reach) ** 2, 0, None), axis=1)
-    return [(R[k], t[k]) for k in np.argsort(-score)[:40]]
+    return _best(R, t, np.sum(np.clip(1 - (gap / (INLIER_DIAMETERS * disc.marker_diameter)) ** 2, 0, None), axis=1))
+
+
+def _sides(triangles: Array) -> Array:
+    """(..., 3) lengths of the sides of triangles (..., 3, 3)."""
+    return np.asarray(np.linalg.norm(triangles - np.roll(triangles, -1, axis=-2), axis=-1))
+
+
+def _best(R: Array, t: Array, score: Array) -> list[Pose]:
+    """The poses with the highest scores."""
+    return [(R[k], t[k]) for k in np.argsort(-score, kind="stable")[:CANDIDATES]]
 
 
 def rigid_motions(body: Array, world: Array) -> tuple[Array, Array]:
@@ -199,7 +195,7 @@ def rigid_motions(body: Array, world: Array) -> tuple[Array, Array]:
     return R, (w0 - b0 @ np.swapaxes(R, 1, 2))[:, 0]
 
 
-def _candidates_from_one_camera(blobs: Array, camera: int, rig: StereoRig, disc: Disc) -> list[tuple[Array, Array]]:
+def _candidates_from_one_camera(blobs: Array, camera: int, rig: StereoRig, disc: Disc) -> list[Pose]:
     if len(blobs) < MIN_EXPLAINED:
         return []
     blobs = blobs[:9]
@@ -224,9 +220,8 @@ def _candidates_from_one_camera(blobs: Array, camera: int, rig: StereoRig, disc:
         return []
     R, t = rotation_from_vector(np.array(turns).reshape(-1, 3)), np.array(shifts).reshape(-1, 3)
     score = _blob_score(R, t, rays, disc)
-    best = np.argsort(-score, kind="stable")[:40]
-    best = best[score[best] > MIN_EXPLAINED - 0.5]
-    return [(R_cw.T @ R[k], R_cw.T @ (t[k] - t_cw)) for k in best]
+    good = score > MIN_EXPLAINED - 0.5
+    return [(R_cw.T @ R, R_cw.T @ (t - t_cw)) for R, t in _best(R[good], t[good], score[good])]
 
 
 def _blob_score(R: Array, t: Array, rays: Array, disc: Disc) -> Array:
@@ -247,63 +242,38 @@ def _blob_score(R: Array, t: Array, rays: Array, disc: Disc) -> Array:
 
 
 def _best_explanation(
-    candidates: list[tuple[Array, Array]], blobs: list[Array], rig: StereoRig, disc: Disc
+    candidates: list[Pose], blobs: list[Array], rig: StereoRig, disc: Disc
 ) -> tuple[float, Array, Array, int] | None:
     """Refine the candidates on the blobs they explain; (cost, R, t, explained dot images) of the best, or None."""
     if not candidates:
         return None
     R, t = (np.array(parts) for parts in zip(*candidates, strict=True))
-    n, m = len(R), disc.n_markers
-    centres = disc.marker_centres_body
-    best = None
+    shape = len(R), 2, disc.n_markers
+    covariance = np.broadcast_to(BLOB_PX**2 * np.eye(2), (*shape, 2, 2))
+    diameters, eyes = expected_diameter_px(rig, disc), [-R_cw.T @ t_cw for R_cw, t_cw in rig.camera_poses()]
     for _ in range(2):  # once with the triple's pose, once with the refined one
-        pixels, _ = marker_pixels(R, t, rig, centres)
-        matched = np.full((n, 2, m, 2), np.nan)
-        facing = _facing(R, t, rig, disc)
+        pixels, _ = marker_pixels(R, t, rig, disc.marker_centres_body)
+        matched = np.full((*shape, 2), np.nan)
         for camera, points in enumerate(blobs):
-            if len(points) == 0:
-                continue
-            gap = np.linalg.norm(pixels[:, camera, :, None] - points[None, None], axis=-1)
-            gap = np.where(np.isfinite(gap), gap, np.inf)
-            nearest = gap.argmin(axis=2)
-            reach = INLIER_DIAMETERS * expected_diameter_px(rig, disc)[camera]
-            ok = (gap.min(axis=2) < reach) & facing[:, camera, None]
-            matched[:, camera] = np.where(ok[..., None], points[nearest], np.nan)
+            if len(points):
+                gap = np.linalg.norm(pixels[:, camera, :, None] - points[None, None], axis=-1)
+                gap = np.where(np.isfinite(gap), gap, np.inf)
+                # the camera is on the side of the upper face
+                facing = np.einsum("ni,ni->n", R[:, :, 2], eyes[camera] - t) > disc.half_thickness
+                ok = (gap.min(axis=2) < INLIER_DIAMETERS * diameters[camera]) & facing[:, None]
+                matched[:, camera] = np.where(ok[..., None], points[gap.argmin(axis=2)], np.nan)
         fits = fit_poses(
-            matched,
-            np.broadcast_to(0.25 * np.eye(2), (n, 2, m, 2, 2)),
-            rig,
-            centres,
-            R,
-            t,
-            reject_outliers=False,
-            with_sensitivity=False,
+            matched, covariance, rig, disc.marker_centres_body, R, t, reject_outliers=False, with_sensitivity=False
         )
         R = np.where(fits.converged[:, None, None], fits.R_world_body, R)
         t = np.where(fits.converged[:, None], fits.t_world_body, t)
     explained = np.isfinite(matched).all(-1).sum((1, 2))
-    rms = np.sqrt(fits.chi_square * 0.25 / np.maximum(explained, 1))
-    # a dot that should be seen and is not costs as much as a badly placed one
-    cost = np.where(fits.converged, rms, np.inf) - 2.0 * explained
-    cost += 0.5 * _table_gap(R, t, rig, disc) / disc.half_thickness
+    rms = BLOB_PX * np.sqrt(fits.chi_square / np.maximum(explained, 1))
+    # a dot that should be seen and is not costs as much as a badly placed one, or half a thickness off the table
+    cost = rms - 2.0 * explained
+    if rig.world_is_table:
+        gap = np.abs(t[:, 2] - disc.resting_height(euler_from_rotation(R)[:, 1]))
+        cost += 0.5 * np.minimum(gap, 5e-3) / disc.half_thickness
     cost = np.where((explained >= MIN_EXPLAINED) & (rms < 2.5) & fits.converged, cost, np.inf)
     k = int(np.argmin(cost))
-    if np.isfinite(cost[k]):
-        best = (float(cost[k]), R[k], t[k], int(explained[k]))
-    return best
-
-
-def _facing(R: Array, t: Array, rig: StereoRig, disc: Disc) -> Mask:
-    """(n, 2) True where the camera is on the side of the upper face."""
-    result = []
-    for R_cw, t_cw in rig.camera_poses():
-        eye = -R_cw.T @ t_cw
-        result.append(np.einsum("ni,ni->n", R[:, :, 2], eye - t) > disc.half_thickness)
-    return np.stack(result, axis=1)
-
-
-def _table_gap(R: Array, t: Array, rig: StereoRig, disc: Disc) -> Array:
-    """(n,) distance between the disc's lowest point and the table [m], at most 5 mm; 0 without a table."""
-    if not rig.world_is_table:
-        return np.zeros(len(R))
-    return np.minimum(np.abs(t[:, 2] - disc.resting_height(euler_from_rotation(R)[:, 1])), 5e-3)
+    return (float(cost[k]), R[k], t[k], int(explained[k])) if np.isfinite(cost[k]) else None

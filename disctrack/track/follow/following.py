@@ -19,7 +19,7 @@ from calibration.kit.arrays import Array, Image, Mask
 from calibration.kit.grey_levels import saturation_level
 from disctrack.disc import Disc
 from disctrack.track.dots import _kernels as kernels
-from disctrack.track.dots.acquisition import acquire
+from disctrack.track.dots.acquisition import Pose, acquire
 from disctrack.track.dots.template import (
     TYPICAL_BLUR_PX,
     NoiseModel,
@@ -30,8 +30,6 @@ from disctrack.track.dots.template import (
 )
 from disctrack.track.follow.motion_span import StillScene
 from disctrack.trajectory import FrameStatus, MarkerStatus
-
-Pose = tuple[Array, Array]  # R_world_body (3, 3), t_world_body (3,) [m]
 
 # A pair whose dots disagree by more than this with any rigid motion is lost: a tenth of a dot, ten times a poor rig
 MAX_PREDICTION_RMS_PX = 2.0

@@ -15,11 +15,11 @@ from disctrack import frames
 from disctrack.arguments import checked, grey_values
 from disctrack.disc import Disc
 from disctrack.errors import ArgumentError
+from disctrack.track.dots.acquisition import Pose
 from disctrack.track.dots.template import dot_centres
 from disctrack.track.follow.following import (
     Follower,
     Heading,
-    Pose,
     Search,
     Tables,
     TrackingSetup,

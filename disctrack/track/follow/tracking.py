@@ -82,9 +82,8 @@ def track(
 
     read_blocks(start, stop) gives the pairs start..stop-1 in blocks, in order; pairs: which to measure (step 1).
     frame_rate [Hz]; timestamps (len(pairs),) [s] where the camera wrote them. workers: threads that follow stretches
-    of a long recording side by side; the result is the same to the last bit for any number of them, if the reader
-    begins a block at each of `stretch_edges`. progress(n) is called when n more pairs are done, from any thread but one
-    at a time.
+    of a long recording side by side; the result is the same to the last bit for any number of them. progress(n) is
+    called when n more pairs are done, from any thread but one at a time.
     Raises TrackingError if the images do not belong to the rig or if the disc is found in no pair at all.
     """
     settings = settings or TrackingSettings()

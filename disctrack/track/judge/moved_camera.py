@@ -14,11 +14,10 @@ from calibration.cameras.camera import N_RIG, PAIR_SHIFT, PAIR_TURN, StereoRig
 from disctrack.disc import Disc
 from disctrack.findings import NONSENSE, Finding, Kind, Number, Remedy, Severity, Subject
 from disctrack.frames import vector_from_rotation
-from disctrack.track.dots.acquisition import MIN_EXPLAINED, expected_diameter_px, seen_by_one_camera
+from disctrack.track.dots.acquisition import BLOB_PX, MIN_EXPLAINED, expected_diameter_px, seen_by_one_camera
 from disctrack.track.pose import fit_poses
 from disctrack.track.refine.self_calibration import MIN_FRAMES, DotsInFrames, fit_shared
 
-BLOB_PX = 0.5  # standard deviation of a blob's centroid under uneven light
 TURN, SHIFT = np.radians(1.0), 2e-3  # [rad], [m] what cameras suffer without anybody's notice: prior sigmas
 MOST_SIGMAS = 4.0  # beyond, it is something else
 FITS_PX = 1.0  # rms of blobs about the fit

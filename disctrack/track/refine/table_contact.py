@@ -85,10 +85,11 @@ def table_from_disc(
         looks like a table that leans while phi follows -psi
     None, and nothing changed, where the rig has no table or the disc did not touch one.
     """
-    found = _contacts(fits, systematic, rig, disc, by_pattern) if rig.world_is_table else None
+    by_pattern = np.zeros((len(systematic), 6, 0)) if by_pattern is None else by_pattern
+    found = _contacts(fits, systematic, disc, by_pattern) if rig.world_is_table else None
     if found is None:
         return fits, systematic, rig, None
-    plane, middle, H, noise, by_radius, by_thickness, by_place, scatter, n = found
+    plane, middle, H, noise, by_disc, by_place, scatter, n = found
     noise = noise + by_place @ by_place.T
     turn = rig.R_left_world
     M = np.zeros((N_RIG, 3))  # d RIG_PARAMETERS / d plane: the world is moved onto it
@@ -96,52 +97,52 @@ def table_from_disc(
     M[WORLD_SHIFT] = turn[:, 2:] * np.array([1.0, *-middle])
 
     # a thicker disc lifts the centre between its faces by half of what it lifts the dots by, which are measured
-    by_disc = np.stack([by_radius, 2.0 * by_thickness], axis=1)
+    by_thickness = by_disc[:, 1]
+    by_disc = by_disc * [1.0, 2.0]
     V, board = noise + by_disc @ by_disc.T, H @ rig.covariance @ H.T
     difference = np.linalg.solve(board + V, plane) @ plane
     told_sigma, told_board = np.sqrt(np.diag(V - 3.0 * np.outer(by_thickness, by_thickness))), np.sqrt(np.diag(board))
     if source == "both":
         rig, by_disc = _narrowed(rig, by_disc, disc, plane, H, noise)
         V, board = noise + by_disc @ by_disc.T, H @ rig.covariance @ H.T
-    stated = V - 0.75 * np.outer(by_disc[:, 1], by_disc[:, 1])
     # where they differ by more than three of both sigmas, it is the board that bends and lies on dust
     allowed = np.diag(board + V)
     excess = np.where(plane**2 > 9.0 * allowed, plane**2 - allowed, 0.0)
     more = board + np.diag(excess)
-    gains = {"board": np.zeros((3, 3)), "disc": np.eye(3)}
     # of what the plane is as these cameras see the disc: errors that both share do not count
-    gain = gains[source] if source in gains else more @ np.linalg.inv(more + V)
-    applied = gain @ plane
-    beyond = np.minimum(excess, applied**2)
+    gain = more @ np.linalg.inv(more + V) if source == "both" else np.eye(3) * (source == "disc")
+    beyond = np.minimum(excess, (gain @ plane) ** 2)
     beyond[0] += middle**2 @ beyond[1:]  # at the origin
     height, slope_x, slope_y = np.sqrt(beyond).tolist()
-    kept = np.eye(N_RIG) - M @ gain @ H
-    covariance = kept @ rig.covariance @ kept.T + M @ gain @ stated @ gain.T @ M.T
     told = TableFromDisc(
         source,
         plane,
         middle,
         told_sigma,
         told_board,
-        applied,
+        gain @ plane,
         (height, slope_x, slope_y),
         float(scipy.special.chdtrc(3, difference)),
         scatter,
         n,
     )
     # of the disc's thickness, what the board's share of the height leaves
-    left = (1.0 - gain[0, 0]) ** 2 * (thickness_tolerance(disc) * _ratio(by_disc[:, 1], 2.0 * by_thickness) / 2.0) ** 2
+    narrower = float(np.linalg.norm(by_disc[:, 1])) / max(2.0 * float(np.linalg.norm(by_thickness)), 1e-150)
+    left = ((1.0 - gain[0, 0]) * narrower * thickness_tolerance(disc) / 2.0) ** 2
     e3 = np.nan_to_num(fits.R_world_body[..., 2])
     systematic[:, :3, :3] += left * e3[:, :, None] * e3[:, None, :]
-    if source == "board":
-        return fits, systematic, rig, told
-    moved, systematic, rig = _on_plane(fits, systematic, rig, applied, middle)
-    allowances = [replace(a, shift=kept @ a.shift) for a in rig.allowances]
-    for cause, column in (("the disc's radius", by_disc[:, 0]), ("the disc's thickness", 0.5 * by_disc[:, 1])):
-        allowances.append(Allowance(cause, M @ gain @ column))
-    allowances += [Allowance(OF_PATTERN, M @ gain @ column) for column in by_place.T if column.any()]
-    covariance = 0.5 * (covariance + covariance.T)
-    return moved, systematic, replace(rig, covariance=covariance, allowances=tuple(allowances)), told
+    if source != "board":
+        fits, systematic, rig = _on_plane(fits, systematic, rig, told)
+        moved = M @ gain
+        kept = np.eye(N_RIG) - moved @ H
+        stated = V - 0.75 * np.outer(by_disc[:, 1], by_disc[:, 1])
+        covariance = kept @ rig.covariance @ kept.T + moved @ stated @ moved.T
+        allowances = [replace(a, shift=kept @ a.shift) for a in rig.allowances]
+        allowances.append(Allowance("the disc's radius", moved @ by_disc[:, 0]))
+        allowances.append(Allowance("the disc's thickness", moved @ by_disc[:, 1] / 2.0))
+        allowances += [Allowance(OF_PATTERN, moved @ column) for column in by_place.T if column.any()]
+        rig = replace(rig, covariance=0.5 * (covariance + covariance.T), allowances=tuple(allowances))
+    return fits, systematic, rig, told
 
 
 def radius_tolerance(disc: Disc) -> float:
@@ -152,10 +153,6 @@ def radius_tolerance(disc: Disc) -> float:
 def thickness_tolerance(disc: Disc) -> float:
     """Standard deviation of the disc's thickness [m], as declared or assumed."""
     return ASSUMED_THICKNESS if disc.thickness_tolerance is None else disc.thickness_tolerance
-
-
-def _ratio(part: Array, whole: Array) -> float:
-    return float(np.sqrt((part @ part) / max(float(whole @ whole), 1e-300)))
 
 
 def _narrowed(
@@ -190,10 +187,10 @@ def _narrowed(
 
 
 def _contacts(
-    fits: PoseFits, systematic: Array, rig: StereoRig, disc: Disc, by_pattern: Array | None = None
-) -> tuple[Array, Array, Array, Array, Array, Array, Array, float, int] | None:
-    """See `TableFromDisc`: plane, middle, d plane / d RIG_PARAMETERS (3, 30), covariance of the plane, its departure
-    for one tolerance of radius and of thickness, by the pattern's place (3, k), scatter, number of frames.
+    fits: PoseFits, systematic: Array, disc: Disc, by_pattern: Array
+) -> tuple[Array, Array, Array, Array, Array, Array, float, int] | None:
+    """See `TableFromDisc`: plane, middle, d plane / d RIG_PARAMETERS (3, 30), covariance of the plane by noise, its
+    departures for one tolerance of radius and thickness (3, 2), by the pattern's place (3, k), scatter, frames.
     """
     with np.errstate(invalid="ignore"):
         theta = np.arccos(np.clip(fits.R_world_body[:, 2, 2], -1, 1))
@@ -213,17 +210,13 @@ def _contacts(
         step = np.linalg.solve(information, A[kept].T @ gap[kept])
         plane = plane + step
         left = gap - A @ step
-        spread = 1.4826 * float(np.median(np.abs(left - np.median(left))))
+        spread = float(scipy.stats.median_abs_deviation(left, scale="normal"))
         kept = np.abs(left) < 4.0 * spread + 1e-9
     by_pose = np.concatenate([np.broadcast_to(normal, t.shape), np.cross(arm, normal)], axis=1)
-    parts = [slice(first, first + _AT_ONCE) for first in range(0, len(rows), _AT_ONCE)]
     noise, repeats = (
-        float(np.median(np.concatenate([np.einsum("ni,nij,nj->n", by_pose[p], C[rows[p]], by_pose[p]) for p in parts])))
-        for C in (fits.covariance, systematic)
+        float(np.median(np.einsum("ni,nij,nj->n", by_pose, C[rows], by_pose))) for C in (fits.covariance, systematic)
     )
-    gap_by_place = (
-        np.zeros((len(rows), 0)) if by_pattern is None else np.einsum("ni,nik->nk", by_pose, by_pattern[rows])
-    )
+    gap_by_place = np.einsum("ni,nik->nk", by_pose, by_pattern[rows])
     told = noise + repeats + float(np.median(np.sum(gap_by_place**2, axis=1)))
     if spread > max(MAX_SCATTER, NOISY * np.sqrt(told)) or kept.sum() < max(MIN_FRAMES, 0.5 * len(rows)):
         return None
@@ -232,13 +225,13 @@ def _contacts(
     gain = inverse @ A.T * kept
     azimuth = np.unwrap(np.arctan2(arm[:, 1], arm[:, 0])[kept])
     independent = np.clip(PLACES * np.ptp(azimuth) / (2 * np.pi), 1.0, PLACES)
-    covariance = inverse * (noise + repeats * max(kept.sum() / independent, 1.0))
+    parts = [slice(first, first + _AT_ONCE) for first in range(0, len(rows), _AT_ONCE)]
     gap_by_rig = [np.einsum("ni,nij->nj", by_pose[part], fits.sensitivity[rows[part]]) for part in parts]
-    by_rig = -gain @ np.concatenate(gap_by_rig)
     sine = np.sqrt(np.maximum(1.0 - (R[:, :, 2] @ normal) ** 2, 0.0))
-    by_radius = gain @ sine * radius_tolerance(disc)
-    by_thickness = gain @ R[:, 2, 2] * 0.5 * thickness_tolerance(disc)
-    return plane, middle, by_rig, covariance, by_radius, by_thickness, gain @ gap_by_place, spread, int(kept.sum())
+    by_disc = gain @ np.stack([sine * radius_tolerance(disc), R[:, 2, 2] * 0.5 * thickness_tolerance(disc)], axis=1)
+    covariance = inverse * (noise + repeats * max(kept.sum() / independent, 1.0))
+    by_rig = -gain @ np.concatenate(gap_by_rig)
+    return plane, middle, by_rig, covariance, by_disc, gain @ gap_by_place, spread, int(kept.sum())
 
 
 def _contact(R: Array, t: Array, disc: Disc, normal: Array) -> tuple[Array, Array]:
@@ -252,12 +245,12 @@ def _contact(R: Array, t: Array, disc: Disc, normal: Array) -> tuple[Array, Arra
 
 
 def _on_plane(
-    fits: PoseFits, systematic: Array, rig: StereoRig, plane: Array, middle: Array
+    fits: PoseFits, systematic: Array, rig: StereoRig, table: TableFromDisc
 ) -> tuple[PoseFits, Array, StereoRig]:
-    """Everything in the axes of a world whose table is the plane; the origin moves along k alone."""
-    height, a, b = plane
+    """Everything in the axes of a world moved onto the table; the origin moves along k alone."""
+    height, a, b = table.applied
     Q = frames.rotation_from_vector(np.array([b, -a, 0.0]))  # R_old_new
-    shift = np.array([0.0, 0.0, height - plane[1:] @ middle])
+    shift = np.array([0.0, 0.0, height - table.applied[1:] @ table.middle])
     both = np.zeros((6, 6))
     both[:3, :3] = both[3:, 3:] = Q.T
     for first in range(0, len(systematic), _AT_ONCE):  # in place: of a long recording these are the largest arrays

@@ -7,7 +7,7 @@ import pytest
 
 from disctrack import frames
 from disctrack.disc import MA_2014, disc_from_mm, has_mirror_axis, symmetry_order
-from disctrack.track.dots.acquisition import _median, acquire, acquire_from_blobs, dot_blobs
+from disctrack.track.dots.acquisition import acquire, acquire_from_blobs, dot_blobs
 from disctrack.track.pose import marker_pixels
 
 
@@ -103,9 +103,3 @@ def test_layouts_that_look_the_same_in_a_mirror_are_recognised():
         turned[0, :2] *= 0.7
         assert not has_mirror_axis(replace(MA_2014, marker_centres_body=turned))
     assert not has_mirror_axis(disc_from_mm(37.5, 6, 200, rng.uniform(-25, 25, (6, 2)), 7))
-
-
-@pytest.mark.parametrize("shape", [(1, 1), (1, 2), (7, 9), (64, 48)])
-def test_the_median_is_numpys_to_the_last_bit(rng, shape):
-    values = rng.normal(size=shape).astype(np.float32)
-    assert _median(values) == float(np.median(values))

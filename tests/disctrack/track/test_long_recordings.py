@@ -5,10 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.testing import assert_array_equal
 
 from disctrack import frames
-from disctrack.recording.readers.blocks import iter_pair_blocks
 from disctrack.track.dots.template import NoiseModel, dot_centres
 from disctrack.track.follow.following import Follower, Law, TrackingSetup
 from disctrack.track.follow.tracking import MOST_STRETCHES, stretch_edges
@@ -31,38 +29,6 @@ def test_stretches_follow_from_the_length_alone_and_cover_it(rendered_pairs, n, 
 def test_dots_that_leave_phi_open_are_followed_in_one_stretch(rendered_pairs):
     four = replace(rendered_pairs.disc, marker_centres_body=rendered_pairs.disc.marker_centres_body[[0, 1, 3, 4]])
     assert len(stretch_edges(range(5000), four)) == 2
-
-
-class Counted:
-    """A reader whose frame i is full of i."""
-
-    timestamps, notes, random_access, bit_depth, image_size = None, (), True, 8, (4, 3)
-
-    def __len__(self):
-        return 100
-
-    def describe(self, index):
-        return f"frame {index}"
-
-    def read(self, index, out=None):
-        out[...] = index
-        return out
-
-    def content_sha256(self, start, stop):
-        return ""
-
-
-def test_blocks_begin_at_the_breaks_and_hold_every_frame_once():
-    seen = []
-    for block in iter_pair_blocks(Counted(), Counted(), 5, 93, block=16, threads=2, breaks=[0, 40, 41, 80, 99]):
-        assert_array_equal(block.images[:, 0, 0, 0], block.frames)
-        seen.append(block.frames.copy())
-    assert {5, 40, 41, 80} <= {int(block[0]) for block in seen}
-    assert_array_equal(np.concatenate(seen), np.arange(5, 93))
-    # the same blocks for whoever begins at a break
-    late = [b.frames.copy() for b in iter_pair_blocks(Counted(), Counted(), 41, 93, block=16, breaks=[40, 41, 80])]
-    for a, b in zip(late, seen[-len(late) :], strict=True):
-        assert_array_equal(a, b)
 
 
 def test_what_the_fit_of_all_poses_needs_beside_its_result_does_not_grow_with_their_number(rendered_pairs, monkeypatch):
