@@ -9,3 +9,8 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Array32 = NDArray[np.float32]
 Image = NDArray[np.uint8] | NDArray[np.uint16]  # one image or a stack of them, as a camera gives it
+
+
+def robust_sigma(values: NDArray[np.floating]) -> float:
+    """Standard deviation by the median absolute deviation, which a few wild values do not change."""
+    return 1.4826 * float(np.median(np.abs(values - np.median(values))))

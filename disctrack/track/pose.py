@@ -46,11 +46,9 @@ def marker_pixels(R: Array, t: Array, rig: StereoRig, centres_body: Array) -> tu
 
     R (n, 3, 3), t (n, 3): body -> world; centres_body (m, 3). NaN behind a camera.
     """
-    n, shape = len(R), (len(R), 2, len(centres_body))
-    pixels, J = np.empty((*shape, 2)), np.empty((*shape, 2, 6))
-    identity, used = np.tile(np.eye(2), (*shape, 1, 1)), np.ones(shape, bool)
-    _fit(np.arange(n), np.zeros((*shape, 2)), identity, used, rig, centres_body, -1.0, np.array(R, float),
-         np.array(t, float), np.empty(n, bool), pixels, np.empty_like(pixels), J)  # fmt: skip
+    shape = len(R), 2, len(centres_body)
+    seen = np.zeros((*shape, 2)), np.tile(np.eye(2), (*shape, 1, 1)), np.ones(shape, bool)
+    pixels, _, J = _evaluated(*seen, rig, centres_body, R, t)
     return pixels, J
 
 
@@ -61,41 +59,34 @@ def misses(
 
     Shapes as in `fit_poses`; (n, 2, m) of the last. Zeros where a dot was not seen, or where there is no pose.
     """
-    known: Mask = np.asarray(np.isfinite(markers_px).all(-1))
-    known &= np.isfinite(markers_covariance_px2).all((-1, -2))
-    posed = np.asarray(np.isfinite(R).all((1, 2)))
-    known &= (posed & np.isfinite(t).all(1))[:, None, None]
+    known = _known(markers_px, markers_covariance_px2, R, t)
     observed, covariance = np.ascontiguousarray(markers_px), np.ascontiguousarray(markers_covariance_px2)
-    pixels, residuals, J = np.empty(observed.shape), np.empty(observed.shape), np.empty((*observed.shape, 6))
-    _fit(np.arange(len(R)), observed, covariance, known, rig, centres_body, -1.0, np.array(R, float),
-         np.array(t, float), np.empty(len(R), bool), pixels, residuals, J)  # fmt: skip
+    _, residuals, J = _evaluated(observed, covariance, known, rig, centres_body, R, t)
     return residuals, J, known
 
 
-def _fit(
-    rows: NDArray[np.intp],
-    observed: Array,
-    covariance: Array,
-    used: Mask,
-    rig: StereoRig,
-    centres_body: Array,
-    tolerance: float,
-    *filled: NDArray,
-) -> None:
-    """`_pose_kernel.fit` with the rig's numbers."""
-    poses = rig.camera_poses()
-    kernel.fit(
-        rows,
-        observed,
-        covariance,
-        used,
-        np.stack([camera.parameters for camera in rig.cameras]),
-        np.stack([R for R, _ in poses]),
-        np.stack([t for _, t in poses]),
-        np.ascontiguousarray(centres_body, float),
-        tolerance,
-        *filled,
-    )
+def _known(markers_px: Array, markers_covariance_px2: Array, R: Array, t: Array) -> Mask:
+    """(n, 2, m) True for dots that were seen in frames with a pose."""
+    seen = np.asarray(np.isfinite(markers_px).all(-1) & np.isfinite(markers_covariance_px2).all((-1, -2)))
+    posed = np.asarray(np.isfinite(R).all((1, 2)) & np.isfinite(t).all(1))
+    return seen & posed[:, None, None]
+
+
+def _evaluated(
+    observed: Array, covariance: Array, used: Mask, rig: StereoRig, centres_body: Array, R: Array, t: Array
+) -> tuple[Array, Array, Array]:
+    """Pixels, whitened residuals and Jacobian as `_pose_kernel.fit` fills them, of poses that stay where they are."""
+    filled = np.empty(observed.shape), np.empty(observed.shape), np.empty((*observed.shape, 6))
+    poses = np.array(R, float), np.array(t, float), np.empty(len(R), bool)
+    centres, rows = np.ascontiguousarray(centres_body, float), np.arange(len(R))
+    kernel.fit(rows, observed, covariance, used, *stacked(rig), centres, -1.0, *poses, *filled)
+    return filled
+
+
+def stacked(rig: StereoRig) -> tuple[Array, Array, Array]:
+    """Of the cameras: INTRINSIC_PARAMETERS (2, 9), R_camera_world (2, 3, 3), t_camera_world (2, 3)."""
+    R, t = zip(*rig.camera_poses(), strict=True)
+    return np.stack([camera.parameters for camera in rig.cameras]), np.stack(R), np.stack(t)
 
 
 def whitening(covariance: Array) -> Array:
@@ -130,19 +121,19 @@ def fit_poses(
     without a start, is NaN. One camera alone is enough for a pose; its covariance tells how much worse it is.
     """
     n = len(markers_px)
-    seen = np.asarray(np.isfinite(markers_px).all(-1))
-    seen &= np.isfinite(markers_covariance_px2).all((-1, -2))
-    possible = np.asarray(np.isfinite(R_start).all((1, 2)))
-    possible &= np.isfinite(t_start).all(1)
-    used = seen & possible[:, None, None]
+    seen, used = (
+        np.asarray(np.isfinite(markers_px).all(-1)),
+        _known(markers_px, markers_covariance_px2, R_start, t_start),
+    )
     observed = np.where(seen[..., None], markers_px, 0.0)
-    weighted = np.ascontiguousarray(markers_covariance_px2, float)
+    covariance = np.ascontiguousarray(markers_covariance_px2, float)
     R, t = np.array(R_start, float, order="C"), np.array(t_start, float, order="C")
-    converged = np.zeros(n, bool)
+    good = np.zeros(n, bool)
     pixels, whitened, JW = np.full(observed.shape, np.nan), np.zeros(observed.shape), np.zeros((*observed.shape, 6))
-    rows = np.flatnonzero(possible)
+    centres, cameras, filled = np.ascontiguousarray(centres_body, float), stacked(rig), (pixels, whitened, JW)
+    rows = np.flatnonzero(np.isfinite(R).all((1, 2)) & np.isfinite(t).all(1))
     for _ in range(MAX_REJECTED + 1):
-        _fit(rows, observed, weighted, used, rig, centres_body, TOLERANCE, R, t, converged, pixels, whitened, JW)
+        kernel.fit(rows, observed, covariance, used, *cameras, centres, TOLERANCE, R, t, good, *filled)
         if not reject_outliers:
             break
         rows = _strike_worst_dot(whitened, JW, used, rows)
@@ -150,26 +141,26 @@ def fit_poses(
             break
 
     JW = JW.reshape(n, -1, 6)
-    good = (used.sum((1, 2)) >= MIN_DOTS) & converged
+    good &= used.sum((1, 2)) >= MIN_DOTS
     normal = np.swapaxes(JW[good], 1, 2) @ JW[good]
     regular = np.linalg.cond(normal, 1) < 1e16
     good[good] = regular
-    covariance = np.full((n, 6, 6), np.nan)
-    covariance[good] = np.linalg.inv(normal[regular])
-    residuals = np.where(seen[..., None], observed - pixels, np.nan)
+    pose_covariance = np.full((n, 6, 6), np.nan)
+    pose_covariance[good] = np.linalg.inv(normal[regular])
     sensitivity = np.full((n, 6, 30), np.nan)
     if with_sensitivity and good.any():
-        for block in np.array_split(np.flatnonzero(good), max(1, good.sum() // 512)):
-            _, _, d_rig = rig.project_with_jacobians(centres_body @ np.swapaxes(R[block], 1, 2) + t[block][:, None])
-            W = whitening(np.where(used[block][..., None, None], markers_covariance_px2[block], 0.0))
-            DW = (W @ d_rig).reshape(len(block), -1, 30)
-            sensitivity[block] = -covariance[block] @ (np.swapaxes(JW[block], 1, 2) @ DW)
+        W = whitening(np.where(used[..., None, None], covariance, 0.0))
+        for some in np.array_split(np.flatnonzero(good), max(1, good.sum() // 512)):
+            d_rig = rig.project_with_jacobians(centres @ np.swapaxes(R[some], 1, 2) + t[some][:, None])[2]
+            by_rig = np.swapaxes(JW[some], 1, 2) @ (W[some] @ d_rig).reshape(len(some), -1, 30)
+            sensitivity[some] = -pose_covariance[some] @ by_rig
+    residuals = np.where((seen & good[:, None, None])[..., None], observed - pixels, np.nan)
     return PoseFits(
         R_world_body=np.where(good[:, None, None], R, np.nan),
         t_world_body=np.where(good[:, None], t, np.nan),
-        covariance=covariance,
+        covariance=pose_covariance,
         sensitivity=sensitivity,
-        residuals_px=np.where(good[:, None, None, None], residuals, np.nan),
+        residuals_px=residuals,
         used=used & good[:, None, None],
         chi_square=np.where(good, np.sum(whitened**2, axis=(1, 2, 3)), np.nan),
         degrees_of_freedom=np.where(good, 2 * used.sum((1, 2)) - 6, 0),

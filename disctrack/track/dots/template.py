@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from calibration.cameras.camera import Camera, normalised_maps, project
-from calibration.kit.arrays import Array, Image
+from calibration.kit.arrays import Array, Image, robust_sigma
 from calibration.kit.grey_levels import full_scale, level_step
 from disctrack.disc import MA_2014, Disc
 from disctrack.track.dots import _kernels as kernels
@@ -177,7 +177,7 @@ def measure_noise(
     for group in (bright, ~bright):
         if group.any():
             middle = np.median(variance[group])
-            spread = 1.4826 * np.median(np.abs(variance[group] - middle)) + 1e-9 * step**2
+            spread = robust_sigma(variance[group]) + 1e-9 * step**2
             keep[group] = np.abs(variance[group] - middle) < 4 * spread
     A = np.column_stack([np.ones(keep.sum()), mean[keep]])
     # a variance with f degrees of freedom scatters by sqrt(2 / f) of itself

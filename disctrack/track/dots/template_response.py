@@ -12,7 +12,6 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from scipy.interpolate import RegularGridInterpolator
 
 from calibration.kit.arrays import Array
 from disctrack.track.dots.template import NoiseModel
@@ -52,12 +51,10 @@ def _tabulated(radius: float, affine: Array, pull: Pull, changes: Changes) -> Ar
     known = np.isfinite(size)
     if not known.any():
         return np.full((*size.shape, 1), np.nan)
-    sizes = np.linspace(size[known].min() * (1 - 1e-9), size[known].max() * (1 + 1e-9), SIZES)
-    # linear in the size and in the logarithm of the shape
-    between = RegularGridInterpolator((sizes, np.log(SHAPES)), _response(sizes, pull, changes))
-    found = np.full((*size.shape, between.values.shape[-1]), np.nan)
-    found[known] = between(np.stack([size[known], np.log(np.clip(shape[known], SHAPES[0], 1.0))], axis=-1))
-    return found
+    sizes = np.linspace(size[known].min(), size[known].max() * (1 + 1e-9), SIZES)
+    table = _response(sizes, pull, changes)
+    T = _between(table, sizes, np.where(known, size, sizes[0]), np.where(known, shape, 1.0))
+    return np.where(known[..., None], T, np.nan)
 
 
 def turned_to_axes(affine: Array) -> Array:
@@ -138,6 +135,17 @@ def _edge_smeared(band: _Band, axis: int) -> Array:
         at, squared = 2 * (vt * dgn + gt * dvn) - 2 * bend * vt * gt, 2 * vn * gn
         changes.append(band.first * at[..., None] + band.second * squared[..., None])
     return np.stack(changes)
+
+
+def _between(table: Array, sizes: Array, size: Array, shape: Array) -> Array:
+    """The table (sizes, SHAPES, k) at dots of any number: linear in the size and in the logarithm of the shape."""
+    width = max(sizes[-1] - sizes[0], 1e-9 * sizes[0])
+    x = np.clip((size - sizes[0]) / width, 0.0, 1.0) * (len(sizes) - 1)
+    y = np.clip(np.log(shape / SHAPES[0]) / np.log(SHAPES[-1] / SHAPES[0]), 0.0, 1.0) * (len(SHAPES) - 1)
+    i, j = np.minimum(x.astype(int), len(sizes) - 2), np.minimum(y.astype(int), len(SHAPES) - 2)
+    x, y = (x - i)[..., None], (y - j)[..., None]
+    low, high = ((1 - y) * table[k, j] + y * table[k, j + 1] for k in (i, i + 1))
+    return np.asarray((1 - x) * low + x * high)
 
 
 def _second_moments(affine: Array) -> tuple[Array, Array, Array]:

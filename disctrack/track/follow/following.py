@@ -29,6 +29,7 @@ from disctrack.track.dots.template import (
     typical_noise,
 )
 from disctrack.track.follow.motion_span import StillScene
+from disctrack.track.pose import stacked
 from disctrack.trajectory import FrameStatus, MarkerStatus
 
 # A pair whose dots disagree by more than this with any rigid motion is lost: a tenth of a dot, ten times a poor rig
@@ -173,14 +174,12 @@ def run(
 
     limits : a dot is refused for a misfit that exceeds them, and is unusual in this recording
     """
-    turns, shifts = zip(*setup.rig.camera_poses(), strict=True)
-    cameras = np.stack([camera.parameters for camera in setup.rig.cameras])
     limits = limits._replace(misfit=max(limits.misfit, UNUSUAL * law.misfit))
     known = Heading(*((np.array(R, order="C"), np.array(t)) for R, t in heading))  # the loop moves them on
     done = kernels.track_frames(
         images,
         readable,
-        kernels.Views(setup.maps_x, setup.maps_y, cameras, np.stack(turns), np.stack(shifts)),
+        kernels.Views(setup.maps_x, setup.maps_y, *stacked(setup.rig)),
         face_of(setup.disc),
         kernels.Expected(np.array(law.blur), np.stack([noise.parameters for noise in law.noise]), limits),
         known,

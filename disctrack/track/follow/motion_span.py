@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.kit.arrays import Array32
+from calibration.kit.arrays import Array32, robust_sigma
 from calibration.kit.grey_levels import level_step
 from disctrack.errors import RecordingError
 from disctrack.recording.readers.base import FrameReader
@@ -79,20 +79,12 @@ def _noise(mean: Array32, difference: Array32, steep: Array32) -> Array32:
     """
     flat = steep <= np.quantile(steep, 0.6)
     grey, change = mean[flat], difference[flat]
-    change = change - np.median(change)
-    edges = np.quantile(grey, np.linspace(0, 1, NOISE_BINS + 1))
-    number = np.clip(np.searchsorted(edges, grey, side="right") - 1, 0, NOISE_BINS - 1)
-    levels, variances = [], []
-    for k in range(NOISE_BINS):
-        mine = number == k
-        if np.count_nonzero(mine) >= 50:
-            levels.append(float(grey[mine].mean()))
-            variances.append((1.4826 * float(np.median(np.abs(change[mine])))) ** 2)
-    read, gain = (float(np.mean(variances)) if variances else 0.0), 0.0
-    if len(levels) > 2 and np.ptp(levels) > 1.0:
-        gain, read = np.polyfit(levels, variances, 1)
-        if gain < 0:
-            read, gain = float(np.mean(variances)), 0.0
+    alike = np.array_split(np.argsort(grey), NOISE_BINS)
+    levels = [float(grey[some].mean()) for some in alike]
+    variances = [robust_sigma(change[some]) ** 2 for some in alike]
+    gain, read = np.polyfit(levels, variances, 1) if np.ptp(levels) > 1.0 else (-1.0, 0.0)
+    if gain < 0:
+        gain, read = 0.0, float(np.mean(variances))
     return np.maximum(read + gain * mean, MIN_SIGMA**2).astype(np.float32)
 
 
@@ -126,12 +118,8 @@ def find_motion(
     worth = MIN_SAVED * frame_rate
     begin = begin if begin - start >= worth else start
     end = end if stop - end >= worth else stop
-    parts = [
-        *([f"rest in frames {start}-{begin - 1}"] if begin > start else []),
-        *([f"rest in frames {end}-{stop - 1}"] if end < stop else []),
-    ]
-    verdict = " and ".join(parts) if parts else "moves from end to end"
-    return MotionSpan(begin, end, len(looked), True, verdict)
+    rest = [f"rest in frames {a}-{b - 1}" for a, b in ((start, begin), (end, stop)) if a < b]
+    return MotionSpan(begin, end, len(looked), True, " and ".join(rest) or "moves from end to end")
 
 
 def _read(left: FrameReader, right: FrameReader, frame: int) -> Pair | None:

@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from calibration.kit.arrays import Array, Mask
+from calibration.kit.arrays import Array, Mask, robust_sigma
 from disctrack import frames
 from disctrack.disc import Disc, symmetry_order
 from disctrack.findings import MISFITS, Finding, Kind, Number, Remedy, Severity, Subject
@@ -60,7 +60,7 @@ def off_the_table(trajectory: Trajectory, severity: Severity = Severity.WARNING)
     by_tilt = disc.half_thickness * np.sin(theta) - disc.radius * np.cos(theta)
     J = np.stack([np.ones_like(psi), by_tilt * np.cos(psi), by_tilt * np.sin(psi)], axis=1)  # z, turns about x and y
     noise = np.median(np.einsum("ni,nij,nj->n", J, C[:, 2:5, 2:5], J))
-    spread = 1.4826 * np.median(np.abs(gap - np.median(gap)))
+    spread = robust_sigma(gap)
     if max(abs(np.median(gap)), np.sqrt(max(spread**2 - NOISE_ALLOWED * noise, 0.0))) <= MAX_TABLE_GAP:
         return ()
     seen = Number(1e6 * float(np.median(gap)), "um", 1e6 * float(gap.std()))

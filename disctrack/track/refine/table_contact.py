@@ -26,7 +26,7 @@ import numpy as np
 import scipy
 
 from calibration.cameras.camera import N_RIG, WORLD_SHIFT, WORLD_TURN, Allowance, StereoRig
-from calibration.kit.arrays import Array
+from calibration.kit.arrays import Array, robust_sigma
 from disctrack import frames
 from disctrack.disc import Disc
 from disctrack.track.pose import PoseFits
@@ -210,7 +210,7 @@ def _contacts(
         step = np.linalg.solve(information, A[kept].T @ gap[kept])
         plane = plane + step
         left = gap - A @ step
-        spread = float(scipy.stats.median_abs_deviation(left, scale="normal"))
+        spread = robust_sigma(left)
         kept = np.abs(left) < 4.0 * spread + 1e-9
     by_pose = np.concatenate([np.broadcast_to(normal, t.shape), np.cross(arm, normal)], axis=1)
     noise, repeats = (
