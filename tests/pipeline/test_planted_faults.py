@@ -18,8 +18,7 @@ from disctrack.findings import Kind, in_doubt, leading
 from disctrack.recording.declaration import read_recording
 from disctrack.recording.readers.blocks import PairBlock
 from disctrack.track.follow.tracking import TrackingSettings, track
-from disctrack.track.judge.moved_camera import moved_camera
-from disctrack.track.judge.wrong_declaration import unlike_declared
+from disctrack.track.judge.disc_not_seen import moved_camera, unlike_declared
 from disctrack.track.measurement import open_pairs
 from disctrack.track.refine.intrinsic_scatter import MIN_FRAMES
 from disctrack.trajectory import FrameStatus

@@ -6,7 +6,6 @@ The disc is followed through each stretch in `following`; what comes of it is pu
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from itertools import chain, islice
 from threading import Event, Lock
 
 import numpy as np
@@ -32,12 +31,11 @@ from disctrack.track.follow.following import (
     follow_block,
     run,
 )
+from disctrack.track.judge.disc_not_seen import why_not_seen
 from disctrack.track.judge.doubts import MOVED
-from disctrack.track.judge.image_arrangement import arrangement_found
-from disctrack.track.judge.moved_camera import moved_camera
-from disctrack.track.judge.wrong_declaration import unlike_declared
 from disctrack.track.pose import marker_pixels
 from disctrack.track.refine.assembly import Taken, Tracking, TrackingSettings, assemble
+from disctrack.track.side_by_side import evenly
 from disctrack.trajectory import FrameStatus
 
 SHORTEST_SPLIT = 1000  # pairs; a stretch must outweigh its own search for the disc, and measuring blur and noise
@@ -48,8 +46,7 @@ MOSTLY = 0.5  # of the frames: that many are not refused for gleams and hands
 # wrong that templates are made for: places 0.1 mm off, rms, shift centres by 0.3e-3 to 2e-3 px, in all frames alike.
 LOOK_AGAIN = 60e-6
 DECLARED = (Kind.DOTS_MISPLACED, Kind.OFF_THE_TABLE, Kind.TABLE_DISAGREES)  # of numbers, not of images
-PAIRS_TRIED = 12  # where no disc is found, for what else is wrong: some more than the refinement of a rig takes
-STUCK_FRAMES = 8  # from which the pixels are told that do not see
+PAIRS_TRIED = 12  # for pixels that do not see, and for what is wrong where no disc is found
 MAX_EDGE_TURN = np.radians(25.0)  # by which the poses on both sides of an edge may miss each other's prediction
 
 
@@ -109,7 +106,7 @@ def track(
         again = replace(setup, disc=looked_for)
         followers, tables = _followed(read_blocks, edges, again, settings, workers, progress)
         if not np.isfinite(tables.t).any():
-            raise _not_found(followers, pairs, _arrangement(read_blocks, rig, disc, pairs))
+            raise _not_found(followers, pairs, why_not_seen(_some(read_blocks, pairs), rig, disc))
         for follower in followers:
             follower.setup = setup
         tracking = assemble(followers, tables, settings, taken, workers)
@@ -127,7 +124,7 @@ def track(
     if (contradicted or far) and Kind.DROPPED_FRAMES not in kinds:  # which makes cameras contradict each other
         of_one = (status == FrameStatus.ONE_CAMERA) | (status == FrameStatus.CONTRADICTED)
         rows = np.flatnonzero(of_one | (far & (status == FrameStatus.MEASURED)))
-        arranged = _arrangement(read_blocks, rig, disc, pairs[rows[0] :]) if len(rows) else ()
+        arranged = why_not_seen(_some(read_blocks, pairs[rows[0] :]), rig, disc) if len(rows) else ()
     # in doubt only here: dots found elsewhere than declared are what the second look above is for
     doubt = {Kind.DOTS_MISPLACED: Severity.DOUBT}
     noticed = (*arranged, *tracking.findings, *stuck)
@@ -185,27 +182,11 @@ def _followed(
     return followers, tables
 
 
-def _arrangement(read_blocks: ReadBlocks, rig: StereoRig, disc: Disc, pairs: range) -> tuple[Finding, ...]:
-    """Why the disc is not seen as declared, by some of the pairs; nothing where nothing explains it.
-
-    Images are mirrored or exchanged, a camera was moved, or the dots are others.
-    """
-    chosen = dict.fromkeys(pairs[round(place * (len(pairs) - 1))] for place in np.linspace(0, 1, PAIRS_TRIED))
-    blocks = [block for pair in chosen for block in read_blocks(pair, pair + 1)]
-    images = [block.images[0] for block in blocks if block.readable.all()]
-    if not images:
-        return ()
-    few = images[:: max(1, len(images) // 2)][:2]
-    return tuple(
-        islice(
-            chain(
-                (finding for image in few for finding in arrangement_found(image, rig, disc)),
-                moved_camera(np.array(images), rig, disc),
-                (finding for image in few for finding in unlike_declared(image, rig, disc)),
-            ),
-            1,
-        )
-    )
+def _some(read_blocks: ReadBlocks, pairs: range) -> NDArray:
+    """(k, 2, height, width) images of some of the pairs, from all over them, that can be read."""
+    chosen = evenly(np.array(pairs), PAIRS_TRIED).tolist()
+    found = [block.images[block.readable.all(axis=1)].copy() for i in chosen for block in read_blocks(i, i + 1)]
+    return np.concatenate(found) if found else np.zeros((0, 2, 1, 1), np.uint8)
 
 
 def stretch_edges(pairs: range, disc: Disc) -> list[int]:
@@ -223,9 +204,7 @@ def stretch_edges(pairs: range, disc: Disc) -> list[int]:
 def _as_one_sensor(read_blocks: ReadBlocks, pairs: range) -> tuple[ReadBlocks, list[Finding]]:
     """Blocks without a colour filter's pattern and pixels that do not see, and both as findings."""
     # from all over the recording: within a millisecond a disc moves by less than a pixel, and edges look stuck, too
-    chosen = np.unique(np.linspace(pairs.start, pairs.stop - 1, STUCK_FRAMES).astype(int)) if len(pairs) else ()
-    found = [block.images[block.readable.all(1)].copy() for i in chosen for block in read_blocks(int(i), int(i) + 1)]
-    images = np.concatenate(found) if found else np.zeros((0, 2, 1, 1), np.uint8)
+    images = _some(read_blocks, pairs)
     gains = [mosaic_gains(images[:, camera]) for camera in (0, 1)]
     for camera, pattern in enumerate(gains):
         if pattern is not None:

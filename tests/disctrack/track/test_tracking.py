@@ -11,7 +11,7 @@ from disctrack import frames
 from disctrack.errors import TrackingError
 from disctrack.findings import Kind
 from disctrack.synthetic import render_disc
-from disctrack.track.follow.tracking import STUCK_FRAMES, TrackingSettings, _as_one_sensor, track
+from disctrack.track.follow.tracking import PAIRS_TRIED, TrackingSettings, _as_one_sensor, track
 from disctrack.trajectory import FrameStatus, MarkerStatus
 
 N = 60
@@ -271,7 +271,7 @@ def test_what_hardly_moves_for_a_millisecond_is_no_stuck_pixel(rng):
     images = np.full((n, 2, size, size), 200.0)
     images[np.arange(n), :, y, x + np.arange(n) // 50] = 25
     images = np.clip(np.rint(images + rng.normal(0, 1.5, images.shape)), 0, 254).astype(np.uint8)
-    assert stuck_pixels(images[:STUCK_FRAMES, 0])[y, x]  # the trap
+    assert stuck_pixels(images[:PAIRS_TRIED, 0])[y, x]  # the trap
     assert _as_one_sensor(blocks_of(images), range(n))[1] == []
     images[:, 1, 5, 5] = 255
     read, told = _as_one_sensor(blocks_of(images), range(n))

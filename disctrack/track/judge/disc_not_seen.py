@@ -1,0 +1,216 @@
+"""Why the disc is not seen as declared: images are mirrored or exchanged, a camera was moved, or the dots are others.
+
+Tried only where the dots make no sense as declared. Each way in which a camera's setup or an export program may have
+arranged the images is undone, and the disc searched for anew.
+
+Of a camera that was moved, each camera alone still sees the dots as declared. From blobs in some pairs, one pose for
+each pair and one turn and shift of the right camera for all are fitted (`self_calibration.fit_shared`): to a tenth of a
+degree and a millimetre or two, as the two make up for each other; enough to say what happened.
+
+Dots may be there, and unlike the declared ones: one camera alone numbers them, on any scale and of any size. What both
+see of a dot tells where it is in the unit of the rig, to some 0.2 mm: enough to say which declared number is wrong.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from itertools import chain, islice
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.cameras.camera import N_RIG, PAIR_SHIFT, PAIR_TURN, StereoRig, triangulate
+from calibration.kit.arrays import Array, Mask
+from disctrack.disc import Disc, has_mirror_axis
+from disctrack.findings import NONSENSE, Finding, Kind, Number, Remedy, Severity, Subject
+from disctrack.frames import CAMERAS, vector_from_rotation
+from disctrack.track.dots.acquisition import (
+    BLOB_PX,
+    EPIPOLAR_PX,
+    MIN_EXPLAINED,
+    SIDE_TOLERANCE,
+    acquire,
+    expected_diameter_px,
+    rigid_motions,
+    seen_by_one_camera,
+)
+from disctrack.track.judge.doubts import misplaced_dots
+from disctrack.track.pose import fit_poses
+from disctrack.track.refine.self_calibration import MIN_FRAMES, DotsInFrames, declared_places_kept, fit_shared
+
+Turn = Callable[[NDArray], NDArray]
+MIRRORED: dict[str, Turn] = {
+    "mirrored left to right": lambda image: image[:, ::-1],
+    "mirrored top to bottom": lambda image: image[::-1],
+    "turned by 180 deg": lambda image: image[::-1, ::-1],
+}
+TURN, SHIFT = np.radians(1.0), 2e-3  # [rad], [m] what cameras suffer without anybody's notice: prior sigmas
+MOST_SIGMAS = 4.0  # beyond, it is something else
+FITS_PX = 1.0  # rms of blobs about the fit
+BETTER = 3.0  # times, than with the camera where it was
+DOT_DIAMETERS_PX = (6.0, 18.0, 54.0, 162.0)  # the search for blobs takes those of a seventh to twice the diameter
+UNITS = {1e3: "mm and m", 1e2: "m and cm", 10.0: "cm and mm", 25.4: "inches and mm", 2.0: "radius and diameter"}
+SIZE_TOLERANCE = 0.15  # blur and threshold make a blob larger or smaller than its dot
+MISPLACED = 0.2  # of the distance between two dots: places measured with a ruler, not dots numbered wrongly
+MEETING_PX = 1.0  # beyond, cameras or clocks do not fit together, and places seen by both are none
+RIM = 64  # points of a dot's outline
+
+
+def why_not_seen(pairs: NDArray, rig: StereoRig, disc: Disc) -> tuple[Finding, ...]:
+    """What explains it first, if anything; pairs (n, 2, height, width) from all over the recording."""
+    few = pairs[:: max(1, len(pairs) // 2)][:2]
+    explained = chain(
+        (finding for pair in few for finding in arrangement_found(pair, rig, disc)),
+        moved_camera(pairs, rig, disc),
+        (finding for pair in few for finding in unlike_declared(pair, rig, disc)),
+    )
+    return tuple(islice(explained, 1))
+
+
+def arrangement_found(pair: NDArray, rig: StereoRig, disc: Disc) -> Iterator[Finding]:
+    """What was done to the images, where undoing it shows the disc.
+
+    pair : (2, height, width). All but one of the dots must be found in both cameras, and more than as declared.
+    """
+    enough = max(acquire(pair[0], pair[1], rig, disc).n_explained + 1, 2 * disc.n_markers - 2)
+    ways = list(_ways(pair, disc))
+    dots = [acquire(left, right, rig, layout).n_explained for _, left, right, layout in ways]
+    best = dots.index(max(dots))
+    if dots[best] >= enough:
+        kind = Kind.MIRRORED if best else Kind.EXCHANGED
+        remedy = Remedy("[cameras] left, right", action="store them as the views are" if best else "exchange the two")
+        yield Finding(kind, Severity.DOUBT, ways[best][0], remedies=(remedy,), explains=NONSENSE)
+
+
+def _ways(pair: NDArray, disc: Disc) -> Iterator[tuple[str, NDArray, NDArray, Disc]]:
+    """What may have been done, and the images with that undone."""
+    left, right = pair
+    yield "the left and right images are exchanged", right, left, disc
+    for what, turn in MIRRORED.items():
+        one, other = np.ascontiguousarray(turn(left)), np.ascontiguousarray(turn(right))
+        since = "since the chessboard was seen"
+        yield f"the images of both cameras are {what} {since}", one, other, disc
+        yield f"the {CAMERAS[0]} camera's images are {what} {since}", one, right, disc
+        yield f"the {CAMERAS[1]} camera's images are {what} {since}", left, other, disc
+    if not has_mirror_axis(disc):
+        seen_in_a_mirror = replace(disc, marker_centres_body=disc.marker_centres_body * [1.0, -1.0, 1.0])
+        told = (
+            "the dots are those of [markers] seen in a mirror: all images are mirrored, or y of centres_mm counts down"
+        )
+        yield told, left, right, seen_in_a_mirror
+
+
+def moved_camera(pairs: NDArray, rig: StereoRig, disc: Disc) -> Iterator[Finding]:
+    """How the right camera moved against the left one, where that explains what is seen.
+
+    pairs : (n, 2, height, width), from all over the recording; fewer than MIN_FRAMES with dots tell nothing
+    """
+    diameters = expected_diameter_px(rig, disc)
+    seen = [[seen_by_one_camera(pair[c], c, diameters[c], rig, disc) for c in (0, 1)] for pair in pairs]
+    pixels = np.array([[side[0][:, :2] for side in pair] for pair in seen]).reshape(-1, 2, disc.n_markers, 2)
+    good = np.isfinite(pixels).all(-1).sum(axis=2).min(axis=1, initial=disc.n_markers) >= MIN_EXPLAINED
+    if good.sum() < MIN_FRAMES:
+        return
+    pixels = pixels[good]
+    R, t = (np.array([pair[0][k] for pair in seen])[good] for k in (1, 2))
+    covariance = np.broadcast_to(BLOB_PX**2 * np.eye(2), (*pixels.shape, 2))
+    left_alone = np.where(np.arange(2)[:, None, None] == 0, pixels, np.nan)
+    began = fit_poses(
+        left_alone, covariance, rig, disc.marker_centres_body, R, t, reject_outliers=False, with_sensitivity=False
+    )
+    free = np.zeros(N_RIG + 2 * disc.n_markers, bool)
+    free[PAIR_TURN] = free[PAIR_SHIFT] = True
+    information = np.diag(np.repeat([TURN**-2, SHIFT**-2], 3))
+    dots = DotsInFrames(rig, disc, pixels, covariance, began.R_world_body, began.t_world_body)
+    found = fit_shared(dots, free, information)
+    rms = BLOB_PX * np.sqrt(found.reduced_chi_square)
+    moved = rig.perturbed(found.shift[:N_RIG])
+    turn = np.linalg.norm(vector_from_rotation(moved.R_right_left @ rig.R_right_left.T))
+    shift = np.linalg.norm(moved.t_right_left - rig.t_right_left)
+    if rms[-1] < FITS_PX and rms[0] > BETTER * rms[-1] and max(turn / TURN, shift / SHIFT) < MOST_SIGMAS:
+        text = (
+            f"the right camera was turned by about {np.degrees(turn):.1f} deg and shifted by {1e3 * shift:.0f} mm "
+            f"against the left one since the calibration (what both see of the dots fits to {rms[-1]:.1f} px then, to "
+            f"{rms[0]:.1f} as calibrated)"
+        )
+        sizes = {"turn": Number(float(np.degrees(turn)), "deg"), "shift": Number(1e3 * float(shift), "mm")}
+        advice = (Remedy(action="calibrate again"),)
+        yield Finding(Kind.CAMERA_MOVED, Severity.DOUBT, text, Subject("track", "right"), sizes, advice, NONSENSE)
+
+
+@dataclass(frozen=True)
+class SeenDots:
+    """Dots that both cameras number alike."""
+
+    which: Mask  # (m,) of the declared dots; k of them
+    points: Array  # (k, 3) [m] in the rig's world and unit
+    areas: Array  # (2, k) [px^2] of their blobs
+    scale: float  # their distances over those declared
+    misfit_px: float  # largest, of the blobs against one point in space
+
+
+def unlike_declared(pair: NDArray, rig: StereoRig, disc: Disc) -> tuple[Finding, ...]:
+    """Which declared number makes no sense, and what it should be, where that is seen.
+
+    pair : (2, height, width), images of the left and the right camera
+    """
+    several = list(_seen_dots(pair, rig, disc))
+    if not several:
+        return ()
+    seen = max(several, key=lambda found: found.which.sum())
+    if abs(np.log(seen.scale)) > SIDE_TOLERANCE:
+        return (_on_another_scale(seen.scale),)
+    (R,), (t,) = rigid_motions(disc.marker_centres_body[None, seen.which], seen.points[None])
+    # by the middle one of the searches: one for blobs far smaller than the dots finds what is darkest in them
+    sizes = [np.median(np.sqrt(found.areas / _areas(found, R, rig, disc))) for found in several]
+    diameter = disc.marker_diameter * float(np.median(sizes))
+    if abs(np.log(diameter / disc.marker_diameter)) > SIZE_TOLERANCE:
+        remedy = Remedy("[markers] diameter_mm", f"{1e3 * diameter:.2g}", f"{1e3 * disc.marker_diameter:g}")
+        text = "the dots' images are of another size"
+        return (Finding(Kind.DIAMETER, Severity.DOUBT, text, remedies=(remedy,), explains=NONSENSE),)
+    if not seen.which.all() or seen.misfit_px > MEETING_PX:
+        return ()
+    shift = (seen.points - t) @ R - disc.marker_centres_body
+    return misplaced_dots(disc, disc.marker_centres_body + declared_places_kept(disc, shift[:, :2]))
+
+
+def _seen_dots(pair: NDArray, rig: StereoRig, disc: Disc) -> Iterator[SeenDots]:
+    """By the searches for blobs of several sizes, as far as they find dots."""
+    for diameter in DOT_DIAMETERS_PX:
+        blobs = np.stack([seen_by_one_camera(pair[camera], camera, diameter, rig, disc)[0] for camera in (0, 1)])
+        which: Mask = np.asarray(np.isfinite(blobs).all((0, 2)))
+        if which.sum() < MIN_EXPLAINED:
+            continue
+        pixels = blobs[:, which, :2]
+        points = triangulate(pixels, rig)
+        one, other = np.triu_indices(which.sum(), 1)
+        ratios = _distances(points, one, other) / _distances(disc.marker_centres_body[which], one, other)
+        scale = float(np.median(ratios))
+        misfit = float(np.abs(rig.project(points) - pixels).max())
+        if misfit < EPIPOLAR_PX and scale > 0 and np.abs(ratios / scale - 1).max() < MISPLACED:
+            yield SeenDots(which, points, blobs[:, which, 2], scale, misfit)
+
+
+def _distances(points: Array, one: NDArray[np.intp], other: NDArray[np.intp]) -> Array:
+    return np.asarray(np.linalg.norm(points[one] - points[other], axis=-1))
+
+
+def _areas(seen: SeenDots, R: Array, rig: StereoRig, disc: Disc) -> Array:
+    """(2, k) [px^2] of the images of dots of the declared diameter."""
+    angle = np.linspace(0, 2 * np.pi, RIM, endpoint=False)
+    rim = 0.5 * disc.marker_diameter * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=-1) @ R.T
+    x, y = np.moveaxis(rig.project(seen.points[:, None] + rim).swapaxes(0, 1), -1, 0)
+    return np.asarray(0.5 * np.abs(np.sum(x * np.roll(y, -1, axis=-1) - y * np.roll(x, -1, axis=-1), axis=-1)))
+
+
+def _on_another_scale(scale: float) -> Finding:
+    mixed = ""
+    for unit, words in UNITS.items():
+        if abs(abs(np.log(scale)) / np.log(unit) - 1) < 0.02:
+            scale, mixed = unit ** np.sign(np.log(scale)), f": are {words} mixed up?"
+            break
+    disc, board = (f"times {float(f'{factor:.3g}'):g}" for factor in (scale, 1 / scale))
+    keys = "[calibration] square_mm", "every length of [disc] and [markers]"
+    remedies = Remedy(keys[0], action=board), Remedy(keys[1], action=disc)
+    text = f"the dots are {scale:.3g} times as far apart as declared{mixed}"
+    found = {"scale": Number(scale)}
+    return Finding(Kind.LENGTHS, Severity.DOUBT, text, numbers=found, remedies=remedies, explains=NONSENSE)
