@@ -158,7 +158,9 @@ def measure(
     span = _span(pairs, rate, settings, threads)
     progress(len(pairs) - (span.stop - span.start))
     tracked = range(span.start, span.stop)
-    workers = _workers(pairs, len(stretch_edges(tracked, recording.disc)) - 1, threads)
+    workers = 1  # stretches that are followed side by side: one per core, where frames can be read anywhere
+    if pairs.left.random_access and pairs.right.random_access:
+        workers = max(1, min(threads or default_threads(), len(stretch_edges(tracked, recording.disc)) - 1))
     readers = max(1, (threads or default_threads()) // workers)  # each worker has its own three blocks
 
     def read_blocks(start: int, stop: int) -> Iterator[PairBlock]:
@@ -256,13 +258,6 @@ def _exposures(recording: Recording, pairs: ImagePairs) -> tuple[tuple[float, fl
     if left is None or right is None:
         return None, ()
     return (left, right), (f"exposure {1e6 * left:g} and {1e6 * right:g} us (left, right) as the cameras' headers say",)
-
-
-def _workers(pairs: ImagePairs, stretches: int, threads: int | None) -> int:
-    """Stretches of the recording that are followed side by side: one per core, where frames can be read anywhere."""
-    if not (pairs.left.random_access and pairs.right.random_access):
-        return 1
-    return max(1, min(threads or default_threads(), stretches))
 
 
 def _span(pairs: ImagePairs, frame_rate: float, settings: TrackingSettings, threads: int | None) -> MotionSpan:

@@ -148,19 +148,17 @@ def fit_poses(
     pose_covariance = np.full((n, 6, 6), np.nan)
     pose_covariance[good] = np.linalg.inv(normal[regular])
     sensitivity = np.full((n, 6, 30), np.nan)
-    if with_sensitivity and good.any():
-        W = whitening(np.where(used[..., None, None], covariance, 0.0))
-        for some in np.array_split(np.flatnonzero(good), max(1, good.sum() // 512)):
-            d_rig = rig.project_with_jacobians(centres @ np.swapaxes(R[some], 1, 2) + t[some][:, None])[2]
-            by_rig = np.swapaxes(JW[some], 1, 2) @ (W[some] @ d_rig).reshape(len(some), -1, 30)
-            sensitivity[some] = -pose_covariance[some] @ by_rig
-    residuals = np.where((seen & good[:, None, None])[..., None], observed - pixels, np.nan)
+    W = whitening(np.where(used[..., None, None], covariance, 0.0))
+    for some in np.array_split(np.flatnonzero(good), good.sum() // 512 + 1) if with_sensitivity else ():
+        d_rig = rig.project_with_jacobians(centres @ np.swapaxes(R[some], 1, 2) + t[some][:, None])[2]
+        by_rig = np.swapaxes(JW[some], 1, 2) @ (W[some] @ d_rig).reshape(len(some), -1, 30)
+        sensitivity[some] = -pose_covariance[some] @ by_rig
     return PoseFits(
         R_world_body=np.where(good[:, None, None], R, np.nan),
         t_world_body=np.where(good[:, None], t, np.nan),
         covariance=pose_covariance,
         sensitivity=sensitivity,
-        residuals_px=residuals,
+        residuals_px=np.where((seen & good[:, None, None])[..., None], observed - pixels, np.nan),
         used=used & good[:, None, None],
         chi_square=np.where(good, np.sum(whitened**2, axis=(1, 2, 3)), np.nan),
         degrees_of_freedom=np.where(good, 2 * used.sum((1, 2)) - 6, 0),

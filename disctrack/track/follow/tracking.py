@@ -116,19 +116,27 @@ def track(
     found = tracking.trajectory.disc
     if np.abs(found.marker_centres_body - disc.marker_centres_body).max() > LOOK_AGAIN and not faulty:
         tracking, faulty = measured(found, lambda n: None)
-    kinds = {finding.kind for finding in tracking.findings}
-    status = tracking.trajectory.frame_status
-    contradicted = Kind.ONE_SIDED in kinds or np.mean(status == FrameStatus.CONTRADICTED) > MOSTLY
-    far = faulty and max(tracking.systematic_px) > FAR_PX
-    arranged: tuple[Finding, ...] = ()
-    if (contradicted or far) and Kind.DROPPED_FRAMES not in kinds:  # which makes cameras contradict each other
-        of_one = (status == FrameStatus.ONE_CAMERA) | (status == FrameStatus.CONTRADICTED)
-        rows = np.flatnonzero(of_one | (far & (status == FrameStatus.MEASURED)))
-        arranged = why_not_seen(_some(read_blocks, pairs[rows[0] :]), rig, disc) if len(rows) else ()
+    arranged = why_not_seen(_senseless(tracking, faulty, read_blocks, pairs), rig, disc)
     # in doubt only here: dots found elsewhere than declared are what the second look above is for
     doubt = {Kind.DOTS_MISPLACED: Severity.DOUBT}
     noticed = (*arranged, *tracking.findings, *stuck)
     return replace(tracking, findings=tuple(replace(f, severity=doubt.get(f.kind, f.severity)) for f in noticed))
+
+
+def _senseless(tracking: Tracking, faulty: bool, read_blocks: ReadBlocks, pairs: range) -> NDArray:
+    """(k, 2, height, width) images in which the dots make no sense as declared; none where they do.
+
+    faulty : the images are in doubt
+    """
+    kinds = {finding.kind for finding in tracking.findings}
+    status = tracking.trajectory.frame_status
+    contradicted = Kind.ONE_SIDED in kinds or np.mean(status == FrameStatus.CONTRADICTED) > MOSTLY
+    far = faulty and max(tracking.systematic_px) > FAR_PX
+    if not (contradicted or far) or Kind.DROPPED_FRAMES in kinds:  # which makes cameras contradict each other
+        return _some(read_blocks, pairs[:0])
+    of_one = (status == FrameStatus.ONE_CAMERA) | (status == FrameStatus.CONTRADICTED)
+    rows = np.flatnonzero(of_one | (far & (status == FrameStatus.MEASURED)))
+    return _some(read_blocks, pairs[rows[0] :] if len(rows) else pairs[:0])
 
 
 def _not_found(followers: list[Follower], pairs: range, why: tuple[Finding, ...]) -> TrackingError:

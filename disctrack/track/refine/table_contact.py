@@ -91,11 +91,6 @@ def table_from_disc(
         return fits, systematic, rig, None
     plane, middle, H, noise, by_disc, by_place, scatter, n = found
     noise = noise + by_place @ by_place.T
-    turn = rig.R_left_world
-    M = np.zeros((N_RIG, 3))  # d RIG_PARAMETERS / d plane: the world is moved onto it
-    M[WORLD_TURN] = turn @ np.array([[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [0.0, 0.0, 0.0]])
-    M[WORLD_SHIFT] = turn[:, 2:] * np.array([1.0, *-middle])
-
     # a thicker disc lifts the centre between its faces by half of what it lifts the dots by, which are measured
     by_thickness = by_disc[:, 1]
     by_disc = by_disc * [1.0, 2.0]
@@ -132,17 +127,28 @@ def table_from_disc(
     e3 = np.nan_to_num(fits.R_world_body[..., 2])
     systematic[:, :3, :3] += left * e3[:, :, None] * e3[:, None, :]
     if source != "board":
+        rig = _as_sure_as_both(rig, middle, gain, H, V, by_disc, by_place)
         fits, systematic, rig = _on_plane(fits, systematic, rig, told)
-        moved = M @ gain
-        kept = np.eye(N_RIG) - moved @ H
-        stated = V - 0.75 * np.outer(by_disc[:, 1], by_disc[:, 1])
-        covariance = kept @ rig.covariance @ kept.T + moved @ stated @ moved.T
-        allowances = [replace(a, shift=kept @ a.shift) for a in rig.allowances]
-        allowances.append(Allowance("the disc's radius", moved @ by_disc[:, 0]))
-        allowances.append(Allowance("the disc's thickness", moved @ by_disc[:, 1] / 2.0))
-        allowances += [Allowance(OF_PATTERN, moved @ column) for column in by_place.T if column.any()]
-        rig = replace(rig, covariance=0.5 * (covariance + covariance.T), allowances=tuple(allowances))
     return fits, systematic, rig, told
+
+
+def _as_sure_as_both(
+    rig: StereoRig, middle: Array, gain: Array, H: Array, V: Array, by_disc: Array, by_place: Array
+) -> StereoRig:
+    """The rig with covariance and allowances of a world whose table is moved by gain @ plane."""
+    turn = rig.R_left_world
+    M = np.zeros((N_RIG, 3))  # d RIG_PARAMETERS / d plane: the world is moved onto it
+    M[WORLD_TURN] = turn @ np.array([[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [0.0, 0.0, 0.0]])
+    M[WORLD_SHIFT] = turn[:, 2:] * np.array([1.0, *-middle])
+    moved = M @ gain
+    kept = np.eye(N_RIG) - moved @ H
+    stated = V - 0.75 * np.outer(by_disc[:, 1], by_disc[:, 1])
+    covariance = kept @ rig.covariance @ kept.T + moved @ stated @ moved.T
+    allowances = [replace(a, shift=kept @ a.shift) for a in rig.allowances]
+    allowances.append(Allowance("the disc's radius", moved @ by_disc[:, 0]))
+    allowances.append(Allowance("the disc's thickness", moved @ by_disc[:, 1] / 2.0))
+    allowances += [Allowance(OF_PATTERN, moved @ column) for column in by_place.T if column.any()]
+    return replace(rig, covariance=0.5 * (covariance + covariance.T), allowances=tuple(allowances))
 
 
 def radius_tolerance(disc: Disc) -> float:
