@@ -9,6 +9,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from disctrack import synthetic
+from disctrack.commands.sample import SCENE
 from disctrack.errors import OutputError, SceneError
 from disctrack.faults.keys import CameraFault, Faults, Occluder
 from disctrack.frames import vector_from_rotation
@@ -384,7 +385,7 @@ def test_missing_table_of_motion_is_named(tmp_path):
 
 
 def test_sample_clip_is_what_its_scene_renders(sample_clip):
-    scene = load_scene(sample_clip.parent / "scene.toml")
+    scene = load_scene(SCENE)
     truth = synthetic.read_truth(sample_clip.parent / "truth" / "clip.h5")
     assert (sample_clip / "recording.toml").read_text() == synthetic.recording_toml(scene)
     assert_allclose(rig_parameters(synthetic.rig_of(scene)), rig_parameters(truth.rig), rtol=1e-12)

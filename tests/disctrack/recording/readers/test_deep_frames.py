@@ -7,6 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from calibration.cameras.camera import StereoRig
+from disctrack.commands.sample import SCENE
 from disctrack.disc import Disc
 from disctrack.findings import Kind
 from disctrack.recording.readers.blocks import PairBlock
@@ -23,9 +24,9 @@ def follow(images: np.ndarray, rig: StereoRig, disc: Disc) -> Tracking:
     return track(lambda a, b: [PairBlock(np.arange(a, b), images[a:b], ())], range(len(images)), rig, disc, 1000.0)
 
 
-def dim_scene(sample_clip, light: float) -> Scene:
+def dim_scene(light: float) -> Scene:
     """The sample clip's scene by little light, with a sensor whose noise is far below a grey value of 8 bits."""
-    scene = load_scene(sample_clip.parent / "scene.toml")
+    scene = load_scene(SCENE)
     surfaces = ("paper", "dot", "rim", "side", "underside")
     return replace(
         scene,
@@ -36,9 +37,9 @@ def dim_scene(sample_clip, light: float) -> Scene:
 
 
 @pytest.fixture(scope="module")
-def dim(sample_clip):
+def dim():
     """12-bit images (N, 2, h, w) at 8 % of the light, their rig, disc and true centres (N, 3) [m]."""
-    scene = dim_scene(sample_clip, 0.08)
+    scene = dim_scene(0.08)
     q = motion_of(scene).pose(np.arange(N) / 1000.0)
     rig, disc = rig_of(scene), scene.declared_disc
     return render_disc(q, rig, disc, scene, np.random.default_rng(5)), rig, disc, q[:, :3]
