@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from calibration.board.chessboard import BoardNotFound, CornerView
-from calibration.board.corner_fit import local_axes
 from calibration.board.target import Board
 from calibration.cameras.camera import CAMERA_NAMES
 from calibration.kit.errors import CalibrationError
@@ -88,16 +87,4 @@ def _view(
             f"{where}: corner {outside[0]} at ({x:.1f}, {y:.1f}) lies outside the image of {size[0]} x {size[1]} px; "
             "are width and height, or x and y, exchanged?"
         )
-    axes = local_axes(pixels, np.ones(n, bool), board.inner_corners)
-    return CornerView(
-        image_size=image_size,
-        points=pixels,
-        covariance=np.tile(sigma**2 * np.eye(2), (n, 1, 1)),
-        accepted=np.ones(n, bool),
-        reasons=("",) * n,
-        chi_square=np.full(n, np.nan),
-        contrast=np.full(n, np.nan),
-        blur=np.full(n, np.nan),
-        spacing=float(np.median(np.linalg.norm(axes, axis=-1))),
-        noise=(float("nan"), float("nan")),
-    )
+    return CornerView(image_size, pixels, np.tile(sigma**2 * np.eye(2), (n, 1, 1)), np.ones(n, bool), ("",) * n)

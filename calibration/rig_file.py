@@ -13,7 +13,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.board.target import Board, Target, target_of
+from calibration.board.target import Target, target_of
 from calibration.cameras.camera import (
     CAMERA_NAMES,
     INTRINSIC_PARAMETERS,
@@ -33,7 +33,16 @@ from calibration.stereo import StereoCalibration
 SCHEMA = "disctrack stereo rig"
 SCHEMA_VERSION = 1
 MAX_VALUES = 50_000_000  # of one dataset: beyond, the file is not a rig whatever it says
-_READ_ERRORS = (OSError, KeyError, ValueError, TypeError, RuntimeError, AttributeError, OverflowError, IndexError)
+_READ_ERRORS = (
+    OSError,
+    LookupError,
+    ValueError,
+    TypeError,
+    RuntimeError,
+    AttributeError,
+    OverflowError,
+    CalibrationError,
+)
 
 
 class Dataset(NamedTuple):
@@ -77,6 +86,19 @@ _OF_RECORD = {
     "t_left_board": Dataset(("places", 3), "m", "corner 0 in left camera axes, per place"),
     "kept": Dataset(("seen",), "1", "1 where the corner was used", "u"),
     "residuals": Dataset(("seen", 2), "px", "located minus predicted corner"),
+}
+_BEYOND_MODEL = {
+    "allowances": Dataset(
+        ("causes", N_RIG),
+        "px, 1, rad, m",
+        "parts of the covariance that no image tells, one row for one standard deviation of each cause",
+    ),
+    "lens_field": Dataset(
+        (2, 2, "rows", "columns"),
+        "px",
+        "coefficients of cubic B-splines (camera, axis, y, x): displacement of image points beyond the polynomial",
+    ),
+    "lens_field_spacing": Dataset((), "px", "of the splines' grid"),
 }
 _AS_JSON = ("settings", "figures", "versions", "warnings", "view_names", "rejected_views")
 
@@ -205,11 +227,11 @@ def write_rig(path: str | os.PathLike[str], content: StereoRig | StereoCalibrati
         raise RigFileError(f"{path}: the rig cannot be written ({error}): no such folder, or no room in it") from error
 
 
-def _put(group: h5py.Group, name: str, value: Any, units: str, description: str) -> None:
-    data = np.asarray(value)
+def _put(group: h5py.Group, name: str, value: Any, row: Dataset) -> None:
+    data = np.asarray(value, np.uint8 if row.kind == "u" else None)
     options = {"compression": "gzip", "shuffle": True, "fletcher32": True} if data.size > 1000 else {}
     dataset = group.create_dataset(name, data=data, **options)
-    dataset.attrs.update(units=units, description=description)
+    dataset.attrs.update(units=row.units, description=row.description)
 
 
 def write_rig_group(group: h5py.Group, rig: StereoRig) -> None:
@@ -218,33 +240,29 @@ def write_rig_group(group: h5py.Group, rig: StereoRig) -> None:
     group.attrs["world_is_table"] = int(rig.world_is_table)
     for name, camera in zip(CAMERA_NAMES, rig.cameras, strict=True):
         for (what, row), value in zip(_OF_CAMERA.items(), (camera.parameters, camera.image_size), strict=True):
-            _put(group, f"{name}_{what}", value, row.units, f"{name} camera: {row.description}")
+            _put(group, f"{name}_{what}", value, row._replace(description=f"{name} camera: {row.description}"))
     for name, row in _OF_RIG.items():
-        _put(group, name, getattr(rig, name), row.units, row.description)
+        _put(group, name, getattr(rig, name), row)
     group["covariance"].attrs["parameters"] = ", ".join(RIG_PARAMETERS)
-    for name, (values, units, told, attributes) in beyond_model(rig).items():
-        _put(group, name, values, units, told)
+    for name, (values, row, attributes) in beyond_model(rig).items():
+        _put(group, name, values, row)
         group[name].attrs.update(attributes)
 
 
-def beyond_model(rig: StereoRig) -> dict[str, tuple[Any, str, str, dict[str, str]]]:
-    """What a rig may have beside cameras and places: by name of the dataset its values, units, meaning, attributes.
+def beyond_model(rig: StereoRig) -> dict[str, tuple[Any, Dataset, dict[str, str]]]:
+    """What a rig may have beside cameras and places: by name of the dataset its values, what they are, attributes.
 
     `read_beyond_model` reads it from any group.
     """
-    found: dict[str, tuple[Any, str, str, dict[str, str]]] = {}
+    values: dict[str, Any] = {}
+    marks: dict[str, dict[str, str]] = {}
     if rig.allowances:
-        told = "parts of the covariance that no image tells, one row for one standard deviation of each cause"
-        marks = {"causes": [a.cause for a in rig.allowances], "assumed": [a.assumed for a in rig.allowances]}
-        shifts = np.stack([a.shift for a in rig.allowances])
-        found["allowances"] = shifts, "px, 1, rad, m", told, {name: json.dumps(mark) for name, mark in marks.items()}
+        values["allowances"] = np.stack([a.shift for a in rig.allowances])
+        causes, assumed = [a.cause for a in rig.allowances], [a.assumed for a in rig.allowances]
+        marks["allowances"] = {"causes": json.dumps(causes), "assumed": json.dumps(assumed)}
     if rig.lens_field is not None:
-        told = (
-            "coefficients of cubic B-splines (camera, axis, y, x): displacement of image points beyond the polynomial"
-        )
-        found["lens_field"] = rig.lens_field.coefficients, "px", told, {}
-        found["lens_field_spacing"] = rig.lens_field.spacing, "px", "of the splines' grid", {}
-    return found
+        values |= {"lens_field": rig.lens_field.coefficients, "lens_field_spacing": rig.lens_field.spacing}
+    return {name: (value, _BEYOND_MODEL[name], marks.get(name, {})) for name, value in values.items()}
 
 
 def write_attributes(group: h5py.Group, document: Mapping[str, Any]) -> None:
@@ -283,8 +301,7 @@ def _write_record(group: h5py.Group, record: CalibrationRecord) -> None:
     seen = (o.view, o.camera, o.point, o.pixels, o.covariance)
     values = {name: getattr(record, name) for name in _OF_RECORD} | dict(zip(_OF_OBSERVATIONS, seen, strict=True))
     for name, row in (_OF_RECORD | _OF_OBSERVATIONS).items():
-        value = np.asarray(values[name])
-        _put(group, name, value.astype(np.uint8) if row.kind == "u" else value, row.units, row.description)
+        _put(group, name, values[name], row)
 
 
 # --- reading ---------------------------------------------------------------------------------------------------------
@@ -365,69 +382,45 @@ def read_rig_group(group: h5py.Group) -> StereoRig:
 
 def read_beyond_model(group: h5py.Group) -> dict[str, Any]:
     """`lens_field` and `allowances` of a rig, as `beyond_model` names them. Raises RigFileError."""
-    return {
-        "lens_field": _lens_field(group) if "lens_field" in group else None,
-        "allowances": _allowances(group) if "allowances" in group else (),
-    }
-
-
-def _allowances(group: h5py.Group) -> tuple[Allowance, ...]:
-    shifts = _get(group, "allowances", Dataset(("causes", N_RIG)))
-    causes, assumed = (json.loads(group["allowances"].attrs[name]) for name in ("causes", "assumed"))
-    if not len(shifts) == len(causes) == len(assumed) <= N_RIG:
-        raise RigFileError(f"{group.name}/allowances: {len(shifts)} rows, {len(causes)} causes, {len(assumed)} marks")
-    return tuple(Allowance(str(c), s, bool(a)) for c, s, a in zip(causes, shifts, assumed, strict=True))
-
-
-def _lens_field(group: h5py.Group) -> LensField:
-    coefficients = _get(group, "lens_field", Dataset((2, 2, "rows", "columns")))
-    spacing = float(_get(group, "lens_field_spacing", Dataset(())))
-    if min(coefficients.shape[2:]) < 4 or not spacing > 0:
-        raise RigFileError(f"{group.name}/lens_field of shape {coefficients.shape}, spacing {spacing} is not a field")
-    return LensField(coefficients, spacing)
-
-
-def _board(group: h5py.Group) -> Target:
-    if "board" in group:
-        try:
-            return target_of(json.loads(group["board"].asstr()[()]))
-        except CalibrationError as error:
-            raise RigFileError(f"{group.name}: {error}") from error
-    counts = _get(group, "inner_corners", Dataset((2,), kind="iu"))  # files that knew chessboards only
-    return Board((int(counts[0]), int(counts[1])), float(_get(group, "square", Dataset(()))))
+    values = {name: _get(group, name, row) for name, row in _BEYOND_MODEL.items() if name in group}
+    field: LensField | None = None
+    allowances: tuple[Allowance, ...] = ()
+    if "lens_field" in values:
+        field = LensField(values["lens_field"], float(values["lens_field_spacing"]))
+        if min(field.coefficients.shape[2:]) < 4 or not field.spacing > 0:
+            raise RigFileError(f"{group.name}/lens_field is not a field of splines")
+    if "allowances" in values:
+        causes, assumed = (json.loads(group["allowances"].attrs[name]) for name in ("causes", "assumed"))
+        allowances = tuple(map(Allowance, causes, values["allowances"], assumed))
+        if not len(allowances) == len(values["allowances"]) == len(causes):
+            raise RigFileError(f"{group.name}/allowances: rows and causes do not match")
+    return {"lens_field": field, "allowances": allowances}
 
 
 def _read_record(group: h5py.Group) -> CalibrationRecord:
-    texts = {name: json.loads(group.attrs[name]) for name in _AS_JSON}
-    board, apart = _board(group), json.loads(group.attrs.get("apart", "[]"))
+    known: dict[str, Any] = {name: json.loads(group.attrs[name]) for name in _AS_JSON}
+    rejected, board = (json.loads(group[name].asstr()[()]) for name in ("rejected_corners", "board"))
+    known |= {"board": target_of(board), "apart": tuple(json.loads(group.attrs.get("apart", "[]")))}
     sizes = {
-        "points": len(board.points),
-        "places": len(texts["view_names"]) + len(apart),
+        "points": len(known["board"].points),
+        "places": len(known["view_names"]) + len(known["apart"]),
         "seen": len(group["pixels"]),
     }
-    seen, values = (
-        {name: _get(group, name, row, sizes) for name, row in rows.items()} for rows in (_OF_OBSERVATIONS, _OF_RECORD)
-    )
+    known |= {name: _get(group, name, row, sizes) for name, row in _OF_RECORD.items()}
+    seen = {name: _get(group, name, row, sizes) for name, row in _OF_OBSERVATIONS.items()}
     for name, limit in (("view", sizes["places"]), ("camera", 2), ("point", sizes["points"])):
         index = seen[name] = seen[name].astype(np.intp)
         if len(index) and not (index.min() >= 0 and index.max() < limit):
             raise RigFileError(f"{group.name}/{name} points beyond the {limit} there are")
     table_view = int(group.attrs["table_view"])
-    rejected = json.loads(group["rejected_corners"].asstr()[()])
-    known: dict[str, Any] = texts | values
-    return CalibrationRecord(
-        **known
-        | {
-            "board": board,
-            "table_view": None if table_view < 0 else table_view,
-            "observations": Observations(*seen.values()),
-            "kept": values["kept"].astype(bool),
-            "board_thickness": float(values["board_thickness"]),
-            "unexplained_sigma": float(values["unexplained_sigma"]),
-            "view_names": tuple((str(a), str(b)) for a, b in texts["view_names"]),
-            "rejected_views": {int(v): str(reason) for v, reason in texts["rejected_views"].items()},
-            "rejected_corners": tuple((int(v), int(c), int(i), str(reason)) for v, c, i, reason in rejected),
-            "warnings": tuple(texts["warnings"]),
-            "apart": tuple(int(v) for v in apart),
-        }
-    )
+    known |= {name: float(known[name]) for name in ("board_thickness", "unexplained_sigma")}
+    known |= {
+        "table_view": None if table_view < 0 else table_view,
+        "observations": Observations(*seen.values()),
+        "kept": known["kept"].astype(bool),
+        "view_names": tuple((str(a), str(b)) for a, b in known["view_names"]),
+        "rejected_views": {int(v): str(reason) for v, reason in known["rejected_views"].items()},
+        "rejected_corners": tuple((int(v), int(c), int(i), str(reason)) for v, c, i, reason in rejected),
+        "warnings": tuple(known["warnings"]),
+    }
+    return CalibrationRecord(**known)

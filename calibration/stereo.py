@@ -13,18 +13,17 @@ from calibration.board.target import Board, Target
 from calibration.cameras.camera import CAMERA_NAMES, StereoRig
 from calibration.fit.lens_field import FieldFit
 from calibration.fit.model_choice import TermsTried
-from calibration.fit.pairing import Names, Views, count_once
+from calibration.fit.pairing import Names, Pairs, Views, count_once
 from calibration.fit.refinement import Refinement
 from calibration.fit.start import MIN_VIEWS, start_stereo
 from calibration.fit.stereo_model import BOARD_MODELS, RICHEST, Observations, Terms
 from calibration.judge.assessment import Assessment, Judged, assess, stereo_covariance
 from calibration.judge.camera_moved import camera_moved, zoomed
-from calibration.judge.pairs import LEAST_PAIRS, PairsJudged, likely_motion
+from calibration.judge.pairs import gradients_by_motion
 from calibration.judge.table_frame import rig_with_covariance
 from calibration.judge.tolerances import (
     BoardShape,
     BoardTolerances,
-    as_made,
     board_shape,
     on_the_table,
     shape_left_out,
@@ -36,7 +35,7 @@ from calibration.kit.brief import Brief
 from calibration.kit.errors import CalibrationError
 from calibration.kit.stuck_pixels import repaired_views
 from calibration.kit.threads import one_blas_thread
-from calibration.stereo_fit import Begun, FreeTerms, JointFit, fit_jointly
+from calibration.stereo_fit import JointFit, fit_jointly
 
 LEAST_SEEN = 12  # images of every point of the target, to free its place: from three pairs alone it fits their errors
 
@@ -47,7 +46,6 @@ class CalibrationSettings:
 
     distortion: str = "auto"  # all terms, with priors; or a key of stereo_model.DISTORTION_MODELS
     board: str = "auto"  # decided by held-out error; or one of stereo_model.BOARD_MODELS
-    equal_aspect: bool = False  # fx = fy
     threads: int = 2
     tolerances: BoardTolerances = field(default_factory=BoardTolerances)
 
@@ -218,20 +216,27 @@ def calibrate_from_corners(
     count_once(views, names, table_view)
     rejected, warnings = _views_not_found(views, names)
     _require_views(views, names, rejected, table_view)
-    begun, zoomed_views = _begin(views, board, names, table_view)
-    if zoomed_views:
-        for camera, v, why in zoomed_views:
-            views[camera][v] = BoardNotFound(why)
+    start, notes = _begin(views, board, names)
+    observations, cameras = _observations(views), start.model.cameras
+    wide = too_wide(observations, board.points, cameras)
+    moved = camera_moved(observations, start, table_view)
+    if moved and (lenses := zoomed(observations, moved, cameras, board.points)):
+        for camera, why in lenses.items():
+            for v in moved.others:
+                views[camera][v] = BoardNotFound(why)
         return calibrate_from_corners(*views, board, settings, table_view, board_thickness, names, progress)
     report("refining")
-    shapes, free = _free(begun.observations, board, settings)
-    fit = fit_jointly(begun, board.points, free, names, table_view, report)
-    apart = _told_apart(fit, names, bool(begun.wide), table_view)
-    _require_fitted(fit, rejected | fit.lost, apart, begun.wide, table_view)
+    seen = np.bincount(observations.point, minlength=len(board.points))
+    shapes = BOARD_MODELS if seen.min() >= LEAST_SEEN else BOARD_MODELS[:-1]  # the points tell a place each, or not
+    distortion = RICHEST if settings.distortion == "auto" else settings.distortion
+    tried = [Terms(distortion, shape) for shape in (shapes if settings.board == "auto" else (settings.board,))]
+    fit = fit_jointly(observations, start, board.points, tried, names, table_view, bool(wide), report)
+    apart = _told_apart(fit, names, bool(wide), table_view)
+    _require_fitted(fit, rejected | fit.lost, apart, wide, table_view)
     report("judging")
     rejected = dict(sorted((rejected | fit.lost).items()))
     judged, shape, shape_note = _judged(fit, board, shapes, settings, table_view, board_thickness)
-    assessment = assess(replace(judged, wide=begun.wide))
+    assessment = assess(replace(judged, wide=wide))
     return StereoCalibration(
         rig=judged.rig_with_board,
         refinement=judged.refinement,
@@ -245,51 +250,25 @@ def calibrate_from_corners(
         apart=tuple(sorted(fit.pairs.apart)),
         candidates=fit.candidates,
         assessment=assessment,
-        warnings=(*warnings, *begun.notes, *fit.notes, *apart, *shape_note, *assessment.warnings),
+        warnings=(*warnings, *notes, *fit.notes, *apart, *shape_note, *assessment.warnings),
         lens=fit.lens,
         shape=shape,
     )
 
 
-def _free(
-    observations: Observations, board: Target, settings: CalibrationSettings
-) -> tuple[tuple[str, ...], FreeTerms]:
-    """Which shapes the board's points tell, and what the fit may change."""
-    seen = np.bincount(observations.point, minlength=len(board.points))
-    shapes = BOARD_MODELS if seen.min() >= LEAST_SEEN else tuple(name for name in BOARD_MODELS if name != "free")
-    boards = shapes if settings.board == "auto" else (settings.board,)
-    distortion = RICHEST if settings.distortion == "auto" else settings.distortion
-    return shapes, FreeTerms(boards, distortion, settings.equal_aspect)
-
-
-def _begin(
-    views: Views, board: Target, names: Names, table_view: int | None
-) -> tuple[Begun, list[tuple[int, int, str]]]:
-    """What a joint fit begins with; and the images (camera, view, why) that a zoomed lens took, if any.
+def _begin(views: Views, board: Target, names: Names) -> tuple[Pairs, list[str]]:
+    """Rough cameras and poses, and what is to be said of the pairs.
 
     A board that looks the same after a turn gets one order of its corners in both cameras, in place.
     """
     sizes = tuple(next(v.image_size for v in side if isinstance(v, CornerView)) for side in views)
-    start = start_stereo(_observations(views), board.points, (sizes[0], sizes[1]), names, board.orders)
-    notes = [*start.notes]
-    if board.symmetry > 1:
-        for v, order in start.orders.items():
-            view = views[1][v]
-            views[1][v] = view.reordered(order) if isinstance(view, CornerView) else view
-        notes.append(_choice_of_origin(board))
-    observations = _observations(views)
-    wide = too_wide(observations, board.points, start.model.cameras)
-    pairs = PairsJudged(start.model, start.right_poses, {}, {}, start.left_poses)
-    # seen best by cameras that no pair has pulled yet
-    moved = camera_moved(observations, pairs, start.model, table_view)
-    lenses = zoomed(observations, moved, board.points, start.model.cameras) if moved else {}
-    if moved:
-        pairs = moved.set_apart(pairs)
-    elif len(start.right_poses) >= LEAST_PAIRS:
-        # a pose by one camera alone, from rough intrinsics, may be degrees off: refined cameras judge these pairs anew
-        pairs = replace(pairs, apart={v: "" for v in start.right_poses if not start.agrees[v]})
-    images = [(camera, v, why) for camera, why in lenses.items() for v in (moved.others if moved else ())]
-    return Begun(observations, pairs, moved, wide, tuple(notes)), images
+    start, orders, notes = start_stereo(_observations(views), board.points, (sizes[0], sizes[1]), names, board.orders)
+    if board.symmetry == 1:
+        return start, [*notes]
+    for v, order in orders.items():
+        view = views[1][v]
+        views[1][v] = view.reordered(order) if isinstance(view, CornerView) else view
+    return start, [*notes, _choice_of_origin(board)]
 
 
 def _judged(
@@ -306,9 +285,8 @@ def _judged(
     """
     inflation = max(fit.refinement.disagreement, 1.0)
     shape = board_shape(fit.refinement, board.points, inflation)
-    refinement, note = as_made(fit.refinement, board.points, shape), []
-    unseen = None if refinement.problem.motion is not None else likely_motion(refinement)
-    covariance = stereo_covariance(refinement, unseen.gradients if unseen else None)
+    refinement, note = fit.refinement, []
+    covariance = stereo_covariance(refinement, gradients_by_motion(refinement))
     if refinement.terms.board in shapes:
         left_out, sigmas = shape_left_out(refinement, board.points, shapes, inflation)
         covariance, note = covariance + left_out, [_not_as_told(settings.board, shape, sigmas)] if sigmas > 1.0 else []

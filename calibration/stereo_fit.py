@@ -1,6 +1,6 @@
 """The rounds of a joint fit of both cameras: the board's shape, which images are pairs, what moved, the lenses."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -8,35 +8,16 @@ import numpy as np
 from calibration.fit.board_motion import BoardMotion
 from calibration.fit.lens_field import FieldFit, fit_lens_field
 from calibration.fit.model_choice import TermsTried, choose_board
-from calibration.fit.pairing import Names
+from calibration.fit.pairing import Names, Pairs
 from calibration.fit.refinement import Refinement
-from calibration.fit.stereo_model import Observations
+from calibration.fit.stereo_model import Observations, Terms
 from calibration.judge.camera_moved import CameraMoved, camera_moved
-from calibration.judge.pairs import PairMotion, PairsJudged, judge_pairs, motion_between_exposures, own_places
+from calibration.judge.pairs import LEAST_PAIRS, PairMotion, judge_pairs, motion_between_exposures, own_places
 from calibration.kit.arrays import Array
 
+MOVED_CAMERA = "a camera was moved"
 REJUDGED = 2  # times that pairs are judged by the refined cameras, and these refined again
 Refined = tuple[Refinement, tuple[TermsTried, ...]]
-
-
-@dataclass(frozen=True)
-class FreeTerms:
-    """What the fit may change, and choose of."""
-
-    boards: tuple[str, ...]  # of stereo_model.BOARD_MODELS, simplest first
-    distortion: str  # key of stereo_model.DISTORTION_MODELS
-    equal_aspect: bool
-
-
-@dataclass(frozen=True)
-class Begun:
-    """What a joint fit begins with, by rough cameras."""
-
-    observations: Observations
-    pairs: PairsJudged  # as roughly judged, with the poses to start from
-    moved: CameraMoved | None
-    wide: tuple[str, ...]  # on lenses that are wider than the model, which is a reason why an image may not fit
-    notes: tuple[str, ...]  # about views that are no pairs
 
 
 @dataclass(frozen=True)
@@ -46,7 +27,7 @@ class JointFit:
     plain: Refinement  # without a field of the lenses
     lens: FieldFit | None
     candidates: tuple[TermsTried, ...]  # all that were compared
-    pairs: PairsJudged
+    pairs: Pairs
     moved: CameraMoved | None
     motion: PairMotion | None  # of the boards between the exposures
     lost: dict[int, str]  # views of which no image can be used -> reason
@@ -59,35 +40,45 @@ class JointFit:
 
 
 def fit_jointly(
-    begun: Begun,
+    observations: Observations,
+    start: Pairs,
     nominal: Array,
-    free: FreeTerms,
+    tried: Sequence[Terms],
     names: Names,
     table_view: int | None = None,
+    wide: bool = False,
     report: Callable[[str], None] = lambda _: None,
 ) -> JointFit:
     """Refine, judge the pairs by what is refined, and refine again; then see whether boards moved, or lenses bend.
 
-    names : (left, right) of every view; table_view : where a camera was moved, the cameras' places are those at it
+    start : by rough cameras; tried : terms with the board's shapes to choose of, simplest first; names : (left, right)
+    of every view; table_view : where a camera was moved, the cameras' places are those at it; wide : a lens is wider
+    than the model, which is a reason why an image may not fit
     """
-    observations, used, moved = begun.observations, begun.pairs, begun.moved
+    moved = camera_moved(observations, start, table_view)  # seen best by cameras that no pair has pulled yet
+    if moved is not None:
+        used = replace(start, apart={}).set_apart(moved.others, MOVED_CAMERA)
+    elif len(start.left_poses) >= LEAST_PAIRS:
+        used = start.set_apart([*start.apart], "")  # rough poses may be degrees off: refined cameras judge these anew
+    else:
+        used = replace(start, apart={})
 
-    def refined(by: PairsJudged, boards: tuple[str, ...], motion: BoardMotion | None = None) -> Refined:
+    def refined(by: Pairs, tried: Sequence[Terms], motion: BoardMotion | None = None) -> Refined:
         places = own_places(observations, by.model, sorted(by.apart), by.right_poses)
-        return choose_board(*places, nominal, boards, free.distortion, free.equal_aspect, report, motion)
+        return choose_board(*places, nominal, tried, report, motion)
 
-    refinement, candidates = refined(used, free.boards)
+    refinement, candidates = refined(used, tried)
     lost: dict[int, str] = {}
     notes: list[str] = []
     for _ in range(REJUDGED):
         pairs = judge_pairs(observations, refinement, sorted(used.apart), moved.others if moved else ())
-        moved = camera_moved(observations, pairs, refinement.model, table_view)
-        pairs = pairs if moved is None else moved.set_apart(pairs)
+        moved = camera_moved(observations, pairs, table_view)
+        pairs = pairs if moved is None else pairs.set_apart(moved.others, MOVED_CAMERA)
         if sorted(pairs.apart) == sorted(used.apart) and not pairs.bad_images:
             break
-        observations, used, more, texts = _without_images(observations, pairs, names, bool(begun.wide))
+        observations, used, more, texts = _without_images(observations, pairs, names, wide)
         lost, notes = lost | more, [*notes, *texts]
-        refinement, again = refined(used, (refinement.terms.board,))
+        refinement, again = refined(used, (refinement.terms,))
         candidates = (*candidates, *again)
     report("trying a field of the lenses")
     motion, lens = motion_between_exposures(refinement), fit_lens_field(refinement, nominal)
@@ -99,15 +90,15 @@ def fit_jointly(
         likely = motion.is_seen
     if motion is not None and likely:
         report("pairs that were not synchronised: with a motion of the board between the exposures")
-        refinement, again = refined(used, free.boards, motion.as_random(nominal))
+        refinement, again = refined(used, tried, motion.size)
         candidates = (*candidates, *again)
         lens = fit_lens_field(refinement, nominal)
     return JointFit(refinement, lens, candidates, pairs, moved, motion, lost, tuple(notes))
 
 
 def _without_images(
-    observations: Observations, pairs: PairsJudged, names: Names, wide: bool
-) -> tuple[Observations, PairsJudged, dict[int, str], list[str]]:
+    observations: Observations, pairs: Pairs, names: Names, wide: bool
+) -> tuple[Observations, Pairs, dict[int, str], list[str]]:
     """Leave out images that do not even fit alone; views of which nothing is left, and warnings about the others."""
     by_right, rejected, warnings = {}, {}, []
     or_else = ", or the board lies too far out for the model of this lens" if wide else ""

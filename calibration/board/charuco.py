@@ -3,14 +3,17 @@
 The board may be partly out of view or covered, or printed as a negative: every marker says where it belongs.
 """
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.board.chessboard import SEARCH_SIZE, BoardNotFound, as_8_bit, grey_values, in_file_units
+from calibration.board.chessboard import SEARCH_SIZE, BoardNotFound, as_8_bit, grey_values
 from calibration.board.corner_fit import CornerView, fit_view
+from calibration.board.corner_grid import smooth_grid
 from calibration.board.target import LEAST_POINTS, CharucoBoard
-from calibration.kit.arrays import Array, Mask
+from calibration.kit.arrays import Array
 from calibration.kit.errors import CalibrationError
 from calibration.kit.grey_levels import level_step
 
@@ -35,7 +38,9 @@ def find_charuco(image: NDArray, board: CharucoBoard) -> CornerView | BoardNotFo
             f"{len(ids)} corners of {board} found, at least {LEAST_POINTS} are needed: is it sharp and lit, and are "
             "squares, dictionary, square_mm and marker_mm those of the print?"
         )
-    rough, seen = _whole_grid(corners, ids, board)
+    rough, seen = np.zeros((columns * rows, 2)), np.zeros(columns * rows, bool)
+    rough[ids], seen[ids] = corners, True
+    rough = np.where(seen[:, None], rough, smooth_grid(rough, (columns, rows), seen)[0])
     plain = 0.5 * (1.0 - board.marker / board.square)
     view = fit_view(np.ascontiguousarray(values, np.float64), rough, (columns, rows), seen, plain)
     if view.accepted.sum() < LEAST_POINTS:
@@ -43,7 +48,7 @@ def find_charuco(image: NDArray, board: CharucoBoard) -> CornerView | BoardNotFo
             f"only {view.accepted.sum()} of the {seen.sum()} corners of {board} in view lie on a regular grid: is the "
             "board bent, and is marker_mm the side of the markers?"
         )
-    return in_file_units(view, step, notes)
+    return replace(view, notes=notes)
 
 
 def _detected(grey: NDArray[np.uint8], board: CharucoBoard) -> tuple[Array, NDArray[np.intp]]:
@@ -66,17 +71,3 @@ def _detected(grey: NDArray[np.uint8], board: CharucoBoard) -> tuple[Array, NDAr
         if ids is not None and found is not None and len(ids) > len(best[1]):
             best = np.asarray(found, float).reshape(-1, 2), np.asarray(ids, np.intp).ravel()
     return (best[0] + 0.5) / scale - 0.5, best[1]
-
-
-def _whole_grid(corners: Array, ids: NDArray[np.intp], board: CharucoBoard) -> tuple[Array, Mask]:
-    """Places (n, 2) [px] of all corners, those not seen by the homography of the others; which were seen (n,)."""
-    columns, rows = board.inner_corners
-    j, i = np.divmod(np.arange(columns * rows), columns)
-    grid = np.stack([i, j], axis=-1).astype(float)
-    H, _ = cv2.findHomography(grid[ids], corners)
-    image = np.column_stack([grid, np.ones(len(grid))]) @ np.asarray(H, float).T
-    rough: Array = image[:, :2] / image[:, 2:]
-    rough[ids] = corners
-    seen = np.zeros(len(grid), bool)
-    seen[ids] = True
-    return rough, seen

@@ -9,7 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.board.corner_fit import CornerView, fit_view, local_axes
+from calibration.board.corner_fit import CornerView, fit_view
+from calibration.board.corner_grid import local_axes
 from calibration.board.target import board_orders
 from calibration.kit.arrays import Array
 from calibration.kit.grey_levels import level_step
@@ -68,7 +69,7 @@ def find_corners(image: NDArray, inner_corners: tuple[int, int], thorough: bool 
             "and the counts must be those of the INNER corners"
         )
     view = _view_at(start, np.ascontiguousarray(grey, dtype=np.float64), inner_corners)
-    return view if isinstance(view, BoardNotFound) else in_file_units(view, step, notes)
+    return view if isinstance(view, BoardNotFound) else replace(view, notes=notes)
 
 
 def board_in(grey: NDArray, thorough: bool = False) -> tuple[int, int] | None:
@@ -106,12 +107,6 @@ def _view_at(start: Array, values: Array, inner_corners: tuple[int, int]) -> Cor
     return BoardNotFound(beyond) if beyond else view
 
 
-def in_file_units(view: CornerView, step: int, notes: tuple[str, ...]) -> CornerView:
-    """A view of an image that was divided by the step of its grey values, in the grey values of the file."""
-    noise = (view.noise[0] * step**2, view.noise[1] * step)
-    return replace(view, notes=notes, contrast=view.contrast * step, noise=noise)
-
-
 def as_8_bit(grey: NDArray) -> NDArray[np.uint8]:
     """Grey values stretched to 8 bit, for the rough search only."""
     if grey.dtype == np.uint8:
@@ -127,20 +122,19 @@ def _rough_corners(grey: NDArray[np.uint8], inner_corners: tuple[int, int], thor
     scale = min(1.0, SEARCH_SIZE / max(grey.shape))
     if scale < 1.0:
         grey = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA).astype(np.uint8)
-    flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
-    grid = _all_lines(cv2.findChessboardCorners(grey, inner_corners, None, flags), inner_corners)
-    if grid is None and thorough:
-        thoroughly = cv2.findChessboardCornersSB(grey, inner_corners, None, cv2.CALIB_CB_EXHAUSTIVE)
-        grid = _all_lines(thoroughly, inner_corners)
-    if grid is None and thorough and 2 * max(grey.shape) <= SEARCH_SIZE:  # squares of 5 to 10 px need finer pixels
-        finer = cv2.resize(grey, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC).astype(np.uint8)
-        grid = _all_lines(cv2.findChessboardCorners(finer, inner_corners, None, flags), inner_corners)
+    quick, slow = cv2.findChessboardCorners, cv2.findChessboardCornersSB
+    flags, exhaustive = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE, cv2.CALIB_CB_EXHAUSTIVE
+    tried = [(quick, 1, flags)]
+    if thorough:
+        tried.append((slow, 1, exhaustive))
+    if thorough and 2 * max(grey.shape) <= SEARCH_SIZE:  # squares of 5 to 10 px need finer pixels
+        tried += [(quick, 2, flags), (slow, 1, exhaustive | cv2.CALIB_CB_ACCURACY)]
+    for find, finer, how in tried:
+        image = grey if finer == 1 else cv2.resize(grey, None, fx=finer, fy=finer, interpolation=cv2.INTER_CUBIC)
+        grid = _all_lines(find(image, inner_corners, None, how), inner_corners)
         if grid is not None:
-            scale *= 2.0
-        else:
-            fine = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
-            grid = _all_lines(cv2.findChessboardCornersSB(grey, inner_corners, None, fine), inner_corners)
-    return None if grid is None else (grid.reshape(-1, 2) + 0.5) / scale - 0.5
+            return (grid.reshape(-1, 2) + 0.5) / (scale * finer) - 0.5
+    return None
 
 
 def _all_lines(answer: tuple[bool, NDArray | None], inner_corners: tuple[int, int]) -> Array | None:
@@ -210,8 +204,9 @@ def _larger_board(grey: Array, view: CornerView, inner_corners: tuple[int, int])
     """A message if full lines of further corners lie beyond a side: the board is larger than was declared."""
     columns, rows = inner_corners
     grid = view.points.reshape(rows, columns, 2)
-    axes = local_axes(view.points, view.accepted, inner_corners).reshape(rows, columns, 2, 2)
-    least = 0.5 * float(np.median(view.contrast[view.accepted]))
+    axes = local_axes(view.points, view.accepted, inner_corners)
+    least = 0.5 * float(np.median(np.abs(_saddles(grey, view.points, axes)[view.accepted])))
+    axes = axes.reshape(rows, columns, 2, 2)
     further = [0, 0]
     for along, across in ((0, 1), (1, 0)):
         for last, before in ((0, 1), (-1, -2)):
@@ -232,17 +227,23 @@ def _larger_board(grey: Array, view: CornerView, inner_corners: tuple[int, int])
 
 
 def _crosses(grey: Array, line: Array, axes: Array, least: float) -> bool:
-    """Whether two light and two dark squares meet at most points (n, 2) of a line; axes (n, 2, 2) of a square."""
-    at = line[:, None] + 0.3 * np.array([[1.0, 1.0], [-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0]]) @ axes
-    inside = np.isfinite(at).all((1, 2)) & (at >= 0).all((1, 2))
-    inside &= (at[..., 0] < grey.shape[1] - 1).all(1) & (at[..., 1] < grey.shape[0] - 1).all(1)
-    if inside.sum() < 3 or inside.mean() < 0.5:
-        return False
-    x, y = np.rint(at[inside]).astype(int).transpose(2, 0, 1)
-    v = grey[y, x]
-    saddle = np.minimum(v[:, 0], v[:, 1]) - np.maximum(v[:, 2], v[:, 3])
-    opposite = np.minimum(v[:, 2], v[:, 3]) - np.maximum(v[:, 0], v[:, 1])
-    return bool(np.mean(np.maximum(saddle, opposite) > least) > 0.7)
+    """Whether two light and two dark squares meet at most points (n, 2) of a line."""
+    contrast = np.abs(_saddles(grey, line, axes))
+    inside = np.isfinite(contrast)
+    return bool(inside.sum() >= 3 and inside.mean() >= 0.5 and np.mean(contrast[inside] > least) > 0.7)
+
+
+def _saddles(grey: Array, points: Array, axes: Array) -> Array:
+    """(n,) By how much two opposite squares are lighter than the two others at points (n, 2), or these, below 0.
+
+    NaN where they do not lie in the image; axes (n, 2, 2) of a square.
+    """
+    at = points[:, None] + 0.3 * np.array([[1.0, 1.0], [-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0]]) @ axes
+    inside = ((at >= 0) & (at < np.array(grey.shape[::-1]) - 1)).all((1, 2))
+    x, y = np.rint(np.where(inside[:, None, None], at, 0.0)).astype(int).transpose(2, 0, 1)
+    a, b = grey[y, x].reshape(-1, 2, 2).transpose(1, 0, 2)
+    lighter, darker = a.min(axis=1) - b.max(axis=1), b.min(axis=1) - a.max(axis=1)
+    return np.where(inside, np.where(lighter > 0, lighter, -np.maximum(darker, 0.0)), np.nan)
 
 
 __all__ = ["BoardNotFound", "CornerView", "board_in", "board_orders", "find_corners", "grey_values"]

@@ -9,14 +9,14 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from calibration.board._corner_kernel import N_CORNER, fit_corners
-from calibration.board.robust_corners import LEAST_SIGMA, WINDOW, degree_for, saddle_points, smooth_grid
+from calibration.board.corner_grid import WINDOW, degree_for, local_axes, saddle_points, smooth_grid
 from calibration.kit.arrays import Array, Mask
 
+LEAST_SIGMA = 0.05  # px, of a corner that no model fits
 MAX_WINDOW = 0.85  # of a square: the next edge, blurred, must stay outside
 MIN_WINDOW = 0.3
 FIRST_REACH = 85.0  # px, of the first fit's window: what it is to tell, blur and noise and places, it tells as well
@@ -42,23 +42,11 @@ class CornerView:
     covariance: Array  # (n, 2, 2) [px^2] from the image's own noise, enlarged where the edges fit badly
     accepted: Mask  # (n,)
     reasons: tuple[str, ...]  # (n,) why a corner was rejected; "" where it holds, or was not in view
-    chi_square: Array  # (n,) reduced, of the pixels on the edges; NaN where a saddle point stands in for their fit
-    contrast: Array  # (n,) light minus dark [grey]
-    blur: Array  # (n,) sigma of the edges [px]
-    spacing: float  # median distance of neighbouring corners [px]
-    noise: tuple[float, float]  # variance of a pixel = noise[0] + noise[1] * grey
     notes: tuple[str, ...] = ()
-
-    @property
-    def sigma_px(self) -> float:
-        """Root mean square of the accepted corners' standard deviation per axis [px]."""
-        traces = np.trace(self.covariance[self.accepted], axis1=-2, axis2=-1)
-        return float(np.sqrt(np.mean(traces) / 2)) if len(traces) else float("nan")
 
     def reordered(self, order: NDArray[np.intp]) -> CornerView:
         """The same view with corner order[i] in place i: for boards whose colouring allows several orders."""
-        arrays = {name: getattr(self, name)[order] for name in ("points", "covariance", "accepted", "chi_square")}
-        arrays |= {name: getattr(self, name)[order] for name in ("contrast", "blur")}
+        arrays = {name: getattr(self, name)[order] for name in ("points", "covariance", "accepted")}
         return replace(self, reasons=tuple(self.reasons[i] for i in order), **arrays)
 
 
@@ -76,24 +64,23 @@ def fit_view(
     """
     noise, blur, known = np.array([1.0, 0.0]), 1.0, np.zeros((len(rough), 4))
     seen = np.ones(len(rough), bool) if seen is None else seen
-    points, ok = rough, seen
-    axes = local_axes(points, ok, inner_corners)
-    starts = _starts(grey, points, axes, blur, 0.7 * min(plain, 0.57))
+    axes = local_axes(rough, seen, inner_corners)
+    starts = _starts(grey, rough, axes, blur, 0.7 * min(plain, 0.57))
     for iterations, tolerance, most in ((12, 1e-2, FIRST_REACH), (30, 1e-5, np.inf)):
-        windows = _windows(points, axes, blur, grey.shape, -plain * np.sign(starts[:, 6]), most)
+        windows = _windows(starts[:, :2], axes, blur, grey.shape, -plain * np.sign(starts[:, 6]), most)
         fit = _Fit(*fit_corners(grey, windows, starts, known, noise, iterations, tolerance))
-        displaced = _displacement(np.where(seen[:, None], fit.found[:, :2], rough), axes, inner_corners)
-        ok = fit.converged & (displaced < MAX_DISPLACEMENT) & seen
+        ok = fit.converged & seen
+        ok &= _displacement(fit.found[:, :2], ok, axes, inner_corners) < MAX_DISPLACEMENT
         if not ok.any():
             break
         noise, blur = _measured_noise(fit.sums[ok]), float(np.median(fit.found[ok, 4]))
+        starts = np.where(ok[:, None], fit.found, starts)
         points = np.where(ok[:, None], fit.found[:, :2], rough)
         axes = local_axes(points, ok, inner_corners)
         bends = _line_curvature(points, ok, fit.found[:, 2:4], inner_corners)
         known = np.concatenate([bends, _contrast_gradient(points, ok, fit.found[:, 5:7])], axis=1)
-        starts = np.where(ok[:, None], fit.found, starts)
     fit = _with_smaller_windows(grey, fit, windows, starts, known, noise)
-    return _judged(grey, fit, noise, axes, rough, inner_corners, seen, plain)
+    return _judged(grey, fit, axes, rough, inner_corners, seen, plain)
 
 
 class _Fit(NamedTuple):
@@ -127,18 +114,6 @@ def _with_smaller_windows(grey: Array, fit: _Fit, windows: Array, starts: Array,
         for old, new in zip(fit, again, strict=True):
             old[bad[better]] = new[better]
     return fit
-
-
-def local_axes(points: Array, ok: Mask, inner_corners: tuple[int, int]) -> Array:
-    """Image of one step along i and along j at every corner, (n, 2 axes, 2) [px], from the view's homography."""
-    columns, rows = inner_corners
-    j, i = np.mgrid[:rows, :columns]
-    board = np.stack([i.ravel(), j.ravel(), np.ones(i.size)], axis=-1).astype(float)
-    use = ok if ok.sum() >= 8 else np.ones(len(points), bool)
-    H = np.asarray(cv2.findHomography(board[use, :2], points[use])[0], float)
-    w = board @ H[2]
-    image = (board @ H[:2].T) / w[:, None]
-    return np.stack([(H[:2, axis] - image * H[2, axis]) / w[:, None] for axis in (0, 1)], axis=1)
 
 
 def _windows(points: Array, axes: Array, blur: float, shape: tuple[int, ...], plain: Array, most: float) -> Array:
@@ -182,24 +157,10 @@ def _starts(grey: Array, points: Array, axes: Array, blur: float, aside: float) 
     return starts
 
 
-def _displacement(found: Array, axes: Array, inner_corners: tuple[int, int]) -> Array:
-    """Distance of every corner from where its neighbours along the lines put it, in squares; (n,).
-
-    The best of six predictions: between the two neighbours and beyond two on either side, along i and along j; one bad
-    neighbour must not condemn a good corner.
-    """
-    columns, rows = inner_corners
-    grid = found.reshape(rows, columns, 2)
-    predicted = np.full((6, rows, columns, 2), np.nan)
-    predicted[0, :, 1:-1] = 0.5 * (grid[:, 2:] + grid[:, :-2])
-    predicted[1, 1:-1] = 0.5 * (grid[2:] + grid[:-2])
-    predicted[2, :, :-2] = 2 * grid[:, 1:-1] - grid[:, 2:]
-    predicted[3, :, 2:] = 2 * grid[:, 1:-1] - grid[:, :-2]
-    predicted[4, :-2] = 2 * grid[1:-1] - grid[2:]
-    predicted[5, 2:] = 2 * grid[1:-1] - grid[:-2]
-    distance = np.linalg.norm(predicted - grid, axis=-1).reshape(6, -1)
-    distance = np.where(np.isfinite(distance), distance, np.inf)
-    return np.asarray(distance.min(axis=0) / np.linalg.norm(axes, axis=-1).max(-1), np.float64)
+def _displacement(found: Array, seen: Mask, axes: Array, inner_corners: tuple[int, int]) -> Array:
+    """(n,) Distance of every corner from where the others put it, in squares."""
+    places, _ = smooth_grid(found, inner_corners, seen)
+    return np.asarray(np.linalg.norm(found - places, axis=-1) / np.linalg.norm(axes, axis=-1).max(-1), np.float64)
 
 
 def _measured_noise(sums: Array) -> Array:
@@ -278,18 +239,10 @@ def _contrast_gradient(points: Array, ok: Mask, levels: Array) -> Array:
 
 
 def _judged(
-    grey: Array,
-    fit: _Fit,
-    noise: Array,
-    axes: Array,
-    rough: Array,
-    counts: tuple[int, int],
-    seen: Mask,
-    plain: float,
+    grey: Array, fit: _Fit, axes: Array, rough: Array, counts: tuple[int, int], seen: Mask, plain: float
 ) -> CornerView:
     """Test every corner; where the fine model does not hold, the saddle point stands in with its own covariance."""
     found, sums = fit.found, fit.sums
-    displaced = _displacement(np.where(seen[:, None], found[:, :2], rough), axes, counts)
     spacing = float(np.median(np.linalg.norm(axes, axis=-1)))
     edge_pixels = sums[:, 1] - sums[:, 4] - sums[:, 7]
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -300,15 +253,16 @@ def _judged(
     spread = float(np.median(chi_square[converged])) if converged.any() else 1.0
     chi_limit = MAX_CHI_SQUARE * max(spread, 1.0)  # compressed images have correlated noise: judge against the view
     faint = converged & (contrast < MIN_CONTRAST_RATIO * typical)
+    displaced = _displacement(found[:, :2], converged, axes, counts)
     fine = converged & (displaced < MAX_DISPLACEMENT) & ~faint & (chi_square < chi_limit)
     covariance = fit.covariance * np.maximum(chi_square, 1.0)[:, None, None]
     points, reasons = found[:, :2].copy(), np.where(faint, "covered, or in glare", "").astype(object)
     saddles = saddle_points(grey, np.where(fine[:, None], points, rough), spacing * min(plain / WINDOW, 1.0))
     expected, sigma = smooth_grid(np.where(fine[:, None], points, saddles), counts, seen)
-    _, sigma_saddle = smooth_grid(saddles, counts, seen)
+    by_saddles, sigma_saddle = smooth_grid(saddles, counts, seen)
     if sigma_saddle < ROUGHER * sigma and fine.any():  # the saddle points lie smoother than the fine fits do
         fine = np.zeros_like(fine)
-        expected, sigma = smooth_grid(saddles, counts, seen)
+        expected, sigma = by_saddles, sigma_saddle
     # edges that fit badly on both sides alike leave the corner where it is: no more error than the grid's scatter shows
     stated = float(np.sqrt(np.median(np.trace(covariance[fine], axis1=1, axis2=2)) / 2)) if fine.any() else sigma
     covariance = np.maximum(min(sigma / stated, 1.0) ** 2, 1 / np.maximum(chi_square, 1.0))[:, None, None] * covariance
@@ -317,7 +271,6 @@ def _judged(
     stands = ~fine & ~faint & seen & (off < min(MAX_DISPLACEMENT * spacing, 4 * sigma_saddle))
     points[~fine] = saddles[~fine]
     covariance[~fine] = sigma_saddle**2 * np.eye(2)
-    chi_square = np.where(fine, chi_square, np.nan)
     for i in np.flatnonzero(~fine & ~stands & ~faint & seen):
         reasons[i] = f"{off[i]:.1f} px from where the other corners put it (they scatter by {sigma_saddle:.2f} px)"
     return CornerView(
@@ -326,9 +279,4 @@ def _judged(
         covariance=covariance,
         accepted=fine | stands,
         reasons=tuple(str(reason) for reason in reasons),
-        chi_square=chi_square,
-        contrast=contrast,
-        blur=found[:, 4],
-        spacing=spacing,
-        noise=(float(noise[0]), float(noise[1])),
     )

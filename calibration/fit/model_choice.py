@@ -5,20 +5,19 @@ error into all others, which nothing would say (1.8 to 2.3 times the stated vari
 are fitted, and `priors` knows how large they are in lenses.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy
 
 from calibration.board.target import LEAST_POINTS
-from calibration.cameras.camera import StereoRig, triangulate
+from calibration.cameras.camera import triangulate
 from calibration.fit.board_motion import BoardMotion, split
 from calibration.fit.normal_equations import Problem, inverse_covariance, minimise, quadratic
 from calibration.fit.refinement import Refinement, refine_stereo
 from calibration.fit.stereo_model import (
-    BOARD_MODELS,
     N_STEREO,
-    RICHEST,
     Observations,
     StereoModel,
     Terms,
@@ -51,16 +50,14 @@ def error_in_space(model: StereoModel, seen: Observations) -> float:
     """Rms distance [m] of a view's corners, triangulated, from the board where they put it best; NaN by one camera."""
     left, right = (seen[seen.camera == camera] for camera in (0, 1))
     common, a, b = np.intersect1d(left.point, right.point, return_indices=True)
-    rig = StereoRig(*model.cameras, model.R_right_left, model.t_right_left, np.eye(3), np.zeros(3))
-    found = triangulate(np.stack([left.pixels[a], right.pixels[b]]), rig)
+    found = triangulate(np.stack([left.pixels[a], right.pixels[b]]), model.rig)
     met = np.isfinite(found).all(axis=1)
     if met.sum() < LEAST_POINTS:
         return float("nan")
     board, found = model.points[common][met], found[met]
     d, e = board - board.mean(0), found - found.mean(0)
-    U, _, Vt = np.linalg.svd(d.T @ e)
-    turn = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
-    return float(np.sqrt(np.mean(np.sum((e - d @ turn) ** 2, axis=1))))
+    off = scipy.spatial.transform.Rotation.align_vectors(e, d)[1]
+    return float(off / np.sqrt(len(d)))
 
 
 def fit_poses(
@@ -128,21 +125,19 @@ def choose_board(
     observations: Observations,
     start: StereoModel,
     nominal: Array,
-    boards: tuple[str, ...] = BOARD_MODELS,
-    distortion: str = RICHEST,
-    equal_aspect: bool = False,
+    tried: Sequence[Terms],
     progress: Callable[[str], None] = lambda _: None,
     motion: BoardMotion | None = None,
 ) -> tuple[Refinement, tuple[TermsTried, ...]]:
-    """Choose the shape that the board may have: of `boards`, simplest first; one alone is taken, not chosen.
+    """Choose what the board's shape may be: of the terms `tried`, the simplest first; one alone is taken, not chosen.
 
     Returns the refinement of the chosen terms and the table of what was compared. motion : as in `refine_stereo`
     """
     fits: list[Refinement] = []
-    for board in boards:
+    for terms in tried:
         if fits:
-            progress(f"trying a {board} board")
-        terms, begin = Terms(distortion, board, equal_aspect), fits[0] if fits else None
+            progress(f"trying a {terms.board} board")
+        begin = fits[0] if fits else None
         fits.append(refine_stereo(observations, start, nominal, terms, begin=begin, motion=None if begin else motion))
     quietest = min(fits, key=lambda fit: fit.unexplained_sigma)
     fits = [fit for fit in fits if fit.unexplained_sigma <= HOPELESS * quietest.unexplained_sigma + 1e-3]

@@ -10,7 +10,7 @@ boards were moved, errors have long tails: a pair's evidence is minus the logari
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import scipy
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from calibration.board.chessboard import BoardNotFound, CornerView
 from calibration.board.target import mirror_symmetries
 from calibration.cameras.camera import CAMERA_NAMES, Camera, by_turning, project_with_jacobians
+from calibration.fit.stereo_model import StereoModel
 from calibration.kit.arrays import Array, Mask
 from calibration.kit.errors import CalibrationError
 
@@ -86,12 +87,12 @@ def _same_place(side: Sequence[CornerView | BoardNotFound]) -> Mask:
     """(n, n) whether two images of a camera show the board in one place; or both do not show it."""
     found = np.array([isinstance(view, CornerView) for view in side], bool)
     same = ~found[:, None] & ~found
-    seen = [np.where(view.accepted[:, None], view.points, np.nan) for view in side if isinstance(view, CornerView)]
-    limit = FLOOR * max((max(view.image_size) for view in side if isinstance(view, CornerView)), default=0)
-    for v, points in zip(np.flatnonzero(found), seen, strict=True):
-        square = np.sum((np.stack(seen) - points) ** 2, axis=2)
-        common = np.isfinite(square)
-        same[v, found] = np.where(common, square, 0.0).sum(axis=1) < limit**2 * common.sum(axis=1)
+    views = [view for view in side if isinstance(view, CornerView)]
+    points = np.array([np.where(view.accepted[:, None], view.points, np.nan) for view in views])
+    for v, seen, view in zip(np.flatnonzero(found), points, views, strict=True):
+        square = np.sum((points - seen) ** 2, axis=2)
+        limit = (FLOOR * max(view.image_size)) ** 2
+        same[v, found] = np.nansum(square, axis=1) < limit * np.isfinite(square).sum(axis=1)
     return same
 
 
@@ -124,6 +125,22 @@ def told_by(left: BoardPlaces, right: BoardPlaces) -> tuple[Array, Array]:
     """How the cameras stand by each pair alone: R_right_left (n, 3, 3) and t_right_left (n, 3) [m]."""
     R = right.R @ np.swapaxes(left.R, 1, 2)
     return R, right.middle - np.einsum("nij,nj->ni", R, left.middle)
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Which pairs show the board in one place, as cameras see it that have a place of it for each image."""
+
+    model: StereoModel  # its poses those of the views: of both images together, or of the left one of a pair apart
+    left_poses: dict[int, Pose]  # of the left image of each pair alone
+    right_poses: dict[int, Pose]  # of the right one alone, in the left camera's axes
+    apart: dict[int, str]  # view -> why its two images are not taken for one place
+    bad_images: dict[tuple[int, int], str] = field(default_factory=dict)  # (view, camera) -> why not even alone
+
+    def set_apart(self, views: Sequence[int], why: str) -> Pairs:
+        """With these apart, too, each at the place that its left image alone gives the board."""
+        model = self.model.placed({v: self.left_poses[v] for v in views})
+        return replace(self, model=model, apart=self.apart | dict.fromkeys(views, why))
 
 
 @dataclass(frozen=True)

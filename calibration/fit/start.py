@@ -1,7 +1,6 @@
 """Rough cameras and poses to start the refinement from: OpenCV per camera, then the pair that most views agree on."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -9,9 +8,9 @@ from numpy.typing import NDArray
 
 from calibration.board.target import LEAST_POINTS
 from calibration.cameras.camera import CAMERA_NAMES, Camera, rotation_from_vector
-from calibration.fit.pairing import FLOOR, Names, Pose, board_turns, paired, places_of
+from calibration.fit.pairing import FLOOR, Names, Pairs, board_turns, paired, places_of
 from calibration.fit.stereo_model import Observations, StereoModel
-from calibration.kit.arrays import Array, Mask
+from calibration.kit.arrays import Array
 from calibration.kit.errors import CalibrationError
 
 MOST_K1 = 10.0  # of a lens that exists; beyond, the views do not tell of it
@@ -32,11 +31,6 @@ def start_camera(
             images.append(observations.pixels[use].astype(np.float32))
             views.append(int(view))
     name = CAMERA_NAMES[index]
-    if len(views) < MIN_VIEWS:
-        raise CalibrationError(
-            f"{name} camera: the target is found in {len(views)} views, at least {MIN_VIEWS} are needed "
-            "(10 to 20, tilted in several directions, are good)"
-        )
     flags = cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3
     w, h = image_size
     guess = np.array([[float(max(w, h)), 0, 0.5 * (w - 1)], [0, float(max(w, h)), 0.5 * (h - 1)], [0, 0, 1]])
@@ -77,28 +71,17 @@ def _refuse_one_place(t_pair: Array, boards: Sequence[Array]) -> None:
         )
 
 
-@dataclass(frozen=True)
-class StereoStart:
-    """Rough cameras and boards, and what the pairs say of them."""
-
-    model: StereoModel
-    agrees: Mask  # (n_views,) views that agree with the model, or were seen by one camera only
-    right_poses: dict[int, Pose]  # of pairs: the board in the left camera's axes by the right image alone
-    left_poses: dict[int, Pose]
-    orders: dict[int, NDArray[np.intp]]  # of pairs: in which the right image shows the target's points, see `Target`
-    notes: tuple[str, ...]
-
-
 def start_stereo(
     observations: Observations,
     nominal: Array,
     image_sizes: tuple[tuple[int, int], tuple[int, int]],
     names: Names,
     orders: Sequence[NDArray[np.intp]] | None = None,
-) -> StereoStart:
-    """Rough cameras, how they stand to each other, and which images are pairs.
+) -> tuple[Pairs, dict[int, NDArray[np.intp]], tuple[str, ...]]:
+    """Rough cameras, how they stand to each other, and which images are pairs; those that do not agree are apart.
 
     names : (left, right) of all views; orders : in which the target looks the same; only as it is without
+    returns also : of pairs, in which order the right image shows the target's points; and notes about them
     Raises CalibrationError where the images do not tell a camera, or are no pairs; see `pairing`.
     """
     orders, n_views = orders or [np.arange(len(nominal))], len(names)
@@ -114,23 +97,15 @@ def start_stereo(
     both = [v for v in poses[0] if v in poses[1]]
     R_pair, t_pair = pairs.R_right_left, pairs.t_right_left
     _refuse_one_place(t_pair, [poses[0][v][1] for v in both])
-    usable, turns, middle = np.ones(n_views, bool), board_turns(nominal, orders), nominal.mean(0)
-    usable[[v for v, ok in zip(both, pairs.agrees, strict=True) if not ok]] = False
+    turns, middle = board_turns(nominal, orders), nominal.mean(0)
     by_right = {}
     for v, (R, t) in poses[1].items():
         turn = turns[pairs.order[both.index(v)]] if v in both else np.eye(3)
         by_right[v] = R_pair.T @ R @ turn, R_pair.T @ (t + R @ (middle - turn @ middle) - t_pair)
     R_board, t_board = np.tile(np.eye(3), (n_views, 1, 1)), np.tile([0.0, 0.0, 1.0], (n_views, 1))
-    for view in range(n_views):
-        if view in poses[0] or view in by_right:
-            R_board[view], t_board[view] = poses[0].get(view) or by_right[view]
-        else:
-            usable[view] = False
-    return StereoStart(
-        StereoModel((cameras[0], cameras[1]), R_pair, t_pair, R_board, t_board, nominal.copy()),
-        usable,
-        {v: by_right[v] for v in both},
-        {v: poses[0][v] for v in both},
-        {v: orders[k] for v, k in zip(both, pairs.order, strict=True)},
-        notes,
-    )
+    for view, (R, t) in (by_right | poses[0]).items():
+        R_board[view], t_board[view] = R, t
+    model = StereoModel((cameras[0], cameras[1]), R_pair, t_pair, R_board, t_board, nominal.copy())
+    left, right = ({v: side[v] for v in both} for side in (poses[0], by_right))
+    apart = {v: "" for v, agrees in zip(both, pairs.agrees, strict=True) if not agrees}
+    return Pairs(model, left, right, apart), {v: orders[k] for v, k in zip(both, pairs.order, strict=True)}, notes

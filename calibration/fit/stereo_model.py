@@ -11,14 +11,11 @@ from numpy.typing import NDArray
 from calibration.cameras.camera import (
     INTRINSIC_PARAMETERS,
     N_INTRINSIC,
-    OF_CAMERAS,
     PAIR_SHIFT,
     PAIR_TURN,
     Camera,
+    StereoRig,
     by_turning,
-    pair_poses,
-    project,
-    project_with_jacobians,
     rotation_from_vector,
     stepped,
 )
@@ -79,6 +76,11 @@ class StereoModel:
     boards_right: tuple[Array, Array] | None = None
 
     @property
+    def rig(self) -> StereoRig:
+        """The cameras; the world is the left one's axes."""
+        return StereoRig(*self.cameras, self.R_right_left, self.t_right_left)
+
+    @property
     def boards_in_right(self) -> tuple[Array, Array]:
         """The same, where they did not move as well."""
         return self.boards_right or (self.R_left_board, self.t_left_board)
@@ -97,8 +99,6 @@ class Terms:
 
     distortion: str = RICHEST  # key of DISTORTION_MODELS, the same for both cameras
     board: str = "flat"  # one of BOARD_MODELS
-    equal_aspect: bool = False  # fx = fy in each camera
-    fixed_intrinsics: bool = False
 
     def __post_init__(self) -> None:
         if self.distortion not in DISTORTION_MODELS:
@@ -110,17 +110,9 @@ class Terms:
 
     def stereo_basis(self) -> Array:
         """(24, n_free) columns span the free directions of intrinsics and stereo pose."""
-        held = {"fy"} if self.equal_aspect else set()
-        free = (
-            set() if self.fixed_intrinsics else {*INTRINSIC_PARAMETERS[:4], *DISTORTION_MODELS[self.distortion]} - held
-        )
-        unit, columns = np.eye(N_STEREO), []
-        for of_camera in OF_CAMERAS:
-            own = dict(zip(INTRINSIC_PARAMETERS, unit[of_camera], strict=True))
-            if self.equal_aspect:
-                own["fx"] = own["fx"] + own["fy"]
-            columns += [column for name, column in own.items() if name in free]
-        return np.array([*columns, *unit[PAIR_TURN], *unit[PAIR_SHIFT]]).T
+        free = {*INTRINSIC_PARAMETERS[:4], *DISTORTION_MODELS[self.distortion]}
+        own = np.array([name in free for name in INTRINSIC_PARAMETERS])
+        return np.eye(N_STEREO)[:, np.concatenate([own, own, np.ones(6, bool)])]
 
 
 def board_basis(nominal: Array, board: str) -> Array:
@@ -129,7 +121,8 @@ def board_basis(nominal: Array, board: str) -> Array:
     flat: none. warped: out of the plane as x^2, x y, y^2 over the half size, and in it longer along one side or
     sheared, as a print that the paper's feed has drawn out. free: every coordinate of every point.
     Shift, turn and scale of the target as a whole are taken out: no image can tell them from a changed pose and
-    baseline, so the mean plane and the mean size stay those declared.
+    baseline. So the mean plane stays the declared one, and the size the likeliest: of sides that are off by equal and
+    opposite parts, since each was made as well as the other.
     """
     n = len(nominal)
     if board == "flat":
@@ -137,7 +130,8 @@ def board_basis(nominal: Array, board: str) -> Array:
     d = nominal - nominal.mean(0)
     size = np.abs(d).max()
     rows = [np.broadcast_to(axis * size, d.shape) for axis in np.eye(3)]
-    rows += [np.cross(axis, d) for axis in np.eye(3)] + [d]
+    spread = np.sum(d**2, axis=0)[:2]
+    rows += [np.cross(axis, d) for axis in np.eye(3)] + [d * [*spread[::-1] / spread.sum(), 0.0]]
     gauge = np.stack([row.reshape(-1) for row in rows], axis=-1)
     q, _ = np.linalg.qr(gauge, mode="complete")
     if board == "free":
@@ -154,32 +148,16 @@ def board_basis(nominal: Array, board: str) -> Array:
 def predict_pixels(model: StereoModel, observations: Observations) -> Array:
     """Pixels (m, 2) alone."""
     _, arm, t = _arms(model, observations)
-    pixels = np.empty((len(observations), 2))
-    for index, (R, shift) in enumerate(pair_poses(model.R_right_left, model.t_right_left)):
-        seen = observations.camera == index
-        pixels[seen] = project((arm[seen] + t[seen]) @ R.T + shift, model.cameras[index])
-    return pixels
+    return model.rig.project(arm + t)[observations.camera, np.arange(len(observations))]
 
 
 def predict(model: StereoModel, observations: Observations) -> tuple[Array, Array, Array, Array]:
     """Pixels (m, 2) and derivatives: d/d stereo (m, 2, 24), d/d view pose (m, 2, 6), d/d target point (m, 2, 3)."""
-    m = len(observations)
     R, arm, t = _arms(model, observations)
-    points_left = arm + t
-    pixels, d_pose = np.empty((m, 2)), np.empty((m, 2, 6))
-    d_left = d_pose[..., 3:]
-    d_stereo = np.zeros((m, 2, N_STEREO))
-    for index, (R_pair, t_pair) in enumerate(pair_poses(model.R_right_left, model.t_right_left)):
-        seen = np.flatnonzero(observations.camera == index)
-        turned = points_left[seen] @ R_pair.T
-        pixels[seen], d_point, d_stereo[seen, :, OF_CAMERAS[index]] = project_with_jacobians(
-            turned + t_pair, model.cameras[index]
-        )
-        if index:  # the first camera's axes are those of the pair
-            d_stereo[seen, :, PAIR_TURN], d_stereo[seen, :, PAIR_SHIFT] = by_turning(d_point, turned), d_point
-        d_left[seen] = d_point @ R_pair
-    d_pose[..., :3] = by_turning(d_left, arm)
-    return pixels, d_stereo, d_pose, d_left @ R
+    seen = observations.camera, np.arange(len(observations))
+    pixels, d_left, d_rig = (of_both[seen] for of_both in model.rig.project_with_jacobians(arm + t))
+    d_pose = np.concatenate([by_turning(d_left, arm), d_left], axis=-1)
+    return pixels, d_rig[..., :N_STEREO], d_pose, d_left @ R
 
 
 def _arms(model: StereoModel, observations: Observations) -> tuple[Array, Array, Array]:
@@ -218,13 +196,9 @@ def restricted(model: StereoModel, nominal: Array, terms: Terms) -> StereoModel:
         deviation = (model.points - nominal).reshape(-1)
         coefficients = np.linalg.lstsq(basis, deviation, rcond=None)[0] if basis.shape[1] else np.zeros(0)
         model = replace(model, points=nominal + (basis @ coefficients).reshape(nominal.shape))
-    if terms.fixed_intrinsics:
-        return model
     cameras, free = [], DISTORTION_MODELS[terms.distortion]
     held = np.array([name in free for name in INTRINSIC_PARAMETERS[4:]])
     for camera in model.cameras:
         parameters = camera.parameters * np.concatenate([np.ones(4), held])
-        if terms.equal_aspect:
-            parameters[:2] = parameters[:2].mean()
         cameras.append(Camera.from_parameters(parameters, camera.image_size))
     return replace(model, cameras=(cameras[0], cameras[1]))

@@ -12,7 +12,6 @@ from calibration.fit.refinement import Refinement
 from calibration.fit.start import GOOD_VIEWS
 from calibration.judge.pairs import PairMotion
 from calibration.kit.arrays import Array
-from calibration.kit.least_squares import scaled_solve
 
 MIN_COVERAGE = 0.35  # share of the image's 8 x 8 cells with a corner: below, distortion is extrapolated elsewhere
 MIN_TILT_SPREAD_DEG = 20.0  # between the boards' normals: below, focal length and distance cannot be told apart
@@ -48,7 +47,6 @@ class Assessment:
     pairs: int  # views that both cameras saw and the fit uses
     motion: PairMotion | None  # of the board between the exposures of a pair
     inflation: float  # of the covariance, from the scatter of views
-    half_sets: float  # odd against even views: root of chi-square per parameter, about 1 is right; NaN of few views
     coverage: tuple[float, ...]  # of each camera: share of 8 x 8 image cells with a corner
     tilt_spread_deg: float  # greatest angle between two boards' normals
     warnings: tuple[str, ...]
@@ -94,29 +92,6 @@ def stereo_covariance(refinement: Refinement, common: Array | None = None) -> Ar
         by_prior = inverse.T @ told @ inverse
     result: Array = (at_minimum + share * beyond @ beyond.T + by_prior) * scale[:s1, None] * scale[:s1]
     return result
-
-
-def half_set_differences(refinement: Refinement, inflation: float) -> float:
-    """By how many of its sigmas the odd and the even views' parameters differ, to first order; NaN of few views.
-
-    Root of chi-square per parameter, of all together: most differences are along directions that views tell badly. The
-    shape of the board is one for both halves.
-    """
-    s, views = refinement.problem.stereo_basis.shape[1], np.unique(refinement.problem.observations.view)
-    if len(views) < 6:
-        return float("nan")
-    information, gradient = (part[:, :s] for part in refinement.normal.told_by_each())
-    prior, towards = refinement.normal.prior[:s, :s], refinement.normal.prior_gradient[:s]
-    found, C = [], np.zeros((s, s))
-    try:
-        for half in (views[::2], views[1::2]):
-            total = information[half, :, :s].sum(0) + prior
-            found.append(scaled_solve(total, gradient[half].sum(0) + towards))
-            C += inflation * scaled_solve(total, np.eye(s))
-        difference = found[1] - found[0]
-        return float(np.sqrt(difference @ scaled_solve(C, difference) / s))
-    except np.linalg.LinAlgError:
-        return float("nan")
 
 
 def coverage(refinement: Refinement, camera: int, cells: int = 8) -> float:
@@ -222,7 +197,6 @@ def assess(judged: Judged) -> Assessment:
         pairs=len(np.intersect1d(kept.view[kept.camera == 0], kept.view[kept.camera == 1])),
         motion=judged.motion,
         inflation=judged.inflation,
-        half_sets=half_set_differences(refinement, judged.inflation),
         coverage=tuple(coverage(refinement, camera) for camera in range(len(CAMERA_NAMES))),
         tilt_spread_deg=tilt_spread(refinement),
         warnings=(),
@@ -262,8 +236,6 @@ def _warnings(found: Assessment, judged: Judged) -> list[str]:
             "uncertainties were enlarged by that: the board moved or bent between views, or the lenses are not as "
             "modelled"
         )
-    if found.half_sets > TWICE:
-        told.append(f"odd and even views differ by {found.half_sets:.1f} times what the covariance predicts (good: 1)")
     if chosen is not None and chosen.held_out_rms_px > TWICE * chosen.rms_px:
         told.append(
             f"views that were left out fit at {chosen.held_out_rms_px:.3f} px, those fitted at {chosen.rms_px:.3f} px: "
@@ -287,8 +259,6 @@ def _verdict(found: Assessment, judged: Judged) -> tuple[Grade, str]:
         reasons.append((2 if found.pairs > 3 else 3, f"only {found.pairs} views were seen by both cameras"))
     if found.stereo_misfit_px > TWICE * rms:
         reasons.append((2, f"views left out give {found.stereo_misfit_px:.3f} px where those fitted give {rms:.3f} px"))
-    if found.half_sets > TWICE:
-        reasons.append((2, f"odd and even views differ by {found.half_sets:.1f} of their sigmas"))
     if judged.moved:
         reasons.append((2, "the two images of a pair do not show the board in one place"))
     worst, why = max(reasons, key=lambda item: item[0], default=(3, "nothing tells how good it is"))

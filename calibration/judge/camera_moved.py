@@ -7,16 +7,15 @@ see them, so that what a pair tells badly (a shift along the axis) counts as lit
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 
 from calibration.cameras.camera import CAMERA_NAMES, Camera, project
-from calibration.fit.pairing import apart, places_of, rotation_vectors, told_by
+from calibration.fit.pairing import Pairs, apart, places_of, rotation_vectors, told_by
 from calibration.fit.start import start_camera
-from calibration.fit.stereo_model import Observations, StereoModel
-from calibration.judge.pairs import PairsJudged
+from calibration.fit.stereo_model import Observations
 from calibration.kit.arrays import Array
 
 # Times as far apart as pairs of one side. None of 400 synthetic sets of boards that moved reaches 2; of 31 photographed
@@ -29,22 +28,13 @@ BY_ZOOM = 1.3  # times less squared misfit by two focal lengths; one and the sam
 
 
 @dataclass(frozen=True)
-class Step:
-    """One step in how the cameras stand to each other."""
-
-    view: int  # the first one after it
-    turn: float  # [rad]
-    shift: float  # [m]
-    pixels: float  # [px] between pairs on either side of it, in the right image: root mean square of the usual two
-    scatter: float  # [px] between pairs of one side, the same way
-
-
-@dataclass(frozen=True)
 class CameraMoved:
     """The stretches of pairs between such steps."""
 
-    steps: tuple[Step, ...]  # in order
     stretches: tuple[tuple[int, ...], ...]  # the views of the pairs; one more than steps
+    # of each step: turn [rad], shift [m], and [px] between pairs on either side of it and between those of one side, in
+    # the right image: root mean square of the usual two
+    steps: tuple[tuple[float, float, float, float], ...]
     kept: int  # the stretch that tells how the cameras stand
 
     @property
@@ -52,18 +42,13 @@ class CameraMoved:
         """The views of the other stretches."""
         return tuple(v for k, stretch in enumerate(self.stretches) if k != self.kept for v in stretch)
 
-    def set_apart(self, pairs: PairsJudged) -> PairsJudged:
-        """The pairs of the other stretches apart, each at the place that its left image alone gives the board."""
-        apart = pairs.apart | dict.fromkeys(self.others, "a camera was moved")
-        return replace(pairs, model=pairs.model.placed({v: pairs.left_poses[v] for v in self.others}), apart=apart)
-
     def told(self, names: Sequence[tuple[str, str]], table_view: int | None) -> str:
         """In words, for whoever took the views."""
         steps = "; ".join(
-            f"from {names[step.view][0]} and {names[step.view][1]} on the cameras stand otherwise to each other than "
-            f"before, by {np.degrees(step.turn):.2g} deg and {1e3 * step.shift:.2g} mm ({step.pixels:.2g} px, where "
-            f"the pairs on either side agree to {step.scatter:.2g} px)"
-            for step in self.steps
+            f"from {names[view][0]} and {names[view][1]} on the cameras stand otherwise to each other than before, by "
+            f"{np.degrees(turn):.2g} deg and {1e3 * shift:.2g} mm ({pixels:.2g} px, where the pairs on either side "
+            f"agree to {scatter:.2g} px)"
+            for (view, *_), (turn, shift, pixels, scatter) in zip(self.stretches[1:], self.steps, strict=True)
         )
         kept = self.stretches[self.kept]
         which = "most pairs" if table_view is None else "the view on the table"
@@ -76,7 +61,7 @@ class CameraMoved:
 
 
 def zoomed(
-    observations: Observations, moved: CameraMoved, nominal: Array, cameras: tuple[Camera, Camera]
+    observations: Observations, moved: CameraMoved, cameras: tuple[Camera, Camera], nominal: Array
 ) -> dict[int, str]:
     """Cameras whose focal length is another one in the other stretches, and what is to be said of their images there.
 
@@ -104,16 +89,14 @@ def zoomed(
     return found
 
 
-def camera_moved(
-    observations: Observations, pairs: PairsJudged, model: StereoModel, table_view: int | None
-) -> CameraMoved | None:
+def camera_moved(observations: Observations, pairs: Pairs, table_view: int | None) -> CameraMoved | None:
     """Find the steps; None where there are none, or too few pairs.
 
-    observations : with the views' numbers; pairs : as judged by cameras that were refined, `model` has those
     table_view : its stretch tells how the cameras stand; None: the one with the most pairs does
     """
+    model = pairs.model
     sides, R_pair, t_pair = [], model.R_right_left, model.t_right_left
-    views = np.array([v for v in pairs.right_poses if v in pairs.left_poses], int)
+    views = np.array([*pairs.left_poses], int)
     if len(views) < 2 * LEAST_SIDE:
         return None
     in_right = {v: (R_pair @ R, R_pair @ t + t_pair) for v, (R, t) in pairs.right_poses.items()}
@@ -130,20 +113,20 @@ def camera_moved(
         return None
     stretches = np.split(np.arange(len(views)), [at for at, _, _ in cuts])
     steps = []
-    for (at, pixels, scatter), (before, after) in zip(cuts, pairwise(stretches), strict=True):
+    for (_, pixels, scatter), (before, after) in zip(cuts, pairwise(stretches), strict=True):
         # in plain units: boards that moved scatter a turn and a shift that nearly cancel in the image
         turn = np.median(rotation_vectors(R[after] @ R_pair.T), axis=0)
         turn -= np.median(rotation_vectors(R[before] @ R_pair.T), axis=0)
         shift = np.median(t[after], axis=0) - np.median(t[before], axis=0)
-        steps.append(Step(int(views[at]), float(np.linalg.norm(turn)), float(np.linalg.norm(shift)), pixels, scatter))
+        steps.append((float(np.linalg.norm(turn)), float(np.linalg.norm(shift)), pixels, scatter))
     kept = int(np.argmax([len(stretch) for stretch in stretches]))
     if table_view is not None:
-        kept = int(np.searchsorted([step.view for step in steps], table_view, "right"))
-    return CameraMoved(tuple(steps), tuple(tuple(views[s].tolist()) for s in stretches), kept)
+        kept = int(np.searchsorted([views[at] for at, _, _ in cuts], table_view, "right"))
+    return CameraMoved(tuple(tuple(views[s].tolist()) for s in stretches), tuple(steps), kept)
 
 
 def _cuts(between: Array) -> list[tuple[int, float, float]]:
-    """Where n pairs part, in order: the clearest step, then those on either side of it; `Step.pixels` and `scatter`.
+    """Where n pairs part, in order: the clearest step, then those on either side of it; as in `CameraMoved.steps`.
 
     between : (n, n) [px] by which what the pairs tell of the cameras differs
     """

@@ -13,7 +13,7 @@ hypothesis of a pair is one of m, and compared by its likelihood with everything
 """
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy
@@ -23,13 +23,14 @@ from calibration.board.target import LEAST_POINTS
 from calibration.fit.board_motion import BoardMotion, motions, split
 from calibration.fit.model_choice import fit_poses
 from calibration.fit.normal_equations import Problem
-from calibration.fit.pairing import TOO_FAR, Pose
+from calibration.fit.pairing import TOO_FAR, Pairs, Pose
 from calibration.fit.refinement import Refinement
 from calibration.fit.stereo_model import Observations, StereoModel, predict, predict_pixels
 from calibration.kit.arrays import Array, Mask
 
 MOVED = 2.0  # times what corners' scatter makes of a board at rest, and times that scatter, that motion is named
 LEAST_PAIRS = 6  # fewer cannot judge one another: one tells how the cameras stand, and a median is of the others
+LEAST_MOTIONS = 3  # fewer do not tell how large they are
 FREE = BoardMotion(np.inf, np.inf)  # nothing known beforehand
 NONE = 1e-7  # [rad], and of the board's distance: less than any view tells
 
@@ -47,15 +48,6 @@ def own_places(
     R = np.concatenate([model.R_left_board, *(right_poses[view][0][None] for view in apart)])
     t = np.concatenate([model.t_left_board, *(right_poses[view][1][None] for view in apart)])
     return replace(observations, view=place), replace(model, R_left_board=R, t_left_board=t)
-
-
-@dataclass(frozen=True)
-class LikelyMotion:
-    """What all pairs together say of the boards' motions."""
-
-    size: BoardMotion
-    pixels: float  # [px] rms displacement of a corner in the right image by such a motion
-    gradients: Array  # (n_views, s, s) covariance of what it adds to each view's gradient by the shared parameters
 
 
 @dataclass(frozen=True)
@@ -102,7 +94,7 @@ class PairMotions:
         white = np.einsum("nji,njk,nk->ni", vectors, L, left)
         return np.asarray(np.sum(np.where(values > 1e-6, white**2 / np.maximum(values, 1e-6), 0.0), axis=1))
 
-    def likely(self) -> LikelyMotion:
+    def likely_size(self) -> BoardMotion:
         """The most likely size of random motions; about a minimum with one place of the board for both images."""
         s1 = self.problem.stereo_basis.shape[1]  # the board's shape is held: it is known better than motions move it
         everyone = np.ones(len(self.views), bool)
@@ -133,11 +125,14 @@ class PairMotions:
         begun = np.log([(1e-4, 1e-4), (1e-3, 1e-4), (1e-5, 1e-5)])
         tried = [scipy.optimize.minimize(unlikely, start, **rough) for start in begun]
         S = variances(min(tried, key=lambda one: float(one.fun)).x)
-        into = np.zeros((self.problem.n_views, self.by_shared.shape[-1], self.by_shared.shape[-1]))
+        return BoardMotion(float(S[0] ** 0.5), float(S[3] ** 0.5))
+
+    def gradients(self, size: BoardMotion) -> Array:
+        """(n_views, s, s) covariance of what motions of this size add to each view's gradient by the shared numbers."""
+        into = np.zeros((self.problem.n_views, *2 * self.by_shared.shape[-1:]))
         known = np.linalg.solve(self.covariance, self.by_shared)
-        into[self.views] = np.swapaxes(known, 1, 2) @ (S[:, None] * known)
-        pixels = np.mean(np.einsum("nii,i->n", self.square_px, S))
-        return LikelyMotion(BoardMotion(float(S[0] ** 0.5), float(S[3] ** 0.5)), float(pixels**0.5), into)
+        into[self.views] = np.swapaxes(known, 1, 2) @ (known / size.weights[:, None])
+        return into
 
 
 def pair_motions(problem: Problem, model: StereoModel) -> PairMotions:
@@ -171,10 +166,11 @@ def pair_motions(problem: Problem, model: StereoModel) -> PairMotions:
     )
 
 
-def likely_motion(refinement: Refinement) -> LikelyMotion | None:
-    """The most likely size of the boards' motions; None where fewer than three pairs could tell it."""
+def gradients_by_motion(refinement: Refinement) -> Array | None:
+    """(n_views, s, s) `gradients` of motions of the likely size; None where the fit has motions, or nothing tells."""
     found = pair_motions(refinement.problem, refinement.model)
-    return found.likely() if len(found.views) >= 3 else None
+    known = refinement.problem.motion is not None or len(found.views) < LEAST_MOTIONS
+    return None if known else found.gradients(found.likely_size())
 
 
 @dataclass(frozen=True)
@@ -185,7 +181,8 @@ class PairMotion:
     pixels: float  # [px] in the right image
     scatter: float  # [px] of the corners within an image, about a pose of its own
     at_rest: float  # [px] what this scatter alone would give for `pixels`
-    likely: float  # [px] the same by all pairs together: cameras that few views leave open have taken up a part of it
+    likely: float  # [px] rms of the likely size: cameras that few views leave open have taken up a part of `pixels`
+    size: BoardMotion  # that is the most likely one by all pairs together
 
     @property
     def is_seen(self) -> bool:
@@ -197,11 +194,6 @@ class PairMotion:
         """True if it is by all pairs together, where the usual one shows more than nothing: few pairs hide it."""
         return self.is_seen or (self.likely > self._enough and self.pixels > self.at_rest)
 
-    def as_random(self, points: Array) -> BoardMotion:
-        """As a random motion of boards with these points (n, 3) [m], roughly: what is begun with."""
-        reach = float(np.sqrt(np.mean(np.sum((points - points.mean(0)) ** 2, axis=1))))
-        return BoardMotion(self.distance / reach, self.distance)
-
     @property
     def _enough(self) -> float:
         return MOVED * max(self.scatter, self.at_rest)
@@ -210,32 +202,23 @@ class PairMotion:
 def motion_between_exposures(refinement: Refinement) -> PairMotion | None:
     """What the pairs say of the board's motion between their exposures; None with fewer than three of them."""
     found = pair_motions(refinement.problem, refinement.model)
-    if len(found.views) < 3:
+    if len(found.views) < LEAST_MOTIONS:
         return None
     noise = float(np.median(np.einsum("nij,nji->n", found.square_px, found.covariance)))
+    size = found.likely_size()
     return PairMotion(
-        float(np.median(np.linalg.norm(found.motion[:, 3:], axis=1))),
-        float(np.median(found.pixels)),
-        found.scatter,
-        float(np.sqrt(noise * found.noise)),
-        found.likely().pixels,
+        distance=float(np.median(np.linalg.norm(found.motion[:, 3:], axis=1))),
+        pixels=float(np.median(found.pixels)),
+        scatter=found.scatter,
+        at_rest=float(np.sqrt(noise * found.noise)),
+        likely=float(np.sqrt(np.mean(np.einsum("nii,i->n", found.square_px, 1.0 / size.weights)))),
+        size=size,
     )
-
-
-@dataclass(frozen=True)
-class PairsJudged:
-    """Which pairs show the board in one place, as cameras that were refined see it."""
-
-    model: StereoModel  # its poses those of the views: of both images together, or of the left one of a pair apart
-    right_poses: dict[int, Pose]  # of the right image alone, in the left camera's axes, for pairs
-    apart: dict[int, str]  # view -> why its two images are not taken for one place
-    bad_images: dict[tuple[int, int], str]  # (view, camera) -> why it cannot be used even alone
-    left_poses: dict[int, Pose] = field(default_factory=dict)  # of the left image alone, for pairs, once judged
 
 
 def judge_pairs(
     observations: Observations, fit: Refinement, apart: Sequence[int], elsewhere: Collection[int] = ()
-) -> PairsJudged:
+) -> Pairs:
     """Compare one place of the board for both images of a pair with a place for each.
 
     One place has six parameters less. What chi-square it costs tells how far the board moved: some of it in every pair,
@@ -271,4 +254,4 @@ def judge_pairs(
     boards = (alone.R_left_board, alone.t_left_board), alone.boards_in_right
     left, right = ({int(v): (one[0][v], one[1][v]) for v in pairs.views} for one in boards)
     model = replace(begun, boards_right=None).placed({v: left[v] for v in {*found, *apart} & set(left)})
-    return PairsJudged(model, right, found, bad, left)
+    return Pairs(model, left, right, found, bad)

@@ -116,23 +116,6 @@ def _over_the_board(nominal: Array, heights: Array) -> Array:
     return found
 
 
-def as_made(refinement: Refinement, nominal: Array, shape: BoardShape) -> Refinement:
-    """The refinement in the likeliest size of its board: with sides that are off by equal and opposite parts.
-
-    The refinement itself keeps the mean square distance from the middle, which gives the longer side more weight.
-    """
-    scale = 1.0 + _growth(nominal, shape)
-    m = refinement.model
-    larger = {name: scale * getattr(m, name) for name in ("t_right_left", "t_left_board", "points")}
-    boards_right = m.boards_right and (m.boards_right[0], scale * m.boards_right[1])
-    return replace(refinement, model=replace(m, boards_right=boards_right, **larger))
-
-
-def _growth(nominal: Array, shape: BoardShape) -> float:
-    d = (nominal - nominal.mean(0))[:, :2]
-    return shape.stretch * (0.5 - float(np.sum(d[:, 1] ** 2) / np.sum(d**2))) if shape.refined else 0.0
-
-
 def on_the_table(nominal: Array, shape: BoardShape) -> Array:
     """(3,) [m] of the world's origin above the table by one declared thickness, in the axes of a board of this shape.
 
@@ -140,8 +123,8 @@ def on_the_table(nominal: Array, shape: BoardShape) -> Array:
     """
     if not shape.refined:
         return np.zeros(3)
-    middle, growth = nominal.mean(0), _growth(nominal, shape)
-    x, y = (growth - side * shape.stretch for side in (0.5, -0.5))  # the middle of `as_made` against its corner 0
+    middle = nominal.mean(0)
+    x, y = -0.5 * shape.stretch, 0.5 * shape.stretch  # of the middle against its corner 0
     return np.array([x * middle[0], y * middle[1], -shape.lift])
 
 

@@ -53,7 +53,6 @@ class CalibrationSource:
                 "board_thickness_m": self.board_thickness,
                 "distortion": self.settings.distortion,
                 "board": self.settings.board,
-                "equal_aspect": self.settings.equal_aspect,
                 "tolerances": dataclasses.asdict(self.settings.tolerances),
             },
         )

@@ -407,10 +407,10 @@ def _write_rig(group: h5py.Group, trajectory: Trajectory) -> None:
     variables |= {name: Variable(getattr(rig, name), *described) for name, described in _RIG_LAYOUT.items()}
     write_variables(group, variables | _variables(trajectory, "calibration"))
     axes = {"allowances": ("allowance", "rig_parameter"), "lens_field": ("camera", "axis", "spline_y", "spline_x")}
-    for name, (data, units, told, attributes) in beyond_model(rig).items():
+    for name, (data, row, attributes) in beyond_model(rig).items():
         dims = axes.get(name, ())
         scales = {d: Variable(np.arange(n), (d,), "1", "index") for d, n in zip(dims, np.shape(data), strict=True)}
-        write_variables(group, {name: Variable(data, dims, units, told, attributes)}, scales)
+        write_variables(group, {name: Variable(data, dims, row.units, row.description, attributes)}, scales)
     group.attrs["world_is_table"] = np.uint8(rig.world_is_table)
     group.attrs["baseline_m"] = rig.baseline
 

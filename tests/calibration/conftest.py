@@ -67,8 +67,7 @@ def corner_view(points, sigma=0.1, image_size=(640, 480)) -> CornerView:
     """What `find_corners` would return of points (n, 2) [px], all of them found and as uncertain."""
     n = len(points)
     covariance = np.tile(sigma**2 * np.eye(2), (n, 1, 1))
-    plain = {"chi_square": np.ones(n), "contrast": np.full(n, 100.0), "blur": np.ones(n), "spacing": 30.0}
-    return CornerView(image_size, points, covariance, np.ones(n, bool), ("",) * n, noise=(1.0, 0.0), **plain)
+    return CornerView(image_size, points, covariance, np.ones(n, bool), ("",) * n)
 
 
 @pytest.fixture(scope="session")

@@ -10,9 +10,10 @@ from numpy.testing import assert_allclose
 from calibration import Board, CalibrationSettings, Terms, calibrate_from_corners, refine_stereo
 from calibration.fit.board_motion import BoardMotion, motions, split
 from calibration.fit.normal_equations import Problem
+from calibration.fit.priors import priors_of
 from calibration.fit.stereo_model import board_basis, moved, predict_pixels
 from calibration.judge.assessment import Grade, stereo_covariance
-from calibration.judge.pairs import likely_motion, motion_between_exposures
+from calibration.judge.pairs import motion_between_exposures
 from calibration.judge.tolerances import BoardTolerances
 from calibration.rig_file import read_rig_file, write_rig
 from calibration.stereo import _observations
@@ -47,38 +48,40 @@ def squared(error, covariance):
     return float(z @ np.linalg.solve(covariance / np.outer(sigma, sigma), z)) / len(z)
 
 
-def test_normal_equations_with_a_motion_have_the_cost_they_say(scene_maker, rng):
+@pytest.mark.parametrize("known", ["motion", "prior"])
+def test_normal_equations_have_the_cost_and_the_gradient_that_they_say(scene_maker, rng, known):
     scene = scene_maker(n_views=3, inner_corners=(4, 3))
+    nominal, moving = scene.board.points, known == "motion"
     observations = scene.observations(0.1, rng)
     observations = observations[np.argsort(observations.view, kind="stable")]
-    deviation = 1e-4 * rng.normal(size=scene.model.points.shape)
-    model = moved(split(scene.model), 1e-4 * rng.normal(size=24), 1e-3 * rng.normal(size=(3, 12)), deviation)
-    problem = Problem(
-        observations,
-        np.linalg.inv(observations.covariance),
-        Terms("k1").stereo_basis(),
-        board_basis(BOARD.points[:12], "warped"),
-        3,
-        motion=BoardMotion(2e-3, 5e-4),
-    )
+    begun, k = (split(scene.model), 12) if moving else (scene.model, 6)
+    deviation = 1e-4 * rng.normal(size=nominal.shape)
+    model = moved(begun, 1e-4 * rng.normal(size=24), 1e-3 * rng.normal(size=(3, k)), deviation)
+    basis, stereo_basis = board_basis(nominal, "warped" if moving else "free"), Terms("k1").stereo_basis()
+    problem = Problem(observations, np.linalg.inv(observations.covariance), stereo_basis, basis, 3)
+    if moving:
+        problem = replace(problem, motion=BoardMotion(2e-3, 5e-4))
+    else:
+        problem = replace(problem, prior=replace(priors_of(scene.model, nominal, basis), weight=3.0))
 
     def cost(model):
         r = observations.pixels - predict_pixels(model, observations)
-        m = motions(model)[0]
-        return np.einsum("mi,mij,mj->", r, problem.weights, r) + np.sum(m**2 * problem.motion.weights)
+        data = np.einsum("mi,mij,mj->", r, problem.weights, r)
+        if moving:
+            return data + np.sum(motions(model)[0] ** 2 * problem.motion.weights)
+        return data + problem.prior.normal(model)[2] + 3.0 * problem.prior.board.normal(model.points)[1]
 
     normal = problem.linearise(model)
     assert_allclose(normal.cost, cost(model), rtol=1e-12)
-    s, k = problem.stereo_basis.shape[1] + 5, 12
+    s = stereo_basis.shape[1] + basis.shape[-1]
     for direction in rng.normal(size=(6, s + 3 * k)):
-        direction[:s] /= np.sqrt(np.diag(normal.shared))
+        direction[:s] /= np.sqrt(np.diag(normal.shared + normal.prior))
         direction[s:] /= np.sqrt(np.concatenate([np.diag(block) for block in normal.own]))
-        shared, poses = direction[:s], direction[s:].reshape(3, k)
-        step = 1e-3
-        there, back = (cost(problem.stepped(model, d * shared, d * poses)) for d in (step, -step))
-        gradient = normal.gain(shared, poses)
+        shared, poses = 1e-3 * direction[:s], 1e-3 * direction[s:].reshape(3, k)
+        there, back = (cost(problem.stepped(model, d * shared, d * poses)) for d in (1.0, -1.0))
         # turns of the motion count to first order: some 1e-3 of it here
-        assert_allclose(-(there - back) / (4 * step), gradient, rtol=5e-3, atol=5e-3 * np.linalg.norm(direction))
+        tolerance = 5e-6 * np.linalg.norm(direction)
+        assert_allclose(-(there - back) / 4, normal.gain(shared, poses), rtol=5e-3, atol=tolerance)
 
 
 @pytest.mark.statistical
@@ -169,8 +172,7 @@ def test_motions_that_no_pair_shows_for_itself_are_in_the_sigma():
         rig = moved_boards.make_rig(100 + seed)
         found = calibrated(rig, 5, seed, shift=0.1e-3, turn=0.1e-3)
         assert found.refinement.problem.motion is None
-        likely = likely_motion(found.refinement)
-        sizes.append(likely.size.shift)
+        sizes.append(motion_between_exposures(found.refinement).size.shift)
         error, places = errors(found, rig)
         C = found.rig.covariance[np.ix_(places, places)]
         by_corners = stereo_covariance(found.refinement)[-6:, -6:]  # and by how the views disagree
@@ -181,8 +183,8 @@ def test_motions_that_no_pair_shows_for_itself_are_in_the_sigma():
     assert 0.5 < everything < 1.5
     assert without > 1.5 * pair
     assert_allclose(np.median(sizes), 0.1e-3, rtol=0.4)
-    at_rest = [likely_motion(calibrated(moved_boards.make_rig(seed), 8, seed).refinement) for seed in range(3)]
-    assert max(one.size.shift for one in at_rest) < 0.02e-3
+    at_rest = (calibrated(moved_boards.make_rig(seed), 8, seed).refinement for seed in range(3))
+    assert max(motion_between_exposures(fit).size.shift for fit in at_rest) < 0.02e-3
 
 
 def test_a_rig_file_keeps_where_the_boards_were(tmp_path):

@@ -76,8 +76,7 @@ def test_a_camera_pushed_by_degrees_in_pairs_that_were_not_synchronised(rig):
 @pytest.mark.statistical
 def test_a_camera_that_was_moved_twice_leaves_three_stretches(rig):
     later = moved_boards.turned(rig, TURN, SHIFT)
-    last = moved_boards.turned(later, 10 * TURN[::-1], SHIFT)
-    found = calibrated([(rig, 8), (later, 6), (last, 5)])
+    found = calibrated([(rig, 8), (later, 6), (moved_boards.turned(later, 10 * TURN[::-1], SHIFT), 5)])
     assert found.apart == tuple(range(8, 19))
     assert told(found)[0].count(" on the cameras stand otherwise") == 2
 

@@ -8,13 +8,12 @@ from numpy.testing import assert_allclose
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from calibration import CalibrationError, Terms, refine_stereo
+from calibration import Terms, refine_stereo
 from calibration.cameras.camera import N_RIG
 from calibration.fit.model_choice import choose_board
 from calibration.fit.normal_equations import Problem, minimise
 from calibration.fit.start import start_stereo
 from calibration.fit.stereo_model import board_basis, moved, predict
-from calibration.judge.assessment import half_set_differences
 from calibration.judge.table_frame import rig_with_covariance, table_pose
 
 FULL = Terms("k1 k2 p1 p2")
@@ -71,27 +70,18 @@ def test_derivatives_agree_with_central_differences(scene_maker, rng):
     o = scene.observations(0.01)
     m, n = scene.model, len(scene.model.points)
     _, d_stereo, d_pose, d_point = predict(m, o)
-    zero = (np.zeros(24), np.zeros((3, 6)), np.zeros((n, 3)))
-
-    def shifted(which, index, h):
-        step = [z.copy() for z in zero]
+    every, of_view, of_point = np.ones((len(o), 1), bool), (o.view == 1)[:, None], (o.point == 5)[:, None]
+    for which, derivative, index, use, h in (
+        *((0, d_stereo[..., i], i, every, 1e-5) for i in range(24)),
+        *((1, d_pose[..., i], (1, i), of_view, 1e-6) for i in range(6)),
+        *((2, d_point[..., i], (5, i), of_point, 1e-6) for i in range(3)),
+    ):
+        step = [np.zeros(24), np.zeros((3, 6)), np.zeros((n, 3))]
         step[which][index] = h
-        return predict(moved(m, *step), o)[0]
-
-    for i in range(24):
-        h = 1e-5
-        numeric = (shifted(0, i, h) - shifted(0, i, -h)) / (2 * h)
+        there, back = (predict(moved(m, *(sign * part for part in step)), o)[0] for sign in (1, -1))
+        numeric = (there - back) / (2 * h)
         # round-off 1e-13 / 1e-5 of pixels of size 500
-        assert_allclose(d_stereo[:, :, i], numeric, atol=1e-6 * max(1, np.abs(numeric).max()))
-    for i in range(6):
-        h = 1e-6
-        numeric = (shifted(1, (1, i), h) - shifted(1, (1, i), -h)) / (2 * h)
-        of_view = (o.view == 1)[:, None]
-        assert_allclose(np.where(of_view, d_pose[:, :, i], 0), numeric, atol=1e-6 * np.abs(numeric).max())
-    for i in range(3):
-        numeric = (shifted(2, (5, i), 1e-6) - shifted(2, (5, i), -1e-6)) / 2e-6
-        of_point = (o.point == 5)[:, None]
-        assert_allclose(np.where(of_point, d_point[:, :, i], 0), numeric, atol=1e-6 * np.abs(numeric).max())
+        assert_allclose(np.where(use, derivative, 0), numeric, atol=1e-6 * max(1, np.abs(numeric).max()))
 
 
 @pytest.mark.parametrize("board", ["flat", "free"])
@@ -163,17 +153,6 @@ def test_the_minimum_is_the_one_that_scipy_finds(scene_maker, rng):
     assert ours <= 2 * other.cost * (1 + 1e-9)
 
 
-def test_the_gradient_vanishes_at_the_minimum(scene_maker, rng):
-    scene = scene_maker()
-    found = refine_stereo(scene.observations(0.02, rng), disturbed(scene, rng), scene.board.points, FULL)
-    normal = found.normal
-    shared, poses = normal.step()
-    gain = normal.gain(shared, poses)
-    assert 0 <= gain < 1e-8 * normal.cost  # what another Newton step could still gain
-    sigma = np.sqrt(np.diag(normal.covariances()[0]))
-    assert np.abs(shared / sigma).max() < 1e-3  # in standard deviations of the parameters
-
-
 @pytest.mark.parametrize(("n_seeds", "tolerance"), [(20, 4.0), pytest.param(200, 4.0, marks=pytest.mark.slow)])
 def test_squared_error_of_the_rig_equals_its_covariance(scene_maker, n_seeds, tolerance):
     scene = scene_maker(n_views=10)
@@ -218,9 +197,7 @@ def test_thickness_of_the_board_moves_the_origin_down_and_couples_it_to_the_tilt
     scene = scene_maker(n_views=8)
     found = refine_stereo(scene.observations(0.02), scene.model, scene.board.points, FULL)
     thin, thick = (rig_with_covariance(found, 0, h, 1.0) for h in (0.0, 20e-3))
-    corner = scene.board.points[:1]
-    on_print = thick.R_left_world @ (corner[0] + [0, 0, 20e-3]) + thick.t_left_world
-    assert_allclose(on_print, thin.R_left_world @ corner[0] + thin.t_left_world, atol=1e-12)
+    assert_allclose(thick.t_left_world, thin.t_left_world - 20e-3 * thin.R_left_world[:, 2], atol=1e-12)
     # by central differences: the same step of the pose, seen through either thickness
     for axis in range(3):
         v = np.zeros(N_RIG)
@@ -255,7 +232,6 @@ def test_rejection_that_does_not_settle_leaves_a_fit_of_the_points_that_it_names
     found = refine_stereo(o, disturbed(scene, rng), scene.board.points, FULL, reject_beyond=1.0)
     assert len(found.problem.observations) == found.kept.sum()
     assert np.array_equal(found.problem.observations.pixels, found.observations.pixels[found.kept])
-    assert np.isfinite(half_set_differences(found, 1.0))
 
 
 @pytest.mark.parametrize("aspect", [0.5, 1.33])
@@ -267,10 +243,9 @@ def test_pixels_that_are_not_square_are_no_hindrance_to_the_start(scene_maker, r
     scene = replace(scene, model=replace(scene.model, cameras=cameras))
     o = scene.observations(0.02, rng)
     sizes = cameras[0].image_size, cameras[1].image_size
-    begun = start_stereo(o, scene.board.points, sizes, [("left", "right")] * 10)
-    start = begun.model
-    assert begun.agrees.all()
-    found = refine_stereo(o, start, scene.board.points, FULL)
+    begun, _, _ = start_stereo(o, scene.board.points, sizes, [("left", "right")] * 10)
+    assert not begun.apart
+    found = refine_stereo(o, begun.model, scene.board.points, FULL)
     assert_allclose(found.model.cameras[0].fy / found.model.cameras[0].fx, cameras[0].fy / cameras[0].fx, rtol=2e-3)
 
 
@@ -279,10 +254,9 @@ def test_a_bent_board_is_chosen_and_recovered(scene_maker, rng):
     basis = board_basis(flat.board.points, "warped")
     scene = scene_maker(n_views=12, deviation=basis @ np.array([0.15e-3, 0.05e-3, -0.1e-3, 0.0, 0.0]))
     o = scene.observations(0.02, rng)
-    begun = start_stereo(o, scene.board.points, ((512, 512), (512, 512)), [("left", "right")] * 12)
-    start = begun.model
-    assert begun.agrees.all()
-    found, table = choose_board(o, start, scene.board.points, ("flat", "warped"))
+    begun, _, _ = start_stereo(o, scene.board.points, ((512, 512), (512, 512)), [("left", "right")] * 12)
+    assert not begun.apart
+    found, table = choose_board(o, begun.model, scene.board.points, (Terms(), Terms(board="warped")))
     assert found.terms.board == "warped"
     assert_allclose(found.model.points[:, 2], scene.model.points[:, 2], atol=5e-6)  # 0.02 px of 0.25 mm, 24 images each
     assert [c.terms.board for c in table] == ["warped"]  # the flat one leaves far more: not worth views left out
@@ -291,7 +265,7 @@ def test_a_bent_board_is_chosen_and_recovered(scene_maker, rng):
 def test_a_flat_board_stays_flat_and_a_lens_without_distortion_has_none_within_its_sigma(scene_maker, rng):
     scene = scene_maker(distortion=False)
     o = scene.observations(0.02, rng)
-    found, _ = choose_board(o, scene.model, scene.board.points, boards=("flat", "warped"))
+    found, _ = choose_board(o, scene.model, scene.board.points, (Terms(), Terms(board="warped")))
     assert found.terms.board == "flat"
     distortion = np.concatenate([camera.distortion for camera in found.model.cameras])
     of_distortion = [*range(4, 9), *range(13, 18)]
@@ -312,15 +286,3 @@ def test_errors_common_to_a_view_inflate_the_covariance(scene_maker, rng):
     noisy = refine_stereo(replace(o, pixels=pixels), scene.model, scene.board.points, FULL).disagreement
     assert 0.4 < quiet < 1.8  # 16 views: scatter of about 0.25
     assert noisy > 1.5 * quiet
-
-
-def test_equal_aspect_ties_the_focal_lengths(scene_maker, rng):
-    scene = scene_maker()
-    found = refine_stereo(scene.observations(0.02), scene.model, scene.board.points, Terms("k1", equal_aspect=True))
-    assert found.model.cameras[0].fx == pytest.approx(found.model.cameras[0].fy, abs=1e-9)
-
-
-def test_too_few_views_are_an_error_that_says_so(scene_maker):
-    scene = scene_maker(n_views=2)
-    with pytest.raises(CalibrationError, match="at least 3"):
-        start_stereo(scene.observations(0.02), scene.board.points, ((512, 512), (512, 512)), [("left", "right")] * 2)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from calibration import Board, CornerView, calibrate_stereo, find_corners
+from calibration import Board, CornerView, find_corners
 from calibration.kit.stuck_pixels import blind_pixels, repair, repaired_views, stuck_pixels
 from disctrack.calibrate.views import calibrate_views, find_views
 
@@ -90,7 +90,7 @@ def test_pixels_that_do_not_see_are_named_in_views_and_cost_no_corner(sample_cli
 
 @pytest.mark.statistical
 def test_pixels_that_do_not_see_are_replaced_in_colour_views_and_in_arrays(sample_clip, rng):
-    views, notes = {}, {}
+    notes = {}
     for side in ("left", "right"):
         files = sorted((sample_clip / "calibration" / side).glob("*.png"))
         grey = [cv2.imread(str(file), cv2.IMREAD_UNCHANGED) for file in files]
@@ -109,7 +109,4 @@ def test_pixels_that_do_not_see_are_replaced_in_colour_views_and_in_arrays(sampl
             changed = np.flatnonzero(view[..., 1] != was[..., 1])
             assert set(changed) <= set(where)
             assert np.median(np.abs(view[..., 1].astype(int) - true).flat[changed]) < 10
-        views[side] = seen
-    found = calibrate_stereo(views["left"], views["right"], Board((9, 6), 6e-3))
-    assert [text for text in found.warnings if "show one value" in text] == list(notes.values())
     assert all(20 <= int(note.split()[2]) <= 50 for note in notes.values())

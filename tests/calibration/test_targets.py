@@ -13,7 +13,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from calibration import BoardNotFound, CalibrationError, CornerView
-from calibration.board import chessboard, search
+from calibration.board import chessboard
 from calibration.board.charuco import find_charuco
 from calibration.board.search import board_size, located, other_board
 from calibration.board.target import Board, CharucoBoard, Target, target_of
@@ -229,63 +229,18 @@ def test_a_target_that_is_not_wholly_declared_is_refused_by_its_key(declared, sa
         read_recording(tmp_path)
 
 
-@pytest.fixture
-def searched(monkeypatch):
-    """Sizes (height, width) of the images in which a board of any size is looked for."""
-    shapes = []
-    theirs = cv2.findChessboardCornersSBWithMeta
-    monkeypatch.setattr(
-        search.cv2,
-        "findChessboardCornersSBWithMeta",
-        lambda image, *more: shapes.append(image.shape) or theirs(image, *more),
-    )
-    return shapes
-
-
 @pytest.mark.statistical
-def test_another_board_is_looked_for_in_few_small_images_and_only_where_the_declared_one_is_not(board_drawer, searched):
-    camera = Camera(2800.0, 2800.0, 500.0, 370.0, (0.0,) * 5, (1000, 750))
-    board, R = Board((9, 6), 8e-3), cv2.Rodrigues(np.array([3.0, 0.2, 0.1]))[0]
-    image = board_drawer(camera, R, np.array([-0.03, 0.02, 0.36]), board, rng=np.random.default_rng(1))
-    told = other_board([image] * 10, [True] * 10, Board((10, 7), 8e-3))
-    assert told == "10 of 10 images looked at show 9 x 6: inner_corners = [9, 6]"
-    assert searched == [(600, 800)] * 4
-    blank = np.full_like(image, 128)
-    # the images in which the declared board is are not looked at, and half of them having it is enough
-    assert not other_board([image] * 4 + [blank] * 5, [False] * 4 + [True] * 5, Board((10, 7), 8e-3))
-    assert len(searched) == 12  # four quickly, and again thoroughly
-    assert not other_board([image] * 10, [False] * 5 + [True] * 5, Board((10, 7), 8e-3))
-    assert len(searched) == 12
-
-
-@pytest.mark.statistical
-def test_images_of_another_board_are_not_searched_to_the_end(board_drawer, monkeypatch):
+def test_images_of_another_board_are_told_by_its_size(board_drawer):
     camera, R = Camera(700.0, 700.0, 160.0, 120.0, (0.0,) * 5, (320, 240)), cv2.Rodrigues(np.array([3.0, 0.2, 0.1]))[0]
     image = board_drawer(camera, R, np.array([-0.03, 0.02, 0.3]), Board((7, 5), 8e-3), rng=np.random.default_rng(1))
-    asked, find = [], search.find_target
-    monkeypatch.setattr(search, "find_target", lambda *what: asked.append(what) or find(*what))
-    views = located([image] * 16, Board((8, 5), 8e-3), 1)
-    assert len(asked) == search.VIEWS_TRIED
+    declared = Board((8, 5), 8e-3)
+    views = located([image] * 16, declared, 1)
     assert all("8 of 8 images looked at show 7 x 5: inner_corners = [7, 5]" in view.reason for view in views)
-
-
-@pytest.mark.parametrize(
-    ("sizes", "chosen"),
-    [
-        (9 * [(9, 6)] + 3 * [(9, 7)], (9, 6)),  # the rim passes for one more line in a few
-        (3 * [(8, 6)] + 4 * [(9, 6)] + 5 * [None], (9, 6)),  # a hand on the board in some
-        (12 * [None], None),
-        (11 * [None] + [(10, 6)], None),  # seen once
-    ],
-)
-def test_the_board_is_the_size_that_most_corners_are_on(monkeypatch, sizes, chosen):
-    images = [np.full((4, 4), i, np.uint8) for i in range(len(sizes))]
-    monkeypatch.setattr(search, "board_in", lambda grey, thorough: sizes[grey[0, 0]])
-    refused = BoardNotFound("no board")
-    shown = lambda grey, size: object() if sizes[grey[0, 0]] and size == chosen else refused  # noqa: E731
-    monkeypatch.setattr(search, "find_corners", shown)
-    n = sum(size is not None for size in sizes) if chosen else 0
-    assert board_size(images) == (chosen, n)
+    # half of the images having the declared one is enough
+    assert not other_board([image] * 10, [False] * 5 + [True] * 5, declared)
+    blank = np.full_like(image, 128)
+    assert board_size([image, image, blank]) == ((7, 5), 2)
+    assert board_size([blank] * 3) == (None, 0)
 
 
 def test_corners_of_which_whole_lines_were_passed_over_are_no_board(rng):

@@ -65,9 +65,6 @@ def corner_view(camera, points, rng):
         np.tile(CORNER_PX**2 * np.eye(2), (n, 1, 1)),
         np.ones(n, bool),
         ("",) * n,
-        *np.ones((3, n)),
-        spacing=30.0,
-        noise=(0.6, 0.02),
     )
 
 

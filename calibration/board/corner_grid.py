@@ -8,11 +8,11 @@ the corners scatter about it is their error.
 import cv2
 import numpy as np
 
+from calibration.board.target import LEAST_POINTS
 from calibration.kit.arrays import Array, Mask
 
 WINDOW = 0.35  # of a square: half width of the window of the saddle point
 MANY_PIXELS = 4e6
-LEAST_SIGMA = 0.05  # px, of a corner that no model fits
 
 
 def saddle_points(grey: Array, points: Array, spacing: float) -> Array:
@@ -32,6 +32,21 @@ def saddle_points(grey: Array, points: Array, spacing: float) -> Array:
     return found.astype(float)
 
 
+def local_axes(points: Array, ok: Mask, inner_corners: tuple[int, int]) -> Array:
+    """Image of one step along i and along j at every corner, (n, 2 axes, 2) [px], from the view's homography."""
+    board, use = _indices(inner_corners), ok if ok.sum() >= LEAST_POINTS else np.ones(len(points), bool)
+    H = np.asarray(cv2.findHomography(board[use], points[use])[0], float)
+    image = np.column_stack([board, np.ones(len(board))]) @ H.T
+    places, depth = image[:, :2] / image[:, 2:], image[:, 2:]
+    return np.stack([(H[:2, axis] - places * H[2, axis]) / depth for axis in (0, 1)], axis=1)
+
+
+def _indices(inner_corners: tuple[int, int]) -> Array:
+    columns, rows = inner_corners
+    j, i = np.divmod(np.arange(columns * rows), columns)
+    return np.stack([i, j], axis=-1).astype(float)
+
+
 def degree_for(n: int, most: int) -> int:
     """Of a polynomial in two coordinates by n corners: three for each of its coefficients."""
     return max(d for d in range(most + 1) if 3 * (d + 1) * (d + 2) <= 2 * n or d == 0)
@@ -41,11 +56,11 @@ def smooth_grid(points: Array, inner_corners: tuple[int, int], seen: Mask) -> tu
     """Where the other corners put each corner (n, 2) [px], and the sigma per axis of the corners' scatter about it.
 
     A homography and, for the lens, a low polynomial of the two indices; few bad corners do not move them, and those
-    not `seen` (n,) do not count.
+    not `seen` (n,) do not count, unless too few are.
     """
     columns, rows = inner_corners
-    j, i = np.mgrid[:rows, :columns]
-    board = np.stack([i.ravel(), j.ravel()], axis=-1).astype(float)
+    seen = seen if seen.sum() >= LEAST_POINTS else np.ones(len(points), bool)
+    board = _indices(inner_corners)
     H, _ = cv2.findHomography(board[seen], points[seen], cv2.LMEDS)
     if H is None:
         H, _ = cv2.findHomography(board[seen], points[seen])
@@ -64,4 +79,4 @@ def smooth_grid(points: Array, inner_corners: tuple[int, int], seen: Mask) -> tu
         scale = float(np.median(distance[seen])) / 1.1774 + 1e-9  # median of a Rayleigh distribution
         weight = np.clip(1 - (distance / (4.7 * scale)) ** 2, 1e-6, None) ** 2 * seen
     n = int(seen.sum())
-    return plane + A @ coefficients, scale * float(np.sqrt(n / (n - A.shape[1])))
+    return plane + A @ coefficients, scale * float(np.sqrt(n / max(n - A.shape[1], 1)))
