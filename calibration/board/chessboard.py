@@ -239,11 +239,11 @@ def _saddles(grey: Array, points: Array, axes: Array) -> Array:
     NaN where they do not lie in the image; axes (n, 2, 2) of a square.
     """
     at = points[:, None] + 0.3 * np.array([[1.0, 1.0], [-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0]]) @ axes
-    inside = ((at >= 0) & (at < np.array(grey.shape[::-1]) - 1)).all((1, 2))
-    x, y = np.rint(np.where(inside[:, None, None], at, 0.0)).astype(int).transpose(2, 0, 1)
+    inside = np.all((at >= 0) & (at < np.array(grey.shape[::-1]) - 1), axis=(1, 2), keepdims=True)
+    x, y = np.rint(np.where(inside, at, 0.0)).astype(int).transpose(2, 0, 1)
     a, b = grey[y, x].reshape(-1, 2, 2).transpose(1, 0, 2)
     lighter, darker = a.min(axis=1) - b.max(axis=1), b.min(axis=1) - a.max(axis=1)
-    return np.where(inside, np.where(lighter > 0, lighter, -np.maximum(darker, 0.0)), np.nan)
+    return np.where(inside[:, 0, 0], np.where(lighter > 0, lighter, -np.maximum(darker, 0.0)), np.nan)
 
 
 __all__ = ["BoardNotFound", "CornerView", "board_in", "board_orders", "find_corners", "grey_values"]

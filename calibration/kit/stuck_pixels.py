@@ -4,7 +4,7 @@ A dot or a corner is fitted to a thousand pixels; one that is off by half the ra
 pulls it by more than the noise of all others. Cameras replace such pixels by their neighbours; many do not.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
@@ -20,28 +20,13 @@ PASSED = 0.3  # of the range, by which the light around a pixel changed: squares
 OFTEN = 0.3  # of the views, in which such a pixel differs from its neighbours
 
 
-def stuck_pixels(images: Sequence[Image] | NDArray) -> Mask | None:
-    """(height, width) True where a pixel is stuck in all grey images (n, height, width); None where none is."""
-    return _steady(images, lambda off, around, scale: off == len(images))
+def stuck_pixels(images: Sequence[Image] | NDArray, of_board: bool = False) -> Mask | None:
+    """(height, width) True where a pixel of grey images (n, height, width) keeps its value and does not see.
 
-
-def blind_pixels(views: Sequence[Image] | NDArray) -> Mask | None:
-    """(height, width) True where a pixel keeps its value while the light around it does not; None where none does.
-
-    Of views of a board (n, height, width), grey: its squares are as dark as a dead pixel and as light as a hot one, so
-    that none differs from its neighbours in every view. It does OFTEN; a pixel of what rests behind the board may be
-    left as it is by an edge that comes near.
-    """
-    return _steady(views, lambda off, around, scale: (around > PASSED * scale) & (off > OFTEN * len(views)))
-
-
-def _steady(
-    images: Sequence[Image] | NDArray, does_not_see: Callable[[NDArray, NDArray, float], NDArray]
-) -> Mask | None:
-    """Pixels that keep their value and do not see; None without any, or where so many are that they are the scene.
-
-    does_not_see : by the number of images in which a pixel is off its neighbours, by how much the light around it
-        changes, and by the range of all grey values
+    That is one that is off its neighbours in all images. Of views of a board its squares are as dark as a dead pixel
+    and as light as a hot one, so that none differs from its neighbours in every view: it does OFTEN, and while the
+    light around it changes; a pixel of what rests behind the board may be left as it is by an edge that comes near.
+    None without any, or where so many are that they are the scene.
     """
     if len(images) < MIN_IMAGES:
         return None
@@ -56,14 +41,16 @@ def _steady(
         np.minimum(around[0], level, out=around[0])
         np.maximum(around[1], level, out=around[1])
         off += np.abs(image.astype(np.int32) - level) > OFF * scale
-    found = (high.astype(np.int32) - low <= STEADY * scale) & does_not_see(
-        off, around[1].astype(np.int32) - around[0], scale
-    )
+    blind = off == len(images)
+    if of_board:
+        changed = around[1].astype(np.int32) - around[0]
+        blind = (changed > PASSED * scale) & (off > OFTEN * len(images))
+    found = blind & (high.astype(np.int32) - low <= STEADY * scale)
     return found if 0 < found.sum() <= MOST * found.size else None
 
 
 def repaired_views(views: Sequence[NDArray], camera: str) -> tuple[list[NDArray], str]:
-    """One camera's views of a board with `blind_pixels` replaced in copies, and what is to be said of it ("": none).
+    """One camera's views of a board with such pixels replaced in copies, and what is to be said of it ("": none).
 
     views : grey (height, width) or colour (height, width, channels), of one size and type; each channel by itself.
     Of a sensor under a colour filter each value is mixed from several pixels, and a blind one spreads a little.
@@ -74,7 +61,7 @@ def repaired_views(views: Sequence[NDArray], camera: str) -> tuple[list[NDArray]
     blind, mended = np.zeros(first.shape[:2], bool), list(views)
     for channel in range(1 if first.ndim == 2 else first.shape[2]):
         one = [np.ascontiguousarray(view if view.ndim == 2 else view[..., channel]) for view in views]
-        mask = blind_pixels(one)
+        mask = stuck_pixels(one, of_board=True)
         if mask is None:
             continue
         if not blind.any():

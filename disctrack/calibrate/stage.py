@@ -1,19 +1,17 @@
 """Calibration from files to a file: where the views come from, reuse of a rig, the rig file, the pictures."""
 
 import dataclasses
-import io
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import h5py
 
 from calibration import CalibrationSettings, StereoCalibration, StereoRig
 from calibration.board import corner_fit
 from calibration.board.search import Progress
-from calibration.board.target import Board, Target
+from calibration.board.target import Target
 from calibration.fit import normal_equations
 from calibration.rig_file import CalibrationRecord, read_rig, read_rig_file, write_rig
 from disctrack.analyse.declaration import Boards
@@ -41,6 +39,11 @@ class CalibrationSource:
     board_thickness: float  # [m]
     settings: CalibrationSettings
 
+    def calibrated(self, progress: Progress | None) -> tuple[StereoCalibration, tuple[str, ...]]:
+        """`calibrate_views` from it."""
+        table = self.table_view, self.board_thickness
+        return calibrate_views(self.views, self.board, *table, self.settings, progress)
+
     @property
     def provenance(self) -> Provenance:
         """Reads the views' content."""
@@ -48,7 +51,7 @@ class CalibrationSource:
             recording=self.name,
             inputs={"calibration views": self.views.sha256()},
             settings={
-                **_as_settings(self.board),
+                **self.board.described(),
                 "table_view": self.table_view,
                 "board_thickness_m": self.board_thickness,
                 "distortion": self.settings.distortion,
@@ -56,12 +59,6 @@ class CalibrationSource:
                 "tolerances": dataclasses.asdict(self.settings.tolerances),
             },
         )
-
-
-def _as_settings(target: Target) -> dict[str, Any]:
-    if isinstance(target, Board):
-        return {"inner_corners": list(target.inner_corners), "square_m": target.square}
-    return target.described()
 
 
 @dataclass(frozen=True)
@@ -95,11 +92,7 @@ def calibrate_recording(
     recording: Recording, settings: CalibrationSettings | None = None, progress: Progress | None = None
 ) -> tuple[StereoCalibration, tuple[str, ...]]:
     """`calibrate_views` with the views, board and table that a recording names. RecordingError without them."""
-    return _calibrated(source_of(recording, settings or CalibrationSettings()), progress)
-
-
-def _calibrated(s: CalibrationSource, progress: Progress | None) -> tuple[StereoCalibration, tuple[str, ...]]:
-    return calibrate_views(s.views, s.board, s.table_view, s.board_thickness, s.settings, progress)
+    return source_of(recording, settings or CalibrationSettings()).calibrated(progress)
 
 
 def boards_in(rig_file: Path, recording: Recording) -> Boards | None:
@@ -160,16 +153,14 @@ def calibrate_into(
         "warnings": [*problems, *found.warnings],
     }
     with whole_file(path, suffix=".h5") as part:
-        write_rig(part, found)
-        buffer = io.BytesIO(part.read_bytes())  # a disk that fills up fails in one plain write, not inside HDF5
-        with h5py.File(buffer, "r+") as file:
-            file.attrs["fingerprint"] = provenance.fingerprint
-            file.attrs["inputs_sha256"] = json.dumps(dict(provenance.inputs))
-            file.attrs["settings"] = json.dumps(dict(provenance.settings))
-            file.attrs["software_version"] = provenance.version
-            file.attrs["summary"] = json.dumps(told)
-            file.attrs["complete"] = 1
-        part.write_bytes(buffer.getbuffer())
+        attributes = {
+            "fingerprint": provenance.fingerprint,
+            "inputs_sha256": json.dumps(dict(provenance.inputs)),
+            "settings": json.dumps(dict(provenance.settings)),
+            "software_version": provenance.version,
+            "summary": json.dumps(told),
+        }
+        write_rig(part, found, attributes)
     files = [path]
     if figures:
         from disctrack.calibrate.figures import FIGURES
@@ -220,4 +211,4 @@ def _calibrate(source: CalibrationSource) -> tuple[StereoCalibration, tuple[str,
                 advance(now - done)
                 done = now
 
-        return _calibrated(source, report)
+        return source.calibrated(report)

@@ -6,7 +6,7 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from calibration import Board, CornerView, find_corners
-from calibration.kit.stuck_pixels import blind_pixels, repair, repaired_views, stuck_pixels
+from calibration.kit.stuck_pixels import repair, repaired_views, stuck_pixels
 from disctrack.calibrate.views import calibrate_views, find_views
 
 
@@ -63,7 +63,7 @@ def test_pixels_that_do_not_see_are_named_in_views_and_cost_no_corner(sample_cli
     views = {}
     for side in ("left", "right"):
         views[side] = [cv2.imread(str(file), cv2.IMREAD_UNCHANGED) for file in sorted((folder / side).glob("*.png"))]
-        assert blind_pixels(views[side]) is None
+        assert stuck_pixels(views[side], of_board=True) is None
         where[side] = rng.permutation(views[side][0].size)[:50]
         (tmp_path / side).mkdir()
         for i, view in enumerate(views[side]):
