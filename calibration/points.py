@@ -67,24 +67,18 @@ def _view(
 ) -> CornerView | BoardNotFound:
     if points is None:
         return _NOT_SEEN
-    pixels = np.asarray(points, float)
-    n = len(board.points)
-    pixels = pixels.reshape(len(pixels), 2) if pixels.shape == (len(pixels), 1, 2) else pixels
-    if pixels.shape != (n, 2):
-        columns, rows = board.inner_corners
+    pixels, n, size = np.asarray(points, float), len(board.points), np.array(image_size)
+    if pixels.shape not in ((n, 2), (n, 1, 2)):
         raise CalibrationError(
-            f"{where}: corners of shape {pixels.shape}, expected ({n}, 2) for {columns} x {rows} inner corners; a view "
-            "with a corner missing must be left out (None)"
+            f"{where}: corners of shape {pixels.shape}, expected ({n}, 2) for {board}; a view with a corner missing "
+            "must be left out (None)"
         )
-    bad = np.flatnonzero(~np.isfinite(pixels).all(axis=1))
+    pixels = pixels.reshape(n, 2)
+    bad = np.flatnonzero(~((pixels >= -0.5) & (pixels <= size - 0.5)).all(axis=1))
     if len(bad):
-        raise CalibrationError(f"{where}: corner {bad[0]} is {pixels[bad[0]]}: leave the view out (None), or mend it")
-    size = np.array(image_size)
-    outside = np.flatnonzero(((pixels < -0.5) | (pixels > size - 0.5)).any(axis=1))
-    if len(outside):
-        x, y = pixels[outside[0]]
+        x, y = pixels[bad[0]]
         raise CalibrationError(
-            f"{where}: corner {outside[0]} at ({x:.1f}, {y:.1f}) lies outside the image of {size[0]} x {size[1]} px; "
-            "are width and height, or x and y, exchanged?"
+            f"{where}: corner {bad[0]} at ({x:.1f}, {y:.1f}) does not lie in the image of {size[0]} x {size[1]} px: "
+            "leave the view out (None), or mend it; are width and height, or x and y, exchanged?"
         )
     return CornerView(image_size, pixels, np.tile(sigma**2 * np.eye(2), (n, 1, 1)), np.ones(n, bool), ("",) * n)

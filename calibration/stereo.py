@@ -17,7 +17,7 @@ from calibration.fit.pairing import Names, Pairs, Views, count_once
 from calibration.fit.refinement import Refinement
 from calibration.fit.start import MIN_VIEWS, start_stereo
 from calibration.fit.stereo_model import BOARD_MODELS, RICHEST, Observations, Terms
-from calibration.judge.assessment import Assessment, Judged, assess, stereo_covariance
+from calibration.judge.assessment import Assessment, assess, stereo_covariance
 from calibration.judge.camera_moved import camera_moved, zoomed
 from calibration.judge.pairs import gradients_by_motion
 from calibration.judge.table_frame import rig_with_covariance
@@ -235,11 +235,14 @@ def calibrate_from_corners(
     _require_fitted(fit, rejected | fit.lost, apart, wide, table_view)
     report("judging")
     rejected = dict(sorted((rejected | fit.lost).items()))
-    judged, shape, shape_note = _judged(fit, board, shapes, settings, table_view, board_thickness)
-    assessment = assess(replace(judged, wide=wide))
+    rigs, shape, shape_note = _rigs(fit, board, shapes, settings, table_view, board_thickness)
+    refinement = fit.refinement
+    chosen = next(row for row in reversed(fit.candidates) if row.terms == refinement.terms)
+    inflation = max(refinement.disagreement, 1.0)
+    assessment = assess(refinement, chosen, *rigs, table_view, inflation, fit.motion, wide)
     return StereoCalibration(
-        rig=judged.rig_with_board,
-        refinement=judged.refinement,
+        rig=rigs[1],
+        refinement=refinement,
         board=board,
         settings=settings,
         table_view=table_view,
@@ -271,21 +274,21 @@ def _begin(views: Views, board: Target, names: Names) -> tuple[Pairs, list[str]]
     return start, [*notes, _choice_of_origin(board)]
 
 
-def _judged(
+def _rigs(
     fit: JointFit,
     board: Target,
     shapes: tuple[str, ...],
     settings: CalibrationSettings,
     table_view: int | None,
     board_thickness: float,
-) -> tuple[Judged, BoardShape, list[str]]:
-    """The rig with its covariance, the board's shape, and a warning where it has another one than it was given.
+) -> tuple[tuple[StereoRig, StereoRig], BoardShape, list[str]]:
+    """The rig by the views alone and with what the board may be off by; the board's shape, and a warning if it is odd.
 
     shapes : that the board's points tell
     """
-    inflation = max(fit.refinement.disagreement, 1.0)
-    shape = board_shape(fit.refinement, board.points, inflation)
     refinement, note = fit.refinement, []
+    inflation = max(refinement.disagreement, 1.0)
+    shape = board_shape(refinement, board.points, inflation)
     covariance = stereo_covariance(refinement, gradients_by_motion(refinement))
     if refinement.terms.board in shapes:
         left_out, sigmas = shape_left_out(refinement, board.points, shapes, inflation)
@@ -294,8 +297,7 @@ def _judged(
     rig = rig_with_covariance(refinement, table_view, board_thickness, inflation, covariance, origin)
     rig = replace(rig, lens_field=fit.lens.field if fit.lens else None)
     with_board = with_tolerances(rig, board.points, table_view, board_thickness, settings.tolerances, shape)
-    judged = Judged(refinement, fit.candidates, rig, with_board, table_view, inflation, fit.motion)
-    return judged, shape, note
+    return (rig, with_board), shape, note
 
 
 def _require_fitted(

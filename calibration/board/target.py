@@ -73,12 +73,9 @@ class Board(Target):
     square: float  # side of a square [m]
 
     def __post_init__(self) -> None:
-        counts = tuple(int(n) for n in self.inner_corners)
-        if len(counts) != 2 or min(counts) < 3:
-            raise CalibrationError(f"a chessboard needs at least 3 x 3 inner corners, got {self.inner_corners}")
+        object.__setattr__(self, "inner_corners", _counts(self.inner_corners, 3, "inner corners of a chessboard"))
         if not (np.isfinite(self.square) and self.square > 0):
             raise CalibrationError(f"the side of a square must be positive, got {self.square} m")
-        object.__setattr__(self, "inner_corners", counts)
 
     @property
     def points(self) -> Array:
@@ -148,7 +145,7 @@ class CharucoBoard(Target):
 def _counts(given: Any, least: int, what: str) -> tuple[int, int]:
     counts = tuple(int(n) for n in given)
     if len(counts) != 2 or min(counts) < least:
-        raise CalibrationError(f"{what}: two whole numbers of at least {least} are needed, got {given}")
+        raise CalibrationError(f"{what}: at least {least} x {least} are needed, got {given}")
     return counts[0], counts[1]
 
 

@@ -53,13 +53,13 @@ def fit_lens_field(refinement: Refinement, nominal: Array) -> FieldFit | None:
     if len(views) < GOOD_VIEWS:
         return None
     coarse, finer = _grid(refinement, CELLS), _grid(refinement, 2 * CELLS)
-    priors = [coarse.precision(sigma) for sigma in PRIORS_PX]
+    priors = [_precision(coarse, sigma) for sigma in PRIORS_PX]
     left = refinement.unexplained_sigma**2
     for _ in range(2):  # once more with the noise that the field leaves
         gain, error, left = _tried(refinement, used, coarse, priors, left)
     if gain < BETTER * error or gain < LEAST_GAIN:
         return None
-    both = [finer.precision(small, coarse, large) for large in PRIORS_PX for small in FINER_PX]
+    both = [_precision(finer, small, coarse, large) for large in PRIORS_PX for small in FINER_PX]
     field = _likeliest(refinement, used, finer, both, left)
     o = refinement.observations
     moved = np.stack([field.displacement(o.pixels, camera) for camera in (0, 1)])[o.camera, np.arange(len(o))]
@@ -69,33 +69,27 @@ def fit_lens_field(refinement: Refinement, nominal: Array) -> FieldFit | None:
     return FieldFit(field, again, rms, gain)
 
 
-@dataclass(frozen=True)
-class _Grid:
-    """Of splines over both images."""
-
-    spacing: float  # [px]
-    shape: tuple[int, int]
-
-    def precision(self, sigma: float, coarser: _Grid | None = None, of_coarser: float = 0.0) -> Array:
-        """Inverse covariance (ny nx, ny nx) of an axis' coefficients [px^-2].
-
-        Independent ones of sigma [px]; and beside them those of a grid of twice the spacing, each a sum of these
-        splines. So what varies within a few cells is small, and nought where no corner lies.
-        """
-        n = self.shape[0] * self.shape[1]
-        covariance = sigma**2 * np.eye(n)
-        if coarser is not None:
-            rows, columns = (_two_scales(few, many) for few, many in zip(coarser.shape, self.shape, strict=True))
-            onto = np.kron(rows, columns)
-            covariance += of_coarser**2 * onto @ onto.T
-        return np.asarray(np.linalg.inv(covariance), np.float64)
-
-
-def _grid(refinement: Refinement, cells: int) -> _Grid:
-    """With so many cells along the longer side of the images."""
+def _grid(refinement: Refinement, cells: int) -> LensField:
+    """A field of nought with so many cells along the longer side of the images."""
     size = np.array([camera.image_size for camera in refinement.model.cameras]).max(0)
     spacing = float(size.max()) / cells
-    return _Grid(spacing, (int(np.ceil(size[1] / spacing)) + 3, int(np.ceil(size[0] / spacing)) + 3))
+    return LensField(
+        np.zeros((2, 2, int(np.ceil(size[1] / spacing)) + 3, int(np.ceil(size[0] / spacing)) + 3)), spacing
+    )
+
+
+def _precision(grid: LensField, sigma: float, coarser: LensField | None = None, of_coarser: float = 0.0) -> Array:
+    """Inverse covariance (ny nx, ny nx) of an axis' coefficients [px^-2].
+
+    Independent ones of sigma [px]; and beside them those of a grid of twice the spacing, each a sum of these splines.
+    So what varies within a few cells is small, and nought where no corner lies.
+    """
+    shape = grid.coefficients.shape[2:]
+    covariance = sigma**2 * np.eye(shape[0] * shape[1])
+    if coarser is not None:
+        onto = np.kron(*map(_two_scales, coarser.coefficients.shape[2:], shape))
+        covariance += of_coarser**2 * onto @ onto.T
+    return np.asarray(np.linalg.inv(covariance), np.float64)
 
 
 def _two_scales(few: int, many: int) -> Array:
@@ -109,7 +103,7 @@ def _two_scales(few: int, many: int) -> Array:
 
 
 def _tried(
-    refinement: Refinement, used: Observations, grid: _Grid, priors: list[Array], extra: float
+    refinement: Refinement, used: Observations, grid: LensField, priors: list[Array], extra: float
 ) -> tuple[float, float, float]:
     """A field on a grid, under that of the priors (precisions) with which views left out are met best.
 
@@ -117,7 +111,7 @@ def _tried(
     returns : part of the chi-square of views left out that the field takes away, its error, and `extra` as it leaves it
     """
     squares = np.stack(list(_squares(refinement, used, grid, extra)))
-    n_field, views = 4 * grid.shape[0] * grid.shape[1], np.arange(len(squares))
+    n_field, views = grid.coefficients.size, np.arange(len(squares))
     chi_square = np.zeros((1 + len(priors), len(views)))  # of each view, left out; without a field first
     for fold in range(FOLDS):
         test = views[fold::FOLDS]
@@ -136,26 +130,28 @@ def _tried(
     return float(gained[best].mean() / mean), float(error / mean), left
 
 
-def _likeliest(refinement: Refinement, used: Observations, grid: _Grid, priors: list[Array], extra: float) -> LensField:
+def _likeliest(
+    refinement: Refinement, used: Observations, grid: LensField, priors: list[Array], extra: float
+) -> LensField:
     """The field under that of the priors (precisions) under which all corners are likeliest; the others as above."""
     total: Array = reduce(np.add, _squares(refinement, used, grid, extra))
-    n_field = 4 * grid.shape[0] * grid.shape[1]
+    n_field = grid.coefficients.size
     best, likeliest = np.zeros(n_field), -np.inf
     for prior in priors:
         solution, volume = _solved(total, n_field, prior)
         likelihood = total[:-1, -1] @ solution + 4 * np.linalg.slogdet(prior)[1] - volume
         if likelihood > likeliest:
             best, likeliest = solution[-n_field:], likelihood
-    return LensField(best.reshape(2, 2, *grid.shape), grid.spacing)
+    return LensField(best.reshape(grid.coefficients.shape), grid.spacing)
 
 
-def _squares(refinement: Refinement, used: Observations, grid: _Grid, extra: float) -> Iterator[Array]:
+def _squares(refinement: Refinement, used: Observations, grid: LensField, extra: float) -> Iterator[Array]:
     """Of each view (s + 1, s + 1): products of its rows [cameras, board, field | residual], its pose projected out."""
-    problem, n = refinement.problem, grid.shape[0] * grid.shape[1]
+    problem, n, shape = refinement.problem, grid.coefficients.size // 4, grid.coefficients.shape[2:]
     for view in np.unique(used.view):
         o = used[used.view == view]
         m, (pixels, d_stereo, d_pose, d_point) = len(o), predict(refinement.model, o)
-        index, weight = spline_weights(o.pixels, grid.spacing, grid.shape)
+        index, weight = spline_weights(o.pixels, grid.spacing, shape)
         field = np.zeros((m, 2, 4 * n))
         for axis in (0, 1):
             np.put_along_axis(field[:, axis], (2 * o.camera[:, None] + axis) * n + index, weight, axis=1)

@@ -152,63 +152,55 @@ def length_uncertainty(rig: StereoRig, points_world: Array) -> tuple[float, floa
     return float(np.sqrt(max(own, 0.0))), float(np.sqrt(max(float(variance.sum()) - 3 * own, 0.0) / 6))
 
 
-@dataclass(frozen=True)
-class Judged:
-    """What of a calibration an assessment looks at."""
+def assess(
+    refinement: Refinement,
+    chosen: TermsTried,
+    rig: StereoRig,
+    rig_with_board: StereoRig,
+    table_view: int | None,
+    inflation: float,
+    motion: PairMotion | None,
+    wide: tuple[str, ...],
+) -> Assessment:
+    """Collect the figures and judge them.
 
-    refinement: Refinement
-    candidates: tuple[TermsTried, ...]
-    rig: StereoRig  # its covariance by the views alone
-    rig_with_board: StereoRig  # and with the tolerances of the board
-    table_view: int | None
-    inflation: float
-    motion: PairMotion | None
-    wide: tuple[str, ...] = ()  # what `wide_lens.too_wide` found
-
-    @property
-    def chosen(self) -> TermsTried | None:
-        """The row of the terms that were taken."""
-        return next((c for c in reversed(self.candidates) if c.terms == self.refinement.terms), None)
-
-    @property
-    def moved(self) -> bool:
-        """True where boards were given a motion between the exposures, and are seen to have one."""
-        return self.motion is not None and self.motion.is_seen and self.refinement.problem.motion is not None
-
-
-def assess(judged: Judged) -> Assessment:
-    """Collect the figures and judge them."""
-    refinement, rig, chosen = judged.refinement, judged.rig, judged.chosen
+    chosen : the row of the terms that were taken; rig : its covariance by the views alone; rig_with_board : and with
+    the tolerances of the board; wide : what `wide_lens.too_wide` found
+    """
     kept = refinement.observations[refinement.kept]
-    volume = measurement_volume(refinement, judged.table_view)
+    volume = measurement_volume(refinement, table_view)
     sigma = np.linalg.norm(point_uncertainty(rig, volume), axis=-1)
     along, across = length_uncertainty(rig, volume)
-    place, most = causes(judged.rig_with_board, _shifts_of_points(judged.rig_with_board, volume))
+    place, most = causes(rig_with_board, _shifts_of_points(rig_with_board, volume))
     found = Assessment(
         grade=Grade.POOR,
         verdict="",
-        stereo_misfit_px=chosen.held_out_rms_px if chosen else np.nan,
-        held_out_error=chosen.held_out_error if chosen else np.nan,
+        stereo_misfit_px=chosen.held_out_rms_px,
+        held_out_error=chosen.held_out_error,
         triangulation_sigma=(float(np.sqrt(np.mean(sigma**2))), float(sigma.max())),
-        length_sigma=(along, length_uncertainty(judged.rig_with_board, volume)[0]),
+        length_sigma=(along, length_uncertainty(rig_with_board, volume)[0]),
         direction_sigma=across,
         place_sigma=tuple(zip(place.tolist(), most, strict=True)),
         distance=float(np.linalg.norm(rig.R_left_world @ volume.mean(0) + rig.t_left_world)),
         pairs=len(np.intersect1d(kept.view[kept.camera == 0], kept.view[kept.camera == 1])),
-        motion=judged.motion,
-        inflation=judged.inflation,
+        motion=motion,
+        inflation=inflation,
         coverage=tuple(coverage(refinement, camera) for camera in range(len(CAMERA_NAMES))),
         tilt_spread_deg=tilt_spread(refinement),
         warnings=(),
     )
-    grade, verdict = _verdict(found, judged)
-    return replace(found, grade=grade, verdict=verdict, warnings=(*judged.wide, *_warnings(found, judged)))
+    grade, verdict = _verdict(found, refinement, chosen, wide)
+    return replace(found, grade=grade, verdict=verdict, warnings=(*wide, *_warnings(found, refinement, chosen)))
 
 
-def _warnings(found: Assessment, judged: Judged) -> list[str]:
-    refinement, chosen, told = judged.refinement, judged.chosen, []
-    if judged.moved and judged.motion is not None:
-        motion = judged.motion
+def _moved(found: Assessment, refinement: Refinement) -> bool:
+    """True where boards were given a motion between the exposures, and are seen to have one."""
+    return found.motion is not None and found.motion.is_seen and refinement.problem.motion is not None
+
+
+def _warnings(found: Assessment, refinement: Refinement, chosen: TermsTried) -> list[str]:
+    told = []
+    if (motion := found.motion) is not None and _moved(found, refinement):
         told.append(
             "the pairs are not synchronised, or the lenses are not as modelled: the two images of a pair differ as if "
             f"the board had moved by {motion.distance * 1e3:.2g} mm between them ({motion.pixels:.2g} px; corners "
@@ -236,7 +228,7 @@ def _warnings(found: Assessment, judged: Judged) -> list[str]:
             "uncertainties were enlarged by that: the board moved or bent between views, or the lenses are not as "
             "modelled"
         )
-    if chosen is not None and chosen.held_out_rms_px > TWICE * chosen.rms_px:
+    if chosen.held_out_rms_px > TWICE * chosen.rms_px:
         told.append(
             f"views that were left out fit at {chosen.held_out_rms_px:.3f} px, those fitted at {chosen.rms_px:.3f} px: "
             "more and more varied views are needed"
@@ -246,20 +238,21 @@ def _warnings(found: Assessment, judged: Judged) -> list[str]:
     return told
 
 
-def _verdict(found: Assessment, judged: Judged) -> tuple[Grade, str]:
+def _verdict(found: Assessment, refinement: Refinement, chosen: TermsTried, wide: tuple[str, ...]) -> tuple[Grade, str]:
     """The worst of what the figures say, with the reason, then the figures: what a user gets on the table."""
-    (sigma, most), error, rms = found.triangulation_sigma, found.held_out_error, judged.refinement.rms()
+    (sigma, most), error, rms = found.triangulation_sigma, found.held_out_error, refinement.rms()
     # of equal grades the first is told: the cause
-    reasons = [(3, judged.wide[0].partition(":")[0])] if judged.wide else []
+    reasons = [(3, wide[0].partition(":")[0])] if wide else []
     for value, what in ((sigma, "a point is uncertain by"), (error, "corners of views left out of the fit are off by")):
         if np.isfinite(value):
             part = f"{1e3 * value:.3g} mm, {100 * value / found.distance:.2g} % of the distance"
             reasons.append((int(np.searchsorted(GRADES, value / found.distance)), f"{what} {part}"))
     if found.pairs < GOOD_VIEWS:
         reasons.append((2 if found.pairs > 3 else 3, f"only {found.pairs} views were seen by both cameras"))
-    if found.stereo_misfit_px > TWICE * rms:
-        reasons.append((2, f"views left out give {found.stereo_misfit_px:.3f} px where those fitted give {rms:.3f} px"))
-    if judged.moved:
+    if chosen.held_out_rms_px > TWICE * chosen.rms_px:
+        left_out = f"views left out give {chosen.held_out_rms_px:.3f} px"
+        reasons.append((2, f"{left_out} where those fitted give {chosen.rms_px:.3f} px"))
+    if _moved(found, refinement):
         reasons.append((2, "the two images of a pair do not show the board in one place"))
     worst, why = max(reasons, key=lambda item: item[0], default=(3, "nothing tells how good it is"))
     grade = list(Grade)[worst]

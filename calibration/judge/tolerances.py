@@ -49,31 +49,26 @@ def board_shape(refinement: Refinement, nominal: Array, inflation: float) -> Boa
     nominal : (n, 3) [m] the target's points as declared, on a grid
     inflation : factor on the covariance that follows from the points' noise
     """
-    n, basis = len(nominal), board_basis(nominal, "warped")
-    B = basis.reshape(3 * n, -1)
-    departure = (refinement.model.points - nominal).reshape(-1)
-    found = np.linalg.lstsq(B, departure, rcond=None)[0]
-    model, problem = refinement.terms.board, refinement.problem
-    if model == "free":
-        s1 = problem.stereo_basis.shape[1]
-        to_smooth = np.linalg.pinv(B) @ problem.shape_basis.reshape(3 * n, -1)
-        C = to_smooth @ refinement.normal.covariances()[0][s1:, s1:] @ to_smooth.T
-    else:  # one step beyond the flat board, everything else free
-        normal = problem.with_shape(nominal, basis).linearise(refinement.model)
-        s1 = problem.stereo_basis.shape[1]
-        found = found + normal.step()[0][s1:]
-        C = normal.covariances()[0][s1:, s1:]
+    n, warp = len(nominal), board_basis(nominal, "warped")
+    free, s1 = refinement.terms.board == "free", refinement.problem.stereo_basis.shape[1]
+    basis, to_smooth = board_basis(nominal, "free") if free else warp, np.linalg.pinv(warp.reshape(3 * n, -1))
+    normal = refinement.problem.with_shape(nominal, basis).linearise(
+        refinement.model
+    )  # with a step beyond a flat board
+    departure = (refinement.model.points - nominal + basis @ normal.step()[0][s1:]).reshape(-1)
+    found, onto = to_smooth @ departure, to_smooth @ basis.reshape(3 * n, -1)
+    C = onto @ normal.covariances()[0][s1:, s1:] @ onto.T
     C = inflation * C
-    left = (departure - B @ found).reshape(n, 3)[:, :2]
+    left = (departure.reshape(n, 3) - warp @ found)[:, :2]
     size = float(np.abs(nominal - nominal.mean(0)).max())
-    heights = _over_the_board(nominal, B.reshape(n, 3, -1)[:, 2, :3])
+    heights = _over_the_board(nominal, warp[:, 2, :3])
     return BoardShape(
         stretch=float(found[3]) / size,
         stretch_sigma=float(np.sqrt(C[3, 3])) / size,
         lift=-float((heights @ found[:3]).min()),
         lift_sigma=float(np.sqrt(np.mean(np.einsum("ni,ij,nj->n", heights, C[:3, :3], heights)))),
-        misprint=float(np.sqrt(np.mean(left**2))) if model == "free" else 0.0,
-        refined=model != "flat",
+        misprint=float(np.sqrt(np.mean(left**2))) if free else 0.0,
+        refined=refinement.terms.board != "flat",
     )
 
 

@@ -94,11 +94,6 @@ class Normal:
         cross = -shared @ np.swapaxes(carried, 1, 2)
         return shared, np.linalg.inv(self.own_held()) - carried @ cross, cross
 
-    def told_by_each(self) -> tuple[Array, Array]:
-        """What each block, its own numbers eliminated, says of the shared ones: (n, s, s) and gradient (n, s)."""
-        carried, own = self.carried()
-        return self.of_each() - self.cross @ carried, self.gradient - np.einsum("nsk,nk->ns", self.cross, own)
-
     def shifts(self, first: int, common: Array | None = None) -> tuple[Array, Array, Array, Array]:
         """What each block, left out in turn, says of the `first` shared numbers, each in units of a `scale`.
 
@@ -109,7 +104,9 @@ class Normal:
         returns : shifts (n, first), the sum of the expected g_b g_b^T (s, s), H^-1 (s, first), and the covariance
             (first, first) by `common`
         """
-        information, gradient = self.told_by_each()
+        carried, own = self.carried()
+        information = self.of_each() - self.cross @ carried  # own numbers eliminated
+        gradient = self.gradient - np.einsum("nsk,nk->ns", self.cross, own)
         total = information.sum(0) + self.prior
         scale = 1.0 / np.sqrt(np.diag(total))  # the numbers' units differ by 10^6
         information, gradient = information * scale[:, None] * scale, gradient * scale

@@ -7,21 +7,13 @@ product, and many times more on a busy machine.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import wraps
-from typing import ParamSpec, TypeVar
+from typing import Any, TypeVar, cast
 
 from threadpoolctl import threadpool_limits
 
-P = ParamSpec("P")
-R = TypeVar("R")
+Function = TypeVar("Function", bound=Callable[..., Any])
 
 
-def one_blas_thread(function: Callable[P, R]) -> Callable[P, R]:
+def one_blas_thread(function: Function) -> Function:
     """The function, with one thread for linear algebra until it returns; the caller's own setting holds again then."""
-
-    @wraps(function)
-    def limited(*arguments: P.args, **named: P.kwargs) -> R:
-        with threadpool_limits(limits=1, user_api="blas"):
-            return function(*arguments, **named)
-
-    return limited
+    return cast(Function, threadpool_limits.wrap(limits=1, user_api="blas")(function))

@@ -29,14 +29,7 @@ def views(board_drawer):
     rng = np.random.default_rng(11)
     found = []
     # no edges at 0 or 45 deg, where the grid of rays of the drawing itself would show
-    for tilt in (
-        (3, 4, 7),
-        (20, 15, 10),
-        (-35, 10, 33),
-        (10, -50, 5),
-        (55, 0, -20),
-        (5, 8, 38),
-    ):
+    for tilt in [(3, 4, 7), (20, 15, 10), (-35, 10, 33), (10, -50, 5), (55, 0, -20), (5, 8, 38)]:
         R, t = pose(board, tilt)
         view = find_corners(board_drawer(CAMERA, R, t, board, rng=rng), (9, 6))
         assert isinstance(view, CornerView), view

@@ -40,7 +40,7 @@ def test_what_cannot_be_right_is_named(scene_maker, rng):
     refused("right view 2: corners of shape \\(53, 2\\)", right=[*right[:2], right[2][1:], *right[3:]])
     spoiled = left[1].copy()
     spoiled[17, 0] = np.nan
-    refused("left view 1: corner 17 is", left=[left[0], spoiled, *left[2:]])
+    refused(r"left view 1: corner 17 at \(nan", left=[left[0], spoiled, *left[2:]])
     refused("8 mm is 0.008", board=Board((9, 6), 8.0))
-    refused("outside the image of 200 x 512", size=(200, 512))
+    refused("not lie in the image of 200 x 512", size=(200, 512))
     refused("above 0 px", sigma=0.0)

@@ -77,10 +77,6 @@ def test_reading_back_gives_equal_dataclasses(content, tmp_path):
     write_rig(tmp_path / "rig.h5", content)
     assert_equal(read_rig_file(tmp_path / "rig.h5"), content)
     assert [p.name for p in tmp_path.iterdir()] == ["rig.h5"]  # no temporary file stays
-
-
-def test_a_changed_covariance_is_not_equal(content, tmp_path):
-    write_rig(tmp_path / "rig.h5", content)
     changed = replace(content, rig=replace(content.rig, covariance=content.rig.covariance * (1 + 1e-15)))
     with pytest.raises(AssertionError):
         assert_equal(read_rig_file(tmp_path / "rig.h5"), changed)
@@ -94,11 +90,6 @@ def test_every_dataset_says_what_it_is(content, tmp_path):
         assert len(found) > 20
         for name, item in found:
             assert item.attrs["description"], name
-
-
-def test_a_rig_in_a_folder_that_does_not_exist_is_an_error_that_names_it(rig, tmp_path):
-    with pytest.raises(RigFileError, match="nowhere"):
-        write_rig(tmp_path / "nowhere" / "rig.h5", rig)
 
 
 def test_missing_foreign_and_unfinished_files_are_told_apart(rig, tmp_path):
@@ -116,6 +107,8 @@ def test_missing_foreign_and_unfinished_files_are_told_apart(rig, tmp_path):
         del file.attrs["complete"]
     with pytest.raises(RigFileError, match="not written to its end"):
         read_rig(tmp_path / "rig.h5")
+    with pytest.raises(RigFileError, match="nowhere"):
+        write_rig(tmp_path / "nowhere" / "rig.h5", rig)
 
 
 @pytest.mark.parametrize(

@@ -13,15 +13,12 @@ from calibration import (
     CalibrationSettings,
     Camera,
     StereoModel,
-    Terms,
     calibrate_from_corners,
     calibrate_stereo,
-    refine_stereo,
 )
 from calibration.board.chessboard import board_orders
 from calibration.cameras.camera import rotation_from_vector, triangulate
 from calibration.judge.assessment import point_uncertainty
-from calibration.judge.pairs import judge_pairs
 from calibration.judge.table_frame import table_pose
 from calibration.judge.tolerances import BoardTolerances
 from calibration.rig_file import read_rig_file, write_rig
@@ -101,11 +98,12 @@ def test_sixteen_bit_and_colour_views_give_the_same_rig(drawn, calibrated):
     assert np.abs(change / np.sqrt(np.diag(found.rig.covariance)[27:])).max() < 0.1
 
 
-def test_a_view_of_another_size_is_named(drawn):
+def test_a_view_of_another_size_is_named_and_one_too_few(drawn):
     _, (left, right) = drawn
-    odd = [*left[:4], left[4][:-10], *left[5:]]
+    with pytest.raises(CalibrationError, match="8 left and 7 right"):
+        calibrate_stereo(left, right[:-1], BOARD)
     with pytest.raises(CalibrationError, match="left 4: left image is 240 x 182 px"):
-        calibrate_stereo(odd, right, BOARD)
+        calibrate_stereo([*left[:4], left[4][:-10], *left[5:]], right, BOARD)
 
 
 def test_views_without_a_board_are_left_out_with_the_reason(drawn):
@@ -180,13 +178,9 @@ def test_a_board_that_moved_between_the_exposures_is_found_out(scene_maker, rng)
 
 
 def test_so_few_pairs_that_none_can_judge_another_are_all_used(scene_maker, rng):
-    scene = small_scene(scene_maker, n_views=3)
-    observations = scene.observations(0.02, rng)
-    pixels = observations.pixels.copy()
-    pixels[(observations.view == 1) & (observations.camera == 1)] += [3.0, -2.0]
-    moved = replace(observations, pixels=pixels)
-    fit = refine_stereo(moved, scene.model, BOARD.points, Terms("k1"))
-    assert not judge_pairs(moved, fit, []).apart
+    left, right = corner_views(small_scene(scene_maker, n_views=3), rng)
+    right[1] = replace(right[1], points=right[1].points + np.array([1.5, -1.0]))
+    assert not calibrate_from_corners(left, right, BOARD, FLAT).apart
 
 
 @pytest.mark.statistical

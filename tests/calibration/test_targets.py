@@ -5,6 +5,7 @@ OpenCV's warp at six times the resolution, and averaged over the pixels; it shar
 """
 
 import json
+import re
 from dataclasses import dataclass
 
 import cv2
@@ -121,11 +122,7 @@ def test_other_markers_are_not_found_and_unknown_ones_refused(rng):
     assert "dictionary" in other.reason
     with pytest.raises(CalibrationError, match="DICT_4X4_50"):
         find_charuco(image, CharucoBoard((9, 6), 12e-3, 8.5e-3, "4X4"))
-
-
-def test_a_page_without_the_board_holds_none(rng):
-    blank = np.clip(rng.normal(128, 20, SIZE[::-1]), 0, 255).astype(np.uint8)
-    assert isinstance(find_charuco(blank, CHARUCO), BoardNotFound)
+    assert isinstance(find_charuco(np.full_like(image, 128), CHARUCO), BoardNotFound)
 
 
 @pytest.mark.parametrize(
@@ -147,47 +144,27 @@ def test_targets_know_their_symmetry_and_survive_a_file(target, symmetry):
     assert target_of(json.loads(json.dumps(target.described()))) == target
 
 
-DECLARED = """
-[cameras]
-frame_rate_hz = 1000.0
-left = "left/*.png"
-right = "right/*.png"
-[disc]
-radius_mm = 37.5
-thickness_mm = 6.0
-mass_g = 209.69
-[markers]
-diameter_mm = 7.0
-centres_mm = [[26.0, 0.0], [13.0, 22.5], [-13.0, 22.5]]
-[calibration]
-left = "views/left*.png"
-right = "views/right*.png"
-%s
-[table]
-view = 0
-board_thickness_mm = 3.0
-[gravity]
-g_m_s2 = 9.81
-"""
 AS_CHARUCO = 'target = "charuco"\nsquares = [9, 6]\nsquare_mm = 12.0\nmarker_mm = 8.5\ndictionary = "DICT_4X4_50"'
 
 
+def declared(sample_clip, folder, keys):
+    """The sample with views in `folder / views`, of a target with these keys."""
+    text = (sample_clip / "recording.toml").read_text()
+    views = '[calibration]\nleft = "views/left*.png"\nright = "views/right*.png"\n'
+    (folder / "recording.toml").write_text(
+        re.sub(r"\[calibration\].*(?=\[table\])", f"{views}{keys}\n", text, flags=re.S)
+    )
+    return read_recording(folder)
+
+
 @pytest.mark.statistical
-def test_a_recording_with_a_charuco_board_is_calibrated(tmp_path, rng):
+def test_a_recording_with_a_charuco_board_is_calibrated(sample_clip, tmp_path, rng):
     target, printed = CHARUCO, print_of(CHARUCO)
     R_pair = cv2.Rodrigues(np.array([0.0, -0.5, 0.0]))[0]
     meeting = np.array([0.0, 0.0, 0.33])
     t_pair = meeting - R_pair @ meeting
-    angles = [
-        (0, 14, 0),
-        (25, 10, 5),
-        (-22, 15, -10),
-        (10, 40, 20),
-        (5, -12, 90),
-        (30, 20, -40),
-        (-25, 0, 30),
-        (0, 30, 10),
-    ]
+    angles = [(0, 14, 0), (25, 10, 5), (-22, 15, -10), (10, 40, 20)]
+    angles += [(5, -12, 90), (30, 20, -40), (-25, 0, 30), (0, 30, 10)]
     (tmp_path / "views").mkdir()
     poses = []
     for v, degrees in enumerate(angles):
@@ -196,8 +173,7 @@ def test_a_recording_with_a_charuco_board_is_calibrated(tmp_path, rng):
         cv2.imwrite(str(tmp_path / f"views/left_{v}.png"), photograph(printed, R, t, rng=rng))
         right = photograph(printed, R_pair @ R, R_pair @ t + t_pair, rng=rng)
         cv2.imwrite(str(tmp_path / f"views/right_{v}.png"), right)
-    (tmp_path / "recording.toml").write_text(DECLARED % AS_CHARUCO)
-    recording = read_recording(tmp_path)
+    recording = declared(sample_clip, tmp_path, AS_CHARUCO)
     assert recording.chessboard is None
     found, problems = calibrate_recording(recording)
     assert not problems
@@ -214,7 +190,7 @@ def test_a_recording_with_a_charuco_board_is_calibrated(tmp_path, rng):
 
 
 @pytest.mark.parametrize(
-    ("declared", "said"),
+    ("keys", "said"),
     [
         ('target = "checkers"\ninner_corners = [9, 6]\nsquare_mm = 8.0', 'one of "chessboard", "charuco"'),
         ('target = "charuco"\nsquares = [9, 6]\nsquare_mm = 12.0\nmarker_mm = 8.5', "dictionary is missing"),
@@ -223,10 +199,9 @@ def test_a_recording_with_a_charuco_board_is_calibrated(tmp_path, rng):
         ('target = "circles"', 'one of "chessboard", "charuco"'),
     ],
 )
-def test_a_target_that_is_not_wholly_declared_is_refused_by_its_key(declared, said, tmp_path):
-    (tmp_path / "recording.toml").write_text(DECLARED % declared)
+def test_a_target_that_is_not_wholly_declared_is_refused_by_its_key(keys, said, sample_clip, tmp_path):
     with pytest.raises(RecordingError, match=said):
-        read_recording(tmp_path)
+        declared(sample_clip, tmp_path, keys)
 
 
 @pytest.mark.statistical
