@@ -1,7 +1,6 @@
 """Rig files: HDF5 that explains itself, with the corners it came from: it can be judged and redone years later."""
 
 import contextlib
-import io
 import json
 import os
 from collections.abc import Mapping
@@ -201,7 +200,7 @@ def write_rig(
 ) -> None:
     """Write a rig file: whole or not at all (a temporary file beside it, fsync, rename).
 
-    A disk that fills up fails in one plain write, not inside HDF5. attributes : of the root, beside its own
+    attributes : of the root, beside its own
     Raises RigFileError if it cannot be written.
     """
     if isinstance(content, StereoCalibration):
@@ -209,10 +208,10 @@ def write_rig(
     elif isinstance(content, StereoRig):
         content = RigFile(content, None)
     path = Path(path)
-    part, buffer = path.with_name(path.name + ".part"), io.BytesIO()
+    part = path.with_name(path.name + ".part")
     try:
-        with h5py.File(buffer, "w") as file:
-            file.attrs.update(schema=SCHEMA, schema_version=SCHEMA_VERSION, **attributes)
+        with h5py.File(part, "w") as file:
+            file.attrs.update(schema=SCHEMA, schema_version=SCHEMA_VERSION)
             file.attrs["description"] = (
                 "Two calibrated cameras. points_left = R_left_world @ points_world + t_left_world; "
                 "points_right = R_right_left @ points_left + t_right_left; Brown distortion, OpenCV's coefficients; "
@@ -221,10 +220,8 @@ def write_rig(
             write_rig_group(file.create_group("rig"), content.rig)
             if content.record is not None:
                 _write_record(file.create_group("calibration"), content.record)
-            file.attrs["complete"] = 1
-        with open(part, "wb") as handle:
-            handle.write(buffer.getbuffer())
-            handle.flush()
+            file.attrs.update(attributes, complete=1)
+        with open(part, "rb") as handle:
             os.fsync(handle.fileno())
         os.replace(part, path)
     except (OSError, RuntimeError) as error:
