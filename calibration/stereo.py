@@ -203,10 +203,7 @@ def calibrate_from_corners(
 ) -> StereoCalibration:
     """`calibrate_stereo` from corners that were located before."""
     settings = settings or CalibrationSettings()
-    n_views = len(left_views)
-    names = tuple(names or [(f"left {i}", f"right {i}") for i in range(n_views)])
-    if table_view is not None and not 0 <= table_view < n_views:
-        raise CalibrationError(f"table view {table_view} does not exist: there are views 0 to {n_views - 1}")
+    names = tuple(names or [(f"left {i}", f"right {i}") for i in range(len(left_views))])
 
     def report(text: str) -> None:
         if progress:
@@ -235,14 +232,10 @@ def calibrate_from_corners(
     _require_fitted(fit, rejected | fit.lost, apart, wide, table_view)
     report("judging")
     rejected = dict(sorted((rejected | fit.lost).items()))
-    rigs, shape, shape_note = _rigs(fit, board, shapes, settings, table_view, board_thickness)
-    refinement = fit.refinement
-    chosen = next(row for row in reversed(fit.candidates) if row.terms == refinement.terms)
-    inflation = max(refinement.disagreement, 1.0)
-    assessment = assess(refinement, chosen, *rigs, table_view, inflation, fit.motion, wide)
+    rig, assessment, shape, shape_note = _judged(fit, board, shapes, settings, table_view, board_thickness, wide)
     return StereoCalibration(
-        rig=rigs[1],
-        refinement=refinement,
+        rig=rig,
+        refinement=fit.refinement,
         board=board,
         settings=settings,
         table_view=table_view,
@@ -274,15 +267,16 @@ def _begin(views: Views, board: Target, names: Names) -> tuple[Pairs, list[str]]
     return start, [*notes, _choice_of_origin(board)]
 
 
-def _rigs(
+def _judged(
     fit: JointFit,
     board: Target,
     shapes: tuple[str, ...],
     settings: CalibrationSettings,
     table_view: int | None,
     board_thickness: float,
-) -> tuple[tuple[StereoRig, StereoRig], BoardShape, list[str]]:
-    """The rig by the views alone and with what the board may be off by; the board's shape, and a warning if it is odd.
+    wide: tuple[str, ...],
+) -> tuple[StereoRig, Assessment, BoardShape, list[str]]:
+    """The rig with its covariance, how good it is, the board's shape, and a warning if that is not the one taken.
 
     shapes : that the board's points tell
     """
@@ -297,7 +291,9 @@ def _rigs(
     rig = rig_with_covariance(refinement, table_view, board_thickness, inflation, covariance, origin)
     rig = replace(rig, lens_field=fit.lens.field if fit.lens else None)
     with_board = with_tolerances(rig, board.points, table_view, board_thickness, settings.tolerances, shape)
-    return (rig, with_board), shape, note
+    chosen = next(row for row in reversed(fit.candidates) if row.terms == refinement.terms)
+    assessment = assess(refinement, chosen, rig, with_board, table_view, inflation, fit.motion, wide)
+    return with_board, assessment, shape, note
 
 
 def _require_fitted(
@@ -342,6 +338,8 @@ def _views_not_found(views: Views, names: Names) -> tuple[dict[int, str], list[s
 
 
 def _require_views(views: Views, names: Names, rejected: dict[int, str], table_view: int | None) -> None:
+    if table_view is not None and not 0 <= table_view < len(names):
+        raise CalibrationError(f"table view {table_view} does not exist: there are views 0 to {len(names) - 1}")
     if not views[0]:
         raise CalibrationError("no calibration views were given")
     for camera, side in enumerate(views):

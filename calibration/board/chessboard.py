@@ -19,7 +19,6 @@ SEARCH_SIZE = 1600  # px: larger images are reduced for the rough search, which 
 MIN_ALTERNATION = 0.6  # share of neighbouring squares that are dark and light in turn, less those that are not
 LEAST_CORNERS = 12  # 3 x 4: what is smaller is found by chance among dots and shadows
 MOST_UNEVEN = 1.6  # a square to the next one: perspective and lenses stay below 1.3, a line passed over gives 2
-MOST_FURTHER = 3  # lines of corners beyond those declared that are counted: straight on, whatever the perspective
 MIN_ACCEPTED = 0.5  # share of corners that must hold for a view to count as found
 
 
@@ -213,7 +212,7 @@ def _larger_board(grey: Array, view: CornerView, inner_corners: tuple[int, int])
             line, step = np.take(grid, last, across), np.take(grid, last, across) - np.take(grid, before, across)
             line_axes = np.take(axes, last, across)
             lines = 0
-            while lines < MOST_FURTHER and _crosses(grey, line + (lines + 1) * step, line_axes, least):
+            while _crosses(grey, line + (lines + 1) * step, line_axes, least):
                 lines += 1
             further[along] += lines
     if not any(further):

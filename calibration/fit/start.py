@@ -10,7 +10,7 @@ from calibration.board.target import LEAST_POINTS
 from calibration.cameras.camera import CAMERA_NAMES, Camera, rotation_from_vector
 from calibration.fit.pairing import FLOOR, Names, Pairs, board_turns, paired, places_of
 from calibration.fit.stereo_model import Observations, StereoModel
-from calibration.kit.arrays import Array
+from calibration.kit.arrays import Array, Array32
 from calibration.kit.errors import CalibrationError
 
 MOST_K1 = 10.0  # of a lens that exists; beyond, the views do not tell of it
@@ -19,18 +19,22 @@ MIN_VIEWS = 3  # Zhang: fewer do not determine a camera
 GOOD_VIEWS = 8  # fewer judge neither lenses nor one another
 
 
+def for_opencv(
+    observations: Observations, index: int, nominal: Array
+) -> tuple[list[int], list[Array32], list[Array32]]:
+    """Views that a camera sees well enough, and in each the target's points and their images, as OpenCV wants them."""
+    mine = observations[observations.camera == index]
+    seen = [(int(v), mine[mine.view == v]) for v in np.unique(mine.view)]
+    seen = [(v, o) for v, o in seen if len(o) >= LEAST_POINTS]
+    objects = [nominal[o.point].astype(np.float32) for _, o in seen]
+    return [v for v, _ in seen], objects, [o.pixels.astype(np.float32) for _, o in seen]
+
+
 def start_camera(
     observations: Observations, index: int, nominal: Array, image_size: tuple[int, int]
 ) -> tuple[Camera, dict[int, tuple[Array, Array]]]:
     """One camera and {view: (R, t) of the board in it} by OpenCV's calibrateCamera with k1 alone."""
-    objects, images, views = [], [], []
-    for view in np.unique(observations.view):
-        use = (observations.view == view) & (observations.camera == index)
-        if use.sum() >= LEAST_POINTS:
-            objects.append(nominal[observations.point[use]].astype(np.float32))
-            images.append(observations.pixels[use].astype(np.float32))
-            views.append(int(view))
-    name = CAMERA_NAMES[index]
+    name, (views, objects, images) = CAMERA_NAMES[index], for_opencv(observations, index, nominal)
     flags = cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3
     w, h = image_size
     guess = np.array([[float(max(w, h)), 0, 0.5 * (w - 1)], [0, float(max(w, h)), 0.5 * (h - 1)], [0, 0, 1]])

@@ -108,17 +108,12 @@ class PairMotions:
             """-2 log likelihood, everything shared marginalised."""
             V = self.noise * self.covariance + np.diag(variances(sizes))
             information, gradient = at_noise.shared(V, everyone, s1)
-            size = np.diag(information)
-            if size.min() <= 0.0:  # motions so large that nothing is left of how the cameras stand
+            sign, volume = np.linalg.slogdet(information)
+            if sign <= 0.0:  # motions so large that nothing is left of how the cameras stand
                 return np.inf
-            scaled = information / np.sqrt(size[:, None] * size)
-            sign, volume = np.linalg.slogdet(scaled)
-            if sign <= 0.0:
-                return np.inf
-            white = gradient / np.sqrt(size)
             chi_square = np.sum(self.motion * np.linalg.solve(V, self.motion[..., None])[..., 0])
-            chi_square -= white @ np.linalg.solve(scaled, white)
-            return float(np.linalg.slogdet(V)[1].sum() + volume + np.log(size).sum() + chi_square)
+            chi_square -= gradient @ np.linalg.solve(information, gradient)
+            return float(np.linalg.slogdet(V)[1].sum() + volume + chi_square)
 
         # an attribute of `scipy` is imported when it is asked for: a measurement with a rig does not wait for it
         rough = {"method": "Nelder-Mead", "options": {"xatol": 0.02, "fatol": 0.02}}  # of logarithms

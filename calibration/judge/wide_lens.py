@@ -4,9 +4,9 @@ import cv2
 import numpy as np
 
 from calibration.cameras.camera import CAMERA_NAMES, Camera
-from calibration.fit.start import GOOD_VIEWS
+from calibration.fit.start import GOOD_VIEWS, for_opencv
 from calibration.fit.stereo_model import Observations
-from calibration.kit.arrays import Array
+from calibration.kit.arrays import Array, Array32
 
 WIDE = 0.8  # half the image's diagonal in focal lengths, 77 deg across: below, the polynomial describes ordinary lenses
 # Misfit of views left out, rational over polynomial. A 150 deg lens had 0.42 and 0.47, the 34 cameras of seventeen
@@ -24,13 +24,8 @@ def too_wide(observations: Observations, nominal: Array, cameras: tuple[Camera, 
     for index, camera in enumerate(cameras):
         if 0.5 * float(np.hypot(*camera.image_size)) < WIDE * min(camera.fx, camera.fy):
             continue
-        objects, images = [], []
-        seen = np.unique(observations.view)
-        for view in seen[:: len(seen) // MOST_VIEWS + 1]:
-            use = (observations.view == view) & (observations.camera == index)
-            if use.sum() >= 12:
-                objects.append(nominal[observations.point[use]].astype(np.float32))
-                images.append(observations.pixels[use].astype(np.float32))
+        _, *seen = for_opencv(observations, index, nominal)
+        objects, images = (of_views[:: len(of_views) // MOST_VIEWS + 1] for of_views in seen)
         if len(objects) < GOOD_VIEWS:
             continue
         try:
@@ -49,7 +44,7 @@ def too_wide(observations: Observations, nominal: Array, cameras: tuple[Camera, 
     return tuple(found)
 
 
-def _left_out(objects: list[Array], images: list[Array], camera: Camera, flags: int) -> float:
+def _left_out(objects: list[Array32], images: list[Array32], camera: Camera, flags: int) -> float:
     """Misfit [px] of the median view, even views by the odd ones' camera and the reverse."""
     squares = []
     for half in (0, 1):

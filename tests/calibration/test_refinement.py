@@ -65,25 +65,6 @@ def test_a_minimum_is_one_where_only_rounding_is_left_to_gain(scene_maker, rng):
     assert np.ptp(costs[:3]) < 1e-6 < costs[3] - costs[0]
 
 
-def test_derivatives_agree_with_central_differences(scene_maker, rng):
-    scene = scene_maker(n_views=3)
-    o = scene.observations(0.01)
-    m, n = scene.model, len(scene.model.points)
-    _, d_stereo, d_pose, d_point = predict(m, o)
-    every, of_view, of_point = np.ones((len(o), 1), bool), (o.view == 1)[:, None], (o.point == 5)[:, None]
-    for which, derivative, index, use, h in (
-        *((0, d_stereo[..., i], i, every, 1e-5) for i in range(24)),
-        *((1, d_pose[..., i], (1, i), of_view, 1e-6) for i in range(6)),
-        *((2, d_point[..., i], (5, i), of_point, 1e-6) for i in range(3)),
-    ):
-        step = [np.zeros(24), np.zeros((3, 6)), np.zeros((n, 3))]
-        step[which][index] = h
-        there, back = (predict(moved(m, *(sign * part for part in step)), o)[0] for sign in (1, -1))
-        numeric = (there - back) / (2 * h)
-        # round-off 1e-13 / 1e-5 of pixels of size 500
-        assert_allclose(np.where(use, derivative, 0), numeric, atol=1e-6 * max(1, np.abs(numeric).max()))
-
-
 @pytest.mark.parametrize("board", ["flat", "free"])
 def test_the_compiled_sums_are_those_of_the_derivatives(scene_maker, rng, board):
     scene = scene_maker(n_views=3, inner_corners=(4, 3))
