@@ -12,20 +12,18 @@ from calibration.board.search import Progress, located
 from calibration.board.target import Board, Target
 from calibration.cameras.camera import CAMERA_NAMES, StereoRig
 from calibration.fit.lens_field import FieldFit
-from calibration.fit.model_choice import TermsTried
 from calibration.fit.pairing import Names, Pairs, Views, count_once
-from calibration.fit.refinement import Refinement
+from calibration.fit.refinement import Refinement, TermsTried
 from calibration.fit.start import MIN_VIEWS, start_stereo
 from calibration.fit.stereo_model import BOARD_MODELS, RICHEST, Observations, Terms
 from calibration.judge.assessment import Assessment, assess, stereo_covariance
-from calibration.judge.camera_moved import camera_moved, zoomed
-from calibration.judge.pairs import gradients_by_motion
-from calibration.judge.table_frame import rig_with_covariance
+from calibration.judge.pairs import camera_moved, gradients_by_motion, zoomed
 from calibration.judge.tolerances import (
     BoardShape,
     BoardTolerances,
     board_shape,
     on_the_table,
+    rig_with_covariance,
     shape_left_out,
     with_tolerances,
 )
@@ -160,7 +158,7 @@ def calibrate_stereo(
     )
     views = located([*left, *right], board, settings.threads, progress)
     n = len(left_images)
-    found = calibrate_from_corners(views[:n], views[n:], board, settings, table_view, board_thickness, names, progress)
+    found = calibrate_from_corners(views[:n], views[n:], board, settings, table_view, board_thickness, names)
     return replace(found, warnings=(*(note for note in (note_left, note_right) if note), *found.warnings))
 
 
@@ -199,16 +197,10 @@ def calibrate_from_corners(
     table_view: int | None = None,
     board_thickness: float = 0.0,
     names: Sequence[tuple[str, str]] | None = None,
-    progress: Progress | None = None,
 ) -> StereoCalibration:
     """`calibrate_stereo` from corners that were located before."""
     settings = settings or CalibrationSettings()
     names = tuple(names or [(f"left {i}", f"right {i}") for i in range(len(left_views))])
-
-    def report(text: str) -> None:
-        if progress:
-            progress(text, 0, 0)
-
     views = (list(left_views), list(right_views))
     count_once(views, names, table_view)
     rejected, warnings = _views_not_found(views, names)
@@ -221,16 +213,14 @@ def calibrate_from_corners(
         for camera, why in lenses.items():
             for v in moved.others:
                 views[camera][v] = BoardNotFound(why)
-        return calibrate_from_corners(*views, board, settings, table_view, board_thickness, names, progress)
-    report("refining")
+        return calibrate_from_corners(*views, board, settings, table_view, board_thickness, names)
     seen = np.bincount(observations.point, minlength=len(board.points))
     shapes = BOARD_MODELS if seen.min() >= LEAST_SEEN else BOARD_MODELS[:-1]  # the points tell a place each, or not
     distortion = RICHEST if settings.distortion == "auto" else settings.distortion
     tried = [Terms(distortion, shape) for shape in (shapes if settings.board == "auto" else (settings.board,))]
-    fit = fit_jointly(observations, start, board.points, tried, names, table_view, bool(wide), report)
+    fit = fit_jointly(observations, start, board.points, tried, names, table_view, bool(wide))
     apart = _told_apart(fit, names, bool(wide), table_view)
     _require_fitted(fit, rejected | fit.lost, apart, wide, table_view)
-    report("judging")
     rejected = dict(sorted((rejected | fit.lost).items()))
     rig, assessment, shape, shape_note = _judged(fit, board, shapes, settings, table_view, board_thickness, wide)
     return StereoCalibration(

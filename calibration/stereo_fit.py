@@ -1,18 +1,24 @@
 """The rounds of a joint fit of both cameras: the board's shape, which images are pairs, what moved, the lenses."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from calibration.fit.board_motion import BoardMotion
 from calibration.fit.lens_field import FieldFit, fit_lens_field
-from calibration.fit.model_choice import TermsTried, choose_board
 from calibration.fit.pairing import Names, Pairs
-from calibration.fit.refinement import Refinement
+from calibration.fit.refinement import Refinement, TermsTried, choose_board
 from calibration.fit.stereo_model import Observations, Terms
-from calibration.judge.camera_moved import CameraMoved, camera_moved
-from calibration.judge.pairs import LEAST_PAIRS, PairMotion, judge_pairs, motion_between_exposures, own_places
+from calibration.judge.pairs import (
+    LEAST_PAIRS,
+    CameraMoved,
+    PairMotion,
+    camera_moved,
+    judge_pairs,
+    motion_between_exposures,
+    own_places,
+)
 from calibration.kit.arrays import Array
 
 MOVED_CAMERA = "a camera was moved"
@@ -47,7 +53,6 @@ def fit_jointly(
     names: Names,
     table_view: int | None = None,
     wide: bool = False,
-    report: Callable[[str], None] = lambda _: None,
 ) -> JointFit:
     """Refine, judge the pairs by what is refined, and refine again; then see whether boards moved, or lenses bend.
 
@@ -65,7 +70,7 @@ def fit_jointly(
 
     def refined(by: Pairs, tried: Sequence[Terms], motion: BoardMotion | None = None) -> Refined:
         places = own_places(observations, by.model, sorted(by.apart), by.right_poses)
-        return choose_board(*places, nominal, tried, report, motion)
+        return choose_board(*places, nominal, tried, motion)
 
     refinement, candidates = refined(used, tried)
     lost: dict[int, str] = {}
@@ -80,7 +85,6 @@ def fit_jointly(
         lost, notes = lost | more, [*notes, *texts]
         refinement, again = refined(used, (refinement.terms,))
         candidates = (*candidates, *again)
-    report("trying a field of the lenses")
     motion, lens = motion_between_exposures(refinement), fit_lens_field(refinement, nominal)
     likely = motion is not None and motion.is_likely
     if motion is not None and likely and lens is not None:
@@ -89,7 +93,6 @@ def fit_jointly(
         motion = replace(left, scatter=max(motion.scatter, left.scatter))
         likely = motion.is_seen
     if motion is not None and likely:
-        report("pairs that were not synchronised: with a motion of the board between the exposures")
         refinement, again = refined(used, tried, motion.size)
         candidates = (*candidates, *again)
         lens = fit_lens_field(refinement, nominal)

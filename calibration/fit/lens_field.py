@@ -18,9 +18,8 @@ import numpy as np
 
 from calibration.cameras.splines import LensField, spline_weights
 from calibration.fit.board_motion import motions
-from calibration.fit.model_choice import FOLDS
 from calibration.fit.normal_equations import inverse_covariance
-from calibration.fit.refinement import Refinement, refine_stereo
+from calibration.fit.refinement import FOLDS, Refinement, refine_stereo
 from calibration.fit.start import GOOD_VIEWS
 from calibration.fit.stereo_model import Observations, predict
 from calibration.kit.arrays import Array

@@ -9,7 +9,7 @@ boards were moved, errors have long tails: a pair's evidence is minus the logari
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -125,6 +125,9 @@ def told_by(left: BoardPlaces, right: BoardPlaces) -> tuple[Array, Array]:
     """How the cameras stand by each pair alone: R_right_left (n, 3, 3) and t_right_left (n, 3) [m]."""
     R = right.R @ np.swapaxes(left.R, 1, 2)
     return R, right.middle - np.einsum("nij,nj->ni", R, left.middle)
+
+
+Paired = tuple[list[int], BoardPlaces, list[BoardPlaces]]  # left views, and where each camera has the board in pairs
 
 
 @dataclass(frozen=True)
@@ -251,12 +254,14 @@ def paired(
     }
     place = [{view: i for i, view in enumerate(side)} for side in views]
 
+    def pairs_of(order: Order, among: Sequence[int]) -> Paired:
+        both = [v for v in among if order.partner(v, names) in place[1]]
+        b = np.array([place[1][order.partner(v, names)] for v in both], int)
+        return both, left[np.array([place[0][v] for v in both], int)], [one[b] for one in turns[order.mirrored]]
+
     def by(order: Order, least: int = LEAST_PAIRS) -> tuple[Pairing, list[int]] | None:
-        both = [v for v in views[0] if order.partner(v, names) in place[1]]
-        if len(both) < least or not turns[order.mirrored]:
-            return None
-        a, b = [place[0][v] for v in both], [place[1][order.partner(v, names)] for v in both]
-        return likeliest(left[np.array(a)], [one[np.array(b)] for one in turns[order.mirrored]], floor), both
+        both, of_left, of_right = pairs_of(order, views[0])
+        return (likeliest(of_left, of_right, floor), both) if len(both) >= least and of_right else None
 
     as_stored = by(Order(), 1)
     if as_stored is None:
@@ -273,9 +278,7 @@ def paired(
         if rivals[likely][0].is_likelier(stored):
             raise CalibrationError(likely.told(*rivals[likely], stored, names))
     _require_agreement(stored, [found.evidence for order, (found, _) in rivals.items() if not order.mirrored])
-    notes = _late(
-        left, turns[False], place, [v for v, fits in zip(both, stored.agrees, strict=True) if not fits], stored, names
-    )
+    notes = _late(pairs_of, [v for v, fits in zip(both, stored.agrees, strict=True) if not fits], stored, names)
     if notes and 2 * stored.agrees.sum() <= n:
         raise CalibrationError(f"{'; '.join(notes)}. As stored {stored.agrees.sum()} of {n} pairs are right")
     return stored, notes
@@ -295,22 +298,14 @@ def _require_agreement(stored: Pairing, others: Sequence[float]) -> None:
 
 
 def _late(
-    left: BoardPlaces,
-    turns: Sequence[BoardPlaces],
-    place: Sequence[Mapping[int, int]],
-    odd: Sequence[int],
-    found: Pairing,
-    names: Names,
+    pairs_of: Callable[[Order, Sequence[int]], Paired], odd: Sequence[int], found: Pairing, names: Names
 ) -> tuple[str, ...]:
     """A warning about pairs, of those that do not fit, that would with a later or an earlier right view."""
     rest, told = list(odd), []
     for k in sorted(range(-MOST_LATE, MOST_LATE + 1), key=abs)[1:]:
-        which = []
-        for v in (v for v in rest if v + k in place[1]):
-            a, b = np.array([place[0][v]]), np.array([place[1][v + k]])
-            at = found.R_right_left[None], found.t_right_left[None]
-            if min(apart(left[a], one[b], *at).min() for one in turns) < TOO_FAR * found.usual:
-                which.append(v)
+        both, left, turns = pairs_of(Order(k), rest)
+        off = np.min([apart(left, right, found.R_right_left[None], found.t_right_left[None])[0] for right in turns], 0)
+        which = [v for v, distance in zip(both, off, strict=True) if distance < TOO_FAR * found.usual]
         rest = [v for v in rest if v not in which]
         if len(which) >= LEAST_PAIRS - 1:
             told.append(

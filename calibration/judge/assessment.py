@@ -7,8 +7,7 @@ import numpy as np
 
 from calibration.cameras.camera import CAMERA_NAMES, StereoRig
 from calibration.cameras.causes import causes
-from calibration.fit.model_choice import TermsTried
-from calibration.fit.refinement import Refinement
+from calibration.fit.refinement import Refinement, TermsTried
 from calibration.fit.start import GOOD_VIEWS
 from calibration.judge.pairs import PairMotion
 from calibration.kit.arrays import Array

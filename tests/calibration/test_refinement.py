@@ -10,11 +10,11 @@ from scipy.spatial.transform import Rotation
 
 from calibration import Terms, refine_stereo
 from calibration.cameras.camera import N_RIG
-from calibration.fit.model_choice import choose_board
 from calibration.fit.normal_equations import Problem, minimise
+from calibration.fit.refinement import choose_board
 from calibration.fit.start import start_stereo
 from calibration.fit.stereo_model import board_basis, moved, predict
-from calibration.judge.table_frame import rig_with_covariance, table_pose
+from calibration.judge.tolerances import rig_with_covariance, table_pose
 
 FULL = Terms("k1 k2 p1 p2")
 

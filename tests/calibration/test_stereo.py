@@ -19,8 +19,7 @@ from calibration import (
 from calibration.board.chessboard import board_orders
 from calibration.cameras.camera import rotation_from_vector, triangulate
 from calibration.judge.assessment import point_uncertainty
-from calibration.judge.table_frame import table_pose
-from calibration.judge.tolerances import BoardTolerances
+from calibration.judge.tolerances import BoardTolerances, table_pose
 from calibration.rig_file import read_rig_file, write_rig
 from tests.calibration.conftest import corner_view
 

@@ -10,12 +10,12 @@ from calibration import Board
 from calibration.cameras.camera import N_RIG
 from calibration.fit.refinement import refine_stereo
 from calibration.fit.stereo_model import Terms
-from calibration.judge.table_frame import rig_with_covariance
 from calibration.judge.tolerances import (
     BoardShape,
     BoardTolerances,
     board_shape,
     on_the_table,
+    rig_with_covariance,
     with_tolerances,
 )
 from calibration.rig_file import read_rig, write_rig
