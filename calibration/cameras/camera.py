@@ -19,13 +19,10 @@ from calibration.kit.brief import Brief
 CAMERA_NAMES = ("left", "right")  # for people, and in files
 INTRINSIC_PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 N_INTRINSIC = len(INTRINSIC_PARAMETERS)
+_PLACES = ("right_left_rotation", "right_left_translation", "left_world_rotation", "left_world_translation")
 RIG_PARAMETERS = (
-    *(f"left_{name}" for name in INTRINSIC_PARAMETERS),
-    *(f"right_{name}" for name in INTRINSIC_PARAMETERS),
-    *(f"right_left_rotation_{axis}" for axis in "xyz"),
-    *(f"right_left_translation_{axis}" for axis in "xyz"),
-    *(f"left_world_rotation_{axis}" for axis in "xyz"),
-    *(f"left_world_translation_{axis}" for axis in "xyz"),
+    *(f"{camera}_{name}" for camera in CAMERA_NAMES for name in INTRINSIC_PARAMETERS),
+    *(f"{place}_{axis}" for place in _PLACES for axis in "xyz"),
 )
 N_RIG = len(RIG_PARAMETERS)  # 30
 # Which of them are of what: the cameras' own; the right one against the left one; the world against the left one
@@ -58,8 +55,7 @@ class Camera:
     @classmethod
     def from_parameters(cls, parameters: Array, image_size: tuple[int, int]) -> Camera:
         """Inverse of `parameters`."""
-        fx, fy, cx, cy, *distortion = (float(p) for p in parameters)
-        k1, k2, p1, p2, k3 = distortion
+        fx, fy, cx, cy, k1, k2, p1, p2, k3 = map(float, parameters)
         return cls(fx, fy, cx, cy, (k1, k2, p1, p2, k3), image_size)
 
 
@@ -260,11 +256,10 @@ class StereoRig(Brief):
 
 def stepped(cameras: Sequence[Camera], step: Array) -> tuple[Camera, Camera]:
     """Both cameras after a step of RIG_PARAMETERS, of which those before the first place are enough."""
-    found = (
+    left, right = (
         Camera.from_parameters(camera.parameters + step[own], camera.image_size)
         for camera, own in zip(cameras, OF_CAMERAS, strict=True)
     )
-    left, right = found
     return left, right
 
 

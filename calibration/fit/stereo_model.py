@@ -191,11 +191,9 @@ def moved(model: StereoModel, stereo: Array, poses: Array, displacement: Array) 
 
 def restricted(model: StereoModel, nominal: Array, terms: Terms) -> StereoModel:
     """The model with the terms that are not free put to zero: distortion, deviation of the board, fx - fy."""
-    if terms.board != "free":
-        basis = board_basis(nominal, terms.board).reshape(nominal.size, -1)
-        deviation = (model.points - nominal).reshape(-1)
-        coefficients = np.linalg.lstsq(basis, deviation, rcond=None)[0] if basis.shape[1] else np.zeros(0)
-        model = replace(model, points=nominal + (basis @ coefficients).reshape(nominal.shape))
+    basis = board_basis(nominal, terms.board).reshape(nominal.size, -1)
+    shape = np.linalg.pinv(basis) @ (model.points - nominal).reshape(-1)
+    model = replace(model, points=nominal + (basis @ shape).reshape(nominal.shape))
     cameras, free = [], DISTORTION_MODELS[terms.distortion]
     held = np.array([name in free for name in INTRINSIC_PARAMETERS[4:]])
     for camera in model.cameras:

@@ -9,6 +9,7 @@ number tells a variance within a factor of ten only; whoever knows better declar
 """
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -154,27 +155,24 @@ def with_tolerances(
 
     found: list[Allowance] = []
 
-    def allow(cause: str, declared: float | None, **shift: Array) -> None:
-        parameters = np.zeros(N_RIG)
-        places = {"pair": PAIR_SHIFT, "turn": WORLD_TURN, "place": WORLD_SHIFT}
-        for name, value in shift.items():
-            parameters[places[name]] = value
+    def allow(cause: str, place: Array, turn: Any = 0.0, pair: Any = 0.0) -> None:
+        parameters, assumed = np.zeros(N_RIG), {THICKNESS: tolerances.thickness, FLATNESS: tolerances.flatness}
+        parameters[WORLD_SHIFT], parameters[WORLD_TURN], parameters[PAIR_SHIFT] = place, turn, pair
         if parameters.any():
-            found.append(Allowance(cause, parameters, declared is None and cause != SIZE))
+            found.append(Allowance(cause, parameters, cause in assumed and assumed[cause] is None))
 
+    R, half, middle = rig.R_left_world, np.abs(d).max(0), nominal.mean(0)
     if table_view is None:
-        allow(SIZE, tolerances.square, pair=size * rig.t_right_left)
+        allow(SIZE, np.zeros(3), pair=size * rig.t_right_left)
     else:
-        R, half, middle = rig.R_left_world, np.abs(d).max(0), nominal.mean(0)
-        place = size * (rig.t_left_world + board_thickness * R[:, 2])
-        allow(SIZE, tolerances.square, pair=size * rig.t_right_left, place=place)
-        allow(SIZE, tolerances.square, place=0.5 * stretch * (middle[0] * R[:, 0] - middle[1] * R[:, 1]))
-        allow(THICKNESS, tolerances.thickness, place=thickness * R[:, 2])
-        allow(FLATNESS, tolerances.flatness, place=flatness * R[:, 2])
+        allow(SIZE, size * (rig.t_left_world + board_thickness * R[:, 2]), pair=size * rig.t_right_left)
+        allow(SIZE, 0.5 * stretch * (middle[0] * R[:, 0] - middle[1] * R[:, 1]))
+        allow(THICKNESS, thickness * R[:, 2])
+        allow(FLATNESS, flatness * R[:, 2])
         for axis, across in ((0, [0.0, -1.0, 0.0]), (1, [1.0, 0.0, 0.0])):
             # turned about the board's other side, so that z grows along this one; the middle stays where it is
             slope = flatness / half[axis]
-            allow(FLATNESS, tolerances.flatness, turn=slope * R @ across, place=-slope * middle[axis] * R[:, 2])
+            allow(FLATNESS, -slope * middle[axis] * R[:, 2], turn=slope * R @ across)
     D = np.stack([a.shift for a in found], axis=1) if found else np.zeros((N_RIG, 0))
     return replace(rig, covariance=rig.covariance + D @ D.T, allowances=tuple(found))
 

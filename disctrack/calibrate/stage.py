@@ -207,8 +207,7 @@ def _calibrate(source: CalibrationSource) -> tuple[StereoCalibration, tuple[str,
 
         def report(stage: str, now: int, total: int) -> None:
             nonlocal done
-            if total:
-                advance(now - done)
-                done = now
+            advance(now - done)
+            done = now
 
         return source.calibrated(report)
