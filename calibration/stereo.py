@@ -44,7 +44,6 @@ class CalibrationSettings:
 
     distortion: str = "auto"  # all terms, with priors; or a key of stereo_model.DISTORTION_MODELS
     board: str = "auto"  # decided by held-out error; or one of stereo_model.BOARD_MODELS
-    threads: int = 2
     tolerances: BoardTolerances = field(default_factory=BoardTolerances)
 
     def __post_init__(self) -> None:
@@ -156,7 +155,7 @@ def calibrate_stereo(
     (left, note_left), (right, note_right) = (
         repaired_views(side, name) for side, name in zip((left_images, right_images), CAMERA_NAMES, strict=True)
     )
-    views = located([*left, *right], board, settings.threads, progress)
+    views = located([*left, *right], board, progress)
     n = len(left_images)
     found = calibrate_from_corners(views[:n], views[n:], board, settings, table_view, board_thickness, names)
     return replace(found, warnings=(*(note for note in (note_left, note_right) if note), *found.warnings))

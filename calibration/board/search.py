@@ -37,9 +37,7 @@ def find_target(image: NDArray, target: Target, thorough: bool = True) -> Target
     raise TypeError(f"no finder for {target}")
 
 
-def located(
-    images: Sequence[NDArray], target: Target, threads: int, progress: Progress | None = None
-) -> list[TargetView]:
+def located(images: Sequence[NDArray], target: Target, progress: Progress | None = None) -> list[TargetView]:
     """The target in every image.
 
     A sample over all of them is searched first. Where most of it does not show the target to the quick search but
@@ -61,7 +59,7 @@ def located(
 
     sample = evenly(len(images), VIEWS_TRIED)
     others = sorted(set(range(len(images))) - set(sample))
-    with ThreadPoolExecutor(threads) as pool:
+    with ThreadPoolExecutor(2) as pool:  # OpenCV and the fit of corners leave the interpreter to the other
         list(pool.map(locate, sample, [False] * len(sample)))
         again = missing(sample)
         if shown := other_board([images[i] for i in sample], [i in again for i in sample], target):

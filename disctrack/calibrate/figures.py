@@ -25,32 +25,28 @@ def residuals_figure(found: StereoCalibration) -> Figure:
     refinement = found.refinement
     lengths = np.linalg.norm(refinement.residuals[refinement.kept], axis=1)
     typical = float(np.median(lengths)) or 1.0
+    # so that the typical arrow is about 1/40 of the image's width; one leading digit, to be read at a glance
+    scale = float(f"{found.rig.left.image_size[0] / 40 / typical:.0e}")
     for camera, name in enumerate(CAMERAS):
         axes = figure.add_subplot(grid[0, camera])
-        _arrows(axes, found, camera, typical)
+        _arrows(axes, found, camera, scale, 4.0 * typical)
         axes.set_title(f"{name}: rms {found.rms_per_camera_px[camera]:.4f} px", color=INK, fontsize=10)
     _views(figure.add_subplot(grid[1, :]), found)
-    figure.suptitle(f"Calibration residuals (arrows {_magnification(found, typical):.0f} times longer; black: unused)")
+    figure.suptitle(f"Calibration residuals (arrows {scale:.0f} times longer; black: unused)")
     return figure
 
 
-def _magnification(found: StereoCalibration, typical: float) -> float:
-    """So that the typical arrow is about 1/40 of the image's width; one leading digit, to be read at a glance."""
-    wanted = found.rig.left.image_size[0] / 40 / typical
-    return float(f"{wanted:.0e}")
-
-
-def _arrows(axes: Axes, found: StereoCalibration, camera: int, typical: float) -> None:
-    refinement, scale = found.refinement, _magnification(found, typical)
-    mine = refinement.observations.camera == camera
-    for select, colour, most in (
+def _arrows(axes: Axes, found: StereoCalibration, camera: int, scale: float, most: float) -> None:
+    """Arrows `scale` times as long as residuals; of corners that were not used, as long as `most` [px] at most."""
+    refinement, mine = found.refinement, found.refinement.observations.camera == camera
+    for select, colour, longest in (
         (refinement.kept, COLOURS[CAMERAS[camera]], np.inf),
-        (~refinement.kept, INK, 4.0),
+        (~refinement.kept, INK, most),
     ):
-        pixels = refinement.observations.pixels[mine & select]
-        arrows = refinement.residuals[mine & select] * scale
+        arrows = refinement.residuals[mine & select]
         length = np.linalg.norm(arrows, axis=1, keepdims=True)
-        arrows = arrows * np.minimum(1.0, most * typical * scale / np.maximum(length, 1e-12))
+        arrows = scale * arrows * np.minimum(1.0, longest / np.maximum(length, 1e-12))
+        pixels = refinement.observations.pixels[mine & select]
         axes.quiver(*pixels.T, *arrows.T, angles="xy", scale_units="xy", scale=1, color=colour, width=0.0015, alpha=0.7)
     _image_frame(axes, found, camera)
 

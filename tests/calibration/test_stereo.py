@@ -141,17 +141,13 @@ def test_exchanged_images_are_found_out(scene_maker, rng, tmp_path):
 
 
 @pytest.mark.statistical
-def test_a_board_that_moved_between_the_exposures_is_found_out(scene_maker, rng):
-    scene = small_scene(scene_maker, n_views=10)
-    left, right = corner_views(scene, rng)
+def test_a_board_that_moved_between_the_exposures_costs_the_pair_and_no_camera(scene_maker, rng):
+    left, right = corner_views(small_scene(scene_maker, n_views=10), rng)
     right[4] = replace(right[4], points=right[4].points + np.array([1.5, -1.0]))
     found = calibrate_from_corners(left, right, BOARD, FLAT)
-    assert not found.rejected_views
     assert found.apart == (4,)
     assert found.assessment.pairs == 9
     assert any(text.startswith("left 4 and right 4 (") and "moved" in text for text in found.warnings)
-    assert found.rms_px < 0.05
-    # as if the pair had been left out for how the cameras stand, and not for the cameras
     left[4] = right[4] = BoardNotFound("left out")
     without = calibrate_from_corners(left, right, BOARD, FLAT)
     sigma = np.sqrt(np.diag(without.rig.covariance))[:9]

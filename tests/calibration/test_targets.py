@@ -209,7 +209,7 @@ def test_images_of_another_board_are_told_by_its_size(board_drawer):
     camera, R = Camera(700.0, 700.0, 160.0, 120.0, (0.0,) * 5, (320, 240)), cv2.Rodrigues(np.array([3.0, 0.2, 0.1]))[0]
     image = board_drawer(camera, R, np.array([-0.03, 0.02, 0.3]), Board((7, 5), 8e-3), rng=np.random.default_rng(1))
     declared = Board((8, 5), 8e-3)
-    views = located([image] * 16, declared, 1)
+    views = located([image] * 16, declared)
     assert all("8 of 8 images looked at show 7 x 5: inner_corners = [7, 5]" in view.reason for view in views)
     # half of the images having the declared one is enough
     assert not other_board([image] * 10, [False] * 5 + [True] * 5, declared)
