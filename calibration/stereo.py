@@ -217,8 +217,8 @@ def calibrate_from_corners(
     shapes = BOARD_MODELS if seen.min() >= LEAST_SEEN else BOARD_MODELS[:-1]  # the points tell a place each, or not
     distortion = RICHEST if settings.distortion == "auto" else settings.distortion
     tried = [Terms(distortion, shape) for shape in (shapes if settings.board == "auto" else (settings.board,))]
-    fit = fit_jointly(observations, start, board.points, tried, names, table_view, bool(wide))
-    apart = _told_apart(fit, names, bool(wide), table_view)
+    fit = fit_jointly(observations, start, board.points, tried, names, table_view)
+    apart = _told_apart(fit, names, table_view)
     _require_fitted(fit, rejected | fit.lost, apart, wide, table_view)
     rejected = dict(sorted((rejected | fit.lost).items()))
     rig, assessment, shape, shape_note = _judged(fit, board, shapes, settings, table_view, board_thickness, wide)
@@ -292,7 +292,7 @@ def _require_fitted(
     if table_view is not None and table_view in rejected | fit.pairs.apart:
         reason = rejected.get(table_view) or apart[0]
         raise CalibrationError(f"the table view {table_view} cannot be used: {reason}")
-    n_used = len(np.unique(fit.plain.observations.view[fit.plain.kept]))
+    n_used = len(np.unique(fit.refinement.observations.view[fit.refinement.kept]))
     if n_used < MIN_VIEWS:
         also = f"{'; '.join(wide)}. " if wide else ""
         reasons = {where: why for where, _, why in (text.partition(": ") for text in rejected.values())}
@@ -378,7 +378,7 @@ def _choice_of_origin(board: Target) -> str:
     )
 
 
-def _told_apart(fit: JointFit, names: Names, wide: bool, table_view: int | None) -> list[str]:
+def _told_apart(fit: JointFit, names: Names, table_view: int | None) -> list[str]:
     """Warnings about pairs whose images are used each for its own camera."""
     told = [fit.moved.told(names, table_view)] if fit.moved else []
     apart = {v: why for v, why in fit.pairs.apart.items() if not (fit.moved and v in fit.moved.others)}
@@ -389,8 +389,8 @@ def _told_apart(fit: JointFit, names: Names, wide: bool, table_view: int | None)
     return [
         *told,
         f"{'; '.join(shown)}{more}: the two images do not show the board in one place: it moved between the "
-        f"exposures, or they are not a pair{', or the lens is wider than the model' if wide else ''}. Each image is "
-        "used for its own camera, none of them for how the cameras stand to each other",
+        "exposures, or they are not a pair. Each image is used for its own camera, none of them for how the cameras "
+        "stand to each other",
     ]
 
 

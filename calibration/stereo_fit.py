@@ -30,7 +30,7 @@ Refined = tuple[Refinement, tuple[TermsTried, ...]]
 class JointFit:
     """What `fit_jointly` arrives at."""
 
-    plain: Refinement  # without a field of the lenses
+    refinement: Refinement  # with the field of the lenses, where there is one
     lens: FieldFit | None
     candidates: tuple[TermsTried, ...]  # all that were compared
     pairs: Pairs
@@ -38,11 +38,6 @@ class JointFit:
     motion: PairMotion | None  # of the boards between the exposures
     lost: dict[int, str]  # views of which no image can be used -> reason
     notes: tuple[str, ...]  # about images that cannot
-
-    @property
-    def refinement(self) -> Refinement:
-        """With the field of the lenses, where there is one."""
-        return self.plain if self.lens is None else self.lens.refinement
 
 
 def fit_jointly(
@@ -52,21 +47,16 @@ def fit_jointly(
     tried: Sequence[Terms],
     names: Names,
     table_view: int | None = None,
-    wide: bool = False,
 ) -> JointFit:
     """Refine, judge the pairs by what is refined, and refine again; then see whether boards moved, or lenses bend.
 
     start : by rough cameras; tried : terms with the board's shapes to choose of, simplest first; names : (left, right)
-    of every view; table_view : where a camera was moved, the cameras' places are those at it; wide : a lens is wider
-    than the model, which is a reason why an image may not fit
+    of every view; table_view : where a camera was moved, the cameras' places are those at it
     """
     moved = camera_moved(observations, start, table_view)  # seen best by cameras that no pair has pulled yet
-    if moved is not None:
-        used = replace(start, apart={}).set_apart(moved.others, MOVED_CAMERA)
-    elif len(start.left_poses) >= LEAST_PAIRS:
-        used = start.set_apart([*start.apart], "")  # rough poses may be degrees off: refined cameras judge these anew
-    else:
-        used = replace(start, apart={})
+    # rough poses may be degrees off: refined cameras judge those anew that do not agree
+    used = start if moved is None and len(start.left_poses) >= LEAST_PAIRS else replace(start, apart={})
+    used = used if moved is None else used.set_apart(moved.others, MOVED_CAMERA)
 
     def refined(by: Pairs, tried: Sequence[Terms], motion: BoardMotion | None = None) -> Refined:
         places = own_places(observations, by.model, sorted(by.apart), by.right_poses)
@@ -81,7 +71,7 @@ def fit_jointly(
         pairs = pairs if moved is None else pairs.set_apart(moved.others, MOVED_CAMERA)
         if sorted(pairs.apart) == sorted(used.apart) and not pairs.bad_images:
             break
-        observations, used, more, texts = _without_images(observations, pairs, names, wide)
+        observations, used, more, texts = _without_images(observations, pairs, names)
         lost, notes = lost | more, [*notes, *texts]
         refinement, again = refined(used, (refinement.terms,))
         candidates = (*candidates, *again)
@@ -96,17 +86,16 @@ def fit_jointly(
         refinement, again = refined(used, tried, motion.size)
         candidates = (*candidates, *again)
         lens = fit_lens_field(refinement, nominal)
-    return JointFit(refinement, lens, candidates, pairs, moved, motion, lost, tuple(notes))
+    return JointFit(lens.refinement if lens else refinement, lens, candidates, pairs, moved, motion, lost, tuple(notes))
 
 
 def _without_images(
-    observations: Observations, pairs: Pairs, names: Names, wide: bool
+    observations: Observations, pairs: Pairs, names: Names
 ) -> tuple[Observations, Pairs, dict[int, str], list[str]]:
     """Leave out images that do not even fit alone; views of which nothing is left, and warnings about the others."""
     by_right, rejected, warnings = {}, {}, []
-    or_else = ", or the board lies too far out for the model of this lens" if wide else ""
     for (view, camera), reason in pairs.bad_images.items():
-        text = f"{names[view][camera]}: {reason}: blurred, or the board was found wrongly{or_else}"
+        text = f"{names[view][camera]}: {reason}: blurred, or the board was found wrongly"
         observations = observations[(observations.view != view) | (observations.camera != camera)]
         if camera == 0 and view in pairs.right_poses:
             by_right[view] = pairs.right_poses[view]
