@@ -20,7 +20,7 @@ from calibration.fit.stereo_model import StereoModel
 from calibration.kit.arrays import Array
 
 TAILS = 4.0  # degrees of freedom of Student's distribution, as usual where few pairs would have to tell them
-LEAST = 1e-6  # [rad], and of the board's distance: far below what any view tells of a pose
+LEAST = 1e-7  # [rad], and of the board's distance: far below what any view tells of a pose
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from calibration.board.target import LEAST_POINTS
 from calibration.cameras.camera import CAMERA_NAMES, Camera, project
-from calibration.fit.board_motion import BoardMotion, motions, split
+from calibration.fit.board_motion import LEAST, BoardMotion, motions, split
 from calibration.fit.normal_equations import Problem
 from calibration.fit.pairing import TOO_FAR, Pairs, Pose, apart, places_of, rotation_vectors, told_by
 from calibration.fit.refinement import Refinement, fit_poses
@@ -38,12 +38,10 @@ MOVED = 2.0  # times what corners' scatter makes of a board at rest, and times t
 LEAST_PAIRS = 6  # fewer cannot judge one another: one tells how the cameras stand, and a median is of the others
 LEAST_MOTIONS = 3  # fewer do not tell how large they are
 FREE = BoardMotion(np.inf, np.inf)  # nothing known beforehand
-NONE = 1e-7  # [rad], and of the board's distance: less than any view tells
 # Times as far apart as pairs of one side. None of 400 synthetic sets of boards that moved reaches 2; of 31 photographed
 # ones two have 8.8 and 4.5, where OpenCV's rig of one side misses the other's pairs as well, and the next one 2.2.
 STEP = 4.0
 LEAST_SIDE = 3  # pairs on either side of a step: fewer are not a place of the cameras, but boards that moved
-ASTRAY = 0.1  # share of the pairs that may lie nearer to the other side's place
 ZOOM = 0.01  # of the focal length: below, a part of the views may tell as much otherwise
 BY_ZOOM = 1.3  # times less squared misfit by two focal lengths; one and the same lens has 1.05
 
@@ -114,7 +112,7 @@ class PairMotions:
         at_noise = replace(self, alone=(self.alone[0] / self.noise, self.alone[1] / self.noise))
 
         def variances(sizes: Array) -> Array:
-            turn, part = np.exp(np.clip(sizes, np.log(NONE), 0.0))
+            turn, part = np.exp(np.clip(sizes, np.log(LEAST), 0.0))
             return np.repeat([turn, part * self.distance], 3) ** 2
 
         def unlikely(sizes: Array) -> float:
@@ -381,7 +379,7 @@ def _cuts(between: Array) -> list[tuple[int, float, float]]:
     at = min(range(LEAST_SIDE, n - LEAST_SIDE + 1), key=lambda cut: float(to_sides(cut)[0].sum()))
     own, other = to_sides(at)
     pixels, scatter = float(np.median(other)), float(max(np.median(own[:at]), np.median(own[at:])))
-    if not pixels > STEP * scatter or np.mean(own > other) > ASTRAY:
+    if not pixels > STEP * scatter:
         return []
     after = [(at + cut, other, own) for cut, other, own in _cuts(between[at:, at:])]
     return [*_cuts(between[:at, :at]), (at, pixels, scatter), *after]
