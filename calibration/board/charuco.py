@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.board.chessboard import SEARCH_SIZE, BoardNotFound, as_8_bit, grey_values
-from calibration.board.corner_fit import CornerView, fit_view
-from calibration.board.corner_grid import smooth_grid
+from calibration.board.corner_fit import CornerView, fit_view, smooth_grid
 from calibration.board.target import LEAST_POINTS, CharucoBoard
 from calibration.kit.arrays import Array
 from calibration.kit.errors import CalibrationError

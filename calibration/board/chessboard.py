@@ -9,8 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.board.corner_fit import CornerView, fit_view
-from calibration.board.corner_grid import local_axes
+from calibration.board.corner_fit import CornerView, fit_view, local_axes
 from calibration.board.target import board_orders
 from calibration.kit.arrays import Array
 from calibration.kit.grey_levels import level_step
