@@ -30,13 +30,12 @@ from calibration.fit.board_motion import LEAST, BoardMotion, motions, split
 from calibration.fit.normal_equations import Problem
 from calibration.fit.pairing import TOO_FAR, Pairs, Pose, apart, places_of, rotation_vectors, told_by
 from calibration.fit.refinement import Refinement, fit_poses
-from calibration.fit.start import start_camera
+from calibration.fit.start import MIN_VIEWS, start_camera
 from calibration.fit.stereo_model import Observations, StereoModel, predict, predict_pixels
 from calibration.kit.arrays import Array, Mask
 
 MOVED = 2.0  # times what corners' scatter makes of a board at rest, and times that scatter, that motion is named
 LEAST_PAIRS = 6  # fewer cannot judge one another: one tells how the cameras stand, and a median is of the others
-LEAST_MOTIONS = 3  # fewer do not tell how large they are
 FREE = BoardMotion(np.inf, np.inf)  # nothing known beforehand
 # Times as far apart as pairs of one side. None of 400 synthetic sets of boards that moved reaches 2; of 31 photographed
 # ones two have 8.8 and 4.5, where OpenCV's rig of one side misses the other's pairs as well, and the next one 2.2.
@@ -175,7 +174,7 @@ def pair_motions(problem: Problem, model: StereoModel) -> PairMotions:
 def gradients_by_motion(refinement: Refinement) -> Array | None:
     """(n_views, s, s) `gradients` of motions of the likely size; None where the fit has motions, or nothing tells."""
     found = pair_motions(refinement.problem, refinement.model)
-    known = refinement.problem.motion is not None or len(found.views) < LEAST_MOTIONS
+    known = refinement.problem.motion is not None or len(found.views) < MIN_VIEWS
     return None if known else found.gradients(found.likely_size())
 
 
@@ -213,7 +212,7 @@ class PairMotion:
 def motion_between_exposures(refinement: Refinement) -> PairMotion | None:
     """What the pairs say of the board's motion between their exposures; None with fewer than three of them."""
     found = pair_motions(refinement.problem, refinement.model)
-    if len(found.views) < LEAST_MOTIONS:
+    if len(found.views) < MIN_VIEWS:
         return None
     noise = float(np.median(np.einsum("nij,nji->n", found.square_px, found.covariance)))
     size = found.likely_size()
