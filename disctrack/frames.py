@@ -3,7 +3,7 @@
 This docstring is the one home of the conventions; every other file obeys it silently.
 
 World frame I = (O, i, j, k): k up, the table is z = 0 (Ma et al. 2014, section 2a). The calibration's table view fixes
-    origin and heading (`calibration.judge.table_frame`).
+    origin and heading (`calibration.judge.tolerances`).
 Body frame: fixed to the disc, origin at its centre O, third axis e3 out of the upper face.
 Nodal frame R_O = (e1, e2, e3): follows precession and nutation, not spin. e1 = (cos psi, sin psi, 0) is horizontal,
     e2 = e3 x e1 points from the contact A towards B; r_OA = -r e2 - h e3, the thickness is 2h.
