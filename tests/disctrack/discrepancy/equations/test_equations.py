@@ -488,10 +488,17 @@ def test_what_sets_in_within_a_run_is_found_beside_a_term_that_names_the_channel
 
 @pytest.mark.statistical
 def test_what_lasts_as_long_as_the_data_themselves_is_no_noise(tank):
-    """The strongest line of a driven motion may be the slowest: how fast the data change is told by their memory."""
+    """The strongest line of a driven motion may be the slowest: how fast the data change is told by their memory.
+
+    It is no noise but a law of the level: the overflow, which nobody offered.
+    """
     equations, run = tank
     answer = diagnose(equations, run, [terms.sensor_drift("level")])
-    assert answer.verdict == "unexplained"
+    law = answer.law
+    truth = 0.1 * law.variable - 2.0 * np.maximum(law.variable - 2.3, 0.0)  # beyond k as declared
+    assert answer.found == ("learned",)
+    assert (law.along.variable, law.held) == ("y", ("k",))
+    assert np.mean(np.abs(law.force - truth) < 3 * law.sigma) > 0.9
 
 
 @pytest.mark.statistical
