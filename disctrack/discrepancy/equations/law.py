@@ -351,13 +351,11 @@ class _Competition:
             fitted = self._fitted(view, (*others, *best.quantities), fitted.values)
         held = held_out(view, fitted.quantities, fitted.values, whole.training)
         x = np.linspace(*_range(there, law, fitted.values), POINTS)
-        columns = _columns(best.quantities, law, x, fitted.values)
-        force = columns @ np.array([fitted.values[q.name] for q in best.quantities])
         # what a declared number has become is a part of the law, where it acts as such a one would
         part = sorted(_part_of_law(there.formulas, law, there.held))
-        moved, by_number = _declared_part(there, law, part, fitted.values, x)
-        force, columns = force + moved, np.column_stack([columns, by_number])
-        at = [fitted.shared.index(n) for n in (*(q.name for q in best.quantities), *part)]
+        names = [*(q.name for q in best.quantities), *part]
+        force, columns = _course(there, law, names, fitted.values, x)
+        at = [fitted.shared.index(n) for n in names]
         variance = np.einsum("ij,jk,ik->i", columns, fitted.covariance[np.ix_(at, at)], columns)
         # waves finer than those that are fitted go on as the inverse square of their number
         finer = HARMONICS / 6.0 * best.quantities[HARMONICS].prior_sigma ** 2
@@ -449,18 +447,6 @@ def _falls(own: Sequence[Quantity], smooth: float, power: float) -> Array:
     return np.array(found)
 
 
-def _columns(own: Sequence[Quantity], law: Along, x: Array, values: Values) -> Array:
-    """(n, k) what each amplitude adds at these values of the variable."""
-    bend = values[f"{NAME}_bend"]
-    place = (bend * np.arcsinh(x / bend) - values[f"{NAME}_from"]) / values[f"{NAME}_span"]
-    whole = {"jump": np.sign(x), "slope": x / values[f"{NAME}_reach"]}
-    found = []
-    for q in own:
-        name = q.part
-        found.append(whole[name] if name in whole else np.cos(int(name[1:]) * np.pi * place))
-    return np.column_stack(found)
-
-
 def _set(system: EquationSystem, law: Along, values: Values) -> tuple[EquationSystem, dict[str, float]]:
     """The system for one law, and the numbers that say where it acts and over which range."""
     low, high = _range(system, law, values)
@@ -521,10 +507,8 @@ def _part_of_law(f: Formulas, law: Along, held: Sequence[str]) -> set[str]:
     return found
 
 
-def _declared_part(
-    system: EquationSystem, law: Along, part: Sequence[str], values: Values, x: Array
-) -> tuple[Array, Array]:
-    """What these parameters make where the law acts beyond their declared values (n,), and by each of them (n, k)."""
+def _course(system: EquationSystem, law: Along, names: Sequence[str], values: Values, x: Array) -> tuple[Array, Array]:
+    """What these numbers make where the law acts beyond their declared values (n,), and by each of them (n, k)."""
     f, s = system.formulas, system.stretches[0]
     states = np.tile(system.start_of(values, s), (len(x), 1))
     times = x if law.variable == "t" else np.asarray(np.arange(len(x)) + 0.5, float)
@@ -534,13 +518,13 @@ def _declared_part(
         pieces = np.zeros((len(s.pieces), 5, len(x)))
         pieces[list(f.equations.inputs).index(law.variable), 3] = x
         s = replace(s, knots=np.arange(len(x) + 1.0), pieces=pieces)
-    declared = {name: f.fitted[name][1].value for name in part}
+    declared = {name: f.fitted[name][1].value for name in names}
     here = f.equations.states.index(law.equation)
     (now, _, by_number), (before, *_) = (
         f.rates_at(s, system.numbers({**values, **changed}, s), times, states) for changed in ({}, declared)
     )
     acting = by_number[:, here, f.names.index(f"{NAME}.a0")]
-    own = by_number[:, here, [f.names.index(name) for name in part]]
+    own = by_number[:, here, [f.names.index(name) for name in names]]
     return (now - before)[:, here] / acting, own / acting[:, None]
 
 
