@@ -70,9 +70,9 @@ def explanations_json(d: Diagnosis) -> list[dict[str, Any]]:
     ]
 
 
-def declared_json(fit: Fit) -> dict[str, Any]:
-    """Numbers of the declared laws with their standard deviations."""
-    laws = [q for q in fit.quantities if not q.is_initial and not np.isfinite(q.prior_sigma)]
+def declared_json(fit: Fit, with_known: bool = False) -> dict[str, Any]:
+    """Numbers of the declared laws with their standard deviations.   with_known : of those with a prior, too"""
+    laws = [q for q in fit.quantities if not q.is_initial and (with_known or not np.isfinite(q.prior_sigma))]
     return {q.name: {"value": fit.values[q.name], "sigma": fit.sigma(q.name), "unit": q.unit} for q in laws}
 
 
@@ -82,13 +82,10 @@ def fit_errors(fit: Fit, held: HeldOut | None, noise: float = 1.0) -> dict[str, 
     noise : variance of the noise over that stated; the chi-squares are in units of it
     """
     ratio = None if held is None or not np.isfinite(held.chi_square) else held.ratio_to_floor / np.sqrt(noise)
-    free = {q.name: q for q in fit.quantities if not q.is_initial}
     return {
         "reduced_chi_square": fit.reduced_chi_square / noise,
         "held_out": {"ratio_to_noise_floor": ratio},
-        "parameters": {
-            name: {"value": fit.values[name], "sigma": fit.sigma(name), "unit": q.unit} for name, q in free.items()
-        },
+        "parameters": declared_json(fit, with_known=True),
     }
 
 

@@ -27,7 +27,6 @@ REFITTED = 5  # families that are fitted in full in each round ...
 OF_ONE_KIND = 2  # ... of them of one kind
 LONGER = 2  # of other kinds, that come nearest to the data in more numbers, beside known effects that describe them
 MAX_ITERATIONS = 15  # of a law that describes the data; others wander
-COMES_NEAR = 1.5  # chi-square per degree of freedom, from which on a fit that did not arrive is worth another start
 MIN_SIGMAS = 3.0  # of a coefficient after the refit; what helped to first order may not help the motion
 EXACT = 0.02  # of chi-square: what a first-order gain may err by where the motion is far from the data
 UNLIKELY = 1e-3  # odds below which a law does not count
@@ -174,7 +173,6 @@ def learn(
     """
     price, law, known = price_of_a_number(system.weights), None, system
     current, shortest = base, base.cost / noise
-    alike, rivals, looked = tuple[str, ...](), tuple[tuple[LearnedLaw, float], ...](), 0.0
     scan = system.scan(along, base.quantities) if along is not None else None
     along = along if scan is not None else None
     scan = scan or system.scan(base)
@@ -188,27 +186,25 @@ def learn(
         lengths = [t.cost / noise + sum(price * f.n_numbers + looked for f in one.families) for one, t in trials]
         if not trials or min(lengths) >= shortest:
             break
-        best = int(np.argmin(lengths))
-        near = [
-            one.title for (one, _), other in zip(trials, lengths, strict=True) if other - lengths[best] < CLASS_GAIN
-        ]
-        alike = tuple(title for title in dict.fromkeys(near) if title != trials[best][0].title)
-        # how short a law is decides which is named; what the recording determines is what all that fit it agree in
-        rivals = tuple(
-            (one, odds)
-            for i, (one, t) in enumerate(trials)
-            if i != best and t.converged and (odds := _odds(t, trials[best][1], noise)) > UNLIKELY
+        shortest, along = min(lengths), None
+        law, current = trials.pop(lengths.index(shortest))
+        lengths.remove(shortest)
+        near = dict.fromkeys(
+            one.title for (one, _), its in zip(trials, lengths, strict=True) if its - shortest < CLASS_GAIN
         )
-        (law, current), shortest, along = trials[best], lengths[best], None
+        # how short a law is decides which is named; what the recording determines is what all that fit it agree in
+        odds = [(one, _odds(t, current, noise)) for one, t in trials if t.converged]
+        law = replace(
+            law,
+            alike=tuple(title for title in near if title != law.title),
+            rivals=tuple((one, share) for one, share in odds if share > UNLIKELY),
+            looked=looked,
+        )
         known = system.knowing(law)
         if len(law.families) == MAX_TERMS or np.isfinite(rival) or (is_noise and is_noise(known, current)):
             break
         scan = known.scan(current)
-    return (
-        None
-        if law is None
-        else without_idle_terms(system, replace(law, alike=alike, rivals=rivals, looked=looked), current)
-    )
+    return without_idle_terms(system, law, current) if law is not None else None
 
 
 def base_alone(base: Fit, along: Fit) -> Fit:
@@ -298,19 +294,6 @@ def _one_by_one(system: System, base: Fit, law: LearnedLaw, widths: Sequence[Qua
     return fitted
 
 
-def in_two_steps(system: System, base: Fit, law: LearnedLaw) -> Fit:
-    """The law's fit; where that comes near and does not arrive, from where its amounts alone lead.
-
-    Far from the law's motion, edges make kinks on the way to it.
-    """
-    fitted = with_law(system, base, law)
-    if fitted.converged or not fitted.reduced_chi_square < COMES_NEAR:
-        return fitted
-    held = with_law(system, base, law, {name for names in law.shapes for name in names})
-    again = with_law(system, base, _arrived(law, held))
-    return min(fitted, again, key=lambda f: (not f.converged, f.cost))
-
-
 def without_idle_terms(system: LawSystem, law: LearnedLaw, fitted: Fit) -> LearnedLaw:
     """The law without the terms that the fit to the data itself finds to be zero, if it has others; else the same.
 
@@ -377,29 +360,18 @@ def explained_by_law(
     as_good = [a for a in answers if a.length - shortest < CLASS_GAIN]
     best = min(as_good, key=lambda a: (sum(f.candidate.kind == "motion" for f in a.kept), a.length))
     left, at_noise = best.fit.reduced_chi_square, diagnosis.settings.at_noise * noise
-    listed = replace(diagnosis, explanations=_listed(system, diagnosis, answers))
+    listed = replace(diagnosis, explanations=_listed(diagnosis, answers))
     if not best.length < known:
         text = f"a single law beside the catalogue describes the data too ({left:.4g}): {best.law.title}"
         return None, replace(listed, remarks=(*diagnosis.remarks, text)) if left <= at_noise else diagnosis
     if left > TELLS * noise:
         return None, diagnosis
-    after = diagnosis.after.reduced_chi_square
-    if diagnosis.found and after <= at_noise:
-        names = ", ".join(f.candidate.name for f in diagnosis.found)
-        text = (
-            f"known effects together ({names}) leave {after:.4g} of the expected variance where the law leaves "
-            f"{left:.4g}: with their prices the law is ahead by {known - best.length:.4g}"
-        )
-        listed = replace(listed, remarks=(*diagnosis.remarks, text))
     return replace(best, law=replace(best.law, rivals=_rivals(best, answers, diagnosis))), listed
 
 
-def _listed(
-    system: System, diagnosis: Diagnosis, answers: Sequence[WithLaw]
-) -> tuple[tuple[tuple[str, ...], float], ...]:
+def _listed(diagnosis: Diagnosis, answers: Sequence[WithLaw]) -> tuple[tuple[tuple[str, ...], float], ...]:
     """Explanations by known effects and by laws that are not told from the shortest, and how much longer they are."""
-    settings, noise = diagnosis.settings, diagnosis.noise
-    found = [(e.effects, length(system, settings, noise, e.fit, e.candidates)) for e in diagnosis.ranked]
+    found = [(e.effects, e.length) for e in diagnosis.ranked]
     found += [((*(f.candidate.name for f in a.kept), a.law.title), a.length) for a in answers]
     shortest = min(its for _, its in found)
     near = ((names, its - shortest) for names, its in found if its - shortest < CLASS_GAIN)
@@ -411,13 +383,10 @@ def _known(system: System, diagnosis: Diagnosis) -> float:
 
     Of two that are as good, what is known: a single effect of the motion has that credit, and no sum has.
     """
-
-    def of(fitted: Fit, candidates: Sequence[Candidate]) -> float:
-        single = sum(c.kind == "motion" for c in candidates) == 1
-        return length(system, diagnosis.settings, diagnosis.noise, fitted, candidates) - CLASS_GAIN * single
-
-    answer = of(diagnosis.after, [f.candidate for f in diagnosis.found])
-    return min([answer, *(of(e.fit, e.candidates) for e in diagnosis.ranked)])
+    found = [f.candidate for f in diagnosis.found]
+    answer = length(system, diagnosis.settings, diagnosis.noise, diagnosis.after, found)
+    lengths = [(answer, found), *((e.length, e.candidates) for e in diagnosis.ranked)]
+    return min(its - CLASS_GAIN * (sum(c.kind == "motion" for c in of) == 1) for its, of in lengths)
 
 
 def _beside(system: LawSystem, diagnosis: Diagnosis, doubtful: bool, known: float) -> tuple[tuple[Found, ...], ...]:
@@ -474,7 +443,7 @@ def _law_beside(system: LawSystem, diagnosis: Diagnosis, kept: tuple[Found, ...]
         most = max(factors[name] for name in found.candidate.names) ** 2
         enough = found.threshold * max(1.0, fitted.reduced_chi_square / noise) * most
         held = fitted.values | {q.name: q.null for q in found.candidate.quantities}
-        without = in_two_steps(judged, base_beside(diagnosis.before, rest), replace(law, values=held))
+        without = with_law(judged, base_beside(diagnosis.before, rest), replace(law, values=held))
         gain = (without.cost - fitted.cost) / noise
         if without.converged and gain < enough:
             again, fitted = rest, without

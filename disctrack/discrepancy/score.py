@@ -57,7 +57,7 @@ class Linearisation:
         self.values = values | {name: q.null for name, q in new.items()}
         self._at = np.array([*(values[q.name] for q in self.fitted), *(q.null for q in new.values())])
         free = [i for i, q in enumerate(self.fitted) if q.lower < self._at[i] < q.upper]
-        self._basis = np.linalg.qr(_normalised(self.matrix[:, free]))[0]
+        self.basis = np.linalg.qr(_normalised(self.matrix[:, free]))[0]
 
     def columns(self, names: Sequence[str]) -> Array:
         """Columns (m, k) as they are."""
@@ -65,7 +65,7 @@ class Linearisation:
 
     def cleared(self, columns: Array) -> Array:
         """Columns without what the fitted quantities can absorb."""
-        return cleared(columns, self._basis)
+        return cleared(columns, self.basis)
 
     def gain_of(self, names: Sequence[str]) -> tuple[float, Array]:
         """Decrease of chi-square when these are fitted too, all within their bounds; and their values (k,)."""
@@ -109,18 +109,18 @@ def score(linear: Linearisation, candidate: Candidate) -> Score:
     if not visible:
         return Score(candidate, np.full(k, np.nan), np.full(k, np.inf), 0.0, False)
     gain, values = linear.gain_of(candidate.names)
-    return Score(candidate, values, _sigmas(cleared, before), gain, True)
+    return Score(candidate, values, sigmas(columns, linear.basis), gain, True)
 
 
-def _sigmas(cleared: Array, before: Array) -> Array:
-    length = np.where(before > 0, before, 1.0)
-    normal = (cleared / length).T @ (cleared / length)
-    eigenvalues, vectors = np.linalg.eigh(normal)
-    floor = INVISIBLE**2
-    seen = eigenvalues > floor
+def sigmas(columns: Array, basis: Array) -> Array:
+    """Standard deviations (k,) by columns (m, k) beside what `basis` spans; infinite where the data see nothing."""
+    length = np.linalg.norm(columns, axis=0)
+    left = cleared(columns, basis) / np.where(length > 0, length, 1.0)
+    eigenvalues, vectors = np.linalg.eigh(left.T @ left)
+    seen = eigenvalues > INVISIBLE**2
     variance = (vectors[:, seen] ** 2) @ (1.0 / eigenvalues[seen])
     variance[np.any(np.abs(vectors[:, ~seen]) > INVISIBLE, axis=1)] = np.inf
-    return np.asarray(np.sqrt(variance) / length, float)
+    return np.asarray(np.sqrt(variance) / np.where(length > 0, length, 1.0), float)
 
 
 def score_all(linear: Linearisation, candidates: Sequence[Candidate]) -> list[Score]:

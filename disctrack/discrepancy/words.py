@@ -13,7 +13,6 @@ from disctrack.discrepancy.system import Quantity
 from disctrack.report.numbers import Measured, measured, rounded, score
 
 STRONG = 0.9  # of a correlation, from which on a standard deviation alone misleads by more than twice
-SHARED = 0.9  # correlation from which on another number, and not noise, keeps one open
 
 
 @dataclass(frozen=True)
@@ -74,7 +73,7 @@ def bounds(found: Found, fit: Fit) -> list[str]:
         shared = np.abs(fit.covariance_with(q.name)) / np.where(spread > 0, spread, np.inf) / spread[i]
         shared[i] = 0.0
         partner = int(np.argmax(shared))
-        why = f"as {fit.names[partner]} moves with it" if shared[partner] > SHARED else "by the noise"
+        why = f"as {fit.names[partner]} moves with it" if shared[partner] > STRONG else "by the noise"
         most = measured(abs(size.value) + TWO_SIDED * size.sigma, unit=q.unit)
         texts.append(f"{name} is only bounded, |{name}| < {most} (95 %), {why}")
     return texts
@@ -102,22 +101,21 @@ def together_text(found: Found, diagnosis: Diagnosis) -> str:
     return text
 
 
-def correlated(fit: Fit, names: Sequence[str], among: Sequence[str], strong: float = STRONG) -> tuple[Correlated, ...]:
+def correlated(fit: Fit, names: Sequence[str], among: Sequence[str]) -> tuple[Correlated, ...]:
     """The strongest partner of each of `names`, from `among`; every pair once, and only where it is strong."""
     found: dict[frozenset[str], Correlated] = {}
-    index = {name: i for i, name in enumerate(fit.shared)}
     for first in names:
-        pairs = [pair for second in among if second != first and (pair := _pair(fit, index, first, second))]
+        pairs = [pair for second in among if second != first and (pair := _pair(fit, first, second))]
         best = max(pairs, key=lambda p: abs(p.correlation), default=None)
-        if best is not None and abs(best.correlation) >= strong:
+        if best is not None and abs(best.correlation) >= STRONG:
             found.setdefault(frozenset((best.first, best.second)), best)
     return tuple(found.values())
 
 
-def _pair(fit: Fit, index: dict[str, int], first: str, second: str) -> Correlated | None:
-    if first not in index or second not in index:
+def _pair(fit: Fit, first: str, second: str) -> Correlated | None:
+    if first not in fit.shared or second not in fit.shared:
         return None
-    chosen = [index[first], index[second]]
+    chosen = [fit.shared.index(first), fit.shared.index(second)]
     (a, cross), (_, b) = fit.covariance[np.ix_(chosen, chosen)]
     if not (a > 0 and b > 0):  # one stands at a bound
         return None

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -56,25 +57,23 @@ class Sharing:
 
         Those that differ within a group are left out.
         """
-        groups = [[self.members[i] for i in of] for of in self._sharers[local].values()]
-        names = set.intersection(*(set(m.covariates) for group in groups for m in group))
-        found = {}
-        for name in sorted(names):
-            numbers = [{m.covariates[name] for m in group} for group in groups]
-            if all(len(n) == 1 for n in numbers):
-                found[name] = [n.pop() for n in numbers]
-        return found
+        declared = self._by_group(local, [m.covariates for m in self.members])
+        return {name: numbers for name, numbers in sorted(declared.items()) if None not in numbers}
 
     def kinds_of(self, local: str) -> dict[str, list[str]]:
         """Which disc, surface, ... each group of this quantity has, for those kinds that two groups have in common."""
-        groups = [[self.members[i] for i in of] for of in self._sharers[local].values()]
+        found = self._by_group(local, [m.labels for m in self.members])
+        named = {kind: [label or f"no {kind} declared" for label in labels] for kind, labels in found.items()}
+        return {kind: labels for kind, labels in named.items() if 1 < len(set(labels)) < len(labels)}
+
+    def _by_group(self, local: str, of_members: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
+        """What is the same in all members of each group of a quantity: name -> one for each group."""
+        groups = [[of_members[i] for i in members] for members in self._sharers[local].values()]
         found = {}
-        for kind in dict.fromkeys(k for group in groups for m in group for k in m.labels):
-            labels = [{m.labels.get(kind, "") for m in group} for group in groups]
-            if all(len(one) == 1 for one in labels):
-                of_group = [one.pop() or f"no {kind} declared" for one in labels]
-                if 1 < len(set(of_group)) < len(groups):
-                    found[kind] = of_group
+        for name in dict.fromkeys(name for group in groups for known in group for name in known):
+            each = [{known.get(name) for known in group} for group in groups]
+            if all(len(one) == 1 for one in each):
+                found[name] = [one.pop() for one in each]
         return found
 
     def _grouped(self, i: int, local: str, group: str, shared: str) -> None:

@@ -21,7 +21,7 @@ from disctrack.discrepancy.joint.crew import Crew
 from disctrack.discrepancy.joint.fitting_in import Blocks, FitsIn, apart
 from disctrack.discrepancy.joint.joint_system import JointSystem
 from disctrack.discrepancy.joint.sharing import EACH, Member, Sharing
-from disctrack.discrepancy.score import Linearisation, cleared, score_all, span
+from disctrack.discrepancy.score import Linearisation, score_all, sigmas, span
 from disctrack.discrepancy.search import Diagnosis, Settings, explain
 from disctrack.discrepancy.significance import TWO_SIDED
 from disctrack.discrepancy.system import Candidate
@@ -264,23 +264,12 @@ def sigmas_of_first(system: JointSystem, fit_: Fit, numbers: Sequence[int]) -> d
     for k in numbers:
         matrix = triangle(np.concatenate([derivative[:k].reshape(-1, len(everything)), priors]))
         found[k] = {
-            c.name: _spread(
-                matrix[:, [column[n] for n in known if n not in c.names]], matrix[:, [column[n] for n in c.names]]
+            c.name: sigmas(
+                matrix[:, [column[n] for n in c.names]], span(matrix[:, [column[n] for n in known if n not in c.names]])
             )
             for c in system.candidates
         }
     return found
-
-
-def _spread(base: Array, mine: Array) -> Array:
-    """Standard deviations of the numbers of `mine` with those of `base` free; infinite where they are not seen."""
-    before, left = np.linalg.norm(mine, axis=0), cleared(mine, span(base))
-    seen = np.linalg.norm(left, axis=0) > 1e-6 * np.maximum(before, 1e-300)
-    sigma = np.full(mine.shape[1], np.inf)
-    if seen.any():
-        normal = (left[:, seen] / before[seen]).T @ (left[:, seen] / before[seen])
-        sigma[seen] = np.sqrt(np.diag(np.linalg.pinv(normal))) / before[seen]
-    return sigma
 
 
 def _dependences(system: JointSystem, diagnosis: Diagnosis) -> tuple[Dependence, ...]:

@@ -8,8 +8,8 @@ from scipy import stats
 
 from disctrack.discrepancy.fit import fit
 from disctrack.discrepancy.score import Linearisation, score_all
-from disctrack.discrepancy.significance import as_sigmas, chance, false_discovery
-from disctrack.discrepancy.system import Candidate, Quantity, System
+from disctrack.discrepancy.significance import as_sigmas, chance, false_discovery, ljung_box, no_memory, whiteness
+from tests.oracles.linear_system import Linear, candidate, one
 
 
 def exact(gain, n):
@@ -32,34 +32,20 @@ def test_noise_alone_is_no_sigma():
     assert as_sigmas(9.0, 3) == pytest.approx(2.18, abs=0.01)  # not 3: three numbers gain 3 on average
 
 
-class Waves(System):
+def waves(data):
     """A line with noise of variance 1; it may lack waves that overlap, some of one sign only, and pairs of them."""
-
-    def __init__(self, data):
-        self.time = np.linspace(0.0, 1.0, 120)
-        self.data, self.weights = data, np.ones(120)
-        self.columns = {"a": np.ones(120), "b": self.time}
-        self.base = (Quantity("a", "1", 1.0), Quantity("b", "1", 1.0))
-        found = []
-        for i, rate in enumerate(np.linspace(4.0, 30.0, 25)):
-            names = (f"c{i}", f"s{i}") if i % 3 == 0 else (f"c{i}",)
-            for name, wave in zip(names, (np.cos, np.sin), strict=False):
-                self.columns[name] = wave(rate * self.time)
-            lower = 0.0 if i % 3 == 1 else -np.inf
-            quantities = tuple(Quantity(n, "1", 1.0, lower=lower) for n in names)
-            found.append(Candidate(f"wave {i}", f"wave {i}", "motion", "", "", quantities))
-        self.candidates = tuple(found)
-
-    def linearise(self, values, names):
-        residual = self.data - sum(values[n] * c for n, c in self.columns.items() if n in values)
-        columns = np.zeros((120, 1, len(names)))
-        for i, name in enumerate(names):
-            columns[:, 0, i] = self.columns[name]
-        return residual[:, None], columns
+    time = np.linspace(0.0, 1.0, 120)
+    columns, found = {"a": np.ones(120), "b": time}, []
+    for i, rate in enumerate(np.linspace(4.0, 30.0, 25)):
+        names = (f"c{i}", f"s{i}") if i % 3 == 0 else (f"c{i}",)
+        columns |= {name: wave(rate * time) for name, wave in zip(names, (np.cos, np.sin), strict=False)}
+        lower = 0.0 if i % 3 == 1 else -np.inf
+        found.append(candidate(f"wave {i}", *(one(name, lower=lower) for name in names)))
+    return Linear(time, data, columns, (one("a"), one("b")), found)
 
 
 def of(data):
-    system = Waves(data)
+    system = waves(data)
     base = fit(system, system.base, {})
     linear = Linearisation(system, base, system.candidates)
     return chance(linear, score_all(linear, system.candidates), 1.0, draws=1000)
@@ -77,7 +63,7 @@ def test_the_probability_is_uniform_where_nothing_is_missing(rng):
 
 
 def test_what_is_there_is_improbable(rng):
-    system = Waves(np.zeros(120))
+    system = waves(np.zeros(120))
     assert of(rng.standard_normal(120) + 2.0 * system.columns["c9"]).p_value < 1e-10
     # a wave that may only be positive does not gain from its opposite, but its neighbours do
     assert of(rng.standard_normal(120) - 2.0 * system.columns["c10"]).p_value < 1e-10
@@ -99,3 +85,21 @@ def test_false_discoveries_among_many_recordings_are_as_stated(rng):
     assert np.mean(shares) == pytest.approx(0.075, abs=4 * np.std(shares) / np.sqrt(300))
     naive = 30 * 0.1 / (30 * 0.1 + 10)
     assert np.mean(shares) < 0.5 * naive
+
+
+def test_the_tail_of_ljung_and_box_is_as_stated_in_short_series(rng):
+    """Chi-square's is too thin: at 200 samples its 1e-3 is seen four times as often."""
+    statistic = ljung_box(rng.standard_normal((200, 20_000)))
+    for level in (0.05, 0.01, 1e-3):
+        seen = int(sum(no_memory(x, 200) < level for x in statistic if x > 25))
+        assert stats.binomtest(seen, 20_000, level).proportion_ci(1 - 1e-4).high > 0.7 * level
+        assert seen / 20_000 < 1.3 * level + 4 * np.sqrt(level / 20_000)
+    assert np.mean(stats.chi2.sf(statistic, 20) < 1e-3) > 2.5e-3
+
+
+def test_a_slow_wave_is_no_noise_and_named_after_the_frequency_that_it_lies_at(rng):
+    wave = rng.standard_normal((500, 3)) + np.sin(2 * np.pi * 27.0 * np.arange(500) / 1000.0)[:, None]
+    answer = whiteness(wave, 1000.0, {"precession": 27.0})
+    assert answer.p_value < 1e-6
+    assert answer.peak_near == ("precession",) * 3
+    assert (answer.peak_p_value < 1e-6).all()

@@ -6,8 +6,9 @@ import pytest
 from disctrack.discrepancy.fit import Fit, fit
 from disctrack.discrepancy.score import Score
 from disctrack.discrepancy.search import Found, _bounds
-from disctrack.discrepancy.system import Candidate, Quantity, System
+from disctrack.discrepancy.system import Candidate, Quantity
 from disctrack.discrepancy.words import bounds, correlated
+from tests.oracles.linear_system import Linear, one
 
 TILT = tuple(Quantity(f"table_tilt.tilt_{axis}", "rad", 1e-6) for axis in "xy")
 DECLARED = Quantity("km.k_m", "m s^2", 1e-9)
@@ -36,27 +37,18 @@ def test_a_candidate_that_gains_no_more_than_noise_is_told_with_its_bound():
     assert _bounds(score) == "; only bounded: tilt_x < 3e-06 rad (95 %)"
 
 
-class TwoNearlyEqualSlopes(System):
+def two_nearly_equal_slopes(seed):
     """y = a t + b t^1.1 + c with noise of variance 1."""
-
-    candidates = ()
-
-    def __init__(self, seed: int) -> None:
-        self.time = np.linspace(0.5, 1.5, 200)
-        self.base = tuple(Quantity(name, "1", 0.1) for name in "abc")
-        self.columns = np.stack([self.time, self.time**1.1, np.ones(200)], axis=1)
-        self.data = self.columns @ [3.0, 2.0, 1.0] + np.random.default_rng(seed).standard_normal(200)
-        self.weights = np.ones(200)
-
-    def linearise(self, values, names):
-        residual = self.data - self.columns @ [values[n] for n in "abc"]
-        return residual[:, None], self.columns[:, None, ["abc".index(n) for n in names]]
+    time = np.linspace(0.5, 1.5, 200)
+    columns = {"a": time, "b": time**1.1, "c": np.ones(200)}
+    observed = 3 * columns["a"] + 2 * columns["b"] + 1 + np.random.default_rng(seed).standard_normal(200)
+    return Linear(time, observed, columns, [one(name) for name in "abc"])
 
 
 def test_the_combination_that_is_known_is_known_as_well_as_stated():
     errors, sigmas, alone = [], [], []
     for seed in range(60):
-        system = TwoNearlyEqualSlopes(seed)
+        system = two_nearly_equal_slopes(seed)
         found = fit(system, system.base, {})
         (pair,) = correlated(found, ["a"], ["b"])
         errors.append(pair.value - (3.0 + pair.factor * 2.0))
@@ -65,10 +57,3 @@ def test_the_combination_that_is_known_is_known_as_well_as_stated():
     assert pair.correlation < -0.99
     assert max(sigmas) < 0.1 * min(alone)
     assert np.sqrt(np.mean((np.array(errors) / sigmas) ** 2)) == pytest.approx(1.0, abs=4 / np.sqrt(120))
-
-
-def test_quantities_without_each_other_are_no_pair():
-    system = TwoNearlyEqualSlopes(1)
-    free = fit(system, system.base, {})
-    assert correlated(free, ["a"], ["a", "unknown"]) == ()
-    assert correlated(free, ["a"], ["b"], strong=1.1) == ()

@@ -61,12 +61,6 @@ def test_nothing_is_found_where_nothing_is_hidden(rng):
     assert sum(bool(f) for f in claimed) == 0  # 0.005 each
 
 
-def test_sigma_falls_with_the_root_of_the_number(rng):
-    items = runs(rng, 16)
-    few, many = (fit(s, s.base, s.sharing.start()) for s in (joint(items[:4])[0], joint(items)[0]))
-    assert few.sigma("friction.g") / many.sigma("friction.g") == pytest.approx(2.0, rel=0.15)  # amplitudes differ
-
-
 def test_a_run_of_another_disc_among_them_is_named(rng):
     items = runs(rng, 12, run_7={"rate": 0.87})
     system, found = answer(items)
@@ -182,15 +176,6 @@ def test_quantities_of_an_undeclared_kind_are_shared_by_all_who_do_not_declare_i
     items = [renamed(item, surface="") for item in runs(rng, 3)] + runs(rng, 2)
     system, _ = joint(items)
     assert [q.name for q in system.base] == ["friction.g[no surface declared]", "friction.g[glass]"]
-
-
-def test_hypotheses_of_exact_values():
-    x = np.array([1.0, 2.0, 3.0, 5.0])
-    tested = hypotheses(7 * x**1.5, 1e-6 * np.eye(4), {"radius": x.tolist(), "mass": [1.0] * 4})
-    by_text = {h.text: h for h in tested}
-    assert by_text["in proportion to a power of the radius"].numbers["exponent of the radius"][0] == pytest.approx(1.5)
-    assert not by_text["the same for all"].holds
-    assert len(tested) == 2  # nothing is said of a mass that does not differ
 
 
 def test_the_sigma_of_an_exponent_is_its_scatter_however_small_the_law_s_constant(rng):
