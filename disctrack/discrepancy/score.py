@@ -67,6 +67,12 @@ class Linearisation:
         """Columns without what the fitted quantities can absorb."""
         return cleared(columns, self.basis)
 
+    def seen(self, names: Sequence[str]) -> Array:
+        """(m, b) of these columns, without what the fitted quantities can absorb, those of which something is left."""
+        columns = self.columns(names)
+        left = self.cleared(columns)
+        return left[:, np.linalg.norm(left, axis=0) > INVISIBLE * np.maximum(np.linalg.norm(columns, axis=0), 1e-300)]
+
     def gain_of(self, names: Sequence[str]) -> tuple[float, Array]:
         """Decrease of chi-square when these are fitted too, all within their bounds; and their values (k,)."""
         mine = [self.column[n] for n in names]
@@ -101,15 +107,11 @@ def _normalised(columns: Array) -> Array:
 
 def score(linear: Linearisation, candidate: Candidate) -> Score:
     """Gain, values and sigmas of one candidate to first order."""
-    columns = linear.columns(candidate.names)
-    cleared = linear.cleared(columns)
-    before, after = np.linalg.norm(columns, axis=0), np.linalg.norm(cleared, axis=0)
-    visible = bool((after > INVISIBLE * np.maximum(before, 1e-300)).any() and (after > 0).any())
-    k = len(candidate.names)
-    if not visible:
+    if not linear.seen(candidate.names).size:
+        k = len(candidate.names)
         return Score(candidate, np.full(k, np.nan), np.full(k, np.inf), 0.0, False)
     gain, values = linear.gain_of(candidate.names)
-    return Score(candidate, values, sigmas(columns, linear.basis), gain, True)
+    return Score(candidate, values, sigmas(linear.columns(candidate.names), linear.basis), gain, True)
 
 
 def sigmas(columns: Array, basis: Array) -> Array:
@@ -133,13 +135,8 @@ def angle(linear: Linearisation, signal: Array, names: Sequence[str]) -> float:
 
     0: no fit tells them apart; pi/2: nothing in common.
     """
-    signal = linear.cleared(signal[:, None])[:, 0]
-    columns = linear.columns(names)
-    cleared = linear.cleared(columns)
-    keep = np.linalg.norm(cleared, axis=0) > INVISIBLE * np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
-    length = float(np.linalg.norm(signal))
-    if length == 0 or not keep.any():
+    signal, basis = linear.cleared(signal), span(linear.seen(names))
+    if not basis.size or not signal.any():
         return float(np.pi / 2)
-    U = span(cleared[:, keep])
-    within = U @ (U.T @ signal)
+    within = basis @ (basis.T @ signal)
     return float(np.arctan2(np.linalg.norm(signal - within), np.linalg.norm(within)))

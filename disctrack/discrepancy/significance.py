@@ -13,7 +13,7 @@ import numpy as np
 from scipy import signal, special, stats
 
 from calibration.kit.arrays import Array
-from disctrack.discrepancy.score import INVISIBLE, Linearisation, Score, span
+from disctrack.discrepancy.score import Linearisation, Score, span
 
 TWO_SIDED = float(stats.norm.isf(0.025))  # sigmas: 95 % between both limits
 LARGE = 500.0  # chi-square beyond which its tail is taken from the asymptotic series: the probability underflows
@@ -102,11 +102,8 @@ def chance(linear: Linearisation, scores: Sequence[Score], noise: float, draws: 
 
 def _directions(linear: Linearisation, names: Sequence[str]) -> Array:
     """Orthonormal (m, k) of what these can predict and the fitted quantities cannot; a single one keeps its sign."""
-    columns = linear.columns(names)
-    cleared = linear.cleared(columns)
-    before, after = np.linalg.norm(columns, axis=0), np.linalg.norm(cleared, axis=0)
-    seen = after > INVISIBLE * np.maximum(before, 1e-300)
-    return cleared[:, seen] / after[seen] if seen.sum() == 1 else span(cleared[:, seen])
+    seen = linear.seen(names)
+    return seen / np.linalg.norm(seen) if seen.shape[1] == 1 else span(seen)
 
 
 def _among(observed: float, sorted_draws: Array) -> Chance:

@@ -192,18 +192,16 @@ def _with_memory(system: JointSystem, diagnosis: Diagnosis, crew: Crew) -> tuple
     ]
     answers = crew.call("alone", asked)
     alone = [a if isinstance(a, Alone) else None for a in answers]
-    free = [q for q in after.quantities if not np.isfinite(q.prior_sigma)]
+    fitted = [(i, a) for i, a in enumerate(alone) if a is not None and a.converged]
     growth = np.ones(len(after.quantities))
-    for q in free:
-        weights, squares = 0.0, 0.0
-        for i, a in enumerate(alone):
-            for local in sharing.local_names(i, [q.name]):
-                sigma = a.sigmas.get(local, 0.0) if a is not None and a.converged else 0.0
-                if a is not None and np.isfinite(sigma) and sigma > 0:
-                    weights += sigma**-2
-                    squares += sigma**-2 * a.inflation[local] ** 2
-        if weights > 0:
-            growth[after.names.index(q.name)] = np.sqrt(max(squares / weights, 1.0))
+    for k, q in enumerate(after.quantities):
+        if np.isfinite(q.prior_sigma):
+            continue
+        of_each = [(a, local) for i, a in fitted for local in sharing.local_names(i, [q.name])]
+        seen = [(a, local) for a, local in of_each if 0 < a.sigmas.get(local, 0.0) < np.inf]
+        weights = [a.sigmas[local] ** -2 for a, local in seen]
+        if seen:
+            growth[k] = np.sqrt(max(np.average([a.inflation[local] ** 2 for a, local in seen], weights=weights), 1.0))
     grown = replace(after, covariance=after.covariance * np.outer(growth, growth))
     return replace(diagnosis, after=grown), alone
 

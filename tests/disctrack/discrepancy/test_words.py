@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from disctrack.discrepancy.fit import Fit, fit
-from disctrack.discrepancy.score import Score
-from disctrack.discrepancy.search import Found, _bounds
+from disctrack.discrepancy.search import Found
 from disctrack.discrepancy.system import Candidate, Quantity
 from disctrack.discrepancy.words import bounds, correlated
 from tests.oracles.linear_system import Linear, one
@@ -30,11 +29,6 @@ def told(values, sigmas, correlation=0.0):
 def test_a_number_that_may_be_zero_is_bounded_and_what_keeps_it_open_is_named(tilt_y, correlation, why):
     bounded = told((5e-6, tilt_y, 1.0), (1e-6, 1e-6, 0.1), correlation)
     assert bounded == ([f"tilt_y is only bounded, |tilt_y| < 2.96 µrad (95 %), {why}"] if why else [])
-
-
-def test_a_candidate_that_gains_no_more_than_noise_is_told_with_its_bound():
-    score = Score(CANDIDATE, np.array([1e-6, -2e-6]), np.array([1e-6, np.inf]), 1.0, True)
-    assert _bounds(score) == "; only bounded: tilt_x < 3e-06 rad (95 %)"
 
 
 def two_nearly_equal_slopes(seed):
