@@ -281,8 +281,7 @@ class _Search:
         """
         for names, values in self.former.items():
             together = tuple(c for c in self.system.candidates if c.name in names)
-            fitted = self._fit(together, values)
-            self.pool[_names(together)] = Explanation(together, fitted, fitted.converged)
+            self._explanation(together, values)
         if self.nothing.fit.converged or _near_enough(self.system, self.nothing.fit):
             return self.nothing
         self.expanded.add(frozenset())
@@ -397,13 +396,20 @@ class _Search:
         if len(extra) == 1:
             self.first.setdefault(extra[0].name, (gain, new))
 
+    def _explanation(
+        self, together: tuple[Candidate, ...], start: Values, tested: Sequence[Candidate] = ()
+    ) -> Explanation:
+        """By these effects, fitted from `start` if they were not before.   tested : to credible amounts"""
+        names = _names(together)
+        if names not in self.pool:
+            fitted = self._fit(together, start)
+            new = Explanation(together, fitted, fitted.converged)
+            self.pool[names] = replace(new, credible=False) if tested and self._incredible(new, tested) else new
+        return self.pool[names]
+
     def _refit_without(self, e: Explanation, c: Candidate) -> Explanation:
         rest = tuple(other for other in e.candidates if other is not c)
-        names = _names(rest)
-        if names not in self.pool:
-            fitted = self._fit(rest, _without(e.fit.values, c, rest))
-            self.pool[names] = Explanation(rest, fitted, fitted.converged)
-        return self.pool[names]
+        return self._explanation(rest, _without(e.fit.values, c, rest))
 
     def _enlarged(self, e: Explanation, with_thresholds: bool) -> list[tuple[Candidate, ...]]:
         """Terms, and pairs of them where one alone will not do, that are worth a refit beside those of `e`."""
@@ -612,13 +618,8 @@ class _Search:
         near = near[: MOST_RIVALS if strength < FAINT else MOST_RIVALS // 2]
         found = []
         for candidate in near:
-            together = (*rest, candidate)
-            names = _names(together)
-            if names not in self.pool:
-                fitted = self._fit(together, _without(e.fit.values, effect, rest))
-                new = Explanation(together, fitted)
-                self.pool[names] = replace(new, credible=fitted.converged and not self._incredible(new, (candidate,)))
-            other = self.pool[names]
+            start = _without(e.fit.values, effect, rest)
+            other = self._explanation((*rest, candidate), start, (candidate,))
             loss = (other.fit.cost - e.fit.cost) / self.noise
             if other.fit.converged and loss < CLASS_GAIN:
                 found.append(Rival(candidate, angles[candidate.name], loss, other.fit))
