@@ -63,12 +63,12 @@ def rms_left(answer: Answer, run: Run) -> dict[str, tuple[float, float]]:
 
 
 def example(folder: Path) -> Outcome:
-    """What does a pendulum with viscous friction lack, and does what is found foretell the rest of its swing?"""
+    """What does a pendulum with viscous friction lack, and does what is found predict the rest of its swing?"""
     run = swing(folder)
     answer = asked(run)
     left, encoder = rms_left(answer, run), STEP / np.sqrt(12)
     lines = [str(answer), "", f"{'rms [mrad]':<38}{'before':>10}{'after':>10}"]
-    for i, name in enumerate(("fitted, 0 to 36.668 s", "kept back, 36.668 to 55 s, foretold")):
+    for i, name in enumerate(("fitted, 0 to 36.668 s", "kept back, 36.668 to 55 s, predicted")):
         lines.append(f"{name:<38}" + "".join(f"{1e3 * rms[i]:10.3g}" for rms in left.values()))
     lines.append(f"{'the step of the encoder allows':<38}{1e3 * encoder:10.3g}{1e3 * encoder:10.3g}")
     kept = {side: rms[1] for side, rms in left.items()}

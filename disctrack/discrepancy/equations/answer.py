@@ -15,7 +15,7 @@ from calibration.kit.arrays import Array
 from calibration.kit.threads import one_blas_thread
 from disctrack.discrepancy.document import document, tables
 from disctrack.discrepancy.equations.declared import Equations, Run, Samples, Term, checked
-from disctrack.discrepancy.equations.forecast import Forecast, RunScore, foretold, scored
+from disctrack.discrepancy.equations.forecast import Forecast, RunScore, free_run, scored
 from disctrack.discrepancy.equations.law import NAME, LearnedForce
 from disctrack.discrepancy.equations.loop import ask
 from disctrack.discrepancy.equations.system import EquationSystem, fitted_rows
@@ -203,7 +203,7 @@ class Answer:
 
     @property
     def sigmas(self) -> dict[str, float]:
-        """Their standard deviations; nought for one that stands at a bound."""
+        """Their standard deviations; zero for one that stands at a bound."""
         return {name: self.diagnosis.after.sigma(name) for name in self.diagnosis.after.names}
 
     @cached_property
@@ -235,7 +235,7 @@ class Answer:
             fitted, errors = d.nearest, self._errors(d.nearest, None)
         of_noise = d.verdict != "unexplained" and by != "before"
         left = [e.noise if of_noise else np.nanmax([e.noise, e.rms, e.held_out]) for e in errors.values()]
-        return foretold(self.system, fitted, self._checked(run), np.array(left), window)
+        return free_run(self.system, fitted, self._checked(run), np.array(left), window)
 
     def score(self, run: Run, *, window: float = 0.0, by: str = "after") -> dict[str, RunScore]:
         """By channel, how well a free run (`forecast`) predicts the samples of a run after the window."""

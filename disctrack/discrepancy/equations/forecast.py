@@ -38,7 +38,7 @@ class RunScore:
     n_samples: int
 
 
-def foretold(system: EquationSystem, fitted: Fit, samples: Samples, left: Array, window: float) -> Forecast:
+def free_run(system: EquationSystem, fitted: Fit, samples: Samples, left: Array, window: float) -> Forecast:
     """Run the model from the fitted numbers.
 
     system : with formulas and sizes; its stretches are not used

@@ -62,7 +62,7 @@ class Along:
     equation: str  # state whose equation it stands in
     variable: str  # state, input, or "t"
     jumps: bool = False  # with the variable's sign, as friction does
-    fine: bool = False  # of finer waves near nought, as drag that falls with speed has them
+    fine: bool = False  # of finer waves near zero, as drag that falls with speed has them
 
     @property
     def title(self) -> str:

@@ -385,7 +385,7 @@ def _with_memory(
     size = float(np.sqrt(np.sum(residual**2) / max(present.sum(), 1)))
     lasting = persistence(residual, system.rows) * float(np.median(np.diff(system.stretches[0].time)))
     shortest_turn = min(min(turn(s), _pace(s)) for s in system.stretches)
-    # so slow an error is the motion's own: that it can be foretold sample by sample does not make it noise
+    # so slow an error is the motion's own: that it can be predicted sample by sample does not make it noise
     as_noise = diagnosis.verdict != "unexplained" or lasting <= SLOW * shortest_turn
     as_noise &= size <= NO_SENSOR
     remembering = without_memory(system, system.rows, coefficients, present)
@@ -447,7 +447,7 @@ def _certain(system: EquationSystem, diagnosis: Diagnosis, block: float) -> Diag
 
 
 def _wald(names: Sequence[str], fitted: Fit) -> float:
-    """Square of the distance from nought in standard deviations, of numbers that move together."""
+    """Square of the distance from zero in standard deviations, of numbers that move together."""
     here = [fitted.shared.index(n) for n in names]
     return wald(np.array([fitted.values[n] for n in names]), fitted.covariance[np.ix_(here, here)])
 
@@ -456,7 +456,7 @@ def robust(system: EquationSystem, fitted: Fit, block: float) -> Fit:
     """The fit with the covariance that its own residual brings about, errors within `block` [s] taken together.
 
     The sandwich of Huber and White over blocks: what is left need be neither white nor as large as stated. The fit
-    bends as many sums over blocks to nought as it has numbers: data that hold too few blocks are cut into shorter ones,
+    bends as many sums over blocks to zero as it has numbers: data that hold too few blocks are cut into shorter ones,
     which are then taken as wholly alike for as long as an error lasts (the largest that their sum can be).
     """
     own = Own(system, fitted.quantities)

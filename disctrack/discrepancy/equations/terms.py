@@ -85,7 +85,7 @@ def end_stop(v: str, x: str, side: int = 1, name: str = "") -> Term:
 def backlash(v: str, x: str, stiffness: str, onto: Mapping[str, str] | None = None, name: str = "") -> Term:
     """Play of a spring or coupling that is declared without: within half the play to either side it does nothing.
 
-    x : its deflection, a coordinate or a difference ("x - y"), nought in the middle of the play
+    x : its deflection, a coordinate or a difference ("x - y"), zero in the middle of the play
     stiffness : its factor in the equation of v, which has -stiffness*x
     onto : by other velocities that it acts on, its factor there: {"w": "-k/m"} where their equation has +k/m*x
     """
