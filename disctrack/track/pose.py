@@ -151,7 +151,7 @@ def fit_poses(
     W = whitening(np.where(used[..., None, None], covariance, 0.0))
     for some in np.array_split(np.flatnonzero(good), good.sum() // 512 + 1) if with_sensitivity else ():
         d_rig = rig.project_with_jacobians(centres @ np.swapaxes(R[some], 1, 2) + t[some][:, None])[2]
-        by_rig = np.swapaxes(JW[some], 1, 2) @ (W[some] @ d_rig).reshape(len(some), -1, 30)
+        by_rig = np.swapaxes(JW[some], 1, 2) @ (W[some] @ d_rig).reshape(len(some), JW.shape[1], 30)
         sensitivity[some] = -pose_covariance[some] @ by_rig
     return PoseFits(
         R_world_body=np.where(good[:, None, None], R, np.nan),
