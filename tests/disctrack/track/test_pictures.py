@@ -5,12 +5,11 @@ import dataclasses
 import cv2
 import numpy as np
 import pytest
-from PIL import Image
 
 from disctrack.disc import MA_2014
 from disctrack.errors import OutputError
 from disctrack.frames import COORDINATES, rotation_from_euler
-from disctrack.report.figures import DPI, save_figure
+from disctrack.report.figures import save_figure
 from disctrack.track import pictures as plots
 from disctrack.track import video_overlay as overlay
 from disctrack.trajectory import FrameStatus, Trajectory
@@ -29,16 +28,6 @@ def trajectory() -> Trajectory:
 def black(trajectory):
     width, height = trajectory.rig.left.image_size
     return np.zeros((2, height, width), np.uint8)
-
-
-@pytest.mark.statistical
-def test_a_png_file_shows_what_matplotlib_writes_at_the_same_size_on_paper(trajectory, tmp_path):
-    figure = plots.coordinates_figure(trajectory)
-    figure.savefig(tmp_path / "expected.png", dpi=DPI)
-    path = save_figure(figure, tmp_path / "ours.png")
-    ours, expected = (Image.open(file) for file in (path, tmp_path / "expected.png"))
-    np.testing.assert_array_equal(np.asarray(ours), np.asarray(expected)[..., :3])
-    assert ours.info["dpi"] == pytest.approx(expected.info["dpi"])
 
 
 @pytest.mark.parametrize("name", sorted(plots.FIGURES))
