@@ -45,7 +45,6 @@ STRETCHES, STRETCH, BLOCK = 4, 100, 20  # stretches looked at, frames of each, f
 MIN_BLOCKS = 5
 # Below, the disc may lie on a patch of its face and the weight has no arm; above, the arm of the weight is short.
 THETA_RANGE = np.radians(1.0), np.radians(60.0)
-MIN_TURN = 0.5  # [rad] of precession in a stretch: a disc that leans on something does not precess
 SIGMAS = 5.0
 # What honest discs and tables may do: rounded edges and tables that lean by a degree shift the balance by 3 % at most.
 BALANCE = 0.10
@@ -59,7 +58,6 @@ MIN_ROUND, FLAT = 2.0, 0.1  # [rad] of precession; scatter about the plane over 
 MIN_SWING = 0.05  # range of sin(theta) below which radius and thickness are not told apart
 SEEN_RARELY = 0.1  # share of the images
 MIN_DOTS_LEFT = 4  # that are seen
-ALIKE = 0.2  # radii by the rates and by the rim: the balance of moments is not quite in proportion to the radius
 DENSITIES = 50.0, 23e3  # [kg/m^3] a hard foam's, and osmium's
 MOST_HEIGHT = 3e-3  # [m] of the rim's plane from the foot of a board that lies on it, its thickness wrong or not
 OFF = (Kind.TABLE_DISAGREES, Kind.OFF_THE_TABLE)  # a wrong number is seen so
@@ -192,11 +190,11 @@ def _of_gravity(trajectory: Trajectory, ratio: float) -> tuple[Remedy, ...]:
 
 
 def _radius_suspected(trajectory: Trajectory, ratio: float) -> tuple[float, Remedy]:
-    """First of all where the rim is on the table with about the radius that the rates ask for."""
+    """First of all where the rim is on the table with a radius nearer to that of the rates than to the declared one."""
     z, theta = trajectory.q[trajectory.measured][:, [2, 4]].T
     disc, would_be, misfit = trajectory.disc, trajectory.disc.radius / ratio, abs(float(np.log(ratio)))
     by_rim = float(np.median((z - disc.half_thickness * np.abs(np.cos(theta))) / np.sin(theta)))
-    if trajectory.rig.world_is_table and by_rim > 0 and abs(np.log(by_rim / would_be)) < min(ALIKE, 0.5 * misfit):
+    if trajectory.rig.world_is_table and by_rim > 0 and abs(np.log(by_rim / would_be)) < 0.5 * misfit:
         would_be, misfit = by_rim, 0.0
     return misfit, Remedy("[disc] radius_mm", f"{1e3 * would_be:.4g}", f"{1e3 * disc.radius:g}")
 
@@ -247,7 +245,7 @@ def _blocks(motion: MeasuredMotion) -> tuple[Array, Array]:
     e1, e2, e3 = motion.axes()
     theta = np.arctan2(motion.sine, e3[:, 2])
     good = motion.known & motion.measured & (theta > THETA_RANGE[0]) & (theta < THETA_RANGE[1])
-    if good.sum() < BLOCK or np.ptp(motion.euler[good, 0]) < MIN_TURN:
+    if good.sum() < BLOCK:
         return np.empty(0), np.empty(0)
 
     def times_inertia(vector: Array) -> Array:
