@@ -202,6 +202,10 @@ def write_rig(
 
     attributes : of the root, beside its own
     Raises RigFileError if it cannot be written.
+
+    >>> write_rig("rig.h5", read_rig("clip/results/rig.h5"))
+    >>> read_rig("rig.h5").baseline == read_rig("clip/results/rig.h5").baseline
+    True
     """
     if isinstance(content, StereoCalibration):
         content = RigFile(content.rig, record_of(content))
@@ -311,7 +315,11 @@ def _write_record(group: h5py.Group, record: CalibrationRecord) -> None:
 
 
 def read_rig(path: str | os.PathLike[str]) -> StereoRig:
-    """The rig of a rig file. Raises RigFileError."""
+    """The rig of a rig file. Raises RigFileError.
+
+    >>> read_rig("clip/results/rig.h5").left.image_size
+    (272, 272)
+    """
     return read_rig_file(path).rig
 
 

@@ -24,6 +24,9 @@ class Disc(Brief):
     """A homogeneous disc of radius r and thickness 2h with round dots on its upper face.
 
     Body frame: origin at the centre of mass, third axis e3 out of the upper face.
+
+    >>> Disc(0.0375, 0.003, 0.2, [[0.026, 0, 0.003], [0, 0.026, 0.003], [-0.026, 0, 0.003]], 0.007)
+    Disc(diameter 75 mm, thickness 6 mm, mass 200 g, dots 3)
     """
 
     radius: float  # r [m]

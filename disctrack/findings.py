@@ -241,7 +241,10 @@ class DoubtWarning(UserWarning):
 def warn_of_doubts(findings: Iterable[Finding]) -> None:
     """A Python warning for each cause that puts the result in doubt, at the line that called one of the packages."""
     level, frame = 1, sys._getframe()
-    while frame.f_back is not None and frame.f_globals["__name__"].split(".")[0] in ("disctrack", "calibration"):
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").split(".")[0] in (
+        "disctrack",
+        "calibration",
+    ):
         level, frame = level + 1, frame.f_back
     for finding in doubts(findings):
         warnings.warn(finding.sentence, DoubtWarning, stacklevel=level)

@@ -8,6 +8,12 @@ class DiscTrackError(Exception):
     """Base of every error this distribution raises on purpose.
 
     It lives here, not in `disctrack`, because imports point from `disctrack` to `calibration` only.
+
+    >>> try:
+    ...     read_recording("nowhere")
+    ... except DiscTrackError as error:
+    ...     print(str(error).partition(":")[0])
+    nowhere
     """
 
 

@@ -38,7 +38,12 @@ class Scaling(Outline):
 
 @dataclass(frozen=True, repr=False)
 class Analysis(Brief):
-    """Everything that the analysis of one trajectory gives."""
+    """Everything that the analysis of one trajectory gives.
+
+    >>> analysis = run_analyse("clip/results/trajectory.h5", overwrite=True).analysis
+    >>> bool(analysis.energy.loss > 0)
+    True
+    """
 
     trajectory: Trajectory
     motion: MeasuredMotion

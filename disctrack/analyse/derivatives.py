@@ -144,6 +144,10 @@ def differentiate(trajectory: Trajectory, breaks: Sequence[float] = ()) -> Measu
     differentiated apart, with the larger sigmas that ends have. A break that leaves fewer than MIN_FRAMES poses on a
     side is passed over.
     Raises AnalysisError when too few frames have a pose, or time does not increase.
+
+    >>> motion = differentiate("clip/results/trajectory.h5")
+    >>> motion.velocity.shape
+    (300, 3)
     """
     time = np.asarray(trajectory.time, float)
     good = trajectory.measured & np.isfinite(trajectory.pose_covariance).all(axis=(1, 2))

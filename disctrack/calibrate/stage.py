@@ -92,7 +92,12 @@ def source_of(recording: Recording, settings: CalibrationSettings) -> Calibratio
 def calibrate_recording(
     recording: Recording, settings: CalibrationSettings | None = None, progress: Progress | None = None
 ) -> tuple[StereoCalibration, tuple[str, ...]]:
-    """`calibrate_views` with the views, board and table that a recording names. RecordingError without them."""
+    """`calibrate_views` with the views, board and table that a recording names. RecordingError without them.
+
+    >>> found, problems = calibrate_recording("clip")
+    >>> round(found.rig.baseline, 4)
+    0.2955
+    """
     return source_of(recording, settings or CalibrationSettings()).calibrated(progress)
 
 

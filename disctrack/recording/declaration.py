@@ -164,7 +164,12 @@ class TableView:
 
 @dataclass(frozen=True, repr=False)
 class Recording(Outline):
-    """What recording.toml declares, in SI units; exactly one of `views` and `rig_file` is given."""
+    """What recording.toml declares, in SI units; exactly one of `views` and `rig_file` is given.
+
+    >>> recording = read_recording("clip")
+    >>> recording.frame_rate, recording.gravity
+    (1000.0, 9.81)
+    """
 
     folder: Path
     name: str
@@ -201,6 +206,9 @@ def read_recording(path: str | Path) -> Recording:
     """Recording from its folder (or from its recording.toml).
 
     Raises RecordingError that names the file, the key, what was found, what was expected and what to do.
+
+    >>> read_recording("clip").disc.n_markers
+    6
     """
     file = _recording_file(Path(path))
     keep(file)

@@ -18,7 +18,11 @@ DEFAULT_THETA_END = np.radians(0.5)  # where the disc of Ma et al. (2014) comes 
 
 @dataclass(frozen=True)
 class Model:
-    """Disc, gravity and effects; parameters are addressed as "effect.parameter"."""
+    """Disc, gravity and effects; parameters are addressed as "effect.parameter".
+
+    >>> Model(read_recording("clip").disc).gravity
+    9.81
+    """
 
     disc: Disc
     gravity: float = 9.81  # [m/s^2] along -k, unless an effect says otherwise

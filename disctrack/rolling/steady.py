@@ -25,6 +25,9 @@ def steady_precession(
     nutation_amplitude, nutation_phase : to first order theta(t) = theta + amplitude cos(w t + phase), where w is
         `nutation_frequency`; omega2 and omega3 are changed along with it, as the linear motion requires.
     Raises ModelError where no regular precession exists.
+
+    >>> float(steady_precession(0.1, read_recording("clip").disc).theta)
+    0.1
     """
     p, q = precession_rate(theta, disc, gravity, omega3)
     offset = nutation_amplitude * np.cos(nutation_phase)

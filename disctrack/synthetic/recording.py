@@ -89,7 +89,12 @@ def write_recording(
 def run_render(
     scene_path: str | Path, folder: str | Path, truth_path: str | Path | None = None, progress: Progress | None = None
 ) -> Truth:
-    """`disctrack render SCENE.toml -o RECORDING`: load, render, write; errors as in load_scene and write_recording."""
+    """`disctrack render SCENE.toml -o RECORDING`: load, render, write; errors as in load_scene and write_recording.
+
+    >>> truth = run_render("scene.toml", "rendered")
+    >>> len(truth.time)
+    4
+    """
     return write_recording(folder, load_scene(scene_path), truth_path=truth_path, progress=progress)
 
 

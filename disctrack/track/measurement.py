@@ -67,7 +67,12 @@ class ImagePairs:
 
 @dataclass(frozen=True, repr=False)
 class Measurement(Brief):
-    """A tracked recording, with what was noticed in `trajectory.findings`."""
+    """A tracked recording, with what was noticed in `trajectory.findings`.
+
+    >>> measurement = measure("clip", "clip/results/rig.h5", open_pairs("clip", (0, 40)))
+    >>> measurement.trajectory.q.shape, measurement.unreadable
+    ((300, 6), ())
+    """
 
     trajectory: Trajectory
     unreadable: tuple[Unreadable, ...]
@@ -86,6 +91,9 @@ def open_pairs(recording: Recording, frames: tuple[int | None, int | None] = (No
 
     Raises RecordingError if images are missing, do not belong together, or the range holds no frame; or if a camera's
     own header contradicts the other's, or the declared frame rate.
+
+    >>> len(open_pairs("clip", frames=(100, 200)))
+    100
     """
     readers = [
         open_frames(pattern, recording.folder, camera)
@@ -142,6 +150,10 @@ def measure(
     Images that cannot be read are lost frames, named in the result. progress is called with the pairs done.
     boards : of the calibration's views, so that a wrong table view is told with the right one
     Raises TrackingError if the disc is found in no frame.
+
+    >>> measurement = measure("clip", "clip/results/rig.h5", open_pairs("clip"))
+    >>> int(measurement.trajectory.measured.sum())
+    300
     """
     settings = settings or TrackingSettings()
     if recording.table is not None:
@@ -298,7 +310,12 @@ def at_full_length(part: Trajectory, n: int, start: int, timestamps: Array | Non
 def trajectory_provenance(
     recording: Recording, rig: StereoRig, pairs: ImagePairs, settings: TrackingSettings | None
 ) -> Provenance:
-    """What the trajectory is made from; reads the images' content where it was not read yet."""
+    """What the trajectory is made from; reads the images' content where it was not read yet.
+
+    >>> recording, rig = read_recording("clip"), read_rig("clip/results/rig.h5")
+    >>> sorted(trajectory_provenance(recording, rig, open_pairs(recording), None).inputs)
+    ['left frames', 'rig', 'right frames']
+    """
     return Provenance(
         recording=recording.name,
         inputs={**pairs.inputs(), "rig": rig_sha256(rig)},

@@ -21,7 +21,11 @@ if TYPE_CHECKING:
 
 
 class FrameStatus(IntEnum):
-    """Why a frame has a pose, or has none; `sentence` is what a report prints."""
+    """Why a frame has a pose, or has none; `sentence` is what a report prints.
+
+    >>> bool((read_trajectory("clip").frame_status == FrameStatus.MEASURED).all())
+    True
+    """
 
     MEASURED = 0
     ONE_CAMERA = 1
@@ -68,7 +72,11 @@ _FRAME_SENTENCES = {
 
 
 class MarkerStatus(IntEnum):
-    """Why a dot has a centre, or has none."""
+    """Why a dot has a centre, or has none.
+
+    >>> MarkerStatus(int(read_trajectory("clip").marker_status[0, 0, 0])).name
+    'MEASURED'
+    """
 
     MEASURED = 0
     OUTSIDE = 1  # its window leaves the image
@@ -85,6 +93,10 @@ class Trajectory(Brief):
     """Pose of the disc in every frame of a recording; always as long as the recording.
 
     n frames, m markers. NaN where there is no answer; `frame_status` tells why.
+
+    >>> trajectory = read_trajectory("clip")
+    >>> trajectory.q.shape, trajectory.coordinate_sigma.shape
+    ((300, 6), (300, 6))
     """
 
     time: Array  # (n,) [s], mid exposure of frame i is i / frame_rate unless the camera said otherwise

@@ -50,7 +50,11 @@ _CONVENTIONS = {
 
 @dataclass(frozen=True, repr=False)
 class Provenance(Outline):
-    """What a result was made from; equal fingerprints mean that making it again would give it again."""
+    """What a result was made from; equal fingerprints mean that making it again would give it again.
+
+    >>> Provenance("by hand", inputs={}, settings={}).recording
+    'by hand'
+    """
 
     recording: str  # name
     inputs: Mapping[str, str]  # what -> SHA-256 (hex) of its content
@@ -74,6 +78,11 @@ def write_trajectory(
     """Write the whole file, or nothing. Raises OutputError if it exists and may not be overwritten, or cannot be.
 
     details : numbers of the run (blur, noise, ...), of JSON's types; see `read_details`
+
+    >>> trajectory = read_trajectory("clip")
+    >>> write_trajectory("copy.h5", trajectory, Provenance("copy", inputs={}, settings={}))
+    >>> np.array_equal(read_trajectory("copy.h5").q, trajectory.q)
+    True
     """
     path = Path(path)
     refuse_existing(path, overwrite)
@@ -98,6 +107,9 @@ def read_trajectory(path: str | Path) -> Trajectory:
     """The trajectory that was written. Raises TrajectoryFileError if the file is missing, damaged or another's.
 
     path : of the file, or of the folder that holds it, itself or in its `results`
+
+    >>> len(read_trajectory("clip/results/trajectory.h5"))
+    300
     """
     with _Reading(trajectory_in(Path(path))) as file:
         trajectory = _trajectory(file)
@@ -170,7 +182,11 @@ def write_group(
     axes: Mapping[str, Variable] | None = None,
     attributes: Mapping[str, Any] | None = None,
 ) -> None:
-    """Add a stage's group to a trajectory file, or replace it; as `write_groups`."""
+    """Add a stage's group to a trajectory file, or replace it; as `write_groups`.
+
+    >>> own = {"own": Variable(np.zeros(300), ("time",), "m/s", "a speed of my own")}
+    >>> write_group("clip/results/trajectory.h5", "mine", own)
+    """
     write_groups(Path(path), {group: Group(variables, attributes or {})}, axes)
 
 
@@ -198,6 +214,10 @@ def read_group(
     """Arrays and attributes of one group. Raises TrajectoryFileError that names the groups there are.
 
     names : the arrays that are wanted, where not all are
+
+    >>> variables, attributes = read_group("clip/results/trajectory.h5", "markers")
+    >>> variables["centre_px"].shape
+    (300, 2, 6, 2)
     """
     with _Reading(Path(path)) as file:
         if group not in file or not isinstance(file[group], h5py.Group):

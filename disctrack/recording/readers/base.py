@@ -22,6 +22,10 @@ class FrameReader:
     """Frames of one camera in order. Opening it reads no more than headers; frames are read when asked for.
 
     `read` may be called from several threads at once.
+
+    >>> reader = open_frames("left/*.png", "clip", "left")
+    >>> reader.image_size, reader.read(0).shape
+    ((272, 272), (272, 272))
     """
 
     camera: str  # left or right

@@ -35,7 +35,13 @@ from disctrack.trajectory import FrameStatus, coordinate_sigma
 
 @dataclass(frozen=True, repr=False)
 class LivePose:
-    """Pose of the disc in one pair, with what is needed to judge it; NaN where `status` has no pose."""
+    """Pose of the disc in one pair, with what is needed to judge it; NaN where `status` has no pose.
+
+    >>> tracker, pairs = Tracker("clip/results/rig.h5", read_trajectory("clip")), open_pairs("clip")
+    >>> pose = tracker.next(pairs.left.read(0), pairs.right.read(0))
+    >>> pose.q.shape, pose.sigma.shape
+    ((6,), (6,))
+    """
 
     frame: int  # pairs since the tracker was made
     q: Array  # (6,) x, y, z [m], psi, theta, phi [rad]; angles unwrapped since the disc was last found
@@ -68,6 +74,10 @@ class Tracker:
     rig, disc : of the set-up, from `read_rig` and a trajectory or recording; nothing is refined over the sequence
     The first pairs compile (once per installation) and search the disc; after that a pair takes
     about a millisecond. A pair in which the disc is not found is answered with a status, and searched anew at the next.
+
+    >>> tracker, pairs = Tracker("clip/results/rig.h5", read_trajectory("clip")), open_pairs("clip")
+    >>> tracker.next(pairs.left.read(0), pairs.right.read(0)).status.name
+    'MEASURED'
     """
 
     @checked

@@ -114,6 +114,9 @@ def convert(
     told : what a foreign rig does not say of itself: world_is_table, cameras (two names), image_size (width, height)
         [px], unit [m]
     Raises DiscTrackError that names the formats there are.
+
+    >>> convert("clip/results/rig.h5", "rig.yml").paths
+    (PosixPath('rig.yml'),)
     """
     paths = [trajectory_in(Path(p)) for p in ([source] if isinstance(source, (str, os.PathLike)) else source)]
     path = Path(target)
