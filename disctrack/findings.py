@@ -240,11 +240,9 @@ class DoubtWarning(UserWarning):
 
 def warn_of_doubts(findings: Iterable[Finding]) -> None:
     """A Python warning for each cause that puts the result in doubt, at the line that called one of the packages."""
+    within = ("disctrack", "calibration", "contextlib")  # the last decorates functions of ours
     level, frame = 1, sys._getframe()
-    while frame.f_back is not None and frame.f_globals.get("__name__", "").split(".")[0] in (
-        "disctrack",
-        "calibration",
-    ):
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] in within:
         level, frame = level + 1, frame.f_back
     for finding in doubts(findings):
         warnings.warn(finding.sentence, DoubtWarning, stacklevel=level)

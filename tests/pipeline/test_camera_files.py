@@ -162,7 +162,7 @@ def test_doubts_about_the_headers_are_told_and_kept(recording, capsys):
             recording / "raw" / name, grey_values(recording / name), 8, Record_Rate="1000", Shutter_Type2=exposure
         )
     use_files(recording, "raw/left.cih", "raw/right.cih")
-    assert main(["run", str(recording), *QUICK]) == 0
+    assert main(["run", str(recording), *QUICK, "-v"]) == 0
     assert "the cameras exposed for different times" in " ".join(capsys.readouterr().out.split())
     assert "left 50 us" in "".join(f.text for f in read_trajectory(recording / "results" / "trajectory.h5").findings)
 

@@ -82,7 +82,7 @@ def test_both_cameras_and_their_times_in_one_hdf5_file(recording, from_png, caps
             file[f"{camera}/timestamps"] = times + later
             file[camera].attrs["frame_rate"] = 1000.0
     name_files(recording, "both.h5:/left/frames", "both.h5:/right/frames")
-    assert main(["run", str(recording), *QUICK]) == 0
+    assert main(["run", str(recording), *QUICK, "-v"]) == 0
     assert "taken 30 us after the left one's" in " ".join(capsys.readouterr().out.split())
     found = recording / "results" / "trajectory.h5"
     assert_array_equal(read_trajectory(found).time, times)
