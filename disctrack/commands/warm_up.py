@@ -14,7 +14,7 @@ from disctrack.discrepancy.equations import _ode_kernel
 from disctrack.progress import compiling
 from disctrack.recording.readers import _png as png
 from disctrack.rolling import _assembly as assembly
-from disctrack.synthetic import board_raster, disc_raster
+from disctrack.synthetic import raster
 from disctrack.track.dots import template as dots
 from disctrack.track.follow.tracking import prepare
 
@@ -49,5 +49,4 @@ def _images() -> None:
         corner_fit.prepare()
         normal_equations.prepare()
     with compiling("rendering", 10):
-        disc_raster.prepare()
-        board_raster.prepare()
+        raster.prepare()

@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass, field
 
+from disctrack.files.toml_tree import NOT_NEGATIVE, POSITIVE, limited
+
 Pair = tuple[float, float]
 Triple = tuple[float, float, float]
 
@@ -12,7 +14,7 @@ class CameraFault:
 
     rotation_deg: Triple = (0.0, 0.0, 0.0)  # rotation vector in the camera's own axes
     translation_mm: Triple = (0.0, 0.0, 0.0)  # of the camera, in its own axes
-    focal_scale: float = 1.0
+    focal_scale: float = limited(1.0, POSITIVE)
     k1_change: float = 0.0
     principal_point_change_px: Pair = (0.0, 0.0)
     missing_frames: tuple[int, ...] = ()
@@ -25,8 +27,8 @@ class Occluder:
     camera: str = "left"
     centre_px: Pair = (256.0, 256.0)
     angle_deg: float = 0.0  # of its axis, from x towards y
-    width_px: float = 20.0
-    length_px: float = 1e4
+    width_px: float = limited(20.0, POSITIVE)
+    length_px: float = limited(1e4, POSITIVE)
     grey: float = 40.0
     first_frame: int = 0
     last_frame: int = 10**9
@@ -37,16 +39,16 @@ class Faults:
     """What goes wrong and is not declared: it changes the images and truth.h5, never recording.toml."""
 
     right_delay_s: float = 0.0  # the right camera exposes that much later than the left
-    frame_rate_hz: float = 0.0  # true frame rate; 0: the declared one
+    frame_rate_hz: float = limited(0.0, NOT_NEGATIVE)  # true frame rate; 0: the declared one
     misprint_mm: tuple[Pair, ...] = ()  # true minus declared centre of each dot
-    misprint_sigma_mm: float = 0.0  # the same drawn at random
+    misprint_sigma_mm: float = limited(0.0, NOT_NEGATIVE)  # the same drawn at random
     pattern_offset_mm: Pair = (0.0, 0.0)  # paper and dots glued off centre
     pattern_turn_deg: float = 0.0  # and turned about the disc's axis
-    pattern_scale: float = 1.0  # true over declared distances of the dots from the pattern's middle
+    pattern_scale: float = limited(1.0, POSITIVE)  # true over declared distances of the dots from the pattern's middle
     pattern_height_mm: float = 0.0  # of the dots above half the thickness: paper and glue
     table_turn_deg: Pair = (0.0, 0.0)  # rotation vector, x and y, of the true table in the axes of the table view
     table_height_mm: float = 0.0  # of the true table in those axes
-    exposure_s: float = 0.0  # true exposure; 0: that of the cameras
+    exposure_s: float = limited(0.0, NOT_NEGATIVE)  # true exposure; 0: that of the cameras
     ellipse_centre_share: float = 0.0  # of centres of images taken for images of centres; 1: all. Nothing to draw
     hidden_markers: tuple[int, ...] = ()  # dots that have come off
     left: CameraFault = field(default_factory=CameraFault)

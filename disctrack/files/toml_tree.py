@@ -1,6 +1,7 @@
 """TOML files: read with errors that name them; settings as frozen dataclasses from such a tree, and back to text.
 
 Fields may be bool, int, float, str, tuples, dictionaries by name, and dataclasses; a Path is not part of the file.
+Numbers of a field that is `limited` lie within its limits, all others within +-MOST.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import re
 import tomllib
 import types
 import typing
-from dataclasses import fields, is_dataclass
+from dataclasses import field, fields, is_dataclass
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,32 @@ import numpy as np
 
 from disctrack.errors import DiscTrackError, SceneError
 from disctrack.files.inputs import MOST_TEXT, read_regular
+
+MOST = 1e7  # no length, angle, rate, grey value or number of frames of a laboratory is larger in its unit
+NOT_NEGATIVE, POSITIVE = (0.0, MOST), (1 / MOST, MOST)  # of what is positive, the reciprocal is a number, too
+
+
+def limited(default: Any, limits: tuple[float, float]) -> Any:
+    """Field of a dataclass whose numbers lie within limits."""
+    return field(default=default, metadata={"limits": limits})
+
+
+def check_limits(settings: Any, where: str, key: str = "", limits: tuple[float, float] = (-MOST, MOST)) -> None:
+    """Raise SceneError for a number of a dataclass beyond its limits; a default may say by nan that it is not given."""
+    if is_dataclass(settings):
+        for f in fields(settings):
+            value = getattr(settings, f.name)
+            if value is not f.default:
+                own = f.metadata.get("limits", limits)
+                check_limits(value, where, f"{key}.{f.name}" if key else f.name, own)
+    elif isinstance(settings, dict):
+        for name, value in settings.items():
+            check_limits(value, where, f"{key}.{name}", limits)
+    elif isinstance(settings, tuple | list):
+        for value in settings:
+            check_limits(value, where, key, limits)
+    elif isinstance(settings, int | float) and not limits[0] <= settings <= limits[1]:  # nan, too
+        raise SceneError(f"{where}: {key} = {settings}; expected a number from {limits[0]:g} to {limits[1]:g}")
 
 
 def read_toml(path: Path, error: type[DiscTrackError]) -> dict[str, Any]:

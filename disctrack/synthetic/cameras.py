@@ -20,31 +20,50 @@ class View(NamedTuple):
     R_camera_world: Array  # (3, 3)
     t_camera_world: Array  # (3,) [m]
 
+    @property
+    def centre(self) -> Array:
+        """(3,) of projection, in the world [m]."""
+        return -self.R_camera_world.T @ self.t_camera_world
+
+
+def views_of(rig: StereoRig) -> list[View]:
+    """The cameras of a rig where they stand."""
+    return [View(camera, *pose) for camera, pose in zip(rig.cameras, rig.camera_poses(), strict=True)]
+
+
+def _rig(views: list[View], rig: StereoRig | None = None) -> StereoRig:
+    left, right = views
+    places: dict[str, Any] = placed_at([(view.R_camera_world, view.t_camera_world) for view in views])
+    if rig is not None:
+        return replace(rig, left=left.camera, right=right.camera, **places)
+    return StereoRig(left.camera, right.camera, **places, world_is_table=True)
+
+
+def brown(points: Array, camera: Camera) -> tuple[Array, Array]:
+    """Brown's polynomial as printed: factor (..., 1) and shift (..., 2) of points (..., 2) at distance 1 (x/z, y/z).
+
+    Not `calibration.cameras.camera`'s, so that a mistake there shows up as a disagreement between rendered images,
+    or the truth, and projected points.
+    """
+    k1, k2, p1, p2, k3 = camera.distortion
+    x, y = points[..., 0], points[..., 1]
+    s = x * x + y * y
+    shift = np.stack([2 * p1 * x * y + p2 * (s + 2 * x * x), p1 * (s + 2 * y * y) + 2 * p2 * x * y], axis=-1)
+    return (1 + s * (k1 + s * (k2 + s * k3)))[..., None], shift
+
 
 def image_of(points_world: Array, view: View) -> Array:
-    """Pixels (..., 2) of points (..., 3) [m]: Brown's polynomial as printed, for bounding boxes and truth only.
-
-    Not `calibration.cameras.camera`'s, so that a mistake there shows up in the truth.
-    """
+    """Pixels (..., 2) of points (..., 3) [m]; for bounding boxes and truth only."""
     points = np.asarray(points_world, float) @ view.R_camera_world.T + view.t_camera_world
-    x, y = points[..., 0] / points[..., 2], points[..., 1] / points[..., 2]
-    k1, k2, p1, p2, k3 = view.camera.distortion
-    s = x**2 + y**2
-    radial = 1 + k1 * s + k2 * s**2 + k3 * s**3
-    xd = x * radial + 2 * p1 * x * y + p2 * (s + 2 * x**2)
-    yd = y * radial + p1 * (s + 2 * y**2) + 2 * p2 * x * y
-    return np.stack([view.camera.fx * xd + view.camera.cx, view.camera.fy * yd + view.camera.cy], axis=-1)
+    flat, camera = points[..., :2] / points[..., 2:], view.camera
+    factor, shift = brown(flat, camera)
+    return np.asarray((flat * factor + shift) * [camera.fx, camera.fy] + [camera.cx, camera.cy])
 
 
 def rig_of(scene: Scene) -> StereoRig:
     """The rig as it was while it was calibrated, with the table as world."""
     rng = np.random.default_rng([scene.seed, 1])
-    left, right = (_camera(scene, index, rng) for index in (0, 1))
-    return StereoRig(left.camera, right.camera, **_places(left, right), world_is_table=True)
-
-
-def _places(*views: View) -> dict[str, Any]:
-    return placed_at([(view.R_camera_world, view.t_camera_world) for view in views])
+    return _rig([_camera(scene, index, rng) for index in (0, 1)])
 
 
 def _camera(scene: Scene, index: int, rng: np.random.Generator) -> View:
@@ -52,34 +71,24 @@ def _camera(scene: Scene, index: int, rng: np.random.Generator) -> View:
     s, scatter = scene.rig, scene.rig.variation * rng.standard_normal(16)
     target = np.array(s.target_mm) * 1e-3 + 2e-3 * scatter[0:3]
     distance = s.distance_mm[index] * 1e-3 + 0.01 * scatter[3]
-    off_vertical, azimuth, roll = np.radians(
-        [
-            s.off_vertical_deg[index] + 2 * scatter[4],
-            s.azimuth_deg[index] + 2 * scatter[5],
-            s.roll_deg[index] + scatter[6],
-        ]
-    )
+    placed = (s.off_vertical_deg[index], s.azimuth_deg[index], s.roll_deg[index])
+    off_vertical, azimuth, roll = np.radians(placed + np.array([2.0, 2.0, 1.0]) * scatter[4:7])
     away = np.array(
         [np.sin(off_vertical) * np.cos(azimuth), np.sin(off_vertical) * np.sin(azimuth), np.cos(off_vertical)]
     )
     right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])  # image x: horizontal, camera z looks along -away
     upright = np.stack([right, np.cross(-away, right), -away])
     R = rotation_from_vector(np.array([0.0, 0.0, roll])) @ upright
-    width, height = s_size = scene.cameras.image_size
+    width, height = scene.cameras.image_size
     focal = s.distance_mm[index] / s.mm_per_px * (1 + 0.005 * scatter[7])
+    lens = (s.k1[index], s.k2[index], s.p1[index], s.p2[index])
     camera = Camera(
         fx=float(focal),
         fy=float(focal * (1 + 5e-4 * scatter[8])),
         cx=float((width - 1) / 2 + 4 * scatter[9]),
         cy=float((height - 1) / 2 + 4 * scatter[10]),
-        distortion=(
-            s.k1[index] + 0.01 * float(scatter[11]),
-            s.k2[index] + 0.03 * float(scatter[12]),
-            s.p1[index] + 2e-4 * float(scatter[13]),
-            s.p2[index] + 2e-4 * float(scatter[14]),
-            s.k3[index],
-        ),
-        image_size=s_size,
+        distortion=(*map(float, lens + np.array([0.01, 0.03, 2e-4, 2e-4]) * scatter[11:15]), s.k3[index]),
+        image_size=scene.cameras.image_size,
     )
     return View(camera, R, -R @ (target + distance * away))
 
@@ -93,14 +102,11 @@ def rig_after_faults(rig: StereoRig, scene: Scene) -> StereoRig:
     turn_table = rotation_from_vector(np.radians([*scene.faults.table_turn_deg, 0.0]))
     lift_table = np.array([0.0, 0.0, scene.faults.table_height_mm * 1e-3])
     views = []
-    for camera, (R, t), fault in zip(
-        rig.cameras, rig.camera_poses(), (scene.faults.left, scene.faults.right), strict=True
-    ):
+    for (camera, R, t), fault in zip(views_of(rig), (scene.faults.left, scene.faults.right), strict=True):
         turn = rotation_from_vector(np.radians(fault.rotation_deg)).T  # the camera turns, its picture turns back
         moved = turn @ (t + R @ lift_table - np.array(fault.translation_mm) * 1e-3)
         views.append(View(_changed_lens(camera, fault), turn @ R @ turn_table, moved))
-    left, right = views
-    return replace(rig, left=left.camera, right=right.camera, **_places(left, right))
+    return _rig(views, rig)
 
 
 def _changed_lens(camera: Camera, fault: CameraFault) -> Camera:
@@ -154,12 +160,11 @@ def _in_view(R_world_board: Array, t_world_board: Array, rig: StereoRig, scene: 
     board = scene.board
     corners = np.array([[x, y, 0.0] for x in (-1, board.inner_corners[0]) for y in (-1, board.inner_corners[1])])
     points = corners * board.square_mm * 1e-3 @ R_world_board.T + t_world_board
-    for camera, (R, t) in zip(rig.cameras, rig.camera_poses(), strict=True):
-        pixels = image_of(points, View(camera, R, t))
-        size = np.array(camera.image_size)
-        if np.any(pixels < 8) or np.any(pixels > size - 9):
+    for view in views_of(rig):
+        pixels = image_of(points, view)
+        if np.any(pixels < 8) or np.any(pixels > np.array(view.camera.image_size) - 9):
             return False
-        eye = -R.T @ t - points.mean(axis=0)
+        eye = view.centre - points.mean(axis=0)
         if eye @ R_world_board[:, 2] < np.cos(np.radians(65)) * np.linalg.norm(eye):
             return False
     return True

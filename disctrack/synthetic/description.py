@@ -8,27 +8,39 @@ not say takes the default below, which resembles the experiment of Ma et al. 201
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from disctrack.disc import AIR_DENSITY, MA_2014, Disc, disc_from_mm
 from disctrack.errors import SceneError
 from disctrack.faults.keys import Faults
-from disctrack.files.toml_tree import build, read_toml, toml_lines
+from disctrack.files.toml_tree import (
+    MOST,
+    NOT_NEGATIVE,
+    POSITIVE,
+    build,
+    check_limits,
+    limited,
+    read_toml,
+    toml_lines,
+)
 
 Pair = tuple[float, float]
 Triple = tuple[float, float, float]
+Pose = tuple[float, float, float, float, float, float]
+MOST_PIXELS = 16384  # a side
 
 
 @dataclass(frozen=True)
 class CameraSettings:
     """Timing and format of the two cameras."""
 
-    frame_rate_hz: float = 1000.0
-    n_frames: int = 200  # for moving discs; static poses give one frame each
-    image_size: tuple[int, int] = (512, 512)  # width, height [px]
-    exposure_s: float = 0.0002  # frame i is exposed from i / frame_rate - exposure / 2 to + exposure / 2
+    frame_rate_hz: float = limited(1000.0, POSITIVE)
+    n_frames: int = limited(200, (1, MOST))  # for moving discs; static poses give one frame each
+    image_size: tuple[int, int] = limited((512, 512), (16, MOST_PIXELS))  # width, height [px]
+    # frame i is exposed from i / frame_rate - exposure / 2 to + exposure / 2
+    exposure_s: float = limited(0.0002, NOT_NEGATIVE)
     bit_depth: int = 8  # 8, 10, 12 or 16; more than 8 is written as 16-bit files
 
 
@@ -36,8 +48,8 @@ class CameraSettings:
 class RigSettings:
     """Where the cameras stand and what lenses they have; `variation` scales the seeded differences between rigs."""
 
-    mm_per_px: float = 0.25  # at the point both cameras look at
-    distance_mm: Pair = (420.0, 420.0)
+    mm_per_px: float = limited(0.25, POSITIVE)  # at the point both cameras look at
+    distance_mm: tuple[float, float] = limited((420.0, 420.0), POSITIVE)
     off_vertical_deg: Pair = (42.0, 42.0)
     azimuth_deg: Pair = (-122.0, -53.0)  # of the camera seen from the target, from world axis i towards j
     roll_deg: Pair = (0.0, 0.0)
@@ -47,26 +59,28 @@ class RigSettings:
     p1: Pair = (4e-4, -3e-4)
     p2: Pair = (-3e-4, 5e-4)
     k3: Pair = (0.0, 0.0)
-    variation: float = 1.0  # 1: scatter of 2 deg, 10 mm, 4 px of the principal point, 0.5 % of focal length, ...
+    # 1: scatter of 2 deg, 10 mm, 4 px of the principal point, 0.5 % of focal length, ...
+    variation: float = limited(1.0, NOT_NEGATIVE)
 
 
 @dataclass(frozen=True)
 class OpticsSettings:
     """Blur and fall-off of the lenses."""
 
-    blur_px: Pair = (0.60, 0.65)  # standard deviation of the Gaussian point spread, left and right, without the pixel
-    vignetting: float = 0.04  # loss of light at the image's corner
+    # standard deviation of the Gaussian point spread, left and right, without the pixel
+    blur_px: tuple[float, float] = limited((0.60, 0.65), (0.2, MOST))
+    vignetting: float = limited(0.04, NOT_NEGATIVE)  # loss of light at the image's corner
 
 
 @dataclass(frozen=True)
 class SensorSettings:
     """From light to grey values. Defaults have the noise of a machine-vision camera: variance 0.64 + grey / 50 DN^2."""
 
-    gain_e_per_dn: float = 50.0  # photo-electrons per 8-bit grey level; 0: no shot noise
-    read_noise_dn: float = 0.8
+    gain_e_per_dn: float = limited(50.0, NOT_NEGATIVE)  # photo-electrons per 8-bit grey level; 0: no shot noise
+    read_noise_dn: float = limited(0.8, NOT_NEGATIVE)
     black_level_dn: float = 0.0
-    hot_pixels: int = 0  # per camera
-    hot_pixel_dn: float = 60.0  # mean excess of a hot pixel, exponentially distributed
+    hot_pixels: int = limited(0, NOT_NEGATIVE)  # per camera
+    hot_pixel_dn: float = limited(60.0, NOT_NEGATIVE)  # mean excess of a hot pixel, exponentially distributed
 
 
 @dataclass(frozen=True)
@@ -75,7 +89,7 @@ class GlareSettings:
 
     camera: str = "left"
     centre_px: Pair = (256.0, 256.0)
-    sigma_px: float = 40.0
+    sigma_px: float = limited(40.0, POSITIVE)
     grey: float = 20.0
 
 
@@ -84,7 +98,8 @@ class LightSettings:
     """The lamp: a gradient over the table, and how far brightness follows the face's inclination to it."""
 
     gradient_per_m: Pair = (0.0, 0.0)  # relative change of brightness per metre along world i, j
-    directed: float = 0.10  # share of light that comes from `direction`; the rest comes from everywhere
+    # share of light that comes from `direction`; the rest comes from everywhere
+    directed: float = limited(0.10, (0, 1))
     direction: Triple = (0.2, 0.3, 1.0)
     glare: tuple[GlareSettings, ...] = ()
 
@@ -93,11 +108,12 @@ class LightSettings:
 class ImperfectionSettings:
     """What every laboratory has and nobody declares; off by default. Lenses and sensors are drawn by the seed."""
 
-    lens_field_px: float = 0.0  # rms per axis of a smooth displacement beyond the lens' polynomial
+    # rms per axis of a smooth displacement beyond the lens' polynomial
+    lens_field_px: float = limited(0.0, NOT_NEGATIVE)
     board_bow_mm: float = 0.0  # middle of the board above its short sides (negative: below)
     board_stretch: float = 0.0  # relative, of the squares along the long side
-    pixel_gain: float = 0.0  # rms of the pixels' gains about 1
-    column_offset_dn: float = 0.0  # rms of the columns' offsets
+    pixel_gain: float = limited(0.0, NOT_NEGATIVE)  # rms of the pixels' gains about 1
+    column_offset_dn: float = limited(0.0, NOT_NEGATIVE)  # rms of the columns' offsets
     response_curve: float = 0.0  # largest departure of grey values from a straight line, of full scale
 
 
@@ -108,14 +124,14 @@ class AppearanceSettings:
     paper: float = 190.0
     dot: float = 25.0
     rim: float = 118.0  # bare steel ring of the upper face
-    rim_width_mm: float = 1.5
+    rim_width_mm: float = limited(1.5, NOT_NEGATIVE)
     side: float = 58.0
     underside: float = 90.0
     board_white: float = 200.0
     board_black: float = 20.0
     table: float = 85.0
-    table_streaks: float = 3.0  # standard deviation of the brushed texture
-    table_blotches: float = 2.0  # standard deviation of the soft spots
+    table_streaks: float = limited(3.0, NOT_NEGATIVE)  # standard deviation of the brushed texture
+    table_blotches: float = limited(2.0, NOT_NEGATIVE)  # standard deviation of the soft spots
     streak_direction_deg: float = 90.0  # from world axis i
 
 
@@ -123,9 +139,9 @@ class AppearanceSettings:
 class DiscSettings:
     """The disc as declared in recording.toml."""
 
-    radius_mm: float = 37.5
-    thickness_mm: float = 6.0
-    mass_g: float = 209.69
+    radius_mm: float = limited(37.5, POSITIVE)
+    thickness_mm: float = limited(6.0, POSITIVE)
+    mass_g: float = limited(209.69, POSITIVE)
 
 
 def _default_centres() -> tuple[Pair, ...]:
@@ -136,7 +152,7 @@ def _default_centres() -> tuple[Pair, ...]:
 class MarkerSettings:
     """The dots as declared in recording.toml."""
 
-    diameter_mm: float = 7.0
+    diameter_mm: float = limited(7.0, POSITIVE)
     centres_mm: tuple[Pair, ...] = field(default_factory=_default_centres)
 
 
@@ -144,14 +160,14 @@ class MarkerSettings:
 class BoardSettings:
     """The chessboard and its views; view 0 lies flat on the table."""
 
-    n_views: int = 20
-    inner_corners: tuple[int, int] = (9, 6)
-    square_mm: float = 8.0
-    margin_mm: float = 8.0  # white paper round the squares
-    thickness_mm: float = 3.0
-    max_tilt_deg: float = 38.0
-    max_turn_deg: float = 35.0
-    shift_mm: float = 22.0
+    n_views: int = limited(20, (1, MOST))
+    inner_corners: tuple[int, int] = limited((9, 6), (2, MOST))
+    square_mm: float = limited(8.0, POSITIVE)
+    margin_mm: float = limited(8.0, NOT_NEGATIVE)  # white paper round the squares
+    thickness_mm: float = limited(3.0, NOT_NEGATIVE)
+    max_tilt_deg: float = limited(38.0, NOT_NEGATIVE)
+    max_turn_deg: float = limited(35.0, NOT_NEGATIVE)
+    shift_mm: float = limited(22.0, NOT_NEGATIVE)
     height_mm: Pair = (5.0, 40.0)  # of the board's middle above the table in the tilted views
 
 
@@ -185,7 +201,7 @@ class MotionSettings:
     """
 
     kind: str = "static"  # static, table or rolling
-    poses: tuple[tuple[float, ...], ...] = ((32.0, 20.0, 12.0, 30.0, 15.0, 40.0),)
+    poses: tuple[Pose, ...] = ((32.0, 20.0, 12.0, 30.0, 15.0, 40.0),)
     table: str = ""
     rolling: RollingMotion = field(default_factory=RollingMotion)
 
@@ -194,9 +210,9 @@ class MotionSettings:
 class RenderSettings:
     """Fineness of the computation, not of the scene."""
 
-    subpixels: int = 5  # cells per pixel and axis where an edge passes
-    threads: int = 2
-    png_compression: int = 3  # 0 to 9
+    subpixels: int = limited(5, (2, MOST))  # cells per pixel and axis where an edge passes
+    threads: int = limited(2, (1, MOST))
+    png_compression: int = limited(3, (0, 9))  # 0 to 9
 
 
 @dataclass(frozen=True)
@@ -204,9 +220,9 @@ class Scene:
     """Everything that determines a synthetic recording."""
 
     name: str = "scene"
-    seed: int = 1
-    gravity_m_s2: float = 9.81
-    air_density_kg_m3: float = AIR_DENSITY
+    seed: int = limited(1, (0, math.inf))
+    gravity_m_s2: float = limited(9.81, POSITIVE)
+    air_density_kg_m3: float = limited(AIR_DENSITY, POSITIVE)
     cameras: CameraSettings = field(default_factory=CameraSettings)
     rig: RigSettings = field(default_factory=RigSettings)
     optics: OpticsSettings = field(default_factory=OpticsSettings)
@@ -216,7 +232,7 @@ class Scene:
     disc: DiscSettings = field(default_factory=DiscSettings)
     markers: MarkerSettings = field(default_factory=MarkerSettings)
     board: BoardSettings = field(default_factory=BoardSettings)
-    motion: MotionSettings = field(default_factory=MotionSettings)
+    motion: MotionSettings = field(default_factory=MotionSettings, hash=False)  # it holds dictionaries
     faults: Faults = field(default_factory=Faults)
     imperfections: ImperfectionSettings = field(default_factory=ImperfectionSettings)
     render: RenderSettings = field(default_factory=RenderSettings)
@@ -253,76 +269,16 @@ def scene_toml(scene: Scene) -> str:
     return "\n".join(toml_lines(scene)).lstrip() + "\n"
 
 
-MOST = 1e7  # no length, angle, rate, grey value or number of frames of a laboratory is larger in its unit
-MOST_PIXELS = 16384  # a side
-_NOT_NEGATIVE = {
-    "rig.variation",
-    "optics.vignetting",
-    *(f"sensor.{name}" for name in ("gain_e_per_dn", "read_noise_dn", "hot_pixels", "hot_pixel_dn")),
-    *(f"board.{name}" for name in ("margin_mm", "thickness_mm", "max_tilt_deg", "max_turn_deg", "shift_mm")),
-    *(f"appearance.{name}" for name in ("table_streaks", "table_blotches", "rim_width_mm")),
-    *(f"imperfections.{name}" for name in ("lens_field_px", "pixel_gain", "column_offset_dn")),
-    "cameras.exposure_s",
-    "faults.exposure_s",
-    "faults.frame_rate_hz",
-    "faults.misprint_sigma_mm",
-    "render.png_compression",
-    "seed",
-}
-_POSITIVE = {
-    "cameras.frame_rate_hz",
-    "rig.mm_per_px",
-    "rig.distance_mm",
-    "disc.radius_mm",
-    "disc.thickness_mm",
-    "disc.mass_g",
-    "markers.diameter_mm",
-    "board.square_mm",
-    "gravity_m_s2",
-    "air_density_kg_m3",
-    "faults.pattern_scale",
-    "faults.left.focal_scale",
-    "faults.right.focal_scale",
-    "light.glare.sigma_px",
-    "faults.occluders.width_px",
-    "faults.occluders.length_px",
-}
-
-
-def _numbers(item: Any, path: str = "") -> Iterator[tuple[str, float]]:
-    """Every number of a scene with its key, but those that say by nan that they are not given."""
-    if is_dataclass(item):
-        for entry in fields(item):
-            value = getattr(item, entry.name)
-            if not (isinstance(value, float) and math.isnan(value) and entry.name == "omega3_rad_s"):
-                yield from _numbers(value, f"{path}.{entry.name}" if path else entry.name)
-    elif isinstance(item, dict):
-        for name, value in item.items():
-            yield from _numbers(value, f"{path}.{name}")
-    elif isinstance(item, tuple | list):
-        for value in item:
-            yield from _numbers(value, path)
-    elif isinstance(item, int | float) and not isinstance(item, bool):
-        yield path, item
-
-
 def _check(scene: Scene, where: str) -> None:
     """Raise SceneError for values that no recording can have."""
-    for key, value in _numbers(scene):
-        least, most = 0.0 if key in _NOT_NEGATIVE else -MOST, math.inf if isinstance(value, int) else MOST
-        if not least <= value <= most:  # nan, too
-            raise SceneError(f"{where}: {key} = {value}; expected a number from {least:g} to {most:g}")
-        if key in _POSITIVE and not 1 / MOST <= value <= MOST:  # its reciprocal is a number, too
-            raise SceneError(f"{where}: {key} = {value}; expected a positive number, from {1 / MOST:g} to {MOST:g}")
-    for bad, key, found, expected in (*_of_the_disc(scene), *_of_the_images(scene), *_of_the_rest(scene)):
+    check_limits(scene, where)
+    for bad, key, found, expected in _complaints(scene):
         if bad:
             raise SceneError(f"{where}: {key} = {found}; expected {expected}")
 
 
-_Complaint = tuple[bool, str, object, str]  # is it so, key, what was found, what was expected
-
-
-def _of_the_disc(scene: Scene) -> Iterator[_Complaint]:
+def _complaints(scene: Scene) -> Iterator[tuple[bool, str, object, str]]:
+    """Is something so, its key, what was found, what was expected."""
     centres, hidden, misprints = scene.markers.centres_mm, scene.faults.hidden_markers, scene.faults.misprint_mm
     n = len(centres)
     reach_mm = max((math.hypot(x, y) for x, y in centres), default=0.0) + scene.markers.diameter_mm / 2
@@ -331,33 +287,14 @@ def _of_the_disc(scene: Scene) -> Iterator[_Complaint]:
     yield len(misprints) not in (0, n), "faults.misprint_mm", f"{len(misprints)} rows", f"one per dot ({n})"
     outside = any(not 0 <= k < n for k in hidden)
     yield outside, "faults.hidden_markers", hidden, f"numbers from 0 to {n - 1}"
-
-
-def _of_the_images(scene: Scene) -> Iterator[_Complaint]:
-    cameras, render, size = scene.cameras, scene.render, scene.cameras.image_size
+    cameras, hot, light = scene.cameras, scene.sensor.hot_pixels, scene.light.direction
     yield cameras.bit_depth not in (8, 10, 12, 16), "cameras.bit_depth", cameras.bit_depth, "8, 10, 12, 16"
-    yield not 1 <= cameras.n_frames <= MOST, "cameras.n_frames", cameras.n_frames, f"1 to {MOST:.0f}"
-    yield min(size) < 16, "cameras.image_size", size, "at least 16 x 16"
-    yield max(size) > MOST_PIXELS, "cameras.image_size", size, f"at most {MOST_PIXELS} pixels a side"
-    hot = scene.sensor.hot_pixels
-    yield hot > math.prod(size), "sensor.hot_pixels", hot, f"no more than the {math.prod(size)} pixels of an image"
-    light = scene.light
-    yield not light.direction[2] > 0, "light.direction", light.direction, "a lamp above the table: the third above 0"
-    yield not 0 <= light.directed <= 1, "light.directed", light.directed, "a share, 0 to 1"
-    yield min(scene.optics.blur_px) < 0.2, "optics.blur_px", scene.optics.blur_px, "0.2 px or more"
-    yield render.png_compression > 9, "render.png_compression", render.png_compression, "0 to 9"
-    yield render.threads < 1, "render.threads", render.threads, "1 or more"
-    yield render.subpixels < 2, "render.subpixels", render.subpixels, "2 or more"
-
-
-def _of_the_rest(scene: Scene) -> Iterator[_Complaint]:
-    board, kind = scene.board, scene.motion.kind
-    empty = board.n_views < 1 or min(board.inner_corners) < 2
-    yield empty, "board", "no view or no corner", "n_views >= 1, corners >= 2"
-    upside_down = board.height_mm[0] > board.height_mm[1]
-    yield upside_down, "board.height_mm", board.height_mm, "the lower, then the higher"
+    pixels = math.prod(cameras.image_size)
+    yield hot > pixels, "sensor.hot_pixels", hot, f"no more than the {pixels} pixels of an image"
+    yield not light[2] > 0, "light.direction", light, "a lamp above the table: the third above 0"
+    low, high = scene.board.height_mm
+    yield low > high, "board.height_mm", (low, high), "the lower, then the higher"
+    kind = scene.motion.kind
     yield kind not in ("static", "table", "rolling"), "motion.kind", kind, "static, table, rolling"
-    short = any(len(p) != 6 for p in scene.motion.poses)
-    yield short, "motion.poses", "rows", "6 numbers each: x y z mm, psi theta phi deg"
     named = {g.camera for g in scene.light.glare} | {r.camera for r in scene.faults.occluders}
     yield not named <= {"left", "right"}, "camera of a glare or occluder", "another word", "left or right"

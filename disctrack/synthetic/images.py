@@ -1,8 +1,8 @@
 """Images of the disc and of the chessboard before the table, as the pair of cameras takes them."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -10,24 +10,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calibration.cameras.camera import Camera, StereoRig
-from calibration.kit.arrays import Array, Array32, Mask
+from calibration.kit.arrays import Array, Array32, Image, Mask
 from disctrack.disc import Disc
 from disctrack.faults.keys import Occluder
-from disctrack.frames import rotation_from_euler
-from disctrack.synthetic import imperfect, optics
-from disctrack.synthetic.board_raster import draw_board
-from disctrack.synthetic.cameras import View, image_of
-from disctrack.synthetic.description import (
-    AppearanceSettings,
-    ImperfectionSettings,
-    LightSettings,
-    OpticsSettings,
-    Scene,
-    SensorSettings,
-)
-from disctrack.synthetic.disc_raster import draw_disc
-from disctrack.synthetic.rays import corner_rays
-from disctrack.synthetic.sensor import digitise, hot_pixels
+from disctrack.frames import CAMERAS, rotation_from_euler
+from disctrack.synthetic import optics, raster
+from disctrack.synthetic.cameras import View, image_of, views_of
+from disctrack.synthetic.description import Scene
+from disctrack.synthetic.sensor import Pattern, digitise, hot_pixels, sensor_pattern
 
 PoseOverExposure = Callable[[Array], Array]  # (k,) times [s] from mid exposure -> (k, 6) q
 
@@ -46,7 +36,7 @@ class Stage:
     table: Array32  # (height, width) blurred table, before lamp and vignetting
     factor: Array32
     glare: Array32
-    pattern: imperfect.Pattern | None
+    pattern: Pattern | None
     hot: Array32 | None
 
     def finish(self, irradiance: Array32) -> Array32:
@@ -54,124 +44,145 @@ class Stage:
         grey = irradiance * self.factor + self.glare
         return grey if self.pattern is None else self.pattern.seen(grey)
 
+    def digitised(self, grey: Array32, scene: Scene, rng: np.random.Generator | None) -> Image:
+        """The image that the camera writes."""
+        return digitise(grey, scene.sensor, scene.cameras.bit_depth, rng, self.hot)
 
-def stages(rig: StereoRig, scene: Scene) -> tuple[Stage, Stage]:
-    """Left and right stage; cached, so that calls with the same rig and look share the table."""
-    look = (
-        scene.seed, scene.appearance, scene.optics, scene.light, scene.sensor, scene.imperfections, scene.rig.target_mm,
-    )  # fmt: skip
-    left, right = (
-        _stage(name, camera, R.tobytes(), t.tobytes(), *look, scene.render.subpixels)
-        for name, camera, (R, t) in zip(("left", "right"), rig.cameras, rig.camera_poses(), strict=True)
+
+def stages(rig: StereoRig, scene: Scene) -> tuple[Stage, ...]:
+    """A stage for each camera; cached, so that calls with the same rig and look share the table."""
+    look = Scene(
+        seed=scene.seed,
+        rig=scene.rig,
+        optics=scene.optics,
+        sensor=scene.sensor,
+        light=scene.light,
+        appearance=scene.appearance,
+        imperfections=scene.imperfections,
+        render=scene.render,
     )
-    return left, right
+    return tuple(
+        _stage(index, view.camera, view.R_camera_world.tobytes(), view.t_camera_world.tobytes(), look)
+        for index, view in enumerate(views_of(rig))
+    )
 
 
 @lru_cache(maxsize=4)
-def _stage(
-    name: str,
-    camera: Camera,
-    R: bytes,
-    t: bytes,
-    seed: int,
-    appearance: AppearanceSettings,
-    optics_settings: OpticsSettings,
-    light: LightSettings,
-    sensor: SensorSettings,
-    imperfections: ImperfectionSettings,
-    target_mm: tuple[float, float, float],
-    s: int,
-) -> Stage:
-    scene = Scene(seed=seed, appearance=appearance, optics=optics_settings, light=light, sensor=sensor)
-    scene = replace(scene, rig=replace(scene.rig, target_mm=target_mm))
+def _stage(index: int, camera: Camera, R: bytes, t: bytes, scene: Scene) -> Stage:
     view = View(camera, np.frombuffer(R).reshape(3, 3), np.frombuffer(t))
-    index = ("left", "right").index(name)
-    sigma = optics_settings.blur_px[index]
+    sigma, s = scene.optics.blur_px[index], scene.render.subpixels
     pad, weights = optics.blur_reach(sigma), optics.blur_weights(sigma, s)
     cells = optics.table_cells(view, pad, s, scene)
-    factor, glare = optics.illumination(view, name, scene)
+    factor, glare = optics.illumination(view, CAMERAS[index], scene)
     return Stage(
-        name=name,
+        name=CAMERAS[index],
         view=view,
         s=s,
         pad=pad,
         weights=weights,
-        rays=imperfect.lens_rays(corner_rays(camera, pad), pad, camera, imperfections, [seed, 9, index]),
+        rays=optics.lens_rays(camera, pad, scene.imperfections.lens_field_px, [scene.seed, 9, index]),
         cells=cells,
         table=optics.blur_to_pixels(cells, weights, s),
         factor=factor,
         glare=glare,
-        pattern=imperfect.sensor_pattern(imperfections, camera.image_size, [seed, 10, index]),
-        hot=hot_pixels(sensor, camera.image_size, np.random.default_rng([seed, 5, index])),
+        pattern=sensor_pattern(scene.imperfections, camera.image_size, [scene.seed, 10, index]),
+        hot=hot_pixels(scene.sensor, camera.image_size, np.random.default_rng([scene.seed, 5, index])),
     )
-
-
-@dataclass(frozen=True)
-class TrueDisc:
-    """The disc as it is, whatever a recording declares: `disc` carries the true centres of the dots."""
-
-    disc: Disc
-    paper_centre_body: tuple[float, float] = (0.0, 0.0)  # [m]
 
 
 def expected_disc_image(
     pose: PoseOverExposure,
     exposure: float,
+    frame: int,
     stage: Stage,
-    true_disc: TrueDisc,
     scene: Scene,
+    disc: Disc,
+    paper_centre_body: ArrayLike = (0.0, 0.0),
     visible: Mask | None = None,
-    occluders: Iterable[Occluder] = (),
 ) -> Array32:
     """Expected grey values (height, width) of one exposure [s]; `pose` gives q around mid exposure.
+
+    disc : the true one, its dots where they are printed   visible : (m,) of the dots
 
     Light is gathered at the nodes of a Gauss-Legendre rule over the exposure, at least one node per 0.8 px of motion:
     the mean and the variance of the path are exact from two nodes on.
     """
-    nodes, weights = _exposure_rule(pose, exposure, stage, true_disc.disc)
+    nodes, weights = _exposure_rule(pose, exposure, stage, disc)
     q = pose(nodes * exposure)
-    R_world_body = rotation_from_euler(q[:, 3], q[:, 4], q[:, 5])
-    view, s, pad = stage.view, stage.s, stage.pad
-    width, height = view.camera.image_size
-    occluders = tuple(occluders)
-    outline = _outline(q, R_world_body, true_disc.disc, view)
-    x0, y0, x1, y1 = _window(outline, pad + 1, width, height) if not occluders else (0, 0, width, height)
+    s, pad = stage.s, stage.pad
+    width, height = stage.view.camera.image_size
+    rods = [r for r in scene.faults.occluders if r.camera == stage.name and r.first_frame <= frame <= r.last_frame]
+    x0, y0, x1, y1 = (0, 0, width, height) if rods else _window(_outline(q, disc, stage.view), pad + 1, width, height)
     image = stage.table.copy()
     if x0 < x1 and y0 < y1:
-        # the window in cells, with the reach of the blur on each side; padded coordinates start `pad` before the image
-        box = (slice(y0 * s, (y1 + 2 * pad) * s), slice(x0 * s, (x1 + 2 * pad) * s))
-        background = np.ascontiguousarray(stage.cells[box])
-        cells = np.zeros_like(background)
-        disc = true_disc.disc
-        dots = disc.marker_centres_body[:, :2] if visible is None else disc.marker_centres_body[visible, :2]
-        paper = np.array([*true_disc.paper_centre_body, disc.radius - scene.appearance.rim_width_mm * 1e-3])
-        top = float(disc.marker_centres_body[:, 2].mean())  # half the thickness, unless the paper lies higher
-        for R, centre, weight in zip(R_world_body, q[:, :3], weights, strict=True):
-            draw_disc(
-                cells, background, (y0, x0), stage.rays, s, weight,
-                np.ascontiguousarray(view.R_camera_world @ R), view.R_camera_world @ centre + view.t_camera_world,
-                disc.radius, top, paper, np.ascontiguousarray(dots), disc.marker_diameter / 2,
-                _surface_greys(R, scene),
-            )  # fmt: skip
-        for rod in occluders:
+        # the window with the reach of the blur on each side; padded coordinates start `pad` before the image
+        table = stage.cells[y0 * s : (y1 + 2 * pad) * s, x0 * s : (x1 + 2 * pad) * s]
+        body, face = np.zeros_like(table), np.zeros_like(table)  # share of the disc; grey of its face above its side
+        dots = disc.marker_centres_body[np.ones(disc.n_markers, bool) if visible is None else visible]
+        whole, around = raster.body_shape(disc.radius, _top(disc)), _rims(disc.radius, _top(disc))
+        for q_now, weight in zip(q, weights, strict=True):
+            place = rotation_from_euler(*q_now[3:]), q_now[:3]
+            _add(body, weight, stage, (x0, y0), place, whole, around)
+            for step, centre, radius in _face(stage, place, disc, dots, paper_centre_body, scene):
+                shape = raster.round_shape(centre[2], (centre[0], centre[1]), radius, disc.radius)
+                _add(face, weight * step, stage, (x0, y0), place, shape, centre + radius * _RING)
+        cells = table + body * (scene.appearance.side - table) + face
+        for rod in rods:
             _draw_rod(cells, (y0 - pad, x0 - pad), s, rod)
         image[y0:y1, x0:x1] = optics.blur_to_pixels(cells, stage.weights, s)
     return stage.finish(image)
 
 
-def _surface_greys(R_world_body: Array, scene: Scene) -> Array:
-    look = scene.appearance
-    face = optics.face_brightness(R_world_body[:, 2], scene)
-    under = optics.face_brightness(-R_world_body[:, 2], scene)
-    return np.array([look.paper * face, look.dot * face, look.rim * face, look.side, look.underside * under])
+Place = tuple[Array, Array]  # R_world_body, t_world_body [m]
+
+
+def _add(
+    cells: Array32, step: float, stage: Stage, corner: tuple[int, int], place: Place, shape: Array, around: Array
+) -> None:
+    """Add a shape of a body to a window of the stage's padded cells.
+
+    corner : x, y of the window's first pixel   around : (k, 3) points of the body among which the shape lies [m]
+    """
+    (R, t), view, s = place, stage.view, stage.s
+    pixels = image_of(around @ R.T + t, view) + stage.pad
+    low = np.floor(pixels.min(axis=0)).astype(int) - 2  # 2: the arcs between the points
+    high = np.ceil(pixels.max(axis=0)).astype(int) + 3
+    (left, top), (x, y) = np.maximum(low, corner), corner
+    right, bottom = np.minimum(high, corner + np.array(cells.shape[::-1]) // s)
+    box = raster.Box(int(top), int(bottom), int(left), int(right), y, x, s)
+    if top < bottom and left < right:
+        raster.add_shape(cells, step, box, stage.rays, view.R_camera_world @ R, R.T @ (view.centre - t), shape)
+
+
+def _face(
+    stage: Stage, place: Place, disc: Disc, dots: Array, paper_centre: ArrayLike, scene: Scene
+) -> list[tuple[float, Array, float]]:
+    """The circles on the face that a camera sees: step of grey, centre in body axes, radius."""
+    (R, t), look = place, scene.appearance
+    top = _top(disc)
+    height = float(R[:, 2] @ (stage.view.centre - t))
+    light = optics.face_brightness(np.sign(height) * R[:, 2], scene)
+    if abs(height) <= top:
+        return []
+    if height < 0:
+        return [(look.underside * light - look.side, np.array([0.0, 0.0, -top]), disc.radius)]
+    return [
+        (look.rim * light - look.side, np.array([0.0, 0.0, top]), disc.radius),
+        ((look.paper - look.rim) * light, np.append(paper_centre, top), disc.radius - 1e-3 * look.rim_width_mm),
+        *(((look.dot - look.paper) * light, np.array([x, y, top]), disc.marker_diameter / 2) for x, y, _ in dots),
+    ]
+
+
+def _top(disc: Disc) -> float:
+    """Height of the dots over the disc's middle [m]: half the thickness, unless the paper lies higher."""
+    return float(disc.marker_centres_body[:, 2].mean())
 
 
 def _exposure_rule(pose: PoseOverExposure, exposure: float, stage: Stage, disc: Disc) -> tuple[Array, Array]:
     """Nodes in units of the exposure (from -1/2 to 1/2) and weights of sum 1."""
     if exposure == 0:
         return np.zeros(1), np.ones(1)
-    q = pose(np.array([-0.5, 0.5]) * exposure)
-    outline = _outline(q, rotation_from_euler(q[:, 3], q[:, 4], q[:, 5]), disc, stage.view).reshape(2, -1, 2)
+    outline = _outline(pose(np.array([-0.5, 0.5]) * exposure), disc, stage.view)
     path_px = float(np.max(np.linalg.norm(outline[1] - outline[0], axis=-1)))
     if path_px < 0.02:  # its variance, path^2 / 12, is 5e-5 of the blur's
         return np.zeros(1), np.ones(1)
@@ -179,22 +190,24 @@ def _exposure_rule(pose: PoseOverExposure, exposure: float, stage: Stage, disc: 
     return nodes / 2, weights / 2
 
 
-_RING = np.radians(np.arange(0, 360, 10))
+_ANGLES = np.radians(np.arange(0, 360, 10))
+_RING = np.column_stack([np.cos(_ANGLES), np.sin(_ANGLES), np.zeros(36)])
 
 
-def _outline(q: Array, R_world_body: Array, disc: Disc, view: View) -> Array:
-    """Pixels (k * 72, 2) of points on both rims."""
-    ring = np.column_stack([np.cos(_RING), np.sin(_RING)]) * disc.radius
-    rims = np.concatenate(
-        [np.column_stack([ring, np.full(len(ring), z)]) for z in (disc.half_thickness, -disc.half_thickness)]
-    )
-    points = rims @ np.swapaxes(R_world_body, -1, -2) + q[:, None, :3]
-    return image_of(points, view).reshape(-1, 2)
+def _rims(radius: float, half_thickness: float) -> Array:
+    """(72, 3) points on both rims."""
+    return np.concatenate([radius * _RING + [0.0, 0.0, z] for z in (half_thickness, -half_thickness)])
+
+
+def _outline(q: Array, disc: Disc, view: View) -> Array:
+    """Pixels (k, 72, 2) of points on both rims at poses q (k, 6)."""
+    rims = _rims(disc.radius, disc.half_thickness)
+    return image_of(rims @ np.swapaxes(rotation_from_euler(*q[:, 3:].T), -1, -2) + q[:, None, :3], view)
 
 
 def _window(outline: Array, margin: int, width: int, height: int) -> tuple[int, int, int, int]:
-    low = np.floor(outline.min(axis=0)).astype(int) - margin - 2  # 2: the arcs between the points
-    high = np.ceil(outline.max(axis=0)).astype(int) + margin + 3
+    low = np.floor(outline.min(axis=(0, 1))).astype(int) - margin - 2  # 2: the arcs between the points
+    high = np.ceil(outline.max(axis=(0, 1))).astype(int) + margin + 3
     return max(low[0], 0), max(low[1], 0), min(high[0], width), min(high[1], height)
 
 
@@ -217,10 +230,10 @@ def expected_disc(
     *,
     qdot: ArrayLike | None = None,
     visible: ArrayLike | None = None,
-    paper_centre_body: tuple[float, float] = (0.0, 0.0),
 ) -> Array32:
     """Noise-free grey values (n, 2 cameras, height, width) before quantisation; arguments as for `render_disc`."""
-    return _disc_series(q, rig, disc, scene or Scene(), qdot, visible, paper_centre_body, lambda image, _: image)
+    scene, q = scene or Scene(), np.atleast_2d(np.asarray(q, float))
+    return _gather(_disc_pictures(q, rig, disc, scene, qdot, visible), len(q), scene)
 
 
 def render_disc(
@@ -232,7 +245,6 @@ def render_disc(
     *,
     qdot: ArrayLike | None = None,
     visible: ArrayLike | None = None,
-    paper_centre_body: tuple[float, float] = (0.0, 0.0),
 ) -> NDArray[Any]:
     """Images (n, 2 cameras, height, width) of the disc at the poses q: uint8, or uint16 for more than 8 bits.
 
@@ -244,43 +256,25 @@ def render_disc(
     qdot    : (n, 6) rates; the pose moves with them for the exposure time. None: at rest
     visible : (n, 2, m) or what broadcasts to it; False: that dot is missing on the paper
     """
-    settings = scene or Scene()
-    q = np.atleast_2d(np.asarray(q, float))
-    noise = [None] * (2 * len(q)) if rng is None else rng.spawn(2 * len(q))
-    hot = [stage.hot for stage in stages(rig, settings)]
-
-    def expose(image: Array32, index: int) -> NDArray[Any]:
-        return digitise(image, settings.sensor, settings.cameras.bit_depth, noise[index], hot[index % 2])
-
-    return _disc_series(q, rig, disc, settings, qdot, visible, paper_centre_body, expose)
+    scene, q = scene or Scene(), np.atleast_2d(np.asarray(q, float))
+    return _digitised(_disc_pictures(q, rig, disc, scene, qdot, visible), len(q), rig, scene, rng)
 
 
-def _disc_series(
-    q: ArrayLike,
-    rig: StereoRig,
-    disc: Disc,
-    scene: Scene,
-    qdot: ArrayLike | None,
-    visible: ArrayLike | None,
-    paper_centre_body: tuple[float, float],
-    finish: Callable[[Array32, int], NDArray[Any]],
-) -> NDArray[Any]:
-    q = np.atleast_2d(np.asarray(q, float))
+Pictures = Callable[[int, int], NDArray[Any]]  # frame and camera -> (height, width)
+
+
+def _disc_pictures(
+    q: Array, rig: StereoRig, disc: Disc, scene: Scene, qdot: ArrayLike | None, visible: ArrayLike | None
+) -> Pictures:
     rates = np.zeros_like(q) if qdot is None else np.broadcast_to(np.asarray(qdot, float), q.shape)
     seen = np.broadcast_to(True if visible is None else np.asarray(visible, bool), (len(q), 2, disc.n_markers))
-    both = stages(rig, scene)
-    true_disc = TrueDisc(disc, paper_centre_body)
-    exposure = 0.0 if qdot is None else scene.cameras.exposure_s
+    both, exposure = stages(rig, scene), 0.0 if qdot is None else scene.cameras.exposure_s
 
-    def one(index: int) -> NDArray[Any]:
-        i, c = divmod(index, 2)
-        rods = [r for r in scene.faults.occluders if r.camera == both[c].name and r.first_frame <= i <= r.last_frame]
-        image = expected_disc_image(
-            lambda dt: q[i] + dt[:, None] * rates[i], exposure, both[c], true_disc, scene, seen[i, c], rods
-        )
-        return finish(image, index)
+    def picture(i: int, c: int) -> Array32:
+        pose = lambda dt: q[i] + dt[:, None] * rates[i]  # noqa: E731
+        return expected_disc_image(pose, exposure, i, both[c], scene, disc, visible=seen[i, c])
 
-    return _gather(one, len(q), scene)
+    return picture
 
 
 def render_board(
@@ -295,37 +289,48 @@ def render_board(
     R_world_board (n, 3, 3), t_world_board (n, 3) [m]: the board's origin is the lower left inner corner seen with the
     side of dark corner squares on the left, its axes run along the long side, the short side and out of the print.
     """
-    settings = scene or Scene()
+    scene, both = scene or Scene(), stages(rig, scene or Scene())
     R, t = np.asarray(R_world_board, float).reshape(-1, 3, 3), np.asarray(t_world_board, float).reshape(-1, 3)
-    noise = [None] * (2 * len(R)) if rng is None else rng.spawn(2 * len(R))
-    both = stages(rig, settings)
-
-    def one(index: int) -> NDArray[Any]:
-        i, c = divmod(index, 2)
-        image = expected_board_image(R[i], t[i], both[c], settings)
-        return digitise(image, settings.sensor, settings.cameras.bit_depth, noise[index], both[c].hot)
-
-    return _gather(one, len(R), settings)
+    return _digitised(lambda i, c: expected_board_image(R[i], t[i], both[c], scene), len(R), rig, scene, rng)
 
 
 def expected_board_image(R_world_board: Array, t_world_board: Array, stage: Stage, scene: Scene) -> Array32:
     """Expected grey values (height, width) of the chessboard at rest in one camera."""
-    view, board = stage.view, scene.board
-    cells = np.zeros_like(stage.cells)
+    board, look = scene.board, scene.appearance
     light = optics.face_brightness(R_world_board[:, 2], scene)
-    draw_board(
-        cells, stage.cells, stage.rays, stage.s,
-        np.ascontiguousarray(view.R_camera_world @ R_world_board),
-        view.R_camera_world @ t_world_board + view.t_camera_world,
-        board.square_mm * 1e-3, board.inner_corners[0], board.inner_corners[1], board.margin_mm / board.square_mm,
-        scene.appearance.board_white * light, scene.appearance.board_black * light,
-        imperfect.bent_board(scene.imperfections, board),
-    )  # fmt: skip
+    square, margin = board.square_mm * 1e-3, board.margin_mm * 1e-3
+    columns, rows = board.inner_corners
+    bow, stretch = scene.imperfections.board_bow_mm * 1e-3, 1 + scene.imperfections.board_stretch
+    middle, half = 0.5 * (columns - 1) * square, 0.5 * (columns + 1) * square
+
+    def add(cells: Array32, step: float, x: tuple[float, float], y: tuple[float, float]) -> None:
+        x = x[0] * stretch, x[1] * stretch
+        around = np.array([[a, b, bow * (1 - ((a - middle) / half) ** 2)] for a in (*x, middle) for b in y])
+        shape = raster.sheet_shape(x, y, (bow, middle, half))
+        _add(cells, step, stage, (0, 0), (R_world_board, t_world_board), shape, around)
+
+    sheet, squares = np.zeros_like(stage.cells), np.zeros_like(stage.cells)
+    add(sheet, 1.0, (-square - margin, columns * square + margin), (-square - margin, rows * square + margin))
+    for i in range(-1, columns):
+        for j in range(-1, rows):
+            if (i + j) % 2 == 0:
+                step = (look.board_black - look.board_white) * light
+                add(squares, step, (i * square, (i + 1) * square), (j * square, (j + 1) * square))
+    cells = stage.cells + sheet * (look.board_white * light - stage.cells) + squares
     return stage.finish(optics.blur_to_pixels(cells, stage.weights, stage.s))
 
 
-def _gather(one: Callable[[int], NDArray[Any]], n: int, scene: Scene) -> NDArray[Any]:
-    """Images one(0 ... 2 n - 1) as (n, 2, height, width), on the scene's threads."""
+def _digitised(
+    pictures: Pictures, n: int, rig: StereoRig, scene: Scene, rng: np.random.Generator | None
+) -> NDArray[Any]:
+    """Images of n pairs, each with noise of its own."""
+    both = stages(rig, scene)
+    noise = [None] * (2 * n) if rng is None else rng.spawn(2 * n)
+    return _gather(lambda i, c: both[c].digitised(pictures(i, c), scene, noise[2 * i + c]), n, scene)
+
+
+def _gather(pictures: Pictures, n: int, scene: Scene) -> NDArray[Any]:
+    """Pictures of n pairs as (n, 2, height, width), on the scene's threads."""
     with ThreadPoolExecutor(max_workers=max(scene.render.threads, 1)) as pool:
-        images = list(pool.map(one, range(2 * n)))
+        images = list(pool.map(lambda index: pictures(*divmod(index, 2)), range(2 * n)))
     return np.stack(images).reshape(n, 2, *images[0].shape)

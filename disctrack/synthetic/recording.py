@@ -4,7 +4,8 @@ import shutil
 import tempfile
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -15,12 +16,10 @@ from calibration.kit.arrays import Array, Array32, Image
 from disctrack.disc import AIR_DENSITY, Disc
 from disctrack.errors import OutputError
 from disctrack.files.toml_tree import toml_value
-from disctrack.frames import CAMERAS
 from disctrack.synthetic.cameras import board_poses, rig_after_faults, rig_of
 from disctrack.synthetic.description import ImperfectionSettings, Scene, load_scene
-from disctrack.synthetic.images import Stage, TrueDisc, expected_board_image, expected_disc_image, stages
+from disctrack.synthetic.images import Stage, expected_board_image, expected_disc_image, stages
 from disctrack.synthetic.motion import SceneMotion, motion_of, true_exposure, true_frame_rate
-from disctrack.synthetic.sensor import digitise
 from disctrack.synthetic.truth import Truth, write_truth
 
 Progress = Callable[[int, int], None]  # images done, images in all
@@ -28,12 +27,7 @@ Progress = Callable[[int, int], None]  # images done, images in all
 TRUTH_NAME = "truth.h5"
 
 
-@dataclass(frozen=True)
-class _Image:
-    """One file to be written."""
-
-    path: Path
-    expose: Callable[[], Image]
+Job = tuple[Path, Callable[[], Image]]  # a file, and how its image is taken
 
 
 def write_recording(
@@ -68,8 +62,7 @@ def write_recording(
         for name in ("left", "right", "calibration/left", "calibration/right"):
             (part / name).mkdir(parents=True)
         (part / "recording.toml").write_text(recording_toml(scene), encoding="utf-8")
-        images = [*_board_images(part, scene, truth), *_disc_images(part, scene, motion, truth)]
-        _write_all(images, scene, progress)
+        _write_all([*_boards(part, scene, truth), *_frames(part, scene, motion, truth)], scene, progress)
         if target is not None:
             target.parent.mkdir(parents=True, exist_ok=True)
         write_truth(target or part / TRUTH_NAME, truth, scene)
@@ -98,8 +91,8 @@ def run_render(
     return write_recording(folder, load_scene(scene_path), truth_path=truth_path, progress=progress)
 
 
-def true_disc_of(scene: Scene) -> TrueDisc:
-    """The disc with its dots and paper where they really are."""
+def true_disc_of(scene: Scene) -> Disc:
+    """The disc with its dots where they really are."""
     declared, faults = scene.declared_disc, scene.faults
     centres = declared.marker_centres_body.copy()
     if faults.misprint_mm:
@@ -110,28 +103,25 @@ def true_disc_of(scene: Scene) -> TrueDisc:
     c, s = np.cos(np.radians(faults.pattern_turn_deg)), np.sin(np.radians(faults.pattern_turn_deg))
     centres[:, :2] = faults.pattern_scale * centres[:, :2] @ np.array([[c, s], [-s, c]])
     centres += np.array([*faults.pattern_offset_mm, faults.pattern_height_mm]) * 1e-3
-    x, y = faults.pattern_offset_mm
-    disc = replace(declared, marker_centres_body=centres)
-    return TrueDisc(disc, (x * 1e-3, y * 1e-3))
+    return replace(declared, marker_centres_body=centres)
 
 
 def _truth(scene: Scene, motion: SceneMotion, rig: StereoRig) -> Truth:
-    n, rate, delay = motion.n_frames, true_frame_rate(scene), scene.faults.right_delay_s
+    n, rate, faults = motion.n_frames, true_frame_rate(scene), scene.faults
     time = np.arange(n) / rate
     visible = np.ones(scene.declared_disc.n_markers, bool)
-    visible[list(scene.faults.hidden_markers)] = False
+    visible[list(faults.hidden_markers)] = False
     R, t = board_poses(scene, rig)
-    true_disc = true_disc_of(scene)
     return Truth(
         time=time,
         q=motion.pose(time),
         qdot=motion.rates(time),
-        q_right=motion.pose(time + delay) if scene.motion.kind != "static" else motion.pose(time),
+        q_right=motion.pose(time + _delay(scene)),
         frame_rate=rate,
         rig=rig,
         rig_while_filming=rig_after_faults(rig, scene),
-        disc=true_disc.disc,
-        paper_centre_body=np.array(true_disc.paper_centre_body),
+        disc=true_disc_of(scene),
+        paper_centre_body=np.array(faults.pattern_offset_mm) * 1e-3,
         markers_printed=visible,
         R_world_board=R,
         t_world_board=t,
@@ -139,57 +129,53 @@ def _truth(scene: Scene, motion: SceneMotion, rig: StereoRig) -> Truth:
     )
 
 
-def _board_images(part: Path, scene: Scene, truth: Truth) -> Iterator[_Image]:
+def _delay(scene: Scene) -> float:
+    """By which the right camera exposes later [s]; a pose at rest has frames, but no time."""
+    return 0.0 if scene.motion.kind == "static" else scene.faults.right_delay_s
+
+
+def _boards(part: Path, scene: Scene, truth: Truth) -> Iterator[Job]:
     for c, stage in enumerate(stages(truth.rig, scene)):
         for view, (R, t) in enumerate(zip(truth.R_world_board, truth.t_world_board, strict=True)):
-
-            def expose(
-                stage: Stage = stage, R: Array = R, t: Array = t, key: tuple[int, ...] = (scene.seed, 3, c, view)
-            ) -> Image:
-                return _digitise(expected_board_image(R, t, stage, scene), stage, scene, key)
-
-            yield _Image(part / "calibration" / CAMERAS[c] / f"{view:02d}.png", expose)
+            picture = partial(expected_board_image, R, t, stage, scene)
+            path = part / "calibration" / stage.name / f"{view:02d}.png"
+            yield path, partial(_exposed, picture, stage, scene, [scene.seed, 3, c, view])
 
 
-def _disc_images(part: Path, scene: Scene, motion: SceneMotion, truth: Truth) -> Iterator[_Image]:
-    true_disc = TrueDisc(truth.disc, (float(truth.paper_centre_body[0]), float(truth.paper_centre_body[1])))
-    still = scene.motion.kind == "static"
-    exposure = 0.0 if still else true_exposure(scene)
+def _frames(part: Path, scene: Scene, motion: SceneMotion, truth: Truth) -> Iterator[Job]:
+    exposure = 0.0 if scene.motion.kind == "static" else true_exposure(scene)
+    looks = (scene, truth.disc, truth.paper_centre_body, truth.markers_printed)
     for c, stage in enumerate(stages(truth.rig_while_filming, scene)):
-        fault = (scene.faults.left, scene.faults.right)[c]
-        delay = 0.0 if still or c == 0 else scene.faults.right_delay_s
-        for i in sorted(set(range(len(truth.time))) - set(fault.missing_frames)):
-            rods = [r for r in scene.faults.occluders if r.camera == stage.name and r.first_frame <= i <= r.last_frame]
-
-            def expose(
-                i: int = i, mid: float = truth.time[i] + delay, stage: Stage = stage, rods: list = rods, c: int = c
-            ) -> Image:
-                image = expected_disc_image(
-                    lambda dt: motion.pose(mid + dt), exposure, stage, true_disc, scene, truth.markers_printed, rods
-                )
-                return _digitise(image, stage, scene, (scene.seed, 4, c, i))
-
-            yield _Image(part / CAMERAS[c] / f"{i:06d}.png", expose)
+        missing = (scene.faults.left, scene.faults.right)[c].missing_frames
+        for i in sorted(set(range(len(truth.time))) - set(missing)):
+            pose = partial(_pose_around, motion, truth.time[i] + c * _delay(scene))
+            picture = partial(expected_disc_image, pose, exposure, i, stage, *looks)
+            yield part / stage.name / f"{i:06d}.png", partial(_exposed, picture, stage, scene, [scene.seed, 4, c, i])
 
 
-def _digitise(image: Array32, stage: Stage, scene: Scene, key: tuple[int, ...]) -> Image:
+def _pose_around(motion: SceneMotion, mid: float, dt: Array) -> Array:
+    return motion.pose(mid + dt)
+
+
+def _exposed(picture: Callable[[], Array32], stage: Stage, scene: Scene, key: list[int]) -> Image:
     """Own noise for every image, so that neither order nor number of threads matters."""
-    return digitise(image, scene.sensor, scene.cameras.bit_depth, np.random.default_rng(key), stage.hot)
+    return stage.digitised(picture(), scene, np.random.default_rng(key))
 
 
-def _write_all(images: list[_Image], scene: Scene, progress: Progress | None) -> None:
+def _write_all(jobs: list[Job], scene: Scene, progress: Progress | None) -> None:
     # noisy pictures have no repeats worth searching for: run lengths give smaller files, sooner
     settings = [cv2.IMWRITE_PNG_COMPRESSION, scene.render.png_compression]
     settings += [cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]
 
-    def write(image: _Image) -> None:
-        if not cv2.imwrite(str(image.path), image.expose(), settings):
-            raise OSError(f"{image.path} not written")
+    def write(job: Job) -> None:
+        path, take = job
+        if not cv2.imwrite(str(path), take(), settings):
+            raise OSError(f"{path} not written")
 
     with ThreadPoolExecutor(max_workers=max(scene.render.threads, 1)) as pool:
-        for done, _ in enumerate(pool.map(write, images), start=1):
+        for done, _ in enumerate(pool.map(write, jobs), start=1):
             if progress is not None:
-                progress(done, len(images))
+                progress(done, len(jobs))
 
 
 def _exact(length_mm: float) -> str:

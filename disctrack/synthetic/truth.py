@@ -14,7 +14,7 @@ from calibration.rig_file import read_rig_group, write_rig_group
 from disctrack.disc import Disc
 from disctrack.errors import OutputError, RigFileError
 from disctrack.frames import COORDINATES, rotation_from_euler
-from disctrack.synthetic.cameras import View, image_of
+from disctrack.synthetic.cameras import image_of, views_of
 from disctrack.synthetic.description import Scene, scene_toml
 
 SCHEMA = "disctrack truth"
@@ -42,12 +42,10 @@ class Truth:
     @property
     def markers_px(self) -> Array:
         """(n, 2, m, 2) images of the dots' own centres at mid exposure, whether visible or not."""
-        views = zip(self.rig_while_filming.cameras, self.rig_while_filming.camera_poses(), strict=True)
         pixels = []
-        for q, (camera, (R_camera_world, t)) in zip((self.q, self.q_right), views, strict=True):
-            R = rotation_from_euler(q[:, 3], q[:, 4], q[:, 5])
-            points = self.disc.marker_centres_body @ np.swapaxes(R, -1, -2) + q[:, None, :3]
-            pixels.append(image_of(points, View(camera, R_camera_world, t)))
+        for q, view in zip((self.q, self.q_right), views_of(self.rig_while_filming), strict=True):
+            R = rotation_from_euler(*q[:, 3:].T)
+            pixels.append(image_of(self.disc.marker_centres_body @ np.swapaxes(R, -1, -2) + q[:, None, :3], view))
         return np.stack(pixels, axis=1)
 
 

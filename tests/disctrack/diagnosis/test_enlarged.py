@@ -64,7 +64,7 @@ def test_images_of_a_faulty_scene_are_those_that_the_diagnosis_predicts(short, e
     scene = load_scene(saved(system, state | everything_wrong, tmp_path))
     rig, q = rig_of(scene), short.q[:5]
     R = rotation_from_euler(*q[:, 3:].T)
-    centres = true_disc_of(scene).disc.marker_centres_body
+    centres = true_disc_of(scene).marker_centres_body
     rendered = rig_after_faults(rig, scene).project(centres @ np.swapaxes(R, 1, 2) + q[:, None, :3])
     predicted = predict(
         np.stack([R, R]), np.stack([q[:, :3]] * 2), rig, short.disc, setup_of(short.disc, everything_wrong)

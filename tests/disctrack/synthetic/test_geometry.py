@@ -11,6 +11,7 @@ from scipy.spatial import ConvexHull
 from disctrack import synthetic
 from disctrack.disc import MA_2014
 from disctrack.frames import rotation_from_euler
+from disctrack.synthetic import raster
 from disctrack.synthetic.description import (
     AppearanceSettings,
     CameraSettings,
@@ -179,10 +180,7 @@ def test_an_error_of_the_lens_model_would_be_noticed(rig):
 
 
 def test_area_and_moments_of_a_half_plane_in_a_cell(rng):
-    from disctrack.synthetic import areas
-
-    half_plane = areas.half_plane.py_func
-
+    half_plane = raster.half_plane.py_func
     grid = (np.arange(500) + 0.5) / 500 - 0.5
     x, y = np.meshgrid(grid, grid)
     for f0, a, b in [*(rng.normal(size=(40, 3)) * [0.5, 1.0, 1.0]), (0.1, 1.0, 0.0), (0.1, 1e-4, -1.0)]:

@@ -15,9 +15,9 @@ from disctrack.synthetic.description import (
     RigSettings,
     Scene,
 )
-from disctrack.synthetic.imperfect import bent_board, lens_rays, sensor_pattern
-from disctrack.synthetic.rays import corner_rays
+from disctrack.synthetic.optics import corner_rays, lens_rays
 from disctrack.synthetic.recording import recording_toml
+from disctrack.synthetic.sensor import sensor_pattern
 
 SCENE = Scene(
     cameras=CameraSettings(image_size=(272, 272)),
@@ -55,7 +55,7 @@ def test_lens_field_has_its_size_and_moves_the_image_by_it(plain):
     settings, rig = ImperfectionSettings(lens_field_px=0.2), rig_of(SCENE)
     camera, pad = rig.left, 3
     straight = corner_rays(camera, pad)
-    bent = lens_rays(straight, pad, camera, settings, [SCENE.seed, 9, 0])
+    bent = lens_rays(camera, pad, 0.2, [SCENE.seed, 9, 0])
     off = -(bent - straight)[pad:-pad, pad:-pad] * [camera.fx, camera.fy]  # near enough: weak distortion
     assert_allclose(off.std((0, 1)), 0.2, rtol=0.1)
     moved = corners_of(settings)[0] - plain[0]
@@ -75,6 +75,6 @@ def test_sensor_pattern_is_fixed_and_has_its_size(rng):
 
 def test_off_by_default_and_declared_only_where_exact():
     assert sensor_pattern(ImperfectionSettings(), (40, 30), [1]) is None
-    assert bent_board(ImperfectionSettings(), BoardSettings())[[0, 3]].tolist() == [0.0, 0.0]
+    assert lens_rays(rig_of(SCENE).left, 3, 0.0, [1]) is corner_rays(rig_of(SCENE).left, 3)
     assert "square_tolerance_mm = 0.0" in recording_toml(Scene())
     assert "tolerance" not in recording_toml(replace(Scene(), imperfections=ImperfectionSettings(pixel_gain=0.01)))

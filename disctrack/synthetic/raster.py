@@ -1,0 +1,219 @@
+"""Shapes in the cells of one camera's sensor: what the lens would draw of them without blur.
+
+What a camera sees is painted in steps: the body over the table, its face over the body, the paper over the face, dots
+over the paper; the sheet of a chessboard over the table, black squares over the sheet. Each lies within the one before,
+so that light adds: every shape adds its step of grey times the area that it covers of a cell.
+
+A pixel that no edge crosses is covered or not. A crossed pixel is cut into s x s cells, and in each the area follows
+from signed distances at its corners and its centre: that on either side of a straight line, and its first moments, are
+exact; curvature is allowed for in second order. The error of a blurred edge is of third order in the cell's size.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import types
+
+from calibration.kit.arrays import Array, Array32
+from calibration.kit.compiled import njit
+
+_RULES: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
+part = njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **_RULES)  # called by compiled functions only
+
+_ROUND, _BODY, _SHEET = 0.0, 1.0, 2.0
+_FAR = -1e3  # [m] signed distance of a ray that does not meet the plane ahead of the camera
+_CLEAR, _CLEAR_OF_TIPS = 0.6, 1.0  # of the spread of a pixel's corners, beyond which no edge crosses it: 1/2 if it
+# were straight, 1 for a right angle that reaches in between two of the corners
+_BENT = 0.02  # of that spread in a cell: more between its centre and its corners' mean, and the edge has a corner there
+_SAMPLES = 16  # a side, of a cell with a corner
+
+
+class Box(NamedTuple):
+    """Pixels of the sensor in which a shape is drawn, and where the window that it is drawn into begins."""
+
+    top: int
+    bottom: int
+    left: int
+    right: int
+    y: int  # of the window
+    x: int
+    s: int  # cells of a pixel along either axis
+
+
+def round_shape(height: float, centre: tuple[float, float], radius: float, within: float) -> Array:
+    """A circle in the plane z = height of a body, as far as it lies `within` that distance from its axis [m]."""
+    return np.array([_ROUND, height, *centre, radius, within, 0.0, 0.0])
+
+
+def body_shape(radius: float, half_thickness: float) -> Array:
+    """The outline of a cylinder about the third axis [m]."""
+    return np.array([_BODY, half_thickness, radius, 0.0, 0.0, 0.0, 0.0, 0.0])
+
+
+def sheet_shape(x: tuple[float, float], y: tuple[float, float], bow: tuple[float, float, float]) -> Array:
+    """The rectangle x[0] ... x[1], y[0] ... y[1] of a sheet that lies bow[0] (1 - u^2) above its plane.
+
+    u = (x - bow[1]) / bow[2]; all in metres
+    """
+    return np.array([_SHEET, *x, *y, *bow])
+
+
+@part
+def half_plane(f0: float, a: float, b: float) -> tuple[float, float, float]:
+    """Area and first moments (in x, in y) of the part of the square [-1/2, 1/2]^2 on which f0 + a x + b y > 0.
+
+    I = integral of max(f, 0) is a sum of cubes at the four corners; the area is dI/df0, the moments are dI/da, dI/db.
+    """
+    A, B = abs(a), abs(b)
+    swapped = A < B
+    if swapped:
+        A, B = B, A
+    if f0 >= 0.5 * (A + B):
+        return 1.0, 0.0, 0.0
+    if f0 <= -0.5 * (A + B):
+        return 0.0, 0.0, 0.0
+    if B < 1e-3 * A:  # as good as parallel to a side; the sums below would cancel
+        area = min(max(f0 / A + 0.5, 0.0), 1.0)
+        m, n = 0.5 * area * (1.0 - area), B / (12.0 * A)
+    else:
+        p, q = 0.5 * (A + B), 0.5 * (A - B)
+        g0, g1, g2, g3 = max(f0 + p, 0.0), max(f0 + q, 0.0), max(f0 - q, 0.0), max(f0 - p, 0.0)
+        product = A * B
+        integral = (g0**3 - g1**3 - g2**3 + g3**3) / (6.0 * product)
+        area = min(max((g0**2 - g1**2 - g2**2 + g3**2) / (2.0 * product), 0.0), 1.0)
+        m = (g0**2 - g1**2 + g2**2 - g3**2) / (4.0 * product) - integral / A
+        n = (g0**2 + g1**2 - g2**2 - g3**2) / (4.0 * product) - integral / B
+    if swapped:
+        m, n = n, m
+    return area, m if a > 0.0 else -m, n if b > 0.0 else -n
+
+
+@part
+def between(grid: Array, row: int, column: int, p: float, q: float, k: int) -> float:
+    """Number k at row fraction p, column fraction q between the points (row, column) and (row + 1, column + 1)."""
+    upper = (1 - q) * grid[row, column, k] + q * grid[row, column + 1, k]
+    lower = (1 - q) * grid[row + 1, column, k] + q * grid[row + 1, column + 1, k]
+    return (1 - p) * upper + p * lower
+
+
+@part
+def _foot(eye: Array, dx: float, dy: float, dz: float, height: float) -> tuple[float, float, bool]:
+    """Point (x, y) of the ray eye + t d in the plane z = height, and whether it lies ahead."""
+    if dz == 0.0:
+        return 0.0, 0.0, False
+    t = (height - eye[2]) / dz
+    return eye[0] + t * dx, eye[1] + t * dy, t > 0.0
+
+
+@part
+def _distance(rx: float, ry: float, R: Array, eye: Array, shape: Array) -> float:
+    """Signed distance [m] of the ray (rx, ry, 1) of the camera from the edge of a shape, positive inside."""
+    dx = R[0, 0] * rx + R[1, 0] * ry + R[2, 0]
+    dy = R[0, 1] * rx + R[1, 1] * ry + R[2, 1]
+    dz = R[0, 2] * rx + R[1, 2] * ry + R[2, 2]
+    if shape[0] == _ROUND:
+        x, y, ahead = _foot(eye, dx, dy, dz, shape[1])
+        if not ahead:
+            return _FAR
+        own = shape[4] - np.sqrt((x - shape[2]) ** 2 + (y - shape[3]) ** 2)
+        return min(own, shape[5] - np.sqrt(x * x + y * y))
+    if shape[0] == _SHEET:
+        x, y, ahead = _foot(eye, dx, dy, dz, 0.0)
+        if shape[5] != 0.0:
+            for _ in range(3):  # the height changes little along the ray
+                u = (x - shape[6]) / shape[7]
+                x, y, ahead = _foot(eye, dx, dy, dz, shape[5] * (1.0 - u * u))
+        return min(min(x - shape[1], shape[2] - x), min(y - shape[3], shape[4] - y)) if ahead else _FAR
+    h, radius, found = shape[1], shape[2], _FAR
+    for sign in (-1.0, 1.0):
+        x, y, ahead = _foot(eye, dx, dy, dz, sign * h)
+        if ahead:
+            found = max(found, radius - np.sqrt(x * x + y * y))
+    across = dx * dx + dy * dy
+    if across > 1e-18 and abs(eye[2] - (eye[0] * dx + eye[1] * dy) / across * dz) <= h:  # passes the axis inside
+        found = max(found, radius - abs(eye[0] * dy - eye[1] * dx) / np.sqrt(across))
+    return found
+
+
+@part
+def _at(rays: Array, row: int, column: int, p: float, q: float, R: Array, eye: Array, shape: Array) -> float:
+    """`_distance` at row fraction p, column fraction q of a pixel."""
+    return _distance(between(rays, row, column, p, q, 0), between(rays, row, column, p, q, 1), R, eye, shape)
+
+
+@part
+def _deposit(cells: Array32, y: int, x: int, value: float, moment_x: float, moment_y: float) -> None:
+    """Add light to a cell, its first moments to the neighbours: else an edge would lie on the cells' lattice.
+
+    The error of a blurred edge falls from second to third order in the cell's size.
+    """
+    cells[y, x] += value
+    if moment_x != 0.0 and 0 < x < cells.shape[1] - 1:
+        cells[y, x - 1] -= 0.5 * moment_x
+        cells[y, x + 1] += 0.5 * moment_x
+    if moment_y != 0.0 and 0 < y < cells.shape[0] - 1:
+        cells[y - 1, x] -= 0.5 * moment_y
+        cells[y + 1, x] += 0.5 * moment_y
+
+
+@part
+def _add_crossed(
+    cells: Array32, step: float, box: Box, row: int, column: int, rays: Array, R: Array, eye: Array, shape: Array
+) -> None:  # fmt: skip
+    """Add a shape in the cells of a pixel that its edge crosses."""
+    s = box.s
+    f = np.empty((2, s + 1))  # at the cells' corners, upper and lower line
+    for i in range(-1, s):
+        for j in range(s + 1):
+            f[0, j], f[1, j] = f[1, j], _at(rays, row, column, (i + 1) / s, j / s, R, eye, shape)
+        for j in range(s if i >= 0 else 0):
+            a, b, c, d = f[0, j], f[0, j + 1], f[1, j], f[1, j + 1]
+            mean, spread = 0.25 * (a + b + c + d), max(max(a, b), max(c, d)) - min(min(a, b), min(c, d))
+            middle = _at(rays, row, column, (i + 0.5) / s, (j + 0.5) / s, R, eye, shape)
+            if abs(mean) < spread and abs(middle - mean) > _BENT * spread:
+                area = m_x = m_y = 0.0
+                for k in range(_SAMPLES * _SAMPLES):
+                    p, q = (k // _SAMPLES + 0.5) / _SAMPLES, (k % _SAMPLES + 0.5) / _SAMPLES
+                    if _at(rays, row, column, (i + p) / s, (j + q) / s, R, eye, shape) > 0.0:
+                        area, m_x, m_y = area + 1.0, m_x + q - 0.5, m_y + p - 0.5
+                area, m_x, m_y = area / _SAMPLES**2, m_x / _SAMPLES**2, m_y / _SAMPLES**2
+            else:
+                middle += (mean - middle) / 3.0
+                area, m_x, m_y = half_plane(middle, 0.5 * (b + d - a - c), 0.5 * (c + d - a - b))
+            y, x = (row - box.y) * s + i, (column - box.x) * s + j
+            _deposit(cells, y, x, step * area, step * m_x, step * m_y)
+
+
+@njit(cache=True, **_RULES)
+def add_shape(cells: Array32, step: float, box: Box, rays: Array, R: Array, eye: Array, shape: Array) -> None:
+    """Add `step` times the covered part of each cell to `cells`.
+
+    cells : (rows * s, columns * s) of a window of the sensor   rays : (..., ..., 2) at the corners of all pixels
+    R, eye : R_camera_body, and the camera's centre in body axes [m]   shape : as `round_shape` and the others give it
+    """
+    s = box.s
+    clear = _CLEAR_OF_TIPS if shape[0] == _SHEET else _CLEAR
+    f = np.empty((2, box.right - box.left + 1))  # at the pixels' corners, upper and lower line
+    for row in range(box.top - 1, box.bottom):
+        for k in range(box.right - box.left + 1):
+            f[0, k] = f[1, k]
+            f[1, k] = _distance(rays[row + 1, box.left + k, 0], rays[row + 1, box.left + k, 1], R, eye, shape)
+        for k in range(box.right - box.left if row >= box.top else 0):
+            a, b, c, d = f[0, k], f[0, k + 1], f[1, k], f[1, k + 1]
+            low, high = min(min(a, b), min(c, d)), max(max(a, b), max(c, d))
+            if low < 0.0 < high or abs(0.25 * (a + b + c + d)) <= clear * (high - low):
+                _add_crossed(cells, step, box, row, box.left + k, rays, R, eye, shape)
+            elif low > 0.0:
+                y, x = (row - box.y) * s, (box.left + k - box.x) * s
+                for i in range(y, y + s):
+                    for j in range(x, x + s):
+                        cells[i, j] += step
+
+
+def prepare() -> None:
+    """Compile what draws, or load it."""
+    number, box = types.float64, types.NamedUniTuple(types.int64, len(Box._fields), Box)
+    rays, row = number[:, :, ::1], number[::1]
+    add_shape.compile((types.float32[:, ::1], number, box, rays, number[:, ::1], row, row))
