@@ -1,7 +1,7 @@
 """numba for both packages, and where its machine code is kept: compiled when first asked for, loaded from then on.
 
 numba looks at a function's own file alone to tell whether what it kept still holds. Some functions here call those of
-other files (the renderer's areas, the fit of poses, helpers of the effects' laws), so machine code lies in a folder
+other files (the renderer's raster, the fit of poses, helpers of the effects' laws), so machine code lies in a folder
 that is named after the contents of every file with compiled functions: other sources, another folder.
 """
 

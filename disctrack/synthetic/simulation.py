@@ -10,6 +10,7 @@ from typing import Any
 import h5py
 import numpy as np
 
+from calibration.kit.arrays import Array
 from calibration.kit.brief import Outline
 from disctrack.errors import SceneError
 from disctrack.files.inputs import keep, refuse_input
@@ -131,76 +132,64 @@ def write_motion(path: Path, motion: Motion, attributes: dict[str, Any] | None =
     write_whole(path, buffer.getbuffer())
 
 
-def _series(columns: dict[str, tuple[Any, str, str]]) -> dict[str, Variable]:
-    return {name: Variable(data, ("time",), unit, text) for name, (data, unit, text) in columns.items()}
+_WORLD = {axis: axis for axis in "xyz"}
+_ANGLES = {angle: angle for angle in ("psi", "theta", "phi")}
+_CONTACT_FRAME = {"n": "n0", "m": "m0", "z": "k"}
+
+
+def _columns(name: str, values: Array, axes: dict[str, str], unit: str, text: str) -> dict[str, Variable]:
+    """A variable for each component of values (n, k), its axis in place of {} in the name, its words in the text."""
+    named = zip(axes.items(), values.T, strict=False)  # along n0 and m0 only, a slip has no third
+    return {name.format(axis): _series(column, unit, text.format(words)) for (axis, words), column in named}
+
+
+def _series(values: Array, unit: str, text: str) -> Variable:
+    return Variable(values, ("time",), unit, text)
 
 
 def _root(motion: Motion) -> dict[str, Variable]:
-    q = motion.q.T
-    variables = _series(
-        {name: (q[i], "m", f"{name} of the geometric centre, world frame") for i, name in enumerate("xyz")}
-        | {
-            "psi": (q[3], "rad", "precession angle, not wrapped"),
-            "theta": (q[4], "rad", "nutation angle"),
-            "phi": (q[5], "rad", "spin angle, not wrapped"),
-        }
-    )
-    quaternion = continuous_quaternions(quaternion_from_rotation(rotation_from_euler(*q[3:])))
+    quaternion = continuous_quaternions(quaternion_from_rotation(rotation_from_euler(*motion.q[:, 3:].T)))
     dims = ("time", "quaternion_component")
-    variables["quaternion"] = Variable(quaternion, dims, "1", "orientation, body to world, continuous")
-    return variables
+    return _columns("{}", motion.q[:, :3], _WORLD, "m", "{} of the geometric centre, world frame") | {
+        "psi": _series(motion.q[:, 3], "rad", "precession angle, not wrapped"),
+        "theta": _series(motion.q[:, 4], "rad", "nutation angle"),
+        "phi": _series(motion.q[:, 5], "rad", "spin angle, not wrapped"),
+        "quaternion": Variable(quaternion, dims, "1", "orientation, body to world, continuous"),
+    }
 
 
 def _rates(motion: Motion) -> dict[str, Variable]:
-    columns: dict[str, tuple[Any, str, str]] = {}
-    units = ["m/s"] * 3 + ["rad/s"] * 3
-    for i, name in enumerate(("x", "y", "z", "psi", "theta", "phi")):
-        columns[f"{name}dot"] = (motion.qdot[:, i], units[i], f"rate of {name}")
-    for i, axis in enumerate("xyz"):
-        columns[f"omega_{axis}"] = (motion.omega_world[:, i], "rad/s", f"angular velocity along world {axis}")
-        columns[f"acceleration_{axis}"] = (
-            motion.acceleration_world[:, i],
-            "m/s^2",
-            f"of the centre along world {axis}",
-        )
-        columns[f"angular_acceleration_{axis}"] = (
-            motion.angular_acceleration_world[:, i],
-            "rad/s^2",
-            f"rate of the angular velocity along world {axis}",
-        )
-    columns["omega2"] = (motion.state[:, 6], "rad/s", "angular velocity along e2, psidot sin(theta)")
-    columns["omega3"] = (motion.state[:, 7], "rad/s", "angular velocity along e3, psidot cos(theta) + phidot")
-    return _series(columns)
+    turn = "rate of the angular velocity along world {}"
+    return {
+        **_columns("{}dot", motion.qdot[:, :3], _WORLD, "m/s", "rate of {}"),
+        **_columns("{}dot", motion.qdot[:, 3:], _ANGLES, "rad/s", "rate of {}"),
+        **_columns("omega_{}", motion.omega_world, _WORLD, "rad/s", "angular velocity along world {}"),
+        **_columns("acceleration_{}", motion.acceleration_world, _WORLD, "m/s^2", "of the centre along world {}"),
+        **_columns("angular_acceleration_{}", motion.angular_acceleration_world, _WORLD, "rad/s^2", turn),
+        "omega2": _series(motion.state[:, 6], "rad/s", "angular velocity along e2, psidot sin(theta)"),
+        "omega3": _series(motion.state[:, 7], "rad/s", "angular velocity along e3, psidot cos(theta) + phidot"),
+    }
 
 
 def _energy(motion: Motion) -> dict[str, Variable]:
-    return _series(
-        {
-            "translation": (motion.energy_translation, "J", "kinetic energy of the centre of mass"),
-            "rotation": (motion.energy_rotation, "J", "kinetic energy about the centre of mass"),
-            "potential": (
-                motion.energy_potential,
-                "J",
-                "potential energy, zero where the disc lies flat at the origin",
-            ),
-            "total": (motion.energy, "J", "mechanical energy"),
-            "power": (motion.power, "W", "power of the contact and of external forces: rate of the total"),
-        }
-    )
+    at_zero = "potential energy, zero where the disc lies flat at the origin"
+    return {
+        "translation": _series(motion.energy_translation, "J", "kinetic energy of the centre of mass"),
+        "rotation": _series(motion.energy_rotation, "J", "kinetic energy about the centre of mass"),
+        "potential": _series(motion.energy_potential, "J", at_zero),
+        "total": _series(motion.energy, "J", "mechanical energy"),
+        "power": _series(motion.power, "W", "power of the contact and of external forces: rate of the total"),
+    }
 
 
 def _contact(motion: Motion) -> dict[str, Variable]:
-    columns: dict[str, tuple[Any, str, str]] = {}
-    for i, axis in enumerate(("n", "m", "z")):
-        along = {"n": "n0", "m": "m0", "z": "k"}[axis]
-        columns[f"F_{axis}"] = (motion.contact_force[:, i], "N", f"contact force on the disc along {along}")
-        columns[f"M_{axis}"] = (motion.contact_moment[:, i], "N m", f"contact moment on the disc along {along}")
-        columns[f"X_{axis}"] = (motion.external_force[:, i], "N", f"external force at the centre along {along}")
-    for i, axis in enumerate("nm"):
-        columns[f"slip_{axis}"] = (motion.slip_velocity[:, i], "m/s", f"slip of the disc's contact point along {axis}0")
-    variables = _series(columns)
-    variables["regime"] = Variable(motion.regime, ("time",), "1", "state of the contact", flags(Regime))
-    return variables
+    return {
+        **_columns("F_{}", motion.contact_force, _CONTACT_FRAME, "N", "contact force on the disc along {}"),
+        **_columns("M_{}", motion.contact_moment, _CONTACT_FRAME, "N m", "contact moment on the disc along {}"),
+        **_columns("X_{}", motion.external_force, _CONTACT_FRAME, "N", "external force at the centre along {}"),
+        **_columns("slip_{}", motion.slip_velocity, _CONTACT_FRAME, "m/s", "slip of the disc's contact point along {}"),
+        "regime": Variable(motion.regime, ("time",), "1", "state of the contact", flags(Regime)),
+    }
 
 
 def _write_model(file: Any, motion: Motion) -> None:
