@@ -7,6 +7,7 @@ Numbers of a field that is `limited` lie within its limits, all others within +-
 from __future__ import annotations
 
 import json
+import math
 import re
 import tomllib
 import types
@@ -34,9 +35,9 @@ def check_limits(settings: Any, where: str, key: str = "", limits: tuple[float, 
     """Raise SceneError for a number of a dataclass beyond its limits; a default may say by nan that it is not given."""
     if is_dataclass(settings):
         for f in fields(settings):
-            value = getattr(settings, f.name)
-            if value is not f.default:
-                own = f.metadata.get("limits", limits)
+            value, own = getattr(settings, f.name), f.metadata.get("limits", limits)
+            not_given = isinstance(f.default, float) and math.isnan(f.default) and math.isnan(value)
+            if not not_given:
                 check_limits(value, where, f"{key}.{f.name}" if key else f.name, own)
     elif isinstance(settings, dict):
         for name, value in settings.items():
