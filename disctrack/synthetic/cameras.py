@@ -81,13 +81,14 @@ def _camera(scene: Scene, index: int, rng: np.random.Generator) -> View:
     R = rotation_from_vector(np.array([0.0, 0.0, roll])) @ upright
     width, height = scene.cameras.image_size
     focal = s.distance_mm[index] / s.mm_per_px * (1 + 0.005 * scatter[7])
-    lens = (s.k1[index], s.k2[index], s.p1[index], s.p2[index])
+    lens = np.array([s.k1[index], s.k2[index], s.p1[index], s.p2[index]])
+    k1, k2, p1, p2 = map(float, lens + np.array([0.01, 0.03, 2e-4, 2e-4]) * scatter[11:15])
     camera = Camera(
         fx=float(focal),
         fy=float(focal * (1 + 5e-4 * scatter[8])),
         cx=float((width - 1) / 2 + 4 * scatter[9]),
         cy=float((height - 1) / 2 + 4 * scatter[10]),
-        distortion=(*map(float, lens + np.array([0.01, 0.03, 2e-4, 2e-4]) * scatter[11:15]), s.k3[index]),
+        distortion=(k1, k2, p1, p2, s.k3[index]),
         image_size=scene.cameras.image_size,
     )
     return View(camera, R, -R @ (target + distance * away))
