@@ -1,8 +1,9 @@
 """What goes wrong in a scene: the keys of its `faults`, whose defaults are that nothing does."""
 
+import math
 from dataclasses import dataclass, field
 
-from disctrack.files.toml_tree import NOT_NEGATIVE, POSITIVE, limited
+from disctrack.files.toml_tree import MOST, NOT_NEGATIVE, POSITIVE, limited
 
 Pair = tuple[float, float]
 Triple = tuple[float, float, float]
@@ -31,7 +32,7 @@ class Occluder:
     length_px: float = limited(1e4, POSITIVE)
     grey: float = 40.0
     first_frame: int = 0
-    last_frame: int = 10**9
+    last_frame: int = limited(10**9, (-MOST, math.inf))
 
 
 @dataclass(frozen=True)
