@@ -21,7 +21,7 @@ from disctrack.findings import doubts
 from disctrack.frames import euler_jacobian
 from disctrack.report.blocks import Report
 from disctrack.report.html import write_page
-from disctrack.trajectory.file import Group, read_provenance, read_setup, read_trajectory, trajectory_in, write_groups
+from disctrack.trajectory.file import Group, read_group, read_provenance, read_trajectory, trajectory_in, write_groups
 from disctrack.trajectory.reuse import refuse_other
 
 
@@ -83,16 +83,16 @@ def write_analysis(path: Path, analysis: Analysis) -> None:
 
     Frames outside the part that was tracked are NaN.
     """
-    file_time = read_setup(path).time
+    file_time = read_group(path, "/", ("time",))[0]["time"]
     first = int(np.searchsorted(file_time, analysis.motion.time[0] - 1e-9))
 
     def whole(variables: dict[str, Variable]) -> dict[str, Variable]:
         return {name: _at_full_length(item, len(file_time), first) for name, item in variables.items()}
 
     onset, circle, energy = analysis.contact.onset, analysis.contact.circle, analysis.energy
-    groups = {
-        "motion": Group(whole(_motion_variables(analysis)), _motion_attributes(analysis)),
-        "contact": Group(
+    groups: dict[str, Group] = {
+        "motion": (whole(_motion_variables(analysis)), _motion_attributes(analysis)),
+        "contact": (
             whole(_series_variables(analysis.contact.series)),
             {
                 "rolling_onset_s": onset.time,
@@ -110,7 +110,7 @@ def write_analysis(path: Path, analysis: Analysis) -> None:
                 "locus_circle_interval_s": np.array([circle.start, circle.end]),
             },
         ),
-        "energy": Group(
+        "energy": (
             whole(_series_variables(energy.series)),
             {
                 "loss_J": energy.loss,
@@ -213,4 +213,4 @@ def _scaling_group(scaling: Scaling) -> Group:
         name: Variable(np.array(values), ("scaling_window",), unit, text)
         for name, (values, unit, text) in found.items()
     }
-    return Group(variables, attributes)
+    return variables, attributes

@@ -8,17 +8,11 @@ from pathlib import Path
 from disctrack.errors import RecordingError
 from disctrack.files.text import printable
 from disctrack.recording.declaration import FILE_NAME
-from disctrack.recording.readers.files import (
-    CINE_SUFFIXES,
-    IMAGE_SUFFIXES,
-    MRAW_SUFFIXES,
-    VIDEO_SUFFIXES,
-    natural_key,
-)
+from disctrack.recording.readers.files import FORMATS, IMAGES, natural_key
 
 RESULTS = "results"  # beside a recording's images
 FOLDER = "batch_results"  # of a batch, for what belongs to no single recording
-_FILMS = VIDEO_SUFFIXES | MRAW_SUFFIXES | CINE_SUFFIXES
+_FILMS = FORMATS["video"] | FORMATS["mraw"] | FORMATS["cine"]
 
 
 @dataclass(frozen=True)
@@ -87,4 +81,4 @@ def _search(folder: Path, seen: set[Path], problems: list[str], undeclared: list
             of_images += yield from _search(folder / name, seen, problems, [] if is_recording else undeclared)
     if not is_recording and max(of_images, sum(suffix in _FILMS for suffix in suffixes)) > 1:
         undeclared.append(folder)
-    return not is_recording and not IMAGE_SUFFIXES.isdisjoint(suffixes)
+    return not is_recording and not IMAGES.isdisjoint(suffixes)

@@ -17,7 +17,7 @@ from disctrack.recording.declaration import CalibrationViews, Recording
 from disctrack.recording.readers import open_frames
 from disctrack.recording.readers.base import FrameReader
 from disctrack.recording.readers.decoding import decode
-from disctrack.recording.readers.files import IMAGE_SUFFIXES, content_of, file_number, match_files, split_member
+from disctrack.recording.readers.files import IMAGES, content_of, file_number, match_files, split_member
 from disctrack.recording.readers.flat_field import FlatField, FlatFields, flat_fields
 from disctrack.recording.readers.part import ImagePart, ImageParts, image_parts
 
@@ -107,10 +107,10 @@ def declared_views(recording: Recording, declared: CalibrationViews) -> TargetIm
 def _views_of(pattern: str, folder: Path, camera: str) -> tuple[View, ...]:
     files = match_files(split_member(pattern)[0], folder, camera)
     suffix = files[0].suffix.lower()
-    if suffix in IMAGE_SUFFIXES and not (len(files) == 1 and suffix in (".tif", ".tiff")):
+    if suffix in IMAGES and not (len(files) == 1 and suffix in (".tif", ".tiff")):
         return tuple(files)
     reader = open_frames(pattern, folder, camera)
-    if suffix in IMAGE_SUFFIXES and len(reader) == 1:
+    if suffix in IMAGES and len(reader) == 1:
         return tuple(files)
     if len(reader) > MOST_VIEWS:
         raise RecordingError(

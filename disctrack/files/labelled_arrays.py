@@ -103,17 +103,15 @@ def _create(group: h5py.Group, name: str, variable: Variable) -> h5py.Dataset:
 MOST_COMPRESSION = 1100
 
 
-def read_variables(group: h5py.Group, text: bool = True, names: Collection[str] | None = None) -> dict[str, NDArray]:
-    """Every dataset of a group (not of its subgroups), or those of `names`, as an array; text as str, or left out.
+def read_variables(group: h5py.Group, names: Collection[str] | None = None) -> dict[str, NDArray]:
+    """Every dataset of a group (not of its subgroups), or those of `names`, as an array; text as str.
 
     Raises ValueError if a dataset claims to be larger than the file could hold.
     """
     return {
         name: _read(item)
         for name, item in group.items()
-        if (names is None or name in names)
-        and isinstance(item, h5py.Dataset)
-        and (text or not h5py.check_string_dtype(item.dtype))
+        if (names is None or name in names) and isinstance(item, h5py.Dataset)
     }
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from disctrack.errors import RecordingError
 from disctrack.recording.readers import open_frames
 from disctrack.recording.readers.base import FrameReader
-from disctrack.recording.readers.files import HDF5_SUFFIXES, IMAGE_SUFFIXES, MRAW_SUFFIXES, SUFFIXES, natural_key
+from disctrack.recording.readers.files import FORMATS, IMAGES, SUFFIXES, natural_key
 
 DEEPEST = 4  # folders below the recording that are looked into
 _OWN_FOLDERS = re.compile(r"(results|batch_results|.*_analysis|.*_diagnosis)$")
@@ -54,14 +54,14 @@ def find_sequences(folder: Path) -> list[Sequence]:
     found: list[Sequence] = []
     for place, names in _folders(folder):
         inside = place.relative_to(folder)
-        images = [name for name in names if Path(name).suffix.lower() in IMAGE_SUFFIXES]
+        images = [name for name in names if Path(name).suffix.lower() in IMAGES]
         found += _image_sequences(inside, images)
-        headers = {Path(name).stem for name in names if Path(name).suffix.lower() in MRAW_SUFFIXES - {".mraw"}}
+        headers = {Path(name).stem for name in names if Path(name).suffix.lower() in FORMATS["mraw"] - {".mraw"}}
         for name in names:
             suffix, path = Path(name).suffix.lower(), (inside / name).as_posix()
-            if suffix in HDF5_SUFFIXES:
+            if suffix in FORMATS["hdf5"]:
                 found += [Sequence(f"{path}:{stack}", suffix, 1) for stack in _stacks(place / name)]
-            elif suffix in SUFFIXES - IMAGE_SUFFIXES and not (suffix == ".mraw" and Path(name).stem in headers):
+            elif suffix in SUFFIXES - IMAGES and not (suffix == ".mraw" and Path(name).stem in headers):
                 found.append(Sequence(path, suffix, 1))
     return found
 

@@ -9,7 +9,7 @@ import hashlib
 import io
 import json
 import platform
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.cameras.camera import RIG_PARAMETERS, Camera, StereoRig
-from calibration.kit.arrays import Array, Mask
+from calibration.kit.arrays import Mask
 from calibration.kit.brief import Outline
 from calibration.rig_file import beyond_model, read_beyond_model, write_attributes
 from disctrack.disc import AIR_DENSITY, Disc
@@ -89,16 +89,18 @@ def write_trajectory(
     buffer = io.BytesIO()  # a disk that fills up fails in one plain write, not inside the HDF5 library
     with h5py.File(buffer, "w", track_order=True) as file:
         write_variables(file, _root_variables(trajectory), _axes(trajectory))
-        for name, variables in (("markers", _variables(trajectory, "markers")), ("disc", _disc(trajectory.disc))):
-            write_variables(file.create_group(name, track_order=True), variables)
-        file["disc"].attrs.update(_disc_attributes(trajectory.disc))
+        write_variables(file.create_group("markers", track_order=True), _variables(trajectory, "markers"))
+        told = "dots on the disc, body frame, as used"
+        dots = Variable(trajectory.disc.marker_centres_body, ("marker", "space_axis"), "m", told)
+        write_variables(file.create_group("disc", track_order=True), {"marker_centres_body": dots})
+        file["disc"].attrs.update(_disc_sizes(trajectory.disc))
         _write_rig(file.create_group("calibration", track_order=True), trajectory)
         file.attrs.update(_root_attributes(trajectory, provenance))
         file.attrs["findings"] = json_text([finding.as_json() for finding in trajectory.findings])
         file.attrs["details"] = json_text(dict(details or {}))
         made_from = {"inputs_sha256": provenance.inputs, "settings": provenance.settings, "dependencies": _versions()}
-        told = [f"{finding.severity.name.lower()}: {finding.sentence}" for finding in trajectory.findings]
-        write_attributes(file, {"findings": {"told": told, **(details or {})}, "made_from": made_from})
+        words = [f"{finding.severity.name.lower()}: {finding.sentence}" for finding in trajectory.findings]
+        write_attributes(file, {"findings": {"told": words, **(details or {})}, "made_from": made_from})
         file.attrs["complete"] = 1
     write_whole(path, buffer.getbuffer())
 
@@ -111,7 +113,7 @@ def read_trajectory(path: str | Path) -> Trajectory:
     >>> len(read_trajectory("clip/results/trajectory.h5"))
     300
     """
-    with _Reading(trajectory_in(Path(path))) as file:
+    with _reading(trajectory_in(Path(path))) as file:
         trajectory = _trajectory(file)
     warn_of_doubts(trajectory.findings)
     return trajectory
@@ -129,7 +131,7 @@ def trajectory_in(path: Path) -> Path:
 
 def read_provenance(path: Path) -> Provenance:
     """What the file was made from. Raises TrajectoryFileError."""
-    with _Reading(path) as file:
+    with _reading(path) as file:
         return Provenance(
             recording=str(file.attrs["recording"]),
             inputs=json.loads(file.attrs["inputs_sha256"]),
@@ -140,13 +142,13 @@ def read_provenance(path: Path) -> Provenance:
 
 def read_details(path: Path) -> dict[str, Any]:
     """Numbers of the run that wrote the file. Raises TrajectoryFileError."""
-    with _Reading(path) as file:
+    with _reading(path) as file:
         return dict(json.loads(file.attrs["details" if "details" in file.attrs else "findings"]))  # of earlier versions
 
 
 def read_findings(path: Path) -> tuple[Finding, ...]:
     """What was noticed in the measurement. Raises TrajectoryFileError."""
-    with _Reading(path) as file:
+    with _reading(path) as file:
         return _findings(json.loads(file.attrs["findings"]))
 
 
@@ -167,12 +169,8 @@ def is_result_of(path: Path, provenance: Provenance) -> bool:
         return False
 
 
-@dataclass(frozen=True)
-class Group:
-    """What a stage adds to a trajectory file; attributes as of `write_attributes`."""
-
-    variables: Mapping[str, Variable]
-    attributes: Mapping[str, Any] = field(default_factory=dict)
+# What a stage adds to a trajectory file: variables, and attributes as of `write_attributes`
+Group = tuple[Mapping[str, Variable], Mapping[str, Any]]
 
 
 def write_group(
@@ -187,7 +185,7 @@ def write_group(
     >>> own = {"own": Variable(np.zeros(300), ("time",), "m/s", "a speed of my own")}
     >>> write_group("clip/results/trajectory.h5", "mine", own)
     """
-    write_groups(Path(path), {group: Group(variables, attributes or {})}, axes)
+    write_groups(Path(path), {group: (variables, attributes or {})}, axes)
 
 
 def write_groups(path: Path, groups: Mapping[str, Group], axes: Mapping[str, Variable] | None = None) -> None:
@@ -199,12 +197,12 @@ def write_groups(path: Path, groups: Mapping[str, Group], axes: Mapping[str, Var
     """
     buffer = io.BytesIO()
     with h5py.File(buffer, "w", track_order=True) as file:
-        with _Reading(path) as old:
+        with _reading(path) as old:
             copy_without(old, file, groups, axes or {})
-        for name, group in groups.items():
+        for name, (variables, attributes) in groups.items():
             created = file.create_group(name, track_order=True)
-            write_variables(created, group.variables, axes)
-            write_attributes(created, group.attributes)
+            write_variables(created, variables, axes)
+            write_attributes(created, attributes)
     write_whole(path, buffer.getbuffer(), adds_to_input=True)
 
 
@@ -219,39 +217,27 @@ def read_group(
     >>> variables["centre_px"].shape
     (300, 2, 6, 2)
     """
-    with _Reading(Path(path)) as file:
+    with _reading(Path(path)) as file:
         if group not in file or not isinstance(file[group], h5py.Group):
             there = ", ".join(name for name, item in file.items() if isinstance(item, h5py.Group))
             raise TrajectoryFileError(f"{path}: no group '{group}'; it holds {there}. Run the stage that writes it.")
         return read_variables(file[group], names=names), dict(file[group].attrs)
 
 
-@dataclass(frozen=True)
-class FilmedSetup:
-    """What was filmed, by which cameras and when, without the measurement itself."""
-
-    time: Array  # (n,) [s]
-    disc: Disc
-    rig: StereoRig
-    gravity: float  # [m/s^2]
-    fingerprint: str  # of the trajectory: equal for equal inputs, settings and version
+def labelled(trajectory: Trajectory) -> tuple[dict[str, Variable], dict[str, Variable], dict[str, float]]:
+    """Variables of the file's root and of its dots (`marker_...`), the axes, and the numbers of the whole recording."""
+    dots = {f"marker_{name}": item for name, item in _variables(trajectory, "markers").items()}
+    sizes = _disc_sizes(trajectory.disc)
+    numbers = _recording_numbers(trajectory) | {f"disc_{name}": sizes[name] for name in _DISC_SIZES}
+    return _root_variables(trajectory) | dots, _axes(trajectory), numbers
 
 
-def read_setup(path: Path) -> FilmedSetup:
-    """Time, disc and rig of a trajectory file. Raises TrajectoryFileError."""
-    with _Reading(path) as file:
-        return FilmedSetup(
-            time=read_variables(file, names=("time",))["time"],
-            disc=_read_disc(file["disc"]),
-            rig=_rig(file["calibration"], read_variables(file["calibration"], names=(*_CAMERA_LAYOUT, *_RIG_LAYOUT))),
-            gravity=float(file.attrs["gravity_m_s2"]),
-            fingerprint=str(file.attrs["fingerprint"]),
-        )
-
-
-def labelled(trajectory: Trajectory) -> tuple[dict[str, Variable], dict[str, Variable], dict[str, Variable]]:
-    """Variables of the file's root, of its group `markers`, and the axes of both."""
-    return _root_variables(trajectory), _variables(trajectory, "markers"), _axes(trajectory)
+def _recording_numbers(trajectory: Trajectory) -> dict[str, float]:
+    return {
+        "frame_rate_hz": trajectory.frame_rate,
+        "gravity_m_s2": trajectory.gravity,
+        "air_density_kg_m3": trajectory.air_density,
+    }
 
 
 def _root_attributes(trajectory: Trajectory, provenance: Provenance) -> dict[str, Any]:
@@ -265,9 +251,7 @@ def _root_attributes(trajectory: Trajectory, provenance: Provenance) -> dict[str
         "inputs_sha256": json.dumps(dict(provenance.inputs), sort_keys=True),
         "settings": json.dumps(dict(provenance.settings), sort_keys=True),
         "fingerprint": provenance.fingerprint,
-        "frame_rate_hz": trajectory.frame_rate,
-        "gravity_m_s2": trajectory.gravity,
-        "air_density_kg_m3": trajectory.air_density,
+        **_recording_numbers(trajectory),
         "table_moved_m_rad": trajectory.table_moved,
         **_CONVENTIONS,
     }
@@ -281,45 +265,47 @@ def _versions() -> dict[str, str]:
     return found
 
 
-# The file's layout. Of every array of a Trajectory: its dataset (in a group or at the root), axes, unit and meaning.
+# The file's layout. Of every array of a Trajectory: axes, unit and meaning
 _POSE2 = ("time", "pose_component", "pose_component_2")
 _DOTS = ("time", "camera", "marker", "axis")
 _MIXED = "m and rad: m2, m rad, rad2"
-_LAYOUT: dict[str, tuple[str, tuple[str, ...], str, str, Mapping[str, Any]]] = {
-    "frame": ("frame", ("time",), "1", "number of the frame in its sequence", {}),
-    "quaternion": (
-        "quaternion", ("time", "quaternion_component"), "1", "orientation, body to world, continuous", {},
-    ),
-    "pose_covariance": (
-        "pose_covariance", _POSE2, _MIXED, "covariance of the pose, noise of this frame; calibration not included", {},
-    ),
+_PARTIAL = "m or rad per unit of the parameter"
+_LAYOUT = {
+    "frame": (("time",), "1", "number of the frame in its sequence"),
+    "quaternion": (("time", "quaternion_component"), "1", "orientation, body to world, continuous"),
+    "pose_covariance": (_POSE2, _MIXED, "covariance of the pose, noise of this frame; calibration not included"),
     "systematic_covariance": (
-        "systematic_covariance", _POSE2, _MIXED,
-        "covariance of the pose from what repeats or varies slowly beside the rig's own: dots' misfit beyond noise", {},
+        _POSE2,
+        _MIXED,
+        "covariance of the pose from what repeats or varies slowly beside the rig's own: dots' misfit beyond noise",
     ),
-    "reprojection_rms_px": (
-        "reprojection_rms_px", ("time", "camera"), "px", "root mean square of observed - projected dots", {},
-    ),
-    "reduced_chi_square": (
-        "reduced_chi_square", ("time",), "1", "squared residuals over their predicted variance", {},
-    ),
-    "frame_status": ("status", ("time",), "1", "why there is a pose, or none", flags(FrameStatus)),
+    "reprojection_rms_px": (("time", "camera"), "px", "root mean square of observed - projected dots"),
+    "reduced_chi_square": (("time",), "1", "squared residuals over their predicted variance"),
+    "frame_status": (("time",), "1", "why there is a pose, or none"),
     "markers_px": (
-        "markers/centre_px", _DOTS, "px",
-        "image of the dot's centre (not the ellipse's), corrected by the lens field of the rig if it has one", {},
+        _DOTS,
+        "px",
+        "image of the dot's centre (not the ellipse's), corrected by the lens field of the rig if it has one",
     ),
-    "markers_covariance_px2": (
-        "markers/centre_covariance_px2", (*_DOTS, "axis_2"), "px2", "covariance of centre_px", {},
-    ),
-    "markers_residual_px": ("markers/residual_px", _DOTS, "px", "observed - projected", {}),
-    "marker_status": (
-        "markers/status", _DOTS[:3], "1", "why a dot has a centre, or none", flags(MarkerStatus),
-    ),
+    "markers_covariance_px2": ((*_DOTS, "axis_2"), "px2", "covariance of centre_px"),
+    "markers_residual_px": (_DOTS, "px", "observed - projected"),
+    "marker_status": (_DOTS[:3], "1", "why a dot has a centre, or none"),
     "calibration_sensitivity": (
-        "calibration/sensitivity", ("time", "pose_component", "rig_parameter"), "m or rad per unit of the parameter",
-        "d pose / d rig parameter at fixed pixels", {},
+        ("time", "pose_component", "rig_parameter"),
+        _PARTIAL,
+        "d pose / d rig parameter at fixed pixels",
     ),
-}  # fmt: skip
+}
+# What is not at the root under its own name
+_PLACES = {
+    "frame_status": "status",
+    "markers_px": "markers/centre_px",
+    "markers_covariance_px2": "markers/centre_covariance_px2",
+    "markers_residual_px": "markers/residual_px",
+    "marker_status": "markers/status",
+    "calibration_sensitivity": "calibration/sensitivity",
+}
+_FLAGS: dict[str, Mapping[str, Any]] = {"frame_status": flags(FrameStatus), "marker_status": flags(MarkerStatus)}
 _CAMERA_LAYOUT = {
     "camera_matrix": (("camera", "space_axis", "space_axis_2"), "px", "pinhole matrix K"),
     "distortion": (("camera", "distortion_coefficient"), "1", "Brown distortion on normalised coordinates"),
@@ -335,13 +321,13 @@ _RIG_LAYOUT: dict[str, tuple[tuple[str, ...], str, str]] = {
         "covariance of the rig's parameters; common to all frames",
     ),
 }  # fmt: skip
-_LONG_NAMES = {
-    "x": "position of the disc's centre along i",
-    "y": "position of the disc's centre along j",
-    "z": "height of the disc's centre above the table",
-    "psi": "precession angle, unwrapped",
-    "theta": "nutation angle",
-    "phi": "spin angle, unwrapped",
+_COORDINATES = {
+    "x": ("m", "position of the disc's centre along i"),
+    "y": ("m", "position of the disc's centre along j"),
+    "z": ("m", "height of the disc's centre above the table"),
+    "psi": ("rad", "precession angle, unwrapped"),
+    "theta": ("rad", "nutation angle"),
+    "phi": ("rad", "spin angle, unwrapped"),
 }
 _NAMED_AXES = {
     "camera": (CAMERAS, "camera"),
@@ -370,59 +356,42 @@ def _axes(trajectory: Trajectory) -> dict[str, Variable]:
 def _variables(trajectory: Trajectory, group: str = "") -> dict[str, Variable]:
     """Those of one group, or of the root, as the layout has them."""
     found = {}
-    for attribute, (place, dims, units, told, attributes) in _LAYOUT.items():
-        home, _, name = place.rpartition("/")
+    for attribute, described in _LAYOUT.items():
+        home, _, name = _PLACES.get(attribute, attribute).rpartition("/")
         if home == group:
-            found[name] = Variable(getattr(trajectory, attribute), dims, units, told, attributes)
+            found[name] = Variable(getattr(trajectory, attribute), *described, _FLAGS.get(attribute, {}))
     return found
 
 
 def _root_variables(trajectory: Trajectory) -> dict[str, Variable]:
     coordinates = {}
+    shared = "standard deviation shared by frames, calibration and systematic: "
     for ending, what, values in (
         ("", "", trajectory.q),
         ("_sigma", "standard deviation, noise of this frame: ", trajectory.coordinate_sigma),
-        (
-            "_sigma_calibration",
-            "standard deviation shared by frames, calibration and systematic: ",
-            trajectory.calibration_sigma,
-        ),
+        ("_sigma_calibration", shared, trajectory.calibration_sigma),
     ):
-        for i, name in enumerate(COORDINATES):
-            unit = "m" if i < 3 else "rad"
-            coordinates[name + ending] = Variable(values[:, i], ("time",), unit, what + _LONG_NAMES[name])
+        for i, (name, (unit, told)) in enumerate(_COORDINATES.items()):
+            coordinates[name + ending] = Variable(values[:, i], ("time",), unit, what + told)
     found = _variables(trajectory)
     return {"frame": found.pop("frame"), **coordinates, **found}
 
 
-def _disc(disc: Disc) -> dict[str, Variable]:
-    return {
-        "marker_centres_body": Variable(
-            disc.marker_centres_body, ("marker", "space_axis"), "m", "dots on the disc, body frame, as used"
-        )
-    }
+# Attributes of the group `disc`: a field of Disc and its unit; tolerances where they are declared
+_DISC_SIZES = ("radius_m", "half_thickness_m", "mass_kg", "marker_diameter_m")
+_TOLERANCES = ("radius_tolerance_m", "thickness_tolerance_m")
 
 
-def _disc_attributes(disc: Disc) -> dict[str, float]:
-    declared = {
-        "radius_tolerance_m": disc.radius_tolerance,
-        "thickness_tolerance_m": disc.thickness_tolerance,
-    }
-    return {
-        "radius_m": disc.radius,
-        "half_thickness_m": disc.half_thickness,
-        "mass_kg": disc.mass,
-        "marker_diameter_m": disc.marker_diameter,
-        **{key: value for key, value in declared.items() if value is not None},
-    }
+def _disc_sizes(disc: Disc) -> dict[str, float]:
+    sizes = {name: getattr(disc, name.rpartition("_")[0]) for name in (*_DISC_SIZES, *_TOLERANCES)}
+    return {name: value for name, value in sizes.items() if value is not None}
 
 
 def _write_rig(group: h5py.Group, trajectory: Trajectory) -> None:
     rig = trajectory.rig
-    cameras = [(camera.camera_matrix, camera.distortion, camera.image_size) for camera in rig.cameras]
     variables = {
-        name: Variable(values, *described)
-        for (name, described), values in zip(_CAMERA_LAYOUT.items(), map(list, zip(*cameras, strict=True)), strict=True)
+        name: Variable([getattr(camera, name.removesuffix("_px")) for camera in rig.cameras], *described)
+        for name, described in _CAMERA_LAYOUT.items()
     }
     variables |= {name: Variable(getattr(rig, name), *described) for name, described in _RIG_LAYOUT.items()}
     write_variables(group, variables | _variables(trajectory, "calibration"))
@@ -435,54 +404,34 @@ def _write_rig(group: h5py.Group, trajectory: Trajectory) -> None:
     group.attrs["baseline_m"] = rig.baseline
 
 
-class _Reading:
+@contextlib.contextmanager
+def _reading(path: Path) -> Iterator[h5py.File]:
     """A complete trajectory file, open for reading; whatever the HDF5 library says becomes a TrajectoryFileError."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = Path(path)
-        self.file: h5py.File | None = None
-
-    def __enter__(self) -> h5py.File:
-        if not self.path.is_file():
-            raise TrajectoryFileError(f"{self.path}: no such file. Give a trajectory file written by disctrack track.")
-        try:
-            self.file = h5py.File(self.path, "r")
-            schema = self.file.attrs.get("schema", None)
-            version = int(self.file.attrs.get("schema_version", -1))
-            complete = int(self.file.attrs.get("complete", 0))
-        except Exception as error:
-            self._close()
-            raise self._damaged(error) from error
-        if schema != SCHEMA:
-            self._close()
-            raise TrajectoryFileError(
-                f"{self.path}: an HDF5 file, but not a trajectory (schema {schema!r}; expected {SCHEMA!r}). "
-                "Give a file written by disctrack track."
-            )
-        if version != SCHEMA_VERSION or complete != 1:
-            self._close()
-            what = f"has version {version} of the layout" if version != SCHEMA_VERSION else "is not complete"
-            raise TrajectoryFileError(f"{self.path}: {what}; expected version {SCHEMA_VERSION}. Run disctrack track.")
-        return self.file
-
-    def __exit__(self, kind: type | None, error: BaseException | None, trace: object) -> None:
-        self._close()
-        if isinstance(error, Exception) and not isinstance(error, TrajectoryFileError):
-            raise self._damaged(error) from error
-
-    def _close(self) -> None:
-        if self.file is not None:
-            self.file.close()
-
-    def _damaged(self, error: Exception) -> TrajectoryFileError:
+    if not path.is_file():
+        raise TrajectoryFileError(f"{path}: no such file. Give a trajectory file written by disctrack track.")
+    try:
+        with h5py.File(path, "r") as file:
+            schema, version = file.attrs.get("schema", None), int(file.attrs.get("schema_version", -1))
+            if schema != SCHEMA:
+                raise TrajectoryFileError(
+                    f"{path}: an HDF5 file, but not a trajectory (schema {schema!r}; expected {SCHEMA!r}). "
+                    "Give a file written by disctrack track."
+                )
+            if version != SCHEMA_VERSION or int(file.attrs.get("complete", 0)) != 1:
+                what = f"has version {version} of the layout" if version != SCHEMA_VERSION else "is not complete"
+                raise TrajectoryFileError(f"{path}: {what}; expected version {SCHEMA_VERSION}. Run disctrack track.")
+            yield file
+    except TrajectoryFileError:
+        raise
+    except Exception as error:
         reason = " ".join(str(error).split())[:200]
-        return TrajectoryFileError(
-            f"{self.path}: not a readable trajectory file ({reason}). Run disctrack track again."
-        )
+        raise TrajectoryFileError(
+            f"{path}: not a readable trajectory file ({reason}). Run disctrack track again."
+        ) from error
 
 
 def _trajectory(file: h5py.File) -> Trajectory:
-    groups = {"": read_variables(file, text=False)}
+    groups = {"": read_variables(file)}
     groups |= {name: read_variables(file[name]) for name in ("markers", "calibration")}
     root, disc = groups[""], _read_disc(file["disc"])
     # files of earlier versions counted it as noise of single frames
@@ -490,8 +439,8 @@ def _trajectory(file: h5py.File) -> Trajectory:
     lengths = {name: len(values) for name, (values, _) in _NAMED_AXES.items()}
     lengths |= {"time": len(root["time"]), "marker": disc.n_markers}
     found = {}
-    for attribute, (place, dims, *_) in _LAYOUT.items():
-        group, _, name = place.rpartition("/")
+    for attribute, (dims, _, _) in _LAYOUT.items():
+        group, _, name = _PLACES.get(attribute, attribute).rpartition("/")
         found[attribute] = groups[group][name]
         expected = tuple(lengths[axis] for axis in dims)
         if found[attribute].shape != expected:
@@ -514,15 +463,12 @@ def _trajectory(file: h5py.File) -> Trajectory:
 
 
 def _read_disc(group: h5py.Group) -> Disc:
-    sizes = {key: float(value) for key, value in group.attrs.items()}
-    return Disc(
-        sizes["radius_m"],
-        sizes["half_thickness_m"],
-        sizes["mass_kg"],
-        read_variables(group)["marker_centres_body"],
-        sizes["marker_diameter_m"],
-        **{key: sizes[f"{key}_m"] for key in ("radius_tolerance", "thickness_tolerance") if f"{key}_m" in sizes},
-    )
+    sizes = {
+        name.rpartition("_")[0]: float(group.attrs[name])
+        for name in (*_DISC_SIZES, *_TOLERANCES)
+        if name in group.attrs
+    }
+    return Disc(marker_centres_body=read_variables(group)["marker_centres_body"], **sizes)
 
 
 def _rig(group: h5py.Group, values: Mapping[str, NDArray]) -> StereoRig:

@@ -13,14 +13,14 @@ from disctrack.files.software import software_version
 from disctrack.files.whole import refuse_existing, write_whole
 from disctrack.report.blocks import Report, document, restored
 from disctrack.report.terminal import full
-from disctrack.trajectory.file import read_setup
+from disctrack.trajectory.file import read_provenance
 
 FILE_NAME, SUMMARY = "made_from.json", "summary.txt"
 
 
 def origin_of(trajectory: Path, settings: Mapping[str, Any]) -> str:
     """SHA-256 (hex) of what a result is made from. Raises TrajectoryFileError."""
-    return hash_of([read_setup(trajectory).fingerprint, dict(settings)])
+    return hash_of([read_provenance(trajectory).fingerprint, dict(settings)])
 
 
 def hash_of(content: Any) -> str:

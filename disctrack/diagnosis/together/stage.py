@@ -15,7 +15,7 @@ from disctrack.files.json_text import json_file
 from disctrack.files.whole import write_whole
 from disctrack.report.blocks import Report
 from disctrack.report.html import write_page
-from disctrack.trajectory.file import read_setup
+from disctrack.trajectory.file import read_provenance
 from disctrack.trajectory.reuse import hash_of, refuse_other, remember, reusable
 
 FOLDER = "together_diagnosis"
@@ -55,7 +55,12 @@ def run_together(
     read, unread = _read(paths)
     if not read:
         raise AnalysisError("; ".join(f"{path}: {reason}" for path, reason in unread.items()))
-    made_from = {"model": known, "plan": settle, "files": [read_setup(p).fingerprint for p in read], "unread": unread}
+    made_from = {
+        "model": known,
+        "plan": settle,
+        "files": [read_provenance(p).fingerprint for p in read],
+        "unread": unread,
+    }
     origin = hash_of(made_from)
     earlier = reusable(folder, origin) if reuse else None
     if earlier is not None:

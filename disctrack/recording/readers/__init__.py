@@ -5,25 +5,7 @@ from pathlib import Path
 
 from disctrack.errors import RecordingError
 from disctrack.recording.readers.base import FrameReader
-from disctrack.recording.readers.files import (
-    CINE_SUFFIXES,
-    HDF5_SUFFIXES,
-    IMAGE_SUFFIXES,
-    MRAW_SUFFIXES,
-    NUMBER,
-    VIDEO_SUFFIXES,
-    match_files,
-    split_member,
-)
-
-# Suffixes of a format, and the module that reads it by `open_MODULE`: (files, camera) -> FrameReader.
-FORMATS: tuple[tuple[frozenset[str], str], ...] = (
-    (IMAGE_SUFFIXES, "images"),
-    (VIDEO_SUFFIXES, "video"),
-    (MRAW_SUFFIXES, "mraw"),
-    (CINE_SUFFIXES, "cine"),
-    (HDF5_SUFFIXES, "hdf5"),
-)
+from disctrack.recording.readers.files import FORMATS, IMAGES, NUMBER, match_files, split_member
 
 
 def open_frames(pattern: str, folder: str | Path, camera: str) -> FrameReader:
@@ -40,8 +22,8 @@ def open_frames(pattern: str, folder: str | Path, camera: str) -> FrameReader:
     pattern, member = split_member(pattern)
     files = match_files(pattern, Path(folder), camera)
     suffix = files[0].suffix.lower()
-    module = next(module for suffixes, module in FORMATS if suffix in suffixes)
-    if NUMBER in member and suffix not in IMAGE_SUFFIXES:
+    module = next(module for module, suffixes in FORMATS.items() if suffix in suffixes)
+    if NUMBER in member and suffix not in IMAGES:
         raise RecordingError(f"{files[0]}: {NUMBER} in a pattern numbers images of a file each; leave it out here.")
     opener = getattr(import_module(f"disctrack.recording.readers.{module}"), f"open_{module}")
     reader: FrameReader = opener(files, camera, member) if member else opener(files, camera)

@@ -74,11 +74,9 @@ class FrameReader:
         where = f"{self._place(index)} ({self.camera} camera, frame {index})"
         image = self._decoded(index, out, where)
         if image.shape[::-1] != self.image_size or image.dtype != self.dtype:
-            width, height = self.image_size
-            raise RecordingError(
-                f"{where}: {image.shape[1]} x {image.shape[0]} px of {8 * image.itemsize} bit, but the first frame has "
-                f"{width} x {height} px of {8 * self.dtype.itemsize} bit. Export it again."
-            )
+            found = in_words(image.shape[::-1], 8 * image.itemsize)
+            first = in_words(self.image_size, 8 * self.dtype.itemsize)
+            raise RecordingError(f"{where}: {found}, but the first frame has {first}. Export it again.")
         return _into(out, image)
 
     def content_sha256(self, start: int, stop: int) -> str:
@@ -126,6 +124,11 @@ class Changed(FrameReader):
     def content_sha256(self, start: int, stop: int) -> str:
         """Of the frames and of how they are changed."""
         return hashlib.sha256(f"{self._reader.content_sha256(start, stop)} {self._by}".encode()).hexdigest()
+
+
+def in_words(image_size: tuple[int, ...], bit_depth: int) -> str:
+    """Size (width, height) and depth of images."""
+    return f"{image_size[0]} x {image_size[1]} px of {bit_depth} bit"
 
 
 def _into(out: Image | None, image: Image) -> Image:

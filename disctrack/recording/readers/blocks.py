@@ -1,7 +1,7 @@
 """Blocks of image pairs, read ahead by several threads in bounded memory."""
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from calibration.kit.arrays import Mask
 from disctrack.errors import RecordingError
 from disctrack.frames import CAMERAS
-from disctrack.recording.readers.base import FrameReader
+from disctrack.recording.readers.base import FrameReader, in_words
 
 BLOCK_BYTES = 16 << 20  # large enough to hide the switch between blocks, small enough for six of them in 100 MB
 
@@ -56,16 +56,13 @@ def check_pair(left: FrameReader, right: FrameReader) -> None:
             f"(the last pair would be {left.describe(last)} with {right.describe(last)})."
             + "".join(f" Note: {note}." for reader in (left, right) for note in reader.notes)
         )
-    for what, unit in (("image_size", "px"), ("bit_depth", "bit")):
-        ours, theirs = (getattr(reader, what) for reader in (left, right))
-        alike = ours == theirs if what == "image_size" else (ours > 8) == (theirs > 8)
-        if not alike:
-            shown = [f"{v[0]} x {v[1]}" if isinstance(v, tuple) else f"{v}" for v in (ours, theirs)]
-            instead = ", or declare parts of one size: [cameras] left_part and right_part" * (what == "image_size")
-            raise RecordingError(
-                f"left images ({left.describe(0)}) have {shown[0]} {unit}, right images ({right.describe(0)}) have "
-                f"{shown[1]} {unit}. Export both cameras alike{instead}."
-            )
+    if left.image_size != right.image_size or (left.bit_depth > 8) != (right.bit_depth > 8):
+        ours, theirs = (in_words(reader.image_size, reader.bit_depth) for reader in (left, right))
+        instead = ", or declare parts of one size: [cameras] left_part and right_part"
+        raise RecordingError(
+            f"left images ({left.describe(0)}) have {ours}, right images ({right.describe(0)}) have {theirs}. Export "
+            f"both cameras alike{instead if left.image_size != right.image_size else ''}."
+        )
 
 
 def default_threads() -> int:
@@ -102,36 +99,30 @@ def iter_pair_blocks(
     ring = [np.empty((min(block, max(stop - start, 1)), 2, height, width), dtype) for _ in range(n_ahead + 1)]
     pool = ThreadPoolExecutor(threads or default_threads(), thread_name_prefix="read")
     # what is read fastest in order has a thread of its own: two blocks at once would send it back and forth
-    pools = [
-        pool if reader.random_access else ThreadPoolExecutor(1, thread_name_prefix="read") for reader in (left, right)
-    ]
-    pending: list[list[Future[list[Unreadable]]]] = []
+    readers = left, right
+    pools = [pool if r.random_access else ThreadPoolExecutor(1, thread_name_prefix="read") for r in readers]
+
+    def submitted(number: int) -> list[Future[list[Unreadable]]]:
+        """Reading of a block as tasks: a few frames each, or a camera's whole block where files are read in order."""
+        images, frames, tasks = ring[number % len(ring)], range(starts[number], stops[number]), []
+        for camera, reader in enumerate(readers):
+            size = 4 if reader.random_access else len(frames)
+            for i in range(0, len(frames), size):
+                part = images[i : i + size, camera], reader, camera, frames[i : i + size]
+                tasks.append(pools[camera].submit(_fill, *part))
+        return tasks
+
     try:
+        pending = [submitted(number) for number in range(min(n_ahead, len(starts)))]
         for number, first in enumerate(starts):
-            for ahead in range(number + len(pending), min(number + n_ahead + 1, len(starts))):
-                pending.append(
-                    _submit(pools, (left, right), range(starts[ahead], stops[ahead]), ring[ahead % len(ring)])
-                )
+            if number + n_ahead < len(starts):
+                pending.append(submitted(number + n_ahead))
             unreadable = [image for future in pending.pop(0) for image in future.result()]
             frames = np.arange(first, stops[number])
             yield PairBlock(frames, ring[number % len(ring)][: len(frames)], tuple(unreadable))
     finally:
         for threads_of_one in {pool, *pools}:
             threads_of_one.shutdown(wait=True, cancel_futures=True)
-
-
-def _submit(
-    pools: Sequence[ThreadPoolExecutor], readers: tuple[FrameReader, FrameReader], frames: range, images: NDArray
-) -> list[Future[list[Unreadable]]]:
-    """Reading of one block as tasks: a few frames each, or a camera's whole block where files are read in order."""
-    tasks = []
-    for camera, reader in enumerate(readers):
-        size = 4 if reader.random_access else len(frames)
-        for i in range(0, len(frames), size):
-            tasks.append(
-                pools[camera].submit(_fill, images[i : i + size, camera], reader, camera, frames[i : i + size])
-            )
-    return tasks
 
 
 def _fill(images: NDArray, reader: FrameReader, camera: int, frames: range) -> list[Unreadable]:

@@ -8,12 +8,16 @@ from pathlib import Path
 from disctrack.errors import RecordingError
 from disctrack.files.inputs import MOST_IMAGE, keep, read_regular, why_not_regular
 
-IMAGE_SUFFIXES = frozenset({".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg"})
-VIDEO_SUFFIXES = frozenset({".avi", ".mp4", ".mkv", ".mov"})
-MRAW_SUFFIXES = frozenset({".cih", ".cihx", ".mraw"})  # Photron
-CINE_SUFFIXES = frozenset({".cine", ".cin", ".cci"})  # Phantom
-HDF5_SUFFIXES = frozenset({".h5", ".hdf5", ".hdf", ".he5"})
-SUFFIXES = IMAGE_SUFFIXES | VIDEO_SUFFIXES | MRAW_SUFFIXES | CINE_SUFFIXES | HDF5_SUFFIXES
+# Suffixes of each format, by the module that reads it with `open_MODULE`: (files, camera) -> FrameReader
+FORMATS = {
+    "images": frozenset({".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg"}),
+    "video": frozenset({".avi", ".mp4", ".mkv", ".mov"}),
+    "mraw": frozenset({".cih", ".cihx", ".mraw"}),  # Photron
+    "cine": frozenset({".cine", ".cin", ".cci"}),  # Phantom
+    "hdf5": frozenset({".h5", ".hdf5", ".hdf", ".he5"}),
+}
+SUFFIXES = frozenset().union(*FORMATS.values())
+IMAGES = FORMATS["images"]
 NUMBER = "{number}"  # in a pattern: these digits count the frames
 
 
@@ -25,7 +29,7 @@ def split_member(pattern: str) -> tuple[str, str]:
     if NUMBER in pattern:
         return pattern.replace(NUMBER, "*"), pattern
     file, colon, member = pattern.rpartition(":")
-    if colon and Path(file).suffix.lower() in HDF5_SUFFIXES:
+    if colon and Path(file).suffix.lower() in FORMATS["hdf5"]:
         return file, member
     return pattern, ""
 

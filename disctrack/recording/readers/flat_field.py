@@ -21,8 +21,8 @@ from calibration.kit.stuck_pixels import repair
 from disctrack.errors import RecordingError
 from disctrack.frames import CAMERAS
 from disctrack.recording.readers import open_frames
-from disctrack.recording.readers.base import Changed, FrameReader
-from disctrack.recording.readers.files import IMAGE_SUFFIXES, match_files, split_member
+from disctrack.recording.readers.base import Changed, FrameReader, in_words
+from disctrack.recording.readers.files import IMAGES, match_files, split_member
 
 ODD = 0.5  # relative, by which a dead pixel's answer to light differs from its neighbours'; gains differ by 0.05
 MOST_DEAD = 0.01  # of all pixels: more, and it is the flat image that is wrong
@@ -45,7 +45,7 @@ class FlatField:
 
     def fits(self, image: Image) -> bool:
         """Is this a grey image of the camera's size and depth?"""
-        return image.shape == self.dark.shape and image.dtype == _stored(self.bit_depth)
+        return image.shape == self.dark.shape and image.dtype == (np.uint8 if self.bit_depth == 8 else np.uint16)
 
     def corrected(self, image: Image) -> Image:
         """(height, width) uint16, full scale 65535, with offsets and gains taken out."""
@@ -56,10 +56,6 @@ class FlatField:
         if self.dead is not None:
             repair(found, self.dead)
         return found
-
-
-def _stored(bit_depth: int) -> type[np.uint8] | type[np.uint16]:
-    return np.uint8 if bit_depth == 8 else np.uint16
 
 
 FlatFields = tuple[FlatField | None, ...]  # of the left and of the right camera
@@ -84,16 +80,14 @@ def flat_fielded(readers: Sequence[FrameReader], fields: FlatFields) -> list[Fra
 
 
 def _corrected(reader: FrameReader, field: FlatField | None, camera: str) -> FrameReader:
-    shape, depth = reader.image_size[::-1], reader.bit_depth
     if field is None:
-        zero = np.zeros(shape, np.float32)
-        field = FlatField(zero, zero + 1, None, depth, "none")
-    if field.dark.shape != shape or field.bit_depth != depth:
-        w, h = reader.image_size
+        zero = np.zeros(reader.image_size[::-1], np.float32)
+        field = FlatField(zero, zero + 1, None, reader.bit_depth, "none")
+    frames, images = in_words(reader.image_size, reader.bit_depth), in_words(field.dark.shape[::-1], field.bit_depth)
+    if frames != images:
         raise RecordingError(
-            f"{reader.describe(0)}: {camera} frames are {w} x {h} px of {depth} bit, but [cameras] {camera}_flat and "
-            f"{camera}_dark have {field.dark.shape[1]} x {field.dark.shape[0]} px of {field.bit_depth} bit. Take these "
-            "with the settings of the recording, or leave them out."
+            f"{reader.describe(0)}: {camera} frames are {frames}, but [cameras] {camera}_flat and {camera}_dark have "
+            f"{images}. Take these with the settings of the recording, or leave them out."
         )
     notes = (*reader.notes, *field.notes)
     return Changed(reader, field.corrected, field.sha256, notes=notes, bit_depth=16, dtype=np.dtype(np.uint16))
@@ -108,12 +102,8 @@ class _Mean:
     clipped: Mask  # in more than a twentieth of the images
     n: int
     bit_depth: int
+    described: str  # size and depth
     sha256: str
-
-    @property
-    def described(self) -> str:
-        """Size and depth."""
-        return f"{self.mean.shape[1]} x {self.mean.shape[0]} px of {self.bit_depth} bit"
 
 
 def _mean(pattern: str, folder: Path, camera: str, kind: str) -> _Mean:
@@ -122,20 +112,20 @@ def _mean(pattern: str, folder: Path, camera: str, kind: str) -> _Mean:
         pattern = str(Path(pattern) / "*")
     files = match_files(split_member(pattern)[0], folder, f"{camera} camera's {kind}")
     what = f"{camera}_{kind}"
-    if files[0].suffix.lower() in IMAGE_SUFFIXES:
+    if files[0].suffix.lower() in IMAGES:
         readers = [open_frames(glob.escape(file.name), file.parent, what) for file in files]
     else:
         readers = [open_frames(pattern, folder, what)]
     first = readers[0]
+    described = in_words(first.image_size, first.bit_depth)
     total = np.zeros(first.image_size[::-1])
     clipped = np.zeros(total.shape, np.int64)
     digest, n = hashlib.sha256(), 0
     for reader in readers:
-        if reader.image_size != first.image_size or reader.bit_depth != first.bit_depth:
+        if (other := in_words(reader.image_size, reader.bit_depth)) != described:
             raise RecordingError(
-                f"[cameras] {what}: {reader.describe(0)} is {reader.image_size[0]} x {reader.image_size[1]} px of "
-                f"{reader.bit_depth} bit, but {first.describe(0)} is {first.image_size[0]} x {first.image_size[1]} px "
-                f"of {first.bit_depth} bit. Images that are averaged must be alike: take the other one away."
+                f"[cameras] {what}: {reader.describe(0)} is {other}, but {first.describe(0)} is {described}. Images "
+                "that are averaged must be alike: take the other one away."
             )
         for index in range(len(reader)):
             image = reader.read(index)
@@ -145,7 +135,7 @@ def _mean(pattern: str, folder: Path, camera: str, kind: str) -> _Mean:
         digest.update(reader.content_sha256(0, len(reader)).encode())
     where = f"{first.describe(0)} ([cameras] {what})"
     mean = (total / n).astype(np.float32)
-    return _Mean(where, mean, clipped > 0.05 * n, n, first.bit_depth, digest.hexdigest())
+    return _Mean(where, mean, clipped > 0.05 * n, n, first.bit_depth, described, digest.hexdigest())
 
 
 def _flat_field(flat_images: str | None, dark_images: str | None, folder: Path, camera: str) -> FlatField | None:

@@ -4,9 +4,9 @@ Doubt leads to a warning, with the frames' numbers, and to evenly spaced frames.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.kit.arrays import Array
+from calibration.kit.brief import ranges
 from disctrack.frames import CAMERAS
 from disctrack.recording.readers.base import FrameReader
 from disctrack.recording.readers.camera_header import start_offset
@@ -75,7 +75,7 @@ def _lost_frames(camera: str, times: Array, frame_rate: float) -> list[str]:
     if not len(gaps):
         return []
     lost = int(np.rint(steps[gaps] - 1).sum())
-    return [f"{camera} camera: by its time stamps {lost} frame(s) are missing, after frame {_listed(gaps)}"]
+    return [f"{camera} camera: by its time stamps {lost} frame(s) are missing, after frame {ranges(gaps)}"]
 
 
 def _slips(left: Array, right: Array, period: float) -> list[str]:
@@ -87,7 +87,7 @@ def _slips(left: Array, right: Array, period: float) -> list[str]:
     if len(changes):
         return [
             f"by the time stamps frame i of both cameras does not show the same instant from frame {changes[0]} on: "
-            f"one camera lost frames that the other has (the offset changes at frame {_listed(changes)}). Poses from "
+            f"one camera lost frames that the other has (the offset changes at frame {ranges(changes)}). Poses from "
             "there on are wrong: take that frame from the other camera, too, or measure up to it with --frames"
         ]
     return []
@@ -118,7 +118,3 @@ def _between_cameras(left: Array, right: Array, period: float) -> list[str]:
             f"most at frame {worst}: {1e6 * float(rest[worst]):+.3g} us"
         )
     return warnings
-
-
-def _listed(frames: NDArray[np.integer]) -> str:
-    return ", ".join(str(frame) for frame in frames[:5]) + (", ..." if len(frames) > 5 else "")

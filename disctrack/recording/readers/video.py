@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.kit.arrays import Image
+from calibration.kit.brief import ranges
 from disctrack.errors import RecordingError
 from disctrack.recording.readers.base import FrameReader, first_readable, only_file
 from disctrack.recording.readers.decoding import as_grey
@@ -253,8 +254,8 @@ def _gap_doubts(times: NDArray[np.int64]) -> list[str]:
     if not len(gaps) or len(gaps) > 0.1 * len(steps):
         return []
     lost = int(np.rint(steps[gaps] / typical - 1).sum())
-    shown = ", ".join(str(gap) for gap in gaps[:5]) + (", ..." if len(gaps) > 5 else "")
-    return [f"the video's clock skips after frame {shown}: {lost} frame(s) seem to be lost, and time shifts there"]
+    where = ranges(gaps)
+    return [f"the video's clock skips after frame {where}: {lost} frame(s) seem to be lost, and time shifts there"]
 
 
 def _depth(frame: av.VideoFrame) -> int:
@@ -294,20 +295,17 @@ def _without_palette(frame: av.VideoFrame) -> bool:
     return bool((colours == colours[0]).all())
 
 
+# Pixel formats whose first plane is the grey values, or begins with the first of them in every pair
+_FIRST_PLANE = ("gray", "yuv", "yuyv", "nv12", "nv16", "nv21", "nv24", "p0", "uyvy")
+
+
 def _luma(frame: av.VideoFrame, where: str) -> Image:
     """Grey values (h, w) of a decoded frame without conversion; a view of its memory where possible."""
-    name = frame.format.name
-    component = frame.format.components[0]
-    if name.startswith(("gray", "yuv", "yuyv", "nv12", "nv16", "nv21", "nv24", "p0", "uyvy")) and name[-2:] not in (
-        "be",
-        "32",
-    ):
-        plane = frame.planes[0]
-        dtype = np.uint8 if component.bits == 8 else np.dtype("<u2")
-        if component.bits in (8, 9, 10, 12, 14, 16):
-            step, first = {"yuyv422": (2, 0), "uyvy422": (2, 1)}.get(name, (1, 0))
-            rows = _rows(plane, frame.height).view(dtype)
-            return np.asarray(rows[:, first : step * frame.width : step])
+    name, bits = frame.format.name, _depth(frame)
+    if name.startswith(_FIRST_PLANE) and not name.endswith(("be", "32")) and bits in (8, 9, 10, 12, 14, 16):
+        step, first = {"yuyv422": (2, 0), "uyvy422": (2, 1)}.get(name, (1, 0))
+        rows = _rows(frame.planes[0], frame.height).view(np.uint8 if bits == 8 else np.dtype("<u2"))
+        return np.asarray(rows[:, first : step * frame.width : step])
     if name in ("gray10be", "gray12be", "gray14be", "gray16be"):
         return np.asarray(frame.to_ndarray(format=name)).astype(np.uint16)
     if name == "pal8" and _without_palette(frame):

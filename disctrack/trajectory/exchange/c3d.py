@@ -7,7 +7,7 @@ import numpy as np
 from disctrack.errors import OutputError
 from disctrack.files.whole import whole_file
 from disctrack.trajectory import Trajectory
-from disctrack.trajectory.exchange.motion import body_points
+from disctrack.trajectory.exchange.motion import body_points, place_sigma_mm
 
 
 def write_c3d(path: Path, trajectory: Trajectory) -> None:
@@ -22,19 +22,16 @@ def write_c3d(path: Path, trajectory: Trajectory) -> None:
     except ImportError as error:
         raise OutputError(f"{path}: C3D needs ezc3d: pip install ezc3d") from error
     points, labels = body_points(trajectory)
-    sigma = np.sqrt(np.einsum("nii->n", trajectory.pose_covariance[:, :3, :3]))
     file = ezc3d.c3d()
-    parameters = file["parameters"]
-    parameters["POINT"]["UNITS"]["value"] = ["mm"]
-    parameters["POINT"]["RATE"]["value"] = [float(trajectory.frame_rate)]
-    parameters["POINT"]["LABELS"]["value"] = labels
-    parameters["POINT"]["DESCRIPTIONS"]["value"] = [_DESCRIPTIONS.get(label, "centre of a dot") for label in labels]
-    known = trajectory.measured
+    described = [_DESCRIPTIONS.get(label, "centre of a dot") for label in labels]
+    told = {"UNITS": ["mm"], "RATE": [float(trajectory.frame_rate)], "LABELS": labels, "DESCRIPTIONS": described}
+    for name, value in told.items():
+        file["parameters"]["POINT"][name]["value"] = value
     data = np.ones((4, len(labels), len(trajectory)))
-    data[:3] = np.where(known, 1e3 * np.moveaxis(points, 0, -1).swapaxes(0, 1), np.nan)
-    residuals = np.where(known, 1e3 * sigma, -1.0)
+    data[:3] = np.where(trajectory.measured, 1e3 * np.moveaxis(points, 0, -1).swapaxes(0, 1), np.nan)
     file["data"]["points"] = data
-    file["data"]["meta_points"]["residuals"] = np.broadcast_to(residuals, (1, len(labels), len(known))).copy()
+    residuals = np.broadcast_to(place_sigma_mm(trajectory), (1, len(labels), len(trajectory)))
+    file["data"]["meta_points"]["residuals"] = residuals.copy()
     file.add_parameter("DISC", "RADIUS", 1e3 * trajectory.disc.radius)
     file.add_parameter("DISC", "THICKNESS", 2e3 * trajectory.disc.half_thickness)
     file.add_parameter("DISC", "MASS", 1e3 * trajectory.disc.mass)

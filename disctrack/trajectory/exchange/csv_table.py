@@ -21,26 +21,20 @@ def write_csv(path: str | Path, trajectory: Trajectory, overwrite: bool = False)
     """
     path = Path(path)
     refuse_existing(path, overwrite)
-    scale = np.array([1e3, 1e3, 1e3, *np.degrees([1.0, 1.0, 1.0])])
-    units = ["mm"] * 3 + ["deg"] * 3
-    names = [f"{name}_{unit}" for name, unit in zip(COORDINATES, units, strict=True)]
-    header = ["frame", "time_s", *names, *(n.replace("_", "_sigma_") for n in names)]
-    header += [n.replace("_", "_sigma_calibration_") for n in names]
-    header += [*(f"reprojection_rms_{camera}_px" for camera in CAMERAS), "status"]
-    table = np.column_stack(
-        [
-            trajectory.q * scale,
-            trajectory.coordinate_sigma * scale,
-            trajectory.calibration_sigma * scale,
-            trajectory.reprojection_rms_px,
-        ]
-    )
+    scale = np.repeat([1e3, np.degrees(1.0)], 3)
+    parts = ("", "sigma_", "sigma_calibration_")
+    names = [f"{name}_{part}{unit}" for part in parts for name, unit in zip(COORDINATES, _UNITS, strict=True)]
+    seen = [f"reprojection_rms_{camera}_px" for camera in CAMERAS]
+    values = [trajectory.q * scale, trajectory.coordinate_sigma * scale, trajectory.calibration_sigma * scale]
+    rows = np.column_stack([*values, trajectory.reprojection_rms_px])
     text = io.StringIO()
     writer = csv.writer(text)
-    writer.writerow(header)
-    for frame, time, values, status in zip(
-        trajectory.frame, trajectory.time, table, trajectory.frame_status, strict=True
-    ):
-        cells = ["" if np.isnan(v) else f"{v:.7f}" if i < 6 else f"{v:.7g}" for i, v in enumerate(values)]
-        writer.writerow([frame, f"{time:.9g}", *cells, FrameStatus(status).name.lower()])
+    writer.writerow(["frame", "time_s", *names, *seen, "status"])
+    for i, row in enumerate(rows):
+        cells = ["" if np.isnan(v) else f"{v:.7f}" if column < 6 else f"{v:.7g}" for column, v in enumerate(row)]
+        status = FrameStatus(trajectory.frame_status[i]).name.lower()
+        writer.writerow([trajectory.frame[i], f"{trajectory.time[i]:.9g}", *cells, status])
     write_whole(path, text.getvalue().encode())
+
+
+_UNITS = ("mm", "mm", "mm", "deg", "deg", "deg")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import partial
@@ -89,7 +89,6 @@ ROWS = (
     Format("MATLAB stereoParameters", (".mat",), "rig", matlab.write_stereo_parameters, matlab.read_stereo_parameters,
            "covariances", "MATLAB: stereoParametersFromOpenCV", asks=("unit", "world_is_table")),
 )  # fmt: skip
-FORMATS = {row.name: row for row in ROWS}
 
 
 class Converted(NamedTuple):
@@ -110,7 +109,7 @@ def convert(
     """A trajectory, its points or a rig from and to another program's format, by the ending of the target.
 
     source : our trajectory or rig file, a recording's folder, or a foreign rig (two files where it keeps one a camera)
-    form : name of the target's format in `FORMATS`, where the ending does not tell
+    form : name of the target's format in `ROWS`, where the ending does not tell
     told : what a foreign rig does not say of itself: world_is_table, cameras (two names), image_size (width, height)
         [px], unit [m]
     Raises DiscTrackError that names the formats there are.
@@ -152,18 +151,14 @@ def read_foreign(paths: Sequence[Path], **told: Any) -> Any:
     """A StereoRig, or points (n, 2, m, 2) [px], of another program; told: as of `convert`. Raises DiscTrackError."""
     first = paths[0]
     head = content_of(first)[:4096] if first.suffix in (".csv", ".yaml", ".yml") else ""
-    ranks = {row.name: _rank(row, first, head) for row in ROWS if row.read}
-    name = max(ranks, key=lambda name: ranks[name])
-    if not any(ranks[name]):
-        raise OutputError(
-            f"{first}: no file of ours, and no format of this name is read; known are {_known(FORMATS, True)}"
-        )
-    idle = [word for word in told if word not in FORMATS[name].asks]
+    readable = [row for row in ROWS if row.read]
+    row = max(readable, key=lambda row: _rank(row, first, head))
+    if row.read is None or not any(_rank(row, first, head)):
+        raise OutputError(f"{first}: no file of ours, and no format of this name is read; known are {_known(readable)}")
+    idle = [word for word in told if word not in row.asks]
     if idle:
-        raise OutputError(f"{_options(idle)}: says nothing about {first} as {name}; leave it out")
-    reader = FORMATS[name].read
-    assert reader is not None
-    return reader(paths, **told)
+        raise OutputError(f"{_options(idle)}: says nothing about {first} as {row.name}; leave it out")
+    return row.read(paths, **told)
 
 
 def _rank(row: Format, path: Path, head: str = "") -> tuple[int, int]:
@@ -175,24 +170,25 @@ def _rank(row: Format, path: Path, head: str = "") -> tuple[int, int]:
 def _row_for(path: Path, form: str | None, value: Any) -> Format:
     """The format to write. Raises OutputError that names those there are."""
     kinds = ("trajectory", "points", "rig") if isinstance(value, Trajectory) else ("rig",)
-    rows = {row.name: row for row in ROWS if row.holds in kinds and not isinstance(value, np.ndarray)}
+    rows = {row.name.lower(): row for row in ROWS if row.holds in kinds and not isinstance(value, np.ndarray)}
     if not rows:
         raise OutputError(f"{path}: points are read in Python, with `read_foreign`, and written of a trajectory")
-    if form is not None:
-        near = get_close_matches(form.lower(), [name.lower() for name in FORMATS], 1, 0.5)
-        row = rows.get(next((name for name in rows if name.lower() in (form.lower(), *near[:1])), ""))
-        if row is None or row.name.lower() != form.lower():
-            hint = f" Did you mean '{row.name}'?" if row else ""
-            raise OutputError(f"{form}: no format for a {kinds[0]}.{hint} Known are {', '.join(rows)}")
+    if form is None:
+        row = max(rows.values(), key=lambda row: _rank(row, path))
+        if not any(_rank(row, path)):
+            known = _known(rows.values())
+            raise OutputError(f"{path}: no format of this name for a {kinds[0]}; known are {known}, and .h5")
         return row
-    row = max(rows.values(), key=lambda row: _rank(row, path))
-    if not any(_rank(row, path)):
-        raise OutputError(f"{path}: no format of this name for a {kinds[0]}; known are {_known(rows)}, and .h5")
-    return row
+    if form.lower() not in rows:
+        near = get_close_matches(form.lower(), rows, 1, 0.5)
+        hint = f" Did you mean '{rows[near[0]].name}'?" if near else ""
+        known = ", ".join(row.name for row in rows.values())
+        raise OutputError(f"{form}: no format for a {kinds[0]}.{hint} Known are {known}")
+    return rows[form.lower()]
 
 
-def _known(rows: Mapping[str, Format], read: bool = False) -> str:
-    return ", ".join(f"{row.endings[0]} ({name})" for name, row in rows.items() if row.read or not read)
+def _known(rows: Iterable[Format]) -> str:
+    return ", ".join(f"{row.endings[0]} ({row.name})" for row in rows)
 
 
 def _options(told: Iterable[str]) -> str:

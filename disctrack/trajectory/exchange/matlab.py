@@ -32,31 +32,19 @@ def write_mat(path: Path, trajectory: Trajectory) -> None:
     disctrack.q (n, 6) with disctrack.q_names, q_sigma (this frame's noise), q_sigma_calibration (common to all frames);
     disctrack.units tells the unit of every field. Raises OutputError.
     """
-    root, markers, _ = labelled(trajectory)
-    fields = {name: np.asarray(item.data) for name, item in root.items()}
-    fields |= {f"marker_{name}": np.asarray(item.data) for name, item in markers.items()}
-    units = {name: item.units for name, item in root.items()}
-    units |= {f"marker_{name}": item.units for name, item in markers.items()}
-    disc = trajectory.disc
+    variables, _, numbers = labelled(trajectory)
+    disc = {name.removeprefix("disc_"): value for name, value in numbers.items() if name.startswith("disc_")}
     content = {
         "time": trajectory.time,
         "q": trajectory.q,
         "q_sigma": trajectory.coordinate_sigma,
         "q_sigma_calibration": trajectory.calibration_sigma,
         "q_names": np.array(COORDINATES, dtype=object),
-        **fields,
+        **{name: np.asarray(item.data) for name, item in variables.items()},
         "status_names": np.array([status.name.lower() for status in FrameStatus], dtype=object),
-        "frame_rate_hz": trajectory.frame_rate,
-        "gravity_m_s2": trajectory.gravity,
-        "air_density_kg_m3": trajectory.air_density,
-        "disc": {
-            "radius_m": disc.radius,
-            "half_thickness_m": disc.half_thickness,
-            "mass_kg": disc.mass,
-            "marker_diameter_m": disc.marker_diameter,
-            "marker_centres_body_m": disc.marker_centres_body,
-        },
-        "units": {"time": "s", "q": "m, m, m, rad, rad, rad", **units},
+        **{name: value for name, value in numbers.items() if not name.startswith("disc_")},
+        "disc": {**disc, "marker_centres_body_m": trajectory.disc.marker_centres_body},
+        "units": {"time": "s", "q": "m, m, m, rad, rad, rad"} | {name: item.units for name, item in variables.items()},
     }
     _save(path, {"disctrack": content})
 

@@ -19,3 +19,9 @@ def rotations(trajectory: Trajectory) -> Array:
     """R_world_body (n, 3, 3); NaN in frames without a pose."""
     R = rotation_from_quaternion(trajectory.quaternion)
     return np.where(trajectory.measured[:, None, None], R, np.nan)
+
+
+def place_sigma_mm(trajectory: Trajectory) -> Array:
+    """(n,) one sigma of the place; -1 in frames without a pose, as programs mark what was not seen."""
+    sigma = np.sqrt(np.einsum("nii->n", trajectory.pose_covariance[:, :3, :3]))
+    return np.where(trajectory.measured, 1e3 * sigma, -1.0)

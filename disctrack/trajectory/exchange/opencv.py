@@ -2,15 +2,18 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 
-from calibration.cameras.camera import Camera, StereoRig
-from calibration.kit.arrays import Array
+from calibration.cameras.camera import StereoRig
 from disctrack.errors import OutputError, RigFileError
 from disctrack.files.whole import whole_file
-from disctrack.trajectory.exchange.rig_parts import MAX_BYTES, camera_of, rotation_of
+from disctrack.trajectory.exchange.rig_parts import array_of, camera_of, content_of, rotation_of
+
+_NAMES = ("M1", "D1", "M2", "D2", "R", "T")
+_MORE = ("image_size1", "image_size2", "R_left_world", "t_left_world")
 
 
 def write_opencv(path: Path, rig: StereoRig) -> None:
@@ -50,66 +53,52 @@ def read_opencv(
 
     The covariance is zero: such files carry none. Raises RigFileError.
     """
-    nodes: dict[str, Array] = {}
-    told_metres, is_table = False, world_is_table
-    names = ("M1", "D1", "M2", "D2", "R", "T", "image_size1", "image_size2", "R_left_world", "t_left_world")
+    nodes: dict[str, Any] = {"unit": "", "world_is_table": False}
     for path in paths:
-        storage = _opened(path)
-        try:
-            for name in names:
-                matrix = storage.getNode(name).mat()
-                if matrix is not None:
-                    nodes[name] = np.asarray(matrix, float)
-            told_metres |= storage.getNode("unit").string() == "m"
-            is_table |= storage.getNode("world_is_table").real() == 1.0
-        except (cv2.error, ValueError, TypeError, SystemError) as error:
-            raise RigFileError(f"{path}: not a stereo rig in OpenCV's format ({error})") from error
-        finally:
-            storage.release()
+        nodes |= _nodes(path)
     where = ", ".join(str(p) for p in paths)
-    missing = [name for name in names[:6] if name not in nodes]
+    missing = [name for name in _NAMES if name not in nodes]
     if missing:
         raise RigFileError(f"{where}: {', '.join(missing)} missing; a stereo rig has M1, D1, M2, D2, R and T")
-    if unit is None and not told_metres:
+    if unit is None and nodes["unit"] != "m":
         raise RigFileError(f"{where}: does not say in which unit T is; give it (0.025 for squares of 25 mm)")
     scale = 1.0 if unit is None else unit
-    cameras = [_camera(nodes, number, image_size, where) for number in (1, 2)]
+    cameras = []
+    for number in (1, 2):
+        size = nodes.get(f"image_size{number}", np.array(image_size or (), float)).ravel()
+        if size.size != 2:
+            raise RigFileError(f"{where}: does not tell the image size; give width and height")
+        K, D = nodes[f"M{number}"], nodes[f"D{number}"].ravel()
+        cameras.append(camera_of(K, D, size, f"{where}: M{number}, D{number}"))
     world = "R_left_world" in nodes and "t_left_world" in nodes
     if world_is_table and not world:
         raise RigFileError(f"{where}: without R_left_world and t_left_world nothing says where the table is")
+    left, right = cameras
     return StereoRig(
-        left=cameras[0],
-        right=cameras[1],
+        left,
+        right,
         R_right_left=rotation_of(nodes["R"], f"{where}: R"),
-        t_right_left=_vector(nodes["T"], where) * scale,
+        t_right_left=array_of(nodes, "T", (3,), where) * scale,
         R_left_world=rotation_of(nodes["R_left_world"], f"{where}: R_left_world") if world else np.eye(3),
-        t_left_world=_vector(nodes["t_left_world"], where) * scale if world else np.zeros(3),
-        world_is_table=world and is_table,
+        t_left_world=array_of(nodes, "t_left_world", (3,), where) * scale if world else np.zeros(3),
+        world_is_table=world and (world_is_table or nodes["world_is_table"]),
     )
 
 
-def _opened(path: Path) -> cv2.FileStorage:
-    if not path.is_file():
-        raise RigFileError(f"{path}: no such file")
-    if path.stat().st_size > MAX_BYTES:
-        raise RigFileError(f"{path}: {path.stat().st_size} bytes are too many for a rig")
+def _nodes(path: Path) -> dict[str, Any]:
+    """What a file holds of a rig. Raises RigFileError."""
+    text = content_of(path)
+    found: dict[str, Any] = {}
     try:
-        storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
-    except (cv2.error, SystemError) as error:
-        raise RigFileError(f"{path}: not a file in OpenCV's YAML, XML or JSON format") from error
-    if not storage.isOpened():
-        raise RigFileError(f"{path}: not a file in OpenCV's YAML, XML or JSON format")
-    return storage
-
-
-def _camera(nodes: dict[str, Array], number: int, image_size: tuple[int, int] | None, where: str) -> Camera:
-    size = nodes.get(f"image_size{number}", np.array(image_size or (), float)).ravel()
-    if size.size != 2:
-        raise RigFileError(f"{where}: does not tell the image size; give width and height")
-    return camera_of(nodes[f"M{number}"], nodes[f"D{number}"].ravel(), size, f"{where}: M{number}, D{number}")
-
-
-def _vector(t: Array, where: str) -> Array:
-    if t.size != 3 or not np.isfinite(t).all():
-        raise RigFileError(f"{where}: T is not a vector of three numbers")
-    return t.ravel()
+        storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+        for name in (*_NAMES, *_MORE):
+            matrix = storage.getNode(name).mat()
+            if matrix is not None:
+                found[name] = np.asarray(matrix, float)
+        if storage.getNode("unit").string() == "m":
+            found["unit"] = "m"
+        if storage.getNode("world_is_table").real() == 1.0:
+            found["world_is_table"] = True
+    except (cv2.error, ValueError, TypeError, SystemError) as error:
+        raise RigFileError(f"{path}: not a stereo rig in OpenCV's YAML, XML or JSON format ({error})") from error
+    return found

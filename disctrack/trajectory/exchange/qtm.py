@@ -10,8 +10,20 @@ from scipy.spatial.transform import Rotation
 
 from disctrack.files.whole import write_whole
 from disctrack.trajectory import Trajectory
-from disctrack.trajectory.exchange.motion import rotations
+from disctrack.trajectory.exchange.motion import place_sigma_mm, rotations
 from disctrack.trajectory.exchange.tables import table
+
+_HEAD = """NO_OF_FRAMES\t{n}
+NO_OF_CAMERAS\t2
+NO_OF_BODIES\t1
+FREQUENCY\t{rate:g}
+NO_OF_ANALOG\t0
+ANALOG_FREQUENCY\t0
+DESCRIPTION\t--
+DATA_INCLUDED\t6D
+BODY_NAMES\tDISC
+"""
+_COLUMNS = ("Frame", "Time", "DISC X", "Y", "Z", "Roll", "Pitch", "Yaw", "Residual", *(f"Rot[{i}]" for i in range(9)))
 
 
 def write_qtm(path: Path, trajectory: Trajectory) -> None:
@@ -20,35 +32,11 @@ def write_qtm(path: Path, trajectory: Trajectory) -> None:
     Raises OutputError.
     """
     known, R = trajectory.measured, rotations(trajectory)
-    values = np.zeros((len(known), 16))
-    values[known, :3] = 1e3 * trajectory.q[known, :3]
-    values[known, 3:6] = Rotation.from_matrix(R[known]).as_euler("XYZ", degrees=True)
-    sigma = np.sqrt(np.einsum("nii->n", trajectory.pose_covariance[:, :3, :3]))
-    values[:, 6] = np.where(known, 1e3 * sigma, -1.0)
-    values[known, 7:] = np.swapaxes(R[known], 1, 2).reshape(-1, 9)
-    heads = {
-        "NO_OF_FRAMES": len(known),
-        "NO_OF_CAMERAS": 2,
-        "NO_OF_BODIES": 1,
-        "FREQUENCY": f"{trajectory.frame_rate:g}",
-        "NO_OF_ANALOG": 0,
-        "ANALOG_FREQUENCY": 0,
-        "DESCRIPTION": "--",
-        "DATA_INCLUDED": "6D",
-        "BODY_NAMES": "DISC",
-    }
-    names = [
-        "Frame",
-        "Time",
-        "DISC X",
-        "Y",
-        "Z",
-        "Roll",
-        "Pitch",
-        "Yaw",
-        "Residual",
-        *(f"Rot[{i}]" for i in range(9)),
-    ]
-    columns = np.column_stack([np.arange(1, len(known) + 1), trajectory.time, values])
-    text = "".join(f"{key}\t{value}\n" for key, value in heads.items())
-    write_whole(path, text.encode() + table(names, columns, "\t"))
+    values = np.zeros((len(known), 18))
+    values[:, 0], values[:, 1] = np.arange(1, len(known) + 1), trajectory.time
+    values[known, 2:5] = 1e3 * trajectory.q[known, :3]
+    values[known, 5:8] = Rotation.from_matrix(R[known]).as_euler("XYZ", degrees=True)
+    values[:, 8] = place_sigma_mm(trajectory)
+    values[known, 9:] = np.swapaxes(R[known], 1, 2).reshape(-1, 9)
+    head = _HEAD.format(n=len(known), rate=trajectory.frame_rate)
+    write_whole(path, head.encode() + table(_COLUMNS, values, "\t"))

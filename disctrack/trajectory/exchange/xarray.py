@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from disctrack.errors import OutputError
+from disctrack.files.labelled_arrays import Variable
 from disctrack.trajectory import Trajectory
 from disctrack.trajectory.file import labelled
 
@@ -23,25 +24,11 @@ def to_xarray(trajectory: Trajectory) -> xarray.Dataset:
         import xarray
     except ImportError as error:
         raise OutputError("to_xarray needs xarray: pip install xarray") from error
-    root, markers, axes = labelled(trajectory)
-    used: set[str] = set()
-    variables = {}
-    for name, item in (*root.items(), *((f"marker_{name}", item) for name, item in markers.items())):
-        attributes = {"units": item.units, "long_name": item.long_name, **item.attributes}
-        variables[name] = (item.dims, np.asarray(item.data), attributes)
-        used.update(item.dims)
-    coordinates = {
-        name: (axis.dims, np.asarray(axis.data), {"units": axis.units, "long_name": axis.long_name})
-        for name, axis in axes.items()
-        if name in used
-    }
-    disc = trajectory.disc
-    attributes = {
-        "frame_rate_hz": trajectory.frame_rate,
-        "gravity_m_s2": trajectory.gravity,
-        "air_density_kg_m3": trajectory.air_density,
-        "disc_radius_m": disc.radius,
-        "disc_half_thickness_m": disc.half_thickness,
-        "disc_mass_kg": disc.mass,
-    }
-    return xarray.Dataset(variables, coordinates, attributes)
+
+    def described(item: Variable) -> tuple:
+        return item.dims, np.asarray(item.data), {"units": item.units, "long_name": item.long_name, **item.attributes}
+
+    variables, axes, numbers = labelled(trajectory)
+    used = {axis for item in variables.values() for axis in item.dims}
+    coordinates = {name: described(axis) for name, axis in axes.items() if name in used}
+    return xarray.Dataset({name: described(item) for name, item in variables.items()}, coordinates, numbers)
