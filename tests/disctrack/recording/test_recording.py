@@ -190,12 +190,6 @@ def test_every_number_has_a_range_and_the_message_tells_it(tmp_path, key, least,
         assert f"from {least:g} to {most:g}" in found
 
 
-def test_every_number_that_is_declared_has_a_range():
-    units = ("_mm", "_g", "_hz", "_us", "_s2", "_hPa", "_m3")
-    named = {k for keys in KEYS.values() for k in keys if k.endswith(units)} - {"centres_mm"}
-    assert named <= {key for key, *_ in NUMBERS}
-
-
 def test_dots_are_bounded_in_number(tmp_path):
     dots = [[float(x), float(y)] for x in range(-15, 16) for y in range(-15, 16)]
     text = re.sub(r"(?m)^centres_mm *=.*$", f"centres_mm = {dots}", REFERENCE)

@@ -23,17 +23,16 @@ from disctrack.disc import MA_2014
 from disctrack.errors import OutputError, RigFileError
 from disctrack.frames import (
     COORDINATES,
-    continuous_quaternions,
-    quaternion_from_rotation,
     rotation_from_euler,
 )
 from disctrack.synthetic import rig_of
 from disctrack.synthetic.description import Scene
-from disctrack.trajectory import FrameStatus, Trajectory
+from disctrack.trajectory import Trajectory
 from disctrack.trajectory.exchange import c3d as c3d_file
 from disctrack.trajectory.exchange import caliscope, dlt, formats, matlab, mrcal, opencv, qtm, trc, xmalab
 from disctrack.trajectory.exchange.csv_table import write_csv
 from disctrack.trajectory.file import Provenance, write_trajectory
+from tests.disctrack.trajectory.test_file import make_trajectory
 
 
 @pytest.fixture
@@ -44,36 +43,11 @@ def rig(rng) -> StereoRig:
 
 @pytest.fixture
 def trajectory(rig, rng) -> Trajectory:
-    """A disc that turns, with two frames without an answer."""
-    n, m = 30, MA_2014.n_markers
-    t = np.arange(n) / 1000
-    q = np.column_stack([1e-3 * np.sin(t), 2e-3 * t, 0.02 + 0 * t, 30 * t, 0.4 + 0 * t, -25 * t])
-    lost = np.isin(np.arange(n), [3, n - 1])
-    q[lost] = np.nan
-    halves = rng.normal(0, 1e-6, (n, 6, 6))
-    R = rotation_from_euler(*q[:, 3:].T)
-    pixels = rig.project(MA_2014.marker_centres_body @ np.swapaxes(R, 1, 2) + q[:, None, :3])
-    return Trajectory(
-        time=t,
-        frame=np.arange(n),
-        q=q,
-        pose_covariance=np.where(lost[:, None, None], np.nan, halves @ np.swapaxes(halves, 1, 2)),
-        calibration_sensitivity=np.where(lost[:, None, None], np.nan, rng.normal(size=(n, 6, N_RIG))),
-        systematic_covariance=np.zeros((n, 6, 6)),
-        quaternion=continuous_quaternions(quaternion_from_rotation(R)),
-        frame_status=np.where(lost, FrameStatus.UNREADABLE, FrameStatus.MEASURED).astype(np.uint8),
-        reprojection_rms_px=rng.uniform(0, 0.05, (n, 2)),
-        reduced_chi_square=rng.uniform(0.8, 1.2, n),
-        markers_px=pixels,
-        markers_covariance_px2=np.broadcast_to(1e-4 * np.eye(2), (n, 2, m, 2, 2)),
-        markers_residual_px=np.zeros((n, 2, m, 2)),
-        marker_status=np.zeros((n, 2, m), np.uint8),
-        disc=MA_2014,
-        rig=rig,
-        frame_rate=1000.0,
-        gravity=9.81,
-        air_density=0.7,
-    )
+    """A disc that turns, with two frames without an answer, as the cameras see it."""
+    made = make_trajectory(rng)
+    R, centre = rotation_from_euler(*made.q[:, 3:].T), made.q[:, None, :3]
+    pixels = rig.project(MA_2014.marker_centres_body @ np.swapaxes(R, 1, 2) + centre)
+    return replace(made, rig=rig, markers_px=pixels, systematic_covariance=np.zeros_like(made.pose_covariance))
 
 
 @pytest.fixture
@@ -334,7 +308,7 @@ def test_matlab_struct_has_every_number_with_both_sigmas(trajectory, tmp_path):
     assert np.array_equal(found["q_sigma_calibration"], trajectory.calibration_sigma, equal_nan=True)
     assert list(found["q_names"]) == list(COORDINATES)
     assert found["units"]["pose_covariance"].startswith("m and rad")
-    assert found["air_density_kg_m3"] == trajectory.air_density == 0.7
+    assert found["air_density_kg_m3"] == trajectory.air_density == 0.3
     assert np.array_equal(found["marker_centre_px"], trajectory.markers_px, equal_nan=True)
 
 

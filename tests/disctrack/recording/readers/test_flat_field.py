@@ -8,7 +8,6 @@ import pytest
 
 from disctrack.calibrate.views import find_views
 from disctrack.errors import RecordingError
-from disctrack.first_look import check
 from disctrack.recording.declaration import read_recording
 from disctrack.recording.readers import open_frames
 from disctrack.recording.readers.flat_field import flat_fields
@@ -119,23 +118,6 @@ def test_results_depend_on_the_flats_and_views_of_the_same_size_are_corrected(fo
     assert flat_fields(folder, plain.sensors) == (None, None)
     raw = open_frames("left/*.png", folder, "left")
     assert type(open_pairs(plain).left) is type(raw)  # nothing stands between where nothing is declared
-
-
-def test_check_looks_at_views_as_a_run_does(folder, monkeypatch):
-    looked_at = []
-
-    def calibrate(views, *_):
-        looked_at.append(views.fields)
-        raise RecordingError("enough")
-
-    monkeypatch.setattr(check, "calibrate_views", calibrate)
-    for flats in ("", ALL):
-        declared(folder, flats)
-        check.run_check(folder)
-    assert looked_at[0] == (None, None)
-    assert [field.sha256 for field in looked_at[1]] == [
-        f.sha256 for f in flat_fields(folder, declared(folder, ALL).sensors)
-    ]
 
 
 def test_clipped_pixels_stay_clipped(folder):

@@ -40,12 +40,17 @@ def write_hdf5(path: Path, frames: np.ndarray, attributes: dict | None = None, *
 
 
 def write_video(path: Path, frames: np.ndarray, pixels: str, codec: str, **options) -> None:
+    pytest.importorskip("av")
+    write_pictures(path, [_picture(frame, pixels) for frame in frames], codec, **options)
+
+
+def write_pictures(path: Path, pictures: list, codec: str, **options) -> None:
     av = pytest.importorskip("av")
     with av.open(str(path), "w") as container:
         stream = container.add_stream(codec, rate=25, options=options)
-        stream.width, stream.height, stream.pix_fmt = frames.shape[2], frames.shape[1], pixels
-        for frame in frames:
-            container.mux(stream.encode(_picture(frame, pixels)))
+        stream.width, stream.height, stream.pix_fmt = pictures[0].width, pictures[0].height, pictures[0].format.name
+        for picture in pictures:
+            container.mux(stream.encode(picture))
         container.mux(stream.encode())
 
 
@@ -124,6 +129,8 @@ def test_frames_come_back_as_they_were_written_in_any_order(tmp_path, kind):
     out = np.zeros_like(frames[0])
     assert reader.read(4, out) is out
     assert_array_equal(out, frames[4])
+    if kind.options.get("pixels", "").startswith("yuv"):
+        assert any("not stretched" in note for note in reader.notes)
 
 
 @pytest.mark.parametrize("kind", FORMATS[:1] + FORMATS[-13:-12] + FORMATS[-11:], ids=str)
@@ -212,8 +219,9 @@ def test_one_of_several_data_sets_must_be_named(tmp_path):
 def test_hdf5_frames_that_were_never_written_are_not_taken_for_black(tmp_path):
     frames = frames_of(8)
     with h5py.File(tmp_path / "stack.h5", "w") as file:
-        late = file.create_dataset("late", (N, HEIGHT, WIDTH), np.uint8, chunks=(3, HEIGHT, WIDTH))
+        late = file.create_dataset("late", (N, HEIGHT, WIDTH), np.uint8, chunks=(3, 10, WIDTH))
         late[:9], late[12:27] = frames[:9], frames[12:27]
+        late[27:, :10] = frames[27:, :10]  # the upper rows alone
         huge = file.create_dataset("huge", (10**15, HEIGHT, WIDTH), np.uint8, chunks=(1, HEIGHT, WIDTH))
         huge[:2] = frames[:2]
         file.create_dataset("empty", (N, HEIGHT, WIDTH), np.uint8)
@@ -266,19 +274,6 @@ def test_hdf5_frames_that_lie_in_other_files_are_those_or_refused(tmp_path):
     (tmp_path / "pixels.bin").unlink()
     with pytest.raises(RecordingError, match=r"pixels\.bin, which is not there"):
         open_frames("external.h5", tmp_path, "left")
-
-
-def test_hdf5_frames_of_which_a_part_was_never_written_are_lost(tmp_path):
-    frames = np.random.default_rng(3).integers(0, 4096, (4, 9, 14)).astype(np.uint16)
-    with h5py.File(tmp_path / "a.h5", "w") as file:
-        stack = file.create_dataset("frames", frames.shape, np.uint16, chunks=(1, 5, 6), compression="gzip")
-        stack[[0, 1, 3]] = frames[[0, 1, 3]]
-        stack[2, :5] = frames[2, :5]
-    reader = open_frames("a.h5", tmp_path, "left")
-    for i in (0, 1, 3):
-        assert_array_equal(reader.read(i), frames[i])
-    with pytest.raises(RecordingError, match=r"frame 2\): was never written"):
-        reader.read(2)
 
 
 @pytest.mark.parametrize("packed", [False, True])
@@ -336,46 +331,28 @@ def test_bitmaps_in_avi_stand_upright_whatever_their_palette(tmp_path, width, to
         open_frames("a.avi", tmp_path, "left")
 
 
-def test_luma_of_limited_range_is_not_stretched(tmp_path):
-    frames = (16 + frames_of(8) % 220).astype(np.uint8)  # 16 to 235
-    write_video(tmp_path / "left.mkv", frames, "yuv420p", "ffv1")
-    reader = open_frames("left.mkv", tmp_path, "left")
-    read = np.array([reader.read(i) for i in range(N)])
-    assert (read.min(), read.max()) == (16, 235)
-    assert_array_equal(read, frames)
-    assert any("not stretched" in note for note in reader.notes)
-
-
 @pytest.mark.parametrize(("pixels", "first"), [("yuyv422", 0), ("uyvy422", 1)])
 def test_luma_between_chroma_is_taken_alone(tmp_path, pixels, first):
     """As cameras with a standard interface write raw video: two bytes for each pixel, one of them luma."""
     av = pytest.importorskip("av")
     frames = frames_of(8)
-    with av.open(str(tmp_path / "left.avi"), "w") as container:
-        stream = container.add_stream("rawvideo", rate=25)
-        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, pixels
-        for frame in frames:
-            picture = av.VideoFrame(WIDTH, HEIGHT, pixels)
-            rows = np.full((HEIGHT, picture.planes[0].line_size), 128, np.uint8)
-            rows[:, first : 2 * WIDTH : 2] = frame
-            picture.planes[0].update(rows.tobytes())
-            container.mux(stream.encode(picture))
-        container.mux(stream.encode())
+    pictures = [av.VideoFrame(WIDTH, HEIGHT, pixels) for _ in frames]
+    for picture, frame in zip(pictures, frames, strict=True):
+        rows = np.full((HEIGHT, picture.planes[0].line_size), 128, np.uint8)
+        rows[:, first : 2 * WIDTH : 2] = frame
+        picture.planes[0].update(rows.tobytes())
+    write_pictures(tmp_path / "left.avi", pictures, "rawvideo")
     reader = open_frames("left.avi", tmp_path, "left")
     for index in (0, 5, 2):
         assert_array_equal(reader.read(index), frames[index])
 
 
 def test_frames_that_a_recorder_dropped_are_named(tmp_path):
-    av = pytest.importorskip("av")
-    with av.open(str(tmp_path / "left.mkv"), "w") as container:
-        stream = container.add_stream("ffv1", rate=25)
-        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "gray"
-        for time, frame in zip([*range(12), *range(14, 32)], frames_of(8), strict=True):
-            picture = _picture(frame, "gray")
-            picture.pts = time
-            container.mux(stream.encode(picture))
-        container.mux(stream.encode())
+    pytest.importorskip("av")
+    pictures = [_picture(frame, "gray") for frame in frames_of(8)]
+    for time, picture in zip([*range(12), *range(14, 32)], pictures, strict=True):
+        picture.pts = time
+    write_pictures(tmp_path / "left.mkv", pictures, "ffv1")
     (doubt,) = open_frames("left.mkv", tmp_path, "left").doubts
     assert "after frame 11: 2 frame(s)" in doubt
 
@@ -399,7 +376,7 @@ def test_a_damaged_packet_costs_its_frames_up_to_the_next_key_frame_and_no_other
             assert_array_equal(reader.read(index), frames[index])
 
 
-@pytest.mark.parametrize("kind", [k for k in FORMATS if k.write is not write_hdf5][::3], ids=str)
+@pytest.mark.parametrize("kind", FORMATS[::3], ids=str)
 def test_a_file_cut_short_loses_its_end_and_says_so(tmp_path, kind):
     frames = frames_of(kind.bits)
     path = tmp_path / f"left.{kind.suffix}"
@@ -409,7 +386,7 @@ def test_a_file_cut_short_loses_its_end_and_says_so(tmp_path, kind):
     try:
         reader = open_frames(path.name, tmp_path, "left")
     except RecordingError:
-        assert kind.suffix == "mp4" or "compress" in kind.options  # the table of all frames stands at the end
+        assert kind.suffix in ("h5", "mp4") or "compress" in kind.options  # the table of all frames stands at the end
         return
     lost = []
     for index in range(len(reader)):
@@ -422,11 +399,3 @@ def test_a_file_cut_short_loses_its_end_and_says_so(tmp_path, kind):
     assert len(reader) < N or lost
     if kind.suffix == "tif":
         assert lost or any("pages are whole" in note for note in reader.notes)
-
-
-def test_hdf5_cut_short_is_refused(tmp_path):
-    write_hdf5(tmp_path / "left.h5", frames_of(8))
-    content = (tmp_path / "left.h5").read_bytes()
-    (tmp_path / "left.h5").write_bytes(content[: len(content) // 2])
-    with pytest.raises(RecordingError, match=r"left\.h5"):
-        open_frames("left.h5", tmp_path, "left")

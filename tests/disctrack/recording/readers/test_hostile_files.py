@@ -5,6 +5,8 @@ import os
 import struct
 import tracemalloc
 import zlib
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -16,6 +18,7 @@ from disctrack.errors import DiscTrackError, RecordingError
 from disctrack.recording.readers import open_frames
 from disctrack.recording.readers.blocks import iter_pair_blocks
 from disctrack.recording.readers.decoding import decode
+from tests.disctrack.recording.readers.test_formats import write_hdf5, write_tiff, write_video
 
 N, HEIGHT, WIDTH = 6, 18, 22
 FRAMES = np.random.default_rng(8).integers(0, 256, (N, HEIGHT, WIDTH), dtype=np.uint8)
@@ -28,43 +31,24 @@ def write_images(folder: Path, suffix: str) -> str:
     return f"*.{suffix}"
 
 
-def write_tiff(folder: Path, suffix: str, **options) -> str:
-    tifffile = pytest.importorskip("tifffile")
-    tifffile.imwrite(folder / "stack.tif", FRAMES, **{"photometric": "minisblack", **options})
-    return "stack.tif"
-
-
-def write_hdf5(folder: Path, suffix: str, **options) -> str:
-    with h5py.File(folder / "stack.h5", "w") as file:
-        file.create_dataset("frames", data=FRAMES, **options).attrs["frame_rate"] = 1000.0
-    return "stack.h5:/frames"
-
-
-def write_video(folder: Path, suffix: str, codec: str = "ffv1") -> str:
-    av = pytest.importorskip("av")
-    with av.open(str(folder / f"video.{suffix}"), "w") as container:
-        stream = container.add_stream(codec, rate=25)
-        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "gray"
-        for frame in FRAMES:
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="gray")))
-        container.mux(stream.encode())
-    return f"video.{suffix}"
+def write_one(folder: Path, suffix: str, write: Callable, **options) -> str:
+    name = f"{'video' if write is write_video else 'stack'}.{suffix}"
+    write(folder / name, FRAMES, **options)
+    return name
 
 
 WRITERS = {
-    "png": lambda folder: write_images(folder, "png"),
-    "bmp": lambda folder: write_images(folder, "bmp"),
-    "tif": lambda folder: write_images(folder, "tif"),
-    "tiff plain": lambda folder: write_tiff(folder, "tif"),
-    "tiff imagej": lambda folder: write_tiff(folder, "tif", imagej=True),
-    "tiff deflate": lambda folder: write_tiff(folder, "tif", compression="zlib"),
-    "tiff tiles": lambda folder: write_tiff(folder, "tif", compression="zlib", tile=(16, 16)),
-    "bigtiff": lambda folder: write_tiff(folder, "tif", bigtiff=True),
-    "hdf5": lambda folder: write_hdf5(folder, "h5"),
-    "hdf5 gzip": lambda folder: write_hdf5(folder, "h5", chunks=(2, HEIGHT, WIDTH), compression="gzip"),
-    "mkv": lambda folder: write_video(folder, "mkv"),
-    "avi": lambda folder: write_video(folder, "avi", "rawvideo"),
-    "mp4": lambda folder: write_video(folder, "mp4"),
+    **{suffix: partial(write_images, suffix=suffix) for suffix in ("png", "bmp", "tif")},
+    "tiff plain": partial(write_one, suffix="tif", write=write_tiff),
+    "tiff imagej": partial(write_one, suffix="tif", write=write_tiff, imagej=True),
+    "tiff deflate": partial(write_one, suffix="tif", write=write_tiff, compression="zlib"),
+    "tiff tiles": partial(write_one, suffix="tif", write=write_tiff, compression="zlib", tile=(16, 16)),
+    "bigtiff": partial(write_one, suffix="tif", write=write_tiff, bigtiff=True),
+    "hdf5": partial(write_one, suffix="h5", write=write_hdf5, attributes={"frame_rate": 1000.0}),
+    "hdf5 gzip": partial(write_one, suffix="h5", write=write_hdf5, chunks=(2, HEIGHT, WIDTH), compression="gzip"),
+    "mkv": partial(write_one, suffix="mkv", write=write_video, pixels="gray", codec="ffv1"),
+    "avi": partial(write_one, suffix="avi", write=write_video, pixels="gray", codec="rawvideo"),
+    "mp4": partial(write_one, suffix="mp4", write=write_video, pixels="gray", codec="ffv1"),
 }
 
 
@@ -181,7 +165,7 @@ def test_hdf5_chunks_that_no_memory_holds_are_refused(tmp_path):
 
 def test_a_playlist_under_a_videos_name_opens_no_other_file(tmp_path):
     pytest.importorskip("av")
-    write_video(tmp_path, "mkv")
+    WRITERS["mkv"](tmp_path)
     (tmp_path / "list.mkv").write_text("#EXTM3U\n#EXTINF:1,\nvideo.mkv\n#EXT-X-ENDLIST\n")
     with pytest.raises(RecordingError, match="not a readable video"):
         open_frames("list.mkv", tmp_path, "left")

@@ -46,11 +46,6 @@ def test_where_white_is_zero_light_is_more_all_the_same(tmp_path, bits, packing,
     assert_array_equal(read(written(tmp_path / "black", frames, **packing)), frames)
 
 
-def test_white_is_zero_as_pillow_sees_it(tmp_path):
-    folder = as_files(tmp_path / "white", FRAMES[8], photometric="miniswhite")
-    assert_array_equal(read(folder)[0], np.array(Image.open(folder / "0.tif")))
-
-
 @pytest.mark.parametrize("compression", ["tiff_lzw", "packbits"])
 @pytest.mark.parametrize("bits", FRAMES)
 @pytest.mark.parametrize("stack", [False, True])

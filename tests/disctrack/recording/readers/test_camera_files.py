@@ -1,0 +1,474 @@
+"""Recordings of Photron (MRAW) and Phantom (cine) give pixels, times and settings as they were written, or a reason."""
+
+import os
+import re
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
+
+from disctrack.errors import RecordingError
+from disctrack.recording.readers import FrameReader, open_frames
+from disctrack.recording.readers.camera_header import check_headers
+from disctrack.recording.readers.cine import linear_from_10_bits
+from disctrack.recording.readers.time_stamps import check_time_stamps
+from tests.oracles.camera_files import TRIGGER, write_cine, write_mraw
+
+KINDS = [
+    *(f"{kind} {bits}" for kind in ("cih", "cihx") for bits in (8, 10, 12, 16)),
+    *("cine 8", "cine 10", "cine 12", "cine 16", "cine 10 packed", "cine 12 packed"),
+]
+
+
+def random_codes(rng, bits: int, n: int = 7, height: int = 24, width: int = 32) -> np.ndarray:
+    return rng.integers(0, 1 << bits, (n, height, width), dtype=np.uint8 if bits == 8 else np.uint16)
+
+
+def write(folder: Path, codes: np.ndarray, kind: str = "cih 8", camera: str = "left", **options) -> Path:
+    """A recording of a kind; the file that names it."""
+    form, bits, *packed = kind.split()
+    if form == "cine":
+        return write_cine(folder / f"{camera}.cine", codes, int(bits), packed_pixels=bool(packed), **options)
+    return write_mraw(folder / camera, codes, int(bits), kind=form, **options)
+
+
+def bits_of(kind: str) -> int:
+    return int(kind.split()[1])
+
+
+def grey_of(codes: np.ndarray, kind: str) -> np.ndarray:
+    return linear_from_10_bits()[codes] if kind == "cine 10 packed" else codes
+
+
+def pair(folder: Path, rng, kind: str, left=None, right=None) -> list[FrameReader]:
+    codes = random_codes(rng, bits_of(kind))
+    for name, options in (("left", left or {}), ("right", right or {})):
+        write(folder, codes, kind, name, **options)
+    return [open_frames(f"{name}.{kind.split()[0]}", folder, name) for name in ("left", "right")]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_depth_returns_the_pixels_that_were_written(tmp_path, rng, kind):
+    codes = random_codes(rng, bits_of(kind))
+    file = write(tmp_path, codes, kind)
+    depth = 12 if kind.endswith("packed") else bits_of(kind)
+    for named in (file.name,) if file.suffix == ".cine" else (file.name, "left.mraw", "left.*"):
+        reader = open_frames(named, tmp_path, "left")
+        assert (len(reader), reader.image_size) == (7, (32, 24))
+        assert (reader.bit_depth, reader.header.saturation) == (depth, (1 << depth) - 1)
+        for i in range(7):
+            assert_array_equal(reader.read(i, np.zeros((24, 32), codes.dtype)), grey_of(codes, kind)[i])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_file_cut_short_loses_only_its_end(tmp_path, rng, kind):
+    codes = random_codes(rng, bits_of(kind))
+    name = write(tmp_path, codes, kind).name
+    file = next(f for f in tmp_path.iterdir() if f.suffix in (".mraw", ".cine"))
+    stored = bits_of(kind) if kind.endswith("packed") or kind.startswith("cih") else 8 * codes.itemsize
+    each = 24 * 32 * stored // 8 + 8 * (file.suffix == ".cine")
+    os.truncate(file, file.stat().st_size - 2 * each - 1)
+    reader = open_frames(name, tmp_path, "left")
+    assert len(reader) == 7
+    assert any("lacks 3 of 7 frames" in note for note in reader.notes)
+    assert_array_equal(reader.read(3), grey_of(codes[3], kind))
+    for index in (4, 6):
+        with pytest.raises(RecordingError, match=rf"{file.name} \(left camera, frame {index}\).*copy it again"):
+            reader.read(index)
+    os.truncate(file, file.stat().st_size - 2 * each)
+    with pytest.raises(RecordingError, match="cut short"):
+        open_frames(name, tmp_path, "left")
+
+
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(kind=st.sampled_from(KINDS), data=st.data())
+def test_a_header_with_any_bytes_changed_is_read_or_refused(tmp_path, kind, data):
+    codes = random_codes(np.random.default_rng(1), bits_of(kind), 3, 8, 8)
+    file = write(tmp_path, codes, kind, **({"setup_bytes": 1576} if kind.startswith("cine") else {}))
+    content = bytearray(file.read_bytes())
+    # places in the headers of a cine, where numbers are believed, as often as any other
+    place = st.one_of(st.integers(0, 83), st.integers(84, 1800), st.integers(0, len(content) - 1))
+    value = st.one_of(st.sampled_from([0, 1, 127, 128, 255]), st.integers(0, 255))
+    for at, number in data.draw(st.lists(st.tuples(place, value), max_size=8)):
+        content[at % len(content)] = number
+    file.write_bytes(content[: data.draw(st.integers(0, len(content)))] if data.draw(st.booleans()) else content)
+    opened_or_refused(file, 2 * (len(content) + codes.nbytes))
+
+
+def opened_or_refused(header: Path, most: int) -> None:
+    """Whatever the header says: an answer that the file can hold, or a reason."""
+    try:
+        reader = open_frames(header.name, header.parent, "left")
+    except RecordingError:
+        return
+    assert len(reader) * reader.layout.frame_bytes <= most
+    for index in range(len(reader)):
+        try:
+            assert reader.read(index).nbytes <= most
+        except RecordingError:
+            continue
+
+
+@pytest.mark.statistical
+@settings(max_examples=80, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    kind=st.sampled_from(["cih 8", "cihx 8"]),
+    name=st.sampled_from(
+        ["Total_Frame", "Image_Width", "Image_Height", "Color_Bit", "EffectiveBit_Depth", "Save_Step", "Record_Rate"]
+    ),
+    value=st.one_of(st.integers().map(str), st.floats().map(str), st.text(max_size=20), st.just("9" * 400)),
+)
+def test_a_header_with_any_value_is_read_or_refused(tmp_path, kind, name, value):
+    images = random_codes(np.random.default_rng(1), 8, 3, 8, 8)
+    opened_or_refused(write(tmp_path, images, kind, **{name: value}), 4 * images.nbytes)
+
+
+@pytest.mark.parametrize(
+    ("kind", "options", "reason"),
+    [
+        ("cih 8", {"Color_Type": "Color", "Color_Bit": "24"}, "of colour type 'color'"),
+        ("cih 8", {"Color_Type": "Raw", "Camera_Type": "FASTCAM Nova S16 type 1100K-C-64GB"}, "a colour mosaic"),
+        ("cih 8", {"File_Format": "TIFF"}, "saved as TIFF"),
+        ("cih 8", {"Color_Bit": "14"}, "'Color Bit' is 14"),
+        ("cih 8", {"Image_Width": "-32"}, "'Image Width' is '-32'"),
+        ("cih 8", {"Image_Width": "99999999", "Image_Height": "99999999"}, "99999999 x 99999999 px"),
+        ("cih 12", {"Image_Width": "31", "Image_Height": "23"}, "do not fill whole bytes"),
+        ("cih 8", {"Total_Frame": "0"}, "no frame"),
+        ("cih 8", {"Total_Frame": "1" + "0" * 14}, "cut short"),
+        ("cih 8", {"Total_Frame": "9" * 5000}, "expected a whole number"),
+        ("cih 8", {"Record_Rate": "nan"}, "expected a number above 0"),
+        ("cine 8", {"compression": 1}, "compressed cine"),
+        ("cine 8", {"s808": 3}, "colour recording"),
+        ("cine 8", {"s808": 0x80000003}, "colour recording"),
+        ("cine 8", {"packing": 512}, "biCompression 512"),
+        ("cine 8", {"rate": 0, "times": np.arange(7.0)}, "no frame rate"),
+    ],
+)
+def test_what_cannot_be_read_is_refused_with_the_reason(tmp_path, rng, kind, options, reason):
+    file = write(tmp_path, random_codes(rng, 8), kind, **options)
+    with pytest.raises(RecordingError, match=reason) as caught:
+        open_frames(file.name, tmp_path, "left")
+    assert str(tmp_path) in str(caught.value)
+
+
+LATER = np.arange(-3, 4) / 2000
+LOCKED = (TRIGGER[0] & ~1, TRIGGER[1])
+
+
+@pytest.mark.parametrize(
+    ("kind", "left", "right", "declared", "reason"),
+    [
+        ("cih 8", {}, {}, 1000.0, r"is 1000, but the left camera's frames were recorded with 2000 Hz.*left\.cih"),
+        ("cih 8", {}, {"Record_Rate": "1000"}, 2000.0, "the right camera's frames were recorded with 1000 Hz"),
+        ("cih 8", {}, {"Save_Step": "2"}, 2000.0, r"1000 Hz \(2000 Hz, one frame in 2 saved\)"),
+        ("cih 8", {"Record_Rate": "2000.4"}, {}, 2000.0, "does not show the same instant"),
+        ("cih 8", {"Start_Frame": "12"}, {}, 2000.0, "begins with the camera's frame 12.*the right one with frame 0"),
+        ("cine 8", {}, {"rate": 1000}, 2000.0, "the right camera's frames were recorded with 1000 Hz"),
+        ("cine 8", {}, {"first_image": 9}, 2000.0, "begins with the camera's frame -3.*the right one with frame 9"),
+        ("cine 8", {}, {"times": LATER + 3e-4}, 2000.0, "taken 0.0003 s after that of the left one.*lasts 0.0005 s"),
+        (
+            "cine 8",
+            {"trigger": LOCKED},
+            {"trigger": (LOCKED[0], LOCKED[1] + 60)},
+            2000.0,
+            "the common clock.*taken 60 s after",
+        ),
+    ],
+)
+def test_frames_of_different_instants_are_an_error(tmp_path, rng, kind, left, right, declared, reason):
+    with pytest.raises(RecordingError, match=reason):
+        check_headers(*pair(tmp_path, rng, kind, left, right), declared, "recording.toml")
+
+
+@pytest.mark.parametrize(
+    ("kind", "right", "reason"),
+    [
+        (
+            "cih 8",
+            {"Trigger_Mode": "Manual", "Start_Frame": "7"},
+            "triggered in different modes: left Start, right Manual",
+        ),
+        ("cih 8", {"Shutter_Type2": "200000"}, "left 100 us, right 200 us.*lie 50 us apart"),
+        ("cih 8", {"Date": "2026/1/19"}, "1440 minutes apart"),
+        ("cine 8", {"times": LATER + 4e-5}, "taken 40 us after the left one's"),
+        ("cine 8", {"times": LATER * 1.009}, "drift apart by"),
+        (
+            "cine 8",
+            {"times": LATER + np.array([0, 0, 0, 0, 1, 1, 1]) / 2000},
+            "one camera lost frames.*changes at frame 4",
+        ),
+        ("cine 8", {"exposure_ns": 60_000}, "left 50 us, right 60 us.*lie 5 us apart"),
+        ("cine 8", {"trigger": (TRIGGER[0], TRIGGER[1] + 3600)}, "60 minutes apart"),
+    ],
+)
+def test_frames_that_may_not_be_simultaneous_are_a_warning(tmp_path, rng, kind, right, reason):
+    readers = pair(tmp_path, rng, kind, {}, right)
+    warnings = check_headers(*readers, 2000.0, "recording.toml") + sum(check_time_stamps(*readers, 2000.0), ())
+    assert any(re.search(reason, warning) for warning in warnings)
+
+
+@pytest.mark.parametrize(
+    ("kind", "declared"),
+    [("cih 8", 2000.0), ("cine 8", 2000.0), ("cine 8", 2001.0)],  # nominal, and as a clock may run
+)
+def test_cameras_that_agree_say_nothing(tmp_path, rng, kind, declared):
+    readers = pair(tmp_path, rng, kind)
+    assert check_headers(*readers, declared, "recording.toml") == ()
+    assert check_time_stamps(*readers, declared) == ((), ())
+
+
+@pytest.mark.parametrize("bits", [8, 16])
+def test_files_of_another_writer_are_read(tmp_path, rng, bits):
+    py_mraw = pytest.importorskip("pyMRAW")
+    images = random_codes(rng, min(bits, 12))
+    settings = {"Record Rate(fps)": "5000", "Shutter Speed(s)": "1/20000"}
+    py_mraw.save_mraw(images, str(tmp_path / "left.cih"), bit_depth=bits, info_dict=settings)
+    reader = open_frames("left.cih", tmp_path, "left")
+    assert_array_equal([reader.read(i) for i in range(7)], images)
+    header = reader.header
+    assert (header.frame_rate, header.exposure) == (5000.0, 1 / 20000)
+
+
+@pytest.mark.parametrize("kind", ["cih", "cihx"])
+@pytest.mark.parametrize("bits", [8, 12, 16])
+def test_another_reader_of_mraw_sees_the_same_pixels(tmp_path, rng, bits, kind):
+    py_mraw = pytest.importorskip("pyMRAW")
+    images = random_codes(rng, min(bits, 12))
+    header = write_mraw(tmp_path / "left", images, bits, kind=kind, depth=min(bits, 12))
+    if bits == 8:
+        with pytest.warns(UserWarning, match="Not 12bit"):
+            theirs, _ = py_mraw.load_video(str(header))
+    else:
+        theirs, _ = py_mraw.load_video(str(header))
+    reader = open_frames(header.name, tmp_path, "left")
+    assert_array_equal([reader.read(i) for i in range(7)], theirs)
+
+
+@pytest.mark.parametrize("kind", ["cih", "cihx"])
+def test_settings_come_from_the_header(tmp_path, rng, kind):
+    header = write_mraw(
+        tmp_path / "left", random_codes(rng, 12), 16, depth=12, kind=kind, Start_Frame="-40", Save_Step="4"
+    )
+    found = open_frames(header.name, tmp_path, "left").header
+    assert (found.frame_rate, found.step) == (500.0, 4)  # of 2000 frames per second, one in four
+    assert found.exposure == pytest.approx(1e-4, rel=1e-12)
+    assert (found.trigger, found.first_frame, found.saturation) == ("Start", -40, 4095)
+    assert found.recorded.isoformat() == "2026-01-18T11:56:13"
+    assert "Mini AX200" in found.sentence()
+    assert found.as_dict()["exposure"] == found.exposure
+
+
+def test_bits_at_the_high_side_are_used_as_they_are(tmp_path, rng):
+    images = random_codes(rng, 12) << 4
+    write_mraw(tmp_path / "left", images, 16, depth=12, EffectiveBit_Side="Higher")
+    reader = open_frames("left.cih", tmp_path, "left")
+    assert (reader.bit_depth, reader.header.saturation) == (16, 4095 << 4)
+    assert_array_equal(reader.read(3), images[3])
+
+
+def test_values_beyond_the_stated_depth_are_used_and_said(tmp_path, rng):
+    write_mraw(tmp_path / "left", random_codes(rng, 16), 16, depth=12)
+    reader = open_frames("left.cih", tmp_path, "left")
+    assert (reader.bit_depth, reader.header.saturation) == (16, 65535)
+    assert any("grey values go up to" in note for note in reader.notes)
+
+
+def test_an_impossible_exposure_or_step_is_not_used_and_said(tmp_path, rng):
+    write_mraw(tmp_path / "left", random_codes(rng, 8), 8, Shutter_Type2="900000", Save_Step="2500")
+    reader = open_frames("left.cih", tmp_path, "left")
+    assert reader.header.exposure is None
+    assert reader.header.frame_rate == 2000
+    assert any("longer than a frame" in note for note in reader.notes)
+    assert any("taken as consecutive" in doubt for doubt in reader.doubts)
+
+
+def test_header_and_frames_must_lie_together(tmp_path, rng):
+    header = write_mraw(tmp_path / "left", random_codes(rng, 8), 8)
+    header.rename(tmp_path / "kept")
+    with pytest.raises(RecordingError, match=r"there is no left\.cihx or \.cih beside it"):
+        open_frames("left.mraw", tmp_path, "left")
+    (tmp_path / "kept").rename(header)
+    (tmp_path / "left.mraw").unlink()
+    with pytest.raises(RecordingError, match=r"there is no left\.mraw beside it"):
+        open_frames("left.cih", tmp_path, "left")
+    write_mraw(tmp_path / "left", random_codes(rng, 8), 8)
+    write_mraw(tmp_path / "left_2", random_codes(rng, 8), 8)
+    with pytest.raises(RecordingError, match="name one recording"):
+        open_frames("left*.cih", tmp_path, "left")
+
+
+def test_a_header_of_nested_or_expanding_xml_costs_nothing(tmp_path, rng):
+    header = write_mraw(tmp_path / "left", random_codes(rng, 8), 8, kind="cihx")
+    bomb = b'<!DOCTYPE cih [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;">]>'
+    for content in (bomb + b"<cih>&b;</cih>", b"<cih>" + bomb + b"&b;</cih>", b"<cih>" + b"<a>" * 20_000 + b"</cih>"):
+        header.write_bytes(content)
+        with pytest.raises(RecordingError, match="the XML in it is damaged"):
+            open_frames("left.cihx", tmp_path, "left")
+    header.write_bytes(b"<cih>" + b"<a>" * 20_000 + b"</a>" * 20_000 + b"</cih>")
+    with pytest.raises(RecordingError, match="saved as nothing known"):
+        open_frames("left.cihx", tmp_path, "left")
+
+
+def test_rows_padded_as_in_a_bitmap_are_read(tmp_path, rng):
+    codes = random_codes(rng, 8, width=30)
+    padded = np.pad(codes, ((0, 0), (0, 0), (0, 2)))
+    file = write_cine(tmp_path / "left.cine", padded, 8)
+    content = bytearray(file.read_bytes())
+    struct.pack_into("<i", content, 44 + 4, 30)  # the bitmap's width
+    file.write_bytes(content)
+    reader = open_frames("left.cine", tmp_path, "left")
+    assert_array_equal([reader.read(i) for i in range(7)], codes)
+
+
+def test_notes_in_front_of_the_images_may_differ_in_length(tmp_path, rng):
+    codes = random_codes(rng, 12)
+    write_cine(tmp_path / "left.cine", codes, 12, notes=(8, 24, 4096))
+    reader = open_frames("left.cine", tmp_path, "left")
+    assert_array_equal([reader.read(i) for i in range(7)], codes)
+
+
+@pytest.mark.parametrize(("bits", "packed"), [(12, False), (16, False), (10, True)])
+def test_another_reader_of_cine_sees_the_same_pixels(tmp_path, rng, bits, packed):
+    """Pycine stretches grey values from black and white level to the full range: of packed ones from 64 and 4064."""
+    raw = pytest.importorskip("pycine.raw")
+    codes = random_codes(rng, bits)
+    if packed:
+        codes = np.clip(codes, 64, 1014)  # below and above it clips
+    file = write_cine(tmp_path / "left.cine", codes, bits, packed_pixels=packed)
+    theirs = np.stack(list(raw.read_frames(str(file), start_frame=1)[0])).astype(int)
+    reader = open_frames("left.cine", tmp_path, "left")
+    ours = np.stack([reader.read(i) for i in range(7)]).astype(int)
+    if not packed:
+        assert_array_equal(ours, theirs)
+    else:  # within a unit of its table, and another of its rounding down
+        assert_allclose((ours - 64) * 4095 / 4000, theirs, atol=2.1)
+
+
+@pytest.mark.parametrize("bits", [8, 16])
+def test_ffmpeg_sees_the_same_pixels_and_rate(tmp_path, rng, bits):
+    av = pytest.importorskip("av")
+    codes = random_codes(rng, bits)
+    file = write_cine(tmp_path / "left.cine", codes, bits)
+    with av.open(str(file)) as container:
+        frames = [frame.to_ndarray() for frame in container.decode(video=0)]
+        assert container.streams.video[0].time_base.denominator == 2000
+    reader = open_frames("left.cine", tmp_path, "left")
+    assert_array_equal([reader.read(i) for i in range(7)], frames)
+
+
+def test_codes_of_10_bits_are_linear_in_the_light():
+    """Black and white of the format's description; the inverse of BT.709, computed forwards; monotonic throughout."""
+    grey = linear_from_10_bits().astype(float)
+    assert (np.diff(grey) >= 0).all()
+    assert_allclose(grey[[64, 1014, 1015, 1023]], [64, 4064, 4095, 4095], atol=1)
+    light = (grey[64:1014] - 64) / 4000
+    code = 63.5 + 950.4 * np.where(light < 0.01805, 4.5 * light, 1.0993 * np.maximum(light, 1e-9) ** 0.45 - 0.0993)
+    # half a unit of 4000 by rounding, where the curve is steepest (4.5 x 950 / 4000 codes a unit): 0.53
+    assert_allclose(code, np.arange(64, 1014), atol=0.6)
+
+
+def test_codes_of_10_bits_agree_with_the_published_table():
+    table = pytest.importorskip("pycine.linLUT").linLUT
+    assert np.abs(linear_from_10_bits().astype(int) - table).max() <= 1
+
+
+def test_settings_and_times_come_from_the_file(tmp_path, rng):
+    write_cine(tmp_path / "left.cine", random_codes(rng, 8), 8)
+    reader = open_frames("left.cine", tmp_path, "left")
+    header = reader.header
+    assert (header.frame_rate, reader.frame_rate, header.first_frame) == (2000.0, 2000.0, -3)
+    assert header.exposure == pytest.approx(50e-6, rel=1e-12)
+    assert header.trigger_time == TRIGGER[1] + 0.25
+    assert header.first_time == pytest.approx(-3 / 2000, abs=2**-30)
+    assert not header.locked_clock
+    assert header.recorded.isoformat() == "2023-11-14T22:13:20"
+    # time stamps have 2**-30 s
+    assert_allclose(reader.timestamps, np.arange(7) / 2000, atol=2**-29)
+    assert "Phantom 711, serial number 12345" in " ".join(reader.notes)
+
+
+def test_an_older_setup_lacks_its_later_fields(tmp_path, rng):
+    codes = random_codes(rng, 8)
+    write_cine(tmp_path / "left.cine", codes, 8, setup_bytes=1200)
+    reader = open_frames("left.cine", tmp_path, "left")
+    assert_array_equal(reader.read(0), codes[0])
+    assert reader.header.exposure == pytest.approx(50e-6)  # in microseconds there
+
+
+@pytest.mark.parametrize(
+    ("times", "reason"),
+    [(np.zeros(7), "do not belong"), (np.arange(7) / 1300, "do not belong"), (-np.arange(7) / 2000, "do not belong")],
+)
+def test_impossible_time_stamps_are_not_used_and_said(tmp_path, rng, times, reason):
+    write_cine(tmp_path / "left.cine", random_codes(rng, 8), 8, times=times)
+    reader = open_frames("left.cine", tmp_path, "left")
+    assert reader.timestamps is None
+    assert any(reason in note for note in reader.notes)
+
+
+def test_a_recording_of_which_every_tenth_frame_was_saved_has_a_tenth_of_the_rate(tmp_path, rng):
+    """The setup keeps the camera's rate; only the time stamps tell."""
+    write_cine(
+        tmp_path / "left.cine", random_codes(rng, 8), 8, rate=90_000, times=np.arange(7) / 9000, exposure_ns=10_000
+    )
+    header = open_frames("left.cine", tmp_path, "left").header
+    assert (header.frame_rate, header.step) == (9000, 10)
+    assert "9000 Hz (90000 Hz, one frame in 10 saved)" in header.sentence()
+
+
+def test_a_gap_in_the_time_stamps_is_kept(tmp_path, rng):
+    times = np.array([0, 1, 2, 3, 9, 10, 11]) / 2000
+    write_cine(tmp_path / "left.cine", random_codes(rng, 8), 8, times=times)
+    assert_allclose(open_frames("left.cine", tmp_path, "left").timestamps, times, atol=2**-29)
+
+
+def test_a_grey_head_of_a_colour_camera_is_grey(tmp_path, rng):
+    write_cine(tmp_path / "left.cine", random_codes(rng, 8), 8, s808=0x80000000)
+    assert len(open_frames("left.cine", tmp_path, "left")) == 7
+
+
+@pytest.mark.parametrize(
+    ("offset", "kind", "value", "reason"),
+    [
+        (0, "2s", b"XX", "not a cine file"),
+        (20, "I", 0, "no frame"),
+        (20, "I", 0xFFFFFFFF, "table of 4294967295 images"),
+        (24, "I", 0xFFFFFF00, "bitmap header"),
+        (28, "I", 0xFFFFFF00, "camera setup"),
+        (28, "I", 0, "no camera setup"),
+        (32, "I", 0xFFFFFF00, "table of 7 images"),
+        (48, "i", 1 << 30, "no camera of this kind"),
+        (48, "i", 40, "does not have the 960 bytes"),
+        (48, "i", -32, "no camera of this kind"),
+        (58, "H", 24, "colour recording"),
+    ],
+)
+def test_a_hostile_header_is_refused_before_anything_is_made_of_its_size(tmp_path, rng, offset, kind, value, reason):
+    file = write_cine(tmp_path / "left.cine", random_codes(rng, 8), 8)
+    content = bytearray(file.read_bytes())
+    struct.pack_into("<" + kind, content, offset, value)
+    file.write_bytes(content)
+    with pytest.raises(RecordingError, match=reason):
+        open_frames("left.cine", tmp_path, "left")
+
+
+def test_a_damaged_record_is_one_lost_frame(tmp_path, rng):
+    codes = random_codes(rng, 8)
+    file = write_cine(tmp_path / "left.cine", codes, 8, notes=(8, 12))
+    content = bytearray(file.read_bytes())
+    (table,) = struct.unpack_from("<I", content, 32)
+    (record,) = struct.unpack_from("<q", content, table + 8 * 4)
+    content[record + 4] ^= 1  # the size behind its note of 8 bytes
+    file.write_bytes(content)
+    reader = open_frames("left.cine", tmp_path, "left")
+    assert any("lacks 1 of 7 frames" in note for note in reader.notes)
+    for index in range(7):
+        if index == 4:
+            with pytest.raises(RecordingError, match=r"frame 4\): there is no image of the right size"):
+                reader.read(index)
+        else:
+            assert_array_equal(reader.read(index), codes[index])
