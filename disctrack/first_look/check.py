@@ -237,7 +237,7 @@ def _once(findings: Iterable[Finding]) -> list[Finding]:
 
 def _track(recording: Recording, rig: StereoRig, pairs: ImagePairs, frames: range) -> Tracking:
     """Track a stretch."""
-    settings = TrackingSettings(refine_markers=False, first_pass=False, table="board")
+    settings = TrackingSettings(refine_markers=False, first_pass=False)
     read_blocks = partial(iter_pair_blocks, pairs.left, pairs.right)
     rate, gravity = recording.frame_rate, recording.gravity
     return track(read_blocks, frames, rig, recording.disc, rate, gravity=gravity, settings=settings)

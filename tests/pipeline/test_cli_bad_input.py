@@ -100,7 +100,7 @@ def test_grey_stored_as_colour_and_sixteen_bits_are_measured_and_said(recording,
                 grey = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
                 grey = grey[..., 0] if grey.ndim == 3 else grey
                 replace(file, change(grey))
-        assert main(["run", str(recording), "--overwrite", *QUICK]) == 0
+        assert main(["run", str(recording), "--overwrite", "-v", *QUICK]) == 0
         said = " ".join(capsys.readouterr().out.split())
         poses.append((read_trajectory(recording / "results" / "trajectory.h5"), said))
     (plain, _), (colour, said_colour), (deep, said_deep) = poses
