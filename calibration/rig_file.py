@@ -203,9 +203,9 @@ def write_rig(
     attributes : of the root, beside its own
     Raises RigFileError if it cannot be written.
 
-    >>> write_rig("rig.h5", read_rig("clip/results/rig.h5"))
-    >>> read_rig("rig.h5").baseline == read_rig("clip/results/rig.h5").baseline
-    True
+        >>> write_rig("rig.h5", read_rig("clip/results/rig.h5"))
+        >>> read_rig("rig.h5").baseline == read_rig("clip/results/rig.h5").baseline
+        True
     """
     if isinstance(content, StereoCalibration):
         content = RigFile(content.rig, record_of(content))

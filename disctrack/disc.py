@@ -25,8 +25,8 @@ class Disc(Brief):
 
     Body frame: origin at the centre of mass, third axis e3 out of the upper face.
 
-    >>> Disc(0.0375, 0.003, 0.2, [[0.026, 0, 0.003], [0, 0.026, 0.003], [-0.026, 0, 0.003]], 0.007)
-    Disc(diameter 75 mm, thickness 6 mm, mass 200 g, dots 3)
+        >>> Disc(0.0375, 0.003, 0.2, [[0.026, 0, 0.003], [0, 0.026, 0.003], [-0.026, 0, 0.003]], 0.007)
+        Disc(diameter 75 mm, thickness 6 mm, mass 200 g, dots 3)
     """
 
     radius: float  # r [m]

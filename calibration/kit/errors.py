@@ -9,11 +9,11 @@ class DiscTrackError(Exception):
 
     It lives here, not in `disctrack`, because imports point from `disctrack` to `calibration` only.
 
-    >>> try:
-    ...     read_recording("nowhere")
-    ... except DiscTrackError as error:
-    ...     print(str(error).partition(":")[0])
-    nowhere
+        >>> try:
+        ...     read_recording("nowhere")
+        ... except DiscTrackError as error:
+        ...     print(str(error).partition(":")[0])
+        nowhere
     """
 
 

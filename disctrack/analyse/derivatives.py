@@ -145,9 +145,9 @@ def differentiate(trajectory: Trajectory, breaks: Sequence[float] = ()) -> Measu
     side is passed over.
     Raises AnalysisError when too few frames have a pose, or time does not increase.
 
-    >>> motion = differentiate("clip/results/trajectory.h5")
-    >>> motion.velocity.shape
-    (300, 3)
+        >>> motion = differentiate("clip/results/trajectory.h5")
+        >>> motion.velocity.shape
+        (300, 3)
     """
     time = np.asarray(trajectory.time, float)
     good = trajectory.measured & np.isfinite(trajectory.pose_covariance).all(axis=(1, 2))

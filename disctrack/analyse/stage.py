@@ -56,9 +56,9 @@ def run_analyse(
     figures : also write every figure of the report as PNG and PDF
     Raises TrajectoryFileError, AnalysisError, OutputError (also when there is a report and not `overwrite`).
 
-    >>> outcome = run_analyse("clip/results/trajectory.h5", overwrite=True)
-    >>> outcome.report.name
-    'report.html'
+        >>> outcome = run_analyse("clip/results/trajectory.h5", overwrite=True)
+        >>> outcome.report.name
+        'report.html'
     """
     from disctrack.analyse.figures import all_figures  # matplotlib is wanted here only
 

@@ -78,8 +78,8 @@ def run_batch(
     Raises RecordingError if there is nothing to measure, OutputError, ClusterError. What is wrong with one recording
     is in its row.
 
-    >>> run_batch(["clip"], side_by_side=1).rows[0]["pairs_measured"]
-    300
+        >>> run_batch(["clip"], side_by_side=1).rows[0]["pairs_measured"]
+        300
     """
     options = options or BatchOptions()
     cores = default_threads()

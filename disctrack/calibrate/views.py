@@ -87,8 +87,8 @@ def find_views(
     parts : of the images that are the cameras'; images of a part's own size are taken whole
     Raises RecordingError if they do not pair up.
 
-    >>> len(find_views("calibration/left/*.png", "calibration/right/*.png", "clip"))
-    18
+        >>> len(find_views("calibration/left/*.png", "calibration/right/*.png", "clip"))
+        18
     """
     sides = [_views_of(pattern, Path(folder), camera) for pattern, camera in zip((left, right), CAMERAS, strict=True)]
     views = TargetImages(sides[0], sides[1], fields, parts)
@@ -150,10 +150,11 @@ def calibrate_views(
     table_view : index among all views; board_thickness [m]
     Raises RecordingError if the table view cannot be read, CalibrationError if the views do not allow a calibration.
 
-    >>> views = find_views("calibration/left/*.png", "calibration/right/*.png", "clip")
-    >>> found, problems = calibrate_views(views, read_recording("clip").chessboard, table_view=0, board_thickness=3e-3)
-    >>> round(found.rig.baseline, 4), problems
-    (0.2955, ())
+        >>> views = find_views("calibration/left/*.png", "calibration/right/*.png", "clip")
+        >>> board = read_recording("clip").chessboard
+        >>> found, problems = calibrate_views(views, board, table_view=0, board_thickness=3e-3)
+        >>> round(found.rig.baseline, 4), problems
+        (0.2955, ())
     """
     if table_view is not None and not 0 <= table_view < len(views):
         raise RecordingError(

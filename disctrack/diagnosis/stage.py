@@ -61,8 +61,8 @@ def diagnose(trajectory: Trajectory, model: str = PAPER, settings: Settings | No
     model : "paper", "none", or a TOML file (`model_file.declared_model`)
     Raises AnalysisError, SceneError, ModelError.
 
-    >>> diagnose("clip").sentence.partition(".")[0]
-    'Nothing is missing'
+        >>> diagnose("clip").sentence.partition(".")[0]
+        'Nothing is missing'
     """
     declared = declared_model(trajectory, model)
     answer = diagnose_motion(trajectory, declared.model, declared.faults, settings)
@@ -211,9 +211,9 @@ def run_diagnose(
     figures : also write every figure of the page as PNG and PDF
     Raises TrajectoryFileError, AnalysisError, SceneError, ModelError, OutputError.
 
-    >>> outcome = run_diagnose("clip/results/trajectory.h5", overwrite=True)
-    >>> sorted(file.name for file in outcome.files)[:2]
-    ['diagnosis.html', 'diagnosis.json']
+        >>> outcome = run_diagnose("clip/results/trajectory.h5", overwrite=True)
+        >>> sorted(file.name for file in outcome.files)[:2]
+        ['diagnosis.html', 'diagnosis.json']
     """
     from disctrack.diagnosis.pages.figures import all_figures  # matplotlib is wanted here only
 

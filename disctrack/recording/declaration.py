@@ -207,8 +207,8 @@ def read_recording(path: str | Path) -> Recording:
 
     Raises RecordingError that names the file, the key, what was found, what was expected and what to do.
 
-    >>> read_recording("clip").disc.n_markers
-    6
+        >>> read_recording("clip").disc.n_markers
+        6
     """
     file = _recording_file(Path(path))
     keep(file)

@@ -47,9 +47,9 @@ def simulate(
     where the nutation falls to `theta_end` [rad], the disc stands up, or it lands after a loss of contact; then only
     the times before are there. Raises ModelError for a state or times that make no sense.
 
-    >>> disc = read_recording("clip").disc
-    >>> simulate(Model(disc), steady_precession(0.1, disc), duration=0.1).q.shape
-    (101, 6)
+        >>> disc = read_recording("clip").disc
+        >>> simulate(Model(disc), steady_precession(0.1, disc), duration=0.1).q.shape
+        (101, 6)
     """
     grid = _grid(duration, rate, times)
     assembly = Assembly(model, theta_end)

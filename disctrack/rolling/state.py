@@ -16,8 +16,8 @@ class State:
     Without v_x, v_y the disc rolls; with them it slides at the contact (or sticks, if they agree with rolling); with z
     and v_z too it is in the air.
 
-    >>> State(theta=0.1).theta
-    0.1
+        >>> State(theta=0.1).theta
+        0.1
     """
 
     x: float = 0.0  # geometric centre O in world axes [m]

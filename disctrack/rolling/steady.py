@@ -26,8 +26,8 @@ def steady_precession(
         `nutation_frequency`; omega2 and omega3 are changed along with it, as the linear motion requires.
     Raises ModelError where no regular precession exists.
 
-    >>> float(steady_precession(0.1, read_recording("clip").disc).theta)
-    0.1
+        >>> float(steady_precession(0.1, read_recording("clip").disc).theta)
+        0.1
     """
     p, q = precession_rate(theta, disc, gravity, omega3)
     offset = nutation_amplitude * np.cos(nutation_phase)

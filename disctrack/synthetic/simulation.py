@@ -55,8 +55,8 @@ def run_simulate(
     duration [s], rate [Hz] : those of the scene's cameras (n_frames, frame_rate_hz) if not given. The file ends earlier
     where the motion does. Raises SceneError, ModelError, OutputError.
 
-    >>> run_simulate("scene.toml", "motion.h5", duration=0.01).path.name
-    'motion.h5'
+        >>> run_simulate("scene.toml", "motion.h5", duration=0.01).path.name
+        'motion.h5'
     """
     scene_path, output = Path(scene_path), Path(output)
     keep(scene_path)

@@ -47,10 +47,10 @@ def measure_pairs(
     gravity    : [m/s^2], kept with the trajectory for the physics
     Raises TrackingError if the arrays are not such images, do not belong to the rig, or show the disc in no pair.
 
-    >>> pairs = open_pairs("clip")
-    >>> images = np.array([[pairs.left.read(i), pairs.right.read(i)] for i in range(20)])
-    >>> len(measure_pairs(images, "clip/results/rig.h5", read_recording("clip"), 1000.0).trajectory)
-    20
+        >>> pairs = open_pairs("clip")
+        >>> images = np.array([[pairs.left.read(i), pairs.right.read(i)] for i in range(20)])
+        >>> len(measure_pairs(images, "clip/results/rig.h5", read_recording("clip"), 1000.0).trajectory)
+        20
     """
     if not isinstance(images, tuple | list):
         images = grey_values(images, "images")

@@ -92,8 +92,8 @@ def open_pairs(recording: Recording, frames: tuple[int | None, int | None] = (No
     Raises RecordingError if images are missing, do not belong together, or the range holds no frame; or if a camera's
     own header contradicts the other's, or the declared frame rate.
 
-    >>> len(open_pairs("clip", frames=(100, 200)))
-    100
+        >>> len(open_pairs("clip", frames=(100, 200)))
+        100
     """
     readers = [
         open_frames(pattern, recording.folder, camera)
@@ -151,9 +151,9 @@ def measure(
     boards : of the calibration's views, so that a wrong table view is told with the right one
     Raises TrackingError if the disc is found in no frame.
 
-    >>> measurement = measure("clip", "clip/results/rig.h5", open_pairs("clip"))
-    >>> int(measurement.trajectory.measured.sum())
-    300
+        >>> measurement = measure("clip", "clip/results/rig.h5", open_pairs("clip"))
+        >>> int(measurement.trajectory.measured.sum())
+        300
     """
     settings = settings or TrackingSettings()
     if recording.table is not None:

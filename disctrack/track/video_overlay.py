@@ -43,10 +43,10 @@ def write_overlay(
     pairs : (row of the trajectory, images (2, height, width)) in order
     Raises OutputError.
 
-    >>> pairs = open_pairs("clip")
-    >>> frames = ((i, np.array([pairs.left.read(i), pairs.right.read(i)])) for i in range(5))
-    >>> write_overlay("five.mp4", frames, read_trajectory("clip")).name
-    'five.mp4'
+        >>> pairs = open_pairs("clip")
+        >>> frames = ((i, np.array([pairs.left.read(i), pairs.right.read(i)])) for i in range(5))
+        >>> write_overlay("five.mp4", frames, read_trajectory("clip")).name
+        'five.mp4'
     """
     path, stream = Path(path), iter(pairs)
     first = next(stream, None)

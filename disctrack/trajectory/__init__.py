@@ -94,9 +94,9 @@ class Trajectory(Brief):
 
     n frames, m markers. NaN where there is no answer; `frame_status` tells why.
 
-    >>> trajectory = read_trajectory("clip")
-    >>> trajectory.q.shape, trajectory.coordinate_sigma.shape
-    ((300, 6), (300, 6))
+        >>> trajectory = read_trajectory("clip")
+        >>> trajectory.q.shape, trajectory.coordinate_sigma.shape
+        ((300, 6), (300, 6))
     """
 
     time: Array  # (n,) [s], mid exposure of frame i is i / frame_rate unless the camera said otherwise

@@ -79,10 +79,10 @@ def write_trajectory(
 
     details : numbers of the run (blur, noise, ...), of JSON's types; see `read_details`
 
-    >>> trajectory = read_trajectory("clip")
-    >>> write_trajectory("copy.h5", trajectory, Provenance("copy", inputs={}, settings={}))
-    >>> np.array_equal(read_trajectory("copy.h5").q, trajectory.q)
-    True
+        >>> trajectory = read_trajectory("clip")
+        >>> write_trajectory("copy.h5", trajectory, Provenance("copy", inputs={}, settings={}))
+        >>> np.array_equal(read_trajectory("copy.h5").q, trajectory.q)
+        True
     """
     path = Path(path)
     refuse_existing(path, overwrite)
@@ -110,8 +110,8 @@ def read_trajectory(path: str | Path) -> Trajectory:
 
     path : of the file, or of the folder that holds it, itself or in its `results`
 
-    >>> len(read_trajectory("clip/results/trajectory.h5"))
-    300
+        >>> len(read_trajectory("clip/results/trajectory.h5"))
+        300
     """
     with _reading(trajectory_in(Path(path))) as file:
         trajectory = _trajectory(file)
@@ -213,9 +213,9 @@ def read_group(
 
     names : the arrays that are wanted, where not all are
 
-    >>> variables, attributes = read_group("clip/results/trajectory.h5", "markers")
-    >>> variables["centre_px"].shape
-    (300, 2, 6, 2)
+        >>> variables, attributes = read_group("clip/results/trajectory.h5", "markers")
+        >>> variables["centre_px"].shape
+        (300, 2, 6, 2)
     """
     with _reading(Path(path)) as file:
         if group not in file or not isinstance(file[group], h5py.Group):

@@ -218,8 +218,8 @@ def measured_attributes():
     for groups in ast.walk(ast.parse(Path(stage.__file__).read_text(encoding="utf-8"))):
         if isinstance(groups, ast.Dict):
             for name, made in zip(groups.keys, groups.values, strict=True):
-                if isinstance(made, ast.Call) and getattr(made.func, "id", "") == "Group":
-                    given = [a for a in made.args if isinstance(a, ast.Dict)]
+                if isinstance(name, ast.Constant) and isinstance(made, ast.Tuple):
+                    given = [a for a in made.elts if isinstance(a, ast.Dict)]
                     found[name.value] = {key.value for d in given for key in d.keys if isinstance(key, ast.Constant)}
     assert len(found["contact"]) > 10
     assert "loss_J" in found["energy"]

@@ -16,8 +16,8 @@ def open_frames(pattern: str, folder: str | Path, camera: str) -> FrameReader:
     camera  : "left" or "right", for messages
     Raises RecordingError if nothing matches, or if no frame can be read.
 
-    >>> len(open_frames("left/*.png", "clip", "left"))
-    300
+        >>> len(open_frames("left/*.png", "clip", "left"))
+        300
     """
     pattern, member = split_member(pattern)
     files = match_files(pattern, Path(folder), camera)

@@ -23,9 +23,9 @@ class FrameReader:
 
     `read` may be called from several threads at once.
 
-    >>> reader = open_frames("left/*.png", "clip", "left")
-    >>> reader.image_size, reader.read(0).shape
-    ((272, 272), (272, 272))
+        >>> reader = open_frames("left/*.png", "clip", "left")
+        >>> reader.image_size, reader.read(0).shape
+        ((272, 272), (272, 272))
     """
 
     camera: str  # left or right

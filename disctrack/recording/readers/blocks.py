@@ -84,9 +84,9 @@ def iter_pair_blocks(
     holds BLOCK_BYTES, so that the memory is independent of the recording's length and of the image size.
     Raises RecordingError if the two sequences do not belong together (`check_pair`).
 
-    >>> pairs = open_pairs("clip")
-    >>> sum(len(block.images) for block in iter_pair_blocks(pairs.left, pairs.right))
-    300
+        >>> pairs = open_pairs("clip")
+        >>> sum(len(block.images) for block in iter_pair_blocks(pairs.left, pairs.right))
+        300
     """
     check_pair(left, right)
     stop = len(left) if stop is None else min(stop, len(left))

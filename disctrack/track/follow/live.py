@@ -75,9 +75,9 @@ class Tracker:
     The first pairs compile (once per installation) and search the disc; after that a pair takes
     about a millisecond. A pair in which the disc is not found is answered with a status, and searched anew at the next.
 
-    >>> tracker, pairs = Tracker("clip/results/rig.h5", read_trajectory("clip")), open_pairs("clip")
-    >>> tracker.next(pairs.left.read(0), pairs.right.read(0)).status.name
-    'MEASURED'
+        >>> tracker, pairs = Tracker("clip/results/rig.h5", read_trajectory("clip")), open_pairs("clip")
+        >>> tracker.next(pairs.left.read(0), pairs.right.read(0)).status.name
+        'MEASURED'
     """
 
     @checked

@@ -17,7 +17,7 @@ def write_csv(path: str | Path, trajectory: Trajectory, overwrite: bool = False)
     Of every coordinate its value, the sigma of the frame's own noise, and the sigma that all frames share through the
     calibration. Coordinates have seven decimals however many turns the angles have counted, sigmas seven digits.
 
-    >>> write_csv("table.csv", read_trajectory("clip"))
+        >>> write_csv("table.csv", read_trajectory("clip"))
     """
     path = Path(path)
     refuse_existing(path, overwrite)

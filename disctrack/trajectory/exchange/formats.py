@@ -114,8 +114,8 @@ def convert(
         [px], unit [m]
     Raises DiscTrackError that names the formats there are.
 
-    >>> convert("clip/results/rig.h5", "rig.yml").paths
-    (PosixPath('rig.yml'),)
+        >>> convert("clip/results/rig.h5", "rig.yml").paths
+        (PosixPath('rig.yml'),)
     """
     paths = [trajectory_in(Path(p)) for p in ([source] if isinstance(source, (str, os.PathLike)) else source)]
     path = Path(target)
