@@ -6,6 +6,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 from calibration import Board, BoardNotFound, Camera, CornerView, find_corners
+from calibration.board import corner_fit
+from calibration.board._corner_kernel import fit_corners
 from calibration.board.chessboard import grey_values
 from calibration.cameras.camera import project, rotation_from_vector
 
@@ -70,7 +72,7 @@ def lit(image, added, fall_off):
 
 
 @pytest.mark.statistical
-def test_added_light_shifts_no_corner(board_drawer):
+def test_added_light_shifts_no_corner(board_drawer, monkeypatch):
     board = Board((9, 6), 8e-3)
     R, t = pose(board, (10, 12, 7))
     image, true = board_drawer(CAMERA, R, t, board, sub=6), truth(board, R, t)
@@ -85,6 +87,20 @@ def test_added_light_shifts_no_corner(board_drawer):
     assert np.abs(plain - true).max() < 0.01  # the premise
     assert shift(added=0.0) < 5e-4
     assert shift(added=30.0) < 1e-3  # the noise of a good image shifts a corner by 0.004 px
+    monkeypatch.setattr(corner_fit, "degree_for", lambda n, most: 0)
+    assert shift(added=30.0) > 5e-3
+
+
+def test_opencv_corners_at_the_usual_window_are_worse(board_drawer):
+    board = Board((9, 6), 8e-3)
+    R, t = pose(board, (10, -50, 5))
+    image = board_drawer(CAMERA, R, t, board, rng=np.random.default_rng(3))
+    ours, true = find_corners(image, (9, 6)).points, truth(board, R, t)
+    theirs = cv2.cornerSubPix(
+        image, np.ascontiguousarray(true, np.float32).reshape(-1, 1, 2), (5, 5), (-1, -1), (3, 100, 1e-4)
+    ).reshape(-1, 2)
+    error = [np.sqrt(np.mean((points - true) ** 2)) for points in (ours, theirs)]
+    assert error[0] < 0.5 * error[1]
 
 
 @pytest.mark.statistical
@@ -196,6 +212,28 @@ def test_an_image_too_large_for_the_rough_search_loses_nothing(board_drawer):
 
 
 @pytest.mark.statistical
+def test_squares_of_150_px_are_as_well_located_by_a_small_first_window(board_drawer, monkeypatch):
+    board, camera = Board((4, 3), 8e-3), Camera(2400.0, 2410.0, 519.0, 403.0, (0.0,) * 5, (1040, 800))
+    R, t = pose(board, (12.0, 9.0, 7.0), distance=0.13)
+    image = board_drawer(camera, R, t, board, sub=3, rng=np.random.default_rng(8))
+    reaches = []
+
+    def counted(image, windows, *others):
+        reaches.append((windows[:, 1] - windows[:, 0]).max())
+        return fit_corners(image, windows, *others)
+
+    monkeypatch.setattr(corner_fit, "fit_corners", counted)
+    view = find_corners(image, (4, 3))
+    assert reaches[0] < 0.8 * reaches[1]  # the premise
+    monkeypatch.setattr(corner_fit, "FIRST_REACH", np.inf)
+    whole = find_corners(image, (4, 3))
+    sigma = np.sqrt(np.diagonal(view.covariance, axis1=1, axis2=2))
+    assert np.abs((view.points - whole.points) / sigma).max() < 0.2  # the lines' bend is measured a little less well
+    pull = (view.points - project(board.points @ R.T + t, camera)) / sigma
+    assert np.sqrt(np.mean(pull**2)) < 1.6  # 24 numbers
+
+
+@pytest.mark.statistical
 def test_squares_of_seven_pixels_are_found_where_opencv_stops(sample_clip):
     """The sample's views at 100 x 100: both finders 15 of 36, and each corner lies where the whole image has it."""
     views = [cv2.imread(str(f), cv2.IMREAD_GRAYSCALE) for f in sorted(sample_clip.glob("calibration/*/*.png"))]
@@ -233,11 +271,14 @@ def test_a_dirty_corner_is_rejected_with_its_reason(board_drawer):
     assert np.abs(view.points - true)[view.accepted].max() < 0.05
 
 
-def test_equal_channels_are_one_grey_image(board_drawer):
+def test_depth_and_equal_channels_change_nothing(board_drawer):
     board = Board((9, 6), 8e-3)
     image = board_drawer(CAMERA, *pose(board), board, rng=np.random.default_rng(5))
+    plain = find_corners(image, (9, 6))
+    deep = find_corners(image.astype(np.uint16) * 64, (9, 6))
+    assert_allclose(deep.points, plain.points, atol=2e-4)  # quantisation floor of the noise differs
     triple = find_corners(np.dstack([image] * 3), (9, 6))
-    assert np.array_equal(triple.points, find_corners(image, (9, 6)).points)
+    assert np.array_equal(triple.points, plain.points)
     assert not triple.notes
     tinted = np.dstack([image, image, (image * 0.9).astype(np.uint8)])
     assert "luminance" in find_corners(tinted, (9, 6)).notes[0]

@@ -114,10 +114,24 @@ def test_a_hidden_effect_is_named_with_all_that_cannot_be_told_from_it(rng, hidd
     assert "no trace" in reasons["nothing"]
 
 
+def test_two_hidden_effects_are_both_named(rng):
+    answer = explain(oscillator(rng, {"d": 0.02, "hum_c": 0.01}), START)
+    assert {f.candidate.name for f in answer.found} == {"damping", "hum"}
+
+
 @pytest.mark.statistical
 def test_noise_alone_raises_an_alarm_at_most_once_in_twenty(rng):
     alarms = sum(bool(explain(oscillator(rng), START).found) for _ in range(60))
     assert alarms <= 3  # the threshold promises one in a hundred
+
+
+def test_a_shuffled_residual_gives_no_finding(rng):
+    system = oscillator(rng, {"d": 0.02})
+    base = fit(system, system.base, START)
+    residual = system.observed - system.predicted(base.values)
+    shuffled = Oscillator(system.predicted(base.values) + rng.permutation(residual), system.time)
+    answer = explain(shuffled, START)
+    assert not answer.found
 
 
 def test_a_negative_damping_is_not_allowed_to_explain_growth(rng):
