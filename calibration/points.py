@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 from calibration.board.chessboard import BoardNotFound, CornerView
 from calibration.board.target import Board
 from calibration.cameras.camera import CAMERA_NAMES
+from calibration.kit.arguments import Thickness, checked
 from calibration.kit.errors import CalibrationError
 from calibration.stereo import CalibrationSettings, StereoCalibration, calibrate_from_corners
 
@@ -17,6 +18,7 @@ OVERSTATED = 0.7  # times the declared sigma: corners that scatter by less were 
 _NOT_SEEN = BoardNotFound("no corners were given")
 
 
+@checked
 def calibrate_from_points(
     left: Sequence[ArrayLike | None],
     right: Sequence[ArrayLike | None],
@@ -25,7 +27,7 @@ def calibrate_from_points(
     sigma_px: float,
     settings: CalibrationSettings | None = None,
     table_view: int | None = None,
-    board_thickness: float = 0.0,
+    board_thickness: Thickness = 0.0,
 ) -> StereoCalibration:
     """Calibrate a stereo pair from corners located elsewhere, item i of both lists from the same place of the board.
 

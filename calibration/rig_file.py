@@ -26,6 +26,7 @@ from calibration.cameras.camera import (
 )
 from calibration.cameras.splines import LensField
 from calibration.fit.stereo_model import Observations
+from calibration.kit.arguments import checked
 from calibration.kit.arrays import Array, Mask
 from calibration.kit.errors import CalibrationError, RigFileError
 from calibration.stereo import StereoCalibration
@@ -195,6 +196,7 @@ def _plain(value: Any) -> Any:
 # --- writing ---------------------------------------------------------------------------------------------------------
 
 
+@checked
 def write_rig(
     path: str | os.PathLike[str], content: StereoRig | StereoCalibration | RigFile, attributes: Mapping[str, Any] = {}
 ) -> None:
@@ -314,6 +316,7 @@ def _write_record(group: h5py.Group, record: CalibrationRecord) -> None:
 # --- reading ---------------------------------------------------------------------------------------------------------
 
 
+@checked
 def read_rig(path: str | os.PathLike[str]) -> StereoRig:
     """The rig of a rig file. Raises RigFileError.
 

@@ -28,6 +28,7 @@ from calibration.judge.tolerances import (
     with_tolerances,
 )
 from calibration.judge.wide_lens import too_wide
+from calibration.kit.arguments import Thickness, checked
 from calibration.kit.arrays import Array
 from calibration.kit.brief import Brief
 from calibration.kit.errors import CalibrationError
@@ -38,6 +39,7 @@ from calibration.stereo_fit import JointFit, fit_jointly
 LEAST_SEEN = 12  # images of every point of the target, to free its place: from three pairs alone it fits their errors
 
 
+@checked
 @dataclass(frozen=True)
 class CalibrationSettings:
     """What the user may decide."""
@@ -125,13 +127,14 @@ class StereoCalibration(Brief):
 
 
 @one_blas_thread
+@checked
 def calibrate_stereo(
     left_images: Sequence[NDArray],
     right_images: Sequence[NDArray],
     board: Target,
     settings: CalibrationSettings | None = None,
     table_view: int | None = None,
-    board_thickness: float = 0.0,
+    board_thickness: Thickness = 0.0,
     names: Sequence[tuple[str, str]] | None = None,
     progress: Progress | None = None,
 ) -> StereoCalibration:
@@ -188,13 +191,14 @@ def _determined() -> Iterator[None]:
 
 @_determined()
 @one_blas_thread
+@checked
 def calibrate_from_corners(
     left_views: Sequence[CornerView | BoardNotFound],
     right_views: Sequence[CornerView | BoardNotFound],
     board: Target,
     settings: CalibrationSettings | None = None,
     table_view: int | None = None,
-    board_thickness: float = 0.0,
+    board_thickness: Thickness = 0.0,
     names: Sequence[tuple[str, str]] | None = None,
 ) -> StereoCalibration:
     """`calibrate_stereo` from corners that were located before."""

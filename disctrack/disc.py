@@ -7,10 +7,12 @@ corrected: I3 s + m r h c without the factor sin theta, I2 = J1 + m h^2 in place
 """
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from calibration.kit.arguments import checked
 from calibration.kit.arrays import Array
 from calibration.kit.brief import Brief
 from disctrack.errors import ModelError
@@ -19,6 +21,7 @@ AIR_DENSITY = 1.2  # [kg/m^3] where no other is declared: at 1013.25 hPa and 20 
 STANDARD_PRESSURE = 1013.25  # [hPa]
 
 
+@checked
 @dataclass(frozen=True, repr=False)
 class Disc(Brief):
     """A homogeneous disc of radius r and thickness 2h with round dots on its upper face.
@@ -28,6 +31,8 @@ class Disc(Brief):
         >>> Disc(0.0375, 0.003, 0.2, [[0.026, 0, 0.003], [0, 0.026, 0.003], [-0.026, 0, 0.003]], 0.007)
         Disc(diameter 75 mm, thickness 6 mm, mass 200 g, dots 3)
     """
+
+    held_as: ClassVar[str] = "disc"
 
     radius: float  # r [m]
     half_thickness: float  # h [m]

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from calibration.kit.errors import CalibrationError, DiscTrackError, RigFileError
+from calibration.kit.errors import ArgumentError, CalibrationError, DiscTrackError, RigFileError
 
 __all__ = [
     "AnalysisError",
@@ -21,10 +21,6 @@ __all__ = [
 
 class AnalysisError(DiscTrackError):
     """A trajectory does not hold enough for what was asked of it."""
-
-
-class ArgumentError(DiscTrackError, TypeError, ValueError):
-    """A function was given something else than it takes."""
 
 
 class ClusterError(DiscTrackError):

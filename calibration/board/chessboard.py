@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 
 from calibration.board.corner_fit import CornerView, fit_view, local_axes
 from calibration.board.target import board_orders
+from calibration.kit.arguments import checked
 from calibration.kit.arrays import Array
+from calibration.kit.errors import ArgumentError
 from calibration.kit.grey_levels import level_step
 
 SEARCH_SIZE = 1600  # px: larger images are reduced for the rough search, which takes seconds on them otherwise
@@ -36,11 +38,11 @@ def grey_values(image: NDArray) -> tuple[NDArray, tuple[str, ...]]:
     """
     image = np.asarray(image)
     if image.dtype not in (np.uint8, np.uint16, np.float32, np.float64):
-        raise ValueError(f"images of type {image.dtype} are not grey values; expected 8 or 16 bit")
+        raise ArgumentError(f"images of type {image.dtype} are not grey values; expected 8 or 16 bit")
     if image.ndim == 2:
         return image, ()
     if image.ndim != 3 or image.shape[2] not in (1, 3, 4):
-        raise ValueError(f"an image is (height, width) or (height, width, 3 or 4), got {image.shape}")
+        raise ArgumentError(f"an image is (height, width) or (height, width, 3 or 4), got {image.shape}")
     if image.shape[2] == 1:
         return image[..., 0], ()
     if (image[..., :1] == image[..., :3]).all():
@@ -48,6 +50,7 @@ def grey_values(image: NDArray) -> tuple[NDArray, tuple[str, ...]]:
     return image[..., :3] @ np.array([0.114, 0.587, 0.299]), ("colour image read as luminance",)
 
 
+@checked
 def find_corners(image: NDArray, inner_corners: tuple[int, int], thorough: bool = True) -> CornerView | BoardNotFound:
     """Locate the inner corners of a chessboard.
 
@@ -117,6 +120,8 @@ def as_8_bit(grey: NDArray) -> NDArray[np.uint8]:
 
 def _rough_corners(grey: NDArray[np.uint8], inner_corners: tuple[int, int], thorough: bool) -> Array | None:
     """Corners (n, 2) [px] to about a pixel in any of the board's orders, or None."""
+    if min(grey.shape) < 2 * min(inner_corners):  # no square would have a pixel to itself
+        return None
     scale = min(1.0, SEARCH_SIZE / max(grey.shape))
     if scale < 1.0:
         grey = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA).astype(np.uint8)

@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.kit.arguments import checked
 from calibration.kit.arrays import Array
 from calibration.kit.errors import CalibrationError
 
@@ -58,6 +59,7 @@ def mirror_symmetries(points: Array) -> list[NDArray[np.intp]]:
     return found
 
 
+@checked
 @dataclass(frozen=True)
 class Board(Target):
     """A chessboard. Board axes: origin at corner 0, i along the first count, j along the second, k out of the print.

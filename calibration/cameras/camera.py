@@ -8,11 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
 from calibration.cameras.splines import LensField
+from calibration.kit.arguments import checked
 from calibration.kit.arrays import Array
 from calibration.kit.brief import Brief
 
@@ -173,6 +174,9 @@ class StereoRig(Brief):
     A rig without a table view has the left camera's axes for a world (`world_is_table` False).
     """
 
+    read_by: ClassVar[str] = "calibration.rig_file:read_rig"
+    held_as: ClassVar[str] = "rig"
+
     left: Camera
     right: Camera
     R_right_left: Array  # (3, 3)
@@ -299,6 +303,7 @@ def rotation_from_vector(v: Array) -> Array:
     return np.asarray(np.eye(3) + first * S + second * S @ S, np.float64)
 
 
+@checked
 def triangulate(pixels: Array, rig: StereoRig, iterations: int = 10) -> Array:
     """World points (n, 3) [m] seen at pixels (2 cameras, n, 2), least squares in pixels; NaN where not seen twice.
 

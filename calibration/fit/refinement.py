@@ -28,6 +28,7 @@ from calibration.fit.stereo_model import (
     predict_pixels,
     restricted,
 )
+from calibration.kit.arguments import checked
 from calibration.kit.arrays import Array, Mask
 from calibration.kit.errors import CalibrationError
 
@@ -82,6 +83,7 @@ def _degrees_of_freedom(problem: Problem) -> int:
     return left
 
 
+@checked
 def refine_stereo(
     observations: Observations,
     start: StereoModel,

@@ -17,6 +17,10 @@ class DiscTrackError(Exception):
     """
 
 
+class ArgumentError(DiscTrackError, TypeError, ValueError):
+    """A function was given something else than it takes."""
+
+
 class CalibrationError(DiscTrackError):
     """The cameras cannot be calibrated from what was given."""
 

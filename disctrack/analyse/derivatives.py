@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.kit.arguments import checked
 from calibration.kit.arrays import Array, Mask
 from calibration.kit.brief import Outline
 from disctrack.analyse.smoothing import (
@@ -24,7 +25,6 @@ from disctrack.analyse.smoothing import (
     joined,
     moving_weights,
 )
-from disctrack.arguments import checked
 from disctrack.disc import Disc
 from disctrack.errors import AnalysisError
 from disctrack.frames import (

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from calibration.kit.arguments import Seconds, checked
 from calibration.kit.brief import Brief
 from calibration.kit.threads import one_blas_thread
 from disctrack.analyse.analysis import CIRCLE_DURATION, WINDOWS, Analysis, Scaling, analyse
@@ -13,7 +14,6 @@ from disctrack.analyse.derivatives import GROUP_NAMES, N_STATE, STATE
 from disctrack.analyse.power_laws import WINDOW
 from disctrack.analyse.propagation import DerivedSeries, Propagated
 from disctrack.analyse.report import report_of
-from disctrack.arguments import Seconds, checked
 from disctrack.errors import AnalysisError
 from disctrack.files.inputs import keep
 from disctrack.files.labelled_arrays import Variable

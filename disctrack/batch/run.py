@@ -9,6 +9,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
+from calibration.kit.arguments import checked
 from disctrack.batch.columns import Row, copies
 from disctrack.batch.find import find_recordings
 from disctrack.batch.plan import BatchOptions, BatchPlan, Job, Places, Shard, make_plan, with_threads
@@ -61,6 +62,7 @@ class BatchOutcome:
         ]
 
 
+@checked
 def run_batch(
     folders: Sequence[str | Path],
     options: BatchOptions | None = None,

@@ -14,9 +14,9 @@ from calibration.board import corner_fit
 from calibration.board.search import Progress
 from calibration.board.target import Target
 from calibration.fit import normal_equations
+from calibration.kit.arguments import checked
 from calibration.rig_file import CalibrationRecord, read_rig, read_rig_file, write_rig
 from disctrack.analyse.declaration import Boards
-from disctrack.arguments import checked
 from disctrack.calibrate.views import TargetImages, calibrate_views, declared_views
 from disctrack.errors import CalibrationError, OutputError, RecordingError, RigFileError
 from disctrack.files.inputs import keep, refuse_input

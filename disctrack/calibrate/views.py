@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from calibration import CalibrationSettings, StereoCalibration, calibrate_stereo
 from calibration.board.search import Progress
 from calibration.board.target import Target
+from calibration.kit.arguments import Thickness, checked
 from calibration.kit.brief import Outline
 from disctrack.errors import RecordingError
 from disctrack.frames import CAMERAS
@@ -78,6 +79,7 @@ class TargetImages(Outline):
         return digest.hexdigest()
 
 
+@checked
 def find_views(
     left: str, right: str, folder: str | Path, fields: FlatFields = (None, None), parts: ImageParts = (None, None)
 ) -> TargetImages:
@@ -137,11 +139,12 @@ def _refuse_unpaired(views: TargetImages, numbers: Sequence[Sequence[int | None]
     )
 
 
+@checked
 def calibrate_views(
     views: TargetImages,
     target: Target,
     table_view: int | None = None,
-    board_thickness: float = 0.0,
+    board_thickness: Thickness = 0.0,
     settings: CalibrationSettings | None = None,
     progress: Progress | None = None,
 ) -> tuple[StereoCalibration, tuple[str, ...]]:

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
+from calibration.kit.arguments import checked
 from calibration.kit.brief import Brief
 from calibration.kit.threads import one_blas_thread
-from disctrack.arguments import checked
 from disctrack.diagnosis.answer import DiscDiagnosis, Learned
 from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.diagnosis.errors import LeftOver, energy_balance, errors, left_over, regimes, where_it_holds
@@ -195,6 +195,7 @@ def _of_motion(found: Iterable[Found]) -> set[str]:
     return {f.candidate.effect for f in found if f.candidate.kind == "motion"}
 
 
+@checked
 def run_diagnose(
     path: str | Path,
     output: str | Path | None = None,

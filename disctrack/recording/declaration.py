@@ -7,10 +7,11 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 from calibration.board.target import Board, CharucoBoard, Target
 from calibration.judge.tolerances import BoardTolerances
+from calibration.kit.arguments import checked
 from calibration.kit.brief import Outline
 from disctrack.disc import AIR_DENSITY, STANDARD_PRESSURE, Disc, disc_from_mm
 from disctrack.errors import CalibrationError, RecordingError
@@ -171,6 +172,8 @@ class Recording(Outline):
     (1000.0, 9.81)
     """
 
+    read_by: ClassVar[str] = "disctrack.recording.declaration:read_recording"
+
     folder: Path
     name: str
     frame_rate: float  # [Hz]
@@ -202,6 +205,7 @@ class Recording(Outline):
         return self.views.target if self.views is not None and isinstance(self.views.target, Board) else None
 
 
+@checked
 def read_recording(path: str | Path) -> Recording:
     """Recording from its folder (or from its recording.toml).
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from calibration.kit.arguments import checked
 from disctrack.disc import AIR_DENSITY, Disc
 from disctrack.rolling.effects import Effect, EffectParameter, ModelError, effect_class, effect_from_formulas
 from disctrack.rolling.records import BODY
@@ -16,6 +17,7 @@ from disctrack.rolling.records import BODY
 DEFAULT_THETA_END = np.radians(0.5)  # where the disc of Ma et al. (2014) comes to lie on its paper
 
 
+@checked
 @dataclass(frozen=True)
 class Model:
     """Disc, gravity and effects; parameters are addressed as "effect.parameter".

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from calibration.kit.arguments import FrameRate, Seconds, Times, checked
 from calibration.kit.arrays import Array
 from disctrack.rolling import integrate
 from disctrack.rolling._assembly import Assembly
@@ -22,22 +23,27 @@ _N_STATE = {ROLLING: 8, SLIPPING: 10, FLYING: 12}
 MAX_SWITCHES = 2000  # of slip and rolling: more is chatter
 MAX_SLIP_STEPS = 10**9  # of the integrator in slip, over all stretches, and ...
 MAX_STEPS = 200_000  # ... in each
+MOST_INSTANTS = 1e8  # of a motion in memory
 
 
 def time_grid(duration: float, rate: float = 1000.0) -> Array:
     """Instants i / rate up to the duration, both ends included [s]."""
-    if not (duration > 0 and rate > 0):
-        raise ModelError(f"duration {duration:g} s and rate {rate:g} Hz must be positive")
+    if not (duration > 0 and rate > 0 and duration * rate < MOST_INSTANTS):
+        raise ModelError(
+            f"duration {duration:g} s and rate {rate:g} Hz; expected positive numbers, and at most {MOST_INSTANTS:g} "
+            "instants"
+        )
     return np.arange(int(np.floor(duration * rate * (1 + 1e-12))) + 1) / rate
 
 
+@checked
 def simulate(
     model: Model,
     state: State,
-    duration: float | None = None,
+    duration: Seconds | None = None,
     *,
-    rate: float = 1000.0,
-    times: ArrayLike | None = None,
+    rate: FrameRate = 1000.0,
+    times: Times | None = None,
     theta_end: float = DEFAULT_THETA_END,
     rtol: float = RTOL,
 ) -> Motion:

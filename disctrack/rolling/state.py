@@ -6,9 +6,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from calibration.kit.arguments import checked
 from calibration.kit.arrays import Array
 
 
+@checked
 @dataclass(frozen=True)
 class State:
     """State of the disc: eight numbers in pure rolling, and the velocity and height of O where it is not rolling.

@@ -2,10 +2,12 @@
 
 import numpy as np
 
+from calibration.kit.arguments import checked
 from disctrack.disc import Disc, followers, nutation_frequency, precession_rate
 from disctrack.rolling.state import State
 
 
+@checked
 def steady_precession(
     theta: float,
     disc: Disc,

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from calibration.cameras.camera import StereoRig
+from calibration.kit.arguments import checked
 from calibration.kit.arrays import Array, Array32, Image
 from disctrack.disc import AIR_DENSITY, Disc
 from disctrack.errors import OutputError
@@ -79,6 +80,7 @@ def write_recording(
     return truth
 
 
+@checked
 def run_render(
     scene_path: str | Path, folder: str | Path, truth_path: str | Path | None = None, progress: Progress | None = None
 ) -> Truth:

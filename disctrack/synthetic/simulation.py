@@ -10,6 +10,7 @@ from typing import Any
 import h5py
 import numpy as np
 
+from calibration.kit.arguments import checked
 from calibration.kit.arrays import Array
 from calibration.kit.brief import Outline
 from disctrack.errors import SceneError
@@ -42,6 +43,7 @@ class SimulationRun(Outline):
     summary: str  # some lines for people
 
 
+@checked
 def run_simulate(
     scene_path: str | Path,
     output: str | Path,

@@ -6,12 +6,12 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from calibration.cameras.camera import StereoRig
+from calibration.kit.arguments import FrameRate, Gravity, Threads, Times, checked, grey_values
 from calibration.kit.threads import one_blas_thread
 from disctrack.analyse.declaration import contradictions
-from disctrack.arguments import FrameRate, Gravity, checked, grey_values
 from disctrack.disc import Disc
 from disctrack.errors import TrackingError
 from disctrack.findings import warn_of_doubts
@@ -28,15 +28,15 @@ BLOCK, COPIED_BLOCK = 256, 16  # pairs
 @one_blas_thread
 @checked
 def measure_pairs(
-    images: Images | tuple[Images, Images],
+    images: tuple[Images, Images] | Images,
     rig: StereoRig,
     disc: Disc,
     frame_rate: FrameRate,
     *,
     gravity: Gravity = 9.81,
     settings: TrackingSettings | None = None,
-    timestamps: ArrayLike | None = None,
-    threads: int = 1,
+    timestamps: Times | None = None,
+    threads: Threads = 1,
     progress: Progress = lambda n: None,
 ) -> Measurement:
     """Measure the disc's pose in every pair; every frame is measured (no rest is left out).

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 
 from calibration.cameras.camera import StereoRig
+from calibration.kit.arguments import Threads, checked
 from calibration.kit.arrays import Array
 from calibration.kit.brief import Brief
 from calibration.kit.threads import one_blas_thread
 from disctrack.analyse.declaration import Boards, contradictions_of
-from disctrack.arguments import checked
 from disctrack.errors import RecordingError, TrackingError
 from disctrack.findings import Finding, Kind, Severity, of_kind, warn_of_doubts
 from disctrack.frames import CAMERAS
@@ -141,7 +141,7 @@ def measure(
     rig: StereoRig,
     pairs: ImagePairs,
     settings: TrackingSettings | None = None,
-    threads: int | None = None,
+    threads: Threads | None = None,
     progress: Progress = lambda n: None,
     boards: Boards | None = None,
 ) -> Measurement:
@@ -307,6 +307,7 @@ def at_full_length(part: Trajectory, n: int, start: int, timestamps: Array | Non
     return dataclasses.replace(part, **whole)
 
 
+@checked
 def trajectory_provenance(
     recording: Recording, rig: StereoRig, pairs: ImagePairs, settings: TrackingSettings | None
 ) -> Provenance:

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.kit.arguments import checked
 from calibration.kit.arrays import Array, Mask
 from calibration.kit.grey_levels import full_scale
 from disctrack.errors import OutputError
@@ -32,6 +33,7 @@ _RIM, _LOWER, _DOT, _CENTRE, _REFUSED, _CONTACT = (
 )  # fmt: skip
 
 
+@checked
 def write_overlay(
     path: str | Path,
     pairs: Iterable[tuple[int, NDArray]],

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
 from enum import IntEnum
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -98,6 +98,9 @@ class Trajectory(Brief):
         >>> trajectory.q.shape, trajectory.coordinate_sigma.shape
         ((300, 6), (300, 6))
     """
+
+    read_by: ClassVar[str] = "disctrack.trajectory.file:read_trajectory"
+    held_as: ClassVar[str] = "trajectory"
 
     time: Array  # (n,) [s], mid exposure of frame i is i / frame_rate unless the camera said otherwise
     frame: NDArray[np.int64]  # (n,) number of the frame in its sequence

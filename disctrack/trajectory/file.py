@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.cameras.camera import RIG_PARAMETERS, Camera, StereoRig
+from calibration.kit.arguments import checked
 from calibration.kit.arrays import Mask
 from calibration.kit.brief import Outline
 from calibration.rig_file import beyond_model, read_beyond_model, write_attributes
@@ -68,6 +69,7 @@ class Provenance(Outline):
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
+@checked
 def write_trajectory(
     path: str | Path,
     trajectory: Trajectory,
@@ -105,6 +107,7 @@ def write_trajectory(
     write_whole(path, buffer.getbuffer())
 
 
+@checked
 def read_trajectory(path: str | Path) -> Trajectory:
     """The trajectory that was written. Raises TrajectoryFileError if the file is missing, damaged or another's.
 
@@ -173,6 +176,7 @@ def is_result_of(path: Path, provenance: Provenance) -> bool:
 Group = tuple[Mapping[str, Variable], Mapping[str, Any]]
 
 
+@checked
 def write_group(
     path: str | Path,
     group: str,
@@ -206,6 +210,7 @@ def write_groups(path: Path, groups: Mapping[str, Group], axes: Mapping[str, Var
     write_whole(path, buffer.getbuffer(), adds_to_input=True)
 
 
+@checked
 def read_group(
     path: str | Path, group: str, names: Collection[str] | None = None
 ) -> tuple[dict[str, NDArray], dict[str, Any]]:

@@ -67,10 +67,10 @@ def test_arrays_that_are_no_pairs_are_refused_with_what_is_expected(taken, chang
         ("images", np.zeros((1, 2, 8, 8), complex), "type complex128"),
         ("rig", 3, "rig is 3; expected a StereoRig or the path"),
         ("disc", "a disc", "disc is 'a disc'; expected a Disc"),
-        ("frame_rate", 1e12, "above 0 and at most 1e\\+08, in Hz"),
+        ("frame_rate", 1e12, "a number from 0.001 to 1e\\+08, in Hz"),
         ("frame_rate", True, "frame_rate is True"),
         ("frame_rate", float("nan"), "frame_rate is nan"),
-        ("gravity", -9.81, "gravity is -9.81; expected a number above 0"),
+        ("gravity", -9.81, "gravity is -9.81; expected a number from 0.001 to 100, in m.s"),
         ("colour", 1, "unexpected keyword argument 'colour'"),
     ],
 )

@@ -3,11 +3,13 @@
 from importlib import import_module
 from pathlib import Path
 
+from calibration.kit.arguments import checked
 from disctrack.errors import RecordingError
 from disctrack.recording.readers.base import FrameReader
 from disctrack.recording.readers.files import FORMATS, IMAGES, NUMBER, match_files, split_member
 
 
+@checked
 def open_frames(pattern: str, folder: str | Path, camera: str) -> FrameReader:
     """Reader of one camera's frames: a file pattern, relative to `folder`.
 

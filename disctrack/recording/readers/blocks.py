@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.kit.arguments import Threads, checked
 from calibration.kit.arrays import Mask
 from disctrack.errors import RecordingError
 from disctrack.frames import CAMERAS
@@ -70,13 +71,14 @@ def default_threads() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+@checked
 def iter_pair_blocks(
     left: FrameReader,
     right: FrameReader,
     start: int = 0,
     stop: int | None = None,
     block: int | None = None,
-    threads: int | None = None,
+    threads: Threads | None = None,
 ) -> Iterator[PairBlock]:
     """Pairs start..stop-1 in blocks of `block` pairs, two blocks read ahead while the caller works on a third.
 

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.cameras.camera import StereoRig, normalised_maps
+from calibration.kit.arguments import checked, grey_values
 from calibration.kit.arrays import Array, Image
 from disctrack import frames
-from disctrack.arguments import checked, grey_values
 from disctrack.disc import Disc
 from disctrack.errors import ArgumentError
 from disctrack.track.dots.acquisition import Pose

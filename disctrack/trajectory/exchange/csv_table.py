@@ -6,11 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
+from calibration.kit.arguments import checked
 from disctrack.files.whole import refuse_existing, write_whole
 from disctrack.frames import CAMERAS, COORDINATES
 from disctrack.trajectory import FrameStatus, Trajectory
 
 
+@checked
 def write_csv(path: str | Path, trajectory: Trajectory, overwrite: bool = False) -> None:
     """The trajectory as a table for people: millimetres and degrees, one row per frame, empty where unknown.
 

@@ -14,6 +14,7 @@ import h5py
 import numpy as np
 
 from calibration.cameras.camera import StereoRig
+from calibration.kit.arguments import checked
 from calibration.rig_file import SCHEMA as RIG
 from calibration.rig_file import CalibrationRecord, read_rig_file, write_rig
 from disctrack.errors import OutputError
@@ -98,6 +99,7 @@ class Converted(NamedTuple):
     notes: tuple[str, ...]
 
 
+@checked
 def convert(
     source: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
     target: str | os.PathLike[str],

@@ -1,0 +1,255 @@
+"""What the public functions are given: taken where it makes sense, refused at once where it does not.
+
+`checked` reads annotations. An object of the packages may be given as the file that holds it, or as a result that
+carries it: a class names its reader in `read_by`, and the attribute that holds it elsewhere in `held_as`. A number has
+the unit and the range of its `Range`. What an annotation says beyond that is left to the function.
+"""
+
+import functools
+import inspect
+import math
+import os
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from numbers import Integral, Real
+from pathlib import Path
+from pkgutil import resolve_name
+from types import NoneType, UnionType
+from typing import Annotated, Any, TypeVar, Union, cast, get_args, get_origin, get_type_hints
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from calibration.kit.errors import ArgumentError
+
+T = TypeVar("T", bound=Callable[..., Any])
+
+
+@dataclass(frozen=True)
+class Range:
+    """A number from `least` to `most`, in `unit`."""
+
+    unit: str
+    least: float = 0.0
+    most: float = math.inf
+
+    def __str__(self) -> str:
+        most = f" to {self.most:g}" if math.isfinite(self.most) else " on"
+        return f"a number from {self.least:g}{most}, in {self.unit}"
+
+    def take(self, number: float) -> float:
+        """The number. Raises ValueError."""
+        if not self.least <= number <= self.most:
+            raise ValueError
+        return number
+
+
+@dataclass(frozen=True)
+class Values:
+    """An array of finite numbers in `unit`."""
+
+    unit: str
+
+    def __str__(self) -> str:
+        return f"numbers in {self.unit}"
+
+    def take(self, values: ArrayLike) -> NDArray[np.float64]:
+        """The values as an array. Raises TypeError, ValueError."""
+        array = _array(values).astype(float)
+        if not np.isfinite(array).all():
+            raise ValueError
+        return array
+
+
+FrameRate = Annotated[float, Range("Hz", 1e-3, 1e8)]  # beyond what any camera does
+Seconds = Annotated[float, Range("s", 1e-6)]
+Gravity = Annotated[float, Range("m/s^2", 1e-3, 100.0)]
+Thickness = Annotated[float, Range("m", 0.0, 1.0)]
+Threads = Annotated[int, Range("threads", 1, 10_000)]
+Times = Annotated[ArrayLike, Values("s")]
+
+
+def checked(target: T) -> T:
+    """A function, or a class when it is made, with arguments as its annotations want them. Raises ArgumentError."""
+    if isinstance(target, type):
+        target.__init__ = checked(target.__init__)  # type: ignore[misc]
+        return cast("T", target)
+    signature = inspect.signature(target)
+    what = target.__qualname__.removesuffix(".__init__")
+
+    @functools.wraps(target)
+    def with_checked(*given: Any, **named: Any) -> Any:
+        try:
+            bound = signature.bind(*given, **named)
+        except TypeError as error:
+            raise ArgumentError(f"{what}: {error}; it takes {signature}") from error
+        hints = _hints(target)
+        for name, value in bound.arguments.items():
+            if name in hints:
+                bound.arguments[name] = _as(value, hints[name], f"{what}: {name}")
+        return target(*bound.args, **bound.kwargs)
+
+    return cast("T", with_checked)
+
+
+@functools.cache
+def _hints(function: Callable[..., Any]) -> dict[str, Any]:
+    """Annotations of the parameters that stand for one value."""
+    hints = get_type_hints(function, include_extras=True)
+    several = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+    parameters = inspect.signature(function).parameters.items()
+    return {name: hints[name] for name, p in parameters if name in hints and p.kind not in several}
+
+
+def _as(value: Any, kind: Any, name: str) -> Any:
+    try:
+        return _fit(value, kind)
+    except (TypeError, ValueError):
+        raise ArgumentError(f"{name} is {_short(value)}; expected {_in_words(kind)}") from None
+
+
+def _options(kind: Any) -> tuple[Any, ...]:
+    return get_args(kind) if get_origin(kind) in (Union, UnionType) else (kind,)
+
+
+def _fit(value: Any, kind: Any) -> Any:
+    """The value as the kind, or the first of its options that it fits. Raises TypeError, ValueError."""
+    if any(isinstance(option, type) and type(value) is option for option in _options(kind)):
+        return value  # before what it may stand for
+    for option in _options(kind):
+        with suppress(TypeError, ValueError):
+            return _fit_one(value, option)
+    raise TypeError
+
+
+def _fit_one(value: Any, kind: Any) -> Any:
+    origin, parts = get_origin(kind), get_args(kind)
+    if origin is Annotated:
+        return next(rule for rule in parts if hasattr(rule, "take")).take(_fit(value, parts[0]))
+    if kind in _PLAIN:
+        return _PLAIN[kind][0](value)
+    if origin is np.ndarray:
+        return _array(value)
+    if origin is tuple and parts[-1] is not ...:
+        if not isinstance(value, tuple | list):
+            raise TypeError
+        return tuple(_fit(v, part) for v, part in zip(value, parts, strict=True))
+    if isinstance(origin, type):
+        return _collection(value, origin, parts)
+    return _object(value, kind) if isinstance(kind, type) else value
+
+
+def _collection(value: Any, kind: type, parts: tuple[Any, ...]) -> Any:
+    """A collection with members that fit; an array is one, text is none."""
+    listed = isinstance(value, list | tuple | np.ndarray) and issubclass(tuple, kind)
+    if not listed and (not isinstance(value, kind) or isinstance(value, str | bytes)):
+        raise TypeError
+    if isinstance(value, Mapping) != issubclass(kind, Mapping):
+        raise TypeError
+    if listed and parts:
+        members = [_fit(member, parts[0]) for member in value]
+        return value if isinstance(value, np.ndarray) else type(value)(members)
+    return value
+
+
+def _object(value: Any, kind: type) -> Any:
+    """An object of a class, or what stands for it."""
+    if getattr(kind, "_is_protocol", False) or isinstance(value, kind):
+        return value
+    if (reader := getattr(kind, "read_by", "")) and isinstance(value, str | os.PathLike):
+        return resolve_name(reader)(value)
+    held = getattr(value, getattr(kind, "held_as", ""), None)
+    if not isinstance(held, kind):
+        raise TypeError
+    return held
+
+
+def _number(value: Any) -> float:
+    if not isinstance(value, Real) or isinstance(value, bool | np.bool_) or not math.isfinite(value):
+        raise TypeError
+    return float(value)
+
+
+def _whole(value: Any) -> int:
+    if not isinstance(value, Integral) or isinstance(value, bool | np.bool_):
+        raise TypeError
+    return int(value)
+
+
+def _of(*kinds: type) -> Callable[[Any], Any]:
+    """A value of one of these types, as it is."""
+
+    def taken(value: Any) -> Any:
+        if not isinstance(value, kinds):
+            raise TypeError
+        return value
+
+    return taken
+
+
+def _array(value: Any) -> NDArray[Any]:
+    array = np.asarray(value)
+    if array.dtype.kind not in "biufc":
+        raise TypeError
+    return array
+
+
+# What is built in: how a value is taken, and what is expected.
+_PLAIN: dict[Any, tuple[Callable[[Any], Any], str]] = {
+    NoneType: (_of(NoneType), "None"),
+    bool: (_of(bool, np.bool_), "True or False"),
+    int: (_whole, "a whole number"),
+    float: (_number, "a finite number"),
+    str: (_of(str), "text"),
+    Path: (_of(str, os.PathLike), "a path"),
+    os.PathLike[str]: (_of(os.PathLike), "a path"),
+    Any: (lambda value: value, "anything"),
+}
+
+
+def _in_words(kind: Any) -> str:
+    return " or ".join(dict.fromkeys(_one_in_words(option) for option in _options(kind) if option is not NoneType))
+
+
+def _one_in_words(kind: Any) -> str:
+    origin, parts = get_origin(kind), get_args(kind)
+    if origin is Annotated:
+        return str(next(rule for rule in parts if hasattr(rule, "take")))
+    if kind in _PLAIN:
+        return _PLAIN[kind][1]
+    if origin is np.ndarray:
+        return "an array of numbers"
+    if origin is Callable:
+        return "a function"
+    if isinstance(origin, type):
+        inner = [_in_words(part) for part in parts if part is not ...]
+        return f"a {origin.__name__.lower()} of ({', '.join(inner)})"
+    path = " or the path of its file or folder" if getattr(kind, "read_by", "") else ""
+    name = getattr(kind, "__name__", str(kind))
+    return f"{'an' if name[0] in 'AEIO' else 'a'} {name}{path}"
+
+
+def _short(value: Any) -> str:
+    if isinstance(value, np.ndarray):
+        return f"an array of shape {value.shape}, {value.dtype}"
+    text = repr(value)
+    return text if len(text) <= 60 else f"a {type(value).__name__}"
+
+
+def grey_values(image: Any, name: str) -> NDArray[Any]:
+    """An image or many, of any real type, as uint8 or uint16: fractions of 1 as 65535ths, other numbers rounded.
+
+    Raises ArgumentError where a value is none, negative, or above 65535.
+    """
+    pixels = np.asarray(image)
+    if pixels.dtype in (np.uint8, np.uint16):
+        return pixels
+    if pixels.dtype.kind not in "biuf":
+        raise ArgumentError(f"{name}: images of type {pixels.dtype}; expected grey values, e.g. uint8 or uint16")
+    if not np.isfinite(pixels).all():
+        raise ArgumentError(f"{name}: not every grey value is a number; expected values from 0 on")
+    if pixels.size and not 0 <= pixels.min() <= pixels.max() <= 65535:
+        raise ArgumentError(f"{name}: grey values {pixels.min():g} to {pixels.max():g}; expected 0 to 1, or 0 to 65535")
+    scale = 65535.0 if pixels.dtype.kind == "f" and pixels.size and pixels.max() <= 1 else 1.0
+    return np.asarray(np.rint(scale * pixels.astype(float)), np.uint16)
