@@ -258,7 +258,7 @@ def _sharpness(seen: Check, disc: Disc, tracking: Tracking) -> None:
     row = rows[len(rows) // 2]
     axis = rotation_from_quaternion(trajectory.quaternion[row])[:, 2]
     for camera, (name, (R, t)) in enumerate(zip(CAMERAS, trajectory.rig.camera_poses(), strict=True)):
-        centre, blur = R @ trajectory.q[row, :3] + t, tracking.blur_px[camera]
+        centre, blur = R @ trajectory.q[row, :3] + t, tracking.law.edges[camera].blur_px
         width = trajectory.rig.cameras[camera].fx * disc.marker_diameter / float(centre[2])
         across = width * abs(float(R @ axis @ centre)) / float(np.linalg.norm(centre))
         text = f"{name}: dots {width:.0f} px wide, {across:.1f} px across, blur {blur:.2f} px (sigma)"

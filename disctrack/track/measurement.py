@@ -236,29 +236,28 @@ def refuse_unreadable(recording: Recording, lost: Sequence[Unreadable], n: int, 
 
 def details_of(tracking: Tracking) -> dict[str, Any]:
     """Numbers that tracking found on the way, of JSON's types."""
-    return {
+    details: dict[str, Any] = {
         "exposure_s": list(tracking.exposure.seconds),
-        "blur_px": list(tracking.blur_px),
-        "noise": [_json_fields(noise) for noise in tracking.noise],
-        "variance_factor": tracking.variance_factor,
-        "noise_factor": tracking.noise_factor,
+        "blur_px": [edge.blur_px for edge in tracking.law.edges],
+        "noise": [dataclasses.asdict(edge.noise) for edge in tracking.law.edges],
+        "variance_factor": tracking.scatter.whole,
+        "noise_factor": tracking.scatter.noise,
         "pose_variance_factor": tracking.pose_scatter.factor.round(3).tolist(),
-        "systematic_px": list(tracking.systematic_px),
+        "systematic_px": list(tracking.scatter.systematic_px),
         "shared_sigma": [[sigma, cause] for sigma, cause in tracking.shared_sigma],
         "size": {
             "by_dots": tracking.as_built.size,
             "sigma": tracking.as_built.size_sigma,
             "share": tracking.as_built.size_share,
         },
-        **(
-            {}
-            if tracking.table is None
-            else {"table": {**_json_fields(tracking.table), "told": tracking.table.sentence}}
-        ),
         "marker_shift_um": (1e6 * tracking.as_built.marker_shift[:, :2]).round(3).tolist(),
         "marker_shift_sigma_um": (1e6 * tracking.as_built.marker_shift_sigma).round(3).tolist(),
         "acquisitions": tracking.acquisitions,
     }
+    if tracking.table is not None:
+        fields = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in vars(tracking.table).items()}
+        details["table"] = {**fields, "told": tracking.table.sentence}
+    return details
 
 
 def _exposures(recording: Recording, pairs: ImagePairs) -> tuple[tuple[float, float] | None, tuple[str, ...]]:
@@ -342,9 +341,3 @@ def rig_sha256(rig: StereoRig) -> str:
     for allowance in rig.allowances:
         digest.update(f"{allowance.cause} {allowance.assumed}".encode() + allowance.shift.tobytes())
     return digest.hexdigest()
-
-
-def _json_fields(item: Any) -> dict[str, Any]:
-    """A dataclass as JSON's types, arrays as lists."""
-    fields = dataclasses.asdict(item)
-    return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in fields.items()}

@@ -22,22 +22,22 @@ def calibration_rows(found: StereoCalibration, problems: Sequence[str] = ()) -> 
     error = f" ({1e3 * assessment.held_out_error:.4f} mm in space)" if np.isfinite(assessment.held_out_error) else ""
     used = n - len(problems) - len(found.rejected_views)
     lines = [
-        _line(
+        (
             "calibration",
             f"{used} of {n} views ({assessment.pairs} by both cameras), stereo misfit of views left out "
             f"{assessment.stereo_misfit_px:.4f} px{error}, baseline {found.rig.baseline * 1e3:.3f} mm",
         ),
-        _line("rig", _rig_text(found.rig)),
-        _line("model", _model_text(found)),
+        ("rig", _rig_text(found.rig)),
+        ("model", _model_text(found)),
     ]
     if found.lens is not None:
         (left, right), gain = found.lens.rms_px, found.lens.gain
         departs = f"the lenses depart from their polynomial by {left:.3f} and {right:.3f} px rms per axis: corrected"
-        lines.append(_line("", f"{departs} (views left out: squared misfit {100 * gain:.0f} % less)"))
+        lines.append(("", f"{departs} (views left out: squared misfit {100 * gain:.0f} % less)"))
     corners = len(found.rejected_corners())
     if corners:
-        lines.append(_line("", f"{corners} corners were found but not used"))
-    return lines + [_line("", text) for text in left_out(found.rejected_views)]
+        lines.append(("", f"{corners} corners were found but not used"))
+    return lines + [("", text) for text in left_out(found.rejected_views)]
 
 
 def place_text(found: StereoCalibration) -> str:
@@ -98,29 +98,29 @@ def trajectory_rows(trajectory: Trajectory, details: Mapping[str, Any]) -> list[
     lines = [*_frame_lines(trajectory)]
     if found := details.get("first_pass"):
         looked = f" (first pass, {found['looked_at']} pairs looked at)" if found["looked_at"] else ""
-        lines.append(_line("motion", f"{found['verdict']}{looked}"))
+        lines.append(("motion", f"{found['verdict']}{looked}"))
     if trajectory.measured.any():
         lines += [
-            _line("sigma", sigma_text(trajectory)),
-            _line("", _sigma_text(trajectory.calibration_sigma, "shared by frames: calibration, table, what repeats")),
+            ("sigma", sigma_text(trajectory)),
+            ("", _sigma_text(trajectory.calibration_sigma, "shared by frames: calibration, table, what repeats")),
             *_shared_lines(details),
-            _fit_line(trajectory),
+            _fit_row(trajectory),
         ]
         if any(repeats := details.get("systematic_px", ())):
             left, right = repeats
             what = "lens beyond its model, printed dots, light"
-            lines.append(_line("repeating", f"misfit of the dots, left {left:.4f} px, right {right:.4f} px ({what})"))
+            lines.append(("repeating", f"misfit of the dots, left {left:.4f} px, right {right:.4f} px ({what})"))
         if table := details.get("table"):
-            lines.append(_line("table", table["told"]))
-    return lines + [_line("image", reason) for reason in list(details.get("unreadable", []))[:SHOWN_RANGES]]
+            lines.append(("table", table["told"]))
+    return lines + [("image", reason) for reason in list(details.get("unreadable", []))[:SHOWN_RANGES]]
 
 
 def _shared_lines(details: Mapping[str, Any]) -> Iterable[Row]:
     if shared := details.get("shared_sigma"):
-        yield _line("", _mostly(shared, "shared by frames"))
+        yield ("", _mostly(shared, "shared by frames"))
     size = details.get("size", {})
     if abs(size.get("share", 0.0) * size.get("by_dots", 0.0)) > LEAST_SIZE:
-        yield _line(
+        yield (
             "size",
             f"by the disc's dots lengths are {100 * size['by_dots']:+.4f} +- {100 * size['sigma']:.4f} % longer than "
             f"by the board; {100 * size['share']:.0f} % of that is taken over",
@@ -140,16 +140,12 @@ def sigma_text(trajectory: Trajectory) -> str:
     return _sigma_text(trajectory.coordinate_sigma, "median of the frames, noise of one frame")
 
 
-def _line(head: str, text: str) -> Row:
-    return head, text
-
-
 def _frame_lines(trajectory: Trajectory) -> Iterable[Row]:
-    yield _line("frames", frames_text(trajectory))
+    yield ("frames", frames_text(trajectory))
     for status in FrameStatus:
         rows = np.flatnonzero(trajectory.frame_status == status)
         if status != FrameStatus.MEASURED and rows.size:
-            yield _line("", f"{rows.size} {status.sentence} (frames {ranges(trajectory.frame[rows])})")
+            yield ("", f"{rows.size} {status.sentence} (frames {ranges(trajectory.frame[rows])})")
 
 
 def _sigma_text(sigma: Array, what: str) -> str:
@@ -161,7 +157,7 @@ def _sigma_text(sigma: Array, what: str) -> str:
     return f"x {x:.2f}  y {y:.2f}  z {z:.2f} um   psi {psi:.1f}  theta {theta:.2f}  phi {phi:.1f} mdeg  ({what})"
 
 
-def _fit_line(trajectory: Trajectory) -> Row:
+def _fit_row(trajectory: Trajectory) -> Row:
     rms = trajectory.reprojection_rms_px
     cameras = [
         f"{name} {np.sqrt(np.nanmean(rms[:, i] ** 2)):.4f} px" if np.isfinite(rms[:, i]).any() else f"{name} not used"
@@ -169,4 +165,4 @@ def _fit_line(trajectory: Trajectory) -> Row:
     ]
     chi = trajectory.reduced_chi_square
     median = f"{np.nanmedian(chi):.2f}" if np.isfinite(chi).any() else "not known"
-    return _line("reprojection", f"{', '.join(cameras)}; reduced chi-square {median} (median; 1 is expected)")
+    return "reprojection", f"{', '.join(cameras)}; reduced chi-square {median} (median; 1 is expected)"

@@ -1,13 +1,27 @@
 """Measured trajectories of a disc without rendering, with what is planted as keywords (disctrack.validate.points)."""
 
 from disctrack.faults.keys import Faults
+from disctrack.frames import rotation_from_quaternion
+from disctrack.track.refine.self_calibration import DotsInFrames
 from disctrack.validate import points
 from disctrack.validate.points import K_M, SIGMA_PX, Filmed, Laboratory, Planted
 
-__all__ = ["K_M", "SIGMA_PX", "Laboratory", "measured"]
+__all__ = ["K_M", "SIGMA_PX", "Laboratory", "dots_of", "measured"]
 
 
 def measured(effects=None, *, faults=None, laboratory=None, motion=None, laws=(), disc=None, **filmed):
     """`filmed` : fields of `Filmed`; the others as in `Planted` and `points.measured`."""
     planted = Planted(effects=effects or {}, faults=faults or Faults(), laboratory=laboratory or Laboratory())
     return points.measured(planted, Filmed(**filmed), motion=motion, laws=laws, disc=disc)
+
+
+def dots_of(trajectory):
+    """The dots of a trajectory with its poses."""
+    return DotsInFrames(
+        trajectory.rig,
+        trajectory.disc,
+        trajectory.markers_px,
+        trajectory.markers_covariance_px2,
+        rotation_from_quaternion(trajectory.quaternion),
+        trajectory.q[:, :3],
+    )

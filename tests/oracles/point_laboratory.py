@@ -14,6 +14,7 @@ from disctrack.disc import MA_2014
 from disctrack.frames import rotation_from_quaternion, vector_from_rotation
 from disctrack.track.dots._kernels import DOT
 from disctrack.track.dots.template import NoiseModel
+from disctrack.track.dots.template_response import Edge
 from disctrack.track.follow.following import Follower, Law, Tables, TrackingSetup
 from disctrack.track.refine.assembly import Taken, TrackingSettings, assemble
 from disctrack.trajectory import FrameStatus, MarkerStatus
@@ -132,7 +133,7 @@ def tracked(px, R, t, times, rig, frame_rate):
     """What tracking makes of located dots (n, 2, m, 2), followed near poses R, t."""
     nothing = np.zeros((2, 1, 1))
     setup = TrackingSetup(rig, MA_2014, nothing, nothing)
-    follower = Follower(setup, Law((NoiseModel(0.64, 0.02),) * 2), measured=True)
+    follower = Follower(setup, Law((Edge(noise=NoiseModel(0.64, 0.02)),) * 2), measured=True)
     return assemble(
         [follower],
         tables_of(px, R, t, DOT_PX),

@@ -41,16 +41,11 @@ class Acquisition:
 
 
 def dot_blobs(image: NDArray[np.generic], expected_diameter_px: float) -> Array:
-    """Centroids (k, 2) of round-ish blobs, dark on light and light on dark, most elliptical first.
+    """Centroids and areas (k, 3) of round-ish blobs, dark on light and light on dark, most elliptical first.
 
-    A blob's pixels differ from the mean of their surroundings (so uneven light does not matter), and its area must be
-    that of the ellipse with the same second moments.
+    x, y [px], area [px^2]. A blob's pixels differ from the mean of their surroundings (so uneven light does not
+    matter), and its area must be that of the ellipse with the same second moments.
     """
-    return _sized_blobs(image, expected_diameter_px)[:, :2]
-
-
-def _sized_blobs(image: NDArray[np.generic], expected_diameter_px: float) -> Array:
-    """`dot_blobs` with their areas, (k, 3): x, y [px], area [px^2]."""
     grey = np.asarray(image, np.float32) / np.float32(level_step(image))  # images of any depth alike, to the last bit
     block = 2 * int(1.25 * expected_diameter_px) + 1
     smooth = cv2.GaussianBlur(grey, (0, 0), 1.0)
@@ -98,7 +93,7 @@ def expected_diameter_px(rig: StereoRig, disc: Disc) -> tuple[float, float]:
 def acquire(left: NDArray[np.generic], right: NDArray[np.generic], rig: StereoRig, disc: Disc) -> Acquisition:
     """Find the disc in one pair of images, wherever it is and however it is turned."""
     diameters = expected_diameter_px(rig, disc)
-    blobs = [dot_blobs(image, diameter) for image, diameter in zip((left, right), diameters, strict=True)]
+    blobs = [dot_blobs(image, diameter)[:, :2] for image, diameter in zip((left, right), diameters, strict=True)]
     return acquire_from_blobs(blobs, rig, disc)
 
 
@@ -131,7 +126,7 @@ def seen_by_one_camera(
     The blobs are x, y [px], area [px^2], (n_markers, 3), NaN for dots that are not seen. What one camera sees is the
     same on every scale: neither baseline nor table matter.
     """
-    blobs = _sized_blobs(image, diameter_px)
+    blobs = dot_blobs(image, diameter_px)
     best = np.full((disc.n_markers, 3), np.nan), np.eye(3), np.zeros(3)
     R_cw, t_cw = rig.camera_poses()[camera]
     for R, t in _candidates_from_one_camera(blobs[:, :2], camera, rig, disc):

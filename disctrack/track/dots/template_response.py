@@ -14,37 +14,38 @@ from typing import NamedTuple
 import numpy as np
 
 from calibration.kit.arrays import Array
-from disctrack.track.dots.template import NoiseModel
+from disctrack.track.dots.template import TYPICAL_BLUR_PX, NoiseModel
 
 BAND = 3.0  # blurs
 ACROSS, AROUND = 60, 32  # nodes of an edge
 SIZES, SHAPES = 5, np.geomspace(0.2, 1.0, 13)  # of dots (short over long axis) between which the pull is interpolated
 
 
-class Pull(NamedTuple):
-    """What a camera's templates see of an edge."""
+class Edge(NamedTuple):
+    """How the edges of dots look in a camera; as they usually do, where nothing was measured."""
 
-    blur_px: float  # sigma of the edge
-    light: tuple[float, float]  # grey value of the paper, and the dots' contrast with it
-    noise: NoiseModel
+    blur_px: float = TYPICAL_BLUR_PX  # sigma
+    level: float = 200.0  # grey value of the paper
+    contrast: float = 0.85  # of the dots with it
+    noise: NoiseModel = NoiseModel(1.0, 0.02)
 
 
-def pulls_by_exposure(radius: float, affine: Array, pull: Pull) -> Array:
+def pulls_by_exposure(radius: float, affine: Array, edge: Edge) -> Array:
     """(n, m, 8) shifts by an exposure, over T^2 / 24 and products of velocity v and growth G (see `exposure`).
 
     radius [m] of the dots; affine (n, m, 2, 2) [px/m] from their plane to the image; NaN where it is. Axes 1, 2 are the
     image's long and short one. The first four numbers are of a shift along axis 1, by v1 G11, v1 G22, v2 G12, v2 G21;
     the others along axis 2, by v2 G11, v2 G22, v1 G12, v1 G21: the others vanish by symmetry.
     """
-    return _tabulated(radius, affine, pull, _edge_smeared)
+    return _tabulated(radius, affine, edge, _edge_smeared)
 
 
-def pulls_by_contrast(radius: float, affine: Array, pull: Pull) -> Array:
+def pulls_by_contrast(radius: float, affine: Array, edge: Edge) -> Array:
     """(n, m, 2) [px^2] shifts along the long and the short axis by the gradient of the contrast; arguments as above."""
-    return _tabulated(radius, affine, pull, _contrast_graded)
+    return _tabulated(radius, affine, edge, _contrast_graded)
 
 
-def _tabulated(radius: float, affine: Array, pull: Pull, changes: Changes) -> Array:
+def _tabulated(radius: float, affine: Array, edge: Edge, changes: Changes) -> Array:
     """What `_response` tells of dots of this size, interpolated."""
     long, short = half_axes(affine)
     size, shape = radius * np.sqrt(long * short), short / long
@@ -52,7 +53,7 @@ def _tabulated(radius: float, affine: Array, pull: Pull, changes: Changes) -> Ar
     if not known.any():
         return np.full((*size.shape, 1), np.nan)
     sizes = np.linspace(size[known].min(), size[known].max() * (1 + 1e-9), SIZES)
-    table = _response(sizes, pull, changes)
+    table = _response(sizes, edge, changes)
     T = _between(table, sizes, np.where(known, size, sizes[0]), np.where(known, shape, 1.0))
     return np.where(known[..., None], T, np.nan)
 
@@ -80,17 +81,17 @@ class _Band(NamedTuple):
 Changes = Callable[[_Band, int], Array]  # of an image, odd along axis 0 or 1: (k, sizes, SHAPES, AROUND, ACROSS)
 
 
-def _response(sizes: Array, pull: Pull, changes: Changes) -> Array:
+def _response(sizes: Array, edge: Edge, changes: Changes) -> Array:
     """(sizes, SHAPES, 2 k) what the template takes for a shift, along the long axis (k numbers) and the short one.
 
     sizes : [px] root of the half axes' product. Least squares over the template's band of pixels, weighted by their
     noise, of centre and slope of the light together; what else is fitted (size, blur, grey values) is even about the
     centre.
     """
-    sigma, (level, contrast) = pull.blur_px, pull.light
+    sigma, level, contrast, noise = edge
     d = np.linspace(-(BAND * sigma + 2.0), BAND * sigma + 1.0, ACROSS)  # as `_kernels` selects its pixels
     seen = 0.5 * np.array([math.erfc(x) for x in d / (np.sqrt(2.0) * sigma)])
-    edge = 1.0 - contrast * seen
+    grey = 1.0 - contrast * seen
     first = contrast * np.exp(-0.5 * (d / sigma) ** 2) / (np.sqrt(2.0 * np.pi) * sigma)
     angle = 2 * np.pi * (np.arange(AROUND) + 0.5) / AROUND
     cos, sin = np.cos(angle), np.sin(angle)
@@ -98,11 +99,11 @@ def _response(sizes: Array, pull: Pull, changes: Changes) -> Array:
     speed = np.hypot(b * cos, a * sin)  # of the outline with the angle
     normal, edge_at, bend = (b * cos / speed, a * sin / speed), (a * cos, b * sin), a * b / speed**3
     band = _Band(d, seen, first, -d / sigma**2 * first, normal, edge_at, bend)
-    weight = np.clip(1 + bend[..., None] * d, 0.0, None) * speed[..., None] / pull.noise.variance(level * edge)
+    weight = np.clip(1 + bend[..., None] * d, 0.0, None) * speed[..., None] / noise.variance(level * grey)
     found = []
     for axis in range(2):
         place = band.u[axis][..., None] + band.n[axis][..., None] * d
-        design = np.stack([-first * band.n[axis][..., None], place * edge])
+        design = np.stack([-first * band.n[axis][..., None], place * grey])
         weighted = (design * weight).reshape(2, *a.shape[:2], -1)
         flat = design.reshape(2, *a.shape[:2], -1)
         data = changes(band, axis)

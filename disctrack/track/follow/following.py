@@ -21,13 +21,13 @@ from disctrack.disc import Disc
 from disctrack.track.dots import _kernels as kernels
 from disctrack.track.dots.acquisition import Pose, acquire
 from disctrack.track.dots.template import (
-    TYPICAL_BLUR_PX,
     NoiseModel,
     face_of,
     measure_noise,
     no_more_than_left,
     typical_noise,
 )
+from disctrack.track.dots.template_response import Edge
 from disctrack.track.follow.motion_span import StillScene
 from disctrack.track.pose import stacked
 from disctrack.trajectory import FrameStatus, MarkerStatus
@@ -45,11 +45,9 @@ REPEAT_REACH = 4  # frames back that an image is compared with: recorders repeat
 
 @dataclass(frozen=True)
 class Law:
-    """Noise and blur [px] of the left and the right camera, and how well dots fit."""
+    """How the dots' edges look in each camera, and how well dots fit."""
 
-    noise: tuple[NoiseModel, NoiseModel] = (NoiseModel(1.0, 0.02), NoiseModel(1.0, 0.02))
-    blur: tuple[float, float] = (TYPICAL_BLUR_PX, TYPICAL_BLUR_PX)
-    light: tuple[tuple[float, float], tuple[float, float]] = ((200.0, 0.85), (200.0, 0.85))  # paper's grey, contrast
+    edges: tuple[Edge, Edge] = (Edge(), Edge())
     misfit: float = 1.0  # rms residual over the noise that dots usually leave: compressed edges leave 4 and more
 
 
@@ -152,7 +150,8 @@ class Follower:
     measured: bool = False  # blur and noise known
     acquisitions: int = 0
     first_reason: str = ""
-    saturated: tuple[int | None, int | None] = (None, None)  # grey value at which the dots' brighter side is clipped
+    saturated: list[int | None] = field(default_factory=lambda: [None, None])  # grey value at which the dots' brighter
+    # side is clipped
     first_row: int = 0  # of the tables
 
     def without_pose(self) -> None:
@@ -181,7 +180,11 @@ def run(
         readable,
         kernels.Views(setup.maps_x, setup.maps_y, *stacked(setup.rig)),
         face_of(setup.disc),
-        kernels.Expected(np.array(law.blur), np.stack([noise.parameters for noise in law.noise]), limits),
+        kernels.Expected(
+            np.array([edge.blur_px for edge in law.edges]),
+            np.stack([edge.noise.parameters for edge in law.edges]),
+            limits,
+        ),
         known,
         rows.results,
         rows.status,
@@ -342,49 +345,46 @@ def _found(follower: Follower, pair: Image, readable: Mask) -> Pose | None:
 
 def _measure_blur_and_noise(follower: Follower, images: Image, readable: Mask, pose: Pose, heading: Heading) -> None:
     """Measure the law of the cameras' noise and blur; where the disc is not there after all, nothing is kept."""
-    setup, law = follower.setup, Law()
-    n, m = min(NOISE_FRAMES, len(images)), setup.disc.n_markers
-    noise, blur, light, misfit = list(law.noise), list(law.blur), list(law.light), law.misfit
-    saturated: list[int | None] = [None, None]
+    setup, edges, misfit = follower.setup, list(Law().edges), Law().misfit
+    n = min(NOISE_FRAMES, len(images))
 
-    def flat_noise(camera: int, frames: Sequence[int], R: Array, t: Array, blur_px: float) -> NoiseModel:
+    def flat_noise(camera: int, frames: Sequence[int], R: Array, t: Array) -> NoiseModel:
         """Of flat parts beside and in the dots, at poses R, t of each frame."""
         R_cw, t_cw = setup.rig.camera_poses()[camera]
         poses = [(R_cw @ R[k], R_cw @ t[k] + t_cw) for k in frames]
+        seen = [images[k, camera] for k in frames]
         maps = setup.maps_x[camera], setup.maps_y[camera]
-        return measure_noise(
-            [images[k, camera] for k in frames], setup.rig.cameras[camera], poses, setup.disc, maps, blur_px
-        )
+        return measure_noise(seen, setup.rig.cameras[camera], poses, setup.disc, maps, edges[camera].blur_px)
 
     for camera in range(2):
         # a first idea of the noise, or good dots of a noisy camera, or of more than 8 bits, would look like misfits;
         # the pose found by blobs is good to a fraction of a pixel, and the flat parts keep off the edges by more
         if readable[0, camera]:
-            noise[camera] = flat_noise(camera, [0], pose[0][None], pose[1][None], blur[camera])
+            edges[camera] = Edge(noise=flat_noise(camera, [0], pose[0][None], pose[1][None]))
         elif readable[:n, camera].any():
-            noise[camera] = typical_noise(images[int(np.argmax(readable[:n, camera])), camera])
+            edges[camera] = Edge(noise=typical_noise(images[int(np.argmax(readable[:n, camera])), camera]))
     for blur_known in (False, True):  # the second time with the blur of the first, and the misfit that is usual
-        law = Law((noise[0], noise[1]), (blur[0], blur[1]), misfit=misfit)
-        trial = empty_tables(n, m)
+        # how the noise is taken to be tells why dots are refused, if they are
+        follower.law = Law((edges[0], edges[1]), misfit)
+        trial = empty_tables(n, setup.disc.n_markers)
         limits = kernels.Limits() if blur_known else kernels.Limits(blur=np.inf, share=MOST_USUAL)
-        done, _ = run(setup, law, heading, images[:n], readable[:n], trial, limits)
+        done, _ = run(setup, follower.law, heading, images[:n], readable[:n], trial, limits)
         if done == 0 or not _enough(trial.status[:1]):
-            follower.law = law  # how the noise was taken to be tells why the dots are refused
             return
         good = trial.status[:done] == MarkerStatus.MEASURED
         for camera in range(2):
             fits = trial.results[:done, camera][good[:, camera]]
             if not len(fits):
                 continue
-            blur[camera] = float(np.median(fits["sigma"]))
-            light[camera] = float(np.median(fits["level"])), float(np.median(fits["contrast"]))
+            blur, level, contrast = (float(np.median(fits[name])) for name in ("sigma", "level", "contrast"))
+            edges[camera] = Edge(blur, level, contrast, edges[camera].noise)
             misfit = max(misfit, float(np.sqrt(np.median(fits["chi_square"]))))
             if blur_known:
-                flat = flat_noise(camera, range(0, done, NOISE_STEP), trial.R, trial.t, blur[camera])
-                noise[camera] = no_more_than_left(flat, noise[camera], fits)
-                saturated[camera] = _saturated(images[:done, camera], fits, noise[camera])
-    follower.saturated = saturated[0], saturated[1]
-    follower.law, follower.measured = Law((noise[0], noise[1]), (blur[0], blur[1]), (light[0], light[1]), misfit), True
+                flat = flat_noise(camera, range(0, done, NOISE_STEP), trial.R, trial.t)
+                noise = no_more_than_left(flat, edges[camera].noise, fits)
+                edges[camera] = edges[camera]._replace(noise=noise)
+                follower.saturated[camera] = _saturated(images[:done, camera], fits, noise)
+    follower.law, follower.measured = Law((edges[0], edges[1]), misfit), True
 
 
 def _saturated(images: Image, fits: NDArray, noise: NoiseModel) -> int | None:

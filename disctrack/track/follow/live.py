@@ -110,9 +110,9 @@ class Tracker:
         if not done:
             follower.without_pose()
             self._angles = None
-            return self._without_pose(FrameStatus.MARKERS_NOT_FOUND)
+            return self._pose(empty_tables(1, m), FrameStatus.MARKERS_NOT_FOUND)
         follower.lost, follower.search = None, Search()
-        return self._pose(rows)
+        return self._pose(rows, FrameStatus.NOT_CONVERGED)
 
     def _run(self, images: NDArray, rows: Tables) -> int:
         follower = self._follower
@@ -148,22 +148,23 @@ class Tracker:
             self._found = (rows.R[0].copy(), rows.t[0].copy())
         return done
 
-    def _pose(self, rows: Tables) -> LivePose:
+    def _pose(self, rows: Tables, unless: FrameStatus) -> LivePose:
+        """What the rows hold; `unless` there is a pose in them."""
         dots = dot_centres(rows.results, rows.status)
         centres = self.disc.marker_centres_body
         fit = fit_poses(dots.pixels, dots.covariance_px2, self.rig, centres, rows.R, rows.t, with_sensitivity=False)
-        if not fit.converged[0]:
-            return self._without_pose(FrameStatus.NOT_CONVERGED)
-        angles = frames.euler_from_rotation(fit.R_world_body[0])
-        if self._angles is not None:
-            angles = frames.unwrap_euler(np.stack([self._angles, angles]))[1]
-        self._angles = angles
-        per_camera = fit.used[0].sum(axis=1)
-        status = FrameStatus.MEASURED
-        if (per_camera == 0).any():
-            status = FrameStatus.ONE_CAMERA
-        elif per_camera.sum() < MIN_GOOD_DOT_IMAGES:
-            status = FrameStatus.FEW_MARKERS
+        angles, status = np.full(3, np.nan), unless
+        if fit.converged[0]:
+            angles = frames.euler_from_rotation(fit.R_world_body[0])
+            if self._angles is not None:
+                angles = frames.unwrap_euler(np.stack([self._angles, angles]))[1]
+            self._angles = angles
+            per_camera = fit.used[0].sum(axis=1)
+            status = FrameStatus.MEASURED
+            if (per_camera == 0).any():
+                status = FrameStatus.ONE_CAMERA
+            elif per_camera.sum() < MIN_GOOD_DOT_IMAGES:
+                status = FrameStatus.FEW_MARKERS
         return LivePose(
             self.frame,
             np.concatenate([fit.t_world_body[0], angles]),
@@ -174,10 +175,3 @@ class Tracker:
             fit.residuals_px[0],
             float(fit.reduced_chi_square[0]),
         )
-
-    def _without_pose(self, status: FrameStatus) -> LivePose:
-        m, nan = self.disc.n_markers, np.nan
-        return LivePose(
-            self.frame, np.full(6, nan), np.full((3, 3), nan), np.full((6, 6), nan), status,
-            np.full((2, m, 2), nan), np.full((2, m, 2), nan), nan,
-        )  # fmt: skip

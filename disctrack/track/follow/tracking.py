@@ -131,7 +131,7 @@ def _senseless(tracking: Tracking, faulty: bool, read_blocks: ReadBlocks, pairs:
     kinds = {finding.kind for finding in tracking.findings}
     status = tracking.trajectory.frame_status
     contradicted = Kind.ONE_SIDED in kinds or np.mean(status == FrameStatus.CONTRADICTED) > MOSTLY
-    far = faulty and max(tracking.systematic_px) > FAR_PX
+    far = faulty and max(tracking.scatter.systematic_px) > FAR_PX
     if not (contradicted or far) or Kind.DROPPED_FRAMES in kinds:  # which makes cameras contradict each other
         return _some(read_blocks, pairs[:0])
     of_one = (status == FrameStatus.ONE_CAMERA) | (status == FrameStatus.CONTRADICTED)

@@ -17,6 +17,7 @@ from itertools import chain, islice
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.distance import pdist
 
 from calibration.cameras.camera import N_RIG, PAIR_SHIFT, PAIR_TURN, StereoRig, triangulate
 from calibration.kit.arrays import Array, Mask
@@ -33,8 +34,9 @@ from disctrack.track.dots.acquisition import (
     rigid_motions,
     seen_by_one_camera,
 )
+from disctrack.track.dots.template_response import plane_to_image
 from disctrack.track.judge.doubts import misplaced_dots
-from disctrack.track.pose import fit_poses
+from disctrack.track.pose import fit_poses, marker_pixels
 from disctrack.track.refine.self_calibration import MIN_FRAMES, DotsInFrames, declared_places_kept, fit_shared
 
 Turn = Callable[[NDArray], NDArray]
@@ -52,7 +54,6 @@ UNITS = {1e3: "mm and m", 1e2: "m and cm", 10.0: "cm and mm", 25.4: "inches and 
 SIZE_TOLERANCE = 0.15  # blur and threshold make a blob larger or smaller than its dot
 MISPLACED = 0.2  # of the distance between two dots: places measured with a ruler, not dots numbered wrongly
 MEETING_PX = 1.0  # beyond, cameras or clocks do not fit together, and places seen by both are none
-RIM = 64  # points of a dot's outline
 
 
 def why_not_seen(pairs: NDArray, rig: StereoRig, disc: Disc) -> tuple[Finding, ...]:
@@ -161,7 +162,9 @@ def unlike_declared(pair: NDArray, rig: StereoRig, disc: Disc) -> tuple[Finding,
         return (_on_another_scale(seen.scale),)
     (R,), (t,) = rigid_motions(disc.marker_centres_body[None, seen.which], seen.points[None])
     # by the middle one of the searches: one for blobs far smaller than the dots finds what is darkest in them
-    sizes = [np.median(np.sqrt(found.areas / _areas(found, R, rig, disc))) for found in several]
+    J = marker_pixels(R[None], t[None], rig, disc.marker_centres_body)[1]
+    expected = np.pi / 4 * disc.marker_diameter**2 * np.abs(np.linalg.det(plane_to_image(J, R[None])[0]))
+    sizes = [np.median(np.sqrt(found.areas / expected[:, found.which])) for found in several]
     diameter = disc.marker_diameter * float(np.median(sizes))
     if abs(np.log(diameter / disc.marker_diameter)) > SIZE_TOLERANCE:
         remedy = Remedy("[markers] diameter_mm", f"{1e3 * diameter:.2g}", f"{1e3 * disc.marker_diameter:g}")
@@ -182,24 +185,11 @@ def _seen_dots(pair: NDArray, rig: StereoRig, disc: Disc) -> Iterator[SeenDots]:
             continue
         pixels = blobs[:, which, :2]
         points = triangulate(pixels, rig)
-        one, other = np.triu_indices(which.sum(), 1)
-        ratios = _distances(points, one, other) / _distances(disc.marker_centres_body[which], one, other)
+        ratios = pdist(points) / pdist(disc.marker_centres_body[which])
         scale = float(np.median(ratios))
         misfit = float(np.abs(rig.project(points) - pixels).max())
         if misfit < EPIPOLAR_PX and scale > 0 and np.abs(ratios / scale - 1).max() < MISPLACED:
             yield SeenDots(which, points, blobs[:, which, 2], scale, misfit)
-
-
-def _distances(points: Array, one: NDArray[np.intp], other: NDArray[np.intp]) -> Array:
-    return np.asarray(np.linalg.norm(points[one] - points[other], axis=-1))
-
-
-def _areas(seen: SeenDots, R: Array, rig: StereoRig, disc: Disc) -> Array:
-    """(2, k) [px^2] of the images of dots of the declared diameter."""
-    angle = np.linspace(0, 2 * np.pi, RIM, endpoint=False)
-    rim = 0.5 * disc.marker_diameter * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=-1) @ R.T
-    x, y = np.moveaxis(rig.project(seen.points[:, None] + rim).swapaxes(0, 1), -1, 0)
-    return np.asarray(0.5 * np.abs(np.sum(x * np.roll(y, -1, axis=-1) - y * np.roll(x, -1, axis=-1), axis=-1)))
 
 
 def _on_another_scale(scale: float) -> Finding:

@@ -1,6 +1,6 @@
 """What a run says about its own result: what makes it worse, and what puts it in question."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -9,8 +9,10 @@ from disctrack import frames
 from disctrack.disc import Disc, symmetry_order
 from disctrack.findings import MISFITS, Finding, Kind, Number, Remedy, Severity, Subject
 from disctrack.track.follow.following import Follower
+from disctrack.track.judge.dropped_frames import delay_of_right
 from disctrack.track.refine.intrinsic_scatter import Scatter, SharedFaults
 from disctrack.track.refine.pose_scatter import GROUPS, PoseScatter
+from disctrack.track.refine.self_calibration import DotsInFrames
 from disctrack.track.refine.table_contact import TableFromDisc
 from disctrack.trajectory import FrameStatus, Trajectory
 
@@ -146,11 +148,11 @@ def doubts_of(
     poses: PoseScatter,
     table: TableFromDisc | None,
     trajectory: Trajectory,
-    delay: Callable[[], tuple[float, float]],
+    seen: DotsInFrames,
 ) -> tuple[Finding, ...]:
     """What a tracking says about its own result.
 
-    delay : frame periods by which the right camera is ahead, and the share of the dots' misfit that this explains
+    seen : the dots, with the poses that were fitted to them
     """
     misplaced = misplaced_dots(follower.setup.disc, trajectory.disc.marker_centres_body)
     found = [*_one_sided(trajectory), *_symmetric(follower.setup.disc), *_clipped(follower), *misplaced]
@@ -158,8 +160,8 @@ def doubts_of(
     systematic_px = max(scatter.systematic_px)
     if scatter.whole > min(FAULTY * own, HOPELESS) and systematic_px > ORDINARY_PX:
         times = np.sqrt(scatter.whole / own)
-        seen = f"the dots miss their fitted places by {times:.1f} times their own scatter ({systematic_px:.3f} px)"
-        found.append(_misfit(seen, *delay(), trajectory.frame_rate))
+        text = f"the dots miss their fitted places by {times:.1f} times their own scatter ({systematic_px:.3f} px)"
+        found.append(_misfit(text, *delay_of_right(seen, np.flatnonzero(seen.posed)), trajectory.frame_rate))
     elif scatter.noise > 4.0:
         text = (
             f"the dots scatter {np.sqrt(scatter.noise):.1f} times more than the image noise explains: they are not "

@@ -5,18 +5,16 @@ To first order they are displaced by their velocity in the image times the delay
 makes up for is no sign of it.
 """
 
-from functools import partial
-
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.cameras.camera import StereoRig
-from calibration.kit.arrays import Array, Mask
+from calibration.kit.arrays import Mask
 from calibration.kit.brief import ranges
 from calibration.kit.least_squares import normal_of_rows
 from disctrack.findings import MISFITS, Finding, Kind, Number, Remedy, Severity, Subject
 from disctrack.frames import CAMERAS
-from disctrack.track.pose import PoseFits, misses, whitening
+from disctrack.track.pose import misses, whitening
+from disctrack.track.refine.self_calibration import DotsInFrames
 from disctrack.track.side_by_side import evenly
 
 SHORTEST = 4  # frames: a gleam or a hand is told by the frames' own status
@@ -24,22 +22,13 @@ EXPLAINED, TOLD = 0.9, 0.5  # of the square of the misfit: by a slip; or by no d
 DELAY_FRAMES = 100  # that a delay is taken from, at most
 
 
-def dropped_frames(
-    refused: Mask,
-    fits: PoseFits,
-    markers_px: Array,
-    covariance_px2: Array,
-    rig: StereoRig,
-    centres: Array,
-    pairs: range,
-) -> tuple[Finding, ...]:
-    """Long stretches of frames refused (n,) for their dots; the other arguments as in `fit_poses`."""
-    delay_of = partial(delay_of_right, fits, markers_px, covariance_px2, rig, centres)
+def dropped_frames(refused: Mask, seen: DotsInFrames, pairs: range) -> tuple[Finding, ...]:
+    """Long stretches of frames refused (n,) for their dots."""
     slips: list[tuple[int, list[int], list[float]]] = []  # the images left out, rows, the delays that say so
     unexplained: list[int] = []
     edges = np.flatnonzero(np.diff(np.r_[False, refused, False].astype(int))).reshape(-1, 2)
     for first, end in edges[edges[:, 1] - edges[:, 0] >= SHORTEST]:
-        delay, explained = delay_of(np.arange(first, end))
+        delay, explained = delay_of_right(seen, np.arange(first, end))
         ahead = round(delay) if explained > EXPLAINED else 0
         if not ahead:
             unexplained += pairs[first:end]
@@ -53,8 +42,8 @@ def dropped_frames(
     for k, (ahead, rows, delays) in enumerate(slips):
         camera, other = CAMERAS[::-1] if ahead > 0 else CAMERAS
         before = np.arange(rows[0])
-        delay, explained = delay_of(before)
-        by_both = np.isfinite(fits.residuals_px[before]).all(axis=-1).any(axis=-1).all(axis=-1)
+        delay, explained = delay_of_right(seen, before)
+        by_both = np.isfinite(seen.pixels[before]).all(axis=-1).any(axis=-1).all(axis=-1) & seen.posed[before]
         always = k == 0 and (round(delay) == ahead if explained > TOLD else by_both.sum() < SHORTEST)
         frames, n = [pairs[i] for i in rows], abs(ahead)
         text = (
@@ -71,26 +60,26 @@ def dropped_frames(
     return tuple(said)
 
 
-def delay_of_right(
-    fits: PoseFits, markers_px: Array, covariance_px2: Array, rig: StereoRig, centres: Array, rows: NDArray[np.intp]
-) -> tuple[float, float]:
+def delay_of_right(seen: DotsInFrames, rows: NDArray[np.intp]) -> tuple[float, float]:
     """Frame periods by which the right camera is ahead of the left in these frames, and the share of misfit explained.
 
     (0, 0) where no frame has both its neighbours.
     """
-    inside = rows[(rows > 0) & (rows < len(fits.converged) - 1)]
-    some = evenly(inside[fits.converged[inside]], DELAY_FRAMES)
-    R, t = fits.R_world_body[some], fits.t_world_body[some]
-    residuals, by_pose, seen = misses(markers_px[some], covariance_px2[some], rig, centres, R, t)
+    inside = rows[(rows > 0) & (rows < len(seen.t) - 1)]
+    rows = evenly(inside[seen.posed[inside]], DELAY_FRAMES)
+    some, pixels = seen.at(rows), seen.pixels
+    residuals, by_pose, known = misses(
+        some.pixels, some.covariance, some.rig, some.disc.marker_centres_body, some.R, some.t
+    )
     velocity = np.zeros_like(residuals)
-    velocity[:, 1] = 0.5 * (markers_px[some + 1, 1] - markers_px[some - 1, 1])
-    by_delay = (whitening(covariance_px2[some]) @ velocity[..., None])[..., 0]
-    seen &= np.isfinite(by_delay).all(axis=-1) & np.isfinite(by_pose).all(axis=(-2, -1))
-    seen &= seen.sum(axis=(1, 2), keepdims=True) >= 4
+    velocity[:, 1] = 0.5 * (pixels[rows + 1, 1] - pixels[rows - 1, 1])
+    by_delay = (whitening(some.covariance) @ velocity[..., None])[..., 0]
+    known &= np.isfinite(by_delay).all(axis=-1) & np.isfinite(by_pose).all(axis=(-2, -1))
+    known &= known.sum(axis=(1, 2), keepdims=True) >= 4
     # with the residuals as a shared column, too: what of their square no pose makes up for
     both = np.stack([by_delay, residuals, residuals], axis=-1)
-    told = np.where(seen[..., None, None], np.concatenate([by_pose, both], axis=-1), 0.0)
-    (by_itself, across), (_, whole) = normal_of_rows(told.reshape(len(some), -1, 9), 6).eliminated()[0]
+    told = np.where(known[..., None, None], np.concatenate([by_pose, both], axis=-1), 0.0)
+    (by_itself, across), (_, whole) = normal_of_rows(told.reshape(len(rows), -1, 9), 6).eliminated()[0]
     if not (whole > 0 and by_itself > 0):
         return 0.0, 0.0
     return float(across / by_itself), float(across**2 / (by_itself * whole))

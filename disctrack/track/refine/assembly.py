@@ -1,7 +1,6 @@
 """From what was followed to the trajectory: what all frames share is refined, all poses are fitted and judged."""
 
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,13 +9,11 @@ from calibration.cameras.camera import StereoRig
 from calibration.cameras.causes import causes
 from calibration.kit.arrays import Array, Mask
 from disctrack import frames
-from disctrack.disc import Disc
 from disctrack.findings import Finding
-from disctrack.track.dots.template import DotCentres, NoiseModel, dot_centres
-from disctrack.track.dots.template_response import Pull
-from disctrack.track.follow.following import Follower, Tables, TrackingSetup, repeats
+from disctrack.track.dots.template import DotCentres, dot_centres
+from disctrack.track.follow.following import Follower, Law, Tables, repeats
 from disctrack.track.judge.doubts import FAULTY, doubts_of, repeated_images
-from disctrack.track.judge.dropped_frames import delay_of_right, dropped_frames
+from disctrack.track.judge.dropped_frames import dropped_frames
 from disctrack.track.judge.outlier_tests import judge_poses, outlying_frames, unexpected_misfit
 from disctrack.track.pose import PoseFits, fit_poses, whitening
 from disctrack.track.refine.exposure import Exposure, exposure_by_smear, exposure_of, shift_by_exposure
@@ -26,6 +23,7 @@ from disctrack.track.refine.pose_scatter import PoseScatter, scatter_of_poses
 from disctrack.track.refine.self_calibration import (
     SHARED_FRAMES,
     AsBuilt,
+    DotsInFrames,
     by_pattern,
     refine_as_built,
     share_of_places,
@@ -54,14 +52,11 @@ class Tracking:
     """A trajectory and what the run found out on the way."""
 
     trajectory: Trajectory
-    noise: tuple[NoiseModel, NoiseModel]  # left, right
-    blur_px: tuple[float, float]
+    law: Law  # noise and blur of the cameras
     as_built: AsBuilt
-    variance_factor: float  # scatter of the dots about the fitted poses over what the image noise predicts, squared
-    noise_factor: float  # the part of it that changes from frame to frame (`own_scatter`), by which the covariances of
-    # dots and poses are multiplied; what is left of the other makes `Trajectory.systematic_covariance`
+    scatter: Scatter  # of the dots about the fitted poses; the covariances of dots and poses hold its noise, what is
+    # left of it makes `Trajectory.systematic_covariance`
     pose_scatter: PoseScatter  # of the poses about a smooth motion, beyond what the dots tell
-    systematic_px: tuple[float, float]  # rms per axis of what repeats in the dots' misfit, left and right camera
     shared_sigma: tuple[tuple[float, str], ...]  # x, y, z [m], turns [rad]: what frames share, most of it from what
     table: TableFromDisc | None  # the plane that the rim touched; None without a table, or a rim that touched it
     exposure: Exposure  # that the dots were moved by
@@ -87,23 +82,22 @@ def assemble(
     workers : threads; the result is the same to the last bit for any number of them
     """
     first = next((follower for follower in followers if follower.measured), followers[0])
+    rig, disc = first.setup.rig, first.setup.disc
     repeated, dots = repeats(tables.digest), dot_centres(tables.results, tables.status)
     exposure = _as_they_were(tables, dots, first, settings, taken)
-    _clean(tables, dots, repeated, first.setup.rig)
-    as_built, faults, outlying = _shared(tables, dots, first.setup, settings, workers)
-    fits = _fit_all(tables, dots, as_built.rig, as_built.disc, workers)
+    _clean(tables, dots, repeated, rig)
+    seen = DotsInFrames(rig, disc, dots.pixels, dots.covariance_px2, tables.R, tables.t)
+    as_built, faults, outlying = _shared(seen, settings, workers)
+    seen = replace(seen, rig=as_built.rig, disc=as_built.disc)
+    fits = fit_all(seen, workers)
     fits, systematic, scatter = _scattered(fits, dots, faults, outlying)
-    delay = partial(
-        delay_of_right,
-        fits,
-        dots.pixels,
-        dots.covariance_px2,
-        as_built.rig,
-        as_built.disc.marker_centres_body,
-        np.flatnonzero(fits.converged),
-    )
-    fits, verdicts, slips = _judged(fits, dots, as_built, repeated, outlying, taken)
-    fits, systematic, as_built, table = _on_the_table(fits, systematic, as_built, settings.table)
+    seen = replace(seen, R=fits.R_world_body, t=fits.t_world_body)
+    fits, verdicts = _judged(fits, dots, repeated, outlying, taken.frame_rate, disc.radius)
+    slips = dropped_frames(verdicts == FrameStatus.CONTRADICTED, seen, taken.pairs)
+    moved = by_pattern(as_built, fits.R_world_body)
+    fits, systematic, rig, table = table_from_disc(fits, systematic, as_built.rig, disc, settings.table, moved)
+    systematic += moved @ moved.swapaxes(1, 2)
+    as_built = replace(as_built, rig=rig)
     # after the table: what poses scatter beside their dots need not be white, and frames do not average it there
     poses = scatter_of_poses(fits)
     fits.covariance[...] *= np.sqrt(np.outer(poses.factor, poses.factor))
@@ -111,17 +105,14 @@ def assemble(
     trajectory = _trajectory(fits, verdicts, systematic, tables, dots, as_built, taken)
     if table is not None:
         trajectory = replace(trajectory, table_moved=table.beyond)
-    doubts = doubts_of(first, faults, scatter, poses, table, trajectory, delay)
+    doubts = doubts_of(first, faults, scatter, poses, table, trajectory, seen)
     return Tracking(
         trajectory=trajectory,
-        noise=first.law.noise,
-        blur_px=first.law.blur,
+        law=first.law,
         as_built=as_built,
-        variance_factor=scatter.whole,
-        noise_factor=scatter.noise,
+        scatter=scatter,
         pose_scatter=poses,
         shared_sigma=shared,
-        systematic_px=scatter.systematic_px,
         table=table,
         exposure=exposure,
         acquisitions=sum(f.acquisitions for f in followers),
@@ -134,13 +125,12 @@ def _as_they_were(
 ) -> Exposure:
     """Move the dots to where they were in the middle of the exposure but for gleams, and tell by which exposure."""
     where, rig, disc = (tables.R, tables.t, taken.time), first.setup.rig, first.setup.disc
+    edges = first.law.edges
     found = exposure_by_smear(*where, dots.blur_px, rig, disc)
     exposure = exposure_of(found, settings.exposure, 1 / taken.frame_rate)
-    law = first.law
-    left, right = (Pull(*seen) for seen in zip(law.blur, law.light, law.noise, strict=True))
-    dots.pixels[...] -= shift_by_gleam(tables.R, tables.t, dots.contrast, rig, disc, (left, right))
+    dots.pixels[...] -= shift_by_gleam(tables.R, tables.t, dots.contrast, rig, disc, edges)
     if any(exposure.seconds):
-        dots.pixels[...] -= shift_by_exposure(*where, np.array(exposure.seconds), rig, disc, (left, right))
+        dots.pixels[...] -= shift_by_exposure(*where, np.array(exposure.seconds), rig, disc, edges)
     return exposure
 
 
@@ -154,34 +144,22 @@ def _clean(tables: Tables, dots: DotCentres, repeated: Mask, rig: StereoRig) -> 
         dots.pixels[...] = rig.lens_field.corrected(dots.pixels)
 
 
-def _shared(
-    tables: Tables, dots: DotCentres, setup: TrackingSetup, settings: TrackingSettings, workers: int
-) -> tuple[AsBuilt, SharedFaults | None, Mask]:
+def _shared(seen: DotsInFrames, settings: TrackingSettings, workers: int) -> tuple[AsBuilt, SharedFaults | None, Mask]:
     """What the frames share, what is wrong with it, and which frames (n,) are outlying and do not enter."""
-    rig, disc = setup.rig, setup.disc
-    outlying = _outlying(tables, dots, rig, disc, workers)
-    faults = without_shared_faults(*_but(outlying, tables, dots, setup))
+    outlying = _outlying(seen, workers)
+    faults = without_shared_faults(seen.but(outlying))
     if faults is not None:  # misprinted dots raise the misfit of all frames, and hide faults of some
-        centres = disc.marker_centres_body + faults.marker_shift
-        more = _outlying(tables, dots, rig, replace(disc, marker_centres_body=centres), workers) & ~outlying
+        found = replace(seen.disc, marker_centres_body=seen.disc.marker_centres_body + faults.marker_shift)
+        more = _outlying(replace(seen, disc=found), workers) & ~outlying
         if more.any():
             outlying |= more
-            faults = without_shared_faults(*_but(outlying, tables, dots, setup))
+            faults = without_shared_faults(seen.but(outlying))
     if not settings.refine_markers:
-        return AsBuilt.as_declared(rig, disc), faults, outlying
-    as_built = refine_as_built(*_but(outlying, tables, dots, setup))
-    if faults is not None:
-        as_built = _without_false_shifts(as_built, rig, disc, faults)
+        return AsBuilt.as_declared(seen.rig, seen.disc), faults, outlying
+    as_built = refine_as_built(seen.but(outlying))
+    if faults is not None and as_built.reduced_chi_square > FAULTY * max(1.0, faults.reduced_chi_square):
+        as_built = _without_false_shifts(as_built, seen, faults)
     return as_built, faults, outlying
-
-
-def _but(
-    outlying: Mask, tables: Tables, dots: DotCentres, setup: TrackingSetup
-) -> tuple[Array, Array, StereoRig, Disc, Array, Array]:
-    """Dots and poses of frames as `pose.fit_poses` takes them, no pose for those that are outlying (n,)."""
-    R = np.where(outlying[:, None, None], np.nan, tables.R)
-    t = np.where(outlying[:, None], np.nan, tables.t)
-    return dots.pixels, dots.covariance_px2, setup.rig, setup.disc, R, t
 
 
 def _scattered(
@@ -201,70 +179,38 @@ def _scattered(
 
 
 def _judged(
-    fits: PoseFits, dots: DotCentres, as_built: AsBuilt, repeated: Mask, outlying: Mask, taken: Taken
-) -> tuple[PoseFits, NDArray[np.uint8], tuple[Finding, ...]]:
-    """Poses without those that are refused, what each is worth, and exchanged images in words."""
+    fits: PoseFits, dots: DotCentres, repeated: Mask, outlying: Mask, frame_rate: float, radius: float
+) -> tuple[PoseFits, NDArray[np.uint8]]:
+    """Poses without those that are refused, and what each is worth."""
     struck = (np.isfinite(dots.pixels).all(-1) & ~fits.used).sum(axis=(1, 2)) * fits.converged
-    status, factor = judge_poses(
-        fits, np.asarray(repeated.all(axis=1)), struck, outlying, 1 / taken.frame_rate, as_built.disc.radius
-    )
-    slips = dropped_frames(
-        status == FrameStatus.CONTRADICTED,
-        fits,
-        dots.pixels,
-        dots.covariance_px2,
-        as_built.rig,
-        as_built.disc.marker_centres_body,
-        taken.pairs,
-    )
+    status, factor = judge_poses(fits, np.asarray(repeated.all(axis=1)), struck, outlying, 1 / frame_rate, radius)
     fits.covariance[...] *= factor[:, None, None]
-    return replace(fits, converged=fits.converged & (status == FrameStatus.MEASURED)), status, slips
+    return replace(fits, converged=fits.converged & (status == FrameStatus.MEASURED)), status
 
 
-def _on_the_table(
-    fits: PoseFits, systematic: Array, as_built: AsBuilt, source: str
-) -> tuple[PoseFits, Array, AsBuilt, TableFromDisc | None]:
-    """Poses, rig and what frames share (n, 6, 6) in the axes of the table that the rim touched, and that table."""
-    moved = by_pattern(as_built, fits.R_world_body)
-    fits, systematic, rig, table = table_from_disc(fits, systematic, as_built.rig, as_built.disc, source, moved)
-    systematic += moved @ moved.swapaxes(1, 2)
-    return fits, systematic, replace(as_built, rig=rig), table
-
-
-def _outlying(tables: Tables, dots: DotCentres, rig: StereoRig, disc: Disc, workers: int) -> Mask:
+def _outlying(seen: DotsInFrames, workers: int) -> Mask:
     """(n,) True where the dots miss the pose that fits best by far more than in others."""
-    fits = _fit_all(tables, dots, rig, disc, workers, judged=False)
-    return outlying_frames((whitening(dots.covariance_px2) @ fits.residuals_px[..., None])[..., 0])
+    fits = fit_all(seen, workers, judged=False)
+    return outlying_frames((whitening(seen.covariance) @ fits.residuals_px[..., None])[..., 0])
 
 
-def _without_false_shifts(as_built: AsBuilt, rig: StereoRig, declared: Disc, faults: SharedFaults) -> AsBuilt:
+def _without_false_shifts(as_built: AsBuilt, seen: DotsInFrames, faults: SharedFaults) -> AsBuilt:
     """Where cameras and clock are wrong, dots refined alone would be moved to make up for that: take the joint ones."""
-    if not as_built.reduced_chi_square > FAULTY * max(1.0, faults.reduced_chi_square):
-        return as_built
-    sigma = faults.marker_shift_sigma
-    shift = share_of_places(declared, faults.marker_shift[:, :2], sigma) * faults.marker_shift
-    disc = replace(declared, marker_centres_body=declared.marker_centres_body + shift)
-    return replace(as_built, rig=rig, disc=disc, marker_shift=shift, marker_shift_sigma=sigma, size_share=0.0)
+    sigma, disc = faults.marker_shift_sigma, seen.disc
+    shift = share_of_places(disc, faults.marker_shift[:, :2], sigma) * faults.marker_shift
+    disc = replace(disc, marker_centres_body=disc.marker_centres_body + shift)
+    return replace(as_built, rig=seen.rig, disc=disc, marker_shift=shift, marker_shift_sigma=sigma, size_share=0.0)
 
 
-def _fit_all(
-    tables: Tables, dots: DotCentres, rig: StereoRig, disc: Disc, workers: int = 1, judged: bool = True
-) -> PoseFits:
+def fit_all(seen: DotsInFrames, workers: int = 1, judged: bool = True) -> PoseFits:
     """The poses of all frames, some hundreds at a time: what a fit needs beside its result is five times as large."""
+    centres = seen.disc.marker_centres_body
 
     def fitted(rows: slice) -> PoseFits:
-        seen = dots.pixels[rows], dots.covariance_px2[rows]
-        return fit_poses(
-            *seen,
-            rig,
-            disc.marker_centres_body,
-            tables.R[rows],
-            tables.t[rows],
-            reject_outliers=judged,
-            with_sensitivity=judged,
-        )
+        part = seen.pixels[rows], seen.covariance[rows], seen.rig, centres, seen.R[rows], seen.t[rows]
+        return fit_poses(*part, reject_outliers=judged, with_sensitivity=judged)
 
-    n, one = len(tables.t), vars(fitted(slice(0, 1)))
+    n, one = len(seen.t), vars(fitted(slice(0, 1)))
     whole = {name: np.empty((n, *value.shape[1:]), value.dtype) for name, value in one.items()}
 
     def fill(rows: slice) -> None:

@@ -31,7 +31,7 @@ from calibration.kit.arrays import Array, Mask
 from disctrack.disc import Disc
 from disctrack.findings import Finding, Kind, Severity
 from disctrack.frames import CAMERAS
-from disctrack.track.dots.template_response import Pull, half_axes, plane_to_image, pulls_by_exposure, turned_to_axes
+from disctrack.track.dots.template_response import Edge, half_axes, plane_to_image, pulls_by_exposure, turned_to_axes
 from disctrack.track.pose import marker_pixels
 
 BORROWED_FROM = 2  # frames: beside a gap, the acceleration of a neighbour up to this far away is used
@@ -63,19 +63,19 @@ class Exposure(NamedTuple):
 
 
 def shift_by_exposure(
-    R: Array, t: Array, time: Array, exposure: Array, rig: StereoRig, disc: Disc, pulls: tuple[Pull, Pull]
+    R: Array, t: Array, time: Array, exposure: Array, rig: StereoRig, disc: Disc, edges: tuple[Edge, Edge]
 ) -> Array:
     """(n, 2, m, 2) [px] by which the dots of an exposure lie beside their places at mid exposure; zero where not known.
 
     R (n, 3, 3), t (n, 3) [m]: poses, NaN where there is none; time (n,) [s]; exposure (2,) of the left and the right
-    camera [s]; pulls: how each camera's dots are lit. Rates are those of three poses in a row: their noise adds at most
+    camera [s]; edges: of the dots in each camera. Rates are those of three poses in a row: their noise adds at most
     0.1 of itself (T as long as the frame interval), what differences leave out is (psidot / frame_rate)^2 / 12 of the
     shift.
     """
     each = np.empty((len(R), 2, disc.n_markers, 2))
     for first in range(0, len(R), AT_ONCE):  # their derivatives are ten times as large
         rows = slice(max(first - 1, 0), first + AT_ONCE + 1)
-        part = _second_order(R[rows], t[rows], time[rows], rig, disc, pulls)
+        part = _second_order(R[rows], t[rows], time[rows], rig, disc, edges)
         each[first : first + AT_ONCE] = part[first - rows.start :][:AT_ONCE]
     measured = np.isfinite(t).all(axis=1)
     known = _all_finite(each)
@@ -165,7 +165,7 @@ def _in_words(camera: str, squared: float, sigma: float) -> str:
     return f"{camera} below {1e6 * np.sqrt(max(squared, 0.0) + SURE * sigma):.0f} us"
 
 
-def _second_order(R: Array, t: Array, time: Array, rig: StereoRig, disc: Disc, pulls: tuple[Pull, Pull]) -> Array:
+def _second_order(R: Array, t: Array, time: Array, rig: StereoRig, disc: Disc, edges: tuple[Edge, Edge]) -> Array:
     """(n, 2, m, 2) [px/s^2] the bracket of the module's first equation; NaN at the ends and beside gaps."""
     pixels, J = marker_pixels(R, t, rig, disc.marker_centres_body)
     affine = plane_to_image(J, R)
@@ -178,18 +178,18 @@ def _second_order(R: Array, t: Array, time: Array, rig: StereoRig, disc: Disc, p
     affine = np.where(known, affine, np.eye(2))  # of a dot behind a camera; its rates are NaN
     growth = _rate(affine, time) @ np.linalg.inv(affine)
     pulled = np.empty_like(pixels)
-    for camera, pull in enumerate(pulls):
+    for camera, edge in enumerate(edges):
         of = affine[:, camera], growth[:, camera], velocity[:, camera]
-        pulled[:, camera] = _pulled(0.5 * disc.marker_diameter, *of, pull)
+        pulled[:, camera] = _pulled(0.5 * disc.marker_diameter, *of, edge)
     return np.asarray(acceleration + pulled)
 
 
-def _pulled(radius: float, affine: Array, growth: Array, velocity: Array, pull: Pull) -> Array:
+def _pulled(radius: float, affine: Array, growth: Array, velocity: Array, edge: Edge) -> Array:
     """(n, m, 2) [px/s^2] p of dots of this radius [m] in one camera.
 
     affine (n, m, 2, 2) [px/m]; growth (n, m, 2, 2) [1/s] A' A^-1; velocity (n, m, 2) [px/s].
     """
-    T = pulls_by_exposure(radius, affine, pull)
+    T = pulls_by_exposure(radius, affine, edge)
     axes = turned_to_axes(affine)
     v = (axes @ velocity[..., None])[..., 0]
     G = axes @ growth @ np.swapaxes(axes, -1, -2)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from calibration.cameras.camera import StereoRig
 from calibration.kit.arrays import Array, Mask
 from disctrack.disc import Disc
-from disctrack.track.dots.template_response import Pull, plane_to_image, pulls_by_contrast, turned_to_axes
+from disctrack.track.dots.template_response import Edge, plane_to_image, pulls_by_contrast, turned_to_axes
 from disctrack.track.pose import marker_pixels
 
 DEGREE = 4  # of the polynomial: a gleam as wide as the disc's path
@@ -37,11 +37,11 @@ LIKELIER = 6.0  # of natural logarithms
 AT_ONCE = 4096  # poses
 
 
-def shift_by_gleam(R: Array, t: Array, contrast: Array, rig: StereoRig, disc: Disc, pulls: tuple[Pull, Pull]) -> Array:
+def shift_by_gleam(R: Array, t: Array, contrast: Array, rig: StereoRig, disc: Disc, edges: tuple[Edge, Edge]) -> Array:
     """(n, 2, m, 2) [px] by which templates find the dots beside their places; zero where not known.
 
     R (n, 3, 3), t (n, 3) [m]: poses, NaN where there is none; contrast (n, 2, m) of each dot with its paper, NaN where
-    it was not seen; pulls: how each camera's dots are lit. One dot tells nothing of the light at another.
+    it was not seen; edges: of the dots in each camera. One dot tells nothing of the light at another.
     """
     n = len(R)
     shift = np.zeros((n, 2, disc.n_markers, 2))
@@ -53,11 +53,11 @@ def shift_by_gleam(R: Array, t: Array, contrast: Array, rig: StereoRig, disc: Di
         rows = slice(first, first + AT_ONCE)
         places, J = marker_pixels(R[rows], t[rows], rig, disc.marker_centres_body)
         affine = plane_to_image(J, R[rows])
-        for camera, (field, pull) in enumerate(zip(fields, pulls, strict=True)):
+        for camera, (field, edge) in enumerate(zip(fields, edges, strict=True)):
             if field is not None:
                 axes = turned_to_axes(affine[:, camera])
                 along = (axes @ field.gradient(places[:, camera])[..., None])[..., 0]
-                along *= pulls_by_contrast(0.5 * disc.marker_diameter, affine[:, camera], pull)
+                along *= pulls_by_contrast(0.5 * disc.marker_diameter, affine[:, camera], edge)
                 shift[rows, camera] = np.nan_to_num((along[..., None, :] @ axes)[..., 0, :])
     return shift
 

@@ -6,13 +6,12 @@ is what remains after a free refinement of the two cameras, the dots' places and
 one pose per frame: nothing slow or systematic can pass it, and it needs no model of the motion.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibration.cameras.camera import INTRINSIC_PARAMETERS, N_RIG, PAIR_SHIFT, StereoRig
+from calibration.cameras.camera import INTRINSIC_PARAMETERS, N_RIG, PAIR_SHIFT
 from calibration.kit.arrays import Array
-from disctrack.disc import Disc
 from disctrack.track.pose import PoseFits, whitening
 from disctrack.track.refine.self_calibration import (
     DOT_SIGMA,
@@ -27,9 +26,9 @@ from disctrack.track.side_by_side import evenly
 MIN_FRAMES = 20
 LEAST_NOISE = 0.25  # of the variance that flat parts of the image tell: the rest may be the pixels' fixed pattern
 # How far a camera may be off: far more than any that is still of use, and enough to bound what the disc does not tell.
+# [px, 1]; rotations [rad] and translations [m]; the delay is free within a frame period.
 _WIDE = {"fx": 20.0, "fy": 20.0, "cx": 10.0, "cy": 10.0, "k1": 0.05, "k2": 0.2, "k3": 0.5, "p1": 5e-3, "p2": 5e-3}
-_WIDE_ROTATION, _WIDE_TRANSLATION = 0.02, 0.01  # [rad], [m]
-_WIDE_DELAY = 1.0  # in frame periods
+_WIDE_POSE = np.repeat([0.02, 0.01], 3)
 
 
 @dataclass(frozen=True)
@@ -42,30 +41,28 @@ class SharedFaults:
     delay: float  # [frame periods] of the right camera against the left
 
 
-def without_shared_faults(
-    markers_px: Array, markers_covariance_px2: Array, rig: StereoRig, disc: Disc, R: Array, t: Array
-) -> SharedFaults | None:
+def without_shared_faults(frames: DotsInFrames) -> SharedFaults | None:
     """Refine cameras, dots and delay together, with a free pose for each of n successive frames.
 
-    Shapes as in `pose.fit_poses`. None if fewer than MIN_FRAMES frames, with both their neighbours, are complete.
+    None if fewer than MIN_FRAMES frames, with both their neighbours, are complete.
     """
-    complete = np.asarray(np.isfinite(markers_px).all((1, 2, 3)) & np.isfinite(t).all(axis=1))
+    rig, disc, pixels = frames.rig, frames.disc, frames.pixels
+    complete = np.asarray(np.isfinite(pixels).all((1, 2, 3)) & frames.posed)
     rows = evenly(np.flatnonzero(complete[:-2] & complete[1:-1] & complete[2:]) + 1, SHARED_FRAMES)
     if len(rows) < MIN_FRAMES:
         return None
-    by_delay = 0.5 * (markers_px[rows + 1] - markers_px[rows - 1])  # per frame period
+    by_delay = 0.5 * (pixels[rows + 1] - pixels[rows - 1])  # per frame period
     by_delay[:, 0] = 0.0
 
     m = disc.n_markers
-    wide = np.concatenate([_wide_rig(), np.full(2 * m, DOT_SIGMA), [_WIDE_DELAY]])
+    camera = [_WIDE[name] for name in INTRINSIC_PARAMETERS]
+    wide = np.concatenate([camera, camera, _WIDE_POSE, _WIDE_POSE, np.full(2 * m, DOT_SIGMA), [1.0]])
     free = np.ones(len(wide), bool)
     free[:N_RIG] = (np.diag(rig.covariance) > 0) & (np.arange(N_RIG) < PAIR_SHIFT.stop)
-    frames = DotsInFrames(
-        rig, disc, markers_px[rows], markers_covariance_px2[rows], R[rows], t[rows], by_delay[..., None]
-    )
-    joint = fit_shared(frames, free, np.diag(wide[free] ** -2))
+    complete_frames = replace(frames.at(rows), further=by_delay[..., None])
+    joint = fit_shared(complete_frames, free, np.diag(wide[free] ** -2))
     shift, dots = joint.shift, slice(N_RIG, N_RIG + 2 * m)
-    _, fits = joint.frames.posed(shift, reject=True)
+    _, fits = joint.frames.fitted(shift, reject=True)
     spent = int(fits.degrees_of_freedom[fits.converged].sum())
     return SharedFaults(
         reduced_chi_square=trimmed_reduced_chi_square(fits) * spent / max(spent - int(free.sum()), 1),
@@ -138,9 +135,3 @@ def _trimmed_mean(reduced: Array) -> float:
     kept = np.sort(reduced)[: int(0.95 * len(reduced))]
     # the 5 % that are cut hold more than 5 % of the sum: 18 degrees of freedom lose 4 % of their mean
     return float(kept.mean() / 0.96)
-
-
-def _wide_rig() -> Array:
-    camera = [_WIDE[name] for name in INTRINSIC_PARAMETERS]
-    pose = [_WIDE_ROTATION] * 3 + [_WIDE_TRANSLATION] * 3
-    return np.array([*camera, *camera, *pose, *pose])

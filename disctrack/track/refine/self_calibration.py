@@ -22,6 +22,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calibration.cameras.camera import N_RIG, PAIR_SHIFT, StereoRig
 from calibration.judge.tolerances import SIZE
@@ -63,23 +64,20 @@ class AsBuilt:
         return cls(rig, disc, np.zeros((m, 3)), np.full((m, 2), DOT_SIGMA))
 
 
-def refine_as_built(
-    markers_px: Array, markers_covariance_px2: Array, rig: StereoRig, disc: Disc, R: Array, t: Array
-) -> AsBuilt:
-    """Refine the dots' places, and the rig's size, from the marker centres of n frames; shapes as in `pose.fit_poses`.
+def refine_as_built(frames: DotsInFrames) -> AsBuilt:
+    """Refine the dots' places, and the rig's size, from the dots of n frames.
 
     Frames with fewer than all dots serve too. Fewer than MIN_FRAMES frames leave everything as declared. Dots are moved
     by that share of their displacements which is theirs, not their sigma's (`share_of_places`).
     """
-    rows = evenly(
-        np.flatnonzero(np.isfinite(t).all(1) & (np.isfinite(markers_px).all(-1).sum((1, 2)) >= 4)), SHARED_FRAMES
-    )
+    rig, disc = frames.rig, frames.disc
+    enough = frames.posed & (np.isfinite(frames.pixels).all(-1).sum((1, 2)) >= 4)
+    rows = evenly(np.flatnonzero(enough), SHARED_FRAMES)
     if len(rows) < MIN_FRAMES:
         return AsBuilt.as_declared(rig, disc)
     m = disc.n_markers
     free = np.arange(N_RIG + 2 * m) >= N_RIG
-    dots = DotsInFrames(rig, disc, markers_px[rows], markers_covariance_px2[rows], R[rows], t[rows])
-    joint = fit_shared(dots, free, np.eye(2 * m) / DOT_SIGMA**2, repeats=SYSTEMATIC_PX)
+    joint = fit_shared(frames.at(rows), free, np.eye(2 * m) / DOT_SIGMA**2, repeats=SYSTEMATIC_PX)
     moved, remaining = joint.shift[N_RIG:].reshape(m, 2), joint.covariance[N_RIG:, N_RIG:]
     sigma = places_sigma(disc, remaining)
     size, size_sigma = pattern_size(disc, moved, remaining)
@@ -97,13 +95,29 @@ class DotsInFrames:
     A `shift` (30 + 2m + j,) of what the frames share: RIG_PARAMETERS, the dots' places in body axes, anything else.
     """
 
-    rig: StereoRig  # as declared
+    rig: StereoRig
     disc: Disc
-    pixels: Array  # (n, 2, m, 2)
+    pixels: Array  # (n, 2, m, 2); NaN where a dot was not seen
     covariance: Array  # (n, 2, m, 2, 2) [px^2]
-    R: Array  # (n, 3, 3)
+    R: Array  # (n, 3, 3); NaN where there is no pose
     t: Array  # (n, 3) [m]
     further: Array | None = None  # (n, 2, m, 2, j) derivatives of the pixels by anything else
+
+    @property
+    def posed(self) -> Mask:
+        """(n,) True where there is a pose."""
+        return np.asarray(np.isfinite(self.t).all(axis=1))
+
+    def at(self, rows: NDArray[np.intp]) -> DotsInFrames:
+        """Some of the frames."""
+        parts = {name: getattr(self, name)[rows] for name in ("pixels", "covariance", "R", "t")}
+        return replace(self, **parts)
+
+    def but(self, outlying: Mask) -> DotsInFrames:
+        """The frames with no pose for those that are outlying (n,)."""
+        return replace(
+            self, R=np.where(outlying[:, None, None], np.nan, self.R), t=np.where(outlying[:, None], np.nan, self.t)
+        )
 
     def shifted(self, shift: Array) -> tuple[Array, Array, StereoRig, Array]:
         """The pixels (n, 2, m, 2) without what else moved them, their covariance, the rig, the dots' places (m, 3)."""
@@ -112,7 +126,7 @@ class DotsInFrames:
         pixels = self.pixels if self.further is None else self.pixels - self.further @ shift[places.stop :]
         return pixels, self.covariance, self.rig.perturbed(shift[:N_RIG]), self.disc.marker_centres_body + moved
 
-    def posed(self, shift: Array, reject: bool) -> tuple[DotsInFrames, PoseFits]:
+    def fitted(self, shift: Array, reject: bool) -> tuple[DotsInFrames, PoseFits]:
         """The frames with the poses that go with the shift; where a fit fails, the pose before."""
         fits = fit_poses(*self.shifted(shift), self.R, self.t, reject_outliers=reject, with_sensitivity=False)
         ok = fits.converged
@@ -160,7 +174,7 @@ def fit_shared(frames: DotsInFrames, free: Mask, information: Array, repeats: fl
     """
     shift, reduced = np.zeros(len(free)), []
     for iteration in range(ITERATIONS):
-        frames, fits = frames.posed(shift, reject=iteration > 0)
+        frames, fits = frames.fitted(shift, reject=iteration > 0)
         ok = fits.converged
         reduced.append(float(fits.chi_square[ok].sum() / max(fits.degrees_of_freedom[ok].sum(), 1)))
         used = fits.used & ok[:, None, None]

@@ -1,28 +1,28 @@
 """Frames in which the cameras contradict each other: how many times a delay is told."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from disctrack.findings import Kind
-from disctrack.frames import rotation_from_quaternion
 from disctrack.track.judge.dropped_frames import dropped_frames
-from disctrack.track.pose import fit_poses
-from tests.oracles.measured_disc import measured
+from disctrack.track.refine.assembly import fit_all
+from tests.oracles.measured_disc import dots_of, measured
 
 
 @pytest.mark.parametrize(("ahead", "said"), [((1, 1), ["right"]), ((1, -1), ["right", "left"])])
 def test_one_delay_in_several_stretches_is_one_sentence(ahead, said):
     """Between stretches of one and the same delay the cameras only happen to agree."""
     trajectory = measured(n=60)
-    markers, covariance = trajectory.markers_px.copy(), trajectory.markers_covariance_px2
+    markers = trajectory.markers_px.copy()
     refused = np.zeros(60, bool)
     for (first, end), k in zip(((8, 18), (30, 42)), ahead, strict=True):
         markers[first:end, 1] = trajectory.markers_px[first + k : end + k, 1]
         refused[first:end] = True
-    rig, centres = trajectory.rig, trajectory.disc.marker_centres_body
-    start = rotation_from_quaternion(trajectory.quaternion), trajectory.q[:, :3]
-    fits = fit_poses(markers, covariance, rig, centres, *start, reject_outliers=False)
-    told = dropped_frames(refused, fits, markers, covariance, rig, centres, range(60))
+    seen = dots_of(replace(trajectory, markers_px=markers))
+    fits = fit_all(seen, judged=False)
+    told = dropped_frames(refused, replace(seen, R=fits.R_world_body, t=fits.t_world_body), range(60))
     assert [finding.kind for finding in told] == [Kind.DROPPED_FRAMES] * len(said)
     assert [finding.subject.camera for finding in told] == said
     assert {finding.numbers["images"].value for finding in told} == {1}

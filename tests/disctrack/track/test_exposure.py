@@ -12,7 +12,7 @@ from disctrack.findings import Kind, Severity
 from disctrack.synthetic import render_disc
 from disctrack.track.dots import template_response as template_pull
 from disctrack.track.dots.template import NoiseModel
-from disctrack.track.dots.template_response import Pull
+from disctrack.track.dots.template_response import Edge
 from disctrack.track.follow.tracking import TrackingSettings
 from disctrack.track.pose import marker_pixels
 from disctrack.track.refine import exposure as smears
@@ -105,9 +105,9 @@ def test_the_shift_is_that_of_the_template(motion, rendered_pairs, dark, noise):
     R = frames.rotation_from_euler(*np.moveaxis(q[..., 3:], -1, 0))
     known, where = R[:, 4].copy(), q[:, 4, :3].copy()
     known[20], where[20] = np.nan, np.nan
-    pull = Pull(0.65, (50000.0, 1 - dark / 50000), noise)
+    edge = Edge(0.65, 50000.0, 1 - dark / 50000, noise)
     exposures = np.array([EXPOSURE, EXPOSURE])
-    found = shift_by_exposure(known, where, np.arange(N) / RATE, exposures, rig, disc, (pull, pull))
+    found = shift_by_exposure(known, where, np.arange(N) / RATE, exposures, rig, disc, (edge, edge))
     assert not found[20].any()
 
     dots = ((3, 0), (9, 1), (14, 2), (28, 3), (33, 4), (37, 0), (6, 2), (11, 4))
@@ -134,8 +134,8 @@ def test_a_dot_seen_obliquely_is_pulled_as_an_ellipse(rendered_pairs, monkeypatc
     cosine = -((R_cw @ R[:, 4])[..., 2] * line).sum(-1) / np.linalg.norm(line, axis=-1)
     oblique = [(int(frame), 0, (0,)) for frame in np.flatnonzero((cosine > 0.27) & (cosine < 0.5))[1:-1:2]]
     assert len(oblique) >= 4
-    pull = Pull(0.7, (50000.0, 0.8), noise)
-    given = R[:, 4], q[:, 4, :3], np.arange(N) / rate, np.array([1, 1]) / rate, rig, disc, (pull, pull)
+    edge = Edge(0.7, 50000.0, 0.8, noise)
+    given = R[:, 4], q[:, 4, :3], np.arange(N) / rate, np.array([1, 1]) / rate, rig, disc, (edge, edge)
     found = smears.shift_by_exposure(*given)
     expected, _, ellipses = _against_drawn_dots(q, R, found, oblique, rig, disc, 10000, noise, 0.7)
     of_ellipses = template_pull._response

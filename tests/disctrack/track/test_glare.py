@@ -7,7 +7,7 @@ from scipy.ndimage import gaussian_filter
 
 from disctrack import frames, rolling
 from disctrack.track.dots.template import NoiseModel
-from disctrack.track.dots.template_response import Pull
+from disctrack.track.dots.template_response import Edge
 from disctrack.track.pose import marker_pixels
 from disctrack.track.refine.glare import shift_by_gleam
 from tests.oracles.flat_dots import locate_on_plane
@@ -56,10 +56,10 @@ def located(rendered_pairs):
                 shift[frame, dot] = (of_lit.pixels - of_plain.pixels)[0]
                 contrast[frame, 0, dot] = of_lit.contrast[0]
         found[kind] = contrast, shift
-    pull = Pull(0.65, (PAPER, 1 - DARK / PAPER), NOISE)
+    edge = Edge(0.65, PAPER, 1 - DARK / PAPER, NOISE)
 
     def told(contrast, frames=slice(None)):
-        return shift_by_gleam(R[frames], t[frames], contrast[frames], rig, disc, (pull, pull))
+        return shift_by_gleam(R[frames], t[frames], contrast[frames], rig, disc, (edge, edge))
 
     return found, told
 

@@ -8,10 +8,12 @@ import pytest
 
 from disctrack import frames
 from disctrack.track.dots.template import NoiseModel, dot_centres
+from disctrack.track.dots.template_response import Edge
 from disctrack.track.follow.following import Follower, Law, TrackingSetup
 from disctrack.track.follow.tracking import MOST_STRETCHES, stretch_edges
 from disctrack.track.pose import marker_pixels
-from disctrack.track.refine.assembly import Taken, TrackingSettings, _fit_all, assemble
+from disctrack.track.refine.assembly import Taken, TrackingSettings, assemble, fit_all
+from disctrack.track.refine.self_calibration import DotsInFrames
 from disctrack.trajectory import FrameStatus
 from tests.oracles.point_laboratory import tables_of
 
@@ -41,7 +43,7 @@ def test_what_the_fit_of_all_poses_needs_beside_its_result_does_not_grow_with_th
         tables = tables_of(rendered_pairs.true_pixels[k], R[k], t[k], 0.01)
         dots = dot_centres(tables.results, tables.status)
         tracemalloc.start()
-        fits = _fit_all(tables, dots, rig, disc)
+        fits = fit_all(DotsInFrames(rig, disc, dots.pixels, dots.covariance_px2, tables.R, tables.t))
         peak = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
         assert fits.converged.all()
@@ -66,7 +68,7 @@ def test_poses_are_the_same_to_the_last_bit_whoever_puts_them_together(rendered_
     taken = Taken(range(n), times, 1000.0, 9.81)
 
     def by(workers, pixels=pixels):
-        follower = Follower(setup, Law((NoiseModel(0.64, 0.02),) * 2), measured=True)
+        follower = Follower(setup, Law((Edge(noise=NoiseModel(0.64, 0.02)),) * 2), measured=True)
         return assemble(
             [follower], tables_of(pixels, R, t, sigma), TrackingSettings(exposure=(1e-4, 1e-4)), taken, workers
         )

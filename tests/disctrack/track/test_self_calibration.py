@@ -9,11 +9,11 @@ from scipy.optimize import minimize
 
 from disctrack.disc import MA_2014
 from disctrack.faults.keys import CameraFault, Faults
-from disctrack.frames import rotation_from_euler, rotation_from_quaternion, rotation_from_vector, vector_from_rotation
-from disctrack.track.pose import fit_poses
+from disctrack.frames import rotation_from_euler, rotation_from_vector, vector_from_rotation
+from disctrack.track.refine.assembly import fit_all
 from disctrack.track.refine.intrinsic_scatter import split_scatter, without_shared_faults
 from disctrack.track.refine.self_calibration import declared_places_kept, motions_of_pattern, pattern_place
-from tests.oracles.measured_disc import SIGMA_PX, measured
+from tests.oracles.measured_disc import SIGMA_PX, dots_of, measured
 
 N = 160
 # relative scatter of chi-square with 18 degrees of freedom in N frames: sqrt(2 / 18 / N) = 2.6 %; four of these
@@ -21,15 +21,7 @@ TOLERANCE = 0.105
 
 
 def judged(trajectory):
-    R = rotation_from_quaternion(trajectory.quaternion)
-    return without_shared_faults(
-        trajectory.markers_px,
-        trajectory.markers_covariance_px2,
-        trajectory.rig,
-        trajectory.disc,
-        R,
-        trajectory.q[:, :3],
-    )
+    return without_shared_faults(dots_of(trajectory))
 
 
 @pytest.mark.parametrize(
@@ -65,14 +57,9 @@ def test_what_repeats_is_not_noise_and_noise_does_not_repeat(rng):
     white = SIGMA_PX * rng.standard_normal(trajectory.markers_px.shape)
 
     def split(markers):
-        R = rotation_from_quaternion(trajectory.quaternion)
-        covariance = trajectory.markers_covariance_px2
-        centres = trajectory.disc.marker_centres_body
-        return split_scatter(
-            fit_poses(markers, covariance, trajectory.rig, centres, R, trajectory.q[:, :3]), covariance, None
-        )
+        seen = dots_of(replace(trajectory, markers_px=markers))
+        return split_scatter(fit_all(seen), seen.covariance, None)
 
-    # second differences of triples that overlap tell half as much as independent frames
     # second differences of triples that overlap tell half as much as independent frames
     smooth = split(trajectory.markers_px + field)
     assert_allclose(smooth.noise, 1.0, atol=2 * TOLERANCE)

@@ -7,9 +7,8 @@ import pytest
 
 from calibration.cameras.camera import Allowance
 from calibration.judge.tolerances import SIZE
-from disctrack.frames import rotation_from_quaternion
 from disctrack.track.refine.self_calibration import refine_as_built
-from tests.oracles.measured_disc import measured
+from tests.oracles.measured_disc import dots_of, measured
 
 SHORT = 1e-4  # relative, by which the rig takes all lengths for too short
 
@@ -29,10 +28,8 @@ def refined(trajectory, rng, size_sigma, misprint=0.0):
     centres = trajectory.disc.marker_centres_body.copy()
     centres[:, :2] += misprint * rng.normal(size=(len(centres), 2))
     disc = replace(trajectory.disc, marker_centres_body=centres)  # as declared: others than those that were seen
-    R = rotation_from_quaternion(trajectory.quaternion)
-    return true, refine_as_built(
-        trajectory.markers_px, trajectory.markers_covariance_px2, small, disc, R, trajectory.q[:, :3] * (1 - SHORT)
-    )
+    seen = dots_of(trajectory)
+    return true, refine_as_built(replace(seen, rig=small, disc=disc, t=seen.t * (1 - SHORT)))
 
 
 def test_regular_dots_correct_a_board_of_unknown_size(trajectory, rng):
