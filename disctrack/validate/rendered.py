@@ -242,7 +242,7 @@ def measure_twice(
     found = [locate(images, rig, disc, rate, apart=apart) for rig in rigs]
     own, true = (compare(part(tracking.trajectory, slice(None, None, step)), q_true) for tracking in found)
     seen = cameras_in_sight(q_true, rigs[1], disc)
-    return MeasuredTwice(own, true, seen, found[0].systematic_px, tuple(f.sentence for f in found[0].findings))
+    return MeasuredTwice(own, true, seen, found[0].scatter.systematic_px, tuple(f.sentence for f in found[0].findings))
 
 
 def locate(images: Image, rig: StereoRig, disc: Disc, frame_rate: float, *, apart: bool) -> Tracking:
