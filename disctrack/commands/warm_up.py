@@ -15,7 +15,6 @@ from disctrack.progress import compiling
 from disctrack.recording.readers import _png as png
 from disctrack.rolling import _assembly as assembly
 from disctrack.synthetic import raster
-from disctrack.track.dots import template as dots
 from disctrack.track.follow.tracking import prepare
 
 
@@ -32,7 +31,6 @@ def _tracking() -> None:
     with compiling("tracking", 40):
         for dtype in (np.uint8, np.uint16):
             prepare(dtype)
-            dots.prepare(dtype)
 
 
 def _motions() -> None:

@@ -10,20 +10,16 @@ from disctrack.track.dots._kernels import _copy, _dot_by_pose, _entry, _part, _r
 
 MAX_DAMPING = 1e10
 _MAX_ITERATIONS = 60
-# Rows of six: J^T J, J^T r, step; and those of a trial
-_MATRIX, _GRADIENT, _STEP, _WORK_ROWS = 6, 6, 7, 8
 
 
 @_part
 def _evaluate(observed, covariance, used, cameras, R_cw, t_cw, centres, R, t, pixels, residual, jacobian, sums):
     """Fill pixels (2, m, 2), whitened residuals and Jacobian (2, m, 2, 6), zeros for dots not used; returns their cost.
 
-    sums (7, 6): J^T J and J^T r.
+    sums (7, 6): J^T J, and J^T r as the last row.
     """
     J, row = np.empty((2, 3)), np.empty((2, 6))
-    for i in range(_GRADIENT + 1):
-        for j in range(6):
-            sums[i, j] = 0.0
+    sums[:] = 0.0
     cost = 0.0
     for c in range(2):
         for m in range(centres.shape[0]):
@@ -50,7 +46,7 @@ def _evaluate(observed, covariance, used, cameras, R_cw, t_cw, centres, R, t, pi
                 cost += r * r
                 for i in range(6):
                     slope = jacobian[c, m, axis, i]
-                    sums[_GRADIENT, i] += slope * r
+                    sums[6, i] += slope * r
                     for j in range(i + 1):
                         sums[i, j] += slope * jacobian[c, m, axis, j]
     return cost
@@ -69,17 +65,16 @@ def fit(rows, observed, covariance, used, cameras, R_cw, t_cw, centres, toleranc
     """
     shape = residuals.shape[1:]
     trial_pixels, trial_residuals, trial_jacobian = np.empty(shape), np.empty(shape), np.empty((*shape, 6))
-    sums, trial_sums, damped = np.empty((_WORK_ROWS, 6)), np.empty((_WORK_ROWS, 6)), np.empty((6, 6))
+    sums, trial_sums, damped, step = np.empty((7, 6)), np.empty((7, 6)), np.empty((6, 6)), np.empty(6)
     R_trial, t_trial = np.empty((3, 3)), np.empty(3)
-    step = sums[_STEP]
     for f in rows:
         cost = _evaluate(observed[f], covariance[f], used[f], cameras, R_cw, t_cw, centres, R[f], t[f], pixels[f],
                          residuals[f], jacobian[f], sums)  # fmt: skip
         damping, converged[f] = 1e-8, False
         for _ in range(_MAX_ITERATIONS if tolerance >= 0.0 else 0):
-            _copy(damped, sums[:_MATRIX])
+            _copy(damped, sums[:6])
             for i in range(6):
-                step[i] = sums[_GRADIENT, i]
+                step[i] = sums[6, i]
                 damped[i, i] += damping * damped[i, i]
                 if damped[i, i] <= 1e-300:  # a parameter that no datum sees stays where it is
                     damped[i, i] = 1.0

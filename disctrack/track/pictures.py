@@ -5,108 +5,68 @@ from collections.abc import Callable
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator, NullFormatter
+from matplotlib.ticker import MaxNLocator
 
 from calibration.kit.arrays import Array
 from disctrack.frames import CAMERAS
-from disctrack.report.figures import lay_out
+from disctrack.report.figures import BAND, Curve, chart, lay_out
 from disctrack.report.palette import COLOURS, INK, MUTED
 from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
 
-BAND = 3.0  # sigmas shown as a band: one is thinner than the line in most recordings
 _NAMES = ("x", "y", "z", "precession ψ", "nutation θ", "spin φ")
 
 
 def coordinates_figure(trajectory: Trajectory) -> Figure:
-    """x, y, z, psi, theta, phi over time above their sigmas; frames without a pose are marked below."""
-    figure = Figure(figsize=(13, 8.5))
-    lay_out(figure, (4, 3), gaps=(0.9, 0.2))
-    grid = figure.add_gridspec(4, 3, height_ratios=(3, 1.3, 3, 1.3))
-    sigma, shared = trajectory.coordinate_sigma, trajectory.calibration_sigma
-    for i in range(len(_NAMES)):
-        row, column = 2 * (i // 3), i % 3
-        axes = figure.add_subplot(grid[row, column])
-        below = figure.add_subplot(grid[row + 1, column], sharex=axes)
-        _coordinate(axes, trajectory, i, sigma[:, i])
-        _sigmas(below, trajectory, i, sigma[:, i], shared[:, i])
-        axes.tick_params(labelbottom=False)
-        below.tick_params(labelbottom=row == 2)
-        axes.xaxis.set_major_locator(MaxNLocator(4))  # shared by both; ticks are what takes longest to draw
-        axes.yaxis.set_major_locator(MaxNLocator(5))
-        if row == 2:
-            below.set_xlabel("time (s)")
+    """x, y, z, psi, theta, phi over time, each above its sigmas; frames without a pose are marked below."""
+    time, sigma, shared = trajectory.time, trajectory.coordinate_sigma, trajectory.calibration_sigma
+    rows = []
+    for i, name in enumerate(_NAMES):
+        unit, scale, small = ("mm", 1e3, "µm") if i < 3 else ("deg", 180 / np.pi, "mdeg")
+        spreads = [Curve(time, 1e3 * scale * sigma[:, i], COLOURS["left"], "" if i else "this frame's noise")]
+        if np.nanmax(shared[:, i], initial=0.0) > 0:
+            label = "" if i else "calibration, shared by all"
+            spreads.append(Curve(time, 1e3 * scale * shared[:, i], COLOURS["right"], label))
+        value = Curve(time, scale * trajectory.q[:, i], INK, sigma=scale * sigma[:, i])
+        rows += [(f"{name} ({unit})", [value]), (f"σ ({small})", spreads)]
+    figure = chart("time (s)", *rows, size=(9.0, 16.0), heights=(3.0, 1.3) * len(_NAMES))
+    for axes in figure.axes[1::2]:
+        low, high = axes.dataLim.intervaly
+        if high > 30 * low > 0:
+            axes.set_yscale("log")
+        else:
+            axes.set_ylim(bottom=0)
     lost = int(np.sum(~trajectory.measured))
-    figure.suptitle(
-        f"Pose of the disc in {len(trajectory)} frames, {lost} without an answer; band ± {BAND:.0f} σ", color=INK
+    figure.axes[0].set_title(
+        f"Pose of the disc in {len(trajectory)} frames, {lost} without an answer; band ± {BAND:.0f} σ"
     )
-    return figure
-
-
-def _coordinate(axes: Axes, trajectory: Trajectory, i: int, sigma: Array) -> None:
-    unit, scale = ("mm", 1e3) if i < 3 else ("deg", 180 / np.pi)
-    time, values = trajectory.time, trajectory.q[:, i] * scale
-    band = BAND * sigma * scale
-    axes.fill_between(time, values - band, values + band, color=COLOURS["left"], alpha=0.35, linewidth=0)
-    axes.plot(time, values, color=INK, linewidth=0.9)
-    _mark_lost(axes, trajectory)
-    axes.set_ylabel(f"{_NAMES[i]} ({unit})")
-    axes.margins(x=0.01)
-    axes.grid(alpha=0.25)
-
-
-def _sigmas(axes: Axes, trajectory: Trajectory, i: int, sigma: Array, shared: Array) -> None:
-    scale, unit = (1e6, "µm") if i < 3 else (180e3 / np.pi, "mdeg")
-    axes.plot(trajectory.time, sigma * scale, color=COLOURS["left"], linewidth=0.9, label="this frame's noise")
-    if np.nanmax(shared, initial=0.0) > 0:
-        label = "calibration, shared by all"
-        axes.plot(trajectory.time, shared * scale, color=COLOURS["right"], linewidth=0.9, label=label)
-    finite = np.concatenate([sigma, shared])
-    finite = finite[np.isfinite(finite) & (finite > 0)] * scale
-    if finite.size and finite.max() > 30 * finite.min():
-        axes.set_yscale("log")
-        axes.yaxis.set_minor_formatter(NullFormatter())
-    else:
-        axes.set_ylim(bottom=0)
-    axes.set_ylabel(f"σ ({unit})")
-    axes.grid(alpha=0.25)
-    if i == 0:
-        axes.legend(fontsize=7, frameon=False)
-
-
-def _mark_lost(axes: Axes, trajectory: Trajectory) -> None:
-    lost = trajectory.time[~trajectory.measured]
-    if lost.size:
-        below = axes.get_xaxis_transform()
-        axes.plot(lost, 0 * lost, "|", color=COLOURS["right"], transform=below, clip_on=False, markersize=6)
+    return _lost_marked(figure, trajectory)
 
 
 def reprojection_figure(trajectory: Trajectory) -> Figure:
     """Root mean square of observed - projected dots per camera, reduced chi-square, and the dots used, over time."""
-    figure = Figure(figsize=(11, 7.5))
-    lay_out(figure, (3, 1), gaps=(0.0, 0.2))
-    error, chi, used = figure.subplots(3, 1, sharex=True, height_ratios=(3, 2, 1.5))
+    time, error, used = trajectory.time, [], []
     for camera, name in enumerate(CAMERAS):
         rms = trajectory.reprojection_rms_px[:, camera]
         typical = f"{np.nanmedian(rms):.4f}" if np.isfinite(rms).any() else "no"
-        error.plot(trajectory.time, rms, color=COLOURS[name], linewidth=0.8, label=f"{name}, median {typical} px")
+        error.append(Curve(time, rms, COLOURS[name], f"{name}, median {typical} px"))
         count = np.sum(trajectory.marker_status[:, camera] == MarkerStatus.MEASURED, axis=1)
-        used.step(trajectory.time, count, color=COLOURS[name], linewidth=0.9, where="mid", label=name)
-    error.set_ylabel("reprojection error, rms (px)")
-    error.set_ylim(bottom=0)
-    error.legend(frameon=False, fontsize=8)
-    chi.plot(trajectory.time, trajectory.reduced_chi_square, color=INK, linewidth=0.8)
-    chi.axhline(1.0, color=MUTED, linewidth=0.8, linestyle="--")
-    chi.set_ylabel("reduced χ²")
-    chi.set_ylim(bottom=0)
-    used.set_ylabel("dots used")
-    used.set_ylim(-0.3, trajectory.disc.n_markers + 0.3)
-    used.set_xlabel("time (s)")
-    for axes in (error, chi, used):
-        _mark_lost(axes, trajectory)
-        axes.grid(alpha=0.25)
-        axes.margins(x=0.01)
+        used.append(Curve(time, count, COLOURS[name]))
+    chi = [Curve(time[[0, -1]], np.ones(2), MUTED, style="--"), Curve(time, trajectory.reduced_chi_square, INK)]
+    rows = ("reprojection error, rms (px)", error), ("reduced χ²", chi), ("dots used", used)
+    figure = chart("time (s)", *rows, size=(11, 7.5), heights=(3, 2, 1.5))
+    for axes in figure.axes:
+        axes.set_ylim(bottom=0)
     unreadable = int(np.sum(trajectory.frame_status == FrameStatus.UNREADABLE))
-    figure.suptitle("Reprojection error over time" + (f"; {unreadable} frames unreadable" if unreadable else ""))
+    figure.axes[0].set_title("Reprojection error" + (f"; {unreadable} frames unreadable" if unreadable else ""))
+    return _lost_marked(figure, trajectory)
+
+
+def _lost_marked(figure: Figure, trajectory: Trajectory) -> Figure:
+    """The figure with a tick for every frame without a pose."""
+    lost = trajectory.time[~trajectory.measured]
+    for axes in figure.axes if lost.size else ():
+        below = axes.get_xaxis_transform()
+        axes.plot(lost, 0 * lost, "|", color=COLOURS["right"], transform=below, clip_on=False, markersize=6)
     return figure
 
 

@@ -88,20 +88,31 @@ class Ellipse(NamedTuple):
     short: float
 
 
-# Rows of what is kept of every pixel: place on the plane from the expected centre [px], place in the image from the
-# expected centre [10 px], grey value, distance from the edge; derivatives by the eight parameters (from _JACOBIAN on)
-# and residual, over the pixel's sigma; weight, one over that. The rows of the derivatives also hold the pixels that are
-# to be chosen from.
-_X, _Y, _OFFSET_X, _OFFSET_Y, _GREY, _DISTANCE, _JACOBIAN = range(7)
-_RESIDUAL = _JACOBIAN + 8
-_WEIGHT = _RESIDUAL + 1
-_PIXEL_ROWS = _WEIGHT + 1
-_PIXELS = (
-    4096 + 64
-)  # of a dot of 60 px; more are made room for. No power of two: rows would fall on one another's cache
-# Rows of eight for the normal equations: matrix, right-hand side, step, parameters before it.
-_RHS, _STEP, _BEFORE, _WORK_ROWS = 8, 9, 10, 11
+class Pixels(NamedTuple):
+    """What is kept of every pixel (n), in single precision."""
 
+    rows: Array  # (6, n) those that follow
+    x: Array  # place on the plane from the expected centre [px]
+    y: Array
+    offset_x: Array  # place in the image from the expected centre [10 px]
+    offset_y: Array
+    grey: Array
+    distance: Array  # from the edge
+    jacobian: Array  # (8, n) by the parameters, over the pixel's sigma; before, the pixels that are to be chosen from
+    residual: Array  # over the pixel's sigma
+    weight: Array  # one over that
+
+
+class Normal(NamedTuple):
+    """Normal equations of the eight parameters."""
+
+    matrix: Array  # (8, 8)
+    rhs: Array  # (8,)
+    step: Array
+    before: Array  # parameters before the step
+
+
+_PIXELS = 4096 + 64  # of a dot of 60 px; more are made room for. No power of two: rows would share lines of the cache
 _MAX_SELECTIONS = 4
 _MAX_ITERATIONS = 20
 _CONVERGED_PX = 2e-4  # length of the step that would come next: a twentieth of the noise of the best dots
@@ -135,6 +146,14 @@ _EXP = tuple(
     .convert(kind=np.polynomial.Polynomial)
     .coef
 )
+
+
+@_part
+def _room(n):
+    """Scratch for n pixels."""
+    block = np.empty((16, n), np.float32)
+    rows, jacobian = block[:6], block[6:14]
+    return Pixels(rows, block[0], block[1], block[2], block[3], block[4], block[5], jacobian, block[14], block[15])
 
 
 @_part
@@ -289,7 +308,7 @@ def _select_pixels(image, map_x, map_y, P, start, window, rim, neighbours, G, un
     x_from, y_from = start[0] / unit, start[1] / unit
     X0, X1, X2, Y0, Y1, Y2 = P[0, 0], P[0, 1], P[0, 2], P[1, 0], P[1, 1], P[1, 2]
     w0, w1, w2 = unit * P[2, 0], unit * P[2, 1], unit * P[2, 2]
-    n = 0
+    found, n = pixels.jacobian, 0
     for y in range(y_lo, y_hi + 1):
         dy = y - v0
         reach2 = (rim_xy * rim_xy - rim_xx * rim_yy) * dy * dy + rim_xx
@@ -310,8 +329,8 @@ def _select_pixels(image, map_x, map_y, P, start, window, rim, neighbours, G, un
                 continue
             # views, for an index that is a sum might be negative, and is looked at one by one
             xs, ys, greys = map_x[y, lo:hi], map_y[y, lo:hi], image[y, lo:hi]
-            X_row, Y_row = pixels[_JACOBIAN, n:], pixels[_JACOBIAN + 1, n:]
-            x_row, y_row, grey_row = pixels[_JACOBIAN + 2, n:], pixels[_JACOBIAN + 3, n:], pixels[_JACOBIAN + 4, n:]
+            X_row, Y_row, grey_row = found[0, n:], found[1, n:], found[4, n:]
+            x_row, y_row = found[2, n:], found[3, n:]
             for k in range(hi - lo):  # one loop, of few pixels at a time: there are some ten
                 w = 1.0 / (w0 * xs[k] + w1 * ys[k] + w2)
                 X_row[k] = (X0 * xs[k] + X1 * ys[k] + X2) * w - x_from
@@ -328,26 +347,26 @@ def _select_pixels(image, map_x, map_y, P, start, window, rim, neighbours, G, un
     g00, g01, g10, g11 = _f(G[0, 0]), _f(G[0, 1]), _f(G[1, 0]), _f(G[1, 1])
     for i in range(n):
         d, slope, nx, ny, inv_g, curvature = _edge_distance(
-            pixels[_JACOBIAN, i] - shift_x, pixels[_JACOBIAN + 1, i] - shift_y, radius, g00, g01, g10, g11, _0
+            found[0, i] - shift_x, found[1, i] - shift_y, radius, g00, g01, g10, g11, _0
         )
-        pixels[_JACOBIAN + 5, i], pixels[_JACOBIAN + 6, i] = d, inv_g
+        found[5, i], found[6, i] = d, inv_g
     kept, nearest, farthest = 0, _f(-band - 1.0), _f(band)
     for i in range(n):
-        d = pixels[_JACOBIAN + 5, i]
+        d = found[5, i]
         good = nearest < d < farthest  # not so for NaN either: a pixel without a ray
         if crowded and good:
-            X, Y = start[0] + unit * pixels[_JACOBIAN, i], start[1] + unit * pixels[_JACOBIAN + 1, i]
-            blur = p[SIGMA] * unit / pixels[_JACOBIAN + 6, i]
+            X, Y = start[0] + unit * found[0, i], start[1] + unit * found[1, i]
+            blur = p[SIGMA] * unit / found[6, i]
             good = math.hypot(X, Y) <= rim - 2.5 * blur
             for j in range(neighbours.shape[0]):
                 good &= math.hypot(X - neighbours[j, 0], Y - neighbours[j, 1]) - start[2] >= 3.0 * blur
-        for row in range(_JACOBIAN):
-            pixels[row, kept] = pixels[_JACOBIAN + row, i]
+        for row in range(6):
+            pixels.rows[row, kept] = found[row, i]
         kept += 1 if good else 0
     inside_sum, inside_n, outside_sum, outside_n = 0.0, 0.0, 0.0, 0.0
     well_inside, well_outside = _f(-min(1.2 * p[SIGMA], 0.4 * p[RADIUS] / steepest)), _f(1.2 * p[SIGMA])
     for i in range(kept):
-        d, grey = pixels[_DISTANCE, i], pixels[_GREY, i]
+        d, grey = pixels.distance[i], pixels.grey[i]
         is_in, is_out = _1 if d < well_inside else _0, _1 if d > well_outside else _0
         inside_n += is_in
         outside_n += is_out
@@ -356,6 +375,27 @@ def _select_pixels(image, map_x, map_y, P, start, window, rim, neighbours, G, un
     inside = inside_sum / inside_n if inside_n >= 3 else np.nan
     outside = outside_sum / outside_n if outside_n >= 8 else np.nan
     return kept, inside, outside
+
+
+@_part
+def _lit(pixels, i, covered, level, slope_x, slope_y, contrast, limit):
+    """Fill a pixel's residual and derivatives by the light, `covered` by the dot so far.
+
+    Returns the light, the weight (0 where the squared residual exceeds the limit), what it adds to chi-square, and 1
+    where it is clipped.
+    """
+    x, y, J = pixels.offset_x[i], pixels.offset_y[i], pixels.jacobian
+    light = level + slope_x * x + slope_y * y
+    weight = pixels.weight[i]
+    r = weight * (pixels.grey[i] - light * (_1 - contrast * covered))
+    squared = r * r
+    fits = _1 if squared <= limit else _0
+    weight *= fits
+    seen = (_1 - contrast * covered) * weight
+    J[LEVEL, i], J[SLOPE_X, i], J[SLOPE_Y, i] = seen, seen * x, seen * y
+    J[CONTRAST, i] = -light * covered * weight
+    pixels.residual[i] = r * fits
+    return light, weight, min(squared, limit), _1 - fits
 
 
 @_part
@@ -372,11 +412,11 @@ def _whitened_model(pixels, n, p, G, det, clip):
     inv_sigma, sigma, half_sigma = _f(1.0 / p[SIGMA]), _f(p[SIGMA]), _f(0.5 * p[SIGMA])
     level, slope_x, slope_y, limit = _f(p[LEVEL]), _f(p[SLOPE_X]), _f(p[SLOPE_Y]), _f(clip)
     half_step = _f(0.05)
-    chi2, n_clipped = _0, _0
+    chi2, n_clipped, J = _0, _0, pixels.jacobian
     for i in range(n):
-        x, y = pixels[_OFFSET_X, i], pixels[_OFFSET_Y, i]
+        x, y = pixels.offset_x[i], pixels.offset_y[i]
         d, slope, nx, ny, inv_g, curvature = _edge_distance(
-            pixels[_X, i] - a, pixels[_Y, i] - b, radius, g00, g01, g10, g11, det2
+            pixels.x[i] - a, pixels.y[i] - b, radius, g00, g01, g10, g11, det2
         )
         # the gradient was taken at the dot's centre: perspective changes the scale over the dot, and what counts is the
         # scale half way between the pixel and the edge (at the pixel itself it would shift centres by 5e-4 px)
@@ -386,23 +426,12 @@ def _whitened_model(pixels, n, p, G, det, clip):
         # a curved edge blurred by sigma looks shifted inwards by sigma^2 / (2 radius of curvature)
         z = d * inv_sigma + half_sigma * curvature
         s, bell = _edge_profile(z)
-        light = level + slope_x * x + slope_y * y
-        weight = pixels[_WEIGHT, i]
-        r = weight * (pixels[_GREY, i] - light * (_1 - contrast * s))
-        squared = r * r
-        fits = _1 if squared <= limit else _0
-        chi2 += min(squared, limit)
-        n_clipped += _1 - fits
-        weight *= fits
-        seen = (_1 - contrast * s) * weight
+        light, weight, squared, clipped = _lit(pixels, i, s, level, slope_x, slope_y, contrast, limit)
+        chi2 += squared
+        n_clipped += clipped
         edge = -light * contrast * bell * inv_sigma * weight  # - d model / d distance
-        pixels[_JACOBIAN + A, i], pixels[_JACOBIAN + B, i] = edge * nx * slope, edge * ny * slope
-        pixels[_JACOBIAN + RADIUS, i] = edge * slope
-        pixels[_JACOBIAN + SIGMA, i] = edge * (z - curvature * sigma)
-        pixels[_JACOBIAN + LEVEL, i] = seen
-        pixels[_JACOBIAN + SLOPE_X, i], pixels[_JACOBIAN + SLOPE_Y, i] = seen * x, seen * y
-        pixels[_JACOBIAN + CONTRAST, i] = -light * s * weight
-        pixels[_RESIDUAL, i] = r * fits
+        J[A, i], J[B, i] = edge * nx * slope, edge * ny * slope
+        J[RADIUS, i], J[SIGMA, i] = edge * slope, edge * (z - curvature * sigma)
     return float(chi2), float(n_clipped)
 
 
@@ -468,9 +497,9 @@ def _whitened_ellipse(pixels, n, p, ellipse, nodes, clip):
     inv_radius, inv_sigma, ten = _f(1.0 / p[RADIUS]), _f(in_sigma), _f(10.0)
     contrast, level, slope_x, slope_y = _f(p[CONTRAST]), _f(p[LEVEL]), _f(p[SLOPE_X]), _f(p[SLOPE_Y])
     limit = _f(clip)
-    chi2, n_clipped = _0, _0
+    chi2, n_clipped, J = _0, _0, pixels.jacobian
     for i in range(n):
-        x, y = pixels[_OFFSET_X, i], pixels[_OFFSET_Y, i]
+        x, y = pixels.offset_x[i], pixels.offset_y[i]
         from_u, from_v = ten * x - from_x, ten * y - from_y
         along, across = along_x * from_u + along_y * from_v, along_x * from_v - along_y * from_u
         covered, d_along, d_across, edge = _0, _0, _0, _0
@@ -487,24 +516,14 @@ def _whitened_ellipse(pixels, n, p, ellipse, nodes, clip):
             d_across += column * (bell_above - bell_below)
             edge += bell * (bell_above + bell_below)
         edge *= round_edge
-        light = level + slope_x * x + slope_y * y
-        weight = pixels[_WEIGHT, i]
-        r = weight * (pixels[_GREY, i] - light * (_1 - contrast * covered))
-        squared = r * r
-        fits = _1 if squared <= limit else _0
-        chi2 += min(squared, limit)
-        n_clipped += _1 - fits
-        weight *= fits
-        seen = (_1 - contrast * covered) * weight
+        light, weight, squared, clipped = _lit(pixels, i, covered, level, slope_x, slope_y, contrast, limit)
+        chi2 += squared
+        n_clipped += clipped
         dark = light * contrast * weight
-        pixels[_JACOBIAN + A, i] = dark * (d_along * A_along + d_across * A_across)
-        pixels[_JACOBIAN + B, i] = dark * (d_along * B_along + d_across * B_across)
-        pixels[_JACOBIAN + RADIUS, i] = -dark * edge * inv_radius
-        pixels[_JACOBIAN + SIGMA, i] = dark * (along * d_along + across * d_across + edge) * inv_sigma
-        pixels[_JACOBIAN + LEVEL, i] = seen
-        pixels[_JACOBIAN + SLOPE_X, i], pixels[_JACOBIAN + SLOPE_Y, i] = seen * x, seen * y
-        pixels[_JACOBIAN + CONTRAST, i] = -light * covered * weight
-        pixels[_RESIDUAL, i] = r * fits
+        J[A, i] = dark * (d_along * A_along + d_across * A_across)
+        J[B, i] = dark * (d_along * B_along + d_across * B_across)
+        J[RADIUS, i] = -dark * edge * inv_radius
+        J[SIGMA, i] = dark * (along * d_along + across * d_across + edge) * inv_sigma
     return float(chi2), float(n_clipped)
 
 
@@ -514,9 +533,9 @@ def _descend(pixels, n, p, G, det, px_per_unit, radius, clip, work, blurred, ell
 
     blurred: take the whole ellipse, with the expected radius as a prior, and not one edge at a time.
 
-    On convergence the first rows of work hold the Cholesky factor of J^T W J at the minimum.
+    On convergence the matrix of work holds the Cholesky factor of J^T W J at the minimum.
     """
-    M, rhs, step, previous = work[:8], work[_RHS], work[_STEP], work[_BEFORE]
+    M, rhs, step, previous = work
     damping, last, rejected, converged = 1e-7, np.inf, False, False
     before = np.inf  # length of the last step: the ratio of two tells how fast the iteration contracts
     chi2, n_clipped = 0.0, 0.0
@@ -542,9 +561,9 @@ def _descend(pixels, n, p, G, det, px_per_unit, radius, clip, work, blurred, ell
             damping = max(0.03 * damping, 1e-9)
         last, rejected = chi2, False
         for j in range(0, 8, 2):  # two by two: what is loaded serves twice
-            row, next_row = pixels[_JACOBIAN + j], pixels[_JACOBIAN + j + 1]
+            row, next_row = pixels.jacobian[j], pixels.jacobian[j + 1]
             for k in range(0, j + 1, 2):
-                column, next_column = pixels[_JACOBIAN + k], pixels[_JACOBIAN + k + 1]
+                column, next_column = pixels.jacobian[k], pixels.jacobian[k + 1]
                 a, b, c, d = _0, _0, _0, _0
                 for i in range(n):
                     a += row[i] * column[i]
@@ -554,8 +573,8 @@ def _descend(pixels, n, p, G, det, px_per_unit, radius, clip, work, blurred, ell
                 M[j, k], M[j, k + 1], M[j + 1, k], M[j + 1, k + 1] = a, b, c, d
             a, b = _0, _0
             for i in range(n):
-                a += row[i] * pixels[_RESIDUAL, i]
-                b += next_row[i] * pixels[_RESIDUAL, i]
+                a += row[i] * pixels.residual[i]
+                b += next_row[i] * pixels.residual[i]
             rhs[j], rhs[j + 1] = a, b
         if blurred:
             M[RADIUS, RADIUS] += 1.0 / (_RADIUS_PRIOR * radius) ** 2
@@ -592,7 +611,7 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, neighbours, pixel
     plane; start (5,): expected centre and radius on the plane, pixel of that centre; sigma: blur to start from [px];
     noise (3,): variance = noise[0] + noise[1] grey, and the square of the grey values' step; rim: radius of an edge
     about the plane's origin whose blur must not reach the pixels used, nor that of `neighbours` (k, 2), the other dots'
-    centres; pixels (_PIXEL_ROWS, any) and work (_WORK_ROWS, 8) are scratch.
+    centres; pixels and work are scratch.
     p (8,) receives the template's parameters (A, B: shift on the plane from the expected centre), result (a DOT) the
     judgement of the fit and the centre's covariance in pixels. The caller projects the centre itself (U, V).
     """
@@ -635,8 +654,8 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, neighbours, pixel
         if window[0] < 1 or window[2] < 1 or window[1] > width - 2 or window[3] > height - 2:
             return OUTSIDE
         room = (window[1] - window[0] + 1) * (window[3] - window[2] + 1) + 1
-        if room > pixels.shape[1]:
-            pixels = np.empty((_PIXEL_ROWS, room), np.float32)
+        if room > pixels.weight.shape[0]:
+            pixels = _room(room)
         n, inside, outside = _select_pixels(
             image, map_x, map_y, P, start, window, rim, neighbours, G, unit, largest, p, u0, v0, pixels
         )
@@ -654,7 +673,7 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, neighbours, pixel
         in_light = 1.0 / light
         read_32, gain_32, floor = _f(read), _f(gain), _f(step2 / 12.0)
         level, step, inv_sigma = _f(p[LEVEL]), _f(dark - p[LEVEL]), _f(1.0 / p[SIGMA])
-        distance, weight, grey = pixels[_DISTANCE], pixels[_WEIGHT], pixels[_GREY]
+        distance, weight, grey = pixels.distance, pixels.weight, pixels.grey
         for i in range(n):
             # weights from the expected grey value: the noisy one would pull the fit towards dark pixels
             s, bell = _edge_profile(distance[i] * inv_sigma)
@@ -684,13 +703,13 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, neighbours, pixel
             limit = _CLIP_SIGMA * _CLIP_SIGMA * max(1.0, chi2 / n)
             worst = _0
             for i in range(n):
-                worst = max(worst, abs(pixels[_RESIDUAL, i]))
+                worst = max(worst, abs(pixels.residual[i]))
             if worst * worst <= limit:
                 break
         if settled:
             break
     # covariance of the shift on the plane: the leading corner of (J^T W J)^-1
-    M, x, y = work[:8], work[_RHS], work[_STEP]
+    M, x, y = work.matrix, work.rhs, work.step
     for i in range(8):
         x[i], y[i] = 1.0 if i == A else 0.0, 1.0 if i == B else 0.0
     _substitute(M, x)
@@ -941,7 +960,7 @@ def track_frames(images, readable, views, face, expected, heading, results, stat
     less than n where the disc was lost at that frame.
     """
     (R_last, t_last), (R_before, t_before), (R_older, t_older) = heading
-    pixels, work = np.empty((_PIXEL_ROWS, _PIXELS), np.float32), np.empty((_WORK_ROWS, 8))
+    pixels, work = _room(_PIXELS), Normal(np.empty((8, 8)), np.empty(8), np.empty(8), np.empty(8))
     R, t, R_expected = np.empty((3, 3)), np.empty(3), np.empty((3, 3))
     for f in range(images.shape[0]):
         _predict(R_last, R_before, R_older, t_last, t_before, t_older, R, t)
@@ -970,5 +989,5 @@ def track_frames(images, readable, views, face, expected, heading, results, stat
 @_entry
 def look(images, readable, views, face, expected, R, t, results, status):
     """`_look` where Python calls it."""
-    pixels, work = np.empty((_PIXEL_ROWS, _PIXELS), np.float32), np.empty((_WORK_ROWS, 8))
+    pixels, work = _room(_PIXELS), Normal(np.empty((8, 8)), np.empty(8), np.empty(8), np.empty(8))
     _look(images, readable, views, face, expected, R, t, pixels, work, results, status)

@@ -16,12 +16,12 @@ printed too large, or motion blur, costs no accuracy.
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import NDArray
 
 from calibration.cameras.camera import Camera, normalised_maps, project
 from calibration.kit.arrays import Array, Image, robust_sigma
 from calibration.kit.grey_levels import full_scale, level_step
-from disctrack.disc import MA_2014, Disc
+from disctrack.disc import Disc
 from disctrack.track.dots import _kernels as kernels
 from disctrack.trajectory import MarkerStatus
 
@@ -110,12 +110,6 @@ def locate_on_disc(
         status,
     )
     return dot_centres(results[0], status[0])
-
-
-def prepare(dtype: DTypeLike = np.uint8) -> None:
-    """Compile the inner loop of `locate_on_disc` for images of this type, or load it."""
-    camera = Camera(1.0, 1.0, 0.0, 0.0, (0.0,) * 5, (8, 8))
-    locate_on_disc(np.zeros((8, 8), dtype), camera, np.eye(3), np.zeros(3), MA_2014)
 
 
 def dot_centres(results: NDArray, status: NDArray[np.uint8]) -> DotCentres:

@@ -9,7 +9,7 @@ from disctrack import frames
 from disctrack.disc import Disc, symmetry_order
 from disctrack.findings import MISFITS, Finding, Kind, Number, Remedy, Severity, Subject
 from disctrack.track.follow.following import Follower
-from disctrack.track.judge.dropped_frames import delay_of_right
+from disctrack.track.judge.dropped_frames import HARDLY, LATE, delay_of_right
 from disctrack.track.refine.intrinsic_scatter import Scatter, SharedFaults
 from disctrack.track.refine.pose_scatter import GROUPS, PoseScatter
 from disctrack.track.refine.self_calibration import DotsInFrames
@@ -23,8 +23,6 @@ FAULTY = 2.0  # times the noise that residuals must reach before cameras or cloc
 DISAGREE = 0.003  # chance that board and disc differ by that much: three standard deviations
 ORDINARY_PX = 0.03  # rms of systematic misfit that good lenses have beyond their polynomial: no camera has moved
 HOPELESS = 25.0  # times the variance of the noise: no result of such dots is right within its sigmas
-LATE = 0.9  # share of the square of a misfit that a delay explains, from which on it is its cause
-HARDLY = 0.3  # and below which it has no part in it: what a camera that moved leaves looks a little like one
 SHAKEN = 1.4  # times what dots tell, from which on the scatter of the poses is worth a word
 NO_TOLERANCE = 0.4e-3  # [m] between the board's table and the disc's: a number declared wrong, or cameras that moved
 MOVED = "Was a camera moved or turned after its calibration? Then calibrate again."

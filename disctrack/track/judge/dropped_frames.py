@@ -15,11 +15,12 @@ from disctrack.findings import MISFITS, Finding, Kind, Number, Remedy, Severity,
 from disctrack.frames import CAMERAS
 from disctrack.track.pose import misses, whitening
 from disctrack.track.refine.self_calibration import DotsInFrames
-from disctrack.track.side_by_side import evenly
+from disctrack.track.side_by_side import SHARED_FRAMES, evenly
 
 SHORTEST = 4  # frames: a gleam or a hand is told by the frames' own status
-EXPLAINED, TOLD = 0.9, 0.5  # of the square of the misfit: by a slip; or by no delay at all, below
-DELAY_FRAMES = 100  # that a delay is taken from, at most
+# Share of the square of a misfit that a delay explains, from which on it is its cause; and below which it has no part
+# in it: what a camera that moved leaves looks a little like one
+LATE, HARDLY = 0.9, 0.3
 
 
 def dropped_frames(refused: Mask, seen: DotsInFrames, pairs: range) -> tuple[Finding, ...]:
@@ -29,7 +30,7 @@ def dropped_frames(refused: Mask, seen: DotsInFrames, pairs: range) -> tuple[Fin
     edges = np.flatnonzero(np.diff(np.r_[False, refused, False].astype(int))).reshape(-1, 2)
     for first, end in edges[edges[:, 1] - edges[:, 0] >= SHORTEST]:
         delay, explained = delay_of_right(seen, np.arange(first, end))
-        ahead = round(delay) if explained > EXPLAINED else 0
+        ahead = round(delay) if explained > LATE else 0
         if not ahead:
             unexplained += pairs[first:end]
             continue
@@ -44,7 +45,7 @@ def dropped_frames(refused: Mask, seen: DotsInFrames, pairs: range) -> tuple[Fin
         before = np.arange(rows[0])
         delay, explained = delay_of_right(seen, before)
         by_both = np.isfinite(seen.pixels[before]).all(axis=-1).any(axis=-1).all(axis=-1) & seen.posed[before]
-        always = k == 0 and (round(delay) == ahead if explained > TOLD else by_both.sum() < SHORTEST)
+        always = k == 0 and (round(delay) == ahead if explained > HARDLY else by_both.sum() < SHORTEST)
         frames, n = [pairs[i] for i in rows], abs(ahead)
         text = (
             f"frames {ranges(frames)} {refused_for}, as if the {camera} camera were "
@@ -66,7 +67,7 @@ def delay_of_right(seen: DotsInFrames, rows: NDArray[np.intp]) -> tuple[float, f
     (0, 0) where no frame has both its neighbours.
     """
     inside = rows[(rows > 0) & (rows < len(seen.t) - 1)]
-    rows = evenly(inside[seen.posed[inside]], DELAY_FRAMES)
+    rows = evenly(inside[seen.posed[inside]], SHARED_FRAMES)
     some, pixels = seen.at(rows), seen.pixels
     residuals, by_pose, known = misses(
         some.pixels, some.covariance, some.rig, some.disc.marker_centres_body, some.R, some.t

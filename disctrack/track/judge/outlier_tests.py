@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from calibration.kit.arrays import Array, Mask
 from disctrack.frames import rotation_from_vector, vector_from_rotation
 from disctrack.track.pose import PoseFits
+from disctrack.track.side_by_side import AT_ONCE
 from disctrack.trajectory import FrameStatus
 
 FEW = 4  # frames beside a cut that tell how large the misfit is there
-_AT_ONCE = 4096  # frames whose neighbours' covariances are held together
 BLOCK = 16  # frames whose median is what is usual, with those of the blocks on both sides: half may be at fault
 SIGMAS = 4.0  # beyond which a dot's misfit is hardly chance (6e-5): such a dot loses its weight, and no frame is lost
 COMPANIONS = 1.0  # the same for the other dots of an image in which something is: gleams are larger than a dot
@@ -231,7 +231,7 @@ def sums_over_time(fits: PoseFits, weights: Mapping[int, float]) -> Iterator[tup
     rows = np.arange(max(-offsets.min(), 0), n - max(offsets.max(), 0))
     near = rows[:, None] + offsets
     good = fits.converged[near].all(axis=1)
-    for some in np.array_split(rows[good], len(rows) // _AT_ONCE + 1):
+    for some in np.array_split(rows[good], len(rows) // AT_ONCE + 1):
         near = some[:, None] + offsets
         turn = vector_from_rotation(R[near] @ np.swapaxes(R[near[:, :1]], 2, 3))  # by little, from the first
         away = np.einsum("k,nki->ni", weight, np.concatenate([t[near], turn], axis=2))

@@ -21,7 +21,6 @@ from disctrack.track.refine.glare import shift_by_gleam
 from disctrack.track.refine.intrinsic_scatter import Scatter, SharedFaults, split_scatter, without_shared_faults
 from disctrack.track.refine.pose_scatter import PoseScatter, scatter_of_poses
 from disctrack.track.refine.self_calibration import (
-    SHARED_FRAMES,
     AsBuilt,
     DotsInFrames,
     by_pattern,
@@ -29,7 +28,7 @@ from disctrack.track.refine.self_calibration import (
     share_of_places,
 )
 from disctrack.track.refine.table_contact import OF_PATTERN, TableFromDisc, table_from_disc
-from disctrack.track.side_by_side import evenly, side_by_side
+from disctrack.track.side_by_side import SHARED_FRAMES, evenly, side_by_side
 from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
 
 MIN_GOOD_DOT_IMAGES = 6

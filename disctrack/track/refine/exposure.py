@@ -33,13 +33,11 @@ from disctrack.findings import Finding, Kind, Severity
 from disctrack.frames import CAMERAS
 from disctrack.track.dots.template_response import Edge, half_axes, plane_to_image, pulls_by_exposure, turned_to_axes
 from disctrack.track.pose import marker_pixels
+from disctrack.track.side_by_side import AT_ONCE, MIN_FRAMES, SHARED_FRAMES, evenly
 
 BORROWED_FROM = 2  # frames: beside a gap, the acceleration of a neighbour up to this far away is used
-OF_SMEAR = 500  # frames at most that the smear is taken from
 PARTS = 10  # stretches of the recording: what the fit leaves has a memory, its sum over a stretch scatters as it does
 LEAST_PARTS = 4.0  # that the motion is spread over: (sum w)^2 / sum w^2 of what each tells
-FEWEST = 2 * PARTS  # frames
-AT_ONCE = 4096  # poses
 EDGE = 16  # directions about a dot
 OUTLYING = 4.0  # robust sigmas
 ALIKE = 1e-6  # of the largest: columns of the fit that differ by less from a sum of others are not told apart
@@ -98,8 +96,7 @@ def exposure_by_smear(R: Array, t: Array, time: Array, blur_px: Array, rig: Ster
     which would hide a twentieth of 200 us), and T^2 times the smear of one second's exposure. Sigmas are those of sums
     over stretches of the recording (sandwich), as what a lens adds is not white.
     """
-    every = max(1, -(-len(t) // OF_SMEAR))
-    chosen = np.arange(0, len(t), every)
+    chosen = evenly(np.arange(len(t)), SHARED_FRAMES)
     rows = np.unique(np.clip(chosen[:, None] + np.arange(-1, 2), 0, len(t) - 1))  # with their neighbours
     own = np.searchsorted(rows, chosen)
     pixels, J = marker_pixels(R[rows], t[rows], rig, disc.marker_centres_body)
@@ -225,8 +222,8 @@ def _slope(y: Array, x: Array, others: list[Array]) -> tuple[float, float]:
     """Of y (n, m) over x (n, m), with its sigma: beside a constant of each column and slopes over `others` (n, m)."""
     n, m = y.shape
     use = np.isfinite(y) & np.isfinite([*others, x]).all(axis=0)
-    often = use.sum(axis=0) >= FEWEST
-    if n < FEWEST or not often.any():
+    often = use.sum(axis=0) >= MIN_FRAMES
+    if n < MIN_FRAMES or not often.any():
         return np.nan, np.inf
     y, use, m = y[:, often].ravel(), use[:, often].ravel(), int(often.sum())
     constants = np.broadcast_to(np.eye(m), (n, m, m))

@@ -22,11 +22,10 @@ from calibration.kit.arrays import Array, Mask
 from disctrack.disc import Disc
 from disctrack.track.dots.template_response import Edge, plane_to_image, pulls_by_contrast, turned_to_axes
 from disctrack.track.pose import marker_pixels
+from disctrack.track.side_by_side import AT_ONCE, MIN_FRAMES, SHARED_FRAMES, evenly
 
 DEGREE = 4  # of the polynomial: a gleam as wide as the disc's path
 POWERS = [(i, k - i) for k in range(1, DEGREE + 1) for i in range(k + 1)]
-OF_CONTRAST = 400  # frames at most that the polynomial is fitted to
-LEAST = 20  # frames
 SAME = 1 / 16  # of a dot's diameter, about a pixel
 OUTLYING = 4.0  # robust sigmas
 # Standard deviations of what one term adds to the contrast over the dots' path, in those of the contrast itself: the
@@ -34,7 +33,6 @@ OUTLYING = 4.0  # robust sigmas
 # likelier than no gradient by this much
 PRIORS = (0.01, 0.03, 0.1, 0.3, 1.0)
 LIKELIER = 6.0  # of natural logarithms
-AT_ONCE = 4096  # poses
 
 
 def shift_by_gleam(R: Array, t: Array, contrast: Array, rig: StereoRig, disc: Disc, edges: tuple[Edge, Edge]) -> Array:
@@ -46,7 +44,7 @@ def shift_by_gleam(R: Array, t: Array, contrast: Array, rig: StereoRig, disc: Di
     n = len(R)
     shift = np.zeros((n, 2, disc.n_markers, 2))
     apart = _apart(R, t, disc)
-    chosen = apart[np.unique(np.linspace(0, len(apart) - 1, min(len(apart), OF_CONTRAST)).astype(int))]
+    chosen = evenly(apart, SHARED_FRAMES)
     pixels = marker_pixels(R[chosen], t[chosen], rig, disc.marker_centres_body)[0]
     fields = [_Field.fitted(pixels[:, c], contrast[chosen, c]) for c in (0, 1)]
     for first in range(0, n if any(fields) else 0, AT_ONCE):
@@ -81,7 +79,7 @@ class _Field:
     def fitted(cls, places: Array, contrast: Array) -> _Field | None:
         """From places (n, m, 2) [px] and contrasts (n, m) of m dots; None where they are too few."""
         known = np.isfinite(contrast) & np.isfinite(places).all(axis=-1)
-        if np.sum(known.sum(axis=1) >= 2) < LEAST:
+        if np.sum(known.sum(axis=1) >= 2) < MIN_FRAMES:
             return None
         middle = np.mean(places[known], axis=0)
         scale = float(np.abs(places[known] - middle).max())

@@ -15,15 +15,13 @@ from calibration.kit.arrays import Array
 from disctrack.track.pose import PoseFits, whitening
 from disctrack.track.refine.self_calibration import (
     DOT_SIGMA,
-    SHARED_FRAMES,
     DotsInFrames,
     declared_places_kept,
     fit_shared,
     places_sigma,
 )
-from disctrack.track.side_by_side import evenly
+from disctrack.track.side_by_side import MIN_FRAMES, SHARED_FRAMES, evenly
 
-MIN_FRAMES = 20
 LEAST_NOISE = 0.25  # of the variance that flat parts of the image tell: the rest may be the pixels' fixed pattern
 # How far a camera may be off: far more than any that is still of use, and enough to bound what the disc does not tell.
 # [px, 1]; rotations [rad] and translations [m]; the delay is free within a frame period.

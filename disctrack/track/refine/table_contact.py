@@ -30,10 +30,10 @@ from calibration.kit.arrays import Array, robust_sigma
 from disctrack import frames
 from disctrack.disc import Disc
 from disctrack.track.pose import PoseFits
+from disctrack.track.side_by_side import AT_ONCE, MIN_FRAMES
 
 SOURCES = ("both", "board", "disc")
 OF_PATTERN = "where the dots are on the disc"
-MIN_FRAMES = 30
 # Below, the direction of the contact is noise; above, a disc stands on its rim and may well slide or fall.
 THETA_RANGE = np.radians(0.7), np.radians(85.0)
 MAX_SCATTER = 30e-6  # [m] of the gaps about their plane: beyond, the disc jumps or the poses are not those of a disc
@@ -41,7 +41,6 @@ NOISY = 6.0  # times what noise and misfit of the poses explain, as far as that 
 # Standard deviations [m] of radius and thickness where none is declared: 0.02 %, and a micrometer's
 ASSUMED_RADIUS, ASSUMED_THICKNESS = 7.5e-6, 3e-6
 PLACES = 6.0  # at which the cameras' smooth errors are independent, in a whole turn of the contact
-_AT_ONCE = 4096  # frames
 _WIDE = np.array([1e-2, 0.1, 0.1])  # [m, rad, rad] bounds what a short arc of contacts leaves open
 
 
@@ -231,7 +230,7 @@ def _contacts(
     gain = inverse @ A.T * kept
     azimuth = np.unwrap(np.arctan2(arm[:, 1], arm[:, 0])[kept])
     independent = np.clip(PLACES * np.ptp(azimuth) / (2 * np.pi), 1.0, PLACES)
-    parts = [slice(first, first + _AT_ONCE) for first in range(0, len(rows), _AT_ONCE)]
+    parts = [slice(first, first + AT_ONCE) for first in range(0, len(rows), AT_ONCE)]
     gap_by_rig = [np.einsum("ni,nij->nj", by_pose[part], fits.sensitivity[rows[part]]) for part in parts]
     sine = np.sqrt(np.maximum(1.0 - (R[:, :, 2] @ normal) ** 2, 0.0))
     by_disc = gain @ np.stack([sine * radius_tolerance(disc), R[:, 2, 2] * 0.5 * thickness_tolerance(disc)], axis=1)
@@ -259,8 +258,8 @@ def _on_plane(
     shift = np.array([0.0, 0.0, height - table.applied[1:] @ table.middle])
     both = np.zeros((6, 6))
     both[:3, :3] = both[3:, 3:] = Q.T
-    for first in range(0, len(systematic), _AT_ONCE):  # in place: of a long recording these are the largest arrays
-        rows = slice(first, first + _AT_ONCE)
+    for first in range(0, len(systematic), AT_ONCE):  # in place: of a long recording these are the largest arrays
+        rows = slice(first, first + AT_ONCE)
         fits.sensitivity[rows] = both @ fits.sensitivity[rows]
         for covariance in (fits.covariance, systematic):
             covariance[rows] = both @ covariance[rows] @ both.T
