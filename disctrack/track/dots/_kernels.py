@@ -103,15 +103,6 @@ class Pixels(NamedTuple):
     weight: Array  # one over that
 
 
-class Normal(NamedTuple):
-    """Normal equations of the eight parameters."""
-
-    matrix: Array  # (8, 8)
-    rhs: Array  # (8,)
-    step: Array
-    before: Array  # parameters before the step
-
-
 _PIXELS = 4096 + 64  # of a dot of 60 px; more are made room for. No power of two: rows would share lines of the cache
 _MAX_SELECTIONS = 4
 _MAX_ITERATIONS = 20
@@ -533,7 +524,7 @@ def _descend(pixels, n, p, G, det, px_per_unit, radius, clip, work, blurred, ell
 
     blurred: take the whole ellipse, with the expected radius as a prior, and not one edge at a time.
 
-    On convergence the matrix of work holds the Cholesky factor of J^T W J at the minimum.
+    On convergence the first matrix of work holds the Cholesky factor of J^T W J at the minimum.
     """
     M, rhs, step, previous = work
     damping, last, rejected, converged = 1e-7, np.inf, False, False
@@ -611,7 +602,7 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, neighbours, pixel
     plane; start (5,): expected centre and radius on the plane, pixel of that centre; sigma: blur to start from [px];
     noise (3,): variance = noise[0] + noise[1] grey, and the square of the grey values' step; rim: radius of an edge
     about the plane's origin whose blur must not reach the pixels used, nor that of `neighbours` (k, 2), the other dots'
-    centres; pixels and work are scratch.
+    centres; pixels and work (matrix, right-hand side, step, parameters before it) are scratch.
     p (8,) receives the template's parameters (A, B: shift on the plane from the expected centre), result (a DOT) the
     judgement of the fit and the centre's covariance in pixels. The caller projects the centre itself (U, V).
     """
@@ -709,7 +700,7 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, neighbours, pixel
         if settled:
             break
     # covariance of the shift on the plane: the leading corner of (J^T W J)^-1
-    M, x, y = work.matrix, work.rhs, work.step
+    M, x, y, _ = work
     for i in range(8):
         x[i], y[i] = 1.0 if i == A else 0.0, 1.0 if i == B else 0.0
     _substitute(M, x)
@@ -960,7 +951,7 @@ def track_frames(images, readable, views, face, expected, heading, results, stat
     less than n where the disc was lost at that frame.
     """
     (R_last, t_last), (R_before, t_before), (R_older, t_older) = heading
-    pixels, work = _room(_PIXELS), Normal(np.empty((8, 8)), np.empty(8), np.empty(8), np.empty(8))
+    pixels, work = _room(_PIXELS), (np.empty((8, 8)), np.empty(8), np.empty(8), np.empty(8))
     R, t, R_expected = np.empty((3, 3)), np.empty(3), np.empty((3, 3))
     for f in range(images.shape[0]):
         _predict(R_last, R_before, R_older, t_last, t_before, t_older, R, t)
@@ -989,5 +980,5 @@ def track_frames(images, readable, views, face, expected, heading, results, stat
 @_entry
 def look(images, readable, views, face, expected, R, t, results, status):
     """`_look` where Python calls it."""
-    pixels, work = _room(_PIXELS), Normal(np.empty((8, 8)), np.empty(8), np.empty(8), np.empty(8))
+    pixels, work = _room(_PIXELS), (np.empty((8, 8)), np.empty(8), np.empty(8), np.empty(8))
     _look(images, readable, views, face, expected, R, t, pixels, work, results, status)

@@ -5,6 +5,7 @@ candidate motions. If one camera sees too little, three blobs of the other give 
 problem), and of mirror twins the one that touches the table is taken.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations, permutations
 
@@ -16,7 +17,7 @@ from calibration.cameras.camera import StereoRig, normalise, triangulate
 from calibration.kit.arrays import Array
 from calibration.kit.grey_levels import level_step
 from disctrack.disc import Disc
-from disctrack.frames import euler_from_rotation, rotation_from_vector
+from disctrack.frames import CAMERAS, euler_from_rotation, rotation_from_vector
 from disctrack.track.pose import fit_poses, marker_pixels
 
 MAX_BLOBS = 24
@@ -34,8 +35,7 @@ Pose = tuple[Array, Array]  # R_world_body (3, 3), t_world_body (3,) [m]
 class Acquisition:
     """Pose found without a prior, good to a fraction of a pixel, or the reason why none was found."""
 
-    R_world_body: Array | None  # (3, 3)
-    t_world_body: Array | None  # (3,) [m]
+    pose: Pose | None
     n_explained: int  # dot images explained by blobs, both cameras together
     reason: str  # empty when found
 
@@ -81,19 +81,19 @@ def _elliptical_components(mask: NDArray[np.uint8], diameter: float) -> list[tup
     return result
 
 
-def expected_diameter_px(rig: StereoRig, disc: Disc) -> tuple[float, float]:
+def expected_diameter_px(rig: StereoRig, disc: Disc) -> list[float]:
     """Diameter of a dot's image in each camera where its axis meets the table, or 0.5 m away without a table."""
     result = []
     for camera, (R, t) in zip(rig.cameras, rig.camera_poses(), strict=True):
         distance = (R.T @ t)[2] / R[2, 2] if rig.world_is_table and R[2, 2] < -0.05 else 0.5
         result.append(camera.fx * disc.marker_diameter / distance)
-    return result[0], result[1]
+    return result
 
 
-def acquire(left: NDArray[np.generic], right: NDArray[np.generic], rig: StereoRig, disc: Disc) -> Acquisition:
-    """Find the disc in one pair of images, wherever it is and however it is turned."""
+def acquire(pair: Sequence[NDArray] | NDArray, rig: StereoRig, disc: Disc) -> Acquisition:
+    """Find the disc in the images of both cameras, wherever it is and however it is turned."""
     diameters = expected_diameter_px(rig, disc)
-    blobs = [dot_blobs(image, diameter)[:, :2] for image, diameter in zip((left, right), diameters, strict=True)]
+    blobs = [dot_blobs(image, diameter)[:, :2] for image, diameter in zip(pair, diameters, strict=True)]
     return acquire_from_blobs(blobs, rig, disc)
 
 
@@ -107,15 +107,13 @@ def acquire_from_blobs(blobs: list[Array], rig: StereoRig, disc: Disc) -> Acquis
             if single is not None and (best is None or single[0] < best[0]):
                 best = single
     if best is None:
-        counts = " and ".join(f"{len(b)} in the {name}" for b, name in zip(blobs, ("left", "right"), strict=True))
-        return Acquisition(
-            None,
-            None,
-            0,
+        counts = " and ".join(f"{len(b)} in the {name}" for b, name in zip(blobs, CAMERAS, strict=True))
+        reason = (
             f"no arrangement of the blobs found ({counts} image) matches the {disc.n_markers} dots of [markers]: "
-            "is the upper face visible, are diameter and centres right, does the rig belong to these images?",
+            "is the upper face visible, are diameter and centres right, does the rig belong to these images?"
         )
-    return Acquisition(best[1], best[2], best[3], "")
+        return Acquisition(None, 0, reason)
+    return Acquisition(best[1:3], best[3], "")
 
 
 def seen_by_one_camera(

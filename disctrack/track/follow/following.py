@@ -8,13 +8,14 @@ fails, going back over the frames before it was found again, and measuring blur 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.cameras.camera import StereoRig
+from calibration.cameras.camera import StereoRig, normalised_maps
 from calibration.kit.arrays import Array, Image, Mask
 from calibration.kit.grey_levels import saturation_level
 from disctrack.disc import Disc
@@ -121,6 +122,13 @@ class TrackingSetup:
     maps_x: Array  # (2, height, width) undistorted normalised coordinates of every pixel
     maps_y: Array
 
+    @classmethod
+    def of(cls, rig: StereoRig, disc: Disc) -> TrackingSetup:
+        """With the cameras' maps, which take a while."""
+        with ThreadPoolExecutor(2) as pool:
+            maps_x, maps_y = zip(*pool.map(normalised_maps, rig.cameras), strict=True)
+        return cls(rig, disc, np.stack(maps_x), np.stack(maps_y))
+
 
 @dataclass
 class Tables:
@@ -153,6 +161,8 @@ class Follower:
     saturated: list[int | None] = field(default_factory=lambda: [None, None])  # grey value at which the dots' brighter
     # side is clipped
     first_row: int = 0  # of the tables
+    found: Pose | None = None  # by a search, in this block; `before`, in a block before of one pair
+    before: Pose | None = None
 
     def without_pose(self) -> None:
         """One more frame is gone in which the disc is lost."""
@@ -210,6 +220,7 @@ def empty_tables(n: int, m: int) -> Tables:
 def follow_block(follower: Follower, images: Image, readable: Mask, tables: Tables, start: int) -> None:
     """Fill the tables' rows from `start` on with what n pairs show; images (n, 2, height, width), readable (n, 2)."""
     n, i = len(images), 0
+    follower.found, follower.before = None, follower.found if n == 1 else None
     rows = tables.part(slice(start, start + n))
     # an image of one camera alone that is a copy of an earlier one: no two are equal, by their noise. Where both are,
     # nothing may have moved: that is judged by the motion
@@ -325,6 +336,10 @@ def _search(follower: Follower, images: Image, readable: Mask) -> bool:
     following = None
     if len(images) > 1 and readable[1].any():
         following = _found(follower, images[1], readable[1])
+    elif follower.before is not None:  # pairs come one by one: as from the pair before
+        R, t = follower.before
+        following = pose[0] @ R.T @ pose[0], 2 * pose[1] - t
+    follower.found = pose
     heading = Heading.leading_to(pose, following)
     if not follower.measured:
         _measure_blur_and_noise(follower, images, readable, pose, heading)
@@ -335,12 +350,9 @@ def _search(follower: Follower, images: Image, readable: Mask) -> bool:
 
 
 def _found(follower: Follower, pair: Image, readable: Mask) -> Pose | None:
-    setup = follower.setup
-    found = acquire(np.where(readable[0], pair[0], 0), np.where(readable[1], pair[1], 0), setup.rig, setup.disc)
-    if found.R_world_body is None or found.t_world_body is None:
-        follower.first_reason = follower.first_reason or found.reason
-        return None
-    return found.R_world_body, found.t_world_body
+    found = acquire(np.where(readable[:, None, None], pair, 0), follower.setup.rig, follower.setup.disc)
+    follower.first_reason = follower.first_reason or found.reason
+    return found.pose
 
 
 def _measure_blur_and_noise(follower: Follower, images: Image, readable: Mask, pose: Pose, heading: Heading) -> None:

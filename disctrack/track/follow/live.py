@@ -9,24 +9,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.cameras.camera import StereoRig, normalised_maps
+from calibration.cameras.camera import StereoRig
 from calibration.kit.arguments import checked, grey_values
 from calibration.kit.arrays import Array, Image
 from disctrack import frames
 from disctrack.disc import Disc
 from disctrack.errors import ArgumentError
-from disctrack.track.dots.acquisition import Pose
 from disctrack.track.dots.template import dot_centres
-from disctrack.track.follow.following import (
-    Follower,
-    Heading,
-    Search,
-    Tables,
-    TrackingSetup,
-    empty_tables,
-    recover,
-    run,
-)
+from disctrack.track.follow.following import Follower, Tables, TrackingSetup, empty_tables, follow_block
 from disctrack.track.follow.tracking import check_images
 from disctrack.track.pose import fit_poses
 from disctrack.track.refine.assembly import MIN_GOOD_DOT_IMAGES
@@ -84,12 +74,8 @@ class Tracker:
     def __init__(self, rig: StereoRig, disc: Disc) -> None:
         self.rig, self.disc = rig, disc
         self.frame = -1
-        maps_x, maps_y = map(np.stack, zip(*map(normalised_maps, rig.cameras), strict=True))
-        self._follower = Follower(TrackingSetup(rig, disc, maps_x, maps_y))
-        self._readable = np.ones((1, 2), bool)
+        self._follower = Follower(TrackingSetup.of(rig, disc))
         self._angles: Array | None = None  # of the last pose
-        self._found: Pose | None = None  # in the pair before, by a search
-        self._pair: NDArray = np.empty((1, 2, 0, 0), np.uint8)
 
     def __repr__(self) -> str:
         state = "following the disc" if self._follower.lost is None else "searching"
@@ -101,24 +87,9 @@ class Tracker:
         Raises ArgumentError if they are no images, TrackingError if the rig was calibrated at another size.
         """
         self.frame += 1
-        images = self._as_block(left, right)
-        follower, m = self._follower, self.disc.n_markers
-        rows = empty_tables(1, m)
-        done = self._run(images, rows) if follower.lost is None else 0
-        if not done:
-            done = self._search(images, rows)
-        if not done:
-            follower.without_pose()
-            self._angles = None
-            return self._pose(empty_tables(1, m), FrameStatus.MARKERS_NOT_FOUND)
-        follower.lost, follower.search = None, Search()
-        return self._pose(rows, FrameStatus.NOT_CONVERGED)
-
-    def _run(self, images: NDArray, rows: Tables) -> int:
-        follower = self._follower
-        assert follower.heading is not None
-        done, follower.heading = run(follower.setup, follower.law, follower.heading, images, self._readable, rows)
-        return done
+        images, rows = self._as_block(left, right), empty_tables(1, self.disc.n_markers)
+        follow_block(self._follower, images, np.ones((1, 2), bool), rows, 0)
+        return self._pose(rows)
 
     def _as_block(self, left: Image, right: Image) -> NDArray:
         left, right = grey_values(left, "left"), grey_values(right, "right")
@@ -127,40 +98,26 @@ class Tracker:
                 f"left is an image of shape {left.shape} {left.dtype}, right of {right.shape} {right.dtype}; expected "
                 "(height, width), both of one type"
             )
-        if self._pair.shape[2:] != left.shape or self._pair.dtype != left.dtype:
-            self._pair = np.empty((1, 2, *left.shape), left.dtype)
-            check_images(self._pair, self.rig)
-        self._pair[0, 0], self._pair[0, 1] = left, right
-        return self._pair
+        check_images(left, self.rig)
+        return np.stack([left, right])[None]
 
-    def _search(self, images: NDArray, rows: Tables) -> int:
-        """Search the disc; the velocity comes from the pair before, if that was searched too."""
-        follower, before = self._follower, self._found
-        self._found = None
-        follower.lost = follower.lost or 0
-        if not recover(follower, images, self._readable):
-            return 0
-        if before is not None and follower.heading is not None:
-            (R, t), (R_now, t_now) = before, follower.heading.last
-            follower.heading = Heading.steady((R, t), (R @ R_now.T @ R, 2 * t - t_now))
-        done = self._run(images, rows)
-        if done:
-            self._found = (rows.R[0].copy(), rows.t[0].copy())
-        return done
-
-    def _pose(self, rows: Tables, unless: FrameStatus) -> LivePose:
-        """What the rows hold; `unless` there is a pose in them."""
+    def _pose(self, rows: Tables) -> LivePose:
+        """What the rows say of one pair; a pair without a pose is one without dots."""
+        status = FrameStatus(rows.frame_status[0])
+        if status != FrameStatus.MEASURED:
+            self._angles, rows = None, empty_tables(1, self.disc.n_markers)
         dots = dot_centres(rows.results, rows.status)
         centres = self.disc.marker_centres_body
         fit = fit_poses(dots.pixels, dots.covariance_px2, self.rig, centres, rows.R, rows.t, with_sensitivity=False)
-        angles, status = np.full(3, np.nan), unless
-        if fit.converged[0]:
+        angles = np.full(3, np.nan)
+        if status == FrameStatus.MEASURED and not fit.converged[0]:
+            status = FrameStatus.NOT_CONVERGED
+        elif fit.converged[0]:
             angles = frames.euler_from_rotation(fit.R_world_body[0])
             if self._angles is not None:
                 angles = frames.unwrap_euler(np.stack([self._angles, angles]))[1]
             self._angles = angles
             per_camera = fit.used[0].sum(axis=1)
-            status = FrameStatus.MEASURED
             if (per_camera == 0).any():
                 status = FrameStatus.ONE_CAMERA
             elif per_camera.sum() < MIN_GOOD_DOT_IMAGES:

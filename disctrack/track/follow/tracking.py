@@ -11,7 +11,7 @@ from threading import Event, Lock
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from calibration.cameras.camera import Camera, StereoRig, normalised_maps
+from calibration.cameras.camera import Camera, StereoRig
 from calibration.kit.arrays import Array, Image
 from calibration.kit.grey_levels import mosaic_gains
 from calibration.kit.stuck_pixels import repair, stuck_pixels
@@ -56,7 +56,7 @@ ReadBlocks = Callable[[int, int], Iterable[PairBlock]]  # pairs start ... stop-1
 def prepare(dtype: DTypeLike = np.uint8) -> None:
     """Compile the inner loops for images of this type, or load them: some seconds once per installation."""
     camera, still = Camera(1.0, 1.0, 0.0, 0.0, (0.0,) * 5, (8, 8)), (np.eye(3), np.zeros(3))
-    setup = TrackingSetup(StereoRig(camera, camera, *still, *still), MA_2014, *np.zeros((2, 2, 8, 8)))
+    setup = TrackingSetup.of(StereoRig(camera, camera, *still, *still), MA_2014)
     rows, nothing = empty_tables(0, MA_2014.n_markers), np.zeros((0, 2, 8, 8), dtype)
     run(setup, Law(), Heading(still, still, still), nothing, np.zeros((0, 2), bool), rows)
     marker_pixels(rows.R, rows.t, setup.rig, MA_2014.marker_centres_body)
@@ -91,14 +91,11 @@ def track(
             + (" on one line" if disc.n_markers > 2 else "")
             + ": a pose needs at least three dots that are not on one line"
         )
-    with ThreadPoolExecutor(2) as pool:
-        drawing = pool.map(normalised_maps, rig.cameras)
-        read_blocks, stuck = _as_one_sensor(read_blocks, pairs)
-        maps_x, maps_y = map(np.stack, zip(*drawing, strict=True))
+    read_blocks, stuck = _as_one_sensor(read_blocks, pairs)
     if timestamps is None:
         timestamps = np.array(pairs) / frame_rate
     taken = Taken(pairs, np.asarray(timestamps, float), frame_rate, gravity)
-    setup = TrackingSetup(rig, disc, maps_x, maps_y)
+    setup = TrackingSetup.of(rig, disc)
     edges = stretch_edges(pairs, disc)
 
     def measured(looked_for: Disc, progress: Callable[[int], object]) -> tuple[Tracking, bool]:

@@ -11,7 +11,7 @@ of each dot (ink and paper differ) and one of each frame (lamps flicker, an atti
 polynomial of the place in the image, whose gradient counts.
 """
 
-from __future__ import annotations
+from collections.abc import Callable
 
 import numpy as np
 from numpy.polynomial.polynomial import polyder, polyval2d
@@ -27,7 +27,6 @@ from disctrack.track.side_by_side import AT_ONCE, MIN_FRAMES, SHARED_FRAMES, eve
 DEGREE = 4  # of the polynomial: a gleam as wide as the disc's path
 POWERS = [(i, k - i) for k in range(1, DEGREE + 1) for i in range(k + 1)]
 SAME = 1 / 16  # of a dot's diameter, about a pixel
-OUTLYING = 4.0  # robust sigmas
 # Standard deviations of what one term adds to the contrast over the dots' path, in those of the contrast itself: the
 # likeliest is the prior, so that noise, and large terms that cancel where the dots are, shift nothing. It must be
 # likelier than no gradient by this much
@@ -46,15 +45,15 @@ def shift_by_gleam(R: Array, t: Array, contrast: Array, rig: StereoRig, disc: Di
     apart = _apart(R, t, disc)
     chosen = evenly(apart, SHARED_FRAMES)
     pixels = marker_pixels(R[chosen], t[chosen], rig, disc.marker_centres_body)[0]
-    fields = [_Field.fitted(pixels[:, c], contrast[chosen, c]) for c in (0, 1)]
-    for first in range(0, n if any(fields) else 0, AT_ONCE):
+    gradients = [_gradient(pixels[:, c], contrast[chosen, c]) for c in (0, 1)]
+    for first in range(0, n if any(gradients) else 0, AT_ONCE):
         rows = slice(first, first + AT_ONCE)
         places, J = marker_pixels(R[rows], t[rows], rig, disc.marker_centres_body)
         affine = plane_to_image(J, R[rows])
-        for camera, (field, edge) in enumerate(zip(fields, edges, strict=True)):
-            if field is not None:
+        for camera, (gradient, edge) in enumerate(zip(gradients, edges, strict=True)):
+            if gradient is not None:
                 axes = turned_to_axes(affine[:, camera])
-                along = (axes @ field.gradient(places[:, camera])[..., None])[..., 0]
+                along = (axes @ gradient(places[:, camera])[..., None])[..., 0]
                 along *= pulls_by_contrast(0.5 * disc.marker_diameter, affine[:, camera], edge)
                 shift[rows, camera] = np.nan_to_num((along[..., None, :] @ axes)[..., 0, :])
     return shift
@@ -69,44 +68,39 @@ def _apart(R: Array, t: Array, disc: Disc) -> NDArray[np.intp]:
     return known[np.unique(path, return_index=True)[1]]
 
 
-class _Field:
-    """The contrast as a polynomial of the place in the image, but for constants of dots and frames."""
+def _gradient(places: Array, contrast: Array) -> Callable[[Array], Array] | None:
+    """Of the contrast, (..., 2) [1/px] at places (..., 2) [px], but for constants of dots and frames.
 
-    def __init__(self, middle: Array, scale: float, coefficients: Array) -> None:
-        self.middle, self.scale, self.coefficients = middle, scale, coefficients
+    From places (n, m, 2) [px] and contrasts (n, m) of m dots; None where they are too few, or tell of no gradient.
+    """
+    known = np.isfinite(contrast) & np.isfinite(places).all(axis=-1)
+    if np.sum(known.sum(axis=1) >= 2) < MIN_FRAMES:
+        return None
+    middle = np.mean(places[known], axis=0)
+    scale = float(np.abs(places[known] - middle).max())
+    x, y = np.moveaxis((places - middle) / scale, -1, 0)
+    terms = np.stack([x**i * y**j for i, j in POWERS], axis=-1)
+    dots = np.broadcast_to(np.eye(contrast.shape[1]), (*contrast.shape, contrast.shape[1]))
+    rows = np.where(known[..., None], np.concatenate([terms, dots, contrast[..., None]], axis=-1), 0.0)
+    use = known
+    for _ in range(3):
+        centred = _without_frames(rows, use)[use]
+        own = centred[:, len(POWERS) : -1]  # of the dots
+        left = centred - own @ np.linalg.lstsq(own, centred, rcond=None)[0]
+        coefficients, likelier = _likeliest(left[:, : len(POWERS)], left[:, -1])
+        away = np.full(contrast.shape, np.inf)
+        away[use] = np.abs(left[:, -1] - left[:, : len(POWERS)] @ coefficients)
+        use = away <= 4.0 * 1.4826 * np.median(away[use]) + 1e-9
+    if likelier < LIKELIER:
+        return None
+    table = np.zeros((DEGREE + 1, DEGREE + 1))
+    table[tuple(np.transpose(POWERS))] = coefficients
 
-    @classmethod
-    def fitted(cls, places: Array, contrast: Array) -> _Field | None:
-        """From places (n, m, 2) [px] and contrasts (n, m) of m dots; None where they are too few."""
-        known = np.isfinite(contrast) & np.isfinite(places).all(axis=-1)
-        if np.sum(known.sum(axis=1) >= 2) < MIN_FRAMES:
-            return None
-        middle = np.mean(places[known], axis=0)
-        scale = float(np.abs(places[known] - middle).max())
+    def gradient(places: Array) -> Array:
         x, y = np.moveaxis((places - middle) / scale, -1, 0)
-        terms = np.stack([x**i * y**j for i, j in POWERS], axis=-1)
-        dots = np.broadcast_to(np.eye(contrast.shape[1]), (*contrast.shape, contrast.shape[1]))
-        rows = np.where(known[..., None], np.concatenate([terms, dots, contrast[..., None]], axis=-1), 0.0)
-        use = known
-        for _ in range(3):
-            centred = _without_frames(rows, use)[use]
-            own = centred[:, len(POWERS) : -1]  # of the dots
-            left = centred - own @ np.linalg.lstsq(own, centred, rcond=None)[0]
-            coefficients, likelier = _likeliest(left[:, : len(POWERS)], left[:, -1])
-            away = np.full(contrast.shape, np.inf)
-            away[use] = np.abs(left[:, -1] - left[:, : len(POWERS)] @ coefficients)
-            use = away <= OUTLYING * 1.4826 * np.median(away[use]) + 1e-9
-        if likelier < LIKELIER:
-            return None
-        table = np.zeros((DEGREE + 1, DEGREE + 1))
-        table[tuple(np.transpose(POWERS))] = coefficients
-        return cls(middle, scale, table)
+        return np.stack([polyval2d(x, y, polyder(table, axis=axis)) for axis in (0, 1)], axis=-1) / scale
 
-    def gradient(self, places: Array) -> Array:
-        """(..., 2) [1/px] at places (..., 2) [px]."""
-        x, y = np.moveaxis((places - self.middle) / self.scale, -1, 0)
-        by_x, by_y = (polyval2d(x, y, polyder(self.coefficients, axis=axis)) for axis in (0, 1))
-        return np.stack([by_x, by_y], axis=-1) / self.scale
+    return gradient
 
 
 def _likeliest(A: Array, b: Array) -> tuple[Array, float]:

@@ -12,8 +12,8 @@ from disctrack.track.pose import marker_pixels
 
 
 def distance(found, R, t):
-    turn = np.degrees(np.linalg.norm(frames.vector_from_rotation(found.R_world_body @ R.T)))
-    return np.linalg.norm(found.t_world_body - t), turn
+    R_found, t_found = found.pose
+    return np.linalg.norm(t_found - t), np.degrees(np.linalg.norm(frames.vector_from_rotation(R_found @ R.T)))
 
 
 def test_the_disc_is_found_in_whatever_attitude(rendered_pairs):
@@ -23,7 +23,7 @@ def test_the_disc_is_found_in_whatever_attitude(rendered_pairs):
         views = [np.degrees(np.arccos(R[:, 2] @ (eye - q[:3]) / np.linalg.norm(eye - q[:3]))) for eye in eyes]
         if max(views) > 70:  # one camera sees the face nearly edge-on, or from behind
             continue
-        found = acquire(images[0], images[1], p.rig, p.disc)
+        found = acquire(images, p.rig, p.disc)
         assert found.reason == ""
         shift, turn = distance(found, R, q[:3])
         # centroids of thresholded blobs: 0.3 px of 12 dots, that is 0.05 mm and 0.2 deg
@@ -34,7 +34,7 @@ def test_the_disc_is_found_in_whatever_attitude(rendered_pairs):
 def test_one_camera_is_enough(rendered_pairs):
     p = rendered_pairs
     black = np.zeros_like(p.images[0, 0])
-    found_of = [acquire(p.images[i, 0], black, p.rig, p.disc) for i in (4, 9, 12)]
+    found_of = [acquire((p.images[i, 0], black), p.rig, p.disc) for i in (4, 9, 12)]
     for i, found in zip((4, 9, 12), found_of, strict=True):
         assert found.reason == ""
         shift, turn = distance(found, p.R[i], p.q[i, :3])
@@ -65,8 +65,8 @@ def test_clutter_and_missing_dots_do_not_mislead(rng):
 
 def test_an_empty_scene_is_said_to_be_empty(rendered_pairs):
     table = np.full((512, 512), 85, np.uint8)
-    found = acquire(table, table, rendered_pairs.rig, rendered_pairs.disc)
-    assert found.R_world_body is None
+    found = acquire((table, table), rendered_pairs.rig, rendered_pairs.disc)
+    assert found.pose is None
     assert "0 in the left and 0 in the right" in found.reason
     assert "[markers]" in found.reason
 

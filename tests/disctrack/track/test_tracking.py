@@ -68,7 +68,7 @@ def test_a_rolling_disc_is_measured_to_the_predicted_sigma(rolling, rendered_pai
     # mean over 60 frames: sigma / 8, plus the template's 3e-4 px or 0.03 um
     assert np.abs(error[:, :3].mean(axis=0)).max() < 0.25e-6
     assert np.abs(error[:, 3:].mean(axis=0)).max() < np.radians(0.5e-3)
-    assert result.variance_factor < 1.15
+    assert result.scatter.whole < 1.15
     assert result.acquisitions == 1
     # angles are continuous, and the quaternion tells the same rotation
     assert np.abs(np.diff(trajectory.q[:, 3:], axis=0)).max() < 0.3
@@ -85,7 +85,7 @@ def test_the_number_of_workers_changes_no_bit_of_the_result(rolling, rendered_pa
         for workers in (1, 2)
     )
     assert two.acquisitions == one.acquisitions == 2
-    assert (one.noise, one.blur_px, one.variance_factor) == (two.noise, two.blur_px, two.variance_factor)
+    assert (one.law, one.scatter) == (two.law, two.scatter)
     for name in ("q", "pose_covariance", "calibration_sensitivity", "markers_px", "marker_status", "quaternion"):
         assert np.array_equal(getattr(one.trajectory, name), getattr(two.trajectory, name), equal_nan=True), name
     sigma = np.sqrt(np.diagonal(whole.trajectory.pose_covariance, axis1=1, axis2=2))
@@ -107,7 +107,7 @@ def test_stretches_without_a_disc_change_nothing_whoever_gets_there_first(rollin
         for workers in (1, 3, 4)
     ]
     for run in runs[1:]:
-        assert run.noise == runs[0].noise
+        assert run.law == runs[0].law
         assert np.array_equal(run.trajectory.q, runs[0].trajectory.q, equal_nan=True)
     assert (runs[0].trajectory.frame_status[:20] == FrameStatus.MARKERS_NOT_FOUND).all()
     assert (runs[0].trajectory.frame_status[20:] == FrameStatus.MEASURED).all()
@@ -123,9 +123,10 @@ def test_a_stretch_that_begins_on_another_branch_of_phi_is_followed_again(rollin
     found, third = following.acquire, np.array([[-0.5, -np.sqrt(0.75), 0], [np.sqrt(0.75), -0.5, 0], [0, 0, 1.0]])
     starts = {images[k, 0].tobytes() for k in (30, 31)}
 
-    def mistaken(left, right, rig, disc):
-        result = found(left, right, rig, disc)
-        return replace(result, R_world_body=result.R_world_body @ third) if left.tobytes() in starts else result
+    def mistaken(pair, rig, disc):
+        result = found(pair, rig, disc)
+        R, t = result.pose
+        return replace(result, pose=(R @ third, t)) if pair[0].tobytes() in starts else result
 
     declared = rendered_pairs.disc.marker_centres_body
     radius = np.linalg.norm(declared, axis=1)
@@ -199,11 +200,11 @@ def test_misprinted_dots_are_found_and_used(rolling, rendered_pairs):
     relative = shift[2] - np.delete(shift, 2, axis=0).mean(axis=0)
     # the mean displacement and turn of the pattern are gauge: the other five move to balance
     assert -75e-6 < relative[0] < -45e-6
-    assert found.variance_factor < 1.2
+    assert found.scatter.whole < 1.2
     kept = track(
         blocks_of(images), range(N), rendered_pairs.rig, wrong, 1000.0, settings=TrackingSettings(refine_markers=False)
     )
-    assert kept.variance_factor > 20  # the fault is loud when it is not refined
+    assert kept.scatter.whole > 20  # the fault is loud when it is not refined
 
 
 def test_good_dots_are_left_where_they_are_declared(rolling, rendered_pairs):
