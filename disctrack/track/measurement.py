@@ -160,43 +160,15 @@ def measure(
         settings = dataclasses.replace(settings, table=recording.table.source)
     exposure, headers = _exposures(recording, pairs)
     settings = dataclasses.replace(settings, exposure=exposure)
-    not_read: dict[tuple[int, int], Unreadable] = {}  # some are tried twice
-    rate = recording.frame_rate
-
-    stamps = usable_times(pairs.left, rate)
+    stamps = usable_times(pairs.left, recording.frame_rate)
     with compiling("tracking", 20):  # not the camera's time: done once per installation
         prepare(np.uint8 if pairs.left.bit_depth == 8 else np.uint16)
     began = time.perf_counter()
-    span = _span(pairs, rate, settings, threads)
+    span = _span(pairs, recording.frame_rate, settings, threads)
     progress(len(pairs) - (span.stop - span.start))
-    tracked = range(span.start, span.stop)
-    workers = 1  # stretches that are followed side by side: one per core, where frames can be read anywhere
-    if pairs.left.random_access and pairs.right.random_access:
-        workers = max(1, min(threads or default_threads(), len(stretch_edges(tracked, recording.disc)) - 1))
-    readers = max(1, (threads or default_threads()) // workers)  # each worker has its own three blocks
-
-    def read_blocks(start: int, stop: int) -> Iterator[PairBlock]:
-        for block in iter_pair_blocks(pairs.left, pairs.right, start, stop, threads=readers):
-            not_read.update({(image.frame, image.camera): image for image in block.unreadable})
-            yield block
-
-    try:
-        tracking = track(
-            read_blocks,
-            tracked,
-            rig,
-            recording.disc,
-            rate,
-            gravity=recording.gravity,
-            settings=settings,
-            timestamps=None if stamps is None else stamps[span.start : span.stop],
-            workers=workers,
-            progress=progress,
-        )
-    except TrackingError as error:
-        refuse_unreadable(recording, list(not_read.values()), 2 * len(tracked), error)
-        raise
-    unreadable = [not_read[place] for place in sorted(not_read)]
+    tracking, unreadable = _tracked(
+        recording, rig, pairs, settings, span, stamps, threads or default_threads(), progress
+    )
     seconds = time.perf_counter() - began
     lost: tuple[Finding, ...] = ()
     if unreadable:
@@ -215,13 +187,55 @@ def measure(
         **pairs.camera_headers(),
     }
     trajectory = at_full_length(tracking.trajectory, len(pairs.left), span.start, stamps)
-    trajectory = dataclasses.replace(trajectory, air_density=recording.air_density)
     for still in (slice(pairs.start, span.start), slice(span.stop, pairs.stop)):
         trajectory.frame_status[still] = FrameStatus.STILL
+    trajectory = dataclasses.replace(trajectory, air_density=recording.air_density)
     contradicted = contradictions_of(recording, trajectory, findings, boards)
     trajectory = dataclasses.replace(trajectory, findings=(*contradicted, *findings))
     warn_of_doubts(trajectory.findings)
-    return Measurement(trajectory, tuple(unreadable), details, seconds)
+    return Measurement(trajectory, unreadable, details, seconds)
+
+
+def _tracked(
+    recording: Recording,
+    rig: StereoRig,
+    pairs: ImagePairs,
+    settings: TrackingSettings,
+    span: MotionSpan,
+    stamps: Array | None,
+    threads: int,
+    progress: Progress,
+) -> tuple[Tracking, tuple[Unreadable, ...]]:
+    """The disc tracked through the span, and the images that could not be read; stamps : of all frames [s]."""
+    not_read: dict[tuple[int, int], Unreadable] = {}  # some are tried twice
+    tracked = range(span.start, span.stop)
+    workers = 1  # stretches that are followed side by side: one per core, where frames can be read anywhere
+    if pairs.left.random_access and pairs.right.random_access:
+        workers = max(1, min(threads, len(stretch_edges(tracked, recording.disc)) - 1))
+    readers = max(1, threads // workers)  # each worker has its own three blocks
+
+    def read_blocks(start: int, stop: int) -> Iterator[PairBlock]:
+        for block in iter_pair_blocks(pairs.left, pairs.right, start, stop, threads=readers):
+            not_read.update({(image.frame, image.camera): image for image in block.unreadable})
+            yield block
+
+    try:
+        tracking = track(
+            read_blocks,
+            tracked,
+            rig,
+            recording.disc,
+            recording.frame_rate,
+            gravity=recording.gravity,
+            settings=settings,
+            timestamps=None if stamps is None else stamps[span.start : span.stop],
+            workers=workers,
+            progress=progress,
+        )
+    except TrackingError as error:
+        refuse_unreadable(recording, list(not_read.values()), 2 * len(tracked), error)
+        raise
+    return tracking, tuple(not_read[place] for place in sorted(not_read))
 
 
 def refuse_unreadable(recording: Recording, lost: Sequence[Unreadable], n: int, error: TrackingError) -> None:
@@ -330,14 +344,13 @@ def trajectory_provenance(
 
 def rig_sha256(rig: StereoRig) -> str:
     """SHA-256 (hex) of a rig's numbers, to the last bit."""
-    digest = hashlib.sha256()
-    for camera in rig.cameras:
-        digest.update(camera.parameters.tobytes() + np.array(camera.image_size, np.int64).tobytes())
-    for part in (rig.R_right_left, rig.t_right_left, rig.R_left_world, rig.t_left_world, rig.covariance):
-        digest.update(np.ascontiguousarray(part, float).tobytes())
-    digest.update(bytes([rig.world_is_table]))
+    parts = [np.append(camera.parameters, camera.image_size) for camera in rig.cameras]
+    parts += [rig.R_right_left, rig.t_right_left, rig.R_left_world, rig.t_left_world, rig.covariance]
     if rig.lens_field is not None:
-        digest.update(np.ascontiguousarray(rig.lens_field.coefficients).tobytes())
-    for allowance in rig.allowances:
-        digest.update(f"{allowance.cause} {allowance.assumed}".encode() + allowance.shift.tobytes())
+        parts.append(rig.lens_field.coefficients)
+    parts += [allowance.shift for allowance in rig.allowances]
+    words = [rig.world_is_table, *((allowance.cause, allowance.assumed) for allowance in rig.allowances)]
+    digest = hashlib.sha256(repr(words).encode())
+    for part in parts:
+        digest.update(np.ascontiguousarray(part, float).tobytes())
     return digest.hexdigest()

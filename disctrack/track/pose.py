@@ -121,10 +121,8 @@ def fit_poses(
     without a start, is NaN. One camera alone is enough for a pose; its covariance tells how much worse it is.
     """
     n = len(markers_px)
-    seen, used = (
-        np.asarray(np.isfinite(markers_px).all(-1)),
-        _known(markers_px, markers_covariance_px2, R_start, t_start),
-    )
+    seen = np.asarray(np.isfinite(markers_px).all(-1))
+    used = _known(markers_px, markers_covariance_px2, R_start, t_start)
     observed = np.where(seen[..., None], markers_px, 0.0)
     covariance = np.ascontiguousarray(markers_covariance_px2, float)
     R, t = np.array(R_start, float, order="C"), np.array(t_start, float, order="C")

@@ -113,8 +113,7 @@ _SETTLED_PX = 0.2
 _CLIP_SIGMA = 5.0
 # Semi-minor axis in blurs, or in pixels: below, the two long edges melt into one another and what one edge looks like
 # errs by more than the centre's sigma; the whole blurred ellipse is the template then, 10 to 20 times as slow.
-_MIN_SEMI_MINOR, _MIN_SEMI_MINOR_PX = 4.5, 4.5
-_LEAST_SEMI_MINOR, _LEAST_SEMI_MINOR_PX = 1.0, 1.0  # below even that one fails: nothing but a blot is left
+_MIN_SEMI_MINOR = 4.5
 _RADIUS_PRIOR = 0.1  # relative standard deviation: a blot's size, darkness and blur cannot be told apart
 _NODES = 64  # at most, over the length of an ellipse
 # [rad] farther from the expected attitude a pair is looked at once more: 3e-3 move centres by 4e-4 to 1e-3 px, in every
@@ -630,9 +629,10 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, neighbours, pixel
         largest = math.sqrt(0.5 * (norm2 + math.sqrt(max(norm2 * norm2 - 4 * det * det, 0.0))))
         if not abs(det) > 1e-9 * norm2:
             return BLURRED
-        if radius / largest < max(_LEAST_SEMI_MINOR * p[SIGMA], _LEAST_SEMI_MINOR_PX):
+        blur = max(p[SIGMA], 1.0)
+        if radius / largest < blur:  # even that template fails: nothing but a blot is left
             return BLURRED
-        blurred = radius / largest < max(_MIN_SEMI_MINOR * p[SIGMA], _MIN_SEMI_MINOR_PX)
+        blurred = radius / largest < _MIN_SEMI_MINOR * blur
         band = 3.0 * p[SIGMA] + 1.0
         extent_x = radius * math.hypot(G[0, 1], G[1, 1]) / abs(det) + band
         extent_y = radius * math.hypot(G[0, 0], G[1, 0]) / abs(det) + band
@@ -683,8 +683,7 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, neighbours, pixel
                 break
             moved_u = start[3] + (G[1, 1] * p[A] - G[0, 1] * p[B]) / det - u0
             moved_v = start[4] + (G[0, 0] * p[B] - G[1, 0] * p[A]) / det - v0
-            u0 += moved_u
-            v0 += moved_v
+            u0, v0 = u0 + moved_u, v0 + moved_v
             settled = math.hypot(moved_u, moved_v) < _SETTLED_PX
             if not blurred and radius / largest < _MIN_SEMI_MINOR * p[SIGMA]:
                 settled = False  # more blurred than expected: once more, by the other template

@@ -138,8 +138,7 @@ def measure_noise(
     """Photon transfer from the dots themselves: variance against mean in the flat parts inside and beside each dot.
 
     In each flat part a plane is fitted and the mean square about it taken, so light gradients do not count as noise;
-    the law read + gain * I is fitted to (mean, variance) of all parts, weighted by their degrees of freedom. Parts
-    struck by a hot pixel or a print fault are dropped (beyond 4 median absolute deviations of their class).
+    parts struck by a hot pixel or a print fault are dropped (beyond 4 median absolute deviations of their class).
     """
     means, variances, weights = [], [], []
     radius = 0.5 * disc.marker_diameter
@@ -164,8 +163,11 @@ def measure_noise(
                 weights.append(len(v) - 3)
     if len(means) < 4:
         return typical_noise(images[0])
-    step = float(level_step(images[0]))
-    mean, variance, weight = np.array(means), np.array(variances), np.array(weights)
+    return photon_transfer(np.array(means), np.array(variances), np.array(weights), float(level_step(images[0])))
+
+
+def photon_transfer(mean: Array, variance: Array, freedom: Array, step: float) -> NoiseModel:
+    """The law read + gain * I of variances (k,) with so many degrees of freedom at mean grey values (k,)."""
     bright = mean > 0.5 * (mean.min() + mean.max())
     keep = np.ones(len(mean), bool)
     for group in (bright, ~bright):
@@ -175,10 +177,10 @@ def measure_noise(
             keep[group] = np.abs(variance[group] - middle) < 4 * spread
     A = np.column_stack([np.ones(keep.sum()), mean[keep]])
     # a variance with f degrees of freedom scatters by sqrt(2 / f) of itself
-    w = np.sqrt(weight[keep] / 2) / np.maximum(variance[keep], 1e-3 * step**2)
+    w = np.sqrt(freedom[keep] / 2) / np.maximum(variance[keep], 1e-3 * step**2)
     read, gain = np.linalg.lstsq(A * w[:, None], variance[keep] * w, rcond=None)[0]
     if gain < 0:  # noise that does not grow with light: a constant says all
-        return NoiseModel(float(np.average(variance[keep], weights=weight[keep])), 0.0, step)
+        return NoiseModel(float(np.average(variance[keep], weights=freedom[keep])), 0.0, step)
     # a negative intercept is a clipped black level: keep the law above it, `variance` holds the floor
     return NoiseModel(float(read), float(gain), step)
 

@@ -19,6 +19,7 @@ from calibration.kit.grey_levels import level_step
 from disctrack.errors import RecordingError
 from disctrack.recording.readers.base import FrameReader
 from disctrack.recording.readers.blocks import default_threads
+from disctrack.track.dots.template import photon_transfer
 
 Pair = tuple[NDArray, NDArray]
 
@@ -29,7 +30,6 @@ MIN_SAVED = 0.1  # [s] of rest at an end that are worth leaving out
 THRESHOLD = 5.0  # sigmas; of 65 000 pixels 0.04 exceed it by chance
 MIN_PIXELS = 12  # of a quarter of the image's pixels: fewer are hot pixels or an insect
 VIBRATION_PX = 0.03  # a fan's trembling; motion shows from THRESHOLD times this on, summed since rest
-MIN_SIGMA = 0.3  # steps of the grey value: rounding, where the sensor's noise is below it
 NOISE_BINS = 16
 
 
@@ -80,12 +80,9 @@ def _noise(mean: Array32, difference: Array32, steep: Array32) -> Array32:
     flat = steep <= np.quantile(steep, 0.6)
     grey, change = mean[flat], difference[flat]
     alike = np.array_split(np.argsort(grey), NOISE_BINS)
-    levels = [float(grey[some].mean()) for some in alike]
-    variances = [robust_sigma(change[some]) ** 2 for some in alike]
-    gain, read = np.polyfit(levels, variances, 1) if np.ptp(levels) > 1.0 else (-1.0, 0.0)
-    if gain < 0:
-        gain, read = 0.0, float(np.mean(variances))
-    return np.maximum(read + gain * mean, MIN_SIGMA**2).astype(np.float32)
+    levels = np.array([grey[part].mean() for part in alike])
+    variances = np.array([robust_sigma(change[part]) ** 2 for part in alike])
+    return photon_transfer(levels, variances, np.ones(NOISE_BINS), 1.0).variance(mean).astype(np.float32)
 
 
 def find_motion(

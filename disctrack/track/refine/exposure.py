@@ -36,8 +36,7 @@ from disctrack.track.pose import marker_pixels
 from disctrack.track.side_by_side import AT_ONCE, MIN_FRAMES, SHARED_FRAMES, evenly
 
 BORROWED_FROM = 2  # frames: beside a gap, the acceleration of a neighbour up to this far away is used
-PARTS = 10  # stretches of the recording: what the fit leaves has a memory, its sum over a stretch scatters as it does
-LEAST_PARTS = 4.0  # that the motion is spread over: (sum w)^2 / sum w^2 of what each tells
+PARTS = 10  # stretches of the recording, each left out in turn: what the fit leaves has a memory
 EDGE = 16  # directions about a dot
 OUTLYING = 4.0  # robust sigmas
 ALIKE = 1e-6  # of the largest: columns of the fit that differ by less from a sum of others are not told apart
@@ -93,8 +92,8 @@ def exposure_by_smear(R: Array, t: Array, time: Array, blur_px: Array, rig: Ster
 
     The squared blur is fitted by a constant of every dot, what changes with the distance (to second order), with the
     place in the image and with how obliquely a dot is seen (to first: blurs of curved edges are off by some 1e-4 px,
-    which would hide a twentieth of 200 us), and T^2 times the smear of one second's exposure. Sigmas are those of sums
-    over stretches of the recording (sandwich), as what a lens adds is not white.
+    which would hide a twentieth of 200 us), and T^2 times the smear of one second's exposure. Sigmas are those of the
+    jackknife over stretches of the recording, as what a lens adds is not white.
     """
     chosen = evenly(np.arange(len(t)), SHARED_FRAMES)
     rows = np.unique(np.clip(chosen[:, None] + np.arange(-1, 2), 0, len(t) - 1))  # with their neighbours
@@ -235,23 +234,21 @@ def _slope(y: Array, x: Array, others: list[Array]) -> tuple[float, float]:
     scale[scale == 0.0] = 1.0
     for _ in range(4):
         told = use.copy()
-        A = design[told] / scale
-        products = A.T @ np.column_stack([A, y[told]])
-        inverse = np.linalg.pinv(products[:, :-1], rcond=ALIKE**2, hermitian=True)
-        solution = inverse @ products[:, -1]
+        rows = np.column_stack([design[told] / scale, y[told]])
+        solution = _solved(rows.T @ rows)
         residual = y - design / scale @ solution
-        size = 1.4826 * np.median(np.abs(residual[use]))
-        use &= np.abs(residual) <= OUTLYING * size
-    part = np.repeat(np.arange(n) * PARTS // n, m)
-    others_alone = np.linalg.pinv(products[:-1, :-2], rcond=ALIKE**2, hermitian=True)
-    own = A[:, -1] - A[:, :-1] @ (others_alone @ products[:-1, -2])
-    told_by = np.bincount(part[told], own**2, minlength=PARTS)
-    if not told_by.sum() ** 2 > LEAST_PARTS * np.sum(told_by**2):  # a sum over one or two stretches has no scatter
-        return np.nan, np.inf
-    score = design[use] / scale * residual[use, None]
-    sums = np.stack([score[part[use] == k].sum(axis=0) for k in range(PARTS)])
-    variance = (inverse @ (sums.T @ sums) @ inverse)[-1, -1]
-    return float(solution[-1] / scale[-1]), float(np.sqrt(variance) / scale[-1])
+        use &= np.abs(residual) <= OUTLYING * 1.4826 * np.median(np.abs(residual[use]))
+    part = np.repeat(np.arange(n) * PARTS // n, m)[told]
+    # without each of the parts: where one alone tells, the others do not agree with it
+    others = [rows[part != k] for k in range(PARTS)]
+    without = np.array([_solved(rows.T @ rows)[-1] for rows in others])
+    sigma = np.sqrt((PARTS - 1) * np.var(without))
+    return float(solution[-1] / scale[-1]), float(sigma / scale[-1])
+
+
+def _solved(products: Array) -> Array:
+    """Least squares from the products of the columns, of which the last is the right-hand side."""
+    return np.asarray(np.linalg.pinv(products[:-1, :-1], rcond=ALIKE**2, hermitian=True) @ products[:-1, -1])
 
 
 def _standardised(x: Array) -> Array:

@@ -148,7 +148,7 @@ def test_disc_in_the_air_tells_of_no_table(leaning):
 
 def test_few_frames_or_a_flat_disc_tell_of_no_table(leaning):
     fits, none = poses_of(leaning)
-    lost = replace(fits, converged=np.arange(len(leaning)) < 20)
+    lost = replace(fits, converged=np.arange(len(leaning)) < 19)
     assert table_from_disc(lost, none, leaning.rig, leaning.disc)[3] is None
     assert table_from_disc(fits, none, replace(leaning.rig, world_is_table=False), leaning.disc)[3] is None
 
