@@ -12,6 +12,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+from scipy.interpolate import RegularGridInterpolator
 
 from calibration.kit.arrays import Array
 from disctrack.track.dots.template import TYPICAL_BLUR_PX, NoiseModel
@@ -46,16 +47,18 @@ def pulls_by_contrast(radius: float, affine: Array, edge: Edge) -> Array:
 
 
 def _tabulated(radius: float, affine: Array, edge: Edge, changes: Changes) -> Array:
-    """What `_response` tells of dots of this size, interpolated."""
+    """What `_response` tells of dots of this size, linear in that and in the logarithm of their shape."""
     long, short = half_axes(affine)
     size, shape = radius * np.sqrt(long * short), short / long
     known = np.isfinite(size)
     if not known.any():
         return np.full((*size.shape, 1), np.nan)
     sizes = np.linspace(size[known].min(), size[known].max() * (1 + 1e-9), SIZES)
-    table = _response(sizes, edge, changes)
-    T = _between(table, sizes, np.where(known, size, sizes[0]), np.where(known, shape, 1.0))
-    return np.where(known[..., None], T, np.nan)
+    table = RegularGridInterpolator(
+        (sizes, np.log(SHAPES)), _response(sizes, edge, changes), bounds_error=False, fill_value=None
+    )
+    size, shape = np.where(known, size, sizes[0]), np.clip(np.where(known, shape, 1.0), SHAPES[0], SHAPES[-1])
+    return np.where(known[..., None], table(np.stack([size, np.log(shape)], axis=-1)), np.nan)
 
 
 def turned_to_axes(affine: Array) -> Array:
@@ -136,17 +139,6 @@ def _edge_smeared(band: _Band, axis: int) -> Array:
         at, squared = 2 * (vt * dgn + gt * dvn) - 2 * bend * vt * gt, 2 * vn * gn
         changes.append(band.first * at[..., None] + band.second * squared[..., None])
     return np.stack(changes)
-
-
-def _between(table: Array, sizes: Array, size: Array, shape: Array) -> Array:
-    """The table (sizes, SHAPES, k) at dots of any number: linear in the size and in the logarithm of the shape."""
-    width = max(sizes[-1] - sizes[0], 1e-9 * sizes[0])
-    x = np.clip((size - sizes[0]) / width, 0.0, 1.0) * (len(sizes) - 1)
-    y = np.clip(np.log(shape / SHAPES[0]) / np.log(SHAPES[-1] / SHAPES[0]), 0.0, 1.0) * (len(SHAPES) - 1)
-    i, j = np.minimum(x.astype(int), len(sizes) - 2), np.minimum(y.astype(int), len(SHAPES) - 2)
-    x, y = (x - i)[..., None], (y - j)[..., None]
-    low, high = ((1 - y) * table[k, j] + y * table[k, j + 1] for k in (i, i + 1))
-    return np.asarray((1 - x) * low + x * high)
 
 
 def _second_moments(affine: Array) -> tuple[Array, Array, Array]:

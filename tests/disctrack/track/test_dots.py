@@ -43,9 +43,13 @@ def locate_all(pairs, images, noise, rng=None, turned=0.0, moved=0.0, disc=None,
     return centres, covariance, found
 
 
+def some(pairs, index):
+    """Those pairs of the recording."""
+    return replace(pairs, images=pairs.images[index], q=pairs.q[index], R=pairs.R[index])
+
+
 def test_centres_have_no_bias_where_there_is_no_noise(rendered_pairs):
-    some = slice(0, 24, 3)
-    pairs = replace(rendered_pairs, q=rendered_pairs.q[some], R=rendered_pairs.R[some])
+    pairs = some(rendered_pairs, slice(0, 24, 3))
     images = (256 * expected_disc(pairs.q, pairs.rig, pairs.disc, pairs.scene)).astype(np.uint16)
     centres, _, _ = locate_all(pairs, images, NoiseModel(0.64 * 256**2, 0.02 * 256))
     error = centres - pairs.true_pixels
@@ -127,12 +131,10 @@ def test_scatter_equals_the_predicted_covariance(rendered_pairs, rng):
 
 def test_a_dot_of_another_size_moves_no_centre(rendered_pairs, rng):
     """Printed 3 % too large, or bloomed: the radius is free and does not couple with the centre."""
-    index = [10, 16]
-    pairs = replace(rendered_pairs, q=rendered_pairs.q[index], R=rendered_pairs.R[index])
-    images = rendered_pairs.images[index]
-    declared, _, _ = locate_all(pairs, images, SENSOR_NOISE)
+    pairs = some(rendered_pairs, [10, 16])
+    declared, _, _ = locate_all(pairs, pairs.images, SENSOR_NOISE)
     wrong_size = replace(pairs.disc, marker_diameter=1.03 * pairs.disc.marker_diameter)
-    found, _, dots = locate_all(pairs, images, SENSOR_NOISE, disc=wrong_size)
+    found, _, dots = locate_all(pairs, pairs.images, SENSOR_NOISE, disc=wrong_size)
     # a third of a sigma: the band of pixels starts 0.4 px farther out, so other noise enters
     assert np.sqrt(np.nanmean((found - declared) ** 2)) < 1.3e-3
     radii = np.concatenate([d.radius for d in dots])
@@ -142,9 +144,8 @@ def test_a_dot_of_another_size_moves_no_centre(rendered_pairs, rng):
 
 @pytest.mark.parametrize("grey_scale", [1, 16])
 def test_light_dots_on_dark_are_found_as_well_as_dark_on_light(rendered_pairs, grey_scale):
-    index = [12]
-    pairs = replace(rendered_pairs, q=rendered_pairs.q[index], R=rendered_pairs.R[index])
-    image = rendered_pairs.images[index].astype(np.uint16) * grey_scale
+    pairs = some(rendered_pairs, [12])
+    image = pairs.images.astype(np.uint16) * grey_scale
     negative = (220 * grey_scale - image).astype(np.uint16)
     noise = NoiseModel(2.0 * grey_scale**2, 0.0)
     for picture in (image, negative):
@@ -157,16 +158,15 @@ def test_light_dots_on_dark_are_found_as_well_as_dark_on_light(rendered_pairs, g
 
 
 def test_uneven_light_and_hot_pixels_move_no_centre(rendered_pairs, rng):
-    index = [8]
-    pairs = replace(rendered_pairs, q=rendered_pairs.q[index], R=rendered_pairs.R[index])
-    clean, _, _ = locate_all(pairs, rendered_pairs.images[index], SENSOR_NOISE)
+    pairs = some(rendered_pairs, [8])
+    clean, _, _ = locate_all(pairs, pairs.images, SENSOR_NOISE)
     y, x = np.mgrid[:512, :512]
     shade = 1.0 - 0.4 * x / 512 - 0.2 * y / 512  # 40 % darker at the right: 1.5 % across a dot
-    dim = np.round(rendered_pairs.images[index] * shade).astype(np.uint8)
+    dim = np.round(pairs.images * shade).astype(np.uint8)
     shaded, covariance, _ = locate_all(pairs, dim, SENSOR_NOISE)
     sigma = np.sqrt(covariance[..., 0, 0])
     assert np.nanmax(np.abs(shaded - clean) / sigma[..., None]) < 3
-    hot = rendered_pairs.images[index].copy()
+    hot = pairs.images.copy()
     for camera in (0, 1):  # one hot pixel on the edge of every dot
         for centre in pairs.true_pixels[0, camera]:
             u, v = np.round(centre).astype(int)
@@ -177,8 +177,8 @@ def test_uneven_light_and_hot_pixels_move_no_centre(rendered_pairs, rng):
 
 
 def test_a_half_hidden_dot_is_refused(rendered_pairs):
-    pairs = replace(rendered_pairs, q=rendered_pairs.q[[9]], R=rendered_pairs.R[[9]])
-    image = rendered_pairs.images[[9]].copy()
+    pairs = some(rendered_pairs, [9])
+    image = pairs.images.copy()
     u, v = np.round(pairs.true_pixels[0, 0, 2]).astype(int)
     image[0, 0, v - 30 : v + 30, u + 3 : u + 30] = 118  # a grey rod across the dot
     _, _, found = locate_all(pairs, image, SENSOR_NOISE)
@@ -188,11 +188,10 @@ def test_a_half_hidden_dot_is_refused(rendered_pairs):
 
 
 def test_a_missing_dot_and_a_dot_at_the_border_are_refused(rendered_pairs, rng):
-    q = rendered_pairs.q[[5]]
+    pairs = some(rendered_pairs, [5])
     visible = np.ones((1, 2, 6), bool)
     visible[0, :, 4] = False
-    image = render_disc(q, rendered_pairs.rig, rendered_pairs.disc, rendered_pairs.scene, rng, visible=visible)
-    pairs = replace(rendered_pairs, q=q, R=rendered_pairs.R[[5]])
+    image = render_disc(pairs.q, pairs.rig, pairs.disc, pairs.scene, rng, visible=visible)
     _, _, found = locate_all(pairs, image, SENSOR_NOISE)
     assert found[0].status[4] == MarkerStatus.LOW_CONTRAST
     u = int(pairs.true_pixels[0, 0, 0, 0])

@@ -35,6 +35,12 @@ def blocks_of(images, readable=None, size=16):
     return read
 
 
+def tracked(images, pairs, *, readable=None, size=16, rig=None, disc=None, **options):
+    """The images of the scene of these pairs tracked."""
+    read = blocks_of(images, readable, size)
+    return track(read, range(len(images)), rig or pairs.rig, disc or pairs.disc, 1000.0, **options)
+
+
 @pytest.fixture(scope="module")
 def rolling(rendered_pairs):
     """Images of a disc that rolls with a moderate nutation, and its poses."""
@@ -57,7 +63,7 @@ def errors(trajectory, q):
 
 def test_a_rolling_disc_is_measured_to_the_predicted_sigma(rolling, rendered_pairs):
     images, q = rolling
-    result = track(blocks_of(images), range(N), rendered_pairs.rig, rendered_pairs.disc, 1000.0)
+    result = tracked(images, rendered_pairs)
     trajectory = result.trajectory
     assert (trajectory.frame_status == FrameStatus.MEASURED).all()
     assert (trajectory.marker_status == MarkerStatus.MEASURED).all()
@@ -78,12 +84,9 @@ def test_a_rolling_disc_is_measured_to_the_predicted_sigma(rolling, rendered_pai
 
 def test_the_number_of_workers_changes_no_bit_of_the_result(rolling, rendered_pairs, monkeypatch):
     images, _ = rolling
-    whole = track(blocks_of(images), range(N), rendered_pairs.rig, rendered_pairs.disc, 1000.0)
+    whole = tracked(images, rendered_pairs)
     monkeypatch.setattr("disctrack.track.follow.tracking.SHORTEST_SPLIT", 20)
-    one, two = (
-        track(blocks_of(images, size=15), range(N), rendered_pairs.rig, rendered_pairs.disc, 1000.0, workers=workers)
-        for workers in (1, 2)
-    )
+    one, two = (tracked(images, rendered_pairs, size=15, workers=workers) for workers in (1, 2))
     assert two.acquisitions == one.acquisitions == 2
     assert (one.law, one.scatter) == (two.law, two.scatter)
     for name in ("q", "pose_covariance", "calibration_sensitivity", "markers_px", "marker_status", "quaternion"):
@@ -102,10 +105,7 @@ def test_stretches_without_a_disc_change_nothing_whoever_gets_there_first(rollin
     monkeypatch.setattr("disctrack.track.follow.tracking.SHORTEST_SPLIT", 4)
     images = rolling[0].copy()
     images[:20] = 85  # no disc in the first of four stretches of 15 pairs, nor at the start of the second
-    runs = [
-        track(blocks_of(images, size=15), range(N), rendered_pairs.rig, rendered_pairs.disc, 1000.0, workers=workers)
-        for workers in (1, 3, 4)
-    ]
+    runs = [tracked(images, rendered_pairs, size=15, workers=workers) for workers in (1, 3, 4)]
     for run in runs[1:]:
         assert run.law == runs[0].law
         assert np.array_equal(run.trajectory.q, runs[0].trajectory.q, equal_nan=True)
@@ -118,7 +118,7 @@ def test_a_stretch_that_begins_on_another_branch_of_phi_is_followed_again(rollin
     from disctrack.track.follow import following, tracking
 
     images, _ = rolling
-    whole = track(blocks_of(images), range(N), rendered_pairs.rig, rendered_pairs.disc, 1000.0)
+    whole = tracked(images, rendered_pairs)
     monkeypatch.setattr("disctrack.track.follow.tracking.SHORTEST_SPLIT", 20)
     found, third = following.acquire, np.array([[-0.5, -np.sqrt(0.75), 0], [np.sqrt(0.75), -0.5, 0], [0, 0, 1.0]])
     starts = {images[k, 0].tobytes() for k in (30, 31)}
@@ -134,7 +134,7 @@ def test_a_stretch_that_begins_on_another_branch_of_phi_is_followed_again(rollin
     disc = replace(rendered_pairs.disc, marker_centres_body=declared[even])
     monkeypatch.setattr(following, "acquire", mistaken)
     monkeypatch.setattr(tracking, "symmetry_order", lambda disc: 1)
-    torn = track(blocks_of(images), range(N), rendered_pairs.rig, disc, 1000.0, workers=2)
+    torn = tracked(images, rendered_pairs, disc=disc, workers=2)
     turn = np.abs(np.diff(torn.trajectory.q[:, 5]))
     assert turn.max() < 0.5 < 2 * np.pi / 3
     assert len(whole.trajectory) == len(torn.trajectory)
@@ -150,7 +150,7 @@ def test_an_empty_scene_is_seldom_searched_and_a_disc_put_there_is_found_at_once
     rng = np.random.default_rng(4)
     images = rolling[0].copy()
     images[:30] = np.clip(np.round(85 + 1.3 * rng.standard_normal((30, *images.shape[1:]))), 0, 255)
-    result = track(blocks_of(images), range(N), rendered_pairs.rig, rendered_pairs.disc, 1000.0)
+    result = tracked(images, rendered_pairs)
     assert (result.trajectory.frame_status[:30] == FrameStatus.MARKERS_NOT_FOUND).all()
     assert (result.trajectory.frame_status[30:] == FrameStatus.MEASURED).all()
     assert len(searched) <= 6  # at growing intervals, and two where the disc is found
@@ -163,7 +163,7 @@ def test_lost_and_unreadable_pairs_are_gaps_with_a_reason_and_the_rest_is_measur
     images[10:13] = 85  # something hides the disc
     readable[20] = False, False
     readable[30] = True, False
-    result = track(blocks_of(images, readable), range(N), rendered_pairs.rig, rendered_pairs.disc, 1000.0)
+    result = tracked(images, rendered_pairs, readable=readable)
     status = result.trajectory.frame_status
     assert (status[10:13] == FrameStatus.MARKERS_NOT_FOUND).all()
     assert status[20] == FrameStatus.UNREADABLE
@@ -184,7 +184,7 @@ def test_a_hidden_dot_costs_sigma_not_truth(rolling, rendered_pairs):
     for i in range(10, 20):
         u, v = np.round(truth[i, 0, 1]).astype(int)
         images[i, 0, v - 18 : v + 18, u - 6 : u + 25] = 120
-    result = track(blocks_of(images), range(30), rendered_pairs.rig, rendered_pairs.disc, 1000.0)
+    result = tracked(images, rendered_pairs)
     assert np.isnan(result.trajectory.markers_px[10:20, 0, 1]).all()
     sigma = np.sqrt(np.diagonal(result.trajectory.pose_covariance, axis1=1, axis2=2))
     assert (np.abs(errors(result.trajectory, q[:30])) < 6 * sigma).all()
@@ -195,21 +195,19 @@ def test_misprinted_dots_are_found_and_used(rolling, rendered_pairs):
     declared = rendered_pairs.disc.marker_centres_body.copy()
     declared[2, 0] += 60e-6  # the declaration is wrong by what a printer does
     wrong = replace(rendered_pairs.disc, marker_centres_body=declared)
-    found = track(blocks_of(images), range(N), rendered_pairs.rig, wrong, 1000.0)
+    found = tracked(images, rendered_pairs, disc=wrong)
     shift = found.as_built.marker_shift
     relative = shift[2] - np.delete(shift, 2, axis=0).mean(axis=0)
     # the mean displacement and turn of the pattern are gauge: the other five move to balance
     assert -75e-6 < relative[0] < -45e-6
     assert found.scatter.whole < 1.2
-    kept = track(
-        blocks_of(images), range(N), rendered_pairs.rig, wrong, 1000.0, settings=TrackingSettings(refine_markers=False)
-    )
+    kept = tracked(images, rendered_pairs, disc=wrong, settings=TrackingSettings(refine_markers=False))
     assert kept.scatter.whole > 20  # the fault is loud when it is not refined
 
 
 def test_good_dots_are_left_where_they_are_declared(rolling, rendered_pairs):
     images, _ = rolling
-    result = track(blocks_of(images), range(N), rendered_pairs.rig, rendered_pairs.disc, 1000.0)
+    result = tracked(images, rendered_pairs)
     assert (result.as_built.marker_shift == 0).all()
     assert np.array_equal(result.trajectory.disc.marker_centres_body, rendered_pairs.disc.marker_centres_body)
 
@@ -217,19 +215,19 @@ def test_good_dots_are_left_where_they_are_declared(rolling, rendered_pairs):
 def test_images_of_another_size_are_refused(rolling, rendered_pairs):
     images, _ = rolling
     with pytest.raises(TrackingError, match=r"480 x 512 px, but the rig's left camera was calibrated at 512 x 512"):
-        track(blocks_of(images[:3, :, :, :480]), range(3), rendered_pairs.rig, rendered_pairs.disc, 1000.0)
+        tracked(images[:3, :, :, :480], rendered_pairs)
 
 
 def test_a_recording_without_the_disc_is_an_error_that_says_what_was_seen(rendered_pairs):
     table = np.full((3, 2, 512, 512), 85, np.uint8)
     with pytest.raises(TrackingError, match=r"none of the pairs 0-2.*0 in the left and 0 in the right"):
-        track(blocks_of(table), range(3), rendered_pairs.rig, rendered_pairs.disc, 1000.0)
+        tracked(table, rendered_pairs)
 
 
 def test_a_symmetric_layout_is_announced(rolling, rendered_pairs):
     images, _ = rolling
     four = replace(rendered_pairs.disc, marker_centres_body=rendered_pairs.disc.marker_centres_body[[0, 1, 3, 4]])
-    result = track(blocks_of(images[:12]), range(12), rendered_pairs.rig, four, 1000.0)
+    result = tracked(images[:12], rendered_pairs, disc=four)
     assert any("repeats every 180 deg" in f.text for f in result.findings)
 
 
@@ -238,17 +236,17 @@ def test_dots_that_carry_no_pose_are_refused(rendered_pairs, keep):
     centres = np.concatenate([rendered_pairs.disc.marker_centres_body, [[0.0, 0.0, 0.003]]])
     poor = replace(rendered_pairs.disc, marker_centres_body=centres[keep])
     with pytest.raises(TrackingError, match="at least three dots that are not on one line"):
-        track(blocks_of(np.zeros((2, 2, 512, 512), np.uint8)), range(2), rendered_pairs.rig, poor, 1000.0)
+        tracked(np.zeros((2, 2, 512, 512), np.uint8), rendered_pairs, disc=poor)
 
 
 def test_a_table_that_is_not_where_the_rig_says_is_announced(rolling, rendered_pairs):
     images, _ = rolling
-    good = track(blocks_of(images[:12]), range(12), rendered_pairs.rig, rendered_pairs.disc, 1000.0)
+    good = tracked(images[:12], rendered_pairs)
     assert not any("from the table" in f.text for f in good.findings)
-    thicker = replace(
-        rendered_pairs.rig, t_left_world=rendered_pairs.rig.t_left_world + 1e-4 * rendered_pairs.rig.R_left_world[:, 2]
+    rig = rendered_pairs.rig
+    off = tracked(
+        images[:12], rendered_pairs, rig=replace(rig, t_left_world=rig.t_left_world + 1e-4 * rig.R_left_world[:, 2])
     )
-    off = track(blocks_of(images[:12]), range(12), thicker, rendered_pairs.disc, 1000.0)
     assert any("-100 um from the table" in f.text for f in off.findings)
 
 
@@ -260,8 +258,7 @@ def test_a_sensor_without_noise_is_not_refused_for_the_templates_own_misfit(rend
         np.uint16
     )
     apart = np.array([[True, True], [False, False]] * 2 + [[True, True]])  # three poses that are not of one motion
-    pairs = blocks_of(images[[0, 0, 1, 1, 2]], apart)
-    result = track(pairs, range(5), rendered_pairs.rig, rendered_pairs.disc, 1000.0)
+    result = tracked(images[[0, 0, 1, 1, 2]], rendered_pairs, readable=apart)
     assert (result.trajectory.marker_status[::2] == MarkerStatus.MEASURED).all()
     assert np.abs(result.trajectory.q[::2, :3] - q[:, :3]).max() < 0.3e-6
 
@@ -289,12 +286,9 @@ def test_behind_a_colour_filter_the_disc_is_measured_as_without(rolling, rendere
     filtered[..., 1::2, 1::2] *= 0.55
     filtered = np.rint(filtered).astype(np.uint8)
 
-    def read(start, stop):  # a fresh copy, as from files: blocks may be worked on
-        return blocks_of(filtered.copy())(start, stop)
-
-    result = track(read, range(N), rendered_pairs.rig, rendered_pairs.disc, 1000.0)
+    result = tracked(filtered, rendered_pairs)
     assert sum("a colour filter lies on the sensor" in f.text for f in result.findings) == 2
-    plain = track(blocks_of(images), range(N), rendered_pairs.rig, rendered_pairs.disc, 1000.0)
+    plain = tracked(images, rendered_pairs)
     assert not any("colour filter" in f.text for f in plain.findings)
     rms = [np.sqrt(np.mean(errors(t.trajectory, q) ** 2, axis=0)) for t in (plain, result)]
     # rounding to grey values that are 0.55 and 0.75 as large adds 1/12 of their square to the noise
@@ -309,11 +303,10 @@ def test_edges_that_compression_spoils_cost_accuracy_and_no_camera(rolling, rend
         return cv2.imdecode(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1], cv2.IMREAD_GRAYSCALE)
 
     lossy = np.array([[compressed(image, 95 if i < 3 else 10) for image in pair] for i, pair in enumerate(images)])
-    trajectory = track(blocks_of(lossy), range(N), rendered_pairs.rig, rendered_pairs.disc, 1000.0).trajectory
+    trajectory = tracked(lossy, rendered_pairs).trajectory
     assert (trajectory.frame_status == FrameStatus.MEASURED).mean() > 0.95
     error = errors(trajectory, q)
-    assert (
-        np.sqrt(np.mean(error[:, :3] ** 2)) < 12e-6
-    )  # grey values are off by 4 of 165 at edges, noise 1: 4 times 3 um
+    # grey values are off by 4 of 165 at edges, noise 1: 4 times 3 um
+    assert np.sqrt(np.mean(error[:, :3] ** 2)) < 12e-6
     stated = np.einsum("nii->ni", trajectory.pose_covariance)
     assert 0.3 < np.nanmean(error**2 / stated) < 3.0
