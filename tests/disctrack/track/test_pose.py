@@ -29,6 +29,12 @@ def centres():
     return MA_2014.marker_centres_body
 
 
+def filmed(rng, n, rig, centres, sigma=SIGMA_PX):
+    """n poses, and the dots as seen in them."""
+    _, R, t = poses(rng, n)
+    return R, t, *noisy_markers(R, t, rig, centres, rng, sigma)
+
+
 def noisy_markers(R, t, rig, centres, rng, sigma=SIGMA_PX):
     pixels, _ = marker_pixels(R, t, rig, centres)
     covariance = np.broadcast_to(sigma**2 * np.eye(2), (*pixels.shape, 2)).copy()
@@ -61,8 +67,7 @@ def test_jacobian_agrees_with_central_differences(rng, rig, centres):
 
 
 def test_pose_scatter_equals_the_predicted_covariance(rng, rig, centres):
-    _, R, t = poses(rng, 500)
-    markers, covariance = noisy_markers(R, t, rig, centres, rng)
+    R, t, markers, covariance = filmed(rng, 500, rig, centres)
     fits = fit_poses(markers, covariance, rig, centres, *near(R, t, rng), with_sensitivity=False)
     assert fits.converged.all()
     error = pose_error(fits, R, t)
@@ -73,8 +78,7 @@ def test_pose_scatter_equals_the_predicted_covariance(rng, rig, centres):
 
 
 def test_minimum_is_that_of_scipy(rng, rig, centres):
-    _, R, t = poses(rng, 4)
-    markers, covariance = noisy_markers(R, t, rig, centres, rng)
+    R, t, markers, covariance = filmed(rng, 4, rig, centres)
     A = SIGMA_PX * rng.normal(size=covariance.shape)  # each dot has ellipses of its own, one is not seen
     covariance += A @ np.swapaxes(A, -1, -2)
     markers[:, 0, 2] = np.nan
@@ -108,8 +112,7 @@ def test_a_flat_disc_is_as_well_conditioned_as_any(rng, rig, centres):
 
 
 def test_one_camera_still_gives_a_pose_with_a_larger_sigma(rng, rig, centres):
-    _, R, t = poses(rng, 60)
-    markers, covariance = noisy_markers(R, t, rig, centres, rng)
+    R, t, markers, covariance = filmed(rng, 60, rig, centres)
     both = fit_poses(markers, covariance, rig, centres, R, t)
     markers[:, 1] = np.nan
     one = fit_poses(markers, covariance, rig, centres, R, t)
@@ -121,8 +124,7 @@ def test_one_camera_still_gives_a_pose_with_a_larger_sigma(rng, rig, centres):
 
 
 def test_three_dot_images_are_the_least_and_two_give_nothing(rng, rig, centres):
-    _, R, t = poses(rng, 2)
-    markers, covariance = noisy_markers(R, t, rig, centres, rng, 1e-4)
+    R, t, markers, covariance = filmed(rng, 2, rig, centres, 1e-4)
     markers[0, 1], markers[0, 0, 3:] = np.nan, np.nan
     markers[1, 1], markers[1, 0, 2:] = np.nan, np.nan
     fits = fit_poses(markers, covariance, rig, centres, R, t)
@@ -133,8 +135,7 @@ def test_three_dot_images_are_the_least_and_two_give_nothing(rng, rig, centres):
 
 @pytest.mark.parametrize("wrong_px", [0.3, 40.0])
 def test_a_wrong_dot_is_struck_and_named(rng, rig, centres, wrong_px):
-    _, R, t = poses(rng, 50)
-    markers, covariance = noisy_markers(R, t, rig, centres, rng)
+    R, t, markers, covariance = filmed(rng, 50, rig, centres)
     markers[::2, 0, 2, 0] += wrong_px
     fits = fit_poses(markers, covariance, rig, centres, *near(R, t, rng))
     assert not fits.used[::2, 0, 2].any()
@@ -146,8 +147,7 @@ def test_a_wrong_dot_is_struck_and_named(rng, rig, centres, wrong_px):
 
 
 def test_sensitivity_tells_where_the_pose_goes_when_the_rig_changes(rng, rig, centres):
-    _, R, t = poses(rng, 5)
-    markers, covariance = noisy_markers(R, t, rig, centres, rng)
+    R, t, markers, covariance = filmed(rng, 5, rig, centres)
     fits = fit_poses(markers, covariance, rig, centres, R, t)
     scale = np.array(
         [1.0, 1, 1, 1, 1e-3, 1e-2, 1e-4, 1e-4, 0.1] * 2 + [1e-4] * 3 + [1e-5] * 3 + [1e-4] * 3 + [1e-5] * 3
@@ -165,8 +165,7 @@ def test_sensitivity_tells_where_the_pose_goes_when_the_rig_changes(rng, rig, ce
 
 
 def test_a_frame_without_a_start_is_nan_and_the_others_are_not(rng, rig, centres):
-    _, R, t = poses(rng, 3)
-    markers, covariance = noisy_markers(R, t, rig, centres, rng)
+    R, t, markers, covariance = filmed(rng, 3, rig, centres)
     t_start = t.copy()
     t_start[1] = np.nan
     fits = fit_poses(markers, covariance, rig, centres, R, t_start)
@@ -177,8 +176,7 @@ def test_a_frame_without_a_start_is_nan_and_the_others_are_not(rng, rig, centres
 
 def test_exchanged_cameras_are_noticed(rng, rig, centres):
     """Negative control: the residuals of a wrong assignment are nowhere near the noise."""
-    _, R, t = poses(rng, 5)
-    markers, covariance = noisy_markers(R, t, rig, centres, rng)
+    R, t, markers, covariance = filmed(rng, 5, rig, centres)
     fits = fit_poses(markers[:, ::-1], covariance, rig, centres, R, t, reject_outliers=False)
     reduced = np.where(fits.converged, fits.reduced_chi_square, np.inf)
     assert np.all(reduced > 1e3)
@@ -186,8 +184,7 @@ def test_exchanged_cameras_are_noticed(rng, rig, centres):
 
 def test_a_pose_does_not_depend_on_which_frames_are_fitted_with_it(rng, rig, centres):
     """Some with a dot that was struck, by unlike amounts, so that every round of rejection has another company."""
-    _, R, t = poses(rng, 60)
-    pixels, covariance = noisy_markers(R, t, rig, centres, rng)
+    R, t, pixels, covariance = filmed(rng, 60, rig, centres)
     struck = rng.choice(60, 25, replace=False)
     pixels[struck, rng.integers(0, 2, 25), rng.integers(0, 6, 25)] += rng.uniform(0.1, 40.0, (25, 1))
     twice = struck[:8]
