@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+from scipy.ndimage import gaussian_filter
 
 from calibration.cameras.camera import Camera
 from disctrack.disc import MA_2014
@@ -20,3 +21,18 @@ def locate_on_plane(image, image_from_plane, centres, radius, **known):
     dots = replace(MA_2014, marker_centres_body=places, marker_diameter=2.0 * radius, radius=1e6 * radius)
     R = np.column_stack([image_from_plane[:, :2], [0.0, 0.0, -1.0]])
     return locate_on_disc(image, camera, R, image_from_plane[:, 2], dots, **known)
+
+
+def covered(centres, affine, blur_px, weights=(1.0,)):
+    """(64, 64) share of each pixel that a dot covers, rays 1/6 px apart, blurred: the weighted mean over its outlines.
+
+    centres (k, 2) [px], affine (k, 2, 2) unit circle -> px
+    """
+    fine, total = 6, 0.0
+    axis = (np.arange(64 * fine) + 0.5) / fine - 0.5
+    pixels = np.stack(np.meshgrid(axis, axis), axis=-1)
+    for weight, centre, A in zip(weights, centres, affine, strict=True):
+        u = (pixels - centre) @ np.linalg.inv(A).T
+        distance = (1 - np.hypot(*np.moveaxis(u, -1, 0))) * np.sqrt(abs(np.linalg.det(A))) * fine
+        total = total + weight * np.clip(distance + 0.5, 0, 1)
+    return gaussian_filter(total, blur_px * fine).reshape(64, fine, 64, fine).mean((1, 3))

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.ndimage import gaussian_filter
 
 from disctrack import frames, measure_pairs, read_recording, rolling
 from disctrack.errors import RecordingError
@@ -18,7 +17,7 @@ from disctrack.track.pose import marker_pixels
 from disctrack.track.refine import exposure as smears
 from disctrack.track.refine.exposure import shift_by_exposure
 from disctrack.trajectory import FrameStatus
-from tests.oracles.flat_dots import locate_on_plane
+from tests.oracles.flat_dots import covered, locate_on_plane
 
 RATE, EXPOSURE = 1000.0, 1e-3  # Hz, s
 N = 40
@@ -58,19 +57,6 @@ def measured(rendered_pairs, motion):
     ]
 
 
-def _seen(centres, affine, dark, blur_px):
-    """Image (64, 64) of a dot, the mean over its outlines: centres (k, 2) [px], affine (k, 2, 2) unit circle -> px."""
-    fine, total = 6, 0.0
-    axis = (np.arange(64 * fine) + 0.5) / fine - 0.5
-    pixels = np.stack(np.meshgrid(axis, axis), axis=-1)
-    for weight, centre, A in zip(SIMPSON, centres, affine, strict=True):
-        u = (pixels - centre) @ np.linalg.inv(A).T
-        distance = (1 - np.hypot(*np.moveaxis(u, -1, 0))) * np.sqrt(abs(np.linalg.det(A))) * fine
-        total = total + weight * np.clip(distance + 0.5, 0, 1)
-    smooth = gaussian_filter(total, blur_px * fine).reshape(64, fine, 64, fine).mean((1, 3))
-    return np.round(50000 - (50000 - dark) * smooth).astype(np.uint16)
-
-
 def _against_drawn_dots(q, R, found, chosen, rig, disc, dark, noise, blur_px):
     """Shifts of the template by the smear, by dots drawn along the motion; by the mean of their path; as `found`."""
     expected, by_path, given = [], [], []
@@ -86,7 +72,8 @@ def _against_drawn_dots(q, R, found, chosen, rig, disc, dark, noise, blur_px):
             window = np.round(centres[4]) - 31
             H = np.eye(3)
             H[:2, :2], H[:2, 2] = affine[4], centres[4] - window
-            seen = [_seen(centres[k] - window, affine[k], dark, 0.6) for k in (np.arange(9), [4] * 9)]
+            cover = [covered(centres[k] - window, affine[k], 0.6, SIMPSON) for k in (np.arange(9), [4] * 9)]
+            seen = [np.round(50000 - (50000 - dark) * share).astype(np.uint16) for share in cover]
             smeared, still = (
                 locate_on_plane(image, H, np.zeros((1, 2)), 1.0, noise=noise, blur_px=blur_px).pixels[0]
                 for image in seen

@@ -3,25 +3,15 @@
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
-from scipy.ndimage import gaussian_filter
 
 from disctrack import frames, rolling
 from disctrack.track.dots.template import NoiseModel
 from disctrack.track.dots.template_response import Edge
 from disctrack.track.pose import marker_pixels
 from disctrack.track.refine.glare import shift_by_gleam
-from tests.oracles.flat_dots import locate_on_plane
+from tests.oracles.flat_dots import covered, locate_on_plane
 
 N, DARK, PAPER, NOISE = 24, 8000.0, 50000.0, NoiseModel(1e4, 8.0)
-
-
-def drawn(centre, affine):
-    """Grey values (64, 64) of a dot, an ellipse of half axes `affine` (2, 2) [px], rays 1/6 px apart, blurred."""
-    axis = (np.arange(64 * 6) + 0.5) / 6 - 0.5
-    u = (np.stack(np.meshgrid(axis, axis), axis=-1) - centre) @ np.linalg.inv(affine).T
-    distance = (1 - np.hypot(*np.moveaxis(u, -1, 0))) * np.sqrt(abs(np.linalg.det(affine))) * 6
-    cover = gaussian_filter(np.clip(distance + 0.5, 0, 1), 0.6 * 6).reshape(64, 6, 64, 6).mean((1, 3))
-    return PAPER - (PAPER - DARK) * cover
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +33,7 @@ def located(rendered_pairs):
             for dot in range(disc.n_markers):
                 centre, A = pixels[frame, 0, dot], affine[frame, dot]
                 window = np.round(centre) - 31
-                plain = drawn(centre - window, A)
+                plain = PAPER - (PAPER - DARK) * covered([centre - window], [A], 0.6)
                 place = np.stack([x, y], axis=-1) + window - middle
                 added = gleam * np.exp(-0.5 * np.sum((place - [30, -20]) ** 2, axis=-1) / 70.0**2)
                 H = np.eye(3)
