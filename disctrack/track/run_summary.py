@@ -9,7 +9,7 @@ from calibration import StereoCalibration, StereoRig
 from calibration.cameras.camera import OF_LEFT, OF_RIGHT, PAIR_SHIFT, PAIR_TURN
 from calibration.kit.arrays import Array
 from calibration.kit.brief import SHOWN_RANGES, ranges
-from disctrack.frames import CAMERAS
+from disctrack.frames import CAMERAS, vector_from_rotation
 from disctrack.trajectory import FrameStatus, Trajectory
 
 Row = tuple[str, str]  # a heading, and what belongs to it
@@ -49,18 +49,17 @@ def _rig_text(rig: StereoRig) -> str:
     """Baseline, angle between the cameras and focal lengths, with their sigmas."""
     C, t = rig.covariance, rig.t_right_left / rig.baseline
     baseline = 1e3 * float(np.sqrt(t @ C[PAIR_SHIFT, PAIR_SHIFT] @ t))
-    R = rig.R_right_left
-    angle = float(np.degrees(np.arccos(np.clip(0.5 * (np.trace(R) - 1), -1, 1))))
-    axis = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-    axis = axis / max(float(np.linalg.norm(axis)), 1e-12)
+    turned = vector_from_rotation(rig.R_right_left)
+    angle = float(np.linalg.norm(turned))
+    axis = turned / max(angle, 1e-12)
     turn = float(np.degrees(np.sqrt(axis @ C[PAIR_TURN, PAIR_TURN] @ axis)))
     focal = [
         f"{name} {camera.fx:.1f} x {camera.fy:.1f} (+- {np.sqrt(C[i, i]):.2g})"
         for name, camera, i in (("left", rig.left, OF_LEFT.start), ("right", rig.right, OF_RIGHT.start))
     ]
     return (
-        f"baseline {rig.baseline * 1e3:.3f} +- {baseline:.2g} mm, cameras turned by {angle:.3f} +- {turn:.2g} deg, "
-        f"focal lengths [px] {', '.join(focal)}"
+        f"baseline {rig.baseline * 1e3:.3f} +- {baseline:.2g} mm, cameras turned by "
+        f"{np.degrees(angle):.3f} +- {turn:.2g} deg, focal lengths [px] {', '.join(focal)}"
     )
 
 

@@ -82,7 +82,11 @@ def _noise(mean: Array32, difference: Array32, steep: Array32) -> Array32:
     alike = np.array_split(np.argsort(grey), NOISE_BINS)
     levels = np.array([grey[part].mean() for part in alike])
     variances = np.array([robust_sigma(change[part]) ** 2 for part in alike])
-    return photon_transfer(levels, variances, np.ones(NOISE_BINS), 1.0).variance(mean).astype(np.float32)
+    return (
+        photon_transfer(levels, variances, np.ones(NOISE_BINS), 1.0)
+        .variance(np.asarray(mean, float))
+        .astype(np.float32)
+    )
 
 
 def find_motion(
