@@ -171,8 +171,8 @@ CLOCKS = (
           seen="dots of another program lie off", remedy="correct its centres, or measure with disctrack"),
 )  # fmt: skip
 _KNOCK = "mount, cable, knock"
-_MISSED = "both cameras contradict each other on the same dots, throughout"
-_AGAIN = "calibrate again, in the place where the recording is made"
+_MISSED = "the cameras contradict each other on the same dots, throughout"
+_AGAIN = "calibrate again where you record"
 OF_CAMERAS = (  # of either camera
     Fault("turned", "the {} camera turned after its calibration", _KNOCK, ("rotation_x", "rotation_y", "rotation_z"),
           "rad", 1e-5, "in its own axes", "rotation_deg", ("rotation",), _DEG, bounds=(-0.06, 0.06),

@@ -18,8 +18,10 @@ import pytest
 
 import disctrack.cli
 from disctrack.cli import COMMANDS
+from disctrack.faults.catalogue import _MISPRINT, CLOCKS, OF_CAMERAS, OF_THE_PAPER, OF_THE_TABLE
 from disctrack.recording.declaration import KEYS, TARGET_KEYS, read_recording
 from disctrack.rolling import CATALOGUE
+from disctrack.trajectory.exchange.formats import ROWS
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "disctrack" / "docs"
@@ -166,14 +168,25 @@ def test_the_readme_is_short():
     assert len(prose.split()) < 850
 
 
-def test_every_stage_lives_where_the_map_says():
-    lines = text_of(DOCS / "contributing.md").splitlines()
-    rows = [line.split("|") for line in lines if line.startswith("| ") and "disctrack" in line]
-    places = [re.findall(r"`([a-z_/]+)`", row[3]) for row in rows if len(row) == 5]
-    assert sum(map(len, places)) > 10
-    for names_of_row in places:
-        for name in names_of_row:
-            assert (ROOT / name).is_dir() or (ROOT / "disctrack" / name).is_dir(), name
+def test_every_folder_of_the_packages_stands_in_the_map():
+    page = text_of(DOCS / "contributing.md")
+    tree = set(re.findall(r"([a-z_]+)/", page.partition("## The map")[2].partition("Who imports whom")[0]))
+    for package in ("calibration", "disctrack"):
+        folders = {file.parent.name for file in (ROOT / package).rglob("__init__.py")}
+        assert folders <= tree, folders - tree
+
+
+def test_every_format_is_on_its_page_with_its_endings():
+    rows = [line.split("|") for line in text_of(DOCS / "exchange.md").splitlines() if line.startswith("| ")]
+    page = {row[1].strip(): tuple(re.findall(r"`([^`]+)`", row[2])) for row in rows[1:]}
+    assert page == {row.name: row.endings for row in ROWS}
+
+
+def test_every_place_for_something_new_is_there():
+    page = text_of(DOCS / "contributing.md").partition("## Where something new goes")[2].partition("## Habits")[0]
+    places = re.findall(r"`((?:disctrack|calibration)/[a-z_/]+(?:\.py)?)`", page)
+    assert len(places) > 8
+    assert all((ROOT / place).exists() for place in places), places
 
 
 def test_every_key_of_a_recording_is_explained_and_the_example_is_one(tmp_path):
@@ -199,6 +212,20 @@ def test_every_effect_is_named():
     text = text_of(DOCS / "scenes.md")
     for name in CATALOGUE:
         assert f"`{name}`" in text, name
+
+
+def test_the_faults_stand_as_the_catalogue_has_them():
+    rows = ["| fault | what you see | what to do |", "|---|---|---|"]
+    same: dict[tuple[str, str], list[str]] = {}
+    for fault in (*CLOCKS, *OF_CAMERAS, _MISPRINT, *OF_THE_PAPER, *OF_THE_TABLE):
+        if fault.in_images:  # sought in the dots of other programs
+            continue
+        what = f"`{fault.declared}`: {fault.remedy}" if fault.declared else fault.remedy or "nothing"
+        title = " ".join(fault.title.format("").split())
+        same.setdefault((fault.seen, what), []).append(f"`{fault.name}`: {title}")
+    rows += [f"| {'; '.join(which)} | {seen} | {what} |" for (seen, what), which in same.items()]
+    table = "\n".join(rows)
+    assert table in text_of(DOCS / "faults.md"), table
 
 
 def test_every_attribute_of_the_groups_is_explained(measured_attributes):
