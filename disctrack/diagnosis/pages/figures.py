@@ -16,7 +16,7 @@ from disctrack.diagnosis.evidence import Evidence, force_of
 from disctrack.diagnosis.missing_force import Course
 from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.held_out import HeldOut
-from disctrack.report.figures import BAND, NO_TITLE, Curve, Drawn, chart, dress, panels, plain_powers
+from disctrack.report.figures import BAND, NO_TITLE, Curve, Drawn, chart, panels, plain_powers
 from disctrack.report.palette import AMBER, BLUE, GRID, INK, MUTED, RED
 
 N_TRIED = 14
@@ -56,46 +56,39 @@ def all_figures(result: DiscDiagnosis, beside: Evidence | None) -> tuple[Drawn, 
     """Every figure of a diagnosis whose base fit converged; of another what was tried."""
     if beside is None:
         return (candidates(result),) if result.diagnosis.tried else ()
-    found = [superposed(result, beside), residuals(result), spectrum(result), free_run(result)]
-    found += [*_missing(result, beside), candidates(result)]
+    over_time, path = superposed(result, beside)
+    found = [over_time, residuals(result), spectrum(result), free_run(result)]
+    found += [*_missing(result, beside), candidates(result), path]
     return tuple(replace(d, name=f"{i:02d}_{d.name}") for i, d in enumerate(found, start=1))
 
 
-def superposed(result: DiscDiagnosis, beside: Evidence) -> Drawn:
+def superposed(result: DiscDiagnosis, beside: Evidence) -> tuple[Drawn, Drawn]:
     """Nutation, precession rate and path: measurement, model before, model after (figures 17 and 18 of the paper)."""
-    system = result.system
-    figure = Figure(figsize=(9.5, 6.4), layout="constrained")
-    grid = figure.add_gridspec(2, 2, width_ratios=(1.5, 1))
-    theta, rate = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[1, 0])
-    path = figure.add_subplot(grid[:, 1])
-    q, time = system.trajectory.q[system.rows], system.time
-    measured_rate = np.full(len(time), np.nan) if beside.psidot is None else beside.psidot
-    dots: dict[str, Any] = {"linestyle": "", "marker": ".", "ms": 4, "color": MUTED, "label": "measured"}
-    theta.plot(time, np.degrees(q[:, 4]), **dots)
-    rate.plot(time, measured_rate, **dots)
-    path.plot(1e3 * q[:, 0], 1e3 * q[:, 1], **dots)
-    for (fit, _, name, colour), line in zip(_sides(result), ("--", "-"), strict=False):
-        style: dict[str, Any] = {"ls": line, "lw": 1.2, "color": colour, "label": name}
+    system, time = result.system, result.system.time
+    q = system.trajectory.q[system.rows]
+    rate = np.full(len(time), np.nan) if beside.psidot is None else beside.psidot
+    nutation, precession, path = (
+        [Curve(x, y, MUTED, "measured", ".")]
+        for x, y in ((time, np.degrees(q[:, 4])), (time, rate), (1e3 * q[:, 0], 1e3 * q[:, 1]))
+    )
+    for (fit, _, name, colour), style in zip(_sides(result), ("--", "-"), strict=False):
         motion = simulated(system, fit.values)
-        instants = time[: len(motion)]
-        theta.plot(instants, np.degrees(motion.q[:, 4]), **style)
-        rate.plot(instants, motion.qdot[:, 3], **style)
-        path.plot(1e3 * motion.q[:, 0], 1e3 * motion.q[:, 1], **style)
-    labels = ((theta, "nutation angle (deg)"), (rate, "precession rate (rad/s)"), (path, "y (mm)"))
-    for axes, label in labels:
-        dress(axes)
-        axes.set_xlabel("time (s)")
-        axes.set_ylabel(label)
-    _frame(theta, np.degrees(q[:, 4]))
-    _frame(rate, measured_rate)
-    path.set_aspect("equal")
-    path.set_xlabel("x (mm)")
-    theta.legend(frameon=False, fontsize=9, loc="upper right", ncols=3)
+        instants, (x, y) = time[: len(motion)], 1e3 * motion.q[:, :2].T
+        nutation.append(Curve(instants, np.degrees(motion.q[:, 4]), colour, name, style))
+        precession.append(Curve(instants, motion.qdot[:, 3], colour, name, style))
+        path.append(Curve(x, y, colour, name, style))
+    over_time = chart(
+        "time (s)", ("nutation angle (deg)", nutation), ("precession rate (rad/s)", precession), size=(9.5, 6.4)
+    )
+    for axes, measured in zip(over_time.axes, (np.degrees(q[:, 4]), rate), strict=True):
+        _frame(axes, measured)
     caption = (
-        "Nutation angle, precession rate and path of the centre: measured, and the model fitted to the measurement. "
+        "Nutation angle and precession rate: measured, and the model fitted to the measurement. "
         "The measured rate is the derivative of the poses, without any model."
     )
-    return Drawn("model_and_measurement", "Model and measurement", caption, figure)
+    in_plane = chart("x (mm)", ("y (mm)", path), size=(6.0, 6.0), equal=True)
+    drawn = Drawn("model_and_measurement", "Model and measurement", caption, over_time)
+    return drawn, Drawn("path", "Path of the centre", "Path of the centre: measured, and fitted.", in_plane)
 
 
 def _frame(axes: Axes, values: Array) -> None:
