@@ -8,7 +8,6 @@ import json
 from dataclasses import replace
 
 import numpy as np
-from scipy.interpolate import CubicHermiteSpline
 
 from disctrack.faults.keys import Faults
 from disctrack.synthetic.description import BoardSettings, CameraSettings, MotionSettings, RigSettings, Scene
@@ -50,12 +49,7 @@ def true_motion(body: newton_euler.Disc, theta_deg: float, omega3: float, durati
         state = newton_euler.state_from_angles(body.at(0.0), 0.032, 0.02, 0.7, theta, -0.4, 0.0, omega2, omega3)
     answer = newton_euler.follow(body, state, times, rtol=1e-10, atol=1e-11, method="LSODA")
     assert answer.success
-    q = newton_euler.coordinates(body, answer.y)
-    speed = np.gradient(q, times, axis=0, edge_order=2)
-    for i, s in enumerate(answer.y.T):
-        now = newton_euler.Instant(body, s)
-        speed[i] = *now.v, now.psidot, now.thetadot, now.phidot
-    spline = CubicHermiteSpline(times - LEAD, q, speed)
+    spline = newton_euler.course(body, times - LEAD, answer.y)
     return SceneMotion(spline, spline.derivative(), int(duration * rate))
 
 

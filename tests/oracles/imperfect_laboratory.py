@@ -15,7 +15,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from scipy.interpolate import CubicHermiteSpline
 
 from tests.oracles import newton_euler
 
@@ -318,12 +317,7 @@ def motion(plan):
     lead = 0.005
     times = np.arange(0.0, plan.n_frames / plan.frame_rate + 2 * lead, 1.0 / (SAMPLES * plan.frame_rate))
     answer = newton_euler.follow(body, state, times, rtol=1e-10, atol=1e-11, method="LSODA")
-    q = newton_euler.coordinates(body, answer.y)
-    speed = np.empty_like(q)
-    for i, s in enumerate(answer.y.T):
-        now = newton_euler.Instant(body, s)
-        speed[i] = *now.v, now.psidot, now.thetadot, now.phidot
-    return CubicHermiteSpline(times - lead, q, speed)
+    return newton_euler.course(body, times - lead, answer.y)
 
 
 def pose_at(spline, time):

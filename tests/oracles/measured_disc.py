@@ -1,12 +1,16 @@
 """Measured trajectories of a disc without rendering, with what is planted as keywords (disctrack.validate.points)."""
 
+from disctrack.diagnosis import DiscSystem
+from disctrack.diagnosis.model_file import declared_model
+from disctrack.diagnosis.motion import motion_candidates
+from disctrack.discrepancy.fit import fit
 from disctrack.faults.keys import Faults
 from disctrack.frames import rotation_from_quaternion
 from disctrack.track.refine.self_calibration import DotsInFrames
 from disctrack.validate import points
 from disctrack.validate.points import K_M, SIGMA_PX, Filmed, Laboratory, Planted
 
-__all__ = ["K_M", "SIGMA_PX", "Laboratory", "dots_of", "measured"]
+__all__ = ["K_M", "SIGMA_PX", "Laboratory", "dots_of", "measured", "system_of", "with_base_fit"]
 
 
 def measured(effects=None, *, faults=None, laboratory=None, motion=None, laws=(), disc=None, **filmed):
@@ -25,3 +29,15 @@ def dots_of(trajectory):
         rotation_from_quaternion(trajectory.quaternion),
         trajectory.q[:, :3],
     )
+
+
+def system_of(trajectory, names=None, model="paper"):
+    """What a diagnosis with this model asks.   names : of the only effects that may be missing, if not all"""
+    declared = declared_model(trajectory, model).model
+    return DiscSystem(trajectory, declared, None if names is None else motion_candidates(declared, names))
+
+
+def with_base_fit(trajectory, names=None, model="paper"):
+    """The same, and its base fit."""
+    system = system_of(trajectory, names, model)
+    return system, fit(system, system.base, system.start())

@@ -10,7 +10,7 @@ from copy import copy
 
 import numpy as np
 from scipy.integrate import solve_ivp
-from scipy.interpolate import make_interp_spline
+from scipy.interpolate import CubicHermiteSpline, make_interp_spline
 from scipy.optimize import brentq
 
 K = np.array([0.0, 0.0, 1.0])
@@ -242,6 +242,13 @@ def coordinates(disc, states):
         now = Instant(disc, s)
         q[i] = *s[:3], s[13], np.arctan2(now.sine, now.cosine), s[14]
     return q
+
+
+def course(disc, times, states):
+    """Spline of q over the times, through states (15, n) with their own rates."""
+    moving = [Instant(disc, s) for s in states.T]
+    speed = np.array([[*now.v, now.psidot, now.thetadot, now.phidot] for now in moving])
+    return CubicHermiteSpline(times, coordinates(disc, states), speed)
 
 
 # Laws: functions of (disc, instant) -> moment independent of the load, moment per load, force at O; world axes.

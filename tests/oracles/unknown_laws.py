@@ -439,9 +439,9 @@ class Recording:
     moment: np.ndarray  # (k, 3)
 
 
-def recording(name: str, seed: int = 1) -> Recording:
-    """Dots of the motion with the law of this name, until 1.2 deg."""
-    times, q, speed, wrench = motion(UNKNOWN[name])
+def recording(unknown: Unknown | str, seed: int = 1) -> Recording:
+    """Dots of the motion with this law, or that of this name, until 1.2 deg."""
+    times, q, speed, wrench = motion(UNKNOWN[unknown] if isinstance(unknown, str) else unknown)
     n = int((times[-1] - 0.01) * RATE)
     trajectory = measured(seed=seed, n=n, declared_rate=RATE, motion=CubicHermiteSpline(times, q, speed))
     known = np.isfinite(wrench).all(axis=1)

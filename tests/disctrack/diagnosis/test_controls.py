@@ -5,18 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from disctrack.diagnosis import DiscSystem
-from disctrack.diagnosis.model_file import declared_model
-from disctrack.diagnosis.motion import motion_candidates
-from disctrack.discrepancy.fit import fit
 from disctrack.discrepancy.noise import common_modes
 from disctrack.discrepancy.search import explain
-from tests.oracles.measured_disc import measured
-
-
-def system_of(trajectory, names=None):
-    model = declared_model(trajectory, "paper").model
-    return DiscSystem(trajectory, model, None if names is None else motion_candidates(model, names))
+from tests.oracles.measured_disc import measured, system_of, with_base_fit
 
 
 @pytest.mark.statistical
@@ -40,8 +31,7 @@ def test_a_wrong_effect_offered_alone_is_refused_by_the_free_run():
 def test_a_shuffled_residual_of_the_disc_gives_no_finding():
     """The frames of a residual that a tilted table has left, in random order: large, and no effect makes it."""
     trajectory = measured({"table_tilt.tilt_x": 5e-4}, seed=10, n=160, declared_rate=500.0)
-    system = system_of(trajectory)
-    base = fit(system, system.base, system.start())
+    system, base = with_base_fit(trajectory)
     assert base.reduced_chi_square > 2
     residual = system.observed - system.pixels(base.values, with_nuisances=True)
     order = np.random.default_rng(3).permutation(len(residual))
@@ -56,8 +46,7 @@ def test_a_camera_that_shakes_is_no_effect_of_the_motion():
     trajectory = measured(seed=12, n=200, declared_rate=500.0)
     shake = np.zeros((200, 2, 1, 2))
     shake[:, 1] = 0.02 * np.random.default_rng(4).standard_normal((200, 1, 2))
-    system = system_of(replace(trajectory, markers_px=trajectory.markers_px + shake))
-    base = fit(system, system.base, system.start())
+    system, base = with_base_fit(replace(trajectory, markers_px=trajectory.markers_px + shake))
     assert base.reduced_chi_square > 5
     vectors, variances = common_modes(system, base)
     # both directions of the right camera's dots and none else: 1 + 6 (0.02 / 0.006)^2 = 68, within 20 %
@@ -68,8 +57,7 @@ def test_a_camera_that_shakes_is_no_effect_of_the_motion():
 
 
 def test_independent_noise_has_no_common_modes():
-    system = system_of(measured(seed=13, n=200, declared_rate=500.0))
-    assert common_modes(system, fit(system, system.base, system.start())) is None
+    assert common_modes(*with_base_fit(measured(seed=13, n=200, declared_rate=500.0))) is None
 
 
 @pytest.mark.statistical

@@ -2,15 +2,12 @@
 
 import numpy as np
 import pytest
-from scipy.interpolate import CubicHermiteSpline
 
-from disctrack.diagnosis import DiscSystem
-from disctrack.diagnosis.model_file import declared_model
 from disctrack.discrepancy.fit import fit
 from disctrack.discrepancy.shape import profiled
 from disctrack.faults.keys import Faults
 from tests.oracles import newton_euler
-from tests.oracles.measured_disc import K_M, measured
+from tests.oracles.measured_disc import K_M, measured, system_of
 
 
 def power_friction(k: float, p: float):
@@ -44,14 +41,12 @@ def test_pulls_over_many_recordings_of_one_motion(laws, delay, fitted, shape, tr
     start = newton_euler.state_from_angles(body, 0.032, 0.02, 0.7, np.radians(10), -0.4, 0.0, omega2, 1.0)
     times = np.arange(0, 0.82, 1 / 4000)
     states = newton_euler.follow(body, start, times, atol=1e-13).y
-    moving = [newton_euler.Instant(body, s) for s in states.T]
-    speed = np.array([[*now.v, now.psidot, now.thetadot, now.phidot] for now in moving])
-    motion = CubicHermiteSpline(times, newton_euler.coordinates(body, states), speed)
+    motion = newton_euler.course(body, times, states)
     pulls = []
     for seed in range(24):
         faults = Faults(right_delay_s=delay)
         trajectory = measured(seed=seed, n=400, declared_rate=500.0, motion=motion, faults=faults)
-        system = DiscSystem(trajectory, declared_model(trajectory).model)
+        system = system_of(trajectory)
         known = {q.name: q for c in system.candidates for q in (*c.quantities, *c.shape)}
         found = fit(system, (*system.base, known[fitted]), system.start())
         for name in shape:

@@ -5,15 +5,13 @@ from dataclasses import astuple, replace
 import numpy as np
 import pytest
 
-from disctrack.diagnosis import DiscSystem, diagnose
-from disctrack.diagnosis.model_file import declared_model
+from disctrack.diagnosis import diagnose
 from disctrack.diagnosis.pages.output import as_json
 from disctrack.diagnosis.plan import Proposal
 from disctrack.diagnosis.stage import with_plan
-from disctrack.discrepancy.fit import fit
 from disctrack.faults.keys import Faults
 from disctrack.rolling import CATALOGUE
-from tests.oracles.measured_disc import measured
+from tests.oracles.measured_disc import measured, with_base_fit
 
 # hidden effect, faults, name; all others are planted and fitted in tests/disctrack/validate
 HIDDEN = [
@@ -21,10 +19,6 @@ HIDDEN = [
     ({"centre_of_mass.c_1": 1e-4}, None, "centre_of_mass"),
     ({"time_offset.delay": 2.5e-4}, Faults(right_delay_s=2.5e-4), "time_offset"),
 ]
-
-
-def system_of(trajectory, model="paper", candidates=None):
-    return DiscSystem(trajectory, declared_model(trajectory, model).model, candidates)
 
 
 @pytest.mark.statistical
@@ -79,8 +73,7 @@ def test_two_effects_are_found_together():
 
 @pytest.mark.statistical
 def test_derivatives_agree_with_differences_of_the_prediction():
-    system = system_of(measured({"kz.k_z": 2e-5}, seed=12, n=80))
-    base = fit(system, system.base, system.start())
+    system, base = with_base_fit(measured({"kz.k_z": 2e-5}, seed=12, n=80))
     quantities = [*system.base[:9], *(q for c in system.candidates for q in c.quantities)]
     quantities = [q for q in quantities if not q.name.startswith(("exposure", "air_quadratic"))]
     values = {q.name: q.null for q in quantities} | base.values

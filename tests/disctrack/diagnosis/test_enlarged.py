@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from calibration.cameras.camera import rotation_from_vector
-from disctrack.diagnosis import DiscSystem, diagnose
+from disctrack.diagnosis import diagnose
 from disctrack.diagnosis.model_file import declared_model, model_toml
 from disctrack.diagnosis.motion import measurement_candidates
 from disctrack.diagnosis.starts import first_state
@@ -21,7 +21,7 @@ from disctrack.synthetic.cameras import rig_after_faults
 from disctrack.synthetic.description import load_scene
 from disctrack.synthetic.motion import rolling_model, rolling_start
 from disctrack.synthetic.recording import true_disc_of
-from tests.oracles.measured_disc import measured
+from tests.oracles.measured_disc import measured, system_of
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +49,7 @@ def everything_wrong(short, rng):
 
 
 def test_every_fault_of_the_measurement_survives_the_file(short, everything_wrong, tmp_path):
-    system = DiscSystem(short, declared_model(short).model)
+    system = system_of(short)
     values = rolling_state(short) | {"km.k_m": 3e-8} | everything_wrong
     again = declared_model(short, str(saved(system, values, tmp_path))).faults
     assert set(again) == set(everything_wrong)
@@ -59,7 +59,7 @@ def test_every_fault_of_the_measurement_survives_the_file(short, everything_wron
 
 def test_images_of_a_faulty_scene_are_those_that_the_diagnosis_predicts(short, everything_wrong, tmp_path):
     """The renderer moves cameras, table and dots by formulas of its own."""
-    system = DiscSystem(short, declared_model(short).model)
+    system = system_of(short)
     state = rolling_state(short)
     scene = load_scene(saved(system, state | everything_wrong, tmp_path))
     rig, q = rig_of(scene), short.q[:5]
@@ -76,7 +76,7 @@ def test_images_of_a_faulty_scene_are_those_that_the_diagnosis_predicts(short, e
 
 
 def test_a_saved_model_looks_at_the_disc_as_the_cameras_did(short, tmp_path):
-    system = DiscSystem(short, declared_model(short).model)
+    system = system_of(short)
     values = system.start()
     rig = rig_of(load_scene(saved(system, values, tmp_path)))
     points = short.q[:3, None, :3] + [[0.0, 0.0, 0.0], [0.03, 0.0, 0.0], [0.0, 0.03, 0.0]]
@@ -133,7 +133,7 @@ def test_table_that_the_rim_levelled_wrongly_is_no_fault_of_the_saved_scene(shor
     def eyes(rig):
         return np.array([-R.T @ t for R, t in rig.camera_poses()])
 
-    levelled = DiscSystem(replace(short, table_moved=(1e-4, 0.0, 2e-3)), declared_model(short).model)
+    levelled = system_of(replace(short, table_moved=(1e-4, 0.0, 2e-3)))
     scene = load_scene(saved(levelled, values, tmp_path))
     assert (scene.faults.table_height_mm, scene.faults.table_turn_deg) == (0.0, (0.0, 0.0))
     assert scene.faults.pattern_height_mm == pytest.approx(0.1)
@@ -141,7 +141,7 @@ def test_table_that_the_rim_levelled_wrongly_is_no_fault_of_the_saved_scene(shor
     lean = rotation_from_vector(np.array([slope, 0.0, 0.0]))
     assert_allclose(eyes(rig_of(scene)), (eyes(short.rig) - [0.0, 0.0, height]) @ lean, atol=1e-10)
 
-    as_calibrated = DiscSystem(short, declared_model(short).model)  # nobody levelled it: a fault of the table view
+    as_calibrated = system_of(short)  # nobody levelled it: a fault of the table view
     scene = load_scene(saved(as_calibrated, values, tmp_path))
     assert scene.faults.table_height_mm == pytest.approx(-0.1)
     assert_allclose(eyes(rig_of(scene)), eyes(short.rig), atol=1e-10)

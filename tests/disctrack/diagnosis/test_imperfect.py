@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from disctrack.diagnosis import DiscSystem, diagnose
+from disctrack.diagnosis import diagnose
 from disctrack.diagnosis.errors import LeftOver
-from disctrack.diagnosis.model_file import declared_model
 from disctrack.diagnosis.stretch import at_rest
 from disctrack.diagnosis.systematic import find_systematic, noise_over_stated, with_noise_of_frames
 from disctrack.discrepancy.fit import fit
@@ -19,7 +18,7 @@ from disctrack.discrepancy.noise import inflation
 from disctrack.discrepancy.system import Quantity, System
 from disctrack.faults.keys import CameraFault, Faults
 from disctrack.validate.points import ORDINARY, Laboratory
-from tests.oracles.measured_disc import measured
+from tests.oracles.measured_disc import measured, system_of
 
 
 def recording(effects=None, *, laboratory=ORDINARY, faults=None, seed=1, n=300):
@@ -38,7 +37,7 @@ def recording(effects=None, *, laboratory=ORDINARY, faults=None, seed=1, n=300):
 
 def systematic_of(trajectory):
     trajectory = with_noise_of_frames(trajectory)
-    return find_systematic(DiscSystem(trajectory, declared_model(trajectory).model))
+    return find_systematic(system_of(trajectory))
 
 
 def test_the_noise_is_what_changes_from_frame_to_frame():

@@ -7,11 +7,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from disctrack.diagnosis import DiscSystem, diagnose
+from disctrack.diagnosis import diagnose
 from disctrack.diagnosis.errors import simulated
 from disctrack.diagnosis.form_misfit import moment_about_contact
 from disctrack.diagnosis.missing_force import law_of, missing_moment, probe
-from disctrack.diagnosis.model_file import declared_model
 from disctrack.diagnosis.pages.output import as_json
 from disctrack.disc import MA_2014
 from disctrack.discrepancy.fit import Fit, fit
@@ -20,7 +19,7 @@ from disctrack.discrepancy.system import Quantity
 from disctrack.faults.keys import Faults
 from disctrack.rolling import Model
 from disctrack.rolling.effects import effect_from_formulas
-from tests.oracles.measured_disc import measured
+from tests.oracles.measured_disc import measured, with_base_fit
 from tests.oracles.unknown_laws import recording
 
 
@@ -46,8 +45,7 @@ def test_an_effect_in_no_catalogue_is_described_by_a_learned_law():
 def test_the_moment_of_what_was_found_is_the_missing_one():
     """Read in the same way, they differ by noise alone, although the first fit bent the rig to make up for the tilt."""
     trajectory = measured({"table_tilt.tilt_x": 2e-3}, n=150, theta_deg=15.0, seed=4)
-    system = DiscSystem(trajectory, declared_model(trajectory).model)
-    before = fit(system, system.base, system.start())
+    system, before = with_base_fit(trajectory)
     assert max(abs(before.values[n]) for n in before.names if n.startswith("rig.")) > 5  # sigmas of the calibration
     tilt = next(c for c in system.candidates if c.name == "table_tilt")
     start = before.values | dict.fromkeys(tilt.names, 0.0)
@@ -65,8 +63,7 @@ def test_the_moment_of_what_was_found_is_the_missing_one():
 def test_missing_moment_is_the_hidden_one():
     """The true course of the moment lies within the band: pulls of order one, and the band is narrow."""
     trajectory = hiding("hidden_cubic", "M_z", "-k * omega_z * omega_z * omega_z", 1e-6, seed=7, n=400)
-    system = DiscSystem(trajectory, declared_model(trajectory).model)
-    base = fit(system, system.base, system.start())
+    system, base = with_base_fit(trajectory)
     moment, _ = missing_moment(probe(system, base))
     law = learn(system, base, 1.0)
     system = system.knowing(law)
@@ -83,8 +80,7 @@ def test_missing_moment_is_the_hidden_one():
 @pytest.mark.statistical
 def test_in_noise_no_law_is_learned():
     trajectory = measured(seed=8, n=300)
-    system = DiscSystem(trajectory, declared_model(trajectory).model)
-    base = fit(system, system.base, system.start())
+    system, base = with_base_fit(trajectory)
     assert learn(system, base, 1.0) is None
 
 
@@ -134,8 +130,7 @@ def test_a_law_is_looked_for_along_the_motion_that_follows_the_data():
     The motion is the oracle's, with 40 N/m^2.
     """
     trajectory = recording("quadratic_spring").trajectory
-    system = DiscSystem(trajectory, declared_model(trajectory).model)
-    base = fit(system, system.base, system.start())
+    system, base = with_base_fit(trajectory)
     spring = next(c for c in system.candidates if c.name == "spring")
     along = fit(system, (*base.quantities, *spring.quantities), base.values)
     assert along.reduced_chi_square < 0.01 * base.reduced_chi_square

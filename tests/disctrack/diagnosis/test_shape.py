@@ -4,19 +4,17 @@ import pytest
 
 from disctrack.diagnosis import DiscSystem, diagnose
 from disctrack.diagnosis.model_file import declared_model
-from disctrack.diagnosis.motion import motion_candidates
 from disctrack.discrepancy.fit import fit
 from disctrack.discrepancy.search import explain
 from disctrack.discrepancy.shape import profiled
 from disctrack.validate.diagnoses import HiddenCase, plant
-from tests.oracles.measured_disc import measured
+from tests.oracles.measured_disc import measured, system_of
 
 
 @pytest.mark.statistical
 def test_an_exponent_is_measured_along_its_profile():
     trajectory = measured({"rolling_power.k": 4e-4, "rolling_power.p": 1.0}, k_m=0.0, seed=72, n=250, theta_deg=5.0)
-    model = declared_model(trajectory, "none").model
-    system = DiscSystem(trajectory, model)
+    system = system_of(trajectory, model="none")
     (power,) = [c for c in system.candidates if c.name == "rolling_power"]
     nominal = fit(system, (*system.base, *power.quantities), system.start())
     free = profiled(system, nominal, power.shape[0], 0.1)
@@ -29,8 +27,7 @@ def test_an_exponent_is_measured_along_its_profile():
 def test_an_exponent_that_cannot_be_seen_is_said_to_be_assumed():
     """At 14 deg and over 0.2 s the rate hardly changes: any exponent gives the same moment."""
     trajectory = measured({"rolling_power.k": 2e-4}, seed=74, n=200)
-    model = declared_model(trajectory).model
-    system = DiscSystem(trajectory, model, motion_candidates(model, ["rolling_power"]))
+    system = system_of(trajectory, ["rolling_power"])
     answer = explain(system, system.start())
     assert [f.candidate.name for f in answer.found] == ["rolling_power"]
     assert "rolling_power.p" not in answer.after.names

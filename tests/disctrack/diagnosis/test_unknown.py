@@ -2,20 +2,14 @@
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
-from scipy.interpolate import CubicHermiteSpline
 
 from disctrack.diagnosis import diagnose
 from disctrack.rolling.effects import effect_from_formulas
-from disctrack.synthetic.description import Scene
 from tests.oracles import newton_euler
-from tests.oracles.measured_disc import K_M, measured
-from tests.oracles.unknown_laws import recording as unknown
+from tests.oracles.measured_disc import measured
+from tests.oracles.unknown_laws import DISC, Unknown, recording
 
 pytestmark = pytest.mark.slow
-
-DISC = Scene().declared_disc
-RATE = 500.0
 
 
 def contour_friction_below(mu: float, theta_deg: float):
@@ -29,32 +23,8 @@ def contour_friction_below(mu: float, theta_deg: float):
     return law
 
 
-def recording(law, theta_deg: float, omega3: float, duration: float, seed: int = 1):
-    """Dots of a motion by world vectors and quaternions, until 1.2 deg."""
-    laws = (newton_euler.precession_friction(K_M), law)
-    body = newton_euler.Disc(DISC.radius, DISC.half_thickness, DISC.mass, laws=laws)
-    theta = np.radians(theta_deg)
-    omega2 = np.sqrt(4 * 9.81 * np.sin(theta) / body.r)
-    start = newton_euler.state_from_angles(body, 0.032, 0.02, 0.7, theta, -0.4, 0.0, omega2, omega3)
-
-    def low(t, s):
-        return newton_euler.Instant(body, s).sine - np.sin(np.radians(1.2))
-
-    low.terminal = True
-    times = np.arange(0.0, duration, 1 / 6000)
-    found = solve_ivp(
-        lambda t, s: newton_euler.rate(body.at(t), s, "rolling"), (0, times[-1]), start, "DOP853", times, rtol=1e-10,
-        atol=1e-11, max_step=2e-3, events=low,
-    )  # fmt: skip
-    q = newton_euler.coordinates(body, found.y)
-    moving = [newton_euler.Instant(body, s) for s in found.y.T]
-    speed = np.array([[*now.v, now.psidot, now.thetadot, now.phidot] for now in moving])
-    n = int((found.t[-1] - 0.01) * RATE)
-    return measured(seed=seed, n=n, declared_rate=RATE, motion=CubicHermiteSpline(found.t, q, speed))
-
-
 def test_a_spring_is_no_tilt_with_an_inertia():
-    result = diagnose(recording(newton_euler.spring(0.8), 14.0, 1.0, 0.9))
+    result = diagnose(recording(Unknown(newton_euler.spring(0.8), 14.0, 1.0, 0.9)).trajectory)
     assert [f.candidate.name for f in result.diagnosis.found] == ["spring"]
     assert result.after.reduced_chi_square < 1.05
     fit = result.diagnosis.after
@@ -66,7 +36,7 @@ def test_a_table_that_vibrates_is_found_with_its_frequency_and_its_forces():
     """3 um at 60 Hz, 16 deg before the course of the cosine's; the frames begin 2 ms after the motion."""
     acceleration = 3e-6 * (2 * np.pi * 60) ** 2 * np.array([0.6, 0.3, 0.7])
     law = newton_euler.vibration(-np.sin(0.3) * acceleration, -np.cos(0.3) * acceleration, 60.0)
-    result = diagnose(recording(law, 14.0, 1.0, 0.9))
+    result = diagnose(recording(Unknown(law, 14.0, 1.0, 0.9)).trajectory)
     assert result.diagnosis.verdict == "unexplained"
     assert result.learned is not None
     fit = result.learned.fit
@@ -81,7 +51,7 @@ def test_a_table_that_vibrates_is_found_with_its_frequency_and_its_forces():
 
 
 def test_a_law_below_a_nutation_is_told_with_the_nutation():
-    result = diagnose(recording(contour_friction_below(1e-3, 2.5), 4.0, 0.3, 1.6))
+    result = diagnose(recording(Unknown(contour_friction_below(1e-3, 2.5), 4.0, 0.3, 1.6)).trajectory)
     assert result.diagnosis.verdict == "unexplained"
     assert result.holds
     assert result.holds["first"] is not None
@@ -102,7 +72,7 @@ def test_a_dent_that_hits_once_a_turn_is_found_with_its_place_and_its_blow():
         bump = size * np.exp((np.cos(phi) - 1) / width**2) * np.sign(now.phidot)
         return newton_euler.ZERO, bump * now.m0, newton_euler.ZERO
 
-    result = diagnose(recording(law, 14.0, 1.0, 0.9))
+    result = diagnose(recording(Unknown(law, 14.0, 1.0, 0.9)).trajectory)
     assert result.learned is not None
     fit = result.learned.fit
     assert result.after.reduced_chi_square < 1.05
@@ -117,7 +87,7 @@ def test_a_force_that_grows_with_time_is_found_with_its_size_and_its_direction()
     def law(disc, now):
         return newton_euler.ZERO, newton_euler.ZERO, disc.t * growing
 
-    result = diagnose(recording(law, 11.0, 0.6, 0.7))
+    result = diagnose(recording(Unknown(law)).trajectory)
     assert result.learned is not None
     fit = result.learned.fit
     assert result.after.reduced_chi_square < 1.05
@@ -132,7 +102,7 @@ def test_a_law_takes_the_place_of_those_that_stand_in_for_it_and_of_no_other():
 
     Pivoting friction beside it is truly there, and stays.
     """
-    alone = diagnose(unknown("quadratic_spring").trajectory)
+    alone = diagnose(recording("quadratic_spring").trajectory)
     assert alone.diagnosis.found == ()
     x, y = "(x * cos(psi) + y * sin(psi))", "(y * cos(psi) - x * sin(psi))"
     forces = {"X_n": f"-k * {x} * sqrt(x * x + y * y)", "X_m": f"-k * {y} * sqrt(x * x + y * y)"}
@@ -152,7 +122,7 @@ def test_a_law_takes_the_place_of_those_that_stand_in_for_it_and_of_no_other():
 
 def test_a_thread_that_twists_is_no_shaken_table():
     """Seven numbers, a frequency among them, leave noise of a moment that grows with the turn: a law leaves less."""
-    made = unknown("twisted_thread")
+    made = recording("twisted_thread")
     result = diagnose(made.trajectory)
     assert result.diagnosis.found == ()
     assert result.learned is not None
@@ -180,7 +150,7 @@ SETTLING = -2 * 40e-6 / 0.7**2  # [m/s^2] of the table, 2 ms before whose first 
 )
 def test_an_effect_of_the_catalogue_is_named_and_sized(name, effect, sizes):
     """To three of its sigmas, or as stated; an infinite size is one of a known sign."""
-    result = diagnose(unknown(name).trajectory)
+    result = diagnose(recording(name).trajectory)
     assert [found.candidate.name for found in result.diagnosis.found] == [effect]
     fit = result.diagnosis.after
     for part, (true, within) in sizes.items():
@@ -202,7 +172,7 @@ def pulls(made, result):
 
 def test_one_friction_in_another_s_place_competes_with_laws():
     """A drag along one direction: creep leaves noise of it, and a law of the same length leaves less; both are told."""
-    made = unknown("drag_one_way")
+    made = recording("drag_one_way")
     result = diagnose(made.trajectory)
     assert result.learned is not None
     assert any("known effects" in note for note in result.notes)
@@ -211,7 +181,7 @@ def test_one_friction_in_another_s_place_competes_with_laws():
 
 def test_a_law_that_ends_at_the_bound_of_its_shape_has_a_course():
     """A step of the table is wider than any hill of the library: its derivatives are taken inwards."""
-    result = diagnose(unknown("seam").trajectory)
+    result = diagnose(recording("seam").trajectory)
     assert result.diagnosis.verdict == "unexplained"
     assert result.learned is None or np.isfinite(result.learned.course.sigma).all()
 
@@ -222,7 +192,7 @@ def test_a_law_that_ends_at_the_bound_of_its_shape_has_a_course():
 )
 def test_a_known_effect_that_stands_in_with_a_law_is_not_claimed(name, beside):
     """A ball in oil, a table that gives way, a brake over half of it: sums that come near to these are no finding."""
-    made = unknown(name, 1)
+    made = recording(name, 1)
     result = diagnose(made.trajectory)
     assert not result.diagnosis.found
     assert any(f"[{beside}] helps the law" in note for note in result.notes)  # it does, by far more than noise
