@@ -48,6 +48,7 @@ THETA_RANGE = np.radians(1.0), np.radians(60.0)
 SIGMAS = 5.0
 # What honest discs and tables may do: rounded edges and tables that lean by a degree shift the balance by 3 % at most.
 BALANCE = 0.10
+NOTED = 0.01  # from which on it is worth a word
 # Where fewer blocks are as near to their median, something else acts on the disc: a hand holds it, or it lies still.
 COHERENT, COHERENT_SHARE = 0.3, 0.8
 GROWTH, STEADY = 0.05, 0.7  # of the energy; share of the blocks in which it does: a push is short
@@ -148,7 +149,8 @@ def motion_against_gravity(trajectory: Trajectory) -> tuple[Finding, ...]:
     sigma = _robust(found) * np.sqrt(np.pi / 2 / n)
     if not (gravity > 0 and np.mean(np.abs(found - gravity) < COHERENT * gravity) >= COHERENT_SHARE):
         return ()
-    if abs(np.log(gravity / g)) > np.log1p(BALANCE) and abs(gravity - g) > SIGMAS * sigma:
+    away = abs(np.log(gravity / g))
+    if away > np.log1p(NOTED) and abs(gravity - g) > SIGMAS * sigma:
         text = (
             f"the motion satisfies the balance of moments with a gravity of {with_sigma(gravity, sigma)} m/s^2 ({n} "
             f"stretches of {BLOCK} frames); expected {g:.4g} m/s^2 at {trajectory.frame_rate:g} frames a second, "
@@ -156,7 +158,8 @@ def motion_against_gravity(trajectory: Trajectory) -> tuple[Finding, ...]:
         )
         numbers = {"gravity": Number(gravity, "m/s^2", sigma)}
         remedies, kind = _of_gravity(trajectory, gravity / g), Kind.GRAVITY_OR_RATE
-        return (Finding(kind, Severity.DOUBT, text, numbers=numbers, remedies=remedies, explains=(Kind.REVERSED,)),)
+        severity = Severity.DOUBT if away > np.log1p(BALANCE) else Severity.NOTE
+        return (Finding(kind, severity, text, numbers=numbers, remedies=remedies, explains=(Kind.REVERSED,)),)
     times = np.arange(n)
     slope, start = np.polyfit(times, energy, 1)
     sigma = _robust(energy - slope * times - start) / (np.std(times) * np.sqrt(n))

@@ -242,6 +242,8 @@ def add_validate(parser: argparse.ArgumentParser) -> None:
     )
     what = "instead: hide each of these effects (default: all known; nothing, prints, laboratory: none) and diagnose"
     parser.add_argument("--diagnosis", nargs="*", metavar="EFFECT[=SIZE]", help=what)
+    what = "instead: plant every fault of a measurement into a rendered recording and into these, and run each"
+    parser.add_argument("--faults", type=Path, nargs="*", metavar="RECORDING", help=what)
     parser.add_argument("--seeds", type=_positive, default=6, help="recordings for each hidden effect (%(default)s)")
     parser.add_argument("--pairs", type=_positive, default=0, metavar="N", help="hide N pairs of effects instead")
     parser.add_argument(

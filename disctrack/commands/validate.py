@@ -3,11 +3,14 @@
 import argparse
 import shlex
 import sys
+import tempfile
+from pathlib import Path
 
 from disctrack.commands import DONE, FAILED
 from disctrack.files.whole import make_folder
 from disctrack.validate.accuracy import accuracy_validation, imperfect_validation
 from disctrack.validate.diagnoses import diagnosis_validation, hidden_cases, hide
+from disctrack.validate.planted_faults import fault_cases, faults_validation, plant_and_run, untouched
 from disctrack.validate.rendered import render_and_measure, rendered_cases
 from disctrack.validate.tables import Validation, measure_all, write_into, write_validation
 
@@ -32,6 +35,10 @@ def _validation(a: argparse.Namespace) -> Validation:
         first = 1 if a.seed is None else a.seed
         hidden = hidden_cases(a.diagnosis, range(first, first + a.seeds), a.pairs, a.frame_rate)
         return diagnosis_validation(measure_all(hide, list(hidden), a.jobs, say))
+    if a.faults is not None:
+        with tempfile.TemporaryDirectory(prefix="disctrack-validate-") as folder:
+            grounds = list(untouched(Path(folder), a.faults))
+            return faults_validation(measure_all(plant_and_run, fault_cases(grounds), a.jobs, say))
     cases = rendered_cases(a.imperfect or a.recordings, 2014 if a.seed is None else a.seed, a.quick, a.imperfect > 0)
     sum_up = imperfect_validation if a.imperfect else accuracy_validation
     return sum_up(measure_all(render_and_measure, cases, a.jobs, say))

@@ -275,7 +275,8 @@ def find_systematic(system: DiscSystem, known: Values | None = None, beside: Seq
     data = view.across_poses(view.residual)[:, 0]
     numbers = float(np.sum(system.weights[rows] - 6.0))
     size = max(float(np.sqrt(np.mean(data**2))), 1.0)
-    extent = float(np.max([np.ptp(view.places[:, c][view.used[:, c]], axis=0).max() for c in range(2)]))
+    seen = [view.places[:, c][view.used[:, c]] for c in range(2) if view.used[:, c].any()]
+    extent = float(np.max([np.ptp(places, axis=0).max() for places in seen]))
     typical = {fault.name: TYPICAL_STEPS * fault.step for fault in system.faults}
     faults = {name: view.whitened(columns) for name, columns in view.faults.items()}
     faults = {name: columns for name, columns in faults.items() if np.linalg.norm(columns) * typical[name] > 3.0}

@@ -19,8 +19,11 @@ from calibration.kit.arrays import Array
 from disctrack.disc import Disc
 from disctrack.faults.dots import MeasurementSetup, Sight, ellipse_centre_shift, predict
 from disctrack.faults.keys import Faults
+from disctrack.findings import Kind
 from disctrack.frames import CAMERAS
 
+MOVED = (Kind.CAMERA_MOVED, Kind.DOTS_MISFIT, Kind.CAMERAS_CONTRADICT, Kind.TABLE_DISAGREES)
+HEIGHT = (Kind.TABLE_DISAGREES, Kind.OFF_THE_TABLE, Kind.THICKNESS, Kind.BOARD_THICKNESS)
 TYPICAL_STEPS = 30  # a fault of so many steps surprises nobody: 1/3 px, 0.02 deg, 0.3 mm, 0.3 ms
 _DEG = 180 / np.pi
 
@@ -51,6 +54,7 @@ class Fault:
     seen: str = ""  # what a user notices
     remedy: str = ""
     declared: str = ""  # the key of recording.toml that would explain it
+    named_by: tuple[Kind, ...] = ()  # findings of a run that are about it; none: it does not show in one
 
     def names(self) -> tuple[str, ...]:
         """Of its quantities."""
@@ -151,19 +155,22 @@ CLOCKS = (
     Fault("time_offset", "the right camera exposes later than the left", "synchronisation of the cameras",
           ("delay",), "s", 1e-5, "right minus left", "right_delay_s", ("delay",), bounds=(-0.05, 0.05), along=_delayed,
           seen="the dots of the two cameras contradict each other, the more the faster the disc is",
-          remedy="check the trigger; renumber the images of the camera that is ahead by whole frames"),
+          remedy="check the trigger; renumber the images of the camera that is ahead by whole frames",
+          named_by=(Kind.DELAY, Kind.DROPPED_FRAMES)),
     Fault("frame_rate", "the true frame rate differs from the declared one", "clock of the cameras",
           ("change",), "1", 1e-4, "true over declared minus one", "frame_rate_hz", ("faster",), bounds=(-0.6, 1.2),
           of_poses_alone=False, along=_faster,
           to_key=lambda v, _, rate: float(rate * (1.0 + v[0])) if v[0] else 0.0,
           from_key=lambda x, rate: x / rate - 1.0 if x else 0.0,
           seen="the balance of moments asks for another gravity: g goes as the square of the rate",
-          remedy="declare the rate that the camera's software states", declared="[cameras] frame_rate_hz"),
+          remedy="declare the rate that the camera's software states", declared="[cameras] frame_rate_hz",
+          named_by=(Kind.GRAVITY_OR_RATE,)),
     Fault("exposure_blur", "dots are averaged over an exposure", "centre moves by T^2/24 times its acceleration",
           ("T2",), "s^2", 1e-7, "square of the exposure", "exposure_s", bounds=(0.0, 1e-3), in_images=True,
           of_poses_alone=False, along=_blurred, to_key=lambda v, *_: float(np.sqrt(max(v[0], 0.0))),
           from_key=lambda x, _: x**2, seen="dots smeared along their way, nutation too small",
-          remedy="declare the exposure, or expose for a shorter time", declared="[cameras] exposure_us"),
+          remedy="declare the exposure, or expose for a shorter time", declared="[cameras] exposure_us",
+          named_by=(Kind.EXPOSURE,)),
     Fault("ellipse_centre", "centres of ellipses were taken for images of the centres", "perspective of circles",
           ("share",), "1", 0.1, "1: not corrected at all, -1: corrected twice", "ellipse_centre_share",
           bounds=(-2.0, 2.0), in_images=True,
@@ -176,48 +183,58 @@ _AGAIN = "calibrate again where you record"
 OF_CAMERAS = (  # of either camera
     Fault("turned", "the {} camera turned after its calibration", _KNOCK, ("rotation_x", "rotation_y", "rotation_z"),
           "rad", 1e-5, "in its own axes", "rotation_deg", ("rotation",), _DEG, bounds=(-0.06, 0.06),
-          seen=_MISSED, remedy=_AGAIN),
+          seen=_MISSED, remedy=_AGAIN,
+          named_by=MOVED),
     Fault("shifted", "the {} camera moved after its calibration", _KNOCK,
           ("translation_x", "translation_y", "translation_z"), "m", 1e-5, "in its own axes", "translation_mm",
-          ("translation",), 1e3, bounds=(-0.01, 0.01), seen=_MISSED, remedy=_AGAIN),
+          ("translation",), 1e3, bounds=(-0.01, 0.01), seen=_MISSED, remedy=_AGAIN,
+          named_by=MOVED),
     Fault("focal", "the focal length of the {} camera changed", "focus, temperature", ("change",), "1", 1e-5,
-          "relative", "focal_scale", ("focal",), null=1.0, bounds=(-0.05, 0.05), seen=_MISSED, remedy=_AGAIN),
+          "relative", "focal_scale", ("focal",), null=1.0, bounds=(-0.05, 0.05), seen=_MISSED, remedy=_AGAIN,
+          named_by=MOVED),
     Fault("principal_point", "the principal point of the {} camera moved", "lens not fixed", ("x", "y"), "px", 0.01,
-          "in the image", "principal_point_change_px", ("centre",), bounds=(-5.0, 5.0), seen=_MISSED, remedy=_AGAIN),
+          "in the image", "principal_point_change_px", ("centre",), bounds=(-5.0, 5.0), seen=_MISSED, remedy=_AGAIN,
+          named_by=MOVED),
     Fault("distortion", "the distortion of the {} camera changed", "focus, aperture, other lens", ("k1",), "1", 1e-3,
-          "change of Brown's k1", "k1_change", ("k1",), bounds=(-1.0, 1.0), seen=_MISSED, remedy=_AGAIN),
+          "change of Brown's k1", "k1_change", ("k1",), bounds=(-1.0, 1.0), seen=_MISSED, remedy=_AGAIN,
+          named_by=MOVED),
 )  # fmt: skip
 _MISPRINT = Fault(
     "misprint", "dot {} is not where it was declared", "printing", ("x", "y"), "m", 1e-6, "body axes", "misprint_mm",
     ("misprint",), belongs_to=("disc",), along=_of_one_dot, seen="one dot misses its place in every frame",
-    remedy="measure it on the sheet", declared="[markers] centres_mm",
+    remedy="measure it on the sheet", declared="[markers] centres_mm", named_by=(Kind.DOTS_MISPLACED, Kind.DOT_UNSEEN),
 )  # fmt: skip
 OF_THE_PAPER = (
     Fault("pattern_offset", "the dots as a whole are off the disc's centre", "gluing of the paper", ("x", "y"), "m",
           1e-6, "body axes", "pattern_offset_mm", ("pattern_offset", slice(2)), 1e3, belongs_to=("disc",),
           seen="the centre circles about another point once a turn of the spin",
-          remedy="centre the sheet, or measure by how much it is off", declared="[markers] centres_mm"),
+          remedy="centre the sheet, or measure by how much it is off", declared="[markers] centres_mm",
+          named_by=(Kind.DOTS_MISPLACED, Kind.TABLE_DISAGREES)),
     Fault("pattern_rotation", "the dots as a whole are turned on the face",
           "gluing; the same as another spin angle", ("angle",), "rad", 1e-5, "about e3", "pattern_turn_deg",
           ("pattern_turn",), _DEG, belongs_to=("disc",), seen="nothing: it is where phi is counted from"),
     Fault("pattern_scale", "the dots as a whole are printed too large", "printer", ("change",), "1", 1e-5, "relative",
           "pattern_scale", ("pattern_growth",), null=1.0, belongs_to=("disc",),
           seen="dots and chessboard contradict each other in their scale",
-          remedy="measure the printed sheet with a caliper", declared="[markers] centres_mm"),
+          remedy="measure the printed sheet with a caliper", declared="[markers] centres_mm",
+          named_by=(Kind.SQUARE, Kind.LENGTHS, Kind.DOTS_MISPLACED)),
     Fault("pattern_height", "the dots lie higher than half the thickness", "paper, glue, thickness", ("offset",), "m",
           1e-6, "along e3", "pattern_height_mm", ("pattern_offset", slice(2, 3)), 1e3, belongs_to=("disc",),
           seen="the disc's lowest point lies off the table",
-          remedy="measure the thickness with its paper", declared="[disc] thickness_mm"),
+          remedy="measure the thickness with its paper", declared="[disc] thickness_mm",
+          named_by=HEIGHT),
 )  # fmt: skip
 OF_THE_TABLE = (
     Fault("table_plane", "the table is not parallel to the calibration's table view", "board on a burr",
           ("tilt_x", "tilt_y"), "rad", 1e-5, "turn of the true table, calibrated axes", "table_turn_deg",
           ("table_turn", slice(2)), _DEG, seen="the disc's lowest point rises towards one side",
-          remedy="lay the board flat, and take the table view again", declared="[table] view"),
+          remedy="lay the board flat, and take the table view again", declared="[table] view",
+          named_by=(Kind.TABLE_VIEW, *HEIGHT)),
     Fault("table_height", "the table is not where the calibration's table view says", "thickness of the board",
           ("offset",), "m", 1e-6, "true height of the table in the calibrated axes", "table_height_mm",
           ("table_height",), 1e3, seen="the disc's lowest point lies off the table",
-          remedy="measure the board's thickness", declared="[table] board_thickness_mm"),
+          remedy="measure the board's thickness", declared="[table] board_thickness_mm",
+          named_by=HEIGHT),
 )  # fmt: skip
 
 

@@ -436,6 +436,7 @@ def _reading(path: Path) -> Iterator[h5py.File]:
 
 
 def _trajectory(file: h5py.File) -> Trajectory:
+    _check_units(file)
     groups = {"": read_variables(file)}
     groups |= {name: read_variables(file[name]) for name in ("markers", "calibration")}
     root, disc = groups[""], _read_disc(file["disc"])
@@ -467,6 +468,16 @@ def _trajectory(file: h5py.File) -> Trajectory:
     return trajectory
 
 
+def _check_units(file: h5py.File) -> None:
+    """Raise ValueError where numbers are in other units than this program writes."""
+    units = {name + ending: unit for name, (unit, _) in _COORDINATES.items() for ending in ("", "_sigma")}
+    units |= {_PLACES.get(attribute, attribute): unit for attribute, (_, unit, _) in _LAYOUT.items()} | {"time": "s"}
+    for name, unit in units.items():
+        found = str(file[name].attrs.get("units", unit)) if name in file else unit
+        if found != unit:
+            raise ValueError(f"{name} is in {found!r}; expected {unit!r}")
+
+
 def _read_disc(group: h5py.Group) -> Disc:
     sizes = {
         name.rpartition("_")[0]: float(group.attrs[name])
@@ -487,6 +498,7 @@ def _rig(group: h5py.Group, values: Mapping[str, NDArray]) -> StereoRig:
     return StereoRig(left, right, **placed, world_is_table=bool(group.attrs["world_is_table"]))
 
 
+_ROUNDED = 1e-3  # of a quaternion's length, by whoever wrote it with few digits
 _MOST_METRES, _MOST_RADIANS = 1e3, 1e6  # beyond, no disc was filmed and squares lose all digits
 
 
@@ -502,7 +514,14 @@ def _check_values(trajectory: Trajectory) -> None:
     if far.any():
         row, column = np.argwhere(far)[0]
         raise ValueError(f"{COORDINATES[column]} of frame {frame[row]} is {q[row, column]:g}, which is no pose")
+    for known, status in ((FrameStatus, trajectory.frame_status), (MarkerStatus, trajectory.marker_status)):
+        unknown = ~np.isin(status, [*known])
+        if unknown.any():
+            raise ValueError(f"frame {frame[np.argwhere(unknown)[0][0]]} has an unknown status {status[unknown][0]}")
     posed = np.flatnonzero(np.isfinite(q).all(axis=1))
+    off = np.abs(np.linalg.norm(trajectory.quaternion[posed], axis=1) - 1) > _ROUNDED
+    if off.any() or not np.isfinite(trajectory.quaternion[posed]).all():
+        raise ValueError(f"quaternion of frame {frame[posed[int(np.argmax(off))]]} is no rotation")
     sound: Mask = np.asarray(np.isfinite(C[posed]).all(axis=(1, 2)))
     sound[sound] = np.linalg.eigvalsh(C[posed][sound])[:, 0] > 0
     if not sound.all():

@@ -13,10 +13,9 @@ from disctrack.validate.errors import (
     PoseErrors,
     calibration_consistency,
     joined,
-    mean_errors,
     noise_consistency,
 )
-from disctrack.validate.rendered import EXPOSURE, IMPERFECT, STATIC, STRATA_DEG, RenderedOutcome
+from disctrack.validate.rendered import EXPOSURE, STATIC, STRATA_DEG, RenderedOutcome
 from disctrack.validate.tables import Table, Validation
 
 CLAIM_POSITION = 5e-6  # [m] and
@@ -25,8 +24,6 @@ REGULAR_DEG = 5.0  # psi and phi are summed up from here on; below, 1/sin(theta)
 LAW_DEG = 20.0  # at larger nutation the cameras' directions matter more than 1/sin(theta)
 CONSISTENT = (0.8, 1.25)
 _UM, _MDEG = 1e6, 180e3 / np.pi
-
-Pair = tuple[PoseErrors, PoseErrors]  # through the own calibration, through the true cameras
 
 
 @dataclass(frozen=True)
@@ -67,11 +64,11 @@ class SightCount:
 
 @dataclass(frozen=True)
 class Accuracy:
-    """All that recordings with static poses showed."""
+    """All that recordings, some with static poses, showed."""
 
-    recordings: int
     corners_px: tuple[float, ...]
-    rows: dict[str, tuple[AccuracyRow, ...]]  # by part of the recordings
+    rows: dict[str, tuple[AccuracyRow, ...]]  # by name of the recordings
+    strata: tuple[tuple[float, ...], ...]  # by STRATA_DEG: see `_strata`
     sights: tuple[SightCount, ...]
     consistency: dict[str, Consistency]  # of the noise in each part, and of the calibration
     law: float  # [rad] c of sigma(psi) = c / sin(theta)
@@ -83,33 +80,29 @@ class Accuracy:
 
 
 def sum_up(outcomes: Sequence[RenderedOutcome]) -> Accuracy:
-    """Of recordings that have static poses; errors count where both cameras see the face."""
-    parts = _parts(outcomes)
-    static = [outcome.parts[STATIC] for outcome in outcomes]
-    law = joined([true for _, true in parts[STATIC]])
-    law = law.part(law.usable & (law.q[:, 4] < np.radians(LAW_DEG)))
-    consistency = {
-        f"noise, {name} (true cameras)": noise_consistency(joined([true for _, true in pairs]))
-        for name, pairs in parts.items()
-    }
-    by_calibration = {"calibration (own - true cameras, same images)": calibration_consistency(parts[STATIC])}
+    """Errors count where both cameras see the face."""
+    by_name = {name: [o for o in outcomes if o.name == name] for name in dict.fromkeys(o.name for o in outcomes)}
+    static, both = by_name[STATIC], {}
+    for name, some in by_name.items():
+        pairs = [outcome.seen_by_both for outcome in some]
+        both[name] = joined(own for own, _ in pairs), joined(true for _, true in pairs)
+    _, noise = both[STATIC]
+    law = noise.part(noise.usable & (noise.q[:, 4] < np.radians(LAW_DEG)))
+    c = _rms(law.angles[:, [0, 2]] * np.sin(law.q[:, 4])[:, None])
+    consistency = {f"noise, {name} (true cameras)": noise_consistency(true) for name, (_, true) in both.items()}
+    by_calibration = calibration_consistency(outcome.seen_by_both for outcome in static)
     return Accuracy(
-        len(outcomes),
         tuple(outcome.corners_px for outcome in outcomes),
-        {name: _rows(pairs) for name, pairs in parts.items()},
-        tuple(_sight(joined([m.own.part(m.cameras == n) for m in static]), n) for n in (2, 1, 0)),
-        consistency | by_calibration,
-        _rms(law.angles[:, [0, 2]] * np.sin(law.q[:, 4])[:, None]),
-        tuple(sorted({w for outcome in outcomes for m in outcome.parts.values() for w in m.warnings})),
+        {name: _rows(*pair) for name, pair in both.items()},
+        _strata(*both[STATIC]),
+        tuple(_sight(joined(o.own.part(o.cameras == n) for o in static), n) for n in (2, 1, 0)),
+        consistency | {"calibration (own - true cameras, same images)": by_calibration},
+        c,
+        tuple(sorted({warning for outcome in outcomes for warning in outcome.warnings})),
     )
 
 
-def _parts(outcomes: Sequence[RenderedOutcome]) -> dict[str, list[Pair]]:
-    return {name: [outcome.parts[name].seen_by_both for outcome in outcomes] for name in outcomes[0].parts}
-
-
-def _rows(pairs: Sequence[Pair]) -> tuple[AccuracyRow, ...]:
-    own, true = (joined(errors) for errors in zip(*pairs, strict=True))
+def _rows(own: PoseErrors, true: PoseErrors) -> tuple[AccuracyRow, ...]:
     both = own.usable & true.usable
     regular = both & (own.q[:, 4] > np.radians(REGULAR_DEG))
     rows = []
@@ -117,16 +110,25 @@ def _rows(pairs: Sequence[Pair]) -> tuple[AccuracyRow, ...]:
         at = regular if name in ("psi", "phi") and regular.any() else both
         e, f = own.part(at).of(name), true.part(at).of(name)
         difference = e - f if name in "xyz" else np.angle(np.exp(1j * (e - f)))
-        rows.append(AccuracyRow(name, len(e), *_spread(e), _rms(f), _rms(difference)))
+        size = np.abs(e) if e.size else np.array([np.nan])
+        bias, scatter = (float(e.mean()), float(e.std())) if e.size else (np.nan, np.nan)
+        spread = bias, scatter, float(np.quantile(size, 0.95)), float(size.max())
+        rows.append(AccuracyRow(name, len(e), *spread, _rms(f), _rms(difference)))
     return tuple(rows)
 
 
-def _spread(errors: Array) -> tuple[float, float, float, float]:
-    """Mean, standard deviation, 95 % and largest of the sizes; NaN where there is no error."""
-    if not errors.size:
-        return float("nan"), float("nan"), float("nan"), float("nan")
-    size = np.abs(errors)
-    return float(errors.mean()), float(errors.std()), float(np.quantile(size, 0.95)), float(size.max())
+def _strata(own: PoseErrors, true: PoseErrors) -> tuple[tuple[float, ...], ...]:
+    """Of each stratum the number of poses, and rms of position, of four angles, and of psi through the true cameras."""
+    theta, found = np.degrees(own.q[:, 4]), []
+    for low, high in STRATA_DEG:
+        at = (theta >= low) & (theta < high)
+        seen, noise = own.part(at), true.part(at)
+        rms = [
+            _rms(seen.error[seen.usable, :3]),
+            *(_rms(seen.of(name)) for name in ("rotation", "theta", "psi", "phi")),
+        ]
+        found.append((int(at.sum()), *rms, _rms(noise.of("psi"))))
+    return tuple(found)
 
 
 def _sight(own: PoseErrors, cameras: int) -> SightCount:
@@ -140,7 +142,7 @@ def _rms(errors: Array) -> float:
 
 
 def verdict(accuracy: Accuracy) -> str:
-    """Where the claim holds and where it cannot, from the numbers."""
+    """Where the claim holds, where it cannot, and by which factor it is beaten; all from the numbers."""
     rows = {row.quantity: row for row in accuracy.rows[STATIC]}
     position = max(rows[name].within_95 for name in "xyz")
     rotation = rows["rotation"].within_95
@@ -182,82 +184,69 @@ def complaints(accuracy: Accuracy) -> tuple[str, ...]:
 
 def accuracy_validation(outcomes: Sequence[RenderedOutcome]) -> Validation:
     """All tables of recordings with static poses, with the verdict on top."""
-    accuracy, parts = sum_up(outcomes), _parts(outcomes)
-    tables = [_accuracy_table(kind, rows) for kind, rows in accuracy.rows.items()]
-    tables += [_strata_table(accuracy.law, parts[STATIC]), _sight_table(accuracy), _consistency_table(accuracy)]
+    accuracy = sum_up(outcomes)
+    tables = [_accuracy_table(name, rows) for name, rows in accuracy.rows.items()]
+    strata = []
+    for (low, high), (n, position, *angles) in zip(STRATA_DEG, accuracy.strata, strict=True):
+        if not n:
+            continue
+        law = accuracy.law / np.sin(np.radians(np.sqrt(low * high)))
+        strata.append([f"{low:g}-{high:g}", str(n), *_cells(_UM, position), *_cells(_MDEG, *angles, law)])
+    names = ("rotation", "theta", "psi", "phi", "psi noise")
+    law_said = f"{_MDEG * accuracy.law:.2f} / sin(theta)"
+    head = ["theta [deg]", "n", "position [um]", *(f"{name} [mdeg]" for name in names), law_said]
+    tables.append(Table("As a function of nutation (static poses)", head, strata, "Root mean squares."))
+    sights = [
+        [*map(str, (s.cameras, s.n, s.found, s.gross)), *_cells(_UM, s.position), *_cells(_MDEG, s.rotation)]
+        for s in accuracy.sights
+    ]
+    head = ["cameras", "poses", "found", "wrong", "position rms [um]", "rotation rms [mdeg]"]
+    note = "A pose that no camera can see rightly has no answer."
+    tables.append(Table("Who sees the face (static poses)", head, sights, note))
+    honest = [[name, *_cells(1, c.value, c.uncertainty), str(c.n)] for name, c in accuracy.consistency.items()]
+    head = ["squared error over predicted variance", "value", "standard error", "poses or rigs"]
+    corners = ", ".join(f"{rms:.4f}" for rms in accuracy.corners_px)
+    note = f"Target {CONSISTENT[0]} to {CONSISTENT[1]}. Corner residuals of the calibrations: {corners} px."
+    tables.append(Table("Honesty of the reported covariance", head, honest, note))
     return Validation("validation", verdict(accuracy), tables, [accuracy], complaints(accuracy), accuracy.warnings)
 
 
-def _cells(*values: float) -> list[str]:
-    return [f"{value:.2f}" if np.isfinite(value) else "-" for value in values]
+def _cells(unit: float, *values: float) -> list[str]:
+    return [f"{unit * value:.2f}" if np.isfinite(value) else "-" for value in values]
 
 
-def _accuracy_table(kind: str, rows: Sequence[AccuracyRow]) -> Table:
+def _accuracy_table(name: str, rows: Sequence[AccuracyRow]) -> Table:
     head = ["quantity", "unit", "n", "bias", "scatter", "95 %", "noise", "calibration", "claim / 95 %"]
     lines = []
     for row in rows:
         k, unit = (_UM, "um") if row.quantity in "xyz" else (_MDEG, "mdeg")
         errors = (row.bias, row.scatter, row.within_95, row.noise_rms, row.calibration_rms)
-        cells = _cells(*(k * error for error in errors))
-        lines.append([row.quantity, unit, str(row.n), *cells, f"{row.claim / row.within_95:.1f}"])
+        lines.append([row.quantity, unit, str(row.n), *_cells(k, *errors), f"{row.claim / row.within_95:.1f}"])
     note = "Rotation: the rotation vector between measured and true attitude."
     by_name = {row.quantity: row for row in rows}
     if by_name["psi"].n < by_name["theta"].n:
         note += f" psi and phi from {REGULAR_DEG:.0f} deg of nutation on."
-    if kind != STATIC:
+    if name != STATIC:
         note = f"Exposure {1e3 * EXPOSURE:g} ms, corrected for by the smear of the dots."
-    return Table(f"{kind[0].upper()}{kind[1:]}", head, lines, note)
-
-
-def _strata_table(law: float, static: Sequence[Pair]) -> Table:
-    own, true = (joined(errors) for errors in zip(*static, strict=True))
-    theta, angles = np.degrees(own.q[:, 4]), ("rotation", "theta", "psi", "phi")
-    lines = []
-    for low, high in STRATA_DEG:
-        at = (theta >= low) & (theta < high)
-        if not at.any():
-            continue
-        seen = own.part(at)
-        position = _UM * _rms(seen.error[seen.usable, :3])
-        rms = [_MDEG * _rms(seen.of(name)) for name in angles]
-        expected = _MDEG * law / np.sin(np.radians(np.sqrt(low * high)))
-        cells = _cells(position, *rms, _MDEG * _rms(true.part(at).of("psi")), expected)
-        lines.append([f"{low:g}-{high:g}", str(int(at.sum())), *cells])
-    head = ["theta [deg]", "n", "position [um]", *(f"{name} [mdeg]" for name in angles),
-            "psi noise [mdeg]", f"{_MDEG * law:.2f} / sin(theta)"]  # fmt: skip
-    return Table("As a function of nutation (static poses)", head, lines, "Root mean squares.")
-
-
-def _sight_table(accuracy: Accuracy) -> Table:
-    lines = [
-        [*map(str, (s.cameras, s.n, s.found, s.gross)), *_cells(_UM * s.position, _MDEG * s.rotation)]
-        for s in accuracy.sights
-    ]
-    head = ["cameras", "poses", "found", "wrong", "position rms [um]", "rotation rms [mdeg]"]
-    note = "A pose that no camera can see rightly has no answer."
-    return Table("Who sees the face (static poses)", head, lines, note)
-
-
-def _consistency_table(accuracy: Accuracy) -> Table:
-    lines = [[name, *_cells(c.value, c.uncertainty), str(c.n)] for name, c in accuracy.consistency.items()]
-    head = ["squared error over predicted variance", "value", "standard error", "poses or rigs"]
-    corners = ", ".join(f"{rms:.4f}" for rms in accuracy.corners_px)
-    note = f"Target {CONSISTENT[0]} to {CONSISTENT[1]}. Corner residuals of the calibrations: {corners} px."
-    return Table("Honesty of the reported covariance", head, lines, note)
+    return Table(f"{name[0].upper()}{name[1:]}", head, lines, note)
 
 
 def imperfect_validation(outcomes: Sequence[RenderedOutcome]) -> Validation:
     """Mean errors of recordings of an imperfect laboratory, with what is stated for them."""
+    lines, honest = [], []
     unit = np.array(3 * [_UM] + 3 * [_MDEG])
-    found = [mean_errors(outcome.parts[IMPERFECT].own) for outcome in outcomes]
-    lines = []
-    for outcome, m in zip(outcomes, found, strict=True):
-        means = [f"{e:.2f} +- {s:.2f}" for e, s in zip(m.error * unit, m.sigma * unit, strict=True)]
-        left, right = outcome.parts[IMPERFECT].systematic_px
-        lines.append([str(outcome.seed), *means, f"{m.noise_ratio:.2f}", f"{left:.4f}, {right:.4f}"])
-    honest = np.mean([(m.error / m.sigma) ** 2 for m in found], axis=0)
-    lines.append(["squared error over variance", *_cells(*honest), "", ""])
+    for outcome in outcomes:
+        errors = outcome.own.part(outcome.own.usable)
+        mean = errors.error.mean(axis=0)
+        sigma = np.sqrt(np.median(np.diagonal(errors.calibration_covariance, axis1=1, axis2=2), axis=0))
+        variance = np.diagonal(errors.covariance, axis1=1, axis2=2)
+        bends = np.diff(errors.error, 2, axis=0) ** 2 / 6.0  # of a smooth motion's frames, in their order
+        honest.append((mean / sigma) ** 2)
+        means = [f"{e:.2f} +- {s:.2f}" for e, s in zip(mean * unit, sigma * unit, strict=True)]
+        repeating = ", ".join(f"{rms:.4f}" for rms in outcome.systematic_px)
+        lines.append([str(outcome.seed), *means, *_cells(1, float(np.mean(bends / variance[1:-1]))), repeating])
+    lines.append(["squared error over variance", *_cells(1, *np.mean(honest, axis=0)), "", ""])
     head = ["seed", *POSE_COMPONENTS, "frame to frame, squared over stated", "repeating, px"]
     note = "Mean error +- what is stated for it, in um and mdeg."
     headline = f"Mean errors in {len(outcomes)} recordings."
-    return Validation("imperfect", headline, [Table("Imperfect laboratory", head, lines, note)], found)
+    return Validation("imperfect", headline, [Table("Imperfect laboratory", head, lines, note)], outcomes)

@@ -1,8 +1,8 @@
-"""Measured against true poses, and the numbers that sum up their differences."""
+"""Measured against true poses: their differences, and how these compare with what is stated."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -58,20 +58,17 @@ class PoseErrors:
 
 def compare(trajectory: Trajectory, q_true: Array) -> PoseErrors:
     """Comparison of a trajectory with the true poses (n, 6) of its frames."""
-    turn = rotation_from_quaternion(trajectory.quaternion) @ np.swapaxes(
-        rotation_from_euler(q_true[:, 3], q_true[:, 4], q_true[:, 5]), 1, 2
-    )
+    R = rotation_from_euler(*q_true[:, 3:].T)
+    turn = rotation_from_quaternion(trajectory.quaternion) @ np.swapaxes(R, 1, 2)
     error = np.concatenate([trajectory.q[:, :3] - q_true[:, :3], vector_from_rotation(turn)], axis=1)
     angles = np.angle(np.exp(1j * (trajectory.q[:, 3:] - q_true[:, 3:])))
-    lost = ~trajectory.measured
-    error[lost], angles[lost] = np.nan, np.nan
+    error[~trajectory.measured] = angles[~trajectory.measured] = np.nan
     return PoseErrors(q_true, error, angles, trajectory.pose_covariance, trajectory.calibration_covariance)
 
 
-def joined(parts: Sequence[PoseErrors]) -> PoseErrors:
+def joined(parts: Iterable[PoseErrors]) -> PoseErrors:
     """All poses of several comparisons."""
-    names = PoseErrors.__dataclass_fields__
-    return PoseErrors(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+    return PoseErrors(*map(np.concatenate, zip(*(vars(part).values() for part in parts), strict=True)))
 
 
 @dataclass(frozen=True)
@@ -83,11 +80,9 @@ class Consistency:
     n: int  # poses, or rigs, that are independent
 
 
-def _consistency(values: Sequence[Array] | Sequence[float]) -> Consistency:
+def _consistency(values: Sequence[float] | Array) -> Consistency:
     n = len(values)
-    if n == 0:
-        return Consistency(float("nan"), float("nan"), 0)
-    return Consistency(float(np.mean(values)), float(np.sqrt(2 / (6 * n))), n)
+    return Consistency(float(np.mean(values)) if n else float("nan"), float(np.sqrt(2 / (6 * max(n, 1)))), n)
 
 
 def _normalised(errors: Array, covariance: Array) -> Array:
@@ -98,10 +93,10 @@ def _normalised(errors: Array, covariance: Array) -> Array:
 def noise_consistency(comparison: PoseErrors) -> Consistency:
     """Mean of e^T C^-1 e / 6 with C the reported noise covariance; e must be free of calibration errors."""
     ok = comparison.usable
-    return _consistency(list(_normalised(comparison.error[ok], comparison.covariance[ok])))
+    return _consistency(_normalised(comparison.error[ok], comparison.covariance[ok]))
 
 
-def calibration_consistency(pairs: Sequence[tuple[PoseErrors, PoseErrors]]) -> Consistency:
+def calibration_consistency(pairs: Iterable[tuple[PoseErrors, PoseErrors]]) -> Consistency:
     """Squared calibration error over its reported variance, from the same images measured through two rigs.
 
     pairs : poses of each recording through its own calibration and through the true cameras. The image noise is in
@@ -114,23 +109,3 @@ def calibration_consistency(pairs: Sequence[tuple[PoseErrors, PoseErrors]]) -> C
         if ok.any():
             values.append(float(_normalised((own.error - true.error)[ok], own.calibration_covariance[ok]).mean()))
     return _consistency(values)
-
-
-@dataclass(frozen=True)
-class MeanErrors:
-    """What frames of one recording have in common, by POSE_COMPONENTS [m, rad]."""
-
-    error: Array  # (6,) mean over the frames
-    sigma: Array  # (6,) stated for it: what frames share
-    scatter: Array  # (6,) about the mean
-    noise_ratio: float  # squared scatter from frame to frame over its stated variance, mean of the components
-
-
-def mean_errors(errors: PoseErrors) -> MeanErrors:
-    """Of the frames of one smooth motion, in their order."""
-    ok = errors.usable
-    error, variance = errors.error[ok], np.diagonal(errors.covariance[ok], axis1=1, axis2=2)
-    shared = np.diagonal(errors.calibration_covariance[ok], axis1=1, axis2=2)
-    bends = np.diff(error, 2, axis=0) ** 2 / 6.0
-    sigma = np.sqrt(np.median(shared, axis=0))
-    return MeanErrors(error.mean(axis=0), sigma, error.std(axis=0), float(np.mean(bends / variance[1:-1])))

@@ -4,25 +4,22 @@ A case says what is filmed; the recording is a folder like any other and passes 
 the tracking as the user's would. Only the truth and the reported numbers enter a comparison.
 """
 
-import itertools
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibration.cameras.camera import StereoRig
-from calibration.kit.arrays import Array, Image
+from calibration.kit.arrays import Array
 from disctrack.calibrate.stage import calibrate_recording
 from disctrack.disc import Disc
 from disctrack.errors import SceneError
 from disctrack.frames import CAMERAS, rotation_from_euler
-from disctrack.recording.declaration import Recording, read_recording
-from disctrack.recording.readers import open_frames
-from disctrack.recording.readers.blocks import PairBlock, Unreadable, iter_pair_blocks
+from disctrack.recording.declaration import read_recording
+from disctrack.recording.readers.blocks import PairBlock, Unreadable
 from disctrack.synthetic import rig_of, write_recording
 from disctrack.synthetic.description import (
     BoardSettings,
@@ -34,8 +31,8 @@ from disctrack.synthetic.description import (
     RollingMotion,
     Scene,
 )
-from disctrack.synthetic.motion import SceneMotion, motion_of
 from disctrack.track.follow.tracking import Tracking, TrackingSettings, track
+from disctrack.track.measurement import open_pairs
 from disctrack.trajectory import part
 from disctrack.validate.errors import PoseErrors, compare
 from disctrack.validate.points import K_M
@@ -57,20 +54,22 @@ FEWEST_DOTS = 3  # two numbers each, six unknowns
 
 @dataclass(frozen=True)
 class RenderedCase:
-    """A recording to be rendered and measured: poses at rest, each without a prior, then stretches of rolling.
+    """A recording to be rendered and measured; poses of a STATIC one are each found without a prior.
 
     Whatever the scene plants (faults, imperfections, light) is in all of its images.
     """
 
+    name: str
     scene: Scene
-    q_static: Array  # (n, 6)
-    stretches: dict[str, Scene]  # by name: the same scene with a motion
 
 
 @dataclass(frozen=True)
-class MeasuredTwice:
-    """The same images measured twice: through the recording's own calibration, and through the true cameras."""
+class RenderedOutcome:
+    """What one recording showed, measured through its own calibration and through the true cameras."""
 
+    name: str
+    seed: int
+    corners_px: float  # rms residual of the calibration
     own: PoseErrors
     true: PoseErrors
     cameras: NDArray[np.int64]  # (n,) that see the upper face
@@ -81,15 +80,6 @@ class MeasuredTwice:
     def seen_by_both(self) -> tuple[PoseErrors, PoseErrors]:
         """Through the own calibration and through the true cameras, where both see the face."""
         return self.own.part(self.cameras == 2), self.true.part(self.cameras == 2)
-
-
-@dataclass(frozen=True)
-class RenderedOutcome:
-    """What one recording showed: STATIC first, where it has such poses, then its stretches."""
-
-    seed: int
-    corners_px: float  # rms residual of the calibration
-    parts: dict[str, MeasuredTwice]
 
 
 def scene_of(seed: int, quick: bool = False) -> Scene:
@@ -106,28 +96,34 @@ def scene_of(seed: int, quick: bool = False) -> Scene:
 
 
 def rendered_cases(n: int | None, seed: int, quick: bool = False, imperfect: bool = False) -> list[RenderedCase]:
-    """Of n recordings (None: as many as it takes) with seeds that count up; quick: small images, few of everything."""
+    """Of n sets of recordings (None: as many as it takes), seeds counting up; quick: small images, few of everything.
+
+    A set has one recording of an imperfect laboratory, or three of an ideal one.
+    """
     n = n or (1 if quick else 3)
     scenes = [scene_of(seed + k, quick) for k in range(n)]
     if imperfect:
         return [imperfect_case(scene, 60 if quick else 200) for scene in scenes]
     # static poses, frames of either stretch of rolling: shared out, but at least a dozen of each in a recording
     totals = (40, 24, 24) if quick else (96, 90, 90)
-    return [ideal_case(scene, *(max(12, -(-total // n)) for total in totals)) for scene in scenes]
+    counts = [max(12, -(-total // n)) for total in totals]
+    return [case for scene in scenes for case in ideal_cases(scene, *counts)]
 
 
-def ideal_case(scene: Scene, n_static: int, n_rolling: int, n_final: int) -> RenderedCase:
-    """Static poses of every attitude, and two stretches of rolling (0 frames: none)."""
+def ideal_cases(scene: Scene, n_static: int, n_rolling: int, n_final: int) -> list[RenderedCase]:
+    """Static poses of every attitude, and two recordings of rolling (0 frames: none)."""
     rng = np.random.default_rng([scene.seed, 8])
     q = static_poses(n_static, rig_of(scene), scene.declared_disc, scene.rig.target_mm[:2], rng)
     start = rng.uniform(8, 12)
-    stretches: dict[str, Scene] = {}
+    rows = (q * np.r_[np.full(3, 1e3), np.full(3, 180 / np.pi)]).tolist()
+    poses = MotionSettings(kind="static", poses=tuple((x, y, z, a, b, c) for x, y, z, a, b, c in rows))
+    cases = [RenderedCase(STATIC, replace(scene, motion=poses))]
     if n_rolling:
-        stretches[ROLLING] = rolling_scene(scene, start, n_rolling, rng)
+        cases.append(RenderedCase(ROLLING, rolling_scene(scene, start, n_rolling, rng)))
     if n_final:
         last = theta_before_rest_deg(n_final, scene.cameras.frame_rate_hz)
-        stretches[FINAL] = rolling_scene(scene, last, n_final, rng)
-    return RenderedCase(scene, q, stretches)
+        cases.append(RenderedCase(FINAL, rolling_scene(scene, last, n_final, rng)))
+    return cases
 
 
 def imperfect_case(scene: Scene, frames: int) -> RenderedCase:
@@ -151,8 +147,7 @@ def imperfect_case(scene: Scene, frames: int) -> RenderedCase:
         optics=replace(scene.optics, vignetting=0.15),
         light=replace(scene.light, glare=spots),
     )
-    rolling = rolling_scene(scene, rng.uniform(8, 16), frames, rng)
-    return RenderedCase(scene, np.empty((0, 6)), {IMPERFECT: rolling})
+    return RenderedCase(IMPERFECT, rolling_scene(scene, rng.uniform(8, 16), frames, rng))
 
 
 def rolling_scene(scene: Scene, theta_deg: float, n: int, rng: np.random.Generator) -> Scene:
@@ -179,73 +174,31 @@ def theta_before_rest_deg(n: int, frame_rate: float) -> float:
     return float(theta * (left / time) ** (2 / 3))
 
 
-def one_after_the_other(parts: Sequence[SceneMotion], rate: float) -> SceneMotion:
-    """Motions in one recording: frame i of part k is frame i + (all frames of the parts before)."""
-    starts = np.concatenate([[0], np.cumsum([part.n_frames for part in parts])])
-
-    def joined(name: str, time: Array) -> Array:
-        time = np.atleast_1d(np.asarray(time, float))
-        part_of = np.searchsorted(starts[1:-1], np.rint(time * rate), side="right")
-        q = np.empty((len(time), 6))
-        for k in np.unique(part_of):
-            rows = part_of == k
-            q[rows] = getattr(parts[k], name)(time[rows] - starts[k] / rate)
-        return q
-
-    return SceneMotion(partial(joined, "pose"), partial(joined, "rates"), int(starts[-1]))
-
-
 def render_and_measure(case: RenderedCase) -> RenderedOutcome:
     """Render the recording, calibrate from its own chessboards, measure it twice; nothing is left on the disk."""
-    scene, rate = case.scene, case.scene.cameras.frame_rate_hz
-    q, n = case.q_static, len(case.q_static)
-    at_rest = SceneMotion(
-        lambda time: q[np.rint(np.asarray(time) * rate).astype(int).clip(0, n - 1)],
-        lambda time: np.zeros((len(time), 6)),
-        n,
-    )
-    motions = ({STATIC: at_rest} if n else {}) | {name: motion_of(part) for name, part in case.stretches.items()}
-    filmed = replace(scene, motion=MotionSettings(kind="rolling"), cameras=replace(scene.cameras, exposure_s=EXPOSURE))
-    edges = np.cumsum([0, *(motion.n_frames for motion in motions.values())])
     with tempfile.TemporaryDirectory(prefix="disctrack-validate-") as folder:
-        truth = write_recording(Path(folder) / "recording", filmed, one_after_the_other([*motions.values()], rate))
+        truth = write_recording(Path(folder) / "recording", case.scene)
         recording = read_recording(Path(folder) / "recording")
         calibration, _ = calibrate_recording(recording)
-        parts = {
-            name: measure_twice(
-                read_images(recording, int(a), int(b)),
-                truth.q[a:b],
-                recording.disc,
-                (calibration.rig, truth.rig),
-                rate,
-                apart=name == STATIC,
-            )
-            for name, (a, b) in zip(motions, itertools.pairwise(edges), strict=True)
-        }
-    return RenderedOutcome(scene.seed, calibration.rms_px, parts)
-
-
-def read_images(recording: Recording, start: int, stop: int) -> Image:
-    """(n, 2, height, width) pairs start ... stop-1 of a recording."""
-    left, right = (
-        open_frames(pattern, recording.folder, camera)
-        for pattern, camera in zip((recording.left, recording.right), CAMERAS, strict=True)
+        pairs = open_pairs(recording)
+        images = np.stack([[pairs.left.read(i), pairs.right.read(i)] for i in range(len(pairs))])
+    disc, rate, apart = recording.disc, recording.frame_rate, case.name == STATIC
+    found = [locate(images, rig, disc, rate, apart=apart) for rig in (calibration.rig, truth.rig)]
+    rows = slice(None, None, 2 if apart else 1)
+    own, true = (compare(part(tracking.trajectory, rows), truth.q) for tracking in found)
+    return RenderedOutcome(
+        case.name,
+        case.scene.seed,
+        calibration.rms_px,
+        own,
+        true,
+        cameras_in_sight(truth.q, truth.rig, disc),
+        found[0].scatter.systematic_px,
+        tuple(finding.sentence for finding in found[0].findings),
     )
-    return np.concatenate([block.images.copy() for block in iter_pair_blocks(left, right, start, stop)])
 
 
-def measure_twice(
-    images: Image, q_true: Array, disc: Disc, rigs: tuple[StereoRig, StereoRig], rate: float, *, apart: bool
-) -> MeasuredTwice:
-    """Errors of images (n, 2, height, width) through two rigs, the own and the true one; `apart` as in `locate`."""
-    step = 2 if apart else 1
-    found = [locate(images, rig, disc, rate, apart=apart) for rig in rigs]
-    own, true = (compare(part(tracking.trajectory, slice(None, None, step)), q_true) for tracking in found)
-    seen = cameras_in_sight(q_true, rigs[1], disc)
-    return MeasuredTwice(own, true, seen, found[0].scatter.systematic_px, tuple(f.sentence for f in found[0].findings))
-
-
-def locate(images: Image, rig: StereoRig, disc: Disc, frame_rate: float, *, apart: bool) -> Tracking:
+def locate(images: NDArray, rig: StereoRig, disc: Disc, frame_rate: float, *, apart: bool) -> Tracking:
     """Track pairs in memory. apart: an unreadable pair follows each one, so that each is found without a prior."""
     step = 2 if apart else 1
 

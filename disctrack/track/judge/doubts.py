@@ -24,6 +24,7 @@ DISAGREE = 0.003  # chance that board and disc differ by that much: three standa
 ORDINARY_PX = 0.03  # rms of systematic misfit that good lenses have beyond their polynomial: no camera has moved
 HOPELESS = 25.0  # times the variance of the noise: no result of such dots is right within its sigmas
 SHAKEN = 1.4  # times what dots tell, from which on the scatter of the poses is worth a word
+PIECE = 5  # frames that agree with each other and with no others: exchanged frames are fewer
 NO_TOLERANCE = 0.4e-3  # [m] between the board's table and the disc's: a number declared wrong, or cameras that moved
 MOVED = "Was a camera moved or turned after its calibration? Then calibrate again."
 
@@ -153,7 +154,13 @@ def doubts_of(
     seen : the dots, with the poses that were fitted to them
     """
     misplaced = misplaced_dots(follower.setup.disc, trajectory.disc.marker_centres_body)
-    found = [*_one_sided(trajectory), *_symmetric(follower.setup.disc), *_clipped(follower), *misplaced]
+    found = [
+        *_lost(trajectory),
+        *_one_sided(trajectory),
+        *_symmetric(follower.setup.disc),
+        *_clipped(follower),
+        *misplaced,
+    ]
     own = scatter.whole if faults is None else max(1.0, faults.reduced_chi_square)
     systematic_px = max(scatter.systematic_px)
     if scatter.whole > min(FAULTY * own, HOPELESS) and systematic_px > ORDINARY_PX:
@@ -173,13 +180,36 @@ def doubts_of(
         text = (
             f"the disc's lowest point does not roll on the board's table: {table.sentence}. They differ by more than "
             "their tolerances allow: the board is bowed or its thickness is another, the disc's radius or thickness "
-            "is, a camera moved up or down by about twice as much since the calibration (or both together), or a long "
-            "exposure is not declared (exposure_us)"
+            "is, the sheet of dots is off the disc's centre, a camera moved up or down by about twice as much since "
+            "the calibration (or both together), or a long exposure is not declared (exposure_us)"
         )
         height = Number(1e6 * float(table.plane[0]), "um", 1e6 * float(np.hypot(table.sigma[0], table.board_sigma[0])))
         found.append(Finding(Kind.TABLE_DISAGREES, severity, text, numbers={"height": height},
                              explains=(Kind.OFF_THE_TABLE,)))  # fmt: skip
     return (*found, *off_the_table(trajectory, severity))
+
+
+def _lost(trajectory: Trajectory) -> Iterator[Finding]:
+    """Frames whose poses no motion joins to the others, and a recording that loses most of its frames."""
+    status, frame = trajectory.frame_status, trajectory.frame
+    jumped = np.flatnonzero(status == FrameStatus.JUMPED)
+    pieces = [piece for piece in np.split(jumped, np.flatnonzero(np.diff(jumped) > 1) + 1) if len(piece) >= PIECE]
+    if pieces:
+        stretches = tuple((int(frame[piece[0]]), int(frame[piece[-1]])) for piece in pieces)
+        told = ", ".join(f"{first}-{last}" for first, last in stretches)
+        text = (
+            f"no motion leads from the other frames to frames {told}, which are refused: both cameras lost pairs "
+            "there and the files were numbered on, the frames are in another order or of another recording, or the "
+            "frame rate is far too high"
+        )
+        where = Subject("track", frames=stretches)
+        yield Finding(Kind.CLOCK_JUMP, Severity.DOUBT, text, where, explains=(Kind.FRAMES_LOST,))
+    reasons = [s for s in FrameStatus if s.looked_for and not s.has_pose and s != FrameStatus.UNREADABLE]
+    counts = {reason: int(np.sum(status == reason)) for reason in reasons}
+    lost, measured, most = sum(counts.values()), int(trajectory.measured.sum()), max(reasons, key=lambda r: counts[r])
+    if lost > measured:
+        text = f"{lost} of {lost + measured} frames have no pose; {counts[most]} of them: {most.sentence}"
+        yield Finding(Kind.FRAMES_LOST, Severity.DOUBT, text, Subject("track"))
 
 
 def _one_sided(trajectory: Trajectory) -> Iterator[Finding]:

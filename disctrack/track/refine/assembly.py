@@ -27,7 +27,7 @@ from disctrack.track.refine.self_calibration import (
     refine_as_built,
     share_of_places,
 )
-from disctrack.track.refine.table_contact import OF_PATTERN, TableFromDisc, table_from_disc
+from disctrack.track.refine.table_contact import OF_PATTERN, TableFromDisc, off_centre, table_from_disc
 from disctrack.track.side_by_side import SHARED_FRAMES, evenly, side_by_side
 from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
 
@@ -95,8 +95,9 @@ def assemble(
     slips = dropped_frames(verdicts == FrameStatus.CONTRADICTED, seen, taken.pairs)
     moved = by_pattern(as_built, fits.R_world_body)
     fits, systematic, rig, table = table_from_disc(fits, systematic, as_built.rig, disc, settings.table, moved)
+    as_built = replace(as_built, rig=rig, off_centre=off_centre(table, fits.R_world_body, disc))
+    moved = by_pattern(as_built, fits.R_world_body)
     systematic += moved @ moved.swapaxes(1, 2)
-    as_built = replace(as_built, rig=rig)
     # after the table: what poses scatter beside their dots need not be white, and frames do not average it there
     poses = scatter_of_poses(fits)
     fits.covariance[...] *= np.sqrt(np.outer(poses.factor, poses.factor))

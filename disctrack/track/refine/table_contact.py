@@ -14,8 +14,9 @@ How far board and disc differ also tells how well both were made: two errors har
 board, and apart from it of the disc, without being declared, is narrowed to the difference that is seen.
 
 Where they differ by more than both sigmas allow, the one that bends is as a rule the board. It may be the table itself:
-a hollow that is rolled along is a slope there. So what is moved beyond the sigmas is kept (`TableFromDisc.beyond`), and
-whoever fits the motion lets the table's plane free by so much.
+a hollow that is rolled along is a slope there; a wrong radius or thickness, a camera that moved, a sheet of dots off
+the disc's centre look alike. So what is moved beyond the sigmas is in the sigma of the world's table, and of the dots'
+place on the disc (`off_centre`); it is kept, and whoever fits the motion lets the table's plane free by so much.
 
 This is geometry alone. A table that is not level leans in the world and against gravity; here the world leans with it.
 """
@@ -34,6 +35,7 @@ from disctrack.track.side_by_side import AT_ONCE, MIN_FRAMES
 
 SOURCES = ("both", "board", "disc")
 OF_PATTERN = "where the dots are on the disc"
+DISAGREEMENT = "board and disc disagree about the table"
 # Below, the direction of the contact is noise; above, a disc stands on its rim and may well slide or fall.
 THETA_RANGE = np.radians(0.7), np.radians(85.0)
 MAX_SCATTER = 30e-6  # [m] of the gaps about their plane: beyond, the disc jumps or the poses are not those of a disc
@@ -106,6 +108,7 @@ def table_from_disc(
     # of what the plane is as these cameras see the disc: errors that both share do not count
     gain = more @ np.linalg.inv(more + V) if source == "both" else np.eye(3) * (source == "disc")
     beyond = np.minimum(excess, (gain @ plane) ** 2)
+    in_doubt = np.sqrt(beyond) * (source == "both")
     beyond[0] += middle**2 @ beyond[1:]  # at the origin
     height, slope_x, slope_y = np.sqrt(beyond).tolist()
     told = TableFromDisc(
@@ -126,15 +129,18 @@ def table_from_disc(
     e3 = np.nan_to_num(fits.R_world_body[..., 2])
     systematic[:, :3, :3] += left * e3[:, :, None] * e3[:, None, :]
     if source != "board":
-        rig = _as_sure_as_both(rig, middle, gain, H, V, by_disc, by_place)
+        rig = _as_sure_as_both(rig, middle, gain, H, V, by_disc, by_place, in_doubt)
         fits, systematic, rig = _on_plane(fits, systematic, rig, told)
     return fits, systematic, rig, told
 
 
 def _as_sure_as_both(
-    rig: StereoRig, middle: Array, gain: Array, H: Array, V: Array, by_disc: Array, by_place: Array
+    rig: StereoRig, middle: Array, gain: Array, H: Array, V: Array, by_disc: Array, by_place: Array, in_doubt: Array
 ) -> StereoRig:
-    """The rig with covariance and allowances of a world whose table is moved by gain @ plane."""
+    """The rig with covariance and allowances of a world whose table is moved by gain @ plane.
+
+    in_doubt : (3,) of the plane, that neither sigma allows
+    """
     turn = rig.R_left_world
     M = np.zeros((N_RIG, 3))  # d RIG_PARAMETERS / d plane: the world is moved onto it
     M[WORLD_TURN] = turn @ np.array([[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [0.0, 0.0, 0.0]])
@@ -142,12 +148,25 @@ def _as_sure_as_both(
     moved = M @ gain
     kept = np.eye(N_RIG) - moved @ H
     stated = V - 0.75 * np.outer(by_disc[:, 1], by_disc[:, 1])
-    covariance = kept @ rig.covariance @ kept.T + moved @ stated @ moved.T
+    doubted = M * in_doubt
+    covariance = kept @ rig.covariance @ kept.T + moved @ stated @ moved.T + doubted @ doubted.T
     allowances = [replace(a, shift=kept @ a.shift) for a in rig.allowances]
     allowances.append(Allowance("the disc's radius", moved @ by_disc[:, 0]))
     allowances.append(Allowance("the disc's thickness", moved @ by_disc[:, 1] / 2.0))
     allowances += [Allowance(OF_PATTERN, moved @ column) for column in by_place.T if column.any()]
+    allowances += [Allowance(DISAGREEMENT, column) for column in doubted.T if column.any()]
     return replace(rig, covariance=0.5 * (covariance + covariance.T), allowances=tuple(allowances))
+
+
+def off_centre(table: TableFromDisc | None, R: Array, disc: Disc) -> float:
+    """Distance [m] of the dots' middle from the disc's that would make the table lean by what no sigma allows.
+
+    R : (n, 3, 3) attitudes; rolling round, the rim rises by that distance times sin(theta) on one side.
+    """
+    if table is None or table.source != "both":
+        return 0.0
+    sine = np.sqrt(1.0 - np.nanmedian(R[:, 2, 2]) ** 2)
+    return float(disc.radius * np.hypot(*table.beyond[1:]) / sine)
 
 
 def radius_tolerance(disc: Disc) -> float:

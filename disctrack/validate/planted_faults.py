@@ -1,0 +1,453 @@
+"""What becomes of a measurement when something is wrong with it that nobody declares.
+
+Faults are planted at three sizes, from just visible to gross, into recordings of different make. Those of the catalogue
+are rendered into the images of a scene; of a recording that was filmed, the rig and what is declared are made wrong by
+as much. Faults of files and of declared numbers are planted into both. Each recording is then run as its user would, in
+a process of its own, and its poses are compared with the truth, or with those that are found without the fault.
+"""
+
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from json import JSONDecodeError, loads
+from pathlib import Path
+from typing import Any
+from warnings import catch_warnings
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.cameras.camera import StereoRig
+from calibration.kit.arrays import Array
+from calibration.rig_file import read_rig, write_rig
+from disctrack.errors import DiscTrackError
+from disctrack.faults.catalogue import HEIGHT, MOVED, TYPICAL_STEPS, Fault, faults_of, scene_faults, setup_of
+from disctrack.faults.dots import MeasurementSetup
+from disctrack.files.toml_tree import toml_value
+from disctrack.findings import DoubtWarning, Finding, Kind, Severity, leading
+from disctrack.frames import CAMERAS, rotation_from_vector
+from disctrack.recording.declaration import Recording, read_recording
+from disctrack.synthetic import write_recording
+from disctrack.synthetic.description import Scene
+from disctrack.trajectory import Trajectory
+from disctrack.trajectory.file import read_trajectory
+from disctrack.validate.errors import compare
+from disctrack.validate.rendered import rolling_scene, scene_of
+from disctrack.validate.tables import Table, Validation, figure
+
+PAIRS = 100  # from so many on gravity and frame rate are judged
+THETA_DEG = 9.0  # of the scene
+SIZES = (0.1, 1.0, 10.0)  # times what surprises nobody: just visible, ordinary, gross
+MOST_SIGMAS = 5.0  # of six components of a hundred poses chance alone reaches 4.1
+MOST_TIMES = 3.0  # an ordinary run
+Tree = dict[str, Any]  # of a recording.toml
+
+
+@dataclass(frozen=True)
+class Ground:
+    """A recording in which nothing is wrong."""
+
+    recording: Path  # its folder
+    rig: Path
+    scene: Scene | None  # that it was rendered from
+    q: Array  # (n, 6) by frame: the truth, or what is found
+    seconds: tuple[float, float]  # of processor time that its run takes, with this rig and with a calibration
+
+    @property
+    def make(self) -> str:
+        """What a table calls it."""
+        return self.recording.name if self.scene is None else "rendered"
+
+
+@dataclass(frozen=True)
+class Planting:
+    """A fault as it is planted."""
+
+    sizes: Sequence[float]
+    unit: str
+    named_by: tuple[Kind, ...]
+    plant: Callable[[Ground, Path, float], Array | None]  # into a new folder; the true poses, where these are others
+
+
+@dataclass(frozen=True)
+class FaultCase:
+    """One fault of one size in one recording."""
+
+    ground: Ground
+    fault: str
+    size: float
+
+
+@dataclass(frozen=True)
+class FaultOutcome:
+    """What became of it."""
+
+    make: str
+    fault: str
+    size: float
+    unit: str
+    position: float  # largest error in its stated sigmas, and
+    rotation: float  # the same of the rotation vector; NaN where there is no pose
+    told: str  # the finding that names the fault; in brackets, another one
+    named: bool
+    code: int  # of exit
+    times: float  # an ordinary run
+
+    @property
+    def complaint(self) -> str:
+        """What must not be; empty where all is well."""
+        where = f"{self.make}: {self.fault} of {self.size:.3g} {self.unit}"
+        worst = np.nanmax([self.position, self.rotation, 0.0])
+        if self.code not in (0, 1, 3):
+            return f"{where}: exit code {self.code}"
+        if worst > MOST_SIGMAS and not self.named:
+            return f"{where}: {worst:.1f} sigma off, and not named ({self.told})"
+        return f"{where}: {self.times:.1f} times an ordinary run" if self.times > MOST_TIMES else ""
+
+
+def untouched(folder: Path, recordings: Sequence[Path], seed: int = 29) -> Iterator[Ground]:
+    """A rendered recording and the first pairs of each of these, run without any fault."""
+    scene = rolling_scene(scene_of(seed, quick=True), THETA_DEG, PAIRS, np.random.default_rng([seed, 34]))
+    scene = replace(scene, cameras=replace(scene.cameras, exposure_s=Scene().cameras.exposure_s))
+    truth = write_recording(folder / "rendered", scene)
+    yield _ground(folder / "rendered", scene, truth.q)
+    for path in recordings:
+        filmed = read_recording(path)
+        copy = folder / filmed.name
+        tree = _with_views(filmed, copy, _copied(filmed, copy))
+        _declare(copy, tree)
+        yield _ground(copy, None, None)
+
+
+def _ground(folder: Path, scene: Scene | None, q: Array | None) -> Ground:
+    code, findings, trajectory, _ = _run(folder)
+    if code or trajectory is None:
+        raise DiscTrackError(f"{folder.name}: something is wrong before anything is planted: {_said(findings)}")
+    ground = Ground(folder, folder / "results" / "rig.h5", scene, trajectory.q if q is None else q, (1.0, 1.0))
+    again = folder.with_name(f"{folder.name} again")
+    _declare(again, _shared(ground, again))
+    return replace(ground, seconds=(_run(again)[-1], _run(folder)[-1]))
+
+
+def fault_cases(grounds: Sequence[Ground], names: Sequence[str] = (), sizes: slice = slice(None)) -> list[FaultCase]:
+    """Every fault (or these) at all of its sizes (or these) in each recording."""
+    return [
+        FaultCase(ground, name, size)
+        for ground in grounds
+        for name, planting in plantings(ground).items()
+        for size in (planting.sizes[sizes] if not names or name in names else ())
+    ]
+
+
+def plant_and_run(case: FaultCase) -> FaultOutcome:
+    """Plant, run, compare; nothing is left on the disk."""
+    planting = plantings(case.ground)[case.fault]
+    folder = case.ground.recording.with_name(f"{case.ground.make} {case.fault} {case.size:g}")
+    try:
+        q = planting.plant(case.ground, folder, case.size)
+        code, findings, trajectory, seconds = _run(folder)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+    position, rotation = _in_sigmas(trajectory, case.ground.q if q is None else q)
+    naming = [f for f in findings if f.kind in planting.named_by]
+    told = _said(naming) if naming else f"({_said(findings)})" if findings else ""
+    of = case.ground.make, case.fault, case.size, planting.unit
+    return FaultOutcome(
+        *of, position, rotation, told, bool(naming), code, seconds / case.ground.seconds[case.fault in OF_VIEWS]
+    )
+
+
+def _run(folder: Path) -> tuple[int, list[Finding], Trajectory | None, float]:
+    """Exit code, findings, poses and processor time [s] of `disctrack run`; why it was refused is a finding, too."""
+    before = os.times()
+    words = ["run", str(folder), "--json", "--no-figures", "--no-video", "--overwrite"]
+    ended = subprocess.run([sys.executable, "-m", "disctrack", *words], capture_output=True, text=True, check=False)
+    after = os.times()
+    seconds = sum(after[2:4]) - sum(before[2:4])
+    try:
+        told = loads(ended.stdout)["findings"]
+    except JSONDecodeError:
+        return ended.returncode, [Finding(Kind.OTHER, Severity.REFUSAL, ended.stderr.strip()[-300:])], None, seconds
+    with catch_warnings(action="ignore", category=DoubtWarning):
+        trajectory = read_trajectory(folder / "results" / "trajectory.h5")
+    found = list(leading(trajectory.findings))
+    known = {finding.sentence for finding in found}
+    of_views = [one for one in told if one["sentence"] not in known]
+    found += [Finding(Kind.CALIBRATION, Severity[one["severity"].upper()], one["sentence"]) for one in of_views]
+    return ended.returncode, sorted(found, key=lambda finding: -finding.severity), trajectory, seconds
+
+
+def _said(findings: Sequence[Finding]) -> str:
+    """The gravest finding in short: its kind with its number; a refusal in its own words."""
+    if not findings:
+        return ""
+    finding = findings[0]
+    if finding.severity == Severity.REFUSAL or finding.kind == Kind.CALIBRATION:
+        return finding.text.replace("|", "/").replace("\n", " ")[:120]
+    values = [str(number) for number in finding.numbers.values()]
+    values += [
+        f"{remedy.key} {remedy.fits}" for remedy in finding.remedies if remedy.fits and "centres" not in remedy.key
+    ]
+    return f"{finding.kind.value}{f': {values[0]}' if values else ''}, {finding.severity.name.lower()}"
+
+
+def _in_sigmas(trajectory: Trajectory | None, q: Array) -> tuple[float, float]:
+    """Largest errors of position and rotation in their stated sigmas."""
+    if trajectory is None or not trajectory.measured.any():
+        return float("nan"), float("nan")
+    error = compare(trajectory, q[np.minimum(trajectory.frame, len(q) - 1)])
+    variance = np.diagonal(error.covariance + error.calibration_covariance, axis1=1, axis2=2)
+    sigmas = np.abs(error.error / np.sqrt(variance))[error.found]
+    return float(sigmas[:, :3].max()), float(sigmas[:, 3:].max())
+
+
+def plantings(ground: Ground) -> dict[str, Planting]:
+    """All faults that can be planted into such a recording, by name."""
+    return {fault.name: planting for fault, planting in _of_catalogue(ground)} | OF_FILES | OF_NUMBERS | OF_VIEWS
+
+
+def _of_catalogue(ground: Ground) -> Iterator[tuple[Fault, Planting]]:
+    """One camera and one dot stand for the others."""
+    others = "right" if ground.scene is None else "left"
+    for fault in faults_of(read_recording(ground.recording).disc):
+        alike = fault.name.startswith((others, "misprint")) and fault.name != "misprint_0"
+        declarable = fault.alters not in ((), ("delay",))  # as if rig, disc, dots or rate were declared wrong
+        if not fault.named_by or alike or (ground.scene is None and not declarable):
+            continue
+        plant = _declared_wrong if ground.scene is None else _rendered
+        sizes = [TYPICAL_STEPS * fault.step * size for size in SIZES]
+        yield fault, Planting(sizes, fault.unit, fault.named_by, partial(plant, fault))
+
+
+def _values(fault: Fault, size: float) -> Mapping[str, float]:
+    """Its numbers, all alike."""
+    return dict.fromkeys(fault.names(), size / np.sqrt(len(fault.parts)))
+
+
+def _rendered(fault: Fault, ground: Ground, folder: Path, size: float) -> Array:
+    scene = ground.scene
+    assert scene is not None
+    wrong = scene_faults(scene.declared_disc, _values(fault, size), scene.cameras.frame_rate_hz)
+    images = folder.with_name(f"{folder.name} images")
+    try:
+        truth = write_recording(images, replace(scene, faults=wrong, board=replace(scene.board, n_views=1)))
+        _declare(folder, _with_rig(_copied(read_recording(images), folder), ground.rig))
+    finally:
+        shutil.rmtree(images, ignore_errors=True)
+    return truth.q
+
+
+def _declared_wrong(fault: Fault, ground: Ground, folder: Path, size: float) -> None:
+    """As if what is declared were true but for the fault."""
+    tree = _shared(ground, folder)
+    disc = read_recording(ground.recording).disc
+    setup = setup_of(disc, {name: -value for name, value in _values(fault, size).items()})
+    places = setup.centres(disc)
+    tree["markers"]["centres_mm"] = (1e3 * places[:, :2]).tolist()
+    tree["disc"]["thickness_mm"] = 2e3 * float(disc.half_thickness + setup.pattern_offset[2])
+    tree["cameras"]["frame_rate_hz"] *= setup.rate
+    write_rig(folder / "rig.h5", _believed(read_rig(ground.rig), setup))
+    _declare(folder, _with_rig(tree, folder / "rig.h5"))
+
+
+def _believed(rig: StereoRig, setup: MeasurementSetup) -> StereoRig:
+    """Cameras and table as they are with this set-up; its table is that of the calibrated axes."""
+    rig = setup.cameras_of(rig)
+    R = rig.R_left_world @ rotation_from_vector(setup.table_turn)
+    lift = np.array([0.0, 0.0, setup.table_height])
+    return replace(rig, R_left_world=R, t_left_world=rig.t_left_world + R @ lift)
+
+
+def _copied(recording: Recording, folder: Path) -> Tree:
+    """The first pairs in a new folder, numbered anew; returns what is declared."""
+    tree: Tree = {name: dict(part) if isinstance(part, dict) else part for name, part in recording.declared.items()}
+    for camera, pattern in zip(CAMERAS, (recording.left, recording.right), strict=True):
+        tree["cameras"][camera] = _put(sorted(recording.folder.glob(pattern))[:PAIRS], folder / camera)
+    return tree
+
+
+def _put(files: Sequence[Path], folder: Path) -> str:
+    """Copy images, numbered as they come; returns their pattern."""
+    folder.mkdir(parents=True)
+    for number, file in enumerate(files):
+        shutil.copy(file, folder / f"{number:06d}{file.suffix}")
+    return f"{folder.name}/*{files[0].suffix}"
+
+
+def _with_rig(tree: Tree, rig: Path) -> Tree:
+    return tree | {"calibration": {"rig": str(rig)}}
+
+
+def _shared(ground: Ground, folder: Path) -> Tree:
+    """A copy that is measured with the rig of the untouched recording."""
+    return _with_rig(_copied(read_recording(ground.recording), folder), ground.rig)
+
+
+def _with_views(recording: Recording, folder: Path, tree: Tree) -> Tree:
+    """With views of its own."""
+    for camera in CAMERAS:
+        files = sorted(recording.folder.glob(recording.declared["calibration"][camera]))
+        tree["calibration"][camera] = _put(files, folder / f"board_{camera}")
+    return tree
+
+
+def _declare(folder: Path, tree: Tree) -> None:
+    lines = [f"{name} = {toml_value(value)}\n" for name, value in tree.items()]
+    (folder / "recording.toml").write_text("".join(lines), encoding="utf-8")
+
+
+def _pairs_lost(ground: Ground, folder: Path, size: float, cameras: Sequence[str] = CAMERAS) -> None:
+    """In the middle, and the files numbered on; both cameras end together."""
+    tree = _shared(ground, folder)
+    for camera in CAMERAS:
+        files = sorted((folder / camera).iterdir())
+        first = len(files) // 2 if camera in cameras else len(files) - int(size)
+        lost, kept = files[first : first + int(size)], files[first + int(size) :]
+        for file in lost:
+            file.unlink()
+        for old, new in zip(kept, files[first:], strict=False):
+            old.rename(new)
+    _declare(folder, tree)
+
+
+def _reversed(ground: Ground, folder: Path, size: float) -> None:
+    tree = _shared(ground, folder)
+    for camera in CAMERAS:
+        files = sorted((folder / camera).iterdir())
+        for file in files:
+            file.rename(file.with_name(f"old {file.name}"))
+        for file, new in zip(files, files[::-1], strict=True):
+            file.with_name(f"old {file.name}").rename(new)
+    _declare(folder, tree)
+
+
+def _exchanged(ground: Ground, folder: Path, size: float) -> None:
+    tree = _shared(ground, folder)
+    cameras = tree["cameras"]
+    cameras["left"], cameras["right"] = cameras["right"], cameras["left"]
+    _declare(folder, tree)
+
+
+def _redrawn(folder: Path, change: Callable[[NDArray, float], NDArray]) -> None:
+    """Change images; the number is the share of the recording before each."""
+    files = sorted(folder.iterdir())
+    for number, file in enumerate(files):
+        image = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+        assert image is not None
+        cv2.imwrite(str(file), change(image, number / len(files)))
+
+
+def _image_moved(ground: Ground, folder: Path, size: float, course: Callable[[float], float]) -> None:
+    """The right camera's images, in either direction by size times the course of time [px]."""
+
+    def moved(image: NDArray, share: float) -> NDArray:
+        by = size * course(share)
+        move = np.array([[1.0, 0.0, by], [0.0, 1.0, by]])
+        turned = cv2.warpAffine(
+            image, move, image.shape[::-1], flags=cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE
+        )
+        return turned if by else image
+
+    tree = _shared(ground, folder)
+    _redrawn(folder / "right", moved)
+    _declare(folder, tree)
+
+
+def _mirrored(ground: Ground, folder: Path, size: float) -> None:
+    tree = _shared(ground, folder)
+    _redrawn(folder / "right", lambda image, _: np.ascontiguousarray(image[:, ::-1]))
+    _declare(folder, tree)
+
+
+def _number(section: str, key: str, ground: Ground, folder: Path, size: float) -> None:
+    """A declared number is wrong by a share of itself; tolerances are the usual ones."""
+    tree = _shared(ground, folder)
+    for part in (tree["disc"], tree["table"]):
+        for tolerance in [name for name in part if "_tolerance_" in name]:
+            del part[tolerance]
+    tree[section][key] *= 1 + size
+    _declare(folder, tree)
+
+
+def _views(change: Callable[[Path, Tree, float], None], ground: Ground, folder: Path, size: float) -> None:
+    """Something is wrong with the views of the board, from which the rig is then made."""
+    recording = read_recording(ground.recording)
+    tree = _with_views(recording, folder, _copied(recording, folder))
+    change(folder, tree, size)
+    _declare(folder, tree)
+
+
+def _negative(folder: Path, tree: Tree, size: float) -> None:
+    for camera in CAMERAS:
+        _redrawn(folder / f"board_{camera}", lambda image, _: np.asarray(np.iinfo(image.dtype).max - image))
+
+
+def _repeated(folder: Path, tree: Tree, size: float) -> None:
+    for camera in CAMERAS:
+        for file in sorted((folder / f"board_{camera}").iterdir()):
+            for copy in range(1, int(size)):
+                shutil.copy(file, file.with_name(f"{int(file.stem) + 1000 * copy:06d}{file.suffix}"))
+
+
+def _late(folder: Path, tree: Tree, size: float) -> None:
+    files = sorted((folder / "board_right").iterdir())
+    for file in files[: int(size)]:
+        file.unlink()
+    for old, new in zip(files[int(size) :], files, strict=False):
+        old.rename(new)
+
+
+def _larger_square(folder: Path, tree: Tree, size: float) -> None:
+    tree["calibration"].pop("square_tolerance_mm", None)
+    tree["calibration"]["square_mm"] *= 1 + size
+
+
+_FEW, _ONCE, _SHARES = (1, 3, 10), (1,), (3e-3, 3e-2, 3e-1)
+OF_FILES = {
+    "pairs lost by both": Planting(_FEW, "pairs", (Kind.CLOCK_JUMP,), _pairs_lost),
+    "images lost by one": Planting(_FEW, "images", (Kind.DROPPED_FRAMES, Kind.DELAY),
+                                   partial(_pairs_lost, cameras=("right",))),
+    "camera knocked": Planting((0.02, 0.2, 2.0), "px", MOVED, partial(_image_moved, course=lambda x: float(x > 0.5))),
+    "camera drifts": Planting((0.03, 0.3, 3.0), "px", MOVED, partial(_image_moved, course=lambda x: x)),
+    "reversed": Planting(_ONCE, "", (Kind.REVERSED,), _reversed),
+    "exchanged": Planting(_ONCE, "", (Kind.EXCHANGED, Kind.OTHER), _exchanged),
+    "mirrored": Planting(_ONCE, "", (Kind.MIRRORED, Kind.OTHER), _mirrored),
+}  # fmt: skip
+OF_NUMBERS = {
+    "radius": Planting(_SHARES, "1", (Kind.RADIUS, *HEIGHT), partial(_number, "disc", "radius_mm")),
+    "thickness": Planting(_SHARES, "1", HEIGHT, partial(_number, "disc", "thickness_mm")),
+    "dot diameter": Planting(_SHARES, "1", (Kind.DIAMETER,), partial(_number, "markers", "diameter_mm")),
+    "gravity": Planting(_SHARES, "1", (Kind.GRAVITY_OR_RATE,), partial(_number, "gravity", "g_m_s2")),
+}
+OF_VIEWS = {
+    "square": Planting((1e-3, 1e-2, 1e-1), "1", (Kind.SQUARE, Kind.LENGTHS), partial(_views, _larger_square)),
+    "negative views": Planting(_ONCE, "", (Kind.CALIBRATION,), partial(_views, _negative)),
+    "repeated views": Planting((2, 3, 6), "times", (Kind.CALIBRATION,), partial(_views, _repeated)),
+    "views late in one": Planting((1, 2, 4), "views", (Kind.CALIBRATION, Kind.OTHER), partial(_views, _late)),
+}
+
+
+def faults_validation(outcomes: Sequence[FaultOutcome]) -> Validation:
+    """A table for each recording, and what must not be."""
+    off = [o for o in outcomes if np.nanmax([o.position, o.rotation, 0.0]) > MOST_SIGMAS]
+    headline = (
+        f"Of {len(outcomes)} planted faults {len(off)} move a pose by more than {MOST_SIGMAS:g} stated sigmas; "
+        f"{sum(o.named for o in off)} of these are named."
+    )
+    tables = [_table(make, [o for o in outcomes if o.make == make]) for make in dict.fromkeys(o.make for o in outcomes)]
+    return Validation("faults", headline, tables, outcomes, tuple(filter(None, (o.complaint for o in outcomes))))
+
+
+def _table(make: str, outcomes: Sequence[FaultOutcome]) -> Table:
+    rows = []
+    for o in outcomes:
+        numbers = [f"{o.size:.3g} {o.unit}".strip(), figure(o.position, 2), figure(o.rotation, 2)]
+        rows.append([o.fault, *numbers, o.told or "-", str(o.code), figure(o.times, 2)])
+    head = ["fault", "size", "position, sigma", "rotation, sigma", "named by", "exit", "time"]
+    note = "Largest error of a pose in its stated sigmas. In brackets: another finding. Time: over an ordinary run's."
+    return Table(f"Planted into a recording: {make}", head, rows, note)
