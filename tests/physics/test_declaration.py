@@ -110,9 +110,15 @@ def test_a_disc_of_no_known_density_is_told(key, factor, honest):
     assert Kind.DENSITY in [finding.kind for finding in contradictions(honest, disc)]
 
 
-def test_departures_that_a_table_or_an_edge_may_make_are_no_contradiction(honest):
-    assert contradictions(at_another_rate(honest, 1.03)) == ()
-    assert contradictions(replace(honest, gravity=9.81 * 0.95)) == ()
+def test_departures_that_a_table_or_an_edge_may_make_are_noted_and_no_contradiction(honest):
+    for trajectory, key, true in (
+        (at_another_rate(honest, 1.03), "[cameras] frame_rate_hz", 1000.0),
+        (replace(honest, gravity=9.81 * 0.97), "[gravity] g_m_s2", 9.81),
+    ):
+        (finding,) = contradictions(trajectory)
+        assert (finding.kind, finding.severity) == (Kind.GRAVITY_OR_RATE, Severity.NOTE)
+        assert abs(next(float(r.fits) for r in finding.remedies if r.key == key) / true - 1) < 2e-3
+    assert contradictions(replace(honest, gravity=9.81 * 0.995)) == ()
 
 
 def test_a_film_that_runs_backwards_gains_energy(true_motion, as_tracked):

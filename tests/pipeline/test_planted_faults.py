@@ -309,6 +309,16 @@ def test_exchanged_frames_of_both_cameras_lie_on_no_motion(clip):
     assert (np.delete(status, range(19, 24)) == FrameStatus.MEASURED).all()
 
 
+def test_a_frame_rate_at_which_no_motion_joins_the_frames_is_a_doubt_that_names_it(clip):
+    """The frames are refused, one by one and rightly; a recording that loses most of them is no success."""
+    found = measure(clip.images, clip.rig, clip.disc, rate=1e12)
+    assert found.trajectory.measured.sum() < N / 2
+    assert in_doubt(found.findings)
+    (first, *_) = leading(found.findings)
+    assert first.kind == Kind.CLOCK_JUMP
+    assert "the frame rate is far too high" in first.text
+
+
 def test_a_gleam_on_some_dots_takes_their_weight_and_the_covariance_follows(clip):
     """It reaches all dots of the left image, and shifts one by ten sigmas whose own template hardly shows it."""
     assert clip.silently_wrong(gleam, 8) == []

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from disctrack.diagnosis import diagnose
 from disctrack.discrepancy.noise import common_modes
 from disctrack.discrepancy.search import explain
 from tests.oracles.measured_disc import measured, system_of, with_base_fit
@@ -72,3 +73,11 @@ def test_before_the_base_fit_has_converged_nothing_is_attributed():
     assert answer.held_out_before is None
     assert "has not converged" in answer.reason
     assert [f.candidate.name for f in explain(system, good).found] == ["table_tilt"]
+
+
+@pytest.mark.statistical
+def test_dots_of_one_camera_alone_are_diagnosed():
+    trajectory = measured({}, seed=3, n=160)
+    dots = trajectory.markers_px.copy()
+    dots[:, 1] = np.nan
+    assert diagnose(replace(trajectory, markers_px=dots)).diagnosis.verdict == "nothing missing"

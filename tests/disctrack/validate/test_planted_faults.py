@@ -1,0 +1,75 @@
+"""Faults are planted, run and compared; what is off by more than its sigmas and not named is told."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from disctrack.faults.catalogue import faults_of
+from disctrack.recording.declaration import read_recording
+from disctrack.synthetic.description import Scene
+from disctrack.validate.planted_faults import (
+    FaultOutcome,
+    Ground,
+    fault_cases,
+    faults_validation,
+    plant_and_run,
+    plantings,
+    untouched,
+)
+
+WELL = FaultOutcome("rendered", "turned", 3e-4, "rad", 2.0, 1.0, "camera moved: 0.017 deg, doubt", True, 3, 1.1)
+# what is still off by more than its sigmas and not named, with the largest such size
+UNNAMED = {"camera knocked": 0.02, "camera drifts": 0.03, "pattern_offset": 3e-6}
+
+
+@pytest.mark.parametrize(
+    ("outcome", "said"),
+    [
+        (WELL, ""),
+        (replace(WELL, position=400.0), ""),
+        (replace(WELL, position=np.nan, rotation=np.nan, told="refused", named=False, code=1), ""),
+        (replace(WELL, position=5.1, named=False), "5.1 sigma off, and not named"),
+        (replace(WELL, rotation=9.0, position=0.1, named=False, code=0), "9.0 sigma off"),
+        (replace(WELL, code=-11), "exit code -11"),
+        (replace(WELL, times=3.2), "3.2 times an ordinary run"),
+    ],
+)
+def test_a_pose_beyond_its_sigmas_that_nothing_names_is_a_complaint(outcome, said):
+    (complaint,) = faults_validation([outcome]).complaints or ("",)
+    assert said in complaint
+    assert bool(said) == bool(complaint)
+    assert f"| {outcome.fault} | 0.0003 rad |" in faults_validation([outcome]).markdown()
+
+
+def test_every_fault_of_the_catalogue_that_a_run_can_show_is_planted(sample_clip, tmp_path):
+    disc = read_recording(sample_clip).disc
+    kinds = {fault.name.removeprefix("right_") for fault in faults_of(disc) if fault.named_by}
+    kinds = {name for name in kinds if not name.startswith(("left_", "misprint"))} | {"misprint_0"}
+    filmed = Ground(sample_clip, tmp_path, None, np.empty((0, 6)), (1.0, 1.0))
+    rendered = {name.removeprefix("right_") for name in plantings(replace(filmed, scene=Scene()))}
+    declared = {name.removeprefix("left_") for name in plantings(filmed)}
+    assert kinds <= rendered
+    assert kinds - declared == {"time_offset", "exposure_blur"}, "what is no matter of rig, disc, dots or rate"
+    assert {case.fault for case in fault_cases([filmed], ["radius"])} == {"radius"}
+
+
+@pytest.fixture(scope="module")
+def grounds(sample_clip, tmp_path_factory):
+    return list(untouched(tmp_path_factory.mktemp("planted"), [sample_clip]))
+
+
+@pytest.mark.statistical
+def test_some_faults_of_one_size_are_named_or_within_the_sigmas(grounds):
+    names = ("left_turned", "right_shifted", "pattern_offset", "radius", "pairs lost by both", "negative views")
+    outcomes = [plant_and_run(case) for case in fault_cases(grounds, names, slice(-1, None))]
+    assert faults_validation(outcomes).complaints == ()
+    assert {outcome.fault for outcome in outcomes} == set(names)
+    assert sum(outcome.named for outcome in outcomes) >= len(outcomes) - 1
+
+
+@pytest.mark.slow
+def test_no_fault_of_any_size_is_silently_wrong_but_those_below_a_known_limit(grounds):
+    outcomes = [plant_and_run(case) for case in fault_cases(grounds)]
+    told = [o for o in outcomes if o.complaint and not o.size <= UNNAMED.get(o.fault, 0.0) * 1.001]
+    assert told == []
