@@ -214,13 +214,16 @@ def plantings(ground: Ground) -> dict[str, Planting]:
 def _of_catalogue(ground: Ground) -> Iterator[tuple[Fault, Planting]]:
     """One camera and one dot stand for the others."""
     others = "right" if ground.scene is None else "left"
-    for fault in faults_of(read_recording(ground.recording).disc):
+    recording = read_recording(ground.recording)
+    for fault in faults_of(recording.disc):
         alike = fault.name.startswith((others, "misprint")) and fault.name != "misprint_0"
         declarable = fault.alters not in ((), ("delay",))  # as if rig, disc, dots or rate were declared wrong
         if not fault.named_by or alike or (ground.scene is None and not declarable):
             continue
         plant = _declared_wrong if ground.scene is None else _rendered
         sizes = [TYPICAL_STEPS * fault.step * size for size in SIZES]
+        if fault.in_images:  # the square of an exposure, which ends before the next
+            sizes = [size for size in sizes if size * recording.frame_rate**2 < 1]
         yield fault, Planting(sizes, fault.unit, fault.named_by, partial(plant, fault))
 
 
@@ -395,8 +398,9 @@ def _repeated(folder: Path, tree: Tree, size: float) -> None:
 
 
 def _late(folder: Path, tree: Tree, size: float) -> None:
-    files = sorted((folder / "board_right").iterdir())
-    for file in files[: int(size)]:
+    """The right camera lost its first views, and both end together."""
+    left, files = (sorted((folder / f"board_{camera}").iterdir()) for camera in CAMERAS)
+    for file in (*files[: int(size)], *left[-int(size) :]):
         file.unlink()
     for old, new in zip(files[int(size) :], files, strict=False):
         old.rename(new)
@@ -415,8 +419,8 @@ OF_FILES = {
     "camera knocked": Planting((0.02, 0.2, 2.0), "px", MOVED, partial(_image_moved, course=lambda x: float(x > 0.5))),
     "camera drifts": Planting((0.03, 0.3, 3.0), "px", MOVED, partial(_image_moved, course=lambda x: x)),
     "reversed": Planting(_ONCE, "", (Kind.REVERSED,), _reversed),
-    "exchanged": Planting(_ONCE, "", (Kind.EXCHANGED, Kind.OTHER), _exchanged),
-    "mirrored": Planting(_ONCE, "", (Kind.MIRRORED, Kind.OTHER), _mirrored),
+    "exchanged": Planting(_ONCE, "", (Kind.EXCHANGED,), _exchanged),
+    "mirrored": Planting(_ONCE, "", (Kind.MIRRORED,), _mirrored),
 }  # fmt: skip
 OF_NUMBERS = {
     "radius": Planting(_SHARES, "1", (Kind.RADIUS, *HEIGHT), partial(_number, "disc", "radius_mm")),
@@ -428,7 +432,7 @@ OF_VIEWS = {
     "square": Planting((1e-3, 1e-2, 1e-1), "1", (Kind.SQUARE, Kind.LENGTHS), partial(_views, _larger_square)),
     "negative views": Planting(_ONCE, "", (Kind.CALIBRATION,), partial(_views, _negative)),
     "repeated views": Planting((2, 3, 6), "times", (Kind.CALIBRATION,), partial(_views, _repeated)),
-    "views late in one": Planting((1, 2, 4), "views", (Kind.CALIBRATION, Kind.OTHER), partial(_views, _late)),
+    "views late in one": Planting((1, 2, 4), "views", (Kind.CALIBRATION,), partial(_views, _late)),
 }
 
 

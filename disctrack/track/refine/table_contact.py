@@ -123,9 +123,9 @@ def table_from_disc(
         scatter,
         n,
     )
-    # of the disc's thickness, what the board's share of the height leaves
+    # of the disc's thickness, what the board's share of the height leaves, and what no sigma allows
     narrower = float(np.linalg.norm(by_disc[:, 1])) / max(2.0 * float(np.linalg.norm(by_thickness)), 1e-150)
-    left = ((1.0 - gain[0, 0]) * narrower * thickness_tolerance(disc) / 2.0) ** 2
+    left = ((1.0 - gain[0, 0]) * narrower * thickness_tolerance(disc) / 2.0) ** 2 + in_doubt[0] ** 2
     e3 = np.nan_to_num(fits.R_world_body[..., 2])
     systematic[:, :3, :3] += left * e3[:, :, None] * e3[:, None, :]
     if source != "board":
