@@ -9,18 +9,13 @@ from numpy.testing import assert_allclose
 from calibration.cameras.camera import N_RIG
 from disctrack.diagnosis.stage import diagnose
 from disctrack.faults.keys import Faults
-from disctrack.frames import (
-    euler_from_rotation,
-    quaternion_from_rotation,
-    rotation_from_quaternion,
-    unwrap_euler,
-)
+from disctrack.frames import euler_from_rotation, quaternion_from_rotation, unwrap_euler
 from disctrack.track.judge.doubts import off_the_table
-from disctrack.track.pose import fit_poses
 from disctrack.track.refine import table_contact
+from disctrack.track.refine.assembly import fit_all
 from disctrack.track.refine.self_calibration import motions_of_pattern
 from disctrack.track.refine.table_contact import table_from_disc
-from tests.oracles.measured_disc import measured
+from tests.oracles.measured_disc import dots_of, measured
 
 TURN, HEIGHT = (6e-4, -4e-4), 60e-6
 
@@ -31,18 +26,9 @@ def leaning():
 
 
 def poses_of(trajectory, lift=0.0):
-    R = rotation_from_quaternion(trajectory.quaternion)
-    fits = fit_poses(
-        trajectory.markers_px,
-        trajectory.markers_covariance_px2,
-        trajectory.rig,
-        trajectory.disc.marker_centres_body,
-        R,
-        trajectory.q[:, :3],
-    )
-    return replace(fits, t_world_body=fits.t_world_body + np.multiply.outer(lift, [0.0, 0.0, 1.0])), np.zeros(
-        (len(R), 6, 6)
-    )
+    fits = fit_all(dots_of(trajectory))
+    lifted = fits.t_world_body + np.multiply.outer(lift, [0.0, 0.0, 1.0])
+    return replace(fits, t_world_body=lifted), np.zeros((len(trajectory), 6, 6))
 
 
 def heights(fits, disc):
