@@ -8,6 +8,7 @@ taken from the frames around, so that a frame is judged by its neighbours and by
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
+from math import comb
 
 import numpy as np
 import scipy
@@ -179,7 +180,9 @@ def judge_poses(
     rest = _at_rest(fits)
     lost = repeated & ~_still_over_the_repeats(repeated, rest)
     good = replace(fits, converged=fits.converged & ~contradicted & ~lost)
-    *one_sided, both = (departure(good, weights) for weights in (FROM_BEFORE, FROM_AFTER, FROM_BOTH))
+    *one_sided, both = (
+        departure(good, weights) for weights in (differences(3, -3), differences(3, 0), differences(4, -2))
+    )
     nearest = np.fmin(*one_sided)
     moved = nearest / _quiet(nearest, rest)
     # next to an end or a gap, a quadratic is all there is, and it follows a slow camera's frames far worse
@@ -209,16 +212,21 @@ def _quiet(moved: Array, rest: Mask) -> Array:
 def departure(fits: PoseFits, weights: Mapping[int, float]) -> Array:
     """Squared length (n,), in its sigmas, of a sum of each frame's neighbours (and its own pose, 0): offset -> weight.
 
-    The weights' sum is 0, so that the sum is a pose's distance from where the others lead: FROM_BEFORE and FROM_AFTER
-    carry the quadratic through three neighbours on by a frame. A blow changes the velocity between two frames, so each
-    of them agrees with its own side; a pose that agrees with neither lies on no motion. FROM_BOTH is the cubic through
-    two neighbours on either side, which follows a motion that changes quickly from frame to frame far better. ACROSS
-    tells how far the disc went. NaN where one of the poses is missing.
+    The weights' sum is 0, so that the sum is a pose's distance from where the others lead: third differences from
+    before and from after carry the quadratic through three neighbours on by a frame. A blow changes the velocity
+    between two frames, so each of them agrees with its own side; a pose that agrees with neither lies on no motion.
+    Fourth ones hold the cubic through two neighbours on either side, which follows a motion that changes quickly from
+    frame to frame far better. NaN where one of the poses is missing.
     """
     square = np.full(len(fits.converged), np.nan)
     for rows, away, spread in sums_over_time(fits, weights):
         square[rows] = np.einsum("ni,ni->n", away, np.linalg.solve(spread, away[..., None])[..., 0])
     return square
+
+
+def differences(order: int, first: int) -> dict[int, float]:
+    """Weights of a difference of this order over successive frames: offset -> weight, from the first offset on."""
+    return {first + k: (-1.0) ** k * comb(order, k) for k in range(order + 1)}
 
 
 def sums_over_time(fits: PoseFits, weights: Mapping[int, float]) -> Iterator[tuple[NDArray[np.intp], Array, Array]]:
@@ -233,15 +241,10 @@ def sums_over_time(fits: PoseFits, weights: Mapping[int, float]) -> Iterator[tup
     good = fits.converged[near].all(axis=1)
     for some in np.array_split(rows[good], len(rows) // AT_ONCE + 1):
         near = some[:, None] + offsets
-        turn = vector_from_rotation(R[near] @ np.swapaxes(R[near[:, :1]], 2, 3))  # by little, from the first
+        middle = near[:, [len(offsets) // 2]]
+        turn = vector_from_rotation(R[near] @ np.swapaxes(R[middle], 2, 3))  # by little, from there
         away = np.einsum("k,nki->ni", weight, np.concatenate([t[near], turn], axis=2))
         yield some, away, np.einsum("k,nkij->nij", weight**2, C[near])
-
-
-FROM_BEFORE = {-1: -3.0, 0: 1.0, -2: 3.0, -3: -1.0}
-FROM_AFTER = {1: -3.0, 0: 1.0, 2: 3.0, 3: -1.0}
-FROM_BOTH = {0: 1.0, -2: 1 / 6, -1: -4 / 6, 1: -4 / 6, 2: 1 / 6}
-ACROSS = {-1: -1.0, 1: 1.0}
 
 
 def torn_off(fits: PoseFits, period: float, radius: float) -> Mask:
@@ -316,7 +319,7 @@ def _still_over_the_repeats(repeated: Mask, rest: Mask) -> Mask:
 def _at_rest(fits: PoseFits) -> Mask:
     """(n,) True where the poses before and after differ by no more than their noise: then a repeat shows no fault."""
     with np.errstate(invalid="ignore"):
-        rest = departure(fits, ACROSS) < _of_six(SUSPECT)
+        rest = departure(fits, {-1: -1, 1: 1}) < _of_six(SUSPECT)
     if len(rest) > 1:
         rest[-1] = rest[-2]
     return np.asarray(rest)

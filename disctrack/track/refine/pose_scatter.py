@@ -7,17 +7,14 @@ of 5 mm. So only frames are counted between which the disc precesses by less.
 """
 
 from dataclasses import dataclass
-from math import comb
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibration.kit.arrays import Array
-from disctrack.track.judge.outlier_tests import sums_over_time
+from disctrack.track.judge.outlier_tests import differences, sums_over_time
 from disctrack.track.pose import PoseFits
 
-# The frame itself first: turns are taken from there.
-SIXTH = {k: float((-1) ** k * comb(6, k + 3)) for k in (0, -3, -2, -1, 1, 2, 3)}
 SLOW = 0.2  # [rad] of precession from frame to frame
 # Horizontal place, height, tilt, turn about the vertical: light and view make each of them scatter in a way of its own.
 GROUPS = ((0, 1), (2,), (3, 4), (5,))
@@ -44,7 +41,7 @@ def scatter_of_poses(fits: PoseFits) -> PoseScatter:
     found, sigma, factor = np.full(4, np.nan), np.full(4, np.nan), np.ones(6)
     parts = [
         away[slow] ** 2 / np.diagonal(spread[slow], axis1=1, axis2=2)
-        for rows, away, spread in sums_over_time(fits, SIXTH)
+        for rows, away, spread in sums_over_time(fits, differences(6, -3))
         for slow in [_precession(fits.R_world_body, rows) < SLOW]
     ]
     square = np.concatenate(parts) if parts else np.empty((0, 6))
