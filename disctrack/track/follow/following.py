@@ -339,13 +339,12 @@ def _search(follower: Follower, images: Image, readable: Mask) -> bool:
     elif follower.before is not None:  # pairs come one by one: as from the pair before
         R, t = follower.before
         following = pose[0] @ R.T @ pose[0], 2 * pose[1] - t
-    follower.found = pose
     heading = Heading.leading_to(pose, following)
     if not follower.measured:
         _measure_blur_and_noise(follower, images, readable, pose, heading)
     if not _holds(follower, heading, images, readable):
         return False
-    follower.heading = heading
+    follower.heading, follower.found = heading, pose
     return True
 
 
