@@ -183,8 +183,15 @@ def _encoder(path: Path, size: tuple[int, int]) -> Iterator[Callable[[ColourImag
     try:
         import av
     except ImportError:
-        with _opencv_encoder(path, size) as write:
-            yield write
+        writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), PLAYBACK_HZ, (size[1], size[0]))
+        if not writer.isOpened():
+            raise OutputError(
+                f"{path}: this OpenCV cannot write mp4. Install PyAV: pip install disctrack[video]"
+            ) from None
+        try:
+            yield lambda picture: writer.write(np.ascontiguousarray(picture))
+        finally:
+            writer.release()
         return
     with av.open(str(path), "w", format="mp4") as container:
         stream = container.add_stream("libx264", rate=round(PLAYBACK_HZ), options={"preset": "ultrafast", "crf": "23"})
@@ -196,18 +203,3 @@ def _encoder(path: Path, size: tuple[int, int]) -> Iterator[Callable[[ColourImag
 
         yield write
         container.mux(stream.encode())
-
-
-@contextlib.contextmanager
-def _opencv_encoder(path: Path, size: tuple[int, int]) -> Iterator[Callable[[ColourImage], None]]:
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), PLAYBACK_HZ, (size[1], size[0]))
-    if not writer.isOpened():
-        raise OutputError(f"{path}: this OpenCV cannot write mp4. Install PyAV: pip install disctrack[video]")
-
-    def write(picture: ColourImage) -> None:
-        writer.write(np.ascontiguousarray(picture))
-
-    try:
-        yield write
-    finally:
-        writer.release()
