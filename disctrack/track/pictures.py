@@ -28,17 +28,14 @@ def coordinates_figure(trajectory: Trajectory) -> Figure:
             spreads.append(Curve(time, 1e3 * scale * shared[:, i], COLOURS["right"], label))
         value = Curve(time, scale * trajectory.q[:, i], INK, sigma=scale * sigma[:, i])
         rows += [(f"{name} ({unit})", [value]), (f"σ ({small})", spreads)]
-    figure = chart("time (s)", *rows, size=(9.0, 16.0), heights=(3.0, 1.3) * len(_NAMES))
+    lost = f"{int(np.sum(~trajectory.measured))} of {len(trajectory)} frames without a pose"
+    figure = chart(f"time (s); band ± {BAND:.0f} σ; {lost}", *rows, size=(9.0, 16.0), heights=(3.0, 1.3) * len(_NAMES))
     for axes in figure.axes[1::2]:
         low, high = axes.dataLim.intervaly
         if high > 30 * low > 0:
             axes.set_yscale("log")
         else:
             axes.set_ylim(bottom=0)
-    lost = int(np.sum(~trajectory.measured))
-    figure.axes[0].set_title(
-        f"Pose of the disc in {len(trajectory)} frames, {lost} without an answer; band ± {BAND:.0f} σ"
-    )
     return _lost_marked(figure, trajectory)
 
 
@@ -53,11 +50,11 @@ def reprojection_figure(trajectory: Trajectory) -> Figure:
         used.append(Curve(time, count, COLOURS[name]))
     chi = [Curve(time[[0, -1]], np.ones(2), MUTED, style="--"), Curve(time, trajectory.reduced_chi_square, INK)]
     rows = ("reprojection error, rms (px)", error), ("reduced χ²", chi), ("dots used", used)
-    figure = chart("time (s)", *rows, size=(11, 7.5), heights=(3, 2, 1.5))
+    unreadable = int(np.sum(trajectory.frame_status == FrameStatus.UNREADABLE))
+    below = "time (s)" + (f"; {unreadable} frames unreadable" if unreadable else "")
+    figure = chart(below, *rows, size=(11, 7.5), heights=(3, 2, 1.5))
     for axes in figure.axes:
         axes.set_ylim(bottom=0)
-    unreadable = int(np.sum(trajectory.frame_status == FrameStatus.UNREADABLE))
-    figure.axes[0].set_title("Reprojection error" + (f"; {unreadable} frames unreadable" if unreadable else ""))
     return _lost_marked(figure, trajectory)
 
 
