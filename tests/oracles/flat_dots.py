@@ -1,13 +1,27 @@
-"""Round dots on a plane that is seen by a homography, without a calibrated camera."""
+"""Dots of a single image located by their template: on a disc, and on a plane that is seen by a homography."""
 
 from dataclasses import replace
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from calibration.cameras.camera import Camera
+from calibration.cameras.camera import Camera, normalised_maps
 from disctrack.disc import MA_2014
-from disctrack.track.dots.template import locate_on_disc
+from disctrack.track.dots import _kernels as kernels
+from disctrack.track.dots.template import TYPICAL_BLUR_PX, dot_centres, face_of, typical_noise
+
+
+def locate_on_disc(image, camera, R, t, disc, *, maps=None, noise=None, blur_px=TYPICAL_BLUR_PX):
+    """The disc's dots in an image (height, width); R (3, 3), t (3,), body -> camera, is its pose within a few px."""
+    map_x, map_y = maps if maps is not None else normalised_maps(camera)
+    parameters = (noise or typical_noise(image)).parameters
+    results, status = np.full((1, disc.n_markers), np.nan, kernels.DOT), np.zeros((1, disc.n_markers), np.uint8)
+    views = kernels.Views(map_x[None], map_y[None], camera.parameters[None], np.eye(3)[None], np.zeros((1, 3)))
+    expected = kernels.Expected(np.array([blur_px]), parameters[None], kernels.Limits())
+    pose = np.ascontiguousarray(R, float), np.ascontiguousarray(t, float)
+    image = np.ascontiguousarray(image)[None]
+    kernels.look(image, np.ones(1, bool), views, face_of(disc), expected, *pose, results, status)
+    return dot_centres(results[0], status[0])
 
 
 def locate_on_plane(image, image_from_plane, centres, radius, **known):

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.cameras.camera import Camera, normalised_maps, project
+from calibration.cameras.camera import Camera, project
 from calibration.kit.arrays import Array, Image, robust_sigma
 from calibration.kit.grey_levels import full_scale, level_step
 from disctrack.disc import Disc
@@ -78,38 +78,6 @@ def face_of(disc: Disc) -> kernels.Face:
     outermost = float(np.hypot(*centres[:, :2].T).max()) + 0.5 * disc.marker_diameter
     rim = max(0.95 * disc.radius, min(outermost + 0.15 * disc.marker_diameter, disc.radius))
     return kernels.Face(centres, 0.5 * disc.marker_diameter, rim)
-
-
-def locate_on_disc(
-    image: Image,
-    camera: Camera,
-    R_camera_body: Array,
-    t_camera_body: Array,
-    disc: Disc,
-    *,
-    maps: tuple[Array, Array] | None = None,
-    noise: NoiseModel | None = None,
-    blur_px: float = TYPICAL_BLUR_PX,
-) -> DotCentres:
-    """Locate the disc's dots in one image, the pose being known to a few pixels.
-
-    image (height, width) uint8 or uint16; R_camera_body (3, 3), t_camera_body (3,) [m].
-    """
-    map_x, map_y = maps if maps is not None else normalised_maps(camera)
-    parameters = (noise or typical_noise(image)).parameters
-    results, status = np.full((1, disc.n_markers), np.nan, kernels.DOT), np.zeros((1, disc.n_markers), np.uint8)
-    kernels.look(
-        np.ascontiguousarray(image)[None],
-        np.ones(1, bool),
-        kernels.Views(map_x[None], map_y[None], camera.parameters[None], np.eye(3)[None], np.zeros((1, 3))),
-        face_of(disc),
-        kernels.Expected(np.array([blur_px]), parameters[None], kernels.Limits()),
-        np.ascontiguousarray(R_camera_body, float),
-        np.ascontiguousarray(t_camera_body, float),
-        results,
-        status,
-    )
-    return dot_centres(results[0], status[0])
 
 
 def dot_centres(results: NDArray, status: NDArray[np.uint8]) -> DotCentres:

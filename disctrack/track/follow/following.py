@@ -91,7 +91,7 @@ class Search:
     always: bool = False  # at every frame, whatever it costs
     failures: int = 0  # in succession
     since: int = 0  # frames since the last of them
-    scenes: tuple[StillScene, StillScene] | None = None
+    scenes: tuple[StillScene, ...] = ()
 
     def is_due(self, pair: Image, readable: Mask, seen: bool) -> bool:
         """True where there is reason to hope.
@@ -101,15 +101,14 @@ class Search:
         """
         if self.always or self.since < self.failures:
             return self.always
-        if seen or self.scenes is None or self.since >= min(2**self.failures, LONGEST_WAIT) or not readable.all():
+        if seen or not self.scenes or self.since >= min(2**self.failures, LONGEST_WAIT) or not readable.all():
             return True
         return any(map(StillScene.differs, self.scenes, pair))
 
     def failed(self, images: Image, readable: Mask) -> Search:
         """After a search of the first of the pairs; the second tells how pixels scatter without anything new."""
-        scenes = None
-        if len(images) > 1 and readable[:2].all():
-            scenes = StillScene(images[0, 0], images[1, 0]), StillScene(images[0, 1], images[1, 1])
+        known = len(images) > 1 and bool(readable[:2].all())
+        scenes = tuple(map(StillScene, *images[:2])) if known else ()
         return replace(self, failures=self.failures + 1, since=0, scenes=scenes)
 
 

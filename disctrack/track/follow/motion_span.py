@@ -132,19 +132,19 @@ def _read(left: FrameReader, right: FrameReader, frame: int) -> Pair | None:
 
 def _last_still(read: Callable[[list[int]], list[Pair | None]], first: int, end: int, sign: int) -> int | None:
     """Last frame, going from `first` towards `end`, that shows what the first shows; None where all do."""
-    scenes: tuple[StillScene, StillScene] | None = None
+    scenes: tuple[StillScene, ...] = ()
     last = first
     for frames in _looks(first, end, sign):
         pairs = read(frames)
-        if scenes is None:
+        if not scenes:
             good = [pair for pair in pairs if pair is not None]
             if len(good) < 2:
                 continue
-            scenes = StillScene(good[0][0], good[1][0]), StillScene(good[0][1], good[1][1])
+            scenes = tuple(map(StillScene, *good[:2]))
         for frame, pair in zip(frames, pairs, strict=True):
             if pair is None:
                 continue
-            if any(scene.differs(image) for scene, image in zip(scenes, pair, strict=True)):
+            if any(map(StillScene.differs, scenes, pair)):
                 return last
             last = frame
     return None

@@ -210,30 +210,30 @@ def _as_one_sensor(read_blocks: ReadBlocks, pairs: range) -> tuple[ReadBlocks, l
     """Blocks without a colour filter's pattern and pixels that do not see, and both as findings."""
     # from all over the recording: within a millisecond a disc moves by less than a pixel, and edges look stuck, too
     images = _some(read_blocks, pairs)
-    gains = [mosaic_gains(images[:, camera]) for camera in (0, 1)]
-    for camera, pattern in enumerate(gains):
+    sensors = []
+    told: list[Finding] = []
+    for camera, name in enumerate(frames.CAMERAS):
+        pattern = mosaic_gains(images[:, camera])
         if pattern is not None:
             images[:, camera] = _without_mosaic(images[:, camera], pattern)
-    stuck = [stuck_pixels(images[:, camera]) for camera in (0, 1)]
-    told: list[tuple[str, str]] = []
-    for name, pattern, mask in zip(frames.CAMERAS, gains, stuck, strict=True):
-        if pattern is not None:
             text = (
                 f"{name} camera: a colour filter lies on the sensor (gains of neighbouring pixels "
                 f"{' '.join(f'{gain:.2f}' for gain in pattern.ravel())}): they are divided by it, which is right for "
                 "grey discs only; a monochrome camera sees more"
             )
-            told.append((name, text))
+            told.append(Finding(Kind.SENSOR, Severity.WARNING, text, Subject("track", name)))
+        mask = stuck_pixels(images[:, camera])
         if mask is not None:
             text = f"{name} camera: {int(mask.sum())} pixels show one value whatever passes; their neighbours stand in"
-            told.append((name, text))
+            told.append(Finding(Kind.SENSOR, Severity.WARNING, text, Subject("track", name)))
+        sensors.append((pattern, mask))
     if not told:
         return read_blocks, []
 
     def repaired(start: int, stop: int) -> Iterator[PairBlock]:
         for block in read_blocks(start, stop):
             images = block.images.copy()  # they may be the caller's own
-            for camera, (pattern, mask) in enumerate(zip(gains, stuck, strict=True)):
+            for camera, (pattern, mask) in enumerate(sensors):
                 if pattern is not None:
                     images[:, camera] = _without_mosaic(images[:, camera], pattern)
                 if mask is not None:
@@ -241,7 +241,7 @@ def _as_one_sensor(read_blocks: ReadBlocks, pairs: range) -> tuple[ReadBlocks, l
                         repair(image, mask)
             yield replace(block, images=images)
 
-    return repaired, [Finding(Kind.SENSOR, Severity.WARNING, text, Subject("track", name)) for name, text in told]
+    return repaired, told
 
 
 def _without_mosaic(images: NDArray, gains: NDArray) -> NDArray:
