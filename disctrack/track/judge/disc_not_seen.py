@@ -36,7 +36,7 @@ from disctrack.track.dots.acquisition import (
 )
 from disctrack.track.dots.template_response import plane_to_image
 from disctrack.track.judge.doubts import misplaced_dots
-from disctrack.track.pose import fit_poses, marker_pixels
+from disctrack.track.pose import marker_pixels
 from disctrack.track.refine.self_calibration import MIN_FRAMES, DotsInFrames, declared_places_kept, fit_shared
 
 Turn = Callable[[NDArray], NDArray]
@@ -111,17 +111,12 @@ def moved_camera(pairs: NDArray, rig: StereoRig, disc: Disc) -> Iterator[Finding
     if good.sum() < MIN_FRAMES:
         return
     pixels = pixels[good]
-    R, t = (np.array([pair[0][k] for pair in seen])[good] for k in (1, 2))
+    R, t = (np.array([pair[0][k] for pair in seen])[good] for k in (1, 2))  # by the left camera
     covariance = np.broadcast_to(BLOB_PX**2 * np.eye(2), (*pixels.shape, 2))
-    left_alone = np.where(np.arange(2)[:, None, None] == 0, pixels, np.nan)
-    began = fit_poses(
-        left_alone, covariance, rig, disc.marker_centres_body, R, t, reject_outliers=False, with_sensitivity=False
-    )
     free = np.zeros(N_RIG + 2 * disc.n_markers, bool)
     free[PAIR_TURN] = free[PAIR_SHIFT] = True
     information = np.diag(np.repeat([TURN**-2, SHIFT**-2], 3))
-    dots = DotsInFrames(rig, disc, pixels, covariance, began.R_world_body, began.t_world_body)
-    found = fit_shared(dots, free, information)
+    found = fit_shared(DotsInFrames(rig, disc, pixels, covariance, R, t), free, information)
     rms = BLOB_PX * np.sqrt(found.reduced_chi_square)
     moved = rig.perturbed(found.shift[:N_RIG])
     turn = np.linalg.norm(vector_from_rotation(moved.R_right_left @ rig.R_right_left.T))
