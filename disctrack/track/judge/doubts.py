@@ -96,13 +96,12 @@ def _shaken(poses: PoseScatter, trajectory: Trajectory) -> tuple[Finding, ...]:
     """Poses that scatter far more than their dots tell, with how far."""
     names = ("horizontal position", "height", "tilt", "turn about the vertical")
     variance = np.nanmedian(np.diagonal(trajectory.pose_covariance[trajectory.measured], axis1=1, axis2=2), axis=0)
-    told = [
-        f"{name} by {length} ({np.sqrt(poses.factor[group[0]]):.1f} times)"
-        for name, group in zip(names, GROUPS, strict=True)
-        if poses.factor[group[0]] > SHAKEN**2
-        for sigma in [np.sqrt(np.mean(variance[list(group)]))]
-        for length in [f"{1e6 * sigma:.1f} um" if group[0] < 3 else f"{1e3 * np.degrees(sigma):.1f} mdeg"]
-    ]
+    told = []
+    for name, group in zip(names, GROUPS, strict=True):
+        times, sigma = np.sqrt(poses.factor[group[0]]), np.sqrt(np.mean(variance[list(group)]))
+        if times > SHAKEN:
+            length = f"{1e6 * sigma:.1f} um" if group[0] < 3 else f"{1e3 * np.degrees(sigma):.1f} mdeg"
+            told.append(f"{name} by {length} ({times:.1f} times)")
     if not told:
         return ()
     text = (
