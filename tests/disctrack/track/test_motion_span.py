@@ -18,23 +18,11 @@ DOTS = np.array([[18.0, 0.0], [-9.0, 15.6], [-9.0, -15.6], [8.0, 9.0]])
 class DrawnCamera:
     """Frames of a disc with four dots at place(i) [px], drawn when asked for; None: no disc."""
 
-    timestamps, notes, random_access, bit_depth = None, (), True, 8
-    image_size = (SIZE, SIZE)
-
-    def __init__(self, n: int, place: Callable[[int], tuple[float, float, float] | None], seed: int, **light) -> None:
-        self.n, self.place, self.seed = n, place, seed
+    def __init__(self, place: Callable[[int], tuple[float, float, float] | None], seed: int, **light) -> None:
+        self.place, self.seed = place, seed
         self.brightness: Callable[[int], float] = light.get("brightness", lambda i: 1.0)
         self.broken: frozenset[int] = frozenset(light.get("broken", ()))
         self.read_frames: list[int] = []
-
-    def __len__(self) -> int:
-        return self.n
-
-    def describe(self, index: int) -> str:
-        return f"frame {index}"
-
-    def content_sha256(self, start: int, stop: int) -> str:
-        return ""
 
     def read(self, index: int, out=None):
         self.read_frames.append(index)
@@ -56,8 +44,8 @@ class DrawnCamera:
         return np.clip(np.round(grey + noise * np.sqrt(0.5 + grey / 50)), 0, 255).astype(np.uint8)
 
 
-def cameras(n, place, **light):
-    return DrawnCamera(n, place, 1, **light), DrawnCamera(n, place, 2, **light)
+def cameras(place, **light):
+    return DrawnCamera(place, 1, **light), DrawnCamera(place, 2, **light)
 
 
 def rest_motion_rest(begin, end, speed):
@@ -66,7 +54,7 @@ def rest_motion_rest(begin, end, speed):
 
 
 def found_in(n, place, **light):
-    return find_motion(*cameras(n, place, **light), 0, n, RATE, threads=2)
+    return find_motion(*cameras(place, **light), 0, n, RATE, threads=2)
 
 
 @pytest.mark.parametrize("speed", [0.1, 1.0])
@@ -122,7 +110,7 @@ def test_a_pause_in_the_middle_stays_and_where_nothing_moves_all_is_kept(speed):
 
 
 def test_motion_from_end_to_end_costs_a_few_looks_and_nothing_is_left_out():
-    left, right = cameras(2000, lambda i: (64.0 + 20 * np.sin(0.05 * i), 64.0, 0.1 * i))
+    left, right = cameras(lambda i: (64.0 + 20 * np.sin(0.05 * i), 64.0, 0.1 * i))
     span = find_motion(left, right, 0, 2000, RATE, threads=2)
     assert (span.start, span.stop) == (0, 2000)
     assert span.looked_at == len(left.read_frames) <= 8
@@ -137,8 +125,8 @@ def test_frames_that_cannot_be_read_are_passed_over():
 
 
 def test_a_scene_tells_a_fifth_of_a_pixel_from_noise_and_noise_from_motion():
-    still = DrawnCamera(60, lambda i: (64.0, 64.0, 0.0), 1)
-    moved = DrawnCamera(60, lambda i: (64.25, 64.0, 0.0), 1)  # drawn in steps of an eighth
+    still = DrawnCamera(lambda i: (64.0, 64.0, 0.0), 1)
+    moved = DrawnCamera(lambda i: (64.25, 64.0, 0.0), 1)  # drawn in steps of an eighth
     scene = StillScene(still.read(0), still.read(1))
     assert not any(scene.differs(still.read(i)) for i in range(2, 60))
     assert all(scene.differs(moved.read(i)) for i in range(2, 20))
