@@ -178,7 +178,7 @@ def _cross(picture: ColourImage, point: Array, colour: tuple[int, int, int], kin
 
 
 @contextlib.contextmanager
-def _encoder(path: Path, size: tuple[int, int]) -> Iterator[Callable[[ColourImage], None]]:
+def _encoder(path: Path, size: tuple[int, int]) -> Iterator[Callable[[ColourImage], object]]:
     """Function that appends one picture to an mp4 file: H.264 where PyAV is installed, MPEG-4 part 2 otherwise."""
     try:
         import av
