@@ -172,7 +172,8 @@ def _run(folder: Path) -> tuple[int, list[Finding], Trajectory | None, float]:
     try:
         told = loads(ended.stdout)["findings"]
     except JSONDecodeError:
-        return ended.returncode, [Finding(Kind.OTHER, Severity.REFUSAL, ended.stderr.strip()[-300:])], None, seconds
+        why = ended.stderr.strip()[-300:].replace(f"{folder.parent}{os.sep}", "")
+        return ended.returncode, [Finding(Kind.OTHER, Severity.REFUSAL, why)], None, seconds
     with catch_warnings(action="ignore", category=DoubtWarning):
         trajectory = read_trajectory(folder / "results" / "trajectory.h5")
     found = list(leading(trajectory.findings))
