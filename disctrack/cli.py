@@ -142,17 +142,9 @@ def _keep_compiled_loops_somewhere() -> None:
 
 
 def _tell(error: Exception) -> int:
-    from disctrack.errors import DiscTrackError  # here, so that --help does not wait for what it imports
+    from disctrack.errors import DiscTrackError, reason_of  # here, so that --help does not wait for what it imports
 
-    if isinstance(error, DiscTrackError):
-        return _say(str(error), FAILED)
-    if isinstance(error, OSError):
-        where = f"{error.filename}: " if error.filename else ""
-        return _say(f"{where}{error.strerror or error}.", FAILED)
-    if isinstance(error, MemoryError):
-        return _say("out of memory. Close other programs, or measure fewer frames at once with --frames.", FAILED)
-    kind = type(error).__name__
-    return _say(f"internal error ({kind}: {error}). {TRACEBACK_VARIABLE}=1 shows where; please report it.", INTERNAL)
+    return _say(reason_of(error), FAILED if isinstance(error, (DiscTrackError, OSError, MemoryError)) else INTERNAL)
 
 
 def _say_interrupted(received: Sequence[int]) -> int:

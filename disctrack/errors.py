@@ -1,5 +1,6 @@
 """The errors that disctrack raises on purpose; `cli` alone turns them into a line and an exit code."""
 
+import errno
 from typing import Any
 
 from calibration.kit.errors import ArgumentError, CalibrationError, DiscTrackError, RigFileError
@@ -16,7 +17,10 @@ __all__ = [
     "SceneError",
     "TrackingError",
     "TrajectoryFileError",
+    "reason_of",
 ]
+
+_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 class AnalysisError(DiscTrackError):
@@ -53,3 +57,17 @@ class TrajectoryFileError(DiscTrackError):
 
 class ModelError(DiscTrackError):
     """A model of the motion cannot be built: unknown effect or parameter, a value out of bounds, no such motion."""
+
+
+def reason_of(error: BaseException) -> str:
+    """What to tell about an error, whatever it is, in one line."""
+    if isinstance(error, DiscTrackError):
+        text = str(error)
+    elif isinstance(error, MemoryError):
+        text = "out of memory. Close other programs, run fewer side by side (-j), or measure fewer --frames at once."
+    elif isinstance(error, OSError):
+        text = f"{f'{error.filename}: ' if error.filename else ''}{error.strerror or error}."
+        text += " Free some space, or choose another place with -o." if error.errno in _NO_ROOM else ""
+    else:
+        text = f"internal error ({type(error).__name__}: {error}); DISCTRACK_TRACEBACK=1 shows where. Please report it."
+    return " ".join(text.split())

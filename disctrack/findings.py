@@ -6,13 +6,14 @@ stages read kinds, severities and numbers, never text. `causes` folds what anoth
 
 from __future__ import annotations
 
-import math
 import sys
 import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from enum import Enum, IntEnum
 from typing import Any
+
+from disctrack.numbers import Measured
 
 
 class Severity(IntEnum):
@@ -95,18 +96,6 @@ NONSENSE = (
 
 
 @dataclass(frozen=True)
-class Number:
-    """A value with its standard deviation, where that is known."""
-
-    value: float
-    unit: str = ""
-    sigma: float | None = None
-
-    def __str__(self) -> str:
-        return with_sigma(self.value, self.sigma, self.unit)
-
-
-@dataclass(frozen=True)
 class Remedy:
     """What would mend it: a declared number with the one that would fit, or what to do."""
 
@@ -140,7 +129,7 @@ class Finding:
     severity: Severity
     text: str  # what was seen, one sentence without its full stop; for people only
     subject: Subject = Subject()
-    numbers: Mapping[str, Number] = field(default_factory=dict)
+    numbers: Mapping[str, Measured] = field(default_factory=dict)
     remedies: tuple[Remedy, ...] = ()  # likeliest first
     explains: tuple[Kind, ...] = ()  # consequences: not told beside this one
 
@@ -179,10 +168,14 @@ def finding_from_json(document: Mapping[str, Any]) -> Finding:
         Severity[document["severity"].upper()],
         document["text"],
         Subject(**{**subject, "frames": tuple((first, last) for first, last in subject["frames"])}),
-        {name: Number(**number) for name, number in document["numbers"].items()},
+        {name: _number(**number) for name, number in document["numbers"].items()},
         tuple(Remedy(**remedy) for remedy in document["remedies"]),
         tuple(_kind(value) for value in document["explains"]),
     )
+
+
+def _number(value: float, sigma: float | None, unit: str) -> Measured:
+    return Measured(value, unit=unit) if sigma is None or sigma != sigma else Measured(value, sigma, unit)
 
 
 def _kind(value: str) -> Kind:
@@ -246,16 +239,3 @@ def warn_of_doubts(findings: Iterable[Finding]) -> None:
         level, frame = level + 1, frame.f_back
     for finding in doubts(findings):
         warnings.warn(finding.sentence, DoubtWarning, stacklevel=level)
-
-
-def with_sigma(value: float, sigma: float | None = None, unit: str = "") -> str:
-    """A value and its sigma in words, both to two digits of the sigma; four digits where that is not known."""
-    value, ending = float(value), f" {unit}" if unit else ""
-    if not math.isfinite(value):
-        return "not known"
-    if sigma is None or not math.isfinite(sigma) or sigma <= 0:
-        return f"{value + 0.0:.4g}{ending}"  # + 0.0: no minus before a zero
-    decimals = 1 - math.floor(math.log10(sigma))
-    decimals -= round(sigma, decimals) >= 10.0 ** (2 - decimals)  # 0.0996 is 0.10
-    shown = max(decimals, 0)
-    return f"{round(value, decimals) + 0.0:.{shown}f} +- {round(sigma, decimals):.{shown}f}{ending}"

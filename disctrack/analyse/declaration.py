@@ -31,8 +31,9 @@ from disctrack.analyse.energy import TOTAL, energy_quantities
 from disctrack.disc import Disc, has_mirror_axis, symmetry_order
 from disctrack.errors import AnalysisError
 from disctrack.faults.clock_jump import clock_jumps
-from disctrack.findings import MISFITS, Finding, Kind, Number, Remedy, Severity, Subject, with_sigma
+from disctrack.findings import MISFITS, Finding, Kind, Remedy, Severity, Subject
 from disctrack.frames import rotation_from_quaternion
+from disctrack.numbers import Measured
 from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory, part
 
 if TYPE_CHECKING:
@@ -133,7 +134,7 @@ def lost_pairs(trajectory: Trajectory) -> Iterator[Finding]:
             Severity.DOUBT,
             f"frame {frame}: {jump.words}; all later times are wrong",
             Subject(frames=((frame, frame),)),
-            {"pairs": Number(jump.frames)},
+            {"pairs": Measured(jump.frames)},
             (Remedy(action=f"number the files from {frame} on higher by {jump.frames}"),),
             (Kind.GRAVITY_OR_RATE, Kind.REVERSED, Kind.POSES_SCATTER),
         )
@@ -152,11 +153,11 @@ def motion_against_gravity(trajectory: Trajectory) -> tuple[Finding, ...]:
     away = abs(np.log(gravity / g))
     if away > np.log1p(NOTED) and abs(gravity - g) > SIGMAS * sigma:
         text = (
-            f"the motion satisfies the balance of moments with a gravity of {with_sigma(gravity, sigma)} m/s^2 ({n} "
+            f"the motion satisfies the balance of moments with a gravity of {Measured(gravity, sigma, 'm/s^2')} ({n} "
             f"stretches of {BLOCK} frames); expected {g:.4g} m/s^2 at {trajectory.frame_rate:g} frames a second, "
             "nothing but the table touching the disc"
         )
-        numbers = {"gravity": Number(gravity, "m/s^2", sigma)}
+        numbers = {"gravity": Measured(gravity, sigma, "m/s^2")}
         remedies, kind = _of_gravity(trajectory, gravity / g), Kind.GRAVITY_OR_RATE
         severity = Severity.DOUBT if away > np.log1p(BALANCE) else Severity.NOTE
         return (Finding(kind, severity, text, numbers=numbers, remedies=remedies, explains=(Kind.REVERSED,)),)
@@ -349,7 +350,7 @@ def rise_of_centre(trajectory: Trajectory) -> tuple[Finding, ...]:
         Remedy("[disc] radius_mm", f"{1e3 * slope:.4g}", f"{1e3 * disc.radius:g}"),
         Remedy("[calibration] square_mm", action=f"times {1 / ratio:.4g}"),
     )
-    rise = Number(1e3 * float(slope), "mm", 1e3 * float(sigma))
+    rise = Measured(1e3 * float(slope), 1e3 * float(sigma), "mm")
     text = f"the centre rises by {rise} per unit of sin(theta); expected the radius, {1e3 * disc.radius:.2f} mm"
     return (Finding(Kind.RADIUS, Severity.DOUBT, text, numbers={"rise": rise}, remedies=remedies, explains=OFF),)
 
@@ -411,7 +412,7 @@ def scale_of_dots(trajectory: Trajectory, declared: Disc, square: float | None =
         board = min(usual, off), Remedy("[calibration] square_mm", f"{side:.2f}", f"{1e3 * square:g}")
     dots_off = off, Remedy("[markers] centres_mm", action=f"times {scale:.4f}")
     remedies = tuple(remedy for _, remedy in sorted((board, dots_off), key=lambda one: one[0]))
-    found = Number(scale, "", max(sigma, 1e-4))
+    found = Measured(scale, max(sigma, 1e-4))
     text = f"by both cameras the dots are {found} times as far apart as declared"
     explains = (Kind.DOTS_MISPLACED, Kind.RADIUS, Kind.GRAVITY_OR_RATE, *MISFITS)
     return (Finding(Kind.SQUARE, Severity.DOUBT, text, Subject(), {"scale": found}, remedies, explains),)

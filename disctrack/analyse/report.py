@@ -13,8 +13,8 @@ from disctrack.analyse.power_laws import MODEL_EXPONENTS, Exponent, PowerLaws
 from disctrack.analyse.propagation import DerivedSeries
 from disctrack.analyse.published import SURFACES, agreement, published_table
 from disctrack.findings import Finding, Kind, Severity, of_kind
+from disctrack.numbers import Measured, measured, unit_text
 from disctrack.report.blocks import Cell, Figures, Listing, Report, Section, Text
-from disctrack.report.numbers import Measured, measured, unit_text
 from disctrack.trajectory import FrameStatus
 from disctrack.trajectory.file import Provenance
 

@@ -1,7 +1,7 @@
 """The columns of the summary."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 from disctrack.frames import CAMERAS, COORDINATES
 
@@ -65,6 +65,27 @@ COLUMNS: dict[str, str] = {
     "fingerprint": "of inputs, settings and version",
     "version": "of disctrack that measured it",
 }
+
+
+class Fitted(NamedTuple):
+    """A number that a recording determines, as the page shows it."""
+
+    column: str
+    sigma: str  # column of its standard deviation
+    label: str
+    scale: float = 1.0  # on the page
+    misfit: str = ""  # column of the reduced chi-square of its model
+    repeated: bool = True  # recordings of one experiment agree in it
+
+
+# t_f is not compared: it depends on when somebody started the cameras.
+FITTED = (
+    Fitted("k_m_m_s2", "k_m_sigma_m_s2", "k_m from the dots (10⁻⁸ m s²)", 1e8, "k_m_reduced_chi_square"),
+    Fitted("n_energy", "n_energy_sigma", "n_E"),
+    Fitted("n_theta", "n_theta_sigma", "n_θ"),
+    Fitted("n_psidot", "n_psidot_sigma", "n_ψ̇"),
+    Fitted("t_f_s", "t_f_sigma_s", "t_f (s)", repeated=False),
+)
 
 
 def copies(rows: Sequence[Row]) -> list[str]:

@@ -15,7 +15,6 @@ from disctrack.batch.columns import Row
 from disctrack.batch.locks import Busy, locked
 from disctrack.batch.numbers import analysed_numbers, diagnosed_numbers, friction_numbers, tracked_numbers
 from disctrack.batch.plan import Job
-from disctrack.batch.reasons import reason_of
 from disctrack.batch.records import (
     BUSY,
     FAILED,
@@ -32,7 +31,7 @@ from disctrack.batch.records import (
 from disctrack.batch.repeats import group_of
 from disctrack.calibrate.stage import boards_in, calibrate_into, is_rig_of, source_of
 from disctrack.diagnosis.recorded import first_to_mend
-from disctrack.errors import AnalysisError, DiscTrackError, OutputError
+from disctrack.errors import AnalysisError, DiscTrackError, OutputError, reason_of
 from disctrack.files.whole import write_whole
 from disctrack.findings import Kind, leading
 from disctrack.progress import StageTime, recorded_times, timed

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from calibration import CalibrationSettings
 from disctrack.batch.find import FOLDER, RESULTS, FoundRecordings
-from disctrack.batch.reasons import reason_of
 from disctrack.calibrate.stage import source_of
+from disctrack.errors import reason_of
 from disctrack.recording.declaration import Recording, read_recording
 from disctrack.track.measurement import open_pairs
 

@@ -1,4 +1,4 @@
-"""Where jobs are done: processes of this machine, or of a cluster's machines, behind one interface.
+"""All jobs, done by processes of this machine or of a cluster: what is ready, what waits, what is tried again.
 
 Every job is done in a process of its own kind: one that crashes or is killed takes its own job with it and no other.
 """
@@ -14,27 +14,30 @@ import os
 import signal
 import sys
 import tempfile
+import threading
 import time
-from concurrent.futures import CancelledError, Executor, Future, ProcessPoolExecutor
+from collections import deque
+from collections.abc import Callable, Sequence
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ProcessPoolExecutor, ThreadPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing.context import SpawnProcess
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import cv2
 
 from disctrack.batch.measure import do
 from disctrack.batch.plan import Job
-from disctrack.batch.reasons import reason_of, reason_of_death
-from disctrack.batch.records import Result
-from disctrack.errors import ClusterError
+from disctrack.batch.records import BUSY, FAILED, Result
+from disctrack.errors import ClusterError, reason_of
 from disctrack.processes import Spawn, end_with_parent, quietly
 
 if TYPE_CHECKING:
     from distributed import Client
 
 CONNECT = 10.0  # [s] for a scheduler to answer
+LOOK = 0.1  # [s] after which Ctrl-C is heard at the latest
 # [s] that processes have to clear up, and after which they are asked once more
 _STOPPING, _ASK_AGAIN = 9.0, 2.0
 
@@ -43,59 +46,109 @@ class Died(Exception):
     """The process that did a job ended before the job did; its text says why."""
 
 
-class Pool(Protocol):
-    """Does jobs, `size` at once."""
+def do_all(
+    rigs: Sequence[Job], recordings: Sequence[Job], pool: Processes | Cluster, done: Callable[[Job, Result], None]
+) -> None:
+    """Do every job; `done` is called with each that is finished for good. Raises ClusterError.
 
-    size: float
+    Rigs come first, and what needs one waits for it. A job at which another batch works is asked for again until that
+    one is done with it. A job whose process died gets a second try at the end, alone, when there is most memory.
+    """
+    made = {rig.rig for rig in rigs}
+    ready = deque([*rigs, *(job for job in recordings if job.rig not in made)])
+    waiting = {path: [job for job in recordings if job.rig == path] for path in made}
+    alone: deque[Job] = deque()
+    died: set[Job] = set()
+    running: dict[Future[Result], Job] = {}
 
-    def submit(self, job: Job) -> Future[Result]:
-        """Begin a job. Raises OSError where no process can be started for it."""
+    def finish(job: Job, result: Result) -> None:
+        if result.status == BUSY:
+            ready.append(job)
+            return
+        done(job, result)
+        for after in waiting.pop(job.rig, []) if job.kind == "rig" else []:
+            if result.status == FAILED:
+                done(after, Result.failed(f"no rig: {result.record.reason}"))
+            else:
+                ready.append(after)
 
-    def result(self, future: Future[Result]) -> Result:
-        """Result of a job that was begun. Raises Died, and ClusterError where nothing further can be done."""
+    def settle(job: Job, future: Future[Result]) -> None:
+        try:
+            finish(job, _result(future))
+        except Died as death:
+            if job in died:
+                finish(job, Result.failed(f"twice, {death}"))
+            else:
+                died.add(job)
+                alone.append(job)
 
-    def close(self) -> None:
-        """End in order what still runs."""
+    while ready or alone or running:
+        while ready and len(running) < pool.size:
+            job = ready.popleft()
+            running[pool.submit(job)] = job
+        if alone and not running:
+            job = alone.popleft()
+            running[pool.submit(job)] = job
+        for future in wait(running, LOOK, FIRST_COMPLETED).done:
+            settle(running.pop(future), future)
+
+
+def _result(future: Future[Result]) -> Result:
+    """Result of a job that has ended. Raises Died, and ClusterError where nothing further can be done."""
+    try:
+        return future.result()
+    except Died:
+        raise
+    except CancelledError as error:  # not by us
+        raise ClusterError(
+            "the connection to the cluster's scheduler was lost. What is finished is kept; the same command continues."
+        ) from error
+    except OSError as error:  # no memory, or no more processes allowed
+        return Result.failed(f"no process could be started for it: {reason_of(error)}")
+    except Exception as error:  # a cluster's machines were lost too often, or could not even begin
+        return Result.failed(f"it could not be done ({type(error).__name__}: {' '.join(str(error).split())[:300]}).")
 
 
 class Processes:
-    """Processes of this machine, each with an executor of its own: when it breaks, it is clear whose job broke it."""
+    """Processes of this machine, a thread for each, with an executor of its own: it is clear whose job broke it."""
 
     def __init__(self, size: int) -> None:
         self.size: float = size
+        self._threads = ThreadPoolExecutor(size, thread_name_prefix="batch")
+        self._own = threading.local()  # the process of a thread
         self._workers: list[_Worker] = []
-        self._idle: list[_Worker] = []
-        self._busy: dict[Future[Result], _Worker] = {}
+        self._ends = False
         self._folder = tempfile.TemporaryDirectory(prefix="disctrack-")
         self._said = (Path(self._folder.name) / str(i) for i in itertools.count())
 
     def submit(self, job: Job) -> Future[Result]:
-        """See Pool."""
-        if not self._idle:
-            self._idle.append(_Worker(next(self._said)))
-            self._workers.append(self._idle[-1])
-        worker = self._idle.pop()
-        future = worker.begin(job)
-        self._busy[future] = worker
-        return future
+        """Begin a job; its future may raise Died, and OSError where no process can be started for it."""
+        return self._threads.submit(self.done, job)
 
-    def result(self, future: Future[Result]) -> Result:
-        """See Pool."""
+    def done(self, job: Job) -> Result:
+        """Do a job in this thread's process."""
+        worker: _Worker | None = getattr(self._own, "worker", None)
+        if worker is None:
+            worker = self._own.worker = _Worker(next(self._said))
+            self._workers.append(worker)
         try:
-            result = future.result()
+            if self._ends:
+                raise Died("the batch ended")
+            return worker.begin(job).result()
         except BrokenProcessPool as error:
-            raise Died(self._busy.pop(future).why_it_ended()) from error
-        except Exception as error:
-            result = Result.failed(reason_of(error))
-        self._idle.append(self._busy.pop(future))
-        return result
+            raise Died(worker.why_it_ended()) from error
+        finally:
+            if worker.process is None:
+                self._own.worker = None
 
     def close(self) -> None:
-        """See Pool."""
+        """End in order what still runs."""
         until = time.monotonic() + _STOPPING
-        living = [worker.process for worker in self._workers if worker.process is not None]
+        self._ends = True
+        self._threads.shutdown(wait=False, cancel_futures=True)
         for worker in self._workers:
             worker.executor.shutdown(wait=False, cancel_futures=True)
+        living = [worker.process for worker in self._workers if worker.process is not None]
         for process in living:
             process.terminate()
         for process in living:
@@ -103,6 +156,7 @@ class Processes:
             while process.is_alive():  # where it was, the request may have been swallowed
                 process.terminate() if time.monotonic() < until else process.kill()
                 process.join(_ASK_AGAIN)
+        self._threads.shutdown()
         self._folder.cleanup()
 
 
@@ -113,29 +167,15 @@ class Cluster:
         """Raises ClusterError if dask.distributed is not installed or nobody answers."""
         self.size: float = math.inf  # the scheduler deals them out
         self._client = connect(address)
-        self._executor: Executor = self._client.get_executor(pure=False)  # a job that is tried again is another task
+        self._executor = self._client.get_executor(pure=False)  # a job that is tried again is another task
 
     def submit(self, job: Job) -> Future[Result]:
-        """See Pool."""
-        return self._executor.submit(do_alone, job)
-
-    def result(self, future: Future[Result]) -> Result:
-        """See Pool."""
-        try:
-            return future.result()
-        except Died:
-            raise
-        except CancelledError as error:  # not by us
-            raise ClusterError(
-                "the connection to the cluster's scheduler was lost. What is finished is kept; "
-                "the same command continues."
-            ) from error
-        except Exception as error:  # its machines were lost too often, or could not even begin
-            text = " ".join(str(error).split())[:300]
-            return Result.failed(f"the cluster could not do it ({type(error).__name__}: {text}).")
+        """Begin a job; its future may raise Died, and what is wrong with the cluster."""
+        future: Future[Result] = self._executor.submit(do_alone, job)
+        return future
 
     def close(self) -> None:
-        """See Pool."""
+        """End in order what still runs."""
         with contextlib.suppress(Exception):  # the scheduler may have gone
             self._executor.shutdown(wait=False)
             self._client.close()
@@ -168,11 +208,8 @@ def connect(address: str) -> Client:
 def do_alone(job: Job) -> Result:
     """Do a job on one of a cluster's machines, in a process of its own. Raises Died."""
     multiprocessing.current_process().daemon = False  # dask's workers are, and Python allows daemons no processes
-    here = Processes(1)
-    try:
-        return here.result(here.submit(job))
-    finally:
-        here.close()
+    with contextlib.closing(Processes(1)) as here:
+        return here.done(job)
 
 
 class _Worker:
@@ -191,19 +228,24 @@ class _Worker:
         return next((process for process in self._context.started if process.is_alive()), None)
 
     def begin(self, job: Job) -> Future[Result]:
-        """Give it a job. Raises OSError where the process cannot be started."""
-        try:
-            return self.executor.submit(_do, job)
-        except BrokenProcessPool as error:  # it died while it had nothing to do
-            future: Future[Result] = Future()
-            future.set_exception(error)
-            return future
+        """Give it a job. Raises OSError where the process cannot be started, BrokenProcessPool where it has died."""
+        return self.executor.submit(_do, job)
 
     def why_it_ended(self) -> str:
         """Signal or exit code, and the last that it said."""
         self.executor.shutdown()
-        said = self._said.read_text("utf-8", "replace").strip() if self._said.exists() else ""
-        return reason_of_death(self._context.started[0].exitcode, said.splitlines()[-1] if said else "")
+        said = self._said.read_text("utf-8", "replace").split() if self._said.exists() else []
+        code = self._context.started[0].exitcode
+        if code == -getattr(signal, "SIGKILL", 9):
+            text = (
+                "its process was killed (signal 9), as the system does when memory runs out. Run fewer side by side "
+                "with -j, or give the machine more memory."
+            )
+        elif code is not None and code < 0:
+            text = f"its process was ended by signal {-code} ({signal.strsignal(-code)})."
+        else:
+            text = f"its process ended by itself (exit code {code})."
+        return f"{text} It said: {' '.join(said)[-300:]}" if said else text
 
 
 def _prepare(said: Path) -> None:

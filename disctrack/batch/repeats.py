@@ -9,11 +9,8 @@ from itertools import groupby
 import numpy as np
 from scipy.special import gammaincc
 
-from disctrack.batch.columns import Row
+from disctrack.batch.columns import FITTED, Fitted, Row
 from disctrack.recording.declaration import Recording
-
-# Column -> that of its sigma. Not t_f and the energy lost: they depend on when somebody started the cameras.
-COMPARED = {name: f"{name}_sigma" for name in ("n_energy", "n_theta", "n_psidot")} | {"k_m_m_s2": "k_m_sigma_m_s2"}
 
 # What is known of one number of one group, and what it means.
 REPEATS: dict[str, str] = {
@@ -41,9 +38,10 @@ def repeats_of(rows: Sequence[Row]) -> list[Row]:
     """Rows of REPEATS, one for each number that two or more recordings of a group determine."""
     different = {row["input_sha256"]: row for row in reversed(rows) if row["repeats"]}  # the first of each
     grouped = groupby(sorted(different.values(), key=_group), key=_group)
-    found = [
-        _spread(group, column, members) for group, alike in grouped for members in [list(alike)] for column in COMPARED
-    ]
+    found = []
+    for group, alike in grouped:
+        members = list(alike)
+        found += [_spread(group, fitted, members) for fitted in FITTED if fitted.repeated]
     return [row for row in found if row["n"] > 1]
 
 
@@ -51,11 +49,11 @@ def _group(row: Row) -> str:
     return str(row["repeats"])
 
 
-def _spread(group: str, column: str, rows: Sequence[Row]) -> Row:
-    known = [row for row in rows if row[column] is not None and row[COMPARED[column]]]
-    value, sigma = (np.array([row[name] for row in known], float) for name in (column, COMPARED[column]))
+def _spread(group: str, fitted: Fitted, rows: Sequence[Row]) -> Row:
+    known = [row for row in rows if row[fitted.column] is not None and row[fitted.sigma]]
+    value, sigma = (np.array([row[name] for row in known], float) for name in (fitted.column, fitted.sigma))
     n = len(known)
-    spread: Row = dict.fromkeys(REPEATS) | {"repeats": group, "quantity": column, "n": n}
+    spread: Row = dict.fromkeys(REPEATS) | {"repeats": group, "quantity": fitted.column, "n": n}
     if n < 2:
         return spread
     weight = sigma**-2

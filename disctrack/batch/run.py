@@ -10,19 +10,20 @@ from pathlib import Path
 from tqdm import tqdm
 
 from calibration.kit.arguments import checked
-from disctrack.batch.columns import Row, copies
+from disctrack.batch.columns import Row
 from disctrack.batch.find import find_recordings
 from disctrack.batch.plan import BatchOptions, BatchPlan, Job, Places, Shard, make_plan, with_threads
-from disctrack.batch.pool import Cluster, Pool, Processes
+from disctrack.batch.pool import Cluster, Processes, do_all
 from disctrack.batch.records import FAILED, NOT_MEASURED, Record, Result
-from disctrack.batch.summary import counts, line_of, rows_of, write_summary
-from disctrack.batch.together import FOLDER, diagnose_all
-from disctrack.batch.work import do_all
-from disctrack.errors import ClusterError, OutputError
-from disctrack.files.text import printable
+from disctrack.batch.repeats import repeats_of
+from disctrack.batch.report import report_of
+from disctrack.batch.summary import TOGETHER, rows_of, write_summary
+from disctrack.errors import AnalysisError, ClusterError, OutputError, reason_of
 from disctrack.files.whole import check_writable
+from disctrack.findings import Kind, Severity, of_kind
 from disctrack.recording.declaration import FILE_NAME
 from disctrack.recording.readers.blocks import default_threads
+from disctrack.report.blocks import Report
 
 INTERRUPTED = "interrupted before it was done"
 
@@ -35,7 +36,7 @@ class BatchOutcome:
     files: tuple[Path, ...]  # summary.json, summary.csv, repeats.csv, index.html; none where they could not be written
     problems: tuple[str, ...]  # besides those of single recordings
     interrupted: bool = False
-    together: tuple[str, ...] = ()  # what the diagnosis of all recordings together says
+    together: str = ""  # verdict of the diagnosis of all recordings together
     undeclared: tuple[str, ...] = ()  # folders of images that no recording.toml speaks of
 
     @property
@@ -48,18 +49,15 @@ class BatchOutcome:
         """Some recording was measured, but not all of it could be used."""
         return any(row["reason"] for row in self.rows)
 
-    def lines(self) -> list[str]:
-        """One line per recording, then the totals."""
-        width = max(len(row["recording"]) for row in self.rows)
-        total = ", ".join(f"{n} {status}" for status, n in counts(self.rows).items() if n)
-        left = [f"{'left out':<13} {name:<{width}}  images, and no {FILE_NAME}" for name in self.undeclared]
-        left += [f"{'copies':<13} {names}: the same images, one recording for any mean" for names in copies(self.rows)]
-        return [
-            *(line_of(row, width) for row in self.rows),
-            *map(printable, left),
-            f"{'total':<13} {total}",
-            *self.together,
-        ]
+    def report(self) -> Report:
+        """What became of the recordings."""
+        others = [*of_kind(Kind.OTHER, Severity.WARNING, self.problems)]
+        others += of_kind(
+            Kind.OTHER, Severity.NOTE, [f"{name}: left out, images and no {FILE_NAME}" for name in self.undeclared]
+        )
+        found = report_of(self.rows, repeats_of(self.rows), others, TOGETHER if self.together else "", self.files)
+        together = f" All together: {self.together}" if self.together else ""
+        return replace(found, verdict=found.verdict + together)
 
 
 @checked
@@ -87,7 +85,7 @@ def run_batch(
     cores = default_threads()
     n = side_by_side or cores
     # before the work: a wrong address must be told at once
-    pool: Pool = Processes(n) if cluster is None else Cluster(cluster)
+    pool = Processes(n) if cluster is None else Cluster(cluster)
     with contextlib.closing(pool):
         places = _places(folders, output)
         check_writable(places.common)
@@ -118,7 +116,7 @@ def _places(folders: Sequence[str | Path], output: str | Path | None) -> Places:
     return Places(found, apart)
 
 
-def _do(plan: BatchPlan, results: dict[str, Result], pool: Pool) -> str:
+def _do(plan: BatchPlan, results: dict[str, Result], pool: Processes | Cluster) -> str:
     """Fill `results` with what becomes of the plan's recordings; returns why some have none."""
     bar = _Bar(plan, len(results))
 
@@ -148,12 +146,13 @@ def _summed_up(
 ) -> BatchOutcome:
     """Processes : for the diagnosis of all together; 0: not now."""
     problems = [f"not searched: {problem}" for problem in places.found.problems]
-    said: list[str] = []
+    said = ""
     if options.together and processes and not interrupted:
         measured = rows_of(places, places.found.recordings, results)
         try:
-            said, problem = diagnose_all(places.common, measured, processes)
-            problems += [problem] if problem else []
+            said = diagnose_all(places.common, measured, processes)
+        except AnalysisError as error:
+            problems.append(f"together: {error}")
         except KeyboardInterrupt:  # what was measured is summed up all the same
             interrupted = True
     files: tuple[Path, ...] = ()
@@ -162,10 +161,27 @@ def _summed_up(
     except OutputError as error:  # the results themselves may be safe all the same
         problems.append(str(error))
         rows = rows_of(places, places.found.recordings, results)
-    files += (places.common / FOLDER / "diagnosis.html",) if said else ()
+    files += (places.common / TOGETHER,) if said else ()
     names = {places.found.name(folder) for folder in mine}
     own = tuple(row for row in rows if row["recording"] in names)
-    return BatchOutcome(own, files, tuple(problems), interrupted, tuple(said))
+    return BatchOutcome(own, files, tuple(problems), interrupted, said)
+
+
+def diagnose_all(folder: Path, rows: Sequence[Row], processes: int) -> str:
+    """Verdict of one diagnosis of all measured trajectories, made in a folder beside the summary unless it is there.
+
+    Raises AnalysisError where there is none.
+    """
+    from disctrack.diagnosis.together.stage import run_together  # draws figures: only where they are wanted
+
+    trajectories = [folder / row["trajectory"] for row in rows if row["trajectory"]]
+    if len(trajectories) < 2:
+        raise AnalysisError(f"{len(trajectories)} of the recordings measured; it takes two or more")
+    try:
+        whole = (folder / TOGETHER).parent
+        return run_together(trajectories, whole, overwrite=True, reuse=True, processes=processes).verdict
+    except Exception as error:  # the single results are worth more than their combination
+        raise AnalysisError(f"the recordings could not be diagnosed: {reason_of(error)}") from error
 
 
 class _Bar:

@@ -1,33 +1,32 @@
 """The summary of a batch: one row per recording, as JSON and as CSV, merged from all who took part."""
 
-import contextlib
 import csv
 import dataclasses
 import io
 import json
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
-from disctrack.batch.columns import COLUMNS, FALSE_DISCOVERY, LACKS_SOMETHING, Row
-from disctrack.batch.index import index_page
+from disctrack.batch.columns import COLUMNS, Row
 from disctrack.batch.locks import Busy, locked
 from disctrack.batch.plan import BatchOptions, Places
 from disctrack.batch.records import FAILED, MEASURED, NOT_MEASURED, SKIPPED, Record, Result, is_done, read_record
 from disctrack.batch.repeats import REPEATS, repeats_of
-from disctrack.batch.together import FOLDER
+from disctrack.batch.report import counts, report_of
 from disctrack.errors import OutputError
 from disctrack.files.json_text import json_file
 from disctrack.files.software import __version__
-from disctrack.files.text import csv_cell, printable
+from disctrack.files.text import csv_cell
 from disctrack.files.whole import write_whole
 from disctrack.recording.changed import changed_since
 from disctrack.recording.declaration import FILE_NAME
-from disctrack.report.numbers import measured, rounded
+from disctrack.report.html import page
 from disctrack.trajectory.file import read_provenance
 
 SCHEMA, SCHEMA_VERSION = "disctrack batch summary", 1
 _PATHS = ("trajectory", "report", "diagnosis_report")
+TOGETHER = "together/diagnosis.html"  # of all recordings, below the folder of the summary
 _WAIT = 300.0  # [s] for another process that writes the summary
 
 
@@ -89,31 +88,40 @@ def write_summary(
     Shards that end at the same time write one after the other, each with all that is on the disk by then: the last one
     has everything. Raises OutputError.
     """
-    folder = places.common
-    with _for_writing(folder):
-        rows = with_false_discovery(rows_of(places, recordings, results))
-        repeats = repeats_of(rows)
-        document = {
-            "schema": SCHEMA,
-            "schema_version": SCHEMA_VERSION,
-            "version": __version__,
-            "searched": [str(places.found.base), *places.found.problems],
-            "options": dataclasses.asdict(options),
-            "counts": counts(rows),
-            "columns": COLUMNS,
-            "recordings": rows,
-            "columns_of_repeats": REPEATS,
-            "repeats": repeats,
-        }
-        together = f"{FOLDER}/diagnosis.html"
-        contents = {
-            "summary.json": json_file(document),
-            "summary.csv": _as_csv(COLUMNS, rows),
-            "repeats.csv": _as_csv(REPEATS, repeats),
-            "index.html": index_page(rows, repeats, together if (folder / together).is_file() else "").encode(),
-        }
-        for name, content in contents.items():
-            write_whole(folder / name, content)
+    try:
+        with locked(places.common / ".summary.lock", wait=_WAIT):
+            return _write_summary(places, rows_of(places, recordings, results), options)
+    except Busy as error:
+        raise OutputError(
+            f"{places.common}: another process has been writing the summary for {_WAIT:g} s. Make it anew with "
+            "--summary-only."
+        ) from error
+
+
+def _write_summary(places: Places, rows: list[Row], options: BatchOptions) -> tuple[list[Row], tuple[Path, ...]]:
+    folder, rows = places.common, with_false_discovery(rows)
+    repeats = repeats_of(rows)
+    document = {
+        "schema": SCHEMA,
+        "schema_version": SCHEMA_VERSION,
+        "version": __version__,
+        "searched": [str(places.found.base), *places.found.problems],
+        "options": dataclasses.asdict(options),
+        "counts": counts(rows),
+        "columns": COLUMNS,
+        "recordings": rows,
+        "columns_of_repeats": REPEATS,
+        "repeats": repeats,
+    }
+    together = TOGETHER if (folder / TOGETHER).is_file() else ""
+    contents = {
+        "summary.json": json_file(document),
+        "summary.csv": as_csv(COLUMNS, rows),
+        "repeats.csv": as_csv(REPEATS, repeats),
+        "index.html": page(report_of(rows, repeats, together=together), {}).encode(),
+    }
+    for name, content in contents.items():
+        write_whole(folder / name, content)
     return rows, tuple(folder / name for name in contents)
 
 
@@ -127,17 +135,6 @@ def with_false_discovery(rows: Sequence[Row]) -> list[Row]:
     return [row | {"diagnosis_false_discovery": known.get(row["recording"])} for row in rows]
 
 
-@contextlib.contextmanager
-def _for_writing(folder: Path) -> Iterator[None]:
-    try:
-        with locked(folder / ".summary.lock", wait=_WAIT):
-            yield
-    except Busy as error:
-        raise OutputError(
-            f"{folder}: another process has been writing the summary for {_WAIT:g} s. Make it anew with --summary-only."
-        ) from error
-
-
 def read_summary(path: Path) -> list[Row]:
     """Rows of a summary.json. Raises OutputError if it is none."""
     try:
@@ -149,41 +146,10 @@ def read_summary(path: Path) -> list[Row]:
     raise OutputError(f"{path}: not the summary of a batch. Give the summary.json that disctrack batch wrote.")
 
 
-def counts(rows: Sequence[Row]) -> dict[str, int]:
-    """How many recordings have which status."""
-    statuses = [row["status"] for row in rows]
-    return {status: statuses.count(status) for status in (MEASURED, SKIPPED, FAILED, NOT_MEASURED)}
-
-
-def _as_csv(columns: Iterable[str], rows: Sequence[Row]) -> bytes:
+def as_csv(columns: Iterable[str], rows: Sequence[Row]) -> bytes:
+    """The rows as a table that a spreadsheet shows as it is."""
     text = io.StringIO()
     writer = csv.DictWriter(text, list(columns))
     writer.writeheader()
     writer.writerows({name: csv_cell(value) for name, value in row.items()} for row in rows)
     return text.getvalue().encode(errors="backslashreplace")
-
-
-def line_of(row: Row, width: int) -> str:
-    """One line for people: what became of a recording. width : of the longest name"""
-    head = f"{row['status']:<13} {row['recording']:<{width}}"
-    if row["status"] in (FAILED, NOT_MEASURED):
-        return printable(f"{head}  {row['reason']}")
-    parts = [f"{row['pairs_measured']} of {row['pairs']} pairs"]
-    if row["k_m_m_s2"] is not None:
-        parts.append(f"k_m {measured(row['k_m_m_s2'], row['k_m_sigma_m_s2'], 'm s^2')}")
-        if row["k_m_reduced_chi_square"] > LACKS_SOMETHING:
-            parts.append(f"but the model with it lacks something (chi-square {rounded(row['k_m_reduced_chi_square'])})")
-    if row["n_theta"] is not None:
-        parts.append(f"n_theta {measured(row['n_theta'], row['n_theta_sigma'])}")
-    if row["t_f_s"] is not None:
-        parts.append(f"t_f {measured(row['t_f_s'], row['t_f_sigma_s'])} s")
-    rms = [row[f"reprojection_rms_{camera}_px"] for camera in ("left", "right")]
-    if None not in rms:
-        parts.append(f"rms {rounded(max(rms))} px")
-    if row["diagnosis"]:
-        share = row["diagnosis_false_discovery"]
-        doubt = "" if share is None or share < FALSE_DISCOVERY else f" (of as improbable ones {share:.0%} are chance)"
-        parts.append(f"{row['diagnosis']}{doubt if row['diagnosis'] != 'nothing missing' else ''}")
-    if row["reason"]:
-        parts.append(f"but {row['reason']}")
-    return printable(f"{head}  {', '.join(parts)}")

@@ -2,6 +2,7 @@
 
 import argparse
 import sys
+from pathlib import Path
 
 from disctrack.batch import BatchOptions, BatchOutcome, Shard, run_batch, summarise_batch
 from disctrack.commands import DONE, FAILED, INCOMPLETE
@@ -17,8 +18,7 @@ def run(arguments: argparse.Namespace) -> int:
     else:
         shard = None if arguments.shard is None else Shard(*arguments.shard)
         outcome = run_batch(arguments.folders, options, arguments.output, arguments.jobs, shard, arguments.cluster)
-    files = [f"{'' if i else 'files':<13} {outputs.relative(file)}" for i, file in enumerate(outcome.files)]
-    print("\n".join([*outcome.lines(), *files]))
+    outputs.tell(outcome.report(), arguments, Path())
     _tell_problems(outcome)
     if outcome.interrupted:
         raise KeyboardInterrupt

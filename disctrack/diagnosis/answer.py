@@ -15,7 +15,7 @@ from disctrack.discrepancy.held_out import HeldOut
 from disctrack.discrepancy.laws import LearnedLaw
 from disctrack.discrepancy.search import Diagnosis
 from disctrack.discrepancy.words import effect_text
-from disctrack.report.numbers import Measured, probability, rounded
+from disctrack.numbers import Measured, probability, rounded
 
 
 @dataclass(frozen=True)

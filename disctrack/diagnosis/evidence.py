@@ -19,7 +19,7 @@ from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.held_out import held_out
 from disctrack.errors import AnalysisError
 from disctrack.frames import nodal_axes_world
-from disctrack.report.numbers import Measured
+from disctrack.numbers import Measured
 from disctrack.trajectory import part
 
 HORIZONS = (0.1, 0.3, 0.5)  # [s] after the last frame that the fit has seen

@@ -11,8 +11,8 @@ from disctrack.discrepancy.held_out import HeldOut
 from disctrack.discrepancy.search import Diagnosis, Found, Tried
 from disctrack.discrepancy.significance import as_sigmas
 from disctrack.discrepancy.words import shown, together
+from disctrack.numbers import measured, rounded, score
 from disctrack.report.blocks import Listing, Section
-from disctrack.report.numbers import measured, rounded, score
 
 _NOTHING: Mapping[str, Any] = MappingProxyType({})
 

@@ -10,7 +10,7 @@ from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.search import Diagnosis, Found
 from disctrack.discrepancy.significance import TWO_SIDED, as_sigmas
 from disctrack.discrepancy.system import Quantity
-from disctrack.report.numbers import Measured, measured, rounded, score
+from disctrack.numbers import Measured, measured, rounded, score
 
 STRONG = 0.9  # of a correlation, from which on a standard deviation alone misleads by more than twice
 

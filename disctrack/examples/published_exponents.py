@@ -23,8 +23,8 @@ from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.search import Diagnosis, Settings, explain
 from disctrack.examples._command import Outcome, command
 from disctrack.examples.exponent_system import ExponentSystem, published_series
+from disctrack.numbers import measured
 from disctrack.report.blocks import Report
-from disctrack.report.numbers import measured
 from disctrack.report.terminal import full
 
 SETTINGS = Settings(noise=1.0, shortlist=12, max_effects=2)  # the trials' own scatter is the noise

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from disctrack.files.json_text import plain
 from disctrack.findings import Finding, Kind, Severity
-from disctrack.report.numbers import Measured
+from disctrack.numbers import Measured
 
 if TYPE_CHECKING:
     from disctrack.report.figures import Drawn
@@ -135,14 +135,14 @@ def restored(kept: Mapping[str, Any], data: Mapping[str, Any]) -> Report:
 def _cell(cell: Cell) -> Any:
     if isinstance(cell, Measured):
         return {"value": cell.value, "sigma": cell.sigma, "unit": cell.unit}
-    return str(cell)
+    return "" if isinstance(cell, Markup) else str(cell)
 
 
 def _block(block: Any) -> dict[str, Any] | None:
     if isinstance(block, Section):
         inner = [shown for b in block.blocks if (shown := _block(b))]
         return {"title": block.title, "blocks": inner} if inner else None
-    if is_empty(block) or isinstance(block, Figures):
+    if is_empty(block) or isinstance(block, Figures) or (isinstance(block, Text) and isinstance(block.said, Markup)):
         return None
     if isinstance(block, Facts):
         return {"facts": {name: _cell(value) for name, value in block.rows}}

@@ -103,7 +103,9 @@ def _facts(rows: Iterable[tuple[str, Cell]], width: int) -> list[str]:
 
 def _table(listing: Listing, width: int) -> list[str]:
     """Columns as wide as what stands in them; the last one, which may hold sentences, as long as it is."""
-    rows: list[Sequence[str]] = [listing.header, *([printable(str(cell)) for cell in row] for row in listing.rows)]
+    rows: list[Sequence[str]] = [listing.header]
+    for row in listing.rows:
+        rows.append(["" if isinstance(cell, Markup) else printable(str(cell)) for cell in row])
     widths = [max(len(row[i]) for row in rows) for i in range(len(listing.header))]
     lines = ["  ".join(cell.ljust(n) for cell, n in zip(row, widths, strict=True)).rstrip() for row in rows]
     return [*_wrapped(listing.caption or listing.folded, width), *lines]

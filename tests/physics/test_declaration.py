@@ -19,7 +19,7 @@ from disctrack.analyse.declaration import (
     turned_board,
     unseen_dots,
 )
-from disctrack.findings import Finding, Kind, Number, Severity, leading
+from disctrack.findings import Finding, Kind, Severity, leading
 from disctrack.frames import (
     continuous_quaternions,
     euler_from_rotation,
@@ -28,6 +28,7 @@ from disctrack.frames import (
     rotation_from_vector,
     unwrap_euler,
 )
+from disctrack.numbers import Measured
 from disctrack.trajectory import MarkerStatus, Trajectory
 
 SIXTHS = np.radians(60.0 * np.arange(6))
@@ -282,7 +283,7 @@ def test_the_view_whose_board_lies_where_the_rim_rolls_is_named(true_motion, as_
     ],
 )
 def test_the_thickness_that_would_put_the_rim_on_the_table_is_named(declared, height, first, honest):
-    seen = {"height": Number(1e3 * height, "um")}
+    seen = {"height": Measured(1e3 * height, unit="um")}
     off = Finding(Kind.TABLE_DISAGREES, Severity.DOUBT, "", numbers=seen)
     (found,) = thickness(honest.disc, 1e-3 * declared, [off])
     assert str(found.remedies[0]) == first

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from disctrack.analyse.stage import run_analyse
-from disctrack.report.numbers import measured
+from disctrack.numbers import measured
 from disctrack.report.palette import BLUE
 from disctrack.trajectory.file import Provenance, write_trajectory
 from tests.oracles.browser import BROWSER, screenshot

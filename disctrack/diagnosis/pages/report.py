@@ -15,8 +15,8 @@ from disctrack.discrepancy.document import explanations_table, tried_table
 from disctrack.discrepancy.significance import TWO_SIDED
 from disctrack.discrepancy.words import effect_text, significance_text
 from disctrack.findings import Finding, Kind, Severity, of_kind
+from disctrack.numbers import Measured, in_unit, measured, probability, rounded, score
 from disctrack.report.blocks import Cell, Figures, Items, Listing, Report, Section, Text
-from disctrack.report.numbers import Measured, in_unit, measured, probability, rounded, score
 
 if TYPE_CHECKING:
     from disctrack.report.figures import Drawn

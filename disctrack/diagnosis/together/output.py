@@ -19,8 +19,8 @@ from disctrack.discrepancy.system import Quantity
 from disctrack.discrepancy.words import effect_text, significance_text
 from disctrack.files.json_text import plain
 from disctrack.findings import Kind, Severity, of_kind
+from disctrack.numbers import Measured, in_unit, measured, probability, rounded
 from disctrack.report.blocks import Facts, Figures, Items, Listing, Report, Section, Text
-from disctrack.report.numbers import Measured, in_unit, measured, probability, rounded
 from disctrack.report.palette import AMBER, BLUE, MUTED
 
 if TYPE_CHECKING:

@@ -28,8 +28,8 @@ from disctrack.errors import OutputError
 from disctrack.files.json_text import json_file, plain
 from disctrack.files.whole import write_whole
 from disctrack.findings import Kind, Severity, of_kind
+from disctrack.numbers import in_unit, probability, rounded
 from disctrack.report.blocks import Figures, Items, Listing, Report, Section
-from disctrack.report.numbers import in_unit, probability, rounded
 from disctrack.report.terminal import full
 
 if TYPE_CHECKING:

@@ -22,8 +22,9 @@ from scipy.spatial.distance import pdist
 from calibration.cameras.camera import N_RIG, PAIR_SHIFT, PAIR_TURN, StereoRig, triangulate
 from calibration.kit.arrays import Array, Mask
 from disctrack.disc import Disc, has_mirror_axis
-from disctrack.findings import NONSENSE, Finding, Kind, Number, Remedy, Severity, Subject
+from disctrack.findings import NONSENSE, Finding, Kind, Remedy, Severity, Subject
 from disctrack.frames import CAMERAS, vector_from_rotation
+from disctrack.numbers import Measured
 from disctrack.track.dots.acquisition import (
     BLOB_PX,
     EPIPOLAR_PX,
@@ -127,7 +128,10 @@ def moved_camera(pairs: NDArray, rig: StereoRig, disc: Disc) -> Iterator[Finding
             f"against the left one since the calibration (what both see of the dots fits to {rms[-1]:.1f} px then, to "
             f"{rms[0]:.1f} as calibrated)"
         )
-        sizes = {"turn": Number(float(np.degrees(turn)), "deg"), "shift": Number(1e3 * float(shift), "mm")}
+        sizes = {
+            "turn": Measured(float(np.degrees(turn)), unit="deg"),
+            "shift": Measured(1e3 * float(shift), unit="mm"),
+        }
         advice = (Remedy(action="calibrate again"),)
         yield Finding(Kind.CAMERA_MOVED, Severity.DOUBT, text, Subject("track", "right"), sizes, advice, NONSENSE)
 
@@ -196,5 +200,5 @@ def _on_another_scale(scale: float) -> Finding:
     keys = "[calibration] square_mm", "every length of [disc] and [markers]"
     remedies = Remedy(keys[0], action=board), Remedy(keys[1], action=disc)
     text = f"the dots are {scale:.3g} times as far apart as declared{mixed}"
-    found = {"scale": Number(scale)}
+    found = {"scale": Measured(scale)}
     return Finding(Kind.LENGTHS, Severity.DOUBT, text, numbers=found, remedies=remedies, explains=NONSENSE)

@@ -7,7 +7,8 @@ import numpy as np
 from calibration.kit.arrays import Array, Mask, robust_sigma
 from disctrack import frames
 from disctrack.disc import Disc, symmetry_order
-from disctrack.findings import MISFITS, Finding, Kind, Number, Remedy, Severity, Subject
+from disctrack.findings import MISFITS, Finding, Kind, Remedy, Severity, Subject
+from disctrack.numbers import Measured
 from disctrack.track.follow.following import Follower
 from disctrack.track.judge.dropped_frames import HARDLY, LATE, delay_of_right
 from disctrack.track.refine.intrinsic_scatter import Scatter, SharedFaults
@@ -64,7 +65,7 @@ def off_the_table(trajectory: Trajectory, severity: Severity = Severity.WARNING)
     spread = robust_sigma(gap)
     if max(abs(np.median(gap)), np.sqrt(max(spread**2 - NOISE_ALLOWED * noise, 0.0))) <= MAX_TABLE_GAP:
         return ()
-    seen = Number(1e6 * float(np.median(gap)), "um", 1e6 * float(gap.std()))
+    seen = Measured(1e6 * float(np.median(gap)), 1e6 * float(gap.std()), "um")
     text = (
         f"the disc's lowest point lies {seen.value:+.0f} um from the table (scatter {seen.sigma:.0f} um): thickness of "
         "the board or of the disc, radius, or the table view do not fit this recording, a camera or both moved since "
@@ -133,7 +134,7 @@ def _misfit(seen: str, ahead: float, explained: float, frame_rate: float) -> Fin
         Severity.DOUBT,
         text,
         Subject("track", early),
-        {"delay": Number(abs(ahead) / frame_rate, "s")},
+        {"delay": Measured(abs(ahead) / frame_rate, unit="s")},
         (Remedy(action=again or "check the synchronisation"),),
         MISFITS,
     )
@@ -182,7 +183,8 @@ def doubts_of(
             "is, the sheet of dots is off the disc's centre, a camera moved up or down by about twice as much since "
             "the calibration (or both together), or a long exposure is not declared (exposure_us)"
         )
-        height = Number(1e6 * float(table.plane[0]), "um", 1e6 * float(np.hypot(table.sigma[0], table.board_sigma[0])))
+        spread = float(np.hypot(table.sigma[0], table.board_sigma[0]))
+        height = Measured(1e6 * float(table.plane[0]), 1e6 * spread, "um")
         found.append(Finding(Kind.TABLE_DISAGREES, severity, text, numbers={"height": height},
                              explains=(Kind.OFF_THE_TABLE,)))  # fmt: skip
     return (*found, *off_the_table(trajectory, severity))

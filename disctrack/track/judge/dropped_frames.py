@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from calibration.kit.arrays import Mask
 from calibration.kit.brief import ranges
 from calibration.kit.least_squares import normal_of_rows
-from disctrack.findings import MISFITS, Finding, Kind, Number, Remedy, Severity, Subject
+from disctrack.findings import MISFITS, Finding, Kind, Remedy, Severity, Subject
 from disctrack.frames import CAMERAS
+from disctrack.numbers import Measured
 from disctrack.track.pose import misses, whitening
 from disctrack.track.refine.self_calibration import DotsInFrames
 from disctrack.track.side_by_side import SHARED_FRAMES, evenly
@@ -54,7 +55,7 @@ def dropped_frames(refused: Mask, seen: DotsInFrames, pairs: range) -> tuple[Fin
         )
         of = Subject("track", camera, ((frames[0], frames[-1]),))
         remedy = Remedy(action=f"number its images from there on higher by {n}")
-        said.append(Finding(Kind.DROPPED_FRAMES, Severity.DOUBT, text, of, {"images": Number(n)}, (remedy,), MISFITS))
+        said.append(Finding(Kind.DROPPED_FRAMES, Severity.DOUBT, text, of, {"images": Measured(n)}, (remedy,), MISFITS))
     if unexplained:
         text = f"frames {ranges(unexplained)} {refused_for}"
         said.append(Finding(Kind.CAMERAS_CONTRADICT, Severity.DOUBT, text))

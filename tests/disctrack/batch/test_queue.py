@@ -6,12 +6,10 @@ import fcntl
 import io
 import os
 import re
-import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
-from concurrent.futures import CancelledError, Future
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from urllib.parse import unquote
 
 import numpy as np
@@ -19,19 +17,18 @@ import pytest
 from scipy import optimize, stats
 
 from disctrack.batch import locks
-from disctrack.batch.columns import COLUMNS, copies
+from disctrack.batch.columns import COLUMNS, FITTED, copies
 from disctrack.batch.find import find_recordings
-from disctrack.batch.index import index_page
 from disctrack.batch.locks import Busy, locked
 from disctrack.batch.plan import BatchOptions, Job, Shard
-from disctrack.batch.pool import Cluster, Died
-from disctrack.batch.reasons import reason_of, reason_of_death
+from disctrack.batch.pool import Cluster, Died, do_all
 from disctrack.batch.records import BUSY, FAILED, MEASURED, Record, Result
-from disctrack.batch.repeats import COMPARED, repeats_of
-from disctrack.batch.run import BatchOutcome
-from disctrack.batch.summary import _as_csv, line_of
-from disctrack.batch.work import do_all
-from disctrack.errors import ClusterError, RecordingError
+from disctrack.batch.repeats import repeats_of
+from disctrack.batch.report import report_of
+from disctrack.batch.summary import as_csv
+from disctrack.errors import ClusterError, RecordingError, reason_of
+from disctrack.report.html import page
+from disctrack.report.terminal import full, short
 
 GOOD = Result(MEASURED, Record(MEASURED))
 
@@ -111,27 +108,22 @@ WITH_RIG = [job("a", "shared.h5"), job("b"), job("c", "shared.h5")]
 
 
 class Pool:
-    """Gives the answers to each job one after the other (GOOD, unless others are listed), the oldest job's first."""
+    """Gives the answers to each job one after the other (GOOD, unless others are listed), a moment later."""
 
     def __init__(self, size=2, **answers):
-        self.size, self.answers = size, answers
-        self.begun, self.running, self.most = [], [], {}
+        self.size, self.answers, self._threads = size, answers, ThreadPoolExecutor(size)
+        self.begun, self.running, self.most = [], [], {}  # .most : how many ran beside each at most, itself included
 
     def submit(self, job):
-        answer = (self.answers.get(f"{job.kind}_{job.name}") or [GOOD]).pop(0)
-        if isinstance(answer, OSError):
-            raise answer
         self.begun.append((job.kind, job.name))
-        self.running.append((future := Future(), answer))
-        self.most[job.name] = len(self.running)
-        self.running[0][0].set_result(None) if not self.running[0][0].done() else None
-        return future
+        return self._threads.submit(self._do, job)
 
-    def result(self, future):
-        (answer,) = (answer for running, answer in self.running if running is future)
-        self.running = [(running, answer) for running, answer in self.running if running is not future]
-        if self.running and not self.running[0][0].done():
-            self.running[0][0].set_result(None)
+    def _do(self, job):
+        self.running.append(job.name)
+        self.most |= {name: max(len(self.running), self.most.get(name, 0)) for name in self.running}
+        time.sleep(0.05)
+        self.running.remove(job.name)
+        answer = (self.answers.get(f"{job.kind}_{job.name}") or [GOOD]).pop(0)
         if isinstance(answer, Exception):
             raise answer
         return answer
@@ -166,9 +158,9 @@ def test_a_job_whose_process_died_is_tried_once_more_at_the_end_and_alone():
     pool = Pool(recording_a=[Died("killed"), Died("killed")], recording_b=[Died("killed"), GOOD])
     results = done_by(pool, [job(name) for name in "abcd"])
     assert results["a"].record.reason == "twice, killed"
+    assert (pool.most["c"], pool.begun[-2:]) == (2, [("recording", "a"), ("recording", "b")])
     assert [results[name].status for name in "abcd"] == [FAILED, MEASURED, MEASURED, MEASURED]
     assert [name for _, name in pool.begun][4:] == ["a", "b"]
-    assert (pool.most["a"], pool.most["b"], pool.most["c"]) == (1, 1, 2)
 
 
 def test_a_job_for_which_no_process_can_be_started_fails_alone():
@@ -185,7 +177,7 @@ def cluster(monkeypatch):
         def get_executor(self, pure: bool):
             return self
 
-        def submit(self, do: Callable, job: Job):
+        def submit(self, do, job):
             future = Future()
             if isinstance(answer := self.answers.pop(0), Exception):
                 future.set_exception(answer)
@@ -216,9 +208,6 @@ def test_reasons_are_one_line_and_say_what_to_do():
     assert "-j" in reason_of(MemoryError())
     assert reason_of(OSError(errno.EIO, "Input/output error", "x.png")) == "x.png: Input/output error."
     assert "ZeroDivisionError" in reason_of(ZeroDivisionError("division by zero"))
-    assert "memory" in reason_of_death(-9)
-    assert "SIGSEGV" in reason_of_death(-signal.SIGSEGV, "said\n at last")
-    assert "exit code 3" in reason_of_death(3)
 
 
 _HOLD = """
@@ -278,6 +267,10 @@ def row(**known):
     return dict.fromkeys(COLUMNS) | {"recording": "r", "status": MEASURED, "reason": ""} | known
 
 
+def page_of(*given):
+    return page(report_of(*given), {})
+
+
 def test_the_page_links_reports_by_paths_that_work_and_shows_what_was_written_as_text():
     there = row(
         recording="day <1>/r #2",
@@ -289,30 +282,24 @@ def test_the_page_links_reports_by_paths_that_work_and_shows_what_was_written_as
         k_m_reduced_chi_square=23.9,
     )
     lost = row(recording="x", status=FAILED, reason="<b>no</b> rig")
-    text = index_page([there, lost])
+    text = page_of([there, lost])
     (link,) = [a for a in re.findall(r'href="([^"]+)"', text) if "report" in a]
     assert unquote(link) == there["report"]
     assert "#" not in link
     assert "day &lt;1&gt;/r #2" in text
     assert "&lt;b&gt;no&lt;/b&gt; rig" in text
     assert "3.8100 ± 0.0010 (model: χ² 23.9)" in text
+    assert "model: χ²" not in page_of([there | {"k_m_reduced_chi_square": 1.01}])
     assert "9 / 10" in text
 
 
 def test_recordings_of_the_same_images_are_told():
     rows = [
-        row(recording=name, input_sha256=digest) for name, digest in (("a", "1"), ("b", "2"), ("c", "1"), ("d", None))
+        row(recording=name, input_sha256=digest) for name, digest in zip("abcd", ("1", "2", "1", None), strict=True)
     ]
     assert copies(rows) == ["a, c"]
-    assert "a, c: the same images" in index_page(rows)
-    assert "the same images" not in index_page(rows[1:])
-    assert "copies        a, c: the same images" in "\n".join(BatchOutcome(tuple(rows), (), ()).lines())
-
-
-def test_a_line_warns_where_the_model_lacks_something():
-    measured = row(pairs=10, pairs_measured=10, k_m_m_s2=3.81e-8, k_m_sigma_m_s2=1e-11, k_m_reduced_chi_square=1.01)
-    assert "lacks" not in line_of(measured, 3)
-    assert "lacks something (chi-square 23.9)" in line_of(measured | {"k_m_reduced_chi_square": 23.9}, 3)
+    assert "a, c: the same images" in "\n".join(short(report_of(rows)))
+    assert "the same images" not in page_of(rows[1:])
 
 
 def repeats_with(values, sigmas, **known):
@@ -362,17 +349,16 @@ def test_repeats_are_of_one_group_determined_and_no_copies():
     (found,) = repeats_of(rows)
     assert (found["repeats"], found["quantity"], found["n"]) == ("glass", "n_theta", 3)
     assert found["mean"] == pytest.approx(0.67)
-    assert set(COMPARED) <= set(COLUMNS)
-    page = index_page(rows, [found])
-    assert "0.670 ± 0.010" in page
-    assert "Repeats" not in index_page(rows)
+    assert {name for fitted in FITTED for name in (fitted.column, fitted.sigma)} <= set(COLUMNS)
+    assert "0.670 ± 0.010" in page_of(rows, [found])
+    assert "Repeats" not in page_of(rows)
 
 
 def test_names_are_text_in_a_spreadsheet_and_steer_no_terminal():
     names = ["=1+1", "+1", "-1", "@SUM(A1)", "\x1b[2J", "plain é"]
     rows = [row(recording=name, reason="\x1b]0;title\x07", pairs=-1) for name in names]
-    cells = list(csv.DictReader(io.StringIO(_as_csv(COLUMNS, rows).decode())))
+    cells = list(csv.DictReader(io.StringIO(as_csv(COLUMNS, rows).decode())))
     assert [cell["recording"] for cell in cells] == ["'=1+1", "'+1", "'-1", "'@SUM(A1)", r"\x1b[2J", "plain é"]
     assert cells[0]["pairs"] == "-1"  # a number stays one
-    assert "\x1b" not in index_page(rows)
-    assert not any("\x1b" in line_of(item | {"status": FAILED}, 3) for item in rows)
+    assert "\x1b" not in page_of(rows)
+    assert "\x1b" not in "".join(full(report_of(rows)))

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 
 from disctrack.files.json_text import json_file, json_text, plain
 from disctrack.findings import Kind, Severity, of_kind
+from disctrack.numbers import Measured, measured, probability, rounded, score
 from disctrack.report import palette
 from disctrack.report.blocks import (
     Facts,
@@ -26,7 +27,6 @@ from disctrack.report.blocks import (
 )
 from disctrack.report.figures import Drawn, draw, plain_powers
 from disctrack.report.html import link_pages, page, write_page
-from disctrack.report.numbers import Measured, measured, probability, rounded, score
 from disctrack.report.terminal import full, short, show
 
 
@@ -151,6 +151,7 @@ def test_pages_of_one_recording_name_those_that_are_there(tmp_path):
         ((0.675, 0.00996), "0.675 ± 0.010"),  # 9.96 has three digits once rounded
         ((-1e-9, 2e-7, "m"), "0 ± 200 nm"),  # no -0
         ((86227.6, 221.0), "86230 ± 220"),
+        ((1.0, 99.6), "0 ± 100"),
         ((4.193e-8, 1.2e-12, "m s^2"), "(4.19300 ± 0.00012) × 10⁻⁸ m s²"),
         ((1.5, 0.0, "rad s-1"), "1.5 rad/s"),
         ((2.6e-7, float("nan"), "m s^2"), "2.6 × 10⁻⁷ m s²"),

@@ -22,8 +22,9 @@ from calibration.cameras.splines import LensField
 from disctrack.disc import MA_2014
 from disctrack.errors import DiscTrackError, OutputError, TrajectoryFileError
 from disctrack.files.labelled_arrays import Variable
-from disctrack.findings import DoubtWarning, Finding, Kind, Number, Remedy, Severity, Subject
+from disctrack.findings import DoubtWarning, Finding, Kind, Remedy, Severity, Subject
 from disctrack.frames import continuous_quaternions, quaternion_from_rotation, rotation_from_euler
+from disctrack.numbers import Measured
 from disctrack.trajectory import FrameStatus, Trajectory
 from disctrack.trajectory import file as storage
 from disctrack.trajectory.exchange.csv_table import write_csv
@@ -195,7 +196,7 @@ SEEN = Finding(
     Severity.DOUBT,
     "on another scale",
     Subject("track", frames=((3, 7),)),
-    {"scale": Number(0.9877, "", 1e-4)},
+    {"scale": Measured(0.9877, 1e-4)},
     (Remedy("square_mm", "8.00", "8.1"),),
     (Kind.RADIUS,),
 )

@@ -1,0 +1,137 @@
+"""A batch as a report: it links the single reports, compares the recordings, and says what is wrong with some."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from urllib.parse import quote
+
+from disctrack.batch.columns import FALSE_DISCOVERY, FITTED, LACKS_SOMETHING, Fitted, Row, copies
+from disctrack.batch.records import FAILED, MEASURED, NOT_MEASURED, SKIPPED
+from disctrack.findings import Finding, Kind, Severity, of_kind
+from disctrack.frames import CAMERAS
+from disctrack.numbers import measured, rounded
+from disctrack.report.blocks import Listing, Markup, Report, Section, Text
+
+SAID = {SKIPPED: "measured before"}  # which is read long after the batch that found it done
+
+
+def report_of(
+    rows: Sequence[Row],
+    repeats: Sequence[Row] = (),
+    others: Sequence[Finding] = (),
+    together: str = "",
+    files: Sequence[Path] = (),
+) -> Report:
+    """All of a batch.
+
+    repeats : as `repeats_of` gives them; others : findings that are not about single recordings
+    together : page of the diagnosis of all, relative to the batch's own, where there is one
+    """
+    header = ("recording", "", "status", "pairs", *(f.label for f in FITTED), "rms (px)", "χ²", "diagnosis")
+    classes = [row["status"].split()[0] for row in rows]
+    data = '<p>All columns: <a href="summary.csv">summary.csv</a>, <a href="summary.json">summary.json</a>.</p>'
+    link = f'<p><a href="{together}">What the model lacks, all recordings together</a></p>'
+    same = [f"{names}: the same images, one recording for any mean" for names in copies(rows)]
+    what = Text(
+        "Values with one standard deviation; a dash where the recording does not determine a number. k_m from the dots "
+        "is the only loss of a rolling model fitted to all images; in a diagnosis other losses enter beside it, and so "
+        "its k_m differs."
+    )
+    table = Listing(header, [_cells(row) for row in rows], classes=classes)
+    return Report(
+        "Batch of recordings",
+        _verdict(rows),
+        findings=[*_noticed(rows), *of_kind(Kind.OTHER, Severity.WARNING, same), *others],
+        blocks=[
+            Section("Results", [what, table, Text(Markup(data))]),
+            Section("All recordings together", [Text(Markup(link))] if together else ()),
+            Section("Repeats", _repeats(repeats) if repeats else ()),
+        ],
+        files=files,
+        page=next((file for file in files if file.name == "index.html"), None),
+    )
+
+
+def counts(rows: Sequence[Row]) -> dict[str, int]:
+    """How many recordings have which status."""
+    statuses = [row["status"] for row in rows]
+    return {status: statuses.count(status) for status in (MEASURED, SKIPPED, FAILED, NOT_MEASURED)}
+
+
+def _verdict(rows: Sequence[Row]) -> str:
+    total = ", ".join(f"{n} {SAID.get(status, status)}" for status, n in counts(rows).items() if n)
+    pairs = sum(row["pairs_measured"] or 0 for row in rows)
+    said = f"{_counted(len(rows), 'recording')}: {total}; {_counted(pairs, 'pair')} with a pose."
+    diagnosed = [row for row in rows if row["diagnosis"]]
+    if not diagnosed:
+        return said
+    missing = [row for row in diagnosed if row["diagnosis"] != "nothing missing"]
+    sure = sum((row["diagnosis_false_discovery"] or 0.0) < FALSE_DISCOVERY for row in missing)
+    return (
+        f"{said} Something is missing in {len(missing)} of {_counted(len(diagnosed), 'diagnosed recording')}; {sure} "
+        f"of these stand at a rate of false discoveries of {FALSE_DISCOVERY:.0%} over the batch."
+    )
+
+
+def _noticed(rows: Sequence[Row]) -> list[Finding]:
+    """Why recordings have no result, or one that is not all it could be."""
+    found = []
+    for row in (row for row in rows if row["reason"]):
+        severity = Severity.DOUBT if row["severity"] == "doubt" else Severity.WARNING
+        severity = Severity.REFUSAL if row["status"] in (FAILED, NOT_MEASURED) else severity
+        found.append(Finding(Kind.OTHER, severity, f"{row['recording']} ({row['status']}): {row['reason']}"))
+    return found
+
+
+def _repeats(repeats: Sequence[Row]) -> list[Text | Listing]:
+    said = (
+        "Mean and standard deviation over the recordings of one disc on one surface, from one case as declared. "
+        "χ² is their squared spread over the stated variances, per degree of freedom: far above 1, with a small "
+        "probability p, they disagree by more than the measurement explains."
+    )
+    fitted = {f.column: f for f in FITTED}
+    cells = [
+        (
+            row["repeats"],
+            fitted[row["quantity"]].label,
+            str(row["n"]),
+            measured(*(fitted[row["quantity"]].scale * row[key] for key in ("mean", "standard_deviation"))),
+            rounded(row["reduced_chi_square"]),
+            rounded(row["p_value"], 2),
+        )
+        for row in repeats
+    ]
+    header = ("recordings", "", "n", "mean ± standard deviation", "χ²", "p")
+    files = '<p>With weighted means: <a href="repeats.csv">repeats.csv</a>.</p>'
+    return [Text(said), Listing(header, cells), Text(Markup(files))]
+
+
+def _counted(n: int, what: str) -> str:
+    return f"{n} {what}" if n == 1 else f"{n} {what}s"
+
+
+def _cells(row: Row) -> list[str]:
+    rms = [row[f"reprojection_rms_{camera}_px"] for camera in CAMERAS]
+    pages = ("report", "report"), ("diagnosis_report", "diagnosis")
+    links = [f'<a href="{quote(row[key])}">{name}</a>' for key, name in pages if row[key]]
+    share = row["diagnosis_false_discovery"]
+    chance = share is not None and share >= FALSE_DISCOVERY and row["diagnosis"] != "nothing missing"
+    return [
+        row["recording"],
+        Markup(" ".join(links)),
+        SAID.get(str(row["status"]), str(row["status"])),
+        "" if row["pairs"] is None else f"{row['pairs_measured']} / {row['pairs']}",
+        *(_with_sigma(row, fitted) for fitted in FITTED),
+        "–" if None in rms else rounded(max(rms)),
+        rounded(row["reduced_chi_square"]) or "–",
+        f"{row['diagnosis'] or ''}{f' (of as improbable ones {share:.0%} are chance)' if chance else ''}",
+    ]
+
+
+def _with_sigma(row: Row, fitted: Fitted) -> str:
+    """A fitted number, with the chi-square of its model where that says that the number is not the whole story."""
+    value, sigma = row[fitted.column], row[fitted.sigma]
+    if value is None or sigma is None:
+        return "–"
+    misfit = row[fitted.misfit] if fitted.misfit else None
+    lacks = f" (model: χ² {rounded(misfit)})" if misfit is not None and misfit > LACKS_SOMETHING else ""
+    return measured(fitted.scale * value, fitted.scale * sigma) + lacks
