@@ -24,13 +24,13 @@ from calibration.kit.arguments import checked
 from calibration.kit.arrays import Mask
 from calibration.kit.brief import Outline
 from calibration.rig_file import beyond_model, read_beyond_model, write_attributes
-from disctrack.disc import AIR_DENSITY, Disc
+from disctrack.disc import Disc
 from disctrack.errors import TrajectoryFileError
 from disctrack.files.json_text import json_text
 from disctrack.files.labelled_arrays import Variable, copy_without, flags, read_variables, write_variables
 from disctrack.files.software import software_version
 from disctrack.files.whole import refuse_existing, write_whole
-from disctrack.findings import Finding, Kind, Severity, finding_from_json, warn_of_doubts
+from disctrack.findings import Finding, finding_from_json, warn_of_doubts
 from disctrack.frames import CAMERAS, COORDINATES, POSE_COMPONENTS
 from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
 
@@ -146,22 +146,17 @@ def read_provenance(path: Path) -> Provenance:
 def read_details(path: Path) -> dict[str, Any]:
     """Numbers of the run that wrote the file. Raises TrajectoryFileError."""
     with _reading(path) as file:
-        return dict(json.loads(file.attrs["details" if "details" in file.attrs else "findings"]))  # of earlier versions
+        return dict(json.loads(file.attrs["details"]))
 
 
 def read_findings(path: Path) -> tuple[Finding, ...]:
     """What was noticed in the measurement. Raises TrajectoryFileError."""
     with _reading(path) as file:
-        return _findings(json.loads(file.attrs["findings"]))
+        return _findings(file)
 
 
-def _findings(content: Any) -> tuple[Finding, ...]:
-    """Findings of a file; earlier versions had sentences, those that put the result in doubt twice."""
-    if isinstance(content, list):
-        return tuple(finding_from_json(document) for document in content)
-    doubts, warnings = (content.get(key, ()) for key in ("doubts", "warnings"))
-    severities = {**dict.fromkeys(warnings, Severity.WARNING), **dict.fromkeys(doubts, Severity.DOUBT)}
-    return tuple(Finding(Kind.OTHER, severity, text) for text, severity in severities.items())
+def _findings(file: h5py.File) -> tuple[Finding, ...]:
+    return tuple(finding_from_json(document) for document in json.loads(file.attrs["findings"]))
 
 
 def is_result_of(path: Path, provenance: Provenance) -> bool:
@@ -440,8 +435,6 @@ def _trajectory(file: h5py.File) -> Trajectory:
     groups = {"": read_variables(file)}
     groups |= {name: read_variables(file[name]) for name in ("markers", "calibration")}
     root, disc = groups[""], _read_disc(file["disc"])
-    # files of earlier versions counted it as noise of single frames
-    root.setdefault("systematic_covariance", np.zeros_like(root["pose_covariance"]))
     lengths = {name: len(values) for name, (values, _) in _NAMED_AXES.items()}
     lengths |= {"time": len(root["time"]), "marker": disc.n_markers}
     found = {}
@@ -451,7 +444,7 @@ def _trajectory(file: h5py.File) -> Trajectory:
         expected = tuple(lengths[axis] for axis in dims)
         if found[attribute].shape != expected:
             raise TrajectoryFileError(f"{attribute} has shape {found[attribute].shape}; expected {expected}")
-    height, slope_x, slope_y = map(float, file.attrs.get("table_moved_m_rad", np.zeros(3)))  # files of earlier versions
+    height, slope_x, slope_y = map(float, file.attrs["table_moved_m_rad"])
     trajectory = Trajectory(
         time=root["time"],
         q=np.column_stack([root[name] for name in COORDINATES]),
@@ -459,9 +452,9 @@ def _trajectory(file: h5py.File) -> Trajectory:
         rig=_rig(file["calibration"], groups["calibration"]),
         frame_rate=float(file.attrs["frame_rate_hz"]),
         gravity=float(file.attrs["gravity_m_s2"]),
-        air_density=float(file.attrs.get("air_density_kg_m3", AIR_DENSITY)),  # files of earlier versions
+        air_density=float(file.attrs["air_density_kg_m3"]),
         table_moved=(height, slope_x, slope_y),
-        findings=_findings(json.loads(file.attrs["findings"])),
+        findings=_findings(file),
         **found,
     )
     _check_values(trajectory)
