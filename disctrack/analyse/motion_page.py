@@ -63,14 +63,10 @@ def motion_html(analysis: Analysis, name: str, drawn: Drawn | None = None) -> st
 
 def page_data(analysis: Analysis, drawn: Drawn | None = None) -> dict[str, Any]:
     """What the page draws, of JSON's types; lengths in mm, angles in degrees, None where nothing is known."""
-    trajectory, motion = analysis.trajectory, analysis.motion
+    trajectory = analysis.trajectory
     rows = np.arange(0, len(trajectory), max(1, -(-len(trajectory) // MOST_ROWS)))
     energy, psidot = analysis.series("total"), analysis.series("psidot")
-    contact = [1e3 * analysis.contact.series[i].value for i in (0, 1)]
-    at = {name: _by_time(motion.time, values, trajectory.time[rows]) for name, values in (
-        ("x", contact[0]), ("y", contact[1]), ("energy", 1e3 * energy.value), ("energy_sigma", 1e3 * energy.sigma),
-        ("psidot", psidot.value), ("psidot_sigma", psidot.sigma),
-    )}  # fmt: skip
+    contact = [1e3 * analysis.contact.series[i].value[rows] for i in (0, 1)]
     q, disc = trajectory.q[rows], trajectory.disc
     theta_sigma = np.degrees(trajectory.coordinate_sigma[rows, 4])
     residual = trajectory.markers_residual_px[rows]
@@ -87,7 +83,7 @@ def page_data(analysis: Analysis, drawn: Drawn | None = None) -> dict[str, Any]:
         "words": [_in_words(row) for row in q],
         "xyz": _plain(1e3 * q[:, :3], 4),
         "quaternion": _plain(trajectory.quaternion[rows], 6),
-        "contact": _plain(np.column_stack([at["x"], at["y"]]), 4),
+        "contact": _plain(np.column_stack(contact), 4),
         "middle": _plain(middle, 3),
         "disc": {
             "radius_mm": 1e3 * disc.radius,
@@ -97,8 +93,8 @@ def page_data(analysis: Analysis, drawn: Drawn | None = None) -> dict[str, Any]:
         },
         "series": [
             series("nutation θ", "deg", 4, np.degrees(q[:, 4]), theta_sigma),
-            series("precession rate", "rad/s", 3, at["psidot"], at["psidot_sigma"]),
-            series("energy", "mJ", 4, at["energy"], at["energy_sigma"]),
+            series("precession rate", "rad/s", 3, psidot.value[rows], psidot.sigma[rows]),
+            series("energy", "mJ", 4, 1e3 * energy.value[rows], 1e3 * energy.sigma[rows]),
         ],
         "residual_px": _plain(residual, 5),
         "residual_reach_px": float(1.2 * np.percentile(finite, 99.5)) if finite.size else 1.0,
@@ -122,12 +118,6 @@ def _in_words(q: Array) -> str:
         return ""
     (x, y, z), (psi, theta, phi) = 1e3 * q[:3], np.degrees(q[3:])
     return f"x {x:.3f}  y {y:.3f}  z {z:.3f} mm   ψ {psi:.2f}  θ {theta:.3f}  φ {phi:.2f}°"
-
-
-def _by_time(time: Array, values: Array, wanted: Array) -> Array:
-    """Values at the wanted times; NaN outside, and where they are."""
-    index = np.clip(np.searchsorted(time, wanted - 1e-9), 0, len(time) - 1)
-    return np.where(np.abs(time[index] - wanted) < 1e-6, values[index], np.nan)
 
 
 def _plain(values: Array, digits: int) -> Any:

@@ -3,7 +3,6 @@
 import csv
 import dataclasses
 import errno
-import json
 import os
 import signal
 import subprocess
@@ -31,7 +30,6 @@ from disctrack.trajectory.exchange.csv_table import write_csv
 from disctrack.trajectory.file import (
     Provenance,
     is_result_of,
-    read_details,
     read_findings,
     read_group,
     read_provenance,
@@ -212,18 +210,6 @@ def test_findings_come_back_and_doubts_are_python_warnings(tmp_path, trajectory)
     assert told[0].filename == __file__
     write_trajectory(tmp_path / "clean.h5", trajectory, PROVENANCE)
     assert read_trajectory(tmp_path / "clean.h5").findings == ()
-
-
-def test_a_file_of_an_earlier_version_gives_its_sentences(tmp_path, trajectory):
-    write_trajectory(tmp_path / "t.h5", trajectory, PROVENANCE)
-    with h5py.File(tmp_path / "t.h5", "r+") as handle:
-        handle.attrs["findings"] = json.dumps({"warnings": ["one", "two"], "doubts": ["two"], "blur_px": [0.7, 0.8]})
-        del handle.attrs["details"]
-    assert [(f.kind, f.severity, f.text) for f in read_findings(tmp_path / "t.h5")] == [
-        (Kind.OTHER, Severity.WARNING, "one"),
-        (Kind.OTHER, Severity.DOUBT, "two"),
-    ]
-    assert read_details(tmp_path / "t.h5")["blur_px"] == [0.7, 0.8]
 
 
 @pytest.mark.statistical
