@@ -73,11 +73,6 @@ def located(images: Sequence[NDArray], target: Target, progress: Progress | None
     return [views[index] for index in range(len(images))]
 
 
-def evenly(n: int, most: int) -> list[int]:
-    """Numbers of at most `most` of n things, evenly over them."""
-    return sorted({round(i) for i in np.linspace(0, n - 1, min(n, most))})
-
-
 def other_board(images: Sequence[NDArray], refused: Sequence[bool], target: Target) -> str:
     """The chessboard that most images show in place of the declared one, in words; "" if there is none.
 

@@ -14,3 +14,8 @@ Image = NDArray[np.uint8] | NDArray[np.uint16]  # one image or a stack of them, 
 def robust_sigma(values: NDArray[np.floating]) -> float:
     """Standard deviation by the median absolute deviation, which a few wild values do not change."""
     return 1.4826 * float(np.median(np.abs(values - np.median(values))))
+
+
+def evenly(n: int, most: int) -> list[int]:
+    """Numbers of at most `most` of n things, evenly over them."""
+    return sorted({round(i) for i in np.linspace(0, n - 1, min(n, most))})

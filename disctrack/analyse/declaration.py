@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from calibration.cameras.camera import StereoRig, triangulate
-from calibration.kit.arrays import Array
+from calibration.kit.arrays import Array, evenly, robust_sigma
 from disctrack.analyse.derivatives import K, MeasuredMotion, differentiate
 from disctrack.analyse.energy import TOTAL, energy_quantities
 from disctrack.disc import Disc, has_mirror_axis, symmetry_order
@@ -147,7 +147,7 @@ def motion_against_gravity(trajectory: Trajectory) -> tuple[Finding, ...]:
     if n < MIN_BLOCKS:
         return ()
     gravity = float(np.median(found))
-    sigma = _robust(found) * np.sqrt(np.pi / 2 / n)
+    sigma = robust_sigma(found) * np.sqrt(np.pi / 2 / n)
     if not (gravity > 0 and np.mean(np.abs(found - gravity) < COHERENT * gravity) >= COHERENT_SHARE):
         return ()
     away = abs(np.log(gravity / g))
@@ -163,7 +163,7 @@ def motion_against_gravity(trajectory: Trajectory) -> tuple[Finding, ...]:
         return (Finding(kind, severity, text, numbers=numbers, remedies=remedies, explains=(Kind.REVERSED,)),)
     times = np.arange(n)
     slope, start = np.polyfit(times, energy, 1)
-    sigma = _robust(energy - slope * times - start) / (np.std(times) * np.sqrt(n))
+    sigma = robust_sigma(energy - slope * times - start) / (np.std(times) * np.sqrt(n))
     end = start + slope * times[-1]
     steady = np.mean(np.diff(energy) > 0) > STEADY
     if end - start > GROWTH * start and slope > SIGMAS * sigma and steady:
@@ -239,7 +239,7 @@ def _stretches(trajectory: Trajectory) -> list[slice]:
         for piece in pieces
         for start in range(piece[0], piece[-1] + 1 - BLOCK, STRETCH)
     ]
-    return [found[i] for i in _evenly(len(found), STRETCHES)]
+    return [found[i] for i in evenly(len(found), STRETCHES)]
 
 
 def _blocks(motion: MeasuredMotion) -> tuple[Array, Array]:
@@ -264,15 +264,6 @@ def _blocks(motion: MeasuredMotion) -> tuple[Array, Array]:
     blocks = [rows for rows in blocks if len(rows) > BLOCK // 2]
     gravity = [left[rows] @ weight[rows] / (weight[rows] @ weight[rows]) for rows in blocks]
     return np.array(gravity), np.array([energy[rows].mean() for rows in blocks])
-
-
-def _robust(values: Array) -> float:
-    return 1.4826 * float(np.median(np.abs(values - np.median(values))))
-
-
-def _evenly(n: int, most: int) -> Array:
-    """Numbers of at most `most` of n things, evenly over them."""
-    return np.linspace(0, n - 1, min(n, most)).round().astype(int)
 
 
 def _doubting(residual: Array) -> Array:
@@ -300,7 +291,7 @@ def another_plane(trajectory: Trajectory, boards: Boards | None = None) -> tuple
     side, ahead = np.linalg.svd(normal[None])[2][1:] @ e3.T
     turned, precessed = np.arccos(np.clip(normal[2], -1, 1)), np.ptp(np.unwrap(np.arctan2(ahead, side)))
     rolls = precessed > MIN_ROUND and np.median(e3 @ normal) < np.cos(THETA_RANGE[0])
-    if not (rolls and turned > MIN_LEAN and _robust(gap) < FLAT * disc.radius * turned):
+    if not (rolls and turned > MIN_LEAN and robust_sigma(gap) < FLAT * disc.radius * turned):
         return ()
     lies = None if boards is None else _view_on_plane(trajectory.rig, boards, normal, middle)
     declared = None if boards is None else boards.table_view
@@ -341,7 +332,7 @@ def rise_of_centre(trajectory: Trajectory) -> tuple[Finding, ...]:
     slope, offset = np.polyfit(s, z, 1)
     for _ in range(5):
         slope, offset = np.polyfit(s, z, 1, w=np.sqrt(_doubting(z - slope * s - offset)))
-    scatter = _robust(z - slope * s - offset)
+    scatter = robust_sigma(z - slope * s - offset)
     sigma = scatter / (np.std(s) * np.sqrt(len(s) / BLOCK))
     ratio = float(slope / disc.radius)
     if not (abs(ratio - 1) > RISE and abs(slope - disc.radius) > SIGMAS * sigma and scatter < RISE * disc.radius):
@@ -384,7 +375,7 @@ def handedness(rig: StereoRig, disc: Disc) -> tuple[Finding, ...]:
 def scale_of_dots(trajectory: Trajectory, declared: Disc, square: float | None = None) -> tuple[Finding, ...]:
     """Distances of the dots, by both cameras alone, over those of their declared centres."""
     rows = np.flatnonzero(trajectory.measured)
-    rows = rows[_evenly(len(rows), 50)]
+    rows = rows[evenly(len(rows), 50)]
     good = (trajectory.marker_status[rows] == MarkerStatus.MEASURED).all(axis=1)
     pixels = np.where(good[:, None, :, None], trajectory.markers_px[rows], np.nan)
     n, _, dots, _ = pixels.shape
@@ -399,7 +390,7 @@ def scale_of_dots(trajectory: Trajectory, declared: Disc, square: float | None =
     per_pair = np.array([np.median(r[np.isfinite(r)]) for r in ratio.T if np.isfinite(r).sum() >= min(5, n)])
     if len(per_pair) < MIN_BLOCKS:
         return ()
-    scale, spread = float(np.median(per_pair)), _robust(per_pair)
+    scale, spread = float(np.median(per_pair)), robust_sigma(per_pair)
     # Pairs of dots share dots: as many are independent as there are dots.
     sigma = spread / np.sqrt(dots)
     if not (abs(scale - 1) > SCALE and abs(scale - 1) > SIGMAS * sigma):

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.kit.arrays import Array
+from calibration.kit.arrays import Array, evenly
 from disctrack.analyse.analysis import Analysis
 from disctrack.findings import doubts
 from disctrack.report.blocks import Markup, Report, Text
@@ -128,16 +128,15 @@ def _plain(values: Array, digits: int) -> Any:
 
 
 def _pictures(rows: NDArray[np.intp], drawn: Drawn) -> list[dict[str, Any]]:
-    chosen = np.unique(np.linspace(0, len(rows) - 1, min(MOST_PICTURES, len(rows))).round().astype(int))
     found = []
-    for k in chosen:
+    for k in evenly(len(rows), MOST_PICTURES):
         picture = drawn(int(rows[k]))
         scale = min(1.0, 300 / picture.shape[0])
         small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
         good, coded = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 72])
         if good:
             uri = f"data:image/jpeg;base64,{base64.b64encode(coded.tobytes()).decode()}"
-            found.append({"row": int(k), "uri": uri})
+            found.append({"row": k, "uri": uri})
     return found
 
 

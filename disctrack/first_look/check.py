@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration import CalibrationSettings, StereoCalibration, StereoRig
-from calibration.board.search import evenly
+from calibration.kit.arrays import evenly
 from calibration.kit.grey_levels import saturation_level
 from calibration.rig_file import read_rig, record_of
 from disctrack.analyse.declaration import Boards, contradictions_of, turned_board

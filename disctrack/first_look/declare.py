@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.board.chessboard import BoardNotFound, find_corners
-from calibration.board.search import VIEWS_TRIED, board_size, evenly
+from calibration.board.search import VIEWS_TRIED, board_size
+from calibration.kit.arrays import evenly
 from calibration.rig_file import read_rig
 from disctrack.errors import DiscTrackError, OutputError, RecordingError
 from disctrack.files.toml_tree import read_toml, toml_value

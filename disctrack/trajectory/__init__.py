@@ -27,17 +27,29 @@ class FrameStatus(IntEnum):
     True
     """
 
-    MEASURED = 0
-    ONE_CAMERA = 1
-    FEW_MARKERS = 2
-    MARKERS_NOT_FOUND = 3
-    NOT_CONVERGED = 4
-    UNREADABLE = 5
-    NOT_PROCESSED = 6
-    STILL = 7
-    REPEATED = 8
-    CONTRADICTED = 9
-    JUMPED = 10
+    sentence: str
+
+    MEASURED = 0, "measured with both cameras"
+    ONE_CAMERA = 1, "measured with one camera: sigma along its view is large"
+    FEW_MARKERS = 2, "measured with fewer than 6 good dot images: sigma is larger"
+    MARKERS_NOT_FOUND = 3, "fewer than 3 dots found: outside the field, hidden, or blurred"
+    NOT_CONVERGED = 4, "no pose fits the dots: two exchanged, or the rig does not belong to this recording"
+    UNREADABLE = 5, "image file could not be read"
+    NOT_PROCESSED = 6, "not processed"
+    STILL = 7, "left out: nothing moves before the start or after the end; --all measures them, too"
+    REPEATED = 8, "both images are copies of earlier ones, while the disc moves: the recorder lost this frame"
+    CONTRADICTED = (
+        9,
+        "refused: the dots contradict each other by more than their noise explains (a gleam, a hand, a repeated or "
+        "exchanged image)",
+    )
+    JUMPED = 10, "refused: no motion leads from the frames before or after to this pose (exchanged frames?)"
+
+    def __new__(cls, value: int, sentence: str) -> FrameStatus:
+        """A number with its sentence."""
+        member = int.__new__(cls, value)
+        member._value_, member.sentence = value, sentence
+        return member
 
     @property
     def has_pose(self) -> bool:
@@ -48,27 +60,6 @@ class FrameStatus(IntEnum):
     def looked_for(self) -> bool:
         """True where a pose was looked for, found or not."""
         return self not in (FrameStatus.NOT_PROCESSED, FrameStatus.STILL)
-
-    @property
-    def sentence(self) -> str:
-        """The status in words."""
-        return _FRAME_SENTENCES[self]
-
-
-_FRAME_SENTENCES = {
-    FrameStatus.MEASURED: "measured with both cameras",
-    FrameStatus.ONE_CAMERA: "measured with one camera: sigma along its view is large",
-    FrameStatus.FEW_MARKERS: "measured with fewer than 6 good dot images: sigma is larger",
-    FrameStatus.MARKERS_NOT_FOUND: "fewer than 3 dots found: outside the field, hidden, or blurred",
-    FrameStatus.NOT_CONVERGED: "no pose fits the dots: two exchanged, or the rig does not belong to this recording",
-    FrameStatus.UNREADABLE: "image file could not be read",
-    FrameStatus.NOT_PROCESSED: "not processed",
-    FrameStatus.REPEATED: "both images are copies of earlier ones, while the disc moves: the recorder lost this frame",
-    FrameStatus.CONTRADICTED: "refused: the dots contradict each other by more than their noise explains (a gleam, "
-    "a hand, a repeated or exchanged image)",
-    FrameStatus.JUMPED: "refused: no motion leads from the frames before or after to this pose (exchanged frames?)",
-    FrameStatus.STILL: "left out: nothing moves before the start or after the end; --all measures them, too",
-}
 
 
 class MarkerStatus(IntEnum):
