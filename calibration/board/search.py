@@ -18,6 +18,7 @@ from calibration.board.chessboard import (
     grey_values,
 )
 from calibration.board.target import Board, CharucoBoard, Target
+from calibration.kit.arrays import evenly
 
 TargetView = CornerView | BoardNotFound
 Progress = Callable[[str, int, int], None]
