@@ -23,18 +23,27 @@ class FoundRecordings:
     recordings: tuple[Path, ...]  # folders with a recording.toml, each once, in natural order of their names
     problems: tuple[str, ...]  # folders that could not be looked into
     undeclared: tuple[Path, ...] = ()  # that hold two folders of images or two films, and no recording.toml
+    output: Path | None = None  # folder for all results; None: beside each recording
 
     def name(self, recording: Path) -> str:
         """The recording's place below `base`, with slashes: unique, printable, and the same on every machine."""
         relative = Path(os.path.relpath(recording, self.base)).as_posix()
         return printable(recording.name if relative == "." and len(self.recordings) == 1 else relative)
 
+    @property
+    def common(self) -> Path:
+        """Folder of the summary, the index and the rigs."""
+        return self.base / FOLDER if self.output is None else self.output
 
-def find_recordings(folders: Sequence[Path], leave_out: Sequence[Path] = ()) -> FoundRecordings:
+    def results(self, recording: Path) -> Path:
+        """Folder of one recording's results."""
+        return recording / RESULTS if self.output is None else self.output / self.name(recording)
+
+
+def find_recordings(folders: Sequence[str | Path], output: str | Path | None = None) -> FoundRecordings:
     """Folders at and below `folders` that hold a recording.toml; links are followed, each folder is looked at once.
 
-    leave_out : folders that are not searched (those that results go to); `results` of a recording and `batch_results`
-        never are
+    output : folder for the results, which is not searched, as `results` of a recording and `batch_results` never are
     Raises RecordingError if a folder does not exist or if there is no recording at all.
     """
     roots = [Path(folder).resolve() for folder in folders]
@@ -43,7 +52,8 @@ def find_recordings(folders: Sequence[Path], leave_out: Sequence[Path] = ()) -> 
             raise RecordingError(f"{folder}: no such folder. Give folders that hold recordings, at any depth.")
     problems: list[str] = []
     undeclared: list[Path] = []
-    seen = {folder.resolve() for folder in leave_out} - set(roots)
+    apart = None if output is None else Path(output).resolve()
+    seen = set() if apart is None else {apart} - set(roots)
     found = [place for root in roots for place in _search(root, seen, problems, undeclared)]
     undeclared = [place for place in undeclared if not set(place.parents) & set(undeclared)]
     if not found:
@@ -55,7 +65,7 @@ def find_recordings(folders: Sequence[Path], leave_out: Sequence[Path] = ()) -> 
         )
     base = Path(os.path.commonpath(roots))
     order = sorted(found, key=lambda place: [natural_key(part) for part in place.parts])
-    return FoundRecordings(base, tuple(order), tuple(problems), tuple(undeclared))
+    return FoundRecordings(base, tuple(order), tuple(problems), tuple(undeclared), apart)
 
 
 def _search(folder: Path, seen: set[Path], problems: list[str], undeclared: list[Path]) -> Generator[Path, None, bool]:

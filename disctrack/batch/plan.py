@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from calibration import CalibrationSettings
-from disctrack.batch.find import FOLDER, RESULTS, FoundRecordings
+from disctrack.batch.find import FoundRecordings
 from disctrack.calibrate.stage import source_of
 from disctrack.errors import reason_of
 from disctrack.recording.declaration import Recording, read_recording
@@ -33,18 +33,6 @@ class BatchOptions:
 
 
 @dataclass(frozen=True)
-class Shard:
-    """Every `of`-th recording, from number `number` (1, 2, ...) on."""
-
-    number: int = 1
-    of: int = 1
-
-    def part(self, recordings: Sequence[Path]) -> tuple[Path, ...]:
-        """Recordings of this shard; all shards together give each once."""
-        return tuple(recordings[self.number - 1 :: self.of])
-
-
-@dataclass(frozen=True)
 class Job:
     """One piece of work for one process."""
 
@@ -68,35 +56,18 @@ class BatchPlan:
     undeclared: tuple[Path, ...]  # folders of images that no recording.toml speaks of
 
 
-@dataclass(frozen=True)
-class Places:
-    """Where results go."""
-
-    found: FoundRecordings
-    output: Path | None  # None: beside each recording
-
-    @property
-    def common(self) -> Path:
-        """Folder of the summary, the index and the rigs."""
-        return self.found.base / FOLDER if self.output is None else self.output
-
-    def results(self, recording: Path) -> Path:
-        """Folder of one recording's results."""
-        return recording / RESULTS if self.output is None else self.output / self.found.name(recording)
-
-
-def make_plan(places: Places, recordings: Sequence[Path], options: BatchOptions) -> BatchPlan:
+def make_plan(found: FoundRecordings, recordings: Sequence[Path], options: BatchOptions) -> BatchPlan:
     """Read every recording.toml, count the images, and find who shares a rig by the content of the views."""
     rigs: dict[str, Job] = {}
     jobs: list[Job] = []
     failures: dict[str, str] = {}
-    undeclared = places.found.undeclared
+    undeclared = found.undeclared
     for folder in recordings:
-        name = places.found.name(folder)
+        name = found.name(folder)
         try:
             recording = read_recording(folder)
             undeclared = tuple(place for place in undeclared if not _has_views_of(place, recording))
-            jobs.append(_job(places, recording, name, options, rigs))
+            jobs.append(_job(found, recording, name, options, rigs))
         except Exception as error:  # whatever is wrong with one recording, the others are measured
             failures[name] = reason_of(error)
     needed = {job.rig for job in jobs}
@@ -108,23 +79,23 @@ def _has_views_of(place: Path, recording: Recording) -> bool:
     return recording.views is not None and (recording.folder / recording.views.left).resolve().is_relative_to(place)
 
 
-def _job(places: Places, recording: Recording, name: str, options: BatchOptions, rigs: dict[str, Job]) -> Job:
+def _job(found: FoundRecordings, recording: Recording, name: str, options: BatchOptions, rigs: dict[str, Job]) -> Job:
     folder = recording.folder
     open_pairs(recording)  # raises where there is nothing to measure
-    results = places.results(folder)
+    results = found.results(folder)
     if recording.rig_file is not None:
         return Job("recording", name, str(folder), str(results), str(recording.rig_file), options)
-    rig = _shared_rig(places, recording, options)
+    rig = _shared_rig(found, recording, options)
     earlier = str(results / "rig.h5")
     job = rigs.get(str(rig)) or Job("rig", name, str(folder), str(rig.parent), str(rig), options)
     rigs[str(rig)] = dataclasses.replace(job, adopt=(*job.adopt, earlier))
     return Job("recording", name, str(folder), str(results), str(rig), options)
 
 
-def _shared_rig(places: Places, recording: Recording, options: BatchOptions) -> Path:
+def _shared_rig(found: FoundRecordings, recording: Recording, options: BatchOptions) -> Path:
     """The file of the rig, named by the content of all that it depends on."""
     provenance = source_of(recording, options.calibration).provenance
-    return places.common / "rigs" / provenance.fingerprint[:16] / "rig.h5"
+    return found.common / "rigs" / provenance.fingerprint[:16] / "rig.h5"
 
 
 def with_threads(jobs: Sequence[Job], cores: int, side_by_side: int) -> tuple[Job, ...]:

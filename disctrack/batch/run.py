@@ -11,8 +11,8 @@ from tqdm import tqdm
 
 from calibration.kit.arguments import checked
 from disctrack.batch.columns import Row
-from disctrack.batch.find import find_recordings
-from disctrack.batch.plan import BatchOptions, BatchPlan, Job, Places, Shard, make_plan, with_threads
+from disctrack.batch.find import FoundRecordings, find_recordings
+from disctrack.batch.plan import BatchOptions, BatchPlan, Job, make_plan, with_threads
 from disctrack.batch.pool import Cluster, Processes, do_all
 from disctrack.batch.records import FAILED, NOT_MEASURED, Record, Result
 from disctrack.batch.repeats import repeats_of
@@ -66,7 +66,7 @@ def run_batch(
     options: BatchOptions | None = None,
     output: str | Path | None = None,
     side_by_side: int | None = None,
-    shard: Shard | None = None,
+    shard: tuple[int, int] | None = None,
     cluster: str | None = None,
 ) -> BatchOutcome:
     """Measure all recordings at and below `folders`.
@@ -74,6 +74,7 @@ def run_batch(
     output : folder for all results, in the order of the recordings' own folders; without it, each recording's own
     `results`, and `batch_results` in the deepest folder common to all
     side_by_side : processes; without it, one per core
+    shard : (i, n), for every n-th recording from the i-th (1 to n) on
     cluster : address of a dask.distributed scheduler
     Raises RecordingError if there is nothing to measure, OutputError, ClusterError. What is wrong with one recording
     is in its row.
@@ -87,10 +88,11 @@ def run_batch(
     # before the work: a wrong address must be told at once
     pool = Processes(n) if cluster is None else Cluster(cluster)
     with contextlib.closing(pool):
-        places = _places(folders, output)
-        check_writable(places.common)
-        mine = (shard or Shard()).part(places.found.recordings)
-        plan = make_plan(places, mine, options)
+        found = find_recordings(folders, output)
+        check_writable(found.common)
+        first, step = shard or (1, 1)
+        mine = found.recordings[first - 1 :: step]
+        plan = make_plan(found, mine, options)
         if cluster is None:
             plan = replace(plan, recordings=with_threads(plan.recordings, cores, n))
         results = {name: Result.failed(reason) for name, reason in plan.failures.items()}
@@ -98,22 +100,16 @@ def run_batch(
     for job in plan.recordings:
         results.setdefault(job.name, Result(NOT_MEASURED, Record(NOT_MEASURED, stopped)))
     whole = shard is None  # or else whoever sums up the shards
-    outcome = _summed_up(places, mine, results, options, stopped == INTERRUPTED, n if whole else 0)
-    return replace(outcome, undeclared=tuple(os.path.relpath(place, places.found.base) for place in plan.undeclared))
+    outcome = _summed_up(found, mine, results, options, stopped == INTERRUPTED, n if whole else 0)
+    return replace(outcome, undeclared=tuple(os.path.relpath(place, found.base) for place in plan.undeclared))
 
 
 def summarise_batch(
     folders: Sequence[Path], options: BatchOptions | None = None, output: str | Path | None = None
 ) -> BatchOutcome:
     """The summary of what lies on the disk; nothing is measured. Raises RecordingError."""
-    places = _places(folders, output)
-    return _summed_up(places, places.found.recordings, {}, options or BatchOptions(), False, default_threads())
-
-
-def _places(folders: Sequence[str | Path], output: str | Path | None) -> Places:
-    apart = None if output is None else Path(output).resolve()
-    found = find_recordings([Path(folder) for folder in folders], [] if apart is None else [apart])
-    return Places(found, apart)
+    found = find_recordings(folders, output)
+    return _summed_up(found, found.recordings, {}, options or BatchOptions(), False, default_threads())
 
 
 def _do(plan: BatchPlan, results: dict[str, Result], pool: Processes | Cluster) -> str:
@@ -137,7 +133,7 @@ def _do(plan: BatchPlan, results: dict[str, Result], pool: Processes | Cluster) 
 
 
 def _summed_up(
-    places: Places,
+    found: FoundRecordings,
     mine: Sequence[Path],
     results: dict[str, Result],
     options: BatchOptions,
@@ -145,24 +141,24 @@ def _summed_up(
     processes: int,
 ) -> BatchOutcome:
     """Processes : for the diagnosis of all together; 0: not now."""
-    problems = [f"not searched: {problem}" for problem in places.found.problems]
+    problems = [f"not searched: {problem}" for problem in found.problems]
     said = ""
     if options.together and processes and not interrupted:
-        measured = rows_of(places, places.found.recordings, results)
+        measured = rows_of(found, results)
         try:
-            said = diagnose_all(places.common, measured, processes)
+            said = diagnose_all(found.common, measured, processes)
         except AnalysisError as error:
             problems.append(f"together: {error}")
         except KeyboardInterrupt:  # what was measured is summed up all the same
             interrupted = True
     files: tuple[Path, ...] = ()
     try:
-        rows, files = write_summary(places, places.found.recordings, results, options)
+        rows, files = write_summary(found, results, options)
     except OutputError as error:  # the results themselves may be safe all the same
         problems.append(str(error))
-        rows = rows_of(places, places.found.recordings, results)
-    files += (places.common / TOGETHER,) if said else ()
-    names = {places.found.name(folder) for folder in mine}
+        rows = rows_of(found, results)
+    files += (found.common / TOGETHER,) if said else ()
+    names = {found.name(folder) for folder in mine}
     own = tuple(row for row in rows if row["recording"] in names)
     return BatchOutcome(own, files, tuple(problems), interrupted, said)
 

@@ -9,8 +9,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from disctrack.batch.columns import COLUMNS, Row
+from disctrack.batch.find import FoundRecordings
 from disctrack.batch.locks import Busy, locked
-from disctrack.batch.plan import BatchOptions, Places
+from disctrack.batch.plan import BatchOptions
 from disctrack.batch.records import FAILED, MEASURED, NOT_MEASURED, SKIPPED, Record, Result, is_done, read_record
 from disctrack.batch.repeats import REPEATS, repeats_of
 from disctrack.batch.report import counts, report_of
@@ -30,15 +31,15 @@ TOGETHER = "together/diagnosis.html"  # of all recordings, below the folder of t
 _WAIT = 300.0  # [s] for another process that writes the summary
 
 
-def rows_of(places: Places, recordings: Sequence[Path], results: Mapping[str, Result]) -> list[Row]:
+def rows_of(found: FoundRecordings, results: Mapping[str, Result]) -> list[Row]:
     """A row for every recording: from `results` (by name) where it took part now, else from what lies on the disk."""
     rows = []
-    for folder in recordings:
-        name = places.found.name(folder)
-        record, status = _outcome(places.results(folder), results.get(name))
+    for folder in found.recordings:
+        name = found.name(folder)
+        record, status = _outcome(found.results(folder), results.get(name))
         if name not in results and status == SKIPPED:
-            record = _if_stale(folder, places.results(folder), record)
-        rows.append(_row(places, folder, name, record, status))
+            record = _if_stale(folder, found.results(folder), record)
+        rows.append(_row(found, folder, name, record, status))
     return rows
 
 
@@ -61,15 +62,15 @@ def _if_stale(folder: Path, results: Path, record: Record) -> Record:
     return dataclasses.replace(record, reason="; ".join(filter(None, [stale, record.reason])))
 
 
-def _row(places: Places, folder: Path, name: str, record: Record, status: str) -> Row:
+def _row(found: FoundRecordings, folder: Path, name: str, record: Record, status: str) -> Row:
     row: Row = dict.fromkeys(COLUMNS)
     row |= {k: v for k, v in record.numbers.items() if k in COLUMNS}
-    row |= {"recording": name, "status": status, "reason": record.reason, "folder": _relative(folder, places.common)}
+    row |= {"recording": name, "status": status, "reason": record.reason, "folder": _relative(folder, found.common)}
     for what in _PATHS:
         if what in record.files:
-            row[what] = _relative(places.results(folder) / record.files[what], places.common)
+            row[what] = _relative(found.results(folder) / record.files[what], found.common)
     if row["rig"]:
-        row["rig"] = _relative(Path(row["rig"]), places.common)
+        row["rig"] = _relative(Path(row["rig"]), found.common)
     return row
 
 
@@ -81,7 +82,7 @@ def _relative(path: Path, folder: Path) -> str:
 
 
 def write_summary(
-    places: Places, recordings: Sequence[Path], results: Mapping[str, Result], options: BatchOptions
+    found: FoundRecordings, results: Mapping[str, Result], options: BatchOptions
 ) -> tuple[list[Row], tuple[Path, ...]]:
     """Write summary.json, summary.csv, repeats.csv and index.html; returns the rows and the files.
 
@@ -89,23 +90,25 @@ def write_summary(
     has everything. Raises OutputError.
     """
     try:
-        with locked(places.common / ".summary.lock", wait=_WAIT):
-            return _write_summary(places, rows_of(places, recordings, results), options)
+        with locked(found.common / ".summary.lock", wait=_WAIT):
+            return _write_summary(found, rows_of(found, results), options)
     except Busy as error:
         raise OutputError(
-            f"{places.common}: another process has been writing the summary for {_WAIT:g} s. Make it anew with "
+            f"{found.common}: another process has been writing the summary for {_WAIT:g} s. Make it anew with "
             "--summary-only."
         ) from error
 
 
-def _write_summary(places: Places, rows: list[Row], options: BatchOptions) -> tuple[list[Row], tuple[Path, ...]]:
-    folder, rows = places.common, with_false_discovery(rows)
+def _write_summary(
+    found: FoundRecordings, rows: list[Row], options: BatchOptions
+) -> tuple[list[Row], tuple[Path, ...]]:
+    folder, rows = found.common, with_false_discovery(rows)
     repeats = repeats_of(rows)
     document = {
         "schema": SCHEMA,
         "schema_version": SCHEMA_VERSION,
         "version": __version__,
-        "searched": [str(places.found.base), *places.found.problems],
+        "searched": [str(found.base), *found.problems],
         "options": dataclasses.asdict(options),
         "counts": counts(rows),
         "columns": COLUMNS,

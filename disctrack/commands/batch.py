@@ -4,7 +4,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from disctrack.batch import BatchOptions, BatchOutcome, Shard, run_batch, summarise_batch
+from disctrack.batch import BatchOptions, BatchOutcome, run_batch, summarise_batch
 from disctrack.commands import DONE, FAILED, INCOMPLETE
 from disctrack.commands import _outputs as outputs
 from disctrack.files.text import printable
@@ -16,8 +16,8 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.summary_only:
         outcome = summarise_batch(arguments.folders, options, arguments.output)
     else:
-        shard = None if arguments.shard is None else Shard(*arguments.shard)
-        outcome = run_batch(arguments.folders, options, arguments.output, arguments.jobs, shard, arguments.cluster)
+        how = arguments.jobs, arguments.shard, arguments.cluster
+        outcome = run_batch(arguments.folders, options, arguments.output, *how)
     outputs.tell(outcome.report(), arguments, Path())
     _tell_problems(outcome)
     if outcome.interrupted:

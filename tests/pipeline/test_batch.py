@@ -20,7 +20,7 @@ from disctrack.analyse.analysis import CIRCLE_DURATION, WINDOW
 from disctrack.batch import BatchOptions, find_recordings, read_summary, run, run_batch
 from disctrack.batch import measure as stage
 from disctrack.batch.columns import FITTED
-from disctrack.batch.plan import Places, make_plan
+from disctrack.batch.plan import make_plan
 from disctrack.batch.records import read_record
 from disctrack.cli import main
 from disctrack.files.whole import output_error
@@ -52,7 +52,7 @@ def statuses(path: Path) -> dict[str, str]:
 
 def jobs_of(folder: Path, **options):
     found = find_recordings([folder])
-    return make_plan(Places(found, None), found.recordings, BatchOptions(report=False, **options)).recordings
+    return make_plan(found, found.recordings, BatchOptions(report=False, **options)).recordings
 
 
 @pytest.fixture

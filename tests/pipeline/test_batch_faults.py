@@ -19,7 +19,7 @@ import pytest
 from disctrack.batch import BatchOptions, find_recordings, pool, run_batch
 from disctrack.batch.locks import locked
 from disctrack.batch.measure import LOCK, do
-from disctrack.batch.plan import Places, make_plan
+from disctrack.batch.plan import make_plan
 from disctrack.batch.pool import connect
 from disctrack.batch.records import MEASURED, is_done, read_record
 from disctrack.cli import main
@@ -111,7 +111,7 @@ def undisturbed(recording, tmp_path) -> Path:
     """The same day, measured without a fault, in this process."""
     root = a_day(recording, tmp_path / "undisturbed", ("a",))
     found = find_recordings([root])
-    (job,) = make_plan(Places(found, None), found.recordings, BatchOptions(report=False)).recordings
+    (job,) = make_plan(found, found.recordings, BatchOptions(report=False)).recordings
     assert do(job).status == MEASURED
     return root
 
