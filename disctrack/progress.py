@@ -69,15 +69,11 @@ def progress_bar(what: str, total: int, unit: str) -> Iterator[Callable[[int], N
 
 
 @contextlib.contextmanager
-def stage(what: str) -> Iterator[None]:
-    """Name the stage and its age while it lasts (terminals only), and write a line with its time when it ends well."""
-    with steps(what):
-        yield
-
-
-@contextlib.contextmanager
 def steps(what: str) -> Iterator[Callable[[str], None]]:
-    """As `stage`; yields a function that is told which step begins, for terminals to show with the stage's age."""
+    """Name the stage and its age while it lasts (terminals only), and write a line with its time when it ends well.
+
+    Yields a function that is told which step begins, for terminals to show with the stage's age.
+    """
     began, over = time.perf_counter(), threading.Event()
     now = [what]
 

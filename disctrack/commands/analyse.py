@@ -13,7 +13,7 @@ from disctrack.commands import _outputs as outputs
 from disctrack.errors import RecordingError
 from disctrack.files.whole import write_whole
 from disctrack.findings import doubts
-from disctrack.progress import stage
+from disctrack.progress import steps
 from disctrack.recording.declaration import FILE_NAME, read_recording
 from disctrack.track.measurement import open_pairs
 from disctrack.track.video_overlay import draw_pair
@@ -32,7 +32,7 @@ def run(arguments: argparse.Namespace) -> int:
     asked = [page, *([folder / "figures"] if arguments.figures else [])]
     if known is not None and not arguments.overwrite and all(place.exists() for place in asked):
         return outputs.tell(known, arguments, folder, doubts(read_findings(path)), reused=True)
-    with stage("analyse"):
+    with steps("analyse"):
         outcome = run_analyse(
             path,
             folder,
@@ -41,7 +41,7 @@ def run(arguments: argparse.Namespace) -> int:
             overwrite=arguments.overwrite or known is not None,
             figures=arguments.figures,
         )
-    with stage("motion.html"):
+    with steps("motion.html"):
         _write_motion_page(page, outcome.analysis, path, arguments.recording)
     files = (*outcome.summary.files, page, *outputs.write_times(folder, "analyse"))
     report = replace(outcome.summary, files=files, then=f"disctrack diagnose {outputs.relative(path)}")

@@ -13,7 +13,7 @@ from disctrack.diagnosis.recorded import first_to_mend
 from disctrack.diagnosis.together.stage import run_together
 from disctrack.errors import TrajectoryFileError
 from disctrack.findings import doubts
-from disctrack.progress import compiling, stage, steps
+from disctrack.progress import compiling, steps
 from disctrack.recording.readers.blocks import default_threads
 from disctrack.report.blocks import Report
 from disctrack.rolling import _assembly as assembly
@@ -44,7 +44,7 @@ def run(arguments: argparse.Namespace) -> int:
         return outputs.tell(Report("", said, findings=wrong, then=then), arguments, folder, findings)
     with compiling("the simulation of motions", 30):
         assembly.prepare()
-    with stage("diagnose"):
+    with steps("diagnose"):
         outcome = run_diagnose(
             path,
             folder,
