@@ -18,7 +18,7 @@ from disctrack.batch.records import FAILED, NOT_MEASURED, Record, Result
 from disctrack.batch.repeats import repeats_of
 from disctrack.batch.report import report_of
 from disctrack.batch.summary import TOGETHER, rows_of, write_summary
-from disctrack.errors import AnalysisError, ClusterError, OutputError, reason_of
+from disctrack.errors import AnalysisError, ArgumentError, ClusterError, OutputError, reason_of
 from disctrack.files.whole import check_writable
 from disctrack.findings import Kind, Severity, of_kind
 from disctrack.recording.declaration import FILE_NAME
@@ -91,6 +91,8 @@ def run_batch(
         found = find_recordings(folders, output)
         check_writable(found.common)
         first, step = shard or (1, 1)
+        if not 1 <= first <= step:
+            raise ArgumentError(f"run_batch: shard is {shard}; expected (i, n) with i from 1 to n")
         mine = found.recordings[first - 1 :: step]
         plan = make_plan(found, mine, options)
         if cluster is None:
