@@ -28,7 +28,6 @@ from disctrack.trajectory.file import read_provenance
 SCHEMA, SCHEMA_VERSION = "disctrack batch summary", 1
 _PATHS = ("trajectory", "report", "diagnosis_report")
 TOGETHER = "together/diagnosis.html"  # of all recordings, below the folder of the summary
-_WAIT = 300.0  # [s] for another process that writes the summary
 
 
 def rows_of(found: FoundRecordings, results: Mapping[str, Result]) -> list[Row]:
@@ -89,12 +88,13 @@ def write_summary(
     Shards that end at the same time write one after the other, each with all that is on the disk by then: the last one
     has everything. Raises OutputError.
     """
+    wait = 300.0  # [s] for another process that writes the summary
     try:
-        with locked(found.common / ".summary.lock", wait=_WAIT):
+        with locked(found.common / ".summary.lock", wait):
             return _write_summary(found, rows_of(found, results), options)
     except Busy as error:
         raise OutputError(
-            f"{found.common}: another process has been writing the summary for {_WAIT:g} s. Make it anew with "
+            f"{found.common}: another process has been writing the summary for {wait:g} s. Make it anew with "
             "--summary-only."
         ) from error
 

@@ -102,9 +102,14 @@ def _declared(made: storage.Provenance) -> dict[str, Any]:
     return dict(kept) if isinstance(kept, dict) else {}
 
 
+def recording_of(trajectory: Path) -> Path | None:
+    """The folder of the recording in whose folder or results a trajectory lies."""
+    return next((place for place in trajectory.absolute().parents[:2] if (place / FILE_NAME).is_file()), None)
+
+
 def tell_stale(trajectory: Path) -> None:
     """Say on stderr where the recording.toml beside a trajectory is no longer the one that it was measured with."""
-    folder = next((place for place in trajectory.absolute().parents[:2] if (place / FILE_NAME).is_file()), None)
+    folder = recording_of(trajectory)
     kept = _declared(storage.read_provenance(trajectory))
     changed = changed_since(folder, kept) if folder is not None and kept else ""
     if folder is not None and changed:

@@ -14,7 +14,7 @@ from disctrack.errors import RecordingError
 from disctrack.files.whole import write_whole
 from disctrack.findings import doubts
 from disctrack.progress import steps
-from disctrack.recording.declaration import FILE_NAME, read_recording
+from disctrack.recording.declaration import read_recording
 from disctrack.track.measurement import open_pairs
 from disctrack.track.video_overlay import draw_pair
 from disctrack.trajectory.file import read_findings, read_provenance, trajectory_in
@@ -52,9 +52,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _write_motion_page(page: Path, analysis: Analysis, trajectory: Path, recording: Path | None) -> None:
     """The interactive page, with pictures where the images of this trajectory are at hand."""
-    folder = recording or next(
-        (place for place in (trajectory.parent, trajectory.parent.parent) if (place / FILE_NAME).is_file()), None
-    )
+    folder = recording or outputs.recording_of(trajectory)
     pairs = None
     if folder is not None:
         try:

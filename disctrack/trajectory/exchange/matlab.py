@@ -22,7 +22,7 @@ from disctrack.errors import RigFileError
 from disctrack.files.whole import write_whole
 from disctrack.frames import COORDINATES
 from disctrack.trajectory import FrameStatus, Trajectory
-from disctrack.trajectory.exchange.rig_parts import array_of, camera_of, rotation_of, the_one
+from disctrack.trajectory.exchange.rig_parts import array_of, stereo_rig, the_one
 from disctrack.trajectory.file import labelled
 
 
@@ -84,25 +84,13 @@ def read_stereo_parameters(
     if scale is None:
         raise RigFileError(f"{path}: does not say in which unit translationOfCamera2 is; give it (0.001 for mm)")
     size = array_of(found, "imageSize", (2,), str(path))[::-1]
-    left, right = (
-        camera_of(
-            array_of(found, f"intrinsicMatrix{number}", (3, 3), str(path)),
-            array_of(found, f"distortionCoefficients{number}", (-1,), str(path)),
-            size,
-            f"{path}: intrinsicMatrix{number}",
-        )
-        for number in (1, 2)
-    )
-    world = {"R_left_world": np.eye(3), "t_left_world": np.zeros(3), "world_is_table": 0.0} | found
-    return StereoRig(
-        left,
-        right,
-        rotation_of(array_of(found, "rotationOfCamera2", (-1,), str(path)), f"{path}: rotationOfCamera2"),
-        array_of(found, "translationOfCamera2", (3,), str(path)) * scale,
-        rotation_of(array_of(world, "R_left_world", (-1,), str(path)), f"{path}: R_left_world"),
-        array_of(world, "t_left_world", (3,), str(path)) * scale,
-        world_is_table=world_is_table or bool(np.ravel(world["world_is_table"])[0]),
-    )
+    return stereo_rig(found, _NAMES, (size, size), scale, world_is_table, str(path))
+
+
+_NAMES = (
+    *(f"{what}{number}" for number in (1, 2) for what in ("intrinsicMatrix", "distortionCoefficients")),
+    *("rotationOfCamera2", "translationOfCamera2"),
+)
 
 
 def _save(path: Path, content: Mapping[str, Any]) -> None:

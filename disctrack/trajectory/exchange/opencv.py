@@ -10,7 +10,7 @@ import numpy as np
 from calibration.cameras.camera import StereoRig
 from disctrack.errors import OutputError, RigFileError
 from disctrack.files.whole import whole_file
-from disctrack.trajectory.exchange.rig_parts import array_of, camera_of, content_of, rotation_of
+from disctrack.trajectory.exchange.rig_parts import content_of, stereo_rig
 
 _NAMES = ("M1", "D1", "M2", "D2", "R", "T")
 _MORE = ("image_size1", "image_size2", "R_left_world", "t_left_world")
@@ -62,27 +62,14 @@ def read_opencv(
         raise RigFileError(f"{where}: {', '.join(missing)} missing; a stereo rig has M1, D1, M2, D2, R and T")
     if unit is None and nodes["unit"] != "m":
         raise RigFileError(f"{where}: does not say in which unit T is; give it (0.025 for squares of 25 mm)")
-    scale = 1.0 if unit is None else unit
-    cameras = []
-    for number in (1, 2):
-        size = nodes.get(f"image_size{number}", np.array(image_size or (), float)).ravel()
-        if size.size != 2:
-            raise RigFileError(f"{where}: does not tell the image size; give width and height")
-        K, D = nodes[f"M{number}"], nodes[f"D{number}"].ravel()
-        cameras.append(camera_of(K, D, size, f"{where}: M{number}, D{number}"))
-    world = "R_left_world" in nodes and "t_left_world" in nodes
-    if world_is_table and not world:
-        raise RigFileError(f"{where}: without R_left_world and t_left_world nothing says where the table is")
-    left, right = cameras
-    return StereoRig(
-        left,
-        right,
-        R_right_left=rotation_of(nodes["R"], f"{where}: R"),
-        t_right_left=array_of(nodes, "T", (3,), where) * scale,
-        R_left_world=rotation_of(nodes["R_left_world"], f"{where}: R_left_world") if world else np.eye(3),
-        t_left_world=array_of(nodes, "t_left_world", (3,), where) * scale if world else np.zeros(3),
-        world_is_table=world and (world_is_table or nodes["world_is_table"]),
-    )
+    sizes = [nodes.get(f"image_size{number}", np.array(image_size or (), float)).ravel() for number in (1, 2)]
+    if any(size.size != 2 for size in sizes):
+        raise RigFileError(f"{where}: does not tell the image size; give width and height")
+    if not {"R_left_world", "t_left_world"} <= nodes.keys():
+        if world_is_table:
+            raise RigFileError(f"{where}: without R_left_world and t_left_world nothing says where the table is")
+        nodes = {name: nodes[name] for name in _NAMES}
+    return stereo_rig(nodes, _NAMES, sizes, 1.0 if unit is None else unit, world_is_table, where)
 
 
 def _nodes(path: Path) -> dict[str, Any]:
