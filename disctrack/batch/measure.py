@@ -17,12 +17,11 @@ from disctrack.batch.numbers import analysed_numbers, diagnosed_numbers, frictio
 from disctrack.batch.plan import Job
 from disctrack.batch.records import (
     BUSY,
-    FAILED,
     MEASURED,
     SKIPPED,
     Record,
-    Result,
     Stages,
+    failed,
     is_done,
     read_record,
     stages_asked,
@@ -46,46 +45,46 @@ LOCK = ".batch.lock"
 BUSY_FOR = 1.0  # [s] to wait for another batch before the recording is put back: longer than to look for it again
 
 
-def do(job: Job) -> Result:
-    """Do a job. Never raises an Exception: what went wrong is in the result, and in the recording's record."""
+def do(job: Job) -> Record:
+    """Do a job. Never raises an Exception: what went wrong is in the record, and in the recording's folder."""
     try:
         return make_rig(job) if job.kind == "rig" else make_recording(job)
     except Busy:
-        return Result(BUSY, Record(FAILED))
+        return Record(BUSY)
     except Exception as error:
-        return Result.failed(reason_of(error))
+        return failed(reason_of(error))
 
 
-def make_rig(job: Job) -> Result:
+def make_rig(job: Job) -> Record:
     """Calibrate into job.rig, unless the same was done before, here or by `disctrack run`. Raises Busy."""
     path = Path(job.rig)
     with locked(path.with_name(LOCK), BUSY_FOR):
         source = source_of(read_recording(job.folder), job.options.calibration)
         if is_rig_of(path, source) and not job.options.overwrite:
-            return Result(SKIPPED, Record(MEASURED))
+            return Record(SKIPPED)
         earlier = [Path(file) for file in job.adopt] if not job.options.overwrite else []
         same = next((file for file in earlier if is_rig_of(file, source)), None)
         if same is not None:
             write_whole(path, same.read_bytes())
-            return Result(SKIPPED, Record(MEASURED))
+            return Record(SKIPPED)
         calibrate_into(path, source, overwrite=True, figures=job.options.report)
-    return Result(MEASURED, Record(MEASURED))
+    return Record(MEASURED)
 
 
-def make_recording(job: Job) -> Result:
+def make_recording(job: Job) -> Record:
     """Track, analyse and, if asked for, diagnose; what is done already with the same inputs is kept. Raises Busy."""
     results = Path(job.results)
     with locked(results / LOCK, BUSY_FOR):
         try:
             return _make_recording(job, results)
         except Exception as error:
-            result = Result.failed(reason_of(error))
+            record = failed(reason_of(error))
             with contextlib.suppress(DiscTrackError):  # or else the batch that runs now is the only one to know
-                write_record(results, result.record)
-            return result
+                write_record(results, record)
+            return record
 
 
-def _make_recording(job: Job, results: Path) -> Result:
+def _make_recording(job: Job, results: Path) -> Record:
     began, used = time.perf_counter(), time.process_time()
     asked = stages_asked(job.options)
     recording = read_recording(job.folder)
@@ -97,7 +96,7 @@ def _make_recording(job: Job, results: Path) -> Result:
     if provenance is not None:
         record = read_record(results)
         if record is not None and record.fingerprint == provenance.fingerprint and is_done(results, record, asked):
-            return Result(SKIPPED, record)
+            return dataclasses.replace(record, status=SKIPPED)
         trajectory = storage.read_trajectory(path)
     else:
         with recorded_times() as tracking, timed("track"):
@@ -110,7 +109,7 @@ def _make_recording(job: Job, results: Path) -> Result:
     numbers |= {f"processor_seconds_{t.stage}": t.processor_seconds for t in (*tracking, *times)}
     record = dataclasses.replace(record, numbers=numbers)
     write_record(results, record)
-    return Result(MEASURED, record)
+    return record
 
 
 def _reusable(path: Path, recording: Recording, rig: StereoRig, pairs: ImagePairs) -> Provenance | None:

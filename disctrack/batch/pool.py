@@ -29,7 +29,7 @@ import cv2
 
 from disctrack.batch.measure import do
 from disctrack.batch.plan import Job
-from disctrack.batch.records import BUSY, FAILED, Result
+from disctrack.batch.records import BUSY, FAILED, Record, failed
 from disctrack.errors import ClusterError, reason_of
 from disctrack.processes import Spawn, end_with_parent, quietly
 
@@ -47,7 +47,7 @@ class Died(Exception):
 
 
 def do_all(
-    rigs: Sequence[Job], recordings: Sequence[Job], pool: Processes | Cluster, done: Callable[[Job, Result], None]
+    rigs: Sequence[Job], recordings: Sequence[Job], pool: Processes | Cluster, done: Callable[[Job, Record], None]
 ) -> None:
     """Do every job; `done` is called with each that is finished for good. Raises ClusterError.
 
@@ -59,25 +59,25 @@ def do_all(
     waiting = {path: [job for job in recordings if job.rig == path] for path in made}
     alone: deque[Job] = deque()
     died: set[Job] = set()
-    running: dict[Future[Result], Job] = {}
+    running: dict[Future[Record], Job] = {}
 
-    def finish(job: Job, result: Result) -> None:
-        if result.status == BUSY:
+    def finish(job: Job, record: Record) -> None:
+        if record.status == BUSY:
             ready.append(job)
             return
-        done(job, result)
+        done(job, record)
         for after in waiting.pop(job.rig, []) if job.kind == "rig" else []:
-            if result.status == FAILED:
-                done(after, Result.failed(f"no rig: {result.record.reason}"))
+            if record.status == FAILED:
+                done(after, failed(f"no rig: {record.reason}"))
             else:
                 ready.append(after)
 
-    def settle(job: Job, future: Future[Result]) -> None:
+    def settle(job: Job, future: Future[Record]) -> None:
         try:
             finish(job, _result(future))
         except Died as death:
             if job in died:
-                finish(job, Result.failed(f"twice, {death}"))
+                finish(job, failed(f"twice, {death}"))
             else:
                 died.add(job)
                 alone.append(job)
@@ -93,8 +93,8 @@ def do_all(
             settle(running.pop(future), future)
 
 
-def _result(future: Future[Result]) -> Result:
-    """Result of a job that has ended. Raises Died, and ClusterError where nothing further can be done."""
+def _result(future: Future[Record]) -> Record:
+    """Record of a job that has ended. Raises Died, and ClusterError where nothing further can be done."""
     try:
         return future.result()
     except Died:
@@ -104,9 +104,9 @@ def _result(future: Future[Result]) -> Result:
             "the connection to the cluster's scheduler was lost. What is finished is kept; the same command continues."
         ) from error
     except OSError as error:  # no memory, or no more processes allowed
-        return Result.failed(f"no process could be started for it: {reason_of(error)}")
+        return failed(f"no process could be started for it: {reason_of(error)}")
     except Exception as error:  # a cluster's machines were lost too often, or could not even begin
-        return Result.failed(f"it could not be done ({type(error).__name__}: {' '.join(str(error).split())[:300]}).")
+        return failed(f"it could not be done ({type(error).__name__}: {' '.join(str(error).split())[:300]}).")
 
 
 class Processes:
@@ -121,11 +121,11 @@ class Processes:
         self._folder = tempfile.TemporaryDirectory(prefix="disctrack-")
         self._said = (Path(self._folder.name) / str(i) for i in itertools.count())
 
-    def submit(self, job: Job) -> Future[Result]:
+    def submit(self, job: Job) -> Future[Record]:
         """Begin a job; its future may raise Died, and OSError where no process can be started for it."""
         return self._threads.submit(self.done, job)
 
-    def done(self, job: Job) -> Result:
+    def done(self, job: Job) -> Record:
         """Do a job in this thread's process."""
         worker: _Worker | None = getattr(self._own, "worker", None)
         if worker is None:
@@ -169,9 +169,9 @@ class Cluster:
         self._client = connect(address)
         self._executor = self._client.get_executor(pure=False)  # a job that is tried again is another task
 
-    def submit(self, job: Job) -> Future[Result]:
+    def submit(self, job: Job) -> Future[Record]:
         """Begin a job; its future may raise Died, and what is wrong with the cluster."""
-        future: Future[Result] = self._executor.submit(do_alone, job)
+        future: Future[Record] = self._executor.submit(do_alone, job)
         return future
 
     def close(self) -> None:
@@ -205,7 +205,7 @@ def connect(address: str) -> Client:
     return client
 
 
-def do_alone(job: Job) -> Result:
+def do_alone(job: Job) -> Record:
     """Do a job on one of a cluster's machines, in a process of its own. Raises Died."""
     multiprocessing.current_process().daemon = False  # dask's workers are, and Python allows daemons no processes
     with contextlib.closing(Processes(1)) as here:
@@ -227,7 +227,7 @@ class _Worker:
         """Of the executor, where it lives."""
         return next((process for process in self._context.started if process.is_alive()), None)
 
-    def begin(self, job: Job) -> Future[Result]:
+    def begin(self, job: Job) -> Future[Record]:
         """Give it a job. Raises OSError where the process cannot be started, BrokenProcessPool where it has died."""
         return self.executor.submit(_do, job)
 
@@ -263,7 +263,7 @@ def _stop(number: int, frame: FrameType | None) -> None:
     sys.exit(128 + number)
 
 
-def _do(job: Job) -> Result:
+def _do(job: Job) -> Record:
     try:
         return do(job)
     except SystemExit:  # half-written files are gone; the executor would keep the process

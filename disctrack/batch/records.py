@@ -23,9 +23,9 @@ Stages = dict[str, float | bool]  # what is made of a trajectory, with which set
 
 @dataclass(frozen=True)
 class Record:
-    """Outcome of one recording; written last, so that all it speaks of is there."""
+    """Outcome of one job; a recording's is written last, so that all it speaks of is there."""
 
-    status: str  # MEASURED or FAILED
+    status: str  # MEASURED, FAILED, or of a job that was not done now SKIPPED, BUSY, NOT_MEASURED
     reason: str = ""
     fingerprint: str = ""  # of the trajectory's inputs, settings and version
     stages: Stages = field(default_factory=dict)
@@ -33,17 +33,9 @@ class Record:
     numbers: Row = field(default_factory=dict)  # columns of the summary
 
 
-@dataclass(frozen=True)
-class Result:
-    """What became of a job: MEASURED, SKIPPED, FAILED or BUSY, and the record of a recording."""
-
-    status: str
-    record: Record
-
-    @classmethod
-    def failed(cls, reason: str) -> Result:
-        """A failure with its reason."""
-        return cls(FAILED, Record(FAILED, reason))
+def failed(reason: str) -> Record:
+    """A failure with its reason."""
+    return Record(FAILED, reason)
 
 
 def stages_asked(options: BatchOptions) -> Stages:

@@ -14,13 +14,14 @@ from disctrack.batch.columns import Row
 from disctrack.batch.find import FoundRecordings, find_recordings
 from disctrack.batch.plan import BatchOptions, BatchPlan, Job, make_plan, with_threads
 from disctrack.batch.pool import Cluster, Processes, do_all
-from disctrack.batch.records import FAILED, NOT_MEASURED, Record, Result
+from disctrack.batch.records import FAILED, NOT_MEASURED, Record, failed
 from disctrack.batch.repeats import repeats_of
 from disctrack.batch.report import report_of
 from disctrack.batch.summary import TOGETHER, rows_of, write_summary
 from disctrack.errors import AnalysisError, ArgumentError, ClusterError, OutputError, reason_of
 from disctrack.files.whole import check_writable
 from disctrack.findings import Kind, Severity, of_kind
+from disctrack.progress import progress_bar
 from disctrack.recording.declaration import FILE_NAME
 from disctrack.recording.readers.blocks import default_threads
 from disctrack.report.blocks import Report
@@ -97,12 +98,12 @@ def run_batch(
         plan = make_plan(found, mine, options)
         if cluster is None:
             plan = replace(plan, recordings=with_threads(plan.recordings, cores, n))
-        results = {name: Result.failed(reason) for name, reason in plan.failures.items()}
-        stopped = _do(plan, results, pool)
+        records = {name: failed(reason) for name, reason in plan.failures.items()}
+        stopped = _do(plan, records, pool)
     for job in plan.recordings:
-        results.setdefault(job.name, Result(NOT_MEASURED, Record(NOT_MEASURED, stopped)))
+        records.setdefault(job.name, Record(NOT_MEASURED, stopped))
     whole = shard is None  # or else whoever sums up the shards
-    outcome = _summed_up(found, mine, results, options, stopped == INTERRUPTED, n if whole else 0)
+    outcome = _summed_up(found, mine, records, options, stopped == INTERRUPTED, n if whole else 0)
     return replace(outcome, undeclared=tuple(os.path.relpath(place, found.base) for place in plan.undeclared))
 
 
@@ -114,30 +115,30 @@ def summarise_batch(
     return _summed_up(found, found.recordings, {}, options or BatchOptions(), False, default_threads())
 
 
-def _do(plan: BatchPlan, results: dict[str, Result], pool: Processes | Cluster) -> str:
-    """Fill `results` with what becomes of the plan's recordings; returns why some have none."""
-    bar = _Bar(plan, len(results))
+def _do(plan: BatchPlan, records: dict[str, Record], pool: Processes | Cluster) -> str:
+    """Fill `records` with what becomes of the plan's recordings; returns why some have none."""
+    n = len(plan.recordings) + len(records)
 
-    def done(job: Job, result: Result) -> None:
+    def done(job: Job, record: Record) -> None:
         if job.kind == "recording":
-            results[job.name] = result
-        bar.done(job, result)
+            records[job.name] = record
+            advance(1)
+            tqdm.write(f"{len(records):4d} of {n}  {job.name}: {record.status}", file=sys.stderr)
 
     try:
-        do_all(plan.rigs, plan.recordings, pool, done)
+        with progress_bar("batch", len(plan.recordings), "recording") as advance:
+            do_all(plan.rigs, plan.recordings, pool, done)
     except KeyboardInterrupt:
         return INTERRUPTED
     except ClusterError as error:
         return str(error)
-    finally:
-        bar.close()
     return ""
 
 
 def _summed_up(
     found: FoundRecordings,
     mine: Sequence[Path],
-    results: dict[str, Result],
+    records: dict[str, Record],
     options: BatchOptions,
     interrupted: bool,
     processes: int,
@@ -146,7 +147,7 @@ def _summed_up(
     problems = [f"not searched: {problem}" for problem in found.problems]
     said = ""
     if options.together and processes and not interrupted:
-        measured = rows_of(found, results)
+        measured = rows_of(found, records)
         try:
             said = diagnose_all(found.common, measured, processes)
         except AnalysisError as error:
@@ -155,10 +156,10 @@ def _summed_up(
             interrupted = True
     files: tuple[Path, ...] = ()
     try:
-        rows, files = write_summary(found, results, options)
+        rows, files = write_summary(found, records, options)
     except OutputError as error:  # the results themselves may be safe all the same
         problems.append(str(error))
-        rows = rows_of(found, results)
+        rows = rows_of(found, records)
     files += (found.common / TOGETHER,) if said else ()
     names = {found.name(folder) for folder in mine}
     own = tuple(row for row in rows if row["recording"] in names)
@@ -180,23 +181,3 @@ def diagnose_all(folder: Path, rows: Sequence[Row], processes: int) -> str:
         return run_together(trajectories, whole, overwrite=True, reuse=True, processes=processes).verdict
     except Exception as error:  # the single results are worth more than their combination
         raise AnalysisError(f"the recordings could not be diagnosed: {reason_of(error)}") from error
-
-
-class _Bar:
-    """One bar for the whole batch, on stderr, where that is a terminal, and a line a recording."""
-
-    def __init__(self, plan: BatchPlan, n_failed: int) -> None:
-        self._n, self._n_failed, self._finished = len(plan.recordings) + n_failed, n_failed, n_failed
-        self._bar = tqdm(total=self._n, initial=n_failed, unit=" recordings", disable=None, leave=False)
-
-    def close(self) -> None:
-        self._bar.close()
-
-    def done(self, job: Job, result: Result) -> None:
-        if job.kind != "recording":
-            return
-        self._finished += 1
-        self._n_failed += result.status == FAILED
-        self._bar.update()
-        tqdm.write(f"{self._finished:4d} of {self._n}  {job.name}: {result.status}", file=sys.stderr)
-        self._bar.set_description_str(f"{self._n_failed} failed" if self._n_failed else "")

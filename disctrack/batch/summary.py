@@ -12,7 +12,7 @@ from disctrack.batch.columns import COLUMNS, Row
 from disctrack.batch.find import FoundRecordings
 from disctrack.batch.locks import Busy, locked
 from disctrack.batch.plan import BatchOptions
-from disctrack.batch.records import FAILED, MEASURED, NOT_MEASURED, SKIPPED, Record, Result, is_done, read_record
+from disctrack.batch.records import MEASURED, NOT_MEASURED, SKIPPED, Record, is_done, read_record
 from disctrack.batch.repeats import REPEATS, repeats_of
 from disctrack.batch.report import counts, report_of
 from disctrack.errors import OutputError
@@ -30,27 +30,25 @@ _PATHS = ("trajectory", "report", "diagnosis_report")
 TOGETHER = "together/diagnosis.html"  # of all recordings, below the folder of the summary
 
 
-def rows_of(found: FoundRecordings, results: Mapping[str, Result]) -> list[Row]:
-    """A row for every recording: from `results` (by name) where it took part now, else from what lies on the disk."""
+def rows_of(found: FoundRecordings, records: Mapping[str, Record]) -> list[Row]:
+    """A row for every recording: from `records` (by name) where it took part now, else from what lies on the disk."""
     rows = []
     for folder in found.recordings:
         name = found.name(folder)
-        record, status = _outcome(found.results(folder), results.get(name))
-        if name not in results and status == SKIPPED:
-            record = _if_stale(folder, found.results(folder), record)
-        rows.append(_row(found, folder, name, record, status))
+        record = records[name] if name in records else _on_the_disk(folder, found.results(folder))
+        rows.append(_row(found, folder, name, record))
     return rows
 
 
-def _outcome(folder: Path, result: Result | None) -> tuple[Record, str]:
-    if result is not None:
-        return result.record, result.status
-    record = read_record(folder)
+def _on_the_disk(folder: Path, results: Path) -> Record:
+    record = read_record(results)
     if record is None:
-        return Record(NOT_MEASURED, "not measured yet, or by another shard that has not come to it"), NOT_MEASURED
-    if record.status == MEASURED and not is_done(folder, record, {}):
-        return Record(NOT_MEASURED, "its files are not those that were measured, or not all there"), NOT_MEASURED
-    return record, SKIPPED if record.status == MEASURED else FAILED
+        return Record(NOT_MEASURED, "not measured yet, or by another shard that has not come to it")
+    if record.status != MEASURED:
+        return record
+    if not is_done(results, record, {}):
+        return Record(NOT_MEASURED, "its files are not those that were measured, or not all there")
+    return _if_stale(folder, results, dataclasses.replace(record, status=SKIPPED))
 
 
 def _if_stale(folder: Path, results: Path, record: Record) -> Record:
@@ -61,10 +59,15 @@ def _if_stale(folder: Path, results: Path, record: Record) -> Record:
     return dataclasses.replace(record, reason="; ".join(filter(None, [stale, record.reason])))
 
 
-def _row(found: FoundRecordings, folder: Path, name: str, record: Record, status: str) -> Row:
+def _row(found: FoundRecordings, folder: Path, name: str, record: Record) -> Row:
     row: Row = dict.fromkeys(COLUMNS)
     row |= {k: v for k, v in record.numbers.items() if k in COLUMNS}
-    row |= {"recording": name, "status": status, "reason": record.reason, "folder": _relative(folder, found.common)}
+    row |= {
+        "recording": name,
+        "status": record.status,
+        "reason": record.reason,
+        "folder": _relative(folder, found.common),
+    }
     for what in _PATHS:
         if what in record.files:
             row[what] = _relative(found.results(folder) / record.files[what], found.common)
@@ -81,7 +84,7 @@ def _relative(path: Path, folder: Path) -> str:
 
 
 def write_summary(
-    found: FoundRecordings, results: Mapping[str, Result], options: BatchOptions
+    found: FoundRecordings, records: Mapping[str, Record], options: BatchOptions
 ) -> tuple[list[Row], tuple[Path, ...]]:
     """Write summary.json, summary.csv, repeats.csv and index.html; returns the rows and the files.
 
@@ -91,7 +94,7 @@ def write_summary(
     wait = 300.0  # [s] for another process that writes the summary
     try:
         with locked(found.common / ".summary.lock", wait):
-            return _write_summary(found, rows_of(found, results), options)
+            return _write_summary(found, rows_of(found, records), options)
     except Busy as error:
         raise OutputError(
             f"{found.common}: another process has been writing the summary for {wait:g} s. Make it anew with "

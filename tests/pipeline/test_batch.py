@@ -167,7 +167,7 @@ def test_a_file_of_unknown_origin_is_kept(one, recording):
     foreign.write_bytes(b"years of work")
     result = stage.do(one)
     assert result.status == "failed"
-    assert "--overwrite" in result.record.reason
+    assert "--overwrite" in result.reason
     assert foreign.read_bytes() == b"years of work"
 
 
@@ -179,7 +179,7 @@ def test_a_full_disk_is_told_and_leaves_nothing_that_looks_whole(one, recording,
     monkeypatch.setattr("disctrack.trajectory.file.write_whole", full)
     result = stage.do(one)
     assert result.status == "failed"
-    assert "disk is full" in result.record.reason
+    assert "disk is full" in result.reason
     assert [file.name for file in (recording / "results").iterdir()] == ["batch.json"]
     monkeypatch.undo()
     assert stage.do(one).status == "measured"
@@ -198,17 +198,17 @@ def test_files_that_vanish_in_mid_run_cost_their_frames_or_their_recording(one, 
     monkeypatch.setattr(stage, "measure", after_the_last_images_went)
     spoilt = stage.do(one)
     assert spoilt.status == "measured"
-    assert spoilt.record.numbers["pairs_measured"] == 20
-    assert "8 images could not be read" in spoilt.record.reason
+    assert spoilt.numbers["pairs_measured"] == 20
+    assert "8 images could not be read" in spoilt.reason
     monkeypatch.undo()
 
     for file in sorted((recording / "right").iterdir())[-2:]:
         file.unlink()
     failed = stage.do(one)
     assert failed.status == "failed"
-    assert "left has 20 frames" in failed.record.reason
+    assert "left has 20 frames" in failed.reason
     shutil.rmtree(recording)
-    assert "recording.toml" in stage.do(one).record.reason
+    assert "recording.toml" in stage.do(one).reason
 
 
 @pytest.mark.statistical
@@ -226,7 +226,7 @@ def test_an_unexpected_fault_of_one_is_its_own(recording, tmp_path, monkeypatch)
     monkeypatch.setattr(stage, "measure", faulty)
     a, b = (stage.do(job) for job in jobs_of(root))
     assert (a.status, b.status) == ("failed", "measured")
-    assert "out of memory" in a.record.reason
+    assert "out of memory" in a.reason
 
 
 @pytest.mark.statistical
@@ -326,7 +326,7 @@ def test_without_room_there_is_a_reason_and_nothing_half_written(room, one, reco
     with largest_file(room):
         result = stage.do(one)
     assert result.status == "failed"
-    assert "would exceed the size limit" in result.record.reason
+    assert "would exceed the size limit" in result.reason
     assert [file.name for file in results.iterdir()] == (["batch.json"] if room > 1000 else [])
 
 
@@ -373,7 +373,7 @@ def test_a_read_only_folder_is_told_at_once_and_results_may_go_elsewhere(recordi
             assert said == ""
             assert "batch_results: cannot be written: no permission" in errors
             assert "-o" in errors
-            assert "another place with -o" in stage.do(jobs_of(recording)[0]).record.reason
+            assert "another place with -o" in stage.do(jobs_of(recording)[0]).reason
             assert main(["batch", str(recording), "-o", str(tmp_path / "out"), *FAST]) == 0
     finally:
         recording.chmod(0o755)

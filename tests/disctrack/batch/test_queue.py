@@ -22,7 +22,7 @@ from disctrack.batch.find import find_recordings
 from disctrack.batch.locks import Busy, locked
 from disctrack.batch.plan import BatchOptions, Job
 from disctrack.batch.pool import Cluster, Died, do_all
-from disctrack.batch.records import BUSY, FAILED, MEASURED, Record, Result
+from disctrack.batch.records import BUSY, FAILED, MEASURED, Record, failed
 from disctrack.batch.repeats import repeats_of
 from disctrack.batch.report import report_of
 from disctrack.batch.summary import as_csv
@@ -30,7 +30,7 @@ from disctrack.errors import ClusterError, RecordingError, reason_of
 from disctrack.report.html import page
 from disctrack.report.terminal import full, short
 
-GOOD = Result(MEASURED, Record(MEASURED))
+GOOD = Record(MEASURED)
 
 
 def recordings_at(root, *names):
@@ -135,13 +135,13 @@ def test_recordings_wait_for_their_rig_and_no_others_do():
 
 
 def test_without_its_rig_a_recording_fails_with_the_rigs_reason_and_others_go_on():
-    results = done_by(Pool(rig_a=[Result.failed("no corners found")]), WITH_RIG, [RIG])
-    assert "no corners found" in results["a"].record.reason
+    results = done_by(Pool(rig_a=[failed("no corners found")]), WITH_RIG, [RIG])
+    assert "no corners found" in results["a"].reason
     assert [results[name].status for name in "abc"] == [FAILED, MEASURED, FAILED]
 
 
 def test_a_recording_at_which_another_batch_works_is_asked_for_again_after_the_others():
-    pool = Pool(size=1, recording_a=[Result(BUSY, Record(FAILED)), GOOD])
+    pool = Pool(size=1, recording_a=[Record(BUSY), GOOD])
     assert done_by(pool, [job("a"), job("b")])["a"].status == MEASURED
     assert [name for _, name in pool.begun] == ["a", "b", "a"]
 
@@ -149,7 +149,7 @@ def test_a_recording_at_which_another_batch_works_is_asked_for_again_after_the_o
 def test_a_job_whose_process_died_is_tried_once_more_at_the_end_and_alone():
     pool = Pool(recording_a=[Died("killed"), Died("killed")], recording_b=[Died("killed"), GOOD])
     results = done_by(pool, [job(name) for name in "abcd"])
-    assert results["a"].record.reason == "twice, killed"
+    assert results["a"].reason == "twice, killed"
     assert (pool.most["c"], pool.begun[-2:]) == (2, [("recording", "a"), ("recording", "b")])
     assert [results[name].status for name in "abcd"] == [FAILED, MEASURED, MEASURED, MEASURED]
     assert [name for _, name in pool.begun][4:] == ["a", "b"]
@@ -157,7 +157,7 @@ def test_a_job_whose_process_died_is_tried_once_more_at_the_end_and_alone():
 
 def test_a_job_for_which_no_process_can_be_started_fails_alone():
     results = done_by(Pool(recording_a=[OSError(errno.EAGAIN, "no more processes")]), [job("a"), job("b")])
-    assert "no process could be started for it: no more processes" in results["a"].record.reason
+    assert "no process could be started for it: no more processes" in results["a"].reason
     assert results["b"].status == MEASURED
 
 
@@ -186,7 +186,7 @@ def test_answers_of_a_cluster_are_results_deaths_and_failures(cluster):
     cluster.answers = [GOOD, Died("killed"), RuntimeError("worker lost too often"), GOOD]
     results = done_by(Cluster("tcp://there"), [job("a"), job("b"), job("c")])
     assert {name: result.status for name, result in results.items()} == {"a": MEASURED, "b": MEASURED, "c": FAILED}
-    assert "worker lost too often" in results["c"].record.reason
+    assert "worker lost too often" in results["c"].reason
 
 
 def test_a_lost_scheduler_is_told_and_no_recording_is_blamed(cluster):
