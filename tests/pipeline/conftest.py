@@ -33,6 +33,16 @@ def rig_file(short_recording, tmp_path_factory) -> Path:
     return path
 
 
+def linked(recording: Path, folder: Path) -> Path:
+    """A recording of the same files as links: a test replaces files, and never writes into them."""
+    for file in recording.rglob("*.*"):
+        if file.is_file() and "results" not in file.relative_to(recording).parts:
+            target = folder / file.relative_to(recording)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            os.link(file, target)
+    return folder
+
+
 @pytest.fixture
 def recording(short_recording, rig_file, tmp_path) -> Path:
     """A copy of the short recording that names the rig file; a test may damage it."""

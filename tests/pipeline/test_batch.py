@@ -4,7 +4,6 @@ import contextlib
 import csv
 import ctypes
 import json
-import os
 import re
 import resource
 import shutil
@@ -26,19 +25,10 @@ from disctrack.cli import main
 from disctrack.files.whole import output_error
 from disctrack.track.follow.tracking import prepare
 from disctrack.trajectory.file import read_trajectory
+from tests.pipeline.conftest import linked
 
 FAST = ["--no-report"]
 MODEL = ["--distortion", "k1 k2 p1 p2", "--board", "flat"]  # choosing by held-out error is tested elsewhere
-
-
-def copy_of(recording: Path, folder: Path) -> Path:
-    """A recording of the same images as links: a test replaces files, and never writes into them."""
-    for file in recording.rglob("*"):
-        if file.is_file() and "results" not in file.relative_to(recording).parts:
-            target = folder / file.relative_to(recording)
-            target.parent.mkdir(parents=True, exist_ok=True)
-            os.link(file, target)
-    return folder
 
 
 def replace(file: Path, content: bytes) -> None:
@@ -78,8 +68,8 @@ def in_this_process(monkeypatch):
 def test_a_batch_calibrates_a_shared_rig_once_and_tells_of_every_recording(short_recording, tmp_path, capsys):
     root = tmp_path / "day"
     for name in ("r2", "r10"):
-        copy_of(short_recording, root / name)
-    copy_of(short_recording, root / "bad toml")
+        linked(short_recording, root / name)
+    linked(short_recording, root / "bad toml")
     replace(root / "bad toml" / "recording.toml", b"x = = 3")
     replace(root / "r10" / "left" / "000005.png", b"junk")
     assert main(["batch", str(root), "-j", "2", *FAST, *MODEL]) == 1
@@ -114,8 +104,8 @@ def test_the_same_command_goes_on_where_something_was_wrong_and_nowhere_else(
     recording, tmp_path, capsys, in_this_process
 ):
     root = tmp_path / "day"
-    copy_of(recording, root / "r1")
-    copy_of(recording, root / "bad toml")
+    linked(recording, root / "r1")
+    linked(recording, root / "bad toml")
     replace(root / "bad toml" / "recording.toml", b"x = = 3")
     assert main(["batch", str(root), *FAST]) == 1
     kept = (root / "r1" / "results" / "trajectory.h5").stat().st_mtime_ns
@@ -215,7 +205,7 @@ def test_files_that_vanish_in_mid_run_cost_their_frames_or_their_recording(one, 
 def test_an_unexpected_fault_of_one_is_its_own(recording, tmp_path, monkeypatch):
     root = tmp_path / "day"
     for name in ("a", "b"):
-        copy_of(recording, root / name)
+        linked(recording, root / name)
     real = stage.measure
 
     def faulty(recording, *rest, **options):
@@ -233,7 +223,7 @@ def test_an_unexpected_fault_of_one_is_its_own(recording, tmp_path, monkeypatch)
 def test_the_summary_is_that_of_all_shards(recording, tmp_path, in_this_process):
     root = tmp_path / "day"
     for name in ("a", "b", "c"):
-        copy_of(recording, root / name)
+        linked(recording, root / name)
     options = ["batch", str(root), "-j", "1", *FAST]
     summary = root / "batch_results" / "summary.json"
     assert main([*options, "--shard", "2/2"]) == 0
@@ -254,7 +244,7 @@ def test_ctrl_c_in_the_diagnosis_of_all_keeps_the_summary_and_its_page_is_named(
     def interrupted(*_):
         raise KeyboardInterrupt
 
-    copy_of(recording, tmp_path / "day" / "a")
+    linked(recording, tmp_path / "day" / "a")
     command = ["batch", str(tmp_path / "day"), "-j", "1", *FAST, "--together"]
     monkeypatch.setattr(run, "diagnose_all", interrupted)
     assert main(command) == 130
@@ -268,7 +258,7 @@ def test_ctrl_c_in_the_diagnosis_of_all_keeps_the_summary_and_its_page_is_named(
 
 @pytest.mark.statistical
 def test_a_summary_tells_of_declarations_that_changed_since(recording, tmp_path, capsys, in_this_process):
-    file = copy_of(recording, tmp_path / "day" / "a") / "recording.toml"
+    file = linked(recording, tmp_path / "day" / "a") / "recording.toml"
     command = ["batch", str(tmp_path / "day"), *FAST]
     assert main(command) == 0
     text = file.read_text()
@@ -295,7 +285,7 @@ def test_nothing_to_measure_is_an_error(tmp_path, capsys):
 @pytest.mark.statistical
 def test_results_may_go_elsewhere_and_the_recordings_stay_as_they_are(recording, tmp_path, in_this_process):
     root, output = tmp_path / "day", tmp_path / "out"
-    copy_of(recording, root / "x" / "a")
+    linked(recording, root / "x" / "a")
     before = sorted(root.rglob("*"))
     outcome = run_batch([root], BatchOptions(report=False), output, side_by_side=1)
     assert not outcome.failed

@@ -24,6 +24,7 @@ from disctrack.batch.pool import connect
 from disctrack.batch.records import MEASURED, is_done, read_record
 from disctrack.cli import main
 from disctrack.errors import ClusterError
+from tests.pipeline.conftest import linked
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 NAMES = ("a", "b")
@@ -40,10 +41,7 @@ def day(recording, tmp_path) -> Path:
 
 def a_day(recording: Path, root: Path, names: tuple[str, ...] = NAMES) -> Path:
     for name in names:
-        for file in recording.rglob("*.*"):
-            target = root / name / file.relative_to(recording)
-            target.parent.mkdir(parents=True, exist_ok=True)
-            os.link(file, target)
+        linked(recording, root / name)
     return root
 
 

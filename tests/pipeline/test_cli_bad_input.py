@@ -19,6 +19,7 @@ from disctrack.cli import main
 from disctrack.commands import INTERRUPTED
 from disctrack.files import whole as whole_files
 from disctrack.trajectory.file import read_trajectory
+from tests.pipeline.conftest import linked
 
 QUICK = ["--no-figures", "--no-video"]
 
@@ -163,12 +164,7 @@ def test_what_recording_toml_says_is_not_said_beside_it(short_recording, capsys,
 
 
 def test_a_calibration_view_without_its_partner(short_recording, tmp_path, capsys):
-    for camera in ("left", "right"):
-        (tmp_path / "calibration" / camera).mkdir(parents=True)
-        for file in (short_recording / "calibration" / camera).iterdir():
-            os.link(file, tmp_path / "calibration" / camera / file.name)
-        os.symlink(short_recording / camera, tmp_path / camera)
-    os.link(short_recording / "recording.toml", tmp_path / "recording.toml")
+    linked(short_recording, tmp_path)
     (tmp_path / "calibration" / "right" / "04.png").unlink()
     message = failure(capsys, "calibrate", tmp_path)
     assert "18 left and 17 right" in message
@@ -177,7 +173,7 @@ def test_a_calibration_view_without_its_partner(short_recording, tmp_path, capsy
 
 @pytest.mark.statistical
 def test_other_corners_than_declared_are_named_once_for_all_views(short_recording, tmp_path, capsys):
-    shutil.copytree(short_recording / "calibration", tmp_path / "calibration", copy_function=os.link)
+    linked(short_recording / "calibration", tmp_path / "calibration")
     shutil.copy(short_recording / "recording.toml", tmp_path)
     edit(tmp_path, "[9, 6]", "[10, 7]")
     message = failure(capsys, "calibrate", tmp_path)
@@ -186,10 +182,7 @@ def test_other_corners_than_declared_are_named_once_for_all_views(short_recordin
 
 
 def test_a_table_view_that_is_damaged_or_not_there(short_recording, tmp_path, capsys):
-    for camera in ("left", "right"):
-        (tmp_path / "calibration" / camera).mkdir(parents=True)
-        for file in (short_recording / "calibration" / camera).iterdir():
-            os.link(file, tmp_path / "calibration" / camera / file.name)
+    linked(short_recording / "calibration", tmp_path / "calibration")
     text = (short_recording / "recording.toml").read_text()
     (tmp_path / "recording.toml").write_text(text.replace("view = 0", "view = 20"))
     assert "there are 18 calibration views" in failure(capsys, "calibrate", tmp_path)

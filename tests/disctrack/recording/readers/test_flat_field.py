@@ -12,34 +12,11 @@ from disctrack.recording.declaration import read_recording
 from disctrack.recording.readers import open_frames
 from disctrack.recording.readers.flat_field import flat_fields
 from disctrack.track.measurement import open_pairs
+from tests.disctrack.recording.test_recording import REFERENCE
 from tests.oracles import imperfect_laboratory as laboratory
 
 SIZE, FRAMES, FLATS = 64, 64, 40
 DEAD = (20, 33)
-TOML = """
-[cameras]
-frame_rate_hz = 1000.0
-left = "left/*.png"
-right = "right/*.png"
-{flats}
-[disc]
-radius_mm = 37.5
-thickness_mm = 6.0
-mass_g = 209.69
-[markers]
-diameter_mm = 7.0
-centres_mm = [[26.0, 0.0], [13.0, 22.5167], [-13.0, 22.5167], [-26.0, 0.0], [-13.0, -22.5167], [6.5, -11.2583]]
-[calibration]
-left = "views/left*.png"
-right = "views/right*.png"
-inner_corners = [9, 6]
-square_mm = 6.0
-[table]
-view = 0
-board_thickness_mm = 3.0
-[gravity]
-g_m_s2 = 9.81
-"""
 ALL = "\n".join(f'{side}_{kind} = "{kind}/{side}"' for side in ("left", "right") for kind in ("flat", "dark"))
 
 
@@ -72,7 +49,7 @@ def folder(tmp_path_factory):
 
 
 def declared(folder, flats):
-    (folder / "recording.toml").write_text(TOML.format(flats=flats))
+    (folder / "recording.toml").write_text(REFERENCE.replace("[cameras]\n", f"[cameras]\n{flats}\n"))
     return read_recording(folder)
 
 
