@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calibration.kit.arrays import Array
-from calibration.kit.brief import Brief, Outline
+from calibration.kit.brief import Brief
 from disctrack.analyse.contact import Contact, analyse_contact
 from disctrack.analyse.derivatives import GROUP_NAMES, MeasuredMotion, differentiate
 from disctrack.analyse.energy import Energy, analyse_energy
@@ -28,15 +28,6 @@ EXPECTED_NOISE_SCALE = (0.7, 1.5)  # found over stated variance of the poses: ou
 
 
 @dataclass(frozen=True, repr=False)
-class Scaling(Outline):
-    """Scaling laws of the last stage."""
-
-    laws: PowerLaws
-    by_window: tuple[PowerLaws, ...]  # one per entry of WINDOWS
-    count: NutationCount
-
-
-@dataclass(frozen=True, repr=False)
 class Analysis(Brief):
     """Everything that the analysis of one trajectory gives.
 
@@ -50,7 +41,9 @@ class Analysis(Brief):
     rates: tuple[DerivedSeries, ...]
     contact: Contact
     energy: Energy
-    scaling: Scaling
+    laws: PowerLaws  # of the last stage
+    laws_by_window: tuple[PowerLaws, ...]  # one per entry of WINDOWS
+    nutation_count: NutationCount
     warnings: tuple[str, ...]
 
     def facts(self) -> dict[str, str]:
@@ -60,7 +53,7 @@ class Analysis(Brief):
             "contact": self.contact.onset.verdict,
             "energy lost": f"{1e3 * self.energy.loss:.4g} mJ",
         }
-        laws = self.scaling.laws
+        laws = self.laws
         if laws.determined:
             told |= {"t_f": f"{laws.t_f:.4f} s", "n_theta": f"{laws.n_theta.value:.4f} ± {laws.n_theta.sigma:.4f}"}
         return told
@@ -100,19 +93,17 @@ def analyse(trajectory: Trajectory, window: float = WINDOW, circle_duration: flo
     energy = analyse_energy(motion)
     psi, psidot = sense * motion.euler[:, 0], sense * found.value[:, 0]
     data = (motion.time, psi, motion.euler[:, 1], psidot, energy.propagated.value[:, 5])
-    scaling = Scaling(
-        laws=fit_power_laws(*data, window=window),
-        by_window=tuple(fit_power_laws(*data, window=float(w)) for w in WINDOWS),
-        count=count_nutation(psi, motion.euler[:, 1], motion.tilt_sigma, motion.disc),
-    )
+    laws = fit_power_laws(*data, window=window)
     return Analysis(
         trajectory=trajectory,
         motion=motion,
         rates=found.series(RATES),
         contact=contact,
         energy=energy,
-        scaling=scaling,
-        warnings=_warnings(trajectory, motion, contact, scaling),
+        laws=laws,
+        laws_by_window=tuple(fit_power_laws(*data, window=float(w)) for w in WINDOWS),
+        nutation_count=count_nutation(psi, motion.euler[:, 1], motion.tilt_sigma, motion.disc),
+        warnings=_warnings(trajectory, motion, contact, laws),
     )
 
 
@@ -132,7 +123,7 @@ def _end_of_rolling(motion: MeasuredMotion, psidot: Array) -> tuple[float, float
     return power_law_end(motion.time, sense * motion.euler[:, 0], sense * psidot), sense
 
 
-def _warnings(trajectory: Trajectory, motion: MeasuredMotion, contact: Contact, scaling: Scaling) -> tuple[str, ...]:
+def _warnings(trajectory: Trajectory, motion: MeasuredMotion, contact: Contact, laws: PowerLaws) -> tuple[str, ...]:
     """What an experimenter should know before using the numbers, in plain words."""
     found = []
     asked = trajectory.looked_for
@@ -171,6 +162,6 @@ def _warnings(trajectory: Trajectory, motion: MeasuredMotion, contact: Contact, 
             f"After the onset of rolling, {onset.n_late_slips} frames still show slip beyond five sigmas: stick and "
             "slip, or impacts."
         )
-    if scaling.laws.reason:
-        found.append(f"No exponents are given: {scaling.laws.reason}.")
+    if laws.reason:
+        found.append(f"No exponents are given: {laws.reason}.")
     return tuple(found)

@@ -120,7 +120,7 @@ def path_of_contact(analysis: Analysis) -> Drawn:
 
 def nutation_count(analysis: Analysis) -> Iterator[Drawn]:
     """Paper's figure 7."""
-    count = analysis.scaling.count
+    count = analysis.nutation_count
     if len(count.count) < 4:
         return
     offset = float(np.mean(count.count - count.slope * count.turns))
@@ -244,7 +244,7 @@ def energy(analysis: Analysis) -> Iterator[Drawn]:
 
 def power_laws(analysis: Analysis) -> Iterator[Drawn]:
     """Paper's figures 14 to 16: energy, nutation, precession rate against the time left, with the models' slopes."""
-    laws = analysis.scaling.laws
+    laws = analysis.laws
     left, ends = laws.t_f - analysis.motion.time, np.log(np.array(laws.window))
     total, theta, psidot = analysis.series("total").value, analysis.motion.euler[:, 1], analysis.series("psidot").value
     drawn = (
@@ -276,7 +276,7 @@ def power_laws(analysis: Analysis) -> Iterator[Drawn]:
 
 def exponents_against_window(analysis: Analysis) -> Iterator[Drawn]:
     """How the exponents depend on the window."""
-    fits = [fit for fit in analysis.scaling.by_window if fit.determined]
+    fits = [fit for fit in analysis.laws_by_window if fit.determined]
     longest = np.array([fit.window[0] for fit in fits])
     new = np.flatnonzero(np.append(True, np.diff(longest) > 1e-3)) if fits else longest  # others repeat the recording
     if len(new) < 2:

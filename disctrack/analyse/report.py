@@ -39,7 +39,7 @@ def report_of(
     def section(title: str, numbers: tuple[str, ...], *blocks: Listing | Text) -> Section:
         return Section(title, [*blocks, Figures([d for d in drawn if d.name.startswith(numbers)])])
 
-    trajectory, laws, energy = analysis.trajectory, analysis.scaling.laws, analysis.energy
+    trajectory, laws, energy = analysis.trajectory, analysis.laws, analysis.energy
     t_f = Measured(laws.t_f, laws.t_f_sigma)
     return Report(
         f"{provenance.recording}: from the trajectory to the physics",
@@ -145,7 +145,7 @@ def _at_95(exponent: Exponent) -> Cell:
 
 
 def _exponents(analysis: Analysis) -> list[Listing | Text]:
-    laws = analysis.scaling.laws
+    laws = analysis.laws
     if not laws.determined:
         return [Text(f"No exponents are given: {laws.reason}.")]
     theta = _largest_nutation(analysis)
@@ -173,7 +173,7 @@ def _exponents(analysis: Analysis) -> list[Listing | Text]:
     return [
         Text(said),
         Listing(header, rows, "Exponents in (t_f - t) and the models that they agree with."),
-        _windows_table(analysis.scaling.by_window),
+        _windows_table(analysis.laws_by_window),
     ]
 
 
@@ -186,7 +186,7 @@ def _agreement(exponent: Exponent, model: float, asymptotic: bool) -> str:
 
 def _largest_nutation(analysis: Analysis) -> float:
     """In the window of the exponents [rad]."""
-    laws, motion = analysis.scaling.laws, analysis.motion
+    laws, motion = analysis.laws, analysis.motion
     left = laws.t_f - motion.time
     inside = motion.known & (left >= min(laws.window)) & (left <= max(laws.window))
     return float(motion.euler[inside, 1].max()) if inside.any() else np.inf

@@ -9,7 +9,7 @@ import numpy as np
 from calibration.kit.arguments import Seconds, checked
 from calibration.kit.brief import Brief
 from calibration.kit.threads import one_blas_thread
-from disctrack.analyse.analysis import CIRCLE_DURATION, WINDOWS, Analysis, Scaling, analyse
+from disctrack.analyse.analysis import CIRCLE_DURATION, WINDOWS, Analysis, analyse
 from disctrack.analyse.derivatives import GROUP_NAMES, N_STATE, STATE
 from disctrack.analyse.power_laws import WINDOW
 from disctrack.analyse.propagation import DerivedSeries, Propagated
@@ -121,7 +121,7 @@ def write_analysis(path: Path, analysis: Analysis) -> None:
                 "precession_level_over_4g_r_steady": energy.level_ratio_steady,
             },
         ),
-        "scaling": _scaling_group(analysis.scaling),
+        "scaling": _scaling_group(analysis),
     }
     axes = {"scaling_window": Variable(WINDOWS, ("scaling_window",), "s", "longest time before t_f in the fit")}
     what = "position, rotation vector, velocity, angular velocity, acceleration, angular acceleration; world axes"
@@ -187,8 +187,8 @@ def _motion_attributes(analysis: Analysis) -> dict[str, object]:
     }
 
 
-def _scaling_group(scaling: Scaling) -> Group:
-    laws, count, fits = scaling.laws, scaling.count, scaling.by_window
+def _scaling_group(analysis: Analysis) -> Group:
+    laws, count, fits = analysis.laws, analysis.nutation_count, analysis.laws_by_window
     attributes: dict[str, object] = {
         "window_s": np.array(laws.window),
         "t_f_s": laws.t_f,

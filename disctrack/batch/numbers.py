@@ -37,7 +37,7 @@ def tracked_numbers(trajectory: Trajectory) -> Row:
 
 def analysed_numbers(analysis: Analysis) -> Row:
     """Exponents, instant of collapse and energy; `exponents_undetermined` says why there are none."""
-    laws, energy = analysis.scaling.laws, analysis.energy
+    laws, energy = analysis.laws, analysis.energy
     numbers: Row = {}
     for name in ("n_energy", "n_theta", "n_psidot"):
         exponent = getattr(laws, name)

@@ -89,9 +89,9 @@ def test_recording_that_runs_on_after_the_end_gives_what_one_that_ends_there_giv
     )
     free = analyse(as_tracked(truth, np.random.default_rng(1)))
     stopped = analyse(as_tracked(still, np.random.default_rng(1)))
-    assert stopped.scaling.laws.determined
-    assert abs(stopped.scaling.laws.n_theta.value - free.scaling.laws.n_theta.value) < 0.005
-    assert abs(stopped.scaling.laws.t_f - free.scaling.laws.t_f) < 2e-3
+    assert stopped.laws.determined
+    assert abs(stopped.laws.n_theta.value - free.laws.n_theta.value) < 0.005
+    assert abs(stopped.laws.t_f - free.laws.t_f) < 2e-3
     assert "from the first frame" in stopped.contact.onset.verdict
     assert_allclose(stopped.contact.circle.radius, free.contact.circle.radius, atol=2e-5)
 
@@ -110,7 +110,7 @@ def test_disc_that_precesses_the_other_way_gives_the_same_exponents(late, analys
         quaternion=continuous_quaternions(quaternion_from_rotation(R)),
         pose_covariance=flip @ late.pose_covariance @ flip,
     )
-    here, there = analysed.scaling.laws, analyse(mirrored).scaling.laws
+    here, there = analysed.laws, analyse(mirrored).laws
     assert here.determined
     assert_allclose(there.n_theta.value, here.n_theta.value, atol=1e-6)
     assert_allclose(there.n_psidot.value, here.n_psidot.value, atol=1e-6)
@@ -125,8 +125,8 @@ def test_disc_at_rest_gives_no_rates_and_no_exponents(tilt_deg, true_motion, as_
     R = rotation_from_euler(0.3, tilt, 0.1)
     still = replace(base, position=np.tile(place, (300, 1)), R=np.tile(R, (300, 1, 1)))
     analysis = analyse(as_tracked(still, rng))
-    assert not analysis.scaling.laws.determined
-    assert np.isnan(analysis.scaling.laws.n_theta.value)
+    assert not analysis.laws.determined
+    assert np.isnan(analysis.laws.n_theta.value)
     assert np.isnan(analysis.contact.circle.radius)
     assert any("No exponents" in text for text in analysis.warnings)
     psidot = analysis.series("psidot")
@@ -194,7 +194,7 @@ def test_rest_that_was_left_out_costs_nothing_and_changes_no_number(tmp_path, la
     found = analyse(long)
     assert len(found.motion) == len(late)
     assert_allclose(found.motion.omega_world, analysed.motion.omega_world, rtol=1e-9, atol=1e-9)
-    assert_allclose(found.scaling.laws.n_theta.value, analysed.scaling.laws.n_theta.value, atol=1e-6)
+    assert_allclose(found.laws.n_theta.value, analysed.laws.n_theta.value, atol=1e-6)
     path = stored(tmp_path, long)
     write_analysis(path, found)
     energy, _ = read_group(path, "energy")

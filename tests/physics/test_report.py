@@ -41,7 +41,7 @@ def test_report_needs_nothing_else(reported):
 @pytest.mark.statistical
 def test_report_says_what_was_found(reported):
     page = reported.report.read_text()
-    laws = reported.analysis.scaling.laws
+    laws = reported.analysis.laws
     half = (laws.n_theta.high - laws.n_theta.low) / 2
     assert "exponent of θ (95 %)" in page
     assert measured(laws.n_theta.value, half) in page  # 4.3 sigmas, Student's t: what a reader takes for it
