@@ -1,7 +1,7 @@
 """`disctrack warm-up`: compile the inner loops ahead of the first recording, as when the image of a cluster is made."""
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from multiprocessing import get_context
@@ -20,28 +20,26 @@ from disctrack.synthetic import raster
 from disctrack.track.dots import template as dots
 from disctrack.track.follow.tracking import prepare
 
-_DEPTHS = (np.uint8, np.uint16)
-# What is compiled -> seconds of processor time that it took where it was measured, and by which functions
-PARTS: dict[str, tuple[int, list[Callable[[], object]]]] = {
-    "tracking": (40, [partial(ready, dtype) for dtype in _DEPTHS for ready in (prepare, dots.prepare)]),
-    "the simulation of motions": (30, [assembly.prepare]),
-    "rendering": (10, [raster.prepare]),
-    "corners": (8, [corner_fit.prepare, normal_equations.prepare]),
-    "equations": (5, [_ode_kernel.prepare]),
-    "readers": (1, [png.prepare]),
-}
-
 
 def run(arguments: argparse.Namespace) -> int:
     """Compile the inner loops of all stages, in two processes; returns the exit code."""
+    # with the seconds of processor time that each took where it was measured
+    parts: list[tuple[str, int, list[Callable[[], object]]]] = [
+        ("tracking", 40, [partial(ready, kind) for kind in (np.uint8, np.uint16) for ready in (prepare, dots.prepare)]),
+        ("the simulation of motions", 30, [assembly.prepare]),
+        ("rendering", 10, [raster.prepare]),
+        ("corners", 8, [corner_fit.prepare, normal_equations.prepare]),
+        ("equations", 5, [_ode_kernel.prepare]),
+        ("readers", 1, [png.prepare]),
+    ]
     with ProcessPoolExecutor(2, get_context("spawn")) as pool:
-        list(pool.map(_compiled, PARTS))
+        for part in [pool.submit(_compiled, *part) for part in parts]:
+            part.result()
     print(f"inner loops are compiled: kept in {FOLDER}")
     return DONE
 
 
-def _compiled(what: str) -> None:
-    seconds, functions = PARTS[what]
+def _compiled(what: str, seconds: int, functions: Sequence[Callable[[], object]]) -> None:
     with compiling(what, seconds):
         for function in functions:
             function()

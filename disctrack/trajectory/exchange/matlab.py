@@ -84,13 +84,9 @@ def read_stereo_parameters(
     if scale is None:
         raise RigFileError(f"{path}: does not say in which unit translationOfCamera2 is; give it (0.001 for mm)")
     size = array_of(found, "imageSize", (2,), str(path))[::-1]
-    return stereo_rig(found, _NAMES, (size, size), scale, world_is_table, str(path))
-
-
-_NAMES = (
-    *(f"{what}{number}" for number in (1, 2) for what in ("intrinsicMatrix", "distortionCoefficients")),
-    *("rotationOfCamera2", "translationOfCamera2"),
-)
+    names = [f"{what}{number}" for number in (1, 2) for what in ("intrinsicMatrix", "distortionCoefficients")]
+    names += ["rotationOfCamera2", "translationOfCamera2"]
+    return stereo_rig(found, names, (size, size), scale, world_is_table, str(path))
 
 
 def _save(path: Path, content: Mapping[str, Any]) -> None:
