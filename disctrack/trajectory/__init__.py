@@ -45,7 +45,7 @@ class FrameStatus(IntEnum):
     )
     JUMPED = 10, "refused: no motion leads from the frames before or after to this pose (exchanged frames?)"
 
-    def __new__(cls, value: int, sentence: str) -> FrameStatus:
+    def __new__(cls, value: int, sentence: str = "") -> FrameStatus:
         """A number with its sentence."""
         member = int.__new__(cls, value)
         member._value_, member.sentence = value, sentence

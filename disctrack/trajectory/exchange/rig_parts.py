@@ -46,7 +46,9 @@ def stereo_rig(
         camera_of(array_of(found, K, (3, 3), where), array_of(found, D, (-1,), where), size, f"{where}: {K}, {D}")
         for K, D, size in zip(of_cameras[::2], of_cameras[1::2], sizes, strict=True)
     ]
-    world = {"R_left_world": np.eye(3), "t_left_world": np.zeros(3), "world_is_table": 0.0} | dict(found)
+    world: dict[str, Any] = {"R_left_world": np.eye(3), "t_left_world": np.zeros(3), "world_is_table": 0.0} | dict(
+        found
+    )
     return StereoRig(
         cameras[0],
         cameras[1],
