@@ -17,7 +17,6 @@ from disctrack.progress import compiling
 from disctrack.recording.readers import _png as png
 from disctrack.rolling import _assembly as assembly
 from disctrack.synthetic import raster
-from disctrack.track.dots import template as dots
 from disctrack.track.follow.tracking import prepare
 
 
@@ -25,7 +24,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Compile the inner loops of all stages, in two processes; returns the exit code."""
     # with the seconds of processor time that each took where it was measured
     parts: list[tuple[str, int, list[Callable[[], object]]]] = [
-        ("tracking", 40, [partial(ready, kind) for kind in (np.uint8, np.uint16) for ready in (prepare, dots.prepare)]),
+        ("tracking", 40, [partial(prepare, kind) for kind in (np.uint8, np.uint16)]),
         ("the simulation of motions", 30, [assembly.prepare]),
         ("rendering", 10, [raster.prepare]),
         ("corners", 8, [corner_fit.prepare, normal_equations.prepare]),
