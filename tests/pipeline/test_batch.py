@@ -277,11 +277,6 @@ def test_wrong_usage_is_told_apart_from_failure(words, tmp_path):
     assert stop.value.code == 2
 
 
-def test_nothing_to_measure_is_an_error(tmp_path, capsys):
-    assert main(["batch", str(tmp_path)]) == 1
-    assert "no recording found" in capsys.readouterr().err
-
-
 @pytest.mark.statistical
 def test_results_may_go_elsewhere_and_the_recordings_stay_as_they_are(recording, tmp_path, in_this_process):
     root, output = tmp_path / "day", tmp_path / "out"

@@ -322,16 +322,6 @@ def test_means_and_spread_of_repeats_agree_with_least_squares(rng):
         assert (found["p_value"] > 1e-3) == (added == 0.0)
 
 
-def test_published_trials_have_the_published_mean():
-    from disctrack.analyse.published import published_table
-
-    table = published_table("glass")
-    exponents = table.exponents[:, 1]
-    (found,) = repeats_of(repeats_with(exponents, np.ones(len(exponents))))
-    np.testing.assert_allclose(found["mean"], table.average[1], rtol=1e-12)
-    assert found["n"] == len(exponents)
-
-
 def test_repeats_are_of_one_group_determined_and_no_copies():
     rows = repeats_with([0.66, 0.67, 0.68, 0.9, 0.9, 0.7], [0.01] * 6)
     rows[3] |= {"repeats": "steel"}  # alone of its kind
