@@ -6,6 +6,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+from disctrack import rolling
 from disctrack.commands import INCOMPLETE
 from disctrack.commands import _outputs as outputs
 from disctrack.diagnosis import run_diagnose
@@ -16,7 +17,6 @@ from disctrack.findings import doubts
 from disctrack.progress import compiling, steps
 from disctrack.recording.readers.blocks import default_threads
 from disctrack.report.blocks import Report
-from disctrack.rolling import _assembly as assembly
 from disctrack.trajectory.file import read_findings, trajectory_in
 from disctrack.trajectory.reuse import origin_of, remember, reusable
 
@@ -43,7 +43,7 @@ def run(arguments: argparse.Namespace) -> int:
         then = f"mend it and run again; or `disctrack diagnose {outputs.relative(path)} --anyway`"
         return outputs.tell(Report("", said, findings=wrong, then=then), arguments, folder, findings)
     with compiling("the simulation of motions", 30):
-        assembly.prepare()
+        rolling.prepare()
     with steps("diagnose"):
         outcome = run_diagnose(
             path,
@@ -67,7 +67,7 @@ def _together(paths: list[Path], arguments: argparse.Namespace) -> int:
         with contextlib.suppress(TrajectoryFileError):  # told of below
             outputs.tell_stale(path)
     with compiling("the simulation of motions", 30):
-        assembly.prepare()
+        rolling.prepare()
     with steps(f"diagnose {len(paths)} recordings together") as step:
         report = run_together(
             paths,

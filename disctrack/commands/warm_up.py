@@ -11,11 +11,11 @@ import numpy as np
 from calibration.board import corner_fit
 from calibration.fit import normal_equations
 from calibration.kit.compiled import FOLDER
+from disctrack import rolling
 from disctrack.commands import DONE
 from disctrack.discrepancy.equations import _ode_kernel
 from disctrack.progress import compiling
 from disctrack.recording.readers import _png as png
-from disctrack.rolling import _assembly as assembly
 from disctrack.synthetic import raster
 from disctrack.track.follow.tracking import prepare
 
@@ -25,7 +25,7 @@ def run(arguments: argparse.Namespace) -> int:
     # with the seconds of processor time that each took where it was measured
     parts: list[tuple[str, int, list[Callable[[], object]]]] = [
         ("tracking", 40, [partial(prepare, kind) for kind in (np.uint8, np.uint16)]),
-        ("the simulation of motions", 30, [assembly.prepare]),
+        ("the simulation of motions", 30, [rolling.prepare]),
         ("rendering", 10, [raster.prepare]),
         ("corners", 8, [corner_fit.prepare, normal_equations.prepare]),
         ("equations", 5, [_ode_kernel.prepare]),

@@ -8,13 +8,11 @@ elsewhere, `run` writes a scene's motion to a file.
 from disctrack.disc import nutation_frequency, precession_rate
 from disctrack.rolling import effects
 from disctrack.rolling.effects import CATALOGUE, Effect, EffectParameter, ModelError
-from disctrack.rolling.impact import struck_disc
 from disctrack.rolling.model import DEFAULT_THETA_END, Model, effects_from_tables
 from disctrack.rolling.motion import EndReason, Motion, Regime, Switch
-from disctrack.rolling.sensitivities import Sensitivities, sensitivities
+from disctrack.rolling.sensitivities import Sensitivities, prepare, sensitivities
 from disctrack.rolling.simulate import simulate, time_grid
-from disctrack.rolling.state import State
-from disctrack.rolling.steady import steady_precession
+from disctrack.rolling.state import State, steady_precession, struck_disc
 
 __all__ = [
     "CATALOGUE",
@@ -33,6 +31,7 @@ __all__ = [
     "effects_from_tables",
     "nutation_frequency",
     "precession_rate",
+    "prepare",
     "sensitivities",
     "simulate",
     "steady_precession",

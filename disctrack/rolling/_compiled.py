@@ -1,22 +1,43 @@
 """Compiled functions that call each other by address.
 
-The integrator, the equations of motion and the law of every effect are compiled separately and cached separately, and
-meet only through addresses. So a new effect costs the compilation of one small function, never that of the integrator,
-and a cached integrator can never hold an outdated copy of a law. The records' field names are part of each signature: a
-changed layout recompiles what depends on it. A call by address costs about 3 ns.
+The integrator, the equations of motion and the law of every effect are compiled separately, and meet only through
+addresses: a new effect costs the compilation of one small function, never that of the integrator. The records' field
+names are part of each signature. A call by address costs about 3 ns.
 """
 
 import operator
 from collections.abc import Callable
 from functools import cache, lru_cache
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
+from llvmlite import ir
 from numba import from_dtype, types
-from numba.extending import lower_builtin, register_jitable
+from numba.core import cgutils
+from numba.extending import intrinsic, lower_builtin, register_jitable
+from numpy.typing import NDArray
 
 from calibration.kit.compiled import cfunc, one_at_a_time
-from disctrack.rolling.records import BODY, KINEMATICS, WRENCH, record_dtype
+from disctrack.rolling.records import BODY, INSTANT, record_dtype
+
+Addresses: TypeAlias = NDArray[np.int64]
+
+
+@intrinsic
+def _call(typingctx, address, pointers):  # type: ignore[no-untyped-def]
+    """Call the C function void(void*, ..., void*) at an address; `pointers` is a tuple of addresses."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        pointer = ir.IntType(8).as_pointer()
+        given = [builder.inttoptr(a, pointer) for a in cgutils.unpack_tuple(builder, args[1])]
+        function = ir.FunctionType(ir.VoidType(), [pointer] * len(given))
+        builder.call(builder.inttoptr(args[0], function.as_pointer()), given)
+        return context.get_dummy_value()
+
+    return types.void(types.int64, pointers), codegen
+
+
+call: Any = _call  # the type checker takes an intrinsic for what numba calls while compiling
 
 
 @lower_builtin(operator.truediv, types.complex128, types.complex128)
@@ -37,14 +58,6 @@ def _divided(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
     return context.compile_internal(builder, ratio, signature, arguments)
 
 
-def _pointer(scalar: type) -> types.Type:
-    return types.CPointer(from_dtype(np.dtype(scalar)))
-
-
-def _record(names: tuple[str, ...], scalar: type) -> types.Type:
-    return from_dtype(record_dtype(names, scalar))
-
-
 def _compile(function: Callable[..., None], signature: Any) -> Any:
     # error_model: a division by zero gives inf or nan, as in NumPy; the integrator then refuses the step
     with one_at_a_time():
@@ -54,17 +67,24 @@ def _compile(function: Callable[..., None], signature: Any) -> Any:
             return cfunc(signature, error_model="numpy")(function)
 
 
+def _record(names: tuple[str, ...], scalar: type) -> types.Type:
+    return from_dtype(record_dtype(names, scalar))
+
+
 @cache
 def compile_system(function: Callable[..., None], scalar: type) -> Any:
-    """f(t, y, out, table, body, kinematics, wrench) as C function; keep the object: it owns the `address`."""
-    v = _pointer(scalar)
-    records = [_record(names, scalar) for names in (BODY, KINEMATICS, WRENCH)]
+    """f(t, y, out, table, body, instant) as C function; keep the object: it owns the `address`."""
+    v = types.CPointer(from_dtype(np.dtype(scalar)))
+    records = [_record(names, scalar) for names in (BODY, INSTANT)]
     return _compile(function, types.void(v, v, v, types.CPointer(types.int64), *records))
 
 
 @lru_cache(maxsize=256)  # the catalogue several times over; whoever calls a law holds it himself
 def compile_law(function: Callable[..., None], parameters: tuple[str, ...], helpers: tuple, scalar: type) -> Any:
-    """law(p, s, w) as C function for parameters of these names; `helpers` are Python functions that it may call."""
+    """law(p, s, w) as C function for parameters of these names; `helpers` are Python functions that it may call.
+
+    s and w are the same record: what a law may read, and where it writes.
+    """
     for helper in helpers:
         register_jitable(helper)
-    return _compile(function, types.void(*(_record(names, scalar) for names in (parameters, KINEMATICS, WRENCH))))
+    return _compile(function, types.void(*(_record(names, scalar) for names in (parameters, INSTANT, INSTANT))))

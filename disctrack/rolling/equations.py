@@ -43,27 +43,26 @@ from typing import TypeAlias
 import numpy as np
 
 from calibration.kit.compiled import njit
-from disctrack.rolling._addresses import Addresses, call_law
+from disctrack.rolling._compiled import Addresses, call
 from disctrack.rolling.records import Numbers, Record
 
 Vector: TypeAlias = tuple[complex, complex, complex]  # all numbers may be real
 State: TypeAlias = Sequence[complex]
-Motion: TypeAlias = tuple[Vector, Vector, Vector]  # omegadot, turn of the frame, acceleration of O
+Forced: TypeAlias = tuple[complex, complex, complex, complex, complex, complex, complex]
 
 _part = njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)  # called by compiled functions only
 
 ROLLING, SLIPPING, FLYING = 0, 1, 2
 EVENTS = ("theta_end", "load", "grip", "upright")
-N_EVENTS = len(EVENTS)
 STICK_SPEED = 1e-7  # [m/s]; 1e-4 of what the tracking can see, and 1e-8 of the disc's speeds
 LOAD_STEP = 1e-4  # [s]; (200 rad/s times it)^2 / 12 = 3e-5 of F_z'', and rounding 1e-8 N/s^2
 CREEP_PASSES = 3  # each adds a power of c times the motion's rate over 3 g to what is known of creep
 FILM = 2e-3  # [m/s] of creep: (c / g times rates of 100 rad/s)^3 is 1e-5 of v_A, and steps of 0.1 ms are stable
 LIFT_OFF_GAP = 1e-12  # [m]; a landing is a fall below this, so that the start of a flight is not one
 
-# table: integers shared by all functions: regime, number of laws, addresses of kinematics and wrench, then the address
-# of each law and of its parameters.
-HEADER = 4
+# table: integers shared by all functions: regime, number of laws, address of the record `now` of all that is known of
+# the instant, then the address of each law and of its parameters.
+HEADER = 3
 
 
 @_part
@@ -142,15 +141,15 @@ def _support(body: Record, cb: complex, sb: complex) -> Vector:
 
 
 @_part
-def _place(body: Record, kin: Record) -> tuple[Vector, Vector, complex, Vector, complex]:
+def _place(body: Record, now: Record) -> tuple[Vector, Vector, complex, Vector, complex]:
     """W, its part in the face over its length, that length, the rim's support there, and the height of O."""
-    s, c = kin.sin_theta, kin.cos_theta
-    cf, sf, sp, cp = np.cos(kin.phi), np.sin(kin.phi), np.sin(kin.psi), np.cos(kin.psi)
+    s, c = now.sin_theta, now.cos_theta
+    cf, sf, sp, cp = np.cos(now.phi), np.sin(now.phi), np.sin(now.psi), np.cos(now.psi)
     kappa, rho = body.curvature, body.edge_radius
     arm3 = body.half_thickness - rho
     upright = np.sqrt(1.0 - body.slope_x * body.slope_x - body.slope_y * body.slope_y)
     n0 = _nodal(body.slope_x * cp + body.slope_y * sp, body.slope_y * cp - body.slope_x * sp, upright, s, c)
-    level = _nodal(-(kin.x * cp + kin.y * sp), kin.x * sp - kin.y * cp, 0.0 * s, s, c)
+    level = _nodal(-(now.x * cp + now.y * sp), now.x * sp - now.y * cp, 0.0 * s, s, c)
     z = (body.radius - rho) * s + arm3 * c + rho
     W, across, w, p = n0, n0, 1.0 + 0.0 * s, (z, z, z)
     for _ in range(6):  # Newton's method; the first guess errs by the table's slope
@@ -167,14 +166,14 @@ def _place(body: Record, kin: Record) -> tuple[Vector, Vector, complex, Vector, 
 
 
 @_part
-def _contact(body: Record, kin: Record) -> tuple[Vector, Vector, complex]:
+def _contact(body: Record, now: Record) -> tuple[Vector, Vector, complex]:
     """r_OA, the normal of the table there, and the height of O."""
-    s, c = kin.sin_theta, kin.cos_theta
+    s, c = now.sin_theta, now.cos_theta
     if _is_plain(body):
         arm, _ = _plain_arm(body, s, c)
         return arm, (0.0 * s, s, c), -(s * arm[1] + c * arm[2])
     rho = body.edge_radius
-    W, across, _, p, z = _place(body, kin)
+    W, across, _, p, z = _place(body, now)
     n = _scale(1.0 / (1.0 - body.curvature * rho), _add(W, _scale(body.curvature * p[0], across)))
     along = (across[1], -across[0], 0.0 * s)  # e3 x e
     rim = _add(_scale(-p[0], across), _scale(p[1], along))
@@ -183,15 +182,15 @@ def _contact(body: Record, kin: Record) -> tuple[Vector, Vector, complex]:
 
 
 @_part
-def _contact_rates(body: Record, kin: Record, omega: Vector, frame: Vector, v: Vector) -> tuple[Vector, Vector]:
+def _contact_rates(body: Record, now: Record, omega: Vector, frame: Vector, v: Vector) -> tuple[Vector, Vector]:
     """Rates of r_OA and of the normal, as vectors; v: velocity of O, nodal components."""
-    s, c = kin.sin_theta, kin.cos_theta
+    s, c = now.sin_theta, now.cos_theta
     if _is_plain(body):
         _, a = _plain_arm(body, s, c)
         return _cross(frame, a), (0.0 * s, 0.0 * s, 0.0 * s)
     rho, kappa = body.edge_radius, body.curvature
     arm3 = rho - body.half_thickness
-    W, across, w, p, _ = _place(body, kin)
+    W, across, w, p, _ = _place(body, now)
     e3 = (0.0 * s, 0.0 * s, 1.0 + 0.0 * s)
     e3_rate = _cross(omega, e3)
     W_rate = _scale(-kappa, _add(v, _scale(arm3, e3_rate)))
@@ -239,16 +238,16 @@ def _kinematics(regime: int, t: complex, y: State, body: Record, k: Record) -> N
 
 
 @_part
-def _apply_laws(table: Addresses, w: Record) -> None:
-    w.M_n = w.M_m = w.M_z = 0.0
-    w.load_n = w.load_m = w.load_z = 0.0
-    w.X_n = w.X_m = w.X_z = 0.0
-    w.table_x = w.table_y = w.table_z = 0.0
-    w.table_vx = w.table_vy = w.table_vz = 0.0
-    w.table_ax = w.table_ay = w.table_az = 0.0
-    w.field_x = w.field_y = w.field_z = 0.0
+def _apply_laws(table: Addresses, now: Record) -> None:
+    now.M_n = now.M_m = now.M_z = 0.0
+    now.load_n = now.load_m = now.load_z = 0.0
+    now.X_n = now.X_m = now.X_z = 0.0
+    now.table_x = now.table_y = now.table_z = 0.0
+    now.table_vx = now.table_vy = now.table_vz = 0.0
+    now.table_ax = now.table_ay = now.table_az = 0.0
+    now.field_x = now.field_y = now.field_z = 0.0
     for i in range(table[1]):
-        call_law(table[HEADER + 2 * i], table[HEADER + 1 + 2 * i], table[2], table[3])
+        call(table[HEADER + 2 * i], (table[HEADER + 1 + 2 * i], table[2], table[2]))
 
 
 @_part
@@ -271,30 +270,30 @@ def _speed_of_friction(body: Record, slip: Vector) -> complex:
 
 
 @_part
-def _accelerations(regime: int, y: State, body: Record, kin: Record, w: Record) -> Motion:
-    """Omegadot and acceleration of O (vectors, nodal components); writes the contact force into the record."""
-    s, c, m = kin.sin_theta, kin.cos_theta, body.mass
+def _accelerations(regime: int, y: State, body: Record, now: Record) -> None:
+    """Writes contact force, acceleration of O and angular acceleration into the record."""
+    s, c, m = now.sin_theta, now.cos_theta, body.mass
     omega = (y[5], y[6], y[7])
     frame = (y[5], y[6], y[6] * c / s)
-    k = _nodal(kin.normal_n, kin.normal_m, kin.normal_z, s, c)
-    arm, _, _ = _contact(body, kin)
-    v = _nodal(kin.v_n, kin.v_m, kin.v_z, s, c)
-    arm_rate, k_rate = _contact_rates(body, kin, omega, frame, v)
-    cf, sf = np.cos(kin.phi), np.sin(kin.phi)
+    k = _nodal(now.normal_n, now.normal_m, now.normal_z, s, c)
+    arm, _, _ = _contact(body, now)
+    v = _nodal(now.v_n, now.v_m, now.v_z, s, c)
+    arm_rate, k_rate = _contact_rates(body, now, omega, frame, v)
+    cf, sf = np.cos(now.phi), np.sin(now.phi)
     com = (body.com_1 * cf - body.com_2 * sf, body.com_1 * sf + body.com_2 * cf, body.com_3)
     D = _add(arm, _scale(-1.0, com))
-    sp, cp = np.sin(kin.psi), np.cos(kin.psi)
-    g_x, g_y = body.g_x + w.field_x - w.table_ax, body.g_y + w.field_y - w.table_ay
-    g = _nodal(g_x * cp + g_y * sp, g_y * cp - g_x * sp, body.g_z + w.field_z - w.table_az, s, c)
-    X = _nodal(w.X_n, w.X_m, w.X_z, s, c)
-    M0 = _nodal(w.M_n, w.M_m, w.M_z, s, c)
-    L = _nodal(w.load_n, w.load_m, w.load_z, s, c)
+    sp, cp = np.sin(now.psi), np.cos(now.psi)
+    g_x, g_y = body.g_x + now.field_x - now.table_ax, body.g_y + now.field_y - now.table_ay
+    g = _nodal(g_x * cp + g_y * sp, g_y * cp - g_x * sp, body.g_z + now.field_z - now.table_az, s, c)
+    X = _nodal(now.X_n, now.X_m, now.X_z, s, c)
+    M0 = _nodal(now.M_n, now.M_m, now.M_z, s, c)
+    L = _nodal(now.load_n, now.load_m, now.load_z, s, c)
     centripetal_G = _cross(omega, _cross(omega, com))
     centripetal_A = _cross(omega, arm_rate)
     weight = _add(_scale(m, g), X)
     f0 = _add(_scale(m, _add(centripetal_G, _scale(-1.0, centripetal_A))), _scale(-1.0, weight))
     f0_z = _dot(k, f0)
-    J0, J1, J2 = _inertia_rows(body, kin.phi)
+    J0, J1, J2 = _inertia_rows(body, now.phi)
     H = (_dot(J0, omega), _dot(J1, omega), _dot(J2, omega))
     b = _add(_add(M0, _scale(-1.0, _cross(omega, H))), _scale(-1.0, _cross(com, X)))
     Dk = _scale(m, _cross(D, k))
@@ -310,8 +309,8 @@ def _accelerations(regime: int, y: State, body: Record, kin: Record, w: Record) 
     else:
         d = k
         if regime == SLIPPING:
-            slip_z = -(kin.slip_n * kin.normal_n + kin.slip_m * kin.normal_m) / kin.normal_z
-            slip = _nodal(kin.slip_n, kin.slip_m, slip_z, s, c)
+            slip_z = -(now.slip_n * now.normal_n + now.slip_m * now.normal_m) / now.normal_z
+            slip = _nodal(now.slip_n, now.slip_m, slip_z, s, c)
             d = _add(k, _scale(-1.0 / _speed_of_friction(body, slip), slip))
             f0_z = f0_z - m * _dot(k_rate, slip)
             B = _add(_cross(D, d), L)
@@ -324,11 +323,12 @@ def _accelerations(regime: int, y: State, body: Record, kin: Record, w: Record) 
         F = _scale(load, d)
         a_G = _scale(1.0 / m, _add(F, weight))
         a_O = _add(a_G, _scale(-1.0, _add(_cross(omegadot, com), centripetal_G)))
-    w.F_n, w.F_m, w.F_z = F[0], c * F[1] - s * F[2], s * F[1] + c * F[2]
+    now.F_n, now.F_m, now.F_z = F[0], c * F[1] - s * F[2], s * F[1] + c * F[2]
+    now.a_n, now.a_m, now.a_z = a_O[0], c * a_O[1] - s * a_O[2], s * a_O[1] + c * a_O[2]
+    now.alpha_1, now.alpha_2, now.alpha_3 = omegadot
     normal_force = _dot(F, k)
     tangential = _add(F, _scale(-normal_force, k))
-    w.N, w.F_t = normal_force, np.sqrt(_dot(tangential, tangential))
-    return omegadot, frame, a_O
+    now.N, now.F_t = normal_force, np.sqrt(_dot(tangential, tangential))
 
 
 @_part
@@ -341,157 +341,149 @@ def _state(regime: int, y: Numbers) -> State:
 
 
 @_part
-def _evaluate(
-    t: complex, y: State, table: Addresses, body: Record, kin: Record, wrench: Record
-) -> tuple[Motion, State]:
-    load = _course_of_load(t, y, table, body, kin, wrench)
-    slide = _creeping(t, y, table, body, kin, wrench)
-    _kinematics(table[0], t, y, body, kin)
-    _apply_laws(table, wrench)
-    wrench.table_vx, wrench.table_vy = wrench.table_vx + slide[0], wrench.table_vy + slide[1]
-    wrench.table_ax, wrench.table_ay = wrench.table_ax + slide[2], wrench.table_ay + slide[3]
-    wrench.table_z -= body.compliance * load[0]
-    wrench.table_vz -= body.compliance * load[1]
-    wrench.table_az -= body.compliance * load[2]
-    return _accelerations(table[0], y, body, kin, wrench), slide
-
-
-@_part
-def _flow(t: complex, y: State, held: Vector, table: Addresses, body: Record, kin: Record, wrench: Record) -> State:
-    """Rates of the first ten components on a rigid table; fills kinematics and wrench on the way.
-
-    held : slip along n0 and m0 that takes the place of the state's own, and the share to which it does
-    """
-    _kinematics(table[0], t, y, body, kin)
-    slip_n, slip_m, share = held
-    kin.slip_n, kin.slip_m = kin.slip_n + share * (slip_n - kin.slip_n), kin.slip_m + share * (slip_m - kin.slip_m)
-    _apply_laws(table, wrench)
-    return _rates_of(y, kin, _accelerations(table[0], y, body, kin, wrench))
-
-
-@_part
-def _rates_of(y: State, kin: Record, found: Motion) -> State:
-    omegadot, frame, a_O = found
-    s, c, sp, cp = kin.sin_theta, kin.cos_theta, np.sin(kin.psi), np.cos(kin.psi)
+def _rates_of(y: State, now: Record) -> State:
+    """Of all twelve components, on a table at rest."""
+    c, sp, cp = now.cos_theta, np.sin(now.psi), np.cos(now.psi)
     # components of a vector in a turning frame: rate of the components = (rate of the vector) - Omega x vector
-    relative = _cross(frame, (y[5], y[6], y[7]))
-    a_n, a_m = a_O[0], c * a_O[1] - s * a_O[2]
+    relative = _cross((y[5], y[6], now.psidot * c), (y[5], y[6], y[7]))
     return (
-        kin.v_n * cp - kin.v_m * sp, kin.v_n * sp + kin.v_m * cp, kin.psidot, kin.thetadot, kin.phidot,
-        omegadot[0] - relative[0], omegadot[1] - relative[1], omegadot[2] - relative[2],
-        a_n * cp - a_m * sp, a_n * sp + a_m * cp,
+        now.v_n * cp - now.v_m * sp, now.v_n * sp + now.v_m * cp, now.psidot, now.thetadot, now.phidot,
+        now.alpha_1 - relative[0], now.alpha_2 - relative[1], now.alpha_3 - relative[2],
+        now.a_n * cp - now.a_m * sp, now.a_n * sp + now.a_m * cp, now.v_z, now.a_z,
     )  # fmt: skip
 
 
 @_part
 def _moved(y: State, h: float, rate: State) -> State:
-    """The state after h along these rates of its first ten components."""
+    """The state after h along these rates."""
     return (
         y[0] + h * rate[0], y[1] + h * rate[1], y[2] + h * rate[2], y[3] + h * rate[3], y[4] + h * rate[4],
         y[5] + h * rate[5], y[6] + h * rate[6], y[7] + h * rate[7], y[8] + h * rate[8], y[9] + h * rate[9],
-        y[10], y[11],
+        y[10] + h * rate[10], y[11] + h * rate[11],
     )  # fmt: skip
 
 
 @_part
-def _course_of_load(t: complex, y: State, table: Addresses, body: Record, kin: Record, wrench: Record) -> Vector:
+def _flow(t: complex, y: State, forced: Forced, table: Addresses, body: Record, now: Record) -> State:
+    """Rates of the state on a rigid table; fills the record on the way.
+
+    forced : acceleration of the contact along i and j, the rate of that; then a slip along n0 and m0 that takes the
+        place of the state's own, and the share to which it does
+    """
+    _kinematics(table[0], t, y, body, now)
+    slip_n, slip_m, share = forced[4:]
+    now.slip_n, now.slip_m = now.slip_n + share * (slip_n - now.slip_n), now.slip_m + share * (slip_m - now.slip_m)
+    _apply_laws(table, now)
+    now.table_ax, now.table_ay = now.table_ax + forced[0], now.table_ay + forced[1]
+    _accelerations(table[0], y, body, now)
+    return _rates_of(y, now)
+
+
+@_part
+def _load_and_pull(now: Record) -> Vector:
+    """F_z, and friction along i and j over N: what the normal of a hollow supports is none."""
+    sp, cp = np.sin(now.psi), np.cos(now.psi)
+    F_n, F_m = now.F_n - now.N * now.normal_n, now.F_m - now.N * now.normal_m
+    return now.F_z, (F_n * cp - F_m * sp) / now.N, (F_n * sp + F_m * cp) / now.N
+
+
+@_part
+def _ahead(
+    h: float, rate: State, t: complex, y: State, forced: Forced, table: Addresses, body: Record, now: Record
+) -> Vector:
+    """`_load_and_pull` after h, by the midpoint of the way there."""
+    for part in (0.5 * h, h):
+        a_x, a_y, j_x, j_y, slip_n, slip_m, share = forced
+        later = (a_x + part * j_x, a_y + part * j_y, j_x, j_y, slip_n, slip_m, share)
+        rate = _flow(t + part, _moved(y, part, rate), later, table, body, now)
+    return _load_and_pull(now)
+
+
+@_part
+def _course(
+    t: complex, y: State, forced: Forced, table: Addresses, body: Record, now: Record
+) -> tuple[Vector, Vector, Vector]:
+    """`_load_and_pull` along the motion, and its first two derivatives by time."""
+    h = LOAD_STEP
+    rate = _flow(t, y, forced, table, body, now)
+    at_once = _load_and_pull(now)
+    after = _ahead(h, rate, t, y, forced, table, body, now)
+    before = _ahead(-h, rate, t, y, forced, table, body, now)
+    rise = _scale(0.5 / h, _add(after, _scale(-1.0, before)))
+    bend = _scale(1.0 / (h * h), _add(_add(after, before), _scale(-2.0, at_once)))
+    return at_once, rise, bend
+
+
+@_part
+def _course_of_load(t: complex, y: State, table: Addresses, body: Record, now: Record) -> Vector:
     """F_z on the rigid table and its first two derivatives by time; zeros where the table does not give way."""
     nothing = 0.0 * y[0]
     if body.compliance == 0.0 or table[0] == FLYING:
         return nothing, nothing, nothing
-    held = (nothing, nothing, nothing)
+    forced = (nothing, nothing, nothing, nothing, nothing, nothing, nothing)
     if table[0] == SLIPPING and body.inverse_friction != 0.0:
         # slip that creeps follows its force at once, and turns any way within LOAD_STEP: its direction is held then
-        _kinematics(table[0], t, y, body, kin)
-        slow = 3.0 * LOAD_STEP * kin.gravity / body.inverse_friction
-        speed2, slow2 = kin.slip_n * kin.slip_n + kin.slip_m * kin.slip_m, slow * slow
-        held = (kin.slip_n, kin.slip_m, slow2 * slow2 / (slow2 * slow2 + speed2 * speed2))
-    first = _flow(t, y, held, table, body, kin, wrench)
-    now, h = wrench.F_z, LOAD_STEP
-    middle = _flow(t + 0.5 * h, _moved(y, 0.5 * h, first), held, table, body, kin, wrench)
-    _flow(t + h, _moved(y, h, middle), held, table, body, kin, wrench)
-    after = wrench.F_z
-    middle = _flow(t - 0.5 * h, _moved(y, -0.5 * h, first), held, table, body, kin, wrench)
-    _flow(t - h, _moved(y, -h, middle), held, table, body, kin, wrench)
-    before = wrench.F_z
-    return now, (after - before) / (2.0 * h), (after - 2.0 * now + before) / (h * h)
+        _kinematics(table[0], t, y, body, now)
+        slow = 3.0 * LOAD_STEP * now.gravity / body.inverse_friction
+        speed2, slow2 = now.slip_n * now.slip_n + now.slip_m * now.slip_m, slow * slow
+        share = slow2 * slow2 / (slow2 * slow2 + speed2 * speed2)
+        forced = (nothing, nothing, nothing, nothing, now.slip_n, now.slip_m, share)
+    load, rise, bend = _course(t, y, forced, table, body, now)
+    return load[0], rise[0], bend[0]
 
 
 @_part
-def _pull(
-    t: complex,
-    y: State,
-    slide_x: complex,
-    slide_y: complex,
-    table: Addresses,
-    body: Record,
-    kin: Record,
-    wrench: Record,
-) -> tuple[State, State]:
-    """F_x / N and F_y / N of a disc that rolls, its contact accelerated by `slide`; and the rates of the state."""
-    _kinematics(table[0], t, y, body, kin)
-    _apply_laws(table, wrench)
-    wrench.table_ax, wrench.table_ay = wrench.table_ax + slide_x, wrench.table_ay + slide_y
-    rate = _rates_of(y, kin, _accelerations(table[0], y, body, kin, wrench))
-    sp, cp = np.sin(kin.psi), np.cos(kin.psi)
-    # along the table: what the normal of a hollow supports is no friction
-    F_n, F_m = wrench.F_n - wrench.N * kin.normal_n, wrench.F_m - wrench.N * kin.normal_m
-    return ((F_n * cp - F_m * sp) / wrench.N, (F_n * sp + F_m * cp) / wrench.N), rate
-
-
-@_part
-def _creeping(t: complex, y: State, table: Addresses, body: Record, kin: Record, wrench: Record) -> State:
+def _creeping(
+    t: complex, y: State, table: Addresses, body: Record, now: Record
+) -> tuple[complex, complex, complex, complex]:
     """Velocity and acceleration along i and j of a contact that creeps; zeros where it does not, or slips."""
     nothing = 0.0 * y[0]
-    if body.creep == 0.0 or table[0] != ROLLING:
+    pull, a_x, a_y, j_x, j_y = (nothing, nothing, nothing), nothing, nothing, nothing, nothing
+    c = body.creep
+    if c == 0.0 or table[0] != ROLLING:
         return nothing, nothing, nothing, nothing
-    c, h = body.creep, LOAD_STEP
-    f, a_x, a_y, j_x, j_y = (nothing, nothing), nothing, nothing, nothing, nothing
     # the force that accelerates what creeps is part of the force by which it creeps
     for _ in range(CREEP_PASSES):
-        f, first = _pull(t, y, a_x, a_y, table, body, kin, wrench)
-        half = t + 0.5 * h, _moved(y, 0.5 * h, first), a_x + 0.5 * j_x, a_y + 0.5 * j_y
-        _, middle = _pull(half[0], half[1], half[2], half[3], table, body, kin, wrench)
-        after, _ = _pull(t + h, _moved(y, h, middle), a_x + j_x, a_y + j_y, table, body, kin, wrench)
-        half = t - 0.5 * h, _moved(y, -0.5 * h, first), a_x - 0.5 * j_x, a_y - 0.5 * j_y
-        _, middle = _pull(half[0], half[1], half[2], half[3], table, body, kin, wrench)
-        before, _ = _pull(t - h, _moved(y, -h, middle), a_x - j_x, a_y - j_y, table, body, kin, wrench)
-        a_x, a_y = -c * (after[0] - before[0]) / (2.0 * h), -c * (after[1] - before[1]) / (2.0 * h)
-        j_x, j_y = -c * (after[0] - 2.0 * f[0] + before[0]) / h, -c * (after[1] - 2.0 * f[1] + before[1]) / h
-    return -c * f[0], -c * f[1], a_x, a_y
+        forced = (a_x, a_y, j_x, j_y, nothing, nothing, nothing)
+        pull, rise, bend = _course(t, y, forced, table, body, now)
+        a_x, a_y, j_x, j_y = -c * rise[1], -c * rise[2], -c * bend[1], -c * bend[2]
+    return -c * pull[1], -c * pull[2], a_x, a_y
 
 
-def rates(t: Numbers, y: Numbers, ydot: Numbers, table: Addresses, body: Record, kin: Record, wrench: Record) -> None:
-    """Time derivative of the state; fills kinematics and wrench on the way."""
-    state = _state(table[0], y)
-    found, slide = _evaluate(t[0], state, table, body, kin, wrench)
-    rate = _rates_of(state, kin, found)
-    ydot[0], ydot[1], ydot[2], ydot[3], ydot[4] = rate[0] + slide[0], rate[1] + slide[1], rate[2], rate[3], rate[4]
-    ydot[5], ydot[6], ydot[7] = rate[5], rate[6], rate[7]
-    if table[0] != ROLLING:
-        ydot[8], ydot[9] = rate[8], rate[9]
-    if table[0] == FLYING:
-        a_O = found[2]
-        ydot[10], ydot[11] = kin.v_z, kin.sin_theta * a_O[1] + kin.cos_theta * a_O[2]
-
-
-def event_margins(
-    t: Numbers, y: Numbers, margin: Numbers, table: Addresses, body: Record, kin: Record, wrench: Record
-) -> None:
+@_part
+def _margins(regime: int, body: Record, now: Record) -> tuple[complex, complex, complex, complex]:
     """Margins (EVENTS) that are positive while the regime lasts.
 
     theta_end: nutation above its end. load: N, or in flight the gap. grip: rolling N - |F_t|/mu, slipping the slip
     speed. upright: the lower rim alone touches; beyond pi/2 it would be the other one.
     """
-    _evaluate(t[0], _state(table[0], y), table, body, kin, wrench)
-    margin[0] = kin.theta - body.theta_end
-    margin[3] = 0.5 * np.pi - kin.theta
-    margin[1] = wrench.N
-    margin[2] = 1.0 + 0.0 * kin.theta
-    if table[0] == ROLLING:
-        margin[2] = wrench.N - body.inverse_friction * wrench.F_t
-    if table[0] == SLIPPING and body.inverse_friction != 0.0:  # on a film nothing sticks
-        margin[2] = np.sqrt(kin.slip_n * kin.slip_n + kin.slip_m * kin.slip_m) - STICK_SPEED
-    if table[0] == FLYING:
-        _, _, z = _contact(body, kin)
-        margin[1] = kin.z - z + LIFT_OFF_GAP
+    load, grip = now.N, 1.0 + 0.0 * now.theta
+    if regime == ROLLING:
+        grip = now.N - body.inverse_friction * now.F_t
+    if regime == SLIPPING and body.inverse_friction != 0.0:  # on a film nothing sticks
+        grip = np.sqrt(now.slip_n * now.slip_n + now.slip_m * now.slip_m) - STICK_SPEED
+    if regime == FLYING:
+        _, _, z = _contact(body, now)
+        load = now.z - z + LIFT_OFF_GAP
+    return now.theta - body.theta_end, load, grip, 0.5 * np.pi - now.theta
+
+
+def rates(t: Numbers, y: Numbers, out: Numbers, table: Addresses, body: Record, now: Record) -> None:
+    """Time derivative of the state, then the margins; fills the record on the way."""
+    regime, state = table[0], _state(table[0], y)
+    load = _course_of_load(t[0], state, table, body, now)
+    v_x, v_y, a_x, a_y = _creeping(t[0], state, table, body, now)
+    _kinematics(regime, t[0], state, body, now)
+    _apply_laws(table, now)
+    now.table_vx, now.table_vy = now.table_vx + v_x, now.table_vy + v_y
+    now.table_ax, now.table_ay = now.table_ax + a_x, now.table_ay + a_y
+    now.table_z -= body.compliance * load[0]
+    now.table_vz -= body.compliance * load[1]
+    now.table_az -= body.compliance * load[2]
+    _accelerations(regime, state, body, now)
+    rate, margins, n = _rates_of(state, now), _margins(regime, body, now), 8 + 2 * regime
+    for i in range(n):
+        out[i] = rate[i]
+    out[0], out[1] = out[0] + v_x, out[1] + v_y
+    for i in range(len(margins)):
+        out[n + i] = margins[i]

@@ -1,4 +1,4 @@
-"""Laws on given motions, in plain NumPy: what an effect would supply there, and what the motion needs."""
+"""Laws on given motions, in plain NumPy: what an effect would supply there."""
 
 from types import SimpleNamespace
 from typing import Any
@@ -8,10 +8,12 @@ from numpy.typing import ArrayLike
 
 from calibration.kit.arrays import Array
 from disctrack.disc import AIR_DENSITY, Disc
+from disctrack.rolling._assembly import Assembly
 from disctrack.rolling.effects import Effect
-from disctrack.rolling.records import KINEMATICS, WRENCH, record_dtype
-
-_K = np.array([0.0, 0.0, 1.0])
+from disctrack.rolling.equations import FLYING
+from disctrack.rolling.model import Model
+from disctrack.rolling.motion import moment_power
+from disctrack.rolling.records import KINEMATICS, WRENCH
 
 
 def kinematics(
@@ -28,21 +30,12 @@ def kinematics(
     """
     x, y, z, psi, theta, phi = np.moveaxis(np.asarray(q, float), -1, 0)
     v_x, v_y, v_z, psidot, thetadot, phidot = np.moveaxis(np.asarray(qdot, float), -1, 0)
-    s, c, sp, cp = np.sin(theta), np.cos(theta), np.sin(psi), np.cos(psi)
-    v_n, v_m = v_x * cp + v_y * sp, v_y * cp - v_x * sp
-    omega2, omega3 = psidot * s, psidot * c + phidot
-    r, h = disc.radius, disc.half_thickness
-    quantities = dict(
-        time=time, x=x, y=y, z=z, psi=psi, theta=theta, phi=phi, sin_theta=s, cos_theta=c, thetadot=thetadot,
-        psidot=psidot, phidot=phidot, omega2=omega2, omega3=omega3, omega_z=psidot + phidot * c, v_n=v_n, v_m=v_m,
-        v_z=v_z, slip_n=v_n - h * omega2 + r * omega3, slip_m=v_m + (r * s + h * c) * thetadot, radius=r,
-        half_thickness=h, mass=disc.mass, gravity=gravity, air_density=air_density, normal_n=0.0, normal_m=0.0,
-        normal_z=1.0,
-    )  # fmt: skip
-    result = np.empty(theta.shape, record_dtype(KINEMATICS, float))
-    for name in KINEMATICS:
-        result[name] = quantities[name]
-    return result.view(np.recarray)
+    omega2, omega3 = psidot * np.sin(theta), psidot * np.cos(theta) + phidot
+    states = np.stack([x, y, psi, theta, phi, thetadot, omega2, omega3, v_x, v_y, z, v_z], axis=-1)
+    times = np.broadcast_to(time, theta.shape).ravel()
+    in_air = Assembly(Model(disc, gravity, air_density=air_density), 0.0)  # where any velocity of O may be
+    found = in_air.at(FLYING, times, states.reshape(-1, 12))[2].reshape(theta.shape)
+    return found[list(KINEMATICS)].view(np.recarray)
 
 
 def effect_wrench(effect: Effect, motion: Any, load: ArrayLike) -> tuple[Array, Array]:
@@ -65,6 +58,5 @@ def effect_wrench(effect: Effect, motion: Any, load: ArrayLike) -> tuple[Array, 
 def effect_power(effect: Effect, motion: Any, load: ArrayLike) -> Array:
     """Power of an effect's moment, and of its force at O (...) [W]: never positive for a passive one."""
     moment, force = effect_wrench(effect, motion, load)
-    rates = np.stack([motion.thetadot, -motion.phidot * motion.sin_theta, motion.omega_z], axis=-1)
     velocity = np.stack([motion.v_n, motion.v_m, motion.v_z], axis=-1)
-    return np.sum(moment * rates, axis=-1) + np.sum(force * velocity, axis=-1)
+    return moment_power(motion, moment) + np.sum(force * velocity, axis=-1)

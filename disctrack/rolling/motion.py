@@ -2,16 +2,17 @@
 
 from dataclasses import dataclass
 from enum import Enum, IntEnum
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibration.kit.arrays import Array
 from calibration.kit.brief import Outline
-from disctrack.frames import nodal_axes_world, rotation_from_euler
+from disctrack.frames import COORDINATES, nodal_axes_world, rotation_from_euler
 from disctrack.rolling import equations
 from disctrack.rolling.model import Model
-from disctrack.rolling.records import ROLLING_COMPONENTS, Numbers, Records
+from disctrack.rolling.records import ROLLING_COMPONENTS, Records
 
 
 class Regime(IntEnum):
@@ -83,108 +84,96 @@ class Motion(Outline):
             return np.hypot(self.contact_force[:, 0], self.contact_force[:, 1]) / self.contact_force[:, 2]
 
 
-def coordinates(kinematics: Records) -> tuple[Numbers, Numbers]:
-    """Q and qdot (n, 6), real or complex, from records of kinematic quantities (n,)."""
-    k = kinematics
-    cp, sp = np.cos(k["psi"]), np.sin(k["psi"])
-    v_x, v_y = k["v_n"] * cp - k["v_m"] * sp, k["v_n"] * sp + k["v_m"] * cp
-    q = np.stack([k["x"], k["y"], k["z"], k["psi"], k["theta"], k["phi"]], axis=-1)
-    qdot = np.stack([v_x, v_y, k["v_z"], k["psidot"], k["thetadot"], k["phidot"]], axis=-1)
-    return q, qdot
-
-
-def as_seen(kinematics: Records, wrench: Records) -> tuple[Numbers, Numbers]:
-    """Q and qdot (n, 6) in the axes of cameras at rest, from records (n,): the table may move in them."""
-    q, qdot = coordinates(kinematics)
-    for i, axis in enumerate("xyz"):
-        q[..., i] += wrench[f"table_{axis}"]
-        qdot[..., i] += wrench[f"table_v{axis}"]
-    return q, qdot
-
-
 @dataclass(frozen=True)
-class MotionSamples:
-    """Raw answers of the compiled equations at n times."""
+class Path:
+    """Solution over all regimes, at n times; numbers are complex where imaginary parts carry derivatives."""
 
-    time: Array  # (n,)
-    kinematics: Records  # (n,) records
-    wrench: Records  # (n,) records
-    rates: Numbers  # (n, 8) of the rolling components
+    now: Records  # (n,) records.INSTANT
     regime: NDArray[np.uint8]  # (n,)
+    switches: list[Switch]
+    end: EndReason
+    end_time: complex
+    end_state: Any  # (8,), (10,) or (12,)
+    slip_steps: int  # of the integrator in slip, which is stiff where it creeps
+
+    @property
+    def as_seen(self) -> tuple[Any, Any]:
+        """Q and qdot (n, 6) in the axes of cameras at rest: the table may move in them."""
+        q, qdot = coordinates(self.now)
+        for i, axis in enumerate("xyz"):
+            q[:, i] += self.now[f"table_{axis}"]
+            qdot[:, i] += self.now[f"table_v{axis}"]
+        return q, qdot
 
 
-def motion_from_samples(
-    model: Model,
-    body: Records,
-    samples: MotionSamples,
-    switches: list[Switch],
-    end: EndReason,
-    end_time: float,
-    end_state: Array,
-) -> Motion:
-    """All quantities of a `Motion` from the solution's samples; `body` is a record (1,) of records.BODY."""
-    k, w, b = samples.kinematics, samples.wrench, body[0]
-    q, qdot = (x.real for x in as_seen(k, w))
-    omega_nodal = np.stack([k["thetadot"], k["omega2"], k["omega3"]], axis=-1)
-    frame_nodal = np.stack([k["thetadot"], k["omega2"], k["psidot"] * k["cos_theta"]], axis=-1)
-    omegadot_nodal = samples.rates[:, 5:8] + np.cross(frame_nodal, omega_nodal)
-    axes = np.stack(nodal_axes_world(k["psi"], k["theta"]), axis=-1)  # nodal -> world
-    omega = np.einsum("nij,nj->ni", axes, omega_nodal)
-    omegadot = np.einsum("nij,nj->ni", axes, omegadot_nodal)
-    R = rotation_from_euler(k["psi"], k["theta"], k["phi"])
+def coordinates(now: Records) -> tuple[Any, Any]:
+    """Q and qdot (n, 6) in axes of the table, real or complex, from records.INSTANT (n,)."""
+    cp, sp = np.cos(now["psi"]), np.sin(now["psi"])
+    v_x, v_y = now["v_n"] * cp - now["v_m"] * sp, now["v_n"] * sp + now["v_m"] * cp
+    q = columns(now, *COORDINATES)
+    qdot = np.stack([v_x, v_y, now["v_z"], now["psidot"], now["thetadot"], now["phidot"]], axis=-1)
+    return q, qdot
+
+
+def columns(now: Records, *names: str) -> Any:
+    """Fields of records (n,) beside each other (n, k)."""
+    return np.stack([now[name] for name in names], axis=-1)
+
+
+def moment_power(now: Records, moment: Array) -> Array:
+    """M . Omega [W]; Omega = thetadot n0 - phidot sin(theta) m0 + omega_z k."""
+    rates = np.stack([now["thetadot"], -now["phidot"] * now["sin_theta"], now["omega_z"]], axis=-1)
+    return np.sum(moment * rates, axis=-1)
+
+
+def motion_of(model: Model, body: Records, path: Path) -> Motion:
+    """All quantities of a `Motion` from its path; `body` is a record (1,) of records.BODY."""
+    now, b = path.now, body[0]
+    q, qdot = path.as_seen
+    nodal = np.stack(nodal_axes_world(now["psi"], now["theta"]), axis=-1)  # nodal -> world
+    n0, k = nodal[:, :, 0], np.tile([0.0, 0.0, 1.0], (len(now), 1))
+    contact = np.stack([n0, np.cross(k, n0), k], axis=-1)  # contact axes -> world
+    omega = _turned(nodal, columns(now, "thetadot", "omega2", "omega3"))
+    R = rotation_from_euler(now["psi"], now["theta"], now["phi"])
     com = R @ np.array([b["com_1"], b["com_2"], b["com_3"]])
-    J = np.array(
-        [[b["J_11"], b["J_12"], b["J_13"]], [b["J_12"], b["J_22"], b["J_23"]], [b["J_13"], b["J_23"], b["J_33"]]]
-    )
+    J = np.array([[b[f"J_{min(i, j)}{max(i, j)}"] for j in (1, 2, 3)] for i in (1, 2, 3)])
     omega_body = np.einsum("nji,nj->ni", R, omega)
     v_G = qdot[:, :3] + np.cross(omega, com)
     gravity = np.array([b["g_x"], b["g_y"], b["g_z"]])
-    load = w["N"]
-    force = np.stack([w[f"F_{a}"] for a in "nmz"], axis=-1)
-    moment = np.stack([w[f"M_{a}"] + w[f"load_{a}"] * load for a in "nmz"], axis=-1)
-    external = np.stack([w["X_n"], w["X_m"], w["X_z"]], axis=-1)
-    contact_axes = np.stack(
-        [axes[:, :, 0], np.cross([0, 0, 1], axes[:, :, 0]), np.tile([0.0, 0, 1], (len(k), 1))], axis=-1
-    )
-    pull = b["mass"] * np.stack([w[f"field_{a}"] for a in "xyz"], axis=-1)
-    external += np.einsum("nij,ni->nj", contact_axes, pull)
-    a_G = np.einsum("nij,nj->ni", contact_axes, force + external) / b["mass"] + gravity
-    slip = np.stack([k["slip_n"], k["slip_m"]], axis=-1)
-    slip[samples.regime == Regime.ROLLING] = 0.0
-    slip_power = np.where(samples.regime == Regime.SLIPPING, w["F_n"] * k["slip_n"] + w["F_m"] * k["slip_m"], 0.0)
-    to_contact = np.swapaxes(contact_axes, 1, 2)
-    external_power = np.sum(external * np.einsum("nij,nj->ni", to_contact, qdot[:, :3]), axis=-1)
-    external_power += np.sum(pull * np.cross(omega, com), axis=-1)  # at the centre of mass, and not at O
-    table_velocity = np.stack([w[f"table_v{a}"] for a in "xyz"], axis=-1)
-    table_power = np.sum(force * np.einsum("nij,nj->ni", to_contact, table_velocity), axis=-1)
+    force, slip = columns(now, "F_n", "F_m", "F_z"), columns(now, "slip_n", "slip_m")
+    moment = columns(now, "M_n", "M_m", "M_z") + columns(now, "load_n", "load_m", "load_z") * now["N"][:, None]
+    pull = b["mass"] * columns(now, "field_x", "field_y", "field_z")  # at the centre of mass, and not at O
+    at_O = columns(now, "X_n", "X_m", "X_z")
+    table_velocity, table_acceleration = (columns(now, *(f"table_{d}{a}" for a in "xyz")) for d in "va")
+    slip[path.regime == Regime.ROLLING] = 0.0
+    slips = path.regime == Regime.SLIPPING
+    power = moment_power(now, moment) + np.where(slips, np.sum(force[:, :2] * slip, axis=-1), 0.0)
+    power += np.sum(_turned(contact, at_O) * qdot[:, :3], axis=-1) + np.sum(pull * v_G, axis=-1)
     return Motion(
         model=model,
-        time=samples.time,
+        time=now["time"],
         q=q,
         qdot=qdot,
-        state=np.stack([k[name] for name in ROLLING_COMPONENTS], axis=-1),
+        state=columns(now, *ROLLING_COMPONENTS),
         omega_world=omega,
-        acceleration_world=a_G - np.cross(omegadot, com) - np.cross(omega, np.cross(omega, com)),
-        angular_acceleration_world=omegadot,
+        acceleration_world=_turned(contact, columns(now, "a_n", "a_m", "a_z")) + table_acceleration,
+        angular_acceleration_world=_turned(nodal, columns(now, "alpha_1", "alpha_2", "alpha_3")),
         energy_translation=0.5 * b["mass"] * np.sum(v_G**2, axis=-1),
         energy_rotation=0.5 * np.einsum("ni,ij,nj->n", omega_body, J, omega_body),
         energy_potential=-b["mass"] * (q[:, :3] + com - [0, 0, b["half_thickness"] + b["com_3"]]) @ gravity,
         contact_force=force,
         contact_moment=moment,
-        external_force=external,
+        external_force=at_O + _turned(np.swapaxes(contact, 1, 2), pull),
         slip_velocity=slip,
-        power=moment_power(k, moment) + external_power + slip_power + table_power,
-        regime=samples.regime,
-        switches=tuple(switches),
-        end=end,
-        end_time=end_time,
-        end_state=end_state,
+        power=power + np.sum(_turned(contact, force) * table_velocity, axis=-1),
+        regime=path.regime,
+        switches=tuple(path.switches),
+        end=path.end,
+        end_time=path.end_time.real,
+        end_state=path.end_state,
     )
 
 
-def moment_power(kinematics: Records, moment: Array) -> Array:
-    """M . Omega [W]; Omega = thetadot n0 - phidot sin(theta) m0 + omega_z k."""
-    k = kinematics
-    return (
-        moment[..., 0] * k["thetadot"] - moment[..., 1] * k["phidot"] * k["sin_theta"] + moment[..., 2] * k["omega_z"]
-    )
+def _turned(axes: Array, vectors: Array) -> Array:
+    """Vectors (n, 3) by matrices (n, 3, 3)."""
+    return np.asarray(np.einsum("nij,nj->ni", axes, vectors))

@@ -56,7 +56,7 @@ KINEMATICS = (
     "normal_z",
 )
 
-# Written by the laws: contact moment M + F_z * load, external force X at O; (n0, m0, k). F is the answer.
+# Written by the laws: contact moment M + F_z * load, external force X at O; (n0, m0, k).
 WRENCH = (
     "M_n",  # moments that do not depend on the load [N m]
     "M_m",
@@ -67,16 +67,28 @@ WRENCH = (
     "X_n",  # force on the centre O [N]
     "X_m",
     "X_z",
-    "F_n",  # contact force on the disc [N], solved from the equations of motion; not to be set by a law
-    "F_m",
-    "F_z",
-    "N",  # its part along the normal of the table at the contact: F_z on a flat one
-    "F_t",  # and the size of the rest, which friction has to supply
     *(f"table_{a}" for a in "xyz"),  # where the table is, in the axes of cameras at rest [m]; q is relative to it
     *(f"table_v{a}" for a in "xyz"),  # its velocity [m/s]
     *(f"table_a{a}" for a in "xyz"),  # and acceleration [m/s^2]
     *(f"field_{a}" for a in "xyz"),  # uniform field beside gravity, world axes [m/s^2]: it pulls at the centre of mass
 )
+
+# Solved from the equations of motion.
+ANSWERS = (
+    "F_n",  # contact force on the disc [N]
+    "F_m",
+    "F_z",
+    "N",  # its part along the normal of the table at the contact: F_z on a flat one
+    "F_t",  # and the size of the rest, which friction has to supply
+    "a_n",  # acceleration of O relative to the table [m/s^2]
+    "a_m",
+    "a_z",
+    "alpha_1",  # angular acceleration along e1, e2, e3 [rad/s^2]
+    "alpha_2",
+    "alpha_3",
+)
+
+INSTANT = KINEMATICS + WRENCH + ANSWERS  # all that the equations of motion know at one instant: one record
 
 # Constants of one body on one table. Inertia about the centre of mass in body axes.
 BODY = (

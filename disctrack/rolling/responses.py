@@ -10,9 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibration.kit.arrays import Array
-from disctrack.rolling import integrate
 from disctrack.rolling._assembly import Assembly
-from disctrack.rolling.effects import effect_class
+from disctrack.rolling.effects import effect_from_formulas
 from disctrack.rolling.equations import ROLLING
 from disctrack.rolling.model import DEFAULT_THETA_END, Model
 from disctrack.rolling.records import ROLLING_COMPONENTS
@@ -21,8 +20,7 @@ from disctrack.rolling.simulate import RTOL, simulate
 from disctrack.rolling.state import State
 
 COMPONENTS = ("M_n", "M_m", "M_z", "X_n", "X_m", "X_z")
-_SEED = 1e-30
-_FOREVER = 1e9  # [s] width of a probe that is a constant
+_PROBE = effect_from_formulas("probe", {c: f"{c}_given" for c in COMPONENTS})
 
 
 @dataclass(frozen=True)
@@ -51,35 +49,17 @@ def responses(model: Model, state: State, times: Array, theta_end: float = DEFAU
     found = sensitivities(model, state, times, (), ROLLING_COMPONENTS, theta_end)
     if not np.isfinite(found.dq).all():
         return None
-    s, c = np.sin(found.q[:, 3 + 1]), np.cos(found.q[:, 3 + 1])
-    psidot = found.qdot[:, 3]
-    d_theta, d_psidot = found.dq[:, 4], found.dqdot[:, 3]
-    by_start = np.concatenate(
-        [
-            found.dq[:, [0, 1, 3, 4, 5]],
-            found.dqdot[:, 4:5],
-            (d_psidot * s[:, None] + (psidot * c)[:, None] * d_theta)[:, None],
-            (d_psidot * c[:, None] - (psidot * s)[:, None] * d_theta + found.dqdot[:, 5])[:, None],
-        ],
-        axis=1,
-    )
-    return Responses(times, found.q, found.qdot, np.linalg.solve(by_start, _per_wrench(model, motion.state, times)))
+    kernel = np.asarray(np.linalg.solve(found.dstate, _per_wrench(model, motion.state, times)), float)
+    return Responses(times, found.q, found.qdot, kernel)
 
 
 def _per_wrench(model: Model, states: Array, times: Array) -> Array:
-    """(N, 8, 6) derivative of the state's rate by moment and force."""
-    probe = effect_class("wrench_probe")
-    probed = model.with_effects(probe(**{c: 0.0 for c in COMPONENTS}, t_0=0.0, width=_FOREVER))
-    found = np.empty((len(times), len(ROLLING_COMPONENTS), len(COMPONENTS)))
-    for i, name in enumerate(COMPONENTS):
-        assembly = Assembly(probed, DEFAULT_THETA_END, complex, {f"wrench_probe.{name}": 1j * _SEED})
-        system = assembly.system(ROLLING)
-        scratch = (assembly.kinematics, assembly.wrench)
-        rates, _, _ = integrate.evaluate(
-            system.rates, system.arguments, times, states.astype(complex), len(ROLLING_COMPONENTS), scratch
-        )
-        found[:, :, i] = rates.imag / _SEED
-    return found
+    """(N, 8, 6) derivative of the state's rate by moment and force, on which it depends linearly."""
+    rates = []
+    for row in np.vstack([np.zeros(len(COMPONENTS)), np.eye(len(COMPONENTS))]):
+        probe = _PROBE(**{f"{c}_given": x for c, x in zip(COMPONENTS, row, strict=True)})
+        rates.append(Assembly(model.with_effects(probe), DEFAULT_THETA_END).at(ROLLING, times, states)[0])
+    return np.asarray(np.stack(rates[1:], axis=-1) - rates[0][..., None], float)
 
 
 def _integral(f: Array, time: Array) -> Array:

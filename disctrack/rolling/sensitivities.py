@@ -2,8 +2,8 @@
 
 Each column is one more run of the same compiled integrator with an imaginary part of 1e-30 on one number (complex-step
 derivative): no difference is taken, and the way in which the instants of the switches between rolling, slip and flight
-move is included. Columns that follow from a symmetry of the model are written down: where nothing tells one place or
-direction of the table, or one angle of the body from another, a motion that begins elsewhere is the same motion there.
+move is included. Columns that follow from a symmetry of the model are written down: where nothing tells one place of
+the table, or one angle of the body, from another, a motion that begins elsewhere is the same motion there.
 """
 
 from collections.abc import Iterator, Sequence
@@ -14,19 +14,20 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from calibration.kit.arrays import Array
+from disctrack.disc import MA_2014
 from disctrack.frames import COORDINATES
 from disctrack.rolling._assembly import Assembly
+from disctrack.rolling._compiled import compile_law
+from disctrack.rolling.effects.base import CATALOGUE, HELPERS
 from disctrack.rolling.model import DEFAULT_THETA_END, Model
-from disctrack.rolling.motion import EndReason, as_seen
-from disctrack.rolling.records import STATE_COMPONENTS
+from disctrack.rolling.motion import EndReason, Path, columns
+from disctrack.rolling.records import ROLLING_COMPONENTS, STATE_COMPONENTS, Numbers
 from disctrack.rolling.simulate import MAX_SLIP_STEPS, MAX_SWITCHES, RTOL, _grid, _start, follow
-from disctrack.rolling.state import State
+from disctrack.rolling.state import State, steady_precession
 
 _SEED = 1e-30  # imaginary part; its square is far below the smallest rounding
 _UNEVEN = ("curvature", "slope_x", "slope_y", "oval_c", "oval_s", "lobes_c", "lobes_s", "flat_depth")
 _ASKEW = ("com_1", "com_2", "J_12", "J_13", "J_23")  # of a body that is not the same all round its axis
-_OF_PLACE = {"x": {"x"}, "y": {"y"}, "phi": {"phi"}}  # kinematics by which a law breaks the symmetry
-_OF_DIRECTION = {"x", "y", "psi", *(f"{v}{a}" for v in ("table_", "table_v", "table_a", "field_") for a in "xy")}
 
 
 @dataclass(frozen=True)
@@ -39,6 +40,7 @@ class Sensitivities:
     names: tuple[str, ...]  # (k,) components of the state, then "effect.parameter"
     dq: Array  # (n, 6, k) in the unit of q per unit of the number
     dqdot: Array  # (n, 6, k)
+    dstate: Array  # (n, 8, k) of records.ROLLING_COMPONENTS
     slip_steps: int = 0  # of the integrator in slip, over all runs
 
 
@@ -65,65 +67,48 @@ def sensitivities(
     enlarged = model.with_values(_missing(model, parameters))
     components = tuple(STATE_COMPONENTS[: len(y0)] if components is None else components)
     names = (*components, *parameters)
-    dq, dqdot = np.full((2, len(grid), 6, len(names)), np.nan)
-    q, qdot = np.full((2, len(grid), 6), np.nan)
+    found = np.full((len(grid), 20, 1 + len(names)), np.nan)  # q, qdot and state: the motion, then its derivatives
     assembly = Assembly(enlarged, theta_end)
     path = follow(assembly, y0, grid, rtol, max_switches, max_slip_steps)
     spent = path.slip_steps
-    n = len(path.samples.time)
-    q[:n], qdot[:n] = as_seen(path.samples.kinematics, path.samples.wrench)
-    if path.end is EndReason.CHATTER:
-        return Sensitivities(grid, q, qdot, names, dq, dqdot, spent)
-    same = symmetries(enlarged, assembly)
-    for name in [c for c in components if c in same and c != "psi"]:
-        column = components.index(name)
-        dq[:n, :, column], dqdot[:n, :, column] = 0.0, 0.0
-        dq[:n, COORDINATES.index(name), column] = 1.0
-    # a turn of the table's axes moves the direction of a velocity at the start, too
-    turns = "psi" in components and "psi" in same and (len(y0) == 8 or {"v_x", "v_y"} <= set(components))
-    for column, name in enumerate(names):
-        if column < len(components) and name in same and (name != "psi" or turns):
-            continue
-        y, values = y0.astype(complex), {}
-        if column < len(components):
-            y[STATE_COMPONENTS.index(name)] += 1j * _SEED
-        else:
-            values = {name: enlarged.values[name] + 1j * _SEED}
-        left = max(max_slip_steps - spent, 0)
-        path = follow(Assembly(enlarged, theta_end, complex, values), y, grid, rtol, max_slip_steps=left)
-        spent += path.slip_steps
-        n = len(path.samples.time)
-        complex_q, complex_qdot = as_seen(path.samples.kinematics, path.samples.wrench)
-        dq[:n, :, column], dqdot[:n, :, column] = complex_q.imag / _SEED, complex_qdot.imag / _SEED
-    if turns:
-        column = components.index("psi")
-        dq[:n, :, column], dqdot[:n, :, column] = _turned(q[:n] - q[0] * [1, 1, 0, 0, 0, 0]), _turned(qdot[:n])
-        dq[:n, COORDINATES.index("psi"), column] = 1.0
-        for amount, name in zip(_turned(y0[None, 8:10])[0], ("v_x", "v_y"), strict=False):
-            dq[..., column] -= amount * dq[..., components.index(name)]
-            dqdot[..., column] -= amount * dqdot[..., components.index(name)]
-    return Sensitivities(grid, q, qdot, names, dq, dqdot, spent)
+    found[: len(path.now), :, 0] = _numbers(path)
+    if path.end is not EndReason.CHATTER:
+        same = symmetries(enlarged, assembly)
+        for column, name in enumerate(names, start=1):
+            if name in same and column <= len(components):
+                found[: len(path.now), :, column] = [float(name == n) for n in _NUMBERS]
+                continue
+            y, values = y0.astype(complex), {}
+            if column <= len(components):
+                y[STATE_COMPONENTS.index(name)] += 1j * _SEED
+            else:
+                values = {name: enlarged.values[name] + 1j * _SEED}
+            moved = Assembly(enlarged, theta_end, complex, values)
+            run = follow(moved, y, grid, rtol, max_slip_steps=max(max_slip_steps - spent, 0))
+            spent += run.slip_steps
+            found[: len(run.now), :, column] = _numbers(run).imag / _SEED
+    q, qdot, _ = np.split(found[..., 0], [6, 12], axis=1)
+    dq, dqdot, dstate = np.split(found[..., 1:], [6, 12], axis=1)
+    return Sensitivities(grid, q, qdot, names, dq, dqdot, dstate, spent)
 
 
-def _turned(vectors: Array) -> Array:
-    """K x v for vectors whose first two of k components are x and y; the others are left at zero."""
-    found = np.zeros_like(vectors)
-    if vectors.shape[1]:
-        found[:, 0], found[:, 1] = -vectors[:, 1], vectors[:, 0]
-    return found
+_NUMBERS = (*COORDINATES, *(f"{c}dot" for c in COORDINATES), *ROLLING_COMPONENTS)
+
+
+def _numbers(path: Path) -> Numbers:
+    """(n, 20) of a path."""
+    return np.concatenate([*path.as_seen, columns(path.now, *ROLLING_COMPONENTS)], axis=1)
 
 
 def symmetries(model: Model, assembly: Assembly) -> set[str]:
-    """Those of x, y, psi, phi at the start on which nothing depends but where, and which way round, the motion is."""
-    reads = {name for e in model.effects if e.law is not None for name in _names(type(e).law.__code__)}
+    """Those of x, y, phi at the start on which nothing depends but where, and which way round, the motion is."""
     if any(assembly.constant(name) != 0.0 for name in _UNEVEN):
         return set()
-    found = {name for name, breaking in _OF_PLACE.items() if not breaking & reads}
-    if any(assembly.constant(name) != 0.0 for name in _ASKEW) or assembly.constant("J_11") != assembly.constant("J_22"):
-        found.discard("phi")
-    if not _OF_DIRECTION & reads and assembly.constant("g_x") == 0.0 and assembly.constant("g_y") == 0.0:
-        found.add("psi")
-    return found
+    reads = {name for e in model.effects if e.law is not None for name in _names(type(e).law.__code__)}
+    askew = any(assembly.constant(name) != 0.0 for name in _ASKEW)
+    if askew or assembly.constant("J_11") != assembly.constant("J_22"):
+        reads.add("phi")
+    return {"x", "y", "phi"} - reads
 
 
 def _names(code: CodeType) -> Iterator[str]:
@@ -143,3 +128,12 @@ def _missing(model: Model, parameters: Sequence[str]) -> dict[str, float]:
         if effect.name not in present:
             missing[full_name] = effect.absent().values[name]
     return missing
+
+
+def prepare() -> None:
+    """Compile integrator, equations of motion and the catalogue's laws for real and complex states, or load them."""
+    for kind in CATALOGUE.values():
+        if kind.law is not None:
+            for scalar in (float, complex):
+                compile_law(kind.law, tuple(p.name for p in kind.parameters), HELPERS, scalar)
+    sensitivities(Model(MA_2014), steady_precession(0.1, MA_2014), [0.0, 1e-3], components=["theta"])

@@ -1,13 +1,17 @@
-"""A state of motion from which a simulation starts."""
+"""States of motion from which a simulation starts: any, regular precession, a disc hit by a ball."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 
 import numpy as np
 
 from calibration.kit.arguments import checked
 from calibration.kit.arrays import Array
+from disctrack.disc import Disc, followers, nutation_frequency, precession_rate
+from disctrack.rolling.effects import ModelError
+
+_FRICTION_ITERATIONS = 30  # fixed point for the direction of friction; each gains a factor of about (h/r)^2
 
 
 @checked
@@ -38,12 +42,8 @@ class State:
     @property
     def array(self) -> Array:
         """Components that are given: (8,), (10,) or (12,)."""
-        full = [self.x, self.y, self.psi, self.theta, self.phi, self.thetadot, self.omega2, self.omega3]
-        for a, b in ((self.v_x, self.v_y), (self.z, self.v_z)):
-            if a is None or b is None:
-                break
-            full += [a, b]
-        return np.array(full, float)
+        given = [value for value in astuple(self) if value is not None]
+        return np.array(given, float)
 
     @property
     def psidot(self) -> float:
@@ -58,3 +58,98 @@ class State:
     def moved(self, **changes: float) -> State:
         """Copy with some components replaced."""
         return replace(self, **changes)
+
+
+@checked
+def steady_precession(
+    theta: float,
+    disc: Disc,
+    gravity: float = 9.81,
+    *,
+    omega3: float | None = None,
+    nutation_amplitude: float = 0.0,
+    nutation_phase: float = 0.0,
+    psi: float = 0.0,
+    phi: float = 0.0,
+    x: float = 0.0,
+    y: float = 0.0,
+) -> State:
+    """Rolling state of regular precession at nutation `theta` [rad], psidot > 0.
+
+    omega3 : spin q [rad/s]; without it the centre stays at rest, q = h p sin(theta) / r.
+    nutation_amplitude, nutation_phase : to first order theta(t) = theta + amplitude cos(w t + phase), where w is
+        `nutation_frequency`; omega2 and omega3 are changed along with it, as the linear motion requires.
+    Raises ModelError where no regular precession exists.
+
+        >>> float(steady_precession(0.1, read_recording("clip").disc).theta)
+        0.1
+    """
+    p, q = precession_rate(theta, disc, gravity, omega3)
+    offset = nutation_amplitude * np.cos(nutation_phase)
+    thetadot = -nutation_amplitude * nutation_frequency(theta, disc, gravity, omega3) * np.sin(nutation_phase)
+    d_omega2, d_omega3 = followers(theta, p, q, disc)
+    return State(
+        x=x,
+        y=y,
+        psi=psi,
+        theta=theta + offset,
+        phi=phi,
+        thetadot=thetadot,
+        omega2=p * np.sin(theta) + d_omega2 * offset,
+        omega3=q + d_omega3 * offset,
+    )
+
+
+def struck_disc(
+    disc: Disc,
+    lateral: float,
+    vertical: float,
+    impulse: float,
+    *,
+    friction: float = 0.0,
+    psi: float = 0.0,
+    phi: float = 0.0,
+    x: float = 0.0,
+    y: float = 0.0,
+) -> State:
+    """State just after an impulse on the upper face of the upright disc (Ma et al. 2014, figure 3 and table 1).
+
+    lateral, vertical : the point hit, a along e1 and b upwards from the middle of the face [m].
+    impulse : of the ball on the disc [N s], along -e3 (it falls so that the hit face looks up).
+    friction : coefficient for the impulse of the table; the table's normal impulse keeps the lower rim from going down.
+
+    Returns a state with the velocity of O, slipping in general. Raises ModelError where the impulse would not tip the
+    disc over, the point lies outside the face or the friction is below 0.
+    """
+    if not friction >= 0:
+        raise ModelError(f"a coefficient of friction of {friction:.4g}; it is 0 or above")
+    if np.hypot(lateral, vertical) > disc.radius:
+        raise ModelError(
+            f"the point ({lateral * 1e3:.4g}, {vertical * 1e3:.4g}) mm lies outside the face of radius "
+            f"{disc.radius * 1e3:.4g} mm"
+        )
+    # Nodal axes at theta = 90 deg: e2 is vertical; the contact is the lower edge of the face that will look down.
+    arm = np.array([0.0, -disc.radius, -disc.half_thickness])
+    hit = np.array([lateral, vertical, disc.half_thickness])
+    J = np.array([disc.moment_diametral, disc.moment_diametral, disc.moment_axial])
+    ball = np.array([0.0, 0.0, -impulse])
+    v0, omega0 = ball / disc.mass, np.cross(hit, ball) / J
+    v, omega, normal = v0, omega0, 0.0
+    for _ in range(_FRICTION_ITERATIONS):
+        slip = (v + np.cross(omega, arm)) * [1.0, 0.0, 1.0]
+        push = np.array([0.0, 1.0, 0.0]) - friction * slip / max(float(np.linalg.norm(slip)), 1e-12)
+        dv, domega = push / disc.mass, np.cross(arm, push) / J
+        # the table's normal impulse N >= 0 is just large enough that the edge does not go down
+        down = (v0 + np.cross(omega0, arm))[1]
+        normal = max(0.0, float(-down / (dv + np.cross(domega, arm))[1]))
+        v, omega = v0 + normal * dv, omega0 + normal * domega
+    if omega[0] >= 0:
+        raise ModelError(
+            f"an impulse of {impulse:.4g} N s at b = {vertical * 1e3:.4g} mm does not tip the disc over: hit it higher"
+        )
+    sp, cp = np.sin(psi), np.cos(psi)
+    # at theta = 90 deg: e1 = (cos psi, sin psi, 0), e3 = (sin psi, -cos psi, 0)
+    v_x, v_y = float(v[0] * cp + v[2] * sp), float(v[0] * sp - v[2] * cp)
+    w1, w2, w3 = (float(w) for w in omega)
+    state = State(x, y, psi, np.pi / 2, phi, w1, w2, w3, v_x, v_y)
+    return state if normal > 0 else state.moved(z=disc.radius, v_z=float(v[1]))

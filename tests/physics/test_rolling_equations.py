@@ -8,9 +8,8 @@ from scipy.integrate import simpson, solve_ivp
 
 from disctrack import rolling
 from disctrack.disc import MA_2014
-from disctrack.rolling import CATALOGUE, Model, State, equations
+from disctrack.rolling import CATALOGUE, Model, State, _assembly
 from disctrack.rolling._assembly import Assembly
-from disctrack.rolling.simulate import _rates
 from tests.oracles import free_flight, newton_euler
 
 t = sp.symbols("t")
@@ -139,7 +138,7 @@ def test_printed_steady_state_is_off_by_what_the_errata_say(theta_deg, low_by):
 
 
 def product_rates(model, state):
-    return _rates(Assembly(model, 1e-3), {8: 0, 10: 1, 12: 2}[len(state.array)], 0.0, state.array)[0]
+    return Assembly(model, 1e-3).at({8: 0, 10: 1, 12: 2}[len(state.array)], 0.0, state.array)[0][0]
 
 
 def random_state(rng, theta=None):
@@ -162,8 +161,7 @@ def test_compiled_rates_satisfy_the_derived_rows_on_random_states(rng):
     for _ in range(50):
         state = random_state(rng)
         assembly = Assembly(model, 1e-3)
-        rates, kin, w = _rates(assembly, 0, 0.0, state.array)
-        kin, w = kin[0], w[0]
+        (rates,), _, (w,) = assembly.at(0, 0.0, state.array)
         sa, ca = np.sin(state.theta), np.cos(state.theta)
         psidd = (rates[6] - state.psidot * ca * state.thetadot) / sa
         phidd = rates[7] - psidd * ca + state.psidot * sa * state.thetadot
@@ -331,8 +329,8 @@ def test_accelerations_and_forces_agree_with_the_world_vector_system(name, regim
             state = state.moved(z=0.1, v_z=0.3)
         a, omegadot, F, now = newton_euler.accelerations(oracle, start, regime)
         assembly = Assembly(model, 1e-3)
-        rates, _, w = _rates(assembly, {"rolling": 0, "slipping": 1, "flying": 2}[regime], 0.0, state.array)
-        contact = np.array([w["F_n"][0], w["F_m"][0], w["F_z"][0]])
+        (rates,), _, (w,) = assembly.at({"rolling": 0, "slipping": 1, "flying": 2}[regime], 0.0, state.array)
+        contact = np.array([w["F_n"], w["F_m"], w["F_z"]])
         expected = np.array([F @ now.n0, F @ now.m0, F[2]])
         scale = 1 + np.abs(expected).max()
         # smoothing of the signs: 1e-2 rad/s of pivoting rates of order 1, 1e-3 of rolling rates of order 1
@@ -405,7 +403,7 @@ class _Creeping(newton_euler.Disc):
 )
 def test_a_contact_that_creeps_is_one_that_slips_on_a_film(c, film, least, most, monkeypatch):
     """The oracle slips with its inertia; ours follows the force by a series, for which c beyond `film` is too fast."""
-    monkeypatch.setattr(equations, "FILM", film)
+    monkeypatch.setattr(_assembly, "FILM", film)
     effects = (CATALOGUE["km"](k_m=4e-8), CATALOGUE["centre_of_mass"](c_1=1e-3, c_2=-5e-4, c_3=3e-4))
     rigid = Model(MA_2014, effects=effects)
     start = rolling.steady_precession(np.radians(16), MA_2014, omega3=1.5, nutation_amplitude=np.radians(1), psi=0.3)

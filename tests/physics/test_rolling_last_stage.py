@@ -93,13 +93,12 @@ def best_of(n, function):
 
 def test_integrator_agrees_with_scipy_on_the_same_equations():
     from disctrack.rolling._assembly import Assembly
-    from disctrack.rolling.simulate import _rates
 
     assembly = Assembly(STEEL, 1e-3)
     start = steady_precession(np.radians(5), MA_2014, nutation_amplitude=0.01)
     times = np.linspace(0, 0.4, 41)
     expected = solve_ivp(
-        lambda t, y: _rates(assembly, 0, t, y)[0], (0, 0.4), start.array, "DOP853", times, rtol=1e-12, atol=1e-13
+        lambda t, y: assembly.at(0, t, y)[0][0], (0, 0.4), start.array, "DOP853", times, rtol=1e-12, atol=1e-13
     )
     motion = rolling.simulate(STEEL, start, times=times)
     assert_allclose(motion.state, expected.y.T, rtol=1e-9, atol=1e-10)

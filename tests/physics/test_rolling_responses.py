@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from disctrack.rolling import Model, sensitivities, steady_precession
-from disctrack.rolling.effects import effect_class
+from disctrack.rolling.effects import effect_from_formulas
 from disctrack.rolling.responses import COMPONENTS, responses
 from disctrack.synthetic.description import Scene
 
@@ -26,9 +26,9 @@ def test_a_pulse_of_any_component_moves_the_disc_as_its_sensitivity_says(rolling
     wrenches = course[:, None, None] * np.eye(len(COMPONENTS))
     by_start = sensitivities(model, state, times, (), None, THETA_END).dq
     moved = by_start @ found.of(wrenches)
-    probe = effect_class("wrench_probe")
-    probed = model.with_effects(probe(**dict.fromkeys(COMPONENTS, 0.0), t_0=0.2, width=0.02))
-    names = [f"wrench_probe.{c}" for c in COMPONENTS]
+    probe = effect_from_formulas("pulse", {c: f"of_{c} * exp(-((time - 0.2) / 0.02)**2 / 2)" for c in COMPONENTS})
+    names = [f"pulse.of_{c}" for c in COMPONENTS]
+    probed = model.knowing(probe).with_values(dict.fromkeys(names, 0.0))
     carried = sensitivities(probed, state, times, names, (), THETA_END).dq
     # the integral is of fourth order in 0.5 ms over 20 ms: 4e-7; the derivatives hold to 1e-9
     assert np.abs(moved - carried).max(axis=0) == pytest.approx(0.0, abs=1e-6 * np.abs(carried).max())

@@ -17,7 +17,7 @@ M_n thetadot - M_m phidot sin(theta) + M_z omega_z + X . v_O, and for a passive 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -139,6 +139,7 @@ def effect(title: str, source: str, *parameters: EffectParameter, **traits: Any)
             "source": source,
             "parameters": parameters,
             "passive": not adjusts,
+            "belongs_to": ("disc",) if adjusts else ("disc", "surface"),
             "adjust" if adjusts else "law": staticmethod(function),
         }
         own = {"__doc__": function.__doc__, "__module__": function.__module__}
@@ -154,15 +155,10 @@ def effect_class(name: str) -> type[Effect]:
     return CATALOGUE[name]
 
 
-def catalogue() -> Iterator[type[Effect]]:
-    """All effects in the order of their definition."""
-    return iter(CATALOGUE.values())
-
-
 def catalogue_table() -> str:
     """The catalogue as a Markdown table: name, law, parameters with unit and nominal value, source."""
     rows = ["| effect | law | parameters (nominal) | source |", "|---|---|---|---|"]
-    for kind in catalogue():
+    for kind in CATALOGUE.values():
         numbers = "; ".join(
             f"`{p.name}` {p.nominal:g} {p.unit if p.unit != '1' else ''}".strip() for p in kind.parameters
         )

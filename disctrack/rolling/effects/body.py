@@ -40,7 +40,6 @@ def gravity(body: Record, p: Record) -> None:
     EffectParameter("c_1", "m", 1e-4, "along the first body axis"),
     EffectParameter("c_2", "m", 1e-4, "along the second body axis"),
     EffectParameter("c_3", "m", 1e-4, "along the axis of the disc, towards the upper face"),
-    belongs_to=("disc",),
 )
 def centre_of_mass(body: Record, p: Record) -> None:
     """The centre of mass is not the geometric centre; inertia is that about the centre of mass."""
@@ -53,7 +52,6 @@ def centre_of_mass(body: Record, p: Record) -> None:
     "radius of the contact circle differs by r_error",
     "geometry (chamfer, burr, micrometer error)",
     EffectParameter("r_error", "m", 1e-5, "contact radius minus the declared one", lower=-5e-3, upper=5e-3),
-    belongs_to=("disc",),
 )
 def contact_radius(body: Record, p: Record) -> None:
     """The circle of contact has another radius; mass and inertia stay."""
@@ -64,7 +62,6 @@ def contact_radius(body: Record, p: Record) -> None:
     "half thickness at the contact differs by h_error",
     "geometry (paper, chamfer, micrometer error)",
     EffectParameter("h_error", "m", 1e-5, "half thickness minus the declared one", lower=-2e-3, upper=5e-3),
-    belongs_to=("disc",),
 )
 def contact_height(body: Record, p: Record) -> None:
     """The contact circle lies at another distance below the centre; mass and inertia stay."""
@@ -75,7 +72,6 @@ def contact_height(body: Record, p: Record) -> None:
     "edge rounded with radius rho",
     "geometry: r_OA = -(r - rho) e2 - (h - rho) e3 - rho k",
     EffectParameter("rho", "m", 1e-4, "radius of the edge", lower=0.0, upper=3e-3),
-    belongs_to=("disc",),
 )
 def edge_radius(body: Record, p: Record) -> None:
     """The edge is a quarter of a torus: the contact wanders over it with the nutation."""
@@ -103,7 +99,6 @@ def table_curved(body: Record, p: Record) -> None:
     EffectParameter("oval_s", "m", 1e-5, "two waves, sine", lower=-2e-3, upper=2e-3),
     EffectParameter("lobes_c", "m", 1e-5, "three waves, cosine", lower=-1e-3, upper=1e-3),
     EffectParameter("lobes_s", "m", 1e-5, "three waves, sine", lower=-1e-3, upper=1e-3),
-    belongs_to=("disc",),
 )
 def rim(body: Record, p: Record) -> None:
     """The rim is no circle: its distance from the axis, tangent by tangent, has two and three waves around."""
@@ -117,7 +112,6 @@ def rim(body: Record, p: Record) -> None:
     EffectParameter("depth", "m", 1e-5, "by which the rim is nearer to the axis there", lower=0.0, upper=5e-4),
     EffectParameter("angle", "rad", 0.0, "of its middle, in the body", lower=-1.0, upper=7.3, is_shape=True),
     EffectParameter("width", "rad", 0.15, "standard deviation of the dip", lower=0.05, upper=0.5, is_shape=True),
-    belongs_to=("disc",),
     sought=True,
 )
 def rim_flat(body: Record, p: Record) -> None:
@@ -153,7 +147,6 @@ def creep(body: Record, p: Record) -> None:
     "J1 and J2 multiplied by 1 + e",
     "holes, rims, inhomogeneous material",
     EffectParameter("e", "1", 0.01, "relative change of J1 and J2", lower=-0.5, upper=1.0),
-    belongs_to=("disc",),
 )
 def inertia_diametral(body: Record, p: Record) -> None:
     """J1 = J2 differ from the homogeneous disc's."""
@@ -165,7 +158,6 @@ def inertia_diametral(body: Record, p: Record) -> None:
     "J3 multiplied by 1 + e",
     "holes, rims, inhomogeneous material",
     EffectParameter("e", "1", 0.01, "relative change of J3", lower=-0.5, upper=1.0),
-    belongs_to=("disc",),
 )
 def inertia_axial(body: Record, p: Record) -> None:
     """J3 differs from the homogeneous disc's."""
@@ -177,7 +169,6 @@ def inertia_axial(body: Record, p: Record) -> None:
     "wedge, dynamic imbalance",
     EffectParameter("J_13", "kg m^2", 1e-8, "moment of deviation between the first body axis and e3"),
     EffectParameter("J_23", "kg m^2", 1e-8, "moment of deviation between the second body axis and e3"),
-    belongs_to=("disc",),
 )
 def inertia_product(body: Record, p: Record) -> None:
     """Products of inertia with the axis: dynamic imbalance of a wedge-shaped disc."""
@@ -189,6 +180,7 @@ def inertia_product(body: Record, p: Record) -> None:
     "Coulomb friction, |F_t| <= mu F_z, F_t = -mu F_z v_A / |v_A| in slip",
     "Coulomb's law at the contact",
     EffectParameter("mu", "1", 0.2, "coefficient of friction; infinite = never slips", null=np.inf, lower=1e-3),
+    belongs_to=("disc", "surface"),
 )
 def slip(body: Record, p: Record) -> None:
     """Coulomb friction of finite coefficient: the disc slips where rolling would need more."""

@@ -43,19 +43,6 @@ def effect_from_formulas(
     formulas : component of the wrench -> formula.   parameters : those not given have unit "SI", nominal 1, no bounds.
     Raises ModelError for a formula that cannot be read and for a name of the catalogue.
     """
-    return _effect(name, tuple(formulas.items()), parameters, title, source, passive)
-
-
-@lru_cache(maxsize=64)  # of a pure function: a law that is asked for again is not compiled again
-def _effect(
-    name: str,
-    pairs: tuple[tuple[str, str], ...],
-    parameters: tuple[EffectParameter, ...],
-    title: str,
-    source: str,
-    passive: bool,
-) -> type[Effect]:
-    formulas = dict(pairs)
     if name in CATALOGUE:
         raise ModelError(f"there is an effect '{name}' already, with another law: choose another name")
     lines, free = [], []
@@ -77,7 +64,7 @@ def _effect(
         "source": source,
         "parameters": tuple(given.get(n, EffectParameter(n, "SI", 1.0, "number of the formula")) for n in free),
         "passive": passive,
-        "formulas": formulas,
+        "formulas": dict(formulas),
         "law": staticmethod(_function("\n".join(lines))),
     }
     return type(f"Formula_{name}", (Effect,), members)
