@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from enum import Enum, IntEnum
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,8 @@ from disctrack.frames import COORDINATES, nodal_axes_world, rotation_from_euler
 from disctrack.rolling import equations
 from disctrack.rolling.model import Model
 from disctrack.rolling.records import ROLLING_COMPONENTS, Records
+
+Parts: TypeAlias = Any  # numbers of records: real in a motion, complex where derivatives are carried
 
 
 class Regime(IntEnum):
@@ -93,11 +95,11 @@ class Path:
     switches: list[Switch]
     end: EndReason
     end_time: complex
-    end_state: Any  # (8,), (10,) or (12,)
+    end_state: Parts  # (8,), (10,) or (12,)
     slip_steps: int  # of the integrator in slip, which is stiff where it creeps
 
     @property
-    def as_seen(self) -> tuple[Any, Any]:
+    def as_seen(self) -> tuple[Parts, Parts]:
         """Q and qdot (n, 6) in the axes of cameras at rest: the table may move in them."""
         q, qdot = coordinates(self.now)
         for i, axis in enumerate("xyz"):
@@ -106,7 +108,7 @@ class Path:
         return q, qdot
 
 
-def coordinates(now: Records) -> tuple[Any, Any]:
+def coordinates(now: Records) -> tuple[Parts, Parts]:
     """Q and qdot (n, 6) in axes of the table, real or complex, from records.INSTANT (n,)."""
     cp, sp = np.cos(now["psi"]), np.sin(now["psi"])
     v_x, v_y = now["v_n"] * cp - now["v_m"] * sp, now["v_n"] * sp + now["v_m"] * cp
@@ -115,7 +117,7 @@ def coordinates(now: Records) -> tuple[Any, Any]:
     return q, qdot
 
 
-def columns(now: Records, *names: str) -> Any:
+def columns(now: Records, *names: str) -> Parts:
     """Fields of records (n,) beside each other (n, k)."""
     return np.stack([now[name] for name in names], axis=-1)
 
