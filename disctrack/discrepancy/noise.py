@@ -149,8 +149,14 @@ def long_run_variance(x: Array) -> tuple[float, float]:
 
 def with_memory(system: System, fit: Fit) -> Fit:
     """The fit with standard deviations that know the residual's size and memory; correlations stay."""
-    factors = inflation(system, fit) * np.sqrt(max(1.0, fit.reduced_chi_square))
-    return replace(fit, covariance=fit.covariance * np.outer(factors, factors))
+    size = float(np.sqrt(max(1.0, fit.reduced_chi_square)))
+    factors = size * inflation(system, fit)[[not q.slot for q in fit.quantities]]
+    return replace(
+        fit,
+        covariance=fit.covariance * np.outer(factors, factors),
+        heads=tuple(replace(head, root=size * head.root) for head in fit.heads),
+        own={name: (size * root, by_shared) for name, (root, by_shared) in fit.own.items()},
+    )
 
 
 @dataclass(frozen=True)

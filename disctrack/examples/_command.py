@@ -6,19 +6,34 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from disctrack.discrepancy.document import document, tables
 from disctrack.discrepancy.equations import Answer
+from disctrack.discrepancy.search import Diagnosis
 from disctrack.errors import AnalysisError, DiscTrackError
 from disctrack.files.json_text import json_file
 from disctrack.files.whole import refuse_existing, write_whole
+from disctrack.report.blocks import Report, Section
+from disctrack.report.terminal import full
 
 
 @dataclass(frozen=True)
 class Outcome:
     """What an example has to say."""
 
-    table: str  # for people
+    report: Report
     document: Mapping[str, object]  # diagnosis.json
     answers: Mapping[str, Answer] = field(default_factory=dict)  # each on a page of its own, in a folder of this name
+
+
+def outcome_of(
+    d: Diagnosis, model: str, sentence: str, blocks: Sequence[Section], sides: Sequence[Mapping[str, object]] = ()
+) -> Outcome:
+    """Of a system of one's own: its blocks before those that every diagnosis has.
+
+    sides : errors before and after in its own units
+    """
+    report = Report(f"{model}: what is missing?", sentence, blocks=[*blocks, *tables(d)])
+    return Outcome(report, document(d, model, sentence, *sides))
 
 
 def needed(folder: Path, name: str) -> Path:
@@ -30,7 +45,7 @@ def needed(folder: Path, name: str) -> Path:
 
 
 def command(name: str, data: str | None, diagnose: Callable[..., Outcome], words: Sequence[str] | None = None) -> int:
-    """Run one example: print its table, write diagnosis.json and pages where asked for; returns the exit code.
+    """Run one example: print its report, write diagnosis.json and pages where asked for; returns the exit code.
 
     data : what the folder that is given to `diagnose` holds; None for data that come with the sources
     """
@@ -44,7 +59,7 @@ def command(name: str, data: str | None, diagnose: Callable[..., Outcome], words
         if given.output is not None:
             refuse_existing(given.output / "diagnosis.json", given.overwrite)
         outcome = diagnose() if data is None else diagnose(given.folder)
-        print(outcome.table)
+        print("\n".join(full(outcome.report)))
         if given.output is not None:
             for where, answer in outcome.answers.items():
                 answer.write(given.output / where, given.overwrite)

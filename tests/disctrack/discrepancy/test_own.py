@@ -11,7 +11,7 @@ from scipy.linalg import null_space
 
 from disctrack.discrepancy.equations import Equations, Parameter, Run, diagnose, terms
 from disctrack.discrepancy.equations.declared import checked
-from disctrack.discrepancy.equations.formulas import formulas
+from disctrack.discrepancy.equations.formulas import Formulas
 from disctrack.discrepancy.equations.loop import redundant, robust
 from disctrack.discrepancy.equations.start import at_once, guessed, misfit
 from disctrack.discrepancy.equations.system import EquationSystem
@@ -188,7 +188,7 @@ def test_of_many_runs_some_tell_a_gain_of_the_wrong_sign_and_the_others_follow(r
         data = {"x": x + SIGMA * rng.standard_normal(80)}
         runs.append(Run(time, data, sigma=SIGMA, inputs={"u": push}, name=f"run {i}"))
     driven = Equations({"x": "v", "v": "-k*x - c*v + g*u"}, {"k": 7.0, "c": 0.4, "g": 3.0}, inputs=["u"])
-    compiled = formulas(driven, [], {"x": "x"})
+    compiled = Formulas(driven, [], {"x": "x"})
     system = EquationSystem(compiled, checked(driven, runs), np.ones(2), {})
     values = at_once(system, guessed(system)[0])
     assert_allclose([values[n] for n in "kcg"], [9.0, 0.5, -4.0], rtol=0.01)
