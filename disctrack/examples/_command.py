@@ -12,6 +12,7 @@ from disctrack.discrepancy.search import Diagnosis
 from disctrack.errors import AnalysisError, DiscTrackError
 from disctrack.files.json_text import json_file
 from disctrack.files.whole import refuse_existing, write_whole
+from disctrack.report import blocks
 from disctrack.report.blocks import Report, Section
 from disctrack.report.terminal import full
 
@@ -20,20 +21,19 @@ from disctrack.report.terminal import full
 class Outcome:
     """What an example has to say."""
 
-    report: Report
-    document: Mapping[str, object]  # diagnosis.json
+    report: Report  # its document is diagnosis.json
     answers: Mapping[str, Answer] = field(default_factory=dict)  # each on a page of its own, in a folder of this name
 
 
-def outcome_of(
-    d: Diagnosis, model: str, sentence: str, blocks: Sequence[Section], sides: Sequence[Mapping[str, object]] = ()
-) -> Outcome:
+def report_of(
+    d: Diagnosis, model: str, sentence: str, own: Sequence[Section], sides: Sequence[Mapping[str, object]] = ()
+) -> Report:
     """Of a system of one's own: its blocks before those that every diagnosis has.
 
     sides : errors before and after in its own units
     """
-    report = Report(f"{model}: what is missing?", sentence, blocks=[*blocks, *tables(d)])
-    return Outcome(report, document(d, model, sentence, *sides))
+    data = document(d, model, sentence, *sides)
+    return Report(f"{model}: what is missing?", sentence, blocks=[*own, *tables(d)], data=data)
 
 
 def needed(folder: Path, name: str) -> Path:
@@ -63,7 +63,7 @@ def command(name: str, data: str | None, diagnose: Callable[..., Outcome], words
         if given.output is not None:
             for where, answer in outcome.answers.items():
                 answer.write(given.output / where, given.overwrite)
-            write_whole(given.output / "diagnosis.json", json_file(dict(outcome.document)))
+            write_whole(given.output / "diagnosis.json", json_file(blocks.document(outcome.report)))
     except DiscTrackError as error:
         print(f"{name}: {error}", file=sys.stderr)
         return 1

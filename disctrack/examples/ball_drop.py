@@ -22,6 +22,7 @@ from calibration.kit.arrays import Array
 from disctrack.discrepancy.equations import Answer, Equations, Parameter, Run, SmoothNoise, Term, diagnose
 from disctrack.discrepancy.noise import SampleStretch, estimate
 from disctrack.discrepancy.search import CLASS_GAIN, Settings
+from disctrack.discrepancy.significance import price_of_a_number
 from disctrack.errors import AnalysisError
 from disctrack.examples._command import Outcome, command, needed
 from disctrack.report.blocks import Listing, Report, Section
@@ -115,9 +116,11 @@ class BallAnswer:
 
     @property
     def forms(self) -> dict[tuple[str, ...], float]:
-        """Sets of effects with a law of drag: -2 log evidence over that of the best one, best first."""
-        found = {e.effects: e.length for e in self.together.diagnosis.ranked if set(e.effects) & set(DRAG)}
-        return {effects: length - min(found.values()) for effects, length in found.items()}
+        """Sets of effects with a law of drag: Bayesian criterion over that of the best one, best first."""
+        d, price = self.together.diagnosis, price_of_a_number(self.together.system.weights)
+        fits = {e.effects: e.fit for e in d.ranked if set(e.effects) & set(DRAG)}
+        found = {effects: f.cost + len(f.shared) * price for effects, f in fits.items()}
+        return {effects: found[effects] - min(found.values()) for effects in sorted(found, key=lambda e: found[e])}
 
     @property
     def undecided(self) -> tuple[tuple[str, ...], ...]:
@@ -187,25 +190,21 @@ def report(answer: BallAnswer) -> Report:
                 "Median of the balls' rms on the second drop (m)",
                 [Listing(("law fitted to the first", "whole", f"after {SEEN} s"), errors)],
             ),
-            Section("All balls together", [Listing(("effects", "longer by"), forms)]),
+            Section("All balls together", [Listing(("effects", "criterion"), forms)]),
             Section("Each ball alone", [Listing(("ball", "verdict", "missing"), alone)]),
         ],
+        data={
+            **answer.together.document(),
+            "identifiable": answer.identifiable,
+            "cannot_be_told_apart": answer.undecided,
+        },
     )
 
 
 def example(folder: Path) -> Outcome:
     """What does gravity alone lack for falling balls, and is its law identifiable?"""
     answer = analyse_drops(read_drops(folder))
-    found = answer.together.document() | {
-        "sentence": sentence(answer),
-        "noise": vars(answer.noise),
-        "identifiable": answer.identifiable,
-        "cannot_be_told_apart": answer.undecided,
-        "forms": [{"effects": effects, "longer_by": over} for effects, over in answer.forms.items()],
-        "errors_m": answer.errors,
-        "balls": {name: a.document() for name, a in answer.alone.items()},
-    }
-    return Outcome(report(answer), found, {"all balls": answer.together})
+    return Outcome(report(answer), {"all balls": answer.together})
 
 
 main = partial(command, "ball_drop", "ball_drops.csv", example)

@@ -64,7 +64,7 @@ def _positions(*files: Columns) -> tuple[list[Run], list[Run]]:
         )
         for d in files
     )
-    return [train.thinned(20)], [test.thinned(20)]
+    return [train.thinned(20)], [test]
 
 
 def _levels(d: Columns) -> tuple[list[Run], list[Run]]:
@@ -160,20 +160,20 @@ def measured(benchmark: Benchmark, paths: Sequence[Path]) -> tuple[Answer, dict[
 
 def example(folder: Path) -> Outcome:
     """What do textbook equations of public benchmarks lack, and how well do they foretell the official test parts?"""
-    rows, answers, document = [], dict[str, Answer](), dict[str, object]()
+    rows, answers, data = [], dict[str, Answer](), dict[str, object]()
     for b in BENCHMARKS:
         if paths := present(folder, b):
             answer, n = measured(b, paths)
             errors = (f"{rounded(n[side])} {b.unit}" for side in ("error", "published"))
             missing = ", ".join(answer.found) or answer.verdict
             rows.append((b.name, *errors, f"{n['covered']:.0%}", f"{n['s']:.0f} s", missing))
-            answers[b.name], document[b.name] = answer, answer.document() | {"test": n}
+            answers[b.name], data[b.name] = answer, answer.document() | {"test": n}
     if not answers:
         wanted = "; ".join(" and ".join(b.files) for b in BENCHMARKS)
         raise AnalysisError(f"{folder}: no benchmark is there. Wanted are the files of at least one: {wanted}.")
     header = ("", "error of the test", "best published", "within 95 % band", "processor", "missing")
     said = "The test parts are foretold by free runs; their first samples tell how they begin."
-    return Outcome(Report("Public benchmarks", said, blocks=[Listing(header, rows)]), document, answers)
+    return Outcome(Report("Public benchmarks", said, blocks=[Listing(header, rows)], data=data), answers)
 
 
 main = partial(command, "benchmarks", "the files of at least one benchmark", example)

@@ -27,16 +27,14 @@ from disctrack.discrepancy.search import Diagnosis, Settings, explain
 from disctrack.discrepancy.system import Quantity, System, Values
 from disctrack.discrepancy.words import effect_text
 from disctrack.errors import AnalysisError
-from disctrack.examples._command import Outcome, command, outcome_of
+from disctrack.examples._command import Outcome, command, report_of
 from disctrack.examples.cube_data import (
     FRAME_RATE,
     HALF_WIDTH,
     Flight,
-    Resting,
     Toss,
     flights,
     read_tosses,
-    resting,
     without_copies,
 )
 from disctrack.examples.cube_effects import GRAVITY, candidates, flown, rested
@@ -64,9 +62,12 @@ class CubeTosses(System):
         self.flights, self.n_left_out = flights(tosses)
         if len(self.flights) < 2 * HELD_OUT:
             raise AnalysisError(f"{len(self.flights)} free flights in {len(tosses)} tosses: 6 are needed at least.")
-        self.cubes = resting(tosses, self.flights)
-        made, at_rest = [flown(f) for f in self.flights], [rested(c) for c in self.cubes]
-        self.names = tuple(dict.fromkeys(name for of in (*made, *at_rest) for name in of))
+        of_number = {f.number: f for f in self.flights}
+        cubes = [(t, rested(t, of_number[t.number])) for t in tosses if t.number in of_number]
+        at_rest = [(t.number, *found) for t, found in cubes if found is not None]
+        made = [flown(f) for f in self.flights]
+        everything: list[Mapping[str, Iterable[float]]] = [*made, *(of for _, _, of in at_rest)]
+        self.names = tuple(dict.fromkeys(name for of in everything for name in of))
         self.candidates = candidates(self.names)
         self.base = tuple(
             Quantity(f"{name}[{f.number}]", "", 1e-3, slot=name, block=i)
@@ -74,7 +75,8 @@ class CubeTosses(System):
             for name in OWN
         )
         flying = [_flight_rows(f, of, self.names) for f, of in zip(self.flights, made, strict=True)]
-        still = _resting_rows(self.cubes, at_rest, self.names)
+        still = _resting_rows([x for _, x, _ in at_rest], [of for _, _, of in at_rest], self.names)
+        self.n_at_rest = len(at_rest)
         self._raw = np.concatenate([*flying, still])
         ends = np.cumsum([len(rows) for rows in flying]).tolist()
         self.blocks = [slice(a, b) for a, b in pairwise([0, *ends])]
@@ -82,7 +84,7 @@ class CubeTosses(System):
             [np.full(len(rows), i) for i, rows in enumerate(flying)] + [np.zeros(len(still), int)]
         )
         numbers = [np.full(len(rows), f.number) for f, rows in zip(self.flights, flying, strict=True)]
-        self.toss = np.concatenate([*numbers, np.array([c.number for c in self.cubes[: len(still)]], int)])
+        self.toss = np.concatenate([*numbers, np.array([number for number, _, _ in at_rest[: len(still)]], int)])
         self.weights = np.concatenate([np.full(ends[-1], 6.0), np.sum(np.any(still != 0, axis=-1), axis=1)])
         self.time = np.arange(len(self.weights), dtype=float)  # only an order: tosses have no common clock
         self.noise = dict(FIRST_NOISE)
@@ -144,23 +146,20 @@ def _flight_rows(flight: Flight, made: Mapping[str, Array], names: Sequence[str]
     return np.concatenate([_side_by_side(made, names, np.zeros(left.shape)), own, left[..., None]], axis=-1)
 
 
-def _resting_rows(
-    cubes: Sequence[Resting], made: Sequence[Mapping[str, Iterable[float]]], names: Sequence[str]
-) -> Array:
+def _resting_rows(left: Sequence[Array], made: Sequence[Mapping[str, Iterable[float]]], names: Sequence[str]) -> Array:
     """The same (m, 6, k + 13) whitened, three of the six used: height, normal (two).
 
     How much resting cubes differ once all candidates have taken their share is the noise.
     """
-    found = np.zeros((len(cubes), 6, len(names) + len(OWN) + 1))
-    if len(cubes) < 4 * HELD_OUT:
+    found = np.zeros((len(left), 6, len(names) + len(OWN) + 1))
+    if len(left) < 4 * HELD_OUT:
         return found[:0]
     effects = np.array([_side_by_side(of, names, np.zeros(3)) for of in made])
-    left = np.array([[c.height - HALF_WIDTH, *c.normal] for c in cubes])
-    for i in range(3):
+    for i, seen in enumerate(np.array(left).T):
         A = effects[:, i][:, np.any(effects[:, i] != 0, axis=0)]
-        rest = left[:, i] - A @ np.linalg.lstsq(A, left[:, i], rcond=1e-10)[0]
-        sigma = np.sqrt(np.sum(rest**2) / (len(cubes) - A.shape[1]))
-        found[:, i, : len(names)], found[:, i, -1] = effects[:, i] / sigma, left[:, i] / sigma
+        rest = seen - A @ np.linalg.lstsq(A, seen, rcond=1e-10)[0]
+        sigma = np.sqrt(np.sum(rest**2) / (len(left) - A.shape[1]))
+        found[:, i, : len(names)], found[:, i, -1] = effects[:, i] / sigma, seen / sigma
     return found
 
 
@@ -210,11 +209,11 @@ def example(folder: Path) -> Outcome:
         rows.append((f"rms {group} ({unit})", *(rounded(size * x) for x in numbers)))
     tosses = (
         f"{len(system.flights)} flights ({system.n_left_out} tosses left out: too short, or not smooth; "
-        f"{system.n_copies} copies of others turned about the vertical), {len(system.cubes)} cubes at rest."
+        f"{system.n_copies} copies of others turned about the vertical), {system.n_at_rest} cubes at rest."
     )
     blocks = [Section("Every third toss, held out", [Listing(("", "before", "after", "white noise"), rows, tosses)])]
     model = f"g = {GRAVITY} m/s^2, uniform cube, {FRAME_RATE:g} Hz, half width {HALF_WIDTH} m"
-    return outcome_of(d, model, said, blocks, [{"rms": before}, {"rms": after}])
+    return Outcome(report_of(d, model, said, blocks, [{"rms": before}, {"rms": after}]))
 
 
 main = partial(command, "cube_tosses", "cube_tosses.npz", example)

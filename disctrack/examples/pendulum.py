@@ -75,10 +75,8 @@ def example(folder: Path) -> Outcome:
     rows.append(("the step of the encoder allows", rounded(1e3 * encoder), rounded(1e3 * encoder)))
     kept = Section("Rms of measured minus modelled (mrad)", [Listing(("", "before", "after"), rows)])
     told = answer.report()
-    document = answer.document() | {
-        "kept_back_rms_rad": {side: rms[1] for side, rms in left.items()}, "encoder_rms_rad": encoder,
-    }  # fmt: skip
-    return Outcome(replace(told, blocks=[kept, *told.blocks]), document, {"swing": answer})
+    data = {**answer.document(), "kept_back_rms_rad": {side: rms[1] for side, rms in left.items()}}
+    return Outcome(replace(told, blocks=[kept, *told.blocks], data=data), {"swing": answer})
 
 
 main = partial(command, "pendulum", "single_free_swing.npz", example)

@@ -31,7 +31,7 @@ from disctrack.discrepancy.held_out import TRAIN_FRACTION
 from disctrack.discrepancy.search import Diagnosis, Settings, explain
 from disctrack.discrepancy.system import Candidate, Quantity, System, Values
 from disctrack.errors import AnalysisError
-from disctrack.examples._command import Outcome, command, outcome_of
+from disctrack.examples._command import Outcome, command, report_of
 from disctrack.examples.exponent_model import GRAVITY, READING, LastStage, Setup
 from disctrack.report.blocks import Listing, Section
 from disctrack.report.numbers import measured, probability, rounded, score
@@ -102,8 +102,8 @@ def exponent_candidates(surfaces: Sequence[str], names: Sequence[str] | None = N
         if not c.threshold:
             found.append(c if shared else replace(c, quantities=_per_surface(c.quantities, surfaces)))
     for c in READING:
-        each = {"name": f"{c.name}_each", "title": f"{c.title}, each surface its own"}
-        found += [c, replace(c, **each, quantities=_per_surface(c.quantities, surfaces))]
+        each = _per_surface(c.quantities, surfaces)
+        found += [c, replace(c, name=f"{c.name}_each", title=f"{c.title}, each surface its own", quantities=each)]
     return tuple(c for c in found if names is None or c.name in names)
 
 
@@ -254,22 +254,11 @@ def example() -> Outcome:
     system = ExponentSystem(published_series())
     d = explain(system, system.start, SETTINGS, system.training)
     model = "rolling disc with k_m, straight lines through the logarithms in the paper's windows"
-    outcome, fits = outcome_of(d, model, sentence(system, d), tables_of(system, d)), in_question(d)
-    more = {
-        "source": "Ma, Liu, Zhao and Zhang 2014, Proc. R. Soc. A 470:20140191, tables 2 and 3",
-        "cannot_be_told_apart": list(fits),
-        "against_thin_disc": [vars(misfit(s.surface, s.exponents, THIN_DISC)) for s in system.series],
-        "explanations": [
-            {
-                "name": name,
-                "gain": d.before.cost - f.cost,
-                "parameters": {n: (f.values[n], f.sigma(n)) for n in f.names if n not in d.before.names},
-                "exponents": [vars(m) for m in left_by(system, f)],
-            }
-            for name, f in fits.items()
-        ],
-    }
-    return replace(outcome, document={**outcome.document, **more})
+    report = report_of(d, model, sentence(system, d), tables_of(system, d))
+    source = "Ma, Liu, Zhao and Zhang 2014, Proc. R. Soc. A 470:20140191, tables 2 and 3"
+    return Outcome(
+        replace(report, data={**report.data, "source": source, "cannot_be_told_apart": list(in_question(d))})
+    )
 
 
 main = partial(command, "published_exponents", None, example)

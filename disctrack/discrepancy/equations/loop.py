@@ -465,7 +465,10 @@ def _sensor_notes(samples: Sequence[Samples], channel: int, name: str) -> list[s
     if step and fast_part(values) < 3 * step:
         notes.append(f"{name} stands on steps of {step:.4g}, which alone scatter by {step / np.sqrt(12):.3g}")
     everything = np.concatenate([s.data[:, channel] for s in samples])
-    for limit, which in ((np.nanmax(everything), "most"), (np.nanmin(everything), "least")):
+    least, most = np.nanmin(everything, initial=np.inf), np.nanmax(everything, initial=-np.inf)
+    if least == most:
+        raise AnalysisError(f"{name} shows {most:g} at all times: its sensor is dead. Leave it out.")
+    for limit, which in ((most, "most"), (least, "least")):
         count = int(np.sum(everything == limit))
         if not step and count > STANDS:  # noise repeats no value; an encoder at rest does
             notes.append(
