@@ -15,7 +15,7 @@ from scipy import stats
 from calibration.kit.arrays import Array
 from calibration.kit.least_squares import triangle
 from disctrack.discrepancy.fit import Fit, prior_rows
-from disctrack.discrepancy.joint.joint_system import JointSystem
+from disctrack.discrepancy.joint.sharing import JointSystem
 from disctrack.discrepancy.system import Candidate
 
 LAW = 1e6  # sigmas: length to which the derivative by a number without a prior is scaled, so that it is never left out

@@ -134,3 +134,15 @@ def test_two_numbers_that_nothing_tells_apart_do_not_end_the_search():
     answer = diagnose(drives, run, [Term("scale", observed={"speed": "s*abs(p)"}, parameters={"s": 0.0})])
     assert answer.diagnosis.held_out_before is not None
     assert any("cannot be told from other numbers" in note for note in answer.notes)
+
+
+def test_a_wrong_sign_a_sensor_at_its_limit_and_a_dead_one_are_told():
+    x = np.cos(3 * TIME) + noise()
+    wrong = diagnose(Equations({"x": "w", "w": "k*x"}, {"k": 14.0}), Run(TIME, {"x": x}, sigma=0.01), DRAG)
+    assert any(note.startswith("k = -") and "sign is another" in note for note in wrong.notes)
+    swing = Equations({"x": "w", "w": "-k*x"}, {"k": 9.0})
+    clipped = diagnose(swing, Run(TIME, {"x": np.minimum(x, 0.9)}, sigma=0.01), [terms.viscous("w")])
+    assert any("at its limit" in note for note in clipped.notes)
+    assert not any("at its limit" in note for note in wrong.notes)
+    with pytest.raises(AnalysisError, match="its sensor is dead"):
+        diagnose(swing, Run(TIME, {"x": 0 * TIME}), DRAG)
