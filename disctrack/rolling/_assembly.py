@@ -42,10 +42,10 @@ class Assembly:
     def _table(self, regime: int, calls: list[int]) -> NDArray[np.int64]:
         return np.array([regime, len(calls) // 2, self.instant.ctypes.data, *calls], np.int64)
 
-    def system(self, regime: int) -> integrate.System:
+    def system(self, regime: int) -> integrate.CompiledSystem:
         """Rates and margins in this regime."""
         a, b, c = (array.ctypes.data for array in (self._tables[regime], self.body, self.instant))
-        return integrate.System(self._rates.address, a, b, c, len(EVENTS))
+        return integrate.CompiledSystem(self._rates.address, a, b, c, len(EVENTS))
 
     def at(self, regime: int, t: ArrayLike, Y: Numbers) -> tuple[Numbers, Numbers, Records]:
         """Rates (N, n), margins (N, 4) and all that is known (N,) at states Y (N, n), or at one (n,)."""

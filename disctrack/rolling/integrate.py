@@ -32,7 +32,7 @@ _C = np.concatenate([DOP853.C[:_N], [1.0], DOP853.C_EXTRA])
 _B, _E3, _E5, _D = (np.ascontiguousarray(a) for a in (DOP853.B, DOP853.E3, DOP853.E5, DOP853.D))
 
 
-class System(NamedTuple):
+class CompiledSystem(NamedTuple):
     """Address of f(t, y, out, a, b, c), which writes rates and then margins, and the addresses a, b, c for it."""
 
     function: int
@@ -64,7 +64,7 @@ class Solved(NamedTuple):
 
 
 def integrate(
-    system: System, t0: complex, y0: Numbers, grid: Array, rtol: float, atol: Array, max_steps: int = MAX_STEPS
+    system: CompiledSystem, t0: complex, y0: Numbers, grid: Array, rtol: float, atol: Array, max_steps: int = MAX_STEPS
 ) -> Solved:
     """Solve dy/dt = f(t, y) from (t0, y0) to the grid's points, until a margin that was positive runs out.
 
@@ -76,7 +76,7 @@ def integrate(
     return Solved(status, solution[:n_filled], t[0], y, event, n_steps)
 
 
-def evaluate(system: System, t: Numbers, Y: Numbers, instant: Records) -> tuple[Numbers, Numbers, Records]:
+def evaluate(system: CompiledSystem, t: Numbers, Y: Numbers, instant: Records) -> tuple[Numbers, Numbers, Records]:
     """Call a system at many states: rates, margins, and a record (1,) that it fills as it is after each call.
 
     t : (N,), Y : (N, n) -> (N, n), (N, n_margins), (N,)
@@ -96,13 +96,13 @@ def _assign(target: Numbers, values: Numbers) -> None:
 
 
 @_part
-def _rates(system: System, t: complex, y: Numbers, out: Numbers, t_box: Numbers) -> None:
+def _rates(system: CompiledSystem, t: complex, y: Numbers, out: Numbers, t_box: Numbers) -> None:
     t_box[0] = t
     call(system.function, (t_box.ctypes.data, y.ctypes.data, out.ctypes.data, system.a, system.b, system.c))
 
 
 @njit(cache=True, error_model="numpy")
-def _evaluate(system: System, t: Numbers, Y: Numbers, out: Numbers, instant: Numbers, found: Numbers) -> None:
+def _evaluate(system: CompiledSystem, t: Numbers, Y: Numbers, out: Numbers, instant: Numbers, found: Numbers) -> None:
     t_box = t[:1].copy()
     for i in range(len(t)):
         _rates(system, t[i], Y[i], out[i], t_box)
@@ -110,7 +110,7 @@ def _evaluate(system: System, t: Numbers, Y: Numbers, out: Numbers, instant: Num
 
 
 @_part
-def _stages(system: System, t: complex, y: Numbers, h: complex, first: int, last: int, work: _Work) -> None:
+def _stages(system: CompiledSystem, t: complex, y: Numbers, h: complex, first: int, last: int, work: _Work) -> None:
     """K[i] = f(t + c_i h, y + h sum_j a_ij K_j) for first <= i < last."""
     K = work.K
     for i in range(first, last):
@@ -123,7 +123,7 @@ def _stages(system: System, t: complex, y: Numbers, h: complex, first: int, last
 
 
 @_part
-def _step(system: System, t: complex, y: Numbers, h: complex, work: _Work) -> None:
+def _step(system: CompiledSystem, t: complex, y: Numbers, h: complex, work: _Work) -> None:
     """y_new = y(t + h) of order 8 from K[0] = f(t, y)."""
     _stages(system, t, y, h, np.int64(1), np.int64(_N), work)  # a literal is a type of its own
     for k in range(y.size):
@@ -163,7 +163,7 @@ def _error(y: Numbers, h: float, rtol: float, atol: Array, size: Array, work: _W
 
 @_part
 def _fill(
-    system: System, t: complex, y: Numbers, h: complex, work: _Work, grid: Array, i_grid: int, solution: Numbers
+    system: CompiledSystem, t: complex, y: Numbers, h: complex, work: _Work, grid: Array, i_grid: int, solution: Numbers
 ) -> int:
     """Write the grid points from number i_grid up to the end of the step; returns the number of the next one."""
     K, F = work.K, work.F
@@ -208,7 +208,7 @@ def _ran_out(K: Numbers, n: int) -> int:
 
 
 @_part
-def _locate(system: System, t: complex, y: Numbers, h: float, work: _Work) -> tuple[int, float]:
+def _locate(system: CompiledSystem, t: complex, y: Numbers, h: float, work: _Work) -> tuple[int, float]:
     """Shorten the step to where the first margin has just run out, by bisection; y_new and K hold there.
 
     Returns the number of the margin and the length of the step.
@@ -232,7 +232,7 @@ def _locate(system: System, t: complex, y: Numbers, h: float, work: _Work) -> tu
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _dop853(
-    system: System,
+    system: CompiledSystem,
     t_last: Numbers,
     y: Numbers,
     grid: Array,

@@ -136,6 +136,7 @@ def test_two_numbers_that_nothing_tells_apart_do_not_end_the_search():
     assert any("cannot be told from other numbers" in note for note in answer.notes)
 
 
+@pytest.mark.statistical
 def test_a_wrong_sign_a_sensor_at_its_limit_and_a_dead_one_are_told():
     x = np.cos(3 * TIME) + noise()
     wrong = diagnose(Equations({"x": "w", "w": "k*x"}, {"k": 14.0}), Run(TIME, {"x": x}, sigma=0.01), DRAG)
