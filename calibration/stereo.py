@@ -401,7 +401,7 @@ def _told_apart(fit: JointFit, names: Names, table_view: int | None) -> list[str
 def _not_as_told(board: str, shape: BoardShape, sigmas: float) -> str:
     """A warning about a board that has another shape than the refinement gave it."""
     taken, do = (
-        (f"{board}, as told,", ": leave its shape to the views (board auto)") if board != "auto" else ("simple", "")
+        (f"{board}, requested,", ": leave its shape to the views (board auto)") if board != "auto" else ("simple", "")
     )
     return (
         f"the board was taken as {taken} but the views show another shape (longer by {100 * abs(shape.stretch):.2g} % "

@@ -8,7 +8,7 @@ with h = u / sigma, k = v / sigma and rho the cosine between the edges' normals,
 exact for any angle between the edges (the product of two error functions is so only at 90 degrees). sigma^2 holds the
 variance 1/12 of the square pixel; its fourth cumulant, which a Gaussian lacks, is added by Edgeworth's term. Lines stay
 lines under perspective, so the corner is where they cross, without bias; lens distortion bends them by a known
-curvature. Light that falls off over the window multiplies both levels, and is fitted; light that is added (a gleam,
+curvature. Light that falls off over the window multiplies both levels, and is fitted; light that is added (glare,
 a lens that flares) takes more of the dark squares' share, so that the contrast changes over the window. Left out, that
 shifts a corner along its gradient, 0.1 grey values per px by 0.004 px; it is known from the other corners.
 

@@ -225,7 +225,7 @@ def _larger_board(grey: Array, view: CornerView, inner_corners: tuple[int, int])
     return (
         f"the board goes on beyond the {columns} x {rows} inner corners that were declared: {all_columns} x {all_rows} "
         f"are in view. If that is all of them, declare inner_corners = [{all_columns}, {all_rows}]; a part of a board "
-        "cannot be told from its neighbour, one square further on"
+        "cannot be distinguished from its neighbour, one square further on"
     )
 
 

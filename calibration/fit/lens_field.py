@@ -69,7 +69,7 @@ def fit_lens_field(refinement: Refinement, nominal: Array) -> FieldFit | None:
 
 
 def _grid(refinement: Refinement, cells: int) -> LensField:
-    """A field of nought with so many cells along the longer side of the images."""
+    """A field of zero with so many cells along the longer side of the images."""
     size = np.array([camera.image_size for camera in refinement.model.cameras]).max(0)
     spacing = float(size.max()) / cells
     return LensField(
@@ -81,7 +81,7 @@ def _precision(grid: LensField, sigma: float, coarser: LensField | None = None, 
     """Inverse covariance (ny nx, ny nx) of an axis' coefficients [px^-2].
 
     Independent ones of sigma [px]; and beside them those of a grid of twice the spacing, each a sum of these splines.
-    So what varies within a few cells is small, and nought where no corner lies.
+    So what varies within a few cells is small, and zero where no corner lies.
     """
     shape = grid.coefficients.shape[2:]
     covariance = sigma**2 * np.eye(shape[0] * shape[1])

@@ -257,10 +257,11 @@ def _verdict(found: Assessment, refinement: Refinement, chosen: TermsTried, wide
     grade = list(Grade)[worst]
     off = f", their corners {1e3 * error:.4f} mm in space" if np.isfinite(error) else ""
     turn = 1e3 * np.degrees(found.direction_sigma)
+    length, with_board = (f"{100 * part:.2g} %" for part in found.length_sigma)
+    of_board = "" if with_board == length else f", or {with_board} with the declared size of the board"
     return grade, (
         f"{grade.value.capitalize()}: {why}. Through this calibration a point comes out within {1e3 * sigma:.4f} mm "
         f"(1 sigma, 3-D; at most {1e3 * most:.4f} mm), a direction within {turn:.2g} mdeg, "
-        f"a length or displacement within {100 * found.length_sigma[0]:.2g} %, or "
-        f"{100 * found.length_sigma[1]:.2g} % with the declared size of the board. Views left out of the fit: stereo "
-        f"misfit {found.stereo_misfit_px:.4f} px{off}; RMS of those fitted {rms:.4f} px."
+        f"a length or displacement within {length}{of_board}. Views left out of the fit: stereo misfit "
+        f"{found.stereo_misfit_px:.4f} px{off}; RMS of those fitted {rms:.4f} px."
     )

@@ -47,7 +47,7 @@ COLUMNS: dict[str, str] = {
         f"{n}_sigma_calibration_{u}": "from the rig, common to all frames"
         for n, u in zip(COORDINATES, UNITS, strict=True)
     },
-    "diagnosis": "verdict, where a diagnosis was asked for",
+    "diagnosis": "verdict, where a diagnosis was requested",
     "diagnosis_sentence": "",
     "diagnosis_p_value": "probability with which noise alone would let some effect gain as much as the best one does",
     "diagnosis_false_discovery": "share of false ones among the recordings whose p value is as small (at most)",

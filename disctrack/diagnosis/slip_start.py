@@ -36,8 +36,8 @@ CREEPS = (
     "it is taken to roll"
 )
 CREEPS_BESIDE = (
-    "slip with Coulomb's friction is all that was fitted: with so little of it the disc creeps, and other effects "
-    "beside it would take too long to try"
+    "slip with Coulomb's friction is all that was fitted: with so little of it the disc creeps, and fits with "
+    "other effects would take too long"
 )
 EXCESS = 10.0  # variances of the noise; above it slip at mm/s is looked for over ...
 LASTS = 5  # ... so many frames at least: contact velocities that are errors of a fit stop within one

@@ -2,7 +2,7 @@
 
 Two cameras see a rigid pattern: of the 4 m numbers of a frame six are its pose, and the others should be noise. What
 they scatter from frame to frame is the noise. What is left beside it moves slowly, and is a smooth function of the
-place in the image (lens, board), of the dot (print), or of both (gleam, gradients of light). The sizes and the length
+place in the image (lens, board), of the dot (print), or of both (glare, gradients of light). The sizes and the length
 of these fields are found by restricted maximum likelihood from the numbers that no pose can absorb; the same fields,
 with these sizes as priors, then stand beside the motion, and take from it what a pose could have absorbed.
 """

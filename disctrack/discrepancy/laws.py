@@ -362,7 +362,7 @@ def explained_by_law(
     left, at_noise = best.fit.reduced_chi_square, diagnosis.settings.at_noise * noise
     listed = replace(diagnosis, explanations=_listed(diagnosis, answers))
     if not best.length < known:
-        text = f"a single law beside the catalogue describes the data too ({left:.4g}): {best.law.title}"
+        text = f"a single law outside the catalogue describes the data too ({left:.4g}): {best.law.title}"
         return None, replace(listed, remarks=(*diagnosis.remarks, text)) if left <= at_noise else diagnosis
     if left > TELLS * noise:
         return None, diagnosis

@@ -184,7 +184,7 @@ class SmoothNoise:
         return np.asarray(self.smooth**2 * np.exp(-0.5 * apart**2) + floor, float)
 
     def whitening(self, time: Array) -> Array:
-        """W (n, n), lower triangular, with W covariance W^T = 1: sample by sample what those before do not foretell."""
+        """W (n, n), lower triangular, with W covariance W^T = 1: sample by sample what those before do not predict."""
         root = np.linalg.cholesky(self.covariance(time))
         return np.asarray(solve_triangular(root, np.eye(len(time)), lower=True), float)
 

@@ -654,7 +654,7 @@ class _Search:
             return "chosen"
         for f in found:
             if any(c.name == r.candidate.name for r in f.cannot_be_told_from):
-                return f"cannot be told from {f.candidate.name}"
+                return f"indistinguishable from {f.candidate.name}"
         if c.threshold and trial is None:
             return "nothing is left that it could explain; beyond its threshold it does nothing"
         if not score.visible and trial is None:

@@ -164,7 +164,7 @@ def _words(effects: Sequence[str]) -> str:
 def sentence(answer: BallAnswer) -> str:
     """The answer in plain words."""
     if not answer.together.found:
-        return f"Nothing is claimed to be missing beside gravity: {answer.together.diagnosis.reason}."
+        return f"Nothing is claimed to be missing besides gravity: {answer.together.diagnosis.reason}."
     null = [name for name, a in answer.alone.items() if a.verdict == "nothing missing"]
     text = f"Drag is missing (not seen, for these drops, on {', '.join(null) or 'none'})"
     if answer.identifiable:

@@ -5,6 +5,7 @@ import shutil
 import sys
 import textwrap
 from collections.abc import Iterable, Sequence
+from itertools import chain
 from typing import Any, TextIO
 
 from disctrack.files.text import printable
@@ -18,7 +19,7 @@ _COLOURS = {"refusal": "31;1", "doubt": "31;1", "warning": "33", "verdict": "1"}
 
 
 def short(report: Report, width: int = WIDTH, *, colour: bool = False) -> list[str]:
-    """Verdict, accuracy, findings, page and next command, in at most MOST_LINES."""
+    """What puts the result in doubt, verdict, accuracy, other findings, page and next, in at most MOST_LINES."""
     first = _cut(_entry("verdict", report.verdict, width)) + _cut(_entry("accuracy", report.accuracy, width), 2)
     last = _entry("page", "" if report.page is None else str(report.page), width) + _entry("next", report.then, width)
     entries = [_cut(_entry(grave, said, width)) for grave, said in report.graver_first()]
@@ -27,21 +28,26 @@ def short(report: Report, width: int = WIDTH, *, colour: bool = False) -> list[s
         entries.pop()
     more = len(report.findings) - len(entries)
     also = _entry("", f"and {more} more: -v shows {'it' if more == 1 else 'them'}" if more else "", width)
-    lines = [*first, *(line for entry in entries for line in entry), *also, *last]
+    lines = [*_around(first, entries), *also, *last]
     return [_coloured(line) for line in lines] if colour else lines
 
 
 def full(report: Report, width: int = WIDTH) -> list[str]:
     """All of it."""
+    first = _entry("verdict", report.verdict, width) + _entry("accuracy", report.accuracy, width)
     lines = [report.title, ""] if report.title else []
-    lines += _entry("verdict", report.verdict, width) + _entry("accuracy", report.accuracy, width)
-    for grave, said in report.graver_first():
-        lines += _entry(grave, said, width)
+    lines += _around(first, [_entry(grave, said, width) for grave, said in report.graver_first()])
     lines += _facts(report.facts, width) + _blocks(report.blocks, width)
     lines += _entry("page", "" if report.page is None else str(report.page), width)
     for i, file in enumerate(report.files):
         lines += _entry("" if i else "files", str(file), width)
     return lines + _entry("next", report.then, width)
+
+
+def _around(result: list[str], findings: list[list[str]]) -> list[str]:
+    """The result between the findings that put it in doubt and the others, of which they are the first."""
+    n = sum(entry[0].startswith(("doubt", "refusal")) for entry in findings)
+    return [*chain(*findings[:n]), *result, *chain(*findings[n:])]
 
 
 def show(report: Report, stream: TextIO | None = None, *, verbose: bool = False) -> None:

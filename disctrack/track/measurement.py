@@ -288,7 +288,7 @@ def _exposures(recording: Recording, pairs: ImagePairs) -> tuple[tuple[float, fl
 def _span(pairs: ImagePairs, frame_rate: float, settings: TrackingSettings, threads: int | None) -> MotionSpan:
     """What is to be tracked of the pairs."""
     if not settings.first_pass:
-        return MotionSpan(pairs.start, pairs.stop, 0, True, "every frame, as asked for")
+        return MotionSpan(pairs.start, pairs.stop, 0, True, "every frame, as requested")
     if len(pairs) < WHOLE_BELOW * frame_rate:
         return MotionSpan(pairs.start, pairs.stop, 0, True, f"every frame of a recording below {WHOLE_BELOW:g} s")
     if not (pairs.left.random_access and pairs.right.random_access):

@@ -9,6 +9,7 @@ from calibration import StereoCalibration, StereoRig
 from calibration.cameras.camera import OF_LEFT, OF_RIGHT, PAIR_SHIFT, PAIR_TURN
 from calibration.kit.arrays import Array
 from calibration.kit.brief import SHOWN_RANGES, ranges
+from disctrack.findings import with_sigma
 from disctrack.frames import CAMERAS, vector_from_rotation
 from disctrack.trajectory import FrameStatus, Trajectory
 
@@ -54,12 +55,12 @@ def _rig_text(rig: StereoRig) -> str:
     axis = turned / max(angle, 1e-12)
     turn = float(np.degrees(np.sqrt(axis @ C[PAIR_TURN, PAIR_TURN] @ axis)))
     focal = [
-        f"{name} {camera.fx:.1f} x {camera.fy:.1f} (+- {np.sqrt(C[i, i]):.2g})"
+        f"{name} {with_sigma(camera.fx, np.sqrt(C[i, i]))} x {with_sigma(camera.fy, np.sqrt(C[i + 1, i + 1]))}"
         for name, camera, i in (("left", rig.left, OF_LEFT.start), ("right", rig.right, OF_RIGHT.start))
     ]
     return (
-        f"baseline {rig.baseline * 1e3:.3f} +- {baseline:.2g} mm, cameras turned by "
-        f"{np.degrees(angle):.3f} +- {turn:.2g} deg, focal lengths [px] {', '.join(focal)}"
+        f"baseline {with_sigma(1e3 * rig.baseline, baseline, 'mm')}, cameras turned by "
+        f"{with_sigma(np.degrees(angle), turn, 'deg')}, focal lengths [px] {', '.join(focal)}"
     )
 
 
@@ -76,7 +77,7 @@ def _model_text(found: StereoCalibration) -> str:
     rows = {c.terms.board: c.held_out_rms_px for c in found.candidates}
     own = rows.pop(chosen.board, float("nan"))
     if not rows:
-        return text + (" (as told)" if found.settings.board != "auto" else " (no other comes near)")
+        return text + (" (as requested)" if found.settings.board != "auto" else " (no other comes near)")
     listed = ", ".join(f"{board} {rms:.4f}" for board, rms in sorted(rows.items(), key=lambda item: item[1]))
     return (
         f"{text}: views left out fit at {own:.4f} px ({listed}); the simplest board that is not clearly worse is taken"
@@ -121,7 +122,7 @@ def _shared_lines(details: Mapping[str, Any]) -> Iterable[Row]:
     if abs(size.get("share", 0.0) * size.get("by_dots", 0.0)) > LEAST_SIZE:
         yield (
             "size",
-            f"by the disc's dots lengths are {100 * size['by_dots']:+.4f} +- {100 * size['sigma']:.4f} % longer than "
+            f"by the disc's dots lengths are {with_sigma(100 * size['by_dots'], 100 * size['sigma'])} % longer than "
             f"by the board; {100 * size['share']:.0f} % of that is taken over",
         )
 

@@ -40,7 +40,7 @@ class FrameStatus(IntEnum):
     REPEATED = 8, "both images are copies of earlier ones, while the disc moves: the recorder lost this frame"
     CONTRADICTED = (
         9,
-        "refused: the dots contradict each other by more than their noise explains (a gleam, a hand, a repeated or "
+        "refused: the dots contradict each other by more than their noise explains (glare, a hand, a repeated or "
         "exchanged image)",
     )
     JUMPED = 10, "refused: no motion leads from the frames before or after to this pose (exchanged frames?)"

@@ -271,7 +271,7 @@ def _rates_table(verdicts: Sequence[Verdict]) -> Table:
         medians = np.median([(v.stands_out, found_from(v), v.seconds) for v in group], axis=0)
         names, sizes = zip(*hidden, strict=True)
         rows.append([" + ".join(names), " + ".join(f"{s:.3g}" for s in sizes), *shares, *map(figure, medians)])
-    head = ["hidden", "size", "can be told", "named", "within 3 sigma", "noise left", "claim too many",
+    head = ["hidden", "size", "distinguishable", "named", "within 3 sigma", "noise left", "claim too many",
             "stands out by, sigma", "found from", "time, s"]  # fmt: skip
     return Table("What was hidden, and what became of it", head, rows, "Sizes in SI units; the last three are medians.")
 

@@ -65,10 +65,10 @@ def test_corners_have_no_bias(views):
 
 
 def lit(image, added, fall_off):
-    """Exact grey values under light that falls off across the image by a part, with a gleam of so many grey values."""
+    """Exact grey values under light that falls off across the image by a part, with glare of so many grey values."""
     y, x = np.mgrid[: image.shape[0], : image.shape[1]]
-    gleam = added * np.exp(-0.5 * ((x - 210) ** 2 + (y - 150) ** 2) / 60.0**2)
-    return image * (1 - fall_off * np.hypot(x, y) / 400) + gleam
+    glare = added * np.exp(-0.5 * ((x - 210) ** 2 + (y - 150) ** 2) / 60.0**2)
+    return image * (1 - fall_off * np.hypot(x, y) / 400) + glare
 
 
 @pytest.mark.statistical

@@ -2,7 +2,7 @@
 
 Every imperfection has its own switch: a lens with a smooth residual field beyond any radial polynomial, a chessboard
 that is bowed and stretched along one side, pixel gains, column offsets, a curved response, light that falls off, a
-broad gleam. The motion is that of `newton_euler`. Images are cast backwards through each camera on a grid of SUB x SUB
+broad glare. The motion is that of `newton_euler`. Images are cast backwards through each camera on a grid of SUB x SUB
 rays per pixel, blurred there, and gathered to pixels.
 
     python -m tests.oracles.imperfect_laboratory FOLDER --seed 3 [--effect kz] [--only bow] [--without lens_field]
@@ -50,7 +50,7 @@ class Imperfections:
     columns: float = 0.3  # [grey] rms of the columns' offsets
     curve: float = 0.03  # largest departure of the response from a straight line, of full scale
     fall_off: float = 0.15  # of the light, from the brightest place to the farthest corner
-    gleam: float = 12.0  # [grey]
+    glare: float = 12.0  # [grey]
     misprint: float = 0.0  # [m] rms of the dots' places, per axis
     exposure: float = 2e-4  # [s]
 
@@ -66,8 +66,8 @@ class Trouble:
     stuck_pixels: int = 0  # of each camera that show full scale, and as many that show nothing
     flicker: float = 0.0  # of the light, 100 Hz, amplitude over mean
     hand: range = range(0)  # frames in which a hand hides half of the disc
-    gleam: range = range(0)  # frames in which a saturated gleam lies on one dot
-    gleam_dot: int = 2
+    glare: range = range(0)  # frames in which saturated glare lies on one dot
+    glare_dot: int = 2
 
     def before(self, camera, radiance, poses, dots, frame, frame_rate):
         """The scene's light as it reaches the sensor."""
@@ -79,8 +79,8 @@ class Trouble:
             edge = 12 * np.sin(0.1 * y + 0.3 * frame)  # fingers that move
             hand = np.clip(x - centre[0] + edge, 0, 1)
             radiance = radiance + hand * (120 + 10 * np.sin(0.07 * x) - radiance)
-        if frame in self.gleam:
-            u, v = camera.project((np.append(dots[self.gleam_dot], HALF_THICKNESS) @ R.T + t)[None])[0]
+        if frame in self.glare:
+            u, v = camera.project((np.append(dots[self.glare_dot], HALF_THICKNESS) @ R.T + t)[None])[0]
             radiance = radiance + 900 * np.exp(-0.5 * ((x - u - 3) ** 2 + (y - v + 2) ** 2) / 6.0**2)
         return radiance * (1 + self.flicker * np.sin(2 * np.pi * 100 * frame / frame_rate + 0.4))
 
@@ -148,7 +148,7 @@ class Camera:
         far = np.sum((u - rng.uniform(-0.25, 0.25, 2)) ** 2, -1)
         self.light = 1 - faults.fall_off * far / far.max()
         glow = np.sum((u - rng.uniform(-0.25, 0.25, 2)) ** 2, -1)
-        self.gleam = faults.gleam * np.exp(-0.5 * glow / 0.18**2)
+        self.glare = faults.glare * np.exp(-0.5 * glow / 0.18**2)
         texture = cv2.GaussianBlur(rng.normal(size=(size, size)), (0, 0), 6.0)
         self.table = 85 + 2 * texture / texture.std()
         self.curve = faults.curve
@@ -202,8 +202,8 @@ class Camera:
         return o[0] + s * d[0], o[1] + s * d[1]
 
     def expose(self, radiance, rng):
-        """Grey values (uint8) from ideal ones: light, gleam, response, pattern, noise."""
-        grey = radiance * self.light + self.gleam
+        """Grey values (uint8) from ideal ones: light, glare, response, pattern, noise."""
+        grey = radiance * self.light + self.glare
         part = grey / 255
         grey = 255 * (part + 4 * self.curve * part * (1 - part))
         grey = grey * self.gain + self.offset

@@ -1,4 +1,4 @@
-"""Recordings by a path tracer (Mitsuba 3): shadows, gleam, reflections, defocus and hands as light makes them.
+"""Recordings by a path tracer (Mitsuba 3): shadows, glare, reflections, defocus and hands as light makes them.
 
 Motion, lens, sensor and folder are those of `imperfect_laboratory`, which share no line with the product; what each
 pixel sees is traced through a scene of triangles and lamps. Every sample of a pixel is a ray of its own: a place in the

@@ -74,9 +74,9 @@ def truncate(images, places, rng):
     return images, np.arange(len(images))
 
 
-def gleam(images, places, rng):
+def glare(images, places, rng):
     """A lamp's reflection over part of an image, for some frames."""
-    return _over(images, places, rng, _gleam)
+    return _over(images, places, rng, _glare)
 
 
 def shadow(images, places, rng):
@@ -106,7 +106,7 @@ def hide(images, places, rng):
     return images, np.arange(len(images))
 
 
-FAULTS = (repeat, drop, lose, reorder, swap, mirror, rescale, truncate, gleam, shadow, smear, hide)
+FAULTS = (repeat, drop, lose, reorder, swap, mirror, rescale, truncate, glare, shadow, smear, hide)
 
 
 def _over(images, places, rng, change):
@@ -121,7 +121,7 @@ def _over(images, places, rng, change):
     return images, np.arange(len(images))
 
 
-def _gleam(rng):
+def _glare(rng):
     width, height = rng.uniform(4, 60), rng.uniform(3, 150)
     return lambda grey, u, v: grey + height * np.exp(-0.5 * (u * u + v * v) / width**2)
 

@@ -22,7 +22,7 @@ from disctrack.track.judge.disc_not_seen import moved_camera, unlike_declared
 from disctrack.track.measurement import open_pairs
 from disctrack.track.refine.intrinsic_scatter import MIN_FRAMES
 from disctrack.trajectory import FrameStatus
-from tests.oracles.planted_faults import FAULTS, gleam
+from tests.oracles.planted_faults import FAULTS, glare
 
 N = 48
 MOST_SIGMAS = 5.0  # of six components of some fifty poses chance alone reaches 4.1
@@ -319,10 +319,10 @@ def test_a_frame_rate_at_which_no_motion_joins_the_frames_is_a_doubt_that_names_
     assert "the frame rate is far too high" in first.text
 
 
-def test_a_gleam_on_some_dots_takes_their_weight_and_the_covariance_follows(clip):
+def test_glare_on_some_dots_takes_their_weight_and_the_covariance_follows(clip):
     """It reaches all dots of the left image, and shifts one by ten sigmas whose own template hardly shows it."""
-    assert clip.silently_wrong(gleam, 8) == []
-    images, _ = gleam(clip.images.copy(), clip.places, np.random.default_rng(8))
+    assert clip.silently_wrong(glare, 8) == []
+    images, _ = glare(clip.images.copy(), clip.places, np.random.default_rng(8))
     found, before = measure(images, clip.rig, clip.disc).trajectory, clip.untouched.trajectory
     assert (images[30, 0] != clip.images[30, 0]).any()
     assert found.frame_status[30] == FrameStatus.MEASURED

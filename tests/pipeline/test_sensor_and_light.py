@@ -24,7 +24,7 @@ TROUBLES = {
     "hot and dead pixels": {"trouble": Trouble(stuck_pixels=250)},
     "a hand over half of the disc": {"trouble": Trouble(hand=DURING)},
     "a lamp at 100 Hz": {"trouble": Trouble(flicker=0.2)},
-    "a saturated gleam on one dot": {"trouble": Trouble(gleam=DURING)},
+    "saturated glare on one dot": {"trouble": Trouble(glare=DURING)},
 }
 
 
@@ -73,13 +73,13 @@ def test_no_pose_is_wrong_without_a_flag(name):
     assert np.all(np.abs(sigmas[posed & unflagged]) < 5), (name, np.nanmax(np.abs(sigmas), axis=0))
     assert np.all(np.abs(sigmas[posed]) < 8)  # those with a flag, too, have a sigma that is worth something
     untouched = np.ones(FRAMES, bool)
-    if "hand" in name or "gleam" in name:
+    if "hand" in name or "glare" in name:
         untouched[DURING.start : DURING.stop] = False
     assert np.all(unflagged[untouched])
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [name for name in TROUBLES if "hand" in name or "gleam" in name])
+@pytest.mark.parametrize("name", [name for name in TROUBLES if "hand" in name or "glare" in name])
 def test_the_rest_of_the_recording_is_as_without_the_trouble(name):
     (_, plain, _), (_, error, _) = filmed("nothing"), filmed(name)
     rest = np.ones(FRAMES, bool)

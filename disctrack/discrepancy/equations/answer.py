@@ -298,7 +298,7 @@ class Answer:
         d = self.diagnosis
         if d.held_out_before is None:
             loose = [n for n, v in self.values.items() if "." not in n and not self.sigmas[n] < abs(v)]
-            open_ = f" {', '.join(loose)} cannot be told: declare a value or bounds." if loose else ""
+            open_ = f" {', '.join(loose)} cannot be determined: declare a value or bounds." if loose else ""
             return f"No answer: {d.reason}.{open_} Values from which to begin nearer to the truth may help."
         level = ", ".join(
             f"{e.rms:.3g} {self._unit(c)} of {c} (noise {e.noise:.3g})".replace(" 1 of", " of")

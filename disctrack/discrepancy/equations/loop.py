@@ -95,7 +95,7 @@ def ask(
         notes += diagnosis.remarks
     if system.held:
         held = ", ".join(system.held)
-        notes.append(f"{held} cannot be told from other numbers with these data, which hold for it as declared")
+        notes.append(f"{held} cannot be distinguished from other numbers by these data: held as declared")
     return diagnosis, system, judged, remembers, tuple(notes), law
 
 

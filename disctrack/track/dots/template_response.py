@@ -117,7 +117,7 @@ def _response(sizes: Array, edge: Edge, changes: Changes) -> Array:
 
 
 def _contrast_graded(band: _Band, axis: int) -> Array:
-    """See `gleam`: by a contrast that grows by 1 per px along the axis."""
+    """See `glare`: by a contrast that grows by 1 per px along the axis."""
     place = band.u[axis][..., None] + band.n[axis][..., None] * band.d
     return np.asarray(-place * band.seen)[None]
 

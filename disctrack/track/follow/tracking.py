@@ -41,7 +41,7 @@ from disctrack.trajectory import FrameStatus
 SHORTEST_SPLIT = 1000  # pairs; a stretch must outweigh its own search for the disc, and measuring blur and noise
 MOST_STRETCHES = 16
 FAR_PX = 1.0  # that dots miss their places by in all frames, beyond any lens: the poses are no better than none
-MOSTLY = 0.5  # of the frames: that many are not refused for gleams and hands
+MOSTLY = 0.5  # of the frames: that many are not refused for glare and hands
 # [m] off its declared place from which on a dot is looked for again, where it is. With wrong places the attitude is
 # wrong that templates are made for: places 0.1 mm off, rms, shift centres by 0.3e-3 to 2e-3 px, in all frames alike.
 LOOK_AGAIN = 60e-6

@@ -1,6 +1,6 @@
 """Which dots and poses are to be believed: each by its own residuals, by its neighbours, by the other camera.
 
-A fault of the measurement (a gleam, a shadow, a repeated or exchanged image) is found where it does what noise does
+A fault of the measurement (glare, a shadow, a repeated or exchanged image) is found where it does what noise does
 not. Levels are those of chi-square distributions; what is usual, in a recording whose dots or lens are not perfect, is
 taken from the frames around, so that a frame is judged by its neighbours and by nothing far away.
 """
@@ -23,9 +23,9 @@ from disctrack.trajectory import FrameStatus
 FEW = 4  # frames beside a cut that tell how large the misfit is there
 BLOCK = 16  # frames whose median is what is usual, with those of the blocks on both sides: half may be at fault
 SIGMAS = 4.0  # beyond which a dot's misfit is hardly chance (6e-5): such a dot loses its weight, and no frame is lost
-COMPANIONS = 1.0  # the same for the other dots of an image in which something is: gleams are larger than a dot
+COMPANIONS = 1.0  # the same for the other dots of an image in which something is: glare is larger than a dot
 # Square of a centre's shift over that of the misfit, both in sigmas: a disturbance is taken for a shift in one part and
-# shows in the other. Of random gleams, shadows, dirt and edges of a hand over dots the largest ratio was 1.96.
+# shows in the other. Of random glare, shadows, dirt and edges of a hand over dots the largest ratio was 1.96.
 HIDDEN_SHARE = 2.0
 CHANCE = 1e-6  # of a frame without fault to be refused by its chi-square: one in a thousand recordings of a thousand
 SUSPECT = 1e-3  # below this chance a frame's covariance follows its residuals
@@ -39,7 +39,7 @@ def unexpected_misfit(misfit: NDArray[np.floating], n_pixels: NDArray[np.floatin
 
     misfit : (n, 2, m) reduced chi-square of the grey values about the template, NaN where there is no dot
     n_pixels : (n, 2, m) grey values that it was taken over
-    A gleam, a shadow's edge, dirt or a hand raise a dot's misfit over that of the same dot in the frames around (and
+    Glare, a shadow's edge, dirt or a hand raise a dot's misfit over that of the same dot in the frames around (and
     over twice that of the camera's other dots, for what stays). The excess times the number of pixels is the square of
     the disturbance in sigmas; HIDDEN_SHARE times that may be the square of the centre's shift. What disturbs a dot may
     reach the image's other dots, and shift them by ten sigmas without showing by itself: there, a small excess counts.

@@ -17,7 +17,7 @@ from disctrack.track.judge.dropped_frames import dropped_frames
 from disctrack.track.judge.outlier_tests import judge_poses, outlying_frames, unexpected_misfit
 from disctrack.track.pose import PoseFits, fit_poses, whitening
 from disctrack.track.refine.exposure import Exposure, exposure_by_smear, exposure_of, shift_by_exposure
-from disctrack.track.refine.glare import shift_by_gleam
+from disctrack.track.refine.glare import shift_by_glare
 from disctrack.track.refine.intrinsic_scatter import Scatter, SharedFaults, split_scatter, without_shared_faults
 from disctrack.track.refine.pose_scatter import PoseScatter, scatter_of_poses
 from disctrack.track.refine.self_calibration import (
@@ -123,12 +123,12 @@ def assemble(
 def _as_they_were(
     tables: Tables, dots: DotCentres, first: Follower, settings: TrackingSettings, taken: Taken
 ) -> Exposure:
-    """Move the dots to where they were in the middle of the exposure but for gleams, and tell by which exposure."""
+    """Move the dots to where they were in the middle of the exposure but for glare, and tell by which exposure."""
     where, rig, disc = (tables.R, tables.t, taken.time), first.setup.rig, first.setup.disc
     edges = first.law.edges
     found = exposure_by_smear(*where, dots.blur_px, rig, disc)
     exposure = exposure_of(found, settings.exposure, 1 / taken.frame_rate)
-    dots.pixels[...] -= shift_by_gleam(tables.R, tables.t, dots.contrast, rig, disc, edges)
+    dots.pixels[...] -= shift_by_glare(tables.R, tables.t, dots.contrast, rig, disc, edges)
     if any(exposure.seconds):
         dots.pixels[...] -= shift_by_exposure(*where, np.array(exposure.seconds), rig, disc, edges)
     return exposure

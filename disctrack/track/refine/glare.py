@@ -1,11 +1,11 @@
-"""Light that is added to an image (a gleam, a lens that flares), whose gradient shifts the dots' centres; taken off.
+"""Light that is added to an image (glare, a lens that flares), whose gradient shifts the dots' centres; taken off.
 
 Light that falls off over a dot multiplies paper and ink alike, and the template has a slope for it. Light that is added
 takes more of the ink's share: the contrast c changes with the place in the image, and inside the dot
 
     I = L (1 - c S)  has  d I / dx = dL/dx (1 - c S) - L dc/dx S,
 
-whose last term the template takes in part for a shift (`template_pull`): 0.1 grey values per px of gleam move a dot of
+whose last term the template takes in part for a shift (`template_pull`): 0.1 grey values per px of glare move a dot of
 17 px by some 0.004 px, in all frames alike. The contrasts themselves tell: those of all frames are fitted by a constant
 of each dot (ink and paper differ) and one of each frame (lamps flicker, an attitude is better lit than another), and a
 polynomial of the place in the image, whose gradient counts.
@@ -24,7 +24,7 @@ from disctrack.track.dots.template_response import Edge, plane_to_image, pulls_b
 from disctrack.track.pose import marker_pixels
 from disctrack.track.side_by_side import AT_ONCE, MIN_FRAMES, SHARED_FRAMES, evenly
 
-DEGREE = 4  # of the polynomial: a gleam as wide as the disc's path
+DEGREE = 4  # of the polynomial: glare as wide as the disc's path
 POWERS = [(i, k - i) for k in range(1, DEGREE + 1) for i in range(k + 1)]
 SAME = 1 / 16  # of a dot's diameter, about a pixel
 # Standard deviations of what one term adds to the contrast over the dots' path, in those of the contrast itself: the
@@ -34,7 +34,7 @@ PRIORS = (0.01, 0.03, 0.1, 0.3, 1.0)
 LIKELIER = 6.0  # of natural logarithms
 
 
-def shift_by_gleam(R: Array, t: Array, contrast: Array, rig: StereoRig, disc: Disc, edges: tuple[Edge, Edge]) -> Array:
+def shift_by_glare(R: Array, t: Array, contrast: Array, rig: StereoRig, disc: Disc, edges: tuple[Edge, Edge]) -> Array:
     """(n, 2, m, 2) [px] by which templates find the dots beside their places; zero where not known.
 
     R (n, 3, 3), t (n, 3) [m]: poses, NaN where there is none; contrast (n, 2, m) of each dot with its paper, NaN where

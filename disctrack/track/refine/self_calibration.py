@@ -161,7 +161,7 @@ class SharedFit:
     """What frames share, fitted with a free pose for every frame."""
 
     shift: Array  # (30 + 2m + j,) of RIG_PARAMETERS, of the dots' places, of anything else
-    covariance: Array  # of it; nought where it was not free
+    covariance: Array  # of it; zero where it was not free
     reduced_chi_square: list[float]  # before each step
     frames: DotsInFrames  # with the poses before the last step
 
@@ -169,7 +169,7 @@ class SharedFit:
 def fit_shared(frames: DotsInFrames, free: Mask, information: Array, repeats: float = 0.0) -> SharedFit:
     """Fit what is free (30 + 2m + j,) of what the frames share, by Gauss-Newton.
 
-    information : (k, k) of the prior about nought
+    information : (k, k) of the prior about zero
     repeats : [px] errors that are common to all frames: they bound what these tell together
     """
     shift, reduced = np.zeros(len(free)), []

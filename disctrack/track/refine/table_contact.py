@@ -30,6 +30,7 @@ from calibration.cameras.camera import N_RIG, WORLD_SHIFT, WORLD_TURN, Allowance
 from calibration.kit.arrays import Array, robust_sigma
 from disctrack import frames
 from disctrack.disc import Disc
+from disctrack.findings import with_sigma
 from disctrack.track.pose import PoseFits
 from disctrack.track.side_by_side import AT_ONCE
 
@@ -43,6 +44,7 @@ MAX_SCATTER = 30e-6  # [m] of the gaps about their plane: beyond, the disc jumps
 NOISY = 6.0  # times what noise and misfit of the poses explain, as far as that is more
 # Standard deviations [m] of radius and thickness where none is declared: 0.02 %, and a micrometer's
 ASSUMED_RADIUS, ASSUMED_THICKNESS = 7.5e-6, 3e-6
+STEEP = 0.1  # slope of a plane that is no table: the board of the declared view lay elsewhere
 PLACES = 6.0  # at which the cameras' smooth errors are independent, in a whole turn of the contact
 _WIDE = np.array([1e-2, 0.1, 0.1])  # [m, rad, rad] bounds what a short arc of contacts leaves open
 
@@ -68,8 +70,8 @@ class TableFromDisc:
         z, *slopes = self.plane
         sigma = np.hypot(self.sigma, self.board_sigma)
         told = (
-            f"by the disc's rim the table lies {1e6 * z:+.1f} +- {1e6 * sigma[0]:.1f} um from the board's, turned by "
-            f"{np.degrees(np.hypot(*slopes)) * 1e3:.0f} +- {np.degrees(sigma[1:].max()) * 1e3:.0f} mdeg"
+            f"by the disc's rim the table lies {with_sigma(1e6 * z, 1e6 * sigma[0], 'um')} from the board's, turned by "
+            f"{with_sigma(np.degrees(np.hypot(*slopes)) * 1e3, np.degrees(sigma[1:].max()) * 1e3, 'mdeg')}"
         )
         used = {"both": "the two are combined", "board": "the board counts", "disc": "the disc counts"}[self.source]
         return f"{told}; {used} ([table] from)"
@@ -85,11 +87,11 @@ def table_from_disc(
     by_pattern : (n, 6, k) how poses change by one sigma of the pattern's own place on the disc, which is not in
         `systematic`: a pattern off the centre by d lifts and lowers the rim by d sin(theta) as the disc turns, which
         looks like a table that leans while phi follows -psi
-    None, and nothing changed, where the rig has no table or the disc did not touch one.
+    None, and nothing changed, where the rig has no table or the disc did not touch one near it.
     """
     by_pattern = np.zeros((len(systematic), 6, 0)) if by_pattern is None else by_pattern
     found = _contacts(fits, systematic, disc, by_pattern) if rig.world_is_table else None
-    if found is None:
+    if found is None or np.abs(found[0][1:]).max() > STEEP:
         return fits, systematic, rig, None
     plane, middle, H, noise, by_disc, by_place, scatter, n = found
     noise = noise + by_place @ by_place.T

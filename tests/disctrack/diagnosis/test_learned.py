@@ -172,4 +172,4 @@ def test_a_law_that_describes_no_more_than_a_known_effect_is_told_beside_it():
     assert result.learned is None
     (found,) = result.diagnosis.found
     assert "spring" in {found.candidate.name, *(r.candidate.name for r in found.cannot_be_told_from)}
-    assert any("a single law beside the catalogue describes the data too" in note for note in result.notes)
+    assert any("a single law outside the catalogue describes the data too" in note for note in result.notes)

@@ -152,14 +152,14 @@ def test_parameters_that_cannot_be_parted_are_told_beside_own_numbers(rng, per):
     both = {"s": Parameter(140.0, per=per), "m": Parameter(1.0, per=per), "c": 0.3}
     twice = Equations({"x": "v", "v": "-s/m*x - c*v"}, both)
     answer = diagnose(twice, runs, [terms.coulomb("v")])
-    assert any("cannot be told from" in note for note in answer.notes)
+    assert any("cannot be distinguished from" in note for note in answer.notes)
     assert answer.system.held in (("m",), ("s",))
     held = redundant(answer.system.with_(held=()), answer.values | {"m": 1.0, "s": 140.0})
     assert held in (("m",), ("s",))
 
 
 def test_a_run_that_is_kept_back_as_a_whole_judges(rng):
-    """What is found in the others foretells it, whatever its spring and its start."""
+    """What is found in the others predicts it, whatever its spring and its start."""
     *others, last = swings(rng, 4)
     runs = [*(replace(run, fit_until=np.inf) for run in others), replace(last, fit_until=0)]
     answer = diagnose(SWINGS, runs, OFFERED)

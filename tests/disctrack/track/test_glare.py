@@ -8,7 +8,7 @@ from disctrack import frames, rolling
 from disctrack.track.dots.template import NoiseModel
 from disctrack.track.dots.template_response import Edge
 from disctrack.track.pose import marker_pixels
-from disctrack.track.refine.glare import shift_by_gleam
+from disctrack.track.refine.glare import shift_by_glare
 from tests.oracles.flat_dots import covered, locate_on_plane
 
 N, DARK, PAPER, NOISE = 24, 8000.0, 50000.0, NoiseModel(1e4, 8.0)
@@ -16,7 +16,7 @@ N, DARK, PAPER, NOISE = 24, 8000.0, 50000.0, NoiseModel(1e4, 8.0)
 
 @pytest.fixture(scope="module")
 def located(rendered_pairs):
-    """Contrast and shift of the left camera's dots under light that falls off, and under that with a gleam."""
+    """Contrast and shift of the left camera's dots under light that falls off, and under that with glare."""
     rig, disc = rendered_pairs.rig, rendered_pairs.disc
     start = rolling.steady_precession(np.radians(15), disc, 9.81)
     q = rolling.simulate(rolling.Model(disc, 9.81), start, times=np.arange(N) / 200).q
@@ -27,7 +27,7 @@ def located(rendered_pairs):
     middle = pixels[:, 0].mean(axis=(0, 1))
     y, x = np.mgrid[:64, :64]
     found = {}
-    for kind, gleam in (("falls off", 0.0), ("gleam", 3000.0)):
+    for kind, glare in (("falls off", 0.0), ("glare", 3000.0)):
         contrast, shift = np.full((N, 2, disc.n_markers), np.nan, np.float32), np.zeros((N, disc.n_markers, 2))
         for frame in range(N):
             for dot in range(disc.n_markers):
@@ -35,7 +35,7 @@ def located(rendered_pairs):
                 window = np.round(centre) - 31
                 plain = PAPER - (PAPER - DARK) * covered([centre - window], [A], 0.6)
                 place = np.stack([x, y], axis=-1) + window - middle
-                added = gleam * np.exp(-0.5 * np.sum((place - [30, -20]) ** 2, axis=-1) / 70.0**2)
+                added = glare * np.exp(-0.5 * np.sum((place - [30, -20]) ** 2, axis=-1) / 70.0**2)
                 H = np.eye(3)
                 H[:2, :2], H[:2, 2] = A, centre - window
                 images = plain, plain * (1 - 4e-4 * place @ [1.0, 0.5]) + added
@@ -49,14 +49,14 @@ def located(rendered_pairs):
     edge = Edge(0.65, PAPER, 1 - DARK / PAPER, NOISE)
 
     def told(contrast, frames=slice(None)):
-        return shift_by_gleam(R[frames], t[frames], contrast[frames], rig, disc, (edge, edge))
+        return shift_by_glare(R[frames], t[frames], contrast[frames], rig, disc, (edge, edge))
 
     return found, told
 
 
-def test_a_gleam_shifts_dots_and_their_contrasts_tell_by_how_much(located):
+def test_glare_shifts_dots_and_their_contrasts_tell_by_how_much(located):
     found, told = located
-    contrast, shift = found["gleam"]
+    contrast, shift = found["glare"]
     given = told(contrast)
     assert np.sqrt(np.mean(shift**2)) > 0.002  # px
     # single dots scatter with the place of their edge among the pixels
@@ -73,7 +73,7 @@ def test_light_that_falls_off_shifts_nothing(located):
 
 def test_flicker_and_dots_of_different_ink_are_no_gradient(located, rng):
     found, told = located
-    contrast = found["gleam"][0]
+    contrast = found["glare"][0]
     uneven = contrast + 0.03 * rng.normal(size=(N, 1, 1)) + 0.03 * rng.normal(size=contrast.shape[2])
     assert np.abs(told(uneven.astype(np.float32)) - told(contrast)).max() < 2e-4  # px
 

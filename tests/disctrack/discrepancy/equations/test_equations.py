@@ -460,6 +460,18 @@ def tank():
 
 
 @pytest.mark.statistical
+def test_what_sets_in_within_a_run_is_found_beside_a_term_that_names_the_channel(tank):
+    """The overflow moves nothing before it begins: its derivative starts from nought at a kink."""
+    equations, run = tank
+    overflow = Term("overflow", {"y": "-o*Max(y - top, 0)"}, parameters={"o": 0.0, "top": Parameter(2.2, shape=True)})
+    answer = diagnose(equations, run, [overflow, terms.sensor_scale("level"), terms.sensor_offset("level")])
+    assert answer.found == ("overflow",)
+    assert within(answer, "k", 0.5)
+    assert within(answer, "overflow.o", 2.0)
+    assert within(answer, "overflow.top", 2.3)
+
+
+@pytest.mark.statistical
 def test_what_lasts_as_long_as_the_data_themselves_is_no_noise(tank):
     """The strongest line of a driven motion may be the slowest: how fast the data change is told by their memory.
 
@@ -772,7 +784,7 @@ def test_a_sensor_that_lags_shows_the_rest_before_the_first_sample_where_that_is
 
 @pytest.mark.statistical
 def test_a_gain_of_the_wrong_sign_is_passed_through_nought(rng):
-    """A valve that drives a resonance: Gauss-Newton ends where with a gain of nought nothing moves."""
+    """A valve that drives a resonance: Gauss-Newton ends where with a gain of zero nothing moves."""
     time = np.arange(600) * 0.05
     push = np.interp(time, np.arange(0, 31, 1.5), np.sign(np.sin(7.3 * np.arange(21) ** 1.3)))
     course = CubicSpline(time, push)
