@@ -105,10 +105,9 @@ def test_a_terminal_gets_ten_lines_the_gravest_first_and_is_told_of_the_rest():
     found = report(verdict="long " * 200, findings=said, page=Path("a page.html"), then="disctrack next")
     lines = short(found, 80)
     assert 8 <= len(lines) <= 10
-    assert lines[3].endswith("…")  # of a long verdict
+    assert lines[0].split() == ["doubt", "doubtful"]  # before the result
+    assert lines[4].endswith("…")  # of a long verdict
     assert max(map(len, lines)) <= 80
-    doubt = next(i for i, line in enumerate(lines) if line.startswith("doubt"))
-    assert not any(line.startswith("note") for line in lines[:doubt])
     assert any("more: -v shows them" in line for line in lines)
     assert lines[-2].split(maxsplit=1) == ["page", "a page.html"]
     everything = " ".join(" ".join(full(found, 80)).split())
