@@ -14,7 +14,7 @@ from calibration.cameras.camera import CAMERA_NAMES, StereoRig
 from calibration.fit.lens_field import FieldFit
 from calibration.fit.pairing import Names, Pairs, Views, count_once
 from calibration.fit.refinement import Refinement, TermsTried
-from calibration.fit.start import MIN_VIEWS, start_stereo
+from calibration.fit.start import MIN_VIEWS, start_stereo, too_wide
 from calibration.fit.stereo_model import BOARD_MODELS, RICHEST, Observations, Terms
 from calibration.judge.assessment import Assessment, assess, stereo_covariance
 from calibration.judge.pairs import camera_moved, gradients_by_motion, zoomed
@@ -27,7 +27,6 @@ from calibration.judge.tolerances import (
     shape_left_out,
     with_tolerances,
 )
-from calibration.judge.wide_lens import too_wide
 from calibration.kit.arguments import Thickness, checked
 from calibration.kit.arrays import Array
 from calibration.kit.brief import Brief
@@ -408,12 +407,3 @@ def _not_as_told(board: str, shape: BoardShape, sigmas: float) -> str:
         f"along one side, bent by {1e6 * abs(shape.lift):.0f} um, or misprinted): cameras are pulled by up to "
         f"{sigmas:.1f} of their sigmas. The sigmas contain that{do}"
     )
-
-
-__all__ = [
-    "Board",
-    "CalibrationSettings",
-    "StereoCalibration",
-    "calibrate_from_corners",
-    "calibrate_stereo",
-]

@@ -164,7 +164,7 @@ def assess(
     """Collect the figures and judge them.
 
     chosen : the row of the terms that were taken; rig : its covariance by the views alone; rig_with_board : and with
-    the tolerances of the board; wide : what `wide_lens.too_wide` found
+    the tolerances of the board; wide : what `start.too_wide` found
     """
     kept = refinement.observations[refinement.kept]
     volume = measurement_volume(refinement, table_view)
