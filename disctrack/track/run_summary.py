@@ -9,8 +9,8 @@ from calibration import StereoCalibration, StereoRig
 from calibration.cameras.camera import OF_LEFT, OF_RIGHT, PAIR_SHIFT, PAIR_TURN
 from calibration.kit.arrays import Array
 from calibration.kit.brief import SHOWN_RANGES, ranges
-from disctrack.findings import with_sigma
 from disctrack.frames import CAMERAS, vector_from_rotation
+from disctrack.numbers import measured
 from disctrack.trajectory import FrameStatus, Trajectory
 
 Row = tuple[str, str]  # a heading, and what belongs to it
@@ -55,12 +55,12 @@ def _rig_text(rig: StereoRig) -> str:
     axis = turned / max(angle, 1e-12)
     turn = float(np.degrees(np.sqrt(axis @ C[PAIR_TURN, PAIR_TURN] @ axis)))
     focal = [
-        f"{name} {with_sigma(camera.fx, np.sqrt(C[i, i]))} x {with_sigma(camera.fy, np.sqrt(C[i + 1, i + 1]))}"
+        f"{name} {measured(camera.fx, np.sqrt(C[i, i]))} x {measured(camera.fy, np.sqrt(C[i + 1, i + 1]))}"
         for name, camera, i in (("left", rig.left, OF_LEFT.start), ("right", rig.right, OF_RIGHT.start))
     ]
     return (
-        f"baseline {with_sigma(1e3 * rig.baseline, baseline, 'mm')}, cameras turned by "
-        f"{with_sigma(np.degrees(angle), turn, 'deg')}, focal lengths [px] {', '.join(focal)}"
+        f"baseline {measured(1e3 * rig.baseline, baseline, 'mm')}, cameras turned by "
+        f"{measured(np.degrees(angle), turn, 'deg')}, focal lengths [px] {', '.join(focal)}"
     )
 
 
@@ -122,7 +122,7 @@ def _shared_lines(details: Mapping[str, Any]) -> Iterable[Row]:
     if abs(size.get("share", 0.0) * size.get("by_dots", 0.0)) > LEAST_SIZE:
         yield (
             "size",
-            f"by the disc's dots lengths are {with_sigma(100 * size['by_dots'], 100 * size['sigma'])} % longer than "
+            f"by the disc's dots lengths are {measured(100 * size['by_dots'], 100 * size['sigma'])} % longer than "
             f"by the board; {100 * size['share']:.0f} % of that is taken over",
         )
 

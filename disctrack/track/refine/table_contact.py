@@ -30,7 +30,7 @@ from calibration.cameras.camera import N_RIG, WORLD_SHIFT, WORLD_TURN, Allowance
 from calibration.kit.arrays import Array, robust_sigma
 from disctrack import frames
 from disctrack.disc import Disc
-from disctrack.findings import with_sigma
+from disctrack.numbers import measured
 from disctrack.track.pose import PoseFits
 from disctrack.track.side_by_side import AT_ONCE
 
@@ -70,8 +70,8 @@ class TableFromDisc:
         z, *slopes = self.plane
         sigma = np.hypot(self.sigma, self.board_sigma)
         told = (
-            f"by the disc's rim the table lies {with_sigma(1e6 * z, 1e6 * sigma[0], 'um')} from the board's, turned by "
-            f"{with_sigma(np.degrees(np.hypot(*slopes)) * 1e3, np.degrees(sigma[1:].max()) * 1e3, 'mdeg')}"
+            f"by the disc's rim the table lies {measured(1e6 * z, 1e6 * sigma[0], 'um')} from the board's, turned by "
+            f"{measured(np.degrees(np.hypot(*slopes)) * 1e3, np.degrees(sigma[1:].max()) * 1e3, 'mdeg')}"
         )
         used = {"both": "the two are combined", "board": "the board counts", "disc": "the disc counts"}[self.source]
         return f"{told}; {used} ([table] from)"
