@@ -251,8 +251,6 @@ FAULTS = {  # what is wrong; the kind that check names first, words of it, and w
     "three frames late": (lambda f: renumber_right(f, 3), Kind.DELAY, "Number its images higher by 3", True),
     "lens cap": (lambda f: darkened(f, "left", np.zeros_like), Kind.LIGHT, "of one grey", True),
     "too bright": (lambda f: darkened(f, "left", lambda image: cv2.add(image, 90)), Kind.LIGHT, "clipped", False),
-    "a broken file": (lambda f: (f / "left/000150.png").unlink() or (f / "left/000150.png").write_bytes(b"no image"),
-                      Kind.FRAMES_LOST, "of 120 frames", False),
     "one moment twice": (lambda f: repeat_left(f), Kind.REPEATED_IMAGES, "copies of earlier ones", True),
 }  # fmt: skip
 
