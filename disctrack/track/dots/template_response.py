@@ -12,7 +12,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from scipy.interpolate import RegularGridInterpolator
+import scipy
 
 from calibration.kit.arrays import Array
 from disctrack.track.dots.template import TYPICAL_BLUR_PX, NoiseModel
@@ -54,7 +54,7 @@ def _tabulated(radius: float, affine: Array, edge: Edge, changes: Changes) -> Ar
     if not known.any():
         return np.full((*size.shape, 1), np.nan)
     sizes = np.linspace(size[known].min(), size[known].max() * (1 + 1e-9), SIZES)
-    table = RegularGridInterpolator(
+    table = scipy.interpolate.RegularGridInterpolator(
         (sizes, np.log(SHAPES)), _response(sizes, edge, changes), bounds_error=False, fill_value=None
     )
     size, shape = np.where(known, size, sizes[0]), np.clip(np.where(known, shape, 1.0), SHAPES[0], SHAPES[-1])
