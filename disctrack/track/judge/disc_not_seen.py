@@ -16,8 +16,8 @@ from dataclasses import dataclass, replace
 from itertools import chain, islice
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial.distance import pdist
 
 from calibration.cameras.camera import N_RIG, PAIR_SHIFT, PAIR_TURN, StereoRig, triangulate
 from calibration.kit.arrays import Array, Mask
@@ -183,7 +183,8 @@ def _seen_dots(pair: NDArray, rig: StereoRig, disc: Disc) -> Iterator[SeenDots]:
             continue
         pixels = blobs[:, which, :2]
         points = triangulate(pixels, rig)
-        ratios = pdist(points) / pdist(disc.marker_centres_body[which])
+        apart = scipy.spatial.distance.pdist
+        ratios = apart(points) / apart(disc.marker_centres_body[which])
         scale = float(np.median(ratios))
         misfit = float(np.abs(rig.project(points) - pixels).max())
         if misfit < EPIPOLAR_PX and scale > 0 and np.abs(ratios / scale - 1).max() < MISPLACED:
