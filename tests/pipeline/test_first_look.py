@@ -242,7 +242,7 @@ FAULTS = {  # what is wrong; the kind that check names first, words of it, and w
     "short side first": (lambda f: declare(f, "[9, 6]", "[6, 9]"), Kind.CORNERS, "[9, 6] would fit", True),
     "wrong view": (lambda f: declare(f, "view = 0 ", "view = 3 "), Kind.TABLE_VIEW, "0 would fit (declared 3)", True),
     "board of no thickness": (lambda f: declare(f, "board_thickness_mm = 3.0", "board_thickness_mm = 0.0"),
-                              Kind.BOARD_THICKNESS, "_mm: 3.00 would fit", True),
+                              Kind.BOARD_THICKNESS, "board_thickness_mm: 3.00 would fit", True),
     "wrong thickness": (lambda f: declare(f, "\nthickness_mm = 6.0", "\nthickness_mm = 6.5"), Kind.THICKNESS,
                         "_mm: 6.00 would fit", True),
     "cameras exchanged": (exchange, Kind.EXCHANGED, "the left and right images are exchanged", True),
