@@ -24,7 +24,7 @@ def short(report: Report, width: int = WIDTH, *, colour: bool = False) -> list[s
     last = _entry("page", "" if report.page is None else str(report.page), width) + _entry("next", report.then, width)
     entries = [_cut(_entry(grave, said, width)) for grave, said in report.graver_first()]
     room = MOST_LINES - len(first) - len(last)
-    while sum(map(len, entries)) > room - (len(entries) < len(report.findings)) and entries:
+    while sum(map(len, entries)) > room - (len(entries) < len(report.findings)) and len(entries) > 1:
         entries.pop()
     more = len(report.findings) - len(entries)
     also = _entry("", f"and {more} more: -v shows {'it' if more == 1 else 'them'}" if more else "", width)
