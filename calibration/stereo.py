@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.board.chessboard import BoardNotFound, CornerView
+from calibration.board.chessboard import BoardNotFound, CornerView, negatives
 from calibration.board.search import Progress, located
 from calibration.board.target import Board, Target
 from calibration.cameras.camera import CAMERA_NAMES, StereoRig
@@ -160,7 +160,9 @@ def calibrate_stereo(
     views = located([*left, *right], board, progress)
     n = len(left_images)
     found = calibrate_from_corners(views[:n], views[n:], board, settings, table_view, board_thickness, names)
-    return replace(found, warnings=(*(note for note in (note_left, note_right) if note), *found.warnings))
+    seen = [view for side in found.corner_views for view in side]
+    negative = negatives([*left, *right], seen, board) if isinstance(board, Board) else ""
+    return replace(found, warnings=(*filter(None, (negative, note_left, note_right)), *found.warnings))
 
 
 def check_sizes(left: Sequence[NDArray], right: Sequence[NDArray], names: Sequence[tuple[str, str]]) -> None:

@@ -3,6 +3,7 @@
 OpenCV finds the board roughly; `corner_fit` locates the corners.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -10,12 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.board.corner_fit import CornerView, fit_view, local_axes
-from calibration.board.target import board_orders
+from calibration.board.target import Board, board_orders
 from calibration.kit.arguments import checked
 from calibration.kit.arrays import Array
 from calibration.kit.errors import ArgumentError
 from calibration.kit.grey_levels import level_step
 
+MARGIN = 1.15  # squares from the outermost corners: just outside the printed ones
 SEARCH_SIZE = 1600  # px: larger images are reduced for the rough search, which takes seconds on them otherwise
 MIN_ALTERNATION = 0.6  # share of neighbouring squares that are dark and light in turn, less those that are not
 LEAST_CORNERS = 12  # 3 x 4: what is smaller is found by chance among dots and shadows
@@ -249,4 +251,50 @@ def _saddles(grey: Array, points: Array, axes: Array) -> Array:
     return np.where(inside[:, 0, 0], np.where(lighter > 0, lighter, -np.maximum(darker, 0.0)), np.nan)
 
 
-__all__ = ["BoardNotFound", "CornerView", "board_in", "board_orders", "find_corners", "grey_values"]
+def negatives(images: Sequence[NDArray], views: Sequence[CornerView | BoardNotFound], board: Board) -> str:
+    """What makes images of a chessboard look like negatives, in words; "" where nothing does.
+
+    Its own marks cannot: the colouring of a negative is that of the board turned by 180 deg.
+    """
+    dark = [
+        margin_is_dark(image, view.points[view.accepted], board.points[view.accepted], board)
+        for image, view in zip(images, views, strict=True)
+        if isinstance(view, CornerView)
+    ]
+    if not dark or np.mean(dark) <= 0.5:
+        return ""
+    return (
+        "the paper round the board's squares is as dark as its dark squares: are the images negative? Then the lab "
+        "frame is turned by 180 deg"
+    )
+
+
+def margin_is_dark(image: NDArray, corners: Array, points: Array, board: Board) -> bool:
+    """Whether the paper just outside a chessboard's squares is as dark as the dark squares.
+
+    corners (n, 2) [px] in the image of points (n, 3) [m] of the board. False where too little of it is in view.
+    """
+    flat, _ = cv2.findHomography(points[:, :2], corners)
+    columns, rows = board.inner_corners
+    if flat is None:
+        return False
+
+    def grey(i: NDArray, j: NDArray) -> Array:
+        places = np.stack([i, j], axis=-1).reshape(1, -1, 2) * board.square
+        x, y = np.rint(cv2.perspectiveTransform(places, flat)[0]).astype(int).T
+        inside = (x >= 0) & (y >= 0) & (x < image.shape[1]) & (y < image.shape[0])
+        return np.asarray(image[y[inside], x[inside]].reshape(inside.sum(), -1).mean(axis=1))
+
+    i, j = np.meshgrid(np.arange(columns - 1) + 0.5, np.arange(rows - 1) + 0.5)
+    squares = grey(i, j)
+    along, across = np.arange(columns), np.arange(rows)
+    edges = [(along, np.full(columns, -MARGIN)), (along, np.full(columns, rows - 1 + MARGIN))]
+    edges += [(np.full(rows, -MARGIN), across), (np.full(rows, columns - 1 + MARGIN), across)]
+    margin = np.concatenate([grey(*edge) for edge in edges])
+    if len(margin) < columns + rows or not len(squares):
+        return False
+    light, dark = np.quantile(squares, [0.8, 0.2])
+    return bool(np.median(margin) < dark + 0.25 * (light - dark))
+
+
+__all__ = ["BoardNotFound", "CornerView", "board_in", "board_orders", "find_corners", "grey_values", "negatives"]

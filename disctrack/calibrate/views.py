@@ -5,16 +5,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
-import numpy as np
 from numpy.typing import NDArray
 
 from calibration import CalibrationSettings, StereoCalibration, calibrate_stereo
-from calibration.board.corner_fit import CornerView
 from calibration.board.search import Progress
-from calibration.board.target import Board, Target
+from calibration.board.target import Target
 from calibration.kit.arguments import Thickness, checked
-from calibration.kit.arrays import Array
 from calibration.kit.brief import Outline
 from disctrack.errors import RecordingError
 from disctrack.frames import CAMERAS
@@ -26,7 +22,6 @@ from disctrack.recording.readers.files import IMAGES, content_of, file_number, m
 from disctrack.recording.readers.flat_field import FlatField, FlatFields, flat_fields
 from disctrack.recording.readers.part import ImagePart, ImageParts, image_parts
 
-MARGIN = 1.15  # squares from the outermost corners: just outside the printed ones
 MOST_VIEWS = 500  # ten times what a calibration needs; corners of one more take as long as those of the first
 
 
@@ -185,46 +180,7 @@ def calibrate_views(
     names = [(str(views.left[i]), str(views.right[i])) for i in used]
     position = None if table_view is None else used.index(table_view)
     found = calibrate_stereo(*images, target, settings, position, board_thickness, names, progress)
-    dark = [
-        margin_is_dark(images[camera][view], corners.points[corners.accepted], target.points[corners.accepted], target)
-        for camera, of_camera in enumerate(found.corner_views)
-        for view, corners in enumerate(of_camera)
-        if isinstance(corners, CornerView) and isinstance(target, Board)
-    ]
-    if dark and np.mean(dark) > 0.5:
-        problems.append(
-            "the paper round the board's squares is as dark as its dark squares: are the images negative? Then the lab "
-            "frame is turned by 180 deg"
-        )
     return found, tuple(problems)
-
-
-def margin_is_dark(image: NDArray, corners: Array, points: Array, board: Board) -> bool:
-    """Whether the paper just outside a chessboard's squares is as dark as the dark squares.
-
-    corners (n, 2) [px] in the image of points (n, 3) [m] of the board. False where too little of it is in view.
-    """
-    flat, _ = cv2.findHomography(points[:, :2], corners)
-    columns, rows = board.inner_corners
-    if flat is None:
-        return False
-
-    def grey(i: NDArray, j: NDArray) -> Array:
-        places = np.stack([i, j], axis=-1).reshape(1, -1, 2) * board.square
-        x, y = np.rint(cv2.perspectiveTransform(places, flat)[0]).astype(int).T
-        inside = (x >= 0) & (y >= 0) & (x < image.shape[1]) & (y < image.shape[0])
-        return np.asarray(image[y[inside], x[inside]].reshape(inside.sum(), -1).mean(axis=1))
-
-    i, j = np.meshgrid(np.arange(columns - 1) + 0.5, np.arange(rows - 1) + 0.5)
-    squares = grey(i, j)
-    along, across = np.arange(columns), np.arange(rows)
-    edges = [(along, np.full(columns, -MARGIN)), (along, np.full(columns, rows - 1 + MARGIN))]
-    edges += [(np.full(rows, -MARGIN), across), (np.full(rows, columns - 1 + MARGIN), across)]
-    margin = np.concatenate([grey(*edge) for edge in edges])
-    if len(margin) < columns + rows or not len(squares):
-        return False
-    light, dark = np.quantile(squares, [0.8, 0.2])
-    return bool(np.median(margin) < dark + 0.25 * (light - dark))
 
 
 def _pixels(view: View, flat: FlatField | None, part: ImagePart | None) -> NDArray:

@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
+from calibration.board.chessboard import margin_is_dark
 from calibration.board.target import Board
-from disctrack.calibrate.views import margin_is_dark
 
 
 @pytest.mark.parametrize("margin", [0.3, 1.0])
