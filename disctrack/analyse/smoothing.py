@@ -132,30 +132,36 @@ def _segment_likelihood(modes: list[tuple[Array, Array]], data: Array, variance:
 def window_weights(lag: Array, noise_ratio: Array, length: float) -> tuple[Array, Array]:
     """Weights that turn the samples of a window into value, first and second derivative at lag 0.
 
-    lag : (w,) times of the samples relative to the point, in intervals
-    noise_ratio : (w,) noise variance over A^2; infinite where there is no sample
-    returns : weights (3, w) per interval^order; prior (3, 3), the covariance in units of A^2 that would remain
+    lag : (u, w) times of the samples relative to the point, in intervals
+    noise_ratio : (u, w) noise variance over A^2; infinite where there is no sample
+    returns : weights (u, 3, w) per interval^order; prior (u, 3, 3), the covariance in units of A^2 that would remain
         without noise: what the samples leave open in gaps and at the ends
     """
     seen = np.isfinite(noise_ratio)
-    at = lag[seen]
-    cross, K = _cross_covariance(at, length), kernel(at[:, None] - at, length)
-    basis = np.stack([np.ones_like(at), at / length])  # (2, w)
-    solved = np.linalg.solve(K + np.diag(noise_ratio[seen]), np.concatenate([cross, basis]).T).T
-    from_process, from_basis = solved[:3], solved[3:]
-    target = np.array([[1.0, 0.0], [0.0, 1.0 / length], [0.0, 0.0]])  # value, slope, curvature of (1, lag / l)
-    missing = target - from_process @ basis.T
-    chosen = from_process + missing @ np.linalg.solve(from_basis @ basis.T, from_basis)
-    mixed = chosen @ cross.T
-    weights = np.zeros((3, len(lag)))
-    weights[:, seen] = chosen
-    return weights, chosen @ K @ chosen.T - mixed - mixed.T + _own_covariance(length)
+    mask = seen.astype(float)
+    cross = _cross_covariance(lag, length) * mask[:, None, :]
+    alike = lag[:1] if (lag == lag[0]).all() else lag  # of frames at one interval all windows are
+    K = kernel(alike[:, :, None] - alike[:, None, :], length) * mask[:, :, None] * mask[:, None, :]
+    diagonal = np.arange(lag.shape[1])
+    sigma = K.copy()
+    sigma[:, diagonal, diagonal] += np.where(seen, noise_ratio, 1.0)
+    basis = np.stack([np.ones_like(lag), lag / length], axis=1) * mask[:, None, :]  # (u, 2, w)
+    solved = np.linalg.solve(sigma, np.concatenate([cross, basis], axis=1).swapaxes(1, 2)).swapaxes(1, 2)
+    from_process, from_basis = solved[:, :3], solved[:, 3:]
+    gram = from_basis @ basis.swapaxes(1, 2)
+    target = np.zeros((3, 2))  # value and slope of (1, lag / l) at the point, and no curvature
+    target[0, 0], target[1, 1] = 1.0, 1.0 / length
+    missing = target - from_process @ basis.swapaxes(1, 2)
+    weights = from_process + missing @ np.linalg.solve(gram, from_basis)
+    mixed = weights @ cross.swapaxes(1, 2)
+    prior = weights @ K @ weights.swapaxes(1, 2) - mixed - mixed.swapaxes(1, 2) + _own_covariance(length)
+    return weights, prior
 
 
 def _cross_covariance(lag: Array, length: float) -> Array:
-    """Covariance (3, w) of value, slope and curvature at lag 0 with the values at `lag`."""
+    """Covariance (u, 3, w) of value, slope and curvature at lag 0 with the values at `lag`."""
     k = kernel(lag, length)
-    return np.stack([k, lag / length**2 * k, (lag**2 / length**2 - 1) / length**2 * k])
+    return np.stack([k, lag / length**2 * k, (lag**2 / length**2 - 1) / length**2 * k], axis=1)
 
 
 def _own_covariance(length: float) -> Array:
@@ -170,19 +176,20 @@ def moving_weights(
     process: Process,
     half_window: int,
     part: NDArray[np.int64],
-    points: NDArray[np.int64],
+    points: NDArray[np.int64] | None = None,
 ) -> tuple[Array, Array]:
     """Weights (k, 3, 2 half_window + 1) and remaining prior covariance (k, 3, 3) for some samples.
 
     times : (n,) in sample intervals; variance : (n,) stated, infinite where there is no sample
     part : (n,) number of the stretch that a sample belongs to; windows do not reach across
-    points : (k,) which samples
+    points : (k,) which samples; without it all n
     Derivatives are per interval. The ends are windows whose outer samples are missing. Windows with the same length,
     ratio and pattern of noise share one solution; noise is told apart in factors of two for this purpose (weights may
     be slightly off the optimum, their covariance is exact). A window with fewer than MIN_WINDOW_SAMPLES samples has
     no weight and an infinite prior covariance.
     """
     n, w = len(times), half_window
+    points = np.arange(n) if points is None else points
     index = points[:, None] + np.arange(-w, w + 1)
     inside = (index >= 0) & (index < n)
     clipped = np.clip(index, 0, n - 1)
@@ -194,15 +201,23 @@ def moving_weights(
     patterns = np.where(inside, noise_class[clipped], np.inf)
     ratio = np.round(2 * np.log10(process.amplitude2[points] / (typical * process.noise_scale))) / 2
     weights, prior = np.zeros((len(points), 3, 2 * w + 1)), np.full((len(points), 3, 3), np.inf)
-    known: dict[tuple[float, float, bytes, bytes], tuple[Array, Array]] = {}
-    for row, length in enumerate(process.length[points].tolist()):
+    lengths = process.length[points]
+    for length in np.unique(lengths):
         reach = min(w, int(np.ceil(HALF_WINDOW_LENGTHS * length)))
         columns = slice(w - reach, w + reach + 1)
-        pattern, times_in = patterns[row, columns], lag[row, columns]
-        if np.isfinite(pattern).sum() < MIN_WINDOW_SAMPLES:
+        enough = np.isfinite(patterns[:, columns]).sum(axis=1) >= MIN_WINDOW_SAMPLES
+        rows = np.flatnonzero((lengths == length) & enough)
+        if rows.size == 0:
             continue
-        key = length, float(ratio[row]), pattern.tobytes(), times_in.tobytes()
-        if key not in known:
-            known[key] = window_weights(times_in, 2.0**pattern / 10.0 ** ratio[row], length)
-        weights[row, :, columns], prior[row] = known[key]
+        keys = np.concatenate([ratio[rows, None], patterns[rows, columns], lag[rows, columns]], axis=1)
+        unique, inverse = np.unique(keys, axis=0, return_inverse=True)
+        size = 2 * reach + 1
+        for start in range(0, len(unique), 256):
+            block = unique[start : start + 256]
+            noise = 2.0 ** block[:, 1 : 1 + size] / 10.0 ** block[:, :1]
+            chosen = np.flatnonzero((inverse.ravel() >= start) & (inverse.ravel() < start + 256))
+            W, P = window_weights(block[:, 1 + size :], noise, float(length))
+            which = inverse.ravel()[chosen] - start
+            weights[rows[chosen], :, columns] = W[which]
+            prior[rows[chosen]] = P[which]
     return weights, prior * process.amplitude2[points, None, None]
