@@ -2,8 +2,8 @@
 
 Each column is one more run of the same compiled integrator with an imaginary part of 1e-30 on one number (complex-step
 derivative): no difference is taken, and the way in which the instants of the switches between rolling, slip and flight
-move is included. Columns that follow from a symmetry of the model are written down: where nothing tells one place of
-the table, or one angle of the body, from another, a motion that begins elsewhere is the same motion there.
+move is included. Columns that follow from a symmetry of the model are written down: where nothing tells one place or
+direction of the table, or one angle of the body from another, a motion that begins elsewhere is the same motion there.
 """
 
 from collections.abc import Iterator, Sequence
@@ -28,6 +28,8 @@ from disctrack.rolling.state import State, steady_precession
 _SEED = 1e-30  # imaginary part; its square is far below the smallest rounding
 _UNEVEN = ("curvature", "slope_x", "slope_y", "oval_c", "oval_s", "lobes_c", "lobes_s", "flat_depth")
 _ASKEW = ("com_1", "com_2", "J_12", "J_13", "J_23")  # of a body that is not the same all round its axis
+# What a law reads that tells one direction of the table from another.
+_OF_DIRECTION = {"x", "y", "psi", *(f"{v}{a}" for v in ("table_", "table_v", "table_a", "field_") for a in "xy")}
 
 
 @dataclass(frozen=True)
@@ -73,10 +75,12 @@ def sensitivities(
     spent = path.slip_steps
     found[: len(path.now), :, 0] = _numbers(path)
     if path.end is not EndReason.CHATTER:
-        same = symmetries(enlarged, assembly)
+        same = symmetries(enlarged, assembly) - ({"psi"} if len(y0) > 8 else set())  # a slip at the start turns, too
         for column, name in enumerate(names, start=1):
             if name in same and column <= len(components):
                 found[: len(path.now), :, column] = [float(name == n) for n in _NUMBERS]
+                if name == "psi":
+                    _turn(found[..., column], found[..., 0])
                 continue
             y, values = y0.astype(complex), {}
             if column <= len(components):
@@ -100,15 +104,24 @@ def _numbers(path: Path) -> Numbers:
     return np.concatenate([*path.as_seen, columns(path.now, *ROLLING_COMPONENTS)], axis=1)
 
 
+def _turn(column: Array, motion: Array) -> None:
+    """Add to a column what a turn of the motion about the vertical through where it begins moves: K x v."""
+    moved = motion[:, :2] - motion[0, :2]
+    for first, (x, y) in ((0, moved.T), (6, motion[:, 6:8].T), (12, moved.T)):  # place, velocity, place in the state
+        column[:, first], column[:, first + 1] = -y, x
+
+
 def symmetries(model: Model, assembly: Assembly) -> set[str]:
-    """Those of x, y, phi at the start on which nothing depends but where, and which way round, the motion is."""
+    """Those of x, y, psi, phi at the start on which nothing depends but where, and which way round, the motion is."""
     if any(assembly.constant(name) != 0.0 for name in _UNEVEN):
         return set()
     reads = {name for e in model.effects if e.law is not None for name in _names(type(e).law.__code__)}
     askew = any(assembly.constant(name) != 0.0 for name in _ASKEW)
     if askew or assembly.constant("J_11") != assembly.constant("J_22"):
         reads.add("phi")
-    return {"x", "y", "phi"} - reads
+    if _OF_DIRECTION & reads or assembly.constant("g_x") != 0.0 or assembly.constant("g_y") != 0.0:
+        reads.add("psi")
+    return {"x", "y", "psi", "phi"} - reads
 
 
 def _names(code: CodeType) -> Iterator[str]:
