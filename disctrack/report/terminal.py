@@ -28,7 +28,7 @@ def short(report: Report, width: int = WIDTH, *, colour: bool = False) -> list[s
         entries.pop()
     more = len(report.findings) - len(entries)
     also = _entry("", f"and {more} more: -v shows {'it' if more == 1 else 'them'}" if more else "", width)
-    lines = [*_around(first, entries), *also, *last]
+    lines = [*_around(first, entries, report), *also, *last]
     return [_coloured(line) for line in lines] if colour else lines
 
 
@@ -36,7 +36,7 @@ def full(report: Report, width: int = WIDTH) -> list[str]:
     """All of it."""
     first = _entry("verdict", report.verdict, width) + _entry("accuracy", report.accuracy, width)
     lines = [report.title, ""] if report.title else []
-    lines += _around(first, [_entry(grave, said, width) for grave, said in report.graver_first()])
+    lines += _around(first, [_entry(grave, said, width) for grave, said in report.graver_first()], report)
     lines += _facts(report.facts, width) + _blocks(report.blocks, width)
     lines += _entry("page", "" if report.page is None else str(report.page), width)
     for i, file in enumerate(report.files):
@@ -44,10 +44,10 @@ def full(report: Report, width: int = WIDTH) -> list[str]:
     return lines + _entry("next", report.then, width)
 
 
-def _around(result: list[str], findings: list[list[str]]) -> list[str]:
-    """The result between the findings that put it in doubt and the others, of which they are the first."""
-    n = sum(entry[0].startswith(("doubt", "refusal")) for entry in findings)
-    return [*chain(*findings[:n]), *result, *chain(*findings[n:])]
+def _around(result: list[str], entries: list[list[str]], report: Report) -> list[str]:
+    """The result between the entries of the findings that put it in doubt, which are the first, and of the others."""
+    n = sum(finding.doubtful for finding in report.findings)
+    return [*chain(*entries[:n]), *result, *chain(*entries[n:])]
 
 
 def show(report: Report, stream: TextIO | None = None, *, verbose: bool = False) -> None:
