@@ -438,21 +438,33 @@ OF_VIEWS = {
 
 
 def faults_validation(outcomes: Sequence[FaultOutcome]) -> Validation:
-    """A table for each recording, and what must not be."""
+    """What is named from which size on in each recording, and what must not be."""
     off = [o for o in outcomes if np.nanmax([o.position, o.rotation, 0.0]) > MOST_SIGMAS]
     headline = (
         f"Of {len(outcomes)} planted faults {len(off)} move a pose by more than {MOST_SIGMAS:g} stated sigmas; "
         f"{sum(o.named for o in off)} of these are named."
     )
-    tables = [_table(make, [o for o in outcomes if o.make == make]) for make in dict.fromkeys(o.make for o in outcomes)]
-    return Validation("faults", headline, tables, outcomes, tuple(filter(None, (o.complaint for o in outcomes))))
+    complaints = tuple(filter(None, (o.complaint for o in outcomes)))
+    return Validation("faults", headline, [_limits(outcomes)], outcomes, complaints)
 
 
-def _table(make: str, outcomes: Sequence[FaultOutcome]) -> Table:
-    rows = []
+def _limits(outcomes: Sequence[FaultOutcome]) -> Table:
+    """A line for each fault; what one camera or the other has is one."""
+    makes = list(dict.fromkeys(o.make for o in outcomes))
+    groups: dict[tuple[str, str], list[FaultOutcome]] = {}
     for o in outcomes:
-        numbers = [f"{o.size:.3g} {o.unit}".strip(), figure(o.position, 2), figure(o.rotation, 2)]
-        rows.append([o.fault, *numbers, o.told or "-", str(o.code), figure(o.times, 2)])
-    head = ["fault", "size", "position, sigma", "rotation, sigma", "named by", "exit", "time"]
-    note = "Largest error of a pose in its stated sigmas. In brackets: another finding. Time: over an ordinary run's."
-    return Table(f"Planted into a recording: {make}", head, rows, note)
+        fault = o.fault.removeprefix("left_").removeprefix("right_").replace("_", " ")
+        groups.setdefault((fault, o.unit or "-"), []).append(o)
+    rows = []
+    for fault_and_unit, of_fault in groups.items():
+        row = list(fault_and_unit)
+        for make in makes:
+            planted = [o for o in of_fault if o.make == make]
+            unnamed = [o for o in planted if not o.named]
+            named = [o.size for o in planted if all(o.size > other.size for other in unnamed)]
+            worst = max((np.nanmax([o.position, o.rotation, 0.0]) for o in unnamed), default=np.nan)
+            row += [figure(min(named, default=np.nan)), figure(worst, 2)]
+        rows.append(row)
+    head = ["fault", "unit", *(f"{make}: {what}" for make in makes for what in ("named from", "unnamed, sigma"))]
+    note = "Named at this size and at all larger ones that were planted. Unnamed: the largest error of a pose in its "
+    return Table("Detection limits", head, rows, note + "stated sigmas that nothing named.")

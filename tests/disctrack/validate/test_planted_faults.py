@@ -45,7 +45,13 @@ def test_a_pose_beyond_its_sigmas_that_nothing_names_is_a_complaint(outcome, sai
     (complaint,) = faults_validation([outcome]).complaints or ("",)
     assert said in complaint
     assert bool(said) == bool(complaint)
-    assert f"| {outcome.fault} | 0.0003 rad |" in faults_validation([outcome]).markdown()
+
+
+def test_the_table_tells_from_which_size_on_a_fault_is_named_and_what_was_missed_below():
+    small, large = replace(WELL, size=1e-5, position=1.2, named=False), replace(WELL, size=1e-3, position=90.0)
+    filmed = [replace(one, make="clip", named=not one.named) for one in (small, WELL, large)]
+    lines = faults_validation([large, small, WELL, *filmed]).markdown().splitlines()
+    assert "| turned | rad | 0.0003 | 1.2 | - | 90 |" in lines
 
 
 def test_every_fault_of_the_catalogue_that_a_run_can_show_is_planted(sample_clip, tmp_path):
