@@ -8,11 +8,11 @@ from pathlib import Path
 from disctrack.errors import RecordingError
 from disctrack.files.text import printable
 from disctrack.recording.declaration import FILE_NAME
-from disctrack.recording.readers.files import FORMATS, IMAGES, natural_key
+from disctrack.recording.readers.files import FORMATS, IMAGES, SUFFIXES, natural_key
 
 RESULTS = "results"  # beside a recording's images
 FOLDER = "batch_results"  # of a batch, for what belongs to no single recording
-_FILMS = FORMATS["video"] | FORMATS["mraw"] | FORMATS["cine"]
+_FILMS = SUFFIXES - IMAGES - FORMATS["hdf5"]  # of which two in a folder may be the cameras
 
 
 @dataclass(frozen=True)

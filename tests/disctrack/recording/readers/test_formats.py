@@ -79,7 +79,7 @@ class Format:
         return f"{self.suffix}-{self.bits}-" + "-".join(str(v) for v in self.options.values())
 
 
-FORMATS = [
+TIFFS = [
     *(
         Format("tif", bits, write_tiff, options)
         for bits in (8, 16)
@@ -93,28 +93,31 @@ FORMATS = [
         )
     ),
     *(Format("tiff", bits, write_pages_by_opencv, {"compression": c}) for bits in (8, 16) for c in (1, 5, 8, 32773)),
+]
+STACKS = [
     Format("h5", 8, write_hdf5, {}),
     Format("h5", 16, write_hdf5, {"chunks": (1, HEIGHT, WIDTH), "compression": "gzip", "shuffle": True}),
     Format("h5", 8, write_hdf5, {"chunks": (1, HEIGHT, WIDTH), "compression": "gzip"}),
     Format("h5", 16, write_hdf5, {"chunks": (1, HEIGHT, WIDTH), "compression": "gzip", "fletcher32": True}),
     Format("h5", 8, write_hdf5, {"chunks": (7, 10, WIDTH), "compression": "lzf", "fletcher32": True}),
-    *(
-        Format(suffix, bits, write_video, {"pixels": pixels, "codec": codec, **options})
-        for suffix, bits, pixels, codec, options in (
-            ("mkv", 8, "gray", "ffv1", {}),
-            ("mkv", 10, "gray10le", "ffv1", {}),
-            ("mkv", 12, "gray12le", "ffv1", {}),
-            ("avi", 16, "gray16le", "ffv1", {"g": "1"}),
-            ("mp4", 8, "gray", "ffv1", {}),
-            ("avi", 8, "gray", "rawvideo", {}),
-            ("mkv", 8, "gray", "rawvideo", {}),
-            ("mkv", 8, "yuv420p", "ffv1", {}),
-            ("mkv", 10, "yuv420p10le", "ffv1", {}),
-            ("avi", 8, "yuv420p", "rawvideo", {}),
-            ("mp4", 8, "yuv420p", "libx264", {"qp": "0", "g": "10", "bf": "2"}),
-        )
-    ),
 ]
+VIDEOS = [
+    Format(suffix, bits, write_video, {"pixels": pixels, "codec": codec, **options})
+    for suffix, bits, pixels, codec, options in (
+        ("mkv", 8, "gray", "ffv1", {}),
+        ("mkv", 10, "gray10le", "ffv1", {}),
+        ("mkv", 12, "gray12le", "ffv1", {}),
+        ("avi", 16, "gray16le", "ffv1", {"g": "1"}),
+        ("mp4", 8, "gray", "ffv1", {}),
+        ("avi", 8, "gray", "rawvideo", {}),
+        ("mkv", 8, "gray", "rawvideo", {}),
+        ("mkv", 8, "yuv420p", "ffv1", {}),
+        ("mkv", 10, "yuv420p10le", "ffv1", {}),
+        ("avi", 8, "yuv420p", "rawvideo", {}),
+        ("mp4", 8, "yuv420p", "libx264", {"qp": "0", "g": "10", "bf": "2"}),
+    )
+]
+FORMATS = [*TIFFS, *STACKS, *VIDEOS]
 
 
 @pytest.mark.parametrize("kind", FORMATS, ids=str)
@@ -133,7 +136,7 @@ def test_frames_come_back_as_they_were_written_in_any_order(tmp_path, kind):
         assert any("not stretched" in note for note in reader.notes)
 
 
-@pytest.mark.parametrize("kind", FORMATS[:1] + FORMATS[-13:-12] + FORMATS[-11:], ids=str)
+@pytest.mark.parametrize("kind", [TIFFS[0], STACKS[3], *VIDEOS], ids=str)
 def test_blocks_of_both_cameras_hold_every_pair(tmp_path, kind):
     both = [frames_of(kind.bits, seed) for seed in (1, 2)]
     for name, frames in zip(("left", "right"), both, strict=True):
@@ -145,7 +148,7 @@ def test_blocks_of_both_cameras_hold_every_pair(tmp_path, kind):
             assert_array_equal(block.images[:, camera], frames[block.frames])
 
 
-@pytest.mark.parametrize("kind", [FORMATS[0], FORMATS[4], *(k for k in FORMATS if k.suffix in ("h5", "mkv"))], ids=str)
+@pytest.mark.parametrize("kind", [TIFFS[0], TIFFS[4], *STACKS, *(k for k in VIDEOS if k.suffix == "mkv")], ids=str)
 def test_the_content_hash_tells_a_changed_frame_and_nothing_else(tmp_path, kind):
     frames = frames_of(kind.bits)
     changed = frames.copy()
@@ -376,7 +379,7 @@ def test_a_damaged_packet_costs_its_frames_up_to_the_next_key_frame_and_no_other
             assert_array_equal(reader.read(index), frames[index])
 
 
-@pytest.mark.parametrize("kind", FORMATS[::3], ids=str)
+@pytest.mark.parametrize("kind", FORMATS, ids=str)
 def test_a_file_cut_short_loses_its_end_and_says_so(tmp_path, kind):
     frames = frames_of(kind.bits)
     path = tmp_path / f"left.{kind.suffix}"
