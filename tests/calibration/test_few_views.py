@@ -50,7 +50,7 @@ def test_a_board_that_is_told_to_be_flat_and_is_not_is_in_the_sigmas(rng, size, 
     )
     ratio, told = mean_square(16, board="flat", rigs=12, displaced=displaced)
     assert least < ratio < most  # 2.8 without
-    named = sum("taken as flat, as told, but the views show another shape" in text for text in told)
+    named = sum("taken as flat, requested, but the views show another shape" in text for text in told)
     assert named >= 8 if size else named == 0  # where a small bend pulls by less than a sigma, nothing is said
 
 
