@@ -18,11 +18,11 @@ numba, because one view is some 10^6 evaluations of this model: 0.05 s compiled.
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 
-from calibration.kit.compiled import njit
+from calibration.kit._cholesky import solve_in_place
+from calibration.kit.compiled import njit, part
 
 N_CORNER = (
     9  # x, y [px], two edge angles [rad], blur sigma [px], mean grey, half contrast, relative light gradient [1/px]
@@ -38,11 +38,9 @@ _SQRT_HALF = math.sqrt(0.5)
 # What only compiled code calls has no way in from Python: that would cost as much compiling again. Nor are whole slices
 # assigned: the text of the error that numba prepares for unequal shapes takes longer to compile than a loop. A literal
 # is given as a number of NumPy's: numba compiles a function once for each literal, and once for its type.
-_OPTIONS: dict[str, Any] = {"nogil": True, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-_part = njit(**_OPTIONS)
 
 
-@_part
+@part
 def nodes(rho):  # type: ignore[no-untyped-def]
     """Quadrature over the angle 0..asin(rho): weight, sine and 1 / (2 cos^2) at each node."""
     table = np.empty((_N_NODES, 3))
@@ -55,7 +53,7 @@ def nodes(rho):  # type: ignore[no-untyped-def]
     return table
 
 
-@_part
+@part
 def blurred_saddle(h, k, rho, table, out):  # type: ignore[no-untyped-def]
     """S and its derivatives with respect to h, k and rho, into out (4,); table from `nodes(rho)`."""
     near_h, near_k = abs(h) < _FAR, abs(k) < _FAR
@@ -76,7 +74,7 @@ def blurred_saddle(h, k, rho, table, out):  # type: ignore[no-untyped-def]
     out[0], out[1], out[2], out[3] = S, S_h, S_k, S_rho
 
 
-@_part
+@part
 def normal_equations(image, window, p, known, noise, weights, first_pass, H, g):  # type: ignore[no-untyped-def]
     """Weighted sums of one corner; H (9, 9) and g (9,) are filled. Returns chi-square, and sums over pixels.
 
@@ -168,33 +166,17 @@ def normal_equations(image, window, p, known, noise, weights, first_pass, H, g):
     return sums
 
 
-@_part
-def cholesky_solve(H, damping, rhs, L):  # type: ignore[no-untyped-def]
+@part
+def solve_damped(H, damping, rhs, L):  # type: ignore[no-untyped-def]
     """Solve (H + damping diag H) x = rhs in place, H given by its lower triangle; False if not positive definite."""
-    n = H.shape[0]
-    for i in range(n):
-        for j in range(i + 1):
-            total = H[i, j] * (1.0 + damping) if i == j else H[i, j]
-            for m in range(j):
-                total -= L[i, m] * L[j, m]
-            if i == j:
-                if not total > 1e-13 * H[i, i]:
-                    return False
-                L[i, i] = math.sqrt(total)
-            else:
-                L[i, j] = total / L[j, j]
-    for i in range(n):
-        for m in range(i):
-            rhs[i] -= L[i, m] * rhs[m]
-        rhs[i] /= L[i, i]
-    for i in range(n - 1, -1, -1):
-        for m in range(i + 1, n):
-            rhs[i] -= L[m, i] * rhs[m]
-        rhs[i] /= L[i, i]
-    return True
+    for i in range(H.shape[0]):
+        for j in range(i):
+            L[i, j] = H[i, j]
+        L[i, i] = H[i, i] * (1.0 + damping)
+    return solve_in_place(L, rhs)
 
 
-@_part
+@part
 def fit_corner(image, window, p, known, noise, iterations, tolerance, covariance):  # type: ignore[no-untyped-def]
     """Levenberg-Marquardt on p (9,) in place; covariance (2, 2) of x, y is filled. Returns sums and success."""
     H, g = np.empty((N_CORNER, N_CORNER)), np.empty(N_CORNER)
@@ -210,7 +192,7 @@ def fit_corner(image, window, p, known, noise, iterations, tolerance, covariance
         if p[4] <= MIN_BLUR and g[4] < 0.0:  # held at its bound, so that the others go to their own minimum
             H[4, :4], H[5:, 4], H[4, 4], g[4] = 0.0, 0.0, 1.0, 0.0
         step = g.copy()
-        if not cholesky_solve(H, damping, step, L):
+        if not solve_damped(H, damping, step, L):
             damping = 10.0 * damping
             if damping > 1e8:
                 break
@@ -242,12 +224,12 @@ def fit_corner(image, window, p, known, noise, iterations, tolerance, covariance
     for axis in range(2):
         unit = np.zeros(N_CORNER)
         unit[axis] = 1.0
-        if not cholesky_solve(H, 0.0, unit, L):
+        if not solve_damped(H, 0.0, unit, L):
             return sums, False
         covariance[0, axis], covariance[1, axis] = unit[0], unit[1]
     if not converged:  # what is left to go may be small beside the error: the box's share of the slope is approximate
         step = g.copy()
-        cholesky_solve(H, 0.0, step, L)
+        solve_damped(H, 0.0, step, L)
         square = NEAR**2 * max(sums[0] / sums[1], 1.0)
         converged = step[0] ** 2 < square * covariance[0, 0] and step[1] ** 2 < square * covariance[1, 1]
     return sums, converged

@@ -12,6 +12,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from calibration.cameras._brown import distorted
 from calibration.cameras.splines import LensField
 from calibration.kit.arguments import checked
 from calibration.kit.arrays import Array
@@ -63,14 +64,14 @@ class Camera:
 def project(points_camera: Array, camera: Camera) -> Array:
     """Pixels (..., 2) of points (..., 3) given in the camera's own axes; NaN behind the camera."""
     a, b, _ = _on_unit_depth(points_camera)
-    xd, yd, *_ = _distorted(a, b, camera)
+    xd, yd, *_ = distorted(a, b, *camera.distortion)
     return np.stack([camera.fx * xd + camera.cx, camera.fy * yd + camera.cy], axis=-1)
 
 
 def project_with_jacobians(points_camera: Array, camera: Camera) -> tuple[Array, Array, Array]:
     """Pixels (..., 2), d pixel / d point (..., 2, 3) and d pixel / d intrinsics (..., 2, 9); NaN behind the camera."""
     a, b, iz = _on_unit_depth(points_camera)
-    xd, yd, xd_a, xd_b, yd_b = _distorted(a, b, camera)
+    xd, yd, xd_a, xd_b, yd_b = distorted(a, b, *camera.distortion)
     yd_a = xd_b
     pixels = np.stack([camera.fx * xd + camera.cx, camera.fy * yd + camera.cy], axis=-1)
 
@@ -103,20 +104,6 @@ def _on_unit_depth(points_camera: Array) -> tuple[Array, Array, Array]:
     return X * inverse, Y * inverse, inverse
 
 
-def _distorted(a: Array, b: Array, camera: Camera) -> tuple[Array, Array, Array, Array, Array]:
-    """Brown's distortion of normalised coordinates: xd, yd, dxd/da, dxd/db (= dyd/da), dyd/db."""
-    k1, k2, p1, p2, k3 = camera.distortion
-    r2 = a * a + b * b
-    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    radial_r2 = k1 + r2 * (2 * k2 + 3 * k3 * r2)  # d radial / d r2
-    xd = a * radial + 2 * p1 * a * b + p2 * (r2 + 2 * a * a)
-    yd = b * radial + p1 * (r2 + 2 * b * b) + 2 * p2 * a * b
-    xd_a = radial + 2 * a * a * radial_r2 + 2 * p1 * b + 6 * p2 * a
-    xd_b = 2 * a * b * radial_r2 + 2 * p1 * a + 2 * p2 * b
-    yd_b = radial + 2 * b * b * radial_r2 + 6 * p1 * b + 2 * p2 * a
-    return xd, yd, xd_a, xd_b, yd_b
-
-
 NEWTON_PX = 1e-6  # the last step of Newton's method
 _AT_ONCE = 16384  # points whose numbers stay in a core's cache: a whole image takes 2.5 times as long
 
@@ -134,7 +121,7 @@ def normalise(pixels: Array, camera: Camera) -> Array:
     a, b = x, y = (pixels[..., 0] - camera.cx) / camera.fx, (pixels[..., 1] - camera.cy) / camera.fy
     with np.errstate(all="ignore"):  # beyond the fold the iteration may run away; it is judged below
         for _ in range(20):
-            xd, yd, xd_a, xd_b, yd_b = _distorted(a, b, camera)
+            xd, yd, xd_a, xd_b, yd_b = distorted(a, b, *camera.distortion)
             rx, ry = x - xd, y - yd
             det = xd_a * yd_b - xd_b * xd_b
             inverse = 1.0 / det
@@ -304,7 +291,7 @@ def rotation_from_vector(v: Array) -> Array:
 
 
 @checked
-def triangulate(pixels: Array, rig: StereoRig, iterations: int = 10) -> Array:
+def triangulate(pixels: Array, rig: StereoRig) -> Array:
     """World points (n, 3) [m] seen at pixels (2 cameras, n, 2), least squares in pixels; NaN where not seen twice.
 
     pixels : as the images show them; the lens field of the rig, if it has one, is taken off first
@@ -325,7 +312,7 @@ def triangulate(pixels: Array, rig: StereoRig, iterations: int = 10) -> Array:
     points = np.full((len(good), 3), np.nan)
     normal = np.swapaxes(A[good], -1, -2) @ A[good]
     points[good] = np.linalg.solve(normal, (np.swapaxes(A[good], -1, -2) @ b[good][..., None]))[..., 0]
-    for _ in range(iterations):
+    for _ in range(10):  # Gauss-Newton: the linear solution is off by the noise times the perspective
         found, d_world, _ = rig.project_with_jacobians(points[good])
         J = np.moveaxis(d_world, 0, 1).reshape(-1, 4, 3)
         residual = np.moveaxis(pixels[:, good] - found, 0, 1).reshape(-1, 4, 1)

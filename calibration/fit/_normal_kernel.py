@@ -9,6 +9,7 @@ import math
 
 import numpy as np
 
+from calibration.cameras._projection import project_point
 from calibration.kit.compiled import njit
 
 # Columns: nine intrinsics of the left camera, nine of the right, turn and shift between them, turn and shift of the
@@ -42,21 +43,12 @@ def accumulate(view, camera, point, limit, pixels, weights, cameras, R_right_lef
         if not X[2] > 0.0:
             return False
         c = cameras[camera[i]]
-        fx, fy, p1, p2 = c[0], c[1], c[6], c[7]
-        iz = 1.0 / X[2]
-        a, b = X[0] * iz, X[1] * iz
+        fx, fy = c[0], c[1]
+        u, v_px = project_point(c, X[0], X[1], X[2], d)
+        a, b = X[0] / X[2], X[1] / X[2]
         r2 = a * a + b * b
-        radial = 1.0 + r2 * (c[4] + r2 * (c[5] + r2 * c[8]))
-        slope = c[4] + r2 * (2.0 * c[5] + 3.0 * c[8] * r2)
-        xd = a * radial + 2.0 * p1 * a * b + p2 * (r2 + 2.0 * a * a)
-        yd = b * radial + p1 * (r2 + 2.0 * b * b) + 2.0 * p2 * a * b
-        xd_a = radial + 2.0 * a * a * slope + 2.0 * p1 * b + 6.0 * p2 * a
-        xd_b = 2.0 * a * b * slope + 2.0 * p1 * a + 2.0 * p2 * b
-        yd_b = radial + 2.0 * b * b * slope + 6.0 * p1 * b + 2.0 * p2 * a
-        d[0, 0], d[0, 1], d[0, 2] = fx * xd_a * iz, fx * xd_b * iz, -fx * (xd_a * a + xd_b * b) * iz
-        d[1, 0], d[1, 1], d[1, 2] = fy * xd_b * iz, fy * yd_b * iz, -fy * (xd_b * a + yd_b * b) * iz
-        row[0, 0], row[0, 1], row[0, 2], row[0, 3] = xd, 0.0, 1.0, 0.0
-        row[1, 0], row[1, 1], row[1, 2], row[1, 3] = 0.0, yd, 0.0, 1.0
+        row[0, 0], row[0, 1], row[0, 2], row[0, 3] = (u - c[2]) / fx, 0.0, 1.0, 0.0
+        row[1, 0], row[1, 1], row[1, 2], row[1, 3] = 0.0, (v_px - c[3]) / fy, 0.0, 1.0
         row[0, 4], row[0, 5], row[0, 8] = fx * a * r2, fx * a * r2 * r2, fx * a * r2 * r2 * r2
         row[1, 4], row[1, 5], row[1, 8] = fy * b * r2, fy * b * r2 * r2, fy * b * r2 * r2 * r2
         row[0, 6], row[0, 7] = fx * 2.0 * a * b, fx * (r2 + 2.0 * a * a)
@@ -78,8 +70,7 @@ def accumulate(view, camera, point, limit, pixels, weights, cameras, R_right_lef
             row[axis, k + 1] = arm[2] * x - arm[0] * z
             row[axis, k + 2] = arm[0] * y - arm[1] * x
             row[axis, k + 3], row[axis, k + 4], row[axis, k + 5] = x, y, z
-        row[0, k + 6] = pixels[i, 0] - (fx * xd + c[2])
-        row[1, k + 6] = pixels[i, 1] - (fy * yd + c[3])
+        row[0, k + 6], row[1, k + 6] = pixels[i, 0] - u, pixels[i, 1] - v_px
         k += 7
         x, y = row[0, k - 1], row[1, k - 1]
         sigmas = math.sqrt(weights[i, 0, 0] * x * x + 2.0 * weights[i, 0, 1] * x * y + weights[i, 1, 1] * y * y)

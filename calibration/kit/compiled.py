@@ -21,6 +21,11 @@ from numba.core import event
 njit: Any = numba.njit  # types of a decorated function say nothing of how it is called
 cfunc: Any = numba.cfunc
 config: Any = numba.config
+# No NaN is ever tested inside these sums, so the fast floating-point rules change the last digit only.
+RULES: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": {"contract", "arcp", "nsz", "reassoc"}}
+# Called from compiled code, always inlined: of a function that is not, two copies may be optimised differently (its own
+# and its caller's), and which of them runs would depend on whether the code was compiled now or loaded.
+part: Any = njit(**RULES, no_cpython_wrapper=True, no_cfunc_wrapper=True, forceinline=True)
 
 WITH_COMPILED = (
     "calibration/**/_[a-z]*.py",

@@ -6,7 +6,8 @@ import math
 
 import numpy as np
 
-from disctrack.track.dots._kernels import _copy, _dot_by_pose, _entry, _part, _rotate_from_left, _solve_in_place
+from calibration.kit._cholesky import solve_in_place
+from disctrack.track.dots._kernels import _copy, _dot_by_pose, _entry, _part, _rotate_from_left
 
 MAX_DAMPING = 1e10
 _MAX_ITERATIONS = 60
@@ -78,7 +79,7 @@ def fit(rows, observed, covariance, used, cameras, R_cw, t_cw, centres, toleranc
                 damped[i, i] += damping * damped[i, i]
                 if damped[i, i] <= 1e-300:  # a parameter that no datum sees stays where it is
                     damped[i, i] = 1.0
-            solved = _solve_in_place(damped, step)
+            solved = solve_in_place(damped, step)
             length2 = 0.0
             for i in range(6):
                 length2 += sums[i, i] * step[i] * step[i]

@@ -12,20 +12,18 @@ unequal shapes takes longer to compile than the loop); and only what Python call
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from calibration.cameras._projection import project_point
+from calibration.kit._cholesky import solve_in_place, substitute
 from calibration.kit.arrays import Array
-from calibration.kit.compiled import njit
+from calibration.kit.compiled import RULES, njit
+from calibration.kit.compiled import part as _part
 from disctrack.trajectory import MarkerStatus
 
-# No NaN is ever tested inside the sums, so the fast floating-point rules change the last digit only.
-_RULES: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": {"contract", "arcp", "nsz", "reassoc"}}
-_entry = njit(cache=True, **_RULES)  # called from Python
-# Called from compiled code, always inlined: of a function that is not, two copies may be optimised differently (its own
-# and its caller's), and which of them runs would depend on whether the code was compiled now or loaded.
-_part = njit(**_RULES | {"no_cpython_wrapper": True, "no_cfunc_wrapper": True, "forceinline": True})
+_entry = njit(cache=True, **RULES)  # called from Python
 
 MEASURED, OUTSIDE, LOW_CONTRAST, OCCLUDED, NOT_CONVERGED, BLURRED, _, NOT_LOOKED_FOR = map(int, MarkerStatus)
 
@@ -144,59 +142,6 @@ def _room(n):
     block = np.empty((16, n), np.float32)
     rows, jacobian = block[:6], block[6:14]
     return Pixels(rows, block[0], block[1], block[2], block[3], block[4], block[5], jacobian, block[14], block[15])
-
-
-@_part
-def _project_point(camera, X, Y, Z, J):
-    """Pixel of one point in camera axes and J (2, 3) = d pixel / d point; camera = the nine INTRINSIC_PARAMETERS."""
-    iz = 1.0 / Z
-    a, b = X * iz, Y * iz
-    r2 = a * a + b * b
-    radial = 1.0 + r2 * (camera[4] + r2 * (camera[5] + r2 * camera[8]))
-    slope = camera[4] + r2 * (2 * camera[5] + 3 * camera[8] * r2)
-    p1, p2 = camera[6], camera[7]
-    xd = a * radial + 2 * p1 * a * b + p2 * (r2 + 2 * a * a)
-    yd = b * radial + p1 * (r2 + 2 * b * b) + 2 * p2 * a * b
-    xd_a = radial + 2 * a * a * slope + 2 * p1 * b + 6 * p2 * a
-    xd_b = 2 * a * b * slope + 2 * p1 * a + 2 * p2 * b
-    yd_b = radial + 2 * b * b * slope + 6 * p1 * b + 2 * p2 * a
-    J[0, 0], J[0, 1], J[0, 2] = camera[0] * xd_a * iz, camera[0] * xd_b * iz, -camera[0] * (xd_a * a + xd_b * b) * iz
-    J[1, 0], J[1, 1], J[1, 2] = camera[1] * xd_b * iz, camera[1] * yd_b * iz, -camera[1] * (xd_b * a + yd_b * b) * iz
-    return camera[0] * xd + camera[2], camera[1] * yd + camera[3]
-
-
-@_part
-def _substitute(L, x):
-    """Replace x by the solution of L L^T x = x for a Cholesky factor L (lower triangle)."""
-    n = L.shape[0]
-    for i in range(n):
-        s = x[i]
-        for k in range(i):
-            s -= L[i, k] * x[k]
-        x[i] = s / L[i, i]
-    for i in range(n - 1, -1, -1):
-        s = x[i]
-        for k in range(i + 1, n):
-            s -= L[k, i] * x[k]
-        x[i] = s / L[i, i]
-
-
-@_part
-def _solve_in_place(M, x):
-    """Solve the symmetric positive definite M x = x by Cholesky; False where M (lower triangle) is not so."""
-    for i in range(M.shape[0]):
-        for j in range(i + 1):
-            s = M[i, j]
-            for k in range(j):
-                s -= M[i, k] * M[j, k]
-            if i == j:
-                if not s > 0.0:
-                    return False
-                M[i, i] = math.sqrt(s)
-            else:
-                M[i, j] = s / M[j, j]
-    _substitute(M, x)
-    return True
 
 
 @_part
@@ -572,7 +517,7 @@ def _descend(pixels, n, p, G, det, px_per_unit, radius, clip, work, blurred, ell
         for i in range(8):
             previous[i], step[i] = p[i], rhs[i]
             M[i, i] *= 1.0 + damping
-        if not _solve_in_place(M, step):
+        if not solve_in_place(M, step):
             return False, chi2, n_clipped
         length = math.hypot(step[A], step[B])
         scale = min(1.0, 0.4 * radius / max(length, 1e-30))
@@ -702,8 +647,8 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, neighbours, pixel
     M, x, y, _ = work
     for i in range(8):
         x[i], y[i] = 1.0 if i == A else 0.0, 1.0 if i == B else 0.0
-    _substitute(M, x)
-    _substitute(M, y)
+    substitute(M, x)
+    substitute(M, y)
     a, b, c, d = G[1, 1] / det, -G[0, 1] / det, -G[1, 0] / det, G[0, 0] / det
     result.var_u = a * a * x[A] + 2 * a * b * x[B] + b * b * y[B]
     result.var_v = c * c * x[A] + 2 * c * d * x[B] + d * d * y[B]
@@ -779,7 +724,7 @@ def _look(images, readable, views, face, expected, R, t, pixels, work, results, 
                 for j in range(3):
                     P[k, j] /= det
             start[0], start[1], start[2] = x, y, radius
-            start[3], start[4] = _project_point(views.cameras[c], point[0], point[1], point[2], J)
+            start[3], start[4] = project_point(views.cameras[c], point[0], point[1], point[2], J)
             for k in range(m - 1):
                 other = k + 1 if k >= i else k
                 neighbours[k, 0], neighbours[k, 1] = centres[other, 0], centres[other, 1]
@@ -788,7 +733,7 @@ def _look(images, readable, views, face, expected, R, t, pixels, work, results, 
             if status[c, i] == MEASURED:
                 for k in range(3):
                     point[k] += R_cb[k, 0] * p[A] + R_cb[k, 1] * p[B]
-                result.u, result.v = _project_point(views.cameras[c], point[0], point[1], point[2], J)
+                result.u, result.v = project_point(views.cameras[c], point[0], point[1], point[2], J)
                 status[c, i] = _judge_dot(result, radius, expected.sigma[c], expected.noise[c], expected.limits)
 
 
@@ -838,7 +783,7 @@ def _dot_by_pose(camera, R_cw, t_cw, centre, R, t, J, rows):
     p0 = t_cw[0] + R_cw[0, 0] * x + R_cw[0, 1] * y + R_cw[0, 2] * z
     p1 = t_cw[1] + R_cw[1, 0] * x + R_cw[1, 1] * y + R_cw[1, 2] * z
     depth = t_cw[2] + R_cw[2, 0] * x + R_cw[2, 1] * y + R_cw[2, 2] * z
-    u, v = _project_point(camera, p0, p1, depth if depth > 0.0 else np.nan, J)
+    u, v = project_point(camera, p0, p1, depth if depth > 0.0 else np.nan, J)
     for axis in range(2):
         row = rows[axis]
         for i in range(3):
@@ -882,7 +827,7 @@ def _pose_step(results, status, views, centres, R, t, step):
                     step[i] += w * row[i] * r
                     for j in range(i + 1):
                         M[i, j] += w * row[i] * row[j]
-    if count < 3 or not _solve_in_place(M, step):
+    if count < 3 or not solve_in_place(M, step):
         return -1.0
     return math.sqrt(total / count)
 

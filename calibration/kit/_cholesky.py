@@ -1,0 +1,44 @@
+"""Compiled solution of small symmetric equations, for the loops of both packages."""
+
+from __future__ import annotations
+
+import math
+
+from calibration.kit.compiled import part
+
+
+@part
+def substitute(L, x):  # type: ignore[no-untyped-def]
+    """Replace x by the solution of L L^T x = x for a Cholesky factor L (lower triangle)."""
+    n = L.shape[0]
+    for i in range(n):
+        s = x[i]
+        for k in range(i):
+            s -= L[i, k] * x[k]
+        x[i] = s / L[i, i]
+    for i in range(n - 1, -1, -1):
+        s = x[i]
+        for k in range(i + 1, n):
+            s -= L[k, i] * x[k]
+        x[i] = s / L[i, i]
+
+
+@part
+def solve_in_place(M, x):  # type: ignore[no-untyped-def]
+    """Solve the symmetric positive definite M x = x by Cholesky; False where M (lower triangle) is not so.
+
+    M becomes its factor.
+    """
+    for i in range(M.shape[0]):
+        for j in range(i + 1):
+            s = M[i, j]
+            for k in range(j):
+                s -= M[i, k] * M[j, k]
+            if i == j:
+                if not s > 0.0:
+                    return False
+                M[i, i] = math.sqrt(s)
+            else:
+                M[i, j] = s / M[j, j]
+    substitute(M, x)
+    return True
