@@ -5,9 +5,8 @@ failed is left out and named.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -35,10 +34,10 @@ from disctrack.findings import (
 )
 from disctrack.frames import CAMERAS, rotation_from_quaternion
 from disctrack.recording.declaration import Recording, read_recording
-from disctrack.recording.readers.blocks import iter_pair_blocks
+from disctrack.recording.readers.blocks import Unreadable
 from disctrack.report.blocks import Facts, Report, Section
 from disctrack.track.follow.tracking import Tracking, TrackingSettings, track
-from disctrack.track.measurement import ImagePairs, check_rig, open_pairs
+from disctrack.track.measurement import ImagePairs, check_rig, images_lost, open_pairs
 from disctrack.track.run_summary import left_out
 from disctrack.trajectory import Trajectory
 
@@ -62,6 +61,7 @@ class Check:
     boards: Boards | None = None
     shown: list[tuple[Trajectory, int, NDArray]] = field(default_factory=list)  # trajectory, row, images (2, h, w)
     raw: list[NDArray] = field(default_factory=list)  # pairs in which the disc was not found
+    not_read: dict[tuple[int, int], Unreadable] = field(default_factory=dict)  # by frame and camera
 
     def warn(self, kind: Kind, text: str, advice: str = "", severity: Severity = Severity.WARNING) -> None:
         """Add a finding, by default one that deserves a look."""
@@ -71,6 +71,11 @@ class Check:
     def refuse(self, kind: Kind, text: str, advice: str = "") -> None:
         """Add what a run would end with."""
         self.warn(kind, text, advice, Severity.REFUSAL)
+
+    def images(self, pairs: ImagePairs, frames: Iterable[int]) -> list[NDArray]:
+        """(2, h, w) images of each of these frames; those that cannot be read are left out, and named."""
+        blocks = (block for i in frames for block in pairs.reading(self.not_read)(i, i + 1))
+        return [block.images[0].copy() for block in blocks if not block.unreadable]
 
     @contextmanager
     def refusing(self, kind: Kind, advice: str = "") -> Iterator[None]:
@@ -121,11 +126,12 @@ def run_check(folder: Path, progress: Callable[[str], None] = lambda step: None)
         if recording.chessboard is not None:
             seen.findings += turned_board(recording.chessboard.inner_corners)
         seen.warn(Kind.DISC_NOT_FOUND, "the dots were not looked for: that needs the cameras' calibration")
-        return seen
-    with seen.refusing(Kind.CALIBRATION):
-        check_rig(rig, pairs, "the calibration")
-        progress("dots")
-        _motion(seen, recording, rig, pairs)
+    else:
+        with seen.refusing(Kind.CALIBRATION):
+            check_rig(rig, pairs, "the calibration")
+            progress("dots")
+            _motion(seen, recording, rig, pairs)
+    seen.findings += images_lost(seen.not_read.values())
     return seen
 
 
@@ -168,7 +174,7 @@ def _rig(seen: Check, recording: Recording) -> StereoRig:
 
 
 def _light(seen: Check, recording: Recording, pairs: ImagePairs) -> None:
-    images = np.array(_pairs_at(pairs, [round(place * (len(pairs) - 1)) for place in PLACES]))
+    images = np.array(seen.images(pairs, [round(place * (len(pairs) - 1)) for place in PLACES]))
     if not len(images):
         seen.refuse(Kind.UNREADABLE, "none of the frames looked at can be read", "copy the frames again")
         return
@@ -198,18 +204,18 @@ def _motion(seen: Check, recording: Recording, rig: StereoRig, pairs: ImagePairs
         if any(frames.start < other.stop for other, _ in done):
             continue
         try:
-            done.append((frames, _track(recording, rig, pairs, frames)))
+            done.append((frames, _track(seen, recording, rig, pairs, frames)))
         except DiscTrackError as error:
             lost.append(Finding(Kind.DISC_NOT_FOUND, Severity.WARNING, str(error), Subject("check")))
             lost += getattr(error, "findings", ())
-            seen.raw += _pairs_at(pairs, [frames.start])
+            seen.raw += seen.images(pairs, [frames.start])
     seen.findings += _once(lost)
     if not done:
         seen.refuse(Kind.DISC_NOT_FOUND, "the disc was found nowhere", "compare [markers] with the picture")
         return
     for frames, tracking in done:
         row = len(frames) // 2
-        seen.shown += [(tracking.trajectory, row, images) for images in _pairs_at(pairs, [frames[row]])]
+        seen.shown += [(tracking.trajectory, row, images) for images in seen.images(pairs, [frames[row]])]
     measured = sum(int(tracking.trajectory.measured.sum()) for _, tracking in done)
     total = sum(len(frames) for frames, _ in done)
     seen.seen.append(("dots", f"disc measured in {measured} of {total} frames looked at"))
@@ -235,12 +241,11 @@ def _once(findings: Iterable[Finding]) -> list[Finding]:
     return list(first.values())
 
 
-def _track(recording: Recording, rig: StereoRig, pairs: ImagePairs, frames: range) -> Tracking:
+def _track(seen: Check, recording: Recording, rig: StereoRig, pairs: ImagePairs, frames: range) -> Tracking:
     """Track a stretch."""
     settings = TrackingSettings(refine_markers=False, first_pass=False)
-    read_blocks = partial(iter_pair_blocks, pairs.left, pairs.right)
     rate, gravity = recording.frame_rate, recording.gravity
-    return track(read_blocks, frames, rig, recording.disc, rate, gravity=gravity, settings=settings)
+    return track(pairs.reading(seen.not_read), frames, rig, recording.disc, rate, gravity=gravity, settings=settings)
 
 
 def _together(stretches: list[Trajectory]) -> Trajectory:
@@ -280,12 +285,3 @@ def _accuracy(seen: Check, trajectory: Trajectory) -> None:
         seen.warn(Kind.ACCURACY, text, "more light, sharper or larger dots")
     elif shared.max() > LAB_FRAME:
         seen.warn(Kind.ACCURACY, text, "more views of the board, tilted and all over; a board that is known better")
-
-
-def _pairs_at(pairs: ImagePairs, indices: Iterable[int]) -> list[NDArray]:
-    """(2, h, w) images of each of these frames; those that cannot be read are left out."""
-    found = []
-    for index in indices:
-        with suppress(RecordingError):
-            found.append(np.stack([np.array(pairs.left.read(index)), np.array(pairs.right.read(index))]))
-    return found

@@ -3,7 +3,7 @@
 import dataclasses
 import hashlib
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
@@ -30,7 +30,7 @@ from disctrack.recording.readers.flat_field import flat_fielded, flat_fields
 from disctrack.recording.readers.part import frames_in_parts, image_parts
 from disctrack.recording.readers.time_stamps import check_time_stamps, usable_times
 from disctrack.track.follow.motion_span import MotionSpan, find_motion
-from disctrack.track.follow.tracking import Tracking, TrackingSettings, prepare, stretch_edges, track
+from disctrack.track.follow.tracking import ReadBlocks, Tracking, TrackingSettings, prepare, stretch_edges, track
 from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
 from disctrack.trajectory.file import Provenance
 
@@ -51,6 +51,16 @@ class ImagePairs:
 
     def __len__(self) -> int:
         return self.stop - self.start
+
+    def reading(self, not_read: dict[tuple[int, int], Unreadable], threads: int | None = None) -> ReadBlocks:
+        """What gives pairs start..stop-1 in blocks; images that cannot be read are put into `not_read`, each once."""
+
+        def read_blocks(start: int, stop: int) -> Iterator[PairBlock]:
+            for block in iter_pair_blocks(self.left, self.right, start, stop, threads=threads):
+                not_read.update({(image.frame, image.camera): image for image in block.unreadable})
+                yield block
+
+        return read_blocks
 
     def camera_headers(self) -> dict[str, Any]:
         """Under "camera_headers" what the cameras wrote about themselves (exposure, trigger, ...), if anything."""
@@ -170,14 +180,10 @@ def measure(
         recording, rig, pairs, settings, span, stamps, threads or default_threads(), progress
     )
     seconds = time.perf_counter() - began
-    lost: tuple[Finding, ...] = ()
-    if unreadable:
-        text = f"{len(unreadable)} images could not be read; their frames rest on one camera or none. The first"
-        lost = (Finding(Kind.UNREADABLE, Severity.WARNING, f"{text}: {unreadable[0].reason}"),)
     findings = (
         *pairs.findings,
         *of_kind(Kind.EXPOSURE, Severity.NOTE, headers),
-        *lost,
+        *images_lost(unreadable),
         *tracking.findings,
     )
     details = {
@@ -213,15 +219,9 @@ def _tracked(
     if pairs.left.random_access and pairs.right.random_access:
         workers = max(1, min(threads, len(stretch_edges(tracked, recording.disc)) - 1))
     readers = max(1, threads // workers)  # each worker has its own three blocks
-
-    def read_blocks(start: int, stop: int) -> Iterator[PairBlock]:
-        for block in iter_pair_blocks(pairs.left, pairs.right, start, stop, threads=readers):
-            not_read.update({(image.frame, image.camera): image for image in block.unreadable})
-            yield block
-
     try:
         tracking = track(
-            read_blocks,
+            pairs.reading(not_read, readers),
             tracked,
             rig,
             recording.disc,
@@ -236,6 +236,15 @@ def _tracked(
         refuse_unreadable(recording, list(not_read.values()), 2 * len(tracked), error)
         raise
     return tracking, tuple(not_read[place] for place in sorted(not_read))
+
+
+def images_lost(unreadable: Iterable[Unreadable]) -> tuple[Finding, ...]:
+    """What is to be said of images that could not be read."""
+    reasons = [image.reason for image in sorted(unreadable, key=lambda image: (image.frame, image.camera))]
+    if not reasons:
+        return ()
+    text = f"{len(reasons)} images could not be read; their frames rest on one camera or none. The first: {reasons[0]}"
+    return of_kind(Kind.UNREADABLE, Severity.WARNING, [text])
 
 
 def refuse_unreadable(recording: Recording, lost: Sequence[Unreadable], n: int, error: TrackingError) -> None:

@@ -227,7 +227,7 @@ def exchange(folder: Path) -> None:
 
 FAULTS = {  # what is wrong; the kind that check names first, words of it, and whether a run would be in doubt
     "a key is missing": (lambda f: declare(f, "mass_g = 209.69", ""), Kind.DECLARATION, "mass_g is missing", True),
-    "frames are missing": (lambda f: (f / "left/000017.png").unlink(), Kind.READING, "missing", False),
+    "frames are missing": (lambda f: (f / "left/000017.png").unlink(), Kind.UNREADABLE, "missing", False),
     "other corners": (lambda f: declare(f, "[9, 6]", "[8, 5]"), Kind.CALIBRATION, "inner_corners = [9, 6]", True),
     "no dot there": (lambda f: declare(f, "[6.5000, -11.2583]", "[0.5, 0.5]"), Kind.DOT_UNSEEN, "dot 5", True),
     "twice the rate": (lambda f: declare(f, "frame_rate_hz = 1000.0", "frame_rate_hz = 2000.0"), Kind.GRAVITY_OR_RATE,
@@ -251,8 +251,16 @@ FAULTS = {  # what is wrong; the kind that check names first, words of it, and w
     "three frames late": (lambda f: renumber_right(f, 3), Kind.DELAY, "Number its images higher by 3", True),
     "lens cap": (lambda f: darkened(f, "left", np.zeros_like), Kind.LIGHT, "of one grey", True),
     "too bright": (lambda f: darkened(f, "left", lambda image: cv2.add(image, 90)), Kind.LIGHT, "clipped", False),
+    "an image is cut short": (lambda f: cut_short(f / "left/000150.png"), Kind.UNREADABLE, "left/000150.png", False),
     "one moment twice": (lambda f: repeat_left(f), Kind.REPEATED_IMAGES, "copies of earlier ones", True),
 }  # fmt: skip
+
+
+def cut_short(file: Path) -> None:
+    """As a copy that was interrupted leaves it."""
+    content = file.read_bytes()
+    file.unlink()
+    file.write_bytes(content[: len(content) // 2])
 
 
 def repeat_left(folder: Path) -> None:
