@@ -64,12 +64,10 @@ class StereoCalibration(Brief):
     board_thickness: float  # [m]
     view_names: tuple[tuple[str, str], ...]  # (n_views,) left and right name
     corner_views: tuple[tuple[CornerView | BoardNotFound, ...], tuple[CornerView | BoardNotFound, ...]]
-    rejected_views: dict[int, str]  # view -> reason
     candidates: tuple[TermsTried, ...]  # cross-validation table; the chosen terms are refinement.terms
     assessment: Assessment
     warnings: tuple[str, ...] = field(default=())
     apart: tuple[int, ...] = ()  # views whose right image has a place of the board of its own, n_views + 0, 1, ...
-    shape: BoardShape | None = None  # of the board against the declared one, as far as the views tell
     lens: FieldFit | None = None  # where views left out were met better with it; the observations are corrected by it
 
     def facts(self) -> dict[str, str]:
@@ -81,6 +79,11 @@ class StereoCalibration(Brief):
             **self.rig.facts(),
             "verdict": self.assessment.verdict,
         }
+
+    @property
+    def rejected_views(self) -> dict[int, str]:
+        """View -> why none of its two images is used."""
+        return _left_out(self.corner_views, self.view_names)[0]
 
     @property
     def board_points(self) -> Array:
@@ -207,8 +210,7 @@ def calibrate_from_corners(
     names = tuple(names or [(f"left {i}", f"right {i}") for i in range(len(left_views))])
     views = (list(left_views), list(right_views))
     count_once(views, names, table_view)
-    rejected, warnings = _views_not_found(views, names)
-    _require_views(views, names, rejected, table_view)
+    _require_views(views, names, table_view)
     start, notes = _begin(views, board, names)
     observations, cameras = _observations(views), start.model.cameras
     wide = too_wide(observations, board.points, cameras)
@@ -222,11 +224,13 @@ def calibrate_from_corners(
     shapes = BOARD_MODELS if seen.min() >= LEAST_SEEN else BOARD_MODELS[:-1]  # the points tell a place each, or not
     distortion = RICHEST if settings.distortion == "auto" else settings.distortion
     tried = [Terms(distortion, shape) for shape in (shapes if settings.board == "auto" else (settings.board,))]
-    fit = fit_jointly(observations, start, board.points, tried, names, table_view)
+    fit = fit_jointly(observations, start, board.points, tried, table_view)
+    for (v, camera), why in fit.bad_images.items():
+        views[camera][v] = BoardNotFound(why)
     apart = _told_apart(fit, names, table_view)
-    _require_fitted(fit, rejected | fit.lost, apart, wide, table_view)
-    rejected = dict(sorted((rejected | fit.lost).items()))
-    rig, assessment, shape, shape_note = _judged(fit, board, shapes, settings, table_view, board_thickness, wide)
+    rejected, warnings = _left_out(views, names)
+    _require_fitted(fit, rejected, apart, wide, table_view)
+    rig, assessment, shape_note = _judged(fit, board, shapes, settings, table_view, board_thickness, wide)
     return StereoCalibration(
         rig=rig,
         refinement=fit.refinement,
@@ -236,13 +240,11 @@ def calibrate_from_corners(
         board_thickness=board_thickness,
         view_names=names,
         corner_views=(tuple(views[0]), tuple(views[1])),
-        rejected_views=rejected,
         apart=tuple(sorted(fit.pairs.apart)),
         candidates=fit.candidates,
         assessment=assessment,
-        warnings=(*warnings, *notes, *fit.notes, *apart, *shape_note, *assessment.warnings),
+        warnings=(*warnings, *notes, *apart, *shape_note, *assessment.warnings),
         lens=fit.lens,
-        shape=shape,
     )
 
 
@@ -269,8 +271,8 @@ def _judged(
     table_view: int | None,
     board_thickness: float,
     wide: tuple[str, ...],
-) -> tuple[StereoRig, Assessment, BoardShape, list[str]]:
-    """The rig with its covariance, how good it is, the board's shape, and a warning if that is not the one taken.
+) -> tuple[StereoRig, Assessment, list[str]]:
+    """The rig with its covariance, how good it is, and a warning if the board's shape is not the one taken.
 
     shapes : that the board's points tell
     """
@@ -287,7 +289,7 @@ def _judged(
     with_board = with_tolerances(rig, board.points, table_view, board_thickness, settings.tolerances, shape)
     chosen = next(row for row in reversed(fit.candidates) if row.terms == refinement.terms)
     assessment = assess(refinement, chosen, rig, with_board, table_view, inflation, fit.motion, wide)
-    return with_board, assessment, shape, note
+    return with_board, assessment, note
 
 
 def _require_fitted(
@@ -312,7 +314,9 @@ def _require_fitted(
             )
 
 
-def _views_not_found(views: Views, names: Names) -> tuple[dict[int, str], list[str]]:
+def _left_out(
+    views: tuple[Sequence[CornerView | BoardNotFound], ...], names: Names
+) -> tuple[dict[int, str], list[str]]:
     """Views that neither camera can use, and warnings about those that only one can."""
     rejected: dict[int, str] = {}
     alone: dict[str, list[str]] = {}
@@ -331,7 +335,7 @@ def _views_not_found(views: Views, names: Names) -> tuple[dict[int, str], list[s
     return rejected, warnings + notes
 
 
-def _require_views(views: Views, names: Names, rejected: dict[int, str], table_view: int | None) -> None:
+def _require_views(views: Views, names: Names, table_view: int | None) -> None:
     if table_view is not None and not 0 <= table_view < len(names):
         raise CalibrationError(f"table view {table_view} does not exist: there are views 0 to {len(names) - 1}")
     if not views[0]:
@@ -344,10 +348,11 @@ def _require_views(views: Views, names: Names, rejected: dict[int, str], table_v
                 f"the board was found in {found} of {len(side)} {CAMERA_NAMES[camera]} images, at least {MIN_VIEWS} "
                 f"are needed (10 to 20 are good). {_listed(reasons)}"
             )
-    if table_view is not None and table_view in rejected:
+    why = "" if table_view is None else _left_out(views, names)[0].get(table_view)
+    if why:
         raise CalibrationError(
-            f"the board was not found in the table view {table_view} ({rejected[table_view]}): without it there is no "
-            "lab frame. Name another view whose board lies flat on the table, or take it again."
+            f"the board was not found in the table view {table_view} ({why}): without it there is no lab frame. Name "
+            "another view whose board lies flat on the table, or take it again."
         )
 
 

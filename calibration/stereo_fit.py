@@ -3,11 +3,9 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
-
 from calibration.fit.board_motion import BoardMotion
 from calibration.fit.lens_field import FieldFit, fit_lens_field
-from calibration.fit.pairing import Names, Pairs
+from calibration.fit.pairing import Pairs
 from calibration.fit.refinement import Refinement, TermsTried, choose_board
 from calibration.fit.stereo_model import Observations, Terms
 from calibration.judge.pairs import (
@@ -36,8 +34,7 @@ class JointFit:
     pairs: Pairs
     moved: CameraMoved | None
     motion: PairMotion | None  # of the boards between the exposures
-    lost: dict[int, str]  # views of which no image can be used -> reason
-    notes: tuple[str, ...]  # about images that cannot
+    bad_images: dict[tuple[int, int], str]  # (view, camera) that cannot be used -> reason
 
 
 def fit_jointly(
@@ -45,13 +42,12 @@ def fit_jointly(
     start: Pairs,
     nominal: Array,
     tried: Sequence[Terms],
-    names: Names,
     table_view: int | None = None,
 ) -> JointFit:
     """Refine, judge the pairs by what is refined, and refine again; then see whether boards moved, or lenses bend.
 
-    start : by rough cameras; tried : terms with the board's shapes to choose of, simplest first; names : (left, right)
-    of every view; table_view : where a camera was moved, the cameras' places are those at it
+    start : by rough cameras; tried : terms with the board's shapes to choose of, simplest first
+    table_view : where a camera was moved, the cameras' places are those at it
     """
     moved = camera_moved(observations, start, table_view)  # seen best by cameras that no pair has pulled yet
     # rough poses may be degrees off: refined cameras judge those anew that do not agree
@@ -63,16 +59,15 @@ def fit_jointly(
         return choose_board(*places, nominal, tried, motion)
 
     refinement, candidates = refined(used, tried)
-    lost: dict[int, str] = {}
-    notes: list[str] = []
+    bad_images: dict[tuple[int, int], str] = {}
     for _ in range(REJUDGED):
         pairs = judge_pairs(observations, refinement, sorted(used.apart), moved.others if moved else ())
         moved = camera_moved(observations, pairs, table_view)
         pairs = pairs if moved is None else pairs.set_apart(moved.others, MOVED_CAMERA)
         if sorted(pairs.apart) == sorted(used.apart) and not pairs.bad_images:
             break
-        observations, used, more, texts = _without_images(observations, pairs, names)
-        lost, notes = lost | more, [*notes, *texts]
+        bad_images |= pairs.bad_images
+        observations, used = _without_images(observations, pairs)
         refinement, again = refined(used, (refinement.terms,))
         candidates = (*candidates, *again)
     motion, lens = motion_between_exposures(refinement), fit_lens_field(refinement, nominal)
@@ -86,23 +81,15 @@ def fit_jointly(
         refinement, again = refined(used, tried, motion.as_random(nominal))
         candidates = (*candidates, *again)
         lens = fit_lens_field(refinement, nominal)
-    return JointFit(lens.refinement if lens else refinement, lens, candidates, pairs, moved, motion, lost, tuple(notes))
+    return JointFit(lens.refinement if lens else refinement, lens, candidates, pairs, moved, motion, bad_images)
 
 
-def _without_images(
-    observations: Observations, pairs: Pairs, names: Names
-) -> tuple[Observations, Pairs, dict[int, str], list[str]]:
-    """Leave out images that do not even fit alone; views of which nothing is left, and warnings about the others."""
-    by_right, rejected, warnings = {}, {}, []
-    for (view, camera), reason in pairs.bad_images.items():
-        text = f"{names[view][camera]}: {reason}: blurred, or the board was found wrongly"
+def _without_images(observations: Observations, pairs: Pairs) -> tuple[Observations, Pairs]:
+    """Leave out images that do not even fit alone."""
+    by_right = {}
+    for view, camera in pairs.bad_images:
         observations = observations[(observations.view != view) | (observations.camera != camera)]
         if camera == 0 and view in pairs.right_poses:
             by_right[view] = pairs.right_poses[view]
-        if np.any(observations.view == view):
-            warnings.append(f"{text}: left out, the other image of the pair is used for its own camera")
-        else:
-            rejected[view] = text
     apart = {view: why for view, why in pairs.apart.items() if not {(view, 0), (view, 1)} & set(pairs.bad_images)}
-    pairs = replace(pairs, model=pairs.model.placed(by_right), apart=apart, bad_images={})
-    return observations, pairs, rejected, warnings
+    return observations, replace(pairs, model=pairs.model.placed(by_right), apart=apart, bad_images={})

@@ -250,12 +250,10 @@ def judge_pairs(
     images, image = np.unique(2 * o.view + o.camera, return_inverse=True)
     rms = np.sqrt(np.bincount(image, square) / np.bincount(image))
     typical = float(np.median(rms))
-    bad = {
-        divmod(int(images[i]), 2): f"RMS {rms[i]:.3f} px by itself, the median image has {typical:.3f} px"
-        for i in np.flatnonzero(rms > TOO_FAR * typical)
-        if len(rms) >= LEAST_PAIRS
-    }
-    found = {}
+    bad, found = {}, {}
+    for i in np.flatnonzero(rms > TOO_FAR * typical) if len(rms) >= LEAST_PAIRS else ():
+        misfit = f"RMS {rms[i]:.3f} px by itself, the median image has {typical:.3f} px"
+        bad[divmod(int(images[i]), 2)] = f"{misfit}: blurred, or the board was found wrongly"
     if len(pairs.views) >= LEAST_PAIRS:
         cost = pairs.cost_of_rest(~np.isin(pairs.views, apart))
         usual = max(float(np.median(cost[~np.isin(pairs.views, list(elsewhere))])), 6.0)
