@@ -1,9 +1,10 @@
 """Rig files: HDF5 that explains itself, with the corners it came from: it can be judged and redone years later."""
 
 import contextlib
+import io
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from importlib import metadata
 from pathlib import Path
@@ -101,7 +102,21 @@ _BEYOND_MODEL = {
     ),
     "lens_field_spacing": Dataset((), "px", "of the splines' grid"),
 }
-_AS_JSON = ("settings", "figures", "versions", "warnings", "view_names", "rejected_views")
+# Parts of a record that are JSON: what describes the dataset, "" of an attribute, and how the part comes back from it
+_OF_TEXT: dict[str, tuple[str, Callable[[Any], Any]]] = {
+    "settings": ("", dict),
+    "figures": ("", dict),
+    "versions": ("", dict),
+    "warnings": ("", tuple),
+    "apart": ("", tuple),
+    "view_names": ("", lambda names: tuple((str(left), str(right)) for left, right in names)),
+    "rejected_views": ("", lambda found: {int(view): str(reason) for view, reason in found.items()}),
+    "rejected_corners": (
+        "JSON list of view, camera, corner, reason",
+        lambda rows: tuple((int(v), int(c), int(i), str(reason)) for v, c, i, reason in rows),
+    ),
+    "board": ("JSON object: kind of target and its fields, lengths in m", target_of),
+}
 
 
 @dataclass(frozen=True)
@@ -174,15 +189,15 @@ def record_of(calibration: StereoCalibration) -> CalibrationRecord:
         settings=_plain(asdict(calibration.settings)),
         figures=_plain(figures),
         rejected_corners=tuple(calibration.rejected_corners()),
-        versions=versions(),
+        versions=versions(("disctrack", "numpy", "scipy", "opencv-contrib-python-headless", "numba", "h5py")),
         apart=apart,
     )
 
 
-def versions() -> dict[str, str]:
-    """Versions of this software and of what its numbers depend on."""
+def versions(packages: Sequence[str]) -> dict[str, str]:
+    """Those of packages that are installed."""
     found = {}
-    for name in ("disctrack", "numpy", "scipy", "opencv-contrib-python-headless", "numba", "h5py"):
+    for name in packages:
         with contextlib.suppress(metadata.PackageNotFoundError):
             found[name] = metadata.version(name)
     return found
@@ -197,43 +212,51 @@ def _plain(value: Any) -> Any:
 
 
 @checked
-def write_rig(
-    path: str | os.PathLike[str], content: StereoRig | StereoCalibration | RigFile, attributes: Mapping[str, Any] = {}
-) -> None:
+def write_rig(path: str | os.PathLike[str], content: StereoRig | StereoCalibration | RigFile) -> None:
     """Write a rig file: whole or not at all (a temporary file beside it, fsync, rename).
 
-    attributes : of the root, beside its own
     Raises RigFileError if it cannot be written.
 
         >>> write_rig("rig.h5", read_rig("clip/results/rig.h5"))
         >>> read_rig("rig.h5").baseline == read_rig("clip/results/rig.h5").baseline
         True
     """
+    path = Path(path)
+    part = path.with_name(path.name + ".part")
+    try:
+        with open(part, "wb") as handle:
+            handle.write(rig_bytes(content))
+            handle.flush()
+            os.fsync(handle.fileno())
+        os.replace(part, path)
+    except OSError as error:
+        with contextlib.suppress(OSError):
+            part.unlink()
+        raise RigFileError(f"{path}: the rig cannot be written ({error}): no such folder, or no room in it") from error
+
+
+def rig_bytes(content: StereoRig | StereoCalibration | RigFile, attributes: Mapping[str, Any] = {}) -> memoryview:
+    """A rig file, made in memory: the HDF5 library crashes where a disk is full.
+
+    attributes : of the root, beside its own
+    """
     if isinstance(content, StereoCalibration):
         content = RigFile(content.rig, record_of(content))
     elif isinstance(content, StereoRig):
         content = RigFile(content, None)
-    path = Path(path)
-    part = path.with_name(path.name + ".part")
-    try:
-        with h5py.File(part, "w") as file:
-            file.attrs.update(schema=SCHEMA, schema_version=SCHEMA_VERSION)
-            file.attrs["description"] = (
-                "Two calibrated cameras. points_left = R_left_world @ points_world + t_left_world; "
-                "points_right = R_right_left @ points_left + t_right_left; Brown distortion, OpenCV's coefficients; "
-                "pixel (0, 0) is the centre of the top-left pixel; camera axes: x right, y down, z along the view."
-            )
-            write_rig_group(file.create_group("rig"), content.rig)
-            if content.record is not None:
-                _write_record(file.create_group("calibration"), content.record)
-            file.attrs.update(attributes, complete=1)
-        with open(part, "rb") as handle:
-            os.fsync(handle.fileno())
-        os.replace(part, path)
-    except (OSError, RuntimeError) as error:
-        with contextlib.suppress(OSError):
-            part.unlink()
-        raise RigFileError(f"{path}: the rig cannot be written ({error}): no such folder, or no room in it") from error
+    buffer = io.BytesIO()
+    with h5py.File(buffer, "w") as file:
+        file.attrs.update(schema=SCHEMA, schema_version=SCHEMA_VERSION)
+        file.attrs["description"] = (
+            "Two calibrated cameras. points_left = R_left_world @ points_world + t_left_world; "
+            "points_right = R_right_left @ points_left + t_right_left; Brown distortion, OpenCV's coefficients; "
+            "pixel (0, 0) is the centre of the top-left pixel; camera axes: x right, y down, z along the view."
+        )
+        write_rig_group(file.create_group("rig"), content.rig)
+        if content.record is not None:
+            _write_record(file.create_group("calibration"), content.record)
+        file.attrs.update(attributes, complete=1)
+    return buffer.getbuffer()
 
 
 def _put(group: h5py.Group, name: str, value: Any, row: Dataset) -> None:
@@ -295,17 +318,15 @@ def write_attributes(group: h5py.Group, document: Mapping[str, Any]) -> None:
 
 def _write_record(group: h5py.Group, record: CalibrationRecord) -> None:
     write_attributes(group, {"settings": record.settings, "figures": record.figures, "versions": record.versions})
-    for name in _AS_JSON:
-        group.attrs[name] = json.dumps(getattr(record, name))
-    if record.apart:
-        group.attrs["apart"] = json.dumps(record.apart)
     group.attrs["table_view"] = -1 if record.table_view is None else record.table_view
-    for name, what, told in (
-        ("rejected_corners", record.rejected_corners, "JSON list of view, camera, corner, reason"),
-        ("board", record.board.described(), "JSON object: kind of target and its fields, lengths in m"),
-    ):
-        group.create_dataset(name, data=json.dumps(what), dtype=h5py.string_dtype())
-        group[name].attrs["description"] = told
+    for name, (description, _) in _OF_TEXT.items():
+        value = getattr(record, name)
+        text = json.dumps(value.described() if isinstance(value, Target) else value)
+        if description:
+            group.create_dataset(name, data=text, dtype=h5py.string_dtype())
+            group[name].attrs["description"] = description
+        else:
+            group.attrs[name] = text
     o = record.observations
     seen = (o.view, o.camera, o.point, o.pixels, o.covariance)
     values = {name: getattr(record, name) for name in _OF_RECORD} | dict(zip(_OF_OBSERVATIONS, seen, strict=True))
@@ -412,9 +433,9 @@ def read_beyond_model(group: h5py.Group) -> dict[str, Any]:
 
 
 def _read_record(group: h5py.Group) -> CalibrationRecord:
-    known: dict[str, Any] = {name: json.loads(group.attrs[name]) for name in _AS_JSON}
-    rejected, board = (json.loads(group[name].asstr()[()]) for name in ("rejected_corners", "board"))
-    known |= {"board": target_of(board), "apart": tuple(json.loads(group.attrs.get("apart", "[]")))}
+    known: dict[str, Any] = {}
+    for name, (description, back) in _OF_TEXT.items():
+        known[name] = back(json.loads(group[name].asstr()[()] if description else group.attrs[name]))
     sizes = {
         "points": len(known["board"].points),
         "places": len(known["view_names"]) + len(known["apart"]),
@@ -432,9 +453,5 @@ def _read_record(group: h5py.Group) -> CalibrationRecord:
         "table_view": None if table_view < 0 else table_view,
         "observations": Observations(*seen.values()),
         "kept": known["kept"].astype(bool),
-        "view_names": tuple((str(a), str(b)) for a, b in known["view_names"]),
-        "rejected_views": {int(v): str(reason) for v, reason in known["rejected_views"].items()},
-        "rejected_corners": tuple((int(v), int(c), int(i), str(reason)) for v, c, i, reason in rejected),
-        "warnings": tuple(known["warnings"]),
     }
     return CalibrationRecord(**known)

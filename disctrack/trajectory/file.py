@@ -11,7 +11,6 @@ import json
 import platform
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +22,7 @@ from calibration.cameras.camera import RIG_PARAMETERS, Camera, StereoRig
 from calibration.kit.arguments import checked
 from calibration.kit.arrays import Mask
 from calibration.kit.brief import Outline
-from calibration.rig_file import beyond_model, read_beyond_model, write_attributes
+from calibration.rig_file import beyond_model, read_beyond_model, versions, write_attributes
 from disctrack.disc import Disc
 from disctrack.errors import TrajectoryFileError
 from disctrack.files.json_text import json_text
@@ -258,11 +257,7 @@ def _root_attributes(trajectory: Trajectory, provenance: Provenance) -> dict[str
 
 
 def _versions() -> dict[str, str]:
-    found = {"python": platform.python_version()}
-    for package in _DEPENDENCIES:
-        with contextlib.suppress(metadata.PackageNotFoundError):
-            found[package] = metadata.version(package)
-    return found
+    return {"python": platform.python_version(), **versions(_DEPENDENCIES)}
 
 
 # The file's layout. Of every array of a Trajectory: axes, unit and meaning
