@@ -93,13 +93,12 @@ def stereo_covariance(refinement: Refinement, common: Array | None = None) -> Ar
     return result
 
 
-def coverage(refinement: Refinement, camera: int, cells: int = 8) -> float:
-    """Share of the cells of a grid on the image that hold a used corner."""
+def cells_of(refinement: Refinement, camera: int) -> Array:
+    """(8, 8) how many used corners lie in each cell of a grid on the image, along x and along y."""
     o = refinement.observations
     pixels = o.pixels[refinement.kept & (o.camera == camera)]
-    size = np.array(refinement.model.cameras[camera].image_size)
-    index = np.clip((pixels + 0.5) / size * cells, 0, cells - 1).astype(int)
-    return len(np.unique(index[:, 0] * cells + index[:, 1])) / cells**2
+    edges = [np.linspace(-0.5, size - 0.5, 9) for size in refinement.model.cameras[camera].image_size]
+    return np.histogram2d(pixels[:, 0], pixels[:, 1], bins=edges)[0]
 
 
 def tilt_spread(refinement: Refinement) -> float:
@@ -184,7 +183,7 @@ def assess(
         pairs=len(np.intersect1d(kept.view[kept.camera == 0], kept.view[kept.camera == 1])),
         motion=motion,
         inflation=inflation,
-        coverage=tuple(coverage(refinement, camera) for camera in range(len(CAMERA_NAMES))),
+        coverage=tuple(float(np.mean(cells_of(refinement, camera) > 0)) for camera in range(len(CAMERA_NAMES))),
         tilt_spread_deg=tilt_spread(refinement),
         warnings=(),
     )

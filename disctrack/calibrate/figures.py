@@ -1,6 +1,4 @@
-"""Pictures of a calibration: what the corners leave unexplained, and which part of the images they cover."""
-
-from collections.abc import Callable
+"""The picture of a calibration: what the corners leave unexplained, and which part of the images they cover."""
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -9,16 +7,16 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from calibration import StereoCalibration
+from calibration.judge.assessment import cells_of
 from disctrack.frames import CAMERAS
 from disctrack.report.figures import lay_out
-from disctrack.report.palette import BLUE, COLOURS, INK
+from disctrack.report.palette import COLOURS, INK
 
-COVERAGE_CELLS = 8
-_SHADES = LinearSegmentedColormap.from_list("coverage", ["#dceefa", BLUE])
+_SHADES = LinearSegmentedColormap.from_list("coverage", ["#e8f1f8", "#a9c6dc"])
 
 
 def residuals_figure(found: StereoCalibration) -> Figure:
-    """Observed - predicted corners as arrows in each image, and their root mean square per view."""
+    """Observed - predicted corners as arrows in each image, over the cells that hold any, and their rms per view."""
     figure = Figure(figsize=(12, 9))
     lay_out(figure, (2, 2), gaps=(0.7, 0.7))
     grid = figure.add_gridspec(2, 2, height_ratios=(3, 1))
@@ -29,11 +27,28 @@ def residuals_figure(found: StereoCalibration) -> Figure:
     scale = float(f"{found.rig.left.image_size[0] / 40 / typical:.0e}")
     for camera, name in enumerate(CAMERAS):
         axes = figure.add_subplot(grid[0, camera])
+        _image_frame(axes, found, camera)
         _arrows(axes, found, camera, scale, 4.0 * typical)
-        axes.set_title(f"{name}: rms {found.rms_per_camera_px[camera]:.4f} px", color=INK, fontsize=10)
+        rms, share = found.rms_per_camera_px[camera], found.assessment.coverage[camera]
+        axes.set_title(f"{name}: rms {rms:.4f} px, {share:.0%} of the cells hold a corner", color=INK, fontsize=10)
     _views(figure.add_subplot(grid[1, :]), found)
-    figure.suptitle(f"Calibration residuals (arrows {scale:.0f} times longer; black: unused)")
+    figure.suptitle(
+        f"Calibration residuals (arrows {scale:.0f} times longer; black: unused; shaded: cells with corners)"
+    )
     return figure
+
+
+def _image_frame(axes: Axes, found: StereoCalibration, camera: int) -> None:
+    """An image's outline, its cells the darker the more corners they hold; distortion is a guess in the others."""
+    width, height = found.rig.cameras[camera].image_size
+    counts = cells_of(found.refinement, camera)
+    edges = [np.linspace(-0.5, size - 0.5, n + 1) for size, n in zip((width, height), counts.shape, strict=True)]
+    axes.pcolormesh(*edges, np.where(counts > 0, counts, np.nan).T, cmap=_SHADES, vmin=0)
+    axes.set_xlim(-0.5, width - 0.5)
+    axes.set_ylim(height - 0.5, -0.5)
+    axes.set_aspect("equal")
+    axes.set_xlabel("x (px)")
+    axes.set_ylabel("y (px)")
 
 
 def _arrows(axes: Axes, found: StereoCalibration, camera: int, scale: float, most: float) -> None:
@@ -48,7 +63,6 @@ def _arrows(axes: Axes, found: StereoCalibration, camera: int, scale: float, mos
         arrows = scale * arrows * np.minimum(1.0, longest / np.maximum(length, 1e-12))
         pixels = refinement.observations.pixels[mine & select]
         axes.quiver(*pixels.T, *arrows.T, angles="xy", scale_units="xy", scale=1, color=colour, width=0.0015, alpha=0.7)
-    _image_frame(axes, found, camera)
 
 
 def _views(axes: Axes, found: StereoCalibration) -> None:
@@ -64,37 +78,3 @@ def _views(axes: Axes, found: StereoCalibration) -> None:
     axes.set_xlim(-0.6, len(rms) - 0.4)
     axes.legend(frameon=False, fontsize=8)
     axes.grid(alpha=0.25, axis="y")
-
-
-def coverage_figure(found: StereoCalibration) -> Figure:
-    """Used corners in each image over the cells that hold any; distortion is a guess where there is none."""
-    figure = Figure(figsize=(12, 6))
-    lay_out(figure, (1, 2))
-    observations, kept = found.refinement.observations, found.refinement.kept
-    for camera, (name, axes) in enumerate(zip(CAMERAS, figure.subplots(1, 2), strict=True)):
-        pixels = observations.pixels[kept & (observations.camera == camera)]
-        width, height = found.rig.cameras[camera].image_size
-        edges = [np.linspace(-0.5, size - 0.5, COVERAGE_CELLS + 1) for size in (width, height)]
-        counts, _, _ = np.histogram2d(pixels[:, 0], pixels[:, 1], bins=edges)
-        shading = axes.pcolormesh(*edges, np.where(counts > 0, counts, np.nan).T, cmap=_SHADES, vmin=0)
-        figure.colorbar(shading, ax=axes, label="corners in the cell", shrink=0.7)
-        axes.plot(*pixels.T, ".", color=INK, markersize=1.5, alpha=0.5)
-        _image_frame(axes, found, camera)
-        axes.set_title(f"{name}: {np.mean(counts > 0):.0%} of the cells hold a corner", color=INK, fontsize=10)
-    figure.suptitle("Coverage of the images by calibration corners")
-    return figure
-
-
-def _image_frame(axes: Axes, found: StereoCalibration, camera: int) -> None:
-    width, height = found.rig.cameras[camera].image_size
-    axes.set_xlim(-0.5, width - 0.5)
-    axes.set_ylim(height - 0.5, -0.5)
-    axes.set_aspect("equal")
-    axes.set_xlabel("x (px)")
-    axes.set_ylabel("y (px)")
-
-
-FIGURES: dict[str, Callable[[StereoCalibration], Figure]] = {
-    "residuals": residuals_figure,
-    "coverage": coverage_figure,
-}

@@ -15,12 +15,12 @@ from calibration.board.search import Progress
 from calibration.board.target import Target
 from calibration.fit import normal_equations
 from calibration.kit.arguments import checked
-from calibration.rig_file import CalibrationRecord, read_rig, read_rig_file, write_rig
+from calibration.rig_file import CalibrationRecord, read_rig, read_rig_file, rig_bytes
 from disctrack.analyse.declaration import Boards
 from disctrack.calibrate.views import TargetImages, calibrate_views, declared_views
 from disctrack.errors import CalibrationError, OutputError, RecordingError, RigFileError
 from disctrack.files.inputs import keep, refuse_input
-from disctrack.files.whole import whole_file
+from disctrack.files.whole import write_whole
 from disctrack.findings import Kind, Severity, of_kind
 from disctrack.progress import compiling, progress_bar
 from disctrack.recording.declaration import Recording
@@ -60,14 +60,6 @@ class CalibrationSource:
                 "tolerances": dataclasses.asdict(self.settings.tolerances),
             },
         )
-
-
-@dataclass(frozen=True)
-class CalibrationResult:
-    """The rig, what to tell about it, and the files it went to."""
-
-    rig: StereoRig
-    report: Report
 
 
 def source_of(recording: Recording, settings: CalibrationSettings) -> CalibrationSource:
@@ -119,19 +111,20 @@ def boards_of(record: CalibrationRecord, views: TargetImages | None, numbers: Se
     return Boards(places, view, record.board_thickness)
 
 
-def given_rig(file: Path) -> CalibrationResult:
-    """A rig that a recording shares with others. Raises RigFileError."""
+def given_rig(file: Path) -> tuple[StereoRig, Report]:
+    """A rig that a recording shares with others, and what to tell about it. Raises RigFileError."""
     keep(file)
     rig = read_rig(file)
-    return CalibrationResult(rig, Report("", f"{file}: baseline {rig.baseline * 1e3:.3f} mm"))
+    return rig, Report("", f"{file}: baseline {rig.baseline * 1e3:.3f} mm")
 
 
 def calibrate_into(
     path: Path, source: CalibrationSource, overwrite: bool, figures: bool, force: bool = False
-) -> CalibrationResult:
-    """Calibrate, or reuse the rig that is there; write rig and pictures.
+) -> tuple[StereoRig, Report]:
+    """Calibrate, or reuse the rig that is there; write rig and picture.
 
     force : write a rig that is beyond use, too; CalibrationError without
+    returns : the rig, what to tell about it, and the files it went to
     Raises OutputError if `path` holds something else and may not be replaced.
     """
     refuse_input(path)
@@ -144,7 +137,7 @@ def calibrate_into(
                 "choose another place with -o, or replace it with --overwrite."
             )
         told["rows"].append(("reused", f"{path}: complete result of the same views, settings and version"))
-        return CalibrationResult(read_rig(path), _report(told, [path]))
+        return read_rig(path), _report(told, [path])
     found, problems = _calibrate(source)
     if found.assessment.beyond_use and not force:
         said = "; ".join([found.assessment.verdict, *found.warnings])
@@ -158,23 +151,22 @@ def calibrate_into(
         "rows": summary.calibration_rows(found, problems),
         "warnings": [*problems, *found.warnings],
     }
-    with whole_file(path, suffix=".h5") as part:
-        attributes = {
-            "fingerprint": provenance.fingerprint,
-            "inputs_sha256": json.dumps(dict(provenance.inputs)),
-            "settings": json.dumps(dict(provenance.settings)),
-            "software_version": provenance.version,
-            "summary": json.dumps(told),
-        }
-        write_rig(part, found, attributes)
+    attributes = {
+        "fingerprint": provenance.fingerprint,
+        "inputs_sha256": json.dumps(dict(provenance.inputs)),
+        "settings": json.dumps(dict(provenance.settings)),
+        "software_version": provenance.version,
+        "summary": json.dumps(told),
+    }
+    write_whole(path, rig_bytes(found, attributes))
     files = [path]
     if figures:
-        from disctrack.calibrate.figures import FIGURES
+        from disctrack.calibrate.figures import residuals_figure
         from disctrack.report.figures import save_figure
 
         prefix = "calibration" if path.stem == "rig" else f"{path.stem}_calibration"
-        files += [save_figure(make(found), path.with_name(f"{prefix}_{name}.png")) for name, make in FIGURES.items()]
-    return CalibrationResult(found.rig, _report(told, files))
+        files.append(save_figure(residuals_figure(found), path.with_name(f"{prefix}_residuals.png")))
+    return found.rig, _report(told, files)
 
 
 def _report(told: Mapping[str, Any], files: Sequence[Path]) -> Report:

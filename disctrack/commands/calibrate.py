@@ -25,8 +25,8 @@ def run(arguments: argparse.Namespace) -> int:
         source = source_of(read_recording(arguments.recording), outputs.calibration_settings(arguments))
         path = arguments.output or arguments.recording / outputs.RESULTS / "rig.h5"
     outputs.check_writable(path.parent)
-    result = calibrate_into(path, source, arguments.overwrite, figures=not arguments.no_figures, force=arguments.force)
-    return outputs.tell(result.report, arguments, path.parent)
+    _, report = calibrate_into(path, source, arguments.overwrite, not arguments.no_figures, arguments.force)
+    return outputs.tell(report, arguments, path.parent)
 
 
 def _source_of_patterns(arguments: argparse.Namespace) -> CalibrationSource:

@@ -4,6 +4,7 @@ import argparse
 
 from disctrack.commands import DONE
 from disctrack.commands.options import UNKNOWN_TO_FILES
+from disctrack.files.toml_tree import toml_value
 from disctrack.first_look.declare import run_init
 
 
@@ -11,7 +12,8 @@ def run(arguments: argparse.Namespace) -> int:
     """Look, write, and tell what is left to fill in; returns the exit code."""
     known = {key: getattr(arguments, key) for key in UNKNOWN_TO_FILES if getattr(arguments, key) is not None}
     done = run_init(arguments.folder, known, arguments.like)
-    rows = [*done.seen, ("written", str(done.file))]
+    rows = [(s, f"{key} = {toml_value(value)}  {remark}".rstrip()) for (s, key), (value, remark) in done.told.items()]
+    rows += [*(("note", note) for note in done.notes), ("written", str(done.file))]
     rows += [("fill in", ", ".join(done.missing))] if done.missing else []
     for heading, text in (*rows, ("then", f"disctrack check {arguments.folder}")):
         print(f"{heading:<13} {text}")

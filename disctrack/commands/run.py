@@ -25,18 +25,15 @@ def run(arguments: argparse.Namespace) -> int:
     outputs.check_writable(folder)
     if recording.rig_file is not None:
         rig_file = recording.rig_file
-        calibrated = given_rig(rig_file)
+        rig, known = given_rig(rig_file)
     else:
         rig_file = folder / "rig.h5"
         source = source_of(recording, outputs.calibration_settings(arguments))
-        calibrated = calibrate_into(rig_file, source, arguments.overwrite, not arguments.no_figures)
-    known = calibrated.report
+        rig, known = calibrate_into(rig_file, source, arguments.overwrite, not arguments.no_figures)
     verdict = f"Calibration: {known.verdict.partition('. ')[0]}"
     if recording.rig_file is None and not arguments.quiet:  # before the frames, which take longer
         print(verdict, file=sys.stderr, flush=True)
-    tracked, findings = outputs.track_into(
-        folder / "trajectory.h5", recording, calibrated.rig, rig_file, pairs, arguments
-    )
+    tracked, findings = outputs.track_into(folder / "trajectory.h5", recording, rig, rig_file, pairs, arguments)
     whole = [("verdict", known.verdict), ("place", known.accuracy)]
     report = replace(
         tracked,

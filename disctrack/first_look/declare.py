@@ -68,7 +68,8 @@ class WrittenDeclaration:
     """What `run_init` wrote."""
 
     file: Path
-    seen: list[tuple[str, str]]  # headings, and what the files tell
+    told: Told  # what the files tell
+    notes: tuple[str, ...]
     missing: tuple[str, ...]  # keys that the user has to fill in
 
 
@@ -84,15 +85,15 @@ def run_init(folder: Path, known: Mapping[str, float] | None = None, like: Path 
     if file.exists():
         raise OutputError(f"{file}: exists. Edit it, or move it away; `disctrack check {folder}` tells what it lacks.")
     example = {} if like is None else read_toml(like / FILE_NAME if like.is_dir() else like, RecordingError)
-    told, seen = look_into(folder)
+    told, notes = look_into(folder)
     given = {"gravity": {"g_m_s2": 9.81}} | example
     text, missing = declaration(folder.resolve().name, told, known or {}, given)
     write_whole(file, text.encode())
-    return WrittenDeclaration(file, seen, missing)
+    return WrittenDeclaration(file, told, tuple(notes), missing)
 
 
-def look_into(folder: Path) -> tuple[Told, list[tuple[str, str]]]:
-    """What the frames of a folder tell, and in words. Raises RecordingError if no two cameras can be told apart."""
+def look_into(folder: Path) -> tuple[Told, list[str]]:
+    """What the frames of a folder tell, and notes. Raises RecordingError if no two cameras can be told apart."""
     sequences = find_sequences(folder)
     shows_once = cache(partial(_shows_the_board_once, folder))  # seconds, for large images
     pairs, half = pair_cameras(sequences), None
@@ -108,55 +109,49 @@ def look_into(folder: Path) -> tuple[Told, list[tuple[str, str]]]:
         raise _no_two_cameras(folder, sequences)
     if frames is views:
         raise _views_alone(folder, frames, inner_corners or (9, 6))
-    told, seen = _of_frames(folder, frames)
+    told, notes = _of_frames(folder, frames)
     if len(candidates) > 1:
         others = ", ".join(pair.left.pattern for pair in candidates if pair is not frames)
-        seen.append(("note", f"the longest of several pairs is taken for the recording; also there: {others}"))
+        notes.append(f"the longest of several pairs is taken for the recording; also there: {others}")
     if half is not None:
         width, height = half
         told["cameras", "left_part"] = [0, 0, width, height], ""
         told["cameras", "right_part"] = [width, 0, width, height], ""
-        text = "each image holds two views side by side, as the board in both halves shows: left_part, right_part"
-        seen.append(("note", text))
+        notes.append("each image holds two views side by side, as the board in both halves shows")
     if views is not None:
         left, right, count = views.left.pattern, views.right.pattern, _length(folder, views.left)
         told["calibration", "left"], told["calibration", "right"] = (left, f"{count} views"), (right, "")
-        corners = ""
-        if inner_corners is not None:
+        if inner_corners is None:
+            notes.append(f"{left}: {board_seen}")
+        else:
             told["calibration", "inner_corners"] = list(inner_corners), f"long side first; {board_seen}"
-            corners = f", {inner_corners[0]} x {inner_corners[1]} corners"
-        seen.append(("chessboard", f"{left}: {count} views{corners} ({board_seen})"))
     elif (rig_file := _rig_beside(folder)) is not None:
         told["calibration", "rig"] = rig_file, "a rig that was calibrated before"
-        seen.append(("rig", rig_file))
     else:
-        text = "no views of a chessboard are there: put them into calibration/left and calibration/right, or name a rig"
-        seen.append(("note", text))
-    return told, seen
+        said = "no views of a chessboard are there: put them into calibration/left and calibration/right, or name a rig"
+        notes.append(said)
+    return told, notes
 
 
-def _of_frames(folder: Path, frames: CameraPair) -> tuple[Told, list[tuple[str, str]]]:
-    """What the cameras' frames tell, and in words."""
+def _of_frames(folder: Path, frames: CameraPair) -> tuple[Told, list[str]]:
+    """What the cameras' frames tell, and notes."""
     left, right = frames.left.open(folder), frames.right.open(folder, "right")
     width, height = left.image_size
-    described = f"{len(left)} frames of {width} x {height} px, {left.bit_depth} bit"
+    described, notes = f"{len(left)} frames of {width} x {height} px, {left.bit_depth} bit", []
     told: Told = {
         ("cameras", "left"): (frames.left.pattern, described),
         ("cameras", "right"): (frames.right.pattern, ""),
         ("table", "view"): (0, ""),
     }
-    seen = [("cameras", f"{frames.left.pattern} and {frames.right.pattern}: {described}")]
     if len(left) != len(right):
-        text = f"left has {len(left)} frames, right has {len(right)}: a run wants as many of both, of the same instants"
-        seen.append(("note", text))
+        many = f"left has {len(left)} frames, right has {len(right)}"
+        notes.append(f"{many}: a run wants as many of both, of the same instants")
     rate, source = _frame_rate(left, right)
     if rate is not None:
         told["cameras", "frame_rate_hz"] = rate, f"frames per second, {source}"
-        seen.append(("", f"{rate:g} Hz, {source}"))
     if not frames.named:
-        text = f"which camera is left is a guess by the order of names: {frames.left.pattern} is taken for left"
-        seen.append(("note", text))
-    return told, seen
+        notes.append(f"which camera is left is a guess by the order of names: {frames.left.pattern} is taken for left")
+    return told, notes
 
 
 def _views_alone(folder: Path, views: CameraPair, corners: tuple[int, int]) -> RecordingError:

@@ -68,7 +68,7 @@ def test_images_without_a_declaration_are_told(tmp_path):
     assert find_recordings([root]).undeclared == ()
     for rig in ("one", "other"):  # pictures of two rigs that a batch calibrated are no images of two cameras
         (root / "batch_results" / "rigs" / rig).mkdir(parents=True)
-        (root / "batch_results" / "rigs" / rig / "calibration_coverage.png").touch()
+        (root / "batch_results" / "rigs" / rig / "calibration_residuals.png").touch()
     assert find_recordings([root]).undeclared == ()
     for name in ("left", "right", "calibration/left", "calibration/right"):
         (root / "day 1" / "r3" / name).mkdir(parents=True)
