@@ -7,54 +7,45 @@ found.rig, found.rms_px, found.assessment.verdict
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from calibration.board.target import Board
-from calibration.cameras.camera import Camera, StereoRig, triangulate
-from calibration.kit.errors import CalibrationError, DiscTrackError, RigFileError
-
-if TYPE_CHECKING:
-    from calibration.board.chessboard import BoardNotFound, CornerView, find_corners
-    from calibration.fit.refinement import refine_stereo
-    from calibration.fit.stereo_model import Observations, StereoModel, Terms
-    from calibration.points import calibrate_from_points
-    from calibration.stereo import CalibrationSettings, StereoCalibration, calibrate_from_corners, calibrate_stereo
-
-# Imported when asked for: the physics needs the camera model and the errors, not the image library behind these.
-_ON_DEMAND = {
+# Imported when asked for: the physics needs the camera model and the errors, not the image library behind the others.
+_HOME = {
     "board.chessboard": ("BoardNotFound", "CornerView", "find_corners"),
-    "points": ("calibrate_from_points",),
+    "board.target": ("Board",),
+    "cameras.camera": ("Camera", "StereoRig", "triangulate"),
     "fit.refinement": ("refine_stereo",),
     "fit.stereo_model": ("Observations", "StereoModel", "Terms"),
     "judge.tolerances": ("BoardTolerances",),
+    "kit.errors": ("CalibrationError", "DiscTrackError", "RigFileError"),
+    "points": ("calibrate_from_points",),
     "stereo": ("CalibrationSettings", "StereoCalibration", "calibrate_from_corners", "calibrate_stereo"),
 }
+_MODULE_OF = {name: module for module, names in _HOME.items() for name in names}
+__all__ = [*_MODULE_OF]
+
+if TYPE_CHECKING:
+    from calibration.board.chessboard import BoardNotFound as BoardNotFound
+    from calibration.board.chessboard import CornerView as CornerView
+    from calibration.board.chessboard import find_corners as find_corners
+    from calibration.board.target import Board as Board
+    from calibration.cameras.camera import Camera as Camera
+    from calibration.cameras.camera import StereoRig as StereoRig
+    from calibration.cameras.camera import triangulate as triangulate
+    from calibration.fit.refinement import refine_stereo as refine_stereo
+    from calibration.fit.stereo_model import Observations as Observations
+    from calibration.fit.stereo_model import StereoModel as StereoModel
+    from calibration.fit.stereo_model import Terms as Terms
+    from calibration.judge.tolerances import BoardTolerances as BoardTolerances
+    from calibration.kit.errors import CalibrationError as CalibrationError
+    from calibration.kit.errors import DiscTrackError as DiscTrackError
+    from calibration.kit.errors import RigFileError as RigFileError
+    from calibration.points import calibrate_from_points as calibrate_from_points
+    from calibration.stereo import CalibrationSettings as CalibrationSettings
+    from calibration.stereo import StereoCalibration as StereoCalibration
+    from calibration.stereo import calibrate_from_corners as calibrate_from_corners
+    from calibration.stereo import calibrate_stereo as calibrate_stereo
 
 
 def __getattr__(name: str) -> Any:
-    for module, names in _ON_DEMAND.items():
-        if name in names:
-            return getattr(import_module(f"calibration.{module}"), name)
-    raise AttributeError(f"module 'calibration' has no attribute '{name}'")
-
-
-__all__ = [
-    "Board",
-    "BoardNotFound",
-    "BoardTolerances",
-    "CalibrationError",
-    "CalibrationSettings",
-    "Camera",
-    "CornerView",
-    "DiscTrackError",
-    "Observations",
-    "RigFileError",
-    "StereoCalibration",
-    "StereoModel",
-    "StereoRig",
-    "Terms",
-    "calibrate_from_corners",
-    "calibrate_from_points",
-    "calibrate_stereo",
-    "find_corners",
-    "refine_stereo",
-    "triangulate",
-]
+    if name not in _MODULE_OF:
+        raise AttributeError(f"module 'calibration' has no attribute {name!r}")
+    return getattr(import_module(f"calibration.{_MODULE_OF[name]}"), name)

@@ -27,6 +27,7 @@ Arrays: many of a thing on leading axes, components last; image points are (n_fr
 import numpy as np
 from numpy.typing import ArrayLike
 
+from calibration.cameras.camera import rotation_from_vector as rotation_from_vector
 from calibration.kit.arrays import Array
 
 POSE_COMPONENTS = ("x", "y", "z", "rotation_x", "rotation_y", "rotation_z")
@@ -127,19 +128,6 @@ def skew(v: ArrayLike) -> Array:
     S[..., 0, 1], S[..., 0, 2], S[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
     S[..., 1, 0], S[..., 2, 0], S[..., 2, 1] = v[..., 2], -v[..., 1], v[..., 0]
     return S
-
-
-def rotation_from_vector(v: ArrayLike) -> Array:
-    """Rodrigues' formula: rotation vector (..., 3) [rad] -> (..., 3, 3), accurate also near zero."""
-    v = np.asarray(v, float)
-    angle2 = np.sum(v * v, axis=-1)[..., None, None]
-    angle = np.sqrt(angle2)
-    small = angle2 < 1e-8
-    safe = np.where(small, 1.0, angle)
-    a = np.where(small, 1 - angle2 / 6, np.sin(safe) / safe)
-    b = np.where(small, 0.5 - angle2 / 24, (1 - np.cos(safe)) / safe**2)
-    S = skew(v)
-    return np.eye(3) + a * S + b * (S @ S)
 
 
 def vector_from_rotation(R: Array) -> Array:

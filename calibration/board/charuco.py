@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.board.chessboard import SEARCH_SIZE, BoardNotFound, as_8_bit, grey_values
+from calibration.board.chessboard import BoardNotFound, as_8_bit, luminance, reduced
 from calibration.board.corner_fit import CornerView, fit_view, smooth_grid
 from calibration.board.target import LEAST_POINTS, CharucoBoard
 from calibration.kit.arrays import Array
@@ -20,9 +20,9 @@ from calibration.kit.grey_levels import level_step
 def find_charuco(image: NDArray, board: CharucoBoard) -> CornerView | BoardNotFound:
     """Locate the inner corners of a ChArUco board; those that are not in view are not accepted, without a reason.
 
-    image : (h, w) or (h, w, 3) as OpenCV reads it; see `chessboard.grey_values`
+    image : (h, w) or (h, w, 3) as OpenCV reads it; see `chessboard.luminance`
     """
-    grey, notes = grey_values(image)
+    grey, notes = luminance(image)
     step = level_step(grey)
     values = grey // step if step > 1 else grey
     corners, ids = _detected(as_8_bit(values), board)
@@ -56,9 +56,7 @@ def _detected(grey: NDArray[np.uint8], board: CharucoBoard) -> tuple[Array, NDAr
     if number is None or not board.dictionary.startswith("DICT_"):
         known = ", ".join(name for name in dir(cv2.aruco) if name.startswith("DICT_") and "_50" in name)
         raise CalibrationError(f"dictionary {board.dictionary!r} is not one of OpenCV's: {known}, ...")
-    scale = min(1.0, SEARCH_SIZE / max(grey.shape))
-    if scale < 1.0:
-        grey = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA).astype(np.uint8)
+    grey, scale = reduced(grey)
     best: tuple[Array, NDArray[np.intp]] = (np.zeros((0, 2)), np.zeros(0, np.intp))
     # before OpenCV 4.6 boards with an even number of rows began with a light square: such prints are about
     for legacy in (False, True) if board.squares[1] % 2 == 0 else (False,):

@@ -32,7 +32,7 @@ class BoardNotFound:
     reason: str
 
 
-def grey_values(image: NDArray) -> tuple[NDArray, tuple[str, ...]]:
+def luminance(image: NDArray) -> tuple[NDArray, tuple[str, ...]]:
     """Grey values (h, w) of an image as cv2.IMREAD_UNCHANGED gives it, and a note where information was left out.
 
     Grey images, 8 or 16 bit, are taken as they are. Three equal channels are one grey image. Colour becomes luminance
@@ -56,11 +56,11 @@ def grey_values(image: NDArray) -> tuple[NDArray, tuple[str, ...]]:
 def find_corners(image: NDArray, inner_corners: tuple[int, int], thorough: bool = True) -> CornerView | BoardNotFound:
     """Locate the inner corners of a chessboard.
 
-    image : (h, w) or (h, w, 3) uint8 or uint16, blue-green-red order as OpenCV reads it; see `grey_values`
+    image : (h, w) or (h, w, 3) uint8 or uint16, blue-green-red order as OpenCV reads it; see `luminance`
     inner_corners : counts along the board's i and j; see `Board` for the order of the corners
     thorough : search with OpenCV's slow finder where its quick one sees nothing
     """
-    grey, notes = grey_values(image)
+    grey, notes = luminance(image)
     step = level_step(grey)
     if step > 1:  # an image whose values are multiples of a step is that image, whatever the step
         grey = grey // step
@@ -81,8 +81,7 @@ def board_in(grey: NDArray, thorough: bool = False) -> tuple[int, int] | None:
     thorough : OpenCV's exhaustive search, 0.3 s for 1280 x 720; without it parts of a board are often all it sees
     """
     flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_NORMALIZE_IMAGE | (cv2.CALIB_CB_EXHAUSTIVE if thorough else 0)
-    stretched = cv2.normalize(grey.astype(np.float32), None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)  # type: ignore[call-overload]
-    found, corners, squares = cv2.findChessboardCornersSBWithMeta(stretched, (3, 3), flags)
+    found, corners, squares = cv2.findChessboardCornersSBWithMeta(as_8_bit(grey), (3, 3), flags)
     if not found or squares is None or squares.size < LEAST_CORNERS:
         return None
     rows, columns = squares.shape[:2]
@@ -120,13 +119,18 @@ def as_8_bit(grey: NDArray) -> NDArray[np.uint8]:
     return np.clip((grey - low) * (255.0 / max(high - low, 1e-12)), 0, 255).astype(np.uint8)
 
 
+def reduced(grey: NDArray, largest: int = SEARCH_SIZE) -> tuple[NDArray, float]:
+    """The image, or a smaller one whose longer side has the largest size allowed [px]; and its scale."""
+    scale = min(1.0, largest / max(grey.shape))
+    small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1.0 else grey
+    return np.asarray(small), scale
+
+
 def _rough_corners(grey: NDArray[np.uint8], inner_corners: tuple[int, int], thorough: bool) -> Array | None:
     """Corners (n, 2) [px] to about a pixel in any of the board's orders, or None."""
     if min(grey.shape) < 2 * min(inner_corners):  # no square would have a pixel to itself
         return None
-    scale = min(1.0, SEARCH_SIZE / max(grey.shape))
-    if scale < 1.0:
-        grey = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA).astype(np.uint8)
+    grey, scale = reduced(grey)
     quick, slow = cv2.findChessboardCorners, cv2.findChessboardCornersSB
     flags, exhaustive = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE, cv2.CALIB_CB_EXHAUSTIVE
     tried = [(quick, 1, flags)]
@@ -297,4 +301,4 @@ def margin_is_dark(image: NDArray, corners: Array, points: Array, board: Board) 
     return bool(np.median(margin) < dark + 0.25 * (light - dark))
 
 
-__all__ = ["BoardNotFound", "CornerView", "board_in", "board_orders", "find_corners", "grey_values", "negatives"]
+__all__ = ["BoardNotFound", "CornerView", "board_in", "board_orders", "find_corners", "luminance", "negatives"]

@@ -339,8 +339,7 @@ def smooth_grid(points: Array, inner_corners: tuple[int, int], seen: Mask) -> tu
     H, _ = cv2.findHomography(board[seen], points[seen], cv2.LMEDS)
     if H is None:
         H, _ = cv2.findHomography(board[seen], points[seen])
-    image = np.column_stack([board, np.ones(len(board))]) @ np.asarray(H, float).T
-    plane = image[:, :2] / image[:, 2:]
+    plane = np.asarray(cv2.perspectiveTransform(board[None], np.asarray(H, float))[0], float)
     degree = max(degree_for(int(seen.sum()), 3), 1)
     u, v = 2 * board[:, 0] / (columns - 1) - 1, 2 * board[:, 1] / (rows - 1) - 1
     A = np.stack([u**a * v**b for a in range(degree + 1) for b in range(degree + 1 - a)], axis=-1)

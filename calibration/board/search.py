@@ -4,8 +4,6 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
-import cv2
-import numpy as np
 from numpy.typing import NDArray
 
 from calibration.board.charuco import find_charuco
@@ -15,7 +13,8 @@ from calibration.board.chessboard import (
     CornerView,
     board_in,
     find_corners,
-    grey_values,
+    luminance,
+    reduced,
 )
 from calibration.board.target import Board, CharucoBoard, Target
 from calibration.kit.arrays import evenly
@@ -96,7 +95,7 @@ def board_size(images: Sequence[NDArray], largest: int = SEARCH_SIZE) -> tuple[t
 
     largest : [px] larger images are reduced to that: OpenCV's search takes 0.3 s at 800 x 600, 5.5 s at 4000 x 3000
     """
-    greys = [_reduced(grey_values(image)[0], largest) for image in images]
+    greys = [reduced(luminance(image)[0], largest)[0] for image in images]
     seen: dict[tuple[int, int], int] = {}
     for thorough in (False, True):
         sizes = [board_in(grey, thorough) for grey in greys]
@@ -116,9 +115,3 @@ def _found(size: tuple[int, int], greys: Sequence[NDArray], sizes: Sequence[tupl
     """How many images of another size, or of none, show a board of this one where it is asked for."""
     others = [grey for grey, found in zip(greys, sizes, strict=True) if found != size]
     return sum(not isinstance(find_corners(grey, size), BoardNotFound) for grey in others)
-
-
-def _reduced(grey: NDArray, largest: int) -> NDArray:
-    """Grey values (h, w), or a smaller image of them whose longer side has the largest size allowed [px]."""
-    scale = largest / max(grey.shape)
-    return np.asarray(cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else grey)

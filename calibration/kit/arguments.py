@@ -106,42 +106,56 @@ def _as(value: Any, kind: Any, name: str) -> Any:
     try:
         return _fit(value, kind)
     except (TypeError, ValueError):
-        raise ArgumentError(f"{name} is {_short(value)}; expected {_in_words(kind)}") from None
-
-
-def _options(kind: Any) -> tuple[Any, ...]:
-    return get_args(kind) if get_origin(kind) in (Union, UnionType) else (kind,)
+        raise ArgumentError(f"{name} is {_short(value)}; expected {_rule(kind)[1]}") from None
 
 
 def _fit(value: Any, kind: Any) -> Any:
-    """The value as the kind, or the first of its options that it fits. Raises TypeError, ValueError."""
-    if any(isinstance(option, type) and type(value) is option for option in _options(kind)):
-        return value  # before what it may stand for
-    for option in _options(kind):
-        with suppress(TypeError, ValueError):
-            return _fit_one(value, option)
-    raise TypeError
+    """The value as the kind. Raises TypeError, ValueError."""
+    return value if isinstance(kind, type) and type(value) is kind else _rule(kind)[0](value)
 
 
-def _fit_one(value: Any, kind: Any) -> Any:
+Rule = tuple[Callable[[Any], Any], str]  # how a value is taken (TypeError, ValueError), and what is expected, in words
+
+
+@functools.cache
+def _rule(kind: Any) -> Rule:
     origin, parts = get_origin(kind), get_args(kind)
-    if origin is Annotated:
-        return next(rule for rule in parts if hasattr(rule, "take")).take(_fit(value, parts[0]))
     if kind in _PLAIN:
-        return _PLAIN[kind][0](value)
+        return _PLAIN[kind]
+    if origin is Annotated:
+        limits = next(rule for rule in parts if hasattr(rule, "take"))
+        return lambda value: limits.take(_fit(value, parts[0])), str(limits)
+    if origin in (Union, UnionType):
+        options = dict.fromkeys(_rule(option)[1] for option in parts if option is not NoneType)
+        return lambda value: _first_that_fits(value, parts), " or ".join(options)
     if origin is np.ndarray:
-        return _array(value)
-    if origin is tuple and parts[-1] is not ...:
-        if not isinstance(value, tuple | list):
-            raise TypeError
-        return tuple(_fit(v, part) for v, part in zip(value, parts, strict=True))
+        return _array, "an array of numbers"
     if isinstance(origin, type):
-        return _collection(value, origin, parts)
-    return _object(value, kind) if isinstance(kind, type) else value
+        inner = ", ".join(_rule(part)[1] for part in parts if part is not ... and origin is not Callable)
+        words = "a function" if origin is Callable else f"a {origin.__name__.lower()} of ({inner})"
+        return lambda value: _collection(value, origin, parts), words
+    path = " or the path of its file or folder" if getattr(kind, "read_by", "") else ""
+    name = getattr(kind, "__name__", str(kind))
+    expected = f"{'an' if name[0] in 'AEIO' else 'a'} {name}{path}"
+    return lambda value: _object(value, kind) if isinstance(kind, type) else value, expected
+
+
+def _first_that_fits(value: Any, options: tuple[Any, ...]) -> Any:
+    """The value as the first of several kinds that it fits."""
+    if any(type(value) is option for option in options):
+        return value  # before what it may stand for
+    for option in options:
+        with suppress(TypeError, ValueError):
+            return _fit(value, option)
+    raise TypeError
 
 
 def _collection(value: Any, kind: type, parts: tuple[Any, ...]) -> Any:
     """A collection with members that fit; an array is one, text is none."""
+    if kind is tuple and parts[-1] is not ...:
+        if not isinstance(value, tuple | list):
+            raise TypeError
+        return tuple(_fit(v, part) for v, part in zip(value, parts, strict=True))
     listed = isinstance(value, list | tuple | np.ndarray) and issubclass(tuple, kind)
     if not listed and (not isinstance(value, kind) or isinstance(value, str | bytes)):
         raise TypeError
@@ -195,8 +209,7 @@ def _array(value: Any) -> NDArray[Any]:
     return array
 
 
-# What is built in: how a value is taken, and what is expected.
-_PLAIN: dict[Any, tuple[Callable[[Any], Any], str]] = {
+_PLAIN: dict[Any, Rule] = {
     NoneType: (_of(NoneType), "None"),
     bool: (_of(bool, np.bool_), "True or False"),
     int: (_whole, "a whole number"),
@@ -206,28 +219,6 @@ _PLAIN: dict[Any, tuple[Callable[[Any], Any], str]] = {
     os.PathLike[str]: (_of(os.PathLike), "a path"),
     Any: (lambda value: value, "anything"),
 }
-
-
-def _in_words(kind: Any) -> str:
-    return " or ".join(dict.fromkeys(_one_in_words(option) for option in _options(kind) if option is not NoneType))
-
-
-def _one_in_words(kind: Any) -> str:
-    origin, parts = get_origin(kind), get_args(kind)
-    if origin is Annotated:
-        return str(next(rule for rule in parts if hasattr(rule, "take")))
-    if kind in _PLAIN:
-        return _PLAIN[kind][1]
-    if origin is np.ndarray:
-        return "an array of numbers"
-    if origin is Callable:
-        return "a function"
-    if isinstance(origin, type):
-        inner = [_in_words(part) for part in parts if part is not ...]
-        return f"a {origin.__name__.lower()} of ({', '.join(inner)})"
-    path = " or the path of its file or folder" if getattr(kind, "read_by", "") else ""
-    name = getattr(kind, "__name__", str(kind))
-    return f"{'an' if name[0] in 'AEIO' else 'a'} {name}{path}"
 
 
 def _short(value: Any) -> str:

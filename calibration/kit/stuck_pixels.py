@@ -78,18 +78,12 @@ def repaired_views(views: Sequence[NDArray], camera: str) -> tuple[list[NDArray]
 
 def repair(images: NDArray, stuck: Mask) -> None:
     """Replace, in place, the stuck pixels of images (..., height, width) by the median of their good neighbours."""
-    width = stuck.shape[1]
     y, x = np.nonzero(stuck)
     steps = np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j])
     v, u = y[:, None] + steps[:, 0], x[:, None] + steps[:, 1]
-    inside = (v >= 0) & (v < stuck.shape[0]) & (u >= 0) & (u < width)
-    good = inside & ~stuck[np.where(inside, v, 0), np.where(inside, u, 0)]
-    index = np.where(inside, v * width + u, 0)
-    # good ones first; places of others are taken by the good ones in turn
-    order = np.take_along_axis(index, np.argsort(~good, axis=1, kind="stable"), axis=1)
-    n = good.sum(axis=1)
-    order = np.take_along_axis(order, np.arange(len(steps)) % np.maximum(n, 1)[:, None], axis=1)[n > 0]
-    flat = images.reshape(-1, stuck.size)
-    if not np.shares_memory(flat, images):
-        raise ValueError("images must be contiguous, or one by one")
-    flat[:, (y * width + x)[n > 0]] = np.median(flat[:, order], axis=-1).astype(images.dtype)
+    inside = (v >= 0) & (v < stuck.shape[0]) & (u >= 0) & (u < stuck.shape[1])
+    v, u = np.where(inside, v, 0), np.where(inside, u, 0)
+    good = inside & ~stuck[v, u]
+    known = good.any(axis=1)
+    around = np.where(good, images[..., v, u], np.nan)[..., known, :]
+    images[..., y[known], x[known]] = np.nanmedian(around, axis=-1).astype(images.dtype)

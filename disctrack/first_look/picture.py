@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from calibration.board.chessboard import grey_values
+from calibration.board.chessboard import luminance, reduced
 from disctrack.first_look.check import Check
 from disctrack.frames import CAMERAS
 from disctrack.recording.readers.decoding import decode
@@ -49,7 +49,7 @@ def _table_view(seen: Check) -> tuple[NDArray, NDArray] | None:
     names = found.view_names[found.table_view]
     if not all(Path(name).is_file() for name in names):
         return None
-    left, right = (_shown(np.asarray(grey_values(decode(Path(n).read_bytes(), n))[0])) for n in names)
+    left, right = (_shown(np.asarray(luminance(decode(Path(n).read_bytes(), n))[0])) for n in names)
     return left, right
 
 
@@ -73,6 +73,4 @@ def _draw_table(axes: Axes, images: tuple[NDArray, NDArray], seen: Check) -> Non
 def _shown(image: NDArray) -> NDArray[np.uint8]:
     """(h, w, 3) for the eye, stretched to 8 bit and reduced."""
     grey = np.asarray(cv2.normalize(image.astype(np.float32), None, 0, 255, cv2.NORM_MINMAX), np.uint8)  # type: ignore[call-overload]
-    scale = min(1.0, MOST_PIXELS / max(grey.shape))
-    small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    return np.asarray(np.repeat(small[..., None], 3, axis=-1), np.uint8)
+    return np.asarray(np.repeat(reduced(grey, MOST_PIXELS)[0][..., None], 3, axis=-1), np.uint8)

@@ -14,7 +14,6 @@ from calibration.cameras.camera import (
     normalise,
     normalised_maps,
     project,
-    project_with_jacobians,
     rotation_from_vector,
     triangulate,
 )
@@ -46,28 +45,8 @@ def test_projection_is_opencvs(points):
     assert_allclose(project(points, CAMERA), expected.reshape(-1, 2), atol=1e-10)
 
 
-def test_derivatives_by_the_point_and_the_intrinsics_agree_with_differences(points):
-    _, d_point, d_intrinsics = project_with_jacobians(points, CAMERA)
-    for k in range(3):
-        step = np.zeros(3)
-        step[k] = 1e-6
-        numeric = (project(points + step, CAMERA) - project(points - step, CAMERA)) / 2e-6
-        assert_allclose(numeric, d_point[..., k], atol=1e-6 * np.abs(d_point).max())
-    for k in range(9):
-        step = np.zeros(9)
-        step[k] = 1e-4 * max(1.0, abs(CAMERA.parameters[k]))
-        ahead, behind = (Camera.from_parameters(CAMERA.parameters + s * step, (512, 512)) for s in (1, -1))
-        numeric = (project(points, ahead) - project(points, behind)) / (2 * step[k])
-        # linear in every intrinsic: round-off of 500 px over the step
-        assert_allclose(numeric, d_intrinsics[..., k], atol=1e-12 * 500 / step[k] + 1e-9)
-
-
 def test_a_point_behind_the_camera_has_no_image():
     assert np.isnan(project(np.array([[0.0, 0.0, -0.3], [0.0, 0.0, 0.0]]), CAMERA)).all()
-
-
-def test_normalising_undoes_the_projection(points):
-    assert_allclose(normalise(project(points, CAMERA), CAMERA), points[:, :2] / points[:, 2:], atol=1e-13)
 
 
 @pytest.mark.parametrize("size", [(512, 512), (640, 48)])
