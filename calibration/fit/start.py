@@ -41,8 +41,8 @@ def for_opencv(
 
 def start_camera(
     observations: Observations, index: int, nominal: Array, image_size: tuple[int, int]
-) -> tuple[Camera, dict[int, tuple[Array, Array]]]:
-    """One camera and {view: (R, t) of the board in it} by OpenCV's calibrateCamera with k1 alone."""
+) -> tuple[Camera, dict[int, tuple[Array, Array]], float]:
+    """One camera, {view: (R, t) of the board in it} and the squared misfit [px^2], by OpenCV and with k1 alone."""
     name, (views, objects, images) = CAMERA_NAMES[index], for_opencv(observations, index, nominal)
     flags = cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3
     w, h = image_size
@@ -52,7 +52,7 @@ def start_camera(
     try:
         # views that leave k1 open still tell of a plain camera, and the refinement knows what cameras are like
         for plainer in (0, cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_PRINCIPAL_POINT | cv2.CALIB_FIX_ASPECT_RATIO):
-            _, K, distortion, turns, shifts = cv2.calibrateCamera(
+            rms, K, distortion, turns, shifts = cv2.calibrateCamera(
                 objects, images, image_size, guess.copy(), np.zeros(5), flags=flags | plainer
             )
             k1 = float(np.ravel(distortion)[0])
@@ -71,7 +71,7 @@ def start_camera(
         view: (rotation_from_vector(np.ravel(turn)), np.ravel(shift).astype(float))
         for view, turn, shift in zip(views, turns, shifts, strict=True)
     }
-    return camera, poses
+    return camera, poses, rms**2 * sum(map(len, images))
 
 
 def _refuse_one_place(t_pair: Array, boards: Sequence[Array]) -> None:
@@ -100,7 +100,7 @@ def start_stereo(
     orders, n_views = orders or [np.arange(len(nominal))], len(names)
     cameras, poses, places = [], [], []
     for index in (0, 1):
-        camera, seen = start_camera(observations, index, nominal, image_sizes[index])
+        camera, seen, _ = start_camera(observations, index, nominal, image_sizes[index])
         mine = observations[observations.camera == index]
         places.append(places_of(seen, {v: nominal[mine.point[mine.view == v]] for v in seen}, nominal, camera))
         cameras.append(camera)

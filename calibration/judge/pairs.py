@@ -25,7 +25,7 @@ import scipy
 from numpy.typing import NDArray
 
 from calibration.board.target import LEAST_POINTS
-from calibration.cameras.camera import CAMERA_NAMES, Camera, project
+from calibration.cameras.camera import CAMERA_NAMES, Camera
 from calibration.fit.board_motion import LEAST, BoardMotion, motions, split
 from calibration.fit.normal_equations import Problem
 from calibration.fit.pairing import TOO_FAR, Pairs, Pose, apart, places_of, rotation_vectors, told_by
@@ -309,14 +309,9 @@ def zoomed(
     other = np.isin(observations.view, moved.others)
     paired = np.isin(observations.view, [v for stretch in moved.stretches for v in stretch])
     for index, camera in enumerate(cameras):
-        focal, square = [], []
-        for part in (paired, paired & ~other, paired & other):
-            rough, poses = start_camera(observations[part], index, nominal, camera.image_size)
-            mine = observations[part & (observations.camera == index) & np.isin(observations.view, list(poses))]
-            R, t = (np.stack([poses[v][i] for v in mine.view]) for i in (0, 1))
-            off = mine.pixels - project(np.einsum("nij,nj->ni", R, nominal[mine.point]) + t, rough)
-            focal.append(rough.fx)
-            square.append(float(np.sum(off**2)))
+        parts = (paired, paired & ~other, paired & other)
+        rough = [start_camera(observations[part], index, nominal, camera.image_size) for part in parts]
+        focal, square = [one.fx for one, *_ in rough], [misfit for *_, misfit in rough]
         change = focal[2] / focal[1] - 1.0
         if abs(change) > ZOOM and square[0] > BY_ZOOM * (square[1] + square[2]):
             found[index] = (
