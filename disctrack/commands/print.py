@@ -12,7 +12,7 @@ from disctrack.recording.declaration import read_recording
 
 def run(arguments: argparse.Namespace) -> int:
     """Draw both sheets, and say what to declare of them; returns the exit code."""
-    disc, corners, square_mm = MA_2014, (9, 6), 20.0
+    disc, corners, square_mm = MA_2014, (9, 6), 10.0
     if arguments.recording is not None:
         recording = read_recording(arguments.recording)
         disc = recording.disc

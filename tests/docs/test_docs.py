@@ -197,7 +197,7 @@ def test_every_key_of_a_recording_is_explained_and_the_example_is_one(tmp_path):
     example = next(block for kind, _, block in blocks_of(text) if kind == "toml")
     (tmp_path / "recording.toml").write_text(example)
     assert read_recording(tmp_path).disc.radius == pytest.approx(0.0375)
-    declared = tomllib.loads(example)
+    declared = tomllib.loads(re.sub(r"(?m)^# (?=\w+ = )", "", example))  # with what few recordings need
     elsewhere = {key for keys in TARGET_KEYS.values() for key in keys} - {*TARGET_KEYS["chessboard"]}
     for section, keys in KEYS.items():
         for key in keys:

@@ -58,7 +58,7 @@ def test_own_calibration_keeps_the_papers_claim_and_finds_every_pose_without_a_p
     assert (two.found, two.gross) == (two.n, 0)
     assert two.n > 10
     assert one.gross == none.gross == 0
-    assert 1 < accuracy.law_limit_deg(1) < accuracy.law_limit_deg(2) < 15
+    assert 1 < accuracy.law_limit_deg < 15
 
 
 @pytest.mark.statistical
