@@ -28,7 +28,9 @@ def prior_rows(quantities: Sequence[Quantity], values: Values) -> tuple[Array, A
     known = [i for i, q in enumerate(quantities) if np.isfinite(q.prior_sigma)]
     sigma = np.array([quantities[i].prior_sigma for i in known])
     away = np.array([quantities[i].null - values[quantities[i].name] for i in known])
-    return away / sigma, np.eye(len(quantities))[known] / sigma[:, None]
+    matrix = np.zeros((len(known), len(quantities)))
+    matrix[np.arange(len(known)), known] = 1.0 / sigma
+    return away / sigma, matrix
 
 
 @dataclass(frozen=True)

@@ -85,7 +85,7 @@ SURE = 3.0  # standard deviations of the long-run variance itself, below which i
 def inflation(system: System, fit: Fit) -> Array:
     """(k,) by which the standard deviation of each fitted quantity grows; 1 where no memory is seen.
 
-    Linear quantities with priors keep theirs, and those that blocks of rows have of their own.
+    Linear quantities with priors keep theirs; those that a block of rows has of its own grow by what that one leaves.
     """
     factors = np.ones(len(fit.quantities))
     moved = [i for i, q in enumerate(fit.quantities) if not (is_linear(q) or q.slot)]
@@ -96,17 +96,29 @@ def inflation(system: System, fit: Fit) -> Array:
         return factors
     own = Own(system, fit.quantities)
     residual, derivative = system.linearise(fit.values, [*own.slots, *(fit.names[i] for i in moved)])
+    power = float(np.sum(residual[rows] ** 2) / max(np.sum(system.weights[rows]), 1.0))
+    shares = autocorrelation(residual[rows])
+    place = {q.name: i for i, q in enumerate(fit.quantities)}
+    for block, head in zip(own.blocks, fit.heads, strict=bool(fit.heads)):
+        mine = block.rows[system.weights[block.rows] > 0]
+        if len(mine) >= SHORTEST:
+            by_own = derivative[mine][..., block.columns] @ head.root @ head.root.T
+            factors[[place[q.name] for q in block.quantities]] = _grown(residual[mine], by_own, power, shares)
     derivative = own.cleared(derivative, fit.heads) if fit.heads else derivative
     common = projection(system, fit.quantities, fit.values)
     cleared = common.cleared(derivative.reshape(residual.size, -1))[: residual.size].reshape(derivative.shape)
-    by_number = cleared[rows] @ covariance  # (n, w, k)
-    influence = np.einsum("nw,nwk->nk", residual[rows], by_number)
+    factors[moved] = _grown(residual[rows], cleared[rows] @ covariance, power, shares)
+    return factors
+
+
+def _grown(residual: Array, by_number: Array, power: float, shares: Sequence[float]) -> Array:
+    """(k,) growth of numbers that move by `by_number` (n, w, k) with the residual (n, w), whose variance is `power`."""
+    influence = np.einsum("nw,nwk->nk", residual, by_number)
     alone = np.einsum("nwk,nwk->k", by_number, by_number)
-    power = float(np.sum(residual[rows] ** 2) / max(np.sum(system.weights[rows]), 1.0))
-    in_common = alone.copy()
-    for lag, share in enumerate(autocorrelation(residual[rows]), start=1):
+    in_common, factors = alone.copy(), np.ones(len(alone))
+    for lag, share in enumerate(shares[: len(residual) - 1], start=1):
         in_common += 2 * share * np.einsum("nwk,nwk->k", by_number[lag:], by_number[:-lag])
-    for i, x, one, together in zip(moved, influence.T, alone, in_common, strict=True):
+    for i, (x, one, together) in enumerate(zip(influence.T, alone, in_common, strict=True)):
         if power * one > 0:
             variance, spread = long_run_variance(x)
             ratio = variance * len(x) / (power * one)
@@ -150,7 +162,10 @@ def long_run_variance(x: Array) -> tuple[float, float]:
 def with_memory(system: System, fit: Fit) -> Fit:
     """The fit with standard deviations that know the residual's size and memory; correlations stay."""
     factors = inflation(system, fit) * np.sqrt(max(1.0, fit.reduced_chi_square))
-    return replace(fit, covariance=fit.covariance * np.outer(factors, factors))
+    shared = factors[[not q.slot for q in fit.quantities]]
+    size = dict(zip(fit.names, factors, strict=True))
+    own = {name: (size[name] * root, by_shared) for name, (root, by_shared) in fit.own.items()}
+    return replace(fit, covariance=fit.covariance * np.outer(shared, shared), own=own)
 
 
 @dataclass(frozen=True)
@@ -169,7 +184,7 @@ class SmoothNoise:
         return np.asarray(self.smooth**2 * np.exp(-0.5 * apart**2) + floor, float)
 
     def whitening(self, time: Array) -> Array:
-        """W (n, n), lower triangular, with W covariance W^T = 1: sample by sample what those before do not foretell."""
+        """W (n, n), lower triangular, with W covariance W^T = 1: sample by sample what those before do not predict."""
         root = np.linalg.cholesky(self.covariance(time))
         return np.asarray(solve_triangular(root, np.eye(len(time)), lower=True), float)
 

@@ -48,6 +48,9 @@ class Linearisation:
         names = list(dict.fromkeys([*(q.name for q in self.fitted), *new]))
         residual, derivative = system.linearise(values, [*own.slots, *names])
         right, matrix, _ = own.reduced(residual, derivative, values, common)
+        # of a column that a block's own quantities take whole, rounding is left
+        before = np.linalg.norm(derivative[..., len(own.slots) :], axis=(0, 1))
+        matrix[:, np.linalg.norm(matrix, axis=0) < DEPENDENT * before] = 0.0
         everything = [*self.fitted, *new.values()]
         prior, prior_matrix = prior_rows(everything, values)
         self.right = np.concatenate([right, prior])

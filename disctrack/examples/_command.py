@@ -6,19 +6,34 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from disctrack.discrepancy.document import document, tables
 from disctrack.discrepancy.equations import Answer
+from disctrack.discrepancy.search import Diagnosis
 from disctrack.errors import AnalysisError, DiscTrackError
 from disctrack.files.json_text import json_file
 from disctrack.files.whole import refuse_existing, write_whole
+from disctrack.report import blocks
+from disctrack.report.blocks import Report, Section
+from disctrack.report.terminal import full
 
 
 @dataclass(frozen=True)
 class Outcome:
     """What an example has to say."""
 
-    table: str  # for people
-    document: Mapping[str, object]  # diagnosis.json
+    report: Report  # its document is diagnosis.json
     answers: Mapping[str, Answer] = field(default_factory=dict)  # each on a page of its own, in a folder of this name
+
+
+def report_of(
+    d: Diagnosis, model: str, sentence: str, own: Sequence[Section], sides: Sequence[Mapping[str, object]] = ()
+) -> Report:
+    """Of a system of one's own: its blocks before those that every diagnosis has.
+
+    sides : errors before and after in its own units
+    """
+    data = document(d, model, sentence, *sides)
+    return Report(f"{model}: what is missing?", sentence, blocks=[*own, *tables(d)], data=data)
 
 
 def needed(folder: Path, name: str) -> Path:
@@ -30,7 +45,7 @@ def needed(folder: Path, name: str) -> Path:
 
 
 def command(name: str, data: str | None, diagnose: Callable[..., Outcome], words: Sequence[str] | None = None) -> int:
-    """Run one example: print its table, write diagnosis.json and pages where asked for; returns the exit code.
+    """Run one example: print its report, write diagnosis.json and pages where asked for; returns the exit code.
 
     data : what the folder that is given to `diagnose` holds; None for data that come with the sources
     """
@@ -44,11 +59,11 @@ def command(name: str, data: str | None, diagnose: Callable[..., Outcome], words
         if given.output is not None:
             refuse_existing(given.output / "diagnosis.json", given.overwrite)
         outcome = diagnose() if data is None else diagnose(given.folder)
-        print(outcome.table)
+        print("\n".join(full(outcome.report)))
         if given.output is not None:
             for where, answer in outcome.answers.items():
                 answer.write(given.output / where, given.overwrite)
-            write_whole(given.output / "diagnosis.json", json_file(dict(outcome.document)))
+            write_whole(given.output / "diagnosis.json", json_file(blocks.document(outcome.report)))
     except DiscTrackError as error:
         print(f"{name}: {error}", file=sys.stderr)
         return 1

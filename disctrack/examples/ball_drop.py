@@ -2,9 +2,9 @@
 
     python -m disctrack.examples.ball_drop FOLDER [-o DIR]
 
-FOLDER holds `ball_drops.csv` (ball, drop, t_s, height_m) and `balls.txt` (weights in ounces, circumferences in cm).
-Every ball was dropped twice: laws are fitted to drop 1 and to the first 1.2 s of drop 2, and judged on the rest. All
-balls together, and each alone; what two drops of one ball do not have in common is noise with a memory.
+FOLDER holds `ball_drops.csv` (ball, drop, t_s, height_m). Every ball was dropped twice: laws are fitted to drop 1 and
+to the first 1.2 s of drop 2, and judged on the rest. All balls together, and each alone; what two drops of one ball do
+not have in common is noise with a memory.
 Data: Frontiers in Artificial Intelligence 3:25; 11 balls.
 """
 
@@ -12,7 +12,6 @@ import csv
 import sys
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -26,15 +25,15 @@ from disctrack.discrepancy.search import CLASS_GAIN, Settings
 from disctrack.discrepancy.significance import price_of_a_number
 from disctrack.errors import AnalysisError
 from disctrack.examples._command import Outcome, command, needed
+from disctrack.numbers import rounded, score
+from disctrack.report.blocks import Listing, Report, Section
 
 GRAVITY = 9.81  # [m/s^2] as declared
-AIR_DENSITY = 1.2  # [kg/m^3] at 20 degC
-OUNCE = 0.028349523125  # [kg]
 ACCELERATION_DEGREE = 4  # of the polynomial in time that all drops of a ball share: any drag, to 1 mm
 SEEN = 1.2  # [s] of a second drop from which the rest is predicted, as in the published comparison
 FALL = Equations(
     {"h": "v", "v": "-g"},
-    constants={"g": GRAVITY, "per_cd": 0.0},
+    constants={"g": GRAVITY},
     units={"h": "m", "v": "m/s"},
     name=f"free fall, g = {GRAVITY} m/s^2",
 )
@@ -50,40 +49,23 @@ OTHERS = (
     Term("frame_rate", clock="-t*change/(1 + change)", parameters={"change": Parameter(0.0, typical=1e-3)}),
     Term("perspective", observed={"h": "b*(h - 30)**2"}, parameters={"b": Parameter(0.0, "1/m", typical=1e-3)}),
 )
-# one number for all of known size and mass: what a law of nature would be
-SPHERE = Term("sphere_drag", {"v": "-Cd*per_cd*v*abs(v)"}, parameters={"Cd": Parameter(0.0, lower=0.0, typical=0.5)})
 
 
-def drop(ball: str, number: int, time: Array, height: Array, per_cd: float = 0.0) -> Run:
-    """One drop of a ball: time [s], height [m].
-
-    per_cd : rho A / (2 m) [1/m], deceleration over v^2 for a drag coefficient of one; 0: not known
-    """
-    constants, groups = {"per_cd": per_cd}, {"ball": ball}
-    return Run(time, {"h": height}, name=f"{ball},{number}", constants=constants, groups=groups)
+def drop(ball: str, number: int, time: Array, height: Array) -> Run:
+    """One drop of a ball: time [s], height [m]."""
+    return Run(time, {"h": height}, name=f"{ball},{number}", groups={"ball": ball})
 
 
 def read_drops(folder: Path) -> tuple[Run, ...]:
-    """All drops of `ball_drops.csv`, with mass and radius from `balls.txt`. Raises AnalysisError."""
-    path, per_cd = needed(folder, "ball_drops.csv"), {}
-    for words in map(str.split, needed(folder, "balls.txt").read_text().splitlines()[1:]):
-        with suppress(ValueError, IndexError):  # nobody measured it
-            mass, radius = OUNCE * float(words[1]), 0.01 * float(words[2]) / (2 * np.pi)
-            per_cd[_key(words[0])] = AIR_DENSITY * np.pi * radius**2 / (2 * mass)
-    rows = defaultdict[tuple[str, int], list[tuple[float, float]]](list)
+    """All drops of `ball_drops.csv`. Raises AnalysisError."""
+    path, rows = needed(folder, "ball_drops.csv"), defaultdict[tuple[str, int], list[tuple[float, float]]](list)
     with path.open(newline="") as stream:
         for line, row in enumerate(csv.DictReader(stream), start=2):
             try:
                 rows[row["ball"], int(row["drop"])].append((float(row["t_s"]), float(row["height_m"])))
             except (KeyError, TypeError, ValueError) as error:
                 raise AnalysisError(f"{path}, line {line}: expected ball,drop,t_s,height_m; found {row}.") from error
-    columns = {key: np.array(samples, float).T for key, samples in rows.items()}
-    return tuple(drop(b, n, t, height, per_cd.get(_key(b), 0.0)) for (b, n), (t, height) in columns.items())
-
-
-def _key(name: str) -> str:
-    plain = name.lower().replace(" ", "").replace("whiffle", "wiffle")
-    return plain.replace("ball", "").replace("basket", "basketball")
+    return tuple(drop(ball, number, *np.array(samples, float).T) for (ball, number), samples in rows.items())
 
 
 def _by_ball(drops: Sequence[Run]) -> dict[str, list[Run]]:
@@ -121,12 +103,6 @@ def ask(drops: Sequence[Run], noise: SmoothNoise, terms: Sequence[Term], equatio
     return diagnose(equations, runs, terms, settings=settings)
 
 
-def with_drag(name: str) -> Equations:
-    """A fall with one of the laws declared."""
-    force, k = DRAG[name]
-    return replace(FALL, rates={"h": "v", "v": f"-g + {force}"}, parameters={"k": k}, name=name)
-
-
 @dataclass(frozen=True)
 class BallAnswer:
     """Everything asked of a set of drops."""
@@ -147,8 +123,7 @@ class BallAnswer:
             d, price = answer.diagnosis, price_of_a_number(answer.system.weights)
             for effects, fitted in (((law,), d.before), ((law, *answer.found), d.after)):
                 found[effects] = fitted.cost + len(fitted.shared) * price
-        best = min(found.values())
-        return {effects: found[effects] - best for effects in sorted(found, key=lambda effects: found[effects])}
+        return {effects: found[effects] - min(found.values()) for effects in sorted(found, key=lambda e: found[e])}
 
     @property
     def undecided(self) -> tuple[tuple[str, ...], ...]:
@@ -163,13 +138,17 @@ class BallAnswer:
 
 def analyse_drops(drops: Sequence[Run]) -> BallAnswer:
     """Diagnose all balls together and each alone, compare the forms of the law, measure errors on the second drops."""
-    noise, balls = height_noise(drops), _by_ball(drops)
-    known = len(balls) > 1 and any(d.constants["per_cd"] for d in drops)
-    together = ask(drops, noise, (*DRAGS, *OTHERS, SPHERE) if known else (*DRAGS, *OTHERS))
-    alone = {ball: ask(takes, noise, (*DRAGS, *OTHERS)) for ball, takes in balls.items()}
+    noise = height_noise(drops)
+    alone = {ball: ask(takes, noise, (*DRAGS, *OTHERS)) for ball, takes in _by_ball(drops).items()}
     by_law = {name: ask(drops, noise, OTHERS[-1:], with_drag(name)) for name in DRAG}
     errors = {"gravity alone": errors_of(drops, FALL), **{name: errors_of(drops, with_drag(name)) for name in DRAG}}
-    return BallAnswer(noise, together, alone, by_law, errors)
+    return BallAnswer(noise, ask(drops, noise, (*DRAGS, *OTHERS)), alone, by_law, errors)
+
+
+def with_drag(name: str) -> Equations:
+    """A fall with one of the laws declared."""
+    force, k = DRAG[name]
+    return replace(FALL, rates={"h": "v", "v": f"-g + {force}"}, parameters={"k": k}, name=name)
 
 
 def errors_of(drops: Sequence[Run], equations: Equations) -> dict[str, dict[str, float]]:
@@ -192,7 +171,7 @@ def _words(effects: Sequence[str]) -> str:
 def sentence(answer: BallAnswer) -> str:
     """The answer in plain words."""
     if not answer.together.found:
-        return f"Nothing is claimed to be missing beside gravity: {answer.together.diagnosis.reason}."
+        return f"Nothing is claimed to be missing besides gravity: {answer.together.diagnosis.reason}."
     null = [name for name, a in answer.alone.items() if a.verdict == "nothing missing"]
     text = f"Drag is missing (not seen, for these drops, on {', '.join(null) or 'none'})"
     if answer.identifiable:
@@ -201,41 +180,41 @@ def sentence(answer: BallAnswer) -> str:
     return f"{text}, but its form is not identifiable: {rivals} describe the drops equally well."
 
 
-def report(answer: BallAnswer) -> str:
+def report(answer: BallAnswer) -> Report:
     """Before and after, for people."""
-    n = answer.noise
-    lines = [
-        sentence(answer),
-        f"Noise of a height: {n.white:.3f} m white and {n.smooth:.3f} m with a memory of {n.memory:.2f} s.",
-        "",
-        f"{'rms on the second drop [m], median of the balls':<52}{'whole':>8}{f'after {SEEN} s':>13}",
-    ]
+    n, errors = answer.noise, []
     for name, e in answer.errors.items():
-        whole, forecast = (float(np.median(list(x.values()))) if x else np.nan for x in e.values())
-        lines.append(f"  {_words([name]):<50}{whole:8.2f}{forecast:13.2f}")
-    lines += ["", f"{'all balls together':<36}{'criterion':>11}"]
-    lines += [f"  {_words(effects):<34}{over:+11.1f}" for effects, over in answer.forms.items()]
-    lines += ["", "each ball alone"]
-    lines += [f"  {name:<20}{a.verdict:<17}{', '.join(a.found)}" for name, a in answer.alone.items()]
-    return "\n".join(lines)
+        medians = [float(np.median(list(x.values()))) if x else np.nan for x in e.values()]
+        errors.append((_words([name]), *(rounded(x) for x in medians)))
+    forms = [(_words(effects), score(over)) for effects, over in answer.forms.items()]
+    alone = [(name, a.verdict, ", ".join(a.found)) for name, a in answer.alone.items()]
+    return Report(
+        "Falling balls: what does gravity alone lack?",
+        sentence(answer),
+        f"noise of a height: {n.white:.3f} m white and {n.smooth:.3f} m with a memory of {n.memory:.2f} s",
+        blocks=[
+            Section(
+                "Median of the balls' rms on the second drop (m)",
+                [Listing(("law fitted to the first", "whole", f"after {SEEN} s"), errors)],
+            ),
+            Section("All balls together", [Listing(("effects", "criterion"), forms)]),
+            Section("Each ball alone", [Listing(("ball", "verdict", "missing"), alone)]),
+        ],
+        data={
+            **answer.together.document(),
+            "identifiable": answer.identifiable,
+            "cannot_be_told_apart": answer.undecided,
+        },
+    )
 
 
 def example(folder: Path) -> Outcome:
     """What does gravity alone lack for falling balls, and is its law identifiable?"""
     answer = analyse_drops(read_drops(folder))
-    found = answer.together.document() | {
-        "sentence": sentence(answer),
-        "noise": vars(answer.noise),
-        "identifiable": answer.identifiable,
-        "cannot_be_told_apart": answer.undecided,
-        "forms": [{"effects": effects, "criterion": over} for effects, over in answer.forms.items()],
-        "errors_m": answer.errors,
-        "balls": {name: a.document() for name, a in answer.alone.items()},
-    }
-    return Outcome(report(answer), found, {"all balls": answer.together})
+    return Outcome(report(answer), {"all balls": answer.together})
 
 
-main = partial(command, "ball_drop", "ball_drops.csv and balls.txt", example)
+main = partial(command, "ball_drop", "ball_drops.csv", example)
 
 
 if __name__ == "__main__":

@@ -23,8 +23,6 @@ SHORTEST = 9  # samples of a flight
 GLITCH = 6.0  # times the median roughness, beyond which a flight is not one: a hand, or a tag mistaken
 RELEASE = 5.0  # sigmas by which a first sample may stand off the smooth motion before it counts as still in the hand
 MAX_RELEASE = 6  # samples
-REST = 8  # last samples of a toss
-AT_REST = (0.03, np.cos(np.radians(1.5)))  # [half widths] about the resting height, and cosine of a face's tilt
 
 
 @dataclass(frozen=True)
@@ -139,35 +137,3 @@ def smooth_flight(toss: Toss, first: int, end: int) -> Flight:
     across = np.cross([0.0, 0.0, 1.0], along)
     smooth = np.asarray(turning.as_matrix(), float)
     return Flight(toss.number, time, position, rotation, path, velocity, omega, smooth, turn, along, across)
-
-
-@dataclass(frozen=True)
-class Resting:
-    """A cube at rest on a face, in the axes of the flight that led there."""
-
-    number: int
-    height: float  # of the centre [m]
-    normal: Array  # (2,) components of the face's normal along and across
-    by_axes: Array  # (2, 3) change of the normal by a turn of the tags' axes against the cube's, about each body axis
-    point: Array  # (3,) along, across, up [m]; where it would be if the declared half width were right
-
-
-def resting(tosses: Sequence[Toss], flown: Sequence[Flight]) -> tuple[Resting, ...]:
-    """The tosses of the given flights that end on a face."""
-    directions = {f.number: np.stack([f.along, f.across]) for f in flown}
-    found = []
-    for toss in tosses:
-        if toss.number not in directions:
-            continue
-        axes, last = directions[toss.number], slice(-REST, None)
-        z = toss.position[last, 2] / HALF_WIDTH
-        up = toss.rotation[last, 2, :]
-        face = int(np.abs(up).mean(axis=0).argmax())
-        if np.abs(up[:, face]).min() > AT_REST[1] and np.ptp(z) < AT_REST[0] and abs(z.mean() - 1) < 3 * AT_REST[0]:
-            normal = (toss.rotation[last, :, face] * np.sign(up[:, face])[:, None]).mean(axis=0)
-            place = toss.position[last].mean(axis=0)
-            point = np.array([*(axes @ place), HALF_WIDTH])
-            upward = np.eye(3)[face] * np.sign(up[-1, face])
-            by_axes = axes @ toss.rotation[-1] @ np.cross(np.eye(3), upward).T
-            found.append(Resting(toss.number, float(place[2]), axes @ normal, by_axes, point))
-    return tuple(found)

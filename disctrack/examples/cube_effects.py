@@ -6,9 +6,11 @@ import numpy as np
 
 from calibration.kit.arrays import Array
 from disctrack.discrepancy.system import Candidate, Quantity
-from disctrack.examples.cube_data import HALF_WIDTH, Flight, Resting
+from disctrack.examples.cube_data import HALF_WIDTH, Flight, Toss
 
 GRAVITY = 9.81  # [m/s^2] as declared
+REST = 8  # last samples of a toss
+AT_REST = (0.03, np.cos(np.radians(1.5)))  # [half widths] about the resting height, and cosine of a face's tilt
 UP = np.array([0.0, 0.0, 1.0])
 LEVEL = ("along", "across")  # the flight
 _M, _S = "motion", "measurement"
@@ -94,15 +96,30 @@ def flown(f: Flight) -> dict[str, Array]:
     return found
 
 
-def rested(c: Resting) -> dict[str, Sequence[float]]:
-    """Change of height [m] and of the normal along and across of a cube at rest, by a unit of each quantity."""
-    leans = {a: (c.point[i], -1.0 * (i == 0), -1.0 * (i == 1)) for i, a in enumerate(LEVEL)}
+def rested(toss: Toss, f: Flight) -> tuple[Array, dict[str, Sequence[float]]] | None:
+    """Of a toss that ends on a face, height over the declared half width [m] and the face's normal along and across.
+
+    (3,), and their change by a unit of each quantity; None of another toss.
+    """
+    axes, last = np.stack([f.along, f.across]), slice(-REST, None)
+    z, up = toss.position[last, 2] / HALF_WIDTH, toss.rotation[last, 2, :]
+    face = int(np.abs(up).mean(axis=0).argmax())
+    flat = np.abs(up[:, face]).min() > AT_REST[1] and np.ptp(z) < AT_REST[0]
+    if not (flat and abs(z.mean() - 1) < 3 * AT_REST[0]):
+        return None
+    normal = (toss.rotation[last, :, face] * np.sign(up[:, face])[:, None]).mean(axis=0)
+    place = toss.position[last].mean(axis=0)
+    point = np.array([*(axes @ place), HALF_WIDTH])  # where it would be if the declared half width were right
+    # by a turn of the tags' axes against the cube's, about each body axis
+    by_axes = axes @ toss.rotation[-1] @ np.cross(np.eye(3), np.eye(3)[face] * np.sign(up[-1, face])).T
+    leans = {a: (point[i], -1.0 * (i == 0), -1.0 * (i == 1)) for i, a in enumerate(LEVEL)}
     found: dict[str, Sequence[float]] = {"length_scale.change": (HALF_WIDTH, 0.0, 0.0)}
     found["table_height.z"] = (1.0, 0.0, 0.0)
     for i, a in enumerate((*LEVEL, "up")):
-        found[f"perspective.{a}"] = (c.point[2] * c.point[i], 0.0, 0.0)
-        found[f"tag_axes.turn_{i + 1}"] = (0.0, *c.by_axes[:, i])
-    return found | {f"{effect}.{a}": lean for effect in ("toss_tilt", "table_tilt") for a, lean in leans.items()}
+        found[f"perspective.{a}"] = (point[2] * point[i], 0.0, 0.0)
+        found[f"tag_axes.turn_{i + 1}"] = (0.0, *by_axes[:, i])
+    found |= {f"{effect}.{a}": lean for effect in ("toss_tilt", "table_tilt") for a, lean in leans.items()}
+    return np.array([place[2] - HALF_WIDTH, *(axes @ normal)]), found
 
 
 def _integrated(f: Flight, rate: Array) -> Array:

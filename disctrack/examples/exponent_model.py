@@ -14,15 +14,17 @@ from scipy.interpolate import CubicSpline
 
 from calibration.kit.arrays import Array
 from disctrack.disc import MA_2014, Disc
-from disctrack.discrepancy.system import Quantity
+from disctrack.discrepancy.system import Candidate, Quantity
 from disctrack.rolling import EndReason, Model, simulate, steady_precession
 
+GRAVITY = 9.81  # [m/s^2]
 FRAME = 1e-3  # [s] between pairs of the paper's cameras
 SAMPLING = 2e-3  # [s] of the simulation; a cubic spline then follows the last nutations read to 1e-4
 SHORTEST = float(np.exp(-3))  # [s] time left where the curves of the paper's figures 14 to 16 end
 RTOL = 1e-7  # collapse then comes out to 1e-10 s
 END_SHARE = 1e-3  # of the start nutation, where the simulation ends: 0.05 ms before collapse with the paper's k_m
 MAX_DURATION = 8.0  # [s]; a motion that has not ended by then is no answer
+ANY = (-np.inf, np.inf)
 OUTCOMES = ("n_theta", "n_psidot", "n_energy", "ln_duration")
 
 
@@ -33,40 +35,32 @@ class Setup:
     surface: str
     k_m: float  # [m s^2] of the paper's model
     longest: float  # [s] longest time left in the fit
-    shortest: float = SHORTEST  # [s]
-    start: float = np.radians(8.0)  # [rad] nutation at which the simulation begins
+    start: float  # [rad] nutation at which the simulation begins
     disc: Disc = MA_2014
-    gravity: float = 9.81
 
 
-# What the experimenter may do wrong; zero is right. By quantity: its title, and where the paper says so
-READING = {
-    Quantity("t_f.bias", "s", 1e-3, lower=-0.045, upper=0.045, typical=0.01): (
-        "the instant called t_f is not that of collapse",
-        "section 4a",
-    ),
-    Quantity("cut.shift", "s", 1e-3, lower=-0.04, upper=0.1, typical=0.02): (
-        "the fits end at another time left than the curves of figures 14 to 16",
-        "figures 14 to 16",
-    ),
-    Quantity("theta_zero.shift", "rad", 1e-5, typical=np.radians(0.05)): (
-        "zero of the nutation (plane of the table)",
-        "section 3b: accuracy 0.05 deg",
-    ),
-    Quantity("height_zero.shift", "m", 1e-6, typical=2e-5): (
-        "zero of the height (plane of the table)",
-        "section 3b: accuracy 5 um",
-    ),
-    Quantity("attitude_noise.variance", "rad^2", 1e-8, 0.0, 0.0, typical=np.radians(0.05) ** 2): (
-        "noise of the attitude, which central differences turn into bias",
-        "section 3b",
-    ),
-    # square of the span
-    Quantity("smoothing.square", "s^2", 1e-6, 0.0, 0.0, 0.06**2, typical=0.01**2): (
-        "moving average over the record",
-        "section 3b: 'a differential method'",
-    ),
-}
+def _wrong(
+    name: str, unit: str, scale: float, typical: float, title: str, source: str, bounds: tuple[float, float] = ANY
+) -> Candidate:
+    q = Quantity(name, unit, scale, 0.0, *bounds, typical=typical)
+    return Candidate(q.owner, q.owner, "measurement", title, source, (q,))
+
+
+# What the experimenter may do wrong; zero is right
+READING = (
+    _wrong("t_f.bias", "s", 1e-3, 0.01, "the instant called t_f is not that of collapse", "section 4a",
+           (-0.045, 0.045)),
+    _wrong("cut.shift", "s", 1e-3, 0.02, "the fits end at another time left than the curves of figures 14 to 16",
+           "figures 14 to 16", (-0.04, 0.1)),
+    _wrong("theta_zero.shift", "rad", 1e-5, np.radians(0.05), "zero of the nutation (plane of the table)",
+           "section 3b: accuracy 0.05 deg"),
+    _wrong("height_zero.shift", "m", 1e-6, 2e-5, "zero of the height (plane of the table)",
+           "section 3b: accuracy 5 um"),
+    _wrong("attitude_noise.variance", "rad^2", 1e-8, np.radians(0.05) ** 2,
+           "noise of the attitude, which central differences turn into bias", "section 3b", (0.0, np.inf)),
+    _wrong("smoothing.square", "s^2", 1e-6, 0.01**2, "moving average over the record, by the square of its span",
+           "section 3b: 'a differential method'", (0.0, 0.06**2)),
+)  # fmt: skip
 
 
 class LastStage:
@@ -75,8 +69,8 @@ class LastStage:
     def __init__(self, setup: Setup, values: Mapping[str, float], omega3: float = 0.0) -> None:
         """Simulate. values : parameters of effects by "effect.parameter"; omega3 [rad/s] at the start."""
         self.setup = setup
-        model = Model(setup.disc, setup.gravity).with_values(dict(values))
-        state = steady_precession(setup.start, setup.disc, setup.gravity, omega3=omega3)
+        model = Model(setup.disc, GRAVITY).with_values(dict(values))
+        state = steady_precession(setup.start, setup.disc, GRAVITY, omega3=omega3)
         motion = simulate(model, state, MAX_DURATION, rate=1 / SAMPLING, theta_end=END_SHARE * setup.start, rtol=RTOL)
         curves = _observed(motion.q, motion.qdot, setup)
         # a strong moment can stop the precession in the very last milliseconds; what is read lies before
@@ -92,15 +86,17 @@ class LastStage:
         """(4,) OUTCOMES; NaN where there is no collapse. reading : those of READING that are not zero."""
         if self.curve is None:
             return np.full(len(OUTCOMES), np.nan)
-        left, *quantities = self._read(self.curve, {q.name: 0.0 for q in READING} | dict(reading or {}))
+        left, *quantities = self._read(
+            self.curve, {q.name: 0.0 for c in READING for q in c.quantities} | dict(reading or {})
+        )
         return np.array([*(slope(left, v) for v in quantities), np.log(self.duration)])
 
     def _read(self, curve: CubicSpline, reading: Mapping[str, float]) -> tuple[Array, Array, Array, Array]:
         """Time left as the experimenter has it, nutation, precession rate, energy, (n,) each."""
         setup, disc = self.setup, self.setup.disc
         # a fixed number of instants, so that nothing jumps when a quantity of the fit moves
-        n = round((setup.longest - setup.shortest) / FRAME) + 1
-        left = np.linspace(setup.longest, setup.shortest + reading["cut.shift"], n)
+        n = round((setup.longest - SHORTEST) / FRAME) + 1
+        left = np.linspace(setup.longest, SHORTEST + reading["cut.shift"], n)
         time = self.duration + reading["t_f.bias"] - left
         half = np.sqrt(max(reading["smoothing.square"], 0.0) / 12)  # two points stand for the mean to third order
         if time[-1] + half > curve.x[-1] or left[-1] <= 0:
@@ -110,7 +106,7 @@ class LastStage:
         rate_variance = reading["attitude_noise.variance"] / (2 * FRAME**2)  # of central differences
         psidot = psidot * np.exp(-0.5 * rate_variance / (psidot * np.sin(theta)) ** 2)  # mean of the noisy logarithm
         energy = energy + 0.5 * (2 * disc.moment_diametral + disc.moment_axial) * rate_variance
-        energy = energy + disc.mass * setup.gravity * reading["height_zero.shift"]
+        energy = energy + disc.mass * GRAVITY * reading["height_zero.shift"]
         return left, theta, psidot, energy
 
 
@@ -130,6 +126,6 @@ def _observed(q: Array, qdot: Array, setup: Setup) -> Array:
     spin = psidot * np.cos(theta) + phidot
     energy = 0.5 * disc.mass * np.sum(qdot[:, :3] ** 2, axis=1)
     energy += 0.5 * disc.moment_diametral * (thetadot**2 + (psidot * np.sin(theta)) ** 2)
-    energy += 0.5 * disc.moment_axial * spin**2 + disc.mass * setup.gravity * (q[:, 2] - disc.half_thickness)
+    energy += 0.5 * disc.moment_axial * spin**2 + disc.mass * GRAVITY * (q[:, 2] - disc.half_thickness)
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.column_stack([np.log(theta), np.log(psidot), energy])

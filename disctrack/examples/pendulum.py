@@ -8,6 +8,7 @@ k1 / (m1 a1^2 + I1) of their numbers can be told from a free swing.
 """
 
 import sys
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -15,6 +16,8 @@ import numpy as np
 
 from disctrack.discrepancy.equations import Answer, Equations, Run, Term, diagnose, terms
 from disctrack.examples._command import Outcome, command, needed
+from disctrack.numbers import rounded
+from disctrack.report.blocks import Listing, Section
 
 FITTED_S = 36.668  # by the authors; the rest is their validation
 STEP = 0.157e-3  # [rad] of the encoder
@@ -67,13 +70,13 @@ def example(folder: Path) -> Outcome:
     run = swing(folder)
     answer = asked(run)
     left, encoder = rms_left(answer, run), STEP / np.sqrt(12)
-    lines = [str(answer), "", f"{'rms [mrad]':<38}{'before':>10}{'after':>10}"]
-    for i, name in enumerate(("fitted, 0 to 36.668 s", "kept back, 36.668 to 55 s, predicted")):
-        lines.append(f"{name:<38}" + "".join(f"{1e3 * rms[i]:10.3g}" for rms in left.values()))
-    lines.append(f"{'the step of the encoder allows':<38}{1e3 * encoder:10.3g}{1e3 * encoder:10.3g}")
-    kept = {side: rms[1] for side, rms in left.items()}
-    document = answer.document() | {"kept_back_rms_rad": kept, "encoder_rms_rad": encoder}
-    return Outcome("\n".join(lines), document, {"swing": answer})
+    parts = ("fitted, 0 to 36.668 s", "kept back, 36.668 to 55 s, predicted")
+    rows = [(name, *(rounded(1e3 * rms[i]) for rms in left.values())) for i, name in enumerate(parts)]
+    rows.append(("the step of the encoder allows", rounded(1e3 * encoder), rounded(1e3 * encoder)))
+    kept = Section("Rms of measured minus modelled (mrad)", [Listing(("", "before", "after"), rows)])
+    told = answer.report()
+    data = {**answer.document(), "kept_back_rms_rad": {side: rms[1] for side, rms in left.items()}}
+    return Outcome(replace(told, blocks=[kept, *told.blocks], data=data), {"swing": answer})
 
 
 main = partial(command, "pendulum", "single_free_swing.npz", example)

@@ -39,6 +39,7 @@ OUTLIER, FEW = 8.0, 0.02  # standard deviations that no noise reaches; share of 
 HALF_WITHIN = 0.6745  # standard deviations, within which half of normal noise lies
 FEWEST_RUNS = 4  # that are compared with each other
 ODD, MOST_ODD = 2.0, 0.3  # rms over the median of all runs; share of them, above which none is odd
+FAR_OFF = 10.0  # sigmas or times, by which a number has left what was declared of it
 FEWEST_LAGS = 3  # of the test of whiteness: shorter stretches say nothing
 
 
@@ -86,7 +87,8 @@ class Answer:
     @property
     def notes(self) -> tuple[str, ...]:
         """Remarks on the data and on what they do not tell."""
-        return (*self.remarks, *self._what_helps_most(), *self._of_a_law(), *self._not_white(), *self._far_off())
+        about = self._what_helps_most() + self._of_a_law() + self._unlike_declared() + self._not_white()
+        return (*self.remarks, *about, *self._far_off())
 
     def _of_a_law(self) -> list[str]:
         """What describes the data as well as the law that is named; or the law, where it is not."""
@@ -115,16 +117,32 @@ class Answer:
 
     def _what_helps_most(self) -> list[str]:
         """Where no term is named: those that gain most, and what they leave."""
-        d = self.diagnosis
-        if self.found or not d.partial or d.nearest is None:
+        nearest, told = self.nearest, []
+        if not nearest or self.diagnosis.nearest is None:
             return []
-        names = " and ".join(self._nearest_of(c) for c in d.partial)
-        left = self._errors(d.nearest, None)
+        for c in self.diagnosis.partial:
+            numbers = ((q.part, nearest.get(q.name, q.null)) for q in (*c.quantities, *c.shape))
+            sizes = ", ".join(f"{name} = {value:.4g}" for name, value in numbers)
+            told.append(self._law_text(c) or f"{c.title} [{c.name}] ({sizes})")
+        left = self._errors(self.diagnosis.nearest, None)
         sizes = ", ".join(f"{e.rms:.3g} of {self.before[c].rms:.3g} {self._unit(c)} of {c}" for c, e in left.items())
-        return [f"{names} would help most and still leave {sizes}".replace(" 1 of", " of")]
+        return [f"{' and '.join(told)} would help most and still leave {sizes}".replace(" 1 of", " of")]
 
-    def _nearest_of(self, c: Candidate) -> str:
-        return self._law_text(c) or f"{c.title} [{c.name}] ({self._numbers_of(c)})"
+    def _unlike_declared(self) -> list[str]:
+        """Numbers that have left what was declared of them: a wrong sign or unit makes up for itself so."""
+        notes, fitted = [], self.diagnosis.after
+        for q in fitted.quantities:
+            value, declared = fitted.values[q.name], q.null if np.isfinite(q.prior_sigma) else q.declared
+            if declared is None or q.owner == NAME:
+                continue
+            text = f"{q.name.removeprefix('state.')} = {value:.4g} where {declared:.4g} was declared"
+            if (away := abs(value - declared) / q.prior_sigma) > FAR_OFF:
+                notes.append(f"{text}: {away:.0f} of its sigmas off")
+            elif declared * value < 0 and abs(value) > FAR_OFF * self.sigmas[q.name]:
+                notes.append(f"{text}: its sign is another; look at the signs of the equations")
+            elif abs(value) > FAR_OFF * abs(declared) > 0 or abs(declared) > FAR_OFF * abs(value) > 0:
+                notes.append(f"{text}: its size is another; look at the units")
+        return notes
 
     def _law_text(self, c: Candidate) -> str:
         """The course of the law that was learned, if the candidate is that; else nothing."""
@@ -132,17 +150,13 @@ class Answer:
             return ""
         return self.law.text(self.equations.units)
 
-    def _numbers_of(self, candidate: Candidate) -> str:
-        """Its numbers in the nearest description, shapes that were held among them."""
-        found = {q.name: q.null for q in (*candidate.quantities, *candidate.shape)} | self.nearest
-        own = [q.name for q in (*candidate.quantities, *candidate.shape)]
-        return ", ".join(f"{n.partition('.')[2]} = {found[n]:.4g}" for n in own)
-
     @property
     def nearest(self) -> dict[str, float]:
         """All fitted numbers with the terms that help most, where they leave too much to be named; else empty."""
         d = self.diagnosis
-        return {} if self.found or d.nearest is None else {n: d.nearest.values[n] for n in d.nearest.names}
+        if self.found or not d.partial or d.nearest is None:
+            return {}
+        return {n: d.nearest.values[n] for n in d.nearest.names}
 
     def _not_white(self) -> list[str]:
         """Where what is left is called noise by its size: is it so by its memory?"""
@@ -284,7 +298,7 @@ class Answer:
         d = self.diagnosis
         if d.held_out_before is None:
             loose = [n for n, v in self.values.items() if "." not in n and not self.sigmas[n] < abs(v)]
-            open_ = f" {', '.join(loose)} cannot be told: declare a value or bounds." if loose else ""
+            open_ = f" {', '.join(loose)} cannot be determined: declare a value or bounds." if loose else ""
             return f"No answer: {d.reason}.{open_} Values from which to begin nearer to the truth may help."
         level = ", ".join(
             f"{e.rms:.3g} {self._unit(c)} of {c} (noise {e.noise:.3g})".replace(" 1 of", " of")

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.interpolate import CubicSpline
 
 from calibration.kit.arrays import Array
 from disctrack.discrepancy.equations.expressions import Formula, checked_name, unknown_name
@@ -232,7 +233,7 @@ def checked(equations: Equations, runs: Sequence[Run]) -> list[Samples]:
 
 
 def _checked_run(equations: Equations, run: Run, name: str, channels: Sequence[str]) -> Samples:
-    time = _numbers(run.time, f"run {name}, time")
+    time = _column(run.time, f"run {name}, time")
     n = len(time)
     if n < 8 or not np.isfinite(time).all() or not np.all(np.diff(time) > 0):
         bad = int(np.argmin(np.diff(time))) + 1 if n > 1 and np.isfinite(time).all() else 0
@@ -258,7 +259,7 @@ def _checked_run(equations: Equations, run: Run, name: str, channels: Sequence[s
     data, sigma = np.full((2, n, len(channels)), np.nan)  # of sigma: to be found
     for i, c in enumerate(channels):
         if c in run.data:
-            data[:, i] = _column(run.data[c], n, f"run {name}, {c}")
+            data[:, i] = _column(run.data[c], f"run {name}, {c}", n)
         if c in given:
             sigma[:, i] = given[c]
     if np.isinf(data).any():
@@ -276,13 +277,11 @@ def _checked_run(equations: Equations, run: Run, name: str, channels: Sequence[s
 
 
 def _inputs(equations: Equations, run: Run, name: str, time: Array) -> tuple[Array, Array]:
-    from scipy.interpolate import CubicSpline
-
     if not equations.inputs:
         return np.zeros(0), np.zeros((0, 5, 0))
     begin, end = time[0], time[-1]
     if run.input_time is not None:
-        time = _numbers(run.input_time, f"run {name}, input_time")
+        time = _column(run.input_time, f"run {name}, input_time")
         spacing = float(np.max(np.diff(time), initial=0.0))
         if len(time) < 4 or not np.all(np.diff(time) > 0) or time[0] > begin or time[-1] < end - spacing:
             raise AnalysisError(
@@ -295,7 +294,7 @@ def _inputs(equations: Equations, run: Run, name: str, time: Array) -> tuple[Arr
     for u in equations.inputs:
         if u not in run.inputs:
             raise AnalysisError(f"run {name}: the input {u!r} is missing. Give it with inputs={{{u!r}: values}}.")
-        columns.append(_column(run.inputs[u], len(time), f"run {name}, input {u}"))
+        columns.append(_column(run.inputs[u], f"run {name}, input {u}", len(time)))
     values = np.array(columns)
     if not np.isfinite(values).all():
         raise AnalysisError(f"run {name}: an input must be known at every sample; fill the gaps first.")
@@ -317,18 +316,14 @@ def _inputs(equations: Equations, run: Run, name: str, time: Array) -> tuple[Arr
     return np.concatenate([time[kept], time[-1:]]), np.ascontiguousarray(pieces[:, :, kept])
 
 
-def _numbers(values: ArrayLike, what: str) -> Array:
+def _column(values: ArrayLike, what: str, n: int | None = None) -> Array:
+    """Numbers (n,). Raises AnalysisError."""
     try:
         found = np.asarray(values, float)
     except (TypeError, ValueError) as error:
         raise AnalysisError(f"{what}: not numbers ({error}).") from error
     if found.ndim != 1:
         raise AnalysisError(f"{what}: expected one number per sample, found an array of shape {found.shape}.")
-    return found
-
-
-def _column(values: ArrayLike, n: int, what: str) -> Array:
-    found = _numbers(values, what)
-    if len(found) != n:
+    if n is not None and len(found) != n:
         raise AnalysisError(f"{what}: {len(found)} values for {n} instants.")
     return found

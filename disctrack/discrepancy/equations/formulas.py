@@ -1,8 +1,7 @@
 """Declared equations and terms, differentiated and compiled: motion, sensors and clock as functions of numbers."""
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property, lru_cache
 from typing import Any
 
@@ -20,29 +19,87 @@ from disctrack.errors import AnalysisError
 OWN = "own_"  # before the name of a term's parameter, in its formulas: not the equations' of that name
 
 
-@dataclass(frozen=True)
+T = sympy.Symbol("t", real=True)
+
+
 class Formulas:
     """Symbols of everything, with all terms added; compiled when first asked for.
 
     Numbers come in one array p: parameters of the model, of the terms, constants, widths of jumps.
     """
 
-    equations: Equations
-    terms: tuple[Term, ...]
-    channels: tuple[str, ...]
-    states: tuple[sympy.Symbol, ...]
-    fitted: dict[str, tuple[sympy.Symbol, Parameter]]  # by name of the quantity
-    constants: dict[str, sympy.Symbol]
-    inputs: tuple[sympy.Symbol, ...]
-    input_rates: tuple[sympy.Symbol, ...]
-    forces: tuple[sympy.Expr, ...]  # as declared: without terms, and not yet divided by the masses
-    masses: tuple[sympy.Expr, ...]
-    rates: tuple[sympy.Expr, ...]
-    observed: tuple[sympy.Expr, ...]
-    late: tuple[sympy.Expr, ...]  # by channel: true instant minus the time beside the sample, in t and numbers
-    widths: dict[sympy.Expr, sympy.Symbol]
-    along: dict[str, sympy.Expr]  # by name of a shape: values along the motion that are tried for it
-    late_inputs: tuple[tuple[int, sympy.Expr], ...]  # the last of the inputs: which of the first each is, how late [s]
+    def __init__(self, equations: Equations, terms: Sequence[Term], channels: Mapping[str, Formula]) -> None:
+        """Read and check every formula. Raises AnalysisError."""
+        self.equations, self.terms, self.channels = equations, tuple(terms), tuple(channels)
+        states, inputs = _symbols(equations.rates), _symbols(equations.inputs)
+        input_rates = _symbols(f"{name}_rate" for name in equations.inputs)
+        self.constants, own = _symbols(equations.constants), _symbols(equations.parameters)
+        self.states, self.inputs = tuple(states.values()), tuple(inputs.values())
+        self.input_rates = tuple(input_rates.values())
+        # by name of the quantity
+        self.fitted = {name: (own[name], _parameter(p)) for name, p in equations.parameters.items()}
+        still = {"t": T, **input_rates, **self.constants, **own}
+        self._numbers = {**self.constants, **own}  # of what does not move
+        self._still, self._words = still, {**still, **states, **inputs}
+        # as declared: without terms, and not yet divided by the masses
+        self.forces = tuple(parsed(f, self._words, f"equation of {name}") for name, f in equations.rates.items())
+        masses = {pair: parsed(f, self._words, f"mass {pair}") for pair, f in equations.mass.items()}
+        self.masses = tuple(masses.values())
+        self._rates = dict(zip(states, self.forces, strict=True))
+        self._seen = {c: parsed(f, self._words, f"observed {c}") for c, f in channels.items()}
+        # a term of a sensor may name the channel itself: what it shows as declared. A state of that name comes first
+        self._shown = {symbol: self._seen[c] for c, symbol in _symbols(channels).items() if c not in self._words}
+        # by channel: true instant minus the time beside the sample, in t and numbers
+        self._late = dict.fromkeys(channels, sympy.Integer(0))
+        self.along: dict[str, sympy.Expr] = {}  # by name of a shape: values along the motion that are tried for it
+        # the last of the inputs: which of the first each is, how late [s]
+        self.late_inputs: list[tuple[int, sympy.Expr]] = []
+        for number, term in enumerate(terms, start=1):
+            if term.name in {t.name for t in terms[: number - 1]} or "[" in term.name or "." in term.name:
+                raise AnalysisError(f"term {term.name!r}: needs a name of its own, without '.' and '['.")
+            self._add(term, f"term{number}_")
+        self.late = tuple(self._late.values())
+        self.widths: dict[sympy.Expr, sympy.Symbol] = {}  # of jumps, by their argument
+        moving = set(self.states)
+        rates = [smooth(e, self.widths, moving) for e in self._rates.values()]
+        self.rates = tuple(_solved(list(states), masses, rates))
+        self.observed = tuple(smooth(e, self.widths, moving) for e in self._seen.values())
+
+    def _add(self, term: Term, prefix: str) -> None:
+        """Add a term's formulas to rates, sensors and clocks; its own numbers get symbols with the prefix."""
+        here, mine = f"term {term.name}", {name: _symbol(f"{prefix}{name}") for name in term.parameters}
+        for name, p in term.parameters.items():
+            checked_name(name, f"parameter of term {term.name}")
+            self.fitted[f"{term.name}.{name}"] = mine[name], _parameter(p)
+            if isinstance(p, Parameter) and p.along:
+                self.along[f"{term.name}.{name}"] = parsed(p.along, self._words, f"{here}, {name} along")
+        marked = {f"{OWN}{name}": s for name, s in mine.items()}
+        written = [*term.rates.values(), *term.observed.values(), *term.lag.values(), term.clock]
+        # where a term says which numbers are its own, other names are the equations'
+        mine = marked if any(OWN in str(f) for f in written) else mine | marked
+        before: dict[str, sympy.Symbol] = {}
+        for name, (u, f) in term.delayed.items():
+            checked_name(name, f"late input of term {term.name}")
+            _known(u, self.equations.inputs, f"{here}, delayed {name}")
+            delay = parsed(f, {**self._numbers, **mine}, f"{here}, delay of {u}")
+            self.late_inputs.append((list(self.equations.inputs).index(u), delay))
+            symbol = _symbol(f"{prefix}late_{name}")
+            self.inputs += (symbol,)
+            self.input_rates += (_symbol(f"{prefix}late_{name}_rate"),)
+            before |= {name: symbol, f"{OWN}{name}": symbol}
+        for name, f in term.rates.items():
+            _known(name, self._rates, f"{here}, rates")
+            self._rates[name] += parsed(f, {**self._words, **mine, **before}, f"{here}, rate of {name}")
+        for name, f in term.observed.items():
+            _known(name, self._seen, f"{here}, observed")
+            names = {**{s.name: s for s in self._shown}, **self._words, **mine}
+            self._seen[name] += parsed(f, names, f"{here}, observed {name}").xreplace(self._shown)
+        clock = parsed(term.clock, {**self._still, **mine}, f"{here}, clock")
+        for c in self._late:
+            self._late[c] += clock
+        for name, f in term.lag.items():
+            _known(name, self._late, f"{here}, lag")
+            self._late[name] -= parsed(f, {**self._still, **mine}, f"{here}, lag of {name}")
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -90,7 +147,7 @@ class Formulas:
         for i, e in enumerate(formulas):
             targets += [(f"{by_number}[{i}, {j}]", self._by_number(e, s)) for j, s in enumerate(fitted)]
         arrays = [("y_", self.states), ("p_", self.numbers), ("u_", self.inputs), ("u_rates_", self.input_rates)]
-        source = source_of(name, [sympy.Symbol("t"), *arrays], targets, out)
+        source = source_of(name, [T, *arrays], targets, out)
         return _compiled_source(source, name)
 
     def _by_number(self, formula: sympy.Expr, number: sympy.Symbol) -> sympy.Expr:
@@ -119,9 +176,9 @@ class Formulas:
     @cached_property
     def lateness(self) -> Any:
         """(t (m,), p) -> true minus written instant (w, m) and its derivatives (w, n_fitted, m); NumPy."""
-        t, fitted = sympy.Symbol("t", real=True), [s for s, _ in self.fitted.values()]
+        fitted = [s for s, _ in self.fitted.values()]
         flat = [*self.late, *(e.diff(s) for e in self.late for s in fitted)]
-        function = sympy.lambdify((t, self.numbers), flat, "numpy")
+        function = sympy.lambdify((T, self.numbers), flat, "numpy")
 
         def evaluate(time: Array, p: Array) -> tuple[Array, Array]:
             values = np.array([np.broadcast_to(v, time.shape) for v in function(time, p)], float)
@@ -141,8 +198,7 @@ class Formulas:
         return self._along_motion(list(self.along.values()))
 
     def _along_motion(self, expressions: Sequence[sympy.Expr]) -> Any:
-        t = sympy.Symbol("t", real=True)
-        return sympy.lambdify((t, self.states, self.numbers, self.inputs), expressions, "numpy")
+        return sympy.lambdify((T, self.states, self.numbers, self.inputs), expressions, "numpy")
 
     def defaults(self) -> dict[str, float]:
         """Declared values of all numbers; the widths of jumps are 1 until they are known."""
@@ -150,82 +206,12 @@ class Formulas:
         return found | {s.name: 1.0 for s in self.widths.values()}
 
 
-def formulas(equations: Equations, terms: Sequence[Term], channels: Mapping[str, Formula]) -> Formulas:
-    """Read and check every formula. Raises AnalysisError."""
+def _symbol(name: str) -> sympy.Symbol:
+    return sympy.Symbol(name, real=True)
 
-    def symbol(name: str) -> sympy.Symbol:
-        return sympy.Symbol(name, real=True)
 
-    states = {name: symbol(name) for name in equations.rates}
-    inputs = {name: symbol(name) for name in equations.inputs}
-    input_rates = {f"{name}_rate": symbol(f"{name}_rate") for name in equations.inputs}
-    constants = {name: symbol(name) for name in equations.constants}
-    own = {name: symbol(name) for name in equations.parameters}
-    fitted = {name: (own[name], _parameter(p)) for name, p in equations.parameters.items()}
-    everything = {"t": symbol("t"), **states, **inputs, **input_rates, **constants, **own}
-    forces = [parsed(f, everything, f"equation of {name}") for name, f in equations.rates.items()]
-    masses = {pair: parsed(f, everything, f"mass {pair}") for pair, f in equations.mass.items()}
-    rates = list(forces)
-    without_motion = {k: v for k, v in everything.items() if k not in states and k not in inputs}
-    observed = {c: parsed(f, everything, f"observed {c}") for c, f in channels.items()}
-    # a term of a sensor may name the channel itself: what it shows as declared. A state of that name comes first
-    shown = {symbol(c): f for c, f in observed.items() if c not in everything}
-    channel_names = {s.name: s for s in shown}
-    late = dict.fromkeys(channels, sympy.Integer(0))
-    position = {name: i for i, name in enumerate(states)}
-    seen: set[str] = set()
-    along: dict[str, sympy.Expr] = {}
-    late_inputs: list[tuple[int, sympy.Expr]] = []
-    driving, driving_rates = list(inputs.values()), list(input_rates.values())
-    for term in terms:
-        if term.name in seen or "[" in term.name or "." in term.name:
-            raise AnalysisError(f"term {term.name!r}: needs a name of its own, without '.' and '['.")
-        seen.add(term.name)
-        mine = {name: symbol(f"term{len(seen)}_{name}") for name in term.parameters}
-        for name, p in term.parameters.items():
-            checked_name(name, f"parameter of term {term.name}")
-            fitted[f"{term.name}.{name}"] = (mine[name], _parameter(p))
-        here = f"term {term.name}"
-        own_names = {f"{OWN}{name}": s for name, s in mine.items()}
-        written = [*term.rates.values(), *term.observed.values(), *term.lag.values(), term.clock]
-        # where a term says which numbers are its own, other names are the equations'
-        mine = own_names if any(OWN in str(f) for f in written) else mine | own_names
-        words = {**everything, **mine}
-        for name, p in term.parameters.items():
-            if isinstance(p, Parameter) and p.along:
-                along[f"{term.name}.{name}"] = parsed(p.along, everything, f"{here}, {name} along")
-        before: dict[str, sympy.Symbol] = {}
-        for name, (u, f) in term.delayed.items():
-            checked_name(name, f"late input of term {term.name}")
-            _known(u, inputs, f"{here}, delayed {name}")
-            delay = parsed(f, {**constants, **own, **mine}, f"{here}, delay of {u}")
-            late_inputs.append((list(inputs).index(u), delay))
-            driving.append(symbol(f"term{len(seen)}_late_{name}"))
-            driving_rates.append(symbol(f"term{len(seen)}_late_{name}_rate"))
-            before |= {name: driving[-1], f"{OWN}{name}": driving[-1]}
-        for name, f in term.rates.items():
-            _known(name, states, f"{here}, rates")
-            rates[position[name]] += parsed(f, {**words, **before}, f"{here}, rate of {name}")
-        for name, f in term.observed.items():
-            _known(name, observed, f"{here}, observed")
-            found = parsed(f, {**channel_names, **words}, f"{here}, observed {name}")
-            observed[name] += found.xreplace(shown)
-        clock = parsed(term.clock, {**without_motion, **mine}, f"{here}, clock")
-        for c in late:
-            late[c] += clock
-        for name, f in term.lag.items():
-            _known(name, late, f"{here}, lag")
-            late[name] -= parsed(f, {**without_motion, **mine}, f"{here}, lag of {name}")
-    widths: dict[sympy.Expr, sympy.Symbol] = {}
-    moving = set(states.values())
-    rates = [smooth(e, widths, moving) for e in rates]
-    rates = _solved(list(states), masses, rates)
-    return Formulas(
-        equations, tuple(terms), tuple(channels), tuple(states.values()), fitted, constants, tuple(driving),
-        tuple(driving_rates), tuple(forces), tuple(masses.values()), tuple(rates),
-        tuple(smooth(e, widths, moving) for e in observed.values()),
-        tuple(late.values()), widths, along, tuple(late_inputs),
-    )  # fmt: skip
+def _symbols(names: Iterable[str]) -> dict[str, sympy.Symbol]:
+    return {name: _symbol(name) for name in names}
 
 
 def _with_late(knots: Array, pieces: Array, which: list[int], late: Array) -> tuple[Array, Array]:
@@ -276,7 +262,7 @@ def _parameter(given: float | Parameter) -> Parameter:
     return given if isinstance(given, Parameter) else Parameter(float(given))
 
 
-def _known(name: str, known: Mapping[str, Any], where: str) -> None:
+def _known(name: str, known: Iterable[str], where: str) -> None:
     if name not in known:
         raise AnalysisError(f"{where}: {unknown_name(name, known)}")
 

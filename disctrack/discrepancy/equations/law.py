@@ -19,7 +19,7 @@ from calibration.kit.arrays import Array
 from disctrack.discrepancy.elimination import compress, prior_rows
 from disctrack.discrepancy.equations.declared import Equations, Parameter, Term
 from disctrack.discrepancy.equations.expressions import Formula
-from disctrack.discrepancy.equations.formulas import Formulas, formulas
+from disctrack.discrepancy.equations.formulas import Formulas
 from disctrack.discrepancy.equations.start import guessed, near_declared, trusted, turn
 from disctrack.discrepancy.equations.system import MOST_STATES, EquationSystem, cut
 from disctrack.discrepancy.fit import Fit, fit
@@ -422,7 +422,7 @@ def _knowing(system: EquationSystem, channels: Mapping[str, Formula]) -> Equatio
         NAME, {s: f"{NAME}_on_{s}*({course})" for s in _forced(e)},
         parameters={name: Parameter(0.0) for name in _names()}, title="a force that no term names",
     )  # fmt: skip
-    known = formulas(replace(e, constants=constants), (*f.terms, term), channels)
+    known = Formulas(replace(e, constants=constants), (*f.terms, term), channels)
     widths = {known.widths[a].name: system.widths[w.name] for a, w in f.widths.items() if a in known.widths}
     new = {w.name: 1.0 for w in known.widths.values() if w.name not in widths}
     return system.with_(formulas=known, widths=widths | new)

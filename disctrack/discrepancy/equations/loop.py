@@ -1,16 +1,15 @@
 """From equations and runs to an answer: what is missing, how much of it, and how sure that is."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 from scipy.linalg import qr
 
 from calibration.kit.arrays import Array
-from disctrack.discrepancy.elimination import Own
 from disctrack.discrepancy.equations import terms as library
 from disctrack.discrepancy.equations.declared import Equations, Run, Samples, Term, checked
-from disctrack.discrepancy.equations.formulas import formulas
+from disctrack.discrepancy.equations.formulas import Formulas
 from disctrack.discrepancy.equations.law import LearnedForce, learn, with_law
 from disctrack.discrepancy.equations.start import LOST, Start, guessed, led, misfit, trusted, turn
 from disctrack.discrepancy.equations.system import EquationSystem, cut, first_part, fitted_rows, spread
@@ -21,6 +20,7 @@ from disctrack.discrepancy.noise import (
     fast_part,
     persistence,
     step_of,
+    with_memory,
     with_noise,
     without_memory,
 )
@@ -34,7 +34,7 @@ from disctrack.discrepancy.search import (
     with_shapes,
 )
 from disctrack.discrepancy.significance import wald
-from disctrack.discrepancy.system import System
+from disctrack.discrepancy.system import Candidate, System
 from disctrack.errors import AnalysisError
 
 JUMP = 1e-3  # width of a jump over the rms of what jumps: it errs by 1e-6 of a friction's work
@@ -46,9 +46,9 @@ NO_SENSOR = 5.0  # times the noise that was declared or is seen from sample to s
 FORGOTTEN = float(np.arccos(np.exp(-1.0)) / (2 * np.pi))  # of its turn, after which an oscillation's memory is 1/e
 SAFE = 0.5  # of the time over which the model can be made to follow: near its end chi-square is full of minima
 SCANNED = 8  # values along the motion that are tried for a limit
-ENOUGH = 2  # blocks for each fitted number, by which the scatter of what is left is told
 NEARLY = 0.2  # of the excess chi-square: what leaves less is named as the nearest description of what no term is
 MOST_LED = 2  # terms with which a fit is led anew over growing windows
+STANDS = 8  # samples of the same largest or least value, above which a sensor stands at a limit
 ERROR_THAT_LASTS = "sigmas are those of what is left"  # note of an error that no term describes
 USUAL_SHARE = 0.1  # of the rms of the motion's own forces: a term of that size would surprise nobody
 
@@ -68,41 +68,17 @@ def ask(
         raise AnalysisError("no run keeps samples back to judge the fit: give one of them a smaller fit_until.")
     channels = equations.channels(runs[0])
     offered = tuple(library.usual(replace(equations, observed=channels)) if terms is None else terms)
-    compiled = formulas(equations, offered, channels)
-    samples = with_noise(given)
-    notes = [n for c, name in enumerate(compiled.channels) if (n := _step_note(given, c, name))]
-    system = EquationSystem(compiled, samples, np.ones(len(compiled.states)), {})
-    system, declared = _prepared(system)
-    start, leading = led(system, declared), dict[str, Start]()
-    followed = system.with_(stretches=first_part(system.stretches, start.followed))
-    held = redundant(followed, start.values) if start.followed > 0.0 else ()
-    if held:
-        system = system.with_(held=held)
-        start = led(system, declared)
-    if start.followed < min(turn(s) for s in system.stretches):
-        leading = _leading(system, declared)
-        if start.followed == 0.0 and not leading:
-            raise AnalysisError(_not_followed(system, declared))
-        notes.append(_lost_soon(start, leading))
-    if leading:
-        values = next(iter(leading.values())).values
-        former = {frozenset([name]): way.values for name, way in leading.items()}
-        system, diagnosis = _searched(_sized(system, values), values, settings, former)
-        if not diagnosis.found or not leading.keys() & {f.candidate.name for f in diagnosis.found}:
-            notes[-1] = f"the fit goes by way of {next(iter(leading))}: without it, growing windows lose the data"
-    else:
-        system, diagnosis, more = _as_far_as_followed(system, start, settings)
-        notes += more
+    compiled = Formulas(equations, offered, channels)
+    notes = [n for c, name in enumerate(compiled.channels) for n in _sensor_notes(given, c, name)]
+    whole = EquationSystem(compiled, with_noise(given), np.ones(len(compiled.states)), {})
+    system, diagnosis, more = _first_answer(whole, settings)
+    notes += more
     if not np.isfinite(diagnosis.before.chi_square):
         raise AnalysisError(
             "the motion can be followed, but not how it depends on its parameters: so it is where equations jump, as "
             "at a stiff contact. Write the contact wider, or cut the data into runs without it."
         )
-    if not start.whole and not leading and diagnosis.found:
-        system, diagnosis, remark = _joined(system, samples, diagnosis, settings)
-        notes.append(remark)
-    judged: System = diagnosis.judged or system
-    remembers = False
+    judged, remembers = diagnosis.judged or system, False
     if settings.noise is None:
         again, remembers, remark = _with_memory(system, diagnosis, settings)
         if again is not None:
@@ -118,22 +94,44 @@ def ask(
         diagnosis = with_shapes(judged, diagnosis)
         notes += diagnosis.remarks
     if system.held:
-        held_ones = ", ".join(system.held)
-        notes.append(f"{held_ones} cannot be told from other numbers with these data, which hold for it as declared")
+        held = ", ".join(system.held)
+        notes.append(f"{held} cannot be distinguished from other numbers by these data: held as declared")
     return diagnosis, system, judged, remembers, tuple(notes), law
 
 
-def _as_far_as_followed(
-    system: EquationSystem, start: Start, settings: Settings
-) -> tuple[EquationSystem, Diagnosis, list[str]]:
-    """The search over whole runs, or over stretches as long as the model follows them; and a note that says so."""
-    values, notes = start.values, []
+def _first_answer(system: EquationSystem, settings: Settings) -> tuple[EquationSystem, Diagnosis, list[str]]:
+    """The search over as much as the model can be made to follow, and remarks on how far that is."""
+    samples = system.stretches
+    system, declared = _prepared(system)
+    start = led(system, declared)
+    followed = system.with_(stretches=first_part(system.stretches, start.followed))
+    held = redundant(followed, start.values) if start.followed > 0.0 else ()
+    if held:
+        system = system.with_(held=held)
+        start = led(system, declared)
+    soon = start.followed < min(turn(s) for s in system.stretches)
+    leading = _leading(system, declared) if soon else {}
+    if soon and start.followed == 0.0 and not leading:
+        raise AnalysisError(_not_followed(system, declared))
+    notes = [_lost_soon(start, leading)] if soon else []
+    if leading:
+        first, values = next(iter(leading.items()))
+        former = {frozenset([name]): values for name, values in leading.items()}
+        system, diagnosis = _searched(_sized(system, values), values, settings, former)
+        if not leading.keys() & {f.candidate.name for f in diagnosis.found}:
+            notes = [f"the fit goes by way of {first}: without it, growing windows lose the data"]
+        return system, diagnosis, notes
+    values = start.values
     if not start.whole:
         system, values, note = _in_stretches(system, values, SAFE * start.followed)
         notes.append(note)
     if not np.isfinite(system.linearise(values, [])[0]).all():
         raise AnalysisError(_not_followed(system, values))
-    return *_searched(_sized(system, values), values, settings), notes
+    system, diagnosis = _searched(_sized(system, values), values, settings)
+    if not start.whole and diagnosis.found:
+        system, diagnosis, remark = _joined(system, samples, diagnosis, settings)
+        notes.append(remark)
+    return system, diagnosis, notes
 
 
 def _searched(
@@ -220,14 +218,14 @@ def _aimed(system: EquationSystem, values: Mapping[str, float]) -> EquationSyste
     return system.with_(aims={n: v for _, aims in best.values() for n, v in aims.items()})
 
 
-def _leading(system: EquationSystem, values: Mapping[str, float]) -> dict[str, Start]:
-    """Terms with which the model follows to their end data that it loses within a turn; best first."""
+def _leading(system: EquationSystem, values: Mapping[str, float]) -> dict[str, dict[str, float]]:
+    """Terms with which the model follows to their end data that it loses within a turn, and where; best first."""
     ways = {c.name: led(system.with_(promoted=(c.name,)), dict(values)) for c in system.candidates}
-    left = {name: misfit(system, way.values) for name, way in ways.items() if way.whole}
-    return {name: ways[name] for name in sorted(left, key=lambda name: left[name])}
+    whole = {name: way.values for name, way in ways.items() if way.whole}
+    return dict(sorted(whole.items(), key=lambda item: misfit(system, item[1])))
 
 
-def _lost_soon(start: Start, leading: Mapping[str, Start]) -> str:
+def _lost_soon(start: Start, leading: Collection[str]) -> str:
     text = f"the model loses the data after {start.followed:.2g} s, less than a turn"
     if leading:
         return f"{text}; with {' or '.join(leading)} it follows them to their end: {next(iter(leading))} does so best"
@@ -314,19 +312,16 @@ def redundant(system: EquationSystem, values: Mapping[str, float]) -> tuple[str,
     system = system.with_(stretches=spread(system.stretches, len(system.formulas.states)))
     states = [q for q in system.base if q.is_initial]
     free = [q for q in system.base if not q.is_initial and np.isinf(q.prior_sigma)]
-    own = Own(system, states)
-    states = [q for q in states if not q.slot]
-    residual, derivative = system.linearise(values, [*own.slots, *(q.name for q in (*states, *free))])
-    if len(free) < 2 or not np.isfinite(derivative).all():
+    if len(free) < 2:
         return ()
-    _, matrix, _ = own.reduced(residual, derivative, values)
-    k = len(states)
-    basis = np.linalg.qr(matrix[:, :k] / np.maximum(np.linalg.norm(matrix[:, :k], axis=0), 1e-300))[0]
-    size = np.array([max(abs(values.get(q.name, q.null)), q.scale) for q in free])
-    before = size * np.linalg.norm(derivative[..., -len(free) :], axis=(0, 1))
-    columns = matrix[:, k:] * size
-    cleared = columns - basis @ (basis.T @ columns)
-    shares, stems = cleared / np.where(before > 0, before, 1.0), np.array([q.name.partition("[")[0] for q in free])
+    everything = Candidate("all", "all", "motion", "", "", tuple(free))
+    linear = Linearisation(system, no_fit(states, values), [everything])
+    columns = linear.columns(everything.names) * [max(abs(values.get(q.name, q.null)), q.scale) for q in free]
+    length = np.linalg.norm(columns, axis=0)
+    shares = linear.cleared(columns) / np.where(length > 0, length, 1.0)
+    if not np.isfinite(shares).all():
+        return ()
+    stems = np.array([q.name.partition("[")[0] for q in free])
     weak: list[str] = []
     while (left := np.flatnonzero(~np.isin(stems, weak))).size:
         _, R, order = qr(shares[:, left], mode="economic", pivoting=True)
@@ -391,11 +386,8 @@ def _with_memory(
     remembering = without_memory(system, system.rows, coefficients, present)
     base = fit(remembering, system.base, diagnosis.before.values) if as_noise else None
     if diagnosis.verdict == "unexplained" and (base is None or not base.converged):
-        block = max(2 * shortest_turn, 5 * lasting)
         reason = f"what is left is {size:.3g} times the noise and lasts for {lasting:.2g} s: no sensor's noise"
-        spread = replace(_certain(system, diagnosis, block), reason=reason)
-        text = f"{ERROR_THAT_LASTS} ({block:.2g} s taken as one error), not of the noise alone"
-        return spread, False, text
+        return replace(_certain(system, diagnosis), reason=reason), False, f"{ERROR_THAT_LASTS}, not of the noise alone"
     if base is None or not base.converged:
         return None, False, ""
     noise = float(share * size**2)
@@ -417,9 +409,9 @@ def _pace(s: Samples) -> float:
     return persistence(away, [slice(0, len(away))]) * float(np.median(np.diff(s.time))) / FORGOTTEN
 
 
-def _certain(system: EquationSystem, diagnosis: Diagnosis, block: float) -> Diagnosis:
+def _certain(system: EquationSystem, diagnosis: Diagnosis) -> Diagnosis:
     """Sigmas as what is left makes them, and of what was found only what stands out from them (Wald's test)."""
-    found, after = diagnosis.found, robust(system, diagnosis.after, block)
+    found, after = diagnosis.found, with_memory(system, diagnosis.after)
     while len(certain := [f for f in found if _wald(f.candidate.names, after) > f.threshold]) < len(found):
         found, fitted = tuple(certain), diagnosis.before
         if found:
@@ -428,10 +420,10 @@ def _certain(system: EquationSystem, diagnosis: Diagnosis, block: float) -> Diag
             quantities = (*system.base, *(q for f in found for q in f.candidate.quantities))
             fits = [fit(system, quantities, values) for values in (start, diagnosis.before.values)]
             fitted = min(fits, key=lambda f: f.cost)
-        after = robust(system, fitted, block)
+        after = with_memory(system, fitted)
     if diagnosis.found and not found:  # none of them is certain, but it is they that describe the data best
         partial = tuple(f.candidate for f in diagnosis.found)
-        diagnosis = replace(diagnosis, partial=partial, nearest=robust(system, diagnosis.after, block))
+        diagnosis = replace(diagnosis, partial=partial, nearest=with_memory(system, diagnosis.after))
     names, tried = {f.candidate.name for f in found}, []
     for t in diagnosis.tried:
         idle = t.reason == "chosen" and t.candidate.name not in names
@@ -439,7 +431,7 @@ def _certain(system: EquationSystem, diagnosis: Diagnosis, block: float) -> Diag
     return replace(
         diagnosis,
         found=tuple(replace(f, gain=_wald(f.candidate.names, after)) for f in found),
-        before=robust(system, diagnosis.before, block),
+        before=with_memory(system, diagnosis.before),
         after=after,
         held_out_after=held_out(system, after.quantities, after.values, system.training),
         tried=tuple(tried),
@@ -450,47 +442,6 @@ def _wald(names: Sequence[str], fitted: Fit) -> float:
     """Square of the distance from zero in standard deviations, of numbers that move together."""
     here = [fitted.shared.index(n) for n in names]
     return wald(np.array([fitted.values[n] for n in names]), fitted.covariance[np.ix_(here, here)])
-
-
-def robust(system: EquationSystem, fitted: Fit, block: float) -> Fit:
-    """The fit with the covariance that its own residual brings about, errors within `block` [s] taken together.
-
-    The sandwich of Huber and White over blocks: what is left need be neither white nor as large as stated. The fit
-    bends as many sums over blocks to zero as it has numbers: data that hold too few blocks are cut into shorter ones,
-    which are then taken as wholly alike for as long as an error lasts (the largest that their sum can be).
-    """
-    own = Own(system, fitted.quantities)
-    names = fitted.shared
-    residual, full = system.linearise(fitted.values, [*own.slots, *names])
-    heads = own.reduced(residual, full, fitted.values)[2]
-    derivative = own.cleared(full, heads)
-    length = np.linalg.norm(derivative, axis=(0, 1))
-    scale = np.where(length > 0, length, 1.0)
-    J = derivative / scale
-    normal = np.einsum("nwi,nwj->ij", J, J)
-    duration = sum(float(np.ptp(system.time[rows])) for rows in system.rows)
-    cut = min(block, duration / (ENOUGH * len(fitted.names)))
-    parts = [
-        [np.flatnonzero(number == b) + rows.start for b in np.unique(number)]
-        for rows in system.rows
-        for number in [((system.time[rows] - system.time[rows.start]) / cut).astype(int)]
-    ]
-    S = np.array([np.einsum("nwi,nw->i", J[here], residual[here]) for of_run in parts for here in of_run])
-    few = len(S) / max(len(S) - len(fitted.names), 1)
-    alike = min(block, duration) / cut
-    inverse = np.linalg.pinv(normal, rcond=1e-12, hermitian=True)
-    spread = few * alike * inverse @ (S.T @ S) @ inverse / np.outer(scale, scale)
-    free = np.diag(fitted.covariance) > 0
-    size, spread_heads = np.sqrt(few * alike), []
-    for of_block, head in zip(own.blocks, heads, strict=True):
-        of_own = [
-            np.einsum("nwi,nw->i", full[here][..., of_block.columns], residual[here])
-            for here in parts[of_block.quantities[0].block]
-        ]
-        # what errors do to both own and shared numbers at once is left out here
-        spread_heads.append(replace(head, root=size * head.root @ (head.root.T @ np.array(of_own).T)))
-    spread = np.where(np.outer(free, free), spread, 0.0)
-    return replace(fitted, covariance=spread, heads=tuple(spread_heads), own=own.known(spread_heads))
 
 
 def _not_followed(system: EquationSystem, values: Mapping[str, float]) -> str:
@@ -506,9 +457,22 @@ def _not_followed(system: EquationSystem, values: Mapping[str, float]) -> str:
     )
 
 
-def _step_note(samples: Sequence[Samples], channel: int, name: str) -> str:
+def _sensor_notes(samples: Sequence[Samples], channel: int, name: str) -> list[str]:
+    """Steps in which a sensor shows, and limits at which it stands."""
+    notes = []
     values = [s.data[:, channel] for s in samples if np.isnan(s.sigma[:, channel]).any()]
-    if not values or not (step := step_of(values)):
-        return ""
-    text = f"{name} stands on steps of {step:.4g}, which alone scatter by {step / np.sqrt(12):.3g}"
-    return text if fast_part(values) < 3 * step else ""
+    step = step_of(values) if values else 0.0
+    if step and fast_part(values) < 3 * step:
+        notes.append(f"{name} stands on steps of {step:.4g}, which alone scatter by {step / np.sqrt(12):.3g}")
+    everything = np.concatenate([s.data[:, channel] for s in samples])
+    least, most = np.nanmin(everything, initial=np.inf), np.nanmax(everything, initial=-np.inf)
+    if least == most:
+        raise AnalysisError(f"{name} shows {most:g} at all times: its sensor is dead. Leave it out.")
+    for limit, which in ((most, "most"), (least, "least")):
+        count = int(np.sum(everything == limit))
+        if not step and count > STANDS:  # noise repeats no value; an encoder at rest does
+            notes.append(
+                f"{name} shows {limit:.4g}, the {which} of all, {count} times: where its sensor is dead or at its "
+                "limit, write NaN, or offer terms.sensor_limit"
+            )
+    return notes

@@ -112,7 +112,7 @@ def guessed(system: EquationSystem) -> tuple[dict[str, float], Array]:
         seen.append(first)
         values |= {f"state.{name}[{s.name}]": float(v) for name, v in zip(names, first, strict=True)}
         count = max(2, _INSTANTS // len(system.stretches)) if len(system.stretches) < _INSTANTS else 0
-        for row in usable[np.linspace(0, len(usable) - 9, count).astype(int)]:
+        for row in usable[np.linspace(0, max(len(usable) - 9, 0), count).astype(int)]:
             seen.append(states_from_data(f, s, p, int(row), first))
     sizes = np.quantile(np.abs(seen), 0.9, axis=0)
     floor = 1e-6 * max(float(sizes.max()), 1e-12)

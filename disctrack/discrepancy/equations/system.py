@@ -156,7 +156,7 @@ class EquationSystem(System):
         everything, alone = np.zeros(len(self.sizes)), np.zeros((len(named), len(self.sizes)))
         together = np.zeros((len(sums), len(self.sizes)))
         for s in self.stretches if sums else ():
-            found = self._predict(values, s, [])
+            found = self.predict(values, s)
             if found is None:
                 return False
             rates, *without = (
@@ -175,11 +175,10 @@ class EquationSystem(System):
         residual = np.zeros((len(self.time), self._w))
         derivative = np.zeros((len(self.time), self._w, len(names)))
         for rows, s in zip(self.rows, self.stretches, strict=True):
-            mine = [(i, own) for i, name in enumerate(names) if (own := self._own(name, s)) is not None]
-            found = self._predict(values, s, [own for _, own in mine])
+            columns = [i for i, name in enumerate(names) if self._own(name, s) is not None]
+            found = self.predict(values, s, [names[i] for i in columns])
             if found is None:
                 return np.full_like(residual, np.nan), np.full_like(derivative, np.nan)
-            columns = [i for i, _ in mine]
             present = np.isfinite(s.data)
             if s.noise is not None:
                 for c in range(self._w):
@@ -195,12 +194,7 @@ class EquationSystem(System):
 
     def predictions(self, values: Values) -> list[Prediction | None]:
         """What every stretch should show; None where the motion cannot be followed to its end."""
-        return [self._predict(values, s, []) for s in self.stretches]
-
-    def predict(self, values: Values, s: Samples, names: Sequence[str]) -> Prediction | None:
-        """As `predictions`, of one stretch with its derivatives by quantities that it has (`names_of`)."""
-        own = [self._own(name, s) for name in names]
-        return self._predict(values, s, [number for number in own if number is not None])
+        return [self.predict(values, s) for s in self.stretches]
 
     def names_of(self, s: Samples) -> set[str]:
         """Quantities that move a stretch."""
@@ -235,7 +229,12 @@ class EquationSystem(System):
             float,
         )
 
-    def _predict(self, values: Values, s: Samples, own: Sequence[int]) -> Prediction | None:
+    def predict(self, values: Values, s: Samples, names: Sequence[str] = ()) -> Prediction | None:
+        """What a stretch should show, with its derivatives by quantities that it has (`names_of`).
+
+        None where the motion cannot be followed to its end.
+        """
+        own = [number for name in names if (number := self._own(name, s)) is not None]
         f = self.formulas
         n, k = len(f.states), len(own)
         p = self.numbers(values, s)
@@ -292,7 +291,7 @@ class EquationSystem(System):
 
     def along(self, values: Values, s: Samples) -> tuple[Array, Array, Array, Array]:
         """Rates (m, n), their derivatives (m, n, n_p), sensors (m, w), theirs (m, w, n_p) along a stretch's motion."""
-        p, found = self.numbers(values, s), self._predict(values, s, [])
+        p, found = self.numbers(values, s), self.predict(values, s)
         states = np.zeros((len(s.time), len(self.formulas.states))) if found is None else found.states
         rates, _, by_number = self.formulas.rates_at(s, p, s.time, states)
         shown, _, shown_by_number = self.formulas.sensors_at(s, p, s.time, states)

@@ -1,7 +1,7 @@
 """Which recordings do not fit the others?
 
 Two tests of each against all others. Of what they share: do the numbers that it determines differ from those that the
-others foretell? Of what the model does not hold: does an effect of the catalogue (a table that leans, a dot misprinted,
+others predict? Of what the model does not hold: does an effect of the catalogue (a table that leans, a dot misprinted,
 a camera that was touched) have another size in it than in the others? Of an effect that the others do not see at all it
 may have any size, and nobody differs by it.
 """
@@ -15,7 +15,7 @@ from scipy import stats
 from calibration.kit.arrays import Array
 from calibration.kit.least_squares import triangle
 from disctrack.discrepancy.fit import Fit, prior_rows
-from disctrack.discrepancy.joint.joint_system import JointSystem
+from disctrack.discrepancy.joint.sharing import JointSystem
 from disctrack.discrepancy.system import Candidate
 
 LAW = 1e6  # sigmas: length to which the derivative by a number without a prior is scaled, so that it is never left out
@@ -77,7 +77,7 @@ class Blocks:
     def fits_in(self, i: int, kept: list[int]) -> FitsIn:
         """Recording i against those of `kept` that it is not.
 
-        What the others foretell of the combinations of shared quantities that the recording itself determines, in
+        What the others predict of the combinations of shared quantities that the recording itself determines, in
         sigmas of both: chi-square of as many degrees. Combinations of cameras' and dots' errors that the recording
         knows no better than the calibration does are left out: their derivatives are mostly noise of its poses.
         """

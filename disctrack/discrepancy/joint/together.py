@@ -19,8 +19,7 @@ from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.joint.covariates import Hypothesis, hypotheses
 from disctrack.discrepancy.joint.crew import Crew
 from disctrack.discrepancy.joint.fitting_in import Blocks, FitsIn, apart
-from disctrack.discrepancy.joint.joint_system import JointSystem
-from disctrack.discrepancy.joint.sharing import EACH, Member, Sharing
+from disctrack.discrepancy.joint.sharing import EACH, JointSystem, Member, Sharing
 from disctrack.discrepancy.score import Linearisation, score_all, sigmas, span
 from disctrack.discrepancy.search import Diagnosis, Settings, explain
 from disctrack.discrepancy.significance import TWO_SIDED

@@ -84,7 +84,7 @@ def test_a_slow_change_of_the_system_is_no_force_of_time():
 
 @pytest.mark.statistical
 def test_what_leaves_more_than_the_sensor_scatters_is_not_found():
-    """A tank with an outlet that nobody declared: an error that lasts, however well one sample foretells the next."""
+    """A tank with an outlet that nobody declared: an error that lasts, however well one sample predicts the next."""
     time = np.arange(0, 600, 1.0)
     pump = np.repeat(np.random.default_rng(3).uniform(0.5, 2.0, 30), 20)
     level = [4.0]
@@ -133,4 +133,17 @@ def test_two_numbers_that_nothing_tells_apart_do_not_end_the_search():
     run = Run(time, {"speed": speed + noise(400)}, inputs={"u": u}, hold="hold", sigma=0.01)
     answer = diagnose(drives, run, [Term("scale", observed={"speed": "s*abs(p)"}, parameters={"s": 0.0})])
     assert answer.diagnosis.held_out_before is not None
-    assert any("cannot be told from other numbers" in note for note in answer.notes)
+    assert any("cannot be distinguished from other numbers" in note for note in answer.notes)
+
+
+@pytest.mark.statistical
+def test_a_wrong_sign_a_sensor_at_its_limit_and_a_dead_one_are_told():
+    x = np.cos(3 * TIME) + noise()
+    wrong = diagnose(Equations({"x": "w", "w": "k*x"}, {"k": 14.0}), Run(TIME, {"x": x}, sigma=0.01), DRAG)
+    assert any(note.startswith("k = -") and "sign is another" in note for note in wrong.notes)
+    swing = Equations({"x": "w", "w": "-k*x"}, {"k": 9.0})
+    clipped = diagnose(swing, Run(TIME, {"x": np.minimum(x, 0.9)}, sigma=0.01), [terms.viscous("w")])
+    assert any("at its limit" in note for note in clipped.notes)
+    assert not any("at its limit" in note for note in wrong.notes)
+    with pytest.raises(AnalysisError, match="its sensor is dead"):
+        diagnose(swing, Run(TIME, {"x": 0 * TIME}), DRAG)

@@ -14,8 +14,7 @@ from disctrack.discrepancy.fit import fit
 from disctrack.discrepancy.joint.covariates import alike, hypotheses
 from disctrack.discrepancy.joint.crew import Crew
 from disctrack.discrepancy.joint.fitting_in import Blocks, apart
-from disctrack.discrepancy.joint.joint_system import JointSystem
-from disctrack.discrepancy.joint.sharing import Sharing
+from disctrack.discrepancy.joint.sharing import JointSystem, Sharing
 from disctrack.discrepancy.search import Settings, explain
 from disctrack.errors import AnalysisError
 from tests.oracles.decaying_runs import build, fitted_at_once, renamed, runs
