@@ -105,8 +105,8 @@ class DiscDiagnosis(Brief):
         if diagnosis.verdict == "found":
             if any(f.candidate.kind == "motion" for f in diagnosis.found):
                 return f"Missing in the model: {effects}."
-            rivals = any(r.candidate.kind == "motion" for f in diagnosis.found for r in f.cannot_be_told_from)
-            is_need = "need be" if rivals else "is"
+            others = any(r.candidate.kind == "motion" for f in diagnosis.found for r in f.cannot_be_told_from)
+            is_need = "need be" if others else "is"
             return f"Nothing {is_need} missing in the motion; wrong in the measurement: {effects}."
         return unnamed(effects)
 

@@ -110,7 +110,7 @@ def with_form(
         another = fitted.covariance + taken @ second @ taken.T  # in the end that of all parts
         mixed += probability * (another - fitted.covariance)
         misfit += probability * size**2
-    variance = np.maximum(variance, 0.0).reshape(3, k).T + _among_rivals(system, fitted, law, course, blocks.time)
+    variance = np.maximum(variance, 0.0).reshape(3, k).T + _among_others(system, fitted, law, course, blocks.time)
     variance += wrong * _within_probes(system, fitted, blocks, course)
     found = Course(blocks.time, course, np.sqrt(variance))
     return replace(fitted, covariance=mixed), replace(fitted, covariance=another), found, float(np.sqrt(misfit))
@@ -131,7 +131,7 @@ def form_is_another(law: LearnedLaw, beside: Collection[str] = ()) -> float:
     if len(law.families) + len(beside) > 1:
         return 1.0
     own = _kinds(law)
-    others = sum(odds for rival, odds in law.rivals if not rival.families or not _kinds(rival) <= own)
+    others = sum(odds for other, odds in law.others if not other.families or not _kinds(other) <= own)
     return max(SELDOM, others / (1.0 + others))
 
 
@@ -155,11 +155,11 @@ def _courses(system: DiscSystem, fitted: Fit, own: Collection[str], time: Array)
     return course[1:], moment_about_contact(system, values, motion, own)[1:], by_number
 
 
-def _among_rivals(system: DiscSystem, fitted: Fit, law: LearnedLaw, course: Array, time: Array) -> Array:
+def _among_others(system: DiscSystem, fitted: Fit, law: LearnedLaw, course: Array, time: Array) -> Array:
     """Variance (k, 3) of the course over the laws that describe the data too, each with its odds."""
     motion, total, spread = _motion(system, fitted.values, time), 1.0, np.zeros_like(course)
-    for rival, odds in law.rivals:
-        moment = moment_about_contact(system.knowing(rival), rival.values, motion)[1:]
+    for other, odds in law.others:
+        moment = moment_about_contact(system.knowing(other), other.values, motion)[1:]
         total, spread = total + odds, spread + odds * (moment - course) ** 2
     return np.asarray(spread / total, float)
 

@@ -67,10 +67,10 @@ class Proposal:
 
 @dataclass(frozen=True)
 class Question:
-    """What a recording leaves open: an effect and its rival, or the size of an effect that was not found."""
+    """What a recording leaves open: an effect and its alternative, or the size of an effect that was not found."""
 
     effect: Candidate
-    rival: Candidate | None = None
+    alternative: Candidate | None = None
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class Proposed:
 
     proposal: Proposal
     duration: float  # [s] until the disc comes to rest, at most that of the proposal
-    answers: tuple[float, ...]  # sigmas between effect and rival; or the standard deviation of the effect's size
+    answers: tuple[float, ...]  # sigmas between effect and alternative; or the standard deviation of the effect's size
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ class Plan:
         known = [r for r in self.rows if np.isfinite(r.answers[i])]
         if not known:
             return None
-        pick: Callable[..., Proposed] = min if self.questions[i].rival is None else max
+        pick: Callable[..., Proposed] = min if self.questions[i].alternative is None else max
         return pick(known, key=lambda r: r.answers[i])
 
 
@@ -154,12 +154,12 @@ class Planner:
             return None
         return np.concatenate([self.now, said]), float(planned.time[-1] - planned.time[0])
 
-    def sigmas(self, rows: Array, effect: Candidate, rival: Candidate) -> float:
-        """Root of the chi-square that the rival leaves where the effect is true at its fitted size."""
+    def sigmas(self, rows: Array, effect: Candidate, alternative: Candidate) -> float:
+        """Root of the chi-square that the alternative leaves where the effect is true at its fitted size."""
         matrix = np.concatenate([rows, self._priors])
         amounts = np.array([self.fit.values.get(q.name, q.null) - q.null for q in effect.quantities])
         signal = matrix[:, self._columns(effect)] @ amounts
-        return float(np.linalg.norm(cleared(signal, span(matrix[:, [*self._base, *self._columns(rival)]]))))
+        return float(np.linalg.norm(cleared(signal, span(matrix[:, [*self._base, *self._columns(alternative)]]))))
 
     def sigma(self, rows: Array, candidate: Candidate) -> float:
         """Standard deviation of its first number; infinite where nothing is seen of it."""
@@ -262,12 +262,12 @@ def plan(
 
     said : as for `Planner`
     """
-    candidates = {c.name: c for q in questions for c in (q.effect, q.rival) if c is not None}
+    candidates = {c.name: c for q in questions for c in (q.effect, q.alternative) if c is not None}
     planner = Planner(system, fit, list(candidates.values()), noise, said)
 
     def answers(rows: Array) -> tuple[float, ...]:
         return tuple(
-            planner.sigma(rows, q.effect) if q.rival is None else planner.sigmas(rows, q.effect, q.rival)
+            planner.sigma(rows, q.effect) if q.alternative is None else planner.sigmas(rows, q.effect, q.alternative)
             for q in questions
         )
 
@@ -291,7 +291,7 @@ def plan(
 
 
 def open_questions(diagnosis: Diagnosis, system: DiscSystem) -> tuple[Question, ...]:
-    """What a diagnosis leaves open: effects and their rivals, then effects of the motion with an upper bound only.
+    """What is open in a diagnosis: effects and their alternatives, then effects of the motion with an upper bound only.
 
     Of the latter those whose standard deviation is largest beside their usual size.
     """

@@ -1,8 +1,8 @@
 """Laws that no catalogue names: proposed by what they would gain to first order, and ranked by length as all else is.
 
 A system says how it answers to small forces along a fitted motion, and makes an effect of a law. The law that gains
-most is fitted in full beside its nearest rivals, and the next is looked for in what it leaves, while each pays for its
-numbers and for having been looked for among so many. With the known effects that stay beside it, a law is an
+most is fitted in full beside its nearest alternatives, and the next is looked for in what it leaves, while each pays
+for its numbers and for having been looked for among so many. With the known effects that stay beside it, a law is an
 explanation; the answer is the shortest one.
 """
 
@@ -79,7 +79,7 @@ class LearnedLaw:
     shapes: tuple[tuple[str, ...], ...] = ()  # ... and of the numbers of its shape
     values: Values = field(default_factory=dict)  # of everything, where its fit ended
     alike: tuple[str, ...] = ()  # other laws that describe the data as well
-    rivals: tuple[tuple[LearnedLaw, float], ...] = ()  # laws that fit as well, however long, with their likelihood
+    others: tuple[tuple[LearnedLaw, float], ...] = ()  # laws that fit as well, however long, with their odds
     looked: float = 0.0  # chi-square that each family pays for having been looked for among so many
 
     @property
@@ -159,7 +159,7 @@ def proposal(family: Family, gram: Array, before: Array, right: Array) -> Gain:
 
 
 def learn(
-    system: LawSystem, base: Fit, noise: float, along: Fit | None = None, rival: float = np.inf,
+    system: LawSystem, base: Fit, noise: float, along: Fit | None = None, against: float = np.inf,
     is_noise: IsNoise | None = None,
 ) -> LearnedLaw | None:  # fmt: skip
     """The law of few terms that describes what is missing; None if none survives, or where there is no first order.
@@ -167,7 +167,7 @@ def learn(
     noise : variance of the residual's noise over that stated
     along : fit of other effects that follows the data more closely than the base does: the law is looked for along its
     motion, in the place of what it has beyond the base
-    rival : chi-square over the noise that another explanation leaves; then only a law of a single term is sought, and
+    against : chi-square over the noise that another explanation leaves; then only a law of a single term is sought, and
     only one that may, to first order, come as near to the data
     is_noise : ends the search for further terms, which else goes on as long as each gains more than its price
     """
@@ -181,7 +181,7 @@ def learn(
         looked = 2.0 * float(np.log(len(library)))
         worth = [g for g in scan.gains(library) if g.gain / noise > price * g.family.n_numbers + looked]
         begin, inexact = (base_alone(base, along), along.cost) if along is not None else (current, scan.chi_square)
-        chosen = _worth_a_refit(worth, scan.chi_square, inexact, noise, price, rival)
+        chosen = _worth_a_refit(worth, scan.chi_square, inexact, noise, price, against)
         trials = [_refitted(system, base, law, begin, g) for g in chosen]
         lengths = [t.cost / noise + sum(price * f.n_numbers + looked for f in one.families) for one, t in trials]
         if not trials or min(lengths) >= shortest:
@@ -197,11 +197,11 @@ def learn(
         law = replace(
             law,
             alike=tuple(title for title in near if title != law.title),
-            rivals=tuple((one, share) for one, share in odds if share > UNLIKELY),
+            others=tuple((one, share) for one, share in odds if share > UNLIKELY),
             looked=looked,
         )
         known = system.knowing(law)
-        if len(law.families) == MAX_TERMS or np.isfinite(rival) or (is_noise and is_noise(known, current)):
+        if len(law.families) == MAX_TERMS or np.isfinite(against) or (is_noise and is_noise(known, current)):
             break
         scan = known.scan(current)
     return without_idle_terms(system, law, current) if law is not None else None
@@ -233,17 +233,17 @@ def _odds(fitted: Fit, best: Fit, noise: float) -> float:
 
 
 def _worth_a_refit(
-    worth: Sequence[Gain], chi_square: float, inexact: float, noise: float, price: float, rival: float
+    worth: Sequence[Gain], chi_square: float, inexact: float, noise: float, price: float, against: float
 ) -> list[Gain]:
     """The best ones, not more than some of a kind: to first order many of a kind are alike.
 
     inexact : chi-square of the motion along which they were looked for
-    rival : as of `learn`
+    against : as of `learn`
     """
     left = {id(g): (chi_square - g.gain) / noise for g in worth}
-    if np.isfinite(rival):
-        beyond = COARSE * max(chi_square / noise - rival, 0.0)
-        worth = [g for g in worth if left[id(g)] < rival + NEARLY + beyond * bool(g.family.shape)]
+    if np.isfinite(against):
+        beyond = COARSE * max(chi_square / noise - against, 0.0)
+        worth = [g for g in worth if left[id(g)] < against + NEARLY + beyond * bool(g.family.shape)]
 
     def rank(g: Gain) -> tuple[float, float]:
         return price * g.family.n_numbers + max(left[id(g)], EXACT * inexact / noise), left[id(g)]
@@ -253,7 +253,7 @@ def _worth_a_refit(
         if kinds.count(g.family.kind) < OF_ONE_KIND and len(found) < REFITTED:
             found.append(g)
             kinds.append(g.family.kind)
-    if np.isfinite(rival):
+    if np.isfinite(against):
         # what fits as well in more numbers is not named, but counts in what is known of the force
         others = (g for g in worth if g.family.kind not in kinds)
         found += sorted(others, key=lambda g: -g.gain)[:LONGER]
@@ -309,7 +309,7 @@ def without_idle_terms(system: LawSystem, law: LearnedLaw, fitted: Fit) -> Learn
     if not kept or len(values) == len(law.candidate.quantities):
         return law
     shorter = system.law(kept, np.array(values))
-    return replace(shorter, values=fitted.values, alike=law.alike, rivals=law.rivals, looked=law.looked)
+    return replace(shorter, values=fitted.values, alike=law.alike, others=law.others, looked=law.looked)
 
 
 def busy_amounts(fitted: Fit, names: Sequence[str]) -> dict[int, float]:
@@ -366,7 +366,7 @@ def explained_by_law(
         return None, replace(listed, remarks=(*diagnosis.remarks, text)) if left <= at_noise else diagnosis
     if left > TELLS * noise:
         return None, diagnosis
-    return replace(best, law=replace(best.law, rivals=_rivals(best, answers, diagnosis))), listed
+    return replace(best, law=replace(best.law, others=_others(best, answers, diagnosis))), listed
 
 
 def _listed(diagnosis: Diagnosis, answers: Sequence[WithLaw]) -> tuple[tuple[tuple[str, ...], float], ...]:
@@ -426,8 +426,8 @@ def _law_beside(system: LawSystem, diagnosis: Diagnosis, kept: tuple[Found, ...]
     """The law that takes the place of what was found but for `kept`; None if there is none."""
     noise, base = diagnosis.noise, base_beside(diagnosis.before, kept)
     along = diagnosis.after if diagnosis.found else diagnosis.nearest
-    rival = along.cost / noise if diagnosis.verdict == "found" and along else np.inf
-    law = learn(system, base, noise, along, rival, None if diagnosis.found else is_noise)
+    against = along.cost / noise if diagnosis.verdict == "found" and along else np.inf
+    law = learn(system, base, noise, along, against, None if diagnosis.found else is_noise)
     if law is None:
         return None
     known = system.knowing(law)
@@ -453,15 +453,15 @@ def _law_beside(system: LawSystem, diagnosis: Diagnosis, kept: tuple[Found, ...]
     return WithLaw(law, known, fitted, tuple(again), of_known + law.looked * len(law.families))
 
 
-def _rivals(best: WithLaw, answers: Sequence[WithLaw], diagnosis: Diagnosis) -> tuple[tuple[LearnedLaw, float], ...]:
+def _others(best: WithLaw, answers: Sequence[WithLaw], diagnosis: Diagnosis) -> tuple[tuple[LearnedLaw, float], ...]:
     """Whatever describes the data as well, with its odds: other laws, beside other effects, and known effects alone."""
-    noise, rivals = diagnosis.noise, list(best.law.rivals)
+    noise, others = diagnosis.noise, list(best.law.others)
     for other in answers:
         if other is not best and other.fit.converged:
             share = _odds(other.fit, best.fit, noise)
-            rivals.append((replace(other.law, values=other.fit.values), share))
-            rivals += [(law, share * its) for law, its in other.law.rivals]
+            others.append((replace(other.law, values=other.fit.values), share))
+            others += [(law, share * its) for law, its in other.law.others]
     if diagnosis.verdict == "found":
         nothing = replace(best.law, families=(), values=diagnosis.after.values)  # beside known effects
-        rivals.append((nothing, _odds(diagnosis.after, best.fit, noise)))
-    return tuple((law, share) for law, share in rivals if share > UNLIKELY)
+        others.append((nothing, _odds(diagnosis.after, best.fit, noise)))
+    return tuple((law, share) for law, share in others if share > UNLIKELY)

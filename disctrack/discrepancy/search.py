@@ -37,7 +37,7 @@ OBVIOUS = 5.0  # times its price: a gain that the fitted part alone may know
 WIDTH = 2  # explanations that are enlarged as long as none leaves noise
 ROUGH = 1e-2  # of chi-square at stake, below which what a fit may still gain in a rough valley decides nothing
 FAINT = 1e3  # chi-square of an effect, below which many others may do as well as it
-MOST_RIVALS = 12
+MOST_ALTERNATIVES = 12
 NOT_CONVERGED = "its refit does not converge"
 CANCELLING = 0.1  # share of the lesser of two faults' power that their sum keeps, below which they undo each other
 FAR, AGREES = 10.0, 2.0  # variances of the noise: a motion far from the data, and one that a beginning agrees with
@@ -79,12 +79,12 @@ class Explanation:
 
 
 @dataclass(frozen=True)
-class Rival:
+class Alternative:
     """Another effect that explains the same."""
 
     candidate: Candidate
     angle: float  # [rad] between the predicted residuals, cleared of what other quantities absorb
-    loss: float  # chi-square with the rival in place of the effect, minus that with the effect
+    loss: float  # chi-square with the alternative in place of the effect, minus that with the effect
     fit: Fit
 
 
@@ -96,7 +96,7 @@ class Found:
     gain: float  # chi-square lost when the effect is taken out again
     held_out_gain: float
     threshold: float  # gain that noise alone does not reach
-    cannot_be_told_from: tuple[Rival, ...]
+    cannot_be_told_from: tuple[Alternative, ...]
 
 
 @dataclass(frozen=True)
@@ -239,14 +239,14 @@ class _Search:
             return _refusal(base, self.settings)
         linear, scores = self._scored(first)
         by_chance = chance(linear, scores, self.noise) if scores else None
-        best, rivals = self._settled()
+        best, alike = self._settled()
         if self.system.frees_shapes and first is self.nothing and self._shapes_freed(best):
-            best, rivals = self._settled()
-        after = self.nothing if rivals is None else best
-        found = tuple(self._found(best, c, r) for c, r in zip(best.candidates, rivals or (), strict=rivals is not None))
+            best, alike = self._settled()
+        after = self.nothing if alike is None else best
+        found = tuple(self._found(best, c, r) for c, r in zip(best.candidates, alike or (), strict=alike is not None))
         ranked = tuple(replace(e, length=self.length(e)) for e in self._ranked())
         listed = ((e.effects, e.length - self.length(after)) for e in ranked)
-        partial = best if rivals is None else None
+        partial = best if alike is None else None
         return Diagnosis(
             *self._verdict(after, found),
             found,
@@ -287,10 +287,10 @@ class _Search:
         self.expanded.add(frozenset())
         return min((e for e in self._ranked() if e.candidates), key=self.length, default=None)
 
-    def _settled(self) -> tuple[Explanation, list[list[Rival]] | None]:
-        """The explanation that stands, and rivals of each of its effects; no such list where it explains too little."""
+    def _settled(self) -> tuple[Explanation, list[list[Alternative]] | None]:
+        """The explanation that stands, and alternatives of each of its effects; None where it explains too little."""
         self._explore()
-        rivals: list[list[Rival]] = []
+        alike: list[list[Alternative]] = []
         while (best := self._shortest_that_stands()).candidates:
             if not self._at_noise(best.fit) and not self._worth_naming(best):
                 return best, None
@@ -299,11 +299,11 @@ class _Search:
                 self.pool.setdefault(smaller.names, smaller)
                 self._explore()
                 continue
-            rivals = [self._rivals(best, c) for c in best.candidates]
+            alike = [self._alternatives(best, c) for c in best.candidates]
             self._explore()
             if self._shortest_that_stands() is best:
                 break
-        return best, rivals
+        return best, alike
 
     def _shapes_freed(self, best: Explanation) -> bool:
         """Do laws with a free shape join the explanations: in the place of all effects, or of a faint one of several?
@@ -602,7 +602,7 @@ class _Search:
         least, _, smaller = min(losses, default=(np.inf, "", e))
         return smaller if least < 1.0 else None
 
-    def _rivals(self, e: Explanation, effect: Candidate) -> list[Rival]:
+    def _alternatives(self, e: Explanation, effect: Candidate) -> list[Alternative]:
         """Effects that predict nearly the same residual, refitted in place of one; they join the explanations."""
         rest = tuple(c for c in e.candidates if c is not effect)
         reduced = _restricted(e.fit, self._quantities(rest))
@@ -615,22 +615,22 @@ class _Search:
         angles = {c.name: angle(linear, signal, c.names) for c in others}
         near = sorted(others, key=lambda c: angles[c.name])
         near = [c for c in near if strength * np.sin(angles[c.name]) ** 2 < 4 * CLASS_GAIN + 0.02 * strength]
-        near = near[: MOST_RIVALS if strength < FAINT else MOST_RIVALS // 2]
+        near = near[: MOST_ALTERNATIVES if strength < FAINT else MOST_ALTERNATIVES // 2]
         found = []
         for candidate in near:
             start = _without(e.fit.values, effect, rest)
             other = self._explanation((*rest, candidate), start, (candidate,))
             loss = (other.fit.cost - e.fit.cost) / self.noise
             if other.fit.converged and loss < CLASS_GAIN:
-                found.append(Rival(candidate, angles[candidate.name], loss, other.fit))
+                found.append(Alternative(candidate, angles[candidate.name], loss, other.fit))
         return found
 
-    def _found(self, e: Explanation, candidate: Candidate, rivals: list[Rival]) -> Found:
+    def _found(self, e: Explanation, candidate: Candidate, alike: list[Alternative]) -> Found:
         rest = tuple(c for c in e.candidates if c is not candidate)
         without = self._fit(rest, _without(e.fit.values, candidate, rest), patient=True)
         held_gain = 2 * (self._held_out(e.fit).log_density - self._held_out(without).log_density) / self.noise
         gain = (without.cost - e.fit.cost) / self.noise
-        return Found(candidate, gain, held_gain, self.threshold(len(candidate.names)), tuple(rivals))
+        return Found(candidate, gain, held_gain, self.threshold(len(candidate.names)), tuple(alike))
 
     def _tried_all(self, scores: Sequence[Score], found: tuple[Found, ...]) -> tuple[Tried, ...]:
         scored = {s.candidate.name for s in scores}

@@ -176,8 +176,8 @@ def sentence(answer: BallAnswer) -> str:
     text = f"Drag is missing (not seen, for these drops, on {', '.join(null) or 'none'})"
     if answer.identifiable:
         return f"{text}; its form is that of {_words(answer.undecided[0])}."
-    rivals = " and ".join(_words(effects) for effects in answer.undecided)
-    return f"{text}, but its form is not identifiable: {rivals} describe the drops equally well."
+    alternatives = " and ".join(_words(effects) for effects in answer.undecided)
+    return f"{text}, but its form is not identifiable: {alternatives} describe the drops equally well."
 
 
 def report(answer: BallAnswer) -> Report:

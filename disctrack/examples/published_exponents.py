@@ -209,8 +209,8 @@ def left_by(system: ExponentSystem, fit: Fit) -> tuple[Misfit, ...]:
 
 def in_question(d: Diagnosis) -> dict[str, Fit]:
     """Fits to all trials of the effects that may be the one, by name."""
-    rivals = {r.candidate.name: r.fit for f in d.found for r in f.cannot_be_told_from}
-    return {f.candidate.name: d.after for f in d.found} | rivals
+    alternatives = {r.candidate.name: r.fit for f in d.found for r in f.cannot_be_told_from}
+    return {f.candidate.name: d.after for f in d.found} | alternatives
 
 
 def sentence(system: ExponentSystem, d: Diagnosis) -> str:

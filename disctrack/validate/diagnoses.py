@@ -166,15 +166,15 @@ def _standing_out(result: DiscDiagnosis, parts: Sequence[Planted]) -> dict[str, 
 
 def _pull_of(result: DiscDiagnosis, planted: Planted) -> float | None:
     """Largest pull of the planted values where the effect, or a class that holds it, is claimed; None: it is not."""
-    claims, rivals = [], []
+    claims, alternatives = [], []
     for found in result.diagnosis.found:
         if set(planted.truth) <= set(found.candidate.names):
             claims.append(_pull(result.diagnosis.after, planted.truth))
-        for rival in found.cannot_be_told_from:
-            if set(planted.truth) <= set(rival.candidate.names):
-                rivals.append(_pull(rival.fit, planted.truth))
+        for alternative in found.cannot_be_told_from:
+            if set(planted.truth) <= set(alternative.candidate.names):
+                alternatives.append(_pull(alternative.fit, planted.truth))
     # two claims may have it in their classes: it is in the place of one of them that it fits
-    return min(claims or rivals, default=None)
+    return min(claims or alternatives, default=None)
 
 
 def _pull(fit: Fit, truth: Mapping[str, float]) -> float:

@@ -85,14 +85,14 @@ def plan_json(plan: Plan | None) -> dict[str, Any] | None:
         return None
     return {
         "questions": [
-            {"effect": q.effect.name, "rival": None if q.rival is None else q.rival.name, "now": x}
+            {"effect": q.effect.name, "rival": None if q.alternative is None else q.alternative.name, "now": x}
             for q, x in zip(plan.questions, plan.now, strict=True)
         ],
         "recordings": [
             {**vars(r.proposal), "text": r.proposal.text, "lasts_s": r.duration, "answers": list(r.answers)}
             for r in plan.rows
         ],
-        "meaning": "answers: sigmas between effect and rival; without a rival the standard deviation of the size",
+        "meaning": "answers: sigmas between effect and alternative; without one the standard deviation of the size",
     }
 
 

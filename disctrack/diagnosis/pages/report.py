@@ -146,7 +146,7 @@ def planned_section(plan: Plan | None) -> Section:
     best = [plan.best(i) for i in range(len(plan.questions))]
     header, said = ["one more recording", "lasts [s]"], []
     for q, now, proposed in zip(plan.questions, plan.now, best, strict=True):
-        between, unit = f"{q.effect.name} or {q.rival.name}" if q.rival else "", q.effect.quantities[0].unit
+        between, unit = f"{q.effect.name} or {q.alternative.name}" if q.alternative else "", q.effect.quantities[0].unit
         header.append(f"{between} [sigmas]" if between else in_unit(f"σ of {q.effect.name}", unit))
         if proposed is None:
             said.append(f"For {between or f'the size of {q.effect.name}'} no recording that was tried can be made.")

@@ -73,10 +73,10 @@ def _plan(answer: TogetherDiagnosis, crew: Crew) -> Plan | None:
     open_sizes.sort(key=lambda b: -float(b.sigma[0]) / b.candidate.quantities[0].typical)
     questions = [Question(f.candidate, r.candidate) for f in diagnosis.found for r in f.cannot_be_told_from]
     questions += [Question(b.candidate) for b in open_sizes]
-    questions = [q for q in questions if {c.name for c in (q.effect, q.rival) if c is not None} <= local][:OPEN]
+    questions = [q for q in questions if {c.name for c in (q.effect, q.alternative) if c is not None} <= local][:OPEN]
     if not questions:
         return None
-    tested = [q for x in questions for c in (x.effect, x.rival) if c is not None for q in c.quantities]
+    tested = [q for x in questions for c in (x.effect, x.alternative) if c is not None for q in c.quantities]
     everything = {q.name: q for q in (*tested, *after.quantities)}
     names = {there: shared for there, shared in sharing.shared_names(longest).items() if shared in everything}
     others = [n for n in everything if n not in set(names.values())]

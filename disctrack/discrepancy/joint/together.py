@@ -172,7 +172,7 @@ def _search(
 
 
 def _without_variants(diagnosis: Diagnosis) -> Diagnosis:
-    """With one value for all, a value for each group is no rival: it contains it."""
+    """With one value for all, a value for each group is no alternative: it contains it."""
     found = [
         replace(f, cannot_be_told_from=tuple(
             r for r in f.cannot_be_told_from if r.candidate.name != f"{f.candidate.name} ({EACH})"

@@ -1,4 +1,4 @@
-"""Moments that resist the rolling of the contact: the paper's laws and their rivals."""
+"""Moments that resist the rolling of the contact: the paper's laws and their alternatives."""
 
 import numpy as np
 

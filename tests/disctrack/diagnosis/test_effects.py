@@ -102,11 +102,11 @@ def test_the_recording_proposed_to_separate_two_effects_separates_them():
     hidden = {"contour_viscous.c": 1e-5}
     first = with_plan(diagnose(measured(hidden, seed=100, n=600)))
     (found,) = first.diagnosis.found
-    rivals = [r.candidate.name for r in found.cannot_be_told_from]
-    assert "contour_viscous" in (found.candidate.name, *rivals)
+    alternatives = [r.candidate.name for r in found.cannot_be_told_from]
+    assert "contour_viscous" in (found.candidate.name, *alternatives)
     starts = [r for r in first.plan.rows if r.proposal == Proposal(*astuple(r.proposal)[:3])]  # of the same disc
-    best = max(starts, key=lambda r: max(r.answers[: len(rivals)]))
-    assert max(best.answers[: len(rivals)]) > 5
+    best = max(starts, key=lambda r: max(r.answers[: len(alternatives)]))
+    assert max(best.answers[: len(alternatives)]) > 5
     plan = best.proposal
     second = measured(hidden, seed=101, n=900, theta_deg=plan.theta_deg, omega3=plan.omega3, nutation_deg=0.4)
     again = diagnose(second)

@@ -141,7 +141,7 @@ def test_a_law_is_looked_for_along_the_motion_that_follows_the_data():
     assert scan.chi_square - near.gain < 1.1 * n < 1.5 * n < far.chi_square - wrong.gain
     assert near.values[0] == pytest.approx(40.0, abs=1.0)
     assert wrong.values[0] > 60.0  # linear in the law, but along a motion that is no longer its own
-    law = learn(system, base, 1.0, along, rival=along.cost)
+    law = learn(system, base, 1.0, along, against=along.cost)
     assert law is not None
     assert [f.title for f in law.families] == [f.title for f in square]
     fitted = with_law(system.knowing(law), base, law)

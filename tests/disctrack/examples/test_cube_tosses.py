@@ -65,8 +65,8 @@ def test_gravity_and_frame_rate_are_one_number_where_cubes_at_rest_deny_the_scal
     system = CubeTosses(simulated(rng, tmp_path, gravity=9.7))
     found = diagnosed(system)
     (effect,) = found.found
-    rivals = {r.candidate.name for r in effect.cannot_be_told_from}
-    assert {effect.candidate.name} | rivals == {"gravity", "frame_rate"}
+    alternatives = {r.candidate.name for r in effect.cannot_be_told_from}
+    assert {effect.candidate.name} | alternatives == {"gravity", "frame_rate"}
 
 
 def test_flights_end_before_contact_and_begin_after_release(published):

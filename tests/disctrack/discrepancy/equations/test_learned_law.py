@@ -1,5 +1,5 @@
-"""A force that no term names, learned as a function of one variable: its course, its rivals, and that it is not claimed
-where known terms do. Motions come from SciPy's `solve_ivp`."""
+"""A force that no term names, learned as a function of one variable: its course, its alternatives, and that it is
+not claimed where known terms do. Motions come from SciPy's `solve_ivp`."""
 
 import json
 

@@ -218,7 +218,7 @@ def test_a_surface_and_a_power_of_the_mass_are_told_together_and_from_each_alone
             assert {"constant (glass)", "constant (steel)"} <= best.numbers.keys()
 
 
-def test_covariates_that_go_together_are_told_as_rivals_and_values_without_a_rule_as_such(rng):
+def test_covariates_that_go_together_are_told_as_alternatives_and_values_without_a_rule_as_such(rng):
     """Discs of one plate: the mass goes with the square of the radius."""
     radius = np.array([0.7, 0.9, 1.0, 1.3])
     covariates = {"mass": (radius**2).tolist(), "radius": radius.tolist()}
