@@ -11,7 +11,6 @@ from disctrack.diagnosis.missing_force import Course
 from disctrack.diagnosis.plan import Plan
 from disctrack.diagnosis.systematic import Systematic
 from disctrack.discrepancy.fit import Fit
-from disctrack.discrepancy.held_out import HeldOut
 from disctrack.discrepancy.laws import LearnedLaw
 from disctrack.discrepancy.search import Diagnosis
 from disctrack.discrepancy.words import effect_text
@@ -23,8 +22,6 @@ class Learned:
     """A law outside the catalogue, fitted like an effect."""
 
     law: LearnedLaw
-    fit: Fit
-    held_out: HeldOut
     gain: float  # decrease of chi-square in units of the noise found
     held_out_gain: float
     power: float  # mean over the recording [W]; negative where it takes energy from the disc
@@ -36,13 +33,10 @@ class Learned:
         """Is it no force?"""
         return all(component.startswith("M") for component in self.law.formulas)
 
-    @property
-    def text(self) -> str:
+    def text(self, fit: Fit) -> str:
         """The law with its numbers."""
         quantities = self.law.candidate.quantities
-        numbers = ", ".join(
-            f"{q.part} = {Measured(self.fit.values[q.name], self.fit.sigma(q.name))}" for q in quantities
-        )
+        numbers = ", ".join(f"{q.part} = {Measured(fit.values[q.name], fit.sigma(q.name))}" for q in quantities)
         formulas = "; ".join(f"{component} = {formula}" for component, formula in self.law.formulas.items())
         angles = ", locked to the disc's angles" if locked(self.law) else ""
         return f"{self.law.title}: {formulas} with {numbers} (SI){angles}"
@@ -67,23 +61,14 @@ class DiscDiagnosis(Brief):
     def facts(self) -> dict[str, str]:
         """What a glance should tell (`Brief`)."""
         told = {"verdict": self.diagnosis.verdict, "says": self.sentence}
-        chi = [fit.reduced_chi_square for fit in (self.diagnosis.before, self.after_fit)]
+        d = self.diagnosis
+        chi = [fit.reduced_chi_square for fit in (d.before, d.after)]
         return told | {"reduced chi-square": f"{chi[0]:.4g} before, {chi[1]:.4g} after"}
 
     @property
     def has_more(self) -> bool:
         """Is the model after larger than that before?"""
         return bool(self.diagnosis.found) or self.learned is not None
-
-    @property
-    def after_fit(self) -> Fit:
-        """Fit of the enlarged model."""
-        return self.learned.fit if self.learned else self.diagnosis.after
-
-    @property
-    def after_held_out(self) -> HeldOut | None:
-        """Its free run."""
-        return self.learned.held_out if self.learned else self.diagnosis.held_out_after
 
     @property
     def sentence(self) -> str:
@@ -99,7 +84,8 @@ class DiscDiagnosis(Brief):
             return f"No answer: {diagnosis.reason}."
         if self.learned is not None:
             first = f"Missing in the model: {effects}. " if effects else ""
-            return f"{first}A law is missing that the catalogue does not name; described by {self.learned.text}."
+            law = self.learned.text(diagnosis.after)
+            return f"{first}A law is missing that the catalogue does not name; described by {law}."
         if diagnosis.verdict == "nothing missing":
             return f"Nothing is missing{' in the motion' if self.remarks else ''}."
         if diagnosis.verdict == "found":

@@ -45,12 +45,12 @@ def evidence(result: DiscDiagnosis) -> Evidence:
     # a fit that fails by whole turns has no linear response to ask for
     if before.converged and not any(f.candidate.name == "slip_start" for f in result.diagnosis.found):
         blocks = probe(system, before)
-        added = probe(system, before, result.after_fit.values) if result.has_more else None
+        added = probe(system, before, result.diagnosis.after.values) if result.has_more else None
         if blocks is not None:
             moment, scale = missing_moment(blocks)
             of_law = None if added is None else missing_moment(added, scale)[0]
     if (learned := result.learned) is not None and learned.is_moment:
-        values, own = learned.fit.values, {learned.law.candidate.effect}
+        values, own = result.diagnosis.after.values, {learned.law.candidate.effect}
         whole = moment_about_contact(system, values, simulated(system, values), own)
         of_law = Course(system.time, whole, np.zeros_like(whole))
     energy = energy_balance(system, before.values) if before.converged else {}
@@ -96,7 +96,7 @@ def _ahead(result: DiscDiagnosis) -> tuple[tuple[Ahead, Ahead], ...]:
         rows, runs = np.asarray(system.time <= last - horizon - HALF_WINDOW, bool), list[Ahead]()
         for fit, held in (
             (result.diagnosis.before, result.diagnosis.held_out_before),
-            (result.after_fit, result.after_held_out),
+            (result.diagnosis.after, result.diagnosis.held_out_after),
         ):
             run = None if held is None else free_run(system, held, horizon)
             if run is None and rows.sum() >= MIN_FRAMES:

@@ -72,20 +72,19 @@ def diagnose(trajectory: Trajectory, model: str = PAPER, settings: Settings | No
     left = left_over(system, diagnosis.after, diagnosis.noise)
     diagnosis = judged_by_what_is_left(diagnosis, left)
     found, diagnosis = _beyond_the_catalogue(system, diagnosis, left)
-    holds, learned, held, notes = {}, None, diagnosis.held_out_after, (*notes, *diagnosis.remarks)
+    holds, learned, notes = {}, None, (*notes, *diagnosis.remarks)
     if diagnosis.verdict == "unexplained":
         holds = regimes(system, judged_as(diagnosis, system), diagnosis.before, diagnosis.noise)
         notes = (*notes, where_it_holds(holds), "" if found else what_is_missing(system, diagnosis.after))
     if found is not None:
         system, learned, diagnosis, doubted = _with_law(system, diagnosis, found)
-        left, notes, held = left_over(system, learned.fit, diagnosis.noise), (*notes, *doubted), learned.held_out
+        left, notes = left_over(system, diagnosis.after, diagnosis.noise), (*notes, *doubted)
     else:
         diagnosis = replace(diagnosis, after=with_memory(judged_as(diagnosis, system), diagnosis.after))
     diagnosis = answer.with_slip(diagnosis)
-    fit_ = learned.fit if learned else diagnosis.after
     before = errors(system, diagnosis.before, diagnosis.held_out_before)
-    after = errors(system, fit_, held)
-    energy, said = energy_balance(system, fit_.values), tuple(note for note in notes if note)
+    after = errors(system, diagnosis.after, diagnosis.held_out_after)
+    energy, said = energy_balance(system, diagnosis.after.values), tuple(note for note in notes if note)
     return DiscDiagnosis(system, diagnosis, declared.name, before, after, energy, learned, said, holds, left)
 
 
@@ -148,27 +147,25 @@ def _with_law(
     held_gain = 2 * (held.log_density - diagnosis.held_out_before.log_density) / noise
     work = energy_balance(known, fitted.values)[f"by {law.candidate.name}"]
     power = -work / float(known.time[-1] - known.time[0])
-    reason = f"{diagnosis.reason}; the law {law.candidate.title} leaves {fitted.reduced_chi_square:.3g}"
-    diagnosis = replace(
-        diagnosis, verdict="unexplained", found=kept, after=fitted if kept else diagnosis.after, reason=reason
-    )
     left = left_over(known, fitted, noise)
     as_found = known, with_memory(judged, fitted), law, noise, left is not None and not left.white
-    fit_, of_another, course, misfit = with_form(*as_found, _of_motion(kept))
-    diagnosis, doubted = _beside_any_form(diagnosis, kept, of_another, law.looked)
-    if _of_motion(diagnosis.found):  # what holds beside any law does not stand in with this one
-        fit_, _, course, misfit = with_form(*as_found, _of_motion(f for f in kept if f not in diagnosis.found))
+    after, of_another, course, misfit = with_form(*as_found, _of_motion(kept))
+    established, doubted = _beside_any_form(kept, of_another, law.looked)
+    if _of_motion(established):  # what holds beside any law does not stand in with this one
+        after, _, course, misfit = with_form(*as_found, _of_motion(f for f in kept if f not in established))
     gain = (diagnosis.before.cost - fitted.cost) / noise
-    learned = Learned(law, fit_, held, gain, float(held_gain), power, course, misfit)
+    learned = Learned(law, gain, float(held_gain), power, course, misfit)
+    reason = f"{diagnosis.reason}; the law {law.candidate.title} leaves {fitted.reduced_chi_square:.3g}"
+    diagnosis = replace(
+        diagnosis, verdict="unexplained", found=established, after=after, held_out_after=held, reason=reason
+    )
     return known, learned, diagnosis, doubted
 
 
-def _beside_any_form(
-    diagnosis: Diagnosis, kept: Sequence[Found], fitted: Fit, looked: float
-) -> tuple[Diagnosis, tuple[str, ...]]:
-    """Without effects beside a law that stand out no longer once the law's form may be another; and a note of each.
+def _beside_any_form(kept: Sequence[Found], fitted: Fit, looked: float) -> tuple[tuple[Found, ...], tuple[str, ...]]:
+    """Effects beside a law that stand out although the law's form may be another; and a note of each of the others.
 
-    They stay in the fit: with the law they describe the data.
+    These stay in the fit: with the law they describe the data.
     kept : effects beside the law.   fitted : with sigmas as they are if the law's form is another's: a library seldom
     holds the law that no catalogue names.   looked : chi-square that a law pays for having been looked for; so does an
     effect whose place or frequency was
@@ -188,7 +185,7 @@ def _beside_any_form(
             f"{candidate.title} [{candidate.name}] helps the law to describe the data, and is not claimed: with what "
             f"the law's form may be off by it stands out by {np.sqrt(gain):.2g} sigma"
         )
-    return replace(diagnosis, found=tuple(established)), tuple(notes)
+    return tuple(established), tuple(notes)
 
 
 def _of_motion(found: Iterable[Found]) -> set[str]:
@@ -236,7 +233,7 @@ def run_diagnose(
     document = {"recording": recorded.name, **as_json(result, beside)}
     write_diagnosis(path, result, beside, document)
     write_whole(report, json_file(document))
-    write_whole(toml, model_toml(result.system, result.after_fit.values, recorded.name).encode())
+    write_whole(toml, model_toml(result.system, result.diagnosis.after.values, recorded.name).encode())
     whole = report_of(
         result, beside, recorded.name, all_figures(result, beside), doubts(recorded.trajectory.findings),
         files=(page, report, toml, path),

@@ -100,7 +100,7 @@ def row_of(name, effect, trajectory, findings, R, t):
     began = time.process_time()
     result = diagnose(with_declared_dots(trajectory, findings))
     seconds = time.process_time() - began
-    claims, faults, fit = {}, [], result.after_fit
+    claims, faults, fit = {}, [], result.diagnosis.after
     if result.learned is not None:
         claims[f"{result.learned.law.candidate.name}.law"] = (np.nan, np.nan)
     for found in result.diagnosis.found:

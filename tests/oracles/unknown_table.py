@@ -24,7 +24,7 @@ from tests.oracles.unknown_laws import UNKNOWN, Recording, recording
 
 def fitted_moment(result) -> tuple[np.ndarray, np.ndarray]:
     """(times [s], moment (n, 3) about the contact) that the fitted motion needs, whatever supplies it."""
-    motion = simulated(result.system, result.after_fit.values)
+    motion = simulated(result.system, result.diagnosis.after.values)
     rates = motion.acceleration_world, motion.angular_acceleration_world
     _, moment = required_wrench(Model(result.system.disc), motion.q, motion.qdot, *rates)
     return motion.time, moment
@@ -36,7 +36,7 @@ def trial(name: str, seed: int) -> dict:
     began = time.process_time()
     result = diagnose(made.trajectory)
     seconds = time.process_time() - began
-    left = left_over(result.system, result.after_fit, result.diagnosis.noise) if result.after else None
+    left = left_over(result.system, result.diagnosis.after, result.diagnosis.noise) if result.after else None
     said = result.sentence
     as_noise = ("Residuals: noise" in said or "Nothing is missing" in said) and "not noise" not in said
     answer = {

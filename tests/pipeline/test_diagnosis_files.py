@@ -70,7 +70,7 @@ def test_what_was_found_supplies_the_missing_force(diagnosed):
     """Two routes: accelerations of the poses without a model, and the force of the enlarged model."""
     result = diagnose(read_trajectory(diagnosed[0]))
     beside = evidence(result)
-    added = force_of(result.system, result.after_fit) - force_of(result.system, result.diagnosis.before)
+    added = force_of(result.system, result.diagnosis.after) - force_of(result.system, result.diagnosis.before)
     missing, sigma = beside.force.values, beside.force.sigma
     inner = slice(30, -30)
     pull = (missing - added)[inner] / sigma[inner]

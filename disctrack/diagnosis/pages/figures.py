@@ -45,7 +45,7 @@ Side = tuple[Fit, HeldOut | None, str, str]  # the fit of a model, its free run,
 
 def _sides(result: DiscDiagnosis) -> list[Side]:
     """The models that are shown: before and after, or the only one where nothing was added to it."""
-    after = result.after_fit, result.after_held_out
+    after = result.diagnosis.after, result.diagnosis.held_out_after
     if not result.has_more:
         return [(*after, "model", BLUE)]
     before = result.diagnosis.before, result.diagnosis.held_out_before
@@ -199,7 +199,7 @@ def _missing(result: DiscDiagnosis, beside: Evidence) -> list[Drawn]:
     if beside.force is not None:
         added = None
         if result.has_more:
-            more = force_of(result.system, result.after_fit) - force_of(result.system, result.diagnosis.before)
+            more = force_of(result.system, result.diagnosis.after) - force_of(result.system, result.diagnosis.before)
             added = Course(beside.force.time, more, np.zeros_like(more))
         figure = _along_the_contact(beside.force, added, "missing", 1e3, "mN")
         found.append(Drawn("missing_force", "The missing force", MISSING_FORCE, figure))
@@ -222,7 +222,7 @@ def spectrum(result: DiscDiagnosis) -> Drawn:
             # white noise of variance 1 has the same power at every frequency: 2 / rate
             axes.semilogy(frequency[1:], (power[1:] * rate / 2).mean(axis=1), lw=0.9, color=colour, label=name)
     axes.axhline(1.0, color=MUTED, lw=1, label="noise")
-    lines = {name: f for name, f in frequencies(system, result.after_fit.values).items() if f < rate / 2}
+    lines = {name: f for name, f in frequencies(system, result.diagnosis.after.values).items() if f < rate / 2}
     top = min(rate / 2, 6 * max([4.0, *lines.values()]))
     style: dict[str, Any] = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points", "rotation": 90}
     style |= {"bbox": {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 0.5}}

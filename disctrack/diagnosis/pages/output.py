@@ -14,6 +14,7 @@ from disctrack.diagnosis.evidence import Evidence
 from disctrack.diagnosis.law_library import locked
 from disctrack.diagnosis.plan import Plan
 from disctrack.discrepancy.document import declared_json, document, effect_json
+from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.search import Found
 from disctrack.files.json_text import json_text, plain
 from disctrack.files.labelled_arrays import Variable
@@ -43,12 +44,12 @@ def _errors(errors: Errors | None, ahead: list[Ahead]) -> dict[str, Any]:
     }
 
 
-def _learned(learned: Learned) -> dict[str, Any]:
+def _learned(learned: Learned, fit: Fit) -> dict[str, Any]:
     law, course = learned.law, {}
     if (known := learned.course) is not None:
         course = {"time_s": known.time, "N_m": known.values, "sigma_N_m": known.sigma, "misfit_of_form": learned.misfit}
     as_found = Found(law.candidate, learned.gain, learned.held_out_gain, float("nan"), ())
-    return effect_json(as_found, learned.fit) | {
+    return effect_json(as_found, fit) | {
         "kind": "learned",
         "formulas": law.formulas,
         "meaning": law.title,
@@ -64,9 +65,9 @@ def as_json(result: DiscDiagnosis, beside: Evidence | None = None) -> dict[str, 
     d, frame, rows = result.diagnosis, result.system.trajectory.frame, result.system.rows
     ahead = ([run[side] for run in beside.ahead] if beside else [] for side in range(2))
     before, after = (_errors(e, runs) for e, runs in zip((result.before, result.after), ahead, strict=True))
-    before["parameters"], after["parameters"] = declared_json(d.before), declared_json(result.after_fit)
+    before["parameters"], after["parameters"] = declared_json(d.before), declared_json(d.after)
     found = document(d, result.model, result.sentence, before, after)
-    found["effects"] += [_learned(result.learned)] if result.learned else []
+    found["effects"] += [_learned(result.learned, d.after)] if result.learned else []
     found |= {
         "notes": list(result.notes),
         "frames": [int(frame[rows.start]), int(frame[rows.stop - 1])],
@@ -101,7 +102,7 @@ def write_diagnosis(path: Path, result: DiscDiagnosis, beside: Evidence | None, 
     system, n = result.system, len(result.system.trajectory)
     variables, axes = dict[str, Variable](), {"coordinate": _axis("coordinate", COORDINATES, "coordinate")}
     axes["contact_axis"] = _axis("contact_axis", ("n0", "m0", "k"), "axis of the contact frame")
-    for name, fit in (("before", result.diagnosis.before), ("after", result.after_fit)):
+    for name, fit in (("before", result.diagnosis.before), ("after", result.diagnosis.after)):
         residual, predicted = np.full((2, n, 6), np.nan)
         if result.before is not None:
             whitened = system.pose_residual(fit.values)

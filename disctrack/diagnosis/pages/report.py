@@ -51,7 +51,7 @@ def report_of(
     effects = [f"{effect_text(f, d)}. {significance_text(f)}." for f in d.found]
     if (learned := result.learned) is not None:
         power, gain = Measured(learned.power, unit="W"), score(learned.gain)
-        effects.append(f"{learned.text}; mean power {power}; chi-square falls by {gain}.")
+        effects.append(f"{learned.text(d.after)}; mean power {power}; chi-square falls by {gain}.")
     if d.chance is not None:
         effects.append(
             f"Probability that noise alone produces this improvement: p {probability(d.chance.p_value)} "
@@ -117,7 +117,7 @@ def _line(errors: Errors) -> str:
 
 def _laws(result: DiscDiagnosis) -> list[Row]:
     """Parameters that the model had already, before and after (1 sigma)."""
-    first, last = result.diagnosis.before, result.after_fit
+    first, last = result.diagnosis.before, result.diagnosis.after
     rows: list[Row] = []
     for q in first.quantities:
         if q.name in result.system.model.values:

@@ -36,7 +36,6 @@ if TYPE_CHECKING:
     from disctrack.report.figures import Drawn
 
 OUTLIER, FEW = 8.0, 0.02  # standard deviations that no noise reaches; share of the samples, above which it is the noise
-HALF_WITHIN = 0.6745  # standard deviations, within which half of normal noise lies
 FEWEST_RUNS = 4  # that are compared with each other
 ODD, MOST_ODD = 2.0, 0.3  # rms over the median of all runs; share of them, above which none is odd
 FAR_OFF = 10.0  # sigmas or times, by which a number has left what was declared of it
@@ -194,7 +193,7 @@ class Answer:
         predicted = self.predicted(self.diagnosis.after)
         for c, channel in enumerate(self.system.formulas.channels):
             left = [np.abs(s.data[:, c] - seen[:, c]) for s, seen in predicted]
-            limit = OUTLIER * float(np.nanmedian(np.concatenate(left))) / HALF_WITHIN
+            limit = OUTLIER * float(np.nanmedian(np.concatenate(left)) / stats.norm.ppf(0.75))
             off = [(s.run, float(t)) for (s, _), r in zip(predicted, left, strict=True) for t in s.time[r > limit]]
             if limit > 0 and 0 < len(off) < FEW * sum(np.isfinite(r).sum() for r in left):
                 some = ", ".join(f"{run} at {t:.4g} s" for run, t in off[:4]) + (", ..." if len(off) > 4 else "")

@@ -19,7 +19,7 @@ from disctrack.errors import AnalysisError
 OWN = "own_"  # before the name of a term's parameter, in its formulas: not the equations' of that name
 
 
-T = sympy.Symbol("t", real=True)
+_t = sympy.Symbol("t", real=True)
 
 
 class Formulas:
@@ -38,7 +38,7 @@ class Formulas:
         self.input_rates = tuple(input_rates.values())
         # by name of the quantity
         self.fitted = {name: (own[name], _parameter(p)) for name, p in equations.parameters.items()}
-        still = {"t": T, **input_rates, **self.constants, **own}
+        still = {"t": _t, **input_rates, **self.constants, **own}
         self._numbers = {**self.constants, **own}  # of what does not move
         self._still, self._words = still, {**still, **states, **inputs}
         # as declared: without terms, and not yet divided by the masses
@@ -147,7 +147,7 @@ class Formulas:
         for i, e in enumerate(formulas):
             targets += [(f"{by_number}[{i}, {j}]", self._by_number(e, s)) for j, s in enumerate(fitted)]
         arrays = [("y_", self.states), ("p_", self.numbers), ("u_", self.inputs), ("u_rates_", self.input_rates)]
-        source = source_of(name, [T, *arrays], targets, out)
+        source = source_of(name, [_t, *arrays], targets, out)
         return _compiled_source(source, name)
 
     def _by_number(self, formula: sympy.Expr, number: sympy.Symbol) -> sympy.Expr:
@@ -178,7 +178,7 @@ class Formulas:
         """(t (m,), p) -> true minus written instant (w, m) and its derivatives (w, n_fitted, m); NumPy."""
         fitted = [s for s, _ in self.fitted.values()]
         flat = [*self.late, *(e.diff(s) for e in self.late for s in fitted)]
-        function = sympy.lambdify((T, self.numbers), flat, "numpy")
+        function = sympy.lambdify((_t, self.numbers), flat, "numpy")
 
         def evaluate(time: Array, p: Array) -> tuple[Array, Array]:
             values = np.array([np.broadcast_to(v, time.shape) for v in function(time, p)], float)
@@ -198,7 +198,7 @@ class Formulas:
         return self._along_motion(list(self.along.values()))
 
     def _along_motion(self, expressions: Sequence[sympy.Expr]) -> Any:
-        return sympy.lambdify((T, self.states, self.numbers, self.inputs), expressions, "numpy")
+        return sympy.lambdify((_t, self.states, self.numbers, self.inputs), expressions, "numpy")
 
     def defaults(self) -> dict[str, float]:
         """Declared values of all numbers; the widths of jumps are 1 until they are known."""

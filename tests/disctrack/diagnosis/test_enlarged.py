@@ -98,7 +98,7 @@ def test_against_the_model_it_was_given_nothing_is_missing(faults, name, tmp_pat
     first = diagnose(measured(faults=faults, seed=62, n=150))
     (found,) = first.diagnosis.found
     assert name in {found.candidate.name, *(r.candidate.name for r in found.cannot_be_told_from)}
-    path = saved(first.system, first.after_fit.values, tmp_path)
+    path = saved(first.system, first.diagnosis.after.values, tmp_path)
     scene = load_scene(path)
     model, start = rolling_model(scene), rolling_start(scene)
     again = measured(
@@ -115,7 +115,7 @@ def test_slip_at_the_start_is_part_of_the_saved_model(tmp_path):
 
     trajectory = measured(motion=sliding(0.2, (0.08, 0.04)), seed=64, n=120)
     first = diagnose(trajectory)
-    path = saved(first.system, first.after_fit.values, tmp_path)
+    path = saved(first.system, first.diagnosis.after.values, tmp_path)
     scene = load_scene(path)
     motion = simulate(rolling_model(scene), rolling_start(scene), 0.1)
     # noise 0.5 um a frame, some um from the rig

@@ -160,7 +160,7 @@ def test_a_law_that_a_found_effect_describes_alone_is_that_effect():
     assert any("table_tilt" in names for names in alike)
     assert any({"frame_rate", "gravity"} <= names for names in alike)  # all laws at hand are quadratic in the rates
     assert result.after.reduced_chi_square < 1.05
-    fit_ = result.after_fit
+    fit_ = result.diagnosis.after
     assert abs(fit_.values["table_tilt.tilt_x"] - 2e-3) < 3 * fit_.sigma("table_tilt.tilt_x")
 
 

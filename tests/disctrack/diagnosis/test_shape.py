@@ -42,7 +42,7 @@ def test_a_law_beyond_the_declared_one_is_found_by_its_exponent():
     result = diagnose(measured(hidden, seed=71, n=400, theta_deg=8.0))
     (found,) = result.diagnosis.found
     assert found.candidate.name == "rolling_power"
-    fit_ = result.after_fit
+    fit_ = result.diagnosis.after
     assert abs(fit_.values["rolling_power.p"] - 2.8) < 4 * fit_.sigma("rolling_power.p")
     assert result.after.reduced_chi_square < 1.1
     assert "p = " in result.sentence
@@ -54,7 +54,7 @@ def test_the_pivoting_rate_at_which_creep_begins_is_measured():
     result = diagnose(measured(hidden, seed=74, n=400))
     (found,) = result.diagnosis.found
     assert found.candidate.name == "pivoting_contensou"
-    fit_ = result.after_fit
+    fit_ = result.diagnosis.after
     assert abs(fit_.values["pivoting_contensou.omega_s"] - 4.0) < 4 * fit_.sigma("pivoting_contensou.omega_s")
     assert "pivoting_contensou.a" not in fit_.names  # without slip its radius does nothing
 

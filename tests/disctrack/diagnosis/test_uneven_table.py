@@ -66,7 +66,7 @@ def test_a_groove_is_no_tilted_table():
     assert result.learned.law.title == "a ridge or groove of the table"
     assert not result.diagnosis.found
     assert result.after.reduced_chi_square < 1.0
-    values, fit = result.learned.fit.values, result.learned.fit
+    values, fit = result.diagnosis.after.values, result.diagnosis.after
     for name, true in (("c_0", -6e-8), ("direction_0", 0.6), ("edge_0", 0.05)):
         assert abs(values[f"learned.{name}"] - true) < 4 * fit.sigma(f"learned.{name}")
     assert any("table_tilt" in note for note in result.notes)

@@ -39,7 +39,7 @@ def test_a_table_that_vibrates_is_found_with_its_frequency_and_its_forces():
     result = diagnose(recording(Unknown(law, 14.0, 1.0, 0.9)).trajectory)
     assert result.diagnosis.verdict == "unexplained"
     assert result.learned is not None
-    fit = result.learned.fit
+    fit = result.diagnosis.after
     value = lambda name: (fit.values[f"learned.{name}"], fit.sigma(f"learned.{name}"))  # noqa: E731
     rate, sigma = value("rate_0")
     assert abs(rate - 2 * np.pi * 60) < 3 * sigma
@@ -59,7 +59,7 @@ def test_a_law_below_a_nutation_is_told_with_the_nutation():
     assert 2.2 < result.holds["first"]["theta_deg"] < 2.8
     assert any("holds until" in note for note in result.notes)
     assert result.learned is not None
-    edges = [v for k, v in result.learned.fit.values.items() if ".edge_" in k]
+    edges = [v for k, v in result.diagnosis.after.values.items() if ".edge_" in k]
     # the gate opens over 5 % of the nutation: half of that
     assert min(abs(np.degrees(np.arcsin(edge)) - 2.5) for edge in edges) < 0.06
 
@@ -74,7 +74,7 @@ def test_a_dent_that_hits_once_a_turn_is_found_with_its_place_and_its_blow():
 
     result = diagnose(recording(Unknown(law, 14.0, 1.0, 0.9)).trajectory)
     assert result.learned is not None
-    fit = result.learned.fit
+    fit = result.diagnosis.after
     assert result.after.reduced_chi_square < 1.05
     assert abs(fit.values["learned.angle_0"] - 1.0) < 3 * fit.sigma("learned.angle_0")
     assert abs(-fit.values["learned.c_0"] - 3e-4 * 0.15) < 3 * fit.sigma("learned.c_0") + 0.01 * 4.5e-5
@@ -89,7 +89,7 @@ def test_a_force_that_grows_with_time_is_found_with_its_size_and_its_direction()
 
     result = diagnose(recording(Unknown(law)).trajectory)
     assert result.learned is not None
-    fit = result.learned.fit
+    fit = result.diagnosis.after
     assert result.after.reduced_chi_square < 1.05
     half = 0.5 * (result.system.time[-1] - result.system.time[0])
     for i, true in enumerate(half * growing[:2]):  # the middle's force has the numbers c_0_0 and c_0_1
@@ -113,7 +113,7 @@ def test_a_law_takes_the_place_of_those_that_stand_in_for_it_and_of_no_other():
     for result in (alone, beside):
         assert result.learned is not None
         assert result.learned.law.title == "a force towards a point that grows as the distance squared"
-        fitted = result.learned.fit
+        fitted = result.diagnosis.after
         (strength,) = result.learned.law.candidate.names
         assert abs(fitted.values[strength] - 40.0) < 3 * fitted.sigma(strength) < 0.2
     assert abs(fitted.values["kz.k_z"] - 6e-5) < 3 * fitted.sigma("kz.k_z") < 2e-6

@@ -108,7 +108,7 @@ def test_hollow_that_was_taken_for_a_slope_is_found_alone():
     levelled = replace(trajectory, q=q, quaternion=quaternion_from_rotation(fits.R_world_body), rig=rig)
     result = diagnose(replace(levelled, table_moved=table.beyond))
     assert [found.candidate.name for found in result.diagnosis.found] == ["table_curved"]
-    values, fit = result.after_fit.values, result.after_fit
+    values, fit = result.diagnosis.after.values, result.diagnosis.after
     assert abs(values["table_curved.kappa"] - 0.25) < 3 * fit.sigma("table_curved.kappa")
     # as if the sigmas of board and disc held for the hollow, too
     assert [f.candidate.name for f in diagnose(levelled).diagnosis.found] != ["table_curved"]
