@@ -78,29 +78,9 @@ def _drive(p, columns, n, knots, pieces):
 
 
 @part
-def first_after(t, knots):
-    """Index of the first knot beyond t: what numpy.searchsorted finds, that compiles for half a second."""
-    low, high = 0, len(knots)
-    while low < high:
-        middle = (low + high) // 2
-        if knots[middle] <= t:
-            low = middle + 1
-        else:
-            high = middle
-    return low
-
-
-@part
-def _assign(target, values):
-    """As target[:] = values, for which numba compiles the text of an error besides."""
-    for i in range(len(target)):
-        target[i] = values[i]
-
-
-@part
 def piece_at(t, knots):
     """Index of the inputs' piece that holds at t and just after it; beyond the ends the last piece goes on."""
-    return min(max(first_after(t, knots) - 1, 0), len(knots) - 2)
+    return min(max(np.searchsorted(knots, t, side="right") - 1, 0), len(knots) - 2)
 
 
 @part
@@ -351,7 +331,7 @@ def integrate(rhs, z, p, columns, span, n, knots, pieces, size, tolerance, max_s
         last = remaining <= h * (1.0 + 1e-9)
         step = remaining if last else h
         # inputs are smooth between their knots only: a step across one would be rejected more often than not
-        i = first_after(t + 1e-12 * max(abs(t), 1.0), knots)
+        i = np.searchsorted(knots, t + 1e-12 * max(abs(t), 1.0), side="right")
         arrival = t + step
         if i < len(knots) and arrival > knots[i]:
             arrival = knots[i]  # to the bit: on the other side of it the inputs are others
@@ -374,7 +354,7 @@ def integrate(rhs, z, p, columns, span, n, knots, pieces, size, tolerance, max_s
         while filled < m and (samples[filled] <= t + step or last):
             x = (samples[filled] - t) / step
             if abs(x - 1.0) <= 1e-12:  # as at every one with an input's knot
-                _assign(out[filled], new)
+                out[filled] = new
             elif stiff:
                 _along_stages(W, z, x, out[filled])
             else:
@@ -393,7 +373,7 @@ def integrate(rhs, z, p, columns, span, n, knots, pieces, size, tolerance, max_s
             for c in range(len(columns)):
                 largest[c] = max(largest[c], abs(new[n * (c + 1) + i]) / (size[i] + 1e-300))
         t, first = arrival, False
-        _assign(z, new)
+        z[:] = new
         before, piece = piece, piece_at(t, knots)
         grow = 5.0 if worst == 0.0 else min(5.0, max(0.2, 0.9 * worst**power))
         if rejected:
@@ -416,7 +396,7 @@ def integrate(rhs, z, p, columns, span, n, knots, pieces, size, tolerance, max_s
             if stiff or piece != before:
                 _slope(rhs, t, piece, z, drive, K[0])
             else:
-                _assign(K[0], K[12])
+                K[0] = K[12]
             if stiff:
                 h, at_limit, calm = step, 0, 0
         if last:
