@@ -19,7 +19,7 @@ from disctrack.diagnosis.stretch import MIN_FRAMES, MIN_THETA, Stretch
 from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.joint.reduction import Reduction
 from disctrack.discrepancy.joint.sharing import LAWS
-from disctrack.discrepancy.score import INVISIBLE, Linearisation, cleared, score, span
+from disctrack.discrepancy.score import Linearisation, cleared, score, sigmas, span
 from disctrack.discrepancy.search import Diagnosis
 from disctrack.discrepancy.system import Candidate, Quantity, Values
 from disctrack.errors import AnalysisError, DiscTrackError
@@ -128,8 +128,8 @@ class Planner:
         laws = [q for q in self._shared if not q.name.startswith("rig.")]
         # directions of the rig in common, laws and dots, what is tested
         names = [f"rig.common_{j}" for j in range(n_rig)] + [q.name for q in (*laws, *self.tested)]
-        sigmas = [1.0] * n_rig + [q.prior_sigma for q in laws] + [np.inf] * len(self.tested)
-        self._priors = np.diag(1.0 / np.array(sigmas))
+        spread = [1.0] * n_rig + [q.prior_sigma for q in laws] + [np.inf] * len(self.tested)
+        self._priors = np.diag(1.0 / np.array(spread))
         self.column = {name: j for j, name in enumerate(names)}
         self._base = [j for j, name in enumerate(names) if name not in new]
         if said is None:
@@ -164,10 +164,7 @@ class Planner:
     def sigma(self, rows: Array, candidate: Candidate) -> float:
         """Standard deviation of its first number; infinite where nothing is seen of it."""
         matrix = np.concatenate([rows, self._priors])
-        mine, *rest = self._columns(candidate)
-        column = matrix[:, mine]
-        left = float(np.linalg.norm(cleared(column, span(matrix[:, [*self._base, *rest]]))))
-        return 1.0 / left if left > INVISIBLE * float(np.linalg.norm(column)) else float("inf")
+        return float(sigmas(matrix[:, self._columns(candidate)], span(matrix[:, self._base]))[0])
 
     def _columns(self, candidate: Candidate) -> list[int]:
         return [self.column[n] for n in candidate.names]

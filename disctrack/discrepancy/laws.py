@@ -16,8 +16,7 @@ import numpy as np
 
 from calibration.kit.arrays import Array
 from disctrack.discrepancy.fit import Fit, fit
-from disctrack.discrepancy.noise import inflation
-from disctrack.discrepancy.search import CLASS_GAIN, Diagnosis, Found, length
+from disctrack.discrepancy.search import CLASS_GAIN, Diagnosis, Found, enough_beside_memory, length
 from disctrack.discrepancy.shape import profiled
 from disctrack.discrepancy.significance import as_sigmas, price_of_a_number, wald
 from disctrack.discrepancy.system import Candidate, Quantity, System, Values
@@ -439,9 +438,7 @@ def _law_beside(system: LawSystem, diagnosis: Diagnosis, kept: tuple[Found, ...]
     judged, again = judged_as(diagnosis, known), list(kept)
     for found in kept:  # in what the law leaves, is it still an effect?
         rest = [f for f in again if f is not found]
-        factors = dict(zip(fitted.names, inflation(judged, fitted), strict=True))
-        most = max(factors[name] for name in found.candidate.names) ** 2
-        enough = found.threshold * max(1.0, fitted.reduced_chi_square / noise) * most
+        enough = enough_beside_memory(judged, fitted, noise, found.candidate, found.threshold)
         held = fitted.values | {q.name: q.null for q in found.candidate.quantities}
         without = with_law(judged, base_beside(diagnosis.before, rest), replace(law, values=held))
         gain = (without.cost - fitted.cost) / noise

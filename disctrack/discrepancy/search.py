@@ -195,6 +195,13 @@ def threshold(system: System, settings: Settings, k: int) -> float:
     return float(stats.chi2.isf(settings.false_alarm / max(len(system.candidates), 1), k))
 
 
+def enough_beside_memory(system: System, fitted: Fit, noise: float, candidate: Candidate, alone: float) -> float:
+    """Gain that a residual with the memory of what a fit leaves may give an effect, where white noise gives `alone`."""
+    factors = dict(zip(fitted.names, inflation(system, fitted), strict=True))
+    left = max(1.0, fitted.reduced_chi_square / noise)  # what is left counts as noise does
+    return left * alone * max(factors[n] for n in candidate.names) ** 2
+
+
 def length(system: System, settings: Settings, noise: float, fitted: Fit, picked: Sequence[Candidate]) -> float:
     """Of an explanation, in units of -2 log evidence, but for a constant of the system.
 
@@ -590,13 +597,11 @@ class _Search:
         """Without the effect that gains least, if a residual with the memory of what is left may give it as much."""
         if self.settings.noise is not None:
             return None
-        left = max(1.0, e.fit.reduced_chi_square / self.noise)  # what is left counts as noise does
-        factors = dict(zip(e.fit.names, inflation(self.system, e.fit), strict=True))
         losses = []
         for c in e.candidates:
             smaller = self._refit_without(e, c)
             loss = (smaller.fit.cost - e.fit.cost) / self.noise
-            enough = left * self.threshold(len(c.names)) * max(factors[n] for n in c.names) ** 2
+            enough = enough_beside_memory(self.system, e.fit, self.noise, c, self.threshold(len(c.names)))
             if smaller.fit.converged or loss < enough:  # a fit that has not converged loses even less further on
                 losses.append((loss / enough, c.name, smaller))
         least, _, smaller = min(losses, default=(np.inf, "", e))

@@ -9,7 +9,8 @@ import numpy as np
 from scipy import signal
 
 from disctrack.discrepancy.equations.law import LearnedForce
-from disctrack.report.figures import Drawn, panels
+from disctrack.numbers import in_unit
+from disctrack.report.figures import BAND, Curve, Drawn, chart, panels
 from disctrack.report.html import write_page
 from disctrack.report.palette import BLUE, MUTED, RED
 
@@ -29,14 +30,10 @@ def write_answer(answer: Answer, path: Path) -> list[Path]:
 
 def _law(answer: Answer, law: LearnedForce) -> Drawn:
     """The law that was learned with its band."""
-    units = answer.equations.units
-    picture, (axes,) = panels(9, 3.5)
-    axes.fill_between(law.variable, law.force - 2 * law.sigma, law.force + 2 * law.sigma, color=BLUE, alpha=0.25, lw=0)
-    axes.plot(law.variable, law.force, color=BLUE, lw=1.2, label="learned, 95 %")
     of = "time" if law.along.variable == "t" else law.along.variable
-    unit = units.get(law.along.variable, "s" if law.along.variable == "t" else "")
-    axes.set(xlabel=f"{of} ({unit})" if unit else of, ylabel=f"added to d{law.along.equation}/dt")
-    axes.legend(frameon=False, fontsize=8)
+    unit = answer.equations.units.get(law.along.variable, "s" if law.along.variable == "t" else "1")
+    course = Curve(law.variable, law.force, BLUE, f"learned, ± {BAND:g} σ", sigma=law.sigma)
+    picture = chart(in_unit(of, unit), (f"added to d{law.along.equation}/dt", [course]), size=(9, 3.5))
     held = f", beyond {' and '.join(law.held)} as declared" if law.held else ""
     return Drawn("law", "law", f"{law.along.title}, learned from what is left{held}.", picture)
 

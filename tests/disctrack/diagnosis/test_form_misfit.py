@@ -80,19 +80,19 @@ def test_slip_that_takes_too_long_is_not_followed():
     assert cut.slip_steps <= whole.slip_steps // 4
 
 
-def test_a_sum_or_a_law_with_rivals_of_another_form_is_taken_for_another_s():
+def test_a_sum_or_a_law_with_alternatives_of_another_form_is_taken_for_another_s():
     """One law that nothing else comes near to has its form nearly for certain; two that are needed have it not."""
 
-    def law(*families, rivals=()):
+    def law(*families, others=()):
         return SimpleNamespace(
-            families=[SimpleNamespace(kind=k, terms=[{c: "1.0"}]) for k, c in families], rivals=rivals
+            families=[SimpleNamespace(kind=k, terms=[{c: "1.0"}]) for k, c in families], others=others
         )
 
     alone, other, other_axis = law(("angle", "M_n")), law(("hum", "X_n")), law(("angle", "M_z"))
     assert form_misfit.form_is_another(alone) == form_misfit.SELDOM
     assert form_misfit.form_is_another(law(("angle", "M_n"), ("hum", "X_n"))) == 1.0
     assert form_misfit.form_is_another(alone, {"kz"}) == 1.0
-    for rival in (other, other_axis, law(("angle", "M_n"), ("hum", "X_n")), law()):  # the last: known effects alone
-        assert form_misfit.form_is_another(law(("angle", "M_n"), rivals=[(rival, 1.0)])) == pytest.approx(0.5)
+    for one in (other, other_axis, law(("angle", "M_n"), ("hum", "X_n")), law()):  # the last: known effects alone
+        assert form_misfit.form_is_another(law(("angle", "M_n"), others=[(one, 1.0)])) == pytest.approx(0.5)
     same = [(law(("angle", "M_n")), 1.0)]  # a variation of the same idea, whose course is in the sigma anyway
-    assert form_misfit.form_is_another(law(("angle", "M_n"), rivals=same)) == form_misfit.SELDOM
+    assert form_misfit.form_is_another(law(("angle", "M_n"), others=same)) == form_misfit.SELDOM
