@@ -22,7 +22,7 @@ from disctrack.diagnosis.systematic import find_systematic, with_noise_of_frames
 from disctrack.discrepancy.fit import Fit, fit
 from disctrack.discrepancy.held_out import HeldOut, held_out, training_rows
 from disctrack.discrepancy.noise import noise_variance
-from disctrack.discrepancy.search import Diagnosis, Found, Settings, beside, explain, threshold
+from disctrack.discrepancy.search import FAR, Diagnosis, Found, Settings, beside, explain, threshold
 from disctrack.discrepancy.system import Budget, Candidate, GivenUp, TrialGivenUp
 from disctrack.errors import AnalysisError
 from disctrack.faults.clock_jump import clock_jumps, without_jumps
@@ -39,8 +39,7 @@ CREEPS_BESIDE = (
     "slip with Coulomb's friction is all that was fitted: with so little of it the disc creeps, and fits with "
     "other effects would take too long"
 )
-EXCESS = 10.0  # variances of the noise; above it slip at mm/s is looked for over ...
-LASTS = 5  # ... so many frames at least: contact velocities that are errors of a fit stop within one
+LASTS = 5  # frames of slip at mm/s at least: contact velocities that are errors of a fit stop within one
 SHOWN = 0.975  # probability of slip at the first frame from which on it is taken for shown
 
 
@@ -109,7 +108,7 @@ def _with_these_times(
 def _rolling_or_slipping(settings: Settings, rolling: DiscSystem, base: Fit) -> MotionDiagnosis:
     """The diagnosis of a motion without large faults. Raises GivenUp where slip would take too long to follow."""
     q = rolling.trajectory.q[rolling.rows]
-    large = not base.reduced_chi_square <= EXCESS * noise_variance(rolling, base)
+    large = not base.reduced_chi_square <= FAR * noise_variance(rolling, base)
     if large and _slips_slowly(settings, rolling):
         return _slipping(settings, rolling, base, None)
     may_slip = first_slip(rolling.time, q, rolling.disc) > LEAST_SLIP and not _at_noise(rolling, base, settings)
@@ -128,7 +127,7 @@ def _slips_slowly(settings: Settings, rolling: DiscSystem) -> bool:
     """Does slip over the first frames bring a residual far above the noise down to it?
 
     Friction below what rolling needs holds the contact's velocity at mm/s, which no first poses show; a fit does. Three
-    numbers that do away with all of an EXCESS are not those of another effect.
+    numbers that do away with all of it are not those of another effect.
     """
     slipping = rolling.again(starts_in_slip=True)
     try:

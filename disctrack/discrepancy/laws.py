@@ -16,7 +16,7 @@ import numpy as np
 
 from calibration.kit.arrays import Array
 from disctrack.discrepancy.fit import Fit, fit
-from disctrack.discrepancy.search import CLASS_GAIN, Diagnosis, Found, enough_beside_memory, length
+from disctrack.discrepancy.search import CLASS_GAIN, FAR, Diagnosis, Explanation, Found, gain_of_memory, length
 from disctrack.discrepancy.shape import profiled
 from disctrack.discrepancy.significance import as_sigmas, price_of_a_number, wald
 from disctrack.discrepancy.system import Candidate, Quantity, System, Values
@@ -31,7 +31,6 @@ EXACT = 0.02  # of chi-square: what a first-order gain may err by where the moti
 UNLIKELY = 1e-3  # odds below which a law does not count
 NEARLY = 20.0  # chi-square by which a refit may be better than the first order ...
 COARSE = 0.1  # ... and share of what is missing, by which one may be that moves a shape off the library's grid
-TELLS = 10.0  # variances of the noise: what leaves more describes nothing
 WIDTHS = ("width", "softness", "length", "lasting")  # shapes that go with the amount
 INVISIBLE = 1e-8  # share of a column's power left after clearing, below which the data do not show it
 
@@ -332,15 +331,18 @@ def busy_amounts(fitted: Fit, names: Sequence[str]) -> dict[int, float]:
         del there[int(np.argmin(sigmas))]
 
 
-@dataclass(frozen=True)
-class WithLaw:
+@dataclass(frozen=True, kw_only=True)
+class WithLaw(Explanation):
     """An explanation with a law: known effects that stay beside it, fitted together."""
 
     law: LearnedLaw
     system: LawSystem  # knows the law
-    fit: Fit
     kept: tuple[Found, ...]
-    length: float  # as of any explanation
+
+    @property
+    def effects(self) -> tuple[str, ...]:
+        """Names of its effects, and what the law means."""
+        return (*super().effects, self.law.title)
 
 
 def explained_by_law(
@@ -359,22 +361,14 @@ def explained_by_law(
     as_good = [a for a in answers if a.length - shortest < CLASS_GAIN]
     best = min(as_good, key=lambda a: (sum(f.candidate.kind == "motion" for f in a.kept), a.length))
     left, at_noise = best.fit.reduced_chi_square, diagnosis.settings.at_noise * noise
-    listed = replace(diagnosis, explanations=_listed(diagnosis, answers))
+    ranked = sorted((*diagnosis.ranked, *answers), key=lambda e: e.length)
+    listed = replace(diagnosis, ranked=tuple(ranked), length=ranked[0].length)
     if not best.length < known:
         text = f"a single law outside the catalogue describes the data too ({left:.4g}): {best.law.title}"
         return None, replace(listed, remarks=(*diagnosis.remarks, text)) if left <= at_noise else diagnosis
-    if left > TELLS * noise:
+    if left > FAR * noise:
         return None, diagnosis
     return replace(best, law=replace(best.law, others=_others(best, answers, diagnosis))), listed
-
-
-def _listed(diagnosis: Diagnosis, answers: Sequence[WithLaw]) -> tuple[tuple[tuple[str, ...], float], ...]:
-    """Explanations by known effects and by laws that are not told from the shortest, and how much longer they are."""
-    found = [(e.effects, e.length) for e in diagnosis.ranked]
-    found += [((*(f.candidate.name for f in a.kept), a.law.title), a.length) for a in answers]
-    shortest = min(its for _, its in found)
-    near = ((names, its - shortest) for names, its in found if its - shortest < CLASS_GAIN)
-    return tuple(sorted(near, key=lambda one: one[1]))
 
 
 def _known(system: System, diagnosis: Diagnosis) -> float:
@@ -438,7 +432,7 @@ def _law_beside(system: LawSystem, diagnosis: Diagnosis, kept: tuple[Found, ...]
     judged, again = judged_as(diagnosis, known), list(kept)
     for found in kept:  # in what the law leaves, is it still an effect?
         rest = [f for f in again if f is not found]
-        enough = enough_beside_memory(judged, fitted, noise, found.candidate, found.threshold)
+        enough = gain_of_memory(judged, fitted, noise, found.candidate, found.threshold)
         held = fitted.values | {q.name: q.null for q in found.candidate.quantities}
         without = with_law(judged, base_beside(diagnosis.before, rest), replace(law, values=held))
         gain = (without.cost - fitted.cost) / noise
@@ -446,8 +440,9 @@ def _law_beside(system: LawSystem, diagnosis: Diagnosis, kept: tuple[Found, ...]
             again, fitted = rest, without
         else:
             again[again.index(found)] = replace(found, gain=float(gain), cannot_be_told_from=())
-    of_known = length(system, diagnosis.settings, noise, fitted, [f.candidate for f in again])
-    return WithLaw(law, known, fitted, tuple(again), of_known + law.looked * len(law.families))
+    beside = tuple(f.candidate for f in again)
+    its = length(system, diagnosis.settings, noise, fitted, beside) + law.looked * len(law.families)
+    return WithLaw(candidates=beside, fit=fitted, length=its, law=law, system=known, kept=tuple(again))
 
 
 def _others(best: WithLaw, answers: Sequence[WithLaw], diagnosis: Diagnosis) -> tuple[tuple[LearnedLaw, float], ...]:

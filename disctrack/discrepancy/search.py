@@ -39,10 +39,9 @@ ROUGH = 1e-2  # of chi-square at stake, below which what a fit may still gain in
 FAINT = 1e3  # chi-square of an effect, below which many others may do as well as it
 MOST_ALTERNATIVES = 12
 NOT_CONVERGED = "its refit does not converge"
-CANCELLING = 0.1  # share of the lesser of two faults' power that their sum keeps, below which they undo each other
+CANCELLING = 0.1  # share of the least effect's power that a sum of effects keeps, below which they undo each other
 FAR, AGREES = 10.0, 2.0  # variances of the noise: a motion far from the data, and one that a beginning agrees with
 FIRST_ORDER = 1.0 / 3.0  # of what a faint effect is to describe, that it does to first order, at the shape assumed
-UNEXPLAINED_SHARE = 0.05  # of the excess chi-square, up to which effects are named although something else is left
 
 
 @dataclass(frozen=True)
@@ -54,7 +53,7 @@ class Settings:
     shortlist: int = 8  # proposals of one term more that are refitted in full for each explanation
     judged: int = 4  # explanations that may be put to the free run
     at_noise: float = 1.1  # reduced chi-square over the noise found in the data, up to which nothing is left
-    unexplained_share: float = UNEXPLAINED_SHARE
+    unexplained_share: float = 0.05  # of the excess chi-square, up to which effects are named although more is left
     noise: float | None = None  # variance over that stated; None: from the residual's fast part
 
 
@@ -126,12 +125,17 @@ class Diagnosis(Outline):
     settings: Settings = field(default_factory=Settings)
     partial: tuple[Candidate, ...] = ()  # effects that help most, refused because they leave too much
     nearest: Fit | None = None  # with them
-    # sets of effects whose length does not tell them from the answer, the shortest first, and how much longer they are
-    explanations: tuple[tuple[tuple[str, ...], float], ...] = ()
     ranked: tuple[Explanation, ...] = ()  # all that can be believed, the shortest first
+    length: float = np.nan  # of the answer
     judged: System | None = None  # what the fits were made of: the system with its noise as found; None: unchanged
     remarks: tuple[str, ...] = ()  # on shapes of laws that the data leave open
     chance: Chance | None = None  # with which noise alone would let some candidate gain as much as the best does
+
+    @property
+    def explanations(self) -> tuple[tuple[tuple[str, ...], float], ...]:
+        """Sets of effects whose length does not tell them from the answer, the shortest first, and by how much."""
+        listed = ((e.effects, e.length - self.length) for e in self.ranked)
+        return tuple(item for item in listed if abs(item[1]) < CLASS_GAIN)
 
 
 Former = Mapping[frozenset[str], Values]  # by names of effects
@@ -195,7 +199,7 @@ def threshold(system: System, settings: Settings, k: int) -> float:
     return float(stats.chi2.isf(settings.false_alarm / max(len(system.candidates), 1), k))
 
 
-def enough_beside_memory(system: System, fitted: Fit, noise: float, candidate: Candidate, alone: float) -> float:
+def gain_of_memory(system: System, fitted: Fit, noise: float, candidate: Candidate, alone: float) -> float:
     """Gain that a residual with the memory of what a fit leaves may give an effect, where white noise gives `alone`."""
     factors = dict(zip(fitted.names, inflation(system, fitted), strict=True))
     left = max(1.0, fitted.reduced_chi_square / noise)  # what is left counts as noise does
@@ -252,7 +256,6 @@ class _Search:
         after = self.nothing if alike is None else best
         found = tuple(self._found(best, c, r) for c, r in zip(best.candidates, alike or (), strict=alike is not None))
         ranked = tuple(replace(e, length=self.length(e)) for e in self._ranked())
-        listed = ((e.effects, e.length - self.length(after)) for e in ranked)
         partial = best if alike is None else None
         return Diagnosis(
             *self._verdict(after, found),
@@ -266,8 +269,8 @@ class _Search:
             self.settings,
             partial.candidates if partial else (),
             partial.fit if partial else None,
-            explanations=tuple(item for item in listed if abs(item[1]) < CLASS_GAIN),
             ranked=ranked,
+            length=self.length(after),
             chance=by_chance,
         )
 
@@ -601,7 +604,7 @@ class _Search:
         for c in e.candidates:
             smaller = self._refit_without(e, c)
             loss = (smaller.fit.cost - e.fit.cost) / self.noise
-            enough = enough_beside_memory(self.system, e.fit, self.noise, c, self.threshold(len(c.names)))
+            enough = gain_of_memory(self.system, e.fit, self.noise, c, self.threshold(len(c.names)))
             if smaller.fit.converged or loss < enough:  # a fit that has not converged loses even less further on
                 losses.append((loss / enough, c.name, smaller))
         least, _, smaller = min(losses, default=(np.inf, "", e))

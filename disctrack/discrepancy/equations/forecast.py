@@ -11,8 +11,8 @@ from disctrack.discrepancy.equations.declared import Samples
 from disctrack.discrepancy.equations.start import guessed
 from disctrack.discrepancy.equations.system import EquationSystem
 from disctrack.discrepancy.fit import Fit, fit
+from disctrack.discrepancy.significance import TWO_SIDED
 
-WITHIN_95 = 1.96  # standard deviations
 OF_SIZE = 1e4  # scales of a state make up ten times its size: farther off is no guess from few samples
 
 
@@ -93,7 +93,7 @@ def scored(found: Forecast, samples: Samples, channels: tuple[str, ...], since: 
     for c, name in enumerate(channels):
         rows = np.isfinite(samples.data[:, c]) & (samples.time > since)
         left = (samples.data[:, c] - found[name])[rows]
-        within = np.abs(left) <= WITHIN_95 * found.sigmas[name][rows]
+        within = np.abs(left) <= TWO_SIDED * found.sigmas[name][rows]
         scores[name] = RunScore(float(np.sqrt(np.mean(left**2))), float(np.mean(within)), int(rows.sum()))
     return scores
 

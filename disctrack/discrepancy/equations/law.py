@@ -27,7 +27,7 @@ from disctrack.discrepancy.held_out import HeldOut, held_out
 from disctrack.discrepancy.laws import evidence
 from disctrack.discrepancy.noise import THIRD
 from disctrack.discrepancy.score import cleared, span
-from disctrack.discrepancy.search import CLASS_GAIN, Diagnosis, Found, Tried
+from disctrack.discrepancy.search import CLASS_GAIN, FAR, Diagnosis, Found, Tried
 from disctrack.discrepancy.significance import price_of_a_number
 from disctrack.discrepancy.system import Candidate, Quantity, System, Values
 
@@ -38,7 +38,6 @@ SMOOTH = (0.7, 1.5, 3.0, 6.0)  # wave numbers from which on amplitudes fall ...
 FALLS = (1.5, 1.0)  # ... as these powers of 1 + (wave number over it) squared: without kinks, and with some
 FINE, STRAIGHT = 0.03, 1e4  # of the largest value: the variable's inverse hyperbolic sine beyond it, or itself
 SIZES = np.logspace(-4, 2, 31)  # prior sigma of the first amplitudes, over the rms of the equation that it stands in
-FAR = 10.0  # variances of the noise, from which on the motion is learned from in short stretches
 FEWEST = 10  # samples of such a stretch
 MOST_SAMPLES = 2000  # with which laws compete; the one that is told is fitted to all
 A_TURN = 40  # samples of a turn that are kept at least
@@ -48,7 +47,6 @@ MOST_BESIDE = 2  # ... beside each of so many known terms, where none describes 
 WORTH = 50.0  # of -2 log evidence to first order: a law that is so much worse than another is not fitted ...
 ROUGHLY = 4.0  # ... times that of the other, where the declared equations are far from the data
 PLAUSIBLE = 4.0  # the same, by which a rougher law may be less probable than the best one
-ALIKE = 10.0  # the same, by which two laws differ that both describe the data
 ROUNDS = 3  # in which size and smoothness follow the fit, and the fit them
 ITERATIONS, ATTEMPTS = 12, 60  # of a fit, and of one within a region of trust
 POINTS = 61  # of the course that is told
@@ -85,7 +83,7 @@ class LearnedForce:
     force: Array  # (POINTS,) beyond the declared equations
     sigma: Array  # (POINTS,)
     length: float  # -2 log evidence of the data with it, with what it pays for having been looked for
-    alike: tuple[Along, ...]  # others whose evidence is within ALIKE
+    alike: tuple[Along, ...]  # others whose evidence is within CLASS_GAIN
     replaces: tuple[Candidate, ...] = ()  # known terms that describe the data too ...
     their_length: float = np.inf  # ... with this
     at_noise: bool = True  # is what it leaves noise?
@@ -186,7 +184,7 @@ class _Competition:
 
     def arrived(self, fitted: Fit) -> bool:
         """Could further steps gain no more than nothing? Along what only the prior holds, they go on for ever."""
-        return fitted.converged or fitted.promised < ALIKE * self.noise
+        return fitted.converged or fitted.promised < CLASS_GAIN * self.noise
 
     def at_noise(self, fitted: Fit) -> bool:
         """As the search has it."""
@@ -253,7 +251,7 @@ class _Competition:
             return None
         trials = [trial for trial in trials if self.arrived(trial.fit)] or trials
         shortest = min(trial.length for trial in trials)
-        alike = [trial for trial in trials if trial.length < shortest + ALIKE]
+        alike = [trial for trial in trials if trial.length < shortest + CLASS_GAIN]
         # a function of time describes any motion: one of the motion itself says more, and is tried by every other run
         best = min(alike, key=lambda trial: (trial.along.variable == "t", trial.length))
         others = (Along(t.along.equation, t.along.variable) for t in alike if t.along.title != best.along.title)

@@ -17,12 +17,12 @@ from disctrack.discrepancy.equations.declared import Samples
 from disctrack.discrepancy.equations.formulas import Formulas
 from disctrack.discrepancy.equations.system import EquationSystem, first_part, spread
 from disctrack.discrepancy.fit import fit
+from disctrack.discrepancy.search import AGREES
 from disctrack.discrepancy.system import Quantity, System
 
 GROWTH = 1.7  # of the window from fit to fit: a phase that is right over it is right to a radian over the next
 LOST = 0.3  # rms of the residual over that of the signal, from which on the model no longer follows the motion
 LOOSE = 0.6  # the same where growing windows follow for less than a turn: most of the motion is still that of the model
-NOISY = 2.0  # variance over that stated, up to which a residual may be noise: sigmas are rough as yet
 _LEASH = 0.3  # relative change of a parameter from window to window, of which none is surprised
 _FAR = 1.0  # relative change of a parameter from its declared value, which is said to be right to some 30 %
 _WINDOWS = (8, 12, 18, 27, 40, 60, 90, 135, 200)  # samples of the local polynomial
@@ -148,7 +148,7 @@ def misfits(system: EquationSystem, values: dict[str, float]) -> Array:
         if found is None:
             return np.full_like(size, np.inf)
         noise = np.where(np.isfinite(s.data), s.sigma**2, 0.0).sum(axis=0)
-        square += np.maximum(np.nansum((s.data - found.seen) ** 2, axis=0) - NOISY * noise, 0.0)
+        square += np.maximum(np.nansum((s.data - found.seen) ** 2, axis=0) - AGREES * noise, 0.0)
         size += np.nansum((s.data - np.nanmean(s.data, axis=0)) ** 2, axis=0) + noise
     return np.asarray(np.sqrt(square / np.maximum(size, 1e-300)), float)
 

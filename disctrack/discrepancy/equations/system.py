@@ -14,17 +14,17 @@ from calibration.kit.arrays import Array, Mask
 from disctrack.discrepancy.equations import _ode_kernel as kernel
 from disctrack.discrepancy.equations.declared import Parameter, Samples, Term
 from disctrack.discrepancy.equations.formulas import Formulas
+from disctrack.discrepancy.held_out import TRAIN_FRACTION
+from disctrack.discrepancy.search import CANCELLING
 from disctrack.discrepancy.system import Candidate, Quantity, System, Values
 from disctrack.errors import AnalysisError
 
 TOLERANCE = 1e-10  # of a step, relative to the size of a state
 MAX_STEPS = 400_000  # after which a motion is given up
-UNDONE = 0.1  # share of the least term's power that a sum of terms keeps, below which they undo each other ...
-LARGE = 5.0  # ... where each is so many times larger than all that moves the motion
+LARGE = 5.0  # times all that moves the motion: terms each so large that their sum may be what describes it
 MOST_STATES = 80  # initial states that are fitted along where others would tell no more that is new
 EACH = "*"  # in the place of a stretch: each has a number of its own
 FEWEST = 4  # samples of a stretch
-FIRST_SHARE = 0.65  # of every stretch: what is fitted to it is judged on the rest
 
 
 @dataclass(frozen=True)
@@ -168,7 +168,7 @@ class EquationSystem(System):
             alone += np.sum(acting**2, axis=1)
             together += [np.sum(acting[own].sum(axis=0) ** 2, axis=0) for own in sums]
         least = np.array([alone[own].min(axis=0) for own in sums]).reshape(together.shape)
-        return bool(np.any((together < UNDONE * least) & (least > LARGE**2 * everything)))
+        return bool(np.any((together < CANCELLING * least) & (least > LARGE**2 * everything)))
 
     def linearise(self, values: Values, names: Sequence[str]) -> tuple[Array, Array]:
         """Whitened residual (n, w), data minus prediction, and the prediction's derivative (n, w, k)."""
@@ -302,7 +302,7 @@ def fitted_rows(s: Samples) -> Mask:
     """(n,) True for the samples to which a fit is made that the others judge."""
     if s.fit_until is not None:
         return np.asarray(s.time <= (s.fit_until or -np.inf), bool)
-    return np.asarray(s.time - s.time[0] <= FIRST_SHARE * (s.time[-1] - s.time[0]), bool)
+    return np.asarray(s.time - s.time[0] <= TRAIN_FRACTION * (s.time[-1] - s.time[0]), bool)
 
 
 def cut(samples: Sequence[Samples], counts: Sequence[int]) -> list[Samples]:

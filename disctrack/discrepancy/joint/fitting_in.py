@@ -16,14 +16,14 @@ from calibration.kit.arrays import Array
 from calibration.kit.least_squares import triangle
 from disctrack.discrepancy.fit import Fit, prior_rows
 from disctrack.discrepancy.joint.sharing import JointSystem
+from disctrack.discrepancy.score import INVISIBLE
+from disctrack.discrepancy.search import CLASS_GAIN
 from disctrack.discrepancy.system import Candidate
 
 LAW = 1e6  # sigmas: length to which the derivative by a number without a prior is scaled, so that it is never left out
 SPOILT = 1e-2  # of the first one's statistic: by so much less the others may be judged wrongly where it moved the fit
 TWIN = 0.5  # of the statistic of the one that fits worst, from which on another may be the one that is wrong
 TWINS = 3  # of those that are looked at: a twin fits about as badly as the worst
-SEEN = 1e-6  # part of an effect's derivative that is left beside what is shared, from which on it is seen
-ALIKE = 10.0  # of chi-square, by which another effect tells less and may yet be the one
 NOISE = 2.0  # median of some falls of chi-square over that of noise, up to which it is noise
 LEFT_ASIDE = 2.5  # median of the squares of normal numbers over that of their inner two thirds
 ALIKE_SHARE = 0.05  # of all that it tells, which is to first order
@@ -134,9 +134,9 @@ def _least(right: Array, matrix: Array, scale: Array) -> tuple[float, int]:
 def _least_seen(right: Array, matrix: Array) -> tuple[float, int]:
     """Smallest sum of squares of right - matrix x, and how many combinations of its columns, of size one, are seen."""
     length = np.linalg.norm(matrix, axis=0)
-    seen = length > SEEN
+    seen = length > INVISIBLE
     U, singular, _ = np.linalg.svd(matrix[:, seen] / length[seen], full_matrices=False)
-    along = U[:, singular > SEEN].T @ right
+    along = U[:, singular > INVISIBLE].T @ right
     return float(right @ right - along @ along), len(along)
 
 
@@ -177,7 +177,7 @@ def _differs_by(blocks: Blocks, standing: Sequence[tuple[float, int, int]], shar
     most = max((difference for difference, _, _ in standing), default=0.0)
     if most < shared or not standing:
         return ""
-    alike = [(d, -x, k) for x, d, k in standing if most - x < max(ALIKE, ALIKE_SHARE * most)]
+    alike = [(d, -x, k) for x, d, k in standing if most - x < max(CLASS_GAIN, ALIKE_SHARE * most)]
     first, *others = (blocks.candidates[k] for _, _, k in sorted(alike)[:NAMED])
     return f"{first.title} [{first.name}]" + "".join(f" or [{c.name}]" for c in others)
 

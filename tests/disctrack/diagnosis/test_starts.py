@@ -11,7 +11,7 @@ from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.diagnosis.pages.output import as_json
 from disctrack.diagnosis.stretch import free_stretch
 from disctrack.discrepancy.fit import fit
-from disctrack.discrepancy.search import Settings
+from disctrack.discrepancy.search import FAR, Settings
 from disctrack.errors import AnalysisError
 from disctrack.faults.keys import Faults
 from disctrack.rolling import Model, Regime, State, simulate, steady_precession
@@ -120,7 +120,7 @@ def test_slip_of_a_millimetre_per_second_at_the_first_frame_is_found(n):
 def test_what_rolls_at_first_does_not_begin_in_slip(effects):
     trajectory = measured(effects, seed=100, n=150, theta_deg=20.0)
     system = DiscSystem(trajectory, PAPER)
-    assert fit(system, system.base, system.start()).reduced_chi_square > slip_start.EXCESS
+    assert fit(system, system.base, system.start()).reduced_chi_square > FAR
     assert not slip_start._slips_slowly(Settings(), system)
 
 
