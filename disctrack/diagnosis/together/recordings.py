@@ -13,13 +13,7 @@ from disctrack.diagnosis.large_faults import find_large
 from disctrack.diagnosis.model_file import PAPER, declared_model
 from disctrack.diagnosis.plan import OPEN, Plan, Question, Say, plan
 from disctrack.diagnosis.recorded import Recorded, first_to_mend
-from disctrack.diagnosis.systematic import (
-    Systematic,
-    find_systematic,
-    noise_over_stated,
-    smooth_field,
-    with_noise,
-)
+from disctrack.diagnosis.systematic import Systematic, find_systematic, noise_over_stated, smooth_field, with_noise
 from disctrack.discrepancy.fit import Fit, fit
 from disctrack.discrepancy.joint.crew import Crew
 from disctrack.discrepancy.joint.reduction import Reduced, Reduction

@@ -25,14 +25,7 @@ from disctrack.discrepancy.noise import (
     without_memory,
 )
 from disctrack.discrepancy.score import Linearisation
-from disctrack.discrepancy.search import (
-    NOT_CONVERGED,
-    Diagnosis,
-    Former,
-    Settings,
-    explain,
-    with_shapes,
-)
+from disctrack.discrepancy.search import NOT_CONVERGED, Diagnosis, Former, Settings, explain, with_shapes
 from disctrack.discrepancy.significance import wald
 from disctrack.discrepancy.system import Candidate, System
 from disctrack.errors import AnalysisError
