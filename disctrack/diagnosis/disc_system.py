@@ -26,7 +26,7 @@ from disctrack.diagnosis.motion import (
     state_quantities,
 )
 from disctrack.diagnosis.starts import STRETCHES, sought, start_values
-from disctrack.diagnosis.stretch import Stretch, free_stretch
+from disctrack.diagnosis.stretch import free_stretch
 from disctrack.diagnosis.systematic import DOT_SIGMA, Systematic, field_columns
 from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.laws import Family, LawSystem, LearnedLaw
@@ -93,7 +93,7 @@ class DiscSystem(LawSystem):
         model: Model,
         candidates: tuple[Candidate, ...] | None = None,
         *,
-        stretch: Stretch | None = None,
+        rows: slice | None = None,
         starts_in_slip: bool = False,
         systematic: Systematic | None = None,
         freed: tuple[Candidate, ...] = (),
@@ -102,7 +102,7 @@ class DiscSystem(LawSystem):
         """Model : declared disc, gravity and effects; the parameters of its effects are fitted along.
 
         candidates : all of the catalogue and of the measurement, if not given
-        stretch : frames to take; those of `free_stretch` if not given
+        rows : frames to take; those of `free_stretch` if not given
         starts_in_slip : the velocity at the first instant is free, and so is the friction, unless the model declares it
         freed : faults that are known to be there: every fit moves their quantities
         known : faults of the measurement that are held at these values; tolerances are about them
@@ -113,9 +113,10 @@ class DiscSystem(LawSystem):
         self.budget = Budget()  # of steps of slip
         self.columns_known: dict[tuple[str, int], tuple[Array, list[Array]]] = {}  # of `sought`, along a motion nearby
         self.known = dict(known or {})
-        self.stretch = stretch or free_stretch(trajectory)
         self.starts_in_slip = starts_in_slip
-        rows = self.stretch.rows
+        self.notes: tuple[str, ...] = ()  # on the frames that were left out
+        if rows is None:
+            rows, self.notes = free_stretch(trajectory)
         self.model = model
         self.trajectory = trajectory
         self.rig, self.disc = trajectory.rig, trajectory.disc
@@ -246,9 +247,9 @@ class DiscSystem(LawSystem):
 
         But for the candidates, and what was taken for slip or freed: all of the catalogue, rolling, and none.
         """
-        same = {"stretch": self.stretch, "systematic": self.systematic, "known": self.known}
+        same = {"rows": self.rows, "systematic": self.systematic, "known": self.known}
         system = DiscSystem(self.trajectory, self.model, candidates, **{**same, **other})
-        system.budget = self.budget
+        system.budget, system.notes = self.budget, self.notes
         return system
 
     def beginnings(self) -> tuple[DiscSystem, ...]:

@@ -13,7 +13,6 @@ from scipy.interpolate import CubicSpline
 
 from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.diagnosis.motion import candidate_of_fault
-from disctrack.diagnosis.stretch import Stretch
 from disctrack.diagnosis.systematic import Systematic, find_systematic, with_noise_of_frames
 from disctrack.disc import Disc
 from disctrack.discrepancy.fit import Fit, fit
@@ -125,7 +124,7 @@ def _found_statically(
     for _ in range(ITERATIONS):
         seen = with_noise_of_frames(poses_with(trajectory, values))
         good = np.flatnonzero(seen.measured)  # poses that are wrong by degrees tell no rest from motion
-        system = DiscSystem(seen, model, stretch=Stretch(slice(int(good[0]), int(good[-1]) + 1)))
+        system = DiscSystem(seen, model, rows=slice(int(good[0]), int(good[-1]) + 1))
         found = find_systematic(system, values, beside=names)
         gain, steps = max(gain, found.gain), [found.amounts.get(q.name, 0.0) for q in quantities]
         for q, step in zip(quantities, steps, strict=True):

@@ -15,7 +15,7 @@ from calibration.kit.arrays import Array
 from calibration.kit.least_squares import triangle
 from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.diagnosis.motion import state_of
-from disctrack.diagnosis.stretch import MIN_FRAMES, MIN_THETA, Stretch
+from disctrack.diagnosis.stretch import MIN_FRAMES, MIN_THETA
 from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.joint.reduction import Reduction
 from disctrack.discrepancy.joint.sharing import LAWS
@@ -241,8 +241,8 @@ class Planner:
             frame_rate=rate,
             **changed,
         )
-        known, stretch = replace(system.model, **changed), Stretch(slice(0, n))
-        planned = DiscSystem(trajectory, known, stretch=stretch, systematic=system.systematic)
+        known = replace(system.model, **changed)
+        planned = DiscSystem(trajectory, known, rows=slice(0, n), systematic=system.systematic)
         names = [q.name for q in planned.base]
         state = dict(zip(names[:8], start.array[:8].tolist(), strict=True))
         return planned, dict.fromkeys(names, 0.0) | values | state

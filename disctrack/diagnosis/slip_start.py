@@ -76,7 +76,7 @@ def diagnose_motion(
     jumps = clock_jumps(trajectory)
     answer = _with_these_times(without_jumps(trajectory, jumps), model, faults, settings or Settings())
     lost = tuple(f"frame {trajectory.frame[jump.row]}: {jump.words}; counted with them" for jump in jumps)
-    return replace(answer, notes=(*lost, *answer.system.stretch.notes, *answer.notes))
+    return replace(answer, notes=(*lost, *answer.system.notes, *answer.notes))
 
 
 def _with_these_times(
@@ -183,10 +183,11 @@ def _after_slip(
 ) -> MotionDiagnosis | None:
     """Diagnosis from the instant of rolling on; None where too little is left, or it is not explained either."""
     try:
-        # the beginning has shown that its law is not Coulomb's
-        system = rolling.again(_without_slip(rolling), stretch=free_stretch(rolling.trajectory, onset.high))
+        rows, notes = free_stretch(rolling.trajectory, onset.high)
     except AnalysisError:
         return None
+    system = rolling.again(_without_slip(rolling), rows=rows)  # the beginning has shown that its law is not Coulomb's
+    system.notes = notes
     diagnosis = explain(system, system.start(), settings)
     if diagnosis.verdict == "unexplained":
         return None

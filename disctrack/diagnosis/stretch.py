@@ -1,7 +1,5 @@
 """Which frames of a recording belong to one motion of the disc on its own, and what the others are."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,18 +21,11 @@ HELD = "the disc is at rest or held"
 OTHERWISE = ("the disc lies flat", HELD, "the disc slips")  # what frames show that are not of a motion on its own
 
 
-@dataclass(frozen=True)
-class Stretch:
-    """Frames to diagnose, and remarks on those that were left out."""
-
-    rows: slice
-    notes: tuple[str, ...] = ()
-
-
-def free_stretch(trajectory: Trajectory, start: float = -np.inf) -> Stretch:
+def free_stretch(trajectory: Trajectory, start: float = -np.inf) -> tuple[slice, tuple[str, ...]]:
     """The longest run of frames from `start` [s] on in which the disc moves, is not flat, and nobody holds it.
 
-    Lost frames do not end a run. Raises AnalysisError where no run has MIN_FRAMES poses.
+    Lost frames do not end a run. With it come remarks on what is left out. Raises AnalysisError where no run has
+    MIN_FRAMES poses.
     """
     if not trajectory.rig.world_is_table:
         raise AnalysisError(
@@ -65,7 +56,7 @@ def free_stretch(trajectory: Trajectory, start: float = -np.inf) -> Stretch:
     lost = rows.stop - rows.start - (last - first)
     if lost:
         notes.append(f"{lost} of the {rows.stop - rows.start} frames have no pose")
-    return Stretch(rows, tuple(notes))
+    return rows, tuple(notes)
 
 
 def _told(why: NDArray[np.str_]) -> list[str]:
