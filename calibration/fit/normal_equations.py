@@ -155,17 +155,13 @@ def prepare() -> None:
 
 def quadratic(matrix: Array, vector: Array) -> Array:
     """v^T M v of (m, 2, 2) and (m, 2)."""
-    x, y = vector[:, 0], vector[:, 1]
-    value: Array = matrix[:, 0, 0] * x * x + 2 * matrix[:, 0, 1] * x * y + matrix[:, 1, 1] * y * y
+    value: Array = np.einsum("mi,mij,mj->m", vector, matrix, vector)
     return value
 
 
 def inverse_covariance(covariance: Array, extra: float) -> Array:
     """Inverse of covariance (m, 2, 2) + extra [px^2] in both axes."""
-    a, b, c = covariance[:, 0, 0] + extra, covariance[:, 0, 1], covariance[:, 1, 1] + extra
-    inverse = np.stack([np.stack([c, -b], axis=-1), np.stack([-b, a], axis=-1)], axis=-2)
-    result: Array = inverse / (a * c - b * b)[:, None, None]
-    return result
+    return np.linalg.inv(covariance + extra * np.eye(2))
 
 
 def minimise(problem: Problem, start: StereoModel, **how: Any) -> Minimum[StereoModel]:

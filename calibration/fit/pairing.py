@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from calibration.board.chessboard import BoardNotFound, CornerView
 from calibration.board.target import mirror_symmetries
 from calibration.cameras.camera import CAMERA_NAMES, Camera, by_turning, project_with_jacobians
-from calibration.fit.stereo_model import StereoModel
+from calibration.fit.stereo_model import Observations, StereoModel
 from calibration.kit.arrays import Array, Mask
 from calibration.kit.errors import CalibrationError
 
@@ -96,12 +96,12 @@ def _same_place(side: Sequence[CornerView | BoardNotFound]) -> Mask:
     return same
 
 
-def places_of(poses: Mapping[int, Pose], points: Mapping[int, Array], nominal: Array, camera: Camera) -> BoardPlaces:
-    """Of images whose poses are known; points : (k, 3) [m] of the target that each shows."""
-    middle = nominal.mean(0)
+def places_of(poses: Mapping[int, Pose], seen_by: Observations, points: Array, camera: Camera) -> BoardPlaces:
+    """Of images whose poses are known. seen_by : the camera;  points : (n, 3) [m] of the target"""
+    middle = points.mean(0)
     found: list[tuple[Array, Array, Array]] = []
     for view, (R, t) in poses.items():
-        seen, at = points[view] @ R.T + t, R @ middle + t
+        seen, at = points[seen_by.point[seen_by.view == view]] @ R.T + t, R @ middle + t
         d_point = project_with_jacobians(seen, camera)[1]
         J = np.concatenate([by_turning(d_point, seen - at), d_point], axis=-1).reshape(-1, 6)
         information = J.T @ J / len(seen)

@@ -101,8 +101,7 @@ def start_stereo(
     cameras, poses, places = [], [], []
     for index in (0, 1):
         camera, seen, _ = start_camera(observations, index, nominal, image_sizes[index])
-        mine = observations[observations.camera == index]
-        places.append(places_of(seen, {v: nominal[mine.point[mine.view == v]] for v in seen}, nominal, camera))
+        places.append(places_of(seen, observations[observations.camera == index], nominal, camera))
         cameras.append(camera)
         poses.append(seen)
     floor = FLOOR * max(max(size) for size in image_sizes)

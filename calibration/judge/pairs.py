@@ -33,6 +33,7 @@ from calibration.fit.refinement import Refinement, fit_poses
 from calibration.fit.start import MIN_VIEWS, start_camera
 from calibration.fit.stereo_model import Observations, StereoModel, predict, predict_pixels
 from calibration.kit.arrays import Array, Mask
+from calibration.kit.least_squares import scaled_solve
 
 MOVED = 2.0  # times what corners' scatter makes of a board at rest, and times that scatter, that motion is named
 LEAST_PAIRS = 6  # fewer cannot judge one another: one tells how the cameras stand, and a median is of the others
@@ -93,12 +94,10 @@ class PairMotions:
         Each pair is compared with what the others say; 0 where they leave open what it says.
         """
         information, gradient = self.shared(self.covariance, tied)
-        scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
-        inverse = np.linalg.inv(information * scale[:, None] * scale)
-        W = self.by_shared * scale
-        left = self.motion - W @ (inverse @ (gradient * scale))
+        inverse = scaled_solve(information, np.eye(len(information)))
+        left = self.motion - self.by_shared @ (inverse @ gradient)
         L = np.linalg.inv(np.linalg.cholesky(self.covariance))
-        W = L @ W
+        W = L @ self.by_shared
         sign = np.where(tied, -1.0, 1.0)[:, None, None]  # what the others say, without the pair's own part
         values, vectors = np.linalg.eigh(np.eye(6) + sign * (W @ inverse @ np.swapaxes(W, 1, 2)))
         white = np.einsum("nji,njk,nk->ni", vectors, L, left)
@@ -335,8 +334,7 @@ def camera_moved(observations: Observations, pairs: Pairs, table_view: int | Non
     in_right = {v: (R_pair @ R, R_pair @ t + t_pair) for v, (R, t) in pairs.right_poses.items()}
     for index, poses in enumerate((pairs.left_poses, in_right)):
         mine = observations[observations.camera == index]
-        points = {v: model.points[mine.point[mine.view == v]] for v in views}
-        sides.append(places_of({v: poses[v] for v in views}, points, model.points, model.cameras[index]))
+        sides.append(places_of({v: poses[v] for v in views}, mine, model.points, model.cameras[index]))
     tells = np.all([np.isfinite(side.covariance).all(axis=(1, 2)) for side in sides], axis=0)
     views, (left, right) = views[tells], (side[tells] for side in sides)
     R, t = told_by(left, right)
