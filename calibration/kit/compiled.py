@@ -28,6 +28,7 @@ RULES: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": {"co
 part: Any = njit(**RULES, no_cpython_wrapper=True, no_cfunc_wrapper=True, forceinline=True)
 
 WITH_COMPILED = (
+    "calibration/kit/compiled.py",
     "calibration/**/_[a-z]*.py",
     "disctrack/**/_[a-z]*.py",
     "disctrack/rolling/**/*.py",
