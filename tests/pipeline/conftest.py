@@ -33,25 +33,22 @@ def rig_file(short_recording, tmp_path_factory) -> Path:
     return path
 
 
-def linked(recording: Path, folder: Path) -> Path:
-    """A recording of the same files as links: a test replaces files, and never writes into them."""
-    for file in recording.rglob("*.*"):
-        if file.is_file() and "results" not in file.relative_to(recording).parts:
-            target = folder / file.relative_to(recording)
-            target.parent.mkdir(parents=True, exist_ok=True)
-            os.link(file, target)
-    return folder
+def linked(recording: Path, folder: Path, link=os.link) -> Path:
+    """A recording of the same images as links: a test replaces them, and never writes into them."""
+
+    def copy(source: str, target: str) -> None:
+        (shutil.copy if source.endswith(".toml") else link)(source, target)
+
+    left_out = shutil.ignore_patterns("results")
+    return Path(shutil.copytree(recording, folder, copy_function=copy, ignore=left_out, dirs_exist_ok=True))
 
 
 @pytest.fixture
 def recording(short_recording, rig_file, tmp_path) -> Path:
     """A copy of the short recording that names the rig file; a test may damage it."""
     folder = tmp_path / "recording"
-    folder.mkdir()
     for camera in ("left", "right"):
-        (folder / camera).mkdir()
-        for file in (short_recording / camera).iterdir():
-            os.link(file, folder / camera / file.name)
+        linked(short_recording / camera, folder / camera)
     text = (short_recording / "recording.toml").read_text()
     start, end = text.index("[calibration]"), text.index("[gravity]")
     rig = rig_file.as_posix()

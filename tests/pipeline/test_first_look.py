@@ -21,27 +21,14 @@ from disctrack.findings import Kind, Severity, in_doubt, leading
 from disctrack.first_look.check import run_check
 from disctrack.first_look.sequences import find_sequences, pair_cameras
 from disctrack.first_look.targets import PAPERS_MM, board_figure, dots_figure
+from tests.pipeline.conftest import linked
 
 DPI = 150
 
 
-def linked(folder: Path, to: Path) -> Path:
-    """A copy of a recording whose images are links."""
-    for file in folder.rglob("*"):
-        place = to / file.relative_to(folder)
-        if file.is_dir():
-            place.mkdir(parents=True, exist_ok=True)
-        elif file.suffix == ".png":
-            place.parent.mkdir(parents=True, exist_ok=True)
-            os.symlink(file.resolve(), place)
-        else:
-            shutil.copy(file, place)
-    return to
-
-
 @pytest.mark.statistical
 def test_init_finds_cameras_views_and_board_and_leaves_only_what_no_file_tells(sample_clip, tmp_path, capsys):
-    folder = linked(sample_clip, tmp_path / "clip")
+    folder = linked(sample_clip, tmp_path / "clip", os.symlink)
     declared = tomllib.loads((folder / "recording.toml").read_text())
     (folder / "recording.toml").unlink()
     assert main(["init", str(folder), "--frame-rate-hz", "1000"]) == 0
@@ -76,7 +63,7 @@ def test_a_folder_of_any_name_gets_a_declaration_that_can_be_read(tmp_path):
 
 @pytest.mark.statistical
 def test_init_takes_the_rest_from_an_earlier_recording_of_the_same_disc(sample_clip, tmp_path):
-    folder = linked(sample_clip, tmp_path / "clip")
+    folder = linked(sample_clip, tmp_path / "clip", os.symlink)
     (folder / "recording.toml").unlink()
     assert main(["init", str(folder), "--like", str(sample_clip)]) == 0
     written, declared = (tomllib.loads((f / "recording.toml").read_text()) for f in (folder, sample_clip))
@@ -122,7 +109,7 @@ def test_folders_behind_links_are_looked_into_once(tmp_path):
 
 @pytest.mark.statistical
 def test_check_names_the_file_of_a_view_that_is_not_used(sample_clip, tmp_path, capsys):
-    folder = linked(sample_clip, tmp_path / "clip")
+    folder = linked(sample_clip, tmp_path / "clip", os.symlink)
     views = sorted((folder / "calibration/right").glob("*.png"))
     blank = np.full_like(cv2.imread(str(views[-1]), cv2.IMREAD_UNCHANGED), 90)
     views[-1].unlink()
@@ -272,7 +259,7 @@ def repeat_left(folder: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("fault", FAULTS)
 def test_check_names_the_fault_first(fault, sample_clip, tmp_path):
-    folder = linked(sample_clip, tmp_path / "clip")
+    folder = linked(sample_clip, tmp_path / "clip", os.symlink)
     plant, kind, words, doubtful = FAULTS[fault]
     plant(folder)
     problems = leading(run_check(folder).findings)
@@ -287,7 +274,7 @@ def test_check_names_the_fault_first(fault, sample_clip, tmp_path):
 @pytest.mark.statistical
 @pytest.mark.parametrize("fault", ["wrong square", "wrong view", "board of no thickness", "cameras exchanged"])
 def test_every_stage_names_the_same_cause_first(fault, sample_clip, tmp_path, capsys):
-    folder = linked(sample_clip, tmp_path / "clip")
+    folder = linked(sample_clip, tmp_path / "clip", os.symlink)
     for camera in ("left", "right"):
         for file in sorted((folder / camera).iterdir())[120:]:
             file.unlink()
