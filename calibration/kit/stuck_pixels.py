@@ -58,22 +58,24 @@ def repaired_views(views: Sequence[NDArray], camera: str) -> tuple[list[NDArray]
     first = views[0] if len(views) else np.zeros((0, 0))
     if any(view.shape != first.shape or view.dtype not in (np.uint8, np.uint16) for view in views) or first.ndim > 3:
         return list(views), ""
-    blind, mended = np.zeros(first.shape[:2], bool), list(views)
-    for channel in range(1 if first.ndim == 2 else first.shape[2]):
-        one = [np.ascontiguousarray(view if view.ndim == 2 else view[..., channel]) for view in views]
-        mask = stuck_pixels(one, of_board=True)
-        if mask is None:
-            continue
-        if not blind.any():
-            mended = [np.array(view) for view in views]
-        blind |= mask
-        for view, values in zip(mended, one, strict=True):
-            values = np.array(values)
-            repair(values, mask)
-            view.reshape(*view.shape[:2], -1)[..., channel] = values
-    n = int(blind.sum())
-    note = f"{camera} camera: {n} pixels show one value in all views; their neighbours stand in for them"
-    return mended, note if n else ""
+    channels = first.shape[2] if first.ndim == 3 else 1
+
+    def channel(view: NDArray, k: int) -> NDArray:
+        return view.reshape(*first.shape[:2], channels)[..., k]
+
+    blind = {}
+    for k in range(channels):
+        mask = stuck_pixels([np.ascontiguousarray(channel(view, k)) for view in views], of_board=True)
+        if mask is not None:
+            blind[k] = mask
+    if not blind:
+        return list(views), ""
+    mended = [np.array(view) for view in views]
+    for view in mended:
+        for k, mask in blind.items():
+            repair(channel(view, k), mask)
+    n = int(np.any([*blind.values()], axis=0).sum())
+    return mended, f"{camera} camera: {n} pixels show one value in all views; their neighbours stand in for them"
 
 
 def repair(images: NDArray, stuck: Mask) -> None:

@@ -35,28 +35,23 @@ HEADINGS = {  # of the sections, in their order
     "table": "the lab frame: k up from the table, which is z = 0",
     "gravity": "",
 }
-ROWS = (  # section, key, what may stand there, remark
-    ("cameras", "frame_rate_hz", "1000.0", "frames per second of the cameras"),
-    ("cameras", "left", "", ""),
-    ("cameras", "right", "", ""),
-    ("disc", "radius_mm", "37.5", "caliper"),
-    ("disc", "thickness_mm", "6.0", "caliper, with the paper"),
-    ("disc", "mass_g", "209.69", "balance, with the paper"),
-    ("markers", "diameter_mm", "7.0", "as printed"),
-    (
-        "markers",
-        "centres_mm",
-        "[[26.0, 0.0], [13.0, 22.5], [-13.0, 22.5]]",
-        "[x, y] of dots from the disc's centre",
-    ),
-    ("calibration", "left", '"calibration/left/*.png"', "views of a chessboard, 15 to 40 of them"),
-    ("calibration", "right", '"calibration/right/*.png"', "the same views, in the same order"),
-    ("calibration", "inner_corners", "[9, 6]", "long side first; count them"),
-    ("calibration", "square_mm", "6.0", "side of a square, measured over many squares"),
-    ("table", "view", "0", "CHECK: in this view, counted from 0, the board lies flat on the table"),
-    ("table", "board_thickness_mm", "3.0", "height of the printed face above the table"),
-    ("gravity", "g_m_s2", "9.81", "9.78 (equator) to 9.83"),
-)
+ROWS = {  # of the keys that a declaration needs: what may stand there, remark
+    ("cameras", "frame_rate_hz"): ("1000.0", "frames per second of the cameras"),
+    ("cameras", "left"): ("", ""),
+    ("cameras", "right"): ("", ""),
+    ("disc", "radius_mm"): ("37.5", "caliper"),
+    ("disc", "thickness_mm"): ("6.0", "caliper, with the paper"),
+    ("disc", "mass_g"): ("209.69", "balance, with the paper"),
+    ("markers", "diameter_mm"): ("7.0", "as printed"),
+    ("markers", "centres_mm"): ("[[26.0, 0.0], [13.0, 22.5], [-13.0, 22.5]]", "[x, y] of dots from the disc's centre"),
+    ("calibration", "left"): ('"calibration/left/*.png"', "views of a chessboard, 15 to 40 of them"),
+    ("calibration", "right"): ('"calibration/right/*.png"', "the same views, in the same order"),
+    ("calibration", "inner_corners"): ("[9, 6]", "long side first; count them"),
+    ("calibration", "square_mm"): ("6.0", "side of a square, measured over many squares"),
+    ("table", "view"): ("0", "CHECK: in this view, counted from 0, the board lies flat on the table"),
+    ("table", "board_thickness_mm"): ("3.0", "height of the printed face above the table"),
+    ("gravity", "g_m_s2"): ("9.81", "9.78 (equator) to 9.83"),
+}
 # Sections whose keys with a default hold for another recording of the same disc and board
 ALIKE = ("disc", "calibration", "table")
 
@@ -275,25 +270,22 @@ def declaration(
         f"name = {toml_value(name)}",
     ]
     missing = []
-    rig = ("calibration", "rig") in told
+    by_rig = {"calibration", "table"} if ("calibration", "rig") in told else set()  # what a rig file stands for
     for section, heading in HEADINGS.items():
-        if rig and section == "table":
+        if section in by_rig - {"calibration"}:
             continue
         lines += ["", _aligned(f"[{section}]", heading)]
-        given = example.get(section, {})
-        keys = [row[1:] for row in ROWS if row[0] == section and not (rig and section == "calibration")]
-        for key, shown, remark in keys:
-            value, source = told.get((section, key), (known.get(key, given.get(key)), ""))
-            if value is None:
-                missing.append(f"[{section}] {key}")
-                lines.append(_aligned(f"# {key} = {shown}", f"FILL IN: {remark}"))
-            else:
-                lines.append(_aligned(f"{key} = {toml_value(value)}", source or remark))
-        for key in sorted(key for key, meant in KEYS[section].items() if not meant.needed):
-            alike = (section in ALIKE and key != "rig" and not rig) or key == "exposure_us"
+        given = {} if section in by_rig else {**example.get(section, {}), **known}
+        for key in KEYS[section]:
+            needed = (section, key) in ROWS
+            shown, remark = ROWS.get((section, key), ("", ""))
+            alike = needed or (section in ALIKE and key != "rig") or key == "exposure_us"
             value, source = told.get((section, key), (given.get(key) if alike else None, ""))
             if value is not None:
-                lines.append(_aligned(f"{key} = {toml_value(value)}", source))
+                lines.append(_aligned(f"{key} = {toml_value(value)}", source or remark))
+            elif needed and section not in by_rig:
+                missing.append(f"[{section}] {key}")
+                lines.append(_aligned(f"# {key} = {shown}", f"FILL IN: {remark}"))
     return "\n".join(lines) + "\n", tuple(missing)
 
 
