@@ -161,7 +161,7 @@ def quadratic(matrix: Array, vector: Array) -> Array:
 
 def inverse_covariance(covariance: Array, extra: float) -> Array:
     """Inverse of covariance (m, 2, 2) + extra [px^2] in both axes."""
-    return np.linalg.inv(covariance + extra * np.eye(2))
+    return np.asarray(np.linalg.inv(covariance + extra * np.eye(2)), np.float64)
 
 
 def minimise(problem: Problem, start: StereoModel, **how: Any) -> Minimum[StereoModel]:
