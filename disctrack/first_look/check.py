@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 from calibration import CalibrationSettings, StereoCalibration, StereoRig
 from calibration.kit.arrays import evenly
 from calibration.kit.grey_levels import saturation_level
-from calibration.rig_file import read_rig, record_of
+from calibration.rig_file import record_of
 from disctrack.analyse.declaration import Boards, contradictions_of, turned_board
-from disctrack.calibrate.stage import boards_in, boards_of
-from disctrack.calibrate.views import calibrate_views, declared_views
+from disctrack.calibrate.stage import boards_in, boards_of, given_rig, source_of
 from disctrack.disc import Disc
 from disctrack.errors import DiscTrackError, RecordingError
 from disctrack.findings import (
@@ -121,7 +120,7 @@ def run_check(folder: Path, progress: Callable[[str], None] = lambda step: None)
     if pairs is None:
         return seen
     progress("light")
-    _light(seen, recording, pairs)
+    _light(seen, pairs)
     if rig is None:
         if recording.chessboard is not None:
             seen.findings += turned_board(recording.chessboard.inner_corners)
@@ -146,20 +145,18 @@ def _frames(seen: Check, recording: Recording) -> ImagePairs:
 
 def _rig(seen: Check, recording: Recording) -> StereoRig:
     if recording.rig_file is not None:
-        rig = read_rig(recording.rig_file)
-        seen.seen.append(("rig", f"{recording.rig_file}: baseline {1e3 * rig.baseline:.1f} mm"))
+        rig, told = given_rig(recording.rig_file)
+        seen.seen.append(("rig", told.verdict))
         seen.boards = boards_in(recording.rig_file, recording)
         return rig
-    declared, table = recording.views, recording.table
-    assert declared is not None
+    source = source_of(recording, CalibrationSettings())
+    views, table = source.views, source.table_view
     assert table is not None
-    views = declared_views(recording, declared)
-    if table.view >= len(views):
-        raise RecordingError(f"[table] view = {table.view}, but there are {len(views)} views, counted from 0")
-    chosen = sorted({*evenly(len(views), VIEWS_LOOKED_AT), table.view})
+    if table >= len(views):
+        raise RecordingError(f"[table] view = {table}, but there are {len(views)} views, counted from 0")
+    chosen = sorted({*evenly(len(views), VIEWS_LOOKED_AT), table})
     some = replace(views, left=tuple(views.left[i] for i in chosen), right=tuple(views.right[i] for i in chosen))
-    view, settings = chosen.index(table.view), CalibrationSettings()
-    found, problems = calibrate_views(some, declared.target, view, table.board_thickness, settings)
+    found, problems = replace(source, views=some, table_view=chosen.index(table)).calibrated(None)
     seen.calibration, seen.boards = found, boards_of(record_of(found), some, chosen)
     used = len(chosen) - len(problems) - len(found.rejected_views)
     text = f"found in {used} of {len(chosen)} pairs of views looked at ({len(views)} in all)"
@@ -173,7 +170,7 @@ def _rig(seen: Check, recording: Recording) -> StereoRig:
     return found.rig
 
 
-def _light(seen: Check, recording: Recording, pairs: ImagePairs) -> None:
+def _light(seen: Check, pairs: ImagePairs) -> None:
     images = np.array(seen.images(pairs, [round(place * (len(pairs) - 1)) for place in PLACES]))
     if not len(images):
         seen.refuse(Kind.UNREADABLE, "none of the frames looked at can be read", "copy the frames again")
