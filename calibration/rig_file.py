@@ -4,8 +4,8 @@ import contextlib
 import io
 import json
 import os
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from importlib import metadata
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -102,20 +102,10 @@ _BEYOND_MODEL = {
     ),
     "lens_field_spacing": Dataset((), "px", "of the splines' grid"),
 }
-# Parts of a record that are JSON: what describes the dataset, "" of an attribute, and how the part comes back from it
-_OF_TEXT: dict[str, tuple[str, Callable[[Any], Any]]] = {
-    "settings": ("", dict),
-    "figures": ("", dict),
-    "versions": ("", dict),
-    "warnings": ("", tuple),
-    "apart": ("", tuple),
-    "view_names": ("", lambda names: tuple((str(left), str(right)) for left, right in names)),
-    "rejected_views": ("", lambda found: {int(view): str(reason) for view, reason in found.items()}),
-    "rejected_corners": (
-        "JSON list of view, camera, corner, reason",
-        lambda rows: tuple((int(v), int(c), int(i), str(reason)) for v, c, i, reason in rows),
-    ),
-    "board": ("JSON object: kind of target and its fields, lengths in m", target_of),
+_TOLD = ("settings", "figures", "versions", "warnings", "rejected_views", "rejected_corners")
+_LONG = {  # parts of a record in JSON that are datasets, as an attribute has 64 kB at most
+    "rejected_corners": "JSON list of view, camera, corner, reason",
+    "board": "JSON object: kind of target and its fields, lengths in m",
 }
 
 
@@ -134,12 +124,9 @@ class CalibrationRecord:
     unexplained_sigma: float  # [px]
     R_left_board: Array  # (n_views + those apart, 3, 3), to which the observations' `view` refers
     t_left_board: Array  # (n_views + those apart, 3) [m]
-    settings: dict[str, Any]
-    figures: dict[str, Any]  # rms, chosen terms, cross-validation table, assessment
-    rejected_views: dict[int, str]
-    rejected_corners: tuple[tuple[int, int, int, str], ...]  # view, camera, corner, reason
-    warnings: tuple[str, ...]
-    versions: dict[str, str] = field(default_factory=dict)
+    # of JSON's types: settings; figures (rms, chosen terms, cross-validation table, assessment); versions of software;
+    # warnings; rejected_views (view: reason); rejected_corners (view, camera, corner, reason)
+    told: dict[str, Any]
     apart: tuple[int, ...] = ()  # views whose right image has a place of the board of its own, n_views + 0, 1, ...
 
 
@@ -176,9 +163,16 @@ def record_of(calibration: StereoCalibration) -> CalibrationRecord:
         boards = zip((model.R_left_board, model.t_left_board), model.boards_right, strict=True)
         R, t = (np.concatenate(both) for both in boards)
         model = replace(model, R_left_board=R, t_left_board=t, boards_right=None)
-    same = ("board", "board_points", "table_view", "board_thickness", "rejected_views", "warnings")
+    told = {
+        "settings": asdict(calibration.settings),
+        "figures": figures,
+        "versions": versions(("disctrack", "numpy", "scipy", "opencv-contrib-python-headless", "numba", "h5py")),
+        "warnings": calibration.warnings,
+        "rejected_views": calibration.rejected_views,
+        "rejected_corners": calibration.rejected_corners(),
+    }
     return CalibrationRecord(
-        **{name: getattr(calibration, name) for name in same},
+        **{name: getattr(calibration, name) for name in ("board", "board_points", "table_view", "board_thickness")},
         view_names=tuple((str(a), str(b)) for a, b in calibration.view_names),
         observations=observations,
         kept=r.kept,
@@ -186,10 +180,7 @@ def record_of(calibration: StereoCalibration) -> CalibrationRecord:
         unexplained_sigma=r.unexplained_sigma,
         R_left_board=model.R_left_board,
         t_left_board=model.t_left_board,
-        settings=_plain(asdict(calibration.settings)),
-        figures=_plain(figures),
-        rejected_corners=tuple(calibration.rejected_corners()),
-        versions=versions(("disctrack", "numpy", "scipy", "opencv-contrib-python-headless", "numba", "h5py")),
+        told=json.loads(json.dumps(told, default=lambda o: o.item() if hasattr(o, "item") else str(o))),
         apart=apart,
     )
 
@@ -201,11 +192,6 @@ def versions(packages: Sequence[str]) -> dict[str, str]:
         with contextlib.suppress(metadata.PackageNotFoundError):
             found[name] = metadata.version(name)
     return found
-
-
-def _plain(value: Any) -> Any:
-    """The value as JSON gives it back."""
-    return json.loads(json.dumps(value, default=lambda o: o.item() if hasattr(o, "item") else str(o)))
 
 
 # --- writing ---------------------------------------------------------------------------------------------------------
@@ -317,16 +303,15 @@ def write_attributes(group: h5py.Group, document: Mapping[str, Any]) -> None:
 
 
 def _write_record(group: h5py.Group, record: CalibrationRecord) -> None:
-    write_attributes(group, {"settings": record.settings, "figures": record.figures, "versions": record.versions})
+    write_attributes(group, {name: record.told[name] for name in ("settings", "figures", "versions")})
     group.attrs["table_view"] = -1 if record.table_view is None else record.table_view
-    for name, (description, _) in _OF_TEXT.items():
-        value = getattr(record, name)
-        text = json.dumps(value.described() if isinstance(value, Target) else value)
-        if description:
-            group.create_dataset(name, data=text, dtype=h5py.string_dtype())
-            group[name].attrs["description"] = description
+    board = {"board": record.board.described(), "view_names": record.view_names, "apart": record.apart}
+    for name, part in (record.told | board).items():
+        if name in _LONG:
+            group.create_dataset(name, data=json.dumps(part), dtype=h5py.string_dtype())
+            group[name].attrs["description"] = _LONG[name]
         else:
-            group.attrs[name] = text
+            group.attrs[name] = json.dumps(part)
     o = record.observations
     seen = (o.view, o.camera, o.point, o.pixels, o.covariance)
     values = {name: getattr(record, name) for name in _OF_RECORD} | dict(zip(_OF_OBSERVATIONS, seen, strict=True))
@@ -433,15 +418,12 @@ def read_beyond_model(group: h5py.Group) -> dict[str, Any]:
 
 
 def _read_record(group: h5py.Group) -> CalibrationRecord:
-    known: dict[str, Any] = {}
-    for name, (description, back) in _OF_TEXT.items():
-        known[name] = back(json.loads(group[name].asstr()[()] if description else group.attrs[name]))
-    sizes = {
-        "points": len(known["board"].points),
-        "places": len(known["view_names"]) + len(known["apart"]),
-        "seen": len(group["pixels"]),
-    }
-    known |= {name: _get(group, name, row, sizes) for name, row in _OF_RECORD.items()}
+    def text(name: str) -> Any:
+        return json.loads(group[name].asstr()[()] if name in _LONG else group.attrs[name])
+
+    board, names, apart = target_of(text("board")), text("view_names"), tuple(text("apart"))
+    sizes = {"points": len(board.points), "places": len(names) + len(apart), "seen": len(group["pixels"])}
+    known: dict[str, Any] = {name: _get(group, name, row, sizes) for name, row in _OF_RECORD.items()}
     seen = {name: _get(group, name, row, sizes) for name, row in _OF_OBSERVATIONS.items()}
     for name, limit in (("view", sizes["places"]), ("camera", 2), ("point", sizes["points"])):
         index = seen[name] = seen[name].astype(np.intp)
@@ -450,6 +432,10 @@ def _read_record(group: h5py.Group) -> CalibrationRecord:
     table_view = int(group.attrs["table_view"])
     known |= {name: float(known[name]) for name in ("board_thickness", "unexplained_sigma")}
     known |= {
+        "board": board,
+        "view_names": tuple((str(left), str(right)) for left, right in names),
+        "apart": apart,
+        "told": {name: text(name) for name in _TOLD},
         "table_view": None if table_view < 0 else table_view,
         "observations": Observations(*seen.values()),
         "kept": known["kept"].astype(bool),

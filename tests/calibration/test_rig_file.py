@@ -50,12 +50,14 @@ def content(rig, rng):
         unexplained_sigma=0.01,
         R_left_board=np.stack([rotation_from_vector(v) for v in rng.normal(size=(3, 3))]),
         t_left_board=rng.normal(size=(3, 3)),
-        settings={"distortion": "auto", "threads": 2},
-        figures={"rms_px": 0.012, "cross_validation": [{"distortion": "k1", "rms_px": 0.1}]},
-        rejected_views={2: "the board moved"},
-        rejected_corners=((0, 1, 7, "contrast"),),
-        warnings=("few views",),
-        versions={"numpy": "2"},
+        told={
+            "settings": {"distortion": "auto", "threads": 2},
+            "figures": {"rms_px": 0.012, "cross_validation": [{"distortion": "k1", "rms_px": 0.1}]},
+            "versions": {"numpy": "2"},
+            "warnings": ["few views"],
+            "rejected_views": {"2": "the board moved"},
+            "rejected_corners": [[0, 1, 7, "contrast"]],
+        },
     )
     return RigFile(rig, record)
 
