@@ -12,18 +12,16 @@ from disctrack.diagnosis.plan import Plan
 from disctrack.diagnosis.systematic import Systematic
 from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.laws import LearnedLaw
-from disctrack.discrepancy.search import Diagnosis
+from disctrack.discrepancy.search import Diagnosis, Found
 from disctrack.discrepancy.words import effect_text
 from disctrack.numbers import Measured, probability, rounded
 
 
 @dataclass(frozen=True)
-class Learned:
+class Learned(Found):
     """A law outside the catalogue, fitted like an effect."""
 
     law: LearnedLaw
-    gain: float  # decrease of chi-square in units of the noise found
-    held_out_gain: float
     power: float  # mean over the recording [W]; negative where it takes energy from the disc
     course: Course | None  # of the moment about the contact of all laws, with what the law's form may be off by
     misfit: float  # rms of that over the law's own, as the residual has it
@@ -35,7 +33,7 @@ class Learned:
 
     def text(self, fit: Fit) -> str:
         """The law with its numbers."""
-        quantities = self.law.candidate.quantities
+        quantities = self.candidate.quantities
         numbers = ", ".join(f"{q.part} = {Measured(fit.values[q.name], fit.sigma(q.name))}" for q in quantities)
         formulas = "; ".join(f"{component} = {formula}" for component, formula in self.law.formulas.items())
         angles = ", locked to the disc's angles" if locked(self.law) else ""

@@ -154,7 +154,7 @@ def _with_law(
     if _of_motion(established):  # what holds beside any law does not stand in with this one
         after, _, course, misfit = with_form(*as_found, _of_motion(f for f in kept if f not in established))
     gain = (diagnosis.before.cost - fitted.cost) / noise
-    learned = Learned(law, gain, float(held_gain), power, course, misfit)
+    learned = Learned(law.candidate, gain, float(held_gain), np.nan, (), law, power, course, misfit)
     reason = f"{diagnosis.reason}; the law {law.candidate.title} leaves {fitted.reduced_chi_square:.3g}"
     diagnosis = replace(
         diagnosis, verdict="unexplained", found=established, after=after, held_out_after=held, reason=reason

@@ -15,7 +15,6 @@ from disctrack.diagnosis.law_library import locked
 from disctrack.diagnosis.plan import Plan
 from disctrack.discrepancy.document import declared_json, document, effect_json
 from disctrack.discrepancy.fit import Fit
-from disctrack.discrepancy.search import Found
 from disctrack.files.json_text import json_text, plain
 from disctrack.files.labelled_arrays import Variable
 from disctrack.frames import COORDINATES, POSE_COMPONENTS
@@ -48,8 +47,7 @@ def _learned(learned: Learned, fit: Fit) -> dict[str, Any]:
     law, course = learned.law, {}
     if (known := learned.course) is not None:
         course = {"time_s": known.time, "N_m": known.values, "sigma_N_m": known.sigma, "misfit_of_form": learned.misfit}
-    as_found = Found(law.candidate, learned.gain, learned.held_out_gain, float("nan"), ())
-    return effect_json(as_found, fit) | {
+    return effect_json(learned, fit) | {
         "kind": "learned",
         "formulas": law.formulas,
         "meaning": law.title,
