@@ -16,9 +16,8 @@ from disctrack.trajectory.file import Provenance, write_trajectory
 from tests.oracles import newton_euler
 from tests.oracles.measured_disc import K_M, measured
 
-RIG = 5
 RATE = 400.0
-VISCOSITY = 1.81e-5  # [Pa s] of the air, for which Moffatt's layer has f = 1
+RIG = {"declared_rate": RATE, "rig_seed": 5}
 F = 0.3
 
 
@@ -29,7 +28,7 @@ def independent(seed, f=0.0, axial=1.0):
     J1, J3 = declared.moment_diametral, declared.moment_axial
     body = newton_euler.Disc(
         declared.radius, declared.half_thickness, declared.mass, J_body=np.diag([J1, J1, axial * J3]),
-        laws=(newton_euler.precession_friction(K_M), newton_euler.moffatt(f * VISCOSITY)),
+        laws=(newton_euler.precession_friction(K_M), newton_euler.moffatt(1.81e-5 * f)),
     )  # fmt: skip
     theta = np.radians(rng.uniform(4, 9))
     omega2 = np.sqrt(4 * 9.81 * np.sin(theta) / body.r)
@@ -40,7 +39,7 @@ def independent(seed, f=0.0, axial=1.0):
         answer = newton_euler.follow(body, state, np.r_[0.0, times], rtol=1e-10, atol=1e-11, method="LSODA")
         return newton_euler.coordinates(body, answer.y)[1:]
 
-    trajectory = measured(seed=seed, n=130, declared_rate=RATE, motion=motion, rig_seed=RIG)
+    trajectory = measured(seed=seed, n=130, motion=motion, **RIG)
     return Recorded(f"run {seed}", trajectory)
 
 
@@ -72,7 +71,7 @@ def test_nothing_is_claimed_of_recordings_without_an_effect_and_the_command_says
     for seed in range(4):
         paths.append(tmp_path / f"{seed}.h5")
         theta = 5.0 + seed
-        trajectory = measured(seed=50 + seed, n=100, theta_deg=theta, declared_rate=RATE, rig_seed=RIG)
+        trajectory = measured(seed=50 + seed, n=100, theta_deg=theta, **RIG)
         write_trajectory(paths[-1], trajectory, Provenance("one name", {"frames": str(seed)}, {}))
     words = ["diagnose", *map(str, paths), "-o", str(tmp_path / "out"), "-j", "2"]
     assert main(words) == 0
@@ -98,7 +97,7 @@ def test_nothing_is_claimed_of_recordings_without_an_effect_and_the_command_says
 @pytest.mark.statistical
 def test_files_that_cannot_be_read_are_left_out_by_name_and_the_others_are_diagnosed(tmp_path, capsys):
     for seed in range(2):
-        trajectory = measured(seed=50 + seed, n=60, theta_deg=5.0 + seed, declared_rate=RATE, rig_seed=RIG)
+        trajectory = measured(seed=50 + seed, n=60, theta_deg=5.0 + seed, **RIG)
         write_trajectory(tmp_path / f"{seed}.h5", trajectory, Provenance(f"run {seed}", {"frames": str(seed)}, {}))
     (tmp_path / "empty.h5").write_bytes(b"")
     (tmp_path / "cut.h5").write_bytes((tmp_path / "0.h5").read_bytes()[:9000])
@@ -125,7 +124,7 @@ def test_files_that_cannot_be_read_are_left_out_by_name_and_the_others_are_diagn
 @pytest.mark.parametrize("mass", [1.0, 0.35])
 def test_a_planned_recording_brings_what_it_brings_when_it_is_made(mass):
     """With another disc, too, whose k_m is its own."""
-    first = measured(seed=1, n=120, theta_deg=6.0, omega3=1.0, declared_rate=RATE, rig_seed=RIG)
+    first = measured(seed=1, n=120, theta_deg=6.0, omega3=1.0, **RIG)
     result = diagnose(first)
     system, fit = result.system, result.diagnosis.after
     candidate = next(c for c in system.candidates if c.name == "air_bildsten")
@@ -133,7 +132,7 @@ def test_a_planned_recording_brings_what_it_brings_when_it_is_made(mass):
     rows, duration = planner.with_(Proposal(12.0, 2.0, 0.3, mass=mass))
     disc = replace(first.disc, mass=mass * first.disc.mass)
     made = measured(seed=2, n=round(duration * RATE) + 1, theta_deg=12.0, nutation_deg=0.6, omega3=2.0,
-                    declared_rate=RATE, rig_seed=RIG, disc=disc)  # fmt: skip
+                    disc=disc, **RIG)  # fmt: skip
     both = diagnose_together([Recorded("first", first), Recorded("second", made)])
     (bound,) = [b for b in both.bounds if b.candidate.name == "air_bildsten"]
     assert planner.sigma(planner.now, candidate) == pytest.approx(float(bound.by_number[1][0]), rel=0.05)
