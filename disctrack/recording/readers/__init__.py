@@ -13,8 +13,8 @@ from disctrack.recording.readers.files import FORMATS, IMAGES, NUMBER, match_fil
 def open_frames(pattern: str, folder: str | Path, camera: str) -> FrameReader:
     """Reader of one camera's frames: a file pattern, relative to `folder`.
 
-    pattern : "left/*.png", "left.mkv", "stack.tif", or "frames.h5:/left" for a data set in an HDF5 file;
-        "left/*_{number}_a.png" where the names alone do not tell which digits count the frames
+    pattern : `left/*.png`, `left.mkv`, `stack.tif`, or `frames.h5:/left` for a data set in an HDF5 file;
+        `left/*_{number}_a.png` where the names alone do not tell which digits count the frames
     camera  : "left" or "right", for messages
     Raises RecordingError if nothing matches, or if no frame can be read.
 
