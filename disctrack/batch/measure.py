@@ -35,7 +35,7 @@ from disctrack.files.whole import write_whole
 from disctrack.findings import Kind, leading
 from disctrack.progress import StageTime, recorded_times, timed
 from disctrack.recording.declaration import Recording, read_recording
-from disctrack.track.measurement import ImagePairs, check_rig, measure, open_pairs, trajectory_provenance
+from disctrack.track.measurement import ImagePairs, measure, open_pairs, trajectory_provenance
 from disctrack.trajectory import Trajectory
 from disctrack.trajectory import file as storage
 from disctrack.trajectory.file import Provenance
@@ -89,7 +89,6 @@ def _make_recording(job: Job, results: Path) -> Record:
     asked = stages_asked(job.options)
     recording = read_recording(job.folder)
     rig, pairs = read_rig(job.rig), open_pairs(recording)
-    check_rig(rig, pairs, job.rig)
     path = results / "trajectory.h5"
     tracking: list[StageTime] = []
     provenance = _reusable(path, recording, rig, pairs) if not job.options.overwrite else None

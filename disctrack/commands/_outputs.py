@@ -30,7 +30,7 @@ from disctrack.report.html import link_pages
 from disctrack.report.terminal import show
 from disctrack.track import run_summary as summary
 from disctrack.track.follow.tracking import TrackingSettings
-from disctrack.track.measurement import ImagePairs, check_rig, measure, trajectory_provenance
+from disctrack.track.measurement import ImagePairs, measure, trajectory_provenance
 from disctrack.track.video_overlay import shown_rows, write_overlay
 from disctrack.trajectory import Trajectory
 from disctrack.trajectory import file as storage
@@ -52,7 +52,6 @@ def track_into(
 
     Raises OutputError if `path` holds something else and may not be replaced.
     """
-    check_rig(rig, pairs, str(rig_file))
     rows = [("recording", f"{recording.name}: {len(pairs)} pairs at {recording.frame_rate:g} Hz")]
     trajectory, details = None, {}
     fresh, settings = False, TrackingSettings(first_pass=not (arguments.all or arguments.frames))

@@ -31,7 +31,7 @@ from disctrack.diagnosis.systematic import DOT_SIGMA, Systematic, field_columns
 from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.laws import Family, LawSystem, LearnedLaw
 from disctrack.discrepancy.system import Budget, Candidate, Quantity, Values
-from disctrack.faults.catalogue import faults_of, setup_of
+from disctrack.faults.catalogue import faults_of, scene_faults
 from disctrack.faults.dots import Sight, predict
 from disctrack.frames import euler_rate_axes_world, rotation_from_euler
 from disctrack.rolling import Model, sensitivities, simulate
@@ -219,7 +219,7 @@ class DiscSystem(LawSystem):
 
     def static_view(self, rows: NDArray[np.intp], known: Values) -> StaticView:
         """The dots of these rows about their measured poses. known : faults that the poses were found with."""
-        delay = setup_of(self.disc, known).delay
+        delay = scene_faults(self.disc, known).right_delay_s
         sight = self._sight(self._as_measured(delay), known)
         if delay:  # the right camera saw a pose earlier, or later
             rows = rows[(self.time[rows] + delay > self.time[0]) & (self.time[rows] + delay < self.time[-1])]
@@ -230,12 +230,12 @@ class DiscSystem(LawSystem):
         }
         nuisances, m = self._nuisance_columns[rows], self.disc.n_markers
         n_rig = len(self.rig_directions)
-        whitened = (self._whiten[rows] @ sight.images.by_pose[rows]).reshape(len(rows), -1, 6)
+        whitened = (self._whiten[rows] @ sight.by_pose[rows]).reshape(len(rows), -1, 6)
         across = np.eye(whitened.shape[1]) - whitened @ np.linalg.pinv(whitened)
-        residual = self._rows_of(self.observed - sight.images.pixels)[rows]
+        residual = self._rows_of(self.observed - sight.pixels)[rows]
         return StaticView(
             residual, across, nuisances[..., :n_rig], nuisances[..., n_rig : n_rig + 2 * m], faults,
-            sight.images.pixels[rows], self.used[rows], self._whiten[rows],
+            sight.pixels[rows], self.used[rows], self._whiten[rows],
         )  # fmt: skip
 
     def start(self) -> dict[str, float]:
@@ -304,17 +304,17 @@ class DiscSystem(LawSystem):
 
     def instants(self, values: Values) -> Array:
         """(n,) true times of the frames [s], by the left camera."""
-        return self.start_time + (self.time - self.start_time) / setup_of(self.disc, values).rate
+        return self.start_time + (self.time - self.start_time) / (scene_faults(self.disc, values).frame_rate_hz or 1.0)
 
     def linearise(self, values: Values, names: Sequence[str]) -> tuple[Array, Array]:
         """Whitened dots (n, 4 m), observed minus predicted, and the prediction's derivative (n, 4 m, k)."""
         path = self._path(values, names)
         sight = self._sight(path, values)
-        residual = self._residual(sight.images.pixels, values)
+        residual = self._residual(sight.pixels, values)
         derivative = np.zeros((*residual.shape, len(names)))
         column = {name: i for i, name in enumerate(names)}
         if path.names:
-            whitened = (self._whiten @ sight.images.by_pose).reshape(*residual.shape, 6)
+            whitened = (self._whiten @ sight.by_pose).reshape(*residual.shape, 6)
             derivative[..., [column[n] for n in path.names]] = whitened @ path.by_motion
         common = [n for n in names if n in self._nuisance_column]
         if common:
@@ -328,7 +328,7 @@ class DiscSystem(LawSystem):
 
     def pixels(self, values: Values, with_nuisances: bool = False) -> Array:
         """Predicted images of the dots (n, 2, m, 2) [px], with the biases that nuisances stand for if wanted."""
-        pixels = self._sight(self._path(values, ()), values).images.pixels
+        pixels = self._sight(self._path(values, ()), values).pixels
         if not with_nuisances:
             return pixels
         whitened = (self._nuisance_columns @ self._nuisance_values(values)).reshape(pixels.shape)
@@ -364,9 +364,9 @@ class DiscSystem(LawSystem):
 
     def _pose_equations(self, values: Values) -> tuple[Array, Array, Array]:
         """Residual (n, 4 m), its derivative (n, 4 m, 6) and normal matrix (n, 6, 6) by a free pose per frame."""
-        images = self._sight(self._path(values, ()), values).images
-        r = self._residual(images.pixels, values)
-        J = (self._whiten @ images.by_pose).reshape(len(r), -1, 6)
+        sight = self._sight(self._path(values, ()), values)
+        r = self._residual(sight.pixels, values)
+        J = (self._whiten @ sight.by_pose).reshape(len(r), -1, 6)
         normal = np.swapaxes(J, 1, 2) @ J
         normal[self.weights < 6] = np.eye(6)
         return r, J, normal
@@ -385,7 +385,7 @@ class DiscSystem(LawSystem):
 
     def _path(self, values: Values, names: Sequence[str]) -> _Path:
         """Motion at the true instants of both cameras, and the derivatives that belong to it."""
-        times, delay = self.instants(values), setup_of(self.disc, values).delay
+        times, delay = self.instants(values), scene_faults(self.disc, values).right_delay_s
         model, state = self.model_with({k: v for k, v in values.items() if np.isfinite(v)}), state_of(values)
         # a step of the fit may lead where no disc rolls, and where following it would take for ever
         fastest = 3 * np.sqrt(4 * model.gravity / (self.disc.radius * np.sin(THETA_END)))
@@ -418,12 +418,12 @@ class DiscSystem(LawSystem):
         axes = euler_rate_axes_world(q[..., 3], q[..., 4])
         speed[..., 3:] = (axes @ speed[..., 3:, None])[..., 0]
         R, t = rotation_from_euler(q[..., 3], q[..., 4], q[..., 5]), q[..., :3]
-        images = predict(R, t, self.rig, self.disc, setup_of(self.disc, values))
-        sight = Sight(self.time, R, t, speed, self.rig, self.disc, values, images)
+        images = predict(R, t, self.rig, self.disc, scene_faults(self.disc, values))
+        sight = Sight(self.time, R, t, speed, self.rig, self.disc, values, *images)
         for fault in self.faults:
             if fault.in_images and (v := fault.numbers(values)).any():
                 shift = sum(x * fault.column(part, sight) for x, part in zip(v, fault.parts, strict=True))
-                sight = replace(sight, images=replace(sight.images, pixels=sight.images.pixels + shift))
+                sight = replace(sight, pixels=sight.pixels + shift)
         return sight
 
 

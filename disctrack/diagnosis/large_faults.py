@@ -19,7 +19,8 @@ from disctrack.discrepancy.fit import Fit, fit
 from disctrack.discrepancy.search import Diagnosis, Found, Settings, beside, explain
 from disctrack.discrepancy.system import Candidate, Values
 from disctrack.errors import AnalysisError
-from disctrack.faults.catalogue import faults_of, setup_of
+from disctrack.faults.catalogue import faults_of, scene_faults
+from disctrack.faults.dots import cameras_with, centres_with
 from disctrack.frames import CAMERAS, euler_from_rotation, rotation_from_euler, unwrap_euler
 from disctrack.rolling import Model
 from disctrack.track.pose import fit_poses
@@ -58,20 +59,22 @@ def poses_with(trajectory: Trajectory, values: Values) -> Trajectory:
 
     Dots and rig stay as measured and as calibrated.
     """
-    setup = setup_of(trajectory.disc, values)
+    faults = scene_faults(trajectory.disc, values)
     pixels = trajectory.markers_px.copy()
-    for dot in range(pixels.shape[2]) if setup.delay else ():  # those of the right camera at the left one's instants
+    for dot in (
+        range(pixels.shape[2]) if faults.right_delay_s else ()
+    ):  # those of the right camera at the left one's instants
         seen = np.asarray(np.isfinite(pixels[:, 1, dot]).all(axis=1))
         moved = np.full_like(pixels[:, 1, dot], np.nan)
         if seen.sum() >= 8:
             course = CubicSpline(trajectory.time[seen], pixels[seen, 1, dot])
-            moved[seen] = course(trajectory.time[seen] - setup.delay, extrapolate=False)
+            moved[seen] = course(trajectory.time[seen] - faults.right_delay_s, extrapolate=False)
         pixels[:, 1, dot] = moved
     fits = fit_poses(
         pixels,
         trajectory.markers_covariance_px2,
-        setup.cameras_of(trajectory.rig),
-        setup.centres(trajectory.disc),
+        cameras_with(faults, trajectory.rig),
+        centres_with(faults, trajectory.disc),
         rotation_from_euler(*trajectory.q[:, 3:].T),
         trajectory.q[:, :3],
         reject_outliers=False,

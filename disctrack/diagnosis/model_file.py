@@ -6,12 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.cameras.camera import StereoRig, placed_at, rotation_from_vector
+from calibration.cameras.camera import StereoRig, placed_at
 from calibration.kit.arrays import Array
 from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.discrepancy.system import Values
 from disctrack.errors import AnalysisError
-from disctrack.faults.catalogue import scene_faults, setup_of, values_in_scene
+from disctrack.faults.catalogue import scene_faults, values_in_scene
+from disctrack.faults.dots import true_table
 from disctrack.rolling import CATALOGUE, Model, effects_from_tables
 from disctrack.synthetic.description import RigSettings, Scene, load_scene, scene_toml
 from disctrack.trajectory import Trajectory
@@ -141,7 +142,6 @@ def _above_the_table(system: DiscSystem, values: Values) -> tuple[StereoRig, Val
     rendered and levelled again.
     """
     own = {q.name for q in system.base if q.name.startswith(OF_TABLE)}
-    setup = setup_of(system.disc, {name: value for name, value in values.items() if name in own})
-    turn, shift = rotation_from_vector(setup.table_turn), np.array([0.0, 0.0, setup.table_height])
+    turn, shift = true_table(scene_faults(system.disc, {name: value for name, value in values.items() if name in own}))
     poses = [(R @ turn, t + R @ shift) for R, t in system.rig.camera_poses()]
     return replace(system.rig, **placed_at(poses)), {n: v for n, v in values.items() if n not in own}

@@ -113,4 +113,4 @@ def candidate_of_fault(fault: Fault) -> Candidate:
 
 def measurement_candidates(disc: Disc) -> tuple[Candidate, ...]:
     """Every fault that a search may find by its quantities alone."""
-    return tuple(candidate_of_fault(fault) for fault in faults_of(disc) if fault.offered)
+    return tuple(candidate_of_fault(fault) for fault in faults_of(disc))

@@ -1,8 +1,8 @@
-"""The faults, one by one: quantities, what each alters, where a scene holds it, and its words.
+"""The faults, one by one: quantities, where a scene holds each, and its words.
 
-An entry says in `alters` which numbers of the `MeasurementSetup` it is, and in `key` which of a scene's `Faults`; where
-that is not all, in `along` what it does to the dots, and in `to_key`, `from_key` how a scene states it. Candidates of
-the diagnosis, scenes, saved models, planted faults and the page of faults are made from these entries.
+An entry says in `key` which of a scene's `Faults` its numbers are; where that is not all, in `to_key`, `from_key` how a
+scene states them, and in `along` what they do to the dots. Candidates of the diagnosis, scenes, saved models, planted
+faults and the page of faults are made from these entries.
 
 Quantities are addressed by name, as parameters of the effects of the motion are: "right_turned.rotation_x". Null is
 always zero: as calibrated, as declared.
@@ -17,7 +17,7 @@ import numpy as np
 
 from calibration.kit.arrays import Array
 from disctrack.disc import Disc
-from disctrack.faults.dots import MeasurementSetup, Sight, ellipse_centre_shift, predict
+from disctrack.faults.dots import Sight, ellipse_centre_shift, predict
 from disctrack.faults.keys import Faults
 from disctrack.findings import Kind
 from disctrack.frames import CAMERAS
@@ -40,14 +40,12 @@ class Fault:
     step: float  # of a fit: a hundredth of a pixel or so in the image
     meaning: str
     key: str  # of a scene's `Faults`: "table_height_mm", "left.rotation_deg"
-    alters: tuple[str | int | slice, ...] = ()  # place in the `MeasurementSetup`
     factor: float = 1.0  # the scene's key holds null + factor times the numbers
     null: float = 0.0
     bounds: tuple[float, float] = (-np.inf, np.inf)  # beyond which no laboratory's lies
     belongs_to: tuple[str, ...] = ("rig",)  # what two recordings must have in common to share it
     in_images: bool = False  # adds its number times `column` to the dots' images
     of_poses_alone: bool = True  # may show in dots about free poses, without a model of the motion
-    offered: bool = True  # as a candidate: it needs no number that is no quantity
     along: Callable[["Fault", str, Sight], Array] | None = None  # the column of a part; None: by difference
     to_key: Callable[[Array, Any, float], Any] | None = None  # numbers, the key so far, declared rate [Hz] -> the key
     from_key: Callable[[Any, float], Any] | None = None
@@ -64,28 +62,18 @@ class Fault:
         """Its numbers among the values; zero where they are not."""
         return np.array([float(values.get(name, 0.0)) for name in self.names()])
 
-    def alter(self, setup: MeasurementSetup, v: Array) -> None:
-        """Write its numbers v into the setup."""
-        *way, last = self.alters or ("",)
-        place: Any = setup
-        for step in way:
-            place = getattr(place, step) if isinstance(step, str) else place[step]
-        if not isinstance(last, str):
-            place[last] = v
-        elif last:
-            setattr(place, last, v if len(v) > 1 else float(v[0]))
-
     def column(self, part: str, sight: Sight) -> Array:
         """Derivative (n, 2, m, 2) of the dots' images by one of its numbers.
 
-        By central difference: what `alter` changes acts smoothly and nearly linearly, and this holds to 1e-8 of it.
+        By central difference: what is altered acts smoothly and nearly linearly, and this holds to 1e-8 of it.
         """
         if self.along is not None:
             return self.along(self, part, sight)
         name, sides = f"{self.name}.{part}", []
         for sign in (1.0, -1.0):
             changed = dict(sight.values) | {name: sight.values.get(name, 0.0) + sign * self.step}
-            sides.append(predict(sight.R, sight.t, sight.rig, sight.disc, setup_of(sight.disc, changed)).pixels)
+            faults = scene_faults(sight.disc, changed)
+            sides.append(predict(sight.R, sight.t, sight.rig, sight.disc, faults)[0])
         return (sides[0] - sides[1]) / (2 * self.step)
 
     def to_scene(self, faults: Faults, v: Array, rate: float) -> Faults:
@@ -112,11 +100,11 @@ class Fault:
 
 def _moved(sight: Sight, camera: int, by: Array) -> Array:
     """Shift of the dots in one camera, all of a frame by a time that is later by `by` (n,) [s]."""
-    return np.einsum("nmap,np->nma", sight.images.by_pose[:, camera], sight.speed[camera] * by[:, None])
+    return np.einsum("nmap,np->nma", sight.by_pose[:, camera], sight.speed[camera] * by[:, None])
 
 
 def _delayed(fault: Fault, part: str, sight: Sight) -> Array:
-    moved = np.zeros_like(sight.images.pixels)
+    moved = np.zeros_like(sight.pixels)
     moved[:, 1] = _moved(sight, 1, np.ones(len(sight.time)))
     return moved
 
@@ -128,15 +116,15 @@ def _faster(fault: Fault, part: str, sight: Sight) -> Array:
 
 
 def _of_one_dot(fault: Fault, part: str, sight: Sight) -> Array:
-    moved, dot = np.zeros_like(sight.images.pixels), int(fault.name.partition("_")[2])
+    moved, dot = np.zeros_like(sight.pixels), int(fault.name.partition("_")[2])
     along = sight.R[:, :, :, fault.parts.index(part)]  # (2, n, 3) body axis in the world
-    moved[:, :, dot] = np.einsum("ncap,cnp->nca", sight.images.by_pose[:, :, dot, :, :3], along)
+    moved[:, :, dot] = np.einsum("ncap,cnp->nca", sight.by_pose[:, :, dot, :, :3], along)
     return moved
 
 
 def _blurred(fault: Fault, part: str, sight: Sight) -> Array:
     """Second derivative of the dots' images by differences over neighbouring frames."""
-    twice = np.gradient(np.gradient(sight.images.pixels, sight.time, axis=0), sight.time, axis=0)
+    twice = np.gradient(np.gradient(sight.pixels, sight.time, axis=0), sight.time, axis=0)
     return np.asarray(twice, float) / 24
 
 
@@ -153,12 +141,12 @@ def _row(dot: int, rows: tuple[Any, ...], rate: float) -> tuple[float, ...]:
 
 CLOCKS = (
     Fault("time_offset", "the right camera exposes later than the left", "synchronisation of the cameras",
-          ("delay",), "s", 1e-5, "right minus left", "right_delay_s", ("delay",), bounds=(-0.05, 0.05), along=_delayed,
+          ("delay",), "s", 1e-5, "right minus left", "right_delay_s", bounds=(-0.05, 0.05), along=_delayed,
           seen="the dots of the two cameras contradict each other, the more the faster the disc is",
           remedy="check the trigger; renumber the images of the camera that is ahead by whole frames",
           named_by=(Kind.DELAY, Kind.DROPPED_FRAMES)),
     Fault("frame_rate", "the true frame rate differs from the declared one", "clock of the cameras",
-          ("change",), "1", 1e-4, "true over declared minus one", "frame_rate_hz", ("faster",), bounds=(-0.6, 1.2),
+          ("change",), "1", 1e-4, "true over declared minus one", "frame_rate_hz", bounds=(-0.6, 1.2),
           of_poses_alone=False, along=_faster,
           to_key=lambda v, _, rate: float(rate * (1.0 + v[0])) if v[0] else 0.0,
           from_key=lambda x, rate: x / rate - 1.0 if x else 0.0,
@@ -182,44 +170,44 @@ _MISSED = "the cameras contradict each other on the same dots, throughout"
 _AGAIN = "calibrate again where you record"
 OF_CAMERAS = (  # of either camera
     Fault("turned", "the {} camera turned after its calibration", _KNOCK, ("rotation_x", "rotation_y", "rotation_z"),
-          "rad", 1e-5, "in its own axes", "rotation_deg", ("rotation",), _DEG, bounds=(-0.06, 0.06),
+          "rad", 1e-5, "in its own axes", "rotation_deg", _DEG, bounds=(-0.06, 0.06),
           seen=_MISSED, remedy=_AGAIN,
           named_by=MOVED),
     Fault("shifted", "the {} camera moved after its calibration", _KNOCK,
           ("translation_x", "translation_y", "translation_z"), "m", 1e-5, "in its own axes", "translation_mm",
-          ("translation",), 1e3, bounds=(-0.01, 0.01), seen=_MISSED, remedy=_AGAIN,
+          1e3, bounds=(-0.01, 0.01), seen=_MISSED, remedy=_AGAIN,
           named_by=MOVED),
     Fault("focal", "the focal length of the {} camera changed", "focus, temperature", ("change",), "1", 1e-5,
-          "relative", "focal_scale", ("focal",), null=1.0, bounds=(-0.05, 0.05), seen=_MISSED, remedy=_AGAIN,
+          "relative", "focal_scale", null=1.0, bounds=(-0.05, 0.05), seen=_MISSED, remedy=_AGAIN,
           named_by=MOVED),
     Fault("principal_point", "the principal point of the {} camera moved", "lens not fixed", ("x", "y"), "px", 0.01,
-          "in the image", "principal_point_change_px", ("centre",), bounds=(-5.0, 5.0), seen=_MISSED, remedy=_AGAIN,
+          "in the image", "principal_point_change_px", bounds=(-5.0, 5.0), seen=_MISSED, remedy=_AGAIN,
           named_by=MOVED),
     Fault("distortion", "the distortion of the {} camera changed", "focus, aperture, other lens", ("k1",), "1", 1e-3,
-          "change of Brown's k1", "k1_change", ("k1",), bounds=(-1.0, 1.0), seen=_MISSED, remedy=_AGAIN,
+          "change of Brown's k1", "k1_change", bounds=(-1.0, 1.0), seen=_MISSED, remedy=_AGAIN,
           named_by=MOVED),
 )  # fmt: skip
 _MISPRINT = Fault(
     "misprint", "dot {} is not where it was declared", "printing", ("x", "y"), "m", 1e-6, "body axes", "misprint_mm",
-    ("misprint",), belongs_to=("disc",), along=_of_one_dot, seen="one dot misses its place in every frame",
+    belongs_to=("disc",), along=_of_one_dot, seen="one dot misses its place in every frame",
     remedy="measure it on the sheet", declared="[markers] centres_mm", named_by=(Kind.DOTS_MISPLACED, Kind.DOT_UNSEEN),
 )  # fmt: skip
 OF_THE_PAPER = (
     Fault("pattern_offset", "the dots as a whole are off the disc's centre", "gluing of the paper", ("x", "y"), "m",
-          1e-6, "body axes", "pattern_offset_mm", ("pattern_offset", slice(2)), 1e3, belongs_to=("disc",),
+          1e-6, "body axes", "pattern_offset_mm", 1e3, belongs_to=("disc",),
           seen="the centre circles about another point once a turn of the spin",
           remedy="centre the sheet, or measure by how much it is off", declared="[markers] centres_mm",
           named_by=(Kind.DOTS_MISPLACED, Kind.TABLE_DISAGREES)),
     Fault("pattern_rotation", "the dots as a whole are turned on the face",
           "gluing; the same as another spin angle", ("angle",), "rad", 1e-5, "about e3", "pattern_turn_deg",
-          ("pattern_turn",), _DEG, belongs_to=("disc",), seen="nothing: it is where phi is counted from"),
+          _DEG, belongs_to=("disc",), seen="nothing: it is where phi is counted from"),
     Fault("pattern_scale", "the dots as a whole are printed too large", "printer", ("change",), "1", 1e-5, "relative",
-          "pattern_scale", ("pattern_growth",), null=1.0, belongs_to=("disc",),
+          "pattern_scale", null=1.0, belongs_to=("disc",),
           seen="dots and chessboard contradict each other in their scale",
           remedy="measure the printed sheet with a caliper", declared="[markers] centres_mm",
           named_by=(Kind.SQUARE, Kind.LENGTHS, Kind.DOTS_MISPLACED)),
     Fault("pattern_height", "the dots lie higher than half the thickness", "paper, glue, thickness", ("offset",), "m",
-          1e-6, "along e3", "pattern_height_mm", ("pattern_offset", slice(2, 3)), 1e3, belongs_to=("disc",),
+          1e-6, "along e3", "pattern_height_mm", 1e3, belongs_to=("disc",),
           seen="the disc's lowest point lies off the table",
           remedy="measure the thickness with its paper", declared="[disc] thickness_mm",
           named_by=HEIGHT),
@@ -227,12 +215,12 @@ OF_THE_PAPER = (
 OF_THE_TABLE = (
     Fault("table_plane", "the table is not parallel to the calibration's table view", "board on a burr",
           ("tilt_x", "tilt_y"), "rad", 1e-5, "turn of the true table, calibrated axes", "table_turn_deg",
-          ("table_turn", slice(2)), _DEG, seen="the disc's lowest point rises towards one side",
+          _DEG, seen="the disc's lowest point rises towards one side",
           remedy="lay the board flat, and take the table view again", declared="[table] view",
           named_by=(Kind.TABLE_VIEW, *HEIGHT)),
     Fault("table_height", "the table is not where the calibration's table view says", "thickness of the board",
           ("offset",), "m", 1e-6, "true height of the table in the calibrated axes", "table_height_mm",
-          ("table_height",), 1e3, seen="the disc's lowest point lies off the table",
+          1e3, seen="the disc's lowest point lies off the table",
           remedy="measure the board's thickness", declared="[table] board_thickness_mm",
           named_by=HEIGHT),
 )  # fmt: skip
@@ -247,31 +235,20 @@ def faults_of(disc: Disc) -> tuple[Fault, ...]:
 def _faults_of(n_markers: int) -> tuple[Fault, ...]:
     time_offset, frame_rate, *of_images = CLOCKS
     of_cameras = (
-        replace(fault, name=f"{camera}_{fault.name}", title=fault.title.format(camera), key=f"{camera}.{fault.key}",
-                alters=("cameras", i, *fault.alters))
+        replace(fault, name=f"{camera}_{fault.name}", title=fault.title.format(camera), key=f"{camera}.{fault.key}")
         for fault in OF_CAMERAS
-        for i, camera in enumerate(CAMERAS)
-    )  # fmt: skip
+        for camera in CAMERAS
+    )
     misprints = (
-        replace(_MISPRINT, name=f"misprint_{i}", title=_MISPRINT.title.format(i), alters=("misprint", i),
+        replace(_MISPRINT, name=f"misprint_{i}", title=_MISPRINT.title.format(i),
                 to_key=partial(_with_row, i, n_markers), from_key=partial(_row, i))
         for i in range(n_markers)
     )  # fmt: skip
     return (time_offset, frame_rate, *of_cameras, *misprints, *OF_THE_PAPER, *OF_THE_TABLE, *of_images)
 
 
-def setup_of(disc: Disc, values: Mapping[str, float]) -> MeasurementSetup:
-    """How the measurement differs from what was declared where faults have these values; those absent are null."""
-    setup = MeasurementSetup(np.zeros((disc.n_markers, 2)))
-    for fault in faults_of(disc):
-        v = fault.numbers(values)
-        if v.any():
-            fault.alter(setup, v)
-    return setup
-
-
-def scene_faults(disc: Disc, values: Mapping[str, float], rate: float, beside: Faults | None = None) -> Faults:
-    """Faults of a scene with this disc, this declared frame rate [Hz] and these values."""
+def scene_faults(disc: Disc, values: Mapping[str, float], rate: float = 1.0, beside: Faults | None = None) -> Faults:
+    """Faults of a scene with this disc, this declared frame rate [Hz] and these values; those absent are null."""
     found = beside or Faults()
     for fault in faults_of(disc):
         v = fault.numbers(values)

@@ -1,84 +1,54 @@
 """Clocks, cameras, dots and table as faults leave them, and the images of the dots that follow from that."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibration.cameras.camera import Camera, StereoRig, placed_at, project_with_jacobians
+from calibration.cameras.camera import StereoRig, placed_at, project_with_jacobians
 from calibration.kit.arrays import Array
 from disctrack.disc import Disc
-from disctrack.frames import rotation_from_vector
+from disctrack.faults.keys import Faults
+from disctrack.frames import rotation_from_vector, rotation_z
 
 RIM_POINTS = 24  # of a dot's outline, for the centre of its image
 
 
-@dataclass
-class CameraChange:
-    """What became of one camera after its calibration."""
+def centres_with(faults: Faults, disc: Disc) -> Array:
+    """(m, 3) where the dots are on the body [m]."""
+    centres = disc.marker_centres_body.copy()
+    centres[:, :2] += 1e-3 * np.array(faults.misprint_mm or np.zeros((disc.n_markers, 2)))
+    turn = rotation_z(np.radians(faults.pattern_turn_deg))[:2, :2]
+    centres[:, :2] = faults.pattern_scale * centres[:, :2] @ turn.T
+    return np.asarray(centres + 1e-3 * np.array([*faults.pattern_offset_mm, faults.pattern_height_mm]))
 
-    rotation: Array = field(default_factory=lambda: np.zeros(3))  # [rad] vector in its own axes
-    translation: Array = field(default_factory=lambda: np.zeros(3))  # [m] in its own axes
-    focal: float = 0.0  # relative
-    centre: Array = field(default_factory=lambda: np.zeros(2))  # [px] of the principal point
-    k1: float = 0.0
 
-    def lens(self, camera: Camera) -> Camera:
-        """The camera with its lens as it is now."""
+def cameras_with(faults: Faults, rig: StereoRig) -> StereoRig:
+    """The rig with what became of its cameras after the calibration."""
+    cameras, poses = [], []
+    for camera, (R, t), fault in zip(rig.cameras, rig.camera_poses(), (faults.left, faults.right), strict=True):
+        turn = rotation_from_vector(np.radians(fault.rotation_deg)).T
+        poses.append((turn @ R, turn @ (t - 1e-3 * np.array(fault.translation_mm))))
         k1, k2, p1, p2, k3 = camera.distortion
-        return replace(
-            camera,
-            fx=camera.fx * (1.0 + self.focal),
-            fy=camera.fy * (1.0 + self.focal),
-            cx=camera.cx + float(self.centre[0]),
-            cy=camera.cy + float(self.centre[1]),
-            distortion=(k1 + self.k1, k2, p1, p2, k3),
+        x, y = fault.principal_point_change_px
+        cameras.append(
+            replace(
+                camera,
+                fx=camera.fx * fault.focal_scale,
+                fy=camera.fy * fault.focal_scale,
+                cx=camera.cx + x,
+                cy=camera.cy + y,
+                distortion=(k1 + fault.k1_change, k2, p1, p2, k3),
+            )
         )
+    left, right = cameras
+    return replace(rig, left=left, right=right, **placed_at(poses))
 
 
-@dataclass
-class MeasurementSetup:
-    """How clocks, cameras, dots and table differ from what was declared and calibrated. Faults alter it."""
-
-    misprint: Array  # (m, 2) [m] of single dots, body axes
-    faster: float = 0.0  # true over declared frame rate, minus one
-    delay: float = 0.0  # [s] of the right camera
-    cameras: tuple[CameraChange, CameraChange] = field(default_factory=lambda: (CameraChange(), CameraChange()))
-    pattern_offset: Array = field(default_factory=lambda: np.zeros(3))  # [m] body axes
-    pattern_turn: float = 0.0  # [rad] about e3
-    pattern_growth: float = 0.0  # relative
-    table_turn: Array = field(default_factory=lambda: np.zeros(3))  # [rad] of the true table in calibrated axes
-    table_height: float = 0.0  # [m]
-
-    @property
-    def rate(self) -> float:
-        """True over declared frame rate."""
-        return 1.0 + self.faster
-
-    def centres(self, disc: Disc) -> Array:
-        """(m, 3) where the dots are on the body [m]."""
-        centres = disc.marker_centres_body.copy()
-        centres[:, :2] += self.misprint
-        c, s = np.cos(self.pattern_turn), np.sin(self.pattern_turn)
-        centres[:, :2] = (1.0 + self.pattern_growth) * centres[:, :2] @ np.array([[c, s], [-s, c]])
-        return np.asarray(centres + self.pattern_offset)
-
-    def cameras_of(self, rig: StereoRig) -> StereoRig:
-        """The rig with what became of its cameras after the calibration."""
-        poses = []
-        for (R, t), change in zip(rig.camera_poses(), self.cameras, strict=True):
-            turn = rotation_from_vector(change.rotation).T
-            poses.append((turn @ R, turn @ (t - change.translation)))
-        left, right = (change.lens(camera) for camera, change in zip(rig.cameras, self.cameras, strict=True))
-        return replace(rig, left=left, right=right, **placed_at(poses))
-
-
-@dataclass(frozen=True)
-class DotImages:
-    """Predicted images of the dots and how they move with the pose."""
-
-    pixels: Array  # (n, 2, m, 2)
-    by_pose: Array  # (n, 2, m, 2, 6), POSE_COMPONENTS of the disc in the world
+def true_table(faults: Faults) -> tuple[Array, Array]:
+    """Turn (3, 3) and shift (3,) [m] of the true table in calibrated axes."""
+    lift = np.array([0.0, 0.0, 1e-3 * faults.table_height_mm])
+    return rotation_from_vector(np.radians([*faults.table_turn_deg, 0.0])), lift
 
 
 @dataclass(frozen=True)
@@ -92,30 +62,25 @@ class Sight:
     rig: StereoRig
     disc: Disc
     values: Mapping[str, float]
-    images: DotImages
+    pixels: Array  # (n, 2, m, 2) of the dots, predicted
+    by_pose: Array  # (n, 2, m, 2, 6) how they move with the POSE_COMPONENTS
 
 
-def predict(R: Array, t: Array, rig: StereoRig, disc: Disc, setup: MeasurementSetup) -> DotImages:
-    """Images of the dots' centres for poses per camera R (2, n, 3, 3), t (2, n, 3), body -> world.
+def predict(R: Array, t: Array, rig: StereoRig, disc: Disc, faults: Faults) -> tuple[Array, Array]:
+    """Images of the dots' centres (n, 2, m, 2) and how they move with the pose (n, 2, m, 2, 6), POSE_COMPONENTS.
 
-    What is wrong with clocks or images has no part in this.
+    R (2, n, 3, 3), t (2, n, 3): poses per camera, body -> world. What is wrong with clocks or images has no part in it.
     """
-    centres = setup.centres(disc)
-    tilt = rotation_from_vector(setup.table_turn)
-    height = np.array([0.0, 0.0, setup.table_height])
+    centres, (tilt, lift), rig = centres_with(faults, disc), true_table(faults), cameras_with(faults, rig)
     pixels, by_pose = [], []
-    for i, (camera, (R_cw, t_cw), change) in enumerate(
-        zip(rig.cameras, rig.camera_poses(), setup.cameras, strict=True)
-    ):
+    for i, (camera, (R_cw, t_cw)) in enumerate(zip(rig.cameras, rig.camera_poses(), strict=True)):
         arm = centres @ np.swapaxes(R[i], 1, 2)
-        world = (arm + t[i][:, None]) @ tilt.T + height
-        turn = rotation_from_vector(change.rotation).T
-        in_camera = (world @ R_cw.T + t_cw - change.translation) @ turn.T
-        view, d_point, _ = project_with_jacobians(in_camera, change.lens(camera))
-        d_world = d_point @ (turn @ R_cw @ tilt)
+        world = (arm + t[i][:, None]) @ tilt.T + lift
+        view, d_point, _ = project_with_jacobians(world @ R_cw.T + t_cw, camera)
+        d_world = d_point @ (R_cw @ tilt)
         pixels.append(view)
         by_pose.append(np.concatenate([d_world, np.cross(arm[..., None, :], d_world)], axis=-1))
-    return DotImages(np.stack(pixels, axis=1), np.stack(by_pose, axis=1))
+    return np.stack(pixels, axis=1), np.stack(by_pose, axis=1)
 
 
 def ellipse_centre_shift(R: Array, t: Array, rig: StereoRig, disc: Disc) -> Array:

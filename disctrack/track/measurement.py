@@ -133,17 +133,6 @@ def open_pairs(recording: Recording, frames: tuple[int | None, int | None] = (No
     return ImagePairs(left, right, start, stop, findings)
 
 
-def check_rig(rig: StereoRig, pairs: ImagePairs, rig_name: str) -> None:
-    """Raise RecordingError unless the rig was calibrated at the recording's image size."""
-    for camera, reader, name in zip(rig.cameras, (pairs.left, pairs.right), CAMERAS, strict=True):
-        if camera.image_size != reader.image_size:
-            (w, h), (wr, hr) = reader.image_size, camera.image_size
-            raise RecordingError(
-                f"{reader.describe(pairs.start)}: {name} images are {w} x {h} px, but {rig_name} was calibrated with "
-                f"{wr} x {hr} px. Calibrate with views of the recording's own size, or name its own rig."
-            )
-
-
 @one_blas_thread
 @checked
 def measure(
@@ -260,12 +249,12 @@ def refuse_unreadable(recording: Recording, lost: Sequence[Unreadable], n: int, 
 def details_of(tracking: Tracking) -> dict[str, Any]:
     """Numbers that tracking found on the way, of JSON's types."""
     details: dict[str, Any] = {
-        "exposure_s": list(tracking.exposure.seconds),
+        "exposure_s": list(tracking.exposure),
         "blur_px": [edge.blur_px for edge in tracking.law.edges],
         "noise": [dataclasses.asdict(edge.noise) for edge in tracking.law.edges],
         "variance_factor": tracking.scatter.whole,
         "noise_factor": tracking.scatter.noise,
-        "pose_variance_factor": tracking.pose_scatter.factor.round(3).tolist(),
+        "pose_variance_factor": tracking.pose_scatter.round(3).tolist(),
         "systematic_px": list(tracking.scatter.systematic_px),
         "shared_sigma": [[sigma, cause] for sigma, cause in tracking.shared_sigma],
         "size": {

@@ -26,11 +26,12 @@ from calibration.cameras.camera import StereoRig
 from calibration.kit.arrays import Array
 from calibration.rig_file import read_rig, write_rig
 from disctrack.errors import DiscTrackError
-from disctrack.faults.catalogue import HEIGHT, MOVED, TYPICAL_STEPS, Fault, faults_of, scene_faults, setup_of
-from disctrack.faults.dots import MeasurementSetup
+from disctrack.faults.catalogue import HEIGHT, MOVED, TYPICAL_STEPS, Fault, faults_of, scene_faults
+from disctrack.faults.dots import cameras_with, centres_with, true_table
+from disctrack.faults.keys import Faults
 from disctrack.files.toml_tree import toml_value
 from disctrack.findings import DoubtWarning, Finding, Kind, Severity, leading
-from disctrack.frames import CAMERAS, rotation_from_vector
+from disctrack.frames import CAMERAS
 from disctrack.recording.declaration import Recording, read_recording
 from disctrack.synthetic import write_recording
 from disctrack.synthetic.description import Scene
@@ -218,7 +219,9 @@ def _of_catalogue(ground: Ground) -> Iterator[tuple[Fault, Planting]]:
     recording = read_recording(ground.recording)
     for fault in faults_of(recording.disc):
         alike = fault.name.startswith((others, "misprint")) and fault.name != "misprint_0"
-        declarable = fault.alters not in ((), ("delay",))  # as if rig, disc, dots or rate were declared wrong
+        declarable = (
+            not fault.in_images and fault.key != "right_delay_s"
+        )  # as if rig, disc, dots or rate were declared wrong
         if not fault.named_by or alike or (ground.scene is None and not declarable):
             continue
         plant = _declared_wrong if ground.scene is None else _rendered
@@ -250,20 +253,19 @@ def _declared_wrong(fault: Fault, ground: Ground, folder: Path, size: float) -> 
     """As if what is declared were true but for the fault."""
     tree = _shared(ground, folder)
     disc = read_recording(ground.recording).disc
-    setup = setup_of(disc, {name: -value for name, value in _values(fault, size).items()})
-    places = setup.centres(disc)
+    wrong = scene_faults(disc, {name: -value for name, value in _values(fault, size).items()})
+    places = centres_with(wrong, disc)
     tree["markers"]["centres_mm"] = (1e3 * places[:, :2]).tolist()
-    tree["disc"]["thickness_mm"] = 2e3 * float(disc.half_thickness + setup.pattern_offset[2])
-    tree["cameras"]["frame_rate_hz"] *= setup.rate
-    write_rig(folder / "rig.h5", _believed(read_rig(ground.rig), setup))
+    tree["disc"]["thickness_mm"] = 2e3 * float(disc.half_thickness + 1e-3 * wrong.pattern_height_mm)
+    tree["cameras"]["frame_rate_hz"] *= wrong.frame_rate_hz or 1.0
+    write_rig(folder / "rig.h5", _believed(read_rig(ground.rig), wrong))
     _declare(folder, _with_rig(tree, folder / "rig.h5"))
 
 
-def _believed(rig: StereoRig, setup: MeasurementSetup) -> StereoRig:
-    """Cameras and table as they are with this set-up; its table is that of the calibrated axes."""
-    rig = setup.cameras_of(rig)
-    R = rig.R_left_world @ rotation_from_vector(setup.table_turn)
-    lift = np.array([0.0, 0.0, setup.table_height])
+def _believed(rig: StereoRig, faults: Faults) -> StereoRig:
+    """Cameras and table as they are with these faults; the table is that of the calibrated axes."""
+    rig, (turn, lift) = cameras_with(faults, rig), true_table(faults)
+    R = rig.R_left_world @ turn
     return replace(rig, R_left_world=R, t_left_world=rig.t_left_world + R @ lift)
 
 

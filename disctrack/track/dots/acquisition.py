@@ -6,7 +6,6 @@ problem), and of mirror twins the one that touches the table is taken.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import combinations, permutations
 
 import cv2
@@ -29,15 +28,6 @@ BLOB_PX = 0.5  # standard deviation of a blob's centroid under uneven light
 CANDIDATES = 40  # poses that are refined
 
 Pose = tuple[Array, Array]  # R_world_body (3, 3), t_world_body (3,) [m]
-
-
-@dataclass(frozen=True)
-class Acquisition:
-    """Pose found without a prior, good to a fraction of a pixel, or the reason why none was found."""
-
-    pose: Pose | None
-    n_explained: int  # dot images explained by blobs, both cameras together
-    reason: str  # empty when found
 
 
 def dot_blobs(image: NDArray[np.generic], expected_diameter_px: float) -> Array:
@@ -90,15 +80,18 @@ def expected_diameter_px(rig: StereoRig, disc: Disc) -> list[float]:
     return result
 
 
-def acquire(pair: Sequence[NDArray] | NDArray, rig: StereoRig, disc: Disc) -> Acquisition:
-    """Find the disc in the images of both cameras, wherever it is and however it is turned."""
+def acquire(pair: Sequence[NDArray] | NDArray, rig: StereoRig, disc: Disc) -> tuple[Pose | None, int, str]:
+    """Find the disc in the images of both cameras, wherever it is and however it is turned.
+
+    The pose, good to a fraction of a pixel; dot images explained by blobs, both cameras together; why none was found.
+    """
     diameters = expected_diameter_px(rig, disc)
     blobs = [dot_blobs(image, diameter)[:, :2] for image, diameter in zip(pair, diameters, strict=True)]
     return acquire_from_blobs(blobs, rig, disc)
 
 
-def acquire_from_blobs(blobs: list[Array], rig: StereoRig, disc: Disc) -> Acquisition:
-    """Find the disc from the centroids of candidate blobs in the left and in the right image, each (k, 2)."""
+def acquire_from_blobs(blobs: list[Array], rig: StereoRig, disc: Disc) -> tuple[Pose | None, int, str]:
+    """As `acquire` from the centroids of candidate blobs in the left and in the right image, each (k, 2)."""
     candidates = _candidates_from_stereo(blobs, rig, disc)
     best = _best_explanation(candidates, blobs, rig, disc)
     if best is None or best[3] < 2 * disc.n_markers - 3:
@@ -112,8 +105,8 @@ def acquire_from_blobs(blobs: list[Array], rig: StereoRig, disc: Disc) -> Acquis
             f"no arrangement of the blobs found ({counts} image) matches the {disc.n_markers} dots of [markers]: "
             "is the upper face visible, are diameter and centres right, does the rig belong to these images?"
         )
-        return Acquisition(None, 0, reason)
-    return Acquisition(best[1:3], best[3], "")
+        return None, 0, reason
+    return best[1:3], best[3], ""
 
 
 def seen_by_one_camera(

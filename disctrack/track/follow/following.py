@@ -68,12 +68,8 @@ class Heading(NamedTuple):
     @classmethod
     def leading_to(cls, pose: Pose, following: Pose | None) -> Heading:
         """The next prediction is `pose`, the one after it `following`, or the same where that is not known."""
-        R, t = pose
-        turn, shift = np.eye(3), np.zeros(3)
-        if following is not None:
-            turn, shift = following[0] @ R.T, following[1] - t
-        last = (turn.T @ R, t - shift)
-        return cls.steady(last, (turn.T @ last[0], t - 2 * shift))
+        back = cls.steady(pose, following or pose).carried_on(2)
+        return cls.steady(back.before, back.last)
 
     def carried_on(self, steps: int) -> Heading:
         """As after so many more frames of the same motion."""
@@ -348,9 +344,9 @@ def _search(follower: Follower, images: Image, readable: Mask) -> bool:
 
 
 def _found(follower: Follower, pair: Image, readable: Mask) -> Pose | None:
-    found = acquire(np.where(readable[:, None, None], pair, 0), follower.setup.rig, follower.setup.disc)
-    follower.first_reason = follower.first_reason or found.reason
-    return found.pose
+    pose, _, reason = acquire(np.where(readable[:, None, None], pair, 0), follower.setup.rig, follower.setup.disc)
+    follower.first_reason = follower.first_reason or reason
+    return pose
 
 
 def _measure_blur_and_noise(follower: Follower, images: Image, readable: Mask, pose: Pose, heading: Heading) -> None:

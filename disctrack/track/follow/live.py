@@ -19,7 +19,7 @@ from disctrack.track.dots.template import dot_centres
 from disctrack.track.follow.following import Follower, Tables, TrackingSetup, empty_tables, follow_block
 from disctrack.track.follow.tracking import check_images
 from disctrack.track.pose import fit_poses
-from disctrack.track.refine.assembly import MIN_GOOD_DOT_IMAGES
+from disctrack.track.refine.assembly import status_of
 from disctrack.trajectory import FrameStatus, coordinate_sigma
 
 
@@ -98,36 +98,29 @@ class Tracker:
                 f"left is an image of shape {left.shape} {left.dtype}, right of {right.shape} {right.dtype}; expected "
                 "(height, width), both of one type"
             )
-        check_images(left, self.rig)
+        check_images(*left.shape[::-1], self.rig)
         return np.stack([left, right])[None]
 
     def _pose(self, rows: Tables) -> LivePose:
         """What the rows say of one pair; a pair without a pose is one without dots."""
-        status = FrameStatus(rows.frame_status[0])
-        if status != FrameStatus.MEASURED:
+        followed = rows.frame_status
+        if followed[0] != FrameStatus.MEASURED:
             self._angles, rows = None, empty_tables(1, self.disc.n_markers)
         dots = dot_centres(rows.results, rows.status)
         centres = self.disc.marker_centres_body
         fit = fit_poses(dots.pixels, dots.covariance_px2, self.rig, centres, rows.R, rows.t, with_sensitivity=False)
         angles = np.full(3, np.nan)
-        if status == FrameStatus.MEASURED and not fit.converged[0]:
-            status = FrameStatus.NOT_CONVERGED
-        elif fit.converged[0]:
+        if fit.converged[0]:
             angles = frames.euler_from_rotation(fit.R_world_body[0])
             if self._angles is not None:
                 angles = frames.unwrap_euler(np.stack([self._angles, angles]))[1]
             self._angles = angles
-            per_camera = fit.used[0].sum(axis=1)
-            if (per_camera == 0).any():
-                status = FrameStatus.ONE_CAMERA
-            elif per_camera.sum() < MIN_GOOD_DOT_IMAGES:
-                status = FrameStatus.FEW_MARKERS
         return LivePose(
             self.frame,
             np.concatenate([fit.t_world_body[0], angles]),
             fit.R_world_body[0],
             fit.covariance[0],
-            status,
+            FrameStatus(status_of(followed, fit)[0]),
             dots.pixels[0],
             fit.residuals_px[0],
             float(fit.reduced_chi_square[0]),

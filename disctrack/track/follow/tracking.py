@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from calibration.cameras.camera import Camera, StereoRig
-from calibration.kit.arrays import Array, Image
+from calibration.kit.arrays import Array
 from calibration.kit.grey_levels import mosaic_gains
 from calibration.kit.stuck_pixels import repair, stuck_pixels
 from disctrack import frames
@@ -165,7 +165,7 @@ def _followed(
         for block in read_blocks(edges[k], edges[k + 1]):
             if given_up.is_set():
                 break
-            check_images(block.images, setup.rig)
+            check_images(*block.images.shape[:1:-1], setup.rig)
             follow_block(followers[k], block.images, block.readable, tables, int(block.frames[0]) - first)
             with telling:
                 tell(len(block.images))
@@ -261,9 +261,8 @@ def _torn(tables: Tables, edge: int) -> bool:
     return bool(np.arccos(np.clip((np.trace(miss) - 1) / 2, -1, 1)) > MAX_EDGE_TURN)
 
 
-def check_images(images: Image, rig: StereoRig) -> None:
-    """Raise TrackingError unless the images have the size that the rig was calibrated at."""
-    height, width = images.shape[-2:]
+def check_images(width: int, height: int, rig: StereoRig) -> None:
+    """Raise TrackingError unless images have the size [px] that the rig was calibrated at."""
     for name, camera in zip(frames.CAMERAS, rig.cameras, strict=True):
         if camera.image_size != (width, height):
             raise TrackingError(

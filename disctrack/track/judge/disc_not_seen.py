@@ -72,9 +72,9 @@ def arrangement_found(pair: NDArray, rig: StereoRig, disc: Disc) -> Iterator[Fin
 
     pair : (2, height, width). All but one of the dots must be found in both cameras, and more than as declared.
     """
-    enough = max(acquire(pair, rig, disc).n_explained + 1, 2 * disc.n_markers - 2)
+    enough = max(acquire(pair, rig, disc)[1] + 1, 2 * disc.n_markers - 2)
     ways = list(_ways(pair, disc))
-    dots = [acquire(images, rig, layout).n_explained for _, images, layout in ways]
+    dots = [acquire(images, rig, layout)[1] for _, images, layout in ways]
     best = dots.index(max(dots))
     if dots[best] >= enough:
         kind = Kind.MIRRORED if best else Kind.EXCHANGED

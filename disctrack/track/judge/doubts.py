@@ -12,7 +12,7 @@ from disctrack.numbers import Measured
 from disctrack.track.follow.following import Follower
 from disctrack.track.judge.dropped_frames import HARDLY, LATE, delay_of_right
 from disctrack.track.refine.intrinsic_scatter import Scatter, SharedFaults
-from disctrack.track.refine.pose_scatter import GROUPS, PoseScatter
+from disctrack.track.refine.pose_scatter import GROUPS
 from disctrack.track.refine.self_calibration import DotsInFrames
 from disctrack.track.refine.table_contact import TableFromDisc
 from disctrack.trajectory import FrameStatus, Trajectory
@@ -93,13 +93,13 @@ def misplaced_dots(declared: Disc, found: Array) -> tuple[Finding, ...]:
     return (Finding(Kind.DOTS_MISPLACED, Severity.WARNING, text, of, remedies=(remedy,)),)
 
 
-def _shaken(poses: PoseScatter, trajectory: Trajectory) -> tuple[Finding, ...]:
+def _shaken(factor: Array, trajectory: Trajectory) -> tuple[Finding, ...]:
     """Poses that scatter far more than their dots tell, with how far."""
     names = ("horizontal position", "height", "tilt", "turn about the vertical")
     variance = np.nanmedian(np.diagonal(trajectory.pose_covariance[trajectory.measured], axis1=1, axis2=2), axis=0)
     told = []
     for name, group in zip(names, GROUPS, strict=True):
-        times, sigma = np.sqrt(poses.factor[group[0]]), np.sqrt(np.mean(variance[list(group)]))
+        times, sigma = np.sqrt(factor[group[0]]), np.sqrt(np.mean(variance[list(group)]))
         if times > SHAKEN:
             length = f"{1e6 * sigma:.1f} um" if group[0] < 3 else f"{1e3 * np.degrees(sigma):.1f} mdeg"
             told.append(f"{name} by {length} ({times:.1f} times)")
@@ -144,7 +144,7 @@ def doubts_of(
     follower: Follower,
     faults: SharedFaults | None,
     scatter: Scatter,
-    poses: PoseScatter,
+    shaken: Array,
     table: TableFromDisc | None,
     trajectory: Trajectory,
     seen: DotsInFrames,
@@ -173,7 +173,7 @@ def doubts_of(
             "round, or their edges are not sharp, or the images were processed"
         )
         found.append(Finding(Kind.DOTS_SCATTER, Severity.WARNING, text))
-    found += _shaken(poses, trajectory)
+    found += _shaken(shaken, trajectory)
     apart = table is not None and abs(table.plane[0]) > NO_TOLERANCE
     severity = Severity.DOUBT if apart else Severity.WARNING
     if table is not None and table.probability < DISAGREE:

@@ -12,14 +12,15 @@ from disctrack import frames
 from disctrack.findings import Finding
 from disctrack.track.dots.template import DotCentres, dot_centres
 from disctrack.track.follow.following import Follower, Law, Tables, repeats
+from disctrack.track.judge.camera_course import camera_course
 from disctrack.track.judge.doubts import FAULTY, doubts_of, repeated_images
 from disctrack.track.judge.dropped_frames import dropped_frames
 from disctrack.track.judge.outlier_tests import judge_poses, outlying_frames, unexpected_misfit
-from disctrack.track.pose import PoseFits, fit_poses, whitening
-from disctrack.track.refine.exposure import Exposure, exposure_by_smear, exposure_of, shift_by_exposure
+from disctrack.track.pose import MIN_DOTS, PoseFits, fit_poses, whitening
+from disctrack.track.refine.exposure import exposure_by_smear, exposure_of, shift_by_exposure
 from disctrack.track.refine.glare import shift_by_glare
 from disctrack.track.refine.intrinsic_scatter import Scatter, SharedFaults, split_scatter, without_shared_faults
-from disctrack.track.refine.pose_scatter import PoseScatter, scatter_of_poses
+from disctrack.track.refine.pose_scatter import scatter_of_poses
 from disctrack.track.refine.self_calibration import (
     AsBuilt,
     DotsInFrames,
@@ -55,10 +56,10 @@ class Tracking:
     as_built: AsBuilt
     scatter: Scatter  # of the dots about the fitted poses; the covariances of dots and poses hold its noise, what is
     # left of it makes `Trajectory.systematic_covariance`
-    pose_scatter: PoseScatter  # of the poses about a smooth motion, beyond what the dots tell
+    pose_scatter: Array  # (6,) variance of the poses about a smooth motion over what the dots tell, at least 1
     shared_sigma: tuple[tuple[float, str], ...]  # x, y, z [m], turns [rad]: what frames share, most of it from what
     table: TableFromDisc | None  # the plane that the rim touched; None without a table, or a rim that touched it
-    exposure: Exposure  # that the dots were moved by
+    exposure: tuple[float, float]  # [s] of the left and the right camera, that the dots were moved by
     acquisitions: int  # times the disc had to be searched for without a prior and was found
     findings: tuple[Finding, ...]
 
@@ -83,7 +84,7 @@ def assemble(
     first = next((follower for follower in followers if follower.measured), followers[0])
     rig, disc = first.setup.rig, first.setup.disc
     repeated, dots = repeats(tables.digest), dot_centres(tables.results, tables.status)
-    exposure = _as_they_were(tables, dots, first, settings, taken)
+    exposure, of_exposure = _as_they_were(tables, dots, first, settings, taken)
     _clean(tables, dots, repeated, rig)
     seen = DotsInFrames(rig, disc, dots.pixels, dots.covariance_px2, tables.R, tables.t)
     as_built, faults, outlying = _shared(seen, settings, workers)
@@ -93,45 +94,47 @@ def assemble(
     seen = replace(seen, R=fits.R_world_body, t=fits.t_world_body)
     fits, verdicts = _judged(fits, dots, repeated, outlying, taken.frame_rate, disc.radius)
     slips = dropped_frames(verdicts == FrameStatus.CONTRADICTED, seen, taken.pairs)
+    course, of_course = camera_course(seen, fits, scatter, taken.pairs)
+    systematic += course
     moved = by_pattern(as_built, fits.R_world_body)
     fits, systematic, rig, table = table_from_disc(fits, systematic, as_built.rig, disc, settings.table, moved)
     as_built = replace(as_built, rig=rig, off_centre=off_centre(table, fits.R_world_body, disc))
     moved = by_pattern(as_built, fits.R_world_body)
     systematic += moved @ moved.swapaxes(1, 2)
     # after the table: what poses scatter beside their dots need not be white, and frames do not average it there
-    poses = scatter_of_poses(fits)
-    fits.covariance[...] *= np.sqrt(np.outer(poses.factor, poses.factor))
+    *_, shaken = scatter_of_poses(fits)
+    fits.covariance[...] *= np.sqrt(np.outer(shaken, shaken))
     shared = _shared_sigma(fits, systematic, as_built)
     trajectory = _trajectory(fits, verdicts, systematic, tables, dots, as_built, taken)
     if table is not None:
         trajectory = replace(trajectory, table_moved=table.beyond)
-    doubts = doubts_of(first, faults, scatter, poses, table, trajectory, seen)
+    doubts = doubts_of(first, faults, scatter, shaken, table, trajectory, seen)
     return Tracking(
         trajectory=trajectory,
         law=first.law,
         as_built=as_built,
         scatter=scatter,
-        pose_scatter=poses,
+        pose_scatter=shaken,
         shared_sigma=shared,
         table=table,
         exposure=exposure,
         acquisitions=sum(f.acquisitions for f in followers),
-        findings=(*repeated_images(repeated, taken.pairs), *slips, *exposure.findings, *doubts),
+        findings=(*repeated_images(repeated, taken.pairs), *slips, *of_exposure, *of_course, *doubts),
     )
 
 
 def _as_they_were(
     tables: Tables, dots: DotCentres, first: Follower, settings: TrackingSettings, taken: Taken
-) -> Exposure:
+) -> tuple[tuple[float, float], tuple[Finding, ...]]:
     """Move the dots to where they were in the middle of the exposure but for glare, and tell by which exposure."""
     where, rig, disc = (tables.R, tables.t, taken.time), first.setup.rig, first.setup.disc
     edges = first.law.edges
     found = exposure_by_smear(*where, dots.blur_px, rig, disc)
-    exposure = exposure_of(found, settings.exposure, 1 / taken.frame_rate)
+    exposure, findings = exposure_of(found, settings.exposure, 1 / taken.frame_rate)
     dots.pixels[...] -= shift_by_glare(tables.R, tables.t, dots.contrast, rig, disc, edges)
-    if any(exposure.seconds):
-        dots.pixels[...] -= shift_by_exposure(*where, np.array(exposure.seconds), rig, disc, edges)
-    return exposure
+    if any(exposure):
+        dots.pixels[...] -= shift_by_exposure(*where, np.array(exposure), rig, disc, edges)
+    return exposure, findings
 
 
 def _clean(tables: Tables, dots: DotCentres, repeated: Mask, rig: StereoRig) -> None:
@@ -233,6 +236,17 @@ def _shared_sigma(fits: PoseFits, systematic: Array, as_built: AsBuilt) -> tuple
     return tuple((float(value), cause) for value, cause in zip(sigma, most, strict=True))
 
 
+def status_of(followed: NDArray[np.uint8], fits: PoseFits) -> NDArray[np.uint8]:
+    """(n,) what the fits make of frames in which the disc was followed; the others keep their status."""
+    status, was = followed.copy(), followed == FrameStatus.MEASURED
+    per_camera = fits.used.sum(axis=2)
+    total = per_camera.sum(axis=1)
+    status[was & (total < MIN_GOOD_DOT_IMAGES)] = FrameStatus.FEW_MARKERS
+    status[was & (per_camera == 0).any(axis=1)] = FrameStatus.ONE_CAMERA
+    status[was & (total < MIN_DOTS)] = FrameStatus.MARKERS_NOT_FOUND
+    return status
+
+
 def _trajectory(
     fits: PoseFits,
     verdicts: NDArray[np.uint8],
@@ -244,14 +258,7 @@ def _trajectory(
 ) -> Trajectory:
     euler = frames.unwrap_euler(frames.euler_from_rotation(fits.R_world_body))
     euler[~fits.converged] = np.nan
-    status = tables.frame_status.copy()
-    followed = status == FrameStatus.MEASURED
-    per_camera = fits.used.sum(axis=2)
-    total = per_camera.sum(axis=1)
-    status[followed & (total < MIN_GOOD_DOT_IMAGES)] = FrameStatus.FEW_MARKERS
-    status[followed & (per_camera == 0).any(axis=1)] = FrameStatus.ONE_CAMERA
-    status[followed & (total < 3)] = FrameStatus.MARKERS_NOT_FOUND
-    status[followed & (total >= 3) & ~fits.converged] = FrameStatus.NOT_CONVERGED
+    status = status_of(tables.frame_status, fits)
     refused = verdicts != FrameStatus.MEASURED
     status[refused] = verdicts[refused]
     marker_status = tables.status.copy()
@@ -262,7 +269,7 @@ def _trajectory(
         without_answer[refused] = np.nan
     squared = np.where(fits.used, np.sum(fits.residuals_px**2, axis=-1), 0.0)
     with np.errstate(invalid="ignore", divide="ignore"):
-        rms = np.sqrt(squared.sum(axis=2) / per_camera)
+        rms = np.sqrt(squared.sum(axis=2) / fits.used.sum(axis=2))
         quaternion = frames.continuous_quaternions(frames.quaternion_from_rotation(fits.R_world_body))
     return Trajectory(
         time=taken.time,

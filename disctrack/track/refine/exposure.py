@@ -22,8 +22,6 @@ by a linear fit. Variance of the path and shift of its mean are both in proporti
 the exposure.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 
 from calibration.cameras.camera import StereoRig
@@ -43,20 +41,6 @@ ALIKE = 1e-6  # of the largest: columns of the fit that differ by less from a su
 SURE = 3.0  # sigmas of T^2, or the exposure is taken as short
 APPROXIMATE = 0.1  # relative, of T^2: one blur stands for an edge that is smeared more here than there
 CONTRADICTS = 5.0  # sigmas between a declared exposure and the smear
-
-
-class ExposureSquared(NamedTuple):
-    """T^2 of the left and the right camera, by the smear; NaN, and sigma infinite, where nothing tells it."""
-
-    value: Array  # (2,) [s^2]
-    sigma: Array  # (2,) [s^2]
-
-
-class Exposure(NamedTuple):
-    """What was taken off, and what is to be told of it."""
-
-    seconds: tuple[float, float]  # [s] of the left and the right camera
-    findings: tuple[Finding, ...] = ()
 
 
 def shift_by_exposure(
@@ -87,9 +71,10 @@ def shift_by_exposure(
     return np.where(np.isfinite(shift), shift, 0.0)
 
 
-def exposure_by_smear(R: Array, t: Array, time: Array, blur_px: Array, rig: StereoRig, disc: Disc) -> ExposureSquared:
-    """The exposures that the dots' edges tell; arguments as of `shift_by_exposure`, blur_px (n, 2, m) sigma of an edge.
+def exposure_by_smear(R: Array, t: Array, time: Array, blur_px: Array, rig: StereoRig, disc: Disc) -> Array:
+    """(2, 2) T^2 of the left and the right camera [s^2] by the dots' edges, and its sigmas.
 
+    Arguments as of `shift_by_exposure`; blur_px (n, 2, m) sigma of an edge. NaN, sigma infinite, where nothing tells.
     The squared blur is fitted by a constant of every dot, what changes with the distance (to second order), with the
     place in the image and with how obliquely a dot is seen (to first: blurs of curved edges are off by some 1e-4 px,
     which would hide a twentieth of 200 us), and T^2 times the smear of one second's exposure. Sigmas are those of the
@@ -111,44 +96,47 @@ def exposure_by_smear(R: Array, t: Array, time: Array, blur_px: Array, rig: Ster
         squared = blur_px[chosen, camera] ** 2
         return _slope(squared, smear[:, camera], [optics[0] ** 2, *optics])
 
-    value, sigma = np.transpose([of_camera(camera) for camera in (0, 1)])
-    return ExposureSquared(value, sigma)
+    return np.transpose([of_camera(camera) for camera in (0, 1)])
 
 
-def exposure_of(found: ExposureSquared, declared: tuple[float, float] | None, longest: float) -> Exposure:
+def exposure_of(
+    found: Array, declared: tuple[float, float] | None, longest: float
+) -> tuple[tuple[float, float], tuple[Finding, ...]]:
     """The exposure to take off: as declared, else one of both cameras as the smear tells where it is sure, else none.
 
-    longest : [s] the frame interval, which no exposure exceeds.
+    found : (2, 2) as `exposure_by_smear` has it; longest : [s] the frame interval, which no exposure exceeds.
     """
-    words = [_in_words(*each) for each in zip(CAMERAS, found.value, found.sigma, strict=True)]
+    words = [_in_words(*each) for each in zip(CAMERAS, *found, strict=True)]
     told = ", ".join(text for text in words if text)
     if declared is None:
         seconds = _likely(found, longest)
         note = f"exposure by the smear of the moving dots: {told}; poses are of the middle of {1e6 * seconds:.0f} us"
-        return Exposure((seconds, seconds), (Finding(Kind.EXPOSURE, Severity.NOTE, note),) if seconds else ())
+        return (seconds, seconds), (Finding(Kind.EXPOSURE, Severity.NOTE, note),) if seconds else ()
     expected = np.array(declared) ** 2
-    doubt = np.hypot(found.sigma, APPROXIMATE * np.fmax(np.abs(found.value), expected))
-    if not (np.abs(found.value - expected) > CONTRADICTS * doubt).any():
-        return Exposure(declared)
+    value, sigma = found
+    doubt = np.hypot(sigma, APPROXIMATE * np.fmax(np.abs(value), expected))
+    if not (np.abs(value - expected) > CONTRADICTS * doubt).any():
+        return declared, ()
     said = " and ".join(f"{1e6 * T:g}" for T in declared)
     text = (
         f"exposure_us is declared (or in the cameras' headers) as {said} us, the smear of the moving dots tells "
         f"{told}. The declared one is used: poses are off by up to g T^2 / (6 r) in theta if it is wrong"
     )
-    return Exposure(declared, (Finding(Kind.EXPOSURE, Severity.WARNING, text),))
+    return declared, (Finding(Kind.EXPOSURE, Severity.WARNING, text),)
 
 
-def _likely(found: ExposureSquared, longest: float) -> float:
+def _likely(found: Array, longest: float) -> float:
     """One exposure [s] of both cameras; 0 where the smear does not show one, or the cameras tell two."""
-    told = np.isfinite(found.sigma)
+    value, sigma = found
+    told = np.isfinite(sigma)
     if not told.any():
         return 0.0
-    weight = found.sigma[told] ** -2
-    mean = float(weight @ found.value[told] / weight.sum())
+    weight = sigma[told] ** -2
+    mean = float(weight @ value[told] / weight.sum())
     if not SURE * weight.sum() ** -0.5 < mean < longest**2 * (1 + SURE * APPROXIMATE):
         return 0.0
-    doubt = np.hypot(np.hypot(*found.sigma), APPROXIMATE * mean)
-    if told.all() and abs(found.value[1] - found.value[0]) > SURE * doubt:
+    doubt = np.hypot(np.hypot(*sigma), APPROXIMATE * mean)
+    if told.all() and abs(value[1] - value[0]) > SURE * doubt:
         return 0.0
     return min(float(np.sqrt(mean)), longest)
 

@@ -6,8 +6,6 @@ the poses white noise is 30 times itself, and what precesses by an angle a per f
 of 5 mm. So only frames are counted between which the disc precesses by less.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -27,17 +25,12 @@ KEPT, MEAN_KEPT = 0.8, 0.43772
 WORTH = 4.5
 
 
-@dataclass(frozen=True)
-class PoseScatter:
-    """Variance of the poses from frame to frame over what the dots tell."""
+def scatter_of_poses(fits: PoseFits) -> tuple[Array, Array, Array]:
+    """Variance of the poses from frame to frame over what their dots, as the covariances have it, tell.
 
-    found: Array  # (4,) by GROUPS; NaN where no frames are slow enough
-    sigma: Array  # (4,) by chance alone, for 1
-    factor: Array  # (6,) at least 1, for the variances of POSE_COMPONENTS: the part of the excess that is no chance
-
-
-def scatter_of_poses(fits: PoseFits) -> PoseScatter:
-    """From sixth differences of the fitted poses; the covariances are those that their dots tell."""
+    From sixth differences: (4,) found, by GROUPS, NaN where no frames are slow enough; (4,) its sigma by chance alone;
+    (6,) at least 1, for the variances of POSE_COMPONENTS: the part of the excess that is no chance.
+    """
     found, sigma, factor = np.full(4, np.nan), np.full(4, np.nan), np.ones(6)
     parts = [
         away[slow] ** 2 / np.diagonal(spread[slow], axis1=1, axis2=2)
@@ -46,7 +39,7 @@ def scatter_of_poses(fits: PoseFits) -> PoseScatter:
     ]
     square = np.concatenate(parts) if parts else np.empty((0, 6))
     if len(square) < MIN_FRAMES:
-        return PoseScatter(found, sigma, factor)
+        return found, sigma, factor
     kept = np.sort(square, axis=0)[: int(KEPT * len(square))].mean(axis=0) / MEAN_KEPT
     for i, group in enumerate(GROUPS):
         part = list(group)
@@ -54,7 +47,7 @@ def scatter_of_poses(fits: PoseFits) -> PoseScatter:
         excess = found[i] - 1.0
         # nothing below three sigmas, all of what is far above
         factor[part] = 1.0 + max(excess - (3.0 * sigma[i]) ** 2 / excess, 0.0) if excess > 0 else 1.0
-    return PoseScatter(found, sigma, factor)
+    return found, sigma, factor
 
 
 def _precession(R: Array, rows: NDArray[np.intp]) -> Array:

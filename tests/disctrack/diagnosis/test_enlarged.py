@@ -11,7 +11,7 @@ from disctrack.diagnosis import diagnose
 from disctrack.diagnosis.model_file import declared_model, model_toml
 from disctrack.diagnosis.motion import measurement_candidates
 from disctrack.diagnosis.starts import first_state
-from disctrack.faults.catalogue import setup_of
+from disctrack.faults.catalogue import scene_faults
 from disctrack.faults.dots import predict
 from disctrack.faults.keys import Faults
 from disctrack.frames import rotation_from_euler
@@ -66,12 +66,11 @@ def test_images_of_a_faulty_scene_are_those_that_the_diagnosis_predicts(short, e
     R = rotation_from_euler(*q[:, 3:].T)
     centres = true_disc_of(scene).marker_centres_body
     rendered = rig_after_faults(rig, scene).project(centres @ np.swapaxes(R, 1, 2) + q[:, None, :3])
-    predicted = predict(
-        np.stack([R, R]), np.stack([q[:, :3]] * 2), rig, short.disc, setup_of(short.disc, everything_wrong)
-    ).pixels
+    poses = np.stack([R, R]), np.stack([q[:, :3]] * 2)
+    predicted, _ = predict(*poses, rig, short.disc, scene_faults(short.disc, everything_wrong))
     # arithmetic; the faults move the dots by some pixels
     assert_allclose(np.moveaxis(rendered, -3, 1), predicted, atol=1e-9)
-    plain = predict(np.stack([R, R]), np.stack([q[:, :3]] * 2), rig, short.disc, setup_of(short.disc, {})).pixels
+    plain, _ = predict(*poses, rig, short.disc, scene_faults(short.disc, {}))
     assert np.abs(plain - predicted).max() > 0.1
 
 

@@ -1,0 +1,62 @@
+"""A camera that moves a little while the disc is filmed is noticed, and the sigmas of the poses hold it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from disctrack.faults.keys import CameraFault, Faults
+from disctrack.findings import Kind
+from disctrack.track.judge.camera_course import camera_course
+from disctrack.track.refine.assembly import fit_all
+from disctrack.track.refine.intrinsic_scatter import split_scatter
+from tests.oracles.measured_disc import dots_of, measured
+
+N = 200
+SHARE = np.linspace(0.0, 1.0, N)
+
+
+def judged(trajectory):
+    """Poses of the dots, and what a camera's course makes of them."""
+    seen = dots_of(trajectory)
+    fits = fit_all(seen)
+    scatter = split_scatter(fits, seen.covariance, None)
+    seen = replace(seen, R=fits.R_world_body, t=fits.t_world_body)
+    return fits, camera_course(seen, fits, scatter, range(N))
+
+
+@pytest.mark.parametrize("camera", [0, 1])
+@pytest.mark.parametrize(
+    "course", [0.02 * (SHARE > 0.5), 0.02 * (SHARE > 0.9), 0.03 * SHARE], ids=["knock", "late", "drift"]
+)
+def test_a_camera_that_moves_a_little_is_named_and_within_the_sigmas(camera, course):
+    still = measured(n=N)
+    pixels = still.markers_px.copy()
+    pixels[:, camera] += course[:, None, None]  # px, along both axes of the image
+    moved, (by_course, told) = judged(replace(still, markers_px=pixels))
+    assert [finding.kind for finding in told] == [Kind.CAMERA_MOVED]
+    if np.ptp(np.diff(course)) > 0.01:
+        assert abs(told[0].subject.frames[0][0] - np.argmax(course > 0)) <= N / 20
+    error = moved.t_world_body - fit_all(dots_of(still)).t_world_body
+    variance = np.diagonal(still.pose_covariance + still.calibration_covariance, axis1=1, axis2=2)[:, :3]
+    assert (np.abs(error) / np.sqrt(variance)).max() > 5  # or it would not matter
+    variance = variance + np.diagonal(by_course, axis1=1, axis2=2)[:, :3]
+    assert (np.abs(error) / np.sqrt(variance)).max() < 3.5
+
+
+@pytest.mark.parametrize(
+    "faults",
+    [
+        Faults(),
+        Faults(right=CameraFault(rotation_deg=(0.02, -0.01, 0.015))),
+        Faults(left=CameraFault(focal_scale=1.004, k1_change=0.01)),
+        Faults(right_delay_s=2e-4),
+    ],
+    ids=["none", "turned", "zoomed", "late"],
+)
+def test_what_is_wrong_throughout_is_no_course(faults):
+    """Negative controls: the misfit of a wrong camera changes with the disc's place."""
+    for seed in range(3):
+        _, (by_course, told) = judged(measured(n=N, faults=faults, seed=seed))
+        assert told == ()
+        assert not by_course.any()
