@@ -16,7 +16,6 @@ from disctrack.findings import MISFITS, Finding, Kind, Remedy, Severity, Subject
 from disctrack.numbers import Measured
 from disctrack.track.judge.dropped_frames import HARDLY
 from disctrack.track.pose import PoseFits
-from disctrack.track.refine.intrinsic_scatter import Scatter
 from disctrack.track.refine.self_calibration import DotsInFrames
 from disctrack.track.side_by_side import SHARED_FRAMES, evenly
 
@@ -25,9 +24,7 @@ FEWEST = 2  # frames in each, and stretches on either side of a knock
 SURE = 5.0  # sigmas of the difference before and after; a drift, whose scatter is its own, reaches 7
 
 
-def camera_course(
-    seen: DotsInFrames, fits: PoseFits, scatter: Scatter, pairs: range
-) -> tuple[Array, tuple[Finding, ...]]:
+def camera_course(seen: DotsInFrames, fits: PoseFits, pairs: range) -> tuple[Array, tuple[Finding, ...]]:
     """What a camera that moved makes the poses uncertain by (n, 6, 6), zero for none, and what is to be told of it.
 
     seen, fits : with the covariances of the dots' own noise
@@ -38,17 +35,17 @@ def camera_course(
     parts = np.array_split(rows, STRETCHES)
     free = np.arange(N_RIG + 2 * seen.disc.n_markers) < N_RIG
     either = _turns(seen.rig)
-    normals, gradients = zip(*[seen.at(part).normal(0.0 * free, fits.used[part], free) for part in parts], strict=True)
+    told = [seen.at(part).normal(0.0 * free, fits.used[part], free) for part in parts]
+    normals, gradients, squares = zip(*told, strict=True)
     right = either[:, 3:]
     best = right @ np.linalg.eigh(right.T @ sum(normals) @ right)[1][:, -1]
     known = np.array([best @ normal @ best for normal in normals])
     course = np.array([best @ gradient for gradient in gradients]) / known
     sure, first = max((_difference(course, cut), cut) for cut in range(FEWEST, STRETCHES - FEWEST + 1))
-    # of the misfit, in parts of the noise: what a turn throughout would explain, and beyond it one that changes
-    freedom = fits.degrees_of_freedom[rows].sum()
-    constant = (known @ course) ** 2 / known.sum() / freedom
-    explained = known @ course**2 / freedom - constant
-    if sure < SURE or explained < HARDLY * (scatter.systematic / scatter.noise - constant):
+    # of chi-square beyond the noise: what a turn throughout would explain, and beside it one that changes
+    constant = (known @ course) ** 2 / known.sum()
+    explained, misfit = known @ course**2 - constant, sum(squares) - fits.degrees_of_freedom[rows].sum()
+    if sure < SURE or explained < HARDLY * (misfit - constant):
         return np.zeros((6, 6)), ()
     turn, frame = float(np.ptp(course)), pairs[parts[first][0]]
     by_turn = turn * fits.sensitivity @ either
@@ -58,8 +55,8 @@ def camera_course(
     )
     of, size = Subject("track", frames=((frame, frame),)), {"turn": Measured(float(np.degrees(turn)), unit="deg")}
     advice = (Remedy(action="clamp the cameras, and calibrate again"),)
-    told = Finding(Kind.CAMERA_MOVED, Severity.WARNING, text, of, size, advice, MISFITS)
-    return by_turn @ by_turn.swapaxes(1, 2), (told,)
+    finding = Finding(Kind.CAMERA_MOVED, Severity.WARNING, text, of, size, advice, MISFITS)
+    return by_turn @ by_turn.swapaxes(1, 2), (finding,)
 
 
 def _turns(rig: StereoRig) -> Array:

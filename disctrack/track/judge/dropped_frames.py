@@ -5,16 +5,17 @@ To first order they are displaced by their velocity in the image times the delay
 makes up for is no sign of it.
 """
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.cameras.camera import N_RIG
 from calibration.kit.arrays import Mask
 from calibration.kit.brief import ranges
-from calibration.kit.least_squares import normal_of_rows
 from disctrack.findings import MISFITS, Finding, Kind, Remedy, Severity, Subject
 from disctrack.frames import CAMERAS
 from disctrack.numbers import Measured
-from disctrack.track.pose import misses, whitening
 from disctrack.track.refine.self_calibration import DotsInFrames
 from disctrack.track.side_by_side import SHARED_FRAMES, evenly
 
@@ -69,19 +70,13 @@ def delay_of_right(seen: DotsInFrames, rows: NDArray[np.intp]) -> tuple[float, f
     """
     inside = rows[(rows > 0) & (rows < len(seen.t) - 1)]
     rows = evenly(inside[seen.posed[inside]], SHARED_FRAMES)
-    some, pixels = seen.at(rows), seen.pixels
-    residuals, by_pose, known = misses(
-        some.pixels, some.covariance, some.rig, some.disc.marker_centres_body, some.R, some.t
-    )
-    velocity = np.zeros_like(residuals)
-    velocity[:, 1] = 0.5 * (pixels[rows + 1, 1] - pixels[rows - 1, 1])
-    by_delay = (whitening(some.covariance) @ velocity[..., None])[..., 0]
-    known &= np.isfinite(by_delay).all(axis=-1) & np.isfinite(by_pose).all(axis=(-2, -1))
-    known &= known.sum(axis=(1, 2), keepdims=True) >= 4
-    # with the residuals as a shared column, too: what of their square no pose makes up for
-    both = np.stack([by_delay, residuals, residuals], axis=-1)
-    told = np.where(known[..., None, None], np.concatenate([by_pose, both], axis=-1), 0.0)
-    (by_itself, across), (_, whole) = normal_of_rows(told.reshape(len(rows), -1, 9), 6).eliminated()[0]
+    velocity = np.zeros_like(seen.pixels[rows])
+    velocity[:, 1] = 0.5 * (seen.pixels[rows + 1, 1] - seen.pixels[rows - 1, 1])
+    some = replace(seen.at(rows), further=velocity[..., None])
+    used = np.isfinite(some.pixels + velocity).all(axis=-1)
+    used &= used.sum(axis=(1, 2), keepdims=True) >= 4
+    free = np.append(np.zeros(N_RIG + 2 * seen.disc.n_markers, bool), True)
+    ((by_itself,),), (across,), whole = some.normal(np.zeros(len(free)), used, free)
     if not (whole > 0 and by_itself > 0):
         return 0.0, 0.0
     return float(across / by_itself), float(across**2 / (by_itself * whole))

@@ -94,7 +94,7 @@ def assemble(
     seen = replace(seen, R=fits.R_world_body, t=fits.t_world_body)
     fits, verdicts = _judged(fits, dots, repeated, outlying, taken.frame_rate, disc.radius)
     slips = dropped_frames(verdicts == FrameStatus.CONTRADICTED, seen, taken.pairs)
-    course, of_course = camera_course(seen, fits, scatter, taken.pairs)
+    course, of_course = camera_course(seen, fits, taken.pairs)
     systematic += course
     moved = by_pattern(as_built, fits.R_world_body)
     fits, systematic, rig, table = table_from_disc(fits, systematic, as_built.rig, disc, settings.table, moved)

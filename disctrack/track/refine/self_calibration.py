@@ -133,10 +133,11 @@ class DotsInFrames:
         R = np.where(ok[:, None, None], fits.R_world_body, self.R)
         return replace(self, R=R, t=np.where(ok[:, None], fits.t_world_body, self.t)), fits
 
-    def normal(self, shift: Array, used: Mask, free: Mask) -> tuple[Array, Array]:
+    def normal(self, shift: Array, used: Mask, free: Mask) -> tuple[Array, Array, float]:
         """Normal matrix (k, k) and gradient (k,) of the free ones of what is shared, every frame's pose eliminated.
 
         used : (n, 2, m) dots that count; free : (30 + 2m + j,)
+        And chi-square, by which the decrease that a shared number explains can be judged.
         """
         _, covariance, rig, centres = shifted = self.shifted(shift)
         residuals, by_pose, known = misses(*shifted, self.R, self.t)
@@ -151,9 +152,12 @@ class DotsInFrames:
             by_shared[:, :, k, :, N_RIG + 2 * k : N_RIG + 2 * k + 2] = by_place[:, :, k]
         if self.further is not None:
             by_shared[..., -self.further.shape[-1] :] = W @ self.further
-        rows = np.concatenate([by_pose, by_shared[..., free], residuals[..., None]], axis=-1)
-        rows = np.where((used & known)[..., None, None], rows, 0.0)
-        return normal_of_rows(rows.reshape(len(rows), -1, rows.shape[-1]), 6).eliminated()
+        known &= used & np.isfinite(by_pose).all(axis=(-2, -1))
+        # with the residuals as one more of what is shared, for their square
+        rows = np.concatenate([by_pose, by_shared[..., free], residuals[..., None], residuals[..., None]], axis=-1)
+        rows = np.where(known[..., None, None], rows, 0.0)
+        matrix, gradient = normal_of_rows(rows.reshape(len(rows), -1, rows.shape[-1]), 6).eliminated()
+        return matrix[:-1, :-1], gradient[:-1], float(gradient[-1])
 
 
 @dataclass(frozen=True)
@@ -178,7 +182,7 @@ def fit_shared(frames: DotsInFrames, free: Mask, information: Array, repeats: fl
         ok = fits.converged
         reduced.append(float(fits.chi_square[ok].sum() / max(fits.degrees_of_freedom[ok].sum(), 1)))
         used = fits.used & ok[:, None, None]
-        normal, gradient = frames.normal(shift, used, free)
+        normal, gradient, _ = frames.normal(shift, used, free)
         # dots that scatter more than the image noise alone makes them tell accordingly less, whatever is common to them
         scale = _information_scale(frames.covariance, used, repeats) / _scatter_left(fits, normal, gradient)
         matrix = scale * normal + information

@@ -9,7 +9,6 @@ from disctrack.faults.keys import CameraFault, Faults
 from disctrack.findings import Kind
 from disctrack.track.judge.camera_course import camera_course
 from disctrack.track.refine.assembly import fit_all
-from disctrack.track.refine.intrinsic_scatter import split_scatter
 from tests.oracles.measured_disc import dots_of, measured
 
 N = 200
@@ -20,9 +19,8 @@ def judged(trajectory):
     """Poses of the dots, and what a camera's course makes of them."""
     seen = dots_of(trajectory)
     fits = fit_all(seen)
-    scatter = split_scatter(fits, seen.covariance, None)
     seen = replace(seen, R=fits.R_world_body, t=fits.t_world_body)
-    return fits, camera_course(seen, fits, scatter, range(N))
+    return fits, camera_course(seen, fits, range(N))
 
 
 @pytest.mark.parametrize("camera", [0, 1])
