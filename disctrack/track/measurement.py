@@ -286,11 +286,11 @@ def _exposures(recording: Recording, pairs: ImagePairs) -> tuple[tuple[float, fl
 def _span(pairs: ImagePairs, frame_rate: float, settings: TrackingSettings, threads: int | None) -> MotionSpan:
     """What is to be tracked of the pairs."""
     if not settings.first_pass:
-        return MotionSpan(pairs.start, pairs.stop, 0, True, "every frame, as requested")
+        return MotionSpan(pairs.start, pairs.stop, 0, "every frame, as requested")
     if len(pairs) < WHOLE_BELOW * frame_rate:
-        return MotionSpan(pairs.start, pairs.stop, 0, True, f"every frame of a recording below {WHOLE_BELOW:g} s")
+        return MotionSpan(pairs.start, pairs.stop, 0, f"every frame of a recording below {WHOLE_BELOW:g} s")
     if not (pairs.left.random_access and pairs.right.random_access):
-        return MotionSpan(pairs.start, pairs.stop, 0, True, "every frame: these files can only be read in order")
+        return MotionSpan(pairs.start, pairs.stop, 0, "every frame: these files can only be read in order")
     return find_motion(pairs.left, pairs.right, pairs.start, pairs.stop, frame_rate, threads)
 
 

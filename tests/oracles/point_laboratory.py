@@ -131,8 +131,7 @@ def tables_of(px, R, t, sigma):
 
 def tracked(px, R, t, times, rig, frame_rate):
     """What tracking makes of located dots (n, 2, m, 2), followed near poses R, t."""
-    nothing = np.zeros((2, 1, 1))
-    setup = TrackingSetup(rig, MA_2014, nothing, nothing)
+    setup = TrackingSetup(rig, MA_2014, None)  # no image is looked at
     follower = Follower(setup, Law((Edge(noise=NoiseModel(0.64, 0.02)),) * 2), measured=True)
     return assemble(
         [follower],

@@ -114,15 +114,14 @@ class TrackingSetup:
 
     rig: StereoRig
     disc: Disc
-    maps_x: Array  # (2, height, width) undistorted normalised coordinates of every pixel
-    maps_y: Array
+    views: kernels.Views
 
     @classmethod
     def of(cls, rig: StereoRig, disc: Disc) -> TrackingSetup:
         """With the cameras' maps, which take a while."""
         with ThreadPoolExecutor(2) as pool:
             maps_x, maps_y = zip(*pool.map(normalised_maps, rig.cameras), strict=True)
-        return cls(rig, disc, np.stack(maps_x), np.stack(maps_y))
+        return cls(rig, disc, kernels.Views(np.stack(maps_x), np.stack(maps_y), *stacked(rig)))
 
 
 @dataclass
@@ -183,7 +182,7 @@ def run(
     done = kernels.track_frames(
         images,
         readable,
-        kernels.Views(setup.maps_x, setup.maps_y, *stacked(setup.rig)),
+        setup.views,
         face_of(setup.disc),
         kernels.Expected(
             np.array([edge.blur_px for edge in law.edges]),
@@ -359,7 +358,7 @@ def _measure_blur_and_noise(follower: Follower, images: Image, readable: Mask, p
         R_cw, t_cw = setup.rig.camera_poses()[camera]
         poses = [(R_cw @ R[k], R_cw @ t[k] + t_cw) for k in frames]
         seen = [images[k, camera] for k in frames]
-        maps = setup.maps_x[camera], setup.maps_y[camera]
+        maps = setup.views.map_x[camera], setup.views.map_y[camera]
         return measure_noise(seen, setup.rig.cameras[camera], poses, setup.disc, maps, edges[camera].blur_px)
 
     for camera in range(2):

@@ -40,7 +40,6 @@ class MotionSpan:
     start: int
     stop: int
     looked_at: int  # pairs read for this
-    moves: bool  # False where no frame differs from the first: then nothing is left out
     verdict: str
 
 
@@ -104,7 +103,7 @@ def find_motion(
     margin = max(int(np.ceil(MARGIN * frame_rate)), 2 * STRIDE)
     looked: list[int] = []
     if stop - start < 2 * margin:
-        return MotionSpan(start, stop, 0, True, "too short to leave anything out")
+        return MotionSpan(start, stop, 0, "too short to leave anything out")
     with ThreadPoolExecutor(threads or default_threads(), thread_name_prefix="look") as pool:
 
         def read(frames: list[int]) -> list[Pair | None]:
@@ -113,14 +112,14 @@ def find_motion(
 
         last_still = _last_still(read, start, stop, 1)
         if last_still is None:
-            return MotionSpan(start, stop, len(looked), False, "nothing moves in the whole recording")
+            return MotionSpan(start, stop, len(looked), "nothing moves in the whole recording")
         first_still = _last_still(read, stop - 1, start - 1, -1)
     begin, end = last_still - margin, (stop - 1 if first_still is None else first_still) + margin + 1
     worth = MIN_SAVED * frame_rate
     begin = begin if begin - start >= worth else start
     end = end if stop - end >= worth else stop
     rest = [f"rest in frames {a}-{b - 1}" for a, b in ((start, begin), (end, stop)) if a < b]
-    return MotionSpan(begin, end, len(looked), True, " and ".join(rest) or "moves from end to end")
+    return MotionSpan(begin, end, len(looked), " and ".join(rest) or "moves from end to end")
 
 
 def _read(left: FrameReader, right: FrameReader, frame: int) -> Pair | None:

@@ -20,7 +20,6 @@ from disctrack.track.refine.self_calibration import DotsInFrames
 from disctrack.track.side_by_side import SHARED_FRAMES, evenly
 
 STRETCHES = 20
-FEWEST = 2  # frames in each, and stretches on either side of a knock
 SURE = 5.0  # sigmas of the difference before and after; a drift, whose scatter is its own, reaches 7
 
 
@@ -30,7 +29,7 @@ def camera_course(seen: DotsInFrames, fits: PoseFits, pairs: range) -> tuple[Arr
     seen, fits : with the covariances of the dots' own noise
     """
     rows = evenly(np.flatnonzero(fits.converged & fits.used.any(axis=2).all(axis=1)), SHARED_FRAMES)
-    if len(rows) < FEWEST * STRETCHES:
+    if len(rows) < 2 * STRETCHES:
         return np.zeros((6, 6)), ()
     parts = np.array_split(rows, STRETCHES)
     free = np.arange(N_RIG + 2 * seen.disc.n_markers) < N_RIG
@@ -41,7 +40,7 @@ def camera_course(seen: DotsInFrames, fits: PoseFits, pairs: range) -> tuple[Arr
     best = right @ np.linalg.eigh(right.T @ sum(normals) @ right)[1][:, -1]
     known = np.array([best @ normal @ best for normal in normals])
     course = np.array([best @ gradient for gradient in gradients]) / known
-    sure, first = max((_difference(course, cut), cut) for cut in range(FEWEST, STRETCHES - FEWEST + 1))
+    sure, first = max((_difference(course, cut), cut) for cut in range(2, STRETCHES - 1))
     # of chi-square beyond the noise: what a turn throughout would explain, and beside it one that changes
     constant = (known @ course) ** 2 / known.sum()
     explained, misfit = known @ course**2 - constant, sum(squares) - fits.degrees_of_freedom[rows].sum()

@@ -64,7 +64,7 @@ def test_poses_are_the_same_to_the_last_bit_whoever_puts_them_together(rendered_
     pixels += sigma * rng.standard_normal(pixels.shape)
     pixels[100, 1, 2] += 3.0  # a dot to be struck
     pixels[160:163, 0] += 0.1  # frames to be refused
-    setup = TrackingSetup(rig, disc, *np.zeros((2, 2, 1, 1)))
+    setup = TrackingSetup(rig, disc, None)  # no image is looked at
     taken = Taken(range(n), times, 1000.0, 9.81)
 
     def by(workers, pixels=pixels):
