@@ -127,7 +127,7 @@ def run_check(folder: Path, progress: Callable[[str], None] = lambda step: None)
         seen.warn(Kind.DISC_NOT_FOUND, "the dots were not looked for: that needs the cameras' calibration")
     else:
         with seen.refusing(Kind.CALIBRATION):
-            check_images(*pairs.left.image_size, rig)
+            check_images(pairs.left.image_size, rig)
             progress("dots")
             _motion(seen, recording, rig, pairs)
     seen.findings += images_lost(seen.not_read.values())

@@ -98,7 +98,7 @@ class Tracker:
                 f"left is an image of shape {left.shape} {left.dtype}, right of {right.shape} {right.dtype}; expected "
                 "(height, width), both of one type"
             )
-        check_images(*left.shape[::-1], self.rig)
+        check_images(left.shape[::-1], self.rig)
         return np.stack([left, right])[None]
 
     def _pose(self, rows: Tables) -> LivePose:

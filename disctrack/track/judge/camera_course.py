@@ -11,7 +11,7 @@ the scatter; where it does not, as the disc settles, it is as much in other dire
 import numpy as np
 
 from calibration.cameras.camera import N_RIG, PAIR_SHIFT, PAIR_TURN, WORLD_SHIFT, WORLD_TURN, StereoRig
-from calibration.kit.arrays import Array
+from calibration.kit.arrays import Array, Mask
 from disctrack.findings import MISFITS, Finding, Kind, Remedy, Severity, Subject
 from disctrack.numbers import Measured
 from disctrack.track.judge.dropped_frames import HARDLY
@@ -28,13 +28,14 @@ def camera_course(seen: DotsInFrames, fits: PoseFits, pairs: range) -> tuple[Arr
 
     seen, fits : with the covariances of the dots' own noise
     """
-    rows = evenly(np.flatnonzero(fits.converged & fits.used.any(axis=2).all(axis=1)), SHARED_FRAMES)
+    by_both: Mask = np.asarray(fits.used.sum(axis=2).min(axis=1) > 0)
+    rows = evenly(np.flatnonzero(fits.converged & by_both), SHARED_FRAMES)
     if len(rows) < 2 * STRETCHES:
         return np.zeros((6, 6)), ()
     parts = np.array_split(rows, STRETCHES)
     free = np.arange(N_RIG + 2 * seen.disc.n_markers) < N_RIG
     either = _turns(seen.rig)
-    told = [seen.at(part).normal(0.0 * free, fits.used[part], free) for part in parts]
+    told = [seen.at(part).normal(np.zeros(len(free)), fits.used[part], free) for part in parts]
     normals, gradients, squares = zip(*told, strict=True)
     right = either[:, 3:]
     best = right @ np.linalg.eigh(right.T @ sum(normals) @ right)[1][:, -1]
