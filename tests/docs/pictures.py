@@ -2,7 +2,7 @@
 
 python tests/docs/pictures.py CLIP SECRET [FOLDER]
 
-CLIP : results of `disctrack check` and `run` of sample_data/clip; SECRET : of the tour, diagnosed with --figures;
+CLIP : results of `disctrack run` of sample_data/clip; SECRET : of the tour, diagnosed with --figures;
 FOLDER : where the pictures go (default: `disctrack/docs/pictures`)
 """
 
@@ -48,9 +48,9 @@ def make(clip: Path, secret: Path, folder: Path) -> list[Path]:
     cv2.imwrite(str(folder / "frame.png"), drawn)
     written = [folder / "frame.png", save_figure(theta_figure(trajectory), folder / "theta.png")]
     copies = {
-        "calibration_residuals.png": clip / "calibration_residuals.png",
-        "coordinates.png": clip / "coordinates.png",
-        "check.jpg": clip / "check.png",
+        "calibration_residuals.png": secret / "calibration_residuals.png",
+        "coordinates.png": secret / "coordinates.png",
+        "check.jpg": secret / "check.png",
         "diagnosis_residuals.png": secret / "trajectory_diagnosis" / "figures" / "02_residuals.png",
         "diagnosis_free_run.png": secret / "trajectory_diagnosis" / "figures" / "04_free_run.png",
         "diagnosis_candidates.png": secret / "trajectory_diagnosis" / "figures" / "07_candidates.png",
