@@ -346,7 +346,7 @@ def _require_views(views: Views, names: Names, table_view: int | None) -> None:
             reasons = {names[v][camera]: view.reason for v, view in enumerate(side) if isinstance(view, BoardNotFound)}
             raise CalibrationError(
                 f"the board was found in {found} of {len(side)} {CAMERA_NAMES[camera]} images, at least {MIN_VIEWS} "
-                f"are needed (10 to 20 are good). {_listed(reasons)}"
+                f"are needed (15 to 40 are good). {_listed(reasons)}"
             )
     why = "" if table_view is None else _left_out(views, names)[0].get(table_view)
     if why:

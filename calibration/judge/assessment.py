@@ -219,7 +219,7 @@ def _warnings(found: Assessment, refinement: Refinement, chosen: TermsTried) -> 
         )
     n_views = len(np.unique(refinement.observations.view[refinement.kept]))
     if n_views < GOOD_VIEWS:
-        told.append(f"{n_views} views are few (good: 10 to 20)")
+        told.append(f"{n_views} views are few (good: 15 to 40)")
     if found.inflation > TWICE:
         told.append(
             f"the views disagree {found.inflation**0.5:.1f} times more than their corners' noise allows; the "
