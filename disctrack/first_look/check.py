@@ -35,8 +35,8 @@ from disctrack.frames import CAMERAS, rotation_from_quaternion
 from disctrack.recording.declaration import Recording, read_recording
 from disctrack.recording.readers.blocks import Unreadable
 from disctrack.report.blocks import Facts, Report, Section
-from disctrack.track.follow.tracking import Tracking, TrackingSettings, check_images, track
-from disctrack.track.measurement import ImagePairs, images_lost, open_pairs
+from disctrack.track.follow.tracking import Tracking, TrackingSettings, track
+from disctrack.track.measurement import ImagePairs, check_rig, images_lost, open_pairs
 from disctrack.track.run_summary import left_out
 from disctrack.trajectory import Trajectory
 
@@ -127,7 +127,7 @@ def run_check(folder: Path, progress: Callable[[str], None] = lambda step: None)
         seen.warn(Kind.DISC_NOT_FOUND, "the dots were not looked for: that needs the cameras' calibration")
     else:
         with seen.refusing(Kind.CALIBRATION):
-            check_images(pairs.left.image_size, rig)
+            check_rig(rig, pairs)
             progress("dots")
             _motion(seen, recording, rig, pairs)
     seen.findings += images_lost(seen.not_read.values())

@@ -30,7 +30,15 @@ from disctrack.recording.readers.flat_field import flat_fielded, flat_fields
 from disctrack.recording.readers.part import frames_in_parts, image_parts
 from disctrack.recording.readers.time_stamps import check_time_stamps, usable_times
 from disctrack.track.follow.motion_span import MotionSpan, find_motion
-from disctrack.track.follow.tracking import ReadBlocks, Tracking, TrackingSettings, prepare, stretch_edges, track
+from disctrack.track.follow.tracking import (
+    ReadBlocks,
+    Tracking,
+    TrackingSettings,
+    check_images,
+    prepare,
+    stretch_edges,
+    track,
+)
 from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
 from disctrack.trajectory.file import Provenance
 
@@ -133,6 +141,12 @@ def open_pairs(recording: Recording, frames: tuple[int | None, int | None] = (No
     return ImagePairs(left, right, start, stop, findings)
 
 
+def check_rig(rig: StereoRig, pairs: ImagePairs) -> None:
+    """Raise TrackingError that names the file unless the rig was calibrated at the recording's image size."""
+    for reader in (pairs.left, pairs.right):
+        check_images(reader.image_size, rig, f"{reader.describe(pairs.start)}: {reader.camera} images")
+
+
 @one_blas_thread
 @checked
 def measure(
@@ -154,6 +168,7 @@ def measure(
         >>> int(measurement.trajectory.measured.sum())
         300
     """
+    check_rig(rig, pairs)
     settings = settings or TrackingSettings()
     if recording.table is not None:
         settings = dataclasses.replace(settings, table=recording.table.source)

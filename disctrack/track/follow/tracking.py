@@ -261,12 +261,12 @@ def _torn(tables: Tables, edge: int) -> bool:
     return bool(np.arccos(np.clip((np.trace(miss) - 1) / 2, -1, 1)) > MAX_EDGE_TURN)
 
 
-def check_images(size: tuple[int, ...], rig: StereoRig) -> None:
+def check_images(size: tuple[int, ...], rig: StereoRig, which: str = "images") -> None:
     """Raise TrackingError unless images of this width and height [px] have the size that the rig was calibrated at."""
     for name, camera in zip(frames.CAMERAS, rig.cameras, strict=True):
         if camera.image_size != size:
             raise TrackingError(
-                f"images are {size[0]} x {size[1]} px, but the rig's {name} camera was calibrated at "
+                f"{which} are {size[0]} x {size[1]} px, but the rig's {name} camera was calibrated at "
                 f"{camera.image_size[0]} x {camera.image_size[1]} px: calibrate with views of the recording's own "
                 "size, or name the rig that belongs to it"
             )

@@ -10,8 +10,10 @@ from calibration.kit.stuck_pixels import stuck_pixels
 from disctrack import frames
 from disctrack.errors import TrackingError
 from disctrack.findings import Kind
+from disctrack.recording.declaration import read_recording
 from disctrack.synthetic import render_disc
 from disctrack.track.follow.tracking import PAIRS_TRIED, TrackingSettings, _as_one_sensor, track
+from disctrack.track.measurement import measure, open_pairs
 from disctrack.trajectory import FrameStatus, MarkerStatus
 
 N = 60
@@ -215,6 +217,12 @@ def test_images_of_another_size_are_refused(rolling, rendered_pairs):
     images, _ = rolling
     with pytest.raises(TrackingError, match=r"480 x 512 px, but the rig's left camera was calibrated at 512 x 512"):
         tracked(images[:3, :, :, :480], rendered_pairs)
+
+
+def test_images_that_do_not_fit_the_rig_are_named_by_file_and_camera(rendered_pairs, sample_clip):
+    recording = read_recording(sample_clip)
+    with pytest.raises(TrackingError, match=r"left/000000\.png: left images are 272 x 272 px, but the rig's"):
+        measure(recording, rendered_pairs.rig, open_pairs(recording))
 
 
 def test_a_recording_without_the_disc_is_an_error_that_says_what_was_seen(rendered_pairs):
