@@ -18,11 +18,13 @@ import tifffile
 from numpy.typing import NDArray
 
 from disctrack.errors import RecordingError
+from disctrack.recording.readers._unpack_kernels import lzw_codes_follow
 from disctrack.recording.readers.raw import MOST_PIXELS, RawFile, check_claim, check_frame_size
 
 logging.getLogger("tifffile").addHandler(logging.NullHandler())  # it logs what it finds odd; here that is an error
 
-_READ = frozenset((1, 5, 7, 8, 32773, 32946))  # compressions: none, LZW, JPEG, deflate, PackBits, deflate
+_LZW = 5
+_READ = frozenset((1, _LZW, 7, 8, 32773, 32946))  # compressions: none, LZW, JPEG, deflate, PackBits, deflate
 # Tags by which the pixels of two pages are decoded alike.
 _LAYOUT = (256, 257, 258, 259, 262, 266, 274, 277, 278, 284, 317, 320, 322, 323, 338, 339, 347)
 
@@ -180,6 +182,8 @@ def _check(page: Page, where: str) -> None:
 def _decoded(page: tifffile.TiffPage, pieces: list[bytes]) -> NDArray:
     pixels: NDArray = np.empty(page.shaped, page.dtype)  # separate samples, 1, height, width, samples
     for index, piece in enumerate(pieces):
+        if page.compression == _LZW and not lzw_codes_follow(np.frombuffer(piece, np.uint8)):
+            raise ValueError(f"a code of LZW in piece {index} that nothing explains")
         part, (sample, _, y, x, _), _ = page.decode(piece, index, jpegtables=page.jpegtables)
         if part is None:
             raise ValueError(f"nothing in piece {index}")
