@@ -98,8 +98,9 @@ def test_the_number_of_workers_changes_no_bit_of_the_result(rolling, rendered_pa
     # a template keeps its attitude until the pose has turned by a tolerance, which moves a dot by up to 1e-3 px of a
     # scatter of 4e-3 px; when that happens hangs on the last digit of a pose, and for some frames after a start
     assert change.max() < 0.5
-    # where noise and blur are taken from the same frames, only single precision rounds differently: 1e-6 px
-    assert np.median(change[: N // 2].max(axis=1)) < 1e-3
+    # before that start the templates are the same: what all frames share brings the later changes back, averaged
+    before, after = (np.median(half.max(axis=1)) for half in (change[: N // 2], change[N // 2 :]))
+    assert before < after / np.sqrt(N // 2)
 
 
 @pytest.mark.statistical
