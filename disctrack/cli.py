@@ -70,6 +70,8 @@ def _answer(words: Sequence[str], received: Sequence[int]) -> int:
         if arguments.command is None:
             parser.print_help()
             return USAGE
+        if sys.stderr.isatty():  # what is imported now takes seconds
+            print(f"{arguments.command} ...", end="\r", file=sys.stderr, flush=True)
         from disctrack.files.inputs import inputs_kept  # here, so that --help does not wait for what it imports
         from disctrack.progress import recorded_times
 

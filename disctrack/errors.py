@@ -40,11 +40,18 @@ class SceneError(DiscTrackError):
 
 
 class TrackingError(DiscTrackError):
-    """The disc cannot be found or followed in the images. findings : why, as far as that was seen"""
+    """The disc cannot be found or followed in the images.
 
-    def __init__(self, text: str, findings: tuple[Any, ...] = ()) -> None:
+    told : what to do where nothing is known of the cause;  findings : the cause, as far as it was seen
+    """
+
+    def __init__(self, text: str, told: str = "", findings: tuple[Any, ...] = ()) -> None:
         super().__init__(text)
-        self.findings = findings  # of Finding
+        self.told, self.findings = told, findings  # of Finding
+
+    def __str__(self) -> str:
+        why = f"Most likely {self.findings[0].sentence}" if self.findings else self.told
+        return f"{self.args[0]}. {why}" if why else str(self.args[0])
 
 
 class OutputError(DiscTrackError):

@@ -1,7 +1,7 @@
 """What the program noticed about a measurement, as data.
 
 A stage makes a `Finding` where it sees something, with its sentence from the room's own module of messages; later
-stages read kinds, severities and numbers, never text. `causes` folds what another finding explains under that one.
+stages read kinds, severities and numbers, never text. `leading` leaves out what another finding explains.
 """
 
 from __future__ import annotations
@@ -29,8 +29,7 @@ class Kind(Enum):
     """What was noticed; the value stands in files."""
 
     # what is declared
-    SQUARE = "square"  # the chessboard's squares and the dots are on different scales
-    LENGTHS = "lengths"  # all lengths of disc and dots, or the board's
+    SQUARE = "square"  # the chessboard's squares and the lengths of disc and dots are on different scales
     DIAMETER = "diameter of the dots"
     RADIUS = "radius"
     THICKNESS = "thickness"
@@ -44,8 +43,7 @@ class Kind(Enum):
     # the table
     TABLE_VIEW = "table view"  # the board of the declared view does not lie where the disc rolls
     BOARD_THICKNESS = "board thickness"
-    OFF_THE_TABLE = "off the table"
-    TABLE_DISAGREES = "table disagrees"  # beyond the tolerances of board and disc
+    TABLE_DISAGREES = "table disagrees"  # the disc does not roll on the board's, beyond the tolerances of both
     # the cameras
     EXCHANGED = "exchanged cameras"
     MIRRORED = "mirrored images"
@@ -57,9 +55,8 @@ class Kind(Enum):
     DOTS_SCATTER = "dots scatter"
     POSES_SCATTER = "poses scatter"
     EXPOSURE = "exposure"
-    CLIPPED = "clipped"
     SENSOR = "sensor"  # colour filter, stuck pixels
-    LIGHT = "light"
+    LIGHT = "light"  # clipped, or none
     SHARPNESS = "sharpness"
     ACCURACY = "accuracy"
     # the clock
@@ -75,23 +72,27 @@ class Kind(Enum):
     FRAMES_LOST = "frames lost"
     DISC_NOT_FOUND = "disc not found"
     DECLARATION = "declaration"
-    CALIBRATION = "calibration"
-    CALIBRATION_VIEWS = "calibration views"
+    CALIBRATION = "calibration"  # and views of the board that it does not use
     ANALYSIS = "analysis"
     DIAGNOSIS = "diagnosis"
-    OTHER = "other"  # of a file that a later version wrote
+    OTHER = "other"  # and of a file that another version wrote
+
+    @classmethod
+    def _missing_(cls, value: object) -> Kind:
+        """A kind that this version does not know."""
+        return cls.OTHER
 
 
 # What else is noticed where two images that are not of one instant, or places that are not the dots', make a pose;
 MISFITS = (
     Kind.DOTS_MISFIT, Kind.DOTS_SCATTER, Kind.POSES_SCATTER, Kind.CAMERAS_CONTRADICT, Kind.ONE_SIDED,
-    Kind.OFF_THE_TABLE, Kind.TABLE_DISAGREES, Kind.ACCURACY,
+    Kind.TABLE_DISAGREES, Kind.SHARPNESS, Kind.ACCURACY, Kind.FRAMES_LOST,
 )  # fmt: skip
 # and where the images are not those of the declared cameras at all, so that no pose is right
 NONSENSE = (
-    *MISFITS, Kind.SQUARE, Kind.LENGTHS, Kind.DIAMETER, Kind.RADIUS, Kind.THICKNESS, Kind.GRAVITY_OR_RATE,
+    *MISFITS, Kind.SQUARE, Kind.DIAMETER, Kind.RADIUS, Kind.THICKNESS, Kind.GRAVITY_OR_RATE,
     Kind.REVERSED, Kind.DOTS_MISPLACED, Kind.DOT_UNSEEN, Kind.TABLE_VIEW, Kind.BOARD_THICKNESS, Kind.DELAY,
-    Kind.DROPPED_FRAMES, Kind.CLOCK_JUMP, Kind.CAMERA_MOVED, Kind.FRAMES_LOST, Kind.DISC_NOT_FOUND,
+    Kind.DROPPED_FRAMES, Kind.CLOCK_JUMP, Kind.CAMERA_MOVED, Kind.DISC_NOT_FOUND,
 )  # fmt: skip
 
 
@@ -145,13 +146,18 @@ class Finding:
         return f"{'; or '.join(told)}: {self.text}"
 
     @property
+    def grave(self) -> str:
+        """How grave it is, in a word."""
+        return self.severity.name.lower()
+
+    @property
     def doubtful(self) -> bool:
         """True where the result may be wrong by more than its sigmas."""
         return self.severity >= Severity.DOUBT
 
     def as_json(self) -> dict[str, Any]:
         """Of JSON's types, with the sentence."""
-        words = {"kind": self.kind.value, "severity": self.severity.name.lower(), "sentence": self.sentence}
+        words = {"kind": self.kind.value, "severity": self.grave, "sentence": self.sentence}
         return {**asdict(self), **words, "explains": [kind.value for kind in self.explains]}
 
 
@@ -164,13 +170,13 @@ def finding_from_json(document: Mapping[str, Any]) -> Finding:
     """The finding that `as_json` wrote; a kind that this version does not know is OTHER."""
     subject = dict(document["subject"])
     return Finding(
-        _kind(document["kind"]),
+        Kind(document["kind"]),
         Severity[document["severity"].upper()],
         document["text"],
         Subject(**{**subject, "frames": tuple((first, last) for first, last in subject["frames"])}),
         {name: _number(**number) for name, number in document["numbers"].items()},
         tuple(Remedy(**remedy) for remedy in document["remedies"]),
-        tuple(_kind(value) for value in document["explains"]),
+        tuple(Kind(value) for value in document["explains"]),
     )
 
 
@@ -178,43 +184,30 @@ def _number(value: float, sigma: float | None, unit: str) -> Measured:
     return Measured(value, unit=unit) if sigma is None or sigma != sigma else Measured(value, sigma, unit)
 
 
-def _kind(value: str) -> Kind:
-    return Kind(value) if value in {kind.value for kind in Kind} else Kind.OTHER
-
-
-@dataclass(frozen=True)
-class Cause:
-    """A finding that no other explains, as grave as what it explains."""
-
-    finding: Finding
-    consequences: tuple[Finding, ...] = ()
-
-
-def causes(findings: Iterable[Finding]) -> tuple[Cause, ...]:
-    """The findings, gravest first, each with those that it explains (or they explain) folded under it."""
+def leading(findings: Iterable[Finding]) -> tuple[Finding, ...]:
+    """The causes alone, one line each, gravest first: no finding explains them; each as grave as what it explains."""
     rest: list[Finding] = []
     for finding in sorted(findings, key=lambda f: -f.severity):
         rest += [finding] if finding not in rest else []
     found = []
     while rest:
-        causal = next((f for f in rest if not any(_explains(g, f) for g in rest)), rest[0])
-        folded, kinds = [causal], set(causal.explains)
+        cause = next((f for f in rest if not any(_explains(g, f) for g in rest)), rest[0])
+        folded, kinds = [cause], set(cause.explains)
         while more := [f for f in rest if f.kind in kinds and f not in folded]:
             folded += more
             kinds |= {kind for f in more for kind in f.explains}
         rest = [f for f in rest if f not in folded]
-        severity = max(f.severity for f in folded)
-        found.append(Cause(replace(causal, severity=severity), tuple(folded[1:])))
-    return tuple(sorted(found, key=lambda cause: -cause.finding.severity))
+        found.append(replace(cause, severity=max(f.severity for f in folded)))
+    return tuple(sorted(found, key=lambda finding: -finding.severity))
 
 
 def _explains(one: Finding, other: Finding) -> bool:
     return one.kind != other.kind and other.kind in one.explains
 
 
-def leading(findings: Iterable[Finding]) -> tuple[Finding, ...]:
-    """The causes alone, gravest first: one line each."""
-    return tuple(cause.finding for cause in causes(findings))
+def carried(findings: Iterable[Finding]) -> tuple[Finding, ...]:
+    """Of a measurement, the causes that the stages after it repeat: all but notes."""
+    return tuple(finding for finding in leading(findings) if finding.severity > Severity.NOTE)
 
 
 def doubts(findings: Iterable[Finding]) -> tuple[Finding, ...]:

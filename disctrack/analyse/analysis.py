@@ -1,5 +1,6 @@
 """From a trajectory to the physics: motion, contact, energy and scaling laws."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,11 +20,12 @@ from disctrack.analyse.power_laws import (
 )
 from disctrack.analyse.propagation import RATES, DerivedSeries, propagate, rates
 from disctrack.errors import AnalysisError
+from disctrack.findings import Finding, Kind, Severity, of_kind
+from disctrack.numbers import measured
 from disctrack.trajectory import Trajectory, part
 
 WINDOWS = np.array([0.2, 0.3, 0.4, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0])  # [s] before t_f, for the exponents' dependence
 CIRCLE_DURATION = 0.6  # [s], as for the paper's figure 9
-HEIGHT_TOLERANCE = 2e-6  # [m] by which a table may depart from the board's plane without a remark
 EXPECTED_NOISE_SCALE = (0.7, 1.5)  # found over stated variance of the poses: outside, the report says so
 
 
@@ -44,18 +46,18 @@ class Analysis(Brief):
     laws: PowerLaws  # of the last stage
     laws_by_window: tuple[PowerLaws, ...]  # one per entry of WINDOWS
     nutation_count: NutationCount
-    warnings: tuple[str, ...]
+    findings: tuple[Finding, ...]  # of the analysis alone
 
     def facts(self) -> dict[str, str]:
         """What a glance should tell (`Brief`)."""
         told = {
             "frames": f"{int(self.motion.known.sum())} of {len(self.motion)}",
             "contact": self.contact.onset.verdict,
-            "energy lost": f"{1e3 * self.energy.loss:.4g} mJ",
+            "energy lost": measured(self.energy.loss, self.energy.loss_sigma, "J"),
         }
         laws = self.laws
         if laws.determined:
-            told |= {"t_f": f"{laws.t_f:.4f} s", "n_theta": f"{laws.n_theta.value:.4f} ± {laws.n_theta.sigma:.4f}"}
+            told |= {"t_f": measured(laws.t_f, laws.t_f_sigma, "s"), "n_theta": str(laws.n_theta)}
         return told
 
     def series(self, name: str) -> DerivedSeries:
@@ -103,7 +105,7 @@ def analyse(trajectory: Trajectory, window: float = WINDOW, circle_duration: flo
         laws=laws,
         laws_by_window=tuple(fit_power_laws(*data, window=float(w)) for w in WINDOWS),
         nutation_count=count_nutation(psi, motion.euler[:, 1], motion.tilt_sigma, motion.disc),
-        warnings=_warnings(trajectory, motion, contact, laws),
+        findings=of_kind(Kind.ANALYSIS, Severity.WARNING, _findings(trajectory, motion, contact)),
     )
 
 
@@ -123,45 +125,31 @@ def _end_of_rolling(motion: MeasuredMotion, psidot: Array) -> tuple[float, float
     return power_law_end(motion.time, sense * motion.euler[:, 0], sense * psidot), sense
 
 
-def _warnings(trajectory: Trajectory, motion: MeasuredMotion, contact: Contact, laws: PowerLaws) -> tuple[str, ...]:
-    """What an experimenter should know before using the numbers, in plain words."""
-    found = []
-    asked = trajectory.looked_for
-    n, missing, unknown = (int(rows.sum()) for rows in (asked, asked & ~motion.measured, asked & ~motion.known))
+def _findings(trajectory: Trajectory, motion: MeasuredMotion, contact: Contact) -> Iterator[str]:
+    """What an experimenter should know before using the numbers, beyond what the measurement's own findings say."""
+    frames = trajectory.looked_for
+    n, missing, unknown = (int(rows.sum()) for rows in (frames, frames & ~motion.measured, frames & ~motion.known))
     if missing:
-        found.append(
+        yield (
             f"{missing} of {n} frames have no pose of their own; {missing - unknown} were bridged from their "
-            f"neighbours (their sigmas are larger), {unknown} stay unknown."
+            f"neighbours (their sigmas are larger), {unknown} stay unknown"
         )
     for name, scale in zip(GROUP_NAMES, motion.noise_scale, strict=True):
         if not EXPECTED_NOISE_SCALE[0] <= scale <= EXPECTED_NOISE_SCALE[1]:
-            found.append(
-                f"The scatter of the {name} is {np.sqrt(scale):.2f} times what the tracker states; the sigmas here "
-                "follow the scatter."
+            yield (
+                f"the scatter of the {name} is {np.sqrt(scale):.2f} times what the tracker states; the sigmas here "
+                "follow the scatter"
             )
-    lowest = next(series for series in contact.series if series.name == "contact_z")
-    height, common = lowest.value, lowest.sigma_calibration
-    offset = float(np.mean(height[np.isfinite(height)])) if np.isfinite(height).any() else 0.0
-    allowed = 3 * float(np.nanmax(np.append(common, 0.0))) + HEIGHT_TOLERANCE
-    if abs(offset) > allowed:
-        found.append(
-            f"The lowest point of the edge lies {1e6 * offset:+.1f} um from the table on average, more than the "
-            f"calibration explains ({1e6 * allowed:.1f} um): the thickness, the table view or the board's thickness is "
-            "off."
-        )
     onset = contact.onset
     if not onset.probability >= 0.5:
-        found.append(f"The disc {onset.verdict}." if np.isfinite(onset.probability) else f"Rolling: {onset.verdict}.")
-    elif onset.low > motion.time[motion.known][0]:
-        found.append(
-            f"Where slip ends, at {onset.time:.4f} s, the acceleration jumps: the motion before and after was "
-            "differentiated apart, so that sigmas are larger near that instant."
+        return
+    if onset.low > motion.time[motion.known][0]:
+        yield (
+            f"where slip ends, at {onset.time:.4f} s, the acceleration jumps: the motion before and after was "
+            "differentiated apart, so that sigmas are larger near that instant"
         )
-    if onset.probability >= 0.5 and onset.n_late_slips:
-        found.append(
-            f"After the onset of rolling, {onset.n_late_slips} frames still show slip beyond five sigmas: stick and "
-            "slip, or impacts."
+    if onset.n_late_slips:
+        yield (
+            f"after the onset of rolling, {onset.n_late_slips} frames still show slip beyond five sigmas: stick and "
+            "slip, or impacts"
         )
-    if laws.reason:
-        found.append(f"No exponents are given: {laws.reason}.")
-    return tuple(found)

@@ -126,7 +126,7 @@ def rolling_onset(motion: MeasuredMotion, found: Propagated, until: float = np.i
         why = "not determined: the contact velocity is not known in any two frames"
         return RollingOnset(*(float("nan"),) * 6, n_late_slips=0, verdict=why)
     v = found.value[frames, SLIP]
-    C = found.covariance_at(frames, SLIP) + found.shared_covariance_at(frames, SLIP)
+    C = found.covariance_at(frames, SLIP) + found.covariance_at(frames, SLIP, shared=True)
     interval = float(np.median(np.diff(motion.time)))
     share = np.minimum(1.0, interval / (INDEPENDENT_AFTER_LENGTHS * motion.length.min(axis=1)[frames]))
     sizes = np.geomspace(4 * SLIP_TOLERANCE, 10.0, 60)

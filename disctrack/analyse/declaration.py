@@ -17,7 +17,7 @@ A finding names the declared numbers that could be wrong, likeliest first, what 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
@@ -32,8 +32,8 @@ from disctrack.disc import Disc, has_mirror_axis, symmetry_order
 from disctrack.errors import AnalysisError
 from disctrack.faults.clock_jump import clock_jumps
 from disctrack.findings import MISFITS, Finding, Kind, Remedy, Severity, Subject
-from disctrack.frames import rotation_from_quaternion
-from disctrack.numbers import Measured
+from disctrack.frames import CAMERAS, rotation_from_quaternion
+from disctrack.numbers import Measured, measured
 from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory, part
 
 if TYPE_CHECKING:
@@ -41,6 +41,7 @@ if TYPE_CHECKING:
 
 
 SIDEWAYS = 0.5  # cosine of the angle up to which a baseline is one from left to right
+USUALLY = 2e-3  # of a rate: the balance of moments tells no usual one from another that is as near
 USUAL_RATES = np.outer(10.0 ** np.arange(1, 7), [1, 1.2, 1.25, 1.5, 2, 2.4, 2.5, 3, 4, 5, 6, 7.5, 8]).ravel()  # [Hz]
 STRETCHES, STRETCH, BLOCK = 4, 100, 20  # stretches looked at, frames of each, frames whose median is one estimate
 MIN_BLOCKS = 5
@@ -54,6 +55,8 @@ NOTED = 0.01  # from which on it is worth a word
 COHERENT, COHERENT_SHARE = 0.3, 0.8
 GROWTH, STEADY = 0.05, 0.7  # of the energy; share of the blocks in which it does: a push is short
 SCALE = 5e-3  # of printed dots against a printed board, paper and toner included
+SIDE_TOLERANCE = 0.06  # of a length: beyond, dots that were printed to another scale would have another size, too
+BY_SCALE = (Kind.DOTS_MISPLACED, Kind.RADIUS, Kind.THICKNESS, Kind.BOARD_THICKNESS, Kind.GRAVITY_OR_RATE, *MISFITS)
 RISE = 0.03  # of the radius: a rounded or bevelled edge of a millimetre
 MIN_LEAN = np.radians(2.0)  # of a plane: boards and tables lean by less
 MIN_ROUND, FLAT = 2.0, 0.1  # [rad] of precession; scatter about the plane over what the rim rises from the declared one
@@ -62,7 +65,10 @@ SEEN_RARELY = 0.1  # share of the images
 MIN_DOTS_LEFT = 4  # that are seen
 DENSITIES = 50.0, 23e3  # [kg/m^3] a hard foam's, and osmium's
 MOST_HEIGHT = 3e-3  # [m] of the rim's plane from the foot of a board that lies on it, its thickness wrong or not
-OFF = (Kind.TABLE_DISAGREES, Kind.OFF_THE_TABLE)  # a wrong number is seen so
+CLAIM = 5e-6  # [m] the accuracy that is claimed for a position
+LAB_FRAME = 20e-6  # [m] to which it is known where a board on a table lies, with no particular care
+OFF = (Kind.TABLE_DISAGREES, Kind.ACCURACY)  # a wrong height is seen so
+UNITS = {1e3: "mm and m", 1e2: "m and cm", 10.0: "cm and mm", 25.4: "inches and mm", 2.0: "radius and diameter"}
 
 
 class Boards(NamedTuple):
@@ -71,42 +77,58 @@ class Boards(NamedTuple):
     places: Mapping[int, tuple[Array, Array]]  # number of the view: R_left_board (3, 3), t_left_board (3,) [m]
     table_view: int | None
     thickness: float  # [m] of the board on the table
+    findings: tuple[Finding, ...] = ()  # of the calibration
 
 
 def contradictions(
-    trajectory: Trajectory, declared: Disc | None = None, square: float | None = None, boards: Boards | None = None
+    trajectory: Trajectory,
+    disc: Disc | None = None,
+    recording: Recording | None = None,
+    noticed: Sequence[Finding] = (),
+    boards: Boards | None = None,
+    blur_px: Sequence[float] = (),
 ) -> tuple[Finding, ...]:
-    """Every check that this trajectory allows.
+    """Every check that this trajectory allows, and after them what was noticed by the tracking.
 
-    declared : the disc as declared, before its dots were refined
-    square : [m] of the chessboard as declared; boards : in the views, where they are at hand
+    disc : as declared, before its dots were refined;  recording : all that was declared, where it is at hand
+    boards : in the calibration's views;  blur_px : of the dots' edges in either camera
     """
-    declared = declared or trajectory.disc
-    found = [*density(declared), *scale_of_dots(trajectory, declared, square), *unseen_dots(trajectory, declared)]
+    disc, board = disc or trajectory.disc, None if recording is None else recording.chessboard
+    square = None if board is None else board.square
+    found = [*density(disc), *scale_of_dots(trajectory, disc, square), *unseen_dots(trajectory, disc)]
     found += lost_pairs(trajectory)
     if trajectory.rig.world_is_table:
-        found += handedness(trajectory.rig, declared)
+        found += handedness(trajectory.rig, disc)
+        off = next((f for f in noticed if f.kind == Kind.TABLE_DISAGREES), None)
+        height = None if off is None else 1e-6 * off.numbers["height"].value
         # on another plane than the declared one neither heights nor the direction of gravity mean anything
-        found += another_plane(trajectory, boards) or [*rise_of_centre(trajectory), *motion_against_gravity(trajectory)]
-    return tuple(found)
+        elsewhere = another_plane(trajectory, boards)
+        found += elsewhere or [*rise_of_centre(trajectory), *motion_against_gravity(trajectory, height)]
+        if recording is not None and recording.table is not None and off is not None and not elsewhere:
+            found += thickness(disc, recording.table.board_thickness, off)
+    found += () if board is None else turned_board(board.inner_corners)
+    return (*found, *with_square(noticed, recording), *(unsharp(trajectory, blur_px) if blur_px else ()))
 
 
-def contradictions_of(
-    recording: Recording, trajectory: Trajectory, noticed: Iterable[Finding] = (), boards: Boards | None = None
-) -> tuple[Finding, ...]:
-    """Every check that a recording and its trajectory allow. noticed : by the tracking;  boards : in the views"""
-    board, table = recording.chessboard, recording.table
-    found = contradictions(trajectory, recording.disc, None if board is None else board.square, boards)
-    if table is not None and all(finding.kind != Kind.TABLE_VIEW for finding in found):
-        found += thickness(recording.disc, table.board_thickness, noticed)
-    return found if board is None else (*found, *turned_board(board.inner_corners))
+def with_square(findings: Sequence[Finding], recording: Recording | None) -> tuple[Finding, ...]:
+    """Findings of the images alone, which know no board: of another scale, with the square that would fit."""
+    if recording is None or recording.chessboard is None:
+        return tuple(findings)
+    square = recording.chessboard.square
+    return tuple(
+        other_scale(finding.numbers["scale"], square, finding.explains) if finding.kind == Kind.SQUARE else finding
+        for finding in findings
+    )
 
 
-def thickness(disc: Disc, board: float, noticed: Iterable[Finding]) -> tuple[Finding, ...]:
-    """Thickness of the board, or of the disc, that puts the rim on the table. board : [m] as declared"""
-    height = next((f.numbers["height"].value for f in noticed if f.doubtful and f.kind in OFF), None)
-    if height is None:
+def thickness(disc: Disc, board: float, off: Finding) -> tuple[Finding, ...]:
+    """Thickness of the board, or of the disc, that puts the rim on the table.
+
+    board : [m] as declared;  off : what was noticed of the table
+    """
+    if not off.doubtful:
         return ()
+    height = off.numbers["height"].value
     # nobody measures a thickness of nothing: it was forgotten
     sizes = (
         ("[table] board_thickness_mm", Kind.BOARD_THICKNESS, board, board - 1e-6 * height),
@@ -125,6 +147,46 @@ def thickness(disc: Disc, board: float, noticed: Iterable[Finding]) -> tuple[Fin
     return (Finding(likely[0][1], Severity.DOUBT, text, remedies=remedies, explains=OFF),)
 
 
+def across(trajectory: Trajectory) -> Array:
+    """(2,) [px] by how much a dot is wide along its narrow side, in the middle of the recording."""
+    rows = np.flatnonzero(trajectory.measured)
+    row, rig = rows[len(rows) // 2], trajectory.rig
+    axis = rotation_from_quaternion(trajectory.quaternion[row])[:, 2]
+    (R_left, t_left), (R_right, t_right) = rig.camera_poses()
+    centres = np.stack([R_left @ trajectory.q[row, :3] + t_left, R_right @ trajectory.q[row, :3] + t_right])
+    slant = np.abs(np.sum(centres * [R_left @ axis, R_right @ axis], axis=1)) / np.linalg.norm(centres, axis=1)
+    focal = np.array([camera.fx for camera in rig.cameras])
+    return np.asarray(focal * trajectory.disc.marker_diameter / centres[:, 2] * slant)
+
+
+def unsharp(trajectory: Trajectory, blur_px: Sequence[float]) -> Iterator[Finding]:
+    """Dots so narrow that the blur of opposite edges overlaps, and positions less certain than claimed."""
+    if not trajectory.measured.any():
+        return
+    for camera, blur, width in zip(CAMERAS, blur_px, across(trajectory), strict=True):
+        if 6 * blur > width:  # three sigma on each side
+            text = (
+                f"{camera} camera: dots are {width:.1f} px across, their edges are blurred by {blur:.2f} px (sigma): "
+                "the blur of opposite edges overlaps"
+            )
+            advice = Remedy(action="larger dots, sharper focus, a shorter exposure, or cameras that look more steeply")
+            of = Subject(camera=camera)
+            yield Finding(Kind.SHARPNESS, Severity.WARNING, text, of, remedies=(advice,), explains=(Kind.ACCURACY,))
+    noise, shared = (
+        float(np.nanmedian(sigma[:, :3], axis=0).max())
+        for sigma in (trajectory.coordinate_sigma, trajectory.calibration_sigma)
+    )
+    advice = Remedy(action="more views of the board, tilted and all over; a board that is known better")
+    if noise > CLAIM:
+        advice = Remedy(action="more light, sharper or larger dots")
+    if noise > CLAIM or shared > LAB_FRAME:
+        text = (
+            f"a position has a standard deviation of {measured(noise, unit='m')} by the noise of its frame, and of "
+            f"{measured(shared, unit='m')} that all frames share"
+        )
+        yield Finding(Kind.ACCURACY, Severity.WARNING, text, remedies=(advice,))
+
+
 def lost_pairs(trajectory: Trajectory) -> Iterator[Finding]:
     """Pairs that both cameras lost while the files were numbered on."""
     for jump in clock_jumps(trajectory):
@@ -140,8 +202,11 @@ def lost_pairs(trajectory: Trajectory) -> Iterator[Finding]:
         )
 
 
-def motion_against_gravity(trajectory: Trajectory) -> tuple[Finding, ...]:
-    """Gravity and frame rate, and an energy that grows, on some stretches of the recording."""
+def motion_against_gravity(trajectory: Trajectory, height: float | None = None) -> tuple[Finding, ...]:
+    """Gravity and frame rate, and an energy that grows, on some stretches of the recording.
+
+    height : [m] of the disc's lowest point above the board's table, where that is no table for it
+    """
     found, energy = balance(trajectory)
     g, n = trajectory.gravity, len(found)
     if n < MIN_BLOCKS:
@@ -158,9 +223,13 @@ def motion_against_gravity(trajectory: Trajectory) -> tuple[Finding, ...]:
             "nothing but the table touching the disc"
         )
         numbers = {"gravity": Measured(gravity, sigma, "m/s^2")}
-        remedies, kind = _of_gravity(trajectory, gravity / g), Kind.GRAVITY_OR_RATE
+        ways = sorted(_of_gravity(trajectory, gravity / g, height), key=lambda one: one[0])
+        (misfit, kind, _), remedies = ways[0], tuple(remedy for *_, remedy in ways)
         severity = Severity.DOUBT if away > np.log1p(BALANCE) else Severity.NOTE
-        return (Finding(kind, severity, text, numbers=numbers, remedies=remedies, explains=(Kind.REVERSED,)),)
+        if kind == Kind.RADIUS and not misfit:  # two laws agree about it
+            severity = max(severity, Severity.WARNING)
+        explains = (Kind.REVERSED, *OFF) if kind == Kind.RADIUS else (Kind.REVERSED,)
+        return (Finding(kind, severity, text, numbers=numbers, remedies=remedies, explains=explains),)
     times = np.arange(n)
     slope, start = np.polyfit(times, energy, 1)
     sigma = robust_sigma(energy - slope * times - start) / (np.std(times) * np.sqrt(n))
@@ -176,31 +245,38 @@ def motion_against_gravity(trajectory: Trajectory) -> tuple[Finding, ...]:
     return ()
 
 
-def _of_gravity(trajectory: Trajectory, ratio: float) -> tuple[Remedy, ...]:
-    """Which declared number would explain that the balance holds with `ratio` times the declared gravity."""
+def _of_gravity(trajectory: Trajectory, ratio: float, height: float | None) -> tuple[tuple[float, Kind, Remedy], ...]:
+    """Which declared numbers would explain that the balance holds with `ratio` times the declared gravity.
+
+    With each how far from an ordinary value it would be, natural logarithm: the nearest is the likeliest.
+    """
     g, rate = trajectory.gravity, trajectory.frame_rate
     true_rate = rate / np.sqrt(ratio)
     departures = np.abs(np.log(true_rate / USUAL_RATES))
     nearest = int(np.argmin(departures))
     usual = f"{USUAL_RATES[nearest]:g} is usual" if departures[nearest] < 0.05 else ""
+    true_rate = USUAL_RATES[nearest] if departures[nearest] < USUALLY else true_rate
     unit = "if it was given in mm/s^2" if abs(np.log(1e3 * ratio)) < 0.1 else ""
-    # how far from an ordinary value each would be, natural logarithm: the nearest is the likeliest
-    found = [
-        (abs(np.log(g * ratio / 9.81)), Remedy("[gravity] g_m_s2", f"{g * ratio:.4g}", f"{g:g}", unit)),
-        (departures[nearest], Remedy("[cameras] frame_rate_hz", f"{true_rate:.4g}", f"{rate:g}", usual)),
-        _radius_suspected(trajectory, ratio),
-    ]
-    return tuple(remedy for _, remedy in sorted(found, key=lambda one: one[0]))
+    by_gravity = Remedy("[gravity] g_m_s2", f"{g * ratio:.4g}", f"{g:g}", unit)
+    by_rate = Remedy("[cameras] frame_rate_hz", f"{true_rate:.4g}", f"{rate:g}", usual)
+    return (
+        (abs(float(np.log(g * ratio / 9.81))), Kind.GRAVITY_OR_RATE, by_gravity),
+        (float(departures[nearest]), Kind.GRAVITY_OR_RATE, by_rate),
+        _radius_suspected(trajectory, ratio, height),
+    )
 
 
-def _radius_suspected(trajectory: Trajectory, ratio: float) -> tuple[float, Remedy]:
+def _radius_suspected(trajectory: Trajectory, ratio: float, height: float | None) -> tuple[float, Kind, Remedy]:
     """First of all where the rim is on the table with a radius nearer to that of the rates than to the declared one."""
     z, theta = trajectory.q[trajectory.measured][:, [2, 4]].T
     disc, would_be, misfit = trajectory.disc, trajectory.disc.radius / ratio, abs(float(np.log(ratio)))
     by_rim = float(np.median((z - disc.half_thickness * np.abs(np.cos(theta))) / np.sin(theta)))
-    if trajectory.rig.world_is_table and by_rim > 0 and abs(np.log(by_rim / would_be)) < 0.5 * misfit:
-        would_be, misfit = by_rim, 0.0
-    return misfit, Remedy("[disc] radius_mm", f"{1e3 * would_be:.4g}", f"{1e3 * disc.radius:g}")
+    # where the table is moved towards the disc's, by how far it was off
+    by_table = by_rim if height is None else disc.radius + height / float(np.median(np.sin(theta)))
+    for radius, better in ((by_rim, by_rim), (by_table, would_be)):
+        if trajectory.rig.world_is_table and radius > 0 and abs(np.log(radius / would_be)) < 0.5 * misfit:
+            would_be, misfit = better, 0.0
+    return misfit, Kind.RADIUS, Remedy("[disc] radius_mm", f"{1e3 * would_be:.4g}", f"{1e3 * disc.radius:g}")
 
 
 def density(disc: Disc) -> tuple[Finding, ...]:
@@ -395,18 +471,27 @@ def scale_of_dots(trajectory: Trajectory, declared: Disc, square: float | None =
     sigma = spread / np.sqrt(dots)
     if not (abs(scale - 1) > SCALE and abs(scale - 1) > SIGMAS * sigma):
         return ()
-    off = abs(float(np.log(scale)))
-    board = off, Remedy("[calibration] square_mm", action=f"times {1 / scale:.4f}")
+    return (other_scale(Measured(scale, max(sigma, 1e-4)), square),)
+
+
+def other_scale(scale: Measured, square: float | None = None, explains: tuple[Kind, ...] = BY_SCALE) -> Finding:
+    """Dots that are so many times as far apart as declared. square : [m] of the board as declared"""
+    factor, off = scale.value, abs(float(np.log(scale.value)))
+    uncertain = max(3 * scale.sigma / factor, 0.01 * min(off, 1.0))  # no template fits dots that are far from declared
+    mixed = [words for unit, words in UNITS.items() if abs(off / np.log(unit) - 1) < 0.02]
+    board = off, Remedy("[calibration] square_mm", action=f"times {1 / factor:.4g}")
     if square is not None:
-        side = 1e3 * square / scale
-        usual = abs(float(np.log(side / (max(round(2 * side), 1) / 2))))  # boards have squares of whole or half mm
-        board = min(usual, off), Remedy("[calibration] square_mm", f"{side:.2f}", f"{1e3 * square:g}")
-    dots_off = off, Remedy("[markers] centres_mm", action=f"times {scale:.4f}")
-    remedies = tuple(remedy for _, remedy in sorted((board, dots_off), key=lambda one: one[0]))
-    found = Measured(scale, max(sigma, 1e-4))
-    text = f"by both cameras the dots are {found} times as far apart as declared"
-    explains = (Kind.DOTS_MISPLACED, Kind.RADIUS, Kind.GRAVITY_OR_RATE, *MISFITS)
-    return (Finding(Kind.SQUARE, Severity.DOUBT, text, Subject(), {"scale": found}, remedies, explains),)
+        side = 1e3 * square / factor
+        usual = max(round(2 * side), 1) / 2  # boards have squares of whole or half mm
+        away = abs(float(np.log(side / usual)))
+        fits = usual if away < uncertain else side
+        board = min(away, off), Remedy("[calibration] square_mm", f"{fits:.2f}", f"{1e3 * square:g}")
+    lengths = "[markers] centres_mm" if off < SIDE_TOLERANCE else "every length of [disc] and [markers]"
+    ways = board, (off, Remedy(lengths, action=f"times {factor:.4g}"))
+    remedies = tuple(remedy for _, remedy in sorted(ways, key=lambda one: one[0]))
+    text = f"by both cameras the dots are {scale} times as far apart as declared"
+    text += f": are {mixed[0]} mixed up?" if mixed else ""
+    return Finding(Kind.SQUARE, Severity.DOUBT, text, Subject(), {"scale": scale}, remedies, explains)
 
 
 def unseen_dots(trajectory: Trajectory, declared: Disc) -> tuple[Finding, ...]:

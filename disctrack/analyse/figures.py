@@ -10,6 +10,7 @@ from disctrack.analyse.analysis import Analysis
 from disctrack.analyse.power_laws import MODEL_EXPONENTS
 from disctrack.disc import MA_2014
 from disctrack.frames import CAMERAS
+from disctrack.numbers import measured
 from disctrack.report.figures import Curve, Drawn, chart, dress
 from disctrack.report.palette import AMBER, BLUE, COLOURS, GREEN, INK, MUTED, RED
 
@@ -129,7 +130,7 @@ def nutation_count(analysis: Analysis) -> Iterator[Drawn]:
     line = Curve(ends, offset + count.slope * ends, RED, f"slope {count.slope:.4f}")
     low, high = sorted(count.expected)
     caption = (
-        f"Maxima of θ against turns of precession: slope {count.slope:.4f} ± {count.sigma:.4f}. Small "
+        f"Maxima of θ against turns of precession: slope {measured(count.slope, count.sigma)}. Small "
         f"oscillations of this disc give {low:.4f} to {high:.4f} over this range of θ, a thin disc at small θ "
         f"{np.sqrt(0.6):.4f}; the paper counted 0.7915."
     )
@@ -149,7 +150,7 @@ def contact(analysis: Analysis) -> Iterator[Drawn]:
     if onset.high > onset.low:
         axes.axvspan(onset.low, onset.high, color=AMBER, alpha=0.35, label="onset of rolling, 95 %")
         axes.legend(frameon=False, fontsize=9, loc="upper right")
-    path = f"{1e3 * onset.slip_distance:.4f} ± {1e3 * onset.slip_distance_sigma:.4f} mm"
+    path = measured(onset.slip_distance, onset.slip_distance_sigma, "m")
     caption = (
         f"Speed of the disc's own point at the contact. The disc {onset.verdict} (probability of rolling at the end: "
         f"{onset.probability:.3f}){f'; path of slip {path}' if onset.slip_distance > 0 else ''}."
@@ -181,7 +182,7 @@ def contact_locus(analysis: Analysis) -> Iterator[Drawn]:
     same_disc = np.isclose(analysis.trajectory.disc.radius, MA_2014.radius)
     caption = (
         f"Contact point from {circle.start:.3f} to {circle.end:.3f} s with the fitted circle: radius "
-        f"{1e3 * circle.radius:.4f} ± {1e3 * circle.sigma:.4f} mm (scatter) ± {1e6 * circle.sigma_calibration:.2g} µm "
+        f"{measured(circle.radius, circle.sigma, 'm')} (scatter) ± {measured(circle.sigma_calibration, unit='m')} "
         f"(calibration). With the centre at rest it would be r cos θ - h sin θ = {1e3 * circle.expected:.4f} mm on "
         f"average; the locus departs from the circle by {1e3 * circle.rms:.3f} mm rms."
         + (" Ma et al. (2014) found 37.286 mm with a disc of this radius." if same_disc else "")
@@ -209,9 +210,9 @@ def rates(analysis: Analysis) -> Iterator[Drawn]:
     figure = chart(TIME, ("ψ̇² sin θ (1/s²)", [_series(analysis, "precession_level", BLUE, "ψ̇² sin θ"), level]))
     found = analysis.energy
     caption = (
-        f"Adiabatic check: averaged over the turns of precession, ψ̇² sin θ is {found.level_ratio:.4f} ± "
-        f"{found.level_ratio_sigma:.4f} times 4 g / r. It is 1 for a thin disc at small θ; steady precession "
-        f"of this disc has {found.level_ratio_steady:.4f} at the median θ."
+        "Adiabatic check: averaged over the turns of precession, ψ̇² sin θ is "
+        f"{measured(found.level_ratio, found.level_ratio_sigma)} times 4 g / r. It is 1 for a thin disc at small θ; "
+        f"steady precession of this disc has {found.level_ratio_steady:.4f} at the median θ."
     )
     yield Drawn("12_adiabatic_level", "Adiabatic condition", caption, figure)
 
@@ -224,8 +225,9 @@ def energy(analysis: Analysis) -> Iterator[Drawn]:
     figure = chart(TIME, ("energy (mJ)", [total, level]))
     figure.axes[0].set_ylim(bottom=0)
     caption = (
-        f"Mechanical energy, zero at rest (z = h). Lost in the recording: {1e3 * found.loss:.4f} ± "
-        f"{1e3 * found.loss_sigma:.4f} (noise) ± {1e3 * found.loss_sigma_calibration:.4f} (calibration) mJ."
+        f"Mechanical energy, zero at rest (z = h). Lost in the recording: "
+        f"{measured(found.loss, found.loss_sigma, 'J')} (noise) ± {measured(found.loss_sigma_calibration, unit='J')} "
+        "(calibration)."
     )
     yield Drawn("13_energy", "Energy", caption, figure)
     parts = (
@@ -258,7 +260,7 @@ def power_laws(analysis: Analysis) -> Iterator[Drawn]:
         if not np.isfinite(exponent.value) or shown.sum() < 2:
             continue
         line = np.log(prefactor) + exponent.value * ends
-        said = f"fit, {exponent.value:.4f} ± {exponent.half:.4f} (95 %)"
+        said = f"fit, {measured(exponent.value, exponent.half)} (95 %)"
         curves = [Curve(np.log(left[shown]), np.log(value[shown]), BLUE, "measured", "."), Curve(ends, line, RED, said)]
         for (_, n), style in zip(MODEL_EXPONENTS, (":", "--", "-.", "-"), strict=True):
             slope = of_theta * n
@@ -267,8 +269,8 @@ def power_laws(analysis: Analysis) -> Iterator[Drawn]:
         figure = chart("ln (t_f - t), t in s", (label, curves), size=SQUARE)
         figure.axes[0].invert_xaxis()
         caption = (
-            f"Exponent {exponent.value:.4f} ± {exponent.sigma:.4f} (95 %: {exponent.low:.4f} to {exponent.high:.4f}) "
-            f"from {laws.window[0]:.3f} to {laws.window[1]:.3f} s before t_f = {laws.t_f:.5f} ± {laws.t_f_sigma:.5f} "
+            f"Exponent {exponent} (95 %: ± {measured(exponent.half)}) from {laws.window[0]:.3f} to "
+            f"{laws.window[1]:.3f} s before t_f = {measured(laws.t_f, laws.t_f_sigma)} "
             f"s. Grey: {'; '.join(name for name, _ in MODEL_EXPONENTS)}."
         )
         yield Drawn(name, f"Power law of {title}", caption, figure)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from calibration.kit.arrays import Array, evenly
 from disctrack.analyse.analysis import Analysis
-from disctrack.findings import doubts
+from disctrack.findings import carried
 from disctrack.report.blocks import Markup, Report, Text
 from disctrack.report.html import page
 from disctrack.report.palette import RED
@@ -56,7 +56,7 @@ def motion_html(analysis: Analysis, name: str, drawn: Drawn | None = None) -> st
         f'<script type="application/json" id="motion-data">{data}</script><script>{script}</script>'
     )
     report = Report(
-        f"{name}: the motion", "", _said(analysis), doubts(analysis.trajectory.findings), blocks=[Text(body)]
+        f"{name}: the motion", "", _said(analysis), carried(analysis.trajectory.findings), blocks=[Text(body)]
     )
     return page(report, {}, head=f"<style>{_STYLE}</style>")
 

@@ -21,6 +21,7 @@ from calibration.kit.arrays import Array
 from calibration.kit.brief import Outline
 from disctrack.disc import Disc, nutation_frequency, precession_rate
 from disctrack.errors import ModelError
+from disctrack.numbers import measured
 
 # (name, n_theta): the power lost goes with theta^a on slow steady precession, n_theta = 1 / (1 - a), n_E = n_theta,
 # n_psidot = -n_theta / 2
@@ -51,6 +52,9 @@ class Exponent:
     value: float = NAN
     sigma: float = NAN
     half: float = NAN  # of the 95 % confidence interval
+
+    def __str__(self) -> str:
+        return measured(self.value, self.sigma)
 
     @property
     def low(self) -> float:

@@ -47,25 +47,19 @@ class Propagated:
     @property
     def covariance(self) -> Array:
         """(n, k, k) noise."""
-        return self.covariance_at(np.arange(len(self.value)), slice(None))
+        return self.covariance_at(np.arange(len(self.value)))
 
-    def covariance_at(self, frames: NDArray[np.int64], columns: slice) -> Array:
-        """(f, c, c) noise of some values in some frames."""
-
-        def some(rows: NDArray[np.int64]) -> Array:
-            J = self.jacobian[rows][:, columns]
-            return np.asarray(J @ self.motion.covariance[rows] @ J.swapaxes(1, 2))
-
-        return _by_parts(some, frames)
-
-    def shared_covariance_at(self, frames: NDArray[np.int64], columns: slice) -> Array:
-        """(f, c, c) of some values in some frames from what does not average out: the rig, and what else repeats."""
+    def covariance_at(self, frames: NDArray[np.int64], columns: slice = slice(None), shared: bool = False) -> Array:
+        """(f, c, c) of some values in some frames: noise, or what all share: of the rig, and what else repeats."""
+        motion = self.motion
 
         def some(rows: NDArray[np.int64]) -> Array:
             J = self.jacobian[rows][:, columns]
-            S = J @ self.motion.calibration_sensitivity[rows]
-            by_rig = S @ self.motion.rig_covariance @ S.swapaxes(1, 2)
-            return np.asarray(by_rig + J @ self.motion.systematic_at(rows) @ J.swapaxes(1, 2))
+            if not shared:
+                return np.asarray(J @ motion.covariance[rows] @ J.swapaxes(1, 2))
+            S = J @ motion.calibration_sensitivity[rows]
+            by_rig = S @ motion.rig_covariance @ S.swapaxes(1, 2)
+            return np.asarray(by_rig + J @ motion.systematic_at(rows) @ J.swapaxes(1, 2))
 
         return _by_parts(some, frames)
 
@@ -73,7 +67,7 @@ class Propagated:
         """The columns one by one; names are (name, unit, long_name)."""
 
         def variances(rows: NDArray[np.int64]) -> Array:
-            both = self.covariance_at(rows, slice(None)), self.shared_covariance_at(rows, slice(None))
+            both = [self.covariance_at(rows, shared=shared) for shared in (False, True)]
             return np.stack([np.diagonal(C, axis1=1, axis2=2) for C in both], axis=1)
 
         sigmas = np.sqrt(np.maximum(_by_parts(variances, np.arange(len(self.value))), 0.0))

@@ -12,8 +12,8 @@ from disctrack.analyse.analysis import Analysis
 from disctrack.analyse.power_laws import MODEL_EXPONENTS, Exponent, PowerLaws
 from disctrack.analyse.propagation import DerivedSeries
 from disctrack.analyse.published import SURFACES, agreement, published_table
-from disctrack.findings import Finding, Kind, Severity, of_kind
-from disctrack.numbers import Measured, measured, unit_text
+from disctrack.findings import Finding
+from disctrack.numbers import Measured, measured, probability, unit_text
 from disctrack.report.blocks import Cell, Figures, Listing, Report, Section, Text
 from disctrack.trajectory import FrameStatus
 from disctrack.trajectory.file import Provenance
@@ -34,7 +34,7 @@ def report_of(
     drawn: Sequence[Drawn] = (),
     files: Sequence[Path] = (),
 ) -> Report:
-    """All of an analysis. findings : of the measurement;  files : that were written"""
+    """All of an analysis. findings : of the measurement;  files : written, the page first, the trajectory last"""
 
     def section(title: str, numbers: tuple[str, ...], *blocks: Listing | Text) -> Section:
         return Section(title, [*blocks, Figures([d for d in drawn if d.name.startswith(numbers)])])
@@ -45,7 +45,7 @@ def report_of(
         f"{provenance.recording}: from the trajectory to the physics",
         f"The disc {analysis.contact.onset.verdict}. {_exponents_text(laws)}",
         _accuracy(analysis),
-        [*findings, *of_kind(Kind.ANALYSIS, Severity.WARNING, analysis.warnings)],
+        [*findings, *analysis.findings],
         facts=[
             ("rolls without slip", _onset(analysis)),
             (
@@ -65,7 +65,8 @@ def report_of(
             Section("Method", [_method(analysis, provenance)]),
         ],
         files=files,
-        page=next((file for file in files if file.name == "report.html"), None),
+        page=files[0] if files else None,
+        then=f"disctrack diagnose {files[-1]}" if files else "",
         data={"frames": len(trajectory), "frames_with_a_pose": int(trajectory.measured.sum())},
     )
 
@@ -152,7 +153,7 @@ def _exponents(analysis: Analysis) -> list[Listing | Text]:
     asymptotic = theta <= ASYMPTOTIC_BELOW
     named = ("energy", laws.n_energy, 1.0), ("nutation", laws.n_theta, 1.0), ("precession rate", laws.n_psidot, -0.5)
     rows = [
-        (name, _at_95(e), measured(e.value, e.sigma), *(_agreement(e, k * n, asymptotic) for _, n in MODEL_EXPONENTS))
+        (name, _at_95(e), str(e), *(_agreement(e, k * n, asymptotic) for _, n in MODEL_EXPONENTS))
         for name, e, k in named
     ]
     first, last = laws.window
@@ -196,7 +197,7 @@ def _windows_table(fits: Sequence[PowerLaws]) -> Listing:
     rows = [
         (
             f"{fit.window[0]:.3f} to {fit.window[1]:.3f}",
-            *(measured(e.value, e.sigma) for e in (fit.n_energy, fit.n_theta, fit.n_psidot)),
+            *map(str, (fit.n_energy, fit.n_theta, fit.n_psidot)),
             measured(fit.t_f, fit.t_f_sigma),
         )
         for fit in fits
@@ -216,7 +217,9 @@ def _published_tables() -> list[Listing]:
         rows.append(("mean, recomputed", "", *(f"{e:.4f}" for e in printed.average), ""))
         rows.append(("mean, as printed", "", *(f"{e:.4f}" for e in printed.printed_average), ""))
         against = zip(*agreement(printed), strict=True)
-        rows.append(("Student's t against 2/3, 2/3, -1/3", "", *(f"{t:.1f} (p = {p:.2g})" for t, p in against), ""))
+        rows.append(
+            ("Student's t against 2/3, 2/3, -1/3", "", *(f"{t:.1f} (p {probability(p)})" for t, p in against), "")
+        )
         caption = f"Ma et al. 2014, disc on {surface}."
         header = ("case", "trial", "n_E", "n_θ", "n_ψ̇", "t_f (s)")
         tables.append(Listing(header, rows, caption, folded=f"Published exponents on {surface}"))

@@ -17,12 +17,12 @@ from disctrack.analyse.report import report_of
 from disctrack.errors import AnalysisError
 from disctrack.files.inputs import keep
 from disctrack.files.labelled_arrays import Variable
-from disctrack.findings import doubts
+from disctrack.findings import carried
 from disctrack.frames import euler_jacobian
 from disctrack.report.blocks import Report
 from disctrack.report.html import write_page
 from disctrack.trajectory.file import Group, read_group, read_provenance, read_trajectory, trajectory_in, write_groups
-from disctrack.trajectory.reuse import refuse_other
+from disctrack.trajectory.reuse import origin_of, refuse_other, remember
 
 
 @dataclass(frozen=True, repr=False)
@@ -73,8 +73,9 @@ def run_analyse(
         raise AnalysisError(f"{path}: {error}") from error
     write_analysis(path, analysis)
     page = folder / "report.html"
-    summary = report_of(analysis, provenance, doubts(trajectory.findings), all_figures(analysis), (page, path))
+    summary = report_of(analysis, provenance, carried(trajectory.findings), all_figures(analysis), (page, path))
     written = write_page(page, summary, ("png", "pdf") if figures else ())
+    remember(folder, origin_of(path, {"window": window, "circle": circle_duration}), summary, (page, *written))
     return AnalyseOutcome(analysis, path, page, tuple(written), summary)
 
 
@@ -183,7 +184,7 @@ def _motion_attributes(analysis: Analysis) -> dict[str, object]:
         "groups": ", ".join(GROUP_NAMES),
         "median_length_s": np.median(motion.length, axis=0),
         "noise_scale": motion.noise_scale,
-        "warnings": "\n".join(analysis.warnings),
+        "warnings": "\n".join(finding.text for finding in analysis.findings),
     }
 
 

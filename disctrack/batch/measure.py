@@ -7,7 +7,6 @@ import json
 import time
 from pathlib import Path
 
-from calibration.cameras.camera import StereoRig
 from calibration.rig_file import read_rig
 from disctrack.analyse.analysis import Analysis, analyse
 from disctrack.analyse.stage import run_analyse, write_analysis
@@ -30,16 +29,15 @@ from disctrack.batch.records import (
 from disctrack.batch.repeats import group_of
 from disctrack.calibrate.stage import boards_in, calibrate_into, is_rig_of, source_of
 from disctrack.diagnosis.recorded import first_to_mend
-from disctrack.errors import AnalysisError, DiscTrackError, OutputError, reason_of
+from disctrack.errors import AnalysisError, DiscTrackError, TrackingError, reason_of
 from disctrack.files.whole import write_whole
 from disctrack.findings import Kind, leading
-from disctrack.progress import StageTime, recorded_times, timed
+from disctrack.progress import recorded_times, timed
 from disctrack.recording.declaration import Recording, read_recording
-from disctrack.track.measurement import ImagePairs, measure, open_pairs, trajectory_provenance
+from disctrack.track.measurement import measure, open_pairs, trajectory_provenance
 from disctrack.trajectory import Trajectory
-from disctrack.trajectory import file as storage
-from disctrack.trajectory.file import Provenance
-from disctrack.trajectory.reuse import origin_of, remember
+from disctrack.trajectory.file import Details, Provenance
+from disctrack.trajectory.reuse import kept_or_made
 
 LOCK = ".batch.lock"
 BUSY_FOR = 1.0  # [s] to wait for another batch before the recording is put back: longer than to look for it again
@@ -78,10 +76,17 @@ def make_recording(job: Job) -> Record:
         try:
             return _make_recording(job, results)
         except Exception as error:
-            record = failed(reason_of(error))
+            record = failed(reason_of(error), _kind_of(error))
             with contextlib.suppress(DiscTrackError):  # or else the batch that runs now is the only one to know
                 write_record(results, record)
             return record
+
+
+def _kind_of(error: Exception) -> Kind:
+    """What a recording could not be measured for."""
+    if not isinstance(error, TrackingError):
+        return Kind.OTHER
+    return error.findings[0].kind if error.findings else Kind.DISC_NOT_FOUND
 
 
 def _make_recording(job: Job, results: Path) -> Record:
@@ -89,51 +94,26 @@ def _make_recording(job: Job, results: Path) -> Record:
     asked = stages_asked(job.options)
     recording = read_recording(job.folder)
     rig, pairs = read_rig(job.rig), open_pairs(recording)
-    path = results / "trajectory.h5"
-    tracking: list[StageTime] = []
-    provenance = _reusable(path, recording, rig, pairs) if not job.options.overwrite else None
-    if provenance is not None:
-        record = read_record(results)
+    path, provenance = results / "trajectory.h5", trajectory_provenance(recording, rig, pairs, None)
+
+    def measured() -> tuple[Trajectory, Details]:
+        with timed("track"):
+            found = measure(recording, rig, pairs, threads=job.threads, boards=boards_in(Path(job.rig), recording))
+        return found.trajectory, found.details
+
+    with recorded_times() as times:
+        trajectory, _, fresh = kept_or_made(path, provenance, measured, job.options.overwrite)
+        record = None if fresh else read_record(results)
         if record is not None and record.fingerprint == provenance.fingerprint and is_done(results, record, asked):
             return dataclasses.replace(record, status=SKIPPED)
-        trajectory = storage.read_trajectory(path)
-    else:
-        with recorded_times() as tracking, timed("track"):
-            trajectory, provenance = _track(path, recording, rig, pairs, job)
-    with recorded_times() as times:
         record = _after_tracking(results, path, trajectory, provenance, job, asked)
     numbers = record.numbers | _origin(recording, provenance)
     numbers |= {"rig": job.rig, "seconds": round(time.perf_counter() - began, 3)}
     numbers |= {"processor_seconds": round(time.process_time() - used, 3)}
-    numbers |= {f"processor_seconds_{t.stage}": t.processor_seconds for t in (*tracking, *times)}
+    numbers |= {f"processor_seconds_{t.stage}": t.processor_seconds for t in times}
     record = dataclasses.replace(record, numbers=numbers)
     write_record(results, record)
     return record
-
-
-def _reusable(path: Path, recording: Recording, rig: StereoRig, pairs: ImagePairs) -> Provenance | None:
-    """What the trajectory that is there was made from, if making it again would give it again.
-
-    Raises OutputError if the file is no trajectory: it may be something that cannot be made again.
-    """
-    if not path.exists():
-        return None
-    try:
-        storage.read_provenance(path)
-    except DiscTrackError as error:
-        raise OutputError(f"{error} It is kept; move it away, or replace it with --overwrite.") from error
-    provenance = trajectory_provenance(recording, rig, pairs, None)
-    return provenance if storage.is_result_of(path, provenance) else None
-
-
-def _track(
-    path: Path, recording: Recording, rig: StereoRig, pairs: ImagePairs, job: Job
-) -> tuple[Trajectory, Provenance]:
-    boards = boards_in(Path(job.rig), recording)
-    found = measure(recording, rig, pairs, threads=job.threads, boards=boards)
-    provenance = trajectory_provenance(recording, rig, pairs, None)
-    storage.write_trajectory(path, found.trajectory, provenance, overwrite=True, details=found.details)
-    return found.trajectory, provenance
 
 
 def _after_tracking(
@@ -148,7 +128,7 @@ def _after_tracking(
     files, numbers = {"trajectory": path.name}, tracked_numbers(trajectory)
     noticed = leading(trajectory.findings)
     missing = [f.sentence for f in noticed if f.doubtful or f.kind == Kind.UNREADABLE]
-    numbers |= {"severity": noticed[0].severity.name.lower(), "finding": noticed[0].kind.value} if noticed else {}
+    numbers |= {"severity": noticed[0].grave, "finding": noticed[0].kind.value} if noticed else {}
     try:
         with timed("analyse"):
             analysis, report = _analyse(path, trajectory, job)
@@ -162,10 +142,12 @@ def _after_tracking(
         try:
             if wrong:
                 raise AnalysisError("a number is declared wrong, and a missing effect would be read into it")
+            from disctrack.diagnosis import run_diagnose
+
             with timed("diagnose"):
-                page, document = _diagnose(path)
-            numbers |= diagnosed_numbers(document)
-            files["diagnosis_report"] = page.relative_to(results).as_posix()
+                diagnosed = run_diagnose(path, overwrite=True).summary
+            numbers |= diagnosed_numbers(dict(diagnosed.data))
+            files["diagnosis_report"] = diagnosed.files[0].relative_to(results).as_posix()
         except AnalysisError as error:
             missing.append(f"not diagnosed: {reason_of(error)}")
     return Record(MEASURED, "; ".join(missing), provenance.fingerprint, asked, files, numbers)
@@ -175,23 +157,10 @@ def _analyse(path: Path, trajectory: Trajectory, job: Job) -> tuple[Analysis, Pa
     window, circle = job.options.window, job.options.circle
     if job.options.report:
         outcome = run_analyse(path, window=window, circle_duration=circle, overwrite=True)
-        origin = origin_of(path, {"window": window, "circle": circle})  # as of the command, which may go on from here
-        remember(outcome.report.parent, origin, outcome.summary, [outcome.report])
         return outcome.analysis, outcome.report
     analysis = analyse(trajectory, window, circle)
     write_analysis(path, analysis)
     return analysis, None
-
-
-def _diagnose(path: Path) -> tuple[Path, Row]:
-    from disctrack.diagnosis import run_diagnose
-    from disctrack.diagnosis.model_file import PAPER
-
-    outcome = run_diagnose(path, overwrite=True)
-    pages = {file.name: file for file in outcome.files}
-    origin = origin_of(path, {"model": PAPER})
-    remember(pages["diagnosis.html"].parent, origin, outcome.summary, outcome.files)
-    return pages["diagnosis.html"], json.loads(pages["diagnosis.json"].read_text(encoding="utf-8"))
 
 
 def _origin(recording: Recording, provenance: Provenance) -> Row:

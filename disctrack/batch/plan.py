@@ -9,6 +9,7 @@ from calibration import CalibrationSettings
 from disctrack.batch.find import FoundRecordings
 from disctrack.calibrate.stage import source_of
 from disctrack.errors import reason_of
+from disctrack.findings import Kind
 from disctrack.recording.declaration import Recording, read_recording
 from disctrack.track.measurement import open_pairs
 
@@ -52,7 +53,7 @@ class BatchPlan:
 
     rigs: tuple[Job, ...]
     recordings: tuple[Job, ...]
-    failures: dict[str, str]  # name of the recording -> reason
+    failures: dict[str, tuple[str, Kind]]  # name of the recording -> reason, and what it is about
     undeclared: tuple[Path, ...]  # folders of images that no recording.toml speaks of
 
 
@@ -60,16 +61,17 @@ def make_plan(found: FoundRecordings, recordings: Sequence[Path], options: Batch
     """Read every recording.toml, count the images, and find who shares a rig by the content of the views."""
     rigs: dict[str, Job] = {}
     jobs: list[Job] = []
-    failures: dict[str, str] = {}
+    failures: dict[str, tuple[str, Kind]] = {}
     undeclared = found.undeclared
     for folder in recordings:
-        name = found.name(folder)
+        name, about = found.name(folder), Kind.DECLARATION
         try:
             recording = read_recording(folder)
+            about = Kind.READING
             undeclared = tuple(place for place in undeclared if not _has_views_of(place, recording))
             jobs.append(_job(found, recording, name, options, rigs))
         except Exception as error:  # whatever is wrong with one recording, the others are measured
-            failures[name] = reason_of(error)
+            failures[name] = reason_of(error), about
     needed = {job.rig for job in jobs}
     return BatchPlan(tuple(job for path, job in rigs.items() if path in needed), tuple(jobs), failures, undeclared)
 

@@ -31,6 +31,7 @@ from disctrack.batch.measure import do
 from disctrack.batch.plan import Job
 from disctrack.batch.records import BUSY, FAILED, Record, failed
 from disctrack.errors import ClusterError, reason_of
+from disctrack.findings import Kind
 from disctrack.processes import Spawn, end_with_parent, quietly
 
 if TYPE_CHECKING:
@@ -68,7 +69,7 @@ def do_all(
         done(job, record)
         for after in waiting.pop(job.rig, []) if job.kind == "rig" else []:
             if record.status == FAILED:
-                done(after, failed(f"no rig: {record.reason}"))
+                done(after, failed(f"no rig: {record.reason}", Kind.CALIBRATION))
             else:
                 ready.append(after)
 

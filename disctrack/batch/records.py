@@ -11,6 +11,7 @@ from disctrack.batch.plan import BatchOptions
 from disctrack.errors import DiscTrackError
 from disctrack.files.json_text import json_file
 from disctrack.files.whole import write_whole
+from disctrack.findings import Kind, Severity
 from disctrack.trajectory.file import read_provenance
 
 RECORD = "batch.json"
@@ -33,9 +34,9 @@ class Record:
     numbers: Row = field(default_factory=dict)  # columns of the summary
 
 
-def failed(reason: str) -> Record:
-    """A failure with its reason."""
-    return Record(FAILED, reason)
+def failed(reason: str, kind: Kind = Kind.OTHER) -> Record:
+    """A failure with its reason, and what kind of finding that is."""
+    return Record(FAILED, reason, numbers={"severity": Severity.REFUSAL.name.lower(), "finding": kind.value})
 
 
 def stages_asked(options: BatchOptions) -> Stages:
@@ -69,7 +70,7 @@ def is_done(folder: Path, record: Record | None, asked: Stages) -> bool:
     """True if the record tells of a measured recording with all stages asked for, and all its files are there.
 
     The trajectory must be the record's; whether that is the result of the present inputs is another question
-    (`disctrack.trajectory.file.is_result_of`).
+    (`disctrack.trajectory.reuse.kept_or_made`).
     """
     if record is None or record.status != MEASURED or "trajectory" not in record.files:
         return False

@@ -8,7 +8,7 @@ from disctrack.batch.columns import FALSE_DISCOVERY, FITTED, LACKS_SOMETHING, Fi
 from disctrack.batch.records import FAILED, MEASURED, NOT_MEASURED, SKIPPED
 from disctrack.findings import Finding, Kind, Severity, of_kind
 from disctrack.frames import CAMERAS
-from disctrack.numbers import measured, rounded
+from disctrack.numbers import measured, probability, rounded
 from disctrack.report.blocks import Listing, Markup, Report, Section, Text
 
 SAID = {SKIPPED: "measured before"}  # which is read long after the batch that found it done
@@ -76,9 +76,10 @@ def _noticed(rows: Sequence[Row]) -> list[Finding]:
     """Why recordings have no result, or one that is not all it could be."""
     found = []
     for row in (row for row in rows if row["reason"]):
-        severity = Severity.DOUBT if row["severity"] == "doubt" else Severity.WARNING
+        severity = max(Severity.WARNING, Severity[(row["severity"] or "note").upper()])
         severity = Severity.REFUSAL if row["status"] in (FAILED, NOT_MEASURED) else severity
-        found.append(Finding(Kind.OTHER, severity, f"{row['recording']} ({row['status']}): {row['reason']}"))
+        text = f"{row['recording']} ({row['status']}): {row['reason']}"
+        found.append(Finding(Kind(row["finding"]), severity, text))
     return found
 
 
@@ -96,7 +97,7 @@ def _repeats(repeats: Sequence[Row]) -> list[Text | Listing]:
             str(row["n"]),
             measured(*(fitted[row["quantity"]].scale * row[key] for key in ("mean", "standard_deviation"))),
             rounded(row["reduced_chi_square"]),
-            rounded(row["p_value"], 2),
+            probability(row["p_value"]),
         )
         for row in repeats
     ]

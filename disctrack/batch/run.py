@@ -98,7 +98,7 @@ def run_batch(
         plan = make_plan(found, mine, options)
         if cluster is None:
             plan = replace(plan, recordings=with_threads(plan.recordings, cores, n))
-        records = {name: failed(reason) for name, reason in plan.failures.items()}
+        records = {name: failed(*why) for name, why in plan.failures.items()}
         stopped = _do(plan, records, pool)
     for job in plan.recordings:
         records.setdefault(job.name, Record(NOT_MEASURED, stopped))

@@ -108,7 +108,8 @@ def boards_of(record: CalibrationRecord, views: TargetImages | None, numbers: Se
     found = [numbers[i] for i in found] if numbers else found
     places = dict(zip(found, zip(record.R_left_board, record.t_left_board, strict=True), strict=False))
     view = None if record.table_view is None else found[record.table_view]
-    return Boards(places, view, record.board_thickness)
+    noticed = of_kind(Kind.CALIBRATION, Severity.WARNING, record.told["warnings"])
+    return Boards(places, view, record.board_thickness, noticed)
 
 
 def given_rig(file: Path) -> tuple[StereoRig, Report]:
@@ -139,6 +140,7 @@ def calibrate_into(
         told["rows"].append(("reused", f"{path}: complete result of the same views, settings and version"))
         return read_rig(path), _report(told, [path])
     found, problems = _calibrate(source)
+    found = dataclasses.replace(found, warnings=(*problems, *found.warnings))
     if found.assessment.beyond_use and not force:
         said = "; ".join([found.assessment.verdict, *found.warnings])
         raise CalibrationError(
@@ -149,7 +151,7 @@ def calibrate_into(
         "verdict": found.assessment.verdict,
         "accuracy": summary.place_text(found),
         "rows": summary.calibration_rows(found, problems),
-        "warnings": [*problems, *found.warnings],
+        "warnings": found.warnings,
     }
     attributes = {
         "fingerprint": provenance.fingerprint,

@@ -5,7 +5,7 @@ import json
 import os
 import sys
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from calibration import CalibrationSettings, StereoRig
 from disctrack.calibrate.stage import boards_in
 from disctrack.commands import DONE, INCOMPLETE
-from disctrack.errors import OutputError, RecordingError, TrajectoryFileError
+from disctrack.errors import RecordingError
 from disctrack.files.json_text import json_file, json_text
 from disctrack.files.software import software_version
 from disctrack.files.whole import check_writable as check_writable
 from disctrack.files.whole import write_whole
-from disctrack.findings import Finding, Kind, Severity, in_doubt, leading, of_kind
+from disctrack.findings import Kind, Severity, in_doubt, leading, of_kind
 from disctrack.progress import progress_bar, times_so_far
 from disctrack.recording.changed import changed_since, told_differences
 from disctrack.recording.declaration import FILE_NAME, Recording
@@ -33,9 +33,9 @@ from disctrack.track.follow.tracking import TrackingSettings
 from disctrack.track.measurement import ImagePairs, measure, trajectory_provenance
 from disctrack.track.video_overlay import shown_rows, write_overlay
 from disctrack.trajectory import Trajectory
-from disctrack.trajectory import file as storage
 from disctrack.trajectory.exchange.csv_table import write_csv
-from disctrack.trajectory.reuse import SUMMARY
+from disctrack.trajectory.file import Details, Provenance, read_provenance
+from disctrack.trajectory.reuse import SUMMARY, kept_or_made
 
 RESULTS = "results"
 
@@ -47,33 +47,32 @@ def calibration_settings(arguments: argparse.Namespace) -> CalibrationSettings:
 
 def track_into(
     path: Path, recording: Recording, rig: StereoRig, rig_file: Path, pairs: ImagePairs, arguments: argparse.Namespace
-) -> tuple[Report, tuple[Finding, ...]]:
-    """Track, or reuse what is there; write trajectory, table, pictures, video. returns : also what was noticed
+) -> Report:
+    """Track, or reuse what is there; write trajectory, table, pictures, video.
 
     Raises OutputError if `path` holds something else and may not be replaced.
     """
+    settings = TrackingSettings(first_pass=not (arguments.all or arguments.frames))
     rows = [("recording", f"{recording.name}: {len(pairs)} pairs at {recording.frame_rate:g} Hz")]
-    trajectory, details = None, {}
-    fresh, settings = False, TrackingSettings(first_pass=not (arguments.all or arguments.frames))
-    if path.exists() and not arguments.overwrite:
-        if not storage.is_result_of(path, trajectory_provenance(recording, rig, pairs, settings)):
-            raise OutputError(
-                f"{path}: exists, and is not the complete result of these images, settings and version"
-                f"{_why(path, recording)}. Keep it and choose another place with -o, or replace it with --overwrite."
-            )
-        trajectory, details = storage.read_trajectory(path), storage.read_details(path)
-        rows.append(("reused", f"{path}: complete result of the same images, settings and version"))
-    if trajectory is None:
+
+    def measured() -> tuple[Trajectory, Details]:
         with progress_bar("track", len(pairs), "pair") as advance:
             boards = boards_in(rig_file, recording)
-            measurement = measure(recording, rig, pairs, settings, arguments.threads, advance, boards)
-        trajectory, details = measurement.trajectory, measurement.details
-        provenance = trajectory_provenance(recording, rig, pairs, settings)
-        storage.write_trajectory(path, trajectory, provenance, overwrite=arguments.overwrite, details=details)
-        speed = len(pairs) / max(measurement.seconds, 1e-9)
-        fresh = True
-        rows.append(("speed", f"{speed:.0f} pairs/s ({measurement.seconds:.2f} s with reading the images)"))
-    report = Report(
+            found = measure(recording, rig, pairs, settings, arguments.threads, advance, boards)
+        speed = len(pairs) / max(found.seconds, 1e-9)
+        rows.append(("speed", f"{speed:.0f} pairs/s ({found.seconds:.2f} s with reading the images)"))
+        return found.trajectory, found.details
+
+    def changed(made: Provenance) -> str:
+        now = json.loads(json.dumps(recording.declared, default=str))
+        found = told_differences(now, _declared(made))
+        return f"{FILE_NAME}: {found}" if found else ""
+
+    provenance = trajectory_provenance(recording, rig, pairs, settings)
+    trajectory, details, fresh = kept_or_made(path, provenance, measured, arguments.overwrite, changed)
+    if not fresh:
+        rows.append(("reused", f"{path}: complete result of the same images, settings and version"))
+    return Report(
         recording.name,
         f"Frames: {summary.frames_text(trajectory)}{'' if fresh else ' (reused)'}.",
         f"sigma {summary.sigma_text(trajectory)}",
@@ -82,20 +81,9 @@ def track_into(
         files=[path, *_companions(path, trajectory, pairs, arguments, fresh)],
         then=f"disctrack analyse {relative(path)}",
     )
-    return report, trajectory.findings
 
 
-def _why(path: Path, recording: Recording) -> str:
-    """What was declared otherwise, or which version made it, where that explains why a result is not reused."""
-    try:
-        made = storage.read_provenance(path)
-    except TrajectoryFileError:
-        return ""
-    changed = told_differences(json.loads(json.dumps(recording.declared, default=str)), _declared(made))
-    return f" ({FILE_NAME}: {changed})" if changed else f" (made by {made.version})"
-
-
-def _declared(made: storage.Provenance) -> dict[str, Any]:
+def _declared(made: Provenance) -> dict[str, Any]:
     """The declaration that a trajectory was measured with."""
     kept = made.settings.get("recording")
     return dict(kept) if isinstance(kept, dict) else {}
@@ -109,7 +97,7 @@ def recording_of(trajectory: Path) -> Path | None:
 def tell_stale(trajectory: Path) -> None:
     """Say on stderr where the recording.toml beside a trajectory is no longer the one that it was measured with."""
     folder = recording_of(trajectory)
-    kept = _declared(storage.read_provenance(trajectory))
+    kept = _declared(read_provenance(trajectory))
     changed = changed_since(folder, kept) if folder is not None and kept else ""
     if folder is not None and changed:
         place = relative(folder)
@@ -120,9 +108,13 @@ def tell_stale(trajectory: Path) -> None:
         )
 
 
-def exit_code(findings: Iterable[Finding]) -> int:
-    """INCOMPLETE where images could not be read, or the result is in doubt; said on stderr."""
-    spoilt = [finding for finding in findings if finding.doubtful or finding.kind == Kind.UNREADABLE]
+def tell(report: Report, arguments: argparse.Namespace, folder: Path, *, reused: bool = False) -> int:
+    """Show a report as the options ask for it. folder : where all of it lies as summary.txt, if it does
+
+    returns : INCOMPLETE where images could not be read, or the result is in doubt, which is said on stderr
+    """
+    show_report(report, arguments, folder, reused=reused)
+    spoilt = [finding for finding in report.findings if finding.doubtful or finding.kind == Kind.UNREADABLE]
     if not spoilt:
         return DONE
     said = "the result is in doubt" if in_doubt(spoilt) else "some images could not be read"
@@ -130,18 +122,8 @@ def exit_code(findings: Iterable[Finding]) -> int:
     return INCOMPLETE
 
 
-def tell(
-    report: Report,
-    arguments: argparse.Namespace,
-    folder: Path,
-    findings: Iterable[Finding] = (),
-    *,
-    reused: bool = False,
-) -> int:
-    """Show a report as the options ask for it; returns the exit code.
-
-    folder : where all of the report lies as summary.txt, if it does;  findings : of the measurement
-    """
+def show_report(report: Report, arguments: argparse.Namespace, folder: Path, *, reused: bool = False) -> None:
+    """Print a report as the options ask for it."""
     if arguments.json:
         print(json_text(document(report), indent=1))
     elif not arguments.quiet:
@@ -155,7 +137,6 @@ def tell(
         else:
             shown = replace(report, findings=[*report.findings, *said], files=files, page=page)
             show(shown, verbose=arguments.verbose)
-    return exit_code(findings)
 
 
 def link_pages_of(trajectory: Path) -> None:

@@ -12,13 +12,12 @@ from disctrack.analyse.stage import run_analyse
 from disctrack.commands import _outputs as outputs
 from disctrack.errors import RecordingError
 from disctrack.files.whole import write_whole
-from disctrack.findings import doubts
 from disctrack.progress import steps
 from disctrack.recording.declaration import read_recording
 from disctrack.track.measurement import open_pairs
 from disctrack.track.video_overlay import draw_pair
-from disctrack.trajectory.file import read_findings, read_provenance, trajectory_in
-from disctrack.trajectory.reuse import origin_of, remember, reusable
+from disctrack.trajectory.file import read_provenance, trajectory_in
+from disctrack.trajectory.reuse import origin_of, reusable
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -26,12 +25,11 @@ def run(arguments: argparse.Namespace) -> int:
     path = trajectory_in(arguments.trajectory)
     folder = arguments.output or path.parent / f"{path.stem}_analysis"
     outputs.tell_stale(path)
-    origin = origin_of(path, {"window": arguments.window, "circle": arguments.circle})
-    known = reusable(folder, origin)
+    known = reusable(folder, origin_of(path, {"window": arguments.window, "circle": arguments.circle}))
     page = folder / "motion.html"
     asked = [page, *([folder / "figures"] if arguments.figures else [])]
     if known is not None and not arguments.overwrite and all(place.exists() for place in asked):
-        return outputs.tell(known, arguments, folder, doubts(read_findings(path)), reused=True)
+        return outputs.tell(known, arguments, folder, reused=True)
     with steps("analyse"):
         outcome = run_analyse(
             path,
@@ -44,10 +42,8 @@ def run(arguments: argparse.Namespace) -> int:
     with steps("motion.html"):
         _write_motion_page(page, outcome.analysis, path, arguments.recording)
     files = (*outcome.summary.files, page, *outputs.write_times(folder, "analyse"))
-    report = replace(outcome.summary, files=files, then=f"disctrack diagnose {outputs.relative(path)}")
-    remember(folder, origin, report, (outcome.report, page, *outcome.figures))
     outputs.link_pages_of(path)
-    return outputs.tell(report, arguments, folder, doubts(outcome.analysis.trajectory.findings))
+    return outputs.tell(replace(outcome.summary, files=files), arguments, folder)
 
 
 def _write_motion_page(page: Path, analysis: Analysis, trajectory: Path, recording: Path | None) -> None:

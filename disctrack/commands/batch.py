@@ -18,7 +18,7 @@ def run(arguments: argparse.Namespace) -> int:
     else:
         how = arguments.jobs, arguments.shard, arguments.cluster
         outcome = run_batch(arguments.folders, options, arguments.output, *how)
-    outputs.tell(outcome.report(), arguments, Path())
+    outputs.show_report(outcome.report(), arguments, Path())
     _tell_problems(outcome)
     if outcome.interrupted:
         raise KeyboardInterrupt

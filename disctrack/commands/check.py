@@ -21,5 +21,5 @@ def run(arguments: argparse.Namespace) -> int:
         path = arguments.output or seen.recording.folder / outputs.RESULTS / "check.png"
         figure = check_figure(seen)
         files = [save_figure(figure, path)] if figure is not None else []
-    outputs.tell(seen.report(files), arguments, arguments.recording)
+    outputs.show_report(seen.report(files), arguments, arguments.recording)
     return FAILED if in_doubt(seen.findings) else DONE

@@ -13,12 +13,12 @@ from disctrack.diagnosis import run_diagnose
 from disctrack.diagnosis.recorded import first_to_mend
 from disctrack.diagnosis.together.stage import run_together
 from disctrack.errors import TrajectoryFileError
-from disctrack.findings import doubts
+from disctrack.findings import carried
 from disctrack.progress import compiling, steps
 from disctrack.recording.readers.blocks import default_threads
 from disctrack.report.blocks import Report
 from disctrack.trajectory.file import read_findings, trajectory_in
-from disctrack.trajectory.reuse import origin_of, remember, reusable
+from disctrack.trajectory.reuse import content_of, origin_of, reusable
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -29,19 +29,15 @@ def run(arguments: argparse.Namespace) -> int:
     path = paths[0]
     folder = arguments.output or path.parent / f"{path.stem}_diagnosis"
     outputs.tell_stale(path)
-    findings = doubts(read_findings(path))
-    model = Path(arguments.model)
-    told_model = model.read_text(encoding="utf-8") if model.is_file() else arguments.model
-    origin = origin_of(path, {"model": told_model} | ({"plan": True} if arguments.plan else {}))
-    known = reusable(folder, origin)
+    known = reusable(folder, origin_of(path, {"model": content_of(arguments.model), "plan": arguments.plan}))
     more = arguments.figures and not (folder / "figures").is_dir()
     if known is not None and not (arguments.overwrite or more):
-        return outputs.tell(known, arguments, folder, findings, reused=True)
-    wrong = first_to_mend(findings)
-    if wrong and not arguments.anyway:
+        return outputs.tell(known, arguments, folder, reused=True)
+    findings = carried(read_findings(path))
+    if first_to_mend(findings) and not arguments.anyway:
         said = "Not diagnosed: a number is declared wrong, and a missing effect would be read into it."
         then = f"mend it and run again; or `disctrack diagnose {outputs.relative(path)} --anyway`"
-        return outputs.tell(Report("", said, findings=wrong, then=then), arguments, folder, findings)
+        return outputs.tell(Report("", said, findings=findings, then=then), arguments, folder)
     with compiling("the simulation of motions", 30):
         rolling.prepare()
     with steps("diagnose"):
@@ -53,12 +49,9 @@ def run(arguments: argparse.Namespace) -> int:
             settle=arguments.plan,
             figures=arguments.figures,
         )
-    then = f"disctrack diagnose {outputs.relative(path)} --model {outputs.relative(folder / 'model.toml')}"
     files = (*outcome.summary.files, *outputs.write_times(folder, "diagnose"))
-    report = replace(outcome.summary, files=files, then=then if outcome.result.has_more else "")
-    remember(folder, origin, report, outcome.files)
     outputs.link_pages_of(path)
-    return outputs.tell(report, arguments, folder, findings)
+    return outputs.tell(replace(outcome.summary, files=files), arguments, folder)
 
 
 def _together(paths: list[Path], arguments: argparse.Namespace) -> int:
@@ -81,5 +74,8 @@ def _together(paths: list[Path], arguments: argparse.Namespace) -> int:
         )
     code = outputs.tell(report, arguments, report.files[0].parent)
     if unusable := report.data["unusable"]:
-        print(f"disctrack: {len(unusable)} recording(s) could not be used (see above).", file=sys.stderr)
+        print(
+            f"disctrack: {len(unusable)} recording{'s' * (len(unusable) > 1)} could not be used (see above).",
+            file=sys.stderr,
+        )
     return INCOMPLETE if unusable else code

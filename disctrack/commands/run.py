@@ -33,15 +33,14 @@ def run(arguments: argparse.Namespace) -> int:
     verdict = f"Calibration: {known.verdict.partition('. ')[0]}"
     if recording.rig_file is None and not arguments.quiet:  # before the frames, which take longer
         print(verdict, file=sys.stderr, flush=True)
-    tracked, findings = outputs.track_into(folder / "trajectory.h5", recording, rig, rig_file, pairs, arguments)
+    tracked = outputs.track_into(folder / "trajectory.h5", recording, rig, rig_file, pairs, arguments)
     whole = [("verdict", known.verdict), ("place", known.accuracy)]
     report = replace(
         tracked,
         verdict=f"{tracked.verdict} {verdict}.",
-        findings=[*tracked.findings, *known.findings],
         blocks=[Section("Calibration", [Facts(whole), *known.blocks]), Section("Tracking", tracked.blocks)],
         files=[*known.files, *tracked.files, summary, *outputs.write_times(folder, "run")],
         page=summary,
     )
     write_whole(summary, ("\n".join(full(report)) + "\n").encode())
-    return outputs.tell(report, arguments, folder, findings)
+    return outputs.tell(report, arguments, folder)

@@ -26,6 +26,6 @@ def run(arguments: argparse.Namespace) -> int:
     pairs = pipeline.open_pairs(recording, arguments.frames or (None, None))
     refuse_input(path)
     outputs.check_writable(path.parent)
-    report, findings = outputs.track_into(path, recording, rig, rig_file, pairs, arguments)
+    report = outputs.track_into(path, recording, rig, rig_file, pairs, arguments)
     report = replace(report, files=[*report.files, *outputs.write_times(path.parent, "track")])
-    return outputs.tell(report, arguments, path.parent, findings)
+    return outputs.tell(report, arguments, path.parent)

@@ -63,6 +63,4 @@ def with_declared_dots(trajectory: Trajectory, details: Mapping[str, Any]) -> Tr
 
 def first_to_mend(findings: Iterable[Finding]) -> tuple[Finding, ...]:
     """What is declared wrongly: a missing effect would be read into it. Dots are measured where they are."""
-    return tuple(
-        f for f in doubts(findings) if f.kind != Kind.DOTS_MISPLACED and any(remedy.key for remedy in f.remedies)
-    )
+    return tuple(f for f in doubts(findings) if f.kind != Kind.DOTS_MISPLACED and any(r.key for r in f.remedies))

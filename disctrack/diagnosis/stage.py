@@ -32,12 +32,12 @@ from disctrack.errors import AnalysisError
 from disctrack.files.inputs import keep, refuse_input
 from disctrack.files.json_text import json_file
 from disctrack.files.whole import write_whole
-from disctrack.findings import doubts
+from disctrack.findings import carried
 from disctrack.report.blocks import Report
 from disctrack.report.html import write_page
 from disctrack.trajectory import Trajectory
 from disctrack.trajectory.file import trajectory_in
-from disctrack.trajectory.reuse import refuse_other
+from disctrack.trajectory.reuse import content_of, origin_of, refuse_other, remember
 
 
 @dataclass(frozen=True, repr=False)
@@ -223,7 +223,7 @@ def run_diagnose(
     refuse_other(report, overwrite)
     for file in (report, toml):
         refuse_input(file)
-    recorded = read_recorded(path)
+    recorded, origin = read_recorded(path), origin_of(path, {"model": content_of(model), "plan": settle})
     try:
         result = diagnose(recorded.trajectory, model)
     except AnalysisError as error:
@@ -235,8 +235,11 @@ def run_diagnose(
     write_whole(report, json_file(document))
     write_whole(toml, model_toml(result.system, result.diagnosis.after.values, recorded.name).encode())
     whole = report_of(
-        result, beside, recorded.name, all_figures(result, beside), doubts(recorded.trajectory.findings),
+        result, beside, recorded.name, all_figures(result, beside), carried(recorded.trajectory.findings),
         files=(page, report, toml, path),
     )  # fmt: skip
     files = write_page(page, whole, ("png", "pdf") if figures else ())
-    return DiagnoseOutcome(result, (report, toml, page, *files), replace(whole, data=document))
+    then = f"disctrack diagnose {path} --model {toml}" if result.has_more else ""
+    outcome = DiagnoseOutcome(result, (report, toml, page, *files), replace(whole, data=document, then=then))
+    remember(folder, origin, outcome.summary, outcome.files)
+    return outcome

@@ -23,7 +23,7 @@ from disctrack.findings import Kind
 from disctrack.frames import CAMERAS
 
 MOVED = (Kind.CAMERA_MOVED, Kind.DOTS_MISFIT, Kind.CAMERAS_CONTRADICT, Kind.TABLE_DISAGREES)
-HEIGHT = (Kind.TABLE_DISAGREES, Kind.OFF_THE_TABLE, Kind.THICKNESS, Kind.BOARD_THICKNESS)
+HEIGHT = (Kind.TABLE_DISAGREES, Kind.THICKNESS, Kind.BOARD_THICKNESS)
 TYPICAL_STEPS = 30  # a fault of so many steps surprises nobody: 1/3 px, 0.02 deg, 0.3 mm, 0.3 ms
 _DEG = 180 / np.pi
 
@@ -205,7 +205,7 @@ OF_THE_PAPER = (
           "pattern_scale", null=1.0, belongs_to=("disc",),
           seen="dots and chessboard contradict each other in their scale",
           remedy="measure the printed sheet with a caliper", declared="[markers] centres_mm",
-          named_by=(Kind.SQUARE, Kind.LENGTHS, Kind.DOTS_MISPLACED)),
+          named_by=(Kind.SQUARE, Kind.DOTS_MISPLACED)),
     Fault("pattern_height", "the dots lie higher than half the thickness", "paper, glue, thickness", ("offset",), "m",
           1e-6, "along e3", "pattern_height_mm", 1e3, belongs_to=("disc",),
           seen="the disc's lowest point lies off the table",

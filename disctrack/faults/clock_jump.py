@@ -35,7 +35,7 @@ class ClockJump:
     @property
     def words(self) -> str:
         """What it is."""
-        return f"the clock jumps by {self.frames} frame(s): both cameras lost as many pairs there"
+        return f"the clock jumps by {self.frames} frame{'s' * (self.frames > 1)}: both cameras lost as many pairs there"
 
 
 def clock_jumps(trajectory: Trajectory) -> tuple[ClockJump, ...]:

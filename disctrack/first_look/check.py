@@ -15,11 +15,9 @@ from numpy.typing import NDArray
 
 from calibration import CalibrationSettings, StereoCalibration, StereoRig
 from calibration.kit.arrays import evenly
-from calibration.kit.grey_levels import saturation_level
 from calibration.rig_file import record_of
-from disctrack.analyse.declaration import Boards, contradictions_of, turned_board
+from disctrack.analyse.declaration import Boards, across, contradictions, lost_pairs, turned_board, with_square
 from disctrack.calibrate.stage import boards_in, boards_of, given_rig, source_of
-from disctrack.disc import Disc
 from disctrack.errors import DiscTrackError, RecordingError
 from disctrack.findings import (
     Finding,
@@ -31,22 +29,19 @@ from disctrack.findings import (
     leading,
     of_kind,
 )
-from disctrack.frames import CAMERAS, rotation_from_quaternion
+from disctrack.frames import CAMERAS
 from disctrack.recording.declaration import Recording, read_recording
 from disctrack.recording.readers.blocks import Unreadable
 from disctrack.report.blocks import Facts, Report, Section
 from disctrack.track.follow.tracking import Tracking, TrackingSettings, track
-from disctrack.track.measurement import ImagePairs, check_rig, images_lost, open_pairs
-from disctrack.track.run_summary import left_out
+from disctrack.track.measurement import ImagePairs, check_rig, exposures, images_lost, open_pairs
+from disctrack.track.run_summary import left_out, sigma_text
 from disctrack.trajectory import Trajectory
 
 KEYS_EXPLAINED = Path(__file__).resolve().parents[1] / "docs" / "recording-toml.md"  # it is installed with the package
 VIEWS_LOOKED_AT = 12  # of the chessboard: half of what a good rig takes
-PLACES = (0.1, 0.5, 0.9)  # of the recording where frames are looked at
-FRAMES_AT_EACH = 40
-CLAIM = 5e-6  # [m] the accuracy that is claimed for a position
-LAB_FRAME = 20e-6  # [m] to which it is known where a board on a table lies, with no particular care
-CLIPPED_SHARE = 0.002  # of an image's pixels that may be clipped: glints on the rim are
+PLACES = (0.1, 0.45, 0.9)  # of the recording where frames are looked at
+FRAMES_AT_EACH = 60  # a jump of the clock in the middle leaves some on either side
 
 
 @dataclass
@@ -95,9 +90,8 @@ class Check:
         place = "" if self.recording is None else self.recording.folder
         then = "" if in_doubt(findings) else f"disctrack run {place}"
         blocks = [Section("What was seen", [Facts(self.seen)])]
-        data = {"problems": [finding.as_json() for finding in findings]}
         name = "check" if self.recording is None else f"{self.recording.name}: check"
-        return Report(name, verdict, findings=findings, blocks=blocks, files=files, then=then, data=data)
+        return Report(name, verdict, findings=findings, blocks=blocks, files=files, then=then)
 
 
 def run_check(folder: Path, progress: Callable[[str], None] = lambda step: None) -> Check:
@@ -124,7 +118,7 @@ def run_check(folder: Path, progress: Callable[[str], None] = lambda step: None)
     if rig is None:
         if recording.chessboard is not None:
             seen.findings += turned_board(recording.chessboard.inner_corners)
-        seen.warn(Kind.DISC_NOT_FOUND, "the dots were not looked for: that needs the cameras' calibration")
+        seen.seen.append(("dots", "not looked for: that needs the cameras' calibration"))
     else:
         with seen.refusing(Kind.CALIBRATION):
             check_rig(rig, pairs)
@@ -163,10 +157,9 @@ def _rig(seen: Check, recording: Recording) -> StereoRig:
     seen.seen.append(("chessboard", f"{text}, {found.assessment.verdict}, baseline {1e3 * found.rig.baseline:.1f} mm"))
     if used < 0.7 * len(chosen):
         advice = "the whole board must be in view of both cameras, with a light rim round it"
-        seen.warn(Kind.CALIBRATION_VIEWS, f"the chessboard was {text}", advice)
-    left = (*left_out(found.rejected_views), *problems)
-    seen.findings += of_kind(Kind.CALIBRATION_VIEWS, Severity.WARNING, left)
-    seen.findings += of_kind(Kind.CALIBRATION, Severity.WARNING, found.warnings)
+        seen.warn(Kind.CALIBRATION, f"the chessboard was {text}", advice)
+    said = (*left_out(found.rejected_views), *problems, *found.warnings)
+    seen.findings += of_kind(Kind.CALIBRATION, Severity.WARNING, said)
     return found.rig
 
 
@@ -176,58 +169,57 @@ def _light(seen: Check, pairs: ImagePairs) -> None:
         seen.refuse(Kind.UNREADABLE, "none of the frames looked at can be read", "copy the frames again")
         return
     for camera, name in enumerate(CAMERAS):
-        side = images[:, camera]
-        saturation = saturation_level(side)
-        clipped = 0.0 if saturation is None else float(np.mean(side >= saturation))
-        low, high = np.percentile(side, [1.0, 99.0])
+        low, high = np.percentile(images[:, camera], [1.0, 99.0])
         text = f"{name}: grey values {low:.0f} to {high:.0f}"
-        if clipped > CLIPPED_SHARE:
-            share = f"{100 * clipped:.1f} % of the pixels clipped at {saturation}"
-            seen.warn(
-                Kind.LIGHT, f"{text}, {share}", "expose for a shorter time, or close the aperture: clipped edges shift"
-            )
-        elif high - low < 1:
+        if high - low < 1:
             seen.refuse(Kind.LIGHT, f"{text}: the images are of one grey", "is the lens cap on, is the lamp lit?")
         seen.seen.append(("light", text))
 
 
 def _motion(seen: Check, recording: Recording, rig: StereoRig, pairs: ImagePairs) -> None:
     done: list[tuple[range, Tracking]] = []
-    lost: list[Finding] = []
+    noticed: list[Finding] = []
+    total, lost = 0, ""
     for place in PLACES:
         n = min(FRAMES_AT_EACH, len(pairs))
         first = pairs.start + min(max(round(place * len(pairs)) - n // 2, 0), len(pairs) - n)
         frames = range(first, first + n)
         if any(frames.start < other.stop for other, _ in done):
             continue
+        total += n
         try:
-            done.append((frames, _track(seen, recording, rig, pairs, frames)))
+            tracking = _track(seen, recording, rig, pairs, frames)
+            done.append((frames, tracking))
+            noticed += [*tracking.findings, *lost_pairs(tracking.trajectory)]
         except DiscTrackError as error:
-            lost.append(Finding(Kind.DISC_NOT_FOUND, Severity.WARNING, str(error), Subject("check")))
-            lost += getattr(error, "findings", ())
+            lost = str(error)
+            noticed += getattr(error, "findings", ())
             seen.raw += seen.images(pairs, [frames.start])
-    seen.findings += _once(lost)
+        if any(Kind.DISC_NOT_FOUND in finding.explains for finding in noticed):
+            break  # the images are not those of the declared cameras: no other place tells more
+    measured = sum(int(tracking.trajectory.measured.sum()) for _, tracking in done)
     if not done:
-        seen.refuse(Kind.DISC_NOT_FOUND, "the disc was found nowhere", "compare [markers] with the picture")
+        seen.refuse(Kind.DISC_NOT_FOUND, "the disc was found nowhere; compare [markers] with the picture", lost)
+    elif measured < total:
+        severity = Severity.DOUBT if 2 * measured < total else Severity.WARNING
+        seen.warn(Kind.FRAMES_LOST, f"{total - measured} of {total} frames looked at have no pose", lost, severity)
+    noticed = _once(noticed)
+    if not done:
+        seen.findings += with_square(noticed, recording)
         return
+    seen.seen.append(("dots", f"disc measured in {measured} of {total} frames looked at"))
     for frames, tracking in done:
         row = len(frames) // 2
         seen.shown += [(tracking.trajectory, row, images) for images in seen.images(pairs, [frames[row]])]
-    measured = sum(int(tracking.trajectory.measured.sum()) for _, tracking in done)
-    total = sum(len(frames) for frames, _ in done)
-    seen.seen.append(("dots", f"disc measured in {measured} of {total} frames looked at"))
-    if measured < total:
-        seen.warn(Kind.FRAMES_LOST, f"the disc was measured in {measured} of {total} frames looked at")
     whole = _together([tracking.trajectory for _, tracking in done])
-    noticed = _once(finding for _, tracking in done for finding in tracking.findings)
-    for finding in contradictions_of(recording, whole, noticed, seen.boards):
+    blur_px = [edge.blur_px for edge in done[len(done) // 2][1].law.edges]
+    for finding in contradictions(whole, recording.disc, recording, noticed, seen.boards, blur_px):
         graver = Severity.DOUBT if finding.kind == Kind.DOT_UNSEEN else finding.severity
         seen.findings.append(replace(finding, severity=graver))
-    tracking = done[len(done) // 2][1]
-    if tracking.trajectory.measured.any():
-        _sharpness(seen, recording.disc, tracking)
-        _accuracy(seen, tracking.trajectory)
-    seen.findings += noticed
+    if measured:
+        for camera, blur, width in zip(CAMERAS, blur_px, across(whole), strict=True):
+            seen.seen.append(("sharpness", f"{camera}: dots {width:.1f} px across, blur {blur:.2f} px (sigma)"))
+        seen.seen.append(("accuracy", sigma_text(whole)))
 
 
 def _once(findings: Iterable[Finding]) -> list[Finding]:
@@ -240,7 +232,7 @@ def _once(findings: Iterable[Finding]) -> list[Finding]:
 
 def _track(seen: Check, recording: Recording, rig: StereoRig, pairs: ImagePairs, frames: range) -> Tracking:
     """Track a stretch."""
-    settings = TrackingSettings(refine_markers=False, first_pass=False)
+    settings = TrackingSettings(first_pass=False, exposure=exposures(recording, pairs)[0])
     rate, gravity = recording.frame_rate, recording.gravity
     return track(pairs.reading(seen.not_read), frames, rig, recording.disc, rate, gravity=gravity, settings=settings)
 
@@ -251,34 +243,3 @@ def _together(stretches: list[Trajectory]) -> Trajectory:
     names = [name for name, value in vars(first).items() if isinstance(value, np.ndarray)]
     joined: dict[str, Any] = {name: np.concatenate([getattr(t, name) for t in stretches]) for name in names}
     return replace(first, **joined)
-
-
-def _sharpness(seen: Check, disc: Disc, tracking: Tracking) -> None:
-    """Blur of the dots' edges against the dots' width, where the disc is in the middle of a stretch."""
-    trajectory = tracking.trajectory
-    rows = np.flatnonzero(trajectory.measured)
-    row = rows[len(rows) // 2]
-    axis = rotation_from_quaternion(trajectory.quaternion[row])[:, 2]
-    for camera, (name, (R, t)) in enumerate(zip(CAMERAS, trajectory.rig.camera_poses(), strict=True)):
-        centre, blur = R @ trajectory.q[row, :3] + t, tracking.law.edges[camera].blur_px
-        width = trajectory.rig.cameras[camera].fx * disc.marker_diameter / float(centre[2])
-        across = width * abs(float(R @ axis @ centre)) / float(np.linalg.norm(centre))
-        text = f"{name}: dots {width:.0f} px wide, {across:.1f} px across, blur {blur:.2f} px (sigma)"
-        seen.seen.append(("sharpness", text))
-        if 6 * blur > across:  # three sigma on each side
-            advice = "larger dots, sharper focus, a shorter exposure, or cameras that look more steeply"
-            seen.warn(Kind.SHARPNESS, f"{text}: the blur of opposite edges overlaps", advice)
-
-
-def _accuracy(seen: Check, trajectory: Trajectory) -> None:
-    sigma = np.nanmedian(trajectory.coordinate_sigma[:, :3], axis=0)
-    shared = np.nanmedian(trajectory.calibration_sigma[:, :3], axis=0)
-    text = (
-        f"expected of a frame: {1e6 * sigma.max():.2g} um by noise, {1e6 * shared.max():.2g} um that all frames share "
-        "(sigma of the worst of x, y, z; the run's own calibration uses all views)"
-    )
-    seen.seen.append(("accuracy", text))
-    if sigma.max() > CLAIM:
-        seen.warn(Kind.ACCURACY, text, "more light, sharper or larger dots")
-    elif shared.max() > LAB_FRAME:
-        seen.warn(Kind.ACCURACY, text, "more views of the board, tilted and all over; a board that is known better")

@@ -9,7 +9,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from disctrack.files.json_text import plain
-from disctrack.findings import Finding, Kind, Severity
+from disctrack.findings import Finding, finding_from_json
 from disctrack.numbers import Measured
 
 if TYPE_CHECKING:
@@ -86,9 +86,9 @@ class Report:
     then: str = ""  # the next command
     data: Mapping[str, Any] = field(default_factory=dict)  # of the stage, for programs: a part of the JSON document
 
-    def graver_first(self) -> list[tuple[str, str]]:
-        """Severity and sentence of the findings as they are told; a cause stays before what it explains."""
-        return [(f.severity.name.lower(), f.sentence) for f in sorted(self.findings, key=lambda f: -f.severity)]
+    def graver_first(self) -> list[Finding]:
+        """The findings as they are told; a cause stays before what it explains."""
+        return sorted(self.findings, key=lambda f: -f.severity)
 
 
 def is_empty(block: Any) -> bool:
@@ -112,7 +112,7 @@ def document(report: Report) -> dict[str, Any]:
         "title": report.title,
         "verdict": report.verdict,
         "accuracy": report.accuracy,
-        "findings": [{"severity": grave, "sentence": said} for grave, said in report.graver_first()],
+        "findings": [finding.as_json() for finding in report.graver_first()],
         "facts": {name: _cell(value) for name, value in report.facts},
         "blocks": [shown for block in report.blocks if (shown := _block(block))],
         "files": [str(file) for file in report.files],
@@ -125,7 +125,7 @@ def document(report: Report) -> dict[str, Any]:
 
 def restored(kept: Mapping[str, Any], data: Mapping[str, Any]) -> Report:
     """A report from its document, made without the stage's own data, and these."""
-    findings = [Finding(Kind.OTHER, Severity[f["severity"].upper()], f["sentence"]) for f in kept["findings"]]
+    findings = [finding_from_json(finding) for finding in kept["findings"]]
     files = [Path(file) for file in kept["files"]]
     page = Path(kept["page"]) if kept["page"] else None
     head = kept["title"], kept["verdict"], kept["accuracy"]

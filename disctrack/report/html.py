@@ -46,7 +46,7 @@ def write_page(path: Path, report: Report, kinds: Sequence[str] = ()) -> list[Pa
 def page(report: Report, pictures: Mapping[str, str], head: str = "") -> str:
     """The whole page. pictures : a data URI per figure's name;  head : HTML for its head"""
     title = escape(report.title)
-    findings = "".join(f"<li class={grave}><b>{grave}</b>{_text(said)}</li>" for grave, said in report.graver_first())
+    findings = "".join(f"<li class={f.grave}><b>{f.grave}</b>{_text(f.sentence)}</li>" for f in report.graver_first())
     tiles = "".join(
         f"<div class=tile><b>{_text(value)}</b><span>{escape(name)}</span></div>" for name, value in report.facts
     )

@@ -22,7 +22,7 @@ def short(report: Report, width: int = WIDTH, *, colour: bool = False) -> list[s
     """What puts the result in doubt, verdict, accuracy, other findings, page and next, in at most MOST_LINES."""
     first = _cut(_entry("verdict", report.verdict, width)) + _cut(_entry("accuracy", report.accuracy, width), 2)
     last = _entry("page", "" if report.page is None else str(report.page), width) + _entry("next", report.then, width)
-    entries = [_cut(_entry(grave, said, width)) for grave, said in report.graver_first()]
+    entries = [_cut(_entry(finding.grave, finding.sentence, width)) for finding in report.graver_first()]
     room = MOST_LINES - len(first) - len(last)
     while sum(map(len, entries)) > room - (len(entries) < len(report.findings)) and len(entries) > 1:
         entries.pop()
@@ -36,7 +36,7 @@ def full(report: Report, width: int = WIDTH) -> list[str]:
     """All of it."""
     first = _entry("verdict", report.verdict, width) + _entry("accuracy", report.accuracy, width)
     lines = [report.title, ""] if report.title else []
-    lines += _around(first, [_entry(grave, said, width) for grave, said in report.graver_first()], report)
+    lines += _around(first, [_entry(f.grave, f.sentence, width) for f in report.graver_first()], report)
     lines += _facts(report.facts, width) + _blocks(report.blocks, width)
     lines += _entry("page", "" if report.page is None else str(report.page), width)
     for i, file in enumerate(report.files):

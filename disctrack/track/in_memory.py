@@ -84,7 +84,7 @@ def measure_pairs(
         progress=progress,
     )
     seconds = time.perf_counter() - began
-    found = (*contradictions(tracking.trajectory, disc), *tracking.findings)
+    found = contradictions(tracking.trajectory, disc, noticed=tracking.findings)
     warn_of_doubts(found)
     return Measurement(replace(tracking.trajectory, findings=found), (), details_of(tracking), seconds)
 

@@ -15,7 +15,7 @@ from calibration.kit.arguments import Threads, checked
 from calibration.kit.arrays import Array
 from calibration.kit.brief import Brief
 from calibration.kit.threads import one_blas_thread
-from disctrack.analyse.declaration import Boards, contradictions_of
+from disctrack.analyse.declaration import Boards, contradictions, with_square
 from disctrack.errors import RecordingError, TrackingError
 from disctrack.findings import Finding, Kind, Severity, of_kind, warn_of_doubts
 from disctrack.frames import CAMERAS
@@ -161,7 +161,7 @@ def measure(
     """Track the disc through the pairs; the trajectory has the length of the recording.
 
     Images that cannot be read are lost frames, named in the result. progress is called with the pairs done.
-    boards : of the calibration's views, so that a wrong table view is told with the right one
+    boards : of the calibration's views, with what was noticed in it
     Raises TrackingError if the disc is found in no frame.
 
         >>> measurement = measure("clip", "clip/results/rig.h5", open_pairs("clip"))
@@ -172,7 +172,7 @@ def measure(
     settings = settings or TrackingSettings()
     if recording.table is not None:
         settings = dataclasses.replace(settings, table=recording.table.source)
-    exposure, headers = _exposures(recording, pairs)
+    exposure, headers = exposures(recording, pairs)
     settings = dataclasses.replace(settings, exposure=exposure)
     stamps = usable_times(pairs.left, recording.frame_rate)
     with compiling("tracking", 20):  # not the camera's time: done once per installation
@@ -189,6 +189,7 @@ def measure(
         *of_kind(Kind.EXPOSURE, Severity.NOTE, headers),
         *images_lost(unreadable),
         *tracking.findings,
+        *(() if boards is None else boards.findings),
     )
     details = {
         **details_of(tracking),
@@ -200,8 +201,9 @@ def measure(
     for still in (slice(pairs.start, span.start), slice(span.stop, pairs.stop)):
         trajectory.frame_status[still] = FrameStatus.STILL
     trajectory = dataclasses.replace(trajectory, air_density=recording.air_density)
-    contradicted = contradictions_of(recording, trajectory, findings, boards)
-    trajectory = dataclasses.replace(trajectory, findings=(*contradicted, *findings))
+    blur_px = [edge.blur_px for edge in tracking.law.edges]
+    findings = contradictions(trajectory, recording.disc, recording, findings, boards, blur_px)
+    trajectory = dataclasses.replace(trajectory, findings=findings)
     warn_of_doubts(trajectory.findings)
     return Measurement(trajectory, unreadable, details, seconds)
 
@@ -238,6 +240,7 @@ def _tracked(
         )
     except TrackingError as error:
         refuse_unreadable(recording, list(not_read.values()), 2 * len(tracked), error)
+        error.findings = with_square(error.findings, recording)
         raise
     return tracking, tuple(not_read[place] for place in sorted(not_read))
 
@@ -247,8 +250,9 @@ def images_lost(unreadable: Iterable[Unreadable]) -> tuple[Finding, ...]:
     reasons = [image.reason for image in sorted(unreadable, key=lambda image: (image.frame, image.camera))]
     if not reasons:
         return ()
-    text = f"{len(reasons)} images could not be read; their frames rest on one camera or none. The first: {reasons[0]}"
-    return of_kind(Kind.UNREADABLE, Severity.WARNING, [text])
+    n, where = len(reasons), "their frames rest on one camera or none"
+    text = f"{n} image{'s' * (n > 1)} could not be read; {where}. The first: {reasons[0]}"
+    return (Finding(Kind.UNREADABLE, Severity.WARNING, text, explains=(Kind.FRAMES_LOST,)),)
 
 
 def refuse_unreadable(recording: Recording, lost: Sequence[Unreadable], n: int, error: TrackingError) -> None:
@@ -287,7 +291,7 @@ def details_of(tracking: Tracking) -> dict[str, Any]:
     return details
 
 
-def _exposures(recording: Recording, pairs: ImagePairs) -> tuple[tuple[float, float] | None, tuple[str, ...]]:
+def exposures(recording: Recording, pairs: ImagePairs) -> tuple[tuple[float, float] | None, tuple[str, ...]]:
     """Of both cameras [s], None where nobody tells it; and where it is from, to be told."""
     if recording.exposure is not None:
         return (recording.exposure, recording.exposure), ()

@@ -35,6 +35,7 @@ from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
 
 SCHEMA = "disctrack trajectory"
 SCHEMA_VERSION = 1
+Details = dict[str, Any]  # numbers of the run that made a trajectory, of JSON's types
 _DEPENDENCIES = ("numpy", "scipy", "opencv-contrib-python-headless", "h5py", "numba")
 _CONVENTIONS = {
     "frame_convention": "world: k up, table z = 0; origin and heading from the calibration's table view; "
@@ -74,7 +75,7 @@ def write_trajectory(
     trajectory: Trajectory,
     provenance: Provenance,
     overwrite: bool = False,
-    details: Mapping[str, Any] | None = None,
+    details: Details | None = None,
 ) -> None:
     """Write the whole file, or nothing. Raises OutputError if it exists and may not be overwritten, or cannot be.
 
@@ -100,7 +101,7 @@ def write_trajectory(
         file.attrs["findings"] = json_text([finding.as_json() for finding in trajectory.findings])
         file.attrs["details"] = json_text(dict(details or {}))
         made_from = {"inputs_sha256": provenance.inputs, "settings": provenance.settings, "dependencies": _versions()}
-        words = [f"{finding.severity.name.lower()}: {finding.sentence}" for finding in trajectory.findings]
+        words = [f"{finding.grave}: {finding.sentence}" for finding in trajectory.findings]
         write_attributes(file, {"findings": {"told": words, **(details or {})}, "made_from": made_from})
         file.attrs["complete"] = 1
     write_whole(path, buffer.getbuffer())
@@ -142,7 +143,7 @@ def read_provenance(path: Path) -> Provenance:
         )
 
 
-def read_details(path: Path) -> dict[str, Any]:
+def read_details(path: Path) -> Details:
     """Numbers of the run that wrote the file. Raises TrajectoryFileError."""
     with _reading(path) as file:
         return dict(json.loads(file.attrs["details"]))
@@ -156,14 +157,6 @@ def read_findings(path: Path) -> tuple[Finding, ...]:
 
 def _findings(file: h5py.File) -> tuple[Finding, ...]:
     return tuple(finding_from_json(document) for document in json.loads(file.attrs["findings"]))
-
-
-def is_result_of(path: Path, provenance: Provenance) -> bool:
-    """True if `path` is the complete result of the same inputs, settings and version, so that it can be reused."""
-    try:
-        return read_provenance(path).fingerprint == provenance.fingerprint
-    except TrajectoryFileError:
-        return False
 
 
 # What a stage adds to a trajectory file: variables, and attributes as of `write_attributes`

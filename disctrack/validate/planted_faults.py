@@ -30,7 +30,7 @@ from disctrack.faults.catalogue import HEIGHT, MOVED, TYPICAL_STEPS, Fault, faul
 from disctrack.faults.dots import cameras_with, centres_with, true_table
 from disctrack.faults.keys import Faults
 from disctrack.files.toml_tree import toml_value
-from disctrack.findings import DoubtWarning, Finding, Kind, Severity, leading
+from disctrack.findings import DoubtWarning, Finding, Kind, Severity, finding_from_json
 from disctrack.frames import CAMERAS
 from disctrack.recording.declaration import Recording, read_recording
 from disctrack.synthetic import write_recording
@@ -47,6 +47,8 @@ SIZES = (0.1, 1.0, 10.0)  # times what surprises nobody: just visible, ordinary,
 MOST_SIGMAS = 5.0  # of six components of a hundred poses chance alone reaches 4.1
 MOST_TIMES = 3.0  # an ordinary run
 Tree = dict[str, Any]  # of a recording.toml
+# Of a recording that may be spoilt, its declaration, which is written afterwards; and the size
+Change = Callable[[Path, Tree, float], None]
 
 
 @dataclass(frozen=True)
@@ -121,7 +123,7 @@ def untouched(folder: Path, recordings: Sequence[Path], seed: int = 29) -> Itera
         filmed = read_recording(path)
         copy = folder / filmed.name
         tree = _with_views(filmed, copy, _copied(filmed, copy))
-        _declare(copy, tree)
+        declare(copy, tree)
         yield _ground(copy, None, None)
 
 
@@ -131,7 +133,7 @@ def _ground(folder: Path, scene: Scene | None, q: Array | None) -> Ground:
         raise DiscTrackError(f"{folder.name}: something is wrong before anything is planted: {_said(findings)}")
     ground = Ground(folder, folder / "results" / "rig.h5", scene, trajectory.q if q is None else q, (1.0, 1.0))
     again = folder.with_name(f"{folder.name} again")
-    _declare(again, _shared(ground, again))
+    declare(again, _shared(ground, again))
     return replace(ground, seconds=(_run(again)[-1], _run(folder)[-1]))
 
 
@@ -171,17 +173,13 @@ def _run(folder: Path) -> tuple[int, list[Finding], Trajectory | None, float]:
     after = os.times()
     seconds = sum(after[2:4]) - sum(before[2:4])
     try:
-        told = loads(ended.stdout)["findings"]
+        found = [finding_from_json(finding) for finding in loads(ended.stdout)["findings"]]
     except JSONDecodeError:
         why = ended.stderr.strip()[-300:].replace(f"{folder.parent}{os.sep}", "")
         return ended.returncode, [Finding(Kind.OTHER, Severity.REFUSAL, why)], None, seconds
     with catch_warnings(action="ignore", category=DoubtWarning):
         trajectory = read_trajectory(folder / "results" / "trajectory.h5")
-    found = list(leading(trajectory.findings))
-    known = {finding.sentence for finding in found}
-    of_views = [one for one in told if one["sentence"] not in known]
-    found += [Finding(Kind.CALIBRATION, Severity[one["severity"].upper()], one["sentence"]) for one in of_views]
-    return ended.returncode, sorted(found, key=lambda finding: -finding.severity), trajectory, seconds
+    return ended.returncode, found, trajectory, seconds
 
 
 def _said(findings: Sequence[Finding]) -> str:
@@ -195,7 +193,7 @@ def _said(findings: Sequence[Finding]) -> str:
     values += [
         f"{remedy.key} {remedy.fits}" for remedy in finding.remedies if remedy.fits and "centres" not in remedy.key
     ]
-    return f"{finding.kind.value}{f': {values[0]}' if values else ''}, {finding.severity.name.lower()}"
+    return f"{finding.kind.value}{f': {values[0]}' if values else ''}, {finding.grave}"
 
 
 def _in_sigmas(trajectory: Trajectory | None, q: Array) -> tuple[float, float]:
@@ -210,7 +208,11 @@ def _in_sigmas(trajectory: Trajectory | None, q: Array) -> tuple[float, float]:
 
 def plantings(ground: Ground) -> dict[str, Planting]:
     """All faults that can be planted into such a recording, by name."""
-    return {fault.name: planting for fault, planting in _of_catalogue(ground)} | OF_FILES | OF_NUMBERS | OF_VIEWS
+    found = {fault.name: planting for fault, planting in _of_catalogue(ground)}
+    for views, table in ((False, CHANGES), (True, OF_VIEWS)):
+        for name, (sizes, unit, kinds, change) in table.items():
+            found[name] = Planting(sizes, unit, kinds, partial(_changed, change, views))
+    return found
 
 
 def _of_catalogue(ground: Ground) -> Iterator[tuple[Fault, Planting]]:
@@ -243,7 +245,7 @@ def _rendered(fault: Fault, ground: Ground, folder: Path, size: float) -> Array:
     images = folder.with_name(f"{folder.name} images")
     try:
         truth = write_recording(images, replace(scene, faults=wrong, board=replace(scene.board, n_views=1)))
-        _declare(folder, _with_rig(_copied(read_recording(images), folder), ground.rig))
+        declare(folder, _with_rig(_copied(read_recording(images), folder), ground.rig))
     finally:
         shutil.rmtree(images, ignore_errors=True)
     return truth.q
@@ -259,7 +261,7 @@ def _declared_wrong(fault: Fault, ground: Ground, folder: Path, size: float) -> 
     tree["disc"]["thickness_mm"] = 2e3 * float(disc.half_thickness + 1e-3 * wrong.pattern_height_mm)
     tree["cameras"]["frame_rate_hz"] *= wrong.frame_rate_hz or 1.0
     write_rig(folder / "rig.h5", _believed(read_rig(ground.rig), wrong))
-    _declare(folder, _with_rig(tree, folder / "rig.h5"))
+    declare(folder, _with_rig(tree, folder / "rig.h5"))
 
 
 def _believed(rig: StereoRig, faults: Faults) -> StereoRig:
@@ -302,53 +304,54 @@ def _with_views(recording: Recording, folder: Path, tree: Tree) -> Tree:
     return tree
 
 
-def _declare(folder: Path, tree: Tree) -> None:
+def declare(folder: Path, tree: Tree) -> None:
+    """Write the recording.toml of a folder."""
     lines = [f"{name} = {toml_value(value)}\n" for name, value in tree.items()]
     (folder / "recording.toml").write_text("".join(lines), encoding="utf-8")
 
 
-def _pairs_lost(ground: Ground, folder: Path, size: float, cameras: Sequence[str] = CAMERAS) -> None:
-    """In the middle, and the files numbered on; both cameras end together."""
-    tree = _shared(ground, folder)
-    for camera in CAMERAS:
-        files = sorted((folder / camera).iterdir())
-        first = len(files) // 2 if camera in cameras else len(files) - int(size)
-        lost, kept = files[first : first + int(size)], files[first + int(size) :]
-        for file in lost:
-            file.unlink()
-        for old, new in zip(kept, files[first:], strict=False):
-            old.rename(new)
-    _declare(folder, tree)
+def reordered(folder: Path, order: Callable[[list[Path]], list[Path]]) -> None:
+    """Files of a folder that change places, or fall out: what is left is numbered as before, without gaps."""
+    files = sorted(folder.iterdir())
+    kept = [file.rename(file.with_name(f"old {file.name}")) for file in order(files)]
+    for file in sorted(set(files) & set(folder.iterdir())):
+        file.unlink()
+    for old, new in zip(kept, files, strict=False):
+        old.rename(new)
 
 
-def _reversed(ground: Ground, folder: Path, size: float) -> None:
-    tree = _shared(ground, folder)
-    for camera in CAMERAS:
-        files = sorted((folder / camera).iterdir())
-        for file in files:
-            file.rename(file.with_name(f"old {file.name}"))
-        for file, new in zip(files, files[::-1], strict=True):
-            file.with_name(f"old {file.name}").rename(new)
-    _declare(folder, tree)
-
-
-def _exchanged(ground: Ground, folder: Path, size: float) -> None:
-    tree = _shared(ground, folder)
-    cameras = tree["cameras"]
-    cameras["left"], cameras["right"] = cameras["right"], cameras["left"]
-    _declare(folder, tree)
-
-
-def _redrawn(folder: Path, change: Callable[[NDArray, float], NDArray]) -> None:
+def redrawn(folder: Path, change: Callable[[NDArray, float], NDArray]) -> None:
     """Change images; the number is the share of the recording before each."""
     files = sorted(folder.iterdir())
     for number, file in enumerate(files):
         image = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
         assert image is not None
+        file.unlink()  # it may be a link to another's
         cv2.imwrite(str(file), change(image, number / len(files)))
 
 
-def _image_moved(ground: Ground, folder: Path, size: float, course: Callable[[float], float]) -> None:
+def _pairs_lost(folder: Path, tree: Tree, size: float, cameras: Sequence[str] = CAMERAS) -> None:
+    """In the middle, and the files numbered on; both cameras end together."""
+    for camera in CAMERAS:
+
+        def without(files: list[Path], camera: str = camera) -> list[Path]:
+            first = len(files) // 2 if camera in cameras else len(files) - int(size)
+            return files[:first] + files[first + int(size) :]
+
+        reordered(folder / camera, without)
+
+
+def _reversed(folder: Path, tree: Tree, size: float) -> None:
+    for camera in CAMERAS:
+        reordered(folder / camera, lambda files: files[::-1])
+
+
+def _exchanged(folder: Path, tree: Tree, size: float) -> None:
+    cameras = tree["cameras"]
+    cameras["left"], cameras["right"] = cameras["right"], cameras["left"]
+
+
+def _image_moved(folder: Path, tree: Tree, size: float, course: Callable[[float], float]) -> None:
     """The right camera's images, in either direction by size times the course of time [px]."""
 
     def moved(image: NDArray, share: float) -> NDArray:
@@ -359,38 +362,24 @@ def _image_moved(ground: Ground, folder: Path, size: float, course: Callable[[fl
         )
         return turned if by else image
 
-    tree = _shared(ground, folder)
-    _redrawn(folder / "right", moved)
-    _declare(folder, tree)
+    redrawn(folder / "right", moved)
 
 
-def _mirrored(ground: Ground, folder: Path, size: float) -> None:
-    tree = _shared(ground, folder)
-    _redrawn(folder / "right", lambda image, _: np.ascontiguousarray(image[:, ::-1]))
-    _declare(folder, tree)
+def _mirrored(folder: Path, tree: Tree, size: float) -> None:
+    redrawn(folder / "right", lambda image, _: np.ascontiguousarray(image[:, ::-1]))
 
 
-def _number(section: str, key: str, ground: Ground, folder: Path, size: float) -> None:
+def wrong_number(section: str, key: str, folder: Path, tree: Tree, size: float) -> None:
     """A declared number is wrong by a share of itself; tolerances are the usual ones."""
-    tree = _shared(ground, folder)
-    for part in (tree["disc"], tree["table"]):
+    for part in (tree["disc"], tree.get("table", {}), tree["calibration"]):
         for tolerance in [name for name in part if "_tolerance_" in name]:
             del part[tolerance]
     tree[section][key] *= 1 + size
-    _declare(folder, tree)
-
-
-def _views(change: Callable[[Path, Tree, float], None], ground: Ground, folder: Path, size: float) -> None:
-    """Something is wrong with the views of the board, from which the rig is then made."""
-    recording = read_recording(ground.recording)
-    tree = _with_views(recording, folder, _copied(recording, folder))
-    change(folder, tree, size)
-    _declare(folder, tree)
 
 
 def _negative(folder: Path, tree: Tree, size: float) -> None:
     for camera in CAMERAS:
-        _redrawn(folder / f"board_{camera}", lambda image, _: np.asarray(np.iinfo(image.dtype).max - image))
+        redrawn(folder / f"board_{camera}", lambda image, _: np.asarray(np.iinfo(image.dtype).max - image))
 
 
 def _repeated(folder: Path, tree: Tree, size: float) -> None:
@@ -402,41 +391,41 @@ def _repeated(folder: Path, tree: Tree, size: float) -> None:
 
 def _late(folder: Path, tree: Tree, size: float) -> None:
     """The right camera lost its first views, and both end together."""
-    left, files = (sorted((folder / f"board_{camera}").iterdir()) for camera in CAMERAS)
-    for file in (*files[: int(size)], *left[-int(size) :]):
-        file.unlink()
-    for old, new in zip(files[int(size) :], files, strict=False):
-        old.rename(new)
-
-
-def _larger_square(folder: Path, tree: Tree, size: float) -> None:
-    tree["calibration"].pop("square_tolerance_mm", None)
-    tree["calibration"]["square_mm"] *= 1 + size
+    reordered(folder / "board_left", lambda files: files[: -int(size)])
+    reordered(folder / "board_right", lambda files: files[int(size) :])
 
 
 _FEW, _ONCE, _SHARES = (1, 3, 10), (1,), (3e-3, 3e-2, 3e-1)
-OF_FILES = {
-    "pairs lost by both": Planting(_FEW, "pairs", (Kind.CLOCK_JUMP,), _pairs_lost),
-    "images lost by one": Planting(_FEW, "images", (Kind.DROPPED_FRAMES, Kind.DELAY),
-                                   partial(_pairs_lost, cameras=("right",))),
-    "camera knocked": Planting((0.02, 0.2, 2.0), "px", MOVED, partial(_image_moved, course=lambda x: float(x > 0.5))),
-    "camera drifts": Planting((0.03, 0.3, 3.0), "px", MOVED, partial(_image_moved, course=lambda x: x)),
-    "reversed": Planting(_ONCE, "", (Kind.REVERSED,), _reversed),
-    "exchanged": Planting(_ONCE, "", (Kind.EXCHANGED,), _exchanged),
-    "mirrored": Planting(_ONCE, "", (Kind.MIRRORED,), _mirrored),
+CHANGES: dict[str, tuple[Sequence[float], str, tuple[Kind, ...], Change]] = {
+    "pairs lost by both": (_FEW, "pairs", (Kind.CLOCK_JUMP,), _pairs_lost),
+    "images lost by one": (
+        _FEW, "images", (Kind.DROPPED_FRAMES, Kind.DELAY), partial(_pairs_lost, cameras=("right",))
+    ),
+    "camera knocked": ((0.02, 0.2, 2.0), "px", MOVED, partial(_image_moved, course=lambda x: float(x > 0.5))),
+    "camera drifts": ((0.03, 0.3, 3.0), "px", MOVED, partial(_image_moved, course=lambda x: x)),
+    "reversed": (_ONCE, "", (Kind.REVERSED,), _reversed),
+    "exchanged": (_ONCE, "", (Kind.EXCHANGED,), _exchanged),
+    "mirrored": (_ONCE, "", (Kind.MIRRORED,), _mirrored),
+    "radius": (_SHARES, "1", (Kind.RADIUS, *HEIGHT), partial(wrong_number, "disc", "radius_mm")),
+    "thickness": (_SHARES, "1", HEIGHT, partial(wrong_number, "disc", "thickness_mm")),
+    "dot diameter": (_SHARES, "1", (Kind.DIAMETER,), partial(wrong_number, "markers", "diameter_mm")),
+    "gravity": (_SHARES, "1", (Kind.GRAVITY_OR_RATE,), partial(wrong_number, "gravity", "g_m_s2")),
 }  # fmt: skip
-OF_NUMBERS = {
-    "radius": Planting(_SHARES, "1", (Kind.RADIUS, *HEIGHT), partial(_number, "disc", "radius_mm")),
-    "thickness": Planting(_SHARES, "1", HEIGHT, partial(_number, "disc", "thickness_mm")),
-    "dot diameter": Planting(_SHARES, "1", (Kind.DIAMETER,), partial(_number, "markers", "diameter_mm")),
-    "gravity": Planting(_SHARES, "1", (Kind.GRAVITY_OR_RATE,), partial(_number, "gravity", "g_m_s2")),
+OF_VIEWS: dict[str, tuple[Sequence[float], str, tuple[Kind, ...], Change]] = {
+    "square": ((1e-3, 1e-2, 1e-1), "1", (Kind.SQUARE,), partial(wrong_number, "calibration", "square_mm")),
+    "negative views": (_ONCE, "", (Kind.CALIBRATION,), _negative),
+    "repeated views": ((2, 3, 6), "times", (Kind.CALIBRATION,), _repeated),
+    "views late in one": ((1, 2, 4), "views", (Kind.CALIBRATION,), _late),
 }
-OF_VIEWS = {
-    "square": Planting((1e-3, 1e-2, 1e-1), "1", (Kind.SQUARE, Kind.LENGTHS), partial(_views, _larger_square)),
-    "negative views": Planting(_ONCE, "", (Kind.CALIBRATION,), partial(_views, _negative)),
-    "repeated views": Planting((2, 3, 6), "times", (Kind.CALIBRATION,), partial(_views, _repeated)),
-    "views late in one": Planting((1, 2, 4), "views", (Kind.CALIBRATION,), partial(_views, _late)),
-}
+
+
+def _changed(change: Change, views: bool, ground: Ground, folder: Path, size: float) -> None:
+    """A copy of the recording with something changed, with its own views or the rig of the untouched one."""
+    recording = read_recording(ground.recording)
+    tree = _copied(recording, folder)
+    tree = _with_views(recording, folder, tree) if views else _with_rig(tree, ground.rig)
+    change(folder, tree, size)
+    declare(folder, tree)
 
 
 def faults_validation(outcomes: Sequence[FaultOutcome]) -> Validation:

@@ -1,11 +1,9 @@
 """Before the first run: a declaration is written, faults are named, printed sheets are true to scale."""
 
-import json
 import os
 import re
 import shutil
 import tomllib
-from pathlib import Path
 
 import cv2
 import h5py
@@ -17,8 +15,6 @@ from calibration.board.chessboard import BoardNotFound, find_corners
 from disctrack.cli import main
 from disctrack.commands.options import PAPERS
 from disctrack.disc import MA_2014
-from disctrack.findings import Kind, Severity, in_doubt, leading
-from disctrack.first_look.check import run_check
 from disctrack.first_look.sequences import find_sequences, pair_cameras
 from disctrack.first_look.targets import PAPERS_MM, board_figure, dots_figure
 from tests.pipeline.conftest import linked
@@ -179,114 +175,6 @@ def test_check_finds_nothing_to_put_right_in_the_sample(sample_clip, tmp_path, c
     for what in ("declaration", "frames", "chessboard", "light", "dots", "sharpness", "accuracy"):
         assert f"\n{what} " in told
     assert cv2.imread(str(tmp_path / "check.png")) is not None
-
-
-def declare(folder: Path, old: str, new: str) -> None:
-    file = folder / "recording.toml"
-    text = file.read_text()
-    assert old in text
-    file.write_text(text.replace(old, new))
-
-
-def renumber_right(folder: Path, by: int = 1) -> None:
-    """The right camera late by some frames: its frame i shows what the left one's shows in i - by."""
-    files = sorted((folder / "right").glob("*.png"))
-    targets = [file.resolve() for file in files]
-    for file in files:
-        file.unlink()
-    for i, file in enumerate(files):
-        os.symlink(targets[max(i - by, 0)], file)
-
-
-def darkened(folder: Path, camera: str, change) -> None:
-    """Images of a camera with other grey values."""
-    for file in sorted((folder / camera).iterdir()):
-        image = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
-        file.unlink()
-        cv2.imwrite(str(file), change(image))
-
-
-def exchange(folder: Path) -> None:
-    declare(folder, 'left = "left/', 'left = "_')
-    declare(folder, 'right = "right/', 'right = "left/')
-    declare(folder, 'left = "_', 'left = "right/')
-
-
-FAULTS = {  # what is wrong; the kind that check names first, words of it, and whether a run would be in doubt
-    "a key is missing": (lambda f: declare(f, "mass_g = 209.69", ""), Kind.DECLARATION, "mass_g is missing", True),
-    "frames are missing": (lambda f: (f / "left/000017.png").unlink(), Kind.UNREADABLE, "missing", False),
-    "other corners": (lambda f: declare(f, "[9, 6]", "[8, 5]"), Kind.CALIBRATION, "inner_corners = [9, 6]", True),
-    "no dot there": (lambda f: declare(f, "[6.5000, -11.2583]", "[0.5, 0.5]"), Kind.DOT_UNSEEN, "dot 5", True),
-    "twice the rate": (lambda f: declare(f, "frame_rate_hz = 1000.0", "frame_rate_hz = 2000.0"), Kind.GRAVITY_OR_RATE,
-                       "1000 would fit (declared 2000)", True),
-    "gravity in cm": (lambda f: declare(f, "g_m_s2 = 9.81", "g_m_s2 = 981.0"), Kind.GRAVITY_OR_RATE, "g_m_s2: 9.8",
-                      True),
-    "foam": (lambda f: declare(f, "mass_g = 209.69", "mass_g = 0.9"), Kind.DENSITY, "mass_g", False),
-    "wrong square": (lambda f: declare(f, "square_mm = 6.0", "square_mm = 6.1"), Kind.SQUARE,
-                     "6.00 would fit (declared 6.1)", True),
-    "squares in cm": (lambda f: declare(f, "square_mm = 6.0", "square_mm = 0.6"), Kind.LENGTHS, "times 10", True),
-    "small dots": (lambda f: declare(f, "diameter_mm = 7.0", "diameter_mm = 3.0"), Kind.DIAMETER, "diameter_mm", True),
-    "short side first": (lambda f: declare(f, "[9, 6]", "[6, 9]"), Kind.CORNERS, "[9, 6] would fit", True),
-    "wrong view": (lambda f: declare(f, "view = 0 ", "view = 3 "), Kind.TABLE_VIEW, "0 would fit (declared 3)", True),
-    "board of no thickness": (lambda f: declare(f, "board_thickness_mm = 3.0", "board_thickness_mm = 0.0"),
-                              Kind.BOARD_THICKNESS, "board_thickness_mm: 3.00 would fit", True),
-    "wrong thickness": (lambda f: declare(f, "\nthickness_mm = 6.0", "\nthickness_mm = 6.5"), Kind.THICKNESS,
-                        "_mm: 6.00 would fit", True),
-    "cameras exchanged": (exchange, Kind.EXCHANGED, "the left and right images are exchanged", True),
-    "one camera mirrored": (lambda f: darkened(f, "right", lambda image: image[:, ::-1]), Kind.MIRRORED, "right", True),
-    "one frame late": (renumber_right, Kind.DELAY, "Number its images higher by 1", True),
-    "three frames late": (lambda f: renumber_right(f, 3), Kind.DELAY, "Number its images higher by 3", True),
-    "lens cap": (lambda f: darkened(f, "left", np.zeros_like), Kind.LIGHT, "of one grey", True),
-    "too bright": (lambda f: darkened(f, "left", lambda image: cv2.add(image, 90)), Kind.LIGHT, "clipped", False),
-    "an image is cut short": (lambda f: cut_short(f / "left/000150.png"), Kind.UNREADABLE, "left/000150.png", False),
-    "one moment twice": (lambda f: repeat_left(f), Kind.REPEATED_IMAGES, "copies of earlier ones", True),
-}  # fmt: skip
-
-
-def cut_short(file: Path) -> None:
-    """As a copy that was interrupted leaves it."""
-    content = file.read_bytes()
-    file.unlink()
-    file.write_bytes(content[: len(content) // 2])
-
-
-def repeat_left(folder: Path) -> None:
-    """The left camera gives an image once more."""
-    (folder / "left/000150.png").unlink()
-    os.symlink((folder / "left/000149.png").resolve(), folder / "left/000150.png")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("fault", FAULTS)
-def test_check_names_the_fault_first(fault, sample_clip, tmp_path):
-    folder = linked(sample_clip, tmp_path / "clip", os.symlink)
-    plant, kind, words, doubtful = FAULTS[fault]
-    plant(folder)
-    problems = leading(run_check(folder).findings)
-    told = "\n".join(f"{finding.kind}: {finding.sentence}" for finding in problems)
-    assert problems[0].kind == kind, told
-    assert words in problems[0].sentence, told
-    assert in_doubt(problems) == doubtful, told
-    if "late" in fault:  # and it is told once, not by every place looked at and by all that follows from it
-        assert len([finding for finding in problems if finding.severity >= Severity.WARNING]) == 1, told
-
-
-@pytest.mark.statistical
-@pytest.mark.parametrize("fault", ["wrong square", "wrong view", "board of no thickness", "cameras exchanged"])
-def test_every_stage_names_the_same_cause_first(fault, sample_clip, tmp_path, capsys):
-    folder = linked(sample_clip, tmp_path / "clip", os.symlink)
-    for camera in ("left", "right"):
-        for file in sorted((folder / camera).iterdir())[120:]:
-            file.unlink()
-    plant, _, words, _ = FAULTS[fault]
-    plant(folder)
-    for command in (["run", "--no-figures", "--no-video"], ["analyse"], ["diagnose"]):
-        assert main([command[0], str(folder), *command[1:]]) == 3
-        told = re.sub(r"\s+", " ", capsys.readouterr().out)
-        assert re.match(r"doubt (.*?) verdict", told + " verdict")[1].count(words) == 1, told
-    assert main(["batch", str(tmp_path), "-j", "1", "--no-report"]) == 3
-    (row,) = json.loads((tmp_path / "batch_results" / "summary.json").read_text())["recordings"]
-    assert words in row["reason"].partition("; not ")[0]
 
 
 def test_init_says_that_the_cameras_differ_in_number_and_that_views_are_missing(sample_clip, tmp_path, capsys):

@@ -16,7 +16,7 @@ from disctrack.files.whole import write_whole
 from disctrack.report.blocks import Report
 from disctrack.report.html import write_page
 from disctrack.trajectory.file import read_provenance
-from disctrack.trajectory.reuse import hash_of, refuse_other, remember, reusable
+from disctrack.trajectory.reuse import content_of, hash_of, refuse_other, remember, reusable
 
 FOLDER = "together_diagnosis"
 
@@ -50,13 +50,12 @@ def run_together(
     common = Path(os.path.commonpath([p.parent for p in whole]))  # the deepest folder that holds all files
     folder = Path(output) if output is not None else common / FOLDER
     report, html = folder / "diagnosis.json", folder / "diagnosis.html"
-    known = Path(model).read_text(encoding="utf-8") if Path(model).is_file() else model
     progress("reading")
     read, unread = _read(paths)
     if not read:
         raise AnalysisError("; ".join(f"{path}: {reason}" for path, reason in unread.items()))
     made_from = {
-        "model": known,
+        "model": content_of(model),
         "plan": settle,
         "files": [read_provenance(p).fingerprint for p in read],
         "unread": unread,

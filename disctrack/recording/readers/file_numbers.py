@@ -48,8 +48,8 @@ def number_files(
     notes, doubts = [], []
     if missing := _missing(column, step):
         notes.append(
-            f"{len(missing)} file(s) missing in the sequence, the first is number {missing[0]}; this camera says "
-            "nothing of these frames"
+            f"{len(missing)} file{'s' * (len(missing) > 1)} missing in the sequence, the first is number "
+            f"{missing[0]}; this camera says nothing of these frames"
         )
     if step > 1:
         doubts.append(

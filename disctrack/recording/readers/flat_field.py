@@ -156,11 +156,11 @@ def _flat_field(flat_images: str | None, dark_images: str | None, folder: Path, 
         gain, dead = _gain(flat, offset, dark)
         if flat.n < ENOUGH:
             notes.append(
-                f"[cameras] {camera}_flat is the mean of {flat.n} image(s): its own noise becomes a pattern of the "
-                f"sensor. Average {ENOUGH} or more"
+                f"[cameras] {camera}_flat is the mean of {flat.n} image{'s' * (flat.n > 1)}: its own noise "
+                f"becomes a pattern of the sensor. Average {ENOUGH} or more"
             )
-    if dead.any():
-        notes.append(f"{camera} camera: {dead.sum()} dead pixel(s) by its flat image, replaced by their neighbours")
+    if n := int(dead.sum()):
+        notes.append(f"{camera} camera: {n} dead pixel{'s' * (n > 1)} by its flat image, replaced by their neighbours")
     digest = " ".join(m.sha256 if m else "-" for m in (flat, dark))
     return FlatField(offset, gain, dead if dead.any() else None, one.bit_depth, digest, tuple(notes))
 

@@ -75,7 +75,7 @@ def _lost_frames(camera: str, times: Array, frame_rate: float) -> list[str]:
     if not len(gaps):
         return []
     lost = int(np.rint(steps[gaps] - 1).sum())
-    return [f"{camera} camera: by its time stamps {lost} frame(s) are missing, after frame {ranges(gaps)}"]
+    return [f"{camera} camera: by its time stamps {lost} frame{'s' * (lost > 1)} missing, after frame {ranges(gaps)}"]
 
 
 def _slips(left: Array, right: Array, period: float) -> list[str]:

@@ -253,9 +253,8 @@ def _gap_doubts(times: NDArray[np.int64]) -> list[str]:
     gaps = np.flatnonzero(steps > 1.5 * typical + 1)
     if not len(gaps) or len(gaps) > 0.1 * len(steps):
         return []
-    lost = int(np.rint(steps[gaps] / typical - 1).sum())
-    where = ranges(gaps)
-    return [f"the video's clock skips after frame {where}: {lost} frame(s) seem to be lost, and time shifts there"]
+    where, n = ranges(gaps), int(np.rint(steps[gaps] / typical - 1).sum())
+    return [f"the video's clock skips after frame {where}: {n} frame{'s' * (n > 1)} lost, and time shifts there"]
 
 
 def _depth(frame: av.VideoFrame) -> int:

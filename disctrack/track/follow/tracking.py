@@ -45,7 +45,7 @@ MOSTLY = 0.5  # of the frames: that many are not refused for glare and hands
 # [m] off its declared place from which on a dot is looked for again, where it is. With wrong places the attitude is
 # wrong that templates are made for: places 0.1 mm off, rms, shift centres by 0.3e-3 to 2e-3 px, in all frames alike.
 LOOK_AGAIN = 60e-6
-DECLARED = (Kind.DOTS_MISPLACED, Kind.OFF_THE_TABLE, Kind.TABLE_DISAGREES)  # of numbers, not of images
+DECLARED = (Kind.DOTS_MISPLACED, Kind.TABLE_DISAGREES)  # of numbers, not of images
 PAIRS_TRIED = 12  # for pixels that do not see, and for what is wrong where no disc is found
 MAX_EDGE_TURN = np.radians(25.0)  # by which the poses on both sides of an edge may miss each other's prediction
 
@@ -140,9 +140,8 @@ def _not_found(followers: list[Follower], pairs: range, why: tuple[Finding, ...]
     """The disc was seen in no pair."""
     reason = next((f.first_reason for f in followers if f.first_reason), "")
     told = f"First search: {reason.rstrip('.')}{'' if reason.endswith('?') else '.'} {MOVED}"
-    told = f"Most likely {why[0].sentence}" if why else told if reason else "No image could be read"
-    text = f"the disc was found in none of the pairs {pairs.start}-{pairs.stop - 1}. {told}"
-    return TrackingError(text, findings=why)
+    told = told if reason else "No image could be read"
+    return TrackingError(f"the disc was found in none of the pairs {pairs.start}-{pairs.stop - 1}", told, why)
 
 
 def _followed(

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from calibration.cameras.camera import N_RIG, PAIR_SHIFT, PAIR_TURN, StereoRig, triangulate
 from calibration.kit.arrays import Array, Mask
+from disctrack.analyse.declaration import other_scale
 from disctrack.disc import Disc, has_mirror_axis
 from disctrack.findings import NONSENSE, Finding, Kind, Remedy, Severity, Subject
 from disctrack.frames import CAMERAS, vector_from_rotation
@@ -50,7 +51,6 @@ TURN, SHIFT = np.radians(1.0), 2e-3  # [rad], [m] what cameras suffer without an
 MOST_SIGMAS = 4.0  # beyond, it is something else
 BETTER = 3.0  # times, than with the camera where it was
 DOT_DIAMETERS_PX = (6.0, 18.0, 54.0, 162.0)  # the search for blobs takes those of a seventh to twice the diameter
-UNITS = {1e3: "mm and m", 1e2: "m and cm", 10.0: "cm and mm", 25.4: "inches and mm", 2.0: "radius and diameter"}
 SIZE_TOLERANCE = 0.15  # blur and threshold make a blob larger or smaller than its dot
 MISPLACED = 0.2  # of the distance between two dots: places measured with a ruler, not dots numbered wrongly
 MEETING_PX = 1.0  # beyond, cameras or clocks do not fit together, and places seen by both are none
@@ -144,6 +144,7 @@ class SeenDots:
     points: Array  # (k, 3) [m] in the rig's world and unit
     areas: Array  # (2, k) [px^2] of their blobs
     scale: float  # their distances over those declared
+    scale_sigma: float
     misfit_px: float  # largest, of the blobs against one point in space
 
 
@@ -157,7 +158,7 @@ def unlike_declared(pair: NDArray, rig: StereoRig, disc: Disc) -> tuple[Finding,
         return ()
     seen = max(several, key=lambda found: found.which.sum())
     if abs(np.log(seen.scale)) > SIDE_TOLERANCE:
-        return (_on_another_scale(seen.scale),)
+        return (other_scale(Measured(seen.scale, seen.scale_sigma), explains=NONSENSE),)
     (R,), (t,) = rigid_motions(disc.marker_centres_body[None, seen.which], seen.points[None])
     # by the middle one of the searches: one for blobs far smaller than the dots finds what is darkest in them
     J = marker_pixels(R[None], t[None], rig, disc.marker_centres_body)[1]
@@ -188,18 +189,5 @@ def _seen_dots(pair: NDArray, rig: StereoRig, disc: Disc) -> Iterator[SeenDots]:
         scale = float(np.median(ratios))
         misfit = float(np.abs(rig.project(points) - pixels).max())
         if misfit < EPIPOLAR_PX and scale > 0 and np.abs(ratios / scale - 1).max() < MISPLACED:
-            yield SeenDots(which, points, blobs[:, which, 2], scale, misfit)
-
-
-def _on_another_scale(scale: float) -> Finding:
-    mixed = ""
-    for unit, words in UNITS.items():
-        if abs(abs(np.log(scale)) / np.log(unit) - 1) < 0.02:
-            scale, mixed = unit ** np.sign(np.log(scale)), f": are {words} mixed up?"
-            break
-    disc, board = (f"times {float(f'{factor:.3g}'):g}" for factor in (scale, 1 / scale))
-    keys = "[calibration] square_mm", "every length of [disc] and [markers]"
-    remedies = Remedy(keys[0], action=board), Remedy(keys[1], action=disc)
-    text = f"the dots are {scale:.3g} times as far apart as declared{mixed}"
-    found = {"scale": Measured(scale)}
-    return Finding(Kind.LENGTHS, Severity.DOUBT, text, numbers=found, remedies=remedies, explains=NONSENSE)
+            sigma = float(ratios.std()) / np.sqrt(which.sum())
+            yield SeenDots(which, points, blobs[:, which, 2], scale, sigma, misfit)

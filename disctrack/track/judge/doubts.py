@@ -37,8 +37,8 @@ def repeated_images(repeated: Mask, pairs: range) -> Iterator[Finding]:
         if len(rows):
             shown = ", ".join(str(pairs[row]) for row in rows[:5]) + (", ..." if len(rows) > 5 else "")
             text = (
-                f"{camera} camera: {len(rows)} image(s) are copies of earlier ones (frame {shown}): the camera or its "
-                "recorder lost these; the frames are measured without them"
+                f"{camera} camera: {len(rows)} repeat{'s' * (len(rows) > 1)} of earlier images (frame {shown}): the "
+                "camera or its recorder lost these; the frames are measured without them"
             )
             where = Subject("track", camera, tuple((pairs[row], pairs[row]) for row in rows))
             yield Finding(Kind.REPEATED_IMAGES, Severity.DOUBT, text, where)
@@ -67,11 +67,10 @@ def off_the_table(trajectory: Trajectory, severity: Severity = Severity.WARNING)
         return ()
     seen = Measured(1e6 * float(np.median(gap)), 1e6 * float(gap.std()), "um")
     text = (
-        f"the disc's lowest point lies {seen.value:+.0f} um from the table (scatter {seen.sigma:.0f} um): thickness of "
-        "the board or of the disc, radius, or the table view do not fit this recording, a camera or both moved since "
-        "it, or the disc is in the air"
+        f"the disc's lowest point lies {seen} from the table: thickness of the board or of the disc, radius, or the "
+        "table view do not fit this recording, a camera or both moved since it, or the disc is in the air"
     )
-    return (Finding(Kind.OFF_THE_TABLE, severity, text, numbers={"height": seen}),)
+    return (Finding(Kind.TABLE_DISAGREES, severity, text, numbers={"height": seen}),)
 
 
 def misplaced_dots(declared: Disc, found: Array) -> tuple[Finding, ...]:
@@ -81,7 +80,7 @@ def misplaced_dots(declared: Disc, found: Array) -> tuple[Finding, ...]:
     if not len(far):
         return ()
     named = ", ".join(f"dot {dot} by {away[dot]:.2f} mm" for dot in far)
-    centres = ", ".join(f"[{x:.3f}, {y:.3f}]" for x, y in 1e3 * found[:, :2])
+    centres = ", ".join(f"[{x:.3f}, {y:.3f}]" for x, y in np.round(1e3 * found[:, :2], 3) + 0.0)
     others = np.delete(away, far)
     rest = f" (the others within {others.max():.3f} mm)" if len(others) else ""
     text = (
@@ -109,7 +108,8 @@ def _shaken(factor: Array, trajectory: Trajectory) -> tuple[Finding, ...]:
         f"from frame to frame poses scatter more than their dots tell: {', '.join(told)}. Dots that err alike leave no "
         "residual: a camera or the table trembles, or the frames were compressed as video. The sigmas follow"
     )
-    return (Finding(Kind.POSES_SCATTER, Severity.WARNING, text),)
+    explains = Kind.DOTS_SCATTER, Kind.TABLE_DISAGREES, Kind.FRAMES_LOST, Kind.ACCURACY
+    return (Finding(Kind.POSES_SCATTER, Severity.WARNING, text, explains=explains),)
 
 
 def _misfit(seen: str, ahead: float, explained: float, frame_rate: float) -> Finding:
@@ -121,7 +121,8 @@ def _misfit(seen: str, ahead: float, explained: float, frame_rate: float) -> Fin
             f"explain {100 * explained:.0f} % of it). `disctrack diagnose` tells which and by how much; calibrate again"
         )
         # now this, now that dot is struck, which shakes the poses
-        return Finding(Kind.DOTS_MISFIT, Severity.DOUBT, text, explains=(Kind.POSES_SCATTER,))
+        explains = Kind.POSES_SCATTER, Kind.TABLE_DISAGREES, Kind.FRAMES_LOST, Kind.ACCURACY
+        return Finding(Kind.DOTS_MISFIT, Severity.DOUBT, text, explains=explains)
     early, late = frames.CAMERAS[::-1] if ahead > 0 else frames.CAMERAS
     whole = round(abs(ahead))
     again = f"number its images higher by {whole}" if whole and abs(abs(ahead) - whole) < 0.1 * whole else ""
@@ -172,22 +173,27 @@ def doubts_of(
             f"the dots scatter {np.sqrt(scatter.noise):.1f} times more than the image noise explains: they are not "
             "round, or their edges are not sharp, or the images were processed"
         )
-        found.append(Finding(Kind.DOTS_SCATTER, Severity.WARNING, text))
+        explains = Kind.FRAMES_LOST, Kind.ACCURACY
+        found.append(Finding(Kind.DOTS_SCATTER, Severity.WARNING, text, explains=explains))
     found += _shaken(shaken, trajectory)
+    return (*found, *_table_disagrees(table, trajectory))
+
+
+def _table_disagrees(table: TableFromDisc | None, trajectory: Trajectory) -> tuple[Finding, ...]:
+    """Board and disc that differ about the table by more than their tolerances; else a disc that is not on it."""
     apart = table is not None and abs(table.plane[0]) > NO_TOLERANCE
     severity = Severity.DOUBT if apart else Severity.WARNING
-    if table is not None and table.probability < DISAGREE:
-        text = (
-            f"the disc's lowest point does not roll on the board's table: {table.sentence}. They differ by more than "
-            "their tolerances allow: the board is bowed or its thickness is another, the disc's radius or thickness "
-            "is, the sheet of dots is off the disc's centre, a camera moved up or down by about twice as much since "
-            "the calibration (or both together), or a long exposure is not declared (exposure_us)"
-        )
-        spread = float(np.hypot(table.sigma[0], table.board_sigma[0]))
-        height = Measured(1e6 * float(table.plane[0]), 1e6 * spread, "um")
-        found.append(Finding(Kind.TABLE_DISAGREES, severity, text, numbers={"height": height},
-                             explains=(Kind.OFF_THE_TABLE,)))  # fmt: skip
-    return (*found, *off_the_table(trajectory, severity))
+    if table is None or table.probability >= DISAGREE:
+        return off_the_table(trajectory, severity)
+    text = (
+        f"the disc's lowest point does not roll on the board's table: {table.sentence}. They differ by more than "
+        "their tolerances allow: the board is bowed or its thickness is another, the disc's radius or thickness "
+        "is, the sheet of dots is off the disc's centre, a camera moved up or down by about twice as much since "
+        "the calibration (or both together), or a long exposure is not declared (exposure_us)"
+    )
+    spread = float(np.hypot(table.sigma[0], table.board_sigma[0]))
+    height = Measured(1e6 * float(table.plane[0]), 1e6 * spread, "um")
+    return (Finding(Kind.TABLE_DISAGREES, severity, text, numbers={"height": height}, explains=(Kind.ACCURACY,)),)
 
 
 def _lost(trajectory: Trajectory) -> Iterator[Finding]:
@@ -220,7 +226,8 @@ def _one_sided(trajectory: Trajectory) -> Iterator[Finding]:
             f"the dots of only one camera make sense in {one} of {one + both} measured frames: are left and right "
             f"exchanged, does the rig belong to this recording, does one camera look at the underside? {MOVED}"
         )
-        yield Finding(Kind.ONE_SIDED, Severity.DOUBT, text, explains=(Kind.POSES_SCATTER, Kind.OFF_THE_TABLE))
+        explains = Kind.POSES_SCATTER, Kind.TABLE_DISAGREES, Kind.FRAMES_LOST, Kind.SHARPNESS, Kind.ACCURACY
+        yield Finding(Kind.ONE_SIDED, Severity.DOUBT, text, explains=explains)
 
 
 def _symmetric(disc: Disc) -> Iterator[Finding]:
@@ -241,4 +248,5 @@ def _clipped(follower: Follower) -> Iterator[Finding]:
                 "hides part of them and of the noise: positions may be off by a micrometre"
             )
             advice = (Remedy(action="expose for a shorter time"),)
-            yield Finding(Kind.CLIPPED, Severity.WARNING, text, Subject("track", camera), remedies=advice)
+            where = Subject("track", camera)
+            yield Finding(Kind.LIGHT, Severity.WARNING, text, where, remedies=advice, explains=(Kind.ACCURACY,))

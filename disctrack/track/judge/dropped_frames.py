@@ -51,15 +51,16 @@ def dropped_frames(refused: Mask, seen: DotsInFrames, pairs: range) -> tuple[Fin
         frames, n = [pairs[i] for i in rows], abs(ahead)
         text = (
             f"frames {ranges(frames)} {refused_for}, as if the {camera} camera were "
-            f"{abs(float(np.mean(delays))):.2f} frames ahead of the {other}: it left out {n} image(s) "
+            f"{abs(float(np.mean(delays))):.2f} frames ahead of the {other}: it left out {n} image{'s' * (n > 1)} "
             f"{'before' if always else 'at'} frame {pairs[0] if always else frames[0]}"
         )
         of = Subject("track", camera, ((frames[0], frames[-1]),))
         remedy = Remedy(action=f"number its images from there on higher by {n}")
-        said.append(Finding(Kind.DROPPED_FRAMES, Severity.DOUBT, text, of, {"images": Measured(n)}, (remedy,), MISFITS))
+        numbers, explains = {"images": Measured(n)}, MISFITS if always else (Kind.DELAY, *MISFITS)
+        said.append(Finding(Kind.DROPPED_FRAMES, Severity.DOUBT, text, of, numbers, (remedy,), explains))
     if unexplained:
         text = f"frames {ranges(unexplained)} {refused_for}"
-        said.append(Finding(Kind.CAMERAS_CONTRADICT, Severity.DOUBT, text))
+        said.append(Finding(Kind.CAMERAS_CONTRADICT, Severity.DOUBT, text, explains=(Kind.FRAMES_LOST,)))
     return tuple(said)
 
 

@@ -122,7 +122,7 @@ def exposure_of(
         f"exposure_us is declared (or in the cameras' headers) as {said} us, the smear of the moving dots tells "
         f"{told}. The declared one is used: poses are off by up to g T^2 / (6 r) in theta if it is wrong"
     )
-    return declared, (Finding(Kind.EXPOSURE, Severity.WARNING, text),)
+    return declared, (Finding(Kind.EXPOSURE, Severity.WARNING, text, explains=(Kind.TABLE_DISAGREES,)),)
 
 
 def _likely(found: Array, longest: float) -> float:

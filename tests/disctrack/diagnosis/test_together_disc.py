@@ -110,7 +110,7 @@ def test_files_that_cannot_be_read_are_left_out_by_name_and_the_others_are_diagn
         assert "2 recordings together (2 left out): nothing is missing" in out
         assert "empty.h5 was left out" in out
         assert "cut.h5 was left out" in out
-        assert "2 recording(s) could not be used" in told.err
+        assert "2 recordings could not be used" in told.err
     document = json.loads((tmp_path / "out" / "diagnosis.json").read_text())
     assert [name.rpartition("/")[2] for name in document["unusable"]] == ["empty.h5", "cut.h5"]
     assert "empty.h5" in (tmp_path / "out" / "diagnosis.html").read_text()

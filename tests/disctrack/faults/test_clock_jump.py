@@ -38,7 +38,7 @@ def test_a_run_puts_the_result_in_doubt_and_names_frame_and_number(rolling):
     found = contradictions(without(rolling, [FRAME, FRAME + 1]))
     (lost,) = (one for one in found if one.kind == Kind.CLOCK_JUMP)
     assert lost.doubtful
-    assert f"frame {FRAME}: the clock jumps by 2 frame(s)" in lost.sentence
+    assert f"frame {FRAME}: the clock jumps by 2 frames" in lost.sentence
     assert not [one for one in contradictions(rolling) if one.kind == Kind.CLOCK_JUMP]
 
 
@@ -71,5 +71,5 @@ def test_frames_without_a_pose_at_the_loss_do_not_hide_it(rolling):
 @pytest.mark.statistical
 def test_a_diagnosis_counts_the_lost_pairs_before_it_looks_for_a_law():
     result = diagnose(without(measured(seed=3, n=300), [100, 101]))
-    assert "frame 100: the clock jumps by 2 frame(s)" in result.notes[0]
+    assert "frame 100: the clock jumps by 2 frames" in result.notes[0]
     assert result.diagnosis.verdict == "nothing missing"

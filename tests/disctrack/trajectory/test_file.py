@@ -29,7 +29,6 @@ from disctrack.trajectory import file as storage
 from disctrack.trajectory.exchange.csv_table import write_csv
 from disctrack.trajectory.file import (
     Provenance,
-    is_result_of,
     read_findings,
     read_group,
     read_provenance,
@@ -38,6 +37,7 @@ from disctrack.trajectory.file import (
     write_groups,
     write_trajectory,
 )
+from disctrack.trajectory.reuse import kept_or_made
 
 PROVENANCE = Provenance("clip", {"images": "ab" * 32}, {"refine": True})
 
@@ -263,7 +263,7 @@ def test_a_stage_adds_its_group_and_leaves_the_rest_untouched(file, trajectory):
     assert_array_equal(arrays["speed"], 2.0 * np.arange(len(trajectory)))
     assert attributes["window_s"] == 0.01
     assert_equal(read_trajectory(file), trajectory)
-    assert is_result_of(file, PROVENANCE)
+    assert read_provenance(file) == PROVENANCE
 
 
 def series(trajectory, n, axis="window"):
@@ -311,15 +311,24 @@ def test_an_existing_file_is_kept_unless_told_otherwise(file, trajectory):
         {"version": "0.0.0"},
     ],
 )
-def test_a_result_is_reused_only_for_the_same_inputs_settings_and_version(file, change):
-    assert is_result_of(file, PROVENANCE)
-    assert not is_result_of(file, dataclasses.replace(PROVENANCE, **change))
+def test_a_result_is_reused_only_for_the_same_inputs_settings_and_version(file, trajectory, change):
+    other = dataclasses.replace(PROVENANCE, **change)
+    made = trajectory, {"made": "now"}
+    assert kept_or_made(file, PROVENANCE, lambda: made)[1:] == ({}, False)
+    before = file.read_bytes()
+    with pytest.raises(OutputError, match=r"not the complete result .*\(a number\)"):
+        kept_or_made(file, other, lambda: made, other=lambda there: "a number")
+    assert file.read_bytes() == before
+    assert kept_or_made(file, other, lambda: made)[1:] == ({"made": "now"}, True)
+    assert read_provenance(file) == other
+    assert kept_or_made(file, other, lambda: made, overwrite=True)[2]
 
 
-def test_an_incomplete_file_or_another_programs_is_no_result(file):
+def test_an_incomplete_file_or_another_programs_is_no_result(file, trajectory):
     with h5py.File(file, "r+") as h5:
         h5.attrs["complete"] = 0
-    assert not is_result_of(file, PROVENANCE)
+    with pytest.raises(OutputError, match="It is kept"):
+        kept_or_made(file, PROVENANCE, lambda: (trajectory, {}))
     with pytest.raises(TrajectoryFileError, match="not complete"):
         read_trajectory(file)
     with h5py.File(file, "w") as h5:
@@ -432,7 +441,6 @@ def test_a_truncated_file_is_refused_wherever_it_is_cut(tmp_path, whole_content,
     path.write_bytes(whole_content[: int(cut * len(whole_content))])
     with pytest.raises(TrajectoryFileError):
         read_trajectory(path)
-    assert not is_result_of(path, PROVENANCE)
 
 
 @pytest.mark.statistical

@@ -80,8 +80,8 @@ def test_predicted_sigmas_hold_for_twelve_bits(dim, plain):
 def test_clipped_light_is_told_and_light_below_it_is_not(dim):
     images, rig, disc, _ = dim
     clipped = np.minimum(images, np.uint16(0.9 * np.percentile(images, 98)))
-    assert Kind.CLIPPED not in {finding.kind for finding in follow(images, rig, disc).findings}
-    found = [finding for finding in follow(clipped, rig, disc).findings if finding.kind == Kind.CLIPPED]
+    assert Kind.LIGHT not in {finding.kind for finding in follow(images, rig, disc).findings}
+    found = [finding for finding in follow(clipped, rig, disc).findings if finding.kind == Kind.LIGHT]
     assert [finding.subject.camera for finding in found] == ["left", "right"]
     assert all(f"clipped at grey value {clipped.max()}" in finding.text for finding in found)
 

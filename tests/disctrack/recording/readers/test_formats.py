@@ -357,7 +357,7 @@ def test_frames_that_a_recorder_dropped_are_named(tmp_path):
         picture.pts = time
     write_pictures(tmp_path / "left.mkv", pictures, "ffv1")
     (doubt,) = open_frames("left.mkv", tmp_path, "left").doubts
-    assert "after frame 11: 2 frame(s)" in doubt
+    assert "after frame 11: 2 frames" in doubt
 
 
 @pytest.mark.parametrize("place", [0.02, 0.3, 0.5, 0.9])

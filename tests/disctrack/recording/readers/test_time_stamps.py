@@ -49,13 +49,13 @@ def test_stamps_that_cannot_be_meant_are_not_used_and_why_is_said(times, reason)
 def test_frames_lost_by_both_cameras_together_are_counted_and_numbered():
     both = without(EVEN, 101, 102, 300)
     left, right = warnings_of(both, both)
-    assert left == "left camera: by its time stamps 3 frame(s) are missing, after frame 100, 297"
+    assert left == "left camera: by its time stamps 3 frames missing, after frame 100, 297"
     assert right.startswith("right camera")
 
 
 def test_a_frame_lost_by_one_camera_alone_parts_the_pairs_from_there_on():
     lost, parted = warnings_of(EVEN, without(EVEN, 101))
-    assert "right camera: by its time stamps 1 frame(s) are missing, after frame 100" in lost
+    assert "right camera: by its time stamps 1 frame missing, after frame 100" in lost
     assert "does not show the same instant from frame 101 on" in parted
     *_, parted = warnings_of(without(EVEN, 200), without(EVEN, 101))
     assert "from frame 101 on" in parted
