@@ -296,12 +296,12 @@ def test_run_and_the_stages_after_it_name_the_fault_first(name, recording, capsy
     if "run" in known.stages:
         assert comes_first(name, findings), findings[0]
     if "analyse" in known.stages:
-        again, findings, _ = ended(capsys, "analyse", folder)
-        assert again == code
+        again, findings, errors = ended(capsys, "analyse", folder)
+        assert again == code, errors
         assert comes_first(name, findings), findings[0]
     if known.stages == "diagnose" or first_to_mend(findings):
-        again, findings, _ = ended(capsys, "diagnose", folder)
-        assert again == code
+        again, findings, errors = ended(capsys, "diagnose", folder)
+        assert again == code, errors
         assert comes_first(name, findings), findings[0]
 
 

@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from calibration.cameras.camera import StereoRig, normalised_maps
 from calibration.kit.arrays import Array, Image, Mask
 from calibration.kit.grey_levels import saturation_level
-from disctrack.disc import Disc
+from disctrack.disc import Disc, symmetry_order
+from disctrack.frames import rotation_z
 from disctrack.track.dots import _kernels as kernels
 from disctrack.track.dots.acquisition import Pose, acquire
 from disctrack.track.dots.template import (
@@ -330,6 +331,8 @@ def _search(follower: Follower, images: Image, readable: Mask) -> bool:
     following = None
     if len(images) > 1 and readable[1].any():
         following = _found(follower, images[1], readable[1])
+        if following is not None:
+            following = _nearest_alike(pose, following, follower.setup.disc)
     elif follower.before is not None:  # pairs come one by one: as from the pair before
         R, t = follower.before
         following = pose[0] @ R.T @ pose[0], 2 * pose[1] - t
@@ -346,6 +349,14 @@ def _found(follower: Follower, pair: Image, readable: Mask) -> Pose | None:
     pose, _, reason = acquire(np.where(readable[:, None, None], pair, 0), follower.setup.rig, follower.setup.disc)
     follower.first_reason = follower.first_reason or reason
     return pose
+
+
+def _nearest_alike(pose: Pose, following: Pose, disc: Disc) -> Pose:
+    """Of the poses at which the dots look as at `following`, the one with the least turn from `pose`."""
+    R, t = following
+    order = symmetry_order(disc)
+    alike = R @ rotation_z(2 * np.pi * np.arange(order) / order)
+    return alike[np.argmax(np.einsum("ij,nij->n", pose[0], alike))], t
 
 
 def _measure_blur_and_noise(follower: Follower, images: Image, readable: Mask, pose: Pose, heading: Heading) -> None:
