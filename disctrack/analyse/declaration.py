@@ -33,7 +33,7 @@ from disctrack.errors import AnalysisError
 from disctrack.faults.clock_jump import clock_jumps
 from disctrack.findings import MISFITS, Finding, Kind, Remedy, Severity, Subject
 from disctrack.frames import CAMERAS, rotation_from_quaternion
-from disctrack.numbers import Measured, measured
+from disctrack.numbers import Measured, measured, rounded
 from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory, part
 
 if TYPE_CHECKING:
@@ -478,8 +478,11 @@ def other_scale(scale: Measured, square: float | None = None, explains: tuple[Ki
     """Dots that are so many times as far apart as declared. square : [m] of the board as declared"""
     factor, off = scale.value, abs(float(np.log(scale.value)))
     uncertain = max(3 * scale.sigma / factor, 0.01 * min(off, 1.0))  # no template fits dots that are far from declared
-    mixed = [words for unit, words in UNITS.items() if abs(off / np.log(unit) - 1) < 0.02]
-    board = off, Remedy("[calibration] square_mm", action=f"times {1 / factor:.4g}")
+    digits, mixed = 1 + int(np.log10(factor / scale.sigma)), ""
+    for unit, words in UNITS.items():
+        if abs(off / np.log(unit) - 1) < 0.02:
+            factor, mixed = float(unit ** np.sign(np.log(factor))), f": are {words} mixed up?"
+    board = off, Remedy("[calibration] square_mm", action=f"times {rounded(1 / factor, digits)}")
     if square is not None:
         side = 1e3 * square / factor
         usual = max(round(2 * side), 1) / 2  # boards have squares of whole or half mm
@@ -487,10 +490,9 @@ def other_scale(scale: Measured, square: float | None = None, explains: tuple[Ki
         fits = usual if away < uncertain else side
         board = min(away, off), Remedy("[calibration] square_mm", f"{fits:.2f}", f"{1e3 * square:g}")
     lengths = "[markers] centres_mm" if off < SIDE_TOLERANCE else "every length of [disc] and [markers]"
-    ways = board, (off, Remedy(lengths, action=f"times {factor:.4g}"))
+    ways = board, (off, Remedy(lengths, action=f"times {rounded(factor, digits)}"))
     remedies = tuple(remedy for _, remedy in sorted(ways, key=lambda one: one[0]))
-    text = f"by both cameras the dots are {scale} times as far apart as declared"
-    text += f": are {mixed[0]} mixed up?" if mixed else ""
+    text = f"by both cameras the dots are {scale} times as far apart as declared{mixed}"
     return Finding(Kind.SQUARE, Severity.DOUBT, text, Subject(), {"scale": scale}, remedies, explains)
 
 

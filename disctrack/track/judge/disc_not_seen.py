@@ -143,8 +143,7 @@ class SeenDots:
     which: Mask  # (m,) of the declared dots; k of them
     points: Array  # (k, 3) [m] in the rig's world and unit
     areas: Array  # (2, k) [px^2] of their blobs
-    scale: float  # their distances over those declared
-    scale_sigma: float
+    scale: Measured  # their distances over those declared
     misfit_px: float  # largest, of the blobs against one point in space
 
 
@@ -157,8 +156,8 @@ def unlike_declared(pair: NDArray, rig: StereoRig, disc: Disc) -> tuple[Finding,
     if not several:
         return ()
     seen = max(several, key=lambda found: found.which.sum())
-    if abs(np.log(seen.scale)) > SIDE_TOLERANCE:
-        return (other_scale(Measured(seen.scale, seen.scale_sigma), explains=NONSENSE),)
+    if abs(np.log(seen.scale.value)) > SIDE_TOLERANCE:
+        return (other_scale(seen.scale, explains=NONSENSE),)
     (R,), (t,) = rigid_motions(disc.marker_centres_body[None, seen.which], seen.points[None])
     # by the middle one of the searches: one for blobs far smaller than the dots finds what is darkest in them
     J = marker_pixels(R[None], t[None], rig, disc.marker_centres_body)[1]
@@ -189,5 +188,6 @@ def _seen_dots(pair: NDArray, rig: StereoRig, disc: Disc) -> Iterator[SeenDots]:
         scale = float(np.median(ratios))
         misfit = float(np.abs(rig.project(points) - pixels).max())
         if misfit < EPIPOLAR_PX and scale > 0 and np.abs(ratios / scale - 1).max() < MISPLACED:
-            sigma = float(ratios.std()) / np.sqrt(which.sum())
-            yield SeenDots(which, points, blobs[:, which, 2], scale, sigma, misfit)
+            # uneven light shifts all blobs alike: more of them tell it no better
+            uncertain = float(np.sqrt(2) * BLOB_PX / np.median(apart(pixels[0])))
+            yield SeenDots(which, points, blobs[:, which, 2], Measured(scale, scale * uncertain), misfit)
