@@ -411,6 +411,6 @@ def _not_as_told(board: str, shape: BoardShape, sigmas: float) -> str:
     )
     return (
         f"the board was taken as {taken} but the views show another shape (longer by {100 * abs(shape.stretch):.2g} % "
-        f"along one side, bent by {1e6 * abs(shape.lift):.0f} um, or misprinted): cameras are pulled by up to "
+        f"along one side, bent by {1e6 * abs(shape.lift):.0f} µm, or misprinted): cameras are pulled by up to "
         f"{sigmas:.1f} of their sigmas. The sigmas contain that{do}"
     )

@@ -142,7 +142,7 @@ class Finding:
             return self.text
         if not self.remedies[0].key:
             advice = "; or ".join(told)
-            return f"{self.text}. {advice[:1].upper()}{advice[1:]}"
+            return f"{self.text.removesuffix('.')}. {advice[:1].upper()}{advice[1:]}"
         return f"{'; or '.join(told)}: {self.text}"
 
     @property

@@ -219,7 +219,7 @@ class Order:
         if self.mirrored:
             return (
                 f"the images of one of the two cameras are mirrored: if they are, {found.agrees.sum()} of {len(both)} "
-                f"pairs tell of one place of the cameras, as stored {stored.agrees.sum()}. Switch the mirroring off "
+                f"pairs agree on one place of the cameras, as stored {stored.agrees.sum()}. Switch the mirroring off "
                 "where that camera's images are exported, or flip all of them, those of the motion too; so, too, if "
                 "it looks through a mirror"
             )
@@ -227,7 +227,7 @@ class Order:
         which = "in reversed order" if self.reversed else f"{abs(self.late)} {'late' if self.late > 0 else 'early'}"
         return (
             f"the left and the right views are no pairs as they are stored: the right ones come {which}. So paired, "
-            f"they tell of one place of the cameras to {np.median(found.distance):.2g} px, as stored to "
+            f"they agree on one place of the cameras to {np.median(found.distance):.2g} px, as stored to "
             f"{np.median(stored.distance):.2g} px: {names[v][0]} shows the board where "
             f"{names[self.partner(v, names)][1]} does. A frame was lost, or one camera began earlier: name or move "
             "the files so that pairs have one number"
@@ -291,7 +291,7 @@ def _require_agreement(stored: Pairing, others: Sequence[float]) -> None:
         return
     if stored.evidence <= float(np.median(others)) + 2.0 * np.log(BY_CHANCE):
         raise CalibrationError(
-            f"the {n} pairs tell of no common place of the cameras: they differ by {stored.usual:.2g} px and more, as "
+            f"the {n} pairs agree on no common place of the cameras: they differ by {stored.usual:.2g} px and more, as "
             f"images do that are no pairs. Other orders, up to {MOST_LATE} views late or early, and mirrored images "
             "do not fit either: left and right image of each number must show the board in one place"
         )

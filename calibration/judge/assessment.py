@@ -34,8 +34,6 @@ class Grade(StrEnum):
 class Assessment:
     """Figures and words about a calibration."""
 
-    grade: Grade
-    verdict: str  # the same with its reason, and what a user gets on the table
     stereo_misfit_px: float  # of views left out of the fit, one place of the board for both images; NaN where none was
     held_out_error: float  # [m] of corners of such views, triangulated, against the board where they put it best
     triangulation_sigma: tuple[float, float]  # [m] of points, rms and greatest, by all of the calibration's uncertainty
@@ -48,7 +46,10 @@ class Assessment:
     inflation: float  # of the covariance, from the scatter of views
     coverage: tuple[float, ...]  # of each camera: share of 8 x 8 image cells with a corner
     tilt_spread_deg: float  # greatest angle between two boards' normals
-    warnings: tuple[str, ...]
+    grade: Grade = Grade.POOR
+    verdict: str = ""  # the same with its reason: one sentence without its full stop
+    figures: str = ""  # what a user gets on the table, and the misfit of views left out
+    warnings: tuple[str, ...] = ()
 
     @property
     def beyond_use(self) -> bool:
@@ -171,8 +172,6 @@ def assess(
     along, across = length_uncertainty(rig, volume)
     place, most = causes(rig_with_board, _shifts_of_points(rig_with_board, volume))
     found = Assessment(
-        grade=Grade.POOR,
-        verdict="",
         stereo_misfit_px=chosen.held_out_rms_px,
         held_out_error=chosen.held_out_error,
         triangulation_sigma=(float(np.sqrt(np.mean(sigma**2))), float(sigma.max())),
@@ -185,10 +184,10 @@ def assess(
         inflation=inflation,
         coverage=tuple(float(np.mean(cells_of(refinement, camera) > 0)) for camera in range(len(CAMERA_NAMES))),
         tilt_spread_deg=tilt_spread(refinement),
-        warnings=(),
     )
-    grade, verdict = _verdict(found, refinement, chosen, wide)
-    return replace(found, grade=grade, verdict=verdict, warnings=(*wide, *_warnings(found, refinement, chosen)))
+    grade, verdict = _verdict(found, chosen, wide, _moved(found, refinement))
+    told = (*wide, *_warnings(found, refinement, chosen))
+    return replace(found, grade=grade, verdict=verdict, figures=_figures(found, refinement.rms()), warnings=told)
 
 
 def _moved(found: Assessment, refinement: Refinement) -> bool:
@@ -236,31 +235,39 @@ def _warnings(found: Assessment, refinement: Refinement, chosen: TermsTried) -> 
     return told
 
 
-def _verdict(found: Assessment, refinement: Refinement, chosen: TermsTried, wide: tuple[str, ...]) -> tuple[Grade, str]:
-    """The worst of what the figures say, with the reason, then the figures: what a user gets on the table."""
-    (sigma, most), error, rms = found.triangulation_sigma, found.held_out_error, refinement.rms()
-    # of equal grades the first is told: the cause
+def _verdict(found: Assessment, chosen: TermsTried, wide: tuple[str, ...], moved: bool) -> tuple[Grade, str]:
+    """The worst of what the figures say, with the reason."""
+    # of equal grades the first is taken: the cause
     reasons = [(3, wide[0].partition(":")[0])] if wide else []
-    for value, what in ((sigma, "a point is uncertain by"), (error, "corners of views left out of the fit are off by")):
-        if np.isfinite(value):
-            part = f"{1e3 * value:.3g} mm, {100 * value / found.distance:.2g} % of the distance"
-            reasons.append((int(np.searchsorted(GRADES, value / found.distance)), f"{what} {part}"))
+    errors = found.triangulation_sigma[0], found.held_out_error
+    for error, what in zip(errors, ("a point is uncertain by", "views left out of the fit are off by"), strict=True):
+        if np.isfinite(share := error / found.distance):
+            part = f"{what} {_length(error)}, {_percent(share)} of the distance"
+            reasons.append((int(np.searchsorted(GRADES, share)), part))
     if found.pairs < GOOD_VIEWS:
         reasons.append((2 if found.pairs > 3 else 3, f"only {found.pairs} views were seen by both cameras"))
     if chosen.held_out_rms_px > TWICE * chosen.rms_px:
-        left_out = f"views left out give {chosen.held_out_rms_px:.3f} px"
-        reasons.append((2, f"{left_out} where those fitted give {chosen.rms_px:.3f} px"))
-    if _moved(found, refinement):
+        reasons.append((2, "views left out of the fit are met far worse than those fitted"))
+    if moved:
         reasons.append((2, "the two images of a pair do not show the board in one place"))
-    worst, why = max(reasons, key=lambda item: item[0], default=(3, "nothing tells how good it is"))
+    worst, why = max(reasons, key=lambda item: item[0], default=(3, "nothing shows how good it is"))
     grade = list(Grade)[worst]
-    off = f", their corners {1e3 * error:.4f} mm in space" if np.isfinite(error) else ""
-    turn = 1e3 * np.degrees(found.direction_sigma)
-    length, with_board = (f"{100 * part:.2g} %" for part in found.length_sigma)
-    of_board = "" if with_board == length else f", or {with_board} with the declared size of the board"
-    return grade, (
-        f"{grade.value.capitalize()}: {why}. Through this calibration a point comes out within {1e3 * sigma:.4f} mm "
-        f"(1 sigma, 3-D; at most {1e3 * most:.4f} mm), a direction within {turn:.2g} mdeg, "
-        f"a length or displacement within {length}{of_board}. Views left out of the fit: stereo misfit "
-        f"{found.stereo_misfit_px:.4f} px{off}; RMS of those fitted {rms:.4f} px."
+    return grade, f"{grade.value.capitalize()}: {why}"
+
+
+def _figures(found: Assessment, rms: float) -> str:
+    sigma, most = map(_length, found.triangulation_sigma)
+    return (
+        f"1 sigma: a point {sigma} (at most {most}), a direction {1e3 * np.degrees(found.direction_sigma):.2g} mdeg, a "
+        f"length {_percent(found.length_sigma[1])}; stereo misfit {found.stereo_misfit_px:.4f} px, rms {rms:.4f} px"
     )
+
+
+def _length(value: float) -> str:
+    """A length [m] with two digits."""
+    scale, unit = (1e6, "µm") if value < 0.5e-3 else (1e3, "mm")
+    return f"{float(f'{scale * value:.2g}'):g} {unit}"
+
+
+def _percent(share: float) -> str:
+    return f"{np.format_float_positional(float(f'{100 * share:.1g}'), trim='-')} %"

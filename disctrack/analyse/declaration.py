@@ -443,7 +443,7 @@ def handedness(rig: StereoRig, disc: Disc) -> tuple[Finding, ...]:
     )
     text = (
         f"the left camera stands {1e3 * rig.baseline:.0f} mm to the right of the right one, as they look at it; "
-        "expected on the left. The dots do not tell, as their layout looks the same in a mirror"
+        "expected on the left. The dots do not show it: their layout looks the same in a mirror"
     )
     return (Finding(Kind.HANDEDNESS, Severity.DOUBT, text, remedies=remedies),)
 

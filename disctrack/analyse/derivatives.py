@@ -298,8 +298,8 @@ def _segments(samples: _Samples, frames: NDArray[np.int64]) -> tuple[list[tuple[
         centres.append((start + stop) / 2)
     if not segments:
         raise AnalysisError(
-            f"nowhere do {MIN_FRAMES} of {SEGMENT} neighbouring frames have a pose: the motion between them cannot be "
-            "told. Track the recording again with better exposure, or look at frame_status for the reasons."
+            f"nowhere do {MIN_FRAMES} of {SEGMENT} neighbouring frames have a pose: the motion between them is not "
+            "known. Track the recording again with better exposure, or look at frame_status for the reasons."
         )
     return segments, np.array(centres)
 

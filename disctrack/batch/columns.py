@@ -49,7 +49,7 @@ COLUMNS: dict[str, str] = {
     },
     "diagnosis": "verdict, where a diagnosis was requested",
     "diagnosis_sentence": "",
-    "diagnosis_p_value": "probability with which noise alone would let some effect gain as much as the best one does",
+    "diagnosis_p_value": "probability that noise alone produces so large a decrease of chi-square",
     "diagnosis_false_discovery": "share of false ones among the recordings whose p value is as small (at most)",
     "seconds": "that the measurement took",
     "processor_seconds": "the same, of a processor, all threads; of it:",

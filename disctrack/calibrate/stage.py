@@ -116,7 +116,7 @@ def given_rig(file: Path) -> tuple[StereoRig, Report]:
     """A rig that a recording shares with others, and what to tell about it. Raises RigFileError."""
     keep(file)
     rig = read_rig(file)
-    return rig, Report("", f"{file}: baseline {rig.baseline * 1e3:.3f} mm")
+    return rig, Report("", f"{file}: baseline {rig.baseline * 1e3:.3f} mm.")
 
 
 def calibrate_into(
@@ -148,8 +148,8 @@ def calibrate_into(
             "calibrate --force` writes it as it is."
         )
     told = {
-        "verdict": found.assessment.verdict,
-        "accuracy": summary.place_text(found),
+        "verdict": f"{found.assessment.verdict}.",
+        "accuracy": found.assessment.figures,
         "rows": summary.calibration_rows(found, problems),
         "warnings": found.warnings,
     }

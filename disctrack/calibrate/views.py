@@ -117,7 +117,7 @@ def _views_of(pattern: str, folder: Path, camera: str) -> tuple[View, ...]:
     if len(reader) > MOST_VIEWS:
         raise RecordingError(
             f"{files[0]}: {len(reader)} frames for the {camera} camera, and every frame is a view of the chessboard. "
-            f"Export at most {MOST_VIEWS} of them; 20 to 40 in different places are enough."
+            f"Export at most {MOST_VIEWS} of them; 15 to 40 in different places are enough."
         )
     return tuple(FrameView(files[0], reader, index) for index in range(len(reader)))
 

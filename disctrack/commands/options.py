@@ -44,9 +44,9 @@ _length_or_zero = _number(float, 0, "a length in mm")
 def add_init(parser: argparse.ArgumentParser) -> None:
     """Arguments of `disctrack init`."""
     parser.add_argument("folder", type=Path, help="folder with the frames of two cameras and views of a chessboard")
-    what = "take disc, dots, board and table from this recording.toml where the files do not tell"
+    what = "take disc, dots, board and table from this recording.toml where the files do not say"
     parser.add_argument("--like", type=Path, metavar="RECORDING", help=what)
-    group = parser.add_argument_group("what no file tells", "left to fill in where it is not given")
+    group = parser.add_argument_group("what no file says", "left to fill in where it is not given")
     for option, what in UNKNOWN_TO_FILES.items():
         number = _length_or_zero if option == "board_thickness_mm" else _positive_number
         group.add_argument(
@@ -215,16 +215,16 @@ def add_convert(parser: argparse.ArgumentParser) -> None:
         help="by its ending: a trajectory to .csv, .mat, .c3d, .trc, .tsv (QTM), xypts.csv (DLTdv8), .nc; a rig to "
         ".yml (OpenCV), .toml (Caliscope), .cameramodel (mrcal), camchain.yaml (Kalibr), .mat; these to .h5",
     )
-    parser.add_argument("--as", dest="form", metavar="FORMAT", help="where the ending does not tell, e.g. Pose2Sim")
+    parser.add_argument("--as", dest="form", metavar="FORMAT", help="where the ending does not say, e.g. Pose2Sim")
     what = "the foreign rig's reference is the table, z up (else heights mean nothing)"
     parser.add_argument("--table", action="store_true", help=what)
     parser.add_argument(
         "--cameras", nargs=2, metavar=("LEFT", "RIGHT"), help="which two cameras of a Caliscope or Anipose file"
     )
-    what = "[px] where an OpenCV file does not tell it"
+    what = "[px] where an OpenCV file does not state it"
     parser.add_argument("--image-size", type=_positive, nargs=2, metavar=("WIDTH", "HEIGHT"), help=what)
     parser.add_argument(
-        "--unit-mm", type=_positive_number, help="length of an OpenCV file's unit, where it does not tell it"
+        "--unit-mm", type=_positive_number, help="length of an OpenCV file's unit, where it does not state it"
     )
     parser.add_argument("--overwrite", action="store_true", help="replace the target")
 
@@ -253,7 +253,7 @@ def add_validate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-j", "--jobs", type=_positive, default=1, help="processes (%(default)s)")
     parser.add_argument("-o", "--output", type=Path, default=Path("validation"), help="folder of tables (%(default)s)")
     parser.add_argument("--write", type=Path, metavar="FILE", help="also put the tables into this Markdown page")
-    parser.add_argument("--quiet", action="store_true", help="do not tell of every recording")
+    parser.add_argument("--quiet", action="store_true", help="no line for every recording")
 
 
 def _corners(text: str) -> tuple[int, int]:

@@ -30,14 +30,14 @@ def run(arguments: argparse.Namespace) -> int:
         rig_file = folder / "rig.h5"
         source = source_of(recording, outputs.calibration_settings(arguments))
         rig, known = calibrate_into(rig_file, source, arguments.overwrite, not arguments.no_figures)
-    verdict = f"Calibration: {known.verdict.partition('. ')[0]}"
+    verdict = f"Calibration: {known.verdict}"
     if recording.rig_file is None and not arguments.quiet:  # before the frames, which take longer
         print(verdict, file=sys.stderr, flush=True)
     tracked = outputs.track_into(folder / "trajectory.h5", recording, rig, rig_file, pairs, arguments)
-    whole = [("verdict", known.verdict), ("place", known.accuracy)]
+    whole = [("verdict", known.verdict), ("accuracy", known.accuracy)]
     report = replace(
         tracked,
-        verdict=f"{tracked.verdict} {verdict}.",
+        verdict=f"{tracked.verdict} {verdict}",
         blocks=[Section("Calibration", [Facts(whole), *known.blocks]), Section("Tracking", tracked.blocks)],
         files=[*known.files, *tracked.files, summary, *outputs.write_times(folder, "run")],
         page=summary,

@@ -105,16 +105,16 @@ def judged_by_what_is_left(diagnosis: Diagnosis, left: LeftOver | None) -> Diagn
     if verdict != "unexplained" and left.of_the_motion:
         verdict = "unexplained"
         but = (
-            f"is not noise (p = {left.pose_p_value:.1g} over {left.n_tests} tests), while the numbers that no pose "
-            "takes are"
+            f"are not noise (p = {left.pose_p_value:.1g} over {left.n_tests} tests), while those that no pose can "
+            "absorb are"
         )
     elif verdict == "unexplained" and left.of_the_measurement:
         verdict = "found" if diagnosis.found else "nothing missing"
         but = (
-            f"({left.pose_chi_square:.3g} of the noise) is no more than errors of the measurement leave in the numbers "
-            f"that no pose takes ({left.other_chi_square:.3g})"
+            f"({left.pose_chi_square:.3g} of the noise) are no more than errors of the measurement leave in those "
+            f"that no pose can absorb ({left.other_chi_square:.3g})"
         )
-    reason = f"{diagnosis.reason}; but what is left in the poses {but}" if but else diagnosis.reason
+    reason = f"{diagnosis.reason}; but the residuals of the poses {but}" if but else diagnosis.reason
     return replace(diagnosis, verdict=verdict, reason=reason)
 
 
@@ -239,7 +239,7 @@ def run_diagnose(
         files=(page, report, toml, path),
     )  # fmt: skip
     files = write_page(page, whole, ("png", "pdf") if figures else ())
-    then = f"disctrack diagnose {path} --model {toml}" if result.has_more else ""
+    then = f"disctrack diagnose {path} --model {toml} -o {folder}_enlarged" if result.has_more else ""
     outcome = DiagnoseOutcome(result, (report, toml, page, *files), replace(whole, data=document, then=then))
     remember(folder, origin, outcome.summary, outcome.files)
     return outcome

@@ -150,7 +150,7 @@ CLOCKS = (
           of_poses_alone=False, along=_faster,
           to_key=lambda v, _, rate: float(rate * (1.0 + v[0])) if v[0] else 0.0,
           from_key=lambda x, rate: x / rate - 1.0 if x else 0.0,
-          seen="the balance of moments asks for another gravity: g goes as the square of the rate",
+          seen="the balance of moments gives another gravity: g goes as the square of the rate",
           remedy="declare the rate that the camera's software states", declared="[cameras] frame_rate_hz",
           named_by=(Kind.GRAVITY_OR_RATE,)),
     Fault("exposure_blur", "dots are averaged over an exposure", "centre moves by T^2/24 times its acceleration",

@@ -140,7 +140,7 @@ def _frames(seen: Check, recording: Recording) -> ImagePairs:
 def _rig(seen: Check, recording: Recording) -> StereoRig:
     if recording.rig_file is not None:
         rig, told = given_rig(recording.rig_file)
-        seen.seen.append(("rig", told.verdict))
+        seen.seen.append(("rig", told.verdict[:-1]))
         seen.boards = boards_in(recording.rig_file, recording)
         return rig
     source = source_of(recording, CalibrationSettings())

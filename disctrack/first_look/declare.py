@@ -78,7 +78,7 @@ def run_init(folder: Path, known: Mapping[str, float] | None = None, like: Path 
     folder = Path(folder)
     file = folder / FILE_NAME
     if file.exists():
-        raise OutputError(f"{file}: exists. Edit it, or move it away; `disctrack check {folder}` tells what it lacks.")
+        raise OutputError(f"{file}: exists. Edit it, or move it away; `disctrack check {folder}` names what it lacks.")
     example = {} if like is None else read_toml(like / FILE_NAME if like.is_dir() else like, RecordingError)
     told, notes = look_into(folder)
     given = {"gravity": {"g_m_s2": 9.81}} | example
@@ -152,7 +152,7 @@ def _of_frames(folder: Path, frames: CameraPair) -> tuple[Told, list[str]]:
 def _views_alone(folder: Path, views: CameraPair, corners: tuple[int, int]) -> RecordingError:
     return RecordingError(
         f"{folder}: {views.left.pattern} and {views.right.pattern} show a chessboard, and nothing else is there. "
-        "Put the cameras' frames of the disc beside them. The cameras alone: disctrack calibrate "
+        "Put the cameras' frames of the disc into the same folder. The cameras alone: disctrack calibrate "
         f"--left '{folder / views.left.pattern}' --right '{folder / views.right.pattern}' "
         f"--corners {corners[0]}x{corners[1]} --square-mm SIDE -o rig.h5"
     )

@@ -225,7 +225,7 @@ def read_recording(path: str | Path) -> Recording:
     exposure = float(cameras["exposure_us"]) / 1e6 if "exposure_us" in cameras else None
     if exposure is not None and exposure * rate > 1.001:
         raise RecordingError(
-            f"{file}: [cameras] exposure_us is {1e6 * exposure:g}, longer than a frame: {1e6 / rate:g} us at "
+            f"{file}: [cameras] exposure_us is {1e6 * exposure:g}, longer than a frame: {1e6 / rate:g} µs at "
             "frame_rate_hz. It is in microseconds: 0.2 ms is 200."
         )
     _refuse_mixed_calibration(file, calibration)

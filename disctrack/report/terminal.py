@@ -61,7 +61,7 @@ def show(report: Report, stream: TextIO | None = None, *, verbose: bool = False)
 
 def _cut(lines: list[str], most: int = _MOST_OF_ONE) -> list[str]:
     """No more lines than that; where there were more, the last one says so."""
-    return lines if len(lines) <= most else [*lines[: most - 1], f"{lines[most - 1][:-2]} …"]
+    return lines if len(lines) <= most else [*lines[: most - 1], f"{lines[most - 1].rpartition(' ')[0]} …"]
 
 
 def _coloured(line: str) -> str:

@@ -299,7 +299,7 @@ def exposures(recording: Recording, pairs: ImagePairs) -> tuple[tuple[float, flo
     left, right = (None if header is None else header.exposure for header in headers)
     if left is None or right is None:
         return None, ()
-    return (left, right), (f"exposure {1e6 * left:g} and {1e6 * right:g} us (left, right) as the cameras' headers say",)
+    return (left, right), (f"exposure {1e6 * left:g} and {1e6 * right:g} µs (left, right) as the cameras' headers say",)
 
 
 def _span(pairs: ImagePairs, frame_rate: float, settings: TrackingSettings, threads: int | None) -> MotionSpan:

@@ -36,6 +36,7 @@ def coordinates_figure(trajectory: Trajectory) -> Figure:
             axes.set_yscale("log")
         else:
             axes.set_ylim(bottom=0)
+    figure.axes[1].legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=2, borderpad=0, frameon=False, fontsize=9)
     return _lost_marked(figure, trajectory)
 
 

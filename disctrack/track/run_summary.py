@@ -20,7 +20,7 @@ LEAST_SIZE = 1e-5  # relative: a change of the rig's size that is worth a line
 def calibration_rows(found: StereoCalibration, problems: Sequence[str] = ()) -> list[Row]:
     """Views used, misfit of views left out, baseline, the model, what was left out and why."""
     n, assessment = len(found.view_names) + len(problems), found.assessment
-    error = f" ({1e3 * assessment.held_out_error:.4f} mm in space)" if np.isfinite(assessment.held_out_error) else ""
+    error = f" ({1e6 * assessment.held_out_error:.3g} µm in space)" if np.isfinite(assessment.held_out_error) else ""
     used = n - len(problems) - len(found.rejected_views)
     lines = [
         (
@@ -28,22 +28,17 @@ def calibration_rows(found: StereoCalibration, problems: Sequence[str] = ()) -> 
             f"{used} of {n} views ({assessment.pairs} by both cameras), stereo misfit of views left out "
             f"{assessment.stereo_misfit_px:.4f} px{error}, baseline {found.rig.baseline * 1e3:.3f} mm",
         ),
+        ("place", _mostly(assessment.place_sigma, "the calibration alone, of a point over the table's board")),
         ("rig", _rig_text(found.rig)),
         ("model", _model_text(found)),
     ]
     if found.lens is not None:
-        (left, right), gain = found.lens.rms_px, found.lens.gain
-        departs = f"the lenses depart from their polynomial by {left:.3f} and {right:.3f} px rms per axis: corrected"
-        lines.append(("", f"{departs} (views left out: squared misfit {100 * gain:.0f} % less)"))
+        left, right = found.lens.rms_px
+        lines.append(("", f"lenses beyond their polynomials: {left:.3f} and {right:.3f} px rms per axis, corrected"))
     corners = len(found.rejected_corners())
     if corners:
         lines.append(("", f"{corners} corners were found but not used"))
     return lines + [("", text) for text in left_out(found.rejected_views)]
-
-
-def place_text(found: StereoCalibration) -> str:
-    """How well a place is known through a calibration."""
-    return _mostly(found.assessment.place_sigma, "the calibration alone, of a point over the table's board")
 
 
 def _rig_text(rig: StereoRig) -> str:
@@ -66,7 +61,7 @@ def _rig_text(rig: StereoRig) -> str:
 
 def _mostly(sigma: Sequence[tuple[float, str]], what: str) -> str:
     """Each coordinate's sigma and what most of it comes from."""
-    parts = [f"{axis} {1e6 * value:.2g} um from {cause}" for axis, (value, cause) in zip("xyz", sigma, strict=False)]
+    parts = [f"{axis} {1e6 * value:.2g} µm from {cause}" for axis, (value, cause) in zip("xyz", sigma, strict=False)]
     return f"{', '.join(parts)} (1 sigma, and its largest part: {what})"
 
 
@@ -154,7 +149,7 @@ def _sigma_text(sigma: Array, what: str) -> str:
         return f"not known ({what})"
     x, y, z = np.median(known[:, :3], axis=0) * 1e6
     psi, theta, phi = np.degrees(np.median(known[:, 3:], axis=0)) * 1e3
-    return f"x {x:.2f}  y {y:.2f}  z {z:.2f} um   psi {psi:.1f}  theta {theta:.2f}  phi {phi:.1f} mdeg  ({what})"
+    return f"x {x:.2f}  y {y:.2f}  z {z:.2f} µm   psi {psi:.1f}  theta {theta:.2f}  phi {phi:.1f} mdeg  ({what})"
 
 
 def _fit_row(trajectory: Trajectory) -> Row:

@@ -191,13 +191,13 @@ def accuracy_validation(outcomes: Sequence[RenderedOutcome]) -> Validation:
         strata.append([f"{low:g}-{high:g}", str(n), *_cells(_UM, position), *_cells(_MDEG, *angles, law)])
     names = ("rotation", "theta", "psi", "phi")
     law_said = f"{_MDEG * accuracy.law:.2f} / sin(theta)"
-    head = ["theta [deg]", "n", "position [um]", *(f"{name} [mdeg]" for name in names), law_said]
+    head = ["theta [deg]", "n", "position [µm]", *(f"{name} [mdeg]" for name in names), law_said]
     tables.append(Table("As a function of nutation (static poses)", head, strata, "Root mean squares."))
     sights = [
         [*map(str, (s.cameras, s.n, s.found, s.gross)), *_cells(_UM, s.position), *_cells(_MDEG, s.rotation)]
         for s in accuracy.sights
     ]
-    head = ["cameras", "poses", "found", "wrong", "position rms [um]", "rotation rms [mdeg]"]
+    head = ["cameras", "poses", "found", "wrong", "position rms [µm]", "rotation rms [mdeg]"]
     note = "Where no camera sees the dots rightly, a pose need not be found; none may be wrong."
     tables.append(Table("Who sees the face (static poses)", head, sights, note))
     honest = [[name, *_cells(1, c.value, c.uncertainty), str(c.n)] for name, c in accuracy.consistency.items()]
@@ -216,7 +216,7 @@ def _accuracy_table(name: str, rows: Sequence[AccuracyRow]) -> Table:
     head = ["quantity", "unit", "n", "bias", "scatter", "95 %", "noise", "calibration", "claim / 95 %"]
     lines = []
     for row in rows:
-        k, unit = (_UM, "um") if row.quantity in "xyz" else (_MDEG, "mdeg")
+        k, unit = (_UM, "µm") if row.quantity in "xyz" else (_MDEG, "mdeg")
         errors = (row.bias, row.scatter, row.within_95, row.noise_rms, row.calibration_rms)
         lines.append([row.quantity, unit, str(row.n), *_cells(k, *errors), f"{row.claim / row.within_95:.1f}"])
     note = "Rotation: the rotation vector between measured and true attitude."
@@ -245,7 +245,7 @@ def imperfect_validation(outcomes: Sequence[RenderedOutcome]) -> Validation:
     lines.append(["squared error over variance", *_cells(1, *np.mean(honest, axis=0)), "", ""])
     head = ["seed", *POSE_COMPONENTS, "frame to frame, squared over stated", "repeating, px"]
     note = (
-        "Mean error +- what is stated for it, in um and mdeg. Below 1: the stated sigmas, which hold what board and "
+        "Mean error +- what is stated for it, in µm and mdeg. Below 1: the stated sigmas, which hold what board and "
         "lens may be off by, are larger than these errors."
     )
     headline = f"Mean errors in {len(outcomes)} recordings."

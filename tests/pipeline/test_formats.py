@@ -20,7 +20,7 @@ from tests.oracles.camera_files import write_cine, write_mraw
 
 QUICK = ["--no-figures", "--no-video"]
 CAMERAS = ("left", "right")
-OURS = {"Record_Rate": "1000", "Shutter_Type2": "50000"}  # of a Photron header: as declared, and 50 us
+OURS = {"Record_Rate": "1000", "Shutter_Type2": "50000"}  # of a Photron header: as declared, and 50 µs
 
 
 def tracked(source, rig_file, folder, declared=""):
@@ -130,7 +130,7 @@ def test_the_exposure_moves_poses_by_what_it_should(from_png, from_png_of_50_us)
 def test_poses_from_mraw_of_8_bit_are_those_from_png_to_the_last_bit(recording, from_png_of_50_us, capsys):
     use_mraw(recording, "cihx")
     found = run(recording, "-v")
-    assert "exposure 50 us, trigger Start" in said(capsys)
+    assert "exposure 50 µs, trigger Start" in said(capsys)
     assert_array_equal(read_trajectory(found).q, from_png_of_50_us.q)
     headers = read_details(found)["camera_headers"]
     assert headers["right"]["exposure"] == pytest.approx(5e-5)
@@ -140,7 +140,7 @@ def test_poses_from_mraw_of_8_bit_are_those_from_png_to_the_last_bit(recording, 
 
 
 def test_both_cameras_and_their_times_in_one_hdf5_file(recording, from_png, capsys):
-    """The right camera's clock runs 30 us late; the times of the left one are those of the trajectory."""
+    """The right camera's clock runs 30 µs late; the times of the left one are those of the trajectory."""
     times = 3.0 + np.arange(len(from_png.time)) * 1e-3
     with h5py.File(recording / "both.h5", "w") as file:
         for camera, later in zip(CAMERAS, (0.0, 3e-5), strict=True):
@@ -149,10 +149,10 @@ def test_both_cameras_and_their_times_in_one_hdf5_file(recording, from_png, caps
             file[camera].attrs["frame_rate"] = 1000.0
     use_files(recording, "both.h5:/left/frames", "both.h5:/right/frames")
     found = read_trajectory(run(recording, "-v"))
-    assert "taken 30 us after the left one's" in said(capsys)
+    assert "taken 30 µs after the left one's" in said(capsys)
     assert_array_equal(found.time, times)
     assert_array_equal(found.q, from_png.q)
-    assert any("30 us after" in finding.text for finding in found.findings)
+    assert any("30 µs after" in finding.text for finding in found.findings)
 
 
 def test_a_declared_exposure_that_no_header_confirms_is_told(recording, capsys):
@@ -160,14 +160,14 @@ def test_a_declared_exposure_that_no_header_confirms_is_told(recording, capsys):
     file = recording / "recording.toml"
     file.write_text(file.read_text().replace("[cameras]", "[cameras]\nexposure_us = 500", 1))
     run(recording, "-v")
-    assert "exposure_us is 500, the left camera's header says 50 us" in said(capsys)
+    assert "exposure_us is 500, the left camera's header says 50 µs" in said(capsys)
 
 
 def test_doubts_about_the_headers_are_told_and_kept(recording, capsys):
     use_mraw(recording, right={"Shutter_Type2": "90000"})
     found = run(recording, "-v")
     assert "the cameras exposed for different times" in said(capsys)
-    assert "left 50 us" in "".join(finding.text for finding in read_trajectory(found).findings)
+    assert "left 50 µs" in "".join(finding.text for finding in read_trajectory(found).findings)
 
 
 def test_headers_that_contradict_the_recording_stop_it_before_any_work(recording, capsys):

@@ -174,6 +174,7 @@ FAULTS = {
                               says("calibration", inner_corners=[6, 9])),
     "a dot a millimetre off": fault(Kind.DOTS_MISPLACED, "doubt", "dot 0 by 1.00 mm",
                                     says("markers", centres_mm=[[25.0, 0.0], *DOTS[1:]])),
+    "y down": fault(Kind.DOTS_MISPLACED, "refusal", "y with", says("markers", centres_mm=[[x, -y] for x, y in DOTS])),
     "no dot there": fault(Kind.DOT_UNSEEN, "warning", "dot 5", says("markers", centres_mm=[*DOTS[:5], [0.5, 0.5]])),
     "dots that repeat": fault(Kind.SYMMETRIC_DOTS, "warning", "repeats every 180 deg",
                               says("markers", centres_mm=[DOTS[i] for i in (0, 1, 3, 4)])),
@@ -216,7 +217,7 @@ FAULTS = {
     "pairs lost by both": fault(Kind.CLOCK_JUMP, "doubt", "frame 150: the clock jumps by 3",
                                 planted("pairs lost by both", 3)),
     "one moment twice": fault(Kind.REPEATED_IMAGES, "doubt", "1 repeat of earlier images", one_image_twice),
-    "stamps in ms": fault(Kind.TIME_STAMPS, "doubt", "they tell of 1 frames/s", stacked(timestamps=np.arange(300.0))),
+    "stamps in ms": fault(Kind.TIME_STAMPS, "doubt", "they give 1 frames/s", stacked(timestamps=np.arange(300.0))),
     "the file of a slower camera": fault(Kind.HEADERS, "warning", "file states 500 Hz", stacked(frame_rate=500.0)),
     # the files, and the rest
     "other numbers": fault(Kind.READING, "refusal", "equal numbers must be the same instant", numbered_from_one),

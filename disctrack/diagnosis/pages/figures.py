@@ -167,7 +167,7 @@ def candidates(result: DiscDiagnosis) -> Drawn:
     style: dict[str, Any] = {"textcoords": "offset points", "fontsize": 8, "ha": "right", "va": "center"}
     for row in np.flatnonzero(beyond):
         axes.annotate("without it nothing fits", (gains[row], row), (-4, 0), color="white", **style)
-    caption = "The candidates that gain most. Blue: found; amber: indistinguishable alternatives."
+    caption = "The candidates that explain most. Blue: found; amber: indistinguishable alternatives."
     return Drawn("candidates", "What was tried", caption, figure)
 
 

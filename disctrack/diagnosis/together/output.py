@@ -59,7 +59,7 @@ def accuracy_text(answer: TogetherDiagnosis) -> str:
 
 def misfits_text(answer: TogetherDiagnosis) -> str:
     """Recordings that do not fit the others; empty where all do."""
-    apart = [r.name for r in answer.recordings if r.reason.startswith("does")]
+    apart = [r.name for r in answer.recordings if r.reason and r.name not in answer.unusable]
     return f"{', '.join(apart)} {'does' if len(apart) == 1 else 'do'} not fit the others." if apart else ""
 
 

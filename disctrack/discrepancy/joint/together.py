@@ -147,8 +147,8 @@ def answer_together(
         *_of_recordings(described, kept, reasons, system, diagnosis, alone),
         *(OfRecording(name, {}, reason) for name, reason in unread.items()),
     )
-    bounds, dependences = _bounds(system, diagnosis), _dependences(system, diagnosis)
-    return TogetherDiagnosis(diagnosis, system, by_recording, bounds, dependences, _notes(by_recording), unusable)
+    laws = _bounds(system, diagnosis), _dependences(system, diagnosis)
+    return TogetherDiagnosis(diagnosis, system, by_recording, *laws, _notes(by_recording, unusable), unusable)
 
 
 def _enough(kept: Sequence[int], names: Sequence[str], reasons: Mapping[int, str], unread: Mapping[str, str]) -> None:
@@ -289,9 +289,9 @@ def _dependences(system: JointSystem, diagnosis: Diagnosis) -> tuple[Dependence,
     return tuple(found)
 
 
-def _notes(recordings: Sequence[OfRecording]) -> tuple[str, ...]:
-    notes = [f"{r.name} {r.reason}" if r.reason.startswith("does") else f"{r.name} was left out: {r.reason}"
-             for r in recordings if r.reason]  # fmt: skip
+def _notes(recordings: Sequence[OfRecording], unusable: Sequence[str]) -> tuple[str, ...]:
+    how = dict.fromkeys(unusable, "was left out: ")
+    notes = [f"{r.name} {how.get(r.name, '')}{r.reason}" for r in recordings if r.reason]
     for r in recordings:
         if r.fits_in is not None and r.fits_in.p_value * len(recordings) < OWN_LEVEL:
             notes.append(

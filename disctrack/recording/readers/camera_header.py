@@ -40,7 +40,7 @@ class CameraHeader:
         """The settings in one line."""
         parts = [self.device, self.rate]
         if self.exposure is not None:
-            parts.append(f"exposure {1e6 * self.exposure:g} us")
+            parts.append(f"exposure {1e6 * self.exposure:g} µs")
         if self.trigger:
             parts.append(f"trigger {self.trigger}")
         if self.first_frame is not None:
@@ -110,13 +110,13 @@ def _doubtful(left: CameraHeader, right: CameraHeader) -> list[str]:
     if left.trigger != right.trigger:  # equal modes count from the same event; of unequal ones nothing is known
         found.append(
             f"the cameras were triggered in different modes: left {left.trigger or 'unknown'}, right "
-            f"{right.trigger or 'unknown'}. The headers cannot tell whether frame i of both shows the same instant"
+            f"{right.trigger or 'unknown'}. The headers do not say whether frame i of both shows the same instant"
         )
     if left.exposure is not None and right.exposure is not None and _differ(left.exposure, right.exposure):
         found.append(
-            f"the cameras exposed for different times: left {1e6 * left.exposure:g} us, right "
-            f"{1e6 * right.exposure:g} us. The middles of the exposures lie "
-            f"{0.5e6 * abs(left.exposure - right.exposure):g} us apart if both begin together"
+            f"the cameras exposed for different times: left {1e6 * left.exposure:g} µs, right "
+            f"{1e6 * right.exposure:g} µs. The middles of the exposures lie "
+            f"{0.5e6 * abs(left.exposure - right.exposure):g} µs apart if both begin together"
         )
     if left.recorded is not None and right.recorded is not None:
         apart = abs((left.recorded - right.recorded).total_seconds())
@@ -141,7 +141,7 @@ def other_exposure(left: FrameReader, right: FrameReader, declared: float | None
             continue
         found.append(
             f"{declared_in}: [cameras] exposure_us is {1e6 * declared:g}, the {reader.camera} camera's header says "
-            f"{1e6 * header.exposure:g} us ({header.file}); the declared one is used"
+            f"{1e6 * header.exposure:g} µs ({header.file}); the declared one is used"
         )
     return tuple(found)
 

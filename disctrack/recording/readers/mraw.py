@@ -92,7 +92,7 @@ def _pair_of(files: Sequence[Path], camera: str) -> tuple[Path, Path]:
     header = beside.get(".cihx", beside.get(".cih"))
     if header is None:
         raise RecordingError(
-            f"{files[0]}: there is no {stem.name}.cihx or .cih beside it for the {camera} camera. It tells size and "
+            f"{files[0]}: there is no {stem.name}.cihx or .cih beside it for the {camera} camera. It states size and "
             "depth of the frames: copy it from the camera's folder."
         )
     if ".mraw" not in beside:

@@ -186,10 +186,10 @@ def count_present(layout: PixelLayout, offsets: NDArray[np.integer], ends: NDArr
 def check_present(file: RawFile, camera: str, layout: PixelLayout, n: int, present: int) -> None:
     """Raise RecordingError unless there are frames, and `present` of the n promised, most of them, are in the file."""
     if n < 1:
-        raise RecordingError(f"{file.path} ({camera} camera): its header tells of no frame. Export it again.")
+        raise RecordingError(f"{file.path} ({camera} camera): its header states no frame. Export it again.")
     if present < LEAST_PRESENT * n or present * layout.frame_bytes > file.size:
         raise RecordingError(
-            f"{file.path} ({camera} camera): the header tells of {n} frames of {layout.width} x {layout.height} px, "
+            f"{file.path} ({camera} camera): the header states {n} frames of {layout.width} x {layout.height} px, "
             f"{layout.stored_bits} bit, which need {n * layout.frame_bytes} bytes, but the file has {file.size}: it is "
             "cut short, or the header is of another file. Copy both again."
         )

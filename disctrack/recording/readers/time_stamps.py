@@ -65,7 +65,7 @@ def _fault(times: Array, frame_rate: float) -> str:
         return f"they do not increase from frame {back[0]} to {back[0] + 1}"
     if len(steps) and abs(float(np.median(steps)) * frame_rate - 1.0) > RATE_TOLERANCE:
         rate = 1.0 / float(np.median(steps))
-        return f"they tell of {rate:.6g} frames/s, frame_rate_hz of {frame_rate:.6g} (are they in seconds?)"
+        return f"they give {rate:.6g} frames/s, frame_rate_hz of {frame_rate:.6g} (are they in seconds?)"
     return ""
 
 
@@ -103,18 +103,18 @@ def _between_cameras(left: Array, right: Array, period: float) -> list[str]:
     rest = later - later.mean() - drift * period * index
     if abs(offset) > SAME_INSTANT * period:
         warnings.append(
-            f"by the time stamps the right camera's frames are taken {1e6 * offset:.4g} us after the left one's, "
+            f"by the time stamps the right camera's frames are taken {1e6 * offset:.4g} µs after the left one's, "
             f"{abs(offset) / period:.2g} of a frame: the cameras are not synchronised, or their clocks have other zeros"
         )
     if abs(drift) > DRIFT and abs(drift) * len(later) > SAME_INSTANT:
         warnings.append(
-            f"by the time stamps the cameras' clocks drift apart by {1e6 * drift:+.3g} us per second: each camera runs "
+            f"by the time stamps the cameras' clocks drift apart by {1e6 * drift:+.3g} µs per second: each camera runs "
             "on a clock of its own"
         )
     worst = int(np.argmax(np.abs(rest)))
     if abs(rest[worst]) > SAME_INSTANT * period:
         warnings.append(
-            f"by the time stamps the instants of the two cameras jitter by {1e6 * float(rest.std()):.3g} us (rms), "
-            f"most at frame {worst}: {1e6 * float(rest[worst]):+.3g} us"
+            f"by the time stamps the instants of the two cameras jitter by {1e6 * float(rest.std()):.3g} µs (rms), "
+            f"most at frame {worst}: {1e6 * float(rest[worst]):+.3g} µs"
         )
     return warnings

@@ -77,9 +77,13 @@ def arrangement_found(pair: NDArray, rig: StereoRig, disc: Disc) -> Iterator[Fin
     dots = [acquire(images, rig, layout)[1] for _, images, layout in ways]
     best = dots.index(max(dots))
     if dots[best] >= enough:
-        kind = Kind.MIRRORED if best else Kind.EXCHANGED
-        remedy = Remedy("[cameras] left, right", action="store them as the views are" if best else "exchange the two")
-        yield Finding(kind, Severity.DOUBT, ways[best][0], remedies=(remedy,), explains=NONSENSE)
+        text, _, layout = ways[best]
+        kind, action = (Kind.MIRRORED, "store them as the views are") if best else (Kind.EXCHANGED, "exchange the two")
+        remedies = [Remedy("[cameras] left, right", action=action)]
+        if layout is not disc:
+            kind, mirror = Kind.DOTS_MISPLACED, Remedy("[markers] centres_mm", action="y with the other sign")
+            remedies.insert(0, mirror)
+        yield Finding(kind, Severity.DOUBT, text, remedies=tuple(remedies), explains=NONSENSE)
 
 
 def _ways(pair: NDArray, disc: Disc) -> Iterator[tuple[str, tuple[NDArray, NDArray], Disc]]:
@@ -94,10 +98,7 @@ def _ways(pair: NDArray, disc: Disc) -> Iterator[tuple[str, tuple[NDArray, NDArr
         yield f"the {CAMERAS[1]} camera's images are {what} {since}", (left, other), disc
     if not has_mirror_axis(disc):
         seen_in_a_mirror = replace(disc, marker_centres_body=disc.marker_centres_body * [1.0, -1.0, 1.0])
-        told = (
-            "the dots are those of [markers] seen in a mirror: all images are mirrored, or y of centres_mm counts down"
-        )
-        yield told, (left, right), seen_in_a_mirror
+        yield "the dots are those of [markers] as a mirror shows them", (left, right), seen_in_a_mirror
 
 
 def moved_camera(pairs: NDArray, rig: StereoRig, disc: Disc) -> Iterator[Finding]:

@@ -100,13 +100,13 @@ def _shaken(factor: Array, trajectory: Trajectory) -> tuple[Finding, ...]:
     for name, group in zip(names, GROUPS, strict=True):
         times, sigma = np.sqrt(factor[group[0]]), np.sqrt(np.mean(variance[list(group)]))
         if times > SHAKEN:
-            length = f"{1e6 * sigma:.1f} um" if group[0] < 3 else f"{1e3 * np.degrees(sigma):.1f} mdeg"
+            length = f"{1e6 * sigma:.1f} µm" if group[0] < 3 else f"{1e3 * np.degrees(sigma):.1f} mdeg"
             told.append(f"{name} by {length} ({times:.1f} times)")
     if not told:
         return ()
     text = (
-        f"from frame to frame poses scatter more than their dots tell: {', '.join(told)}. Dots that err alike leave no "
-        "residual: a camera or the table trembles, or the frames were compressed as video. The sigmas follow"
+        f"from frame to frame poses scatter more than their dots explain: {', '.join(told)}. Dots that err alike leave "
+        "no residual: a camera or the table trembles, or the frames were compressed as video. The sigmas follow"
     )
     explains = Kind.DOTS_SCATTER, Kind.TABLE_DISAGREES, Kind.FRAMES_LOST, Kind.ACCURACY
     return (Finding(Kind.POSES_SCATTER, Severity.WARNING, text, explains=explains),)
@@ -118,7 +118,7 @@ def _misfit(seen: str, ahead: float, explained: float, frame_rate: float) -> Fin
         lags = "" if explained < HARDLY else ", or one lags"
         text = (
             f"{seen}: a camera moved or was refocused since the calibration{lags} (a delay between the two would "
-            f"explain {100 * explained:.0f} % of it). `disctrack diagnose` tells which and by how much; calibrate again"
+            f"explain {100 * explained:.0f} % of it). `disctrack diagnose` names it with its size; calibrate again"
         )
         # now this, now that dot is struck, which shakes the poses
         explains = Kind.POSES_SCATTER, Kind.TABLE_DISAGREES, Kind.FRAMES_LOST, Kind.ACCURACY
@@ -166,7 +166,7 @@ def doubts_of(
     systematic_px = max(scatter.systematic_px)
     if scatter.whole > min(FAULTY * own, HOPELESS) and systematic_px > ORDINARY_PX:
         times = np.sqrt(scatter.whole / own)
-        text = f"the dots miss their fitted places by {times:.1f} times their own scatter ({systematic_px:.3f} px)"
+        text = f"the dots miss their fitted places by {times:.1f} times their scatter ({systematic_px:.3f} px)"
         found.append(_misfit(text, *delay_of_right(seen, np.flatnonzero(seen.posed)), trajectory.frame_rate))
     elif scatter.noise > 4.0:
         text = (
@@ -215,7 +215,7 @@ def _lost(trajectory: Trajectory) -> Iterator[Finding]:
     counts = {reason: int(np.sum(status == reason)) for reason in reasons}
     lost, measured, most = sum(counts.values()), int(trajectory.measured.sum()), max(reasons, key=lambda r: counts[r])
     if lost > measured:
-        text = f"{lost} of {lost + measured} frames have no pose; {counts[most]} of them: {most.sentence}"
+        text = f"{lost} of {lost + measured} frames have no pose; most often: {most.sentence} ({counts[most]})"
         yield Finding(Kind.FRAMES_LOST, Severity.DOUBT, text, Subject("track"))
 
 

@@ -110,7 +110,7 @@ def exposure_of(
     told = ", ".join(text for text in words if text)
     if declared is None:
         seconds = _likely(found, longest)
-        note = f"exposure by the smear of the moving dots: {told}; poses are of the middle of {1e6 * seconds:.0f} us"
+        note = f"exposure by the smear of the moving dots: {told}; poses are of the middle of {1e6 * seconds:.0f} µs"
         return (seconds, seconds), (Finding(Kind.EXPOSURE, Severity.NOTE, note),) if seconds else ()
     expected = np.array(declared) ** 2
     value, sigma = found
@@ -119,7 +119,7 @@ def exposure_of(
         return declared, ()
     said = " and ".join(f"{1e6 * T:g}" for T in declared)
     text = (
-        f"exposure_us is declared (or in the cameras' headers) as {said} us, the smear of the moving dots tells "
+        f"exposure_us is declared (or in the cameras' headers) as {said} µs, the smear of the moving dots shows "
         f"{told}. The declared one is used: poses are off by up to g T^2 / (6 r) in theta if it is wrong"
     )
     return declared, (Finding(Kind.EXPOSURE, Severity.WARNING, text, explains=(Kind.TABLE_DISAGREES,)),)
@@ -145,8 +145,8 @@ def _in_words(camera: str, squared: float, sigma: float) -> str:
     if not np.isfinite(sigma):
         return ""
     if squared > SURE * sigma:
-        return f"{camera} {1e6 * np.sqrt(squared):.0f} +- {5e5 * sigma / np.sqrt(squared):.0f} us"
-    return f"{camera} below {1e6 * np.sqrt(max(squared, 0.0) + SURE * sigma):.0f} us"
+        return f"{camera} {1e6 * np.sqrt(squared):.0f} ± {5e5 * sigma / np.sqrt(squared):.0f} µs"
+    return f"{camera} below {1e6 * np.sqrt(max(squared, 0.0) + SURE * sigma):.0f} µs"
 
 
 def _second_order(R: Array, t: Array, time: Array, rig: StereoRig, disc: Disc, edges: tuple[Edge, Edge]) -> Array:

@@ -106,7 +106,7 @@ def test_a_terminal_gets_ten_lines_the_gravest_first_and_is_told_of_the_rest():
     lines = short(found, 80)
     assert 8 <= len(lines) <= 10
     assert lines[0].split() == ["doubt", "doubtful"]  # before the result
-    assert lines[4].endswith("…")  # of a long verdict
+    assert lines[4].endswith("long …")  # of a long verdict, between two words
     assert max(map(len, lines)) <= 80
     assert any("more: -v shows them" in line for line in lines)
     assert lines[-2].split(maxsplit=1) == ["page", "a page.html"]

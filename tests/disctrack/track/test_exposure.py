@@ -145,7 +145,7 @@ def test_an_exposure_longer_than_a_frame_is_refused(tmp_path, sample_clip):
     declared.write_text(text.replace("[cameras]", "[cameras]\nexposure_us = 200", 1))
     assert read_recording(tmp_path).exposure == pytest.approx(200e-6)
     declared.write_text(text.replace("[cameras]", "[cameras]\nexposure_us = 1200", 1))
-    with pytest.raises(RecordingError, match="exposure_us is 1200, longer than a frame: 1000 us"):
+    with pytest.raises(RecordingError, match="exposure_us is 1200, longer than a frame: 1000 µs"):
         read_recording(tmp_path)
 
 
@@ -174,13 +174,13 @@ def test_the_smear_tells_the_exposure(measured):
     assert "exposure by the smear" in said_of(smeared, Severity.NOTE)[0]
     assert told.details["exposure_s"] == [EXPOSURE, EXPOSURE]
     assert not said_of(told, Severity.WARNING)
-    for run, said in ((none, "0 and 0 us"), (wrong, "200 and 200 us")):
+    for run, said in ((none, "0 and 0 µs"), (wrong, "200 and 200 µs")):
         (warning,) = said_of(run, Severity.WARNING)
         assert said in warning
 
 
 def test_a_blur_that_changes_with_obliqueness_is_no_exposure(motion, rendered_pairs):
-    """Of 2e-4 px, as curved edges have; a dot's smear by 200 us is some 1e-3 px of blur."""
+    """Of 2e-4 px, as curved edges have; a dot's smear by 200 µs is some 1e-3 px of blur."""
     q, rig, disc = motion[0][:, 4], rendered_pairs.rig, rendered_pairs.disc
     R = frames.rotation_from_euler(*q[:, 3:].T)
     pixels, J = marker_pixels(R, q[:, :3], rig, disc.marker_centres_body)

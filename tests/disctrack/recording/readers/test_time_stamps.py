@@ -33,10 +33,10 @@ def test_cameras_that_run_together_are_not_warned_of(rng):
 @pytest.mark.parametrize(
     ("times", "reason"),
     [
-        (1e3 * EVEN, "tell of 1 frames/s, frame_rate_hz of 1000"),
+        (1e3 * EVEN, "give 1 frames/s, frame_rate_hz of 1000"),
         (np.where(np.arange(N) == 31, np.nan, EVEN), "frame 31 is not a number"),
         (np.where(np.arange(N) == 31, EVEN[30], EVEN), "do not increase from frame 30 to 31"),
-        (EVEN * 1.02, "tell of 980.392 frames/s"),
+        (EVEN * 1.02, "give 980.392 frames/s"),
     ],
 )
 def test_stamps_that_cannot_be_meant_are_not_used_and_why_is_said(times, reason):
@@ -65,11 +65,11 @@ def test_a_frame_lost_by_one_camera_alone_parts_the_pairs_from_there_on():
 @pytest.mark.parametrize("offset", [2.5e-4, -0.3])
 def test_a_constant_offset_is_measured(offset):
     (warning,) = warnings_of(EVEN, EVEN + offset)
-    assert f"{1e6 * offset:.4g} us after" in warning
+    assert f"{1e6 * offset:.4g} µs after" in warning
 
 
 def test_clocks_of_their_own_are_told_by_their_drift_and_jitter_by_its_worst_frame():
     (drift,) = warnings_of(EVEN, EVEN[0] + (EVEN - EVEN[0]) * (1 + 4e-5) - 8e-6)
-    assert "drift apart by +40 us per second" in drift
+    assert "drift apart by +40 µs per second" in drift
     (jitter,) = warnings_of(EVEN, EVEN + np.where(np.arange(N) == 222, 1e-4, 0))
     assert "most at frame 222: +99" in jitter
