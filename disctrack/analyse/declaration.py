@@ -219,7 +219,7 @@ def motion_against_gravity(trajectory: Trajectory, height: float | None = None) 
     if away > np.log1p(NOTED) and abs(gravity - g) > SIGMAS * sigma:
         text = (
             f"the motion satisfies the balance of moments with a gravity of {Measured(gravity, sigma, 'm/s^2')} ({n} "
-            f"stretches of {BLOCK} frames); expected {g:.4g} m/s^2 at {trajectory.frame_rate:g} frames a second, "
+            f"stretches of {BLOCK} frames); expected {g:.4g} m/s² at {trajectory.frame_rate:g} frames a second, "
             "nothing but the table touching the disc"
         )
         numbers = {"gravity": Measured(gravity, sigma, "m/s^2")}
@@ -256,7 +256,7 @@ def _of_gravity(trajectory: Trajectory, ratio: float, height: float | None) -> t
     nearest = int(np.argmin(departures))
     usual = f"{USUAL_RATES[nearest]:g} is usual" if departures[nearest] < 0.05 else ""
     true_rate = USUAL_RATES[nearest] if departures[nearest] < USUALLY else true_rate
-    unit = "if it was given in mm/s^2" if abs(np.log(1e3 * ratio)) < 0.1 else ""
+    unit = "if it was given in mm/s²" if abs(np.log(1e3 * ratio)) < 0.1 else ""
     by_gravity = Remedy("[gravity] g_m_s2", f"{g * ratio:.4g}", f"{g:g}", unit)
     by_rate = Remedy("[cameras] frame_rate_hz", f"{true_rate:.4g}", f"{rate:g}", usual)
     return (
@@ -287,7 +287,7 @@ def density(disc: Disc) -> tuple[Finding, ...]:
     sizes = {"mass_g": disc.mass, "radius_mm": disc.radius, "thickness_mm": 2 * disc.half_thickness}
     remedies = tuple(Remedy(f"[disc] {key}", declared=f"{1e3 * size:g}") for key, size in sizes.items())
     text = (
-        f"mass, radius and thickness give the disc a density of {1e-3 * found:.2g} g/cm^3; expected 0.05 (foam) to 23 "
+        f"mass, radius and thickness give the disc a density of {1e-3 * found:.2g} g/cm³; expected 0.05 (foam) to 23 "
         "(osmium)"
     )
     return (Finding(Kind.DENSITY, Severity.WARNING, text, remedies=remedies),)
