@@ -86,21 +86,19 @@ class Ellipse(NamedTuple):
     short: float
 
 
-class Pixels(NamedTuple):
-    """What is kept of every pixel (n), in single precision."""
-
-    rows: Array  # (6, n) those that follow
-    x: Array  # place on the plane from the expected centre [px]
-    y: Array
-    offset_x: Array  # place in the image from the expected centre [10 px]
-    offset_y: Array
-    grey: Array
-    distance: Array  # from the edge
-    jacobian: Array  # (8, n) by the parameters, over the pixel's sigma; before, the pixels that are to be chosen from
-    residual: Array  # over the pixel's sigma
-    weight: Array  # one over that
-
-
+# What is kept of every pixel (n), in single precision: rows of an array (16, n). The first six are those of `_select_pixels`;
+# the next eight the derivatives by the template's parameters, over the pixel's sigma, and before the pixels that are to
+# be chosen from.
+(
+    X,  # place on the plane from the expected centre [px]
+    Y,
+    OFFSET_X,  # place in the image from the expected centre [10 px]
+    OFFSET_Y,
+    GREY,
+    DISTANCE,  # from the edge
+    JACOBIAN,
+) = range(7)
+RESIDUAL, WEIGHT, _ROWS = 14, 15, 16  # over the pixel's sigma; one over that
 _PIXELS = 4096 + 64  # of a dot of 60 px; more are made room for. No power of two: rows would share lines of the cache
 _MAX_SELECTIONS = 4
 _MAX_ITERATIONS = 20
@@ -134,14 +132,6 @@ _EXP = tuple(
     .convert(kind=np.polynomial.Polynomial)
     .coef
 )
-
-
-@_part
-def _room(n):
-    """Scratch for n pixels."""
-    block = np.empty((16, n), np.float32)
-    rows, jacobian = block[:6], block[6:14]
-    return Pixels(rows, block[0], block[1], block[2], block[3], block[4], block[5], jacobian, block[14], block[15])
 
 
 @_part
@@ -243,7 +233,7 @@ def _select_pixels(image, map_x, map_y, P, start, window, rim, neighbours, G, un
     x_from, y_from = start[0] / unit, start[1] / unit
     X0, X1, X2, Y0, Y1, Y2 = P[0, 0], P[0, 1], P[0, 2], P[1, 0], P[1, 1], P[1, 2]
     w0, w1, w2 = unit * P[2, 0], unit * P[2, 1], unit * P[2, 2]
-    found, n = pixels.jacobian, 0
+    found, n = pixels[JACOBIAN:], 0
     for y in range(y_lo, y_hi + 1):
         dy = y - v0
         reach2 = (rim_xy * rim_xy - rim_xx * rim_yy) * dy * dy + rim_xx
@@ -296,12 +286,12 @@ def _select_pixels(image, map_x, map_y, P, start, window, rim, neighbours, G, un
             for j in range(neighbours.shape[0]):
                 good &= math.hypot(X - neighbours[j, 0], Y - neighbours[j, 1]) - start[2] >= 3.0 * blur
         for row in range(6):
-            pixels.rows[row, kept] = found[row, i]
+            pixels[row, kept] = found[row, i]
         kept += 1 if good else 0
     inside_sum, inside_n, outside_sum, outside_n = 0.0, 0.0, 0.0, 0.0
     well_inside, well_outside = _f(-min(1.2 * p[SIGMA], 0.4 * p[RADIUS] / steepest)), _f(1.2 * p[SIGMA])
     for i in range(kept):
-        d, grey = pixels.distance[i], pixels.grey[i]
+        d, grey = pixels[DISTANCE, i], pixels[GREY, i]
         is_in, is_out = _1 if d < well_inside else _0, _1 if d > well_outside else _0
         inside_n += is_in
         outside_n += is_out
@@ -319,17 +309,17 @@ def _lit(pixels, i, covered, level, slope_x, slope_y, contrast, limit):
     Returns the light, the weight (0 where the squared residual exceeds the limit), what it adds to chi-square, and 1
     where it is clipped.
     """
-    x, y, J = pixels.offset_x[i], pixels.offset_y[i], pixels.jacobian
+    x, y, J = pixels[OFFSET_X, i], pixels[OFFSET_Y, i], pixels[JACOBIAN:]
     light = level + slope_x * x + slope_y * y
-    weight = pixels.weight[i]
-    r = weight * (pixels.grey[i] - light * (_1 - contrast * covered))
+    weight = pixels[WEIGHT, i]
+    r = weight * (pixels[GREY, i] - light * (_1 - contrast * covered))
     squared = r * r
     fits = _1 if squared <= limit else _0
     weight *= fits
     seen = (_1 - contrast * covered) * weight
     J[LEVEL, i], J[SLOPE_X, i], J[SLOPE_Y, i] = seen, seen * x, seen * y
     J[CONTRAST, i] = -light * covered * weight
-    pixels.residual[i] = r * fits
+    pixels[RESIDUAL, i] = r * fits
     return light, weight, min(squared, limit), _1 - fits
 
 
@@ -347,11 +337,11 @@ def _whitened_model(pixels, n, p, G, det, clip):
     inv_sigma, sigma, half_sigma = _f(1.0 / p[SIGMA]), _f(p[SIGMA]), _f(0.5 * p[SIGMA])
     level, slope_x, slope_y, limit = _f(p[LEVEL]), _f(p[SLOPE_X]), _f(p[SLOPE_Y]), _f(clip)
     half_step = _f(0.05)
-    chi2, n_clipped, J = _0, _0, pixels.jacobian
+    chi2, n_clipped, J = _0, _0, pixels[JACOBIAN:]
     for i in range(n):
-        x, y = pixels.offset_x[i], pixels.offset_y[i]
+        x, y = pixels[OFFSET_X, i], pixels[OFFSET_Y, i]
         d, slope, nx, ny, inv_g, curvature = _edge_distance(
-            pixels.x[i] - a, pixels.y[i] - b, radius, g00, g01, g10, g11, det2
+            pixels[X, i] - a, pixels[Y, i] - b, radius, g00, g01, g10, g11, det2
         )
         # the gradient was taken at the dot's centre: perspective changes the scale over the dot, and what counts is the
         # scale half way between the pixel and the edge (at the pixel itself it would shift centres by 5e-4 px)
@@ -432,9 +422,9 @@ def _whitened_ellipse(pixels, n, p, ellipse, nodes, clip):
     inv_radius, inv_sigma, ten = _f(1.0 / p[RADIUS]), _f(in_sigma), _f(10.0)
     contrast, level, slope_x, slope_y = _f(p[CONTRAST]), _f(p[LEVEL]), _f(p[SLOPE_X]), _f(p[SLOPE_Y])
     limit = _f(clip)
-    chi2, n_clipped, J = _0, _0, pixels.jacobian
+    chi2, n_clipped, J = _0, _0, pixels[JACOBIAN:]
     for i in range(n):
-        x, y = pixels.offset_x[i], pixels.offset_y[i]
+        x, y = pixels[OFFSET_X, i], pixels[OFFSET_Y, i]
         from_u, from_v = ten * x - from_x, ten * y - from_y
         along, across = along_x * from_u + along_y * from_v, along_x * from_v - along_y * from_u
         covered, d_along, d_across, edge = _0, _0, _0, _0
@@ -495,10 +485,11 @@ def _descend(pixels, n, p, G, det, px_per_unit, radius, clip, work, blurred, ell
         if not rejected:
             damping = max(0.03 * damping, 1e-9)
         last, rejected = chi2, False
+        residual = pixels[RESIDUAL]
         for j in range(0, 8, 2):  # two by two: what is loaded serves twice
-            row, next_row = pixels.jacobian[j], pixels.jacobian[j + 1]
+            row, next_row = pixels[JACOBIAN + j], pixels[JACOBIAN + j + 1]
             for k in range(0, j + 1, 2):
-                column, next_column = pixels.jacobian[k], pixels.jacobian[k + 1]
+                column, next_column = pixels[JACOBIAN + k], pixels[JACOBIAN + k + 1]
                 a, b, c, d = _0, _0, _0, _0
                 for i in range(n):
                     a += row[i] * column[i]
@@ -508,8 +499,8 @@ def _descend(pixels, n, p, G, det, px_per_unit, radius, clip, work, blurred, ell
                 M[j, k], M[j, k + 1], M[j + 1, k], M[j + 1, k + 1] = a, b, c, d
             a, b = _0, _0
             for i in range(n):
-                a += row[i] * pixels.residual[i]
-                b += next_row[i] * pixels.residual[i]
+                a += row[i] * residual[i]
+                b += next_row[i] * residual[i]
             rhs[j], rhs[j + 1] = a, b
         if blurred:
             M[RADIUS, RADIUS] += 1.0 / (_RADIUS_PRIOR * radius) ** 2
@@ -590,8 +581,8 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, neighbours, pixel
         if window[0] < 1 or window[2] < 1 or window[1] > width - 2 or window[3] > height - 2:
             return OUTSIDE
         room = (window[1] - window[0] + 1) * (window[3] - window[2] + 1) + 1
-        if room > pixels.weight.shape[0]:
-            pixels = _room(room)
+        if room > pixels.shape[1]:
+            pixels = np.empty((_ROWS, room), np.float32)
         n, inside, outside = _select_pixels(
             image, map_x, map_y, P, start, window, rim, neighbours, G, unit, largest, p, u0, v0, pixels
         )
@@ -609,7 +600,7 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, neighbours, pixel
         in_light = 1.0 / light
         read_32, gain_32, floor = _f(read), _f(gain), _f(step2 / 12.0)
         level, step, inv_sigma = _f(p[LEVEL]), _f(dark - p[LEVEL]), _f(1.0 / p[SIGMA])
-        distance, weight, grey = pixels.distance, pixels.weight, pixels.grey
+        distance, weight, grey = pixels[DISTANCE], pixels[WEIGHT], pixels[GREY]
         for i in range(n):
             # weights from the expected grey value: the noisy one would pull the fit towards dark pixels
             s, bell = _edge_profile(distance[i] * inv_sigma)
@@ -638,7 +629,7 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, neighbours, pixel
             limit = _CLIP_SIGMA * _CLIP_SIGMA * max(1.0, chi2 / n)
             worst = _0
             for i in range(n):
-                worst = max(worst, abs(pixels.residual[i]))
+                worst = max(worst, abs(pixels[RESIDUAL, i]))
             if worst * worst <= limit:
                 break
         if settled:
@@ -895,7 +886,7 @@ def track_frames(images, readable, views, face, expected, heading, results, stat
     less than n where the disc was lost at that frame.
     """
     (R_last, t_last), (R_before, t_before), (R_older, t_older) = heading
-    pixels, work = _room(_PIXELS), (np.empty((8, 8)), np.empty(8), np.empty(8), np.empty(8))
+    pixels, work = np.empty((_ROWS, _PIXELS), np.float32), (np.empty((8, 8)), np.empty(8), np.empty(8), np.empty(8))
     R, t, R_expected = np.empty((3, 3)), np.empty(3), np.empty((3, 3))
     for f in range(images.shape[0]):
         _predict(R_last, R_before, R_older, t_last, t_before, t_older, R, t)
@@ -924,5 +915,5 @@ def track_frames(images, readable, views, face, expected, heading, results, stat
 @_entry
 def look(images, readable, views, face, expected, R, t, results, status):
     """`_look` where Python calls it."""
-    pixels, work = _room(_PIXELS), (np.empty((8, 8)), np.empty(8), np.empty(8), np.empty(8))
+    pixels, work = np.empty((_ROWS, _PIXELS), np.float32), (np.empty((8, 8)), np.empty(8), np.empty(8), np.empty(8))
     _look(images, readable, views, face, expected, R, t, pixels, work, results, status)
