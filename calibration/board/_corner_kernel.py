@@ -43,7 +43,7 @@ _SQRT_HALF = math.sqrt(0.5)
 @part
 def nodes(rho):  # type: ignore[no-untyped-def]
     """Quadrature over the angle 0..asin(rho): weight, sine and 1 / (2 cos^2) at each node."""
-    table = np.empty((_N_NODES, 3))
+    table = np.zeros((_N_NODES, 3))
     half = 0.5 * math.asin(rho)
     for n in range(_N_NODES):
         sine = math.sin(half * (1.0 + _X[n]))
@@ -86,7 +86,7 @@ def normal_equations(image, window, p, known, noise, weights, first_pass, H, g):
     i and j [squares]; largest step [px]; distance from both edges [squares] beyond which the light squares are
     not plain (a marker), positive if they lie where i j > 0, negative if where i j < 0.
     """
-    gradient, S4 = np.zeros(N_CORNER), np.empty(4)
+    gradient, S4 = np.zeros(N_CORNER), np.zeros(4)
     H[:] = 0.0
     g[:] = 0.0
     sums = np.zeros(9)  # chi2, n; dark: r2, grey, n; light: r2, grey, n; edge chi2
@@ -176,77 +176,60 @@ def solve_damped(H, damping, rhs, L):  # type: ignore[no-untyped-def]
     return solve_in_place(L, rhs)
 
 
-@part
-def fit_corner(image, window, p, known, noise, iterations, tolerance, covariance):  # type: ignore[no-untyped-def]
-    """Levenberg-Marquardt on p (9,) in place; covariance (2, 2) of x, y is filled. Returns sums and success."""
-    H, g = np.empty((N_CORNER, N_CORNER)), np.empty(N_CORNER)
-    H_new, g_new = np.empty((N_CORNER, N_CORNER)), np.empty(N_CORNER)
-    L = np.zeros((N_CORNER, N_CORNER))
-    covariance[:] = np.nan
-    weights = np.empty((max(int(window[3] - window[2]) + 1, 1), max(int(window[1] - window[0]) + 1, 1)))
-    sums = normal_equations(image, window, p, known, noise, weights, np.bool_(True), H, g)
-    if sums[1] < 4 * N_CORNER:
-        return sums, False
-    damping, converged = 1e-3, False
-    for _ in range(iterations):
-        if p[4] <= MIN_BLUR and g[4] < 0.0:  # held at its bound, so that the others go to their own minimum
-            H[4, :4], H[5:, 4], H[4, 4], g[4] = 0.0, 0.0, 1.0, 0.0
-        step = g.copy()
-        if not solve_damped(H, damping, step, L):
-            damping = 10.0 * damping
-            if damping > 1e8:
-                break
-            continue
-        trial = np.empty(N_CORNER)
-        for i in range(N_CORNER):
-            trial[i] = p[i] + step[i]
-        trial[4] = min(max(trial[4], 0.5 * p[4], MIN_BLUR), 2.0 * p[4])
-        reach = math.hypot(trial[0] - window[4], trial[1] - window[5])
-        accepted = reach < window[12] and abs(math.cos(trial[3] - trial[2])) < 0.985
-        if accepted:
-            sums_new = normal_equations(image, window, trial, known, noise, weights, np.bool_(False), H_new, g_new)
-            accepted = sums_new[0] <= sums[0] * (1 + 1e-12)
-        if accepted:
-            blur_step = trial[4] - p[4]  # as clamped: edges sharper than the pixel hold it at its lower bound
-            for i in range(N_CORNER):
-                p[i] = trial[i]
-            sums = sums_new
-            H, H_new = H_new, H
-            g, g_new = g_new, g
-            damping = max(damping * 0.1, 1e-9)
-            if abs(step[0]) < tolerance and abs(step[1]) < tolerance and abs(blur_step) < 10 * tolerance:
-                converged = True
-                break
-        else:
-            damping *= 10.0
-            if damping > 1e8:
-                break
-    for axis in range(2):
-        unit = np.zeros(N_CORNER)
-        unit[axis] = 1.0
-        if not solve_damped(H, 0.0, unit, L):
-            return sums, False
-        covariance[0, axis], covariance[1, axis] = unit[0], unit[1]
-    if not converged:  # what is left to go may be small beside the error: the box's share of the slope is approximate
-        step = g.copy()
-        solve_damped(H, 0.0, step, L)
-        square = NEAR**2 * max(sums[0] / sums[1], 1.0)
-        converged = step[0] ** 2 < square * covariance[0, 0] and step[1] ** 2 < square * covariance[1, 1]
-    return sums, converged
-
-
 @njit(cache=True, nogil=True)
 def fit_corners(image, windows, starts, known, noise, iterations, tolerance):  # type: ignore[no-untyped-def]
-    """`fit_corner` for many corners of one image: parameters (n, 9), covariances (n, 2, 2), sums (n, 9), converged."""
-    n = starts.shape[0]
-    found = starts.copy()
-    covariance = np.empty((n, 2, 2))
-    sums = np.empty((n, 9))
-    converged = np.empty(n, np.bool_)
-    for i in range(n):
-        own, converged[i] = fit_corner(
-            image, windows[i], found[i], known[i], noise, iterations, tolerance, covariance[i]
-        )
-        for k in range(own.shape[0]):
-            sums[i, k] = own[k]
-    return found, covariance, sums, converged
+    """Levenberg-Marquardt on many corners of one image.
+
+    Parameters (n, 9), covariances (n, 2, 2) of x and y, sums (n, 9) as `normal_equations` has them, converged (n,).
+    """
+    n, found = starts.shape[0], starts.copy()
+    covariance, all_sums, converged = np.zeros((n, 2, 2)), np.zeros((n, N_CORNER)), np.zeros(n, np.bool_)
+    H, H_new, L = np.zeros((N_CORNER, N_CORNER)), np.zeros((N_CORNER, N_CORNER)), np.zeros((N_CORNER, N_CORNER))
+    g, g_new, step, trial = np.zeros(N_CORNER), np.zeros(N_CORNER), np.zeros(N_CORNER), np.zeros(N_CORNER)
+    for c in range(n):
+        window, p, sums = windows[c], found[c], all_sums[c]
+        weights = np.zeros((max(int(window[3] - window[2]) + 1, 1), max(int(window[1] - window[0]) + 1, 1)))
+        damping, done, possible, enough, blur = 1e-2, False, True, True, p[4]
+        for i in range(N_CORNER):
+            trial[i] = p[i]
+        for k in range(iterations + 1):
+            accepted = possible
+            if possible:
+                new = normal_equations(image, window, trial, known[c], noise, weights, k == 0, H_new, g_new)
+                accepted = k == 0 or new[0] <= sums[0] * (1 + 1e-12)
+            if accepted:
+                blur = p[4]
+                for i in range(N_CORNER):
+                    p[i], sums[i] = trial[i], new[i]
+                H, H_new = H_new, H
+                g, g_new = g_new, g
+                damping = max(damping * 0.1, 1e-9)
+                # the blur as clamped: edges sharper than the pixel hold it at its lower bound
+                done = k > 0 and abs(step[0]) < tolerance and abs(step[1]) < tolerance
+                done = done and abs(p[4] - blur) < 10 * tolerance
+            else:
+                damping *= 10.0
+            enough = sums[1] >= 4 * N_CORNER
+            if done or damping > 1e8 or not enough:
+                break
+            if p[4] <= MIN_BLUR and g[4] < 0.0:  # held at its bound, so that the others go to their own minimum
+                H[4, :4], H[5:, 4], H[4, 4], g[4] = 0.0, 0.0, 1.0, 0.0
+            for i in range(N_CORNER):
+                step[i] = g[i]
+            possible = solve_damped(H, damping, step, L)
+            for i in range(N_CORNER):
+                trial[i] = p[i] + step[i]
+            trial[4] = min(max(trial[4], 0.5 * p[4], MIN_BLUR), 2.0 * p[4])
+            reach = math.hypot(trial[0] - window[4], trial[1] - window[5])
+            possible &= reach < window[12] and abs(math.cos(trial[3] - trial[2])) < 0.985
+        for axis in range(3):  # of the inverse the columns of x and y; and what is left to go
+            for i in range(N_CORNER):
+                step[i] = g[i] if axis == 2 else 1.0 if i == axis else 0.0
+            enough &= solve_damped(H, 0.0, step, L)
+            if axis < 2:
+                covariance[c, 0, axis], covariance[c, 1, axis] = step[0], step[1]
+        # it may be small beside the error: the box's share of the slope is approximate
+        square = NEAR**2 * max(sums[0] / max(sums[1], 1.0), 1.0)
+        near = step[0] ** 2 < square * covariance[c, 0, 0] and step[1] ** 2 < square * covariance[c, 1, 1]
+        converged[c] = enough and (done or near)
+    return found, covariance, all_sums, converged

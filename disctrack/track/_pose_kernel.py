@@ -69,29 +69,14 @@ def fit(rows, observed, covariance, used, cameras, R_cw, t_cw, centres, toleranc
     sums, trial_sums, damped, step = np.empty((7, 6)), np.empty((7, 6)), np.empty((6, 6)), np.empty(6)
     R_trial, t_trial = np.empty((3, 3)), np.empty(3)
     for f in rows:
-        cost = _evaluate(observed[f], covariance[f], used[f], cameras, R_cw, t_cw, centres, R[f], t[f], pixels[f],
-                         residuals[f], jacobian[f], sums)  # fmt: skip
-        damping, converged[f] = 1e-8, False
-        for _ in range(_MAX_ITERATIONS if tolerance >= 0.0 else 0):
-            _copy(damped, sums[:6])
-            for i in range(6):
-                step[i] = sums[6, i]
-                damped[i, i] += damping * damped[i, i]
-                if damped[i, i] <= 1e-300:  # a parameter that no datum sees stays where it is
-                    damped[i, i] = 1.0
-            solved = solve_in_place(damped, step)
-            length2 = 0.0
-            for i in range(6):
-                length2 += sums[i, i] * step[i] * step[i]
-                for j in range(i):
-                    length2 += 2.0 * sums[i, j] * step[i] * step[j]
-            _rotate_from_left(step[3:6], R[f], R_trial)
-            for i in range(3):
-                t_trial[i] = t[f, i] + step[i]
+        cost, damping, converged[f], solved, small = np.inf, 1e-7, False, True, False
+        _copy(R_trial, R[f])
+        for i in range(3):
+            t_trial[i] = t[f, i]
+        for k in range(_MAX_ITERATIONS + 1 if tolerance >= 0.0 else 1):
             new = _evaluate(observed[f], covariance[f], used[f], cameras, R_cw, t_cw, centres, R_trial, t_trial,
                             trial_pixels, trial_residuals, trial_jacobian, trial_sums)  # fmt: skip
-            small = solved and length2 < tolerance * tolerance and damping < 1e-2
-            if solved and (new < cost or (small and new <= cost * (1.0 + 1e-9) + 1e-12)):
+            if k == 0 or (solved and (new < cost or (small and new <= cost * (1.0 + 1e-9) + 1e-12))):
                 cost, damping = new, max(0.1 * damping, 1e-10)
                 _copy(R[f], R_trial)
                 _copy(sums, trial_sums)
@@ -107,3 +92,19 @@ def fit(rows, observed, covariance, used, cameras, R_cw, t_cw, centres, toleranc
             if small or damping > MAX_DAMPING:
                 converged[f] = small
                 break
+            _copy(damped, sums[:6])
+            for i in range(6):
+                step[i] = sums[6, i]
+                damped[i, i] += damping * damped[i, i]
+                if damped[i, i] <= 1e-300:  # a parameter that no datum sees stays where it is
+                    damped[i, i] = 1.0
+            solved = solve_in_place(damped, step)
+            length2 = 0.0
+            for i in range(6):
+                length2 += sums[i, i] * step[i] * step[i]
+                for j in range(i):
+                    length2 += 2.0 * sums[i, j] * step[i] * step[j]
+            small = solved and length2 < tolerance * tolerance and damping < 1e-2
+            _rotate_from_left(step[3:6], R[f], R_trial)
+            for i in range(3):
+                t_trial[i] = t[f, i] + step[i]

@@ -175,7 +175,7 @@ def measure(
     exposure, headers = exposures(recording, pairs)
     settings = dataclasses.replace(settings, exposure=exposure)
     stamps = usable_times(pairs.left, recording.frame_rate)
-    with compiling("tracking", 20):  # not the camera's time: done once per installation
+    with compiling("tracking", 15):  # not the camera's time: done once per installation
         prepare(np.uint8 if pairs.left.bit_depth == 8 else np.uint16)
     began = time.perf_counter()
     span = _span(pairs, recording.frame_rate, settings, threads)

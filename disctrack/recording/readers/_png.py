@@ -10,8 +10,7 @@ from calibration.kit.compiled import njit
 
 def prepare() -> None:
     """Compile what undoes the row filters, or load it."""
-    for raw in (bytes(2), bytearray(2)):  # what zlib gives, and libdeflate
-        undo_filters(np.frombuffer(raw, np.uint8).reshape(1, 2), 1, np.empty((1, 1), np.uint8))
+    undo_filters(np.frombuffer(bytes(2), np.uint8).reshape(1, 2), 1, np.empty((1, 1), np.uint8))
 
 
 @njit(nogil=True, cache=True)

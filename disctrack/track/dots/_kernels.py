@@ -86,19 +86,10 @@ class Ellipse(NamedTuple):
     short: float
 
 
-# What is kept of every pixel (n), in single precision: rows of an array (16, n). The first six are those of `_select_pixels`;
-# the next eight the derivatives by the template's parameters, over the pixel's sigma, and before the pixels that are to
-# be chosen from.
-(
-    X,  # place on the plane from the expected centre [px]
-    Y,
-    OFFSET_X,  # place in the image from the expected centre [10 px]
-    OFFSET_Y,
-    GREY,
-    DISTANCE,  # from the edge
-    JACOBIAN,
-) = range(7)
-RESIDUAL, WEIGHT, _ROWS = 14, 15, 16  # over the pixel's sigma; one over that
+# Rows of what is kept of every pixel, in single precision: its place on the plane from the expected centre [px], and in
+# the image [10 px]; its grey value; its distance from the edge [px]; eight derivatives by the parameters (before them,
+# pixels that are to be chosen from) and the residual, over the pixel's sigma; one over that.
+_X, _Y, _OFFSET_X, _OFFSET_Y, _GREY, _DISTANCE, _JACOBIAN, _RESIDUAL, _WEIGHT, _ROWS = (*range(7), 14, 15, 16)
 _PIXELS = 4096 + 64  # of a dot of 60 px; more are made room for. No power of two: rows would share lines of the cache
 _MAX_SELECTIONS = 4
 _MAX_ITERATIONS = 20
@@ -217,51 +208,39 @@ def _select_pixels(image, map_x, map_y, P, start, window, rim, neighbours, G, un
     band = 3.0 * p[SIGMA] + 1.0
     shift_x, shift_y, radius = _f(p[A]), _f(p[B]), _f(p[RADIUS])
     outer = p[RADIUS] + band * steepest
-    # Of each row the pixels between two ellipses, longer and shorter by the band than the dot's own, by the linear map:
-    # its scale changes over the window, and a pixel is one more in doubt. In the ring of both nothing is decided by
-    # branches, so that it is vector code.
+    # Of each row the pixels in an ellipse longer by the band than the dot's own, by the linear map: its scale changes
+    # over the window, and a pixel is one more in doubt. In it no branch decides anything, so that it is vector code.
     doubt = 0.05 * math.hypot(x_hi - x_lo, y_hi - y_lo) * math.hypot(G[2, 0], G[2, 1])
     gentlest = abs(G[0, 0] * G[1, 1] - G[0, 1] * G[1, 0]) / steepest
-    longest, shortest = p[RADIUS] / gentlest, p[RADIUS] / steepest
-    more, less = band + 1.0, band + 2.0
-    rim_xx, rim_xy, rim_yy = _conic(
-        G, gentlest, steepest, longest * (1.0 + doubt) + more, shortest * (1.0 + doubt) + more
-    )
-    hole_xx, hole_xy, hole_yy = _conic(
-        G, gentlest, steepest, max(longest * (1.0 - doubt) - less, 0.1), max(shortest * (1.0 - doubt) - less, 0.1)
+    more = band + 1.0
+    xx, xy, yy = _conic(
+        G,
+        gentlest,
+        steepest,
+        p[RADIUS] / gentlest * (1.0 + doubt) + more,
+        p[RADIUS] / steepest * (1.0 + doubt) + more,
     )
     x_from, y_from = start[0] / unit, start[1] / unit
     X0, X1, X2, Y0, Y1, Y2 = P[0, 0], P[0, 1], P[0, 2], P[1, 0], P[1, 1], P[1, 2]
     w0, w1, w2 = unit * P[2, 0], unit * P[2, 1], unit * P[2, 2]
-    found, n = pixels[JACOBIAN:], 0
+    found, n = pixels[_JACOBIAN:], 0
     for y in range(y_lo, y_hi + 1):
         dy = y - v0
-        reach2 = (rim_xy * rim_xy - rim_xx * rim_yy) * dy * dy + rim_xx
-        hole2 = (hole_xy * hole_xy - hole_xx * hole_yy) * dy * dy + hole_xx
+        reach2 = (xy * xy - xx * yy) * dy * dy + xx
         if reach2 < 0.0:
             continue
-        middle, hole_middle = u0 - rim_xy / rim_xx * dy, u0 - hole_xy / hole_xx * dy
-        reach, hole = math.sqrt(reach2) / rim_xx, math.sqrt(max(hole2, 0.0)) / hole_xx
-        first, end = max(int(math.ceil(middle - reach)), x_lo), min(int(middle + reach) + 1, x_hi + 1)
-        for part in range(2):
-            if hole2 <= 0.0:
-                lo, hi = (first, end) if part == 0 else (end, end)
-            elif part == 0:
-                lo, hi = first, min(int(math.ceil(hole_middle - hole)), end)
-            else:
-                lo, hi = max(int(hole_middle + hole) + 1, first), end
-            if lo >= hi:
-                continue
-            # views, for an index that is a sum might be negative, and is looked at one by one
-            xs, ys, greys = map_x[y, lo:hi], map_y[y, lo:hi], image[y, lo:hi]
-            X_row, Y_row, grey_row = found[0, n:], found[1, n:], found[4, n:]
-            x_row, y_row = found[2, n:], found[3, n:]
-            for k in range(hi - lo):  # one loop, of few pixels at a time: there are some ten
-                w = 1.0 / (w0 * xs[k] + w1 * ys[k] + w2)
-                X_row[k] = (X0 * xs[k] + X1 * ys[k] + X2) * w - x_from
-                Y_row[k] = (Y0 * xs[k] + Y1 * ys[k] + Y2) * w - y_from
-                x_row[k], y_row[k], grey_row[k] = 0.1 * (lo + k - u0), 0.1 * (y - v0), greys[k]
-            n += hi - lo
+        middle, reach = u0 - xy / xx * dy, math.sqrt(reach2) / xx
+        lo, hi = max(int(math.ceil(middle - reach)), x_lo), min(int(middle + reach) + 1, x_hi + 1)
+        # views, for an index that is a sum might be negative, and is looked at one by one
+        xs, ys, greys = map_x[y, lo:hi], map_y[y, lo:hi], image[y, lo:hi]
+        X_row, Y_row, grey_row = found[0, n:], found[1, n:], found[4, n:]
+        x_row, y_row = found[2, n:], found[3, n:]
+        for k in range(hi - lo):
+            w = 1.0 / (w0 * xs[k] + w1 * ys[k] + w2)
+            X_row[k] = (X0 * xs[k] + X1 * ys[k] + X2) * w - x_from
+            Y_row[k] = (Y0 * xs[k] + Y1 * ys[k] + Y2) * w - y_from
+            x_row[k], y_row[k], grey_row[k] = 0.1 * (lo + k - u0), 0.1 * (y - v0), greys[k]
+        n += max(hi - lo, 0)
     # which of the dot's surroundings can come near any pixel at all
     reach = unit * (outer + math.hypot(p[A], p[B]))
     blur = p[SIGMA] * steepest * unit
@@ -291,7 +270,7 @@ def _select_pixels(image, map_x, map_y, P, start, window, rim, neighbours, G, un
     inside_sum, inside_n, outside_sum, outside_n = 0.0, 0.0, 0.0, 0.0
     well_inside, well_outside = _f(-min(1.2 * p[SIGMA], 0.4 * p[RADIUS] / steepest)), _f(1.2 * p[SIGMA])
     for i in range(kept):
-        d, grey = pixels[DISTANCE, i], pixels[GREY, i]
+        d, grey = pixels[_DISTANCE, i], pixels[_GREY, i]
         is_in, is_out = _1 if d < well_inside else _0, _1 if d > well_outside else _0
         inside_n += is_in
         outside_n += is_out
@@ -309,17 +288,17 @@ def _lit(pixels, i, covered, level, slope_x, slope_y, contrast, limit):
     Returns the light, the weight (0 where the squared residual exceeds the limit), what it adds to chi-square, and 1
     where it is clipped.
     """
-    x, y, J = pixels[OFFSET_X, i], pixels[OFFSET_Y, i], pixels[JACOBIAN:]
+    x, y, J = pixels[_OFFSET_X, i], pixels[_OFFSET_Y, i], pixels[_JACOBIAN:]
     light = level + slope_x * x + slope_y * y
-    weight = pixels[WEIGHT, i]
-    r = weight * (pixels[GREY, i] - light * (_1 - contrast * covered))
+    weight = pixels[_WEIGHT, i]
+    r = weight * (pixels[_GREY, i] - light * (_1 - contrast * covered))
     squared = r * r
     fits = _1 if squared <= limit else _0
     weight *= fits
     seen = (_1 - contrast * covered) * weight
     J[LEVEL, i], J[SLOPE_X, i], J[SLOPE_Y, i] = seen, seen * x, seen * y
     J[CONTRAST, i] = -light * covered * weight
-    pixels[RESIDUAL, i] = r * fits
+    pixels[_RESIDUAL, i] = r * fits
     return light, weight, min(squared, limit), _1 - fits
 
 
@@ -337,11 +316,11 @@ def _whitened_model(pixels, n, p, G, det, clip):
     inv_sigma, sigma, half_sigma = _f(1.0 / p[SIGMA]), _f(p[SIGMA]), _f(0.5 * p[SIGMA])
     level, slope_x, slope_y, limit = _f(p[LEVEL]), _f(p[SLOPE_X]), _f(p[SLOPE_Y]), _f(clip)
     half_step = _f(0.05)
-    chi2, n_clipped, J = _0, _0, pixels[JACOBIAN:]
+    chi2, n_clipped, J = _0, _0, pixels[_JACOBIAN:]
     for i in range(n):
-        x, y = pixels[OFFSET_X, i], pixels[OFFSET_Y, i]
+        x, y = pixels[_OFFSET_X, i], pixels[_OFFSET_Y, i]
         d, slope, nx, ny, inv_g, curvature = _edge_distance(
-            pixels[X, i] - a, pixels[Y, i] - b, radius, g00, g01, g10, g11, det2
+            pixels[_X, i] - a, pixels[_Y, i] - b, radius, g00, g01, g10, g11, det2
         )
         # the gradient was taken at the dot's centre: perspective changes the scale over the dot, and what counts is the
         # scale half way between the pixel and the edge (at the pixel itself it would shift centres by 5e-4 px)
@@ -422,9 +401,9 @@ def _whitened_ellipse(pixels, n, p, ellipse, nodes, clip):
     inv_radius, inv_sigma, ten = _f(1.0 / p[RADIUS]), _f(in_sigma), _f(10.0)
     contrast, level, slope_x, slope_y = _f(p[CONTRAST]), _f(p[LEVEL]), _f(p[SLOPE_X]), _f(p[SLOPE_Y])
     limit = _f(clip)
-    chi2, n_clipped, J = _0, _0, pixels[JACOBIAN:]
+    chi2, n_clipped, J = _0, _0, pixels[_JACOBIAN:]
     for i in range(n):
-        x, y = pixels[OFFSET_X, i], pixels[OFFSET_Y, i]
+        x, y = pixels[_OFFSET_X, i], pixels[_OFFSET_Y, i]
         from_u, from_v = ten * x - from_x, ten * y - from_y
         along, across = along_x * from_u + along_y * from_v, along_x * from_v - along_y * from_u
         covered, d_along, d_across, edge = _0, _0, _0, _0
@@ -485,11 +464,11 @@ def _descend(pixels, n, p, G, det, px_per_unit, radius, clip, work, blurred, ell
         if not rejected:
             damping = max(0.03 * damping, 1e-9)
         last, rejected = chi2, False
-        residual = pixels[RESIDUAL]
+        residual = pixels[_RESIDUAL]
         for j in range(0, 8, 2):  # two by two: what is loaded serves twice
-            row, next_row = pixels[JACOBIAN + j], pixels[JACOBIAN + j + 1]
+            row, next_row = pixels[_JACOBIAN + j], pixels[_JACOBIAN + j + 1]
             for k in range(0, j + 1, 2):
-                column, next_column = pixels[JACOBIAN + k], pixels[JACOBIAN + k + 1]
+                column, next_column = pixels[_JACOBIAN + k], pixels[_JACOBIAN + k + 1]
                 a, b, c, d = _0, _0, _0, _0
                 for i in range(n):
                     a += row[i] * column[i]
@@ -600,7 +579,7 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, neighbours, pixel
         in_light = 1.0 / light
         read_32, gain_32, floor = _f(read), _f(gain), _f(step2 / 12.0)
         level, step, inv_sigma = _f(p[LEVEL]), _f(dark - p[LEVEL]), _f(1.0 / p[SIGMA])
-        distance, weight, grey = pixels[DISTANCE], pixels[WEIGHT], pixels[GREY]
+        distance, weight, grey = pixels[_DISTANCE], pixels[_WEIGHT], pixels[_GREY]
         for i in range(n):
             # weights from the expected grey value: the noisy one would pull the fit towards dark pixels
             s, bell = _edge_profile(distance[i] * inv_sigma)
@@ -629,7 +608,7 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, neighbours, pixel
             limit = _CLIP_SIGMA * _CLIP_SIGMA * max(1.0, chi2 / n)
             worst = _0
             for i in range(n):
-                worst = max(worst, abs(pixels[RESIDUAL, i]))
+                worst = max(worst, abs(pixels[_RESIDUAL, i]))
             if worst * worst <= limit:
                 break
         if settled:
@@ -792,10 +771,11 @@ def _pose_step(results, status, views, centres, R, t, step):
     Huber weights keep one wrong dot from pulling the prediction away. Returns the rms residual before the step [px],
     or -1 where fewer than three dots or a singular system leave nothing to solve.
     """
-    M, J = np.zeros((6, 6)), np.empty((2, 3))
-    rows = np.empty((2, 6))
+    M, J, rows = np.empty((6, 6)), np.empty((2, 3)), np.empty((2, 6))
     for i in range(6):
         step[i] = 0.0
+        for j in range(6):
+            M[i, j] = 0.0
     total, count = 0.0, 0
     for c in range(2):
         for m in range(centres.shape[0]):
