@@ -86,10 +86,20 @@ class Ellipse(NamedTuple):
     short: float
 
 
-# Rows of what is kept of every pixel, in single precision: its place on the plane from the expected centre [px], and in
-# the image [10 px]; its grey value; its distance from the edge [px]; eight derivatives by the parameters (before them,
-# pixels that are to be chosen from) and the residual, over the pixel's sigma; one over that.
-_X, _Y, _OFFSET_X, _OFFSET_Y, _GREY, _DISTANCE, _JACOBIAN, _RESIDUAL, _WEIGHT, _ROWS = (*range(7), 14, 15, 16)
+class Rows(NamedTuple):
+    """Of what is kept of every pixel (16, n), in single precision, behind eight derivatives over the pixel's sigma."""
+
+    x: int = 8  # place on the plane from the expected centre [px]
+    y: int = 9
+    offset_x: int = 10  # place in the image from the expected centre [10 px]
+    offset_y: int = 11
+    grey: int = 12
+    distance: int = 13  # from the edge [px]
+    residual: int = 14  # over the pixel's sigma
+    weight: int = 15  # one over that
+
+
+ROW = Rows()
 _PIXELS = 4096 + 64  # of a dot of 60 px; more are made room for. No power of two: rows would share lines of the cache
 _MAX_SELECTIONS = 4
 _MAX_ITERATIONS = 20
@@ -223,7 +233,7 @@ def _select_pixels(image, map_x, map_y, P, start, window, rim, neighbours, G, un
     x_from, y_from = start[0] / unit, start[1] / unit
     X0, X1, X2, Y0, Y1, Y2 = P[0, 0], P[0, 1], P[0, 2], P[1, 0], P[1, 1], P[1, 2]
     w0, w1, w2 = unit * P[2, 0], unit * P[2, 1], unit * P[2, 2]
-    found, n = pixels[_JACOBIAN:], 0
+    n = 0  # pixels that are to be chosen from, in the rows of derivatives
     for y in range(y_lo, y_hi + 1):
         dy = y - v0
         reach2 = (xy * xy - xx * yy) * dy * dy + xx
@@ -233,8 +243,8 @@ def _select_pixels(image, map_x, map_y, P, start, window, rim, neighbours, G, un
         lo, hi = max(int(math.ceil(middle - reach)), x_lo), min(int(middle + reach) + 1, x_hi + 1)
         # views, for an index that is a sum might be negative, and is looked at one by one
         xs, ys, greys = map_x[y, lo:hi], map_y[y, lo:hi], image[y, lo:hi]
-        X_row, Y_row, grey_row = found[0, n:], found[1, n:], found[4, n:]
-        x_row, y_row = found[2, n:], found[3, n:]
+        X_row, Y_row, grey_row = pixels[0, n:], pixels[1, n:], pixels[4, n:]
+        x_row, y_row = pixels[2, n:], pixels[3, n:]
         for k in range(hi - lo):
             w = 1.0 / (w0 * xs[k] + w1 * ys[k] + w2)
             X_row[k] = (X0 * xs[k] + X1 * ys[k] + X2) * w - x_from
@@ -251,26 +261,26 @@ def _select_pixels(image, map_x, map_y, P, start, window, rim, neighbours, G, un
     g00, g01, g10, g11 = _f(G[0, 0]), _f(G[0, 1]), _f(G[1, 0]), _f(G[1, 1])
     for i in range(n):
         d, slope, nx, ny, inv_g, curvature = _edge_distance(
-            found[0, i] - shift_x, found[1, i] - shift_y, radius, g00, g01, g10, g11, _0
+            pixels[0, i] - shift_x, pixels[1, i] - shift_y, radius, g00, g01, g10, g11, _0
         )
-        found[5, i], found[6, i] = d, inv_g
+        pixels[5, i], pixels[6, i] = d, inv_g
     kept, nearest, farthest = 0, _f(-band - 1.0), _f(band)
     for i in range(n):
-        d = found[5, i]
+        d = pixels[5, i]
         good = nearest < d < farthest  # not so for NaN either: a pixel without a ray
         if crowded and good:
-            X, Y = start[0] + unit * found[0, i], start[1] + unit * found[1, i]
-            blur = p[SIGMA] * unit / found[6, i]
+            X, Y = start[0] + unit * pixels[0, i], start[1] + unit * pixels[1, i]
+            blur = p[SIGMA] * unit / pixels[6, i]
             good = math.hypot(X, Y) <= rim - 2.5 * blur
             for j in range(neighbours.shape[0]):
                 good &= math.hypot(X - neighbours[j, 0], Y - neighbours[j, 1]) - start[2] >= 3.0 * blur
         for row in range(6):
-            pixels[row, kept] = found[row, i]
+            pixels[ROW.x + row, kept] = pixels[row, i]
         kept += 1 if good else 0
     inside_sum, inside_n, outside_sum, outside_n = 0.0, 0.0, 0.0, 0.0
     well_inside, well_outside = _f(-min(1.2 * p[SIGMA], 0.4 * p[RADIUS] / steepest)), _f(1.2 * p[SIGMA])
     for i in range(kept):
-        d, grey = pixels[_DISTANCE, i], pixels[_GREY, i]
+        d, grey = pixels[ROW.distance, i], pixels[ROW.grey, i]
         is_in, is_out = _1 if d < well_inside else _0, _1 if d > well_outside else _0
         inside_n += is_in
         outside_n += is_out
@@ -288,17 +298,17 @@ def _lit(pixels, i, covered, level, slope_x, slope_y, contrast, limit):
     Returns the light, the weight (0 where the squared residual exceeds the limit), what it adds to chi-square, and 1
     where it is clipped.
     """
-    x, y, J = pixels[_OFFSET_X, i], pixels[_OFFSET_Y, i], pixels[_JACOBIAN:]
+    x, y = pixels[ROW.offset_x, i], pixels[ROW.offset_y, i]
     light = level + slope_x * x + slope_y * y
-    weight = pixels[_WEIGHT, i]
-    r = weight * (pixels[_GREY, i] - light * (_1 - contrast * covered))
+    weight = pixels[ROW.weight, i]
+    r = weight * (pixels[ROW.grey, i] - light * (_1 - contrast * covered))
     squared = r * r
     fits = _1 if squared <= limit else _0
     weight *= fits
     seen = (_1 - contrast * covered) * weight
-    J[LEVEL, i], J[SLOPE_X, i], J[SLOPE_Y, i] = seen, seen * x, seen * y
-    J[CONTRAST, i] = -light * covered * weight
-    pixels[_RESIDUAL, i] = r * fits
+    pixels[LEVEL, i], pixels[SLOPE_X, i], pixels[SLOPE_Y, i] = seen, seen * x, seen * y
+    pixels[CONTRAST, i] = -light * covered * weight
+    pixels[ROW.residual, i] = r * fits
     return light, weight, min(squared, limit), _1 - fits
 
 
@@ -316,11 +326,11 @@ def _whitened_model(pixels, n, p, G, det, clip):
     inv_sigma, sigma, half_sigma = _f(1.0 / p[SIGMA]), _f(p[SIGMA]), _f(0.5 * p[SIGMA])
     level, slope_x, slope_y, limit = _f(p[LEVEL]), _f(p[SLOPE_X]), _f(p[SLOPE_Y]), _f(clip)
     half_step = _f(0.05)
-    chi2, n_clipped, J = _0, _0, pixels[_JACOBIAN:]
+    chi2, n_clipped = _0, _0
     for i in range(n):
-        x, y = pixels[_OFFSET_X, i], pixels[_OFFSET_Y, i]
+        x, y = pixels[ROW.offset_x, i], pixels[ROW.offset_y, i]
         d, slope, nx, ny, inv_g, curvature = _edge_distance(
-            pixels[_X, i] - a, pixels[_Y, i] - b, radius, g00, g01, g10, g11, det2
+            pixels[ROW.x, i] - a, pixels[ROW.y, i] - b, radius, g00, g01, g10, g11, det2
         )
         # the gradient was taken at the dot's centre: perspective changes the scale over the dot, and what counts is the
         # scale half way between the pixel and the edge (at the pixel itself it would shift centres by 5e-4 px)
@@ -334,8 +344,8 @@ def _whitened_model(pixels, n, p, G, det, clip):
         chi2 += squared
         n_clipped += clipped
         edge = -light * contrast * bell * inv_sigma * weight  # - d model / d distance
-        J[A, i], J[B, i] = edge * nx * slope, edge * ny * slope
-        J[RADIUS, i], J[SIGMA, i] = edge * slope, edge * (z - curvature * sigma)
+        pixels[A, i], pixels[B, i] = edge * nx * slope, edge * ny * slope
+        pixels[RADIUS, i], pixels[SIGMA, i] = edge * slope, edge * (z - curvature * sigma)
     return float(chi2), float(n_clipped)
 
 
@@ -401,9 +411,9 @@ def _whitened_ellipse(pixels, n, p, ellipse, nodes, clip):
     inv_radius, inv_sigma, ten = _f(1.0 / p[RADIUS]), _f(in_sigma), _f(10.0)
     contrast, level, slope_x, slope_y = _f(p[CONTRAST]), _f(p[LEVEL]), _f(p[SLOPE_X]), _f(p[SLOPE_Y])
     limit = _f(clip)
-    chi2, n_clipped, J = _0, _0, pixels[_JACOBIAN:]
+    chi2, n_clipped = _0, _0
     for i in range(n):
-        x, y = pixels[_OFFSET_X, i], pixels[_OFFSET_Y, i]
+        x, y = pixels[ROW.offset_x, i], pixels[ROW.offset_y, i]
         from_u, from_v = ten * x - from_x, ten * y - from_y
         along, across = along_x * from_u + along_y * from_v, along_x * from_v - along_y * from_u
         covered, d_along, d_across, edge = _0, _0, _0, _0
@@ -424,10 +434,10 @@ def _whitened_ellipse(pixels, n, p, ellipse, nodes, clip):
         chi2 += squared
         n_clipped += clipped
         dark = light * contrast * weight
-        J[A, i] = dark * (d_along * A_along + d_across * A_across)
-        J[B, i] = dark * (d_along * B_along + d_across * B_across)
-        J[RADIUS, i] = -dark * edge * inv_radius
-        J[SIGMA, i] = dark * (along * d_along + across * d_across + edge) * inv_sigma
+        pixels[A, i] = dark * (d_along * A_along + d_across * A_across)
+        pixels[B, i] = dark * (d_along * B_along + d_across * B_across)
+        pixels[RADIUS, i] = -dark * edge * inv_radius
+        pixels[SIGMA, i] = dark * (along * d_along + across * d_across + edge) * inv_sigma
     return float(chi2), float(n_clipped)
 
 
@@ -464,11 +474,11 @@ def _descend(pixels, n, p, G, det, px_per_unit, radius, clip, work, blurred, ell
         if not rejected:
             damping = max(0.03 * damping, 1e-9)
         last, rejected = chi2, False
-        residual = pixels[_RESIDUAL]
+        residual = pixels[ROW.residual]
         for j in range(0, 8, 2):  # two by two: what is loaded serves twice
-            row, next_row = pixels[_JACOBIAN + j], pixels[_JACOBIAN + j + 1]
+            row, next_row = pixels[j], pixels[j + 1]
             for k in range(0, j + 1, 2):
-                column, next_column = pixels[_JACOBIAN + k], pixels[_JACOBIAN + k + 1]
+                column, next_column = pixels[k], pixels[k + 1]
                 a, b, c, d = _0, _0, _0, _0
                 for i in range(n):
                     a += row[i] * column[i]
@@ -561,7 +571,7 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, neighbours, pixel
             return OUTSIDE
         room = (window[1] - window[0] + 1) * (window[3] - window[2] + 1) + 1
         if room > pixels.shape[1]:
-            pixels = np.empty((_ROWS, room), np.float32)
+            pixels = np.empty((16, room), np.float32)
         n, inside, outside = _select_pixels(
             image, map_x, map_y, P, start, window, rim, neighbours, G, unit, largest, p, u0, v0, pixels
         )
@@ -579,7 +589,7 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, neighbours, pixel
         in_light = 1.0 / light
         read_32, gain_32, floor = _f(read), _f(gain), _f(step2 / 12.0)
         level, step, inv_sigma = _f(p[LEVEL]), _f(dark - p[LEVEL]), _f(1.0 / p[SIGMA])
-        distance, weight, grey = pixels[_DISTANCE], pixels[_WEIGHT], pixels[_GREY]
+        distance, weight, grey = pixels[ROW.distance], pixels[ROW.weight], pixels[ROW.grey]
         for i in range(n):
             # weights from the expected grey value: the noisy one would pull the fit towards dark pixels
             s, bell = _edge_profile(distance[i] * inv_sigma)
@@ -608,7 +618,7 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, neighbours, pixel
             limit = _CLIP_SIGMA * _CLIP_SIGMA * max(1.0, chi2 / n)
             worst = _0
             for i in range(n):
-                worst = max(worst, abs(pixels[_RESIDUAL, i]))
+                worst = max(worst, abs(pixels[ROW.residual, i]))
             if worst * worst <= limit:
                 break
         if settled:
@@ -866,7 +876,7 @@ def track_frames(images, readable, views, face, expected, heading, results, stat
     less than n where the disc was lost at that frame.
     """
     (R_last, t_last), (R_before, t_before), (R_older, t_older) = heading
-    pixels, work = np.empty((_ROWS, _PIXELS), np.float32), (np.empty((8, 8)), np.empty(8), np.empty(8), np.empty(8))
+    pixels, work = np.empty((16, _PIXELS), np.float32), (np.empty((8, 8)), np.empty(8), np.empty(8), np.empty(8))
     R, t, R_expected = np.empty((3, 3)), np.empty(3), np.empty((3, 3))
     for f in range(images.shape[0]):
         _predict(R_last, R_before, R_older, t_last, t_before, t_older, R, t)
@@ -895,5 +905,5 @@ def track_frames(images, readable, views, face, expected, heading, results, stat
 @_entry
 def look(images, readable, views, face, expected, R, t, results, status):
     """`_look` where Python calls it."""
-    pixels, work = np.empty((_ROWS, _PIXELS), np.float32), (np.empty((8, 8)), np.empty(8), np.empty(8), np.empty(8))
+    pixels, work = np.empty((16, _PIXELS), np.float32), (np.empty((8, 8)), np.empty(8), np.empty(8), np.empty(8))
     _look(images, readable, views, face, expected, R, t, pixels, work, results, status)

@@ -81,12 +81,6 @@ def test_density_of_the_air_is_declared_or_follows_from_the_pressure(tmp_path, a
     assert read_recording(write(tmp_path, REFERENCE + air)).air_density == pytest.approx(density)
 
 
-def test_pressure_and_density_of_the_air_are_not_declared_both(tmp_path):
-    both = REFERENCE + "[air]\npressure_hPa = 1000\ndensity_kg_m3 = 1.2\n"
-    assert "both pressure_hPa and density_kg_m3" in message(tmp_path, both)
-    assert "density_kg_m3 is -1" in message(tmp_path, REFERENCE + "[air]\ndensity_kg_m3 = -1\n")
-
-
 def test_a_shared_rig_replaces_views_and_table(tmp_path):
     start, end = REFERENCE.index("[calibration]"), REFERENCE.index("[gravity]")
     text = REFERENCE[:start] + '[calibration]\nrig = "../rig.h5"\n' + REFERENCE[end:]
@@ -144,6 +138,8 @@ def test_an_unknown_key_is_refused_with_the_nearest_known_one(tmp_path, written,
         ("frame_rate_hz = 1000.0", "frame_rate_hz = 0", "from 0.1 to 1e+07"),
         ("frame_rate_hz = 1000.0", "frame_rate_hz = nan", "from 0.1 to 1e+07"),
         ("frame_rate_hz = 1000.0", f"frame_rate_hz = 1{'0' * 400}", "from 0.1 to 1e+07"),
+        ("[cameras]", "[cameras]\nexposure_us = 1200", "exposure_us is 1200, longer than a frame: 1000 µs"),
+        ("[gravity]", "[air]\npressure_hPa = 1\ndensity_kg_m3 = 1\n[gravity]", "both pressure_hPa and density_kg_m3"),
         ("radius_mm = 37.5", "radius_mm = -37.5", "[disc] radius_mm is -37.5; expected a number from 0.1 to 10000"),
         ('left = "left/*.png"', "left = 3", "file pattern"),
         ("inner_corners = [9, 6]", "inner_corners = [9]", "two whole numbers"),
@@ -246,14 +242,15 @@ def _read_or_refuse(folder: Path) -> None:
     assert np.isfinite(recording.disc.marker_centres_body).all()
 
 
-def test_tolerances_and_source_of_the_table_may_be_declared(tmp_path):
+def test_tolerances_exposure_and_source_of_the_table_may_be_declared(tmp_path):
     plain = read_recording(write(tmp_path, REFERENCE))
     assert plain.table.source == "both"
     assert plain.disc.thickness_tolerance is None  # not declared
     assert plain.board_tolerances.square is None
     text = REFERENCE.replace("mass_g", "thickness_tolerance_mm = 0.02\nradius_tolerance_mm = 0\nmass_g", 1)
     text = text.replace("[table]", '[table]\nfrom = "disc"')
-    read = read_recording(write(tmp_path, text))
+    read = read_recording(write(tmp_path, text.replace("[cameras]", "[cameras]\nexposure_us = 200")))
+    assert read.exposure == pytest.approx(200e-6)
     assert (read.disc.thickness_tolerance, read.disc.radius_tolerance) == (pytest.approx(2e-5), 0.0)
     assert read.table.source == "disc"
     assert '"board", "disc" or "both"' in message(tmp_path, text.replace('"disc"', '"rim"'))

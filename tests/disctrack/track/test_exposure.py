@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from disctrack import frames, measure_pairs, read_recording, rolling
-from disctrack.errors import RecordingError
+from disctrack import frames, measure_pairs, rolling
 from disctrack.findings import Kind, Severity
 from disctrack.synthetic import render_disc
 from disctrack.track.dots import template_response as template_pull
@@ -137,16 +136,6 @@ def test_a_dot_seen_obliquely_is_pulled_as_an_ellipse(rendered_pairs, monkeypatc
     assert np.sum(expected * ellipses) / np.sum(ellipses**2) == pytest.approx(1.0, abs=0.12)
     assert np.sqrt(np.mean((ellipses - expected) ** 2)) < 0.35 * size
     assert np.sqrt(np.mean((circles - expected) ** 2)) > 0.5 * size
-
-
-def test_an_exposure_longer_than_a_frame_is_refused(tmp_path, sample_clip):
-    text = (sample_clip / "recording.toml").read_text()
-    declared = tmp_path / "recording.toml"
-    declared.write_text(text.replace("[cameras]", "[cameras]\nexposure_us = 200", 1))
-    assert read_recording(tmp_path).exposure == pytest.approx(200e-6)
-    declared.write_text(text.replace("[cameras]", "[cameras]\nexposure_us = 1200", 1))
-    with pytest.raises(RecordingError, match="exposure_us is 1200, longer than a frame: 1000 µs"):
-        read_recording(tmp_path)
 
 
 @pytest.mark.statistical
