@@ -126,16 +126,15 @@ def _instants_table(analysis: Analysis) -> Listing:
     known = np.flatnonzero(analysis.motion.known)
     frames = known[[0, len(known) // 2, -1]] if known.size > 2 else known[:0]
     shown = [analysis.series(name) for name in (*RATES_SHOWN, *CONTACT_SHOWN)]
-    rows = [(series.long_name, *(_with_both(series, frame) for frame in frames)) for series in shown]
+    rows = [(series.long_name, *(_at(series, frame) for frame in frames)) for series in shown]
     times = [f"at {analysis.motion.time[frame]:.3f} s" for frame in frames]
-    caption = "Some quantities at three instants: value ± 1 σ of the noise ± 1 σ of the calibration."
+    caption = "Some quantities at three instants: value ± 1 σ, of the noise and of the calibration together."
     return Listing(("quantity", *times), rows if len(frames) else (), caption)
 
 
-def _with_both(series: DerivedSeries, frame: int) -> str:
+def _at(series: DerivedSeries, frame: int) -> str:
     value, sigma, common = (float(a[frame]) for a in (series.value, series.sigma, series.sigma_calibration))
-    shared = f" ± {measured(common, unit=series.unit)}" if common > 0 else ""
-    return measured(value, sigma, series.unit) + shared
+    return measured(value, float(np.hypot(sigma, common)), series.unit)
 
 
 def _at_95(exponent: Exponent) -> Cell:
