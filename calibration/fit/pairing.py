@@ -272,12 +272,12 @@ def paired(
         return stored, ()
     shifts = [k for k in range(-MOST_LATE, MOST_LATE + 1) if abs(k) <= n - LEAST_PAIRS]
     tried = [Order(k, backwards) for backwards in (False, True) for k in shifts if k or backwards]
-    rivals = {order: found for order in (Order(mirrored=True), *tried) if (found := by(order)) is not None}
-    if rivals:
-        likely = max(rivals, key=lambda order: rivals[order][0].evidence)
-        if rivals[likely][0].is_likelier(stored):
-            raise CalibrationError(likely.told(*rivals[likely], stored, names))
-    _require_agreement(stored, [found.evidence for order, (found, _) in rivals.items() if not order.mirrored])
+    others = {order: found for order in (Order(mirrored=True), *tried) if (found := by(order)) is not None}
+    if others:
+        likely = max(others, key=lambda order: others[order][0].evidence)
+        if others[likely][0].is_likelier(stored):
+            raise CalibrationError(likely.told(*others[likely], stored, names))
+    _require_agreement(stored, [found.evidence for order, (found, _) in others.items() if not order.mirrored])
     notes = _late(pairs_of, [v for v, fits in zip(both, stored.agrees, strict=True) if not fits], stored, names)
     if notes and 2 * stored.agrees.sum() <= n:
         raise CalibrationError(f"{'; '.join(notes)}. As stored {stored.agrees.sum()} of {n} pairs are right")

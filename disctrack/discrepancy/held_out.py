@@ -67,7 +67,7 @@ def held_out(system: System, quantities: Sequence[Quantity], start: Values, rows
     by_shared = own.cleared(derivative, train.heads)[test].reshape(m * w, k)
     both[test, :, :k], both[test, :, k] = (by_shared @ root).reshape(m, w, k), residual[test]
     parts = [both[own.rest][test[own.rest]].reshape(-1, k + 1)]
-    foretold, log_determinant, spread = [parts[0]], 0.0, 0.0
+    predicted, log_determinant, spread = [parts[0]], 0.0, 0.0
     for block, head in zip(own.blocks, train.heads, strict=True):
         here = block.rows[test[block.rows]]
         part, J = both[here].reshape(-1, k + 1), derivative[here][..., block.columns].reshape(-1, len(block.columns))
@@ -79,9 +79,9 @@ def held_out(system: System, quantities: Sequence[Quantity], start: Values, rows
         n_data -= free
         spread += float(np.sum(B * B))
         log_determinant += float(np.sum(np.log(np.abs(np.diag(R)[: B.shape[1]]))))
-        foretold.append(R[B.shape[1] :, B.shape[1] :])
+        predicted.append(R[B.shape[1] :, B.shape[1] :])
         parts.append(part)
-    everything, whitened = np.concatenate(parts), np.concatenate(foretold)
+    everything, whitened = np.concatenate(parts), np.concatenate(predicted)
     R = _over_ones(whitened[:, :k], whitened[:, k:])
     quadratic = R[k, k] ** 2 if R.shape[0] > k else 0.0
     log_density = -0.5 * (quadratic + 2 * (np.sum(np.log(np.abs(np.diag(R)[:k]))) + log_determinant))

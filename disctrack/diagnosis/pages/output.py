@@ -84,7 +84,7 @@ def plan_json(plan: Plan | None) -> dict[str, Any] | None:
         return None
     return {
         "questions": [
-            {"effect": q.effect.name, "rival": None if q.alternative is None else q.alternative.name, "now": x}
+            {"effect": q.effect.name, "alternative": None if q.alternative is None else q.alternative.name, "now": x}
             for q, x in zip(plan.questions, plan.now, strict=True)
         ],
         "recordings": [

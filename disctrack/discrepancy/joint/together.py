@@ -26,7 +26,7 @@ from disctrack.discrepancy.significance import TWO_SIDED
 from disctrack.discrepancy.system import Candidate
 from disctrack.errors import AnalysisError, DiscTrackError
 
-TEST_EVERY = 3  # of the recordings, every so many is foretold from the others
+TEST_EVERY = 3  # of the recordings, every so many is predicted from the others
 ROUNDS = 3  # of leaving recordings out
 NUMBERS = (1, 2, 5, 10, 20, 50, 100, 200, 500)  # of recordings, for which sigmas are told
 OWN_LEVEL = 1e-3  # probability that a recording which the model describes is said to be at odds with it
