@@ -32,12 +32,17 @@ class Learned(Found):
         return all(component.startswith("M") for component in self.law.formulas)
 
     def text(self, fit: Fit) -> str:
-        """The law with its numbers."""
+        """The law with its numbers; where these do not stand out, its course alone is known."""
+        if self.course is not None and not self.law.stands_out(fit):
+            return (
+                f"its form is not determined here: it is {self.course.text} (nearest of the library: {self.law.title})"
+            )
         quantities = self.candidate.quantities
         numbers = ", ".join(f"{q.part} = {Measured(fit.values[q.name], fit.sigma(q.name))}" for q in quantities)
-        formulas = "; ".join(f"{component} = {formula}" for component, formula in self.law.formulas.items())
+        named = all(family.names for family in self.law.families)
+        formulas = "" if named else "; ".join(f"{c} = {formula}" for c, formula in self.law.formulas.items())
         angles = ", locked to the disc's angles" if locked(self.law) else ""
-        return f"{self.law.title}: {formulas} with {numbers} (SI){angles}"
+        return f"{self.law.title}: {formulas}{'' if named else ' with '}{numbers} (SI){angles}"
 
 
 @dataclass(frozen=True, repr=False)
@@ -83,7 +88,8 @@ class DiscDiagnosis(Brief):
         if self.learned is not None:
             first = f"Missing in the model: {effects}. " if effects else ""
             law = self.learned.text(diagnosis.after)
-            return f"{first}A law is missing that the catalogue does not name; described by {law}."
+            told = "described by " if self.learned.law.stands_out(diagnosis.after) else ""
+            return f"{first}A law is missing that the catalogue does not name; {told}{law}."
         if diagnosis.verdict == "nothing missing":
             return f"Nothing is missing{' in the motion' if self.remarks else ''}."
         if diagnosis.verdict == "found":

@@ -47,6 +47,7 @@ MAX_SWITCHES = (50, 200)  # and per second: slip at every extremum of a nutation
 TRIAL_SLIP_STEPS = 1_000  # of them in a fit that is one trial among many; where slip is true, a fit takes hundreds
 # slip that hardly exceeds friction creeps: it follows within v / (3 mu g), and a step has to be as short
 MOST_SLIP_STEPS = 17_000  # of the integrator for every frame, 8 us each: longer recordings need more in proportion
+MOST_PREDICTED = 4_000  # for every frame, with derivatives by each number counting as one more
 MOST_SIGMAS = 10.0  # of a size's tolerance, within which it is sought: else a wrong clock bends the disc to fit itself
 SLIP_STARTS = (0.9, 0.7, 0.5)  # of the friction that rolling needs at most
 
@@ -110,7 +111,6 @@ class DiscSystem(LawSystem):
         Raises AnalysisError.
         """
         self.systematic = systematic or Systematic()
-        self.budget = Budget()  # of steps of slip
         self.columns_known: dict[tuple[str, int], tuple[Array, list[Array]]] = {}  # of `sought`, along a motion nearby
         self.known = dict(known or {})
         self.starts_in_slip = starts_in_slip
@@ -132,6 +132,8 @@ class DiscSystem(LawSystem):
         self._whiten = np.where(self.used[..., None, None], whitening(safe), 0.0)
         self.weights = np.asarray(2.0 * self.used.sum((1, 2)), float)
         self.trial_steps = TRIAL_SLIP_STEPS * len(self.time)
+        # of steps of slip, and of frames that are predicted, once more for each number by which they are derived
+        self.budget = Budget(work=MOST_PREDICTED * len(self.time))
         of_slip = slipping_start_quantities(model) if starts_in_slip else ()
         if candidates is None:
             candidates = (*motion_candidates(model), *measurement_candidates(self.disc))
@@ -304,7 +306,7 @@ class DiscSystem(LawSystem):
 
     def instants(self, values: Values) -> Array:
         """(n,) true times of the frames [s], by the left camera."""
-        return self.start_time + (self.time - self.start_time) / (scene_faults(self.disc, values).frame_rate_hz or 1.0)
+        return self.start_time + scene_faults(self.disc, values).true_times(self.time - self.start_time, 1.0)
 
     def linearise(self, values: Values, names: Sequence[str]) -> tuple[Array, Array]:
         """Whitened dots (n, 4 m), observed minus predicted, and the prediction's derivative (n, 4 m, k)."""
@@ -402,6 +404,7 @@ class DiscSystem(LawSystem):
         of_state = [n.partition(".")[2] for n in components]
         moving = sensitivities(model, state, times, tuple(parameters.values()), of_state, THETA_END, RTOL, limit, left)
         self.budget.take(moving.slip_steps)
+        self.budget.worked((1 + len(moving.names)) * len(times))
         by_motion, moved = moving.dq.copy(), (*components, *parameters)
         by_motion[:, 3:] = euler_rate_axes_world(moving.q[:, 3], moving.q[:, 4]) @ moving.dq[:, 3:]
         if SLIP in parameters:

@@ -48,6 +48,10 @@ _CONTACT_X, _CONTACT_Y = f"(x + {_ARM} * sin(psi))", f"(y - {_ARM} * cos(psi))"
 _ALONG = f"({_CONTACT_X} * cos({{direction}}) + {_CONTACT_Y} * sin({{direction}}))"
 
 
+# of the coefficients of a kind, where they mean something by themselves
+HALF = " of half a wave"
+NAMES = {"blow": ("impulse_x", "impulse_y", "impulse_z"), "blow M": ("impulse_n", "impulse_m", "impulse_k")}
+
 Shape = Mapping[str, float]
 # title, kind, terms; values of the shape at which they are looked at
 Row = tuple[str, str, tuple[Parts, ...]] | tuple[str, str, tuple[Parts, ...], Iterable[Shape]]
@@ -113,7 +117,7 @@ def families(q: Array, time: Array, frame_rate: float, disc: Disc) -> Iterator[F
     )  # fmt: skip
     for title, kind, terms, *shapes in chain(*rows):
         for shape in shapes[0] if shapes else ({},):
-            yield Family(title, terms, shape, kind)
+            yield Family(title, terms, shape, kind, NAMES.get(kind.removesuffix(HALF), ()))
 
 
 def _by_rates() -> Iterator[Row]:
@@ -201,12 +205,12 @@ def _drifts(time: Array) -> Iterator[Row]:
     middle, half = 0.5 * float(time[0] + time[-1]), 0.5 * float(time[-1] - time[0])
     u = f"((time - {middle!r}) / {half!r})"
     powers = [" * ".join([u] * n) or "1.0" for n in range(DRIFT_DEGREE + 1)]
-    for n in range(1, DRIFT_DEGREE + 1):
-        changes, here = f"that changes with time, degree {n}", powers[: n + 1]
-        yield f"a level force {changes}", "drift", tuple(along(f) for f in here for along in (along_x, along_y))
-        yield f"a vertical force {changes}", "drift Z", tuple({"X_z": f} for f in here)
+    for n in range(DRIFT_DEGREE + 1):
+        changes, here = f" that changes with time, degree {n}" if n else "", powers[: n + 1]
+        yield f"a level force{changes}", "drift", tuple(along(f) for f in here for along in (along_x, along_y))
+        yield f"a vertical force{changes}", "drift Z", tuple({"X_z": f} for f in here)
         for axis in ("m", "z"):
-            yield f"a moment M_{axis} by the load {changes}", "drift M", tuple({f"load_{axis}": f} for f in here)
+            yield f"a moment M_{axis} by the load{changes}", "drift M", tuple({f"load_{axis}": f} for f in here)
 
 
 def _below_a_nutation(q: Array) -> Iterator[Row]:
@@ -220,17 +224,24 @@ def _below_a_nutation(q: Array) -> Iterator[Row]:
 
 
 def _instants(time: Array) -> Iterator[Row]:
-    """What begins at an instant, and blows; a blow's numbers are its impulse."""
+    """What begins at an instant, and blows; a blow's numbers are its impulse.
+
+    A blow is a bell, or half a wave as a soft hammer makes it (IEC 60068-2-27): in between lies what is met.
+    """
     after = "(0.5 + 0.5 * sign(time - {instant}, 0.002))"
-    blow = "exp(-0.5 * ((time - {instant}) / {lasting}) ** 2) / (2.5066283 * {lasting})"
+    bell = "exp(-0.5 * ((time - {instant}) / {lasting}) ** 2) / (2.5066283 * {lasting})"
+    phase = "((time - {instant}) / (4.0 * {lasting}))"
+    within = f"(0.5 + 0.5 * sign(0.25 - {phase} * {phase}, 1e-3))"
+    half_wave = f"{within} * cos(3.14159265 * {phase}) * 0.39269908 / {{lasting}}"
     few, many = (np.interp(np.linspace(0.03, 0.97, n), (0, 1), time[[0, -1]]).tolist() for n in (32, 64))
     begins = [{"instant": instant} for instant in few]
     yield "a force from an instant on", "from then on", _push(after), begins
     for axis in MOMENTS:
         yield f"a moment M_{axis} from an instant on", "from then on", ({f"M_{axis}": after},), begins
     blows = [{"instant": instant, "lasting": 0.008} for instant in many]
-    yield "a blow: a force during milliseconds", "blow", _push(blow), blows
-    yield "a blow: a moment during milliseconds", "blow M", _moment(blow), blows
+    for words, blow in (("", bell), (HALF, half_wave)):
+        yield f"a blow{words}: a force during milliseconds", f"blow{words}", _push(blow), blows
+        yield f"a blow{words}: a moment during milliseconds", f"blow M{words}", _moment(blow), blows
 
 
 def _edges(places: Array, shares: Array) -> list[Shape]:

@@ -34,6 +34,7 @@ AXES = ("n", "m", "z")
 PROBES_PER_TURN = 7  # of the fastest angle, so that a moment locked to it is resolved
 MAX_PROBES = 90
 WIDTH = 0.7  # of a probe over the distance to the next: their sum is flat to 1e-4
+STANDS_OUT = 3.0  # sigmas of a missing moment
 TELLING = 0.3  # share of chi-square to first order, from which on it is said what the missing moment goes with
 INSTANTS_PER_SECOND = 1000.0  # of the responses: Simpson's rule errs by 0.4 % of a hum of 150 Hz
 CHUNK = 120  # families of the library that are asked for at a time
@@ -46,6 +47,19 @@ class Course:
     time: Array  # (k,) [s]
     values: Array  # (k, 3) along n0, m0, k [N m] or [N]
     sigma: Array  # (k, 3)
+
+    @property
+    def text(self) -> str:
+        """How large a moment is, when it is largest, and from when to when it stands out."""
+        size = np.sum(self.values**2, axis=1)
+        rms, largest = np.sqrt(np.mean(self.values**2, axis=0)), self.time[np.argmax(size)]
+        known = np.flatnonzero(size > STANDS_OUT**2 * np.sum(self.sigma**2, axis=1))
+        text = (
+            f"a moment of {', '.join(f'{1e6 * x:.2g}' for x in rms)} uN m rms along n0, m0, k, or a force that does "
+            f"the same; it is largest at {largest:.3f} s"
+        )
+        first, last = self.time[known[[0, -1]]] if known.size else (largest, largest)
+        return f"{text} and stands out from {first:.3f} to {last:.3f} s" if last > first else text
 
 
 @dataclass(frozen=True)
@@ -89,13 +103,9 @@ def what_is_missing(system: DiscSystem, fit_: Fit) -> str:
     if blocks is None or scan is None:
         return ""
     missing, _ = missing_moment(blocks)
-    rms, largest = np.sqrt(np.mean(missing.values**2, axis=0)), int(np.argmax(np.sum(missing.values**2, axis=1)))
     gains = scan.gains(family for family in scan.library() if not family.shape and family.n_numbers <= 2)
     best = max(gains, key=lambda g: g.gain)
-    text = (
-        f"what the model lacks is a moment of {', '.join(f'{1e6 * x:.2g}' for x in rms)} uN m rms along n0, m0, k, or "
-        f"a force that does the same; it is largest at {missing.time[largest]:.3f} s"
-    )
+    text = f"what the model lacks is {missing.text}"
     share = best.gain / scan.chi_square
     return f"{text}; {100 * share:.0f} % of it would be {best.family.title}" if share > TELLING else text
 
@@ -246,6 +256,7 @@ def law_of(model: Model, chosen: Sequence[Family], values: Array) -> LearnedLaw:
     for i, family in enumerate(chosen):
         many = len(family.terms) > 1
         own = [f"c_{i}_{j}" if many else f"c_{i}" for j in range(len(family.terms))]
+        own = [f"{number}_{i}" for number in family.names] or own
         inside = {shape: f"{shape}_{i}" for shape in family.shape}
         for number, parts in zip(own, family.terms, strict=True):
             numbers.append(EffectParameter(number, "SI", begin[len(numbers)], family.title))

@@ -12,7 +12,7 @@ import numpy as np
 
 from disctrack.analyse.contact import RollingOnset, analyse_contact
 from disctrack.analyse.derivatives import differentiate
-from disctrack.diagnosis.disc_system import MOST_SLIP_STEPS, DiscSystem
+from disctrack.diagnosis.disc_system import MOST_PREDICTED, MOST_SLIP_STEPS, DiscSystem
 from disctrack.diagnosis.errors import simulated
 from disctrack.diagnosis.large_faults import diagnose_with_large, find_clock, find_large
 from disctrack.diagnosis.motion import SLIP, SLIP_VELOCITY, slip_candidate
@@ -93,7 +93,8 @@ def _with_these_times(
         assumed = None if base.converged else find_clock(rolling)
     if assumed is not None:
         return MotionDiagnosis(assumed.system, *diagnose_with_large(assumed, settings))
-    rolling.budget = Budget(MOST_SLIP_STEPS * len(rolling.time))
+    n = len(rolling.time)
+    rolling.budget = Budget(MOST_SLIP_STEPS * n, MOST_PREDICTED * n)
     try:
         answer = _rolling_or_slipping(settings, rolling, base)
         rolling.budget.without_end()

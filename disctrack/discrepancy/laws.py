@@ -45,6 +45,7 @@ class Family:
     terms: tuple[Parts, ...]
     shape: Mapping[str, float] = field(default_factory=dict)  # numbers in braces, fitted along with the coefficients
     kind: str = "moment"  # families of one kind are variations of one idea
+    names: tuple[str, ...] = ()  # of the coefficients, where they mean something by themselves
 
     @property
     def n_numbers(self) -> int:
@@ -84,6 +85,15 @@ class LearnedLaw:
     def title(self) -> str:
         """What the law means, in words."""
         return "; and ".join(family.title for family in self.families)
+
+    def stands_out(self, fitted: Fit) -> bool:
+        """Do the coefficients of each of its families differ from zero, in a fit whose sigmas hold all doubts?"""
+        for names in self.amounts:
+            index = [fitted.shared.index(n) for n in names]
+            amounts = np.array([fitted.values[n] for n in names])
+            if as_sigmas(wald(amounts, fitted.covariance[np.ix_(index, index)]), len(names)) <= MIN_SIGMAS:
+                return False
+        return True
 
     @property
     def widths(self) -> set[str]:
@@ -180,7 +190,7 @@ def learn(
         worth = [g for g in scan.gains(library) if g.gain / noise > price * g.family.n_numbers + looked]
         begin, inexact = (base_alone(base, along), along.cost) if along is not None else (current, scan.chi_square)
         chosen = _worth_a_refit(worth, scan.chi_square, inexact, noise, price, against)
-        trials = [_refitted(system, base, law, begin, g) for g in chosen]
+        trials = [_refitted(system, base, law, begin, g) for g in chosen if system.budget.open()]
         lengths = [t.cost / noise + sum(price * f.n_numbers + looked for f in one.families) for one, t in trials]
         if not trials or min(lengths) >= shortest:
             break
@@ -302,7 +312,9 @@ def without_idle_terms(system: LawSystem, law: LearnedLaw, fitted: Fit) -> Learn
         busy = busy_amounts(fitted, amounts)
         if busy:
             title = family.title if 0 in busy else f"{family.title}, without its first term"  # which it is named after
-            kept.append(replace(family, title=title, terms=tuple(family.terms[i] for i in busy)))
+            names = tuple(family.names[i] for i in busy if family.names)
+            title = family.title if names else title
+            kept.append(replace(family, title=title, terms=tuple(family.terms[i] for i in busy), names=names))
             values += [*busy.values(), *(fitted.values[n] for n in shapes)]
     if not kept or len(values) == len(law.candidate.quantities):
         return law
@@ -348,18 +360,14 @@ class WithLaw(Explanation):
 def explained_by_law(
     system: LawSystem, diagnosis: Diagnosis, doubtful: bool, is_noise: IsNoise
 ) -> tuple[WithLaw | None, Diagnosis]:
-    """The explanation with a law if that is the shortest one; and the diagnosis with those with laws in its list.
-
-    Of those that describe the data as well as the shortest, the one that claims the fewest known effects.
-    """
+    """The explanation with a law if that is the shortest one; and the diagnosis with those with laws in its list."""
     known, noise = _known(system, diagnosis), diagnosis.noise
-    found = [_law_beside(system, diagnosis, kept, is_noise) for kept in _beside(system, diagnosis, doubtful, known)]
+    beside = _beside(system, diagnosis, doubtful, known)
+    found = [_law_beside(system, diagnosis, kept, is_noise) for kept in beside if system.budget.open()]
     answers = [a for a in found if a is not None and a.fit.converged]
     if not answers:
         return None, diagnosis
-    shortest = min(a.length for a in answers)
-    as_good = [a for a in answers if a.length - shortest < CLASS_GAIN]
-    best = min(as_good, key=lambda a: (sum(f.candidate.kind == "motion" for f in a.kept), a.length))
+    best = min(answers, key=lambda a: a.length)
     left, at_noise = best.fit.reduced_chi_square, diagnosis.settings.at_noise * noise
     ranked = sorted((*diagnosis.ranked, *answers), key=lambda e: e.length)
     listed = replace(diagnosis, ranked=tuple(ranked), length=ranked[0].length)

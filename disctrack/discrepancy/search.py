@@ -32,6 +32,7 @@ WIDTH = 2  # explanations that are enlarged as long as none leaves noise
 ROUGH = 1e-2  # of chi-square at stake, below which what a fit may still gain in a rough valley decides nothing
 FAINT = 1e3  # chi-square of an effect, below which many others may do as well as it
 MOST_ALTERNATIVES = 12
+FOR_LAWS = 0.5  # of the budget, that the known effects leave to laws that nobody named
 NOT_CONVERGED = "its refit does not converge"
 CANCELLING = 0.1  # share of the least effect's power that a sum of effects keeps, below which they undo each other
 FAR, AGREES = 10.0, 2.0  # variances of the noise: a motion far from the data, and one that a beginning agrees with
@@ -320,13 +321,14 @@ class _Search:
             return False
         excess = nothing.fit.chi_square - self.noise * nothing.fit.degrees_of_freedom
         for c in self.system.candidates:
-            if c.shape:
+            if c.shape and self.system.budget.open(kept=FOR_LAWS):
                 self._with_free_shape(nothing, c, 0.0, nothing.fit.cost - (1.0 - WORTH_A_SHAPE) * excess)
         faint = [c for c in best.candidates if c.kind == "motion" and at_noise]
         for rest in (self._refit_without(best, c) for c in faint):
             gain = rest.fit.cost - best.fit.cost
             for c in self.system.candidates:
-                if c.sought and c.name not in best.names and gain <= FAINT * self.noise:
+                wanted = c.sought and c.name not in best.names and gain <= FAINT * self.noise
+                if wanted and self.system.budget.open(kept=FOR_LAWS):
                     self._with_free_shape(rest, c, FIRST_ORDER * max(gain, 0.0), best.fit.cost)
         return len(self.pool) > before
 
@@ -374,7 +376,8 @@ class _Search:
                 return
             self.expanded.add(new.names)
             for extra in self._enlarged(new, new is best):
-                self._refit(new, extra)
+                if self.system.budget.open(kept=FOR_LAWS):
+                    self._refit(new, extra)
             if len(new.candidates) > 1:
                 for c in new.candidates:
                     self._refit_without(new, c)

@@ -106,6 +106,8 @@ def profiled(system: System, fitted: Fit, q: Quantity, step: float, goal: float 
     for offset in (0.0, -step, step):
         at(start + offset)
     for _ in range(MAX_TRIALS):
+        if not system.budget.open():
+            break
         values = np.array(sorted(points))
         costs = np.array([points[v].cost for v in values])
         best = int(np.argmin(costs))

@@ -88,12 +88,21 @@ class TrialGivenUp(GivenUp):
 class Budget:
     """Steps that predictions may still take while an answer is sought; of all systems that share it.
 
-    Steps, and not seconds, so that an answer does not depend on the machine.
+    Steps, and not seconds, so that an answer does not depend on the machine. Of `work`, nothing is given up half way:
+    when it is used up no further hypothesis is put forward, and the answer is the best of those that were.
     """
 
-    def __init__(self, steps: float = np.inf) -> None:
+    def __init__(self, steps: float = np.inf, work: float = np.inf) -> None:
         """Without an end, if not given."""
-        self._left, self._trial = float(steps), np.inf
+        self._left, self._trial, self._work, self._of = float(steps), np.inf, float(work), float(work)
+
+    def worked(self, work: float) -> None:
+        """Count what a prediction took."""
+        self._work -= work
+
+    def open(self, kept: float = 0.0) -> bool:
+        """May a hypothesis be put forward, while this share of the whole is kept for others?"""
+        return np.isinf(self._of) or self._work > kept * self._of
 
     @property
     def left(self) -> float:

@@ -110,9 +110,14 @@ def _delayed(fault: Fault, part: str, sight: Sight) -> Array:
 
 
 def _faster(fault: Fault, part: str, sight: Sight) -> Array:
-    rate = 1.0 + fault.numbers(sight.values)[0]
-    earlier = -(sight.time - sight.time[0]) / rate**2
-    return np.stack([_moved(sight, camera, earlier) for camera in range(2)], axis=1)
+    """By clocks: central difference of the frames' true times."""
+    since, name = sight.time - sight.time[0], f"{fault.name}.{part}"
+    early, late = (
+        scene_faults(sight.disc, {**sight.values, name: sight.values.get(name, 0.0) + step}).true_times(since, 1.0)
+        for step in (-fault.step, fault.step)
+    )
+    later = (late - early) / (2 * fault.step)
+    return np.stack([_moved(sight, camera, later) for camera in range(2)], axis=1)
 
 
 def _of_one_dot(fault: Fault, part: str, sight: Sight) -> Array:
@@ -153,6 +158,10 @@ CLOCKS = (
           seen="the balance of moments gives another gravity: g goes as the square of the rate",
           remedy="declare the rate that the camera's software states", declared="[cameras] frame_rate_hz",
           named_by=(Kind.GRAVITY_OR_RATE,)),
+    Fault("clock_drift", "the clock of the cameras changes its rate", "oscillator that warms, trigger that slows down",
+          ("growth",), "1/s", 1e-4, "of the time between frames, relative, per second", "frame_interval_growth",
+          bounds=(-0.5, 0.5), of_poses_alone=False, along=_faster, seen="gravity seems to change slowly",
+          remedy="trigger by a quartz; let the cameras warm up"),
     Fault("exposure_blur", "dots are averaged over an exposure", "centre moves by T^2/24 times its acceleration",
           ("T2",), "s^2", 1e-7, "square of the exposure", "exposure_s", bounds=(0.0, 1e-3), in_images=True,
           of_poses_alone=False, along=_blurred, to_key=lambda v, *_: float(np.sqrt(max(v[0], 0.0))),
@@ -233,7 +242,7 @@ def faults_of(disc: Disc) -> tuple[Fault, ...]:
 
 @cache
 def _faults_of(n_markers: int) -> tuple[Fault, ...]:
-    time_offset, frame_rate, *of_images = CLOCKS
+    time_offset, frame_rate, drift, *of_images = CLOCKS
     of_cameras = (
         replace(fault, name=f"{camera}_{fault.name}", title=fault.title.format(camera), key=f"{camera}.{fault.key}")
         for fault in OF_CAMERAS
@@ -244,7 +253,7 @@ def _faults_of(n_markers: int) -> tuple[Fault, ...]:
                 to_key=partial(_with_row, i, n_markers), from_key=partial(_row, i))
         for i in range(n_markers)
     )  # fmt: skip
-    return (time_offset, frame_rate, *of_cameras, *misprints, *OF_THE_PAPER, *OF_THE_TABLE, *of_images)
+    return (time_offset, frame_rate, drift, *of_cameras, *misprints, *OF_THE_PAPER, *OF_THE_TABLE, *of_images)
 
 
 def scene_faults(disc: Disc, values: Mapping[str, float], rate: float = 1.0, beside: Faults | None = None) -> Faults:

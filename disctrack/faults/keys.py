@@ -3,6 +3,9 @@
 import math
 from dataclasses import dataclass, field
 
+import numpy as np
+
+from calibration.kit.arrays import Array
 from disctrack.files.toml_tree import MOST, NOT_NEGATIVE, POSITIVE, limited
 
 Pair = tuple[float, float]
@@ -40,7 +43,8 @@ class Faults:
     """What goes wrong and is not declared: it changes the images and truth.h5, never recording.toml."""
 
     right_delay_s: float = 0.0  # the right camera exposes that much later than the left
-    frame_rate_hz: float = limited(0.0, NOT_NEGATIVE)  # true frame rate; 0: the declared one
+    frame_rate_hz: float = limited(0.0, NOT_NEGATIVE)  # true frame rate at first; 0: the declared one
+    frame_interval_growth: float = 0.0  # of the time between frames, relative, per second: a clock that slows down
     misprint_mm: tuple[Pair, ...] = ()  # true minus declared centre of each dot
     misprint_sigma_mm: float = limited(0.0, NOT_NEGATIVE)  # the same drawn at random
     pattern_offset_mm: Pair = (0.0, 0.0)  # paper and dots glued off centre
@@ -55,3 +59,8 @@ class Faults:
     left: CameraFault = field(default_factory=CameraFault)
     right: CameraFault = field(default_factory=CameraFault)
     occluders: tuple[Occluder, ...] = ()
+
+    def true_times(self, since: Array, rate: float) -> Array:
+        """Times [s] after the first frame of frames that a clock with this declared rate [Hz] puts at `since`."""
+        ratio = self.frame_rate_hz / rate if self.frame_rate_hz else 1.0
+        return np.asarray(since * (1.0 + 0.5 * self.frame_interval_growth * since) / ratio, float)

@@ -27,6 +27,8 @@ differences over LOAD_STEP; slip that friction would turn within that time keeps
 A contact that creeps, v_A = -c F_t / F_z, is a table that slides by as much under a rolling disc: v_A follows the force
 within c / (3 g) to c / g, and is had in powers of that time over the motion's, by the same differences. Where that is
 no short time (c above FILM) v_A is a state of its own, as in slip: a disc on a film that is sheared.
+A surface that moves under the disc (a belt, a turntable), v = v_0 + Omega k x A, is in the same way a table that slides
+with the velocity of the surface where the disc touches it; A is its place there, which moves as the disc rolls.
 
 F_z contains omegadot, so laws proportional to the load are solved together with it. For a homogeneous disc with a sharp
 edge this is Ma et al. (2014), (2.6), (2.8) and (2.9), with (2.3) corrected to zdot = (r cos theta - h sin theta)
@@ -451,6 +453,23 @@ def _creeping(
 
 
 @_part
+def _moving(y: State, body: Record, now: Record) -> tuple[complex, complex, complex, complex]:
+    """Velocity along i and j of the surface at the contact, and its rate as the contact moves along; no laws asked."""
+    nothing, turn = 0.0 * y[0], body.surface_turn
+    if turn == 0.0:
+        return nothing + body.surface_vx, nothing + body.surface_vy, nothing, nothing
+    s, c, sp, cp = now.sin_theta, now.cos_theta, np.sin(now.psi), np.cos(now.psi)
+    arm, _, _ = _contact(body, now)
+    v = _nodal(now.v_n, now.v_m, now.v_z, s, c)
+    arm_rate, _ = _contact_rates(body, now, (y[5], y[6], y[7]), (y[5], y[6], y[6] * c / s), v)
+    at_n, at_m = arm[0], c * arm[1] - s * arm[2]
+    to_n, to_m = now.v_n + arm_rate[0], now.v_m + c * arm_rate[1] - s * arm_rate[2]
+    v_x = body.surface_vx - turn * (now.y + at_n * sp + at_m * cp)
+    v_y = body.surface_vy + turn * (now.x + at_n * cp - at_m * sp)
+    return v_x, v_y, -turn * (v_y + to_n * sp + to_m * cp), turn * (v_x + to_n * cp - to_m * sp)
+
+
+@_part
 def _margins(regime: int, body: Record, now: Record) -> tuple[complex, complex, complex, complex]:
     """Margins (EVENTS) that are positive while the regime lasts.
 
@@ -475,6 +494,8 @@ def rates(t: Numbers, y: Numbers, out: Numbers, table: Addresses, body: Record, 
     v_x, v_y, a_x, a_y = _creeping(t[0], state, table, body, now)
     _kinematics(regime, t[0], state, body, now)
     _apply_laws(table, now)
+    turning = _moving(state, body, now)
+    v_x, v_y, a_x, a_y = v_x + turning[0], v_y + turning[1], a_x + turning[2], a_y + turning[3]
     now.table_vx, now.table_vy = now.table_vx + v_x, now.table_vy + v_y
     now.table_ax, now.table_ay = now.table_ax + a_x, now.table_ay + a_y
     now.table_z -= body.compliance * load[0]

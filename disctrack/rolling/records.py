@@ -106,6 +106,9 @@ BODY = (
     "flat_sharpness",  # 1 / width^2 [1/rad^2]
     "compliance",  # of the table: it sinks by so much per load [m/N]
     "creep",  # of the contact: velocity over F_t / F_z [m/s]
+    "surface_vx",  # velocity of the table's surface at the origin [m/s] ...
+    "surface_vy",
+    "surface_turn",  # ... and its rate of turn about the vertical [rad/s]
     "curvature",  # of the table, a sphere through the origin: positive in a hollow [1/m]
     "slope_x",  # of the table at the origin, descending towards i, and j
     "slope_y",

@@ -26,7 +26,10 @@ from disctrack.rolling.simulate import MAX_SLIP_STEPS, MAX_SWITCHES, RTOL, _grid
 from disctrack.rolling.state import State, steady_precession
 
 _SEED = 1e-30  # imaginary part; its square is far below the smallest rounding
-_UNEVEN = ("curvature", "slope_x", "slope_y", "oval_c", "oval_s", "lobes_c", "lobes_s", "flat_depth")
+_UNEVEN = (
+    "curvature", "slope_x", "slope_y", "oval_c", "oval_s", "lobes_c", "lobes_s", "flat_depth",
+    "surface_vx", "surface_vy", "surface_turn",
+)  # fmt: skip
 _ASKEW = ("com_1", "com_2", "J_12", "J_13", "J_23")  # of a body that is not the same all round its axis
 # What a law reads that tells one direction of the table from another.
 _OF_DIRECTION = {"x", "y", "psi", *(f"{v}{a}" for v in ("table_", "table_v", "table_a", "field_") for a in "xy")}

@@ -83,10 +83,12 @@ def _frames_within(scene: Scene, start: float, end: float, source: str) -> int:
     before, after = _margin(scene)
     if start > -before + 1e-9:
         raise SceneError(f"{source}: begins at {start:g} s, after the first exposure at {-before:g} s; begin earlier")
-    n = int(np.floor((end - after) * true_frame_rate(scene) + 1e-6)) + 1
+    rate = true_frame_rate(scene)
+    exposed = scene.faults.true_times(np.arange(scene.cameras.n_frames) / rate, rate)
+    n = int(np.sum(exposed <= end - after + 1e-6 / rate))
     if n < 1:
         raise SceneError(f"{source}: ends at {end:g} s, before the first frame is exposed")
-    return min(n, scene.cameras.n_frames)
+    return n
 
 
 def rolling_model(scene: Scene) -> Model:

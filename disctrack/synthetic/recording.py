@@ -109,8 +109,8 @@ def true_disc_of(scene: Scene) -> Disc:
 
 
 def _truth(scene: Scene, motion: SceneMotion, rig: StereoRig) -> Truth:
-    n, rate, faults = motion.n_frames, true_frame_rate(scene), scene.faults
-    time = np.arange(n) / rate
+    rate, faults = true_frame_rate(scene), scene.faults
+    time = faults.true_times(np.arange(motion.n_frames) / rate, rate)
     visible = np.ones(scene.declared_disc.n_markers, bool)
     visible[list(faults.hidden_markers)] = False
     R, t = board_poses(scene, rig)

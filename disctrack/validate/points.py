@@ -130,7 +130,7 @@ def measured(
     if motion is None:
         model = Model(disc, laws=tuple(laws)).with_values({"km.k_m": filmed.k_m} | dict(planted.effects))
         motion = _rolling(model, filmed, rng)
-    times = np.arange(filmed.n) / rate + STATION
+    times = faults.true_times(np.arange(filmed.n) / rate, rate) + STATION
     off_place = true_disc_of(scene).marker_centres_body - scene.declared_disc.marker_centres_body
     centres = disc.marker_centres_body + off_place + prints
     views = [

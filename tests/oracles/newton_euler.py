@@ -34,6 +34,7 @@ class Disc:
         waves=(),
         dips=(),
         table=None,
+        carries=None,
         gives_way=0.0,
     ):
         self.r, self.h, self.m, self.edge, self.mu, self.laws = r, h, m, edge, mu, laws
@@ -42,6 +43,7 @@ class Disc:
         self.dips = dips  # of the rim: (depth, angle in the body, width)
         self.gives_way = gives_way  # compliance of a table that `yielding` makes move [m/N]
         self.table = table  # t -> displacement, velocity, acceleration in the axes of the world; None: at rest
+        self.carries = carries  # velocity (3,) of the table's surface at the origin, and its rate of turn
         self.wears = 0.0  # [m/s] by which the radius shrinks; `r` is that of the instant
         self.g = np.array(gravity, float)
         J1 = m * r * r / 4 + m * h * h / 3
@@ -105,6 +107,10 @@ class Instant:
         self.phidot = self.omega @ d - self.psidot * d[2]
         self.thetadot = self.omega @ self.n0
         self.u, self.u_rate, self.u_acceleration = (np.zeros(3),) * 3 if disc.table is None else disc.table(disc.t)
+        if disc.carries is not None:
+            velocity, turn = disc.carries
+            self.u_rate = self.u_rate + velocity + turn * np.cross(K, self.O + self.arm)
+            self.u_acceleration = self.u_acceleration + turn * np.cross(K, self.v + self.arm_rate)
         self.v_contact = self.v + np.cross(self.omega, self.arm) - self.u_rate  # past the table
 
     def touch_the_bowl(self, disc, d, d_rate):
@@ -201,6 +207,8 @@ def state_from_angles(disc, x, y, psi, theta, phi, thetadot, omega2, omega3, vel
 
         state[2] = brentq(gap, state[2] - 0.03, state[2] + 0.03, xtol=1e-16, rtol=1e-15)
         now = Instant(disc, state)
+    if disc.carries is not None:
+        now = Instant(disc, state)  # where it lies
     state[7:10] = -np.cross(omega, now.arm) + now.u_rate
     state[:3] += now.u
     if velocity is not None:

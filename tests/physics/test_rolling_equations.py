@@ -270,6 +270,13 @@ EFFECTS = {
         {"table_settles": {"v_z": -2e-3, "a_z": 5e-2}, "centre_of_mass": {"c_1": 1e-3, "c_2": -5e-4, "c_3": 3e-4}},
         {"table": newton_euler.settling(-2e-3, 5e-2), "com_body": (1e-3, -5e-4, 3e-4)},
     ),
+    "turntable": (
+        {
+            "surface_moves": {"v_x": 0.02, "v_y": -0.01, "rate": 0.8},
+            "centre_of_mass": {"c_1": 1e-3, "c_2": -5e-4, "c_3": 3e-4},
+        },
+        {"carries": (np.array([0.02, -0.01, 0.0]), 0.8), "com_body": (1e-3, -5e-4, 3e-4)},
+    ),
     "body": (
         {
             "centre_of_mass": {"c_1": 1e-3, "c_2": -5e-4, "c_3": 3e-4},

@@ -96,6 +96,7 @@ def test_all_columns_at_once_equal_those_one_by_one():
         ({"spring.k": 0.1}, {"phi"}),
         ({"table_curved.kappa": 0.1}, set()),
         ({"rim.oval_c": 1e-5}, set()),
+        ({"surface_moves.rate": 0.1}, set()),
     ],
 )
 @pytest.mark.parametrize("slides", [False, True])

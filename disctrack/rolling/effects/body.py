@@ -144,6 +144,20 @@ def creep(body: Record, p: Record) -> None:
 
 
 @effect(
+    "surface that moves under the disc, v_A = v + rate k x r_A",
+    "kinematics: rolling on a turntable, on a belt",
+    EffectParameter("v_x", "m/s", 1e-3, "velocity of the surface at the origin along i"),
+    EffectParameter("v_y", "m/s", 1e-3, "along j"),
+    EffectParameter("rate", "rad/s", 0.1, "of its turn about the vertical"),
+    belongs_to=("rig", "surface"),
+)
+def surface_moves(body: Record, p: Record) -> None:
+    """The contact moves with the table's surface, which turns or slides under cameras at rest."""
+    body.surface_vx, body.surface_vy = body.surface_vx + p.v_x, body.surface_vy + p.v_y
+    body.surface_turn = body.surface_turn + p.rate
+
+
+@effect(
     "J1 and J2 multiplied by 1 + e",
     "holes, rims, inhomogeneous material",
     EffectParameter("e", "1", 0.01, "relative change of J1 and J2", lower=-0.5, upper=1.0),

@@ -1,0 +1,183 @@
+"""Public benchmarks of system identification with their official splits: what is missing, and how well is it foretold?
+
+    python -m disctrack.examples.benchmarks FOLDER [-o DIR]
+
+FOLDER holds files as published (nonlinearbenchmark.org), those of at least one of them: `DATA_EMPS.mat` and
+`DATA_EMPS_PULSES.mat`, a positioning system whose friction is withheld; `dataBenchmark.mat` or `.csv`, two tanks in a
+row, which may run over; `DATAUNIF.mat`, electric drives coupled by a belt; `SNLS80mV.mat`, the circuit called
+Silverbox. The textbook's equations are fitted to the part for estimation; the other is foretold by a free run that
+begins in what the official window shows, and compared with the best published.
+"""
+
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from time import process_time
+
+import numpy as np
+from scipy.io import loadmat
+
+from calibration.kit.arrays import Array
+from disctrack.discrepancy.equations import Answer, Equations, Parameter, Run, Term, diagnose, terms
+from disctrack.errors import AnalysisError
+from disctrack.examples._command import Outcome, command
+from disctrack.numbers import rounded
+from disctrack.report.blocks import Listing, Report
+
+Columns = dict[str, Array]
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """One system, with the way from its files to runs."""
+
+    name: str
+    files: tuple[str, ...]
+    equations: Equations
+    offered: Sequence[Term] | None
+    runs: Callable[..., tuple[list[Run], list[Run]]]  # of the columns of each file: for estimation and for the test
+    window: float  # [s] of a test that may tell its start
+    unit: str
+    scale: float  # units in one of the data's
+    published: float  # best error [unit]
+
+
+def columns(path: Path) -> Columns:
+    """Columns of a file by name, each (n,)."""
+    if path.suffix == ".csv":
+        names = path.read_text().partition("\n")[0].replace('"', "").split(",")
+        table = np.genfromtxt(path, delimiter=",", skip_header=1)
+        return {name: table[:, i] for i, name in enumerate(names) if name}
+    return {name: np.ravel(values) for name, values in loadmat(path).items() if not name.startswith("_")}
+
+
+def _positions(*files: Columns) -> tuple[list[Run], list[Run]]:
+    train, test = (
+        Run(
+            d["t"] - d["t"][0],
+            {"q": d["qm"]},
+            inputs={"F": d["gtau"] * d["vir"]},
+            hold="hold",
+            known={"v": (0.0, 1e-3)},
+        )
+        for d in files
+    )
+    return [train.thinned(20)], [test]
+
+
+def _levels(d: Columns) -> tuple[list[Run], list[Run]]:
+    time = 4.0 * np.arange(len(d["uEst"]))
+    sides = ("Est", "Val")
+    train, test = (Run(time, {"y": d[f"y{s}"]}, inputs={"u": d[f"u{s}"]}, start={"h1": 4.0}) for s in sides)
+    return [train], [test]
+
+
+def _speeds(d: Columns) -> tuple[list[Run], list[Run]]:
+    time, parts = 0.02 * np.arange(400), (slice(400), slice(400, None))
+    train, test = (
+        [
+            Run(
+                time[: len(d[z][part])],
+                {"speed": d[z][part]},
+                inputs={"u": d[u][part]},
+                hold="hold",
+                name=f"{z} {side}",
+            )
+            for u, z in (("u11", "z11"), ("u12", "z12"))
+        ]
+        for part, side in zip(parts, ("estimation", "test"), strict=True)
+    )
+    return train, test
+
+
+def _voltages(d: Columns) -> tuple[list[Run], list[Run]]:
+    multisine = slice(40_650, 127_400)
+    u, y = d["V1"][multisine], d["V2"][multisine]
+    part = int(0.75 * len(u))  # for estimation, of which so many samples tell all
+    train, test = (
+        Run(np.arange(len(y[rows])) / 610.35, {"y": y[rows]}, inputs={"u": u[rows]})
+        for rows in (slice(3000), slice(part, None))
+    )
+    return [train], [test]
+
+
+BENCHMARKS = (
+    Benchmark(
+        "EMPS", ("DATA_EMPS.mat", "DATA_EMPS_PULSES.mat"),
+        Equations({"q": "v", "v": "(F - Fv*v)/M"}, {"M": 90.0, "Fv": 220.0}, inputs=["F"], units={"q": "m"}),
+        [terms.coulomb("v"), terms.constant("v"), terms.quadratic("v"), terms.spring("v", "q")],
+        _positions, 0.02, "mm", 1e3, 2.64,
+    ),
+    Benchmark(
+        "cascaded tanks", ("dataBenchmark",),
+        Equations(
+            {"h1": "k4*u - k1*sqrt(Max(h1, 0.001))", "h2": "k2*sqrt(Max(h1, 0.001)) - k3*sqrt(Max(h2, 0.001))"},
+            {name: Parameter(0.05, lower=0.0) for name in ("k1", "k2", "k3", "k4")}, inputs=["u"],
+            observed={"y": "h2"}, units={"y": "V"},
+        ),
+        None, _levels, 16.0, "V", 1.0, 0.191,
+    ),
+    Benchmark(
+        "coupled drives", ("DATAUNIF.mat",),
+        Equations(
+            {"d": "(gain*u - d)/lag", "p": "r", "r": "omega**2*(d - p) - c*r"},
+            {"gain": 2.0, "lag": Parameter(0.3, lower=0.01), "omega": 14.0, "c": 5.0}, inputs=["u"],
+            observed={"speed": "abs(p)"},
+        ),
+        None, _speeds, 0.06, "ticks/s", 1.0, 0.12,
+    ),
+    Benchmark(
+        "Silverbox", ("SNLS80mV.mat",),
+        Equations(
+            {"y": "v", "v": "g*u - k*y - c*v"}, {"g": 1.8e5, "k": 1.9e5, "c": 40.0}, inputs=["u"], units={"y": "V"}
+        ),
+        [terms.cubic_spring("v", "y"), terms.asymmetric_spring("v", "y"), terms.constant("v"), terms.quadratic("v")],
+        _voltages, 0.08, "mV", 1e3, 0.301,
+    ),
+)  # fmt: skip
+
+
+def present(folder: Path, benchmark: Benchmark) -> list[Path]:
+    """Files of a benchmark in the folder, whatever their letters' case; empty where one is missing."""
+    there = {p.name.lower(): p for p in sorted(Path(folder).iterdir())}
+    wanted = [[f"{f.lower()}{suffix}" for suffix in ("", ".mat", ".csv")] for f in benchmark.files]
+    found = [next((there[name] for name in names if name in there), None) for names in wanted]
+    return [path for path in found if path is not None] if None not in found else []
+
+
+def measured(benchmark: Benchmark, paths: Sequence[Path]) -> tuple[Answer, dict[str, float]]:
+    """The answer, and error [unit] and share within the 95 % band of its tests, with the processor time [s]."""
+    began = process_time()
+    train, test = benchmark.runs(*(columns(path) for path in paths))
+    answer = diagnose(benchmark.equations, train, benchmark.offered)
+    scores = [score for run in test for score in answer.score(run, window=benchmark.window).values()]
+    error = benchmark.scale * float(np.mean([s.rms for s in scores]))
+    covered = float(np.mean([s.covered for s in scores]))
+    return answer, {"error": error, "published": benchmark.published, "covered": covered, "s": process_time() - began}
+
+
+def example(folder: Path) -> Outcome:
+    """What do textbook equations of public benchmarks lack, and how well do they foretell the official test parts?"""
+    rows, answers, data = [], dict[str, Answer](), dict[str, object]()
+    for b in BENCHMARKS:
+        if paths := present(folder, b):
+            answer, n = measured(b, paths)
+            errors = (f"{rounded(n[side])} {b.unit}" for side in ("error", "published"))
+            missing = ", ".join(answer.found) or answer.verdict
+            rows.append((b.name, *errors, f"{n['covered']:.0%}", f"{n['s']:.0f} s", missing))
+            answers[b.name], data[b.name] = answer, answer.document() | {"test": n}
+    if not answers:
+        wanted = "; ".join(" and ".join(b.files) for b in BENCHMARKS)
+        raise AnalysisError(f"{folder}: no benchmark is there. Wanted are the files of at least one: {wanted}.")
+    header = ("", "error of the test", "best published", "within 95 % band", "processor", "missing")
+    said = "The test parts are foretold by free runs; their first samples tell how they begin."
+    return Outcome(Report("Public benchmarks", said, blocks=[Listing(header, rows)], data=data), answers)
+
+
+main = partial(command, "benchmarks", "the files of at least one benchmark", example)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
