@@ -47,7 +47,8 @@ MAX_SWITCHES = (50, 200)  # and per second: slip at every extremum of a nutation
 TRIAL_SLIP_STEPS = 1_000  # of them in a fit that is one trial among many; where slip is true, a fit takes hundreds
 # slip that hardly exceeds friction creeps: it follows within v / (3 mu g), and a step has to be as short
 MOST_SLIP_STEPS = 17_000  # of the integrator for every frame, 8 us each: longer recordings need more in proportion
-MOST_PREDICTED = 4_000  # for every frame, with derivatives by each number counting as one more
+MOST_PREDICTED = 4_000  # times for every frame, 10 to 20 us each; a derivative counts, and a step of slip, as one more
+USUAL = 700  # frames of a recording
 MOST_SIGMAS = 10.0  # of a size's tolerance, within which it is sought: else a wrong clock bends the disc to fit itself
 SLIP_STARTS = (0.9, 0.7, 0.5)  # of the friction that rolling needs at most
 
@@ -132,8 +133,7 @@ class DiscSystem(LawSystem):
         self._whiten = np.where(self.used[..., None, None], whitening(safe), 0.0)
         self.weights = np.asarray(2.0 * self.used.sum((1, 2)), float)
         self.trial_steps = TRIAL_SLIP_STEPS * len(self.time)
-        # of steps of slip, and of frames that are predicted, once more for each number by which they are derived
-        self.budget = Budget(work=MOST_PREDICTED * len(self.time))
+        self.budget = self.budget_with(np.inf)
         of_slip = slipping_start_quantities(model) if starts_in_slip else ()
         if candidates is None:
             candidates = (*motion_candidates(model), *measurement_candidates(self.disc))
@@ -239,6 +239,10 @@ class DiscSystem(LawSystem):
             residual, across, nuisances[..., :n_rig], nuisances[..., n_rig : n_rig + 2 * m], faults,
             sight.pixels[rows], self.used[rows], self._whiten[rows],
         )  # fmt: skip
+
+    def budget_with(self, slip_steps: float) -> Budget:
+        """Of a search that may take so many steps of slip; a short recording may take as long as the usual one."""
+        return Budget(slip_steps, MOST_PREDICTED * max(len(self.time), USUAL))
 
     def start(self) -> dict[str, float]:
         """Values of the base quantities from the measured poses, good enough for Gauss-Newton, and the known faults."""
@@ -404,7 +408,7 @@ class DiscSystem(LawSystem):
         of_state = [n.partition(".")[2] for n in components]
         moving = sensitivities(model, state, times, tuple(parameters.values()), of_state, THETA_END, RTOL, limit, left)
         self.budget.take(moving.slip_steps)
-        self.budget.worked((1 + len(moving.names)) * len(times))
+        self.budget.worked((1 + len(moving.names)) * len(times) + moving.slip_steps)
         by_motion, moved = moving.dq.copy(), (*components, *parameters)
         by_motion[:, 3:] = euler_rate_axes_world(moving.q[:, 3], moving.q[:, 4]) @ moving.dq[:, 3:]
         if SLIP in parameters:

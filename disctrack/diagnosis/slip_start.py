@@ -12,7 +12,7 @@ import numpy as np
 
 from disctrack.analyse.contact import RollingOnset, analyse_contact
 from disctrack.analyse.derivatives import differentiate
-from disctrack.diagnosis.disc_system import MOST_PREDICTED, MOST_SLIP_STEPS, DiscSystem
+from disctrack.diagnosis.disc_system import MOST_SLIP_STEPS, DiscSystem
 from disctrack.diagnosis.errors import simulated
 from disctrack.diagnosis.large_faults import diagnose_with_large, find_clock, find_large
 from disctrack.diagnosis.motion import SLIP, SLIP_VELOCITY, slip_candidate
@@ -23,7 +23,7 @@ from disctrack.discrepancy.fit import Fit, fit
 from disctrack.discrepancy.held_out import HeldOut, held_out, training_rows
 from disctrack.discrepancy.noise import noise_variance
 from disctrack.discrepancy.search import FAR, Diagnosis, Found, Settings, beside, explain, threshold
-from disctrack.discrepancy.system import Budget, Candidate, GivenUp, TrialGivenUp
+from disctrack.discrepancy.system import Candidate, GivenUp, TrialGivenUp
 from disctrack.errors import AnalysisError
 from disctrack.faults.clock_jump import clock_jumps, without_jumps
 from disctrack.rolling import CATALOGUE, Model, Regime
@@ -93,8 +93,7 @@ def _with_these_times(
         assumed = None if base.converged else find_clock(rolling)
     if assumed is not None:
         return MotionDiagnosis(assumed.system, *diagnose_with_large(assumed, settings))
-    n = len(rolling.time)
-    rolling.budget = Budget(MOST_SLIP_STEPS * n, MOST_PREDICTED * n)
+    rolling.budget = rolling.budget_with(MOST_SLIP_STEPS * len(rolling.time))
     try:
         answer = _rolling_or_slipping(settings, rolling, base)
         rolling.budget.without_end()

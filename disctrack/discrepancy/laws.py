@@ -360,14 +360,19 @@ class WithLaw(Explanation):
 def explained_by_law(
     system: LawSystem, diagnosis: Diagnosis, doubtful: bool, is_noise: IsNoise
 ) -> tuple[WithLaw | None, Diagnosis]:
-    """The explanation with a law if that is the shortest one; and the diagnosis with those with laws in its list."""
+    """The explanation with a law if that is the shortest one; and the diagnosis with those with laws in its list.
+
+    Of those that describe the data as well as the shortest, the one that claims the fewest known effects.
+    """
     known, noise = _known(system, diagnosis), diagnosis.noise
     beside = _beside(system, diagnosis, doubtful, known)
     found = [_law_beside(system, diagnosis, kept, is_noise) for kept in beside if system.budget.open()]
     answers = [a for a in found if a is not None and a.fit.converged]
     if not answers:
         return None, diagnosis
-    best = min(answers, key=lambda a: a.length)
+    shortest = min(a.length for a in answers)
+    as_good = [a for a in answers if a.length - shortest < CLASS_GAIN]
+    best = min(as_good, key=lambda a: (sum(f.candidate.kind == "motion" for f in a.kept), a.length))
     left, at_noise = best.fit.reduced_chi_square, diagnosis.settings.at_noise * noise
     ranked = sorted((*diagnosis.ranked, *answers), key=lambda e: e.length)
     listed = replace(diagnosis, ranked=tuple(ranked), length=ranked[0].length)

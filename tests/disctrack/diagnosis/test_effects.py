@@ -124,6 +124,22 @@ def test_no_recording_is_proposed_to_tell_gravity_from_the_frame_rate():
     )  # all laws at hand are quadratic in the rates: time can be stretched
 
 
+@pytest.mark.statistical
+@pytest.mark.parametrize(
+    ("hidden", "faults", "name", "true"),
+    [
+        ({}, Faults(frame_interval_growth=0.014), "clock_drift.growth", 0.014),
+        ({"surface_moves.rate": 0.35}, Faults(), "surface_moves.rate", 0.35),
+    ],
+)
+def test_what_moves_beside_the_disc_is_no_force(hidden, faults, name, true):
+    """A clock that slows down, a turntable."""
+    result = diagnose(measured(hidden, faults=faults, seed=14, n=300))
+    assert [found.candidate.name for found in result.diagnosis.found] == [name.partition(".")[0]]
+    fit = result.diagnosis.after
+    assert abs(fit.values[name] - true) < 3 * fit.sigma(name) < 0.01 * true
+
+
 @pytest.mark.slow
 def test_slip_is_found_by_the_friction_at_which_it_sets_in():
     """Slip has no derivative where the disc does not slip yet: it is fitted from where it would begin."""

@@ -80,6 +80,29 @@ def test_a_dent_that_hits_once_a_turn_is_found_with_its_place_and_its_blow():
     assert abs(-fit.values["learned.c_0"] - 3e-4 * 0.15) < 3 * fit.sigma("learned.c_0") + 0.01 * 4.5e-5
 
 
+def test_a_blow_is_an_impulse_at_an_instant():
+    """1.7 mN s within 12 ms, as a soft hammer gives them; frames begin 2 ms after the motion."""
+    impulse = np.array([1.5e-3, -0.8e-3, 0.0])
+
+    def law(disc, now):
+        phase = (disc.t - 0.31) / 0.012
+        return (
+            newton_euler.ZERO,
+            newton_euler.ZERO,
+            impulse * np.pi / 0.024 * np.cos(np.pi * phase) * (abs(phase) < 0.5),
+        )
+
+    result = diagnose(recording(Unknown(law)).trajectory)
+    assert result.learned is not None
+    fit = result.diagnosis.after
+    for axis, true in zip("xy", impulse, strict=False):
+        name = f"learned.impulse_{axis}_0"
+        assert abs(fit.values[name] - true) < 3 * fit.sigma(name) < 0.05e-3
+    assert abs(fit.values["learned.instant_0"] - 0.308) < 3 * fit.sigma("learned.instant_0") < 1e-3
+    assert len(result.learned.candidate.quantities) <= 5
+    assert len(result.verdict_text) < 400
+
+
 def test_a_force_that_grows_with_time_is_found_with_its_size_and_its_direction():
     """Known effects and a force that turns with the face come near it, and leave a memory of p = 1e-80."""
     growing = np.array([1.2e-3, -3.8e-3, 0.0])  # [N/s]
