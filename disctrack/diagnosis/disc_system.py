@@ -314,6 +314,7 @@ class DiscSystem(LawSystem):
 
     def linearise(self, values: Values, names: Sequence[str]) -> tuple[Array, Array]:
         """Whitened dots (n, 4 m), observed minus predicted, and the prediction's derivative (n, 4 m, k)."""
+        self.budget.worked((1 + len(names)) * len(self.time))
         path = self._path(values, names)
         sight = self._sight(path, values)
         residual = self._residual(sight.pixels, values)
@@ -408,7 +409,7 @@ class DiscSystem(LawSystem):
         of_state = [n.partition(".")[2] for n in components]
         moving = sensitivities(model, state, times, tuple(parameters.values()), of_state, THETA_END, RTOL, limit, left)
         self.budget.take(moving.slip_steps)
-        self.budget.worked((1 + len(moving.names)) * len(times) + moving.slip_steps)
+        self.budget.worked(moving.slip_steps)
         by_motion, moved = moving.dq.copy(), (*components, *parameters)
         by_motion[:, 3:] = euler_rate_axes_world(moving.q[:, 3], moving.q[:, 4]) @ moving.dq[:, 3:]
         if SLIP in parameters:
