@@ -35,7 +35,6 @@ from disctrack.faults.catalogue import faults_of, scene_faults
 from disctrack.faults.dots import Sight, predict
 from disctrack.frames import euler_rate_axes_world, rotation_from_euler
 from disctrack.rolling import Model, sensitivities, simulate
-from disctrack.rolling.simulate import MAX_SLIP_STEPS
 from disctrack.track.pose import whitening
 from disctrack.track.refine.table_contact import ASSUMED_THICKNESS as MICROMETER
 from disctrack.track.refine.table_contact import thickness_tolerance
@@ -44,10 +43,9 @@ from disctrack.trajectory import MarkerStatus, Trajectory
 RTOL = 1e-10  # of the integration: a millionth of the noise
 MIN_NUISANCE = 0.1  # a direction of the rig's covariance that moves all dots together by less than this many sigmas
 MAX_SWITCHES = (50, 200)  # and per second: slip at every extremum of a nutation of 30 Hz has 120; more is chatter
-TRIAL_SLIP_STEPS = 1_000  # of them in a fit that is one trial among many; where slip is true, a fit takes hundreds
 # slip that hardly exceeds friction creeps: it follows within v / (3 mu g), and a step has to be as short
-MOST_SLIP_STEPS = 17_000  # of the integrator for every frame, 8 us each: longer recordings need more in proportion
-MOST_PREDICTED = 4_000  # times for every frame, 10 to 20 us each; a derivative counts, and a step of slip, as one more
+TRIAL_SLIP_STEPS = 1_000  # for every frame, in a fit that is one trial among many; where slip is true, hundreds
+MOST_WORK = 4_000  # for every frame: steps of the integrator and rows of derivatives, 10 us each
 USUAL = 700  # frames of a recording
 MOST_SIGMAS = 10.0  # of a size's tolerance, within which it is sought: else a wrong clock bends the disc to fit itself
 SLIP_STARTS = (0.9, 0.7, 0.5)  # of the friction that rolling needs at most
@@ -133,7 +131,7 @@ class DiscSystem(LawSystem):
         self._whiten = np.where(self.used[..., None, None], whitening(safe), 0.0)
         self.weights = np.asarray(2.0 * self.used.sum((1, 2)), float)
         self.trial_steps = TRIAL_SLIP_STEPS * len(self.time)
-        self.budget = self.budget_with(np.inf)
+        self.budget = Budget(MOST_WORK * max(len(self.time), USUAL))  # a short one may take as long as the usual
         of_slip = slipping_start_quantities(model) if starts_in_slip else ()
         if candidates is None:
             candidates = (*motion_candidates(model), *measurement_candidates(self.disc))
@@ -240,10 +238,6 @@ class DiscSystem(LawSystem):
             sight.pixels[rows], self.used[rows], self._whiten[rows],
         )  # fmt: skip
 
-    def budget_with(self, slip_steps: float) -> Budget:
-        """Of a search that may take so many steps of slip; a short recording may take as long as the usual one."""
-        return Budget(slip_steps, MOST_PREDICTED * max(len(self.time), USUAL))
-
     def start(self) -> dict[str, float]:
         """Values of the base quantities from the measured poses, good enough for Gauss-Newton, and the known faults."""
         return start_values(self, self.known)
@@ -314,7 +308,7 @@ class DiscSystem(LawSystem):
 
     def linearise(self, values: Values, names: Sequence[str]) -> tuple[Array, Array]:
         """Whitened dots (n, 4 m), observed minus predicted, and the prediction's derivative (n, 4 m, k)."""
-        self.budget.worked((1 + len(names)) * len(self.time))
+        self.budget.work(len(names) * len(self.time))
         path = self._path(values, names)
         sight = self._sight(path, values)
         residual = self._residual(sight.pixels, values)
@@ -405,11 +399,11 @@ class DiscSystem(LawSystem):
         if SLIP in names and values.get(SLIP, 0.0) > 0:
             parameters[SLIP] = "slip.mu"
         limit = int(MAX_SWITCHES[0] + MAX_SWITCHES[1] * (times[-1] - times[0]))
-        left = int(min(self.budget.left, MAX_SLIP_STEPS))
+        left = int(min(self.budget.trial_left, self.trial_steps))  # more is no motion that can be followed
         of_state = [n.partition(".")[2] for n in components]
         moving = sensitivities(model, state, times, tuple(parameters.values()), of_state, THETA_END, RTOL, limit, left)
-        self.budget.take(moving.slip_steps)
-        self.budget.worked(moving.slip_steps)
+        self.budget.work(moving.n_steps)
+        self.budget.step(moving.slip_steps)
         by_motion, moved = moving.dq.copy(), (*components, *parameters)
         by_motion[:, 3:] = euler_rate_axes_world(moving.q[:, 3], moving.q[:, 4]) @ moving.dq[:, 3:]
         if SLIP in parameters:

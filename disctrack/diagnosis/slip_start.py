@@ -12,7 +12,7 @@ import numpy as np
 
 from disctrack.analyse.contact import RollingOnset, analyse_contact
 from disctrack.analyse.derivatives import differentiate
-from disctrack.diagnosis.disc_system import MOST_SLIP_STEPS, DiscSystem
+from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.diagnosis.errors import simulated
 from disctrack.diagnosis.large_faults import diagnose_with_large, find_clock, find_large
 from disctrack.diagnosis.motion import SLIP, SLIP_VELOCITY, slip_candidate
@@ -23,7 +23,7 @@ from disctrack.discrepancy.fit import Fit, fit
 from disctrack.discrepancy.held_out import HeldOut, held_out, training_rows
 from disctrack.discrepancy.noise import noise_variance
 from disctrack.discrepancy.search import FAR, Diagnosis, Found, Settings, beside, explain, threshold
-from disctrack.discrepancy.system import Candidate, GivenUp, TrialGivenUp
+from disctrack.discrepancy.system import Candidate, GivenUp
 from disctrack.errors import AnalysisError
 from disctrack.faults.clock_jump import clock_jumps, without_jumps
 from disctrack.rolling import CATALOGUE, Model, Regime
@@ -31,14 +31,6 @@ from disctrack.trajectory import Trajectory, part
 
 LEAST_SLIP = 12e-3  # [m/s] a cubic over the first 20 ms errs by 9 mm/s at 3 deg; friction of 0.1 stops it in 12 ms
 MAX_ITERATIONS = 12  # where slip is a mere possibility: a trial of a friction that is too low takes long
-CREEPS = (
-    "slip with Coulomb's friction was given up: with so little of it the disc creeps, for longer than can be followed; "
-    "it is taken to roll"
-)
-CREEPS_BESIDE = (
-    "slip with Coulomb's friction is all that was fitted: with so little of it the disc creeps, and fits with "
-    "other effects would take too long"
-)
 LASTS = 5  # frames of slip at mm/s at least: contact velocities that are errors of a fit stop within one
 SHOWN = 0.975  # probability of slip at the first frame from which on it is taken for shown
 
@@ -93,20 +85,11 @@ def _with_these_times(
         assumed = None if base.converged else find_clock(rolling)
     if assumed is not None:
         return MotionDiagnosis(assumed.system, *diagnose_with_large(assumed, settings))
-    rolling.budget = rolling.budget_with(MOST_SLIP_STEPS * len(rolling.time))
-    try:
-        answer = _rolling_or_slipping(settings, rolling, base)
-        rolling.budget.without_end()
-        return answer
-    except GivenUp:
-        rolling.budget.without_end()
-        # without slip there is still the rest of the catalogue, and whatever a law outside of it describes
-        rolling = rolling.again(_without_slip(rolling))
-        return MotionDiagnosis(rolling, explain(rolling, base.values, settings), (CREEPS,))
+    return _rolling_or_slipping(settings, rolling, base)
 
 
 def _rolling_or_slipping(settings: Settings, rolling: DiscSystem, base: Fit) -> MotionDiagnosis:
-    """The diagnosis of a motion without large faults. Raises GivenUp where slip would take too long to follow."""
+    """The diagnosis of a motion without large faults."""
     q = rolling.trajectory.q[rolling.rows]
     large = not base.reduced_chi_square <= FAR * noise_variance(rolling, base)
     if large and _slips_slowly(settings, rolling):
@@ -133,7 +116,7 @@ def _slips_slowly(settings: Settings, rolling: DiscSystem) -> bool:
     try:
         with slipping.budget.trial(slipping.trial_steps):
             alone = fit(slipping, slipping.base, slipping.start(), MAX_ITERATIONS)
-    except TrialGivenUp:
+    except GivenUp:
         return False
     if not _at_noise(slipping, alone, settings):
         return False
@@ -160,18 +143,12 @@ def _onset(rolling: DiscSystem) -> RollingOnset | None:
 def _slipping(settings: Settings, rolling: DiscSystem, base: Fit, onset: RollingOnset | None) -> MotionDiagnosis:
     """The diagnosis with slip at first, or of what comes after it where no coefficient of friction describes it."""
     system = rolling.again(starts_in_slip=True)
-    crept: tuple[str, ...] = ()
-    try:
-        diagnosis = explain(system, system.start(), settings)
-    except GivenUp:  # while effects beside it were tried: what slip alone explains is an answer still
-        rolling.budget.without_end()
-        system = rolling.again((), starts_in_slip=True)
-        diagnosis, crept = explain(system, system.start(), settings), (CREEPS_BESIDE,)
-    if not crept and diagnosis.verdict == "unexplained" and onset is not None and np.isfinite(onset.high):
+    diagnosis = explain(system, system.start(), settings)
+    if diagnosis.verdict == "unexplained" and onset is not None and np.isfinite(onset.high):
         later = _after_slip(settings, rolling, onset, diagnosis)
         if later is not None:
             return later
-    notes = (*_in_words(system, diagnosis), *crept)
+    notes = _in_words(system, diagnosis)
     if diagnosis.held_out_after is None or SLIP not in {q.name for q in system.base}:  # friction was declared
         return MotionDiagnosis(system, diagnosis, notes)
     held = held_out(diagnosis.judged or system, base.quantities, base.values, training_rows(system))

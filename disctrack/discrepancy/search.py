@@ -24,7 +24,7 @@ from disctrack.discrepancy.noise import THIRD, common_modes, inflation, noise_va
 from disctrack.discrepancy.score import Linearisation, Score, angle, score_all
 from disctrack.discrepancy.shape import WORTH_A_SHAPE, with_free_shape, with_shape
 from disctrack.discrepancy.significance import TWO_SIDED, Chance, chance, price_of_a_number
-from disctrack.discrepancy.system import Candidate, Quantity, System, TrialGivenUp, Values
+from disctrack.discrepancy.system import Candidate, GivenUp, Quantity, System, Values
 
 CLASS_GAIN = 10.0  # two explanations whose lengths differ by less are not told apart (odds of e^5)
 OBVIOUS = 5.0  # times its price: a gain that the fitted part alone may know
@@ -510,7 +510,7 @@ class _Search:
         try:
             with self.system.budget.trial(np.inf if patient else self.system.trial_steps):
                 return fit(self.system, quantities, values)
-        except TrialGivenUp:
+        except GivenUp:
             return no_fit(quantities, values)
 
     def _better(self, start: Values, known: Fit) -> bool:
@@ -554,7 +554,7 @@ class _Search:
             try:
                 with self.system.budget.trial(self.system.trial_steps):
                     found = fit(part, quantities, values)
-            except TrialGivenUp:
+            except GivenUp:
                 return None
             if not found.converged or found.reduced_chi_square > AGREES * self.noise:
                 return None

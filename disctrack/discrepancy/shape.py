@@ -13,7 +13,7 @@ import numpy as np
 from calibration.kit.arrays import Array
 from disctrack.discrepancy.fit import Fit, fit
 from disctrack.discrepancy.score import Linearisation, score
-from disctrack.discrepancy.system import Candidate, Quantity, System, TrialGivenUp
+from disctrack.discrepancy.system import Candidate, GivenUp, Quantity, System
 
 MAX_TRIALS = 24  # values of a shape at which the rest is refitted
 ALONG = 5.0  # times the time of a trial, for all that follows from the best start
@@ -41,7 +41,7 @@ def with_free_shape(
         return None
     fits = []
     for start in starts or _grid(candidate):
-        with suppress(TrialGivenUp), system.budget.trial(system.trial_steps):
+        with suppress(GivenUp), system.budget.trial(system.trial_steps):
             quantities = (*base.quantities, *candidate.quantities)
             fits.append(fit(system, quantities, base.values | start, MAX_STARTED))
     fitted = min(fits, key=lambda f: f.cost, default=None)
@@ -52,7 +52,7 @@ def with_free_shape(
     if fitted.cost - gain > goal and gain < WORTH_A_SHAPE * (fitted.cost - goal):
         return None
     free = [(q, expected) for q in candidate.shape if np.isfinite(expected := expected_sigma(system, fitted, q))]
-    with suppress(TrialGivenUp), system.budget.trial(ALONG * system.trial_steps):
+    with suppress(GivenUp), system.budget.trial(ALONG * system.trial_steps):
         for q, expected in free:
             fitted = profiled(system, fitted, q, expected, goal)
         if fitted.converged and all(is_determined(fitted, q) for q, _ in free):

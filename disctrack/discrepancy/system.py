@@ -78,56 +78,44 @@ class Candidate:
 
 
 class GivenUp(Exception):
-    """A hypothesis would take too long to follow: the one who put it forward goes on without it."""
-
-
-class TrialGivenUp(GivenUp):
-    """One of many hypotheses would take too long: the others are still to be tried."""
+    """One of many hypotheses would take too long: the one who put it forward goes on without it."""
 
 
 class Budget:
-    """Steps that predictions may still take while an answer is sought; of all systems that share it.
+    """Work that an answer may take, in units of the system's; of all systems that share it.
 
-    Steps, and not seconds, so that an answer does not depend on the machine. Of `work`, nothing is given up half way:
-    when it is used up no further hypothesis is put forward, and the answer is the best of those that were.
+    Work, and not seconds, so that an answer does not depend on the machine. When it is used up no further hypothesis
+    is put forward, and the answer is the best of those that were. A trial among many is given up half way.
     """
 
-    def __init__(self, steps: float = np.inf, work: float = np.inf) -> None:
+    def __init__(self, work: float = np.inf) -> None:
         """Without an end, if not given."""
-        self._left, self._trial, self._work, self._of = float(steps), np.inf, float(work), float(work)
-
-    def worked(self, work: float) -> None:
-        """Count what a prediction took."""
-        self._work -= work
+        self._left = self._whole = float(work)
+        self.trial_left = np.inf  # steps until the trial is given up
 
     def open(self, kept: float = 0.0) -> bool:
         """May a hypothesis be put forward, while this share of the whole is kept for others?"""
-        return np.isinf(self._of) or self._work > kept * self._of
+        return np.isinf(self._whole) or self._left > kept * self._whole
 
-    @property
-    def left(self) -> float:
-        """Steps until something is given up."""
-        return min(self._left, self._trial)
+    def work(self, done: float) -> None:
+        """Count."""
+        self._left -= done
 
-    def take(self, steps: float) -> None:
-        """Count. Raises GivenUp when the last is taken, TrialGivenUp where that is a trial's last only."""
-        self._left, self._trial = max(self._left - steps, 0.0), max(self._trial - steps, 0.0)
-        if self.left == 0.0:
-            raise TrialGivenUp if self._left else GivenUp
+    def step(self, steps: float) -> None:
+        """Count steps that a trial may have too many of. Raises GivenUp."""
+        self.trial_left = max(self.trial_left - steps, 0.0)
+        if self.trial_left == 0.0:
+            raise GivenUp
 
     @contextmanager
     def trial(self, steps: float) -> Iterator[None]:
         """Within, one trial among many, that may take so many steps; a trial within another no more than that has."""
-        outer, inner = self._trial, min(self._trial, steps)
-        self._trial = inner
+        outer, inner = self.trial_left, min(self.trial_left, steps)
+        self.trial_left = inner
         try:
             yield
         finally:
-            self._trial = outer if np.isinf(outer) else outer - (inner - self._trial)
-
-    def without_end(self) -> None:
-        """An answer has been found, or given up: what is still asked is asked to the end."""
-        self._left = np.inf
+            self.trial_left = outer if np.isinf(outer) else outer - (inner - self.trial_left)
 
 
 class System:
@@ -141,7 +129,7 @@ class System:
     base: tuple[Quantity, ...]  # that every fit moves: initial conditions, declared laws, nuisances with priors
     candidates: tuple[Candidate, ...]  # effects that the model may lack
     budget: Budget = Budget()
-    trial_steps: float = np.inf  # of the budget, that one hypothesis among many may take
+    trial_steps: float = np.inf  # that one hypothesis among many may take
     several_minima: bool = False  # may fits of the same quantities end in different minima?
     frees_shapes: bool = False  # are numbers of laws' shapes tried free where no law as it is written down will do?
     blocks: Sequence[slice] = ()  # rows that may have quantities of their own (`discrepancy.elimination`)

@@ -97,6 +97,7 @@ class Path:
     end_time: complex
     end_state: Parts  # (8,), (10,) or (12,)
     slip_steps: int  # of the integrator in slip, which is stiff where it creeps
+    n_steps: int  # of it in all
 
     @property
     def as_seen(self) -> tuple[Parts, Parts]:

@@ -47,6 +47,7 @@ class Sensitivities:
     dqdot: Array  # (n, 6, k)
     dstate: Array  # (n, 8, k) of records.ROLLING_COMPONENTS
     slip_steps: int = 0  # of the integrator in slip, over all runs
+    n_steps: int = 0  # of it in all
 
 
 def sensitivities(
@@ -75,7 +76,7 @@ def sensitivities(
     found = np.full((len(grid), 20, 1 + len(names)), np.nan)  # q, qdot and state: the motion, then its derivatives
     assembly = Assembly(enlarged, theta_end)
     path = follow(assembly, y0, grid, rtol, max_switches, max_slip_steps)
-    spent = path.slip_steps
+    spent, n_steps = path.slip_steps, path.n_steps
     found[: len(path.now), :, 0] = _numbers(path)
     if path.end is not EndReason.CHATTER:
         same = symmetries(enlarged, assembly) - ({"psi"} if len(y0) > 8 else set())  # a slip at the start turns, too
@@ -92,11 +93,11 @@ def sensitivities(
                 values = {name: enlarged.values[name] + 1j * _SEED}
             moved = Assembly(enlarged, theta_end, complex, values)
             run = follow(moved, y, grid, rtol, max_slip_steps=max(max_slip_steps - spent, 0))
-            spent += run.slip_steps
+            spent, n_steps = spent + run.slip_steps, n_steps + run.n_steps
             found[: len(run.now), :, column] = _numbers(run).imag / _SEED
     q, qdot, _ = np.split(found[..., 0], [6, 12], axis=1)
     dq, dqdot, dstate = np.split(found[..., 1:], [6, 12], axis=1)
-    return Sensitivities(grid, q, qdot, names, dq, dqdot, dstate, spent)
+    return Sensitivities(grid, q, qdot, names, dq, dqdot, dstate, spent, n_steps)
 
 
 _NUMBERS = (*COORDINATES, *(f"{c}dot" for c in COORDINATES), *ROLLING_COMPONENTS)

@@ -106,7 +106,7 @@ def follow(
     pieces: list[tuple[Records, Array]] = []
     switches: list[Switch] = []
     end: EndReason | None = None
-    i, slip_steps = 0, 0
+    i, slip_steps, n_steps = 0, 0, 0
 
     def add(times: Array, Y: Numbers) -> None:
         pieces.append((assembly.at(regime, times, Y)[2], np.full(len(times), regime, np.uint8)))
@@ -120,6 +120,7 @@ def follow(
             most = min(left, integrate.MAX_STEPS)
             done = integrate.integrate(assembly.system(regime), t, y, grid[i:], rtol, ATOL[: len(y)], most)
             slip_steps += done.n_steps if regime == SLIPPING else 0
+            n_steps += done.n_steps
             if len(done.y):  # none where the steps are used up before the first instant
                 add(grid[i : i + len(done.y)], done.y)
             i, t, y = i + len(done.y), done.t_last, done.y_last
@@ -141,7 +142,7 @@ def follow(
     if not pieces:  # over at its start
         add(grid[:1], y[None])
     now, regimes = (np.concatenate(parts) for parts in zip(*pieces, strict=True))
-    return Path(now, regimes, switches, end, t, y, slip_steps)
+    return Path(now, regimes, switches, end, t, y, slip_steps, n_steps)
 
 
 def _event_at_start(assembly: Assembly, regime: int, t: complex, y: Numbers) -> int | None:

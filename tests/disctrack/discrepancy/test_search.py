@@ -12,7 +12,7 @@ from disctrack.discrepancy.fit import fit
 from disctrack.discrepancy.held_out import held_out, training_rows
 from disctrack.discrepancy.score import Linearisation, score_all
 from disctrack.discrepancy.search import Settings, explain, length
-from disctrack.discrepancy.system import Budget, Candidate, GivenUp, Quantity, System
+from disctrack.discrepancy.system import Budget, Candidate, Quantity, System
 from tests.oracles.linear_system import Linear, candidate, one
 
 SIGMA = 0.01
@@ -232,7 +232,7 @@ class Impatient(Oscillator):
 
     def linearise(self, values, names):
         if values.get("drift"):
-            self.budget.take(10.0)
+            self.budget.step(10.0)
         return super().linearise(values, names)
 
 
@@ -244,9 +244,16 @@ def test_a_hypothesis_that_takes_too_long_is_left_and_the_others_are_tried(rng):
     answer = explain(impatient, START)  # the twin of the drift does what the drift did
     assert sorted(f.candidate.name for f in answer.found) == ["hum", "twin"]
     assert not any(r.candidate.name == "drift" for f in answer.found for r in f.cannot_be_told_from)
-    impatient.budget = Budget(5.0)  # when all of it is spent, that is another matter
-    with pytest.raises(GivenUp):
-        explain(impatient, START)
+
+
+def test_when_the_work_is_used_up_nothing_more_is_put_forward(rng):
+    system = oscillator(rng, {"hum_c": 0.05})
+    system.budget = Budget(10.0)
+    assert [f.candidate.name for f in explain(system, START).found] == ["hum"]
+    system.budget.work(6.0)  # half of it is kept for laws
+    answer = explain(system, START)
+    assert answer.found == ()
+    assert answer.verdict == "unexplained"
 
 
 def test_a_fit_that_leaves_much_is_found_to_a_share_of_its_own_scatter(rng):
