@@ -39,6 +39,8 @@ from disctrack.trajectory import Trajectory
 from disctrack.trajectory.file import trajectory_in
 from disctrack.trajectory.reuse import content_of, origin_of, refuse_other, remember
 
+USED_UP = "the search ended when its work was used up: not all that may be missing was tried"
+
 
 @dataclass(frozen=True, repr=False)
 class DiagnoseOutcome(Brief):
@@ -81,6 +83,7 @@ def diagnose(trajectory: Trajectory, model: str = PAPER, settings: Settings | No
         left, notes = left_over(system, diagnosis.after, diagnosis.noise), (*notes, *doubted)
     else:
         diagnosis = replace(diagnosis, after=with_memory(judged_as(diagnosis, system), diagnosis.after))
+    notes = (*notes, "" if system.budget.open() else USED_UP)
     diagnosis = answer.with_slip(diagnosis)
     before = errors(system, diagnosis.before, diagnosis.held_out_before)
     after = errors(system, diagnosis.after, diagnosis.held_out_after)
