@@ -136,8 +136,6 @@ HIDDEN_EFFECTS: tuple[HiddenEffect, ...] = (
     _wrong("table_height", 5e-5),
     _wrong("exposure_blur", 4e-6),
     _wrong("ellipse_centre", 1.0),
-    _wrong("clock_drift", 0.01),
-    _motion("surface_moves", 0.02, "rad/s", "rate", signed=True),
 )  # fmt: skip
 CONTROLS: tuple[HiddenEffect, ...] = (
     HiddenEffect("nothing", 1.0, "1", lambda size, _: Planted()),
