@@ -205,12 +205,12 @@ def _drifts(time: Array) -> Iterator[Row]:
     middle, half = 0.5 * float(time[0] + time[-1]), 0.5 * float(time[-1] - time[0])
     u = f"((time - {middle!r}) / {half!r})"
     powers = [" * ".join([u] * n) or "1.0" for n in range(DRIFT_DEGREE + 1)]
-    for n in range(DRIFT_DEGREE + 1):
-        changes, here = f" that changes with time, degree {n}" if n else "", powers[: n + 1]
-        yield f"a level force{changes}", "drift", tuple(along(f) for f in here for along in (along_x, along_y))
-        yield f"a vertical force{changes}", "drift Z", tuple({"X_z": f} for f in here)
+    for n in range(1, DRIFT_DEGREE + 1):
+        changes, here = f"that changes with time, degree {n}", powers[: n + 1]
+        yield f"a level force {changes}", "drift", tuple(along(f) for f in here for along in (along_x, along_y))
+        yield f"a vertical force {changes}", "drift Z", tuple({"X_z": f} for f in here)
         for axis in ("m", "z"):
-            yield f"a moment M_{axis} by the load{changes}", "drift M", tuple({f"load_{axis}": f} for f in here)
+            yield f"a moment M_{axis} by the load {changes}", "drift M", tuple({f"load_{axis}": f} for f in here)
 
 
 def _below_a_nutation(q: Array) -> Iterator[Row]:
