@@ -125,7 +125,7 @@ class CalibrationRecord:
     R_left_board: Array  # (n_views + those apart, 3, 3), to which the observations' `view` refers
     t_left_board: Array  # (n_views + those apart, 3) [m]
     # of JSON's types: settings; figures (rms, chosen terms, cross-validation table, assessment); versions of software;
-    # warnings; rejected_views (view: reason); rejected_corners (view, camera, corner, reason)
+    # doubts; warnings; rejected_views (view: reason); rejected_corners (view, camera, corner, reason)
     told: dict[str, Any]
     apart: tuple[int, ...] = ()  # views whose right image has a place of the board of its own, n_views + 0, 1, ...
 
@@ -167,6 +167,7 @@ def record_of(calibration: StereoCalibration) -> CalibrationRecord:
         "settings": asdict(calibration.settings),
         "figures": figures,
         "versions": versions(("disctrack", "numpy", "scipy", "opencv-contrib-python-headless", "numba", "h5py")),
+        "doubts": calibration.doubts,
         "warnings": calibration.warnings,
         "rejected_views": calibration.rejected_views,
         "rejected_corners": calibration.rejected_corners(),
@@ -435,7 +436,7 @@ def _read_record(group: h5py.Group) -> CalibrationRecord:
         "board": board,
         "view_names": tuple((str(left), str(right)) for left, right in names),
         "apart": apart,
-        "told": {name: text(name) for name in _TOLD},
+        "told": {name: text(name) for name in _TOLD} | {"doubts": text("doubts") if "doubts" in group.attrs else []},
         "table_view": None if table_view < 0 else table_view,
         "observations": Observations(*seen.values()),
         "kept": known["kept"].astype(bool),

@@ -67,6 +67,7 @@ class StereoCalibration(Brief):
     candidates: tuple[TermsTried, ...]  # cross-validation table; the chosen terms are refinement.terms
     assessment: Assessment
     warnings: tuple[str, ...] = field(default=())
+    doubts: tuple[str, ...] = ()  # what may make the rig wrong by more than its sigmas
     apart: tuple[int, ...] = ()  # views whose right image has a place of the board of its own, n_views + 0, 1, ...
     lens: FieldFit | None = None  # where views left out were met better with it; the observations are corrected by it
 
@@ -165,7 +166,8 @@ def calibrate_stereo(
     found = calibrate_from_corners(views[:n], views[n:], board, settings, table_view, board_thickness, names)
     seen = [view for side in found.corner_views for view in side]
     negative = negatives([*left, *right], seen, board) if isinstance(board, Board) else ""
-    return replace(found, warnings=(*filter(None, (negative, note_left, note_right)), *found.warnings))
+    found = replace(found, doubts=(negative,) if negative else ())
+    return replace(found, warnings=(*filter(None, (note_left, note_right)), *found.warnings))
 
 
 def check_sizes(left: Sequence[NDArray], right: Sequence[NDArray], names: Sequence[tuple[str, str]]) -> None:

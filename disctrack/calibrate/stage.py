@@ -21,7 +21,7 @@ from disctrack.calibrate.views import TargetImages, calibrate_views, declared_vi
 from disctrack.errors import CalibrationError, OutputError, RecordingError, RigFileError
 from disctrack.files.inputs import keep, refuse_input
 from disctrack.files.whole import write_whole
-from disctrack.findings import Kind, Severity, of_kind
+from disctrack.findings import Finding, Kind, Severity, of_kind
 from disctrack.progress import compiling, progress_bar
 from disctrack.recording.declaration import Recording
 from disctrack.report.blocks import Facts, Report
@@ -108,8 +108,15 @@ def boards_of(record: CalibrationRecord, views: TargetImages | None, numbers: Se
     found = [numbers[i] for i in found] if numbers else found
     places = dict(zip(found, zip(record.R_left_board, record.t_left_board, strict=True), strict=False))
     view = None if record.table_view is None else found[record.table_view]
-    noticed = of_kind(Kind.CALIBRATION, Severity.WARNING, record.told["warnings"])
-    return Boards(places, view, record.board_thickness, noticed)
+    return Boards(places, view, record.board_thickness, noticed_in(record.told))
+
+
+def noticed_in(told: Mapping[str, Any]) -> tuple[Finding, ...]:
+    """What a calibration says of itself, its `doubts` and `warnings`, as findings."""
+    grave = (Severity.DOUBT, "doubts"), (Severity.WARNING, "warnings")
+    return tuple(
+        finding for severity, name in grave for finding in of_kind(Kind.CALIBRATION, severity, told.get(name, ()))
+    )
 
 
 def given_rig(file: Path) -> tuple[StereoRig, Report]:
@@ -151,6 +158,7 @@ def calibrate_into(
         "verdict": f"{found.assessment.verdict}.",
         "accuracy": found.assessment.figures,
         "rows": summary.calibration_rows(found, problems),
+        "doubts": found.doubts,
         "warnings": found.warnings,
     }
     attributes = {
@@ -173,8 +181,7 @@ def calibrate_into(
 
 def _report(told: Mapping[str, Any], files: Sequence[Path]) -> Report:
     """What a calibration tells, from what its rig file keeps of it."""
-    warnings = of_kind(Kind.CALIBRATION, Severity.WARNING, told["warnings"])
-    return Report("", told["verdict"], told["accuracy"], warnings, blocks=[Facts(told["rows"])], files=files)
+    return Report("", told["verdict"], told["accuracy"], noticed_in(told), blocks=[Facts(told["rows"])], files=files)
 
 
 def is_rig_of(path: Path, source: CalibrationSource) -> bool:

@@ -17,7 +17,7 @@ from calibration import CalibrationSettings, StereoCalibration, StereoRig
 from calibration.kit.arrays import evenly
 from calibration.rig_file import record_of
 from disctrack.analyse.declaration import Boards, across, contradictions, lost_pairs, turned_board, with_square
-from disctrack.calibrate.stage import boards_in, boards_of, given_rig, source_of
+from disctrack.calibrate.stage import boards_in, boards_of, given_rig, noticed_in, source_of
 from disctrack.errors import DiscTrackError, RecordingError
 from disctrack.findings import (
     Finding,
@@ -27,7 +27,6 @@ from disctrack.findings import (
     Subject,
     in_doubt,
     leading,
-    of_kind,
 )
 from disctrack.frames import CAMERAS
 from disctrack.recording.declaration import Recording, read_recording
@@ -159,7 +158,7 @@ def _rig(seen: Check, recording: Recording) -> StereoRig:
         advice = "the whole board must be in view of both cameras, with a light rim round it"
         seen.warn(Kind.CALIBRATION, f"the chessboard was {text}", advice)
     said = (*left_out(found.rejected_views), *problems, *found.warnings)
-    seen.findings += of_kind(Kind.CALIBRATION, Severity.WARNING, said)
+    seen.findings += noticed_in({"doubts": found.doubts, "warnings": said})
     return found.rig
 
 

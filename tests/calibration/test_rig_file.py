@@ -54,6 +54,7 @@ def content(rig, rng):
             "settings": {"distortion": "auto", "threads": 2},
             "figures": {"rms_px": 0.012, "cross_validation": [{"distortion": "k1", "rms_px": 0.1}]},
             "versions": {"numpy": "2"},
+            "doubts": ["are the images negative?"],
             "warnings": ["few views"],
             "rejected_views": {"2": "the board moved"},
             "rejected_corners": [[0, 1, 7, "contrast"]],

@@ -214,6 +214,8 @@ FAULTS = {
     "three frames late": fault(Kind.DELAY, "doubt", "Number its images higher by 3", late(3)),
     "images lost by one": fault(Kind.DROPPED_FRAMES, "doubt", "left out 3 images at frame 150",
                                 planted("images lost by one", 3)),
+    "ten images lost by one": fault(Kind.DROPPED_FRAMES, "doubt", "left out 10 images",
+                                    planted("images lost by one", 10)),
     "pairs lost by both": fault(Kind.CLOCK_JUMP, "doubt", "frame 150: the clock jumps by 3",
                                 planted("pairs lost by both", 3)),
     "one moment twice": fault(Kind.REPEATED_IMAGES, "doubt", "1 repeat of earlier images", one_image_twice),
@@ -228,7 +230,7 @@ FAULTS = {
                            says("calibration", inner_corners=[8, 5])),
     "views late in one": fault(Kind.CALIBRATION, "refusal", "the right ones come 1 early",
                                planted("views late in one", 1)),
-    "negative views": fault(Kind.CALIBRATION, "warning", "the paper round the board", planted("negative views", 1)),
+    "negative views": fault(Kind.CALIBRATION, "doubt", "the paper round the board", planted("negative views", 1)),
     "a hand for a moment": fault(Kind.ANALYSIS, "warning", "1 of 300 frames have", drawn(hidden_once), "analyse"),
     "a hand in between": fault(Kind.DIAGNOSIS, "note", "1 of the 300 frames have", drawn(hidden_once), "diagnose"),
 }  # fmt: skip

@@ -290,6 +290,33 @@ def test_a_camera_that_left_out_an_image_is_named_with_the_frame(clip):
     assert "left out 1 image at frame 9" in first.text
 
 
+@pytest.mark.statistical
+@pytest.mark.parametrize("camera", [0, 1])
+def test_ten_images_left_out_are_named_and_the_frames_after_them_are_the_other_cameras(clip, camera):
+    """Too many to see a delay in: dots are looked for where there are none, or others."""
+    images = clip.images.copy()
+    images[9:-10, camera] = images[19:, camera]
+    found = measure(images[:-10], clip.rig, clip.disc)
+    after = np.arange(N - 10) >= 9
+    assert (found.trajectory.frame_status == np.where(after, FrameStatus.ONE_CAMERA, FrameStatus.MEASURED)).all()
+    (first,) = (finding for finding in leading(found.findings) if finding.doubtful)
+    assert (first.kind, first.subject.camera, first.subject.frames) == (
+        Kind.DROPPED_FRAMES,
+        frames.CAMERAS[camera],
+        ((9, 37),),
+    )
+    assert "left out 10 images at frame 9" in first.text
+    own = found.trajectory.pose_covariance + found.trajectory.calibration_covariance
+    assert not beyond(found.trajectory, clip.untouched.trajectory.q[: N - 10], own).any()
+
+
+def test_a_hand_before_one_camera_is_no_sign_of_images_left_out(clip):
+    images = clip.images.copy()
+    images[20:, 1] = 90
+    kinds = kinds_of(measure(images, clip.rig, clip.disc))
+    assert Kind.DROPPED_FRAMES not in kinds
+
+
 def test_a_camera_that_stays_ahead_is_told_once(clip):
     """Although its frames are refused in pieces: two images between them show nothing."""
     images = clip.images.copy()

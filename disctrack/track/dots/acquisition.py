@@ -80,21 +80,26 @@ def expected_diameter_px(rig: StereoRig, disc: Disc) -> list[float]:
     return result
 
 
-def acquire(pair: Sequence[NDArray] | NDArray, rig: StereoRig, disc: Disc) -> tuple[Pose | None, int, str]:
+def acquire(
+    pair: Sequence[NDArray] | NDArray, rig: StereoRig, disc: Disc, by_one: bool = True
+) -> tuple[Pose | None, int, str]:
     """Find the disc in the images of both cameras, wherever it is and however it is turned.
 
+    by_one : by the dots of either camera, too, where both together show too few; that takes four times as long
     The pose, good to a fraction of a pixel; dot images explained by blobs, both cameras together; why none was found.
     """
     diameters = expected_diameter_px(rig, disc)
     blobs = [dot_blobs(image, diameter)[:, :2] for image, diameter in zip(pair, diameters, strict=True)]
-    return acquire_from_blobs(blobs, rig, disc)
+    return acquire_from_blobs(blobs, rig, disc, by_one)
 
 
-def acquire_from_blobs(blobs: list[Array], rig: StereoRig, disc: Disc) -> tuple[Pose | None, int, str]:
+def acquire_from_blobs(
+    blobs: list[Array], rig: StereoRig, disc: Disc, by_one: bool = True
+) -> tuple[Pose | None, int, str]:
     """As `acquire` from the centroids of candidate blobs in the left and in the right image, each (k, 2)."""
     candidates = _candidates_from_stereo(blobs, rig, disc)
     best = _best_explanation(candidates, blobs, rig, disc)
-    if best is None or best[3] < 2 * disc.n_markers - 3:
+    if by_one and (best is None or best[3] < 2 * disc.n_markers - 3):
         for camera in (0, 1):
             single = _best_explanation(_candidates_from_one_camera(blobs[camera], camera, rig, disc), blobs, rig, disc)
             if single is not None and (best is None or single[0] < best[0]):

@@ -19,7 +19,8 @@ from disctrack import frames
 from disctrack.disc import MA_2014, Disc, symmetry_order
 from disctrack.errors import TrackingError
 from disctrack.findings import Finding, Kind, Severity, Subject, in_doubt
-from disctrack.recording.readers.blocks import PairBlock
+from disctrack.recording.readers.blocks import PairBlock, Unreadable
+from disctrack.track.dots.template import dot_centres
 from disctrack.track.follow.following import (
     Follower,
     Heading,
@@ -31,10 +32,12 @@ from disctrack.track.follow.following import (
     follow_block,
     run,
 )
-from disctrack.track.judge.disc_not_seen import why_not_seen
+from disctrack.track.judge.disc_not_seen import frames_ahead, why_not_seen
 from disctrack.track.judge.doubts import MOVED
+from disctrack.track.judge.dropped_frames import delay_of_right, left_out
 from disctrack.track.pose import marker_pixels
 from disctrack.track.refine.assembly import Taken, Tracking, TrackingSettings, assemble
+from disctrack.track.refine.self_calibration import DotsInFrames
 from disctrack.track.side_by_side import evenly
 from disctrack.trajectory import FrameStatus
 
@@ -46,6 +49,7 @@ MOSTLY = 0.5  # of the frames: that many are not refused for glare and hands
 # wrong that templates are made for: places 0.1 mm off, rms, shift centres by 0.3e-3 to 2e-3 px, in all frames alike.
 LOOK_AGAIN = 60e-6
 DECLARED = (Kind.DOTS_MISPLACED, Kind.TABLE_DISAGREES)  # of numbers, not of images
+APART, PAIRED = 10, 24  # frames without dots of both cameras, from which on others are paired; of so many
 PAIRS_TRIED = 12  # for pixels that do not see, and for what is wrong where no disc is found
 MAX_EDGE_TURN = np.radians(25.0)  # by which the poses on both sides of an edge may miss each other's prediction
 
@@ -84,13 +88,7 @@ def track(
     Raises TrackingError if the images do not belong to the rig or if the disc is found in no pair at all.
     """
     settings = settings or TrackingSettings()
-    spread = disc.marker_centres_body - disc.marker_centres_body.mean(axis=0)
-    if disc.n_markers < 3 or np.linalg.matrix_rank(spread, tol=0.1 * disc.marker_diameter) < 2:
-        raise TrackingError(
-            f"[markers] declares {disc.n_markers} dots"
-            + (" on one line" if disc.n_markers > 2 else "")
-            + ": a pose needs at least three dots that are not on one line"
-        )
+    _check_dots(disc)
     read_blocks, stuck = _as_one_sensor(read_blocks, pairs)
     if timestamps is None:
         timestamps = np.array(pairs) / frame_rate
@@ -110,14 +108,68 @@ def track(
         return tracking, in_doubt(f for f in tracking.findings if f.kind not in DECLARED)
 
     tracking, faulty = measured(disc, progress)
+    slips = _slips(tracking, read_blocks, pairs, setup, settings)
+    for slip in slips:
+        read_blocks = _without(read_blocks, frames.CAMERAS.index(slip.subject.camera), slip.subject.frames[0][0])
+        tracking, faulty = measured(disc, lambda n: None)
     found = tracking.trajectory.disc
     if np.abs(found.marker_centres_body - disc.marker_centres_body).max() > LOOK_AGAIN and not faulty:
         tracking, faulty = measured(found, lambda n: None)
+    tracking = replace(tracking, findings=(*slips, *tracking.findings))
     arranged = why_not_seen(_senseless(tracking, faulty, read_blocks, pairs), rig, disc)
     # in doubt only here: dots found elsewhere than declared are what the second look above is for
     doubt = {Kind.DOTS_MISPLACED: Severity.DOUBT}
     noticed = (*arranged, *tracking.findings, *stuck)
     return replace(tracking, findings=tuple(replace(f, severity=doubt.get(f.kind, f.severity)) for f in noticed))
+
+
+def _check_dots(disc: Disc) -> None:
+    """Raise TrackingError unless they tell a pose."""
+    spread = disc.marker_centres_body - disc.marker_centres_body.mean(axis=0)
+    if disc.n_markers < 3 or np.linalg.matrix_rank(spread, tol=0.1 * disc.marker_diameter) < 2:
+        raise TrackingError(
+            f"[markers] declares {disc.n_markers} dots"
+            + (" on one line" if disc.n_markers > 2 else "")
+            + ": a pose needs at least three dots that are not on one line"
+        )
+
+
+def _slips(
+    tracking: Tracking, read_blocks: ReadBlocks, pairs: range, setup: TrackingSetup, settings: TrackingSettings
+) -> tuple[Finding, ...]:
+    """More images left out by one camera than a delay of its dots tells: the pairing that fits the frames after it."""
+    missed = max(tracking.scatter.systematic_px) > FAR_PX / 2
+    status = tracking.trajectory.frame_status
+    apart = (status == FrameStatus.ONE_CAMERA) | (status == FrameStatus.CONTRADICTED) | missed
+    begun = np.flatnonzero(np.convolve(apart, np.ones(APART), "valid") == APART)
+    if not begun.size or {Kind.DROPPED_FRAMES, Kind.DELAY} & {finding.kind for finding in tracking.findings}:
+        return ()
+    first, start = int(begun[0]), pairs[begun[0]]
+    blocks = read_blocks(start, min(start + PAIRED, pairs.stop))
+    images = np.concatenate([block.images.copy() for block in blocks])
+    ahead = frames_ahead(images, setup.rig, setup.disc)
+    if not ahead:
+        return ()
+    left = np.arange(max(ahead, 0), len(images) + min(ahead, 0))
+    again = PairBlock(left, np.stack([images[left, 0], images[left - ahead, 1]], axis=1))
+    _, tables = _followed(lambda start, stop: [again], [left[0], left[-1] + 1], setup, settings, 1, lambda n: None)
+    dots = dot_centres(tables.results, tables.status)
+    seen = DotsInFrames(setup.rig, setup.disc, dots.pixels, dots.covariance_px2, tables.R, tables.t)
+    ahead += round(delay_of_right(seen, np.arange(len(left)))[0])
+    camera, other = frames.CAMERAS[::-1] if ahead > 0 else frames.CAMERAS
+    text = f"the {camera} camera is {abs(ahead)} frames ahead of the {other}, and its images are not used from there on"
+    return (left_out(text, ahead, (start, pairs[-1]), start, first == 0),)
+
+
+def _without(read_blocks: ReadBlocks, camera: int, since: int) -> ReadBlocks:
+    """The same, but for a camera's images from a frame on."""
+
+    def rest(start: int, stop: int) -> Iterator[PairBlock]:
+        for block in read_blocks(start, stop):
+            gone = [Unreadable(int(frame), camera, "of another instant") for frame in block.frames if frame >= since]
+            yield replace(block, unreadable=(*block.unreadable, *gone))
+
+    return rest
 
 
 def _senseless(tracking: Tracking, faulty: bool, read_blocks: ReadBlocks, pairs: range) -> NDArray:

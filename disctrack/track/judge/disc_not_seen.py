@@ -53,6 +53,7 @@ BETTER = 3.0  # times, than with the camera where it was
 DOT_DIAMETERS_PX = (6.0, 18.0, 54.0, 162.0)  # the search for blobs takes those of a seventh to twice the diameter
 SIZE_TOLERANCE = 0.15  # blur and threshold make a blob larger or smaller than its dot
 MISPLACED = 0.2  # of the distance between two dots: places measured with a ruler, not dots numbered wrongly
+MOST_AHEAD, THIRD = 12, 3  # frames
 MEETING_PX = 1.0  # beyond, cameras or clocks do not fit together, and places seen by both are none
 
 
@@ -74,7 +75,7 @@ def arrangement_found(pair: NDArray, rig: StereoRig, disc: Disc) -> Iterator[Fin
     """
     enough = max(acquire(pair, rig, disc)[1] + 1, 2 * disc.n_markers - 2)
     ways = list(_ways(pair, disc))
-    dots = [acquire(images, rig, layout)[1] for _, images, layout in ways]
+    dots = [acquire(images, rig, layout, by_one=False)[1] for _, images, layout in ways]
     best = dots.index(max(dots))
     if dots[best] >= enough:
         text, _, layout = ways[best]
@@ -106,19 +107,14 @@ def moved_camera(pairs: NDArray, rig: StereoRig, disc: Disc) -> Iterator[Finding
 
     pairs : (n, 2, height, width), from all over the recording; fewer than MIN_FRAMES with dots tell nothing
     """
-    diameters = expected_diameter_px(rig, disc)
-    seen = [[seen_by_one_camera(pair[c], c, diameters[c], rig, disc) for c in (0, 1)] for pair in pairs]
-    pixels = np.array([[side[0][:, :2] for side in pair] for pair in seen]).reshape(-1, 2, disc.n_markers, 2)
-    good = np.isfinite(pixels).all(-1).sum(axis=2).min(axis=1, initial=disc.n_markers) >= MIN_EXPLAINED
-    if good.sum() < MIN_FRAMES:
+    seen = _by_each_camera(pairs, rig, disc)
+    seen = seen.at(np.flatnonzero(_by_both(seen)))
+    if len(seen.t) < MIN_FRAMES:
         return
-    pixels = pixels[good]
-    R, t = (np.array([pair[0][k] for pair in seen])[good] for k in (1, 2))  # by the left camera
-    covariance = np.broadcast_to(BLOB_PX**2 * np.eye(2), (*pixels.shape, 2))
     free = np.zeros(N_RIG + 2 * disc.n_markers, bool)
     free[PAIR_TURN] = free[PAIR_SHIFT] = True
     information = np.diag(np.repeat([TURN**-2, SHIFT**-2], 3))
-    found = fit_shared(DotsInFrames(rig, disc, pixels, covariance, R, t), free, information)
+    found = fit_shared(seen, free, information)
     rms = BLOB_PX * np.sqrt(found.reduced_chi_square)
     moved = rig.perturbed(found.shift[:N_RIG])
     turn = np.linalg.norm(vector_from_rotation(moved.R_right_left @ rig.R_right_left.T))
@@ -135,6 +131,41 @@ def moved_camera(pairs: NDArray, rig: StereoRig, disc: Disc) -> Iterator[Finding
         }
         advice = (Remedy(action="calibrate again"),)
         yield Finding(Kind.CAMERA_MOVED, Severity.DOUBT, text, Subject("track", "right"), sizes, advice, NONSENSE)
+
+
+def frames_ahead(pairs: NDArray, rig: StereoRig, disc: Disc) -> int:
+    """Frames by which the right camera is ahead of the left, if the two see one disc only so; else 0.
+
+    pairs : (n, 2, height, width), one after the other. Known to a frame or two: blobs err as dots move in that time
+    """
+    some = pairs.copy()
+    some[np.arange(len(pairs)) % THIRD > 0, 0] = 0  # every third of one camera is enough, and the search takes long
+    seen, misfit = _by_each_camera(some, rig, disc), {}
+    still = np.zeros(N_RIG + 2 * disc.n_markers)
+    for ahead in range(-MOST_AHEAD, MOST_AHEAD + 1):
+        left = np.arange(max(ahead, 0), len(pairs) + min(ahead, 0))
+        paired = replace(seen.at(left), pixels=np.stack([seen.pixels[left, 0], seen.pixels[left - ahead, 1]], axis=1))
+        rows = np.flatnonzero(_by_both(paired))
+        if len(rows) >= THIRD:
+            _, fits = paired.at(rows).fitted(still, reject=False)
+            misfit[ahead] = BLOB_PX * float(np.sqrt(np.median(fits.reduced_chi_square)))
+    best = min(misfit, key=misfit.__getitem__, default=0)
+    return best if best and misfit[best] < min(MEETING_PX, misfit.get(0, 0.0) / BETTER) else 0
+
+
+def _by_each_camera(pairs: NDArray, rig: StereoRig, disc: Disc) -> DotsInFrames:
+    """Blobs that are the dots by one camera alone, in pairs (n, 2, height, width), with the poses by the left one."""
+    diameters = expected_diameter_px(rig, disc)
+    seen = [[seen_by_one_camera(pair[c], c, diameters[c], rig, disc) for c in (0, 1)] for pair in pairs]
+    pixels = np.array([[side[0][:, :2] for side in pair] for pair in seen]).reshape(-1, 2, disc.n_markers, 2)
+    R, t = (np.array([pair[0][k] for pair in seen]) for k in (1, 2))
+    return DotsInFrames(rig, disc, pixels, np.broadcast_to(BLOB_PX**2 * np.eye(2), (*pixels.shape, 2)), R, t)
+
+
+def _by_both(seen: DotsInFrames) -> Mask:
+    """(n,) True where both cameras see dots enough."""
+    dots = np.isfinite(seen.pixels).all(-1).sum(axis=2)
+    return np.asarray(dots.min(axis=1, initial=seen.disc.n_markers) >= MIN_EXPLAINED)
 
 
 @dataclass(frozen=True)

@@ -48,20 +48,30 @@ def dropped_frames(refused: Mask, seen: DotsInFrames, pairs: range) -> tuple[Fin
         delay, explained = delay_of_right(seen, before)
         by_both = np.isfinite(seen.pixels[before]).all(axis=-1).any(axis=-1).all(axis=-1) & seen.posed[before]
         always = k == 0 and (round(delay) == ahead if explained > HARDLY else by_both.sum() < SHORTEST)
-        frames, n = [pairs[i] for i in rows], abs(ahead)
+        frames = [pairs[i] for i in rows]
         text = (
             f"frames {ranges(frames)} {refused_for}, as if the {camera} camera were "
-            f"{abs(float(np.mean(delays))):.2f} frames ahead of the {other}: it left out {n} image{'s' * (n > 1)} "
-            f"{'before' if always else 'at'} frame {pairs[0] if always else frames[0]}"
+            f"{abs(float(np.mean(delays))):.2f} frames ahead of the {other}"
         )
-        of = Subject("track", camera, ((frames[0], frames[-1]),))
-        remedy = Remedy(action=f"number its images from there on higher by {n}")
-        numbers, explains = {"images": Measured(n)}, MISFITS if always else (Kind.DELAY, *MISFITS)
-        said.append(Finding(Kind.DROPPED_FRAMES, Severity.DOUBT, text, of, numbers, (remedy,), explains))
+        since = pairs[0] if always else frames[0]
+        said.append(left_out(text, ahead, (frames[0], frames[-1]), since, always))
     if unexplained:
         text = f"frames {ranges(unexplained)} {refused_for}"
         said.append(Finding(Kind.CAMERAS_CONTRADICT, Severity.DOUBT, text, explains=(Kind.FRAMES_LOST,)))
     return tuple(said)
+
+
+def left_out(text: str, ahead: int, frames: tuple[int, int], since: int, always: bool) -> Finding:
+    """One camera left out images: the right one where `ahead`, the frames by which it is, is positive.
+
+    frames : first and last that it spoils;  since : where it was, or before if always
+    """
+    n, camera = abs(ahead), CAMERAS[int(ahead > 0)]
+    text = f"{text}: it left out {n} image{'s' * (n > 1)} {'before' if always else 'at'} frame {since}"
+    of, numbers = Subject("track", camera, (frames,)), {"images": Measured(n)}
+    remedy = Remedy(action=f"number its images from there on higher by {n}")
+    explains = MISFITS if always else (Kind.DELAY, *MISFITS)
+    return Finding(Kind.DROPPED_FRAMES, Severity.DOUBT, text, of, numbers, (remedy,), explains)
 
 
 def delay_of_right(seen: DotsInFrames, rows: NDArray[np.intp]) -> tuple[float, float]:
