@@ -18,7 +18,7 @@ RTOL = 1e-11  # of the integrator; keeps the energy without losses to 1e-11 over
 # m, m, rad, rad, rad, rad/s x 3, m/s x 2, m, m/s: about 1e-12 of what moves
 ATOL = np.array([1e-13, 1e-13, 1e-12, 1e-13, 1e-12, 1e-11, 1e-11, 1e-11, 1e-13, 1e-13, 1e-13, 1e-13])
 MAX_SWITCHES = 2000  # of slip and rolling: more is chatter
-MAX_SLIP_STEPS = 10**9  # of the integrator in slip, over all stretches
+MOST_STEPS = 10**9  # of the integrator, over all stretches
 MOST_INSTANTS = 1e8  # of a motion in memory
 
 
@@ -97,7 +97,7 @@ def follow(
     grid: Array,
     rtol: float,
     max_switches: int = MAX_SWITCHES,
-    max_slip_steps: int = MAX_SLIP_STEPS,
+    max_steps: int = MOST_STEPS,
 ) -> Path:
     """Integrate through the regimes until the grid or the motion ends; complex if the assembly is."""
     y = np.array(y, assembly.scalar)
@@ -116,8 +116,7 @@ def follow(
             regime, y = SLIPPING, np.concatenate([y, assembly.at(ROLLING, t, y)[0][0, :2]])
         event = _event_at_start(assembly, regime, t, y)
         if event is None:
-            left = max(max_slip_steps - slip_steps, 0) if regime == SLIPPING else integrate.MAX_STEPS
-            most = min(left, integrate.MAX_STEPS)
+            most = min(max(max_steps - n_steps, 0), integrate.MAX_STEPS)
             done = integrate.integrate(assembly.system(regime), t, y, grid[i:], rtol, ATOL[: len(y)], most)
             slip_steps += done.n_steps if regime == SLIPPING else 0
             n_steps += done.n_steps

@@ -75,7 +75,7 @@ def test_slip_that_takes_too_long_is_not_followed():
     whole = sensitivities(model, start, times, components=["theta"])
     assert np.isfinite(whole.dq).all()
     assert whole.slip_steps > 1000
-    cut = sensitivities(model, start, times, components=["theta"], max_slip_steps=whole.slip_steps // 4)
+    cut = sensitivities(model, start, times, components=["theta"], max_steps=whole.slip_steps // 4)
     assert not np.isfinite(cut.dq).all()
     assert cut.slip_steps <= whole.slip_steps // 4
 
