@@ -97,7 +97,7 @@ def sum_up(outcomes: Sequence[RenderedOutcome]) -> Accuracy:
         {name: _rows(*pair) for name, pair in both.items()},
         _strata(both[STATIC][0]),
         tuple(_sight(joined(o.own.part(o.cameras == n) for o in static), n) for n in (2, 1, 0)),
-        consistency | {"calibration (own - true cameras, same images)": by_calibration},
+        consistency | {"calibration, static poses (own - true cameras, same images)": by_calibration},
         c,
         tuple(sorted({warning for outcome in outcomes for warning in outcome.warnings})),
     )
@@ -150,12 +150,12 @@ def verdict(accuracy: Accuracy) -> str:
     name = "holds" if held == {True} else "does not hold" if held == {False} else "holds in part"
     text = (
         f"Where both cameras see the face, the claim of 0.005 mm and 0.05 deg {name}: 95 % of {two.n} poses lie within "
-        f"{1e3 * position:.4f} mm per axis and {np.degrees(rotation):.4f} deg per rotation axis, calibration included"
+        f"{1e3 * position:.5f} mm per axis and {np.degrees(rotation):.4f} deg per rotation axis, calibration included"
         f"{f'; {missed} poses were not found or wrong' if missed else ''}. psi and phi alone scatter by "
         f"{_MDEG * accuracy.law:.2f} mdeg / sin(theta); 95 % lie within 0.05 deg above {accuracy.law_limit_deg:.1f} deg"
     )
     if one.found:
-        beyond = "beyond the claim" if one.position > CLAIM_POSITION else "within the claim"
+        beyond = "worse than the claim" if one.position > CLAIM_POSITION else "within the claim"
         text += f". Frames seen by one camera only are good to {1e3 * one.position:.3f} mm (rms), {beyond}"
     return text + "."
 
@@ -198,13 +198,13 @@ def accuracy_validation(outcomes: Sequence[RenderedOutcome]) -> Validation:
         for s in accuracy.sights
     ]
     head = ["cameras", "poses", "found", "wrong", "position rms [µm]", "rotation rms [mdeg]"]
-    note = "Where no camera sees the dots rightly, a pose need not be found; none may be wrong."
+    note = "0 cameras: the dots are seen at a grazing angle. There a pose need not be found; none may be wrong."
     tables.append(Table("Who sees the face (static poses)", head, sights, note))
     honest = [[name, *_cells(1, c.value, c.uncertainty), str(c.n)] for name, c in accuracy.consistency.items()]
     head = ["squared error over predicted variance", "value", "standard error", "poses or rigs"]
     corners = ", ".join(f"{rms:.4f}" for rms in accuracy.corners_px)
-    note = f"Target {CONSISTENT[0]} to {CONSISTENT[1]}. Corner residuals of the calibrations: {corners} px."
-    tables.append(Table("Honesty of the reported covariance", head, honest, note))
+    note = f"Target {CONSISTENT[0]} to {CONSISTENT[1]} within 3 standard errors. Corner rms by recording: {corners} px."
+    tables.append(Table("Errors against stated uncertainty", head, honest, note))
     return Validation("validation", verdict(accuracy), tables, [accuracy], complaints(accuracy), accuracy.warnings)
 
 
