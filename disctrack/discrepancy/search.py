@@ -11,6 +11,7 @@ what is left.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
+from typing import Literal
 
 import numpy as np
 from scipy import stats
@@ -37,6 +38,8 @@ NOT_CONVERGED = "its refit does not converge"
 CANCELLING = 0.1  # share of the least effect's power that a sum of effects keeps, below which they undo each other
 FAR, AGREES = 10.0, 2.0  # variances of the noise: a motion far from the data, and one that a beginning agrees with
 FIRST_ORDER = 1.0 / 3.0  # of what a faint effect is to describe, that it does to first order, at the shape assumed
+
+Verdict = Literal["nothing missing", "found", "unexplained"]
 
 
 @dataclass(frozen=True)
@@ -108,7 +111,7 @@ class Tried:
 class Diagnosis(Outline):
     """Answer of the search."""
 
-    verdict: str  # "nothing missing", "found" or "unexplained"
+    verdict: Verdict
     reason: str  # in words
     found: tuple[Found, ...]
     before: Fit
@@ -269,7 +272,7 @@ class _Search:
             chance=by_chance,
         )
 
-    def _verdict(self, after: Explanation, found: tuple[Found, ...]) -> tuple[str, str]:
+    def _verdict(self, after: Explanation, found: tuple[Found, ...]) -> tuple[Verdict, str]:
         """Verdict and reason."""
         left = f"{after.fit.reduced_chi_square:.3g} per degree of freedom at a noise of {self.noise:.3g}"
         if not self._at_noise(after.fit):

@@ -20,7 +20,7 @@ from disctrack.discrepancy.equations.law import NAME, LearnedForce
 from disctrack.discrepancy.equations.loop import ask
 from disctrack.discrepancy.equations.system import EquationSystem, fitted_rows
 from disctrack.discrepancy.fit import Fit
-from disctrack.discrepancy.search import Diagnosis, Settings
+from disctrack.discrepancy.search import Diagnosis, Settings, Verdict
 from disctrack.discrepancy.significance import LAGS, ljung_box, no_memory
 from disctrack.discrepancy.system import Candidate, System
 from disctrack.discrepancy.words import effect_text
@@ -79,7 +79,7 @@ class Answer:
     law: LearnedForce | None  # of one variable, that no term names, with its course; None where none describes the data
 
     @property
-    def verdict(self) -> str:
+    def verdict(self) -> Verdict:
         """`nothing missing`, `found` or `unexplained`."""
         return self.diagnosis.verdict
 
