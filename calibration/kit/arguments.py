@@ -131,8 +131,10 @@ def _rule(kind: Any) -> Rule:
     if origin is np.ndarray:
         return _array, "an array of numbers"
     if isinstance(origin, type):
-        inner = ", ".join(_rule(part)[1] for part in parts if part is not ... and origin is not Callable)
-        words = "a function" if origin is Callable else f"a {origin.__name__.lower()} of ({inner})"
+        if "__call__" in vars(origin):  # of a function
+            return lambda value: _collection(value, origin, parts), "a function"
+        inner = ", ".join(_rule(part)[1] for part in parts if part is not ...)
+        words = f"a {origin.__name__.lower()} of ({inner})"
         return lambda value: _collection(value, origin, parts), words
     path = " or the path of its file or folder" if getattr(kind, "read_by", "") else ""
     name = getattr(kind, "__name__", str(kind))
