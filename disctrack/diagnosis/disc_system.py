@@ -45,7 +45,7 @@ MIN_NUISANCE = 0.1  # a direction of the rig's covariance that moves all dots to
 MAX_SWITCHES = (50, 200)  # and per second: slip at every extremum of a nutation of 30 Hz has 120; more is chatter
 # slip that hardly exceeds friction creeps: it follows within v / (3 mu g), and a step has to be as short
 TRIAL_SLIP_STEPS = 1_000  # for every frame, in a fit that is one trial among many; where slip is true, hundreds
-MOST_WORK = 30_000  # for every frame: steps of the integrator and rows of derivatives, 10 us each; a law in a part of the table took 19_000
+MOST_WORK = 30_000  # for every frame: steps of the integrator and rows of derivatives, 10 us each; some laws take half
 USUAL = 700  # frames of a recording
 MOST_SIGMAS = 10.0  # of a size's tolerance, within which it is sought: else a wrong clock bends the disc to fit itself
 SLIP_STARTS = (0.9, 0.7, 0.5)  # of the friction that rolling needs at most
