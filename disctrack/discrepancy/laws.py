@@ -88,12 +88,7 @@ class LearnedLaw:
 
     def stands_out(self, fitted: Fit) -> bool:
         """Do the coefficients of each of its families differ from zero, in a fit whose sigmas hold all doubts?"""
-        for names in self.amounts:
-            index = [fitted.shared.index(n) for n in names]
-            amounts = np.array([fitted.values[n] for n in names])
-            if as_sigmas(wald(amounts, fitted.covariance[np.ix_(index, index)]), len(names)) <= MIN_SIGMAS:
-                return False
-        return True
+        return all(_differ_from_zero(*_amounts(fitted, names)) for names in self.amounts)
 
     @property
     def widths(self) -> set[str]:
@@ -322,14 +317,23 @@ def without_idle_terms(system: LawSystem, law: LearnedLaw, fitted: Fit) -> Learn
     return replace(shorter, values=fitted.values, alike=law.alike, others=law.others, looked=law.looked)
 
 
+def _amounts(fitted: Fit, names: Sequence[str]) -> tuple[Array, Array]:
+    """Amounts (k,) with their covariance (k, k)."""
+    index = [fitted.shared.index(n) for n in names]
+    return np.array([fitted.values[n] for n in names]), fitted.covariance[np.ix_(index, index)]
+
+
+def _differ_from_zero(amounts: Array, covariance: Array) -> bool:
+    return as_sigmas(wald(amounts, covariance), len(amounts)) > MIN_SIGMAS
+
+
 def busy_amounts(fitted: Fit, names: Sequence[str]) -> dict[int, float]:
     """Those of the amounts that the data need, with their values while the others are zero; none if all are idle.
 
     One after the other goes, each judged with those before it out: of two that move together one may do for both.
     """
-    index = [fitted.shared.index(n) for n in names]
-    amounts, covariance = np.array([fitted.values[n] for n in names]), fitted.covariance[np.ix_(index, index)]
-    if as_sigmas(wald(amounts, covariance), len(names)) <= MIN_SIGMAS:
+    amounts, covariance = _amounts(fitted, names)
+    if not _differ_from_zero(amounts, covariance):
         return {}
     size = np.where(np.diag(covariance) > 0, np.sqrt(np.diag(covariance)), 1.0)
     precision = np.linalg.pinv(covariance / np.outer(size, size), rcond=1e-12, hermitian=True)
