@@ -65,7 +65,7 @@ SEEN_RARELY = 0.1  # share of the images
 MIN_DOTS_LEFT = 4  # that are seen
 DENSITIES = 50.0, 23e3  # [kg/m^3] a hard foam's, and osmium's
 MOST_HEIGHT = 3e-3  # [m] of the rim's plane from the foot of a board that lies on it, its thickness wrong or not
-CLAIM = 5e-6  # [m] the accuracy that is claimed for a position
+CLAIM_POSITION = 5e-6  # [m] the accuracy that is claimed: Ma et al. 2014, end of section 3
 LAB_FRAME = 20e-6  # [m] to which it is known where a board on a table lies, with no particular care
 OFF = (Kind.TABLE_DISAGREES, Kind.ACCURACY)  # a wrong height is seen so
 UNITS = {1e3: "mm and m", 1e2: "m and cm", 10.0: "cm and mm", 25.4: "inches and mm", 2.0: "radius and diameter"}
@@ -151,10 +151,9 @@ def across(trajectory: Trajectory) -> Array:
     """(2,) [px] by how much a dot is wide along its narrow side, in the middle of the recording."""
     rows = np.flatnonzero(trajectory.measured)
     row, rig = rows[len(rows) // 2], trajectory.rig
-    axis = rotation_from_quaternion(trajectory.quaternion[row])[:, 2]
-    (R_left, t_left), (R_right, t_right) = rig.camera_poses()
-    centres = np.stack([R_left @ trajectory.q[row, :3] + t_left, R_right @ trajectory.q[row, :3] + t_right])
-    slant = np.abs(np.sum(centres * [R_left @ axis, R_right @ axis], axis=1)) / np.linalg.norm(centres, axis=1)
+    R, t = map(np.array, zip(*rig.camera_poses(), strict=True))
+    centres, axes = R @ trajectory.q[row, :3] + t, R @ rotation_from_quaternion(trajectory.quaternion[row])[:, 2]
+    slant = np.abs(np.sum(centres * axes, axis=1)) / np.linalg.norm(centres, axis=1)
     focal = np.array([camera.fx for camera in rig.cameras])
     return np.asarray(focal * trajectory.disc.marker_diameter / centres[:, 2] * slant)
 
@@ -177,9 +176,9 @@ def unsharp(trajectory: Trajectory, blur_px: Sequence[float]) -> Iterator[Findin
         for sigma in (trajectory.coordinate_sigma, trajectory.calibration_sigma)
     )
     advice = Remedy(action="more views of the board, tilted and all over; a board that is known better")
-    if noise > CLAIM:
+    if noise > CLAIM_POSITION:
         advice = Remedy(action="more light, sharper or larger dots")
-    if noise > CLAIM or shared > LAB_FRAME:
+    if noise > CLAIM_POSITION or shared > LAB_FRAME:
         text = (
             f"a position has a standard deviation of {measured(noise, unit='m')} by the noise of its frame, and of "
             f"{measured(shared, unit='m')} that all frames share"

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibration.kit.arrays import Array
+from disctrack.analyse.declaration import CLAIM_POSITION
 from disctrack.frames import POSE_COMPONENTS
 from disctrack.validate.errors import (
     QUANTITIES,
@@ -18,7 +19,6 @@ from disctrack.validate.errors import (
 from disctrack.validate.rendered import EXPOSURE, STATIC, STRATA_DEG, RenderedOutcome
 from disctrack.validate.tables import Table, Validation
 
-CLAIM_POSITION = 5e-6  # [m] and
 CLAIM_ROTATION = np.radians(0.05)  # Ma et al. 2014, end of section 3
 REGULAR_DEG = 5.0  # psi and phi are summed up from here on; below, 1/sin(theta) is all there is to see
 LAW_DEG = 20.0  # at larger nutation the cameras' directions matter more than 1/sin(theta)

@@ -191,8 +191,8 @@ def _senseless(tracking: Tracking, faulty: bool, read_blocks: ReadBlocks, pairs:
 def _not_found(followers: list[Follower], pairs: range, why: tuple[Finding, ...]) -> TrackingError:
     """The disc was seen in no pair."""
     reason = next((f.first_reason for f in followers if f.first_reason), "")
-    told = f"First search: {reason.rstrip('.')}{'' if reason.endswith('?') else '.'} {MOVED}"
-    told = told if reason else "No image could be read"
+    end = "" if reason.endswith("?") else "."
+    told = f"First search: {reason.rstrip('.')}{end} {MOVED}" if reason else "No image could be read"
     return TrackingError(f"the disc was found in none of the pairs {pairs.start}-{pairs.stop - 1}", told, why)
 
 
