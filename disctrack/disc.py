@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from calibration.kit.arguments import checked
-from calibration.kit.arrays import Array
+from calibration.kit.arrays import Array, Mask
 from calibration.kit.brief import Brief
 from disctrack.errors import ModelError
 
@@ -105,34 +105,32 @@ def disc_from_mm(
     )
 
 
-def symmetry_order(disc: Disc, tolerance: float = 0.1) -> int:
+def _onto_itself(disc: Disc, places: Array) -> Mask:
+    """Whether each dot of layouts (..., n, 2) [m] lies, to a tenth of its diameter, where the disc has one."""
+    gaps = np.linalg.norm(places[..., None, :] - disc.marker_centres_body[:, :2], axis=-1)
+    return np.asarray(gaps.min(axis=-1).max(axis=-1) < 0.1 * disc.marker_diameter)
+
+
+def symmetry_order(disc: Disc) -> int:
     """Number of turns about e3 that map the layout of the dots onto itself (1: none but the full turn).
 
-    With an order n > 1 the spin angle phi is known only modulo 2 pi / n. tolerance: part of a dot's diameter.
+    With an order n > 1 the spin angle phi is known only modulo 2 pi / n.
     """
-    centres = disc.marker_centres_body[:, :2]
-    reach = tolerance * disc.marker_diameter
     order = 1
     for n in range(2, 2 * disc.n_markers + 1):
         angle = 2 * np.pi / n
         turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-        distance = np.linalg.norm((centres @ turn.T)[:, None] - centres[None], axis=-1)
-        if np.all(distance.min(axis=1) < reach):
+        if _onto_itself(disc, disc.marker_centres_body[:, :2] @ turn.T):
             order = n
     return order
 
 
-def has_mirror_axis(disc: Disc, tolerance: float = 0.1) -> bool:
-    """True where the layout of the dots looks the same in a mirror, so that the dots do not tell left from right.
-
-    tolerance : part of a dot's diameter
-    """
+def has_mirror_axis(disc: Disc) -> bool:
+    """True where the layout of the dots looks the same in a mirror, so that the dots do not tell left from right."""
     z = disc.marker_centres_body[:, 0] + 1j * disc.marker_centres_body[:, 1]
-    far = z[np.argmax(np.abs(z))]  # goes to a dot as far out, or stays
-    twice = np.angle(far) + np.angle(z[np.abs(np.abs(z) - np.abs(far)) < tolerance * disc.marker_diameter])
-    mirrored = np.exp(1j * twice)[:, None] * np.conj(z)
-    gap = np.abs(mirrored[:, :, None] - z).min(axis=2).max(axis=1)
-    return bool(np.any(gap < tolerance * disc.marker_diameter))
+    far = z[np.argmax(np.abs(z))]  # goes to another dot, or stays
+    mirrored = np.exp(1j * (np.angle(far) + np.angle(z)))[:, None] * np.conj(z)
+    return bool(_onto_itself(disc, np.stack([mirrored.real, mirrored.imag], axis=-1)).any())
 
 
 def precession_rate(

@@ -9,13 +9,11 @@ existence.
 from disctrack.batch.find import find_recordings
 from disctrack.batch.plan import BatchOptions
 from disctrack.batch.run import BatchOutcome, run_batch, summarise_batch
-from disctrack.batch.summary import read_summary
 
 __all__ = [
     "BatchOptions",
     "BatchOutcome",
     "find_recordings",
-    "read_summary",
     "run_batch",
     "summarise_batch",
 ]

@@ -19,11 +19,9 @@ from disctrack.batch.records import (
     MEASURED,
     SKIPPED,
     Record,
-    Stages,
     failed,
     is_done,
     read_record,
-    stages_asked,
     write_record,
 )
 from disctrack.batch.repeats import group_of
@@ -91,7 +89,6 @@ def _kind_of(error: Exception) -> Kind:
 
 def _make_recording(job: Job, results: Path) -> Record:
     began, used = time.perf_counter(), time.process_time()
-    asked = stages_asked(job.options)
     recording = read_recording(job.folder)
     rig, pairs = read_rig(job.rig), open_pairs(recording)
     path, provenance = results / "trajectory.h5", trajectory_provenance(recording, rig, pairs, None)
@@ -104,9 +101,13 @@ def _make_recording(job: Job, results: Path) -> Record:
     with recorded_times() as times:
         trajectory, _, fresh = kept_or_made(path, provenance, measured, job.options.overwrite)
         record = None if fresh else read_record(results)
-        if record is not None and record.fingerprint == provenance.fingerprint and is_done(results, record, asked):
+        if (
+            record is not None
+            and record.fingerprint == provenance.fingerprint
+            and is_done(results, record, job.options.stages)
+        ):
             return dataclasses.replace(record, status=SKIPPED)
-        record = _after_tracking(results, path, trajectory, provenance, job, asked)
+        record = _after_tracking(results, path, trajectory, provenance, job)
     numbers = record.numbers | _origin(recording, provenance)
     numbers |= {"rig": job.rig, "seconds": round(time.perf_counter() - began, 3)}
     numbers |= {"processor_seconds": round(time.process_time() - used, 3)}
@@ -116,14 +117,7 @@ def _make_recording(job: Job, results: Path) -> Record:
     return record
 
 
-def _after_tracking(
-    results: Path,
-    path: Path,
-    trajectory: Trajectory,
-    provenance: Provenance,
-    job: Job,
-    asked: Stages,
-) -> Record:
+def _after_tracking(results: Path, path: Path, trajectory: Trajectory, provenance: Provenance, job: Job) -> Record:
     """Analysis, loss coefficient, diagnosis; one of them that is not possible is a reason, not a failure."""
     files, numbers = {"trajectory": path.name}, tracked_numbers(trajectory)
     noticed = leading(trajectory.findings)
@@ -150,15 +144,14 @@ def _after_tracking(
             files["diagnosis_report"] = diagnosed.files[0].relative_to(results).as_posix()
         except AnalysisError as error:
             missing.append(f"not diagnosed: {reason_of(error)}")
-    return Record(MEASURED, "; ".join(missing), provenance.fingerprint, asked, files, numbers)
+    return Record(MEASURED, "; ".join(missing), provenance.fingerprint, job.options.stages, files, numbers)
 
 
 def _analyse(path: Path, trajectory: Trajectory, job: Job) -> tuple[Analysis, Path | None]:
-    window, circle = job.options.window, job.options.circle
     if job.options.report:
-        outcome = run_analyse(path, window=window, circle_duration=circle, overwrite=True)
+        outcome = run_analyse(path, window=job.options.window, overwrite=True)
         return outcome.analysis, outcome.report
-    analysis = analyse(trajectory, window, circle)
+    analysis = analyse(trajectory, job.options.window)
     write_analysis(path, analysis)
     return analysis, None
 

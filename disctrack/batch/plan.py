@@ -6,7 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from calibration import CalibrationSettings
+from disctrack.analyse.analysis import WINDOW
 from disctrack.batch.find import FoundRecordings
+from disctrack.batch.records import Record, Stages, failed
 from disctrack.calibrate.stage import source_of
 from disctrack.errors import reason_of
 from disctrack.findings import Kind
@@ -20,8 +22,7 @@ class BatchOptions:
 
     distortion: str = "auto"  # see CalibrationSettings
     board: str = "auto"
-    window: float = 0.5  # [s] before t_f, for the exponents; as analyse has it
-    circle: float = 0.6  # [s] before the end, for the circle through the contact
+    window: float = WINDOW  # [s] before t_f, for the exponents
     report: bool = True  # report.html and figures of each recording
     diagnose: bool = False
     together: bool = False  # one diagnosis of all recordings, besides
@@ -31,6 +32,11 @@ class BatchOptions:
     def calibration(self) -> CalibrationSettings:
         """Settings of every calibration."""
         return CalibrationSettings(distortion=self.distortion, board=self.board)
+
+    @property
+    def stages(self) -> Stages:
+        """What is asked for beyond the trajectory."""
+        return {"window_s": self.window, "report": self.report, "diagnose": self.diagnose}
 
 
 @dataclass(frozen=True)
@@ -47,21 +53,17 @@ class Job:
     adopt: tuple[str, ...] = ()  # rig files of earlier runs that may be the same
 
 
-@dataclass(frozen=True)
-class BatchPlan:
-    """Jobs of a batch, and the recordings that fail before they begin."""
+def make_plan(
+    found: FoundRecordings, recordings: Sequence[Path], options: BatchOptions
+) -> tuple[list[Job], list[Job], dict[str, Record], tuple[Path, ...]]:
+    """Read every recording.toml, count the images, and find who shares a rig by the content of the views.
 
-    rigs: tuple[Job, ...]
-    recordings: tuple[Job, ...]
-    failures: dict[str, tuple[str, Kind]]  # name of the recording -> reason, and what it is about
-    undeclared: tuple[Path, ...]  # folders of images that no recording.toml speaks of
-
-
-def make_plan(found: FoundRecordings, recordings: Sequence[Path], options: BatchOptions) -> BatchPlan:
-    """Read every recording.toml, count the images, and find who shares a rig by the content of the views."""
+    returns : jobs of rigs and of recordings, what fails before it begins by the recording's name, and folders of images
+        that no recording.toml speaks of
+    """
     rigs: dict[str, Job] = {}
     jobs: list[Job] = []
-    failures: dict[str, tuple[str, Kind]] = {}
+    failures: dict[str, Record] = {}
     undeclared = found.undeclared
     for folder in recordings:
         name, about = found.name(folder), Kind.DECLARATION
@@ -71,9 +73,9 @@ def make_plan(found: FoundRecordings, recordings: Sequence[Path], options: Batch
             undeclared = tuple(place for place in undeclared if not _has_views_of(place, recording))
             jobs.append(_job(found, recording, name, options, rigs))
         except Exception as error:  # whatever is wrong with one recording, the others are measured
-            failures[name] = reason_of(error), about
+            failures[name] = failed(reason_of(error), about)
     needed = {job.rig for job in jobs}
-    return BatchPlan(tuple(job for path, job in rigs.items() if path in needed), tuple(jobs), failures, undeclared)
+    return [job for path, job in rigs.items() if path in needed], jobs, failures, undeclared
 
 
 def _has_views_of(place: Path, recording: Recording) -> bool:
@@ -98,9 +100,3 @@ def _shared_rig(found: FoundRecordings, recording: Recording, options: BatchOpti
     """The file of the rig, named by the content of all that it depends on."""
     provenance = source_of(recording, options.calibration).provenance
     return found.common / "rigs" / provenance.fingerprint[:16] / "rig.h5"
-
-
-def with_threads(jobs: Sequence[Job], cores: int, side_by_side: int) -> tuple[Job, ...]:
-    """Cores that no other recording uses read images ahead."""
-    threads = max(1, cores // max(1, min(side_by_side, len(jobs))))
-    return tuple(dataclasses.replace(job, threads=threads) for job in jobs)

@@ -50,48 +50,53 @@ class Died(Exception):
 def do_all(
     rigs: Sequence[Job], recordings: Sequence[Job], pool: Processes | Cluster, done: Callable[[Job, Record], None]
 ) -> None:
-    """Do every job; `done` is called with each that is finished for good. Raises ClusterError.
+    """Do every job; `done` is called with each recording that is finished for good. Raises ClusterError.
 
-    Rigs come first, and what needs one waits for it. A job at which another batch works is asked for again until that
-    one is done with it. A job whose process died gets a second try at the end, alone, when there is most memory.
+    Rigs come first; a recording without its rig fails for the rig's reason. A job at which another batch works is asked
+    for again until that one is done with it. A job whose process died gets a second try at the end, alone, when there
+    is most memory.
     """
-    made = {rig.rig for rig in rigs}
-    ready = deque([*rigs, *(job for job in recordings if job.rig not in made)])
-    waiting = {path: [job for job in recordings if job.rig == path] for path in made}
-    alone: deque[Job] = deque()
-    died: set[Job] = set()
+    no_rig: dict[str, str] = {}
+
+    def made(rig: Job, record: Record) -> None:
+        if record.status == FAILED:
+            no_rig[rig.rig] = record.reason
+
+    _do_jobs(rigs, pool, made)
+    for job in recordings:
+        if job.rig in no_rig:
+            done(job, failed(f"no rig: {no_rig[job.rig]}", Kind.CALIBRATION))
+    _do_jobs([job for job in recordings if job.rig not in no_rig], pool, done)
+
+
+def _do_jobs(jobs: Sequence[Job], pool: Processes | Cluster, done: Callable[[Job, Record], None]) -> None:
+    for job in _tried(jobs, pool, pool.size, done):
+        for again, death in _tried([job], pool, 1, done).items():
+            done(again, failed(f"twice, {death}"))
+
+
+def _tried(
+    jobs: Sequence[Job], pool: Processes | Cluster, at_once: float, done: Callable[[Job, Record], None]
+) -> dict[Job, Died]:
+    """Do the jobs, so many side by side; returns those whose process died, and why."""
+    ready, died = deque(jobs), dict[Job, Died]()
     running: dict[Future[Record], Job] = {}
-
-    def finish(job: Job, record: Record) -> None:
-        if record.status == BUSY:
-            ready.append(job)
-            return
-        done(job, record)
-        for after in waiting.pop(job.rig, []) if job.kind == "rig" else []:
-            if record.status == FAILED:
-                done(after, failed(f"no rig: {record.reason}", Kind.CALIBRATION))
-            else:
-                ready.append(after)
-
-    def settle(job: Job, future: Future[Record]) -> None:
-        try:
-            finish(job, _result(future))
-        except Died as death:
-            if job in died:
-                finish(job, failed(f"twice, {death}"))
-            else:
-                died.add(job)
-                alone.append(job)
-
-    while ready or alone or running:
-        while ready and len(running) < pool.size:
+    while ready or running:
+        while ready and len(running) < at_once:
             job = ready.popleft()
             running[pool.submit(job)] = job
-        if alone and not running:
-            job = alone.popleft()
-            running[pool.submit(job)] = job
         for future in wait(running, LOOK, FIRST_COMPLETED).done:
-            settle(running.pop(future), future)
+            job = running.pop(future)
+            try:
+                record = _result(future)
+            except Died as death:
+                died[job] = death
+                continue
+            if record.status == BUSY:
+                ready.append(job)
+            else:
+                done(job, record)
+    return died
 
 
 def _result(future: Future[Record]) -> Record:

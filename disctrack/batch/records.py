@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from disctrack.batch.columns import Row
-from disctrack.batch.plan import BatchOptions
 from disctrack.errors import DiscTrackError
 from disctrack.files.json_text import json_file
 from disctrack.files.whole import write_whole
@@ -37,16 +36,6 @@ class Record:
 def failed(reason: str, kind: Kind = Kind.OTHER) -> Record:
     """A failure with its reason, and what kind of finding that is."""
     return Record(FAILED, reason, numbers={"severity": Severity.REFUSAL.name.lower(), "finding": kind.value})
-
-
-def stages_asked(options: BatchOptions) -> Stages:
-    """What the options ask for beyond the trajectory."""
-    return {
-        "window_s": options.window,
-        "circle_s": options.circle,
-        "report": options.report,
-        "diagnose": options.diagnose,
-    }
 
 
 def write_record(folder: Path, record: Record) -> None:

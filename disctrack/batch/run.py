@@ -12,9 +12,9 @@ from tqdm import tqdm
 from calibration.kit.arguments import checked
 from disctrack.batch.columns import Row
 from disctrack.batch.find import FoundRecordings, find_recordings
-from disctrack.batch.plan import BatchOptions, BatchPlan, Job, make_plan, with_threads
+from disctrack.batch.plan import BatchOptions, Job, make_plan
 from disctrack.batch.pool import Cluster, Processes, do_all
-from disctrack.batch.records import FAILED, NOT_MEASURED, Record, failed
+from disctrack.batch.records import FAILED, NOT_MEASURED, Record
 from disctrack.batch.repeats import repeats_of
 from disctrack.batch.report import report_of
 from disctrack.batch.summary import TOGETHER, rows_of, write_summary
@@ -95,16 +95,17 @@ def run_batch(
         if not 1 <= first <= step:
             raise ArgumentError(f"run_batch: shard is {shard}; expected (i, n) with i from 1 to n")
         mine = found.recordings[first - 1 :: step]
-        plan = make_plan(found, mine, options)
+        rigs, jobs, records, undeclared = make_plan(found, mine, options)
         if cluster is None:
-            plan = replace(plan, recordings=with_threads(plan.recordings, cores, n))
-        records = {name: failed(*why) for name, why in plan.failures.items()}
-        stopped = _do(plan, records, pool)
-    for job in plan.recordings:
+            # cores that no other recording uses read images ahead
+            threads = max(1, cores // max(1, min(n, len(jobs))))
+            jobs = [replace(job, threads=threads) for job in jobs]
+        stopped = _do(rigs, jobs, records, pool)
+    for job in jobs:
         records.setdefault(job.name, Record(NOT_MEASURED, stopped))
     whole = shard is None  # or else whoever sums up the shards
     outcome = _summed_up(found, mine, records, options, stopped == INTERRUPTED, n if whole else 0)
-    return replace(outcome, undeclared=tuple(os.path.relpath(place, found.base) for place in plan.undeclared))
+    return replace(outcome, undeclared=tuple(os.path.relpath(place, found.base) for place in undeclared))
 
 
 def summarise_batch(
@@ -115,19 +116,18 @@ def summarise_batch(
     return _summed_up(found, found.recordings, {}, options or BatchOptions(), False, default_threads())
 
 
-def _do(plan: BatchPlan, records: dict[str, Record], pool: Processes | Cluster) -> str:
-    """Fill `records` with what becomes of the plan's recordings; returns why some have none."""
-    n = len(plan.recordings) + len(records)
+def _do(rigs: list[Job], jobs: list[Job], records: dict[str, Record], pool: Processes | Cluster) -> str:
+    """Fill `records` with what becomes of the recordings; returns why some have none."""
+    n = len(jobs) + len(records)
 
     def done(job: Job, record: Record) -> None:
-        if job.kind == "recording":
-            records[job.name] = record
-            advance(1)
-            tqdm.write(f"{len(records):4d} of {n}  {job.name}: {record.status}", file=sys.stderr)
+        records[job.name] = record
+        advance(1)
+        tqdm.write(f"{len(records):4d} of {n}  {job.name}: {record.status}", file=sys.stderr)
 
     try:
-        with progress_bar("batch", len(plan.recordings), "recording") as advance:
-            do_all(plan.rigs, plan.recordings, pool, done)
+        with progress_bar("batch", len(jobs), "recording") as advance:
+            do_all(rigs, jobs, pool, done)
     except KeyboardInterrupt:
         return INTERRUPTED
     except ClusterError as error:

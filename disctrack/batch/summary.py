@@ -3,7 +3,6 @@
 import csv
 import dataclasses
 import io
-import json
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -139,17 +138,6 @@ def with_false_discovery(rows: Sequence[Row]) -> list[Row]:
     shares = false_discovery([row["diagnosis_p_value"] for row in tested])
     known = {row["recording"]: float(share) for row, share in zip(tested, shares, strict=True)}
     return [row | {"diagnosis_false_discovery": known.get(row["recording"])} for row in rows]
-
-
-def read_summary(path: Path) -> list[Row]:
-    """Rows of a summary.json. Raises OutputError if it is none."""
-    try:
-        document = json.loads(Path(path).read_text(encoding="utf-8"))
-        if document["schema"] == SCHEMA:
-            return list(document["recordings"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise OutputError(f"{path}: cannot be read as the summary of a batch ({error}).") from error
-    raise OutputError(f"{path}: not the summary of a batch. Give the summary.json that disctrack batch wrote.")
 
 
 def as_csv(columns: Iterable[str], rows: Sequence[Row]) -> bytes:

@@ -20,7 +20,7 @@ from disctrack.recording.readers.base import FrameReader
 from disctrack.recording.readers.decoding import decode
 from disctrack.recording.readers.files import IMAGES, content_of, file_number, match_files, split_member
 from disctrack.recording.readers.flat_field import FlatField, FlatFields, flat_fields
-from disctrack.recording.readers.part import ImagePart, ImageParts, image_parts
+from disctrack.recording.readers.part import ImagePart, ImageParts
 
 MOST_VIEWS = 500  # ten times what a calibration needs; corners of one more take as long as those of the first
 
@@ -103,7 +103,7 @@ def find_views(
 def declared_views(recording: Recording, declared: CalibrationViews) -> TargetImages:
     """The calibration views of a recording. Raises RecordingError if they do not pair up."""
     fields = flat_fields(recording.folder, recording.sensors)
-    return find_views(declared.left, declared.right, recording.folder, fields, image_parts(recording.parts))
+    return find_views(declared.left, declared.right, recording.folder, fields, recording.parts)
 
 
 def _views_of(pattern: str, folder: Path, camera: str) -> tuple[View, ...]:

@@ -6,18 +6,14 @@ It shares no code with the location of markers and corners, so that those can be
 """
 
 from disctrack.synthetic.cameras import board_poses, rig_after_faults, rig_of
-from disctrack.synthetic.images import expected_disc, render_board, render_disc
 from disctrack.synthetic.recording import recording_toml, run_render, true_disc_of, write_recording
 from disctrack.synthetic.truth import Truth, read_truth
 
 __all__ = [
     "Truth",
     "board_poses",
-    "expected_disc",
     "read_truth",
     "recording_toml",
-    "render_board",
-    "render_disc",
     "rig_after_faults",
     "rig_of",
     "run_render",

@@ -1,13 +1,11 @@
 """Images of the disc and of the chessboard before the table, as the pair of cameras takes them."""
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from calibration.cameras.camera import Camera, StereoRig
 from calibration.kit.arrays import Array, Array32, Image, Mask
@@ -222,78 +220,6 @@ def _draw_rod(cells: Array32, corner: tuple[int, int], s: int, rod: Occluder) ->
     cells += (area * (rod.grey - cells)).astype(np.float32)
 
 
-def expected_disc(
-    q: ArrayLike,
-    rig: StereoRig,
-    disc: Disc,
-    scene: Scene | None = None,
-    *,
-    qdot: ArrayLike | None = None,
-    visible: ArrayLike | None = None,
-) -> Array32:
-    """Noise-free grey values (n, 2 cameras, height, width) before quantisation; arguments as for `render_disc`."""
-    scene, q = scene or Scene(), np.atleast_2d(np.asarray(q, float))
-    return _gather(_disc_pictures(q, rig, disc, scene, qdot, visible), len(q), scene)
-
-
-def render_disc(
-    q: ArrayLike,
-    rig: StereoRig,
-    disc: Disc,
-    scene: Scene | None = None,
-    rng: np.random.Generator | None = None,
-    *,
-    qdot: ArrayLike | None = None,
-    visible: ArrayLike | None = None,
-) -> NDArray[Any]:
-    """Images (n, 2 cameras, height, width) of the disc at the poses q: uint8, or uint16 for more than 8 bits.
-
-    q       : (n, 6) at mid exposure, SI and radians (frames.py); (6,) counts as n = 1
-    rig     : the true cameras; disc: the true disc, its marker centres those that are printed
-    scene   : appearance, optics, light, sensor, exposure; defaults of `Scene`. Its `disc`, `rig`, `motion` and `faults`
-              (but for the occluders) are not used here
-    rng     : noise; None: no noise, only quantisation
-    qdot    : (n, 6) rates; the pose moves with them for the exposure time. None: at rest
-    visible : (n, 2, m) or what broadcasts to it; False: that dot is missing on the paper
-    """
-    scene, q = scene or Scene(), np.atleast_2d(np.asarray(q, float))
-    return _digitised(_disc_pictures(q, rig, disc, scene, qdot, visible), len(q), rig, scene, rng)
-
-
-Pictures = Callable[[int, int], NDArray[Any]]  # frame and camera -> (height, width)
-
-
-def _disc_pictures(
-    q: Array, rig: StereoRig, disc: Disc, scene: Scene, qdot: ArrayLike | None, visible: ArrayLike | None
-) -> Pictures:
-    rates = np.zeros_like(q) if qdot is None else np.broadcast_to(np.asarray(qdot, float), q.shape)
-    seen = np.broadcast_to(True if visible is None else np.asarray(visible, bool), (len(q), 2, disc.n_markers))
-    both, exposure = stages(rig, scene), 0.0 if qdot is None else scene.cameras.exposure_s
-
-    def picture(i: int, c: int) -> Array32:
-        pose = lambda dt: q[i] + dt[:, None] * rates[i]  # noqa: E731
-        return expected_disc_image(pose, exposure, i, both[c], scene, disc, visible=seen[i, c])
-
-    return picture
-
-
-def render_board(
-    R_world_board: ArrayLike,
-    t_world_board: ArrayLike,
-    rig: StereoRig,
-    scene: Scene | None = None,
-    rng: np.random.Generator | None = None,
-) -> NDArray[Any]:
-    """Images (n, 2 cameras, height, width) of the chessboard of `scene.board` in n poses, as `render_disc`.
-
-    R_world_board (n, 3, 3), t_world_board (n, 3) [m]: the board's origin is the lower left inner corner seen with the
-    side of dark corner squares on the left, its axes run along the long side, the short side and out of the print.
-    """
-    scene, both = scene or Scene(), stages(rig, scene or Scene())
-    R, t = np.asarray(R_world_board, float).reshape(-1, 3, 3), np.asarray(t_world_board, float).reshape(-1, 3)
-    return _digitised(lambda i, c: expected_board_image(R[i], t[i], both[c], scene), len(R), rig, scene, rng)
-
-
 def expected_board_image(R_world_board: Array, t_world_board: Array, stage: Stage, scene: Scene) -> Array32:
     """Expected grey values (height, width) of the chessboard at rest in one camera."""
     board, look = scene.board, scene.appearance
@@ -318,19 +244,3 @@ def expected_board_image(R_world_board: Array, t_world_board: Array, stage: Stag
                 add(squares, step, (i * square, (i + 1) * square), (j * square, (j + 1) * square))
     cells = stage.cells + sheet * (look.board_white * light - stage.cells) + squares
     return stage.finish(optics.blur_to_pixels(cells, stage.weights, stage.s))
-
-
-def _digitised(
-    pictures: Pictures, n: int, rig: StereoRig, scene: Scene, rng: np.random.Generator | None
-) -> NDArray[Any]:
-    """Images of n pairs, each with noise of its own."""
-    both = stages(rig, scene)
-    noise = [None] * (2 * n) if rng is None else rng.spawn(2 * n)
-    return _gather(lambda i, c: both[c].digitised(pictures(i, c), scene, noise[2 * i + c]), n, scene)
-
-
-def _gather(pictures: Pictures, n: int, scene: Scene) -> NDArray[Any]:
-    """Pictures of n pairs as (n, 2, height, width), on the scene's threads."""
-    with ThreadPoolExecutor(max_workers=max(scene.render.threads, 1)) as pool:
-        images = list(pool.map(lambda index: pictures(*divmod(index, 2)), range(2 * n)))
-    return np.stack(images).reshape(n, 2, *images[0].shape)

@@ -49,37 +49,44 @@ class Truth:
         return np.stack(pixels, axis=1)
 
 
+_POSE = ", ".join(f"{c} {'m' if c in 'xyz' else 'rad'}" for c in COORDINATES)
+# Of every array of a Truth: where it lies in the file, unit and meaning
+_DATASETS = {
+    "time": ("s", "mid exposure of the left camera"),
+    "q": (_POSE, "pose at time, world frame = table"),
+    "qdot": ("m/s, rad/s", "rates of q at time"),
+    "q_right": (_POSE, "pose at the right camera's mid exposure"),
+    "disc/paper_centre_body": ("m", "centre of the paper on the upper face"),
+    "disc/markers_printed": ("1", "0: the dot has come off"),
+    "board/R_world_board": ("1", "orientation of the board in the calibration views"),
+    "board/t_world_board": ("m", "lower left inner corner in the calibration views"),
+}
+_CENTRES = "disc/marker_centres_body"
+_SIZES = ("radius", "half_thickness", "mass", "marker_diameter")  # of the disc
+_RIGS = ("rig", "rig_while_filming")
+
+
 def write_truth(path: Path, truth: Truth, scene: Scene) -> None:
     """Write `truth` and the scene it was rendered from."""
     with h5py.File(path, "w") as file:
         file.attrs["schema"], file.attrs["schema_version"] = SCHEMA, SCHEMA_VERSION
         file.attrs["scene"] = scene_toml(scene)  # renders the same recording again
         file.attrs["frame_rate_hz"] = truth.frame_rate
-        _put(file, "time", truth.time, "s", "mid exposure of the left camera")
-        units = ", ".join(f"{c} {'m' if c in 'xyz' else 'rad'}" for c in COORDINATES)
-        _put(file, "q", truth.q, units, "pose at time, world frame = table")
-        _put(file, "qdot", truth.qdot, "m/s, rad/s", "rates of q at time")
-        _put(file, "q_right", truth.q_right, units, "pose at the right camera's mid exposure")
+        for place, described in _DATASETS.items():
+            values = np.asarray(getattr(truth, Path(place).name))
+            _put(file, place, values.astype(np.uint8) if values.dtype == bool else values, *described)
         _put(file, "markers_px", truth.markers_px, "px", "images of the dots' own centres (frame, camera, marker, xy)")
-        disc = file.create_group("disc")
-        for name in ("radius", "half_thickness", "mass", "marker_diameter"):
-            disc.attrs[name] = getattr(truth.disc, name)
-        _put(disc, "marker_centres_body", truth.disc.marker_centres_body, "m", "true centres of the dots")
-        _put(disc, "declared_marker_centres_body", scene.declared_disc.marker_centres_body, "m", "as in recording.toml")
-        _put(disc, "paper_centre_body", truth.paper_centre_body, "m", "centre of the paper on the upper face")
-        _put(disc, "markers_printed", truth.markers_printed.astype(np.uint8), "1", "0: the dot has come off")
-        for name, rig in (("rig", truth.rig), ("rig_while_filming", truth.rig_while_filming)):
-            write_rig_group(file.create_group(name), rig)
-        board = file.create_group("board")
-        _put(board, "R_world_board", truth.R_world_board, "1", "orientation of the board in the calibration views")
-        _put(board, "t_world_board", truth.t_world_board, "m", "lower left inner corner in the calibration views")
-        effects = file.create_group("effects")
-        for name, value in truth.effects.items():
-            effects.attrs[name] = value
+        _put(file, _CENTRES, truth.disc.marker_centres_body, "m", "true centres of the dots")
+        declared = scene.declared_disc.marker_centres_body
+        _put(file, "disc/declared_marker_centres_body", declared, "m", "as in recording.toml")
+        file["disc"].attrs.update({name: getattr(truth.disc, name) for name in _SIZES})
+        for name in _RIGS:
+            write_rig_group(file.create_group(name), getattr(truth, name))
+        file.create_group("effects").attrs.update(truth.effects)
 
 
-def _put(group: Any, name: str, values: NDArray[Any], units: str, text: str) -> None:
-    data = group.create_dataset(name, data=values, compression="gzip" if values.size > 1000 else None)
+def _put(file: h5py.File, name: str, values: NDArray[Any], units: str, text: str) -> None:
+    data = file.create_dataset(name, data=values, compression="gzip" if values.size > 1000 else None)
     data.attrs["units"], data.attrs["description"] = units, text
 
 
@@ -91,26 +98,14 @@ def read_truth(path: str | Path) -> Truth:
                 raise OutputError(
                     f"{path}: schema {file.attrs.get('schema')!r}; expected {SCHEMA!r}, as `render` writes"
                 )
-            disc = file["disc"]
+            found: dict[str, Any] = {Path(place).name: file[place][:] for place in _DATASETS}
+            found["markers_printed"] = found["markers_printed"].astype(bool)
+            found |= {name: read_rig_group(file[name]) for name in _RIGS}
+            sizes = {name: float(file["disc"].attrs[name]) for name in _SIZES}
             return Truth(
-                time=file["time"][:],
-                q=file["q"][:],
-                qdot=file["qdot"][:],
-                q_right=file["q_right"][:],
+                **found,
                 frame_rate=float(file.attrs["frame_rate_hz"]),
-                rig=read_rig_group(file["rig"]),
-                rig_while_filming=read_rig_group(file["rig_while_filming"]),
-                disc=Disc(
-                    radius=float(disc.attrs["radius"]),
-                    half_thickness=float(disc.attrs["half_thickness"]),
-                    mass=float(disc.attrs["mass"]),
-                    marker_centres_body=disc["marker_centres_body"][:],
-                    marker_diameter=float(disc.attrs["marker_diameter"]),
-                ),
-                paper_centre_body=disc["paper_centre_body"][:],
-                markers_printed=disc["markers_printed"][:].astype(bool),
-                R_world_board=file["board/R_world_board"][:],
-                t_world_board=file["board/t_world_board"][:],
+                disc=Disc(marker_centres_body=file[_CENTRES][:], **sizes),
                 effects={name: float(value) for name, value in file["effects"].attrs.items()},
             )
     except (OSError, KeyError, RigFileError) as error:

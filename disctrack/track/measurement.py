@@ -24,10 +24,10 @@ from disctrack.recording.declaration import Recording
 from disctrack.recording.readers import open_frames
 from disctrack.recording.readers.base import FrameReader
 from disctrack.recording.readers.blocks import PairBlock, Unreadable, check_pair, default_threads, iter_pair_blocks
-from disctrack.recording.readers.camera_header import check_headers, other_exposure
+from disctrack.recording.readers.camera_header import check_headers
 from disctrack.recording.readers.file_numbers import check_same_numbers
 from disctrack.recording.readers.flat_field import flat_fielded, flat_fields
-from disctrack.recording.readers.part import frames_in_parts, image_parts
+from disctrack.recording.readers.part import frames_in_parts
 from disctrack.recording.readers.time_stamps import check_time_stamps, usable_times
 from disctrack.track.follow.motion_span import MotionSpan, find_motion
 from disctrack.track.follow.tracking import (
@@ -118,9 +118,8 @@ def open_pairs(recording: Recording, frames: tuple[int | None, int | None] = (No
         for pattern, camera in zip((recording.left, recording.right), CAMERAS, strict=True)
     ]
     readers = flat_fielded(readers, flat_fields(recording.folder, recording.sensors))
-    left, right = frames_in_parts(readers, image_parts(recording.parts), str(recording.file))
-    headers = check_headers(left, right, recording.frame_rate, str(recording.file))
-    headers += other_exposure(left, right, recording.exposure, str(recording.file))
+    left, right = frames_in_parts(readers, recording.parts, str(recording.file))
+    headers = check_headers(left, right, recording.frame_rate, recording.exposure, str(recording.file))
     check_pair(left, right)
     stamp_doubts, stamp_warnings = check_time_stamps(left, right, recording.frame_rate)
     findings = (

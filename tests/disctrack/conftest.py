@@ -8,8 +8,9 @@ import pytest
 from calibration.cameras.camera import StereoRig
 from disctrack import frames
 from disctrack.disc import Disc
-from disctrack.synthetic import render_disc, rig_of
+from disctrack.synthetic import rig_of
 from disctrack.synthetic.description import Scene
+from tests.rendering import render_disc
 
 
 @dataclass(frozen=True)

@@ -3,11 +3,9 @@
 import errno
 import os
 import re
-import shutil
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import cv2
@@ -18,7 +16,6 @@ import pytest
 from disctrack.cli import main
 from disctrack.commands import INTERRUPTED
 from disctrack.files import whole as whole_files
-from disctrack.trajectory.file import read_trajectory
 from tests.pipeline.conftest import linked
 
 QUICK = ["--no-figures", "--no-video"]
@@ -47,16 +44,6 @@ def replace(file: Path, image: np.ndarray) -> None:
     assert cv2.imwrite(str(file), image)
 
 
-def test_a_folder_that_is_not_there(tmp_path, capsys):
-    assert "no such folder" in failure(capsys, "run", tmp_path / "nowhere")
-
-
-def test_a_folder_without_a_trajectory(recording, capsys):
-    assert f"no results/trajectory.h5 in this folder; 'disctrack run {recording}' makes it" in failure(
-        capsys, "analyse", recording
-    )
-
-
 def change_images(recording: Path, change, cameras=("left", "right")) -> None:
     for camera in cameras:
         for file in (recording / camera).iterdir():
@@ -67,45 +54,49 @@ def in_colour(image: np.ndarray) -> np.ndarray:
     return np.random.default_rng(1).integers(0, 255, (64, 64, 3), dtype=np.uint8)
 
 
+def another_file(recording: Path) -> None:
+    with h5py.File(recording / "other.h5", "w") as file:
+        file["x"] = 1.0
+
+
+def nothing(recording: Path) -> None:
+    pass
+
+
+PATTERNS = "calibrate --left {r}/l*.png --right {r}/r*.png --corners 9x6 --square-mm 8"
+
+
 @pytest.mark.parametrize(
-    ("spoil", "words"),
+    ("spoil", "words", "said"),
     [
-        (lambda r: edit(r, "frame_rate_hz", "framerate_hz"), r"Did you mean 'frame_rate_hz'\?"),
-        (lambda r: edit(r, "mass_g = 209.69", ""), r"\[disc\] mass_g is missing"),
-        (lambda r: edit(r, '"left/*.png"', '"left/*.tif"'), r"no image matched for the left camera.*000000\.png"),
-        (lambda r: (r / "right" / "000023.png").unlink(), "left has 24 frames.*right has 23"),
-        (lambda r: change_images(r, lambda i: i[:200], ["right"]), r"(\d+) x \1 px.*\1 x 200 px"),
-        (lambda r: change_images(r, in_colour), "colour"),
-        (lambda r: change_images(r, lambda i: np.full_like(i, 90)), "found in none"),
+        (nothing, "run {r}/nowhere", "no such folder"),
+        (nothing, "analyse {r}", r"no results/trajectory.h5 in this folder; 'disctrack run .*recording' makes it"),
+        (lambda r: edit(r, "frame_rate_hz", "framerate_hz"), "run {r}", r"Did you mean 'frame_rate_hz'\?"),
+        (lambda r: edit(r, "mass_g = 209.69", ""), "run {r}", r"\[disc\] mass_g is missing"),
+        (lambda r: edit(r, '"left/*.png"', '"left/*.tif"'), "run {r}", r"no image matched for the left .*000000\.png"),
+        (lambda r: (r / "right" / "000023.png").unlink(), "run {r}", "left has 24 frames.*right has 23"),
+        (lambda r: change_images(r, lambda i: i[:200], ["right"]), "run {r}", r"(\d+) x \1 px.*\1 x 200 px"),
+        (lambda r: change_images(r, in_colour), "run {r}", "colour"),
+        (lambda r: change_images(r, lambda i: np.full_like(i, 90)), "run {r}", "found in none"),
+        (lambda r: change_images(r, lambda i: i[:200]), "track {r}", "272 x 200 px.*272 x 272 px"),
+        (nothing, "track {r} --rig {r}/nowhere.h5", "no such rig file"),
+        (lambda r: (r / "bad.h5").write_bytes(b"nothing"), "track {r} --rig {r}/bad.h5", "bad.h5"),
+        (another_file, "track {r} --rig {r}/other.h5", "other.h5"),
+        (lambda r: (r / "mine.h5").write_text("dear"), "track {r} -o {r}/mine.h5", "--overwrite"),
+        (nothing, "track {r} --frames 30:40", "holds no frame; the recording has 24"),
+        (nothing, "track {r} --frames 9:5", "holds no frame; the recording has 24"),
+        (nothing, "calibrate", "--left, --right, --corners, --square-mm missing"),
+        (nothing, PATTERNS, "no image matched for the left camera"),
+        (nothing, "calibrate {r} --table-view 2", "--table-view.*recording.toml says this"),
+        (nothing, "calibrate {r} --left l*.png --square-mm 8", "--left.*recording.toml says this"),
     ],
 )
-def test_a_recording_that_cannot_be_measured(recording, capsys, spoil, words):
+def test_what_cannot_be_done_is_said_in_one_line(recording, capsys, spoil, words, said):
     spoil(recording)
-    assert re.search(words, failure(capsys, "run", recording))
-    assert not (recording / "results" / "trajectory.h5").exists()
-
-
-def test_a_rig_of_another_image_size(recording, rig_file, tmp_path, capsys):
-    change_images(recording, lambda image: image[:200])
-    message = failure(capsys, "track", recording, "--rig", rig_file, "-o", tmp_path / "t.h5")
-    assert "272 x 200 px" in message
-    assert "272 x 272 px" in message
-
-
-def test_a_rig_file_that_is_none(recording, tmp_path, capsys):
-    assert "no such rig file" in failure(capsys, "track", recording, "--rig", tmp_path / "nowhere.h5")
-    (tmp_path / "bad.h5").write_bytes(b"nothing")
-    assert "bad.h5" in failure(capsys, "track", recording, "--rig", tmp_path / "bad.h5")
-    with h5py.File(tmp_path / "other.h5", "w") as file:
-        file["x"] = 1.0
-    assert "other.h5" in failure(capsys, "track", recording, "--rig", tmp_path / "other.h5")
-
-
-def test_an_output_that_exists(recording, tmp_path, capsys):
-    path = tmp_path / "mine.h5"
-    path.write_text("something dear")
-    assert "--overwrite" in failure(capsys, "track", recording, "-o", path)
-    assert path.read_text() == "something dear"
+    before = {file for file in recording.rglob("*") if file.is_file()}
+    assert re.search(said, failure(capsys, *words.format(r=recording).split()))
+    assert {file for file in recording.rglob("*") if file.is_file()} == before
+    assert not (recording / "mine.h5").exists() or (recording / "mine.h5").read_text() == "dear"
 
 
 @pytest.mark.statistical
@@ -119,11 +110,6 @@ def test_a_terminal_without_the_letters_of_a_name_does_not_end_the_work(tmp_path
     assert done.returncode == 0, done.stderr
     assert rb"M\xfcnze.h5" in done.stdout
     assert (tmp_path / "Münze.h5").is_file()
-
-
-@pytest.mark.parametrize("range_", ["30:40", "9:5"])
-def test_a_range_without_frames(recording, capsys, range_):
-    assert "holds no frame; the recording has 24" in failure(capsys, "track", recording, "--frames", range_)
 
 
 @pytest.mark.parametrize(
@@ -141,6 +127,11 @@ def test_a_range_without_frames(recording, capsys, range_):
         ["init", "x", "--board-thickness-mm", "-1"],
         ["convert", "rig.yml", "rig.h5", "--unit-mm", "nan"],
         ["convert", "rig.yml", "rig.h5", "--image-size", "0", "200"],
+        ["batch"],
+        ["batch", "x", "--shard", "0/3"],
+        ["batch", "x", "--shard", "4/3"],
+        ["batch", "x", "--shard", "x"],
+        ["batch", "x", "-j", "0"],
     ],
 )
 def test_wrong_usage_is_explained_with_exit_code_2(words, capsys):
@@ -150,48 +141,27 @@ def test_wrong_usage_is_explained_with_exit_code_2(words, capsys):
     assert "usage:" in capsys.readouterr().err
 
 
-def test_calibrate_without_anything_to_calibrate_from(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    assert "--left, --right, --corners, --square-mm missing" in failure(capsys, "calibrate")
-    words = ("calibrate", "--left", "l*.png", "--right", "r*.png", "--corners", "9x6", "--square-mm", "8")
-    assert "no image matched for the left camera" in failure(capsys, *words)
+def empty(file: Path) -> None:
+    file.unlink()
+    file.touch()
 
 
-@pytest.mark.parametrize("words", [("--table-view", 2), ("--left", "l*.png", "--square-mm", 8)])
-def test_what_recording_toml_says_is_not_said_beside_it(short_recording, capsys, words):
-    assert f"{words[0]}" in (told := failure(capsys, "calibrate", short_recording, *words))
-    assert "recording.toml says this" in told
-
-
-def test_a_calibration_view_without_its_partner(short_recording, tmp_path, capsys):
-    linked(short_recording, tmp_path)
-    (tmp_path / "calibration" / "right" / "04.png").unlink()
-    message = failure(capsys, "calibrate", tmp_path)
-    assert "18 left and 17 right" in message
-    assert "left 04.png" in message
-
-
-@pytest.mark.statistical
-def test_other_corners_than_declared_are_named_once_for_all_views(short_recording, tmp_path, capsys):
-    linked(short_recording / "calibration", tmp_path / "calibration")
-    shutil.copy(short_recording / "recording.toml", tmp_path)
-    edit(tmp_path, "[9, 6]", "[10, 7]")
-    message = failure(capsys, "calibrate", tmp_path)
-    assert message.count("a board of 10 x 7 inner corners is not in it") == 1
-    assert "inner_corners = [9, 6]" in message
-
-
-def test_a_table_view_that_is_damaged_or_not_there(short_recording, tmp_path, capsys):
-    linked(short_recording / "calibration", tmp_path / "calibration")
-    text = (short_recording / "recording.toml").read_text()
-    (tmp_path / "recording.toml").write_text(text.replace("view = 0", "view = 20"))
-    assert "there are 18 calibration views" in failure(capsys, "calibrate", tmp_path)
-    (tmp_path / "recording.toml").write_text(text)
-    (tmp_path / "calibration" / "left" / "00.png").unlink()
-    (tmp_path / "calibration" / "left" / "00.png").write_bytes(b"")
-    message = failure(capsys, "calibrate", tmp_path)
-    assert "00.png" in message
-    assert "table view" in message
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (lambda r: (r / "calibration" / "right" / "04.png").unlink(), "18 left and 17 right.*left 04.png"),
+        (lambda r: edit(r, "view = 0", "view = 20"), "there are 18 calibration views"),
+        (lambda r: empty(r / "calibration" / "left" / "00.png"), "00.png.*table view|table view.*00.png"),
+        pytest.param(
+            lambda r: edit(r, "[9, 6]", "[10, 7]"),
+            r"(?=.*inner_corners = \[9, 6\])(?!(.*a board of 10 x 7){2}).*a board of 10 x 7 inner corners is not in it",
+            marks=pytest.mark.statistical,
+        ),
+    ],
+)
+def test_views_that_cannot_be_used_are_named(short_recording, tmp_path, capsys, spoil, said):
+    spoil(linked(short_recording, tmp_path))
+    assert re.search(said, failure(capsys, "calibrate", tmp_path))
 
 
 @pytest.mark.statistical
@@ -294,36 +264,3 @@ def test_a_disk_that_fills_up_while_the_result_is_written(recording, monkeypatch
     assert os.listdir(recording / "results") == []
     monkeypatch.undo()
     assert main(["run", str(recording), *QUICK]) == 0
-
-
-def start(*words, **environment) -> subprocess.Popen:
-    return subprocess.Popen(
-        [sys.executable, "-m", "disctrack", *map(str, words)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), **environment},
-    )
-
-
-@pytest.mark.statistical
-@pytest.mark.skipif(sys.platform == "win32", reason="signals are POSIX")
-@pytest.mark.parametrize(
-    "delay", [1.0, pytest.param(0.3, marks=pytest.mark.slow), pytest.param(2.0, marks=pytest.mark.slow)]
-)
-@pytest.mark.parametrize("kind", [signal.SIGINT, signal.SIGKILL])
-def test_a_run_that_is_stopped_leaves_nothing_half_and_the_next_completes(recording, capsys, kind, delay):
-    process = start("run", recording, "--no-video")
-    time.sleep(delay)
-    process.send_signal(kind)  # harmless where the run was done before
-    _, errors = process.communicate(timeout=60)
-    # before 0.5 s the interpreter itself may still be starting
-    if process.returncode != 0 and kind == signal.SIGINT and delay > 0.5:
-        assert "interrupted" in errors
-        assert "Traceback" not in errors
-    results = recording / "results"
-    if (results / "trajectory.h5").exists():
-        read_trajectory(results / "trajectory.h5")  # whole
-    assert main(["run", str(recording), *QUICK]) == 0
-    assert len(read_trajectory(results / "trajectory.h5")) == 24
-    assert not list(results.glob("*.part*"))

@@ -15,7 +15,7 @@ from disctrack.calibrate.views import find_views
 from disctrack.cli import main
 from disctrack.errors import RecordingError
 from disctrack.trajectory.file import read_details, read_trajectory
-from tests.disctrack.recording.readers.test_formats import write_hdf5, write_pages_by_opencv, write_video
+from tests.disctrack.recording.readers.written import write_hdf5, write_pages_by_opencv, write_video
 from tests.oracles.camera_files import write_cine, write_mraw
 
 QUICK = ["--no-figures", "--no-video"]

@@ -15,7 +15,6 @@ import pytest
 from scipy.ndimage import fourier_shift
 
 from calibration.rig_file import read_rig
-from disctrack.batch import read_summary
 from disctrack.cli import main
 from disctrack.diagnosis.recorded import first_to_mend
 from disctrack.findings import Finding, Kind, Severity, finding_from_json, in_doubt, leading
@@ -326,7 +325,8 @@ def test_a_diagnosis_repeats_it_first(name, recording, capsys):
 def test_a_batch_names_every_fault_first(names, recording, capsys):
     *_, day = (recording(name).parent for name in names)
     assert main(["batch", str(day), "--no-report"]) == 1
-    rows = {row["recording"]: row for row in read_summary(day / "batch_results" / "summary.json")}
+    summary = json.loads((day / "batch_results" / "summary.json").read_text())
+    rows = {row["recording"]: row for row in summary["recordings"]}
     for name in names:
         row, known = rows[name], FAULTS[name]
         assert (row["finding"], row["severity"]) == (known.kind.value, known.grave), row

@@ -23,6 +23,7 @@ from disctrack.track.measurement import open_pairs
 from disctrack.track.refine.intrinsic_scatter import MIN_FRAMES
 from disctrack.trajectory import FrameStatus
 from tests.oracles.planted_faults import FAULTS, glare
+from tests.rendering import render_disc
 
 N = 48
 MOST_SIGMAS = 5.0  # of six components of some fifty poses chance alone reaches 4.1
@@ -408,7 +409,7 @@ def test_of_a_hundred_random_faults_none_passes_in_silence(laboratory, tmp_path)
 def ideal():
     """Rendered here, with the poses that were rendered as the truth, through the true rig."""
     from disctrack import rolling as model
-    from disctrack.synthetic import render_disc, rig_of
+    from disctrack.synthetic import rig_of
     from disctrack.synthetic.description import Scene
 
     scene = Scene()

@@ -56,25 +56,34 @@ class CameraHeader:
         return {**fields, "recorded": self.recorded.isoformat() if self.recorded else None}
 
 
-def check_headers(left: FrameReader, right: FrameReader, frame_rate: float, declared_in: str) -> tuple[str, ...]:
-    """Compare the cameras' headers with each other and with the declared frame rate [Hz]; returns warnings.
+def check_headers(
+    left: FrameReader, right: FrameReader, frame_rate: float, exposure: float | None, declared_in: str
+) -> tuple[str, ...]:
+    """Compare the cameras' headers with each other, and with the declared frame rate [Hz] and exposure [s].
 
-    Raises RecordingError where frame i of both cannot belong together, or cannot have been taken at the declared
-    rate. Formats without a header pass, with a warning where they state another rate: it may be that of a player.
+    Returns warnings. Raises RecordingError where frame i of both cannot belong together, or cannot have been taken at
+    the declared rate. Formats without a header pass, with a warning where they state another rate: it may be that of a
+    player.
     """
     warnings = []
     for reader in (left, right):
         header, camera, rate = reader.header, reader.camera, reader.frame_rate
         declared = f"{declared_in}: [cameras] frame_rate_hz is {frame_rate:g}"
-        if header is None and rate is not None and abs(rate - frame_rate) > RATE_ROUNDING_HZ:
-            warnings.append(f"{declared}, the {camera} file states {rate:g} Hz")
-        if header is not None:
-            stamped = 0.0 if header.first_time is None else CLOCK_TOLERANCE * header.frame_rate
-            if abs(header.frame_rate - frame_rate) > max(RATE_ROUNDING_HZ, stamped):
-                raise RecordingError(
-                    f"{declared}, but the {camera} camera's frames were recorded with {header.rate}, says "
-                    f"{header.file}. Every velocity would be wrong by their ratio: correct that."
-                )
+        if header is None:
+            if rate is not None and abs(rate - frame_rate) > RATE_ROUNDING_HZ:
+                warnings.append(f"{declared}, the {camera} file states {rate:g} Hz")
+            continue
+        stamped = 0.0 if header.first_time is None else CLOCK_TOLERANCE * header.frame_rate
+        if abs(header.frame_rate - frame_rate) > max(RATE_ROUNDING_HZ, stamped):
+            raise RecordingError(
+                f"{declared}, but the {camera} camera's frames were recorded with {header.rate}, says {header.file}. "
+                "Every velocity would be wrong by their ratio: correct that."
+            )
+        if exposure is not None and header.exposure is not None and _differ(header.exposure, exposure):
+            warnings.append(
+                f"{declared_in}: [cameras] exposure_us is {1e6 * exposure:g}, the {camera} camera's header says "
+                f"{1e6 * header.exposure:g} µs ({header.file}); the declared one is used"
+            )
     if left.header is not None and right.header is not None:
         _check_instants(left.header, right.header)
         warnings += _doubtful(left.header, right.header)
@@ -130,20 +139,6 @@ def _doubtful(left: CameraHeader, right: CameraHeader) -> list[str]:
 
 def _differ(one: float, other: float) -> bool:
     return abs(one - other) > SAME_EXPOSURE * max(one, other)
-
-
-def other_exposure(left: FrameReader, right: FrameReader, declared: float | None, declared_in: str) -> tuple[str, ...]:
-    """Warnings where the declared exposure [s] is not that of a camera's header."""
-    found = []
-    for reader in (left, right):
-        header = reader.header
-        if declared is None or header is None or header.exposure is None or not _differ(header.exposure, declared):
-            continue
-        found.append(
-            f"{declared_in}: [cameras] exposure_us is {1e6 * declared:g}, the {reader.camera} camera's header says "
-            f"{1e6 * header.exposure:g} µs ({header.file}); the declared one is used"
-        )
-    return tuple(found)
 
 
 def start_offset(left: CameraHeader, right: CameraHeader) -> tuple[float, str] | None:

@@ -37,11 +37,6 @@ class ImagePart:
 ImageParts = tuple[ImagePart | None, ...]  # of the left and of the right camera
 
 
-def image_parts(declared: Sequence[tuple[int, int, int, int] | None]) -> ImageParts:
-    """Parts of the left and of the right camera, each as (x, y, width, height) [px] or None."""
-    return tuple(None if part is None else ImagePart(*part) for part in declared)
-
-
 def frames_in_parts(readers: Sequence[FrameReader], parts: ImageParts, where: str) -> list[FrameReader]:
     """Both cameras' readers, of the declared parts. Raises RecordingError, which begins with `where`, if one is cut."""
     found: list[FrameReader] = []

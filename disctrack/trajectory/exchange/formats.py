@@ -16,7 +16,7 @@ import numpy as np
 from calibration.cameras.camera import StereoRig
 from calibration.kit.arguments import checked
 from calibration.rig_file import SCHEMA as RIG
-from calibration.rig_file import CalibrationRecord, read_rig_file, write_rig
+from calibration.rig_file import read_rig, write_rig
 from disctrack.errors import OutputError
 from disctrack.files.inputs import keep, refuse_input
 from disctrack.files.whole import refuse_existing, write_whole
@@ -127,11 +127,11 @@ def convert(
     refuse_input(path)
     told = {name: value for name, value in told.items() if value}
     if not _is_ours(paths[0]):
-        value, record = read_foreign(paths, **told), None
+        value = read_foreign(paths, **told)
     elif told:
         raise OutputError(f"{_options(told)}: says nothing about {paths[0]}, a file of ours; leave it out")
     else:
-        value, record = _own(paths)
+        value = _own(paths)
     if path.suffix in OWN and form is None:
         _write_own(path, value, paths[0])
         return Converted((path,), ())
@@ -143,7 +143,7 @@ def convert(
     if row.holds == "rig":
         value = value.rig if isinstance(value, Trajectory) else value
         if row.terms is not None:
-            value, words = within_brown(value, row.terms, record)
+            value, words = within_brown(value, row.terms)
             notes += [words] if words else []
     row.write(path, value)
     return Converted(written, tuple(notes))
@@ -202,15 +202,12 @@ def _is_ours(path: Path) -> bool:
     return path.suffix in OWN or h5py.is_hdf5(path)
 
 
-def _own(paths: Sequence[Path]) -> tuple[Trajectory | StereoRig, CalibrationRecord | None]:
-    path = the_one(paths)
+def _own(paths: Sequence[Path]) -> Trajectory | StereoRig:
+    path, schema = the_one(paths), None
     if path.is_file() and h5py.is_hdf5(path):
         with h5py.File(path, "r") as file:
-            is_rig = file.attrs.get("schema") == RIG
-        if is_rig:
-            content = read_rig_file(path)
-            return content.rig, content.record
-    return read_trajectory(path), None
+            schema = file.attrs.get("schema")
+    return read_rig(path) if schema == RIG else read_trajectory(path)
 
 
 def _write_own(path: Path, value: Any, source: Path) -> None:

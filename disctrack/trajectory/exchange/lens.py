@@ -13,17 +13,15 @@ from calibration.cameras.camera import (
     project_with_jacobians,
 )
 from calibration.kit.arrays import Array
-from calibration.rig_file import CalibrationRecord
 
 BROWN = ("k1", "k2", "p1", "p2", "k3")
 
 
-def within_brown(rig: StereoRig, terms: tuple[str, ...], record: CalibrationRecord | None) -> tuple[StereoRig, str]:
+def within_brown(rig: StereoRig, terms: tuple[str, ...]) -> tuple[StereoRig, str]:
     """The rig without a lens field and with no other terms than these, and what that costs, in words.
 
     Of each camera fx, fy, cx, cy and the terms are fitted to where its lens shows the rays of a whole image. Nothing is
     changed, and nothing said, where the rig needs no more than the terms.
-    record : how it was calibrated, if that is known: its corners tell the misfit before and after
     """
     lost = [name for name in BROWN if name not in terms and any(c.distortion[BROWN.index(name)] for c in rig.cameras)]
     if rig.lens_field is None and not lost:
@@ -33,11 +31,7 @@ def within_brown(rig: StereoRig, terms: tuple[str, ...], record: CalibrationReco
     rms, most = np.sqrt(np.mean(np.concatenate(moved) ** 2)), np.abs(np.concatenate(moved)).max()
     words = f"{' and '.join(beyond)} fitted by fx fy cx cy {' '.join(terms)}: images differ by {rms:.2g} px rms"
     words += f", {most:.2g} at most"
-    plain = replace(rig, left=cameras[0], right=cameras[1], lens_field=None)
-    if record is not None and record.kept.any():
-        before, after = _corner_misfit(record, rig, plain)
-        words += f"; misfit of the calibration's corners {before:.3f} -> {after:.3f} px"
-    return plain, words
+    return replace(rig, left=cameras[0], right=cameras[1], lens_field=None), words
 
 
 def _refitted(rig: StereoRig, number: int, terms: tuple[str, ...]) -> tuple[Camera, Array]:
@@ -64,15 +58,3 @@ def _rays(rig: StereoRig, number: int, seen: Array) -> Array:
         seen = seen - rig.lens_field.displacement(seen, number)
     flat = normalise(seen, rig.cameras[number])
     return np.column_stack([flat, np.ones(len(flat))])
-
-
-def _corner_misfit(record: CalibrationRecord, rig: StereoRig, plain: StereoRig) -> tuple[float, float]:
-    """Root mean square [px] per axis of the corners that the calibration kept, by either rig."""
-    o, kept, rows = record.observations, record.kept, np.arange(len(record.kept))
-    seen = np.stack([o.pixels, o.pixels])  # where either camera shows them; the record's are without the field
-    seen = seen if rig.lens_field is None else rig.lens_field.distorted(seen)
-    rays = [np.column_stack([normalise(o.pixels, camera), np.ones(len(rows))]) for camera in rig.cameras]
-    found = np.stack([project(ray, camera) for ray, camera in zip(rays, plain.cameras, strict=True)])
-    moved = (seen - found)[o.camera, rows]
-    before, after = (float(np.sqrt(np.nanmean(r[kept] ** 2))) for r in (record.residuals, record.residuals + moved))
-    return before, after

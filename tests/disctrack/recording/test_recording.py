@@ -114,25 +114,14 @@ def test_each_missing_section_is_named(tmp_path, section):
 
 
 @pytest.mark.parametrize(
-    ("written", "found", "meant"),
-    [
-        ("radius_mm", "radus_mm", "radius_mm"),
-        ("frame_rate_hz", "framerate_hz", "frame_rate_hz"),
-        ("[gravity]", "[gravitiy]", "gravity"),
-        ("name =", "nane =", "name"),
-        ("mass_g = 209.69", "mass_g = 209.69\nframe_rate_hz = 5", "'frame_rate_hz' of [cameras]"),
-        ("square_mm = 8.0", "square_mm = 8.0\ntemperature = 20", "Known here: left, right"),
-    ],
-)
-def test_an_unknown_key_is_refused_with_the_nearest_known_one(tmp_path, written, found, meant):
-    text = message(tmp_path, REFERENCE.replace(written, found, 1))
-    assert "unknown" in text
-    assert meant in text
-
-
-@pytest.mark.parametrize(
     ("written", "found", "expected"),
     [
+        ("radius_mm", "radus_mm", "unknown.*radius_mm"),
+        ("frame_rate_hz", "framerate_hz", "unknown.*frame_rate_hz"),
+        ("[gravity]", "[gravitiy]", "unknown.*gravity"),
+        ("name =", "nane =", "unknown.*name"),
+        ("mass_g = 209.69", "mass_g = 209.69\nframe_rate_hz = 5", "unknown.*'frame_rate_hz' of [cameras]"),
+        ("square_mm = 8.0", "square_mm = 8.0\ntemperature = 20", "unknown.*Known here: left, right"),
         ("frame_rate_hz = 1000.0", 'frame_rate_hz = "fast"', "a number"),
         ("frame_rate_hz = 1000.0", "frame_rate_hz = true", "a number"),
         ("frame_rate_hz = 1000.0", "frame_rate_hz = 0", "from 0.1 to 1e+07"),
@@ -151,10 +140,15 @@ def test_an_unknown_key_is_refused_with_the_nearest_known_one(tmp_path, written,
         ("[[26.0, 0.0], [13.0, 22.5167]", "[[13.0, 22.0], [13.0, 22.5167]", "overlap"),
         ("square_mm = 8.0", 'square_mm = 8.0\nrig = "rig.h5"', "both rig and"),
         ("[gravity]\n", "gravity = 9.81\n[other]\n", "unknown"),
+        ("[[26.0, 0.0], [13.0, 22.5167], [-13.0, 22.5167]]", str([[0.01 * i, 1.0] for i in range(101)]), "at most 100"),
+        ("frame_rate_hz = 1000.0", "frame_rate_hz = = 3", "line 4"),
+        ("[table]", '[table]\nfrom = "rim"', '"board", "disc" or "both"'),
     ],
 )
-def test_a_wrong_value_is_shown_with_what_was_expected(tmp_path, written, found, expected):
-    assert expected in message(tmp_path, REFERENCE.replace(written, found, 1))
+def test_what_is_wrong_is_shown_with_what_was_expected(tmp_path, written, found, expected):
+    assert written in REFERENCE
+    text = message(tmp_path, REFERENCE.replace(written, found, 1))
+    assert all(part in text for part in expected.split(".*"))
 
 
 NUMBERS = [(key, *meant.between) for keys in KEYS.values() for key, meant in keys.items() if meant.between]
@@ -186,16 +180,6 @@ def test_every_number_has_a_range_and_the_message_tells_it(tmp_path, key, least,
         assert f"from {least:g} to {most:g}" in found
 
 
-def test_dots_are_bounded_in_number(tmp_path):
-    dots = [[float(x), float(y)] for x in range(-15, 16) for y in range(-15, 16)]
-    text = re.sub(r"(?m)^centres_mm *=.*$", f"centres_mm = {dots}", REFERENCE)
-    assert "at most 100" in message(tmp_path, text)
-
-
-def test_a_syntax_error_is_told_with_its_line(tmp_path):
-    assert "line 3" in message(tmp_path, 'name = "a"\n[cameras]\nframe_rate_hz = = 3\n')
-
-
 def test_a_missing_folder_and_a_folder_without_recording_are_told_apart(tmp_path):
     with pytest.raises(RecordingError, match="no such folder"):
         read_recording(tmp_path / "nowhere")
@@ -214,12 +198,6 @@ _values = st.recursive(
     lambda children: st.lists(children, max_size=4).map(lambda items: f"[{', '.join(items)}]"),
     max_leaves=8,
 )
-
-
-@_fuzz
-@given(content=st.binary(max_size=400))
-def test_any_bytes_are_read_or_refused_with_a_message(tmp_path, content):
-    _read_or_refuse(write(tmp_path, content))
 
 
 @pytest.mark.statistical
@@ -253,4 +231,3 @@ def test_tolerances_exposure_and_source_of_the_table_may_be_declared(tmp_path):
     assert read.exposure == pytest.approx(200e-6)
     assert (read.disc.thickness_tolerance, read.disc.radius_tolerance) == (pytest.approx(2e-5), 0.0)
     assert read.table.source == "disc"
-    assert '"board", "disc" or "both"' in message(tmp_path, text.replace('"disc"', '"rim"'))

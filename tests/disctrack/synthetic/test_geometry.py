@@ -20,6 +20,7 @@ from disctrack.synthetic.description import (
     RigSettings,
     Scene,
 )
+from tests.rendering import expected_disc, render_board
 
 PLAIN = Scene(
     appearance=AppearanceSettings(table=0.0, table_streaks=0.0, table_blotches=0.0),
@@ -86,8 +87,8 @@ def test_dots_lie_where_opencv_projects_their_outlines(q, index, rig):
         pytest.skip("this camera looks at the underside")
     without = replace(PLAIN, appearance=replace(PLAIN.appearance, dot=PLAIN.appearance.paper))
     dark = (
-        synthetic.expected_disc(q, rig, MA_2014, without)[0, index].astype(float)
-        - synthetic.expected_disc(q, rig, MA_2014, PLAIN)[0, index]
+        expected_disc(q, rig, MA_2014, without)[0, index].astype(float)
+        - expected_disc(q, rig, MA_2014, PLAIN)[0, index]
     )
     R = rotation_from_euler(*q[3:])
     for centre in MA_2014.marker_centres_body:
@@ -106,7 +107,7 @@ def test_dots_lie_where_opencv_projects_their_outlines(q, index, rig):
 def test_silhouette_is_the_hull_of_both_projected_rims(q, index, rig):
     same = {name: 200.0 for name in ("paper", "dot", "rim", "side", "underside")}
     scene = replace(PLAIN, appearance=replace(PLAIN.appearance, **same))
-    image = synthetic.expected_disc(q, rig, MA_2014, scene)[0, index].astype(float)
+    image = expected_disc(q, rig, MA_2014, scene)[0, index].astype(float)
     R = rotation_from_euler(*q[3:])
     rims = np.concatenate([circle([0, 0, z * MA_2014.half_thickness], MA_2014.radius) for z in (-1, 1)])
     points = cv2_pixels(rims @ R.T + q[:3], rig, index)
@@ -123,7 +124,7 @@ def test_black_squares_lie_where_opencv_projects_them(index, rig):
     R = rotation_from_euler(0.4, 0.3, -0.2)
     t = np.array([0.002, 0.004, 0.012])
     fine = replace(scene, cameras=CameraSettings(bit_depth=16), render=replace(scene.render, subpixels=5))
-    image = synthetic.render_board(R, t, rig, fine)[0, index] / (65535 / 255)
+    image = render_board(R, t, rig, fine)[0, index] / (65535 / 255)
     total, moment = 0.0, np.zeros(2)
     for i in range(-1, 9):
         for j in range(-1, 6):
@@ -151,8 +152,7 @@ def test_black_squares_lie_where_opencv_projects_them(index, rig):
 @pytest.mark.statistical
 def test_edges_have_converged(rig):
     coarse, fine = (
-        synthetic.expected_disc(POSES, rig, MA_2014, replace(PLAIN, render=replace(PLAIN.render, subpixels=s)))
-        for s in (5, 10)
+        expected_disc(POSES, rig, MA_2014, replace(PLAIN, render=replace(PLAIN.render, subpixels=s))) for s in (5, 10)
     )
     assert np.abs(coarse - fine).max() < 0.1  # grey levels of 165
 
@@ -161,7 +161,7 @@ def test_edges_have_converged(rig):
 def test_chessboard_has_converged(rig):
     R, t = rotation_from_euler(0.4, 0.3, -0.2), np.array([0.002, 0.004, 0.012])
     coarse, fine = (
-        synthetic.render_board(
+        render_board(
             R, t, rig, replace(PLAIN, cameras=CameraSettings(bit_depth=16), render=replace(PLAIN.render, subpixels=s))
         )
         for s in (5, 10)

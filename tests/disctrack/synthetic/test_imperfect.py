@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from calibration import find_corners
-from disctrack.synthetic import render_board, rig_of
+from disctrack.synthetic import rig_of
 from disctrack.synthetic.description import (
     BoardSettings,
     CameraSettings,
@@ -18,6 +18,7 @@ from disctrack.synthetic.description import (
 from disctrack.synthetic.optics import corner_rays, lens_rays
 from disctrack.synthetic.recording import recording_toml
 from disctrack.synthetic.sensor import sensor_pattern
+from tests.rendering import render_board
 
 SCENE = Scene(
     cameras=CameraSettings(image_size=(272, 272)),

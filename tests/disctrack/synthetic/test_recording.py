@@ -30,6 +30,7 @@ from disctrack.synthetic.description import (
 )
 from disctrack.synthetic.motion import motion_of
 from disctrack.synthetic.truth import SCHEMA
+from tests.rendering import expected_disc, render_disc
 
 SMALL = Scene(
     name="small",
@@ -140,8 +141,11 @@ def test_faults_never_show_in_recording_toml(scene):
 
 
 @pytest.mark.statistical
-def test_same_scene_gives_the_same_files_and_another_seed_another_rig(scene, tmp_path):
-    first, second = (synthetic.write_recording(tmp_path / name, scene) for name in "ab")
+def test_same_scene_gives_the_same_files_on_any_number_of_threads_and_another_seed_another_rig(scene, tmp_path):
+    first, second = (
+        synthetic.write_recording(tmp_path / name, replace(scene, render=replace(scene.render, threads=n)))
+        for name, n in (("a", 1), ("b", 3))
+    )
     assert_array_equal(images(tmp_path / "a", "right"), images(tmp_path / "b", "right"))
     other = synthetic.rig_of(replace(scene, seed=2))
     difference = rig_parameters(first.rig) - rig_parameters(other)
@@ -247,7 +251,7 @@ def test_frame_shows_the_pose_of_its_mid_exposure(scene, tmp_path):
     quiet = replace(scene, sensor=SensorSettings(gain_e_per_dn=0.0, read_noise_dn=0.0))
     blurred = replace(quiet, cameras=replace(quiet.cameras, exposure_s=8e-4))
     truth = synthetic.write_recording(tmp_path / "r", blurred)
-    still = synthetic.render_disc(truth.q, truth.rig, truth.disc, quiet)
+    still = render_disc(truth.q, truth.rig, truth.disc, quiet)
     moving = images(tmp_path / "r", "left").astype(float)
     dark_still, dark_moving = 190.0 - still[:, 0].astype(float), 190.0 - moving
     for frame, (u, v) in enumerate(np.rint(truth.markers_px[:, 0, 0]).astype(int)):
@@ -259,14 +263,6 @@ def test_frame_shows_the_pose_of_its_mid_exposure(scene, tmp_path):
         ]
         # rounding to 8 bit: 0.003 px; the wrong end of the exposure would be 0.4 px away
         assert_allclose(centres[0], centres[1], atol=0.01)
-
-
-def test_static_poses_give_one_frame_each(tmp_path):
-    poses = ((32.0, 20.0, 12.0, 30.0, 15.0, 40.0), (30.0, 22.0, 30.0, -80.0, 50.0, 10.0))
-    scene = replace(SMALL, motion=MotionSettings(kind="static", poses=poses))
-    truth = synthetic.write_recording(tmp_path / "r", scene)
-    assert_allclose(truth.q[1], [0.030, 0.022, 0.030, *np.radians([-80.0, 50.0, 10.0])])
-    assert len(list((tmp_path / "r/left").iterdir())) == 2
 
 
 def test_rolling_scene_starts_as_asked_and_knows_its_effects():
@@ -298,12 +294,6 @@ def test_a_render_that_fails_leaves_nothing_behind(scene, tmp_path):
         synthetic.write_recording(tmp_path / "r", scene, progress=stop)
     assert not (tmp_path / "r").exists()
     assert not (tmp_path / "r.part").exists()
-
-
-def test_truth_can_lie_apart(scene, tmp_path):
-    synthetic.write_recording(tmp_path / "r", scene, truth_path=tmp_path / "truth" / "r.h5")
-    assert not (tmp_path / "r" / "truth.h5").exists()
-    assert len(synthetic.read_truth(tmp_path / "truth" / "r.h5").time) == 4
 
 
 def test_truth_of_another_file_is_refused(tmp_path):
@@ -368,7 +358,7 @@ def test_truth_holds_the_scene_and_the_rates(scene, tmp_path):
 def test_a_lens_that_folds_is_refused():
     lens = replace(SMALL, rig=replace(SMALL.rig, k1=(-30.0, -30.0), k2=(0.0, 0.0)))
     with pytest.raises(SceneError, match="folds inside the picture"):
-        synthetic.expected_disc(START, synthetic.rig_of(lens), lens.declared_disc, lens)
+        expected_disc(START, synthetic.rig_of(lens), lens.declared_disc, lens)
 
 
 def test_missing_table_of_motion_is_named(tmp_path):
@@ -384,7 +374,7 @@ def test_sample_clip_is_what_its_scene_renders(sample_clip):
     assert_allclose(rig_parameters(synthetic.rig_of(scene)), rig_parameters(truth.rig), rtol=1e-12)
     assert_allclose(motion_of(scene).pose(truth.time), truth.q, atol=1e-9)  # integrator: 1e-11 relative
     stored = np.stack([images(sample_clip, name, 300)[-1] for name in ("left", "right")]).astype(float)
-    again = synthetic.expected_disc(truth.q[-1], truth.rig, truth.disc, scene)[0]
+    again = expected_disc(truth.q[-1], truth.rig, truth.disc, scene)[0]
     # grey levels: noise of variance 0.04 + 190 / 400 + 1 / 12 on the paper and less elsewhere; the last frame's motion
     # during 0.2 ms is 0.05 px and moves edges by less than the noise
     assert np.std(stored - again) < np.sqrt(0.04 + 190 / 400 + 1 / 12)

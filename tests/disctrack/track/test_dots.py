@@ -8,12 +8,13 @@ from numpy.testing import assert_allclose
 
 from calibration.cameras.camera import normalised_maps
 from disctrack import frames
-from disctrack.synthetic import expected_disc, render_disc, rig_of
+from disctrack.synthetic import rig_of
 from disctrack.synthetic.description import Scene
 from disctrack.track.dots.template import NoiseModel, measure_noise
 from disctrack.trajectory import MarkerStatus
 from tests.disctrack.conftest import RenderedPairs, disc_on_table
 from tests.oracles.flat_dots import locate_on_disc, locate_on_plane
+from tests.rendering import expected_disc, render_disc
 
 SENSOR_NOISE = NoiseModel(0.64 + 1 / 12, 0.02)  # of the default scene: read noise, rounding, 50 electrons per grey
 

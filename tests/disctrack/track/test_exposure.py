@@ -7,7 +7,6 @@ import pytest
 
 from disctrack import frames, measure_pairs, rolling
 from disctrack.findings import Kind, Severity
-from disctrack.synthetic import render_disc
 from disctrack.track.dots import template_response as template_pull
 from disctrack.track.dots.template import NoiseModel
 from disctrack.track.dots.template_response import Edge
@@ -17,6 +16,7 @@ from disctrack.track.refine import exposure as smears
 from disctrack.track.refine.exposure import shift_by_exposure
 from disctrack.trajectory import FrameStatus
 from tests.oracles.flat_dots import covered, locate_on_plane
+from tests.rendering import render_disc
 
 RATE, EXPOSURE = 1000.0, 1e-3  # Hz, s
 N = 40

@@ -11,10 +11,10 @@ from disctrack import frames
 from disctrack.errors import TrackingError
 from disctrack.findings import Kind
 from disctrack.recording.declaration import read_recording
-from disctrack.synthetic import render_disc
 from disctrack.track.follow.tracking import PAIRS_TRIED, TrackingSettings, _as_one_sensor, track
 from disctrack.track.measurement import measure, open_pairs
 from disctrack.trajectory import FrameStatus, MarkerStatus
+from tests.rendering import render_disc
 
 N = 60
 
@@ -260,7 +260,7 @@ def test_a_table_that_is_not_where_the_rig_says_is_announced(rolling, rendered_p
 
 
 def test_a_sensor_without_noise_is_not_refused_for_the_templates_own_misfit(rendered_pairs):
-    from disctrack.synthetic import expected_disc
+    from tests.rendering import expected_disc
 
     q = rendered_pairs.q[[4, 5, 6]]
     images = np.round(16 * expected_disc(q, rendered_pairs.rig, rendered_pairs.disc, rendered_pairs.scene)).astype(

@@ -207,96 +207,83 @@ def test_our_lens_terms_are_those_of_mrcals_own_example(tmp_path):
     assert rig.baseline == pytest.approx(0.1)
 
 
+def fisheye(text, rig):
+    return text.replace("fisheye = false", "fisheye = true", 1)
+
+
+def third_camera(text, rig):
+    return text + text.replace("[cameras.0]", "[cameras.5]").partition("[cameras.1]")[0]
+
+
+def entry(key, value):
+    """Another value of one key of every camera's table."""
+    return lambda text, rig: re.sub(rf"(?m)^{key} = .*$", f"{key} = {value}", text)
+
+
+def matrix(change):
+    """Another matrix of the left camera, in a table of TOML or YAML."""
+
+    def changed(text, rig):
+        K = rig.left.camera_matrix
+        if "%YAML" in text:
+            numbers = ", ".join(map(repr, change(K).ravel().tolist()))
+            return re.sub(r"(M1: !!opencv-matrix(?:\n .*){3}\n   data: \[)[^]]*", rf"\g<1>{numbers}", text)
+        return text.replace(f"matrix = {K.tolist()}", f"matrix = {change(K).tolist()}")
+
+    return changed
+
+
+SKEWED = [
+    (lambda K: K.T, "camera matrix is .*MATLAB"),
+    (lambda K: K + np.eye(3, k=1) * [[1], [0], [0]], "without skew"),
+    (lambda K: 2 * K, "expected fx, 0, cx; 0, fy, cy; 0, 0, 1"),
+    (lambda K: -K, "is not a camera matrix"),
+]
+
+
 @pytest.mark.parametrize(
-    ("text", "words"),
+    ("name", "change", "said"),
     [
-        ("{'lensmodel': 'LENSMODEL_SPLINED_STEREOGRAPHIC'}", "SPLINED"),
-        ("{'lensmodel': 'LENSMODEL_OPENCV5', 'intrinsics': [1, 2]}", "intrinsics"),
-        ("import os", "not a .cameramodel"),
+        ("rig.cameramodel", lambda *_: "{'lensmodel': 'LENSMODEL_SPLINED_STEREOGRAPHIC'}", "SPLINED"),
+        ("rig.cameramodel", lambda *_: "{'lensmodel': 'LENSMODEL_OPENCV5', 'intrinsics': [1, 2]}", "intrinsics"),
+        ("rig.cameramodel", lambda *_: "import os", "not a .cameramodel"),
+        ("rig.toml", fisheye, "camera 0: a fisheye"),
+        ("rig.toml", third_camera, "0, 1, 5; name two"),
+        ("rig.toml", entry("distortions", '["a"]'), "camera 0.*'distortions' is missing, or not numbers"),
+        ("rig.toml", entry("rotation", '"none"'), "camera 0.*'rotation' is missing, or not numbers"),
+        ("rig.toml", entry("rotation", "[]"), "camera 0.*has no rotation"),
+        ("rig.toml", entry("rotation", "[[1e300, 0, 0], [0, 1, 0], [0, 0, 1]]"), "camera 0.*is not a rotation"),
+        ("rig.toml", entry("size", "[1e300, 200]"), "camera 0.*no image size"),
+        ("rig.yml", lambda text, _: re.sub("unit: .*", 'unit: "foot"', text), "unit"),
+        ("rig.yml", lambda text, _: text.replace("\nR:", "\nQ:"), "R missing"),
+        ("rig.yml", lambda *_: "%YAML:1.0\n---\nM1: [1, 2", r"rig\.yml"),
+        *(("rig.toml", matrix(change), f"camera 0.*{said}") for change, said in SKEWED),
+        *(("rig.yml", matrix(change), f"M1.*{said}") for change, said in SKEWED),
     ],
 )
-def test_models_that_are_not_browns_are_refused_by_name(text, words, tmp_path):
-    file = tmp_path / "x.cameramodel"
-    file.write_text(text)
-    with pytest.raises(RigFileError, match=words):
-        mrcal.read_mrcal([file, file])
+def test_what_is_no_rig_of_browns_cameras_is_refused_by_name(rig, tmp_path, name, change, said):
+    write_rig(tmp_path / "own.h5", rig)
+    written, _ = disctrack.convert(tmp_path / "own.h5", tmp_path / name)
+    text = written[0].read_text()
+    assert change(text, rig) != text
+    written[0].write_text(change(text, rig))
+    with pytest.raises(RigFileError, match=said):
+        formats.read_foreign(list(written))
 
 
-def test_a_fisheye_and_a_third_camera_are_refused_by_name(rig, tmp_path):
-    path = tmp_path / "camera_array.toml"
-    caliscope.write_caliscope(path, rig)
-    text = path.read_text()
-    path.write_text(text.replace("fisheye = false", "fisheye = true", 1))
-    with pytest.raises(RigFileError, match="camera 0: a fisheye"):
-        caliscope.read_caliscope([path])
-    path.write_text(text + text.replace("[cameras.0]", "[cameras.5]").partition("[cameras.1]")[0])
-    with pytest.raises(RigFileError, match="0, 1, 5; name two"):
-        caliscope.read_caliscope([path])
-    assert caliscope.read_caliscope([path], cameras=("0", "1")).baseline == pytest.approx(rig.baseline)
-
-
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        (lambda K: K.T, "camera matrix is .*MATLAB"),
-        (lambda K: K + np.eye(3, k=1) * [[1], [0], [0]], "without skew"),
-        (lambda K: 2 * K, "expected fx, 0, cx; 0, fy, cy; 0, 0, 1"),
-        (lambda K: -K, "is not a camera matrix"),
-    ],
-)
-def test_what_is_not_a_camera_matrix_is_refused(rig, tmp_path, change, words):
-    opencv.write_opencv(tmp_path / "rig.yml", rig)
+def test_what_a_file_does_not_tell_may_be_told(rig, tmp_path):
     caliscope.write_caliscope(tmp_path / "rig.toml", rig)
-    K, source = rig.left.camera_matrix, cv2.FileStorage(str(tmp_path / "rig.yml"), cv2.FILE_STORAGE_READ)
-    target = cv2.FileStorage(str(tmp_path / "other.yml"), cv2.FILE_STORAGE_WRITE)
-    target.write("M1", change(K))
-    for name in ("D1", "M2", "D2", "R", "T", "image_size1", "image_size2"):
-        target.write(name, source.getNode(name).mat())
-    target.release()
-    with pytest.raises(RigFileError, match=f"M1.*{words}"):
-        opencv.read_opencv([tmp_path / "other.yml"], unit=1.0)
     text = (tmp_path / "rig.toml").read_text()
-    (tmp_path / "other.toml").write_text(text.replace(f"matrix = {K.tolist()}", f"matrix = {change(K).tolist()}"))
-    with pytest.raises(RigFileError, match=f"camera 0.*{words}"):
-        caliscope.read_caliscope([tmp_path / "other.toml"])
-
-
-def test_opencv_yaml_without_unit_or_with_rational_distortion_is_refused(rig, tmp_path):
+    (tmp_path / "rig.toml").write_text(third_camera(text, rig))
+    assert caliscope.read_caliscope([tmp_path / "rig.toml"], cameras=("0", "1")).baseline == pytest.approx(rig.baseline)
     opencv.write_opencv(tmp_path / "rig.yml", rig)
     text = (tmp_path / "rig.yml").read_text()
-    (tmp_path / "no_unit.yml").write_text(text.replace("unit: m", "unit: foot").replace('unit: "m"', 'unit: "foot"'))
-    with pytest.raises(RigFileError, match="unit"):
-        opencv.read_opencv([tmp_path / "no_unit.yml"])
-    assert opencv.read_opencv([tmp_path / "no_unit.yml"], unit=0.5).baseline == pytest.approx(0.5 * rig.baseline)
-    (tmp_path / "no_R.yml").write_text(text.replace("\nR:", "\nQ:"))
-    with pytest.raises(RigFileError, match="R missing"):
-        opencv.read_opencv([tmp_path / "no_R.yml"])
+    (tmp_path / "rig.yml").write_text(re.sub("unit: .*", 'unit: "foot"', text))
+    assert opencv.read_opencv([tmp_path / "rig.yml"], unit=0.5).baseline == pytest.approx(0.5 * rig.baseline)
     for cut in range(0, len(text), 37):
         (tmp_path / "cut.yml").write_text(text[:cut])
         with contextlib.suppress(RigFileError):
             opencv.read_opencv([tmp_path / "cut.yml"])
-    (tmp_path / "junk.yml").write_text("%YAML:1.0\n---\nM1: [1, 2")
-    with pytest.raises(RigFileError, match=r"junk\.yml"):
-        opencv.read_opencv([tmp_path / "junk.yml"])
-
-
-@pytest.mark.parametrize(
-    ("key", "value", "words"),
-    [
-        ("distortions", '["a"]', "'distortions' is missing, or not numbers"),
-        ("rotation", '"none"', "'rotation' is missing, or not numbers"),
-        ("rotation", "[]", "has no rotation"),
-        ("rotation", "[[1e300, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]", "is not a rotation"),
-        ("size", "[1e300, 200]", "no image size"),
-    ],
-)
-def test_what_a_camera_table_cannot_hold_is_named(rig, tmp_path, key, value, words):
-    path = tmp_path / "camera_array.toml"
-    caliscope.write_caliscope(path, rig)
-    lines = [f"{key} = {value}" if line.startswith(f"{key} =") else line for line in path.read_text().splitlines()]
-    path.write_text("\n".join(lines))
-    with pytest.raises(RigFileError, match=f"camera 0.*{words}"):
-        caliscope.read_caliscope([path])
 
 
 def test_matlab_struct_has_every_number_with_both_sigmas(trajectory, tmp_path):

@@ -10,7 +10,7 @@ from disctrack.cli import main
 from disctrack.disc import precession_rate
 from disctrack.faults.keys import CameraFault, Faults
 from disctrack.frames import rotation_from_euler
-from disctrack.synthetic import render_disc, rig_of
+from disctrack.synthetic import rig_of
 from disctrack.trajectory import part
 from disctrack.validate.accuracy import accuracy_validation, complaints, imperfect_validation, sum_up, verdict
 from disctrack.validate.errors import compare, joined, noise_consistency
@@ -28,6 +28,7 @@ from disctrack.validate.rendered import (
     static_poses,
 )
 from disctrack.validate.tables import write_into, write_validation
+from tests.rendering import render_disc
 
 GOAL_HEIGHT, GOAL_TILT = 5e-6, np.radians(5e-3)  # [m, rad] of the mean error in an imperfect laboratory
 

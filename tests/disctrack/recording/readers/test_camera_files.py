@@ -1,6 +1,5 @@
 """Recordings of Photron (MRAW) and Phantom (cine) give pixels, times and settings as they were written, or a reason."""
 
-import os
 import re
 import struct
 from pathlib import Path
@@ -18,11 +17,6 @@ from disctrack.recording.readers.cine import linear_from_10_bits
 from disctrack.recording.readers.time_stamps import check_time_stamps
 from tests.oracles.camera_files import TRIGGER, write_cine, write_mraw
 
-KINDS = [
-    *(f"{kind} {bits}" for kind in ("cih", "cihx") for bits in (8, 10, 12, 16)),
-    *("cine 8", "cine 10", "cine 12", "cine 16", "cine 10 packed", "cine 12 packed"),
-]
-
 
 def random_codes(rng, bits: int, n: int = 7, height: int = 24, width: int = 32) -> np.ndarray:
     return rng.integers(0, 1 << bits, (n, height, width), dtype=np.uint8 if bits == 8 else np.uint16)
@@ -36,12 +30,13 @@ def write(folder: Path, codes: np.ndarray, kind: str = "cih 8", camera: str = "l
     return write_mraw(folder / camera, codes, int(bits), kind=form, **options)
 
 
+def read_all(folder: Path) -> np.ndarray:
+    reader = open_frames("left.cine", folder, "left")
+    return np.stack([reader.read(i) for i in range(len(reader))])
+
+
 def bits_of(kind: str) -> int:
     return int(kind.split()[1])
-
-
-def grey_of(codes: np.ndarray, kind: str) -> np.ndarray:
-    return linear_from_10_bits()[codes] if kind == "cine 10 packed" else codes
 
 
 def pair(folder: Path, rng, kind: str, left=None, right=None) -> list[FrameReader]:
@@ -51,41 +46,8 @@ def pair(folder: Path, rng, kind: str, left=None, right=None) -> list[FrameReade
     return [open_frames(f"{name}.{kind.split()[0]}", folder, name) for name in ("left", "right")]
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_every_depth_returns_the_pixels_that_were_written(tmp_path, rng, kind):
-    codes = random_codes(rng, bits_of(kind))
-    file = write(tmp_path, codes, kind)
-    depth = 12 if kind.endswith("packed") else bits_of(kind)
-    for named in (file.name,) if file.suffix == ".cine" else (file.name, "left.mraw", "left.*"):
-        reader = open_frames(named, tmp_path, "left")
-        assert (len(reader), reader.image_size) == (7, (32, 24))
-        assert (reader.bit_depth, reader.header.saturation) == (depth, (1 << depth) - 1)
-        for i in range(7):
-            assert_array_equal(reader.read(i, np.zeros((24, 32), codes.dtype)), grey_of(codes, kind)[i])
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_file_cut_short_loses_only_its_end(tmp_path, rng, kind):
-    codes = random_codes(rng, bits_of(kind))
-    name = write(tmp_path, codes, kind).name
-    file = next(f for f in tmp_path.iterdir() if f.suffix in (".mraw", ".cine"))
-    stored = bits_of(kind) if kind.endswith("packed") or kind.startswith("cih") else 8 * codes.itemsize
-    each = 24 * 32 * stored // 8 + 8 * (file.suffix == ".cine")
-    os.truncate(file, file.stat().st_size - 2 * each - 1)
-    reader = open_frames(name, tmp_path, "left")
-    assert len(reader) == 7
-    assert any("lacks 3 of 7 frames" in note for note in reader.notes)
-    assert_array_equal(reader.read(3), grey_of(codes[3], kind))
-    for index in (4, 6):
-        with pytest.raises(RecordingError, match=rf"{file.name} \(left camera, frame {index}\).*copy it again"):
-            reader.read(index)
-    os.truncate(file, file.stat().st_size - 2 * each)
-    with pytest.raises(RecordingError, match="cut short"):
-        open_frames(name, tmp_path, "left")
-
-
 @settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(kind=st.sampled_from(KINDS), data=st.data())
+@given(kind=st.sampled_from(["cih 8", "cihx 12", "cine 8", "cine 10 packed", "cine 16"]), data=st.data())
 def test_a_header_with_any_bytes_changed_is_read_or_refused(tmp_path, kind, data):
     codes = random_codes(np.random.default_rng(1), bits_of(kind), 3, 8, 8)
     file = write(tmp_path, codes, kind, **({"setup_bytes": 1576} if kind.startswith("cine") else {}))
@@ -111,20 +73,6 @@ def opened_or_refused(header: Path, most: int) -> None:
             assert reader.read(index).nbytes <= most
         except RecordingError:
             continue
-
-
-@pytest.mark.statistical
-@settings(max_examples=80, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(
-    kind=st.sampled_from(["cih 8", "cihx 8"]),
-    name=st.sampled_from(
-        ["Total_Frame", "Image_Width", "Image_Height", "Color_Bit", "EffectiveBit_Depth", "Save_Step", "Record_Rate"]
-    ),
-    value=st.one_of(st.integers().map(str), st.floats().map(str), st.text(max_size=20), st.just("9" * 400)),
-)
-def test_a_header_with_any_value_is_read_or_refused(tmp_path, kind, name, value):
-    images = random_codes(np.random.default_rng(1), 8, 3, 8, 8)
-    opened_or_refused(write(tmp_path, images, kind, **{name: value}), 4 * images.nbytes)
 
 
 @pytest.mark.parametrize(
@@ -181,7 +129,7 @@ LOCKED = (TRIGGER[0] & ~1, TRIGGER[1])
 )
 def test_frames_of_different_instants_are_an_error(tmp_path, rng, kind, left, right, declared, reason):
     with pytest.raises(RecordingError, match=reason):
-        check_headers(*pair(tmp_path, rng, kind, left, right), declared, "recording.toml")
+        check_headers(*pair(tmp_path, rng, kind, left, right), declared, None, "recording.toml")
 
 
 @pytest.mark.parametrize(
@@ -207,7 +155,7 @@ def test_frames_of_different_instants_are_an_error(tmp_path, rng, kind, left, ri
 )
 def test_frames_that_may_not_be_simultaneous_are_a_warning(tmp_path, rng, kind, right, reason):
     readers = pair(tmp_path, rng, kind, {}, right)
-    warnings = check_headers(*readers, 2000.0, "recording.toml") + sum(check_time_stamps(*readers, 2000.0), ())
+    warnings = check_headers(*readers, 2000.0, None, "recording.toml") + sum(check_time_stamps(*readers, 2000.0), ())
     assert any(re.search(reason, warning) for warning in warnings)
 
 
@@ -217,7 +165,7 @@ def test_frames_that_may_not_be_simultaneous_are_a_warning(tmp_path, rng, kind, 
 )
 def test_cameras_that_agree_say_nothing(tmp_path, rng, kind, declared):
     readers = pair(tmp_path, rng, kind)
-    assert check_headers(*readers, declared, "recording.toml") == ()
+    assert check_headers(*readers, declared, None, "recording.toml") == ()
     assert check_time_stamps(*readers, declared) == ((), ())
 
 
@@ -234,26 +182,12 @@ def test_files_of_another_writer_are_read(tmp_path, rng, bits):
 
 
 @pytest.mark.parametrize("kind", ["cih", "cihx"])
-@pytest.mark.parametrize("bits", [8, 12, 16])
-def test_another_reader_of_mraw_sees_the_same_pixels(tmp_path, rng, bits, kind):
-    py_mraw = pytest.importorskip("pyMRAW")
-    images = random_codes(rng, min(bits, 12))
-    header = write_mraw(tmp_path / "left", images, bits, kind=kind, depth=min(bits, 12))
-    if bits == 8:
-        with pytest.warns(UserWarning, match="Not 12bit"):
-            theirs, _ = py_mraw.load_video(str(header))
-    else:
-        theirs, _ = py_mraw.load_video(str(header))
-    reader = open_frames(header.name, tmp_path, "left")
-    assert_array_equal([reader.read(i) for i in range(7)], theirs)
-
-
-@pytest.mark.parametrize("kind", ["cih", "cihx"])
 def test_settings_come_from_the_header(tmp_path, rng, kind):
     header = write_mraw(
         tmp_path / "left", random_codes(rng, 12), 16, depth=12, kind=kind, Start_Frame="-40", Save_Step="4"
     )
     found = open_frames(header.name, tmp_path, "left").header
+    assert found == open_frames("left.mraw", tmp_path, "left").header == open_frames("left.*", tmp_path, "left").header
     assert (found.frame_rate, found.step) == (500.0, 4)  # of 2000 frames per second, one in four
     assert found.exposure == pytest.approx(1e-4, rel=1e-12)
     assert (found.trigger, found.first_frame, found.saturation) == ("Start", -40, 4095)
@@ -320,32 +254,25 @@ def test_rows_padded_as_in_a_bitmap_are_read(tmp_path, rng):
     content = bytearray(file.read_bytes())
     struct.pack_into("<i", content, 44 + 4, 30)  # the bitmap's width
     file.write_bytes(content)
-    reader = open_frames("left.cine", tmp_path, "left")
-    assert_array_equal([reader.read(i) for i in range(7)], codes)
+    assert_array_equal(read_all(tmp_path), codes)
 
 
 def test_notes_in_front_of_the_images_may_differ_in_length(tmp_path, rng):
     codes = random_codes(rng, 12)
     write_cine(tmp_path / "left.cine", codes, 12, notes=(8, 24, 4096))
-    reader = open_frames("left.cine", tmp_path, "left")
-    assert_array_equal([reader.read(i) for i in range(7)], codes)
+    assert_array_equal(read_all(tmp_path), codes)
 
 
-@pytest.mark.parametrize(("bits", "packed"), [(12, False), (16, False), (10, True)])
-def test_another_reader_of_cine_sees_the_same_pixels(tmp_path, rng, bits, packed):
-    """Pycine stretches grey values from black and white level to the full range: of packed ones from 64 and 4064."""
+def test_another_reader_of_packed_cines_sees_the_same_pixels(tmp_path, rng):
+    """Pycine stretches grey values from black and white level, 64 and 4064, to the full range, and clips beyond."""
     raw = pytest.importorskip("pycine.raw")
-    codes = random_codes(rng, bits)
-    if packed:
-        codes = np.clip(codes, 64, 1014)  # below and above it clips
-    file = write_cine(tmp_path / "left.cine", codes, bits, packed_pixels=packed)
+    codes = np.clip(random_codes(rng, 10), 64, 1014)
+    file = write_cine(tmp_path / "left.cine", codes, 10, packed_pixels=True)
     theirs = np.stack(list(raw.read_frames(str(file), start_frame=1)[0])).astype(int)
-    reader = open_frames("left.cine", tmp_path, "left")
-    ours = np.stack([reader.read(i) for i in range(7)]).astype(int)
-    if not packed:
-        assert_array_equal(ours, theirs)
-    else:  # within a unit of its table, and another of its rounding down
-        assert_allclose((ours - 64) * 4095 / 4000, theirs, atol=2.1)
+    ours = read_all(tmp_path)
+    assert_array_equal(ours, linear_from_10_bits()[codes])
+    # within a unit of its table, and another of its rounding down
+    assert_allclose((ours.astype(int) - 64) * 4095 / 4000, theirs, atol=2.1)
 
 
 @pytest.mark.parametrize("bits", [8, 16])
@@ -356,8 +283,7 @@ def test_ffmpeg_sees_the_same_pixels_and_rate(tmp_path, rng, bits):
     with av.open(str(file)) as container:
         frames = [frame.to_ndarray() for frame in container.decode(video=0)]
         assert container.streams.video[0].time_base.denominator == 2000
-    reader = open_frames("left.cine", tmp_path, "left")
-    assert_array_equal([reader.read(i) for i in range(7)], frames)
+    assert_array_equal(read_all(tmp_path), frames)
 
 
 def test_codes_of_10_bits_are_linear_in_the_light():
@@ -369,11 +295,6 @@ def test_codes_of_10_bits_are_linear_in_the_light():
     code = 63.5 + 950.4 * np.where(light < 0.01805, 4.5 * light, 1.0993 * np.maximum(light, 1e-9) ** 0.45 - 0.0993)
     # half a unit of 4000 by rounding, where the curve is steepest (4.5 x 950 / 4000 codes a unit): 0.53
     assert_allclose(code, np.arange(64, 1014), atol=0.6)
-
-
-def test_codes_of_10_bits_agree_with_the_published_table():
-    table = pytest.importorskip("pycine.linLUT").linLUT
-    assert np.abs(linear_from_10_bits().astype(int) - table).max() <= 1
 
 
 def test_settings_and_times_come_from_the_file(tmp_path, rng):
@@ -399,15 +320,16 @@ def test_an_older_setup_lacks_its_later_fields(tmp_path, rng):
     assert reader.header.exposure == pytest.approx(50e-6)  # in microseconds there
 
 
-@pytest.mark.parametrize(
-    ("times", "reason"),
-    [(np.zeros(7), "do not belong"), (np.arange(7) / 1300, "do not belong"), (-np.arange(7) / 2000, "do not belong")],
-)
-def test_impossible_time_stamps_are_not_used_and_said(tmp_path, rng, times, reason):
+@pytest.mark.parametrize("times", [[0, 1, 2, 3, 9, 10, 11], np.zeros(7), np.arange(7) / 0.65, -np.arange(7)])
+def test_time_stamps_keep_gaps_and_are_not_used_where_they_are_impossible(tmp_path, rng, times):
+    times = np.array(times) / 2000
     write_cine(tmp_path / "left.cine", random_codes(rng, 8), 8, times=times)
     reader = open_frames("left.cine", tmp_path, "left")
-    assert reader.timestamps is None
-    assert any(reason in note for note in reader.notes)
+    if times[-1] == 11 / 2000:
+        assert_allclose(reader.timestamps, times, atol=2**-29)
+    else:
+        assert reader.timestamps is None
+        assert any("do not belong" in note for note in reader.notes)
 
 
 def test_a_recording_of_which_every_tenth_frame_was_saved_has_a_tenth_of_the_rate(tmp_path, rng):
@@ -418,12 +340,6 @@ def test_a_recording_of_which_every_tenth_frame_was_saved_has_a_tenth_of_the_rat
     header = open_frames("left.cine", tmp_path, "left").header
     assert (header.frame_rate, header.step) == (9000, 10)
     assert "9000 Hz (90000 Hz, one frame in 10 saved)" in header.sentence()
-
-
-def test_a_gap_in_the_time_stamps_is_kept(tmp_path, rng):
-    times = np.array([0, 1, 2, 3, 9, 10, 11]) / 2000
-    write_cine(tmp_path / "left.cine", random_codes(rng, 8), 8, times=times)
-    assert_allclose(open_frames("left.cine", tmp_path, "left").timestamps, times, atol=2**-29)
 
 
 def test_a_grey_head_of_a_colour_camera_is_grey(tmp_path, rng):

@@ -11,11 +11,12 @@ from disctrack.commands.sample import SCENE
 from disctrack.disc import Disc
 from disctrack.findings import Kind
 from disctrack.recording.readers.blocks import PairBlock
-from disctrack.synthetic import render_disc, rig_of
+from disctrack.synthetic import rig_of
 from disctrack.synthetic.description import Scene, load_scene
 from disctrack.synthetic.motion import motion_of
 from disctrack.track.follow.tracking import Tracking, track
 from disctrack.track.video_overlay import draw_pair
+from tests.rendering import render_disc
 
 N = 24
 

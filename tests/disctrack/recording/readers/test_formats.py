@@ -1,11 +1,7 @@
 """Every format gives back the grey values that an independent library wrote, in any order, and names what is lost."""
 
 import struct
-from collections.abc import Callable
-from dataclasses import dataclass
-from pathlib import Path
 
-import cv2
 import h5py
 import numpy as np
 import pytest
@@ -15,116 +11,31 @@ from disctrack.errors import RecordingError
 from disctrack.recording.readers import open_frames
 from disctrack.recording.readers.base import FrameReader
 from disctrack.recording.readers.blocks import iter_pair_blocks
-
-N, HEIGHT, WIDTH = 30, 18, 22
-
-
-def frames_of(bits: int, seed: int = 0, n: int = N) -> np.ndarray:
-    frames = np.random.default_rng(seed).integers(0, 2**bits, (n, HEIGHT, WIDTH))
-    return frames.astype(np.uint8 if bits == 8 else np.uint16)
-
-
-def write_tiff(path: Path, frames: np.ndarray, **options) -> None:
-    tifffile = pytest.importorskip("tifffile")
-    tifffile.imwrite(path, frames, **{"photometric": "minisblack", **options})
-
-
-def write_pages_by_opencv(path: Path, frames: np.ndarray, compression: int) -> None:
-    assert cv2.imwritemulti(str(path), list(frames), [cv2.IMWRITE_TIFF_COMPRESSION, compression])
-
-
-def write_hdf5(path: Path, frames: np.ndarray, attributes: dict | None = None, **options) -> None:
-    with h5py.File(path, "w") as file:
-        stack = file.create_dataset("camera/frames", data=frames, **options)
-        stack.attrs.update(attributes or {})
-
-
-def write_video(path: Path, frames: np.ndarray, pixels: str, codec: str, **options) -> None:
-    pytest.importorskip("av")
-    write_pictures(path, [_picture(frame, pixels) for frame in frames], codec, **options)
-
-
-def write_pictures(path: Path, pictures: list, codec: str, **options) -> None:
-    av = pytest.importorskip("av")
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream(codec, rate=25, options=options)
-        stream.width, stream.height, stream.pix_fmt = pictures[0].width, pictures[0].height, pictures[0].format.name
-        for picture in pictures:
-            container.mux(stream.encode(picture))
-        container.mux(stream.encode())
-
-
-def _picture(frame: np.ndarray, pixels: str):
-    """A picture whose luma is `frame`, byte for byte; no conversion by the library."""
-    import av
-
-    picture = av.VideoFrame(frame.shape[1], frame.shape[0], pixels)
-    neutral = 128 if frame.dtype == np.uint8 else 512
-    for number, plane in enumerate(picture.planes):
-        rows = np.full((plane.height, plane.line_size // frame.itemsize), neutral, frame.dtype)
-        if number == 0:
-            rows[:, : frame.shape[1]] = frame
-        plane.update(rows.tobytes())
-    return picture
-
-
-@dataclass(frozen=True)
-class Format:
-    suffix: str
-    bits: int
-    write: Callable[..., None]
-    options: dict
-
-    def __str__(self) -> str:
-        return f"{self.suffix}-{self.bits}-" + "-".join(str(v) for v in self.options.values())
-
-
-TIFFS = [
-    *(
-        Format("tif", bits, write_tiff, options)
-        for bits in (8, 16)
-        for options in (
-            {},
-            {"bigtiff": True, "byteorder": ">"},
-            {"imagej": True},
-            {"rowsperstrip": 5},
-            {"compression": "zlib", "predictor": True},
-            {"tile": (16, 16), "compression": "zlib"},
-        )
-    ),
-    *(Format("tiff", bits, write_pages_by_opencv, {"compression": c}) for bits in (8, 16) for c in (1, 5, 8, 32773)),
-]
-STACKS = [
-    Format("h5", 8, write_hdf5, {}),
-    Format("h5", 16, write_hdf5, {"chunks": (1, HEIGHT, WIDTH), "compression": "gzip", "shuffle": True}),
-    Format("h5", 8, write_hdf5, {"chunks": (1, HEIGHT, WIDTH), "compression": "gzip"}),
-    Format("h5", 16, write_hdf5, {"chunks": (1, HEIGHT, WIDTH), "compression": "gzip", "fletcher32": True}),
-    Format("h5", 8, write_hdf5, {"chunks": (7, 10, WIDTH), "compression": "lzf", "fletcher32": True}),
-]
-VIDEOS = [
-    Format(suffix, bits, write_video, {"pixels": pixels, "codec": codec, **options})
-    for suffix, bits, pixels, codec, options in (
-        ("mkv", 8, "gray", "ffv1", {}),
-        ("mkv", 10, "gray10le", "ffv1", {}),
-        ("mkv", 12, "gray12le", "ffv1", {}),
-        ("avi", 16, "gray16le", "ffv1", {"g": "1"}),
-        ("mp4", 8, "gray", "ffv1", {}),
-        ("avi", 8, "gray", "rawvideo", {}),
-        ("mkv", 8, "gray", "rawvideo", {}),
-        ("mkv", 8, "yuv420p", "ffv1", {}),
-        ("mkv", 10, "yuv420p10le", "ffv1", {}),
-        ("avi", 8, "yuv420p", "rawvideo", {}),
-        ("mp4", 8, "yuv420p", "libx264", {"qp": "0", "g": "10", "bf": "2"}),
-    )
-]
-FORMATS = [*TIFFS, *STACKS, *VIDEOS]
+from tests.disctrack.recording.readers.written import (
+    CAMERAS,
+    EACH,
+    FORMATS,
+    HEIGHT,
+    IMAGES,
+    STACKS,
+    TIFFS,
+    VIDEOS,
+    WIDTH,
+    N,
+    frames_of,
+    picture_of,
+    write_hdf5,
+    write_pictures,
+    write_tiff,
+    write_video,
+)
 
 
 @pytest.mark.parametrize("kind", FORMATS, ids=str)
 def test_frames_come_back_as_they_were_written_in_any_order(tmp_path, kind):
-    frames = frames_of(kind.bits)
-    kind.write(tmp_path / f"left.{kind.suffix}", frames, **kind.options)
-    reader = open_frames(f"left.{kind.suffix}", tmp_path, "left")
+    frames, folder = frames_of(kind.bits), tmp_path / "run [1]"  # no pattern
+    folder.mkdir()
+    reader = open_frames(kind.written(folder, frames), folder, "left")
     assert isinstance(reader, FrameReader)
     assert (len(reader), reader.image_size, reader.bit_depth) == (N, (WIDTH, HEIGHT), kind.bits)
     for index in (*range(N), 17, 3, N - 1, 0, 20, 21, 5):
@@ -132,23 +43,27 @@ def test_frames_come_back_as_they_were_written_in_any_order(tmp_path, kind):
     out = np.zeros_like(frames[0])
     assert reader.read(4, out) is out
     assert_array_equal(out, frames[4])
-    if kind.options.get("pixels", "").startswith("yuv"):
-        assert any("not stretched" in note for note in reader.notes)
+    told = " ".join(reader.notes)
+    assert ("not stretched" in told) == kind.options.get("pixels", "").startswith("yuv")
+    assert ("16 bits" in told) == (kind in IMAGES and kind.bits == 16)
 
 
-@pytest.mark.parametrize("kind", [TIFFS[0], STACKS[3], *VIDEOS], ids=str)
+@pytest.mark.parametrize("kind", [IMAGES[0], TIFFS[0], STACKS[3], CAMERAS[0], *VIDEOS], ids=str)
 def test_blocks_of_both_cameras_hold_every_pair(tmp_path, kind):
     both = [frames_of(kind.bits, seed) for seed in (1, 2)]
-    for name, frames in zip(("left", "right"), both, strict=True):
-        kind.write(tmp_path / f"{name}.{kind.suffix}", frames, **kind.options)
-    readers = [open_frames(f"{name}.{kind.suffix}", tmp_path, name) for name in ("left", "right")]
+    readers = [
+        open_frames(kind.written(tmp_path, frames, name), tmp_path, name)
+        for name, frames in zip(("left", "right"), both, strict=True)
+    ]
     for block in iter_pair_blocks(*readers, block=4, threads=2):
         assert block.unreadable == ()
         for camera, frames in enumerate(both):
             assert_array_equal(block.images[:, camera], frames[block.frames])
 
 
-@pytest.mark.parametrize("kind", [TIFFS[0], TIFFS[4], *STACKS, *(k for k in VIDEOS if k.suffix == "mkv")], ids=str)
+@pytest.mark.parametrize(
+    "kind", [IMAGES[0], TIFFS[0], TIFFS[4], *STACKS, CAMERAS[0], *(k for k in VIDEOS if k.suffix == "mkv")], ids=str
+)
 def test_the_content_hash_tells_a_changed_frame_and_nothing_else(tmp_path, kind):
     frames = frames_of(kind.bits)
     changed = frames.copy()
@@ -156,8 +71,7 @@ def test_the_content_hash_tells_a_changed_frame_and_nothing_else(tmp_path, kind)
     found = []
     for name, content in (("a", frames), ("b", frames), ("c", changed)):
         (tmp_path / name).mkdir()
-        kind.write(tmp_path / name / f"left.{kind.suffix}", content, **kind.options)
-        reader = open_frames(f"left.{kind.suffix}", tmp_path / name, "left")
+        reader = open_frames(kind.written(tmp_path / name, content), tmp_path / name, "left")
         if name == "b":  # computed while reading, or apart
             for index in range(N):
                 reader.read(index)
@@ -166,6 +80,37 @@ def test_the_content_hash_tells_a_changed_frame_and_nothing_else(tmp_path, kind)
         assert found[0] == found[1]
         assert found[0][1] == found[2][1]
     assert found[0][0] != found[2][0]
+
+
+@pytest.mark.parametrize("kind", FORMATS, ids=str)
+def test_a_file_cut_short_loses_its_end_and_says_so(tmp_path, kind):
+    frames = frames_of(kind.bits)
+    pattern = kind.written(tmp_path, frames)
+    path = tmp_path / f"left.{kind.suffix}".replace("cihx", "mraw").replace("cih", "mraw")
+    path = tmp_path / "left" / f"shot_{N - 1}.{kind.suffix}" if kind in IMAGES else path
+    content = path.read_bytes()
+    path.write_bytes(content[: -int(0.3 * frames.nbytes)] if kind in CAMERAS else content[: int(0.6 * len(content))])
+    try:
+        reader = open_frames(pattern, tmp_path, "left")
+    except RecordingError:
+        assert kind.suffix in ("h5", "mp4") or "compress" in kind.options  # the table of all frames stands at the end
+        return
+    lost = {}
+    for index in range(len(reader)):
+        try:
+            assert_array_equal(reader.read(index), frames[index])
+        except RecordingError as error:
+            lost[index] = str(error)
+    assert all(path.name in text and f"left camera, frame {index}" in text for index, text in lost.items())
+    assert list(lost) == list(range(len(reader) - len(lost), len(reader)))  # the end, and nothing else
+    assert len(reader) - len(lost) < N
+    assert len(reader) < N or lost
+    if kind in CAMERAS or (kind.suffix == "tif" and kind not in IMAGES and not lost):
+        assert any("pages are whole" in note or f"lacks {len(lost)} of {N} frames" in note for note in reader.notes)
+    if kind in CAMERAS:
+        path.write_bytes(content[: -int(0.6 * frames.nbytes)])
+        with pytest.raises(RecordingError, match="cut short"):
+            open_frames(pattern, tmp_path, "left")
 
 
 def test_several_tiff_files_of_one_camera_continue_one_another(tmp_path):
@@ -241,7 +186,7 @@ def test_hdf5_frames_that_were_never_written_are_not_taken_for_black(tmp_path):
         open_frames("stack.h5:/empty", tmp_path, "left")
 
 
-@pytest.mark.parametrize("options", [{}, {"chunks": (1, HEIGHT, WIDTH), "compression": "gzip", "shuffle": True}])
+@pytest.mark.parametrize("options", [{}, {**EACH, "shuffle": True}])
 @pytest.mark.parametrize("dtype", ["<u2", ">u2"])
 def test_hdf5_of_any_byte_order_behind_a_user_block(tmp_path, options, dtype):
     frames = frames_of(16)
@@ -352,7 +297,7 @@ def test_luma_between_chroma_is_taken_alone(tmp_path, pixels, first):
 
 def test_frames_that_a_recorder_dropped_are_named(tmp_path):
     pytest.importorskip("av")
-    pictures = [_picture(frame, "gray") for frame in frames_of(8)]
+    pictures = [picture_of(frame, "gray") for frame in frames_of(8)]
     for time, picture in zip([*range(12), *range(14, 32)], pictures, strict=True):
         picture.pts = time
     write_pictures(tmp_path / "left.mkv", pictures, "ffv1")
@@ -377,28 +322,3 @@ def test_a_damaged_packet_costs_its_frames_up_to_the_next_key_frame_and_no_other
                 reader.read(index)
         else:
             assert_array_equal(reader.read(index), frames[index])
-
-
-@pytest.mark.parametrize("kind", FORMATS, ids=str)
-def test_a_file_cut_short_loses_its_end_and_says_so(tmp_path, kind):
-    frames = frames_of(kind.bits)
-    path = tmp_path / f"left.{kind.suffix}"
-    kind.write(path, frames, **kind.options)
-    content = path.read_bytes()
-    path.write_bytes(content[: int(0.6 * len(content))])
-    try:
-        reader = open_frames(path.name, tmp_path, "left")
-    except RecordingError:
-        assert kind.suffix in ("h5", "mp4") or "compress" in kind.options  # the table of all frames stands at the end
-        return
-    lost = []
-    for index in range(len(reader)):
-        try:
-            assert_array_equal(reader.read(index), frames[index])
-        except RecordingError:
-            lost.append(index)
-    assert lost == list(range(len(reader) - len(lost), len(reader)))  # the end, and nothing else
-    assert len(reader) - len(lost) < N
-    assert len(reader) < N or lost
-    if kind.suffix == "tif":
-        assert lost or any("pages are whole" in note for note in reader.notes)

@@ -5,8 +5,6 @@ import os
 import struct
 import tracemalloc
 import zlib
-from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 
 import cv2
@@ -18,38 +16,41 @@ from disctrack.errors import DiscTrackError, RecordingError
 from disctrack.recording.readers import open_frames
 from disctrack.recording.readers.blocks import iter_pair_blocks
 from disctrack.recording.readers.decoding import decode
-from tests.disctrack.recording.readers.test_formats import write_hdf5, write_tiff, write_video
+from tests.disctrack.recording.readers.written import (
+    EACH,
+    IMAGES,
+    Format,
+    frames_of,
+    write_hdf5,
+    write_tiff,
+    write_video,
+)
 
-N, HEIGHT, WIDTH = 6, 18, 22
-FRAMES = np.random.default_rng(8).integers(0, 256, (N, HEIGHT, WIDTH), dtype=np.uint8)
+N = 6
+FRAMES = frames_of(8, 8, N)
 MOST_MEMORY = 300 << 20  # bytes; the frames themselves are 2 kB
+PICTURES = [kind for kind in IMAGES if kind.bits == 8]
+SINGLE = [
+    *(
+        Format("tif", 8, write_tiff, options)
+        for options in (
+            {},
+            {"imagej": True},
+            {"compression": "zlib"},
+            {"compression": "zlib", "tile": (16, 16)},
+            {"bigtiff": True},
+        )
+    ),
+    Format("h5", 8, write_hdf5, {"attributes": {"frame_rate": 1000.0}}),
+    Format("h5", 8, write_hdf5, {**EACH, "chunks": (2, *FRAMES.shape[1:])}),
+    *(Format(suffix, 8, write_video, {"pixels": "gray", "codec": "ffv1"}) for suffix in ("mkv", "mp4")),
+    Format("avi", 8, write_video, {"pixels": "gray", "codec": "rawvideo"}),
+]
+each_kind = pytest.mark.parametrize("kind", [*PICTURES, *SINGLE], ids=str)
 
 
-def write_images(folder: Path, suffix: str) -> str:
-    for i, frame in enumerate(FRAMES):
-        cv2.imwrite(str(folder / f"{i:03d}.{suffix}"), frame)
-    return f"*.{suffix}"
-
-
-def write_one(folder: Path, suffix: str, write: Callable, **options) -> str:
-    name = f"{'video' if write is write_video else 'stack'}.{suffix}"
-    write(folder / name, FRAMES, **options)
-    return name
-
-
-WRITERS = {
-    **{suffix: partial(write_images, suffix=suffix) for suffix in ("png", "bmp", "tif")},
-    "tiff plain": partial(write_one, suffix="tif", write=write_tiff),
-    "tiff imagej": partial(write_one, suffix="tif", write=write_tiff, imagej=True),
-    "tiff deflate": partial(write_one, suffix="tif", write=write_tiff, compression="zlib"),
-    "tiff tiles": partial(write_one, suffix="tif", write=write_tiff, compression="zlib", tile=(16, 16)),
-    "bigtiff": partial(write_one, suffix="tif", write=write_tiff, bigtiff=True),
-    "hdf5": partial(write_one, suffix="h5", write=write_hdf5, attributes={"frame_rate": 1000.0}),
-    "hdf5 gzip": partial(write_one, suffix="h5", write=write_hdf5, chunks=(2, HEIGHT, WIDTH), compression="gzip"),
-    "mkv": partial(write_one, suffix="mkv", write=write_video, pixels="gray", codec="ffv1"),
-    "avi": partial(write_one, suffix="avi", write=write_video, pixels="gray", codec="rawvideo"),
-    "mp4": partial(write_one, suffix="mp4", write=write_video, pixels="gray", codec="ffv1"),
-}
+def files_in(folder: Path) -> list[Path]:
+    return sorted(file for file in folder.rglob("*") if file.is_file())
 
 
 def read_all(pattern: str, folder: Path) -> int:
@@ -79,10 +80,10 @@ def damaged(content: bytes, rng: np.random.Generator) -> bytes:
     return bytes(data[: rng.integers(1, len(data))] if rng.random() < 0.1 else data)
 
 
-@pytest.mark.parametrize("name", WRITERS)
-def test_damaged_bytes_never_raise_anything_else_nor_take_the_memory(tmp_path, name, capfd):
-    pattern = WRITERS[name](tmp_path)
-    file = sorted(tmp_path.iterdir())[0]
+@each_kind
+def test_damaged_bytes_never_raise_anything_else_nor_take_the_memory(tmp_path, kind, capfd):
+    pattern = kind.written(tmp_path, FRAMES)
+    file = files_in(tmp_path)[0]
     content, rng = file.read_bytes(), np.random.default_rng(17)
     assert read_all(pattern, tmp_path) == N
     read = 0
@@ -151,7 +152,7 @@ def _claiming(suffix: str, width: int, height: int) -> bytes:
 
 @pytest.mark.parametrize("suffix", ["png", "bmp", "tiff", "jpg"])
 def test_an_image_cannot_claim_more_than_its_bytes_can_hold(suffix):
-    assert decode(_claiming(suffix, WIDTH, HEIGHT), "file").shape == (HEIGHT, WIDTH)
+    assert decode(_claiming(suffix, *FRAMES[0].T.shape), "file").shape == FRAMES[0].shape
     with pytest.raises(RecordingError, match="claims 30000 x 4000"):
         decode(_claiming(suffix, 30000, 4000), "file")
 
@@ -165,66 +166,57 @@ def test_hdf5_chunks_that_no_memory_holds_are_refused(tmp_path):
 
 def test_a_playlist_under_a_videos_name_opens_no_other_file(tmp_path):
     pytest.importorskip("av")
-    WRITERS["mkv"](tmp_path)
-    (tmp_path / "list.mkv").write_text("#EXTM3U\n#EXTINF:1,\nvideo.mkv\n#EXT-X-ENDLIST\n")
+    SINGLE[-3].written(tmp_path, FRAMES)
+    (tmp_path / "list.mkv").write_text("#EXTM3U\n#EXTINF:1,\nleft.mkv\n#EXT-X-ENDLIST\n")
     with pytest.raises(RecordingError, match="not a readable video"):
         open_frames("list.mkv", tmp_path, "left")
 
 
-@pytest.mark.parametrize("name", WRITERS)
-def test_a_file_that_is_cut_while_it_is_read_costs_frames_and_names_them(tmp_path, name):
-    pattern = WRITERS[name](tmp_path)
-    reader = open_frames(pattern, tmp_path, "left")
+@each_kind
+def test_a_file_that_is_cut_or_deleted_while_it_is_read_costs_frames_and_names_them(tmp_path, kind):
+    reader = open_frames(kind.written(tmp_path, FRAMES), tmp_path, "left")
     assert np.array_equal(reader.read(0), FRAMES[0])
-    files = sorted(tmp_path.iterdir())
-    os.truncate(files[-1], files[-1].stat().st_size // 2 if len(files) > 1 else 200)
-    reader.read(0) if len(files) > 1 else None
-    failed = []
+    files = files_in(tmp_path)
+    if kind in PICTURES:
+        files[4].unlink()
+    os.truncate(files[-1], files[-1].stat().st_size // 2 if kind in PICTURES else 200)
+    failed = {}
     for index in range(1, N):
         try:
             assert np.array_equal(reader.read(index), FRAMES[index])
         except RecordingError as error:
-            failed.append((index, str(error)))
-    if not name.startswith(
-        ("mkv", "mp4", "avi", "hdf5 gzip")
-    ):  # a short file may lie in the library's buffer as a whole
-        assert failed
-    assert all(f"frame {index}" in text and str(tmp_path) in text for index, text in failed)
+            failed[index] = str(error)
+    if kind in PICTURES:
+        assert list(failed) == [4, 5]
+        assert "shot_4" in failed[4]
+        assert "cannot be read: No such file" in failed[4]
+    elif (kind.suffix not in ("mkv", "mp4", "avi") and "compression" not in kind.options) or kind.suffix == "tif":
+        assert failed  # a short file may lie in the library's buffer as a whole
+    assert all(f"frame {index}" in text and str(tmp_path) in text for index, text in failed.items())
 
 
-@pytest.mark.parametrize("name", ["png", "bmp", "tif"])
-def test_files_deleted_while_they_are_read_are_named(tmp_path, name):
-    pattern = WRITERS[name](tmp_path)
-    reader = open_frames(pattern, tmp_path, "left")
-    sorted(tmp_path.iterdir())[4].unlink()
-    with pytest.raises(RecordingError, match=r"004\..* \(left camera, frame 4\): cannot be read: No such file"):
-        reader.read(4)
-
-
-@pytest.mark.parametrize("name", [n for n in WRITERS if n not in ("png", "bmp", "tif")])
-def test_a_single_file_that_is_deleted_while_it_is_read_loses_nothing(tmp_path, name):
+@pytest.mark.parametrize("kind", SINGLE, ids=str)
+def test_a_single_file_that_is_deleted_while_it_is_read_loses_nothing(tmp_path, kind):
     """It stays open, and its content exists until it is closed."""
-    pattern = WRITERS[name](tmp_path)
-    reader = open_frames(pattern, tmp_path, "left")
+    reader = open_frames(kind.written(tmp_path, FRAMES), tmp_path, "left")
     next(tmp_path.iterdir()).unlink()
     for index in (1, 3, 5):
         assert np.array_equal(reader.read(index), FRAMES[index])
-    if name in ("mkv", "avi", "mp4"):  # going back opens a video anew
-        with pytest.raises(RecordingError, match=rf"video\.{name} \(left camera, frame 0\).*No such file"):
+    if kind.write is write_video:  # going back opens a video anew
+        with pytest.raises(RecordingError, match=rf"left\.{kind.suffix} \(left camera, frame 0\).*No such file"):
             reader.read(0)
     assert len(reader.content_sha256(0, N)) == 64  # what was measured can still be stored
 
 
-@pytest.mark.parametrize("name", ["tiff plain", "tiff deflate", "hdf5"])
-def test_a_network_that_goes_away_is_an_error_of_the_frame(tmp_path, name, monkeypatch):
-    pattern = WRITERS[name](tmp_path)
-    reader = open_frames(pattern, tmp_path, "left")
+@pytest.mark.parametrize("kind", [SINGLE[0], SINGLE[2], SINGLE[5]], ids=str)
+def test_a_network_that_goes_away_is_an_error_of_the_frame(tmp_path, kind, monkeypatch):
+    reader = open_frames(kind.written(tmp_path, FRAMES), tmp_path, "left")
 
     def gone(*_: object) -> int:
         raise OSError(116, "Stale file handle")
 
     monkeypatch.setattr(os, "preadv", gone)
-    with pytest.raises(RecordingError, match=r"stack\..*left camera, frame 3.*Stale file handle"):
+    with pytest.raises(RecordingError, match=r"left\..*left camera, frame 3.*Stale file handle"):
         reader.read(3)
     blocks = list(iter_pair_blocks(reader, reader, block=4, threads=2))
     assert [len(block.unreadable) for block in blocks] == [8, 4]

@@ -54,20 +54,6 @@ def collect(readers, **how):
     )
 
 
-@pytest.mark.parametrize(
-    ("suffix", "bits"), [("png", 8), ("png", 16), ("tif", 8), ("tif", 16), ("tiff", 8), ("bmp", 8)]
-)
-def test_lossless_files_return_the_pixels_that_were_written_in_the_order_of_their_numbers(tmp_path, rng, suffix, bits):
-    images = rng.integers(0, 2**bits, (11, 24, 32)).astype(f"u{bits // 8}")
-    folder = tmp_path / "run [1]"  # no pattern
-    write_sequence(folder / "left", images, suffix, names=[f"shot_{i}" for i in range(11)])
-    reader = open_frames(f"left/shot_*.{suffix}", folder, "left")
-    assert isinstance(reader, FrameReader)
-    assert (len(reader), reader.image_size, reader.bit_depth) == (11, (32, 24), bits)
-    assert_array_equal([reader.read(i) for i in range(11)], images)
-    assert any("16 bits" in note for note in reader.notes) == (bits == 16)
-
-
 @pytest.mark.parametrize("channels", [3, 4])
 def test_grey_stored_as_colour_is_read_without_loss_and_said(tmp_path, frames, channels):
     code = {3: cv2.COLOR_GRAY2BGR, 4: cv2.COLOR_GRAY2BGRA}[channels]
@@ -232,14 +218,11 @@ def test_a_damaged_image_is_named_and_the_others_are_delivered(pair, frames, cap
     assert "libpng" not in capfd.readouterr().err
 
 
-@pytest.mark.parametrize("suffix", ["jpg", "bmp", "tiff"])
-def test_a_truncated_file_of_another_format_is_not_half_an_image(tmp_path, frames, suffix):
-    smooth = [cv2.GaussianBlur(image, (0, 0), 2) for image in frames[:, 0]]
-    files = write_sequence(tmp_path / "left", smooth, suffix)
+def test_a_truncated_jpeg_is_not_half_an_image(tmp_path, frames):
+    files = write_sequence(tmp_path / "left", [cv2.GaussianBlur(image, (0, 0), 2) for image in frames[:, 0]], "jpg")
     files[3].write_bytes(_truncate(files[3].read_bytes()))
-    reader = open_frames("left/*", tmp_path, "left")
-    with pytest.raises(RecordingError, match="frame 3"):
-        reader.read(3)
+    with pytest.raises(RecordingError, match=r"frame 3.*truncated"):
+        open_frames("left/*", tmp_path, "left").read(3)
 
 
 def test_a_frame_of_another_size_or_depth_is_refused(tmp_path, frames):
@@ -267,19 +250,6 @@ def test_cameras_of_different_length_or_size_are_refused(pair, frames):
     write_sequence(pair / "right", frames[:, 1, :20])
     with pytest.raises(RecordingError, match=r"32 x 24 px.*32 x 20 px"):
         next(iter_pair_blocks(*open_pair(pair)))
-
-
-def test_the_content_hash_tells_a_changed_frame_and_only_that(pair):
-    left, _ = open_pair(pair)
-    before = left.content_sha256(0, 11)
-    for i in range(11):
-        left.read(i)
-    assert left.content_sha256(0, 11) == before  # computed while reading, or apart
-    file = pair / "left" / "000003.png"
-    cv2.imwrite(str(file), cv2.imread(str(file), cv2.IMREAD_UNCHANGED) ^ 1)
-    changed, _ = open_pair(pair)
-    assert changed.content_sha256(0, 11) != before
-    assert changed.content_sha256(4, 11) == left.content_sha256(4, 11)
 
 
 _fuzz = settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])

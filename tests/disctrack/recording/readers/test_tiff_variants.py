@@ -46,21 +46,6 @@ def test_where_white_is_zero_light_is_more_all_the_same(tmp_path, bits, packing,
     assert_array_equal(read(written(tmp_path / "black", frames, **packing)), frames)
 
 
-@pytest.mark.parametrize("compression", ["tiff_lzw", "packbits"])
-@pytest.mark.parametrize("bits", FRAMES)
-@pytest.mark.parametrize("stack", [False, True])
-def test_white_is_zero_in_what_pillow_packs(tmp_path, bits, compression, stack):
-    black, white = (struct.pack("<HHI", 262, 3, 1) + bytes([number]) for number in (1, 0))
-    pictures = [Image.fromarray(frame) for frame in FRAMES[bits]]
-    for i, picture in enumerate(pictures[:1] if stack else pictures):
-        file, rest = tmp_path / f"{i}.tif", pictures[1:] if stack else []
-        picture.save(file, save_all=stack, append_images=rest, compression=compression)
-        content = file.read_bytes()
-        assert content.count(black) == 1 + len(rest)
-        file.write_bytes(content.replace(black, white))
-    assert_array_equal(read(tmp_path), ~FRAMES[bits])
-
-
 @pytest.mark.parametrize("packing", PACKINGS, ids=str)
 @pytest.mark.parametrize("orientation", range(1, 9))
 def test_frames_stand_upright_in_files_and_stacks_as_in_pillow(tmp_path, orientation, packing):
