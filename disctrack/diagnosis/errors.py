@@ -48,7 +48,7 @@ def errors(system: DiscSystem, fit_: Fit, held: HeldOut | None) -> Errors:
     present = system.weights >= 6
     error = coordinate_errors(system, fit_.values)[0][present]
     # of the fitted quantities, those without a prior take their share of the pose's numbers
-    freedom = 6 * present.sum() - sum(not np.isfinite(q.prior_sigma) for q in fit_.quantities)
+    freedom = 6 * present.sum() - fit_.n_free
     return Errors(
         reduced_chi_square=fit_.reduced_chi_square,
         reduced_chi_square_pose=float(np.sum(pose[present] ** 2) / max(freedom, 1)),
@@ -169,9 +169,8 @@ def left_over(system: DiscSystem, fit_: Fit, noise: float) -> LeftOver | None:
     pose, other = (part[full] for part in system.parts_of_residual(fit_.values))
     tested = whiteness(pose, system.rate, {})
     lags, channels = min(20, max(1, n // 4)), other.shape[1]
-    moved = sum(not np.isfinite(q.prior_sigma) for q in fit_.quantities)
     return LeftOver(
-        float(np.sum(pose**2) / max(6 * n - moved, 1) / noise),
+        float(np.sum(pose**2) / max(6 * n - fit_.n_free, 1) / noise),
         float(np.sum(other**2) / max((most - 6) * n, 1) / noise),
         min(1.0, 2 * tested.p_value, 2 * 6 * float(tested.peak_p_value.min())),
         min(1.0, channels * no_memory(float(ljung_box(other, lags).max()), n, lags)),

@@ -50,8 +50,7 @@ class Assumed:
     @property
     def price(self) -> float:
         """Cost of the fit, and of the numbers that it moves (Bayesian information criterion)."""
-        free = sum(not np.isfinite(q.prior_sigma) for q in self.base.quantities)
-        return self.base.cost + free * float(np.log(max(self.base.n_data, 2)))
+        return self.base.cost + self.base.n_free * float(np.log(max(self.base.n_data, 2)))
 
 
 def poses_with(trajectory: Trajectory, values: Values) -> Trajectory:

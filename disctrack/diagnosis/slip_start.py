@@ -50,10 +50,10 @@ class MotionDiagnosis:
             return diagnosis
         (without, held_without), held, noise = self.rolling, diagnosis.held_out_before, diagnosis.noise
         gain = (without.cost - diagnosis.before.cost) / noise
-        held_gain = 2 * (held.log_density - held_without.log_density) / noise if held else np.nan
+        held_gain = held.gain_over(held_without, noise) if held else np.nan
         candidate = _candidate(self.system)
         enough = threshold(self.system, diagnosis.settings, len(candidate.names))
-        found = Found(candidate, float(gain), float(held_gain), enough, ())
+        found = Found(candidate, float(gain), held_gain, enough, ())
         reason = f"with slip at the start, {diagnosis.reason}"
         return replace(beside(diagnosis, [found]), reason=reason, before=without, held_out_before=held_without)
 

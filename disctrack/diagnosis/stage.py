@@ -147,7 +147,7 @@ def _with_law(
     judged = judged_as(diagnosis, known)
     held = held_out(judged, fitted.quantities, fitted.values, training_rows(known))
     assert diagnosis.held_out_before is not None
-    held_gain = 2 * (held.log_density - diagnosis.held_out_before.log_density) / noise
+    held_gain = held.gain_over(diagnosis.held_out_before, noise)
     work = energy_balance(known, fitted.values)[f"by {law.candidate.name}"]
     power = -work / float(known.time[-1] - known.time[0])
     left = left_over(known, fitted, noise)
@@ -157,7 +157,7 @@ def _with_law(
     if _of_motion(established):  # what holds beside any law does not stand in with this one
         after, _, course, misfit = with_form(*as_found, _of_motion(f for f in kept if f not in established))
     gain = (diagnosis.before.cost - fitted.cost) / noise
-    learned = Learned(law.candidate, gain, float(held_gain), np.nan, (), law, power, course, misfit)
+    learned = Learned(law.candidate, gain, held_gain, np.nan, (), law, power, course, misfit)
     reason = f"{diagnosis.reason}; the law {law.candidate.title} leaves {fitted.reduced_chi_square:.3g}"
     diagnosis = replace(
         diagnosis, verdict="unexplained", found=established, after=after, held_out_after=held, reason=reason
@@ -177,10 +177,7 @@ def _beside_any_form(kept: Sequence[Found], fitted: Fit, looked: float) -> tuple
     for found in kept:
         candidate = found.candidate
         shape = {q.name for q in candidate.shape}  # an exponent or a frequency is no amount
-        sizes = [q for q in candidate.quantities if q.name not in shape]
-        index = [fitted.names.index(q.name) for q in sizes]
-        amounts = np.array([fitted.values[q.name] - q.null for q in sizes])
-        gain = wald(amounts, fitted.covariance[np.ix_(index, index)])
+        gain = wald(*fitted.amounts([name for name in candidate.names if name not in shape]))
         if gain > found.threshold + looked * candidate.sought:
             established.append(found)
             continue

@@ -289,21 +289,20 @@ def find_systematic(system: DiscSystem, known: Values | None = None, beside: Seq
     start = {"rig": 1.0, "print": DOT_SIGMA} | {name: WIDE * typical[name] for name in given}
     amounts = {name: typical[name] for name in faults} if beside is None else {}
 
-    alone = Likelihood(data, groups)
-    nothing = alone.twice_log(start)
-    value, sizes, chosen = _with_faults(alone, start, amounts)
-    best = _with_amounts(Systematic(gain=value - nothing), alone, sizes, (*given, *chosen), view, system.faults)
-    for share in LENS_LENGTHS:
-        lens_columns = view.whitened(field_columns(view.places, view.used, share * extent, size))
-        evidence = Likelihood(data, {**groups, "lens": lens_columns})
-        value, sizes = _best_sizes(evidence, dict(start), grids)
+    nothing, best = Likelihood(data, groups).twice_log(start), Systematic(gain=-np.inf)
+    for share in (0.0, *LENS_LENGTHS):  # without any field, and with fields of the cameras as long
+        fields, sought = dict(groups), grids if share else {}
+        if share:
+            fields["lens"] = view.whitened(field_columns(view.places, view.used, share * extent, size))
+        evidence = Likelihood(data, fields)
+        value, sizes = _best_sizes(evidence, dict(start), sought)
         value, sizes, chosen = _with_faults(evidence, sizes, amounts)
         if chosen:  # what a fault explains is no field
-            value, sizes = _best_sizes(evidence, start | {name: typical[name] for name in chosen}, grids)
+            value, sizes = _best_sizes(evidence, start | {name: typical[name] for name in chosen}, sought)
         print_m, left = sizes["print"] if sizes["print"] > DOT_SIGMA else 0.0, evidence.left(sizes) / numbers
         lens, dot = (sizes.get("lens", 0.0), share * extent), (sizes.get("dot", 0.0), DOT_LENGTH * extent)
-        found = Systematic(*lens, *dot, print_m, value - nothing, left=max(1.0, left))
+        found = Systematic(*lens, *dot, print_m, value - nothing, left=max(1.0, left) if share else 1.0)
         found = _with_amounts(found, evidence, sizes, (*given, *chosen), view, system.faults)
-        if found.present and found.gain > best.gain + WORTH:
+        if not share or (found.present and found.gain > best.gain + WORTH):
             best = found
     return best

@@ -50,9 +50,14 @@ class Fit(Outline):
         return self.chi_square + self.penalty
 
     @property
+    def n_free(self) -> int:
+        """Quantities without a prior."""
+        return sum(not np.isfinite(q.prior_sigma) for q in self.quantities)
+
+    @property
     def degrees_of_freedom(self) -> int:
         """Data minus quantities without a prior."""
-        return self.n_data - sum(not np.isfinite(q.prior_sigma) for q in self.quantities)
+        return self.n_data - self.n_free
 
     @property
     def reduced_chi_square(self) -> float:
@@ -68,6 +73,16 @@ class Fit(Outline):
             return 0.0  # of a fit that never began
         i = self.shared.index(name)
         return float(np.sqrt(max(self.covariance[i, i], 0.0)))
+
+    def amounts(self, names: Sequence[str]) -> tuple[Array, Array]:
+        """How far shared quantities (k,) are from their nulls, and their covariance (k, k)."""
+        index = [self.shared.index(n) for n in names]
+        nulls = {q.name: q.null for q in self.quantities}
+        return np.array([self.values[n] - nulls[n] for n in names]), self.covariance[np.ix_(index, index)]
+
+    def excess(self, noise: float) -> float:
+        """Chi-square beyond that of noise of this variance, in units of it."""
+        return self.chi_square / noise - self.degrees_of_freedom
 
     def covariance_with(self, name: str) -> Array:
         """(names,) covariances of a shared quantity with all that are fitted."""

@@ -1,5 +1,7 @@
 """Fit on the first part, free run over the rest: the judge that a flexible model cannot flatter."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -30,6 +32,11 @@ class HeldOut:
     def ratio_to_floor(self) -> float:
         """Rms of the free run's residual over what noise and uncertainty of the fit allow; 1 is perfect."""
         return float(np.sqrt(self.chi_square / self.expected)) if self.expected > 0 else float("nan")
+
+    def gain_over(self, before: HeldOut, noise: float) -> float:
+        """Gain of twice the log density, in units of the noise, over another prediction of the same samples."""
+        gain = 2 * (self.log_density - before.log_density) / noise
+        return -np.inf if np.isnan(gain) else float(gain)  # neither predicts anything
 
 
 def training_rows(system: System) -> Mask:

@@ -16,7 +16,7 @@ import numpy as np
 
 from calibration.kit.arrays import Array
 from disctrack.discrepancy.fit import Fit, fit
-from disctrack.discrepancy.search import CLASS_GAIN, FAR, Diagnosis, Explanation, Found, gain_of_memory, length
+from disctrack.discrepancy.search import CLASS_GAIN, FAR, Diagnosis, Explanation, Found, alike, gain_of_memory, length
 from disctrack.discrepancy.shape import profiled
 from disctrack.discrepancy.significance import as_sigmas, price_of_a_number, wald
 from disctrack.discrepancy.system import Candidate, Quantity, System, Values
@@ -88,7 +88,7 @@ class LearnedLaw:
 
     def stands_out(self, fitted: Fit) -> bool:
         """Do the coefficients of each of its families differ from zero, in a fit whose sigmas hold all doubts?"""
-        return all(_differ_from_zero(*_amounts(fitted, names)) for names in self.amounts)
+        return all(_differ_from_zero(*fitted.amounts(names)) for names in self.amounts)
 
     @property
     def widths(self) -> set[str]:
@@ -190,16 +190,13 @@ def learn(
         if not trials or min(lengths) >= shortest:
             break
         shortest, along = min(lengths), None
+        near = [one.title for (one, _), its in zip(trials, lengths, strict=True) if its - shortest < CLASS_GAIN]
         law, current = trials.pop(lengths.index(shortest))
-        lengths.remove(shortest)
-        near = dict.fromkeys(
-            one.title for (one, _), its in zip(trials, lengths, strict=True) if its - shortest < CLASS_GAIN
-        )
         # how short a law is decides which is named; what the recording determines is what all that fit it agree in
         odds = [(one, _odds(t, current, noise)) for one, t in trials if t.converged]
         law = replace(
             law,
-            alike=tuple(title for title in near if title != law.title),
+            alike=tuple(title for title in dict.fromkeys(near) if title != law.title),
             others=tuple((one, share) for one, share in odds if share > UNLIKELY),
             looked=looked,
         )
@@ -227,8 +224,7 @@ def shortest_to_first_order(system: LawSystem, base: Fit, along: Fit, noise: flo
     library, price = scan.library(), price_of_a_number(system.weights)
     gains = scan.gains(family for family in library if not family.shape)
     nearest = min((scan.chi_square - g.gain) / noise + price * g.family.n_numbers for g in gains)
-    free = sum(not np.isfinite(q.prior_sigma) for q in base.quantities)
-    return nearest + 2.0 * float(np.log(len(library))) + price * free
+    return nearest + 2.0 * float(np.log(len(library))) + price * base.n_free
 
 
 def _odds(fitted: Fit, best: Fit, noise: float) -> float:
@@ -317,12 +313,6 @@ def without_idle_terms(system: LawSystem, law: LearnedLaw, fitted: Fit) -> Learn
     return replace(shorter, values=fitted.values, alike=law.alike, others=law.others, looked=law.looked)
 
 
-def _amounts(fitted: Fit, names: Sequence[str]) -> tuple[Array, Array]:
-    """Amounts (k,) with their covariance (k, k)."""
-    index = [fitted.shared.index(n) for n in names]
-    return np.array([fitted.values[n] for n in names]), fitted.covariance[np.ix_(index, index)]
-
-
 def _differ_from_zero(amounts: Array, covariance: Array) -> bool:
     return as_sigmas(wald(amounts, covariance), len(amounts)) > MIN_SIGMAS
 
@@ -332,7 +322,7 @@ def busy_amounts(fitted: Fit, names: Sequence[str]) -> dict[int, float]:
 
     One after the other goes, each judged with those before it out: of two that move together one may do for both.
     """
-    amounts, covariance = _amounts(fitted, names)
+    amounts, covariance = fitted.amounts(names)
     if not _differ_from_zero(amounts, covariance):
         return {}
     size = np.where(np.diag(covariance) > 0, np.sqrt(np.diag(covariance)), 1.0)
@@ -374,9 +364,7 @@ def explained_by_law(
     answers = [a for a in found if a is not None and a.fit.converged]
     if not answers:
         return None, diagnosis
-    shortest = min(a.length for a in answers)
-    as_good = [a for a in answers if a.length - shortest < CLASS_GAIN]
-    best = min(as_good, key=lambda a: (sum(f.candidate.kind == "motion" for f in a.kept), a.length))
+    best = min(alike(answers), key=lambda a: sum(f.candidate.kind == "motion" for f in a.kept))
     left, at_noise = best.fit.reduced_chi_square, diagnosis.settings.at_noise * noise
     ranked = sorted((*diagnosis.ranked, *answers), key=lambda e: e.length)
     listed = replace(diagnosis, ranked=tuple(ranked), length=ranked[0].length)

@@ -8,10 +8,10 @@ which its fit has not seen better than the shorter sets of its terms do, and who
 what is left.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 from scipy import stats
@@ -137,6 +137,13 @@ class Diagnosis(Outline):
 
 
 Former = Mapping[frozenset[str], Values]  # by names of effects
+E = TypeVar("E", bound=Explanation)
+
+
+def alike(explanations: Iterable[E]) -> list[E]:
+    """The shortest, and after it those that the data do not tell from it."""
+    ranked = sorted(explanations, key=lambda e: e.length)
+    return [e for e in ranked if e.length <= ranked[0].length + CLASS_GAIN]
 
 
 def explain(
@@ -212,9 +219,16 @@ def length(system: System, settings: Settings, noise: float, fitted: Fit, picked
     looked for; and how surprising its values are.
     """
     number = price_of_a_number(system.weights)
-    free = sum(not np.isfinite(q.prior_sigma) for q in fitted.quantities)
     picks = len(picked) * (threshold(system, settings, 1) - number) + CLASS_GAIN * sum(c.sought for c in picked)
-    return fitted.cost / noise + free * number + picks + sum(_surprise(c, fitted) for c in picked)
+    return fitted.cost / noise + fitted.n_free * number + picks + sum(_surprise(c, fitted) for c in picked)
+
+
+def is_noise(fit_: Fit, settings: Settings, noise: float, gain: float = 0.0) -> bool:
+    """Is what a fit leaves noise of this variance, once chi-square has fallen by a gain?"""
+    left, limit = (fit_.chi_square - gain) / max(fit_.degrees_of_freedom, 1), settings.at_noise
+    if settings.noise is None:  # in a short recording both chi-square and the noise found in it scatter
+        limit = max(limit, 1.0 + 4.0 * float(np.sqrt(2.0 * (1.0 + THIRD) / max(fit_.n_data, 1))))
+    return left <= limit * noise
 
 
 class _Search:
@@ -322,7 +336,7 @@ class _Search:
         at_noise, nothing, before = self._at_noise(best.fit), self.nothing, len(self.pool)
         if at_noise and len(best.candidates) < 2:
             return False
-        excess = nothing.fit.chi_square - self.noise * nothing.fit.degrees_of_freedom
+        excess = self.noise * nothing.fit.excess(self.noise)
         for c in self.system.candidates:
             if c.shape and self.system.budget.open(kept=FOR_LAWS):
                 self._with_free_shape(nothing, c, 0.0, nothing.fit.cost - (1.0 - WORTH_A_SHAPE) * excess)
@@ -473,8 +487,7 @@ class _Search:
 
     def _held_out_gain(self, before: Explanation, after: Explanation) -> float:
         """Of twice the log density of what was kept back, in units of the noise."""
-        gain = 2 * (self._held_out(after.fit).log_density - self._held_out(before.fit).log_density) / self.noise
-        return -np.inf if np.isnan(gain) else float(gain)  # neither predicts anything
+        return self._held_out(after.fit).gain_over(self._held_out(before.fit), self.noise)
 
     def _worth_naming(self, after: Explanation) -> bool:
         """Does what was found explain the residual, if not to noise then nearly all of it, in the free run too?
@@ -482,7 +495,7 @@ class _Search:
         In a residual that none of them makes, wrong effects gain a lot as well; they leave a good part of it.
         """
         before = self.nothing
-        excess = [e.fit.chi_square / self.noise - e.fit.degrees_of_freedom for e in (before, after)]
+        excess = [e.fit.excess(self.noise) for e in (before, after)]
         held = [self._held_out(e.fit) for e in (before, after)]
         free = [h.chi_square / self.noise - h.expected for h in held]
         # where next to nothing moves in what was kept back, no model errs there: what it lacks elsewhere is the measure
@@ -566,16 +579,11 @@ class _Search:
 
     def _nearly_all(self, before: Explanation, after: Explanation) -> bool:
         """Does the other remove nine tenths of what exceeds the noise, and is little left?"""
-        excess = [t.fit.chi_square / self.noise - t.fit.degrees_of_freedom for t in (before, after)]
         near = after.fit.reduced_chi_square < FAR * self.noise
-        return after.fit.converged and near and excess[1] < 0.1 * excess[0]
+        return after.fit.converged and near and after.fit.excess(self.noise) < 0.1 * before.fit.excess(self.noise)
 
     def _at_noise(self, fit_: Fit, gain: float = 0.0) -> bool:
-        left = (fit_.chi_square - gain) / max(fit_.degrees_of_freedom, 1)
-        limit = self.settings.at_noise
-        if self.settings.noise is None:  # in a short recording both chi-square and the noise found in it scatter
-            limit = max(limit, 1.0 + 4.0 * float(np.sqrt(2.0 * (1.0 + THIRD) / max(fit_.n_data, 1))))
-        return left <= limit * self.noise
+        return is_noise(fit_, self.settings, self.noise, gain)
 
     def _incredible(self, trial: Explanation, extra: Sequence[Candidate]) -> bool:
         """Is an amount at the limit of what is ever met, or do forces or faults of the measurement undo each other?"""
@@ -636,7 +644,7 @@ class _Search:
     def _found(self, e: Explanation, candidate: Candidate, alike: list[Alternative]) -> Found:
         rest = tuple(c for c in e.candidates if c is not candidate)
         without = self._fit(rest, _without(e.fit.values, candidate, rest), patient=True)
-        held_gain = 2 * (self._held_out(e.fit).log_density - self._held_out(without).log_density) / self.noise
+        held_gain = self._held_out(e.fit).gain_over(self._held_out(without), self.noise)
         gain = (without.cost - e.fit.cost) / self.noise
         return Found(candidate, gain, held_gain, self.threshold(len(candidate.names)), tuple(alike))
 
@@ -691,8 +699,7 @@ def _near_enough(system: System, base: Fit) -> bool:
 
     Where equations jump, chi-square is rough: far above the noise no step may lead to the bottom of a rough valley.
     """
-    excess = base.chi_square - base.degrees_of_freedom
-    return system.several_minima and base.promised < ROUGH * excess
+    return system.several_minima and base.promised < ROUGH * base.excess(1.0)
 
 
 def _refusal(base: Fit, settings: Settings) -> Diagnosis:
@@ -708,9 +715,7 @@ def _bounds(score: Score) -> str:
     """What the data leave room for, where they show no more than noise does."""
     sizes = zip(score.candidate.quantities, np.abs(score.values), score.sigma, strict=True)
     open_ = [(q, size + TWO_SIDED * sigma) for q, size, sigma in sizes if np.isfinite(size + sigma)]
-    most = ", ".join(
-        f"{q.name.partition('.')[2]} < {b:.2g} {'' if q.unit == '1' else q.unit}".rstrip() for q, b in open_
-    )
+    most = ", ".join(f"{q.part} < {b:.2g} {'' if q.unit == '1' else q.unit}".rstrip() for q, b in open_)
     return f"; only bounded: {most} (95 %)" if most else ""
 
 

@@ -51,6 +51,11 @@ class Quantity:
         return self.name.partition(".")[2]
 
     @property
+    def stem(self) -> str:
+        """Its name without that of the run or group whose own it is."""
+        return self.name.partition("[")[0]
+
+    @property
     def is_initial(self) -> bool:
         """Does it belong to the state at the first instant, which matters to nobody else?"""
         return self.owner == "state"

@@ -121,24 +121,22 @@ def residuals(result: DiscDiagnosis) -> Drawn:
 def free_run(result: DiscDiagnosis) -> Drawn:
     """Error of the free run over the part that the fit has not seen."""
     system = result.system
-    figure, (left, right) = panels(9.5, 3.4, 1, 2, NO_TITLE)
+    position, nutation = list[Curve](), list[Curve]()
 
-    def draw(errors: Array, width: float, colour: str, label: str) -> None:
-        style: dict[str, Any] = {"lw": width, "color": colour, "label": label}
-        left.semilogy(system.time, 1e3 * np.linalg.norm(errors[:, :3], axis=1), **style)
-        right.semilogy(system.time, np.degrees(np.abs(errors[:, 4])), **style)
+    def add(errors: Array, colour: str, label: str) -> None:
+        position.append(Curve(system.time, 1e3 * np.linalg.norm(errors[:, :3], axis=1), colour, label))
+        nutation.append(Curve(system.time, np.degrees(np.abs(errors[:, 4])), colour))
 
     for _, held, name, colour in _sides(result):
         assert held is not None
         error, sigma = coordinate_errors(system, held.train.values)
-        draw(error, 0.8, colour, name)
+        add(error, colour, name)
         last = system.time[~held.test_rows & (system.weights > 0)].max()
-    draw(sigma, 1, MUTED, "noise, 1 σ")
-    for axes, label in ((left, "error of the position (mm)"), (right, "error of the nutation (deg)")):
+    add(sigma, MUTED, "noise, 1 σ")
+    figure = chart("time (s)", ("position (mm)", position), ("nutation (deg)", nutation), size=(9.5, 4.4))
+    for axes in figure.axes:
+        axes.set_yscale("log")
         axes.axvline(last, color=AMBER, lw=1)
-        axes.set_xlabel("time (s)")
-        axes.set_ylabel(label)
-    left.legend(frameon=False, fontsize=9)
     caption = "Error of the free run: the model is fitted up to the vertical line and continues alone after it."
     return Drawn("free_run", "Free run over held-out data", caption, figure)
 

@@ -223,7 +223,7 @@ def figures(answer: TogetherDiagnosis) -> tuple[Drawn, ...]:
         else:
             axes.xaxis.set_major_locator(MaxNLocator(integer=True))
             axes.set_xlabel("recording, from 0")
-        axes.set_ylabel(in_unit(q.part.partition("[")[0], q.unit))
+        axes.set_ylabel(in_unit(q.stem.removeprefix(f"{q.owner}."), q.unit))
         caption = "Each recording alone with its standard deviation; the band is two of all together."
         drawn.append(Drawn(f"{number:02d}_{q.name.replace('.', '_').split('[')[0]}", q.name, caption, figure))
     return tuple(drawn)

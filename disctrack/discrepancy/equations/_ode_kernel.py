@@ -200,30 +200,11 @@ def _along(F, z, x, out):
 
 @part
 def _solve(M, b):
-    """Replace b (m, k) by M^-1 b, by elimination with pivots that uses M up; False where M has no inverse."""
-    m, k = b.shape
-    for i in range(m):
-        best = i
-        for j in range(i + 1, m):
-            if abs(M[j, i]) > abs(M[best, i]):
-                best = j
-        if M[best, i] == 0.0 or not np.isfinite(M[best, i]):
-            return False
-        for j in range(i, m):
-            M[i, j], M[best, j] = M[best, j], M[i, j]
-        for c in range(k):
-            b[i, c], b[best, c] = b[best, c], b[i, c]
-        for j in range(i + 1, m):
-            factor = M[j, i] / M[i, i]
-            for r in range(i + 1, m):
-                M[j, r] -= factor * M[i, r]
-            for c in range(k):
-                b[j, c] -= factor * b[i, c]
-    for c in range(k):
-        for i in range(m - 1, -1, -1):
-            for j in range(i + 1, m):
-                b[i, c] -= M[i, j] * b[j, c]
-            b[i, c] /= M[i, i]
+    """Replace b (m, k) by M^-1 b; False where M has no inverse."""
+    try:
+        b[:] = np.linalg.solve(M, b)
+    except Exception:  # compiled code knows no LinAlgError
+        return False
     return True
 
 

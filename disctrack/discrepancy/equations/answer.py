@@ -95,15 +95,15 @@ class Answer:
         if law is None:
             return []
         notes = []
-        known = " and ".join(c.name for c in law.replaces)
-        odds = f"1 to exp({0.5 * abs(law.length - law.their_length):.3g})"
+        known = " and ".join(c.name for c in law.instead.candidates)
+        odds = f"1 to exp({0.5 * abs(law.length - law.instead.length):.3g})"
         text = law.text(self.equations.units)
         named = law.candidate.name in {*self.found, *(c.name for c in self.diagnosis.partial)}
         if not law.is_shorter:
             notes.append(f"one law describes the data in place of {known}, with odds of {odds} against it: {text}")
         elif not named:
             notes.append(f"nearer to the data than {known} comes one law, though not to the noise: {text}")
-        elif np.isfinite(law.their_length):
+        elif known:
             notes.append(f"of known terms {known} come nearest, with odds of {odds} against the law")
         if law.held and named:
             notes.append(f"{' and '.join(law.held)} acts as a part of the law, and says nothing by itself")

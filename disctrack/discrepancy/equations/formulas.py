@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property, lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import sympy
@@ -22,6 +22,14 @@ OWN = "own_"  # before the name of a term's parameter, in its formulas: not the 
 _t = sympy.Symbol("t", real=True)
 
 
+class Number(NamedTuple):
+    """A number that a fit may move."""
+
+    symbol: sympy.Symbol
+    parameter: Parameter
+    term: str = ""  # whose it is; empty: of the equations
+
+
 class Formulas:
     """Symbols of everything, with all terms added; compiled when first asked for.
 
@@ -37,7 +45,7 @@ class Formulas:
         self.states, self.inputs = tuple(states.values()), tuple(inputs.values())
         self.input_rates = tuple(input_rates.values())
         # by name of the quantity
-        self.fitted = {name: (own[name], _parameter(p)) for name, p in equations.parameters.items()}
+        self.fitted = {name: Number(own[name], _parameter(p)) for name, p in equations.parameters.items()}
         still = {"t": _t, **input_rates, **self.constants, **own}
         self._numbers = {**self.constants, **own}  # of what does not move
         self._still, self._words = still, {**still, **states, **inputs}
@@ -70,7 +78,7 @@ class Formulas:
         here, mine = f"term {term.name}", {name: _symbol(f"{prefix}{name}") for name in term.parameters}
         for name, p in term.parameters.items():
             checked_name(name, f"parameter of term {term.name}")
-            self.fitted[f"{term.name}.{name}"] = mine[name], _parameter(p)
+            self.fitted[f"{term.name}.{name}"] = Number(mine[name], _parameter(p), term.name)
             if isinstance(p, Parameter) and p.along:
                 self.along[f"{term.name}.{name}"] = parsed(p.along, self._words, f"{here}, {name} along")
         marked = {f"{OWN}{name}": s for name, s in mine.items()}
@@ -109,7 +117,7 @@ class Formulas:
     @cached_property
     def numbers(self) -> list[sympy.Symbol]:
         """Symbols of p."""
-        return [*(s for s, _ in self.fitted.values()), *self.constants.values(), *self.widths.values()]
+        return [*(n.symbol for n in self.fitted.values()), *self.constants.values(), *self.widths.values()]
 
     @cached_property
     def rhs(self) -> Any:
@@ -143,7 +151,7 @@ class Formulas:
         targets += [
             (f"{by_state}[{i}, {j}]", e.diff(y)) for i, e in enumerate(formulas) for j, y in enumerate(self.states)
         ]
-        fitted = [s for s, _ in self.fitted.values()]
+        fitted = [n.symbol for n in self.fitted.values()]
         for i, e in enumerate(formulas):
             targets += [(f"{by_number}[{i}, {j}]", self._by_number(e, s)) for j, s in enumerate(fitted)]
         arrays = [("y_", self.states), ("p_", self.numbers), ("u_", self.inputs), ("u_rates_", self.input_rates)]
@@ -176,7 +184,7 @@ class Formulas:
     @cached_property
     def lateness(self) -> Any:
         """(t (m,), p) -> true minus written instant (w, m) and its derivatives (w, n_fitted, m); NumPy."""
-        fitted = [s for s, _ in self.fitted.values()]
+        fitted = [n.symbol for n in self.fitted.values()]
         flat = [*self.late, *(e.diff(s) for e in self.late for s in fitted)]
         function = sympy.lambdify((_t, self.numbers), flat, "numpy")
 
@@ -202,7 +210,7 @@ class Formulas:
 
     def defaults(self) -> dict[str, float]:
         """Declared values of all numbers; the widths of jumps are 1 until they are known."""
-        found = {name: p.value for name, (_, p) in self.fitted.items()} | dict(self.equations.constants)
+        found = {name: n.parameter.value for name, n in self.fitted.items()} | dict(self.equations.constants)
         return found | {s.name: 1.0 for s in self.widths.values()}
 
 

@@ -20,15 +20,13 @@ from disctrack.discrepancy.elimination import compress, prior_rows
 from disctrack.discrepancy.equations.declared import Equations, Parameter, Term
 from disctrack.discrepancy.equations.expressions import Formula
 from disctrack.discrepancy.equations.formulas import Formulas
-from disctrack.discrepancy.equations.start import guessed, near_declared, trusted, turn
+from disctrack.discrepancy.equations.start import guessed, near_declared, sizes_alike, trusted, turn
 from disctrack.discrepancy.equations.system import MOST_STATES, EquationSystem, cut
 from disctrack.discrepancy.fit import Fit, fit
 from disctrack.discrepancy.held_out import HeldOut, held_out
 from disctrack.discrepancy.laws import evidence
-from disctrack.discrepancy.noise import THIRD
 from disctrack.discrepancy.score import cleared, span
-from disctrack.discrepancy.search import CLASS_GAIN, FAR, Diagnosis, Found, Tried
-from disctrack.discrepancy.significance import price_of_a_number
+from disctrack.discrepancy.search import CLASS_GAIN, FAR, Diagnosis, Explanation, Found, Tried, alike, is_noise, length
 from disctrack.discrepancy.system import Candidate, Quantity, System, Values
 
 NAME = "learned"  # of the term
@@ -39,8 +37,6 @@ FALLS = (1.5, 1.0)  # ... as these powers of 1 + (wave number over it) squared: 
 FINE, STRAIGHT = 0.03, 1e4  # of the largest value: the variable's inverse hyperbolic sine beyond it, or itself
 SIZES = np.logspace(-4, 2, 31)  # prior sigma of the first amplitudes, over the rms of the equation that it stands in
 FEWEST = 10  # samples of such a stretch
-MOST_SAMPLES = 2000  # with which laws compete; the one that is told is fitted to all
-A_TURN = 40  # samples of a turn that are kept at least
 MOST_LAWS = 40  # that are looked at in any case
 REFITTED = 4  # laws that are fitted in full ...
 MOST_BESIDE = 2  # ... beside each of so many known terms, where none describes the data by itself
@@ -69,25 +65,36 @@ class Along:
         return f"a force on {self.equation} that is a function of {of}"
 
 
-@dataclass(frozen=True)
-class LearnedForce:
-    """A law with its course."""
+@dataclass(frozen=True, kw_only=True)
+class WithForce(Explanation):
+    """An explanation by a law, the last of its candidates, and known terms before it."""
 
     along: Along
-    candidate: Candidate
-    beside: tuple[Candidate, ...]  # known terms that were fitted with it
-    fit: Fit
+    alike: tuple[Along, ...] = ()  # others that are not longer by CLASS_GAIN
+
+    @property
+    def candidate(self) -> Candidate:
+        """The law."""
+        return self.candidates[-1]
+
+    @property
+    def beside(self) -> tuple[Candidate, ...]:
+        """Known terms that were fitted with it."""
+        return self.candidates[:-1]
+
+
+@dataclass(frozen=True, kw_only=True)
+class LearnedForce(WithForce):
+    """A law with its course."""
+
     held_out: HeldOut
     held: tuple[str, ...]  # parameters that are a part of the law, and held as declared
     variable: Array  # (POINTS,) from the least to the largest that is visited
     force: Array  # (POINTS,) beyond the declared equations
     sigma: Array  # (POINTS,)
-    length: float  # -2 log evidence of the data with it, with what it pays for having been looked for
-    alike: tuple[Along, ...]  # others whose evidence is within CLASS_GAIN
-    replaces: tuple[Candidate, ...] = ()  # known terms that describe the data too ...
-    their_length: float = np.inf  # ... with this
-    at_noise: bool = True  # is what it leaves noise?
-    system: EquationSystem | None = None  # that knows the law
+    instead: Explanation  # the shortest by known terms alone
+    at_noise: bool  # is what it leaves noise?
+    system: EquationSystem  # that knows the law
 
     def is_named(self, diagnosis: Diagnosis) -> bool:
         """Is it this law that describes the data best, or comes nearest where no term is certain?"""
@@ -96,7 +103,7 @@ class LearnedForce:
     @property
     def is_shorter(self) -> bool:
         """Than the known terms that come nearest to the data?"""
-        return self.length < self.their_length
+        return self.length < self.instead.length
 
     def document(self) -> dict[str, Any]:
         """Its course in JSON's types, with the names of what describes the data too."""
@@ -112,8 +119,8 @@ class LearnedForce:
             "at_noise": self.at_noise,
             "minus_2_log_evidence": self.length,
             "cannot_be_told_from": [{"equation": a.equation, "variable": a.variable} for a in self.alike],
-            "known_terms": [c.name for c in self.replaces],
-            "minus_2_log_evidence_of_known_terms": self.their_length,
+            "known_terms": [c.name for c in self.instead.candidates],
+            "minus_2_log_evidence_of_known_terms": self.instead.length,
         }
 
     def text(self, units: Mapping[str, str]) -> str:
@@ -139,9 +146,7 @@ def learn(
         return None
     if len(system.stretches) * len(system.formulas.states) > MOST_STATES:  # more than are fitted side by side
         return None
-    whole = _knowing(system, channels)
-    few = _thinned(whole) if judged is None else whole
-    over = _Competition(few, diagnosis, None if judged is None else judged)
+    over = _Competition(_knowing(system, channels), diagnosis, judged)
     best = over.best(())
     several = diagnosis.verdict == "unexplained" or len(diagnosis.found) > 2
     if several and (best is None or not over.at_noise(best.fit)):
@@ -149,18 +154,8 @@ def learn(
         best = min((o for o in (best, *others) if o is not None), key=lambda trial: trial.length, default=None)
     if best is None:
         return None
-    law = over.told(best, whole)
+    law = over.told(best)
     return law if over.is_worth_telling(law) else None
-
-
-@dataclass(frozen=True)
-class _Trial:
-    along: Along
-    beside: tuple[Candidate, ...]
-    quantities: tuple[Quantity, ...]  # of the law, with their priors
-    fit: Fit
-    length: float
-    alike: tuple[Along, ...] = ()
 
 
 class _Competition:
@@ -169,7 +164,6 @@ class _Competition:
     def __init__(self, system: EquationSystem, diagnosis: Diagnosis, judged: System | None) -> None:
         self.system, self.diagnosis, self.noise = system, diagnosis, diagnosis.noise
         self._judged = judged
-        self.price = price_of_a_number(system.weights)
         base = diagnosis.before
         self.declared = {q.name: q.null for q in system.base if not q.is_initial}
         self.begin = dict(base.values)
@@ -188,18 +182,7 @@ class _Competition:
 
     def at_noise(self, fitted: Fit) -> bool:
         """As the search has it."""
-        scatter = 4.0 * float(np.sqrt(2.0 * (1.0 + THIRD) / max(fitted.n_data, 1)))
-        limit = max(self.diagnosis.settings.at_noise, 1.0 + scatter)
-        return self.arrived(fitted) and fitted.reduced_chi_square <= limit * self.noise
-
-    def known(self, candidates: Sequence[Candidate], fitted: Fit) -> float:
-        """-2 log evidence of known terms: Schwarz's price, and that of having been chosen among so many."""
-        numbers = sum(len(c.names) for c in candidates)
-        looked = 2.0 * len(candidates) * float(np.log(max(len(self.system.candidates) - 1, 2)))
-        values = self.begin | fitted.values
-        residual, _ = self.view(self.system).linearise(values, [])
-        right, _ = prior_rows(self.system.base, values)
-        return float((np.sum(residual**2) + right @ right) / self.noise + self.price * numbers + looked)
+        return self.arrived(fitted) and is_noise(fitted, self.diagnosis.settings, self.noise)
 
     def beside(self) -> list[Candidate]:
         """Known terms that may act with a law: those that were found or help most."""
@@ -217,13 +200,12 @@ class _Competition:
         d = self.diagnosis
         if not self.arrived(law.fit) or d.held_out_before is None:
             return False
-        ahead = 2 * (law.held_out.log_density - d.held_out_before.log_density) / self.noise
-        if not ahead > CLASS_GAIN:
+        if not law.held_out.gain_over(d.held_out_before, self.noise) > CLASS_GAIN:
             return False
-        excess = [f.chi_square / self.noise - f.degrees_of_freedom for f in (d.before, law.fit)]
-        return law.at_noise or (law.is_shorter and excess[1] < d.settings.unexplained_share * excess[0])
+        most = d.settings.unexplained_share * d.before.excess(self.noise)
+        return law.at_noise or (law.is_shorter and law.fit.excess(self.noise) < most)
 
-    def best(self, beside: tuple[Candidate, ...]) -> _Trial | None:
+    def best(self, beside: tuple[Candidate, ...]) -> WithForce | None:
         """The law that makes the data most probable beside these terms."""
         shots = _shots(self.system) if self.far else [self.system]
         first = shots[0]
@@ -249,12 +231,10 @@ class _Competition:
                 trials.append(trial)
         if not trials:
             return None
-        trials = [trial for trial in trials if self.arrived(trial.fit)] or trials
-        shortest = min(trial.length for trial in trials)
-        alike = [trial for trial in trials if trial.length < shortest + CLASS_GAIN]
+        near = alike([trial for trial in trials if self.arrived(trial.fit)] or trials)
         # a function of time describes any motion: one of the motion itself says more, and is tried by every other run
-        best = min(alike, key=lambda trial: (trial.along.variable == "t", trial.length))
-        others = (Along(t.along.equation, t.along.variable) for t in alike if t.along.title != best.along.title)
+        best = min(near, key=lambda trial: trial.along.variable == "t")
+        others = (Along(t.along.equation, t.along.variable) for t in near if t.along.title != best.along.title)
         return replace(best, alike=tuple(dict.fromkeys(others)))
 
     def _others(self, system: EquationSystem, beside: Sequence[Candidate]) -> tuple[Quantity, ...]:
@@ -277,7 +257,7 @@ class _Competition:
         basis = span(np.vstack([by_others, prior_matrix]))
         right = cleared(np.concatenate([right, prior]), basis)
         columns = cleared(np.vstack([columns, np.zeros((len(prior), len(own)))]), basis)
-        size, root, found = _size(system, law, values), np.sqrt(self.noise), []
+        size, root, found = sizes_alike(system, values).get(f"{NAME}.a0", 1.0), np.sqrt(self.noise), []
         for smooth, fall in product(SMOOTH, FALLS):
             falls = _falls(own, smooth, fall)
             # the faster driver gives up where columns are alike
@@ -299,13 +279,13 @@ class _Competition:
     def _led(
         self, shots: Sequence[EquationSystem], law: Along, beside: tuple[Candidate, ...], own: tuple[Quantity, ...],
         values: Values, bars: list[float],
-    ) -> _Trial | None:  # fmt: skip
+    ) -> WithForce | None:  # fmt: skip
         """The law's fit to stretches that are joined two by two; None where it loses the data, or to another law.
 
         bars : -2 log evidence of the best law so far in each of these; this one's are put in
         """
         first, numbers = _set(shots[0], law, values)
-        now, length = dict(values) | {q.name: 0.0 for q in own} | numbers, np.inf
+        now, evident = dict(values) | {q.name: 0.0 for q in own} | numbers, np.inf
         for i, (system, longer) in enumerate(zip(shots, [*shots[1:], None], strict=True)):
             there = system.with_(widths=first.widths)
             others, view = self._others(there, beside), there if longer else self.view(there)
@@ -313,18 +293,20 @@ class _Competition:
                 fitted = self._fitted(view, (*others, *own), now)
                 if not fitted.reduced_chi_square < FAR * self.noise:  # joined, it leaves more
                     return None
-                before, now = length, dict(fitted.values)
-                length, own = self._evidence(there, law, beside, now)
-                if abs(before - length) < 1.0:
+                before, now = evident, dict(fitted.values)
+                evident, own = self._evidence(there, law, beside, now)
+                if abs(before - evident) < 1.0:
                     break
-            if length > bars[i] + WORTH:
+            if evident > bars[i] + WORTH:
                 return None
-            bars[i] = min(bars[i], length)
+            bars[i] = min(bars[i], evident)
             if longer:
                 now |= _joining(now, there, longer)
         fitted = self._fitted(view, (*others, *own), now)
-        price = sum(self.price * len(c.names) + self.looked for c in beside)
-        return _Trial(law, beside, own, fitted, length + price)
+        # known numbers and terms are priced as where no law is; of the law, the evidence has paid
+        prices = length(view, self.diagnosis.settings, self.noise, fitted, beside) - fitted.cost / self.noise
+        candidate = Candidate(NAME, NAME, "motion", law.title, "learned from what is left", own)
+        return WithForce((*beside, candidate), fitted, length=evident + prices, along=law)
 
     def _fitted(self, system: System, quantities: Sequence[Quantity], values: Values) -> Fit:
         """The fit; where its steps have to be halved again and again, with a region of trust for each number.
@@ -339,31 +321,28 @@ class _Competition:
             return found
         return fit(system, quantities, trusted(system, quantities, found.values, ATTEMPTS), ITERATIONS)
 
-    def told(self, best: _Trial, whole: EquationSystem) -> LearnedForce:
-        """The law fitted to all data, with its course, beside the known terms that describe them too."""
-        law, d = best.along, self.diagnosis
-        there, fitted = _set(whole, law, best.fit.values)[0], best.fit
-        view = self.view(there)
-        if len(whole.time) != len(self.system.time):
-            others = self._others(there, best.beside)
-            fitted = self._fitted(view, (*others, *best.quantities), fitted.values)
-        held = held_out(view, fitted.quantities, fitted.values, whole.training)
-        x = np.linspace(*_range(there, law, fitted.values), POINTS)
+    def told(self, best: WithForce) -> LearnedForce:
+        """The law with its course, beside the known terms that describe the data too."""
+        law, fitted, own = best.along, best.fit, best.candidate.quantities
+        there = _set(self.system, law, fitted.values)[0]
+        held = held_out(self.view(there), fitted.quantities, fitted.values, there.training)
+        visited = _visited(there, law.variable, fitted.values)
+        x = np.linspace(visited.min(), visited.max(), POINTS)
         # what a declared number has become is a part of the law, where it acts as such a one would
         part = sorted(_part_of_law(there.formulas, law, there.held))
-        names = [*(q.name for q in best.quantities), *part]
+        names = [*(q.name for q in own), *part]
         force, columns = _course(there, law, names, fitted.values, x)
         at = [fitted.shared.index(n) for n in names]
         variance = np.einsum("ij,jk,ik->i", columns, fitted.covariance[np.ix_(at, at)], columns)
         # waves finer than those that are fitted go on as the inverse square of their number
-        finer = HARMONICS / 6.0 * best.quantities[HARMONICS].prior_sigma ** 2
+        finer = HARMONICS / 6.0 * own[HARMONICS].prior_sigma ** 2
         sigma = np.sqrt(max(self.noise, fitted.reduced_chi_square) * np.maximum(variance, 0.0) + self.noise * finer)
-        candidate = Candidate(NAME, NAME, "motion", law.title, "learned from what is left", best.quantities)
-        sums = tuple(f.candidate for f in d.found) or d.partial
-        of_sums = d.after if d.found else d.nearest
-        their_length = self.known(sums, of_sums) if of_sums is not None and sums else np.inf
-        return LearnedForce(law, candidate, best.beside, fitted, held, tuple(part), x, force, sigma, best.length,
-                            best.alike, sums, their_length, self.at_noise(fitted), there)  # fmt: skip
+        nothing = Explanation((), self.diagnosis.before)
+        instead = next((e for e in self.diagnosis.ranked if e.candidates), nothing)
+        return LearnedForce(
+            **vars(best), held_out=held, held=tuple(part), variable=x, force=force, sigma=sigma, instead=instead,
+            at_noise=self.at_noise(fitted), system=there,
+        )  # fmt: skip
 
 
 def _laws(system: EquationSystem, values: Values) -> Iterator[Along]:
@@ -382,7 +361,7 @@ def _laws(system: EquationSystem, values: Values) -> Iterator[Along]:
             yield Along(equation, variable)
             if variable in _velocities(equations, equation):
                 yield Along(equation, variable, fine=True)
-                if _turns(system, variable, values):
+                if np.sum(np.diff(np.sign(_visited(system, variable, values))) != 0) >= TURNING:
                     yield Along(equation, variable, jumps=True)
 
 
@@ -393,16 +372,6 @@ def _forced(equations: Equations) -> list[str]:
 
 def _velocities(equations: Equations, equation: str) -> set[str]:
     return {str(f).strip() for f in equations.rates.values()} & set(equations.rates) | {equation}
-
-
-def _turns(system: EquationSystem, state: str, values: Values) -> bool:
-    """Does a state change its sign again and again along the motion?"""
-    i = system.formulas.equations.states.index(state)
-    count = 0
-    for found in system.predictions(values):
-        if found is not None:
-            count += int(np.sum(np.diff(np.sign(found.states[:, i])) != 0))
-    return count >= TURNING
 
 
 def _knowing(system: EquationSystem, channels: Mapping[str, Formula]) -> EquationSystem:
@@ -438,16 +407,14 @@ def _amplitudes(system: EquationSystem, law: Along) -> tuple[Quantity, ...]:
 
 def _falls(own: Sequence[Quantity], smooth: float, power: float) -> Array:
     """Prior sigma of each amplitude over that of the first."""
-    found = []
-    for q in own:
-        number = q.name.partition(".a")[2]
-        found.append((1.0 + (int(number) / smooth) ** 2) ** -power if number else 1.0)
-    return np.array(found)
+    numbers = [q.part.removeprefix("a") for q in own]
+    return np.array([(1.0 + (int(n) / smooth) ** 2) ** -power if n.isdigit() else 1.0 for n in numbers])
 
 
 def _set(system: EquationSystem, law: Along, values: Values) -> tuple[EquationSystem, dict[str, float]]:
     """The system for one law, and the numbers that say where it acts and over which range."""
-    low, high = _range(system, law, values)
+    visited = _visited(system, law.variable, values)
+    low, high = float(visited.min()), float(visited.max())
     reach = max(abs(low), abs(high), 1e-12)
     bend = reach * (FINE if law.fine else STRAIGHT)
     low, high = (float(bend * np.arcsinh(end / bend)) for end in (low, high))
@@ -458,35 +425,19 @@ def _set(system: EquationSystem, law: Along, values: Values) -> tuple[EquationSy
     numbers |= {f"{NAME}_from": low - MARGIN * span, f"{NAME}_span": (1 + 2 * MARGIN) * span}
     numbers |= {f"{NAME}_reach": reach, f"{NAME}_bend": bend}
     mine = [w.name for a, w in system.formulas.widths.items() if any(s.name.startswith(of) for s in a.free_symbols)]
-    size = float(np.sqrt(np.mean(np.concatenate(_visited(system, law.variable, values)) ** 2)))
+    size = float(np.sqrt(np.mean(visited**2)))
     return system.with_(widths=system.widths | {w: 1e-3 * (size or 1.0) for w in mine}), numbers
 
 
-def _visited(system: EquationSystem, variable: str, values: Values) -> list[Array]:
-    """Values of a state, an input or time at the samples of each stretch."""
+def _visited(system: EquationSystem, variable: str, values: Values) -> Array:
+    """Values of a state, an input or time at the samples of all stretches, one after the other."""
     e = system.formulas.equations
     if variable == "t":
-        return [s.time for s in system.stretches]
+        return np.concatenate([s.time for s in system.stretches])
     if variable in e.inputs:
-        return [system.inputs_of(s)[list(e.inputs).index(variable)] for s in system.stretches]
-    i = e.states.index(variable)
-    found = [p.states[:, i] for p in system.predictions(values) if p is not None]
-    return found or [np.array([-1.0, 1.0])]
-
-
-def _range(system: EquationSystem, law: Along, values: Values) -> tuple[float, float]:
-    visited = np.concatenate(_visited(system, law.variable, values))
-    return float(visited.min()), float(visited.max())
-
-
-def _size(system: EquationSystem, law: Along, values: Values) -> float:
-    """Force that by itself makes the rms of the equation in which the law stands, along the motion."""
-    f = system.formulas
-    i, constant = f.equations.states.index(law.equation), f.names.index(f"{NAME}.a0")
-    found = [system.along(values, s)[:2] for s in system.stretches]
-    own = np.concatenate([rates[:, i] for rates, _ in found])
-    acting = np.concatenate([by_number[:, i, constant] for _, by_number in found])
-    return float(np.sqrt(np.mean(own**2) / max(np.mean(acting**2), 1e-300))) or 1.0
+        return np.concatenate([system.inputs_of(s)[list(e.inputs).index(variable)] for s in system.stretches])
+    found = [p.states[:, e.states.index(variable)] for p in system.predictions(values) if p is not None]
+    return np.concatenate(found or [np.array([-1.0, 1.0])])
 
 
 def _part_of_law(f: Formulas, law: Along, held: Sequence[str]) -> set[str]:
@@ -496,8 +447,8 @@ def _part_of_law(f: Formulas, law: Along, held: Sequence[str]) -> set[str]:
     elsewhere = set().union(*(e.free_symbols for e in forces))
     driving = {s.name for s in (*f.states, *f.inputs, *f.input_rates)} | {"t"}
     found = set()
-    for name, (symbol, parameter) in f.fitted.items():
-        if "." in name or parameter.per or name in held or symbol in elsewhere:
+    for name, (symbol, parameter, term) in f.fitted.items():
+        if term or parameter.per or name in held or symbol in elsewhere:
             continue
         acts = f.forces[here].diff(symbol)
         if acts != 0 and {s.name for s in acts.free_symbols} & driving <= {law.variable}:
@@ -516,7 +467,7 @@ def _course(system: EquationSystem, law: Along, names: Sequence[str], values: Va
         pieces = np.zeros((len(s.pieces), 5, len(x)))
         pieces[list(f.equations.inputs).index(law.variable), 3] = x
         s = replace(s, knots=np.arange(len(x) + 1.0), pieces=pieces)
-    declared = {name: f.fitted[name][1].value for name in names}
+    declared = {name: f.fitted[name].parameter.value for name in names}
     here = f.equations.states.index(law.equation)
     (now, _, by_number), (before, *_) = (
         f.rates_at(s, system.numbers({**values, **changed}, s), times, states) for changed in ({}, declared)
@@ -524,20 +475,6 @@ def _course(system: EquationSystem, law: Along, names: Sequence[str], values: Va
     acting = by_number[:, here, f.names.index(f"{NAME}.a0")]
     own = by_number[:, here, [f.names.index(name) for name in names]]
     return (now - before)[:, here] / acting, own / acting[:, None]
-
-
-def _thinned(system: EquationSystem) -> EquationSystem:
-    """Samples enough for laws to compete."""
-    every = int(sum(len(s.time) for s in system.stretches) / MOST_SAMPLES)
-    turns = min(turn(s) / float(np.median(np.diff(s.time))) for s in system.stretches)
-    every = min(every, int(turns / A_TURN))
-    if every < 2:
-        return system
-    some = []
-    for s in system.stretches:
-        time, data, sigma = (np.ascontiguousarray(column[::every]) for column in (s.time, s.data, s.sigma))
-        some.append(replace(s, time=time, data=data, sigma=sigma))
-    return system.with_(stretches=some)
 
 
 def _shots(system: EquationSystem) -> list[EquationSystem]:
@@ -577,8 +514,8 @@ def with_law(diagnosis: Diagnosis, law: LearnedForce) -> Diagnosis:
             diagnosis, verdict="unexplained", reason=reason, found=(), after=diagnosis.before, tried=tried,
             held_out_after=diagnosis.held_out_before, partial=(*law.beside, law.candidate), nearest=law.fit,
         )  # fmt: skip
-    ahead = diagnosis.held_out_before
-    held_gain = 2 * (law.held_out.log_density - (ahead.log_density if ahead else -np.inf)) / diagnosis.noise
+    assert diagnosis.held_out_before is not None
+    held_gain = law.held_out.gain_over(diagnosis.held_out_before, diagnosis.noise)
     gain = (diagnosis.before.cost - law.fit.cost) / diagnosis.noise
     found = tuple(Found(c, gain, held_gain, 0.0, ()) for c in (*law.beside, law.candidate))
     own = Tried(law.candidate, gain, gain, held_gain, "chosen")

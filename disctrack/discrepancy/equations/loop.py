@@ -11,10 +11,9 @@ from disctrack.discrepancy.equations import terms as library
 from disctrack.discrepancy.equations.declared import Equations, Run, Samples, Term, checked
 from disctrack.discrepancy.equations.formulas import Formulas
 from disctrack.discrepancy.equations.law import LearnedForce, learn, with_law
-from disctrack.discrepancy.equations.start import LOST, Start, guessed, led, misfit, trusted, turn
+from disctrack.discrepancy.equations.start import LOST, Start, guessed, led, misfit, sizes_alike, trusted, turn
 from disctrack.discrepancy.equations.system import EquationSystem, cut, first_part, fitted_rows, spread
 from disctrack.discrepancy.fit import Fit, fit, no_fit
-from disctrack.discrepancy.held_out import held_out
 from disctrack.discrepancy.noise import (
     autoregression,
     fast_part,
@@ -27,7 +26,7 @@ from disctrack.discrepancy.noise import (
 from disctrack.discrepancy.score import Linearisation
 from disctrack.discrepancy.search import NOT_CONVERGED, Diagnosis, Former, Settings, explain, with_shapes
 from disctrack.discrepancy.significance import wald
-from disctrack.discrepancy.system import Candidate, System
+from disctrack.discrepancy.system import Candidate, System, Values
 from disctrack.errors import AnalysisError
 
 JUMP = 1e-3  # width of a jump over the rms of what jumps: it errs by 1e-6 of a friction's work
@@ -78,7 +77,7 @@ def ask(
             diagnosis, judged = again, again.judged or judged
             notes.append(remark)
     law = learn(system, diagnosis, channels, None if judged is system else judged)
-    if law is not None and law.system is not None and law.is_named(diagnosis):
+    if law is not None and law.is_named(diagnosis):
         judged = law.system if judged is system else judged.over(law.system)
         system, diagnosis = law.system, with_law(diagnosis, law)
         if law.at_noise:
@@ -103,16 +102,16 @@ def _first_answer(system: EquationSystem, settings: Settings) -> tuple[EquationS
         system = system.with_(held=held)
         start = led(system, declared)
     soon = start.followed < min(turn(s) for s in system.stretches)
-    leading = _leading(system, declared) if soon else {}
+    leading = _leading(system, declared, [c.name for c in system.candidates]) if soon else {}
     if soon and start.followed == 0.0 and not leading:
         raise AnalysisError(_not_followed(system, declared))
-    notes = [_lost_soon(start, leading)] if soon else []
+    names = [name for names in leading for name in names]
+    notes = [_lost_soon(start, names)] if soon else []
     if leading:
-        first, values = next(iter(leading.items()))
-        former = {frozenset([name]): values for name, values in leading.items()}
-        system, diagnosis = _searched(_sized(system, values), values, settings, former)
-        if not leading.keys() & {f.candidate.name for f in diagnosis.found}:
-            notes = [f"the fit goes by way of {first}: without it, growing windows lose the data"]
+        values = next(iter(leading.values()))
+        system, diagnosis = _searched(_sized(system, values), values, settings, leading)
+        if not {f.candidate.name for f in diagnosis.found} & {*names}:
+            notes = [f"the fit goes by way of {names[0]}: without it, growing windows lose the data"]
         return system, diagnosis, notes
     values = start.values
     if not start.whole:
@@ -139,15 +138,19 @@ def _searched(
     if scans:  # each value that was looked at is a chance more
         share = len(system.candidates) / (len(system.candidates) + scans)
         settings = replace(settings, false_alarm=settings.false_alarm * share)
-    values = {k: v for k, v in values.items() if "." not in k or k.startswith("state.")}
+    values = {q.name: values[q.name] for q in system.base if q.name in values}
     diagnosis = explain(system, values, settings, system.training, former)
     if diagnosis.held_out_before is None and np.isfinite(diagnosis.before.chi_square):
         # no step leads down: by way of others, and without what the data do not tell apart
         system = system.with_(held=(*system.held, *redundant(system, diagnosis.before.values)))
         values = trusted(system, system.base, diagnosis.before.values)
         diagnosis = explain(system, values, settings, system.training)
-    if stuck := _led_with_terms(system, diagnosis):
-        diagnosis = explain(system, diagnosis.before.values, settings, system.training, stuck)
+    if diagnosis.verdict == "unexplained" and not diagnosis.found:
+        # of an arm that friction stops, no step leads from a motion without end to the instant at which it stops
+        stuck = [t for t in diagnosis.tried if t.gain is not None and t.reason == NOT_CONVERGED]
+        names = [t.candidate.name for t in sorted(stuck, key=lambda t: -t.score)]
+        if ways := _leading(system, guessed(system)[0], names[:MOST_LED]):
+            diagnosis = explain(system, diagnosis.before.values, settings, system.training, ways)
     sharper = _sharp_enough(system, diagnosis.after)
     if sharper is system:
         return system, diagnosis
@@ -162,23 +165,6 @@ def _former(diagnosis: Diagnosis) -> Former:
     return {names: values for names, values in found.items() if names}
 
 
-def _led_with_terms(system: EquationSystem, diagnosis: Diagnosis) -> Former:
-    """Better descriptions with a term whose refit did not converge: led to it over growing windows.
-
-    Of an arm that friction stops, no step leads from a motion that goes on for ever to the instant at which it stops.
-    """
-    if diagnosis.verdict != "unexplained" or diagnosis.found:
-        return {}
-    stuck = [t for t in diagnosis.tried if t.gain is not None and t.reason == NOT_CONVERGED]
-    found, lowest = {}, (diagnosis.nearest or diagnosis.before).cost
-    for t in sorted(stuck, key=lambda t: -t.score)[:MOST_LED]:
-        promoted = system.with_(promoted=(t.candidate.name,))
-        fitted = fit(promoted, promoted.base, led(promoted, guessed(system)[0]).values)
-        if fitted.converged and fitted.cost < lowest:
-            found[frozenset([t.candidate.name])] = fitted.values
-    return found
-
-
 def _aimed(system: EquationSystem, values: Mapping[str, float]) -> EquationSystem:
     """With a start for every term that has a number to be tried along the motion, where it explains most."""
     f = system.formulas
@@ -191,13 +177,13 @@ def _aimed(system: EquationSystem, values: Mapping[str, float]) -> EquationSyste
             found = f.scanned(s.time, list(motion.states.T), p, system.inputs_of(s))
             passed.append([np.broadcast_to(x, s.time.shape) for x in found])
     best: dict[str, tuple[float, dict[str, float]]] = {}
-    amounts = [c for c in system.candidates if any(n.startswith(f"{c.name}.") for n in f.along)]
+    amounts = [c for c in system.candidates if any(f.fitted[n].term == c.name for n in f.along)]
     here = no_fit(system.base, values)
     for share in (np.arange(SCANNED) + 0.5) / SCANNED:
         tried = {}
         for i, name in enumerate(f.along):
             value = float(np.nanquantile(np.concatenate([x[i] for x in passed]), share))
-            bounds = f.fitted[name][1]
+            bounds = f.fitted[name].parameter
             tried[name] = float(np.clip(value, bounds.lower, bounds.upper))
         there = system.with_(aims=tried)
         if not np.isfinite(there.linearise(values, [n for c in amounts for n in c.names])[1]).all():
@@ -206,22 +192,22 @@ def _aimed(system: EquationSystem, values: Mapping[str, float]) -> EquationSyste
         for c in amounts:
             gain, there_best = linear.gain_of(c.names)
             if gain > best.get(c.name, (0.0, {}))[0]:
-                limits = {n: v for n, v in tried.items() if n.startswith(f"{c.name}.")}
+                limits = {n: v for n, v in tried.items() if f.fitted[n].term == c.name}
                 best[c.name] = gain, limits | dict(zip(c.names, there_best.tolist(), strict=True))
     return system.with_(aims={n: v for _, aims in best.values() for n, v in aims.items()})
 
 
-def _leading(system: EquationSystem, values: Mapping[str, float]) -> dict[str, dict[str, float]]:
-    """Terms with which the model follows to their end data that it loses within a turn, and where; best first."""
-    ways = {c.name: led(system.with_(promoted=(c.name,)), dict(values)) for c in system.candidates}
-    whole = {name: way.values for name, way in ways.items() if way.whole}
-    return dict(sorted(whole.items(), key=lambda item: misfit(system, item[1])))
+def _leading(system: EquationSystem, values: Values, names: Collection[str]) -> dict[frozenset[str], Values]:
+    """Those with which, over growing windows, the model follows the data to their end, and where; the best first."""
+    ways = {name: led(system.with_(promoted=(name,)), dict(values)) for name in names}
+    whole = {frozenset([name]): way.values for name, way in ways.items() if way.whole}
+    return dict(sorted(whole.items(), key=lambda item: misfit(system, dict(item[1]))))
 
 
-def _lost_soon(start: Start, leading: Collection[str]) -> str:
+def _lost_soon(start: Start, leading: Sequence[str]) -> str:
     text = f"the model loses the data after {start.followed:.2g} s, less than a turn"
     if leading:
-        return f"{text}; with {' or '.join(leading)} it follows them to their end: {next(iter(leading))} does so best"
+        return f"{text}; with {' or '.join(leading)} it follows them to their end: {leading[0]} does so best"
     return f"{text}: sizes of terms mean little"
 
 
@@ -275,28 +261,9 @@ def _sized(system: EquationSystem, values: Mapping[str, float]) -> EquationSyste
         return system
     sizes = np.maximum(np.max([np.abs(m.states).max(axis=0) for _, m in found], axis=0), 1e-9 * system.sizes)
     system = system.with_(sizes=sizes, widths=_widths(system, [(s, m.states) for s, m in found]))
-    return system.with_(typical=_typical(system, values))
-
-
-def _typical(system: EquationSystem, values: Mapping[str, float]) -> dict[str, float]:
-    f = system.formulas
-    n_fitted = len(f.fitted)
-    own, acting = np.zeros(len(f.states)), np.zeros((len(f.states), n_fitted))
-    shown, seen = np.zeros(len(f.channels)), np.zeros((len(f.channels), n_fitted))
-    for s in system.stretches:
-        rates, by_number, h, H_p = system.along(values, s)
-        own += np.sum(rates**2, axis=0)
-        acting += np.sum(by_number[..., :n_fitted] ** 2, axis=0)
-        shown += np.sum((h - h.mean(axis=0)) ** 2, axis=0)
-        seen += np.sum(H_p[..., :n_fitted] ** 2, axis=0)
-    found = {}
-    for i, name in enumerate(f.fitted):
-        with np.errstate(divide="ignore", invalid="ignore"):
-            sizes = np.concatenate([np.sqrt(own / acting[:, i]), 0.1 * np.sqrt(shown / seen[:, i])])
-        sizes = sizes[np.isfinite(sizes) & (sizes > 0)]
-        if "." in name and sizes.size:
-            found[name] = USUAL_SHARE * float(sizes.min())
-    return found
+    of_terms = {name for name, number in system.formulas.fitted.items() if number.term}
+    typical = {name: USUAL_SHARE * size for name, size in sizes_alike(system, values).items() if name in of_terms}
+    return system.with_(typical=typical)
 
 
 def redundant(system: EquationSystem, values: Mapping[str, float]) -> tuple[str, ...]:
@@ -314,7 +281,7 @@ def redundant(system: EquationSystem, values: Mapping[str, float]) -> tuple[str,
     shares = linear.cleared(columns) / np.where(length > 0, length, 1.0)
     if not np.isfinite(shares).all():
         return ()
-    stems = np.array([q.name.partition("[")[0] for q in free])
+    stems = np.array([q.stem for q in free])
     weak: list[str] = []
     while (left := np.flatnonzero(~np.isin(stems, weak))).size:
         _, R, order = qr(shares[:, left], mode="economic", pivoting=True)
@@ -333,7 +300,7 @@ def _in_stretches(
     pieces = cut(system.stretches, [max(1, int(np.ceil(d / length * (1 - 1e-9)))) for d in durations])
     chosen = spread(pieces, len(system.formulas.states), at_least=len(system.stretches))
     system = system.with_(stretches=chosen)
-    shared = {k: v for k, v in values.items() if not k.startswith("state.")}
+    shared = {q.name: values[q.name] for q in system.base if not q.is_initial}
     guesses, _ = guessed(system)
     start = led(system, shared | guesses)
     text = f"runs are taken in {len(pieces)} stretches of {length:.3g} s with an initial state each"
@@ -403,38 +370,16 @@ def _pace(s: Samples) -> float:
 
 
 def _certain(system: EquationSystem, diagnosis: Diagnosis) -> Diagnosis:
-    """Sigmas as what is left makes them, and of what was found only what stands out from them (Wald's test)."""
-    found, after = diagnosis.found, with_memory(system, diagnosis.after)
-    while len(certain := [f for f in found if _wald(f.candidate.names, after) > f.threshold]) < len(found):
-        found, fitted = tuple(certain), diagnosis.before
-        if found:
-            kept = {n for f in found for n in f.candidate.names}
-            start = {k: v for k, v in after.values.items() if k in kept or "." not in k or k.startswith("state.")}
-            quantities = (*system.base, *(q for f in found for q in f.candidate.quantities))
-            fits = [fit(system, quantities, values) for values in (start, diagnosis.before.values)]
-            fitted = min(fits, key=lambda f: f.cost)
-        after = with_memory(system, fitted)
-    if diagnosis.found and not found:  # none of them is certain, but it is they that describe the data best
-        partial = tuple(f.candidate for f in diagnosis.found)
-        diagnosis = replace(diagnosis, partial=partial, nearest=with_memory(system, diagnosis.after))
-    names, tried = {f.candidate.name for f in found}, []
-    for t in diagnosis.tried:
-        idle = t.reason == "chosen" and t.candidate.name not in names
-        tried.append(replace(t, reason="does not stand out from what is left") if idle else t)
+    """Sigmas, and what stands out from them (Wald's test), as what is left makes them."""
+    after, nearest = with_memory(system, diagnosis.after), diagnosis.nearest
+    gains = [wald(*after.amounts(f.candidate.names)) for f in diagnosis.found]
     return replace(
         diagnosis,
-        found=tuple(replace(f, gain=_wald(f.candidate.names, after)) for f in found),
+        found=tuple(replace(f, gain=gain) for f, gain in zip(diagnosis.found, gains, strict=True)),
         before=with_memory(system, diagnosis.before),
         after=after,
-        held_out_after=held_out(system, after.quantities, after.values, system.training),
-        tried=tuple(tried),
+        nearest=None if nearest is None else with_memory(system, nearest),
     )
-
-
-def _wald(names: Sequence[str], fitted: Fit) -> float:
-    """Square of the distance from zero in standard deviations, of numbers that move together."""
-    here = [fitted.shared.index(n) for n in names]
-    return wald(np.array([fitted.values[n] for n in names]), fitted.covariance[np.ix_(here, here)])
 
 
 def _not_followed(system: EquationSystem, values: Mapping[str, float]) -> str:

@@ -119,6 +119,24 @@ def guessed(system: EquationSystem) -> tuple[dict[str, float], Array]:
     return values, np.asarray(np.maximum(sizes, floor), float)
 
 
+def sizes_alike(system: EquationSystem, values: Mapping[str, float]) -> dict[str, float]:
+    """Of every number that shows, the size at which it does as much as an equation, or a tenth of a sensor, in all."""
+    f = system.formulas
+    n_fitted = len(f.fitted)
+    own, acting = np.zeros(len(f.states)), np.zeros((len(f.states), n_fitted))
+    shown, seen = np.zeros(len(f.channels)), np.zeros((len(f.channels), n_fitted))
+    for s in system.stretches:
+        rates, by_number, h, H_p = system.along(values, s)
+        own += np.sum(rates**2, axis=0)
+        acting += np.sum(by_number[..., :n_fitted] ** 2, axis=0)
+        shown += np.sum((h - h.mean(axis=0)) ** 2, axis=0)
+        seen += np.sum(H_p[..., :n_fitted] ** 2, axis=0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        sizes = np.concatenate([np.sqrt(own[:, None] / acting), 0.1 * np.sqrt(shown[:, None] / seen)])
+    usable = np.where(np.isfinite(sizes) & (sizes > 0), sizes, np.inf).min(axis=0)
+    return {name: float(size) for name, size in zip(f.fitted, usable, strict=True) if np.isfinite(size)}
+
+
 @dataclass(frozen=True)
 class Start:
     """Values from which Gauss-Newton converges, as far as the model follows the motion."""
@@ -196,7 +214,7 @@ def _not_astray(system: EquationSystem, declared: dict[str, float], found: Start
 
 def near_declared(q: Quantity) -> Quantity:
     """Of a parameter that the data may not tell, one that stays near; of a term's number zero is the absence."""
-    return q if "." in q.name else replace(q, prior_sigma=min(q.prior_sigma, max(abs(q.null), q.scale)))
+    return q if q.declared is None else replace(q, prior_sigma=min(q.prior_sigma, max(abs(q.null), q.scale)))
 
 
 def at_once(system: EquationSystem, declared: Mapping[str, float]) -> dict[str, float]:

@@ -12,7 +12,7 @@ from scipy.interpolate import PPoly
 
 from calibration.kit.arrays import Array, Mask
 from disctrack.discrepancy.equations import _ode_kernel as kernel
-from disctrack.discrepancy.equations.declared import Parameter, Samples, Term
+from disctrack.discrepancy.equations.declared import Samples, Term
 from disctrack.discrepancy.equations.formulas import Formulas
 from disctrack.discrepancy.held_out import TRAIN_FRACTION
 from disctrack.discrepancy.search import CANCELLING
@@ -72,7 +72,7 @@ class EquationSystem(System):
             self.training[rows] = fitted_rows(s)
         self._w = w
         self._defaults = formulas.defaults() | self.widths | self._limits()
-        self._per = {name: p.per for name, (_, p) in formulas.fitted.items() if p.per}
+        self._per = {name: n.parameter.per for name, n in formulas.fitted.items() if n.parameter.per}
         self.base = tuple(self._base())
         self.candidates = tuple(self._candidate(t) for t in formulas.terms if t.name not in self.promoted)
 
@@ -92,11 +92,10 @@ class EquationSystem(System):
                     q = Quantity(f"state.{name}[{s.name}]", unit, 1e-3 * size, value, prior_sigma=sigma,
                                  meaning="at the first sample")  # fmt: skip
                     found.append(replace(q, slot=f"state.{name}[{EACH}]", block=i) if several else q)
-        for name, (_, p) in self.formulas.fitted.items():
-            term = name.partition(".")[0] if "." in name else ""
+        for name, (_, p, term) in self.formulas.fitted.items():
             if name in self.held or (p.shape and name not in self.aims) or (term and term not in self.promoted):
                 continue
-            found += self._with_slots(name, self._quantities(name, p)) if several else self._quantities(name, p)
+            found += self._with_slots(name, self._quantities(name)) if several else self._quantities(name)
         return found
 
     def _with_slots(self, name: str, quantities: Sequence[Quantity]) -> list[Quantity]:
@@ -111,11 +110,12 @@ class EquationSystem(System):
             for q in quantities
         ]
 
-    def _quantities(self, name: str, p: Parameter) -> list[Quantity]:
+    def _quantities(self, name: str) -> list[Quantity]:
+        _, p, term = self.formulas.fitted[name]
         scale = 1e-3 * abs(p.value) or 1e-3 * self.typical.get(name, 1.0)
         typical = p.typical or self.typical.get(name, np.inf)
         names = list(dict.fromkeys(self._name(name, s) for s in self.stretches))
-        declared = None if "." in name else p.value
+        declared = None if term else p.value
         null = self._limits().get(name, p.value)
         return [
             Quantity(n, p.unit, scale, null, p.lower, p.upper, p.sigma, p.meaning, typical, declared=declared)
@@ -132,12 +132,12 @@ class EquationSystem(System):
         return f"{name}[{s.groups[kind]}]"
 
     def _candidate(self, term: Term) -> Candidate:
-        own = {n: p for n, (_, p) in self.formulas.fitted.items() if n.startswith(f"{term.name}.")}
+        own = {name: n.parameter for name, n in self.formulas.fitted.items() if n.term == term.name}
         aimed = [n for n in own if n in self.aims]
-        amounts = tuple(q for n, p in own.items() if not p.shape or n in aimed for q in self._quantities(n, p))
-        shape = tuple(q for n, p in own.items() if p.shape and n not in aimed for q in self._quantities(n, p))
+        amounts = tuple(q for n, p in own.items() if not p.shape or n in aimed for q in self._quantities(n))
+        shape = tuple(q for n, p in own.items() if p.shape and n not in aimed for q in self._quantities(n))
         kind = "measurement" if term.is_measurement else "motion"
-        start = tuple(self.aims.get(q.name.partition("[")[0], q.null) for q in amounts) if aimed else ()
+        start = tuple(self.aims.get(q.stem, q.null) for q in amounts) if aimed else ()
         return Candidate(term.name, term.name, kind, term.title or term.name, term.source, amounts, start, shape)
 
     def _limits(self) -> dict[str, float]:
@@ -175,8 +175,9 @@ class EquationSystem(System):
         residual = np.zeros((len(self.time), self._w))
         derivative = np.zeros((len(self.time), self._w, len(names)))
         for rows, s in zip(self.rows, self.stretches, strict=True):
-            columns = [i for i, name in enumerate(names) if self._own(name, s) is not None]
-            found = self.predict(values, s, [names[i] for i in columns])
+            own = self.names_of(s)
+            columns = [i for i, name in enumerate(names) if name in own]
+            found = self.predict(values, s, names)
             if found is None:
                 return np.full_like(residual, np.nan), np.full_like(derivative, np.nan)
             present = np.isfinite(s.data)
@@ -196,22 +197,12 @@ class EquationSystem(System):
         """What every stretch should show; None where the motion cannot be followed to its end."""
         return [self.predict(values, s) for s in self.stretches]
 
-    def names_of(self, s: Samples) -> set[str]:
-        """Quantities that move a stretch."""
-        states = (f"state.{name}[{s.name}]" for name in self.formulas.equations.states)
-        return {*states, *(self._name(name, s) for name in self.formulas.fitted)}
-
-    def _own(self, name: str, s: Samples) -> int | None:
-        """Which number of a stretch a quantity is: its place in p, or -1 - i for the i-th state at the start."""
-        stem, bracket, rest = name.partition("[")
-        where = rest.rstrip("]")
-        if stem.startswith("state."):
-            if where not in (s.name, EACH):
-                return None
-            return -1 - self.formulas.equations.states.index(stem.removeprefix("state."))
-        if bracket and where != EACH and self._name(stem, s) != name:
-            return None
-        return self.formulas.names.index(stem)
+    def names_of(self, s: Samples) -> dict[str, int]:
+        """Quantities that move a stretch: the place of each in p, or -1 - i of the i-th state at the start."""
+        states, numbers = self.formulas.equations.states, self.formulas.names
+        found = {f"state.{n}[{where}]": -1 - i for i, n in enumerate(states) for where in (s.name, EACH)}
+        own = {name: i for i, n in enumerate(numbers) for name in (self._name(n, s), f"{n}[{EACH}]")}
+        return found | own
 
     def numbers(self, values: Values, s: Samples) -> Array:
         """(n_p,) all numbers of a stretch."""
@@ -234,7 +225,8 @@ class EquationSystem(System):
 
         None where the motion cannot be followed to its end.
         """
-        own = [number for name in names if (number := self._own(name, s)) is not None]
+        known = self.names_of(s) if names else {}
+        own = [known[name] for name in names if name in known]
         f = self.formulas
         n, k = len(f.states), len(own)
         p = self.numbers(values, s)

@@ -137,5 +137,5 @@ def test_the_law_is_told_on_the_page_and_in_json(tmp_path):
     law = json.loads(told.read_text())["law"]
     assert law["variable"] == "v"
     assert len(law["at"]) == len(law["force"]) == len(law["sigma"])
-    assert law["known_terms"] == [c.name for c in answer.law.replaces]
+    assert law["known_terms"] == [c.name for c in answer.law.instead.candidates]
     assert "a force on v that is a function of v, learned from what is left" in page.read_text()
