@@ -19,7 +19,7 @@ from disctrack.diagnosis.motion import SLIP, SLIP_VELOCITY, slip_candidate
 from disctrack.diagnosis.starts import first_slip
 from disctrack.diagnosis.stretch import free_stretch
 from disctrack.diagnosis.systematic import find_systematic, with_noise_of_frames
-from disctrack.discrepancy.fit import Fit, fit
+from disctrack.discrepancy.fit import TRIAL, Fit, fit
 from disctrack.discrepancy.held_out import HeldOut, held_out, training_rows
 from disctrack.discrepancy.noise import noise_variance
 from disctrack.discrepancy.search import FAR, Diagnosis, Found, Settings, beside, explain, threshold
@@ -30,7 +30,6 @@ from disctrack.rolling import CATALOGUE, Model, Regime
 from disctrack.trajectory import Trajectory, part
 
 LEAST_SLIP = 12e-3  # [m/s] a cubic over the first 20 ms errs by 9 mm/s at 3 deg; friction of 0.1 stops it in 12 ms
-MAX_ITERATIONS = 12  # where slip is a mere possibility: a trial of a friction that is too low takes long
 LASTS = 5  # frames of slip at mm/s at least: contact velocities that are errors of a fit stop within one
 SHOWN = 0.975  # probability of slip at the first frame from which on it is taken for shown
 
@@ -115,7 +114,7 @@ def _slips_slowly(settings: Settings, rolling: DiscSystem) -> bool:
     slipping = rolling.again(starts_in_slip=True)
     try:
         with slipping.budget.trial(slipping.trial_steps):
-            alone = fit(slipping, slipping.base, slipping.start(), MAX_ITERATIONS)
+            alone = fit(slipping, slipping.base, slipping.start(), TRIAL)
     except GivenUp:
         return False
     if not _at_noise(slipping, alone, settings):

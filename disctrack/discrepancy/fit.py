@@ -12,6 +12,7 @@ from disctrack.discrepancy.elimination import Own, Projection, is_linear, prior_
 from disctrack.discrepancy.system import Quantity, System, Values
 
 MAX_ITERATIONS = 40
+TRIAL = 15  # iterations of one fit among many: what describes the data is there by then, and others wander
 TOLERANCE = 1e-3  # a fit has converged when a full step would lower chi-square by less, over what is left per datum
 _HALVINGS = 8
 NO_DERIVATIVE = np.zeros(0)

@@ -15,7 +15,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from calibration.kit.arrays import Array
-from disctrack.discrepancy.fit import Fit, fit
+from disctrack.discrepancy.fit import TRIAL, Fit, fit
 from disctrack.discrepancy.search import CLASS_GAIN, FAR, Diagnosis, Explanation, Found, alike, gain_of_memory, length
 from disctrack.discrepancy.shape import profiled
 from disctrack.discrepancy.significance import as_sigmas, price_of_a_number, wald
@@ -25,7 +25,6 @@ MAX_TERMS = 3
 REFITTED = 5  # families that are fitted in full in each round ...
 OF_ONE_KIND = 2  # ... of them of one kind
 LONGER = 2  # of other kinds, that come nearest to the data in more numbers, beside known effects that describe them
-MAX_ITERATIONS = 15  # of a law that describes the data; others wander
 MIN_SIGMAS = 3.0  # of a coefficient after the refit; what helped to first order may not help the motion
 EXACT = 0.02  # of chi-square: what a first-order gain may err by where the motion is far from the data
 UNLIKELY = 1e-3  # odds below which a law does not count
@@ -282,7 +281,7 @@ def with_law(system: System, base: Fit, law: LearnedLaw, held: Collection[str] =
     """The base model's fit with the law's numbers fitted along, but for those held."""
     moved = (q for q in law.candidate.quantities if q.name not in held)
     start = base.values | dict(law.values) | dict(zip(law.candidate.names, law.candidate.start, strict=True))
-    return fit(system, (*base.quantities, *moved), start, MAX_ITERATIONS)
+    return fit(system, (*base.quantities, *moved), start, TRIAL)
 
 
 def _one_by_one(system: System, base: Fit, law: LearnedLaw, widths: Sequence[Quantity]) -> Fit:

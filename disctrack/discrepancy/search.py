@@ -158,19 +158,21 @@ def explain(
         has to follow the data
     """
     settings = settings or Settings()
-    base = fit(system, system.base, start)
-    if not (base.converged or _near_enough(system, base) or (former and np.isfinite(base.cost))):
-        return _refusal(base, settings)
-    answer = _Search(system, settings, rows, former).run(base)
+    answer = _searched(system, start, settings, rows, former)
     if settings.noise is None and answer.verdict != "unexplained":
         # looked for only here: what a large effect does from frame to frame would pass for scatter
         modes = common_modes(system, answer.after)
         if modes is not None:
             judged = whitened(system, modes)
-            base = fit(judged, judged.base, base.values)
-            answer = _Search(judged, settings, rows, former).run(base) if base.converged else _refusal(base, settings)
-            answer = replace(answer, judged=judged)
+            answer = replace(_searched(judged, answer.before.values, settings, rows, former), judged=judged)
     return with_shapes(system, answer) if system.frees_shapes else answer
+
+
+def _searched(system: System, start: Values, settings: Settings, rows: Mask | None, former: Former | None) -> Diagnosis:
+    base = fit(system, system.base, start)
+    if not (base.converged or _near_enough(system, base) or (former and np.isfinite(base.cost))):
+        return _refusal(base, settings)
+    return _Search(system, settings, rows, former).run(base)
 
 
 def with_shapes(system: System, diagnosis: Diagnosis) -> Diagnosis:

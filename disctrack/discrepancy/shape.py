@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from calibration.kit.arrays import Array
-from disctrack.discrepancy.fit import Fit, fit
+from disctrack.discrepancy.fit import TRIAL, Fit, fit
 from disctrack.discrepancy.score import Linearisation, score
 from disctrack.discrepancy.system import Candidate, GivenUp, Quantity, System
 
@@ -22,7 +22,6 @@ ENOUGH = 0.01  # of chi-square: a tenth of a sigma, beyond which a shape is not 
 STEEP = 1.0  # of chi-square above the lowest point, beyond which a neighbour says nothing of the valley's floor
 NARROW = 1e-6  # of a shape's size: as close as two values need to be
 WORTH_A_SHAPE = 0.5  # share of what is too much, that a law, and then its shape to first order, remove to be pursued
-MAX_STARTED = 12  # iterations at each shape of the grid
 DETERMINED = 0.3  # sigma over size, up to which a number is more than an order of magnitude
 
 
@@ -43,7 +42,7 @@ def with_free_shape(
     for start in starts or _grid(candidate):
         with suppress(GivenUp), system.budget.trial(system.trial_steps):
             quantities = (*base.quantities, *candidate.quantities)
-            fits.append(fit(system, quantities, base.values | start, MAX_STARTED))
+            fits.append(fit(system, quantities, base.values | start, TRIAL))
     fitted = min(fits, key=lambda f: f.cost, default=None)
     if fitted is None or not fitted.cost < below:
         return None

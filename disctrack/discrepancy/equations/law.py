@@ -16,16 +16,15 @@ import numpy as np
 from scipy import linalg
 
 from calibration.kit.arrays import Array
-from disctrack.discrepancy.elimination import compress, prior_rows
 from disctrack.discrepancy.equations.declared import Equations, Parameter, Term
 from disctrack.discrepancy.equations.expressions import Formula
 from disctrack.discrepancy.equations.formulas import Formulas
 from disctrack.discrepancy.equations.start import guessed, near_declared, sizes_alike, trusted, turn
 from disctrack.discrepancy.equations.system import MOST_STATES, EquationSystem, cut
-from disctrack.discrepancy.fit import Fit, fit
+from disctrack.discrepancy.fit import TRIAL, Fit, fit, no_fit
 from disctrack.discrepancy.held_out import HeldOut, held_out
 from disctrack.discrepancy.laws import evidence
-from disctrack.discrepancy.score import cleared, span
+from disctrack.discrepancy.score import Linearisation
 from disctrack.discrepancy.search import CLASS_GAIN, FAR, Diagnosis, Explanation, Found, Tried, alike, is_noise, length
 from disctrack.discrepancy.system import Candidate, Quantity, System, Values
 
@@ -44,7 +43,6 @@ WORTH = 50.0  # of -2 log evidence to first order: a law that is so much worse t
 ROUGHLY = 4.0  # ... times that of the other, where the declared equations are far from the data
 PLAUSIBLE = 4.0  # the same, by which a rougher law may be less probable than the best one
 ROUNDS = 3  # in which size and smoothness follow the fit, and the fit them
-ITERATIONS, ATTEMPTS = 12, 60  # of a fit, and of one within a region of trust
 POINTS = 61  # of the course that is told
 TURNING = 2  # times that a velocity changes its sign, from which on friction may jump with it
 
@@ -212,7 +210,7 @@ class _Competition:
         values = self.begin
         if self.far:
             values = self.begin | self.declared | guessed(first)[0]
-            values = fit(first, [near_declared(q) for q in first.base], values, ITERATIONS).values
+            values = fit(first, [near_declared(q) for q in first.base], values, TRIAL).values
         scans = []
         for law in self.laws:
             there, numbers = _set(first, law, values)
@@ -247,16 +245,13 @@ class _Competition:
         others, own = self._others(system, beside), _amplitudes(system, law)
         values = {q.name: q.null for q in (*others, *own)} | dict(values)
         view = self.view(system) if len(system.stretches) == len(self.system.stretches) else system
-        right, matrix = compress(*view.linearise(values, [q.name for q in (*others, *own)]))
-        if not (np.isfinite(matrix).all() and np.isfinite(right).all()):
-            return np.inf, own
-        prior, prior_matrix = prior_rows(others, values)
-        by_others, columns = np.split(matrix, [len(others)], axis=1)
+        linear = Linearisation(view, no_fit(others, values), [_candidate(law, own)])
+        columns = linear.columns([q.name for q in own])
         # the residual as it would be without the law
-        right = right + columns @ np.array([values[q.name] for q in own])
-        basis = span(np.vstack([by_others, prior_matrix]))
-        right = cleared(np.concatenate([right, prior]), basis)
-        columns = cleared(np.vstack([columns, np.zeros((len(prior), len(own)))]), basis)
+        right = linear.cleared(linear.right + columns @ np.array([values[q.name] for q in own]))
+        columns = linear.cleared(columns)
+        if not (np.isfinite(columns).all() and np.isfinite(right).all()):
+            return np.inf, own
         size, root, found = sizes_alike(system, values).get(f"{NAME}.a0", 1.0), np.sqrt(self.noise), []
         for smooth, fall in product(SMOOTH, FALLS):
             falls = _falls(own, smooth, fall)
@@ -305,21 +300,20 @@ class _Competition:
         fitted = self._fitted(view, (*others, *own), now)
         # known numbers and terms are priced as where no law is; of the law, the evidence has paid
         prices = length(view, self.diagnosis.settings, self.noise, fitted, beside) - fitted.cost / self.noise
-        candidate = Candidate(NAME, NAME, "motion", law.title, "learned from what is left", own)
-        return WithForce((*beside, candidate), fitted, length=evident + prices, along=law)
+        return WithForce((*beside, _candidate(law, own)), fitted, length=evident + prices, along=law)
 
     def _fitted(self, system: System, quantities: Sequence[Quantity], values: Values) -> Fit:
         """The fit; where its steps have to be halved again and again, with a region of trust for each number.
 
         Amplitudes that the data hardly show may go far to first order, and shift the phase in second.
         """
-        found = fit(system, quantities, values, ITERATIONS)
+        found = fit(system, quantities, values, TRIAL)
         ahead = (found.chi_square - found.promised) / max(
             found.degrees_of_freedom, 1
         )  # were the rest of the way linear
         if self.arrived(found) or not ahead < FAR * self.noise:
             return found
-        return fit(system, quantities, trusted(system, quantities, found.values, ATTEMPTS), ITERATIONS)
+        return fit(system, quantities, trusted(system, quantities, found.values), TRIAL)
 
     def told(self, best: WithForce) -> LearnedForce:
         """The law with its course, beside the known terms that describe the data too."""
@@ -397,6 +391,10 @@ def _knowing(system: EquationSystem, channels: Mapping[str, Formula]) -> Equatio
 
 def _names() -> list[str]:
     return [f"a{k}" for k in range(HARMONICS + 1)] + ["slope", "jump"]
+
+
+def _candidate(law: Along, own: tuple[Quantity, ...]) -> Candidate:
+    return Candidate(NAME, NAME, "motion", law.title, "learned from what is left", own)
 
 
 def _amplitudes(system: EquationSystem, law: Along) -> tuple[Quantity, ...]:

@@ -16,7 +16,7 @@ from disctrack.discrepancy.elimination import prior_rows
 from disctrack.discrepancy.equations.declared import Samples
 from disctrack.discrepancy.equations.formulas import Formulas
 from disctrack.discrepancy.equations.system import EquationSystem, first_part, spread
-from disctrack.discrepancy.fit import fit
+from disctrack.discrepancy.fit import TRIAL, fit
 from disctrack.discrepancy.search import AGREES
 from disctrack.discrepancy.system import Quantity, System
 
@@ -222,13 +222,11 @@ def at_once(system: EquationSystem, declared: Mapping[str, float]) -> dict[str, 
     some = system.with_(stretches=spread(system.stretches, len(system.formulas.states)))
     values = trusted(some, some.base, declared)
     if len(some.stretches) < len(system.stretches):
-        values |= fit(system, [q for q in system.base if q.slot], values, max_iterations=15).values
+        values |= fit(system, [q for q in system.base if q.slot], values, max_iterations=TRIAL).values
     return values
 
 
-def trusted(
-    system: System, quantities: Sequence[Quantity], declared: Mapping[str, float], attempts: int = _ATTEMPTS
-) -> dict[str, float]:
+def trusted(system: System, quantities: Sequence[Quantity], declared: Mapping[str, float]) -> dict[str, float]:
     """Quantities fitted within a region of trust that grows and shrinks with its success.
 
     Gauss-Newton's halved steps end where a parameter far off (a gain of the wrong sign) has to pass through values with
@@ -257,7 +255,7 @@ def trusted(
         return dict(declared)
     found = least_squares(
         lambda x: np.nan_to_num(both(x)[0], nan=_NOWHERE, posinf=_NOWHERE, neginf=-_NOWHERE), start,
-        lambda x: -np.nan_to_num(both(x)[1]), bounds=(lower, upper), x_scale=size, max_nfev=attempts,
+        lambda x: -np.nan_to_num(both(x)[1]), bounds=(lower, upper), x_scale=size, max_nfev=_ATTEMPTS,
     )  # fmt: skip
     return dict(declared) | dict(zip(names, found.x.tolist(), strict=True))
 
@@ -269,9 +267,9 @@ def _led(system: EquationSystem, values: dict[str, float], window: float, durati
         last = window >= duration
         part = system.with_(stretches=first_part(system.stretches, duration if last else window))
         if followed == 0.0:
-            values |= fit(part, states, values, max_iterations=15).values
+            values |= fit(part, states, values, max_iterations=TRIAL).values
         tied = [q if q.is_initial else _near_last(q, values) for q in system.base]
-        trial = values | fit(part, tied, values, max_iterations=15).values
+        trial = values | fit(part, tied, values, max_iterations=TRIAL).values
         lost = misfit(part, trial)
         if lost > LOST and followed > 0.0:
             break
