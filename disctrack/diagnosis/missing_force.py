@@ -19,7 +19,7 @@ from disctrack.diagnosis.law_library import SHAPES, families
 from disctrack.diagnosis.motion import STATE_SCALES, THETA_END, state_of
 from disctrack.discrepancy.elimination import is_linear, prior_rows, projection
 from disctrack.discrepancy.fit import Fit
-from disctrack.discrepancy.laws import Family, Gain, LearnedLaw, evidence, proposal
+from disctrack.discrepancy.laws import MIN_SIGMAS, Family, Gain, LearnedLaw, evidence, proposal
 from disctrack.discrepancy.score import cleared, span
 from disctrack.discrepancy.system import Candidate, Quantity, Values
 from disctrack.rolling import Model, simulate
@@ -34,7 +34,6 @@ AXES = ("n", "m", "z")
 PROBES_PER_TURN = 7  # of the fastest angle, so that a moment locked to it is resolved
 MAX_PROBES = 90
 WIDTH = 0.7  # of a probe over the distance to the next: their sum is flat to 1e-4
-STANDS_OUT = 3.0  # sigmas of a missing moment
 TELLING = 0.3  # share of chi-square to first order, from which on it is said what the missing moment goes with
 INSTANTS_PER_SECOND = 1000.0  # of the responses: Simpson's rule errs by 0.4 % of a hum of 150 Hz
 CHUNK = 120  # families of the library that are asked for at a time
@@ -53,7 +52,7 @@ class Course:
         """How large a moment is, when it is largest, and from when to when it stands out."""
         size = np.sum(self.values**2, axis=1)
         rms, largest = np.sqrt(np.mean(self.values**2, axis=0)), self.time[np.argmax(size)]
-        known = np.flatnonzero(size > STANDS_OUT**2 * np.sum(self.sigma**2, axis=1))
+        known = np.flatnonzero(size > MIN_SIGMAS**2 * np.sum(self.sigma**2, axis=1))
         text = (
             f"a moment of {', '.join(f'{1e6 * x:.2g}' for x in rms)} uN m rms along n0, m0, k, or a force that does "
             f"the same; it is largest at {largest:.3f} s"

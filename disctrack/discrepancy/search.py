@@ -29,7 +29,7 @@ from disctrack.discrepancy.system import Candidate, GivenUp, Quantity, System, V
 
 CLASS_GAIN = 10.0  # two explanations whose lengths differ by less are not told apart (odds of e^5)
 OBVIOUS = 5.0  # times its price: a gain that the fitted part alone may know
-WIDTH = 2  # explanations that are enlarged as long as none leaves noise
+WIDTH = 2  # explanations that are enlarged, or led on otherwise, as long as none leaves noise
 ROUGH = 1e-2  # of chi-square at stake, below which what a fit may still gain in a rough valley decides nothing
 FAINT = 1e3  # chi-square of an effect, below which many others may do as well as it
 MOST_ALTERNATIVES = 12

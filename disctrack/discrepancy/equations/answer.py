@@ -96,15 +96,15 @@ class Answer:
             return []
         notes = []
         known = " and ".join(c.name for c in law.instead.candidates)
-        odds = f"1 to exp({0.5 * abs(law.length - law.instead.length):.3g})"
+        longer = f"{law.length - law.instead.length:+.3g} in -2 log evidence"
         text = law.text(self.equations.units)
         named = law.candidate.name in {*self.found, *(c.name for c in self.diagnosis.partial)}
         if not law.is_shorter:
-            notes.append(f"one law describes the data in place of {known}, with odds of {odds} against it: {text}")
+            notes.append(f"one law describes the data in place of {known} ({longer}): {text}")
         elif not named:
             notes.append(f"nearer to the data than {known} comes one law, though not to the noise: {text}")
         elif known:
-            notes.append(f"of known terms {known} come nearest, with odds of {odds} against the law")
+            notes.append(f"of known terms {known} come nearest (the law: {longer})")
         if law.held and named:
             notes.append(f"{' and '.join(law.held)} acts as a part of the law, and says nothing by itself")
         if law.along.variable == "t":

@@ -23,9 +23,20 @@ from disctrack.discrepancy.equations.start import guessed, near_declared, sizes_
 from disctrack.discrepancy.equations.system import MOST_STATES, EquationSystem, cut
 from disctrack.discrepancy.fit import TRIAL, Fit, fit, no_fit
 from disctrack.discrepancy.held_out import HeldOut, held_out
-from disctrack.discrepancy.laws import evidence
+from disctrack.discrepancy.laws import REFITTED, evidence
 from disctrack.discrepancy.score import Linearisation
-from disctrack.discrepancy.search import CLASS_GAIN, FAR, Diagnosis, Explanation, Found, Tried, alike, is_noise, length
+from disctrack.discrepancy.search import (
+    CLASS_GAIN,
+    FAR,
+    WIDTH,
+    Diagnosis,
+    Explanation,
+    Found,
+    Tried,
+    alike,
+    is_noise,
+    length,
+)
 from disctrack.discrepancy.system import Candidate, Quantity, System, Values
 
 NAME = "learned"  # of the term
@@ -37,8 +48,6 @@ FINE, STRAIGHT = 0.03, 1e4  # of the largest value: the variable's inverse hyper
 SIZES = np.logspace(-4, 2, 31)  # prior sigma of the first amplitudes, over the rms of the equation that it stands in
 FEWEST = 10  # samples of such a stretch
 MOST_LAWS = 40  # that are looked at in any case
-REFITTED = 4  # laws that are fitted in full ...
-MOST_BESIDE = 2  # ... beside each of so many known terms, where none describes the data by itself
 WORTH = 50.0  # of -2 log evidence to first order: a law that is so much worse than another is not fitted ...
 ROUGHLY = 4.0  # ... times that of the other, where the declared equations are far from the data
 PLAUSIBLE = 4.0  # the same, by which a rougher law may be less probable than the best one
@@ -100,8 +109,8 @@ class LearnedForce(WithForce):
 
     @property
     def is_shorter(self) -> bool:
-        """Than the known terms that come nearest to the data?"""
-        return self.length < self.instead.length
+        """Than the known terms that come nearest? Of two that the data do not tell apart, what is known is named."""
+        return self.length < self.instead.length - CLASS_GAIN
 
     def document(self) -> dict[str, Any]:
         """Its course in JSON's types, with the names of what describes the data too."""
@@ -188,7 +197,7 @@ class _Competition:
         tried = sorted(d.tried, key=lambda t: -(t.score if t.gain is None else t.gain))
         named = [*(f.candidate.name for f in d.found), *(c.name for c in d.partial), *(t.candidate.name for t in tried)]
         own = {c.name: c for c in self.system.candidates}
-        return [own[name] for name in dict.fromkeys(named) if name in own][:MOST_BESIDE]
+        return [own[name] for name in dict.fromkeys(named) if name in own][:WIDTH]
 
     def is_worth_telling(self, law: LearnedForce) -> bool:
         """Does it describe the data, or nearly all of what is missing, and samples that it has not seen as well?
@@ -326,8 +335,7 @@ class _Competition:
         part = sorted(_part_of_law(there.formulas, law, there.held))
         names = [*(q.name for q in own), *part]
         force, columns = _course(there, law, names, fitted.values, x)
-        at = [fitted.shared.index(n) for n in names]
-        variance = np.einsum("ij,jk,ik->i", columns, fitted.covariance[np.ix_(at, at)], columns)
+        variance = np.einsum("ij,jk,ik->i", columns, fitted.amounts(names)[1], columns)
         # waves finer than those that are fitted go on as the inverse square of their number
         finer = HARMONICS / 6.0 * own[HARMONICS].prior_sigma ** 2
         sigma = np.sqrt(max(self.noise, fitted.reduced_chi_square) * np.maximum(variance, 0.0) + self.noise * finer)

@@ -24,7 +24,7 @@ from disctrack.discrepancy.noise import (
     without_memory,
 )
 from disctrack.discrepancy.score import Linearisation
-from disctrack.discrepancy.search import NOT_CONVERGED, Diagnosis, Former, Settings, explain, with_shapes
+from disctrack.discrepancy.search import NOT_CONVERGED, WIDTH, Diagnosis, Former, Settings, explain, with_shapes
 from disctrack.discrepancy.significance import wald
 from disctrack.discrepancy.system import Candidate, System, Values
 from disctrack.errors import AnalysisError
@@ -39,7 +39,6 @@ FORGOTTEN = float(np.arccos(np.exp(-1.0)) / (2 * np.pi))  # of its turn, after w
 SAFE = 0.5  # of the time over which the model can be made to follow: near its end chi-square is full of minima
 SCANNED = 8  # values along the motion that are tried for a limit
 NEARLY = 0.2  # of the excess chi-square: what leaves less is named as the nearest description of what no term is
-MOST_LED = 2  # terms with which a fit is led anew over growing windows
 STANDS = 8  # samples of the same largest or least value, above which a sensor stands at a limit
 ERROR_THAT_LASTS = "sigmas are those of what is left"  # note of an error that no term describes
 USUAL_SHARE = 0.1  # of the rms of the motion's own forces: a term of that size would surprise nobody
@@ -149,7 +148,7 @@ def _searched(
         # of an arm that friction stops, no step leads from a motion without end to the instant at which it stops
         stuck = [t for t in diagnosis.tried if t.gain is not None and t.reason == NOT_CONVERGED]
         names = [t.candidate.name for t in sorted(stuck, key=lambda t: -t.score)]
-        if ways := _leading(system, guessed(system)[0], names[:MOST_LED]):
+        if ways := _leading(system, guessed(system)[0], names[:WIDTH]):
             diagnosis = explain(system, diagnosis.before.values, settings, system.training, ways)
     sharper = _sharp_enough(system, diagnosis.after)
     if sharper is system:
