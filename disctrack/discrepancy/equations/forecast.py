@@ -48,7 +48,7 @@ def free_run(system: EquationSystem, fitted: Fit, samples: Samples, left: Array,
     alone = system.with_(stretches=[replace(samples, sigma=np.broadcast_to(left, samples.data.shape))])
     values, states = dict(fitted.values), [q for q in alone.base if q.is_initial]
     numbers = [n for n in fitted.shared if n in alone.names_of(samples)]
-    covariance = _of(fitted, numbers)
+    covariance = fitted.amounts(numbers)[1]
     by_state, spread, follows = [], np.zeros((0, 0)), np.zeros((0, len(numbers)))
     if window > 0 and states:
         n = int(np.searchsorted(samples.time, window, side="right"))
@@ -61,7 +61,7 @@ def free_run(system: EquationSystem, fitted: Fit, samples: Samples, left: Array,
         start = fit(seen, loose, values | begun)
         values, spread, by_state = values | start.values, start.covariance, [q.name for q in states]
         numbers = [n for n in numbers if n not in by_state]
-        covariance = _of(fitted, numbers)
+        covariance = fitted.amounts(numbers)[1]
         residual, J = seen.linearise(values, [*by_state, *numbers])
         J = J.reshape(-1, J.shape[-1])
         # one step more: where the band is wide, a fit ends before it has reached the minimum
@@ -96,8 +96,3 @@ def scored(found: Forecast, samples: Samples, channels: tuple[str, ...], since: 
         within = np.abs(left) <= TWO_SIDED * found.sigmas[name][rows]
         scores[name] = RunScore(float(np.sqrt(np.mean(left**2))), float(np.mean(within)), int(rows.sum()))
     return scores
-
-
-def _of(fitted: Fit, names: list[str]) -> Array:
-    index = [fitted.shared.index(n) for n in names]
-    return fitted.covariance[np.ix_(index, index)]

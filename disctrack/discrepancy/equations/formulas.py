@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property, lru_cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import sympy
@@ -22,14 +22,6 @@ OWN = "own_"  # before the name of a term's parameter, in its formulas: not the 
 _t = sympy.Symbol("t", real=True)
 
 
-class Number(NamedTuple):
-    """A number that a fit may move."""
-
-    symbol: sympy.Symbol
-    parameter: Parameter
-    term: str = ""  # whose it is; empty: of the equations
-
-
 class Formulas:
     """Symbols of everything, with all terms added; compiled when first asked for.
 
@@ -44,8 +36,9 @@ class Formulas:
         self.constants, own = _symbols(equations.constants), _symbols(equations.parameters)
         self.states, self.inputs = tuple(states.values()), tuple(inputs.values())
         self.input_rates = tuple(input_rates.values())
-        # by name of the quantity
-        self.fitted = {name: Number(own[name], _parameter(p)) for name, p in equations.parameters.items()}
+        # numbers that a fit may move, by name of the quantity: symbol, what was declared, and the term whose it is
+        self.fitted, self.owner = dict(own), dict.fromkeys(own, "")
+        self.declared = {name: _parameter(p) for name, p in equations.parameters.items()}
         still = {"t": _t, **input_rates, **self.constants, **own}
         self._numbers = {**self.constants, **own}  # of what does not move
         self._still, self._words = still, {**still, **states, **inputs}
@@ -78,9 +71,11 @@ class Formulas:
         here, mine = f"term {term.name}", {name: _symbol(f"{prefix}{name}") for name in term.parameters}
         for name, p in term.parameters.items():
             checked_name(name, f"parameter of term {term.name}")
-            self.fitted[f"{term.name}.{name}"] = Number(mine[name], _parameter(p), term.name)
+            quantity = f"{term.name}.{name}"
+            self.fitted[quantity], self.declared[quantity] = mine[name], _parameter(p)
+            self.owner[quantity] = term.name
             if isinstance(p, Parameter) and p.along:
-                self.along[f"{term.name}.{name}"] = parsed(p.along, self._words, f"{here}, {name} along")
+                self.along[quantity] = parsed(p.along, self._words, f"{here}, {name} along")
         marked = {f"{OWN}{name}": s for name, s in mine.items()}
         written = [*term.rates.values(), *term.observed.values(), *term.lag.values(), term.clock]
         # where a term says which numbers are its own, other names are the equations'
@@ -117,7 +112,7 @@ class Formulas:
     @cached_property
     def numbers(self) -> list[sympy.Symbol]:
         """Symbols of p."""
-        return [*(n.symbol for n in self.fitted.values()), *self.constants.values(), *self.widths.values()]
+        return [*self.fitted.values(), *self.constants.values(), *self.widths.values()]
 
     @cached_property
     def rhs(self) -> Any:
@@ -151,7 +146,7 @@ class Formulas:
         targets += [
             (f"{by_state}[{i}, {j}]", e.diff(y)) for i, e in enumerate(formulas) for j, y in enumerate(self.states)
         ]
-        fitted = [n.symbol for n in self.fitted.values()]
+        fitted = list(self.fitted.values())
         for i, e in enumerate(formulas):
             targets += [(f"{by_number}[{i}, {j}]", self._by_number(e, s)) for j, s in enumerate(fitted)]
         arrays = [("y_", self.states), ("p_", self.numbers), ("u_", self.inputs), ("u_rates_", self.input_rates)]
@@ -184,7 +179,7 @@ class Formulas:
     @cached_property
     def lateness(self) -> Any:
         """(t (m,), p) -> true minus written instant (w, m) and its derivatives (w, n_fitted, m); NumPy."""
-        fitted = [n.symbol for n in self.fitted.values()]
+        fitted = list(self.fitted.values())
         flat = [*self.late, *(e.diff(s) for e in self.late for s in fitted)]
         function = sympy.lambdify((_t, self.numbers), flat, "numpy")
 
@@ -210,7 +205,7 @@ class Formulas:
 
     def defaults(self) -> dict[str, float]:
         """Declared values of all numbers; the widths of jumps are 1 until they are known."""
-        found = {name: n.parameter.value for name, n in self.fitted.items()} | dict(self.equations.constants)
+        found = {name: p.value for name, p in self.declared.items()} | dict(self.equations.constants)
         return found | {s.name: 1.0 for s in self.widths.values()}
 
 

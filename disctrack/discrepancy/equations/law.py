@@ -453,8 +453,8 @@ def _part_of_law(f: Formulas, law: Along, held: Sequence[str]) -> set[str]:
     elsewhere = set().union(*(e.free_symbols for e in forces))
     driving = {s.name for s in (*f.states, *f.inputs, *f.input_rates)} | {"t"}
     found = set()
-    for name, (symbol, parameter, term) in f.fitted.items():
-        if term or parameter.per or name in held or symbol in elsewhere:
+    for name, symbol in f.fitted.items():
+        if f.owner[name] or f.declared[name].per or name in held or symbol in elsewhere:
             continue
         acts = f.forces[here].diff(symbol)
         if acts != 0 and {s.name for s in acts.free_symbols} & driving <= {law.variable}:
@@ -473,7 +473,7 @@ def _course(system: EquationSystem, law: Along, names: Sequence[str], values: Va
         pieces = np.zeros((len(s.pieces), 5, len(x)))
         pieces[list(f.equations.inputs).index(law.variable), 3] = x
         s = replace(s, knots=np.arange(len(x) + 1.0), pieces=pieces)
-    declared = {name: f.fitted[name].parameter.value for name in names}
+    declared = {name: f.declared[name].value for name in names}
     here = f.equations.states.index(law.equation)
     (now, _, by_number), (before, *_) = (
         f.rates_at(s, system.numbers({**values, **changed}, s), times, states) for changed in ({}, declared)

@@ -176,13 +176,13 @@ def _aimed(system: EquationSystem, values: Mapping[str, float]) -> EquationSyste
             found = f.scanned(s.time, list(motion.states.T), p, system.inputs_of(s))
             passed.append([np.broadcast_to(x, s.time.shape) for x in found])
     best: dict[str, tuple[float, dict[str, float]]] = {}
-    amounts = [c for c in system.candidates if any(f.fitted[n].term == c.name for n in f.along)]
+    amounts = [c for c in system.candidates if any(f.owner[n] == c.name for n in f.along)]
     here = no_fit(system.base, values)
     for share in (np.arange(SCANNED) + 0.5) / SCANNED:
         tried = {}
         for i, name in enumerate(f.along):
             value = float(np.nanquantile(np.concatenate([x[i] for x in passed]), share))
-            bounds = f.fitted[name].parameter
+            bounds = f.declared[name]
             tried[name] = float(np.clip(value, bounds.lower, bounds.upper))
         there = system.with_(aims=tried)
         if not np.isfinite(there.linearise(values, [n for c in amounts for n in c.names])[1]).all():
@@ -191,7 +191,7 @@ def _aimed(system: EquationSystem, values: Mapping[str, float]) -> EquationSyste
         for c in amounts:
             gain, there_best = linear.gain_of(c.names)
             if gain > best.get(c.name, (0.0, {}))[0]:
-                limits = {n: v for n, v in tried.items() if f.fitted[n].term == c.name}
+                limits = {n: v for n, v in tried.items() if f.owner[n] == c.name}
                 best[c.name] = gain, limits | dict(zip(c.names, there_best.tolist(), strict=True))
     return system.with_(aims={n: v for _, aims in best.values() for n, v in aims.items()})
 
@@ -260,8 +260,8 @@ def _sized(system: EquationSystem, values: Mapping[str, float]) -> EquationSyste
         return system
     sizes = np.maximum(np.max([np.abs(m.states).max(axis=0) for _, m in found], axis=0), 1e-9 * system.sizes)
     system = system.with_(sizes=sizes, widths=_widths(system, [(s, m.states) for s, m in found]))
-    of_terms = {name for name, number in system.formulas.fitted.items() if number.term}
-    typical = {name: USUAL_SHARE * size for name, size in sizes_alike(system, values).items() if name in of_terms}
+    found_alike = sizes_alike(system, values)
+    typical = {name: USUAL_SHARE * size for name, size in found_alike.items() if system.formulas.owner[name]}
     return system.with_(typical=typical)
 
 

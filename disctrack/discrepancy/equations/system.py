@@ -72,7 +72,7 @@ class EquationSystem(System):
             self.training[rows] = fitted_rows(s)
         self._w = w
         self._defaults = formulas.defaults() | self.widths | self._limits()
-        self._per = {name: n.parameter.per for name, n in formulas.fitted.items() if n.parameter.per}
+        self._per = {name: p.per for name, p in formulas.declared.items() if p.per}
         self.base = tuple(self._base())
         self.candidates = tuple(self._candidate(t) for t in formulas.terms if t.name not in self.promoted)
 
@@ -92,7 +92,8 @@ class EquationSystem(System):
                     q = Quantity(f"state.{name}[{s.name}]", unit, 1e-3 * size, value, prior_sigma=sigma,
                                  meaning="at the first sample")  # fmt: skip
                     found.append(replace(q, slot=f"state.{name}[{EACH}]", block=i) if several else q)
-        for name, (_, p, term) in self.formulas.fitted.items():
+        for name, p in self.formulas.declared.items():
+            term = self.formulas.owner[name]
             if name in self.held or (p.shape and name not in self.aims) or (term and term not in self.promoted):
                 continue
             found += self._with_slots(name, self._quantities(name)) if several else self._quantities(name)
@@ -111,11 +112,11 @@ class EquationSystem(System):
         ]
 
     def _quantities(self, name: str) -> list[Quantity]:
-        _, p, term = self.formulas.fitted[name]
+        p = self.formulas.declared[name]
         scale = 1e-3 * abs(p.value) or 1e-3 * self.typical.get(name, 1.0)
         typical = p.typical or self.typical.get(name, np.inf)
         names = list(dict.fromkeys(self._name(name, s) for s in self.stretches))
-        declared = None if term else p.value
+        declared = None if self.formulas.owner[name] else p.value
         null = self._limits().get(name, p.value)
         return [
             Quantity(n, p.unit, scale, null, p.lower, p.upper, p.sigma, p.meaning, typical, declared=declared)
@@ -132,7 +133,7 @@ class EquationSystem(System):
         return f"{name}[{s.groups[kind]}]"
 
     def _candidate(self, term: Term) -> Candidate:
-        own = {name: n.parameter for name, n in self.formulas.fitted.items() if n.term == term.name}
+        own = {name: p for name, p in self.formulas.declared.items() if self.formulas.owner[name] == term.name}
         aimed = [n for n in own if n in self.aims]
         amounts = tuple(q for n, p in own.items() if not p.shape or n in aimed for q in self._quantities(n))
         shape = tuple(q for n, p in own.items() if p.shape and n not in aimed for q in self._quantities(n))
