@@ -511,6 +511,8 @@ def with_law(diagnosis: Diagnosis, law: LearnedForce) -> Diagnosis:
     Where more than noise is left, it is the nearest description; so is a function of time alone, which any motion has.
     """
     level = f"{law.fit.reduced_chi_square:.3g} per degree of freedom at a noise of {diagnosis.noise:.3g}"
+    ranked = sorted((*diagnosis.ranked, law), key=lambda e: e.length)
+    diagnosis = replace(diagnosis, ranked=tuple(ranked), length=law.length)
     if not law.at_noise or law.along.variable == "t":
         reason = (
             f"chi-square stays at {diagnosis.before.reduced_chi_square:.3g}, with a law that was learned at {level}"
@@ -518,12 +520,12 @@ def with_law(diagnosis: Diagnosis, law: LearnedForce) -> Diagnosis:
         tried = tuple(_instead(t, ()) for t in diagnosis.tried)
         return replace(
             diagnosis, verdict="unexplained", reason=reason, found=(), after=diagnosis.before, tried=tried,
-            held_out_after=diagnosis.held_out_before, partial=(*law.beside, law.candidate), nearest=law.fit,
+            held_out_after=diagnosis.held_out_before, partial=law.candidates, nearest=law.fit,
         )  # fmt: skip
     assert diagnosis.held_out_before is not None
     held_gain = law.held_out.gain_over(diagnosis.held_out_before, diagnosis.noise)
     gain = (diagnosis.before.cost - law.fit.cost) / diagnosis.noise
-    found = tuple(Found(c, gain, held_gain, 0.0, ()) for c in (*law.beside, law.candidate))
+    found = tuple(Found(c, gain, held_gain, 0.0, ()) for c in law.candidates)
     own = Tried(law.candidate, gain, gain, held_gain, "chosen")
     tried = (own, *(_instead(t, law.beside) for t in diagnosis.tried))
     return replace(

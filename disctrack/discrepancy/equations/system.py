@@ -1,4 +1,4 @@
-"""Equations and runs as a system that `diagnosis.engine` can diagnose."""
+"""Equations and runs as a system that `discrepancy.search` can diagnose."""
 
 from __future__ import annotations
 

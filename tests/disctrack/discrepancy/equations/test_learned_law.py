@@ -133,6 +133,7 @@ def test_the_law_is_told_on_the_page_and_in_json(tmp_path):
     answer = diagnose(OSCILLATOR, recorded(lambda x, v, t: force(v), seed=15), [terms.coulomb("v")])
     assert "a force on v that is a function of v" in " ".join(str(answer).split())
     assert f"{NAME}.a3" not in str(answer)
+    assert answer.diagnosis.explanations[0] == ((NAME,), 0.0)  # one of the list
     told, page = answer.write(tmp_path)
     law = json.loads(told.read_text())["law"]
     assert law["variable"] == "v"
