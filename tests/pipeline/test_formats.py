@@ -97,30 +97,6 @@ def test_poses_from_lossless_files_of_8_bit_are_those_from_png(recording, from_p
         assert read_details(found)["camera_headers"]["left"]["first_frame"] == -5
 
 
-@pytest.mark.parametrize(
-    ("suffix", "factor", "write"),
-    [
-        ("mkv", 16, partial(write_video, pixels="gray12le", codec="ffv1")),
-        ("cine", 257, partial(write_cine, bits=16, rate=1000, exposure_ns=0)),
-    ],
-)
-def test_poses_do_not_depend_on_the_unit_of_grey(recording, from_png, suffix, factor, write):
-    """The same picture in another unit; rounding to 1/16 of a PNG's grey value leaves no trace."""
-    for camera in CAMERAS:
-        write(recording / f"{camera}.{suffix}", grey_values(recording / camera).astype(np.uint16) * factor)
-    use_files(recording, f"left.{suffix}", f"right.{suffix}")
-    found = read_trajectory(run(recording))
-    assert (np.abs(found.q - from_png.q) <= 1e-5 * from_png.coordinate_sigma).all()
-
-
-def test_packed_pixels_of_12_bit_are_the_same_picture(recording, from_png_of_50_us):
-    for name in CAMERAS:
-        write_mraw(recording / name, grey_values(recording / name).astype(np.uint16) << 4, 12, **OURS)
-    use_files(recording, "left.cih", "right.mraw")
-    found = read_trajectory(run(recording))
-    assert (np.abs(found.q - from_png_of_50_us.q) <= 1e-5 * from_png_of_50_us.coordinate_sigma).all()
-
-
 def test_the_exposure_moves_poses_by_what_it_should(from_png, from_png_of_50_us):
     """Theta by g T^2 / (6 r) while the disc rolls (exposure.py), within what a nutation of 0.04 deg changes."""
     moved = from_png_of_50_us.q[:, 4] - from_png.q[:, 4]

@@ -1,13 +1,11 @@
 """Falling balls: drag is found, its form is told where the heights are good enough, and only there."""
 
-import json
-
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
 from disctrack.discrepancy.noise import SampleStretch, SmoothNoise, estimate
-from disctrack.examples.ball_drop import DRAGS, GRAVITY, OTHERS, analyse_drops, ask, drop, main, read_drops
+from disctrack.examples.ball_drop import DRAGS, GRAVITY, OTHERS, analyse_drops, ask, drop, read_drops, report
 
 TIME = np.arange(45) / 15.0
 BALLS = {"foam": 0.0405, "rubber": 0.038, "lead": 0.00047}  # deceleration over v^2 [1/m]
@@ -92,6 +90,7 @@ def test_the_drag_of_these_balls_is_certain_and_its_form_is_not_identifiable(ans
     assert answer.together.diagnosis.after.reduced_chi_square == pytest.approx(1.10, abs=0.02)
     assert not answer.identifiable
     assert {effects[0] for effects in answer.undecided} == {"linear_drag", "quadratic_drag"}
+    assert "not identifiable" in report(answer).verdict
     # a constant deceleration is refused, and with an undistorted camera the quadratic law too
     assert answer.forms["constant_drag",] > 100
     assert answer.forms["quadratic_drag",] > 50
@@ -131,20 +130,3 @@ def test_shuffled_residuals_of_the_balls_give_no_finding(answer, rng):
         ball, _, number = stretch.run.partition(",")
         shuffled.append(drop(ball, int(number), stretch.time, fall_alone + L @ rng.permutation(white)))
     assert not ask(shuffled, answer.noise, (*DRAGS, *OTHERS)).found
-
-
-@pytest.mark.statistical
-def test_command_writes_the_diagnosis_and_a_page(shared_data, tmp_path, capsys, monkeypatch, answer):
-    monkeypatch.setattr("disctrack.examples.ball_drop.analyse_drops", lambda drops: answer)
-    words = [str(shared_data / "ball_drop"), "-o", str(tmp_path)]
-    assert main(words) == 0
-    assert "not identifiable" in " ".join(capsys.readouterr().out.split())
-    found = json.loads((tmp_path / "diagnosis.json").read_text())
-    assert {"verdict", "effects", "before", "after", "tried", "identifiable"} <= set(found)
-    assert len(found["effects"]) == 1
-    assert len(found["cannot_be_told_apart"]) > 1
-    assert (tmp_path / "all balls" / "diagnosis.html").stat().st_size > 10_000
-    assert main(words) == 1  # an earlier result is kept
-    assert "exists" in capsys.readouterr().err
-    assert main([str(tmp_path)]) == 1
-    assert "ball_drops.csv" in capsys.readouterr().err

@@ -59,15 +59,6 @@ def test_motion_file_holds_the_motion_with_units(scene, tmp_path):
     assert list(tmp_path.glob("*.part")) == []
 
 
-def test_motion_file_opens_in_xarray(scene, tmp_path):
-    xarray = pytest.importorskip("xarray")
-    pytest.importorskip("h5netcdf")
-    run = run_simulate(scene, tmp_path / "motion.h5", duration=0.02, rate=2000)
-    with xarray.open_dataset(run.path, engine="h5netcdf") as data:
-        assert dict(data.sizes)["time"] == 41
-        assert data.theta.attrs["units"] == "rad"
-
-
 def test_a_motion_that_ends_gives_a_shorter_file_with_the_reason(scene, tmp_path):
     scene.write_text(SCENE.replace("theta_deg = 8", "theta_deg = 0.8"))
     run = run_simulate(scene, tmp_path / "motion.h5", duration=1.0)

@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 import tifffile
 from PIL import Image
+from tifffile import COMPRESSION
 
 from disctrack.errors import RecordingError
 from disctrack.recording.readers import open_frames
 from disctrack.recording.readers._unpack_kernels import lzw_codes_follow
 from disctrack.recording.readers.decoding import decode
-
-LZW, DEFLATE = 5, 8
 
 
 def ours(content):
@@ -49,7 +48,7 @@ def test_pages_of_other_writers_come_back_in_this_machines_order_of_bytes(name, 
     pixels = picture(name, bits)
     for predictor in (1, 2):
         contents = []
-        for code in (LZW, DEFLATE, 1):
+        for code in (COMPRESSION.LZW, COMPRESSION.ADOBE_DEFLATE, COMPRESSION.NONE):
             words = [cv2.IMWRITE_TIFF_COMPRESSION, code, cv2.IMWRITE_TIFF_PREDICTOR, predictor]
             contents.append(cv2.imencode(".tif", pixels, words)[1].tobytes())
         for kind in ("tiff_lzw", "tiff_adobe_deflate"):
@@ -70,7 +69,7 @@ def test_pages_of_other_writers_come_back_in_this_machines_order_of_bytes(name, 
 @pytest.mark.parametrize("name", ["noise", "flat", "disc"])
 def test_damaged_codes_give_what_libtiff_makes_of_them_or_an_error(name):
     rng = np.random.default_rng(8)
-    whole = cv2.imencode(".tif", picture(name, 8), [cv2.IMWRITE_TIFF_COMPRESSION, LZW])[1].tobytes()
+    whole = cv2.imencode(".tif", picture(name, 8), [cv2.IMWRITE_TIFF_COMPRESSION, COMPRESSION.LZW])[1].tobytes()
     refused = 0
     for _ in range(300):
         content = bytearray(whole)
