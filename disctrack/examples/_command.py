@@ -3,7 +3,6 @@
 import argparse
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 
 from disctrack.discrepancy.document import document, tables
@@ -16,13 +15,10 @@ from disctrack.report import blocks
 from disctrack.report.blocks import Report, Section
 from disctrack.report.terminal import full
 
-
-@dataclass(frozen=True)
-class Outcome:
-    """What an example has to say."""
-
-    report: Report  # its document is diagnosis.json
-    answers: Mapping[str, Answer] = field(default_factory=dict)  # each on a page of its own, in a folder of this name
+GRAVITY = 9.81  # [m/s^2] as declared
+# What an example has to say: a report, whose document is diagnosis.json, and answers, each on a page of its own in a
+# folder of that name
+Outcome = tuple[Report, Mapping[str, Answer]]
 
 
 def report_of(
@@ -58,12 +54,12 @@ def command(name: str, data: str | None, diagnose: Callable[..., Outcome], words
     try:
         if given.output is not None:
             refuse_existing(given.output / "diagnosis.json", given.overwrite)
-        outcome = diagnose() if data is None else diagnose(given.folder)
-        print("\n".join(full(outcome.report)))
+        report, answers = diagnose() if data is None else diagnose(given.folder)
+        print("\n".join(full(report)))
         if given.output is not None:
-            for where, answer in outcome.answers.items():
+            for where, answer in answers.items():
                 answer.write(given.output / where, given.overwrite)
-            write_whole(given.output / "diagnosis.json", json_file(blocks.document(outcome.report)))
+            write_whole(given.output / "diagnosis.json", json_file(blocks.document(report)))
     except DiscTrackError as error:
         print(f"{name}: {error}", file=sys.stderr)
         return 1

@@ -24,11 +24,10 @@ from disctrack.discrepancy.noise import SampleStretch, estimate
 from disctrack.discrepancy.search import CLASS_GAIN, Settings
 from disctrack.discrepancy.significance import price_of_a_number
 from disctrack.errors import AnalysisError
-from disctrack.examples._command import Outcome, command, needed
+from disctrack.examples._command import GRAVITY, Outcome, command, needed
 from disctrack.numbers import rounded, score
 from disctrack.report.blocks import Listing, Report, Section
 
-GRAVITY = 9.81  # [m/s^2] as declared
 ACCELERATION_DEGREE = 4  # of the polynomial in time that all drops of a ball share: any drag, to 1 mm
 SEEN = 1.2  # [s] of a second drop from which the rest is predicted, as in the published comparison
 FALL = Equations(
@@ -211,7 +210,7 @@ def report(answer: BallAnswer) -> Report:
 def example(folder: Path) -> Outcome:
     """What does gravity alone lack for falling balls, and is its law identifiable?"""
     answer = analyse_drops(read_drops(folder))
-    return Outcome(report(answer), {"all balls": answer.together})
+    return report(answer), {"all balls": answer.together}
 
 
 main = partial(command, "ball_drop", "ball_drops.csv", example)

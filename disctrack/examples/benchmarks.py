@@ -173,7 +173,7 @@ def example(folder: Path) -> Outcome:
         raise AnalysisError(f"{folder}: no benchmark is there. Wanted are the files of at least one: {wanted}.")
     header = ("", "error of the test", "best published", "within 95 % band", "processor", "missing")
     said = "The test parts are foretold by free runs; their first samples tell how they begin."
-    return Outcome(Report("Public benchmarks", said, blocks=[Listing(header, rows)], data=data), answers)
+    return Report("Public benchmarks", said, blocks=[Listing(header, rows)], data=data), answers
 
 
 main = partial(command, "benchmarks", "the files of at least one benchmark", example)

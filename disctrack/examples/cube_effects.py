@@ -6,9 +6,9 @@ import numpy as np
 
 from calibration.kit.arrays import Array
 from disctrack.discrepancy.system import Candidate, Quantity
+from disctrack.examples._command import GRAVITY
 from disctrack.examples.cube_data import HALF_WIDTH, Flight, Toss
 
-GRAVITY = 9.81  # [m/s^2] as declared
 REST = 8  # last samples of a toss
 AT_REST = (0.03, np.cos(np.radians(1.5)))  # [half widths] about the resting height, and cosine of a face's tilt
 UP = np.array([0.0, 0.0, 1.0])

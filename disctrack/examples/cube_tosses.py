@@ -27,7 +27,7 @@ from disctrack.discrepancy.search import Diagnosis, Settings, explain
 from disctrack.discrepancy.system import Quantity, System, Values
 from disctrack.discrepancy.words import effect_text
 from disctrack.errors import AnalysisError
-from disctrack.examples._command import Outcome, command, report_of
+from disctrack.examples._command import GRAVITY, Outcome, command, report_of
 from disctrack.examples.cube_data import (
     FRAME_RATE,
     HALF_WIDTH,
@@ -37,7 +37,7 @@ from disctrack.examples.cube_data import (
     read_tosses,
     without_copies,
 )
-from disctrack.examples.cube_effects import GRAVITY, candidates, flown, rested
+from disctrack.examples.cube_effects import candidates, flown, rested
 from disctrack.numbers import rounded
 from disctrack.report.blocks import Listing, Section
 
@@ -213,7 +213,7 @@ def example(folder: Path) -> Outcome:
     )
     blocks = [Section("Every third toss, held out", [Listing(("", "before", "after", "white noise"), rows, tosses)])]
     model = f"g = {GRAVITY} m/s^2, uniform cube, {FRAME_RATE:g} Hz, half width {HALF_WIDTH} m"
-    return Outcome(report_of(d, model, said, blocks, [{"rms": before}, {"rms": after}]))
+    return report_of(d, model, said, blocks, [{"rms": before}, {"rms": after}]), {}
 
 
 main = partial(command, "cube_tosses", "cube_tosses.npz", example)

@@ -7,7 +7,7 @@ phase differs from trial to trial, so that it enters the mean of a series to sec
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -15,9 +15,9 @@ from scipy.interpolate import CubicSpline
 from calibration.kit.arrays import Array
 from disctrack.disc import MA_2014, Disc
 from disctrack.discrepancy.system import Candidate, Quantity
+from disctrack.examples._command import GRAVITY
 from disctrack.rolling import EndReason, Model, simulate, steady_precession
 
-GRAVITY = 9.81  # [m/s^2]
 FRAME = 1e-3  # [s] between pairs of the paper's cameras
 SAMPLING = 2e-3  # [s] of the simulation; a cubic spline then follows the last nutations read to 1e-4
 SHORTEST = float(np.exp(-3))  # [s] time left where the curves of the paper's figures 14 to 16 end
@@ -29,14 +29,16 @@ OUTCOMES = ("n_theta", "n_psidot", "n_energy", "ln_duration")
 
 
 @dataclass(frozen=True)
-class Setup:
-    """One series of trials: what rolls where, and which part of the record is fitted."""
+class Series:
+    """Trials on one surface: what rolls where, which part of the record is fitted, and what was found."""
 
     surface: str
     k_m: float  # [m s^2] of the paper's model
     longest: float  # [s] longest time left in the fit
     start: float  # [rad] nutation at which the simulation begins
     disc: Disc = MA_2014
+    exponents: Array = field(default_factory=lambda: np.zeros((0, 3)))  # (n, 3) n_theta, n_psidot, n_energy
+    ln_duration: float = np.nan  # of the last stage, from that nutation on
 
 
 def _wrong(
@@ -64,19 +66,19 @@ READING = (
 
 
 class LastStage:
-    """The motion of one setup from its start nutation to collapse."""
+    """The motion of one series from its start nutation to collapse."""
 
-    def __init__(self, setup: Setup, values: Mapping[str, float], omega3: float = 0.0) -> None:
+    def __init__(self, series: Series, values: Mapping[str, float], omega3: float = 0.0) -> None:
         """Simulate. values : parameters of effects by "effect.parameter"; omega3 [rad/s] at the start."""
-        self.setup = setup
-        model = Model(setup.disc, GRAVITY).with_values(dict(values))
-        state = steady_precession(setup.start, setup.disc, GRAVITY, omega3=omega3)
-        motion = simulate(model, state, MAX_DURATION, rate=1 / SAMPLING, theta_end=END_SHARE * setup.start, rtol=RTOL)
-        curves = _observed(motion.q, motion.qdot, setup)
+        self.series = series
+        model = Model(series.disc, GRAVITY).with_values(dict(values))
+        state = steady_precession(series.start, series.disc, GRAVITY, omega3=omega3)
+        motion = simulate(model, state, MAX_DURATION, rate=1 / SAMPLING, theta_end=END_SHARE * series.start, rtol=RTOL)
+        curves = _observed(motion.q, motion.qdot, series)
         # a strong moment can stop the precession in the very last milliseconds; what is read lies before
         n = int(np.argmin(np.append(np.isfinite(curves).all(axis=1), False)))
-        last = motion.time[:n] > motion.end_time - 1.5 * setup.longest
-        long_enough = motion.end_time > setup.longest + SAMPLING and last.sum() > 3
+        last = motion.time[:n] > motion.end_time - 1.5 * series.longest
+        long_enough = motion.end_time > series.longest + SAMPLING and last.sum() > 3
         ended = motion.end is EndReason.NUTATION and long_enough
         self.duration = motion.end_time if ended else float("nan")  # [s] from the start to collapse
         # ln theta, ln psidot, energy against time
@@ -93,10 +95,10 @@ class LastStage:
 
     def _read(self, curve: CubicSpline, reading: Mapping[str, float]) -> tuple[Array, Array, Array, Array]:
         """Time left as the experimenter has it, nutation, precession rate, energy, (n,) each."""
-        setup, disc = self.setup, self.setup.disc
+        series, disc = self.series, self.series.disc
         # a fixed number of instants, so that nothing jumps when a quantity of the fit moves
-        n = round((setup.longest - SHORTEST) / FRAME) + 1
-        left = np.linspace(setup.longest, SHORTEST + reading["cut.shift"], n)
+        n = round((series.longest - SHORTEST) / FRAME) + 1
+        left = np.linspace(series.longest, SHORTEST + reading["cut.shift"], n)
         time = self.duration + reading["t_f.bias"] - left
         half = np.sqrt(max(reading["smoothing.square"], 0.0) / 12)  # two points stand for the mean to third order
         if time[-1] + half > curve.x[-1] or left[-1] <= 0:
@@ -119,9 +121,9 @@ def slope(left: Array, values: Array) -> float:
     return float(x @ np.log(values) / (x @ x))
 
 
-def _observed(q: Array, qdot: Array, setup: Setup) -> Array:
+def _observed(q: Array, qdot: Array, series: Series) -> Array:
     """(n, 3) ln theta, ln psidot and the energy (2.10) [J] with the declared disc, zero at rest."""
-    disc = setup.disc
+    disc = series.disc
     theta, (psidot, thetadot, phidot) = q[:, 4], qdot[:, 3:].T
     spin = psidot * np.cos(theta) + phidot
     energy = 0.5 * disc.mass * np.sum(qdot[:, :3] ** 2, axis=1)

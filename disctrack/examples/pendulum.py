@@ -76,7 +76,7 @@ def example(folder: Path) -> Outcome:
     kept = Section("Rms of measured minus modelled (mrad)", [Listing(("", "before", "after"), rows)])
     told = answer.report()
     data = {**answer.document(), "kept_back_rms_rad": {side: rms[1] for side, rms in left.items()}}
-    return Outcome(replace(told, blocks=[kept, *told.blocks], data=data), {"swing": answer})
+    return replace(told, blocks=[kept, *told.blocks], data=data), {"swing": answer}
 
 
 main = partial(command, "pendulum", "single_free_swing.npz", example)

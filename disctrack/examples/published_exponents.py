@@ -31,8 +31,8 @@ from disctrack.discrepancy.held_out import TRAIN_FRACTION
 from disctrack.discrepancy.search import Diagnosis, Settings, explain
 from disctrack.discrepancy.system import Candidate, Quantity, System, Values
 from disctrack.errors import AnalysisError
-from disctrack.examples._command import Outcome, command, report_of
-from disctrack.examples.exponent_model import GRAVITY, READING, LastStage, Setup
+from disctrack.examples._command import GRAVITY, Outcome, command, report_of
+from disctrack.examples.exponent_model import READING, LastStage, Series
 from disctrack.numbers import measured, probability, rounded, score
 from disctrack.report.blocks import Listing, Section
 from disctrack.rolling import CATALOGUE, Model, effects
@@ -50,20 +50,6 @@ LONGEST = {"steel": 0.5, "glass": 0.3}  # [s] section 4a: time left where the fi
 LAST_STAGE = 1.5  # [s] simulated in section 5c
 STEP = 0.1  # of a quantity's scale, for differences: the simulation is smooth to 1e-8
 _SHARED = ("air", "body")  # modules of effects that do not depend on the surface
-
-
-@dataclass(frozen=True)
-class Series:
-    """Trials on one surface."""
-
-    setup: Setup
-    exponents: Array  # (n, 3) n_theta, n_psidot, n_energy
-    ln_duration: float  # of the last stage, at the start nutation of the setup
-
-    @property
-    def surface(self) -> str:
-        """Where they were made."""
-        return self.setup.surface
 
 
 def sample_covariance(exponents: Array) -> Array:
@@ -84,9 +70,10 @@ def published_series() -> tuple[Series, ...]:
     for surface in SURFACES:
         k_m = K_M[surface]
         start = (k_m * LAST_STAGE) ** (2 / 3) * 4 * GRAVITY / MA_2014.radius ** (5 / 3)
-        setup = Setup(surface, k_m, LONGEST[surface], start=float(start))
-        stage = LastStage(setup, {"km.k_m": k_m}, SPIN_AT_REST)
-        found.append(Series(setup, published_table(surface).exponents[:, ORDER], float(np.log(stage.duration))))
+        exponents = published_table(surface).exponents[:, ORDER]
+        series = Series(surface, k_m, LONGEST[surface], start=float(start), exponents=exponents)
+        stage = LastStage(series, {"km.k_m": k_m}, SPIN_AT_REST)
+        found.append(replace(series, ln_duration=float(np.log(stage.duration))))
     return tuple(found)
 
 
@@ -124,7 +111,7 @@ class ExponentSystem(System):
             q
             for s in self.series
             for q in (
-                Quantity(f"km.k_m@{s.surface}", "m s^2", 1e-3 * s.setup.k_m, lower=0.0, typical=s.setup.k_m),
+                Quantity(f"km.k_m@{s.surface}", "m s^2", 1e-3 * s.k_m, lower=0.0, typical=s.k_m),
                 Quantity(f"{SPIN}@{s.surface}", "rad/s", 0.01, SPIN_AT_REST, prior_sigma=SPIN_SIGMA),
             )
         )
@@ -132,7 +119,7 @@ class ExponentSystem(System):
     @property
     def start(self) -> dict[str, float]:
         """Values from which the base fit begins."""
-        return {q.name: q.null for q in self.base} | {f"km.k_m@{s.surface}": s.setup.k_m for s in self.series}
+        return {q.name: q.null for q in self.base} | {f"km.k_m@{s.surface}": s.k_m for s in self.series}
 
     def linearise(self, values: Values, names: Sequence[str]) -> tuple[Array, Array]:
         """Whitened residual (n, 1) and derivative (n, 1, k) by central differences, one-sided at bounds."""
@@ -162,17 +149,17 @@ class ExponentSystem(System):
 
         Of values that stand with and without the surface in their names the series sees the sum.
         """
-        setup, own = self.series[index].setup, dict[str, float]()
+        series, own = self.series[index], dict[str, float]()
         for name, value in values.items():
             plain, _, surface = name.partition("@")
-            if surface in ("", setup.surface):
+            if surface in ("", series.surface):
                 own[plain] = own.get(plain, 0.0) + value
         spin = own.pop(SPIN, SPIN_AT_REST)
         reading = {q.name: own.pop(q.name) for c in READING for q in c.quantities if q.name in own}
         laws = {name: value for name, value in own.items() if value or name == "km.k_m"}
         key = (index, spin, *sorted(laws.items()))
         if key not in self._stages:
-            self._stages[key] = LastStage(setup, laws, spin)
+            self._stages[key] = LastStage(series, laws, spin)
         return self._stages[key].outcomes(reading)
 
 
@@ -256,9 +243,7 @@ def example() -> Outcome:
     model = "rolling disc with k_m, straight lines through the logarithms in the paper's windows"
     report = report_of(d, model, sentence(system, d), tables_of(system, d))
     source = "Ma, Liu, Zhao and Zhang 2014, Proc. R. Soc. A 470:20140191, tables 2 and 3"
-    return Outcome(
-        replace(report, data={**report.data, "source": source, "cannot_be_told_apart": list(in_question(d))})
-    )
+    return replace(report, data={**report.data, "source": source, "cannot_be_told_apart": list(in_question(d))}), {}
 
 
 main = partial(command, "published_exponents", None, example)

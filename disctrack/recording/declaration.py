@@ -21,8 +21,7 @@ from disctrack.frames import CAMERAS
 from disctrack.recording.readers.part import ImagePart, ImageParts
 
 FILE_NAME = RECORDING_FILE
-MOST_DOTS = 100
-MOST_CELLS = 100  # corners or squares along a side of a target
+MOST = 100  # dots of a disc; corners or squares along a side of a target
 MOST_COLUMNS = 10**6  # [px] of an image
 
 
@@ -60,14 +59,14 @@ def _one_of(*words: str) -> Key:
 
 
 def _counts(what: str, needed: bool = True) -> Key:
-    expected = f"two whole numbers from 1 to {MOST_CELLS}, {what}, e.g. [9, 6]"
-    return Key(expected, lambda value: _whole(value, 2, 1, MOST_CELLS), needed)
+    expected = f"two whole numbers from 1 to {MOST}, {what}, e.g. [9, 6]"
+    return Key(expected, lambda value: _whole(value, 2, 1, MOST), needed)
 
 
 def _are_centres(value: object) -> bool:
     return (
         isinstance(value, list)
-        and 3 <= len(value) <= MOST_DOTS
+        and 3 <= len(value) <= MOST
         and all(isinstance(dot, list) and len(dot) == 2 for dot in value)
         and all(_in_range(x, -_FARTHEST, _FARTHEST) for dot in value for x in dot)
     )
@@ -85,7 +84,7 @@ _PART = Key(
 )
 _VIEW = Key("a whole number from 0 to 100000", lambda value: _whole([value], 1, 0, 100_000), between=(0, 1e5))
 _CENTRES = Key(
-    f"a list of [x, y] pairs, at least 3 and at most {MOST_DOTS} of them, each number from {-_FARTHEST:g} to "
+    f"a list of [x, y] pairs, at least 3 and at most {MOST} of them, each number from {-_FARTHEST:g} to "
     f"{_FARTHEST:g}, e.g. [[26.0, 0.0], [13.0, 22.5], [-13.0, 22.5]]",
     _are_centres,
 )

@@ -219,8 +219,8 @@ def read_group(
 def labelled(trajectory: Trajectory) -> tuple[dict[str, Variable], dict[str, Variable], dict[str, float]]:
     """Variables of the file's root and of its dots (`marker_...`), the axes, and the numbers of the whole recording."""
     dots = {f"marker_{name}": item for name, item in _variables(trajectory, "markers").items()}
-    sizes = _disc_sizes(trajectory.disc)
-    numbers = _recording_numbers(trajectory) | {f"disc_{name}": sizes[name] for name in _DISC_SIZES}
+    sizes = _disc_sizes(trajectory.disc).items()
+    numbers = _recording_numbers(trajectory) | {f"disc_{name}": value for name, value in sizes}
     return _root_variables(trajectory) | dots, _axes(trajectory), numbers
 
 
@@ -366,12 +366,13 @@ def _root_variables(trajectory: Trajectory) -> dict[str, Variable]:
 
 
 # Attributes of the group `disc`: a field of Disc and its unit; tolerances where they are declared
-_DISC_SIZES = ("radius_m", "half_thickness_m", "mass_kg", "marker_diameter_m")
-_TOLERANCES = ("radius_tolerance_m", "thickness_tolerance_m")
+_DISC_SIZES = (
+    "radius_m", "half_thickness_m", "mass_kg", "marker_diameter_m", "radius_tolerance_m", "thickness_tolerance_m"
+)  # fmt: skip
 
 
 def _disc_sizes(disc: Disc) -> dict[str, float]:
-    sizes = {name: getattr(disc, name.rpartition("_")[0]) for name in (*_DISC_SIZES, *_TOLERANCES)}
+    sizes = {name: getattr(disc, name.rpartition("_")[0]) for name in _DISC_SIZES}
     return {name: value for name, value in sizes.items() if value is not None}
 
 
@@ -460,11 +461,7 @@ def _check_units(file: h5py.File) -> None:
 
 
 def _read_disc(group: h5py.Group) -> Disc:
-    sizes = {
-        name.rpartition("_")[0]: float(group.attrs[name])
-        for name in (*_DISC_SIZES, *_TOLERANCES)
-        if name in group.attrs
-    }
+    sizes = {name.rpartition("_")[0]: float(group.attrs[name]) for name in _DISC_SIZES if name in group.attrs}
     return Disc(marker_centres_body=read_variables(group)["marker_centres_body"], **sizes)
 
 

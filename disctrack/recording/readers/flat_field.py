@@ -28,7 +28,6 @@ ODD = 0.5  # relative, by which a dead pixel's answer to light differs from its 
 MOST_DEAD = 0.01  # of all pixels: more, and it is the flat image that is wrong
 MOST_SATURATED = 0.002  # of all pixels: more is no matter of single hot ones
 LEAST_LIGHT = 0.1  # of full scale: a flat that is darker tells gains worse than they differ
-FULL_SCALE = 65535  # [grey] of corrected frames
 ENOUGH = 10  # images averaged, from which on the flat's own noise (1 % of one image) is below usual patterns
 
 
@@ -52,7 +51,7 @@ class FlatField:
         signal = cv2.subtract(image, self.dark, dtype=cv2.CV_32F)
         scale = 2.0 ** (16 - self.bit_depth)
         found: Image = np.asarray(cv2.multiply(signal, self.gain, scale=scale, dtype=cv2.CV_16U), np.uint16)
-        found[image >= 2**self.bit_depth - 1] = FULL_SCALE
+        found[image >= 2**self.bit_depth - 1] = np.iinfo(np.uint16).max
         if self.dead is not None:
             repair(found, self.dead)
         return found

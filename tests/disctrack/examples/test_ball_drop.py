@@ -5,7 +5,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 from disctrack.discrepancy.noise import SampleStretch, SmoothNoise, estimate
-from disctrack.examples.ball_drop import DRAGS, GRAVITY, OTHERS, analyse_drops, ask, drop, read_drops, report
+from disctrack.examples._command import GRAVITY
+from disctrack.examples.ball_drop import DRAGS, OTHERS, analyse_drops, ask, drop, read_drops, report
 
 TIME = np.arange(45) / 15.0
 BALLS = {"foam": 0.0405, "rubber": 0.038, "lead": 0.00047}  # deceleration over v^2 [1/m]

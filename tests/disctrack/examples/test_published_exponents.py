@@ -12,11 +12,10 @@ from disctrack.discrepancy.fit import fit
 from disctrack.discrepancy.search import explain
 from disctrack.errors import AnalysisError
 from disctrack.examples import published_exponents
-from disctrack.examples.exponent_model import LastStage, Setup, slope
+from disctrack.examples.exponent_model import LastStage, Series, slope
 from disctrack.examples.published_exponents import (
     THIN_DISC,
     ExponentSystem,
-    Series,
     left_by,
     misfit,
     published_series,
@@ -39,7 +38,7 @@ def tables(published, values, rng, scatter=1.0, n=12):
     for i, s in enumerate(published):
         mean, noise = system.outcomes(i, values)[:3], np.cov(s.exponents.T) * scatter**2
         exponents = rng.multivariate_normal(mean, noise, n)
-        made.append(Series(s.setup, exponents, float(system.outcomes(i, values)[3])))
+        made.append(replace(s, exponents=exponents, ln_duration=float(system.outcomes(i, values)[3])))
     return tuple(made)
 
 
@@ -89,7 +88,7 @@ def test_the_widened_covariance_makes_chi_square_of_the_mean_its_number_of_expon
 def test_a_thin_disc_at_small_nutation_has_the_exponents_of_theory(law, exponent):
     """n_theta = 1 / (1 - a) for a power that goes with theta^a, n_psidot = -n_theta / 2; slow precession to 1 %."""
     disc = replace(MA_2014, half_thickness=1e-6)
-    setup = Setup("", 0.0, longest=0.4, start=np.radians(0.1), disc=disc)
+    setup = Series("", 0.0, longest=0.4, start=np.radians(0.1), disc=disc)
     stage = LastStage(setup, law)
     n_theta, n_psidot, n_energy, _ = stage.outcomes()
     assert stage.duration > 0.6
@@ -99,7 +98,7 @@ def test_a_thin_disc_at_small_nutation_has_the_exponents_of_theory(law, exponent
 def test_an_early_t_f_lowers_the_exponents_as_for_an_exact_power_law():
     """The simulated motion is a power law to 1 %, so that the line through ln (t + b)^(2/3) has the same slope."""
     disc = replace(MA_2014, half_thickness=1e-6)
-    stage = LastStage(Setup("", 0.0, longest=0.4, start=np.radians(2.0), disc=disc), {"km.k_m": 4e-9})
+    stage = LastStage(Series("", 0.0, longest=0.4, start=np.radians(2.0), disc=disc), {"km.k_m": 4e-9})
     left = np.linspace(0.4, np.exp(-3), 351)
     for bias in (-0.03, -0.01, 0.005):
         expected = slope(left, (left - bias) ** (2 / 3)) - 2 / 3
