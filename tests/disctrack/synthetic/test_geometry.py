@@ -150,23 +150,14 @@ def test_black_squares_lie_where_opencv_projects_them(index, rig):
 
 
 @pytest.mark.statistical
-def test_edges_have_converged(rig):
-    coarse, fine = (
-        expected_disc(POSES, rig, MA_2014, replace(PLAIN, render=replace(PLAIN.render, subpixels=s))) for s in (5, 10)
-    )
+def test_edges_and_squares_have_converged(rig):
+    board = rotation_from_euler(0.4, 0.3, -0.2), np.array([0.002, 0.004, 0.012])
+    scenes = [replace(PLAIN, render=replace(PLAIN.render, subpixels=s)) for s in (5, 10)]
+    coarse, fine = (expected_disc(POSES, rig, MA_2014, scene) for scene in scenes)
     assert np.abs(coarse - fine).max() < 0.1  # grey levels of 165
-
-
-@pytest.mark.statistical
-def test_chessboard_has_converged(rig):
-    R, t = rotation_from_euler(0.4, 0.3, -0.2), np.array([0.002, 0.004, 0.012])
-    coarse, fine = (
-        render_board(
-            R, t, rig, replace(PLAIN, cameras=CameraSettings(bit_depth=16), render=replace(PLAIN.render, subpixels=s))
-        )
-        for s in (5, 10)
-    )
-    assert np.abs(coarse.astype(int) - fine).max() / 257 < 0.1  # grey levels of 180
+    deep = (replace(scene, cameras=CameraSettings(bit_depth=16)) for scene in scenes)
+    coarse, fine = (render_board(*board, rig, scene).astype(int) for scene in deep)
+    assert np.abs(coarse - fine).max() / 257 < 0.1  # grey levels of 180
 
 
 def test_an_error_of_the_lens_model_would_be_noticed(rig):
