@@ -10,13 +10,11 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from calibration import CalibrationSettings, StereoRig
 from disctrack.calibrate.stage import boards_in
 from disctrack.commands import DONE, INCOMPLETE
-from disctrack.errors import RecordingError
 from disctrack.files.json_text import json_file, json_text
 from disctrack.files.software import software_version
 from disctrack.files.whole import check_writable as check_writable
@@ -25,6 +23,7 @@ from disctrack.findings import Kind, Severity, in_doubt, leading, of_kind
 from disctrack.progress import progress_bar, times_so_far
 from disctrack.recording.changed import changed_since, told_differences
 from disctrack.recording.declaration import FILE_NAME, Recording
+from disctrack.recording.readers.blocks import iter_pair_blocks
 from disctrack.report.blocks import Facts, Report, document
 from disctrack.report.html import link_pages
 from disctrack.report.terminal import show
@@ -178,22 +177,15 @@ def _companions(
 
 
 def _write_video(path: Path, trajectory: Trajectory, pairs: ImagePairs) -> None:
-
     rows = shown_rows(pairs.start, pairs.stop)
     with progress_bar("video", len(rows), "frame") as advance:
         write_overlay(path, ((row, pair_of(pairs, row)) for row in rows), trajectory, advance)
 
 
 def pair_of(pairs: ImagePairs, row: int) -> NDArray:
-    """Both images of a frame; one that cannot be read is black."""
-    width, height = pairs.left.image_size
-    images = np.zeros((2, height, width), np.uint8 if pairs.left.bit_depth == 8 else np.uint16)
-    for image, reader in zip(images, (pairs.left, pairs.right), strict=True):
-        try:
-            reader.read(row, image)
-        except RecordingError:
-            image[...] = 0
-    return images
+    """Both images of a frame (2, height, width); one that cannot be read is black."""
+    (block,) = iter_pair_blocks(pairs.left, pairs.right, row, row + 1)
+    return block.images[0]
 
 
 def write_times(folder: Path, command: str) -> list[Path]:

@@ -111,48 +111,32 @@ def rolling_start(scene: Scene) -> State:
 
     Or, with `struck`, the upright disc just after a ball has hit it.
     """
-    start = scene.motion.rolling
+    start, disc = scene.motion.rolling, scene.declared_disc
+    x, y = np.array(start.centre_mm) * 1e-3
+    place = {"psi": np.radians(start.psi_deg), "phi": np.radians(start.phi_deg), "x": x, "y": y}
     if start.struck:
-        return _struck(scene)
+        wanted, given = {"lateral_mm", "vertical_mm", "impulse_N_s"}, set(start.struck)
+        if not wanted <= given <= wanted | {"friction"}:
+            raise SceneError(
+                f"motion.rolling.struck has {', '.join(sorted(given))}; expected {', '.join(sorted(wanted))} and, "
+                "if wanted, friction"
+            )
+        hit = [start.struck["lateral_mm"] * 1e-3, start.struck["vertical_mm"] * 1e-3, start.struck["impulse_N_s"]]
+        return struck_disc(disc, *hit, friction=start.struck.get("friction", 0.0), **place)
     unknown = set(start.state) - set(State.__dataclass_fields__)
     if unknown:
         known = ", ".join(State.__dataclass_fields__)
         raise SceneError(f"motion.rolling.state: unknown {', '.join(sorted(unknown))}; a state has {known}")
     regular = steady_precession(
         np.radians(start.theta_deg),
-        scene.declared_disc,
+        disc,
         scene.gravity_m_s2,
         omega3=None if np.isnan(start.omega3_rad_s) else start.omega3_rad_s,
         nutation_amplitude=np.radians(start.nutation_deg),
         nutation_phase=np.radians(start.nutation_phase_deg),
-        psi=np.radians(start.psi_deg),
-        phi=np.radians(start.phi_deg),
-        x=start.centre_mm[0] * 1e-3,
-        y=start.centre_mm[1] * 1e-3,
+        **place,
     )
     return regular.moved(**start.state)
-
-
-def _struck(scene: Scene) -> State:
-    start = scene.motion.rolling
-    wanted = {"lateral_mm", "vertical_mm", "impulse_N_s"}
-    given = set(start.struck)
-    if not wanted <= given <= wanted | {"friction"}:
-        raise SceneError(
-            f"motion.rolling.struck has {', '.join(sorted(given))}; expected {', '.join(sorted(wanted))} and, "
-            "if wanted, friction"
-        )
-    return struck_disc(
-        scene.declared_disc,
-        start.struck["lateral_mm"] * 1e-3,
-        start.struck["vertical_mm"] * 1e-3,
-        start.struck["impulse_N_s"],
-        friction=start.struck.get("friction", 0.0),
-        psi=np.radians(start.psi_deg),
-        phi=np.radians(start.phi_deg),
-        x=start.centre_mm[0] * 1e-3,
-        y=start.centre_mm[1] * 1e-3,
-    )
 
 
 def simulate_scene(scene: Scene) -> Motion:
