@@ -213,8 +213,12 @@ def test_the_sample_is_the_recording_of_the_repository(sample_clip, tmp_path):
     same = [file.relative_to(sample_clip) for file in sample_clip.rglob("*.png") if "results" not in file.parts]
     assert len(same) == 636
     assert all((tmp_path / "clip" / file).is_file() for file in same)
-    drawn, stored = (cv2.imread(str(at / "left/000000.png"), -1).astype(int) for at in (tmp_path / "clip", sample_clip))
-    assert np.abs(drawn - stored).max() <= 1  # processors round differently
+    first, last = (
+        np.abs(np.subtract(*(cv2.imread(str(at / name), -1).astype(int) for at in (tmp_path / "clip", sample_clip))))
+        for name in ("left/000000.png", "right/000299.png")
+    )
+    assert first.max() <= 1  # processors round differently
+    assert last.mean() < 1  # and noise drawn anew differs by less than that
     assert (tmp_path / "clip/recording.toml").read_text() == (sample_clip / "recording.toml").read_text()
 
 

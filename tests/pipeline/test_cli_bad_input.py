@@ -15,7 +15,6 @@ import pytest
 
 from disctrack.cli import main
 from disctrack.commands import INTERRUPTED
-from disctrack.files import whole as whole_files
 from tests.pipeline.conftest import linked
 
 QUICK = ["--no-figures", "--no-video"]
@@ -247,20 +246,3 @@ def test_a_name_cannot_steer_the_terminal(tmp_path, capsys):
     told = capsys.readouterr().err
     assert "\\x1b]0;a title\\x07" in told
     assert told.rstrip("\n").isprintable()
-
-
-def test_a_disk_that_fills_up_while_the_result_is_written(recording, monkeypatch, capsys):
-    written = whole_files.os.fsync
-
-    def full(descriptor):
-        if ".part" in os.readlink(f"/proc/self/fd/{descriptor}"):
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        written(descriptor)
-
-    if not Path("/proc/self/fd").exists():
-        pytest.skip("needs /proc to tell one file from another")
-    monkeypatch.setattr(whole_files.os, "fsync", full)
-    assert "disk is full" in failure(capsys, "run", recording, *QUICK)
-    assert os.listdir(recording / "results") == []
-    monkeypatch.undo()
-    assert main(["run", str(recording), *QUICK]) == 0
