@@ -23,7 +23,7 @@ QUICK = ["--no-figures", "--no-video"]
 def failure(capsys, *words) -> str:
     """The one line that a failing command prints."""
     assert main([str(word) for word in words]) == 1
-    ended = re.compile(r" *[0-9.]+ s  ")  # stages that ended before the failure
+    ended = re.compile(r" *[0-9.]+ s  |compiling the inner loops")  # what went before the failure
     errors = "".join(line for line in capsys.readouterr().err.splitlines(keepends=True) if not ended.match(line))
     assert errors.startswith("disctrack: ")
     assert errors.count("\n") == 1
