@@ -29,22 +29,12 @@ from calibration.cameras.splines import LensField
 from calibration.fit.stereo_model import Observations
 from calibration.kit.arguments import checked
 from calibration.kit.arrays import Array, Mask
-from calibration.kit.errors import CalibrationError, RigFileError
+from calibration.kit.errors import RigFileError
 from calibration.stereo import StereoCalibration
 
 SCHEMA = "disctrack stereo rig"
 SCHEMA_VERSION = 1
 MAX_VALUES = 50_000_000  # of one dataset: beyond, the file is not a rig whatever it says
-_READ_ERRORS = (
-    OSError,
-    LookupError,
-    ValueError,
-    TypeError,
-    RuntimeError,
-    AttributeError,
-    OverflowError,
-    CalibrationError,
-)
 
 
 class Dataset(NamedTuple):
@@ -102,7 +92,7 @@ _BEYOND_MODEL = {
     ),
     "lens_field_spacing": Dataset((), "px", "of the splines' grid"),
 }
-_TOLD = ("settings", "figures", "versions", "warnings", "rejected_views", "rejected_corners")
+_TOLD = ("settings", "figures", "versions", "doubts", "warnings", "rejected_views", "rejected_corners")
 _LONG = {  # parts of a record in JSON that are datasets, as an attribute has 64 kB at most
     "rejected_corners": "JSON list of view, camera, corner, reason",
     "board": "JSON object: kind of target and its fields, lengths in m",
@@ -128,14 +118,6 @@ class CalibrationRecord:
     # doubts; warnings; rejected_views (view: reason); rejected_corners (view, camera, corner, reason)
     told: dict[str, Any]
     apart: tuple[int, ...] = ()  # views whose right image has a place of the board of its own, n_views + 0, 1, ...
-
-
-@dataclass(frozen=True)
-class RigFile:
-    """Content of a rig file."""
-
-    rig: StereoRig
-    record: CalibrationRecord | None  # None for a rig that was imported without its corners
 
 
 def record_of(calibration: StereoCalibration) -> CalibrationRecord:
@@ -199,9 +181,12 @@ def versions(packages: Sequence[str]) -> dict[str, str]:
 
 
 @checked
-def write_rig(path: str | os.PathLike[str], content: StereoRig | StereoCalibration | RigFile) -> None:
+def write_rig(
+    path: str | os.PathLike[str], content: StereoRig | StereoCalibration, record: CalibrationRecord | None = None
+) -> None:
     """Write a rig file: whole or not at all (a temporary file beside it, fsync, rename).
 
+    record : where a rig comes from; a calibration has its own
     Raises RigFileError if it cannot be written.
 
         >>> write_rig("rig.h5", read_rig("clip/results/rig.h5"))
@@ -212,7 +197,7 @@ def write_rig(path: str | os.PathLike[str], content: StereoRig | StereoCalibrati
     part = path.with_name(path.name + ".part")
     try:
         with open(part, "wb") as handle:
-            handle.write(rig_bytes(content))
+            handle.write(rig_bytes(content, record))
             handle.flush()
             os.fsync(handle.fileno())
         os.replace(part, path)
@@ -222,15 +207,16 @@ def write_rig(path: str | os.PathLike[str], content: StereoRig | StereoCalibrati
         raise RigFileError(f"{path}: the rig cannot be written ({error}): no such folder, or no room in it") from error
 
 
-def rig_bytes(content: StereoRig | StereoCalibration | RigFile, attributes: Mapping[str, Any] = {}) -> memoryview:
+def rig_bytes(
+    content: StereoRig | StereoCalibration,
+    record: CalibrationRecord | None = None,
+    attributes: Mapping[str, Any] = {},
+) -> memoryview:
     """A rig file, made in memory: the HDF5 library crashes where a disk is full.
 
     attributes : of the root, beside its own
     """
-    if isinstance(content, StereoCalibration):
-        content = RigFile(content.rig, record_of(content))
-    elif isinstance(content, StereoRig):
-        content = RigFile(content, None)
+    rig, record = (content, record) if isinstance(content, StereoRig) else (content.rig, record_of(content))
     buffer = io.BytesIO()
     with h5py.File(buffer, "w") as file:
         file.attrs.update(schema=SCHEMA, schema_version=SCHEMA_VERSION)
@@ -239,9 +225,9 @@ def rig_bytes(content: StereoRig | StereoCalibration | RigFile, attributes: Mapp
             "points_right = R_right_left @ points_left + t_right_left; Brown distortion, OpenCV's coefficients; "
             "pixel (0, 0) is the centre of the top-left pixel; camera axes: x right, y down, z along the view."
         )
-        write_rig_group(file.create_group("rig"), content.rig)
-        if content.record is not None:
-            _write_record(file.create_group("calibration"), content.record)
+        write_rig_group(file.create_group("rig"), rig)
+        if record is not None:
+            _write_record(file.create_group("calibration"), record)
         file.attrs.update(attributes, complete=1)
     return buffer.getbuffer()
 
@@ -330,33 +316,32 @@ def read_rig(path: str | os.PathLike[str]) -> StereoRig:
     >>> read_rig("clip/results/rig.h5").left.image_size
     (272, 272)
     """
-    return read_rig_file(path).rig
+    return read_rig_file(path)[0]
 
 
-def read_rig_file(path: str | os.PathLike[str]) -> RigFile:
-    """Everything in a rig file. Raises RigFileError if the file is missing, damaged or something else."""
+def read_rig_file(path: str | os.PathLike[str]) -> tuple[StereoRig, CalibrationRecord | None]:
+    """The rig, and where it comes from; None of one that was imported without its corners.
+
+    Raises RigFileError if the file is missing, damaged or something else.
+    """
     path = Path(path)
     if not path.is_file():
         raise RigFileError(f"{path}: no such rig file; `disctrack calibrate` makes one")
     try:
         with h5py.File(path, "r") as file, np.errstate(all="ignore"):
             if file.attrs.get("schema") != SCHEMA:
-                raise RigFileError(
-                    f"{path}: an HDF5 file, but not a rig (its schema is {file.attrs.get('schema')!r}, "
-                    f"expected {SCHEMA!r})"
-                )
+                found = file.attrs.get("schema")
+                raise RigFileError(f"an HDF5 file, but not a rig (its schema is {found!r}, expected {SCHEMA!r})")
             if int(file.attrs.get("schema_version", -1)) > SCHEMA_VERSION:
-                raise RigFileError(f"{path}: written by a newer version of disctrack; update to read it")
+                raise RigFileError("written by a newer version of disctrack; update to read it")
             if int(file.attrs.get("complete", 0)) != 1:
-                raise RigFileError(f"{path}: was not written to its end; calibrate again")
+                raise RigFileError("was not written to its end; calibrate again")
             rig = read_rig_group(file["rig"])
             record = _read_record(file["calibration"]) if "calibration" in file else None
-        return RigFile(rig, record)
+        return rig, record
     except RigFileError as error:
-        if str(error).startswith(str(path)):
-            raise
         raise RigFileError(f"{path}: {error}") from error
-    except _READ_ERRORS as error:
+    except Exception as error:  # the HDF5 library raises many kinds on damaged files
         raise RigFileError(
             f"{path}: cannot be read as a rig file ({type(error).__name__}: {error}): damaged, cut short or another "
             "format; calibrate again or take the original"
@@ -436,7 +421,7 @@ def _read_record(group: h5py.Group) -> CalibrationRecord:
         "board": board,
         "view_names": tuple((str(left), str(right)) for left, right in names),
         "apart": apart,
-        "told": {name: text(name) for name in _TOLD} | {"doubts": text("doubts") if "doubts" in group.attrs else []},
+        "told": {name: text(name) for name in _TOLD},
         "table_view": None if table_view < 0 else table_view,
         "observations": Observations(*seen.values()),
         "kept": known["kept"].astype(bool),

@@ -95,7 +95,7 @@ def calibrate_recording(
 
 def boards_in(rig_file: Path, recording: Recording) -> Boards | None:
     """Where the board was in the views of a rig file; None where that does not say. Raises RigFileError."""
-    record = read_rig_file(rig_file).record
+    _, record = read_rig_file(rig_file)
     if record is None:
         return None
     return boards_of(record, None if recording.views is None else declared_views(recording, recording.views))
@@ -168,7 +168,7 @@ def calibrate_into(
         "software_version": provenance.version,
         "summary": json.dumps(told),
     }
-    write_whole(path, rig_bytes(found, attributes))
+    write_whole(path, rig_bytes(found, attributes=attributes))
     files = [path]
     if figures:
         from disctrack.calibrate.figures import residuals_figure

@@ -191,7 +191,7 @@ def test_a_rig_file_keeps_where_the_boards_were(tmp_path):
     found = calibrated(moved_boards.make_rig(1), 6, 1, shift=1e-3, turn=1e-3)
     assert found.refinement.model.boards_right is not None
     write_rig(tmp_path / "rig.h5", found)
-    record = read_rig_file(tmp_path / "rig.h5").record
+    _, record = read_rig_file(tmp_path / "rig.h5")
     model = replace(
         found.refinement.model, R_left_board=record.R_left_board, t_left_board=record.t_left_board, boards_right=None
     )
