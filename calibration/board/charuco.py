@@ -14,7 +14,6 @@ from calibration.board.corner_fit import CornerView, fit_view, smooth_grid
 from calibration.board.target import LEAST_POINTS, CharucoBoard
 from calibration.kit.arrays import Array
 from calibration.kit.errors import CalibrationError
-from calibration.kit.grey_levels import level_step
 
 
 def find_charuco(image: NDArray, board: CharucoBoard) -> CornerView | BoardNotFound:
@@ -22,9 +21,7 @@ def find_charuco(image: NDArray, board: CharucoBoard) -> CornerView | BoardNotFo
 
     image : (h, w) or (h, w, 3) as OpenCV reads it; see `chessboard.luminance`
     """
-    grey, notes = luminance(image)
-    step = level_step(grey)
-    values = grey // step if step > 1 else grey
+    values, notes = luminance(image)
     corners, ids = _detected(as_8_bit(values), board)
     if len(ids) < LEAST_POINTS:  # prints with light and dark exchanged are about, too: their markers say so
         negative = np.asarray(values.max() - values, values.dtype)

@@ -35,21 +35,20 @@ class BoardNotFound:
 def luminance(image: NDArray) -> tuple[NDArray, tuple[str, ...]]:
     """Grey values (h, w) of an image as cv2.IMREAD_UNCHANGED gives it, and a note where information was left out.
 
-    Grey images, 8 or 16 bit, are taken as they are. Three equal channels are one grey image. Colour becomes luminance
-    (0.114 B + 0.587 G + 0.299 R) in float; transparency is dropped.
+    Grey images, 8 or 16 bit, are taken in their own step: one whose values are multiples of a step is that image,
+    whatever the step. Three equal channels are one grey image. Colour becomes luminance (0.114 B + 0.587 G + 0.299 R)
+    in float; transparency is dropped.
     """
     image = np.asarray(image)
     if image.dtype not in (np.uint8, np.uint16, np.float32, np.float64):
         raise ArgumentError(f"images of type {image.dtype} are not grey values; expected 8 or 16 bit")
-    if image.ndim == 2:
-        return image, ()
+    image = image[..., None] if image.ndim == 2 else image
     if image.ndim != 3 or image.shape[2] not in (1, 3, 4):
         raise ArgumentError(f"an image is (height, width) or (height, width, 3 or 4), got {image.shape}")
-    if image.shape[2] == 1:
-        return image[..., 0], ()
-    if (image[..., :1] == image[..., :3]).all():
-        return image[..., 0], ()
-    return image[..., :3] @ np.array([0.114, 0.587, 0.299]), ("colour image read as luminance",)
+    if not (image[..., :1] == image[..., :3]).all():
+        return image[..., :3] @ np.array([0.114, 0.587, 0.299]), ("colour image read as luminance",)
+    step = level_step(image[..., 0])
+    return image[..., 0] if step == 1 else image[..., 0] // step, ()
 
 
 @checked
@@ -61,9 +60,6 @@ def find_corners(image: NDArray, inner_corners: tuple[int, int], thorough: bool 
     thorough : search with OpenCV's slow finder where its quick one sees nothing
     """
     grey, notes = luminance(image)
-    step = level_step(grey)
-    if step > 1:  # an image whose values are multiples of a step is that image, whatever the step
-        grey = grey // step
     start = _rough_corners(as_8_bit(grey), inner_corners, thorough)
     if start is None:
         columns, rows = inner_corners

@@ -33,7 +33,6 @@ MIN_CONTRAST_RATIO = 0.25  # of the view's median: below, the corner is covered 
 ROUGHER = 0.7  # scatter of saddle points about a smooth grid over that of the fits: below, the fits are not trusted
 MAX_DISPLACEMENT = 0.2  # of a square, from the corner's neighbours: beyond, another feature was fitted
 WINDOW = 0.35  # of a square: half width of the window of the saddle point
-MANY_PIXELS = 4e6
 
 
 def prepare() -> None:
@@ -296,9 +295,7 @@ def saddle_points(grey: Array, points: Array, spacing: float) -> Array:
     A point outside the image stays where it is.
     """
     half = int(np.clip(round(WINDOW * spacing), 2, 15))
-    every = 1 + int(np.sqrt(grey.size / MANY_PIXELS))  # of large images some rows and columns tell the range
-    low, high = np.percentile(grey[::every, ::every], [0.5, 99.5])
-    image = np.clip((grey - low) * (255.0 / max(high - low, 1e-12)), 0, 255).astype(np.float32)
+    image = grey.astype(np.float32)
     found = np.array(points, np.float32)
     inside = ((found >= 0) & (found < np.array(grey.shape[::-1], np.float32))).all(axis=1)
     if inside.any():

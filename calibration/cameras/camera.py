@@ -217,7 +217,7 @@ class StereoRig(Brief):
         points_left = arm_world + self.t_left_world
         d_rig = np.zeros((*points_world.shape[:-2], len(OF_CAMERAS), points_world.shape[-2], 2, N_RIG))
         pixels, d_world = [], []
-        for i, (R, t) in enumerate(pair_poses(self.R_right_left, self.t_right_left)):
+        for i, (R, t) in enumerate(((np.eye(3), np.zeros(3)), (self.R_right_left, self.t_right_left))):
             turned = points_left @ R.T
             pixel, d_point, d_rig[..., i, :, :, OF_CAMERAS[i]] = project_with_jacobians(turned + t, self.cameras[i])
             if i:  # the first camera's axes are those of the pair
@@ -252,11 +252,6 @@ def stepped(cameras: Sequence[Camera], step: Array) -> tuple[Camera, Camera]:
         for camera, own in zip(cameras, OF_CAMERAS, strict=True)
     )
     return left, right
-
-
-def pair_poses(R_right_left: Array, t_right_left: Array) -> tuple[tuple[Array, Array], ...]:
-    """R (3, 3) and t (3,) [m] of each camera against the first."""
-    return (np.eye(3), np.zeros(3)), (R_right_left, t_right_left)
 
 
 def by_turning(d_point: Array, arm: Array) -> Array:

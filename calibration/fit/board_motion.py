@@ -47,9 +47,7 @@ class BoardMotion:
 
 def split(model: StereoModel) -> StereoModel:
     """The model with places of the boards at the right camera's exposure: those of the left one, to begin with."""
-    if model.boards_right is not None:
-        return model
-    return replace(model, boards_right=(model.R_left_board.copy(), model.t_left_board.copy()))
+    return replace(model, boards_right=model.boards_in_right)
 
 
 def motions(model: StereoModel) -> tuple[Array, Array]:
@@ -57,9 +55,7 @@ def motions(model: StereoModel) -> tuple[Array, Array]:
 
     By steps of the two poses of a board, as `stereo_model.moved` takes them; turns to first order.
     """
-    if model.boards_right is None:
-        raise ValueError("the model has one place of the board for both images of a pair")
-    R, t = model.boards_right
+    R, t = model.boards_in_right
     middle = model.points.mean(0)
     arms = [model.R_left_board @ middle, R @ middle]
     turn = R @ np.swapaxes(model.R_left_board, 1, 2)

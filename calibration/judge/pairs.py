@@ -42,7 +42,6 @@ FREE = BoardMotion(np.inf, np.inf)  # nothing known beforehand
 # ones two have 8.8 and 4.5, where OpenCV's rig of one side misses the other's pairs as well, and the next one 2.2.
 STEP = 4.0
 LEAST_SIDE = 3  # pairs on either side of a step: fewer are not a place of the cameras, but boards that moved
-ZOOM = 0.01  # of the focal length: below, a part of the views may tell as much otherwise
 BY_ZOOM = 1.3  # times less squared misfit by two focal lengths; one and the same lens has 1.05
 
 
@@ -198,11 +197,6 @@ class PairMotion:
         """True if it is by all pairs together, where the usual one shows more than nothing: few pairs hide it."""
         return self.is_seen or (self.likely > self._enough and self.pixels > self.at_rest)
 
-    def as_random(self, points: Array) -> BoardMotion:
-        """As a random motion of boards with these points (n, 3) [m], roughly: what is begun with."""
-        reach = float(np.sqrt(np.mean(np.sum((points - points.mean(0)) ** 2, axis=1))))
-        return BoardMotion(self.distance / reach, self.distance)
-
     @property
     def _enough(self) -> float:
         return MOVED * max(self.scatter, self.at_rest)
@@ -311,8 +305,7 @@ def zoomed(
         parts = (paired, paired & ~other, paired & other)
         rough = [start_camera(observations[part], index, nominal, camera.image_size) for part in parts]
         focal, square = [one.fx for one, *_ in rough], [misfit for *_, misfit in rough]
-        change = focal[2] / focal[1] - 1.0
-        if abs(change) > ZOOM and square[0] > BY_ZOOM * (square[1] + square[2]):
+        if square[0] > BY_ZOOM * (square[1] + square[2]):
             found[index] = (
                 f"the {CAMERA_NAMES[index]} camera was zoomed or focused anew while the views were taken: its "
                 f"focal length is {focal[1]:.0f} px in the {len(moved.stretches[moved.kept])} views that are used, "

@@ -28,38 +28,21 @@ T = TypeVar("T", bound=Callable[..., Any])
 
 @dataclass(frozen=True)
 class Range:
-    """A number from `least` to `most`, in `unit`."""
+    """A number from `least` to `most`, in `unit`; or an array of them."""
 
     unit: str
-    least: float = 0.0
+    least: float = -math.inf
     most: float = math.inf
 
     def __str__(self) -> str:
         most = f" to {self.most:g}" if math.isfinite(self.most) else " on"
         return f"a number from {self.least:g}{most}, in {self.unit}"
 
-    def take(self, number: float) -> float:
-        """The number. Raises ValueError."""
-        if not self.least <= number <= self.most:
+    def take(self, number: Any) -> Any:
+        """What was given. Raises ValueError."""
+        if not np.all(np.isfinite(number) & (self.least <= number) & (number <= self.most)):
             raise ValueError
         return number
-
-
-@dataclass(frozen=True)
-class Values:
-    """An array of finite numbers in `unit`."""
-
-    unit: str
-
-    def __str__(self) -> str:
-        return f"numbers in {self.unit}"
-
-    def take(self, values: ArrayLike) -> NDArray[np.float64]:
-        """The values as an array. Raises TypeError, ValueError."""
-        array = _array(values).astype(float)
-        if not np.isfinite(array).all():
-            raise ValueError
-        return array
 
 
 FrameRate = Annotated[float, Range("Hz", 1e-3, 1e8)]  # beyond what any camera does
@@ -67,7 +50,7 @@ Seconds = Annotated[float, Range("s", 1e-6)]
 Gravity = Annotated[float, Range("m/s^2", 1e-3, 100.0)]
 Thickness = Annotated[float, Range("m", 0.0, 1.0)]
 Threads = Annotated[int, Range("threads", 1, 10_000)]
-Times = Annotated[ArrayLike, Values("s")]
+Times = Annotated[ArrayLike, Range("s")]
 
 
 def checked(target: T) -> T:
@@ -123,8 +106,10 @@ def _rule(kind: Any) -> Rule:
     if kind in _PLAIN:
         return _PLAIN[kind]
     if origin is Annotated:
-        limits = next(rule for rule in parts if hasattr(rule, "take"))
-        return lambda value: limits.take(_fit(value, parts[0])), str(limits)
+        kind, limits = parts
+        if kind == ArrayLike:
+            return lambda value: limits.take(_array(value).astype(float)), f"numbers in {limits.unit}"
+        return lambda value: limits.take(_fit(value, kind)), str(limits)
     if origin in (Union, UnionType):
         options = dict.fromkeys(_rule(option)[1] for option in parts if option is not NoneType)
         return lambda value: _first_that_fits(value, parts), " or ".join(options)

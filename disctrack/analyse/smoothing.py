@@ -176,20 +176,19 @@ def moving_weights(
     process: Process,
     half_window: int,
     part: NDArray[np.int64],
-    points: NDArray[np.int64] | None = None,
+    points: NDArray[np.int64],
 ) -> tuple[Array, Array]:
     """Weights (k, 3, 2 half_window + 1) and remaining prior covariance (k, 3, 3) for some samples.
 
     times : (n,) in sample intervals; variance : (n,) stated, infinite where there is no sample
     part : (n,) number of the stretch that a sample belongs to; windows do not reach across
-    points : (k,) which samples; without it all n
+    points : (k,) which samples
     Derivatives are per interval. The ends are windows whose outer samples are missing. Windows with the same length,
     ratio and pattern of noise share one solution; noise is told apart in factors of two for this purpose (weights may
     be slightly off the optimum, their covariance is exact). A window with fewer than MIN_WINDOW_SAMPLES samples has
     no weight and an infinite prior covariance.
     """
     n, w = len(times), half_window
-    points = np.arange(n) if points is None else points
     index = points[:, None] + np.arange(-w, w + 1)
     inside = (index >= 0) & (index < n)
     clipped = np.clip(index, 0, n - 1)

@@ -115,10 +115,10 @@ def _image_sequences(inside: Path, names: list[str]) -> list[Sequence]:
         runs = list(zip(*(parts[1::2] for parts in members), strict=True))
         counter = max(range(len(runs)), key=lambda k: (len(set(runs[k])), len(runs[k][0]), k), default=None)
         for parts in members:
-            shown = list(parts)
-            if counter is not None and (len(members) > 1 or not _holds_many(Path("".join(parts)))):
+            shown, suffix = list(parts), Path("".join(parts)).suffix.lower()
+            if counter is not None and (len(members) > 1 or suffix not in (".tif", ".tiff")):  # which may be stacks
                 shown[2 * counter + 1] = "*"
-            groups["".join(shown), Path("".join(parts)).suffix.lower()] += 1
+            groups["".join(shown), suffix] += 1
     suffixes = [suffix for _, suffix in groups]
     result = []
     for (pattern, suffix), count in groups.items():
@@ -126,11 +126,6 @@ def _image_sequences(inside: Path, names: list[str]) -> list[Sequence]:
         shown_pattern = f"*{Path(pattern).suffix}" if alone and inside != Path() else pattern
         result.append(Sequence((inside / shown_pattern).as_posix(), suffix, count))
     return result
-
-
-def _holds_many(file: Path) -> bool:
-    """A TIFF may be a stack, or one image of many."""
-    return file.suffix.lower() in (".tif", ".tiff")
 
 
 def _stacks(file: Path) -> list[str]:

@@ -32,14 +32,15 @@ def calibrated(rig, n, seed, **motion):
 
 
 def errors(found, rig):
-    """Of intrinsics, of the pair's rotation and of its translation, and the places of these in the covariance."""
+    """Of intrinsics, of the pair's rotation and of its translation, and their covariance."""
     intrinsics = [
         np.array([c.fx, c.fy, c.cx, c.cy]) - [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
         for c, K in zip((found.rig.left, found.rig.right), rig.matrices, strict=True)
     ]
     turn = cv2.Rodrigues(found.rig.R_right_left @ rig.R.T)[0].ravel()
     places = [*range(4), *range(9, 13), *range(18, 24)]
-    return np.concatenate([*intrinsics, turn, found.rig.t_right_left - rig.t]), places
+    error = np.concatenate([*intrinsics, turn, found.rig.t_right_left - rig.t])
+    return error, found.rig.covariance[np.ix_(places, places)]
 
 
 def squared(error, covariance):
@@ -90,8 +91,7 @@ def test_cameras_and_pair_are_right_where_boards_moved_between_the_exposures():
     for seed in range(6):
         rig = moved_boards.make_rig(seed)
         found = calibrated(rig, 10, seed, shift=0.5e-3, turn=0.5e-3)
-        error, places = errors(found, rig)
-        C = found.rig.covariance[np.ix_(places, places)]
+        error, C = errors(found, rig)
         ratios.append((squared(error[-6:], C[-6:, -6:]), squared(error, C)))
         sizes.append(found.refinement.problem.motion)
         assert any("not synchronised" in text for text in found.warnings)
@@ -119,12 +119,11 @@ def test_boards_that_were_held_still_count_for_more_than_those_that_moved():
     found = calibrate_from_corners([corner_view(p) for p in left], [corner_view(p) for p in right], BOARD, SETTINGS)
     heeded = found.refinement.problem.motion.heeded
     assert heeded[:6].min() > 1.5 * heeded[6:].max()
-    error, places = errors(found, rig)
+    error, C = errors(found, rig)
     # the six still pairs alone
     views = [[corner_view(p) for p in side[:6]] for side in (left, right)]
     alone, _ = errors(calibrate_from_corners(*views, BOARD, SETTINGS), rig)
-    sigma = np.sqrt(np.diag(found.rig.covariance))[places]
-    assert np.all(np.abs(error) < 4 * sigma)
+    assert np.all(np.abs(error) < 4 * np.sqrt(np.diag(C)))
     assert np.linalg.norm(error[[0, 1, 4, 5]]) < 1.5 * np.linalg.norm(alone[[0, 1, 4, 5]]) + 0.3
 
 
@@ -173,8 +172,7 @@ def test_motions_that_no_pair_shows_for_itself_are_in_the_sigma():
         found = calibrated(rig, 5, seed, shift=0.1e-3, turn=0.1e-3)
         assert found.refinement.problem.motion is None
         sizes.append(motion_between_exposures(found.refinement).size.shift)
-        error, places = errors(found, rig)
-        C = found.rig.covariance[np.ix_(places, places)]
+        error, C = errors(found, rig)
         by_corners = stereo_covariance(found.refinement)[-6:, -6:]  # and by how the views disagree
         pair = error[-6:]
         ratios.append((squared(pair, C[-6:, -6:]), squared(error, C), squared(pair, by_corners)))
@@ -207,8 +205,7 @@ def test_sigmas_hold_for_small_and_large_motions(size, n):
     for seed in range(12):
         rig = moved_boards.make_rig(100 + seed)
         found = calibrated(rig, n, seed, shift=size, turn=size)
-        error, places = errors(found, rig)
-        C = found.rig.covariance[np.ix_(places, places)]
+        error, C = errors(found, rig)
         axis = rig.t / np.linalg.norm(rig.t)
         along = found.rig.baseline - np.linalg.norm(rig.t)
         ratios.append((squared(error, C), along**2 / (axis @ C[-3:, -3:] @ axis)))

@@ -25,9 +25,8 @@ def calibrated(parts, table_view=None, noise=0.1, **motion):
 
 def pair_error(found, rig):
     """Squared error of how the cameras stand over its variance, per number."""
-    error, places = errors(found, rig)
-    covariance = found.rig.covariance[np.ix_(places[-6:], places[-6:])]
-    return squared(error[-6:], covariance)
+    error, C = errors(found, rig)
+    return squared(error[-6:], C[-6:, -6:])
 
 
 def told(found):

@@ -270,12 +270,10 @@ def test_paper_round_the_squares_tells_a_negative_from_a_positive(board_drawer, 
     assert margin_is_dark(255 - image, seen, board.points, board)
 
 
-def test_depth_and_equal_channels_change_nothing(board_drawer):
+def test_equal_channels_change_nothing(board_drawer):
     board = Board((9, 6), 8e-3)
     image = board_drawer(CAMERA, *pose(board), board, rng=np.random.default_rng(5))
     plain = find_corners(image, (9, 6))
-    deep = find_corners(image.astype(np.uint16) * 64, (9, 6))
-    assert_allclose(deep.points, plain.points, atol=2e-4)  # quantisation floor of the noise differs
     triple = find_corners(np.dstack([image] * 3), (9, 6))
     assert np.array_equal(triple.points, plain.points)
     assert not triple.notes

@@ -23,8 +23,7 @@ def mean_square(n, distortion="auto", board="auto", rigs=16, displaced=None):
         left, right = moved_boards.pairs(rig, n, seed, correlation=0.4, points=points)
         views = [corner_view(p) for p in left], [corner_view(p) for p in right]
         calibration = calibrate_from_corners(*views, BOARD, settings)
-        error, places = errors(calibration, rig)
-        found.append(squared(error, calibration.rig.covariance[np.ix_(places, places)]))
+        found.append(squared(*errors(calibration, rig)))
         told.append(" ".join(calibration.warnings))
     return np.mean(found), told
 

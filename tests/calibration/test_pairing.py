@@ -70,8 +70,7 @@ def test_every_pair_of_a_square_board_is_used_whichever_way_a_camera_sees_it(sce
     scene = scene_maker(n_views=16, inner_corners=counts, square=6e-3)
     near = rotation_from_vector(np.array([0.0, -0.06, 0.0]))
     m = replace(scene.model, R_right_left=near, t_right_left=np.array([-0.02, 0.0, 0.002]))
-    views = corner_views(replace(scene, model=m), rng, 0.1, board)
-    views = [[replace(view, image_size=(512, 512)) for view in side] for side in views]
+    views = corner_views(replace(scene, model=m), rng, 0.1)
     for turned in (0, 1):  # and the right camera upside down
         right = [view.reordered(board.orders[(turned + v // 3) % board.symmetry]) for v, view in enumerate(views[1])]
         found = calibrate_from_corners(views[0], right, board, CalibrationSettings("k1", "flat"))
@@ -117,10 +116,10 @@ def test_a_lens_that_was_zoomed_between_the_views_is_named_and_costs_its_later_i
     m, board = scene.model, scene.board
     right = m.cameras[1]
     zoomed = replace(m, cameras=(m.cameras[0], replace(right, fx=zoom * right.fx, fy=zoom * right.fy)))
-    left, before = corner_views(scene, np.random.default_rng(0), board=board)
-    after = corner_views(replace(scene, model=zoomed), np.random.default_rng(1), board=board)[1]
-    sides = ([replace(view, image_size=(512, 512)) for view in side] for side in (left, [*before[:12], *after[12:]]))
-    found = calibrate_from_corners(*sides, board, CalibrationSettings(board="flat"))
+    left, before = corner_views(scene, np.random.default_rng(0))
+    after = corner_views(replace(scene, model=zoomed), np.random.default_rng(1))[1]
+    right_views = [*before[:12], *after[12:]]
+    found = calibrate_from_corners(left, right_views, board, CalibrationSettings(board="flat"))
     (text,) = [text for text in found.warnings if "zoomed" in text]
     assert text.startswith("right 12, right 13")
     assert "the right camera was zoomed or focused anew" in text
@@ -140,9 +139,8 @@ def test_images_of_half_the_size_are_no_better_a_calibration(scene_maker):
         for c in m.cameras
     )
     found = []
-    for model, size, sigma in ((m, (240, 192), 0.1), (replace(m, cameras=half), (120, 96), 0.05)):
+    for model, sigma in ((m, 0.1), (replace(m, cameras=half), 0.05)):
         sides = corner_views(replace(scene, model=model), np.random.default_rng(2), sigma)
-        sides = [[replace(view, image_size=size) for view in side] for side in sides]
         found.append(calibrate_from_corners(*sides, BOARD, FLAT).assessment)
     whole, less = found
     assert less.verdict.split(":")[0] == whole.verdict.split(":")[0]

@@ -18,6 +18,7 @@ from calibration import (
 )
 from calibration.judge.assessment import stereo_covariance
 from calibration.rig_file import read_rig_group
+from tests.calibration.test_refinement import rig_error
 
 
 def read_pairs(folder, pattern, indices):
@@ -99,16 +100,7 @@ def test_sample_clip_gives_the_cameras_it_was_rendered_with(sample_clip):
     views = ([cv2.imread(str(file), cv2.IMREAD_UNCHANGED) for file in side] for side in files)
     found = calibrate_stereo(*views, Board((9, 6), 6e-3), CalibrationSettings(board="flat"), 0, 3e-3)
     rig = found.rig
-    error = np.concatenate(
-        [
-            rig.left.parameters - truth.left.parameters,
-            rig.right.parameters - truth.right.parameters,
-            vector_of(rig.R_right_left @ truth.R_right_left.T),
-            rig.t_right_left - truth.t_right_left,
-            vector_of(rig.R_left_world @ truth.R_left_world.T),
-            rig.t_left_world - truth.t_left_world,
-        ]
-    )
+    error = rig_error(rig, truth)
     free = np.diag(rig.covariance) > 0
     sigma = np.sqrt(np.diag(rig.covariance)[free])
     correlation = rig.covariance[np.ix_(free, free)] / sigma / sigma[:, None]
@@ -120,11 +112,6 @@ def test_sample_clip_gives_the_cameras_it_was_rendered_with(sample_clip):
     assert found.assessment.triangulation_sigma[1] < 1e-6
     points = np.array([[0.0, 0, 0], [50e-3, 0, 0], [0, 30e-3, 0], [25e-3, 15e-3, 20e-3]])
     assert np.abs(triangulate(truth.project(points), rig) - points).max() < 2e-6
-
-
-def vector_of(R):
-    """Small rotation vector of R (3, 3)."""
-    return 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
 
 
 @pytest.mark.statistical

@@ -63,11 +63,11 @@ def calibrated(drawn):
     return scene, calibrate_stereo(left, right, BOARD, FLAT, table_view=3, board_thickness=THICKNESS)
 
 
-def corner_views(scene, rng, sigma=0.02, board=BOARD):
+def corner_views(scene, rng, sigma=0.02):
     """What `find_corners` would return, without images."""
     return [
-        [corner_view(p + rng.normal(size=p.shape) * sigma, sigma, (240, 192)) for p in scene.pixels(camera)]
-        for camera in (0, 1)
+        [corner_view(p + rng.normal(size=p.shape) * sigma, sigma, camera.image_size) for p in scene.pixels(c)]
+        for c, camera in enumerate(scene.model.cameras)
     ]
 
 
@@ -189,7 +189,7 @@ def test_a_board_that_looks_the_same_after_a_turn_still_gives_one_pair(scene_mak
     assert board.symmetry > 1
     scene = scene_maker(n_views=8, inner_corners=counts, square=9e-3)
     scene = replace(scene, board=board)
-    left, right = corner_views(scene, rng, 0.01, board)
+    left, right = corner_views(scene, rng, 0.01)
     orders = board_orders(counts)
     orders = orders if board.symmetry == len(orders) else orders[::2]
     turned = [view.reordered(orders[v % len(orders)]) for v, view in enumerate(right)]
@@ -198,10 +198,6 @@ def test_a_board_that_looks_the_same_after_a_turn_still_gives_one_pair(scene_mak
     assert found.rms_px < 0.03
     assert any("looks the same after a turn" in w for w in found.warnings)
     assert_allclose(found.rig.t_right_left, scene.model.t_right_left, atol=5e-3)  # 5 x 5 corners tell little
-
-
-def replace_all(views, **changes):
-    return [replace(view, **changes) for view in views]
 
 
 def in_a_mirror(view, board):
@@ -217,8 +213,7 @@ def in_a_mirror(view, board):
 def test_one_camera_that_shows_a_mirror_image_is_named_and_two_are_one_world(scene_maker, rng, counts):
     board = Board(counts, 9e-3)
     scene = replace(scene_maker(n_views=9, inner_corners=counts, square=9e-3), board=board)
-    left, right = corner_views(scene, rng, 0.02, board)
-    sides = [replace_all(side, image_size=(512, 512)) for side in (left, right)]
+    sides = corner_views(scene, rng)
     mirrored = [[in_a_mirror(view, board) for view in side] for side in sides]
     for pair in ((sides[0], mirrored[1]), (mirrored[0], sides[1])):
         with pytest.raises(CalibrationError, match=r"images of one of the two cameras are mirrored: if they are, 9 of"):

@@ -12,7 +12,6 @@ import pytest
 
 import calibration
 import disctrack
-from calibration.kit.arguments import Range
 from disctrack.errors import ArgumentError
 
 MADE = {"Board", "CalibrationSettings", "Disc", "Model", "State", "Tracker"}
@@ -33,7 +32,7 @@ def stand_in(kind: Any) -> Any:
     if origin in (Union, UnionType):
         return stand_in(parts[0])
     if origin is Annotated:
-        return max(parts[1].least, 1.0) if isinstance(parts[1], Range) else np.zeros(1)
+        return max(parts[1].least, 1.0) if parts[0] in (int, float) else np.zeros(1)
     if origin is np.ndarray:
         return np.zeros(1)
     if origin is tuple:

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibration.cameras.camera import Camera, StereoRig
+from calibration.cameras.camera import Camera, StereoRig, placed_at
 from disctrack.analyse.declaration import (
     Boards,
     balance,
@@ -87,6 +87,18 @@ def test_a_number_that_the_balance_of_moments_contradicts_is_named_with_the_true
     assert finding.doubtful
 
 
+def leaning(degrees: float):
+    """(3, 3) of a board that leans."""
+    return rotation_from_vector(np.radians(degrees) * np.array([0.6, -0.8, 0.0]))
+
+
+def seen_in(Q, trajectory: Trajectory, height: float = 0.0) -> Trajectory:
+    """The same motion in a world that is turned by Q and lies lower."""
+    R = Q @ rotation_from_quaternion(trajectory.quaternion)
+    q = np.column_stack([trajectory.q[:, :3] @ Q.T + [0.0, 0.0, height], unwrap_euler(euler_from_rotation(R))])
+    return replace(trajectory, q=q, quaternion=continuous_quaternions(quaternion_from_rotation(R)))
+
+
 @pytest.mark.parametrize(("theta", "seconds", "k_m", "nutation", "spin"), HONEST)
 @pytest.mark.parametrize("turn_deg", [3.0, 25.0])
 def test_a_table_view_whose_board_did_not_lie_on_the_table_is_named(
@@ -95,11 +107,7 @@ def test_a_table_view_whose_board_did_not_lie_on_the_table_is_named(
     """Before, the radius was said to be 0.5 mm: over another plane the height of the centre means nothing."""
     motion = true_motion(theta, seconds, k_m, nutation, spin=spin)
     trajectory = as_tracked(motion, np.random.default_rng(1), missing=range(50, 58))
-    Q = rotation_from_vector(np.radians(turn_deg) * np.array([0.6, -0.8, 0.0]))
-    R = Q @ rotation_from_quaternion(trajectory.quaternion)
-    q = np.column_stack([trajectory.q[:, :3] @ Q.T + [0.0, 0.0, 0.02], unwrap_euler(euler_from_rotation(R))])
-    turned = replace(trajectory, q=q, quaternion=continuous_quaternions(quaternion_from_rotation(R)))
-    (finding,) = contradictions(turned)
+    (finding,) = contradictions(seen_in(leaning(turn_deg), trajectory, 0.02))
     assert finding.remedies[0].key == "[table] view"
     assert f"turned by {turn_deg:.1f} deg" in finding.sentence
     assert finding.doubtful
@@ -175,13 +183,10 @@ def test_a_chessboard_of_another_scale_is_told_from_the_dots(scale, honest):
     assert finding.kind == Kind.SQUARE
     square = next(r for r in finding.remedies if r.key == "[calibration] square_mm")
     assert abs(float(square.action.split()[1]) * scale - 1) < 1e-3
-
-
-def test_the_true_square_of_a_board_is_named_first(honest):
-    (finding,) = contradictions(with_dots(honest, 6.1 / 6.0))
-    finding = other_scale(finding.numbers["scale"], 6.1e-3)
-    assert finding.remedies[0].key == "[calibration] square_mm"
-    assert abs(float(finding.remedies[0].fits) - 6.0) < 5e-3
+    # the true square of a board is named first
+    known = other_scale(finding.numbers["scale"], 6e-3 * scale)
+    assert known.remedies[0].key == "[calibration] square_mm"
+    assert abs(float(known.remedies[0].fits) - 6.0) < 5e-3
 
 
 def test_dots_on_the_boards_scale_but_for_printing_are_fine(honest):
@@ -210,10 +215,8 @@ def camera_rig(left, right):
         across /= np.linalg.norm(across)
         R = np.stack([across, np.cross(forward, across), forward])
         poses.append((R, -R @ place))
-    (R_left, t_left), (R_right, t_right) = poses
-    R = R_right @ R_left.T
     camera = Camera(1000.0, 1000.0, 255.5, 255.5, (0.0,) * 5, (512, 512))
-    return StereoRig(camera, camera, R, t_right - R @ t_left, R_left, t_left, world_is_table=True)
+    return StereoRig(camera, camera, **placed_at(poses), world_is_table=True)
 
 
 @pytest.mark.parametrize("azimuth", [0.0, 1.0, 2.5, 4.0])
@@ -247,11 +250,8 @@ def test_a_dot_that_is_not_seen_costs_precision_and_a_rate_spoils_every_velocity
 def test_the_view_whose_board_lies_where_the_rim_rolls_is_named(true_motion, as_tracked):
     """The world is that of a view that leans; the board of another view has the plane that the disc rolls on."""
     trajectory = as_tracked(true_motion(10.0, 0.2, spin=1.0), np.random.default_rng(1))
-    Q = rotation_from_vector(np.radians(25.0) * np.array([0.6, -0.8, 0.0]))
-    R = Q @ rotation_from_quaternion(trajectory.quaternion)
-    q = np.column_stack([trajectory.q[:, :3] @ Q.T, unwrap_euler(euler_from_rotation(R))])
-    rig = camera_rig((-0.15, -0.4, 0.5), (0.15, -0.4, 0.5))
-    turned = replace(trajectory, q=q, quaternion=continuous_quaternions(quaternion_from_rotation(R)), rig=rig)
+    Q, rig = leaning(25.0), camera_rig((-0.15, -0.4, 0.5), (0.15, -0.4, 0.5))
+    turned = replace(seen_in(Q, trajectory), rig=rig)
 
     def seen(normal_turn, foot):  # the printed face is 3 mm above the board's foot
         R_board = rig.R_left_world @ normal_turn

@@ -1,7 +1,5 @@
 """Power laws of the last stage: known laws come back within their stated confidence."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -9,12 +7,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from disctrack.analyse.derivatives import differentiate
 from disctrack.analyse.energy import analyse_energy, energy_quantities
-from disctrack.analyse.power_laws import (
-    count_nutation,
-    fit_power_laws,
-    nutation_ratio,
-    power_law_end,
-)
+from disctrack.analyse.power_laws import count_nutation, fit_power_laws, power_law_end
 from disctrack.analyse.propagation import propagate, rates
 from disctrack.disc import MA_2014
 
@@ -151,20 +144,6 @@ def test_unknown_frames_are_passed_over(rng):
     for array in (psi, theta, psidot, energy):
         array[300:320] = np.nan
     assert abs(fit_power_laws(time, psi, theta, psidot, energy).n_theta.value - whole.n_theta.value) < 0.002
-
-
-@pytest.mark.parametrize(
-    ("theta_deg", "ratio"),
-    [(0.5, 0.7787), (2, 0.7795), (8, 0.7842), (15, 0.7928), (25, 0.8098), (40, 0.8422), (60, 0.8886)],
-)
-def test_nutation_ratio_of_this_disc(theta_deg, ratio):
-    """Full linearised equations solved elsewhere, h = 3 mm, four decimals."""
-    assert_allclose(nutation_ratio(np.radians(theta_deg), MA_2014), ratio, atol=5e-5)
-
-
-def test_nutation_ratio_of_a_thin_disc_is_root_three_fifths():
-    thin = replace(MA_2014, half_thickness=1e-7)
-    assert_allclose(nutation_ratio(1e-3, thin), np.sqrt(0.6), rtol=1e-4)
 
 
 def test_counted_ratio_lies_where_theory_puts_it(true_motion):
