@@ -272,7 +272,7 @@ def _judged(
     settings: CalibrationSettings,
     table_view: int | None,
     board_thickness: float,
-    wide: tuple[str, ...],
+    wide: Sequence[tuple[str, str]],
 ) -> tuple[StereoRig, Assessment, list[str]]:
     """The rig with its covariance, how good it is, and a warning if the board's shape is not the one taken.
 
@@ -295,7 +295,11 @@ def _judged(
 
 
 def _require_fitted(
-    fit: JointFit, rejected: dict[int, str], apart: Sequence[str], wide: Sequence[str], table_view: int | None
+    fit: JointFit,
+    rejected: dict[int, str],
+    apart: Sequence[str],
+    wide: Sequence[tuple[str, str]],
+    table_view: int | None,
 ) -> None:
     """Raises CalibrationError where the table view is lost, or too few views are left."""
     if table_view is not None and table_view in rejected | fit.pairs.apart:
@@ -303,7 +307,7 @@ def _require_fitted(
         raise CalibrationError(f"the table view {table_view} cannot be used: {reason}")
     n_used = len(np.unique(fit.refinement.observations.view[fit.refinement.kept]))
     if n_used < MIN_VIEWS:
-        also = f"{'; '.join(wide)}. " if wide else ""
+        also = "".join(f"{what}: {by_what}. " for what, by_what in wide)
         reasons = {where: why for where, _, why in (text.partition(": ") for text in rejected.values())}
         raise CalibrationError(
             f"{also}Only {n_used} views can be used, at least {MIN_VIEWS} are needed: {_listed(reasons)}"

@@ -123,8 +123,8 @@ def start_stereo(
     return Pairs(model, left, right, apart), {v: orders[k] for v, k in zip(both, pairs.order, strict=True)}, notes
 
 
-def too_wide(observations: Observations, nominal: Array, cameras: tuple[Camera, Camera]) -> tuple[str, ...]:
-    """A sentence about every lens that the rational model describes far better than any polynomial here could.
+def too_wide(observations: Observations, nominal: Array, cameras: tuple[Camera, Camera]) -> tuple[tuple[str, str], ...]:
+    """What is to be said, and by what, of every lens that the rational model describes far better than a polynomial.
 
     nominal : (n, 3) [m] the target's points as declared; cameras : as they start the refinement
     """
@@ -143,12 +143,12 @@ def too_wide(observations: Observations, nominal: Array, cameras: tuple[Camera, 
         except cv2.error:
             continue
         if rational < CLEARLY * polynomial:
-            found.append(
-                f"the {CAMERA_NAMES[index]} lens is wider than the model: a polynomial in the radius leaves "
-                f"{polynomial:.2f} px in views left out, a rational function {rational:.2f} px, and that is not "
-                "supported. Results are wrong by as much: take a lens below some 90 deg, or crop the images to the "
-                "middle"
+            by_what = (
+                f"a polynomial in the radius leaves {polynomial:.2f} px in views left out, a rational function "
+                f"{rational:.2f} px, and that is not supported. Results are wrong by as much: take a lens below some "
+                "90 deg, or crop the images to the middle"
             )
+            found.append((f"the {CAMERA_NAMES[index]} lens is wider than the model", by_what))
     return tuple(found)
 
 

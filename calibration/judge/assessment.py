@@ -1,5 +1,6 @@
 """How good a calibration is: consistency of its parts, coverage, uncertainty in px and mm, and a verdict in words."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
@@ -159,7 +160,7 @@ def assess(
     table_view: int | None,
     inflation: float,
     motion: PairMotion | None,
-    wide: tuple[str, ...],
+    wide: Sequence[tuple[str, str]],
 ) -> Assessment:
     """Collect the figures and judge them.
 
@@ -186,7 +187,7 @@ def assess(
         tilt_spread_deg=tilt_spread(refinement),
     )
     grade, verdict = _verdict(found, chosen, wide, _moved(found, refinement))
-    told = (*wide, *_warnings(found, refinement, chosen))
+    told = (*map(": ".join, wide), *_warnings(found, refinement, chosen))
     return replace(found, grade=grade, verdict=verdict, figures=_figures(found, refinement.rms()), warnings=told)
 
 
@@ -235,10 +236,10 @@ def _warnings(found: Assessment, refinement: Refinement, chosen: TermsTried) -> 
     return told
 
 
-def _verdict(found: Assessment, chosen: TermsTried, wide: tuple[str, ...], moved: bool) -> tuple[Grade, str]:
+def _verdict(found: Assessment, chosen: TermsTried, wide: Sequence[tuple[str, str]], moved: bool) -> tuple[Grade, str]:
     """The worst of what the figures say, with the reason."""
     # of equal grades the first is taken: the cause
-    reasons = [(3, wide[0].partition(":")[0])] if wide else []
+    reasons = [(3, what) for what, _ in wide]
     errors = found.triangulation_sigma[0], found.held_out_error
     for error, what in zip(errors, ("a point is uncertain by", "views left out of the fit are off by"), strict=True):
         if np.isfinite(share := error / found.distance):

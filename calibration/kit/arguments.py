@@ -24,6 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 from calibration.kit.errors import ArgumentError
 
 T = TypeVar("T", bound=Callable[..., Any])
+Numbers = TypeVar("Numbers", float, NDArray[np.float64])
 
 
 @dataclass(frozen=True)
@@ -38,7 +39,7 @@ class Range:
         most = f" to {self.most:g}" if math.isfinite(self.most) else " on"
         return f"a number from {self.least:g}{most}, in {self.unit}"
 
-    def take(self, number: Any) -> Any:
+    def take(self, number: Numbers) -> Numbers:
         """What was given. Raises ValueError."""
         if not np.all(np.isfinite(number) & (self.least <= number) & (number <= self.most)):
             raise ValueError

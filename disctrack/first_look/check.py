@@ -138,8 +138,8 @@ def _frames(seen: Check, recording: Recording) -> ImagePairs:
 
 def _rig(seen: Check, recording: Recording) -> StereoRig:
     if recording.rig_file is not None:
-        rig, told = given_rig(recording.rig_file)
-        seen.seen.append(("rig", told.verdict[:-1]))
+        rig, _ = given_rig(recording.rig_file)
+        seen.seen.append(("rig", f"{recording.rig_file}: baseline {1e3 * rig.baseline:.3f} mm"))
         seen.boards = boards_in(recording.rig_file, recording)
         return rig
     source = source_of(recording, CalibrationSettings())

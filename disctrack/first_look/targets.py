@@ -50,15 +50,12 @@ def dots_figure(disc: Disc, paper: str = "a4", dark: bool = True) -> Figure:
 def board_figure(inner_corners: tuple[int, int], square_mm: float, paper: str = "a4") -> Figure:
     """Chessboard with a light rim of one square and more. Raises OutputError if it does not fit."""
     columns, rows = inner_corners
-    size = np.array([(columns + 1) * square_mm, (rows + 1) * square_mm])
+    turned = columns > rows  # so that the long side lies along the paper's
+    size = np.array([rows + 1, columns + 1] if turned else [columns + 1, rows + 1]) * square_mm
     width, height = PAPERS_MM[paper]
     across = size + 2 * square_mm  # with the rim
     room = np.array([width - 2 * MARGIN_MM, height - 2 * MARGIN_MM - 14])
-    if (across[::-1] <= room).all() and not (across <= room).all():
-        size, turned = size[::-1], True
-    elif (across <= room).all():
-        turned = False
-    else:
+    if (across > room).any():
         raise OutputError(
             f"a board of {columns} x {rows} inner corners of {square_mm:g} mm needs {across[0]:g} x {across[1]:g} mm "
             f"with the light rim; {paper.upper()} has {room[0]:.0f} x {room[1]:.0f} mm. Choose a larger paper."
