@@ -14,7 +14,7 @@ from scipy.optimize import least_squares
 from calibration.kit.arrays import Array
 from calibration.kit.brief import Outline
 from disctrack.analyse.derivatives import K, MeasuredMotion, MotionState
-from disctrack.analyse.propagation import DerivedSeries, Propagated, propagate
+from disctrack.analyse.propagation import DerivedSeries, Propagated, propagate, rates
 from disctrack.disc import Disc
 
 CONTACT = (
@@ -77,9 +77,7 @@ def contact_quantities(state: MotionState, disc: Disc, gravity: float) -> Array:
     """
     n0, e2, e3 = state.axes()
     r_OA, m0 = disc.arm_to_contact(e2, e3), np.cross(K, n0)
-    thetadot = np.sum(state.omega_world * n0, axis=1)[:, None]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        psidot = (np.sum(state.omega_world * e2, axis=1) / state.sine)[:, None]
+    psidot, thetadot = rates(state).T[:2, :, None]
     slip = state.velocity + np.cross(state.omega_world, r_OA)
     locus = state.velocity + np.cross(thetadot * n0 + psidot * K, r_OA)
     force = disc.mass * (state.acceleration + gravity * K)

@@ -318,7 +318,7 @@ def _blocks(motion: MeasuredMotion) -> tuple[Array, Array]:
     disc = motion.disc
     m, J1, J3 = disc.mass, disc.moment_diametral, disc.moment_axial
     e1, e2, e3 = motion.axes()
-    theta = np.arctan2(motion.sine, e3[:, 2])
+    theta = motion.euler[:, 1]
     good = motion.known & motion.measured & (theta > THETA_RANGE[0]) & (theta < THETA_RANGE[1])
     if good.sum() < BLOCK:
         return np.empty(0), np.empty(0)

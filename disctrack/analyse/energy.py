@@ -11,7 +11,7 @@ import numpy as np
 from calibration.kit.arrays import Array
 from calibration.kit.brief import Outline
 from disctrack.analyse.derivatives import K, MeasuredMotion, MotionState
-from disctrack.analyse.propagation import DerivedSeries, Propagated, propagate
+from disctrack.analyse.propagation import DerivedSeries, Propagated, propagate, rates
 from disctrack.disc import Disc, precession_rate
 from disctrack.errors import ModelError
 
@@ -47,8 +47,8 @@ class Energy(Outline):
 def energy_quantities(state: MotionState, disc: Disc, gravity: float) -> Array:
     """All of ENERGY, (n, 9)."""
     m, J1, J3 = disc.mass, disc.moment_diametral, disc.moment_axial
-    e1, e2, e3 = state.axes()
-    omega = [np.sum(state.omega_world * e, axis=1) for e in (e1, e2, e3)]
+    e3 = state.axes()[2]
+    psidot, _, _, *omega, _ = rates(state).T
     translation = 0.5 * m * np.sum(state.velocity**2, axis=1)
     rotation = [0.5 * J * w**2 for J, w in zip((J1, J1, J3), omega, strict=True)]
     potential = m * gravity * (state.position[:, 2] - disc.half_thickness)
@@ -57,11 +57,9 @@ def energy_quantities(state: MotionState, disc: Disc, gravity: float) -> Array:
     power = m * np.sum(state.velocity * (state.acceleration + gravity * K), axis=1)
     power = power + np.sum(state.omega_world * inertia_alpha, axis=1)
     s = state.sine
-    with np.errstate(divide="ignore", invalid="ignore"):
-        level = omega[1] ** 2 / s
     total = translation + rotation[0] + rotation[1] + rotation[2] + potential
     return np.column_stack(
-        [translation, *rotation, potential, total, power, 1.5 * m * gravity * disc.radius * s, level]
+        [translation, *rotation, potential, total, power, 1.5 * m * gravity * disc.radius * s, psidot**2 * s]
     )
 
 
