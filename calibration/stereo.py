@@ -43,7 +43,7 @@ LEAST_SEEN = 12  # images of every point of the target, to free its place: from 
 class CalibrationSettings:
     """What the user may decide."""
 
-    distortion: str = "auto"  # all terms, with priors; or a key of stereo_model.DISTORTION_MODELS
+    distortion: str = "auto"  # all terms, with priors; or one of stereo_model.DISTORTION_MODELS
     board: str = "auto"  # decided by held-out error; or one of stereo_model.BOARD_MODELS
     tolerances: BoardTolerances = field(default_factory=BoardTolerances)
 

@@ -22,15 +22,8 @@ from calibration.cameras.camera import (
 from calibration.kit.arrays import Array
 from calibration.kit.errors import CalibrationError
 
-DISTORTION_MODELS: dict[str, tuple[str, ...]] = {
-    "none": (),
-    "k1": ("k1",),
-    "k1 k2": ("k1", "k2"),
-    "k1 k2 p1 p2": ("k1", "k2", "p1", "p2"),
-    "k1 k2 k3": ("k1", "k2", "k3"),
-    "k1 k2 p1 p2 k3": ("k1", "k2", "p1", "p2", "k3"),
-}
 RICHEST = "k1 k2 p1 p2 k3"
+DISTORTION_MODELS = ("none", "k1", "k1 k2", "k1 k2 p1 p2", "k1 k2 k3", RICHEST)  # by the terms that are free
 BOARD_MODELS = ("flat", "warped", "free")
 N_WARP = 5  # shape parameters of a warped board
 N_STEREO = 2 * N_INTRINSIC + 6  # left and right intrinsics, rotation and translation of the pair
@@ -97,7 +90,7 @@ class StereoModel:
 class Terms:
     """What the refinement may change."""
 
-    distortion: str = RICHEST  # key of DISTORTION_MODELS, the same for both cameras
+    distortion: str = RICHEST  # one of DISTORTION_MODELS, the same for both cameras
     board: str = "flat"  # one of BOARD_MODELS
 
     def __post_init__(self) -> None:
@@ -110,7 +103,7 @@ class Terms:
 
     def stereo_basis(self) -> Array:
         """(24, n_free) columns span the free directions of intrinsics and stereo pose."""
-        free = {*INTRINSIC_PARAMETERS[:4], *DISTORTION_MODELS[self.distortion]}
+        free = {*INTRINSIC_PARAMETERS[:4], *self.distortion.split()}
         own = np.array([name in free for name in INTRINSIC_PARAMETERS])
         return np.eye(N_STEREO)[:, np.concatenate([own, own, np.ones(6, bool)])]
 
@@ -194,7 +187,7 @@ def restricted(model: StereoModel, nominal: Array, terms: Terms) -> StereoModel:
     basis = board_basis(nominal, terms.board).reshape(nominal.size, -1)
     shape = np.linalg.pinv(basis) @ (model.points - nominal).reshape(-1)
     model = replace(model, points=nominal + (basis @ shape).reshape(nominal.shape))
-    cameras, free = [], DISTORTION_MODELS[terms.distortion]
+    cameras, free = [], terms.distortion.split()
     held = np.array([name in free for name in INTRINSIC_PARAMETERS[4:]])
     for camera in model.cameras:
         parameters = camera.parameters * np.concatenate([np.ones(4), held])
