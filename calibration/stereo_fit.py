@@ -78,7 +78,7 @@ def fit_jointly(
         motion = replace(left, scatter=max(motion.scatter, left.scatter))
         likely = motion.is_seen
     if motion is not None and likely:
-        refinement, again = refined(used, tried, motion.size)
+        refinement, again = refined(used, tried, motion.as_random(nominal))
         candidates = (*candidates, *again)
         lens = fit_lens_field(refinement, nominal)
     return JointFit(lens.refinement if lens else refinement, lens, candidates, pairs, moved, motion, bad_images)

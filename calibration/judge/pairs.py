@@ -197,6 +197,11 @@ class PairMotion:
         """True if it is by all pairs together, where the usual one shows more than nothing: few pairs hide it."""
         return self.is_seen or (self.likely > self._enough and self.pixels > self.at_rest)
 
+    def as_random(self, points: Array) -> BoardMotion:
+        """As a random motion of boards with these points (n, 3) [m], roughly: what is begun with."""
+        reach = float(np.sqrt(np.mean(np.sum((points - points.mean(0)) ** 2, axis=1))))
+        return BoardMotion(self.distance / reach, self.distance)
+
     @property
     def _enough(self) -> float:
         return MOVED * max(self.scatter, self.at_rest)
