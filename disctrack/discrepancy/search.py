@@ -18,7 +18,6 @@ from scipy import stats
 
 from calibration.kit.arrays import Mask
 from calibration.kit.brief import Outline
-from disctrack.discrepancy.elimination import prior_rows
 from disctrack.discrepancy.fit import Fit, fit, no_fit
 from disctrack.discrepancy.held_out import HeldOut, held_out, training_rows
 from disctrack.discrepancy.noise import THIRD, common_modes, inflation, noise_variance, whitened
@@ -518,7 +517,7 @@ class _Search:
         """With these effects.   patient : however long it takes; else a fit that is given up has not converged"""
         key = _names(candidates)
         known = self.pool[key].fit if key in self.pool else None
-        if known is not None and (known.converged or not key) and not self._better(start, known):
+        if known is not None and (known.converged or not key):
             return known
         values = dict(start)
         for c in candidates:
@@ -530,15 +529,6 @@ class _Search:
                 return fit(self.system, quantities, values)
         except GivenUp:
             return no_fit(quantities, values)
-
-    def _better(self, start: Values, known: Fit) -> bool:
-        """Does a fit begin below the minimum that is known of its effects? Then that was not the lowest."""
-        if not self.rough:
-            return False
-        values = known.values | {q.name: start.get(q.name, q.null) for q in known.quantities}
-        right, _ = prior_rows(known.quantities, values)
-        cost = float(np.sum(self.system.linearise(values, ())[0] ** 2) + right @ right)
-        return cost < known.cost - CLASS_GAIN * self.noise
 
     def _best_fit(self, current: Explanation, extra: Sequence[Candidate]) -> Fit | None:
         """Refit with the extra candidates, from each of its starts where one acts beyond a threshold only."""

@@ -115,8 +115,7 @@ def correlated(fit: Fit, names: Sequence[str], among: Sequence[str]) -> tuple[Co
 def _pair(fit: Fit, first: str, second: str) -> Correlated | None:
     if first not in fit.shared or second not in fit.shared:
         return None
-    chosen = [fit.shared.index(first), fit.shared.index(second)]
-    (a, cross), (_, b) = fit.covariance[np.ix_(chosen, chosen)]
+    (a, cross), (_, b) = fit.amounts([first, second])[1]
     if not (a > 0 and b > 0):  # one stands at a bound
         return None
     factor = float(-cross / b)

@@ -277,10 +277,8 @@ def _dependences(system: JointSystem, diagnosis: Diagnosis) -> tuple[Dependence,
         names = [n for n in groups.values() if n in after.names and after.sigma(n) > 0]
         if len(names) < 2 or len(names) < len(groups):
             continue
-        index = [after.names.index(n) for n in names]
-        values = np.array([after.values[n] for n in names])
-        covariance = after.covariance[np.ix_(index, index)]
-        q = after.quantities[index[0]]
+        values, covariance = np.array([after.values[n] for n in names]), after.amounts(names)[1]
+        q = after.quantities[after.names.index(names[0])]
         if np.isfinite(q.prior_sigma):  # a tolerance, no law
             continue
         tested = hypotheses(values, covariance, sharing.covariates_of(local), sharing.kinds_of(local))
