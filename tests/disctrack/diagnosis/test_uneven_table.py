@@ -14,25 +14,21 @@ from disctrack.rolling.effects import effect_from_formulas
 from tests.oracles.measured_disc import K_M
 from tests.oracles.unknown_laws import DISC, PLACE, UNKNOWN, motion, recording
 
-RIDGE = {"direction": 0.6, "edge": 0.05, "length": 3e-3}  # as UNKNOWN["groove"], of 20 um
-STEP = {"direction": 0.9, "edge": 0.045, "length": 4e-3}  # as UNKNOWN["seam"], of 6 um
-HILL = {"x0": float(PLACE[0]), "y0": float(PLACE[1]), "length": 8e-3}  # as UNKNOWN["bump"], of 30 um
-
 
 @pytest.mark.statistical
 @pytest.mark.parametrize(
-    ("name", "title", "shape", "amount"),
-    [
-        ("groove", "a ridge or groove of the table", RIDGE, -20e-6 * 3e-3),
-        ("seam", "a step of the table", STEP, 6e-6),
-        ("bump", "a hill or dip of the table", HILL, 30e-6 * 8e-3**2),
+    ("name", "kind", "shape", "amount"),
+    [  # shapes as in UNKNOWN, of 20, 6 and 30 um
+        ("groove", "ridge", {"direction": 0.6, "edge": 0.05, "length": 3e-3}, -20e-6 * 3e-3),
+        ("seam", "step", {"direction": 0.9, "edge": 0.045, "length": 4e-3}, 6e-6),
+        ("bump", "hill", {"x0": float(PLACE[0]), "y0": float(PLACE[1]), "length": 8e-3}, 30e-6 * 8e-3**2),
     ],
 )
-def test_an_uneven_table_moves_the_disc_as_the_work_of_the_load_does(name, title, shape, amount):
+def test_an_uneven_table_moves_the_disc_as_the_work_of_the_load_does(name, kind, shape, amount):
     """The oracle lets the load pay for what the contact climbs, for every direction of the angular velocity."""
     unknown = replace(UNKNOWN[name], duration=0.2)
     times, q, speed, _ = motion(unknown)
-    family = next(f for f in families(q, times, 500.0, DISC) if f.title == title)
+    family = next(f for f in families(q, times, 500.0, DISC) if f.kind == kind)
     formulas = replace(family, shape=shape).formulas()[0]
     law = effect_from_formulas("uneven", {k: f"c * ({f})" for k, f in formulas.items()})
     theta, psidot, phidot = q[0, 4], speed[0, 3], speed[0, 5]
