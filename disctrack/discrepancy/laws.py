@@ -22,7 +22,7 @@ from disctrack.discrepancy.significance import as_sigmas, price_of_a_number, wal
 from disctrack.discrepancy.system import Candidate, Quantity, System, Values
 
 MAX_TERMS = 3
-REFITTED = 5  # laws that are fitted in full in each round ...
+REFITTED = 5  # families that are fitted in full in each round ...
 OF_ONE_KIND = 2  # ... of them of one kind
 LONGER = 2  # of other kinds, that come nearest to the data in more numbers, beside known effects that describe them
 MIN_SIGMAS = 3.0  # of a coefficient after the refit; what helped to first order may not help the motion

@@ -23,7 +23,7 @@ from disctrack.discrepancy.equations.start import guessed, near_declared, sizes_
 from disctrack.discrepancy.equations.system import MOST_STATES, EquationSystem, cut
 from disctrack.discrepancy.fit import TRIAL, Fit, fit, no_fit
 from disctrack.discrepancy.held_out import HeldOut, held_out
-from disctrack.discrepancy.laws import REFITTED, evidence
+from disctrack.discrepancy.laws import evidence
 from disctrack.discrepancy.score import Linearisation
 from disctrack.discrepancy.search import (
     CLASS_GAIN,
@@ -48,6 +48,7 @@ FINE, STRAIGHT = 0.03, 1e4  # of the largest value: the variable's inverse hyper
 SIZES = np.logspace(-4, 2, 31)  # prior sigma of the first amplitudes, over the rms of the equation that it stands in
 FEWEST = 10  # samples of such a stretch
 MOST_LAWS = 40  # that are looked at in any case
+REFITTED = 4  # laws that are fitted in full: the next one may wander for longer than these take
 WORTH = 50.0  # of -2 log evidence to first order: a law that is so much worse than another is not fitted ...
 ROUGHLY = 4.0  # ... times that of the other, where the declared equations are far from the data
 PLAUSIBLE = 4.0  # the same, by which a rougher law may be less probable than the best one
