@@ -75,18 +75,18 @@ def flat_fielded(readers: Sequence[FrameReader], fields: FlatFields) -> list[Fra
     """
     if fields == (None, None):
         return list(readers)
-    return [_corrected(reader, field, name) for reader, field, name in zip(readers, fields, CAMERAS, strict=True)]
+    return [_corrected(reader, field) for reader, field in zip(readers, fields, strict=True)]
 
 
-def _corrected(reader: FrameReader, field: FlatField | None, camera: str) -> FrameReader:
+def _corrected(reader: FrameReader, field: FlatField | None) -> FrameReader:
     if field is None:
         zero = np.zeros(reader.image_size[::-1], np.float32)
         field = FlatField(zero, zero + 1, None, reader.bit_depth, "none")
     frames, images = in_words(reader.image_size, reader.bit_depth), in_words(field.dark.shape[::-1], field.bit_depth)
     if frames != images:
         raise RecordingError(
-            f"{reader.describe(0)}: {camera} frames are {frames}, but [cameras] {camera}_flat and {camera}_dark have "
-            f"{images}. Take these with the settings of the recording, or leave them out."
+            f"{reader.describe(0)}: {reader.camera} frames are {frames}, but [cameras] {reader.camera}_flat and "
+            f"{reader.camera}_dark have {images}. Take these with the settings of the recording, or leave them out."
         )
     notes = (*reader.notes, *field.notes)
     return Changed(reader, field.corrected, field.sha256, notes=notes, bit_depth=16, dtype=np.dtype(np.uint16))

@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disctrack.errors import RecordingError
-from disctrack.frames import CAMERAS
 from disctrack.recording.readers.base import Changed, FrameReader
 
 
@@ -40,16 +39,16 @@ ImageParts = tuple[ImagePart | None, ...]  # of the left and of the right camera
 def frames_in_parts(readers: Sequence[FrameReader], parts: ImageParts, where: str) -> list[FrameReader]:
     """Both cameras' readers, of the declared parts. Raises RecordingError, which begins with `where`, if one is cut."""
     found: list[FrameReader] = []
-    for reader, part, camera in zip(readers, parts, CAMERAS, strict=True):
-        width, height = reader.image_size
+    for reader, part in zip(readers, parts, strict=True):
         if part is None:
             found.append(reader)
             continue
+        width, height = reader.image_size
         if not part.lies_in(width, height):
             raise RecordingError(
-                f"{where}: [cameras] {camera}_part is {part}, columns {part.x} to {part.x + part.width - 1} and rows "
-                f"{part.y} to {part.y + part.height - 1}, but {reader.describe(0)} has {width} x {height} px. It is "
-                "[x, y, width, height] in pixels, from the upper left corner."
+                f"{where}: [cameras] {reader.camera}_part is {part}, columns {part.x} to {part.x + part.width - 1} and "
+                f"rows {part.y} to {part.y + part.height - 1}, but {reader.describe(0)} has {width} x {height} px. It "
+                "is [x, y, width, height] in pixels, from the upper left corner."
             )
         found.append(Changed(reader, part.of, str(part), image_size=(part.width, part.height)))
     return found
