@@ -23,14 +23,17 @@ PLAYBACK_HZ = 25.0
 MOST_FRAMES = 1500  # a minute of video; of longer recordings every second, third, ... pair is shown
 POINTS = 120  # of an outline
 CAPTION_LINE = 18  # height of a line [px]
-CAPTION_WIDTH = 950  # of the whole caption on one line [px]
 _SUBPIXEL_BITS = 4  # OpenCV draws at fractions of 1/16 px
 
-_TEXT = (230, 230, 230)
-# Blue, green, red as OpenCV orders them.
-_RIM, _LOWER, _DOT, _CENTRE, _REFUSED, _CONTACT = (
-    (80, 220, 80), (90, 140, 60), (255, 190, 60), (60, 60, 255), (60, 160, 255), (240, 80, 240),
-)  # fmt: skip
+_COLOURS = {  # blue, green, red as OpenCV orders them
+    "text": (230, 230, 230),
+    "upper rim": (80, 220, 80),
+    "lower rim": (90, 140, 60),
+    "dot": (255, 190, 60),
+    "centre": (60, 60, 255),
+    "refused": (60, 160, 255),
+    "contact": (240, 80, 240),
+}
 
 
 @checked
@@ -75,7 +78,7 @@ def draw_pair(images: NDArray, trajectory: Trajectory, row: int) -> ColourImage:
     images : (2, height, width) uint8 or uint16
     """
     height, width = images.shape[1:]
-    captions = _caption_lines(trajectory, row, 2 * width)
+    captions = _caption(trajectory, row)
     whole = np.zeros((height + CAPTION_LINE * len(captions) + 6, 2 * width, 3), np.uint8)
     pictures = [whole[:height, :width], whole[:height, width:]]
     for image, picture in zip(images, pictures, strict=True):
@@ -84,20 +87,15 @@ def draw_pair(images: NDArray, trajectory: Trajectory, row: int) -> ColourImage:
         _draw_disc(pictures, trajectory, row)
     for camera, picture in enumerate(pictures):
         _draw_centres(picture, trajectory.markers_px[row, camera], trajectory.marker_status[row, camera])
-        cv2.putText(picture, CAMERAS[camera], (8, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.45, _TEXT, 1, cv2.LINE_AA)
-    colour = _TEXT if trajectory.measured[row] else _REFUSED
+        _write(picture, 0, CAMERAS[camera], "text")
     for line, text in enumerate(captions):
-        place = (8, CAPTION_LINE * (line + 1) - 3)
-        cv2.putText(whole[height:], text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.45, colour, 1, cv2.LINE_AA)
+        _write(whole[height:], line, text, "text" if trajectory.measured[row] else "refused")
     return whole[: whole.shape[0] // 2 * 2, : whole.shape[1] // 2 * 2]  # video codecs want even sizes
 
 
-def _caption_lines(trajectory: Trajectory, row: int, width: int) -> list[str]:
-    """Caption below the images, on as many lines as the width [px] asks for."""
-    parts = _caption(trajectory, row)
-    n_lines = min(-(-CAPTION_WIDTH // width), 4)
-    per_line = -(-len(parts) // n_lines)
-    return ["   ".join(parts[line * per_line : (line + 1) * per_line]) for line in range(n_lines)]
+def _write(picture: ColourImage, line: int, text: str, colour: str) -> None:
+    place, font = (8, CAPTION_LINE * (line + 1) - 3), cv2.FONT_HERSHEY_SIMPLEX
+    cv2.putText(picture, text, place, font, 0.45, _COLOURS[colour], 1, cv2.LINE_AA)
 
 
 def _to_8_bit(image: NDArray) -> NDArray[np.uint8]:
@@ -108,9 +106,10 @@ def _to_8_bit(image: NDArray) -> NDArray[np.uint8]:
 
 
 def _caption(trajectory: Trajectory, row: int) -> list[str]:
+    """Lines below the images."""
     head = f"frame {trajectory.frame[row]}  t = {trajectory.time[row]:.4f} s"
     if not trajectory.measured[row]:
-        return [head, FrameStatus(trajectory.frame_status[row]).sentence]
+        return [head, FrameStatus(trajectory.frame_status[row]).sentence, "", ""]  # as many as of any frame
     q = trajectory.q[row]
     x, y, z = q[:3] * 1e3
     psi, theta, phi = np.degrees(q[3:])
@@ -141,11 +140,11 @@ def _draw_disc(pictures: list[ColourImage], trajectory: Trajectory, row: int) ->
         facing = np.sum((lower - t + h * R[:, 2]) * (-R_cw.T @ t_cw - lower), axis=1) > 0
         start = int(np.argmin(facing))  # a hidden point, so that the visible ones are in one run
         visible = np.roll(facing, -start)
-        _polylines(picture, [np.roll(lower_px, -start, axis=0)[visible]], _LOWER, closed=bool(facing.all()))
-        _polylines(picture, [upper_px], _RIM)
-        _polylines(picture, dots_px, _DOT)
+        _polylines(picture, [np.roll(lower_px, -start, axis=0)[visible]], "lower rim", closed=bool(facing.all()))
+        _polylines(picture, [upper_px], "upper rim")
+        _polylines(picture, dots_px, "dot")
         if np.isfinite(seen[-1]).all():
-            _cross(picture, seen[-1], _CONTACT, cv2.MARKER_DIAMOND, 9)
+            _cross(picture, seen[-1], "contact", cv2.MARKER_DIAMOND, 9)
 
 
 def _circle() -> Array:
@@ -153,9 +152,7 @@ def _circle() -> Array:
     return np.stack([np.cos(angle), np.sin(angle), np.zeros(POINTS)], axis=-1)
 
 
-def _polylines(
-    picture: ColourImage, lines: Sequence[Array] | Array, colour: tuple[int, int, int], closed: bool = True
-) -> None:
+def _polylines(picture: ColourImage, lines: Sequence[Array] | Array, colour: str, closed: bool = True) -> None:
     exact = np.asarray(lines)
     finite: Mask = np.asarray(np.isfinite(exact).all(axis=2))  # not behind a camera, nor out of the lens's reach
     whole = np.clip(np.rint(np.where(finite[..., None], 2**_SUBPIXEL_BITS * exact, 0.0)), -(2**24), 2**24).astype(
@@ -163,18 +160,18 @@ def _polylines(
     )
     fixed = [line[seen, None] for line, seen in zip(whole, finite, strict=True) if seen.sum() > 1]
     if fixed:
-        cv2.polylines(picture, fixed, closed, colour, 1, cv2.LINE_AA, _SUBPIXEL_BITS)
+        cv2.polylines(picture, fixed, closed, _COLOURS[colour], 1, cv2.LINE_AA, _SUBPIXEL_BITS)
 
 
 def _draw_centres(picture: ColourImage, pixels: Array, status: NDArray[np.uint8]) -> None:
     for point, state in zip(pixels, status, strict=True):
         if np.isfinite(point).all():
-            _cross(picture, point, _CENTRE if state == MarkerStatus.MEASURED else _REFUSED, cv2.MARKER_CROSS, 7)
+            _cross(picture, point, "centre" if state == MarkerStatus.MEASURED else "refused", cv2.MARKER_CROSS, 7)
 
 
-def _cross(picture: ColourImage, point: Array, colour: tuple[int, int, int], kind: int, size: int) -> None:
+def _cross(picture: ColourImage, point: Array, colour: str, kind: int, size: int) -> None:
     x, y = np.clip(np.rint(point), -10000, 10000).astype(int)
-    cv2.drawMarker(picture, (int(x), int(y)), colour, kind, size, 1, cv2.LINE_AA)
+    cv2.drawMarker(picture, (int(x), int(y)), _COLOURS[colour], kind, size, 1, cv2.LINE_AA)
 
 
 @contextlib.contextmanager

@@ -35,7 +35,6 @@ class AccuracyRow:
     bias: float
     scatter: float  # about the bias
     within_95: float  # 95 % of |error| lie within
-    largest: float
     noise_rms: float  # through the true cameras
     calibration_rms: float  # difference of the recordings' own and the true cameras
 
@@ -66,13 +65,10 @@ class SightCount:
 class Accuracy:
     """All that recordings, some with static poses, showed."""
 
-    corners_px: tuple[float, ...]
     rows: dict[str, tuple[AccuracyRow, ...]]  # by name of the recordings
-    strata: tuple[tuple[float, ...], ...]  # by STRATA_DEG: see `_strata`
     sights: tuple[SightCount, ...]
     consistency: dict[str, Consistency]  # of the noise in each part, and of the calibration
     law: float  # [rad] c of sigma(psi) = c / sin(theta)
-    warnings: tuple[str, ...]
 
     @property
     def law_limit_deg(self) -> float:
@@ -93,13 +89,10 @@ def sum_up(outcomes: Sequence[RenderedOutcome]) -> Accuracy:
     consistency = {f"noise, {name} (true cameras)": noise_consistency(true) for name, (_, true) in both.items()}
     by_calibration = calibration_consistency(outcome.seen_by_both for outcome in static)
     return Accuracy(
-        tuple(outcome.corners_px for outcome in outcomes),
         {name: _rows(*pair) for name, pair in both.items()},
-        _strata(both[STATIC][0]),
         tuple(_sight(joined(o.own.part(o.cameras == n) for o in static), n) for n in (2, 1, 0)),
         consistency | {"calibration, static poses (own - true cameras, same images)": by_calibration},
         c,
-        tuple(sorted({warning for outcome in outcomes for warning in outcome.warnings})),
     )
 
 
@@ -113,20 +106,23 @@ def _rows(own: PoseErrors, true: PoseErrors) -> tuple[AccuracyRow, ...]:
         difference = e - f if name in "xyz" else np.angle(np.exp(1j * (e - f)))
         size = np.abs(e) if e.size else np.array([np.nan])
         bias, scatter = (float(e.mean()), float(e.std())) if e.size else (np.nan, np.nan)
-        spread = bias, scatter, float(np.quantile(size, 0.95)), float(size.max())
-        rows.append(AccuracyRow(name, len(e), *spread, _rms(f), _rms(difference)))
+        within_95 = float(np.quantile(size, 0.95))
+        rows.append(AccuracyRow(name, len(e), bias, scatter, within_95, _rms(f), _rms(difference)))
     return tuple(rows)
 
 
-def _strata(own: PoseErrors) -> tuple[tuple[float, ...], ...]:
-    """Of each stratum the number of poses, and rms of position and of four angles."""
-    theta, found = np.degrees(own.q[:, 4]), []
+def _strata_table(own: PoseErrors, law: float) -> Table:
+    """Root mean squares of the poses in each stratum of nutation."""
+    theta, names, rows = np.degrees(own.q[:, 4]), ("rotation", "theta", "psi", "phi"), []
     for low, high in STRATA_DEG:
-        at = (theta >= low) & (theta < high)
-        seen = own.part(at)
-        rms = (_rms(seen.of(name)) for name in ("rotation", "theta", "psi", "phi"))
-        found.append((int(at.sum()), _rms(seen.error[seen.usable, :3]), *rms))
-    return tuple(found)
+        some = own.part((theta >= low) & (theta < high))
+        if len(some.q):
+            angles = [_rms(some.of(name)) for name in names] + [law / np.sin(np.radians(np.sqrt(low * high)))]
+            position = _rms(some.error[some.usable, :3])
+            rows.append([f"{low:g}-{high:g}", str(len(some.q)), *_cells(_UM, position), *_cells(_MDEG, *angles)])
+    law_said = f"{_MDEG * law:.2f} / sin(theta)"
+    head = ["theta [deg]", "n", "position [µm]", *(f"{name} [mdeg]" for name in names), law_said]
+    return Table("As a function of nutation (static poses)", head, rows, "Root mean squares.")
 
 
 def _sight(own: PoseErrors, cameras: int) -> SightCount:
@@ -183,16 +179,8 @@ def accuracy_validation(outcomes: Sequence[RenderedOutcome]) -> Validation:
     """All tables of recordings with static poses, with the verdict on top."""
     accuracy = sum_up(outcomes)
     tables = [_accuracy_table(name, rows) for name, rows in accuracy.rows.items()]
-    strata = []
-    for (low, high), (n, position, *angles) in zip(STRATA_DEG, accuracy.strata, strict=True):
-        if not n:
-            continue
-        law = accuracy.law / np.sin(np.radians(np.sqrt(low * high)))
-        strata.append([f"{low:g}-{high:g}", str(n), *_cells(_UM, position), *_cells(_MDEG, *angles, law)])
-    names = ("rotation", "theta", "psi", "phi")
-    law_said = f"{_MDEG * accuracy.law:.2f} / sin(theta)"
-    head = ["theta [deg]", "n", "position [µm]", *(f"{name} [mdeg]" for name in names), law_said]
-    tables.append(Table("As a function of nutation (static poses)", head, strata, "Root mean squares."))
+    static = joined(outcome.seen_by_both[0] for outcome in outcomes if outcome.name == STATIC)
+    tables.append(_strata_table(static, accuracy.law))
     sights = [
         [*map(str, (s.cameras, s.n, s.found, s.gross)), *_cells(_UM, s.position), *_cells(_MDEG, s.rotation)]
         for s in accuracy.sights
@@ -202,10 +190,11 @@ def accuracy_validation(outcomes: Sequence[RenderedOutcome]) -> Validation:
     tables.append(Table("Who sees the face (static poses)", head, sights, note))
     honest = [[name, *_cells(1, c.value, c.uncertainty), str(c.n)] for name, c in accuracy.consistency.items()]
     head = ["squared error over predicted variance", "value", "standard error", "poses or rigs"]
-    corners = ", ".join(f"{rms:.4f}" for rms in accuracy.corners_px)
+    corners = ", ".join(f"{outcome.corners_px:.4f}" for outcome in outcomes)
     note = f"Target {CONSISTENT[0]} to {CONSISTENT[1]} within 3 standard errors. Corner rms by recording: {corners} px."
     tables.append(Table("Errors against stated uncertainty", head, honest, note))
-    return Validation("validation", verdict(accuracy), tables, [accuracy], complaints(accuracy), accuracy.warnings)
+    warnings = sorted({warning for outcome in outcomes for warning in outcome.warnings})
+    return Validation("validation", verdict(accuracy), tables, [accuracy], complaints(accuracy), warnings)
 
 
 def _cells(unit: float, *values: float) -> list[str]:

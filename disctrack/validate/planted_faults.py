@@ -47,8 +47,9 @@ SIZES = (0.1, 1.0, 10.0)  # times what surprises nobody: just visible, ordinary,
 MOST_SIGMAS = 5.0  # of six components of a hundred poses chance alone reaches 4.1
 MOST_TIMES = 3.0  # an ordinary run
 Tree = dict[str, Any]  # of a recording.toml
-# Of a recording that may be spoilt, its declaration, which is written afterwards; and the size
-Change = Callable[[Path, Tree, float], None]
+# Of a recording that may be spoilt, its declaration, which is written afterwards, and the size; returns the true poses,
+# where they are others
+Change = Callable[[Path, Tree, float], Array | None]
 
 
 @dataclass(frozen=True)
@@ -74,7 +75,8 @@ class Planting:
     sizes: Sequence[float]
     unit: str
     named_by: tuple[Kind, ...]
-    plant: Callable[[Ground, Path, float], Array | None]  # into a new folder; the true poses, where these are others
+    change: Change
+    of_views: bool = False  # the recording is calibrated anew, by its own views
 
 
 @dataclass(frozen=True)
@@ -121,10 +123,8 @@ def untouched(folder: Path, recordings: Sequence[Path], seed: int = 29) -> Itera
     yield _ground(folder / "rendered", scene, truth.q)
     for path in recordings:
         filmed = read_recording(path)
-        copy = folder / filmed.name
-        tree = _with_views(filmed, copy, _copied(filmed, copy))
-        declare(copy, tree)
-        yield _ground(copy, None, None)
+        declare(folder / filmed.name, _copied(filmed, folder / filmed.name))
+        yield _ground(folder / filmed.name, None, None)
 
 
 def _ground(folder: Path, scene: Scene | None, q: Array | None) -> Ground:
@@ -133,7 +133,7 @@ def _ground(folder: Path, scene: Scene | None, q: Array | None) -> Ground:
         raise DiscTrackError(f"{folder.name}: something is wrong before anything is planted: {_said(findings)}")
     ground = Ground(folder, folder / "results" / "rig.h5", scene, trajectory.q if q is None else q, (1.0, 1.0))
     again = folder.with_name(f"{folder.name} again")
-    declare(again, _shared(ground, again))
+    declare(again, _copied(read_recording(folder), again, ground.rig))
     return replace(ground, seconds=(_run(again)[-1], _run(folder)[-1]))
 
 
@@ -152,7 +152,10 @@ def plant_and_run(case: FaultCase) -> FaultOutcome:
     planting = plantings(case.ground)[case.fault]
     folder = case.ground.recording.with_name(f"{case.ground.make} {case.fault} {case.size:g}")
     try:
-        q = planting.plant(case.ground, folder, case.size)
+        rig = None if planting.of_views else case.ground.rig
+        tree = _copied(read_recording(case.ground.recording), folder, rig)
+        q = planting.change(folder, tree, case.size)
+        declare(folder, tree)
         code, findings, trajectory, seconds = _run(folder)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
@@ -160,9 +163,8 @@ def plant_and_run(case: FaultCase) -> FaultOutcome:
     naming = [f for f in findings if f.kind in planting.named_by]
     told = _said(naming) if naming else f"({_said(findings)})" if findings else ""
     of = case.ground.make, case.fault, case.size, planting.unit
-    return FaultOutcome(
-        *of, position, rotation, told, bool(naming), code, seconds / case.ground.seconds[case.fault in OF_VIEWS]
-    )
+    times = seconds / case.ground.seconds[planting.of_views]
+    return FaultOutcome(*of, position, rotation, told, bool(naming), code, times)
 
 
 def _run(folder: Path) -> tuple[int, list[Finding], Trajectory | None, float]:
@@ -208,11 +210,7 @@ def _in_sigmas(trajectory: Trajectory | None, q: Array) -> tuple[float, float]:
 
 def plantings(ground: Ground) -> dict[str, Planting]:
     """All faults that can be planted into such a recording, by name."""
-    found = {fault.name: planting for fault, planting in _of_catalogue(ground)}
-    for views, table in ((False, CHANGES), (True, OF_VIEWS)):
-        for name, (sizes, unit, kinds, change) in table.items():
-            found[name] = Planting(sizes, unit, kinds, partial(_changed, change, views))
-    return found
+    return {fault.name: planting for fault, planting in _of_catalogue(ground)} | CHANGES
 
 
 def _of_catalogue(ground: Ground) -> Iterator[tuple[Fault, Planting]]:
@@ -226,11 +224,11 @@ def _of_catalogue(ground: Ground) -> Iterator[tuple[Fault, Planting]]:
         )  # as if rig, disc, dots or rate were declared wrong
         if not fault.named_by or alike or (ground.scene is None and not declarable):
             continue
-        plant = _declared_wrong if ground.scene is None else _rendered
+        change = _declared_wrong if ground.scene is None else _rendered
         sizes = [TYPICAL_STEPS * fault.step * size for size in SIZES]
         if fault.in_images:  # the square of an exposure, which ends before the next
             sizes = [size for size in sizes if size * recording.frame_rate**2 < 1]
-        yield fault, Planting(sizes, fault.unit, fault.named_by, partial(plant, fault))
+        yield fault, Planting(sizes, fault.unit, fault.named_by, partial(change, fault, ground))
 
 
 def _values(fault: Fault, size: float) -> Mapping[str, float]:
@@ -238,30 +236,30 @@ def _values(fault: Fault, size: float) -> Mapping[str, float]:
     return dict.fromkeys(fault.names(), size / np.sqrt(len(fault.parts)))
 
 
-def _rendered(fault: Fault, ground: Ground, folder: Path, size: float) -> Array:
+def _rendered(fault: Fault, ground: Ground, folder: Path, tree: Tree, size: float) -> Array:
     scene = ground.scene
     assert scene is not None
     wrong = scene_faults(scene.declared_disc, _values(fault, size), scene.cameras.frame_rate_hz)
     images = folder.with_name(f"{folder.name} images")
     try:
         truth = write_recording(images, replace(scene, faults=wrong, board=replace(scene.board, n_views=1)))
-        declare(folder, _with_rig(_copied(read_recording(images), folder), ground.rig))
+        shutil.rmtree(folder)
+        tree.update(_copied(read_recording(images), folder, ground.rig))
     finally:
         shutil.rmtree(images, ignore_errors=True)
     return truth.q
 
 
-def _declared_wrong(fault: Fault, ground: Ground, folder: Path, size: float) -> None:
+def _declared_wrong(fault: Fault, ground: Ground, folder: Path, tree: Tree, size: float) -> None:
     """As if what is declared were true but for the fault."""
-    tree = _shared(ground, folder)
     disc = read_recording(ground.recording).disc
     wrong = scene_faults(disc, {name: -value for name, value in _values(fault, size).items()})
     places = centres_with(wrong, disc)
     tree["markers"]["centres_mm"] = (1e3 * places[:, :2]).tolist()
     tree["disc"]["thickness_mm"] = 2e3 * float(disc.half_thickness + 1e-3 * wrong.pattern_height_mm)
     tree["cameras"]["frame_rate_hz"] *= wrong.frame_rate_hz or 1.0
+    tree["calibration"]["rig"] = str(folder / "rig.h5")
     write_rig(folder / "rig.h5", _believed(read_rig(ground.rig), wrong))
-    declare(folder, _with_rig(tree, folder / "rig.h5"))
 
 
 def _believed(rig: StereoRig, faults: Faults) -> StereoRig:
@@ -271,12 +269,15 @@ def _believed(rig: StereoRig, faults: Faults) -> StereoRig:
     return replace(rig, R_left_world=R, t_left_world=rig.t_left_world + R @ lift)
 
 
-def _copied(recording: Recording, folder: Path) -> Tree:
-    """The first pairs in a new folder, numbered anew; returns what is declared."""
+def _copied(recording: Recording, folder: Path, rig: Path | None = None) -> Tree:
+    """The first pairs in a new folder, numbered anew, with this rig or views of their own; returns what is declared."""
     tree: Tree = {name: dict(part) if isinstance(part, dict) else part for name, part in recording.declared.items()}
     for camera, pattern in zip(CAMERAS, (recording.left, recording.right), strict=True):
         tree["cameras"][camera] = _put(sorted(recording.folder.glob(pattern))[:PAIRS], folder / camera)
-    return tree
+        if rig is None:
+            views = sorted(recording.folder.glob(tree["calibration"][camera]))
+            tree["calibration"][camera] = _put(views, folder / f"board_{camera}")
+    return tree if rig is None else tree | {"calibration": {"rig": str(rig)}}
 
 
 def _put(files: Sequence[Path], folder: Path) -> str:
@@ -285,23 +286,6 @@ def _put(files: Sequence[Path], folder: Path) -> str:
     for number, file in enumerate(files):
         shutil.copy(file, folder / f"{number:06d}{file.suffix}")
     return f"{folder.name}/*{files[0].suffix}"
-
-
-def _with_rig(tree: Tree, rig: Path) -> Tree:
-    return tree | {"calibration": {"rig": str(rig)}}
-
-
-def _shared(ground: Ground, folder: Path) -> Tree:
-    """A copy that is measured with the rig of the untouched recording."""
-    return _with_rig(_copied(read_recording(ground.recording), folder), ground.rig)
-
-
-def _with_views(recording: Recording, folder: Path, tree: Tree) -> Tree:
-    """With views of its own."""
-    for camera in CAMERAS:
-        files = sorted(recording.folder.glob(recording.declared["calibration"][camera]))
-        tree["calibration"][camera] = _put(files, folder / f"board_{camera}")
-    return tree
 
 
 def declare(folder: Path, tree: Tree) -> None:
@@ -369,12 +353,17 @@ def _mirrored(folder: Path, tree: Tree, size: float) -> None:
     redrawn(folder / "right", lambda image, _: np.ascontiguousarray(image[:, ::-1]))
 
 
-def wrong_number(section: str, key: str, folder: Path, tree: Tree, size: float) -> None:
+def _wrong(section: str, key: str, *kinds: Kind) -> Planting:
     """A declared number is wrong by a share of itself; tolerances are the usual ones."""
-    for part in (tree["disc"], tree.get("table", {}), tree["calibration"]):
-        for tolerance in [name for name in part if "_tolerance_" in name]:
-            del part[tolerance]
-    tree[section][key] *= 1 + size
+
+    def change(folder: Path, tree: Tree, size: float) -> None:
+        for part in (tree["disc"], tree.get("table", {}), tree["calibration"]):
+            for tolerance in [name for name in part if "_tolerance_" in name]:
+                del part[tolerance]
+        tree[section][key] *= 1 + size
+
+    of_views = section == "calibration"
+    return Planting((1e-3, 1e-2, 1e-1) if of_views else (3e-3, 3e-2, 3e-1), "1", kinds, change, of_views)
 
 
 def _negative(folder: Path, tree: Tree, size: float) -> None:
@@ -395,37 +384,62 @@ def _late(folder: Path, tree: Tree, size: float) -> None:
     reordered(folder / "board_right", lambda files: files[int(size) :])
 
 
-_FEW, _ONCE, _SHARES = (1, 3, 10), (1,), (3e-3, 3e-2, 3e-1)
-CHANGES: dict[str, tuple[Sequence[float], str, tuple[Kind, ...], Change]] = {
-    "pairs lost by both": (_FEW, "pairs", (Kind.CLOCK_JUMP,), _pairs_lost),
-    "images lost by one": (
-        _FEW, "images", (Kind.DROPPED_FRAMES, Kind.DELAY), partial(_pairs_lost, cameras=("right",))
+def _again(folder: Path, tree: Tree, size: float, cameras: Sequence[str] = CAMERAS) -> None:
+    """In the middle the recorder writes one image again and again."""
+    for camera in cameras:
+        files = sorted((folder / camera).iterdir())
+        middle = len(files) // 2
+        for file in files[middle : middle + int(size)]:
+            file.unlink()  # it may be a link to another's
+            shutil.copy(files[middle - 1], file)
+
+
+def _damaged(folder: Path, tree: Tree, size: float) -> None:
+    """The end of the right camera's last files was never written."""
+    for file in sorted((folder / "right").iterdir())[-int(size) :]:
+        whole = file.read_bytes()
+        file.unlink()
+        file.write_bytes(whole[: len(whole) // 2])
+
+
+def _glare(folder: Path, tree: Tree, size: float) -> None:
+    """Light that is added to the right camera's images, size grey values of 8 bits at most."""
+
+    def lit(image: NDArray, _: float) -> NDArray:
+        height, width = image.shape
+        y, x = np.mgrid[:height, :width]
+        spot = np.exp(-8.0 * ((x / width - 0.6) ** 2 + (y / height - 0.5) ** 2))
+        most = np.iinfo(image.dtype).max
+        return np.clip(np.rint(image + size / 255 * most * spot), 0, most).astype(image.dtype)
+
+    redrawn(folder / "right", lit)
+
+
+_LOST = (Kind.DROPPED_FRAMES, Kind.DELAY, Kind.ONE_SIDED)
+_CALIBRATED = (Kind.CALIBRATION,)
+CHANGES = {
+    "pairs lost by both": Planting((1, 3, 10), "pairs", (Kind.CLOCK_JUMP,), _pairs_lost),
+    "images lost by one": Planting((1, 3, 10, 20), "images", _LOST, partial(_pairs_lost, cameras=("right",))),
+    "pairs repeated": Planting((1, 3, 10), "pairs", (Kind.REPEATED_IMAGES,), _again),
+    "images repeated by one": Planting(
+        (1, 3, 10), "images", (Kind.REPEATED_IMAGES,), partial(_again, cameras=("right",))
     ),
-    "camera knocked": ((0.02, 0.2, 2.0), "px", MOVED, partial(_image_moved, course=lambda x: float(x > 0.5))),
-    "camera drifts": ((0.03, 0.3, 3.0), "px", MOVED, partial(_image_moved, course=lambda x: x)),
-    "reversed": (_ONCE, "", (Kind.REVERSED,), _reversed),
-    "exchanged": (_ONCE, "", (Kind.EXCHANGED,), _exchanged),
-    "mirrored": (_ONCE, "", (Kind.MIRRORED,), _mirrored),
-    "radius": (_SHARES, "1", (Kind.RADIUS, *HEIGHT), partial(wrong_number, "disc", "radius_mm")),
-    "thickness": (_SHARES, "1", HEIGHT, partial(wrong_number, "disc", "thickness_mm")),
-    "dot diameter": (_SHARES, "1", (Kind.DIAMETER,), partial(wrong_number, "markers", "diameter_mm")),
-    "gravity": (_SHARES, "1", (Kind.GRAVITY_OR_RATE,), partial(wrong_number, "gravity", "g_m_s2")),
-}  # fmt: skip
-OF_VIEWS: dict[str, tuple[Sequence[float], str, tuple[Kind, ...], Change]] = {
-    "square": ((1e-3, 1e-2, 1e-1), "1", (Kind.SQUARE,), partial(wrong_number, "calibration", "square_mm")),
-    "negative views": (_ONCE, "", (Kind.CALIBRATION,), _negative),
-    "repeated views": ((2, 3, 6), "times", (Kind.CALIBRATION,), _repeated),
-    "views late in one": ((1, 2, 4), "views", (Kind.CALIBRATION,), _late),
+    "files damaged": Planting((1, 10, 100), "files", (Kind.UNREADABLE,), _damaged),
+    "glare": Planting((3, 30, 300), "grey values", (Kind.LIGHT, Kind.ONE_SIDED, *MOVED), _glare),
+    "camera knocked": Planting((0.02, 0.2, 2.0), "px", MOVED, partial(_image_moved, course=lambda x: float(x > 0.5))),
+    "camera drifts": Planting((0.03, 0.3, 3.0), "px", MOVED, partial(_image_moved, course=lambda x: x)),
+    "reversed": Planting((1,), "", (Kind.REVERSED,), _reversed),
+    "exchanged": Planting((1,), "", (Kind.EXCHANGED,), _exchanged),
+    "mirrored": Planting((1,), "", (Kind.MIRRORED,), _mirrored),
+    "radius": _wrong("disc", "radius_mm", Kind.RADIUS, *HEIGHT),
+    "thickness": _wrong("disc", "thickness_mm", *HEIGHT),
+    "dot diameter": _wrong("markers", "diameter_mm", Kind.DIAMETER),
+    "gravity": _wrong("gravity", "g_m_s2", Kind.GRAVITY_OR_RATE),
+    "square": _wrong("calibration", "square_mm", Kind.SQUARE),
+    "negative views": Planting((1,), "", _CALIBRATED, _negative, of_views=True),
+    "repeated views": Planting((2, 3, 6), "times", _CALIBRATED, _repeated, of_views=True),
+    "views late in one": Planting((1, 2, 4), "views", _CALIBRATED, _late, of_views=True),
 }
-
-
-def _changed(change: Change, views: bool, ground: Ground, folder: Path, size: float) -> None:
-    """A copy of the recording with something changed, with its own views or the rig of the untouched one."""
-    recording = read_recording(ground.recording)
-    tree = _copied(recording, folder)
-    tree = _with_views(recording, folder, tree) if views else _with_rig(tree, ground.rig)
-    change(folder, tree, size)
-    declare(folder, tree)
 
 
 def faults_validation(outcomes: Sequence[FaultOutcome]) -> Validation:

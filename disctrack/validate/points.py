@@ -18,17 +18,13 @@ from calibration.kit.least_squares import normal_of_rows
 from disctrack.disc import Disc
 from disctrack.faults.catalogue import scene_faults
 from disctrack.faults.keys import Faults
-from disctrack.frames import (
-    continuous_quaternions,
-    euler_from_rotation,
-    quaternion_from_rotation,
-    rotation_from_euler,
-    unwrap_euler,
-)
+from disctrack.frames import rotation_from_euler
 from disctrack.rolling import Effect, Model, simulate, steady_precession
 from disctrack.synthetic import board_poses, rig_after_faults, rig_of, true_disc_of
 from disctrack.synthetic.description import Scene
 from disctrack.track.pose import fit_poses
+from disctrack.track.refine.assembly import Taken, trajectory_of
+from disctrack.track.refine.self_calibration import DotsInFrames
 from disctrack.trajectory import Trajectory
 
 Motion = Callable[[Array], Array]  # instants (k,) [s] -> coordinates q (k, 6)
@@ -142,7 +138,9 @@ def measured(
         pixels = _shifted_dots(of_rig, pixels, scene.cameras.image_size[0], planted.laboratory)
     pixels = pixels + filmed.sigma_px * rng.standard_normal(pixels.shape)
     dots = np.broadcast_to(filmed.sigma_px**2 * np.eye(2), (*pixels.shape, 2)).copy()
-    return _tracked(pixels, dots, motion(times), believed_rig, disc, filmed.declared_rate)
+    q = motion(times)
+    seen = DotsInFrames(believed_rig, disc, pixels, dots, rotation_from_euler(*q[:, 3:].T), q[:, :3])
+    return _tracked(seen, filmed.declared_rate)
 
 
 def _in_the_laboratory(scene: Scene, lab: Laboratory, rng: np.random.Generator) -> tuple[Scene, Array]:
@@ -229,35 +227,9 @@ def _image_centres(R: Array, t: Array, rig: StereoRig, centres: Array, disc: Dis
     return np.stack(found, axis=2)
 
 
-def _tracked(pixels: Array, dots: Array, q: Array, rig: StereoRig, disc: Disc, rate: float) -> Trajectory:
-    n = len(pixels)
-    fits = fit_poses(
-        pixels,
-        dots,
-        rig,
-        disc.marker_centres_body,
-        rotation_from_euler(*q[:, 3:].T),
-        q[:, :3],
-        reject_outliers=False,
-    )
-    angles = unwrap_euler(euler_from_rotation(fits.R_world_body))
-    return Trajectory(
-        time=np.arange(n) / rate,
-        frame=np.arange(n),
-        q=np.column_stack([fits.t_world_body, angles]),
-        pose_covariance=fits.covariance,
-        calibration_sensitivity=fits.sensitivity,
-        systematic_covariance=np.zeros((len(fits.covariance), 6, 6)),
-        quaternion=continuous_quaternions(quaternion_from_rotation(fits.R_world_body)),
-        frame_status=np.zeros(n, np.uint8),
-        reprojection_rms_px=np.sqrt(np.nanmean(fits.residuals_px**2, axis=(2, 3))),
-        reduced_chi_square=fits.reduced_chi_square,
-        markers_px=pixels,
-        markers_covariance_px2=dots,
-        markers_residual_px=fits.residuals_px,
-        marker_status=np.zeros((n, 2, disc.n_markers), np.uint8),
-        disc=disc,
-        rig=rig,
-        frame_rate=rate,
-        gravity=9.81,
-    )
+def _tracked(seen: DotsInFrames, rate: float) -> Trajectory:
+    n, none = len(seen.t), np.zeros((*seen.pixels.shape[:-1],), np.uint8)
+    centres = seen.disc.marker_centres_body
+    fits = fit_poses(seen.pixels, seen.covariance, seen.rig, centres, seen.R, seen.t, reject_outliers=False)
+    taken = Taken(range(n), np.arange(n) / rate, rate, 9.81)
+    return trajectory_of(seen, fits, np.zeros((n, 6, 6)), none[:, 0, 0], none[:, 0, 0], none, taken)

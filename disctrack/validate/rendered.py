@@ -31,7 +31,7 @@ from disctrack.synthetic.description import (
     RollingMotion,
     Scene,
 )
-from disctrack.track.follow.tracking import Tracking, TrackingSettings, track
+from disctrack.track.follow.tracking import Tracking, track
 from disctrack.track.measurement import open_pairs
 from disctrack.trajectory import part
 from disctrack.validate.errors import PoseErrors, compare
@@ -212,8 +212,7 @@ def locate(images: NDArray, rig: StereoRig, disc: Disc, frame_rate: float, *, ap
             none = tuple(Unreadable(int(i), camera, "") for i in frames[~real] for camera in (0, 1))
             yield PairBlock(frames, pairs, none)
 
-    settings = TrackingSettings(search_always=apart)
-    return track(read_blocks, range(step * len(images)), rig, disc, frame_rate, settings=settings)
+    return track(read_blocks, range(step * len(images)), rig, disc, frame_rate)
 
 
 def static_poses(n: int, rig: StereoRig, disc: Disc, middle_mm: tuple[float, float], rng: np.random.Generator) -> Array:

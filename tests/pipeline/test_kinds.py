@@ -20,7 +20,7 @@ from disctrack.diagnosis.recorded import first_to_mend
 from disctrack.findings import Finding, Kind, Severity, finding_from_json, in_doubt, leading
 from disctrack.first_look.check import run_check
 from disctrack.frames import CAMERAS
-from disctrack.validate.planted_faults import CHANGES, OF_VIEWS, declare, redrawn, reordered
+from disctrack.validate.planted_faults import CHANGES, declare, redrawn, reordered
 from tests.pipeline.conftest import linked
 
 Plant = Callable[[Path, dict], object]  # into a folder, and into what is declared in it
@@ -36,7 +36,7 @@ def says(section: str, **values) -> Plant:
 
 
 def planted(name: str, size: float) -> Plant:
-    return lambda folder, tree: (CHANGES | OF_VIEWS)[name][3](folder, tree, size)
+    return lambda folder, tree: CHANGES[name].change(folder, tree, size)
 
 
 def drawn(change, cameras=CAMERAS) -> Plant:

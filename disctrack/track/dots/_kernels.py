@@ -27,9 +27,6 @@ _entry = njit(cache=True, **RULES)  # called from Python
 
 MEASURED, OUTSIDE, LOW_CONTRAST, OCCLUDED, NOT_CONVERGED, BLURRED, _, NOT_LOOKED_FOR = map(int, MarkerStatus)
 
-# Template parameters, in the order of every array of eight below.
-A, B, RADIUS, SIGMA, LEVEL, SLOPE_X, SLOPE_Y, CONTRAST = range(8)
-
 # Of a dot: pixel of its centre, covariance of that, and what is needed to judge the fit.
 _OF_DOT = ("u", "v", "var_u", "var_v", "cov_uv", "chi_square", "sigma", "radius", "level", "contrast")
 DOT = np.dtype([(name, float) for name in (*_OF_DOT, "clipped", "n_pixels")])
@@ -87,8 +84,19 @@ class Ellipse(NamedTuple):
 
 
 class Rows(NamedTuple):
-    """Of what is kept of every pixel (16, n), in single precision, behind eight derivatives over the pixel's sigma."""
+    """Of what is kept of every pixel (16, n), in single precision; the first eight are the template's parameters, too.
 
+    Of a pixel these rows are derivatives by the parameter, over the pixel's sigma.
+    """
+
+    a: int = 0  # shift of the centre on the plane
+    b: int = 1
+    radius: int = 2
+    sigma: int = 3
+    level: int = 4
+    slope_x: int = 5
+    slope_y: int = 6
+    contrast: int = 7
     x: int = 8  # place on the plane from the expected centre [px]
     y: int = 9
     offset_x: int = 10  # place in the image from the expected centre [10 px]
@@ -215,9 +223,9 @@ def _select_pixels(image, map_x, map_y, P, start, window, rim, neighbours, G, un
     unit: plane units per pixel; steepest: the longest step that one pixel can mean on the plane, in those units.
     """
     x_lo, x_hi, y_lo, y_hi = window
-    band = 3.0 * p[SIGMA] + 1.0
-    shift_x, shift_y, radius = _f(p[A]), _f(p[B]), _f(p[RADIUS])
-    outer = p[RADIUS] + band * steepest
+    band = 3.0 * p[ROW.sigma] + 1.0
+    shift_x, shift_y, radius = _f(p[ROW.a]), _f(p[ROW.b]), _f(p[ROW.radius])
+    outer = p[ROW.radius] + band * steepest
     # Of each row the pixels in an ellipse longer by the band than the dot's own, by the linear map: its scale changes
     # over the window, and a pixel is one more in doubt. In it no branch decides anything, so that it is vector code.
     doubt = 0.05 * math.hypot(x_hi - x_lo, y_hi - y_lo) * math.hypot(G[2, 0], G[2, 1])
@@ -227,8 +235,8 @@ def _select_pixels(image, map_x, map_y, P, start, window, rim, neighbours, G, un
         G,
         gentlest,
         steepest,
-        p[RADIUS] / gentlest * (1.0 + doubt) + more,
-        p[RADIUS] / steepest * (1.0 + doubt) + more,
+        p[ROW.radius] / gentlest * (1.0 + doubt) + more,
+        p[ROW.radius] / steepest * (1.0 + doubt) + more,
     )
     x_from, y_from = start[0] / unit, start[1] / unit
     X0, X1, X2, Y0, Y1, Y2 = P[0, 0], P[0, 1], P[0, 2], P[1, 0], P[1, 1], P[1, 2]
@@ -252,8 +260,8 @@ def _select_pixels(image, map_x, map_y, P, start, window, rim, neighbours, G, un
             x_row[k], y_row[k], grey_row[k] = 0.1 * (lo + k - u0), 0.1 * (y - v0), greys[k]
         n += max(hi - lo, 0)
     # which of the dot's surroundings can come near any pixel at all
-    reach = unit * (outer + math.hypot(p[A], p[B]))
-    blur = p[SIGMA] * steepest * unit
+    reach = unit * (outer + math.hypot(p[ROW.a], p[ROW.b]))
+    blur = p[ROW.sigma] * steepest * unit
     crowded = math.hypot(start[0], start[1]) + reach > rim - 2.5 * blur
     for j in range(neighbours.shape[0]):
         apart = math.hypot(start[0] - neighbours[j, 0], start[1] - neighbours[j, 1])
@@ -270,7 +278,7 @@ def _select_pixels(image, map_x, map_y, P, start, window, rim, neighbours, G, un
         good = nearest < d < farthest  # not so for NaN either: a pixel without a ray
         if crowded and good:
             X, Y = start[0] + unit * pixels[0, i], start[1] + unit * pixels[1, i]
-            blur = p[SIGMA] * unit / pixels[6, i]
+            blur = p[ROW.sigma] * unit / pixels[6, i]
             good = math.hypot(X, Y) <= rim - 2.5 * blur
             for j in range(neighbours.shape[0]):
                 good &= math.hypot(X - neighbours[j, 0], Y - neighbours[j, 1]) - start[2] >= 3.0 * blur
@@ -278,7 +286,7 @@ def _select_pixels(image, map_x, map_y, P, start, window, rim, neighbours, G, un
             pixels[ROW.x + row, kept] = pixels[row, i]
         kept += 1 if good else 0
     inside_sum, inside_n, outside_sum, outside_n = 0.0, 0.0, 0.0, 0.0
-    well_inside, well_outside = _f(-min(1.2 * p[SIGMA], 0.4 * p[RADIUS] / steepest)), _f(1.2 * p[SIGMA])
+    well_inside, well_outside = _f(-min(1.2 * p[ROW.sigma], 0.4 * p[ROW.radius] / steepest)), _f(1.2 * p[ROW.sigma])
     for i in range(kept):
         d, grey = pixels[ROW.distance, i], pixels[ROW.grey, i]
         is_in, is_out = _1 if d < well_inside else _0, _1 if d > well_outside else _0
@@ -306,8 +314,8 @@ def _lit(pixels, i, covered, level, slope_x, slope_y, contrast, limit):
     fits = _1 if squared <= limit else _0
     weight *= fits
     seen = (_1 - contrast * covered) * weight
-    pixels[LEVEL, i], pixels[SLOPE_X, i], pixels[SLOPE_Y, i] = seen, seen * x, seen * y
-    pixels[CONTRAST, i] = -light * covered * weight
+    pixels[ROW.level, i], pixels[ROW.slope_x, i], pixels[ROW.slope_y, i] = seen, seen * x, seen * y
+    pixels[ROW.contrast, i] = -light * covered * weight
     pixels[ROW.residual, i] = r * fits
     return light, weight, min(squared, limit), _1 - fits
 
@@ -322,9 +330,9 @@ def _whitened_model(pixels, n, p, G, det, clip):
     """
     g00, g01, g10, g11, det2 = _f(G[0, 0]), _f(G[0, 1]), _f(G[1, 0]), _f(G[1, 1]), _f(det * det)
     near_x, near_y = _f(G[2, 0]), _f(G[2, 1])
-    a, b, radius, contrast = _f(p[A]), _f(p[B]), _f(p[RADIUS]), _f(p[CONTRAST])
-    inv_sigma, sigma, half_sigma = _f(1.0 / p[SIGMA]), _f(p[SIGMA]), _f(0.5 * p[SIGMA])
-    level, slope_x, slope_y, limit = _f(p[LEVEL]), _f(p[SLOPE_X]), _f(p[SLOPE_Y]), _f(clip)
+    a, b, radius, contrast = _f(p[ROW.a]), _f(p[ROW.b]), _f(p[ROW.radius]), _f(p[ROW.contrast])
+    inv_sigma, sigma, half_sigma = _f(1.0 / p[ROW.sigma]), _f(p[ROW.sigma]), _f(0.5 * p[ROW.sigma])
+    level, slope_x, slope_y, limit = _f(p[ROW.level]), _f(p[ROW.slope_x]), _f(p[ROW.slope_y]), _f(clip)
     half_step = _f(0.05)
     chi2, n_clipped = _0, _0
     for i in range(n):
@@ -344,8 +352,8 @@ def _whitened_model(pixels, n, p, G, det, clip):
         chi2 += squared
         n_clipped += clipped
         edge = -light * contrast * bell * inv_sigma * weight  # - d model / d distance
-        pixels[A, i], pixels[B, i] = edge * nx * slope, edge * ny * slope
-        pixels[RADIUS, i], pixels[SIGMA, i] = edge * slope, edge * (z - curvature * sigma)
+        pixels[ROW.a, i], pixels[ROW.b, i] = edge * nx * slope, edge * ny * slope
+        pixels[ROW.radius, i], pixels[ROW.sigma, i] = edge * slope, edge * (z - curvature * sigma)
     return float(chi2), float(n_clipped)
 
 
@@ -392,15 +400,15 @@ def _whitened_ellipse(pixels, n, p, ellipse, nodes, clip):
 
     Along the long axis x = a sin t, where the trapezoidal rule converges exponentially; across it the error function.
     """
-    in_sigma = 1.0 / p[SIGMA]
-    a, b = p[RADIUS] * ellipse.long * in_sigma, p[RADIUS] * ellipse.short * in_sigma
+    in_sigma = 1.0 / p[ROW.sigma]
+    a, b = p[ROW.radius] * ellipse.long * in_sigma, p[ROW.radius] * ellipse.short * in_sigma
     n_nodes = min(int(3.2 * a) + 8, _NODES)
     every = math.pi / n_nodes
     for k in range(n_nodes):
         t = (k + 0.5) * every - 0.5 * math.pi
         nodes[0, k], nodes[1, k], nodes[2, k] = a * math.sin(t), b * math.cos(t), a * every * math.cos(t)
     round_edge = _f(a * b * every)
-    A_px, B_px = p[A], p[B]
+    A_px, B_px = p[ROW.a], p[ROW.b]
     from_x = _f(ellipse.from_u + ellipse.i00 * A_px + ellipse.i01 * B_px)
     from_y = _f(ellipse.from_v + ellipse.i10 * A_px + ellipse.i11 * B_px)
     along_x, along_y = _f(ellipse.axis_u * in_sigma), _f(ellipse.axis_v * in_sigma)
@@ -408,8 +416,8 @@ def _whitened_ellipse(pixels, n, p, ellipse, nodes, clip):
     A_across = _f(in_sigma * (ellipse.axis_u * ellipse.i10 - ellipse.axis_v * ellipse.i00))
     B_along = _f(in_sigma * (ellipse.axis_u * ellipse.i01 + ellipse.axis_v * ellipse.i11))
     B_across = _f(in_sigma * (ellipse.axis_u * ellipse.i11 - ellipse.axis_v * ellipse.i01))
-    inv_radius, inv_sigma, ten = _f(1.0 / p[RADIUS]), _f(in_sigma), _f(10.0)
-    contrast, level, slope_x, slope_y = _f(p[CONTRAST]), _f(p[LEVEL]), _f(p[SLOPE_X]), _f(p[SLOPE_Y])
+    inv_radius, inv_sigma, ten = _f(1.0 / p[ROW.radius]), _f(in_sigma), _f(10.0)
+    contrast, level, slope_x, slope_y = _f(p[ROW.contrast]), _f(p[ROW.level]), _f(p[ROW.slope_x]), _f(p[ROW.slope_y])
     limit = _f(clip)
     chi2, n_clipped = _0, _0
     for i in range(n):
@@ -434,10 +442,10 @@ def _whitened_ellipse(pixels, n, p, ellipse, nodes, clip):
         chi2 += squared
         n_clipped += clipped
         dark = light * contrast * weight
-        pixels[A, i] = dark * (d_along * A_along + d_across * A_across)
-        pixels[B, i] = dark * (d_along * B_along + d_across * B_across)
-        pixels[RADIUS, i] = -dark * edge * inv_radius
-        pixels[SIGMA, i] = dark * (along * d_along + across * d_across + edge) * inv_sigma
+        pixels[ROW.a, i] = dark * (d_along * A_along + d_across * A_across)
+        pixels[ROW.b, i] = dark * (d_along * B_along + d_across * B_across)
+        pixels[ROW.radius, i] = -dark * edge * inv_radius
+        pixels[ROW.sigma, i] = dark * (along * d_along + across * d_across + edge) * inv_sigma
     return float(chi2), float(n_clipped)
 
 
@@ -458,7 +466,7 @@ def _descend(pixels, n, p, G, det, px_per_unit, radius, clip, work, blurred, ell
     for _ in range(_MAX_ITERATIONS + 1):
         if blurred:
             chi2, n_clipped = _whitened_ellipse(pixels, n, p, ellipse, nodes, clip)
-            chi2 += ((p[RADIUS] / radius - 1.0) / _RADIUS_PRIOR) ** 2
+            chi2 += ((p[ROW.radius] / radius - 1.0) / _RADIUS_PRIOR) ** 2
         else:
             chi2, n_clipped = _whitened_model(pixels, n, p, G, det, clip)
         if converged:
@@ -492,21 +500,21 @@ def _descend(pixels, n, p, G, det, px_per_unit, radius, clip, work, blurred, ell
                 b += next_row[i] * residual[i]
             rhs[j], rhs[j + 1] = a, b
         if blurred:
-            M[RADIUS, RADIUS] += 1.0 / (_RADIUS_PRIOR * radius) ** 2
-            rhs[RADIUS] += (radius - p[RADIUS]) / (_RADIUS_PRIOR * radius) ** 2
+            M[ROW.radius, ROW.radius] += 1.0 / (_RADIUS_PRIOR * radius) ** 2
+            rhs[ROW.radius] += (radius - p[ROW.radius]) / (_RADIUS_PRIOR * radius) ** 2
         for i in range(8):
             previous[i], step[i] = p[i], rhs[i]
             M[i, i] *= 1.0 + damping
         if not solve_in_place(M, step):
             return False, chi2, n_clipped
-        length = math.hypot(step[A], step[B])
+        length = math.hypot(step[ROW.a], step[ROW.b])
         scale = min(1.0, 0.4 * radius / max(length, 1e-30))
         gain = 0.0
         for i in range(8):
             p[i] += scale * step[i]
             gain += step[i] * rhs[i]
-        p[SIGMA] = min(max(p[SIGMA], 0.4 * previous[SIGMA], 0.2), 2.0 * previous[SIGMA])
-        if not (0.5 * radius < p[RADIUS] < 1.6 * radius and p[SIGMA] < 20.0):
+        p[ROW.sigma] = min(max(p[ROW.sigma], 0.4 * previous[ROW.sigma], 0.2), 2.0 * previous[ROW.sigma])
+        if not (0.5 * radius < p[ROW.radius] < 1.6 * radius and p[ROW.sigma] < 20.0):
             return False, chi2, n_clipped
         length *= px_per_unit
         contraction = min(length / before, 1.0) if before < np.inf else 1.0
@@ -527,7 +535,7 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, neighbours, pixel
     noise (3,): variance = noise[0] + noise[1] grey, and the square of the grey values' step; rim: radius of an edge
     about the plane's origin whose blur must not reach the pixels used, nor that of `neighbours` (k, 2), the other dots'
     centres; pixels and work (matrix, right-hand side, step, parameters before it) are scratch.
-    p (8,) receives the template's parameters (A, B: shift on the plane from the expected centre), result (a DOT) the
+    p (8,) receives the template's parameters (a, b: shift on the plane from the expected centre), result (a DOT) the
     judgement of the fit and the centre's covariance in pixels. The caller projects the centre itself (U, V).
     """
     height, width = image.shape
@@ -536,7 +544,7 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, neighbours, pixel
     u0, v0, radius, unit = start[3], start[4], start[2], 0.0
     for i in range(8):
         p[i] = 0.0
-    p[SIGMA] = sigma
+    p[ROW.sigma] = sigma
     n, n_clipped, det, chi2, largest, light, settled = 0, 0.0, 0.0, 0.0, 0.0, 1.0, False
     for selection in range(_MAX_SELECTIONS):
         if not (2.0 < u0 < width - 3.0 and 2.0 < v0 < height - 3.0):
@@ -545,7 +553,7 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, neighbours, pixel
         if selection == 0:
             unit = math.sqrt(abs(det)) if det != 0.0 else 1.0
             radius /= unit
-            p[RADIUS] = radius
+            p[ROW.radius] = radius
         for i in range(2):
             for j in range(2):
                 G[i, j] /= unit
@@ -554,11 +562,11 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, neighbours, pixel
         largest = math.sqrt(0.5 * (norm2 + math.sqrt(max(norm2 * norm2 - 4 * det * det, 0.0))))
         if not abs(det) > 1e-9 * norm2:
             return BLURRED
-        blur = max(p[SIGMA], 1.0)
+        blur = max(p[ROW.sigma], 1.0)
         if radius / largest < blur:  # even that template fails: nothing but a blot is left
             return BLURRED
         blurred = radius / largest < _MIN_SEMI_MINOR * blur
-        band = 3.0 * p[SIGMA] + 1.0
+        band = 3.0 * p[ROW.sigma] + 1.0
         extent_x = radius * math.hypot(G[0, 1], G[1, 1]) / abs(det) + band
         extent_y = radius * math.hypot(G[0, 0], G[1, 0]) / abs(det) + band
         window = (
@@ -581,14 +589,14 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, neighbours, pixel
             return OCCLUDED
         if selection == 0:
             light = max(inside, outside, 1e-6)  # the unit of grey from here on: no result depends on the file's own
-            p[LEVEL], p[CONTRAST] = outside / light, 1.0 - inside / max(outside, 1e-6)
-        dark = p[LEVEL] * (1.0 - p[CONTRAST])
+            p[ROW.level], p[ROW.contrast] = outside / light, 1.0 - inside / max(outside, 1e-6)
+        dark = p[ROW.level] * (1.0 - p[ROW.contrast])
         read, gain, step2 = noise[0] / (light * light), noise[1] / light, noise[2] / (light * light)
-        if abs(p[LEVEL] - dark) < 4.0 * math.sqrt(max(read + gain * max(p[LEVEL], dark), 0.1 * step2)):
+        if abs(p[ROW.level] - dark) < 4.0 * math.sqrt(max(read + gain * max(p[ROW.level], dark), 0.1 * step2)):
             return LOW_CONTRAST
         in_light = 1.0 / light
         read_32, gain_32, floor = _f(read), _f(gain), _f(step2 / 12.0)
-        level, step, inv_sigma = _f(p[LEVEL]), _f(dark - p[LEVEL]), _f(1.0 / p[SIGMA])
+        level, step, inv_sigma = _f(p[ROW.level]), _f(dark - p[ROW.level]), _f(1.0 / p[ROW.sigma])
         distance, weight, grey = pixels[ROW.distance], pixels[ROW.weight], pixels[ROW.grey]
         for i in range(n):
             # weights from the expected grey value: the noisy one would pull the fit towards dark pixels
@@ -606,11 +614,11 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, neighbours, pixel
             if limit < np.inf:
                 chi2 -= n_clipped * limit
                 break
-            moved_u = start[3] + (G[1, 1] * p[A] - G[0, 1] * p[B]) / det - u0
-            moved_v = start[4] + (G[0, 0] * p[B] - G[1, 0] * p[A]) / det - v0
+            moved_u = start[3] + (G[1, 1] * p[ROW.a] - G[0, 1] * p[ROW.b]) / det - u0
+            moved_v = start[4] + (G[0, 0] * p[ROW.b] - G[1, 0] * p[ROW.a]) / det - v0
             u0, v0 = u0 + moved_u, v0 + moved_v
             settled = math.hypot(moved_u, moved_v) < _SETTLED_PX
-            if not blurred and radius / largest < _MIN_SEMI_MINOR * p[SIGMA]:
+            if not blurred and radius / largest < _MIN_SEMI_MINOR * p[ROW.sigma]:
                 settled = False  # more blurred than expected: once more, by the other template
             if not settled and selection < _MAX_SELECTIONS - 1:
                 break
@@ -626,17 +634,17 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, neighbours, pixel
     # covariance of the shift on the plane: the leading corner of (J^T W J)^-1
     M, x, y, _ = work
     for i in range(8):
-        x[i], y[i] = 1.0 if i == A else 0.0, 1.0 if i == B else 0.0
+        x[i], y[i] = 1.0 if i == ROW.a else 0.0, 1.0 if i == ROW.b else 0.0
     substitute(M, x)
     substitute(M, y)
     a, b, c, d = G[1, 1] / det, -G[0, 1] / det, -G[1, 0] / det, G[0, 0] / det
-    result.var_u = a * a * x[A] + 2 * a * b * x[B] + b * b * y[B]
-    result.var_v = c * c * x[A] + 2 * c * d * x[B] + d * d * y[B]
-    result.cov_uv = a * c * x[A] + (a * d + b * c) * x[B] + b * d * y[B]
-    p[A], p[B], p[RADIUS] = unit * p[A], unit * p[B], unit * p[RADIUS]
+    result.var_u = a * a * x[ROW.a] + 2 * a * b * x[ROW.b] + b * b * y[ROW.b]
+    result.var_v = c * c * x[ROW.a] + 2 * c * d * x[ROW.b] + d * d * y[ROW.b]
+    result.cov_uv = a * c * x[ROW.a] + (a * d + b * c) * x[ROW.b] + b * d * y[ROW.b]
+    p[ROW.a], p[ROW.b], p[ROW.radius] = unit * p[ROW.a], unit * p[ROW.b], unit * p[ROW.radius]
     result.chi_square = chi2 / max(n - n_clipped - 8, 1)
-    result.sigma, result.radius = p[SIGMA], p[RADIUS]
-    result.level, result.contrast = light * p[LEVEL], p[CONTRAST]
+    result.sigma, result.radius = p[ROW.sigma], p[ROW.radius]
+    result.level, result.contrast = light * p[ROW.level], p[ROW.contrast]
     result.clipped, result.n_pixels = n_clipped / n, n
     return MEASURED
 
@@ -712,7 +720,7 @@ def _look(images, readable, views, face, expected, R, t, pixels, work, results, 
                                     expected.noise[c], face.rim, neighbours, pixels, work, p, result)  # fmt: skip
             if status[c, i] == MEASURED:
                 for k in range(3):
-                    point[k] += R_cb[k, 0] * p[A] + R_cb[k, 1] * p[B]
+                    point[k] += R_cb[k, 0] * p[ROW.a] + R_cb[k, 1] * p[ROW.b]
                 result.u, result.v = project_point(views.cameras[c], point[0], point[1], point[2], J)
                 status[c, i] = _judge_dot(result, radius, expected.sigma[c], expected.noise[c], expected.limits)
 

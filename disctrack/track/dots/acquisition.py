@@ -198,19 +198,21 @@ def _candidates_from_one_camera(blobs: Array, camera: int, rig: StereoRig, disc:
         combinations(range(len(centres)), 3),
         key=lambda k: -np.linalg.norm(np.cross(centres[k[1]] - centres[k[0]], centres[k[2]] - centres[k[0]])),
     )[:6]
-    turns: list[NDArray] = []
-    shifts: list[NDArray] = []
-    for order in permutations(range(len(blobs)), 3):
-        image = np.ascontiguousarray(rays[list(order)].reshape(3, 1, 2))
-        for triple in triples:
-            model = np.ascontiguousarray(centres[list(triple)].reshape(3, 1, 3))
-            n, rvecs, tvecs = cv2.solveP3P(model, image, np.eye(3), None, flags=cv2.SOLVEPNP_AP3P)
-            turns += rvecs[:n]
-            shifts += tvecs[:n]
-    if not turns:
-        return []
-    R, t = rotation_from_vector(np.array(turns).reshape(-1, 3)), np.array(shifts).reshape(-1, 3)
-    score = _blob_score(R, t, rays, disc)
+    orders = np.array([*permutations(range(len(blobs)), 3)])
+    images = np.ascontiguousarray(rays[orders].reshape(-1, 3, 1, 2))
+    R, t, score = np.empty((0, 3, 3)), np.empty((0, 3)), np.empty(0)
+    for triple in triples:
+        model = np.ascontiguousarray(centres[list(triple)].reshape(3, 1, 3))
+        solved = [cv2.solveP3P(model, image, np.eye(3), None, flags=cv2.SOLVEPNP_AP3P) for image in images]
+        turns = np.array([turn for n, turns, _ in solved for turn in turns[:n]]).reshape(-1, 3)
+        shifts = np.array([shift for n, _, shifts in solved for shift in shifts[:n]]).reshape(-1, 3)
+        turned = rotation_from_vector(turns)
+        R, t = np.concatenate([R, turned]), np.concatenate([t, shifts])
+        score = np.concatenate([score, _blob_score(turned, shifts, rays, disc)])
+        if (
+            score.max(initial=0.0) > len(centres) - 1.0
+        ):  # all dots but for what blobs err by: no other triple knows better
+            break
     good = score > MIN_EXPLAINED - 0.5
     return [(R_cw.T @ R, R_cw.T @ (t - t_cw)) for R, t in _best(R[good], t[good], score[good])]
 

@@ -39,7 +39,6 @@ MAX_PREDICTION_RMS_PX = 2.0
 NOISE_FRAMES, NOISE_STEP = 12, 3  # frames that blur is taken from, and every third of them for the noise
 MIN_TO_BEGIN = 5  # dot images that must be measured where the disc is found anew: three fit anything
 MOST_CARRIED = 60  # frames over which the last motion is carried on; each costs one look at the dots
-LONGEST_WAIT = 60  # frames between searches of a scene in which no disc was seen yet: one costs as much as some 600
 UNUSUAL = 2.0  # times the usual misfit; of dots in compressed video, one in twenty leaves 1.25 times the median
 MOST_USUAL = 0.1  # of the contrast: dots that leave more than this are not the declared ones
 REPEAT_REACH = 4  # frames back that an image is compared with: recorders repeat from buffers of a few
@@ -85,7 +84,6 @@ class Heading(NamedTuple):
 class Search:
     """When the disc is searched for, and what the images showed where it was not found."""
 
-    always: bool = False  # at every frame, whatever it costs
     failures: int = 0  # in succession
     since: int = 0  # frames since the last of them
     scenes: tuple[StillScene, ...] = ()
@@ -96,9 +94,9 @@ class Search:
         A disc that was seen before comes out from behind a hand after some frames: the wait grows by one with every
         failure. Where none was seen yet, the pair (2, height, width) must show something new, or the wait doubles.
         """
-        if self.always or self.since < self.failures:
-            return self.always
-        if seen or not self.scenes or self.since >= min(2**self.failures, LONGEST_WAIT) or not readable.all():
+        if self.since < self.failures:
+            return False
+        if seen or not self.scenes or self.since >= 2**self.failures or not readable.all():
             return True
         return any(map(StillScene.differs, self.scenes, pair))
 
@@ -225,6 +223,8 @@ def follow_block(follower: Follower, images: Image, readable: Mask, tables: Tabl
     while i < n:
         anew = follower.lost is not None
         seen = bool(readable[i].any())
+        if not seen:  # what was searched in vain before tells nothing of what comes after
+            follower.search = Search()
         if not seen or (anew and not recover(follower, images[i:], readable[i:])):
             rows.frame_status[i] = FrameStatus.MARKERS_NOT_FOUND if seen else FrameStatus.UNREADABLE
             follower.without_pose()
@@ -238,7 +238,7 @@ def follow_block(follower: Follower, images: Image, readable: Mask, tables: Tabl
         if anew and done > 1:
             _go_back(follower, images, readable, rows, i)
         i += done
-        follower.search = Search(follower.search.always)
+        follower.search = Search()
         follower.lost = 0 if i < n else None
 
 

@@ -23,10 +23,8 @@ from disctrack.track.dots.template import photon_transfer
 
 Pair = tuple[NDArray, NDArray]
 
-STRIDE = 16  # frames between two looks; irregular by JITTER, so that no turn of the disc comes back to every look
-JITTER = 5
+STRIDE = 16  # frames between two looks, not always: so no turn of the disc comes back to every look
 MARGIN = 0.25  # [s] kept before the last frame at rest: a disc that tips over starts below what can be seen
-MIN_SAVED = 0.1  # [s] of rest at an end that are worth leaving out
 THRESHOLD = 5.0  # sigmas; of 65 000 pixels 0.04 exceed it by chance
 MIN_PIXELS = 12  # of a quarter of the image's pixels: fewer are hot pixels or an insect
 VIBRATION_PX = 0.03  # a fan's trembling; motion shows from THRESHOLD times this on, summed since rest
@@ -98,7 +96,7 @@ def find_motion(
 ) -> MotionSpan:
     """The part of frames start..stop-1 in which something moves, with a margin of MARGIN seconds at either end.
 
-    Frames that cannot be read are passed over. Less than MIN_SAVED of rest at an end is not left out.
+    Frames that cannot be read are passed over.
     """
     margin = max(int(np.ceil(MARGIN * frame_rate)), 2 * STRIDE)
     looked: list[int] = []
@@ -115,9 +113,7 @@ def find_motion(
             return MotionSpan(start, stop, len(looked), "nothing moves in the whole recording")
         first_still = _last_still(read, stop - 1, start - 1, -1)
     begin, end = last_still - margin, (stop - 1 if first_still is None else first_still) + margin + 1
-    worth = MIN_SAVED * frame_rate
-    begin = begin if begin - start >= worth else start
-    end = end if stop - end >= worth else stop
+    begin, end = max(begin, start), min(end, stop)
     rest = [f"rest in frames {a}-{b - 1}" for a, b in ((start, begin), (end, stop)) if a < b]
     return MotionSpan(begin, end, len(looked), " and ".join(rest) or "moves from end to end")
 
@@ -153,7 +149,7 @@ def _looks(first: int, end: int, sign: int) -> Iterator[list[int]]:
     """Frames to look at, in growing batches: two neighbours, then one in STRIDE, the last before `end` included."""
     yield [first, first + sign]
     count = abs(end - first)
-    offsets = [STRIDE * i + (5 * i * i) % (2 * JITTER + 1) - JITTER for i in range(1, count // STRIDE + 1)]
+    offsets = [STRIDE * i - i * i % STRIDE for i in range(1, count // STRIDE + 1)]
     offsets = [offset for offset in offsets if 1 < offset < count - 1] + [count - 1]
     size = 2
     while offsets:

@@ -20,24 +20,21 @@ from disctrack.disc import MA_2014, Disc, symmetry_order
 from disctrack.errors import TrackingError
 from disctrack.findings import Finding, Kind, Severity, Subject, in_doubt
 from disctrack.recording.readers.blocks import PairBlock, Unreadable
-from disctrack.track.dots.template import dot_centres
 from disctrack.track.follow.following import (
     Follower,
     Heading,
     Law,
-    Search,
     Tables,
     TrackingSetup,
     empty_tables,
     follow_block,
     run,
 )
-from disctrack.track.judge.disc_not_seen import frames_ahead, why_not_seen
+from disctrack.track.judge.disc_not_seen import why_not_seen
 from disctrack.track.judge.doubts import MOVED
-from disctrack.track.judge.dropped_frames import delay_of_right, left_out
+from disctrack.track.judge.dropped_frames import frames_ahead, left_out
 from disctrack.track.pose import marker_pixels
 from disctrack.track.refine.assembly import Taken, Tracking, TrackingSettings, assemble
-from disctrack.track.refine.self_calibration import DotsInFrames
 from disctrack.track.side_by_side import evenly
 from disctrack.trajectory import FrameStatus
 
@@ -49,7 +46,7 @@ MOSTLY = 0.5  # of the frames: that many are not refused for glare and hands
 # wrong that templates are made for: places 0.1 mm off, rms, shift centres by 0.3e-3 to 2e-3 px, in all frames alike.
 LOOK_AGAIN = 60e-6
 DECLARED = (Kind.DOTS_MISPLACED, Kind.TABLE_DISAGREES)  # of numbers, not of images
-APART, PAIRED = 10, 24  # frames without dots of both cameras, from which on others are paired; of so many
+APART, PAIRED = 10, 60  # frames without dots of both cameras, from which on others are paired; of so many
 PAIRS_TRIED = 12  # for pixels that do not see, and for what is wrong where no disc is found
 MAX_EDGE_TURN = np.radians(25.0)  # by which the poses on both sides of an edge may miss each other's prediction
 
@@ -99,7 +96,7 @@ def track(
     def measured(looked_for: Disc, progress: Callable[[int], object]) -> tuple[Tracking, bool]:
         """With the dots looked for at the places of a disc; and whether the images are in doubt."""
         again = replace(setup, disc=looked_for)
-        followers, tables = _followed(read_blocks, edges, again, settings, workers, progress)
+        followers, tables = _followed(read_blocks, edges, again, workers, progress)
         if not np.isfinite(tables.t).any():
             raise _not_found(followers, pairs, why_not_seen(_some(read_blocks, pairs), rig, disc))
         for follower in followers:
@@ -108,7 +105,7 @@ def track(
         return tracking, in_doubt(f for f in tracking.findings if f.kind not in DECLARED)
 
     tracking, faulty = measured(disc, progress)
-    slips = _slips(tracking, read_blocks, pairs, setup, settings)
+    slips = _slips(tracking, read_blocks, pairs, setup)
     for slip in slips:
         read_blocks = _without(read_blocks, frames.CAMERAS.index(slip.subject.camera), slip.subject.frames[0][0])
         tracking, faulty = measured(disc, lambda n: None)
@@ -134,9 +131,7 @@ def _check_dots(disc: Disc) -> None:
         )
 
 
-def _slips(
-    tracking: Tracking, read_blocks: ReadBlocks, pairs: range, setup: TrackingSetup, settings: TrackingSettings
-) -> tuple[Finding, ...]:
+def _slips(tracking: Tracking, read_blocks: ReadBlocks, pairs: range, setup: TrackingSetup) -> tuple[Finding, ...]:
     """More images left out by one camera than a delay of its dots tells: the pairing that fits the frames after it."""
     missed = max(tracking.scatter.systematic_px) > FAR_PX / 2
     status = tracking.trajectory.frame_status
@@ -145,17 +140,11 @@ def _slips(
     if not begun.size or {Kind.DROPPED_FRAMES, Kind.DELAY} & {finding.kind for finding in tracking.findings}:
         return ()
     first, start = int(begun[0]), pairs[begun[0]]
-    blocks = read_blocks(start, min(start + PAIRED, pairs.stop))
-    images = np.concatenate([block.images.copy() for block in blocks])
-    ahead = frames_ahead(images, setup.rig, setup.disc)
+    edges = [start, min(start + PAIRED, pairs.stop)]
+    alone = (_without(read_blocks, other, start) for other in (1, 0))
+    ahead = frames_ahead(*(_followed(one, edges, setup, 1, lambda n: None)[1].R for one in alone))
     if not ahead:
         return ()
-    left = np.arange(max(ahead, 0), len(images) + min(ahead, 0))
-    again = PairBlock(left, np.stack([images[left, 0], images[left - ahead, 1]], axis=1))
-    _, tables = _followed(lambda start, stop: [again], [left[0], left[-1] + 1], setup, settings, 1, lambda n: None)
-    dots = dot_centres(tables.results, tables.status)
-    seen = DotsInFrames(setup.rig, setup.disc, dots.pixels, dots.covariance_px2, tables.R, tables.t)
-    ahead += round(delay_of_right(seen, np.arange(len(left)))[0])
     camera, other = frames.CAMERAS[::-1] if ahead > 0 else frames.CAMERAS
     text = f"the {camera} camera is {abs(ahead)} frames ahead of the {other}, and its images are not used from there on"
     return (left_out(text, ahead, (start, pairs[-1]), start, first == 0),)
@@ -200,15 +189,13 @@ def _followed(
     read_blocks: ReadBlocks,
     edges: list[int],
     setup: TrackingSetup,
-    settings: TrackingSettings,
     workers: int,
     progress: Callable[[int], object],
 ) -> tuple[list[Follower], Tables]:
     """The disc followed through the stretches between edges; arguments as of `track`."""
     first = edges[0]
     tables = empty_tables(edges[-1] - first, setup.disc.n_markers)
-    search = Search(always=settings.search_always)
-    followers = [Follower(setup, search=search, first_row=edge - first) for edge in edges[:-1]]
+    followers = [Follower(setup, first_row=edge - first) for edge in edges[:-1]]
     given_up, telling = Event(), Lock()
 
     def follow(k: int, tell: Callable[[int], object]) -> None:

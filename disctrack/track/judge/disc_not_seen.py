@@ -53,7 +53,6 @@ BETTER = 3.0  # times, than with the camera where it was
 DOT_DIAMETERS_PX = (6.0, 18.0, 54.0, 162.0)  # the search for blobs takes those of a seventh to twice the diameter
 SIZE_TOLERANCE = 0.15  # blur and threshold make a blob larger or smaller than its dot
 MISPLACED = 0.2  # of the distance between two dots: places measured with a ruler, not dots numbered wrongly
-MOST_AHEAD, THIRD = 12, 3  # frames
 MEETING_PX = 1.0  # beyond, cameras or clocks do not fit together, and places seen by both are none
 
 
@@ -131,26 +130,6 @@ def moved_camera(pairs: NDArray, rig: StereoRig, disc: Disc) -> Iterator[Finding
         }
         advice = (Remedy(action="calibrate again"),)
         yield Finding(Kind.CAMERA_MOVED, Severity.DOUBT, text, Subject("track", "right"), sizes, advice, NONSENSE)
-
-
-def frames_ahead(pairs: NDArray, rig: StereoRig, disc: Disc) -> int:
-    """Frames by which the right camera is ahead of the left, if the two see one disc only so; else 0.
-
-    pairs : (n, 2, height, width), one after the other. Known to a frame or two: blobs err as dots move in that time
-    """
-    some = pairs.copy()
-    some[np.arange(len(pairs)) % THIRD > 0, 0] = 0  # every third of one camera is enough, and the search takes long
-    seen, misfit = _by_each_camera(some, rig, disc), {}
-    still = np.zeros(N_RIG + 2 * disc.n_markers)
-    for ahead in range(-MOST_AHEAD, MOST_AHEAD + 1):
-        left = np.arange(max(ahead, 0), len(pairs) + min(ahead, 0))
-        paired = replace(seen.at(left), pixels=np.stack([seen.pixels[left, 0], seen.pixels[left - ahead, 1]], axis=1))
-        rows = np.flatnonzero(_by_both(paired))
-        if len(rows) >= THIRD:
-            _, fits = paired.at(rows).fitted(still, reject=False)
-            misfit[ahead] = BLOB_PX * float(np.sqrt(np.median(fits.reduced_chi_square)))
-    best = min(misfit, key=misfit.__getitem__, default=0)
-    return best if best and misfit[best] < min(MEETING_PX, misfit.get(0, 0.0) / BETTER) else 0
 
 
 def _by_each_camera(pairs: NDArray, rig: StereoRig, disc: Disc) -> DotsInFrames:

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from calibration.kit.arrays import Array, Mask, robust_sigma
+from calibration.kit.brief import ranges
 from disctrack import frames
 from disctrack.disc import Disc, symmetry_order
 from disctrack.findings import MISFITS, Finding, Kind, Remedy, Severity, Subject
@@ -30,18 +31,34 @@ NO_TOLERANCE = 0.4e-3  # [m] between the board's table and the disc's: a number 
 MOVED = "Was a camera moved or turned after its calibration? Then calibrate again."
 
 
-def repeated_images(repeated: Mask, pairs: range) -> Iterator[Finding]:
-    """Images that are copies of earlier ones, as (n, 2)."""
-    for camera, copies in zip(frames.CAMERAS, (repeated & ~repeated.all(axis=1, keepdims=True)).T, strict=True):
-        rows = np.flatnonzero(copies)
-        if len(rows):
-            shown = ", ".join(str(pairs[row]) for row in rows[:5]) + (", ..." if len(rows) > 5 else "")
+def repeated_images(repeated: Mask, trajectory: Trajectory) -> Iterator[Finding]:
+    """Images that are copies of earlier ones, as (n, 2), and frames that are lost because both are."""
+    alone = repeated & ~repeated.all(axis=1, keepdims=True)
+    for camera, copies in zip(frames.CAMERAS, alone.T, strict=True):
+        if copies.any():
+            shown, where = _named(trajectory, copies)
             text = (
-                f"{camera} camera: {len(rows)} repeat{'s' * (len(rows) > 1)} of earlier images (frame {shown}): the "
-                "camera or its recorder lost these; the frames are measured without them"
+                f"{camera} camera: {copies.sum()} repeat{'s' * int(copies.sum() > 1)} of earlier images (frame {shown}): "
+                "the camera or its recorder lost these; the frames are measured without them"
             )
-            where = Subject("track", camera, tuple((pairs[row], pairs[row]) for row in rows))
-            yield Finding(Kind.REPEATED_IMAGES, Severity.DOUBT, text, where)
+            yield Finding(Kind.REPEATED_IMAGES, Severity.DOUBT, text, Subject("track", camera, where))
+    lost = trajectory.frame_status == FrameStatus.REPEATED
+    if lost.any():
+        shown, where = _named(trajectory, lost)
+        text = (
+            f"both cameras repeat earlier images while the disc moves (frame {shown}): the recorder lost these pairs; "
+            "they have no pose, and time goes on over them"
+        )
+        yield Finding(Kind.REPEATED_IMAGES, Severity.NOTE, text, Subject("track", frames=where))
+
+
+def _named(trajectory: Trajectory, chosen: Mask, shortest: int = 1) -> tuple[str, tuple[tuple[int, int], ...]]:
+    """Stretches of at least so many of the frames chosen (n,): in words, and first and last of each."""
+    edges = np.flatnonzero(np.diff(np.r_[False, chosen, False].astype(int))).reshape(-1, 2)
+    long = edges[edges[:, 1] - edges[:, 0] >= shortest]
+    rows = [row for first, end in long for row in range(first, end)]
+    stretches = [(int(trajectory.frame[first]), int(trajectory.frame[end - 1])) for first, end in long]
+    return ranges(trajectory.frame[rows]) if rows else "", tuple(stretches)
 
 
 def _table_gap(trajectory: Trajectory) -> Array:
@@ -198,12 +215,9 @@ def _table_disagrees(table: TableFromDisc | None, trajectory: Trajectory) -> tup
 
 def _lost(trajectory: Trajectory) -> Iterator[Finding]:
     """Frames whose poses no motion joins to the others, and a recording that loses most of its frames."""
-    status, frame = trajectory.frame_status, trajectory.frame
-    jumped = np.flatnonzero(status == FrameStatus.JUMPED)
-    pieces = [piece for piece in np.split(jumped, np.flatnonzero(np.diff(jumped) > 1) + 1) if len(piece) >= PIECE]
-    if pieces:
-        stretches = tuple((int(frame[piece[0]]), int(frame[piece[-1]])) for piece in pieces)
-        told = ", ".join(f"{first}-{last}" for first, last in stretches)
+    status = trajectory.frame_status
+    told, stretches = _named(trajectory, status == FrameStatus.JUMPED, PIECE)
+    if stretches:
         text = (
             f"no motion leads from the other frames to frames {told}, which are refused: both cameras lost pairs "
             "there and the files were numbered on, the frames are in another order or of another recording, or the "
@@ -220,7 +234,10 @@ def _lost(trajectory: Trajectory) -> Iterator[Finding]:
 
 
 def _one_sided(trajectory: Trajectory) -> Iterator[Finding]:
-    one, both = (int(np.sum(trajectory.frame_status == s)) for s in (FrameStatus.ONE_CAMERA, FrameStatus.MEASURED))
+    """Frames that rest on one camera: most of them, or a stretch."""
+    by_one = trajectory.frame_status == FrameStatus.ONE_CAMERA
+    one, both = int(by_one.sum()), int(np.sum(trajectory.frame_status == FrameStatus.MEASURED))
+    told, stretches = _named(trajectory, by_one, PIECE)
     if one > both:
         text = (
             f"the dots of only one camera make sense in {one} of {one + both} measured frames: are left and right "
@@ -228,6 +245,12 @@ def _one_sided(trajectory: Trajectory) -> Iterator[Finding]:
         )
         explains = Kind.POSES_SCATTER, Kind.TABLE_DISAGREES, Kind.FRAMES_LOST, Kind.SHARPNESS, Kind.ACCURACY
         yield Finding(Kind.ONE_SIDED, Severity.DOUBT, text, explains=explains)
+    elif stretches:
+        text = (
+            f"frames {told} rest on one camera, with its larger sigma: the other was covered, sees the disc edge-on, "
+            "or lost images and is at another instant from there on"
+        )
+        yield Finding(Kind.ONE_SIDED, Severity.NOTE, text, Subject("track", frames=stretches))
 
 
 def _symmetric(disc: Disc) -> Iterator[Finding]:

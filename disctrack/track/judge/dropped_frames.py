@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.cameras.camera import N_RIG
-from calibration.kit.arrays import Mask
+from calibration.kit.arrays import Array, Mask
 from calibration.kit.brief import ranges
 from disctrack.findings import MISFITS, Finding, Kind, Remedy, Severity, Subject
-from disctrack.frames import CAMERAS
+from disctrack.frames import CAMERAS, vector_from_rotation
 from disctrack.numbers import Measured
 from disctrack.track.refine.self_calibration import DotsInFrames
 from disctrack.track.side_by_side import SHARED_FRAMES, evenly
@@ -72,6 +72,27 @@ def left_out(text: str, ahead: int, frames: tuple[int, int], since: int, always:
     remedy = Remedy(action=f"number its images from there on higher by {n}")
     explains = MISFITS if always else (Kind.DELAY, *MISFITS)
     return Finding(Kind.DROPPED_FRAMES, Severity.DOUBT, text, of, numbers, (remedy,), explains)
+
+
+def frames_ahead(left: Array, right: Array) -> int:
+    """Frames by which the right camera is ahead of the left; 0 where they see one disc at once, or none tells.
+
+    left, right : (n, 3, 3) attitudes of the disc as each camera alone sees them, NaN where it does not. They are those
+    of one motion where the median of what is between them is less than half of what the disc turns in a frame.
+    """
+
+    def apart(a: Array, b: Array) -> float:
+        turn = np.linalg.norm(vector_from_rotation(a @ np.swapaxes(b, 1, 2)), axis=1)
+        turn = turn[np.isfinite(turn)]
+        return float(np.median(turn)) if len(turn) >= SHORTEST else np.inf
+
+    n = len(left)
+    misfit = {
+        ahead: apart(left[max(ahead, 0) : n + min(ahead, 0)], right[max(-ahead, 0) : n - max(ahead, 0)])
+        for ahead in range(SHORTEST - n, n - SHORTEST + 1)
+    }
+    best = min(misfit, key=misfit.__getitem__, default=0)
+    return best if best and misfit[best] < 0.5 * min(apart(a[1:], a[:-1]) for a in (left, right)) else 0
 
 
 def delay_of_right(seen: DotsInFrames, rows: NDArray[np.intp]) -> tuple[float, float]:

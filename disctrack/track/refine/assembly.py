@@ -1,5 +1,6 @@
 """From what was followed to the trajectory: what all frames share is refined, all poses are fitted and judged."""
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -29,7 +30,7 @@ from disctrack.track.refine.self_calibration import (
     share_of_places,
 )
 from disctrack.track.refine.table_contact import OF_PATTERN, TableFromDisc, off_centre, table_from_disc
-from disctrack.track.side_by_side import SHARED_FRAMES, evenly, side_by_side
+from disctrack.track.side_by_side import SHARED_FRAMES, evenly
 from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
 
 MIN_GOOD_DOT_IMAGES = 6
@@ -42,7 +43,6 @@ class TrackingSettings:
 
     refine_markers: bool = True  # the dots' places on the disc, over the whole sequence
     table: str = "both"  # board, disc or both: what tells where the table is (table_contact.py)
-    search_always: bool = False  # at every frame where the disc is lost, whatever it costs: for single, unrelated poses
     exposure: tuple[float, float] | None = None  # [s] of the left and the right camera; None: as the dots' smear tells
     first_pass: bool = True  # leave out what lies still before the motion starts and after it ends (motion_span.py)
 
@@ -105,7 +105,8 @@ def assemble(
     *_, shaken = scatter_of_poses(fits)
     fits.covariance[...] *= np.sqrt(np.outer(shaken, shaken))
     shared = _shared_sigma(fits, systematic, as_built)
-    trajectory = _trajectory(fits, verdicts, systematic, tables, dots, as_built, taken)
+    seen = replace(seen, rig=rig)
+    trajectory = trajectory_of(seen, fits, systematic, verdicts, tables.frame_status, tables.status, taken)
     if table is not None:
         trajectory = replace(trajectory, table_moved=table.beyond)
     doubts = doubts_of(first, faults, scatter, shaken, table, trajectory, seen)
@@ -119,7 +120,7 @@ def assemble(
         table=table,
         exposure=exposure,
         acquisitions=sum(f.acquisitions for f in followers),
-        findings=(*repeated_images(repeated, taken.pairs), *slips, *of_exposure, *of_course, *doubts),
+        findings=(*repeated_images(repeated, trajectory), *slips, *of_exposure, *of_course, *doubts),
     )
 
 
@@ -220,7 +221,9 @@ def fit_all(seen: DotsInFrames, workers: int = 1, judged: bool = True) -> PoseFi
         for name, value in vars(fitted(rows)).items():
             whole[name][rows] = value
 
-    side_by_side(fill, n, FITTED_AT_ONCE, workers)
+    # NumPy lets go of the interpreter where arrays are large: parts of some hundred frames are worked on side by side
+    with ThreadPoolExecutor(workers, thread_name_prefix="part") as pool:
+        list(pool.map(fill, [slice(first, first + FITTED_AT_ONCE) for first in range(0, n, FITTED_AT_ONCE)]))
     return PoseFits(**whole)
 
 
@@ -247,24 +250,29 @@ def status_of(followed: NDArray[np.uint8], fits: PoseFits) -> NDArray[np.uint8]:
     return status
 
 
-def _trajectory(
+def trajectory_of(
+    seen: DotsInFrames,
     fits: PoseFits,
-    verdicts: NDArray[np.uint8],
     systematic: Array,
-    tables: Tables,
-    dots: DotCentres,
-    as_built: AsBuilt,
+    verdicts: NDArray[np.uint8],
+    followed: NDArray[np.uint8],
+    located: NDArray[np.uint8],
     taken: Taken,
 ) -> Trajectory:
+    """The trajectory of poses that were fitted to dots; what is refused is taken out of the arrays of `fits`, too.
+
+    systematic : (n, 6, 6) covariance of what repeats; verdicts (n,) of `judge_poses`; followed (n,) FrameStatus before
+    the fits; located (n, 2, m) MarkerStatus
+    """
     euler = frames.unwrap_euler(frames.euler_from_rotation(fits.R_world_body))
     euler[~fits.converged] = np.nan
-    status = status_of(tables.frame_status, fits)
+    status = status_of(followed, fits)
     refused = verdicts != FrameStatus.MEASURED
     status[refused] = verdicts[refused]
-    marker_status = tables.status.copy()
-    seen = tables.status == MarkerStatus.MEASURED
+    marker_status = located.copy()
     kept = fits.used & ~refused[:, None, None]
-    marker_status[seen & ~kept & (fits.converged | refused)[:, None, None]] = MarkerStatus.REJECTED
+    struck = ~kept & (fits.converged | refused)[:, None, None]
+    marker_status[struck & (located == MarkerStatus.MEASURED)] = MarkerStatus.REJECTED
     for without_answer in (euler, fits.t_world_body, fits.R_world_body, fits.covariance, fits.sensitivity, systematic):
         without_answer[refused] = np.nan
     squared = np.where(fits.used, np.sum(fits.residuals_px**2, axis=-1), 0.0)
@@ -282,12 +290,12 @@ def _trajectory(
         frame_status=status,
         reprojection_rms_px=rms,
         reduced_chi_square=fits.reduced_chi_square,
-        markers_px=dots.pixels,
-        markers_covariance_px2=dots.covariance_px2,
+        markers_px=seen.pixels,
+        markers_covariance_px2=seen.covariance,
         markers_residual_px=fits.residuals_px,
         marker_status=marker_status,
-        disc=as_built.disc,
-        rig=as_built.rig,
+        disc=seen.disc,
+        rig=seen.rig,
         frame_rate=taken.frame_rate,
         gravity=taken.gravity,
     )

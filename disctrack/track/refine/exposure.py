@@ -33,7 +33,6 @@ from disctrack.track.dots.template_response import Edge, half_axes, plane_to_ima
 from disctrack.track.pose import marker_pixels
 from disctrack.track.side_by_side import AT_ONCE, MIN_FRAMES, SHARED_FRAMES, evenly
 
-BORROWED_FROM = 2  # frames: beside a gap, the acceleration of a neighbour up to this far away is used
 PARTS = 10  # stretches of the recording, each left out in turn: what the fit leaves has a memory
 EDGE = 16  # directions about a dot
 OUTLYING = 4.0  # robust sigmas
@@ -58,15 +57,11 @@ def shift_by_exposure(
         rows = slice(max(first - 1, 0), first + AT_ONCE + 1)
         part = _second_order(R[rows], t[rows], time[rows], rig, disc, edges)
         each[first : first + AT_ONCE] = part[first - rows.start :][:AT_ONCE]
-    measured = np.isfinite(t).all(axis=1)
-    known = _all_finite(each)
-    for distance in range(1, BORROWED_FROM + 1):
-        for way in (-distance, distance):
-            wanted = np.flatnonzero(measured & ~known)
-            wanted = wanted[(wanted + way >= 0) & (wanted + way < len(known))]
-            wanted = wanted[known[wanted + way]]
-            each[wanted] = each[wanted + way]
-        known = _all_finite(each)
+    known: Mask = np.asarray(np.isfinite(each).all(axis=(1, 2, 3)))
+    wanted = np.flatnonzero(np.isfinite(t).all(axis=1) & ~known)
+    for beside in (wanted - 1, wanted + 1):  # a gap: as of a neighbour
+        use = known[np.clip(beside, 0, len(known) - 1)]
+        each[wanted[use]] = each[beside[use]]
     shift = np.asarray(exposure)[:, None, None] ** 2 / 24 * each
     return np.where(np.isfinite(shift), shift, 0.0)
 
@@ -243,7 +238,3 @@ def _standardised(x: Array) -> Array:
     known = x[np.isfinite(x)]
     spread = np.std(known) if known.size else 0.0
     return np.asarray((x - np.mean(known)) / spread if spread else np.zeros_like(x))
-
-
-def _all_finite(values: Array) -> Mask:
-    return np.asarray(np.isfinite(values).all(axis=(1, 2, 3)))

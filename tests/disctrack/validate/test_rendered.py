@@ -85,10 +85,10 @@ def test_a_biased_calibration_turns_the_verdict(outcomes):
 @pytest.mark.statistical
 def test_a_camera_turned_since_the_calibration_is_noticed_by_the_measurement_and_by_the_truth():
     turned = Faults(left=CameraFault(rotation_deg=(0.0, np.degrees(1e-3), 0.0)))
-    accuracy = sum_up(ideal(replace(scene_of(2014, quick=True), faults=turned), 24, 0, 0))
-    assert "does not hold" in verdict(accuracy) or "holds in part" in verdict(accuracy)
-    assert complaints(accuracy)
-    assert accuracy.warnings
+    found = accuracy_validation(ideal(replace(scene_of(2014, quick=True), faults=turned), 24, 0, 0))
+    assert "does not hold" in found.headline or "holds in part" in found.headline
+    assert found.complaints
+    assert found.remarks
 
 
 @pytest.mark.statistical
