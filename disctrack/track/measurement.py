@@ -177,7 +177,7 @@ def measure(
     with compiling("tracking", 15):  # not the camera's time: done once per installation
         prepare(np.uint8 if pairs.left.bit_depth == 8 else np.uint16)
     began = time.perf_counter()
-    span = _span(pairs, recording.frame_rate, settings, threads)
+    span = _span(pairs, recording.frame_rate, settings)
     progress(len(pairs) - (span.stop - span.start))
     tracking, unreadable = _tracked(
         recording, rig, pairs, settings, span, stamps, threads or default_threads(), progress
@@ -301,7 +301,7 @@ def exposures(recording: Recording, pairs: ImagePairs) -> tuple[tuple[float, flo
     return (left, right), (f"exposure {1e6 * left:g} and {1e6 * right:g} µs (left, right) as the cameras' headers say",)
 
 
-def _span(pairs: ImagePairs, frame_rate: float, settings: TrackingSettings, threads: int | None) -> MotionSpan:
+def _span(pairs: ImagePairs, frame_rate: float, settings: TrackingSettings) -> MotionSpan:
     """What is to be tracked of the pairs."""
     if not settings.first_pass:
         return MotionSpan(pairs.start, pairs.stop, 0, "every frame, as requested")
@@ -309,7 +309,7 @@ def _span(pairs: ImagePairs, frame_rate: float, settings: TrackingSettings, thre
         return MotionSpan(pairs.start, pairs.stop, 0, f"every frame of a recording below {WHOLE_BELOW:g} s")
     if not (pairs.left.random_access and pairs.right.random_access):
         return MotionSpan(pairs.start, pairs.stop, 0, "every frame: these files can only be read in order")
-    return find_motion(pairs.left, pairs.right, pairs.start, pairs.stop, frame_rate, threads)
+    return find_motion(pairs.left, pairs.right, pairs.start, pairs.stop, frame_rate)
 
 
 _FILL = {"frame_status": FrameStatus.NOT_PROCESSED, "marker_status": MarkerStatus.NOT_LOOKED_FOR}

@@ -4,12 +4,9 @@ Every imperfection has its own switch: a lens with a smooth residual field beyon
 that is bowed and stretched along one side, pixel gains, column offsets, a curved response, light that falls off, a
 broad glare. The motion is that of `newton_euler`. Images are cast backwards through each camera on a grid of SUB x SUB
 rays per pixel, blurred there, and gathered to pixels.
-
-    python -m tests.oracles.imperfect_laboratory FOLDER --seed 3 [--effect kz] [--only bow] [--without lens_field]
 """
 
-import argparse
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
 
@@ -408,31 +405,3 @@ g_m_s2 = {G}
         truth[f"{name}_field"] = camera.field(grid)
     np.savez(folder / "truth.npz", effect=plan.effect, **truth)
     return folder
-
-
-def main():
-    """Command line."""
-    names = [f.name for f in fields(Imperfections)]
-    parser = argparse.ArgumentParser(description="Render a recording of an imperfect laboratory.")
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--frames", type=int, default=300)
-    parser.add_argument("--frame-rate", type=float, default=1000.0, help="pairs per second")
-    parser.add_argument("--theta", type=float, default=12.0, help="nutation at the start [deg]")
-    parser.add_argument("--omega3", type=float, default=1.5)
-    parser.add_argument("--effect", choices=sorted(EFFECTS), default="none")
-    parser.add_argument("--ideal", action="store_true", help="no imperfection at all (but exposure)")
-    parser.add_argument("--only", nargs="*", choices=names, help="these imperfections alone")
-    parser.add_argument("--without", nargs="*", choices=names, default=(), help="all but these")
-    asked = parser.parse_args()
-    faults, full = Imperfections(), Imperfections()
-    if asked.ideal or asked.only is not None:
-        kept = {"exposure", *(asked.only or ())}
-        faults = replace(IDEAL, **{name: getattr(full, name) for name in kept})
-    faults = replace(faults, **dict.fromkeys(asked.without, 0.0))
-    plan = Plan(asked.seed, asked.frames, theta_deg=asked.theta, omega3=asked.omega3, effect=asked.effect)
-    write(asked.folder, replace(plan, frame_rate=asked.frame_rate, imperfections=faults))
-
-
-if __name__ == "__main__":
-    main()

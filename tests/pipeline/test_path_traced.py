@@ -12,7 +12,7 @@ from calibration.rig_file import read_rig
 from disctrack.cli import main as disctrack_cli
 from disctrack.trajectory import FrameStatus
 from disctrack.trajectory.file import read_trajectory
-from tests.oracles.imperfect_table import truth_of
+from tests.oracles import newton_euler
 from tests.oracles.point_laboratory import errors_and_variances
 
 pytestmark = [
@@ -31,6 +31,13 @@ def recording(tmp_path_factory):
     return folder
 
 
+def truth_of(folder):
+    """The poses R (n, 3, 3), t (n, 3) of a rendered recording."""
+    q = np.load(folder / "truth.npz")["q"]
+    R = [newton_euler.matrix_of(newton_euler.quaternion_from_angles(*angles)) for angles in q[:, 3:]]
+    return np.stack(R), q[:, :3]
+
+
 def measured(folder, out):
     assert disctrack_cli(["run", str(folder), "-o", str(out), "--no-figures", "--no-video"]) == 0
     return read_trajectory(out / "trajectory.h5")
@@ -39,7 +46,7 @@ def measured(folder, out):
 def test_a_path_traced_recording_is_measured_within_its_sigmas(recording, tmp_path):
     trajectory = measured(recording, tmp_path)
     assert np.all(trajectory.frame_status == FrameStatus.MEASURED)
-    error, variance = errors_and_variances(trajectory, *truth_of(recording)[1:])
+    error, variance = errors_and_variances(trajectory, *truth_of(recording))
     shared = np.diagonal(trajectory.calibration_covariance, axis1=1, axis2=2).mean(0)
     noise = variance.mean(0) - shared
     assert np.all(np.abs(error.mean(0)) < 4 * np.sqrt(shared + noise / FRAMES))
@@ -63,7 +70,7 @@ def test_squares_declared_too_large_are_errors_beyond_the_sigmas_of_right_ones(r
 
     By the sigmas of the right run: those of the wrong one are larger, as the dots' distances contradict the squares.
     """
-    truth = truth_of(recording)[1:]
+    truth = truth_of(recording)
     _, variance = errors_and_variances(measured(recording, tmp_path / "right"), *truth)
     declared = recording / "recording.toml"
     text = declared.read_text()

@@ -6,8 +6,7 @@ and a pause in the middle stays. "Differs" means more than noise, a change of th
 VIBRATION_PX: anything else counts as motion, a hand as well as the disc, so that doubt costs time and not data.
 """
 
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -18,7 +17,6 @@ from calibration.kit.arrays import Array32, robust_sigma
 from calibration.kit.grey_levels import level_step
 from disctrack.errors import RecordingError
 from disctrack.recording.readers.base import FrameReader
-from disctrack.recording.readers.blocks import default_threads
 from disctrack.track.dots.template import photon_transfer
 
 Pair = tuple[NDArray, NDArray]
@@ -86,73 +84,46 @@ def _noise(mean: Array32, difference: Array32, steep: Array32) -> Array32:
     )
 
 
-def find_motion(
-    left: FrameReader,
-    right: FrameReader,
-    start: int,
-    stop: int,
-    frame_rate: float,
-    threads: int | None = None,
-) -> MotionSpan:
+def find_motion(left: FrameReader, right: FrameReader, start: int, stop: int, frame_rate: float) -> MotionSpan:
     """The part of frames start..stop-1 in which something moves, with a margin of MARGIN seconds at either end.
 
     Frames that cannot be read are passed over.
     """
     margin = max(int(np.ceil(MARGIN * frame_rate)), 2 * STRIDE)
-    looked: list[int] = []
     if stop - start < 2 * margin:
         return MotionSpan(start, stop, 0, "too short to leave anything out")
-    with ThreadPoolExecutor(threads or default_threads(), thread_name_prefix="look") as pool:
-
-        def read(frames: list[int]) -> list[Pair | None]:
-            looked.extend(frames)
-            return list(pool.map(lambda frame: _read(left, right, frame), frames))
-
-        last_still = _last_still(read, start, stop, 1)
-        if last_still is None:
-            return MotionSpan(start, stop, len(looked), "nothing moves in the whole recording")
-        first_still = _last_still(read, stop - 1, start - 1, -1)
+    last_still, looked = _last_still(left, right, range(start, stop))
+    if last_still is None:
+        return MotionSpan(start, stop, looked, "nothing moves in the whole recording")
+    first_still, more = _last_still(left, right, range(stop - 1, start - 1, -1))
     begin, end = last_still - margin, (stop - 1 if first_still is None else first_still) + margin + 1
     begin, end = max(begin, start), min(end, stop)
     rest = [f"rest in frames {a}-{b - 1}" for a, b in ((start, begin), (end, stop)) if a < b]
-    return MotionSpan(begin, end, len(looked), " and ".join(rest) or "moves from end to end")
+    return MotionSpan(begin, end, looked + more, " and ".join(rest) or "moves from end to end")
 
 
-def _read(left: FrameReader, right: FrameReader, frame: int) -> Pair | None:
-    try:
-        return left.read(frame), right.read(frame)
-    except RecordingError:
-        return None
+def _last_still(left: FrameReader, right: FrameReader, frames: range) -> tuple[int | None, int]:
+    """Last of the frames, from the first on, that shows what the first shows, None where all do; pairs looked at."""
+    scenes: list[Pair] = []
+    last, looked = frames[0], 0
+    for frame in _looks(frames):
+        try:
+            pair = left.read(frame), right.read(frame)
+        except RecordingError:
+            continue
+        looked += 1
+        if len(scenes) < 2:
+            scenes.append(pair)
+            still = tuple(map(StillScene, scenes[0], pair))
+        elif any(map(StillScene.differs, still, pair)):
+            return last, looked
+        last = frame
+    return None, looked
 
 
-def _last_still(read: Callable[[list[int]], list[Pair | None]], first: int, end: int, sign: int) -> int | None:
-    """Last frame, going from `first` towards `end`, that shows what the first shows; None where all do."""
-    scenes: tuple[StillScene, ...] = ()
-    last = first
-    for frames in _looks(first, end, sign):
-        pairs = read(frames)
-        if not scenes:
-            good = [pair for pair in pairs if pair is not None]
-            if len(good) < 2:
-                continue
-            scenes = tuple(map(StillScene, *good[:2]))
-        for frame, pair in zip(frames, pairs, strict=True):
-            if pair is None:
-                continue
-            if any(map(StillScene.differs, scenes, pair)):
-                return last
-            last = frame
-    return None
-
-
-def _looks(first: int, end: int, sign: int) -> Iterator[list[int]]:
-    """Frames to look at, in growing batches: two neighbours, then one in STRIDE, the last before `end` included."""
-    yield [first, first + sign]
-    count = abs(end - first)
-    offsets = [STRIDE * i - i * i % STRIDE for i in range(1, count // STRIDE + 1)]
-    offsets = [offset for offset in offsets if 1 < offset < count - 1] + [count - 1]
-    size = 2
-    while offsets:
-        yield [first + sign * offset for offset in offsets[:size]]
-        offsets = offsets[size:]
-        size = min(2 * size, 32)
+def _looks(frames: range) -> Iterator[int]:
+    """Frames to look at: two neighbours, one in STRIDE, and the last."""
+    yield from frames[:2]
+    for i in range(1, (len(frames) - 1) // STRIDE + 1):
+        yield frames[STRIDE * i - i * i % STRIDE]
+    yield frames[-1]

@@ -12,9 +12,9 @@ from disctrack.findings import MISFITS, Finding, Kind, Remedy, Severity, Subject
 from disctrack.numbers import Measured
 from disctrack.track.follow.following import Follower
 from disctrack.track.judge.dropped_frames import HARDLY, LATE, delay_of_right
-from disctrack.track.refine.intrinsic_scatter import Scatter, SharedFaults
+from disctrack.track.refine.intrinsic_scatter import Scatter
 from disctrack.track.refine.pose_scatter import GROUPS
-from disctrack.track.refine.self_calibration import DotsInFrames
+from disctrack.track.refine.self_calibration import AsBuilt, DotsInFrames
 from disctrack.track.refine.table_contact import TableFromDisc
 from disctrack.trajectory import FrameStatus, Trajectory
 
@@ -36,9 +36,9 @@ def repeated_images(repeated: Mask, trajectory: Trajectory) -> Iterator[Finding]
     alone = repeated & ~repeated.all(axis=1, keepdims=True)
     for camera, copies in zip(frames.CAMERAS, alone.T, strict=True):
         if copies.any():
-            shown, where = _named(trajectory, copies)
+            n, (shown, where) = int(copies.sum()), _named(trajectory, copies)
             text = (
-                f"{camera} camera: {copies.sum()} repeat{'s' * int(copies.sum() > 1)} of earlier images (frame {shown}): "
+                f"{camera} camera: {n} repeat{'s' * (n > 1)} of earlier images (frame {shown}): "
                 "the camera or its recorder lost these; the frames are measured without them"
             )
             yield Finding(Kind.REPEATED_IMAGES, Severity.DOUBT, text, Subject("track", camera, where))
@@ -160,7 +160,7 @@ def _misfit(seen: str, ahead: float, explained: float, frame_rate: float) -> Fin
 
 def doubts_of(
     follower: Follower,
-    faults: SharedFaults | None,
+    by_free_cameras: AsBuilt | None,
     scatter: Scatter,
     shaken: Array,
     table: TableFromDisc | None,
@@ -179,7 +179,7 @@ def doubts_of(
         *_clipped(follower),
         *misplaced,
     ]
-    own = scatter.whole if faults is None else max(1.0, faults.reduced_chi_square)
+    own = scatter.whole if by_free_cameras is None else max(1.0, by_free_cameras.reduced_chi_square)
     systematic_px = max(scatter.systematic_px)
     if scatter.whole > min(FAULTY * own, HOPELESS) and systematic_px > ORDINARY_PX:
         times = np.sqrt(scatter.whole / own)

@@ -20,14 +20,13 @@ from disctrack.track.judge.outlier_tests import judge_poses, outlying_frames, un
 from disctrack.track.pose import MIN_DOTS, PoseFits, fit_poses, whitening
 from disctrack.track.refine.exposure import exposure_by_smear, exposure_of, shift_by_exposure
 from disctrack.track.refine.glare import shift_by_glare
-from disctrack.track.refine.intrinsic_scatter import Scatter, SharedFaults, split_scatter, without_shared_faults
+from disctrack.track.refine.intrinsic_scatter import Scatter, split_scatter, without_shared_faults
 from disctrack.track.refine.pose_scatter import scatter_of_poses
 from disctrack.track.refine.self_calibration import (
     AsBuilt,
     DotsInFrames,
     by_pattern,
     refine_as_built,
-    share_of_places,
 )
 from disctrack.track.refine.table_contact import OF_PATTERN, TableFromDisc, off_centre, table_from_disc
 from disctrack.track.side_by_side import SHARED_FRAMES, evenly
@@ -148,13 +147,12 @@ def _clean(tables: Tables, dots: DotCentres, repeated: Mask, rig: StereoRig) -> 
         dots.pixels[...] = rig.lens_field.corrected(dots.pixels)
 
 
-def _shared(seen: DotsInFrames, settings: TrackingSettings, workers: int) -> tuple[AsBuilt, SharedFaults | None, Mask]:
+def _shared(seen: DotsInFrames, settings: TrackingSettings, workers: int) -> tuple[AsBuilt, AsBuilt | None, Mask]:
     """What the frames share, what is wrong with it, and which frames (n,) are outlying and do not enter."""
     outlying = _outlying(seen, workers)
     faults = without_shared_faults(seen.but(outlying))
     if faults is not None:  # misprinted dots raise the misfit of all frames, and hide faults of some
-        found = replace(seen.disc, marker_centres_body=seen.disc.marker_centres_body + faults.marker_shift)
-        more = _outlying(replace(seen, disc=found), workers) & ~outlying
+        more = _outlying(replace(seen, disc=faults.disc), workers) & ~outlying
         if more.any():
             outlying |= more
             faults = without_shared_faults(seen.but(outlying))
@@ -162,12 +160,12 @@ def _shared(seen: DotsInFrames, settings: TrackingSettings, workers: int) -> tup
         return AsBuilt.as_declared(seen.rig, seen.disc), faults, outlying
     as_built = refine_as_built(seen.but(outlying))
     if faults is not None and as_built.reduced_chi_square > FAULTY * max(1.0, faults.reduced_chi_square):
-        as_built = _without_false_shifts(as_built, seen, faults)
+        as_built = faults  # dots refined alone would be moved to make up for wrong cameras
     return as_built, faults, outlying
 
 
 def _scattered(
-    fits: PoseFits, dots: DotCentres, faults: SharedFaults | None, outlying: Mask
+    fits: PoseFits, dots: DotCentres, faults: AsBuilt | None, outlying: Mask
 ) -> tuple[PoseFits, Array, Scatter]:
     """Poses and dots with covariances of the noise they have, the part (n, 6, 6) that repeats, and what was found."""
     ordinary = replace(
@@ -196,14 +194,6 @@ def _outlying(seen: DotsInFrames, workers: int) -> Mask:
     """(n,) True where the dots miss the pose that fits best by far more than in others."""
     fits = fit_all(seen, workers, judged=False)
     return outlying_frames((whitening(seen.covariance) @ fits.residuals_px[..., None])[..., 0])
-
-
-def _without_false_shifts(as_built: AsBuilt, seen: DotsInFrames, faults: SharedFaults) -> AsBuilt:
-    """Where cameras and clock are wrong, dots refined alone would be moved to make up for that: take the joint ones."""
-    sigma, disc = faults.marker_shift_sigma, seen.disc
-    shift = share_of_places(disc, faults.marker_shift[:, :2], sigma) * faults.marker_shift
-    disc = replace(disc, marker_centres_body=disc.marker_centres_body + shift)
-    return replace(as_built, rig=seen.rig, disc=disc, marker_shift=shift, marker_shift_sigma=sigma, size_share=0.0)
 
 
 def fit_all(seen: DotsInFrames, workers: int = 1, judged: bool = True) -> PoseFits:

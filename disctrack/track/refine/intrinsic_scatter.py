@@ -15,10 +15,9 @@ from calibration.kit.arrays import Array
 from disctrack.track.pose import PoseFits, whitening
 from disctrack.track.refine.self_calibration import (
     DOT_SIGMA,
+    AsBuilt,
     DotsInFrames,
-    declared_places_kept,
     fit_shared,
-    places_sigma,
 )
 from disctrack.track.side_by_side import MIN_FRAMES, SHARED_FRAMES, evenly
 
@@ -29,18 +28,8 @@ _WIDE = {"fx": 20.0, "fy": 20.0, "cx": 10.0, "cy": 10.0, "k1": 0.05, "k2": 0.2, 
 _WIDE_POSE = np.repeat([0.02, 0.01], 3)
 
 
-@dataclass(frozen=True)
-class SharedFaults:
-    """Dots and their scatter when cameras, dots and clock are free."""
-
-    reduced_chi_square: float  # of the dots about the poses, without the twentieth of the frames that fits worst
-    marker_shift: Array  # (m, 3) [m] from the declared places, body axes
-    marker_shift_sigma: Array  # (m, 2) [m] of the dots against each other
-    delay: float  # [frame periods] of the right camera against the left
-
-
-def without_shared_faults(frames: DotsInFrames) -> SharedFaults | None:
-    """Refine cameras, dots and delay together, with a free pose for each of n successive frames.
+def without_shared_faults(frames: DotsInFrames) -> AsBuilt | None:
+    """The dots refined together with cameras and delay, with a free pose for each of n successive frames.
 
     None if fewer than MIN_FRAMES frames, with both their neighbours, are complete.
     """
@@ -59,15 +48,11 @@ def without_shared_faults(frames: DotsInFrames) -> SharedFaults | None:
     free[:N_RIG] = (np.diag(rig.covariance) > 0) & (np.arange(N_RIG) < PAIR_SHIFT.stop)
     complete_frames = replace(frames.at(rows), further=by_delay[..., None])
     joint = fit_shared(complete_frames, free, np.diag(wide[free] ** -2))
-    shift, dots = joint.shift, slice(N_RIG, N_RIG + 2 * m)
-    _, fits = joint.frames.fitted(shift, reject=True)
+    dots = slice(N_RIG, N_RIG + 2 * m)
+    _, fits = joint.frames.fitted(joint.shift, reject=True)
     spent = int(fits.degrees_of_freedom[fits.converged].sum())
-    return SharedFaults(
-        reduced_chi_square=trimmed_reduced_chi_square(fits) * spent / max(spent - int(free.sum()), 1),
-        marker_shift=declared_places_kept(disc, shift[dots].reshape(m, 2)),
-        marker_shift_sigma=places_sigma(disc, joint.covariance[dots, dots]),
-        delay=float(shift[-1]),
-    )
+    reduced = trimmed_reduced_chi_square(fits) * spent / max(spent - int(free.sum()), 1)
+    return AsBuilt.moved(rig, disc, joint.shift[dots].reshape(m, 2), joint.covariance[dots, dots], reduced)
 
 
 @dataclass(frozen=True)
@@ -80,7 +65,7 @@ class Scatter:
     systematic_px: tuple[float, float]  # rms of that rest per axis, left and right camera
 
 
-def split_scatter(fits: PoseFits, markers_covariance_px2: Array, faults: SharedFaults | None) -> Scatter:
+def split_scatter(fits: PoseFits, markers_covariance_px2: Array, by_free_cameras: AsBuilt | None) -> Scatter:
     """What the dots do not fit, as noise and as what repeats.
 
     Where no three successive frames are complete, all that passes a refinement of what frames share is noise.
@@ -89,7 +74,7 @@ def split_scatter(fits: PoseFits, markers_covariance_px2: Array, faults: SharedF
     noise = frame_to_frame_chi_square(fits, markers_covariance_px2)
     if noise is None:
         whole = max(1.0, whole)
-        noise = whole if faults is None else min(whole, max(1.0, faults.reduced_chi_square))
+        noise = whole if by_free_cameras is None else min(whole, max(1.0, by_free_cameras.reduced_chi_square))
     noise = max(noise, LEAST_NOISE)
     # chance alone: both are means over n frames, the second differences of overlapping triples tell half as much
     freedom = float(np.sum(fits.degrees_of_freedom[fits.degrees_of_freedom >= 6]))

@@ -63,12 +63,19 @@ class AsBuilt:
         m = disc.n_markers
         return cls(rig, disc, np.zeros((m, 3)), np.full((m, 2), DOT_SIGMA))
 
+    @classmethod
+    def moved(cls, rig: StereoRig, disc: Disc, shift: Array, covariance: Array, reduced_chi_square: float) -> AsBuilt:
+        """Dots moved by the part of displacements (m, 2) of covariance (2m, 2m) that is theirs, not their sigma's."""
+        sigma = places_sigma(disc, covariance)
+        kept = share_of_places(disc, shift, sigma) * declared_places_kept(disc, shift)
+        disc = replace(disc, marker_centres_body=disc.marker_centres_body + kept)
+        return cls(rig, disc, kept, sigma, reduced_chi_square)
+
 
 def refine_as_built(frames: DotsInFrames) -> AsBuilt:
     """Refine the dots' places, and the rig's size, from the dots of n frames.
 
-    Frames with fewer than all dots serve too. Fewer than MIN_FRAMES frames leave everything as declared. Dots are moved
-    by that share of their displacements which is theirs, not their sigma's (`share_of_places`).
+    Frames with fewer than all dots serve too. Fewer than MIN_FRAMES frames leave everything as declared.
     """
     rig, disc = frames.rig, frames.disc
     enough = frames.posed & (np.isfinite(frames.pixels).all(-1).sum((1, 2)) >= 4)
@@ -79,13 +86,11 @@ def refine_as_built(frames: DotsInFrames) -> AsBuilt:
     free = np.arange(N_RIG + 2 * m) >= N_RIG
     joint = fit_shared(frames.at(rows), free, np.eye(2 * m) / DOT_SIGMA**2, repeats=SYSTEMATIC_PX)
     moved, remaining = joint.shift[N_RIG:].reshape(m, 2), joint.covariance[N_RIG:, N_RIG:]
-    sigma = places_sigma(disc, remaining)
     size, size_sigma = pattern_size(disc, moved, remaining)
     rig, size_share = sized_by_pattern(rig, size, size_sigma)
     moved = moved + size_share * size * _from_middle(disc)
-    kept = share_of_places(disc, moved, sigma) * declared_places_kept(disc, moved)
-    disc = replace(disc, marker_centres_body=disc.marker_centres_body + kept)
-    return AsBuilt(rig, disc, kept, sigma, joint.reduced_chi_square[-1], size, size_sigma, size_share)
+    found = AsBuilt.moved(rig, disc, moved, remaining, joint.reduced_chi_square[-1])
+    return replace(found, size=size, size_sigma=size_sigma, size_share=size_share)
 
 
 @dataclass(frozen=True)

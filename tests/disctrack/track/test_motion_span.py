@@ -54,7 +54,7 @@ def rest_motion_rest(begin, end, speed):
 
 
 def found_in(n, place, **light):
-    return find_motion(*cameras(place, **light), 0, n, RATE, threads=2)
+    return find_motion(*cameras(place, **light), 0, n, RATE)
 
 
 @pytest.mark.parametrize("speed", [0.1, 1.0])
@@ -111,7 +111,7 @@ def test_a_pause_in_the_middle_stays_and_where_nothing_moves_all_is_kept(speed):
 
 def test_motion_from_end_to_end_costs_a_few_looks_and_nothing_is_left_out():
     left, right = cameras(lambda i: (64.0 + 20 * np.sin(0.05 * i), 64.0, 0.1 * i))
-    span = find_motion(left, right, 0, 2000, RATE, threads=2)
+    span = find_motion(left, right, 0, 2000, RATE)
     assert (span.start, span.stop) == (0, 2000)
     assert span.looked_at == len(left.read_frames) <= 8
     assert span.verdict == "moves from end to end"
