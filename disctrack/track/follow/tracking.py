@@ -30,7 +30,7 @@ from disctrack.track.follow.following import (
     follow_block,
     run,
 )
-from disctrack.track.judge.disc_not_seen import why_not_seen
+from disctrack.track.judge.disc_not_seen import MEETING_PX, why_not_seen
 from disctrack.track.judge.doubts import MOVED
 from disctrack.track.judge.dropped_frames import frames_ahead, left_out
 from disctrack.track.pose import marker_pixels
@@ -39,9 +39,6 @@ from disctrack.track.side_by_side import evenly
 from disctrack.trajectory import FrameStatus
 
 SHORTEST_SPLIT = 1000  # pairs; a stretch must outweigh its own search for the disc, and measuring blur and noise
-MOST_STRETCHES = 16
-FAR_PX = 1.0  # that dots miss their places by in all frames, beyond any lens: the poses are no better than none
-MOSTLY = 0.5  # of the frames: that many are not refused for glare and hands
 # [m] off its declared place from which on a dot is looked for again, where it is. With wrong places the attitude is
 # wrong that templates are made for: places 0.1 mm off, rms, shift centres by 0.3e-3 to 2e-3 px, in all frames alike.
 LOOK_AGAIN = 60e-6
@@ -133,7 +130,7 @@ def _check_dots(disc: Disc) -> None:
 
 def _slips(tracking: Tracking, read_blocks: ReadBlocks, pairs: range, setup: TrackingSetup) -> tuple[Finding, ...]:
     """More images left out by one camera than a delay of its dots tells: the pairing that fits the frames after it."""
-    missed = max(tracking.scatter.systematic_px) > FAR_PX / 2
+    missed = max(tracking.scatter.systematic_px) > MEETING_PX / 2
     status = tracking.trajectory.frame_status
     apart = (status == FrameStatus.ONE_CAMERA) | (status == FrameStatus.CONTRADICTED) | missed
     begun = np.flatnonzero(np.convolve(apart, np.ones(APART), "valid") == APART)
@@ -168,8 +165,8 @@ def _senseless(tracking: Tracking, faulty: bool, read_blocks: ReadBlocks, pairs:
     """
     kinds = {finding.kind for finding in tracking.findings}
     status = tracking.trajectory.frame_status
-    contradicted = Kind.ONE_SIDED in kinds or np.mean(status == FrameStatus.CONTRADICTED) > MOSTLY
-    far = faulty and max(tracking.scatter.systematic_px) > FAR_PX
+    contradicted = Kind.ONE_SIDED in kinds or 2 * np.sum(status == FrameStatus.CONTRADICTED) > len(status)
+    far = faulty and max(tracking.scatter.systematic_px) > MEETING_PX
     if not (contradicted or far) or Kind.DROPPED_FRAMES in kinds:  # which makes cameras contradict each other
         return _some(read_blocks, pairs[:0])
     of_one = (status == FrameStatus.ONE_CAMERA) | (status == FrameStatus.CONTRADICTED)
@@ -239,7 +236,7 @@ def stretch_edges(pairs: range, disc: Disc) -> list[int]:
     open by a symmetry, every new start could choose another branch: then there is one stretch.
     """
     n, count = len(pairs), 1
-    while n >= SHORTEST_SPLIT * count**2 and count < MOST_STRETCHES and symmetry_order(disc) == 1:
+    while n >= SHORTEST_SPLIT * count**2 and symmetry_order(disc) == 1:
         count *= 2
     return [pairs.start + round(k * n / count) for k in range(count + 1)]
 
@@ -275,8 +272,7 @@ def _as_one_sensor(read_blocks: ReadBlocks, pairs: range) -> tuple[ReadBlocks, l
                 if pattern is not None:
                     images[:, camera] = _without_mosaic(images[:, camera], pattern)
                 if mask is not None:
-                    for image in images[:, camera]:
-                        repair(image, mask)
+                    repair(images[:, camera], mask)
             yield replace(block, images=images)
 
     return repaired, told

@@ -38,14 +38,14 @@ from disctrack.track.dots.acquisition import (
 )
 from disctrack.track.dots.template_response import plane_to_image
 from disctrack.track.judge.doubts import misplaced_dots
-from disctrack.track.pose import marker_pixels
-from disctrack.track.refine.self_calibration import MIN_FRAMES, DotsInFrames, declared_places_kept, fit_shared
+from disctrack.track.pose import MIN_DOTS, marker_pixels
+from disctrack.track.refine.self_calibration import DotsInFrames, declared_places_kept, fit_shared
 
 Turn = Callable[[NDArray], NDArray]
 MIRRORED: dict[str, Turn] = {
-    "mirrored left to right": lambda image: image[:, ::-1],
-    "mirrored top to bottom": lambda image: image[::-1],
-    "turned by 180 deg": lambda image: image[::-1, ::-1],
+    "mirrored left to right": np.fliplr,
+    "mirrored top to bottom": np.flipud,
+    "turned by 180 deg": np.flip,
 }
 TURN, SHIFT = np.radians(1.0), 2e-3  # [rad], [m] what cameras suffer without anybody's notice: prior sigmas
 MOST_SIGMAS = 4.0  # beyond, it is something else
@@ -53,7 +53,7 @@ BETTER = 3.0  # times, than with the camera where it was
 DOT_DIAMETERS_PX = (6.0, 18.0, 54.0, 162.0)  # the search for blobs takes those of a seventh to twice the diameter
 SIZE_TOLERANCE = 0.15  # blur and threshold make a blob larger or smaller than its dot
 MISPLACED = 0.2  # of the distance between two dots: places measured with a ruler, not dots numbered wrongly
-MEETING_PX = 1.0  # beyond, cameras or clocks do not fit together, and places seen by both are none
+MEETING_PX = 1.0  # beyond, cameras or clocks do not fit together, and what both see is no place and no pose
 
 
 def why_not_seen(pairs: NDArray, rig: StereoRig, disc: Disc) -> tuple[Finding, ...]:
@@ -104,11 +104,11 @@ def _ways(pair: NDArray, disc: Disc) -> Iterator[tuple[str, tuple[NDArray, NDArr
 def moved_camera(pairs: NDArray, rig: StereoRig, disc: Disc) -> Iterator[Finding]:
     """How the right camera moved against the left one, where that explains what is seen.
 
-    pairs : (n, 2, height, width), from all over the recording; fewer than MIN_FRAMES with dots tell nothing
+    pairs : (n, 2, height, width), from all over the recording; both cameras must see the dots in most of them
     """
     seen = _by_each_camera(pairs, rig, disc)
     seen = seen.at(np.flatnonzero(_by_both(seen)))
-    if len(seen.t) < MIN_FRAMES:
+    if 2 * len(seen.t) < len(pairs) or len(seen.t) < MIN_DOTS:
         return
     free = np.zeros(N_RIG + 2 * disc.n_markers, bool)
     free[PAIR_TURN] = free[PAIR_SHIFT] = True

@@ -11,7 +11,7 @@ from disctrack.disc import Disc, symmetry_order
 from disctrack.findings import MISFITS, Finding, Kind, Remedy, Severity, Subject
 from disctrack.numbers import Measured
 from disctrack.track.follow.following import Follower
-from disctrack.track.judge.dropped_frames import HARDLY, LATE, delay_of_right
+from disctrack.track.judge.dropped_frames import HARDLY, LATE, SHORTEST, delay_of_right
 from disctrack.track.refine.intrinsic_scatter import Scatter
 from disctrack.track.refine.pose_scatter import GROUPS
 from disctrack.track.refine.self_calibration import AsBuilt, DotsInFrames
@@ -19,14 +19,11 @@ from disctrack.track.refine.table_contact import TableFromDisc
 from disctrack.trajectory import FrameStatus, Trajectory
 
 MISPLACED_MM = 0.15  # a printer that stretches a sheet by 0.5 % moves a dot 26 mm off the centre by 0.13 mm
-NOISE_ALLOWED = 1.5  # times the variance of the noise: the scatter of a few frames is no better known
 MAX_TABLE_GAP = 20e-6  # [m] the thickness of a board on the table is known to some 10 um
-FAULTY = 2.0  # times the noise that residuals must reach before cameras or clock are taken to be wrong
+FAULTY = 2.0  # times the variance of the noise, from which on a scatter has another cause
 DISAGREE = 0.003  # chance that board and disc differ by that much: three standard deviations
 ORDINARY_PX = 0.03  # rms of systematic misfit that good lenses have beyond their polynomial: no camera has moved
 HOPELESS = 25.0  # times the variance of the noise: no result of such dots is right within its sigmas
-SHAKEN = 1.4  # times what dots tell, from which on the scatter of the poses is worth a word
-PIECE = 5  # frames that agree with each other and with no others: exchanged frames are fewer
 NO_TOLERANCE = 0.4e-3  # [m] between the board's table and the disc's: a number declared wrong, or cameras that moved
 MOVED = "Was a camera moved or turned after its calibration? Then calibrate again."
 
@@ -80,7 +77,7 @@ def off_the_table(trajectory: Trajectory, severity: Severity = Severity.WARNING)
     J = np.stack([np.ones_like(psi), by_tilt * np.cos(psi), by_tilt * np.sin(psi)], axis=1)  # z, turns about x and y
     noise = np.median(np.einsum("ni,nij,nj->n", J, C[:, 2:5, 2:5], J))
     spread = robust_sigma(gap)
-    if max(abs(np.median(gap)), np.sqrt(max(spread**2 - NOISE_ALLOWED * noise, 0.0))) <= MAX_TABLE_GAP:
+    if max(abs(np.median(gap)), np.sqrt(max(spread**2 - FAULTY * noise, 0.0))) <= MAX_TABLE_GAP:
         return ()
     seen = Measured(1e6 * float(np.median(gap)), 1e6 * float(gap.std()), "um")
     text = (
@@ -115,8 +112,8 @@ def _shaken(factor: Array, trajectory: Trajectory) -> tuple[Finding, ...]:
     variance = np.nanmedian(np.diagonal(trajectory.pose_covariance[trajectory.measured], axis1=1, axis2=2), axis=0)
     told = []
     for name, group in zip(names, GROUPS, strict=True):
-        times, sigma = np.sqrt(factor[group[0]]), np.sqrt(np.mean(variance[list(group)]))
-        if times > SHAKEN:
+        if factor[group[0]] > FAULTY:
+            times, sigma = np.sqrt(factor[group[0]]), np.sqrt(np.mean(variance[list(group)]))
             length = f"{1e6 * sigma:.1f} µm" if group[0] < 3 else f"{1e3 * np.degrees(sigma):.1f} mdeg"
             told.append(f"{name} by {length} ({times:.1f} times)")
     if not told:
@@ -216,7 +213,7 @@ def _table_disagrees(table: TableFromDisc | None, trajectory: Trajectory) -> tup
 def _lost(trajectory: Trajectory) -> Iterator[Finding]:
     """Frames whose poses no motion joins to the others, and a recording that loses most of its frames."""
     status = trajectory.frame_status
-    told, stretches = _named(trajectory, status == FrameStatus.JUMPED, PIECE)
+    told, stretches = _named(trajectory, status == FrameStatus.JUMPED, SHORTEST)
     if stretches:
         text = (
             f"no motion leads from the other frames to frames {told}, which are refused: both cameras lost pairs "
@@ -237,7 +234,7 @@ def _one_sided(trajectory: Trajectory) -> Iterator[Finding]:
     """Frames that rest on one camera: most of them, or a stretch."""
     by_one = trajectory.frame_status == FrameStatus.ONE_CAMERA
     one, both = int(by_one.sum()), int(np.sum(trajectory.frame_status == FrameStatus.MEASURED))
-    told, stretches = _named(trajectory, by_one, PIECE)
+    told, stretches = _named(trajectory, by_one, SHORTEST)
     if one > both:
         text = (
             f"the dots of only one camera make sense in {one} of {one + both} measured frames: are left and right "

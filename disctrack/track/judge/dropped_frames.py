@@ -19,7 +19,7 @@ from disctrack.numbers import Measured
 from disctrack.track.refine.self_calibration import DotsInFrames
 from disctrack.track.side_by_side import SHARED_FRAMES, evenly
 
-SHORTEST = 4  # frames: glare or a hand is told by the frames' own status
+SHORTEST = 4  # frames of a stretch: glare, a hand, exchanged frames are told by the frames' own status
 # Share of the square of a misfit that a delay explains, from which on it is its cause; and below which it has no part
 # in it: what a camera that moved leaves looks a little like one
 LATE, HARDLY = 0.9, 0.3

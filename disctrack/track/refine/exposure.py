@@ -29,12 +29,18 @@ from calibration.kit.arrays import Array, Mask
 from disctrack.disc import Disc
 from disctrack.findings import Finding, Kind, Severity
 from disctrack.frames import CAMERAS
-from disctrack.track.dots.template_response import Edge, half_axes, plane_to_image, pulls_by_exposure, turned_to_axes
+from disctrack.track.dots.template_response import (
+    AROUND,
+    Edge,
+    half_axes,
+    plane_to_image,
+    pulls_by_exposure,
+    turned_to_axes,
+)
 from disctrack.track.pose import marker_pixels
 from disctrack.track.side_by_side import AT_ONCE, MIN_FRAMES, SHARED_FRAMES, evenly
 
 PARTS = 10  # stretches of the recording, each left out in turn: what the fit leaves has a memory
-EDGE = 16  # directions about a dot
 OUTLYING = 4.0  # robust sigmas
 ALIKE = 1e-6  # of the largest: columns of the fit that differ by less from a sum of others are not told apart
 SURE = 3.0  # sigmas of T^2, or the exposure is taken as short
@@ -192,8 +198,8 @@ def _smear(velocity: Array, affine: Array) -> Array:
 
     velocity (n, 2, m, 2) [px/s]; affine (n, 2, m, 2, 2) [px/m] from the disc's plane to the image.
     """
-    angle = 2 * np.pi * np.arange(EDGE) / EDGE
-    tangent = affine @ np.stack([-np.sin(angle), np.cos(angle)])  # (n, 2, m, xy, EDGE)
+    angle = 2 * np.pi * np.arange(AROUND) / AROUND
+    tangent = affine @ np.stack([-np.sin(angle), np.cos(angle)])  # (n, 2, m, xy, AROUND)
     length = np.hypot(tangent[..., 0, :], tangent[..., 1, :])
     v = velocity[..., None]
     outwards = (v[..., 0, :] * tangent[..., 1, :] - v[..., 1, :] * tangent[..., 0, :]) / length
