@@ -19,7 +19,7 @@ from disctrack.disc import Disc
 from disctrack.faults.catalogue import scene_faults
 from disctrack.faults.keys import Faults
 from disctrack.frames import rotation_from_euler
-from disctrack.rolling import Effect, Model, simulate, steady_precession
+from disctrack.rolling import CATALOGUE, Effect, Model, simulate, steady_precession
 from disctrack.synthetic import board_poses, rig_after_faults, rig_of, true_disc_of
 from disctrack.synthetic.description import Scene
 from disctrack.track.pose import fit_poses
@@ -31,7 +31,7 @@ Motion = Callable[[Array], Array]  # instants (k,) [s] -> coordinates q (k, 6)
 
 SIGMA_PX = 0.006  # of a dot's centre: 0.5 um and 1.3 mdeg per pose, as in the reference recordings
 CORNER_SIGMA_PX = 0.01
-K_M = 0.381e-7  # [m s^2]
+K_M = CATALOGUE["km"]().values["k_m"]  # [m s^2]
 STATION = 0.002  # [s] after the motion's first instant at which the first frame is taken
 _WAVES = 14
 _WAVELENGTHS = (0.4, 1.5)  # of the image's width

@@ -33,6 +33,7 @@ from disctrack.synthetic.description import (
 )
 from disctrack.track.follow.tracking import Tracking, track
 from disctrack.track.measurement import open_pairs
+from disctrack.track.pose import MIN_DOTS
 from disctrack.trajectory import part
 from disctrack.validate.errors import PoseErrors, compare
 from disctrack.validate.points import K_M
@@ -49,7 +50,6 @@ STRATA_DEG = ((0.5, 1.0), (1.0, 2.0), (2.0, 5.0), (5.0, 10.0), (10.0, 20.0), (20
 FIELD_RADIUS = 25e-3  # [m] of the disc's centre about the middle of the field, where the dots stay in both images
 BORDER_PX = 14  # a dot's window needs some pixels around it
 SMALLEST_SEMI_MINOR_PX = 3.2  # a dot seen flatter than this is all edge: its blurred middle shows no black
-FEWEST_DOTS = 3  # two numbers each, six unknowns
 
 
 @dataclass(frozen=True)
@@ -262,5 +262,5 @@ def cameras_in_sight(q: Array, rig: StereoRig, disc: Disc) -> NDArray[np.int64]:
         distance = np.linalg.norm(ray, axis=-1)
         cosine = np.einsum("nmi,ni->nm", ray, R[:, :, 2]) / distance
         semi_minor = camera.fx * disc.marker_diameter / 2 * cosine / distance
-        cameras += np.sum(semi_minor > SMALLEST_SEMI_MINOR_PX, axis=1) >= FEWEST_DOTS
+        cameras += np.sum(semi_minor > SMALLEST_SEMI_MINOR_PX, axis=1) >= MIN_DOTS
     return cameras

@@ -76,19 +76,6 @@ def exchanged_with_the_views(folder, tree):
         tree[section]["left"], tree[section]["right"] = tree[section]["right"], tree[section]["left"]
 
 
-def one_image_twice(folder, tree):
-    first, again = (folder / "left" / f"000{number}.png" for number in (149, 150))
-    again.unlink()
-    os.link(first, again)
-
-
-def broken_files(folder, tree):
-    for number in (148, 149, 150):
-        file = folder / "left" / f"000{number}.png"
-        file.unlink()
-        file.write_bytes(b"\x89PNG and nothing else")
-
-
 def moved(image, x, y):
     move = np.array([[1.0, 0.0, x], [0.0, 1.0, y]])
     return cv2.warpAffine(image, move, image.shape[::-1], flags=cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE)
@@ -215,12 +202,13 @@ FAULTS = {
                                     planted("images lost by one", 10)),
     "pairs lost by both": fault(Kind.CLOCK_JUMP, "doubt", "frame 150: the clock jumps by 3",
                                 planted("pairs lost by both", 3)),
-    "one moment twice": fault(Kind.REPEATED_IMAGES, "doubt", "1 repeat of earlier images", one_image_twice),
+    "one moment twice": fault(Kind.REPEATED_IMAGES, "doubt", "1 repeat of earlier images",
+                              planted("images repeated by one", 1)),
     "stamps in ms": fault(Kind.TIME_STAMPS, "doubt", "they give 1 frames/s", stacked(timestamps=np.arange(300.0))),
     "the file of a slower camera": fault(Kind.HEADERS, "warning", "file states 500 Hz", stacked(frame_rate=500.0)),
     # the files, and the rest
     "other numbers": fault(Kind.READING, "refusal", "equal numbers must be the same instant", numbered_from_one),
-    "broken files": fault(Kind.UNREADABLE, "warning", "3 images could not be read", broken_files),
+    "broken files": fault(Kind.UNREADABLE, "warning", "3 images could not be read", planted("files damaged", 3)),
     "a hand": fault(Kind.FRAMES_LOST, "doubt", "have no pose", drawn(hidden)),
     "no disc": fault(Kind.DISC_NOT_FOUND, "refusal", "the disc was found", drawn(lambda image, _: grey(image))),
     "other corners": fault(Kind.CALIBRATION, "refusal", "inner_corners = [9, 6]",

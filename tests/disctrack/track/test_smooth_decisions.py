@@ -3,37 +3,24 @@
 import numpy as np
 import pytest
 
-from calibration.cameras.camera import Camera, StereoRig
 from disctrack.disc import MA_2014
 from disctrack.track.refine.self_calibration import share_of_places
 from disctrack.trajectory import FrameStatus
-from tests.oracles import imperfect_laboratory as laboratory
-from tests.oracles import point_laboratory
-
-
-def true_rig(cameras):
-    left, right = (Camera(c.focal, c.focal, *c.middle, (c.k1, c.k2, 0, 0, 0), (c.size, c.size)) for c in cameras)
-    (R, t), (R_right, t_right) = ((c.R, -c.R @ c.place) for c in cameras)
-    pair = R_right @ R.T
-    return StereoRig(left, right, pair, t_right - pair @ t, R, t, world_is_table=True)
+from tests.oracles.measured_disc import dots_of, measured
+from tests.oracles.point_laboratory import DOT_PX, tracked
 
 
 @pytest.mark.parametrize("frame_rate", [1000.0, 400.0])
 def test_ends_of_a_slow_recording_are_measured_and_an_exchange_there_is_refused(frame_rate):
     """At 400 pairs/s a quadratic through three frames misses the next by 11 times its noise, and no other is there."""
-    plan = laboratory.Plan(21, 80, frame_rate=frame_rate, imperfections=laboratory.IDEAL)
-    cameras, _, rng = point_laboratory.cameras_of(plan)
-    times = np.arange(plan.n_frames) / frame_rate
-    R, t = point_laboratory.poses_at(laboratory.motion(plan), times)
-    body = np.column_stack([laboratory.DOTS, np.full(6, laboratory.HALF_THICKNESS)])
-    points = body @ np.swapaxes(R, 1, 2) + t[:, None]
-    px = np.stack([camera.project(points) for camera in cameras], 1)
-    px += 0.0045 * rng.normal(size=px.shape)
+    trajectory = measured(n=80, declared_rate=frame_rate, sigma_px=DOT_PX)
+    seen = dots_of(trajectory)
+    px, R, t = seen.pixels, seen.R, seen.t
     px[40, 0, 0] = np.nan  # one dot hidden
-    found = point_laboratory.tracked(px, R, t, times, true_rig(cameras), frame_rate).trajectory
+    found = tracked(px, R, t, trajectory.time, seen.rig, frame_rate).trajectory
     assert np.all(found.frame_status == FrameStatus.MEASURED)
     px[[1, 3]], R[[1, 3]], t[[1, 3]] = px[[3, 1]], R[[3, 1]], t[[3, 1]]
-    found = point_laboratory.tracked(px, R, t, times, true_rig(cameras), frame_rate).trajectory
+    found = tracked(px, R, t, trajectory.time, seen.rig, frame_rate).trajectory
     assert found.frame_status[1] == found.frame_status[3] == FrameStatus.JUMPED
     assert np.all(found.frame_status[6:] == FrameStatus.MEASURED)
 
