@@ -64,7 +64,6 @@ class DotCentres:
     n_pixels: Array  # (..., m) grey values that it was taken over
     blur_px: Array  # (..., m) sigma of the edge, smear of its motion included
     radius: Array  # (..., m) fitted radius, plane units
-    level: Array  # (..., m) grey value beside the dot
     contrast: Array  # (..., m) 1 - dark / light
 
 
@@ -91,7 +90,7 @@ def dot_centres(results: NDArray, status: NDArray[np.uint8]) -> DotCentres:
     covariance = of("var_u", "cov_uv", "cov_uv", "var_v").reshape(*good.shape, 2, 2)
     # grey values that scatter more than the noise model says (print, speckle, compression) scatter the centre too
     covariance *= np.maximum(misfit, 1.0)[..., None, None]
-    further = np.moveaxis(of("n_pixels", "sigma", "radius", "level", "contrast"), -1, 0)
+    further = np.moveaxis(of("n_pixels", "sigma", "radius", "contrast"), -1, 0)
     return DotCentres(of("u", "v"), covariance, status, misfit, *further)
 
 

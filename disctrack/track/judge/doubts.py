@@ -179,7 +179,7 @@ def doubts_of(
     own = scatter.whole if by_free_cameras is None else max(1.0, by_free_cameras.reduced_chi_square)
     systematic_px = max(scatter.systematic_px)
     if scatter.whole > min(FAULTY * own, HOPELESS) and systematic_px > ORDINARY_PX:
-        times = np.sqrt(scatter.whole / own)
+        times = np.sqrt(scatter.whole / scatter.noise)
         text = f"the dots miss their fitted places by {times:.1f} times their scatter ({systematic_px:.3f} px)"
         found.append(_misfit(text, *delay_of_right(seen, np.flatnonzero(seen.posed)), trajectory.frame_rate))
     elif scatter.noise > 4.0:

@@ -22,6 +22,7 @@ from disctrack.trajectory import FrameStatus
 
 BLOCK = 16  # frames whose median is what is usual, with those of the blocks on both sides: half may be at fault
 SIGMAS = 4.0  # beyond which a dot's misfit is hardly chance (6e-5): such a dot loses its weight, and no frame is lost
+COMPANIONS = 1.0  # the same for the other dots of an image in which something is: glare is larger than a dot
 # Square of a centre's shift over that of the misfit, both in sigmas: a disturbance is taken for a shift in one part and
 # shows in the other. Of random glare, shadows, dirt and edges of a hand over dots the largest ratio was 1.96.
 HIDDEN_SHARE = 2.0
@@ -40,7 +41,7 @@ def unexpected_misfit(misfit: NDArray[np.floating], n_pixels: NDArray[np.floatin
     Glare, a shadow's edge, dirt or a hand raise a dot's misfit over that of the same dot in the frames around (and
     over twice that of the camera's other dots, for what stays). The excess times the number of pixels is the square of
     the disturbance in sigmas; HIDDEN_SHARE times that may be the square of the centre's shift. What disturbs a dot may
-    reach the image's other dots, and shift them by ten sigmas without showing by itself: there, any excess counts.
+    reach the image's other dots, and shift them by ten sigmas without showing by itself: there, a small excess counts.
     """
     shown, pixels = np.asarray(misfit, float), np.asarray(n_pixels, float)
     own, spread = _usual(shown)
@@ -50,7 +51,7 @@ def unexpected_misfit(misfit: NDArray[np.floating], n_pixels: NDArray[np.floatin
         chance = np.maximum(spread / own, np.sqrt(2.0 / pixels)) * expected
         above = (shown - expected) / chance
         disturbed = (above > SIGMAS).any(axis=2)
-        excess = np.where(above > np.where(disturbed, 0.0, SIGMAS)[..., None], shown - expected, 0.0)
+        excess = np.where(above > np.where(disturbed, COMPANIONS, SIGMAS)[..., None], shown - expected, 0.0)
         return 1.0 + HIDDEN_SHARE * np.nan_to_num(excess * pixels / np.maximum(shown, 1.0))
 
 

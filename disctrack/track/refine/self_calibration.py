@@ -65,7 +65,9 @@ class AsBuilt:
     @classmethod
     def moved(cls, rig: StereoRig, disc: Disc, shift: Array, covariance: Array, reduced_chi_square: float) -> AsBuilt:
         """Dots moved by the part of displacements (m, 2) of covariance (2m, 2m) that is theirs, not their sigma's."""
-        sigma = places_sigma(disc, covariance)
+        motions = _pattern_motions(disc).reshape(-1, 3)
+        keep = np.eye(len(covariance)) - motions @ np.linalg.pinv(motions)
+        sigma = np.sqrt(np.diag(keep @ covariance @ keep)).reshape(-1, 2)
         kept = share_of_places(disc, shift, sigma) * declared_places_kept(disc, shift)
         disc = replace(disc, marker_centres_body=disc.marker_centres_body + kept)
         return cls(rig, disc, kept, sigma, reduced_chi_square)
@@ -307,13 +309,6 @@ def declared_places_kept(disc: Disc, shift: Array) -> Array:
         if done:
             break
     return np.column_stack([rest, np.zeros(len(rest))])
-
-
-def places_sigma(disc: Disc, covariance: Array) -> Array:
-    """Standard deviations (m, 2) of displacements of covariance (2m, 2m), the motion of the whole pattern left out."""
-    motions = _pattern_motions(disc).reshape(len(covariance), 3)
-    keep = np.eye(len(covariance)) - motions @ np.linalg.pinv(motions)
-    return np.sqrt(np.diag(keep @ covariance @ keep)).reshape(-1, 2)
 
 
 def _pattern_motions(disc: Disc) -> Array:
