@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from calibration.cameras.camera import StereoRig
 from disctrack.disc import Disc
+from disctrack.rolling import Model, simulate, steady_precession
 from disctrack.synthetic.description import Scene
 from disctrack.synthetic.images import expected_board_image, expected_disc_image, stages
 
@@ -70,3 +71,12 @@ def _digitised(expected, rig, scene, rng):
             for pair in expected
         ]
     )
+
+
+def rolling_disc(rig: StereoRig, disc: Disc, scene: Scene, theta_deg: float, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Images of a disc that rolls from this nutation on, 1000 pairs/s, and its poses q (n, 6)."""
+    start = steady_precession(np.radians(theta_deg), disc, 9.81)
+    motion = simulate(Model(disc, 9.81), start, duration=(n - 0.5) / 1000)
+    q = motion.q[:n].copy()
+    q[:, :2] += np.array([0.032, 0.02]) - q[:, :2].mean(axis=0)
+    return render_disc(q, rig, disc, scene, np.random.default_rng(3), qdot=motion.qdot[:n]), q

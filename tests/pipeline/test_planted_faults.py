@@ -17,13 +17,15 @@ from disctrack.errors import TrackingError
 from disctrack.findings import Kind, in_doubt, leading
 from disctrack.recording.declaration import read_recording
 from disctrack.recording.readers.blocks import PairBlock
+from disctrack.synthetic import rig_of
+from disctrack.synthetic.description import Scene
 from disctrack.track.follow.tracking import TrackingSettings, track
 from disctrack.track.judge.disc_not_seen import arrangement_found, moved_camera, unlike_declared
 from disctrack.track.measurement import open_pairs
 from disctrack.track.refine.intrinsic_scatter import MIN_FRAMES
 from disctrack.trajectory import FrameStatus
 from tests.oracles.planted_faults import FAULTS, glare
-from tests.rendering import render_disc
+from tests.rendering import rolling_disc
 
 N = 48
 MOST_SIGMAS = 5.0  # of six components of some fifty poses chance alone reaches 4.1
@@ -401,17 +403,9 @@ def test_of_a_hundred_random_faults_none_passes_in_silence(laboratory, tmp_path)
 
 def ideal():
     """Rendered here, with the poses that were rendered as the truth, through the true rig."""
-    from disctrack import rolling as model
-    from disctrack.synthetic import rig_of
-    from disctrack.synthetic.description import Scene
-
     scene = Scene()
     rig, disc = rig_of(scene), scene.declared_disc
-    start = model.steady_precession(np.radians(8), disc, 9.81)
-    motion = model.simulate(model.Model(disc, 9.81), start, duration=(N - 0.5) / 1000)
-    q = motion.q[:N].copy()
-    q[:, :2] += np.array([0.032, 0.02]) - q[:, :2].mean(axis=0)
-    images = render_disc(q, rig, disc, scene, np.random.default_rng(3), qdot=motion.qdot[:N])
+    images, q = rolling_disc(rig, disc, scene, 8, N)
     return Laboratory(images, rig, disc, truth=q)
 
 

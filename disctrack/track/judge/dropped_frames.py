@@ -78,7 +78,8 @@ def frames_ahead(left: Array, right: Array) -> int:
     """Frames by which the right camera is ahead of the left; 0 where they see one disc at once, or none tells.
 
     left, right : (n, 3, 3) attitudes of the disc as each camera alone sees them, NaN where it does not. They are those
-    of one motion where the median of what is between them is less than half of what the disc turns in a frame.
+    of one motion where the median of what is between them is less than half of what the disc turns in a frame, and that
+    they were taken at once explains next to nothing of it.
     """
 
     def apart(a: Array, b: Array) -> float:
@@ -92,7 +93,8 @@ def frames_ahead(left: Array, right: Array) -> int:
         for ahead in range(SHORTEST - n, n - SHORTEST + 1)
     }
     best = min(misfit, key=misfit.__getitem__, default=0)
-    return best if best and misfit[best] < 0.5 * min(apart(a[1:], a[:-1]) for a in (left, right)) else 0
+    one = misfit.get(best, np.inf) < 0.5 * min(apart(a[1:], a[:-1]) for a in (left, right))
+    return best if one and misfit[best] ** 2 < (1 - LATE) * misfit[0] ** 2 else 0
 
 
 def delay_of_right(seen: DotsInFrames, rows: NDArray[np.intp]) -> tuple[float, float]:

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from disctrack.findings import Kind
-from disctrack.track.judge.dropped_frames import dropped_frames
+from disctrack.frames import rotation_from_vector
+from disctrack.track.judge.dropped_frames import dropped_frames, frames_ahead
 from disctrack.track.refine.assembly import fit_all
 from tests.oracles.measured_disc import dots_of, measured
 
@@ -27,3 +28,13 @@ def test_one_delay_in_several_stretches_is_one_sentence(ahead, said):
     assert [finding.subject.camera for finding in told] == said
     assert {finding.numbers["images"].value for finding in told} == {1}
     assert "at frame 8" in told[0].text
+
+
+@pytest.mark.parametrize(("lost", "turn_deg", "told"), [(20, 0.0, 20), (-37, 0.0, -37), (0, 0.0, 0), (0, 0.5, 0)])
+def test_images_lost_by_one_camera_are_counted_by_what_each_sees_alone(lost, turn_deg, told, rng):
+    """As sure of an attitude as one camera is; a camera that turned is no camera that lost images."""
+    R = dots_of(measured(n=97)).R
+    alone = np.einsum("cnij,njk->cnik", rotation_from_vector(np.radians(0.05) * rng.normal(size=(2, 97, 3))), R)
+    turned = rotation_from_vector(np.radians(turn_deg) * np.array([0.6, 0.0, 0.8]))
+    left, right = alone[0, max(-lost, 0) :][:60], turned @ alone[1, max(lost, 0) :][:60]
+    assert frames_ahead(left, right) == told

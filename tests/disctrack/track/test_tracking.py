@@ -15,7 +15,7 @@ from disctrack.recording.readers.blocks import PairBlock, Unreadable
 from disctrack.track.follow.tracking import PAIRS_TRIED, TrackingSettings, _as_one_sensor, track
 from disctrack.track.measurement import measure, open_pairs
 from disctrack.trajectory import FrameStatus, MarkerStatus
-from tests.rendering import render_disc
+from tests.rendering import rolling_disc
 
 N = 60
 
@@ -40,15 +40,7 @@ def tracked(images, pairs, *, readable=None, size=16, rig=None, disc=None, **opt
 @pytest.fixture(scope="module")
 def rolling(rendered_pairs):
     """Images of a disc that rolls with a moderate nutation, and its poses."""
-    from disctrack import rolling as model
-
-    disc, rig = rendered_pairs.disc, rendered_pairs.rig
-    start = model.steady_precession(np.radians(10), disc, 9.81)
-    motion = model.simulate(model.Model(disc, 9.81), start, duration=(N - 0.5) / 1000)
-    q = motion.q[:N].copy()
-    q[:, :2] += np.array([0.032, 0.02]) - q[:, :2].mean(axis=0)
-    images = render_disc(q, rig, disc, rendered_pairs.scene, np.random.default_rng(3), qdot=motion.qdot[:N])
-    return images, q
+    return rolling_disc(rendered_pairs.rig, rendered_pairs.disc, rendered_pairs.scene, 10, N)
 
 
 def errors(trajectory, q):
