@@ -17,6 +17,7 @@ MIN_DOTS = 3  # six unknowns, two numbers per dot
 # A dot is refused when chi-square falls without it by more than twice this, times what is usual for the other dots:
 # chance alone does it once in 3e5 dots.
 OUTLIER_CHI_SQUARE = 25.0
+MAX_REJECTED = 4  # more would make a frame fit whose cameras contradict each other
 TOLERANCE = 1e-3  # standard deviations: the Gauss-Newton step at which a pose has converged
 
 
@@ -129,7 +130,7 @@ def fit_poses(
     pixels, whitened, JW = np.full(observed.shape, np.nan), np.zeros(observed.shape), np.zeros((*observed.shape, 6))
     centres, cameras, filled = np.ascontiguousarray(centres_body, float), stacked(rig), (pixels, whitened, JW)
     rows = np.flatnonzero(np.isfinite(R).all((1, 2)) & np.isfinite(t).all(1))
-    while True:
+    for _ in range(MAX_REJECTED + 1):
         kernel.fit(rows, observed, covariance, used, *cameras, centres, TOLERANCE, R, t, good, *filled)
         rows = _strike_worst_dot(whitened, JW, used, rows) if reject_outliers else rows[:0]
         if rows.size == 0:

@@ -424,7 +424,7 @@ CHANGES = {
     "images repeated by one": Planting(
         (1, 3, 10), "images", (Kind.REPEATED_IMAGES,), partial(_again, cameras=("right",))
     ),
-    "files damaged": Planting((1, 10, 100), "files", (Kind.UNREADABLE,), _damaged),
+    "files damaged": Planting((1, 5, 50), "files", (Kind.UNREADABLE,), _damaged),
     "glare": Planting((3, 30, 300), "grey values", (Kind.LIGHT, Kind.ONE_SIDED, *MOVED), _glare),
     "camera knocked": Planting((0.02, 0.2, 2.0), "px", MOVED, partial(_image_moved, course=lambda x: float(x > 0.5))),
     "camera drifts": Planting((0.03, 0.3, 3.0), "px", MOVED, partial(_image_moved, course=lambda x: x)),
