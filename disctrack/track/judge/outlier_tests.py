@@ -20,6 +20,7 @@ from disctrack.track.pose import PoseFits
 from disctrack.track.side_by_side import AT_ONCE
 from disctrack.trajectory import FrameStatus
 
+FEW = 4  # frames beside a cut that tell how large the misfit is there
 BLOCK = 16  # frames whose median is what is usual, with those of the blocks on both sides: half may be at fault
 SIGMAS = 4.0  # beyond which a dot's misfit is hardly chance (6e-5): such a dot loses its weight, and no frame is lost
 COMPANIONS = 1.0  # the same for the other dots of an image in which something is: glare is larger than a dot
@@ -116,8 +117,8 @@ def _at_fault_since_a_jump(residuals: Array, reduced: Array) -> Mask:
     if not len(cuts):
         return at_fault
     starts, ends = np.r_[0, cuts], np.r_[cuts, len(rows)]
-    first = np.array([np.median(reduced[rows[a : min(b, a + BLOCK)]]) for a, b in zip(starts, ends, strict=True)])
-    last = np.array([np.median(reduced[rows[max(a, b - BLOCK) : b]]) for a, b in zip(starts, ends, strict=True)])
+    first = np.array([np.median(reduced[rows[a : min(b, a + FEW)]]) for a, b in zip(starts, ends, strict=True)])
+    last = np.array([np.median(reduced[rows[max(a, b - FEW) : b]]) for a, b in zip(starts, ends, strict=True)])
     long = ends - starts >= 2  # one frame alone is no measure for the others
     if not long.any():
         return at_fault
