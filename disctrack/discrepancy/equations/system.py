@@ -71,6 +71,7 @@ class EquationSystem(System):
             self.weights[rows] = np.isfinite(s.data).sum(axis=1)
             self.training[rows] = fitted_rows(s)
         self._w = w
+        self._places: dict[str, dict[str, int]] = {}
         self._defaults = formulas.defaults() | self.widths | self._limits()
         self._per = {name: p.per for name, p in formulas.declared.items() if p.per}
         self.base = tuple(self._base())
@@ -200,10 +201,12 @@ class EquationSystem(System):
 
     def names_of(self, s: Samples) -> dict[str, int]:
         """Quantities that move a stretch: the place of each in p, or -1 - i of the i-th state at the start."""
-        states, numbers = self.formulas.equations.states, self.formulas.names
-        found = {f"state.{n}[{where}]": -1 - i for i, n in enumerate(states) for where in (s.name, EACH)}
-        own = {name: i for i, n in enumerate(numbers) for name in (self._name(n, s), f"{n}[{EACH}]")}
-        return found | own
+        if s.name not in self._places:
+            states, numbers = self.formulas.equations.states, self.formulas.names
+            found = {f"state.{n}[{where}]": -1 - i for i, n in enumerate(states) for where in (s.name, EACH)}
+            own = {name: i for i, n in enumerate(numbers) for name in (self._name(n, s), f"{n}[{EACH}]")}
+            self._places[s.name] = found | own
+        return self._places[s.name]
 
     def numbers(self, values: Values, s: Samples) -> Array:
         """(n_p,) all numbers of a stretch."""
