@@ -12,7 +12,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calibration.kit.arguments import checked
+from calibration.kit.arguments import Length, Mass, checked
 from calibration.kit.arrays import Array, Mask
 from calibration.kit.brief import Brief
 from disctrack.errors import ModelError
@@ -34,21 +34,16 @@ class Disc(Brief):
 
     held_as: ClassVar[str] = "disc"
 
-    radius: float  # r [m]
-    half_thickness: float  # h [m]
-    mass: float  # m [kg]
+    radius: Length  # r [m]
+    half_thickness: Length  # h [m]
+    mass: Mass  # m [kg]
     marker_centres_body: Array  # (n_markers, 3) [m]; third component +h for dots on the upper face
-    marker_diameter: float  # [m]
+    marker_diameter: Length  # [m]
     # Standard deviations of radius and thickness 2h as declared [m]; None: not declared
     radius_tolerance: float | None = None
     thickness_tolerance: float | None = None
 
     def __post_init__(self) -> None:
-        sizes = {"radius": "m", "half_thickness": "m", "mass": "kg", "marker_diameter": "m"}
-        for name, unit in sizes.items():
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value > 0):
-                raise ModelError(f"a disc's {name} is {value} {unit}: expected a number above 0")
         shape = np.shape(self.marker_centres_body)
         if len(shape) != 2 or shape[1] != 3:
             raise ModelError(f"marker_centres_body has the shape {shape}: expected (dots, 3), in metres")

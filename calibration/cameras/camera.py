@@ -33,6 +33,7 @@ PAIR_TURN, PAIR_SHIFT = slice(18, 21), slice(21, 24)
 WORLD_TURN, WORLD_SHIFT = slice(24, 27), slice(27, 30)
 
 
+@checked
 @dataclass(frozen=True)
 class Camera:
     """Intrinsics of one camera: pinhole and Brown distortion."""
@@ -151,6 +152,7 @@ class Allowance:
     assumed: bool = False  # neither declared nor measured: a default, which other evidence may narrow
 
 
+@checked
 @dataclass(frozen=True, repr=False)
 class StereoRig(Brief):
     """Two calibrated cameras and the world (lab) frame they look at.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,8 +19,9 @@ from calibration.cameras.camera import (
     rotation_from_vector,
     stepped,
 )
+from calibration.kit.arguments import checked
 from calibration.kit.arrays import Array
-from calibration.kit.errors import CalibrationError
+from calibration.kit.errors import ArgumentError, CalibrationError
 
 RICHEST = "k1 k2 p1 p2 k3"
 DISTORTION_MODELS = ("none", "k1", "k1 k2", "k1 k2 p1 p2", "k1 k2 k3", RICHEST)  # by the terms that are free
@@ -29,6 +30,7 @@ N_WARP = 5  # shape parameters of a warped board
 N_STEREO = 2 * N_INTRINSIC + 6  # left and right intrinsics, rotation and translation of the pair
 
 
+@checked
 @dataclass(frozen=True)
 class Observations:
     """Image points of target points, flat over everything that was seen."""
@@ -40,19 +42,18 @@ class Observations:
     covariance: Array  # (m, 2, 2) [px^2]
 
     def __post_init__(self) -> None:
-        m = len(self.view)
-        shapes = (self.camera.shape, self.point.shape, self.pixels.shape, self.covariance.shape)
-        if shapes != ((m,), (m,), (m, 2), (m, 2, 2)):
-            raise ValueError(f"shapes of observations do not match: {m} views, then {shapes}")
+        shapes = tuple(np.shape(getattr(self, f.name)) for f in fields(self))
+        m = self.view.size
+        if shapes != ((m,), (m,), (m,), (m, 2), (m, 2, 2)):
+            raise ArgumentError(f"Observations: shapes {shapes}; expected (m,), (m,), (m,), (m, 2), (m, 2, 2)")
         if not (np.isfinite(self.pixels).all() and np.isfinite(self.covariance).all()):
-            raise ValueError("observations must be finite: leave out what was not seen")
+            raise ArgumentError("Observations: pixels and covariance must be finite: leave out what was not seen")
 
     def __len__(self) -> int:
         return len(self.view)
 
     def __getitem__(self, keep: NDArray) -> Observations:
-        names = ("view", "camera", "point", "pixels", "covariance")
-        return Observations(*(getattr(self, name)[keep] for name in names))
+        return Observations(*(getattr(self, f.name)[keep] for f in fields(self)))
 
 
 @dataclass(frozen=True)

@@ -50,6 +50,9 @@ FrameRate = Annotated[float, Range("Hz", 1e-3, 1e8)]  # beyond what any camera d
 Seconds = Annotated[float, Range("s", 1e-6)]
 Gravity = Annotated[float, Range("m/s^2", 1e-3, 100.0)]
 Thickness = Annotated[float, Range("m", 0.0, 1.0)]
+Length = Annotated[float, Range("m", 1e-7, 10.0)]
+Mass = Annotated[float, Range("kg", 1e-6, 1e4)]
+Density = Annotated[float, Range("kg/m^3", 0.0, 1e3)]
 Threads = Annotated[int, Range("threads", 1, 10_000)]
 Times = Annotated[ArrayLike, Range("s")]
 

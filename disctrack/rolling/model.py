@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from calibration.kit.arguments import checked
+from calibration.kit.arguments import Density, Gravity, checked
 from disctrack.disc import AIR_DENSITY, Disc
 from disctrack.rolling.effects import Effect, EffectParameter, ModelError, effect_class, effect_from_formulas
 from disctrack.rolling.records import BODY
@@ -27,24 +27,18 @@ class Model:
     """
 
     disc: Disc
-    gravity: float = 9.81  # [m/s^2] along -k, unless an effect says otherwise
+    gravity: Gravity = 9.81  # [m/s^2] along -k, unless an effect says otherwise
     effects: tuple[Effect, ...] = ()
-    air_density: float = AIR_DENSITY  # [kg/m^3]
+    air_density: Density = AIR_DENSITY  # [kg/m^3]
     laws: tuple[type[Effect], ...] = ()  # by formula, that parameters may name beside those of the catalogue
 
     def __post_init__(self) -> None:
-        if not isinstance(self.disc, Disc):
-            raise ModelError(f"the disc of a model is {self.disc!r}: expected a Disc")
         object.__setattr__(self, "effects", tuple(self.effects))
         object.__setattr__(self, "laws", tuple(self.laws))
         names = [effect.name for effect in self.effects]
         for name in names:
             if names.count(name) > 1:
                 raise ModelError(f"effect '{name}' is in the model twice: give it once, with the sum of its amounts")
-        if not (np.isfinite(self.gravity) and self.gravity > 0):
-            raise ModelError(f"gravity is {self.gravity} m/s^2: expected a positive number")
-        if not (np.isfinite(self.air_density) and self.air_density >= 0):
-            raise ModelError(f"the density of the air is {self.air_density} kg/m^3: expected a number from 0 on")
 
     @property
     def values(self) -> dict[str, float]:

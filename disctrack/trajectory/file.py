@@ -49,6 +49,7 @@ _CONVENTIONS = {
 }
 
 
+@checked
 @dataclass(frozen=True, repr=False)
 class Provenance(Outline):
     """What a result was made from; equal fingerprints mean that making it again would give it again.

@@ -14,7 +14,18 @@ import calibration
 import disctrack
 from disctrack.errors import ArgumentError
 
-MADE = {"Board", "CalibrationSettings", "Disc", "Model", "State", "Tracker"}
+MADE = {
+    "Board",
+    "CalibrationSettings",
+    "Camera",
+    "Disc",
+    "Model",
+    "Observations",
+    "Provenance",
+    "State",
+    "StereoRig",
+    "Tracker",
+}
 PUBLIC = {
     name: getattr(package, name)
     for package in (calibration, disctrack)
