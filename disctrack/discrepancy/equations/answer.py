@@ -240,11 +240,12 @@ class Answer:
         A run of the same name as one that was fitted begins in that one's fitted state, and may be longer; another
         begins as its `start` and `known` say. Its data are not looked at, but for their channels' names.
         window : [s] from the first sample: data to which the initial state is fitted, those and no others
-        by : "after"; "before": the equations as declared (and fitted); "nearest": with the terms that help most
+        by : "after": with what was found, or, where nothing is, with the terms that help most; "before": the equations
+        as declared (and fitted)
         """
         d = self.diagnosis
         fitted, errors = (d.before, self.before) if by == "before" else (d.after, self.after)
-        if by == "nearest" and self.nearest and d.nearest is not None:
+        if by == "after" and self.nearest and d.nearest is not None:
             fitted, errors = d.nearest, self._errors(d.nearest, None)
         of_noise = d.verdict != "unexplained" and by != "before"
         left = [e.noise if of_noise else np.nanmax([e.noise, e.rms, e.held_out]) for e in errors.values()]
