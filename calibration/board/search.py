@@ -23,7 +23,6 @@ TargetView = CornerView | BoardNotFound
 Progress = Callable[[str, int, int], None]
 LEAST_VIEWS = 2  # that must show the whole board
 SIZES_TRIED = 3  # of those that several images seem to show
-COMMON_SIZE = (9, 6)  # asked for where no size is seen: OpenCV's own board
 VIEWS_TRIED = 8  # over a whole set: what most of them show is the board; without one, the slow search waits
 REFUSED_TRIED = 4  # images without the declared board in which another is looked for, a quarter of a second each
 
@@ -105,10 +104,8 @@ def board_size(images: Sequence[NDArray], largest: int = SEARCH_SIZE) -> tuple[t
         seen |= {size: counts[size] + _found(size, greys, sizes) for size in often}
         if 2 * max(seen.values(), default=0) >= len(images):
             break
-    else:
-        seen.setdefault(COMMON_SIZE, _found(COMMON_SIZE, greys, sizes))
-    best = max(seen, key=lambda size: seen[size] * size[0] * size[1])
-    return (best, seen[best]) if seen[best] >= min(LEAST_VIEWS, len(images)) else (None, 0)
+    best = max(seen, key=lambda size: seen[size] * size[0] * size[1], default=None)
+    return (best, seen[best]) if best and seen[best] >= min(LEAST_VIEWS, len(images)) else (None, 0)
 
 
 def _found(size: tuple[int, int], greys: Sequence[NDArray], sizes: Sequence[tuple[int, int] | None]) -> int:
