@@ -10,6 +10,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from disctrack import synthetic
+from disctrack.commands.sample import SCENE
 from disctrack.errors import OutputError, SceneError
 from disctrack.faults.keys import CameraFault, Faults, Occluder
 from disctrack.frames import vector_from_rotation
@@ -364,3 +365,17 @@ def test_missing_table_of_motion_is_named(tmp_path):
     (tmp_path / "scene.toml").write_text('[motion]\nkind = "table"\ntable = "nowhere.csv"')
     with pytest.raises(SceneError, match=r"nowhere\.csv"):
         motion_of(load_scene(tmp_path / "scene.toml"))
+
+
+def test_sample_clip_is_what_its_scene_renders(sample_clip):
+    scene = load_scene(SCENE)
+    truth = synthetic.read_truth(sample_clip.parent / "truth" / "clip.h5")
+    assert (sample_clip / "recording.toml").read_text() == synthetic.recording_toml(scene)
+    assert_allclose(rig_parameters(synthetic.rig_of(scene)), rig_parameters(truth.rig), rtol=1e-12)
+    assert_allclose(motion_of(scene).pose(truth.time), truth.q, atol=1e-9)  # integrator: 1e-11 relative
+    stored = np.stack([images(sample_clip, name, 300)[-1] for name in ("left", "right")]).astype(float)
+    again = expected_disc(truth.q[-1], truth.rig, truth.disc, scene)[0]
+    # grey levels: noise of variance 0.04 + 190 / 400 + 1 / 12 on the paper and less elsewhere; the last frame's motion
+    # during 0.2 ms is 0.05 px and moves edges by less than the noise
+    assert np.std(stored - again) < np.sqrt(0.04 + 190 / 400 + 1 / 12)
+    assert abs(np.mean(stored - again)) < 0.05
