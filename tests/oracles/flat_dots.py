@@ -1,12 +1,11 @@
 """Dots of a single image located by their template: on a disc, and on a plane that is seen by a homography."""
 
-from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from calibration.cameras.camera import Camera, normalised_maps
-from disctrack.disc import MA_2014
 from disctrack.track.dots import _kernels as kernels
 from disctrack.track.dots.template import TYPICAL_BLUR_PX, dot_centres, face_of, typical_noise
 
@@ -32,7 +31,8 @@ def locate_on_plane(image, image_from_plane, centres, radius, **known):
     height, width = image.shape
     camera = Camera(1.0, 1.0, 0.0, 0.0, (0.0,) * 5, (width, height))
     places = np.column_stack([np.atleast_2d(centres), np.zeros(len(centres))])
-    dots = replace(MA_2014, marker_centres_body=places, marker_diameter=2.0 * radius, radius=1e6 * radius)
+    # no disc, whose lengths are metres: dots on a face without an end
+    dots = SimpleNamespace(n_markers=len(places), marker_centres_body=places, marker_diameter=2 * radius, radius=np.inf)
     R = np.column_stack([image_from_plane[:, :2], [0.0, 0.0, -1.0]])
     return locate_on_disc(image, camera, R, image_from_plane[:, 2], dots, **known)
 
