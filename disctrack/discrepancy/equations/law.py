@@ -318,9 +318,8 @@ class _Competition:
         Amplitudes that the data hardly show may go far to first order, and shift the phase in second.
         """
         found = fit(system, quantities, values, TRIAL)
-        ahead = (found.chi_square - found.promised) / max(
-            found.degrees_of_freedom, 1
-        )  # were the rest of the way linear
+        # were the rest of the way linear
+        ahead = (found.chi_square - found.promised) / max(found.degrees_of_freedom, 1)
         if self.arrived(found) or not ahead < FAR * self.noise:
             return found
         return fit(system, quantities, trusted(system, quantities, found.values), TRIAL)

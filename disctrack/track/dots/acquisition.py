@@ -209,10 +209,8 @@ def _candidates_from_one_camera(blobs: Array, camera: int, rig: StereoRig, disc:
         turned = rotation_from_vector(turns)
         R, t = np.concatenate([R, turned]), np.concatenate([t, shifts])
         score = np.concatenate([score, _blob_score(turned, shifts, rays, disc)])
-        if (
-            score.max(initial=0.0) > len(centres) - 1.0
-        ):  # all dots but for what blobs err by: no other triple knows better
-            break
+        if score.max(initial=0.0) > len(centres) - 1.0:
+            break  # all dots but for what blobs err by: no other triple knows better
     good = score > MIN_EXPLAINED - 0.5
     return [(R_cw.T @ R, R_cw.T @ (t - t_cw)) for R, t in _best(R[good], t[good], score[good])]
 
