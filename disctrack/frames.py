@@ -26,7 +26,6 @@ Arrays: many of a thing on leading axes, components last; image points are (n_fr
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation
 
 from calibration.cameras.camera import rotation_from_vector as rotation_from_vector
 from calibration.kit.arrays import Array
@@ -142,14 +141,28 @@ def vector_from_rotation(R: Array) -> Array:
 
 
 def quaternion_from_rotation(R: Array) -> Array:
-    """Unit quaternion (w, x, y, z) of R (..., 3, 3) -> (..., 4); NaN in, NaN out."""
+    """Unit quaternion (w, x, y, z) of R (..., 3, 3) -> (..., 4); NaN in, NaN out.
+
+    The largest of the four squared components is taken from the trace identities, the others follow from sums and
+    differences, so that no cancellation occurs at any angle.
+    """
     R = np.asarray(R, float)
-    rows = R.reshape(-1, 3, 3)
-    known = np.isfinite(rows).all(axis=(1, 2))
-    q = np.full((len(rows), 4), np.nan)
-    if known.any():
-        q[known] = np.roll(Rotation.from_matrix(rows[known]).as_quat(), 1, axis=1)  # SciPy: x, y, z, w
-    return q.reshape(*R.shape[:-2], 4)
+    d0, d1, d2 = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
+    squares = np.stack([1 + d0 + d1 + d2, 1 + d0 - d1 - d2, 1 - d0 + d1 - d2, 1 - d0 - d1 + d2], axis=-1)
+    a, b, c = R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]
+    d, e, f = R[..., 1, 0] + R[..., 0, 1], R[..., 0, 2] + R[..., 2, 0], R[..., 2, 1] + R[..., 1, 2]
+    rows = np.stack(
+        [
+            np.stack([squares[..., 0], a, b, c], axis=-1),
+            np.stack([a, squares[..., 1], d, e], axis=-1),
+            np.stack([b, d, squares[..., 2], f], axis=-1),
+            np.stack([c, e, f, squares[..., 3]], axis=-1),
+        ],
+        axis=-2,
+    )
+    best = np.argmax(np.where(np.isfinite(squares), squares, -1.0), axis=-1)
+    q = np.take_along_axis(rows, best[..., None, None], axis=-2)[..., 0, :]
+    return q / np.linalg.norm(q, axis=-1, keepdims=True)
 
 
 def rotation_from_quaternion(q: Array) -> Array:

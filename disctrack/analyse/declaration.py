@@ -51,12 +51,16 @@ SIGMAS = 5.0
 # What honest discs and tables may do: rounded edges and tables that lean by a degree shift the balance by 3 % at most.
 BALANCE = 0.10
 NOTED = 0.01  # from which on it, or energy that grows, is worth a word
+# Where fewer blocks are as near to their median, something else acts on the disc: a hand holds it, or it lies still.
+COHERENT, COHERENT_SHARE = 0.3, 0.8
+STEADY = 0.7  # share of the blocks in which the energy grows: a push is short
 SCALE = 5e-3  # of printed dots against a printed board, paper and toner included
 SIDE_TOLERANCE = 0.06  # of a length: beyond, dots that were printed to another scale would have another size, too
 BY_SCALE = (Kind.DOTS_MISPLACED, Kind.RADIUS, Kind.THICKNESS, Kind.BOARD_THICKNESS, Kind.GRAVITY_OR_RATE, *MISFITS)
 RISE = 0.03  # of the radius: a rounded or bevelled edge of a millimetre
 MIN_LEAN = np.radians(2.0)  # of a plane: boards and tables lean by less
 MIN_ROUND, FLAT = 2.0, 0.1  # [rad] of precession; scatter about the plane over what the rim rises from the declared one
+MIN_SWING = 0.05  # range of sin(theta) below which radius and thickness are not told apart
 SEEN_RARELY = 0.1  # share of the images
 MIN_DOTS_LEFT = 4  # that are seen
 DENSITIES = 50.0, 23e3  # [kg/m^3] a hard foam's, and osmium's
@@ -208,7 +212,7 @@ def motion_against_gravity(trajectory: Trajectory, height: float | None = None) 
         return ()
     gravity = float(np.median(found))
     sigma = robust_sigma(found) * np.sqrt(np.pi / 2 / n)
-    if not gravity > 0:
+    if not (gravity > 0 and np.mean(np.abs(found - gravity) < COHERENT * gravity) >= COHERENT_SHARE):
         return ()
     away = abs(np.log(gravity / g))
     if away > np.log1p(NOTED) and abs(gravity - g) > SIGMAS * sigma:
@@ -229,7 +233,8 @@ def motion_against_gravity(trajectory: Trajectory, height: float | None = None) 
     slope, start = np.polyfit(times, energy, 1)
     sigma = robust_sigma(energy - slope * times - start) / (np.std(times) * np.sqrt(n))
     end = start + slope * times[-1]
-    if end - start > NOTED * start and slope > SIGMAS * sigma:
+    steady = np.mean(np.diff(energy) > 0) > STEADY
+    if end - start > NOTED * start and slope > SIGMAS * sigma and steady:
         grown = Measured(1e3 * float(end - start), 1e3 * float(sigma * times[-1]), "mJ")
         text = (
             f"the mechanical energy, {1e3 * start:.4g} mJ at first, grows by {grown} though no force but the table's "
@@ -396,7 +401,7 @@ def rise_of_centre(trajectory: Trajectory) -> tuple[Finding, ...]:
     q = trajectory.q[trajectory.measured]
     theta, disc = q[:, 4], trajectory.disc
     q = q[(theta > THETA_RANGE[0]) & (theta < THETA_RANGE[1])]
-    if len(q) < BLOCK:
+    if len(q) < BLOCK or np.ptp(np.sin(q[:, 4])) < MIN_SWING:
         return ()
     s = np.sin(q[:, 4])
     z = q[:, 2] - disc.half_thickness * np.cos(q[:, 4])

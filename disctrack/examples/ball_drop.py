@@ -157,7 +157,7 @@ def errors_of(drops: Sequence[Run], equations: Equations) -> dict[str, dict[str,
     found: dict[str, dict[str, float]] = {"whole": {}, "forecast": {}}
     for run in (d for d in second if d.groups["ball"] in _by_ball(first)):
         ball, time, height = run.groups["ball"], np.asarray(run.time), np.asarray(run.data["h"])
-        whole, ahead = (height - answer.forecast(run, window=w)["h"] for w in (np.inf, SEEN - time[0]))
+        whole, ahead = (height - answer.forecast(run, window=w, by="before")["h"] for w in (np.inf, SEEN - time[0]))
         found["whole"][ball] = float(np.sqrt(np.mean(whole**2)))
         found["forecast"][ball] = float(np.sqrt(np.mean(ahead[time - time[0] > SEEN] ** 2)))
     return found
