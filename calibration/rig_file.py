@@ -405,6 +405,8 @@ def read_beyond_model(group: h5py.Group) -> dict[str, Any]:
 
 def _read_record(group: h5py.Group) -> CalibrationRecord:
     def text(name: str) -> Any:
+        if name == "doubts" and name not in group.attrs:  # of an earlier file
+            return []
         return json.loads(group[name].asstr()[()] if name in _LONG else group.attrs[name])
 
     board, names, apart = target_of(text("board")), text("view_names"), tuple(text("apart"))

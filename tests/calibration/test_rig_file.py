@@ -88,6 +88,15 @@ def test_reading_back_gives_equal_dataclasses(content, tmp_path):
         assert_equal(read_rig_file(tmp_path / "rig.h5"), changed)
 
 
+def test_a_rig_written_before_doubts_were_kept_is_read(content, tmp_path):
+    write_rig(tmp_path / "rig.h5", *content)
+    with h5py.File(tmp_path / "rig.h5", "r+") as file:
+        del file["calibration"].attrs["doubts"]
+    rig, record = read_rig_file(tmp_path / "rig.h5")
+    assert_equal(rig, content[0])
+    assert record.told == content[1].told | {"doubts": []}
+
+
 def test_every_dataset_says_what_it_is(content, tmp_path):
     write_rig(tmp_path / "rig.h5", *content)
     found = []

@@ -133,7 +133,9 @@ def free_run(result: DiscDiagnosis) -> Drawn:
         add(error, colour, name)
         last = system.time[~held.test_rows & (system.weights > 0)].max()
     add(sigma, MUTED, "noise, 1 σ")
-    figure = chart("time (s)", ("position (mm)", position), ("nutation (deg)", nutation), size=(9.5, 4.4))
+    figure = chart(
+        "time (s)", ("error of position (mm)", position), ("error of nutation (deg)", nutation), size=(9.5, 4.4)
+    )
     for axes in figure.axes:
         axes.set_yscale("log")
         axes.axvline(last, color=AMBER, lw=1)

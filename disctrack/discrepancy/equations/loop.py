@@ -369,7 +369,7 @@ def _pace(s: Samples) -> float:
 
 
 def _certain(system: EquationSystem, diagnosis: Diagnosis) -> Diagnosis:
-    """Sigmas, and what stands out from them (Wald's test), as what is left makes them."""
+    """Sigmas, and gains by them (Wald's test), as what is left makes them."""
     after, nearest = with_memory(system, diagnosis.after), diagnosis.nearest
     gains = [wald(*after.amounts(f.candidate.names)) for f in diagnosis.found]
     return replace(

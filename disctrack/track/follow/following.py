@@ -39,6 +39,7 @@ MAX_PREDICTION_RMS_PX = 2.0
 NOISE_FRAMES, NOISE_STEP = 12, 3  # frames that blur is taken from, and every third of them for the noise
 MIN_TO_BEGIN = 5  # dot images that must be measured where the disc is found anew: three fit anything
 MOST_CARRIED = 60  # frames over which the last motion is carried on; each costs one look at the dots
+LONGEST_WAIT = 60  # frames between searches of a scene in which no disc was seen yet: one costs as much as some 600
 UNUSUAL = 2.0  # times the usual misfit; of dots in compressed video, one in twenty leaves 1.25 times the median
 MOST_USUAL = 0.1  # of the contrast: dots that leave more than this are not the declared ones
 REPEAT_REACH = 4  # frames back that an image is compared with: recorders repeat from buffers of a few
@@ -96,7 +97,7 @@ class Search:
         """
         if self.since < self.failures:
             return False
-        if seen or not self.scenes or self.since >= 2**self.failures or not readable.all():
+        if seen or not self.scenes or self.since >= min(2**self.failures, LONGEST_WAIT) or not readable.all():
             return True
         return any(map(StillScene.differs, self.scenes, pair))
 
