@@ -39,6 +39,7 @@ from disctrack.track.follow.tracking import (
     stretch_edges,
     track,
 )
+from disctrack.track.refine.table_contact import least_off_centre
 from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
 from disctrack.trajectory.file import Provenance
 
@@ -286,6 +287,9 @@ def details_of(tracking: Tracking) -> dict[str, Any]:
     }
     if tracking.table is not None:
         fields = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in vars(tracking.table).items()}
+        fields["least_off_centre"] = least_off_centre(
+            tracking.table, tracking.trajectory.q[:, 4], tracking.as_built.disc
+        )
         details["table"] = {**fields, "told": tracking.table.sentence}
     return details
 

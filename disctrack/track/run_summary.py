@@ -107,6 +107,9 @@ def trajectory_rows(trajectory: Trajectory, details: Mapping[str, Any]) -> list[
             lines.append(("repeating", f"misfit of the dots, left {left:.4f} px, right {right:.4f} px ({what})"))
         if table := details.get("table"):
             lines.append(("table", table["told"]))
+            if least := table.get("least_off_centre"):
+                centred = "the dots' middle is taken for the disc's centre ([markers] centres_mm)"
+                lines.append(("given", f"{centred}; it may be off by up to {1e6 * least:.2g} µm unseen"))
     return lines + [("image", reason) for reason in list(details.get("unreadable", []))[:SHOWN_RANGES]]
 
 

@@ -44,6 +44,7 @@ MAX_SCATTER = 30e-6  # [m] of the gaps about their plane: beyond, the disc jumps
 NOISY = 6.0  # times what noise and misfit of the poses explain, as far as that is more
 # Standard deviations [m] of radius and thickness where none is declared: 0.02 %, and a micrometer's
 ASSUMED_RADIUS, ASSUMED_THICKNESS = 7.5e-6, 3e-6
+FROM_SIGMAS = 3.0  # of both on, board and disc disagree
 STEEP = 0.1  # slope of a plane that is no table: the board of the declared view lay elsewhere
 PLACES = 6.0  # at which the cameras' smooth errors are independent, in a whole turn of the contact
 _WIDE = np.array([1e-2, 0.1, 0.1])  # [m, rad, rad] bounds what a short arc of contacts leaves open
@@ -106,7 +107,7 @@ def table_from_disc(
         V, board = noise + by_disc @ by_disc.T, H @ rig.covariance @ H.T
     # where they differ by more than three of both sigmas, it is the board that bends and lies on dust
     allowed = np.diag(board + V)
-    excess = np.where(plane**2 > 9.0 * allowed, plane**2 - allowed, 0.0)
+    excess = np.where(plane**2 > FROM_SIGMAS**2 * allowed, plane**2 - allowed, 0.0)
     more = board + np.diag(excess)
     # of what the plane is as these cameras see the disc: errors that both share do not count
     gain = more @ np.linalg.inv(more + V) if source == "both" else np.eye(3) * (source == "disc")
@@ -161,15 +162,20 @@ def _as_sure_as_both(
     return replace(rig, covariance=0.5 * (covariance + covariance.T), allowances=tuple(allowances))
 
 
-def off_centre(table: TableFromDisc | None, R: Array, disc: Disc) -> float:
+def off_centre(table: TableFromDisc | None, theta: Array, disc: Disc) -> float:
     """Distance [m] of the dots' middle from the disc's that would make the table lean by what no sigma allows.
 
-    R : (n, 3, 3) attitudes; rolling round, the rim rises by that distance times sin(theta) on one side.
+    theta : (n,) nutation [rad]; rolling round, the rim rises by that distance times sin(theta) on one side.
     """
     if table is None or table.source != "both":
         return 0.0
-    sine = np.sqrt(1.0 - np.nanmedian(R[:, 2, 2]) ** 2)
-    return float(disc.radius * np.hypot(*table.beyond[1:]) / sine)
+    return float(disc.radius * np.hypot(*table.beyond[1:]) / np.sin(np.nanmedian(theta)))
+
+
+def least_off_centre(table: TableFromDisc, theta: Array, disc: Disc) -> float:
+    """Distance [m] from which on board and disc disagree: a smaller one is in no sigma. theta : as of `off_centre`."""
+    lean = FROM_SIGMAS * np.hypot(table.sigma, table.board_sigma)[1:].max()
+    return float(disc.radius * lean / np.sin(np.nanmedian(theta)))
 
 
 def radius_tolerance(disc: Disc) -> float:
