@@ -1,6 +1,6 @@
 """From synchronised views of a chessboard to a calibrated stereo rig with its uncertainty."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 
@@ -36,6 +36,7 @@ from calibration.kit.threads import one_blas_thread
 from calibration.stereo_fit import JointFit, fit_jointly
 
 LEAST_SEEN = 12  # images of every point of the target, to free its place: from three pairs alone it fits their errors
+Image = tuple[str, str]  # the name of one that is not used, and why
 
 
 @checked
@@ -84,7 +85,13 @@ class StereoCalibration(Brief):
     @property
     def rejected_views(self) -> dict[int, str]:
         """View -> why none of its two images is used."""
-        return _left_out(self.corner_views, self.view_names)[0]
+        return {v: _told(images) for v, images in _not_used(self.corner_views, self.view_names).items()}
+
+    @property
+    def reasons(self) -> dict[str, list[str]]:
+        """Why views are not used -> names of their images."""
+        not_used = _not_used(self.corner_views, self.view_names)
+        return _by_reason(image for images in not_used.values() for image in images)
 
     @property
     def board_points(self) -> Array:
@@ -230,8 +237,7 @@ def calibrate_from_corners(
     for (v, camera), why in fit.bad_images.items():
         views[camera][v] = BoardNotFound(why)
     apart = _told_apart(fit, names, table_view)
-    rejected, warnings = _left_out(views, names)
-    _require_fitted(fit, rejected, apart, wide, table_view)
+    _require_fitted(fit, _not_used(views, names), apart, wide, table_view)
     rig, assessment, shape_note = _judged(fit, board, shapes, settings, table_view, board_thickness, wide)
     return StereoCalibration(
         rig=rig,
@@ -245,7 +251,7 @@ def calibrate_from_corners(
         apart=tuple(sorted(fit.pairs.apart)),
         candidates=fit.candidates,
         assessment=assessment,
-        warnings=(*warnings, *notes, *apart, *shape_note, *assessment.warnings),
+        warnings=(*_used_alone(views, names), *notes, *apart, *shape_note, *assessment.warnings),
         lens=fit.lens,
     )
 
@@ -296,22 +302,20 @@ def _judged(
 
 def _require_fitted(
     fit: JointFit,
-    rejected: dict[int, str],
+    not_used: dict[int, list[Image]],
     apart: Sequence[str],
     wide: Sequence[tuple[str, str]],
     table_view: int | None,
 ) -> None:
     """Raises CalibrationError where the table view is lost, or too few views are left."""
-    if table_view is not None and table_view in rejected | fit.pairs.apart:
-        reason = rejected.get(table_view) or apart[0]
+    if table_view is not None and (table_view in not_used or table_view in fit.pairs.apart):
+        reason = _told(not_used[table_view]) if table_view in not_used else apart[0]
         raise CalibrationError(f"the table view {table_view} cannot be used: {reason}")
     n_used = len(np.unique(fit.refinement.observations.view[fit.refinement.kept]))
     if n_used < MIN_VIEWS:
         also = "".join(f"{what}: {by_what}. " for what, by_what in wide)
-        reasons = {where: why for where, _, why in (text.partition(": ") for text in rejected.values())}
-        raise CalibrationError(
-            f"{also}Only {n_used} views can be used, at least {MIN_VIEWS} are needed: {_listed(reasons)}"
-        )
+        listed = _listed(image for images in not_used.values() for image in images)
+        raise CalibrationError(f"{also}Only {n_used} views can be used, at least {MIN_VIEWS} are needed: {listed}")
     for name, camera in zip(CAMERA_NAMES, fit.refinement.model.cameras, strict=True):
         if not min(camera.fx, camera.fy) > 0.0:
             raise CalibrationError(
@@ -320,25 +324,25 @@ def _require_fitted(
             )
 
 
-def _left_out(
-    views: tuple[Sequence[CornerView | BoardNotFound], ...], names: Names
-) -> tuple[dict[int, str], list[str]]:
-    """Views that neither camera can use, and warnings about those that only one can."""
-    rejected: dict[int, str] = {}
-    alone: dict[str, list[str]] = {}
+def _lost(views: tuple[Sequence[CornerView | BoardNotFound], ...], names: Names) -> Iterator[list[Image]]:
+    """The images of each view that are not used."""
     for v, pair in enumerate(zip(*views, strict=True)):
-        missing = [(names[v][c], view.reason) for c, view in enumerate(pair) if isinstance(view, BoardNotFound)]
-        if len(missing) == 2:
-            (one, left), (other, right) = missing
-            rejected[v] = f"{one} and {other}: {left}" if left == right else f"{one}: {left}; {other}: {right}"
-        elif missing:
-            alone.setdefault(missing[0][1], []).append(missing[0][0])
+        yield [(names[v][c], view.reason) for c, view in enumerate(pair) if isinstance(view, BoardNotFound)]
+
+
+def _not_used(views: tuple[Sequence[CornerView | BoardNotFound], ...], names: Names) -> dict[int, list[Image]]:
+    """Views that neither camera can use."""
+    return {v: images for v, images in enumerate(_lost(views, names)) if len(images) == len(CAMERA_NAMES)}
+
+
+def _used_alone(views: Views, names: Names) -> list[str]:
+    """Warnings about views that only one camera can use, and what was noted of images."""
+    alone = _by_reason(image for images in _lost(views, names) if len(images) == 1 for image in images)
     warnings = [
         f"{', '.join(which)}: left out, the other image of the pair is used for its own camera: {reason}"
         for reason, which in alone.items()
     ]
-    notes = sorted({note for side in views for view in side if isinstance(view, CornerView) for note in view.notes})
-    return rejected, warnings + notes
+    return warnings + sorted({note for side in views for v in side if isinstance(v, CornerView) for note in v.notes})
 
 
 def _require_views(views: Views, names: Names, table_view: int | None) -> None:
@@ -349,29 +353,39 @@ def _require_views(views: Views, names: Names, table_view: int | None) -> None:
     for camera, side in enumerate(views):
         found = sum(isinstance(view, CornerView) for view in side)
         if found < MIN_VIEWS:
-            reasons = {names[v][camera]: view.reason for v, view in enumerate(side) if isinstance(view, BoardNotFound)}
+            lost = ((names[v][camera], view.reason) for v, view in enumerate(side) if isinstance(view, BoardNotFound))
             raise CalibrationError(
                 f"the board was found in {found} of {len(side)} {CAMERA_NAMES[camera]} images, at least {MIN_VIEWS} "
-                f"are needed (15 to 40 are good). {_listed(reasons)}"
+                f"are needed (15 to 40 are good). {_listed(lost)}"
             )
-    why = "" if table_view is None else _left_out(views, names)[0].get(table_view)
-    if why:
+    not_used = _not_used(views, names)
+    if table_view in not_used:
+        why = _told(not_used[table_view])
         raise CalibrationError(
             f"the board was not found in the table view {table_view} ({why}): without it there is no lab frame. Name "
             "another view whose board lies flat on the table, or take it again."
         )
 
 
-def _listed(reasons: dict[str, str]) -> str:
-    """Each reason once, with the first of the views (by name) that it holds for; three reasons at most."""
-    views: dict[str, list[str]] = {}
-    for name, reason in reasons.items():
-        views.setdefault(reason, []).append(name)
+def _by_reason(images: Iterable[Image]) -> dict[str, list[str]]:
+    found: dict[str, list[str]] = {}
+    for name, reason in images:
+        found.setdefault(reason, []).append(name)
+    return found
+
+
+def _told(images: Iterable[Image]) -> str:
+    return "; ".join(f"{' and '.join(which)}: {reason}" for reason, which in _by_reason(images).items())
+
+
+def _listed(images: Iterable[Image]) -> str:
+    """Each reason once, with the first image that it holds for; three reasons at most."""
+    reasons = _by_reason(images)
     shown = [
         f"{which[0]}{f' and {len(which) - 1} more' if len(which) > 1 else ''}: {reason}"
-        for reason, which in list(views.items())[:3]
+        for reason, which in list(reasons.items())[:3]
     ]
-    more = sum(len(which) for which in list(views.values())[3:])
+    more = sum(len(which) for which in list(reasons.values())[3:])
     return "; ".join(shown) + (f"; and {more} more" if more else "")
 
 

@@ -157,7 +157,7 @@ def _rig(seen: Check, recording: Recording) -> StereoRig:
     if used < 0.7 * len(chosen):
         advice = "the whole board must be in view of both cameras, with a light rim round it"
         seen.warn(Kind.CALIBRATION, f"the chessboard was {text}", advice)
-    said = (*left_out(found.rejected_views), *problems, *found.warnings)
+    said = (*left_out(found), *problems, *found.warnings)
     seen.findings += noticed_in({"doubts": found.doubts, "warnings": said})
     return found.rig
 

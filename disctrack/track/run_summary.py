@@ -38,7 +38,7 @@ def calibration_rows(found: StereoCalibration, problems: Sequence[str] = ()) -> 
     corners = len(found.rejected_corners())
     if corners:
         lines.append(("", f"{corners} corners were found but not used"))
-    return lines + [("", text) for text in left_out(found.rejected_views)]
+    return lines + [("", text) for text in left_out(found)]
 
 
 def _rig_text(rig: StereoRig) -> str:
@@ -79,13 +79,9 @@ def _model_text(found: StereoCalibration) -> str:
     )
 
 
-def left_out(rejected: Mapping[int, str]) -> list[str]:
-    """One line for each reason, with the views that it holds for."""
-    groups: dict[str, list[str]] = {}
-    for view, why in rejected.items():
-        where, _, reason = why.partition(": ")
-        groups.setdefault(reason or where, []).append(where if reason else f"view {view}")
-    return [f"not used: {', '.join(views)}: {why}" for why, views in groups.items()]
+def left_out(found: StereoCalibration) -> list[str]:
+    """One line for each reason, with the images that it holds for."""
+    return [f"not used: {', '.join(images)}: {why}" for why, images in found.reasons.items()]
 
 
 def trajectory_rows(trajectory: Trajectory, details: Mapping[str, Any]) -> list[Row]:
