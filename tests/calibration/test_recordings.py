@@ -48,6 +48,8 @@ def test_opencv_photographs_with_their_board_freed(opencv_photographs):
     found = calibrate_from_corners(left, right, Board((9, 6), 25e-3))
     assert found.refinement.terms.board == "free"  # held-out error finds that this board is not flat
     assert found.rms_px <= 0.15  # PROVENANCE.md: a converged adjustment of cornerSubPix's corners reaches 0.1497
+    assert found.assessment.stereo_misfit_px < 0.076  # of views left out: 0.0736 when this was written
+    assert found.assessment.pairs == len(reference["pairs"])
     assert 83.2e-3 <= found.rig.baseline <= 83.4e-3
     # the reference's own sigma of the baseline is 0.036 mm, and its corners are other ones
     assert abs(1e3 * found.rig.baseline - reference["converged_ba_win5"]["free_board"]["baseline_mm"]) < 0.1
