@@ -1,13 +1,8 @@
 """The trajectory file: equal when read back, open to other programs, whole or not there, honest about its origin."""
 
-import csv
 import dataclasses
 import errno
 import os
-import signal
-import subprocess
-import sys
-import textwrap
 
 import h5py
 import numpy as np
@@ -16,16 +11,14 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
-from calibration.cameras.camera import N_RIG, Allowance, Camera, StereoRig
+from calibration.cameras.camera import N_RIG, Allowance
 from calibration.cameras.splines import LensField
-from disctrack.disc import MA_2014
 from disctrack.errors import OutputError, TrajectoryFileError
 from disctrack.files.labelled_arrays import Variable
 from disctrack.findings import DoubtWarning, Finding, Kind, Remedy, Severity, Subject
-from disctrack.frames import continuous_quaternions, quaternion_from_rotation, rotation_from_euler
+from disctrack.frames import euler_from_rotation, rotation_from_euler, rotation_from_vector
 from disctrack.numbers import Measured
 from disctrack.trajectory import FrameStatus, Trajectory
-from disctrack.trajectory.exchange.csv_table import write_csv
 from disctrack.trajectory.file import (
     Provenance,
     read_findings,
@@ -37,56 +30,24 @@ from disctrack.trajectory.file import (
     write_trajectory,
 )
 from disctrack.trajectory.reuse import kept_or_made
+from tests.oracles.measured_disc import measured
 
 PROVENANCE = Provenance("clip", {"images": "ab" * 32}, {"refine": True})
 
 
 def make_trajectory(rng: np.random.Generator, n: int = 30) -> Trajectory:
-    """A disc that turns, with noise of every kind and two frames without an answer."""
-    m = MA_2014.n_markers
-    t = np.arange(n) / 1000
-    q = np.column_stack([1e-3 * np.sin(t), 2e-3 * t, 0.02 + 0 * t, 30 * t, 0.4 + 0 * t, -25 * t])
-    halves = rng.normal(0, 1e-6, (n, 6, 6))
-    status = np.zeros(n, np.uint8)
-    status[[3, n - 1]] = FrameStatus.UNREADABLE, FrameStatus.MARKERS_NOT_FOUND
-    lost = status != 0
-    q[lost] = np.nan
-    quaternion = continuous_quaternions(quaternion_from_rotation(rotation_from_euler(*q[:, 3:].T)))
-    markers = rng.uniform(100, 400, (n, 2, m, 2))
-    markers[lost] = np.nan
-    rig_part = rng.normal(0, 1e-3, (N_RIG, N_RIG))
-    left = Camera(1500.0, 1501.0, 255.1, 256.2, (0.1, -0.2, 1e-4, 2e-4, 0.0), (512, 512))
-    right = Camera(1490.0, 1491.0, 250.1, 259.2, (0.1, -0.2, 1e-4, 2e-4, 0.3), (512, 512))
-    return Trajectory(
-        time=t,
-        frame=np.arange(n),
-        q=q,
-        pose_covariance=np.where(lost[:, None, None], np.nan, halves @ np.swapaxes(halves, 1, 2)),
-        calibration_sensitivity=rng.normal(size=(n, 6, N_RIG)),
+    """A disc that rolls; two frames without an answer, and something else than nothing in every field."""
+    made, lost, part = measured(n=n), [3, n - 1], rng.normal(0, 1e-3, N_RIG)
+    for values in (made.q, made.quaternion, made.pose_covariance, made.markers_px):
+        values[lost] = np.nan
+    made.frame_status[lost] = FrameStatus.UNREADABLE, FrameStatus.MARKERS_NOT_FOUND
+    field = LensField(rng.normal(0, 0.02, (2, 2, 5, 6)), 128.0)
+    allowances = Allowance("the board's size", part, True), Allowance("its thickness", 2 * part)
+    return dataclasses.replace(
+        made,
         systematic_covariance=np.full((n, 6, 6), 0.25),
-        quaternion=quaternion,
-        frame_status=status,
-        reprojection_rms_px=rng.uniform(0, 0.05, (n, 2)),
-        reduced_chi_square=rng.uniform(0.8, 1.2, n),
-        markers_px=markers,
-        markers_covariance_px2=rng.normal(size=(n, 2, m, 2, 2)),
-        markers_residual_px=rng.normal(size=(n, 2, m, 2)),
-        marker_status=rng.integers(0, 8, (n, 2, m), dtype=np.uint8),
-        disc=MA_2014,
-        rig=StereoRig(
-            left,
-            right,
-            rotation_from_euler(0.1, 0.2, 0.3),
-            np.array([-0.3, 0.01, 0.02]),
-            rotation_from_euler(1.1, 2.2, 0.3),
-            np.array([0.01, 0.02, 0.7]),
-            rig_part @ rig_part.T,
-            True,
-            LensField(rng.normal(0, 0.02, (2, 2, 5, 6)), 128.0),
-            (Allowance("the board's size", rig_part[0], True), Allowance("its thickness", rig_part[1])),
-        ),
-        frame_rate=1000.0,
-        gravity=9.81,
+        marker_status=rng.integers(0, 8, made.marker_status.shape, dtype=np.uint8),
+        rig=dataclasses.replace(made.rig, lens_field=field, allowances=allowances),
         air_density=0.3,
         table_moved=(1e-4, 0.0, 2e-3),
     )
@@ -176,18 +137,6 @@ def test_xarray_opens_root_and_groups_with_their_axes(file, trajectory, engine):
         assert_array_equal(data["covariance"].values, trajectory.rig.covariance)
 
 
-def test_the_csv_keeps_an_angle_after_a_thousand_turns(tmp_path, trajectory):
-    """Ten seconds at 100 turns a second: 360 000 degrees, and still a thousandth of the smallest sigma."""
-    turns = 2 * np.pi * 1000 * np.array([0, 0, 0, 1, 0, -1])
-    turned = dataclasses.replace(trajectory, q=trajectory.q + turns)
-    write_csv(tmp_path / "trajectory.csv", turned)
-    with (tmp_path / "trajectory.csv").open() as stream:
-        rows = list(csv.DictReader(stream))
-    assert_allclose(float(rows[7]["psi_deg"]), np.degrees(turned.q[7, 3]), atol=1e-7)
-    assert_allclose(float(rows[7]["phi_deg"]), np.degrees(turned.q[7, 5]), atol=1e-7)
-    assert (rows[3]["x_mm"], rows[3]["status"]) == ("", "unreadable")
-
-
 SEEN = Finding(
     Kind.SQUARE,
     Severity.DOUBT,
@@ -238,8 +187,6 @@ def test_what_was_found_and_chosen_are_plain_attributes_that_a_later_stage_keeps
 
 @pytest.mark.parametrize("i", [5, 28])  # precession 9 and 48 deg: every component of the axis counts
 def test_sigmas_of_angles_agree_with_perturbed_poses(trajectory, rng, i):
-    from disctrack.frames import euler_from_rotation, rotation_from_vector
-
     count = 20000
     small = trajectory.pose_covariance[i] / np.abs(trajectory.pose_covariance[i]).max() * 1e-8
     draws = rng.multivariate_normal(np.zeros(6), small, count)
@@ -351,56 +298,6 @@ def test_a_disk_that_refuses_leaves_no_file_and_the_old_result(file, trajectory,
     assert file.read_bytes() == before
 
 
-def run_python(code: str, folder, *arguments) -> subprocess.Popen:
-    return subprocess.Popen(
-        [sys.executable, "-c", textwrap.dedent(code), *map(str, arguments)],
-        cwd=folder,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
-    )
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="signals are POSIX")
-def test_a_killed_writer_leaves_nothing_that_looks_whole(file, trajectory):
-    """Killed while the bytes are on their way; the next writer also clears away what was left."""
-    code = """
-        import os, sys, time
-        from pathlib import Path
-        from disctrack.trajectory.file import read_provenance, read_trajectory, write_trajectory
-        path = Path(sys.argv[1])
-        trajectory, provenance = read_trajectory(path), read_provenance(path)
-        def wait(descriptor):
-            print("written", flush=True)
-            time.sleep(60)
-        os.fsync = wait
-        write_trajectory(path.with_name("second.h5"), trajectory, provenance)
-    """
-    process = run_python(code, file.parent, file)
-    assert process.stdout is not None
-    assert process.stdout.readline() == "written\n"
-    process.send_signal(signal.SIGKILL)
-    process.communicate(timeout=60)
-    second = file.with_name("second.h5")
-    assert not second.exists()
-    assert len(list(file.parent.glob("*.part"))) == 1
-    write_trajectory(second, trajectory, PROVENANCE)
-    assert sorted(os.listdir(file.parent)) == ["second.h5", file.name]
-
-
-_fuzz = settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-
-
-@_fuzz
-@given(content=st.binary(max_size=600), signature=st.booleans())
-def test_any_bytes_are_refused_with_a_message(tmp_path, content, signature):
-    path = tmp_path / "any.h5"
-    path.write_bytes((b"\x89HDF\r\n\x1a\n" if signature else b"") + content)
-    with pytest.raises(TrajectoryFileError):
-        read_trajectory(path)
-
-
 @pytest.fixture(scope="session")
 def whole_content(tmp_path_factory) -> bytes:
     path = tmp_path_factory.mktemp("whole") / "trajectory.h5"
@@ -408,11 +305,18 @@ def whole_content(tmp_path_factory) -> bytes:
     return path.read_bytes()
 
 
-@_fuzz
-@given(cut=st.floats(0, 0.999))
-def test_a_truncated_file_is_refused_wherever_it_is_cut(tmp_path, whole_content, cut):
-    path = tmp_path / "cut.h5"
-    path.write_bytes(whole_content[: int(cut * len(whole_content))])
+@settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    st.one_of(
+        st.binary(max_size=600),
+        st.binary(max_size=600).map(b"\x89HDF\r\n\x1a\n".__add__),
+        st.floats(0, 0.999),
+    )
+)
+def test_any_bytes_and_a_file_cut_anywhere_are_refused_with_a_message(tmp_path, whole_content, content):
+    """A number is the share of a whole file that is left."""
+    path = tmp_path / "any.h5"
+    path.write_bytes(whole_content[: int(content * len(whole_content))] if isinstance(content, float) else content)
     with pytest.raises(TrajectoryFileError):
         read_trajectory(path)
 
