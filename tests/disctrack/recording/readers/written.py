@@ -36,7 +36,7 @@ def write_pages_by_opencv(path: Path, frames: np.ndarray, compression: int) -> N
 
 
 def write_hdf5(path: Path, frames: np.ndarray, attributes: dict | None = None, **options) -> None:
-    with h5py.File(path, "w") as file:
+    with h5py.File(path, "w", userblock_size=1024) as file:
         stack = file.create_dataset("camera/frames", data=frames, **options)
         stack.attrs.update(attributes or {})
 
@@ -60,16 +60,20 @@ def write_pictures(path: Path, pictures: list, codec: str, **options) -> None:
         container.mux(stream.encode())
 
 
+BETWEEN_CHROMA = ("yuyv422", "uyvy422")  # of cameras with a standard interface: every other byte is luma
+
+
 def picture_of(frame: np.ndarray, pixels: str):
     """A picture whose luma is `frame`, byte for byte; no conversion by the library."""
     import av
 
     picture = av.VideoFrame(frame.shape[1], frame.shape[0], pixels)
     neutral = 128 if frame.dtype == np.uint8 else 512
+    between = pixels in BETWEEN_CHROMA
     for number, plane in enumerate(picture.planes):
         rows = np.full((plane.height, plane.line_size // frame.itemsize), neutral, frame.dtype)
         if number == 0:
-            rows[:, : frame.shape[1]] = frame
+            rows[:, pixels == "uyvy422" :: 1 + between][:, : frame.shape[1]] = frame
         plane.update(rows.tobytes())
     return picture
 
@@ -112,6 +116,8 @@ STACKS = [
     Format("h5", 16, write_hdf5, {**EACH, "shuffle": True}),
     Format("h5", 8, write_hdf5, EACH),
     Format("h5", 16, write_hdf5, {**EACH, "fletcher32": True}),
+    Format("h5", 16, write_hdf5, {"dtype": ">u2"}),
+    Format("h5", 16, write_hdf5, {**EACH, "shuffle": True, "dtype": ">u2"}),
     Format("h5", 8, write_hdf5, {"chunks": (7, 10, WIDTH), "compression": "lzf", "fletcher32": True}),
 ]
 VIDEOS = [
@@ -128,6 +134,7 @@ VIDEOS = [
         ("mkv", 10, "yuv420p10le", "ffv1", {}),
         ("avi", 8, "yuv420p", "rawvideo", {}),
         ("mp4", 8, "yuv420p", "libx264", {"qp": "0", "g": "10", "bf": "2"}),
+        *(("avi", 8, pixels, "rawvideo", {}) for pixels in BETWEEN_CHROMA),
     )
 ]
 CAMERAS = [
