@@ -3,7 +3,9 @@
 import ast
 import subprocess
 import sys
+from collections import Counter
 from functools import cache
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -68,43 +70,52 @@ def test_every_public_name_is_there():
         disctrack.nothing  # noqa: B018
 
 
-# Each folder or module of disctrack/ may ask for what stands above it, at whatever place in the file it does so. A new
+# Each folder or module of a package may ask for what stands above it, at whatever place in the file it does so. A new
 # one belongs where what it needs is above, and what needs it below; names in one row know nothing of each other.
-STAIRS = (
-    ("frames", "errors", "numbers", "progress", "processes"),  # words shared by all
-    ("findings",),
-    ("disc", "files"),
-    ("report",),
-    ("trajectory", "rolling", "recording"),
-    ("faults",),
-    ("analyse",),
-    ("track",),
-    ("synthetic", "discrepancy"),
-    ("diagnosis", "calibrate"),
-    ("first_look", "examples", "validate", "batch"),
-    ("commands",),
-    ("cli",),
-    ("__main__",),
-)
-ROOMS_OF_CALIBRATION = ("kit", "board", "cameras", "fit", "judge")  # each asks for those before it
+STAIRS = {
+    "calibration": (
+        ("kit",),
+        ("board", "cameras"),
+        ("fit",),
+        ("judge",),
+        ("stereo_fit",),
+        ("stereo",),
+        ("points", "rig_file"),
+    ),
+    "disctrack": (
+        ("frames", "errors", "numbers", "progress", "processes"),  # words shared by all
+        ("findings",),
+        ("disc", "files"),
+        ("report",),
+        ("trajectory", "rolling", "recording"),
+        ("faults",),
+        ("analyse",),
+        ("track",),
+        ("synthetic", "discrepancy"),
+        ("diagnosis", "calibrate"),
+        ("first_look", "examples", "validate", "batch"),
+        ("commands",),
+        ("cli",),
+        ("__main__",),
+    ),
+}
+SOURCES = {
+    ".".join(file.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): file
+    for package in PACKAGES
+    for file in sorted((ROOT / package).rglob("*.py"))
+}
 
 
 @cache
-def statements(file: Path) -> list[ast.AST]:
+def statements(file: str) -> list[ast.AST]:
     """All imports, conditions and classes of a file."""
-    tree = ast.parse(file.read_text(encoding="utf-8"))
+    tree = ast.parse(SOURCES[file].read_text(encoding="utf-8"))
     return [node for node in ast.walk(tree) if isinstance(node, (ast.Import, ast.ImportFrom, ast.If, ast.ClassDef))]
 
 
-@pytest.fixture(scope="module", autouse=True)
-def sources_are_read_once() -> None:
-    for file in (file for package in PACKAGES for file in (ROOT / package).rglob("*.py")):
-        statements(file)
-
-
 @cache
-def imported(file: Path) -> set[str]:
-    """Modules of ours that a file asks for, but for types."""
+def asked_for(file: str) -> set[str]:
+    """Files of ours that a file asks for, at whatever place in it, but for types."""
     for_types = {
         below
         for node in statements(file)
@@ -113,94 +124,72 @@ def imported(file: Path) -> set[str]:
     }
     found = set()
     for node in statements(file):
-        if node in for_types:
-            continue
         if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
+            found |= {alias.name for alias in node.names if node not in for_types}
         elif isinstance(node, ast.ImportFrom) and node.module:
-            found |= {f"{node.module}.{alias.name}" for alias in node.names}
-    return {name for name in found if name.split(".")[0] in PACKAGES}
+            found |= {f"{node.module}.{alias.name}" for alias in node.names if node not in for_types}
+    return {file_of(name) for name in found if name.split(".")[0] in PACKAGES} - {file}
 
 
-def files_asked_for() -> dict[str, set[str]]:
-    """File, as a module -> files that it asks for, at whatever place in it."""
-    files = {
-        ".".join(file.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): file
-        for package in PACKAGES
-        for file in (ROOT / package).rglob("*.py")
-    }
-
-    def file_of(name: str) -> str:
-        return name if name in files else file_of(name.rpartition(".")[0])  # a class or a function lies in its file
-
-    return {name: {file_of(other) for other in imported(file)} - {name} for name, file in files.items()}
+def file_of(name: str) -> str:
+    return name if name in SOURCES else file_of(name.rpartition(".")[0])  # a class or a function lies in its file
 
 
-def dependencies() -> dict[tuple[str, str], set[str]]:
-    """(folder, folder that it asks for) -> files that do."""
-    found: dict[tuple[str, str], set[str]] = {}
-    for file in (ROOT / "disctrack").rglob("*.py"):
-        own = file.relative_to(ROOT / "disctrack").parts[0].removesuffix(".py")
-        for name in imported(file):
-            package, other = f"{name}.__init__".split(".")[:2]
-            if package == "disctrack" and "__init__" not in (own, other) and other != own:
-                found.setdefault((own, other), set()).add(file.name)
+@pytest.fixture(scope="module", autouse=True)
+def sources_are_read_once() -> None:
+    for file in SOURCES:
+        asked_for(file)
+
+
+def between_rooms(package: str) -> dict[tuple[str, str], list[str]]:
+    """(room, room that it asks for) -> files that do; a room is a folder or a module of the package."""
+    found: dict[tuple[str, str], list[str]] = {}
+    for file in SOURCES:
+        for other in asked_for(file):
+            (one, *own), (two, *theirs) = file.split("."), other.split(".")
+            if one == two == package and own and theirs and own[0] != theirs[0]:
+                found.setdefault((own[0], theirs[0]), []).append(file)
     return found
 
 
-def test_folders_ask_only_for_what_stands_above_them():
-    step = {name: i for i, names in enumerate(STAIRS) for name in names}
-    upwards = {}
-    for (own, other), files in dependencies().items():
-        assert own in step, f"{own}: give it a place in STAIRS"
-        if other in step and step[other] >= step[own]:
-            upwards[own, other] = sorted(files)
-    assert upwards == {}
+@pytest.mark.parametrize("package", PACKAGES)
+def test_rooms_ask_only_for_what_stands_above_them(package):
+    step = {name: i for i, names in enumerate(STAIRS[package]) for name in names}
+    rooms = {file.split(".")[1] for file in SOURCES if file.startswith(f"{package}.")}
+    assert step.keys() == rooms, "every room has a place"
+    assert {pair: files for pair, files in between_rooms(package).items() if step[pair[1]] >= step[pair[0]]} == {}
 
 
-def test_every_room_has_a_place_on_the_stairs():
-    """With `calibration` and the package's face these are 29 units on 10 levels."""
-    rooms = {file.parent.name for file in (ROOT / "disctrack").glob("*/*.py")}
-    modules = {file.stem for file in (ROOT / "disctrack").glob("*.py")} - {"__init__"}
-    assert {name for names in STAIRS for name in names} == rooms | modules
-    assert ("batch", "diagnosis") in dependencies()  # the reading sees what is asked for inside a function
+def test_what_is_asked_for_inside_a_function_is_seen():
+    assert ("batch", "diagnosis") in between_rooms("disctrack")
 
 
 def test_calibration_never_imports_disctrack():
-    for file in (ROOT / "calibration").rglob("*.py"):
-        assert not any(name.split(".")[0] == "disctrack" for name in imported(file)), file
-
-
-def test_rooms_of_the_calibration_ask_only_for_those_before_them():
-    for own, room in enumerate(ROOMS_OF_CALIBRATION):
-        for file in (ROOT / "calibration" / room).rglob("*.py"):
-            asked = {f"{name}.__init__".split(".")[1] for name in imported(file) if name.startswith("calibration")}
-            assert asked <= {*ROOMS_OF_CALIBRATION[: own + 1]}, file
+    assert not [file for file in SOURCES if file.startswith("calibration") and "disctrack" in str(asked_for(file))]
 
 
 def test_no_file_asks_for_one_that_asks_for_it():
-    asked = files_asked_for()
-    assert ("disctrack.trajectory", "disctrack.trajectory.exchange.xarray") in {(a, b) for a in asked for b in asked[a]}
+    asked = {file: asked_for(file) for file in SOURCES}
     # the object that people hold offers it as a verb; it is looked up when it is called
-    asked["disctrack.trajectory"].remove("disctrack.trajectory.exchange.xarray")
-    while len(asked) > 0:
-        free = {name for name, others in asked.items() if not others & asked.keys()}
-        assert free, {name: sorted(others & asked.keys()) for name, others in asked.items()}
-        asked = {name: others for name, others in asked.items() if name not in free}
+    asked["disctrack.trajectory"] = asked["disctrack.trajectory"] - {"disctrack.trajectory.exchange.xarray"}
+    assert asked["disctrack.trajectory"] != asked_for("disctrack.trajectory")
+    TopologicalSorter(asked).prepare()  # raises an error that names a circle
 
 
 def test_a_public_class_has_a_name_of_its_own():
     """Plan, Motion or Found say nothing where two things bear the name; each example speaks its own language."""
-    places: dict[str, list[str]] = {}
-    for file in (file for package in PACKAGES for file in (ROOT / package).rglob("*.py")):
-        if "examples" not in file.parts:
-            for node in (node for node in statements(file) if isinstance(node, ast.ClassDef)):
-                places.setdefault(node.name, []).append(file.name)
-    assert {name: files for name, files in places.items() if len(files) > 1 and name[0] != "_"} == {}
+    classes = Counter(
+        node.name
+        for file in SOURCES
+        if not file.startswith("disctrack.examples")
+        for node in statements(file)
+        if isinstance(node, ast.ClassDef) and node.name[0] != "_"
+    )
+    assert [name for name, n in classes.items() if n > 1] == []
 
 
 def test_discrepancy_knows_no_disc():
-    asked = {name for file in (ROOT / "disctrack" / "discrepancy").rglob("*.py") for name in imported(file)}
-    rooms = {name.split(".")[1] for name in asked if name.startswith("disctrack.")}
-    assert "system" in {name.split(".")[2] for name in asked if name.startswith("disctrack.discrepancy.")}
+    asked = {other for file in SOURCES if file.startswith("disctrack.discrepancy") for other in asked_for(file)}
+    assert "disctrack.discrepancy.system" in asked
+    rooms = {other.split(".")[1] for other in asked if other.startswith("disctrack.")}
     assert not rooms & {"diagnosis", "disc", "rolling", "trajectory", "track", "analyse"}
