@@ -13,7 +13,6 @@ from tifffile import COMPRESSION
 
 from disctrack.errors import RecordingError
 from disctrack.recording.readers import open_frames
-from disctrack.recording.readers._unpack_kernels import lzw_codes_follow
 from disctrack.recording.readers.decoding import decode
 
 
@@ -81,14 +80,6 @@ def test_damaged_codes_give_what_libtiff_makes_of_them_or_an_error(name):
         if found is not None and theirs is not None:
             np.testing.assert_array_equal(found, theirs)
     assert 0 < refused < 300
-
-
-@pytest.mark.parametrize(("codes", "follow"), [((65, 258, 257), True), ((300, 257), False), ((65, 259, 257), False)])
-def test_codes_of_lzw_stand_for_what_was_there_before(codes, follow):
-    """258 is the first string that a code makes; a decoder that trusts a later one reads beside its table."""
-    bits = "".join(f"{code:09b}" for code in (256, *codes))
-    packed = int(bits.ljust(-(-len(bits) // 8) * 8, "0"), 2).to_bytes(-(-len(bits) // 8), "big")
-    assert lzw_codes_follow(np.frombuffer(packed, np.uint8)) == follow
 
 
 def claiming(pixels, compression, **tags):

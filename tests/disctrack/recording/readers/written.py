@@ -8,7 +8,10 @@ import cv2
 import h5py
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
+from disctrack.errors import RecordingError
+from disctrack.recording.readers.base import FrameReader
 from tests.oracles.camera_files import write_cine, write_mraw
 
 N, HEIGHT, WIDTH = 30, 18, 22
@@ -17,6 +20,17 @@ N, HEIGHT, WIDTH = 30, 18, 22
 def frames_of(bits: int, seed: int = 0, n: int = N) -> np.ndarray:
     frames = np.random.default_rng(seed).integers(0, 2**bits, (n, HEIGHT, WIDTH))
     return frames.astype(np.uint8 if bits == 8 else np.uint16)
+
+
+def lost_of(reader: FrameReader, frames: np.ndarray) -> dict[int, str]:
+    """Why a frame cannot be read, by its index; all others are these frames (n, height, width)."""
+    lost = {}
+    for index in range(len(reader)):
+        try:
+            assert_array_equal(reader.read(index), frames[index])
+        except RecordingError as error:
+            lost[index] = str(error)
+    return lost
 
 
 def write_images(path: Path, frames: np.ndarray) -> None:
