@@ -1,5 +1,7 @@
 """Measured trajectories of a disc without rendering, with what is planted as keywords (disctrack.validate.points)."""
 
+import numpy as np
+
 from disctrack.diagnosis import DiscSystem
 from disctrack.diagnosis.model_file import declared_model
 from disctrack.diagnosis.motion import motion_candidates
@@ -10,7 +12,7 @@ from disctrack.track.refine.self_calibration import DotsInFrames
 from disctrack.validate import points
 from disctrack.validate.points import K_M, SIGMA_PX, Filmed, Laboratory, Planted
 
-__all__ = ["K_M", "SIGMA_PX", "Laboratory", "dots_of", "measured", "system_of", "with_base_fit"]
+__all__ = ["K_M", "SIGMA_PX", "Laboratory", "assert_sized", "dots_of", "measured", "system_of", "with_base_fit"]
 
 
 def measured(effects=None, *, faults=None, laboratory=None, motion=None, laws=(), disc=None, **filmed):
@@ -41,3 +43,9 @@ def with_base_fit(trajectory, names=None, model="paper"):
     """The same, and its base fit."""
     system = system_of(trajectory, names, model)
     return system, fit(system, system.base, system.start())
+
+
+def assert_sized(fit, truth, sigmas, most=np.inf):
+    """Each of these numbers was found within so many of its sigmas, and these are below `most`."""
+    for name, true in truth.items():
+        assert abs(fit.values[name] - true) < sigmas * fit.sigma(name) < most, name

@@ -11,7 +11,7 @@ from disctrack.diagnosis.plan import Proposal
 from disctrack.diagnosis.stage import with_plan
 from disctrack.faults.keys import Faults
 from disctrack.rolling import CATALOGUE
-from tests.oracles.measured_disc import measured, with_base_fit
+from tests.oracles.measured_disc import assert_sized, measured, with_base_fit
 
 # hidden effect, faults, name; all others are planted and fitted in tests/disctrack/validate
 HIDDEN = [
@@ -29,10 +29,7 @@ def test_a_hidden_effect_is_found_named_and_sized(planted, faults, name):
     assert result.diagnosis.verdict == "found", result.sentence
     (effect,) = result.diagnosis.found
     assert effect.candidate.name == name
-    after = result.diagnosis.after
-    for key, value in planted.items():
-        # four sigmas: one of 10 runs would miss two sigmas by chance alone
-        assert abs(after.values[key] - value) < 4 * after.sigma(key)
+    assert_sized(result.diagnosis.after, planted, 4)  # one of 10 runs would miss two sigmas by chance alone
     assert result.after.reduced_chi_square < 1.1
     assert result.after.ratio_to_floor < 1.2
     assert result.before.ratio_to_floor > 1.5
@@ -46,8 +43,7 @@ def test_a_thickness_within_its_tolerance_is_no_effect():
     disc = replace(trajectory.disc, thickness_tolerance=3e-5)
     result = diagnose(replace(trajectory, disc=disc))
     assert result.diagnosis.verdict == "nothing missing"
-    after = result.diagnosis.after
-    assert abs(after.values["contact_height.h_error"] - 3e-5) < 4 * after.sigma("contact_height.h_error") < 3e-5
+    assert_sized(result.diagnosis.after, {"contact_height.h_error": 3e-5}, 4, 3e-5)
 
 
 @pytest.mark.statistical
@@ -56,8 +52,7 @@ def test_two_effects_are_found_together():
     result = diagnose(measured(hidden, seed=6, n=250, declared_rate=500.0))
     assert {f.candidate.name for f in result.diagnosis.found} == {"table_tilt", "kz"}
     assert result.learned is None  # two named effects beat a law without a name
-    for key, value in hidden.items():
-        assert abs(result.diagnosis.after.values[key] - value) < 4 * result.diagnosis.after.sigma(key)
+    assert_sized(result.diagnosis.after, hidden, 4)
 
 
 @pytest.mark.statistical
@@ -125,8 +120,7 @@ def test_what_moves_beside_the_disc_is_no_force(hidden, faults, name, true):
     """A clock that slows down, a turntable."""
     result = diagnose(measured(hidden, faults=faults, seed=14, n=300))
     assert [found.candidate.name for found in result.diagnosis.found] == [name.partition(".")[0]]
-    fit = result.diagnosis.after
-    assert abs(fit.values[name] - true) < 3 * fit.sigma(name) < 0.01 * true
+    assert_sized(result.diagnosis.after, {name: true}, 3, 0.01 * true)
 
 
 @pytest.mark.slow

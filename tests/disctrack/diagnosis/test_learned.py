@@ -19,7 +19,7 @@ from disctrack.discrepancy.system import Quantity
 from disctrack.faults.keys import Faults
 from disctrack.rolling import Model
 from disctrack.rolling.effects import effect_from_formulas
-from tests.oracles.measured_disc import measured, with_base_fit
+from tests.oracles.measured_disc import assert_sized, measured, with_base_fit
 from tests.oracles.unknown_laws import recording
 
 
@@ -146,8 +146,7 @@ def test_a_law_is_looked_for_along_the_motion_that_follows_the_data():
     assert [f.title for f in law.families] == [f.title for f in square]
     fitted = with_law(system.knowing(law), base, law)
     assert fitted.reduced_chi_square < 1.1
-    strength = law.candidate.names[0]
-    assert abs(fitted.values[strength] - 40.0) < 3 * fitted.sigma(strength)
+    assert_sized(fitted, {law.candidate.names[0]: 40.0}, 3)
 
 
 @pytest.mark.slow
@@ -160,8 +159,7 @@ def test_a_law_that_a_found_effect_describes_alone_is_that_effect():
     assert any("table_tilt" in names for names in alike)
     assert any({"frame_rate", "gravity"} <= names for names in alike)  # all laws at hand are quadratic in the rates
     assert result.after.reduced_chi_square < 1.05
-    fit_ = result.diagnosis.after
-    assert abs(fit_.values["table_tilt.tilt_x"] - 2e-3) < 3 * fit_.sigma("table_tilt.tilt_x")
+    assert_sized(result.diagnosis.after, {"table_tilt.tilt_x": 2e-3}, 3)
 
 
 @pytest.mark.slow

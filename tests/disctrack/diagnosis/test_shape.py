@@ -8,7 +8,7 @@ from disctrack.discrepancy.fit import fit
 from disctrack.discrepancy.search import explain
 from disctrack.discrepancy.shape import profiled
 from disctrack.validate.diagnoses import HiddenCase, plant
-from tests.oracles.measured_disc import measured, system_of
+from tests.oracles.measured_disc import assert_sized, measured, system_of
 
 
 @pytest.mark.statistical
@@ -19,8 +19,7 @@ def test_an_exponent_is_measured_along_its_profile():
     nominal = fit(system, (*system.base, *power.quantities), system.start())
     free = profiled(system, nominal, power.shape[0], 0.1)
     assert free.converged
-    assert abs(free.values["rolling_power.p"] - 1.0) < 4 * free.sigma("rolling_power.p")
-    assert free.sigma("rolling_power.p") < 0.05
+    assert_sized(free, {"rolling_power.p": 1.0}, 4, 4 * 0.05)
     assert free.reduced_chi_square < 1.1 < nominal.reduced_chi_square
 
 
@@ -42,8 +41,7 @@ def test_a_law_beyond_the_declared_one_is_found_by_its_exponent():
     result = diagnose(measured(hidden, seed=71, n=400, theta_deg=8.0))
     (found,) = result.diagnosis.found
     assert found.candidate.name == "rolling_power"
-    fit_ = result.diagnosis.after
-    assert abs(fit_.values["rolling_power.p"] - 2.8) < 4 * fit_.sigma("rolling_power.p")
+    assert_sized(result.diagnosis.after, {"rolling_power.p": 2.8}, 4)
     assert result.after.reduced_chi_square < 1.1
     assert "p = " in result.sentence
 
@@ -54,9 +52,8 @@ def test_the_pivoting_rate_at_which_creep_begins_is_measured():
     result = diagnose(measured(hidden, seed=74, n=400))
     (found,) = result.diagnosis.found
     assert found.candidate.name == "pivoting_contensou"
-    fit_ = result.diagnosis.after
-    assert abs(fit_.values["pivoting_contensou.omega_s"] - 4.0) < 4 * fit_.sigma("pivoting_contensou.omega_s")
-    assert "pivoting_contensou.a" not in fit_.names  # without slip its radius does nothing
+    assert_sized(result.diagnosis.after, {"pivoting_contensou.omega_s": 4.0}, 4)
+    assert "pivoting_contensou.a" not in result.diagnosis.after.names  # without slip its radius does nothing
 
 
 @pytest.mark.slow
@@ -72,8 +69,7 @@ def test_a_flat_of_the_rim_beside_a_fault_of_a_camera_is_no_inertia():
 
     answer = found("right_distortion", "inertia_product", "rim_flat")
     assert [f.candidate.name for f in answer.found] == ["right_distortion", "rim_flat"]
-    for name, true in (("rim_flat.depth", 1e-5), ("rim_flat.width", 0.15), ("right_distortion.k1", -0.05)):
-        assert abs(answer.after.values[name] - true) < 3 * answer.after.sigma(name)
+    assert_sized(answer.after, {"rim_flat.depth": 1e-5, "rim_flat.width": 0.15, "right_distortion.k1": -0.05}, 3)
     without = found("right_distortion", "inertia_product")  # noise is left there, too
     assert [f.candidate.name for f in without.found] == ["right_distortion", "inertia_product"]
     assert answer.after.cost < without.after.cost - 30.0

@@ -14,7 +14,7 @@ from disctrack.diagnosis.together.recordings import diagnose_together
 from disctrack.synthetic.description import Scene
 from disctrack.trajectory.file import Provenance, write_trajectory
 from tests.oracles import newton_euler
-from tests.oracles.measured_disc import K_M, measured
+from tests.oracles.measured_disc import K_M, assert_sized, measured
 
 RATE = 400.0
 RIG = {"declared_rate": RATE, "rig_seed": 5}
@@ -58,8 +58,7 @@ def test_air_that_single_recordings_do_not_show_is_found_in_four_and_another_dis
     named = {found.candidate.name: answer.diagnosis.after} | {
         r.candidate.name: r.fit for r in found.cannot_be_told_from
     }
-    fit = named["air_moffatt"]
-    assert abs(fit.values["air_moffatt.f"] - F) < 3 * fit.sigma("air_moffatt.f")
+    assert_sized(named["air_moffatt"], {"air_moffatt.f": F}, 3)
     (bound,) = [b for b in answer.bounds if b.candidate.name == "air_moffatt"]
     assert bound.by_number[1][0] > F / 3
     assert bound.by_number[4][0] < 0.5 * bound.by_number[1][0]

@@ -11,7 +11,7 @@ from disctrack.diagnosis.law_library import families
 from disctrack.frames import nodal_axes_world
 from disctrack.rolling import Model, State, simulate
 from disctrack.rolling.effects import effect_from_formulas
-from tests.oracles.measured_disc import K_M
+from tests.oracles.measured_disc import K_M, assert_sized
 from tests.oracles.unknown_laws import DISC, PLACE, UNKNOWN, motion, recording
 
 
@@ -62,7 +62,6 @@ def test_a_groove_is_no_tilted_table():
     assert result.learned.law.title == "a ridge or groove of the table"
     assert not result.diagnosis.found
     assert result.after.reduced_chi_square < 1.0
-    values, fit = result.diagnosis.after.values, result.diagnosis.after
-    for name, true in (("c_0", -6e-8), ("direction_0", 0.6), ("edge_0", 0.05)):
-        assert abs(values[f"learned.{name}"] - true) < 4 * fit.sigma(f"learned.{name}")
+    truth = {"learned.c_0": -6e-8, "learned.direction_0": 0.6, "learned.edge_0": 0.05}
+    assert_sized(result.diagnosis.after, truth, 4)
     assert any("table_tilt" in note for note in result.notes)

@@ -6,7 +6,7 @@ import pytest
 from disctrack.diagnosis import diagnose
 from disctrack.rolling.effects import effect_from_formulas
 from tests.oracles import newton_euler
-from tests.oracles.measured_disc import measured
+from tests.oracles.measured_disc import assert_sized, measured
 from tests.oracles.unknown_laws import DISC, Unknown, recording
 
 pytestmark = pytest.mark.slow
@@ -27,9 +27,7 @@ def test_a_spring_is_no_tilt_with_an_inertia():
     result = diagnose(recording(Unknown(newton_euler.spring(0.8), 14.0, 1.0, 0.9)).trajectory)
     assert [f.candidate.name for f in result.diagnosis.found] == ["spring"]
     assert result.after.reduced_chi_square < 1.05
-    fit = result.diagnosis.after
-    for name, truth in (("k", 0.8), ("F_x", 0.0), ("F_y", 0.0)):
-        assert abs(fit.values[f"spring.{name}"] - truth) < 3 * fit.sigma(f"spring.{name}")
+    assert_sized(result.diagnosis.after, {"spring.k": 0.8, "spring.F_x": 0.0, "spring.F_y": 0.0}, 3)
 
 
 def test_a_table_that_vibrates_is_found_with_its_frequency_and_its_forces():
@@ -40,14 +38,12 @@ def test_a_table_that_vibrates_is_found_with_its_frequency_and_its_forces():
     assert result.diagnosis.verdict == "unexplained"
     assert result.learned is not None
     fit = result.diagnosis.after
-    value = lambda name: (fit.values[f"learned.{name}"], fit.sigma(f"learned.{name}"))  # noqa: E731
-    rate, sigma = value("rate_0")
-    assert abs(rate - 2 * np.pi * 60) < 3 * sigma
+    assert_sized(fit, {"learned.rate_0": 2 * np.pi * 60}, 3)
     assert result.after.reduced_chi_square < 1.05
     # the phase at t = 0 and the rate go together: of each axis the size of the force
     for axis, true in enumerate(DISC.mass * acceleration):
-        (c, c_sigma), (s, s_sigma) = value(f"c_0_{2 * axis}"), value(f"c_0_{2 * axis + 1}")
-        assert abs(np.hypot(c, s) - true) < 3 * max(c_sigma, s_sigma)
+        course = [f"learned.c_0_{2 * axis + k}" for k in (0, 1)]
+        assert abs(np.hypot(*(fit.values[name] for name in course)) - true) < 3 * max(map(fit.sigma, course))
 
 
 def test_a_law_below_a_nutation_is_told_with_the_nutation():
@@ -76,7 +72,7 @@ def test_a_dent_that_hits_once_a_turn_is_found_with_its_place_and_its_blow():
     assert result.learned is not None
     fit = result.diagnosis.after
     assert result.after.reduced_chi_square < 1.05
-    assert abs(fit.values["learned.angle_0"] - 1.0) < 3 * fit.sigma("learned.angle_0")
+    assert_sized(fit, {"learned.angle_0": 1.0}, 3)
     assert abs(-fit.values["learned.c_0"] - 3e-4 * 0.15) < 3 * fit.sigma("learned.c_0") + 0.01 * 4.5e-5
 
 
@@ -94,11 +90,9 @@ def test_a_blow_is_an_impulse_at_an_instant():
 
     result = diagnose(recording(Unknown(law)).trajectory)
     assert result.learned is not None
-    fit = result.diagnosis.after
-    for axis, true in zip("xy", impulse, strict=False):
-        name = f"learned.impulse_{axis}_0"
-        assert abs(fit.values[name] - true) < 3 * fit.sigma(name) < 0.05e-3
-    assert abs(fit.values["learned.instant_0"] - 0.308) < 3 * fit.sigma("learned.instant_0") < 1e-3
+    blow = {"learned.impulse_x_0": impulse[0], "learned.impulse_y_0": impulse[1]}
+    assert_sized(result.diagnosis.after, blow, 3, 0.05e-3)
+    assert_sized(result.diagnosis.after, {"learned.instant_0": 0.308}, 3, 1e-3)
     assert len(result.learned.candidate.quantities) <= 5
     assert len(result.verdict_text) < 400
 
@@ -112,12 +106,10 @@ def test_a_force_that_grows_with_time_is_found_with_its_size_and_its_direction()
 
     result = diagnose(recording(Unknown(law)).trajectory)
     assert result.learned is not None
-    fit = result.diagnosis.after
     assert result.after.reduced_chi_square < 1.05
     half = 0.5 * (result.system.time[-1] - result.system.time[0])
-    for i, true in enumerate(half * growing[:2]):  # the middle's force has the numbers c_0_0 and c_0_1
-        name = f"learned.c_0_{2 + i}"
-        assert abs(fit.values[name] - true) < 3 * fit.sigma(name)
+    # the middle's force has the numbers c_0_0 and c_0_1
+    assert_sized(result.diagnosis.after, {f"learned.c_0_{2 + i}": half * growing[i] for i in (0, 1)}, 3)
 
 
 def test_a_law_takes_the_place_of_those_that_stand_in_for_it_and_of_no_other():
@@ -136,10 +128,9 @@ def test_a_law_takes_the_place_of_those_that_stand_in_for_it_and_of_no_other():
     for result in (alone, beside):
         assert result.learned is not None
         assert result.learned.law.title == "a force towards a point that grows as the distance squared"
-        fitted = result.diagnosis.after
         (strength,) = result.learned.law.candidate.names
-        assert abs(fitted.values[strength] - 40.0) < 3 * fitted.sigma(strength) < 0.2
-    assert abs(fitted.values["kz.k_z"] - 6e-5) < 3 * fitted.sigma("kz.k_z") < 2e-6
+        assert_sized(result.diagnosis.after, {strength: 40.0}, 3, 0.2)
+    assert_sized(beside.diagnosis.after, {"kz.k_z": 6e-5}, 3, 2e-6)
     assert "Missing in the model: pivoting friction" in beside.sentence
 
 

@@ -63,9 +63,8 @@ def polygon_moments(polygon):
 
 
 def image_moments(weight):
-    y, x = np.mgrid[0 : weight.shape[0], 0 : weight.shape[1]]
-    total = weight.sum()
-    return total, np.array([(x * weight).sum(), (y * weight).sum()]) / total
+    found = cv2.moments(weight)
+    return found["m00"], np.array([found["m10"], found["m01"]]) / found["m00"]
 
 
 def circle(centre, radius, n=2000):
@@ -130,17 +129,8 @@ def test_black_squares_lie_where_opencv_projects_them(index, rig):
         for j in range(-1, 6):
             if (i + j) % 2 == 0:
                 side = np.linspace(0, 1, 50, endpoint=False)
-                square = np.concatenate(
-                    [
-                        np.stack(p, axis=-1)
-                        for p in (
-                            (side, 0 * side),
-                            (0 * side + 1, side),
-                            (1 - side, 0 * side + 1),
-                            (0 * side, 1 - side),
-                        )
-                    ]
-                )
+                along = np.column_stack([side, 0 * side])
+                square = np.concatenate([along, along[:, ::-1] + [1, 0], 1 - along, 1 - along[:, ::-1] - [1, 0]])
                 corners = np.column_stack([(square + np.array([i, j])) * 8e-3, np.zeros(len(square))])
                 area, centroid = polygon_moments(cv2_pixels(corners @ R.T + t, rig, index))
                 total, moment = total + area, moment + area * centroid

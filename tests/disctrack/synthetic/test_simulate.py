@@ -30,6 +30,9 @@ k_z = 6e-5
 """
 
 
+WITHOUT_EFFECTS = SCENE.partition("[motion.rolling.effects")[0]
+
+
 @pytest.fixture
 def scene(tmp_path):
     path = tmp_path / "scene.toml"
@@ -37,8 +40,19 @@ def scene(tmp_path):
     return path
 
 
-def test_motion_file_holds_the_motion_with_units(scene, tmp_path):
-    run = run_simulate(scene, tmp_path / "motion.h5")
+@pytest.fixture
+def simulated(scene, tmp_path):
+    """What a scene of this text gives, in a file of its own."""
+
+    def run(text=SCENE, **options):
+        scene.write_text(text)
+        return run_simulate(scene, tmp_path / f"motion_{len(list(tmp_path.iterdir()))}.h5", **options)
+
+    return run
+
+
+def test_motion_file_holds_the_motion_with_units(simulated, tmp_path):
+    run = simulated()
     assert "kz.k_z = 6e-05 m" in run.summary
     with h5py.File(run.path) as file:
         assert file.attrs["complete"] == 1
@@ -59,36 +73,32 @@ def test_motion_file_holds_the_motion_with_units(scene, tmp_path):
     assert list(tmp_path.glob("*.part")) == []
 
 
-def test_a_motion_that_ends_gives_a_shorter_file_with_the_reason(scene, tmp_path):
-    scene.write_text(SCENE.replace("theta_deg = 8", "theta_deg = 0.8"))
-    run = run_simulate(scene, tmp_path / "motion.h5", duration=1.0)
-    with h5py.File(run.path) as file:
+def test_a_motion_that_ends_gives_a_shorter_file_with_the_reason(simulated):
+    with h5py.File(simulated(SCENE.replace("theta_deg = 8", "theta_deg = 0.8"), duration=1.0).path) as file:
         assert len(file["time"]) < 501
         assert file.attrs["end"] == "NUTATION"
 
 
-def test_a_struck_disc_is_a_scene_too(scene, tmp_path):
-    struck = "struck = { lateral_mm = 20, vertical_mm = 10.5, impulse_N_s = 0.05, friction = 0.1 }"
-    text = SCENE.replace("theta_deg = 8", struck) + "[motion.rolling.effects.slip]\nmu = 0.1\n"
-    scene.write_text(text)
-    run = run_simulate(scene, tmp_path / "motion.h5")
-    assert run.motion.q[0, 4] == np.pi / 2
-    scene.write_text(text.replace("impulse_N_s", "impulse"))
+STRUCK = SCENE.replace("theta_deg = 8", "struck = { lateral_mm = 20, vertical_mm = 10.5, impulse_N_s = 0.05 }")
+
+
+def test_a_struck_disc_is_a_scene_too(simulated):
+    text = STRUCK.replace("0.05 }", "0.05, friction = 0.1 }") + "[motion.rolling.effects.slip]\nmu = 0.1\n"
+    assert simulated(text).motion.q[0, 4] == np.pi / 2
     with pytest.raises(SceneError, match="expected impulse_N_s, lateral_mm, vertical_mm"):
-        run_simulate(scene, tmp_path / "other.h5")
+        simulated(text.replace("impulse_N_s", "impulse"))
 
 
-def test_a_disc_that_never_touches_the_table_is_summed_up_too(scene, tmp_path):
-    scene.write_text(SCENE.replace("theta_deg = 8", "state = { z = 1.0, v_x = 0.0, v_y = 0.0, v_z = 0.0 }"))
-    run = run_simulate(scene, tmp_path / "motion.h5", duration=0.02)
+def test_a_disc_that_never_touches_the_table_is_summed_up_too(simulated):
+    state = "state = { z = 1.0, v_x = 0.0, v_y = 0.0, v_z = 0.0 }"
+    run = simulated(SCENE.replace("theta_deg = 8", state), duration=0.02)
     assert (run.motion.regime == Regime.FLYING).all()
     assert "never held by the table" in run.summary
     assert "nan" not in run.summary
 
 
 def test_a_scene_whose_motion_ends_where_it_starts_is_not_filmed(scene, tmp_path):
-    struck = "struck = { lateral_mm = 20, vertical_mm = 10.5, impulse_N_s = 0.05 }"  # without the effect slip
-    scene.write_text(SCENE.replace("theta_deg = 8", struck))
+    scene.write_text(STRUCK)  # without the effect slip
     with pytest.raises(SceneError, match="over before anything is filmed: after losing contact"):
         motion_of(load_scene(scene))
     np.savetxt(tmp_path / "table.csv", [[0, 0, 0, 0, 0, 0.5, 0], [1, 0, 0, np.nan, 0, 0.5, 0]], delimiter=",")
@@ -97,39 +107,31 @@ def test_a_scene_whose_motion_ends_where_it_starts_is_not_filmed(scene, tmp_path
         motion_of(load_scene(scene))
 
 
-def test_what_cannot_be_simulated_is_refused_with_the_reason(scene, tmp_path):
+def test_what_cannot_be_simulated_is_refused_with_the_reason(simulated, scene, tmp_path):
     (tmp_path / "there.h5").write_text("")
     with pytest.raises(OutputError, match="exists"):
         run_simulate(scene, tmp_path / "there.h5")
     with pytest.raises(SceneError, match=r"2 s at 1e\+300 Hz are 2e\+300 instants; expected at most 1e\+07"):
-        run_simulate(scene, tmp_path / "motion.h5", duration=2.0, rate=1e300)
-    scene.write_text('[motion]\nkind = "static"\n')
+        simulated(duration=2.0, rate=1e300)
     with pytest.raises(SceneError, match='needs kind = "rolling"'):
-        run_simulate(scene, tmp_path / "motion.h5")
+        simulated('[motion]\nkind = "static"\n')
 
 
-def test_an_effect_by_formula_is_simulated_and_saved(scene, tmp_path):
+def test_an_effect_by_formula_is_simulated_and_saved(simulated):
     law = '[motion.rolling.formulas.brake]\nload_z = "-c * omega_z"\n[motion.rolling.effects.brake]\nc = 1e-4\n'
-    scene.write_text(SCENE + law)
-    run = run_simulate(scene, tmp_path / "motion.h5")
-    plain = scene.with_name("plain.toml")
-    plain.write_text(SCENE)
-    without = run_simulate(plain, tmp_path / "plain.h5")
-    assert np.abs(run.motion.q - without.motion.q).max() > 1e-6
-    (brake,) = (effect for effect in run.motion.model.effects if effect.name == "brake")
+    # without it, with it, and with another law of that name in the same process
+    texts = SCENE, SCENE + law, SCENE + law.replace("omega_z", "thetadot")
+    without, with_it, another = (simulated(text).motion for text in texts)
+    assert np.abs(with_it.q - without.q).max() > 1e-6
+    assert np.abs(another.q - with_it.q).max() > 1e-6
+    (brake,) = (effect for effect in with_it.model.effects if effect.name == "brake")
     assert effects_from_tables({"brake": brake.values}, {"brake": brake.formulas}) == (brake,)
-    scene.write_text(SCENE + law.replace("omega_z", "thetadot"))  # another law of that name, in the same process
-    assert np.abs(run_simulate(scene, tmp_path / "other.h5").motion.q - run.motion.q).max() > 1e-6
-    scene.write_text(SCENE + law.partition("[motion.rolling.effects")[0])
     with pytest.raises(ModelError, match="brake"):
-        run_simulate(scene, tmp_path / "no_numbers.h5")
+        simulated(SCENE + law.partition("[motion.rolling.effects")[0])
 
 
-def test_a_number_that_a_scene_does_not_give_is_zero_and_what_it_leaves_out_is_said(scene, tmp_path):
-    scene.write_text(
-        SCENE.partition("[motion.rolling.effects")[0] + "[motion.rolling.effects.table_tilt]\ntilt_x = 0.0035\n"
-    )
-    run = run_simulate(scene, tmp_path / "motion.h5")
+def test_a_number_that_a_scene_does_not_give_is_zero_and_what_it_leaves_out_is_said(simulated):
+    run = simulated(WITHOUT_EFFECTS + "[motion.rolling.effects.table_tilt]\ntilt_x = 0.0035\n")
     assert run.motion.model.values == {"table_tilt.tilt_x": 0.0035, "table_tilt.tilt_y": 0.0}
     assert "without km, kn, kz, which only a scene that names no effect has" in run.summary
     assert effects_from_tables({"km": {}}) == (CATALOGUE["km"](),)
@@ -137,9 +139,8 @@ def test_a_number_that_a_scene_does_not_give_is_zero_and_what_it_leaves_out_is_s
         effects_from_tables({"rolling_power": {"p": 1.5}})
 
 
-def test_a_scene_without_effects_has_those_of_the_paper_at_their_nominal_sizes(scene, tmp_path):
-    scene.write_text(SCENE.partition("[motion.rolling.effects")[0])
-    run = run_simulate(scene, tmp_path / "motion.h5")
+def test_a_scene_without_effects_has_those_of_the_paper_at_their_nominal_sizes(simulated):
+    run = simulated(WITHOUT_EFFECTS)
     assert run.motion.model.effects == tuple(CATALOGUE[name]() for name in ("km", "kn", "kz"))
     assert "; without" not in run.summary
 

@@ -7,13 +7,17 @@ import pytest
 
 from disctrack import frames
 from disctrack.disc import MA_2014, disc_from_mm, has_mirror_axis, symmetry_order
+from disctrack.synthetic import rig_of
+from disctrack.synthetic.description import Scene
 from disctrack.track.dots.acquisition import acquire, acquire_from_blobs, dot_blobs
 from disctrack.track.pose import marker_pixels
 
 
-def distance(pose, R, t):
-    R_found, t_found = pose
-    return np.linalg.norm(t_found - t), np.degrees(np.linalg.norm(frames.vector_from_rotation(R_found @ R.T)))
+def assert_found(answer, R, t, shift, turn_deg):
+    (R_found, t_found), _, reason = answer
+    assert reason == ""
+    assert np.linalg.norm(t_found - t) < shift
+    assert np.degrees(np.linalg.norm(frames.vector_from_rotation(R_found @ R.T))) < turn_deg
 
 
 def test_the_disc_is_found_in_whatever_attitude(rendered_pairs):
@@ -23,29 +27,19 @@ def test_the_disc_is_found_in_whatever_attitude(rendered_pairs):
         views = [np.degrees(np.arccos(R[:, 2] @ (eye - q[:3]) / np.linalg.norm(eye - q[:3]))) for eye in eyes]
         if max(views) > 70:  # one camera sees the face nearly edge-on, or from behind
             continue
-        pose, _, reason = acquire(images, p.rig, p.disc)
-        assert reason == ""
-        shift, turn = distance(pose, R, q[:3])
         # centroids of thresholded blobs: 0.3 px of 12 dots, that is 0.05 mm and 0.2 deg
-        assert shift < 2e-4
-        assert turn < 0.7
+        assert_found(acquire(images, p.rig, p.disc), R, q[:3], 2e-4, 0.7)
 
 
 def test_one_camera_is_enough(rendered_pairs):
     p = rendered_pairs
     black = np.zeros_like(p.images[0, 0])
     for i in (4, 9, 12):
-        pose, _, reason = acquire((p.images[i, 0], black), p.rig, p.disc)
-        assert reason == ""
-        shift, turn = distance(pose, p.R[i], p.q[i, :3])
-        assert shift < 3e-3  # depth of one camera from centroids
-        assert turn < 4.0
+        found = acquire((p.images[i, 0], black), p.rig, p.disc)
+        assert_found(found, p.R[i], p.q[i, :3], 3e-3, 4.0)  # depth of one camera from centroids
 
 
 def test_clutter_and_missing_dots_do_not_mislead(rng):
-    from disctrack.synthetic import rig_of
-    from disctrack.synthetic.description import Scene
-
     rig, disc = rig_of(Scene()), MA_2014
     for trial in range(6):
         euler = rng.uniform([-3, 0.05, -3], [3, 0.5, 3])
@@ -56,11 +50,7 @@ def test_clutter_and_missing_dots_do_not_mislead(rng):
             seen = np.delete(pixels[camera], (trial + camera) % 6, axis=0)  # one dot missing in each, not the same
             clutter = rng.uniform(40, 470, (5, 2))
             blobs.append(rng.permutation(np.concatenate([seen + 0.2 * rng.normal(size=seen.shape), clutter])))
-        pose, _, reason = acquire_from_blobs(blobs, rig, disc)
-        assert reason == ""
-        shift, turn = distance(pose, R, t)
-        assert shift < 3e-4
-        assert turn < 1.0
+        assert_found(acquire_from_blobs(blobs, rig, disc), R, t, 3e-4, 1.0)
 
 
 def test_an_empty_scene_is_said_to_be_empty(rendered_pairs):
