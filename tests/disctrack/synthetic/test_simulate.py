@@ -15,7 +15,7 @@ from disctrack.synthetic.description import load_scene
 from disctrack.synthetic.motion import motion_of
 from disctrack.synthetic.simulation import run_simulate
 
-SCENE = """
+WITHOUT_EFFECTS = """
 name = "roll"
 [cameras]
 n_frames = 51
@@ -24,13 +24,12 @@ frame_rate_hz = 500.0
 kind = "rolling"
 [motion.rolling]
 theta_deg = 8
+"""
+SCENE = f"""{WITHOUT_EFFECTS}
 [motion.rolling.effects.km]
 [motion.rolling.effects.kz]
 k_z = 6e-5
 """
-
-
-WITHOUT_EFFECTS = SCENE.partition("[motion.rolling.effects")[0]
 
 
 @pytest.fixture
