@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from hashlib import sha256
 
 import numpy as np
 from numpy.typing import NDArray
@@ -168,7 +169,10 @@ def calibrate_stereo(
     (left, note_left), (right, note_right) = (
         repaired_views(side, name) for side, name in zip((left_images, right_images), CAMERA_NAMES, strict=True)
     )
-    views = located([*left, *right], board, progress)
+    digests = [sha256(image.tobytes()).digest() for image in (*left, *right)]
+    images = dict(zip(digests, (*left, *right), strict=True))  # copies are looked at once
+    seen_in = dict(zip(images, located([*images.values()], board, progress), strict=True))
+    views = [seen_in[digest] for digest in digests]
     n = len(left_images)
     found = calibrate_from_corners(views[:n], views[n:], board, settings, table_view, board_thickness, names)
     seen = [view for side in found.corner_views for view in side]

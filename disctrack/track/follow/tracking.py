@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from calibration.cameras.camera import Camera, StereoRig
-from calibration.kit.arrays import Array
+from calibration.kit.arrays import Array, Mask
 from calibration.kit.grey_levels import mosaic_gains
 from calibration.kit.stuck_pixels import repair, stuck_pixels
 from disctrack import frames
@@ -36,7 +36,7 @@ from disctrack.track.judge.dropped_frames import frames_ahead, left_out
 from disctrack.track.pose import marker_pixels
 from disctrack.track.refine.assembly import Taken, Tracking, TrackingSettings, assemble
 from disctrack.track.side_by_side import evenly
-from disctrack.trajectory import FrameStatus
+from disctrack.trajectory import FrameStatus, MarkerStatus
 
 SHORTEST_SPLIT = 1000  # pairs; a stretch must outweigh its own search for the disc, and measuring blur and noise
 # [m] off its declared place from which on a dot is looked for again, where it is. With wrong places the attitude is
@@ -130,9 +130,7 @@ def _check_dots(disc: Disc) -> None:
 
 def _slips(tracking: Tracking, read_blocks: ReadBlocks, pairs: range, setup: TrackingSetup) -> tuple[Finding, ...]:
     """More images left out by one camera than a delay of its dots tells: the pairing that fits the frames after it."""
-    missed = max(tracking.scatter.systematic_px) > MEETING_PX / 2
-    status = tracking.trajectory.frame_status
-    apart = (status == FrameStatus.ONE_CAMERA) | (status == FrameStatus.CONTRADICTED) | missed
+    apart = _apart(tracking) | (max(tracking.scatter.systematic_px) > MEETING_PX / 2)
     begun = np.flatnonzero(np.convolve(apart, np.ones(APART), "valid") == APART)
     if not begun.size or {Kind.DROPPED_FRAMES, Kind.DELAY} & {finding.kind for finding in tracking.findings}:
         return ()
@@ -145,6 +143,13 @@ def _slips(tracking: Tracking, read_blocks: ReadBlocks, pairs: range, setup: Tra
     camera, other = frames.CAMERAS[::-1] if ahead > 0 else frames.CAMERAS
     text = f"the {camera} camera is {abs(ahead)} frames ahead of the {other}, and its images are not used from there on"
     return (left_out(text, ahead, (start, pairs[-1]), start, first == 0),)
+
+
+def _apart(tracking: Tracking) -> Mask:
+    """(n,) frames in which dots were looked for in both images, and make no sense together."""
+    status = tracking.trajectory.frame_status
+    looked = (tracking.trajectory.marker_status != MarkerStatus.NOT_LOOKED_FOR).any(axis=2).all(axis=1)
+    return looked & ((status == FrameStatus.ONE_CAMERA) | (status == FrameStatus.CONTRADICTED))
 
 
 def _without(read_blocks: ReadBlocks, camera: int, since: int) -> ReadBlocks:
@@ -169,8 +174,7 @@ def _senseless(tracking: Tracking, faulty: bool, read_blocks: ReadBlocks, pairs:
     far = faulty and max(tracking.scatter.systematic_px) > MEETING_PX
     if not (contradicted or far) or Kind.DROPPED_FRAMES in kinds:  # which makes cameras contradict each other
         return _some(read_blocks, pairs[:0])
-    of_one = (status == FrameStatus.ONE_CAMERA) | (status == FrameStatus.CONTRADICTED)
-    rows = np.flatnonzero(of_one | (far & (status == FrameStatus.MEASURED)))
+    rows = np.flatnonzero(_apart(tracking) | (far & (status == FrameStatus.MEASURED)))
     return _some(read_blocks, pairs[rows[0] :] if len(rows) else pairs[:0])
 
 
