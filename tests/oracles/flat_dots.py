@@ -50,3 +50,10 @@ def covered(centres, affine, blur_px, weights=(1.0,)):
         distance = (1 - np.hypot(*np.moveaxis(u, -1, 0))) * np.sqrt(abs(np.linalg.det(A))) * fine
         total = total + weight * np.clip(distance + 0.5, 0, 1)
     return gaussian_filter(total, blur_px * fine).reshape(64, fine, 64, fine).mean((1, 3))
+
+
+def locate_in_window(image, centre, affine, **known):
+    """A dot, unit circle -> px by affine (2, 2), in an image (64, 64) whose first pixel is round(centre) - 31."""
+    homography = np.eye(3)
+    homography[:2, :2], homography[:2, 2] = affine, centre - np.round(centre) + 31
+    return locate_on_plane(np.rint(image).astype(np.uint16), homography, np.zeros((1, 2)), 1.0, **known)

@@ -129,16 +129,12 @@ def tables_of(px, R, t, sigma):
     return Tables(results, measured[0], R.copy(), t.copy(), measured[1], np.zeros((n, 2), np.uint64))
 
 
-def tracked(px, R, t, times, rig, frame_rate):
+def tracked(px, R, t, times, rig, frame_rate, settings=None, workers=1):
     """What tracking makes of located dots (n, 2, m, 2), followed near poses R, t."""
     setup = TrackingSetup(rig, MA_2014, None)  # no image is looked at
     follower = Follower(setup, Law((Edge(noise=NoiseModel(0.64, 0.02)),) * 2), measured=True)
-    return assemble(
-        [follower],
-        tables_of(px, R, t, DOT_PX),
-        TrackingSettings(),
-        Taken(range(len(px)), times, frame_rate, laboratory.G),
-    )
+    taken = Taken(range(len(px)), times, frame_rate, laboratory.G)
+    return assemble([follower], tables_of(px, R, t, DOT_PX), settings or TrackingSettings(), taken, workers)
 
 
 def errors_and_variances(trajectory, R, t):

@@ -9,7 +9,7 @@ from disctrack.track.dots.template import NoiseModel
 from disctrack.track.dots.template_response import Edge
 from disctrack.track.pose import marker_pixels
 from disctrack.track.refine.glare import shift_by_glare
-from tests.oracles.flat_dots import covered, locate_on_plane
+from tests.oracles.flat_dots import covered, locate_in_window
 
 N, DARK, PAPER, NOISE = 24, 8000.0, 50000.0, NoiseModel(1e4, 8.0)
 
@@ -36,13 +36,8 @@ def located(rendered_pairs):
                 plain = PAPER - (PAPER - DARK) * covered([centre - window], [A], 0.6)
                 place = np.stack([x, y], axis=-1) + window - middle
                 added = glare * np.exp(-0.5 * np.sum((place - [30, -20]) ** 2, axis=-1) / 70.0**2)
-                H = np.eye(3)
-                H[:2, :2], H[:2, 2] = A, centre - window
-                images = plain, plain * (1 - 4e-4 * place @ [1.0, 0.5]) + added
-                of_plain, of_lit = (
-                    locate_on_plane(np.rint(image).astype(np.uint16), H, np.zeros((1, 2)), 1.0, noise=NOISE)
-                    for image in images
-                )
+                lit = plain * (1 - 4e-4 * place @ [1.0, 0.5]) + added
+                of_plain, of_lit = (locate_in_window(image, centre, A, noise=NOISE) for image in (plain, lit))
                 shift[frame, dot] = (of_lit.pixels - of_plain.pixels)[0]
                 contrast[frame, 0, dot] = of_lit.contrast[0]
         found[kind] = contrast, shift

@@ -7,15 +7,14 @@ import numpy as np
 import pytest
 
 from disctrack import frames
-from disctrack.track.dots.template import NoiseModel, dot_centres
-from disctrack.track.dots.template_response import Edge
-from disctrack.track.follow.following import Follower, Law, TrackingSetup
+from disctrack.disc import MA_2014
+from disctrack.track.dots.template import dot_centres
 from disctrack.track.follow.tracking import stretch_edges
 from disctrack.track.pose import marker_pixels
-from disctrack.track.refine.assembly import Taken, TrackingSettings, assemble, fit_all
+from disctrack.track.refine.assembly import TrackingSettings, fit_all
 from disctrack.track.refine.self_calibration import DotsInFrames
 from disctrack.trajectory import FrameStatus
-from tests.oracles.point_laboratory import tables_of
+from tests.oracles.point_laboratory import DOT_PX, tables_of, tracked
 
 
 @pytest.mark.parametrize(
@@ -54,24 +53,19 @@ def test_what_the_fit_of_all_poses_needs_beside_its_result_does_not_grow_with_th
 
 def test_poses_are_the_same_to_the_last_bit_whoever_puts_them_together(rendered_pairs, rng, monkeypatch):
     monkeypatch.setattr("disctrack.track.refine.assembly.FITTED_AT_ONCE", 50)
-    rig, disc, m, n = rendered_pairs.rig, rendered_pairs.disc, rendered_pairs.disc.n_markers, 230
+    rig, n = rendered_pairs.rig, 230
     times = np.arange(n) / 1000.0
     angles = np.stack([0.1 + 9.0 * times, np.full(n, 0.35), 0.2 - 8.0 * times])
     R = frames.rotation_from_euler(*angles)
     t = rendered_pairs.q[0, :3] + 1e-3 * np.stack([np.cos(angles[0]), np.sin(angles[0]), 0.0 * times], axis=1)
-    sigma, printed = 0.004, disc.marker_centres_body + 20e-6 * rng.standard_normal((m, 3)) * [1, 1, 0]
+    printed = MA_2014.marker_centres_body + 20e-6 * rng.standard_normal((6, 3)) * [1, 1, 0]
     pixels = marker_pixels(R, t, rig, printed)[0]
-    pixels += sigma * rng.standard_normal(pixels.shape)
+    pixels += DOT_PX * rng.standard_normal(pixels.shape)
     pixels[100, 1, 2] += 3.0  # a dot to be struck
     pixels[160:163, 0] += 0.1  # frames to be refused
-    setup = TrackingSetup(rig, disc, None)  # no image is looked at
-    taken = Taken(range(n), times, 1000.0, 9.81)
 
     def by(workers, pixels=pixels):
-        follower = Follower(setup, Law((Edge(noise=NoiseModel(0.64, 0.02)),) * 2), measured=True)
-        return assemble(
-            [follower], tables_of(pixels, R, t, sigma), TrackingSettings(exposure=(1e-4, 1e-4)), taken, workers
-        )
+        return tracked(pixels, R, t, times, rig, 1000.0, TrackingSettings(exposure=(1e-4, 1e-4)), workers)
 
     one, three = by(1), by(3)
     assert (one.trajectory.frame_status != FrameStatus.MEASURED).any()

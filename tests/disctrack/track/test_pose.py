@@ -52,6 +52,11 @@ def pose_error(fits, R, t):
     return np.concatenate([fits.t_world_body - t, turn], axis=1)
 
 
+def chi_square(fits, R, t):
+    error = pose_error(fits, R, t)
+    return np.einsum("ni,nij,nj->n", error, np.linalg.inv(fits.covariance), error)
+
+
 def test_jacobian_agrees_with_central_differences(rng, rig, centres):
     _, R, t = poses(rng, 6)
     pixels, J = marker_pixels(R, t, rig, centres)
@@ -70,10 +75,8 @@ def test_pose_scatter_equals_the_predicted_covariance(rng, rig, centres):
     R, t, markers, covariance = filmed(rng, 500, rig, centres)
     fits = fit_poses(markers, covariance, rig, centres, *near(R, t, rng), with_sensitivity=False)
     assert fits.converged.all()
-    error = pose_error(fits, R, t)
-    squared = np.einsum("ni,nij,nj->n", error, np.linalg.inv(fits.covariance), error)
     # 500 x 6 degrees of freedom: the mean of chi-square / 6 scatters by sqrt(2 / 3000) = 0.026
-    assert abs(squared.mean() / 6 - 1) < 0.1
+    assert abs(chi_square(fits, R, t).mean() / 6 - 1) < 0.1
     assert abs(fits.reduced_chi_square.mean() - 1) < 0.06  # 500 x 18 degrees of freedom, 4 sigma
 
 
@@ -118,9 +121,7 @@ def test_one_camera_still_gives_a_pose_with_a_larger_sigma(rng, rig, centres):
     one = fit_poses(markers, covariance, rig, centres, R, t)
     assert one.converged.all()
     assert np.all(np.linalg.det(one.covariance) > np.linalg.det(both.covariance))
-    error = pose_error(one, R, t)
-    squared = np.einsum("ni,nij,nj->n", error, np.linalg.inv(one.covariance), error)
-    assert 0.7 < np.median(squared) / 5.35 < 1.3  # median of chi-square with 6 degrees of freedom
+    assert 0.7 < np.median(chi_square(one, R, t)) / 5.35 < 1.3  # median of chi-square with 6 degrees of freedom
 
 
 def test_three_dot_images_are_the_least_and_two_give_nothing(rng, rig, centres):
@@ -140,9 +141,7 @@ def test_a_wrong_dot_is_struck_and_named(rng, rig, centres, wrong_px):
     fits = fit_poses(markers, covariance, rig, centres, *near(R, t, rng))
     assert not fits.used[::2, 0, 2].any()
     assert fits.used.sum() == fits.used.size - 25  # no good dot with it
-    error = pose_error(fits, R, t)
-    squared = np.einsum("ni,nij,nj->n", error, np.linalg.inv(fits.covariance), error)
-    assert squared.mean() / 6 < 1.4
+    assert chi_square(fits, R, t).mean() / 6 < 1.4
     assert_allclose(np.abs(fits.residuals_px[::2, 0, 2, 0]), wrong_px, atol=0.2)  # still reported
 
 

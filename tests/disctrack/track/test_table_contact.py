@@ -15,7 +15,7 @@ from disctrack.track.refine import table_contact
 from disctrack.track.refine.assembly import fit_all
 from disctrack.track.refine.self_calibration import motions_of_pattern
 from disctrack.track.refine.table_contact import least_off_centre, off_centre, table_from_disc
-from tests.oracles.measured_disc import dots_of, measured
+from tests.oracles.measured_disc import assert_sized, dots_of, measured
 
 TURN, HEIGHT = (6e-4, -4e-4), 60e-6
 
@@ -121,8 +121,7 @@ def test_hollow_that_was_taken_for_a_slope_is_found_alone():
     levelled = replace(trajectory, q=q, quaternion=quaternion_from_rotation(fits.R_world_body), rig=rig)
     result = diagnose(replace(levelled, table_moved=table.beyond))
     assert [found.candidate.name for found in result.diagnosis.found] == ["table_curved"]
-    values, fit = result.diagnosis.after.values, result.diagnosis.after
-    assert abs(values["table_curved.kappa"] - 0.25) < 3 * fit.sigma("table_curved.kappa")
+    assert_sized(result.diagnosis.after, {"table_curved.kappa": 0.25}, 3)
     # as if the sigmas of board and disc held for the hollow, too
     assert [f.candidate.name for f in diagnose(levelled).diagnosis.found] != ["table_curved"]
 

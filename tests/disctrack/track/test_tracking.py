@@ -15,7 +15,7 @@ from disctrack.recording.readers.blocks import PairBlock, Unreadable
 from disctrack.track.follow.tracking import PAIRS_TRIED, TrackingSettings, _as_one_sensor, track
 from disctrack.track.measurement import measure, open_pairs
 from disctrack.trajectory import FrameStatus, MarkerStatus
-from tests.rendering import rolling_disc
+from tests.rendering import expected_disc, rolling_disc
 
 N = 60
 
@@ -49,6 +49,11 @@ def errors(trajectory, q):
     return np.concatenate([trajectory.q[:, :3] - q[:, :3], turn], axis=1)
 
 
+def pulls(trajectory, q):
+    """(n, 6) errors in their own sigmas."""
+    return np.abs(errors(trajectory, q)) / np.sqrt(np.diagonal(trajectory.pose_covariance, axis1=1, axis2=2))
+
+
 def test_a_rolling_disc_is_measured_to_the_predicted_sigma(rolling, rendered_pairs):
     images, q = rolling
     result = tracked(images, rendered_pairs)
@@ -80,8 +85,7 @@ def test_the_number_of_workers_changes_no_bit_of_the_result(rolling, rendered_pa
     assert (one.law, one.scatter) == (two.law, two.scatter)
     for name in ("q", "pose_covariance", "calibration_sensitivity", "markers_px", "marker_status", "quaternion"):
         assert np.array_equal(getattr(one.trajectory, name), getattr(two.trajectory, name), equal_nan=True), name
-    sigma = np.sqrt(np.diagonal(whole.trajectory.pose_covariance, axis1=1, axis2=2))
-    change = np.abs(errors(one.trajectory, whole.trajectory.q)) / sigma
+    change = pulls(one.trajectory, whole.trajectory.q)
     # a template keeps its attitude until the pose has turned by a tolerance, which moves a dot by up to 1e-3 px of a
     # scatter of 4e-3 px; when that happens hangs on the last digit of a pose, and for some frames after a start
     assert change.max() < 0.5
@@ -129,22 +133,6 @@ def test_a_stretch_that_begins_on_another_branch_of_phi_is_followed_again(rollin
     assert len(whole.trajectory) == len(torn.trajectory)
 
 
-@pytest.mark.statistical
-def test_an_empty_scene_is_seldom_searched_and_a_disc_put_there_is_found_at_once(rolling, rendered_pairs, monkeypatch):
-    from disctrack.track.follow import following
-
-    searched = []
-    found = following.acquire
-    monkeypatch.setattr(following, "acquire", lambda *a: searched.append(1) or found(*a))
-    rng = np.random.default_rng(4)
-    images = rolling[0].copy()
-    images[:30] = np.clip(np.round(85 + 1.3 * rng.standard_normal((30, *images.shape[1:]))), 0, 255)
-    result = tracked(images, rendered_pairs)
-    assert (result.trajectory.frame_status[:30] == FrameStatus.MARKERS_NOT_FOUND).all()
-    assert (result.trajectory.frame_status[30:] == FrameStatus.MEASURED).all()
-    assert len(searched) <= 6  # at growing intervals, and two where the disc is found
-
-
 def test_lost_and_unreadable_pairs_are_gaps_with_a_reason_and_the_rest_is_measured(rolling, rendered_pairs):
     images, q = rolling
     images = images.copy()
@@ -162,7 +150,7 @@ def test_lost_and_unreadable_pairs_are_gaps_with_a_reason_and_the_rest_is_measur
     assert np.isnan(result.trajectory.q[[10, 11, 12, 20]]).all()
     sigma = np.sqrt(np.diagonal(result.trajectory.pose_covariance, axis1=1, axis2=2))
     assert (sigma[30, :3] > 5 * sigma[29, :3]).all()  # depth rests on the pattern's size in one image
-    assert (np.abs(errors(result.trajectory, q)[rest]) < 6 * sigma[rest]).all()
+    assert (pulls(result.trajectory, q)[rest] < 6).all()
     assert np.isfinite(result.trajectory.time).all()
 
 
@@ -175,8 +163,7 @@ def test_a_hidden_dot_costs_sigma_not_truth(rolling, rendered_pairs):
         images[i, 0, v - 18 : v + 18, u - 6 : u + 25] = 120
     result = tracked(images, rendered_pairs)
     assert np.isnan(result.trajectory.markers_px[10:20, 0, 1]).all()
-    sigma = np.sqrt(np.diagonal(result.trajectory.pose_covariance, axis1=1, axis2=2))
-    assert (np.abs(errors(result.trajectory, q[:30])) < 6 * sigma).all()
+    assert (pulls(result.trajectory, q[:30]) < 6).all()
 
 
 def test_misprinted_dots_are_found_and_used(rolling, rendered_pairs):
@@ -209,8 +196,6 @@ def test_dots_that_carry_no_pose_are_refused(rendered_pairs, keep):
 
 
 def test_a_sensor_without_noise_is_not_refused_for_the_templates_own_misfit(rendered_pairs):
-    from tests.rendering import expected_disc
-
     q = rendered_pairs.q[[4, 5, 6]]
     images = np.round(16 * expected_disc(q, rendered_pairs.rig, rendered_pairs.disc, rendered_pairs.scene)).astype(
         np.uint16

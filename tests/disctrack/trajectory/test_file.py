@@ -117,11 +117,17 @@ def test_h5py_finds_units_axes_and_whole_chunks(file):
         assert meanings[h5["status"][3]] == "unreadable"
 
 
+@pytest.fixture(params=["h5netcdf", "netCDF4"])
+def engine(request):
+    """What xarray may read the file by."""
+    pytest.importorskip("xarray")
+    return pytest.importorskip(request.param).__name__.lower()
+
+
 @pytest.mark.statistical
-@pytest.mark.parametrize("engine", ["h5netcdf", "netcdf4"])
 def test_xarray_opens_root_and_groups_with_their_axes(file, trajectory, engine):
-    xarray = pytest.importorskip("xarray")
-    pytest.importorskip({"netcdf4": "netCDF4"}.get(engine, engine))
+    import xarray
+
     with xarray.open_dataset(file, engine=engine) as data:
         assert data["x"].dims == ("time",)
         assert data["x"].attrs["units"] == "m"
@@ -161,10 +167,9 @@ def test_findings_come_back_and_doubts_are_python_warnings(tmp_path, trajectory)
 
 
 @pytest.mark.statistical
-@pytest.mark.parametrize("engine", ["h5netcdf", "netcdf4"])
 def test_what_was_found_and_chosen_are_plain_attributes_that_a_later_stage_keeps(tmp_path, trajectory, engine):
-    xarray = pytest.importorskip("xarray")
-    pytest.importorskip({"netcdf4": "netCDF4"}.get(engine, engine))
+    import xarray
+
     path = tmp_path / "t.h5"
     details = {
         "words": ["one", "two"], "notes": [], "blur_px": (0.7, np.inf), "first_pass": {"moves": True, "start": 3},

@@ -145,16 +145,11 @@ def test_static_poses_cover_the_range_and_stand_on_the_table(rng):
 
 
 def poses_seen_by_both(n, rig, scene, rng):
-    """(n, 6) poses that both cameras see, from 3 to 30 deg of nutation, near the middle of the field."""
-    disc, found = scene.declared_disc, []
-    for theta in np.radians(np.geomspace(3.0, 30.0, n)):
-        seen = 0
-        while seen < 2:
-            x, y = np.array(scene.rig.target_mm[:2]) * 1e-3 + rng.uniform(-8e-3, 8e-3, 2)
-            q = np.array([x, y, disc.resting_height(theta), rng.uniform(-np.pi, np.pi), theta, rng.uniform(0, 6)])
-            seen = cameras_in_sight(q[None], rig, disc)[0]
-        found.append(q)
-    return np.array(found)
+    """(n, 6) poses that both cameras see, from 3 to 30 deg of nutation."""
+    disc = scene.declared_disc
+    q = static_poses(64, rig, disc, scene.rig.target_mm[:2], rng)
+    seen = (cameras_in_sight(q, rig, disc) == 2) & (np.radians(3) < q[:, 4]) & (q[:, 4] < np.radians(30))
+    return rng.choice(q[seen], n, replace=False)
 
 
 def test_pairs_apart_are_each_found_without_the_one_before(rng):
