@@ -70,6 +70,13 @@ def corner_view(points, sigma=0.1, image_size=(640, 480)) -> CornerView:
     return CornerView(image_size, points, covariance, np.ones(n, bool), ("",) * n)
 
 
+def squared(error, covariance) -> float:
+    """Squared error over its covariance, per number, of numbers in units of their own."""
+    sigma = np.sqrt(np.diag(covariance))
+    z = error / sigma
+    return float(z @ np.linalg.solve(covariance / np.outer(sigma, sigma), z)) / len(z)
+
+
 @pytest.fixture(scope="session")
 def scene_maker():
     return make_scene

@@ -17,7 +17,7 @@ from calibration.judge.pairs import motion_between_exposures
 from calibration.judge.tolerances import BoardTolerances
 from calibration.rig_file import read_rig_file, write_rig
 from calibration.stereo import _observations
-from tests.calibration.conftest import corner_view
+from tests.calibration.conftest import corner_view, squared
 from tests.oracles import imperfect_laboratory as laboratory
 from tests.oracles import moved_boards, point_laboratory
 
@@ -43,13 +43,7 @@ def errors(found, rig):
     return error, found.rig.covariance[np.ix_(places, places)]
 
 
-def squared(error, covariance):
-    sigma = np.sqrt(np.diag(covariance))
-    z = error / sigma
-    return float(z @ np.linalg.solve(covariance / np.outer(sigma, sigma), z)) / len(z)
-
-
-@pytest.mark.parametrize("known", ["motion", "prior"])
+@pytest.mark.parametrize("known", ["motion", "prior", "outliers"])
 def test_normal_equations_have_the_cost_and_the_gradient_that_they_say(scene_maker, rng, known):
     scene = scene_maker(n_views=3, inner_corners=(4, 3))
     nominal, moving = scene.board.points, known == "motion"
@@ -60,18 +54,27 @@ def test_normal_equations_have_the_cost_and_the_gradient_that_they_say(scene_mak
     model = moved(begun, 1e-4 * rng.normal(size=24), 1e-3 * rng.normal(size=(3, k)), deviation)
     basis, stereo_basis = board_basis(nominal, "warped" if moving else "free"), Terms("k1").stereo_basis()
     problem = Problem(observations, np.linalg.inv(observations.covariance), stereo_basis, basis, 3)
-    if moving:
-        problem = replace(problem, motion=BoardMotion(2e-3, 5e-4))
-    else:
-        problem = replace(problem, prior=replace(priors_of(scene.model, nominal, basis), weight=3.0))
+    problem = {
+        "motion": replace(problem, motion=BoardMotion(2e-3, 5e-4)),
+        "prior": replace(problem, prior=replace(priors_of(scene.model, nominal, basis), weight=3.0)),
+        "outliers": replace(problem, huber=30.0),
+    }[known]
+
+    def distances(model):
+        r = observations.pixels - predict_pixels(model, observations)
+        return np.sqrt(np.einsum("mi,mij,mj->m", r, problem.weights, r))
 
     def cost(model):
-        r = observations.pixels - predict_pixels(model, observations)
-        data = np.einsum("mi,mij,mj->", r, problem.weights, r)
-        if moving:
-            return data + np.sum(motions(model)[0] ** 2 * problem.motion.weights)
-        return data + problem.prior.normal(model)[2] + 3.0 * problem.prior.board.normal(model.points)[1]
+        distance = distances(model)
+        within = np.minimum(distance, problem.huber)
+        data = np.sum(within * (2 * distance - within))
+        if problem.motion is not None:
+            data += np.sum(motions(model)[0] ** 2 * problem.motion.weights)
+        if problem.prior is not None:
+            data += problem.prior.normal(model)[2] + 3.0 * problem.prior.board.normal(model.points)[1]
+        return data
 
+    assert known != "outliers" or 0.1 < np.mean(distances(model) > problem.huber) < 0.9
     normal = problem.linearise(model)
     assert_allclose(normal.cost, cost(model), rtol=1e-12)
     s = stereo_basis.shape[1] + basis.shape[-1]
@@ -83,6 +86,9 @@ def test_normal_equations_have_the_cost_and_the_gradient_that_they_say(scene_mak
         # turns of the motion count to first order: some 1e-3 of it here
         tolerance = 5e-6 * np.linalg.norm(direction)
         assert_allclose(-(there - back) / 4, normal.gain(shared, poses), rtol=5e-3, atol=tolerance)
+    if not moving:
+        behind = replace(model, t_left_board=model.t_left_board * [1, 1, -1])
+        assert np.isinf(problem.linearise(behind).cost)
 
 
 @pytest.mark.statistical
@@ -146,9 +152,8 @@ def test_pairs_that_were_synchronised_have_no_motion():
 @pytest.mark.statistical
 @pytest.mark.parametrize("seed", [404, 416])
 def test_a_field_of_the_lenses_is_no_motion_of_the_boards(seed, rng):
-    plan = laboratory.Plan(seed)
-    cameras, target, draws = point_laboratory.cameras_of(plan)
-    found = point_laboratory.calibration_of(plan, cameras, target, draws, settings=CalibrationSettings())
+    plan, draws = laboratory.Plan(seed), np.random.default_rng([seed, 11])
+    found = point_laboratory.calibration_of(plan, *laboratory.cameras_of(plan, draws), draws, CalibrationSettings())
     assert found.lens is not None
     assert found.refinement.problem.motion is None
     assert not any("synchronised" in text for text in found.warnings)

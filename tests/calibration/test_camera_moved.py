@@ -7,8 +7,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 from calibration import calibrate_from_corners
-from tests.calibration.conftest import corner_view
-from tests.calibration.test_board_motion import BOARD, SETTINGS, errors, squared
+from tests.calibration.conftest import corner_view, squared
+from tests.calibration.test_board_motion import BOARD, SETTINGS, errors
 from tests.oracles import moved_boards
 
 TURN = np.radians([0.05, -0.04, 0.03])  # 0.07 deg: 1.1 px, as when somebody touches a camera

@@ -4,13 +4,12 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from calibration import Board, CalibrationSettings, calibrate_from_corners
+from calibration import CalibrationSettings, calibrate_from_corners
 from calibration.fit.priors import BEND, MISPRINT, STRETCH, board_prior
 from calibration.fit.stereo_model import board_basis
-from tests.calibration.test_board_motion import EXACT, corner_view, errors, squared
+from tests.calibration.conftest import corner_view, squared
+from tests.calibration.test_board_motion import BOARD, EXACT, errors
 from tests.oracles import moved_boards
-
-BOARD = Board(moved_boards.INNER_CORNERS, moved_boards.SQUARE)
 
 
 def mean_square(n, distortion="auto", board="auto", rigs=16, displaced=None):

@@ -1,6 +1,7 @@
 """Closed forms of a body without contact: a parabola, and the regular precession of a symmetric free top."""
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 
 def centre(x0, v0, gravity, t):
@@ -18,13 +19,6 @@ def symmetric_top(R0, omega0_world, J1, J3, t):
     omega3 = omega0_world @ axis
     G = J1 * (omega0_world - omega3 * axis) + J3 * omega3 * axis
     spin = (1 - J3 / J1) * omega3
-    return np.array([_turn(G / J1 * ti) @ R0 @ _turn(np.array([0, 0, spin]) * ti) for ti in t])
-
-
-def _turn(v):
-    angle = np.linalg.norm(v)
-    if angle == 0:
-        return np.eye(3)
-    n = v / angle
-    N = np.array([[0, -n[2], n[1]], [n[2], 0, -n[0]], [-n[1], n[0], 0]])
-    return np.eye(3) + np.sin(angle) * N + (1 - np.cos(angle)) * N @ N
+    t = np.asarray(t)[:, None]
+    about_G, about_axis = (Rotation.from_rotvec(t * rate).as_matrix() for rate in (G / J1, np.array([0, 0, spin])))
+    return about_G @ R0 @ about_axis

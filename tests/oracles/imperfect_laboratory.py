@@ -20,18 +20,17 @@ RADIUS, HALF_THICKNESS, MASS, G = 37.5e-3, 3e-3, 0.20969, 9.81
 DOT_RADIUS = 3.5e-3
 ANGLES = np.radians([0, 60, 120, 180, 240, 300])
 DOTS = np.column_stack([np.cos(ANGLES), np.sin(ANGLES)]) * np.array([26, 26, 26, 26, 26, 13.0])[:, None] * 1e-3
-K_M = 0.381e-7
-SAMPLES = 8  # of the motion per frame
+BOARD_THICKNESS = 3e-3
 GAUSS = ((-0.7745966692414834, 5 / 18), (0.0, 8 / 18), (0.7745966692414834, 5 / 18))
 
-# What hides in the motion: changes of the body that newton_euler follows.
+# What hides in the motion: laws and changes of the body that newton_euler follows.
 EFFECTS = {
-    "none": {},
-    "tilt": {"gravity": (G * np.sin(np.radians(0.1)), 0.0, -G * np.cos(np.radians(0.1)))},
-    "kz": {"laws": (newton_euler.pivoting_friction(30e-6),)},
-    "com": {"com_body": (50e-6, 0.0, 0.0)},
-    "rolling": {"laws": (newton_euler.classical_rolling_friction(30e-6),)},
-    "drag": {"laws": (lambda disc, now: (-2.5e-6 * now.omega, newton_euler.ZERO, newton_euler.ZERO),)},
+    "none": ((), {}),
+    "tilt": ((), {"gravity": (G * np.sin(np.radians(0.1)), 0.0, -G * np.cos(np.radians(0.1)))}),
+    "kz": ((newton_euler.pivoting_friction(30e-6),), {}),
+    "com": ((), {"com_body": (50e-6, 0.0, 0.0)}),
+    "rolling": ((newton_euler.classical_rolling_friction(30e-6),), {}),
+    "drag": ((lambda disc, now: (-2.5e-6 * now.omega, newton_euler.ZERO, newton_euler.ZERO),), {}),
 }
 
 
@@ -42,7 +41,6 @@ class Imperfections:
     lens_field: float = 0.02  # [px] rms per axis
     bow: float = 60e-6  # [m] of the board, middle against short sides
     stretch: float = 2e-4  # squares longer along the long side
-    thickness: float = 0.0  # [m] true minus declared thickness of the board
     gains: float = 0.01  # rms of the pixels' gains
     columns: float = 0.3  # [grey] rms of the columns' offsets
     curve: float = 0.03  # largest departure of the response from a straight line, of full scale
@@ -99,6 +97,8 @@ class Plan:
     size: int = 512
     mm_per_px: float = 0.25
     n_views: int = 20
+    azimuths: tuple[float, float] = (-122.0, -53.0)  # [deg] of the cameras
+    inner_corners: tuple[int, int] = (9, 6)
     square: float = 8e-3
     theta_deg: float = 12.0
     omega3: float = 1.5
@@ -110,9 +110,17 @@ class Plan:
     blur: float = 0.62  # [px]
     trouble: Trouble = Trouble()
     board_heights: tuple = (5e-3, 40e-3)  # [m] of the board's middle over the target
-    half_thickness: float = HALF_THICKNESS
-    lag: float = 0.0  # [s] by which the right camera is late
-    wrong_dot: float = 0.0  # [m] by which dot 1 is not where it is declared, along x
+
+    @property
+    def board_size(self):
+        """[m] of the board from the first to the last corner, along both sides."""
+        return self.square * (np.array(self.inner_corners) - 1)
+
+
+def cameras_of(plan, rng):
+    """The two cameras, and the place that they look at."""
+    target = np.array([0.032, 0.02, 0.004]) + rng.normal(0, 5e-4, 3)
+    return [Camera(rng, plan, azimuth, target) for azimuth in plan.azimuths], target
 
 
 class Camera:
@@ -191,7 +199,7 @@ class Camera:
         return found
 
     def plane(self, rays, R, t, height):
-        """Where rays (..., 2) meet the plane z = height of a body at R, t: two arrays of body coordinates."""
+        """Where rays (..., 2) meet z = height (one, or one a ray) of a body at R, t: two arrays of body coordinates."""
         o = R.T @ (self.place - t)
         M = R.T @ self.R.T
         d = [rays[..., 0] * M[i, 0] + rays[..., 1] * M[i, 1] + M[i, 2] for i in range(3)]
@@ -218,11 +226,10 @@ def gathered(fine, blur):
 def board_image(camera, plan, R, t, rng):
     """One view of the board; R, t of the board's frame: origin at corner 0 of the printed face's undeformed plane."""
     faults, a = plan.imperfections, plan.square
-    long, short = 8 * a, 5 * a
+    long, short = plan.board_size
     x, y = camera.plane(camera.rays, R, t, 0.0)
     for _ in range(3):
-        height = board_height(x / (1 + faults.stretch), plan)
-        x, y = _deeper(camera, R, t, height)
+        x, y = camera.plane(camera.rays, R, t, board_height(x / (1 + faults.stretch), plan))
     x = x / (1 + faults.stretch)
     w = plan.mm_per_px * 1e-3 / SUB  # of a sub-pixel on the board, near enough for the antialiasing
 
@@ -242,18 +249,20 @@ def board_image(camera, plan, R, t, rng):
 
 def board_height(x, plan):
     """Height [m] of the printed face above its lowest part, at x [m] along the long side."""
-    bow = plan.imperfections.bow
-    along = (x - 4 * plan.square) / (5 * plan.square)
+    bow, half = plan.imperfections.bow, 0.5 * plan.board_size[0]
+    along = (x - half) / (half + plan.square)
     return bow * (1 - along**2) if plan.seed % 2 else bow * along**2
 
 
-def _deeper(camera, R, t, height):
-    o = R.T @ (camera.place - t)
-    M = R.T @ camera.R.T
-    rays = camera.rays
-    d = [rays[..., 0] * M[i, 0] + rays[..., 1] * M[i, 1] + M[i, 2] for i in range(3)]
-    s = (height - o[2]) / d[2]
-    return o[0] + s * d[0], o[1] + s * d[1]
+def board_pose(view, plan, target, rng):
+    """R, t of the printed face; the first view is that of the board on the table."""
+    if not view:
+        return np.eye(3), np.array([0.0, 0.0, BOARD_THICKNESS])
+    azimuth = rng.uniform(0, 2 * np.pi)
+    R = cv2.Rodrigues(rng.uniform(0, np.radians(38)) * np.array([np.cos(azimuth), np.sin(azimuth), 0]))[0]
+    R = R @ cv2.Rodrigues(np.array([0, 0, rng.uniform(-1, 1) * np.radians(35)]))[0]
+    place = target + np.array([*rng.uniform(-0.022, 0.022, 2), rng.uniform(*plan.board_heights)])
+    return R, place - R @ np.array([*(0.5 * plan.board_size), 0.0])
 
 
 def disc_image(camera, plan, poses, dots, rng, frame=0):
@@ -304,65 +313,49 @@ def disc_image(camera, plan, poses, dots, rng, frame=0):
 
 def motion(plan):
     """Spline of (x, y, z, psi, theta, phi) over time."""
-    changes = dict(EFFECTS[plan.effect])
-    laws = (newton_euler.precession_friction(K_M), *changes.pop("laws", ()))
-    body = newton_euler.Disc(RADIUS, plan.half_thickness, MASS, laws=laws, **changes)
-    theta = np.radians(plan.theta_deg)
-    omega2 = np.sqrt(4 * G * np.sin(theta) / RADIUS)
-    psi0 = 0.7 + 1.9 * plan.seed
-    state = newton_euler.state_from_angles(body, 0.032, 0.02, psi0, theta, -0.4, 0.0, omega2, plan.omega3)
-    lead = 0.005
-    times = np.arange(0.0, plan.n_frames / plan.frame_rate + 2 * lead, 1.0 / (SAMPLES * plan.frame_rate))
-    answer = newton_euler.follow(body, state, times, rtol=1e-10, atol=1e-11, method="LSODA")
-    return newton_euler.course(body, times - lead, answer.y)
+    laws, changes = EFFECTS[plan.effect]
+    body, duration = newton_euler.of_the_paper(*laws, **changes), plan.n_frames / plan.frame_rate
+    return newton_euler.filmed_motion(
+        body, plan.theta_deg, plan.omega3, duration, plan.frame_rate, psi=0.7 + 1.9 * plan.seed
+    )
 
 
-def pose_at(spline, time):
+def pose_of(q):
     """(R, t) of the disc."""
-    q = spline(time)
     return newton_euler.matrix_of(newton_euler.quaternion_from_angles(*q[3:])), q[:3]
 
 
-def write(folder, plan, board_image=board_image, disc_image=disc_image, nodes=3):
+def poses_during(spline, time, exposure):
+    """(R, t, weight) of the disc over an exposure about this time, in the order of time."""
+    nodes = GAUSS if exposure else ((0.0, 1.0),)
+    return [(*pose_of(spline(time + 0.5 * exposure * x)), weight) for x, weight in nodes]
+
+
+def write(folder, plan, board_image=board_image, disc_image=disc_image):
     """A recording's folder, with truth.npz beside recording.toml. Returns the folder.
 
     board_image, disc_image : what draws a view and a frame
-    nodes : instants of an exposure
     """
-    folder, faults = Path(folder), plan.imperfections
-    rng = np.random.default_rng([plan.seed, 7])
-    target = np.array([0.032, 0.02, 0.004]) + rng.normal(0, 5e-4, 3)
-    cameras = [Camera(rng, plan, azimuth, target) for azimuth in (-122.0, -53.0)]
-    dots = DOTS + faults.misprint * rng.normal(size=DOTS.shape)
-    dots[1, 0] += plan.wrong_dot
-    thickness = 3e-3
-    for name in ("left", "right", "calibration/left", "calibration/right"):
+    folder, rng = Path(folder), np.random.default_rng([plan.seed, 7])
+    cameras, target = cameras_of(plan, rng)
+    both = {"left": cameras[0], "right": cameras[1]}
+    dots = DOTS + plan.imperfections.misprint * rng.normal(size=DOTS.shape)
+    for name in both:
         (folder / name).mkdir(parents=True, exist_ok=True)
+        (folder / "calibration" / name).mkdir(parents=True, exist_ok=True)
 
     def save(name, image):
         cv2.imwrite(str(folder / name), image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
 
     for view in range(plan.n_views):
-        R, t = np.eye(3), np.array([0, 0, thickness + faults.thickness])
-        if view:
-            tilt, turn = rng.uniform(0, np.radians(38)), rng.uniform(-1, 1) * np.radians(35)
-            axis = rng.uniform(0, 2 * np.pi)
-            tilted = cv2.Rodrigues(tilt * np.array([np.cos(axis), np.sin(axis), 0]))[0]
-            R = tilted @ cv2.Rodrigues(np.array([0, 0, turn]))[0]
-            middle = np.array([4, 2.5, 0]) * plan.square
-            place = target + np.array([*rng.uniform(-0.022, 0.022, 2), rng.uniform(*plan.board_heights)])
-            t = place - R @ middle
-        for name, camera in zip(("left", "right"), cameras, strict=True):
+        R, t = board_pose(view, plan, target, rng)
+        for name, camera in both.items():
             save(f"calibration/{name}/{view:04d}.png", board_image(camera, plan, R, t, rng))
     spline = motion(plan)
     times = np.arange(plan.n_frames) / plan.frame_rate
-    instants = np.polynomial.legendre.leggauss(nodes) if faults.exposure else ([0.0], [2.0])
     for i, time in enumerate(times):
-        for name, camera, late in zip(("left", "right"), cameras, (0.0, plan.lag), strict=True):
-            middle = time + late
-            poses = [
-                (*pose_at(spline, middle + 0.5 * faults.exposure * x), 0.5 * w) for x, w in zip(*instants, strict=True)
-            ]
+        poses = poses_during(spline, time, plan.imperfections.exposure)
+        for name, camera in both.items():
             save(f"{name}/{i:06d}.png", disc_image(camera, plan, poses, dots, rng, i))
     centres = ", ".join(f"[{x * 1e3:.4f}, {y * 1e3:.4f}]" for x, y in DOTS)
     (folder / "recording.toml").write_text(
@@ -375,7 +368,7 @@ right = "right/*.png"
 
 [disc]
 radius_mm = {RADIUS * 1e3}
-thickness_mm = {plan.half_thickness * 2e3}
+thickness_mm = {HALF_THICKNESS * 2e3}
 mass_g = {MASS * 1e3}
 
 [markers]
@@ -385,23 +378,18 @@ centres_mm = [{centres}]
 [calibration]
 left = "calibration/left/*.png"
 right = "calibration/right/*.png"
-inner_corners = [9, 6]
+inner_corners = {[*plan.inner_corners]}
 square_mm = {plan.square * 1e3}
 
 [table]
 view = 0
-board_thickness_mm = {thickness * 1e3}
+board_thickness_mm = {BOARD_THICKNESS * 1e3}
 
 [gravity]
 g_m_s2 = {G}
 """,
         encoding="utf-8",
     )
-    truth = {"time": times, "q": spline(times), "dots": dots}
-    for name, camera in zip(("left", "right"), cameras, strict=True):
-        truth |= {f"{name}_R": camera.R, f"{name}_place": camera.place}
-        truth[f"{name}_intrinsics"] = np.array([camera.focal, *camera.middle, camera.k1, camera.k2])
-        grid = np.stack(np.meshgrid(np.arange(0, plan.size, 16.0), np.arange(0, plan.size, 16.0)), -1)
-        truth[f"{name}_field"] = camera.field(grid)
-    np.savez(folder / "truth.npz", effect=plan.effect, **truth)
+    intrinsics = {f"{name}_intrinsics": np.array([camera.focal, *camera.middle]) for name, camera in both.items()}
+    np.savez(folder / "truth.npz", q=spline(times), **intrinsics)
     return folder

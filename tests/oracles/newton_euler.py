@@ -6,53 +6,51 @@ written once more from their published form. Slow, and meant to be.
 State: O (3), quaternion (4), velocity of O (3), omega (3), all in world axes; psi and phi by quadrature (2).
 """
 
+from collections.abc import Callable, Sequence
 from copy import copy
+from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicHermiteSpline, make_interp_spline
 from scipy.optimize import brentq
 
 K = np.array([0.0, 0.0, 1.0])
+K_M = 0.381e-7  # the paper's friction
+LEAD = 0.005  # [s] of motion before the first frame
+SAMPLES = 8  # of the motion per frame; the cubic between them errs by 1e-4 of the noise
 
 
+@dataclass
 class Disc:
-    """Numbers of the body; defaults are the homogeneous disc with a sharp edge."""
+    """The body and what it rolls on; defaults are the paper's disc, homogeneous with a sharp edge, on a flat table."""
 
-    def __init__(
-        self,
-        r,
-        h,
-        m,
-        gravity=(0, 0, -9.81),
-        J_body=None,
-        com_body=(0, 0, 0),
-        edge=0.0,
-        mu=np.inf,
-        laws=(),
-        bowl=None,
-        waves=(),
-        dips=(),
-        table=None,
-        carries=None,
-        gives_way=0.0,
-    ):
-        self.r, self.h, self.m, self.edge, self.mu, self.laws = r, h, m, edge, mu, laws
-        self.bowl = None if bowl is None else (np.array(bowl[0], float), bowl[1])  # centre and radius of a sphere
-        self.waves = waves  # of the rim: (number around, cosine, sine) of its support function
-        self.dips = dips  # of the rim: (depth, angle in the body, width)
-        self.gives_way = gives_way  # compliance of a table that `yielding` makes move [m/N]
-        self.table = table  # t -> displacement, velocity, acceleration in the axes of the world; None: at rest
-        self.carries = carries  # velocity (3,) of the table's surface at the origin, and its rate of turn
-        self.wears = 0.0  # [m/s] by which the radius shrinks; `r` is that of the instant
-        self.g = np.array(gravity, float)
-        J1 = m * r * r / 4 + m * h * h / 3
-        self.J = np.diag([J1, J1, m * r * r / 2]) if J_body is None else np.array(J_body, float)
-        self.com = np.array(com_body, float)
-        self.t = 0.0
+    r: float = 37.5e-3
+    h: float = 3e-3
+    m: float = 0.20969
+    gravity: Sequence[float] = (0, 0, -9.81)
+    J_body: NDArray | None = None
+    com_body: Sequence[float] = (0, 0, 0)
+    edge: float = 0.0
+    mu: float = np.inf
+    laws: Sequence[Callable] = ()
+    bowl: tuple | None = None  # centre and radius of a sphere that it rolls in
+    waves: tuple = ()  # of the rim: (number around, cosine, sine) of its support function
+    dips: tuple = ()  # of the rim: (depth, angle in the body, width)
+    table: Callable | None = None  # t -> displacement, velocity, acceleration in the axes of the world; None: at rest
+    carries: tuple | None = None  # velocity (3,) of the table's surface at the origin, and its rate of turn
+    gives_way: float = 0.0  # compliance of a table that `yielding` makes move [m/N]
+    wears: float = 0.0  # [m/s] by which the radius shrinks; `r` is that of the instant
+    t: float = 0.0  # the instant that laws may ask for
+
+    def __post_init__(self):
+        J1 = self.m * self.r**2 / 4 + self.m * self.h**2 / 3
+        self.J = np.diag([J1, J1, self.m * self.r**2 / 2]) if self.J_body is None else self.J_body
+        self.g, self.com = np.array(self.gravity, float), np.array(self.com_body, float)
 
     def at(self, t):
-        """Itself, at an instant that laws may ask for."""
+        """Itself, at an instant."""
         self.t = t
         return self
 
@@ -259,6 +257,21 @@ def course(disc, times, states):
     return CubicHermiteSpline(times, coordinates(disc, states), speed)
 
 
+def filmed_motion(disc, theta_deg, omega3, duration, rate, psi=0.7):
+    """Spline of q over time, from LEAD before the first frame on; a start near steady precession is the nutation."""
+    theta = np.radians(theta_deg)
+    omega2 = np.sqrt(4 * 9.81 * np.sin(theta) / disc.r)  # thin disc, centre at rest
+    start = (0.032, 0.02, psi, theta, -0.4, 0.0, omega2, omega3)
+    state = state_from_angles(disc, *start)
+    times = np.arange(0.0, duration + 2 * LEAD, 1.0 / (SAMPLES * rate))
+    if disc.gives_way:
+        disc.table = yielding(disc, state, times)
+        state = state_from_angles(disc.at(0.0), *start)
+    answer = follow(disc, state, times, rtol=1e-10, atol=1e-11, method="LSODA")
+    assert answer.success
+    return course(disc, times - LEAD, answer.y)
+
+
 # Laws: functions of (disc, instant) -> moment independent of the load, moment per load, force at O; world axes.
 ZERO = np.zeros(3)
 
@@ -350,3 +363,8 @@ def linear_drag(c):
 
 def moffatt(viscosity):
     return lambda disc, now: (-np.pi * viscosity * disc.r**3 / 4 * now.psidot / now.sine**2 * now.m0, ZERO, ZERO)
+
+
+def of_the_paper(*laws, **changes):
+    """The paper's disc with its friction; laws on top of it, and whatever is changed in the disc."""
+    return Disc(laws=(precession_friction(K_M), *laws), **changes)

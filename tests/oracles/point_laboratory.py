@@ -4,9 +4,6 @@ The independent laboratory's lenses, its bowed and stretched board and its rolli
 dots, with noise; whatever follows (calibration, what the dots share, poses, table) is the product's own.
 """
 
-from dataclasses import dataclass
-
-import cv2
 import numpy as np
 
 from calibration import Board, CalibrationSettings, CornerView, calibrate_from_corners
@@ -24,39 +21,6 @@ CORNER_PX, DOT_PX = 0.0024, 0.0045  # noise per axis of corners and dots in that
 TERMS = {True: ("k1 k2 p1 p2 k3", "free"), False: ("k1 k2", "flat")}  # as chosen there by views left out
 
 
-@dataclass(frozen=True)
-class Geometry:
-    """Where the cameras stand, and the board they are shown."""
-
-    azimuths: tuple[float, float] = (-122.0, -53.0)  # [deg]
-    inner_corners: tuple[int, int] = (9, 6)
-    square: float = 8e-3  # [m]
-    views: int = 20
-
-    @property
-    def board(self):
-        """As declared."""
-        return Board(self.inner_corners, self.square)
-
-
-def cameras_of(plan, geometry=None):
-    """The two cameras of a plan's seed, whose images nobody casts, and the place that they look at."""
-    geometry = geometry or Geometry()
-    rng = np.random.default_rng([plan.seed, 11])
-    target = np.array([0.032, 0.02, 0.004]) + rng.normal(0, 5e-4, 3)
-    return [laboratory.Camera(rng, plan, azimuth, target) for azimuth in geometry.azimuths], target, rng
-
-
-def true_corners(plan, board):
-    """(n, 3) [m] of the board as made: bowed along its long side, and longer there."""
-    x, y, _ = board.points.T
-    half = 0.5 * x.max()
-    along = (x - half) / (half + board.square)
-    bow = plan.imperfections.bow
-    height = bow * (1 - along**2) if plan.seed % 2 else bow * along**2
-    return np.stack([x * (1 + plan.imperfections.stretch), y, height], -1)
-
-
 def corner_view(camera, points, rng):
     """Corners (n, 3) [m] in the world as a finder would state them."""
     n = len(points)
@@ -69,53 +33,43 @@ def corner_view(camera, points, rng):
     )
 
 
-def calibration_of(plan, cameras, target, rng, geometry=None, settings=None):
-    """The rig from views of the board, the first of which lies on the table."""
-    geometry = geometry or Geometry()
-    board, thickness = geometry.board, 3e-3
-    points = true_corners(plan, board)
-    middle = 0.5 * board.points.max(axis=0)
+def calibration_of(plan, cameras, target, rng, settings=None):
+    """The rig from views of the board, which is bowed along its long side, and longer there than declared."""
+    board = Board(plan.inner_corners, plan.square)
+    x, y, _ = board.points.T
+    points = np.stack([x * (1 + plan.imperfections.stretch), y, laboratory.board_height(x, plan)], -1)
     views = ([], [])
-    for view in range(geometry.views):
-        R, t = np.eye(3), np.array([0, 0, thickness + plan.imperfections.thickness])
-        if view:
-            azimuth = rng.uniform(0, 2 * np.pi)
-            axis = np.array([np.cos(azimuth), np.sin(azimuth), 0])
-            R = cv2.Rodrigues(rng.uniform(0, np.radians(38)) * axis)[0]
-            R = R @ cv2.Rodrigues(np.array([0, 0, rng.uniform(-1, 1) * np.radians(35)]))[0]
-            t = target + np.array([*rng.uniform(-0.022, 0.022, 2), rng.uniform(5e-3, 40e-3)]) - R @ middle
+    for view in range(plan.n_views):
+        R, t = laboratory.board_pose(view, plan, target, rng)
         for side, camera in zip(views, cameras, strict=True):
             side.append(corner_view(camera, points @ R.T + t, rng))
     if settings is None:
         settings = CalibrationSettings(*TERMS[plan.imperfections != laboratory.IDEAL])
-    return calibrate_from_corners(*views, board, settings, 0, thickness)
+    return calibrate_from_corners(*views, board, settings, 0, laboratory.BOARD_THICKNESS)
 
 
-def recorded(plan, geometry=None, settings=None, frames=None):
-    """Tracking of a recording by points, and its true poses R (n, 3, 3), t (n, 3).
-
-    frames : numbers of those that are there, if not all
-    """
-    cameras, target, rng = cameras_of(plan, geometry)
-    rig = calibration_of(plan, cameras, target, rng, geometry, settings).rig
+def recorded(plan):
+    """Tracking of a recording by points, and its true poses R (n, 3, 3), t (n, 3)."""
+    rng = np.random.default_rng([plan.seed, 11])
+    cameras, target = laboratory.cameras_of(plan, rng)
+    rig = calibration_of(plan, cameras, target, rng).rig
     times = np.arange(plan.n_frames) / plan.frame_rate
     spline = laboratory.motion(plan)
     body = np.column_stack([laboratory.DOTS, np.full(len(laboratory.DOTS), laboratory.HALF_THICKNESS)])
     body[:, :2] += plan.imperfections.misprint * rng.normal(size=laboratory.DOTS.shape)
     px = 0.0
     for node, weight in laboratory.GAUSS:
-        R, t = poses_at(spline, times + 0.5 * plan.imperfections.exposure * node)
+        R, t = poses_of(spline(times + 0.5 * plan.imperfections.exposure * node))
         points = body @ np.swapaxes(R, 1, 2) + t[:, None]
         px = px + weight * np.stack([camera.project(points) for camera in cameras], 1)
     px = px + DOT_PX * rng.normal(size=px.shape)
-    R, t = poses_at(spline, times)
-    rows = np.arange(plan.n_frames) if frames is None else np.asarray(frames)
-    return tracked(px[rows], R[rows], t[rows], times[rows], rig, plan.frame_rate), R[rows], t[rows]
+    R, t = poses_of(spline(times))
+    return tracked(px, R, t, times, rig, plan.frame_rate), R, t
 
 
-def poses_at(spline, times):
-    """R (n, 3, 3), t (n, 3) of the disc."""
-    return tuple(np.stack(part) for part in zip(*(laboratory.pose_at(spline, time) for time in times), strict=True))
+def poses_of(q):
+    """R (n, 3, 3), t (n, 3) of the disc at q (n, 6)."""
+    return tuple(np.stack(part) for part in zip(*map(laboratory.pose_of, q), strict=True))
 
 
 def tables_of(px, R, t, sigma):

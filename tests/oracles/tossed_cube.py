@@ -1,6 +1,7 @@
 """A tossed cube by integrating Newton's and Euler's equations with quaternions: shares no line with the product."""
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 SIDE = 2 * 0.0524
 RATE = 148.0
@@ -11,17 +12,6 @@ def _quaternion_rate(q, omega_body):
     a, b, c = np.moveaxis(omega_body, -1, 0)
     parts = (-x * a - y * b - z * c, w * a + y * c - z * b, w * b - x * c + z * a, w * c + x * b - y * a)
     return 0.5 * np.stack(parts, axis=-1)
-
-
-def matrix(q):
-    """Body to world (..., 3, 3) of w, x, y, z."""
-    w, x, y, z = np.moveaxis(q, -1, 0)
-    rows = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
-    return np.stack([np.stack(r, axis=-1) for r in rows], axis=-2)
 
 
 def toss(rng, n, gravity=9.81, centre_of_mass=(0, 0, 0), inertia=(1, 1, 1), drag=0.0, scale=0.0, lean=0.0, noise=2e-5):
@@ -51,7 +41,7 @@ def toss(rng, n, gravity=9.81, centre_of_mass=(0, 0, 0), inertia=(1, 1, 1), drag
     y = (x, v, q, omega)
     for step in range(steps):
         if step % 8 == 0:
-            seen_x.append(y[0] - np.einsum("nij,j->ni", matrix(y[2]), offset_of_mass))
+            seen_x.append(y[0] - Rotation.from_quat(y[2], scalar_first=True).apply(offset_of_mass))
             seen_q.append(y[2] / np.linalg.norm(y[2], axis=1, keepdims=True))
         k1 = rates(*y)
         k2 = rates(*(a + h / 2 * b for a, b in zip(y, k1, strict=True)))

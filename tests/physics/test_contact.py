@@ -29,6 +29,12 @@ def sliding(truth, onset, speed, heading=0.7):
     )
 
 
+def horizontal_axes(truth):
+    """n0 and m0, each (n, 2)."""
+    psi = truth.euler[:, 0]
+    return np.column_stack([np.cos(psi), np.sin(psi)]), np.column_stack([-np.sin(psi), np.cos(psi)])
+
+
 def test_material_point_at_the_contact_is_at_rest_in_pure_rolling(true_motion):
     truth = true_motion(theta_deg=60, duration=0.8, nutation=0.2)
     q = contact_quantities(truth.state, MA_2014, 9.81)
@@ -39,8 +45,7 @@ def test_material_point_at_the_contact_is_at_rest_in_pure_rolling(true_motion):
 def test_locus_moves_with_the_derivative_of_the_contact_point(true_motion):
     truth = true_motion(theta_deg=25, duration=0.6, nutation=0.1)
     q = contact_quantities(truth.state, MA_2014, 9.81)
-    psi = truth.euler[:, 0]
-    n0, m0 = np.column_stack([np.cos(psi), np.sin(psi)]), np.column_stack([-np.sin(psi), np.cos(psi)])
+    n0, m0 = horizontal_axes(truth)
     velocity = np.gradient(q[:, :2], truth.time, axis=0)
     found = q[:, 6, None] * n0 + q[:, 7, None] * m0
     # central differences: interval^2 / 6 of the second derivative of 2 m/s at 80 rad/s
@@ -69,8 +74,7 @@ def test_swapped_components_are_noticed(true_motion):
     """Negative control: with the printed labels of (2.3) the slip of a sliding disc points elsewhere."""
     truth = sliding(true_motion(theta_deg=25, duration=0.6, nutation=0.1), 0.3, 0.5, heading=0.7)
     q = contact_quantities(truth.state, MA_2014, 9.81)
-    psi = truth.euler[:, 0]
-    n0, m0 = np.column_stack([np.cos(psi), np.sin(psi)]), np.column_stack([-np.sin(psi), np.cos(psi)])
+    n0, m0 = horizontal_axes(truth)
     right = q[:, 3, None] * n0 + q[:, 4, None] * m0
     swapped = q[:, 4, None] * n0 + q[:, 3, None] * m0
     slip = np.outer(0.5 * np.clip(1 - truth.time / 0.3, 0, None), [np.cos(0.7), np.sin(0.7)])

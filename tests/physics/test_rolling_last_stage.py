@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from scipy.integrate import solve_ivp
 from scipy.signal import argrelmax
 
 from disctrack import rolling
@@ -89,16 +88,3 @@ def best_of(n, function):
         function()
         times.append(time.process_time() - start)
     return min(times)
-
-
-def test_integrator_agrees_with_scipy_on_the_same_equations():
-    from disctrack.rolling._assembly import Assembly
-
-    assembly = Assembly(STEEL, 1e-3)
-    start = steady_precession(np.radians(5), MA_2014, nutation_amplitude=0.01)
-    times = np.linspace(0, 0.4, 41)
-    expected = solve_ivp(
-        lambda t, y: assembly.at(0, t, y)[0][0], (0, 0.4), start.array, "DOP853", times, rtol=1e-12, atol=1e-13
-    )
-    motion = rolling.simulate(STEEL, start, times=times)
-    assert_allclose(motion.state, expected.y.T, rtol=1e-9, atol=1e-10)

@@ -39,7 +39,7 @@ def test_slip_ends_where_an_independent_integration_ends_it_and_rolling_goes_on(
     state, mu = sliding_start(), 0.35
     motion = rolling.simulate(slippery(mu), state, 0.15)
     assert [s.after for s in motion.switches] == [Regime.ROLLING]
-    oracle = newton_euler.Disc(MA_2014.radius, MA_2014.half_thickness, MA_2014.mass, mu=mu)
+    oracle = newton_euler.Disc(mu=mu)
     start = newton_euler.state_from_angles(oracle, *state.array[:8], velocity=state.array[8:])
 
     def slip_left(t, y):
@@ -59,7 +59,7 @@ def test_slip_ends_where_an_independent_integration_ends_it_and_rolling_goes_on(
 def test_a_table_gives_way_under_a_sliding_disc_too():
     """The oracle's table moves as the load of the slip on a rigid one would let it sink: the same to first order."""
     state, c, times = sliding_start(), 1e-7, np.linspace(0, 0.05, 401)
-    oracle = newton_euler.Disc(MA_2014.radius, MA_2014.half_thickness, MA_2014.mass, mu=0.3)
+    oracle = newton_euler.Disc(mu=0.3)
     begin = lambda d: newton_euler.state_from_angles(d.at(0.0), *state.array[:8], velocity=state.array[8:])  # noqa: E731
     q = lambda d: newton_euler.coordinates(d, newton_euler.follow(d, begin(d), times[::40], "slipping").y)  # noqa: E731
     rigid = q(oracle)

@@ -13,6 +13,7 @@ from disctrack.frames import rotation_from_quaternion, vector_from_rotation
 from disctrack.trajectory import FrameStatus, MarkerStatus
 from tests.oracles import imperfect_laboratory as laboratory
 from tests.oracles.imperfect_laboratory import Trouble
+from tests.oracles.point_laboratory import poses_of
 
 FRAMES = 64
 DURING = range(8, 58)  # fifty frames
@@ -43,20 +44,16 @@ def filmed(name, frames=FRAMES):
     """Trajectory with the true rig, and the errors of its poses in units of their own sigma, NaN without a pose."""
     plan = laboratory.Plan(5, frames, imperfections=replace(laboratory.IDEAL, exposure=2e-4), **TROUBLES[name])
     rng = np.random.default_rng([plan.seed, 3])
-    cameras = [laboratory.Camera(rng, plan, a, np.array([0.032, 0.02, 0.004])) for a in (-122.0, -53.0)]
-    spline, images, truth = laboratory.motion(plan), [], []
-    for i in range(frames):
-        instants = [i / plan.frame_rate + 0.5 * plan.imperfections.exposure * x for x, _ in laboratory.GAUSS]
-        poses = [
-            (*laboratory.pose_at(spline, at), weight)
-            for at, (_, weight) in zip(instants, laboratory.GAUSS, strict=True)
-        ]
+    cameras = [laboratory.Camera(rng, plan, a, np.array([0.032, 0.02, 0.004])) for a in plan.azimuths]
+    spline, times = laboratory.motion(plan), np.arange(frames) / plan.frame_rate
+    images = []
+    for i, time in enumerate(times):
+        poses = laboratory.poses_during(spline, time, plan.imperfections.exposure)
         images.append([laboratory.disc_image(camera, plan, poses, laboratory.DOTS, rng, i) for camera in cameras])
-        truth.append(poses[1][:2])
     disc = replace(MA_2014, radius_tolerance=0.0, thickness_tolerance=0.0)
     found = disctrack.measure_pairs(np.array(images), rig_of(cameras), disc, plan.frame_rate)
     trajectory = found.trajectory
-    R, t = (np.stack(part) for part in zip(*truth, strict=True))
+    R, t = poses_of(spline(times))
     turn = vector_from_rotation(rotation_from_quaternion(trajectory.quaternion) @ np.swapaxes(R, 1, 2))
     error = np.concatenate([trajectory.q[:, :3] - t, turn], axis=1)
     whole = trajectory.pose_covariance + trajectory.systematic_covariance
