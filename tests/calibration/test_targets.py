@@ -6,18 +6,19 @@ OpenCV's warp at six times the resolution, and averaged over the pixels; it shar
 
 import json
 import re
-from dataclasses import dataclass
+from functools import cache
 
 import cv2
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from scipy.spatial.transform import Rotation
 
 from calibration import BoardNotFound, CalibrationError, CornerView
 from calibration.board import chessboard
 from calibration.board.charuco import find_charuco
 from calibration.board.search import board_size, located, other_board
-from calibration.board.target import Board, CharucoBoard, Target, target_of
+from calibration.board.target import Board, CharucoBoard, target_of
 from calibration.cameras.camera import Camera
 from disctrack.calibrate.stage import calibrate_recording
 from disctrack.errors import RecordingError
@@ -31,46 +32,42 @@ PIXEL = 0.1e-3  # [m] of the drawn print
 RIM = 200  # light pixels round it
 
 
-@dataclass(frozen=True)
-class Print:
-    """A drawn print and where its pixels lie on the target."""
-
-    image: np.ndarray
-    board_from_pixel: np.ndarray  # (3, 3) homogeneous: x right, y up [m]
-
-
-def print_of(target: CharucoBoard) -> Print:
-    columns, rows = target.squares
-    side = round(target.square / PIXEL)
-    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, target.dictionary))
-    board = cv2.aruco.CharucoBoard(target.squares, target.square, target.marker, dictionary)
+@cache
+def drawn_print():
+    """Image of the print, and the homogeneous (3, 3) from its pixels to the board, x right and y up [m]."""
+    columns, rows = CHARUCO.squares
+    side = round(CHARUCO.square / PIXEL)
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, CHARUCO.dictionary))
+    board = cv2.aruco.CharucoBoard(CHARUCO.squares, CHARUCO.square, CHARUCO.marker, dictionary)
     image = np.pad(board.generateImage((columns * side, rows * side)), RIM, constant_values=255)
     # the lower left inner corner lies between pixels, one square from the left, one from below
     origin = np.array([RIM + side - 0.5, RIM + (rows - 1) * side - 0.5])
-    return Print(image, np.array([[PIXEL, 0, -PIXEL * origin[0]], [0, -PIXEL, PIXEL * origin[1]], [0, 0, 1]]))
+    return image, np.array([[PIXEL, 0, -PIXEL * origin[0]], [0, -PIXEL, PIXEL * origin[1]], [0, 0, 1]])
 
 
-def photograph(printed: Print, R, t, camera_matrix=K, rng=None, light=(25.0, 215.0)) -> np.ndarray:
+def photograph(R, t, rng) -> np.ndarray:
     """Image (300, 400) of the print at pose R, t in the camera's axes: blur of 0.6 px, noise of 1.5 grey values."""
-    H = camera_matrix @ np.column_stack([R[:, 0], R[:, 1], t]) @ printed.board_from_pixel
+    image, board_from_pixel = drawn_print()
+    H = K @ np.column_stack([R[:, 0], R[:, 1], t]) @ board_from_pixel
     fine = np.array([[FINE, 0, (FINE - 1) / 2], [0, FINE, (FINE - 1) / 2], [0, 0, 1.0]])
     size = (SIZE[0] * FINE, SIZE[1] * FINE)
-    big = cv2.warpPerspective(printed.image, fine @ H, size, flags=cv2.INTER_LINEAR, borderValue=130)
+    big = cv2.warpPerspective(image, fine @ H, size, flags=cv2.INTER_LINEAR, borderValue=130)
     grey = cv2.resize(cv2.GaussianBlur(big.astype(np.float32), (0, 0), 0.6 * FINE), SIZE, interpolation=cv2.INTER_AREA)
-    noise = 0.0 if rng is None else rng.normal(0, 1.5, grey.shape)
-    return np.clip(np.rint(light[0] + (light[1] - light[0]) * grey / 255 + noise), 0, 255).astype(np.uint8)
+    noisy = 25.0 + 190.0 * grey / 255 + rng.normal(0, 1.5, grey.shape)
+    return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
 
 
-def pose(target: Target, degrees, distance=0.33, aside=(0.0, 0.0)):
+def pose(degrees, distance=0.33, aside=(0.0, 0.0)):
     """Upright and facing the camera, then turned by these angles about x, y, z."""
-    x, y, z = (cv2.Rodrigues(np.radians(a) * axis)[0] for a, axis in zip(degrees, np.eye(3), strict=True))
-    R = x @ y @ z @ np.diag([1.0, -1.0, -1.0])
-    return R, np.array([*aside, distance]) - R @ target.points.mean(0)
+    R = Rotation.from_euler("XYZ", degrees, degrees=True).as_matrix() @ np.diag([1.0, -1.0, -1.0])
+    return R, np.array([*aside, distance]) - R @ CHARUCO.points.mean(0)
 
 
-def pixels_of(target: Target, R, t, camera_matrix=K) -> np.ndarray:
-    image = (target.points @ R.T + t) @ camera_matrix.T
-    return image[:, :2] / image[:, 2:]
+def seen(degrees, rng, **where):
+    """A photograph of the board, and where its corners are in it."""
+    R, t = pose(degrees, **where)
+    image = (CHARUCO.points @ R.T + t) @ K.T
+    return photograph(R, t, rng), image[:, :2] / image[:, 2:]
 
 
 def normalised_errors(view: CornerView, truth: np.ndarray) -> np.ndarray:
@@ -78,10 +75,10 @@ def normalised_errors(view: CornerView, truth: np.ndarray) -> np.ndarray:
     return np.einsum("ni,nij,nj->n", e, np.linalg.inv(view.covariance[view.accepted]), e)
 
 
-def test_charuco_corners_are_located_several_times_better_than_opencvs(rng):
-    R, t = pose(CHARUCO, (20, -15, 10), distance=0.28)
-    image, truth = photograph(print_of(CHARUCO), R, t, rng=rng), pixels_of(CHARUCO, R, t)
-    view = find_charuco(image, CHARUCO)
+@pytest.mark.parametrize("negative", [False, True])
+def test_charuco_corners_are_located_several_times_better_than_opencvs(negative, rng):
+    image, truth = seen((20, -15, 10), rng, distance=0.28)
+    view = find_charuco(255 - image if negative else image, CHARUCO)
     assert isinstance(view, CornerView), view
     assert view.accepted.all()
     assert np.sqrt(np.mean((view.points - truth) ** 2)) < 0.006  # its own sigma is 0.003 px
@@ -93,19 +90,9 @@ def test_charuco_corners_are_located_several_times_better_than_opencvs(rng):
     assert np.sqrt(np.mean(theirs**2)) > 0.02
 
 
-def test_a_charuco_board_printed_as_a_negative_is_found_where_it_is(rng):
-    R, t = pose(CHARUCO, (20, -15, 10), distance=0.28)
-    image, truth = photograph(print_of(CHARUCO), R, t, rng=rng), pixels_of(CHARUCO, R, t)
-    view = find_charuco(255 - image, CHARUCO)
-    assert isinstance(view, CornerView), view
-    assert view.accepted.all()
-    assert np.sqrt(np.mean((view.points - truth) ** 2)) < 0.006
-
-
 def test_a_charuco_board_may_reach_out_of_the_image(rng):
-    R, t = pose(CHARUCO, (-10, 20, 170), aside=(0.07, 0.04))
-    truth = pixels_of(CHARUCO, R, t)
-    view = find_charuco(photograph(print_of(CHARUCO), R, t, rng=rng), CHARUCO)
+    image, truth = seen((-10, 20, 170), rng, aside=(0.07, 0.04))
+    view = find_charuco(image, CHARUCO)
     assert isinstance(view, CornerView), view
     inside = ((truth > 0) & (truth < np.array(SIZE) - 1)).all(1)
     assert not view.accepted[~inside].any()
@@ -115,8 +102,7 @@ def test_a_charuco_board_may_reach_out_of_the_image(rng):
 
 
 def test_other_markers_are_not_found_and_unknown_ones_refused(rng):
-    R, t = pose(CHARUCO, (0, 10, 0))
-    image = photograph(print_of(CHARUCO), R, t, rng=rng)
+    image, _ = seen((0, 10, 0), rng)
     other = find_charuco(image, CharucoBoard((9, 6), 12e-3, 8.5e-3, "DICT_6X6_250"))
     assert isinstance(other, BoardNotFound)
     assert "dictionary" in other.reason
@@ -159,7 +145,6 @@ def declared(sample_clip, folder, keys):
 
 @pytest.mark.statistical
 def test_a_recording_with_a_charuco_board_is_calibrated(sample_clip, tmp_path, rng):
-    target, printed = CHARUCO, print_of(CHARUCO)
     R_pair = cv2.Rodrigues(np.array([0.0, -0.5, 0.0]))[0]
     meeting = np.array([0.0, 0.0, 0.33])
     t_pair = meeting - R_pair @ meeting
@@ -168,10 +153,10 @@ def test_a_recording_with_a_charuco_board_is_calibrated(sample_clip, tmp_path, r
     (tmp_path / "views").mkdir()
     poses = []
     for v, degrees in enumerate(angles):
-        R, t = pose(target, degrees, aside=tuple(rng.uniform(-0.01, 0.01, 2)))
+        R, t = pose(degrees, aside=tuple(rng.uniform(-0.01, 0.01, 2)))
         poses.append((R, t))
-        cv2.imwrite(str(tmp_path / f"views/left_{v}.png"), photograph(printed, R, t, rng=rng))
-        right = photograph(printed, R_pair @ R, R_pair @ t + t_pair, rng=rng)
+        cv2.imwrite(str(tmp_path / f"views/left_{v}.png"), photograph(R, t, rng))
+        right = photograph(R_pair @ R, R_pair @ t + t_pair, rng)
         cv2.imwrite(str(tmp_path / f"views/right_{v}.png"), right)
     recording = declared(sample_clip, tmp_path, AS_CHARUCO)
     assert recording.chessboard is None
