@@ -4,8 +4,10 @@ import os
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from disctrack import open_pairs
 from disctrack.cli import main
 
 SHORT = 24  # frames: enough for the noise to be measured
@@ -41,6 +43,12 @@ def linked(recording: Path, folder: Path, link=os.link) -> Path:
 
     left_out = shutil.ignore_patterns("results")
     return Path(shutil.copytree(recording, folder, copy_function=copy, ignore=left_out, dirs_exist_ok=True))
+
+
+def images_of(recording, n: int | None = None) -> np.ndarray:
+    """(n, 2, height, width) of the first pairs of a recording."""
+    pairs = open_pairs(recording)
+    return np.stack([[pairs.left.read(i), pairs.right.read(i)] for i in range(n or len(pairs))])
 
 
 @pytest.fixture

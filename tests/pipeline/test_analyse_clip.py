@@ -3,12 +3,14 @@
 import contextlib
 import io
 import json
+import re
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 
+import disctrack
 from disctrack.cli import main
 from disctrack.recording.changed import told_differences
 from disctrack.trajectory.file import read_group
@@ -51,6 +53,15 @@ def test_clip_rolls_without_slip_and_on_the_table(analysed_clip):
     slip = np.hypot(contact["slip_n"], contact["slip_m"])
     assert np.sqrt(np.mean(slip[10:-10] ** 2)) < 1e-4  # [m/s]; 0.05 mm/s when written
     assert abs(np.mean(contact["contact_z"])) < 2e-6  # [m]
+
+
+def test_every_attribute_of_the_groups_is_explained(analysed_clip):
+    page = Path(disctrack.__file__).with_name("docs") / "result-file.md"
+    explained = set(re.findall(r"`([A-Za-z0-9_.]+)`", page.read_text(encoding="utf-8")))
+    for group, one in (("contact", "rolling_onset_s"), ("energy", "loss_J")):
+        _, attributes = read_group(analysed_clip, group)
+        assert one in attributes
+        assert attributes.keys() <= explained, attributes.keys() - explained
 
 
 def test_command_says_where_the_results_are(analysed_clip):

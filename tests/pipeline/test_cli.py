@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -16,6 +17,7 @@ from numpy.testing import assert_allclose
 from disctrack import open_pairs
 from disctrack.cli import COMMANDS, main
 from disctrack.disc import MA_2014
+from disctrack.synthetic.description import Scene, load_scene
 from disctrack.trajectory import FrameStatus
 from disctrack.trajectory.file import read_details, read_trajectory
 
@@ -236,12 +238,6 @@ def test_open_shows_the_page_written_last(tmp_path, monkeypatch, capsys):
     assert opened == [page.as_uri()]
 
 
-def test_an_unknown_option_is_told_with_the_usage_of_its_command(capsys):
-    with pytest.raises(SystemExit):
-        main(["analyse", "x", "--frobnicate"])
-    assert "usage: disctrack analyse" in capsys.readouterr().err
-
-
 def test_a_range_that_is_cut_says_so(recording):
     (cut,) = open_pairs(recording, (5, 99)).findings
     assert cut.text == "--frames 5:99 is cut: the recording has the frames 0 to 23"
@@ -252,3 +248,10 @@ def test_print_says_what_to_declare_of_its_sheets(tmp_path, capsys):
     assert main(["print", "-o", str(tmp_path)]) == 0
     (centres,) = re.findall(r"centres_mm = (\[\[.*\]\])", capsys.readouterr().out)
     assert_allclose(json.loads(centres), 1e3 * MA_2014.marker_centres_body[:, :2], atol=1e-4)  # digits that it prints
+
+
+def test_printed_defaults_are_the_default_scene(tmp_path, capsys):
+    assert main(["render", "--defaults"]) == 0
+    (tmp_path / "scene.toml").write_text(capsys.readouterr().out)
+    read = replace(load_scene(tmp_path / "scene.toml"), folder=Path())
+    assert repr(read) == repr(Scene())  # to the last bit, and nan is nan

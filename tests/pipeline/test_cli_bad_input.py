@@ -58,6 +58,11 @@ def another_file(recording: Path) -> None:
         file["x"] = 1.0
 
 
+def another_scene(recording: Path) -> None:
+    (recording / "wrong.toml").write_text("[cameras]\nframes = 3\n")
+    (recording / "left.toml").write_text("[cameras]\nn_frames = 3\n")  # whose folder would be `left`
+
+
 def nothing(recording: Path) -> None:
     pass
 
@@ -86,6 +91,8 @@ PATTERNS = "calibrate --left {r}/l*.png --right {r}/r*.png --corners 9x6 --squar
         (nothing, "track {r} --frames 9:5", "holds no frame; the recording has 24"),
         (nothing, "calibrate", "--left, --right, --corners, --square-mm missing"),
         (nothing, PATTERNS, "no image matched for the left camera"),
+        (another_scene, "render {r}/wrong.toml --quiet", "nearest known key is 'n_frames'"),
+        (another_scene, "render {r}/left.toml --quiet", "not an empty folder"),
         (nothing, "calibrate {r} --table-view 2", "--table-view.*recording.toml says this"),
         (nothing, "calibrate {r} --left l*.png --square-mm 8", "--left.*recording.toml says this"),
     ],
@@ -126,6 +133,7 @@ def test_a_terminal_without_the_letters_of_a_name_does_not_end_the_work(tmp_path
         ["init", "x", "--board-thickness-mm", "-1"],
         ["convert", "rig.yml", "rig.h5", "--unit-mm", "nan"],
         ["convert", "rig.yml", "rig.h5", "--image-size", "0", "200"],
+        ["analyse", "x", "--frobnicate"],
         ["batch"],
         ["batch", "x", "--shard", "0/3"],
         ["batch", "x", "--shard", "4/3"],

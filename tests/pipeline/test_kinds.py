@@ -44,12 +44,12 @@ def drawn(change, cameras=CAMERAS) -> Plant:
     return lambda folder, tree: [redrawn(folder / camera, change) for camera in cameras]
 
 
-def late(by: int) -> Plant:
-    """The left camera lost its first frames, and both end together."""
+def late(by: int, ahead: str, behind: str) -> Plant:
+    """A camera lost its first frames, and both end together."""
 
     def plant(folder, tree):
-        reordered(folder / "left", lambda files: files[by:])
-        reordered(folder / "right", lambda files: files[:-by])
+        reordered(folder / ahead, lambda files: files[by:])
+        reordered(folder / behind, lambda files: files[:-by])
 
     return plant
 
@@ -194,8 +194,8 @@ FAULTS = {
                           drawn(lambda image, _: cv2.GaussianBlur(image, (0, 0), 3.0))),
     "noise": fault(Kind.ACCURACY, "warning", "a position has a standard deviation of", drawn(noisy)),
     # the clock
-    "one frame late": fault(Kind.DELAY, "doubt", "Number its images higher by 1", late(1)),
-    "three frames late": fault(Kind.DELAY, "doubt", "Number its images higher by 3", late(3)),
+    "one frame late": fault(Kind.DELAY, "doubt", "Number its images higher by 1", late(1, "left", "right")),
+    "three frames late": fault(Kind.DELAY, "doubt", "Number its images higher by 3", late(3, "right", "left")),
     "images lost by one": fault(Kind.DROPPED_FRAMES, "doubt", "left out 3 images at frame 150",
                                 planted("images lost by one", 3)),
     "ten images lost by one": fault(Kind.DROPPED_FRAMES, "doubt", "left out 10 images",

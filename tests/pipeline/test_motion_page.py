@@ -11,14 +11,14 @@ from disctrack.analyse.analysis import analyse
 from disctrack.analyse.motion_page import motion_html
 from disctrack.track.video_overlay import draw_pair
 from tests.oracles.browser import BROWSER, browse, screenshot
+from tests.pipeline.conftest import images_of
 
 
 @pytest.fixture(scope="module")
 def measured(sample_clip, rig_file):
     """Trajectory of some frames, its analysis, and what gives its images; the clip's rig is that of the short one."""
     recording = disctrack.read_recording(sample_clip)
-    pairs = disctrack.open_pairs(recording, (0, 60))
-    images = np.stack([[pairs.left.read(i), pairs.right.read(i)] for i in range(60)])
+    images = images_of(recording, 60)
     measurement = disctrack.measure_pairs(images, disctrack.read_rig(rig_file), recording.disc, recording.frame_rate)
     return measurement.trajectory, analyse(measurement.trajectory), images
 

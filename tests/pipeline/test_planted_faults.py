@@ -9,9 +9,11 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.distance import pdist
 
 from calibration.rig_file import read_rig
 from disctrack import frames
+from disctrack.cli import main
 from disctrack.disc import Disc, disc_from_mm
 from disctrack.errors import TrackingError
 from disctrack.findings import Kind, in_doubt, leading
@@ -21,10 +23,11 @@ from disctrack.synthetic import rig_of
 from disctrack.synthetic.description import Scene
 from disctrack.track.follow.tracking import TrackingSettings, track
 from disctrack.track.judge.disc_not_seen import arrangement_found, moved_camera, unlike_declared
-from disctrack.track.measurement import open_pairs
 from disctrack.track.refine.intrinsic_scatter import MIN_FRAMES
 from disctrack.trajectory import FrameStatus
+from tests.oracles import imperfect_laboratory
 from tests.oracles.planted_faults import FAULTS, glare
+from tests.pipeline.conftest import images_of
 from tests.rendering import rolling_disc
 
 N = 48
@@ -69,22 +72,31 @@ class Laboratory:
         return np.flatnonzero(wrong).tolist()
 
 
-def beyond(found, q, covariance, shared=False):
-    """(n,) True for poses that are farther than MOST_SIGMAS from q in a component; `shared`: but for what all share."""
+def away_from(found, q):
+    """(n, 6) of poses from q: position, and the vector of the turn."""
     R, R_true = (frames.rotation_from_euler(*angles.T) for angles in (found.q[:, 3:], q[:, 3:]))
     turn = frames.vector_from_rotation(R @ np.swapaxes(R_true, 1, 2))
-    away = np.column_stack([found.q[:, :3] - q[:, :3], turn])
+    return np.column_stack([found.q[:, :3] - q[:, :3], turn])
+
+
+def beyond(found, q, covariance, shared=False):
+    """(n,) True for poses that are farther than MOST_SIGMAS from q in a component; `shared`: but for what all share."""
+    away = away_from(found, q)
     if shared:
         away -= np.nanmedian(away, axis=0)
     with np.errstate(invalid="ignore"):
         return (np.abs(away) > MOST_SIGMAS * np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))).any(axis=1)
 
 
+def filmed(folder, rig_file, truth=None):
+    """The first frames of a recording."""
+    recording = read_recording(folder)
+    return Laboratory(images_of(recording, N), read_rig(rig_file), recording.disc, truth)
+
+
 @pytest.fixture(scope="module")
 def clip(sample_clip, rig_file):
-    pairs = open_pairs(read_recording(sample_clip), (0, N))
-    images = np.stack([[pairs.left.read(i), pairs.right.read(i)] for i in range(N)])
-    return Laboratory(images, read_rig(rig_file), read_recording(sample_clip).disc)
+    return filmed(sample_clip, rig_file)
 
 
 def test_a_recording_without_faults_has_no_flag(clip):
@@ -148,11 +160,11 @@ def kinds_of(tracking):
     return {finding.kind for finding in tracking.findings}
 
 
-def with_dots(disc, shift_mm=0.0, diameter=1.0):
-    """The disc as a user declares it who errs by shift_mm (m, 2) in the dots' places, and by a factor in their size."""
+def with_dots(disc, shift_mm):
+    """The disc as a user declares it who errs by shift_mm (m, 2) in the dots' places."""
     centres = disc.marker_centres_body.copy()
     centres[:, :2] += 1e-3 * shift_mm
-    return replace(disc, marker_centres_body=centres, marker_diameter=diameter * disc.marker_diameter)
+    return replace(disc, marker_centres_body=centres)
 
 
 def test_a_dot_declared_a_millimetre_off_is_found_and_named(clip):
@@ -189,34 +201,31 @@ def test_dots_declared_by_a_ruler_are_located_as_those_declared_right(clip):
 
 
 @pytest.mark.statistical
-@pytest.mark.parametrize(("shift", "diameter", "said"), [(0.5, 1.0, "centres_mm: [["), (0.0, 0.5, "diameter_mm: 7")])
-def test_dots_declared_too_far_off_to_be_followed_are_told(clip, shift, diameter, said):
-    """Places by a ruler, or half the diameter: no dot fits the template, and the error says what to declare."""
-    off = shift * np.random.default_rng(3).normal(size=(clip.disc.n_markers, 2))
-    with pytest.raises(TrackingError, match=re.escape(said)) as told:
-        measure(clip.images[:4], clip.rig, with_dots(clip.disc, off, diameter))
-    if shift:
-        centres = np.array(json.loads(re.search(r"centres_mm: (\[\[.*?\]\])", str(told.value))[1]))
-        i, j = np.triu_indices(len(centres), 1)
-        true = 1e3 * clip.disc.marker_centres_body[:, :2]
-        distance, expected = (np.linalg.norm(places[i] - places[j], axis=1) for places in (centres, true))
-        np.testing.assert_allclose(distance, expected, atol=0.25)  # blobs err by up to 0.5 px, 0.2 mm
+def test_dots_declared_too_far_off_to_be_followed_are_told(clip):
+    """Places by a ruler: no dot fits the template, and the error says what to declare."""
+    off = 0.5 * np.random.default_rng(3).normal(size=(clip.disc.n_markers, 2))
+    with pytest.raises(TrackingError, match=r"centres_mm: \[\[") as told:
+        measure(clip.images[:4], clip.rig, with_dots(clip.disc, off))
+    centres = np.array(json.loads(re.search(r"centres_mm: (\[\[.*?\]\])", str(told.value))[1]))
+    found, expected = (pdist(places) for places in (centres, 1e3 * clip.disc.marker_centres_body[:, :2]))
+    np.testing.assert_allclose(found, expected, atol=0.25)  # blobs err by up to 0.5 px, 0.2 mm
 
 
-CAMERA_MOVED = {  # turn [deg] about its own axes, shift [mm]
-    "turned by 1 deg up": ((1, 0, 0), (0, 0, 0)),
-    "turned by 1 deg aside": ((0, 1, 0), (0, 0, 0)),
-    "turned by 0.2 deg": ((0.2, 0, 0), (0, 0, 0)),
-    "shifted by 2 mm": ((0, 0, 0), (0, 2, 0)),
-}
+def with_the_right_camera_moved(rig, turn_deg, shift_mm=(0, 0, 0)):
+    """The rig of a user whose right camera was turned about its own axes and shifted since the calibration."""
+    dR = frames.rotation_from_vector(np.radians(turn_deg))
+    shift = 1e-3 * np.array(shift_mm)
+    return replace(rig, R_right_left=dR @ rig.R_right_left, t_right_left=dR @ rig.t_right_left + shift)
 
 
 @pytest.mark.statistical
-@pytest.mark.parametrize("motion", CAMERA_MOVED)
-def test_a_camera_moved_too_far_to_measure_with_is_named_and_sized(clip, motion):
-    turn, shift = np.radians(CAMERA_MOVED[motion][0]), 1e-3 * np.array(CAMERA_MOVED[motion][1])
-    dR = frames.rotation_from_vector(turn)
-    rig = replace(clip.rig, R_right_left=dR @ clip.rig.R_right_left, t_right_left=dR @ clip.rig.t_right_left + shift)
+@pytest.mark.parametrize(
+    ("turn_deg", "shift_mm"),
+    [((1, 0, 0), (0, 0, 0)), ((0, 1, 0), (0, 0, 0)), ((0.2, 0, 0), (0, 0, 0)), ((0, 0, 0), (0, 2, 0))],
+    ids=["turned by 1 deg up", "turned by 1 deg aside", "turned by 0.2 deg", "shifted by 2 mm"],
+)
+def test_a_camera_moved_too_far_to_measure_with_is_named_and_sized(clip, turn_deg, shift_mm):
+    rig = with_the_right_camera_moved(clip.rig, turn_deg, shift_mm)
     try:
         told = " ".join(doubts_of(measure(clip.images, rig, clip.disc)))
     except TrackingError as error:
@@ -224,37 +233,18 @@ def test_a_camera_moved_too_far_to_measure_with_is_named_and_sized(clip, motion)
     found = re.search(r"the right camera was turned by about ([0-9.]+) deg and shifted by ([0-9.]+) mm", told)
     assert found, told
     # each makes up for the other: a shift of 1 mm, 0.5 m away, is a turn of 0.1 deg
-    assert abs(float(found[1]) - np.degrees(np.linalg.norm(turn))) < 0.25
-    assert abs(float(found[2]) - 1e3 * np.linalg.norm(shift)) < 4.5
+    assert abs(float(found[1]) - np.linalg.norm(turn_deg)) < 0.25
+    assert abs(float(found[2]) - np.linalg.norm(shift_mm)) < 4.5
 
 
 @pytest.mark.statistical
 @pytest.mark.parametrize("turn_deg", [0.05, 0.1])
 def test_a_camera_turned_a_little_is_one_fault_and_not_a_trembling_table_too(clip, turn_deg):
     """Poses do scatter there, as now this, now that dot is struck: named once, by its cause."""
-    dR = frames.rotation_from_vector(np.radians(turn_deg) * np.array([0.6, 0.8, 0.0]))
-    rig = replace(clip.rig, R_right_left=dR @ clip.rig.R_right_left, t_right_left=dR @ clip.rig.t_right_left)
-    found = measure(clip.images, rig, clip.disc)
-    causes = {f.kind for f in leading(found.findings)}
+    rig = with_the_right_camera_moved(clip.rig, turn_deg * np.array([0.6, 0.8, 0.0]))
+    causes = {f.kind for f in leading(measure(clip.images, rig, clip.disc).findings)}
     assert causes & {Kind.DOTS_MISFIT, Kind.CAMERA_MOVED}
     assert Kind.POSES_SCATTER not in causes
-
-
-@pytest.mark.parametrize(("late", "early"), [("left", "right"), ("right", "left")])
-def test_cameras_that_are_one_frame_out_of_step_are_named_and_no_camera_has_moved(clip, late, early):
-    first, second = (slice(None, -1), slice(1, None)) if late == "left" else (slice(1, None), slice(None, -1))
-    images = np.stack([clip.images[first, 0], clip.images[second, 1]], axis=1)
-    told = " ".join(doubts_of(measure(images, clip.rig, clip.disc)))
-    found = re.search(rf"the {early} camera is ([0-9.]+) frames \([0-9.]+ ms\) ahead of the {late} one", told)
-    assert found, told
-    assert abs(float(found[1]) - 1.0) < 0.05
-    assert "Number its images higher by 1" in told
-    assert "moved" not in told
-
-
-@pytest.mark.statistical
-def test_no_camera_is_said_to_have_moved_where_none_did(clip):
-    assert not list(moved_camera(clip.images[::4], clip.rig, clip.disc))
 
 
 @pytest.mark.statistical
@@ -279,36 +269,30 @@ def test_no_scale_is_told_where_no_dots_are(clip):
     assert not told.value.findings
 
 
-def test_a_camera_that_left_out_an_image_is_named_with_the_frame(clip):
-    images = clip.images.copy()
-    images[9:-1, 1] = images[10:, 1]
-    found = measure(images[:-1], clip.rig, clip.disc)
-    assert (found.trajectory.frame_status == np.where(np.arange(N - 1) < 9, 0, FrameStatus.CONTRADICTED)).all()
-    (first, *_) = leading(found.findings)
-    assert (first.kind, first.subject.camera, first.subject.frames) == (Kind.DROPPED_FRAMES, "right", ((9, 46),))
-    assert "frames 9-46 are refused" in first.text
-    assert "the right camera were 1.0" in first.text or "the right camera were 0.9" in first.text
-    assert "left out 1 image at frame 9" in first.text
-
-
 @pytest.mark.statistical
-@pytest.mark.parametrize("camera", [0, 1])
-def test_ten_images_left_out_are_named_and_the_frames_after_them_are_the_other_cameras(clip, camera):
-    """Too many to see a delay in: dots are looked for where there are none, or others."""
-    images = clip.images.copy()
-    images[9:-10, camera] = images[19:, camera]
-    found = measure(images[:-10], clip.rig, clip.disc)
-    after = np.arange(N - 10) >= 9
-    assert (found.trajectory.frame_status == np.where(after, FrameStatus.ONE_CAMERA, FrameStatus.MEASURED)).all()
+@pytest.mark.parametrize(
+    ("lost", "camera", "status"),
+    [
+        (1, 1, FrameStatus.CONTRADICTED),
+        # too many to see a delay in: dots are looked for where there are none, or others
+        (10, 0, FrameStatus.ONE_CAMERA),
+        (10, 1, FrameStatus.ONE_CAMERA),
+    ],
+)
+def test_images_left_out_by_a_camera_are_named_with_the_frame(clip, lost, camera, status):
+    images, n = clip.images.copy(), N - lost
+    images[9:n, camera] = images[9 + lost :, camera]
+    found = measure(images[:n], clip.rig, clip.disc)
+    assert (found.trajectory.frame_status == np.where(np.arange(n) < 9, FrameStatus.MEASURED, status)).all()
     (first,) = (finding for finding in leading(found.findings) if finding.doubtful)
-    assert (first.kind, first.subject.camera, first.subject.frames) == (
-        Kind.DROPPED_FRAMES,
-        frames.CAMERAS[camera],
-        ((9, 37),),
-    )
-    assert "left out 10 images at frame 9" in first.text
+    subject = first.subject
+    assert (first.kind, subject.camera, subject.frames) == (Kind.DROPPED_FRAMES, frames.CAMERAS[camera], ((9, n - 1),))
+    assert f"left out {lost} image{'s' * (lost > 1)} at frame 9" in first.text
+    if status == FrameStatus.CONTRADICTED:
+        assert "frames 9-46 are refused" in first.text
+        assert "the right camera were 1.0" in first.text or "the right camera were 0.9" in first.text
     own = found.trajectory.pose_covariance + found.trajectory.calibration_covariance
-    assert not beyond(found.trajectory, clip.untouched.trajectory.q[: N - 10], own).any()
+    assert not beyond(found.trajectory, clip.untouched.trajectory.q[:n], own).any()
 
 
 def test_a_hand_before_one_camera_is_no_sign_of_images_left_out(clip):
@@ -411,17 +395,10 @@ def ideal():
 
 def imperfect(tmp_path):
     """Cast by other code, and measured through a rig calibrated from its bowed boards."""
-    from disctrack.cli import main
-    from tests.oracles import imperfect_laboratory
-
     folder = tmp_path / "imperfect"
     imperfect_laboratory.write(folder, imperfect_laboratory.Plan(seed=3, n_frames=N))
     assert main(["calibrate", str(folder), "-o", str(tmp_path / "rig.h5"), "--no-figures"]) == 0
-    recording = read_recording(folder)
-    pairs = open_pairs(recording)
-    images = np.stack([[pairs.left.read(i), pairs.right.read(i)] for i in range(N)])
-    with np.load(folder / "truth.npz") as truth:
-        return Laboratory(images, read_rig(tmp_path / "rig.h5"), recording.disc, truth["q"])
+    return filmed(folder, tmp_path / "rig.h5", np.load(folder / "truth.npz")["q"])
 
 
 def as_video(images, quality):
@@ -444,10 +421,7 @@ def test_frames_that_an_encoder_predicts_from_one_another_scatter_as_stated(clip
     """H.264 moves blocks of an image together: dots err alike, poses farther than the dots' misfit tells."""
     lossy = np.stack([as_video(clip.images[:, side], 23) for side in (0, 1)], axis=1)
     found = measure(lossy, clip.rig, clip.disc)
-    truth = clip.untouched.trajectory
-    R, R_true = (frames.rotation_from_euler(*t.q[:, 3:].T) for t in (found.trajectory, truth))
-    turn = frames.vector_from_rotation(R @ np.swapaxes(R_true, 1, 2))
-    error = np.column_stack([found.trajectory.q[:, :3] - truth.q[:, :3], turn])
+    error = away_from(found.trajectory, clip.untouched.trajectory.q)
     stated = found.trajectory.pose_covariance + found.trajectory.calibration_covariance
     ratio = np.nanmean(error**2 / np.einsum("nii->ni", stated), axis=0)
     assert (ratio < 2.5).all()  # errors of neighbouring frames are alike: 48 are some 16
