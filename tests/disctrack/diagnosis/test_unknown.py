@@ -7,7 +7,7 @@ from disctrack.diagnosis import diagnose
 from disctrack.rolling.effects import effect_from_formulas
 from tests.oracles import newton_euler
 from tests.oracles.measured_disc import assert_sized, measured
-from tests.oracles.unknown_laws import DISC, Unknown, recording
+from tests.oracles.unknown_laws import Unknown, recording
 
 pytestmark = pytest.mark.slow
 
@@ -21,29 +21,6 @@ def contour_friction_below(mu: float, theta_deg: float):
         return newton_euler.ZERO, mu * disc.r * np.sign(now.phidot) / now.sine * share * now.m0, newton_euler.ZERO
 
     return law
-
-
-def test_a_spring_is_no_tilt_with_an_inertia():
-    result = diagnose(recording(Unknown(newton_euler.spring(0.8), 14.0, 1.0, 0.9)).trajectory)
-    assert [f.candidate.name for f in result.diagnosis.found] == ["spring"]
-    assert result.after.reduced_chi_square < 1.05
-    assert_sized(result.diagnosis.after, {"spring.k": 0.8, "spring.F_x": 0.0, "spring.F_y": 0.0}, 3)
-
-
-def test_a_table_that_vibrates_is_found_with_its_frequency_and_its_forces():
-    """3 um at 60 Hz, 16 deg before the course of the cosine's; the frames begin 2 ms after the motion."""
-    acceleration = 3e-6 * (2 * np.pi * 60) ** 2 * np.array([0.6, 0.3, 0.7])
-    law = newton_euler.vibration(-np.sin(0.3) * acceleration, -np.cos(0.3) * acceleration, 60.0)
-    result = diagnose(recording(Unknown(law, 14.0, 1.0, 0.9)).trajectory)
-    assert result.diagnosis.verdict == "unexplained"
-    assert result.learned is not None
-    fit = result.diagnosis.after
-    assert_sized(fit, {"learned.rate_0": 2 * np.pi * 60}, 3)
-    assert result.after.reduced_chi_square < 1.05
-    # the phase at t = 0 and the rate go together: of each axis the size of the force
-    for axis, true in enumerate(DISC.mass * acceleration):
-        course = [f"learned.c_0_{2 * axis + k}" for k in (0, 1)]
-        assert abs(np.hypot(*(fit.values[name] for name in course)) - true) < 3 * max(map(fit.sigma, course))
 
 
 def test_a_law_below_a_nutation_is_told_with_the_nutation():

@@ -53,17 +53,9 @@ def cv2_pixels(points_world, rig, index):
     return pixels.reshape(-1, 2)
 
 
-def polygon_moments(polygon):
-    """Area and centroid of a closed polygon (n, 2)."""
-    x, y = polygon.T
-    xn, yn = np.roll(x, -1), np.roll(y, -1)
-    cross = x * yn - xn * y
-    area = cross.sum() / 2
-    return abs(area), np.array([((x + xn) * cross).sum(), ((y + yn) * cross).sum()]) / (6 * area)
-
-
-def image_moments(weight):
-    found = cv2.moments(weight)
+def area_and_centroid(shape):
+    """Of an image, by its grey values, or of a closed polygon (n, 2)."""
+    found = cv2.moments(shape.astype(np.float32) if shape.shape[1] == 2 else shape)
     return found["m00"], np.array([found["m10"], found["m01"]]) / found["m00"]
 
 
@@ -92,10 +84,10 @@ def test_dots_lie_where_opencv_projects_their_outlines(q, index, rig):
     R = rotation_from_euler(*q[3:])
     for centre in MA_2014.marker_centres_body:
         outline = cv2_pixels(circle(centre, MA_2014.marker_diameter / 2) @ R.T + q[:3], rig, index)
-        area, centroid = polygon_moments(outline)
+        area, centroid = area_and_centroid(outline)
         low, high = np.floor(outline.min(axis=0)).astype(int) - 6, np.ceil(outline.max(axis=0)).astype(int) + 7
         window = dark[low[1] : high[1], low[0] : high[0]]
-        mass, found = image_moments(window)
+        mass, found = area_and_centroid(window)
         # float32 sums and second-order edges: measured 2e-4 px at worst
         assert_allclose(found + low, centroid, atol=1e-3)
         assert_allclose(mass / (190.0 - 25.0), area, rtol=1e-3, atol=0.02)
@@ -111,8 +103,8 @@ def test_silhouette_is_the_hull_of_both_projected_rims(q, index, rig):
     rims = np.concatenate([circle([0, 0, z * MA_2014.half_thickness], MA_2014.radius) for z in (-1, 1)])
     points = cv2_pixels(rims @ R.T + q[:3], rig, index)
     # straight sides of the hull are bent by distortion by less than 0.01 px over the thickness
-    area, centroid = polygon_moments(points[ConvexHull(points).vertices])
-    mass, found = image_moments(image)
+    area, centroid = area_and_centroid(points[ConvexHull(points).vertices])
+    mass, found = area_and_centroid(image)
     assert_allclose(found, centroid, atol=2e-3)
     assert_allclose(mass / 200.0, area, rtol=1e-4)
 
@@ -132,9 +124,9 @@ def test_black_squares_lie_where_opencv_projects_them(index, rig):
                 along = np.column_stack([side, 0 * side])
                 square = np.concatenate([along, along[:, ::-1] + [1, 0], 1 - along, 1 - along[:, ::-1] - [1, 0]])
                 corners = np.column_stack([(square + np.array([i, j])) * 8e-3, np.zeros(len(square))])
-                area, centroid = polygon_moments(cv2_pixels(corners @ R.T + t, rig, index))
+                area, centroid = area_and_centroid(cv2_pixels(corners @ R.T + t, rig, index))
                 total, moment = total + area, moment + area * centroid
-    mass, found = image_moments(image)
+    mass, found = area_and_centroid(image)
     assert_allclose(found, moment / total, atol=1e-3)  # 16-bit rounding and 16 x 16 samples at corners: 1e-4 px
     assert_allclose(mass / 200, total, rtol=1e-4)
 
@@ -156,7 +148,7 @@ def test_an_error_of_the_lens_model_would_be_noticed(rig):
     outline = circle(MA_2014.marker_centres_body[3], MA_2014.marker_diameter / 2) @ R.T + q[:3]
     k1, k2, p1, p2, k3 = rig.left.distortion
     wrong = replace(rig, left=replace(rig.left, distortion=(k1, k2, -p1, p2, k3)))
-    shift = polygon_moments(cv2_pixels(outline, wrong, 0))[1] - polygon_moments(cv2_pixels(outline, rig, 0))[1]
+    shift = area_and_centroid(cv2_pixels(outline, wrong, 0))[1] - area_and_centroid(cv2_pixels(outline, rig, 0))[1]
     assert np.abs(shift).max() > 10e-3  # ten times the tolerance above
 
 

@@ -68,14 +68,6 @@ def test_what_repeats_is_not_noise_and_noise_does_not_repeat(rng):
     assert rough.systematic_px == (0.0, 0.0)
 
 
-def test_misprinted_dot_is_found_where_it_is_and_the_others_stay():
-    misprint = [(0.0, 0.0)] * 6
-    misprint[2] = (0.12, -0.08)
-    found = judged(measured(faults=Faults(misprint_mm=tuple(misprint)), n=N))
-    assert abs(found.reduced_chi_square - 1) < TOLERANCE
-    assert_allclose(1e3 * found.marker_shift[:, :2], misprint, atol=4e3 * found.marker_shift_sigma.max())
-
-
 def test_too_few_frames_give_no_judgement():
     assert judged(measured(n=15)) is None
 

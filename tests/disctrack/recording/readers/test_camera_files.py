@@ -112,12 +112,6 @@ def test_frames_of_different_instants_are_an_error(tmp_path, rng, kind, left, ri
         ("cih", {"Shutter_Type2": "200000"}, "left 100 µs, right 200 µs.*lie 50 µs apart"),
         ("cih", {"Date": "2026/1/19"}, "1440 minutes apart"),
         ("cine", {"times": LATER + 4e-5}, "taken 40 µs after the left one's"),
-        ("cine", {"times": LATER * 1.009}, "drift apart by"),
-        (
-            "cine",
-            {"times": LATER + np.array([0, 0, 0, 0, 1, 1, 1]) / 2000},
-            "one camera lost frames.*changes at frame 4",
-        ),
         ("cine", {"exposure_ns": 60_000}, "left 50 µs, right 60 µs.*lie 5 µs apart"),
         ("cine", {"trigger": (TRIGGER[0], TRIGGER[1] + 3600)}, "60 minutes apart"),
     ],
