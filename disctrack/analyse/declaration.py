@@ -20,6 +20,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from types import MappingProxyType
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -41,7 +42,6 @@ if TYPE_CHECKING:
 
 
 SIDEWAYS = 0.5  # cosine of the angle up to which a baseline is one from left to right
-USUALLY = 2e-3  # of a rate: the balance of moments tells no usual one from another that is as near
 USUAL_RATES = np.outer(10.0 ** np.arange(1, 7), [1, 1.2, 1.25, 1.5, 2, 2.4, 2.5, 3, 4, 5, 6, 7.5, 8]).ravel()  # [Hz]
 STRETCHES, STRETCH, BLOCK = 4, 100, 20  # stretches looked at, frames of each, frames whose median is one estimate
 MIN_BLOCKS = 5
@@ -51,16 +51,11 @@ SIGMAS = 5.0
 # What honest discs and tables may do: rounded edges and tables that lean by a degree shift the balance by 3 % at most.
 BALANCE = 0.10
 NOTED = 0.01  # from which on it, or energy that grows, is worth a word
-# Where fewer blocks are as near to their median, something else acts on the disc: a hand holds it, or it lies still.
-COHERENT, COHERENT_SHARE = 0.3, 0.8
-STEADY = 0.7  # share of the blocks in which the energy grows: a push is short
 SCALE = 5e-3  # of printed dots against a printed board, paper and toner included
-SIDE_TOLERANCE = 0.06  # of a length: beyond, dots that were printed to another scale would have another size, too
 BY_SCALE = (Kind.DOTS_MISPLACED, Kind.RADIUS, Kind.THICKNESS, Kind.BOARD_THICKNESS, Kind.GRAVITY_OR_RATE, *MISFITS)
 RISE = 0.03  # of the radius: a rounded or bevelled edge of a millimetre
 MIN_LEAN = np.radians(2.0)  # of a plane: boards and tables lean by less
-MIN_ROUND, FLAT = 2.0, 0.1  # [rad] of precession; scatter about the plane over what the rim rises from the declared one
-MIN_SWING = 0.05  # range of sin(theta) below which radius and thickness are not told apart
+MIN_ROUND = 2.0  # [rad] of precession
 SEEN_RARELY = 0.1  # share of the images
 MIN_DOTS_LEFT = 4  # that are seen
 DENSITIES = 50.0, 23e3  # [kg/m^3] a hard foam's, and osmium's
@@ -129,22 +124,18 @@ def thickness(disc: Disc, board: float, off: Finding) -> tuple[Finding, ...]:
     if not off.doubtful:
         return ()
     height = off.numbers["height"].value
-    # nobody measures a thickness of nothing: it was forgotten
     sizes = (
-        ("[table] board_thickness_mm", Kind.BOARD_THICKNESS, board, board - 1e-6 * height),
-        ("[disc] thickness_mm", Kind.THICKNESS, 2 * disc.half_thickness, 2 * disc.half_thickness + 1e-6 * height),
+        ("[table] board_thickness_mm", Kind.BOARD_THICKNESS, 1e3 * board, 1e3 * board - 1e-3 * height),
+        ("[disc] thickness_mm", Kind.THICKNESS, 2e3 * disc.half_thickness, 2e3 * disc.half_thickness + 1e-3 * height),
     )
-    likely = [
-        (abs(float(np.log(fits / size))) if size else 0.0, kind, Remedy(key, f"{1e3 * fits:.2f}", f"{1e3 * size:g}"))
+    suspects = [
+        # nobody measures a thickness of nothing: it was forgotten
+        Suspect(_apart(fits, size) if size else 0.0, kind, Remedy(key, f"{fits:.2f}", f"{size:g}"))
         for key, kind, size, fits in sizes
         if fits > 0
     ]
-    if not likely:
-        return ()
-    likely.sort(key=lambda one: one[0])
     text = f"the disc's rim rolls {1e-3 * height:+.2f} mm from the table that the board gives"
-    remedies = tuple(remedy for *_, remedy in likely)
-    return (Finding(likely[0][1], Severity.DOUBT, text, remedies=remedies, explains=OFF),)
+    return (_contradiction(suspects, text, explains=OFF),) if suspects else ()
 
 
 def across(trajectory: Trajectory) -> Array:
@@ -201,82 +192,110 @@ def lost_pairs(trajectory: Trajectory) -> Iterator[Finding]:
         )
 
 
+class Suspect(NamedTuple):
+    """A declared number that may be wrong."""
+
+    away: float  # what fits, from an ordinary value, natural logarithm: the nearest is the likeliest
+    kind: Kind
+    remedy: Remedy
+
+
+def _contradiction(
+    suspects: Sequence[Suspect],
+    text: str,
+    severity: Severity = Severity.DOUBT,
+    numbers: Mapping[str, Measured] = MappingProxyType({}),
+    explains: tuple[Kind, ...] = (),
+) -> Finding:
+    """Of the kind of the likeliest suspect, all of which it names."""
+    likely = sorted(suspects, key=lambda suspect: suspect.away)
+    remedies = tuple(suspect.remedy for suspect in likely)
+    return Finding(likely[0].kind, severity, text, numbers=numbers, remedies=remedies, explains=explains)
+
+
+def _apart(one: float, other: float) -> float:
+    return abs(float(np.log(one / other)))
+
+
+def _typical(estimates: Array, unit: str = "") -> Measured:
+    """Median of independent estimates; its sigma from their scatter is unknown where they are too few to have one."""
+    if len(estimates) < MIN_BLOCKS:
+        return Measured(np.nan)
+    return Measured(float(np.median(estimates)), robust_sigma(estimates) * np.sqrt(np.pi / 2 / len(estimates)), unit)
+
+
+def _beyond(found: Measured, expected: float, tolerance: float) -> bool:
+    """Whether what was found is known, and differs from what is expected by more than its sigmas and a share of it."""
+    known = found.value > SIGMAS * found.sigma and abs(found.value - expected) > SIGMAS * found.sigma
+    return bool(known and _apart(found.value, expected) > np.log1p(tolerance))
+
+
 def motion_against_gravity(trajectory: Trajectory, height: float | None = None) -> tuple[Finding, ...]:
     """Gravity and frame rate, and an energy that grows, on some stretches of the recording.
 
+    What else acts on the disc, a hand or a push, differs from block to block: nothing is known then.
     height : [m] of the disc's lowest point above the board's table, where that is no table for it
     """
     found, energy = balance(trajectory)
-    g, n = trajectory.gravity, len(found)
-    if n < MIN_BLOCKS:
-        return ()
-    gravity = float(np.median(found))
-    sigma = robust_sigma(found) * np.sqrt(np.pi / 2 / n)
-    if not (gravity > 0 and np.mean(np.abs(found - gravity) < COHERENT * gravity) >= COHERENT_SHARE):
-        return ()
-    away = abs(np.log(gravity / g))
-    if away > np.log1p(NOTED) and abs(gravity - g) > SIGMAS * sigma:
+    g, gravity = trajectory.gravity, _typical(found, "m/s^2")
+    if _beyond(gravity, g, NOTED):
         text = (
-            f"the motion satisfies the balance of moments with a gravity of {Measured(gravity, sigma, 'm/s^2')} ({n} "
-            f"stretches of {BLOCK} frames); expected {g:.4g} m/s² at {trajectory.frame_rate:g} frames a second, "
-            "nothing but the table touching the disc"
+            f"the motion satisfies the balance of moments with a gravity of {gravity} ({len(found)} stretches of "
+            f"{BLOCK} frames); expected {g:.4g} m/s² at {trajectory.frame_rate:g} frames a second, nothing but the "
+            "table touching the disc"
         )
-        numbers = {"gravity": Measured(gravity, sigma, "m/s^2")}
-        ways = sorted(_of_gravity(trajectory, gravity / g, height), key=lambda one: one[0])
-        (misfit, kind, _), remedies = ways[0], tuple(remedy for *_, remedy in ways)
-        severity = Severity.DOUBT if away > np.log1p(BALANCE) else Severity.NOTE
-        if kind == Kind.RADIUS and not misfit:  # two laws agree about it
-            severity = max(severity, Severity.WARNING)
-        explains = (Kind.REVERSED, *OFF) if kind == Kind.RADIUS else (Kind.REVERSED,)
-        return (Finding(kind, severity, text, numbers=numbers, remedies=remedies, explains=explains),)
-    times = np.arange(n)
-    slope, start = np.polyfit(times, energy, 1)
-    sigma = robust_sigma(energy - slope * times - start) / (np.std(times) * np.sqrt(n))
-    end = start + slope * times[-1]
-    steady = np.mean(np.diff(energy) > 0) > STEADY
-    if end - start > NOTED * start and slope > SIGMAS * sigma and steady:
-        grown = Measured(1e3 * float(end - start), 1e3 * float(sigma * times[-1]), "mJ")
+        suspects = _of_gravity(trajectory, gravity, height)
+        severity = Severity.DOUBT if _beyond(gravity, g, BALANCE) else Severity.NOTE
+        explains: tuple[Kind, ...] = (Kind.REVERSED,)
+        if min(suspects).kind == Kind.RADIUS:
+            explains = (*explains, *OFF)
+            # where two laws agree about it
+            severity = max(severity, Severity.NOTE if min(suspects).away else Severity.WARNING)
+        return (_contradiction(suspects, text, severity, {"gravity": gravity}, explains),)
+    step = _typical(np.diff(energy))
+    if step.value > SIGMAS * step.sigma and energy[-1] > (1 + NOTED) * energy[0]:
+        n = len(energy) - 1
+        grown = Measured(1e3 * float(energy[-1] - energy[0]), 1e3 * n * step.sigma, "mJ")
         text = (
-            f"the mechanical energy, {1e3 * start:.4g} mJ at first, grows by {grown} though no force but the table's "
-            "acts; expected a loss"
+            f"the mechanical energy, {1e3 * energy[0]:.4g} mJ at first, grows by {grown} though no force but the "
+            "table's acts; expected a loss"
         )
         remedy = Remedy("[cameras] left, right", action="give the files in the order of time")
-        return (Finding(Kind.REVERSED, Severity.DOUBT, text, numbers={"growth": grown}, remedies=(remedy,)),)
+        return (_contradiction([Suspect(0.0, Kind.REVERSED, remedy)], text, numbers={"growth": grown}),)
     return ()
 
 
-def _of_gravity(trajectory: Trajectory, ratio: float, height: float | None) -> tuple[tuple[float, Kind, Remedy], ...]:
-    """Which declared numbers would explain that the balance holds with `ratio` times the declared gravity.
-
-    With each how far from an ordinary value it would be, natural logarithm: the nearest is the likeliest.
-    """
+def _of_gravity(trajectory: Trajectory, gravity: Measured, height: float | None) -> tuple[Suspect, ...]:
+    """Which declared numbers would explain that the balance holds with this gravity."""
     g, rate = trajectory.gravity, trajectory.frame_rate
+    ratio = gravity.value / g
     true_rate = rate / np.sqrt(ratio)
-    departures = np.abs(np.log(true_rate / USUAL_RATES))
-    nearest = int(np.argmin(departures))
-    usual = f"{USUAL_RATES[nearest]:g} is usual" if departures[nearest] < 0.05 else ""
-    true_rate = USUAL_RATES[nearest] if departures[nearest] < USUALLY else true_rate
-    unit = "if it was given in mm/s²" if abs(np.log(1e3 * ratio)) < 0.1 else ""
-    by_gravity = Remedy("[gravity] g_m_s2", f"{g * ratio:.4g}", f"{g:g}", unit)
-    by_rate = Remedy("[cameras] frame_rate_hz", f"{true_rate:.4g}", f"{rate:g}", usual)
+    usual = float(min(USUAL_RATES, key=lambda other: _apart(true_rate, other)))
+    away = _apart(true_rate, usual)
+    hint = f"{usual:g} is usual" if away < NOTED else ""
+    true_rate = usual if away < SIGMAS * gravity.sigma / gravity.value / 2 else true_rate
+    unit = "if it was given in mm/s²" if _apart(1e3 * ratio, 1.0) < BALANCE else ""
+    by_gravity = Remedy("[gravity] g_m_s2", f"{gravity.value:.4g}", f"{g:g}", unit)
+    by_rate = Remedy("[cameras] frame_rate_hz", f"{true_rate:.4g}", f"{rate:g}", hint)
     return (
-        (abs(float(np.log(g * ratio / 9.81))), Kind.GRAVITY_OR_RATE, by_gravity),
-        (float(departures[nearest]), Kind.GRAVITY_OR_RATE, by_rate),
+        Suspect(_apart(gravity.value, 9.81), Kind.GRAVITY_OR_RATE, by_gravity),
+        Suspect(away, Kind.GRAVITY_OR_RATE, by_rate),
         _radius_suspected(trajectory, ratio, height),
     )
 
 
-def _radius_suspected(trajectory: Trajectory, ratio: float, height: float | None) -> tuple[float, Kind, Remedy]:
+def _radius_suspected(trajectory: Trajectory, ratio: float, height: float | None) -> Suspect:
     """First of all where the rim is on the table with a radius nearer to that of the rates than to the declared one."""
     z, theta = trajectory.q[trajectory.measured][:, [2, 4]].T
-    disc, would_be, misfit = trajectory.disc, trajectory.disc.radius / ratio, abs(float(np.log(ratio)))
+    disc, would_be, misfit = trajectory.disc, trajectory.disc.radius / ratio, _apart(ratio, 1.0)
     by_rim = float(np.median((z - disc.half_thickness * np.abs(np.cos(theta))) / np.sin(theta)))
     # where the table is moved towards the disc's, by how far it was off
     by_table = by_rim if height is None else disc.radius + height / float(np.median(np.sin(theta)))
     for radius, better in ((by_rim, by_rim), (by_table, would_be)):
-        if trajectory.rig.world_is_table and radius > 0 and abs(np.log(radius / would_be)) < 0.5 * misfit:
+        if trajectory.rig.world_is_table and radius > 0 and _apart(radius, would_be) < 0.5 * misfit:
             would_be, misfit = better, 0.0
-    return misfit, Kind.RADIUS, Remedy("[disc] radius_mm", f"{1e3 * would_be:.4g}", f"{1e3 * disc.radius:g}")
+    remedy = Remedy("[disc] radius_mm", f"{1e3 * would_be:.4g}", f"{1e3 * disc.radius:g}")
+    return Suspect(misfit, Kind.RADIUS, remedy)
 
 
 def density(disc: Disc) -> tuple[Finding, ...]:
@@ -324,7 +343,9 @@ def _blocks(motion: MeasuredMotion) -> tuple[Array, Array]:
     m, J1, J3 = disc.mass, disc.moment_diametral, disc.moment_axial
     e1, e2, e3 = motion.axes()
     theta = motion.euler[:, 1]
-    good = motion.known & motion.measured & (theta > THETA_RANGE[0]) & (theta < THETA_RANGE[1])
+    turn_sigma = np.sqrt(np.trace(motion.covariance[:, 9:12, 9:12], axis1=1, axis2=2) / 3)
+    moves = np.linalg.norm(motion.omega_world, axis=1) > SIGMAS * turn_sigma
+    good = moves & motion.measured & (theta > THETA_RANGE[0]) & (theta < THETA_RANGE[1])
     if good.sum() < BLOCK:
         return np.empty(0), np.empty(0)
 
@@ -367,7 +388,7 @@ def another_plane(trajectory: Trajectory, boards: Boards | None = None) -> tuple
     side, ahead = np.linalg.svd(normal[None])[2][1:] @ e3.T
     turned, precessed = np.arccos(np.clip(normal[2], -1, 1)), np.ptp(np.unwrap(np.arctan2(ahead, side)))
     rolls = precessed > MIN_ROUND and np.median(e3 @ normal) < np.cos(THETA_RANGE[0])
-    if not (rolls and turned > MIN_LEAN and robust_sigma(gap) < FLAT * disc.radius * turned):
+    if not (rolls and turned > MIN_LEAN and robust_sigma(gap) < SIGMAS * LAB_FRAME):
         return ()
     lies = None if boards is None else _view_on_plane(trajectory.rig, boards, normal, middle)
     declared = None if boards is None else boards.table_view
@@ -401,7 +422,7 @@ def rise_of_centre(trajectory: Trajectory) -> tuple[Finding, ...]:
     q = trajectory.q[trajectory.measured]
     theta, disc = q[:, 4], trajectory.disc
     q = q[(theta > THETA_RANGE[0]) & (theta < THETA_RANGE[1])]
-    if len(q) < BLOCK or np.ptp(np.sin(q[:, 4])) < MIN_SWING:
+    if len(q) < BLOCK or np.ptp(np.sin(q[:, 4])) < 2 * MIN_LEAN:
         return ()
     s = np.sin(q[:, 4])
     z = q[:, 2] - disc.half_thickness * np.cos(q[:, 4])
@@ -410,16 +431,16 @@ def rise_of_centre(trajectory: Trajectory) -> tuple[Finding, ...]:
         slope, offset = np.polyfit(s, z, 1, w=np.sqrt(_doubting(z - slope * s - offset)))
     scatter = robust_sigma(z - slope * s - offset)
     sigma = scatter / (np.std(s) * np.sqrt(len(s) / BLOCK))
-    ratio = float(slope / disc.radius)
-    if not (abs(ratio - 1) > RISE and abs(slope - disc.radius) > SIGMAS * sigma and scatter < RISE * disc.radius):
-        return ()
-    remedies = (
-        Remedy("[disc] radius_mm", f"{1e3 * slope:.4g}", f"{1e3 * disc.radius:g}"),
-        Remedy("[calibration] square_mm", action=f"times {1 / ratio:.4g}"),
-    )
     rise = Measured(1e3 * float(slope), 1e3 * float(sigma), "mm")
+    if scatter > RISE * disc.radius or not _beyond(rise, 1e3 * disc.radius, RISE):
+        return ()
+    off = _apart(rise.value, 1e3 * disc.radius)
+    suspects = (
+        Suspect(off, Kind.RADIUS, Remedy("[disc] radius_mm", f"{rise.value:.4g}", f"{1e3 * disc.radius:g}")),
+        Suspect(off, Kind.SQUARE, Remedy("[calibration] square_mm", action=f"times {disc.radius / slope:.4g}")),
+    )
     text = f"the centre rises by {rise} per unit of sin(theta); expected the radius, {1e3 * disc.radius:.2f} mm"
-    return (Finding(Kind.RADIUS, Severity.DOUBT, text, numbers={"rise": rise}, remedies=remedies, explains=OFF),)
+    return (_contradiction(suspects, text, numbers={"rise": rise}, explains=OFF),)
 
 
 def handedness(rig: StereoRig, disc: Disc) -> tuple[Finding, ...]:
@@ -464,36 +485,31 @@ def scale_of_dots(trajectory: Trajectory, declared: Disc, square: float | None =
     expected = np.linalg.norm(declared.marker_centres_body[i] - declared.marker_centres_body[j], axis=1)
     ratio = np.linalg.norm(seen[:, i] - seen[:, j], axis=2) / expected
     per_pair = np.array([np.median(r[np.isfinite(r)]) for r in ratio.T if np.isfinite(r).sum() >= min(5, n)])
-    if len(per_pair) < MIN_BLOCKS:
-        return ()
-    scale, spread = float(np.median(per_pair)), robust_sigma(per_pair)
-    # Pairs of dots share dots: as many are independent as there are dots.
-    sigma = spread / np.sqrt(dots)
-    if not (abs(scale - 1) > SCALE and abs(scale - 1) > SIGMAS * sigma):
-        return ()
-    return (other_scale(Measured(scale, max(sigma, 1e-4)), square),)
+    typical = _typical(per_pair)
+    # pairs of dots share dots: as many are independent as there are dots
+    scale = replace(typical, sigma=max(typical.sigma * np.sqrt(len(per_pair) / dots), 1e-4))
+    return (other_scale(scale, square),) if _beyond(scale, 1.0, SCALE) else ()
 
 
 def other_scale(scale: Measured, square: float | None = None, explains: tuple[Kind, ...] = BY_SCALE) -> Finding:
     """Dots that are so many times as far apart as declared. square : [m] of the board as declared"""
-    factor, off = scale.value, abs(float(np.log(scale.value)))
+    factor, off = scale.value, _apart(scale.value, 1.0)
     uncertain = max(3 * scale.sigma / factor, 0.01 * min(off, 1.0))  # no template fits dots that are far from declared
     digits, mixed = 1 + int(np.log10(factor / scale.sigma)), ""
     for unit, words in UNITS.items():
         if abs(off / np.log(unit) - 1) < 0.02:
             factor, mixed = float(unit ** np.sign(np.log(factor))), f": are {words} mixed up?"
-    board = off, Remedy("[calibration] square_mm", action=f"times {rounded(1 / factor, digits)}")
+    board = Suspect(off, Kind.SQUARE, Remedy("[calibration] square_mm", action=f"times {rounded(1 / factor, digits)}"))
     if square is not None:
         side = 1e3 * square / factor
         usual = max(round(2 * side), 1) / 2  # boards have squares of whole or half mm
-        away = abs(float(np.log(side / usual)))
-        fits = usual if away < uncertain else side
-        board = min(away, off), Remedy("[calibration] square_mm", f"{fits:.2f}", f"{1e3 * square:g}")
-    lengths = "[markers] centres_mm" if off < SIDE_TOLERANCE else "every length of [disc] and [markers]"
-    ways = board, (off, Remedy(lengths, action=f"times {rounded(factor, digits)}"))
-    remedies = tuple(remedy for _, remedy in sorted(ways, key=lambda one: one[0]))
+        away = _apart(side, usual)
+        remedy = Remedy("[calibration] square_mm", f"{usual if away < uncertain else side:.2f}", f"{1e3 * square:g}")
+        board = Suspect(min(away, off), Kind.SQUARE, remedy)
+    action = f"and every other length of the disc, times {rounded(factor, digits)}"
+    lengths = Suspect(off, Kind.SQUARE, Remedy("[markers] centres_mm", action=action))
     text = f"by both cameras the dots are {scale} times as far apart as declared{mixed}"
-    return Finding(Kind.SQUARE, Severity.DOUBT, text, Subject(), {"scale": scale}, remedies, explains)
+    return _contradiction((board, lengths), text, numbers={"scale": scale}, explains=explains)
 
 
 def unseen_dots(trajectory: Trajectory, declared: Disc) -> tuple[Finding, ...]:

@@ -9,7 +9,9 @@ acceleration in world axes. Euler rates are then read off the angular velocity, 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +24,6 @@ from disctrack.analyse.smoothing import (
     SEGMENT,
     Process,
     fit_process,
-    joined,
     moving_weights,
 )
 from disctrack.disc import Disc
@@ -35,7 +36,7 @@ from disctrack.frames import (
     skew,
     unwrap_euler,
 )
-from disctrack.trajectory import FrameStatus, Trajectory
+from disctrack.trajectory import FrameStatus, Trajectory, part
 
 K = np.array([0.0, 0.0, 1.0])
 STATE = (
@@ -152,16 +153,41 @@ def differentiate(trajectory: Trajectory, breaks: Sequence[float] = ()) -> Measu
     time = np.asarray(trajectory.time, float)
     good = trajectory.measured & np.isfinite(trajectory.pose_covariance).all(axis=(1, 2))
     _require_samples(time, good)
-    interval, status = float(np.median(np.diff(time))), trajectory.frame_status
+    pieces = [_differentiated(part(trajectory, rows), good[rows]) for rows in _between(breaks, time, good)]
+    if len(pieces) == 1:
+        return pieces[0]
+    n = len(pieces[0])
+    whole: dict[str, Any] = {
+        name: np.concatenate([getattr(piece, name) for piece in pieces])
+        for name, value in vars(pieces[0]).items()
+        if isinstance(value, np.ndarray) and value.shape[0] == n
+    }
+    whole["noise_scale"] = np.average([p.noise_scale for p in pieces], axis=0, weights=[len(p) for p in pieces])
+    whole |= {"rig_covariance": trajectory.rig.covariance, "systematic_pace": _pace(trajectory)}
+    return replace(pieces[0], **whole)
+
+
+def _between(breaks: Sequence[float], time: Array, good: Mask) -> list[slice]:
+    """The rows between the breaks that leave poses enough on both sides."""
+    starts = [0]
+    for row in np.searchsorted(time, sorted(breaks)):
+        if min(good[starts[-1] : row].sum(), good[row:].sum()) >= MIN_FRAMES:
+            starts.append(int(row))
+    return [slice(*ends) for ends in pairwise([*starts, len(time)])]
+
+
+def _differentiated(trajectory: Trajectory, good: Mask) -> MeasuredMotion:
+    """Without breaks. good : (n,) frames with a pose"""
+    time, status = np.asarray(trajectory.time, float), trajectory.frame_status
+    interval = float(np.median(np.diff(time)))
     samples = _Samples(
         ticks=(time - time[0]) / interval,
         position=np.where(good[:, None], trajectory.q[:, :3], 0.0),
-        R=_bridged_rotations(time, trajectory.quaternion, good),
+        R=_filled(rotation_from_quaternion(trajectory.quaternion), good, np.nan),
         covariance=np.where(good[:, None, None], trajectory.pose_covariance, 0.0),
         # a pose from one camera depends on the rig in another way, and the jump must not be differentiated
         sensitivity=_filled(trajectory.calibration_sensitivity, good & (status == FrameStatus.MEASURED), np.nan),
         good=good,
-        part=_parts(time, good, breaks),
     )
     processes = _fit_groups(samples)
     state, R, covariance, sensitivity = _smoothed(samples, processes)
@@ -218,11 +244,10 @@ class _Samples:
 
     ticks: Array  # (n,)
     position: Array  # (n, 3), 0 where not measured
-    R: Array  # (n, 3, 3), gaps bridged along the shortest arc
+    R: Array  # (n, 3, 3), in gaps that of the nearest frame: they have no weight
     covariance: Array  # (n, 6, 6), 0 where not measured
     sensitivity: Array  # (n, 6, 30)
     good: Mask  # (n,)
-    part: NDArray[np.int64]  # (n,) number of the stretch between breaks
 
     @property
     def variance(self) -> Array:
@@ -244,51 +269,21 @@ def _require_samples(time: Array, good: Mask) -> None:
         )
 
 
-def _parts(time: Array, good: Mask, breaks: Sequence[float]) -> NDArray[np.int64]:
-    """Number of the stretch (n,) that each frame belongs to."""
-    part = np.zeros(len(time), np.int64)
-    for instant in sorted(breaks):
-        after, last = time >= instant, part == part.max()
-        if min((good & last & ~after).sum(), (good & after).sum()) >= MIN_FRAMES:
-            part[after] += 1
-    return part
-
-
-def _bridged_rotations(time: Array, quaternion: Array, good: Mask) -> Array:
-    """R_world_body (n, 3, 3), missing frames on the shortest arc between their neighbours, held at the ends."""
-    R = rotation_from_quaternion(np.where(good[:, None], quaternion, np.array([1.0, 0.0, 0.0, 0.0])))
-    missing = ~good
-    if missing.any():
-        from scipy.spatial.transform import Rotation, Slerp  # half a second, wanted where frames are missing
-
-        arc = Slerp(time[good], Rotation.from_matrix(R[good]))
-        R[missing] = arc(np.clip(time[missing], time[good][0], time[good][-1])).as_matrix()
-    return R
-
-
 def _fit_groups(samples: _Samples) -> tuple[Process, ...]:
-    """One process per group of CHANNEL_GROUPS, fitted to each stretch between breaks."""
-    by_part = []
-    for number in np.unique(samples.part):
-        frames = np.flatnonzero(samples.part == number)
-        segments, centres = _segments(samples, frames)
-        by_part.append(
-            [
-                fit_process([(t, d[list(g)], v[list(g)]) for t, d, v in segments], centres, len(frames))
-                for g in CHANNEL_GROUPS
-            ]
-        )
-    return tuple(joined(fits) for fits in zip(*by_part, strict=True))
+    """One process per group of CHANNEL_GROUPS."""
+    segments, centres = _segments(samples)
+    groups = [[(t, d[list(g)], v[list(g)]) for t, d, v in segments] for g in CHANNEL_GROUPS]
+    return tuple(fit_process(group, centres, len(samples.ticks)) for group in groups)
 
 
-def _segments(samples: _Samples, frames: NDArray[np.int64]) -> tuple[list[tuple[Array, Array, Array]], Array]:
-    """Overlapping segments (times, data, variance) of a stretch of frames, and the middles that they stand for."""
-    n = len(frames)
+def _segments(samples: _Samples) -> tuple[list[tuple[Array, Array, Array]], Array]:
+    """Overlapping segments (times, data, variance), and the middles that they stand for."""
+    n = len(samples.ticks)
     starts = np.arange(0, max(1, n - SEGMENT // 2), SEGMENT // 2)
     segments, centres = [], []
     for start in starts:
         stop = n if start == starts[-1] else start + SEGMENT
-        used = frames[start:stop][samples.good[frames[start:stop]]]
+        used = start + np.flatnonzero(samples.good[start:stop])
         if len(used) < MIN_FRAMES:
             continue
         s, gain = _sine_vectors(samples.R[used], samples.R[used[len(used) // 2]])
@@ -341,9 +336,9 @@ def _smoothed(samples: _Samples, processes: tuple[Process, ...]) -> tuple[Array,
         weights, prior, unknown = _weights_and_prior(samples, processes, half, rows)
         for k in range(0, len(rows), FRAMES_AT_ONCE // 8):
             some = slice(k, k + FRAMES_AT_ONCE // 8)
-            parts = _smoothed_rows(samples, noise, rows[some], weights[some][:, of_channel], half)
-            for whole, part in zip(out, parts, strict=True):
-                whole[rows[some]] = part
+            found = _smoothed_rows(samples, noise, rows[some], weights[some][:, of_channel], half)
+            for whole, rows_of_it in zip(out, found, strict=True):
+                whole[rows[some]] = rows_of_it
         for channel in range(6):
             entries = channel + 6 * np.arange(3)
             out[2][rows[:, None, None], entries[:, None], entries] += prior[:, channel]
@@ -362,7 +357,7 @@ def _weights_and_prior(
     for number, (group, process) in enumerate(zip(CHANNEL_GROUPS, processes, strict=True)):
         channels = list(group)
         variance = samples.variance[:, channels].mean(axis=1)
-        weights[:, number], P = moving_weights(samples.ticks, variance, process, half, samples.part, rows)
+        weights[:, number], P = moving_weights(samples.ticks, variance, process, half, rows)
         prior[:, channels] = P[:, None]
         open_fraction = P[:, 1, 1] * process.length[rows] ** 2 / process.amplitude2[rows]
         unknown |= ~np.isfinite(open_fraction) | (~samples.good[rows] & (open_fraction > KNOWN_FRACTION))

@@ -37,16 +37,6 @@ class Process:
     noise_scale: float  # variance found over variance stated
 
 
-def joined(processes: Sequence[Process]) -> Process:
-    """Processes of successive stretches as one; the noise scale is their mean, by samples."""
-    sizes = [len(p.length) for p in processes]
-    return Process(
-        np.concatenate([p.length for p in processes]),
-        np.concatenate([p.amplitude2 for p in processes]),
-        float(np.average([p.noise_scale for p in processes], weights=sizes)),
-    )
-
-
 def kernel(lag: Array, length: float) -> Array:
     """Covariance exp(-lag^2 / 2 l^2) of the process with unit amplitude."""
     return np.exp(-0.5 * (lag / length) ** 2)
@@ -175,13 +165,11 @@ def moving_weights(
     variance: Array,
     process: Process,
     half_window: int,
-    part: NDArray[np.int64],
     points: NDArray[np.int64],
 ) -> tuple[Array, Array]:
     """Weights (k, 3, 2 half_window + 1) and remaining prior covariance (k, 3, 3) for some samples.
 
     times : (n,) in sample intervals; variance : (n,) stated, infinite where there is no sample
-    part : (n,) number of the stretch that a sample belongs to; windows do not reach across
     points : (k,) which samples
     Derivatives are per interval. The ends are windows whose outer samples are missing. Windows with the same length,
     ratio and pattern of noise share one solution; noise is told apart in factors of two for this purpose (weights may
@@ -192,7 +180,6 @@ def moving_weights(
     index = points[:, None] + np.arange(-w, w + 1)
     inside = (index >= 0) & (index < n)
     clipped = np.clip(index, 0, n - 1)
-    inside &= part[clipped] == part[points, None]
     lag = _on_grid(np.where(inside, times[clipped] - times[points, None], np.arange(-w, w + 1, dtype=float)))
     typical = float(np.median(variance[np.isfinite(variance)]))
     with np.errstate(divide="ignore"):
