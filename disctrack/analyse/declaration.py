@@ -43,8 +43,8 @@ if TYPE_CHECKING:
 
 SIDEWAYS = 0.5  # cosine of the angle up to which a baseline is one from left to right
 USUAL_RATES = np.outer(10.0 ** np.arange(1, 7), [1, 1.2, 1.25, 1.5, 2, 2.4, 2.5, 3, 4, 5, 6, 7.5, 8]).ravel()  # [Hz]
-STRETCHES, STRETCH, BLOCK = 4, 100, 20  # stretches looked at, frames of each, frames whose median is one estimate
-MIN_BLOCKS = 5
+STRETCHES, BLOCK = 4, 20  # stretches looked at, frames that give one estimate
+MIN_BLOCKS = 5  # to judge them by their scatter: a stretch
 # Below, the disc may lie on a patch of its face and the weight has no arm; above, the arm of the weight is short.
 THETA_RANGE = np.radians(1.0), np.radians(60.0)
 SIGMAS = 5.0
@@ -218,16 +218,34 @@ def _apart(one: float, other: float) -> float:
 
 
 def _typical(estimates: Array, unit: str = "") -> Measured:
-    """Median of independent estimates; its sigma from their scatter is unknown where they are too few to have one."""
-    if len(estimates) < MIN_BLOCKS:
-        return Measured(np.nan)
+    """Median of independent estimates, and its sigma from their scatter."""
     return Measured(float(np.median(estimates)), robust_sigma(estimates) * np.sqrt(np.pi / 2 / len(estimates)), unit)
 
 
+def _slope(x: Array, y: Array) -> tuple[Measured, float]:
+    """Slope of y over x, and the scatter about the line; frames in the air, or in a hand, count less.
+
+    Its sigma grows with the memory of what the line leaves: a push, or a curve, has few independent points.
+    """
+    weight = np.ones(len(x))
+    for _ in range(6):
+        slope, offset = np.polyfit(x, y, 1, w=np.sqrt(weight))
+        left = y - slope * x - offset
+        weight = _doubting(left)
+    scatter, memory = robust_sigma(left), max(float(np.corrcoef(left[:-1], left[1:])[0, 1]), 0.0)
+    sigma = scatter / np.std(x) * np.sqrt((1 + memory) / (1 - memory) / len(x))
+    return Measured(float(slope), float(sigma)), scatter
+
+
+def _known(found: Measured) -> bool:
+    """Whether a positive number is told from zero."""
+    return found.value > SIGMAS * found.sigma
+
+
 def _beyond(found: Measured, expected: float, tolerance: float) -> bool:
-    """Whether what was found is known, and differs from what is expected by more than its sigmas and a share of it."""
-    known = found.value > SIGMAS * found.sigma and abs(found.value - expected) > SIGMAS * found.sigma
-    return bool(known and _apart(found.value, expected) > np.log1p(tolerance))
+    """Whether what was found differs from what is expected by more than its sigmas and a share of it."""
+    differs = _known(found) and abs(found.value - expected) > SIGMAS * found.sigma
+    return bool(differs and _apart(found.value, expected) > np.log1p(tolerance))
 
 
 def motion_against_gravity(trajectory: Trajectory, height: float | None = None) -> tuple[Finding, ...]:
@@ -237,6 +255,8 @@ def motion_against_gravity(trajectory: Trajectory, height: float | None = None) 
     height : [m] of the disc's lowest point above the board's table, where that is no table for it
     """
     found, energy = balance(trajectory)
+    if len(found) < MIN_BLOCKS:
+        return ()
     g, gravity = trajectory.gravity, _typical(found, "m/s^2")
     if _beyond(gravity, g, NOTED):
         text = (
@@ -246,16 +266,15 @@ def motion_against_gravity(trajectory: Trajectory, height: float | None = None) 
         )
         suspects = _of_gravity(trajectory, gravity, height)
         severity = Severity.DOUBT if _beyond(gravity, g, BALANCE) else Severity.NOTE
-        explains: tuple[Kind, ...] = (Kind.REVERSED,)
-        if min(suspects).kind == Kind.RADIUS:
-            explains = (*explains, *OFF)
-            # where two laws agree about it
-            severity = max(severity, Severity.NOTE if min(suspects).away else Severity.WARNING)
+        likeliest = min(suspects, key=lambda suspect: suspect.away)
+        explains = (Kind.REVERSED, *OFF) if likeliest.kind == Kind.RADIUS else (Kind.REVERSED,)
+        if likeliest.kind == Kind.RADIUS and not likeliest.away:  # two laws agree about it
+            severity = max(severity, Severity.WARNING)
         return (_contradiction(suspects, text, severity, {"gravity": gravity}, explains),)
-    step = _typical(np.diff(energy))
-    if step.value > SIGMAS * step.sigma and energy[-1] > (1 + NOTED) * energy[0]:
-        n = len(energy) - 1
-        grown = Measured(1e3 * float(energy[-1] - energy[0]), 1e3 * n * step.sigma, "mJ")
+    blocks = np.arange(len(energy))
+    slope, _ = _slope(blocks, energy)
+    if _known(gravity) and _known(slope) and slope.value * blocks[-1] > NOTED * energy[0]:
+        grown = Measured(1e3 * slope.value * blocks[-1], 1e3 * slope.sigma * blocks[-1], "mJ")
         text = (
             f"the mechanical energy, {1e3 * energy[0]:.4g} mJ at first, grows by {grown} though no force but the "
             "table's acts; expected a loss"
@@ -330,9 +349,9 @@ def _stretches(trajectory: Trajectory) -> list[slice]:
     gaps = np.diff(trajectory.time[rows])
     pieces = np.split(rows, np.flatnonzero(gaps > BLOCK * np.median(gaps)) + 1)
     found = [
-        slice(int(start), int(min(start + STRETCH, piece[-1] + 1)))
+        slice(int(start), int(min(start + MIN_BLOCKS * BLOCK, piece[-1] + 1)))
         for piece in pieces
-        for start in range(piece[0], piece[-1] + 1 - BLOCK, STRETCH)
+        for start in range(piece[0], piece[-1] + 1 - BLOCK, MIN_BLOCKS * BLOCK)
     ]
     return [found[i] for i in evenly(len(found), STRETCHES)]
 
@@ -426,18 +445,14 @@ def rise_of_centre(trajectory: Trajectory) -> tuple[Finding, ...]:
         return ()
     s = np.sin(q[:, 4])
     z = q[:, 2] - disc.half_thickness * np.cos(q[:, 4])
-    slope, offset = np.polyfit(s, z, 1)
-    for _ in range(5):
-        slope, offset = np.polyfit(s, z, 1, w=np.sqrt(_doubting(z - slope * s - offset)))
-    scatter = robust_sigma(z - slope * s - offset)
-    sigma = scatter / (np.std(s) * np.sqrt(len(s) / BLOCK))
-    rise = Measured(1e3 * float(slope), 1e3 * float(sigma), "mm")
+    slope, scatter = _slope(s, z)
+    rise = Measured(1e3 * slope.value, 1e3 * slope.sigma, "mm")
     if scatter > RISE * disc.radius or not _beyond(rise, 1e3 * disc.radius, RISE):
         return ()
     off = _apart(rise.value, 1e3 * disc.radius)
     suspects = (
         Suspect(off, Kind.RADIUS, Remedy("[disc] radius_mm", f"{rise.value:.4g}", f"{1e3 * disc.radius:g}")),
-        Suspect(off, Kind.SQUARE, Remedy("[calibration] square_mm", action=f"times {disc.radius / slope:.4g}")),
+        Suspect(off, Kind.SQUARE, Remedy("[calibration] square_mm", action=f"times {disc.radius / slope.value:.4g}")),
     )
     text = f"the centre rises by {rise} per unit of sin(theta); expected the radius, {1e3 * disc.radius:.2f} mm"
     return (_contradiction(suspects, text, numbers={"rise": rise}, explains=OFF),)
@@ -485,6 +500,8 @@ def scale_of_dots(trajectory: Trajectory, declared: Disc, square: float | None =
     expected = np.linalg.norm(declared.marker_centres_body[i] - declared.marker_centres_body[j], axis=1)
     ratio = np.linalg.norm(seen[:, i] - seen[:, j], axis=2) / expected
     per_pair = np.array([np.median(r[np.isfinite(r)]) for r in ratio.T if np.isfinite(r).sum() >= min(5, n)])
+    if len(per_pair) < MIN_BLOCKS:
+        return ()
     typical = _typical(per_pair)
     # pairs of dots share dots: as many are independent as there are dots
     scale = replace(typical, sigma=max(typical.sigma * np.sqrt(len(per_pair) / dots), 1e-4))

@@ -19,6 +19,7 @@ from scipy.special import stdtrit
 
 from calibration.kit.arrays import Array
 from calibration.kit.brief import Outline
+from disctrack.analyse.derivatives import MIN_FRAMES
 from disctrack.disc import Disc, nutation_frequency, precession_rate
 from disctrack.errors import ModelError
 from disctrack.numbers import measured
@@ -33,10 +34,8 @@ MODEL_EXPONENTS = (
 )
 WINDOW = 0.5  # [s] before t_f, as for the paper's table 2
 MIN_PERIODS = 5  # of nutation, in a window
-MIN_SPAN = 2.5  # longest over shortest time left: a power law shows only over a ratio
 MAX_TF_SIGMA = 0.3  # of t_f, over the shortest time left
 RATIO_RANGE = (0.72, 0.95)  # nutation over precession frequency: thin disc 0.7746, 3 mm at 60 degrees 0.89
-LEAST_FRAMES = 20  # in a window
 HARMONICS = ((1, 3), (2, 2))  # (harmonic, terms of its amplitude in a polynomial of the phase)
 BRAKE_DROP = 0.05  # relative fall of psidot below its peak that is taken for the brake at the very end
 BRAKE_MARGIN = 0.01  # [s] left out before that peak
@@ -114,18 +113,18 @@ def fit_power_laws(
     periods (cluster-robust covariance), so that neighbouring frames do not count as independent.
     """
     usable = np.isfinite(psi) & (theta > 0) & (psidot > 0)
-    if usable.sum() < LEAST_FRAMES:
-        return PowerLaws(f"fewer than {LEAST_FRAMES} frames with a nutation and a positive precession rate")
-    end = power_law_end(time, psi, psidot)
+    end = power_law_end(time, psi, psidot) if usable.any() else np.inf
     usable &= time <= end
-    if usable.sum() < LEAST_FRAMES:
-        return PowerLaws(f"fewer than {LEAST_FRAMES} frames before the brake at the end")
+    if usable.sum() < MIN_FRAMES:
+        return PowerLaws(
+            f"fewer than {MIN_FRAMES} frames with a nutation and a positive precession rate before the brake at the end"
+        )
     with np.errstate(invalid="ignore", divide="ignore"):
         data = np.log(np.stack([theta, psidot, np.where(energy > 0, energy, np.nan)]))
     fit = _fitted(time[usable], psi[usable], data[:2, usable])
     for _ in range(4):
         chosen = usable & (fit.t_f - time <= window)
-        if chosen.sum() < LEAST_FRAMES:
+        if chosen.sum() < MIN_FRAMES:
             still = fit.t_f - end
             how_far = f"about {still:.2g} s" if still < 5 * np.ptp(time) else "long"
             return PowerLaws(
@@ -240,14 +239,10 @@ def _judged(fit: _Fit, ln_energy: Array) -> PowerLaws:
     reason = ""
     if periods < MIN_PERIODS:
         reason = f"only {periods:.1f} nutation periods in the window, {MIN_PERIODS} are needed"
-    elif longest < MIN_SPAN * shortest:
-        reason = (
-            f"the window reaches from {longest:.3f} s to {shortest:.3f} s before collapse, less than a factor "
-            f"{MIN_SPAN}: record closer to the end"
-        )
     elif not t_f_sigma < MAX_TF_SIGMA * shortest:
         reason = (
-            f"t_f is known only to {1e3 * t_f_sigma:.1f} ms with {1e3 * shortest:.1f} ms left at the end of the data"
+            f"t_f is known only to {1e3 * t_f_sigma:.1f} ms with {1e3 * shortest:.1f} ms left at the end of the data: "
+            "record closer to the end"
         )
     if reason:
         return PowerLaws(reason, (longest, shortest), periods, fit.t_f, t_f_sigma)
