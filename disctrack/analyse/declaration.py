@@ -447,7 +447,7 @@ def rise_of_centre(trajectory: Trajectory) -> tuple[Finding, ...]:
     z = q[:, 2] - disc.half_thickness * np.cos(q[:, 4])
     slope, scatter = _slope(s, z)
     rise = Measured(1e3 * slope.value, 1e3 * slope.sigma, "mm")
-    if scatter > RISE * disc.radius or not _beyond(rise, 1e3 * disc.radius, RISE):
+    if scatter > SIGMAS * LAB_FRAME or not _beyond(rise, 1e3 * disc.radius, RISE):
         return ()
     off = _apart(rise.value, 1e3 * disc.radius)
     suspects = (

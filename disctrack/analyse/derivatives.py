@@ -50,7 +50,7 @@ STATE = (
 N_STATE = len(STATE)  # 18
 CHANNEL_GROUPS = ((0, 1), (2,), (3, 4), (5,))  # horizontal, vertical, tilt, turn about the vertical: unlike spectra
 GROUP_NAMES = ("horizontal position", "height", "tilt", "turn about the vertical")
-FRAMES_AT_ONCE = 1024
+FRAMES_AT_ONCE = 256
 MIN_FRAMES = 12  # a line and a curvature per channel, and enough left over to judge the noise
 # Of the image's longer side: what repeats is as smooth as half a cell of the splines that have taken out the lens
 SYSTEMATIC_LENGTH = 0.1
@@ -324,41 +324,36 @@ def _smoothed(samples: _Samples, processes: tuple[Process, ...]) -> tuple[Array,
     for group, process in zip(CHANNEL_GROUPS, processes, strict=True):
         scale[list(group)] = np.sqrt(process.noise_scale)
     noise = samples.covariance * np.outer(scale, scale)
-    of_channel = np.repeat(range(len(CHANNEL_GROUPS)), [len(group) for group in CHANNEL_GROUPS])
     out = (
         np.empty((n, 3, 6)),
         np.empty((n, 3, 3)),
         np.empty((n, 18, 18)),
         np.empty((n, 18, samples.sensitivity.shape[2])),
     )
-    for first in range(0, n, FRAMES_AT_ONCE):  # the windows of all frames at once would be as large as all the rest
+    for first in range(0, n, FRAMES_AT_ONCE):  # the windows of all frames at once would be larger than all the rest
         rows = np.arange(first, min(first + FRAMES_AT_ONCE, n))
         weights, prior, unknown = _weights_and_prior(samples, processes, half, rows)
-        for k in range(0, len(rows), FRAMES_AT_ONCE // 8):
-            some = slice(k, k + FRAMES_AT_ONCE // 8)
-            found = _smoothed_rows(samples, noise, rows[some], weights[some][:, of_channel], half)
-            for whole, rows_of_it in zip(out, found, strict=True):
-                whole[rows[some]] = rows_of_it
+        for whole, found in zip(out, _smoothed_rows(samples, noise, rows, weights, half), strict=True):
+            whole[rows] = found
+            whole[rows[unknown]] = np.nan
         for channel in range(6):
             entries = channel + 6 * np.arange(3)
             out[2][rows[:, None, None], entries[:, None], entries] += prior[:, channel]
-        for whole in out:
-            whole[rows[unknown]] = np.nan
     return out
 
 
 def _weights_and_prior(
     samples: _Samples, processes: tuple[Process, ...], half: int, rows: NDArray[np.int64]
 ) -> tuple[Array, Array, Mask]:
-    """For k rows: weights (k, groups, 3, w), prior covariance (k, 6, 3, 3), True where that leaves too much open."""
+    """For k rows: weights (k, 6, 3, w), prior covariance (k, 6, 3, 3), True where that leaves too much open."""
     k = len(rows)
-    weights, prior = np.zeros((k, len(CHANNEL_GROUPS), 3, 2 * half + 1)), np.zeros((k, 6, 3, 3))
+    weights, prior = np.zeros((k, 6, 3, 2 * half + 1)), np.zeros((k, 6, 3, 3))
     unknown = np.zeros(k, bool)
-    for number, (group, process) in enumerate(zip(CHANNEL_GROUPS, processes, strict=True)):
+    for group, process in zip(CHANNEL_GROUPS, processes, strict=True):
         channels = list(group)
         variance = samples.variance[:, channels].mean(axis=1)
-        weights[:, number], P = moving_weights(samples.ticks, variance, process, half, rows)
-        prior[:, channels] = P[:, None]
+        W, P = moving_weights(samples.ticks, variance, process, half, rows)
+        weights[:, channels], prior[:, channels] = W[:, None], P[:, None]
         open_fraction = P[:, 1, 1] * process.length[rows] ** 2 / process.amplitude2[rows]
         unknown |= ~np.isfinite(open_fraction) | (~samples.good[rows] & (open_fraction > KNOWN_FRACTION))
     return weights, prior, unknown

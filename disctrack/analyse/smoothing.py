@@ -197,13 +197,7 @@ def moving_weights(
             continue
         keys = np.concatenate([ratio[rows, None], patterns[rows, columns], lag[rows, columns]], axis=1)
         unique, inverse = np.unique(keys, axis=0, return_inverse=True)
-        size = 2 * reach + 1
-        for start in range(0, len(unique), 256):
-            block = unique[start : start + 256]
-            noise = 2.0 ** block[:, 1 : 1 + size] / 10.0 ** block[:, :1]
-            chosen = np.flatnonzero((inverse.ravel() >= start) & (inverse.ravel() < start + 256))
-            W, P = window_weights(block[:, 1 + size :], noise, float(length))
-            which = inverse.ravel()[chosen] - start
-            weights[rows[chosen], :, columns] = W[which]
-            prior[rows[chosen]] = P[which]
+        patterns_of, lags = np.split(unique[:, 1:], 2, axis=1)
+        W, P = window_weights(lags, 2.0**patterns_of / 10.0 ** unique[:, :1], float(length))
+        weights[rows, :, columns], prior[rows] = W[inverse.ravel()], P[inverse.ravel()]
     return weights, prior * process.amplitude2[points, None, None]

@@ -2,5 +2,4 @@
 
 INK, MUTED, GRID = "#1d2733", "#6b7885", "#e3e8ed"  # text and axes, what steps back, lines of the grid
 BLUE, RED, GREEN, AMBER = "#0072b2", "#d55e00", "#009e73", "#e69f00"  # blue, vermilion, bluish green, orange
-PURPLE, SKY = "#cc79a7", "#56b4e9"  # reddish purple, sky blue
 COLOURS = {"left": BLUE, "right": RED}  # of the cameras

@@ -59,10 +59,6 @@ class Model:
         new = {e.name: e for e in self.effects} | {e.name: e for e in effects}
         return replace(self, effects=tuple(new.values()))
 
-    def without(self, *names: str) -> Model:
-        """Copy without the effects of these names."""
-        return replace(self, effects=tuple(e for e in self.effects if e.name not in names))
-
     def with_values(self, values: Mapping[str, float]) -> Model:
         """Copy with new values by "effect.parameter"; an effect that is not in the model is added, absent otherwise."""
         new = {e.name: dict(e.values) for e in self.effects}

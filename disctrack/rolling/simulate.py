@@ -96,7 +96,6 @@ def follow(
     y: Numbers,
     grid: Array,
     rtol: float,
-    max_switches: int = MAX_SWITCHES,
     max_steps: int = MOST_STEPS,
 ) -> Path:
     """Integrate through the regimes until the grid or the motion ends; complex if the assembly is."""
@@ -136,7 +135,7 @@ def follow(
             if end is None:
                 switches.append(Switch(float(np.real(t)), Regime(regime), Regime(new)))
                 regime = new
-                if len(switches) > max_switches:
+                if len(switches) > MAX_SWITCHES:
                     end = EndReason.CHATTER
     if not pieces:  # over at its start
         add(grid[:1], y[None])

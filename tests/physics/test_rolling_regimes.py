@@ -105,14 +105,6 @@ def test_slip_starts_when_rolling_needs_more_than_the_cone_and_energy_falls_by_i
     assert_allclose(simpson(motion.power, x=motion.time), lost, rtol=1e-3)
 
 
-def test_enough_friction_never_slips():
-    state = steady_precession(np.radians(40), MA_2014, nutation_amplitude=0.02)
-    free = rolling.simulate(Model(MA_2014), state, 0.2)
-    motion = rolling.simulate(slippery(1.05 * free.friction_needed.max()), state, 0.2)
-    assert motion.switches == ()
-    assert_allclose(motion.q, free.q, atol=1e-12)
-
-
 @pytest.fixture
 def jump():
     """A disc flung upwards about its edge so fast that the table would have to pull."""
@@ -132,16 +124,6 @@ def test_contact_is_lost_where_the_table_would_have_to_pull_and_the_flight_keeps
     assert gap.max() > 1e-4
     assert motion.end in (EndReason.LANDED, EndReason.UPRIGHT)
     assert (motion.contact_force[~flying, 2] > 0).all()
-
-
-def test_load_is_never_negative_in_contact(rng):
-    for _ in range(20):
-        theta = np.radians(rng.uniform(5, 80))
-        state = State(theta=theta, thetadot=rng.normal() * 20, omega2=rng.normal() * 20, omega3=rng.normal() * 20)
-        motion = rolling.simulate(slippery(0.3), state, 0.1)
-        contact = motion.regime != Regime.FLYING
-        assert (motion.contact_force[contact, 2] >= 0).all()
-        assert motion.end is not EndReason.FAILED
 
 
 def test_every_end_has_its_reason():
@@ -184,6 +166,7 @@ def test_any_model_from_any_state_ends_with_a_reason_and_finite_numbers(rng):
         motion = rolling.simulate(random_model(rng), state, 0.3)
         assert motion.end not in (EndReason.FAILED, EndReason.CHATTER)
         assert len(motion) > 0
+        assert (motion.contact_force[motion.regime != Regime.FLYING, 2] >= 0).all()
         for values in (motion.q, motion.qdot, motion.energy, motion.contact_force, motion.acceleration_world):
             assert np.isfinite(values).all()
 
