@@ -8,7 +8,6 @@ Against the printed equation (2.3) of Ma et al. 2014: its first line is the n0 c
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from calibration.kit.arrays import Array
@@ -136,7 +135,22 @@ def rolling_onset(motion: MeasuredMotion, found: Propagated, until: float = np.i
     peak = log_joint.max()
     posterior = np.exp(log_joint - peak).mean(axis=0)
     posterior /= posterior.sum()
-    return _describe_onset(motion, frames, v, C, posterior, share)
+    probability = float(1.0 - posterior[-1])
+    index = np.minimum(np.searchsorted(np.cumsum(posterior), [0.025, 0.5, 0.975]), len(frames))
+    first = int(index[1]) if index[0] else 0
+    times = np.append(motion.time[frames], np.nan)
+    low, median, high = times[[index[0], first, index[2]]] if probability >= 0.5 else np.full(3, np.nan)
+    distance, distance_sigma = _slip_distance(motion.time[frames[:first]], v[:first], C[:first], share[:first])
+    squared = np.sum(v * np.linalg.solve(C + SLIP_TOLERANCE**2 * np.eye(2), v[..., None])[..., 0], axis=1)
+    late = int(np.sum(squared[first:] > 25.0))
+    if probability < 0.5:
+        verdict = "slips to the end of the recording; no pure rolling was reached"
+    elif not first:
+        verdict = f"rolls without slip from the first frame on (95 %: at the latest from {high:.4f} s)"
+    else:
+        verdict = f"rolls without slip from {median:.4f} s on (95 %: {low:.4f} to {high:.4f} s)"
+    times_found = float(median), float(low), float(high)
+    return RollingOnset(*times_found, probability, distance, distance_sigma, late, verdict)
 
 
 def _log_normal(v: Array, C: Array, extra: float) -> Array:
@@ -145,43 +159,6 @@ def _log_normal(v: Array, C: Array, extra: float) -> Array:
     det = a * d - b * b
     misfit = (d * v[:, 0] ** 2 - 2 * b * v[:, 0] * v[:, 1] + a * v[:, 1] ** 2) / det
     return -0.5 * (misfit + np.log(det))
-
-
-def _describe_onset(
-    motion: MeasuredMotion,
-    frames: NDArray[np.int64],
-    v: Array,
-    C: Array,
-    posterior: Array,
-    share: Array,
-) -> RollingOnset:
-    probability = float(1.0 - posterior[-1])
-    index = np.searchsorted(np.cumsum(posterior), [0.025, 0.5, 0.975])
-    times = np.append(motion.time[frames], np.nan)
-    low, median, high = (float(times[min(i, len(frames))]) for i in index)
-    first = 0 if index[0] == 0 else int(min(index[1], len(frames)))
-    distance, distance_sigma = _slip_distance(motion.time[frames[:first]], v[:first], C[:first], share[:first])
-    total = C + SLIP_TOLERANCE**2 * np.eye(2)
-    squared = np.einsum("ni,nij,nj->n", v, np.linalg.inv(total), v)
-    late = squared[first:]
-    if probability < 0.5:
-        verdict = "slips to the end of the recording; no pure rolling was reached"
-        low = median = high = np.nan
-    elif index[0] == 0:
-        median = low
-        verdict = f"rolls without slip from the first frame on (95 %: at the latest from {high:.4f} s)"
-    else:
-        verdict = f"rolls without slip from {median:.4f} s on (95 %: {low:.4f} to {high:.4f} s)"
-    return RollingOnset(
-        time=median,
-        low=low,
-        high=high,
-        probability=probability,
-        slip_distance=distance,
-        slip_distance_sigma=distance_sigma,
-        n_late_slips=int(np.sum(late > 25.0)),
-        verdict=verdict,
-    )
 
 
 def _slip_distance(time: Array, v: Array, C: Array, share: Array) -> tuple[float, float]:

@@ -20,8 +20,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from operator import itemgetter
 from types import MappingProxyType
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -130,7 +131,7 @@ def thickness(disc: Disc, board: float, off: Finding) -> tuple[Finding, ...]:
     )
     suspects = [
         # nobody measures a thickness of nothing: it was forgotten
-        Suspect(_apart(fits, size) if size else 0.0, kind, Remedy(key, f"{fits:.2f}", f"{size:g}"))
+        (_apart(fits, size) if size else 0.0, kind, Remedy(key, f"{fits:.2f}", f"{size:g}"))
         for key, kind, size, fits in sizes
         if fits > 0
     ]
@@ -192,12 +193,9 @@ def lost_pairs(trajectory: Trajectory) -> Iterator[Finding]:
         )
 
 
-class Suspect(NamedTuple):
-    """A declared number that may be wrong."""
-
-    away: float  # what fits, from an ordinary value, natural logarithm: the nearest is the likeliest
-    kind: Kind
-    remedy: Remedy
+# A declared number that may be wrong: how far what fits is from an ordinary value, natural logarithm; its kind; what to
+# change. The nearest is the likeliest.
+Suspect: TypeAlias = tuple[float, Kind, Remedy]
 
 
 def _contradiction(
@@ -208,9 +206,9 @@ def _contradiction(
     explains: tuple[Kind, ...] = (),
 ) -> Finding:
     """Of the kind of the likeliest suspect, all of which it names."""
-    likely = sorted(suspects, key=lambda suspect: suspect.away)
-    remedies = tuple(suspect.remedy for suspect in likely)
-    return Finding(likely[0].kind, severity, text, numbers=numbers, remedies=remedies, explains=explains)
+    likely = sorted(suspects, key=itemgetter(0))
+    remedies = tuple(remedy for *_, remedy in likely)
+    return Finding(likely[0][1], severity, text, numbers=numbers, remedies=remedies, explains=explains)
 
 
 def _apart(one: float, other: float) -> float:
@@ -266,9 +264,9 @@ def motion_against_gravity(trajectory: Trajectory, height: float | None = None) 
         )
         suspects = _of_gravity(trajectory, gravity, height)
         severity = Severity.DOUBT if _beyond(gravity, g, BALANCE) else Severity.NOTE
-        likeliest = min(suspects, key=lambda suspect: suspect.away)
-        explains = (Kind.REVERSED, *OFF) if likeliest.kind == Kind.RADIUS else (Kind.REVERSED,)
-        if likeliest.kind == Kind.RADIUS and not likeliest.away:  # two laws agree about it
+        away, kind, _ = min(suspects, key=itemgetter(0))
+        explains = (Kind.REVERSED, *OFF) if kind == Kind.RADIUS else (Kind.REVERSED,)
+        if kind == Kind.RADIUS and not away:  # two laws agree about it
             severity = max(severity, Severity.WARNING)
         return (_contradiction(suspects, text, severity, {"gravity": gravity}, explains),)
     blocks = np.arange(len(energy))
@@ -280,7 +278,7 @@ def motion_against_gravity(trajectory: Trajectory, height: float | None = None) 
             "table's acts; expected a loss"
         )
         remedy = Remedy("[cameras] left, right", action="give the files in the order of time")
-        return (_contradiction([Suspect(0.0, Kind.REVERSED, remedy)], text, numbers={"growth": grown}),)
+        return (_contradiction([(0.0, Kind.REVERSED, remedy)], text, numbers={"growth": grown}),)
     return ()
 
 
@@ -297,8 +295,8 @@ def _of_gravity(trajectory: Trajectory, gravity: Measured, height: float | None)
     by_gravity = Remedy("[gravity] g_m_s2", f"{gravity.value:.4g}", f"{g:g}", unit)
     by_rate = Remedy("[cameras] frame_rate_hz", f"{true_rate:.4g}", f"{rate:g}", hint)
     return (
-        Suspect(_apart(gravity.value, 9.81), Kind.GRAVITY_OR_RATE, by_gravity),
-        Suspect(away, Kind.GRAVITY_OR_RATE, by_rate),
+        (_apart(gravity.value, 9.81), Kind.GRAVITY_OR_RATE, by_gravity),
+        (away, Kind.GRAVITY_OR_RATE, by_rate),
         _radius_suspected(trajectory, ratio, height),
     )
 
@@ -314,7 +312,7 @@ def _radius_suspected(trajectory: Trajectory, ratio: float, height: float | None
         if trajectory.rig.world_is_table and radius > 0 and _apart(radius, would_be) < 0.5 * misfit:
             would_be, misfit = better, 0.0
     remedy = Remedy("[disc] radius_mm", f"{1e3 * would_be:.4g}", f"{1e3 * disc.radius:g}")
-    return Suspect(misfit, Kind.RADIUS, remedy)
+    return (misfit, Kind.RADIUS, remedy)
 
 
 def density(disc: Disc) -> tuple[Finding, ...]:
@@ -451,8 +449,8 @@ def rise_of_centre(trajectory: Trajectory) -> tuple[Finding, ...]:
         return ()
     off = _apart(rise.value, 1e3 * disc.radius)
     suspects = (
-        Suspect(off, Kind.RADIUS, Remedy("[disc] radius_mm", f"{rise.value:.4g}", f"{1e3 * disc.radius:g}")),
-        Suspect(off, Kind.SQUARE, Remedy("[calibration] square_mm", action=f"times {disc.radius / slope.value:.4g}")),
+        (off, Kind.RADIUS, Remedy("[disc] radius_mm", f"{rise.value:.4g}", f"{1e3 * disc.radius:g}")),
+        (off, Kind.SQUARE, Remedy("[calibration] square_mm", action=f"times {disc.radius / slope.value:.4g}")),
     )
     text = f"the centre rises by {rise} per unit of sin(theta); expected the radius, {1e3 * disc.radius:.2f} mm"
     return (_contradiction(suspects, text, numbers={"rise": rise}, explains=OFF),)
@@ -516,15 +514,15 @@ def other_scale(scale: Measured, square: float | None = None, explains: tuple[Ki
     for unit, words in UNITS.items():
         if abs(off / np.log(unit) - 1) < 0.02:
             factor, mixed = float(unit ** np.sign(np.log(factor))), f": are {words} mixed up?"
-    board = Suspect(off, Kind.SQUARE, Remedy("[calibration] square_mm", action=f"times {rounded(1 / factor, digits)}"))
+    board = (off, Kind.SQUARE, Remedy("[calibration] square_mm", action=f"times {rounded(1 / factor, digits)}"))
     if square is not None:
         side = 1e3 * square / factor
         usual = max(round(2 * side), 1) / 2  # boards have squares of whole or half mm
         away = _apart(side, usual)
         remedy = Remedy("[calibration] square_mm", f"{usual if away < uncertain else side:.2f}", f"{1e3 * square:g}")
-        board = Suspect(min(away, off), Kind.SQUARE, remedy)
+        board = (min(away, off), Kind.SQUARE, remedy)
     action = f"and every other length of the disc, times {rounded(factor, digits)}"
-    lengths = Suspect(off, Kind.SQUARE, Remedy("[markers] centres_mm", action=action))
+    lengths = (off, Kind.SQUARE, Remedy("[markers] centres_mm", action=action))
     text = f"by both cameras the dots are {scale} times as far apart as declared{mixed}"
     return _contradiction((board, lengths), text, numbers={"scale": scale}, explains=explains)
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -157,14 +156,14 @@ def differentiate(trajectory: Trajectory, breaks: Sequence[float] = ()) -> Measu
     if len(pieces) == 1:
         return pieces[0]
     n = len(pieces[0])
-    whole: dict[str, Any] = {
+    whole = {
         name: np.concatenate([getattr(piece, name) for piece in pieces])
         for name, value in vars(pieces[0]).items()
         if isinstance(value, np.ndarray) and value.shape[0] == n
     }
     whole["noise_scale"] = np.average([p.noise_scale for p in pieces], axis=0, weights=[len(p) for p in pieces])
-    whole |= {"rig_covariance": trajectory.rig.covariance, "systematic_pace": _pace(trajectory)}
-    return replace(pieces[0], **whole)
+    whole["rig_covariance"] = trajectory.rig.covariance
+    return replace(pieces[0], **whole, systematic_pace=_pace(trajectory))
 
 
 def _between(breaks: Sequence[float], time: Array, good: Mask) -> list[slice]:
