@@ -269,7 +269,7 @@ def motion_against_gravity(trajectory: Trajectory, height: float | None = None) 
         if kind == Kind.RADIUS and not away:  # two laws agree about it
             severity = max(severity, Severity.WARNING)
         return (_contradiction(suspects, text, severity, {"gravity": gravity}, explains),)
-    blocks = np.arange(len(energy))
+    blocks = np.arange(float(len(energy)))
     slope, _ = _slope(blocks, energy)
     if _known(gravity) and _known(slope) and slope.value * blocks[-1] > NOTED * energy[0]:
         grown = Measured(1e3 * slope.value * blocks[-1], 1e3 * slope.sigma * blocks[-1], "mJ")

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,6 +55,9 @@ MIN_FRAMES = 12  # a line and a curvature per channel, and enough left over to j
 # Of the image's longer side: what repeats is as smooth as half a cell of the splines that have taken out the lens
 SYSTEMATIC_LENGTH = 0.1
 KNOWN_FRACTION = 0.25  # of the process' own variance of the first derivative: above it the samples say too little
+
+
+Stretch = TypeVar("Stretch", Trajectory, "MeasuredMotion")
 
 
 @dataclass(frozen=True, repr=False)
@@ -155,15 +159,19 @@ def differentiate(trajectory: Trajectory, breaks: Sequence[float] = ()) -> Measu
     pieces = [_differentiated(part(trajectory, rows), good[rows]) for rows in _between(breaks, time, good)]
     if len(pieces) == 1:
         return pieces[0]
-    n = len(pieces[0])
-    whole = {
+    scales, sizes = [piece.noise_scale for piece in pieces], [len(piece) for piece in pieces]
+    common = {"rig_covariance": trajectory.rig.covariance, "noise_scale": np.average(scales, axis=0, weights=sizes)}
+    return replace(joined(pieces), **common, systematic_pace=_pace(trajectory))
+
+
+def joined(pieces: Sequence[Stretch]) -> Stretch:
+    """Successive stretches of one recording as one: with the rows of all, and all else as the first has it."""
+    rows: dict[str, Any] = {
         name: np.concatenate([getattr(piece, name) for piece in pieces])
         for name, value in vars(pieces[0]).items()
-        if isinstance(value, np.ndarray) and value.shape[0] == n
+        if isinstance(value, np.ndarray) and len(value) == len(pieces[0])
     }
-    whole["noise_scale"] = np.average([p.noise_scale for p in pieces], axis=0, weights=[len(p) for p in pieces])
-    whole["rig_covariance"] = trajectory.rig.covariance
-    return replace(pieces[0], **whole, systematic_pace=_pace(trajectory))
+    return replace(pieces[0], **rows)
 
 
 def _between(breaks: Sequence[float], time: Array, good: Mask) -> list[slice]:

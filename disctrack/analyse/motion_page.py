@@ -120,7 +120,7 @@ def _in_words(q: Array) -> str:
     return f"x {x:.3f}  y {y:.3f}  z {z:.3f} mm   ψ {psi:.2f}  θ {theta:.3f}  φ {phi:.2f}°"
 
 
-def _plain(values: Array, digits: int) -> Any:
+def _plain(values: Array, digits: int) -> object:
     """Nested lists, rounded; None for NaN."""
     rounded = np.round(np.asarray(values, float), digits).astype(object)
     rounded[~np.isfinite(rounded.astype(float))] = None

@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +16,7 @@ from calibration import CalibrationSettings, StereoCalibration, StereoRig
 from calibration.kit.arrays import evenly
 from calibration.rig_file import record_of
 from disctrack.analyse.declaration import Boards, across, contradictions, lost_pairs, turned_board, with_square
+from disctrack.analyse.derivatives import joined
 from disctrack.calibrate.stage import boards_in, boards_of, given_rig, noticed_in, source_of
 from disctrack.errors import DiscTrackError, RecordingError
 from disctrack.findings import (
@@ -210,7 +210,7 @@ def _motion(seen: Check, recording: Recording, rig: StereoRig, pairs: ImagePairs
     for frames, tracking in done:
         row = len(frames) // 2
         seen.shown += [(tracking.trajectory, row, images) for images in seen.images(pairs, [frames[row]])]
-    whole = _together([tracking.trajectory for _, tracking in done])
+    whole = joined([tracking.trajectory for _, tracking in done])
     blur_px = [edge.blur_px for edge in done[len(done) // 2][1].law.edges]
     for finding in contradictions(whole, recording.disc, recording, noticed, seen.boards, blur_px):
         graver = Severity.DOUBT if finding.kind == Kind.DOT_UNSEEN else finding.severity
@@ -234,11 +234,3 @@ def _track(seen: Check, recording: Recording, rig: StereoRig, pairs: ImagePairs,
     settings = TrackingSettings(first_pass=False, exposure=exposures(recording, pairs)[0])
     rate, gravity = recording.frame_rate, recording.gravity
     return track(pairs.reading(seen.not_read), frames, rig, recording.disc, rate, gravity=gravity, settings=settings)
-
-
-def _together(stretches: list[Trajectory]) -> Trajectory:
-    """The stretches one after the other, as one trajectory with gaps in time."""
-    first = stretches[0]
-    names = [name for name, value in vars(first).items() if isinstance(value, np.ndarray)]
-    joined: dict[str, Any] = {name: np.concatenate([getattr(t, name) for t in stretches]) for name in names}
-    return replace(first, **joined)

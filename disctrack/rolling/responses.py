@@ -8,6 +8,7 @@ hundreds of laws can be asked for what each would do, for the price of some sums
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.integrate import cumulative_simpson
 
 from calibration.kit.arrays import Array
 from disctrack.rolling._assembly import Assembly
@@ -25,7 +26,7 @@ _PROBE = effect_from_formulas("probe", {c: f"{c}_given" for c in COMPONENTS})
 
 @dataclass(frozen=True)
 class Responses:
-    """Of a motion that rolls all the time; N instants."""
+    """Of a motion that rolls all the time; N instants, (nearly) equally far apart."""
 
     time: Array  # (N,) [s]
     q: Array  # (N, 6)
@@ -37,8 +38,8 @@ class Responses:
 
         The state itself has moved by Phi times this; so has every prediction by its derivative by the initial state.
         """
-        integrand = np.einsum("nkc,ncp->nkp", self.kernel, courses)
-        return _integral(integrand, self.time)
+        per_instant = self.kernel * np.gradient(self.time)[:, None, None]
+        return np.asarray(cumulative_simpson(np.einsum("nkc,ncp->nkp", per_instant, courses), axis=0, initial=0.0))
 
 
 def responses(model: Model, state: State, times: Array, theta_end: float = DEFAULT_THETA_END) -> Responses | None:
@@ -60,16 +61,3 @@ def _per_wrench(model: Model, states: Array, times: Array) -> Array:
         probe = _PROBE(**{f"{c}_given": x for c, x in zip(COMPONENTS, row, strict=True)})
         rates.append(Assembly(model.with_effects(probe), DEFAULT_THETA_END).at(ROLLING, times, states)[0])
     return np.asarray(np.stack(rates[1:], axis=-1) - rates[0][..., None], float)
-
-
-def _integral(f: Array, time: Array) -> Array:
-    """Integral of f (N, ...) from time[0] on, N > 3 instants (nearly) equally far apart: cubics, of order 4."""
-    first, last = 3 * (f[:1] - f[1:2]) + f[2:3], 3 * (f[-1:] - f[-2:-1]) + f[-3:-2]
-    longer = np.concatenate([first, f, last])
-    pieces = 13.0 * (f[:-1] + f[1:])
-    pieces -= longer[:-3]
-    pieces -= longer[3:]
-    pieces *= (np.diff(time) / 24.0).reshape(-1, *[1] * (f.ndim - 1))
-    found = np.zeros_like(f)
-    np.cumsum(pieces, axis=0, out=found[1:])
-    return found

@@ -22,7 +22,7 @@ from disctrack.rolling.effects.base import CATALOGUE, HELPERS
 from disctrack.rolling.model import DEFAULT_THETA_END, Model
 from disctrack.rolling.motion import EndReason, Path, columns
 from disctrack.rolling.records import ROLLING_COMPONENTS, STATE_COMPONENTS, Numbers
-from disctrack.rolling.simulate import MOST_STEPS, RTOL, _grid, _start, follow
+from disctrack.rolling.simulate import MAX_SWITCHES, MOST_STEPS, RTOL, _grid, _start, follow
 from disctrack.rolling.state import State, steady_precession
 
 _SEED = 1e-30  # imaginary part; its square is far below the smallest rounding
@@ -58,12 +58,14 @@ def sensitivities(
     components: Sequence[str] | None = None,
     theta_end: float = DEFAULT_THETA_END,
     rtol: float = RTOL,
+    max_switches: int = MAX_SWITCHES,
     max_steps: int = MOST_STEPS,
 ) -> Sensitivities:
     """D q(t), d qdot(t) by initial state and parameters.
 
     parameters : "effect.parameter" names; an effect that is not in the model is taken at its null value.
     components : of records.STATE_COMPONENTS; all that the state has if not given.
+    max_switches : between rolling and slip, beyond which the motion counts as over; then there are no derivatives.
     max_steps : of the integrator, of all runs together; beyond them the rest is missing, too
     """
     grid = _grid(None, 0.0, times)
@@ -73,7 +75,7 @@ def sensitivities(
     names = (*components, *parameters)
     found = np.full((len(grid), 20, 1 + len(names)), np.nan)  # q, qdot and state: the motion, then its derivatives
     assembly = Assembly(enlarged, theta_end)
-    path = follow(assembly, y0, grid, rtol, max_steps)
+    path = follow(assembly, y0, grid, rtol, max_switches, max_steps)
     spent, n_steps = path.slip_steps, path.n_steps
     found[: len(path.now), :, 0] = _numbers(path)
     if path.end is not EndReason.CHATTER:

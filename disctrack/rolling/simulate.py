@@ -96,6 +96,7 @@ def follow(
     y: Numbers,
     grid: Array,
     rtol: float,
+    max_switches: int = MAX_SWITCHES,
     max_steps: int = MOST_STEPS,
 ) -> Path:
     """Integrate through the regimes until the grid or the motion ends; complex if the assembly is."""
@@ -135,7 +136,7 @@ def follow(
             if end is None:
                 switches.append(Switch(float(np.real(t)), Regime(regime), Regime(new)))
                 regime = new
-                if len(switches) > MAX_SWITCHES:
+                if len(switches) > max_switches:
                     end = EndReason.CHATTER
     if not pieces:  # over at its start
         add(grid[:1], y[None])

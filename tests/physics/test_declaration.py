@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter1d
 
 from calibration.cameras.camera import Camera, StereoRig, placed_at
 from disctrack.analyse.declaration import (
@@ -24,6 +25,7 @@ from disctrack.frames import (
     continuous_quaternions,
     euler_from_rotation,
     quaternion_from_rotation,
+    rotation_from_euler,
     rotation_from_quaternion,
     rotation_from_vector,
     unwrap_euler,
@@ -153,6 +155,30 @@ def test_a_hand_that_turns_the_disc_and_a_disc_at_rest_give_no_verdict(as_tracke
     resting = replace(held, R=np.broadcast_to(held.R[0], held.R.shape))
     for motion in (held, resting):
         assert not [f for f in contradictions(as_tracked(motion, np.random.default_rng(3))) if f.kind != Kind.RADIUS]
+
+
+@pytest.mark.statistical
+@pytest.mark.parametrize("memory_ms", [15, 40, 100])
+def test_no_hand_is_taken_for_a_wrong_number(memory_ms, true_motion, as_tracked):
+    """However a hand turns and lifts the disc, alone and after it has rolled; nor is a pose that never moves."""
+    rolled = true_motion(10.0, 0.15)
+
+    def wander(rng, size, n=400):
+        smooth = gaussian_filter1d(rng.normal(size=(n + 8 * memory_ms, 3)), memory_ms, axis=0)[4 * memory_ms :][:n]
+        return size * smooth / smooth.std(axis=0)
+
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        start = rotation_from_euler(rng.uniform(0, 6), np.radians(rng.uniform(5, 50)), 0.3)
+        R = rotation_from_vector(wander(rng, rng.uniform(0.02, 0.3))) @ start
+        position = wander(rng, 5e-3) + np.array([0.05, 0.04, 0.05])
+        for before in (0, 150):
+            parts = {"R": R, "position": position, "time": 1e-3 * np.arange(before, before + len(R))}
+            joined = {k: np.concatenate([getattr(rolled, k)[:before], v]) for k, v in parts.items()}
+            found = contradictions(as_tracked(replace(rolled, **joined), rng))
+            assert {finding.kind for finding in found} <= {Kind.CLOCK_JUMP}  # from rolling to the hand in one frame
+        still = replace(rolled, R=np.tile(start, (150, 1, 1)), position=np.tile(position[0], (150, 1)))
+        assert contradictions(as_tracked(still, rng, noise=0.0)) == ()
 
 
 def test_a_wrong_radius_is_seen_where_the_nutation_varies(true_motion, as_tracked):
