@@ -13,7 +13,7 @@ from scipy.optimize import least_squares
 from calibration.kit.arrays import Array
 from calibration.kit.brief import Outline
 from disctrack.analyse.derivatives import K, MeasuredMotion, MotionState
-from disctrack.analyse.propagation import DerivedSeries, Propagated, propagate, rates
+from disctrack.analyse.propagation import SIGMAS, DerivedSeries, Propagated, propagate, rates
 from disctrack.disc import Disc
 
 CONTACT = (
@@ -142,7 +142,7 @@ def rolling_onset(motion: MeasuredMotion, found: Propagated, until: float = np.i
     low, median, high = times[[index[0], first, index[2]]] if probability >= 0.5 else np.full(3, np.nan)
     distance, distance_sigma = _slip_distance(motion.time[frames[:first]], v[:first], C[:first], share[:first])
     squared = np.sum(v * np.linalg.solve(C + SLIP_TOLERANCE**2 * np.eye(2), v[..., None])[..., 0], axis=1)
-    late = int(np.sum(squared[first:] > 25.0))
+    late = int(np.sum(squared[first:] > SIGMAS**2))
     if probability < 0.5:
         verdict = "slips to the end of the recording; no pure rolling was reached"
     elif not first:

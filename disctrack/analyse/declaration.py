@@ -30,6 +30,7 @@ from calibration.cameras.camera import StereoRig, triangulate
 from calibration.kit.arrays import Array, evenly, robust_sigma
 from disctrack.analyse.derivatives import K, MeasuredMotion, differentiate
 from disctrack.analyse.energy import TOTAL, energy_quantities
+from disctrack.analyse.propagation import SIGMAS
 from disctrack.disc import Disc, has_mirror_axis, symmetry_order
 from disctrack.errors import AnalysisError
 from disctrack.faults.clock_jump import clock_jumps
@@ -48,7 +49,6 @@ STRETCHES, BLOCK = 4, 20  # stretches looked at, frames that give one estimate
 MIN_BLOCKS = 5  # to judge them by their scatter: a stretch
 # Below, the disc may lie on a patch of its face and the weight has no arm; above, the arm of the weight is short.
 THETA_RANGE = np.radians(1.0), np.radians(60.0)
-SIGMAS = 5.0
 # What honest discs and tables may do: rounded edges and tables that lean by a degree shift the balance by 3 % at most.
 BALANCE = 0.10
 NOTED = 0.01  # from which on it, or energy that grows, is worth a word

@@ -18,7 +18,7 @@ from disctrack.analyse.derivatives import FRAMES_AT_ONCE, N_STATE, MeasuredMotio
 # Steps of central differences in the order of STATE: far above round-off, far below the scale on which the derived
 # quantities bend (sin theta of a disc at rest on its patch is 1e-2). They are quadratic at most in the rates.
 STEPS = np.repeat([1e-6, 1e-6, 1e-4, 1e-3, 1e-2, 1.0], 3)
-RESOLVED_TILT_SIGMAS = 5.0  # below this many sigmas of theta, the direction of precession is not determined
+SIGMAS = 5.0  # of its own, below which a number is not told from zero; of theta, the direction of precession neither
 
 
 @dataclass(frozen=True, repr=False)
@@ -87,7 +87,7 @@ def propagate(motion: MeasuredMotion, function: Callable[[MotionState], Array]) 
 
     NaN where the motion is unknown, and where theta is so small against its own sigma that e1 has no direction.
     """
-    resolved = motion.sine > RESOLVED_TILT_SIGMAS * motion.tilt_sigma
+    resolved = motion.sine > SIGMAS * motion.tilt_sigma
 
     def some(rows: NDArray[np.int64]) -> Array:
         columns = []
