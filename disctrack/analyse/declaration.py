@@ -230,7 +230,7 @@ def _slope(x: Array, y: Array) -> tuple[Measured, float]:
         slope, offset = np.polyfit(x, y, 1, w=np.sqrt(weight))
         left = y - slope * x - offset
         weight = _doubting(left)
-    scatter, memory = robust_sigma(left), max(float(np.corrcoef(left[:-1], left[1:])[0, 1]), 0.0)
+    scatter, memory = robust_sigma(left), np.maximum(np.corrcoef(left[:-1], left[1:])[0, 1], 0.0)
     sigma = scatter / np.std(x) * np.sqrt((1 + memory) / (1 - memory) / len(x))
     return Measured(float(slope), float(sigma)), scatter
 
@@ -269,9 +269,11 @@ def motion_against_gravity(trajectory: Trajectory, height: float | None = None) 
         if kind == Kind.RADIUS and not away:  # two laws agree about it
             severity = max(severity, Severity.WARNING)
         return (_contradiction(suspects, text, severity, {"gravity": gravity}, explains),)
+    if not _known(gravity):
+        return ()
     blocks = np.arange(float(len(energy)))
     slope, _ = _slope(blocks, energy)
-    if _known(gravity) and _known(slope) and slope.value * blocks[-1] > NOTED * energy[0]:
+    if _known(slope) and slope.value * blocks[-1] > NOTED * energy[0]:
         grown = Measured(1e3 * slope.value * blocks[-1], 1e3 * slope.sigma * blocks[-1], "mJ")
         text = (
             f"the mechanical energy, {1e3 * energy[0]:.4g} mJ at first, grows by {grown} though no force but the "
@@ -289,7 +291,7 @@ def _of_gravity(trajectory: Trajectory, gravity: Measured, height: float | None)
     true_rate = rate / np.sqrt(ratio)
     usual = float(min(USUAL_RATES, key=lambda other: _apart(true_rate, other)))
     away = _apart(true_rate, usual)
-    hint = f"{usual:g} is usual" if away < NOTED else ""
+    hint = f"{usual:g} is usual" if away < BALANCE / 2 else ""
     true_rate = usual if away < SIGMAS * gravity.sigma / gravity.value / 2 else true_rate
     unit = "if it was given in mm/s²" if _apart(1e3 * ratio, 1.0) < BALANCE else ""
     by_gravity = Remedy("[gravity] g_m_s2", f"{gravity.value:.4g}", f"{g:g}", unit)
