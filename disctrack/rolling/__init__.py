@@ -8,15 +8,14 @@ elsewhere, `run` writes a scene's motion to a file.
 from disctrack.disc import nutation_frequency, precession_rate
 from disctrack.rolling import effects
 from disctrack.rolling.effects import CATALOGUE, Effect, EffectParameter, ModelError
-from disctrack.rolling.model import DEFAULT_THETA_END, Model, effects_from_tables
-from disctrack.rolling.motion import EndReason, Motion, Regime, Switch
-from disctrack.rolling.sensitivities import Sensitivities, prepare, sensitivities
-from disctrack.rolling.simulate import simulate, time_grid
+from disctrack.rolling.model import Model, effects_from_tables
+from disctrack.rolling.motion import EndReason, Motion, Regime
+from disctrack.rolling.sensitivities import prepare, sensitivities
+from disctrack.rolling.simulate import simulate
 from disctrack.rolling.state import State, steady_precession, struck_disc
 
 __all__ = [
     "CATALOGUE",
-    "DEFAULT_THETA_END",
     "Effect",
     "EffectParameter",
     "EndReason",
@@ -24,9 +23,7 @@ __all__ = [
     "ModelError",
     "Motion",
     "Regime",
-    "Sensitivities",
     "State",
-    "Switch",
     "effects",
     "effects_from_tables",
     "nutation_frequency",
@@ -36,5 +33,4 @@ __all__ = [
     "simulate",
     "steady_precession",
     "struck_disc",
-    "time_grid",
 ]

@@ -22,16 +22,6 @@ MOST_STEPS = 10**9  # of the integrator, over all stretches
 MOST_INSTANTS = 1e8  # of a motion in memory
 
 
-def time_grid(duration: float, rate: float = 1000.0) -> Array:
-    """Instants i / rate up to the duration, both ends included [s]."""
-    if not (duration > 0 and rate > 0 and duration * rate < MOST_INSTANTS):
-        raise ModelError(
-            f"duration {duration:g} s and rate {rate:g} Hz; expected positive numbers, and at most {MOST_INSTANTS:g} "
-            "instants"
-        )
-    return np.arange(int(np.floor(duration * rate * (1 + 1e-12))) + 1) / rate
-
-
 @checked
 def simulate(
     model: Model,
@@ -59,10 +49,16 @@ def simulate(
 
 
 def _grid(duration: float | None, rate: float, times: ArrayLike | None) -> Array:
+    """The times, or the instants i / rate up to the duration, both ends included [s]."""
     if times is None:
         if duration is None:
             raise ModelError("neither a duration nor times are given")
-        return time_grid(duration, rate)
+        if not (duration > 0 and rate > 0 and duration * rate < MOST_INSTANTS):
+            raise ModelError(
+                f"duration {duration:g} s and rate {rate:g} Hz; expected positive numbers, and at most "
+                f"{MOST_INSTANTS:g} instants"
+            )
+        return np.arange(int(np.floor(duration * rate * (1 + 1e-12))) + 1) / rate
     grid = np.ascontiguousarray(times, float)
     if grid.ndim != 1 or len(grid) == 0 or not np.isfinite(grid).all() or (np.diff(grid) <= 0).any():
         raise ModelError("the times must be a list of finite, increasing numbers")
