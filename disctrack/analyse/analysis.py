@@ -9,7 +9,7 @@ from calibration.kit.arrays import Array
 from calibration.kit.brief import Brief
 from disctrack.analyse.contact import Contact, analyse_contact
 from disctrack.analyse.derivatives import GROUP_NAMES, MeasuredMotion, differentiate
-from disctrack.analyse.energy import Energy, analyse_energy
+from disctrack.analyse.energy import TOTAL, Energy, analyse_energy
 from disctrack.analyse.power_laws import (
     WINDOW,
     NutationCount,
@@ -94,7 +94,7 @@ def analyse(trajectory: Trajectory, window: float = WINDOW, circle_duration: flo
         found = propagate(motion, rates)
     energy = analyse_energy(motion)
     psi, psidot = sense * motion.euler[:, 0], sense * found.value[:, 0]
-    data = (motion.time, psi, motion.euler[:, 1], psidot, energy.propagated.value[:, 5])
+    data = (motion.time, psi, motion.euler[:, 1], psidot, energy.propagated.value[:, TOTAL])
     laws = fit_power_laws(*data, window=window)
     return Analysis(
         trajectory=trajectory,

@@ -26,8 +26,8 @@ ENERGY = (
     ("adiabatic", "J", "3/2 m g r sin theta, the energy of slow steady precession of a thin disc"),
     ("precession_level", "s-2", "psidot^2 sin theta; 4 g / r in slow steady precession of a thin disc"),
 )
-
-TOTAL, LEVEL = 5, 8  # columns
+_NAMES = [name for name, *_ in ENERGY]
+TOTAL, LEVEL = _NAMES.index("total"), _NAMES.index("precession_level")
 
 
 @dataclass(frozen=True, repr=False)
