@@ -160,8 +160,12 @@ def differentiate(trajectory: Trajectory, breaks: Sequence[float] = ()) -> Measu
     if len(pieces) == 1:
         return pieces[0]
     scales, sizes = [piece.noise_scale for piece in pieces], [len(piece) for piece in pieces]
-    common = {"rig_covariance": trajectory.rig.covariance, "noise_scale": np.average(scales, axis=0, weights=sizes)}
-    return replace(joined(pieces), **common, systematic_pace=_pace(trajectory))
+    return replace(
+        joined(pieces),
+        rig_covariance=trajectory.rig.covariance,
+        noise_scale=np.average(scales, axis=0, weights=sizes),
+        systematic_pace=_pace(trajectory),
+    )
 
 
 def joined(pieces: Sequence[Stretch]) -> Stretch:
