@@ -166,3 +166,19 @@ def test_what_a_table_or_a_rim_does_is_found_in_images(name, tmp_path):
         for parameter, (value, sigma) in sizes(document, effect).items():
             assert abs(value - numbers[parameter]) < 3 * sigma, (parameter, value, sigma)
     assert document["after"]["reduced_chi_square"] < 1.1
+
+
+@pytest.mark.slow
+def test_a_table_that_vibrates_with_its_cameras_is_found_in_images(tmp_path):
+    """30 um at 60 Hz: in the axes of both a force that swings, of which the diagnosis learns the frequency."""
+    acceleration = 3e-5 * (2 * np.pi * 60) ** 2 * np.array([0.6, 0.3, 0.7])
+    body = of_the_paper(newton_euler.vibration(acceleration, 0 * acceleration, 60.0))
+    document = diagnosis_of(hide(tmp_path, small_scene(79, 250, 500.0), body))
+    assert document["verdict"] == "unexplained", document["sentence"]
+    numbers = {p["name"]: (p["value"], p["sigma"]) for p in document["effects"][0]["parameters"]}
+    rate, sigma = numbers["rate_0"]
+    assert abs(rate - 2 * np.pi * 60) < 3 * sigma
+    assert document["after"]["reduced_chi_square"] < 1.1
+    for axis, true in enumerate(body.m * acceleration):
+        (c, c_sigma), (s, s_sigma) = numbers[f"c_0_{2 * axis}"], numbers[f"c_0_{2 * axis + 1}"]
+        assert abs(np.hypot(c, s) - true) < 3 * max(c_sigma, s_sigma)
