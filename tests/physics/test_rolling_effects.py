@@ -8,7 +8,7 @@ from disctrack import rolling
 from disctrack.disc import MA_2014
 from disctrack.errors import ArgumentError
 from disctrack.rolling import CATALOGUE, Effect, EffectParameter, Model, ModelError, steady_precession
-from disctrack.rolling.effects import effect, effect_from_formulas
+from disctrack.rolling.effects import catalogue_table, effect, effect_from_formulas
 from disctrack.rolling.evaluate import effect_power, effect_wrench, kinematics
 
 MOVES_THE_TABLE = ("table_shaken", "table_settles")  # and exerts nothing in its axes
@@ -247,3 +247,11 @@ def test_spin_drifts_whichever_direction_the_dissipative_moment_has():
     assert_allclose(along_m0.energy[-1], along_e2.energy[-1], rtol=0.05)
     assert along_m0.state[-1, 7] < 0.05 < state.omega3
     assert along_e2.state[-1, 7] < along_m0.state[-1, 7] - 0.1
+
+
+def test_catalogue_table_names_every_effect_with_its_parameters():
+    table = catalogue_table().splitlines()
+    assert len(table) == len(CATALOGUE) + 2
+    for row, kind in zip(table[2:], CATALOGUE.values(), strict=True):
+        assert row.startswith(f"| `{kind.name}` |")
+        assert all(f"`{p.name}`" in row for p in kind.parameters)
