@@ -71,17 +71,6 @@ def test_command_says_where_the_results_are(analysed_clip):
     assert (analysed_clip.parent / "report" / "report.html").stat().st_size > 1e5
 
 
-def test_bad_input_is_one_line_and_an_exit_code(tmp_path, capsys):
-    foreign = tmp_path / "foreign.h5"
-    with h5py.File(foreign, "w") as file:
-        file["x"] = np.zeros(3)
-    assert main(["analyse", str(foreign)]) == 1
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1
-    assert "foreign.h5" in said
-    assert "not a trajectory" in said
-
-
 def test_a_second_analysis_is_reused_and_another_window_or_a_missing_figure_is_not(analysed_clip, capsys):
     report = analysed_clip.parent / "report"
     command = ["analyse", str(analysed_clip), "-o", str(report)]

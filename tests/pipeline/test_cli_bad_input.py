@@ -86,6 +86,7 @@ PATTERNS = "calibrate --left {r}/l*.png --right {r}/r*.png --corners 9x6 --squar
         (nothing, "track {r} --rig {r}/nowhere.h5", "no such rig file"),
         (lambda r: (r / "bad.h5").write_bytes(b"nothing"), "track {r} --rig {r}/bad.h5", "bad.h5"),
         (another_file, "track {r} --rig {r}/other.h5", "other.h5"),
+        (another_file, "analyse {r}/other.h5", "other.h5.*not a trajectory"),
         (lambda r: (r / "mine.h5").write_text("dear"), "track {r} -o {r}/mine.h5", "--overwrite"),
         (nothing, "track {r} --frames 30:40", "holds no frame; the recording has 24"),
         (nothing, "track {r} --frames 9:5", "holds no frame; the recording has 24"),
