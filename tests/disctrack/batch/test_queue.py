@@ -33,11 +33,15 @@ from disctrack.report.terminal import full, short
 GOOD = Record(MEASURED)
 
 
-def recordings_at(root, *names):
-    for name in names:
-        (root / name).mkdir(parents=True, exist_ok=True)
-        (root / name / "recording.toml").write_text("")
+def touched(root, *files):
+    for file in files:
+        (root / file).parent.mkdir(parents=True, exist_ok=True)
+        (root / file).touch()
     return root
+
+
+def recordings_at(root, *names):
+    return touched(root, *(f"{name}/recording.toml" for name in names))
 
 
 def names_of(found):
@@ -62,23 +66,18 @@ def test_recordings_are_found_at_any_depth_in_natural_order_and_results_are_not_
 def test_images_without_a_declaration_are_told(tmp_path):
     """The uppermost folder of a recording that was forgotten; not its views, results, or a single film of something."""
     root = recordings_at(tmp_path, "day 1/r1", "day 1/r2")
-    for name in ("day 1/r1/left", "day 1/r1/right", "day 1/r2/calibration/left", "day 1/r2/calibration/right"):
-        (root / name).mkdir(parents=True)
-        (root / name / "0.png").write_bytes(b"")
+    touched(
+        root,
+        *(f"day 1/{name}/0.png" for name in ("r1/left", "r1/right", "r2/calibration/left", "r2/calibration/right")),
+    )
     assert find_recordings([root]).undeclared == ()
-    for rig in ("one", "other"):  # pictures of two rigs that a batch calibrated are no images of two cameras
-        (root / "batch_results" / "rigs" / rig).mkdir(parents=True)
-        (root / "batch_results" / "rigs" / rig / "calibration_residuals.png").touch()
+    # pictures of two rigs that a batch calibrated are no images of two cameras
+    touched(root, *(f"batch_results/rigs/{rig}/calibration_residuals.png" for rig in ("one", "other")))
     assert find_recordings([root]).undeclared == ()
-    for name in ("left", "right", "calibration/left", "calibration/right"):
-        (root / "day 1" / "r3" / name).mkdir(parents=True)
-        (root / "day 1" / "r3" / name / "0.TIF").write_bytes(b"")
-    (root / "films").mkdir()
-    (root / "films" / "left.cine").write_bytes(b"")
-    (root / "pictures" / "some").mkdir(parents=True)
-    (root / "pictures" / "some" / "a.png").write_bytes(b"")
+    touched(root, *(f"day 1/r3/{name}/0.TIF" for name in ("left", "right", "calibration/left", "calibration/right")))
+    touched(root, "films/left.cine", "pictures/some/a.png")
     assert find_recordings([root]).undeclared == (root / "day 1" / "r3",)
-    (root / "films" / "right.cine").write_bytes(b"")
+    touched(root, "films/right.cine")
     assert set(find_recordings([root]).undeclared) == {root / "day 1" / "r3", root / "films"}
     with pytest.raises(RecordingError, match=r"r3 has images: `disctrack init .*r3` writes one"):
         find_recordings([root / "day 1" / "r3"])

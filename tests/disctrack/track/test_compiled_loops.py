@@ -84,6 +84,5 @@ def test_loops_compiled_now_and_loops_loaded_give_the_same_bits(sample_clip, tmp
         words = ["run", str(sample_clip), "-o", str(tmp_path / name), "--frames", "0:24", "--no-figures", "--no-video"]
         subprocess.run([sys.executable, "-m", "disctrack", *words], env=environment, check=True, capture_output=True)
         found.append(read_trajectory(tmp_path / name / "trajectory.h5"))
-    np.testing.assert_array_equal(found[1].q, found[0].q)
-    np.testing.assert_array_equal(found[1].markers_px, found[0].markers_px)
-    np.testing.assert_array_equal(found[1].pose_covariance, found[0].pose_covariance)
+    for name in ("q", "markers_px", "pose_covariance"):
+        np.testing.assert_array_equal(*(getattr(trajectory, name) for trajectory in found))
