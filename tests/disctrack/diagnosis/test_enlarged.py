@@ -21,6 +21,7 @@ from disctrack.synthetic.cameras import rig_after_faults
 from disctrack.synthetic.description import load_scene
 from disctrack.synthetic.motion import rolling_model, rolling_start
 from disctrack.synthetic.recording import true_disc_of
+from tests.disctrack.diagnosis.test_starts import sliding
 from tests.oracles.measured_disc import measured, system_of
 
 
@@ -84,19 +85,11 @@ def test_a_saved_model_looks_at_the_disc_as_the_cameras_did(short, tmp_path):
 
 
 @pytest.mark.statistical
-@pytest.mark.parametrize(
-    ("faults", "name"),
-    [
-        (Faults(table_turn_deg=(0.03, -0.02)), "table_plane"),
-        pytest.param(Faults(pattern_scale=1.0005), "pattern_scale", marks=pytest.mark.slow),
-        pytest.param(Faults(pattern_height_mm=0.1), "pattern_height", marks=pytest.mark.slow),
-    ],
-)
-def test_against_the_model_it_was_given_nothing_is_missing(faults, name, tmp_path):
+def test_against_the_model_it_was_given_nothing_is_missing(tmp_path):
     """Found, saved, simulated anew with other noise, diagnosed against the saved model."""
-    first = diagnose(measured(faults=faults, seed=62, n=150))
+    first = diagnose(measured(faults=Faults(table_turn_deg=(0.03, -0.02)), seed=62, n=150))
     (found,) = first.diagnosis.found
-    assert name in {found.candidate.name, *(r.candidate.name for r in found.cannot_be_told_from)}
+    assert "table_plane" in {found.candidate.name, *(r.candidate.name for r in found.cannot_be_told_from)}
     path = saved(first.system, first.diagnosis.after.values, tmp_path)
     scene = load_scene(path)
     model, start = rolling_model(scene), rolling_start(scene)
@@ -110,8 +103,6 @@ def test_against_the_model_it_was_given_nothing_is_missing(faults, name, tmp_pat
 
 @pytest.mark.statistical
 def test_slip_at_the_start_is_part_of_the_saved_model(tmp_path):
-    from tests.disctrack.diagnosis.test_starts import sliding
-
     trajectory = measured(motion=sliding(0.2, (0.08, 0.04)), seed=64, n=120)
     first = diagnose(trajectory)
     path = saved(first.system, first.diagnosis.after.values, tmp_path)
