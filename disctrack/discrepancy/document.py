@@ -1,20 +1,17 @@
 """A diagnosis of any system, not of the disc alone: the keys of diagnosis.json, and the tables of its report."""
 
 from collections.abc import Mapping
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
 from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.held_out import HeldOut
-from disctrack.discrepancy.search import Diagnosis, Found, Tried
+from disctrack.discrepancy.search import Diagnosis, Found
 from disctrack.discrepancy.significance import as_sigmas
 from disctrack.discrepancy.words import shown, together
 from disctrack.numbers import measured, rounded, score
 from disctrack.report.blocks import Listing, Section
-
-_NOTHING: Mapping[str, Any] = MappingProxyType({})
 
 
 def parameters_json(quantities: Any, fit: Fit) -> list[dict[str, Any]]:
@@ -50,18 +47,6 @@ def effect_json(found: Found, after: Fit) -> dict[str, Any]:
     }
 
 
-def tried_json(tried: Tried) -> dict[str, Any]:
-    """What became of one candidate, of any system."""
-    return {
-        "name": tried.candidate.name,
-        "kind": tried.candidate.kind,
-        "score": tried.score,
-        "refit_gain": tried.gain,
-        "held_out_gain": tried.held_out_gain,
-        "reason": tried.reason,
-    }
-
-
 def explanations_json(d: Diagnosis) -> list[dict[str, Any]]:
     """Sets of effects that describe the data as shortly as the answer, with their odds against it."""
     return [
@@ -93,8 +78,8 @@ def document(
     d: Diagnosis,
     model: str,
     sentence: str,
-    before: Mapping[str, Any] = _NOTHING,
-    after: Mapping[str, Any] = _NOTHING,
+    before: Mapping[str, Any] | None = None,
+    after: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """All of a diagnosis in JSON's types; the keys are those that `disctrack diagnose` writes.
 
@@ -106,11 +91,21 @@ def document(
         "reason": d.reason,
         "model": model,
         "effects": [effect_json(f, d.after) for f in d.found],
-        "before": fit_errors(d.before, d.held_out_before, d.noise) | dict(before),
-        "after": fit_errors(d.after, d.held_out_after, d.noise) | dict(after),
+        "before": fit_errors(d.before, d.held_out_before, d.noise) | dict(before or {}),
+        "after": fit_errors(d.after, d.held_out_after, d.noise) | dict(after or {}),
         "noise_variance_over_stated": d.noise,
         "explanations": explanations_json(d),
-        "tried": [tried_json(t) for t in d.tried],
+        "tried": [
+            {
+                "name": t.candidate.name,
+                "kind": t.candidate.kind,
+                "score": t.score,
+                "refit_gain": t.gain,
+                "held_out_gain": t.held_out_gain,
+                "reason": t.reason,
+            }
+            for t in d.tried
+        ],
         "settings": vars(d.settings),
     }
 

@@ -153,7 +153,7 @@ class Answer:
     def nearest(self) -> dict[str, float]:
         """All fitted numbers with the terms that help most, where they leave too much to be named; else empty."""
         d = self.diagnosis
-        if self.found or not d.partial or d.nearest is None:
+        if not d.partial or d.nearest is None:
             return {}
         return {n: d.nearest.values[n] for n in d.nearest.names}
 

@@ -58,11 +58,6 @@ class Term:
     title: str = ""
     source: str = ""
 
-    @property
-    def is_measurement(self) -> bool:
-        """True where the motion itself is left as it is."""
-        return not self.rates
-
 
 @dataclass(frozen=True)
 class Equations:

@@ -24,6 +24,7 @@ from disctrack.discrepancy.equations.system import MOST_STATES, EquationSystem, 
 from disctrack.discrepancy.fit import TRIAL, Fit, fit, no_fit
 from disctrack.discrepancy.held_out import HeldOut, held_out
 from disctrack.discrepancy.laws import evidence
+from disctrack.discrepancy.noise import with_memory
 from disctrack.discrepancy.score import Linearisation
 from disctrack.discrepancy.search import (
     CLASS_GAIN,
@@ -105,8 +106,9 @@ class LearnedForce(WithForce):
     system: EquationSystem  # that knows the law
 
     def is_named(self, diagnosis: Diagnosis) -> bool:
-        """Is it this law that describes the data best, or comes nearest where no term is certain?"""
-        return self.is_shorter and (self.at_noise or not diagnosis.found)
+        """Is it this law that describes the data best, or comes nearest, beside all that is found?"""
+        stays = {f.candidate.name for f in diagnosis.found} <= {c.name for c in self.beside}
+        return self.is_shorter and (self.at_noise or stays)
 
     @property
     def is_shorter(self) -> bool:
@@ -147,8 +149,8 @@ def learn(
 
     channels : formulas of what is observed, without terms
     judged : the system with its noise as judged, if that remembers
-    None where no law describes most of what is missing, where one known term describes it, or where there are too many
-    runs.
+    Where none describes the data, the one that comes nearest, beside known terms. None where no law describes most of
+    what is missing, where one known term describes it, or where there are too many runs.
     """
     if diagnosis.held_out_before is None or (diagnosis.verdict != "unexplained" and len(diagnosis.found) < 2):
         return None
@@ -160,10 +162,32 @@ def learn(
     if several and (best is None or not over.at_noise(best.fit)):
         others = [over.best((c,)) for c in over.beside()]
         best = min((o for o in (best, *others) if o is not None), key=lambda trial: trial.length, default=None)
-    if best is None:
+    law = over.told(best) if best is not None else None
+    if law is not None and over.is_worth_telling(law):
+        return law
+    return _nearest(over.system, diagnosis, judged)
+
+
+def _nearest(system: EquationSystem, diagnosis: Diagnosis, judged: System | None) -> LearnedForce | None:
+    """The law that comes nearest beside the known terms that do, at the noise that these leave; it is no finding.
+
+    No law of a real system comes as near as good sensors see. None where known terms do not lead near the data.
+    """
+    known, d = diagnosis.ranked[0], diagnosis
+    noise = max(d.noise, known.fit.reduced_chi_square)
+    near = known.candidates and d.before.reduced_chi_square > FAR * noise
+    if d.verdict != "unexplained" or not near:
+        return None
+    view = system if judged is None else judged.over(system)
+    before = held_out(view, known.fit.quantities, known.fit.values, system.training)
+    known = replace(known, length=length(view, d.settings, noise, known.fit, known.candidates))
+    left = replace(d, noise=noise, before=known.fit, held_out_before=before, ranked=(known,))
+    over = _Competition(system, left, judged)
+    best = over.best(known.candidates)
+    if best is None or best.along.variable == "t":  # which any motion has, and which foretells nothing
         return None
     law = over.told(best)
-    return law if over.is_worth_telling(law) else None
+    return replace(law, at_noise=False) if law.is_shorter and over.is_worth_telling(law) else None
 
 
 class _Competition:
@@ -233,7 +257,7 @@ class _Competition:
         trials, bars = [], [np.inf] * len(shots)
         for length, law, quantities in scans[:REFITTED]:
             # along short stretches that the declared equations do not follow the first order says little
-            if length > scans[0][0] * (ROUGHLY if self.far else 1.0) + WORTH:
+            if length > (ROUGHLY * scans[0][0] + WORTH if self.far else scans[0][0] + CLASS_GAIN):
                 break
             if (trial := self._led(shots, law, beside, quantities, values, bars)) is not None:
                 trials.append(trial)
@@ -263,8 +287,9 @@ class _Competition:
         if not (np.isfinite(columns).all() and np.isfinite(right).all()):
             return np.inf, own
         size, root, found = sizes_alike(system, values).get(f"{NAME}.a0", 1.0), np.sqrt(self.noise), []
+        waves = np.array([int(n) if (n := q.part.removeprefix("a")).isdigit() else 0 for q in own])
         for smooth, fall in product(SMOOTH, FALLS):
-            falls = _falls(own, smooth, fall)
+            falls = (1.0 + (waves / smooth) ** 2) ** -fall  # prior sigma of each amplitude over that of the first
             # the faster driver gives up where columns are alike
             U, singular, _ = linalg.svd(columns * falls, full_matrices=False, lapack_driver="gesvd")
             lengths = evidence(size * singular / root, U.T @ right / root, SIZES)
@@ -354,6 +379,7 @@ def _laws(system: EquationSystem, values: Values) -> Iterator[Along]:
     """
     equations = system.formulas.equations
     everything = (*equations.states, *equations.inputs, "t")
+    velocities = {str(f).strip() for f in equations.rates.values()} & set(equations.rates)
     many = len(_forced(equations)) * len(everything) > MOST_LAWS
     for equation in _forced(equations):
         there = {s.name for s in system.formulas.forces[equations.states.index(equation)].free_symbols} | {"t"}
@@ -361,7 +387,7 @@ def _laws(system: EquationSystem, values: Values) -> Iterator[Along]:
             if many and variable not in there:
                 continue
             yield Along(equation, variable)
-            if variable in _velocities(equations, equation):
+            if variable in {equation, *velocities}:
                 yield Along(equation, variable, fine=True)
                 if np.sum(np.diff(np.sign(_visited(system, variable, values))) != 0) >= TURNING:
                     yield Along(equation, variable, jumps=True)
@@ -370,10 +396,6 @@ def _laws(system: EquationSystem, values: Values) -> Iterator[Along]:
 def _forced(equations: Equations) -> list[str]:
     """States whose equations are more than a definition (x' = v)."""
     return [s for s, f in equations.rates.items() if str(f).strip() not in equations.rates]
-
-
-def _velocities(equations: Equations, equation: str) -> set[str]:
-    return {str(f).strip() for f in equations.rates.values()} & set(equations.rates) | {equation}
 
 
 def _knowing(system: EquationSystem, channels: Mapping[str, Formula]) -> EquationSystem:
@@ -409,12 +431,6 @@ def _amplitudes(system: EquationSystem, law: Along) -> tuple[Quantity, ...]:
     """Of the law, without priors as yet."""
     own = {q.name: q for c in system.candidates if c.name == NAME for q in c.quantities}
     return tuple(own[f"{NAME}.{n}"] for n in _names() if law.jumps or n != "jump")
-
-
-def _falls(own: Sequence[Quantity], smooth: float, power: float) -> Array:
-    """Prior sigma of each amplitude over that of the first."""
-    numbers = [q.part.removeprefix("a") for q in own]
-    return np.array([(1.0 + (int(n) / smooth) ** 2) ** -power if n.isdigit() else 1.0 for n in numbers])
 
 
 def _set(system: EquationSystem, law: Along, values: Values) -> tuple[EquationSystem, dict[str, float]]:
@@ -508,15 +524,18 @@ def _joining(values: Values, system: EquationSystem, longer: EquationSystem) -> 
 def with_law(diagnosis: Diagnosis, law: LearnedForce) -> Diagnosis:
     """The answer with the law in place of known terms, and with those that act beside it.
 
-    Where more than noise is left, it is the nearest description; so is a function of time alone, which any motion has.
+    Where more than noise is left, it is the nearest description, and what was found stays; of a function of time alone,
+    which any motion has, nothing does.
     """
     level = f"{law.fit.reduced_chi_square:.3g} per degree of freedom at a noise of {diagnosis.noise:.3g}"
+    at_first = f"{diagnosis.before.reduced_chi_square:.3g}"
+    reason = f"chi-square stays at {at_first}, with a law that was learned at {level}"
+    if not law.at_noise:
+        nearest = with_memory(law.system, law.fit)
+        return replace(diagnosis, reason=reason, partial=law.candidates, nearest=nearest)
     ranked = sorted((*diagnosis.ranked, law), key=lambda e: e.length)
     diagnosis = replace(diagnosis, ranked=tuple(ranked), length=law.length)
-    if not law.at_noise or law.along.variable == "t":
-        reason = (
-            f"chi-square stays at {diagnosis.before.reduced_chi_square:.3g}, with a law that was learned at {level}"
-        )
+    if law.along.variable == "t":
         tried = tuple(_instead(t, ()) for t in diagnosis.tried)
         return replace(
             diagnosis, verdict="unexplained", reason=reason, found=(), after=diagnosis.before, tried=tried,

@@ -138,7 +138,7 @@ class EquationSystem(System):
         aimed = [n for n in own if n in self.aims]
         amounts = tuple(q for n, p in own.items() if not p.shape or n in aimed for q in self._quantities(n))
         shape = tuple(q for n, p in own.items() if p.shape and n not in aimed for q in self._quantities(n))
-        kind = "measurement" if term.is_measurement else "motion"
+        kind = "motion" if term.rates else "measurement"
         start = tuple(self.aims.get(q.stem, q.null) for q in amounts) if aimed else ()
         return Candidate(term.name, term.name, kind, term.title or term.name, term.source, amounts, start, shape)
 

@@ -14,7 +14,8 @@ from scipy import stats
 
 from calibration.kit.arrays import Array
 from calibration.kit.least_squares import triangle
-from disctrack.discrepancy.fit import Fit, prior_rows
+from disctrack.discrepancy.elimination import compress, prior_rows
+from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.joint.sharing import JointSystem
 from disctrack.discrepancy.score import INVISIBLE
 from disctrack.discrepancy.search import CLASS_GAIN
@@ -67,13 +68,6 @@ class Blocks:
         self._sigma = np.array([q.prior_sigma for q in quantities])
         self.chi_square = np.sum(residual**2, axis=1)
 
-    def others(self, kept: list[int]) -> tuple[Array, Array]:
-        """The problem (right, matrix) of these recordings and the priors together, compressed."""
-        right = np.concatenate([self.right[kept].reshape(-1), self.prior[0]])
-        matrix = np.concatenate([self.matrix[kept].reshape(len(right) - len(self.prior[0]), -1), self.prior[1]])
-        R = triangle(np.column_stack([matrix, right]))
-        return R[:, -1], R[:, :-1]
-
     def fits_in(self, i: int, kept: list[int]) -> FitsIn:
         """Recording i against those of `kept` that it is not.
 
@@ -81,7 +75,10 @@ class Blocks:
         sigmas of both: chi-square of as many degrees. Combinations of cameras' and dots' errors that the recording
         knows no better than the calibration does are left out: their derivatives are mostly noise of its poses.
         """
-        rest = self.others([k for k in kept if k != i])
+        others = [k for k in kept if k != i]
+        right = self.right[others].reshape(-1)
+        matrix = np.concatenate([self.matrix[others].reshape(len(right), -1), self.prior[1]])
+        rest = compress(np.concatenate([right, self.prior[0]]), matrix)
         length = np.linalg.norm(self.matrix[i], axis=0)
         scale = np.where(np.isfinite(self._sigma), self._sigma, LAW / np.where(length > 0, length, 1.0))
         U, singular, _ = np.linalg.svd(self.matrix[i] * scale, full_matrices=False)

@@ -7,7 +7,6 @@ out. The cost is linear in the number of recordings.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -30,9 +29,6 @@ TEST_EVERY = 3  # of the recordings, every so many is predicted from the others
 ROUNDS = 3  # of leaving recordings out
 NUMBERS = (1, 2, 5, 10, 20, 50, 100, 200, 500)  # of recordings, for which sigmas are told
 OWN_LEVEL = 1e-3  # probability that a recording which the model describes is said to be at odds with it
-
-
-_NOTHING: Mapping[str, str] = MappingProxyType({})
 
 
 @dataclass(frozen=True)
@@ -105,7 +101,7 @@ def answer_together(
     in_common: Callable[[list[Any]], list[Any]],
     settings: Settings | None = None,
     progress: Callable[[str], None] = lambda text: None,
-    unread: Mapping[str, str] = _NOTHING,
+    unread: Mapping[str, str] | None = None,
 ) -> TogetherDiagnosis:
     """What does the model lack, of all the crew's recordings together?
 
@@ -117,7 +113,7 @@ def answer_together(
     Raises AnalysisError where fewer than two can be used.
     """
     settings = replace(settings or Settings(), noise=1.0)
-    names, n = [name for name, _ in described], len(described)
+    names, n, unread = [name for name, _ in described], len(described), unread or {}
     told = crew.call("told", [()] * n)
     reasons = {i: str(t) for i, t in enumerate(told) if isinstance(t, DiscTrackError)}
     kept = [i for i in range(n) if i not in reasons]
