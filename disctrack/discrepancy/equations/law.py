@@ -187,7 +187,8 @@ def _nearest(system: EquationSystem, diagnosis: Diagnosis, judged: System | None
     if best is None or best.along.variable == "t":  # which any motion has, and which foretells nothing
         return None
     law = over.told(best)
-    return replace(law, at_noise=False) if law.is_shorter and over.is_worth_telling(law) else None
+    foretells = law.held_out.chi_square < before.chi_square  # itself, and not by being open
+    return replace(law, at_noise=False) if foretells and law.is_shorter and over.is_worth_telling(law) else None
 
 
 class _Competition:
