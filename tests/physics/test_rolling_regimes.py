@@ -192,3 +192,21 @@ def test_motion_does_not_depend_on_the_tolerance():
     coarse, fine = (rolling.simulate(model, sliding_start(), 0.4, rtol=rtol) for rtol in (1e-10, 1e-12))
     assert_allclose(coarse.q[:, :3], fine.q[:, :3], atol=1e-9)
     assert_allclose(coarse.q[:, 3:], fine.q[:, 3:], atol=1e-7)
+
+
+def test_enough_friction_never_slips():
+    state = steady_precession(np.radians(40), MA_2014, nutation_amplitude=0.02)
+    free = rolling.simulate(Model(MA_2014), state, 0.2)
+    motion = rolling.simulate(slippery(1.05 * free.friction_needed.max()), state, 0.2)
+    assert motion.switches == ()
+    assert_allclose(motion.q, free.q, atol=1e-12)
+
+
+def test_load_is_never_negative_in_contact(rng):
+    for _ in range(20):
+        theta = np.radians(rng.uniform(5, 80))
+        state = State(theta=theta, thetadot=rng.normal() * 20, omega2=rng.normal() * 20, omega3=rng.normal() * 20)
+        motion = rolling.simulate(slippery(0.3), state, 0.1)
+        contact = motion.regime != Regime.FLYING
+        assert (motion.contact_force[contact, 2] >= 0).all()
+        assert motion.end is not EndReason.FAILED

@@ -417,3 +417,7 @@ def test_frames_that_an_encoder_predicts_from_one_another_scatter_as_stated(clip
     assert any("the frames were compressed as video" in f.text for f in found.findings)
     assert clip.untouched.pose_scatter.max() < 1.5
     assert not any("compressed as video" in f.text for f in clip.untouched.findings)
+
+
+def test_no_camera_is_said_to_have_moved_where_none_did(clip):
+    assert not list(moved_camera(clip.images[::4], clip.rig, clip.disc))
