@@ -38,14 +38,14 @@ KNOWN = {
 }
 
 
-def recorded(force, seed):
+def recorded(force, seed, sigma=SIGMA):
     """The oscillator with omega = 12, beta = 0.15 and a force(x, v, t), seen with noise."""
     swing = solve_ivp(
         lambda t, y: [y[1], -144 * y[0] - 0.3 * y[1] + force(y[0], y[1], t)],
         (0, TIME[-1]), [1.0, 0.0], t_eval=TIME, rtol=1e-9, atol=1e-11, method="LSODA",
     )  # fmt: skip
-    noise = SIGMA * np.random.default_rng(seed).standard_normal(len(TIME))
-    return Run(TIME, {"x": swing.y[0] + noise}, sigma=SIGMA)
+    noise = sigma * np.random.default_rng(seed).standard_normal(len(TIME))
+    return Run(TIME, {"x": swing.y[0] + noise}, sigma=sigma)
 
 
 QUICK = ("a drag that saturates", "a spring of a table", "an odd friction", "a push by time")
@@ -140,3 +140,16 @@ def test_the_law_is_told_on_the_page_and_in_json(tmp_path):
     assert len(law["at"]) == len(law["force"]) == len(law["sigma"])
     assert law["known_terms"] == [c.name for c in answer.law.instead.candidates]
     assert "a force on v that is a function of v, learned from what is left" in page.read_text()
+
+
+@pytest.mark.statistical
+def test_a_law_that_leaves_more_than_the_sensor_scatters_is_no_finding_and_foretells():
+    """A good sensor sees a drive that nothing describes; beside known terms the law still comes nearest."""
+    run = recorded(lambda x, v, t: -1.5 * np.tanh(v / 1e-3) - 0.3 * np.sin(v) + 0.03 * np.sin(1.3 * t), 16, 1e-5)
+    answer = diagnose(OSCILLATOR, run, [terms.coulomb("v"), terms.constant("v")])
+    assert answer.verdict == "unexplained"
+    assert not any(found.candidate.name == NAME for found in answer.diagnosis.found)
+    assert not answer.law.at_noise
+    assert answer.law.along.variable == "v"
+    left = {by: np.std(answer.forecast(run, by=by)["x"] - run.data["x"]) for by in ("before", "after")}
+    assert left["after"] < 0.02 * left["before"]
