@@ -30,6 +30,7 @@ from calibration.fit.stereo_model import Observations
 from calibration.kit.arguments import checked
 from calibration.kit.arrays import Array, Mask
 from calibration.kit.errors import RigFileError
+from calibration.kit.seal import check_seal, sealed
 from calibration.stereo import StereoCalibration
 
 SCHEMA = "disctrack stereo rig"
@@ -229,7 +230,7 @@ def rig_bytes(
         if record is not None:
             _write_record(file.create_group("calibration"), record)
         file.attrs.update(attributes, complete=1)
-    return buffer.getbuffer()
+    return sealed(buffer)
 
 
 def _put(group: h5py.Group, name: str, value: Any, row: Dataset) -> None:
@@ -328,6 +329,7 @@ def read_rig_file(path: str | os.PathLike[str]) -> tuple[StereoRig, CalibrationR
     if not path.is_file():
         raise RigFileError(f"{path}: no such rig file; `disctrack calibrate` makes one")
     try:
+        check_seal(path)
         with h5py.File(path, "r") as file, np.errstate(all="ignore"):
             if file.attrs.get("schema") != SCHEMA:
                 found = file.attrs.get("schema")

@@ -15,6 +15,7 @@ from calibration.board.search import Progress
 from calibration.board.target import Target
 from calibration.fit import normal_equations
 from calibration.kit.arguments import checked
+from calibration.kit.seal import check_seal
 from calibration.rig_file import CalibrationRecord, read_rig, read_rig_file, rig_bytes
 from disctrack.analyse.declaration import Boards
 from disctrack.calibrate.views import TargetImages, calibrate_views, declared_views
@@ -195,6 +196,7 @@ def is_rig_of(path: Path, source: CalibrationSource) -> bool:
 def _reusable(path: Path, provenance: Provenance) -> dict[str, Any] | None:
     """What is told of the rig in `path` if it was made, completely, from the same; None otherwise."""
     try:
+        check_seal(path)
         with h5py.File(path, "r") as file:
             same = file.attrs.get("fingerprint") == provenance.fingerprint and int(file.attrs.get("complete", 0)) == 1
             return dict(json.loads(file.attrs["summary"])) if same else None

@@ -22,6 +22,7 @@ from calibration.cameras.camera import RIG_PARAMETERS, Camera, StereoRig
 from calibration.kit.arguments import checked
 from calibration.kit.arrays import Mask
 from calibration.kit.brief import Outline
+from calibration.kit.seal import check_seal, sealed
 from calibration.rig_file import beyond_model, read_beyond_model, versions, write_attributes
 from disctrack.disc import Disc
 from disctrack.errors import TrajectoryFileError
@@ -105,7 +106,7 @@ def write_trajectory(
         words = [f"{finding.grave}: {finding.sentence}" for finding in trajectory.findings]
         write_attributes(file, {"findings": {"told": words, **(details or {})}, "made_from": made_from})
         file.attrs["complete"] = 1
-    write_whole(path, buffer.getbuffer())
+    write_whole(path, sealed(buffer))
 
 
 @checked
@@ -195,7 +196,7 @@ def write_groups(path: Path, groups: Mapping[str, Group], axes: Mapping[str, Var
             created = file.create_group(name, track_order=True)
             write_variables(created, variables, axes)
             write_attributes(created, attributes)
-    write_whole(path, buffer.getbuffer(), adds_to_input=True)
+    write_whole(path, sealed(buffer), adds_to_input=True)
 
 
 @checked
@@ -400,6 +401,7 @@ def _reading(path: Path) -> Iterator[h5py.File]:
     if not path.is_file():
         raise TrajectoryFileError(f"{path}: no such file. Give a trajectory file written by disctrack track.")
     try:
+        check_seal(path)
         with h5py.File(path, "r") as file:
             schema, version = file.attrs.get("schema", None), int(file.attrs.get("schema_version", -1))
             if schema != SCHEMA:

@@ -316,11 +316,15 @@ def whole_content(tmp_path_factory) -> bytes:
         st.binary(max_size=600),
         st.binary(max_size=600).map(b"\x89HDF\r\n\x1a\n".__add__),
         st.floats(0, 0.999),
+        st.integers(0, 10**9),
     )
 )
-def test_any_bytes_and_a_file_cut_anywhere_are_refused_with_a_message(tmp_path, whole_content, content):
-    """A number is the share of a whole file that is left."""
-    path = tmp_path / "any.h5"
+def test_any_bytes_and_a_file_cut_or_changed_anywhere_are_refused_with_a_message(tmp_path, whole_content, content):
+    """A share of a whole file that is left, or the place of a byte in it that is another."""
+    path, changed = tmp_path / "any.h5", bytearray(whole_content)
+    if isinstance(content, int):
+        changed[content % (len(changed) - 100)] ^= 0x10
+        content = bytes(changed)
     path.write_bytes(whole_content[: int(content * len(whole_content))] if isinstance(content, float) else content)
     with pytest.raises(TrajectoryFileError):
         read_trajectory(path)
