@@ -21,7 +21,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from operator import itemgetter
-from types import MappingProxyType
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
@@ -202,13 +201,13 @@ def _contradiction(
     suspects: Sequence[Suspect],
     text: str,
     severity: Severity = Severity.DOUBT,
-    numbers: Mapping[str, Measured] = MappingProxyType({}),
+    numbers: Mapping[str, Measured] | None = None,
     explains: tuple[Kind, ...] = (),
 ) -> Finding:
     """Of the kind of the likeliest suspect, all of which it names."""
     likely = sorted(suspects, key=itemgetter(0))
     remedies = tuple(remedy for *_, remedy in likely)
-    return Finding(likely[0][1], severity, text, numbers=numbers, remedies=remedies, explains=explains)
+    return Finding(likely[0][1], severity, text, numbers=numbers or {}, remedies=remedies, explains=explains)
 
 
 def _apart(one: float, other: float) -> float:

@@ -20,7 +20,7 @@ from disctrack.analyse.declaration import (
     thickness,
     unseen_dots,
 )
-from disctrack.findings import Finding, Kind, Severity, leading
+from disctrack.findings import Finding, Kind, Severity, finding_from_json, leading
 from disctrack.frames import (
     continuous_quaternions,
     euler_from_rotation,
@@ -305,6 +305,7 @@ def test_the_thickness_that_would_put_the_rim_on_the_table_is_named(declared, he
     off = Finding(Kind.TABLE_DISAGREES, Severity.DOUBT, "", numbers=seen)
     (found,) = thickness(honest.disc, 1e-3 * declared, off)
     assert str(found.remedies[0]) == first
+    assert finding_from_json(found.as_json()) == found  # as it stands in files
     assert len(found.remedies) == (1 if declared - height < 0 else 2)
     assert leading([off, found]) == (found,)
     assert not thickness(honest.disc, 1e-3 * declared, replace(off, severity=Severity.WARNING))
