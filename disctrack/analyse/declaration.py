@@ -53,6 +53,7 @@ BALANCE = 0.10
 NOTED = 0.01  # from which on it, or energy that grows, is worth a word
 SCALE = 5e-3  # of printed dots against a printed board, paper and toner included
 BY_SCALE = (Kind.DOTS_MISPLACED, Kind.RADIUS, Kind.THICKNESS, Kind.BOARD_THICKNESS, Kind.GRAVITY_OR_RATE, *MISFITS)
+SIDE_TOLERANCE = 0.06  # of a length: beyond, dots that were printed to another scale would have another size, too
 RISE = 0.03  # of the radius: a rounded or bevelled edge of a millimetre
 MIN_LEAN = np.radians(2.0)  # of a plane: boards and tables lean by less
 MIN_ROUND = 2.0  # [rad] of precession
@@ -522,8 +523,8 @@ def other_scale(scale: Measured, square: float | None = None, explains: tuple[Ki
         away = _apart(side, usual)
         remedy = Remedy("[calibration] square_mm", f"{usual if away < uncertain else side:.2f}", f"{1e3 * square:g}")
         board = (min(away, off), Kind.SQUARE, remedy)
-    action = f"and every other length of the disc, times {rounded(factor, digits)}"
-    lengths = (off, Kind.SQUARE, Remedy("[markers] centres_mm", action=action))
+    which = "[markers] centres_mm" if off < SIDE_TOLERANCE else "every length of [disc] and [markers]"
+    lengths = (off, Kind.SQUARE, Remedy(which, action=f"times {rounded(factor, digits)}"))
     text = f"by both cameras the dots are {scale} times as far apart as declared{mixed}"
     return _contradiction((board, lengths), text, numbers={"scale": scale}, explains=explains)
 
