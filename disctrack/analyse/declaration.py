@@ -441,6 +441,7 @@ def rise_of_centre(trajectory: Trajectory) -> tuple[Finding, ...]:
     q = trajectory.q[trajectory.measured]
     theta, disc = q[:, 4], trajectory.disc
     q = q[(theta > THETA_RANGE[0]) & (theta < THETA_RANGE[1])]
+    # rolling round a table that leans, a disc of steady nutation seems to swing by twice as much
     if len(q) < BLOCK or np.ptp(np.sin(q[:, 4])) < 2 * MIN_LEAN:
         return ()
     s = np.sin(q[:, 4])
