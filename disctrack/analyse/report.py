@@ -21,6 +21,8 @@ from disctrack.trajectory.file import Provenance
 if TYPE_CHECKING:
     from disctrack.report.figures import Drawn
 
+# Below, sin and cos of the nutation are its first terms to 2e-4, and the exponents of the models are those of the law.
+ASYMPTOTIC_BELOW = np.radians(1.0)
 RATES_SHOWN = ("psidot", "thetadot", "omega_3", "omega_z")
 CONTACT_SHOWN = ("slip_n", "slip_m", "force_z", "friction_needed", "total", "power")
 
@@ -146,17 +148,27 @@ def _exponents(analysis: Analysis) -> list[Listing | Text]:
     laws = analysis.laws
     if not laws.determined:
         return [Text(f"No exponents are given: {laws.reason}.")]
+    theta = _largest_nutation(analysis)
+    asymptotic = theta <= ASYMPTOTIC_BELOW
     named = ("energy", laws.n_energy, 1.0), ("nutation", laws.n_theta, 1.0), ("precession rate", laws.n_psidot, -0.5)
-    rows = [(name, _at_95(e), str(e), *(_agreement(e, k * n) for _, n in MODEL_EXPONENTS)) for name, e, k in named]
+    rows = [
+        (name, _at_95(e), str(e), *(_agreement(e, k * n, asymptotic) for _, n in MODEL_EXPONENTS))
+        for name, e, k in named
+    ]
     first, last = laws.window
     said = (
         f"Window: from {first:.3f} s to {last:.3f} s before t_f = {measured(laws.t_f, laws.t_f_sigma)} s (1 σ; "
         f"{laws.n_periods:.1f} nutation periods). 5 ms in t_f would move the exponent of θ by "
         f"{5e-3 * laws.n_theta_per_t_f:.3f}. The 95 % intervals are Student's t with few degrees of freedom, and so "
         "wider than two standard deviations. They are those of a power law over this window; how far the law itself "
-        "bends shows in the dependence on the window. The models' exponents hold for a nutation that goes to zero; the "
-        "same law has another slope before, so that agreement is marked where it is found and disagreement is not."
+        "bends shows in the dependence on the window."
     )
+    if not asymptotic:
+        said += (
+            f" The models' exponents hold for a nutation that goes to zero. Here it reaches {np.degrees(theta):.2f} "
+            f"degrees, more than {np.degrees(ASYMPTOTIC_BELOW):.0f}: the same law then has another slope, so that "
+            "agreement is marked where it is found and disagreement is not."
+        )
     header = ("exponent of", "95 %", "1 σ", *(name.split(",")[0] for name, _ in MODEL_EXPONENTS))
     return [
         Text(said),
@@ -165,9 +177,19 @@ def _exponents(analysis: Analysis) -> list[Listing | Text]:
     ]
 
 
-def _agreement(exponent: Exponent, model: float) -> str:
-    """A model's exponent and whether the confidence interval holds it; no "no", where the law bends by itself."""
-    return f"{model:.3f} {'yes' if exponent.agrees_with(model) else 'as θ → 0'}"
+def _agreement(exponent: Exponent, model: float, asymptotic: bool) -> str:
+    """A model's exponent and whether the confidence interval holds it; no "no" where the law bends by itself."""
+    if exponent.agrees_with(model):
+        return f"{model:.3f} yes"
+    return f"{model:.3f} no" if asymptotic else f"{model:.3f} as θ → 0"
+
+
+def _largest_nutation(analysis: Analysis) -> float:
+    """In the window of the exponents [rad]."""
+    laws, motion = analysis.laws, analysis.motion
+    left = laws.t_f - motion.time
+    inside = motion.known & (left >= min(laws.window)) & (left <= max(laws.window))
+    return float(motion.euler[inside, 1].max()) if inside.any() else np.inf
 
 
 def _windows_table(fits: Sequence[PowerLaws]) -> Listing:
