@@ -148,8 +148,7 @@ def _exponents(analysis: Analysis) -> list[Listing | Text]:
     laws = analysis.laws
     if not laws.determined:
         return [Text(f"No exponents are given: {laws.reason}.")]
-    theta = _largest_nutation(analysis)
-    asymptotic = theta <= ASYMPTOTIC_BELOW
+    asymptotic = _largest_nutation(analysis) <= ASYMPTOTIC_BELOW
     named = ("energy", laws.n_energy, 1.0), ("nutation", laws.n_theta, 1.0), ("precession rate", laws.n_psidot, -0.5)
     rows = [
         (name, _at_95(e), str(e), *(_agreement(e, k * n, asymptotic) for _, n in MODEL_EXPONENTS))
@@ -161,14 +160,9 @@ def _exponents(analysis: Analysis) -> list[Listing | Text]:
         f"{laws.n_periods:.1f} nutation periods). 5 ms in t_f would move the exponent of θ by "
         f"{5e-3 * laws.n_theta_per_t_f:.3f}. The 95 % intervals are Student's t with few degrees of freedom, and so "
         "wider than two standard deviations. They are those of a power law over this window; how far the law itself "
-        "bends shows in the dependence on the window."
+        "bends shows in the dependence on the window. The models' exponents hold as the nutation goes to zero; above "
+        f"{np.degrees(ASYMPTOTIC_BELOW):.0f} degree the same law has another slope: there agreement alone is marked."
     )
-    if not asymptotic:
-        said += (
-            f" The models' exponents hold for a nutation that goes to zero. Here it reaches {np.degrees(theta):.2f} "
-            f"degrees, more than {np.degrees(ASYMPTOTIC_BELOW):.0f}: the same law then has another slope, so that "
-            "agreement is marked where it is found and disagreement is not."
-        )
     header = ("exponent of", "95 %", "1 σ", *(name.split(",")[0] for name, _ in MODEL_EXPONENTS))
     return [
         Text(said),

@@ -287,9 +287,8 @@ def details_of(tracking: Tracking) -> dict[str, Any]:
     }
     if tracking.table is not None:
         fields = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in vars(tracking.table).items()}
-        fields["least_off_centre"] = least_off_centre(
-            tracking.table, tracking.trajectory.q[:, 4], tracking.as_built.disc
-        )
+        theta = tracking.trajectory.q[:, 4]
+        fields["least_off_centre"] = least_off_centre(tracking.table, theta, tracking.as_built.disc)
         details["table"] = {**fields, "told": tracking.table.sentence}
     return details
 

@@ -97,8 +97,7 @@ def assemble(
     systematic += course
     moved = by_pattern(as_built, fits.R_world_body)
     fits, systematic, rig, table = table_from_disc(fits, systematic, as_built.rig, disc, settings.table, moved)
-    theta = np.arccos(fits.R_world_body[:, 2, 2])
-    as_built = replace(as_built, rig=rig, off_centre=off_centre(table, theta, disc))
+    as_built = replace(as_built, rig=rig, off_centre=off_centre(table, np.arccos(fits.R_world_body[:, 2, 2]), disc))
     moved = by_pattern(as_built, fits.R_world_body)
     systematic += moved @ moved.swapaxes(1, 2)
     # after the table: what poses scatter beside their dots need not be white, and frames do not average it there
