@@ -154,7 +154,8 @@ class Processes:
         self._threads.shutdown(wait=False, cancel_futures=True)
         for worker in self._workers:
             worker.executor.shutdown(wait=False, cancel_futures=True)
-        living = [worker.process for worker in self._workers if worker.process is not None]
+        # asked once each: it may end by itself at any moment
+        living = [process for worker in self._workers if (process := worker.process) is not None]
         for process in living:
             process.terminate()
         for process in living:
