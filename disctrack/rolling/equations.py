@@ -50,6 +50,9 @@ from disctrack.rolling.records import Numbers, Record
 
 Vector: TypeAlias = tuple[complex, complex, complex]  # all numbers may be real
 State: TypeAlias = Sequence[complex]
+# r_OA, the normal, the height of O; and what only an uneven rim or table asks for: W, its part in the face over its
+# length, that length, and the rim's support there
+Contact: TypeAlias = tuple[Vector, Vector, complex, tuple[Vector, Vector, complex, Vector]]
 Forced: TypeAlias = tuple[complex, complex, complex, complex, complex, complex, complex]
 
 _part = njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)  # called by compiled functions only
@@ -60,6 +63,7 @@ STICK_SPEED = 1e-7  # [m/s]; 1e-4 of what the tracking can see, and 1e-8 of the 
 LOAD_STEP = 1e-4  # [s]; (200 rad/s times it)^2 / 12 = 3e-5 of F_z'', and rounding 1e-8 N/s^2
 CREEP_PASSES = 3  # each adds a power of c times the motion's rate over 3 g to what is known of creep
 FILM = 2e-3  # [m/s] of creep: (c / g times rates of 100 rad/s)^3 is 1e-5 of v_A, and steps of 0.1 ms are stable
+NEAR_CONTACT = 1e-10  # [m] of a step of Newton's method: what is left then is its square over the radius
 LIFT_OFF_GAP = 1e-12  # [m]; a landing is a fall below this, so that the start of a flight is not one
 
 # table: integers shared by all functions: regime, number of laws, address of the record `now` of all that is known of
@@ -118,15 +122,6 @@ def _is_plain(body: Record) -> bool:
 
 
 @_part
-def _plain_arm(body: Record, s: complex, c: complex) -> tuple[Vector, Vector]:
-    """r_OA and its part a that turns with the nodal frame, nodal components."""
-    rho = body.edge_radius
-    a2, a3 = rho - body.radius, rho - body.half_thickness
-    zero = 0.0 * s
-    return (zero, a2 - rho * s, a3 - rho * c), (zero, a2, a3)
-
-
-@_part
 def _support(body: Record, cb: complex, sb: complex) -> Vector:
     """Support function of the rim, less its edge's radius, and two derivatives; by cosine and sine of the angle."""
     c2, s2 = cb * cb - sb * sb, 2.0 * sb * cb
@@ -143,56 +138,49 @@ def _support(body: Record, cb: complex, sb: complex) -> Vector:
 
 
 @_part
-def _place(body: Record, now: Record) -> tuple[Vector, Vector, complex, Vector, complex]:
-    """W, its part in the face over its length, that length, the rim's support there, and the height of O."""
+def _contact(body: Record, now: Record) -> Contact:
+    """From place and angles in the record."""
     s, c = now.sin_theta, now.cos_theta
-    cf, sf, sp, cp = np.cos(now.phi), np.sin(now.phi), np.sin(now.psi), np.cos(now.psi)
-    kappa, rho = body.curvature, body.edge_radius
+    zero, kappa, rho = 0.0 * s, body.curvature, body.edge_radius
+    if _is_plain(body):
+        arm, normal = (zero, rho - body.radius - rho * s, rho - body.half_thickness - rho * c), (zero, s, c)
+        return arm, normal, -(s * arm[1] + c * arm[2]), (normal, normal, zero, normal)
+    cf, sf, sp, cp = now.cos_phi, now.sin_phi, now.sin_psi, now.cos_psi
     arm3 = body.half_thickness - rho
     upright = np.sqrt(1.0 - body.slope_x * body.slope_x - body.slope_y * body.slope_y)
     n0 = _nodal(body.slope_x * cp + body.slope_y * sp, body.slope_y * cp - body.slope_x * sp, upright, s, c)
-    level = _nodal(-(now.x * cp + now.y * sp), now.x * sp - now.y * cp, 0.0 * s, s, c)
+    level = _nodal(-(now.x * cp + now.y * sp), now.x * sp - now.y * cp, zero, s, c)
     z = (body.radius - rho) * s + arm3 * c + rho
-    W, across, w, p = n0, n0, 1.0 + 0.0 * s, (z, z, z)
+    W, across, w, p = n0, n0, 1.0 + zero, (z, z, z)
     for _ in range(6):  # Newton's method; the first guess errs by the table's slope
         D = (level[0], level[1] - z * s, level[2] - z * c + arm3)
         W = _add(n0, _scale(kappa, D))
         w = np.sqrt(W[0] * W[0] + W[1] * W[1])
-        across = (W[0] / w, W[1] / w, 0.0 * w)  # -e
+        across = (W[0] / w, W[1] / w, zero)  # -e
         # e in body axes: nodal axes turned back by the spin
         p = _support(body, -(cf * across[0] + sf * across[1]), -(cf * across[1] - sf * across[0]))
         gap = 2.0 * _dot(n0, D) + kappa * _dot(D, D) + 2.0 * p[0] * w + kappa * p[0] * p[0] + (2.0 - kappa * rho) * rho
         by_z = -2.0 * upright - 2.0 * kappa * (s * D[1] + c * D[2]) - 2.0 * kappa * p[0] * s * across[1]
-        z = z - gap / by_z
-    return W, across, w, p, z
-
-
-@_part
-def _contact(body: Record, now: Record) -> tuple[Vector, Vector, complex]:
-    """r_OA, the normal of the table there, and the height of O."""
-    s, c = now.sin_theta, now.cos_theta
-    if _is_plain(body):
-        arm, _ = _plain_arm(body, s, c)
-        return arm, (0.0 * s, s, c), -(s * arm[1] + c * arm[2])
-    rho = body.edge_radius
-    W, across, _, p, z = _place(body, now)
-    n = _scale(1.0 / (1.0 - body.curvature * rho), _add(W, _scale(body.curvature * p[0], across)))
-    along = (across[1], -across[0], 0.0 * s)  # e3 x e
+        step = gap / by_z
+        z = z - step
+        if abs(step.real) < NEAR_CONTACT:
+            break
+    n = _scale(1.0 / (1.0 - kappa * rho), _add(W, _scale(kappa * p[0], across)))
+    along = (across[1], -across[0], zero)  # e3 x e
     rim = _add(_scale(-p[0], across), _scale(p[1], along))
-    arm = _add(_add(rim, (0.0 * s, 0.0 * s, rho - body.half_thickness)), _scale(-rho, n))
-    return arm, n, z
+    arm = _add(_add(rim, (zero, zero, -arm3)), _scale(-rho, n))
+    return arm, n, z, (W, across, w, p)
 
 
 @_part
-def _contact_rates(body: Record, now: Record, omega: Vector, frame: Vector, v: Vector) -> tuple[Vector, Vector]:
-    """Rates of r_OA and of the normal, as vectors; v: velocity of O, nodal components."""
-    s, c = now.sin_theta, now.cos_theta
+def _contact_rates(body: Record, now: Record, y: State, at: Contact) -> tuple[Vector, Vector]:
+    """Rates of r_OA and of the normal, as vectors; nodal components."""
+    s, c, rho, kappa = now.sin_theta, now.cos_theta, body.edge_radius, body.curvature
+    arm, normal, _, (W, across, w, p) = at
     if _is_plain(body):
-        _, a = _plain_arm(body, s, c)
-        return _cross(frame, a), (0.0 * s, 0.0 * s, 0.0 * s)
-    rho, kappa = body.edge_radius, body.curvature
-    arm3 = rho - body.half_thickness
-    W, across, w, p, _ = _place(body, now)
+        a = _add(arm, _scale(rho, normal))
+        return _cross((y[5], y[6], y[6] * c / s), a), (0.0 * s, 0.0 * s, 0.0 * s)
+    arm3, omega, v = rho - body.half_thickness, (y[5], y[6], y[7]), _nodal(now.v_n, now.v_m, now.v_z, s, c)
     e3 = (0.0 * s, 0.0 * s, 1.0 + 0.0 * s)
     e3_rate = _cross(omega, e3)
     W_rate = _scale(-kappa, _add(v, _scale(arm3, e3_rate)))
@@ -212,14 +200,15 @@ def _contact_rates(body: Record, now: Record, omega: Vector, frame: Vector, v: V
 
 
 @_part
-def _kinematics(regime: int, t: complex, y: State, body: Record, k: Record) -> None:
+def _kinematics(regime: int, t: complex, y: State, body: Record, k: Record) -> Contact:
     """Fills the record of kinematic quantities from the state."""
-    psi, theta = y[2], y[3]
-    s, c, sp, cp = np.sin(theta), np.cos(theta), np.sin(psi), np.cos(psi)
+    k.time, k.x, k.y, k.psi, k.theta, k.phi = t, y[0], y[1], y[2], y[3], y[4]
+    s, c, sp, cp = np.sin(k.theta), np.cos(k.theta), np.sin(k.psi), np.cos(k.psi)
+    k.sin_psi, k.cos_psi, k.sin_phi, k.cos_phi = sp, cp, np.sin(k.phi), np.cos(k.phi)
     w1, w2, w3 = y[5], y[6], y[7]
-    k.time, k.x, k.y, k.psi, k.theta, k.phi = t, y[0], y[1], psi, theta, y[4]
     k.sin_theta, k.cos_theta, k.thetadot, k.omega2, k.omega3 = s, c, w1, w2, w3
-    arm, normal, k.z = _contact(body, k)
+    at = _contact(body, k)
+    arm, normal, k.z, _ = at
     turn = _cross((w1, w2, w3), arm)  # omega x r_OA
     turn_n, turn_m, turn_z = turn[0], c * turn[1] - s * turn[2], s * turn[1] + c * turn[2]
     k.normal_n, k.normal_m, k.normal_z = normal[0], c * normal[1] - s * normal[2], s * normal[1] + c * normal[2]
@@ -237,6 +226,7 @@ def _kinematics(regime: int, t: complex, y: State, body: Record, k: Record) -> N
     k.radius, k.half_thickness, k.mass = body.radius, body.half_thickness, body.mass
     k.air_density = body.air_density
     k.gravity = np.sqrt(body.g_x * body.g_x + body.g_y * body.g_y + body.g_z * body.g_z)
+    return at
 
 
 @_part
@@ -253,9 +243,8 @@ def _apply_laws(table: Addresses, now: Record) -> None:
 
 
 @_part
-def _inertia_rows(body: Record, phi: complex) -> tuple[Vector, Vector, Vector]:
-    """Inertia about G in nodal axes, from body axes turned by the spin angle."""
-    c, s = np.cos(phi), np.sin(phi)
+def _inertia_rows(body: Record, s: complex, c: complex) -> tuple[Vector, Vector, Vector]:
+    """Inertia about G in nodal axes, from body axes turned by the spin angle of this sine and cosine."""
     J11 = c * c * body.J_11 - 2 * c * s * body.J_12 + s * s * body.J_22
     J22 = s * s * body.J_11 + 2 * c * s * body.J_12 + c * c * body.J_22
     J12 = c * s * (body.J_11 - body.J_22) + (c * c - s * s) * body.J_12
@@ -272,19 +261,15 @@ def _speed_of_friction(body: Record, slip: Vector) -> complex:
 
 
 @_part
-def _accelerations(regime: int, y: State, body: Record, now: Record) -> None:
+def _accelerations(regime: int, y: State, body: Record, now: Record, at: Contact) -> None:
     """Writes contact force, acceleration of O and angular acceleration into the record."""
     s, c, m = now.sin_theta, now.cos_theta, body.mass
     omega = (y[5], y[6], y[7])
-    frame = (y[5], y[6], y[6] * c / s)
-    k = _nodal(now.normal_n, now.normal_m, now.normal_z, s, c)
-    arm, _, _ = _contact(body, now)
-    v = _nodal(now.v_n, now.v_m, now.v_z, s, c)
-    arm_rate, k_rate = _contact_rates(body, now, omega, frame, v)
-    cf, sf = np.cos(now.phi), np.sin(now.phi)
+    arm, k, _, _ = at
+    arm_rate, k_rate = _contact_rates(body, now, y, at)
+    cf, sf, sp, cp = now.cos_phi, now.sin_phi, now.sin_psi, now.cos_psi
     com = (body.com_1 * cf - body.com_2 * sf, body.com_1 * sf + body.com_2 * cf, body.com_3)
     D = _add(arm, _scale(-1.0, com))
-    sp, cp = np.sin(now.psi), np.cos(now.psi)
     g_x, g_y = body.g_x + now.field_x - now.table_ax, body.g_y + now.field_y - now.table_ay
     g = _nodal(g_x * cp + g_y * sp, g_y * cp - g_x * sp, body.g_z + now.field_z - now.table_az, s, c)
     X = _nodal(now.X_n, now.X_m, now.X_z, s, c)
@@ -295,7 +280,7 @@ def _accelerations(regime: int, y: State, body: Record, now: Record) -> None:
     weight = _add(_scale(m, g), X)
     f0 = _add(_scale(m, _add(centripetal_G, _scale(-1.0, centripetal_A))), _scale(-1.0, weight))
     f0_z = _dot(k, f0)
-    J0, J1, J2 = _inertia_rows(body, now.phi)
+    J0, J1, J2 = _inertia_rows(body, sf, cf)
     H = (_dot(J0, omega), _dot(J1, omega), _dot(J2, omega))
     b = _add(_add(M0, _scale(-1.0, _cross(omega, H))), _scale(-1.0, _cross(com, X)))
     Dk = _scale(m, _cross(D, k))
@@ -345,7 +330,7 @@ def _state(regime: int, y: Numbers) -> State:
 @_part
 def _rates_of(y: State, now: Record) -> State:
     """Of all twelve components, on a table at rest."""
-    c, sp, cp = now.cos_theta, np.sin(now.psi), np.cos(now.psi)
+    c, sp, cp = now.cos_theta, now.sin_psi, now.cos_psi
     # components of a vector in a turning frame: rate of the components = (rate of the vector) - Omega x vector
     relative = _cross((y[5], y[6], now.psidot * c), (y[5], y[6], y[7]))
     return (
@@ -372,19 +357,19 @@ def _flow(t: complex, y: State, forced: Forced, table: Addresses, body: Record, 
     forced : acceleration of the contact along i and j, the rate of that; then a slip along n0 and m0 that takes the
         place of the state's own, and the share to which it does
     """
-    _kinematics(table[0], t, y, body, now)
+    at = _kinematics(table[0], t, y, body, now)
     slip_n, slip_m, share = forced[4:]
     now.slip_n, now.slip_m = now.slip_n + share * (slip_n - now.slip_n), now.slip_m + share * (slip_m - now.slip_m)
     _apply_laws(table, now)
     now.table_ax, now.table_ay = now.table_ax + forced[0], now.table_ay + forced[1]
-    _accelerations(table[0], y, body, now)
+    _accelerations(table[0], y, body, now, at)
     return _rates_of(y, now)
 
 
 @_part
 def _load_and_pull(now: Record) -> Vector:
     """F_z, and friction along i and j over N: what the normal of a hollow supports is none."""
-    sp, cp = np.sin(now.psi), np.cos(now.psi)
+    sp, cp = now.sin_psi, now.cos_psi
     F_n, F_m = now.F_n - now.N * now.normal_n, now.F_m - now.N * now.normal_m
     return now.F_z, (F_n * cp - F_m * sp) / now.N, (F_n * sp + F_m * cp) / now.N
 
@@ -453,15 +438,13 @@ def _creeping(
 
 
 @_part
-def _moving(y: State, body: Record, now: Record) -> tuple[complex, complex, complex, complex]:
+def _moving(y: State, body: Record, now: Record, at: Contact) -> tuple[complex, complex, complex, complex]:
     """Velocity along i and j of the surface at the contact, and its rate as the contact moves along; no laws asked."""
     nothing, turn = 0.0 * y[0], body.surface_turn
     if turn == 0.0:
         return nothing + body.surface_vx, nothing + body.surface_vy, nothing, nothing
-    s, c, sp, cp = now.sin_theta, now.cos_theta, np.sin(now.psi), np.cos(now.psi)
-    arm, _, _ = _contact(body, now)
-    v = _nodal(now.v_n, now.v_m, now.v_z, s, c)
-    arm_rate, _ = _contact_rates(body, now, (y[5], y[6], y[7]), (y[5], y[6], y[6] * c / s), v)
+    s, c, sp, cp, arm = now.sin_theta, now.cos_theta, now.sin_psi, now.cos_psi, at[0]
+    arm_rate, _ = _contact_rates(body, now, y, at)
     at_n, at_m = arm[0], c * arm[1] - s * arm[2]
     to_n, to_m = now.v_n + arm_rate[0], now.v_m + c * arm_rate[1] - s * arm_rate[2]
     v_x = body.surface_vx - turn * (now.y + at_n * sp + at_m * cp)
@@ -470,7 +453,7 @@ def _moving(y: State, body: Record, now: Record) -> tuple[complex, complex, comp
 
 
 @_part
-def _margins(regime: int, body: Record, now: Record) -> tuple[complex, complex, complex, complex]:
+def _margins(regime: int, body: Record, now: Record, at: Contact) -> tuple[complex, complex, complex, complex]:
     """Margins (EVENTS) that are positive while the regime lasts.
 
     theta_end: nutation above its end. load: N, or in flight the gap. grip: rolling N - |F_t|/mu, slipping the slip
@@ -482,8 +465,7 @@ def _margins(regime: int, body: Record, now: Record) -> tuple[complex, complex, 
     if regime == SLIPPING and body.inverse_friction != 0.0:  # on a film nothing sticks
         grip = np.sqrt(now.slip_n * now.slip_n + now.slip_m * now.slip_m) - STICK_SPEED
     if regime == FLYING:
-        _, _, z = _contact(body, now)
-        load = now.z - z + LIFT_OFF_GAP
+        load = now.z - at[2] + LIFT_OFF_GAP
     return now.theta - body.theta_end, load, grip, 0.5 * np.pi - now.theta
 
 
@@ -492,17 +474,17 @@ def rates(t: Numbers, y: Numbers, out: Numbers, table: Addresses, body: Record, 
     regime, state = table[0], _state(table[0], y)
     load = _course_of_load(t[0], state, table, body, now)
     v_x, v_y, a_x, a_y = _creeping(t[0], state, table, body, now)
-    _kinematics(regime, t[0], state, body, now)
+    at = _kinematics(regime, t[0], state, body, now)
     _apply_laws(table, now)
-    turning = _moving(state, body, now)
+    turning = _moving(state, body, now, at)
     v_x, v_y, a_x, a_y = v_x + turning[0], v_y + turning[1], a_x + turning[2], a_y + turning[3]
     now.table_vx, now.table_vy = now.table_vx + v_x, now.table_vy + v_y
     now.table_ax, now.table_ay = now.table_ax + a_x, now.table_ay + a_y
     now.table_z -= body.compliance * load[0]
     now.table_vz -= body.compliance * load[1]
     now.table_az -= body.compliance * load[2]
-    _accelerations(regime, state, body, now)
-    rate, margins, n = _rates_of(state, now), _margins(regime, body, now), 8 + 2 * regime
+    _accelerations(regime, state, body, now, at)
+    rate, margins, n = _rates_of(state, now), _margins(regime, body, now, at), 8 + 2 * regime
     for i in range(n):
         out[i] = rate[i]
     out[0], out[1] = out[0] + v_x, out[1] + v_y

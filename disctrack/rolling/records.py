@@ -88,7 +88,9 @@ ANSWERS = (
     "alpha_3",
 )
 
-INSTANT = KINEMATICS + WRENCH + ANSWERS  # all that the equations of motion know at one instant: one record
+ANGLES = ("sin_psi", "cos_psi", "sin_phi", "cos_phi")  # read by the equations alone: laws that turn with psi say so
+
+INSTANT = KINEMATICS + WRENCH + ANSWERS + ANGLES  # all that the equations of motion know at one instant: one record
 
 # Constants of one body on one table. Inertia about the centre of mass in body axes.
 BODY = (
