@@ -21,6 +21,7 @@ from disctrack.rolling.records import Numbers, Records
 REACHED_END, EVENT, TOO_MANY_STEPS, NOT_FINITE = range(4)
 RTOL_IMAGINARY = 1e-7  # error of fifth order per step; the derivatives then hold to about 1e-9 of their size
 MAX_STEPS = 200_000
+INSTANT = 1e-16  # [s] between which events are not told apart
 
 _part = njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)  # called by compiled functions only
 
@@ -208,26 +209,32 @@ def _ran_out(K: Numbers, n: int) -> int:
 
 
 @_part
-def _locate(system: CompiledSystem, t: complex, y: Numbers, h: float, work: _Work) -> tuple[int, float]:
-    """Shorten the step to where the first margin has just run out, by bisection; y_new and K hold there.
+def _locate(system: CompiledSystem, t: complex, y: Numbers, h: float, event: int, work: _Work) -> tuple[int, float]:
+    """Shorten the step to where the first margin has just run out, by the Illinois method; y_new and K hold there.
 
-    Returns the number of the margin and the length of the step.
+    event : number of the first margin that has run out after h.   Returns that at the end, and the length of the step.
     """
-    unit = 0.0 * y[0] + 1.0
-    low, high, trial = 0.0, h, 0.5 * h
+    unit, n, side = 0.0 * y[0] + 1.0, y.size, 0
+    low, high, at_low, at_high = 0.0, h, work.K[0, n + event].real, work.K[_N, n + event].real
     while True:
+        trial = high
+        if high - low > 2.0 * INSTANT:
+            trial -= (high - low) * at_high / (at_high - at_low)  # where the chord is zero
+            trial = min(max(trial, low + INSTANT), high - INSTANT)
         _step(system, t, y, trial * unit, work)
         _rates(system, t + trial * unit, work.y_new, work.K[_N], work.t)
-        event = _ran_out(work.K, y.size)
         if trial == high:
             return event, high
-        if event >= 0:
-            high = trial
+        found, before = _ran_out(work.K, n), side
+        side = 1 if found >= 0 else -1
+        kept = 0.5 if side == before else 1.0  # the side that is kept twice gives way
+        if found < 0:
+            low, at_high, margin = trial, kept * at_high, work.K[_N, n + event].real
+            at_low = margin if margin > 0.0 else at_low  # not where it is no number
         else:
-            low = trial
-        trial = 0.5 * (low + high)
-        if not low < trial < high or high - low < 1e-16:
-            trial = high
+            high, at_high = trial, work.K[_N, n + found].real
+            at_low = kept * at_low if found == event else work.K[0, n + found].real
+            event = found
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -269,7 +276,7 @@ def _dop853(
         _rates(system, t + h, work.y_new, K[_N], work.t)
         event = _ran_out(K, n)
         if event >= 0:
-            event, h_event = _locate(system, t, y, h.real, work)
+            event, h_event = _locate(system, t, y, h.real, event, work)
             h = h_event * unit
         if grid[i_grid] <= (t + h).real:
             i_grid = _fill(system, t, y, h, work, grid, i_grid, solution)
