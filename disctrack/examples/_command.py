@@ -1,14 +1,13 @@
 """What all examples share: their command line, their files, and how errors end."""
 
 import argparse
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from disctrack.discrepancy.document import document, tables
 from disctrack.discrepancy.equations import Answer
 from disctrack.discrepancy.search import Diagnosis
-from disctrack.errors import AnalysisError, DiscTrackError
+from disctrack.errors import DiscTrackError
 from disctrack.files.json_text import json_file
 from disctrack.files.whole import refuse_existing, write_whole
 from disctrack.report import blocks
@@ -32,21 +31,14 @@ def report_of(
     return Report(f"{model}: what is missing?", sentence, blocks=[*own, *tables(d)], data=data)
 
 
-def needed(folder: Path, name: str) -> Path:
-    """A file that an example reads. Raises AnalysisError."""
-    path = Path(folder) / name
-    if not path.is_file():
-        raise AnalysisError(f"{path}: not there. Name the folder that holds {name}.")
-    return path
+def command(example: Callable[..., Outcome], data: str = "", words: Sequence[str] | None = None) -> None:
+    """Run one example: print its report, write diagnosis.json and pages where asked for; an error ends the program.
 
-
-def command(name: str, data: str | None, diagnose: Callable[..., Outcome], words: Sequence[str] | None = None) -> int:
-    """Run one example: print its report, write diagnosis.json and pages where asked for; returns the exit code.
-
-    data : what the folder that is given to `diagnose` holds; None for data that come with the sources
+    data : what the example reads from the folder that it is given; none, if its data come with the sources
+    words : of the command line, if not those of the program
     """
-    parser = argparse.ArgumentParser(prog=f"python -m disctrack.examples.{name}", description=diagnose.__doc__)
-    if data is not None:
+    parser = argparse.ArgumentParser(description=example.__doc__)
+    if data:
         parser.add_argument("folder", type=Path, help=f"folder with {data}")
     parser.add_argument("-o", "--output", type=Path, help="folder for diagnosis.json and the pages")
     parser.add_argument("--overwrite", action="store_true", help="replace an earlier result")
@@ -54,13 +46,11 @@ def command(name: str, data: str | None, diagnose: Callable[..., Outcome], words
     try:
         if given.output is not None:
             refuse_existing(given.output / "diagnosis.json", given.overwrite)
-        report, answers = diagnose() if data is None else diagnose(given.folder)
+        report, answers = example(given.folder) if data else example()
         print("\n".join(full(report)))
         if given.output is not None:
             for where, answer in answers.items():
                 answer.write(given.output / where, given.overwrite)
             write_whole(given.output / "diagnosis.json", json_file(blocks.document(report)))
-    except DiscTrackError as error:
-        print(f"{name}: {error}", file=sys.stderr)
-        return 1
-    return 0
+    except (DiscTrackError, OSError) as error:
+        parser.exit(1, f"{error}\n")

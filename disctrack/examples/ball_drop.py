@@ -8,12 +8,9 @@ not have in common is noise with a memory.
 Data: Frontiers in Artificial Intelligence 3:25; 11 balls.
 """
 
-import csv
-import sys
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -23,8 +20,7 @@ from disctrack.discrepancy.equations import Answer, Equations, Parameter, Run, S
 from disctrack.discrepancy.noise import SampleStretch, estimate
 from disctrack.discrepancy.search import CLASS_GAIN, Settings
 from disctrack.discrepancy.significance import price_of_a_number
-from disctrack.errors import AnalysisError
-from disctrack.examples._command import GRAVITY, Outcome, command, needed
+from disctrack.examples._command import GRAVITY, Outcome, command
 from disctrack.numbers import rounded, score
 from disctrack.report.blocks import Listing, Report, Section
 
@@ -51,27 +47,29 @@ OTHERS = (
 
 
 def drop(ball: str, number: int, time: Array, height: Array) -> Run:
-    """One drop of a ball: time [s], height [m]."""
-    return Run(time, {"h": height}, name=f"{ball},{number}", groups={"ball": ball})
+    """One drop of a ball: time from zero on [s], height [m]."""
+    until = np.inf if number == 1 else SEEN
+    return Run(
+        time, {"h": height}, name=f"{ball},{number}", groups={"ball": ball, "drop": str(number)}, fit_until=until
+    )
 
 
-def read_drops(folder: Path) -> tuple[Run, ...]:
-    """All drops of `ball_drops.csv`. Raises AnalysisError."""
-    path, rows = needed(folder, "ball_drops.csv"), defaultdict[tuple[str, int], list[tuple[float, float]]](list)
-    with path.open(newline="") as stream:
-        for line, row in enumerate(csv.DictReader(stream), start=2):
-            try:
-                rows[row["ball"], int(row["drop"])].append((float(row["t_s"]), float(row["height_m"])))
-            except (KeyError, TypeError, ValueError) as error:
-                raise AnalysisError(f"{path}, line {line}: expected ball,drop,t_s,height_m; found {row}.") from error
-    return tuple(drop(ball, number, *np.array(samples, float).T) for (ball, number), samples in rows.items())
+def read_drops(folder: Path) -> list[Run]:
+    """All drops of `ball_drops.csv`."""
+    table = np.genfromtxt(folder / "ball_drops.csv", delimiter=",", names=True, dtype=None, encoding="utf-8")
+    takes = table[["ball", "drop"]]
+    drops = []
+    for ball, number in dict.fromkeys(takes.tolist()):
+        rows = table[(table["ball"] == ball) & (table["drop"] == number)]
+        drops.append(drop(ball, number, rows["t_s"], rows["height_m"]))
+    return drops
 
 
 def _by_ball(drops: Sequence[Run]) -> dict[str, list[Run]]:
     found = defaultdict[str, list[Run]](list)
     for run in drops:
         found[run.groups["ball"]].append(run)
-    return dict(found)
+    return found
 
 
 def height_noise(drops: Sequence[Run]) -> SmoothNoise:
@@ -83,23 +81,21 @@ def height_noise(drops: Sequence[Run]) -> SmoothNoise:
     """
     stretches = []
     for takes in _by_ball(drops).values():
-        clocks = [np.asarray(d.time) - np.asarray(d.time)[0] for d in takes]
-        time, part = np.concatenate(clocks), np.repeat(np.arange(len(takes)), [len(t) for t in clocks])
+        time = np.concatenate([d.time for d in takes])
+        part = np.repeat(np.arange(len(takes)), [np.size(d.time) for d in takes])
         own = (part[:, None] == np.arange(len(takes))).astype(float)
         u = time[:, None] / time.max()
-        basis = np.concatenate([own, own * u, *(u**k for k in range(2, ACCELERATION_DEGREE + 3))], axis=1)
-        heights = np.concatenate([np.asarray(d.data["h"]) for d in takes])
+        basis = np.concatenate([own, own * u, u ** np.arange(2, ACCELERATION_DEGREE + 3)], axis=1)
+        heights = np.concatenate([d.data["h"] for d in takes])
         stretches.append(SampleStretch(time, heights[:, None], basis, part))
     return estimate(stretches, SmoothNoise(0.05, 0.15, 0.5))
 
 
 def ask(drops: Sequence[Run], noise: SmoothNoise, terms: Sequence[Term], equations: Equations = FALL) -> Answer:
     """What the equations lack for these drops. The noise is that of all balls, and takes of one may differ."""
-    until = [np.inf if d.name.endswith(",1") else SEEN - np.asarray(d.time)[0] for d in drops]
-    runs = [replace(d, noise=noise, fit_until=t) for d, t in zip(drops, until, strict=True)]
-    at_noise = 1 + 3 * np.sqrt(2 / sum(len(np.asarray(d.time)) for d in drops))  # three sigmas of a reduced chi-square
+    at_noise = 1 + 3 * np.sqrt(2 / sum(np.size(d.time) for d in drops))  # three sigmas of a reduced chi-square
     settings = Settings(noise=1.0, unexplained_share=0.2, at_noise=float(at_noise))
-    return diagnose(equations, runs, terms, settings=settings)
+    return diagnose(equations, [replace(d, noise=noise) for d in drops], terms, settings=settings)
 
 
 @dataclass(frozen=True)
@@ -110,9 +106,7 @@ class BallAnswer:
     together: Answer
     alone: Mapping[str, Answer]
     by_law: Mapping[str, Answer]  # what a fall with that law of drag lacks
-    # by law, and "gravity alone": rms [m] on the second drop of every ball of a law fitted to the first, with a start
-    # that is fitted to "whole" of it, or to its first SEEN seconds and the error taken after them, "forecast"
-    errors: Mapping[str, Mapping[str, dict[str, float]]]
+    errors: Mapping[str, Array]  # by law, and "gravity alone": `errors_on_second_drops`
 
     @property
     def forms(self) -> dict[tuple[str, ...], float]:
@@ -138,29 +132,29 @@ class BallAnswer:
 def analyse_drops(drops: Sequence[Run]) -> BallAnswer:
     """Diagnose all balls together and each alone, compare the forms of the law, measure errors on the second drops."""
     noise = height_noise(drops)
+    together = ask(drops, noise, (*DRAGS, *OTHERS))
     alone = {ball: ask(takes, noise, (*DRAGS, *OTHERS)) for ball, takes in _by_ball(drops).items()}
-    by_law = {name: ask(drops, noise, OTHERS[-1:], with_drag(name)) for name in DRAG}
-    errors = {"gravity alone": errors_of(drops, FALL), **{name: errors_of(drops, with_drag(name)) for name in DRAG}}
-    return BallAnswer(noise, ask(drops, noise, (*DRAGS, *OTHERS)), alone, by_law, errors)
+    laws = {
+        name: replace(FALL, rates={"h": "v", "v": f"-g + {force}"}, parameters={"k": k}, name=name)
+        for name, (force, k) in DRAG.items()
+    }
+    by_law = {name: ask(drops, noise, OTHERS[-1:], law) for name, law in laws.items()}
+    errors = {name: errors_on_second_drops(drops, law) for name, law in ({"gravity alone": FALL} | laws).items()}
+    return BallAnswer(noise, together, alone, by_law, errors)
 
 
-def with_drag(name: str) -> Equations:
-    """A fall with one of the laws declared."""
-    force, k = DRAG[name]
-    return replace(FALL, rates={"h": "v", "v": f"-g + {force}"}, parameters={"k": k}, name=name)
+def errors_on_second_drops(drops: Sequence[Run], equations: Equations) -> Array:
+    """(2,) medians of the balls' rms [m] on drop 2, by least squares with a law fitted to drop 1.
 
-
-def errors_of(drops: Sequence[Run], equations: Equations) -> dict[str, dict[str, float]]:
-    """Least squares without a model of the noise: a law fitted to drops 1, errors on drops 2 of the same balls."""
-    first, second = ([replace(d, sigma=1.0) for d in drops if d.name.endswith(f",{k}")] for k in (1, 2))
+    Its start is fitted to the whole drop; or to the first SEEN seconds, and the error taken after them.
+    """
+    first, second = ([replace(d, sigma=1.0, fit_until=None) for d in drops if d.groups["drop"] == k] for k in "12")
     answer = diagnose(equations, first, (), settings=Settings(noise=1.0))
-    found: dict[str, dict[str, float]] = {"whole": {}, "forecast": {}}
-    for run in (d for d in second if d.groups["ball"] in _by_ball(first)):
-        ball, time, height = run.groups["ball"], np.asarray(run.time), np.asarray(run.data["h"])
-        whole, ahead = (height - answer.forecast(run, window=w, by="before")["h"] for w in (np.inf, SEEN - time[0]))
-        found["whole"][ball] = float(np.sqrt(np.mean(whole**2)))
-        found["forecast"][ball] = float(np.sqrt(np.mean(ahead[time - time[0] > SEEN] ** 2)))
-    return found
+    errors = []
+    for run in second:
+        left = run.data["h"] - answer.forecast(run, window=np.inf, by="before")["h"]
+        errors.append((np.sqrt(np.mean(left**2)), answer.score(run, window=SEEN, by="before")["h"].rms))
+    return np.median(errors, axis=0)
 
 
 def _words(effects: Sequence[str]) -> str:
@@ -181,10 +175,8 @@ def sentence(answer: BallAnswer) -> str:
 
 def report(answer: BallAnswer) -> Report:
     """Before and after, for people."""
-    n, errors = answer.noise, []
-    for name, e in answer.errors.items():
-        medians = [float(np.median(list(x.values()))) if x else np.nan for x in e.values()]
-        errors.append((_words([name]), *(rounded(x) for x in medians)))
+    n = answer.noise
+    errors = [(_words([name]), *(rounded(x) for x in both)) for name, both in answer.errors.items()]
     forms = [(_words(effects), score(over)) for effects, over in answer.forms.items()]
     alone = [(name, a.verdict, ", ".join(a.found)) for name, a in answer.alone.items()]
     return Report(
@@ -199,11 +191,8 @@ def report(answer: BallAnswer) -> Report:
             Section("All balls together", [Listing(("effects", "criterion"), forms)]),
             Section("Each ball alone", [Listing(("ball", "verdict", "missing"), alone)]),
         ],
-        data={
-            **answer.together.document(),
-            "identifiable": answer.identifiable,
-            "cannot_be_told_apart": answer.undecided,
-        },
+        data=answer.together.document()
+        | {"identifiable": answer.identifiable, "cannot_be_told_apart": answer.undecided},
     )
 
 
@@ -213,8 +202,5 @@ def example(folder: Path) -> Outcome:
     return report(answer), {"all balls": answer.together}
 
 
-main = partial(command, "ball_drop", "ball_drops.csv", example)
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    command(example, "ball_drops.csv")

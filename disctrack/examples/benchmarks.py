@@ -9,10 +9,8 @@ Silverbox. The textbook's equations are fitted to the part for estimation; the o
 begins in what the official window shows, and compared with the best published.
 """
 
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from time import process_time
 
@@ -176,8 +174,5 @@ def example(folder: Path) -> Outcome:
     return Report("Public benchmarks", said, blocks=[Listing(header, rows)], data=data), answers
 
 
-main = partial(command, "benchmarks", "the files of at least one benchmark", example)
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    command(example, "the files of at least one benchmark")

@@ -7,15 +7,13 @@ and keep the rest for validation; so is it done here. Only the ratios stiffness 
 k1 / (m1 a1^2 + I1) of their numbers can be told from a free swing.
 """
 
-import sys
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from disctrack.discrepancy.equations import Answer, Equations, Run, Term, diagnose, terms
-from disctrack.examples._command import Outcome, command, needed
+from disctrack.discrepancy.equations import Equations, Run, Term, diagnose, terms
+from disctrack.examples._command import Outcome, command
 from disctrack.numbers import rounded
 from disctrack.report.blocks import Listing, Section
 
@@ -42,45 +40,24 @@ MISSING = (
 )  # fmt: skip
 
 
-def swing(folder: Path) -> Run:
-    """Angle [rad] from hanging. Raises AnalysisError."""
-    with np.load(needed(folder, "single_free_swing.npz")) as data:
-        return Run(data["time_s"], {"angle": data["angle_rad"] - np.pi}, name="swing")
-
-
-def asked(run: Run) -> Answer:
-    """The diagnosis of the swing as far as the authors fit it."""
-    time, angle = np.asarray(run.time), np.asarray(run.data["angle"])
-    rows = time <= FITTED_S
-    return diagnose(PENDULUM, Run(time[rows], {"angle": angle[rows]}, name=run.name), MISSING)
-
-
-def rms_left(answer: Answer, run: Run) -> dict[str, tuple[float, float]]:
-    """Rms [rad] of measured minus modelled angle, by model: of what was fitted, and of what was kept back."""
-    kept = np.asarray(run.time) > FITTED_S
-    found = {}
-    for side in ("before", "after"):
-        left = np.asarray(run.data["angle"]) - answer.forecast(run, by=side)["angle"]
-        found[side] = float(np.sqrt(np.mean(left[~kept] ** 2))), float(np.sqrt(np.mean(left[kept] ** 2)))
-    return found
-
-
 def example(folder: Path) -> Outcome:
     """What does a pendulum with viscous friction lack, and does what is found predict the rest of its swing?"""
-    run = swing(folder)
-    answer = asked(run)
-    left, encoder = rms_left(answer, run), STEP / np.sqrt(12)
-    parts = ("fitted, 0 to 36.668 s", "kept back, 36.668 to 55 s, predicted")
-    rows = [(name, *(rounded(1e3 * rms[i]) for rms in left.values())) for i, name in enumerate(parts)]
-    rows.append(("the step of the encoder allows", rounded(1e3 * encoder), rounded(1e3 * encoder)))
-    kept = Section("Rms of measured minus modelled (mrad)", [Listing(("", "before", "after"), rows)])
-    told = answer.report()
-    data = {**answer.document(), "kept_back_rms_rad": {side: rms[1] for side, rms in left.items()}}
-    return replace(told, blocks=[kept, *told.blocks], data=data), {"swing": answer}
-
-
-main = partial(command, "pendulum", "single_free_swing.npz", example)
+    with np.load(folder / "single_free_swing.npz") as file:
+        time, angle = file["time_s"], file["angle_rad"] - np.pi  # from hanging
+    fitted = time <= FITTED_S
+    answer = diagnose(PENDULUM, Run(time[fitted], {"angle": angle[fitted]}, name="swing"), MISSING)
+    rms = dict[str, list[float]]()
+    for side in ("before", "after"):
+        left = angle - answer.forecast(Run(time, {"angle": angle}, name="swing"), by=side)["angle"]
+        rms[side] = [float(np.sqrt(np.mean(left[rows] ** 2))) for rows in (fitted, ~fitted)]
+    data = {**answer.document(), "kept_back_rms_rad": {side: kept_back for side, (_, kept_back) in rms.items()}}
+    rms["the step of the encoder allows"] = [STEP / np.sqrt(12)] * 2
+    rows = [(name, *(rounded(1e3 * x) for x in both)) for name, both in rms.items()]
+    header = ("", f"fitted, 0 to {FITTED_S} s", "kept back, from there to 55 s, predicted")
+    kept = Section("Rms of measured minus modelled (mrad)", [Listing(header, rows)])
+    report = answer.report()
+    return replace(report, blocks=[kept, *report.blocks], data=data), {"swing": answer}
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    command(example, "single_free_swing.npz")

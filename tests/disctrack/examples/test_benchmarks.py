@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from disctrack.examples.benchmarks import main
+from disctrack.examples._command import command
+from disctrack.examples.benchmarks import example
 
 
 def positions(rng, path, frequencies):
@@ -29,10 +30,11 @@ def positions(rng, path, frequencies):
 def test_friction_of_the_positioning_system_is_found_and_its_test_part_is_foretold(rng, tmp_path, capsys):
     positions(rng, tmp_path / "DATA_EMPS.mat", (0.3, 0.7))
     positions(rng, tmp_path / "data_emps_pulses.mat", (0.4, 1.1))
-    assert main([str(tmp_path), "-o", str(tmp_path / "out")]) == 0
+    command(example, "files", [str(tmp_path), "-o", str(tmp_path / "out")])
     assert "EMPS" in capsys.readouterr().out
     found = json.loads((tmp_path / "out" / "diagnosis.json").read_text())["EMPS"]
     assert [e["name"] for e in found["effects"]] == ["coulomb_v"]
     assert found["test"]["error"] < 0.1  # mm, of a path of some 100
-    assert main([str(tmp_path / "out")]) == 1
+    with pytest.raises(SystemExit):
+        command(example, "files", [str(tmp_path / "out")])
     assert "no benchmark is there" in capsys.readouterr().err

@@ -393,17 +393,16 @@ def test_false_alarms_are_as_rare_as_stated():
 @pytest.mark.slow
 def test_the_arm_that_swings_lacks_more_than_viscous_friction(shared_data):
     """Real data; the part that the authors kept for validation is foretold."""
-    from disctrack.examples.pendulum import asked, rms_left, swing
+    from disctrack.examples.pendulum import example
 
     if not (shared_data / "pendulum").is_dir():
         pytest.skip("the recording is not there")
-    run = swing(shared_data / "pendulum")
-    answer = asked(run)
+    report, answers = example(shared_data / "pendulum")
+    answer, kept_back = answers["swing"], report.data["kept_back_rms_rad"]
     assert answer.verdict == "unexplained"  # 1.5 mrad are left where the encoder errs by 0.045
     assert {"coulomb_rate", "quadratic_rate"} <= set(answer.found)
     assert answer.after["angle"].rms < answer.before["angle"].rms / 4
-    (_, before), (_, after) = rms_left(answer, run).values()  # of what was kept
-    assert after < before / 6
+    assert kept_back["after"] < kept_back["before"] / 6
 
 
 def test_an_input_that_is_held_moves_what_was_at_rest():
