@@ -152,7 +152,7 @@ def errors_on_second_drops(drops: Sequence[Run], equations: Equations) -> Array:
     answer = diagnose(equations, first, (), settings=Settings(noise=1.0))
     errors = []
     for run in second:
-        left = run.data["h"] - answer.forecast(run, window=np.inf, by="before")["h"]
+        left = np.asarray(run.data["h"]) - answer.forecast(run, window=np.inf, by="before")["h"]
         errors.append((np.sqrt(np.mean(left**2)), answer.score(run, window=SEEN, by="before")["h"].rms))
     return np.median(errors, axis=0)
 

@@ -10,19 +10,19 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+from scipy.integrate import cumulative_trapezoid
 from scipy.spatial.transform import Rotation
 
 from calibration.kit.arrays import Array
-from disctrack.errors import AnalysisError
-from disctrack.examples._command import needed
 
 HALF_WIDTH = 0.0524  # [m] as declared
 FRAME_RATE = 148.0  # [Hz]
 CLEARANCE = 0.12  # [half widths] of the lowest corner, from which on nothing touches: several times what contacts show
 SHORTEST = 9  # samples of a flight
-GLITCH = 6.0  # times the median roughness, beyond which a flight is not one: a hand, or a tag mistaken
 RELEASE = 5.0  # sigmas by which a first sample may stand off the smooth motion before it counts as still in the hand
+GLITCH = 20.0  # sigmas off the smooth motion that no effect explains: a hand, or a tag mistaken
 MAX_RELEASE = 6  # samples
+UP = np.array([0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True)
@@ -34,16 +34,16 @@ class Toss:
     rotation: Array  # (n, 3, 3) body to world
 
     @property
-    def reach(self) -> Array:
-        """(n,) height of the centre over the lowest corner, in half widths: 1 on a face, sqrt(3) on a corner."""
-        return np.asarray(np.abs(self.rotation[:, 2, :]).sum(axis=1), float)
+    def clearance(self) -> Array:
+        """(n,) height of the lowest corner in half widths; the centre is 1 above it on a face, sqrt(3) on a corner."""
+        return np.asarray(self.position[:, 2] / HALF_WIDTH - np.abs(self.rotation[:, 2, :]).sum(axis=1), float)
 
 
 @dataclass(frozen=True)
 class Flight:
     """A stretch of a toss in free flight, with the smooth motion about which effects are reckoned."""
 
-    number: int  # of the toss
+    toss: Toss
     time: Array  # (n,) from the middle [s]
     position: Array  # (n, 3) [m]
     rotation: Array  # (n, 3, 3)
@@ -52,21 +52,35 @@ class Flight:
     omega: Array  # (3,) constant angular velocity in world axes that fits best [rad/s]
     turning: Array  # (n, 3, 3) rotation at that velocity
     turn: Array  # (n, 3) from there to the measured attitude, rotation vector in axes of the body [rad]
-    along: Array  # (3,) horizontal direction of the flight
-    across: Array  # (3,) horizontal, to its left
+
+    @property
+    def off(self) -> Array:
+        """(n, 6) distances from the smooth motion [m], turns as they move the middle of a face."""
+        return np.concatenate([self.position - self.path, HALF_WIDTH * self.turn], axis=1)
+
+    @property
+    def axes(self) -> Array:
+        """(3, 3) horizontal direction of the flight, the one across it to its left, and up."""
+        level = self.velocity.mean(axis=0) * (1 - UP)
+        along = level / np.linalg.norm(level)
+        return np.array([along, np.cross(UP, along), UP])
+
+    def in_body(self, vectors: Array) -> Array:
+        """(n, 3) of vectors (3,) or (n, 3) in world axes."""
+        return np.einsum("nji,nj->ni", self.turning, np.broadcast_to(vectors, self.path.shape))
+
+
+def integrated(rate: Array) -> Array:
+    """Integral (n, ...) of a rate (n, ...) from the first sample on."""
+    return np.asarray(cumulative_trapezoid(rate, dx=1 / FRAME_RATE, axis=0, initial=0), float)
 
 
 def read_tosses(folder: Path) -> tuple[Toss, ...]:
-    """All tosses of `cube_tosses.npz`. Raises AnalysisError."""
-    path = needed(folder, "cube_tosses.npz")
-    with np.load(path) as file:
-        try:
-            state, offset = np.asarray(file["state"], float), np.asarray(file["offset"], int)
-            pose, rotation = state[: offset[-1], :3], Rotation.from_quat(state[:, [4, 5, 6, 3]]).as_matrix()
-        except (KeyError, IndexError, ValueError) as error:
-            raise AnalysisError(f"{path}: expected state (n, 13) and offset (tosses + 1,); {error}.") from error
-    spans = pairwise(offset.tolist())
-    return tuple(Toss(i, HALF_WIDTH * pose[a:b], rotation[a:b]) for i, (a, b) in enumerate(spans))
+    """All tosses of `cube_tosses.npz`."""
+    with np.load(folder / "cube_tosses.npz") as file:
+        state, spans = np.asarray(file["state"], float), pairwise(file["offset"].tolist())
+    position, rotation = HALF_WIDTH * state[:, :3], Rotation.from_quat(state[:, 3:7], scalar_first=True).as_matrix()
+    return tuple(Toss(i, position[a:b], rotation[a:b]) for i, (a, b) in enumerate(spans))
 
 
 def without_copies(tosses: Sequence[Toss]) -> tuple[tuple[Toss, ...], int]:
@@ -82,36 +96,23 @@ def without_copies(tosses: Sequence[Toss]) -> tuple[tuple[Toss, ...], int]:
 
 
 def flights(tosses: Sequence[Toss]) -> tuple[tuple[Flight, ...], int]:
-    """The first flight of every toss, and how many were left out because they are rough or too short.
+    """The first flight of every toss, and how many were left out because they are too short, or not smooth.
 
     A flight begins with the first sample that keeps to the smooth motion of the others (before, a hand still holds the
-    cube; the very first sample is never taken) and lasts until a corner comes as low as CLEARANCE. Rough is one whose
-    third differences are GLITCH times those of the others: no smooth motion has them.
+    cube; the very first sample is never taken) and lasts until a corner comes as low as CLEARANCE.
     """
-    ends = [_first_contact(toss) for toss in tosses]
+    ends = [int(np.argmin(np.append(toss.clearance > CLEARANCE, False))) for toss in tosses]
     whole = [smooth_flight(t, 1, n) for t, n in zip(tosses, ends, strict=True) if n - 1 >= SHORTEST]
-    if not whole:
-        return (), len(tosses)
-    sigma = 1.4826 * float(np.median([np.median(np.abs(_off(f)[2:-2])) for f in whole]))
+    sigma = 1.4826 * float(np.median([np.median(np.abs(f.off)[2:-2]) for f in whole]))
     found = []
     for toss, end in zip(tosses, ends, strict=True):
-        tries = (smooth_flight(toss, first, end) for first in range(1, min(MAX_RELEASE, end - SHORTEST) + 1))
-        flight = next((f for f in tries if np.abs(_off(f)[0]).max() <= RELEASE * sigma), None)
-        if flight is not None:
-            found.append(flight)
-    rough = np.array([np.sqrt(np.mean(np.diff(_off(f), 3, axis=0) ** 2)) for f in found])
-    smooth = tuple(f for f, r in zip(found, rough, strict=True) if r <= GLITCH * np.median(rough))
-    return smooth, len(tosses) - len(smooth)
-
-
-def _first_contact(toss: Toss) -> int:
-    clear = toss.position[:, 2] / HALF_WIDTH - toss.reach > CLEARANCE
-    return len(clear) if clear.all() else int(np.argmin(clear))
-
-
-def _off(flight: Flight) -> Array:
-    """(n, 6) distances from the smooth motion [m], turns as they move the middle of a face."""
-    return np.concatenate([flight.position - flight.path, HALF_WIDTH * flight.turn], axis=1)
+        for first in range(1, min(MAX_RELEASE, end - SHORTEST) + 1):
+            flight = smooth_flight(toss, first, end)
+            off = np.abs(flight.off).max(axis=1) / sigma
+            if off[0] <= RELEASE and off.max() <= GLITCH:
+                found.append(flight)
+                break
+    return tuple(found), len(tosses) - len(found)
 
 
 def smooth_flight(toss: Toss, first: int, end: int) -> Flight:
@@ -131,9 +132,5 @@ def smooth_flight(toss: Toss, first: int, end: int) -> Flight:
         shift, rate = np.linalg.lstsq(powers[:, :2], left, rcond=None)[0]
         middle, omega = Rotation.from_rotvec(shift) * middle, omega + rate
     turning = Rotation.from_rotvec(time[:, None] * omega) * middle
-    turn = (turning.inv() * measured).as_rotvec()
-    path = powers @ parabola
-    along = np.array([parabola[1, 0], parabola[1, 1], 0.0]) / np.hypot(*parabola[1, :2])
-    across = np.cross([0.0, 0.0, 1.0], along)
-    smooth = np.asarray(turning.as_matrix(), float)
-    return Flight(toss.number, time, position, rotation, path, velocity, omega, smooth, turn, along, across)
+    turn, smooth = (turning.inv() * measured).as_rotvec(), np.asarray(turning.as_matrix(), float)
+    return Flight(toss, time, position, rotation, powers @ parabola, velocity, omega, smooth, turn)

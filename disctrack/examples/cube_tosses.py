@@ -11,9 +11,8 @@ constant angular velocity. Place, velocity, attitude and angular velocity are ea
 its residual is reckoned to first order along the smooth motion of the flight (`cube_effects`).
 """
 
-import sys
-from collections.abc import Iterable, Mapping, Sequence
-from functools import partial
+from collections import defaultdict
+from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 
@@ -26,7 +25,6 @@ from disctrack.discrepancy.score import Linearisation
 from disctrack.discrepancy.search import Diagnosis, Settings, explain
 from disctrack.discrepancy.system import Quantity, System, Values
 from disctrack.discrepancy.words import effect_text
-from disctrack.errors import AnalysisError
 from disctrack.examples._command import GRAVITY, Outcome, command, report_of
 from disctrack.examples.cube_data import (
     FRAME_RATE,
@@ -34,60 +32,54 @@ from disctrack.examples.cube_data import (
     Flight,
     Toss,
     flights,
+    integrated,
     read_tosses,
     without_copies,
 )
-from disctrack.examples.cube_effects import candidates, flown, rested
+from disctrack.examples.cube_effects import CANDIDATES, flown, rested
 from disctrack.numbers import rounded
 from disctrack.report.blocks import Listing, Section
 
-GROUPS = {"horizontal": (0, 1), "vertical": (2,), "turn": (3, 4, 5)}  # channels whose noise is alike: x, y, z, turns
 HELD_OUT = 3  # every third toss
+EFFECTS = tuple(q for c in CANDIDATES for q in c.quantities)
 OWN = tuple(f"state.{what}_{axis}" for what in ("place", "velocity", "turn", "rate") for axis in "123")
-FIRST_NOISE = {
-    "horizontal": SmoothNoise(2e-5, 5e-5, 0.03),
-    "vertical": SmoothNoise(2e-5, 3e-5, 0.03),
-    "turn": SmoothNoise(2e-4, 3e-4, 0.03),
+COLUMN = {name: i for i, name in enumerate((*(q.name for q in EFFECTS), *OWN))}
+FIRST_NOISE = {  # channels whose noise is alike, and where the search for it begins
+    "horizontal": (slice(0, 2), SmoothNoise(2e-5, 5e-5, 0.03)),
+    "vertical": (slice(2, 3), SmoothNoise(2e-5, 3e-5, 0.03)),
+    "turn": (slice(3, 6), SmoothNoise(2e-4, 3e-4, 0.03)),
 }
 # The covariance of the noise is that of the data already. Eight effects at most.
 SETTINGS = Settings(noise=1.0, unexplained_share=0.2, max_effects=8)
 
 
 class CubeTosses(System):
-    """Poses in free flight, place and turn (6,) a row, then cubes at rest, height and normal (3,) in one row a toss."""
+    """A toss is a block of rows: poses in free flight, place and turn (6,) each, and at last the cube at rest.
+
+    Of that, height and normal (3,); a row without data where it does not rest on a face.
+    """
+
+    candidates = CANDIDATES
 
     def __init__(self, tosses: Sequence[Toss]) -> None:
-        """Find the flights, measure their noise, whiten. Raises AnalysisError."""
+        """Find the flights, measure their noise, whiten."""
         tosses, self.n_copies = without_copies(tosses)
         self.flights, self.n_left_out = flights(tosses)
-        if len(self.flights) < 2 * HELD_OUT:
-            raise AnalysisError(f"{len(self.flights)} free flights in {len(tosses)} tosses: 6 are needed at least.")
-        of_number = {f.number: f for f in self.flights}
-        cubes = [(t, rested(t, of_number[t.number])) for t in tosses if t.number in of_number]
-        at_rest = [(t.number, *found) for t, found in cubes if found is not None]
-        made = [flown(f) for f in self.flights]
-        everything: list[Mapping[str, Iterable[float]]] = [*made, *(of for _, _, of in at_rest)]
-        self.names = tuple(dict.fromkeys(name for of in everything for name in of))
-        self.candidates = candidates(self.names)
+        rows = [_rows(f) for f in self.flights]
+        self._raw = np.concatenate(rows)
+        ends = np.cumsum([0, *map(len, rows)])
+        self.blocks = [slice(a, b) for a, b in pairwise(ends.tolist())]
+        self._block = np.repeat(np.arange(len(rows)), np.diff(ends))
+        self._last = ends[1:] - 1
+        self.weights = np.any(self._raw != 0, axis=-1).sum(axis=1)
+        self.n_at_rest = int(np.sum(self.weights[self._last] > 0))
+        self.time = np.arange(len(self.weights), dtype=float)  # only an order: tosses have no common clock
         self.base = tuple(
-            Quantity(f"{name}[{f.number}]", "", 1e-3, slot=name, block=i)
+            Quantity(f"{name}[{f.toss.number}]", "", 1e-3, slot=name, block=i)
             for i, f in enumerate(self.flights)
             for name in OWN
         )
-        flying = [_flight_rows(f, of, self.names) for f, of in zip(self.flights, made, strict=True)]
-        still = _resting_rows([x for _, x, _ in at_rest], [of for _, _, of in at_rest], self.names)
-        self.n_at_rest = len(at_rest)
-        self._raw = np.concatenate([*flying, still])
-        ends = np.cumsum([len(rows) for rows in flying]).tolist()
-        self.blocks = [slice(a, b) for a, b in pairwise([0, *ends])]
-        self._block = np.concatenate(
-            [np.full(len(rows), i) for i, rows in enumerate(flying)] + [np.zeros(len(still), int)]
-        )
-        numbers = [np.full(len(rows), f.number) for f, rows in zip(self.flights, flying, strict=True)]
-        self.toss = np.concatenate([*numbers, np.array([number for number, _, _ in at_rest[: len(still)]], int)])
-        self.weights = np.concatenate([np.full(ends[-1], 6.0), np.sum(np.any(still != 0, axis=-1), axis=1)])
-        self.time = np.arange(len(self.weights), dtype=float)  # only an order: tosses have no common clock
-        self.noise = dict(FIRST_NOISE)
+        self.noise = {name: noise for name, (_, noise) in FIRST_NOISE.items()}
         for _ in range(2):
             self._white = self._whitened()
             self.noise = self._measured_noise()
@@ -95,83 +87,80 @@ class CubeTosses(System):
 
     def training_rows(self) -> Mask:
         """(n,) False for every third toss."""
-        return np.asarray(self.toss % HELD_OUT != HELD_OUT - 1, bool)
+        return np.repeat([not _kept_back(f) for f in self.flights], np.bincount(self._block))
 
     def linearise(self, values: Values, names: Sequence[str]) -> tuple[Array, Array]:
         """Whitened residual (n, 6), and the prediction's derivative (n, 6, k): linear in every quantity."""
-        index = {name: i for i, name in enumerate((*self.names, *OWN))}
-        return self._left(self._white, values), self._white[..., [index[n] for n in names]]
+        return self._left(self._white, values), self._white[..., [COLUMN[n] for n in names]]
 
     def residuals(self, values: Values) -> list[Array]:
         """Measured minus predicted (n, 6) [m], [rad] of every flight, its own start and rates by least squares."""
         left = self._left(self._raw, fit(self, self.base, values).values)
-        return [left[rows] for rows in self.blocks]
+        return [left[rows][:-1] for rows in self.blocks]
 
     def _left(self, rows: Array, values: Values) -> Array:
+        effects, by_own, left = np.split(rows, [len(EFFECTS), len(COLUMN)], axis=-1)
         own = np.array([values.get(q.name, 0.0) for q in self.base]).reshape(-1, len(OWN))
-        effects, by_own, left = np.split(rows, [len(self.names), rows.shape[-1] - 1], axis=-1)
-        left = left[..., 0] - effects @ np.array([values.get(n, 0.0) for n in self.names])
+        left = left[..., 0] - effects @ np.array([values.get(q.name, 0.0) for q in EFFECTS])
         return np.asarray(left - np.einsum("nwi,ni->nw", by_own, own[self._block]), float)
 
     def _whitened(self) -> Array:
         white = self._raw.copy()
-        for flight, rows in zip(self.flights, self.blocks, strict=True):
-            for name, channels in GROUPS.items():
+        for flight, block in zip(self.flights, self.blocks, strict=True):
+            flying = slice(block.start, block.stop - 1)
+            for name, (channels, _) in FIRST_NOISE.items():
                 W = self.noise[name].whitening(flight.time)
-                for c in channels:
-                    white[rows, c] = W @ white[rows, c]
+                white[flying, channels] = np.tensordot(W, white[flying, channels], axes=1)
+        # how much resting cubes differ once all candidates have taken their share is the noise
+        for c in range(3):
+            effects, seen = white[self._last, c, : len(EFFECTS)], white[self._last, c, -1]
+            amounts, _, rank, _ = np.linalg.lstsq(effects, seen, rcond=1e-10)
+            white[self._last, c] /= np.sqrt(np.sum((seen - effects @ amounts) ** 2) / (self.n_at_rest - rank))
         return white
 
     def _measured_noise(self) -> dict[str, SmoothNoise]:
         """Noise of each group of channels, from what is left when all candidates together have taken their share."""
-        alone = fit(self, self.base, {})
-        _, amounts = Linearisation(self, alone, self.candidates).gain_of(self.names)
-        left = self.residuals(dict(zip(self.names, amounts.tolist(), strict=True)))
-        return {name: estimate(_by_length(self.flights, left, c), self.noise[name]) for name, c in GROUPS.items()}
+        linear = Linearisation(self, fit(self, self.base, {}), self.candidates)
+        # some make up for each other: of all amounts that do as well, those that would surprise least
+        size = np.array([q.typical for q in EFFECTS])
+        columns = linear.columns([q.name for q in EFFECTS]) * size
+        amounts = size * np.linalg.lstsq(columns, linear.right, rcond=1e-9)[0]
+        left = self.residuals({q.name: float(x) for q, x in zip(EFFECTS, amounts, strict=True)})
+        return {name: _noise(left, channels, start) for name, (channels, start) in FIRST_NOISE.items()}
 
 
-def _side_by_side(made: Mapping[str, Iterable[float]], names: Sequence[str], nothing: Array) -> Array:
-    return np.stack([np.asarray(made.get(name, nothing), float) for name in names], axis=-1)
+def _kept_back(flight: Flight) -> bool:
+    return flight.toss.number % HELD_OUT == HELD_OUT - 1
 
 
-def _flight_rows(flight: Flight, made: Mapping[str, Array], names: Sequence[str]) -> Array:
-    """(n, 6, k + 13) by effects, by what is the flight's own, and measured minus base model [m], [rad]."""
-    falling = np.zeros_like(flight.position)
-    falling[:, 2] = -GRAVITY * flight.time**2 / 2
-    step, dt = np.swapaxes(flight.turning, 1, 2), flight.time[1] - flight.time[0]
-    own = np.zeros((len(step), 6, len(OWN)))
-    own[:, :3, :3], own[:, :3, 3:6] = np.eye(3), flight.time[:, None, None] * np.eye(3)
-    own[:, 3:, 6:9], own[1:, 3:, 9:] = np.eye(3), np.cumsum(0.5 * (step[1:] + step[:-1]) * dt, axis=0)
-    left = np.concatenate([flight.position - falling, flight.turn], axis=1)
-    return np.concatenate([_side_by_side(made, names, np.zeros(left.shape)), own, left[..., None]], axis=-1)
+def _rows(f: Flight) -> Array:
+    """(n + 1, 6, k + 13) by effects, by what is the flight's own, and measured minus base model [m], [rad]."""
+    n = len(f.time)
+    rows = np.zeros((n + 1, 6, len(COLUMN) + 1))
+    effects, own, seen = np.split(rows, [len(EFFECTS), len(COLUMN)], axis=-1)
+    for name, column in flown(f).items():
+        effects[:n, :, COLUMN[name]] = column
+    own[:n, :3, :3], own[:n, :3, 3:6] = np.eye(3), f.time[:, None, None] * np.eye(3)
+    own[:n, 3:, 6:9], own[:n, 3:, 9:] = np.eye(3), integrated(np.swapaxes(f.turning, 1, 2))
+    seen[:n, :3, 0], seen[:n, 3:, 0] = f.position, f.turn
+    seen[:n, 2, 0] += GRAVITY * f.time**2 / 2
+    if (cube := rested(f)) is not None:
+        seen[n, :3, 0], by_effects = cube
+        for name, change in by_effects.items():
+            effects[n, :3, COLUMN[name]] = change
+    return rows
 
 
-def _resting_rows(left: Sequence[Array], made: Sequence[Mapping[str, Iterable[float]]], names: Sequence[str]) -> Array:
-    """The same (m, 6, k + 13) whitened, three of the six used: height, normal (two).
-
-    How much resting cubes differ once all candidates have taken their share is the noise.
-    """
-    found = np.zeros((len(left), 6, len(names) + len(OWN) + 1))
-    if len(left) < 4 * HELD_OUT:
-        return found[:0]
-    effects = np.array([_side_by_side(of, names, np.zeros(3)) for of in made])
-    for i, seen in enumerate(np.array(left).T):
-        A = effects[:, i][:, np.any(effects[:, i] != 0, axis=0)]
-        rest = seen - A @ np.linalg.lstsq(A, seen, rcond=1e-10)[0]
-        sigma = np.sqrt(np.sum(rest**2) / (len(left) - A.shape[1]))
-        found[:, i, : len(names)], found[:, i, -1] = effects[:, i] / sigma, seen / sigma
-    return found
-
-
-def _by_length(flown: Sequence[Flight], left: Sequence[Array], channels: Sequence[int]) -> list[SampleStretch]:
-    """Flights of one length share instants, so that their samples stand side by side."""
-    found = []
-    for n in sorted({len(x) for x in left}):
-        alike = [(f.time, x[:, list(channels)]) for f, x in zip(flown, left, strict=True) if len(x) == n]
-        time = alike[0][0]
-        values = np.concatenate([x for _, x in alike], axis=1)
-        found.append(SampleStretch(time, values, np.column_stack([np.ones(n), time])))
-    return found
+def _noise(left: Sequence[Array], channels: slice, start: SmoothNoise) -> SmoothNoise:
+    """Noise of channels of all flights; those of one length share instants: their samples stand side by side."""
+    by_length = defaultdict[int, list[Array]](list)
+    for flight in left:
+        by_length[len(flight)].append(flight[:, channels])
+    stretches = []
+    for n, alike in by_length.items():
+        time = np.arange(n) / FRAME_RATE
+        stretches.append(SampleStretch(time, np.concatenate(alike, axis=1), time[:, None] ** np.arange(2)))
+    return estimate(stretches, start)
 
 
 def diagnosed(system: CubeTosses) -> Diagnosis:
@@ -182,10 +171,10 @@ def diagnosed(system: CubeTosses) -> Diagnosis:
 def rms_of(system: CubeTosses, values: Values) -> dict[str, float]:
     """Rms of measured minus predicted of the held-out flights, per group of channels [m], [rad]."""
     residuals = zip(system.flights, system.residuals(values), strict=True)
-    left = [x for flight, x in residuals if flight.number % HELD_OUT == HELD_OUT - 1]
+    left = [x for flight, x in residuals if _kept_back(flight)]
     freedom = sum(len(x) - 2 for x in left)
-    square = np.sum([np.sum(x**2, axis=0) for x in left], axis=0) / freedom
-    return {name: float(np.sqrt(np.mean(square[list(channels)]))) for name, channels in GROUPS.items()}
+    square = np.sum(np.concatenate(left) ** 2, axis=0) / freedom
+    return {name: float(np.sqrt(np.mean(square[channels]))) for name, (channels, _) in FIRST_NOISE.items()}
 
 
 def errors(system: CubeTosses, d: Diagnosis) -> tuple[dict[str, float], dict[str, float]]:
@@ -200,8 +189,8 @@ def example(folder: Path) -> Outcome:
     d = diagnosed(system)
     before, after = errors(system, d)
     effects = "; ".join(effect_text(f, d) for f in d.found)
-    said = f"Missing: {effects}" if effects else "No effect is claimed to be missing"
-    said = f"{said}. Something else is missing: {d.reason}." if d.verdict == "unexplained" else f"{said}."
+    said = f"Missing: {effects}." if effects else "No effect is claimed to be missing."
+    said += f" Something else is missing: {d.reason}." if d.verdict == "unexplained" else ""
     rows = []
     for group, noise in system.noise.items():
         size, unit = (float(np.degrees(1e3)), "mdeg") if group == "turn" else (1e6, "um")
@@ -216,8 +205,5 @@ def example(folder: Path) -> Outcome:
     return report_of(d, model, said, blocks, [{"rms": before}, {"rms": after}]), {}
 
 
-main = partial(command, "cube_tosses", "cube_tosses.npz", example)
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    command(example, "cube_tosses.npz")

@@ -14,10 +14,8 @@ another law acts beside it. The tables' own t_f count from the blow that starts 
 rolling disc has nothing to say to them.
 """
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 from scipy import stats
@@ -246,8 +244,5 @@ def example() -> Outcome:
     return replace(report, data={**report.data, "source": source, "cannot_be_told_apart": list(in_question(d))}), {}
 
 
-main = partial(command, "published_exponents", None, example)
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    command(example)

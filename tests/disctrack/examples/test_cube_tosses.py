@@ -5,8 +5,9 @@ import json
 import numpy as np
 import pytest
 
-from disctrack.examples.cube_data import CLEARANCE, HALF_WIDTH, flights, read_tosses, without_copies
-from disctrack.examples.cube_tosses import CubeTosses, diagnosed, errors, main
+from disctrack.examples._command import command
+from disctrack.examples.cube_data import CLEARANCE, flights, read_tosses, without_copies
+from disctrack.examples.cube_tosses import CubeTosses, diagnosed, errors, example
 from tests.oracles import tossed_cube
 
 N = 50  # tosses that are simulated
@@ -72,13 +73,10 @@ def test_gravity_and_frame_rate_are_one_number_where_cubes_at_rest_deny_the_scal
 def test_flights_end_before_contact_and_begin_after_release(published):
     tosses, _ = without_copies(published[:180])
     found, left_out = flights(tosses)
-    by_number = {t.number: t for t in tosses}
     assert len(found) > 0.85 * len(tosses)
     assert left_out == len(tosses) - len(found)
     for f in found[::10]:
-        toss = by_number[f.number]
-        lowest = toss.position[1 : 1 + len(f.time), 2] / HALF_WIDTH - toss.reach[1 : 1 + len(f.time)]
-        assert lowest.min() > CLEARANCE
+        assert f.toss.clearance[1 : 1 + len(f.time)].min() > CLEARANCE
     # second differences of the height scatter about g by sqrt(6) x 24 um x rate^2 = 1.3 m/s^2; a contact adds hundreds
     bends = np.concatenate([np.diff(f.position[:, 2], 2) for f in found]) * 148.0**2
     assert np.percentile(np.abs(bends + 9.6), 99.5) < 6
@@ -137,14 +135,15 @@ def test_shuffled_residuals_of_the_tosses_give_no_finding(answer, rng):
 
 def test_command_writes_the_diagnosis_of_the_tosses(rng, tmp_path, capsys):
     simulated(rng, tmp_path, 30, scale=-0.02)
-    assert main([str(tmp_path), "-o", str(tmp_path / "out")]) == 0
+    command(example, "tosses", [str(tmp_path), "-o", str(tmp_path / "out")])
     assert "length_scale" in capsys.readouterr().out
     found = json.loads((tmp_path / "out" / "diagnosis.json").read_text())
     assert found["verdict"] == "found"
     assert found["effects"][0]["name"] == "length_scale"
     assert found["after"]["reduced_chi_square"] < 1.15
     assert found["before"]["rms"]["vertical"] > found["after"]["rms"]["vertical"]
-    assert main([str(tmp_path / "out")]) == 1
+    with pytest.raises(SystemExit):
+        command(example, "tosses", [str(tmp_path / "out")])
     assert "cube_tosses.npz" in capsys.readouterr().err
 
 

@@ -12,6 +12,7 @@ from disctrack.discrepancy.fit import fit
 from disctrack.discrepancy.search import explain
 from disctrack.errors import AnalysisError
 from disctrack.examples import published_exponents
+from disctrack.examples._command import command
 from disctrack.examples.exponent_model import LastStage, Series, slope
 from disctrack.examples.published_exponents import (
     THIN_DISC,
@@ -202,7 +203,7 @@ def test_false_alarms_and_finds_over_many_tables(published):
 
 @pytest.mark.slow
 def test_the_example_says_that_the_tables_do_not_identify_the_effect(tmp_path, capsys):
-    assert published_exponents.main(["-o", str(tmp_path)]) == 0
+    command(published_exponents.example, words=["-o", str(tmp_path)])
     assert "not identifiable from these tables" in " ".join(capsys.readouterr().out.split())
     found = json.loads((tmp_path / "diagnosis.json").read_text())
     assert found["verdict"] == "found"
