@@ -62,11 +62,6 @@ class Ground:
     q: Array  # (n, 6) by frame: the truth, or what is found
     seconds: tuple[float, float]  # of processor time that its run takes, with this rig and with a calibration
 
-    @property
-    def make(self) -> str:
-        """What a table calls it."""
-        return self.recording.name if self.scene is None else "rendered"
-
 
 @dataclass(frozen=True)
 class Planting:
@@ -104,14 +99,18 @@ class FaultOutcome:
     times: float  # an ordinary run
 
     @property
+    def worst(self) -> float:
+        """The larger of the two errors; 0 without a pose."""
+        return float(np.nanmax([self.position, self.rotation, 0.0]))
+
+    @property
     def complaint(self) -> str:
         """What must not be; empty where all is well."""
         where = f"{self.make}: {self.fault} of {self.size:.3g} {self.unit}"
-        worst = np.nanmax([self.position, self.rotation, 0.0])
         if self.code not in (0, 1, 3):
             return f"{where}: exit code {self.code}"
-        if worst > MOST_SIGMAS and not self.named:
-            return f"{where}: {worst:.1f} sigma off, and not named ({self.told})"
+        if self.worst > MOST_SIGMAS and not self.named:
+            return f"{where}: {self.worst:.1f} sigma off, and not named ({self.told})"
         return f"{where}: {self.times:.1f} times an ordinary run" if self.times > MOST_TIMES else ""
 
 
@@ -150,7 +149,7 @@ def fault_cases(grounds: Sequence[Ground], names: Sequence[str] = (), sizes: sli
 def plant_and_run(case: FaultCase) -> FaultOutcome:
     """Plant, run, compare; nothing is left on the disk."""
     planting = plantings(case.ground)[case.fault]
-    folder = case.ground.recording.with_name(f"{case.ground.make} {case.fault} {case.size:g}")
+    folder = case.ground.recording.with_name(f"{case.ground.recording.name} {case.fault} {case.size:g}")
     try:
         rig = None if planting.of_views else case.ground.rig
         tree = _copied(read_recording(case.ground.recording), folder, rig)
@@ -162,7 +161,7 @@ def plant_and_run(case: FaultCase) -> FaultOutcome:
     position, rotation = _in_sigmas(trajectory, case.ground.q if q is None else q)
     naming = [f for f in findings if f.kind in planting.named_by]
     told = _said(naming) if naming else f"({_said(findings)})" if findings else ""
-    of = case.ground.make, case.fault, case.size, planting.unit
+    of = case.ground.recording.name, case.fault, case.size, planting.unit
     times = seconds / case.ground.seconds[planting.of_views]
     return FaultOutcome(*of, position, rotation, told, bool(naming), code, times)
 
@@ -219,9 +218,7 @@ def _of_catalogue(ground: Ground) -> Iterator[tuple[Fault, Planting]]:
     recording = read_recording(ground.recording)
     for fault in faults_of(recording.disc):
         alike = fault.name.startswith((others, "misprint")) and fault.name != "misprint_0"
-        declarable = (
-            not fault.in_images and fault.key != "right_delay_s"
-        )  # as if rig, disc, dots or rate were declared wrong
+        declarable = not fault.in_images and fault.key != "right_delay_s"  # rig, disc, dots, rate: as if declared wrong
         if not fault.named_by or alike or (ground.scene is None and not declarable):
             continue
         change = _declared_wrong if ground.scene is None else _rendered
@@ -240,14 +237,8 @@ def _rendered(fault: Fault, ground: Ground, folder: Path, tree: Tree, size: floa
     scene = ground.scene
     assert scene is not None
     wrong = scene_faults(scene.declared_disc, _values(fault, size), scene.cameras.frame_rate_hz)
-    images = folder.with_name(f"{folder.name} images")
-    try:
-        truth = write_recording(images, replace(scene, faults=wrong, board=replace(scene.board, n_views=1)))
-        shutil.rmtree(folder)
-        tree.update(_copied(read_recording(images), folder, ground.rig))
-    finally:
-        shutil.rmtree(images, ignore_errors=True)
-    return truth.q
+    shutil.rmtree(folder)
+    return write_recording(folder, replace(scene, faults=wrong, board=replace(scene.board, n_views=1))).q
 
 
 def _declared_wrong(fault: Fault, ground: Ground, folder: Path, tree: Tree, size: float) -> None:
@@ -295,13 +286,13 @@ def declare(folder: Path, tree: Tree) -> None:
 
 
 def reordered(folder: Path, order: Callable[[list[Path]], list[Path]]) -> None:
-    """Files of a folder that change places, or fall out: what is left is numbered as before, without gaps."""
+    """Files of a folder in another order, without some or with some again: numbered anew, without gaps."""
     files = sorted(folder.iterdir())
-    kept = [file.rename(file.with_name(f"old {file.name}")) for file in order(files)]
-    for file in sorted(set(files) & set(folder.iterdir())):
-        file.unlink()
-    for old, new in zip(kept, files, strict=False):
-        old.rename(new)
+    kept = [file.read_bytes() for file in order(files)]
+    for file in files:
+        file.unlink()  # it may be a link to another's
+    for number, content in enumerate(kept):
+        (folder / f"{number:06d}{files[0].suffix}").write_bytes(content)
 
 
 def redrawn(folder: Path, change: Callable[[NDArray, float], NDArray]) -> None:
@@ -314,20 +305,42 @@ def redrawn(folder: Path, change: Callable[[NDArray, float], NDArray]) -> None:
         cv2.imwrite(str(file), change(image, number / len(files)))
 
 
-def _pairs_lost(folder: Path, tree: Tree, size: float, cameras: Sequence[str] = CAMERAS) -> None:
-    """In the middle, and the files numbered on; both cameras end together."""
-    for camera in CAMERAS:
+def _files(**orders: Callable[[list[Path], int], list[Path]]) -> Change:
+    """By folder, the order of its files, which the size is given to."""
 
-        def without(files: list[Path], camera: str = camera) -> list[Path]:
-            first = len(files) // 2 if camera in cameras else len(files) - int(size)
-            return files[:first] + files[first + int(size) :]
+    def change(folder: Path, tree: Tree, size: float) -> None:
+        for name, order in orders.items():
+            reordered(folder / name, partial(order, k=int(size)))
 
-        reordered(folder / camera, without)
+    return change
 
 
-def _reversed(folder: Path, tree: Tree, size: float) -> None:
-    for camera in CAMERAS:
-        reordered(folder / camera, lambda files: files[::-1])
+def _lost(files: list[Path], k: int) -> list[Path]:
+    middle = len(files) // 2
+    return files[:middle] + files[middle + k :]
+
+
+def _again(files: list[Path], k: int) -> list[Path]:
+    """In the middle the recorder writes one image again and again."""
+    middle = len(files) // 2
+    return files[:middle] + k * [files[middle - 1]] + files[middle + k :]
+
+
+def _first_lost(files: list[Path], k: int) -> list[Path]:
+    return files[k:]
+
+
+def _last_lost(files: list[Path], k: int) -> list[Path]:
+    """Of the other camera, so that both end together."""
+    return files[:-k]
+
+
+def _backwards(files: list[Path], k: int) -> list[Path]:
+    return files[::-1]
+
+
+def _several(files: list[Path], k: int) -> list[Path]:
+    return k * files
 
 
 def _exchanged(folder: Path, tree: Tree, size: float) -> None:
@@ -335,22 +348,47 @@ def _exchanged(folder: Path, tree: Tree, size: float) -> None:
     cameras["left"], cameras["right"] = cameras["right"], cameras["left"]
 
 
-def _image_moved(folder: Path, tree: Tree, size: float, course: Callable[[float], float]) -> None:
-    """The right camera's images, in either direction by size times the course of time [px]."""
+def _images(change: Callable[[NDArray, float, float], NDArray], *folders: str) -> Change:
+    """What becomes of images, from the share of the recording before each, and the size."""
 
-    def moved(image: NDArray, share: float) -> NDArray:
-        by = size * course(share)
-        move = np.array([[1.0, 0.0, by], [0.0, 1.0, by]])
-        turned = cv2.warpAffine(
-            image, move, image.shape[::-1], flags=cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE
-        )
-        return turned if by else image
+    def of_all(folder: Path, tree: Tree, size: float) -> None:
+        for name in folders:
+            redrawn(folder / name, lambda image, share: change(image, share, size))
 
-    redrawn(folder / "right", moved)
+    return of_all
 
 
-def _mirrored(folder: Path, tree: Tree, size: float) -> None:
-    redrawn(folder / "right", lambda image, _: np.ascontiguousarray(image[:, ::-1]))
+def _moved(image: NDArray, by: float) -> NDArray:
+    """In either direction [px]."""
+    move = np.array([[1.0, 0.0, by], [0.0, 1.0, by]])
+    shape = image.shape[::-1]
+    moved = cv2.warpAffine(image, move, shape, flags=cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE)
+    return moved if by else image
+
+
+def _knocked(image: NDArray, share: float, size: float) -> NDArray:
+    return _moved(image, size * (share > 0.5))
+
+
+def _drifting(image: NDArray, share: float, size: float) -> NDArray:
+    return _moved(image, size * share)
+
+
+def _mirrored(image: NDArray, share: float, size: float) -> NDArray:
+    return np.ascontiguousarray(image[:, ::-1])
+
+
+def _negative(image: NDArray, share: float, size: float) -> NDArray:
+    return np.asarray(np.iinfo(image.dtype).max - image)
+
+
+def _lit(image: NDArray, share: float, size: float) -> NDArray:
+    """By a lamp's reflex of size grey values of 8 bits at most."""
+    height, width = image.shape
+    y, x = np.mgrid[:height, :width]
+    spot = np.exp(-8.0 * ((x / width - 0.6) ** 2 + (y / height - 0.5) ** 2))
+    most = np.iinfo(image.dtype).max
+    return np.clip(np.rint(image + size / 255 * most * spot), 0, most).astype(image.dtype)
 
 
 def _wrong(section: str, key: str, *kinds: Kind) -> Planting:
@@ -366,34 +404,6 @@ def _wrong(section: str, key: str, *kinds: Kind) -> Planting:
     return Planting((1e-3, 1e-2, 1e-1) if of_views else (3e-3, 3e-2, 3e-1), "1", kinds, change, of_views)
 
 
-def _negative(folder: Path, tree: Tree, size: float) -> None:
-    for camera in CAMERAS:
-        redrawn(folder / f"board_{camera}", lambda image, _: np.asarray(np.iinfo(image.dtype).max - image))
-
-
-def _repeated(folder: Path, tree: Tree, size: float) -> None:
-    for camera in CAMERAS:
-        for file in sorted((folder / f"board_{camera}").iterdir()):
-            for copy in range(1, int(size)):
-                shutil.copy(file, file.with_name(f"{int(file.stem) + 1000 * copy:06d}{file.suffix}"))
-
-
-def _late(folder: Path, tree: Tree, size: float) -> None:
-    """The right camera lost its first views, and both end together."""
-    reordered(folder / "board_left", lambda files: files[: -int(size)])
-    reordered(folder / "board_right", lambda files: files[int(size) :])
-
-
-def _again(folder: Path, tree: Tree, size: float, cameras: Sequence[str] = CAMERAS) -> None:
-    """In the middle the recorder writes one image again and again."""
-    for camera in cameras:
-        files = sorted((folder / camera).iterdir())
-        middle = len(files) // 2
-        for file in files[middle : middle + int(size)]:
-            file.unlink()  # it may be a link to another's
-            shutil.copy(files[middle - 1], file)
-
-
 def _damaged(folder: Path, tree: Tree, size: float) -> None:
     """The end of the right camera's last files was never written."""
     for file in sorted((folder / "right").iterdir())[-int(size) :]:
@@ -402,49 +412,40 @@ def _damaged(folder: Path, tree: Tree, size: float) -> None:
         file.write_bytes(whole[: len(whole) // 2])
 
 
-def _glare(folder: Path, tree: Tree, size: float) -> None:
-    """Light that is added to the right camera's images, size grey values of 8 bits at most."""
-
-    def lit(image: NDArray, _: float) -> NDArray:
-        height, width = image.shape
-        y, x = np.mgrid[:height, :width]
-        spot = np.exp(-8.0 * ((x / width - 0.6) ** 2 + (y / height - 0.5) ** 2))
-        most = np.iinfo(image.dtype).max
-        return np.clip(np.rint(image + size / 255 * most * spot), 0, most).astype(image.dtype)
-
-    redrawn(folder / "right", lit)
-
-
 _LOST = (Kind.DROPPED_FRAMES, Kind.DELAY, Kind.ONE_SIDED)
+_REPEATED = (Kind.REPEATED_IMAGES,)
 _CALIBRATED = (Kind.CALIBRATION,)
+_VIEWS = ("board_left", "board_right")
 CHANGES = {
-    "pairs lost by both": Planting((1, 3, 10), "pairs", (Kind.CLOCK_JUMP,), _pairs_lost),
-    "images lost by one": Planting((1, 3, 10, 20), "images", _LOST, partial(_pairs_lost, cameras=("right",))),
-    "pairs repeated": Planting((1, 3, 10), "pairs", (Kind.REPEATED_IMAGES,), _again),
-    "images repeated by one": Planting(
-        (1, 3, 10), "images", (Kind.REPEATED_IMAGES,), partial(_again, cameras=("right",))
-    ),
+    "pairs lost by both": Planting((1, 3, 10), "pairs", (Kind.CLOCK_JUMP,), _files(left=_lost, right=_lost)),
+    "images lost by one": Planting((1, 3, 10, 20), "images", _LOST, _files(left=_last_lost, right=_lost)),
+    "pairs repeated": Planting((1, 3, 10), "pairs", _REPEATED, _files(left=_again, right=_again)),
+    "images repeated by one": Planting((1, 3, 10), "images", _REPEATED, _files(right=_again)),
     "files damaged": Planting((1, 5, 50), "files", (Kind.UNREADABLE,), _damaged),
-    "glare": Planting((3, 30, 300), "grey values", (Kind.LIGHT, Kind.ONE_SIDED, *MOVED), _glare),
-    "camera knocked": Planting((0.02, 0.2, 2.0), "px", MOVED, partial(_image_moved, course=lambda x: float(x > 0.5))),
-    "camera drifts": Planting((0.03, 0.3, 3.0), "px", MOVED, partial(_image_moved, course=lambda x: x)),
-    "reversed": Planting((1,), "", (Kind.REVERSED,), _reversed),
+    "glare": Planting((3, 30, 300), "grey values", (Kind.LIGHT, Kind.ONE_SIDED, *MOVED), _images(_lit, "right")),
+    "camera knocked": Planting((0.02, 0.2, 2.0), "px", MOVED, _images(_knocked, "right")),
+    "camera drifts": Planting((0.03, 0.3, 3.0), "px", MOVED, _images(_drifting, "right")),
+    "reversed": Planting((1,), "", (Kind.REVERSED,), _files(left=_backwards, right=_backwards)),
     "exchanged": Planting((1,), "", (Kind.EXCHANGED,), _exchanged),
-    "mirrored": Planting((1,), "", (Kind.MIRRORED,), _mirrored),
+    "mirrored": Planting((1,), "", (Kind.MIRRORED,), _images(_mirrored, "right")),
     "radius": _wrong("disc", "radius_mm", Kind.RADIUS, *HEIGHT),
     "thickness": _wrong("disc", "thickness_mm", *HEIGHT),
     "dot diameter": _wrong("markers", "diameter_mm", Kind.DIAMETER),
     "gravity": _wrong("gravity", "g_m_s2", Kind.GRAVITY_OR_RATE),
     "square": _wrong("calibration", "square_mm", Kind.SQUARE),
-    "negative views": Planting((1,), "", _CALIBRATED, _negative, of_views=True),
-    "repeated views": Planting((2, 3, 6), "times", _CALIBRATED, _repeated, of_views=True),
-    "views late in one": Planting((1, 2, 4), "views", _CALIBRATED, _late, of_views=True),
+    "negative views": Planting((1,), "", _CALIBRATED, _images(_negative, *_VIEWS), of_views=True),
+    "repeated views": Planting(
+        (2, 3, 6), "times", _CALIBRATED, _files(**dict.fromkeys(_VIEWS, _several)), of_views=True
+    ),
+    "views late in one": Planting(
+        (1, 2, 4), "views", _CALIBRATED, _files(board_left=_last_lost, board_right=_first_lost), of_views=True
+    ),
 }
 
 
 def faults_validation(outcomes: Sequence[FaultOutcome]) -> Validation:
     """What is named from which size on in each recording, and what must not be."""
-    off = [o for o in outcomes if np.nanmax([o.position, o.rotation, 0.0]) > MOST_SIGMAS]
+    off = [o for o in outcomes if o.worst > MOST_SIGMAS]
     headline = (
         f"Of {len(outcomes)} planted faults {len(off)} move a pose by more than {MOST_SIGMAS:g} stated sigmas; "
         f"{sum(o.named for o in off)} of these are named."
@@ -467,7 +468,7 @@ def _limits(outcomes: Sequence[FaultOutcome]) -> Table:
             planted = [o for o in of_fault if o.make == make]
             unnamed = [o for o in planted if not o.named]
             named = [o.size for o in planted if all(o.size > other.size for other in unnamed)]
-            worst = max((np.nanmax([o.position, o.rotation, 0.0]) for o in unnamed), default=np.nan)
+            worst = max((o.worst for o in unnamed), default=np.nan)
             row += [figure(min(named, default=np.nan)), figure(worst, 2)]
         rows.append(row)
     head = ["fault", "unit", *(f"{make}: {what}" for make in makes for what in ("named from", "unnamed, sigma"))]
