@@ -18,11 +18,10 @@ from disctrack.errors import DiscTrackError
 from disctrack.rolling import Model, simulate, steady_precession
 from disctrack.synthetic.description import Scene
 from disctrack.trajectory import Trajectory
-from disctrack.validate.hidden import HIDDEN_EFFECTS, hidden_effect, together
+from disctrack.validate.hidden import CONTROLS, INVISIBLE, SIZES, alike, plant, together
 from disctrack.validate.points import Filmed, Planted, measured
 from disctrack.validate.tables import Table, Validation, figure
 
-FRAME_RATE = 1000.0  # [Hz] of the reference recordings
 DURATION = (0.4, 0.9)  # [s]
 FLATTEST_DEG = 0.9  # the last frame's nutation: below, the disc touches its paper
 ENOUGH = 3.0  # [sigma] a coefficient may be off
@@ -36,7 +35,12 @@ class HiddenCase:
 
     hidden: Mapping[str, float]
     seed: int
-    rate: float = FRAME_RATE  # [Hz]
+    rate: float = Filmed.declared_rate  # [Hz]
+
+    @property
+    def asked(self) -> bool:
+        """Is there something that the diagnosis should name?"""
+        return any(name not in CONTROLS for name in self.hidden)
 
 
 @dataclass(frozen=True)
@@ -76,8 +80,14 @@ class Verdict:
         """Are the coefficients right within three sigma?"""
         return self.named and abs(self.pull) <= ENOUGH
 
+    @property
+    def found_from(self) -> float:
+        """Size from which a single effect would stand out by what a claim takes in this recording: found in half."""
+        size, *others = self.case.hidden.values()
+        return size * self.needed / self.stands_out if self.case.asked and not others else float("nan")
 
-def draw(seed: int, planted: Planted, rate: float = FRAME_RATE) -> Filmed:
+
+def draw(seed: int, planted: Planted, rate: float = Filmed.declared_rate) -> Filmed:
     """A motion that lasts as long as it is filmed, whatever is planted in it."""
     rng = np.random.default_rng([seed, 31])
     disc = Scene().declared_disc
@@ -98,20 +108,21 @@ def draw(seed: int, planted: Planted, rate: float = FRAME_RATE) -> Filmed:
     raise DiscTrackError(f"no motion of {DURATION[0]} s among those drawn: what is planted stops the disc at once")
 
 
-def plant(case: HiddenCase) -> tuple[list[Planted], Trajectory]:
+def recorded(case: HiddenCase) -> tuple[list[Planted], Trajectory]:
     """What is planted, one by one, and the recording with all of it."""
     rng = np.random.default_rng([case.seed, 32])
-    parts = [hidden_effect(name).plant(size, rng) for name, size in case.hidden.items()]
+    parts = [plant(name, size, rng) for name, size in case.hidden.items()]
     planted = together(parts)
     return [p for p in parts if p.truth], measured(planted, draw(case.seed, planted, case.rate))
 
 
 def hide(case: HiddenCase) -> Verdict:
     """Plant, diagnose, compare."""
-    parts, trajectory = plant(case)
+    parts, trajectory = recorded(case)
     began = perf_counter()
     result = diagnose(trajectory)
     seconds = perf_counter() - began
+    stands_out, needed = _standing_out(result, parts)
     pulls = [_pull_of(result, p) for p in parts]
     d, nan = result.diagnosis, float("nan")
     errors = [e for e in (result.before, result.after) if e]
@@ -129,7 +140,8 @@ def hide(case: HiddenCase) -> Verdict:
         gain=(d.before.cost - d.after.cost) / d.noise,
         p_value=d.chance.p_value if d.chance else nan,
         seconds=seconds,
-        **_standing_out(result, parts),
+        stands_out=stands_out,
+        needed=needed,
     )
 
 
@@ -137,31 +149,30 @@ def _with_class(name: str, others: Sequence[str]) -> str:
     return f"{name} ({', '.join(others)})" if others else name
 
 
-def _standing_out(result: DiscDiagnosis, parts: Sequence[Planted]) -> dict[str, float]:
+def _standing_out(result: DiscDiagnosis, parts: Sequence[Planted]) -> tuple[float, float]:
     """By how many sigmas the least of the planted effects stands out of the joint model, and how many a claim takes.
 
     Fisher's information at the truth: the gain is a' C^-1 a for amounts a with covariance C, all else fitted along, the
     other planted effects, too. NaN where the joint model has no fit, or the catalogue no such numbers.
     """
     system, d = result.system, result.diagnosis
-    unknown = {"stands_out": float("nan"), "needed": float("nan")}
     meant = [next((c for c in system.candidates if set(p.truth) <= set(c.names)), None) for p in parts]
     own = [c for c in meant if c is not None]
     if not parts or not d.before.converged or len(own) < len(parts):
-        return unknown
+        return np.nan, np.nan
     quantities = {q.name: q for q in system.base} | {q.name: q for c in own for q in c.quantities}
     truth = {k: v for p in parts for k, v in (*p.effects.items(), *p.truth.items())}
     joint = fit(system, tuple(quantities.values()), d.before.values | truth)
     if not joint.converged:
-        return unknown
+        return np.nan, np.nan
     found = []
     for part, candidate in zip(parts, own, strict=True):
         index = [joint.names.index(n) for n in candidate.names]
         amount = np.array([part.truth.get(q.name, q.null) - q.null for q in candidate.quantities])
-        sigmas = float(np.sqrt(wald(amount, joint.covariance[np.ix_(index, index)]) / d.noise))
-        needed = stats.chi2.isf(d.settings.false_alarm / max(len(system.candidates), 1), len(index))
-        found.append({"stands_out": sigmas, "needed": float(np.sqrt(needed))})
-    return min(found, key=lambda one: one["stands_out"] / one["needed"])
+        sigmas = np.sqrt(wald(amount, joint.covariance[np.ix_(index, index)]) / d.noise)
+        needed = np.sqrt(stats.chi2.isf(d.settings.false_alarm / max(len(system.candidates), 1), len(index)))
+        found.append((float(sigmas), float(needed)))
+    return min(found, key=lambda one: one[0] / one[1])
 
 
 def _pull_of(result: DiscDiagnosis, planted: Planted) -> float | None:
@@ -182,14 +193,14 @@ def _pull(fit: Fit, truth: Mapping[str, float]) -> float:
 
 
 def hidden_cases(
-    names: Sequence[str], seeds: Sequence[int], pairs: int = 0, rate: float = FRAME_RATE
+    names: Sequence[str], seeds: Sequence[int], pairs: int = 0, rate: float = Filmed.declared_rate
 ) -> Iterator[HiddenCase]:
     """Each effect ("NAME" or "NAME=SIZE"; none: all) with each seed; or pairs drawn at random, a seed each."""
-    hidden = [_sized(name) for name in names] or [(e.name, e.size) for e in HIDDEN_EFFECTS]
+    hidden = [_sized(name) for name in names] or [*SIZES.items()]
     if not pairs:
         yield from (HiddenCase({name: size}, seed, rate) for name, size in hidden for seed in seeds)
         return
-    visible = [(name, size) for name, size in hidden if hidden_effect(name).visible]
+    visible = [(name, size) for name, size in hidden if name not in INVISIBLE]
     rng = np.random.default_rng([seeds[0], 33])
     for number in range(pairs):
         two = rng.choice(len(visible), 2, replace=False)
@@ -198,27 +209,16 @@ def hidden_cases(
 
 def _sized(text: str) -> tuple[str, float]:
     name, _, size = text.partition("=")
-    effect = hidden_effect(name)
+    units = [candidate.quantities[0].unit for candidate in alike(name)]
     try:
-        return name, float(size) if size else effect.size
+        return name, float(size) if size else (SIZES | CONTROLS)[name]
     except ValueError:
-        raise DiscTrackError(f"{text}: expected EFFECT=SIZE with the size in {effect.unit}") from None
-
-
-def _asked(case: HiddenCase) -> bool:
-    """Is there something that the diagnosis should name?"""
-    return any(_truth_at(name, size) for name, size in case.hidden.items())
-
-
-def _truth_at(name: str, size: float) -> float:
-    """Largest of the diagnosis' numbers that an effect of this size means; 0 for a control."""
-    truth = hidden_effect(name).plant(size, np.random.default_rng(0)).truth
-    return max((abs(v) for v in truth.values()), default=0.0)
+        raise DiscTrackError(f"{text}: expected EFFECT=SIZE with the size in {(*units, 'm')[0]}") from None
 
 
 def what_was_wrong(v: Verdict) -> str:
     """One line on a case that did not come out as it should; empty where it did."""
-    right = v.within and v.at_noise if _asked(v.case) else v.verdict == "nothing missing"
+    right = v.within and v.at_noise if v.case.asked else v.verdict == "nothing missing"
     if right and not v.extra:
         return ""
     return (
@@ -228,19 +228,10 @@ def what_was_wrong(v: Verdict) -> str:
     )
 
 
-def found_from(v: Verdict) -> float:
-    """Size from which a single effect would stand out by what a claim takes in this recording: found in half."""
-    (name, size), *others = v.case.hidden.items()
-    if others or not _asked(v.case):
-        return float("nan")
-    power = np.log2(_truth_at(name, size) / _truth_at(name, size / 2))  # of the size, in what the dots see of it
-    return float(size * (v.needed / v.stands_out) ** (1 / power))
-
-
 def diagnosis_validation(verdicts: Sequence[Verdict]) -> Validation:
     """How often what was hidden was named and sized, and how often something was claimed where nothing was hidden."""
-    asked = [v for v in verdicts if _asked(v.case)]
-    controls = [v for v in verdicts if not _asked(v.case)]
+    asked = [v for v in verdicts if v.case.asked]
+    controls = [v for v in verdicts if not v.case.asked]
     told = [v for v in asked if v.can_be_told]
     claimed = [v for v in controls if v.verdict != "nothing missing"]
     headline = []
@@ -268,7 +259,7 @@ def _rates_table(verdicts: Sequence[Verdict]) -> Table:
     for hidden, group in groups.items():
         counts = ([v.can_be_told, v.named, v.within, v.at_noise, v.extra > 0] for v in group)
         shares = [f"{sum(column)}/{len(group)}" for column in zip(*counts, strict=True)]
-        medians = np.median([(v.stands_out, found_from(v), v.seconds) for v in group], axis=0)
+        medians = np.median([(v.stands_out, v.found_from, v.seconds) for v in group], axis=0)
         names, sizes = zip(*hidden, strict=True)
         rows.append([" + ".join(names), " + ".join(f"{s:.3g}" for s in sizes), *shares, *map(figure, medians)])
     head = ["hidden", "size", "distinguishable", "named", "within 3 sigma", "noise left", "claim too many",

@@ -7,7 +7,7 @@ from disctrack.diagnosis.model_file import declared_model
 from disctrack.discrepancy.fit import fit
 from disctrack.discrepancy.search import explain
 from disctrack.discrepancy.shape import profiled
-from disctrack.validate.diagnoses import HiddenCase, plant
+from disctrack.validate.diagnoses import HiddenCase, recorded
 from tests.oracles.measured_disc import assert_sized, measured, system_of
 
 
@@ -59,7 +59,7 @@ def test_the_pivoting_rate_at_which_creep_begins_is_measured():
 @pytest.mark.slow
 def test_a_flat_of_the_rim_beside_a_fault_of_a_camera_is_no_inertia():
     """The flat's place has to be looked for, and only an effect that stands in for it is met by the search."""
-    _, trajectory = plant(HiddenCase({"rim_flat": 1e-5, "distortion": 0.05}, seed=2014, rate=500.0))
+    _, trajectory = recorded(HiddenCase({"rim_flat": 1e-5, "distortion": 0.05}, seed=2014, rate=500.0))
     model = declared_model(trajectory).model
     every = {c.name: c for c in DiscSystem(trajectory, model).candidates}
 

@@ -13,31 +13,24 @@ from disctrack.validate.diagnoses import (
     HiddenCase,
     diagnosis_validation,
     draw,
-    found_from,
     hidden_cases,
     hide,
     what_was_wrong,
 )
-from disctrack.validate.hidden import HIDDEN_EFFECTS, hidden_effect
+from disctrack.validate.hidden import INVISIBLE, SIZES, alike, plant
 from disctrack.validate.points import measured
 from tests.oracles.measured_disc import assert_sized
 
-# whose planting takes another way than the prediction: through the renderer's faults, instants, frames, areas
-MEASUREMENT = {e.name for e in HIDDEN_EFFECTS if e.visible and not e.plant(e.size, np.random.default_rng(1)).effects}
+
+def visible(name):
+    """Faults of the measurement are planted in another way than predicted: by renderer, instants, frames, areas."""
+    return name if alike(name)[0].kind == "measurement" else pytest.param(name, marks=pytest.mark.slow)
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        e.name if e.name in MEASUREMENT else pytest.param(e.name, marks=pytest.mark.slow)
-        for e in HIDDEN_EFFECTS
-        if e.visible
-    ],
-)
+@pytest.mark.parametrize("name", [visible(name) for name in SIZES if name not in INVISIBLE])
 def test_a_planted_effect_is_what_the_diagnosis_calls_by_that_name(name):
     """Fitted alone, it comes out at the planted size within its sigma, and leaves noise."""
-    effect = hidden_effect(name)
-    planted = effect.plant(effect.size, np.random.default_rng(7))
+    planted = plant(name, SIZES[name], np.random.default_rng(7))
     trajectory = measured(planted, replace(draw(5, planted), n=150))
     system = DiscSystem(trajectory, declared_model(trajectory, "paper").model)
     candidate = next(c for c in system.candidates if set(planted.truth) <= set(c.names))
@@ -63,7 +56,7 @@ def test_a_verdict_tells_what_became_of_the_hidden_effect():
     # by itself it gains what it stands out by; scatter of a normal number
     assert verdict.stands_out == pytest.approx(np.sqrt(verdict.gain), abs=4)
     # and of the size that it is found from it gains what a claim takes, within the same scatter
-    faint = hide(replace(verdict.case, hidden={"time_offset": found_from(verdict)}))
+    faint = hide(replace(verdict.case, hidden={"time_offset": verdict.found_from}))
     assert faint.stands_out == pytest.approx(faint.needed, rel=0.2)
 
 
@@ -105,8 +98,7 @@ def test_cases_are_told_by_name_and_size_and_pairs_are_drawn_anew_for_each_seed(
 @pytest.mark.slow
 def test_beside_an_effect_that_was_looked_for_another_of_the_catalogue_is_tried_before_a_law_outside_of_it():
     """A shaken table and a dot 20 um off: the shaking alone left chi-square 1.006, but no noise."""
-    sizes = {name: hidden_effect(name).size for name in ("table_shaken", "misprint")}
-    verdict = hide(HiddenCase(sizes, seed=10, rate=500.0))
+    verdict = hide(HiddenCase({name: SIZES[name] for name in ("table_shaken", "misprint")}, seed=10, rate=500.0))
     assert verdict.named
     assert verdict.within
     assert verdict.verdict == "found"
