@@ -9,7 +9,6 @@ from calibration.kit.arrays import Array
 from disctrack.analyse.declaration import CLAIM_POSITION
 from disctrack.frames import POSE_COMPONENTS
 from disctrack.validate.errors import (
-    QUANTITIES,
     Consistency,
     PoseErrors,
     calibration_consistency,
@@ -24,6 +23,7 @@ REGULAR_DEG = 5.0  # psi and phi are summed up from here on; below, 1/sin(theta)
 LAW_DEG = 20.0  # at larger nutation the cameras' directions matter more than 1/sin(theta)
 CONSISTENT = (0.8, 1.25)
 _UM, _MDEG = 1e6, 180e3 / np.pi
+_COUNTED = ("x", "y", "z", "psi", "theta", "phi", "rotation")
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ def _rows(own: PoseErrors, true: PoseErrors) -> tuple[AccuracyRow, ...]:
     both = own.usable & true.usable
     regular = both & (own.q[:, 4] > np.radians(REGULAR_DEG))
     rows = []
-    for name in QUANTITIES:
+    for name in _COUNTED:
         at = regular if name in ("psi", "phi") and regular.any() else both
         e, f = own.part(at).of(name), true.part(at).of(name)
         difference = e - f if name in "xyz" else np.angle(np.exp(1j * (e - f)))
@@ -113,22 +113,21 @@ def _rows(own: PoseErrors, true: PoseErrors) -> tuple[AccuracyRow, ...]:
 
 def _strata_table(own: PoseErrors, law: float) -> Table:
     """Root mean squares of the poses in each stratum of nutation."""
-    theta, names, rows = np.degrees(own.q[:, 4]), ("rotation", "theta", "psi", "phi"), []
+    theta, rows = np.degrees(own.q[:, 4]), []
     for low, high in STRATA_DEG:
         some = own.part((theta >= low) & (theta < high))
         if len(some.q):
-            angles = [_rms(some.of(name)) for name in names] + [law / np.sin(np.radians(np.sqrt(low * high)))]
-            position = _rms(some.error[some.usable, :3])
-            rows.append([f"{low:g}-{high:g}", str(len(some.q)), *_cells(_UM, position), *_cells(_MDEG, *angles)])
+            angles = [_MDEG * _rms(some.of(name)) for name in ("rotation", "theta", "psi", "phi")]
+            by_law = _MDEG * law / np.sin(np.radians(np.sqrt(low * high)))
+            rows.append([f"{low:g}-{high:g}", len(some.q), _UM * _rms(some.of("position")), *angles, by_law])
+    head = ["theta [deg]", "n", "position [µm]", "rotation [mdeg]", "theta [mdeg]", "psi [mdeg]", "phi [mdeg]"]
     law_said = f"{_MDEG * law:.2f} / sin(theta)"
-    head = ["theta [deg]", "n", "position [µm]", *(f"{name} [mdeg]" for name in names), law_said]
-    return Table("As a function of nutation (static poses)", head, rows, "Root mean squares.")
+    return Table("As a function of nutation (static poses)", [*head, law_said], rows, "Root mean squares.", ".2f")
 
 
 def _sight(own: PoseErrors, cameras: int) -> SightCount:
-    error = own.error[own.usable]
     found, gross = int(own.found.sum()), int(own.gross.sum())
-    return SightCount(cameras, len(own.q), found, gross, _rms(error[:, :3]), _rms(error[:, 3:]))
+    return SightCount(cameras, len(own.q), found, gross, _rms(own.of("position")), _rms(own.of("rotation")))
 
 
 def _rms(errors: Array) -> float:
@@ -141,13 +140,12 @@ def verdict(accuracy: Accuracy) -> str:
     position = max(rows[name].within_95 for name in "xyz")
     rotation = rows["rotation"].within_95
     two, one, _ = accuracy.sights
-    missed = two.n - two.found + two.gross
     held = {position <= CLAIM_POSITION, rotation <= CLAIM_ROTATION}
     name = "holds" if held == {True} else "does not hold" if held == {False} else "holds in part"
     text = (
         f"Where both cameras see the face, the claim of 0.005 mm and 0.05 deg {name}: 95 % of {two.n} poses lie within "
-        f"{1e3 * position:.5f} mm per axis and {np.degrees(rotation):.4f} deg per rotation axis, calibration included"
-        f"{f'; {missed} poses were not found or wrong' if missed else ''}. psi and phi alone scatter by "
+        f"{1e3 * position:.5f} mm per axis and {np.degrees(rotation):.4f} deg per rotation axis, calibration included. "
+        "psi and phi alone scatter by "
         f"{_MDEG * accuracy.law:.2f} mdeg / sin(theta); 95 % lie within 0.05 deg above {accuracy.law_limit_deg:.1f} deg"
     )
     if one.found:
@@ -181,24 +179,17 @@ def accuracy_validation(outcomes: Sequence[RenderedOutcome]) -> Validation:
     tables = [_accuracy_table(name, rows) for name, rows in accuracy.rows.items()]
     static = joined(outcome.seen_by_both[0] for outcome in outcomes if outcome.name == STATIC)
     tables.append(_strata_table(static, accuracy.law))
-    sights = [
-        [*map(str, (s.cameras, s.n, s.found, s.gross)), *_cells(_UM, s.position), *_cells(_MDEG, s.rotation)]
-        for s in accuracy.sights
-    ]
+    sights = [[s.cameras, s.n, s.found, s.gross, _UM * s.position, _MDEG * s.rotation] for s in accuracy.sights]
     head = ["cameras", "poses", "found", "wrong", "position rms [µm]", "rotation rms [mdeg]"]
     note = "0 cameras: the dots are seen at a grazing angle. There a pose need not be found; none may be wrong."
-    tables.append(Table("Who sees the face (static poses)", head, sights, note))
-    honest = [[name, *_cells(1, c.value, c.uncertainty), str(c.n)] for name, c in accuracy.consistency.items()]
+    tables.append(Table("Who sees the face (static poses)", head, sights, note, ".2f"))
+    honest = [[name, c.value, c.uncertainty, c.n] for name, c in accuracy.consistency.items()]
     head = ["squared error over predicted variance", "value", "standard error", "poses or rigs"]
     corners = ", ".join(f"{outcome.corners_px:.4f}" for outcome in outcomes)
     note = f"Target {CONSISTENT[0]} to {CONSISTENT[1]} within 3 standard errors. Corner rms by recording: {corners} px."
-    tables.append(Table("Errors against stated uncertainty", head, honest, note))
+    tables.append(Table("Errors against stated uncertainty", head, honest, note, ".2f"))
     warnings = sorted({warning for outcome in outcomes for warning in outcome.warnings})
     return Validation("validation", verdict(accuracy), tables, [accuracy], complaints(accuracy), warnings)
-
-
-def _cells(unit: float, *values: float) -> list[str]:
-    return [f"{unit * value:.2f}" if np.isfinite(value) else "-" for value in values]
 
 
 def _accuracy_table(name: str, rows: Sequence[AccuracyRow]) -> Table:
@@ -207,14 +198,14 @@ def _accuracy_table(name: str, rows: Sequence[AccuracyRow]) -> Table:
     for row in rows:
         k, unit = (_UM, "µm") if row.quantity in "xyz" else (_MDEG, "mdeg")
         errors = (row.bias, row.scatter, row.within_95, row.noise_rms, row.calibration_rms)
-        lines.append([row.quantity, unit, str(row.n), *_cells(k, *errors), f"{row.claim / row.within_95:.1f}"])
+        lines.append([row.quantity, unit, row.n, *(k * e for e in errors), f"{row.claim / row.within_95:.1f}"])
     note = "Rotation: the rotation vector between measured and true attitude."
     by_name = {row.quantity: row for row in rows}
     if by_name["psi"].n < by_name["theta"].n:
         note += f" psi and phi from {REGULAR_DEG:.0f} deg of nutation on."
     if name != STATIC:
         note = f"Exposure {1e3 * EXPOSURE:g} ms, corrected for by the smear of the dots."
-    return Table(f"{name[0].upper()}{name[1:]}", head, lines, note)
+    return Table(f"{name[0].upper()}{name[1:]}", head, lines, note, ".2f")
 
 
 def imperfect_validation(outcomes: Sequence[RenderedOutcome]) -> Validation:
@@ -222,20 +213,16 @@ def imperfect_validation(outcomes: Sequence[RenderedOutcome]) -> Validation:
     lines, honest = [], []
     unit = np.array(3 * [_UM] + 3 * [_MDEG])
     for outcome in outcomes:
-        errors = outcome.own.part(outcome.own.usable)
-        mean = errors.error.mean(axis=0)
-        sigma = np.sqrt(np.median(np.diagonal(errors.calibration_covariance, axis1=1, axis2=2), axis=0))
-        variance = np.diagonal(errors.covariance, axis1=1, axis2=2)
-        bends = np.diff(errors.error, 2, axis=0) ** 2 / 6.0  # of a smooth motion's frames, in their order
+        mean, sigma = outcome.own.mean()
         honest.append((mean / sigma) ** 2)
         means = [f"{e:.2f} +- {s:.2f}" for e, s in zip(mean * unit, sigma * unit, strict=True)]
         repeating = ", ".join(f"{rms:.4f}" for rms in outcome.systematic_px)
-        lines.append([str(outcome.seed), *means, *_cells(1, float(np.mean(bends / variance[1:-1]))), repeating])
-    lines.append(["squared error over variance", *_cells(1, *np.mean(honest, axis=0)), "", ""])
+        lines.append([outcome.seed, *means, outcome.own.frame_to_frame(), repeating])
+    lines.append(["squared error over variance", *np.mean(honest, axis=0), "", ""])
     head = ["seed", *POSE_COMPONENTS, "frame to frame, squared over stated", "repeating, px"]
     note = (
         "Mean error +- what is stated for it, in µm and mdeg. Below 1: the stated sigmas, which hold what board and "
         "lens may be off by, are larger than these errors."
     )
     headline = f"Mean errors in {len(outcomes)} recordings."
-    return Validation("imperfect", headline, [Table("Imperfect laboratory", head, lines, note)], outcomes)
+    return Validation("imperfect", headline, [Table("Imperfect laboratory", head, lines, note, ".2f")], outcomes)

@@ -18,9 +18,9 @@ from disctrack.errors import DiscTrackError
 from disctrack.rolling import Model, simulate, steady_precession
 from disctrack.synthetic.description import Scene
 from disctrack.trajectory import Trajectory
-from disctrack.validate.hidden import CONTROLS, INVISIBLE, SIZES, alike, plant, together
-from disctrack.validate.points import Filmed, Planted, measured
-from disctrack.validate.tables import Table, Validation, figure
+from disctrack.validate.hidden import CONTROLS, INVISIBLE, SIZES, alike, plant
+from disctrack.validate.points import Filmed, Laboratory, Planted, measured
+from disctrack.validate.tables import Table, Validation
 
 DURATION = (0.4, 0.9)  # [s]
 FLATTEST_DEG = 0.9  # the last frame's nutation: below, the disc touches its paper
@@ -112,7 +112,9 @@ def recorded(case: HiddenCase) -> tuple[list[Planted], Trajectory]:
     """What is planted, one by one, and the recording with all of it."""
     rng = np.random.default_rng([case.seed, 32])
     parts = [plant(name, size, rng) for name, size in case.hidden.items()]
-    planted = together(parts)
+    effects, wrong = ({k: v for p in parts for k, v in getattr(p, kind).items()} for kind in ("effects", "wrong"))
+    imperfect = [p.laboratory for p in parts if p.laboratory != Laboratory()] or [Laboratory()]
+    planted = Planted(effects=effects, wrong=wrong, laboratory=imperfect[-1])
     return [p for p in parts if p.truth], measured(planted, draw(case.seed, planted, case.rate))
 
 
@@ -177,15 +179,11 @@ def _standing_out(result: DiscDiagnosis, parts: Sequence[Planted]) -> tuple[floa
 
 def _pull_of(result: DiscDiagnosis, planted: Planted) -> float | None:
     """Largest pull of the planted values where the effect, or a class that holds it, is claimed; None: it is not."""
-    claims, alternatives = [], []
-    for found in result.diagnosis.found:
-        if set(planted.truth) <= set(found.candidate.names):
-            claims.append(_pull(result.diagnosis.after, planted.truth))
-        for alternative in found.cannot_be_told_from:
-            if set(planted.truth) <= set(alternative.candidate.names):
-                alternatives.append(_pull(alternative.fit, planted.truth))
+    d, truth = result.diagnosis, planted.truth
+    claims = [_pull(d.after, truth) for f in d.found if set(truth) <= set(f.candidate.names)]
+    others = [a for f in d.found for a in f.cannot_be_told_from if set(truth) <= set(a.candidate.names)]
     # two claims may have it in their classes: it is in the place of one of them that it fits
-    return min(claims or alternatives, default=None)
+    return min(claims or [_pull(other.fit, truth) for other in others], default=None)
 
 
 def _pull(fit: Fit, truth: Mapping[str, float]) -> float:
@@ -261,7 +259,7 @@ def _rates_table(verdicts: Sequence[Verdict]) -> Table:
         shares = [f"{sum(column)}/{len(group)}" for column in zip(*counts, strict=True)]
         medians = np.median([(v.stands_out, v.found_from, v.seconds) for v in group], axis=0)
         names, sizes = zip(*hidden, strict=True)
-        rows.append([" + ".join(names), " + ".join(f"{s:.3g}" for s in sizes), *shares, *map(figure, medians)])
+        rows.append([" + ".join(names), " + ".join(f"{s:.3g}" for s in sizes), *shares, *medians])
     head = ["hidden", "size", "distinguishable", "named", "within 3 sigma", "noise left", "claim too many",
             "stands out by, sigma", "found from", "time, s"]  # fmt: skip
     return Table("What was hidden, and what became of it", head, rows, "Sizes in SI units; the last three are medians.")

@@ -13,8 +13,8 @@ from disctrack.trajectory import Trajectory
 
 GROSS_POSITION = 0.5e-3  # [m] and
 GROSS_ROTATION = np.radians(1.0)  # beyond: not an error of measurement but another pose
-QUANTITIES = ("x", "y", "z", "psi", "theta", "phi", "rotation")
-# "rotation": the rotation vector between measured and true attitude, per axis (its three components together)
+# rotation: the rotation vector between measured and true attitude; of both vectors all components together
+QUANTITIES = ("x", "y", "z", "psi", "theta", "phi", "position", "rotation")
 
 
 @dataclass(frozen=True)
@@ -45,11 +45,22 @@ class PoseErrors:
         return np.asarray(self.found & ~self.gross)
 
     def of(self, quantity: str) -> Array:
-        """Errors of one of QUANTITIES [m, rad]: (n,), for "rotation" (3 n,), only of usable poses."""
-        ok, i = self.usable, QUANTITIES.index(quantity)
-        if quantity == "rotation":
-            return self.error[ok, 3:].ravel()
-        return self.error[ok, i] if i < 3 else self.angles[ok, i - 3]
+        """Errors of one of QUANTITIES [m, rad]: (n,), of a vector (3 n,), only of usable poses."""
+        columns = dict(zip(QUANTITIES, (*self.error.T[:3], *self.angles.T), strict=False))
+        columns |= {"position": self.error[:, :3], "rotation": self.error[:, 3:]}
+        return columns[quantity][self.usable].ravel()
+
+    def mean(self) -> tuple[Array, Array]:
+        """Mean error (6,) of the usable poses, and what is stated for what they share (6,)."""
+        usable = self.part(self.usable)
+        variance = np.median(np.diagonal(usable.calibration_covariance, axis1=1, axis2=2), axis=0)
+        return usable.error.mean(axis=0), np.sqrt(variance)
+
+    def frame_to_frame(self) -> float:
+        """Bends of the errors along a smooth motion, squared, over the variance stated for a frame's noise."""
+        usable = self.part(self.usable)
+        bends = np.diff(usable.error, 2, axis=0) ** 2 / 6.0
+        return float(np.mean(bends / np.diagonal(usable.covariance, axis1=1, axis2=2)[1:-1]))
 
     def part(self, rows: Mask) -> PoseErrors:
         """The poses where `rows` (n,) is True."""

@@ -4,7 +4,6 @@ An effect is hidden by the name of the candidate that means it, in the candidate
 that a careful experimenter would still overlook; directions and signs are drawn, passive effects keep theirs.
 """
 
-from collections.abc import Sequence
 from functools import cache
 
 import numpy as np
@@ -109,12 +108,3 @@ def plant(name: str, size: float, rng: Generator) -> Planted:
         return Planted(truth, wrong=truth)
     place = {"rim_flat.angle": rng.uniform(0, 2 * np.pi)} if name == "rim_flat" else {}
     return Planted(truth, effects=truth | place)
-
-
-def together(planted: Sequence[Planted]) -> Planted:
-    """Several at once."""
-    truth, effects, wrong = (
-        {k: v for p in planted for k, v in getattr(p, kind).items()} for kind in ("truth", "effects", "wrong")
-    )
-    laboratory = next((p.laboratory for p in reversed(planted) if p.laboratory != Laboratory()), Laboratory())
-    return Planted(truth, effects, wrong, laboratory=laboratory)

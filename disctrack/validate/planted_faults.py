@@ -10,7 +10,7 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from json import JSONDecodeError, loads
@@ -22,9 +22,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.cameras.camera import StereoRig
 from calibration.kit.arrays import Array
 from calibration.rig_file import read_rig, write_rig
+from disctrack.disc import Disc
 from disctrack.errors import DiscTrackError
 from disctrack.faults.catalogue import HEIGHT, MOVED, TYPICAL_STEPS, Fault, faults_of, scene_faults
 from disctrack.faults.dots import cameras_with, centres_with, true_table
@@ -39,7 +39,7 @@ from disctrack.trajectory import Trajectory
 from disctrack.trajectory.file import read_trajectory
 from disctrack.validate.errors import compare
 from disctrack.validate.rendered import rolling_scene, scene_of
-from disctrack.validate.tables import Table, Validation, figure
+from disctrack.validate.tables import Table, Validation
 
 PAIRS = 100  # from so many on gravity and frame rate are judged
 THETA_DEG = 9.0  # of the scene
@@ -63,6 +63,9 @@ class Ground:
     seconds: tuple[float, float]  # of processor time that its run takes, with this rig and with a calibration
 
 
+FaultCase = tuple[Ground, str, float]  # a recording, a fault, its size
+
+
 @dataclass(frozen=True)
 class Planting:
     """A fault as it is planted."""
@@ -72,15 +75,6 @@ class Planting:
     named_by: tuple[Kind, ...]
     change: Change
     of_views: bool = False  # the recording is calibrated anew, by its own views
-
-
-@dataclass(frozen=True)
-class FaultCase:
-    """One fault of one size in one recording."""
-
-    ground: Ground
-    fault: str
-    size: float
 
 
 @dataclass(frozen=True)
@@ -116,7 +110,7 @@ class FaultOutcome:
 
 def untouched(folder: Path, recordings: Sequence[Path], seed: int = 29) -> Iterator[Ground]:
     """A rendered recording and the first pairs of each of these, run without any fault."""
-    scene = rolling_scene(scene_of(seed, quick=True), THETA_DEG, PAIRS, np.random.default_rng([seed, 34]))
+    scene = rolling_scene(scene_of(seed, quick=True), "rendered", THETA_DEG, PAIRS, np.random.default_rng([seed, 34]))
     scene = replace(scene, cameras=replace(scene.cameras, exposure_s=Scene().cameras.exposure_s))
     truth = write_recording(folder / "rendered", scene)
     yield _ground(folder / "rendered", scene, truth.q)
@@ -139,7 +133,7 @@ def _ground(folder: Path, scene: Scene | None, q: Array | None) -> Ground:
 def fault_cases(grounds: Sequence[Ground], names: Sequence[str] = (), sizes: slice = slice(None)) -> list[FaultCase]:
     """Every fault (or these) at all of its sizes (or these) in each recording."""
     return [
-        FaultCase(ground, name, size)
+        (ground, name, size)
         for ground in grounds
         for name, planting in plantings(ground).items()
         for size in (planting.sizes[sizes] if not names or name in names else ())
@@ -148,21 +142,21 @@ def fault_cases(grounds: Sequence[Ground], names: Sequence[str] = (), sizes: sli
 
 def plant_and_run(case: FaultCase) -> FaultOutcome:
     """Plant, run, compare; nothing is left on the disk."""
-    planting = plantings(case.ground)[case.fault]
-    folder = case.ground.recording.with_name(f"{case.ground.recording.name} {case.fault} {case.size:g}")
+    ground, fault, size = case
+    planting = plantings(ground)[fault]
+    folder = ground.recording.with_name(f"{ground.recording.name} {fault} {size:g}")
     try:
-        rig = None if planting.of_views else case.ground.rig
-        tree = _copied(read_recording(case.ground.recording), folder, rig)
-        q = planting.change(folder, tree, case.size)
+        tree = _copied(read_recording(ground.recording), folder, None if planting.of_views else ground.rig)
+        q = planting.change(folder, tree, size)
         declare(folder, tree)
         code, findings, trajectory, seconds = _run(folder)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
-    position, rotation = _in_sigmas(trajectory, case.ground.q if q is None else q)
+    position, rotation = _in_sigmas(trajectory, ground.q if q is None else q)
     naming = [f for f in findings if f.kind in planting.named_by]
     told = _said(naming) if naming else f"({_said(findings)})" if findings else ""
-    of = case.ground.recording.name, case.fault, case.size, planting.unit
-    times = seconds / case.ground.seconds[planting.of_views]
+    of = ground.recording.name, fault, size, planting.unit
+    times = seconds / ground.seconds[planting.of_views]
     return FaultOutcome(*of, position, rotation, told, bool(naming), code, times)
 
 
@@ -228,36 +222,31 @@ def _of_catalogue(ground: Ground) -> Iterator[tuple[Fault, Planting]]:
         yield fault, Planting(sizes, fault.unit, fault.named_by, partial(change, fault, ground))
 
 
-def _values(fault: Fault, size: float) -> Mapping[str, float]:
-    """Its numbers, all alike."""
-    return dict.fromkeys(fault.names(), size / np.sqrt(len(fault.parts)))
+def _with(fault: Fault, size: float, disc: Disc, rate: float = 1.0) -> Faults:
+    """The fault alone, its numbers all alike; rate : declared [Hz]."""
+    values = dict.fromkeys(fault.names(), size / np.sqrt(len(fault.parts)))
+    return scene_faults(disc, values, rate)
 
 
 def _rendered(fault: Fault, ground: Ground, folder: Path, tree: Tree, size: float) -> Array:
     scene = ground.scene
     assert scene is not None
-    wrong = scene_faults(scene.declared_disc, _values(fault, size), scene.cameras.frame_rate_hz)
+    wrong = _with(fault, size, scene.declared_disc, scene.cameras.frame_rate_hz)
     shutil.rmtree(folder)
     return write_recording(folder, replace(scene, faults=wrong, board=replace(scene.board, n_views=1))).q
 
 
 def _declared_wrong(fault: Fault, ground: Ground, folder: Path, tree: Tree, size: float) -> None:
     """As if what is declared were true but for the fault."""
-    disc = read_recording(ground.recording).disc
-    wrong = scene_faults(disc, {name: -value for name, value in _values(fault, size).items()})
-    places = centres_with(wrong, disc)
-    tree["markers"]["centres_mm"] = (1e3 * places[:, :2]).tolist()
+    disc, rig = read_recording(ground.recording).disc, read_rig(ground.rig)
+    wrong = _with(fault, -size, disc)
+    tree["markers"]["centres_mm"] = (1e3 * centres_with(wrong, disc)[:, :2]).tolist()
     tree["disc"]["thickness_mm"] = 2e3 * float(disc.half_thickness + 1e-3 * wrong.pattern_height_mm)
     tree["cameras"]["frame_rate_hz"] *= wrong.frame_rate_hz or 1.0
     tree["calibration"]["rig"] = str(folder / "rig.h5")
-    write_rig(folder / "rig.h5", _believed(read_rig(ground.rig), wrong))
-
-
-def _believed(rig: StereoRig, faults: Faults) -> StereoRig:
-    """Cameras and table as they are with these faults; the table is that of the calibrated axes."""
-    rig, (turn, lift) = cameras_with(faults, rig), true_table(faults)
-    R = rig.R_left_world @ turn
-    return replace(rig, R_left_world=R, t_left_world=rig.t_left_world + R @ lift)
+    rig, (turn, lift) = cameras_with(wrong, rig), true_table(wrong)
+    R = rig.R_left_world @ turn  # the table is that of the calibrated axes
+    write_rig(folder / "rig.h5", replace(rig, R_left_world=R, t_left_world=rig.t_left_world + R @ lift))
 
 
 def _copied(recording: Recording, folder: Path, rig: Path | None = None) -> Tree:
@@ -310,7 +299,7 @@ def _files(**orders: Callable[[list[Path], int], list[Path]]) -> Change:
 
     def change(folder: Path, tree: Tree, size: float) -> None:
         for name, order in orders.items():
-            reordered(folder / name, partial(order, k=int(size)))
+            reordered(folder / name, lambda files, order=order: order(files, int(size)))  # type: ignore[misc]
 
     return change
 
@@ -463,13 +452,13 @@ def _limits(outcomes: Sequence[FaultOutcome]) -> Table:
         groups.setdefault((fault, o.unit or "-"), []).append(o)
     rows = []
     for fault_and_unit, of_fault in groups.items():
-        row = list(fault_and_unit)
+        row: list[object] = [*fault_and_unit]
         for make in makes:
             planted = [o for o in of_fault if o.make == make]
             unnamed = [o for o in planted if not o.named]
             named = [o.size for o in planted if all(o.size > other.size for other in unnamed)]
             worst = max((o.worst for o in unnamed), default=np.nan)
-            row += [figure(min(named, default=np.nan)), figure(worst, 2)]
+            row += [min(named, default=np.nan), worst]
         rows.append(row)
     head = ["fault", "unit", *(f"{make}: {what}" for make in makes for what in ("named from", "unnamed, sigma"))]
     note = "Named at this size and at all larger ones that were planted. Unnamed: the largest error of a pose in its "

@@ -1,11 +1,11 @@
 """Recordings that are rendered, measured and compared with their truth: each with its own rig and chessboards.
 
-A case says what is filmed; the recording is a folder like any other and passes through the readers, the calibration and
-the tracking as the user's would. Only the truth and the reported numbers enter a comparison.
+A case is a scene with the name of what it shows; whatever it plants (faults, imperfections, light) is in all of its
+images. The recording is a folder like any other and passes through the readers, the calibration and the tracking as the
+user's would. Only the truth and the reported numbers enter a comparison.
 """
 
 import tempfile
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -18,17 +18,10 @@ from disctrack.calibrate.stage import calibrate_recording
 from disctrack.disc import Disc
 from disctrack.errors import SceneError
 from disctrack.frames import CAMERAS, rotation_from_euler
-from disctrack.recording.declaration import read_recording
-from disctrack.recording.readers.blocks import PairBlock, Unreadable
-from disctrack.synthetic import rig_of, write_recording
+from disctrack.recording.declaration import Recording, read_recording
+from disctrack.synthetic import Truth, rig_of, write_recording
 from disctrack.synthetic.description import (
-    BoardSettings,
-    CameraSettings,
     GlareSettings,
-    ImperfectionSettings,
-    MotionSettings,
-    RigSettings,
-    RollingMotion,
     Scene,
 )
 from disctrack.track.follow.tracking import Tracking, track
@@ -50,17 +43,6 @@ STRATA_DEG = ((0.5, 1.0), (1.0, 2.0), (2.0, 5.0), (5.0, 10.0), (10.0, 20.0), (20
 FIELD_RADIUS = 25e-3  # [m] of the disc's centre about the middle of the field, where the dots stay in both images
 BORDER_PX = 14  # a dot's window needs some pixels around it
 SMALLEST_SEMI_MINOR_PX = 3.2  # a dot seen flatter than this is all edge: its blurred middle shows no black
-
-
-@dataclass(frozen=True)
-class RenderedCase:
-    """A recording to be rendered and measured; poses of a STATIC one are each found without a prior.
-
-    Whatever the scene plants (faults, imperfections, light) is in all of its images.
-    """
-
-    name: str
-    scene: Scene
 
 
 @dataclass(frozen=True)
@@ -89,13 +71,13 @@ def scene_of(seed: int, quick: bool = False) -> Scene:
         return scene
     return replace(
         scene,
-        cameras=CameraSettings(image_size=(272, 272)),
-        rig=RigSettings(mm_per_px=0.42),
-        board=BoardSettings(n_views=12, square_mm=6.0, shift_mm=15.0),
+        cameras=replace(scene.cameras, image_size=(272, 272)),
+        rig=replace(scene.rig, mm_per_px=0.42),
+        board=replace(scene.board, n_views=12, square_mm=6.0, shift_mm=15.0),
     )
 
 
-def rendered_cases(n: int | None, seed: int, quick: bool = False, imperfect: bool = False) -> list[RenderedCase]:
+def rendered_cases(n: int | None, seed: int, quick: bool = False, imperfect: bool = False) -> list[Scene]:
     """Of n sets of recordings (None: as many as it takes), seeds counting up; quick: small images, few of everything.
 
     A set has one recording of an imperfect laboratory, or three of an ideal one.
@@ -110,23 +92,28 @@ def rendered_cases(n: int | None, seed: int, quick: bool = False, imperfect: boo
     return [case for scene in scenes for case in ideal_cases(scene, *counts)]
 
 
-def ideal_cases(scene: Scene, n_static: int, n_rolling: int, n_final: int) -> list[RenderedCase]:
-    """Static poses of every attitude, and two recordings of rolling (0 frames: none)."""
+def ideal_cases(scene: Scene, n_static: int, n_rolling: int, n_final: int) -> list[Scene]:
+    """Static poses of every attitude, and two recordings of rolling."""
     rng = np.random.default_rng([scene.seed, 8])
     q = static_poses(n_static, rig_of(scene), scene.declared_disc, scene.rig.target_mm[:2], rng)
     start = rng.uniform(8, 12)
+    theta, time = TO_REST
+    left = time * (0.5 / theta) ** 1.5 + n_final / scene.cameras.frame_rate_hz
+    return [
+        at_rest(scene, q),
+        rolling_scene(scene, ROLLING, start, n_rolling, rng),
+        rolling_scene(scene, FINAL, theta * (left / time) ** (2 / 3), n_final, rng),
+    ]
+
+
+def at_rest(scene: Scene, q: Array) -> Scene:
+    """The scene with poses q (n, 6) at rest, a frame each."""
     rows = (q * np.r_[np.full(3, 1e3), np.full(3, 180 / np.pi)]).tolist()
-    poses = MotionSettings(kind="static", poses=tuple((x, y, z, a, b, c) for x, y, z, a, b, c in rows))
-    cases = [RenderedCase(STATIC, replace(scene, motion=poses))]
-    if n_rolling:
-        cases.append(RenderedCase(ROLLING, rolling_scene(scene, start, n_rolling, rng)))
-    if n_final:
-        last = theta_before_rest_deg(n_final, scene.cameras.frame_rate_hz)
-        cases.append(RenderedCase(FINAL, rolling_scene(scene, last, n_final, rng)))
-    return cases
+    poses = tuple((x, y, z, psi, theta, phi) for x, y, z, psi, theta, phi in rows)
+    return replace(scene, name=STATIC, motion=replace(scene.motion, kind="static", poses=poses))
 
 
-def imperfect_case(scene: Scene, frames: int) -> RenderedCase:
+def imperfect_case(scene: Scene, frames: int) -> Scene:
     """Rolling in a laboratory with what every one has and nobody declares; every second board is bowed downwards."""
     rng = np.random.default_rng([scene.seed, 11])
     width, height = scene.cameras.image_size
@@ -136,7 +123,8 @@ def imperfect_case(scene: Scene, frames: int) -> RenderedCase:
     )
     scene = replace(
         scene,
-        imperfections=ImperfectionSettings(
+        imperfections=replace(
+            scene.imperfections,
             lens_field_px=0.02,
             board_bow_mm=0.06 if scene.seed % 2 else -0.06,
             board_stretch=2e-4,
@@ -147,13 +135,14 @@ def imperfect_case(scene: Scene, frames: int) -> RenderedCase:
         optics=replace(scene.optics, vignetting=0.15),
         light=replace(scene.light, glare=spots),
     )
-    return RenderedCase(IMPERFECT, rolling_scene(scene, rng.uniform(8, 16), frames, rng))
+    return rolling_scene(scene, IMPERFECT, rng.uniform(8, 16), frames, rng)
 
 
-def rolling_scene(scene: Scene, theta_deg: float, n: int, rng: np.random.Generator) -> Scene:
+def rolling_scene(scene: Scene, name: str, theta_deg: float, n: int, rng: np.random.Generator) -> Scene:
     """The scene with n frames of rolling from `theta_deg` on, starting at random psi and phi."""
     x, y = scene.rig.target_mm[:2]
-    start = RollingMotion(
+    start = replace(
+        scene.motion.rolling,
         theta_deg=theta_deg,
         psi_deg=rng.uniform(-180, 180),
         phi_deg=rng.uniform(-180, 180),
@@ -162,57 +151,48 @@ def rolling_scene(scene: Scene, theta_deg: float, n: int, rng: np.random.Generat
     )
     return replace(
         scene,
+        name=name,
         cameras=replace(scene.cameras, n_frames=n, exposure_s=EXPOSURE),
-        motion=MotionSettings(kind="rolling", rolling=start),
+        motion=replace(scene.motion, kind="rolling", rolling=start),
     )
 
 
-def theta_before_rest_deg(n: int, frame_rate: float) -> float:
-    """Nutation [deg] from which the disc takes n frames down to 0.5 deg, by (5.11)."""
-    theta, time = TO_REST
-    left = time * (0.5 / theta) ** 1.5 + n / frame_rate
-    return float(theta * (left / time) ** (2 / 3))
-
-
-def render_and_measure(case: RenderedCase) -> RenderedOutcome:
+def render_and_measure(scene: Scene) -> RenderedOutcome:
     """Render the recording, calibrate from its own chessboards, measure it twice; nothing is left on the disk."""
     with tempfile.TemporaryDirectory(prefix="disctrack-validate-") as folder:
-        truth = write_recording(Path(folder) / "recording", case.scene)
+        truth = render(Path(folder) / "recording", scene)
         recording = read_recording(Path(folder) / "recording")
         calibration, _ = calibrate_recording(recording)
-        pairs = open_pairs(recording)
-        images = np.stack([[pairs.left.read(i), pairs.right.read(i)] for i in range(len(pairs))])
-    disc, rate, apart = recording.disc, recording.frame_rate, case.name == STATIC
-    found = [locate(images, rig, disc, rate, apart=apart) for rig in (calibration.rig, truth.rig)]
-    rows = slice(None, None, 2 if apart else 1)
+        found = [locate(recording, rig) for rig in (calibration.rig, truth.rig)]
+    rows = slice(None, None, 2 if scene.motion.kind == "static" else 1)
     own, true = (compare(part(tracking.trajectory, rows), truth.q) for tracking in found)
     return RenderedOutcome(
-        case.name,
-        case.scene.seed,
+        scene.name,
+        scene.seed,
         calibration.rms_px,
         own,
         true,
-        cameras_in_sight(truth.q, truth.rig, disc),
+        cameras_in_sight(truth.q, truth.rig, recording.disc),
         found[0].scatter.systematic_px,
         tuple(finding.sentence for finding in found[0].findings),
     )
 
 
-def locate(images: NDArray, rig: StereoRig, disc: Disc, frame_rate: float, *, apart: bool) -> Tracking:
-    """Track pairs in memory. apart: an unreadable pair follows each one, so that each is found without a prior."""
-    step = 2 if apart else 1
+def render(folder: Path, scene: Scene) -> Truth:
+    """Write a recording; a pair without images follows each pose at rest, so that each is found without a prior."""
+    truth = write_recording(folder, scene)
+    if scene.motion.kind == "static":
+        for camera in CAMERAS:
+            for number, file in reversed([*enumerate(sorted((folder / camera).iterdir()))]):
+                file.rename(file.with_name(f"{2 * number:06d}.png"))
+                file.with_name(f"{2 * number + 1:06d}.png").touch()
+    return truth
 
-    def read_blocks(start: int, stop: int) -> Iterator[PairBlock]:
-        block = 32
-        for first in range(start, stop, block):
-            frames = np.arange(first, min(first + block, stop))
-            real = frames % step == 0
-            pairs = np.zeros((len(frames), *images.shape[1:]), images.dtype)
-            pairs[real] = images[frames[real] // step]
-            none = tuple(Unreadable(int(i), camera, "") for i in frames[~real] for camera in (0, 1))
-            yield PairBlock(frames, pairs, none)
 
-    return track(read_blocks, range(step * len(images)), rig, disc, frame_rate)
+def locate(recording: Recording, rig: StereoRig) -> Tracking:
+    """The disc in all pairs, through these cameras."""
+    pairs = open_pairs(recording)
+    return track(pairs.reading({}), range(len(pairs)), rig, recording.disc, recording.frame_rate)
 
 
 def static_poses(n: int, rig: StereoRig, disc: Disc, middle_mm: tuple[float, float], rng: np.random.Generator) -> Array:

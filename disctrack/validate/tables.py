@@ -22,18 +22,25 @@ Outcome = TypeVar("Outcome")
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of text below a head, with a title above and a note below."""
+    """Rows of text and numbers below a head, with a title above and a note below."""
 
     title: str
     head: Sequence[str]
-    rows: Sequence[Sequence[str]]
+    rows: Sequence[Sequence[object]]
     note: str = ""
+    form: str = ".3g"  # of numbers that are not whole; a dash stands where there is none
 
     def markdown(self, level: int = 2) -> str:
         """As people read it, under a heading of this level."""
-        lines = [self.head, ["---"] * len(self.head), *self.rows]
+        rows = [[self._text(cell) for cell in row] for row in self.rows]
+        lines = [self.head, ["---"] * len(self.head), *rows]
         text = "\n".join("| " + " | ".join(line) + " |" for line in lines)
         return f"{level * '#'} {self.title}\n\n{text}\n" + (f"\n{self.note}\n" if self.note else "")
+
+    def _text(self, cell: object) -> str:
+        if isinstance(cell, float):
+            return format(cell, self.form) if np.isfinite(cell) else "-"
+        return str(cell)
 
 
 @dataclass(frozen=True)
@@ -51,11 +58,6 @@ class Validation:
         """The headline, what is wrong, and all tables."""
         lists = ["\n".join(f"- {line}" for line in lines) + "\n" for lines in (self.complaints, self.remarks) if lines]
         return "\n".join([f"{self.headline}\n", *lists, *(table.markdown() for table in self.tables)])
-
-
-def figure(value: float, digits: int = 3) -> str:
-    """A number of so many digits; a dash where there is none."""
-    return f"{value:.{digits}g}" if np.isfinite(value) else "-"
 
 
 def measure_all(

@@ -57,7 +57,7 @@ def test_every_fault_of_the_catalogue_that_a_run_can_show_is_planted(sample_clip
     declared = {name.removeprefix("left_") for name in plantings(filmed)}
     assert kinds <= rendered
     assert kinds - declared == {"time_offset", "exposure_blur"}, "what is no matter of rig, disc, dots or rate"
-    assert {case.fault for case in fault_cases([filmed], ["radius"])} == {"radius"}
+    assert {fault for _, fault, _ in fault_cases([filmed], ["radius"])} == {"radius"}
 
 
 @pytest.fixture(scope="module")

@@ -9,6 +9,7 @@ import pytest
 from disctrack.cli import main
 from disctrack.faults.keys import CameraFault, Faults
 from disctrack.frames import rotation_from_euler
+from disctrack.recording.declaration import read_recording
 from disctrack.synthetic import rig_of
 from disctrack.trajectory import part
 from disctrack.validate.accuracy import accuracy_validation, complaints, imperfect_validation, sum_up, verdict
@@ -18,16 +19,17 @@ from disctrack.validate.rendered import (
     ROLLING,
     STATIC,
     STRATA_DEG,
+    at_rest,
     cameras_in_sight,
     ideal_cases,
     imperfect_case,
     locate,
+    render,
     render_and_measure,
     scene_of,
     static_poses,
 )
 from disctrack.validate.tables import write_into, write_validation
-from tests.rendering import render_disc
 
 GOAL_HEIGHT, GOAL_TILT = 5e-6, np.radians(5e-3)  # [m, rad] of the mean error in an imperfect laboratory
 
@@ -84,7 +86,8 @@ def test_a_biased_calibration_turns_the_verdict(outcomes):
 @pytest.mark.statistical
 def test_a_camera_turned_since_the_calibration_is_noticed_by_the_measurement_and_by_the_truth():
     turned = Faults(left=CameraFault(rotation_deg=(0.0, np.degrees(1e-3), 0.0)))
-    found = accuracy_validation(ideal(replace(scene_of(2014, quick=True), faults=turned), 24, 0, 0))
+    static, *_ = ideal_cases(replace(scene_of(2014, quick=True), faults=turned), 24, 1, 1)
+    found = accuracy_validation([render_and_measure(static)])
     assert "does not hold" in found.headline or "holds in part" in found.headline
     assert found.complaints
     assert found.remarks
@@ -144,34 +147,33 @@ def test_static_poses_cover_the_range_and_stand_on_the_table(rng):
     assert set(cameras_in_sight(q, rig, disc)) >= {1, 2}
 
 
-def poses_seen_by_both(n, rig, scene, rng):
-    """(n, 6) poses that both cameras see, from 3 to 30 deg of nutation."""
-    disc = scene.declared_disc
+def seen_by_both(n, scene, rng):
+    """n poses that both cameras see, from 3 to 30 deg of nutation, and one view of the board."""
+    scene = replace(scene, board=replace(scene.board, n_views=1))
+    rig, disc = rig_of(scene), scene.declared_disc
     q = static_poses(64, rig, disc, scene.rig.target_mm[:2], rng)
     seen = (cameras_in_sight(q, rig, disc) == 2) & (np.radians(3) < q[:, 4]) & (q[:, 4] < np.radians(30))
-    return rng.choice(q[seen], n, replace=False)
+    return at_rest(scene, rng.choice(q[seen], n, replace=False))
 
 
-def test_pairs_apart_are_each_found_without_the_one_before(rng):
-    scene = scene_of(1, quick=True)
-    rig, disc = rig_of(scene), scene.declared_disc
-    images = render_disc(poses_seen_by_both(4, rig, scene, rng), rig, disc, scene, rng)
-    assert locate(images, rig, disc, 1000.0, apart=True).acquisitions == 4
+def located(scene, folder):
+    """What is found through the true cameras, with the truth."""
+    truth = render(folder / "recording", scene)
+    return locate(read_recording(folder / "recording"), truth.rig), truth
+
+
+def test_poses_at_rest_are_each_found_without_the_one_before(rng, tmp_path):
+    tracking, _ = located(seen_by_both(4, scene_of(1, quick=True), rng), tmp_path)
+    assert tracking.acquisitions == 4
 
 
 @pytest.mark.parametrize(("bits", "read_noise"), [(8, 16.0), (12, 3.0), (16, 0.8)])
-def test_noisy_sensors_and_more_bits_are_measured_from_the_first_pair_on(bits, read_noise, rng):
+def test_noisy_sensors_and_more_bits_are_measured_from_the_first_pair_on(bits, read_noise, rng, tmp_path):
     """The noise is measured before dots are judged by it: what is large in grey values is not a misfit."""
     scene = scene_of(2, quick=True)
-    scene = replace(
-        scene,
-        cameras=replace(scene.cameras, bit_depth=bits),
-        sensor=replace(scene.sensor, read_noise_dn=read_noise),
-    )
-    rig, disc = rig_of(scene), scene.declared_disc
-    q = poses_seen_by_both(3, rig, scene, rng)
-    tracking = locate(render_disc(q, rig, disc, scene, rng), rig, disc, 1000.0, apart=True)
-    found = compare(part(tracking.trajectory, slice(None, None, 2)), q)
+    cameras, sensor = replace(scene.cameras, bit_depth=bits), replace(scene.sensor, read_noise_dn=read_noise)
+    tracking, truth = located(seen_by_both(3, replace(scene, cameras=cameras, sensor=sensor), rng), tmp_path)
+    found = compare(part(tracking.trajectory, slice(None, None, 2)), truth.q)
     assert found.usable.all()
     # on 40 numbers chance allows 1 +- 0.33
     assert 0.3 < noise_consistency(found).value < 2.0
@@ -201,14 +203,11 @@ def test_height_and_tilt_in_an_imperfect_laboratory_and_what_is_stated_of_them()
     assert imperfect_validation(outcomes).markdown().count("+-") == 13
     pulls = []
     for outcome in outcomes:
-        found = outcome.own
-        mean = found.error.mean(axis=0)
-        sigma = np.sqrt(np.median(np.diagonal(found.calibration_covariance, axis1=1, axis2=2), axis=0))
-        bends = np.diff(found.error, 2, axis=0) ** 2 / 6.0
+        mean, sigma = outcome.own.mean()
         # cameras of a quarter of the pixels: noise and what is left of the lens field are 1.7 times the paper's
         assert abs(mean[2]) < 1.7 * GOAL_HEIGHT
         assert np.abs(mean[3:5]).max() < 1.7 * GOAL_TILT
-        assert 0.7 < np.mean(bends / np.diagonal(found.covariance, axis1=1, axis2=2)[1:-1]) < 1.4
+        assert 0.7 < outcome.own.frame_to_frame() < 1.4
         assert max(outcome.systematic_px) > 0
         pulls.append(mean / sigma)
     assert np.abs(pulls).max() < 4
