@@ -78,19 +78,17 @@ class Accuracy:
 
 def sum_up(outcomes: Sequence[RenderedOutcome]) -> Accuracy:
     """Errors count where both cameras see the face."""
-    by_name = {name: [o for o in outcomes if o.name == name] for name in dict.fromkeys(o.name for o in outcomes)}
-    static, both = by_name[STATIC], {}
-    for name, some in by_name.items():
-        pairs = [outcome.seen_by_both for outcome in some]
-        both[name] = joined(own for own, _ in pairs), joined(true for _, true in pairs)
+    names = dict.fromkeys(outcome.name for outcome in outcomes)
+    pairs = {name: [outcome.seen_by_both for outcome in outcomes if outcome.name == name] for name in names}
+    both = {name: [joined(errors) for errors in zip(*some, strict=True)] for name, some in pairs.items()}
     _, noise = both[STATIC]
     law = noise.part(noise.usable & (noise.q[:, 4] < np.radians(LAW_DEG)))
     c = _rms(law.angles[:, [0, 2]] * np.sin(law.q[:, 4])[:, None])
     consistency = {f"noise, {name} (true cameras)": noise_consistency(true) for name, (_, true) in both.items()}
-    by_calibration = calibration_consistency(outcome.seen_by_both for outcome in static)
+    by_calibration = calibration_consistency(pairs[STATIC])
     return Accuracy(
         {name: _rows(*pair) for name, pair in both.items()},
-        tuple(_sight(joined(o.own.part(o.cameras == n) for o in static), n) for n in (2, 1, 0)),
+        tuple(_sight(joined(o.own.part(o.cameras == n) for o in outcomes if o.name == STATIC), n) for n in (2, 1, 0)),
         consistency | {"calibration, static poses (own - true cameras, same images)": by_calibration},
         c,
     )
@@ -140,8 +138,8 @@ def verdict(accuracy: Accuracy) -> str:
     position = max(rows[name].within_95 for name in "xyz")
     rotation = rows["rotation"].within_95
     two, one, _ = accuracy.sights
-    held = {position <= CLAIM_POSITION, rotation <= CLAIM_ROTATION}
-    name = "holds" if held == {True} else "does not hold" if held == {False} else "holds in part"
+    held = (position <= CLAIM_POSITION) + (rotation <= CLAIM_ROTATION)
+    name = ("does not hold", "holds in part", "holds")[held]
     text = (
         f"Where both cameras see the face, the claim of 0.005 mm and 0.05 deg {name}: 95 % of {two.n} poses lie within "
         f"{1e3 * position:.5f} mm per axis and {np.degrees(rotation):.4f} deg per rotation axis, calibration included. "

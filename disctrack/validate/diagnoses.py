@@ -127,8 +127,7 @@ def hide(case: HiddenCase) -> Verdict:
     stands_out, needed = _standing_out(result, parts)
     pulls = [_pull_of(result, p) for p in parts]
     d, nan = result.diagnosis, float("nan")
-    errors = [e for e in (result.before, result.after) if e]
-    reduced, free = [e.reduced_chi_square for e in errors], [e.ratio_to_floor for e in errors]
+    left = [(e.reduced_chi_square, e.ratio_to_floor) for e in (result.before, result.after) if e] or [(nan, nan)]
     return Verdict(
         case,
         len(trajectory),
@@ -137,8 +136,8 @@ def hide(case: HiddenCase) -> Verdict:
         named=None not in pulls,
         pull=max((p for p in pulls if p is not None), default=nan),
         extra=max(len(d.found) - len(parts), 0),
-        chi_square=(reduced[0], reduced[-1]) if errors else (nan, nan),
-        free_run=(free[0], free[-1]) if errors else (nan, nan),
+        chi_square=(left[0][0], left[-1][0]),
+        free_run=(left[0][1], left[-1][1]),
         gain=(d.before.cost - d.after.cost) / d.noise,
         p_value=d.chance.p_value if d.chance else nan,
         seconds=seconds,
