@@ -63,6 +63,7 @@ READING = (
     _wrong("smoothing.square", "s^2", 1e-6, 0.01**2, "moving average over the record, by the square of its span",
            "section 3b: 'a differential method'", (0.0, 0.06**2)),
 )  # fmt: skip
+NO_ERRORS = {q.name: 0.0 for c in READING for q in c.quantities}
 
 
 class LastStage:
@@ -74,56 +75,43 @@ class LastStage:
         model = Model(series.disc, GRAVITY).with_values(dict(values))
         state = steady_precession(series.start, series.disc, GRAVITY, omega3=omega3)
         motion = simulate(model, state, MAX_DURATION, rate=1 / SAMPLING, theta_end=END_SHARE * series.start, rtol=RTOL)
-        curves = _observed(motion.q, motion.qdot, series)
+        curves = _observed(motion.q, motion.qdot, series.disc)
         # a strong moment can stop the precession in the very last milliseconds; what is read lies before
         n = int(np.argmin(np.append(np.isfinite(curves).all(axis=1), False)))
-        last = motion.time[:n] > motion.end_time - 1.5 * series.longest
-        long_enough = motion.end_time > series.longest + SAMPLING and last.sum() > 3
-        ended = motion.end is EndReason.NUTATION and long_enough
+        ended = motion.end is EndReason.NUTATION and n > 1
         self.duration = motion.end_time if ended else float("nan")  # [s] from the start to collapse
         # ln theta, ln psidot, energy against time
-        self.curve = CubicSpline(motion.time[:n][last], curves[:n][last], axis=0) if ended else None
+        self.curve = CubicSpline(motion.time[:n], curves[:n], axis=0, extrapolate=False) if ended else None
 
-    def outcomes(self, reading: Mapping[str, float] | None = None) -> Array:
-        """(4,) OUTCOMES; NaN where there is no collapse. reading : those of READING that are not zero."""
+    def outcomes(self, reading: Mapping[str, float] = NO_ERRORS) -> Array:
+        """(4,) OUTCOMES as the experimenter has them; NaN where there is no collapse, or none so late."""
         if self.curve is None:
             return np.full(len(OUTCOMES), np.nan)
-        left, *quantities = self._read(
-            self.curve, {q.name: 0.0 for c in READING for q in c.quantities} | dict(reading or {})
-        )
-        return np.array([*(slope(left, v) for v in quantities), np.log(self.duration)])
-
-    def _read(self, curve: CubicSpline, reading: Mapping[str, float]) -> tuple[Array, Array, Array, Array]:
-        """Time left as the experimenter has it, nutation, precession rate, energy, (n,) each."""
-        series, disc = self.series, self.series.disc
+        wrong, disc = {**NO_ERRORS, **reading}, self.series.disc
         # a fixed number of instants, so that nothing jumps when a quantity of the fit moves
-        n = round((series.longest - SHORTEST) / FRAME) + 1
-        left = np.linspace(series.longest, SHORTEST + reading["cut.shift"], n)
-        time = self.duration + reading["t_f.bias"] - left
-        half = np.sqrt(max(reading["smoothing.square"], 0.0) / 12)  # two points stand for the mean to third order
-        if time[-1] + half > curve.x[-1] or left[-1] <= 0:
-            return (left, *np.full((3, n), np.nan))
-        ln_theta, ln_psidot, energy = (0.5 * (curve(time - half) + curve(time + half))).T
-        theta, psidot = np.exp(ln_theta) + reading["theta_zero.shift"], np.exp(ln_psidot)
-        rate_variance = reading["attitude_noise.variance"] / (2 * FRAME**2)  # of central differences
+        n = round((self.series.longest - SHORTEST) / FRAME) + 1
+        left = np.linspace(self.series.longest, SHORTEST + wrong["cut.shift"], n)
+        time = self.duration + wrong["t_f.bias"] - left
+        half = np.sqrt(wrong["smoothing.square"] / 12)  # two points stand for the mean to third order
+        ln_theta, ln_psidot, energy = (0.5 * (self.curve(time - half) + self.curve(time + half))).T
+        theta, psidot = np.exp(ln_theta) + wrong["theta_zero.shift"], np.exp(ln_psidot)
+        rate_variance = wrong["attitude_noise.variance"] / (2 * FRAME**2)  # of central differences
         psidot = psidot * np.exp(-0.5 * rate_variance / (psidot * np.sin(theta)) ** 2)  # mean of the noisy logarithm
         energy = energy + 0.5 * (2 * disc.moment_diametral + disc.moment_axial) * rate_variance
-        energy = energy + disc.mass * GRAVITY * reading["height_zero.shift"]
-        return left, theta, psidot, energy
+        energy = energy + disc.mass * GRAVITY * wrong["height_zero.shift"]
+        return np.array([*slope(left, np.column_stack([theta, psidot, energy])), np.log(self.duration)])
 
 
-def slope(left: Array, values: Array) -> float:
-    """Slope of ln values (n,) over ln left (n,) by ordinary least squares; NaN for values that have no logarithm."""
-    if not (np.isfinite(values).all() and (values > 0).all()):
-        return float("nan")
+def slope(left: Array, values: Array) -> Array:
+    """Slopes (...) of ln values (n, ...) over ln left (n,) by ordinary least squares; not finite without logarithms."""
     x = np.log(left)
     x = x - x.mean()
-    return float(x @ np.log(values) / (x @ x))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray(x @ np.log(values) / (x @ x), float)
 
 
-def _observed(q: Array, qdot: Array, series: Series) -> Array:
+def _observed(q: Array, qdot: Array, disc: Disc) -> Array:
     """(n, 3) ln theta, ln psidot and the energy (2.10) [J] with the declared disc, zero at rest."""
-    disc = series.disc
     theta, (psidot, thetadot, phidot) = q[:, 4], qdot[:, 3:].T
     spin = psidot * np.cos(theta) + phidot
     energy = 0.5 * disc.mass * np.sum(qdot[:, :3] ** 2, axis=1)

@@ -7,11 +7,11 @@ glass. On glass they contradict the paper's 2/3 and -1/3. The engine fits the pa
 through the catalogue of motions and through what the reading may do wrong, and says which effects would remove the
 contradiction, and which of them these tables cannot tell apart.
 
-A row is one exponent of one trial, cleared of what the exponents before it in the same trial predict (Cholesky), so
-that all rows are independent with variance one. One more row per surface is the time that the last stage lasts: the
-paper's k_m is that with which its simulation collapses at the measured instant, which is all that k_m can say once
-another law acts beside it. The tables' own t_f count from the blow that starts the disc, through seconds of slip; a
-rolling disc has nothing to say to them.
+A row is one trial: each exponent cleared of what those before it in the same trial predict (Cholesky), so that all
+numbers are independent with variance one. One more row per surface is the time that the last stage lasts: the paper's
+k_m is that with which its simulation collapses at the measured instant, which is all that k_m can say once another law
+acts beside it. The tables' own t_f count from the blow that starts the disc, through seconds of slip; a rolling disc
+has nothing to say to them.
 """
 
 from collections.abc import Sequence
@@ -28,12 +28,11 @@ from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.held_out import TRAIN_FRACTION
 from disctrack.discrepancy.search import Diagnosis, Settings, explain
 from disctrack.discrepancy.system import Candidate, Quantity, System, Values
-from disctrack.errors import AnalysisError
 from disctrack.examples._command import GRAVITY, Outcome, command, report_of
-from disctrack.examples.exponent_model import READING, LastStage, Series
+from disctrack.examples.exponent_model import NO_ERRORS, READING, LastStage, Series
 from disctrack.numbers import measured, probability, rounded, score
 from disctrack.report.blocks import Listing, Section
-from disctrack.rolling import CATALOGUE, Model, effects
+from disctrack.rolling import Model, effects
 
 ORDER = (1, 2, 0)  # of the table's columns: n_theta, n_psidot, n_energy; the energy last, as it depends on the spin
 NAMES = ("n_theta", "n_psidot", "n_energy")
@@ -47,18 +46,14 @@ K_M = {"steel": 0.381e-7, "glass": 0.28e-7}  # [m s^2] section 5c
 LONGEST = {"steel": 0.5, "glass": 0.3}  # [s] section 4a: time left where the fits of tables 2 and 3 begin
 LAST_STAGE = 1.5  # [s] simulated in section 5c
 STEP = 0.1  # of a quantity's scale, for differences: the simulation is smooth to 1e-8
-_SHARED = ("air", "body")  # modules of effects that do not depend on the surface
 
 
 def sample_covariance(exponents: Array) -> Array:
     """Covariance (k, k) of one trial, widened so that its inverse is unbiased (Hartlap, Simon & Schneider 2007).
 
     With the sample covariance as it is, chi-square of n = 8 trials of three numbers would be 7/3 of what it should be.
-    Raises AnalysisError for fewer than k + 3 trials.
     """
     n, k = exponents.shape
-    if n < k + 3:
-        raise AnalysisError(f"{n} trials of {k} numbers: their covariance needs {k + 3} trials or more")
     return np.asarray(np.cov(exponents.T) * (n - 1) / (n - k - 2), float)
 
 
@@ -75,85 +70,79 @@ def published_series() -> tuple[Series, ...]:
     return tuple(found)
 
 
-def _per_surface(quantities: Sequence[Quantity], surfaces: Sequence[str]) -> tuple[Quantity, ...]:
-    return tuple(replace(q, name=f"{q.name}@{s}") for q in quantities for s in surfaces)
-
-
-def exponent_candidates(surfaces: Sequence[str], names: Sequence[str] | None = None) -> tuple[Candidate, ...]:
+def exponent_candidates(surfaces: Sequence[str]) -> tuple[Candidate, ...]:
     """The catalogue of motions that roll, laws of the contact per surface; and what the reading may do wrong."""
-    found = []
+
+    def on_each(c: Candidate) -> Candidate:
+        return replace(c, quantities=tuple(replace(q, name=f"{q.name}@{s}") for q in c.quantities for s in surfaces))
+
+    found = list[Candidate]()
     for c in motion_candidates(Model(MA_2014, effects=(effects.effect_class("km").absent(),))):
-        shared = CATALOGUE[c.effect].__module__.rpartition(".")[2] in _SHARED
+        shared = all(q.belongs_to and "surface" not in q.belongs_to for q in c.quantities)
         if not c.threshold:
-            found.append(c if shared else replace(c, quantities=_per_surface(c.quantities, surfaces)))
+            found.append(c if shared else on_each(c))
     for c in READING:
-        each = _per_surface(c.quantities, surfaces)
-        found += [c, replace(c, name=f"{c.name}_each", title=f"{c.title}, each surface its own", quantities=each)]
-    return tuple(c for c in found if names is None or c.name in names)
+        found += [c, replace(on_each(c), name=f"{c.name}_each", title=f"{c.title}, each surface its own")]
+    return tuple(found)
 
 
 class ExponentSystem(System):
     """Several series of trials with their model, for the engine."""
 
-    def __init__(self, series: Sequence[Series], candidates: Sequence[str] | None = None) -> None:
-        """Candidates : names of those to look at; all if not given."""
+    def __init__(self, series: Sequence[Series]) -> None:
+        """Of each series its trials, of which the first part is fitted, and at last the duration."""
         self.series = tuple(series)
-        self.candidates = exponent_candidates([s.surface for s in series], candidates)
+        self.candidates = exponent_candidates([s.surface for s in series])
         self._stages: dict[tuple[object, ...], LastStage] = {}
-        # of each series its trials, three rows each, and at last the duration; of the trials the first part is fitted
-        counts = [len(s.exponents) for s in series]
-        shares = [np.repeat(np.append((np.arange(n) + 0.5) / n, 0.0), [3] * n + [1]) for n in counts]
+        self.weights = np.concatenate([[3.0] * len(s.exponents) + [1.0] for s in series])
+        shares = [np.append((np.arange(len(s.exponents)) + 0.5) / len(s.exponents), 0.0) for s in series]
         self.training = np.concatenate(shares) < TRAIN_FRACTION
-        self.time, self.weights = np.arange(len(self.training), dtype=float), np.ones(len(self.training))
+        self.time = np.arange(len(self.weights), dtype=float)
         self.base = tuple(
             q
             for s in self.series
             for q in (
-                Quantity(f"km.k_m@{s.surface}", "m s^2", 1e-3 * s.k_m, lower=0.0, typical=s.k_m),
+                Quantity(f"km.k_m@{s.surface}", "m s^2", 1e-3 * s.k_m, s.k_m, lower=0.0, typical=s.k_m),
                 Quantity(f"{SPIN}@{s.surface}", "rad/s", 0.01, SPIN_AT_REST, prior_sigma=SPIN_SIGMA),
             )
         )
 
-    @property
-    def start(self) -> dict[str, float]:
-        """Values from which the base fit begins."""
-        return {q.name: q.null for q in self.base} | {f"km.k_m@{s.surface}": s.k_m for s in self.series}
-
     def linearise(self, values: Values, names: Sequence[str]) -> tuple[Array, Array]:
-        """Whitened residual (n, 1) and derivative (n, 1, k) by central differences, one-sided at bounds."""
+        """Whitened residual (n, 3) and derivative (n, 3, k) by central differences, one-sided at bounds."""
         known = {q.name: q for q in (*self.base, *(q for c in self.candidates for q in c.quantities))}
         residual = self._residual(values)
-        derivative = np.zeros((len(residual), len(names)))
+        derivative = np.zeros((*residual.shape, len(names)))
         for k, name in enumerate(names):
             q, value = known[name], values.get(name, 0.0)
             # central differences away from bounds: with large residuals their gradient decides about convergence
             up, down = min(value + STEP * q.scale, q.upper), max(value - STEP * q.scale, q.lower)
             change = self._residual({**values, name: down}) - self._residual({**values, name: up})
-            derivative[:, k] = change / (up - down)
-        return residual[:, None], derivative[:, None]
+            derivative[..., k] = change / (up - down)
+        return residual, derivative
 
     def _residual(self, values: Values) -> Array:
-        """(n,) observed minus predicted, whitened."""
-        parts = []
+        """(n, 3) observed minus predicted, whitened."""
+        rows = []
         for i, s in enumerate(self.series):
-            predicted = self.outcomes(i, values)
-            whiten = np.linalg.inv(np.linalg.cholesky(sample_covariance(s.exponents)))
-            parts += [((s.exponents - predicted[:3]) @ whiten.T).ravel()]
-            parts += [np.array([s.ln_duration - predicted[3]]) / DURATION_SIGMA]
-        return np.concatenate(parts)
+            *exponents, ln_duration = self.outcomes(i, values)
+            root = np.linalg.cholesky(sample_covariance(s.exponents))
+            rows += [*np.linalg.solve(root, (s.exponents - exponents).T).T]
+            rows += [np.array([(s.ln_duration - ln_duration) / DURATION_SIGMA, 0.0, 0.0])]
+        return np.array(rows)
 
     def outcomes(self, index: int, values: Values) -> Array:
         """(4,) predicted means of one series: n_theta, n_psidot, n_energy, ln duration.
 
-        Of values that stand with and without the surface in their names the series sees the sum.
+        Base quantities that are not among the values are at their null. Of values that stand with and without the
+        surface in their names the series sees the sum.
         """
         series, own = self.series[index], dict[str, float]()
-        for name, value in values.items():
+        for name, value in ({q.name: q.null for q in self.base} | dict(values)).items():
             plain, _, surface = name.partition("@")
             if surface in ("", series.surface):
                 own[plain] = own.get(plain, 0.0) + value
-        spin = own.pop(SPIN, SPIN_AT_REST)
-        reading = {q.name: own.pop(q.name) for c in READING for q in c.quantities if q.name in own}
+        spin = own.pop(SPIN)
+        reading = {name: own.pop(name) for name in NO_ERRORS if name in own}
         laws = {name: value for name, value in own.items() if value or name == "km.k_m"}
         key = (index, spin, *sorted(laws.items()))
         if key not in self._stages:
@@ -221,7 +210,7 @@ def tables_of(system: ExponentSystem, d: Diagnosis) -> list[Section]:
         m = misfit(s.surface, s.exponents, THIN_DISC)
         for name, mean, sigma, predicted, away in zip(NAMES, m.mean, m.sigma, THIN_DISC, m.sigmas, strict=True):
             means.append((s.surface, name, measured(mean, sigma), rounded(predicted, 4), f"{away:.1f}"))
-        means.append((s.surface, f"together, p = {probability(m.p_value)}", "", "", f"{m.joint_sigmas:.1f}"))
+        means.append((s.surface, f"together, p {probability(m.p_value)}", "", "", f"{m.joint_sigmas:.1f}"))
     for effect, f in in_question(d).items():
         own = [q for q in f.quantities if q not in d.before.quantities]
         sizes = ", ".join(f"{q.name} = {measured(f.values[q.name], f.sigma(q.name), q.unit)}" for q in own)
@@ -237,7 +226,7 @@ def tables_of(system: ExponentSystem, d: Diagnosis) -> list[Section]:
 def example() -> Outcome:
     """Diagnose the published exponents of Ma et al. (2014)."""
     system = ExponentSystem(published_series())
-    d = explain(system, system.start, SETTINGS, system.training)
+    d = explain(system, {}, SETTINGS, system.training)
     model = "rolling disc with k_m, straight lines through the logarithms in the paper's windows"
     report = report_of(d, model, sentence(system, d), tables_of(system, d))
     source = "Ma, Liu, Zhao and Zhang 2014, Proc. R. Soc. A 470:20140191, tables 2 and 3"

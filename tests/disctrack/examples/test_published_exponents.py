@@ -10,13 +10,13 @@ from numpy.testing import assert_allclose
 from disctrack.disc import MA_2014
 from disctrack.discrepancy.fit import fit
 from disctrack.discrepancy.search import explain
-from disctrack.errors import AnalysisError
 from disctrack.examples import published_exponents
 from disctrack.examples._command import command
 from disctrack.examples.exponent_model import LastStage, Series, slope
 from disctrack.examples.published_exponents import (
     THIN_DISC,
     ExponentSystem,
+    in_question,
     left_by,
     misfit,
     published_series,
@@ -30,6 +30,13 @@ FEW = ("t_f", "air_bildsten", "contour_viscous", "theta_zero", "kz")
 @pytest.fixture(scope="module")
 def published() -> tuple[Series, ...]:
     return published_series()
+
+
+def offering(series, names):
+    """The system with some of its candidates."""
+    system = ExponentSystem(series)
+    system.candidates = tuple(c for c in system.candidates if c.name in names)
+    return system
 
 
 def tables(published, values, rng, scatter=1.0, n=12):
@@ -72,8 +79,6 @@ def test_the_widened_covariance_makes_chi_square_of_the_mean_its_number_of_expon
         mean = trials.mean(axis=0)
         chi_square.append(15 * mean @ np.linalg.solve(sample_covariance(trials), mean))
     assert abs(np.mean(chi_square) - 3) < 0.25
-    with pytest.raises(AnalysisError, match="5 trials of 3 numbers"):
-        sample_covariance(rng.normal(size=(5, 3)))
 
 
 @pytest.mark.parametrize(
@@ -111,7 +116,7 @@ def test_an_early_t_f_lowers_the_exponents_as_for_an_exact_power_law():
 def test_chi_square_of_the_system_is_the_distance_of_all_trials_from_the_prediction(published):
     """Mahalanobis with the covariance of a trial, and the duration with its 3 %; independent of the order of rows."""
     system = ExponentSystem(published)
-    values = system.start | {"t_f.bias": -0.004, "contour_viscous.c@glass": 2e-5}
+    values = {"t_f.bias": -0.004, "contour_viscous.c@glass": 2e-5}
     expected = 0.0
     for i, s in enumerate(published):
         outcome = system.outcomes(i, values)
@@ -120,16 +125,10 @@ def test_chi_square_of_the_system_is_the_distance_of_all_trials_from_the_predict
         expected += ((s.ln_duration - outcome[3]) / 0.03) ** 2
     residual, derivative = system.linearise(values, ["contour_viscous.c@glass", "t_f.bias"])
     assert_allclose(np.sum(residual**2), expected, rtol=1e-9)
-    steel = 3 * len(published[0].exponents)  # rows of its trials; then comes its duration
+    steel = len(published[0].exponents)  # rows of its trials; then comes its duration
     assert (derivative[: steel + 1, :, 0] == 0).all()  # friction on glass does nothing on steel
     assert (derivative[[steel, -1], :, 1] == 0).all()  # nor does t_f for the duration
     assert np.abs(derivative).max(axis=(0, 1)).all()
-
-
-def fits_of_the_class(found):
-    """Fit of every effect that is named, and of those that it cannot be told from."""
-    fits = {f.candidate.name: found.after for f in found.found}
-    return fits | {r.candidate.name: r.fit for f in found.found for r in f.cannot_be_told_from}
 
 
 @pytest.mark.parametrize(
@@ -141,20 +140,19 @@ def fits_of_the_class(found):
 )
 def test_what_is_planted_is_found_in_its_class_and_sized(published, planted, size, offered, n):
     """With the published scatter, and so many trials per surface that something is missing for sure."""
-    truth = ExponentSystem(published).start | {planted: size}
-    system = ExponentSystem(tables(published, truth, np.random.default_rng(2), n=n), offered)
-    found = explain(system, system.start, QUICK, system.training)
+    truth = {planted: size}
+    system = offering(tables(published, truth, np.random.default_rng(2), n=n), offered)
+    found = explain(system, {}, QUICK, system.training)
     assert found.verdict == "found"
-    fits = fits_of_the_class(found)
+    fits = in_question(found)
     assert not {"kz", "theta_zero"} & set(fits)
     name = planted.partition(".")[0]
     assert abs(fits[name].values[planted] - size) < 3 * fits[name].sigma(planted)
 
 
 def test_nothing_is_claimed_where_nothing_was_planted(published, rng):
-    start = ExponentSystem(published).start
-    system = ExponentSystem(tables(published, start, rng, n=9), FEW)
-    found = explain(system, system.start, QUICK, system.training)
+    system = offering(tables(published, {}, rng, n=9), FEW)
+    found = explain(system, {}, QUICK, system.training)
     assert found.verdict == "nothing missing"
     assert not found.found
 
@@ -163,7 +161,7 @@ def test_nothing_is_claimed_where_nothing_was_planted(published, rng):
 def test_on_the_published_trials_a_biased_t_f_and_steeper_laws_do_equally_well(published):
     """Each lowers chi-square by more than noise reaches (14.7 for one number), to within 1.7 sigma per surface."""
     system = ExponentSystem(published)
-    base = fit(system, system.base, system.start)
+    base = fit(system, system.base, {})
     assert base.converged
     glass = published[1]
     assert misfit("glass", glass.exponents, system.outcomes(1, base.values)[:3]).joint_sigmas > 2.5
@@ -179,8 +177,8 @@ def test_on_the_published_trials_a_biased_t_f_and_steeper_laws_do_equally_well(p
 @pytest.mark.statistical
 def test_effects_that_cannot_bend_the_law_are_refused_on_the_published_trials(published):
     """Something is missing there, but none of these is: offered alone they gain less than noise may."""
-    system = ExponentSystem(published, ("kz", "theta_zero", "rolling_classical", "edge_radius", "smoothing"))
-    found = explain(system, system.start, QUICK, system.training)
+    system = offering(published, ("kz", "theta_zero", "rolling_classical", "edge_radius", "smoothing"))
+    found = explain(system, {}, QUICK, system.training)
     assert found.before.converged
     assert not found.found
 
@@ -189,15 +187,14 @@ def test_effects_that_cannot_bend_the_law_are_refused_on_the_published_trials(pu
 def test_false_alarms_and_finds_over_many_tables(published):
     """At the published scatter: 1 false claim in 20 at most; a bias of 20 ms is found in its class in 9 of 10."""
     rng = np.random.default_rng(7)
-    start = ExponentSystem(published).start
     claims = names = 0
     for _ in range(20):
-        system = ExponentSystem(tables(published, start, rng, n=9), FEW)
-        claims += bool(explain(system, system.start, QUICK, system.training).found)
+        system = offering(tables(published, {}, rng, n=9), FEW)
+        claims += bool(explain(system, {}, QUICK, system.training).found)
     assert claims <= 1
     for _ in range(10):
-        system = ExponentSystem(tables(published, start | {"t_f.bias": -0.02}, rng, n=9), FEW)
-        names += "t_f" in fits_of_the_class(explain(system, system.start, QUICK, system.training))
+        system = offering(tables(published, {"t_f.bias": -0.02}, rng, n=9), FEW)
+        names += "t_f" in in_question(explain(system, {}, QUICK, system.training))
     assert names >= 9
 
 
