@@ -157,27 +157,23 @@ def errors_on_second_drops(drops: Sequence[Run], equations: Equations) -> Array:
     return np.median(errors, axis=0)
 
 
-def _words(effects: Sequence[str]) -> str:
-    return " + ".join(e.replace("_drag", " drag") for e in effects)
-
-
 def sentence(answer: BallAnswer) -> str:
     """The answer in plain words."""
     if not answer.together.found:
         return f"Nothing is claimed to be missing besides gravity: {answer.together.diagnosis.reason}."
     null = [name for name, a in answer.alone.items() if a.verdict == "nothing missing"]
     text = f"Drag is missing (not seen, for these drops, on {', '.join(null) or 'none'})"
+    forms = " and ".join(" + ".join(effects) for effects in answer.undecided)
     if answer.identifiable:
-        return f"{text}; its form is that of {_words(answer.undecided[0])}."
-    alternatives = " and ".join(_words(effects) for effects in answer.undecided)
-    return f"{text}, but its form is not identifiable: {alternatives} describe the drops equally well."
+        return f"{text}; its form is that of {forms}."
+    return f"{text}, but its form is not identifiable: {forms} describe the drops equally well."
 
 
 def report(answer: BallAnswer) -> Report:
     """Before and after, for people."""
     n = answer.noise
-    errors = [(_words([name]), *(rounded(x) for x in both)) for name, both in answer.errors.items()]
-    forms = [(_words(effects), score(over)) for effects, over in answer.forms.items()]
+    errors = [(name, *(rounded(x) for x in both)) for name, both in answer.errors.items()]
+    forms = [(" + ".join(effects), score(over)) for effects, over in answer.forms.items()]
     alone = [(name, a.verdict, ", ".join(a.found)) for name, a in answer.alone.items()]
     return Report(
         "Falling balls: what does gravity alone lack?",

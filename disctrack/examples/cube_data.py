@@ -83,20 +83,19 @@ def read_tosses(folder: Path) -> tuple[Toss, ...]:
     return tuple(Toss(i, position[a:b], rotation[a:b]) for i, (a, b) in enumerate(spans))
 
 
-def without_copies(tosses: Sequence[Toss]) -> tuple[tuple[Toss, ...], int]:
-    """Tosses without those that are others turned about the vertical, and how many they were.
+def without_copies(tosses: Sequence[Toss]) -> tuple[Toss, ...]:
+    """Tosses without those that are others turned about the vertical.
 
     Such copies have the same heights to the last digit; in a comparison with held-out tosses they would be cheats.
     """
     first: dict[bytes, Toss] = {}
     for toss in tosses:
         first.setdefault(np.round(toss.position[:8, 2] / HALF_WIDTH, 6).tobytes(), toss)
-    kept = tuple(first.values())
-    return kept, len(tosses) - len(kept)
+    return tuple(first.values())
 
 
-def flights(tosses: Sequence[Toss]) -> tuple[tuple[Flight, ...], int]:
-    """The first flight of every toss, and how many were left out because they are too short, or not smooth.
+def flights(tosses: Sequence[Toss]) -> tuple[Flight, ...]:
+    """The first flight of every toss, but for those that are too short, or not smooth.
 
     A flight begins with the first sample that keeps to the smooth motion of the others (before, a hand still holds the
     cube; the very first sample is never taken) and lasts until a corner comes as low as CLEARANCE.
@@ -112,7 +111,7 @@ def flights(tosses: Sequence[Toss]) -> tuple[tuple[Flight, ...], int]:
             if off[0] <= RELEASE and off.max() <= GLITCH:
                 found.append(flight)
                 break
-    return tuple(found), len(tosses) - len(found)
+    return tuple(found)
 
 
 def smooth_flight(toss: Toss, first: int, end: int) -> Flight:

@@ -30,7 +30,6 @@ from disctrack.examples.cube_data import (
     FRAME_RATE,
     HALF_WIDTH,
     Flight,
-    Toss,
     flights,
     integrated,
     read_tosses,
@@ -61,11 +60,9 @@ class CubeTosses(System):
 
     candidates = CANDIDATES
 
-    def __init__(self, tosses: Sequence[Toss]) -> None:
-        """Find the flights, measure their noise, whiten."""
-        tosses, self.n_copies = without_copies(tosses)
-        self.flights, self.n_left_out = flights(tosses)
-        rows = [_rows(f) for f in self.flights]
+    def __init__(self, flights: Sequence[Flight]) -> None:
+        """Measure the noise, and whiten."""
+        self.flights, rows = flights, [_rows(f) for f in flights]
         self._raw = np.concatenate(rows)
         ends = np.cumsum([0, *map(len, rows)])
         self.blocks = [slice(a, b) for a, b in pairwise(ends.tolist())]
@@ -185,7 +182,9 @@ def errors(system: CubeTosses, d: Diagnosis) -> tuple[dict[str, float], dict[str
 
 def example(folder: Path) -> Outcome:
     """What do gravity and torque-free rotation lack for a tossed cube?"""
-    system = CubeTosses(read_tosses(folder))
+    published = read_tosses(folder)
+    tosses = without_copies(published)
+    system = CubeTosses(flights(tosses))
     d = diagnosed(system)
     before, after = errors(system, d)
     effects = "; ".join(effect_text(f, d) for f in d.found)
@@ -196,11 +195,12 @@ def example(folder: Path) -> Outcome:
         size, unit = (float(np.degrees(1e3)), "mdeg") if group == "turn" else (1e6, "um")
         numbers = (before[group], after[group], noise.white)
         rows.append((f"rms {group} ({unit})", *(rounded(size * x) for x in numbers)))
-    tosses = (
-        f"{len(system.flights)} flights ({system.n_left_out} tosses left out: too short, or not smooth; "
-        f"{system.n_copies} copies of others turned about the vertical), {system.n_at_rest} cubes at rest."
+    copies, left_out = len(published) - len(tosses), len(tosses) - len(system.flights)
+    caption = (
+        f"{len(system.flights)} flights, {system.n_at_rest} cubes at rest; {left_out} tosses are left out (too short, "
+        f"or not smooth), and {copies} copies of others, turned about the vertical."
     )
-    blocks = [Section("Every third toss, held out", [Listing(("", "before", "after", "white noise"), rows, tosses)])]
+    blocks = [Section("Every third toss, held out", [Listing(("", "before", "after", "white noise"), rows, caption)])]
     model = f"g = {GRAVITY} m/s^2, uniform cube, {FRAME_RATE:g} Hz, half width {HALF_WIDTH} m"
     return report_of(d, model, said, blocks, [{"rms": before}, {"rms": after}]), {}
 

@@ -15,7 +15,7 @@ has nothing to say to them.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy import stats
@@ -30,7 +30,7 @@ from disctrack.discrepancy.search import Diagnosis, Settings, explain
 from disctrack.discrepancy.system import Candidate, Quantity, System, Values
 from disctrack.examples._command import GRAVITY, Outcome, command, report_of
 from disctrack.examples.exponent_model import NO_ERRORS, READING, LastStage, Series
-from disctrack.numbers import measured, probability, rounded, score
+from disctrack.numbers import measured, rounded, score
 from disctrack.report.blocks import Listing, Section
 from disctrack.rolling import Model, effects
 
@@ -150,35 +150,21 @@ class ExponentSystem(System):
         return self._stages[key].outcomes(reading)
 
 
-@dataclass(frozen=True)
-class Misfit:
-    """Mean exponents of one surface against a prediction without error."""
+def sigmas_off(exponents: Array, predicted: Array) -> float:
+    """How far the mean of trials (n, k) is off a prediction (k,) without error: Hotelling's T-squared of all together.
 
-    surface: str
-    mean: Array  # (3,)
-    sigma: Array  # (3,) of the mean, from the scatter of the trials
-    t: Array  # (3,) Student's
-    sigmas: Array  # (3,) deviations as a normal variable of the same probability would have them
-    p_value: float  # of all three together, Hotelling's T-squared
-    joint_sigmas: float  # the same in normal standard deviations, two-sided
-
-
-def misfit(surface: str, exponents: Array, predicted: Array) -> Misfit:
-    """Student's t of each exponent and Hotelling's T-squared of all; exponents (n, 3), predicted (3,)."""
+    In sigmas: those that a normal variable of the same probability would be off.
+    """
     n, k = exponents.shape
-    mean, covariance = exponents.mean(axis=0), np.cov(exponents.T) / n
-    difference, sigma = mean - predicted, np.sqrt(np.diag(covariance))
-    t = difference / sigma
-    t_squared = float(difference @ np.linalg.solve(covariance, difference))
-    p = float(stats.f.sf(t_squared * (n - k) / (k * (n - 1)), k, n - k))
-    sigmas = np.sign(t) * stats.norm.isf(stats.t.sf(np.abs(t), n - 1))
-    return Misfit(surface, mean, sigma, t, sigmas, p, float(stats.norm.isf(p / 2)))
+    difference = exponents.mean(axis=0) - predicted
+    t_squared = n * difference @ np.linalg.solve(np.cov(exponents.T), difference)
+    p = stats.f.sf(t_squared * (n - k) / (k * (n - 1)), k, n - k)
+    return float(stats.norm.isf(p / 2))
 
 
-def left_by(system: ExponentSystem, fit: Fit) -> tuple[Misfit, ...]:
-    """Every surface against the prediction of a fit."""
-    sides = enumerate(system.series)
-    return tuple(misfit(s.surface, s.exponents, system.outcomes(i, fit.values)[:3]) for i, s in sides)
+def left_by(system: ExponentSystem, fit: Fit) -> list[float]:
+    """How many sigmas the trials on every surface are off the prediction of a fit."""
+    return [sigmas_off(s.exponents, system.outcomes(i, fit.values)[:3]) for i, s in enumerate(system.series)]
 
 
 def in_question(d: Diagnosis) -> dict[str, Fit]:
@@ -193,33 +179,31 @@ def sentence(system: ExponentSystem, d: Diagnosis) -> str:
     if not fits:
         return f"Nothing is claimed: {d.reason}."
     gains = [d.before.cost - f.cost for f in fits.values()]
-    worst = max((misfit(s.surface, s.exponents, THIN_DISC) for s in system.series), key=lambda m: m.joint_sigmas)
-    after = max(m.joint_sigmas for f in fits.values() for m in left_by(system, f))
+    before, surface = max((sigmas_off(s.exponents, THIN_DISC), s.surface) for s in system.series)
+    after = max(max(left_by(system, f)) for f in fits.values())
     text = (
-        f"The trials on {worst.surface} lie {worst.joint_sigmas:.1f} sigma from 2/3, -1/3, 2/3; each alone of "
-        f"{', '.join(fits)} brings every surface within {after:.1f} sigma, and "
-        f"chi-square down by {min(gains):.0f} to {max(gains):.0f}"
+        f"The trials on {surface} lie {before:.1f} sigma from 2/3, -1/3, 2/3; each alone of {', '.join(fits)} brings "
+        f"every surface within {after:.1f} sigma, and chi-square down by {min(gains):.0f} to {max(gains):.0f}"
     )
     return text + (": not identifiable from these tables." if len(gains) > 1 else ".")
 
 
 def tables_of(system: ExponentSystem, d: Diagnosis) -> list[Section]:
-    """Mean of the trials, and what each effect in question leaves of them."""
-    means, left = [], []
+    """Means of the trials, and how far off they are what each effect in question predicts."""
+    means = [("thin disc", *(rounded(x, 4) for x in THIN_DISC))]
     for s in system.series:
-        m = misfit(s.surface, s.exponents, THIN_DISC)
-        for name, mean, sigma, predicted, away in zip(NAMES, m.mean, m.sigma, THIN_DISC, m.sigmas, strict=True):
-            means.append((s.surface, name, measured(mean, sigma), rounded(predicted, 4), f"{away:.1f}"))
-        means.append((s.surface, f"together, p {probability(m.p_value)}", "", "", f"{m.joint_sigmas:.1f}"))
+        both = zip(s.exponents.mean(axis=0), stats.sem(s.exponents), strict=True)
+        means.append((s.surface, *(str(measured(*x)) for x in both)))
+    thin = [sigmas_off(s.exponents, THIN_DISC) for s in system.series]
+    off = [("thin disc", "", *(f"{x:.1f}" for x in thin), "")]
     for effect, f in in_question(d).items():
         own = [q for q in f.quantities if q not in d.before.quantities]
         sizes = ", ".join(f"{q.name} = {measured(f.values[q.name], f.sigma(q.name), q.unit)}" for q in own)
-        away = (f"{m.joint_sigmas:.1f}" for m in left_by(system, f))
-        left.append((effect, score(d.before.cost - f.cost), *away, sizes))
+        off.append((effect, score(d.before.cost - f.cost), *(f"{x:.1f}" for x in left_by(system, f)), sizes))
     surfaces = (f"sigmas of {s.surface}" for s in system.series)
     return [
-        Section("Mean of the trials", [Listing(("", "", "mean", "thin disc", "sigmas"), means)]),
-        Section("Refitted", [Listing(("effect", "chi-square falls by", *surfaces, "size"), left)]),
+        Section("Mean of the trials", [Listing(("", *NAMES), means)]),
+        Section("Refitted", [Listing(("effect", "chi-square falls by", *surfaces, "size"), off)]),
     ]
 
 
