@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+Numbers = NDArray[np.inexact[Any]]  # real, or complex where imaginary parts carry derivatives
 Array32 = NDArray[np.float32]
 Image = NDArray[np.uint8] | NDArray[np.uint16]  # one image or a stack of them, as a camera gives it
 

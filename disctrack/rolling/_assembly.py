@@ -6,12 +6,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from calibration.kit.arrays import Numbers
 from disctrack.rolling import integrate
 from disctrack.rolling._compiled import compile_law, compile_system
 from disctrack.rolling.effects.base import HELPERS
 from disctrack.rolling.equations import EVENTS, FILM, FLYING, rates
 from disctrack.rolling.model import Model, body_constants, effect_values
-from disctrack.rolling.records import BODY, INSTANT, Numbers, Records, record_dtype
+from disctrack.rolling.records import BODY, INSTANT, Records, record_dtype
 
 
 class Assembly:

@@ -44,9 +44,10 @@ from typing import TypeAlias
 
 import numpy as np
 
+from calibration.kit.arrays import Numbers
 from calibration.kit.compiled import njit
 from disctrack.rolling._compiled import Addresses, call
-from disctrack.rolling.records import Numbers, Record
+from disctrack.rolling.records import Record
 
 Vector: TypeAlias = tuple[complex, complex, complex]  # all numbers may be real
 State: TypeAlias = Sequence[complex]

@@ -1,4 +1,4 @@
-"""Runge-Kutta method of order 8 with dense output (coefficients: SciPy's DOP853) and events, compiled.
+"""Runge-Kutta method of order 8 with dense output and events, compiled.
 
 It has never heard of discs: the system is a C function by address that gives rates and event margins. Numbers may be
 complex: an imaginary part of 1e-30 on a starting value or a parameter is carried along as the exact derivative of the
@@ -11,26 +11,17 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.integrate import DOP853
 
-from calibration.kit.arrays import Array
+from calibration.kit import _dop853 as dop853
+from calibration.kit.arrays import Array, Numbers
 from calibration.kit.compiled import njit
 from disctrack.rolling._compiled import call
-from disctrack.rolling.records import Numbers, Records
+from disctrack.rolling.records import Records
 
 REACHED_END, EVENT, TOO_MANY_STEPS, NOT_FINITE = range(4)
 RTOL_IMAGINARY = 1e-7  # error of fifth order per step; the derivatives then hold to about 1e-9 of their size
 MAX_STEPS = 200_000
 INSTANT = 1e-16  # [s] between which events are not told apart
-
-_part = njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)  # called by compiled functions only
-
-_N = DOP853.n_stages  # 12; stage 12 is the rate at the end of the step, stages 13 to 15 serve the dense output
-_A = np.zeros((_N + 4, _N + 4))
-_A[:_N, :_N] = DOP853.A[:_N, :_N]
-_A[_N + 1 :] = DOP853.A_EXTRA
-_C = np.concatenate([DOP853.C[:_N], [1.0], DOP853.C_EXTRA])
-_B, _E3, _E5, _D = (np.ascontiguousarray(a) for a in (DOP853.B, DOP853.E3, DOP853.E5, DOP853.D))
 
 
 class CompiledSystem(NamedTuple):
@@ -41,16 +32,6 @@ class CompiledSystem(NamedTuple):
     b: int
     c: int
     n_margins: int
-
-
-class _Work(NamedTuple):
-    """Scratch of a step; Numbers."""
-
-    K: Numbers  # (16, n + n_margins) rates at the stages, and margins
-    F: Numbers  # (7, n) of the polynomial through the step
-    y_stage: Numbers  # (n,)
-    y_new: Numbers  # (n,) at the end of the step
-    t: Numbers  # (1,)
 
 
 class Solved(NamedTuple):
@@ -89,53 +70,32 @@ def evaluate(system: CompiledSystem, t: Numbers, Y: Numbers, instant: Records) -
     return out[:, : Y.shape[1]], out[:, Y.shape[1] :], found
 
 
-@_part
+@dop853.part
 def _assign(target: Numbers, values: Numbers) -> None:
     """As target[:] = values, for which numba compiles the text of an error besides: a second."""
     for i in range(target.size):
         target[i] = values[i]
 
 
-@_part
-def _rates(system: CompiledSystem, t: complex, y: Numbers, out: Numbers, t_box: Numbers) -> None:
+@dop853.part
+def _rates(t: complex, y: Numbers, out: Numbers, system: CompiledSystem, t_box: Numbers) -> None:
     t_box[0] = t
     call(system.function, (t_box.ctypes.data, y.ctypes.data, out.ctypes.data, system.a, system.b, system.c))
+
+
+_step, _polynomial = dop853.method(_rates)
 
 
 @njit(cache=True, error_model="numpy")
 def _evaluate(system: CompiledSystem, t: Numbers, Y: Numbers, out: Numbers, instant: Numbers, found: Numbers) -> None:
     t_box = t[:1].copy()
     for i in range(len(t)):
-        _rates(system, t[i], Y[i], out[i], t_box)
+        _rates(t[i], Y[i], out[i], system, t_box)
         _assign(found[i], instant)
 
 
-@_part
-def _stages(system: CompiledSystem, t: complex, y: Numbers, h: complex, first: int, last: int, work: _Work) -> None:
-    """K[i] = f(t + c_i h, y + h sum_j a_ij K_j) for first <= i < last."""
-    K = work.K
-    for i in range(first, last):
-        for k in range(y.size):
-            total = _A[i, 0] * K[0, k]
-            for j in range(1, i):
-                total += _A[i, j] * K[j, k]
-            work.y_stage[k] = y[k] + h * total
-        _rates(system, t + _C[i] * h, work.y_stage, K[i], work.t)
-
-
-@_part
-def _step(system: CompiledSystem, t: complex, y: Numbers, h: complex, work: _Work) -> None:
-    """y_new = y(t + h) of order 8 from K[0] = f(t, y)."""
-    _stages(system, t, y, h, np.int64(1), np.int64(_N), work)  # a literal is a type of its own
-    for k in range(y.size):
-        total = _B[0] * work.K[0, k]
-        for i in range(1, _N):
-            total += _B[i] * work.K[i, k]
-        work.y_new[k] = y[k] + h * total
-
-
-@_part
-def _error(y: Numbers, h: float, rtol: float, atol: Array, size: Array, work: _Work) -> float:
+@dop853.part
+def _error(y: Numbers, h: float, rtol: float, atol: Array, size: Array, made: dop853.Step) -> float:
     """Hairer's combination of the embedded errors of order 5 and 3, in units of the tolerance.
 
     Or, where it is more, the error of order 5 of the imaginary parts; `size` (1,) is their largest so far in atol.
@@ -143,10 +103,10 @@ def _error(y: Numbers, h: float, rtol: float, atol: Array, size: Array, work: _W
     sum5, sum3, worst = 0.0, 0.0, 0.0
     for k in range(y.size):
         e5, e3 = 0.0 * y[k], 0.0 * y[k]
-        for i in range(_E5.size):
-            e5 += _E5[i] * work.K[i, k]
-            e3 += _E3[i] * work.K[i, k]
-        new = work.y_new[k]
+        for i in range(dop853.E5.size):
+            e5 += dop853.E5[i] * made.K[i, k]
+            e3 += dop853.E3[i] * made.K[i, k]
+        new = made.end[k]
         scale = atol[k] + rtol * max(abs(y[k].real), abs(new.real))
         sum5 += (e5.real / scale) ** 2
         sum3 += (e3.real / scale) ** 2
@@ -162,35 +122,16 @@ def _error(y: Numbers, h: float, rtol: float, atol: Array, size: Array, work: _W
     return error
 
 
-@_part
-def _fill(
-    system: CompiledSystem, t: complex, y: Numbers, h: complex, work: _Work, grid: Array, i_grid: int, solution: Numbers
-) -> int:
+@dop853.part
+def _fill(F: Numbers, t: complex, y: Numbers, h: complex, grid: Array, i_grid: int, solution: Numbers) -> int:
     """Write the grid points from number i_grid up to the end of the step; returns the number of the next one."""
-    K, F = work.K, work.F
-    _stages(system, t, y, h, np.int64(_N + 1), np.int64(_N + 4), work)
-    for k in range(y.size):  # the polynomial of degree 7 through the step
-        difference = work.y_new[k] - y[k]
-        F[0, k] = difference
-        F[1, k] = h * K[0, k] - difference
-        F[2, k] = 2.0 * difference - h * (K[_N, k] + K[0, k])
-        for row in range(4):
-            total = _D[row, 0] * K[0, k]
-            for i in range(1, _N + 4):
-                total += _D[row, i] * K[i, k]
-            F[3 + row, k] = h * total
     while i_grid < grid.size and grid[i_grid] <= (t + h).real:
-        x = (grid[i_grid] - t) / h
-        for k in range(y.size):  # by nested factors x, 1 - x, x, ...
-            total = 0.0 * F[0, k]
-            for i in range(7):
-                total = (total + F[6 - i, k]) * (x if i % 2 == 0 else 1.0 - x)
-            solution[i_grid, k] = y[k] + total
+        dop853.along(F, y, (grid[i_grid] - t) / h, solution[i_grid])
         i_grid += 1
     return i_grid
 
 
-@_part
+@dop853.part
 def _first_step(y: Numbers, f: Numbers, atol: Array) -> float:
     """A hundredth of the time in which the fastest component changes by its own size."""
     fastest = 0.0
@@ -199,41 +140,43 @@ def _first_step(y: Numbers, f: Numbers, atol: Array) -> float:
     return 0.01 / (1.0 + fastest)
 
 
-@_part
+@dop853.part
 def _ran_out(K: Numbers, n: int) -> int:
     """Number of the first margin that was positive at the step's start and is no longer at its end, or -1."""
     for e in range(n, K.shape[1]):
-        if K[0, e].real > 0.0 and K[_N, e].real <= 0.0:
+        if K[0, e].real > 0.0 and K[dop853.N, e].real <= 0.0:
             return e - n
     return -1
 
 
-@_part
-def _locate(system: CompiledSystem, t: complex, y: Numbers, h: float, event: int, work: _Work) -> tuple[int, float]:
-    """Shorten the step to where the first margin has just run out, by the Illinois method; y_new and K hold there.
+@dop853.part
+def _locate(
+    system: CompiledSystem, t_box: Numbers, t: complex, y: Numbers, h: float, event: int, made: dop853.Step
+) -> tuple[int, float]:
+    """Shorten the step to where the first margin has just run out, by the Illinois method; the end and K hold there.
 
     event : number of the first margin that has run out after h.   Returns that at the end, and the length of the step.
     """
     unit, n, side = 0.0 * y[0] + 1.0, y.size, 0
-    low, high, at_low, at_high = 0.0, h, work.K[0, n + event].real, work.K[_N, n + event].real
+    low, high, at_low, at_high = 0.0, h, made.K[0, n + event].real, made.K[dop853.N, n + event].real
     while True:
         trial = high
         if high - low > 2.0 * INSTANT:
             trial -= (high - low) * at_high / (at_high - at_low)  # where the chord is zero
             trial = min(max(trial, low + INSTANT), high - INSTANT)
-        _step(system, t, y, trial * unit, work)
-        _rates(system, t + trial * unit, work.y_new, work.K[_N], work.t)
+        _step(system, t_box, t, y, trial * unit, made)
+        _rates(t + trial * unit, made.end, made.K[dop853.N], system, t_box)
         if trial == high:
             return event, high
-        found, before = _ran_out(work.K, n), side
+        found, before = _ran_out(made.K, n), side
         side = 1 if found >= 0 else -1
         kept = 0.5 if side == before else 1.0  # the side that is kept twice gives way
         if found < 0:
-            low, at_high, margin = trial, kept * at_high, work.K[_N, n + event].real
+            low, at_high, margin = trial, kept * at_high, made.K[dop853.N, n + event].real
             at_low = margin if margin > 0.0 else at_low  # not where it is no number
         else:
-            high, at_high = trial, work.K[_N, n + found].real
-            at_low = kept * at_low if found == event else work.K[0, n + found].real
+            high, at_high = trial, made.K[dop853.N, n + found].real
+            at_low = kept * at_low if found == event else made.K[0, n + found].real
             event = found
 
 
@@ -250,10 +193,10 @@ def _dop853(
 ) -> tuple[int, np.signedinteger, int, int]:
     """Fills the solution, moves t_last (1,) and y (n,); status, grid points reached, event, steps."""
     n, unit = y.size, 0.0 * y[0] + 1.0  # one, in the kind of number of the state
-    K = np.zeros((_N + 4, n + system.n_margins), y.dtype)
-    work = _Work(K, np.zeros((7, n), y.dtype), y.copy(), y.copy(), t_last.copy())
+    t_box, made = t_last.copy(), dop853.room(y, n + system.n_margins)
+    K = made.K
     size, t, i_grid = np.zeros(1), t_last[0], np.int64(0)
-    _rates(system, t, y, K[0], work.t)
+    _rates(t, y, K[0], system, t_box)
     h_next = _first_step(y, K[0], atol)
     for steps in range(max_steps):
         if i_grid == grid.size:
@@ -265,25 +208,26 @@ def _dop853(
                 _assign(solution[i_grid], y)
                 i_grid += 1
             continue
-        _step(system, t, y, h, work)
-        error = _error(y, h.real, rtol, atol, size, work)
+        _step(system, t_box, t, y, h, made)
+        error = _error(y, h.real, rtol, atol, size, made)
         if not error <= 1.0:  # also when not a number
             h_next = h.real * (max(0.2, 0.9 * error**-0.125) if np.isfinite(error) else 0.1)
             if h_next < 1e-15:
                 return NOT_FINITE, i_grid, -1, steps
             continue
         h_next = h.real * (5.0 if error == 0.0 else min(5.0, 0.9 * error**-0.125))
-        _rates(system, t + h, work.y_new, K[_N], work.t)
+        _rates(t + h, made.end, K[dop853.N], system, t_box)
         event = _ran_out(K, n)
         if event >= 0:
-            event, h_event = _locate(system, t, y, h.real, event, work)
+            event, h_event = _locate(system, t_box, t, y, h.real, event, made)
             h = h_event * unit
         if grid[i_grid] <= (t + h).real:
-            i_grid = _fill(system, t, y, h, work, grid, i_grid, solution)
+            _polynomial(system, t_box, t, y, h, made)
+            i_grid = _fill(made.F, t, y, h, grid, i_grid, solution)
         t = t + h
         t_last[0] = t
-        _assign(y, work.y_new)
+        _assign(y, made.end)
         if event >= 0:
             return EVENT, i_grid, event, steps
-        _assign(K[0], K[_N])
+        _assign(K[0], K[dop853.N])
     return TOO_MANY_STEPS, i_grid, -1, max_steps

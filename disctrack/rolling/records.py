@@ -17,7 +17,6 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-Numbers: TypeAlias = NDArray[np.inexact[Any]]  # real, or complex where imaginary parts carry derivatives
 Record: TypeAlias = "np.recarray[Any, Any]"  # the numbers of one kind below, read and written by name
 Records: TypeAlias = NDArray[np.void]  # many of them
 

@@ -13,7 +13,7 @@ from types import CodeType
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calibration.kit.arrays import Array
+from calibration.kit.arrays import Array, Numbers
 from disctrack.disc import MA_2014
 from disctrack.frames import COORDINATES
 from disctrack.rolling._assembly import Assembly
@@ -21,7 +21,7 @@ from disctrack.rolling._compiled import compile_law
 from disctrack.rolling.effects.base import CATALOGUE, HELPERS
 from disctrack.rolling.model import DEFAULT_THETA_END, Model
 from disctrack.rolling.motion import EndReason, Path, columns
-from disctrack.rolling.records import ROLLING_COMPONENTS, STATE_COMPONENTS, Numbers
+from disctrack.rolling.records import ROLLING_COMPONENTS, STATE_COMPONENTS
 from disctrack.rolling.simulate import MAX_SWITCHES, MOST_STEPS, RTOL, _grid, _start, follow
 from disctrack.rolling.state import State, steady_precession
 

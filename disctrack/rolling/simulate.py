@@ -4,14 +4,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from calibration.kit.arguments import FrameRate, Seconds, Times, checked
-from calibration.kit.arrays import Array
+from calibration.kit.arrays import Array, Numbers
 from disctrack.rolling import integrate
 from disctrack.rolling._assembly import Assembly
 from disctrack.rolling.effects import ModelError
 from disctrack.rolling.equations import EVENTS, FLYING, ROLLING, SLIPPING, STICK_SPEED
 from disctrack.rolling.model import DEFAULT_THETA_END, Model
 from disctrack.rolling.motion import EndReason, Motion, Path, Regime, Switch, coordinates, motion_of
-from disctrack.rolling.records import Numbers, Records
+from disctrack.rolling.records import Records
 from disctrack.rolling.state import State
 
 RTOL = 1e-11  # of the integrator; keeps the energy without losses to 1e-11 over 1.5 s

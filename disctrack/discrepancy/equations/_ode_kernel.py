@@ -14,8 +14,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numba import types
-from scipy.integrate import DOP853
+from numpy.typing import NDArray
 
+from calibration.kit import _dop853 as dop853
 from calibration.kit.arrays import Array
 from calibration.kit.compiled import njit
 
@@ -29,10 +30,6 @@ _STABLE = 6.1  # step times the fastest rate, up to which the method is stable (
 _OFTEN = 15  # steps in a row at that limit, from which on it is the limit and not the error that holds them back
 _RAN_AWAY = 1e6  # times larger than all its states are: what becomes of such a motion nobody asks
 
-_A, _B, _C = (np.ascontiguousarray(x) for x in (DOP853.A, DOP853.B, DOP853.C))  # (12, 12), (12,), (12,)
-_E3, _E5 = np.ascontiguousarray(DOP853.E3), np.ascontiguousarray(DOP853.E5)  # (13,)
-_D = np.ascontiguousarray(DOP853.D)  # (4, 16)
-_A_EXTRA, _C_EXTRA = np.ascontiguousarray(DOP853.A_EXTRA), np.ascontiguousarray(DOP853.C_EXTRA)  # (3, 16), (3,)
 _SENSITIVITY_TOLERANCE = 1e-6  # relative to the largest so far: steps of a fit need no more
 
 _S6 = 6.0**0.5
@@ -52,9 +49,7 @@ _CLOSE = 1e-3  # of the tolerance, to which Newton's method solves the stages
 _MILD = 2.0  # step times the fastest rate, below which the explicit method takes steps as long
 
 
-_RULES: dict[str, Any] = {"error_model": "numpy", "nogil": True}
-entry = njit(cache=True, **_RULES)
-part = njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **_RULES)  # called by compiled functions only
+entry = njit(cache=True, error_model="numpy", nogil=True)
 
 
 class _Drive(NamedTuple):
@@ -64,6 +59,7 @@ class _Drive(NamedTuple):
     columns: Array
     knots: Array
     pieces: Array
+    piece: NDArray[np.int64]  # (1,) number of that of the inputs' which holds
     u: Array
     u_rate: Array
     f: Array
@@ -71,19 +67,20 @@ class _Drive(NamedTuple):
     P: Array
 
 
-@part
+@dop853.part
 def _drive(p, columns, n, knots, pieces):
     u, u_rate = np.zeros(len(pieces)), np.zeros(len(pieces))
-    return _Drive(p, columns, knots, pieces, u, u_rate, np.zeros(n), np.zeros((n, n)), np.zeros((n, len(p))))
+    piece = np.zeros(1, np.int64)
+    return _Drive(p, columns, knots, pieces, piece, u, u_rate, np.zeros(n), np.zeros((n, n)), np.zeros((n, len(p))))
 
 
-@part
+@dop853.part
 def piece_at(t, knots):
     """Index of the inputs' piece that holds at t and just after it; beyond the ends the last piece goes on."""
     return min(max(np.searchsorted(knots, t, side="right") - 1, 0), len(knots) - 2)
 
 
-@part
+@dop853.part
 def inputs_at(t, i, knots, pieces, u, u_rate):
     """Piecewise cubics (channels, 5, knots - 1), highest power first: the i-th piece at t.
 
@@ -96,11 +93,11 @@ def inputs_at(t, i, knots, pieces, u, u_rate):
         u_rate[c] = (3.0 * a * x + 2.0 * b) * x + d + pieces[c, 4, i]
 
 
-@part
-def _slope(rhs, t, piece, z, drive, out):
+@dop853.part
+def _slope(t, z, out, rhs, drive):
     """Z = (y, dy/da_1, dy/da_2, ...) one after the other -> dz/dt, with the inputs of one of their pieces."""
     n, k = len(drive.f), len(drive.columns)
-    inputs_at(t, piece, drive.knots, drive.pieces, drive.u, drive.u_rate)
+    inputs_at(t, drive.piece[0], drive.knots, drive.pieces, drive.u, drive.u_rate)
     rhs(t, z[:n], drive.p, drive.u, drive.u_rate, drive.f, drive.J, drive.P)
     for i in range(n):
         out[i] = drive.f[i]
@@ -113,28 +110,10 @@ def _slope(rhs, t, piece, z, drive, out):
             out[s + i] = total
 
 
-@part
-def _moved(z, step, weights, K, out):
-    """`out` = z + step times the weighted sum of slopes K."""
-    for i in range(len(z)):
-        total = 0.0
-        for j in range(len(weights)):
-            total += weights[j] * K[j, i]
-        out[i] = z[i] + step * total
+_step, _polynomial = dop853.method(_slope)
 
 
-@part
-def _step(rhs, t, step, piece, z, drive, K, last_stage, new):
-    """Stages K[1] to K[12] of a step from z, whose slope is K[0], to `new`; `last_stage`: a second estimate of it."""
-    for s in range(1, 12):
-        _moved(z, step, _A[s, :s], K, last_stage)
-        _slope(rhs, t + _C[s] * step, piece, last_stage, drive, K[s])
-    _moved(z, step, _B, K, new)
-    # at a knot too the inputs of the piece before it hold for this step
-    _slope(rhs, t + step, piece, new, drive, K[12])
-
-
-@part
+@dop853.part
 def _error(step, K, new, size, largest, tolerance, to_come):
     """Largest error of a step over what is allowed, of the states and of each sensitivity; infinite without a value.
 
@@ -156,8 +135,8 @@ def _error(step, K, new, size, largest, tolerance, to_come):
         for i in range(n):
             a5, a3 = 0.0, 0.0
             for j in range(13):
-                a5 += _E5[j] * K[j, n * c + i]
-                a3 += _E3[j] * K[j, n * c + i]
+                a5 += dop853.E5[j] * K[j, n * c + i]
+                a3 += dop853.E3[j] * K[j, n * c + i]
             if c == 0:
                 scale = tolerance * max(size[i], abs(new[i]))
             else:
@@ -171,34 +150,7 @@ def _error(step, K, new, size, largest, tolerance, to_come):
     return worst
 
 
-@part
-def _dense(rhs, t, step, piece, z, drive, K, new, F):
-    """The step's polynomial F (7, len(z)); K[13] to K[15] are worked out for it."""
-    work = np.zeros(len(z))
-    for e in range(3):
-        _moved(z, step, _A_EXTRA[e, : 13 + e], K, work)
-        _slope(rhs, t + _C_EXTRA[e] * step, piece, work, drive, K[13 + e])
-    for i in range(len(z)):
-        work[i] = 0.0
-        F[0, i] = new[i] - z[i]
-        F[1, i] = step * K[0, i] - F[0, i]
-        F[2, i] = 2.0 * F[0, i] - step * (K[12, i] + K[0, i])
-    for d in range(4):
-        _moved(work, step, _D[d], K, F[3 + d])
-
-
-@part
-def _along(F, z, x, out):
-    """The step's polynomial at the part x of it."""
-    for i in range(len(z)):
-        total = 0.0
-        for d in range(6, -1, -1):
-            total += F[d, i]
-            total *= x if d % 2 == 0 else 1.0 - x
-        out[i] = total + z[i]
-
-
-@part
+@dop853.part
 def _solve(M, b):
     """Replace b (m, k) by M^-1 b; False where M has no inverse."""
     try:
@@ -208,13 +160,13 @@ def _solve(M, b):
     return True
 
 
-@part
-def _stages(rhs, t, step, piece, z, Z, drive, F, J, P, M, left):
+@dop853.part
+def _stages(rhs, t, step, z, Z, drive, F, J, P, M, left):
     """What Newton's method has to make zero of stages z + Z (3 n, 1), with minus sign; M (3 n, 3 n) for its steps."""
     n = len(drive.f)
     for s in range(3):
         at = t + _RADAU_C[s] * step
-        inputs_at(at, piece, drive.knots, drive.pieces, drive.u, drive.u_rate)
+        inputs_at(at, drive.piece[0], drive.knots, drive.pieces, drive.u, drive.u_rate)
         rhs(at, z[:n] + Z[s * n : (s + 1) * n, 0], drive.p, drive.u, drive.u_rate, F[s], J[s], P[s])
     for s in range(3):
         for i in range(n):
@@ -227,8 +179,8 @@ def _stages(rhs, t, step, piece, z, Z, drive, F, J, P, M, left):
             M[row, row] += 1.0
 
 
-@part
-def _implicit_step(rhs, t, step, piece, z, drive, slope, size, W):
+@dop853.part
+def _implicit_step(rhs, t, step, z, drive, slope, size, W):
     """What each stage adds to states and sensitivities, W (3, len(z)), and the error over what is allowed.
 
     slope : at (t, z), where `drive` holds its derivative by the states
@@ -238,7 +190,7 @@ def _implicit_step(rhs, t, step, piece, z, drive, slope, size, W):
     Z, M, change, own = np.zeros((3 * n, 1)), np.zeros((3 * n, 3 * n)), np.zeros((3 * n, 1)), np.zeros((3 * n, k))
     E, error = np.zeros((n, n)), np.zeros((n, 1))
     for _ in range(_NEWTON):
-        _stages(rhs, t, step, piece, z, Z, drive, F, J, P, M, change)
+        _stages(rhs, t, step, z, Z, drive, F, J, P, M, change)
         if not _solve(M, change):
             return np.inf
         moved = 0.0
@@ -249,7 +201,7 @@ def _implicit_step(rhs, t, step, piece, z, drive, slope, size, W):
             break
     if not moved < _CLOSE:
         return np.inf
-    _stages(rhs, t, step, piece, z, Z, drive, F, J, P, M, change)
+    _stages(rhs, t, step, z, Z, drive, F, J, P, M, change)
     for i in range(n):
         error[i, 0] = slope[i]
         for j in range(n):
@@ -275,7 +227,7 @@ def _implicit_step(rhs, t, step, piece, z, drive, slope, size, W):
     return worst
 
 
-@part
+@dop853.part
 def _along_stages(W, z, x, out):
     """The implicit step's polynomial at the part x of it."""
     c, d = _RADAU_C[0], _RADAU_C[1]
@@ -297,11 +249,11 @@ def integrate(rhs, z, p, columns, span, n, knots, pieces, size, tolerance, max_s
     """
     N, m = len(z), len(samples)
     drive = _drive(p, columns, n, knots, pieces)
-    K, F, W = np.zeros((16, N)), np.zeros((7, N)), np.zeros((3, N))
-    new, last_stage, largest = np.zeros(N), np.zeros(N), np.zeros(len(columns))
+    made, W, largest = dop853.room(z, N), np.zeros((3, N)), np.zeros(len(columns))
+    K, new = made.K, made.end
     t, end = span[0], span[1]
-    piece = piece_at(t, knots)
-    _slope(rhs, t, piece, z, drive, K[0])
+    drive.piece[0] = piece_at(t, knots)
+    _slope(t, z, K[0], rhs, drive)
     speed, most = 0.0, 0.0
     for i in range(n):
         speed, most = max(speed, abs(K[0, i]) / size[i]), max(most, _RAN_AWAY * size[i])
@@ -320,10 +272,12 @@ def integrate(rhs, z, p, columns, span, n, knots, pieces, size, tolerance, max_s
         if step < 1e-15 * max(abs(t), 1e-3):
             return False
         if stiff:
-            worst, power = _implicit_step(rhs, t, step, piece, z, drive, K[0], size, W), -0.25
+            worst, power = _implicit_step(rhs, t, step, z, drive, K[0], size, W), -0.25
             _along_stages(W, z, 1.0, new)
         else:
-            _step(rhs, t, step, piece, z, drive, K, last_stage, new)
+            _step(rhs, drive, t, z, step, made)
+            # at a knot too the inputs of the piece before it hold for this step
+            _slope(t + step, new, K[12], rhs, drive)
             worst, power = _error(step, K, new, size, largest, tolerance, 0.0 if first else end - span[0]), -0.125
         if not worst <= 1.0:
             h = step * max(0.2, 0.9 * worst**power) if np.isfinite(worst) else 0.1 * step
@@ -331,6 +285,15 @@ def integrate(rhs, z, p, columns, span, n, knots, pieces, size, tolerance, max_s
             if h < 1e-14 * (end - span[0]):
                 return False
             continue
+        # how fast nearby motions part or meet, from two estimates of the state at the end of the step
+        apart, together = 0.0, 0.0
+        for i in range(n):
+            if abs(new[i]) > most:
+                return False
+            apart += ((K[12, i] - K[11, i]) / size[i]) ** 2
+            together += ((new[i] - made.stage[i]) / size[i]) ** 2
+            for c in range(len(columns)):
+                largest[c] = max(largest[c], abs(new[n * (c + 1) + i]) / (size[i] + 1e-300))
         inside = False
         while filled < m and (samples[filled] <= t + step or last):
             x = (samples[filled] - t) / step
@@ -340,22 +303,13 @@ def integrate(rhs, z, p, columns, span, n, knots, pieces, size, tolerance, max_s
                 _along_stages(W, z, x, out[filled])
             else:
                 if not inside:
-                    _dense(rhs, t, step, piece, z, drive, K, new, F)
+                    _polynomial(rhs, drive, t, z, step, made)
                     inside = True
-                _along(F, z, x, out[filled])
+                dop853.along(made.F, z, x, out[filled])
             filled += 1
-        # how fast nearby motions part or meet, from two estimates of the state at the end of the step
-        apart, together = 0.0, 0.0
-        for i in range(n):
-            if abs(new[i]) > most:
-                return False
-            apart += ((K[12, i] - K[11, i]) / size[i]) ** 2
-            together += ((new[i] - last_stage[i]) / size[i]) ** 2
-            for c in range(len(columns)):
-                largest[c] = max(largest[c], abs(new[n * (c + 1) + i]) / (size[i] + 1e-300))
         t, first = arrival, False
         z[:] = new
-        before, piece = piece, piece_at(t, knots)
+        before, drive.piece[0] = drive.piece[0], piece_at(t, knots)
         grow = 5.0 if worst == 0.0 else min(5.0, max(0.2, 0.9 * worst**power))
         if rejected:
             grow = min(1.0, grow)
@@ -363,7 +317,7 @@ def integrate(rhs, z, p, columns, span, n, knots, pieces, size, tolerance, max_s
         # a step cut short at a knot says nothing against the next
         h = h * grow if step >= h * 0.999 else max(h, step * grow)
         if stiff:
-            _slope(rhs, t, piece, z, drive, K[0])
+            _slope(t, z, K[0], rhs, drive)
             fastest = 0.0
             for i in range(n):
                 for j in range(n):
@@ -374,8 +328,8 @@ def integrate(rhs, z, p, columns, span, n, knots, pieces, size, tolerance, max_s
             calm = 0 if together > 0.0 and step * np.sqrt(apart / together) > _STABLE else calm + 1
             at_limit = at_limit + 1 if calm == 0 else (0 if calm == 6 else at_limit)
             stiff = at_limit >= _OFTEN
-            if stiff or piece != before:
-                _slope(rhs, t, piece, z, drive, K[0])
+            if stiff or drive.piece[0] != before:
+                _slope(t, z, K[0], rhs, drive)
             else:
                 K[0] = K[12]
             if stiff:
