@@ -19,7 +19,6 @@ from calibration.kit.arrays import Array
 from disctrack.discrepancy.equations import Answer, Equations, Parameter, Run, SmoothNoise, Term, diagnose
 from disctrack.discrepancy.noise import SampleStretch, estimate
 from disctrack.discrepancy.search import CLASS_GAIN, Settings
-from disctrack.discrepancy.significance import price_of_a_number
 from disctrack.examples._command import GRAVITY, Outcome, command
 from disctrack.numbers import rounded, score
 from disctrack.report.blocks import Listing, Report, Section
@@ -105,22 +104,13 @@ class BallAnswer:
     noise: SmoothNoise
     together: Answer
     alone: Mapping[str, Answer]
-    by_law: Mapping[str, Answer]  # what a fall with that law of drag lacks
+    # laws of drag, alone and with what a fall with them may lack: length over that of the shortest, which stands first
+    forms: Mapping[tuple[str, ...], float]
     errors: Mapping[str, Array]  # by law, and "gravity alone": `errors_on_second_drops`
 
     @property
-    def forms(self) -> dict[tuple[str, ...], float]:
-        """Laws, alone and with what they lack: Bayesian criterion over that of the best one, best first."""
-        found = {}
-        for law, answer in self.by_law.items():
-            d, price = answer.diagnosis, price_of_a_number(answer.system.weights)
-            for effects, fitted in (((law,), d.before), ((law, *answer.found), d.after)):
-                found[effects] = fitted.cost + len(fitted.shared) * price
-        return {effects: found[effects] - min(found.values()) for effects in sorted(found, key=lambda e: found[e])}
-
-    @property
     def undecided(self) -> tuple[tuple[str, ...], ...]:
-        """Forms that the data do not tell from the best one."""
+        """Forms that the data do not tell from the shortest."""
         return tuple(effects for effects, over in self.forms.items() if over < CLASS_GAIN)
 
     @property
@@ -138,9 +128,15 @@ def analyse_drops(drops: Sequence[Run]) -> BallAnswer:
         name: replace(FALL, rates={"h": "v", "v": f"-g + {force}"}, parameters={"k": k}, name=name)
         for name, (force, k) in DRAG.items()
     }
-    by_law = {name: ask(drops, noise, OTHERS[-1:], law) for name, law in laws.items()}
+    lengths = {
+        (name, *explanation.effects): explanation.length
+        for name, law in laws.items()
+        for explanation in ask(drops, noise, OTHERS[-1:], law).diagnosis.ranked
+    }
+    shortest = min(lengths.values())
+    forms = {effects: lengths[effects] - shortest for effects in sorted(lengths, key=lengths.__getitem__)}
     errors = {name: errors_on_second_drops(drops, law) for name, law in ({"gravity alone": FALL} | laws).items()}
-    return BallAnswer(noise, together, alone, by_law, errors)
+    return BallAnswer(noise, together, alone, forms, errors)
 
 
 def errors_on_second_drops(drops: Sequence[Run], equations: Equations) -> Array:
@@ -184,7 +180,7 @@ def report(answer: BallAnswer) -> Report:
                 "Median of the balls' rms on the second drop (m)",
                 [Listing(("law fitted to the first", "whole", f"after {SEEN} s"), errors)],
             ),
-            Section("All balls together", [Listing(("effects", "criterion"), forms)]),
+            Section("All balls together", [Listing(("effects", "longer by"), forms)]),
             Section("Each ball alone", [Listing(("ball", "verdict", "missing"), alone)]),
         ],
         data=answer.together.document()
