@@ -13,17 +13,15 @@ its residual is reckoned to first order along the smooth motion of the flight (`
 
 from collections import defaultdict
 from collections.abc import Sequence
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
 from calibration.kit.arrays import Array, Mask
-from disctrack.discrepancy.fit import fit
 from disctrack.discrepancy.noise import SampleStretch, SmoothNoise, estimate
-from disctrack.discrepancy.score import Linearisation
+from disctrack.discrepancy.score import INVISIBLE
 from disctrack.discrepancy.search import Diagnosis, Settings, explain
-from disctrack.discrepancy.system import Quantity, System, Values
+from disctrack.discrepancy.system import System, Values
 from disctrack.discrepancy.words import effect_text
 from disctrack.examples._command import GRAVITY, Outcome, command, report_of
 from disctrack.examples.cube_data import (
@@ -40,9 +38,9 @@ from disctrack.numbers import rounded
 from disctrack.report.blocks import Listing, Section
 
 HELD_OUT = 3  # every third toss
-EFFECTS = tuple(q for c in CANDIDATES for q in c.quantities)
-OWN = tuple(f"state.{what}_{axis}" for what in ("place", "velocity", "turn", "rate") for axis in "123")
-COLUMN = {name: i for i, name in enumerate((*(q.name for q in EFFECTS), *OWN))}
+QUANTITIES = tuple(q for c in CANDIDATES for q in c.quantities)
+COLUMN = {q.name: i for i, q in enumerate(QUANTITIES)}
+OWN = 12  # numbers of each flight's own: place, velocity, attitude and angular velocity
 FIRST_NOISE = {  # channels whose noise is alike, and where the search for it begins
     "horizontal": (slice(0, 2), SmoothNoise(2e-5, 5e-5, 0.03)),
     "vertical": (slice(2, 3), SmoothNoise(2e-5, 3e-5, 0.03)),
@@ -53,99 +51,104 @@ SETTINGS = Settings(noise=1.0, unexplained_share=0.2, max_effects=8)
 
 
 class CubeTosses(System):
-    """A toss is a block of rows: poses in free flight, place and turn (6,) each, and at last the cube at rest.
+    """All that flights tell beside what their own motion absorbs, and cubes at rest: one number of variance one a row.
 
-    Of that, height and normal (3,); a row without data where it does not rest on a face.
+    seen : (n,) measured minus base model
+    effects : (n, k) its change by QUANTITIES, in all of which it is linear
     """
 
     candidates = CANDIDATES
+    base = ()
 
     def __init__(self, flights: Sequence[Flight]) -> None:
         """Measure the noise, and whiten."""
-        self.flights, rows = flights, [_rows(f) for f in flights]
-        self._raw = np.concatenate(rows)
-        ends = np.cumsum([0, *map(len, rows)])
-        self.blocks = [slice(a, b) for a, b in pairwise(ends.tolist())]
-        self._block = np.repeat(np.arange(len(rows)), np.diff(ends))
-        self._last = ends[1:] - 1
-        self.weights = np.any(self._raw != 0, axis=-1).sum(axis=1)
-        self.n_at_rest = int(np.sum(self.weights[self._last] > 0))
-        self.time = np.arange(len(self.weights), dtype=float)  # only an order: tosses have no common clock
-        self.base = tuple(
-            Quantity(f"{name}[{f.toss.number}]", "", 1e-3, slot=name, block=i)
-            for i, f in enumerate(self.flights)
-            for name in OWN
-        )
+        self.flights, self._flown, self._at_rest = flights, [_flown(f) for f in flights], _at_rest(flights)
+        self.n_at_rest = sum(len(rows) > 0 for rows in self._at_rest)
         self.noise = {name: noise for name, (_, noise) in FIRST_NOISE.items()}
         for _ in range(2):
-            self._white = self._whitened()
+            self._whiten()
             self.noise = self._measured_noise()
-        self._white = self._whitened()
-
-    def training_rows(self) -> Mask:
-        """(n,) False for every third toss."""
-        return np.repeat([not _kept_back(f) for f in self.flights], np.bincount(self._block))
+        self._whiten()
 
     def linearise(self, values: Values, names: Sequence[str]) -> tuple[Array, Array]:
-        """Whitened residual (n, 6), and the prediction's derivative (n, 6, k): linear in every quantity."""
-        return self._left(self._white, values), self._white[..., [COLUMN[n] for n in names]]
+        """Residual (n, 1) and the prediction's derivative (n, 1, k)."""
+        left = self.seen - self.effects @ _amounts(values)
+        return left[:, None], self.effects[:, None, [COLUMN[n] for n in names]]
 
     def residuals(self, values: Values) -> list[Array]:
-        """Measured minus predicted (n, 6) [m], [rad] of every flight, its own start and rates by least squares."""
-        left = self._left(self._raw, fit(self, self.base, values).values)
-        return [left[rows][:-1] for rows in self.blocks]
+        """Measured minus predicted (n, 6) [m], [rad] of every flight, its own motion by least squares."""
+        found = []
+        for rows in self._flown:
+            effects, seen, own = np.split(rows.reshape(-1, rows.shape[-1]), [-OWN - 1, -OWN], axis=1)
+            left = seen[:, 0] - effects @ _amounts(values)
+            found.append((left - own @ np.linalg.lstsq(own, left, rcond=None)[0]).reshape(-1, 6))
+        return found
 
-    def _left(self, rows: Array, values: Values) -> Array:
-        effects, by_own, left = np.split(rows, [len(EFFECTS), len(COLUMN)], axis=-1)
-        own = np.array([values.get(q.name, 0.0) for q in self.base]).reshape(-1, len(OWN))
-        left = left[..., 0] - effects @ np.array([values.get(q.name, 0.0) for q in EFFECTS])
-        return np.asarray(left - np.einsum("nwi,ni->nw", by_own, own[self._block]), float)
-
-    def _whitened(self) -> Array:
-        white = self._raw.copy()
-        for flight, block in zip(self.flights, self.blocks, strict=True):
-            flying = slice(block.start, block.stop - 1)
+    def _whiten(self) -> None:
+        parts, training = [], []
+        for f, rows, at_rest in zip(self.flights, self._flown, self._at_rest, strict=True):
+            white = rows.copy()
             for name, (channels, _) in FIRST_NOISE.items():
-                W = self.noise[name].whitening(flight.time)
-                white[flying, channels] = np.tensordot(W, white[flying, channels], axes=1)
-        # how much resting cubes differ once all candidates have taken their share is the noise
-        for c in range(3):
-            effects, seen = white[self._last, c, : len(EFFECTS)], white[self._last, c, -1]
-            amounts, _, rank, _ = np.linalg.lstsq(effects, seen, rcond=1e-10)
-            white[self._last, c] /= np.sqrt(np.sum((seen - effects @ amounts) ** 2) / (self.n_at_rest - rank))
-        return white
+                white[:, channels] = np.tensordot(self.noise[name].whitening(f.time), rows[:, channels], axes=1)
+            effects, own = np.split(white.reshape(-1, rows.shape[-1]), [-OWN], axis=1)
+            beside_own = np.linalg.qr(own, mode="complete")[0][:, OWN:].T @ effects
+            # of an effect that the flight's own motion absorbs, rounding is left
+            beside_own[:, np.linalg.norm(beside_own, axis=0) < INVISIBLE * np.linalg.norm(effects, axis=0)] = 0.0
+            parts += [beside_own, at_rest]
+            training += [not _kept_back(f)] * (len(beside_own) + len(at_rest))
+        everything = np.concatenate(parts)
+        self.effects, self.seen = everything[:, :-1], everything[:, -1]
+        self.training: Mask = np.array(training)  # (n,) False for every third toss
+        self.weights = np.ones(len(everything))
+        self.time = np.arange(len(everything), dtype=float)  # only an order: tosses have no common clock
 
     def _measured_noise(self) -> dict[str, SmoothNoise]:
         """Noise of each group of channels, from what is left when all candidates together have taken their share."""
-        linear = Linearisation(self, fit(self, self.base, {}), self.candidates)
         # some make up for each other: of all amounts that do as well, those that would surprise least
-        size = np.array([q.typical for q in EFFECTS])
-        columns = linear.columns([q.name for q in EFFECTS]) * size
-        amounts = size * np.linalg.lstsq(columns, linear.right, rcond=1e-9)[0]
-        left = self.residuals({q.name: float(x) for q, x in zip(EFFECTS, amounts, strict=True)})
+        size = np.array([q.typical for q in QUANTITIES])
+        amounts = size * np.linalg.lstsq(self.effects * size, self.seen, rcond=1e-9)[0]
+        left = self.residuals(dict(zip(COLUMN, amounts.tolist(), strict=True)))
         return {name: _noise(left, channels, start) for name, (channels, start) in FIRST_NOISE.items()}
+
+
+def _amounts(values: Values) -> Array:
+    return np.array([values.get(name, 0.0) for name in COLUMN])
 
 
 def _kept_back(flight: Flight) -> bool:
     return flight.toss.number % HELD_OUT == HELD_OUT - 1
 
 
-def _rows(f: Flight) -> Array:
-    """(n + 1, 6, k + 13) by effects, by what is the flight's own, and measured minus base model [m], [rad]."""
-    n = len(f.time)
-    rows = np.zeros((n + 1, 6, len(COLUMN) + 1))
-    effects, own, seen = np.split(rows, [len(EFFECTS), len(COLUMN)], axis=-1)
+def _flown(f: Flight) -> Array:
+    """(n, 6, k + 1 + OWN) by QUANTITIES, measured minus base model [m], [rad], and by what is the flight's own."""
+    rows = np.zeros((len(f.time), 6, len(COLUMN) + 1 + OWN))
     for name, column in flown(f).items():
-        effects[:n, :, COLUMN[name]] = column
-    own[:n, :3, :3], own[:n, :3, 3:6] = np.eye(3), f.time[:, None, None] * np.eye(3)
-    own[:n, 3:, 6:9], own[:n, 3:, 9:] = np.eye(3), integrated(np.swapaxes(f.turning, 1, 2))
-    seen[:n, :3, 0], seen[:n, 3:, 0] = f.position, f.turn
-    seen[:n, 2, 0] += GRAVITY * f.time**2 / 2
-    if (cube := rested(f)) is not None:
-        seen[n, :3, 0], by_effects = cube
-        for name, change in by_effects.items():
-            effects[n, :3, COLUMN[name]] = change
+        rows[..., COLUMN[name]] = column
+    _, seen, own = np.split(rows, [len(COLUMN), len(COLUMN) + 1], axis=-1)
+    seen[:, :3, 0], seen[:, 3:, 0] = f.position, f.turn
+    seen[:, 2, 0] += GRAVITY * f.time**2 / 2
+    own[:, :3, :3], own[:, :3, 3:6] = np.eye(3), f.time[:, None, None] * np.eye(3)
+    own[:, 3:, 6:9], own[:, 3:, 9:] = np.eye(3), integrated(np.swapaxes(f.turning, 1, 2))
     return rows
+
+
+def _at_rest(flights: Sequence[Flight]) -> list[Array]:
+    """Of every toss (3, k + 1) the cube at rest, by QUANTITIES and as measured; (0, k + 1) where it is not on a face.
+
+    How much resting cubes differ once all candidates have taken their share is the noise.
+    """
+    rows = np.zeros((len(flights), 3, len(COLUMN) + 1))
+    for of_toss, f in zip(rows, flights, strict=True):
+        if (cube := rested(f)) is not None:
+            of_toss[:, -1], changes = cube
+            for name, change in changes.items():
+                of_toss[:, COLUMN[name]] = change
+    there = np.any(rows != 0, axis=(1, 2))
+    for c in range(3):
+        effects, seen = rows[there, c, :-1], rows[there, c, -1]
+        amounts, _, rank, _ = np.linalg.lstsq(effects, seen, rcond=1e-10)
+        rows[:, c] /= np.sqrt(np.sum((seen - effects @ amounts) ** 2) / (len(seen) - rank))
+    return [of_toss[: 3 * on_a_face] for of_toss, on_a_face in zip(rows, there.tolist(), strict=True)]
 
 
 def _noise(left: Sequence[Array], channels: slice, start: SmoothNoise) -> SmoothNoise:
@@ -162,7 +165,7 @@ def _noise(left: Sequence[Array], channels: slice, start: SmoothNoise) -> Smooth
 
 def diagnosed(system: CubeTosses) -> Diagnosis:
     """What the base model lacks."""
-    return explain(system, {}, SETTINGS, system.training_rows())
+    return explain(system, {}, SETTINGS, system.training)
 
 
 def rms_of(system: CubeTosses, values: Values) -> dict[str, float]:
