@@ -40,7 +40,6 @@ from disctrack.report.blocks import Listing, Section
 HELD_OUT = 3  # every third toss
 QUANTITIES = tuple(q for c in CANDIDATES for q in c.quantities)
 COLUMN = {q.name: i for i, q in enumerate(QUANTITIES)}
-OWN = 12  # numbers of each flight's own: place, velocity, attitude and angular velocity
 FIRST_NOISE = {  # channels whose noise is alike, and where the search for it begins
     "horizontal": (slice(0, 2), SmoothNoise(2e-5, 5e-5, 0.03)),
     "vertical": (slice(2, 3), SmoothNoise(2e-5, 3e-5, 0.03)),
@@ -79,7 +78,7 @@ class CubeTosses(System):
         """Measured minus predicted (n, 6) [m], [rad] of every flight, its own motion by least squares."""
         found = []
         for rows in self._flown:
-            effects, seen, own = np.split(rows.reshape(-1, rows.shape[-1]), [-OWN - 1, -OWN], axis=1)
+            effects, seen, own = np.split(rows.reshape(-1, rows.shape[-1]), [len(COLUMN), len(COLUMN) + 1], axis=1)
             left = seen[:, 0] - effects @ _amounts(values)
             found.append((left - own @ np.linalg.lstsq(own, left, rcond=None)[0]).reshape(-1, 6))
         return found
@@ -90,8 +89,8 @@ class CubeTosses(System):
             white = rows.copy()
             for name, (channels, _) in FIRST_NOISE.items():
                 white[:, channels] = np.tensordot(self.noise[name].whitening(f.time), rows[:, channels], axes=1)
-            effects, own = np.split(white.reshape(-1, rows.shape[-1]), [-OWN], axis=1)
-            beside_own = np.linalg.qr(own, mode="complete")[0][:, OWN:].T @ effects
+            effects, own = np.split(white.reshape(-1, rows.shape[-1]), [len(COLUMN) + 1], axis=1)
+            beside_own = np.linalg.qr(own, mode="complete")[0][:, own.shape[1] :].T @ effects
             # of an effect that the flight's own motion absorbs, rounding is left
             beside_own[:, np.linalg.norm(beside_own, axis=0) < INVISIBLE * np.linalg.norm(effects, axis=0)] = 0.0
             parts += [beside_own, at_rest]
@@ -120,8 +119,11 @@ def _kept_back(flight: Flight) -> bool:
 
 
 def _flown(f: Flight) -> Array:
-    """(n, 6, k + 1 + OWN) by QUANTITIES, measured minus base model [m], [rad], and by what is the flight's own."""
-    rows = np.zeros((len(f.time), 6, len(COLUMN) + 1 + OWN))
+    """(n, 6, k + 1 + 12) by QUANTITIES, measured minus base model [m], [rad], and by what is the flight's own.
+
+    That is place, velocity, attitude and angular velocity, three numbers each.
+    """
+    rows = np.zeros((len(f.time), 6, len(COLUMN) + 1 + 12))
     for name, column in flown(f).items():
         rows[..., COLUMN[name]] = column
     _, seen, own = np.split(rows, [len(COLUMN), len(COLUMN) + 1], axis=-1)
