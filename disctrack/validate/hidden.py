@@ -15,7 +15,7 @@ from disctrack.discrepancy.system import Candidate
 from disctrack.errors import DiscTrackError
 from disctrack.rolling import Model
 from disctrack.synthetic.description import Scene
-from disctrack.validate.points import ORDINARY, Laboratory, Planted
+from disctrack.validate.points import ORDINARY, STATION, Laboratory, Planted
 
 SIZES = {
     "table_tilt": np.radians(0.35),
@@ -106,5 +106,11 @@ def plant(name: str, size: float, rng: Generator) -> Planted:
     truth = {q.name: float(number) for q, number in zip(quantities, numbers, strict=True)}
     if candidate.kind == "measurement":
         return Planted(truth, wrong=truth)
-    place = {"rim_flat.angle": rng.uniform(0, 2 * np.pi)} if name == "rim_flat" else {}
-    return Planted(truth, effects=truth | place)
+    if name == "rim_flat":
+        return Planted(truth, effects=truth | {"rim_flat.angle": rng.uniform(0, 2 * np.pi)})
+    if name == "table_shaken":  # the diagnosis' phase is that at the first frame
+        turn = 2 * np.pi * candidate.shape[0].null * STATION
+        cosine, sine = numbers.reshape(2, 3)
+        c, s = np.cos(turn), np.sin(turn)
+        numbers = np.ravel([c * cosine - s * sine, s * cosine + c * sine])
+    return Planted(truth, effects=dict(zip(truth, numbers.tolist(), strict=True)))

@@ -194,8 +194,7 @@ def _rolling(model: Model, filmed: Filmed, rng: np.random.Generator) -> Motion:
         x=0.032,
         y=0.020,
     )
-    # an effect's own time begins at the first frame
-    return lambda times: simulate(model, start, times=np.r_[0.0, times] - STATION).q[1:]
+    return lambda times: simulate(model, start, times=np.r_[0.0, times]).q[1:]
 
 
 def _exposed(motion: Motion, times: Array, faults: Faults, rig: StereoRig, centres: Array, disc: Disc) -> Array:
