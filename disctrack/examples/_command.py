@@ -2,11 +2,15 @@
 
 import argparse
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
+
+import numpy as np
 
 from disctrack.discrepancy.document import document, tables
 from disctrack.discrepancy.equations import Answer
 from disctrack.discrepancy.search import Diagnosis
+from disctrack.discrepancy.system import Candidate, Quantity
 from disctrack.errors import DiscTrackError
 from disctrack.files.json_text import json_file
 from disctrack.files.whole import refuse_existing, write_whole
@@ -18,6 +22,19 @@ GRAVITY = 9.81  # [m/s^2] as declared
 # What an example has to say: a report, whose document is diagnosis.json, and answers, each on a page of its own in a
 # folder of that name
 Outcome = tuple[Report, Mapping[str, Answer]]
+
+
+def effect(
+    name: str, kind: str, title: str, unit: str, typical: float, *parts: str,
+    bounds: tuple[float, float] = (-np.inf, np.inf), source: str = "",
+) -> Candidate:  # fmt: skip
+    """An effect that a system of one's own may lack: its numbers `parts` are zero where it is absent.
+
+    kind : "motion" or "measurement"
+    typical : size that would surprise nobody
+    """
+    one = Quantity(name, unit, 0.1 * typical, 0.0, *bounds, typical=typical)
+    return Candidate(name, name, kind, title, source, tuple(replace(one, name=f"{name}.{part}") for part in parts))
 
 
 def report_of(

@@ -5,51 +5,43 @@ from collections.abc import Sequence
 import numpy as np
 
 from calibration.kit.arrays import Array
-from disctrack.discrepancy.system import Candidate, Quantity
-from disctrack.examples._command import GRAVITY
+from disctrack.examples._command import GRAVITY, effect
 from disctrack.examples.cube_data import HALF_WIDTH, UP, Flight, integrated
 
 REST = 8  # last samples of a toss
-AT_REST = (0.03, np.cos(np.radians(1.5)))  # [half widths] about the resting height, and cosine of a face's tilt
 LEVEL = ("along", "across")  # the flight
 AXES = (*LEVEL, "up")
 
-
-def _effect(name: str, kind: str, title: str, unit: str, typical: float, *parts: str) -> Candidate:
-    """An effect with its numbers, of a size that would surprise nobody."""
-    lower = 0.0 if name.endswith("_drag") else -np.inf
-    quantities = (Quantity(f"{name}.{part}", unit, 0.1 * typical, lower=lower, typical=typical) for part in parts)
-    return Candidate(name, name, kind, title, "", tuple(quantities))
-
-
 _M, _S = "motion", "measurement"
 CANDIDATES = (
-    _effect("gravity", _M, "another gravity", "m/s^2", 0.01, "change"),
-    _effect("frame_rate", _S, "frame rate wrong", "1", 1e-3, "change"),
-    _effect("length_scale", _S, "scale of the lengths wrong", "1", 0.02, "change"),
-    _effect("tilt", _S, "vertical wrong, the same way in the axes of the file for all tosses", "rad", 0.01, "beta_x",
-            "beta_y"),
-    _effect("toss_tilt", _S, "vertical wrong, the same way in the axes of every toss", "rad", 0.01, *LEVEL),
-    _effect("linear_drag", _M, "drag in proportion to the speed", "1/s", 0.03, "k"),
-    _effect("quadratic_drag", _M, "drag in proportion to the square of the speed", "1/m", 0.02, "k"),
-    _effect("side_force", _M, "force across the horizontal velocity, to its left", "1/s", 0.01, "c"),
-    _effect("magnus", _M, "lift of the spinning cube (Magnus)", "1", 0.004, "c"),
-    _effect("frame_rotation", _S, "world axes turn about the vertical", "rad/s", 1e-3, "rate"),
-    _effect("centre_of_mass", _M, "centre of mass not in the centre of the tags", "m", 2e-3, "c_1", "c_2", "c_3"),
-    _effect("principal_moments", _M, "moments of inertia not those of a uniform cube", "1", 0.05, "e_11", "e_22"),
-    _effect("products_of_inertia", _M, "products of inertia", "1", 0.05, "e_12", "e_13", "e_23"),
-    _effect("rotational_drag", _M, "drag of the rotation", "1/s", 0.01, "k"),
-    _effect("side_torque", _M, "torque that turns the angular velocity about the vertical", "1/s", 0.01, "c"),
-    _effect("twist", _S, "measured place and attitude turn about the vertical with height", "rad/m", 0.01, "a"),
-    _effect("perspective", _S, "scale of the lengths changes with place", "1/m", 5e-3, *AXES),
-    _effect("face_bias", _S, "error of place that depends on which faces look up", "m", 5e-4,
-            *(f"{a}_{i}" for i in "123" for a in AXES)),
-    _effect("clock_offset", _S, "positions later than attitudes", "s", 1e-3, "delay"),
-    _effect("smoothing", _S, "exposure, or smoothing of the positions", "s^2", 1e-5, "T2"),
-    _effect("table_height", _S, "table not at height zero, or another half width of the cube", "m", 1e-3, "z"),
-    _effect("tag_axes", _S, "axes of the tags turned against those of the cube", "rad", 5e-3,
-            "turn_1", "turn_2", "turn_3"),
-    _effect("table_tilt", _S, "table leans against the vertical", "rad", 1e-2, *LEVEL),
+    effect("gravity", _M, "another gravity", "m/s^2", 0.01, "change"),
+    effect("frame_rate", _S, "frame rate wrong", "1", 1e-3, "change"),
+    effect("length_scale", _S, "scale of the lengths wrong", "1", 0.02, "change"),
+    effect("tilt", _S, "vertical wrong, the same way in the axes of the file for all tosses", "rad", 0.01, "beta_x",
+           "beta_y"),
+    effect("toss_tilt", _S, "vertical wrong, the same way in the axes of every toss", "rad", 0.01, *LEVEL),
+    effect("linear_drag", _M, "drag in proportion to the speed", "1/s", 0.03, "k",
+           bounds=(0.0, np.inf)),
+    effect("quadratic_drag", _M, "drag in proportion to the square of the speed", "1/m", 0.02, "k",
+           bounds=(0.0, np.inf)),
+    effect("side_force", _M, "force across the horizontal velocity, to its left", "1/s", 0.01, "c"),
+    effect("magnus", _M, "lift of the spinning cube (Magnus)", "1", 0.004, "c"),
+    effect("frame_rotation", _S, "world axes turn about the vertical", "rad/s", 1e-3, "rate"),
+    effect("centre_of_mass", _M, "centre of mass not in the centre of the tags", "m", 2e-3, "c_1", "c_2", "c_3"),
+    effect("principal_moments", _M, "moments of inertia not those of a uniform cube", "1", 0.05, "e_11", "e_22"),
+    effect("products_of_inertia", _M, "products of inertia", "1", 0.05, "e_12", "e_13", "e_23"),
+    effect("rotational_drag", _M, "drag of the rotation", "1/s", 0.01, "k", bounds=(0.0, np.inf)),
+    effect("side_torque", _M, "torque that turns the angular velocity about the vertical", "1/s", 0.01, "c"),
+    effect("twist", _S, "measured place and attitude turn about the vertical with height", "rad/m", 0.01, "a"),
+    effect("perspective", _S, "scale of the lengths changes with place", "1/m", 5e-3, *AXES),
+    effect("face_bias", _S, "error of place that depends on which faces look up", "m", 5e-4,
+           *(f"{a}_{i}" for i in "123" for a in AXES)),
+    effect("clock_offset", _S, "positions later than attitudes", "s", 1e-3, "delay"),
+    effect("smoothing", _S, "exposure, or smoothing of the positions", "s^2", 1e-5, "T2"),
+    effect("table_height", _S, "table not at height zero, or another half width of the cube", "m", 1e-3, "z"),
+    effect("tag_axes", _S, "axes of the tags turned against those of the cube", "rad", 5e-3,
+           "turn_1", "turn_2", "turn_3"),
+    effect("table_tilt", _S, "table leans against the vertical", "rad", 1e-2, *LEVEL),
 )  # fmt: skip
 
 
@@ -102,24 +94,21 @@ def flown(f: Flight) -> dict[str, Array]:
     for i, j in ((0, 0), (1, 1), (0, 1), (0, 2), (1, 2)):  # J = J_0 (1 + E): omega' = -omega x (E omega), axes of body
         E = np.zeros((3, 3))
         E[i, j] = E[j, i] = 1.0
-        effect = "principal_moments" if i == j else "products_of_inertia"
+        moments = "principal_moments" if i == j else "products_of_inertia"
         change = np.einsum("nij,nj->ni", f.turning, -np.cross(omega, omega @ E))
-        found[f"{effect}.e_{i + 1}{j + 1}"] = twisted(change)
+        found[f"{moments}.e_{i + 1}{j + 1}"] = twisted(change)
     return found
 
 
-def rested(f: Flight) -> tuple[Array, dict[str, Sequence[float]]] | None:
-    """Of a toss that ends on a face, height over the declared half width [m] and the face's normal along and across.
+def rested(f: Flight) -> tuple[Array, dict[str, Sequence[float]]]:
+    """Where a toss ends, on a face: height over the declared half width [m] and the face's normal along and across.
 
-    (3,), and their change by a unit of each quantity; None of another toss.
+    (3,), and their change by a unit of each quantity.
     """
     position, rotation, level = f.toss.position[-REST:], f.toss.rotation[-REST:], f.axes[:2]
-    z, up = position[:, 2] / HALF_WIDTH, rotation[:, 2, :]
-    face = int(np.abs(up).mean(axis=0).argmax())
-    flat = np.abs(up[:, face]).min() > AT_REST[1] and np.ptp(z) < AT_REST[0]
-    if not (flat and abs(z.mean() - 1) < 3 * AT_REST[0]):
-        return None
-    outward, place = np.eye(3)[face] * np.sign(up[-1, face]), position.mean(axis=0)
+    place, up = position.mean(axis=0), rotation[-1, 2]
+    face = int(np.abs(up).argmax())
+    outward = np.eye(3)[face] * np.sign(up[face])
     point = [*(level @ place).tolist(), HALF_WIDTH]  # where it would be if the declared half width were right
     # by a turn of the tags' axes against the cube's, about each body axis
     by_axes = level @ rotation[-1] @ np.cross(np.eye(3), outward).T

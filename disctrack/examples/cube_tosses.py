@@ -62,7 +62,6 @@ class CubeTosses(System):
     def __init__(self, flights: Sequence[Flight]) -> None:
         """Measure the noise, and whiten."""
         self.flights, self._flown, self._at_rest = flights, [_flown(f) for f in flights], _at_rest(flights)
-        self.n_at_rest = sum(len(rows) > 0 for rows in self._at_rest)
         self.noise = {name: noise for name, (_, noise) in FIRST_NOISE.items()}
         for _ in range(2):
             self._whiten()
@@ -134,23 +133,21 @@ def _flown(f: Flight) -> Array:
     return rows
 
 
-def _at_rest(flights: Sequence[Flight]) -> list[Array]:
-    """Of every toss (3, k + 1) the cube at rest, by QUANTITIES and as measured; (0, k + 1) where it is not on a face.
+def _at_rest(flights: Sequence[Flight]) -> Array:
+    """(m, 3, k + 1) of every toss the cube at rest, by QUANTITIES and as measured.
 
     How much resting cubes differ once all candidates have taken their share is the noise.
     """
     rows = np.zeros((len(flights), 3, len(COLUMN) + 1))
     for of_toss, f in zip(rows, flights, strict=True):
-        if (cube := rested(f)) is not None:
-            of_toss[:, -1], changes = cube
-            for name, change in changes.items():
-                of_toss[:, COLUMN[name]] = change
-    there = np.any(rows != 0, axis=(1, 2))
+        of_toss[:, -1], changes = rested(f)
+        for name, change in changes.items():
+            of_toss[:, COLUMN[name]] = change
     for c in range(3):
-        effects, seen = rows[there, c, :-1], rows[there, c, -1]
+        effects, seen = rows[:, c, :-1], rows[:, c, -1]
         amounts, _, rank, _ = np.linalg.lstsq(effects, seen, rcond=1e-10)
         rows[:, c] /= np.sqrt(np.sum((seen - effects @ amounts) ** 2) / (len(seen) - rank))
-    return [of_toss[: 3 * on_a_face] for of_toss, on_a_face in zip(rows, there.tolist(), strict=True)]
+    return rows
 
 
 def _noise(left: Sequence[Array], channels: slice, start: SmoothNoise) -> SmoothNoise:
@@ -202,8 +199,8 @@ def example(folder: Path) -> Outcome:
         rows.append((f"rms {group} ({unit})", *(rounded(size * x) for x in numbers)))
     copies, left_out = len(published) - len(tosses), len(tosses) - len(system.flights)
     caption = (
-        f"{len(system.flights)} flights, {system.n_at_rest} cubes at rest; {left_out} tosses are left out (too short, "
-        f"or not smooth), and {copies} copies of others, turned about the vertical."
+        f"{len(system.flights)} flights, each with its cube at rest; {left_out} tosses are left out (too short, or not "
+        f"smooth), and {copies} copies of others, turned about the vertical."
     )
     blocks = [Section("Every third toss, held out", [Listing(("", "before", "after", "white noise"), rows, caption)])]
     model = f"g = {GRAVITY} m/s^2, uniform cube, {FRAME_RATE:g} Hz, half width {HALF_WIDTH} m"

@@ -14,8 +14,7 @@ from scipy.interpolate import CubicSpline
 
 from calibration.kit.arrays import Array
 from disctrack.disc import MA_2014, Disc
-from disctrack.discrepancy.system import Candidate, Quantity
-from disctrack.examples._command import GRAVITY
+from disctrack.examples._command import GRAVITY, effect
 from disctrack.rolling import EndReason, Model, simulate, steady_precession
 
 FRAME = 1e-3  # [s] between pairs of the paper's cameras
@@ -24,7 +23,6 @@ SHORTEST = float(np.exp(-3))  # [s] time left where the curves of the paper's fi
 RTOL = 1e-7  # collapse then comes out to 1e-10 s
 END_SHARE = 1e-3  # of the start nutation, where the simulation ends: 0.05 ms before collapse with the paper's k_m
 MAX_DURATION = 8.0  # [s]; a motion that has not ended by then is no answer
-ANY = (-np.inf, np.inf)
 OUTCOMES = ("n_theta", "n_psidot", "n_energy", "ln_duration")
 
 
@@ -41,27 +39,20 @@ class Series:
     ln_duration: float = np.nan  # of the last stage, from that nutation on
 
 
-def _wrong(
-    name: str, unit: str, scale: float, typical: float, title: str, source: str, bounds: tuple[float, float] = ANY
-) -> Candidate:
-    q = Quantity(name, unit, scale, 0.0, *bounds, typical=typical)
-    return Candidate(q.owner, q.owner, "measurement", title, source, (q,))
-
-
-# What the experimenter may do wrong; zero is right
+# What the experimenter may do wrong
 READING = (
-    _wrong("t_f.bias", "s", 1e-3, 0.01, "the instant called t_f is not that of collapse", "section 4a",
-           (-0.045, 0.045)),
-    _wrong("cut.shift", "s", 1e-3, 0.02, "the fits end at another time left than the curves of figures 14 to 16",
-           "figures 14 to 16", (-0.04, 0.1)),
-    _wrong("theta_zero.shift", "rad", 1e-5, np.radians(0.05), "zero of the nutation (plane of the table)",
-           "section 3b: accuracy 0.05 deg"),
-    _wrong("height_zero.shift", "m", 1e-6, 2e-5, "zero of the height (plane of the table)",
-           "section 3b: accuracy 5 um"),
-    _wrong("attitude_noise.variance", "rad^2", 1e-8, np.radians(0.05) ** 2,
-           "noise of the attitude, which central differences turn into bias", "section 3b", (0.0, np.inf)),
-    _wrong("smoothing.square", "s^2", 1e-6, 0.01**2, "moving average over the record, by the square of its span",
-           "section 3b: 'a differential method'", (0.0, 0.06**2)),
+    effect("t_f", "measurement", "the instant called t_f is not that of collapse", "s", 0.01, "bias",
+           bounds=(-0.045, 0.045), source="section 4a"),
+    effect("cut", "measurement", "the fits end at another time left than the curves of figures 14 to 16", "s", 0.02,
+           "shift", bounds=(-0.04, 0.1), source="figures 14 to 16"),
+    effect("theta_zero", "measurement", "zero of the nutation (plane of the table)", "rad", np.radians(0.05), "shift",
+           source="section 3b: accuracy 0.05 deg"),
+    effect("height_zero", "measurement", "zero of the height (plane of the table)", "m", 2e-5, "shift",
+           source="section 3b: accuracy 5 um"),
+    effect("attitude_noise", "measurement", "noise of the attitude, which central differences turn into bias",
+           "rad^2", np.radians(0.05) ** 2, "variance", bounds=(0.0, np.inf), source="section 3b"),
+    effect("smoothing", "measurement", "moving average over the record, by the square of its span", "s^2", 0.01**2,
+           "square", bounds=(0.0, 0.06**2), source="section 3b: 'a differential method'"),
 )  # fmt: skip
 NO_ERRORS = {q.name: 0.0 for c in READING for q in c.quantities}
 

@@ -21,7 +21,7 @@ import numpy as np
 from scipy import stats
 
 from calibration.kit.arrays import Array
-from disctrack.analyse.published import PREDICTED, SURFACES, published_table
+from disctrack.analyse.published import PREDICTED, published_table
 from disctrack.diagnosis.motion import motion_candidates
 from disctrack.disc import MA_2014
 from disctrack.discrepancy.fit import Fit
@@ -29,21 +29,20 @@ from disctrack.discrepancy.held_out import TRAIN_FRACTION
 from disctrack.discrepancy.search import Diagnosis, Settings, explain
 from disctrack.discrepancy.system import Candidate, Quantity, System, Values
 from disctrack.examples._command import GRAVITY, Outcome, command, report_of
-from disctrack.examples.exponent_model import NO_ERRORS, READING, LastStage, Series
+from disctrack.examples.exponent_model import NO_ERRORS, OUTCOMES, READING, LastStage, Series
 from disctrack.numbers import measured, rounded, score
 from disctrack.report.blocks import Listing, Section
 from disctrack.rolling import Model, effects
 
 ORDER = (1, 2, 0)  # of the table's columns: n_theta, n_psidot, n_energy; the energy last, as it depends on the spin
-NAMES = ("n_theta", "n_psidot", "n_energy")
 THIN_DISC = np.array(PREDICTED)[[*ORDER]]
 SETTINGS = Settings(noise=1.0, shortlist=12, max_effects=2)  # the trials' own scatter is the noise
 DURATION_SIGMA = 0.03  # of ln duration: simulation and measurement of figures 17 and 18 end within 50 ms of 1.5 s
 SPIN = "state.omega3"  # at the start of the last stage; each series has its own
 SPIN_AT_REST = 0.97  # [rad/s] omega_3 at 8 deg when the centre stays at rest, h psidot sin(theta) / r
 SPIN_SIGMA = 2.0  # [rad/s]: the centre then runs on a circle of 1 mm
-K_M = {"steel": 0.381e-7, "glass": 0.28e-7}  # [m s^2] section 5c
-LONGEST = {"steel": 0.5, "glass": 0.3}  # [s] section 4a: time left where the fits of tables 2 and 3 begin
+# k_m [m s^2], section 5c; and time left [s] where the fits of tables 2 and 3 begin, section 4a
+TRIALS = {"steel": (0.381e-7, 0.5), "glass": (0.28e-7, 0.3)}
 LAST_STAGE = 1.5  # [s] simulated in section 5c
 STEP = 0.1  # of a quantity's scale, for differences: the simulation is smooth to 1e-8
 
@@ -60,11 +59,10 @@ def sample_covariance(exponents: Array) -> Array:
 def published_series() -> tuple[Series, ...]:
     """Tables 2 and 3, with the duration of the paper's model from the nutation that (5.11) has 1.5 s before the end."""
     found = []
-    for surface in SURFACES:
-        k_m = K_M[surface]
+    for surface, (k_m, longest) in TRIALS.items():
         start = (k_m * LAST_STAGE) ** (2 / 3) * 4 * GRAVITY / MA_2014.radius ** (5 / 3)
         exponents = published_table(surface).exponents[:, ORDER]
-        series = Series(surface, k_m, LONGEST[surface], start=float(start), exponents=exponents)
+        series = Series(surface, k_m, longest, start=float(start), exponents=exponents)
         stage = LastStage(series, {"km.k_m": k_m}, SPIN_AT_REST)
         found.append(replace(series, ln_duration=float(np.log(stage.duration))))
     return tuple(found)
@@ -202,7 +200,7 @@ def tables_of(system: ExponentSystem, d: Diagnosis) -> list[Section]:
         off.append((effect, score(d.before.cost - f.cost), *(f"{x:.1f}" for x in left_by(system, f)), sizes))
     surfaces = (f"sigmas of {s.surface}" for s in system.series)
     return [
-        Section("Mean of the trials", [Listing(("", *NAMES), means)]),
+        Section("Mean of the trials", [Listing(("", *OUTCOMES[:3]), means)]),
         Section("Refitted", [Listing(("effect", "chi-square falls by", *surfaces, "size"), off)]),
     ]
 

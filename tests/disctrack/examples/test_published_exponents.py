@@ -127,17 +127,17 @@ def test_chi_square_of_the_system_is_the_distance_of_all_trials_from_the_predict
     assert np.abs(derivative).max(axis=(0, 1)).all()
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize(
     ("planted", "size", "offered", "n"),
     [
-        pytest.param("t_f.bias", -0.012, FEW, 16, marks=pytest.mark.statistical),
-        pytest.param("air_bildsten.beta", 0.3, ("air_bildsten", "theta_zero"), 12, marks=pytest.mark.slow),
+        ("t_f.bias", -0.012, FEW, 16),
+        ("air_bildsten.beta", 0.3, ("air_bildsten", "theta_zero"), 12),
     ],
 )
 def test_what_is_planted_is_found_in_its_class_and_sized(published, planted, size, offered, n):
     """With the published scatter, and so many trials per surface that something is missing for sure."""
-    truth = {planted: size}
-    system = offering(tables(published, truth, np.random.default_rng(2), n=n), offered)
+    system = offering(tables(published, {planted: size}, np.random.default_rng(2), n=n), offered)
     found = explain(system, {}, QUICK, system.training)
     assert found.verdict == "found"
     fits = in_question(found)
