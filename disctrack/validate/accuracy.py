@@ -7,14 +7,8 @@ import numpy as np
 
 from calibration.kit.arrays import Array
 from disctrack.analyse.declaration import CLAIM_POSITION
-from disctrack.frames import POSE_COMPONENTS
-from disctrack.validate.errors import (
-    Consistency,
-    PoseErrors,
-    calibration_consistency,
-    joined,
-    noise_consistency,
-)
+from disctrack.frames import COORDINATES, POSE_COMPONENTS
+from disctrack.validate.errors import Consistency, PoseErrors, calibration_consistency, joined, noise_consistency
 from disctrack.validate.rendered import EXPOSURE, STATIC, STRATA_DEG, RenderedOutcome
 from disctrack.validate.tables import Table, Validation
 
@@ -23,7 +17,6 @@ REGULAR_DEG = 5.0  # psi and phi are summed up from here on; below, 1/sin(theta)
 LAW_DEG = 20.0  # at larger nutation the cameras' directions matter more than 1/sin(theta)
 CONSISTENT = (0.8, 1.25)
 _UM, _MDEG = 1e6, 180e3 / np.pi
-_COUNTED = ("x", "y", "z", "psi", "theta", "phi", "rotation")
 
 
 @dataclass(frozen=True)
@@ -98,7 +91,7 @@ def _rows(own: PoseErrors, true: PoseErrors) -> tuple[AccuracyRow, ...]:
     both = own.usable & true.usable
     regular = both & (own.q[:, 4] > np.radians(REGULAR_DEG))
     rows = []
-    for name in _COUNTED:
+    for name in (*COORDINATES, "rotation"):
         at = regular if name in ("psi", "phi") and regular.any() else both
         e, f = own.part(at).of(name), true.part(at).of(name)
         difference = e - f if name in "xyz" else np.angle(np.exp(1j * (e - f)))
@@ -138,7 +131,7 @@ def verdict(accuracy: Accuracy) -> str:
     position = max(rows[name].within_95 for name in "xyz")
     rotation = rows["rotation"].within_95
     two, one, _ = accuracy.sights
-    held = (position <= CLAIM_POSITION) + (rotation <= CLAIM_ROTATION)
+    held = [position <= CLAIM_POSITION, rotation <= CLAIM_ROTATION].count(True)
     name = ("does not hold", "holds in part", "holds")[held]
     text = (
         f"Where both cameras see the face, the claim of 0.005 mm and 0.05 deg {name}: 95 % of {two.n} poses lie within "

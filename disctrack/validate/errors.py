@@ -8,13 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibration.kit.arrays import Array, Mask
-from disctrack.frames import rotation_from_euler, rotation_from_quaternion, vector_from_rotation
+from disctrack.frames import COORDINATES, rotation_from_euler, rotation_from_quaternion, vector_from_rotation
 from disctrack.trajectory import Trajectory
 
 GROSS_POSITION = 0.5e-3  # [m] and
 GROSS_ROTATION = np.radians(1.0)  # beyond: not an error of measurement but another pose
-# rotation: the rotation vector between measured and true attitude; of both vectors all components together
-QUANTITIES = ("x", "y", "z", "psi", "theta", "phi", "position", "rotation")
 
 
 @dataclass(frozen=True)
@@ -45,8 +43,11 @@ class PoseErrors:
         return np.asarray(self.found & ~self.gross)
 
     def of(self, quantity: str) -> Array:
-        """Errors of one of QUANTITIES [m, rad]: (n,), of a vector (3 n,), only of usable poses."""
-        columns = dict(zip(QUANTITIES, (*self.error.T[:3], *self.angles.T), strict=False))
+        """Errors of a coordinate (n,), or of "position" or "rotation" about all axes (3 n,) [m, rad], of usable poses.
+
+        rotation : the rotation vector between measured and true attitude
+        """
+        columns = dict(zip(COORDINATES, (*self.error.T[:3], *self.angles.T), strict=True))
         columns |= {"position": self.error[:, :3], "rotation": self.error[:, 3:]}
         return columns[quantity][self.usable].ravel()
 

@@ -20,10 +20,7 @@ from disctrack.errors import SceneError
 from disctrack.frames import CAMERAS, rotation_from_euler
 from disctrack.recording.declaration import Recording, read_recording
 from disctrack.synthetic import Truth, rig_of, write_recording
-from disctrack.synthetic.description import (
-    GlareSettings,
-    Scene,
-)
+from disctrack.synthetic.description import GlareSettings, Scene
 from disctrack.track.follow.tracking import Tracking, track
 from disctrack.track.measurement import open_pairs
 from disctrack.track.pose import MIN_DOTS
@@ -87,22 +84,22 @@ def rendered_cases(n: int | None, seed: int, quick: bool = False, imperfect: boo
     if imperfect:
         return [imperfect_case(scene, 60 if quick else 200) for scene in scenes]
     # static poses, frames of either stretch of rolling: shared out, but at least a dozen of each in a recording
-    totals = (40, 24, 24) if quick else (96, 90, 90)
+    totals = (40, 24) if quick else (96, 90)
     counts = [max(12, -(-total // n)) for total in totals]
     return [case for scene in scenes for case in ideal_cases(scene, *counts)]
 
 
-def ideal_cases(scene: Scene, n_static: int, n_rolling: int, n_final: int) -> list[Scene]:
+def ideal_cases(scene: Scene, n_static: int, n_rolling: int) -> list[Scene]:
     """Static poses of every attitude, and two recordings of rolling."""
     rng = np.random.default_rng([scene.seed, 8])
     q = static_poses(n_static, rig_of(scene), scene.declared_disc, scene.rig.target_mm[:2], rng)
     start = rng.uniform(8, 12)
     theta, time = TO_REST
-    left = time * (0.5 / theta) ** 1.5 + n_final / scene.cameras.frame_rate_hz
+    left = time * (0.5 / theta) ** 1.5 + n_rolling / scene.cameras.frame_rate_hz
     return [
         at_rest(scene, q),
         rolling_scene(scene, ROLLING, start, n_rolling, rng),
-        rolling_scene(scene, FINAL, theta * (left / time) ** (2 / 3), n_final, rng),
+        rolling_scene(scene, FINAL, theta * (left / time) ** (2 / 3), n_rolling, rng),
     ]
 
 

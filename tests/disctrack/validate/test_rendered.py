@@ -40,7 +40,7 @@ def ideal(scene, *counts):
 
 @pytest.fixture(scope="module")
 def outcomes():
-    return ideal(scene_of(2014, quick=True), 24, 16, 16)
+    return ideal(scene_of(2014, quick=True), 24, 16)
 
 
 @pytest.fixture(scope="module")
@@ -83,7 +83,7 @@ def test_a_biased_calibration_turns_the_verdict(outcomes):
 @pytest.mark.statistical
 def test_a_camera_turned_since_the_calibration_is_noticed_by_the_measurement_and_by_the_truth():
     turned = Faults(left=CameraFault(rotation_deg=(0.0, np.degrees(1e-3), 0.0)))
-    static, *_ = ideal_cases(replace(scene_of(2014, quick=True), faults=turned), 24, 1, 1)
+    static, *_ = ideal_cases(replace(scene_of(2014, quick=True), faults=turned), 24, 1)
     found = accuracy_validation([render_and_measure(static)])
     assert "does not hold" in found.headline or "holds in part" in found.headline
     assert found.complaints
@@ -181,7 +181,7 @@ def test_noisy_sensors_and_more_bits_are_measured_from_the_first_pair_on(bits, r
 @pytest.mark.slow
 def test_full_validation_over_many_rigs():
     """Covariances honest within the band of 0.8 to 1.25, noise and calibration, in the paper's format."""
-    accuracy = sum_up([outcome for k in range(6) for outcome in ideal(scene_of(2014 + k), 16, 15, 15)])
+    accuracy = sum_up([outcome for k in range(6) for outcome in ideal(scene_of(2014 + k), 16, 15)])
     assert complaints(accuracy) == ()
     for value in accuracy.consistency.values():
         slack = 2 * value.uncertainty
