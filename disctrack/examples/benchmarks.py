@@ -32,7 +32,7 @@ class Benchmark:
     """One system, with the way from its files to runs."""
 
     name: str
-    files: tuple[str, ...]
+    files: tuple[str, ...]  # without .mat or .csv
     equations: Equations
     offered: Sequence[Term] | None
     runs: Callable[..., tuple[list[Run], list[Run]]]  # of the columns of each file: for estimation and for the test
@@ -44,7 +44,7 @@ class Benchmark:
 
 def columns(path: Path) -> Columns:
     """Columns of a file by name, each (n,)."""
-    if path.suffix == ".csv":
+    if path.suffix.lower() == ".csv":
         names = path.read_text().partition("\n")[0].replace('"', "").split(",")
         table = np.genfromtxt(path, delimiter=",", skip_header=1)
         return {name: table[:, i] for i, name in enumerate(names) if name}
@@ -103,7 +103,7 @@ def _voltages(d: Columns) -> tuple[list[Run], list[Run]]:
 
 BENCHMARKS = (
     Benchmark(
-        "EMPS", ("DATA_EMPS.mat", "DATA_EMPS_PULSES.mat"),
+        "EMPS", ("DATA_EMPS", "DATA_EMPS_PULSES"),
         Equations({"q": "v", "v": "(F - Fv*v)/M"}, {"M": 90.0, "Fv": 220.0}, inputs=["F"], units={"q": "m"}),
         [terms.coulomb("v"), terms.constant("v"), terms.quadratic("v"), terms.spring("v", "q")],
         _positions, 0.02, "mm", 1e3, 2.64,
@@ -118,7 +118,7 @@ BENCHMARKS = (
         None, _levels, 16.0, "V", 1.0, 0.191,
     ),
     Benchmark(
-        "coupled drives", ("DATAUNIF.mat",),
+        "coupled drives", ("DATAUNIF",),
         Equations(
             {"d": "(gain*u - d)/lag", "p": "r", "r": "omega**2*(d - p) - c*r"},
             {"gain": 2.0, "lag": Parameter(0.3, lower=0.01), "omega": 14.0, "c": 5.0}, inputs=["u"],
@@ -127,7 +127,7 @@ BENCHMARKS = (
         None, _speeds, 0.06, "ticks/s", 1.0, 0.12,
     ),
     Benchmark(
-        "Silverbox", ("SNLS80mV.mat",),
+        "Silverbox", ("SNLS80mV",),
         Equations(
             {"y": "v", "v": "g*u - k*y - c*v"}, {"g": 1.8e5, "k": 1.9e5, "c": 40.0}, inputs=["u"], units={"y": "V"}
         ),
@@ -139,10 +139,9 @@ BENCHMARKS = (
 
 def present(folder: Path, benchmark: Benchmark) -> list[Path]:
     """Files of a benchmark in the folder, whatever their letters' case; empty where one is missing."""
-    there = {p.name.lower(): p for p in sorted(Path(folder).iterdir())}
-    wanted = [[f"{f.lower()}{suffix}" for suffix in ("", ".mat", ".csv")] for f in benchmark.files]
-    found = [next((there[name] for name in names if name in there), None) for names in wanted]
-    return [path for path in found if path is not None] if None not in found else []
+    there = {p.stem.lower(): p for p in sorted(folder.iterdir()) if p.suffix.lower() in (".mat", ".csv")}
+    found = [there[name.lower()] for name in benchmark.files if name.lower() in there]
+    return found if len(found) == len(benchmark.files) else []
 
 
 def measured(benchmark: Benchmark, paths: Sequence[Path]) -> tuple[Answer, dict[str, float]]:

@@ -11,11 +11,12 @@ constant angular velocity. Place, velocity, attitude and angular velocity are ea
 its residual is reckoned to first order along the smooth motion of the flight (`cube_effects`).
 """
 
-from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from itertools import groupby
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from calibration.kit.arrays import Array, Mask
 from disctrack.discrepancy.noise import SampleStretch, SmoothNoise, estimate
@@ -27,6 +28,7 @@ from disctrack.examples._command import GRAVITY, Outcome, command, report_of
 from disctrack.examples.cube_data import (
     FRAME_RATE,
     HALF_WIDTH,
+    UP,
     Flight,
     flights,
     integrated,
@@ -117,20 +119,22 @@ def _kept_back(flight: Flight) -> bool:
     return flight.toss.number % HELD_OUT == HELD_OUT - 1
 
 
+def _columns(seen: Array, changes: Mapping[str, ArrayLike]) -> Array:
+    """(..., k + 1) changes of what is seen (...) by QUANTITIES, zero where none is named, and that itself."""
+    return np.stack([*(np.broadcast_to(changes.get(name, 0.0), seen.shape) for name in COLUMN), seen], axis=-1)
+
+
 def _flown(f: Flight) -> Array:
     """(n, 6, k + 1 + 12) by QUANTITIES, measured minus base model [m], [rad], and by what is the flight's own.
 
     That is place, velocity, attitude and angular velocity, three numbers each.
     """
-    rows = np.zeros((len(f.time), 6, len(COLUMN) + 1 + 12))
-    for name, column in flown(f).items():
-        rows[..., COLUMN[name]] = column
-    _, seen, own = np.split(rows, [len(COLUMN), len(COLUMN) + 1], axis=-1)
-    seen[:, :3, 0], seen[:, 3:, 0] = f.position, f.turn
-    seen[:, 2, 0] += GRAVITY * f.time**2 / 2
+    fallen = f.position + GRAVITY / 2 * f.time[:, None] ** 2 * UP
+    seen = np.concatenate([fallen, f.turn], axis=1)
+    own = np.zeros((*seen.shape, 12))
     own[:, :3, :3], own[:, :3, 3:6] = np.eye(3), f.time[:, None, None] * np.eye(3)
     own[:, 3:, 6:9], own[:, 3:, 9:] = np.eye(3), integrated(np.swapaxes(f.turning, 1, 2))
-    return rows
+    return np.concatenate([_columns(seen, flown(f)), own], axis=-1)
 
 
 def _at_rest(flights: Sequence[Flight]) -> Array:
@@ -138,11 +142,7 @@ def _at_rest(flights: Sequence[Flight]) -> Array:
 
     How much resting cubes differ once all candidates have taken their share is the noise.
     """
-    rows = np.zeros((len(flights), 3, len(COLUMN) + 1))
-    for of_toss, f in zip(rows, flights, strict=True):
-        of_toss[:, -1], changes = rested(f)
-        for name, change in changes.items():
-            of_toss[:, COLUMN[name]] = change
+    rows = np.array([_columns(*rested(f)) for f in flights])
     for c in range(3):
         effects, seen = rows[:, c, :-1], rows[:, c, -1]
         amounts, _, rank, _ = np.linalg.lstsq(effects, seen, rcond=1e-10)
@@ -152,13 +152,11 @@ def _at_rest(flights: Sequence[Flight]) -> Array:
 
 def _noise(left: Sequence[Array], channels: slice, start: SmoothNoise) -> SmoothNoise:
     """Noise of channels of all flights; those of one length share instants: their samples stand side by side."""
-    by_length = defaultdict[int, list[Array]](list)
-    for flight in left:
-        by_length[len(flight)].append(flight[:, channels])
     stretches = []
-    for n, alike in by_length.items():
+    for n, alike in groupby(sorted(left, key=len), key=len):
         time = np.arange(n) / FRAME_RATE
-        stretches.append(SampleStretch(time, np.concatenate(alike, axis=1), time[:, None] ** np.arange(2)))
+        values = np.concatenate([flight[:, channels] for flight in alike], axis=1)
+        stretches.append(SampleStretch(time, values, time[:, None] ** np.arange(2)))
     return estimate(stretches, start)
 
 

@@ -23,7 +23,6 @@ SHORTEST = float(np.exp(-3))  # [s] time left where the curves of the paper's fi
 RTOL = 1e-7  # collapse then comes out to 1e-10 s
 END_SHARE = 1e-3  # of the start nutation, where the simulation ends: 0.05 ms before collapse with the paper's k_m
 MAX_DURATION = 8.0  # [s]; a motion that has not ended by then is no answer
-OUTCOMES = ("n_theta", "n_psidot", "n_energy", "ln_duration")
 
 
 @dataclass(frozen=True)
@@ -35,7 +34,7 @@ class Series:
     longest: float  # [s] longest time left in the fit
     start: float  # [rad] nutation at which the simulation begins
     disc: Disc = MA_2014
-    exponents: Array = field(default_factory=lambda: np.zeros((0, 3)))  # (n, 3) n_theta, n_psidot, n_energy
+    exponents: Array = field(default_factory=lambda: np.zeros((0, 3)))  # (n, 3) `published.EXPONENTS`
     ln_duration: float = np.nan  # of the last stage, from that nutation on
 
 
@@ -75,9 +74,9 @@ class LastStage:
         self.curve = CubicSpline(motion.time[:n], curves[:n], axis=0, extrapolate=False) if ended else None
 
     def outcomes(self, reading: Mapping[str, float] = NO_ERRORS) -> Array:
-        """(4,) OUTCOMES as the experimenter has them; NaN where there is no collapse, or none so late."""
+        """(4,) `published.EXPONENTS` and ln duration as the experimenter has them; NaN where no collapse is seen."""
         if self.curve is None:
-            return np.full(len(OUTCOMES), np.nan)
+            return np.full(4, np.nan)
         wrong, disc = {**NO_ERRORS, **reading}, self.series.disc
         # a fixed number of instants, so that nothing jumps when a quantity of the fit moves
         n = round((self.series.longest - SHORTEST) / FRAME) + 1
@@ -90,7 +89,7 @@ class LastStage:
         psidot = psidot * np.exp(-0.5 * rate_variance / (psidot * np.sin(theta)) ** 2)  # mean of the noisy logarithm
         energy = energy + 0.5 * (2 * disc.moment_diametral + disc.moment_axial) * rate_variance
         energy = energy + disc.mass * GRAVITY * wrong["height_zero.shift"]
-        return np.array([*slope(left, np.column_stack([theta, psidot, energy])), np.log(self.duration)])
+        return np.array([*slope(left, np.column_stack([energy, theta, psidot])), np.log(self.duration)])
 
 
 def slope(left: Array, values: Array) -> Array:

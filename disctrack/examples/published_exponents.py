@@ -21,7 +21,7 @@ import numpy as np
 from scipy import stats
 
 from calibration.kit.arrays import Array
-from disctrack.analyse.published import PREDICTED, published_table
+from disctrack.analyse.published import EXPONENTS, PREDICTED, published_table
 from disctrack.diagnosis.motion import motion_candidates
 from disctrack.disc import MA_2014
 from disctrack.discrepancy.fit import Fit
@@ -29,13 +29,12 @@ from disctrack.discrepancy.held_out import TRAIN_FRACTION
 from disctrack.discrepancy.search import Diagnosis, Settings, explain
 from disctrack.discrepancy.system import Candidate, Quantity, System, Values
 from disctrack.examples._command import GRAVITY, Outcome, command, report_of
-from disctrack.examples.exponent_model import NO_ERRORS, OUTCOMES, READING, LastStage, Series
+from disctrack.examples.exponent_model import NO_ERRORS, READING, LastStage, Series
 from disctrack.numbers import measured, rounded, score
 from disctrack.report.blocks import Listing, Section
 from disctrack.rolling import Model, effects
 
-ORDER = (1, 2, 0)  # of the table's columns: n_theta, n_psidot, n_energy; the energy last, as it depends on the spin
-THIN_DISC = np.array(PREDICTED)[[*ORDER]]
+THIN_DISC = np.array(PREDICTED)
 SETTINGS = Settings(noise=1.0, shortlist=12, max_effects=2)  # the trials' own scatter is the noise
 DURATION_SIGMA = 0.03  # of ln duration: simulation and measurement of figures 17 and 18 end within 50 ms of 1.5 s
 SPIN = "state.omega3"  # at the start of the last stage; each series has its own
@@ -61,8 +60,7 @@ def published_series() -> tuple[Series, ...]:
     found = []
     for surface, (k_m, longest) in TRIALS.items():
         start = (k_m * LAST_STAGE) ** (2 / 3) * 4 * GRAVITY / MA_2014.radius ** (5 / 3)
-        exponents = published_table(surface).exponents[:, ORDER]
-        series = Series(surface, k_m, longest, start=float(start), exponents=exponents)
+        series = Series(surface, k_m, longest, float(start), exponents=published_table(surface).exponents)
         stage = LastStage(series, {"km.k_m": k_m}, SPIN_AT_REST)
         found.append(replace(series, ln_duration=float(np.log(stage.duration))))
     return tuple(found)
@@ -129,7 +127,7 @@ class ExponentSystem(System):
         return np.array(rows)
 
     def outcomes(self, index: int, values: Values) -> Array:
-        """(4,) predicted means of one series: n_theta, n_psidot, n_energy, ln duration.
+        """(4,) predicted means of one series: EXPONENTS, ln duration.
 
         Base quantities that are not among the values are at their null. Of values that stand with and without the
         surface in their names the series sees the sum.
@@ -180,7 +178,7 @@ def sentence(system: ExponentSystem, d: Diagnosis) -> str:
     before, surface = max((sigmas_off(s.exponents, THIN_DISC), s.surface) for s in system.series)
     after = max(max(left_by(system, f)) for f in fits.values())
     text = (
-        f"The trials on {surface} lie {before:.1f} sigma from 2/3, -1/3, 2/3; each alone of {', '.join(fits)} brings "
+        f"The trials on {surface} lie {before:.1f} sigma from 2/3, 2/3, -1/3; each alone of {', '.join(fits)} brings "
         f"every surface within {after:.1f} sigma, and chi-square down by {min(gains):.0f} to {max(gains):.0f}"
     )
     return text + (": not identifiable from these tables." if len(gains) > 1 else ".")
@@ -200,7 +198,7 @@ def tables_of(system: ExponentSystem, d: Diagnosis) -> list[Section]:
         off.append((effect, score(d.before.cost - f.cost), *(f"{x:.1f}" for x in left_by(system, f)), sizes))
     surfaces = (f"sigmas of {s.surface}" for s in system.series)
     return [
-        Section("Mean of the trials", [Listing(("", *OUTCOMES[:3]), means)]),
+        Section("Mean of the trials", [Listing(("", *EXPONENTS), means)]),
         Section("Refitted", [Listing(("effect", "chi-square falls by", *surfaces, "size"), off)]),
     ]
 
