@@ -15,7 +15,7 @@ from disctrack import rolling
 from disctrack.commands import DONE
 from disctrack.discrepancy.equations import _ode_kernel
 from disctrack.progress import compiling
-from disctrack.recording.readers import _png as png
+from disctrack.recording.readers import _pixel_kernels
 from disctrack.synthetic import raster
 from disctrack.track.follow.tracking import prepare
 
@@ -29,7 +29,7 @@ def run(arguments: argparse.Namespace) -> int:
         ("rendering", 10, [raster.prepare]),
         ("corners", 8, [corner_fit.prepare, normal_equations.prepare]),
         ("equations", 5, [_ode_kernel.prepare]),
-        ("readers", 1, [png.prepare]),
+        ("readers", 1, [_pixel_kernels.prepare]),
     ]
     with ProcessPoolExecutor(2, get_context("spawn")) as pool:
         for part in [pool.submit(_compiled, *part) for part in parts]:

@@ -118,15 +118,10 @@ class Played(FrameReader):
     """Frames in memory, forth and back."""
 
     def __init__(self, like: FrameReader, frames: np.ndarray, n: int) -> None:
-        super().__init__(camera=like.camera, image_size=like.image_size, dtype=like.dtype, bit_depth=like.bit_depth)
         k = len(frames)
         self._frames, self._order = frames, np.resize(np.r_[0:k, k - 2 : 0 : -1], n)
-
-    def __len__(self) -> int:
-        return len(self._order)
-
-    def _place(self, index: int) -> str:
-        return f"frame {self._order[index]} in memory"
+        alike = {name: getattr(like, name) for name in ("camera", "image_size", "dtype", "bit_depth")}
+        super().__init__(files=["memory"] * n, **alike)
 
     def _decoded(self, index: int, out: np.ndarray | None, where: str) -> np.ndarray:
         return self._frames[self._order[index]]

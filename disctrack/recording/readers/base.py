@@ -29,6 +29,7 @@ class FrameReader:
     """
 
     camera: str  # left or right
+    files: Sequence[object]  # in which each frame lies, as messages name it
     image_size: tuple[int, int]  # width, height [px]
     dtype: np.dtype  # of grey values in memory
     bit_depth: int = 0  # bits that carry grey values: 8 (uint8), or 9 to 16 (uint16); 0 stands for all of the type's
@@ -48,11 +49,7 @@ class FrameReader:
         self.doubts = tuple(f"{self.camera} camera: {doubt}" for doubt in self.doubts)
 
     def __len__(self) -> int:
-        raise NotImplementedError
-
-    def _place(self, index: int) -> str:
-        """The file of frame `index`."""
-        raise NotImplementedError
+        return len(self.files)
 
     def _decoded(self, index: int, out: Image | None, where: str) -> Image:
         """Frame `index`, in `out` or anywhere else. RecordingErrors begin with `where`."""
@@ -64,14 +61,14 @@ class FrameReader:
 
     def describe(self, index: int) -> str:
         """Where frame `index` lies, for messages."""
-        return f"{self._place(index)}, frame {index}"
+        return f"{self.files[index]}, frame {index}"
 
     def read(self, index: int, out: Image | None = None) -> Image:
         """Frame `index`, (height, width) grey values as the camera wrote them; into `out` if given, and returned.
 
         Raises RecordingError with file, camera, frame, what was found and what to do.
         """
-        where = f"{self._place(index)} ({self.camera} camera, frame {index})"
+        where = f"{self.files[index]} ({self.camera} camera, frame {index})"
         image = self._decoded(index, out, where)
         if image.shape[::-1] != self.image_size or image.dtype != self.dtype:
             found = in_words(image.shape[::-1], 8 * image.itemsize)
@@ -109,9 +106,6 @@ class Changed(FrameReader):
         """By : all that tells how they are changed, for the digest of the content; different : other fields."""
         vars(self).update({f.name: getattr(reader, f.name) for f in fields(FrameReader)} | different)
         self._reader, self._change, self._by = reader, change, by
-
-    def __len__(self) -> int:
-        return len(self._reader)
 
     def describe(self, index: int) -> str:
         """As of the other reader."""

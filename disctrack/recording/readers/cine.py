@@ -59,13 +59,13 @@ def open_cine(files: Sequence[Path], camera: str) -> RawFrames:
     cine = _Cine(file)
     layout, depth = _layout(cine)
     n = cine.n_images
-    starts = np.frombuffer(file.bytes_at(cine.table, 8 * n, f"{file.path}: table of {n} images"), "<i8")
+    starts = np.frombuffer(file.bytes_at(cine.table, 8 * n, f"{file}: table of {n} images"), "<i8")
     check_present(file, camera, layout, n, count_present(layout, starts, file.size))
     times, step, doubts = _times(cine)
     header = _header(cine, depth, times, step)
     return RawFrames(
         camera=camera,
-        files=[file],
+        files=[file] * n,
         offsets=_pixels(cine, starts, layout),
         layout=layout,
         bit_depth=depth,
@@ -81,7 +81,7 @@ class _Cine:
 
     def __init__(self, file: RawFile) -> None:
         self.file, self.path = file, file.path
-        head = _FILE_HEADER.unpack(file.bytes_at(0, _FILE_HEADER.size, f"{file.path}: file header"))
+        head = _FILE_HEADER.unpack(file.bytes_at(0, _FILE_HEADER.size, f"{file}: file header"))
         mark, _, compression, version, _, _, *rest = head
         self.first_image, self.n_images, bitmap_at, setup_at, self.table, *time = rest
         if mark != b"CI" or version > 1:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from calibration.kit.arrays import Image
 from disctrack.errors import RecordingError
-from disctrack.recording.readers._png import undo_filters
+from disctrack.recording.readers._pixel_kernels import undo_filters
 from disctrack.recording.readers.raw import check_claim
 from disctrack.recording.readers.tiff_pages import Content, page_pixels, pages_of
 

@@ -118,14 +118,13 @@ def _open(handle: h5py.File, stack: h5py.Dataset, file: Path, camera: str) -> Fr
     if offset is not None and whole:
         layout = PixelLayout(width, height, stack.dtype)
         handle.close()
-        return RawFrames(
-            files=[RawFile(file)], offsets=offset + layout.frame_bytes * np.arange(n), layout=layout, **told
-        )
+        starts = offset + layout.frame_bytes * np.arange(n)
+        return RawFrames(files=[RawFile(file)] * n, offsets=starts, layout=layout, **told)
     filters, together = _filters(stack), stack.chunks[0] if stack.chunks else 1
     here = whole and stack.chunks == (1, height, width) and _DEFLATE in filters <= {_SHUFFLE, _DEFLATE}
     slow = f"chunks of {together} frames are decompressed anew for each of them; chunks of one frame are read faster"
     return Hdf5Frames(
-        file=file,
+        files=[where] * n,
         stack=stack,
         shuffled=_SHUFFLE in filters,
         random_access=bool(here),
@@ -205,19 +204,12 @@ class Hdf5Frames(FrameReader):
     the compressed bytes only, and frames are inflated side by side: with random access.
     """
 
-    file: Path
     stack: h5py.Dataset
     shuffled: bool
 
     def __post_init__(self) -> None:
         self._lock = threading.Lock()
         super().__post_init__()
-
-    def __len__(self) -> int:
-        return int(self.stack.shape[0])
-
-    def _place(self, index: int) -> str:
-        return f"{self.file}:{self.stack.name}"
 
     def _decoded(self, index: int, out: Image | None, where: str) -> Image:
         image, content = self._buffer(out), None

@@ -40,7 +40,7 @@ def open_images(files: Sequence[Path], camera: str, pattern: str = "") -> FrameR
     stored, first = first_readable(len(files), camera, decoded)
     return ImageSequence(
         camera=camera,
-        files=slots,
+        files=[file or f"missing file of {camera} frame {index}" for index, file in enumerate(slots)],
         numbers=numbers,
         image_size=(first.shape[1], first.shape[0]),
         dtype=first.dtype,
@@ -64,16 +64,11 @@ def _depth_notes(stored: NDArray, grey: Image) -> list[str]:
 class ImageSequence(FrameReader):
     """One file per frame. Files are opened when a frame is read, and never written."""
 
-    files: Sequence[Path | None]  # None where a number is missing
-
-    def __len__(self) -> int:
-        return len(self.files)
+    files: Sequence[Path | str]  # words where a number is missing
 
     def describe(self, index: int) -> str:
-        """The file's name, or that there is none."""
-        return str(self.files[index] or f"missing file of {self.camera} frame {index}")
-
-    _place = describe
+        """The file's name."""
+        return str(self.files[index])
 
     def _decoded(self, index: int, out: Image | None, where: str) -> Image:
         content = self._stored(index, where)
@@ -82,6 +77,6 @@ class ImageSequence(FrameReader):
 
     def _stored(self, index: int, where: str = "") -> bytes:
         file = self.files[index]
-        if file is None:
+        if isinstance(file, str):
             raise RecordingError(f"{where}: there is no file with this number. Copy it again from the camera.")
         return content_of(file, where)

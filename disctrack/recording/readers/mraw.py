@@ -62,7 +62,7 @@ def open_mraw(files: Sequence[Path], camera: str) -> RawFrames:
     n = entries.whole("Total Frame")
     check_present(file, camera, layout, n, min(n, file.size // layout.frame_bytes))
     if layout.stored_bits == 16 and saturation != 0xFFFF:
-        largest = int(np.frombuffer(file.bytes_at(0, layout.frame_bytes, str(file.path)), "<u2").max())
+        largest = int(np.frombuffer(file.bytes_at(0, layout.frame_bytes, str(file)), "<u2").max())
         if largest > saturation:
             notes.append(f"grey values go up to {largest}, not {saturation} as the header says; used as they are")
             depth, saturation = 16, 0xFFFF
@@ -71,7 +71,7 @@ def open_mraw(files: Sequence[Path], camera: str) -> RawFrames:
     header, remarks, doubts = _header(entries, saturation)
     return RawFrames(
         camera=camera,
-        files=[file],
+        files=[file] * n,
         offsets=np.arange(n, dtype=np.int64) * layout.frame_bytes,
         layout=layout,
         bit_depth=depth,

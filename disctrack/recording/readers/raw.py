@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from calibration.kit.arrays import Image
 from disctrack.errors import RecordingError
 from disctrack.files.inputs import open_regular
-from disctrack.recording.readers._unpack_kernels import unpack_10, unpack_12
+from disctrack.recording.readers._pixel_kernels import unpack_10, unpack_12
 from disctrack.recording.readers.base import FrameReader
 
 # A header may claim any size; no camera of this kind has more pixels, and reading one must not exhaust the memory.
@@ -47,6 +47,9 @@ class RawFile:
             self.size = os.fstat(self._descriptor).st_size
         except OSError as error:
             raise RecordingError(f"{path}: cannot be read: {error.strerror}.") from error
+
+    def __str__(self) -> str:
+        return str(self.path)
 
     def read_into(self, buffer: NDArray[np.uint8], offset: int, where: str) -> None:
         """Fill `buffer` (n,) with the bytes from `offset` on.
@@ -129,8 +132,8 @@ class PixelLayout:
 class RawFrames(FrameReader):
     """Frames of equal size at known places in one or several files.
 
-    Frame i begins at byte offsets[i] of files[file_of_frame[i]]; it is lost where that is below 0, or where the file
-    ends before its end.
+    Frame i begins at byte offsets[i] of files[i]; it is lost where that is below 0, or where the file ends before its
+    end.
     """
 
     image_size: tuple[int, int] = field(init=False)
@@ -138,30 +141,21 @@ class RawFrames(FrameReader):
     files: Sequence[RawFile]
     offsets: NDArray[np.integer]
     layout: PixelLayout
-    file_of_frame: NDArray[np.integer] | int = 0
 
     def __post_init__(self) -> None:
         layout, n = self.layout, len(self.offsets)
         self.image_size, self.dtype = (layout.width, layout.height), layout.dtype.newbyteorder("=")
         self._coding = f"{layout.stored_bits} {layout.dtype.str} {layout.bottom_up} {layout.table is not None}"
-        self._file_of_frame = np.broadcast_to(self.file_of_frame, n)
-        ends = np.array([file.size for file in self.files])[self._file_of_frame]
-        lost = n - count_present(layout, self.offsets, ends)
+        lost = n - count_present(layout, self.offsets, np.array([file.size for file in self.files]))
         if lost:
-            cut = f"{self.files[0].path}: lacks {lost} of {n} frames; they are left without an answer"
+            cut = f"{self.files[0]}: lacks {lost} of {n} frames; they are left without an answer"
             self.notes = (*self.notes, cut)
         super().__post_init__()
-
-    def __len__(self) -> int:
-        return len(self.offsets)
-
-    def _place(self, index: int) -> str:
-        return str(self.files[self._file_of_frame[index]].path)
 
     def _fill(self, buffer: NDArray[np.uint8], index: int, where: str) -> NDArray[np.uint8]:
         if self.offsets[index] < 0:
             raise RecordingError(f"{where}: there is no image of the right size where the file says. Copy it again.")
-        self.files[self._file_of_frame[index]].read_into(buffer, int(self.offsets[index]), where)
+        self.files[index].read_into(buffer, int(self.offsets[index]), where)
         return buffer
 
     def _stored(self, index: int) -> memoryview:
@@ -186,10 +180,10 @@ def count_present(layout: PixelLayout, offsets: NDArray[np.integer], ends: NDArr
 def check_present(file: RawFile, camera: str, layout: PixelLayout, n: int, present: int) -> None:
     """Raise RecordingError unless there are frames, and `present` of the n promised, most of them, are in the file."""
     if n < 1:
-        raise RecordingError(f"{file.path} ({camera} camera): its header states no frame. Export it again.")
+        raise RecordingError(f"{file} ({camera} camera): its header states no frame. Export it again.")
     if present < LEAST_PRESENT * n or present * layout.frame_bytes > file.size:
         raise RecordingError(
-            f"{file.path} ({camera} camera): the header states {n} frames of {layout.width} x {layout.height} px, "
+            f"{file} ({camera} camera): the header states {n} frames of {layout.width} x {layout.height} px, "
             f"{layout.stored_bits} bit, which need {n * layout.frame_bytes} bytes, but the file has {file.size}: it is "
             "cut short, or the header is of another file. Copy both again."
         )

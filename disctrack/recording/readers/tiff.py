@@ -40,48 +40,41 @@ def open_stack(files: Sequence[Path], camera: str) -> FrameReader:
 
     The frame rate is taken from the notes of ImageJ or OME in the first page, time stamps from those of OME.
     """
-    raw_files = [RawFile(file) for file in files]
     pages: list[Page] = []
-    numbers: list[int] = []
+    sources: list[RawFile] = []
     notes = []
-    for number, file in enumerate(raw_files):
+    for file in map(RawFile, files):
         found, note = _pages(file)
         pages += found
-        numbers += [number] * len(found)
+        sources += [file] * len(found)
         notes += [note] if note else []
     if not pages:
         raise RecordingError(f"{files[0]}: a TIFF file without a page that can be read. Export it again.")
     first = pages[0]
     rate, stamps = _times(first.description, len(pages))
     check_frame_size(first.width, first.height, str(files[0]))
-    told: dict[str, Any] = {"camera": camera, "notes": tuple(notes), "timestamps": stamps, "frame_rate": rate}
+    told: dict[str, Any] = {"camera": camera, "files": sources, "notes": tuple(notes)}
+    told |= {"timestamps": stamps, "frame_rate": rate}
     offsets = np.array([page.plain_offset for page in pages], np.int64)
     if (offsets >= 0).all() and all(page.layout == first.layout for page in pages):
         layout = PixelLayout(first.width, first.height, first.dtype)
-        return RawFrames(files=raw_files, file_of_frame=np.array(numbers), offsets=offsets, layout=layout, **told)
-    sources = [raw_files[number] for number in numbers]
+        return RawFrames(offsets=offsets, layout=layout, **told)
 
     def decoded(index: int) -> Image:
-        where = str(sources[index].path)
+        where = str(sources[index])
         return as_grey(page_pixels(sources[index], pages[index], where), where)
 
     image = first_readable(len(pages), camera, decoded)
     size = image.shape[1], image.shape[0]
-    return TiffPages(files=sources, pages=pages, image_size=size, dtype=image.dtype, **told)
+    return TiffPages(pages=pages, image_size=size, dtype=image.dtype, **told)
 
 
 @dataclass(eq=False, kw_only=True)
 class TiffPages(FrameReader):
     """Pages that are compressed, or otherwise not plain."""
 
-    files: Sequence[RawFile]  # of each frame
+    files: Sequence[RawFile]
     pages: Sequence[Page]
-
-    def __len__(self) -> int:
-        return len(self.pages)
-
-    def _place(self, index: int) -> str:
-        return str(self.files[index].path)
 
     def _stored(self, index: int) -> bytes:
         page = self.pages[index]
@@ -114,7 +107,7 @@ def _without_directories(file: RawFile, first: Page) -> list[Page]:
         return [first]
     if first.plain_offset < 0:
         raise RecordingError(
-            f"{file.path}: announces {n} frames in one directory, whose pixels are not plain (white is zero, rows "
+            f"{file}: announces {n} frames in one directory, whose pixels are not plain (white is zero, rows "
             "from another corner, compressed, or no grey values of 8 or 16 bit). Export it again, black as zero."
         )
     most = max(1, -(-file.size // size))  # of a file cut short the frames that begin in it; the next is the end

@@ -18,7 +18,7 @@ import tifffile
 from numpy.typing import NDArray
 
 from disctrack.errors import RecordingError
-from disctrack.recording.readers._unpack_kernels import lzw_codes_follow
+from disctrack.recording.readers._pixel_kernels import lzw_codes_follow
 from disctrack.recording.readers.raw import MOST_PIXELS, RawFile, check_claim, check_frame_size
 
 logging.getLogger("tifffile").addHandler(logging.NullHandler())  # it logs what it finds odd; here that is an error
@@ -87,27 +87,27 @@ def pages_of(source: RawFile) -> Iterator[Page]:
     layouts: dict[str, tifffile.TiffPage] = {}
     seen: set[int] = set()
     try:
-        tiff = tifffile.TiffFile(io.BufferedReader(_Stream(source)), name=str(source.path))
+        tiff = tifffile.TiffFile(io.BufferedReader(_Stream(source)), name=str(source))
         for index in count():
             try:
                 page = tiff.pages[index]
             except IndexError:
                 break
             if page.offset in seen:
-                raise RecordingError(f"{source.path}: the chain of pages turns back to byte {page.offset}.")
+                raise RecordingError(f"{source}: the chain of pages turns back to byte {page.offset}.")
             if not isinstance(page, tifffile.TiffPage):  # others know less of themselves; nobody wanted them
                 raise TypeError("no page of its own")
             seen.add(page.offset)
             found = _page(page, layouts)
             if not page.subfiletype & tifffile.FILETYPE.REDUCEDIMAGE:
                 yield found
-        link = source.bytes_at(tiff.pages.next_page_offset or 0, tiff.tiff.offsetsize, str(source.path))
+        link = source.bytes_at(tiff.pages.next_page_offset or 0, tiff.tiff.offsetsize, str(source))
         if any(link):
-            raise RecordingError(f"{source.path}: the chain of pages breaks off, it is damaged. Copy it again.")
+            raise RecordingError(f"{source}: the chain of pages breaks off, it is damaged. Copy it again.")
     except (RecordingError, GeneratorExit):
         raise
     except Exception as error:  # whatever a damaged file makes of it
-        raise RecordingError(f"{source.path}: not a readable TIFF file, or damaged ({error}).") from error
+        raise RecordingError(f"{source}: not a readable TIFF file, or damaged ({error}).") from error
 
 
 class _Stream(io.RawIOBase):
@@ -127,7 +127,7 @@ class _Stream(io.RawIOBase):
 
     def readinto(self, buffer: bytearray | memoryview) -> int:  # type: ignore[override]
         size = max(min(len(buffer), self._source.size - self._at), 0)
-        buffer[:size] = self._source.bytes_at(self._at, size, str(self._source.path)) if size else b""
+        buffer[:size] = self._source.bytes_at(self._at, size, str(self._source)) if size else b""
         self._at += size
         return size
 

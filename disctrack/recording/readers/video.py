@@ -66,13 +66,15 @@ class VideoFile(FrameReader):
             self._times, self._keys, self._timed, self._checked = _index(container, codec_name, file)
 
         def looked_at(index: int) -> tuple[av.VideoFrame, Image]:
-            frame = self._frame(index, self.describe(index))
-            return frame, _luma(frame, self.describe(index))
+            where = f"{file}, frame {index}"
+            frame = self._frame(index, where)
+            return frame, _luma(frame, where)
 
-        frame, first = first_readable(len(self), camera, looked_at)
+        frame, first = first_readable(len(self._times), camera, looked_at)
         lossy = f"{codec_name} may compress with loss, which costs accuracy; ffv1 is free of loss"
         super().__init__(
             camera=camera,
+            files=[file] * len(self._times),
             image_size=(first.shape[1], first.shape[0]),
             dtype=first.dtype,
             bit_depth=_depth(frame),
@@ -80,12 +82,6 @@ class VideoFile(FrameReader):
             doubts=tuple(_gap_doubts(self._times)),
             random_access=False,
         )
-
-    def __len__(self) -> int:
-        return len(self._times)
-
-    def _place(self, index: int) -> str:
-        return str(self.file)
 
     def _decoded(self, index: int, out: Image | None, where: str) -> Image:
         with self._lock:
@@ -112,7 +108,7 @@ class VideoFile(FrameReader):
                 raise RecordingError(f"{where}: {error}") from error
         self._next = index + 1
         while self._held[0] < index:
-            self._held = next(self._frames, (len(self), None, ""))
+            self._held = next(self._frames, (len(self._times), None, ""))
         position, frame, problem = self._held
         if position > index:
             raise RecordingError(f"{where}: the video does not hold this frame, or it is cut short. Copy it again.")
