@@ -33,21 +33,21 @@ _BLOCK_HEADER = struct.Struct("<IHH")
 _TIMES_BLOCK = 1002
 _MOST_BLOCKS = 1000  # real files have two or three
 _SETUP_MARK = 140  # where the setup's own mark and length stand
-# Field of the camera setup: offset and type. Fields beyond the setup's stated length are not in the file.
+# Field of the camera setup (4 bytes): its offset. Fields beyond the setup's stated length are not in the file.
 _SETUP_FIELDS = {
-    "Serial": (743, "<I"),
-    "bFlipH": (756, "<i"),
-    "bFlipV": (760, "<i"),
-    "FrameRate": (768, "<I"),
-    "Shutter": (772, "<I"),
-    "CameraVersion": (792, "<I"),
-    "CFA": (808, "<I"),
-    "RealBPP": (896, "<I"),
-    "FRPSteps": (1048, "<I"),
-    "ShutterNs": (1568, "<I"),
-    "EDRShutterNs": (1572, "<I"),
+    "Serial": 743,
+    "bFlipH": 756,
+    "bFlipV": 760,
+    "FrameRate": 768,
+    "Shutter": 772,
+    "CameraVersion": 792,
+    "CFA": 808,
+    "RealBPP": 896,
+    "FRPSteps": 1048,
+    "ShutterNs": 1568,
+    "EDRShutterNs": 1572,
 }
-_SETUP_BYTES = 1576
+_SETUP_BYTES = max(_SETUP_FIELDS.values()) + 4
 _FRACTION = 0xFFFFFFFC  # of a second, in 2**-32 s; the two lowest bits are flags
 # Way of packing (biCompression): bits per stored pixel; 0 is none.
 _PACKED = {256: 10, 1024: 12}
@@ -80,50 +80,48 @@ class _Cine:
     """The headers of one file."""
 
     def __init__(self, file: RawFile) -> None:
-        self.file, self.path = file, file.path
+        self.file = file
         head = _FILE_HEADER.unpack(file.bytes_at(0, _FILE_HEADER.size, f"{file}: file header"))
         mark, _, compression, version, _, _, *rest = head
         self.first_image, self.n_images, bitmap_at, setup_at, self.table, *time = rest
         if mark != b"CI" or version > 1:
-            raise RecordingError(f"{self.path}: not a cine file of a known version. Export the recording again.")
+            raise RecordingError(f"{file}: not a cine file of a known version. Export the recording again.")
         if compression == 1:  # 0: as they are; 2: as the sensor has them, which is grey without a colour filter
-            raise RecordingError(f"{self.path}: a compressed cine (JPEG). Save it uncompressed: cine raw.")
+            raise RecordingError(f"{file}: a compressed cine (JPEG). Save it uncompressed: cine raw.")
         self.clock_is_free, self.trigger_second = bool(time[0] & 1), time[1]  # [s] since 1970
         self.trigger = (time[0] & _FRACTION) * 2.0**-32  # [s] after that
-        bitmap = _BITMAP_HEADER.unpack(file.bytes_at(bitmap_at, _BITMAP_HEADER.size, f"{self.path}: bitmap header"))
+        bitmap = _BITMAP_HEADER.unpack(file.bytes_at(bitmap_at, _BITMAP_HEADER.size, f"{file}: bitmap header"))
         _, self.width, height, _, self.bits, self.packing, self.image_bytes = bitmap
         self.height = abs(height)
         self.bottom_up = height > 0 and self.packing == 0  # as in a bitmap; packed images begin with the upper row
-        mark_and_length = file.bytes_at(setup_at + _SETUP_MARK, 4, f"{self.path}: camera setup")
+        mark_and_length = file.bytes_at(setup_at + _SETUP_MARK, 4, f"{file}: camera setup")
         length = int.from_bytes(mark_and_length[2:], "little")
         if mark_and_length[:2] != b"ST":
-            raise RecordingError(f"{self.path}: no camera setup where the header says. Export the recording again.")
-        self.setup = file.bytes_at(setup_at, min(length, _SETUP_BYTES), f"{self.path}: camera setup")
+            raise RecordingError(f"{file}: no camera setup where the header says. Export the recording again.")
+        self.setup = file.bytes_at(setup_at, min(length, _SETUP_BYTES), f"{file}: camera setup")
         self.blocks = setup_at + length  # where they begin
 
-    def field(self, name: str) -> int | None:
-        """A field of the camera setup, or None where the file's setup is older than the field."""
-        offset, kind = _SETUP_FIELDS[name]
-        if offset + struct.calcsize(kind) > len(self.setup):
-            return None
-        return int(struct.unpack_from(kind, self.setup, offset)[0])
+    def field(self, name: str) -> int:
+        """A field of the camera setup, or 0 where the file's setup is older than the field."""
+        offset = _SETUP_FIELDS[name]
+        return int.from_bytes(self.setup[offset : offset + 4], "little") if offset + 4 <= len(self.setup) else 0
 
 
 def _layout(cine: _Cine) -> tuple[PixelLayout, int]:
     """How the pixels lie, and the bits that carry grey values. RecordingError for colours, and what is compressed."""
-    filter_code = (cine.field("CFA") or 0) & 0xFFFFFF  # the highest byte tells of grey heads
+    filter_code = cine.field("CFA") & 0xFFFFFF  # the highest byte tells of grey heads
     if filter_code or cine.bits not in (8, 16):
         raise RecordingError(
-            f"{cine.path}: a colour recording (filter code {filter_code}, {cine.bits} bit per pixel); expected grey "
+            f"{cine.file}: a colour recording (filter code {filter_code}, {cine.bits} bit per pixel); expected grey "
             "values. A conversion here would mix what the sensor measured: record with a monochrome camera."
         )
     if cine.packing and cine.packing not in _PACKED:
         raise RecordingError(
-            f"{cine.path}: images are packed in a way (biCompression {cine.packing}) that is not read. Save them "
+            f"{cine.file}: images are packed in a way (biCompression {cine.packing}) that is not read. Save them "
             "unpacked with 8 or 16 bit, or packed with 10 or 12 bit."
         )
     packed, w, h = _PACKED.get(cine.packing, 0), cine.width, cine.height
-    check_frame_size(w, h, str(cine.path), packed or cine.bits)
+    check_frame_size(w, h, str(cine.file), packed or cine.bits)
     if packed:
         table = linear_from_10_bits() if packed == 10 else None
         depth = 12 if packed == 10 else bit_depth_of(12, cine.field("RealBPP") or 12)
@@ -144,7 +142,7 @@ def _pixels(cine: _Cine, starts: NDArray[np.int64], layout: PixelLayout) -> NDAr
     first = _pixels_of(cine, int(starts[0]), layout)
     if first < 0:
         raise RecordingError(
-            f"{cine.path}: the first image does not have the {layout.frame_bytes} bytes of {layout.width} x "
+            f"{cine.file}: the first image does not have the {layout.frame_bytes} bytes of {layout.width} x "
             f"{layout.height} px with {layout.stored_bits} bit. The file is damaged: export it again."
         )
     if (np.diff(starts) == first - starts[0] + layout.frame_bytes).all():
@@ -154,7 +152,7 @@ def _pixels(cine: _Cine, starts: NDArray[np.int64], layout: PixelLayout) -> NDAr
 
 def _pixels_of(cine: _Cine, start: int, layout: PixelLayout) -> int:
     """Where the pixels of the record at `start` begin, or -1 if it is damaged or beyond the end of the file."""
-    where = f"{cine.path}: image at byte {start}"
+    where = f"{cine.file}: image at byte {start}"
     try:
         (note,) = struct.unpack("<I", cine.file.bytes_at(start, 4, where))
         (size,) = struct.unpack("<I", cine.file.bytes_at(start + note - 4, 4, where))
@@ -188,10 +186,10 @@ def _times(cine: _Cine) -> tuple[Array | None, int, list[str]]:
     start, size = block
     if size < 8 * n:
         return None, 1, [f"the file has {size // 8} time stamps for {n} frames; they are not used"]
-    raw = np.frombuffer(cine.file.bytes_at(start, 8 * n, str(cine.path)), "<u4").reshape(-1, 2)
+    raw = np.frombuffer(cine.file.bytes_at(start, 8 * n, str(cine.file)), "<u4").reshape(-1, 2)
     fractions = (raw[:, 0] & np.uint32(_FRACTION)) * 2.0**-32
     times = (raw[:, 1].astype(np.int64) - cine.trigger_second) + fractions - cine.trigger
-    steps, rate = np.diff(times), cine.field("FrameRate") or 0
+    steps, rate = np.diff(times), cine.field("FrameRate")
     periods = float(np.median(steps)) * rate if len(steps) else 1.0
     step = round(periods)
     if not (steps > 0).all() or step < 1 or abs(periods / step - 1) >= 0.01:
@@ -205,7 +203,7 @@ def _find_block(cine: _Cine, wanted: int) -> tuple[int, int] | None:
     for _ in range(_MOST_BLOCKS):
         if position + _BLOCK_HEADER.size > min(cine.table, cine.file.size):
             return None
-        content = cine.file.bytes_at(position, _BLOCK_HEADER.size, str(cine.path))
+        content = cine.file.bytes_at(position, _BLOCK_HEADER.size, str(cine.file))
         size, kind, _ = _BLOCK_HEADER.unpack(content)
         if size < _BLOCK_HEADER.size or position + size > cine.file.size:
             return None
@@ -218,11 +216,11 @@ def _find_block(cine: _Cine, wanted: int) -> tuple[int, int] | None:
 def _header(cine: _Cine, depth: int, times: Array | None, step: int) -> CameraHeader:
     rate = cine.field("FrameRate")
     if not rate:
-        raise RecordingError(f"{cine.path}: the camera setup states no frame rate. Export the recording again.")
-    exposure = (cine.field("ShutterNs") or 1000 * (cine.field("Shutter") or 0)) / 1e9
+        raise RecordingError(f"{cine.file}: the camera setup states no frame rate. Export the recording again.")
+    exposure = (cine.field("ShutterNs") or 1000 * cine.field("Shutter")) / 1e9
     second = cine.trigger_second
     return CameraHeader(
-        file=str(cine.path),
+        file=str(cine.file),
         device=f"Phantom {cine.field('CameraVersion')}, serial number {cine.field('Serial')}",
         frame_rate=rate / step,
         step=step,
@@ -241,7 +239,7 @@ def _setup_notes(cine: _Cine) -> list[str]:
     notes = []
     if cine.field("FRPSteps"):
         notes.append("the frame rate was changed during the recording (frame rate profile)")
-    if 0 < (cine.field("EDRShutterNs") or 0) < (cine.field("ShutterNs") or 0):
+    if 0 < cine.field("EDRShutterNs") < cine.field("ShutterNs"):
         notes.append("bright pixels are compressed (extreme dynamic range): edges of the dots may be biased")
     if cine.field("bFlipH") or cine.field("bFlipV"):
         notes.append(

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 
 from calibration.kit.arrays import Array32, Image, Mask
-from calibration.kit.stuck_pixels import repair
+from calibration.kit.stuck_pixels import MOST, repair
 from disctrack.errors import RecordingError
 from disctrack.frames import CAMERAS
 from disctrack.recording.readers import open_frames
@@ -25,8 +25,6 @@ from disctrack.recording.readers.base import Changed, FrameReader, in_words
 from disctrack.recording.readers.files import IMAGES, match_files, split_member
 
 ODD = 0.5  # relative, by which a dead pixel's answer to light differs from its neighbours'; gains differ by 0.05
-MOST_DEAD = 0.01  # of all pixels: more, and it is the flat image that is wrong
-MOST_SATURATED = 0.002  # of all pixels: more is no matter of single hot ones
 LEAST_LIGHT = 0.1  # of full scale: a flat that is darker tells gains worse than they differ
 ENOUGH = 10  # images averaged, from which on the flat's own noise (1 % of one image) is below usual patterns
 
@@ -167,7 +165,7 @@ def _flat_field(flat_images: str | None, dark_images: str | None, folder: Path, 
 def _gain(flat: _Mean, offset: Array32, dark: _Mean | None) -> tuple[Array32, Mask]:
     """Factors on the pixels' signals, and which pixels are dead. Raises RecordingError."""
     saturated = float(np.mean(flat.clipped))
-    if saturated > MOST_SATURATED:
+    if saturated > MOST:
         raise RecordingError(
             f"{flat.where}: {100 * saturated:.2g} % of its pixels are saturated, so that their gains are not "
             "known. Take it with less light, or a shorter exposure: half of full scale is good."
@@ -186,7 +184,7 @@ def _gain(flat: _Mean, offset: Array32, dark: _Mean | None) -> tuple[Array32, Ma
         )
     around = cv2.medianBlur(answer, 5)
     dead = np.asarray((np.abs(answer - around) > ODD * around) | flat.clipped | (answer <= 0.1 * level))
-    if dead.mean() > MOST_DEAD:
+    if dead.mean() > MOST:
         raise RecordingError(
             f"{flat.where}: {100 * dead.mean():.2g} % of its pixels hardly answer the light, or far more than their "
             "neighbours. Take it out of focus, of an evenly lit white surface without an edge in view."

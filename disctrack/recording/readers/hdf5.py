@@ -10,23 +10,28 @@ import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import h5py
 import numpy as np
+from h5py import h5z
 
 from calibration.kit.arrays import Array, Image
 from disctrack.errors import RecordingError
 from disctrack.recording.readers.base import FrameReader, only_file
 from disctrack.recording.readers.decoding import inflated
-from disctrack.recording.readers.raw import PixelLayout, RawFile, RawFrames, check_frame_size
+from disctrack.recording.readers.raw import (
+    LEAST_PRESENT,
+    PixelLayout,
+    RawFile,
+    RawFrames,
+    bit_depth_of,
+    check_frame_size,
+)
 
 _MOST_OBJECTS = 10_000  # looked at in the search for the one stack
 _LARGEST_CACHE = 64 << 20  # bytes of decompressed chunks kept; more than one camera's chunk of many frames
 _LARGEST_CHUNK = 512 << 20  # bytes: what the library takes at once, whatever the file's size
-_DEPTHS = (10, 12, 14, 16)  # of 16-bit whole numbers
-_DEFLATE, _SHUFFLE = 1, 2  # filters by their registered numbers
-_SMALL = 1 << 12  # bytes: what deflate may add to what it cannot compress
 
 
 def open_hdf5(files: Sequence[Path], camera: str, member: str = "") -> FrameReader:
@@ -100,7 +105,7 @@ def _open(handle: h5py.File, stack: h5py.Dataset, file: Path, camera: str) -> Fr
     stored = _frames_stored(stack)
     if n == 0 or stored == 0:
         raise RecordingError(f"{where}: a stack without frames.")
-    if n > 2 * stored:  # a few that are missing are lost frames; a header may announce any number
+    if stored < LEAST_PRESENT * n:  # a few that are missing are lost frames; a header may announce any number
         raise RecordingError(
             f"{where}: announces {n} frames, but at most {stored} were ever written. The recording was cut short: "
             "write it again, or give the data set its true length."
@@ -109,7 +114,7 @@ def _open(handle: h5py.File, stack: h5py.Dataset, file: Path, camera: str) -> Fr
     rate, bits = _attribute(stack, "frame_rate"), _attribute(stack, "bit_depth")
     told: dict[str, Any] = {
         "camera": camera,
-        "bit_depth": int(bits) if bits in _DEPTHS and stack.dtype.itemsize == 2 else 0,
+        "bit_depth": bit_depth_of(8 * stack.dtype.itemsize, int(bits or 0)),
         "timestamps": _timestamps(stack, n, where),
         "frame_rate": rate if rate is not None and rate > 0 else None,
     }
@@ -121,13 +126,13 @@ def _open(handle: h5py.File, stack: h5py.Dataset, file: Path, camera: str) -> Fr
         starts = offset + layout.frame_bytes * np.arange(n)
         return RawFrames(files=[RawFile(file)] * n, offsets=starts, layout=layout, **told)
     filters, together = _filters(stack), stack.chunks[0] if stack.chunks else 1
-    here = whole and stack.chunks == (1, height, width) and _DEFLATE in filters <= {_SHUFFLE, _DEFLATE}
+    deflated = h5z.FILTER_DEFLATE in filters <= {h5z.FILTER_SHUFFLE, h5z.FILTER_DEFLATE}
     slow = f"chunks of {together} frames are decompressed anew for each of them; chunks of one frame are read faster"
     return Hdf5Frames(
-        files=[where] * n,
+        files=cast(Sequence[str], np.broadcast_to(where, n)),  # a virtual one may announce any n
         stack=stack,
-        shuffled=_SHUFFLE in filters,
-        random_access=bool(here),
+        shuffled=h5z.FILTER_SHUFFLE in filters,
+        random_access=bool(whole and deflated and stack.chunks == (1, height, width)),
         notes=(slow,) if together > max(1, _LARGEST_CACHE // (width * height * stack.dtype.itemsize)) else (),
         image_size=(int(width), int(height)),
         dtype=stack.dtype.newbyteorder("="),
@@ -218,7 +223,7 @@ class Hdf5Frames(FrameReader):
                 size = self._stored_size(index)
                 if size == 0:
                     raise RecordingError(f"{where}: was never written to the file. Copy or write it again.")
-                if self.random_access and size <= 2 * image.nbytes + _SMALL:
+                if self.random_access and size <= 2 * image.nbytes:
                     mask, content = self.stack.id.read_direct_chunk((index, 0, 0))
                     content = None if mask else content  # some filter was left out
                 if content is None:

@@ -14,7 +14,6 @@ from disctrack.recording.readers.camera_header import start_offset
 RATE_TOLERANCE = 0.01  # of the declared rate; a clock's error is a thousandth of that, a wrong unit far more
 LOST = 1.5  # periods between two frames: beyond, at least one is missing
 SAME_INSTANT = 0.01  # of a period: at 60 rad/s and 1000 Hz the disc turns by 0.6 mrad in it
-DRIFT = 1e-5  # two free-running crystals differ by more; locked ones do not
 
 
 def usable_times(reader: FrameReader, frame_rate: float) -> Array | None:
@@ -106,7 +105,7 @@ def _between_cameras(left: Array, right: Array, period: float) -> list[str]:
             f"by the time stamps the right camera's frames are taken {1e6 * offset:.4g} µs after the left one's, "
             f"{abs(offset) / period:.2g} of a frame: the cameras are not synchronised, or their clocks have other zeros"
         )
-    if abs(drift) > DRIFT and abs(drift) * len(later) > SAME_INSTANT:
+    if abs(drift) * len(later) > SAME_INSTANT:
         warnings.append(
             f"by the time stamps the cameras' clocks drift apart by {1e6 * drift:+.3g} µs per second: each camera runs "
             "on a clock of its own"

@@ -29,7 +29,6 @@ if TYPE_CHECKING:  # an optional package
 # Nothing but containers for frames: a play list under a video's name could make the library open other files.
 _CONTAINERS = {"format_whitelist": "avi,matroska,webm,mov,mp4,m4a,3gp,3g2,mj2", "protocol_whitelist": "file"}
 _LOSSLESS = frozenset({"ffv1", "rawvideo", "huffyuv", "ffvhuff", "utvideo", "magicyuv", "png", "tiff", "v210", "qtrle"})
-_LOOKED_AT = 8  # packets: one with a right checksum among the first tells that there are checksums
 _DECODED_ON = 8  # frames: opening the file anew and seeking costs more than to decode these and drop them
 
 _Decoded: TypeAlias = (
@@ -182,7 +181,7 @@ def _index(
     try:
         for packet in container.demux(container.streams.video[0]):
             if packet.size:
-                if codec == "ffv1" and not checked and len(stamps) < _LOOKED_AT:
+                if codec == "ffv1" and not checked:
                     checked = checksums_hold(bytes(packet))
                 stamps.append((packet.pts, packet.dts, bool(packet.is_keyframe)))
     except (av.FFmpegError, OSError) as error:
@@ -211,13 +210,12 @@ def checksums_hold(packet: bytes) -> bool:
     ends in its size (24 bits), and with error detection in an error status (8 bits) and a parity that makes the CRC of
     the whole slice zero (polynomial 0x04C11DB7, start 0, most significant bit first).
     """
-    mirrored = _REVERSED[np.frombuffer(packet, np.uint8)].tobytes()
-    stop = len(packet)
+    content, stop = np.frombuffer(packet, np.uint8), len(packet)
     while stop:
         if stop < _FOOTER:
             return False
         start = stop - _FOOTER - int.from_bytes(packet[stop - _FOOTER : stop - _FOOTER + 3], "big")
-        if start < 0 or packet[stop - 5] or zlib.crc32(memoryview(mirrored)[start:stop], 0xFFFFFFFF) != 0xFFFFFFFF:
+        if start < 0 or packet[stop - 5] or zlib.crc32(_REVERSED[content[start:stop]].data, 0xFFFFFFFF) != 0xFFFFFFFF:
             return False
         stop = start
     return True
