@@ -140,7 +140,10 @@ def measured(
     dots = np.broadcast_to(filmed.sigma_px**2 * np.eye(2), (*pixels.shape, 2)).copy()
     q = motion(times)
     seen = DotsInFrames(believed_rig, disc, pixels, dots, rotation_from_euler(*q[:, 3:].T), q[:, :3])
-    return _tracked(seen, filmed.declared_rate)
+    fits = fit_poses(pixels, dots, believed_rig, disc.marker_centres_body, seen.R, seen.t, reject_outliers=False)
+    taken = Taken(range(filmed.n), np.arange(filmed.n) / filmed.declared_rate, filmed.declared_rate, 9.81)
+    good = np.zeros(pixels.shape[:-1], np.uint8)  # the status of frames, and of their dots
+    return trajectory_of(seen, fits, np.zeros((filmed.n, 6, 6)), good[:, 0, 0], good[:, 0, 0], good, taken)
 
 
 def _in_the_laboratory(scene: Scene, lab: Laboratory, rng: np.random.Generator) -> tuple[Scene, Array]:
@@ -225,11 +228,3 @@ def _image_centres(R: Array, t: Array, rig: StereoRig, centres: Array, disc: Dis
         area = np.abs(np.linalg.det(by_point @ R[:, None, None, :, :2])) * weight  # (n, 2, points)
         found.append(np.sum(pixels * area[..., None], axis=2) / np.sum(area, axis=2)[..., None])
     return np.stack(found, axis=2)
-
-
-def _tracked(seen: DotsInFrames, rate: float) -> Trajectory:
-    n, none = len(seen.t), np.zeros((*seen.pixels.shape[:-1],), np.uint8)
-    centres = seen.disc.marker_centres_body
-    fits = fit_poses(seen.pixels, seen.covariance, seen.rig, centres, seen.R, seen.t, reject_outliers=False)
-    taken = Taken(range(n), np.arange(n) / rate, rate, 9.81)
-    return trajectory_of(seen, fits, np.zeros((n, 6, 6)), none[:, 0, 0], none[:, 0, 0], none, taken)

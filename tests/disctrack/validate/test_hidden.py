@@ -9,14 +9,7 @@ from disctrack.diagnosis import DiscSystem
 from disctrack.diagnosis.model_file import declared_model
 from disctrack.discrepancy.fit import fit
 from disctrack.errors import DiscTrackError
-from disctrack.validate.diagnoses import (
-    HiddenCase,
-    diagnosis_validation,
-    draw,
-    hidden_cases,
-    hide,
-    what_was_wrong,
-)
+from disctrack.validate.diagnoses import HiddenCase, diagnosis_validation, draw, hidden_cases, hide, what_was_wrong
 from disctrack.validate.hidden import INVISIBLE, SIZES, alike, plant
 from disctrack.validate.points import measured
 from tests.oracles.measured_disc import assert_sized
