@@ -92,7 +92,7 @@ def rendered_cases(n: int | None, seed: int, quick: bool = False, imperfect: boo
 def ideal_cases(scene: Scene, n_static: int, n_rolling: int) -> list[Scene]:
     """Static poses of every attitude, and two recordings of rolling."""
     rng = np.random.default_rng([scene.seed, 8])
-    q = static_poses(n_static, rig_of(scene), scene.declared_disc, scene.rig.target_mm[:2], rng)
+    q = static_poses(n_static, scene, rng)
     start = rng.uniform(8, 12)
     theta, time = TO_REST
     left = time * (0.5 / theta) ** 1.5 + n_rolling / scene.cameras.frame_rate_hz
@@ -192,24 +192,24 @@ def locate(recording: Recording, rig: StereoRig) -> Tracking:
     return track(pairs.reading({}), range(len(pairs)), rig, recording.disc, recording.frame_rate)
 
 
-def static_poses(n: int, rig: StereoRig, disc: Disc, middle_mm: tuple[float, float], rng: np.random.Generator) -> Array:
+def static_poses(n: int, scene: Scene, rng: np.random.Generator) -> Array:
     """(n, 6) poses q on the table, by increasing nutation: strata in turn, all psi and phi, anywhere in the field.
 
-    middle_mm : (x, y) of the field. Places where a dot would leave an image are drawn again; at large nutation the
-    disc looks away from the cameras for half of all psi, and such poses stay in.
-    Raises SceneError where the field has no room for the disc.
+    Places where a dot would leave an image are drawn again; at large nutation the disc looks away from the cameras for
+    half of all psi, and such poses stay in. Raises SceneError where the field has no room for the disc.
     """
-    return np.array(sorted((_pose(i, rig, disc, middle_mm, rng) for i in range(n)), key=lambda q: q[4])).reshape(n, 6)
+    rig, disc, middle = rig_of(scene), scene.declared_disc, 1e-3 * np.array(scene.rig.target_mm[:2])
+    poses = [_pose(np.radians(STRATA_DEG[i % len(STRATA_DEG)]), rig, disc, middle, rng) for i in range(n)]
+    return np.array(sorted(poses, key=lambda q: q[4]))
 
 
-def _pose(i: int, rig: StereoRig, disc: Disc, middle_mm: tuple[float, float], rng: np.random.Generator) -> Array:
-    low, high = np.radians(STRATA_DEG[i % len(STRATA_DEG)])
+def _pose(stratum: Array, rig: StereoRig, disc: Disc, middle: Array, rng: np.random.Generator) -> Array:
     for attempt in range(400):
         psi, phi, direction = rng.uniform(-np.pi, np.pi, 3)
-        theta = np.exp(rng.uniform(np.log(low), np.log(high)))
+        theta = np.exp(rng.uniform(*np.log(stratum)))
         # the field shrinks slowly, for small images and long strides of the rim
         reach = FIELD_RADIUS * np.sqrt(rng.uniform()) * (1 - attempt / 500)
-        x, y = np.array(middle_mm) * 1e-3 + reach * np.array([np.cos(direction), np.sin(direction)])
+        x, y = middle + reach * np.array([np.cos(direction), np.sin(direction)])
         q = np.array([x, y, disc.resting_height(theta), psi, theta, phi])
         if _inside(q, rig, disc):
             return q

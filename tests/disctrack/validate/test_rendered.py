@@ -128,7 +128,7 @@ def test_command_prints_the_verdict_and_tells_of_failed_checks(outcomes, tmp_pat
 def test_static_poses_cover_the_range_and_stand_on_the_table(rng):
     scene = scene_of(1, quick=True)
     rig, disc = rig_of(scene), scene.declared_disc
-    q = static_poses(40, rig, disc, (32.0, 20.0), rng)
+    q = static_poses(40, scene, rng)
     theta = np.degrees(q[:, 4])
     counts = [np.sum((theta >= low) & (theta < high)) for low, high in STRATA_DEG]
     assert counts == [5] * len(STRATA_DEG)
@@ -146,7 +146,7 @@ def seen_by_both(n, scene, rng):
     """n poses that both cameras see, from 3 to 30 deg of nutation, and one view of the board."""
     scene = replace(scene, board=replace(scene.board, n_views=1))
     rig, disc = rig_of(scene), scene.declared_disc
-    q = static_poses(64, rig, disc, scene.rig.target_mm[:2], rng)
+    q = static_poses(64, scene, rng)
     seen = (cameras_in_sight(q, rig, disc) == 2) & (np.radians(3) < q[:, 4]) & (q[:, 4] < np.radians(30))
     return at_rest(scene, rng.choice(q[seen], n, replace=False))
 
