@@ -352,8 +352,8 @@ def _disc(file: Path, disc: Mapping[str, Any], markers: Mapping[str, Any]) -> Di
                     f"{file}: [markers] centres_mm: dots {other} and {number} overlap: "
                     f"{math.hypot(x - u, y - v):g} mm apart with diameter {diameter:g}. Give each dot once."
                 )
-    tolerances = {key: disc[key] for key in ("radius_tolerance_mm", "thickness_tolerance_mm") if key in disc}
-    return disc_from_mm(radius, disc["thickness_mm"], disc["mass_g"], centres, diameter, **tolerances)
+    tolerances = disc.get("radius_tolerance_mm"), disc.get("thickness_tolerance_mm")
+    return disc_from_mm(radius, disc["thickness_mm"], disc["mass_g"], centres, diameter, *tolerances)
 
 
 def _refuse_mixed_calibration(file: Path, calibration: Mapping[str, Any]) -> None:
@@ -390,12 +390,8 @@ def _target(file: Path, calibration: Mapping[str, Any]) -> Target:
 
 
 def _tolerances(calibration: Mapping[str, float], table: Mapping[str, float]) -> BoardTolerances:
-    """What is not declared takes its default."""
-    given: dict[str, float] = {}
-    if "square_tolerance_mm" in calibration and "square_mm" in calibration:
-        given["square"] = calibration["square_tolerance_mm"] / calibration["square_mm"]
-    if "flatness_tolerance_mm" in calibration:
-        given["flatness"] = calibration["flatness_tolerance_mm"] * 1e-3
-    if "board_thickness_tolerance_mm" in table:
-        given["thickness"] = table["board_thickness_tolerance_mm"] * 1e-3
-    return BoardTolerances(**given)
+    """None for what is not declared; that of the squares needs their size, which a rig file does without."""
+    lengths = calibration.get("flatness_tolerance_mm"), table.get("board_thickness_tolerance_mm")
+    flatness, thickness = (None if length is None else length * 1e-3 for length in lengths)
+    square, side = calibration.get("square_tolerance_mm"), calibration.get("square_mm")
+    return BoardTolerances(None if square is None or side is None else square / side, flatness, thickness)

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calibration.kit.arrays import Array, Image
 from disctrack.errors import RecordingError
@@ -91,13 +92,6 @@ class FrameReader:
                 return b"unreadable"
         return self._digests[index]
 
-    def _buffer(self, out: Image | None) -> Image:
-        """`out` where a frame can be decoded straight into it; another array of a frame's size and type otherwise."""
-        shape = self.image_size[::-1]
-        if out is not None and out.shape == shape and out.dtype == self.dtype and out.flags.c_contiguous:
-            return out
-        return np.empty(shape, self.dtype)
-
 
 class Changed(FrameReader):
     """Frames of another reader that are changed after they are read; in all else that reader."""
@@ -123,6 +117,13 @@ class Changed(FrameReader):
 def in_words(image_size: tuple[int, ...], bit_depth: int) -> str:
     """Size (width, height) and depth of images."""
     return f"{image_size[0]} x {image_size[1]} px of {bit_depth} bit"
+
+
+def room_for(out: NDArray | None, image_size: tuple[int, int], dtype: np.dtype) -> NDArray:
+    """`out` where an image (width, height) can be decoded straight into it; another array of its type otherwise."""
+    if out is not None and out.shape == image_size[::-1] and out.dtype == dtype and out.flags.c_contiguous:
+        return out
+    return np.empty(image_size[::-1], dtype)
 
 
 def _into(out: Image | None, image: Image) -> Image:

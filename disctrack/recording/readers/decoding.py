@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from calibration.kit.arrays import Image
 from disctrack.errors import RecordingError
 from disctrack.recording.readers._pixel_kernels import undo_filters
+from disctrack.recording.readers.base import room_for
 from disctrack.recording.readers.raw import check_claim
 from disctrack.recording.readers.tiff_pages import Content, page_pixels, pages_of
 
@@ -140,12 +141,11 @@ def _plain_grey(stream: bytes, width: int, height: int, depth: int, out: NDArray
 
     The stream carries a checksum of its own, which is verified.
     """
-    stride, dtype = width * depth // 8, np.uint8 if depth == 8 else np.uint16
+    stride = width * depth // 8
     raw = inflated(stream, (stride + 1) * height)
     if raw is None:
         return None
-    if out is None or out.dtype != dtype or out.shape != (height, width) or not out.flags.c_contiguous:
-        out = np.empty((height, width), dtype)
+    out = room_for(out, (width, height), np.dtype(f"u{depth // 8}"))
     rows = np.frombuffer(raw, np.uint8).reshape(height, stride + 1)
     if not undo_filters(rows, depth // 8, out.view(np.uint8)):
         return None

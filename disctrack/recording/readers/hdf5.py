@@ -18,7 +18,7 @@ from h5py import h5z
 
 from calibration.kit.arrays import Array, Image
 from disctrack.errors import RecordingError
-from disctrack.recording.readers.base import FrameReader, only_file
+from disctrack.recording.readers.base import FrameReader, only_file, room_for
 from disctrack.recording.readers.decoding import inflated
 from disctrack.recording.readers.raw import (
     LEAST_PRESENT,
@@ -217,7 +217,7 @@ class Hdf5Frames(FrameReader):
         super().__post_init__()
 
     def _decoded(self, index: int, out: Image | None, where: str) -> Image:
-        image, content = self._buffer(out), None
+        image, content = room_for(out, self.image_size, self.dtype), None
         with self._lock:
             try:
                 size = self._stored_size(index)

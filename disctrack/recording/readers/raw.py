@@ -21,7 +21,7 @@ from calibration.kit.arrays import Image
 from disctrack.errors import RecordingError
 from disctrack.files.inputs import open_regular
 from disctrack.recording.readers._pixel_kernels import unpack_10, unpack_12
-from disctrack.recording.readers.base import FrameReader
+from disctrack.recording.readers.base import FrameReader, room_for
 
 # A header may claim any size; no camera of this kind has more pixels, and reading one must not exhaust the memory.
 MOST_PIXELS = 1 << 27
@@ -162,7 +162,7 @@ class RawFrames(FrameReader):
         return self._fill(np.empty(self.layout.frame_bytes, np.uint8), index, "").data
 
     def _decoded(self, index: int, out: Image | None, where: str) -> Image:
-        image = self._buffer(out)
+        image = room_for(out, self.image_size, self.dtype)
         if not self.layout.is_plain:
             self.layout.decode(self._fill(np.empty(self.layout.frame_bytes, np.uint8), index, where), image)
             return image
