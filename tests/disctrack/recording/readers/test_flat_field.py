@@ -12,6 +12,7 @@ from disctrack.recording.declaration import read_recording
 from disctrack.recording.readers import open_frames
 from disctrack.recording.readers.flat_field import flat_fields
 from disctrack.track.measurement import open_pairs
+from tests.disctrack.recording.readers.written import write_sequence
 from tests.disctrack.recording.test_recording import REFERENCE
 from tests.oracles import imperfect_laboratory as laboratory
 
@@ -38,13 +39,10 @@ def folder(tmp_path_factory):
     level = np.ones((SIZE, SIZE))
     for side in ("left", "right"):
         for kind, radiance, n in (("flat", 140 * level, FLATS), ("dark", 0 * level, FLATS), ("", scene(), FRAMES)):
-            (folder / kind / side).mkdir(parents=True)
-            for i in range(n):
-                cv2.imwrite(str(folder / kind / side / f"{i:03d}.png"), camera.expose(radiance, rng))
-    (folder / "views").mkdir()
+            write_sequence(folder / kind / side, [camera.expose(radiance, rng) for _ in range(n)])
     for side in ("left", "right"):
-        cv2.imwrite(str(folder / "views" / f"{side}0.png"), camera.expose(scene(), rng))
-        cv2.imwrite(str(folder / "views" / f"{side}1.png"), np.zeros((SIZE // 2, SIZE, 3), np.uint8))
+        views = camera.expose(scene(), rng), np.zeros((SIZE // 2, SIZE, 3), np.uint8)
+        write_sequence(folder / "views", views, names=[f"{side}0", f"{side}1"])
     return folder
 
 
@@ -105,12 +103,6 @@ def test_clipped_pixels_stay_clipped(folder):
     assert dark.max() == 0
 
 
-def write(folder, name, image, n=1):
-    (folder / name).mkdir(exist_ok=True)
-    for i in range(n):
-        cv2.imwrite(str(folder / name / f"{i}.png"), image)
-
-
 @pytest.mark.parametrize(
     ("flat", "dark", "said"),
     [
@@ -126,14 +118,14 @@ def write(folder, name, image, n=1):
 def test_flats_that_cannot_serve_stop_the_run_with_what_to_do(folder, tmp_path, flat, dark, said):
     lines = [f'left_flat = "{tmp_path}/f"']
     if flat is not None:
-        write(tmp_path, "f", flat)
+        write_sequence(tmp_path / "f", [flat])
     if dark is not None:
-        write(tmp_path, "d", dark)
+        write_sequence(tmp_path / "d", [dark])
         lines.append(f'left_dark = "{tmp_path}/d"')
     with pytest.raises(RecordingError, match=said):
         open_pairs(declared(folder, "\n".join(lines)))
 
 
 def test_one_noisy_flat_is_used_and_said(folder):
-    reader = open_pairs(declared(folder, 'left_flat = "flat/left/000.png"')).left
+    reader = open_pairs(declared(folder, 'left_flat = "flat/left/000000.png"')).left
     assert any("mean of 1 image" in note for note in reader.notes)

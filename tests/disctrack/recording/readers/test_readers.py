@@ -19,14 +19,7 @@ from disctrack.recording.readers.blocks import iter_pair_blocks
 from disctrack.recording.readers.decoding import decode
 from disctrack.recording.readers.file_numbers import check_same_numbers
 from disctrack.recording.readers.files import match_files
-
-
-def write_sequence(folder: Path, images, suffix="png", names=None) -> list[Path]:
-    folder.mkdir(parents=True, exist_ok=True)
-    files = [folder / f"{names[i] if names else f'{i:06d}'}.{suffix}" for i in range(len(images))]
-    for file, image in zip(files, images, strict=True):
-        assert cv2.imwrite(str(file), image)
-    return files
+from tests.disctrack.recording.readers.written import write_sequence
 
 
 @pytest.fixture

@@ -22,35 +22,29 @@ def read(folder):
     return np.stack([reader.read(i) for i in range(len(reader))])
 
 
-def as_files(folder, frames, **options):
+def written(folder, frames, stacked, **options):
+    """A file for each frame, or one of all of them."""
     folder.mkdir()
+    options = {"photometric": "minisblack", "contiguous": False, **options}
     for i, frame in enumerate(frames):
-        tifffile.imwrite(folder / f"{i}.tif", frame, **{"photometric": "minisblack", **options})
-    return folder
-
-
-def as_pages(folder, frames, **options):
-    folder.mkdir()
-    with tifffile.TiffWriter(folder / "stack.tif") as file:
-        for frame in frames:
-            file.write(frame, contiguous=False, **{"photometric": "minisblack", **options})
+        tifffile.imwrite(folder / ("stack.tif" if stacked else f"{i}.tif"), frame, append=stacked and i > 0, **options)
     return folder
 
 
 @pytest.mark.parametrize("packing", PACKINGS, ids=str)
 @pytest.mark.parametrize("bits", FRAMES)
-@pytest.mark.parametrize("written", [as_files, as_pages])
-def test_where_white_is_zero_light_is_more_all_the_same(tmp_path, bits, packing, written):
+@pytest.mark.parametrize("stacked", [False, True])
+def test_where_white_is_zero_light_is_more_all_the_same(tmp_path, bits, packing, stacked):
     frames = FRAMES[bits]
-    assert_array_equal(read(written(tmp_path / "white", frames, photometric="miniswhite", **packing)), ~frames)
-    assert_array_equal(read(written(tmp_path / "black", frames, **packing)), frames)
+    assert_array_equal(read(written(tmp_path / "white", frames, stacked, photometric="miniswhite", **packing)), ~frames)
+    assert_array_equal(read(written(tmp_path / "black", frames, stacked, **packing)), frames)
 
 
 @pytest.mark.parametrize("packing", PACKINGS, ids=str)
 @pytest.mark.parametrize("orientation", range(1, 9))
 def test_frames_stand_upright_in_files_and_stacks_as_in_pillow(tmp_path, orientation, packing):
     tag = {"extratags": [(274, 3, 1, orientation, True)], **packing}
-    files, pages = as_files(tmp_path / "files", FRAMES[8], **tag), as_pages(tmp_path / "pages", FRAMES[8], **tag)
+    files, pages = (written(tmp_path / f"{stacked}", FRAMES[8], stacked, **tag) for stacked in (False, True))
     # from bytes: of a file of its own Pillow maps the rows before it turns them
     upright = np.stack([np.array(Image.open(io.BytesIO((files / f"{i}.tif").read_bytes()))) for i in range(4)])
     assert np.array_equal(upright, FRAMES[8]) == (orientation == 1)
@@ -58,10 +52,10 @@ def test_frames_stand_upright_in_files_and_stacks_as_in_pillow(tmp_path, orienta
     assert_array_equal(read(pages), upright)
 
 
-@pytest.mark.parametrize("written", [as_files, as_pages])
+@pytest.mark.parametrize("stacked", [False, True])
 @pytest.mark.parametrize(("code", "name"), [(34712, "JPEG2000"), (34933, "PNG"), (50000, "ZSTD"), (40000, "unkn")])
-def test_pixels_by_an_unknown_method_are_refused_by_name_and_never_black(tmp_path, written, code, name):
-    folder = written(tmp_path / "frames", FRAMES[8], compression="zlib")
+def test_pixels_by_an_unknown_method_are_refused_by_name_and_never_black(tmp_path, stacked, code, name):
+    folder = written(tmp_path / "frames", FRAMES[8], stacked, compression="zlib")
     for file in folder.iterdir():
         deflate, other = (struct.pack("<HHII", 259, 3, 1, number) for number in (8, code))
         content = file.read_bytes()

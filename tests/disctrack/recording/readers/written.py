@@ -33,11 +33,18 @@ def lost_of(reader: FrameReader, frames: np.ndarray) -> dict[int, str]:
     return lost
 
 
+def write_sequence(folder: Path, images, suffix: str = "png", names=None) -> list[Path]:
+    """A file for each image."""
+    folder.mkdir(parents=True, exist_ok=True)
+    files = [folder / f"{names[i] if names else f'{i:06d}'}.{suffix}" for i in range(len(images))]
+    for file, image in zip(files, images, strict=True):
+        assert cv2.imwrite(str(file), image)
+    return files
+
+
 def write_images(path: Path, frames: np.ndarray) -> None:
     """A file for each frame in the folder PATH without its suffix."""
-    path.with_suffix("").mkdir(exist_ok=True)
-    for i, frame in enumerate(frames):
-        assert cv2.imwrite(str(path.with_suffix("") / f"shot_{i}{path.suffix}"), frame)
+    write_sequence(path.with_suffix(""), frames, path.suffix[1:], [f"shot_{i}" for i in range(len(frames))])
 
 
 def write_tiff(path: Path, frames: np.ndarray, **options) -> None:
