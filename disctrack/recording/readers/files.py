@@ -54,8 +54,8 @@ def match_files(pattern: str, folder: Path, camera: str) -> list[Path]:
 
 def _what_is_there(pattern: str, folder: Path) -> str:
     place = (folder / pattern).parent
-    if glob.has_magic(str(place)) or not place.is_dir():
-        return f"There is no folder {place}." if not place.is_dir() else "Correct the pattern."
+    if not place.is_dir():
+        return f"There is no folder {place}."
     names = sorted(os.listdir(place), key=natural_key)
     if not names:
         return f"The folder {place} is empty."
