@@ -17,7 +17,7 @@ from calibration.kit.arrays import Image
 from disctrack.errors import RecordingError
 from disctrack.recording.readers._pixel_kernels import undo_filters
 from disctrack.recording.readers.base import room_for
-from disctrack.recording.readers.raw import check_claim
+from disctrack.recording.readers.raw import check_frame_size
 from disctrack.recording.readers.tiff_pages import Content, page_pixels, pages_of
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
@@ -78,13 +78,13 @@ def _check_length(content: bytes, where: str) -> None:
     if content.startswith(b"\xff\xd8"):
         if b"\xff\xd9" not in content[-1024:]:
             raise RecordingError(f"{where}: the JPEG file is truncated (no end marker). {_AGAIN}")
-        check_claim(*_jpeg_size(content), len(content), where)
+        check_frame_size(*_jpeg_size(content), where, n_bytes=len(content))
     if content.startswith(b"BM") and len(content) >= 26:
         declared = struct.unpack_from("<I", content, 2)[0]
         if declared > len(content):
             raise RecordingError(f"{where}: the BMP file ends after {len(content)} of {declared} bytes. {_AGAIN}")
         width, height = struct.unpack_from("<ii", content, 18)
-        check_claim(abs(width), abs(height), len(content), where)
+        check_frame_size(abs(width), abs(height), where, n_bytes=len(content))
 
 
 def _jpeg_size(content: bytes) -> tuple[int, int]:
@@ -119,7 +119,7 @@ def _png(content: bytes, where: str, out: NDArray | None) -> NDArray:
             )
         if kind == b"IHDR" and length == 13:
             ihdr = struct.unpack_from(">IIBBBBB", content, start)
-            check_claim(ihdr[0], ihdr[1], end, where)
+            check_frame_size(ihdr[0], ihdr[1], where, n_bytes=end)
         elif kind == b"IDAT":
             data.append(view[start:stop])
         elif kind == b"tRNS":

@@ -194,26 +194,19 @@ def bit_depth_of(stored_bits: int, effective_bits: int) -> int:
     return effective_bits if 8 < effective_bits <= stored_bits else stored_bits
 
 
-def check_frame_size(width: int, height: int, where: str, bits: int = 8) -> None:
+def check_frame_size(width: int, height: int, where: str, bits: int = 8, n_bytes: int | None = None) -> None:
     """Raise RecordingError, beginning with `where`, unless a header's image is one that a camera can have.
 
-    bits : of a pixel in the file; those of a frame must fill whole bytes
+    bits    : of a pixel in the file; those of a frame must fill whole bytes
+    n_bytes : of what is compressed in any way, and must be able to hold that many pixels
     """
-    if not (0 < width <= MOST_PIXELS and 0 < height <= MOST_PIXELS and width * height <= MOST_PIXELS):
+    most = MOST_PIXELS if n_bytes is None else min(MOST_PIXELS, max(_SMALL_IMAGE, _MOST_PER_BYTE * n_bytes))
+    if width <= 0 or height <= 0 or width * height > most:
         raise RecordingError(
-            f"{where}: the header claims images of {width} x {height} px, which no camera of this kind has. "
-            "The header is damaged, or not of this format: copy the file again."
+            f"{where}: the header claims images of {width} x {height} px, which no camera of this kind has, or the "
+            "file cannot hold. The header is damaged, or not of this format: copy or export it again."
         )
     if width * height * bits % 8:
         raise RecordingError(
             f"{where}: {width} x {height} px of {bits} bit do not fill whole bytes. Save them with 16 bit."
-        )
-
-
-def check_claim(width: int, height: int, n_bytes: int, where: str) -> None:
-    """Raise RecordingError, beginning with `where`, for a size that n_bytes cannot hold, however compressed."""
-    if width * height > min(MOST_PIXELS, max(_SMALL_IMAGE, _MOST_PER_BYTE * n_bytes)):
-        raise RecordingError(
-            f"{where}: the header claims {width} x {height} px, more than any such camera has or the file can hold. "
-            "Copy or export this image again."
         )

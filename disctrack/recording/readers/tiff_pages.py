@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from disctrack.errors import RecordingError
 from disctrack.recording.readers._pixel_kernels import lzw_codes_follow
-from disctrack.recording.readers.raw import MOST_PIXELS, RawFile, check_claim, check_frame_size
+from disctrack.recording.readers.raw import MOST_PIXELS, RawFile, check_frame_size
 
 logging.getLogger("tifffile").addHandler(logging.NullHandler())  # it logs what it finds odd; here that is an error
 
@@ -162,14 +162,13 @@ def page_pixels(source: RawFile, page: Page, where: str) -> NDArray:
 def _check(page: Page, where: str) -> None:
     """Raise RecordingError unless a page's numbers fit each other, and its pixels are compressed in a known way."""
     like = page.like
-    check_frame_size(page.width, page.height, where)
+    check_frame_size(page.width, page.height, where, n_bytes=sum(page.sizes))
     if like.compression not in _READ:
         name = getattr(like.compression, "name", "unknown")
         raise RecordingError(
             f"{where}: its pixels are compressed by a method ({int(like.compression)}, {name}) that is not read; LZW "
             "and deflate are. Export this image again."
         )
-    check_claim(page.width, page.height, sum(page.sizes), where)
     tile = int(like.tilewidth) * int(like.tilelength) * int(like.tiledepth) if like.is_tiled else 0
     n = int(np.prod(like.chunked, dtype=float)) if like.dtype is not None and like.shaped[1] == 1 else -1
     if n != len(page.places) or like.samplesperpixel > 4 or max(tile * n, sum(page.sizes)) > 4 * MOST_PIXELS:

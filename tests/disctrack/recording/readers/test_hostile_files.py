@@ -144,7 +144,7 @@ def _claiming(suffix: str, width: int, height: int) -> bytes:
 @pytest.mark.parametrize("suffix", ["png", "bmp", "jpg"])
 def test_an_image_cannot_claim_more_than_its_bytes_can_hold(suffix):
     assert decode(_claiming(suffix, *FRAMES[0].T.shape), "file").shape == FRAMES[0].shape
-    with pytest.raises(RecordingError, match="claims 30000 x 4000"):
+    with pytest.raises(RecordingError, match="claims images of 30000 x 4000 px"):
         decode(_claiming(suffix, 30000, 4000), "file")
 
 
