@@ -69,8 +69,10 @@ def test_derivatives_agree_with_differences_of_the_prediction():
         difference = system.linearise(down, [])[0] - system.linearise(up, [])[0]
         numeric = difference / ((1.0 - low) * q.scale)
         size = np.abs(derivative[..., i]).max()
-        # one-sided where the effect has a sign: then the error is the curvature over one step
-        assert np.abs(numeric - derivative[..., i]).max() < (2e-2 if low == 0.0 else 1e-4) * max(size, 1e-12), q.name
+        # one-sided where the effect has a sign: then the error is the curvature over one step; and the integration errs
+        # by some millionths of a sigma
+        share, integration = 2e-2 if low == 0.0 else 1e-4, 1e-5 / ((1.0 - low) * q.scale)
+        assert np.abs(numeric - derivative[..., i]).max() < share * max(size, 1e-12) + integration, q.name
 
 
 @pytest.mark.slow
