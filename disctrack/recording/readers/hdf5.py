@@ -191,14 +191,13 @@ def _attribute(stack: h5py.Dataset, name: str) -> float | None:
 
 def _timestamps(stack: h5py.Dataset, n: int, where: str) -> Array | None:
     stamps = stack.attrs.get("timestamps", stack.parent.get("timestamps"))
-    if stamps is None or (isinstance(stamps, h5py.Dataset) and stamps.shape != (n,)):
-        if isinstance(stamps, h5py.Dataset) and stamps.ndim == 1:
-            raise RecordingError(f"{where}: {n} frames, but {stamps.shape[0]} timestamps. Write one for each frame.")
+    if stamps is None or (isinstance(stamps, h5py.Dataset) and stamps.ndim != 1):
         return None
-    values = np.asarray(stamps[()] if isinstance(stamps, h5py.Dataset) else stamps)
+    values = stamps if isinstance(stamps, h5py.Dataset) else np.asarray(stamps)
     if values.dtype.kind not in "iuf" or values.shape != (n,):
-        raise RecordingError(f"{where}: timestamps are {values.shape} of {values.dtype}; expected {n} times in s.")
-    return values.astype(np.float64)
+        found = f"{values.shape} of {values.dtype}"
+        raise RecordingError(f"{where}: timestamps are {found}; expected {n} times in s, one for each frame.")
+    return np.asarray(values[()], np.float64)
 
 
 @dataclass(eq=False, kw_only=True)

@@ -140,6 +140,9 @@ def test_the_frame_rate_and_times_that_imagej_ome_and_hdf5_note_are_found(tmp_pa
         reader = open_frames(name, tmp_path, "left")
         assert reader.frame_rate == pytest.approx(1000)
         assert_allclose(reader.timestamps, times, rtol=0, atol=1e-12)  # decimal text of milliseconds
+    write_hdf5(tmp_path / "short.h5", frames_of(8), {"timestamps": times[1:]})
+    with pytest.raises(RecordingError, match=rf"timestamps are \({N - 1},\) of float64; expected {N} times in s"):
+        open_frames("short.h5", tmp_path, "left")
 
 
 @pytest.mark.parametrize(("declared", "found"), [(12, 12), (8, 16), (99, 16), ("many", 16)])
