@@ -155,6 +155,20 @@ def test_hdf5_chunks_that_no_memory_holds_are_refused(tmp_path):
         open_frames("a.h5", tmp_path, "left")
 
 
+def test_an_hdf5_view_of_any_length_takes_no_memory(tmp_path):
+    layout = h5py.VirtualLayout((10**12, *FRAMES.shape[1:]), np.uint8)
+    layout[0] = h5py.VirtualSource("part.h5", "frame", shape=FRAMES.shape[1:])
+    with h5py.File(tmp_path / "part.h5", "w") as file:
+        file["frame"] = FRAMES[0]
+    with h5py.File(tmp_path / "view.h5", "w") as file:
+        file.create_virtual_dataset("frames", layout)
+    tracemalloc.start()
+    reader = open_frames("view.h5", tmp_path, "left")
+    assert np.array_equal(reader.read(0), FRAMES[0])
+    assert tracemalloc.get_traced_memory()[1] < 100 << 20
+    tracemalloc.stop()
+
+
 def test_a_playlist_under_a_videos_name_opens_no_other_file(tmp_path):
     pytest.importorskip("av")
     SINGLE[-3].written(tmp_path, FRAMES)
