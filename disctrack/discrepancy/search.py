@@ -331,16 +331,19 @@ class _Search:
     def _shapes_freed(self, best: Explanation) -> bool:
         """Do laws with a free shape join the explanations: in the place of all effects, or of a faint one of several?
 
-        At its null an effect whose place has to be looked for has no derivative, so that no score proposes it; beside
-        another effect, a faint one that a flat of the rim makes is an inertia's or a pattern's off centre.
+        At its null an effect whose place has to be looked for has no derivative, so that no score proposes it: it is
+        tried beside effects that leave too much, too. Beside another effect, a faint one that a flat of the rim makes
+        is an inertia's or a pattern's off centre.
         """
         at_noise, nothing, before = self._at_noise(best.fit), self.nothing, len(self.pool)
         if at_noise and len(best.candidates) < 2:
             return False
-        excess = self.noise * nothing.fit.excess(self.noise)
-        for c in self.system.candidates:
-            if c.shape and self.system.budget.open(kept=FOR_LAWS):
-                self._with_free_shape(nothing, c, 0.0, nothing.fit.cost - (1.0 - WORTH_A_SHAPE) * excess)
+        for e in (nothing,) if at_noise or best is nothing else (nothing, best):
+            below = e.fit.cost - (1.0 - WORTH_A_SHAPE) * self.noise * e.fit.excess(self.noise)
+            for c in self.system.candidates:
+                wanted = c.shape if e is nothing else c.sought and c.name not in e.names
+                if wanted and self.system.budget.open(kept=FOR_LAWS):
+                    self._with_free_shape(e, c, 0.0, below)
         faint = [c for c in best.candidates if c.kind == "motion" and at_noise]
         for rest in (self._refit_without(best, c) for c in faint):
             gain = rest.fit.cost - best.fit.cost
