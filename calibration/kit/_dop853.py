@@ -11,7 +11,7 @@ import numpy as np
 from scipy.integrate import DOP853
 
 from calibration.kit.arrays import Numbers
-from calibration.kit.compiled import njit
+from calibration.kit.compiled import exact_part
 
 N = DOP853.n_stages  # 12; stage 12 is the rate at the end of the step, stages 13 to 15 serve the dense output
 A = np.zeros((N + 4, N + 4))
@@ -19,9 +19,6 @@ A[:N, :N] = DOP853.A[:N, :N]
 A[N + 1 :] = DOP853.A_EXTRA
 C = np.concatenate([DOP853.C[:N], [1.0], DOP853.C_EXTRA])
 B, E3, E5, D = (np.ascontiguousarray(a) for a in (DOP853.B, DOP853.E3, DOP853.E5, DOP853.D))
-
-# called by compiled functions only
-part = njit(error_model="numpy", nogil=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 
 
 class Step(NamedTuple):
@@ -33,13 +30,13 @@ class Step(NamedTuple):
     end: Numbers  # (n,) ... where the step ends
 
 
-@part
+@exact_part
 def room(y: Numbers, width: int) -> Step:
     """For states (n,) whose rates come with other numbers, `width` in all."""
     return Step(np.zeros((N + 4, width), y.dtype), np.zeros((7, y.size), y.dtype), y.copy(), y.copy())
 
 
-@part
+@exact_part
 def _moved(y: Numbers, h: complex, weights: Numbers, K: Numbers, out: Numbers) -> None:
     """`out` = y + h times the weighted sum of rates."""
     for k in range(y.size):
@@ -57,18 +54,18 @@ def method(rates):
     polynomial : F, once the rate at the step's end is in K[12]; the last stages are worked out for it, and `stage` used
     """
 
-    @part
+    @exact_part
     def stages(system, own, t, y, h, first, last, made):
         for s in range(first, last):
             _moved(y, h, A[s, :s], made.K, made.stage)
             rates(t + C[s] * h, made.stage, made.K[s], system, own)
 
-    @part
+    @exact_part
     def step(system, own, t, y, h, made):
         stages(system, own, t, y, h, np.int64(1), np.int64(N), made)  # a literal is a type of its own
         _moved(y, h, B, made.K, made.end)
 
-    @part
+    @exact_part
     def polynomial(system, own, t, y, h, made):
         stages(system, own, t, y, h, np.int64(N + 1), np.int64(N + 4), made)
         K, F = made.K, made.F
@@ -83,7 +80,7 @@ def method(rates):
     return step, polynomial
 
 
-@part
+@exact_part
 def along(F: Numbers, y: Numbers, x: complex, out: Numbers) -> None:
     """The step's polynomial at the part x of it, by nested factors x, 1 - x, x, ..."""
     for k in range(y.size):

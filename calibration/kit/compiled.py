@@ -26,6 +26,8 @@ RULES: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": {"co
 # Called from compiled code, always inlined: of a function that is not, two copies may be optimised differently (its own
 # and its caller's), and which of them runs would depend on whether the code was compiled now or loaded.
 part: Any = njit(**RULES, no_cpython_wrapper=True, no_cfunc_wrapper=True, forceinline=True)
+# Called from compiled code, too, without fast rules and not forced inline: what is integrated over thousands of steps.
+exact_part = njit(error_model="numpy", nogil=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 
 WITH_COMPILED = (
     "calibration/kit/compiled.py",

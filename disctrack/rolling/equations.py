@@ -45,7 +45,7 @@ from typing import TypeAlias
 import numpy as np
 
 from calibration.kit.arrays import Numbers
-from calibration.kit.compiled import njit
+from calibration.kit.compiled import exact_part
 from disctrack.rolling._compiled import Addresses, call
 from disctrack.rolling.records import Record
 
@@ -55,8 +55,6 @@ State: TypeAlias = Sequence[complex]
 # length, that length, and the rim's support there
 Contact: TypeAlias = tuple[Vector, Vector, complex, tuple[Vector, Vector, complex, Vector]]
 Forced: TypeAlias = tuple[complex, complex, complex, complex, complex, complex, complex]
-
-_part = njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)  # called by compiled functions only
 
 ROLLING, SLIPPING, FLYING = 0, 1, 2
 EVENTS = ("theta_end", "load", "grip", "upright")
@@ -72,33 +70,33 @@ LIFT_OFF_GAP = 1e-12  # [m]; a landing is a fall below this, so that the start o
 HEADER = 3
 
 
-@_part
+@exact_part
 def _cross(a: Vector, b: Vector) -> Vector:
     return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
-@_part
+@exact_part
 def _dot(a: Vector, b: Vector) -> complex:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@_part
+@exact_part
 def _add(a: Vector, b: Vector) -> Vector:
     return (a[0] + b[0], a[1] + b[1], a[2] + b[2])
 
 
-@_part
+@exact_part
 def _scale(f: complex, a: Vector) -> Vector:
     return (f * a[0], f * a[1], f * a[2])
 
 
-@_part
+@exact_part
 def _nodal(n: complex, m: complex, z: complex, s: complex, c: complex) -> Vector:
     """(n0, m0, k) -> (e1, e2, e3): n0 = e1, m0 = c e2 - s e3, k = s e2 + c e3."""
     return (n, m * c + z * s, z * c - m * s)
 
 
-@_part
+@exact_part
 def _solve(rows: tuple[Vector, Vector, Vector], b: Vector) -> Vector:
     """3 x 3 system by Cramer's rule."""
     r0, r1, r2 = rows
@@ -107,7 +105,7 @@ def _solve(rows: tuple[Vector, Vector, Vector], b: Vector) -> Vector:
     return _scale(1.0 / _dot(r0, c0), x)
 
 
-@_part
+@exact_part
 def _is_plain(body: Record) -> bool:
     """A round rim on a level, flat table."""
     return bool(
@@ -122,7 +120,7 @@ def _is_plain(body: Record) -> bool:
     )
 
 
-@_part
+@exact_part
 def _support(body: Record, cb: complex, sb: complex) -> Vector:
     """Support function of the rim, less its edge's radius, and two derivatives; by cosine and sine of the angle."""
     c2, s2 = cb * cb - sb * sb, 2.0 * sb * cb
@@ -138,7 +136,7 @@ def _support(body: Record, cb: complex, sb: complex) -> Vector:
     return p, slope, bend
 
 
-@_part
+@exact_part
 def _contact(body: Record, now: Record) -> Contact:
     """From place and angles in the record."""
     s, c = now.sin_theta, now.cos_theta
@@ -173,7 +171,7 @@ def _contact(body: Record, now: Record) -> Contact:
     return arm, n, z, (W, across, w, p)
 
 
-@_part
+@exact_part
 def _contact_rates(body: Record, now: Record, y: State, at: Contact) -> tuple[Vector, Vector]:
     """Rates of r_OA and of the normal, as vectors; nodal components."""
     s, c, rho, kappa = now.sin_theta, now.cos_theta, body.edge_radius, body.curvature
@@ -200,7 +198,7 @@ def _contact_rates(body: Record, now: Record, y: State, at: Contact) -> tuple[Ve
     return _add(_add(rim_rate, _scale(arm3, e3_rate)), _scale(-rho, n_rate)), n_rate
 
 
-@_part
+@exact_part
 def _kinematics(regime: int, t: complex, y: State, body: Record, k: Record) -> Contact:
     """Fills the record of kinematic quantities from the state."""
     k.time, k.x, k.y, k.psi, k.theta, k.phi = t, y[0], y[1], y[2], y[3], y[4]
@@ -230,7 +228,7 @@ def _kinematics(regime: int, t: complex, y: State, body: Record, k: Record) -> C
     return at
 
 
-@_part
+@exact_part
 def _apply_laws(table: Addresses, now: Record) -> None:
     now.M_n = now.M_m = now.M_z = 0.0
     now.load_n = now.load_m = now.load_z = 0.0
@@ -243,7 +241,7 @@ def _apply_laws(table: Addresses, now: Record) -> None:
         call(table[HEADER + 2 * i], (table[HEADER + 1 + 2 * i], table[2], table[2]))
 
 
-@_part
+@exact_part
 def _inertia_rows(body: Record, s: complex, c: complex) -> tuple[Vector, Vector, Vector]:
     """Inertia about G in nodal axes, from body axes turned by the spin angle of this sine and cosine."""
     J11 = c * c * body.J_11 - 2 * c * s * body.J_12 + s * s * body.J_22
@@ -253,7 +251,7 @@ def _inertia_rows(body: Record, s: complex, c: complex) -> tuple[Vector, Vector,
     return (J11, J12, J13), (J12, J22, J23), (J13, J23, body.J_33)
 
 
-@_part
+@exact_part
 def _speed_of_friction(body: Record, slip: Vector) -> complex:
     """Slip over F_t / F_z: |slip| / mu with Coulomb's friction, c on a film."""
     if body.inverse_friction == 0.0:
@@ -261,7 +259,7 @@ def _speed_of_friction(body: Record, slip: Vector) -> complex:
     return body.inverse_friction * np.sqrt(_dot(slip, slip))
 
 
-@_part
+@exact_part
 def _accelerations(regime: int, y: State, body: Record, now: Record, at: Contact) -> None:
     """Writes contact force, acceleration of O and angular acceleration into the record."""
     s, c, m = now.sin_theta, now.cos_theta, body.mass
@@ -319,7 +317,7 @@ def _accelerations(regime: int, y: State, body: Record, now: Record, at: Contact
     now.N, now.F_t = normal_force, np.sqrt(_dot(tangential, tangential))
 
 
-@_part
+@exact_part
 def _state(regime: int, y: Numbers) -> State:
     """All twelve components; zeros for those that a regime does not have: so that all below is compiled once."""
     zero = 0.0 * y[0]
@@ -328,7 +326,7 @@ def _state(regime: int, y: Numbers) -> State:
     return (y[0], y[1], y[2], y[3], y[4], y[5], y[6], y[7], v_x, v_y, z, v_z)
 
 
-@_part
+@exact_part
 def _rates_of(y: State, now: Record) -> State:
     """Of all twelve components, on a table at rest."""
     c, sp, cp = now.cos_theta, now.sin_psi, now.cos_psi
@@ -341,7 +339,7 @@ def _rates_of(y: State, now: Record) -> State:
     )  # fmt: skip
 
 
-@_part
+@exact_part
 def _moved(y: State, h: float, rate: State) -> State:
     """The state after h along these rates."""
     return (
@@ -351,7 +349,7 @@ def _moved(y: State, h: float, rate: State) -> State:
     )  # fmt: skip
 
 
-@_part
+@exact_part
 def _flow(t: complex, y: State, forced: Forced, table: Addresses, body: Record, now: Record) -> State:
     """Rates of the state on a rigid table; fills the record on the way.
 
@@ -367,7 +365,7 @@ def _flow(t: complex, y: State, forced: Forced, table: Addresses, body: Record, 
     return _rates_of(y, now)
 
 
-@_part
+@exact_part
 def _load_and_pull(now: Record) -> Vector:
     """F_z, and friction along i and j over N: what the normal of a hollow supports is none."""
     sp, cp = now.sin_psi, now.cos_psi
@@ -375,7 +373,7 @@ def _load_and_pull(now: Record) -> Vector:
     return now.F_z, (F_n * cp - F_m * sp) / now.N, (F_n * sp + F_m * cp) / now.N
 
 
-@_part
+@exact_part
 def _ahead(
     h: float, rate: State, t: complex, y: State, forced: Forced, table: Addresses, body: Record, now: Record
 ) -> Vector:
@@ -387,7 +385,7 @@ def _ahead(
     return _load_and_pull(now)
 
 
-@_part
+@exact_part
 def _course(
     t: complex, y: State, forced: Forced, table: Addresses, body: Record, now: Record
 ) -> tuple[Vector, Vector, Vector]:
@@ -402,7 +400,7 @@ def _course(
     return at_once, rise, bend
 
 
-@_part
+@exact_part
 def _course_of_load(t: complex, y: State, table: Addresses, body: Record, now: Record) -> Vector:
     """F_z on the rigid table and its first two derivatives by time; zeros where the table does not give way."""
     nothing = 0.0 * y[0]
@@ -420,7 +418,7 @@ def _course_of_load(t: complex, y: State, table: Addresses, body: Record, now: R
     return load[0], rise[0], bend[0]
 
 
-@_part
+@exact_part
 def _creeping(
     t: complex, y: State, table: Addresses, body: Record, now: Record
 ) -> tuple[complex, complex, complex, complex]:
@@ -438,7 +436,7 @@ def _creeping(
     return -c * pull[1], -c * pull[2], a_x, a_y
 
 
-@_part
+@exact_part
 def _moving(y: State, body: Record, now: Record, at: Contact) -> tuple[complex, complex, complex, complex]:
     """Velocity along i and j of the surface at the contact, and its rate as the contact moves along; no laws asked."""
     nothing, turn = 0.0 * y[0], body.surface_turn
@@ -453,7 +451,7 @@ def _moving(y: State, body: Record, now: Record, at: Contact) -> tuple[complex, 
     return v_x, v_y, -turn * (v_y + to_n * sp + to_m * cp), turn * (v_x + to_n * cp - to_m * sp)
 
 
-@_part
+@exact_part
 def _margins(regime: int, body: Record, now: Record, at: Contact) -> tuple[complex, complex, complex, complex]:
     """Margins (EVENTS) that are positive while the regime lasts.
 

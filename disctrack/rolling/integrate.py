@@ -14,7 +14,7 @@ import numpy as np
 
 from calibration.kit import _dop853 as dop853
 from calibration.kit.arrays import Array, Numbers
-from calibration.kit.compiled import njit
+from calibration.kit.compiled import exact_part, njit
 from disctrack.rolling._compiled import call
 from disctrack.rolling.records import Records
 
@@ -70,14 +70,14 @@ def evaluate(system: CompiledSystem, t: Numbers, Y: Numbers, instant: Records) -
     return out[:, : Y.shape[1]], out[:, Y.shape[1] :], found
 
 
-@dop853.part
+@exact_part
 def _assign(target: Numbers, values: Numbers) -> None:
     """As target[:] = values, for which numba compiles the text of an error besides: a second."""
     for i in range(target.size):
         target[i] = values[i]
 
 
-@dop853.part
+@exact_part
 def _rates(t: complex, y: Numbers, out: Numbers, system: CompiledSystem, t_box: Numbers) -> None:
     t_box[0] = t
     call(system.function, (t_box.ctypes.data, y.ctypes.data, out.ctypes.data, system.a, system.b, system.c))
@@ -94,7 +94,7 @@ def _evaluate(system: CompiledSystem, t: Numbers, Y: Numbers, out: Numbers, inst
         _assign(found[i], instant)
 
 
-@dop853.part
+@exact_part
 def _error(y: Numbers, h: float, rtol: float, atol: Array, size: Array, made: dop853.Step) -> float:
     """Hairer's combination of the embedded errors of order 5 and 3, in units of the tolerance.
 
@@ -122,7 +122,7 @@ def _error(y: Numbers, h: float, rtol: float, atol: Array, size: Array, made: do
     return error
 
 
-@dop853.part
+@exact_part
 def _fill(F: Numbers, t: complex, y: Numbers, h: complex, grid: Array, i_grid: int, solution: Numbers) -> int:
     """Write the grid points from number i_grid up to the end of the step; returns the number of the next one."""
     while i_grid < grid.size and grid[i_grid] <= (t + h).real:
@@ -131,7 +131,7 @@ def _fill(F: Numbers, t: complex, y: Numbers, h: complex, grid: Array, i_grid: i
     return i_grid
 
 
-@dop853.part
+@exact_part
 def _first_step(y: Numbers, f: Numbers, atol: Array) -> float:
     """A hundredth of the time in which the fastest component changes by its own size."""
     fastest = 0.0
@@ -140,7 +140,7 @@ def _first_step(y: Numbers, f: Numbers, atol: Array) -> float:
     return 0.01 / (1.0 + fastest)
 
 
-@dop853.part
+@exact_part
 def _ran_out(K: Numbers, n: int) -> int:
     """Number of the first margin that was positive at the step's start and is no longer at its end, or -1."""
     for e in range(n, K.shape[1]):
@@ -149,7 +149,7 @@ def _ran_out(K: Numbers, n: int) -> int:
     return -1
 
 
-@dop853.part
+@exact_part
 def _locate(
     system: CompiledSystem, t_box: Numbers, t: complex, y: Numbers, h: float, event: int, made: dop853.Step
 ) -> tuple[int, float]:

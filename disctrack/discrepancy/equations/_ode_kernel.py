@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from calibration.kit import _dop853 as dop853
 from calibration.kit.arrays import Array
-from calibration.kit.compiled import njit
+from calibration.kit.compiled import exact_part, njit
 
 _f, _v, _m, _cube = types.float64, types.float64[::1], types.float64[:, ::1], types.float64[:, :, ::1]
 # rhs(t, y, p, u, u_rate, f, J, P): f (n,), J = df/dy (n, n), P = df/dp (n, n_p) are filled in
@@ -67,20 +67,20 @@ class _Drive(NamedTuple):
     P: Array
 
 
-@dop853.part
+@exact_part
 def _drive(p, columns, n, knots, pieces):
     u, u_rate = np.zeros(len(pieces)), np.zeros(len(pieces))
     piece = np.zeros(1, np.int64)
     return _Drive(p, columns, knots, pieces, piece, u, u_rate, np.zeros(n), np.zeros((n, n)), np.zeros((n, len(p))))
 
 
-@dop853.part
+@exact_part
 def piece_at(t, knots):
     """Index of the inputs' piece that holds at t and just after it; beyond the ends the last piece goes on."""
     return min(max(np.searchsorted(knots, t, side="right") - 1, 0), len(knots) - 2)
 
 
-@dop853.part
+@exact_part
 def inputs_at(t, i, knots, pieces, u, u_rate):
     """Piecewise cubics (channels, 5, knots - 1), highest power first: the i-th piece at t.
 
@@ -93,7 +93,7 @@ def inputs_at(t, i, knots, pieces, u, u_rate):
         u_rate[c] = (3.0 * a * x + 2.0 * b) * x + d + pieces[c, 4, i]
 
 
-@dop853.part
+@exact_part
 def _slope(t, z, out, rhs, drive):
     """Z = (y, dy/da_1, dy/da_2, ...) one after the other -> dz/dt, with the inputs of one of their pieces."""
     n, k = len(drive.f), len(drive.columns)
@@ -113,7 +113,7 @@ def _slope(t, z, out, rhs, drive):
 _step, _polynomial = dop853.method(_slope)
 
 
-@dop853.part
+@exact_part
 def _error(step, K, new, size, largest, tolerance, to_come):
     """Largest error of a step over what is allowed, of the states and of each sensitivity; infinite without a value.
 
@@ -150,7 +150,7 @@ def _error(step, K, new, size, largest, tolerance, to_come):
     return worst
 
 
-@dop853.part
+@exact_part
 def _solve(M, b):
     """Replace b (m, k) by M^-1 b; False where M has no inverse."""
     try:
@@ -160,7 +160,7 @@ def _solve(M, b):
     return True
 
 
-@dop853.part
+@exact_part
 def _stages(rhs, t, step, z, Z, drive, F, J, P, M, left):
     """What Newton's method has to make zero of stages z + Z (3 n, 1), with minus sign; M (3 n, 3 n) for its steps."""
     n = len(drive.f)
@@ -179,7 +179,7 @@ def _stages(rhs, t, step, z, Z, drive, F, J, P, M, left):
             M[row, row] += 1.0
 
 
-@dop853.part
+@exact_part
 def _implicit_step(rhs, t, step, z, drive, slope, size, W):
     """What each stage adds to states and sensitivities, W (3, len(z)), and the error over what is allowed.
 
@@ -227,7 +227,7 @@ def _implicit_step(rhs, t, step, z, drive, slope, size, W):
     return worst
 
 
-@dop853.part
+@exact_part
 def _along_stages(W, z, x, out):
     """The implicit step's polynomial at the part x of it."""
     c, d = _RADAU_C[0], _RADAU_C[1]
