@@ -15,6 +15,7 @@ import pytest
 
 from disctrack.processes import ONE_THREAD
 from disctrack.recording.declaration import Recording
+from tests.pipeline.conftest import linked, naming_rig
 
 pytestmark = pytest.mark.slow
 COPIES = 4  # of the recording in a batch
@@ -57,7 +58,8 @@ def test_batch(benchmark: Benchmark, recording: Recording, tmp_path: Path, proce
     rig = tmp_path / "rig.h5"
     disctrack("calibrate", recording.folder, "-o", rig, "--no-figures")
     for i in range(COPIES):
-        linked(recording, rig, tmp_path / f"half {i % 2}" / f"copy {i}")
+        folder = linked(recording.folder.resolve(), tmp_path / f"half {i % 2}" / f"copy {i}", os.symlink)
+        (folder / "recording.toml").write_text(naming_rig(recording.file.read_text(encoding="utf-8"), rig))
     halves = [tmp_path / "half 0", tmp_path / "half 1"]
     roots = [[half] for half in halves] if processes == 2 else [halves]
 
@@ -73,13 +75,3 @@ def test_batch(benchmark: Benchmark, recording: Recording, tmp_path: Path, proce
             shutil.rmtree(results)
 
     benchmark.pedantic(run, setup=anew, rounds=2)
-
-
-def linked(recording: Recording, rig: Path, folder: Path) -> None:
-    """A recording of the same frames, with a rig."""
-    folder.mkdir(parents=True)
-    for camera in ("left", "right"):
-        (folder / camera).symlink_to(recording.folder.resolve() / camera, target_is_directory=True)
-    text = recording.file.read_text(encoding="utf-8")
-    start, end = text.index("[calibration]"), text.index("[gravity]")
-    (folder / "recording.toml").write_text(f'{text[:start]}[calibration]\nrig = "{rig.as_posix()}"\n\n{text[end:]}')

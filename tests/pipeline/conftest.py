@@ -45,6 +45,12 @@ def linked(recording: Path, folder: Path, link=os.link) -> Path:
     return Path(shutil.copytree(recording, folder, copy_function=copy, ignore=left_out, dirs_exist_ok=True))
 
 
+def naming_rig(declaration: str, rig: Path) -> str:
+    """The declaration with a rig file in place of its views and their table."""
+    start, end = declaration.index("[calibration]"), declaration.index("[gravity]")
+    return f'{declaration[:start]}[calibration]\nrig = "{rig.as_posix()}"\n\n{declaration[end:]}'
+
+
 def images_of(recording, n: int | None = None) -> np.ndarray:
     """(n, 2, height, width) of the first pairs of a recording."""
     pairs = open_pairs(recording)
@@ -57,8 +63,5 @@ def recording(short_recording, rig_file, tmp_path) -> Path:
     folder = tmp_path / "recording"
     for camera in ("left", "right"):
         linked(short_recording / camera, folder / camera)
-    text = (short_recording / "recording.toml").read_text()
-    start, end = text.index("[calibration]"), text.index("[gravity]")
-    rig = rig_file.as_posix()
-    (folder / "recording.toml").write_text(f'{text[:start]}[calibration]\nrig = "{rig}"\n\n{text[end:]}')
+    (folder / "recording.toml").write_text(naming_rig((short_recording / "recording.toml").read_text(), rig_file))
     return folder

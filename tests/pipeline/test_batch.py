@@ -23,7 +23,7 @@ from disctrack.batch.records import read_record
 from disctrack.cli import main
 from disctrack.track.follow.tracking import prepare
 from disctrack.trajectory.file import read_trajectory
-from tests.pipeline.conftest import linked
+from tests.pipeline.conftest import linked, naming_rig
 
 FAST = ["--no-report"]
 MODEL = ["--distortion", "k1 k2 p1 p2", "--board", "flat"]  # choosing by held-out error is tested elsewhere
@@ -316,16 +316,13 @@ def test_a_read_only_folder_is_told_at_once_and_results_may_go_elsewhere(recordi
 @pytest.mark.slow
 def test_the_index_links_the_reports_and_compares_repeats(sample_clip, rig_file, tmp_path):
     """Two parts of one motion: what is fitted to them is the same, and the comparison must say so."""
-    text = (sample_clip / "recording.toml").read_text()
-    start, end = text.index("[calibration]"), text.index("[gravity]")
+    declared = naming_rig((sample_clip / "recording.toml").read_text(), rig_file)
     for name, frames in (("run 1", slice(0, 300)), ("run 2", slice(15, 300))):
         for camera in ("left", "right"):
             (tmp_path / name / camera).mkdir(parents=True)
             for file in sorted((sample_clip / camera).iterdir())[frames]:
                 (tmp_path / name / camera / file.name).symlink_to(file)
-        declared = text.replace("sample clip", name)
-        declared = declared.replace(text[start:end], f'[calibration]\nrig = "{rig_file.as_posix()}"\n\n')
-        (tmp_path / name / "recording.toml").write_text(declared)
+        (tmp_path / name / "recording.toml").write_text(declared.replace("sample clip", name))
     outcome = run_batch([tmp_path])
     assert not outcome.problems
     page = tmp_path / "batch_results" / "index.html"
