@@ -26,7 +26,6 @@ from disctrack.trajectory.exchange.formats import ROWS
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "disctrack" / "docs"
 PAGES = [ROOT / "README.md", *sorted(DOCS.glob("*.md"))]
-RUN = [page for page in PAGES if page.name != "systems.md"]  # that page has a test of its own
 BLOCK = re.compile(r"^(?:(<!-- slow -->)\n)?```(sh|python|toml)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
 IN_TEXT = re.compile(r"`(disctrack [^`]+)`")
@@ -80,7 +79,7 @@ def run_shell(block: str, folder: Path) -> None:
 
 
 @pytest.mark.statistical
-@pytest.mark.parametrize("page", RUN, ids=names(RUN))
+@pytest.mark.parametrize("page", PAGES, ids=names(PAGES))
 def test_short_blocks_run(page, workplace, monkeypatch):
     monkeypatch.chdir(workplace)
     scope: dict[str, object] = {}
@@ -104,7 +103,7 @@ def measured(tmp_path_factory) -> Path:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("page", RUN, ids=names(RUN))
+@pytest.mark.parametrize("page", PAGES, ids=names(PAGES))
 def test_all_blocks_run_in_their_order(page, measured, monkeypatch):
     monkeypatch.chdir(measured)
     scope: dict[str, object] = {}

@@ -12,7 +12,6 @@ from disctrack.analyse.analysis import analyse
 from disctrack.analyse.stage import run_analyse, write_analysis
 from disctrack.disc import MA_2014
 from disctrack.errors import AnalysisError, OutputError
-from disctrack.findings import Kind, Severity, of_kind
 from disctrack.frames import continuous_quaternions, quaternion_from_rotation, rotation_from_euler
 from disctrack.track.measurement import at_full_length
 from disctrack.trajectory import FrameStatus
@@ -60,15 +59,6 @@ def test_file_gets_the_groups_and_keeps_what_it_had(tmp_path, late, analysed, tr
             for name, dataset in file[group].items():
                 assert dataset.attrs["units"], f"{group}/{name}"
                 assert dataset.attrs["long_name"], f"{group}/{name}"
-
-
-def test_analysing_again_replaces_the_groups(tmp_path, late, analysed):
-    path = stored(tmp_path, late)
-    write_analysis(path, replace(analysed, findings=of_kind(Kind.ANALYSIS, Severity.WARNING, ["first"])))
-    write_analysis(path, analysed)
-    arrays, attributes = read_group(path, "motion")
-    assert attributes["warnings"] == "\n".join(finding.text for finding in analysed.findings)
-    assert_allclose(arrays["velocity_x"], analysed.motion.velocity[:, 0], atol=0)
 
 
 @pytest.mark.slow

@@ -44,16 +44,6 @@ def test_exponents_of_the_last_half_second(half_thickness, expected):
     assert_allclose(exponents(motion, t_f), expected, atol=0.005)
 
 
-def test_thin_disc_limit_of_the_final_law():
-    """theta^(3/2) falls linearly with the rate of (5.10) where the disc is thin and the motion quasi-static."""
-    disc = replace(MA_2014, half_thickness=1e-9)
-    motion = rolling.simulate(STEEL.__class__(disc, effects=STEEL.effects), steady_precession(0.05, disc), 3.0)
-    late = motion.q[:, 4] < 0.03
-    rate = np.polyfit(motion.time[late], motion.q[late, 4] ** 1.5, 1)[0]
-    # measured 1.5 % off at 0.03 rad: nutation set off by the start, and theta in the place of sin theta
-    assert_allclose(rate, -K_M * (4 * 9.81) ** 1.5 / disc.radius**2.5, rtol=0.05)
-
-
 def test_one_and_a_half_seconds_to_three_hundred_radians_per_second_take_less_than_fifty_milliseconds():
     start = steady_precession(np.radians(7.7), MA_2014)
     motion = rolling.simulate(STEEL, start, 2.0)  # compiles or loads

@@ -164,18 +164,6 @@ def test_calibrate_without_a_recording(shared_data, tmp_path, capsys):
     assert path.exists()
 
 
-def test_a_changed_image_is_measured_anew_only_when_told(recording, capsys):
-    assert main(["run", str(recording), *QUICK]) == 0
-    file = recording / "left" / "000003.png"
-    image = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
-    file.unlink()  # it is linked to the original
-    cv2.imwrite(str(file), image ^ 1)
-    assert main(["run", str(recording), *QUICK]) == 1
-    assert "--overwrite" in capsys.readouterr().err
-    assert main(["run", str(recording), "--overwrite", *QUICK]) == 0
-    assert "reused" not in capsys.readouterr().out
-
-
 def test_an_unreadable_image_is_one_lost_camera_and_the_exit_code_says_so(recording, capsys):
     (recording / "right" / "000007.png").unlink()
     (recording / "right" / "000007.png").write_bytes(b"\x89PNG\r\n\x1a\nhalf")

@@ -172,17 +172,6 @@ def test_views_that_cannot_be_used_are_named(short_recording, tmp_path, capsys, 
     assert re.search(said, failure(capsys, "calibrate", tmp_path))
 
 
-@pytest.mark.statistical
-@pytest.mark.parametrize("corners", ["8x6", "12x9"])
-def test_a_wrong_board_geometry(short_recording, tmp_path, capsys, corners):
-    views = short_recording / "calibration"
-    words = ["--left", views / "left" / "0[0-4].png", "--right", views / "right" / "0[0-4].png"]
-    message = failure(capsys, "calibrate", *words, "--corners", corners, "--square-mm", 8, "-o", tmp_path / "rig.h5")
-    assert "board" in message
-    assert "00.png" in message or "view 0" in message
-    assert list(tmp_path.iterdir()) == []
-
-
 @pytest.mark.parametrize(("code", "word"), [(errno.EROFS, "read-only"), (errno.EACCES, "permission")])
 def test_a_recording_folder_that_is_read_only(recording, monkeypatch, capsys, code, word):
     """Simulated: the superuser may write everywhere."""

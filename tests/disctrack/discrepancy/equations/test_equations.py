@@ -7,7 +7,6 @@ import json
 import re
 import time as clock
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,7 +15,6 @@ from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline
 from scipy.signal import lfilter
 
-import disctrack
 from disctrack.discrepancy.equations import Equations, Parameter, Run, SmoothNoise, Term, diagnose, terms
 from disctrack.discrepancy.equations import _ode_kernel as kernel
 from disctrack.discrepancy.equations.declared import checked
@@ -362,19 +360,6 @@ def test_the_answer_is_written_as_json_and_as_a_page(with_friction, tmp_path):
     assert found["effects"][0]["name"] == "coulomb_v"
     assert found["after"]["channels"]["x"]["rms"] < found["before"]["channels"]["x"]["rms"]
     assert all("dry friction" in text for text in (paths[1].read_text(), str(with_friction)))
-
-
-def snippets():
-    page = Path(disctrack.__file__).parent / "docs" / "systems.md"
-    return re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
-
-
-@pytest.mark.statistical
-def test_every_snippet_of_the_documentation_runs(capsys):
-    scope: dict = {}
-    for code in snippets():
-        exec(compile(code, "systems.md", "exec"), scope)
-    assert "dry friction" in capsys.readouterr().out
 
 
 @pytest.mark.slow
