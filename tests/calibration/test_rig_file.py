@@ -1,6 +1,6 @@
 """Rig files: nothing is lost on the way, and nothing that is not a rig gets in."""
 
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import replace
 
 import h5py
 import numpy as np
@@ -9,6 +9,7 @@ import pytest
 from calibration import Board, Camera, Observations, RigFileError, StereoRig
 from calibration.cameras.camera import N_RIG, rotation_from_vector
 from calibration.rig_file import CalibrationRecord, read_rig, read_rig_file, write_rig
+from tests.equality import assert_equal
 
 
 @pytest.fixture
@@ -60,22 +61,6 @@ def content(rig, rng):
         },
     )
     return rig, record
-
-
-def assert_equal(a, b):
-    """Field by field, bit by bit."""
-    assert type(a) is type(b)
-    if is_dataclass(a):
-        for f in fields(a):
-            assert_equal(getattr(a, f.name), getattr(b, f.name))
-    elif isinstance(a, tuple):
-        for one, other in zip(a, b, strict=True):
-            assert_equal(one, other)
-    elif isinstance(a, np.ndarray):
-        assert a.dtype == b.dtype
-        assert np.array_equal(a, b)
-    else:
-        assert a == b
 
 
 def test_reading_back_gives_equal_dataclasses(content, tmp_path):

@@ -1,6 +1,7 @@
 """A tossed cube by integrating Newton's and Euler's equations with quaternions: shares no line with the product."""
 
 import numpy as np
+from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 SIDE = 2 * 0.0524
@@ -14,13 +15,13 @@ def _quaternion_rate(q, omega_body):
     return 0.5 * np.stack(parts, axis=-1)
 
 
-def toss(rng, n, gravity=9.81, centre_of_mass=(0, 0, 0), inertia=(1, 1, 1), drag=0.0, scale=0.0, lean=0.0, noise=2e-5):
+def toss(rng, n, gravity=9.81, centre_of_mass=(0, 0, 0), inertia=(1, 1, 1), scale=0.0, lean=0.0, noise=2e-5):
     """State (n * 40, 13) and offset of n tosses: 24 samples of flight at most, then 16 at rest, in half widths.
 
     lean : [rad] of gravity, in the measured axes, to the left of every flight
     noise : [m] of a position; of an attitude, that over the half width
     """
-    h, steps = 1 / RATE / 8, 24 * 8
+    t = np.arange(24) / RATE
     J = np.asarray(inertia, float)
     offset_of_mass = np.asarray(centre_of_mass, float)
     heading = rng.uniform(0, 2 * np.pi, n)
@@ -33,22 +34,17 @@ def toss(rng, n, gravity=9.81, centre_of_mass=(0, 0, 0), inertia=(1, 1, 1), drag
     q /= np.linalg.norm(q, axis=1, keepdims=True)
     omega = 3.0 * rng.standard_normal((n, 3))
 
-    def rates(x, v, q, omega):
-        pull = down - drag * np.linalg.norm(v, axis=1, keepdims=True) * v
-        return v, pull, _quaternion_rate(q, omega), np.cross(J * omega, omega) / J
+    def rates(_, state):
+        q, omega = np.split(state.reshape(n, 7), [4], axis=1)
+        return np.concatenate([_quaternion_rate(q, omega), np.cross(J * omega, omega) / J], axis=1).ravel()
 
-    seen_x, seen_q = [], []
-    y = (x, v, q, omega)
-    for step in range(steps):
-        if step % 8 == 0:
-            seen_x.append(y[0] - Rotation.from_quat(y[2], scalar_first=True).apply(offset_of_mass))
-            seen_q.append(y[2] / np.linalg.norm(y[2], axis=1, keepdims=True))
-        k1 = rates(*y)
-        k2 = rates(*(a + h / 2 * b for a, b in zip(y, k1, strict=True)))
-        k3 = rates(*(a + h / 2 * b for a, b in zip(y, k2, strict=True)))
-        k4 = rates(*(a + h * b for a, b in zip(y, k3, strict=True)))
-        y = tuple(a + h / 6 * (p + 2 * r + 2 * s + t) for a, p, r, s, t in zip(y, k1, k2, k3, k4, strict=True))
-    still_x = np.repeat((seen_x[-1] * [1, 1, 0] + [0, 0, SIDE / 2])[None], 16, axis=0)
+    start = np.concatenate([q, omega], axis=1).ravel()
+    turned = solve_ivp(rates, (0, t[-1]), start, t_eval=t, rtol=1e-9, atol=1e-11).y.T.reshape(24, n, 7)[..., :4]
+    turned /= np.linalg.norm(turned, axis=-1, keepdims=True)
+    fallen = x + v * t[:, None, None] + down * t[:, None, None] ** 2 / 2
+    at = Rotation.from_quat(turned.reshape(-1, 4), scalar_first=True).apply(offset_of_mass)
+    flown = fallen - at.reshape(24, n, 3)
+    still_x = np.repeat((flown[-1] * [1, 1, 0] + [0, 0, SIDE / 2])[None], 16, axis=0)
     yaw = rng.uniform(0, 2 * np.pi, n)
     # the table is level, so that in axes which lean, resting cubes lean and stand on a slope
     still_x[..., 2] += lean * np.sum(still_x * across, axis=-1)
@@ -57,8 +53,8 @@ def toss(rng, n, gravity=9.81, centre_of_mass=(0, 0, 0), inertia=(1, 1, 1), drag
     level = np.concatenate([c - s * side[:, 2:], c * side[:, :1] + s * side[:, 1:2], c * side[:, 1:2] - s * side[:, :1],
                             s + c * side[:, 2:]], axis=-1)  # fmt: skip
     level /= np.linalg.norm(level, axis=1, keepdims=True)
-    position = np.concatenate([np.array(seen_x), still_x]).swapaxes(0, 1)
-    attitude = np.concatenate([np.array(seen_q), np.repeat(level[None], 16, axis=0)]).swapaxes(0, 1)
+    position = np.concatenate([flown, still_x]).swapaxes(0, 1)
+    attitude = np.concatenate([turned, np.repeat(level[None], 16, axis=0)]).swapaxes(0, 1)
     # one resting pose per toss is off by more than the noise of a sample, as tags are
     off = np.concatenate([np.zeros((n, 24, 3)), np.repeat(2e-4 * rng.standard_normal((n, 1, 3)), 16, axis=1)], axis=1)
     position = (1 + scale) * position + off + noise * rng.standard_normal(position.shape)
