@@ -12,15 +12,13 @@ from scipy.ndimage import gaussian_filter1d
 
 from calibration.cameras.camera import Camera, StereoRig, placed_at
 from disctrack.analyse.declaration import (
-    Boards,
     balance,
     contradictions,
     handedness,
     other_scale,
-    thickness,
     unseen_dots,
 )
-from disctrack.findings import Finding, Kind, Severity, finding_from_json, leading
+from disctrack.findings import Kind, Severity
 from disctrack.frames import (
     continuous_quaternions,
     euler_from_rotation,
@@ -30,7 +28,6 @@ from disctrack.frames import (
     rotation_from_vector,
     unwrap_euler,
 )
-from disctrack.numbers import Measured
 from disctrack.trajectory import MarkerStatus, Trajectory
 
 SIXTHS = np.radians(60.0 * np.arange(6))
@@ -181,16 +178,6 @@ def test_no_hand_is_taken_for_a_wrong_number(memory_ms, true_motion, as_tracked)
         assert contradictions(as_tracked(still, rng, noise=0.0)) == ()
 
 
-def test_a_wrong_radius_is_seen_where_the_nutation_varies(true_motion, as_tracked):
-    rng = np.random.default_rng(5)
-    trajectory = as_tracked(true_motion(30.0, 0.2, nutation=0.5), rng)
-    assert np.ptp(np.sin(trajectory.q[:, 4])) > 0.05
-    assert contradictions(trajectory) == ()
-    (finding,) = contradictions(replace(trajectory, disc=replace(trajectory.disc, radius=35.0e-3)))
-    assert (finding.kind, finding.remedies[0].key) == (Kind.RADIUS, "[disc] radius_mm")
-    assert abs(float(finding.remedies[0].fits) / 37.5 - 1) < 5e-3
-
-
 def with_dots(trajectory: Trajectory, scale: float, unseen: tuple[int, ...] = ()) -> Trajectory:
     """Half a metre before the cameras, with the images of dots `scale` times as far apart as declared."""
     R = rotation_from_quaternion(trajectory.quaternion)
@@ -271,41 +258,3 @@ def test_a_dot_that_is_not_seen_costs_precision_and_a_rate_spoils_every_velocity
     dot, rate = contradictions(with_dots(at_another_rate(honest, 2.0), 1.0, unseen=(0,)))
     assert (dot.kind, dot.severity) == (Kind.DOT_UNSEEN, Severity.WARNING)
     assert (rate.kind, rate.severity) == (Kind.GRAVITY_OR_RATE, Severity.DOUBT)
-
-
-def test_the_view_whose_board_lies_where_the_rim_rolls_is_named(true_motion, as_tracked):
-    """The world is that of a view that leans; the board of another view has the plane that the disc rolls on."""
-    trajectory = as_tracked(true_motion(10.0, 0.2, spin=1.0), np.random.default_rng(1))
-    Q, rig = leaning(25.0), camera_rig((-0.15, -0.4, 0.5), (0.15, -0.4, 0.5))
-    turned = replace(seen_in(Q, trajectory), rig=rig)
-
-    def seen(normal_turn, foot):  # the printed face is 3 mm above the board's foot
-        R_board = rig.R_left_world @ normal_turn
-        return R_board, rig.R_left_world @ (foot + 3e-3 * normal_turn[:, 2]) + rig.t_left_world
-
-    places = {3: seen(np.eye(3), np.zeros(3)), 0: seen(Q, np.zeros(3)), 5: seen(Q, 0.1 * Q[:, 2])}
-    (finding,) = contradictions(turned, boards=Boards(places, 3, 3e-3))
-    assert finding.sentence.startswith(
-        "[table] view: 0 would fit (declared 3): view 3 does not lie on the table; view 0"
-    )
-    (unnamed,) = contradictions(turned, boards=Boards({3: places[3], 5: places[5]}, 3, 3e-3))
-    assert unnamed.remedies[0].fits == ""
-
-
-@pytest.mark.parametrize(
-    ("declared", "height", "first"),
-    [
-        (0.0, -3.0, "[table] board_thickness_mm: 3.00 would fit (declared 0)"),
-        (3.0, 1.0, "[disc] thickness_mm: 7.00 would fit (declared 6)"),
-        (1.0, 2.0, "[disc] thickness_mm: 8.00 would fit (declared 6)"),
-    ],
-)
-def test_the_thickness_that_would_put_the_rim_on_the_table_is_named(declared, height, first, honest):
-    seen = {"height": Measured(1e3 * height, unit="um")}
-    off = Finding(Kind.TABLE_DISAGREES, Severity.DOUBT, "", numbers=seen)
-    (found,) = thickness(honest.disc, 1e-3 * declared, off)
-    assert str(found.remedies[0]) == first
-    assert finding_from_json(found.as_json()) == found  # as it stands in files
-    assert len(found.remedies) == (1 if declared - height < 0 else 2)
-    assert leading([off, found]) == (found,)
-    assert not thickness(honest.disc, 1e-3 * declared, replace(off, severity=Severity.WARNING))

@@ -1,7 +1,6 @@
 """The measurement from stacks, videos and the cameras' own files is the one from PNG files of the same grey values."""
 
 import shutil
-from functools import partial
 from pathlib import Path
 
 import cv2
@@ -15,7 +14,7 @@ from disctrack.calibrate.views import find_views
 from disctrack.cli import main
 from disctrack.errors import RecordingError
 from disctrack.trajectory.file import read_details, read_trajectory
-from tests.disctrack.recording.readers.written import write_hdf5, write_pages_by_opencv, write_video
+from tests.disctrack.recording.readers.written import write_hdf5
 from tests.oracles.camera_files import write_cine, write_mraw
 
 QUICK = ["--no-figures", "--no-video"]
@@ -74,27 +73,6 @@ def run(recording: Path, *words: str) -> Path:
 
 def said(capsys) -> str:
     return " ".join(capsys.readouterr().out.split())
-
-
-@pytest.mark.parametrize(
-    ("suffix", "write"),
-    [
-        ("tif", partial(write_pages_by_opencv, compression=1)),
-        ("mkv", partial(write_video, pixels="gray", codec="ffv1")),
-        ("h5", partial(write_hdf5, compression="gzip")),
-        # without its exposure: times differ by the stamps' rounding, and with them the last bits of what it shifts
-        ("cine", partial(write_cine, bits=8, rate=1000, first_image=-5, exposure_ns=0)),
-    ],
-)
-def test_poses_from_lossless_files_of_8_bit_are_those_from_png(recording, from_png, suffix, write):
-    for camera in CAMERAS:
-        write(recording / f"{camera}.{suffix}", grey_values(recording / camera))
-    use_files(recording, f"left.{suffix}", f"right.{suffix}")
-    found = run(recording)
-    assert_array_equal(read_trajectory(found).q, from_png.q)
-    if suffix == "cine":
-        assert_allclose(read_trajectory(found).time, from_png.time, atol=2**-29)  # stamps have 2**-30 s
-        assert read_details(found)["camera_headers"]["left"]["first_frame"] == -5
 
 
 def test_the_exposure_moves_poses_by_what_it_should(from_png, from_png_of_50_us):

@@ -196,33 +196,10 @@ def test_reasons_are_one_line_and_say_what_to_do():
     assert "ZeroDivisionError" in reason_of(ZeroDivisionError("division by zero"))
 
 
-_HOLD = """
-import fcntl, sys, time
-file = open(sys.argv[1], "w")
-fcntl.flock(file, fcntl.LOCK_EX)
-print(flush=True)
-time.sleep(60)
-"""
-
-
-@pytest.fixture
-def holder(tmp_path):
-    """Another process that holds a lock until it is killed; the lock's path, and the process."""
-    process = subprocess.Popen([sys.executable, "-c", _HOLD, tmp_path / "lock"], stdout=subprocess.PIPE)
-    assert process.stdout.readline() == b"\n"
-    yield tmp_path / "lock", process
-    process.kill()
-    process.communicate()
-
-
-def test_a_lock_keeps_another_process_out_until_its_holder_is_killed(holder):
-    path, process = holder
-    with pytest.raises(Busy), locked(path):
+def test_a_lock_keeps_others_out_and_leaves_nothing(tmp_path):
+    with locked(tmp_path / "lock"), pytest.raises(Busy), locked(tmp_path / "lock"):
         pass
-    process.kill()
-    with locked(path, wait=5.0), pytest.raises(Busy), locked(path):  # what the killed one left does not count
-        pass
-    assert not path.exists()
+    assert not (tmp_path / "lock").exists()
 
 
 def test_a_disk_without_locks_is_locked_by_a_file_and_a_dead_holders_file_is_cleared(tmp_path, monkeypatch):

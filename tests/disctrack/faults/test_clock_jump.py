@@ -5,10 +5,8 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from disctrack.analyse.declaration import contradictions
 from disctrack.diagnosis import diagnose
 from disctrack.faults.clock_jump import clock_jumps, without_jumps
-from disctrack.findings import Kind
 from tests.oracles.measured_disc import measured
 
 FRAME = 50
@@ -32,14 +30,6 @@ def rolling(request):
 def test_lost_pairs_are_counted_and_their_place_is_told(rolling, k):
     (jump,) = clock_jumps(without(rolling, range(FRAME, FRAME + k)))
     assert (jump.row, jump.frames) == (FRAME, k)
-
-
-def test_a_run_puts_the_result_in_doubt_and_names_frame_and_number(rolling):
-    found = contradictions(without(rolling, [FRAME, FRAME + 1]))
-    (lost,) = (one for one in found if one.kind == Kind.CLOCK_JUMP)
-    assert lost.doubtful
-    assert f"frame {FRAME}: the clock jumps by 2 frames" in lost.sentence
-    assert not [one for one in contradictions(rolling) if one.kind == Kind.CLOCK_JUMP]
 
 
 def test_two_losses_are_two_and_the_right_times_come_back(rolling):

@@ -192,9 +192,7 @@ def series(trajectory, n, axis="window"):
     return {"speed": speed, "fit": Variable(np.arange(float(n)), (axis,), "1", "fitted in each window")}
 
 
-def test_replacing_groups_again_and_again_leaves_the_rest_as_it_is_and_the_file_as_small(
-    file, trajectory
-):
+def test_replacing_groups_again_and_again_leaves_the_rest_as_it_is_and_the_file_as_small(file, trajectory):
     sizes = []
     for n in (5, 5, 7, 5):  # an axis that only these groups use may change its length
         axis = {"window": Variable(np.arange(float(n)), ("window",), "s", "window")}

@@ -3,7 +3,6 @@
 Motions come from SciPy's `solve_ivp` with right-hand sides written here a second time.
 """
 
-import json
 import re
 import time as clock
 from dataclasses import replace
@@ -350,16 +349,6 @@ def test_the_noise_of_a_channel_is_found_in_its_data(rng):
 def test_what_is_declared_wrongly_is_named(declare, message):
     with pytest.raises(AnalysisError, match=re.escape(message)):
         declare()
-
-
-@pytest.mark.statistical
-def test_the_answer_is_written_as_json_and_as_a_page(with_friction, tmp_path):
-    paths = with_friction.write(tmp_path)
-    found = json.loads(paths[0].read_text())
-    assert {"verdict", "sentence", "effects", "before", "after", "tried", "notes", "runs"} <= set(found)
-    assert found["effects"][0]["name"] == "coulomb_v"
-    assert found["after"]["channels"]["x"]["rms"] < found["before"]["channels"]["x"]["rms"]
-    assert all("dry friction" in text for text in (paths[1].read_text(), str(with_friction)))
 
 
 @pytest.mark.slow

@@ -135,7 +135,10 @@ def test_the_law_is_told_on_the_page_and_in_json(tmp_path):
     assert f"{NAME}.a3" not in str(answer)
     assert answer.diagnosis.explanations[0] == ((NAME,), 0.0)  # one of the list
     told, page = answer.write(tmp_path)
-    law = json.loads(told.read_text())["law"]
+    found = json.loads(told.read_text())
+    assert {"verdict", "sentence", "effects", "before", "after", "tried", "notes", "runs"} <= set(found)
+    assert found["after"]["channels"]["x"]["rms"] < found["before"]["channels"]["x"]["rms"]
+    law = found["law"]
     assert law["variable"] == "v"
     assert len(law["at"]) == len(law["force"]) == len(law["sigma"])
     assert law["known_terms"] == [c.name for c in answer.law.instead.candidates]
