@@ -7,7 +7,17 @@ from numpy.testing import assert_allclose
 from disctrack import rolling
 from disctrack.disc import MA_2014
 from disctrack.errors import ArgumentError
-from disctrack.rolling import CATALOGUE, Effect, EffectParameter, Model, ModelError, steady_precession
+from disctrack.rolling import (
+    CATALOGUE,
+    Effect,
+    EffectParameter,
+    Model,
+    ModelError,
+    State,
+    sensitivities,
+    steady_precession,
+    struck_disc,
+)
 from disctrack.rolling.effects import catalogue_table, effect, effect_from_formulas
 from disctrack.rolling.evaluate import effect_power, effect_wrench, kinematics
 
@@ -135,9 +145,8 @@ def test_a_new_effect_is_one_small_function():
         del CATALOGUE["test_magnet"]
 
 
-def test_two_effects_of_one_name_are_refused():
-    with pytest.raises(ModelError, match="two effects are called 'km'"):
-        type("Other", (Effect,), {"name": "km", "parameters": ()})
+def simulated(theta=0.3, effects=(), times=(0.0, 0.01), **state):
+    return rolling.simulate(Model(MA_2014, effects=effects), State(theta=theta, omega2=5.0, **state), times=times)
 
 
 @pytest.mark.parametrize(
@@ -146,10 +155,28 @@ def test_two_effects_of_one_name_are_refused():
         (lambda: CATALOGUE["km"](k=1.0), "no parameter 'k'; it has k_m"),
         (lambda: Model(MA_2014).with_values({"km.mu": 1.0}), "no parameter; effect 'km' has k_m"),
         (lambda: Model(MA_2014).with_values({"kx.mu": 1.0}), "there is no effect 'kx'"),
-        (lambda: Model(MA_2014, effects=(CATALOGUE["km"](), CATALOGUE["km"]())), "twice"),
+        (lambda: simulated(effects=(CATALOGUE["km"](), CATALOGUE["km"]())), "twice"),
+        (lambda: type("Other", (Effect,), {"name": "km", "parameters": ()}), "two effects are called 'km'"),
+        (lambda: simulated(v_x=1.0), "the state has v_x: give none for rolling"),
+        (lambda: simulated(z=0.1, v_z=0.0), "the state has z, v_z: give none for rolling"),
+        (lambda: simulated(v_x=0.0, v_y=0.0, z=0.1), "the state has v_x, v_y, z: give none for rolling"),
+        (lambda: simulated(theta=np.radians(0.3)), "outside"),
+        (lambda: simulated(times=[0.0, 0.0]), "increasing"),
+        (lambda: sensitivities(Model(MA_2014), State(theta=0.3), [0, 1], ["kz.k_x"]), "'kz.k_x' is no .*has k_z"),
+        (lambda: sensitivities(Model(MA_2014), State(theta=0.3), [0, 1], ["nothing.x"]), "no effect 'nothing'"),
+        (lambda: struck_disc(MA_2014, 0.0, -0.02, 0.05), "hit it higher"),
+        (lambda: struck_disc(MA_2014, 0.03, 0.03, 0.05), "outside the face"),
+        (lambda: struck_disc(MA_2014, 0.0, 0.02, 0.05, friction=-0.2), "friction of -0.2"),
+        (lambda: effect_from_formulas("km", {"M_z": "-c*omega_z"}), "already"),
+        (lambda: effect_from_formulas("formula_bad", {"M_z": "__import__('os')"}), "no function __import__"),
+        (lambda: effect_from_formulas("formula_bad", {"M_z": "c.real"}), "not allowed"),
+        (lambda: effect_from_formulas("formula_bad", {"M_z": "c *"}), "is no formula"),
+        (lambda: effect_from_formulas("formula_bad", {"M_z": "c if theta else 1"}), "not allowed"),
+        (lambda: effect_from_formulas("formula_bad", {"M_q": "c"}), "no component"),
+        (lambda: effect_from_formulas("formula_bad", {}), "no formula"),
     ],
 )
-def test_a_wrong_name_or_value_is_answered_with_what_there_is(make, message):
+def test_what_cannot_be_a_model_a_start_or_a_law_is_refused_in_words(make, message):
     with pytest.raises(ModelError, match=message):
         make()
 
@@ -216,23 +243,6 @@ def test_laws_of_one_name_live_side_by_side_in_one_process():
     step = 1e-7
     moved = rolling.simulate(with_second.with_values({"learned.c_0": 0.0, "learned.c_1": step}), state, times=times)
     assert_allclose(found.dq[:, :, -1] * step, moved.q - found.q, rtol=1e-2, atol=1e-10)  # integrated to 1e-11
-
-
-@pytest.mark.parametrize(
-    ("name", "formulas", "message"),
-    [
-        ("km", {"M_z": "-c*omega_z"}, "already"),
-        ("formula_bad", {"M_z": "__import__('os')"}, "no function __import__"),
-        ("formula_bad", {"M_z": "c.real"}, "not allowed"),
-        ("formula_bad", {"M_z": "c *"}, "is no formula"),
-        ("formula_bad", {"M_z": "c if theta else 1"}, "not allowed"),
-        ("formula_bad", {"M_q": "c"}, "no component"),
-        ("formula_bad", {}, "no formula"),
-    ],
-)
-def test_a_formula_that_cannot_be_a_law_is_refused(name, formulas, message):
-    with pytest.raises(ModelError, match=message):
-        effect_from_formulas(name, formulas)
 
 
 def test_spin_drifts_whichever_direction_the_dissipative_moment_has():

@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose
 
 from disctrack import rolling
 from disctrack.disc import MA_2014
-from disctrack.rolling import CATALOGUE, Model, ModelError, Regime, State, steady_precession
+from disctrack.rolling import CATALOGUE, Model, Regime, steady_precession
 from disctrack.rolling._assembly import Assembly
 from disctrack.rolling.effects import effect_from_formulas
 from disctrack.rolling.records import ROLLING_COMPONENTS
@@ -160,15 +160,6 @@ def test_derivatives_are_nan_after_the_end():
     assert 0 < ended.sum() < 101
     assert np.isnan(found.dq[ended]).all()
     assert np.isfinite(found.dq[~ended]).all()
-
-
-def test_a_parameter_that_is_not_there_is_named():
-    with pytest.raises(ModelError, match=r"'kz\.k_x' is no parameter; effect 'kz' has k_z"):
-        rolling.sensitivities(MODEL, STATE, TIMES, ["kz.k_x"])
-    with pytest.raises(ModelError, match="no effect 'nothing'"):
-        rolling.sensitivities(MODEL, STATE, TIMES, ["nothing.x"])
-    with pytest.raises(ModelError, match="increasing"):
-        rolling.simulate(MODEL, State(theta=0.3), times=[0.0, 0.0])
 
 
 def test_a_friction_that_is_never_reached_has_no_influence():

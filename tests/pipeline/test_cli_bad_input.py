@@ -63,6 +63,11 @@ def another_scene(recording: Path) -> None:
     (recording / "left.toml").write_text("[cameras]\nn_frames = 3\n")  # whose folder would be `left`
 
 
+def effect(name: str, value: str):
+    scene = f'[motion]\nkind = "rolling"\n[motion.rolling.effects.{name}]\n{value}\n'
+    return lambda recording: (recording / "scene.toml").write_text(scene)
+
+
 def nothing(recording: Path) -> None:
     pass
 
@@ -94,6 +99,9 @@ PATTERNS = "calibrate --left {r}/l*.png --right {r}/r*.png --corners 9x6 --squar
         (nothing, PATTERNS, "no image matched for the left camera"),
         (another_scene, "render {r}/wrong.toml --quiet", "nearest known key is 'n_frames'"),
         (another_scene, "render {r}/left.toml --quiet", "not an empty folder"),
+        (nothing, "simulate {r}/nowhere.toml", "nowhere.toml"),
+        (effect("kz", "k_z = -6e-5"), "simulate {r}/scene.toml", "a passive effect cannot feed the disc with energy"),
+        (effect("kx", "k_z = 6e-5"), "simulate {r}/scene.toml", "there is no effect 'kx'"),
         (nothing, "calibrate {r} --table-view 2", "--table-view.*recording.toml says this"),
         (nothing, "calibrate {r} --left l*.png --square-mm 8", "--left.*recording.toml says this"),
     ],

@@ -25,6 +25,7 @@ from disctrack.track.follow.tracking import TrackingSettings, track
 from disctrack.track.judge.disc_not_seen import arrangement_found, moved_camera, unlike_declared
 from disctrack.track.refine.intrinsic_scatter import MIN_FRAMES
 from disctrack.trajectory import FrameStatus
+from disctrack.validate.errors import compare
 from tests.disctrack.recording.readers.written import write_video
 from tests.oracles import imperfect_laboratory
 from tests.oracles.planted_faults import FAULTS, glare
@@ -73,16 +74,9 @@ class Laboratory:
         return np.flatnonzero(wrong).tolist()
 
 
-def away_from(found, q):
-    """(n, 6) of poses from q: position, and the vector of the turn."""
-    R, R_true = (frames.rotation_from_euler(*angles.T) for angles in (found.q[:, 3:], q[:, 3:]))
-    turn = frames.vector_from_rotation(R @ np.swapaxes(R_true, 1, 2))
-    return np.column_stack([found.q[:, :3] - q[:, :3], turn])
-
-
 def beyond(found, q, covariance, shared=False):
     """(n,) True for poses that are farther than MOST_SIGMAS from q in a component; `shared`: but for what all share."""
-    away = away_from(found, q)
+    away = compare(found, q).error
     if shared:
         away -= np.nanmedian(away, axis=0)
     with np.errstate(invalid="ignore"):
@@ -385,7 +379,7 @@ def test_frames_that_an_encoder_predicts_from_one_another_scatter_as_stated(clip
         reader = open_frames(f"{camera}.mp4", tmp_path, camera)
         lossy.append([reader.read(i) for i in range(N)])
     found = measure(np.stack(lossy, axis=1), clip.rig, clip.disc)
-    error = away_from(found.trajectory, clip.untouched.trajectory.q)
+    error = compare(found.trajectory, clip.untouched.trajectory.q).error
     stated = found.trajectory.pose_covariance + found.trajectory.calibration_covariance
     ratio = np.nanmean(error**2 / np.einsum("nii->ni", stated), axis=0)
     assert (ratio < 2.5).all()  # errors of neighbouring frames are alike: 48 are some 16

@@ -30,15 +30,8 @@ def independent(seed, f=0.0, axial=1.0):
         declared.radius, declared.half_thickness, declared.mass, J_body=np.diag([J1, J1, axial * J3]),
         laws=(newton_euler.precession_friction(K_M), newton_euler.moffatt(1.81e-5 * f)),
     )  # fmt: skip
-    theta = np.radians(rng.uniform(4, 9))
-    omega2 = np.sqrt(4 * 9.81 * np.sin(theta) / body.r)
-    start = (0.032, 0.02, rng.uniform(-3, 3), theta, rng.uniform(-3, 3), 0.0, omega2, rng.uniform(0, 2))
-    state = newton_euler.state_from_angles(body, *start)
-
-    def motion(times):
-        answer = newton_euler.follow(body, state, np.r_[0.0, times], rtol=1e-10, atol=1e-11, method="LSODA")
-        return newton_euler.coordinates(body, answer.y)[1:]
-
+    theta_deg, psi, omega3 = rng.uniform([4, -3, 0], [9, 3, 2])
+    motion = newton_euler.filmed_motion(body, theta_deg, omega3, 130 / RATE, RATE, psi)
     trajectory = measured(seed=seed, n=130, motion=motion, **RIG)
     return Recorded(f"run {seed}", trajectory)
 

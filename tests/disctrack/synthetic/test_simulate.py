@@ -159,19 +159,6 @@ def test_command_writes_the_motion_and_tells_how_it_went(scene, capsys):
         assert len(file["time"]) == 51
 
 
-def test_command_answers_mistakes_with_one_line(scene, capsys):
-    assert main(["simulate", str(scene.with_name("nowhere.toml"))]) == 1
-    assert "nowhere.toml" in capsys.readouterr().err
-    scene.write_text(SCENE.replace("k_z = 6e-5", "k_z = -6e-5"))
-    assert main(["simulate", str(scene)]) == 1
-    assert "a passive effect cannot feed the disc with energy" in capsys.readouterr().err
-    scene.write_text(SCENE.replace("effects.kz", "effects.kx"))
-    assert main(["simulate", str(scene)]) == 1
-    said = capsys.readouterr().err
-    assert "there is no effect 'kx'" in said
-    assert len(said.strip().splitlines()) == 1
-
-
 def test_command_lists_the_effects(capsys):
     assert main(["simulate", "--list-effects"]) == 0
     assert "| `km` |" in capsys.readouterr().out

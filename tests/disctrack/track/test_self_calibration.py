@@ -1,4 +1,4 @@
-"""Scatter of the dots apart from what all frames share: cameras, printed dots, clock."""
+"""What all frames share apart from the scatter of the dots: cameras, printed dots, clock, the size of the board."""
 
 from dataclasses import replace
 
@@ -7,13 +7,23 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.optimize import minimize
 
+from calibration.cameras.camera import Allowance
+from calibration.judge.tolerances import SIZE
 from disctrack.disc import MA_2014
 from disctrack.faults.keys import CameraFault, Faults
 from disctrack.frames import rotation_from_euler, rotation_from_vector, vector_from_rotation
 from disctrack.track.refine.assembly import fit_all
 from disctrack.track.refine.intrinsic_scatter import split_scatter, without_shared_faults
-from disctrack.track.refine.self_calibration import declared_places_kept, motions_of_pattern, pattern_place
+from disctrack.track.refine.self_calibration import (
+    declared_places_kept,
+    motions_of_pattern,
+    pattern_place,
+    refine_as_built,
+    share_of_places,
+)
+from disctrack.trajectory import FrameStatus
 from tests.oracles.measured_disc import SIGMA_PX, dots_of, measured
+from tests.oracles.point_laboratory import DOT_PX, tracked
 
 N = 160
 # relative scatter of chi-square with 18 degrees of freedom in N frames: sqrt(2 / 18 / N) = 2.6 %; four of these
@@ -138,3 +148,71 @@ def test_poses_move_with_the_pattern(rng):
     expected = motions_of_pattern(R[None], disc)[0] @ [*displaced, turn]
     np.testing.assert_allclose(t_found, expected[:3], atol=1e-8)
     np.testing.assert_allclose(vector_from_rotation(R_found @ R.T), expected[3:], atol=1e-7)
+
+
+SHORT = 1e-4  # relative, by which the rig takes all lengths for too short
+
+
+@pytest.fixture(scope="module")
+def trajectory():
+    return measured(n=80)
+
+
+def refined(trajectory, rng, size_sigma, misprint=0.0):
+    """The dots seen with a rig that is too small, and what is made of both."""
+    true = trajectory.rig
+    shift = np.zeros(30)
+    shift[21:24], shift[27:30] = true.t_right_left, true.t_left_world
+    small = replace(true.perturbed(-SHORT * shift), covariance=size_sigma**2 * np.outer(shift, shift))
+    small = replace(small, allowances=(Allowance(SIZE, size_sigma * shift),) if size_sigma else ())
+    centres = trajectory.disc.marker_centres_body.copy()
+    centres[:, :2] += misprint * rng.normal(size=(len(centres), 2))
+    disc = replace(trajectory.disc, marker_centres_body=centres)  # as declared: others than those that were seen
+    seen = dots_of(trajectory)
+    return true, refine_as_built(replace(seen, rig=small, disc=disc, t=seen.t * (1 - SHORT)))
+
+
+def test_regular_dots_correct_a_board_of_unknown_size(trajectory, rng):
+    true, found = refined(trajectory, rng, size_sigma=1e-4)
+    assert abs(found.size - SHORT) < 4 * found.size_sigma < 1e-4
+    assert found.size_share > 0.8
+    assert abs(found.rig.baseline / true.baseline - 1) < 4 * found.size_sigma
+    left = np.linalg.norm(found.rig.allowances[0].shift[21:24]) / true.baseline
+    assert 0.5 * found.size_sigma < left < 1.1 * found.size_sigma  # what is known of both together
+    assert np.abs(found.marker_shift).max() < 2e-6
+
+
+def test_misprinted_dots_or_a_declared_board_leave_the_rig_alone(trajectory, rng):
+    true, found = refined(trajectory, rng, size_sigma=1e-5, misprint=30e-6)
+    assert found.size_sigma > 1e-4
+    assert abs(found.rig.baseline / true.baseline - (1 - SHORT)) < 1e-5
+    true, found = refined(trajectory, rng, size_sigma=0.0)
+    assert found.size_share == 0.0
+    assert abs(found.rig.baseline / true.baseline - (1 - SHORT)) < 1e-9
+
+
+@pytest.mark.parametrize("frame_rate", [1000.0, 400.0])
+def test_ends_of_a_slow_recording_are_measured_and_an_exchange_there_is_refused(frame_rate):
+    """At 400 pairs/s a quadratic through three frames misses the next by 11 times its noise, and no other is there."""
+    trajectory = measured(n=80, declared_rate=frame_rate, sigma_px=DOT_PX)
+    seen = dots_of(trajectory)
+    px, R, t = seen.pixels, seen.R, seen.t
+    px[40, 0, 0] = np.nan  # one dot hidden
+    found = tracked(px, R, t, trajectory.time, seen.rig, frame_rate).trajectory
+    assert np.all(found.frame_status == FrameStatus.MEASURED)
+    px[[1, 3]], R[[1, 3]], t[[1, 3]] = px[[3, 1]], R[[3, 1]], t[[3, 1]]
+    found = tracked(px, R, t, trajectory.time, seen.rig, frame_rate).trajectory
+    assert found.frame_status[1] == found.frame_status[3] == FrameStatus.JUMPED
+    assert np.all(found.frame_status[6:] == FrameStatus.MEASURED)
+
+
+def test_dots_are_moved_by_the_share_of_their_displacement_that_is_no_noise(rng):
+    sigma = np.full((6, 2), 0.5e-6)
+    pattern = rng.normal(size=(6, 2))
+    shares = np.array([share_of_places(MA_2014, size * pattern, sigma) for size in np.geomspace(1e-8, 1e-4, 400)])
+    assert np.all(np.diff(shares) >= 0)
+    assert np.diff(shares).max() < 0.05  # 2.3 % more displacement never tips anything
+    assert shares[0] == 0.0
+    assert shares[-1] > 0.9999
+    moved = 1e-3 + 0.02 * (MA_2014.marker_centres_body[:, :2] @ [[0, 1], [-1, 0]])  # the pattern as a whole
+    assert share_of_places(MA_2014, moved, sigma) == 0.0

@@ -1,6 +1,9 @@
-"""From images to the trajectory: a rendered rolling disc, interruptions, faults."""
+"""From images to the trajectory: a rendered rolling disc, interruptions, faults, long recordings."""
 
+import tracemalloc
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -8,13 +11,18 @@ import pytest
 
 from calibration.kit.stuck_pixels import stuck_pixels
 from disctrack import frames
-from disctrack.errors import TrackingError
+from disctrack.errors import RecordingError, TrackingError
 from disctrack.findings import Kind
 from disctrack.recording.declaration import read_recording
 from disctrack.recording.readers.blocks import PairBlock, Unreadable
-from disctrack.track.follow.tracking import PAIRS_TRIED, TrackingSettings, _as_one_sensor, track
-from disctrack.track.measurement import measure, open_pairs
+from disctrack.track.dots.template import dot_centres
+from disctrack.track.follow.tracking import PAIRS_TRIED, TrackingSettings, _as_one_sensor, stretch_edges, track
+from disctrack.track.measurement import measure, open_pairs, refuse_unreadable
+from disctrack.track.refine.assembly import fit_all
+from disctrack.track.refine.self_calibration import DotsInFrames
 from disctrack.trajectory import FrameStatus, MarkerStatus
+from disctrack.validate.errors import compare
+from tests.oracles.point_laboratory import tables_of
 from tests.rendering import expected_disc, rolling_disc
 
 N = 60
@@ -43,15 +51,9 @@ def rolling(rendered_pairs):
     return rolling_disc(rendered_pairs.rig, rendered_pairs.disc, rendered_pairs.scene, 10, N)
 
 
-def errors(trajectory, q):
-    R = frames.rotation_from_euler(*trajectory.q[:, 3:].T)
-    turn = frames.vector_from_rotation(R @ np.swapaxes(frames.rotation_from_euler(*q[:, 3:].T), 1, 2))
-    return np.concatenate([trajectory.q[:, :3] - q[:, :3], turn], axis=1)
-
-
 def pulls(trajectory, q):
     """(n, 6) errors in their own sigmas."""
-    return np.abs(errors(trajectory, q)) / np.sqrt(np.diagonal(trajectory.pose_covariance, axis1=1, axis2=2))
+    return np.abs(compare(trajectory, q).error) / np.sqrt(np.diagonal(trajectory.pose_covariance, axis1=1, axis2=2))
 
 
 def test_a_rolling_disc_is_measured_to_the_predicted_sigma(rolling, rendered_pairs):
@@ -60,7 +62,7 @@ def test_a_rolling_disc_is_measured_to_the_predicted_sigma(rolling, rendered_pai
     trajectory = result.trajectory
     assert (trajectory.frame_status == FrameStatus.MEASURED).all()
     assert (trajectory.marker_status == MarkerStatus.MEASURED).all()
-    error = errors(trajectory, q)
+    error = compare(trajectory, q).error
     squared = np.einsum("ni,nij,nj->n", error, np.linalg.inv(trajectory.pose_covariance), error)
     # 360 degrees of freedom scatter by 0.075; the templates' own error adds (0.3e-3 / 4e-3)^2
     assert 0.75 < squared.mean() / 6 < 1.3
@@ -235,7 +237,7 @@ def test_behind_a_colour_filter_the_disc_is_measured_as_without(rolling, rendere
     assert sum("a colour filter lies on the sensor" in f.text for f in result.findings) == 2
     plain = tracked(images, rendered_pairs)
     assert not any("colour filter" in f.text for f in plain.findings)
-    rms = [np.sqrt(np.mean(errors(t.trajectory, q) ** 2, axis=0)) for t in (plain, result)]
+    rms = [np.sqrt(np.mean(compare(t.trajectory, q).error ** 2, axis=0)) for t in (plain, result)]
     # rounding to grey values that are 0.55 and 0.75 as large adds 1/12 of their square to the noise
     assert (rms[1] < 1.6 * rms[0]).all()
 
@@ -250,8 +252,60 @@ def test_edges_that_compression_spoils_cost_accuracy_and_no_camera(rolling, rend
     lossy = np.array([[compressed(image, 95 if i < 3 else 10) for image in pair] for i, pair in enumerate(images)])
     trajectory = tracked(lossy, rendered_pairs).trajectory
     assert (trajectory.frame_status == FrameStatus.MEASURED).mean() > 0.95
-    error = errors(trajectory, q)
+    error = compare(trajectory, q).error
     # grey values are off by 4 of 165 at edges, noise 1: 4 times 3 um
     assert np.sqrt(np.mean(error[:, :3] ** 2)) < 12e-6
     stated = np.einsum("nii->ni", trajectory.pose_covariance)
     assert 0.3 < np.nanmean(error**2 / stated) < 3.0
+
+
+RECORDING = SimpleNamespace(folder=Path("rec"))
+
+
+def lost_images(n):
+    return [Unreadable(n - i, i % 2, f"left/{n - i}.png: cannot be read: No such device.") for i in range(n)]
+
+
+def test_most_images_unreadable_is_the_cause_that_is_told():
+    with pytest.raises(
+        RecordingError, match=r"rec: the files cannot be read: 150 of 200 images, the first: left/1\.png"
+    ):
+        refuse_unreadable(RECORDING, lost_images(150), 200, TrackingError("found in none"))
+
+
+def test_a_few_are_not():
+    refuse_unreadable(RECORDING, lost_images(100), 200, TrackingError("found in none"))
+
+
+@pytest.mark.parametrize(
+    ("n", "stretches"), [(1, 1), (999, 1), (1000, 2), (3999, 2), (4000, 4), (16000, 8), (10**6, 32)]
+)
+def test_stretches_follow_from_the_length_alone_and_cover_it(rendered_pairs, n, stretches):
+    edges = stretch_edges(range(70, 70 + n), rendered_pairs.disc)
+    assert len(edges) == stretches + 1
+    assert (edges[0], edges[-1]) == (70, 70 + n)
+    assert np.ptp(np.diff(edges)) <= 1
+
+
+def test_dots_that_leave_phi_open_are_followed_in_one_stretch(rendered_pairs):
+    four = replace(rendered_pairs.disc, marker_centres_body=rendered_pairs.disc.marker_centres_body[[0, 1, 3, 4]])
+    assert len(stretch_edges(range(5000), four)) == 2
+
+
+def test_what_the_fit_of_all_poses_needs_beside_its_result_does_not_grow_with_their_number(rendered_pairs, monkeypatch):
+    monkeypatch.setattr("disctrack.track.refine.assembly.FITTED_AT_ONCE", 512)
+    rig, disc = rendered_pairs.rig, rendered_pairs.disc
+    R, t = frames.rotation_from_euler(*rendered_pairs.q[:, 3:].T), rendered_pairs.q[:, :3]
+    beside = []
+    for n in (1536, 4608):
+        k = np.arange(n) % len(R)
+        tables = tables_of(rendered_pairs.true_pixels[k], R[k], t[k], 0.01)
+        dots = dot_centres(tables.results, tables.status)
+        tracemalloc.start()
+        fits = fit_all(DotsInFrames(rig, disc, dots.pixels, dots.covariance_px2, tables.R, tables.t))
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert fits.converged.all()
+        beside.append(peak - sum(value.nbytes for value in vars(fits).values()))
+    # three times the frames; before they were fitted in parts it was three times the memory
+    assert beside[1] < 1.2 * beside[0]
