@@ -14,10 +14,6 @@ _NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
 SILENT_FOR = 12 * 3600.0  # [s] after which a lock counts as abandoned, where the disk knows no locks
 
 
-class Busy(Exception):
-    """Another process holds the lock."""
-
-
 @contextlib.contextmanager
 def locked(path: Path, wait: float = 0.0) -> Iterator[None]:
     """Hold the lock `path`, a file that is there while it is held.
@@ -25,20 +21,9 @@ def locked(path: Path, wait: float = 0.0) -> Iterator[None]:
     The operating system frees the lock when its holder ends, however it ends, so a file that a killed process left
     has no effect. On a disk without locks the existence of `<path>.holder` is the lock, and the host and process named
     in it tell whether it is still valid; one of another host is, for SILENT_FOR.
-    wait : [s] to wait for another holder. Raises Busy, OutputError.
+    wait : [s] to wait for another holder. Raises Timeout where that holds it still, OutputError.
     """
     make_folder(path.parent)
-    lock = _acquired(path, wait)
-    try:
-        yield
-    finally:
-        if not isinstance(lock, SoftFileLock):
-            with contextlib.suppress(OSError):
-                path.unlink()  # before it is free: who locks the removed file notices that it is no longer there
-        lock.release()
-
-
-def _acquired(path: Path, wait: float) -> BaseFileLock:
     lock: BaseFileLock = FileLock(path, timeout=wait, fallback_to_soft=False)
     try:
         try:
@@ -52,8 +37,14 @@ def _acquired(path: Path, wait: float) -> BaseFileLock:
                     holder.unlink()
             lock = SoftFileLock(holder, timeout=wait)
             lock.acquire()
-    except Timeout as error:
-        raise Busy(f"{path} is held by another process") from error
+    except Timeout:
+        raise
     except OSError as error:
         raise output_error(path, error) from error
-    return lock
+    try:
+        yield
+    finally:
+        if not isinstance(lock, SoftFileLock):
+            with contextlib.suppress(OSError):
+                path.unlink()  # before it is free: who locks the removed file notices that it is no longer there
+        lock.release()

@@ -7,11 +7,13 @@ import json
 import time
 from pathlib import Path
 
+from filelock import Timeout
+
 from calibration.rig_file import read_rig
 from disctrack.analyse.analysis import Analysis, analyse
 from disctrack.analyse.stage import run_analyse, write_analysis
 from disctrack.batch.columns import Row
-from disctrack.batch.locks import Busy, locked
+from disctrack.batch.locks import locked
 from disctrack.batch.numbers import analysed_numbers, diagnosed_numbers, friction_numbers, tracked_numbers
 from disctrack.batch.plan import Job
 from disctrack.batch.records import (
@@ -28,6 +30,7 @@ from disctrack.batch.repeats import group_of
 from disctrack.calibrate.stage import boards_in, calibrate_into, is_rig_of, source_of
 from disctrack.diagnosis.recorded import first_to_mend
 from disctrack.errors import AnalysisError, DiscTrackError, TrackingError, reason_of
+from disctrack.files.json_text import plain
 from disctrack.files.whole import write_whole
 from disctrack.findings import Kind, leading
 from disctrack.progress import recorded_times, timed
@@ -45,14 +48,14 @@ def do(job: Job) -> Record:
     """Do a job. Never raises an Exception: what went wrong is in the record, and in the recording's folder."""
     try:
         return make_rig(job) if job.kind == "rig" else make_recording(job)
-    except Busy:
+    except Timeout:
         return Record(BUSY)
     except Exception as error:
         return failed(reason_of(error))
 
 
 def make_rig(job: Job) -> Record:
-    """Calibrate into job.rig, unless the same was done before, here or by `disctrack run`. Raises Busy."""
+    """Calibrate into job.rig, unless the same was done before, here or by `disctrack run`. Raises Timeout."""
     path = Path(job.rig)
     with locked(path.with_name(LOCK), BUSY_FOR):
         source = source_of(read_recording(job.folder), job.options.calibration)
@@ -68,7 +71,7 @@ def make_rig(job: Job) -> Record:
 
 
 def make_recording(job: Job) -> Record:
-    """Track, analyse and, if asked for, diagnose; what is done already with the same inputs is kept. Raises Busy."""
+    """Track, analyse and, if asked for, diagnose; what is done already with the same inputs is kept. Raises Timeout."""
     results = Path(job.results)
     with locked(results / LOCK, BUSY_FOR):
         try:
@@ -100,19 +103,15 @@ def _make_recording(job: Job, results: Path) -> Record:
 
     with recorded_times() as times:
         trajectory, _, fresh = kept_or_made(path, provenance, measured, job.options.overwrite)
-        record = None if fresh else read_record(results)
-        if (
-            record is not None
-            and record.fingerprint == provenance.fingerprint
-            and is_done(results, record, job.options.stages)
-        ):
+        record = None if fresh else read_record(results)  # is_done: of this provenance, as the trajectory is
+        if record is not None and is_done(results, record, job.options.stages):
             return dataclasses.replace(record, status=SKIPPED)
         record = _after_tracking(results, path, trajectory, provenance, job)
     numbers = record.numbers | _origin(recording, provenance)
     numbers |= {"rig": job.rig, "seconds": round(time.perf_counter() - began, 3)}
     numbers |= {"processor_seconds": round(time.process_time() - used, 3)}
     numbers |= {f"processor_seconds_{t.stage}": t.processor_seconds for t in times}
-    record = dataclasses.replace(record, numbers=numbers)
+    record = dataclasses.replace(record, numbers=plain(numbers))
     write_record(results, record)
     return record
 

@@ -7,9 +7,11 @@ import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
+from filelock import Timeout
+
 from disctrack.batch.columns import COLUMNS, Row
 from disctrack.batch.find import FoundRecordings
-from disctrack.batch.locks import Busy, locked
+from disctrack.batch.locks import locked
 from disctrack.batch.plan import BatchOptions
 from disctrack.batch.records import MEASURED, NOT_MEASURED, SKIPPED, Record, is_done, read_record
 from disctrack.batch.repeats import REPEATS, repeats_of
@@ -94,7 +96,7 @@ def write_summary(
     try:
         with locked(found.common / ".summary.lock", wait):
             return _write_summary(found, rows_of(found, records), options)
-    except Busy as error:
+    except Timeout as error:
         raise OutputError(
             f"{found.common}: another process has been writing the summary for {wait:g} s. Make it anew with "
             "--summary-only."

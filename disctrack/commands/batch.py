@@ -2,6 +2,7 @@
 
 import argparse
 import sys
+from dataclasses import fields
 from pathlib import Path
 
 from disctrack.batch import BatchOptions, BatchOutcome, run_batch, summarise_batch
@@ -12,7 +13,7 @@ from disctrack.files.text import printable
 
 def run(arguments: argparse.Namespace) -> int:
     """Measure, say what became of each recording; returns the exit code."""
-    options = _options(arguments)
+    options = BatchOptions(**{field.name: getattr(arguments, field.name) for field in fields(BatchOptions)})
     if arguments.summary_only:
         outcome = summarise_batch(arguments.folders, options, arguments.output)
     else:
@@ -23,18 +24,6 @@ def run(arguments: argparse.Namespace) -> int:
     if outcome.interrupted:
         raise KeyboardInterrupt
     return FAILED if outcome.failed else INCOMPLETE if outcome.incomplete else DONE
-
-
-def _options(arguments: argparse.Namespace) -> BatchOptions:
-    return BatchOptions(
-        distortion=arguments.distortion,
-        board=arguments.board,
-        window=arguments.window,
-        report=not arguments.no_report,
-        diagnose=arguments.diagnose,
-        together=arguments.together,
-        overwrite=arguments.overwrite,
-    )
 
 
 def _tell_problems(outcome: BatchOutcome) -> None:

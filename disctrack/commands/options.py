@@ -169,7 +169,9 @@ def add_batch(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--shard", type=_shard, metavar="i/N", help="only every N-th recording, from the i-th (1...N)")
     parser.add_argument("--cluster", metavar="ADDRESS", help="scheduler of a dask cluster that does the work")
     parser.add_argument("--summary-only", action="store_true", help="measure nothing; sum up what there is")
-    parser.add_argument("--no-report", action="store_true", help="numbers only, no report and figures per recording")
+    parser.add_argument(
+        "--no-report", dest="report", action="store_false", help="numbers only, no report and figures per recording"
+    )
     parser.add_argument("--diagnose", action="store_true", help="also ask of each which effect the model lacks")
     parser.add_argument("--together", action="store_true", help="also ask it of all together: one answer for many")
     parser.add_argument("--overwrite", action="store_true", help="measure anew what is done already")

@@ -3,6 +3,7 @@
 import hashlib
 import io
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,6 @@ import h5py
 import numpy as np
 
 from calibration.kit.arguments import checked
-from calibration.kit.arrays import Array
 from calibration.kit.brief import Outline
 from disctrack.errors import SceneError
 from disctrack.files.inputs import keep, refuse_input
@@ -105,93 +105,66 @@ def summary(motion: Motion) -> str:
     return "\n".join(lines)
 
 
-def write_motion(path: Path, motion: Motion, attributes: dict[str, Any] | None = None) -> None:
+_ONE = {"": ""}
+_AT_ZERO = "potential energy, zero where the disc lies flat at the origin"
+_WORLD = {axis: axis for axis in "xyz"}
+_ANGLES = {"psi": "precession angle, not wrapped", "theta": "nutation angle", "phi": "spin angle, not wrapped"}
+_CONTACT_FRAME = {"n": "n0", "m": "m0", "z": "k"}
+_NODAL_FRAME = {"2": "e2, psidot sin(theta)", "3": "e3, psidot cos(theta) + phidot"}
+# Of arrays of a Motion: group, attribute, its first column, name, components with their words, unit, meaning. Component
+# and words stand in place of {}; a slip has no third
+_LAYOUT = (
+    ("", "q", 0, "{}", _WORLD, "m", "{} of the geometric centre, world frame"),
+    ("", "q", 3, "{}", _ANGLES, "rad", "{}"),
+    ("motion", "qdot", 0, "{}dot", _WORLD, "m/s", "rate of {}"),
+    ("motion", "qdot", 3, "{}dot", {name: name for name in _ANGLES}, "rad/s", "rate of {}"),
+    ("motion", "omega_world", 0, "omega_{}", _WORLD, "rad/s", "angular velocity along world {}"),
+    ("motion", "acceleration_world", 0, "acceleration_{}", _WORLD, "m/s^2", "of the centre along world {}"),
+    ("motion", "angular_acceleration_world", 0, "angular_acceleration_{}", _WORLD, "rad/s^2",
+     "rate of the angular velocity along world {}"),
+    ("motion", "state", 6, "omega{}", _NODAL_FRAME, "rad/s", "angular velocity along {}"),
+    ("energy", "energy_translation", 0, "translation", _ONE, "J", "kinetic energy of the centre of mass"),
+    ("energy", "energy_rotation", 0, "rotation", _ONE, "J", "kinetic energy about the centre of mass"),
+    ("energy", "energy_potential", 0, "potential", _ONE, "J", _AT_ZERO),
+    ("energy", "energy", 0, "total", _ONE, "J", "mechanical energy"),
+    ("energy", "power", 0, "power", _ONE, "W", "power of the contact and of external forces: rate of the total"),
+    ("contact", "contact_force", 0, "F_{}", _CONTACT_FRAME, "N", "contact force on the disc along {}"),
+    ("contact", "contact_moment", 0, "M_{}", _CONTACT_FRAME, "N m", "contact moment on the disc along {}"),
+    ("contact", "external_force", 0, "X_{}", _CONTACT_FRAME, "N", "external force at the centre along {}"),
+    ("contact", "slip_velocity", 0, "slip_{}", _CONTACT_FRAME, "m/s", "slip of the disc's contact point along {}"),
+)  # fmt: skip
+
+
+def write_motion(path: Path, motion: Motion, attributes: Mapping[str, Any]) -> None:
     """Write a motion as HDF5 that xarray and netCDF readers open: root, groups motion, energy, contact, effects."""
+    axes = {
+        "time": Variable(motion.time, ("time",), "s", "time"),
+        "quaternion_component": Variable(np.array(list("wxyz")), ("quaternion_component",), "1", "component"),
+    }
     buffer = io.BytesIO()
     with h5py.File(buffer, "w", track_order=True) as file:
-        axes = {
-            "time": Variable(motion.time, ("time",), "s", "time"),
-            "quaternion_component": Variable(np.array(list("wxyz")), ("quaternion_component",), "1", "component"),
-        }
-        write_variables(file, _root(motion), axes)
-        for name, variables in (("motion", _rates(motion)), ("energy", _energy(motion)), ("contact", _contact(motion))):
-            write_variables(file.create_group(name, track_order=True), variables)
+        for group, variables in _variables(motion).items():
+            write_variables(file.create_group(group, track_order=True) if group else file, variables, axes)
         _write_model(file, motion)
-        file.attrs.update(
-            {
-                "schema": SCHEMA,
-                "schema_version": SCHEMA_VERSION,
-                "software": "disctrack",
-                "software_version": __version__,
-                "end": motion.end.name,
-                "end_reason": motion.end.value,
-                "end_time_s": motion.end_time,
-                **_CONVENTIONS,
-                **(attributes or {}),
-            }
-        )
-        file.attrs["complete"] = 1
+        file.attrs.update(schema=SCHEMA, schema_version=SCHEMA_VERSION, software="disctrack")
+        file.attrs.update(software_version=__version__, end=motion.end.name, end_reason=motion.end.value)
+        file.attrs.update({"end_time_s": motion.end_time, **_CONVENTIONS, **attributes, "complete": 1})
     write_whole(path, buffer.getbuffer())
 
 
-_WORLD = {axis: axis for axis in "xyz"}
-_ANGLES = {angle: angle for angle in ("psi", "theta", "phi")}
-_CONTACT_FRAME = {"n": "n0", "m": "m0", "z": "k"}
-
-
-def _columns(name: str, values: Array, axes: dict[str, str], unit: str, text: str) -> dict[str, Variable]:
-    """A variable for each component of values (n, k), its axis in place of {} in the name, its words in the text."""
-    named = zip(axes.items(), values.T, strict=False)  # along n0 and m0 only, a slip has no third
-    return {name.format(axis): _series(column, unit, text.format(words)) for (axis, words), column in named}
-
-
-def _series(values: Array, unit: str, text: str) -> Variable:
-    return Variable(values, ("time",), unit, text)
-
-
-def _root(motion: Motion) -> dict[str, Variable]:
+def _variables(motion: Motion) -> dict[str, dict[str, Variable]]:
+    """By group, those of the layout, the orientation and the state of the contact."""
+    found: dict[str, dict[str, Variable]] = {group: {} for group, *_ in _LAYOUT}
+    for group, attribute, first, name, components, unit, meaning in _LAYOUT:
+        columns = getattr(motion, attribute).reshape(len(motion), -1).T[first:]
+        for (component, words), column in zip(components.items(), columns, strict=False):
+            told = meaning.format(words)
+            found[group][name.format(component)] = Variable(column, ("time",), unit, told)
     quaternion = continuous_quaternions(quaternion_from_rotation(rotation_from_euler(*motion.q[:, 3:].T)))
     dims = ("time", "quaternion_component")
-    return _columns("{}", motion.q[:, :3], _WORLD, "m", "{} of the geometric centre, world frame") | {
-        "psi": _series(motion.q[:, 3], "rad", "precession angle, not wrapped"),
-        "theta": _series(motion.q[:, 4], "rad", "nutation angle"),
-        "phi": _series(motion.q[:, 5], "rad", "spin angle, not wrapped"),
-        "quaternion": Variable(quaternion, dims, "1", "orientation, body to world, continuous"),
-    }
-
-
-def _rates(motion: Motion) -> dict[str, Variable]:
-    turn = "rate of the angular velocity along world {}"
-    return {
-        **_columns("{}dot", motion.qdot[:, :3], _WORLD, "m/s", "rate of {}"),
-        **_columns("{}dot", motion.qdot[:, 3:], _ANGLES, "rad/s", "rate of {}"),
-        **_columns("omega_{}", motion.omega_world, _WORLD, "rad/s", "angular velocity along world {}"),
-        **_columns("acceleration_{}", motion.acceleration_world, _WORLD, "m/s^2", "of the centre along world {}"),
-        **_columns("angular_acceleration_{}", motion.angular_acceleration_world, _WORLD, "rad/s^2", turn),
-        "omega2": _series(motion.state[:, 6], "rad/s", "angular velocity along e2, psidot sin(theta)"),
-        "omega3": _series(motion.state[:, 7], "rad/s", "angular velocity along e3, psidot cos(theta) + phidot"),
-    }
-
-
-def _energy(motion: Motion) -> dict[str, Variable]:
-    at_zero = "potential energy, zero where the disc lies flat at the origin"
-    return {
-        "translation": _series(motion.energy_translation, "J", "kinetic energy of the centre of mass"),
-        "rotation": _series(motion.energy_rotation, "J", "kinetic energy about the centre of mass"),
-        "potential": _series(motion.energy_potential, "J", at_zero),
-        "total": _series(motion.energy, "J", "mechanical energy"),
-        "power": _series(motion.power, "W", "power of the contact and of external forces: rate of the total"),
-    }
-
-
-def _contact(motion: Motion) -> dict[str, Variable]:
-    return {
-        **_columns("F_{}", motion.contact_force, _CONTACT_FRAME, "N", "contact force on the disc along {}"),
-        **_columns("M_{}", motion.contact_moment, _CONTACT_FRAME, "N m", "contact moment on the disc along {}"),
-        **_columns("X_{}", motion.external_force, _CONTACT_FRAME, "N", "external force at the centre along {}"),
-        **_columns("slip_{}", motion.slip_velocity, _CONTACT_FRAME, "m/s", "slip of the disc's contact point along {}"),
-        "regime": Variable(motion.regime, ("time",), "1", "state of the contact", flags(Regime)),
-    }
+    found[""]["quaternion"] = Variable(quaternion, dims, "1", "orientation, body to world, continuous")
+    found["contact"]["regime"] = Variable(motion.regime, ("time",), "1", "state of the contact", flags(Regime))
+    return found
 
 
 def _write_model(file: Any, motion: Motion) -> None:

@@ -14,12 +14,13 @@ from urllib.parse import unquote
 
 import numpy as np
 import pytest
+from filelock import Timeout
 from scipy import optimize, stats
 
 from disctrack.batch import locks
 from disctrack.batch.columns import COLUMNS, FITTED, copies
 from disctrack.batch.find import find_recordings
-from disctrack.batch.locks import Busy, locked
+from disctrack.batch.locks import locked
 from disctrack.batch.plan import BatchOptions, Job
 from disctrack.batch.pool import Cluster, Died, do_all
 from disctrack.batch.records import BUSY, FAILED, MEASURED, Record, failed
@@ -197,7 +198,7 @@ def test_reasons_are_one_line_and_say_what_to_do():
 
 
 def test_a_lock_keeps_others_out_and_leaves_nothing(tmp_path):
-    with locked(tmp_path / "lock"), pytest.raises(Busy), locked(tmp_path / "lock"):
+    with locked(tmp_path / "lock"), pytest.raises(Timeout), locked(tmp_path / "lock"):
         pass
     assert not (tmp_path / "lock").exists()
 
@@ -208,7 +209,7 @@ def test_a_disk_without_locks_is_locked_by_a_file_and_a_dead_holders_file_is_cle
 
     monkeypatch.setattr(fcntl, "flock", no_locks)
     path, holder = tmp_path / "lock", tmp_path / "lock.holder"
-    with locked(path), pytest.raises(Busy), locked(path):
+    with locked(path), pytest.raises(Timeout), locked(path):
         pass
     assert not holder.exists()
     host = os.uname().nodename
@@ -218,7 +219,7 @@ def test_a_disk_without_locks_is_locked_by_a_file_and_a_dead_holders_file_is_cle
     with locked(path, wait=5.0):
         assert holder.read_text().startswith(f"{os.getpid()}\n{host}\n")
     holder.write_text("1\nanother-host\n")  # who knows whether it lives
-    with pytest.raises(Busy), locked(path):
+    with pytest.raises(Timeout), locked(path):
         pass
     old = time.time() - locks.SILENT_FOR - 1
     os.utime(holder, (old, old))
