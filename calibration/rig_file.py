@@ -4,7 +4,7 @@ import contextlib
 import io
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from importlib import metadata
 from pathlib import Path
@@ -247,28 +247,25 @@ def write_rig_group(group: h5py.Group, rig: StereoRig) -> None:
     for name, camera in zip(CAMERA_NAMES, rig.cameras, strict=True):
         for (what, row), value in zip(_OF_CAMERA.items(), (camera.parameters, camera.image_size), strict=True):
             _put(group, f"{name}_{what}", value, row._replace(description=f"{name} camera: {row.description}"))
-    for name, row in _OF_RIG.items():
-        _put(group, name, getattr(rig, name), row)
-    group["covariance"].attrs["parameters"] = ", ".join(RIG_PARAMETERS)
-    for name, (values, row, attributes) in beyond_model(rig).items():
+    for name, (values, row, attributes) in beside_cameras(rig).items():
         _put(group, name, values, row)
         group[name].attrs.update(attributes)
 
 
-def beyond_model(rig: StereoRig) -> dict[str, tuple[Any, Dataset, dict[str, str]]]:
-    """What a rig may have beside cameras and places: by name of the dataset its values, what they are, attributes.
+def beside_cameras(rig: StereoRig) -> dict[str, tuple[Any, Dataset, dict[str, str]]]:
+    """What a rig has beside its cameras: by name of the dataset its values, what they are, attributes.
 
-    `read_beyond_model` reads it from any group.
+    `read_beside_cameras` reads it from any group.
     """
-    values: dict[str, Any] = {}
-    marks: dict[str, dict[str, str]] = {}
+    values: dict[str, Any] = {name: getattr(rig, name) for name in _OF_RIG}
+    marks = {"covariance": {"parameters": ", ".join(RIG_PARAMETERS)}}
     if rig.allowances:
         values["allowances"] = np.stack([a.shift for a in rig.allowances])
         causes, assumed = [a.cause for a in rig.allowances], [a.assumed for a in rig.allowances]
         marks["allowances"] = {"causes": json.dumps(causes), "assumed": json.dumps(assumed)}
     if rig.lens_field is not None:
         values |= {"lens_field": rig.lens_field.coefficients, "lens_field_spacing": rig.lens_field.spacing}
-    return {name: (value, _BEYOND_MODEL[name], marks.get(name, {})) for name, value in values.items()}
+    return {name: (value, (_OF_RIG | _BEYOND_MODEL)[name], marks.get(name, {})) for name, value in values.items()}
 
 
 def write_attributes(group: h5py.Group, document: Mapping[str, Any]) -> None:
@@ -369,9 +366,18 @@ def _get(group: h5py.Group, name: str, row: Dataset, sizes: Mapping[str, int] | 
 
 def read_rig_group(group: h5py.Group) -> StereoRig:
     """Inverse of `write_rig_group`. Raises RigFileError on content that is not a rig."""
+    return read_beside_cameras(
+        group, [[_get(group, f"{name}_{what}", row) for what, row in _OF_CAMERA.items()] for name in CAMERA_NAMES]
+    )
+
+
+def read_beside_cameras(group: h5py.Group, of_cameras: Iterable[Sequence[NDArray]]) -> StereoRig:
+    """A rig whose group has all that `beside_cameras` names; of_cameras : parameters and image size of each.
+
+    Raises RigFileError on content that is not a rig.
+    """
     cameras = []
-    for name in CAMERA_NAMES:
-        parameters, (width, height) = (_get(group, f"{name}_{what}", row) for what, row in _OF_CAMERA.items())
+    for name, (parameters, (width, height)) in zip(CAMERA_NAMES, of_cameras, strict=True):
         if not (0 < width < 10**6 and 0 < height < 10**6 and parameters[0] > 0 and parameters[1] > 0):
             raise RigFileError(f"{group.name}: {name} camera of {width} x {height} px, focal lengths {parameters[:2]}")
         cameras.append(Camera.from_parameters(parameters, (int(width), int(height))))
@@ -385,11 +391,11 @@ def read_rig_group(group: h5py.Group) -> StereoRig:
     if variance.min() < 0 or np.abs(correlation).max() > 1 + 1e-6 or not np.allclose(correlation, correlation.T):
         raise RigFileError(f"{group.name}/covariance is not a covariance")
     is_table = bool(group.attrs.get("world_is_table", 0))
-    return StereoRig(cameras[0], cameras[1], world_is_table=is_table, **values, **read_beyond_model(group))
+    return StereoRig(cameras[0], cameras[1], world_is_table=is_table, **values, **_beyond_model(group))
 
 
-def read_beyond_model(group: h5py.Group) -> dict[str, Any]:
-    """`lens_field` and `allowances` of a rig, as `beyond_model` names them. Raises RigFileError."""
+def _beyond_model(group: h5py.Group) -> dict[str, Any]:
+    """`lens_field` and `allowances` of a rig. Raises RigFileError."""
     values = {name: _get(group, name, row) for name, row in _BEYOND_MODEL.items() if name in group}
     field: LensField | None = None
     allowances: tuple[Allowance, ...] = ()

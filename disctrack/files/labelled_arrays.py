@@ -109,13 +109,14 @@ def read_variables(group: h5py.Group, names: Collection[str] | None = None) -> d
     Raises ValueError if a dataset claims to be larger than the file could hold.
     """
     return {
-        name: _read(item)
+        name: read_array(item)
         for name, item in group.items()
         if (names is None or name in names) and isinstance(item, h5py.Dataset)
     }
 
 
-def _read(dataset: h5py.Dataset) -> NDArray:
+def read_array(dataset: h5py.Dataset) -> NDArray:
+    """Text as str. Raises ValueError if the dataset claims to be larger than the file could hold."""
     if dataset.size * dataset.dtype.itemsize > MOST_COMPRESSION * dataset.file.id.get_filesize():
         raise ValueError(f"{dataset.name} claims {dataset.shape} values, more than the file can hold")
     return dataset.asstr()[()] if h5py.check_string_dtype(dataset.dtype) else dataset[()]

@@ -18,16 +18,16 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.cameras.camera import RIG_PARAMETERS, Camera, StereoRig
+from calibration.cameras.camera import RIG_PARAMETERS, StereoRig
 from calibration.kit.arguments import checked
 from calibration.kit.arrays import Mask
 from calibration.kit.brief import Outline
 from calibration.kit.seal import check_seal, sealed
-from calibration.rig_file import beyond_model, read_beyond_model, versions, write_attributes
+from calibration.rig_file import beside_cameras, read_beside_cameras, versions, write_attributes
 from disctrack.disc import Disc
 from disctrack.errors import TrajectoryFileError
 from disctrack.files.json_text import json_text
-from disctrack.files.labelled_arrays import Variable, copy_without, flags, read_variables, write_variables
+from disctrack.files.labelled_arrays import Variable, copy_without, flags, read_array, read_variables, write_variables
 from disctrack.files.software import software_version
 from disctrack.files.whole import refuse_existing, write_whole
 from disctrack.findings import Finding, finding_from_json, warn_of_doubts
@@ -255,62 +255,48 @@ def _versions() -> dict[str, str]:
     return {"python": platform.python_version(), **versions(_DEPENDENCIES)}
 
 
-# The file's layout. Of every array of a Trajectory: axes, unit and meaning
+# The file's layout. Of every array of a Trajectory: its place, axes, unit and meaning
 _POSE2 = ("time", "pose_component", "pose_component_2")
 _DOTS = ("time", "camera", "marker", "axis")
+_SPACE2 = ("space_axis", "space_axis_2")
 _MIXED = "m and rad: m2, m rad, rad2"
-_PARTIAL = "m or rad per unit of the parameter"
-_LAYOUT = {
-    "frame": (("time",), "1", "number of the frame in its sequence"),
-    "quaternion": (("time", "quaternion_component"), "1", "orientation, body to world, continuous"),
-    "pose_covariance": (_POSE2, _MIXED, "covariance of the pose, noise of this frame; calibration not included"),
+_LAYOUT: dict[str, tuple[str, tuple[str, ...], str, str]] = {
+    "frame": ("frame", ("time",), "1", "number of the frame in its sequence"),
+    "quaternion": ("quaternion", ("time", "quaternion_component"), "1", "orientation, body to world, continuous"),
+    "pose_covariance": ("pose_covariance", _POSE2, _MIXED,
+                        "covariance of the pose, noise of this frame; calibration not included"),
     "systematic_covariance": (
-        _POSE2,
-        _MIXED,
-        "covariance of the pose from what repeats or varies slowly beside the rig's own: dots' misfit beyond noise",
-    ),
-    "reprojection_rms_px": (("time", "camera"), "px", "root mean square of observed - projected dots"),
-    "reduced_chi_square": (("time",), "1", "squared residuals over their predicted variance"),
-    "frame_status": (("time",), "1", "why there is a pose, or none"),
-    "markers_px": (
-        _DOTS,
-        "px",
-        "image of the dot's centre (not the ellipse's), corrected by the lens field of the rig if it has one",
-    ),
-    "markers_covariance_px2": ((*_DOTS, "axis_2"), "px2", "covariance of centre_px"),
-    "markers_residual_px": (_DOTS, "px", "observed - projected"),
-    "marker_status": (_DOTS[:3], "1", "why a dot has a centre, or none"),
-    "calibration_sensitivity": (
-        ("time", "pose_component", "rig_parameter"),
-        _PARTIAL,
-        "d pose / d rig parameter at fixed pixels",
-    ),
-}
-# What is not at the root under its own name
-_PLACES = {
-    "frame_status": "status",
-    "markers_px": "markers/centre_px",
-    "markers_covariance_px2": "markers/centre_covariance_px2",
-    "markers_residual_px": "markers/residual_px",
-    "marker_status": "markers/status",
-    "calibration_sensitivity": "calibration/sensitivity",
-}
+        "systematic_covariance", _POSE2, _MIXED,
+        "covariance of the pose from what repeats or varies slowly beside the rig's own: dots' misfit beyond noise"),
+    "reprojection_rms_px": ("reprojection_rms_px", ("time", "camera"), "px",
+                            "root mean square of observed - projected dots"),
+    "reduced_chi_square": ("reduced_chi_square", ("time",), "1", "squared residuals over their predicted variance"),
+    "frame_status": ("status", ("time",), "1", "why there is a pose, or none"),
+    "markers_px": ("markers/centre_px", _DOTS, "px", "image of the dot's centre (not the ellipse's), corrected by the "
+                   "lens field of the rig if it has one"),
+    "markers_covariance_px2": ("markers/centre_covariance_px2", (*_DOTS, "axis_2"), "px2", "covariance of centre_px"),
+    "markers_residual_px": ("markers/residual_px", _DOTS, "px", "observed - projected"),
+    "marker_status": ("markers/status", _DOTS[:3], "1", "why a dot has a centre, or none"),
+    "calibration_sensitivity": ("calibration/sensitivity", ("time", "pose_component", "rig_parameter"),
+                                "m or rad per unit of the parameter", "d pose / d rig parameter at fixed pixels"),
+}  # fmt: skip
 _FLAGS: dict[str, Mapping[str, Any]] = {"frame_status": flags(FrameStatus), "marker_status": flags(MarkerStatus)}
-_CAMERA_LAYOUT = {
-    "camera_matrix": (("camera", "space_axis", "space_axis_2"), "px", "pinhole matrix K"),
+# Of the rig: cameras side by side, and axes of what is beside them
+_OF_CAMERAS = {
+    "camera_matrix": (("camera", *_SPACE2), "px", "pinhole matrix K"),
     "distortion": (("camera", "distortion_coefficient"), "1", "Brown distortion on normalised coordinates"),
     "image_size_px": (("camera", "axis"), "px", "width, height"),
 }
-_RIG_LAYOUT: dict[str, tuple[tuple[str, ...], str, str]] = {
-    "R_right_left": (("space_axis", "space_axis_2"), "1", "rotation, left camera axes to right camera axes"),
-    "t_right_left": (("space_axis",), "m", "points_right = R_right_left @ points_left + t"),
-    "R_left_world": (("space_axis", "space_axis_2"), "1", "rotation, world axes to left camera axes"),
-    "t_left_world": (("space_axis",), "m", "points_left = R_left_world @ points_world + t"),
-    "covariance": (
-        ("rig_parameter", "rig_parameter_2"), "px, m, rad and products",
-        "covariance of the rig's parameters; common to all frames",
-    ),
-}  # fmt: skip
+_RIG_AXES = {
+    "R_right_left": _SPACE2,
+    "t_right_left": _SPACE2[:1],
+    "R_left_world": _SPACE2,
+    "t_left_world": _SPACE2[:1],
+    "covariance": ("rig_parameter", "rig_parameter_2"),
+    "allowances": ("allowance", "rig_parameter"),
+    "lens_field": ("camera", "axis", "spline_y", "spline_x"),
+    "lens_field_spacing": (),
+}
 _COORDINATES = {
     "x": ("m", "position of the disc's centre along i"),
     "y": ("m", "position of the disc's centre along j"),
@@ -346,10 +332,10 @@ def _axes(trajectory: Trajectory) -> dict[str, Variable]:
 def _variables(trajectory: Trajectory, group: str = "") -> dict[str, Variable]:
     """Those of one group, or of the root, as the layout has them."""
     found = {}
-    for attribute, described in _LAYOUT.items():
-        home, _, name = _PLACES.get(attribute, attribute).rpartition("/")
+    for attribute, (place, dims, unit, told) in _LAYOUT.items():
+        home, _, name = place.rpartition("/")
         if home == group:
-            found[name] = Variable(getattr(trajectory, attribute), *described, _FLAGS.get(attribute, {}))
+            found[name] = Variable(getattr(trajectory, attribute), dims, unit, told, _FLAGS.get(attribute, {}))
     return found
 
 
@@ -382,13 +368,11 @@ def _write_rig(group: h5py.Group, trajectory: Trajectory) -> None:
     rig = trajectory.rig
     variables = {
         name: Variable([getattr(camera, name.removesuffix("_px")) for camera in rig.cameras], *described)
-        for name, described in _CAMERA_LAYOUT.items()
+        for name, described in _OF_CAMERAS.items()
     }
-    variables |= {name: Variable(getattr(rig, name), *described) for name, described in _RIG_LAYOUT.items()}
     write_variables(group, variables | _variables(trajectory, "calibration"))
-    axes = {"allowances": ("allowance", "rig_parameter"), "lens_field": ("camera", "axis", "spline_y", "spline_x")}
-    for name, (data, row, attributes) in beyond_model(rig).items():
-        dims = axes.get(name, ())
+    for name, (data, row, attributes) in beside_cameras(rig).items():
+        dims = _RIG_AXES[name]
         scales = {d: Variable(np.arange(n), (d,), "1", "index") for d, n in zip(dims, np.shape(data), strict=True)}
         write_variables(group, {name: Variable(data, dims, row.units, row.description, attributes)}, scales)
     group.attrs["world_is_table"] = np.uint8(rig.world_is_table)
@@ -424,15 +408,12 @@ def _reading(path: Path) -> Iterator[h5py.File]:
 
 def _trajectory(file: h5py.File) -> Trajectory:
     _check_units(file)
-    groups = {"": read_variables(file)}
-    groups |= {name: read_variables(file[name]) for name in ("markers", "calibration")}
-    root, disc = groups[""], _read_disc(file["disc"])
+    root, disc = read_variables(file), _read_disc(file["disc"])
     lengths = {name: len(values) for name, (values, _) in _NAMED_AXES.items()}
     lengths |= {"time": len(root["time"]), "marker": disc.n_markers}
     found = {}
-    for attribute, (dims, _, _) in _LAYOUT.items():
-        group, _, name = _PLACES.get(attribute, attribute).rpartition("/")
-        found[attribute] = groups[group][name]
+    for attribute, (place, dims, *_) in _LAYOUT.items():
+        found[attribute] = read_array(file[place])
         expected = tuple(lengths[axis] for axis in dims)
         if found[attribute].shape != expected:
             raise TrajectoryFileError(f"{attribute} has shape {found[attribute].shape}; expected {expected}")
@@ -441,7 +422,7 @@ def _trajectory(file: h5py.File) -> Trajectory:
         time=root["time"],
         q=np.column_stack([root[name] for name in COORDINATES]),
         disc=disc,
-        rig=_rig(file["calibration"], groups["calibration"]),
+        rig=_rig(file["calibration"]),
         frame_rate=float(file.attrs["frame_rate_hz"]),
         gravity=float(file.attrs["gravity_m_s2"]),
         air_density=float(file.attrs["air_density_kg_m3"]),
@@ -456,7 +437,7 @@ def _trajectory(file: h5py.File) -> Trajectory:
 def _check_units(file: h5py.File) -> None:
     """Raise ValueError where numbers are in other units than this program writes."""
     units = {name + ending: unit for name, (unit, _) in _COORDINATES.items() for ending in ("", "_sigma")}
-    units |= {_PLACES.get(attribute, attribute): unit for attribute, (_, unit, _) in _LAYOUT.items()} | {"time": "s"}
+    units |= {place: unit for place, _, unit, _ in _LAYOUT.values()} | {"time": "s"}
     for name, unit in units.items():
         found = str(file[name].attrs.get("units", unit)) if name in file else unit
         if found != unit:
@@ -468,15 +449,12 @@ def _read_disc(group: h5py.Group) -> Disc:
     return Disc(marker_centres_body=read_variables(group)["marker_centres_body"], **sizes)
 
 
-def _rig(group: h5py.Group, values: Mapping[str, NDArray]) -> StereoRig:
-    left, right = (
-        Camera.from_parameters(
-            np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], *distortion]), (int(size[0]), int(size[1]))
-        )
-        for K, distortion, size in zip(*(values[name] for name in _CAMERA_LAYOUT), strict=True)
+def _rig(group: h5py.Group) -> StereoRig:
+    matrices, *others = (read_array(group[name]) for name in _OF_CAMERAS)
+    focal_and_centre = matrices[:, [0, 1, 0, 1], [0, 1, 2, 2]]
+    return read_beside_cameras(
+        group, [(np.append(*pinhole), size) for *pinhole, size in zip(focal_and_centre, *others, strict=True)]
     )
-    placed: dict[str, Any] = {name: values[name] for name in _RIG_LAYOUT} | read_beyond_model(group)
-    return StereoRig(left, right, **placed, world_is_table=bool(group.attrs["world_is_table"]))
 
 
 _ROUNDED = 1e-3  # of a quaternion's length, by whoever wrote it with few digits
