@@ -8,7 +8,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,44 +17,15 @@ from calibration.board.search import VIEWS_TRIED, board_size
 from calibration.kit.arrays import evenly
 from calibration.rig_file import read_rig
 from disctrack.errors import DiscTrackError, OutputError, RecordingError
-from disctrack.files.toml_tree import read_toml, toml_value
+from disctrack.files.toml_tree import read_toml
 from disctrack.files.whole import write_whole
 from disctrack.first_look.sequences import CameraPair, Sequence, find_sequences, pair_cameras
-from disctrack.recording.declaration import FILE_NAME, KEYS
+from disctrack.recording.declaration import FILE_NAME
+from disctrack.recording.declaration_text import Told, declaration_text
 from disctrack.recording.readers import open_frames
 from disctrack.recording.readers.base import FrameReader
 from disctrack.recording.readers.decoding import decode
 from disctrack.recording.readers.files import match_files, split_member
-
-HEADINGS = {  # of the sections, in their order
-    "cameras": "frame i of the left and of the right must show the same instant",
-    "disc": "",
-    "markers": "round dots on the upper face, all of one size",
-    "calibration": "synchronised views of a flat chessboard",
-    "table": "the lab frame: k up from the table, which is z = 0",
-    "gravity": "",
-}
-ROWS = {  # of the keys that a declaration needs: what may stand there, remark
-    ("cameras", "frame_rate_hz"): ("1000.0", "frames per second of the cameras"),
-    ("cameras", "left"): ("", ""),
-    ("cameras", "right"): ("", ""),
-    ("disc", "radius_mm"): ("37.5", "caliper"),
-    ("disc", "thickness_mm"): ("6.0", "caliper, with the paper"),
-    ("disc", "mass_g"): ("209.69", "balance, with the paper"),
-    ("markers", "diameter_mm"): ("7.0", "as printed"),
-    ("markers", "centres_mm"): ("[[26.0, 0.0], [13.0, 22.5], [-13.0, 22.5]]", "[x, y] of dots from the disc's centre"),
-    ("calibration", "left"): ('"calibration/left/*.png"', "views of a chessboard, 15 to 40 of them"),
-    ("calibration", "right"): ('"calibration/right/*.png"', "the same views, in the same order"),
-    ("calibration", "inner_corners"): ("[9, 6]", "long side first; count them"),
-    ("calibration", "square_mm"): ("6.0", "side of a square, measured over many squares"),
-    ("table", "view"): ("0", "CHECK: in this view, counted from 0, the board lies flat on the table"),
-    ("table", "board_thickness_mm"): ("3.0", "height of the printed face above the table"),
-    ("gravity", "g_m_s2"): ("9.81", "9.78 (equator) to 9.83"),
-}
-# Sections whose keys with a default hold for another recording of the same disc and board
-ALIKE = ("disc", "calibration", "table")
-
-Told = dict[tuple[str, str], tuple[Any, str]]  # (section, key) -> value, None if not known; and a remark
 
 
 @dataclass(frozen=True)
@@ -82,7 +52,7 @@ def run_init(folder: Path, known: Mapping[str, float] | None = None, like: Path 
     example = {} if like is None else read_toml(like / FILE_NAME if like.is_dir() else like, RecordingError)
     told, notes = look_into(folder)
     given = {"gravity": {"g_m_s2": 9.81}} | example
-    text, missing = declaration(folder.resolve().name, told, known or {}, given)
+    text, missing = declaration_text(folder.resolve().name, told, known or {}, given)
     write_whole(file, text.encode())
     return WrittenDeclaration(file, told, tuple(notes), missing)
 
@@ -259,35 +229,3 @@ def _rig_beside(folder: Path) -> str | None:
                 continue
             return f"{shown}{file.name}"
     return None
-
-
-def declaration(
-    name: str, told: Told, known: Mapping[str, float], example: Mapping[str, Any]
-) -> tuple[str, tuple[str, ...]]:
-    """Text of the recording.toml, and the keys that nobody told."""
-    lines = [
-        "# Lengths in mm, masses in g, times in s. Every key: disctrack/docs/recording-toml.md",
-        f"name = {toml_value(name)}",
-    ]
-    missing = []
-    by_rig = {"calibration", "table"} if ("calibration", "rig") in told else set()  # what a rig file stands for
-    for section, heading in HEADINGS.items():
-        if section in by_rig - {"calibration"}:
-            continue
-        lines += ["", _aligned(f"[{section}]", heading)]
-        given = {} if section in by_rig else {**example.get(section, {}), **known}
-        for key in KEYS[section]:
-            needed = (section, key) in ROWS
-            shown, remark = ROWS.get((section, key), ("", ""))
-            alike = needed or (section in ALIKE and key != "rig") or key == "exposure_us"
-            value, source = told.get((section, key), (given.get(key) if alike else None, ""))
-            if value is not None:
-                lines.append(_aligned(f"{key} = {toml_value(value)}", source or remark))
-            elif needed and section not in by_rig:
-                missing.append(f"[{section}] {key}")
-                lines.append(_aligned(f"# {key} = {shown}", f"FILL IN: {remark}"))
-    return "\n".join(lines) + "\n", tuple(missing)
-
-
-def _aligned(text: str, remark: str) -> str:
-    return f"{text:<31} # {remark}" if remark else text

@@ -4,9 +4,10 @@ import shutil
 import tempfile
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -16,7 +17,7 @@ from calibration.kit.arguments import checked
 from calibration.kit.arrays import Array, Array32, Image
 from disctrack.disc import AIR_DENSITY, Disc
 from disctrack.errors import OutputError
-from disctrack.files.toml_tree import toml_value
+from disctrack.recording.declaration_text import declaration_text
 from disctrack.synthetic.cameras import board_poses, rig_after_faults, rig_of
 from disctrack.synthetic.description import ImperfectionSettings, Scene, load_scene
 from disctrack.synthetic.images import Stage, expected_board_image, expected_disc_image, stages
@@ -180,58 +181,26 @@ def _write_all(jobs: list[Job], scene: Scene, progress: Progress | None) -> None
                 progress(done, len(jobs))
 
 
-def _exact(length_mm: float) -> str:
-    """With four decimals where these are all; as declared, the disc is exact."""
-    short = f"{length_mm:.4f}"
-    return short if float(short) == length_mm else toml_value(length_mm)
-
-
 def recording_toml(scene: Scene) -> str:
     """What the experimenter declares: nothing of the scene's faults.
 
     A scene without imperfections is exact, and says so; with them, the tolerances are the usual ones.
     """
-    disc: Disc = scene.declared_disc
-    centres = ", ".join(f"[{_exact(x)}, {_exact(y)}]" for x, y in scene.markers.centres_mm)
     board, cameras = scene.board, scene.cameras
-    text = f"""\
-# A recording of a disc rolling on a table. Lengths in mm, masses in g, times in s.
-name = {toml_value(scene.name)}
-
-[cameras]                       # two synchronised cameras; frame i of the left and of the right belong together
-frame_rate_hz = {cameras.frame_rate_hz!r}
-left = "left/*.png"             # {cameras.image_size[0]} x {cameras.image_size[1]}, {cameras.bit_depth} bit
-right = "right/*.png"
-
-[disc]                          # a homogeneous steel disc with a sharp edge
-radius_mm = {scene.disc.radius_mm!r}
-thickness_mm = {scene.disc.thickness_mm!r}
-mass_g = {scene.disc.mass_g!r}
-radius_tolerance_mm = 0.0       # here, what is declared is exact
-thickness_tolerance_mm = 0.0
-
-[markers]                       # black dots on the white paper of the disc's upper face (z = +h)
-diameter_mm = {scene.markers.diameter_mm!r}
-centres_mm = [{centres}]        # {disc.n_markers} dots, body frame: origin at the disc's centre
-
-[calibration]                   # synchronised views of a flat chessboard
-left = "calibration/left/*.png"
-right = "calibration/right/*.png"
-inner_corners = [{board.inner_corners[0]}, {board.inner_corners[1]}]  # along the long side, along the short side
-square_mm = {board.square_mm!r}
-square_tolerance_mm = 0.0
-flatness_tolerance_mm = 0.0
-
-[table]                         # the lab frame: k up from the table, which is z = 0
-view = 0                        # in this calibration view the board lies flat on the table
-board_thickness_mm = {board.thickness_mm!r}        # its printed face is at that height
-board_thickness_tolerance_mm = 0.0
-
-[gravity]
-g_m_s2 = {scene.gravity_m_s2!r}
-"""
-    if scene.air_density_kg_m3 != AIR_DENSITY:
-        text += f"\n[air]\ndensity_kg_m3 = {scene.air_density_kg_m3!r}\n"
+    views = {"left": "calibration/left/*.png", "right": "calibration/right/*.png"}
+    declared: dict[str, dict[str, Any]] = {
+        "cameras": {"frame_rate_hz": cameras.frame_rate_hz, "left": "left/*.png", "right": "right/*.png"},
+        "disc": asdict(scene.disc),
+        "markers": asdict(scene.markers),
+        "calibration": {**views, "inner_corners": board.inner_corners, "square_mm": board.square_mm},
+        "table": {"board_thickness_mm": board.thickness_mm},
+        "gravity": {"g_m_s2": scene.gravity_m_s2},
+        "air": {} if scene.air_density_kg_m3 == AIR_DENSITY else {"density_kg_m3": scene.air_density_kg_m3},
+    }
     if scene.imperfections == ImperfectionSettings():
-        return text
-    return "".join(line for line in text.splitlines(keepends=True) if "_tolerance_" not in line)
+        declared["disc"] |= {"radius_tolerance_mm": 0.0, "thickness_tolerance_mm": 0.0}
+        declared["calibration"] |= {"square_tolerance_mm": 0.0, "flatness_tolerance_mm": 0.0}
+        declared["table"] |= {"board_thickness_tolerance_mm": 0.0}
+    told = {(section, key): (value, "") for section, values in declared.items() for key, value in values.items()}
+    told["table", "view"] = 0, "in this view, counted from 0, the board lies flat on the table"
+    return declaration_text(scene.name, told, {}, {})[0]
