@@ -11,7 +11,7 @@ import numpy as np
 from disctrack.analyse.analysis import Analysis
 from disctrack.analyse.power_laws import MODEL_EXPONENTS, Exponent, PowerLaws
 from disctrack.analyse.propagation import DerivedSeries
-from disctrack.analyse.published import SURFACES, agreement, published_table
+from disctrack.analyse.published import SURFACES, agreement, exponents_of, published_table
 from disctrack.findings import Finding
 from disctrack.numbers import Measured, measured, probability, unit_text
 from disctrack.report.blocks import Cell, Figures, Listing, Report, Section, Text
@@ -204,12 +204,17 @@ def _windows_table(fits: Sequence[PowerLaws]) -> Listing:
 def _published_tables() -> list[Listing]:
     tables = []
     for surface in SURFACES:
-        printed = published_table(surface)
-        columns = zip(printed.cases, printed.trials, printed.exponents, printed.t_f, strict=True)
-        rows = [(case, str(trial), *(f"{e:.4f}" for e in n), f"{t_f:.3f}") for case, trial, n, t_f in columns]
-        rows.append(("mean, recomputed", "", *(f"{e:.4f}" for e in printed.average), ""))
-        rows.append(("mean, as printed", "", *(f"{e:.4f}" for e in printed.printed_average), ""))
-        against = zip(*agreement(printed), strict=True)
+        trials, printed = published_table(surface)
+        exponents = exponents_of(trials)
+        shown = [[f"{e:.4f}" for e in n] for n in (*exponents, exponents.mean(axis=0), exponents_of(printed))]
+        heads = [
+            *((row["case"], str(row["trial"])) for row in trials),
+            ("mean, recomputed", ""),
+            ("mean, as printed", ""),
+        ]
+        t_f = [*(f"{row['t_f']:.3f}" for row in trials), "", ""]
+        rows = [(*head, *n, at) for head, n, at in zip(heads, shown, t_f, strict=True)]
+        against = zip(*agreement(exponents), strict=True)
         rows.append(
             ("Student's t against 2/3, 2/3, -1/3", "", *(f"{t:.1f} (p {probability(p)})" for t, p in against), "")
         )

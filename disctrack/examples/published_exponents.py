@@ -21,7 +21,7 @@ import numpy as np
 from scipy import stats
 
 from calibration.kit.arrays import Array
-from disctrack.analyse.published import EXPONENTS, PREDICTED, published_table
+from disctrack.analyse.published import EXPONENTS, PREDICTED, exponents_of, published_table
 from disctrack.diagnosis.motion import motion_candidates
 from disctrack.disc import MA_2014
 from disctrack.discrepancy.fit import Fit
@@ -60,7 +60,8 @@ def published_series() -> tuple[Series, ...]:
     found = []
     for surface, (k_m, longest) in TRIALS.items():
         start = (k_m * LAST_STAGE) ** (2 / 3) * 4 * GRAVITY / MA_2014.radius ** (5 / 3)
-        series = Series(surface, k_m, longest, float(start), exponents=published_table(surface).exponents)
+        exponents = exponents_of(published_table(surface)[0])
+        series = Series(surface, k_m, longest, float(start), exponents=exponents)
         stage = LastStage(series, {"km.k_m": k_m}, SPIN_AT_REST)
         found.append(replace(series, ln_duration=float(np.log(stage.duration))))
     return tuple(found)

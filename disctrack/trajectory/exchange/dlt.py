@@ -9,8 +9,8 @@ without a lens, so xypts.csv holds points without the lens' distortion. Both cou
 from collections.abc import Sequence
 from pathlib import Path
 
+import cv2
 import numpy as np
-from scipy.linalg import rq
 
 from calibration.cameras.camera import StereoRig, normalise
 from calibration.kit.arrays import Array
@@ -53,12 +53,9 @@ def read_dlt(
     parts = []
     for number, column in enumerate(L.T, start=1):
         P = np.linalg.inv(FROM_ONE) @ np.append(column, 1.0).reshape(3, 4)
-        K, R = rq(P[:, :3])
-        signs = np.diag(np.sign(np.diag(K)))
-        K, R = K @ signs, signs @ R
-        if np.linalg.det(R) < 0:  # P is known up to its sign
-            R, P = -R, -P
-        t = np.linalg.solve(K, P[:, 3]) * unit
+        P *= np.sign(np.linalg.det(P[:, :3]))  # it is known up to its sign
+        K, R, (*centre, scale) = cv2.decomposeProjectionMatrix(P)[:3]
+        t = -R @ np.ravel(centre) / scale * unit
         parts.append((camera_of(K / K[2, 2], np.zeros(0), np.array(image_size), f"{path}, camera {number}"), R, t))
     return rig_of(parts, world_is_table)
 

@@ -22,8 +22,11 @@ from disctrack.errors import RigFileError
 from disctrack.files.whole import write_whole
 from disctrack.frames import COORDINATES
 from disctrack.trajectory import FrameStatus, Trajectory
-from disctrack.trajectory.exchange.rig_parts import array_of, stereo_rig, the_one
+from disctrack.trajectory.exchange.rig_parts import array_of, opencv_numbers, stereo_rig, the_one
 from disctrack.trajectory.file import labelled
+
+_NAMES = [f"{what}{number}" for number in (1, 2) for what in ("intrinsicMatrix", "distortionCoefficients")]
+_NAMES += ["rotationOfCamera2", "translationOfCamera2"]
 
 
 def write_mat(path: Path, trajectory: Trajectory) -> None:
@@ -51,13 +54,8 @@ def write_mat(path: Path, trajectory: Trajectory) -> None:
 
 def write_stereo_parameters(path: Path, rig: StereoRig) -> None:
     """Arguments of stereoParametersFromOpenCV in metres; the world frame beside them. Raises OutputError."""
-    content: dict[str, Any] = {"worldUnits": "m", "imageSize": np.array(rig.left.image_size[::-1], float)[None]}
-    for number, camera in enumerate(rig.cameras, start=1):
-        content[f"intrinsicMatrix{number}"] = camera.camera_matrix
-        content[f"distortionCoefficients{number}"] = np.array([camera.distortion])
-    content |= {"rotationOfCamera2": rig.R_right_left, "translationOfCamera2": rig.t_right_left}
-    content |= {"R_left_world": rig.R_left_world, "t_left_world": rig.t_left_world}
-    _save(path, content | {"world_is_table": rig.world_is_table})
+    size = np.array(rig.left.image_size[::-1], float)[None]
+    _save(path, {"worldUnits": "m", "imageSize": size} | opencv_numbers(rig, _NAMES))
 
 
 def read_stereo_parameters(
@@ -84,9 +82,7 @@ def read_stereo_parameters(
     if scale is None:
         raise RigFileError(f"{path}: does not say in which unit translationOfCamera2 is; give it (0.001 for mm)")
     size = array_of(found, "imageSize", (2,), str(path))[::-1]
-    names = [f"{what}{number}" for number in (1, 2) for what in ("intrinsicMatrix", "distortionCoefficients")]
-    names += ["rotationOfCamera2", "translationOfCamera2"]
-    return stereo_rig(found, names, (size, size), scale, world_is_table, str(path))
+    return stereo_rig(found, _NAMES, (size, size), scale, world_is_table, str(path))
 
 
 def _save(path: Path, content: Mapping[str, Any]) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from calibration.cameras.camera import StereoRig
 from disctrack.errors import OutputError, RigFileError
 from disctrack.files.whole import whole_file
-from disctrack.trajectory.exchange.rig_parts import content_of, stereo_rig
+from disctrack.trajectory.exchange.rig_parts import content_of, opencv_numbers, stereo_rig
 
 _NAMES = ("M1", "D1", "M2", "D2", "R", "T")
 _MORE = ("image_size1", "image_size2", "R_left_world", "t_left_world")
@@ -26,15 +26,9 @@ def write_opencv(path: Path, rig: StereoRig) -> None:
         if not storage.isOpened():
             raise OutputError(f"{path}: the rig cannot be written there")
         storage.write("unit", "m")
-        for number, camera in enumerate(rig.cameras, start=1):
-            storage.write(f"M{number}", camera.camera_matrix)
-            storage.write(f"D{number}", np.array([camera.distortion]))
-            storage.write(f"image_size{number}", np.array([camera.image_size], dtype=np.int32))
-        storage.write("R", rig.R_right_left)
-        storage.write("T", rig.t_right_left[:, None])
-        storage.write("R_left_world", rig.R_left_world)
-        storage.write("t_left_world", rig.t_left_world[:, None])
-        storage.write("world_is_table", int(rig.world_is_table))
+        sizes = {f"image_size{c}": np.array([camera.image_size], np.int32) for c, camera in enumerate(rig.cameras, 1)}
+        for name, number in (opencv_numbers(rig, _NAMES) | sizes).items():
+            storage.write(name, number)
         storage.release()
 
 

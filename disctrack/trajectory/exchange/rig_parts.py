@@ -60,6 +60,14 @@ def stereo_rig(
     )
 
 
+def opencv_numbers(rig: StereoRig, names: Sequence[str]) -> dict[str, Any]:
+    """The inverse of `stereo_rig`, in metres: the world beside what stands under `names`."""
+    of_cameras = [number for camera in rig.cameras for number in (camera.camera_matrix, np.array([camera.distortion]))]
+    numbers = dict(zip(names, (*of_cameras, rig.R_right_left, rig.t_right_left[:, None]), strict=True))
+    world = {"R_left_world": rig.R_left_world, "t_left_world": rig.t_left_world[:, None]}
+    return numbers | world | {"world_is_table": int(rig.world_is_table)}
+
+
 def camera_of(K: Array, D: Array, size: Array, where: str) -> Camera:
     """From another program's camera matrix, up to 14 lens terms of OpenCV's order, and image size (width, height).
 
