@@ -276,7 +276,7 @@ _LAYOUT: dict[str, tuple[str, tuple[str, ...], str, str]] = {
                    "lens field of the rig if it has one"),
     "markers_covariance_px2": ("markers/centre_covariance_px2", (*_DOTS, "axis_2"), "px2", "covariance of centre_px"),
     "markers_residual_px": ("markers/residual_px", _DOTS, "px", "observed - projected"),
-    "marker_status": ("markers/status", _DOTS[:3], "1", "why a dot has a centre, or none"),
+    "marker_status": ("markers/status", ("time", "camera", "marker"), "1", "why a dot has a centre, or none"),
     "calibration_sensitivity": ("calibration/sensitivity", ("time", "pose_component", "rig_parameter"),
                                 "m or rad per unit of the parameter", "d pose / d rig parameter at fixed pixels"),
 }  # fmt: skip
@@ -289,9 +289,9 @@ _OF_CAMERAS = {
 }
 _RIG_AXES = {
     "R_right_left": _SPACE2,
-    "t_right_left": _SPACE2[:1],
+    "t_right_left": ("space_axis",),
     "R_left_world": _SPACE2,
-    "t_left_world": _SPACE2[:1],
+    "t_left_world": ("space_axis",),
     "covariance": ("rig_parameter", "rig_parameter_2"),
     "allowances": ("allowance", "rig_parameter"),
     "lens_field": ("camera", "axis", "spline_y", "spline_x"),
