@@ -60,8 +60,7 @@ def published_series() -> tuple[Series, ...]:
     found = []
     for surface, (k_m, longest) in TRIALS.items():
         start = (k_m * LAST_STAGE) ** (2 / 3) * 4 * GRAVITY / MA_2014.radius ** (5 / 3)
-        exponents = exponents_of(published_table(surface)[0])
-        series = Series(surface, k_m, longest, float(start), exponents=exponents)
+        series = Series(surface, k_m, longest, float(start), exponents=exponents_of(published_table(surface)[0]))
         stage = LastStage(series, {"km.k_m": k_m}, SPIN_AT_REST)
         found.append(replace(series, ln_duration=float(np.log(stage.duration))))
     return tuple(found)

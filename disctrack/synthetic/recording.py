@@ -7,7 +7,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -188,7 +187,7 @@ def recording_toml(scene: Scene) -> str:
     """
     board, cameras = scene.board, scene.cameras
     views = {"left": "calibration/left/*.png", "right": "calibration/right/*.png"}
-    declared: dict[str, dict[str, Any]] = {
+    declared: dict[str, dict[str, object]] = {
         "cameras": {"frame_rate_hz": cameras.frame_rate_hz, "left": "left/*.png", "right": "right/*.png"},
         "disc": asdict(scene.disc),
         "markers": asdict(scene.markers),

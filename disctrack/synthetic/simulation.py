@@ -6,7 +6,6 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
@@ -109,33 +108,11 @@ _ONE = {"": ""}
 _AT_ZERO = "potential energy, zero where the disc lies flat at the origin"
 _WORLD = {axis: axis for axis in "xyz"}
 _ANGLES = {"psi": "precession angle, not wrapped", "theta": "nutation angle", "phi": "spin angle, not wrapped"}
-_CONTACT_FRAME = {"n": "n0", "m": "m0", "z": "k"}
+_TABLE = {"n": "n0", "m": "m0", "z": "k"}
 _NODAL_FRAME = {"2": "e2, psidot sin(theta)", "3": "e3, psidot cos(theta) + phidot"}
-# Of arrays of a Motion: group, attribute, its first column, name, components with their words, unit, meaning. Component
-# and words stand in place of {}; a slip has no third
-_LAYOUT = (
-    ("", "q", 0, "{}", _WORLD, "m", "{} of the geometric centre, world frame"),
-    ("", "q", 3, "{}", _ANGLES, "rad", "{}"),
-    ("motion", "qdot", 0, "{}dot", _WORLD, "m/s", "rate of {}"),
-    ("motion", "qdot", 3, "{}dot", {name: name for name in _ANGLES}, "rad/s", "rate of {}"),
-    ("motion", "omega_world", 0, "omega_{}", _WORLD, "rad/s", "angular velocity along world {}"),
-    ("motion", "acceleration_world", 0, "acceleration_{}", _WORLD, "m/s^2", "of the centre along world {}"),
-    ("motion", "angular_acceleration_world", 0, "angular_acceleration_{}", _WORLD, "rad/s^2",
-     "rate of the angular velocity along world {}"),
-    ("motion", "state", 6, "omega{}", _NODAL_FRAME, "rad/s", "angular velocity along {}"),
-    ("energy", "energy_translation", 0, "translation", _ONE, "J", "kinetic energy of the centre of mass"),
-    ("energy", "energy_rotation", 0, "rotation", _ONE, "J", "kinetic energy about the centre of mass"),
-    ("energy", "energy_potential", 0, "potential", _ONE, "J", _AT_ZERO),
-    ("energy", "energy", 0, "total", _ONE, "J", "mechanical energy"),
-    ("energy", "power", 0, "power", _ONE, "W", "power of the contact and of external forces: rate of the total"),
-    ("contact", "contact_force", 0, "F_{}", _CONTACT_FRAME, "N", "contact force on the disc along {}"),
-    ("contact", "contact_moment", 0, "M_{}", _CONTACT_FRAME, "N m", "contact moment on the disc along {}"),
-    ("contact", "external_force", 0, "X_{}", _CONTACT_FRAME, "N", "external force at the centre along {}"),
-    ("contact", "slip_velocity", 0, "slip_{}", _CONTACT_FRAME, "m/s", "slip of the disc's contact point along {}"),
-)  # fmt: skip
 
 
-def write_motion(path: Path, motion: Motion, attributes: Mapping[str, Any]) -> None:
+def write_motion(path: Path, motion: Motion, attributes: Mapping[str, str]) -> None:
     """Write a motion as HDF5 that xarray and netCDF readers open: root, groups motion, energy, contact, effects."""
     axes = {
         "time": Variable(motion.time, ("time",), "s", "time"),
@@ -153,11 +130,32 @@ def write_motion(path: Path, motion: Motion, attributes: Mapping[str, Any]) -> N
 
 
 def _variables(motion: Motion) -> dict[str, dict[str, Variable]]:
-    """By group, those of the layout, the orientation and the state of the contact."""
-    found: dict[str, dict[str, Variable]] = {group: {} for group, *_ in _LAYOUT}
-    for group, attribute, first, name, components, unit, meaning in _LAYOUT:
-        columns = getattr(motion, attribute).reshape(len(motion), -1).T[first:]
-        for (component, words), column in zip(components.items(), columns, strict=False):
+    """By group, as datasets of the file."""
+    # group, values, name, components with their words, unit, meaning; component and words stand in place of {}
+    layout = (
+        ("", motion.q[:, :3], "{}", _WORLD, "m", "{} of the geometric centre, world frame"),
+        ("", motion.q[:, 3:], "{}", _ANGLES, "rad", "{}"),
+        ("motion", motion.qdot[:, :3], "{}dot", _WORLD, "m/s", "rate of {}"),
+        ("motion", motion.qdot[:, 3:], "{}dot", {name: name for name in _ANGLES}, "rad/s", "rate of {}"),
+        ("motion", motion.omega_world, "omega_{}", _WORLD, "rad/s", "angular velocity along world {}"),
+        ("motion", motion.acceleration_world, "acceleration_{}", _WORLD, "m/s^2", "of the centre along world {}"),
+        ("motion", motion.angular_acceleration_world, "angular_acceleration_{}", _WORLD, "rad/s^2",
+         "rate of the angular velocity along world {}"),
+        ("motion", motion.state[:, 6:8], "omega{}", _NODAL_FRAME, "rad/s", "angular velocity along {}"),
+        ("energy", motion.energy_translation, "translation", _ONE, "J", "kinetic energy of the centre of mass"),
+        ("energy", motion.energy_rotation, "rotation", _ONE, "J", "kinetic energy about the centre of mass"),
+        ("energy", motion.energy_potential, "potential", _ONE, "J", _AT_ZERO),
+        ("energy", motion.energy, "total", _ONE, "J", "mechanical energy"),
+        ("energy", motion.power, "power", _ONE, "W", "power of the contact and of external forces: rate of the total"),
+        ("contact", motion.contact_force, "F_{}", _TABLE, "N", "contact force on the disc along {}"),
+        ("contact", motion.contact_moment, "M_{}", _TABLE, "N m", "contact moment on the disc along {}"),
+        ("contact", motion.external_force, "X_{}", _TABLE, "N", "external force at the centre along {}"),
+        ("contact", motion.slip_velocity, "slip_{}", _TABLE, "m/s", "slip of the disc's contact point along {}"),
+    )  # fmt: skip
+    found: dict[str, dict[str, Variable]] = {group: {} for group, *_ in layout}
+    for group, values, name, components, unit, meaning in layout:
+        columns = values.reshape(len(motion), -1).T
+        for (component, words), column in zip(components.items(), columns, strict=False):  # a slip has no third
             told = meaning.format(words)
             found[group][name.format(component)] = Variable(column, ("time",), unit, told)
     quaternion = continuous_quaternions(quaternion_from_rotation(rotation_from_euler(*motion.q[:, 3:].T)))
@@ -167,7 +165,7 @@ def _variables(motion: Motion) -> dict[str, dict[str, Variable]]:
     return found
 
 
-def _write_model(file: Any, motion: Motion) -> None:
+def _write_model(file: h5py.File, motion: Motion) -> None:
     group = file.create_group("model", track_order=True)
     disc, model = motion.model.disc, motion.model
     group.attrs.update(
