@@ -12,6 +12,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from tests.oracles import newton_euler
 
@@ -321,8 +322,8 @@ def motion(plan):
 
 
 def pose_of(q):
-    """(R, t) of the disc."""
-    return newton_euler.matrix_of(newton_euler.quaternion_from_angles(*q[3:])), q[:3]
+    """R (..., 3, 3), t (..., 3) of the disc at q (..., 6)."""
+    return Rotation.from_euler("ZXZ", q[..., 3:]).as_matrix(), q[..., :3]
 
 
 def poses_during(spline, time, exposure):
@@ -331,11 +332,8 @@ def poses_during(spline, time, exposure):
     return [(*pose_of(spline(time + 0.5 * exposure * x)), weight) for x, weight in nodes]
 
 
-def write(folder, plan, board_image=board_image, disc_image=disc_image):
-    """A recording's folder, with truth.npz beside recording.toml. Returns the folder.
-
-    board_image, disc_image : what draws a view and a frame
-    """
+def write(folder, plan):
+    """A recording's folder, with truth.npz beside recording.toml. Returns the folder."""
     folder, rng = Path(folder), np.random.default_rng([plan.seed, 7])
     cameras, target = cameras_of(plan, rng)
     both = {"left": cameras[0], "right": cameras[1]}

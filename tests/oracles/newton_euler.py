@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicHermiteSpline, make_interp_spline
 from scipy.optimize import brentq
+from scipy.spatial.transform import Rotation
 
 K = np.array([0.0, 0.0, 1.0])
 K_M = 0.381e-7  # the paper's friction
@@ -55,26 +56,8 @@ class Disc:
         return self
 
 
-def matrix_of(quaternion):
-    w, x, y, z = quaternion / np.linalg.norm(quaternion)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-
-
 def cross_matrix(v):
     return np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
-
-
-def quaternion_from_angles(psi, theta, phi):
-    """Product of the three half-angle quaternions of Rz(psi) Rx(theta) Rz(phi)."""
-    c, s = np.cos(theta / 2), np.sin(theta / 2)
-    plus, minus = (psi + phi) / 2, (psi - phi) / 2
-    return np.array([c * np.cos(plus), s * np.cos(minus), s * np.sin(minus), c * np.sin(plus)])
 
 
 class Instant:
@@ -82,7 +65,7 @@ class Instant:
 
     def __init__(self, disc, state):
         self.O, self.v, self.omega, self.phi = state[:3], state[7:10], state[10:13], state[14]
-        self.R = matrix_of(state[3:7])
+        self.R = Rotation.from_quat(state[3:7], scalar_first=True).as_matrix()
         d = self.R[:, 2]
         d_rate = np.cross(self.omega, d)
         up = K - d[2] * d  # towards the highest point of the face, length sin(theta)
@@ -189,11 +172,12 @@ def accelerations(disc, state, regime):
 
 def state_from_angles(disc, x, y, psi, theta, phi, thetadot, omega2, omega3, velocity=None):
     """State of a disc in contact; rolling unless the horizontal velocity of O is given."""
-    R = matrix_of(quaternion_from_angles(psi, theta, phi))
+    attitude = Rotation.from_euler("ZXZ", [psi, theta, phi])
+    R = attitude.as_matrix()
     e1 = np.array([np.cos(psi), np.sin(psi), 0])
     omega = thetadot * e1 + omega2 * np.cross(R[:, 2], e1) + omega3 * R[:, 2]
     state = np.zeros(15)
-    state[3:7], state[10:13], state[13], state[14] = quaternion_from_angles(psi, theta, phi), omega, psi, phi
+    state[3:7], state[10:13], state[13], state[14] = attitude.as_quat(scalar_first=True), omega, psi, phi
     now = Instant(disc, state)
     state[:3] = x, y, -now.arm[2]
     if disc.bowl is not None:  # lowered until the rim touches
@@ -219,11 +203,8 @@ def state_from_angles(disc, x, y, psi, theta, phi, thetadot, omega2, omega3, vel
 
 def rate(disc, state, regime):
     a, omegadot, _, now = accelerations(disc, state, regime)
-    w, x, y, z = state[3:7]
-    ox, oy, oz = now.omega
-    spin = 0.5 * np.array(
-        [-ox * x - oy * y - oz * z, ox * w + oy * z - oz * y, oy * w + oz * x - ox * z, oz * w + ox * y - oy * x]
-    )
+    w, v = state[3], state[4:7]  # of the quaternion
+    spin = 0.5 * np.array([-now.omega @ v, *(w * now.omega + np.cross(now.omega, v))])
     return np.concatenate([now.v, spin, a, omegadot, [now.psidot, now.phidot]])
 
 

@@ -59,17 +59,12 @@ def recorded(plan):
     body[:, :2] += plan.imperfections.misprint * rng.normal(size=laboratory.DOTS.shape)
     px = 0.0
     for node, weight in laboratory.GAUSS:
-        R, t = poses_of(spline(times + 0.5 * plan.imperfections.exposure * node))
+        R, t = laboratory.pose_of(spline(times + 0.5 * plan.imperfections.exposure * node))
         points = body @ np.swapaxes(R, 1, 2) + t[:, None]
         px = px + weight * np.stack([camera.project(points) for camera in cameras], 1)
     px = px + DOT_PX * rng.normal(size=px.shape)
-    R, t = poses_of(spline(times))
+    R, t = laboratory.pose_of(spline(times))
     return tracked(px, R, t, times, rig, plan.frame_rate), R, t
-
-
-def poses_of(q):
-    """R (n, 3, 3), t (n, 3) of the disc at q (n, 6)."""
-    return tuple(np.stack(part) for part in zip(*map(laboratory.pose_of, q), strict=True))
 
 
 def tables_of(px, R, t, sigma):

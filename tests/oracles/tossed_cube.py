@@ -9,10 +9,9 @@ RATE = 148.0
 
 
 def _quaternion_rate(q, omega_body):
-    w, x, y, z = np.moveaxis(q, -1, 0)
-    a, b, c = np.moveaxis(omega_body, -1, 0)
-    parts = (-x * a - y * b - z * c, w * a + y * c - z * b, w * b - x * c + z * a, w * c + x * b - y * a)
-    return 0.5 * np.stack(parts, axis=-1)
+    w, v = q[..., :1], q[..., 1:]
+    along = -np.sum(v * omega_body, axis=-1, keepdims=True)
+    return 0.5 * np.concatenate([along, w * omega_body + np.cross(v, omega_body)], axis=-1)
 
 
 def toss(rng, n, gravity=9.81, centre_of_mass=(0, 0, 0), inertia=(1, 1, 1), scale=0.0, lean=0.0, noise=2e-5):
@@ -48,13 +47,9 @@ def toss(rng, n, gravity=9.81, centre_of_mass=(0, 0, 0), inertia=(1, 1, 1), scal
     yaw = rng.uniform(0, 2 * np.pi, n)
     # the table is level, so that in axes which lean, resting cubes lean and stand on a slope
     still_x[..., 2] += lean * np.sum(still_x * across, axis=-1)
-    c, s = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
-    side = lean / 2 * along
-    level = np.concatenate([c - s * side[:, 2:], c * side[:, :1] + s * side[:, 1:2], c * side[:, 1:2] - s * side[:, :1],
-                            s + c * side[:, 2:]], axis=-1)  # fmt: skip
-    level /= np.linalg.norm(level, axis=1, keepdims=True)
+    level = Rotation.from_rotvec(lean * along) * Rotation.from_rotvec(np.outer(2 * yaw, [0, 0, 1]))
     position = np.concatenate([flown, still_x]).swapaxes(0, 1)
-    attitude = np.concatenate([turned, np.repeat(level[None], 16, axis=0)]).swapaxes(0, 1)
+    attitude = np.concatenate([turned, np.tile(level.as_quat(scalar_first=True), (16, 1, 1))]).swapaxes(0, 1)
     # one resting pose per toss is off by more than the noise of a sample, as tags are
     off = np.concatenate([np.zeros((n, 24, 3)), np.repeat(2e-4 * rng.standard_normal((n, 1, 3)), 16, axis=1)], axis=1)
     position = (1 + scale) * position + off + noise * rng.standard_normal(position.shape)

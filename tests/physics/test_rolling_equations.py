@@ -5,6 +5,7 @@ import pytest
 import sympy as sp
 from numpy.testing import assert_allclose
 from scipy.integrate import simpson, solve_ivp
+from scipy.spatial.transform import Rotation
 
 from disctrack import rolling
 from disctrack.disc import MA_2014
@@ -151,114 +152,66 @@ def swinging(letter, scale=1.0):
     return named | {"frequency": 60.0}
 
 
-# The same physics in the product and in the oracle: effects; options of the oracle's disc, the laws of its contact
-# and those that act in the air, too.
+def same(effects, contact=(), anywhere=(), **options):
+    """In the product and in the oracle: effects; laws of its contact, laws that act in the air, too, its options."""
+    return effects, [*contact], [*anywhere], options
+
+
+TILTED = np.array([0.03, -0.02, -np.sqrt(1 - 0.03**2 - 0.02**2)])
 EFFECTS = {
-    "ideal": ({}, {}, [], []),
-    "friction": (
-        {
-            **K_M,
-            "kn": {"k_n": 1e-6},
-            "kz": {"k_z": 1e-4},
-            "rolling_classical": {"delta": 1e-4},
-            "rolling_adhesive": {"a": 1e-4},
-        },
-        {},
-        [
-            KM_LAW,
-            newton_euler.nutation_friction(1e-6),
-            newton_euler.pivoting_friction(1e-4),
-            newton_euler.classical_rolling_friction(1e-4),
-            newton_euler.adhesive_rolling_friction(1e-4),
-        ],
-        [],
+    "ideal": same({}),
+    "friction": same(
+        {**K_M, "kn": {"k_n": 1e-6}, "kz": {"k_z": 1e-4}, "rolling_classical": {"delta": 1e-4},
+         "rolling_adhesive": {"a": 1e-4}},
+        [KM_LAW, newton_euler.nutation_friction(1e-6), newton_euler.pivoting_friction(1e-4),
+         newton_euler.classical_rolling_friction(1e-4), newton_euler.adhesive_rolling_friction(1e-4)],
     ),
-    "forces": (
-        {
-            "drag_linear": {"c": 0.02},
-            "table_tilt": {"tilt_x": 0.03, "tilt_y": -0.02},
-            "air_moffatt": {"f": 3.0},
-            "spring": {"k": 0.8, "F_x": 0.04, "F_y": -0.024},
-            "table_vibration": swinging("a"),
-        },
-        {"gravity": 9.81 * np.array([0.03, -0.02, -np.sqrt(1 - 0.03**2 - 0.02**2)])},
+    "forces": same(
+        {"drag_linear": {"c": 0.02}, "table_tilt": {"tilt_x": 0.03, "tilt_y": -0.02}, "air_moffatt": {"f": 3.0},
+         "spring": {"k": 0.8, "F_x": 0.04, "F_y": -0.024}, "table_vibration": swinging("a")},
         [newton_euler.moffatt(3 * 1.81e-5)],
         [newton_euler.linear_drag(0.02), SPRING, VIBRATION],
+        gravity=9.81 * TILTED,
     ),
-    "vibrating with its cameras": (
-        {"table_vibration": swinging("a"), **COM_EFFECT},
-        {"com_body": COM},
-        [],
-        [VIBRATION],
+    "vibrating with its cameras": same(
+        {"table_vibration": swinging("a"), **COM_EFFECT}, anywhere=[VIBRATION], com_body=COM
     ),
-    "hollow": (
+    "hollow": same(
         {"table_curved": {"kappa": 0.8, "slope_x": 0.03, "slope_y": -0.02}, **COM_EFFECT, **K_M},
-        {"com_body": COM, "bowl": (np.array([0.03, -0.02, np.sqrt(1 - 0.03**2 - 0.02**2)]) / 0.8, 1 / 0.8)},
-        [KM_LAW],
-        [],
+        [KM_LAW], com_body=COM, bowl=(TILTED * [1, 1, -1] / 0.8, 1 / 0.8),
     ),
-    "out of round": (
+    "out of round": same(
         {"rim": {"oval_c": 3e-4, "oval_s": -2e-4, "lobes_c": 1e-4, "lobes_s": 1.5e-4}, **K_M},
-        {"waves": ((2, 3e-4, -2e-4), (3, 1e-4, 1.5e-4))},
-        [KM_LAW],
-        [],
+        [KM_LAW], waves=((2, 3e-4, -2e-4), (3, 1e-4, 1.5e-4)),
     ),
-    "thin air": (
+    "thin air": same(
         {"air": {"density": 0.1}, "air_bildsten": {"beta": 3.0}, "air_quadratic": {"a": 5.0}},
-        {},
-        [newton_euler.bildsten(3.0, 0.12)],
-        [newton_euler.quadratic_air(5.0, 0.12)],
+        [newton_euler.bildsten(3.0, 0.12)], [newton_euler.quadratic_air(5.0, 0.12)],
     ),
-    "flat": (
-        {"rim_flat": {"depth": 2e-4, "angle": 0.7, "width": 0.15}, **K_M},
-        {"dips": ((2e-4, 0.7, 0.15),)},
-        [KM_LAW],
-        [],
+    "flat": same(
+        {"rim_flat": {"depth": 2e-4, "angle": 0.7, "width": 0.15}, **K_M}, [KM_LAW], dips=((2e-4, 0.7, 0.15),)
     ),
-    "shaken": (
+    "shaken": same(
         {"table_shaken": swinging("u", 1e-5), **COM_EFFECT},
-        {"table": newton_euler.swing(1e-5 * COSINE, 1e-5 * SINE, 60.0), "com_body": COM},
-        [],
-        [],
+        table=newton_euler.swing(1e-5 * COSINE, 1e-5 * SINE, 60.0), com_body=COM,
     ),
-    "settles": (
+    "settles": same(
         {"table_settles": {"v_z": -2e-3, "a_z": 5e-2}, **COM_EFFECT},
-        {"table": newton_euler.settling(-2e-3, 5e-2), "com_body": COM},
-        [],
-        [],
+        table=newton_euler.settling(-2e-3, 5e-2), com_body=COM,
     ),
-    "turntable": (
+    "turntable": same(
         {"surface_moves": {"v_x": 0.02, "v_y": -0.01, "rate": 0.8}, **COM_EFFECT},
-        {"carries": (np.array([0.02, -0.01, 0.0]), 0.8), "com_body": COM},
-        [],
-        [],
+        carries=(np.array([0.02, -0.01, 0.0]), 0.8), com_body=COM,
     ),
-    "body": (
-        {
-            **COM_EFFECT,
-            "inertia_product": {"J_13": 1.5e-6, "J_23": -3e-6},
-            "edge_radius": {"rho": 5e-4},
-            "inertia_axial": {"e": 0.05},
-            "inertia_diametral": {"e": -0.03},
-            "contact_radius": {"r_error": 1e-3},
-            "contact_height": {"h_error": -2e-4},
-            "gravity": {"g_error": 0.5},
-        },
-        {
-            "r": MA_2014.radius + 1e-3,
-            "h": MA_2014.half_thickness - 2e-4,
-            "gravity": (0, 0, -10.31),
-            "com_body": COM,
-            "edge": 5e-4,
-            "J_body": np.diag(
-                MA_2014.moment_diametral * np.array([0.97, 0.97, 0]) + [0, 0, 1.05 * MA_2014.moment_axial]
-            )
-            + np.array([[0, 0, 1.5e-6], [0, 0, -3e-6], [1.5e-6, -3e-6, 0]]),
-        },
-        [],
-        [],
+    "body": same(
+        {**COM_EFFECT, "inertia_product": {"J_13": 1.5e-6, "J_23": -3e-6}, "edge_radius": {"rho": 5e-4},
+         "inertia_axial": {"e": 0.05}, "inertia_diametral": {"e": -0.03}, "contact_radius": {"r_error": 1e-3},
+         "contact_height": {"h_error": -2e-4}, "gravity": {"g_error": 0.5}},
+        r=MA_2014.radius + 1e-3, h=MA_2014.half_thickness - 2e-4, gravity=(0, 0, -10.31), com_body=COM, edge=5e-4,
+        J_body=np.diag(MA_2014.moment_diametral * np.array([0.97, 0.97, 0]) + [0, 0, 1.05 * MA_2014.moment_axial])
+        + np.array([[0, 0, 1.5e-6], [0, 0, -3e-6], [1.5e-6, -3e-6, 0]]),
     ),
-}
+}  # fmt: skip
 
 
 def model_with(effects):
@@ -267,7 +220,7 @@ def model_with(effects):
 
 def pair(name, in_the_air=False):
     """Model and oracle; contact laws do nothing in the air."""
-    effects, options, contact, anywhere = EFFECTS[name]
+    effects, contact, anywhere, options = EFFECTS[name]
     return model_with(effects), newton_euler.Disc(**options, laws=anywhere if in_the_air else contact + anywhere)
 
 
@@ -418,9 +371,7 @@ def test_free_flight_is_a_parabola_and_a_free_top():
     assert motion.end is rolling.EndReason.TIME
     expected = free_flight.centre(np.array([0.1, 0.2, 0.3]), np.array([0.4, -0.2, 0.5]), np.array([0, 0, -9.81]), times)
     assert_allclose(motion.q[:, :3], expected, atol=1e-12)
-    R0 = newton_euler.matrix_of(newton_euler.quaternion_from_angles(0.3, 1.0, 0.4))
+    R0 = Rotation.from_euler("ZXZ", [0.3, 1.0, 0.4]).as_matrix()
     R = free_flight.symmetric_top(R0, motion.omega_world[0], MA_2014.moment_diametral, MA_2014.moment_axial, times)
-    for angles, expected_R in zip(motion.q[:, 3:], R, strict=True):
-        found = newton_euler.matrix_of(newton_euler.quaternion_from_angles(*angles))
-        assert_allclose(found, expected_R, atol=1e-10)
+    assert_allclose(Rotation.from_euler("ZXZ", motion.q[:, 3:]).as_matrix(), R, atol=1e-10)
     assert not motion.contact_force.any()

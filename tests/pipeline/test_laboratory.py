@@ -19,7 +19,7 @@ from disctrack.trajectory.file import read_trajectory
 from tests.oracles import imperfect_laboratory as laboratory
 from tests.oracles import point_laboratory
 from tests.oracles.imperfect_laboratory import IDEAL, Imperfections, Plan, Trouble
-from tests.oracles.point_laboratory import errors_and_variances, poses_of
+from tests.oracles.point_laboratory import errors_and_variances
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +48,7 @@ def measured(recording):
 def truth(recording):
     """The poses R (n, 3, 3), t (n, 3); and what else is kept of it."""
     kept = np.load(recording / "truth.npz")
-    return poses_of(kept["q"]), kept
+    return laboratory.pose_of(kept["q"]), kept
 
 
 @pytest.mark.slow
@@ -126,7 +126,7 @@ def filmed(name, frames=FRAMES):
     disc = replace(MA_2014, radius_tolerance=0.0, thickness_tolerance=0.0)
     found = disctrack.measure_pairs(np.array(images), rig_of(cameras), disc, plan.frame_rate)
     trajectory = found.trajectory
-    R, t = poses_of(spline(times))
+    R, t = laboratory.pose_of(spline(times))
     turn = vector_from_rotation(rotation_from_quaternion(trajectory.quaternion) @ np.swapaxes(R, 1, 2))
     error = np.concatenate([trajectory.q[:, :3] - t, turn], axis=1)
     whole = trajectory.pose_covariance + trajectory.systematic_covariance
