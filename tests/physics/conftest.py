@@ -162,6 +162,8 @@ def tracked(truth: TrueMotion, rng, missing=(), noise=1.0, sensitivity=None, rig
     missing = list(missing)
     R[missing], position[missing], status[missing] = np.nan, np.nan, FrameStatus.MARKERS_NOT_FOUND
     camera = Camera(1000.0, 1000.0, 255.5, 255.5, (0.0, 0.0, 0.0, 0.0, 0.0), (512, 512))
+    covariance = np.zeros((N_RIG, N_RIG)) if rig_covariance is None else rig_covariance
+    rig = StereoRig(camera, camera, np.eye(3), np.array([-0.2, 0, 0]), covariance=covariance, world_is_table=True)
     return Trajectory(
         time=truth.time,
         frame=np.arange(n),
@@ -178,14 +180,7 @@ def tracked(truth: TrueMotion, rng, missing=(), noise=1.0, sensitivity=None, rig
         markers_residual_px=np.full((n, 2, 6, 2), np.nan),
         marker_status=np.zeros((n, 2, 6), np.uint8),
         disc=MA_2014,
-        rig=StereoRig(
-            camera,
-            camera,
-            np.eye(3),
-            np.array([-0.2, 0.0, 0.0]),
-            covariance=np.zeros((N_RIG, N_RIG)) if rig_covariance is None else rig_covariance,
-            world_is_table=True,
-        ),
+        rig=rig,
         frame_rate=1000.0,
         gravity=g,
     )

@@ -1,4 +1,4 @@
-"""Slip, locus, forces and the onset of rolling against true motions."""
+"""Velocities, accelerations, slip, locus, forces, energy and the onset of rolling against true motions, with noise."""
 
 from dataclasses import replace
 
@@ -6,13 +6,256 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from scipy.integrate import trapezoid
+from scipy.stats import norm
 
 from disctrack.analyse.contact import analyse_contact, contact_quantities
-from disctrack.analyse.derivatives import differentiate
+from disctrack.analyse.derivatives import SYSTEMATIC_LENGTH, differentiate
+from disctrack.analyse.energy import analyse_energy, energy_quantities
+from disctrack.analyse.propagation import propagate, rates
 from disctrack.disc import MA_2014
-from disctrack.frames import rotation_from_euler
+from disctrack.errors import AnalysisError
+from disctrack.frames import rotation_from_euler, rotation_from_vector, vector_from_rotation
 from disctrack.rolling import CATALOGUE, Model, simulate
 from disctrack.rolling import State as RollingState
+
+QUANTITIES = ("position", "rotation", "velocity", "omega", "acceleration", "alpha")
+MOTIONS = {
+    "from 9 degrees to rest": dict(theta_deg=9, duration=3.0),
+    "25 degrees, nutating": dict(theta_deg=25, duration=0.6, nutation=0.1),
+    "60 degrees, nutating": dict(theta_deg=60, duration=0.8, nutation=0.2),
+}
+
+
+def errors(motion, truth):
+    turn = vector_from_rotation(motion.R_world_body @ np.swapaxes(truth.R, 1, 2))
+    found = motion.position, motion.velocity, motion.omega_world, motion.acceleration, motion.alpha_world
+    true = truth.position, truth.velocity, truth.omega, truth.acceleration, truth.alpha
+    position, *rates = (a - b for a, b in zip(found, true, strict=True))
+    return np.concatenate([position, turn, *rates], axis=1)
+
+
+def squared_error_over_variance(motion, truth, frames=slice(None)):
+    """Per quantity, squared error over predicted covariance per degree of freedom, mean over the frames."""
+    e = errors(motion, truth)[frames]
+    C = motion.covariance[frames]
+    result = {}
+    for i, name in enumerate(QUANTITIES):
+        part = slice(3 * i, 3 * i + 3)
+        result[name] = np.mean(np.einsum("ni,nij,nj->n", e[:, part], np.linalg.inv(C[:, part, part]), e[:, part]) / 3)
+    return result
+
+
+@pytest.mark.parametrize("name", MOTIONS)
+@pytest.mark.parametrize(
+    ("seeds", "low", "high"),
+    [pytest.param(4, 0.7, 1.3, marks=pytest.mark.statistical), pytest.param(24, 0.8, 1.25, marks=pytest.mark.slow)],
+)
+def test_squared_error_is_the_predicted_variance(name, seeds, low, high, true_motion, as_tracked):
+    # smoothed noise is correlated over 20 frames: a copy holds 100 values and scatters by 15 %, a mean by 8 and 3 %
+    truth = true_motion(**MOTIONS[name])[-700:]
+    found = [
+        squared_error_over_variance(differentiate(as_tracked(truth, np.random.default_rng(seed))), truth)
+        for seed in range(seeds)
+    ]
+    for quantity in QUANTITIES:
+        assert low <= np.mean([f[quantity] for f in found]) <= high, quantity
+
+
+@pytest.fixture(scope="module")
+def four_motions(true_motion, as_tracked):
+    """The end of a motion, and four measurements of it."""
+    truth = true_motion(theta_deg=9, duration=3.0)[-700:]
+    return truth, [differentiate(as_tracked(truth, np.random.default_rng(seed))) for seed in range(4)]
+
+
+@pytest.mark.statistical
+@pytest.mark.parametrize(
+    ("quantities", "low", "high"),
+    [
+        (rates, 0.7, 1.35),
+        (lambda state: contact_quantities(state, MA_2014, 9.81), 0.65, 1.45),
+        (lambda state: energy_quantities(state, MA_2014, 9.81), 0.65, 1.45),
+    ],
+    ids=["rates", "contact", "energy"],
+)
+def test_derived_quantities_are_honest_about_their_noise(quantities, low, high, four_motions):
+    # each alone has 4 * 700 / 20 independent values: 12 % of scatter
+    truth, motions = four_motions
+    ratios = []
+    for motion in motions:
+        found = propagate(motion, quantities)
+        variance = np.diagonal(found.covariance, axis1=1, axis2=2)
+        ratios.append(np.mean((found.value - quantities(truth.state)) ** 2 / variance, axis=0))
+    assert np.all(np.mean(ratios, axis=0) > low), ratios
+    assert np.all(np.mean(ratios, axis=0) < high), ratios
+
+
+def test_covariance_that_is_too_small_is_noticed(true_motion, as_tracked, rng):
+    """Negative control of the test above, and the data's own noise is preferred to a wrong statement about it."""
+    truth = true_motion(theta_deg=25, duration=0.6, nutation=0.1)
+    honest = as_tracked(truth, rng)
+    boasting = replace(honest, pose_covariance=honest.pose_covariance / 4)
+    motion = differentiate(boasting)
+    assert_allclose(motion.noise_scale, 4, rtol=0.2)  # 600 frames, 1 or 2 channels: 3-6 % of scatter, grid 3.5 %
+    shrunk = replace(motion, covariance=motion.covariance / 4)
+    assert squared_error_over_variance(motion, truth)["velocity"] < 1.35
+    assert squared_error_over_variance(shrunk, truth)["velocity"] > 2.5
+
+
+def imagined(true_motion, n, **known):
+    """A motion that nobody rolled: n instants of a disc at rest but for what is given."""
+    base, zero = true_motion(theta_deg=9, duration=3.0)[:n], np.zeros((n, 3))
+    still = dict.fromkeys(("position", "velocity", "omega", "acceleration", "alpha"), zero)
+    return replace(base, **still | {"R": np.tile(np.eye(3), (n, 1, 1))} | known)
+
+
+@pytest.mark.parametrize("frequency", [10.0, 60.0, 80.0])
+def test_amplitude_of_an_oscillation_is_kept(frequency, true_motion, as_tracked, rng):
+    """To 0.5 % at 60 Hz in value, velocity and acceleration, for shifts and for tilts, with the noise of real poses."""
+    time = np.arange(400) * 1e-3
+    w = 2 * np.pi * frequency
+    wave = [np.sin(w * time), w * np.cos(w * time), -w * w * np.sin(w * time)]
+    x, v, a = (np.outer(f, [1e-3, 0, 0]) for f in wave)
+    spin, omega, alpha = (np.outer(f, [0, np.radians(1.0), 0]) for f in wave)
+    known = {"position": x, "velocity": v, "acceleration": a, "omega": omega, "alpha": alpha}
+    truth = imagined(true_motion, 400, R=rotation_from_vector(spin), **known)
+    motion = differentiate(as_tracked(truth, rng))
+    for found, true in (
+        (motion.position[:, 0], x[:, 0]),
+        (motion.velocity[:, 0], v[:, 0]),
+        (motion.acceleration[:, 0], a[:, 0]),
+        (motion.omega_world[:, 1], omega[:, 1]),
+        (motion.alpha_world[:, 1], alpha[:, 1]),
+    ):
+        gain = (found[20:-20] @ true[20:-20]) / (true[20:-20] @ true[20:-20])
+        # an unbiased gain still scatters with the noise, at 10 Hz most in the second derivative: 1e-3
+        assert abs(gain - 1) < 0.005
+
+
+@pytest.mark.statistical
+@pytest.mark.parametrize(
+    ("frames", "worst", "missing", "low", "high"),  # some 24 independent values: 30 % of scatter; at the ends 15 %
+    [(np.r_[300:320], 310, range(300, 320), 0.3, 2.0), (np.r_[0:8, 392:400], 399, (), 0.6, 1.6)],
+    ids=["a gap", "the ends"],
+)
+def test_sigmas_are_honest_where_samples_are_missing(frames, worst, missing, low, high, true_motion, as_tracked):
+    truth = (
+        true_motion(theta_deg=25, duration=0.6, nutation=0.1)
+        if len(missing)
+        else true_motion(theta_deg=9, duration=3.0)[-400:]
+    )
+    found = []
+    for seed in range(6):
+        motion = differentiate(as_tracked(truth, np.random.default_rng(seed), missing=missing))
+        assert motion.known.all()
+        assert not motion.measured[list(missing)].any()
+        found.append(squared_error_over_variance(motion, truth, frames))
+        assert motion.covariance[worst, 6, 6] > 1.5 * motion.covariance[200, 6, 6]
+    for quantity in QUANTITIES:
+        assert low < np.mean([f[quantity] for f in found]) < high, quantity
+
+
+@pytest.mark.statistical
+def test_motion_across_a_gap_too_long_to_bridge_is_unknown(true_motion, as_tracked, rng):
+    truth = true_motion(theta_deg=9, duration=3.0)[:600]
+    motion = differentiate(as_tracked(truth, rng, missing=range(200, 400)))
+    assert not motion.known[230:370].any()
+    assert motion.known[:195].all()
+    assert motion.known[405:].all()
+    ratio = squared_error_over_variance(motion, truth, motion.known)
+    assert all(0.6 < value < 1.6 for value in ratio.values()), ratio
+
+
+def test_disc_at_rest_has_no_velocity_beyond_its_sigma(true_motion, as_tracked, rng):
+    still = imagined(true_motion, 300, position=np.tile([0.05, 0.04, 0.003], (300, 1)))
+    motion = differentiate(as_tracked(still, rng))
+    assert np.abs(motion.velocity).max() < 2e-5
+    sigma = np.sqrt(np.diagonal(motion.covariance, axis1=1, axis2=2))
+    assert np.all(np.abs(errors(motion, still)) < 6 * sigma)
+    # flat on the table there is no direction of precession: NaN, not a number
+    assert np.isnan(propagate(motion, rates).value[:, 0]).all()
+
+
+def test_fast_spin_is_followed(true_motion, as_tracked, rng):
+    """A coin that turns about the vertical at 60 rad/s turns by several radians inside one window."""
+    spin = np.tile([0.0, 0.0, 60.0], (300, 1))
+    upright = rotation_from_vector(np.array([np.radians(60.0), 0.0, 0.0]))
+    R = rotation_from_vector(1e-3 * np.arange(300)[:, None] * spin) @ upright
+    truth = imagined(true_motion, 300, R=R, omega=spin)
+    motion = differentiate(as_tracked(truth, rng))
+    ratio = squared_error_over_variance(motion, truth)
+    assert 0.6 < ratio["omega"] < 1.5, ratio
+    assert_allclose(motion.omega_world, spin, atol=0.02)
+
+
+@pytest.mark.statistical
+def test_calibration_error_is_carried_as_one_common_error(true_motion, as_tracked, rng):
+    """A rig parameter that turns and shifts all poses alike changes the found motion as the sensitivity says."""
+    truth = true_motion(theta_deg=25, duration=0.6, nutation=0.1)[:300]
+    turn = np.array([2e-4, -1e-4, 3e-4])
+    shift = np.cross(turn, truth.position)  # the world turned about its origin
+    sensitivity = np.zeros((300, 6, 30))
+    sensitivity[:, :3, 24], sensitivity[:, 3:, 24] = shift, turn
+    trajectory = as_tracked(truth, rng, noise=0.0, sensitivity=sensitivity)
+    turned = replace(truth, position=truth.position + shift, R=rotation_from_vector(turn) @ truth.R)
+    before, after = differentiate(trajectory), differentiate(as_tracked(turned, rng, noise=0.0))
+    S = before.calibration_sensitivity[:, :, 24]
+    pairs = {
+        "velocity": (after.velocity - before.velocity, S[:, 6:9]),
+        "omega": (after.omega_world - before.omega_world, S[:, 9:12]),
+        "acceleration": (after.acceleration - before.acceleration, S[:, 12:15]),
+        "alpha": (after.alpha_world - before.alpha_world, S[:, 15:18]),
+    }
+    for name, (found, predicted) in pairs.items():
+        # second order in a turn of 4e-4 rad
+        assert_allclose(found, predicted, atol=2e-3 * np.abs(predicted).max(), err_msg=name)
+
+
+def test_uneven_times_are_respected(true_motion, as_tracked, rng):
+    time = np.sort(1e-3 * np.arange(200) + rng.uniform(-2e-4, 2e-4, 200))
+    w = 2 * np.pi * 20
+    x, v = (np.outer(f, [1e-3, 0, 0]) for f in (np.sin(w * time), w * np.cos(w * time)))
+    motion = differentiate(as_tracked(imagined(true_motion, 200, time=time, position=x, velocity=v), rng))
+    assert_allclose(motion.velocity[10:-10], v[10:-10], atol=2e-4)  # sigma is 3e-5 to 5e-5 m/s
+
+
+@pytest.mark.parametrize("missing", [range(0, 195), range(0, 200)])
+def test_too_few_poses_are_an_error_that_says_so(missing, true_motion, as_tracked, rng):
+    truth = true_motion(theta_deg=25, duration=0.6, nutation=0.1)[:200]
+    with pytest.raises(AnalysisError, match="of 200 frames have a pose"):
+        differentiate(as_tracked(truth, rng, missing=missing))
+
+
+@pytest.mark.statistical
+def test_what_repeats_in_the_poses_is_carried_to_the_rates(true_motion, as_tracked, rng):
+    """A smooth error with the stated variance and pace: of pose and rates within their stated sigma, chi-square."""
+    truth = true_motion(theta_deg=25, duration=0.6, nutation=0.1)[:300]
+    trajectory = as_tracked(truth, rng, noise=0.0)
+    S = np.diag([2e-6, 1e-6, 3e-6, 3e-5, 2e-5, 1e-5]) ** 2
+    length = SYSTEMATIC_LENGTH * 512
+    pace = 40.0  # [1/s]: dots that run through the image
+    px = np.broadcast_to((pace * length * truth.time)[:, None, None, None] * [1.0, 0.0], trajectory.markers_px.shape)
+    trajectory = replace(trajectory, systematic_covariance=np.broadcast_to(S, (300, 6, 6)), markers_px=px)
+    motion = differentiate(trajectory)
+    assert_allclose(motion.systematic_pace, pace, rtol=1e-9)
+    squared = {"position": [], "velocity": [], "omega_world": [], "acceleration": [], "alpha_world": []}
+    for _ in range(12):
+        # waves with a normal spectrum of the pace's width
+        w = pace * norm.ppf((np.arange(24) + 0.5) / 24)
+        phase = rng.uniform(0, 2 * np.pi, (6, 24))
+        error = np.sqrt(np.diag(S)) * np.cos(w * truth.time[:, None, None] + phase).sum(-1) / np.sqrt(12)
+        wrong = replace(truth, position=truth.position + error[:, :3], R=rotation_from_vector(error[:, 3:]) @ truth.R)
+        found = differentiate(as_tracked(wrong, rng, noise=0.0))
+        for name in squared:
+            squared[name].append((getattr(found, name) - getattr(motion, name)) ** 2)
+    C = np.diagonal(motion.systematic_at(np.arange(300)), axis1=1, axis2=2)
+    first = {"position": 0, "velocity": 6, "omega_world": 9, "acceleration": 12, "alpha_world": 15}
+    for name, values in squared.items():
+        ratio = np.mean(np.mean(values, axis=0) / C[:, first[name] : first[name] + 3])
+        assert 0.7 < ratio < 1.4, (name, ratio)
+    silent = differentiate(as_tracked(truth, rng, noise=0.0))
+    assert not silent.systematic_at(np.arange(5)).any()
+
 
 COLUMN = {"slip": slice(3, 6), "locus": slice(6, 8), "force": slice(8, 11), "needed": 11}
 
@@ -142,15 +385,6 @@ def test_sliding_friction_is_measured_and_its_end_found(slip_to_roll, true_motio
     assert squared_error(contact.propagated, soon) > 10 > 3 > squared_error(propagated, soon)
 
 
-def test_disc_that_rolls_from_the_start_is_said_to(true_motion, as_tracked, rng):
-    truth = true_motion(theta_deg=25, duration=0.6, nutation=0.1)
-    found = analyse_contact(differentiate(as_tracked(truth, rng))).onset
-    assert found.time == truth.time[0]
-    assert "from the first frame" in found.verdict
-    assert found.slip_distance < 1e-5
-    assert found.n_late_slips == 0
-
-
 def test_disc_that_slips_to_the_end_has_no_onset(true_motion, as_tracked, rng):
     truth = sliding(true_motion(theta_deg=25, duration=0.6, nutation=0.1)[:400], 0.6, 0.2)
     found = analyse_contact(differentiate(as_tracked(truth, rng))).onset
@@ -174,3 +408,59 @@ def test_short_arc_gives_no_circle(true_motion, as_tracked, rng):
     truth = true_motion(theta_deg=25, duration=0.6, nutation=0.1)[:25]
     circle = analyse_contact(differentiate(as_tracked(truth, rng))).circle
     assert np.isnan(circle.radius)
+
+
+TOTAL, POWER, ADIABATIC, LEVEL = 5, 6, 7, 8
+
+
+def exact(truth):
+    return energy_quantities(truth.state, MA_2014, 9.81)
+
+
+def test_energy_is_constant_without_losses(true_motion):
+    E = exact(true_motion(theta_deg=25, duration=0.6, k_m=0.0, nutation=0.1))
+    assert_allclose(E[:, TOTAL], E[0, TOTAL], rtol=1e-10)  # the integrator's tolerance is 1e-11
+    assert_allclose(E[:, POWER], 0, atol=1e-12)
+
+
+def test_lost_power_is_that_of_the_rolling_moment(true_motion):
+    """dE/dt = -M_m phidot sin theta, M_m = -k_m F_z psidot |psidot| (5.4, 5.5); F_z from the vertical acceleration."""
+    k_m = 0.381e-7
+    truth = true_motion(theta_deg=9, duration=3.0)
+    psidot, phidot = truth.rates[:, 0], truth.rates[:, 2]
+    F_z = MA_2014.mass * (9.81 + truth.acceleration[:, 2])
+    expected = k_m * F_z * psidot * np.abs(psidot) * phidot * np.sin(truth.euler[:, 1])
+    E = exact(truth)
+    assert_allclose(E[:, POWER], expected, rtol=1e-9)
+    assert_allclose(E[-1, TOTAL] - E[0, TOTAL], trapezoid(expected, truth.time), rtol=1e-5)
+
+
+def test_datum_at_rest_is_what_makes_the_adiabatic_energy_right(true_motion):
+    """With z instead of z - h the energy at 9 degrees would be 34 % too large."""
+    truth = true_motion(theta_deg=2, duration=0.2, k_m=0.0, nutation=0.0)
+    E = exact(truth)
+    ratio = E[:, TOTAL] / E[:, ADIABATIC]
+    assert_allclose(ratio, 1, atol=0.1)  # finite thickness: h / r = 8 %
+    wrong = (E[:, TOTAL] + MA_2014.mass * 9.81 * MA_2014.half_thickness) / E[:, ADIABATIC]
+    assert np.all(wrong > 2)
+
+
+def test_level_of_thin_slow_precession_is_4g_over_r(true_motion):
+    E = exact(true_motion(theta_deg=2, duration=0.2, k_m=0.0, nutation=0.0))
+    assert_allclose(E[:, LEVEL] / (4 * 9.81 / 0.0375), 1, atol=0.02)
+
+
+def test_error_of_the_table_height_is_common_and_does_not_enter_the_loss(true_motion, as_tracked, rng):
+    """A height wrong by 2 um at all times shifts the potential energy by m g 2 um and cancels in differences."""
+    truth = true_motion(theta_deg=9, duration=3.0)[:400]
+    sensitivity = np.zeros((400, 6, 30))
+    sensitivity[:, 2, 29] = 1.0
+    rig_covariance = np.zeros((30, 30))
+    rig_covariance[29, 29] = (2e-6) ** 2
+    trajectory = as_tracked(truth, rng, sensitivity=sensitivity, rig_covariance=rig_covariance)
+    energy = analyse_energy(differentiate(trajectory))
+    total = energy.series[TOTAL]
+    assert_allclose(total.sigma_calibration, MA_2014.mass * 9.81 * 2e-6, rtol=1e-6)
+    assert energy.loss_sigma_calibration < 1e-3 * total.sigma_calibration[0]
+    E = exact(truth)
+    assert abs(energy.loss - (E[0, TOTAL] - E[-1, TOTAL])) < 4 * energy.loss_sigma

@@ -112,13 +112,6 @@ def test_a_table_view_whose_board_did_not_lie_on_the_table_is_named(
     assert finding.doubtful
 
 
-@pytest.mark.parametrize("key", ["mass", "half_thickness"])
-@pytest.mark.parametrize("factor", [1e-3, 1e3])
-def test_a_disc_of_no_known_density_is_told(key, factor, honest):
-    disc = replace(honest.disc, **{key: factor * getattr(honest.disc, key)})
-    assert Kind.DENSITY in [finding.kind for finding in contradictions(honest, disc)]
-
-
 def test_departures_that_a_table_or_an_edge_may_make_are_noted_and_no_contradiction(honest):
     for trajectory, key, true in (
         (at_another_rate(honest, 1.03), "[cameras] frame_rate_hz", 1000.0),

@@ -55,6 +55,7 @@ def test_frames_missing_in_one_piece_are_lost_and_time_goes_on(recording, untouc
     apart = np.abs(trajectory.q[after] - untouched.q[after]) / untouched.coordinate_sigma[after]
     assert apart.max() < 1  # the shared refinement has three frames less; time itself must not move
     assert len(findings["unreadable"]) == 6
+    measured(recording, code=3)  # reused, and still incomplete
 
 
 def contents(folder) -> dict[str, bytes]:

@@ -283,14 +283,6 @@ def test_a_camera_that_stays_ahead_is_told_once(clip):
     assert "left out 2 images at frame 9." in told
 
 
-def test_exchanged_frames_of_both_cameras_lie_on_no_motion(clip):
-    images = clip.images.copy()
-    images[[20, 22]] = images[[22, 20]]
-    status = measure(images, clip.rig, clip.disc).trajectory.frame_status
-    assert set(status[[20, 22]]) == {FrameStatus.JUMPED}
-    assert (np.delete(status, range(19, 24)) == FrameStatus.MEASURED).all()
-
-
 def test_a_frame_rate_at_which_no_motion_joins_the_frames_is_a_doubt_that_names_it(clip):
     """The frames are refused, one by one and rightly; a recording that loses most of them is no success."""
     found = measure(clip.images, clip.rig, clip.disc, rate=1e12)

@@ -1,16 +1,20 @@
 """What no catalogue names, from the independent simulation: never noise, and described where a law can be had."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from disctrack.diagnosis import diagnose
+from disctrack.diagnosis.law_library import families
 from disctrack.discrepancy.search import CLASS_GAIN
+from disctrack.frames import nodal_axes_world
+from disctrack.rolling import Model, State, simulate
 from disctrack.rolling.effects import effect_from_formulas
 from tests.oracles import newton_euler
-from tests.oracles.measured_disc import assert_sized, measured
-from tests.oracles.unknown_laws import Unknown, recording
-
-pytestmark = pytest.mark.slow
+from tests.oracles.measured_disc import K_M, assert_sized, measured
+from tests.oracles.unknown_laws import DISC, PLACE, UNKNOWN, Unknown, motion, recording
 
 
 def contour_friction_below(mu: float, theta_deg: float):
@@ -24,6 +28,7 @@ def contour_friction_below(mu: float, theta_deg: float):
     return law
 
 
+@pytest.mark.slow
 def test_a_law_below_a_nutation_is_told_with_the_nutation():
     result = diagnose(recording(Unknown(contour_friction_below(1e-3, 2.5), 4.0, 0.3, 1.6)).trajectory)
     assert result.diagnosis.verdict == "unexplained"
@@ -38,6 +43,7 @@ def test_a_law_below_a_nutation_is_told_with_the_nutation():
     assert min(abs(np.degrees(np.arcsin(edge)) - 2.5) for edge in edges) < 0.06
 
 
+@pytest.mark.slow
 def test_a_dent_that_hits_once_a_turn_is_found_with_its_place_and_its_blow():
     """A lever arm of 0.3 mm while a spot of the rim, 0.15 rad wide, is at the contact."""
 
@@ -54,6 +60,7 @@ def test_a_dent_that_hits_once_a_turn_is_found_with_its_place_and_its_blow():
     assert abs(-fit.values["learned.c_0"] - 3e-4 * 0.15) < 3 * fit.sigma("learned.c_0") + 0.01 * 4.5e-5
 
 
+@pytest.mark.slow
 def test_a_blow_is_an_impulse_at_an_instant():
     """1.7 mN s within 12 ms, as a soft hammer gives them; frames begin 2 ms after the motion."""
     impulse = np.array([1.5e-3, -0.8e-3, 0.0])
@@ -75,6 +82,7 @@ def test_a_blow_is_an_impulse_at_an_instant():
     assert len(result.verdict_text) < 400
 
 
+@pytest.mark.slow
 def test_a_force_that_grows_with_time_is_found_with_its_size_and_its_direction():
     """Known effects and a force that turns with the face come near it, and leave a memory of p = 1e-80."""
     growing = np.array([1.2e-3, -3.8e-3, 0.0])  # [N/s]
@@ -90,6 +98,7 @@ def test_a_force_that_grows_with_time_is_found_with_its_size_and_its_direction()
     assert_sized(result.diagnosis.after, {f"learned.c_0_{2 + i}": half * growing[i] for i in (0, 1)}, 3)
 
 
+@pytest.mark.slow
 def test_a_law_takes_the_place_of_those_that_stand_in_for_it_and_of_no_other():
     """A spring that grows with the distance, 40 N/m^2: as a linear one with an inertia and a yielding table, at noise.
 
@@ -112,6 +121,7 @@ def test_a_law_takes_the_place_of_those_that_stand_in_for_it_and_of_no_other():
     assert "Missing in the model: pivoting friction" in beside.sentence
 
 
+@pytest.mark.slow
 def test_a_thread_that_twists_is_no_shaken_table():
     """Seven numbers, a frequency among them, leave noise of a moment that grows with the turn: a law leaves less."""
     made = recording("twisted_thread")
@@ -125,6 +135,7 @@ def test_a_thread_that_twists_is_no_shaken_table():
     assert np.sqrt(np.mean(result.learned.course.sigma[:, 2] ** 2)) < np.sqrt(np.mean(true[:, 2] ** 2))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "effect", "sizes"),
     [
@@ -160,6 +171,7 @@ def pulls(made, result):
     return (course.values - true) / course.sigma, true
 
 
+@pytest.mark.slow
 def test_one_friction_in_another_s_place_competes_with_laws():
     """A drag along one direction: creep leaves noise of it, and a law of the same length leaves less; both are told."""
     made = recording("drag_one_way")
@@ -169,6 +181,7 @@ def test_one_friction_in_another_s_place_competes_with_laws():
     assert np.mean(np.abs(pulls(made, result)[0]) < 3) > 0.85
 
 
+@pytest.mark.slow
 def test_a_law_that_ends_at_the_bound_of_its_shape_has_a_course():
     """A step of the table is wider than any hill of the library: its derivatives are taken inwards."""
     result = diagnose(recording("seam").trajectory)
@@ -176,6 +189,7 @@ def test_a_law_that_ends_at_the_bound_of_its_shape_has_a_course():
     assert result.learned is None or np.isfinite(result.learned.course.sigma).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "beside"),
     [("loose_ball", "rolling_classical"), ("pad", "table_shaken"), ("eddy_half", "table_shaken")],
@@ -187,3 +201,55 @@ def test_a_known_effect_that_stands_in_with_a_law_is_not_claimed(name, beside):
     assert not result.diagnosis.found
     assert any(f"[{beside}] helps the law" in note for note in result.notes)  # it does, by far more than noise
     assert np.mean(np.abs(pulls(made, result)[0]) < 3) > 0.95
+
+
+@pytest.mark.statistical
+@pytest.mark.parametrize(
+    ("name", "kind", "shape", "amount"),
+    [  # shapes as in UNKNOWN, of 20, 6 and 30 um
+        ("groove", "ridge", {"direction": 0.6, "edge": 0.05, "length": 3e-3}, -20e-6 * 3e-3),
+        ("seam", "step", {"direction": 0.9, "edge": 0.045, "length": 4e-3}, 6e-6),
+        ("bump", "hill", {"x0": float(PLACE[0]), "y0": float(PLACE[1]), "length": 8e-3}, 30e-6 * 8e-3**2),
+    ],
+)
+def test_an_uneven_table_moves_the_disc_as_the_work_of_the_load_does(name, kind, shape, amount):
+    """The oracle lets the load pay for what the contact climbs, for every direction of the angular velocity."""
+    unknown = replace(UNKNOWN[name], duration=0.2)
+    times, q, speed, _ = motion(unknown)
+    family = next(f for f in families(q, times, 500.0, DISC) if f.kind == kind)
+    formulas = replace(family, shape=shape).formulas()[0]
+    law = effect_from_formulas("uneven", {k: f"c * ({f})" for k, f in formulas.items()})
+    theta, psidot, phidot = q[0, 4], speed[0, 3], speed[0, 5]
+    start = State(*q[0, :2], *q[0, 3:], speed[0, 4], psidot * np.sin(theta), psidot * np.cos(theta) + phidot)
+    flat = Model(DISC).with_values({"km.k_m": K_M})
+    found, without = (simulate(m, start, times=times).q for m in (flat.with_effects(law(c=amount)), flat))
+    moved = np.abs(q - without).max(axis=0)
+    assert moved[2] > 1e-7
+    # as much as the two integrations, of 1e-10, differ where nothing acts
+    assert_allclose(found, q, atol=1e-3 * moved.min())
+
+
+def test_uneven_tables_are_looked_for_where_the_disc_touches():
+    """A disc of half the size: hills of the library lie on the path of its lowest point, and cover it."""
+    small = replace(DISC, radius=0.5 * DISC.radius, half_thickness=0.5 * DISC.half_thickness)
+    q = np.tile([0.02, -0.01, 0.0, 0.0, 0.3, 0.0], (200, 1))
+    q[:, 3] = np.linspace(0, 6, 200)
+    lowest = q[:, :2] + small.arm_to_contact(*nodal_axes_world(q[:, 3], q[:, 4])[1:])[:, :2]
+    hills = (f.shape for f in families(q, np.arange(200) / 500.0, 500.0, small) if f.kind == "hill")
+    places = np.array(sorted({(s["x0"], s["y0"]) for s in hills}))
+    apart = np.linalg.norm(places[:, None] - lowest, axis=2)
+    half_diagonal = 0.006 / np.sqrt(2)  # of the squares of the grid
+    assert apart.min(axis=0).max() <= half_diagonal
+    assert apart.min(axis=1).max() <= half_diagonal
+
+
+@pytest.mark.slow
+def test_a_groove_is_no_tilted_table():
+    """The tilt leaves 1.03 of the noise, with p = 0.02; a law by the place leaves noise, and is named in its stead."""
+    result = diagnose(recording("groove").trajectory)
+    assert result.learned.law.title == "a ridge or groove of the table"
+    assert not result.diagnosis.found
+    assert result.after.reduced_chi_square < 1.0
+    truth = {"learned.c_0": -6e-8, "learned.direction_0": 0.6, "learned.edge_0": 0.05}
+    assert_sized(result.diagnosis.after, truth, 4)
+    assert any("table_tilt" in note for note in result.notes)

@@ -99,30 +99,22 @@ def test_a_run_with_a_fault_that_no_shared_number_takes_is_named_with_the_fault(
 
 
 @pytest.mark.statistical
-def test_difference_in_an_effect_is_a_chi_square_and_names_nobody_by_chance(rng):
-    falls, false = [], 0
+def test_differences_in_an_effect_and_to_the_others_are_chi_squares_and_name_nobody_by_chance(rng):
+    falls, judged, false = [], [], 0
     for _ in range(40):
         system, _ = joint(runs(rng, 8))
         found = fit(system, system.base, system.sharing.start())
         falls += Blocks(system, found, system.candidates).differences(range(8)).values()
+        blocks = Blocks(system, found)
+        judged += [blocks.fits_in(i, list(range(8))) for i in range(8)]
         false += bool(apart(system, found, 0.005, candidates=system.candidates))
     falls = np.array(falls)  # (320, candidates, 2)
     assert_allclose(falls[..., 1], np.tile([1, 2, 1], (320, 1)))
     # eight of seven are free; three standard errors
     assert_allclose(falls[..., 0].mean(0) / [1, 2, 1], 1.0, atol=3 * np.sqrt(2 / 280))
-    assert false <= 3  # at most 0.4 are expected
-
-
-def test_difference_to_the_others_is_a_chi_square(rng):
-    judged = []
-    for _ in range(15):
-        system, _ = joint(runs(rng, 8))
-        blocks = Blocks(system, fit(system, system.base, system.sharing.start()))
-        judged += [blocks.fits_in(i, list(range(8))) for i in range(8)]
     assert {f.degrees for f in judged} == {1}
-    assert np.mean([f.statistic for f in judged]) == pytest.approx(
-        1.0, abs=3 * np.sqrt(2 / 105)
-    )  # eight of seven are free
+    assert np.mean([f.statistic for f in judged]) == pytest.approx(1.0, abs=3 * np.sqrt(2 / 280))
+    assert false <= 3  # at most 0.4 are expected
 
 
 def test_runs_that_declare_another_disc_have_a_rate_of_their_own(rng):

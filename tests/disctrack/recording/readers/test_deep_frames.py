@@ -71,13 +71,6 @@ def test_twelve_bits_scatter_less_than_the_same_frames_rounded_to_eight(dim, pla
     assert np.mean(errors[0] / errors[1]) < 0.75
 
 
-def test_predicted_sigmas_hold_for_twelve_bits(dim, plain):
-    found, centres = plain.trajectory, dim[3]
-    sigma = np.sqrt(np.diagonal(found.pose_covariance, axis1=1, axis2=2)[:, :3])
-    # 24 frames of 3 coordinates: chi-square / n scatters by sqrt(2 / 72) = 0.17
-    assert 0.5 < np.mean(((found.q[:, :3] - centres) / sigma) ** 2) < 1.6
-
-
 def test_clipped_light_is_told_and_light_below_it_is_not(dim):
     images, rig, disc, _ = dim
     clipped = np.minimum(images, np.uint16(0.9 * np.percentile(images, 98)))
