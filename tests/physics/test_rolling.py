@@ -122,9 +122,6 @@ def test_published_friction_stops_the_disc_in_about_one_and_a_half_seconds(k_m, 
     assert_allclose(motion.end_time, 1.5, rtol=0.08)
 
 
-K_M = 0.381e-7
-
-
 def exponents(motion, t_f, first=0.5, last=0.03):
     """(n_E, n_theta, n_psidot): slopes against t_f - t in logarithms, over last < t_f - t <= first."""
     remaining = t_f - motion.time
@@ -136,12 +133,12 @@ def exponents(motion, t_f, first=0.5, last=0.03):
 
 def to_the_end(disc):
     """Motion from 9 deg with the centre at rest to 0.02 deg, and the instant of the singularity."""
-    model = Model(disc, effects=(CATALOGUE["km"](k_m=K_M),))
+    model = Model(disc, effects=(CATALOGUE["km"](k_m=newton_euler.K_M),))
     start = steady_precession(np.radians(9), disc)
     motion = rolling.simulate(model, start, 4.0, rate=2000, theta_end=np.radians(0.02))
     assert motion.end is rolling.EndReason.NUTATION
     # what is left at 0.02 deg: 0.24 ms by (5.11)
-    rest = motion.end_state[3] ** 1.5 * disc.radius**2.5 / (K_M * (4 * 9.81) ** 1.5)
+    rest = motion.end_state[3] ** 1.5 * disc.radius**2.5 / (newton_euler.K_M * (4 * 9.81) ** 1.5)
     return motion, motion.end_time + rest
 
 

@@ -106,7 +106,6 @@ def test_nothing_is_found_in_images_of_an_independent_motion_without_an_effect(t
 
 SHAKEN = np.array([8e-6, -5e-6, 6e-6]), np.array([4e-6, 7e-6, -9e-6])  # [m] at the first frame, and a quarter later
 SHAKEN_NAMES = [f"u_{phase}_{axis}" for phase in ("cos", "sin") for axis in "xyz"]
-LEANING, LEANS = tilted(0.002, -1.0)
 CASES = {  # what is hidden, and how: in the body and its laws, and in the measurement
     "pivoting friction": ({"kz": {"k_z": 6e-5}}, of_the_paper(newton_euler.pivoting_friction(6e-5))),
     "rolling moment": (
@@ -115,7 +114,8 @@ CASES = {  # what is hidden, and how: in the body and its laws, and in the measu
     "centre of mass": ({"centre_of_mass": {"c_1": 7e-5, "c_2": -7e-5}}, of_the_paper(com_body=(7e-5, -7e-5, 0.0))),
     "frame rate": ({"frame_rate": {"change": 0.012}}, of_the_paper(), Faults(frame_rate_hz=404.8)),
     "tilt and a late camera": (
-        LEANS | {"time_offset": {"delay": 2e-4}}, of_the_paper(**LEANING), Faults(right_delay_s=2e-4)
+        tilted(0.002, -1.0)[1] | {"time_offset": {"delay": 2e-4}}, of_the_paper(**tilted(0.002, -1.0)[0]),
+        Faults(right_delay_s=2e-4),
     ),
     "pivoting friction and an unbalanced disc": (
         {"kz": {"k_z": 3e-5}, "centre_of_mass": {"c_1": 5e-5, "c_2": 3e-5}},
