@@ -18,9 +18,8 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ProcessPoolExecutor, ThreadPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
-from multiprocessing.context import SpawnProcess
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ThreadPoolExecutor, wait
+from multiprocessing.connection import Connection
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING
@@ -32,7 +31,7 @@ from disctrack.batch.plan import Job
 from disctrack.batch.records import BUSY, FAILED, Record, failed
 from disctrack.errors import ClusterError, reason_of
 from disctrack.findings import Kind
-from disctrack.processes import Spawn, end_with_parent, quietly
+from disctrack.processes import Spawn, end_with_parent
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -116,13 +115,13 @@ def _result(future: Future[Record]) -> Record:
 
 
 class Processes:
-    """Processes of this machine, a thread for each, with an executor of its own: it is clear whose job broke it."""
+    """Processes of this machine, a thread for each, which gives it one job after the other."""
 
     def __init__(self, size: int) -> None:
         self.size: float = size
         self._threads = ThreadPoolExecutor(size, thread_name_prefix="batch")
         self._own = threading.local()  # the process of a thread
-        self._workers: list[_Worker] = []
+        self._context = Spawn()
         self._ends = False
         self._folder = tempfile.TemporaryDirectory(prefix="disctrack-")
         self._said = (Path(self._folder.name) / str(i) for i in itertools.count())
@@ -133,29 +132,21 @@ class Processes:
 
     def done(self, job: Job) -> Record:
         """Do a job in this thread's process."""
-        worker: _Worker | None = getattr(self._own, "worker", None)
-        if worker is None:
-            worker = self._own.worker = _Worker(next(self._said))
-            self._workers.append(worker)
-        try:
-            if self._ends:
-                raise Died("the batch ended")
-            return worker.begin(job).result()
-        except BrokenProcessPool as error:
-            raise Died(worker.why_it_ended()) from error
-        finally:
-            if worker.process is None:
-                self._own.worker = None
+        if self._ends:
+            raise Died("the batch ended")
+        worker: _Worker = getattr(self._own, "worker", None) or _Worker(self._context, next(self._said))
+        self._own.worker = None
+        record = worker.done(job)
+        self._own.worker = worker
+        return record
 
     def close(self) -> None:
         """End in order what still runs."""
         until = time.monotonic() + _STOPPING
         self._ends = True
         self._threads.shutdown(wait=False, cancel_futures=True)
-        for worker in self._workers:
-            worker.executor.shutdown(wait=False, cancel_futures=True)
         # asked once each: it may end by itself at any moment
-        living = [process for worker in self._workers if (process := worker.process) is not None]
+        living = [process for process in self._context.started if process.is_alive()]
         for process in living:
             process.terminate()
         for process in living:
@@ -222,27 +213,28 @@ def do_alone(job: Job) -> Record:
 class _Worker:
     """One process that does jobs one after the other."""
 
-    def __init__(self, said: Path) -> None:
-        """Said : file for whatever its libraries print"""
-        context = Spawn()
-        with quietly():  # with the first one Python starts its process that clears up semaphores
-            self.executor = ProcessPoolExecutor(1, context, _prepare, (said,))
-        self._context, self._said = context, said
+    def __init__(self, context: Spawn, said: Path) -> None:
+        """Said : file for whatever its libraries print. Raises OSError where the process cannot be started."""
+        self._said = said
+        self._jobs, its_end = context.Pipe()
+        self.process = context.Process(target=_work, args=(its_end, said))
+        self.process.start()
+        its_end.close()  # with the process its own goes, too: that ends what waits for an answer
 
-    @property
-    def process(self) -> SpawnProcess | None:
-        """Of the executor, where it lives."""
-        return next((process for process in self._context.started if process.is_alive()), None)
-
-    def begin(self, job: Job) -> Future[Record]:
-        """Give it a job. Raises OSError where the process cannot be started, BrokenProcessPool where it has died."""
-        return self.executor.submit(_do, job)
+    def done(self, job: Job) -> Record:
+        """Record of a job. Raises Died."""
+        try:
+            self._jobs.send(job)
+            record: Record = self._jobs.recv()
+        except (EOFError, ConnectionError) as error:
+            raise Died(self.why_it_ended()) from error
+        return record
 
     def why_it_ended(self) -> str:
         """Signal or exit code, and the last that it said."""
-        self.executor.shutdown()
+        self.process.join()
         said = self._said.read_text("utf-8", "replace").split() if self._said.exists() else []
-        code = self._context.started[0].exitcode
+        code = self.process.exitcode
         if code == -getattr(signal, "SIGKILL", 9):
             text = (
                 "its process was killed (signal 9), as the system does when memory runs out. Run fewer side by side "
@@ -255,7 +247,7 @@ class _Worker:
         return f"{text} It said: {' '.join(said)[-300:]}" if said else text
 
 
-def _prepare(said: Path) -> None:
+def _work(jobs: Connection, said: Path) -> None:
     """In a new process: what its libraries print goes into a file, and it ends with the batch that started it."""
     signal.signal(signal.SIGTERM, _stop)
     output = os.open(said, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
@@ -263,17 +255,14 @@ def _prepare(said: Path) -> None:
         os.dup2(output, stream)
     cv2.setNumThreads(1)  # the others have the cores
     end_with_parent()
+    try:
+        while True:
+            jobs.send(do(jobs.recv()))
+    except SystemExit:  # half-written files are gone
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        signal.raise_signal(signal.SIGTERM)
 
 
 def _stop(number: int, frame: FrameType | None) -> None:
     """Leave by way of the blocks that remove half-written files."""
     sys.exit(128 + number)
-
-
-def _do(job: Job) -> Record:
-    try:
-        return do(job)
-    except SystemExit:  # half-written files are gone; the executor would keep the process
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
-        signal.raise_signal(signal.SIGTERM)
-        raise

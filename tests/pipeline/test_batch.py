@@ -15,6 +15,7 @@ import sys
 import threading
 import time
 from concurrent.futures import Future
+from multiprocessing.context import SpawnProcess
 from pathlib import Path
 from urllib.parse import unquote
 
@@ -494,16 +495,15 @@ def test_processes_end_with_a_batch_that_is_killed(recording, tmp_path):
 
 @pytest.mark.statistical
 def test_a_killed_worker_is_tried_again_and_a_deadly_recording_fails_alone(day, monkeypatch):
-    begin, deaths = pool._Worker.begin, {"a": 2, "b": 1}  # how often the process is killed
+    done, deaths = pool._Worker.done, {"a": 2, "b": 1}  # how often the process is killed
 
     def deadly(self, job):
-        future = begin(self, job)
         if deaths[job.name]:
             deaths[job.name] -= 1
             self.process.kill()
-        return future
+        return done(self, job)
 
-    monkeypatch.setattr(pool._Worker, "begin", deadly)
+    monkeypatch.setattr(pool._Worker, "done", deadly)
     outcome = run_batch([day], BatchOptions(report=False), side_by_side=2)
     a, b = outcome.rows
     assert (a["status"], b["status"]) == ("failed", "measured")
@@ -515,7 +515,7 @@ def test_recordings_for_which_no_process_can_be_started_fail_with_that_reason(da
     def refused(*_, **__):
         raise OSError(errno.EAGAIN, "Resource temporarily unavailable")
 
-    monkeypatch.setattr(pool.SpawnProcess, "start", refused)
+    monkeypatch.setattr(SpawnProcess, "start", refused)
     outcome = run_batch([day], BatchOptions(report=False))
     assert [row["status"] for row in outcome.rows] == ["failed", "failed"]
     assert "no process could be started for it: Resource temporarily unavailable" in outcome.rows[0]["reason"]
