@@ -233,7 +233,8 @@ def rig_bytes(
     return sealed(buffer)
 
 
-def _put(group: h5py.Group, name: str, value: Any, row: Dataset) -> None:
+def put_array(group: h5py.Group, name: str, value: Any, row: Dataset) -> None:
+    """A dataset with its unit and description."""
     data = np.asarray(value, np.uint8 if row.kind == "u" else None)
     options = {"compression": "gzip", "shuffle": True, "fletcher32": True} if data.size > 1000 else {}
     dataset = group.create_dataset(name, data=data, **options)
@@ -246,9 +247,9 @@ def write_rig_group(group: h5py.Group, rig: StereoRig) -> None:
     group.attrs["world_is_table"] = int(rig.world_is_table)
     for name, camera in zip(CAMERA_NAMES, rig.cameras, strict=True):
         for (what, row), value in zip(_OF_CAMERA.items(), (camera.parameters, camera.image_size), strict=True):
-            _put(group, f"{name}_{what}", value, row._replace(description=f"{name} camera: {row.description}"))
+            put_array(group, f"{name}_{what}", value, row._replace(description=f"{name} camera: {row.description}"))
     for name, (values, row, attributes) in beside_cameras(rig).items():
-        _put(group, name, values, row)
+        put_array(group, name, values, row)
         group[name].attrs.update(attributes)
 
 
@@ -301,7 +302,7 @@ def _write_record(group: h5py.Group, record: CalibrationRecord) -> None:
     seen = (o.view, o.camera, o.point, o.pixels, o.covariance)
     values = {name: getattr(record, name) for name in _OF_RECORD} | dict(zip(_OF_OBSERVATIONS, seen, strict=True))
     for name, row in (_OF_RECORD | _OF_OBSERVATIONS).items():
-        _put(group, name, values[name], row)
+        put_array(group, name, values[name], row)
 
 
 # --- reading ---------------------------------------------------------------------------------------------------------

@@ -2,7 +2,8 @@
 """The command line: a shell round the stages, and the one place where an error becomes a line and an exit code.
 
 A new subcommand is a line in COMMANDS, its arguments in `disctrack.commands.options`, and a module of its name in
-`disctrack.commands` with `run(arguments) -> exit code`, which is imported only when it is called.
+`disctrack.commands` with `run(arguments) -> exit code`, or nothing where all is done; it is imported only when it is
+called.
 """
 
 import argparse
@@ -78,7 +79,7 @@ def _answer(words: Sequence[str], received: Sequence[int]) -> int:
         command = importlib.import_module(f"disctrack.commands.{arguments.command.replace('-', '_')}")
         with inputs_kept(), recorded_times(), catch_warnings():
             simplefilter("ignore", DoubtWarning)  # reports say it
-            return int(command.run(arguments))
+            return int(command.run(arguments) or DONE)
     except KeyboardInterrupt:
         return _say_interrupted(received)
     except BrokenPipeError:  # the reader of our output has gone: `disctrack ... | head`

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from calibration.kit.arrays import Array, evenly
 from disctrack.analyse.analysis import Analysis
+from disctrack.files.json_text import plain
 from disctrack.findings import carried
 from disctrack.report.blocks import Markup, Report, Text
 from disctrack.report.html import page
@@ -122,9 +123,7 @@ def _in_words(q: Array) -> str:
 
 def _plain(values: Array, digits: int) -> object:
     """Nested lists, rounded; None for NaN."""
-    rounded = np.round(np.asarray(values, float), digits).astype(object)
-    rounded[~np.isfinite(rounded.astype(float))] = None
-    return rounded.tolist()
+    return plain(np.round(np.asarray(values, float), digits))
 
 
 def _pictures(rows: NDArray[np.intp], drawn: Drawn) -> list[dict[str, Any]]:

@@ -63,10 +63,9 @@ def is_done(folder: Path, record: Record | None, asked: Stages) -> bool:
     """
     if record is None or record.status != MEASURED or "trajectory" not in record.files:
         return False
-    for stage, value in asked.items():
-        made = record.stages.get(stage)
-        if made != value and not (value is False and made is True):
-            return False
+    made = [(record.stages.get(stage), value) for stage, value in asked.items()]
+    if not all(there == value or (value is False and there is True) for there, value in made):
+        return False
     if not all((folder / file).is_file() for file in record.files.values()):
         return False
     try:

@@ -54,8 +54,8 @@ def _on_the_disk(folder: Path, results: Path) -> Record:
 
 def _if_stale(folder: Path, results: Path, record: Record) -> Record:
     """The record, with a reason where the declaration is no longer the one that was measured."""
-    measured = read_provenance(results / record.files["trajectory"]).settings.get("recording")
-    changed = changed_since(folder, measured) if isinstance(measured, dict) else ""
+    measured = read_provenance(results / record.files["trajectory"]).declared
+    changed = changed_since(folder, measured) if measured else ""
     stale = f"{FILE_NAME} has changed: {changed}; the batch without --summary-only measures it anew" if changed else ""
     return dataclasses.replace(record, reason="; ".join(filter(None, [stale, record.reason])))
 

@@ -1,4 +1,4 @@
-"""One module per subcommand of `disctrack`, with `run(arguments) -> exit code`; what it may be given: `options`."""
+"""One module per subcommand, with `run(arguments) -> exit code` (or nothing: DONE); what it may be given: `options`."""
 
 DONE = 0
 FAILED = 1  # nothing was written; the reason is on stderr

@@ -8,7 +8,6 @@ import time
 from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
 
 from numpy.typing import NDArray
 
@@ -64,7 +63,7 @@ def track_into(
 
     def changed(made: Provenance) -> str:
         now = json.loads(json.dumps(recording.declared, default=str))
-        found = told_differences(now, _declared(made))
+        found = told_differences(now, made.declared)
         return f"{FILE_NAME}: {found}" if found else ""
 
     provenance = trajectory_provenance(recording, rig, pairs, settings)
@@ -82,12 +81,6 @@ def track_into(
     )
 
 
-def _declared(made: Provenance) -> dict[str, Any]:
-    """The declaration that a trajectory was measured with."""
-    kept = made.settings.get("recording")
-    return dict(kept) if isinstance(kept, dict) else {}
-
-
 def recording_of(trajectory: Path) -> Path | None:
     """The folder of the recording in whose folder or results a trajectory lies."""
     return next((place for place in trajectory.absolute().parents[:2] if (place / FILE_NAME).is_file()), None)
@@ -96,7 +89,7 @@ def recording_of(trajectory: Path) -> Path | None:
 def tell_stale(trajectory: Path) -> None:
     """Say on stderr where the recording.toml beside a trajectory is no longer the one that it was measured with."""
     folder = recording_of(trajectory)
-    kept = _declared(read_provenance(trajectory))
+    kept = read_provenance(trajectory).declared
     changed = changed_since(folder, kept) if folder is not None and kept else ""
     if folder is not None and changed:
         place = relative(folder)

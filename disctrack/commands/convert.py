@@ -2,12 +2,11 @@
 
 import argparse
 
-from disctrack.commands import DONE
 from disctrack.trajectory.exchange.formats import convert
 
 
-def run(arguments: argparse.Namespace) -> int:
-    """Convert; returns the exit code."""
+def run(arguments: argparse.Namespace) -> None:
+    """Convert."""
     found = convert(
         arguments.source,
         arguments.target,
@@ -21,4 +20,3 @@ def run(arguments: argparse.Namespace) -> int:
     print(f"{'written':<13} {', '.join(str(path) for path in found.paths)}")
     for note in found.notes:
         print(f"{'note':<13} {note}")
-    return DONE

@@ -2,14 +2,13 @@
 
 import argparse
 
-from disctrack.commands import DONE
 from disctrack.commands.options import UNKNOWN_TO_FILES
 from disctrack.files.toml_tree import toml_value
 from disctrack.first_look.declare import run_init
 
 
-def run(arguments: argparse.Namespace) -> int:
-    """Look, write, and tell what is left to fill in; returns the exit code."""
+def run(arguments: argparse.Namespace) -> None:
+    """Look, write, and tell what is left to fill in."""
     known = {key: getattr(arguments, key) for key in UNKNOWN_TO_FILES if getattr(arguments, key) is not None}
     done = run_init(arguments.folder, known, arguments.like)
     rows = [(s, f"{key} = {toml_value(value)}  {remark}".rstrip()) for (s, key), (value, remark) in done.told.items()]
@@ -17,4 +16,3 @@ def run(arguments: argparse.Namespace) -> int:
     rows += [("fill in", ", ".join(done.missing))] if done.missing else []
     for heading, text in (*rows, ("then", f"disctrack check {arguments.folder}")):
         print(f"{heading:<13} {text}")
-    return DONE

@@ -4,19 +4,17 @@ import argparse
 import webbrowser
 from pathlib import Path
 
-from disctrack.commands import DONE
 from disctrack.errors import OutputError
 
 FOLDERS = ("results", "batch_results", ".")  # of a recording, of a batch, or the results themselves
 PAGES = ("index.html", "*_analysis/report.html", "*_diagnosis/diagnosis.html", "report.html", "diagnosis.html")
 
 
-def run(arguments: argparse.Namespace) -> int:
-    """Open it and print its path; returns the exit code."""
+def run(arguments: argparse.Namespace) -> None:
+    """Open it and print its path."""
     page = last_page(arguments.recording)
     webbrowser.open(page.resolve().as_uri())
     print(page)
-    return DONE
 
 
 def last_page(folder: Path) -> Path:

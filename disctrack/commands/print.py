@@ -2,7 +2,6 @@
 
 import argparse
 
-from disctrack.commands import DONE
 from disctrack.commands import _outputs as outputs
 from disctrack.disc import MA_2014
 from disctrack.files.whole import refuse_existing
@@ -10,8 +9,8 @@ from disctrack.first_look.targets import board_figure, dots_figure, write_sheet
 from disctrack.recording.declaration import read_recording
 
 
-def run(arguments: argparse.Namespace) -> int:
-    """Draw both sheets, and say what to declare of them; returns the exit code."""
+def run(arguments: argparse.Namespace) -> None:
+    """Draw both sheets, and say what to declare of them."""
     disc, corners, square_mm = MA_2014, (9, 6), 10.0
     if arguments.recording is not None:
         recording = read_recording(arguments.recording)
@@ -32,4 +31,3 @@ def run(arguments: argparse.Namespace) -> int:
     print(f"{'declare':<13} [markers] diameter_mm = {1e3 * disc.marker_diameter:g}")
     print(f"{'':<13} centres_mm = [{centres}]")
     print(f"{'':<13} [calibration] inner_corners = [{corners[0]}, {corners[1]}], square_mm = {square_mm:g}")
-    return DONE

@@ -6,24 +6,22 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from disctrack.commands import DONE
 from disctrack.errors import SceneError
 from disctrack.synthetic import run_render
 from disctrack.synthetic.description import Scene, load_scene, scene_toml
 from disctrack.synthetic.motion import effects_in_words
 
 
-def run(arguments: argparse.Namespace) -> int:
-    """Render, write, and say what; returns the exit code."""
+def run(arguments: argparse.Namespace) -> None:
+    """Render, write, and say what."""
     if arguments.defaults:
         print(scene_toml(Scene()), end="")
-        return DONE
+        return
     if arguments.scene is None:
         raise SceneError("no scene given: name a TOML file, or ask for one with --defaults")
 
     folder = arguments.output or arguments.scene.parent / arguments.scene.stem
     rendered(arguments.scene, folder, arguments.truth, arguments.quiet)
-    return DONE
 
 
 def rendered(file: Path, folder: Path, truth_file: Path | None, quiet: bool) -> None:

@@ -3,15 +3,13 @@
 import argparse
 from pathlib import Path
 
-from disctrack.commands import DONE
 from disctrack.commands.render import rendered
 from disctrack.synthetic import description
 
 SCENE = Path(description.__file__).with_name("sample.toml")
 
 
-def run(arguments: argparse.Namespace) -> int:
-    """Render it; returns the exit code."""
+def run(arguments: argparse.Namespace) -> None:
+    """Render it."""
     rendered(SCENE, arguments.folder, None, arguments.quiet)
     print(f"next: disctrack run {arguments.folder}")
-    return DONE

@@ -2,17 +2,16 @@
 
 import argparse
 
-from disctrack.commands import DONE
 from disctrack.errors import SceneError
 from disctrack.rolling.effects import catalogue_table
 from disctrack.synthetic.simulation import run_simulate
 
 
-def run(arguments: argparse.Namespace) -> int:
-    """Simulate, write, and say how the motion went; returns the exit code."""
+def run(arguments: argparse.Namespace) -> None:
+    """Simulate, write, and say how the motion went."""
     if arguments.list_effects:
         print(catalogue_table(), end="")
-        return DONE
+        return
     if arguments.scene is None:
         raise SceneError("no scene given: name a TOML file, or ask for the effects with --list-effects")
 
@@ -21,4 +20,3 @@ def run(arguments: argparse.Namespace) -> int:
         arguments.scene, output, duration=arguments.duration, rate=arguments.rate, overwrite=arguments.overwrite
     )
     print(done.summary)
-    return DONE

@@ -12,7 +12,6 @@ from calibration.board import corner_fit
 from calibration.fit import normal_equations
 from calibration.kit.compiled import FOLDER
 from disctrack import rolling
-from disctrack.commands import DONE
 from disctrack.discrepancy.equations import _ode_kernel
 from disctrack.progress import compiling
 from disctrack.recording.readers import _pixel_kernels
@@ -20,8 +19,8 @@ from disctrack.synthetic import raster
 from disctrack.track.follow.tracking import prepare
 
 
-def run(arguments: argparse.Namespace) -> int:
-    """Compile the inner loops of all stages, in two processes; returns the exit code."""
+def run(arguments: argparse.Namespace) -> None:
+    """Compile the inner loops of all stages, in two processes."""
     # with the seconds of processor time that each took where it was measured
     parts: list[tuple[str, int, list[Callable[[], object]]]] = [
         ("tracking", 40, [partial(prepare, kind) for kind in (np.uint8, np.uint16)]),
@@ -35,7 +34,6 @@ def run(arguments: argparse.Namespace) -> int:
         for part in [pool.submit(_compiled, *part) for part in parts]:
             part.result()
     print(f"inner loops are compiled: kept in {FOLDER}")
-    return DONE
 
 
 def _compiled(what: str, seconds: int, functions: Sequence[Callable[[], object]]) -> None:

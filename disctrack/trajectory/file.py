@@ -65,6 +65,12 @@ class Provenance(Outline):
     version: str = field(default_factory=software_version)
 
     @property
+    def declared(self) -> dict[str, Any]:
+        """What recording.toml said; empty where it is not kept."""
+        kept = self.settings.get("recording")
+        return dict(kept) if isinstance(kept, dict) else {}
+
+    @property
     def fingerprint(self) -> str:
         """SHA-256 (hex) of inputs, settings and version."""
         content = {"inputs": dict(self.inputs), "settings": dict(self.settings), "version": self.version}
