@@ -16,6 +16,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.cameras.camera import N_RIG
 from calibration.kit.arguments import checked
 from calibration.kit.arrays import Array, Mask
 from calibration.kit.brief import Outline
@@ -335,28 +336,18 @@ def _smoothed(samples: _Samples, processes: tuple[Process, ...]) -> tuple[Array,
     for group, process in zip(CHANNEL_GROUPS, processes, strict=True):
         scale[list(group)] = np.sqrt(process.noise_scale)
     noise = samples.covariance * np.outer(scale, scale)
-    out = (
-        np.empty((n, 3, 6)),
-        np.empty((n, 3, 3)),
-        np.empty((n, 18, 18)),
-        np.empty((n, 18, samples.sensitivity.shape[2])),
-    )
+    out = np.empty((n, 3, 6)), np.empty((n, 3, 3)), np.empty((n, 18, 18)), np.empty((n, 18, N_RIG))
     for first in range(0, n, FRAMES_AT_ONCE):  # the windows of all frames at once would be larger than all the rest
         rows = np.arange(first, min(first + FRAMES_AT_ONCE, n))
-        weights, prior, unknown = _weights_and_prior(samples, processes, half, rows)
-        for whole, found in zip(out, _smoothed_rows(samples, noise, rows, weights, half), strict=True):
+        for whole, found in zip(out, _smoothed_rows(samples, noise, processes, half, rows), strict=True):
             whole[rows] = found
-            whole[rows[unknown]] = np.nan
-        for channel in range(6):
-            entries = channel + 6 * np.arange(3)
-            out[2][rows[:, None, None], entries[:, None], entries] += prior[:, channel]
     return out
 
 
-def _weights_and_prior(
-    samples: _Samples, processes: tuple[Process, ...], half: int, rows: NDArray[np.int64]
-) -> tuple[Array, Array, Mask]:
-    """For k rows: weights (k, 6, 3, w), prior covariance (k, 6, 3, 3), True where that leaves too much open."""
+def _smoothed_rows(
+    samples: _Samples, noise: Array, processes: tuple[Process, ...], half: int, rows: NDArray[np.int64]
+) -> tuple[Array, Array, Array, Array]:
+    """Some frames from the samples round them, by weights (k, 6, 3, w) and what these leave open (k, 6, 3, 3)."""
     k = len(rows)
     weights, prior = np.zeros((k, 6, 3, 2 * half + 1)), np.zeros((k, 6, 3, 3))
     unknown = np.zeros(k, bool)
@@ -367,13 +358,6 @@ def _weights_and_prior(
         weights[:, channels], prior[:, channels] = W[:, None], P[:, None]
         open_fraction = P[:, 1, 1] * process.length[rows] ** 2 / process.amplitude2[rows]
         unknown |= ~np.isfinite(open_fraction) | (~samples.good[rows] & (open_fraction > KNOWN_FRACTION))
-    return weights, prior, unknown
-
-
-def _smoothed_rows(
-    samples: _Samples, noise: Array, rows: NDArray[np.int64], weights: Array, half: int
-) -> tuple[Array, Array, Array, Array]:
-    """Apply the weights (k, 6, 3, w) of some frames to the samples round them."""
     window = np.clip(rows[:, None] + np.arange(-half, half + 1), 0, len(samples.ticks) - 1)
     R = samples.R[rows]
     for _ in range(2):  # the second time relative to the smoothed pose itself, where s and the rotation vector agree
@@ -383,14 +367,18 @@ def _smoothed_rows(
     noise_window = gain @ noise[window] @ gain.swapaxes(-1, -2)
     data = np.concatenate([samples.position[window], s], axis=-1)
     state = np.einsum("kcow,kwc->koc", weights, data)
-    covariance = np.empty((len(rows), 3, 6, 3, 6))  # order and channel, as STATE
+    covariance = np.empty((k, 3, 6, 3, 6))  # order and channel, as STATE
     for c in range(6):
         for d in range(c, 6):
             block = (weights[:, c] * noise_window[..., c, d][:, None]) @ weights[:, d].swapaxes(1, 2)
             covariance[:, :, c, :, d] = block
             covariance[:, :, d, :, c] = block.swapaxes(1, 2)
+        covariance[:, :, c, :, c] += prior[:, c]
     sensitivity = np.stack([weights[:, c] @ samples.sensitivity[window, c] for c in range(6)], axis=2)
-    return state, R, covariance.reshape(-1, 18, 18), sensitivity.reshape(len(rows), 18, -1)
+    found = state, R, covariance.reshape(-1, 18, 18), sensitivity.reshape(k, 18, -1)
+    for values in found:
+        values[unknown] = np.nan
+    return found
 
 
 def _rates_of_turned_frame(sensitivity: Array, omega_world: Array, alpha_world: Array) -> None:
