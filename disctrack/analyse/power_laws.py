@@ -22,7 +22,7 @@ from calibration.kit.brief import Outline
 from disctrack.analyse.derivatives import MIN_FRAMES
 from disctrack.disc import Disc, nutation_frequency, precession_rate
 from disctrack.errors import ModelError
-from disctrack.numbers import measured
+from disctrack.numbers import Measured
 
 # (name, n_theta): the power lost goes with theta^a on slow steady precession, n_theta = 1 / (1 - a), n_E = n_theta,
 # n_psidot = -n_theta / 2
@@ -45,15 +45,11 @@ NAN = float("nan")
 
 
 @dataclass(frozen=True)
-class Exponent:
+class Exponent(Measured):
     """One fitted exponent."""
 
     value: float = NAN
-    sigma: float = NAN
     half: float = NAN  # of the 95 % confidence interval
-
-    def __str__(self) -> str:
-        return measured(self.value, self.sigma)
 
     @property
     def low(self) -> float:
@@ -249,7 +245,7 @@ def _judged(fit: _Fit, ln_energy: Array) -> PowerLaws:
     quantile = float(stdtrit(max(2.0, fit.period.max() + 1 - 4.0), 0.975))
 
     def exponent(value: float, sigma: float) -> Exponent:
-        return Exponent(float(value), float(sigma), float(quantile * sigma))
+        return Exponent(float(value), float(sigma), half=float(quantile * sigma))
 
     of_energy, energy_at_1s = Exponent(), NAN
     if np.isfinite(ln_energy).all():

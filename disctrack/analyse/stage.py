@@ -88,7 +88,14 @@ def write_analysis(path: Path, analysis: Analysis) -> None:
     first = int(np.searchsorted(file_time, analysis.motion.time[0] - 1e-9))
 
     def whole(variables: dict[str, Variable]) -> dict[str, Variable]:
-        return {name: _at_full_length(item, len(file_time), first) for name, item in variables.items()}
+        """Those of the frames from `first` on as those of all frames of the file."""
+        found = {}
+        for name, item in variables.items():
+            data = np.asarray(item.data)
+            of_all = np.full((len(file_time), *data.shape[1:]), np.nan if data.dtype.kind == "f" else 0, data.dtype)
+            of_all[first : first + len(data)] = data
+            found[name] = replace(item, data=of_all)
+        return found
 
     onset, circle, energy = analysis.contact.onset, analysis.contact.circle, analysis.energy
     groups: dict[str, Group] = {
@@ -128,16 +135,6 @@ def write_analysis(path: Path, analysis: Analysis) -> None:
     what = "position, rotation vector, velocity, angular velocity, acceleration, angular acceleration; world axes"
     axes |= {name: Variable(np.array(STATE), (name,), "1", what) for name in ("state", "state_2")}
     write_groups(path, groups, axes=axes)
-
-
-def _at_full_length(item: Variable, n: int, first: int) -> Variable:
-    """A variable of frames first.. as one of all n frames of the file."""
-    data = np.asarray(item.data)
-    if item.dims[0] != "time" or len(data) == n:
-        return item
-    out = np.full((n, *data.shape[1:]), np.nan if data.dtype.kind == "f" else 0, data.dtype)
-    out[first : first + len(data)] = data
-    return replace(item, data=out)
 
 
 def _series_variables(series: Sequence[DerivedSeries]) -> dict[str, Variable]:

@@ -12,7 +12,6 @@ from filelock import Timeout
 from calibration.rig_file import read_rig
 from disctrack.analyse.analysis import Analysis, analyse
 from disctrack.analyse.stage import run_analyse, write_analysis
-from disctrack.batch.columns import Row
 from disctrack.batch.locks import locked
 from disctrack.batch.numbers import analysed_numbers, diagnosed_numbers, friction_numbers, tracked_numbers
 from disctrack.batch.plan import Job
@@ -34,7 +33,7 @@ from disctrack.files.json_text import plain
 from disctrack.files.whole import write_whole
 from disctrack.findings import Kind, leading
 from disctrack.progress import recorded_times, timed
-from disctrack.recording.declaration import Recording, read_recording
+from disctrack.recording.declaration import read_recording
 from disctrack.track.measurement import measure, open_pairs, trajectory_provenance
 from disctrack.trajectory import Trajectory
 from disctrack.trajectory.file import Details, Provenance
@@ -77,17 +76,13 @@ def make_recording(job: Job) -> Record:
         try:
             return _make_recording(job, results)
         except Exception as error:
-            record = failed(reason_of(error), _kind_of(error))
+            kind = Kind.OTHER
+            if isinstance(error, TrackingError):
+                kind = error.findings[0].kind if error.findings else Kind.DISC_NOT_FOUND
+            record = failed(reason_of(error), kind)
             with contextlib.suppress(DiscTrackError):  # or else the batch that runs now is the only one to know
                 write_record(results, record)
             return record
-
-
-def _kind_of(error: Exception) -> Kind:
-    """What a recording could not be measured for."""
-    if not isinstance(error, TrackingError):
-        return Kind.OTHER
-    return error.findings[0].kind if error.findings else Kind.DISC_NOT_FOUND
 
 
 def _make_recording(job: Job, results: Path) -> Record:
@@ -107,10 +102,17 @@ def _make_recording(job: Job, results: Path) -> Record:
         if record is not None and is_done(results, record, job.options.stages):
             return dataclasses.replace(record, status=SKIPPED)
         record = _after_tracking(results, path, trajectory, provenance, job)
-    numbers = record.numbers | _origin(recording, provenance)
-    numbers |= {"rig": job.rig, "seconds": round(time.perf_counter() - began, 3)}
-    numbers |= {"processor_seconds": round(time.process_time() - used, 3)}
-    numbers |= {f"processor_seconds_{t.stage}": t.processor_seconds for t in times}
+    numbers = record.numbers | {f"processor_seconds_{t.stage}": t.processor_seconds for t in times}
+    numbers |= {
+        "name": recording.name,
+        "repeats": group_of(recording),
+        "rig": job.rig,
+        "input_sha256": hashlib.sha256(json.dumps(dict(provenance.inputs), sort_keys=True).encode()).hexdigest(),
+        "fingerprint": provenance.fingerprint,
+        "version": provenance.version,
+        "seconds": round(time.perf_counter() - began, 3),
+        "processor_seconds": round(time.process_time() - used, 3),
+    }
     record = dataclasses.replace(record, numbers=plain(numbers))
     write_record(results, record)
     return record
@@ -153,14 +155,3 @@ def _analyse(path: Path, trajectory: Trajectory, job: Job) -> tuple[Analysis, Pa
     analysis = analyse(trajectory, job.options.window)
     write_analysis(path, analysis)
     return analysis, None
-
-
-def _origin(recording: Recording, provenance: Provenance) -> Row:
-    inputs = json.dumps(dict(provenance.inputs), sort_keys=True).encode()
-    return {
-        "name": recording.name,
-        "repeats": group_of(recording),
-        "input_sha256": hashlib.sha256(inputs).hexdigest(),
-        "fingerprint": provenance.fingerprint,
-        "version": provenance.version,
-    }

@@ -89,14 +89,9 @@ def _job(found: FoundRecordings, recording: Recording, name: str, options: Batch
     results = found.results(folder)
     if recording.rig_file is not None:
         return Job("recording", name, str(folder), str(results), str(recording.rig_file), options)
-    rig = _shared_rig(found, recording, options)
-    earlier = str(results / "rig.h5")
+    # named by the content of all that it depends on
+    made_from = source_of(recording, options.calibration).provenance.fingerprint[:16]
+    rig, earlier = found.common / "rigs" / made_from / "rig.h5", str(results / "rig.h5")
     job = rigs.get(str(rig)) or Job("rig", name, str(folder), str(rig.parent), str(rig), options)
     rigs[str(rig)] = dataclasses.replace(job, adopt=(*job.adopt, earlier))
     return Job("recording", name, str(folder), str(results), str(rig), options)
-
-
-def _shared_rig(found: FoundRecordings, recording: Recording, options: BatchOptions) -> Path:
-    """The file of the rig, named by the content of all that it depends on."""
-    provenance = source_of(recording, options.calibration).provenance
-    return found.common / "rigs" / provenance.fingerprint[:16] / "rig.h5"

@@ -5,6 +5,7 @@ As tables 2 and 3 of Ma et al. (2014), with what the paper leaves open: how much
 
 from collections.abc import Sequence
 from itertools import groupby
+from operator import itemgetter
 
 import numpy as np
 from scipy.special import gammaincc
@@ -37,16 +38,13 @@ def group_of(recording: Recording) -> str:
 def repeats_of(rows: Sequence[Row]) -> list[Row]:
     """Rows of REPEATS, one for each number that two or more recordings of a group determine."""
     different = {row["input_sha256"]: row for row in reversed(rows) if row["repeats"]}  # the first of each
-    grouped = groupby(sorted(different.values(), key=_group), key=_group)
+    group_in = itemgetter("repeats")
+    grouped = groupby(sorted(different.values(), key=group_in), key=group_in)
     found = []
     for group, alike in grouped:
         members = list(alike)
         found += [_spread(group, fitted, members) for fitted in FITTED if fitted.repeated]
     return [row for row in found if row["n"] > 1]
-
-
-def _group(row: Row) -> str:
-    return str(row["repeats"])
 
 
 def _spread(group: str, fitted: Fitted, rows: Sequence[Row]) -> Row:

@@ -42,6 +42,7 @@ def rows_of(found: FoundRecordings, records: Mapping[str, Record]) -> list[Row]:
 
 
 def _on_the_disk(folder: Path, results: Path) -> Record:
+    """With a reason where the declaration is no longer the one that was measured."""
     record = read_record(results)
     if record is None:
         return Record(NOT_MEASURED, "not measured yet, or by another shard that has not come to it")
@@ -49,32 +50,18 @@ def _on_the_disk(folder: Path, results: Path) -> Record:
         return record
     if not is_done(results, record, {}):
         return Record(NOT_MEASURED, "its files are not those that were measured, or not all there")
-    return _if_stale(folder, results, dataclasses.replace(record, status=SKIPPED))
-
-
-def _if_stale(folder: Path, results: Path, record: Record) -> Record:
-    """The record, with a reason where the declaration is no longer the one that was measured."""
     measured = read_provenance(results / record.files["trajectory"]).declared
     changed = changed_since(folder, measured) if measured else ""
     stale = f"{FILE_NAME} has changed: {changed}; the batch without --summary-only measures it anew" if changed else ""
-    return dataclasses.replace(record, reason="; ".join(filter(None, [stale, record.reason])))
+    return dataclasses.replace(record, status=SKIPPED, reason="; ".join(filter(None, [stale, record.reason])))
 
 
 def _row(found: FoundRecordings, folder: Path, name: str, record: Record) -> Row:
-    row: Row = dict.fromkeys(COLUMNS)
-    row |= {k: v for k, v in record.numbers.items() if k in COLUMNS}
-    row |= {
-        "recording": name,
-        "status": record.status,
-        "reason": record.reason,
-        "folder": _relative(folder, found.common),
-    }
-    for what in _PATHS:
-        if what in record.files:
-            row[what] = _relative(found.results(folder) / record.files[what], found.common)
-    if row["rig"]:
-        row["rig"] = _relative(Path(row["rig"]), found.common)
-    return row
+    known: Row = {"recording": name, "status": record.status, "reason": record.reason}
+    known |= {column: value for column, value in record.numbers.items() if column in COLUMNS}
+    paths = {what: found.results(folder) / record.files[what] for what in _PATHS if what in record.files}
+    paths |= {"folder": folder} | ({"rig": Path(known["rig"])} if known.get("rig") else {})
+    return dict.fromkeys(COLUMNS) | known | {what: _relative(path, found.common) for what, path in paths.items()}
 
 
 def _relative(path: Path, folder: Path) -> str:
