@@ -81,7 +81,9 @@ def analyse(trajectory: Trajectory, window: float = WINDOW, circle_duration: flo
             "vertical are known. Name the view whose board lies on the table ([table] in recording.toml), calibrate "
             "and track again."
         )
-    trajectory = _tracked_part(trajectory)
+    looked_for = np.flatnonzero(trajectory.looked_for)
+    if looked_for.size not in (0, len(trajectory)):
+        trajectory = part(trajectory, slice(int(looked_for[0]), int(looked_for[-1]) + 1))
     motion = differentiate(trajectory)
     found = propagate(motion, rates)
     until, sense = _end_of_rolling(motion, found.value[:, 0])
@@ -107,14 +109,6 @@ def analyse(trajectory: Trajectory, window: float = WINDOW, circle_duration: flo
         nutation_count=count_nutation(psi, motion.euler[:, 1], motion.tilt_sigma, motion.disc),
         findings=of_kind(Kind.ANALYSIS, Severity.WARNING, _findings(trajectory, motion, contact)),
     )
-
-
-def _tracked_part(trajectory: Trajectory) -> Trajectory:
-    """The frames from the first to the last in which a pose was looked for."""
-    n, rows = len(trajectory), np.flatnonzero(trajectory.looked_for)
-    if rows.size in (0, n):
-        return trajectory
-    return part(trajectory, slice(int(rows[0]), int(rows[-1]) + 1))
 
 
 def _end_of_rolling(motion: MeasuredMotion, psidot: Array) -> tuple[float, float]:

@@ -1,7 +1,5 @@
 """What is kept beside each recording's results: how far they are complete, of what they were made, and their row."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -165,14 +165,10 @@ def _companions(
     if not arguments.no_video:
         video = path.with_name(f"{prefix}overlay.mp4")
         if fresh or not video.exists():
-            _write_video(video, trajectory, pairs)
+            rows = shown_rows(pairs.start, pairs.stop)
+            with progress_bar("video", len(rows), "frame") as advance:
+                write_overlay(video, ((row, pair_of(pairs, row)) for row in rows), trajectory, advance)
         yield video
-
-
-def _write_video(path: Path, trajectory: Trajectory, pairs: ImagePairs) -> None:
-    rows = shown_rows(pairs.start, pairs.stop)
-    with progress_bar("video", len(rows), "frame") as advance:
-        write_overlay(path, ((row, pair_of(pairs, row)) for row in rows), trajectory, advance)
 
 
 def pair_of(pairs: ImagePairs, row: int) -> NDArray:

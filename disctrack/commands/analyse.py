@@ -2,6 +2,7 @@
 
 import argparse
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from numpy.typing import NDArray
@@ -14,8 +15,9 @@ from disctrack.errors import RecordingError
 from disctrack.files.whole import write_whole
 from disctrack.progress import steps
 from disctrack.recording.declaration import read_recording
-from disctrack.track.measurement import open_pairs
+from disctrack.track.measurement import ImagePairs, open_pairs
 from disctrack.track.video_overlay import draw_pair
+from disctrack.trajectory import Trajectory
 from disctrack.trajectory.file import read_provenance, trajectory_in
 from disctrack.trajectory.reuse import origin_of, reusable
 
@@ -48,26 +50,22 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _write_motion_page(page: Path, analysis: Analysis, trajectory: Path, recording: Path | None) -> None:
     """The interactive page, with pictures where the images of this trajectory are at hand."""
-    folder = recording or outputs.recording_of(trajectory)
-    pairs = None
-    if folder is not None:
-        try:
-            pairs = open_pairs(read_recording(folder))
-        except RecordingError:
-            if recording is not None:
-                raise
-    if pairs is not None and len(pairs) != len(analysis.trajectory):
-        if recording is not None:
+    folder, n = recording or outputs.recording_of(trajectory), len(analysis.trajectory)
+    drawn = None
+    try:
+        pairs = None if folder is None else open_pairs(read_recording(folder))
+        if pairs is not None and len(pairs) != n:
             raise RecordingError(
-                f"{recording}: {len(pairs)} pairs, but {trajectory} has {len(analysis.trajectory)} frames: it was "
-                "measured from another recording."
+                f"{folder}: {len(pairs)} pairs, but {trajectory} has {n} frames: it was measured from another "
+                "recording."
             )
-        pairs = None
+        drawn = None if pairs is None else partial(_drawn, analysis.trajectory, pairs)
+    except RecordingError:
+        if recording is not None:
+            raise
+    write_whole(page, motion_html(analysis, read_provenance(trajectory).recording, drawn).encode())
 
-    def drawn(row: int) -> NDArray:
-        assert pairs is not None
-        images = outputs.pair_of(pairs, row)
-        return draw_pair(images, analysis.trajectory, row)[: images.shape[1]]  # without the strip of numbers
 
-    name = read_provenance(trajectory).recording
-    write_whole(page, motion_html(analysis, name, None if pairs is None else drawn).encode())
+def _drawn(trajectory: Trajectory, pairs: ImagePairs, row: int) -> NDArray:
+    images = outputs.pair_of(pairs, row)
+    return draw_pair(images, trajectory, row)[: images.shape[1]]  # without the strip of numbers

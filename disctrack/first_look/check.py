@@ -187,7 +187,9 @@ def _motion(seen: Check, recording: Recording, rig: StereoRig, pairs: ImagePairs
             continue
         total += n
         try:
-            tracking = _track(seen, recording, rig, pairs, frames)
+            settings = TrackingSettings(first_pass=False, exposure=exposures(recording, pairs)[0])
+            reading, rate = pairs.reading(seen.not_read), recording.frame_rate
+            tracking = track(reading, frames, rig, recording.disc, rate, gravity=recording.gravity, settings=settings)
             done.append((frames, tracking))
             noticed += [*tracking.findings, *lost_pairs(tracking.trajectory)]
         except DiscTrackError as error:
@@ -227,10 +229,3 @@ def _once(findings: Iterable[Finding]) -> list[Finding]:
     for finding in sorted(findings, key=lambda f: -f.severity):
         first.setdefault((finding.kind, finding.subject.camera), finding)
     return list(first.values())
-
-
-def _track(seen: Check, recording: Recording, rig: StereoRig, pairs: ImagePairs, frames: range) -> Tracking:
-    """Track a stretch."""
-    settings = TrackingSettings(first_pass=False, exposure=exposures(recording, pairs)[0])
-    rate, gravity = recording.frame_rate, recording.gravity
-    return track(pairs.reading(seen.not_read), frames, rig, recording.disc, rate, gravity=gravity, settings=settings)

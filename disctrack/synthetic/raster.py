@@ -9,8 +9,6 @@ from signed distances at its corners and its centre: that on either side of a st
 exact; curvature is allowed for in second order. The error of a blurred edge is of third order in the cell's size.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

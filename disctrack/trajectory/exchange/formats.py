@@ -1,7 +1,5 @@
 """The table of formats, and conversion by it."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
