@@ -65,7 +65,7 @@ class Provenance(Outline):
     version: str = field(default_factory=software_version)
 
     @property
-    def declared(self) -> dict[str, Any]:
+    def declared(self) -> dict[str, object]:
         """What recording.toml said; empty where it is not kept."""
         kept = self.settings.get("recording")
         return dict(kept) if isinstance(kept, dict) else {}
@@ -232,12 +232,12 @@ def labelled(trajectory: Trajectory) -> tuple[dict[str, Variable], dict[str, Var
     return _root_variables(trajectory) | dots, _axes(trajectory), numbers
 
 
+# Numbers of the whole recording: attribute of a Trajectory, and of the file's root
+_NUMBERS = {"frame_rate": "frame_rate_hz", "gravity": "gravity_m_s2", "air_density": "air_density_kg_m3"}
+
+
 def _recording_numbers(trajectory: Trajectory) -> dict[str, float]:
-    return {
-        "frame_rate_hz": trajectory.frame_rate,
-        "gravity_m_s2": trajectory.gravity,
-        "air_density_kg_m3": trajectory.air_density,
-    }
+    return {key: getattr(trajectory, name) for name, key in _NUMBERS.items()}
 
 
 def _root_attributes(trajectory: Trajectory, provenance: Provenance) -> dict[str, Any]:
@@ -286,7 +286,7 @@ _LAYOUT: dict[str, tuple[str, tuple[str, ...], str, str]] = {
     "calibration_sensitivity": ("calibration/sensitivity", ("time", "pose_component", "rig_parameter"),
                                 "m or rad per unit of the parameter", "d pose / d rig parameter at fixed pixels"),
 }  # fmt: skip
-_FLAGS: dict[str, Mapping[str, Any]] = {"frame_status": flags(FrameStatus), "marker_status": flags(MarkerStatus)}
+_FLAGS = {"frame_status": flags(FrameStatus), "marker_status": flags(MarkerStatus)}
 # Of the rig: cameras side by side, and axes of what is beside them
 _OF_CAMERAS = {
     "camera_matrix": (("camera", *_SPACE2), "px", "pinhole matrix K"),
@@ -417,22 +417,19 @@ def _trajectory(file: h5py.File) -> Trajectory:
     root, disc = read_variables(file), _read_disc(file["disc"])
     lengths = {name: len(values) for name, (values, _) in _NAMED_AXES.items()}
     lengths |= {"time": len(root["time"]), "marker": disc.n_markers}
-    found = {}
+    found: dict[str, Any] = {}
     for attribute, (place, dims, *_) in _LAYOUT.items():
         found[attribute] = read_array(file[place])
         expected = tuple(lengths[axis] for axis in dims)
         if found[attribute].shape != expected:
             raise TrajectoryFileError(f"{attribute} has shape {found[attribute].shape}; expected {expected}")
-    height, slope_x, slope_y = map(float, file.attrs["table_moved_m_rad"])
+    found |= {name: float(file.attrs[key]) for name, key in _NUMBERS.items()}
     trajectory = Trajectory(
         time=root["time"],
         q=np.column_stack([root[name] for name in COORDINATES]),
         disc=disc,
         rig=_rig(file["calibration"]),
-        frame_rate=float(file.attrs["frame_rate_hz"]),
-        gravity=float(file.attrs["gravity_m_s2"]),
-        air_density=float(file.attrs["air_density_kg_m3"]),
-        table_moved=(height, slope_x, slope_y),
+        table_moved=tuple(file.attrs["table_moved_m_rad"].tolist()),
         findings=_findings(file),
         **found,
     )
