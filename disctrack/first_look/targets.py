@@ -13,7 +13,6 @@ from disctrack.disc import Disc
 from disctrack.errors import OutputError
 from disctrack.files.whole import whole_file
 
-MM = 1 / 25.4  # inches, matplotlib's unit
 PAPERS_MM = {"a4": (210.0, 297.0), "a3": (297.0, 420.0), "letter": (215.9, 279.4)}
 MARGIN_MM = 8.0  # that printers leave white
 RULER_MM = 100.0
@@ -81,7 +80,7 @@ def _places(width: float, height: float, diameter: float) -> Iterator[tuple[floa
 
 
 def _sheet(width: float, height: float) -> tuple[Figure, Axes]:
-    figure = Figure(figsize=(width * MM, height * MM))
+    figure = Figure(figsize=(width / 25.4, height / 25.4))
     axes = figure.add_axes((0, 0, 1, 1))
     axes.set_xlim(0, width)
     axes.set_ylim(0, height)

@@ -7,8 +7,6 @@ import numpy as np
 from calibration.kit.arrays import Array32, Image
 from disctrack.synthetic.description import ImperfectionSettings, SensorSettings
 
-MOST_ELECTRONS = np.float32(1e12)  # in a pixel; the generator takes no more than 1e18
-
 
 class Pattern(NamedTuple):
     """What a sensor adds to the light, the same in every frame."""
@@ -50,7 +48,7 @@ def digitise(
     if rng is not None:
         gain = np.float32(settings.gain_e_per_dn)
         if gain > 0:
-            electrons = rng.poisson(np.minimum(np.maximum(grey, 0.0) * gain, MOST_ELECTRONS))
+            electrons = rng.poisson(np.maximum(grey, 0.0) * gain)  # it takes 1e18, more than a scene's limits allow
             grey = electrons.astype(np.float32) / gain
         grey = grey + np.float32(settings.read_noise_dn) * rng.standard_normal(grey.shape, dtype=np.float32)
     top = 2**bit_depth - 1
