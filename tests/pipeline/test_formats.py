@@ -170,7 +170,7 @@ def declaration(sample_clip: Path, parts: str = HALVES) -> str:
     """That of the sample, for images that hold both cameras'."""
     text = (sample_clip / "recording.toml").read_text()
     for old, new in (
-        ('left = "left/*.png" ', f'{parts}\nleft = "frames/*.png"'),
+        ('left = "left/*.png"', f'{parts}\nleft = "frames/*.png"'),
         ('right = "right/*.png"', 'right = "frames/*.png"'),
         ('left = "calibration/left/*.png"', 'left = "views/*.png"'),
         ('right = "calibration/right/*.png"', 'right = "views/*.png"'),
