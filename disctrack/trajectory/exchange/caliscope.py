@@ -21,7 +21,6 @@ from disctrack.trajectory.exchange.rig_parts import (
     rig_of,
     rotation_of,
     rotation_vector,
-    the_one,
 )
 
 
@@ -52,16 +51,13 @@ def _write(path: Path, rig: StereoRig, tables: Sequence[str], own: Sequence[str]
     write_whole(path, (text + end).encode())
 
 
-def read_caliscope(
-    paths: Sequence[Path], *, cameras: tuple[str, str] | None = None, world_is_table: bool = False
-) -> StereoRig:
+def read_caliscope(path: Path, *, cameras: tuple[str, str] | None = None, world_is_table: bool = False) -> StereoRig:
     """Two cameras of such a file.
 
     cameras : their names ("0", "1"; "cam_0", ...) where the file has more than two; left first
     world_is_table : True if the file's reference is the table, k up; otherwise the heights mean nothing
     Raises RigFileError that names what the file holds.
     """
-    path = the_one(paths)
     try:
         content = tomllib.loads(content_of(path))
     except ValueError as error:

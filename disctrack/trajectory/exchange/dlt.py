@@ -6,7 +6,6 @@ dltcoefs.csv has eleven rows and a column for each camera; X, Y, Z are in metres
 without a lens, so xypts.csv holds points without the lens' distortion. Both count pixels from 1 at the top left.
 """
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -17,7 +16,7 @@ from calibration.kit.arrays import Array
 from disctrack.errors import RigFileError
 from disctrack.files.whole import write_whole
 from disctrack.trajectory import Trajectory
-from disctrack.trajectory.exchange.rig_parts import camera_of, content_of, rig_of, the_one
+from disctrack.trajectory.exchange.rig_parts import camera_of, content_of, rig_of
 from disctrack.trajectory.exchange.tables import point_columns, read_points, table
 
 FROM_ONE = np.array([[1.0, 0.0, 1.0], [0.0, 1.0, 1.0], [0.0, 0.0, 1.0]])  # pixels from 0 -> pixels from 1
@@ -33,7 +32,7 @@ def write_dlt(path: Path, rig: StereoRig) -> None:
 
 
 def read_dlt(
-    paths: Sequence[Path], *, image_size: tuple[int, int] | None = None, unit: float = 1.0, world_is_table: bool = False
+    path: Path, *, image_size: tuple[int, int] | None = None, unit: float = 1.0, world_is_table: bool = False
 ) -> StereoRig:
     """Two cameras without distortion from their coefficients; (width, height) [px] stands in no such file.
 
@@ -41,7 +40,6 @@ def read_dlt(
     world_is_table : True if their axes are the table's, z up
     Raises RigFileError, also where a camera is skewed: eleven free coefficients need not be a pinhole's.
     """
-    path = the_one(paths)
     try:
         L = np.array([[float(cell) for cell in line.split(",")] for line in content_of(path).split()])
     except ValueError as error:
@@ -71,6 +69,6 @@ def write_xypts(path: Path, trajectory: Trajectory) -> None:
     write_whole(path, table(*point_columns(np.stack(straight, axis=1), names)))
 
 
-def read_xypts(paths: Sequence[Path]) -> Array:
+def read_xypts(path: Path) -> Array:
     """Points (n, cameras, points, 2) [px], counted from 0. Raises RigFileError."""
-    return read_points(the_one(paths)) - 1.0
+    return read_points(path) - 1.0

@@ -35,6 +35,7 @@ from disctrack.trajectory.exchange import (
 )
 from disctrack.trajectory.exchange.lens import BROWN, within_brown
 from disctrack.trajectory.exchange.rig_parts import content_of, the_one
+from disctrack.trajectory.exchange.tables import read_points
 from disctrack.trajectory.file import read_trajectory, trajectory_in
 
 OWN = (".h5", ".nc")  # netCDF-4 is HDF5: other programs go by the second name
@@ -49,12 +50,14 @@ class Format:
     endings: tuple[str, ...]  # of file names; the longest that fits is meant
     holds: str  # "trajectory", "rig" or "points"
     write: Callable[[Path, Any], object]  # path, Trajectory or StereoRig
-    read: Callable[..., Any] | None  # paths and what is asked of the user -> StereoRig, or points (n, 2, m, 2)
+    # path (or paths: `in_parts`) and what is asked of the user -> StereoRig, or points (n, 2, m, 2)
+    read: Callable[..., Any] | None
     lost: str  # what of ours it has no place for
     source: str  # of its definition
     # Terms of a lens that it holds, by which the others are fitted; None: it holds points without any lens
     terms: tuple[str, ...] | None = BROWN
     asks: tuple[str, ...] = ()  # what a reader may be told: world_is_table, cameras, image_size, unit
+    in_parts: bool = False  # True where a rig may lie in several files
     mark: str = ""  # text by which a file is told from others of its ending
 
 
@@ -69,12 +72,12 @@ ROWS = (
     Format("QTM", (".tsv",), "trajectory", qtm.write_qtm, None, SIGMAS, "Qualisys: TSV export of 6DOF data"),
     Format("XMALab transformations", ("transformation.csv", "transformations.csv"), "trajectory",
            xmalab.write_transformations, None, "sigmas, times, the rig, the dots", "XMALab: Trial.cpp"),
-    Format("XMALab points", ("points.csv",), "points", xmalab.write_points, xmalab.read_xmalab, "sigmas",
+    Format("XMALab points", ("points.csv",), "points", xmalab.write_points, read_points, "sigmas",
            "XMALab: Trial.cpp", mark="_cam1_X"),
     Format("DLTdv8 points", ("xypts.csv",), "points", dlt.write_xypts, dlt.read_xypts, "sigmas, the lenses: the points "
            "are without their distortion, as dltcoefs.csv needs them", "DLTdv8 manual", mark="pt1_cam1_X"),
     Format("OpenCV", (".yml", ".yaml", ".xml"), "rig", opencv.write_opencv, opencv.read_opencv, "covariances",
-           "OpenCV: stereo_calib sample", asks=("image_size", "unit", "world_is_table")),
+           "OpenCV: stereo_calib sample", asks=("image_size", "unit", "world_is_table"), in_parts=True),
     Format("Kalibr", ("camchain.yaml", "kalibr.yaml"), "rig", kalibr.write_kalibr, kalibr.read_kalibr,
            "covariances, the world frame", "Kalibr: yaml formats", FOUR, mark="cam0:"),
     Format("Caliscope", (".toml",), "rig", caliscope.write_caliscope, caliscope.read_caliscope, "covariances",
@@ -82,7 +85,7 @@ ROWS = (
     Format("Pose2Sim", ("pose2sim.toml", "calib.toml"), "rig", caliscope.write_pose2sim, caliscope.read_caliscope,
            "covariances", "Pose2Sim: calibration.py", FOUR, ("cameras", "world_is_table")),
     Format("mrcal", (".cameramodel",), "rig", mrcal.write_mrcal, mrcal.read_mrcal, "covariances",
-           "mrcal: camera model representation", asks=("world_is_table",)),
+           "mrcal: camera model representation", asks=("world_is_table",), in_parts=True),
     Format("DLT", ("dltcoefs.csv",), "rig", dlt.write_dlt, dlt.read_dlt, "covariances, the lenses: they belong to "
            "points without distortion, those of xypts.csv", "DLTdv8 manual", None,
            ("image_size", "unit", "world_is_table")),
@@ -159,7 +162,7 @@ def read_foreign(paths: Sequence[Path], **told: Any) -> Any:
     idle = [word for word in told if word not in row.asks]
     if idle:
         raise OutputError(f"{_options(idle)}: says nothing about {first} as {row.name}; leave it out")
-    return row.read(paths, **told)
+    return row.read(paths if row.in_parts else the_one(paths), **told)
 
 
 def _rank(row: Format, path: Path, head: str = "") -> tuple[int, int]:

@@ -3,7 +3,6 @@
 cam1 holds T_cn_cnm1 (4, 4), from cam0's axes to its own, in metres. Kalibr knows no world.
 """
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,6 @@ from disctrack.trajectory.exchange.rig_parts import (
     listed,
     rig_of,
     rotation_of,
-    the_one,
 )
 
 
@@ -42,9 +40,8 @@ def write_kalibr(path: Path, rig: StereoRig) -> None:
     write_whole(path, text.encode())
 
 
-def read_kalibr(paths: Sequence[Path]) -> StereoRig:
+def read_kalibr(path: Path) -> StereoRig:
     """cam0 and cam1 of a camchain. Raises RigFileError; OutputError where PyYAML is not installed."""
-    path = the_one(paths)
     try:
         import yaml
     except ImportError as error:

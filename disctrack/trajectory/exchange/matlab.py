@@ -10,7 +10,7 @@ Back again: save what stereoParametersToOpenCV returns under these names. MATLAB
 """
 
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ from disctrack.errors import RigFileError
 from disctrack.files.whole import write_whole
 from disctrack.frames import COORDINATES
 from disctrack.trajectory import FrameStatus, Trajectory
-from disctrack.trajectory.exchange.rig_parts import array_of, opencv_numbers, stereo_rig, the_one
+from disctrack.trajectory.exchange.rig_parts import array_of, opencv_numbers, stereo_rig
 from disctrack.trajectory.file import labelled
 
 _NAMES = [f"{what}{number}" for number in (1, 2) for what in ("intrinsicMatrix", "distortionCoefficients")]
@@ -58,16 +58,13 @@ def write_stereo_parameters(path: Path, rig: StereoRig) -> None:
     _save(path, {"worldUnits": "m", "imageSize": size} | opencv_numbers(rig, _NAMES))
 
 
-def read_stereo_parameters(
-    paths: Sequence[Path], *, unit: float | None = None, world_is_table: bool = False
-) -> StereoRig:
+def read_stereo_parameters(path: Path, *, unit: float | None = None, world_is_table: bool = False) -> StereoRig:
     """A rig of such a MAT file.
 
     unit : [m] of translationOfCamera2 where the file has no worldUnits that tell it
     world_is_table : True if the world of R_left_world is the table, k up, whether or not the file says so
     Raises RigFileError.
     """
-    path = the_one(paths)
     try:
         found = loadmat(path)
     except (OSError, ValueError, NotImplementedError, TypeError) as error:

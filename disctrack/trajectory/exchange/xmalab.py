@@ -4,17 +4,14 @@ Points are those of the images, with lens and all, counted from 0 at the top lef
 no offset, not inverted). A transformation is a row of 16 numbers, the matrix (4, 4) column by column, in millimetres.
 """
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from calibration.kit.arrays import Array
 from disctrack.files.whole import write_whole
 from disctrack.trajectory import Trajectory
 from disctrack.trajectory.exchange.motion import rotations
-from disctrack.trajectory.exchange.rig_parts import the_one
-from disctrack.trajectory.exchange.tables import point_columns, read_points, table
+from disctrack.trajectory.exchange.tables import point_columns, table
 
 _HEADS = ("R11", "R12", "R13", "01", "R21", "R22", "R23", "02", "R31", "R32", "R33", "03", "TX", "TY", "TZ", "1")
 
@@ -25,11 +22,6 @@ def write_points(path: Path, trajectory: Trajectory) -> None:
     if field is not None:
         points = field.distorted(points)
     write_whole(path, table(*point_columns(points, [f"DOT_{i}" for i in range(points.shape[2])])))
-
-
-def read_xmalab(paths: Sequence[Path]) -> Array:
-    """Points (n, cameras, m, 2) [px]. Raises RigFileError."""
-    return read_points(the_one(paths))
 
 
 def write_transformations(path: Path, trajectory: Trajectory) -> None:

@@ -270,7 +270,7 @@ def test_what_a_file_does_not_tell_may_be_told(rig, tmp_path):
     caliscope.write_caliscope(tmp_path / "rig.toml", rig)
     text = (tmp_path / "rig.toml").read_text()
     (tmp_path / "rig.toml").write_text(third_camera(text, rig))
-    assert caliscope.read_caliscope([tmp_path / "rig.toml"], cameras=("0", "1")).baseline == pytest.approx(rig.baseline)
+    assert caliscope.read_caliscope(tmp_path / "rig.toml", cameras=("0", "1")).baseline == pytest.approx(rig.baseline)
     opencv.write_opencv(tmp_path / "rig.yml", rig)
     text = (tmp_path / "rig.yml").read_text()
     (tmp_path / "rig.yml").write_text(re.sub("unit: .*", 'unit: "foot"', text))
