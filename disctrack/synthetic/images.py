@@ -49,16 +49,8 @@ class Stage:
 
 def stages(rig: StereoRig, scene: Scene) -> tuple[Stage, ...]:
     """A stage for each camera; cached, so that calls with the same rig and look share the table."""
-    look = Scene(
-        seed=scene.seed,
-        rig=scene.rig,
-        optics=scene.optics,
-        sensor=scene.sensor,
-        light=scene.light,
-        appearance=scene.appearance,
-        imperfections=scene.imperfections,
-        render=scene.render,
-    )
+    sections = ("seed", "rig", "optics", "sensor", "light", "appearance", "imperfections", "render")
+    look = Scene(**{name: getattr(scene, name) for name in sections})
     return tuple(
         _stage(index, view.camera, view.R_camera_world.tobytes(), view.t_camera_world.tobytes(), look)
         for index, view in enumerate(views_of(rig))
