@@ -8,9 +8,9 @@ not have in common is noise with a memory.
 Data: Frontiers in Artificial Intelligence 3:25; 11 balls.
 """
 
-from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import groupby
 from pathlib import Path
 
 import numpy as np
@@ -56,19 +56,16 @@ def drop(ball: str, number: int, time: Array, height: Array) -> Run:
 def read_drops(folder: Path) -> list[Run]:
     """All drops of `ball_drops.csv`."""
     table = np.genfromtxt(folder / "ball_drops.csv", delimiter=",", names=True, dtype=None, encoding="utf-8")
-    takes = table[["ball", "drop"]]
     drops = []
-    for ball, number in dict.fromkeys(takes.tolist()):
-        rows = table[(table["ball"] == ball) & (table["drop"] == number)]
-        drops.append(drop(ball, number, rows["t_s"], rows["height_m"]))
+    for (ball, number), rows in groupby(table, lambda row: (row["ball"], row["drop"])):
+        time, height = np.array([(row["t_s"], row["height_m"]) for row in rows]).T
+        drops.append(drop(ball, number, time, height))
     return drops
 
 
 def _by_ball(drops: Sequence[Run]) -> dict[str, list[Run]]:
-    found = defaultdict[str, list[Run]](list)
-    for run in drops:
-        found[run.groups["ball"]].append(run)
-    return found
+    """Drops of one ball follow each other."""
+    return {ball: list(takes) for ball, takes in groupby(drops, lambda run: run.groups["ball"])}
 
 
 def height_noise(drops: Sequence[Run]) -> SmoothNoise:

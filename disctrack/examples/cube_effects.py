@@ -1,8 +1,9 @@
 """What a tossed cube may lack, and what each effect leaves in its flight and where it rests, to first order."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from calibration.kit.arrays import Array
 from disctrack.examples._command import GRAVITY, effect
@@ -44,8 +45,42 @@ CANDIDATES = (
     effect("table_tilt", _S, "table leans against the vertical", "rad", 1e-2, *LEVEL),
 )  # fmt: skip
 
+QUANTITIES = tuple(q for c in CANDIDATES for q in c.quantities)
+COLUMN = {q.name: i for i, q in enumerate(QUANTITIES)}
 
-def flown(f: Flight) -> dict[str, Array]:
+
+def _columns(seen: Array, changes: Mapping[str, ArrayLike]) -> Array:
+    """(..., k + 1) changes of what is seen (...) by QUANTITIES, zero where none is named, and that itself."""
+    return np.stack([*(np.broadcast_to(changes.get(name, 0.0), seen.shape) for name in COLUMN), seen], axis=-1)
+
+
+def flown(f: Flight) -> Array:
+    """(n, 6, k + 1 + 12) by QUANTITIES, measured minus base model [m], [rad], and by what is the flight's own.
+
+    That is place, velocity, attitude and angular velocity, three numbers each.
+    """
+    fallen = f.position + GRAVITY / 2 * f.time[:, None] ** 2 * UP
+    seen = np.concatenate([fallen, f.turn], axis=1)
+    own = np.zeros((*seen.shape, 12))
+    own[:, :3, :3], own[:, :3, 3:6] = np.eye(3), f.time[:, None, None] * np.eye(3)
+    own[:, 3:, 6:9], own[:, 3:, 9:] = np.eye(3), integrated(np.swapaxes(f.turning, 1, 2))
+    return np.concatenate([_columns(seen, _flown(f)), own], axis=-1)
+
+
+def at_rest(flights: Sequence[Flight]) -> Array:
+    """(m, 3, k + 1) of every toss the cube at rest, by QUANTITIES and as measured.
+
+    How much resting cubes differ once all candidates have taken their share is the noise.
+    """
+    rows = np.array([_columns(*_rested(f)) for f in flights])
+    for c in range(3):
+        effects, seen = rows[:, c, :-1], rows[:, c, -1]
+        amounts, _, rank, _ = np.linalg.lstsq(effects, seen, rcond=1e-10)
+        rows[:, c] /= np.sqrt(np.sum((seen - effects @ amounts) ** 2) / (len(seen) - rank))
+    return rows
+
+
+def _flown(f: Flight) -> dict[str, Array]:
     """Change of position [m] and turn in axes of the body [rad] (n, 6) of a flight, by a unit of each quantity."""
 
     def moved(position: Array | float, turn: Array | float = 0.0) -> Array:
@@ -100,7 +135,7 @@ def flown(f: Flight) -> dict[str, Array]:
     return found
 
 
-def rested(f: Flight) -> tuple[Array, dict[str, Sequence[float]]]:
+def _rested(f: Flight) -> tuple[Array, dict[str, Sequence[float]]]:
     """Where a toss ends, on a face: height over the declared half width [m] and the face's normal along and across.
 
     (3,), and their change by a unit of each quantity.

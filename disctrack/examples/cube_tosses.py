@@ -11,12 +11,11 @@ constant angular velocity. Place, velocity, attitude and angular velocity are ea
 its residual is reckoned to first order along the smooth motion of the flight (`cube_effects`).
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import groupby
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from calibration.kit.arrays import Array, Mask
 from disctrack.discrepancy.noise import SampleStretch, SmoothNoise, estimate
@@ -25,23 +24,12 @@ from disctrack.discrepancy.search import Diagnosis, Settings, explain
 from disctrack.discrepancy.system import System, Values
 from disctrack.discrepancy.words import effect_text
 from disctrack.examples._command import GRAVITY, Outcome, command, report_of
-from disctrack.examples.cube_data import (
-    FRAME_RATE,
-    HALF_WIDTH,
-    UP,
-    Flight,
-    flights,
-    integrated,
-    read_tosses,
-    without_copies,
-)
-from disctrack.examples.cube_effects import CANDIDATES, flown, rested
+from disctrack.examples.cube_data import FRAME_RATE, HALF_WIDTH, Flight, flights, read_tosses, without_copies
+from disctrack.examples.cube_effects import CANDIDATES, COLUMN, QUANTITIES, at_rest, flown
 from disctrack.numbers import rounded
 from disctrack.report.blocks import Listing, Section
 
 HELD_OUT = 3  # every third toss
-QUANTITIES = tuple(q for c in CANDIDATES for q in c.quantities)
-COLUMN = {q.name: i for i, q in enumerate(QUANTITIES)}
 FIRST_NOISE = {  # channels whose noise is alike, and where the search for it begins
     "horizontal": (slice(0, 2), SmoothNoise(2e-5, 5e-5, 0.03)),
     "vertical": (slice(2, 3), SmoothNoise(2e-5, 3e-5, 0.03)),
@@ -63,7 +51,7 @@ class CubeTosses(System):
 
     def __init__(self, flights: Sequence[Flight]) -> None:
         """Measure the noise, and whiten."""
-        self.flights, self._flown, self._at_rest = flights, [_flown(f) for f in flights], _at_rest(flights)
+        self.flights, self._flown, self._at_rest = flights, [flown(f) for f in flights], at_rest(flights)
         self.noise = {name: noise for name, (_, noise) in FIRST_NOISE.items()}
         for _ in range(2):
             self._whiten()
@@ -86,7 +74,7 @@ class CubeTosses(System):
 
     def _whiten(self) -> None:
         parts, training = [], []
-        for f, rows, at_rest in zip(self.flights, self._flown, self._at_rest, strict=True):
+        for f, rows, rest in zip(self.flights, self._flown, self._at_rest, strict=True):
             white = rows.copy()
             for name, (channels, _) in FIRST_NOISE.items():
                 white[:, channels] = np.tensordot(self.noise[name].whitening(f.time), rows[:, channels], axes=1)
@@ -94,8 +82,8 @@ class CubeTosses(System):
             beside_own = np.linalg.qr(own, mode="complete")[0][:, own.shape[1] :].T @ effects
             # of an effect that the flight's own motion absorbs, rounding is left
             beside_own[:, np.linalg.norm(beside_own, axis=0) < INVISIBLE * np.linalg.norm(effects, axis=0)] = 0.0
-            parts += [beside_own, at_rest]
-            training += [not _kept_back(f)] * (len(beside_own) + len(at_rest))
+            parts += [beside_own, rest]
+            training += [not _kept_back(f)] * (len(beside_own) + len(rest))
         everything = np.concatenate(parts)
         self.effects, self.seen = everything[:, :-1], everything[:, -1]
         self.training: Mask = np.array(training)  # (n,) False for every third toss
@@ -117,37 +105,6 @@ def _amounts(values: Values) -> Array:
 
 def _kept_back(flight: Flight) -> bool:
     return flight.toss.number % HELD_OUT == HELD_OUT - 1
-
-
-def _columns(seen: Array, changes: Mapping[str, ArrayLike]) -> Array:
-    """(..., k + 1) changes of what is seen (...) by QUANTITIES, zero where none is named, and that itself."""
-    return np.stack([*(np.broadcast_to(changes.get(name, 0.0), seen.shape) for name in COLUMN), seen], axis=-1)
-
-
-def _flown(f: Flight) -> Array:
-    """(n, 6, k + 1 + 12) by QUANTITIES, measured minus base model [m], [rad], and by what is the flight's own.
-
-    That is place, velocity, attitude and angular velocity, three numbers each.
-    """
-    fallen = f.position + GRAVITY / 2 * f.time[:, None] ** 2 * UP
-    seen = np.concatenate([fallen, f.turn], axis=1)
-    own = np.zeros((*seen.shape, 12))
-    own[:, :3, :3], own[:, :3, 3:6] = np.eye(3), f.time[:, None, None] * np.eye(3)
-    own[:, 3:, 6:9], own[:, 3:, 9:] = np.eye(3), integrated(np.swapaxes(f.turning, 1, 2))
-    return np.concatenate([_columns(seen, flown(f)), own], axis=-1)
-
-
-def _at_rest(flights: Sequence[Flight]) -> Array:
-    """(m, 3, k + 1) of every toss the cube at rest, by QUANTITIES and as measured.
-
-    How much resting cubes differ once all candidates have taken their share is the noise.
-    """
-    rows = np.array([_columns(*rested(f)) for f in flights])
-    for c in range(3):
-        effects, seen = rows[:, c, :-1], rows[:, c, -1]
-        amounts, _, rank, _ = np.linalg.lstsq(effects, seen, rcond=1e-10)
-        rows[:, c] /= np.sqrt(np.sum((seen - effects @ amounts) ** 2) / (len(seen) - rank))
-    return rows
 
 
 def _noise(left: Sequence[Array], channels: slice, start: SmoothNoise) -> SmoothNoise:

@@ -15,7 +15,7 @@ from scipy.interpolate import CubicSpline
 from calibration.kit.arrays import Array
 from disctrack.disc import MA_2014, Disc
 from disctrack.examples._command import GRAVITY, effect
-from disctrack.rolling import EndReason, Model, simulate, steady_precession
+from disctrack.rolling import EndReason, Model, Motion, simulate, steady_precession
 
 FRAME = 1e-3  # [s] between pairs of the paper's cameras
 SAMPLING = 2e-3  # [s] of the simulation; a cubic spline then follows the last nutations read to 1e-4
@@ -65,7 +65,7 @@ class LastStage:
         model = Model(series.disc, GRAVITY).with_values(dict(values))
         state = steady_precession(series.start, series.disc, GRAVITY, omega3=omega3)
         motion = simulate(model, state, MAX_DURATION, rate=1 / SAMPLING, theta_end=END_SHARE * series.start, rtol=RTOL)
-        curves = _observed(motion.q, motion.qdot, series.disc)
+        curves = _observed(motion, series.disc)
         # a strong moment can stop the precession in the very last milliseconds; what is read lies before
         n = int(np.argmin(np.append(np.isfinite(curves).all(axis=1), False)))
         ended = motion.end is EndReason.NUTATION and n > 1
@@ -89,23 +89,16 @@ class LastStage:
         psidot = psidot * np.exp(-0.5 * rate_variance / (psidot * np.sin(theta)) ** 2)  # mean of the noisy logarithm
         energy = energy + 0.5 * (2 * disc.moment_diametral + disc.moment_axial) * rate_variance
         energy = energy + disc.mass * GRAVITY * wrong["height_zero.shift"]
-        return np.array([*slope(left, np.column_stack([energy, theta, psidot])), np.log(self.duration)])
+        with np.errstate(invalid="ignore", divide="ignore"):
+            slopes, _ = np.polyfit(np.log(left), np.log(np.column_stack([energy, theta, psidot])), 1)
+        return np.array([*slopes, np.log(self.duration)])
 
 
-def slope(left: Array, values: Array) -> Array:
-    """Slopes (...) of ln values (n, ...) over ln left (n,) by ordinary least squares; not finite without logarithms."""
-    x = np.log(left)
-    x = x - x.mean()
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.asarray(x @ np.log(values) / (x @ x), float)
-
-
-def _observed(q: Array, qdot: Array, disc: Disc) -> Array:
+def _observed(motion: Motion, disc: Disc) -> Array:
     """(n, 3) ln theta, ln psidot and the energy (2.10) [J] with the declared disc, zero at rest."""
-    theta, (psidot, thetadot, phidot) = q[:, 4], qdot[:, 3:].T
-    spin = psidot * np.cos(theta) + phidot
-    energy = 0.5 * disc.mass * np.sum(qdot[:, :3] ** 2, axis=1)
-    energy += 0.5 * disc.moment_diametral * (thetadot**2 + (psidot * np.sin(theta)) ** 2)
-    energy += 0.5 * disc.moment_axial * spin**2 + disc.mass * GRAVITY * (q[:, 2] - disc.half_thickness)
+    thetadot, omega2, omega3 = motion.state[:, 5:].T
+    energy = 0.5 * disc.mass * np.sum(motion.qdot[:, :3] ** 2, axis=1)
+    energy += 0.5 * disc.moment_diametral * (thetadot**2 + omega2**2) + 0.5 * disc.moment_axial * omega3**2
+    energy += disc.mass * GRAVITY * (motion.q[:, 2] - disc.half_thickness)
     with np.errstate(invalid="ignore", divide="ignore"):
-        return np.column_stack([np.log(theta), np.log(psidot), energy])
+        return np.column_stack([np.log(motion.q[:, 4]), np.log(motion.qdot[:, 3]), energy])
