@@ -9,7 +9,8 @@ from pathlib import Path
 from disctrack.commands import DONE, FAILED
 from disctrack.files.whole import make_folder
 from disctrack.validate.accuracy import accuracy_validation, imperfect_validation
-from disctrack.validate.diagnoses import diagnosis_validation, hidden_cases, hide
+from disctrack.validate.diagnoses import diagnosis_validation, hide
+from disctrack.validate.hidden import hidden_cases
 from disctrack.validate.planted_faults import fault_cases, faults_validation, plant_and_run, untouched
 from disctrack.validate.rendered import render_and_measure, rendered_cases
 from disctrack.validate.tables import Validation, measure_all, write_into, write_validation

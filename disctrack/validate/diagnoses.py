@@ -1,10 +1,9 @@
 """How often does the diagnosis find, name and size what is hidden, how small may it be, and does it cry wolf?
 
-Every case draws a motion, a rig with a calibration error of its own, and the noise of the dots; plants effects
-(`hidden`); and hands the measured trajectory, which does not tell of them, to the diagnosis.
+The measured trajectory with hidden effects (`hidden`), which does not tell of them, is handed to the diagnosis.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from time import perf_counter
 
@@ -14,33 +13,12 @@ from scipy import stats
 from disctrack.diagnosis import DiscDiagnosis, diagnose
 from disctrack.discrepancy.fit import Fit, fit
 from disctrack.discrepancy.significance import wald
-from disctrack.errors import DiscTrackError
-from disctrack.rolling import Model, simulate, steady_precession
-from disctrack.synthetic.description import Scene
-from disctrack.trajectory import Trajectory
-from disctrack.validate.hidden import CONTROLS, INVISIBLE, SIZES, alike, plant
-from disctrack.validate.points import Filmed, Laboratory, Planted, measured
+from disctrack.validate.hidden import HiddenCase, Planted, recorded
 from disctrack.validate.tables import Table, Validation
 
-DURATION = (0.4, 0.9)  # [s]
-FLATTEST_DEG = 0.9  # the last frame's nutation: below, the disc touches its paper
 ENOUGH = 3.0  # [sigma] a coefficient may be off
 AT_NOISE, HELD_OUT = 1.1, 1.2  # reduced chi-square, free run over its floor
 LEVELS = (0.5, 0.2, 0.05, 0.01, 0.005)
-
-
-@dataclass(frozen=True)
-class HiddenCase:
-    """What is hidden, effect -> size, in the recording of a seed; controls hide nothing that may be claimed."""
-
-    hidden: Mapping[str, float]
-    seed: int
-    rate: float = Filmed.declared_rate  # [Hz]
-
-    @property
-    def asked(self) -> bool:
-        """Is there something that the diagnosis should name?"""
-        return any(name not in CONTROLS for name in self.hidden)
 
 
 @dataclass(frozen=True)
@@ -85,37 +63,6 @@ class Verdict:
         """Size from which a single effect would stand out by what a claim takes in this recording: found in half."""
         size, *others = self.case.hidden.values()
         return size * self.needed / self.stands_out if self.case.asked and not others else float("nan")
-
-
-def draw(seed: int, planted: Planted, rate: float = Filmed.declared_rate) -> Filmed:
-    """A motion that lasts as long as it is filmed, whatever is planted in it."""
-    rng = np.random.default_rng([seed, 31])
-    disc = Scene().declared_disc
-    for _ in range(200):
-        theta = float(rng.uniform(3.0, 15.0))  # [deg]
-        n = int(rate * rng.uniform(*DURATION))
-        nutation = theta * float(rng.uniform(0.02, 0.1))
-        omega3 = float(rng.uniform(-2.0, 3.0))  # [rad/s]
-        filmed = Filmed(seed, n, theta, nutation, omega3, float(rng.uniform(0.2e-7, 0.5e-7)), declared_rate=rate)
-        model = Model(disc).with_values({"km.k_m": filmed.k_m} | dict(planted.effects))
-        try:
-            start = steady_precession(np.radians(theta), disc, omega3=omega3, nutation_amplitude=np.radians(nutation))
-            motion = simulate(model, start, duration=1.03 * n / rate + 0.01, rate=rate)
-        except DiscTrackError:  # no such precession
-            continue
-        if len(motion) > 1.02 * n and motion.q[-1, 4] > np.radians(FLATTEST_DEG):
-            return filmed
-    raise DiscTrackError(f"no motion of {DURATION[0]} s among those drawn: what is planted stops the disc at once")
-
-
-def recorded(case: HiddenCase) -> tuple[list[Planted], Trajectory]:
-    """What is planted, one by one, and the recording with all of it."""
-    rng = np.random.default_rng([case.seed, 32])
-    parts = [plant(name, size, rng) for name, size in case.hidden.items()]
-    effects, wrong = ({k: v for p in parts for k, v in getattr(p, kind).items()} for kind in ("effects", "wrong"))
-    imperfect = [p.laboratory for p in parts if p.laboratory != Laboratory()] or [Laboratory()]
-    planted = Planted(effects=effects, wrong=wrong, laboratory=imperfect[-1])
-    return [p for p in parts if p.truth], measured(planted, draw(case.seed, planted, case.rate))
 
 
 def hide(case: HiddenCase) -> Verdict:
@@ -187,30 +134,6 @@ def _pull_of(result: DiscDiagnosis, planted: Planted) -> float | None:
 
 def _pull(fit: Fit, truth: Mapping[str, float]) -> float:
     return max(abs(fit.values[k] - v) / max(fit.sigma(k), 1e-300) for k, v in truth.items())
-
-
-def hidden_cases(
-    names: Sequence[str], seeds: Sequence[int], pairs: int = 0, rate: float = Filmed.declared_rate
-) -> Iterator[HiddenCase]:
-    """Each effect ("NAME" or "NAME=SIZE"; none: all) with each seed; or pairs drawn at random, a seed each."""
-    hidden = [_sized(name) for name in names] or [*SIZES.items()]
-    if not pairs:
-        yield from (HiddenCase({name: size}, seed, rate) for name, size in hidden for seed in seeds)
-        return
-    visible = [(name, size) for name, size in hidden if name not in INVISIBLE]
-    rng = np.random.default_rng([seeds[0], 33])
-    for number in range(pairs):
-        two = rng.choice(len(visible), 2, replace=False)
-        yield HiddenCase(dict(visible[int(k)] for k in two), seeds[0] + number, rate)
-
-
-def _sized(text: str) -> tuple[str, float]:
-    name, _, size = text.partition("=")
-    units = [candidate.quantities[0].unit for candidate in alike(name)]
-    try:
-        return name, float(size) if size else (SIZES | CONTROLS)[name]
-    except ValueError:
-        raise DiscTrackError(f"{text}: expected EFFECT=SIZE with the size in {(*units, 'm')[0]}") from None
 
 
 def what_was_wrong(v: Verdict) -> str:

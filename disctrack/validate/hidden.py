@@ -1,10 +1,15 @@
-"""Effects to hide, one by one, in measured trajectories: what is planted, and what the diagnosis should then say.
+"""Effects to hide in measured trajectories: what is planted, one by one, and the recording with all of it.
 
+Every case draws a motion, a rig with a calibration error of its own, and the noise of the dots (`points`).
 An effect is hidden by the name of the candidate that means it, in the candidate's numbers and units. Every size is one
 that a careful experimenter would still overlook; directions and signs are drawn, passive effects keep theirs.
 """
 
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cache
+from re import sub
 
 import numpy as np
 from numpy.random import Generator
@@ -13,52 +18,35 @@ from disctrack.diagnosis.motion import measurement_candidates, motion_candidates
 from disctrack.diagnosis.systematic import DOT_SIGMA
 from disctrack.discrepancy.system import Candidate
 from disctrack.errors import DiscTrackError
-from disctrack.rolling import Model
-from disctrack.synthetic.description import Scene
-from disctrack.validate.points import ORDINARY, STATION, Laboratory, Planted
+from disctrack.faults.catalogue import scene_faults
+from disctrack.rolling import Model, simulate
+from disctrack.synthetic.description import CameraSettings, MotionSettings, RollingMotion, Scene
+from disctrack.synthetic.motion import rolling_start
+from disctrack.trajectory import Trajectory
+from disctrack.validate.points import ORDINARY, STATION, Laboratory, measured
 
-SIZES = {
+# [SI] where what would surprise nobody (`Quantity.typical`) is not what a careful experimenter would overlook
+OVERLOOKED = {
     "table_tilt": np.radians(0.35),
     "kz": 6e-5,
-    "spring": 0.05,
-    "rolling_adhesive": 2e-5,
-    "table_curved": 0.1,
-    "rim_oval": 1e-5,
-    "rim_lobes": 1e-5,
-    "rim_flat": 1e-5,
-    "table_yielding": 1e-6,
     "creep": 2e-6,
     "table_shaken": 2e-6,
     "frame_rate": 0.012,
     "rolling_classical": 2e-4,
-    "air_moffatt": 1.0,
     "drag_rotation": 2.5e-6,
-    "centre_of_mass": 1e-4,
     "inertia_axial": 0.005,
     "air_bildsten": 0.3,
-    "air_quadratic": 0.1,
-    "air_spin": 1e-7,
-    "drag_linear": 1e-4,
-    "pivoting_viscous": 1e-5,
-    "pivoting_contensou": 1e-5,
     "km_e2": 0.381e-8,
-    "kn": 0.381e-7,
     "rolling_power": 1e-5,
     "contour_dry": 1e-4,
-    "contour_viscous": 1e-5,
-    "rolling_viscous": 1e-6,
-    "centre_of_mass_axial": 1e-4,
     "gravity": 0.05,
     "contact_radius": 2e-5,
     "contact_height": 2e-5,
-    "edge_radius": 1e-4,
     "inertia_diametral": 0.005,
-    "inertia_product": 1e-8,
     "time_offset": 1e-4,
     "turned": 2e-4,
     "shifted": 2e-4,
     "focal": 1e-3,
-    "principal_point": 0.3,
     "distortion": 0.05,
     "misprint": 2e-5,
     "pattern_offset": 2e-5,
@@ -71,21 +59,57 @@ SIZES = {
     "ellipse_centre": 1.0,
 }
 CONTROLS = {"nothing": 1.0, "prints": DOT_SIGMA, "laboratory": 1.0}  # hide nothing that may be claimed
+NOT_HIDDEN = ("km", "slip", "surface_moves", "table_settles", "clock_drift")  # the first is in every model
 INVISIBLE = ("pattern_rotation",)  # no recording of one disc shows it, and nothing should be said
 FIRST_ALONE = ("spring", "table_curved")  # of the candidate's numbers
+DURATION = (0.4, 0.9)  # [s]
+FLATTEST_DEG = 0.9  # the last frame's nutation: below, the disc touches its paper
+
+
+@dataclass(frozen=True)
+class Planted:
+    """What goes into the data, and the values of the diagnosis' quantities that are true then."""
+
+    truth: Mapping[str, float] = field(default_factory=dict)
+    effects: Mapping[str, float] = field(default_factory=dict)  # of the motion: "effect.parameter"
+    wrong: Mapping[str, float] = field(default_factory=dict)  # of the measurement: "fault.part" of the catalogue
+    laboratory: Laboratory = field(default_factory=Laboratory)
+
+
+@dataclass(frozen=True)
+class HiddenCase:
+    """What is hidden, effect -> size, in the recording of a seed; controls hide nothing that may be claimed."""
+
+    hidden: Mapping[str, float]
+    seed: int
+    rate: float = 1000.0  # [Hz]
+
+    @property
+    def asked(self) -> bool:
+        """Is there something that the diagnosis should name?"""
+        return any(name not in CONTROLS for name in self.hidden)
 
 
 @cache
-def alike(name: str) -> tuple[Candidate, ...]:
-    """What the diagnosis calls by this name, of one camera or dot each where it is theirs; none of a control.
+def _catalogue() -> Mapping[str, list[Candidate]]:
+    """What the diagnosis calls by a name, of one camera or dot each where it is theirs."""
+    disc, found = Scene().declared_disc, defaultdict[str, list[Candidate]](list)
+    for candidate in (*motion_candidates(Model(disc)), *measurement_candidates(disc)):
+        found[sub(r"^(left|right)_|_\d$", "", candidate.name)].append(candidate)
+    return found
 
-    Raises DiscTrackError.
-    """
-    if name not in SIZES | CONTROLS:
-        raise DiscTrackError(f"there is no effect '{name}' to hide; there are {', '.join(SIZES | CONTROLS)}")
-    disc = Scene().declared_disc
-    candidates = *motion_candidates(Model(disc)), *measurement_candidates(disc)
-    return tuple(c for c in candidates if name in (c.name, *c.name.split("_", 1)))
+
+def sizes() -> dict[str, float]:
+    """Of every effect that is hidden."""
+    typical = {name: alike[0].quantities[0].typical for name, alike in _catalogue().items() if name not in NOT_HIDDEN}
+    return typical | OVERLOOKED
+
+
+def alike(name: str) -> Sequence[Candidate]:
+    """What the diagnosis calls by this name; nothing of a control. Raises DiscTrackError."""
+    if name not in sizes() | CONTROLS:
+        raise DiscTrackError(f"there is no effect '{name}' to hide; there are {', '.join(sizes() | CONTROLS)}")
+    return _catalogue().get(name, ())
 
 
 def plant(name: str, size: float, rng: Generator) -> Planted:
@@ -114,3 +138,61 @@ def plant(name: str, size: float, rng: Generator) -> Planted:
         c, s = np.cos(turn), np.sin(turn)
         numbers = np.ravel([c * cosine - s * sine, s * cosine + c * sine])
     return Planted(truth, effects=dict(zip(truth, numbers.tolist(), strict=True)))
+
+
+def draw(seed: int, planted: Planted, rate: float = 1000.0) -> Scene:
+    """A motion that lasts as long as it is filmed, whatever is planted in it."""
+    rng = np.random.default_rng([seed, 31])
+    disc = Scene().declared_disc
+    faults = scene_faults(disc, planted.wrong, rate)
+    for _ in range(200):
+        theta = float(rng.uniform(3.0, 15.0))  # [deg]
+        n = int(rate * rng.uniform(*DURATION))
+        nutation = theta * float(rng.uniform(0.02, 0.1))
+        omega3 = float(rng.uniform(-2.0, 3.0))  # [rad/s]
+        model = Model(disc).with_values({"km.k_m": float(rng.uniform(0.2e-7, 0.5e-7))} | dict(planted.effects))
+        effects = {effect.name: effect.values for effect in model.effects}
+        rolling = RollingMotion(theta_deg=theta, nutation_deg=nutation, omega3_rad_s=omega3, effects=effects)
+        motion_of = MotionSettings("rolling", rolling=rolling)
+        scene = Scene(seed=seed, cameras=CameraSettings(rate, n), motion=motion_of, faults=faults)
+        try:
+            motion = simulate(model, rolling_start(scene), duration=1.03 * n / rate + 0.01, rate=rate)
+        except DiscTrackError:  # no such precession
+            continue
+        if len(motion) > 1.02 * n and motion.q[-1, 4] > np.radians(FLATTEST_DEG):
+            return scene
+    raise DiscTrackError(f"no motion of {DURATION[0]} s among those drawn: what is planted stops the disc at once")
+
+
+def recorded(case: HiddenCase) -> tuple[list[Planted], Trajectory]:
+    """What is planted, one by one, and the recording with all of it."""
+    rng = np.random.default_rng([case.seed, 32])
+    parts = [plant(name, size, rng) for name, size in case.hidden.items()]
+    effects, wrong = ({k: v for p in parts for k, v in getattr(p, kind).items()} for kind in ("effects", "wrong"))
+    imperfect = [p.laboratory for p in parts if p.laboratory != Laboratory()] or [Laboratory()]
+    planted = Planted(effects=effects, wrong=wrong, laboratory=imperfect[-1])
+    return [p for p in parts if p.truth], measured(draw(case.seed, planted, case.rate), planted.laboratory)
+
+
+def hidden_cases(
+    names: Sequence[str], seeds: Sequence[int], pairs: int = 0, rate: float = 1000.0
+) -> Iterator[HiddenCase]:
+    """Each effect ("NAME" or "NAME=SIZE"; none: all) with each seed; or pairs drawn at random, a seed each."""
+    hidden = [_sized(name) for name in names] or [*sizes().items()]
+    if not pairs:
+        yield from (HiddenCase({name: size}, seed, rate) for name, size in hidden for seed in seeds)
+        return
+    visible = [(name, size) for name, size in hidden if name not in INVISIBLE]
+    rng = np.random.default_rng([seeds[0], 33])
+    for number in range(pairs):
+        two = rng.choice(len(visible), 2, replace=False)
+        yield HiddenCase(dict(visible[int(k)] for k in two), seeds[0] + number, rate)
+
+
+def _sized(text: str) -> tuple[str, float]:
+    name, _, size = text.partition("=")
+    units = [candidate.quantities[0].unit for candidate in alike(name)]
+    try:
+        return name, float(size) if size else (sizes() | CONTROLS)[name]
+    except ValueError:
+        raise DiscTrackError(f"{text}: expected EFFECT=SIZE with the size in {(*units, 'm')[0]}") from None

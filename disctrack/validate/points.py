@@ -7,8 +7,8 @@ lens field is a sum of plane waves with random directions and phases; glare move
 that the table was taken from was bowed.
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,12 +16,12 @@ from calibration.cameras.camera import N_RIG, StereoRig
 from calibration.kit.arrays import Array
 from calibration.kit.least_squares import normal_of_rows
 from disctrack.disc import Disc
-from disctrack.faults.catalogue import scene_faults
 from disctrack.faults.keys import Faults
 from disctrack.frames import rotation_from_euler
-from disctrack.rolling import CATALOGUE, Effect, Model, simulate, steady_precession
+from disctrack.rolling import simulate
 from disctrack.synthetic import board_poses, rig_after_faults, rig_of, true_disc_of
 from disctrack.synthetic.description import Scene
+from disctrack.synthetic.motion import rolling_model, rolling_start, true_frame_rate
 from disctrack.track.pose import fit_poses
 from disctrack.track.refine.assembly import Taken, trajectory_of
 from disctrack.track.refine.self_calibration import DotsInFrames
@@ -31,7 +31,6 @@ Motion = Callable[[Array], Array]  # instants (k,) [s] -> coordinates q (k, 6)
 
 SIGMA_PX = 0.006  # of a dot's centre: 0.5 um and 1.3 mdeg per pose, as in the reference recordings
 CORNER_SIGMA_PX = 0.01
-K_M = CATALOGUE["km"]().values["k_m"]  # [m s^2]
 STATION = 0.002  # [s] after the motion's first instant at which the first frame is taken
 _WAVES = 14
 _WAVELENGTHS = (0.4, 1.5)  # of the image's width
@@ -55,32 +54,6 @@ class Laboratory:
 ORDINARY = Laboratory(0.02, 0.004, 3e-6, 40e-6, 1.2e-4, 1e-4)
 
 
-@dataclass(frozen=True)
-class Planted:
-    """What goes into the data, and the values of the diagnosis' quantities that are true then."""
-
-    truth: Mapping[str, float] = field(default_factory=dict)
-    effects: Mapping[str, float] = field(default_factory=dict)  # of the motion: "effect.parameter"
-    wrong: Mapping[str, float] = field(default_factory=dict)  # of the measurement: "fault.part" of the catalogue
-    faults: Faults = field(default_factory=Faults)  # and whatever else a scene may have
-    laboratory: Laboratory = field(default_factory=Laboratory)
-
-
-@dataclass(frozen=True)
-class Filmed:
-    """What is filmed, before anything is planted."""
-
-    seed: int = 1
-    n: int = 500
-    theta_deg: float = 14.0
-    nutation_deg: float = 0.5
-    omega3: float = 1.0  # [rad/s]
-    k_m: float = K_M  # [m s^2] known of to every diagnosis
-    declared_rate: float = 1000.0  # [Hz]
-    sigma_px: float = SIGMA_PX
-    rig_seed: int | None = None  # of the errors of calibration and laboratory, equal for recordings of one day
-
-
 def rig_covariance(rig: StereoRig, scene: Scene) -> Array:
     """(30, 30) from the corners of the scene's chessboard views, the first of which defines the world."""
     board = scene.board
@@ -98,69 +71,67 @@ def rig_covariance(rig: StereoRig, scene: Scene) -> Array:
 
 
 def measured(
-    planted: Planted,
-    filmed: Filmed,
+    scene: Scene,
+    laboratory: Laboratory = Laboratory(),
     *,
     motion: Motion | None = None,
-    laws: Sequence[type[Effect]] = (),
-    disc: Disc | None = None,
+    sigma_px: float = SIGMA_PX,
+    noise_seed: int | None = None,
 ) -> Trajectory:
-    """Trajectory of a disc that rolls down, with what is planted; the trajectory does not tell of it.
+    """Trajectory of the disc of a scene that rolls down, begun at random psi and phi; it does not tell of the faults.
 
-    motion : in place of the rolling model's   laws : by formula, that `planted` may name   disc : not the scene's
+    motion : in place of the rolling model's
+    noise_seed : of the motion's start and the noise; the scene's is then that of the errors of calibration and
+        laboratory alone, equal for recordings of one day
     """
-    rng = np.random.default_rng([20261121, filmed.seed])
-    scene = Scene(seed=filmed.seed if filmed.rig_seed is None else filmed.rig_seed)
-    disc = disc or scene.declared_disc
-    faults = scene_faults(disc, planted.wrong, filmed.declared_rate, planted.faults)
-    scene, rate = replace(scene, faults=faults), faults.frame_rate_hz or filmed.declared_rate
+    rng = np.random.default_rng([20261121, scene.seed if noise_seed is None else noise_seed])
+    of_rig = rng if noise_seed is None else np.random.default_rng([20261122, scene.seed])
+    n, declared_rate = scene.cameras.n_frames, scene.cameras.frame_rate_hz
     believed_rig = rig_of(scene)
     covariance = rig_covariance(believed_rig, scene)
     # drawn as correlations: k3 has a sigma of 100, a rotation one of 1e-4, and rounding must not mix them
     sigma = np.sqrt(np.diag(covariance))
-    of_rig = rng if filmed.rig_seed is None else np.random.default_rng([20261122, filmed.rig_seed])
     error = sigma * of_rig.multivariate_normal(np.zeros(N_RIG), covariance / np.outer(sigma, sigma), method="eigh")
-    scene, prints = _in_the_laboratory(scene, planted.laboratory, of_rig)
+    scene = _in_the_laboratory(scene, laboratory, of_rig)
+    faults, disc, rate = scene.faults, true_disc_of(scene), true_frame_rate(scene)
     true_rig = rig_after_faults(believed_rig.perturbed(error), scene)
     believed_rig = replace(believed_rig, covariance=covariance, world_is_table=True)
-    if motion is None:
-        model = Model(disc, laws=tuple(laws)).with_values({"km.k_m": filmed.k_m} | dict(planted.effects))
-        motion = _rolling(model, filmed, rng)
-    times = faults.true_times(np.arange(filmed.n) / rate, rate) + STATION
-    off_place = true_disc_of(scene).marker_centres_body - scene.declared_disc.marker_centres_body
-    centres = disc.marker_centres_body + off_place + prints
+    motion = motion or _rolling(scene, *rng.uniform(-3, 3, 2))
+    times = faults.true_times(np.arange(n) / rate, rate) + STATION
     views = [
-        _exposed(motion, times + delay, scene.faults, true_rig, centres, disc)[:, camera]
+        _exposed(motion, times + delay, faults, true_rig, disc)[:, camera]
         for camera, delay in enumerate((0.0, faults.right_delay_s))
     ]
     pixels = np.stack(views, axis=1)
-    if planted.laboratory != Laboratory():
-        pixels = _shifted_dots(of_rig, pixels, scene.cameras.image_size[0], planted.laboratory)
-    pixels = pixels + filmed.sigma_px * rng.standard_normal(pixels.shape)
-    dots = np.broadcast_to(filmed.sigma_px**2 * np.eye(2), (*pixels.shape, 2)).copy()
-    q = motion(times)
-    seen = DotsInFrames(believed_rig, disc, pixels, dots, rotation_from_euler(*q[:, 3:].T), q[:, :3])
-    fits = fit_poses(pixels, dots, believed_rig, disc.marker_centres_body, seen.R, seen.t, reject_outliers=False)
-    taken = Taken(range(filmed.n), np.arange(filmed.n) / filmed.declared_rate, filmed.declared_rate, 9.81)
+    if laboratory != Laboratory():
+        pixels = _shifted_dots(of_rig, pixels, scene.cameras.image_size[0], laboratory)
+    pixels = pixels + sigma_px * rng.standard_normal(pixels.shape)
+    dots = np.broadcast_to(sigma_px**2 * np.eye(2), (*pixels.shape, 2)).copy()
+    q, declared = motion(times), scene.declared_disc
+    seen = DotsInFrames(believed_rig, declared, pixels, dots, rotation_from_euler(*q[:, 3:].T), q[:, :3])
+    fits = fit_poses(pixels, dots, believed_rig, declared.marker_centres_body, seen.R, seen.t, reject_outliers=False)
+    taken = Taken(range(n), np.arange(n) / declared_rate, declared_rate, scene.gravity_m_s2)
     good = np.zeros(pixels.shape[:-1], np.uint8)  # the status of frames, and of their dots
-    return trajectory_of(seen, fits, np.zeros((filmed.n, 6, 6)), good[:, 0, 0], good[:, 0, 0], good, taken)
+    return trajectory_of(seen, fits, np.zeros((n, 6, 6)), good[:, 0, 0], good[:, 0, 0], good, taken)
 
 
-def _in_the_laboratory(scene: Scene, lab: Laboratory, rng: np.random.Generator) -> tuple[Scene, Array]:
-    """The scene with the board's errors among its faults, and the errors (m, 3) of the dots' places [m]."""
-    shift = np.zeros((scene.declared_disc.n_markers, 3))
+def _in_the_laboratory(scene: Scene, lab: Laboratory, rng: np.random.Generator) -> Scene:
+    """The scene with errors of the board and of the dots' places among its faults."""
     if lab == Laboratory():
-        return scene, shift
+        return scene
     height, scale, x, y = rng.standard_normal(4)
-    shift[:, :2] = lab.print_m * rng.standard_normal((len(shift), 2))
     f, tilt = scene.faults, np.degrees(lab.board_tilt)
+    pattern_scale = f.pattern_scale + lab.board_scale * scale
+    # the error of a print is that of the dot itself, whatever the pattern is scaled by
+    prints = 1e3 * lab.print_m * rng.standard_normal((scene.declared_disc.n_markers, 2)) / pattern_scale
     faults = replace(
         f,
+        misprint_mm=tuple(map(tuple, prints + (f.misprint_mm or 0.0))),
         table_height_mm=f.table_height_mm + 1e3 * lab.board_bow_m * height,
         table_turn_deg=(f.table_turn_deg[0] + tilt * x, f.table_turn_deg[1] + tilt * y),
-        pattern_scale=f.pattern_scale + lab.board_scale * scale,
+        pattern_scale=pattern_scale,
     )
-    return replace(scene, faults=faults), shift
+    return replace(scene, faults=faults)
 
 
 def _shifted_dots(rng: np.random.Generator, pixels: Array, width_px: float, laboratory: Laboratory) -> Array:
@@ -186,21 +157,12 @@ def plane_waves(rng: np.random.Generator, places_px: Array, width_px: float, rms
     return found
 
 
-def _rolling(model: Model, filmed: Filmed, rng: np.random.Generator) -> Motion:
-    start = steady_precession(
-        np.radians(filmed.theta_deg),
-        model.disc,
-        omega3=filmed.omega3,
-        nutation_amplitude=np.radians(filmed.nutation_deg),
-        psi=rng.uniform(-3, 3),
-        phi=rng.uniform(-3, 3),
-        x=0.032,
-        y=0.020,
-    )
+def _rolling(scene: Scene, psi: float, phi: float) -> Motion:
+    model, start = rolling_model(scene), rolling_start(scene).moved(psi=psi, phi=phi)
     return lambda times: simulate(model, start, times=np.r_[0.0, times]).q[1:]
 
 
-def _exposed(motion: Motion, times: Array, faults: Faults, rig: StereoRig, centres: Array, disc: Disc) -> Array:
+def _exposed(motion: Motion, times: Array, faults: Faults, rig: StereoRig, disc: Disc) -> Array:
     """Images of the dots (n, 2, m, 2), averaged over the exposure."""
     exposure, share = faults.exposure_s, faults.ellipse_centre_share
     nodes, weights = np.polynomial.legendre.leggauss(_INSTANTS) if exposure else (np.zeros(1), np.array([2.0]))
@@ -208,21 +170,21 @@ def _exposed(motion: Motion, times: Array, faults: Faults, rig: StereoRig, centr
     for node, weight in zip(nodes, weights, strict=True):
         q = motion(times + 0.5 * node * exposure)
         R, t = rotation_from_euler(*q[:, 3:].T), q[:, :3]
-        seen = np.moveaxis(rig.project(centres @ np.swapaxes(R, 1, 2) + t[:, None]), -3, 1)
+        seen = np.moveaxis(rig.project(disc.marker_centres_body @ np.swapaxes(R, 1, 2) + t[:, None]), -3, 1)
         if share:
-            seen = (1 - share) * seen + share * _image_centres(R, t, rig, centres, disc)
+            seen = (1 - share) * seen + share * _image_centres(R, t, rig, disc)
         images = images + 0.5 * weight * seen
     return np.asarray(images)
 
 
-def _image_centres(R: Array, t: Array, rig: StereoRig, centres: Array, disc: Disc) -> Array:
+def _image_centres(R: Array, t: Array, rig: StereoRig, disc: Disc) -> Array:
     """Centres of the areas that the dots' images cover (n, 2, m, 2), by quadrature over the dots."""
     nodes, weights = np.polynomial.legendre.leggauss(_RADII)
     radii, angles = 0.25 * disc.marker_diameter * (1 + nodes), 2 * np.pi * np.arange(_ANGLES) / _ANGLES
     r, a = (grid.ravel() for grid in np.meshgrid(radii, angles, indexing="ij"))
     weight = np.repeat(weights * radii, _ANGLES)
     found = []
-    for centre in centres:
+    for centre in disc.marker_centres_body:
         body = centre + np.stack([r * np.cos(a), r * np.sin(a), np.zeros(r.size)], axis=-1)
         pixels, by_point, _ = rig.project_with_jacobians(body @ np.swapaxes(R, 1, 2) + t[:, None])
         area = np.abs(np.linalg.det(by_point @ R[:, None, None, :, :2])) * weight  # (n, 2, points)

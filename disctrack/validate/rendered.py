@@ -26,7 +26,6 @@ from disctrack.track.measurement import open_pairs
 from disctrack.track.pose import MIN_DOTS
 from disctrack.trajectory import part
 from disctrack.validate.errors import PoseErrors, compare
-from disctrack.validate.points import K_M
 
 STATIC = "static poses"
 ROLLING = "rolling at 8 to 12 deg"
@@ -144,7 +143,7 @@ def rolling_scene(scene: Scene, name: str, theta_deg: float, n: int, rng: np.ran
         psi_deg=rng.uniform(-180, 180),
         phi_deg=rng.uniform(-180, 180),
         centre_mm=(x, y),
-        effects={"km": {"k_m": K_M}},
+        effects={"km": {}},  # as large as it is published
     )
     return replace(
         scene,

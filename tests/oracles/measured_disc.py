@@ -8,17 +8,35 @@ from disctrack.diagnosis.motion import motion_candidates
 from disctrack.discrepancy.fit import fit
 from disctrack.faults.keys import Faults
 from disctrack.frames import rotation_from_quaternion
+from disctrack.rolling import CATALOGUE, Model
+from disctrack.synthetic.description import CameraSettings, MotionSettings, RollingMotion, Scene
 from disctrack.track.refine.self_calibration import DotsInFrames
 from disctrack.validate import points
-from disctrack.validate.points import K_M, SIGMA_PX, Filmed, Laboratory, Planted
+from disctrack.validate.points import SIGMA_PX, Laboratory
 
 __all__ = ["K_M", "SIGMA_PX", "Laboratory", "assert_sized", "dots_of", "measured", "system_of", "with_base_fit"]
 
 
-def measured(effects=None, *, faults=None, laboratory=None, motion=None, laws=(), disc=None, **filmed):
-    """`filmed` : fields of `Filmed`; the others as in `Planted` and `points.measured`."""
-    planted = Planted(effects=effects or {}, faults=faults or Faults(), laboratory=laboratory or Laboratory())
-    return points.measured(planted, Filmed(**filmed), motion=motion, laws=laws, disc=disc)
+K_M = CATALOGUE["km"]().values["k_m"]  # [m s^2] as published, known of to every diagnosis
+
+
+def measured(
+    effects=None, *, laws=(), k_m=K_M, n=500, declared_rate=1000.0, seed=1, rig_seed=None, faults=None, **other
+):
+    """`effects` : by "effect.parameter"; `laws` : by formula, that they may name; `other` : of the motion's start, and
+    of `points.measured`.
+
+    rig_seed : of the errors of calibration and laboratory, equal for recordings of one day
+    """
+    model = Model(Scene().declared_disc, laws=tuple(laws)).with_values({"km.k_m": k_m} | dict(effects or {}))
+    of_points = {name: other.pop(name) for name in ("laboratory", "motion", "sigma_px") if name in other}
+    start = {"theta_deg": 14.0, "nutation_deg": 0.5, "omega3_rad_s": other.pop("omega3", 1.0)} | other
+    formulas = {law.name: law.formulas for law in laws}
+    rolling = RollingMotion(**start, effects={e.name: e.values for e in model.effects}, formulas=formulas)
+    motion, cameras = MotionSettings("rolling", rolling=rolling), CameraSettings(declared_rate, n)
+    day, noise = (seed, None) if rig_seed is None else (rig_seed, seed)
+    scene = Scene(seed=day, cameras=cameras, motion=motion, faults=faults or Faults())
+    return points.measured(scene, noise_seed=noise, **of_points)
 
 
 def dots_of(trajectory):

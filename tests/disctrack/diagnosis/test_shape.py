@@ -9,7 +9,7 @@ from disctrack.discrepancy.fit import fit
 from disctrack.discrepancy.search import explain
 from disctrack.discrepancy.shape import profiled
 from disctrack.faults.keys import Faults
-from disctrack.validate.diagnoses import HiddenCase, recorded
+from disctrack.validate.hidden import HiddenCase, recorded
 from tests.oracles import newton_euler
 from tests.oracles.measured_disc import K_M, assert_sized, measured, system_of, with_base_fit
 

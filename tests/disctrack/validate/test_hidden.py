@@ -9,8 +9,8 @@ from disctrack.diagnosis import DiscSystem
 from disctrack.diagnosis.model_file import declared_model
 from disctrack.discrepancy.fit import fit
 from disctrack.errors import DiscTrackError
-from disctrack.validate.diagnoses import HiddenCase, diagnosis_validation, draw, hidden_cases, hide, what_was_wrong
-from disctrack.validate.hidden import INVISIBLE, SIZES, alike, plant
+from disctrack.validate.diagnoses import diagnosis_validation, hide, what_was_wrong
+from disctrack.validate.hidden import INVISIBLE, HiddenCase, alike, draw, hidden_cases, plant, sizes
 from disctrack.validate.points import measured
 from tests.oracles.measured_disc import assert_sized
 
@@ -20,11 +20,12 @@ def visible(name):
     return name if alike(name)[0].kind == "measurement" else pytest.param(name, marks=pytest.mark.slow)
 
 
-@pytest.mark.parametrize("name", [visible(name) for name in SIZES if name not in INVISIBLE])
+@pytest.mark.parametrize("name", [visible(name) for name in sizes() if name not in INVISIBLE])
 def test_a_planted_effect_is_what_the_diagnosis_calls_by_that_name(name):
     """Fitted alone, it comes out at the planted size within its sigma, and leaves noise."""
-    planted = plant(name, SIZES[name], np.random.default_rng(7))
-    trajectory = measured(planted, replace(draw(5, planted), n=150))
+    planted = plant(name, sizes()[name], np.random.default_rng(7))
+    scene = draw(5, planted)
+    trajectory = measured(replace(scene, cameras=replace(scene.cameras, n_frames=150)))
     system = DiscSystem(trajectory, declared_model(trajectory, "paper").model)
     candidate = next(c for c in system.candidates if set(planted.truth) <= set(c.names))
     base = tuple(q for q in system.base if q.name not in candidate.names)
@@ -91,7 +92,7 @@ def test_cases_are_told_by_name_and_size_and_pairs_are_drawn_anew_for_each_seed(
 @pytest.mark.slow
 def test_beside_an_effect_that_was_looked_for_another_of_the_catalogue_is_tried_before_a_law_outside_of_it():
     """A shaken table and a dot 20 um off: the shaking alone left chi-square 1.006, but no noise."""
-    verdict = hide(HiddenCase({name: SIZES[name] for name in ("table_shaken", "misprint")}, seed=10, rate=500.0))
+    verdict = hide(HiddenCase({name: sizes()[name] for name in ("table_shaken", "misprint")}, seed=10, rate=500.0))
     assert verdict.named
     assert verdict.within
     assert verdict.verdict == "found"
