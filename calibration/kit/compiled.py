@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numba
 from filelock import FileLock
@@ -55,6 +55,25 @@ def _folder() -> Path:
 
 FOLDER = _folder()
 config.CACHE_DIR = str(FOLDER)
+
+
+def function_of(text: str, name: str, names: dict[str, object]) -> tuple[Callable[..., None], bool]:
+    """The function of this name in a text that the caller has checked, and may its machine code be kept?
+
+    Of a function that is in no file numba keeps none, so the text gets one where that can be written.
+    names : what the text may use
+    """
+    file = FOLDER / "texts" / sha256(text.encode()).hexdigest()[:16]
+    try:
+        if not file.exists():
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.write_text(text)
+        kept = True
+    except OSError:
+        kept = False
+    names["__name__"] = __name__  # numba loads a function together with its module
+    exec(compile(text, str(file), "exec"), names)
+    return cast("Callable[..., None]", names[name]), kept
 
 
 class _BeforeCompiling(event.Listener):

@@ -7,6 +7,7 @@ import pytest
 from numba import cfunc, types
 from numpy.testing import assert_allclose, assert_array_equal
 
+from calibration.kit.compiled import function_of
 from disctrack import rolling
 from disctrack.disc import MA_2014
 from disctrack.rolling import (
@@ -18,6 +19,7 @@ from disctrack.rolling import (
     steady_precession,
 )
 from disctrack.rolling._assembly import Assembly
+from disctrack.rolling._compiled import compile_law
 from disctrack.rolling.effects import effect_from_formulas
 from disctrack.rolling.records import ROLLING_COMPONENTS
 from disctrack.rolling.responses import COMPONENTS, responses
@@ -244,3 +246,12 @@ def test_complex_numbers_are_divided_as_in_python_and_by_zero_without_a_word(cap
     divided.ctypes(three.ctypes.data)
     assert_array_equal(three[2], complex(np.nan, np.nan))
     assert capfd.readouterr().err == ""
+
+
+def test_machine_code_of_a_law_by_formula_is_kept():
+    """The second function of the same text is loaded; one of another text is another."""
+    text = "def law(p, s, w):\n    w.M_z += -p.c * s.omega_z\n"
+    laws = [function_of(t, "law", {})[0] for t in (text, text, text.replace("M_z", "M_n"))]
+    compiled = [compile_law.__wrapped__(law, ("c",), (), float) for law in laws]
+    assert compiled[1].cache_hits == 1
+    assert compiled[2].address != compiled[1].address

@@ -13,10 +13,10 @@ from __future__ import annotations
 import ast
 from collections.abc import Callable, Mapping
 from functools import lru_cache
-from typing import Any, cast
 
 import numpy as np
 
+from calibration.kit.compiled import function_of
 from disctrack.rolling.effects.base import CATALOGUE, Effect, EffectParameter, ModelError, magnitude, sign
 from disctrack.rolling.records import KINEMATICS, WRENCH
 
@@ -72,9 +72,8 @@ def effect_from_formulas(
 
 @lru_cache(maxsize=64)  # the same formulas with other numbers are compiled once
 def _function(lines: str) -> Callable[..., None]:
-    namespace: dict[str, Any] = {"np": np, "magnitude": magnitude, "sign": sign}
-    exec(f"def law(p, s, w):\n{lines}", namespace)  # checked node by node in _translate
-    return cast("Callable[..., None]", namespace["law"])
+    namespace: dict[str, object] = {"np": np, "magnitude": magnitude, "sign": sign}
+    return function_of(f"def law(p, s, w):\n{lines}\n", "law", namespace)[0]  # checked node by node in _translate
 
 
 def _translate(name: str, formula: str) -> tuple[str, list[str]]:
