@@ -45,6 +45,7 @@ MIN_NUISANCE = 0.1  # a direction of the rig's covariance that moves all dots to
 MAX_SWITCHES = (50, 200)  # and per second: slip at every extremum of a nutation of 30 Hz has 120; more is chatter
 # slip that hardly exceeds friction creeps: it follows within v / (3 mu g), and a step has to be as short
 TRIAL_SLIP_STEPS = 1_000  # for every frame, in a fit that is one trial among many; where slip is true, hundreds
+ROLLS = 0.2  # of that, where the disc cannot slip: a law that narrows to nothing, or drives it round ever faster
 MOST_WORK = 30_000  # for every frame: steps of the integrator and rows of derivatives, 10 us each; some laws take half
 USUAL = 700  # frames of a recording
 MOST_SIGMAS = 10.0  # of a size's tolerance, within which it is sought: else a wrong clock bends the disc to fit itself
@@ -399,7 +400,9 @@ class DiscSystem(LawSystem):
         if SLIP in names and values.get(SLIP, 0.0) > 0:
             parameters[SLIP] = "slip.mu"
         limit = int(MAX_SWITCHES[0] + MAX_SWITCHES[1] * (times[-1] - times[0]))
-        left = int(min(self.budget.trial_left, self.trial_steps))  # more is no motion that can be followed
+        rolls = model.effect("slip") is None and model.effect("creep") is None
+        # more is no motion that can be followed
+        left = int(min(self.budget.trial_left, self.trial_steps * (ROLLS if rolls else 1.0)))
         of_state = [n.partition(".")[2] for n in components]
         moving = sensitivities(model, state, times, tuple(parameters.values()), of_state, THETA_END, RTOL, limit, left)
         self.budget.work(moving.n_steps)

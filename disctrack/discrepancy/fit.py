@@ -157,11 +157,12 @@ class _Problem:
             inside = np.clip(x + factor * step, self.lower, self.upper)
             trial = values | dict(zip(self.names, inside.tolist(), strict=True))
             trial |= {name: values[name] + factor * change for name, change in own.items()}
-            if halving and not self._cost(trial, self.system.linearise(trial, ())[0], NO_DERIVATIVE) < self.cost:
-                continue  # derivatives cost many times more, and a step that failed once may well fail again
+            # derivatives cost many times more than the prediction, and most of all where the step led far off
+            if not self._cost(trial, self.system.linearise(trial, ())[0], NO_DERIVATIVE) < self.cost:
+                continue
             residual, derivative = self.system.linearise(trial, [*self.own.slots, *self.names])
             cost = self._cost(trial, residual, derivative)
-            if np.isfinite(cost) and cost < self.cost:
+            if cost < self.cost:
                 self.values, self.residual, self.derivative, self.cost = trial, residual, derivative, cost
                 return True
         return False
