@@ -367,12 +367,18 @@ def explained_by_law(
     left, at_noise = best.fit.reduced_chi_square, diagnosis.settings.at_noise * noise
     ranked = sorted((*diagnosis.ranked, *answers), key=lambda e: e.length)
     listed = replace(diagnosis, ranked=tuple(ranked), length=ranked[0].length)
-    if not best.length < known:
+    if not best.length < known or _is_known(diagnosis, best.fit):
         text = f"a single law outside the catalogue describes the data too ({left:.4g}): {best.law.title}"
         return None, replace(listed, remarks=(*diagnosis.remarks, text)) if left <= at_noise else diagnosis
     if left > FAR * noise:
         return None, diagnosis
     return replace(best, law=replace(best.law, others=_others(best, answers, diagnosis))), listed
+
+
+def _is_known(diagnosis: Diagnosis, by_law: Fit) -> bool:
+    """Does a single effect of the motion describe the data as well as the law? Then that is what the law says."""
+    alone = sum(f.candidate.kind == "motion" for f in diagnosis.found) == 1
+    return alone and diagnosis.after.cost < by_law.cost + CLASS_GAIN * diagnosis.noise
 
 
 def _known(system: System, diagnosis: Diagnosis) -> float:

@@ -55,8 +55,9 @@ def diagnosis_of(recording, model="paper"):
     if not (out / "trajectory.h5").exists():
         # 3: a doubt is told, as a camera that is late by 200 us leaves 11 times the dots' scatter
         assert main(["run", str(recording), "-o", str(out), "--no-figures", "--no-video", *CALIBRATION]) in (0, 3)
-    asked = ["-o", str(out / "diagnosis"), "--overwrite", "--model", str(model)]
-    assert main(["diagnose", str(out / "trajectory.h5"), *asked]) == 0
+    # a hollow table is a doubt about the thickness of the disc to the tracking: diagnosed anyway, and told again
+    asked = ["-o", str(out / "diagnosis"), "--overwrite", "--anyway", "--model", str(model)]
+    assert main(["diagnose", str(out / "trajectory.h5"), *asked]) in (0, 3)
     return json.loads((out / "diagnosis" / "diagnosis.json").read_text())
 
 

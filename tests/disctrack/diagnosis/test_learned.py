@@ -22,8 +22,9 @@ from disctrack.rolling import Model, sensitivities, simulate, steady_precession
 from disctrack.rolling.effects import effect_from_formulas
 from disctrack.rolling.model import body_constants
 from disctrack.synthetic.description import Scene
+from tests.oracles import newton_euler
 from tests.oracles.measured_disc import assert_sized, measured, with_base_fit
-from tests.oracles.unknown_laws import recording
+from tests.oracles.unknown_laws import Unknown, recording
 
 
 def hiding(name: str, component: str, formula: str, size: float, **options):
@@ -133,6 +134,15 @@ def test_a_law_is_looked_for_along_the_motion_that_follows_the_data():
     fitted = with_law(system.knowing(law), base, law)
     assert fitted.reduced_chi_square < 1.1
     assert_sized(fitted, {law.candidate.names[0]: 40.0}, 3)
+
+
+@pytest.mark.statistical
+def test_a_strong_spring_is_no_law_in_fewer_numbers():
+    """About the origin it is a force in proportion to the distance, with one number where the catalogue's has three."""
+    result = diagnose(recording(Unknown(newton_euler.spring(0.8), duration=0.4)).trajectory)
+    assert result.learned is None
+    assert [found.candidate.name for found in result.diagnosis.found] == ["spring"]
+    assert_sized(result.diagnosis.after, {"spring.k": 0.8}, 3)
 
 
 @pytest.mark.slow
