@@ -376,9 +376,9 @@ def explained_by_law(
 
 
 def _is_known(diagnosis: Diagnosis, by_law: Fit) -> bool:
-    """Does a single effect of the motion describe the data as well as the law? Then that is what the law says."""
+    """Does a single effect of the motion leave no more than the law does? Then that says the same in fewer numbers."""
     alone = sum(f.candidate.kind == "motion" for f in diagnosis.found) == 1
-    return alone and diagnosis.after.cost < by_law.cost + CLASS_GAIN * diagnosis.noise
+    return alone and diagnosis.after.cost <= by_law.cost
 
 
 def _known(system: System, diagnosis: Diagnosis) -> float:

@@ -112,7 +112,9 @@ def measured(
     fits = fit_poses(pixels, dots, believed_rig, declared.marker_centres_body, seen.R, seen.t, reject_outliers=False)
     taken = Taken(range(n), np.arange(n) / declared_rate, declared_rate, scene.gravity_m_s2)
     good = np.zeros(pixels.shape[:-1], np.uint8)  # the status of frames, and of their dots
-    return trajectory_of(seen, fits, np.zeros((n, 6, 6)), good[:, 0, 0], good[:, 0, 0], good, taken)
+    found = trajectory_of(seen, fits, np.zeros((n, 6, 6)), good[:, 0, 0], good[:, 0, 0], good, taken)
+    # of a bowed board the rim tells the tracking by how much the table is another
+    return replace(found, table_moved=(laboratory.board_bow_m, laboratory.board_tilt, laboratory.board_tilt))
 
 
 def _in_the_laboratory(scene: Scene, lab: Laboratory, rng: np.random.Generator) -> Scene:
