@@ -1,8 +1,11 @@
-"""Recordings with effects that no catalogue names.
+"""Recordings with effects that no catalogue names, and what the diagnosis makes of them.
+
+    python -m tests.oracles.unknown_table                        # all of them, one line each
+    python -m tests.oracles.unknown_table bump groove --seeds 1 2
 
 The motion is that of world vectors and quaternions (newton_euler), so that no line of the equations is the product's.
-Beside it stands the true moment about the contact, of all laws together, of which a rolling disc takes notice: a force
-X at its centre and a moment M act as M - r_OA x X.
+Beside the answer stands the true moment about the contact, of all laws together, against that of the fitted model: the
+numbers of which a rolling disc takes notice, for a force X at its centre and a moment M act as M - r_OA x X.
 """
 
 from __future__ import annotations
@@ -34,10 +37,10 @@ class Unknown:
     theta_deg: float = 11.0
     omega3: float = 0.6
     duration: float = 0.7
-    rate_of_memory: Callable | None = (
-        None  # (disc, instant, memory) -> rate of one more number, 0 at first, which the law reads
-    )
+    rate_of_memory: Callable | None = None  # (disc, instant, memory) -> rate of one more number, which the law reads
+    remembered: Callable | None = None  # (instant) -> that number at the start; psidot^2, if not given
     wears: float = 0.0  # [m/s] by which the radius shrinks
+    com: Callable | None = None  # instant -> centre of mass in the body
     friction: Callable | None = None  # slip speed -> coefficient: the disc slips, and there is no true moment
     shift: Callable | None = None  # times -> (n, 6) by which the coordinates are seen beside the motion
 
@@ -57,6 +60,11 @@ def contact(now):
 def force(of):
     """A force at the centre."""
     return lambda disc, now: (ZERO, ZERO, of(disc, now))
+
+
+def by_load(of):
+    """A moment in proportion to the load [m]."""
+    return lambda disc, now: (ZERO, of(disc, now), ZERO)
 
 
 def moment(of):
@@ -110,6 +118,46 @@ def groove(angle, offset, depth, width):
     return gradient
 
 
+def magnets(*places):
+    def of(disc, now):
+        total = np.zeros(3)
+        for x, y, strength, reach in places:
+            d = now.O - (x, y, now.O[2])
+            total -= strength * d / (1 + d @ d / reach**2) ** 2
+        return total
+
+    return force(of)
+
+
+def kicks(every, impulse, angle, width=1.5e-3):
+    def of(disc, now):
+        since = (disc.t + 0.5 * every) % every - 0.5 * every
+        return impulse / (width * np.sqrt(2 * np.pi)) * np.exp(-0.5 * (since / width) ** 2) * level(angle)
+
+    return force(of)
+
+
+def sticker(mass, arm, size, frequency):
+    """A mass on the face, `arm` from the centre, that flaps along the axis."""
+
+    def law(disc, now):
+        push = mass * size * (2 * np.pi * frequency) ** 2 * np.cos(2 * np.pi * frequency * disc.t) * now.d
+        return np.cross(arm * now.R[:, 0], push), ZERO, push
+
+    return law
+
+
+def over_iron(strength):
+    """A magnet along the axis above an iron table, with its image: U = -C (1 + cos^2 theta) / z^3."""
+
+    def law(disc, now):
+        z = now.O[2]
+        torque = -2 * strength * now.cosine * now.sine / z**3 * now.n0
+        return torque, ZERO, -3 * strength * (1 + now.cosine**2) / z**4 * K
+
+    return law
+
+
 def seam(angle, offset, height, width):
     """Two halves of a table, one higher than the other."""
     normal = level(angle)[:2]
@@ -121,29 +169,182 @@ def seam(angle, offset, height, width):
     return gradient
 
 
-def stribeck(speed):
-    return 0.08 + (0.30 - 0.08) * np.exp(-((speed / 0.02) ** 2))
+def nail(strength, place):
+    """A magnet in the face, 25 mm from its centre, pulled towards a nail below the table: U = -C / d^3."""
 
+    def law(disc, now):
+        lever = 0.025 * now.R[:, 0]
+        d = now.O + lever - np.array(place)
+        pull = -3 * strength * d / np.linalg.norm(d) ** 5
+        return np.cross(lever, pull), ZERO, pull
+
+    return law
+
+
+def both(*laws):
+    """Two laws at once."""
+
+    def law(disc, now):
+        parts = [one(disc, now) for one in laws]
+        return tuple(sum(part[i] for part in parts) for i in range(3))
+
+    return law
+
+
+def dipole(strength, place):
+    """A magnet along the axis in the field of an upright one below the table; its force by differences of energy."""
+
+    def field(r):
+        away = r / np.linalg.norm(r)
+        return strength * (3 * away * away[2] - K) / np.linalg.norm(r) ** 3
+
+    def law(disc, now):
+        r, step = now.O - np.array(place), 1e-6
+        by_place = [field(r + step * axis) - field(r - step * axis) for axis in np.eye(3)]
+        return np.cross(now.d, field(r)), ZERO, np.array(by_place) @ now.d / (2 * step)
+
+    return law
+
+
+def jet(size, speed, width, middle, angle):
+    """Air blown along a direction in a beam, by the square of the speed past it and the area that stands in its way."""
+    towards, aside = level(angle), level(angle + 0.5 * np.pi)
+
+    def of(disc, now):
+        off = (now.O @ aside - middle) / width
+        past = speed * np.exp(-off * off) - now.v @ towards
+        return size * (abs(now.d @ towards) + 0.1) * past * abs(past) * towards
+
+    return force(of)
+
+
+def azimuth(now):
+    return np.arctan2(now.n0[1], now.n0[0])
+
+
+def stribeck(static, dynamic, speed):
+    return lambda w: dynamic + (static - dynamic) * np.exp(-((w / speed) ** 2))
+
+
+KZ = stribeck(2e-4, 5e-5, 0.8)
+CONTOUR = stribeck(2.5e-4, 5e-5, 25.0)
+SLIDING = stribeck(0.30, 0.08, 0.02)
 
 UNKNOWN: dict[str, Unknown] = {
-    "stribeck_slip": Unknown(None, 14.0, 1.0, 0.5, friction=lambda v: stribeck(v) * v / np.sqrt(v * v + 2e-4**2)),
+    "stribeck_pivoting": Unknown(by_load(lambda d, n: -KZ(n.omega[2]) * np.tanh(n.omega[2] / 0.05) * K), omega3=1.5),
+    "stribeck_contour": Unknown(by_load(lambda d, n: -CONTOUR(n.psidot) * np.sign(n.psidot) * n.m0)),
+    "stribeck_slip": Unknown(None, 14.0, 1.0, 0.5, friction=lambda v: SLIDING(v) * v / np.sqrt(v * v + 2e-4**2)),
+    "low_friction": Unknown(None, 14.0, 1.0, 0.5, friction=lambda v: 0.02 * v / np.sqrt(v * v + 2e-4**2)),
     "viscous_contact": Unknown(None, 14.0, 1.0, 0.5, friction=lambda v: 30.0 * v),
+    "sticky_patch": Unknown(
+        moment(lambda d, n: -6e-4 * np.exp(-np.sum((contact(n)[:2] - PLACE) ** 2) / 0.012**2) * rolling(n))
+    ),
+    "dying_force": Unknown(force(lambda d, n: 4e-3 * np.exp(-d.t / 0.15) * level(0.8))),
+    "growing_force": Unknown(force(lambda d, n: d.t * np.array([1.2e-3, -3.8e-3, 0.0]))),
     "drag_one_way": Unknown(force(lambda d, n: -0.012 * (n.v @ level(0.5)) * level(0.5))),
+    "two_magnets": Unknown(magnets((0.06, 0.02, 0.6, 0.03), (-0.01, 0.05, 0.4, 0.02))),
+    "rough_sector": Unknown(
+        by_load(lambda d, n: -2.5e-4 * smooth((np.cos(np.arctan2(n.n0[1], n.n0[0]) - 1.0) - 0.3) / 0.1) * rolling(n))
+    ),
+    "friction_steps": Unknown(by_load(lambda d, n: -1.5e-4 * smooth((d.t - 0.35) / 0.005) * rolling(n))),
+    "torque_by_attitude": Unknown(moment(lambda d, n: 6e-4 * np.cross(n.d, level(0.4)))),
     "quadratic_spring": Unknown(force(lambda d, n: -40.0 * np.linalg.norm(n.O[:2]) * np.array([*n.O[:2], 0.0]))),
+    "hysteresis": Unknown(
+        lambda d, n: (ZERO, -4e-8 * d.memory * n.m0, ZERO), rate_of_memory=lambda d, n, z: (n.psidot**2 - z) / 0.05
+    ),
+    "periodic_kicks": Unknown(kicks(0.06, 2e-5, 0.9)),
     "eddy_half": Unknown(force(lambda d, n: -0.02 * smooth((n.O[0] - 0.032) / 1e-4) * n.v * (1, 1, 0))),
     "bump": Unknown(uneven(hill(*PLACE, 30e-6, 8e-3))),
     "groove": Unknown(uneven(groove(0.6, 0.05, 20e-6, 3e-3))),
+    "swirl": Unknown(force(lambda d, n: -0.01 * (n.v - 3.0 * np.cross(K, n.O - (0.02, 0.0, 0.0))) * (1, 1, 0))),
+    "adhesion_by_rest": Unknown(moment(lambda d, n: -2e-4 * (1 + 30.0 / np.abs(n.psidot)) * rolling(n))),
+    "pivoting_by_root": Unknown(
+        by_load(lambda d, n: -8e-5 * n.omega[2] / (n.omega[2] ** 2 + 0.01) ** 0.25 * K), omega3=1.5
+    ),
+    "mass_shifts": Unknown(None, com=lambda t: (40e-6 * smooth((t - 0.3) / 0.003), 0.0, 0.0)),
+    "sticker_flaps": Unknown(sticker(2e-5, 0.025, 2e-4, 37.0)),
     "table_sinks": Unknown(None, shift=lambda t: np.outer(-40e-6 * (t / 0.7) ** 2, [0, 0, 1, 0, 0, 0])),
+    "table_slides": Unknown(None, shift=lambda t: np.outer(60e-6 * np.sin(2 * np.pi * 3 * t), [1, 0.5, 0, 0, 0, 0])),
+    "wind_gusts": Unknown(force(lambda d, n: 1.5e-3 * (np.sin(19 * d.t) + np.sin(31 * d.t + 1)) * level(2.0))),
+    "magnus_by_height": Unknown(force(lambda d, n: 0.05 * n.sine * np.cross(n.omega, n.v) * (1, 1, 0))),
+    "soft_start": Unknown(by_load(lambda d, n: -2e-4 * np.exp(-d.t / 0.1) * rolling(n))),
+    "brake_by_tilt": Unknown(by_load(lambda d, n: -3e-3 * n.sine**2 * rolling(n))),
+    "tilt_by_azimuth": Unknown(by_load(lambda d, n: -6e-4 * n.sine * np.cos(2 * azimuth(n) - 0.5) * rolling(n))),
     "wear": Unknown(None, wears=20e-6),
+    "magnet_over_iron": Unknown(over_iron(3e-11)),
     "seam": Unknown(uneven(seam(0.9, 0.045, 6e-6, 4e-3))),
+    "rough_rim": Unknown(by_load(lambda d, n: -2e-4 * smooth((np.cos(n.phi - 1.0) - 0.5) / 0.1) * rolling(n))),
+    "puddle": Unknown(
+        moment(lambda d, n: -1.5e-5 * n.psidot * np.exp(-np.sum((contact(n)[:2] - PLACE) ** 2) / 0.015**2) * n.m0)
+    ),
+    "hinged_frame": Unknown(
+        force(lambda d, n: d.m * 9.81 * d.memory * np.array([1.0, 0.0, 0.0])),
+        rate_of_memory=lambda d, n, z: (5e-3 * (contact(n)[0] + 0.1) - z) / 0.04,
+        remembered=lambda n: 5e-3 * (contact(n)[0] + 0.1),
+    ),
+    "fan": Unknown(force(lambda d, n: -0.01 * (n.v - 0.5 * smooth((d.t - 0.3) / 0.02) * level(1.3)) * (1, 1, 0))),
+    "liquid": Unknown(
+        lambda d, n: (-4e-6 * (n.omega @ n.d - d.memory) * n.d, ZERO, ZERO),
+        omega3=1.5,
+        rate_of_memory=lambda d, n, z: (n.omega @ n.d - z) / 0.1,
+        remembered=lambda n: 0.0,
+    ),
+    "thrust": Unknown(force(lambda d, n: 3e-3 * n.d)),
     "twisted_thread": Unknown(
         moment(lambda d, n: -3e-6 * d.memory * K),
         rate_of_memory=lambda d, n, z: n.omega[2],
+        remembered=lambda n: 0.0,
         omega3=1.5,
+    ),
+    "worn_in": Unknown(  # friction that falls with the distance rolled
+        by_load(lambda d, n: -1.5e-4 * np.exp(-d.memory / 0.4) * rolling(n)),
+        rate_of_memory=lambda d, n, z: d.r * np.linalg.norm(n.omega - n.omega[2] * K),
+        remembered=lambda n: 0.0,
+    ),
+    "cross_drag": Unknown(force(lambda d, n: 6e-4 * n.psidot * n.sine * n.n0)),
+    "nail": Unknown(nail(3e-10, (0.05, 0.01, -0.02))),
+    "warming": Unknown(  # friction that falls with the heat of what it has dissipated, which cools
+        by_load(lambda d, n: -2e-4 / (1 + d.memory / 2e-4) * rolling(n)),
+        rate_of_memory=lambda d, n, z: (
+            2e-4 * d.m * 9.81 / (1 + z / 2e-4) * np.linalg.norm(n.omega - n.omega[2] * K) - z / 0.3
+        ),
+        remembered=lambda n: 0.0,
+    ),
+    "slipping_thread": Unknown(  # which holds up to a moment, and slips
+        moment(lambda d, n: -6e-5 * d.memory * K),
+        omega3=1.5,
+        rate_of_memory=lambda d, n, z: n.omega[2] - abs(n.omega[2]) * z / 0.25,
+        remembered=lambda n: 0.0,
+    ),
+    "presliding": Unknown(  # friction that builds up over a way, by Dahl
+        by_load(lambda d, n: -1.5e-4 * d.memory * n.m0),
+        rate_of_memory=lambda d, n, z: n.psidot * n.sine * (1 - z * np.sign(n.psidot) * abs(z)) / 0.3,
+        remembered=lambda n: -0.5,
     ),
     "loose_ball": Unknown(  # in a tube of the face, in oil
         lambda d, n: (np.cross(d.memory * n.R[:, 0], -0.0981 * K), ZERO, ZERO),
         rate_of_memory=lambda d, n, z: (-3e-3 * n.R[2, 0] - z) / 0.02,
+        remembered=lambda n: 0.0,
+    ),
+    "two_materials": Unknown(
+        both(
+            uneven(seam(0.9, 0.045, 6e-6, 4e-3)),
+            by_load(lambda d, n: -1e-4 * smooth((contact(n) @ level(0.9) - 0.045) / 1e-3) * rolling(n)),
+        )
+    ),
+    "dipole_below": Unknown(dipole(4e-9, (0.06, 0.05, -0.05))),
+    "jet": Unknown(jet(2e-2, 1.0, 0.01, 0.02, 0.3)),
+    "force_and_rim": Unknown(
+        both(
+            force(lambda d, n: d.t * np.array([1.2e-3, -3.8e-3, 0.0])),
+            by_load(lambda d, n: -2e-4 * smooth((np.cos(n.phi - 1.0) - 0.5) / 0.1) * rolling(n)),
+        )
+    ),
+    "drag_and_steps": Unknown(
+        both(
+            force(lambda d, n: -0.012 * (n.v @ level(0.5)) * level(0.5)),
+            by_load(lambda d, n: -1.5e-4 * smooth((d.t - 0.35) / 0.005) * rolling(n)),
+        )
     ),
     "pad": Unknown(  # a table that leans, as far as it gives way, to where the contact is
         force(lambda d, n: d.m * 9.81 * 2e-3 * np.tanh((contact(n)[0] - 0.03) / 0.02) * np.array([1.0, 0.0, 0.0]))
@@ -152,7 +353,7 @@ UNKNOWN: dict[str, Unknown] = {
 
 
 class _Body(newton_euler.Disc):
-    """A disc with a number that its laws remember, a radius that wears, or friction by the speed of slip."""
+    """A disc with a number that its laws remember, a centre of mass that wanders, or friction by the speed of slip."""
 
     memory = 0.0
 
@@ -166,6 +367,8 @@ class _Body(newton_euler.Disc):
     def moved(self, t, state):
         """At an instant and a state."""
         self.t, self.memory = t, state[15] if len(state) > 15 else 0.0
+        if self._unknown.com is not None:
+            self.com = np.array(self._unknown.com(t))
         self.r, self.wears = DISC.radius - self._unknown.wears * t, self._unknown.wears
         if self._unknown.friction is not None:
             now = newton_euler.Instant(self, state[:15])
@@ -184,7 +387,8 @@ def motion(unknown: Unknown):
     if regime == "slipping":
         state[7:9] += (5e-3, -3e-3)
     if unknown.rate_of_memory is not None:
-        state = np.append(state, 0.0)
+        now = newton_euler.Instant(body, state)
+        state = np.append(state, now.psidot**2 if unknown.remembered is None else unknown.remembered(now))
 
     def rate(t, s):
         ydot = newton_euler.rate(body.moved(t, s), s[:15], regime)
@@ -206,7 +410,7 @@ def motion(unknown: Unknown):
     for i, (t, s) in enumerate(zip(found.t, states, strict=True)):
         now = newton_euler.Instant(body.moved(t, s), s[:15])
         speed[i] = *now.v, now.psidot, now.thetadot, now.phidot
-    if regime == "rolling" and unknown.shift is None and not unknown.wears:
+    if regime == "rolling" and unknown.com is None and unknown.shift is None and not unknown.wears:
         for i in range(0, len(q), 6):
             body.moved(found.t[i], states[i])
             wrench[i] = moment_of(body, states[i][:15])
