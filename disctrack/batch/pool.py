@@ -255,12 +255,14 @@ def _work(jobs: Connection, said: Path) -> None:
         os.dup2(output, stream)
     cv2.setNumThreads(1)  # the others have the cores
     end_with_parent()
-    try:
-        while True:
-            jobs.send(do(jobs.recv()))
-    except SystemExit:  # half-written files are gone
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
-        signal.raise_signal(signal.SIGTERM)
+    while True:
+        job = jobs.recv()  # struck here, it ends in order, and gives back what it has of the system
+        try:
+            record = do(job)
+        except SystemExit:  # half-written files are gone
+            signal.signal(signal.SIGTERM, signal.SIG_DFL)
+            signal.raise_signal(signal.SIGTERM)
+        jobs.send(record)
 
 
 def _stop(number: int, frame: FrameType | None) -> None:

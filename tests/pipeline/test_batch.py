@@ -436,7 +436,7 @@ def test_a_batch_killed_at_random_instants_leaves_only_whole_results_and_can_go_
     process = start(a_day(recording, tmp_path / "timed", names))
     wait_until(lambda: begun(tmp_path / "timed"), process)
     began = time.monotonic()
-    process.communicate(timeout=PATIENCE)
+    assert "leaked" not in process.communicate(timeout=PATIENCE)[1]  # of what processes that end owe to the system
     duration, chance = time.monotonic() - began, random.Random(17)
     died: list[int] = []  # how many recordings were finished at each kill
     finished, root, tree = len(names), tmp_path, 0
