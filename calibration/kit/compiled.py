@@ -12,12 +12,13 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from hashlib import sha256
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, TypeVar, cast
 
 import numba
 from filelock import FileLock
 from numba.core import event
 
+T = TypeVar("T")
 njit: Any = numba.njit  # types of a decorated function say nothing of how it is called
 cfunc: Any = numba.cfunc
 config: Any = numba.config
@@ -57,23 +58,30 @@ FOLDER = _folder()
 config.CACHE_DIR = str(FOLDER)
 
 
-def function_of(text: str, name: str, names: dict[str, object]) -> tuple[Callable[..., None], bool]:
-    """The function of this name in a text that the caller has checked, and may its machine code be kept?
+def compiled(
+    decorator: Callable[..., Callable[..., T]], signature: object, function: Callable[..., None], **rules: bool
+) -> T:
+    """A function compiled for one signature; its machine code is kept where the function is in a file."""
+    # error_model: a division by zero gives inf or nan, as in NumPy; the integrator then refuses the step
+    try:
+        return decorator(signature, cache=True, error_model="numpy", **rules)(function)
+    except RuntimeError:  # numba: "no locator available": typed at a prompt, or no file can be written
+        return decorator(signature, error_model="numpy", **rules)(function)
 
-    Of a function that is in no file numba keeps none, so the text gets one where that can be written.
-    names : what the text may use
+
+def function_of(text: str, name: str, names: dict[str, object]) -> Callable[..., None]:
+    """The function of this name in a text that the caller has checked.   names : what the text may use
+
+    Of a function that is in no file numba keeps no machine code, so the text gets one where that can be written.
     """
     file = FOLDER / "texts" / sha256(text.encode()).hexdigest()[:16]
-    try:
+    with suppress(OSError):
         if not file.exists():
             file.parent.mkdir(parents=True, exist_ok=True)
             file.write_text(text)
-        kept = True
-    except OSError:
-        kept = False
     names["__name__"] = __name__  # numba loads a function together with its module
     exec(compile(text, str(file), "exec"), names)
-    return cast("Callable[..., None]", names[name]), kept
+    return cast("Callable[..., None]", names[name])
 
 
 class _BeforeCompiling(event.Listener):

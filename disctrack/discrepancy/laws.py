@@ -376,7 +376,7 @@ def explained_by_law(
 
 
 def _is_known(diagnosis: Diagnosis, by_law: Fit) -> bool:
-    """Does a single effect of the motion leave no more than the law does? Then that says the same in fewer numbers."""
+    """Does a single effect of the motion leave no more than the law, which then says the same in fewer numbers?"""
     alone = sum(f.candidate.kind == "motion" for f in diagnosis.found) == 1
     return alone and diagnosis.after.cost <= by_law.cost
 

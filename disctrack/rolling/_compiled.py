@@ -17,7 +17,7 @@ from numba.core import cgutils
 from numba.extending import intrinsic, lower_builtin, register_jitable
 from numpy.typing import NDArray
 
-from calibration.kit.compiled import cfunc, one_at_a_time
+from calibration.kit.compiled import cfunc, compiled, one_at_a_time
 from disctrack.rolling.records import BODY, INSTANT, record_dtype
 
 Addresses: TypeAlias = NDArray[np.int64]
@@ -59,12 +59,8 @@ def _divided(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
 
 
 def _compile(function: Callable[..., None], signature: Any) -> Any:
-    # error_model: a division by zero gives inf or nan, as in NumPy; the integrator then refuses the step
     with one_at_a_time():
-        try:
-            return cfunc(signature, cache=True, error_model="numpy")(function)
-        except RuntimeError:  # numba: "no locator available": typed at a prompt, or a law by formula: in no file
-            return cfunc(signature, error_model="numpy")(function)
+        return compiled(cfunc, signature, function)
 
 
 def _record(names: tuple[str, ...], scalar: type) -> types.Type:

@@ -16,6 +16,7 @@ from calibration.kit.arguments import checked
 from calibration.kit.arrays import Array, Array32, Image
 from disctrack.disc import AIR_DENSITY, Disc
 from disctrack.errors import OutputError
+from disctrack.recording.declaration import KEYS
 from disctrack.recording.declaration_text import declaration_text
 from disctrack.synthetic.cameras import board_poses, rig_after_faults, rig_of
 from disctrack.synthetic.description import ImperfectionSettings, Scene, load_scene
@@ -196,10 +197,9 @@ def recording_toml(scene: Scene) -> str:
         "gravity": {"g_m_s2": scene.gravity_m_s2},
         "air": {} if scene.air_density_kg_m3 == AIR_DENSITY else {"density_kg_m3": scene.air_density_kg_m3},
     }
-    if scene.imperfections == ImperfectionSettings():
-        declared["disc"] |= {"radius_tolerance_mm": 0.0, "thickness_tolerance_mm": 0.0}
-        declared["calibration"] |= {"square_tolerance_mm": 0.0, "flatness_tolerance_mm": 0.0}
-        declared["table"] |= {"board_thickness_tolerance_mm": 0.0}
     told = {(section, key): (value, "") for section, values in declared.items() for key, value in values.items()}
+    if scene.imperfections == ImperfectionSettings():
+        tolerances = [(section, key) for section, keys in KEYS.items() for key in keys if "_tolerance_" in key]
+        told |= dict.fromkeys(tolerances, (0.0, "here, what is declared is exact"))
     told["table", "view"] = 0, "in this view, counted from 0, the board lies flat on the table"
     return declaration_text(scene.name, told, {}, {})[0]

@@ -414,7 +414,7 @@ def _reading(path: Path) -> Iterator[h5py.File]:
 
 def _trajectory(file: h5py.File) -> Trajectory:
     _check_units(file)
-    root, disc = read_variables(file), _read_disc(file["disc"])
+    root, disc = read_variables(file, ("time", *COORDINATES)), _read_disc(file["disc"])
     lengths = {name: len(values) for name, (values, _) in _NAMED_AXES.items()}
     lengths |= {"time": len(root["time"]), "marker": disc.n_markers}
     found: dict[str, Any] = {}

@@ -140,7 +140,7 @@ def plant(name: str, size: float, rng: Generator) -> Planted:
     return Planted(truth, effects=dict(zip(truth, numbers.tolist(), strict=True)))
 
 
-def draw(seed: int, planted: Planted, rate: float = 1000.0) -> Scene:
+def draw(seed: int, planted: Planted, rate: float = HiddenCase.rate) -> Scene:
     """A motion that lasts as long as it is filmed, whatever is planted in it."""
     rng = np.random.default_rng([seed, 31])
     disc = Scene().declared_disc
@@ -175,7 +175,7 @@ def recorded(case: HiddenCase) -> tuple[list[Planted], Trajectory]:
 
 
 def hidden_cases(
-    names: Sequence[str], seeds: Sequence[int], pairs: int = 0, rate: float = 1000.0
+    names: Sequence[str], seeds: Sequence[int], pairs: int = 0, rate: float = HiddenCase.rate
 ) -> Iterator[HiddenCase]:
     """Each effect ("NAME" or "NAME=SIZE"; none: all) with each seed; or pairs drawn at random, a seed each."""
     hidden = [_sized(name) for name in names] or [*sizes().items()]

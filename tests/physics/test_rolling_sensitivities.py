@@ -251,7 +251,7 @@ def test_complex_numbers_are_divided_as_in_python_and_by_zero_without_a_word(cap
 def test_machine_code_of_a_law_by_formula_is_kept():
     """The second function of the same text is loaded; one of another text is another."""
     text = "def law(p, s, w):\n    w.M_z += -p.c * s.omega_z\n"
-    laws = [function_of(t, "law", {})[0] for t in (text, text, text.replace("M_z", "M_n"))]
+    laws = [function_of(t, "law", {}) for t in (text, text, text.replace("M_z", "M_n"))]
     compiled = [compile_law.__wrapped__(law, ("c",), (), float) for law in laws]
     assert compiled[1].cache_hits == 1
     assert compiled[2].address != compiled[1].address

@@ -10,7 +10,7 @@ import sympy
 from numba.core.types import CompileResultWAP
 
 from calibration.kit.arrays import Array
-from calibration.kit.compiled import function_of, njit
+from calibration.kit.compiled import compiled, function_of, njit
 from disctrack.discrepancy.equations import _ode_kernel as kernel
 from disctrack.discrepancy.equations.declared import Equations, Parameter, Samples, Term
 from disctrack.discrepancy.equations.expressions import Formula, checked_name, parsed, smooth, source_of, unknown_name
@@ -275,7 +275,6 @@ def _compiled_source(source: str, name: str) -> Any:
     """The same equations are compiled once, however many runs are asked about."""
     kernel.prepare()
     scope: dict[str, object] = {k: getattr(math, k) for k in dir(math) if not k.startswith("_")}
-    function, kept = function_of(source, name, scope)
-    compiled = njit(kernel.RHS, error_model="numpy", nogil=True, cache=kept)(function)
+    found = compiled(njit, kernel.RHS, function_of(source, name, scope), nogil=True)
     # its address, once: asked for at every call, it takes as long as a short stretch's motion
-    return CompileResultWAP(compiled.get_compile_result(kernel.RHS))
+    return CompileResultWAP(found.get_compile_result(kernel.RHS))

@@ -73,7 +73,7 @@ def effect_from_formulas(
 @lru_cache(maxsize=64)  # the same formulas with other numbers are compiled once
 def _function(lines: str) -> Callable[..., None]:
     namespace: dict[str, object] = {"np": np, "magnitude": magnitude, "sign": sign}
-    return function_of(f"def law(p, s, w):\n{lines}\n", "law", namespace)[0]  # checked node by node in _translate
+    return function_of(f"def law(p, s, w):\n{lines}\n", "law", namespace)  # checked node by node in _translate
 
 
 def _translate(name: str, formula: str) -> tuple[str, list[str]]:
