@@ -4,7 +4,7 @@ import contextlib
 import io
 import json
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from importlib import metadata
 from pathlib import Path
@@ -323,28 +323,39 @@ def read_rig_file(path: str | os.PathLike[str]) -> tuple[StereoRig, CalibrationR
 
     Raises RigFileError if the file is missing, damaged or something else.
     """
-    path = Path(path)
+    with complete_file(Path(path), "rig", SCHEMA, SCHEMA_VERSION, "calibrate", RigFileError) as file:
+        record = _read_record(file["calibration"]) if "calibration" in file else None
+        return read_rig_group(file["rig"]), record
+
+
+@contextlib.contextmanager
+def complete_file(
+    path: Path, kind: str, schema: str, version: int, command: str, raised: type[Exception]
+) -> Iterator[h5py.File]:
+    """A sealed HDF5 file of ours, open for reading; whatever is wrong with it is `raised` with its name.
+
+    kind, schema, version : what it must be;  command : of disctrack, that makes one
+    """
     if not path.is_file():
-        raise RigFileError(f"{path}: no such rig file; `disctrack calibrate` makes one")
+        raise raised(f"{path}: no such {kind} file; `disctrack {command}` makes one")
     try:
         check_seal(path)
         with h5py.File(path, "r") as file, np.errstate(all="ignore"):
-            if file.attrs.get("schema") != SCHEMA:
+            if file.attrs.get("schema") != schema:
                 found = file.attrs.get("schema")
-                raise RigFileError(f"an HDF5 file, but not a rig (its schema is {found!r}, expected {SCHEMA!r})")
-            if int(file.attrs.get("schema_version", -1)) > SCHEMA_VERSION:
-                raise RigFileError("written by a newer version of disctrack; update to read it")
+                raise raised(f"an HDF5 file, but not a {kind} (its schema is {found!r}, expected {schema!r})")
+            if int(file.attrs.get("schema_version", -1)) > version:
+                raise raised("written by a newer version of disctrack; update to read it")
             if int(file.attrs.get("complete", 0)) != 1:
-                raise RigFileError("was not written to its end; calibrate again")
-            rig = read_rig_group(file["rig"])
-            record = _read_record(file["calibration"]) if "calibration" in file else None
-        return rig, record
-    except RigFileError as error:
-        raise RigFileError(f"{path}: {error}") from error
+                raise raised(f"is not complete: it was not written to its end; {command} again")
+            yield file
+    except raised as error:
+        raise raised(f"{path}: {error}") from error
     except Exception as error:  # the HDF5 library raises many kinds on damaged files
-        raise RigFileError(
-            f"{path}: cannot be read as a rig file ({type(error).__name__}: {error}): damaged, cut short or another "
-            "format; calibrate again or take the original"
+        reason = " ".join(str(error).split())[:200]
+        raise raised(
+            f"{path}: cannot be read as a {kind} file ({type(error).__name__}: {reason}): damaged, cut short or "
+            f"another format; {command} again or take the original"
         ) from error
 
 

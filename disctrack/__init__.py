@@ -45,7 +45,7 @@ _HOME = {
         "write_group",
         "read_group",
     ),
-    "disctrack.trajectory.exchange.csv_table": ("write_csv",),
+    "disctrack.trajectory.exchange.motion": ("write_csv",),
     "disctrack.trajectory.exchange.formats": ("convert",),
     "disctrack.track.video_overlay": ("write_overlay",),
     "disctrack.analyse.derivatives": ("differentiate",),
@@ -99,8 +99,8 @@ if TYPE_CHECKING:
     from disctrack.trajectory import FrameStatus as FrameStatus
     from disctrack.trajectory import MarkerStatus as MarkerStatus
     from disctrack.trajectory import Trajectory as Trajectory
-    from disctrack.trajectory.exchange.csv_table import write_csv as write_csv
     from disctrack.trajectory.exchange.formats import convert as convert
+    from disctrack.trajectory.exchange.motion import write_csv as write_csv
     from disctrack.trajectory.file import Provenance as Provenance
     from disctrack.trajectory.file import read_group as read_group
     from disctrack.trajectory.file import read_trajectory as read_trajectory

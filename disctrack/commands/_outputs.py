@@ -31,7 +31,7 @@ from disctrack.track.follow.tracking import TrackingSettings
 from disctrack.track.measurement import ImagePairs, measure, trajectory_provenance
 from disctrack.track.video_overlay import shown_rows, write_overlay
 from disctrack.trajectory import Trajectory
-from disctrack.trajectory.exchange.csv_table import write_csv
+from disctrack.trajectory.exchange.motion import write_csv
 from disctrack.trajectory.file import Details, Provenance, read_provenance
 from disctrack.trajectory.reuse import SUMMARY, kept_or_made
 

@@ -137,7 +137,7 @@ class Trajectory(Brief):
 
     def to_xarray(self) -> xarray.Dataset:
         """The trajectory as an `xarray.Dataset` with time, units and both sigmas; the disc's sizes are attributes."""
-        from disctrack.trajectory.exchange.xarray import to_xarray
+        from disctrack.trajectory.file import to_xarray
 
         return to_xarray(self)
 

@@ -4,15 +4,17 @@ Layout (axes in brackets): at the root time, frame, x y z psi theta phi with the
 reprojection_rms_px, status; groups `markers`, `disc`, `calibration`, and those that later stages add (`write_groups`).
 """
 
+from __future__ import annotations
+
 import contextlib
 import hashlib
 import io
 import json
 import platform
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import h5py
 import numpy as np
@@ -22,10 +24,10 @@ from calibration.cameras.camera import RIG_PARAMETERS, StereoRig
 from calibration.kit.arguments import checked
 from calibration.kit.arrays import Mask
 from calibration.kit.brief import Outline
-from calibration.kit.seal import check_seal, sealed
-from calibration.rig_file import beside_cameras, read_beside_cameras, versions, write_attributes
+from calibration.kit.seal import sealed
+from calibration.rig_file import beside_cameras, complete_file, read_beside_cameras, versions, write_attributes
 from disctrack.disc import Disc
-from disctrack.errors import TrajectoryFileError
+from disctrack.errors import OutputError, TrajectoryFileError
 from disctrack.files.json_text import json_text
 from disctrack.files.labelled_arrays import Variable, copy_without, flags, read_array, read_variables, write_variables
 from disctrack.files.software import software_version
@@ -33,6 +35,9 @@ from disctrack.files.whole import refuse_existing, write_whole
 from disctrack.findings import Finding, finding_from_json, warn_of_doubts
 from disctrack.frames import CAMERAS, COORDINATES, POSE_COMPONENTS
 from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
+
+if TYPE_CHECKING:
+    import xarray
 
 SCHEMA = "disctrack trajectory"
 SCHEMA_VERSION = 1
@@ -220,7 +225,7 @@ def read_group(
     with _reading(Path(path)) as file:
         if group not in file or not isinstance(file[group], h5py.Group):
             there = ", ".join(name for name, item in file.items() if isinstance(item, h5py.Group))
-            raise TrajectoryFileError(f"{path}: no group '{group}'; it holds {there}. Run the stage that writes it.")
+            raise TrajectoryFileError(f"no group '{group}'; it holds {there}. Run the stage that writes it.")
         return read_variables(file[group], names=names), dict(file[group].attrs)
 
 
@@ -230,6 +235,25 @@ def labelled(trajectory: Trajectory) -> tuple[dict[str, Variable], dict[str, Var
     sizes = _disc_sizes(trajectory.disc).items()
     numbers = _recording_numbers(trajectory) | {f"disc_{name}": value for name, value in sizes}
     return _root_variables(trajectory) | dots, _axes(trajectory), numbers
+
+
+def to_xarray(trajectory: Trajectory) -> xarray.Dataset:
+    """`xarray.Dataset` with the root of the trajectory file and its dots (`marker_...`).
+
+    Raises OutputError where xarray is not installed.
+    """
+    try:
+        import xarray
+    except ImportError as error:
+        raise OutputError("to_xarray needs xarray: pip install xarray") from error
+
+    def described(item: Variable) -> tuple:
+        return item.dims, np.asarray(item.data), {"units": item.units, "long_name": item.long_name, **item.attributes}
+
+    variables, axes, numbers = labelled(trajectory)
+    used = {axis for item in variables.values() for axis in item.dims}
+    coordinates = {name: described(axis) for name, axis in axes.items() if name in used}
+    return xarray.Dataset({name: described(item) for name, item in variables.items()}, coordinates, numbers)
 
 
 # Numbers of the whole recording: attribute of a Trajectory, and of the file's root
@@ -385,31 +409,8 @@ def _write_rig(group: h5py.Group, trajectory: Trajectory) -> None:
     group.attrs["baseline_m"] = rig.baseline
 
 
-@contextlib.contextmanager
-def _reading(path: Path) -> Iterator[h5py.File]:
-    """A complete trajectory file, open for reading; whatever the HDF5 library says becomes a TrajectoryFileError."""
-    if not path.is_file():
-        raise TrajectoryFileError(f"{path}: no such file. Give a trajectory file written by disctrack track.")
-    try:
-        check_seal(path)
-        with h5py.File(path, "r") as file:
-            schema, version = file.attrs.get("schema", None), int(file.attrs.get("schema_version", -1))
-            if schema != SCHEMA:
-                raise TrajectoryFileError(
-                    f"{path}: an HDF5 file, but not a trajectory (schema {schema!r}; expected {SCHEMA!r}). "
-                    "Give a file written by disctrack track."
-                )
-            if version != SCHEMA_VERSION or int(file.attrs.get("complete", 0)) != 1:
-                what = f"has version {version} of the layout" if version != SCHEMA_VERSION else "is not complete"
-                raise TrajectoryFileError(f"{path}: {what}; expected version {SCHEMA_VERSION}. Run disctrack track.")
-            yield file
-    except TrajectoryFileError:
-        raise
-    except Exception as error:
-        reason = " ".join(str(error).split())[:200]
-        raise TrajectoryFileError(
-            f"{path}: not a readable trajectory file ({reason}). Run disctrack track again."
-        ) from error
+def _reading(path: Path) -> contextlib.AbstractContextManager[h5py.File]:
+    return complete_file(path, "trajectory", SCHEMA, SCHEMA_VERSION, "track", TrajectoryFileError)
 
 
 def _trajectory(file: h5py.File) -> Trajectory:

@@ -163,7 +163,7 @@ def test_calibration_never_imports_disctrack():
 def test_no_file_asks_for_one_that_asks_for_it():
     asked = {file: asked_for(file) for file in SOURCES}
     # the object that people hold offers it as a verb; it is looked up when it is called
-    asked["disctrack.trajectory"] = asked["disctrack.trajectory"] - {"disctrack.trajectory.exchange.xarray"}
+    asked["disctrack.trajectory"] = asked["disctrack.trajectory"] - {"disctrack.trajectory.file"}
     assert asked["disctrack.trajectory"] != asked_for("disctrack.trajectory")
     TopologicalSorter(asked).prepare()  # raises an error that names a circle
 

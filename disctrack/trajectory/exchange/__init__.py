@@ -1,1 +1,1 @@
-"""Trajectories, rigs and points in the formats of other programs: a format is a small module and a row in `formats`."""
+"""Trajectories, rigs and points in the formats of other programs: a function or two, and a row in `formats`."""

@@ -20,22 +20,9 @@ from disctrack.errors import OutputError, TrajectoryFileError
 from disctrack.files.inputs import keep, refuse_input
 from disctrack.files.whole import refuse_existing, write_whole
 from disctrack.trajectory import Trajectory
-from disctrack.trajectory.exchange import (
-    c3d,
-    caliscope,
-    csv_table,
-    dlt,
-    kalibr,
-    matlab,
-    mrcal,
-    opencv,
-    qtm,
-    trc,
-    xmalab,
-)
+from disctrack.trajectory.exchange import matlab, motion, opencv, points, rigs
 from disctrack.trajectory.exchange.lens import BROWN, within_brown
 from disctrack.trajectory.exchange.rig_parts import content_of, the_one
-from disctrack.trajectory.exchange.tables import read_points
 from disctrack.trajectory.file import read_trajectory, trajectory_in
 
 OWN = (".h5", ".nc")  # netCDF-4 is HDF5: other programs go by the second name
@@ -53,7 +40,6 @@ class Format:
     # path (or paths: `in_parts`) and what is asked of the user -> StereoRig, or points (n, 2, m, 2)
     read: Callable[..., Any] | None
     lost: str  # what of ours it has no place for
-    source: str  # of its definition
     # Terms of a lens that it holds, by which the others are fitted; None: it holds points without any lens
     terms: tuple[str, ...] | None = BROWN
     asks: tuple[str, ...] = ()  # what a reader may be told: world_is_table, cameras, image_size, unit
@@ -62,35 +48,34 @@ class Format:
 
 
 SIGMAS = "sigmas but one of the place, the rig, the dots in the images"
+WORLD = ("world_is_table",)
 ROWS = (
-    Format("table", (".csv",), "trajectory", partial(csv_table.write_csv, overwrite=True), None,
-           "covariances, the rig, the dots", "here"),
-    Format("MATLAB", (".mat",), "trajectory", matlab.write_mat, None, "the rig", "MAT-file version 5"),
-    Format("C3D", (".c3d",), "trajectory", c3d.write_c3d, None, SIGMAS, "c3d.org"),
-    Format("TRC", (".trc",), "trajectory", trc.write_trc, None, "sigmas, the rig, the dots in the images",
-           "OpenSim: Marker (.trc) Files"),
-    Format("QTM", (".tsv",), "trajectory", qtm.write_qtm, None, SIGMAS, "Qualisys: TSV export of 6DOF data"),
+    Format("table", (".csv",), "trajectory", partial(motion.write_csv, overwrite=True), None,
+           "covariances, the rig, the dots"),
+    Format("MATLAB", (".mat",), "trajectory", matlab.write_mat, None, "the rig"),
+    Format("C3D", (".c3d",), "trajectory", motion.write_c3d, None, SIGMAS),
+    Format("TRC", (".trc",), "trajectory", motion.write_trc, None, "sigmas, the rig, the dots in the images"),
+    Format("QTM", (".tsv",), "trajectory", motion.write_qtm, None, SIGMAS),
     Format("XMALab transformations", ("transformation.csv", "transformations.csv"), "trajectory",
-           xmalab.write_transformations, None, "sigmas, times, the rig, the dots", "XMALab: Trial.cpp"),
-    Format("XMALab points", ("points.csv",), "points", xmalab.write_points, read_points, "sigmas",
-           "XMALab: Trial.cpp", mark="_cam1_X"),
-    Format("DLTdv8 points", ("xypts.csv",), "points", dlt.write_xypts, dlt.read_xypts, "sigmas, the lenses: the points "
-           "are without their distortion, as dltcoefs.csv needs them", "DLTdv8 manual", mark="pt1_cam1_X"),
+           motion.write_transformations, None, "sigmas, times, the rig, the dots"),
+    Format("XMALab points", ("points.csv",), "points", points.write_points, points.read_points, "sigmas",
+           mark="_cam1_X"),
+    Format("DLTdv8 points", ("xypts.csv",), "points", points.write_xypts, points.read_xypts, "sigmas, the lenses: the "
+           "points are without their distortion, as dltcoefs.csv needs them", mark="pt1_cam1_X"),
     Format("OpenCV", (".yml", ".yaml", ".xml"), "rig", opencv.write_opencv, opencv.read_opencv, "covariances",
-           "OpenCV: stereo_calib sample", asks=("image_size", "unit", "world_is_table"), in_parts=True),
-    Format("Kalibr", ("camchain.yaml", "kalibr.yaml"), "rig", kalibr.write_kalibr, kalibr.read_kalibr,
-           "covariances, the world frame", "Kalibr: yaml formats", FOUR, mark="cam0:"),
-    Format("Caliscope", (".toml",), "rig", caliscope.write_caliscope, caliscope.read_caliscope, "covariances",
-           "Caliscope: camera_array.py", asks=("cameras", "world_is_table")),
-    Format("Pose2Sim", ("pose2sim.toml", "calib.toml"), "rig", caliscope.write_pose2sim, caliscope.read_caliscope,
-           "covariances", "Pose2Sim: calibration.py", FOUR, ("cameras", "world_is_table")),
-    Format("mrcal", (".cameramodel",), "rig", mrcal.write_mrcal, mrcal.read_mrcal, "covariances",
-           "mrcal: camera model representation", asks=("world_is_table",), in_parts=True),
-    Format("DLT", ("dltcoefs.csv",), "rig", dlt.write_dlt, dlt.read_dlt, "covariances, the lenses: they belong to "
-           "points without distortion, those of xypts.csv", "DLTdv8 manual", None,
-           ("image_size", "unit", "world_is_table")),
+           asks=("image_size", "unit", *WORLD), in_parts=True),
+    Format("Kalibr", ("camchain.yaml", "kalibr.yaml"), "rig", rigs.write_kalibr, rigs.read_kalibr,
+           "covariances, the world frame", FOUR, mark="cam0:"),
+    Format("Caliscope", (".toml",), "rig", rigs.write_caliscope, rigs.read_caliscope, "covariances",
+           asks=("cameras", *WORLD)),
+    Format("Pose2Sim", ("pose2sim.toml", "calib.toml"), "rig", rigs.write_pose2sim, rigs.read_caliscope, "covariances",
+           FOUR, ("cameras", *WORLD)),
+    Format("mrcal", (".cameramodel",), "rig", rigs.write_mrcal, rigs.read_mrcal, "covariances", asks=WORLD,
+           in_parts=True),
+    Format("DLT", ("dltcoefs.csv",), "rig", rigs.write_dlt, rigs.read_dlt, "covariances, the lenses: they belong to "
+           "points without distortion, those of xypts.csv", None, ("image_size", "unit", *WORLD)),
     Format("MATLAB stereoParameters", (".mat",), "rig", matlab.write_stereo_parameters, matlab.read_stereo_parameters,
-           "covariances", "MATLAB: stereoParametersFromOpenCV", asks=("unit", "world_is_table")),
+           "covariances", asks=("unit", *WORLD)),
 )  # fmt: skip
 
 
@@ -138,7 +123,7 @@ def convert(
         _write_own(path, value, paths[0])
         return Converted((path,), ())
     row = _row_for(path, form, value)
-    written = mrcal.sides_of(path) if row.name == "mrcal" else (path,)
+    written = rigs.sides_of(path) if row.name == "mrcal" else (path,)
     for one in written:
         refuse_existing(one, overwrite)
     notes = [f"{row.name} has no place for {row.lost}"]
@@ -156,8 +141,8 @@ def read_foreign(paths: Sequence[Path], **told: Any) -> Any:
     first = paths[0]
     head = content_of(first)[:4096] if first.suffix in (".csv", ".yaml", ".yml") else ""
     readable = [row for row in ROWS if row.read]
-    row = max(readable, key=lambda row: _rank(row, first, head))
-    if row.read is None or not any(_rank(row, first, head)):
+    row = _fitting(readable, first, head)
+    if row is None or row.read is None:
         raise OutputError(f"{first}: no file of ours, and no format of this name is read; known are {_known(readable)}")
     idle = [word for word in told if word not in row.asks]
     if idle:
@@ -165,30 +150,30 @@ def read_foreign(paths: Sequence[Path], **told: Any) -> Any:
     return row.read(paths if row.in_parts else the_one(paths), **told)
 
 
-def _rank(row: Format, path: Path, head: str = "") -> tuple[int, int]:
-    """How well a file fits a format: by what stands in it, then by its name."""
-    ending = max((len(e) for e in row.endings if path.name.lower().endswith(e)), default=0)
-    return (len(row.mark) if row.mark and row.mark in head else 0), ending
+def _fitting(rows: Sequence[Format], path: Path, head: str = "") -> Format | None:
+    """The format that a file fits best, by what stands in it, then by its name; None where it fits none."""
+    ends = [max((len(e) for e in row.endings if path.name.lower().endswith(e)), default=0) for row in rows]
+    ranks = [(len(row.mark) * (row.mark in head), end) for row, end in zip(rows, ends, strict=True)]
+    return rows[ranks.index(max(ranks))] if any(max(ranks)) else None
 
 
 def _row_for(path: Path, form: str | None, value: Any) -> Format:
     """The format to write. Raises OutputError that names those there are."""
-    kinds = ("trajectory", "points", "rig") if isinstance(value, Trajectory) else ("rig",)
-    rows = {row.name.lower(): row for row in ROWS if row.holds in kinds and not isinstance(value, np.ndarray)}
-    if not rows:
+    if isinstance(value, np.ndarray):
         raise OutputError(f"{path}: points are read in Python, with `read_foreign`, and written of a trajectory")
+    kinds = ("trajectory", "points", "rig") if isinstance(value, Trajectory) else ("rig",)
+    rows = [row for row in ROWS if row.holds in kinds]
     if form is None:
-        row = max(rows.values(), key=lambda row: _rank(row, path))
-        if not any(_rank(row, path)):
-            known = _known(rows.values())
-            raise OutputError(f"{path}: no format of this name for a {kinds[0]}; known are {known}, and .h5")
+        if (row := _fitting(rows, path)) is None:
+            raise OutputError(f"{path}: no format of this name for a {kinds[0]}; known are {_known(rows)}, and .h5")
         return row
-    if form.lower() not in rows:
-        near = get_close_matches(form.lower(), rows, 1, 0.5)
-        hint = f" Did you mean '{rows[near[0]].name}'?" if near else ""
-        known = ", ".join(row.name for row in rows.values())
+    named = {row.name.lower(): row for row in rows}
+    if form.lower() not in named:
+        near = get_close_matches(form.lower(), named, 1, 0.5)
+        hint = f" Did you mean '{named[near[0]].name}'?" if near else ""
+        known = ", ".join(row.name for row in rows)
         raise OutputError(f"{form}: no format for a {kinds[0]}.{hint} Known are {known}")
-    return rows[form.lower()]
+    return named[form.lower()]
 
 
 def _known(rows: Iterable[Format]) -> str:

@@ -1,10 +1,19 @@
-"""A trajectory as points and rotations of the body, for programs of motion capture."""
+"""A trajectory as other programs keep the motion of a body: tables, points, rotations."""
+
+import csv
+import io
+from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
+from calibration.kit.arguments import checked
 from calibration.kit.arrays import Array
-from disctrack.frames import rotation_from_quaternion
-from disctrack.trajectory import Trajectory
+from disctrack.errors import OutputError
+from disctrack.files.whole import refuse_existing, whole_file, write_whole
+from disctrack.frames import CAMERAS, COORDINATES, rotation_from_quaternion
+from disctrack.trajectory import FrameStatus, Trajectory
+from disctrack.trajectory.exchange.points import table
 
 
 def body_points(trajectory: Trajectory) -> tuple[Array, list[str]]:
@@ -25,3 +34,144 @@ def place_sigma_mm(trajectory: Trajectory) -> Array:
     """(n,) one sigma of the place; -1 in frames without a pose, as programs mark what was not seen."""
     sigma = np.sqrt(np.einsum("nii->n", trajectory.pose_covariance[:, :3, :3]))
     return np.where(trajectory.measured, 1e3 * sigma, -1.0)
+
+
+@checked
+def write_csv(path: str | Path, trajectory: Trajectory, overwrite: bool = False) -> None:
+    """The trajectory as a table for people: millimetres and degrees, one row per frame, empty where unknown.
+
+    Of every coordinate its value, the sigma of the frame's own noise, and the sigma that all frames share through the
+    calibration. Coordinates have seven decimals however many turns the angles have counted, sigmas seven digits.
+
+        >>> write_csv("table.csv", read_trajectory("clip"))
+    """
+    path = Path(path)
+    refuse_existing(path, overwrite)
+    scale = np.repeat([1e3, np.degrees(1.0)], 3)
+    parts = ("", "sigma_", "sigma_calibration_")
+    names = [f"{name}_{part}{unit}" for part in parts for name, unit in zip(COORDINATES, _UNITS, strict=True)]
+    seen = [f"reprojection_rms_{camera}_px" for camera in CAMERAS]
+    values = [trajectory.q * scale, trajectory.coordinate_sigma * scale, trajectory.calibration_sigma * scale]
+    rows = np.column_stack([*values, trajectory.reprojection_rms_px])
+    text = io.StringIO()
+    writer = csv.writer(text)
+    writer.writerow(["frame", "time_s", *names, *seen, "status"])
+    for i, row in enumerate(rows):
+        cells = ["" if np.isnan(v) else f"{v:.7f}" if column < 6 else f"{v:.7g}" for column, v in enumerate(row)]
+        status = FrameStatus(trajectory.frame_status[i]).name.lower()
+        writer.writerow([trajectory.frame[i], f"{trajectory.time[i]:.9g}", *cells, status])
+    write_whole(path, text.getvalue().encode())
+
+
+_UNITS = ("mm", "mm", "mm", "deg", "deg", "deg")
+
+
+def write_c3d(path: Path, trajectory: Trajectory) -> None:
+    """Dots, centre and the tips of the body axes as points in mm, world axes, z up; times at the frame rate.
+
+    The body axes are points one radius from the centre (AXIS_1, AXIS_2 in the face, AXIS_3 out of it), from which any
+    program builds the rigid body; a point's residual is its one-sigma in mm, -1 in frames without a pose. C3D keeps
+    single precision: 1e-4 mm at 1 m. Raises OutputError, also where ezc3d is not installed.
+    """
+    try:
+        import ezc3d
+    except ImportError as error:
+        raise OutputError(f"{path}: C3D needs ezc3d: pip install ezc3d") from error
+    points, labels = body_points(trajectory)
+    file = ezc3d.c3d()
+    described = [_DESCRIPTIONS.get(label, "centre of a dot") for label in labels]
+    told = {"UNITS": ["mm"], "RATE": [float(trajectory.frame_rate)], "LABELS": labels, "DESCRIPTIONS": described}
+    for name, value in told.items():
+        file["parameters"]["POINT"][name]["value"] = value
+    data = np.ones((4, len(labels), len(trajectory)))
+    data[:3] = np.where(trajectory.measured, 1e3 * np.moveaxis(points, 0, -1).swapaxes(0, 1), np.nan)
+    file["data"]["points"] = data
+    residuals = np.broadcast_to(place_sigma_mm(trajectory), (1, len(labels), len(trajectory)))
+    file["data"]["meta_points"]["residuals"] = residuals.copy()
+    file.add_parameter("DISC", "RADIUS", 1e3 * trajectory.disc.radius)
+    file.add_parameter("DISC", "THICKNESS", 2e3 * trajectory.disc.half_thickness)
+    file.add_parameter("DISC", "MASS", 1e3 * trajectory.disc.mass)
+    with whole_file(path, suffix=".c3d") as part:
+        file.write(str(part))
+
+
+_DESCRIPTIONS = {
+    "CENTRE": "centre of mass",
+    "AXIS_1": "centre + radius * first body axis",
+    "AXIS_2": "centre + radius * second body axis",
+    "AXIS_3": "centre + radius * normal of the upper face",
+}
+
+
+def write_trc(path: Path, trajectory: Trajectory) -> None:
+    """TRC, the points of motion capture that OpenSim and Pose2Sim read: those of `body_points` in metres.
+
+    OpenSim's axes are y up: written are (Y, Z, X) of the world, as Pose2Sim turns them. Empty where there is none.
+    Raises OutputError.
+    """
+    points, labels = body_points(trajectory)
+    n, k, rate = len(points), len(labels), f"{trajectory.frame_rate:g}"
+    heads = [
+        f"PathFileType\t4\t(X/Y/Z)\t{path.name}",
+        "DataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits\tOrigDataRate\tOrigDataStartFrame\tOrigNumFrames",
+        f"{rate}\t{rate}\t{n}\t{k}\tm\t{rate}\t{trajectory.frame[0]}\t{n}",
+        "Frame#\tTime\t" + "\t\t\t".join(labels) + "\t\t",
+        "\t\t" + "\t".join(f"X{i}\tY{i}\tZ{i}" for i in range(1, k + 1)),
+        "",
+    ]
+    rows = [
+        f"{frame}\t{time:.9g}\t" + "\t".join("" if np.isnan(v) else f"{v:.9f}" for v in row)
+        for frame, time, row in zip(
+            trajectory.frame, trajectory.time, points[..., [1, 2, 0]].reshape(n, -1), strict=True
+        )
+    ]
+    write_whole(path, ("\n".join((*heads, *rows)) + "\n").encode())
+
+
+def write_qtm(path: Path, trajectory: Trajectory) -> None:
+    """A 6DOF file as Qualisys Track Manager exports a rigid body: DISC, in millimetres and degrees.
+
+    R = Rx(roll) Ry(pitch) Rz(yaw), and Rot[0...8] is R column by column. Frames count from 1. The residual is one sigma
+    of the place [mm]. A frame without a pose has zeros and residual -1. Raises OutputError.
+    """
+    known, R = trajectory.measured, rotations(trajectory)
+    values = np.zeros((len(known), 18))
+    values[:, 0], values[:, 1] = np.arange(1, len(known) + 1), trajectory.time
+    values[known, 2:5] = 1e3 * trajectory.q[known, :3]
+    values[known, 5:8] = Rotation.from_matrix(R[known]).as_euler("XYZ", degrees=True)
+    values[:, 8] = place_sigma_mm(trajectory)
+    values[known, 9:] = np.swapaxes(R[known], 1, 2).reshape(-1, 9)
+    head = _QTM_HEAD.format(n=len(known), rate=trajectory.frame_rate)
+    write_whole(path, head.encode() + table(_QTM_COLUMNS, values, "\t"))
+
+
+_QTM_HEAD = """NO_OF_FRAMES\t{n}
+NO_OF_CAMERAS\t2
+NO_OF_BODIES\t1
+FREQUENCY\t{rate:g}
+NO_OF_ANALOG\t0
+ANALOG_FREQUENCY\t0
+DESCRIPTION\t--
+DATA_INCLUDED\t6D
+BODY_NAMES\tDISC
+"""
+_QTM_COLUMNS = (
+    "Frame", "Time", "DISC X", "Y", "Z", "Roll", "Pitch", "Yaw", "Residual", *(f"Rot[{i}]" for i in range(9))
+)  # fmt: skip
+
+
+def write_transformations(path: Path, trajectory: Trajectory) -> None:
+    """XMALab's rigid body: a row for each frame, the matrix (4, 4) from body to world column by column, in millimetres.
+
+    NaN without a pose. Raises OutputError.
+    """
+    T = np.zeros((len(trajectory), 4, 4))
+    T[:, :3, :3], T[:, :3, 3], T[:, 3, 3] = rotations(trajectory), 1e3 * trajectory.q[:, :3], 1.0
+    T[~trajectory.measured] = np.nan
+    columns = np.swapaxes(T, 1, 2).reshape(-1, 16)
+    write_whole(path, table([f"DISC_{head}" for head in _TRANSFORMATION], columns))
+
+
+_TRANSFORMATION = (
+    "R11", "R12", "R13", "01", "R21", "R22", "R23", "02", "R31", "R32", "R33", "03", "TX", "TY", "TZ", "1"
+)  # fmt: skip

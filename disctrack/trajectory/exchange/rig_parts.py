@@ -5,7 +5,6 @@ module says otherwise. None has a place for the covariance: a rig that comes bac
 lack the calibration's part of the sigma.
 """
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -109,20 +108,10 @@ def rotation_of(rotation: Array, where: str) -> Array:
     return R
 
 
-def rotation_vector(R: Array) -> Array:
-    """(3,) [rad] of a rotation (3, 3)."""
-    return np.asarray(cv2.Rodrigues(R)[0], float).ravel()
-
-
-def listed(values: Any) -> str:
-    """Numbers, or rows of them, as TOML, YAML and Python write lists."""
-    return json.dumps(np.asarray(values).tolist())
-
-
-def content_of(path: Path, most: int = MAX_BYTES) -> str:
+def content_of(path: Path) -> str:
     """The file's text. Raises RigFileError."""
     try:
-        return read_regular(path, most).decode()
+        return read_regular(path, MAX_BYTES).decode()
     except (OSError, UnicodeDecodeError) as error:
         raise RigFileError(f"{path}: cannot be read ({error})") from error
 

@@ -23,9 +23,8 @@ from disctrack.frames import COORDINATES, rotation_from_euler
 from disctrack.synthetic import rig_of
 from disctrack.synthetic.description import Scene
 from disctrack.trajectory import Trajectory
-from disctrack.trajectory.exchange import c3d as c3d_file
-from disctrack.trajectory.exchange import caliscope, dlt, formats, matlab, mrcal, opencv, qtm, trc, xmalab
-from disctrack.trajectory.exchange.csv_table import write_csv
+from disctrack.trajectory.exchange import formats, matlab, motion, opencv, rigs
+from disctrack.trajectory.exchange import points as point_tables
 from disctrack.trajectory.file import Provenance, write_trajectory
 from tests.disctrack.trajectory.test_file import make_trajectory
 
@@ -139,7 +138,7 @@ def test_dlt_coefficients_describe_the_points_of_xypts(rig, trajectory, tmp_path
     (path,), notes = disctrack.convert(tmp_path / "own.h5", tmp_path / "clip_dltcoefs.csv")
     assert "lens" in notes[0]
     L = np.loadtxt(path, delimiter=",")
-    dlt.write_xypts(tmp_path / "clip_xypts.csv", trajectory)
+    point_tables.write_xypts(tmp_path / "clip_xypts.csv", trajectory)
     with (tmp_path / "clip_xypts.csv").open() as stream:
         rows = list(csv.DictReader(stream))
     body = trajectory.disc.marker_centres_body[4]
@@ -197,7 +196,7 @@ def test_our_lens_terms_are_those_of_mrcals_own_example(tmp_path):
       'extrinsics': [0, 0, 0, %g, 0, 0], 'imagersize': [1000, 700] }"""
     (tmp_path / "l.cameramodel").write_text(text % 0.0)
     (tmp_path / "r.cameramodel").write_text(text % 0.1)
-    rig = mrcal.read_mrcal([tmp_path / "l.cameramodel", tmp_path / "r.cameramodel"])
+    rig = rigs.read_mrcal([tmp_path / "l.cameramodel", tmp_path / "r.cameramodel"])
     assert project(np.array([[1.0, 2.0, 10.0]]), rig.left)[0] == pytest.approx([651.2740691, 555.2309482], abs=1e-6)
     assert rig.baseline == pytest.approx(0.1)
 
@@ -267,10 +266,10 @@ def test_what_is_no_rig_of_browns_cameras_is_refused_by_name(rig, tmp_path, name
 
 
 def test_what_a_file_does_not_tell_may_be_told(rig, tmp_path):
-    caliscope.write_caliscope(tmp_path / "rig.toml", rig)
+    rigs.write_caliscope(tmp_path / "rig.toml", rig)
     text = (tmp_path / "rig.toml").read_text()
     (tmp_path / "rig.toml").write_text(third_camera(text, rig))
-    assert caliscope.read_caliscope(tmp_path / "rig.toml", cameras=("0", "1")).baseline == pytest.approx(rig.baseline)
+    assert rigs.read_caliscope(tmp_path / "rig.toml", cameras=("0", "1")).baseline == pytest.approx(rig.baseline)
     opencv.write_opencv(tmp_path / "rig.yml", rig)
     text = (tmp_path / "rig.yml").read_text()
     (tmp_path / "rig.yml").write_text(re.sub("unit: .*", 'unit: "foot"', text))
@@ -299,7 +298,7 @@ def test_c3d_is_read_by_another_library_with_gaps_as_gaps(trajectory, tmp_path):
     pytest.importorskip("ezc3d")
     c3d = pytest.importorskip("c3d")
     path = tmp_path / "t.c3d"
-    c3d_file.write_c3d(path, trajectory)
+    motion.write_c3d(path, trajectory)
     with path.open("rb") as stream:
         reader = c3d.Reader(stream)
         labels = [label.strip() for label in reader.point_labels]
@@ -321,7 +320,7 @@ def test_c3d_is_read_by_another_library_with_gaps_as_gaps(trajectory, tmp_path):
 def test_table_has_both_sigmas_in_mm_and_deg_and_keeps_an_angle_after_a_thousand_turns(trajectory, tmp_path):
     """Ten seconds at 100 turns a second: 360 000 degrees, and still a thousandth of the smallest sigma."""
     turned = replace(trajectory, q=trajectory.q + 2 * np.pi * 1000 * np.array([0, 0, 0, 1, 0, -1]))
-    write_csv(tmp_path / "t.csv", turned)
+    motion.write_csv(tmp_path / "t.csv", turned)
     rows = list(csv.DictReader((tmp_path / "t.csv").read_text().splitlines()))
     for k, name in enumerate(COORDINATES):
         scale, unit = (1e3, "mm") if k < 3 else (np.degrees(1.0), "deg")
@@ -341,7 +340,7 @@ def test_a_rigid_body_is_that_of_qualisys_own_export(trajectory, tmp_path):
         return (x @ y @ z).T.ravel()
 
     assert rot(roll, pitch, yaw) == pytest.approx(real, abs=2e-5)
-    qtm.write_qtm(tmp_path / "t_6D.tsv", trajectory)
+    motion.write_qtm(tmp_path / "t_6D.tsv", trajectory)
     heads, rows = {}, []
     for line in (tmp_path / "t_6D.tsv").read_text().splitlines():
         key, *values = line.split("\t")
@@ -363,7 +362,7 @@ def test_a_rigid_body_is_that_of_qualisys_own_export(trajectory, tmp_path):
 
 def test_points_of_motion_capture_stand_y_up_in_a_trc_file(trajectory, tmp_path):
     trc_reader = pytest.importorskip("trc")
-    trc.write_trc(tmp_path / "t.trc", trajectory)
+    motion.write_trc(tmp_path / "t.trc", trajectory)
     data = trc_reader.TRCData()
     data.load(str(tmp_path / "t.trc"))
     assert data["Units"] == "m"
@@ -375,10 +374,10 @@ def test_points_of_motion_capture_stand_y_up_in_a_trc_file(trajectory, tmp_path)
 
 def test_xmalab_has_the_images_points_and_matrices_by_columns(trajectory, tmp_path):
     bent = replace(trajectory, rig=with_field(trajectory.rig))
-    xmalab.write_points(tmp_path / "clip_points.csv", bent)
+    point_tables.write_points(tmp_path / "clip_points.csv", bent)
     points = formats.read_foreign([tmp_path / "clip_points.csv"])
     assert bent.rig.lens_field.corrected(points) == pytest.approx(trajectory.markers_px, abs=1e-6, nan_ok=True)
-    xmalab.write_transformations(tmp_path / "clip_transformation.csv", trajectory)
+    motion.write_transformations(tmp_path / "clip_transformation.csv", trajectory)
     head, *lines = (tmp_path / "clip_transformation.csv").read_text().splitlines()
     assert head.split(",")[12:15] == ["DISC_TX", "DISC_TY", "DISC_TZ"]
     T = np.array([[float(v) for v in line.split(",")] for line in lines]).reshape(-1, 4, 4).swapaxes(1, 2)

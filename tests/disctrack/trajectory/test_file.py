@@ -261,7 +261,7 @@ def test_an_incomplete_file_or_another_programs_is_no_result(file, trajectory):
         h5["x"] = np.arange(3.0)
     with pytest.raises(TrajectoryFileError, match="not a trajectory"):
         read_trajectory(file)
-    with pytest.raises(TrajectoryFileError, match="no such file"):
+    with pytest.raises(TrajectoryFileError, match="no such trajectory file"):
         read_trajectory(file.with_name("nowhere.h5"))
 
 
@@ -310,7 +310,7 @@ def test_any_bytes_and_a_file_cut_or_changed_anywhere_are_refused_with_a_message
     [
         ("quaternion", (30, 3), "quaternion has shape"),
         ("x", (10**12,), "more than the file can hold"),
-        *((name, None, "not a readable") for name in ("x", "time", "markers/status", "calibration/covariance", "disc")),
+        *((name, None, "cannot be read") for name in ("x", "time", "markers/status", "calibration/covariance", "disc")),
     ],
 )
 def test_a_part_that_is_missing_or_of_another_size_is_refused(file, name, shape, said):

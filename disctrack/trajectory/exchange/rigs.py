@@ -1,0 +1,241 @@
+"""Rigs from and to formats with a table of numbers for each camera, and where it stands from a common reference."""
+
+import ast
+import json
+import tomllib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from calibration.cameras.camera import StereoRig
+from calibration.kit.arrays import Array
+from disctrack.errors import OutputError, RigFileError
+from disctrack.files.whole import write_whole
+from disctrack.trajectory.exchange.rig_parts import array_of, camera_of, content_of, rig_of, rotation_of
+
+# --- Caliscope's camera_array.toml, Pose2Sim's Calib.toml, Anipose's calibration.toml (read only) ---------------------
+# Of each camera size, matrix, distortions in OpenCV's order; rotation (a vector), translation from the reference.
+# Caliscope numbers its cameras in [cameras]; Pose2Sim and Anipose name them at the top, Pose2Sim with k1 k2 p1 p2 only.
+
+
+def write_caliscope(path: Path, rig: StereoRig) -> None:
+    """Cameras 0 (left) and 1 (right), lengths in metres. Raises OutputError."""
+    own = [f"cam_id = {number}\nrotation_count = 0" for number in (0, 1)]
+    _write_toml(path, rig, ("cameras.0", "cameras.1"), own, 5)
+
+
+def write_pose2sim(path: Path, rig: StereoRig) -> None:
+    """Cameras cam_01 (left) and cam_02 (right), lengths in metres, without k3. Raises OutputError."""
+    names = ("cam_01", "cam_02")
+    own = [f'name = "{name}"' for name in names]
+    _write_toml(path, rig, names, own, 4, "[metadata]\nadjusted = false\nerror = 0.0\n")
+
+
+def _write_toml(
+    path: Path, rig: StereoRig, tables: Sequence[str], own: Sequence[str], terms: int, end: str = ""
+) -> None:
+    text = ""
+    for table, more, camera, (R, t) in zip(tables, own, rig.cameras, rig.camera_poses(), strict=True):
+        text += (
+            f"[{table}]\n{more}\n"
+            f"size = {_listed(camera.image_size)}\n"
+            f"matrix = {_listed(camera.camera_matrix)}\n"
+            f"distortions = {_listed(camera.distortion[:terms])}\n"
+            f"translation = {_listed(t)}\n"
+            f"rotation = {_listed(_rotation_vector(R))}\n"
+            "fisheye = false\n\n"
+        )
+    write_whole(path, (text + end).encode())
+
+
+def read_caliscope(path: Path, *, cameras: tuple[str, str] | None = None, world_is_table: bool = False) -> StereoRig:
+    """Two cameras of such a file.
+
+    cameras : their names ("0", "1"; "cam_0", ...) where the file has more than two; left first
+    world_is_table : True if the file's reference is the table, k up; otherwise the heights mean nothing
+    Raises RigFileError that names what the file holds.
+    """
+    try:
+        content = tomllib.loads(content_of(path))
+    except ValueError as error:
+        raise RigFileError(f"{path}: not TOML: {error}") from error
+    tables = content.get("cameras", content)
+    found = {name: table for name, table in tables.items() if isinstance(table, dict) and "matrix" in table}
+    names = cameras or tuple(found)
+    if len(names) != 2 or not all(name in found for name in names):
+        raise RigFileError(f"{path}: holds the cameras {', '.join(found) or 'none'}; name two of them, left first")
+    parts = []
+    for name in names:
+        table, where = found[name], f"{path}, camera {name}"
+        if table.get("fisheye"):
+            raise RigFileError(f"{where}: a fisheye lens; only Brown's distortion can be read")
+        K, size = array_of(table, "matrix", (3, 3), where), array_of(table, "size", (2,), where)
+        D = array_of(table, "distortions", (-1,), where) if "distortions" in table else np.zeros(0)
+        if not table.get("rotation"):
+            raise RigFileError(f"{where}: has no rotation: its place was not calibrated")
+        R = rotation_of(array_of(table, "rotation", (-1,), where), where)
+        parts.append((camera_of(K, D, size, where), R, array_of(table, "translation", (3,), where)))
+    return rig_of(parts, world_is_table)
+
+
+# --- Kalibr's camchain YAML: cam0 (left), cam1 (right), pinholes with radtan or no distortion -------------------------
+# cam1 holds T_cn_cnm1 (4, 4), from cam0's axes to its own, in metres. Kalibr knows no world.
+
+
+def write_kalibr(path: Path, rig: StereoRig) -> None:
+    """k3 and the world have no place there. Raises OutputError."""
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = rig.R_right_left, rig.t_right_left
+    text = ""
+    for number, camera in enumerate(rig.cameras):
+        text += (
+            f"cam{number}:\n"
+            f"  cam_overlaps: [{1 - number}]\n"
+            "  camera_model: pinhole\n"
+            f"  distortion_coeffs: {_listed(camera.distortion[:4])}\n"
+            "  distortion_model: radtan\n"
+            f"  intrinsics: {_listed(camera.parameters[:4])}\n"
+            f"  resolution: {_listed(camera.image_size)}\n"
+            f"  rostopic: /cam{number}/image_raw\n"
+        )
+    text += "  T_cn_cnm1:\n" + "".join(f"  - {_listed(row)}\n" for row in T)
+    write_whole(path, text.encode())
+
+
+def read_kalibr(path: Path) -> StereoRig:
+    """cam0 and cam1 of a camchain. Raises RigFileError; OutputError where PyYAML is not installed."""
+    try:
+        import yaml
+    except ImportError as error:
+        raise OutputError(f"{path}: Kalibr's YAML needs PyYAML: pip install pyyaml") from error
+    try:
+        chain = yaml.safe_load(content_of(path))
+    except yaml.YAMLError as error:
+        raise RigFileError(f"{path}: not YAML: {error}") from error
+    parts = []
+    for name in ("cam0", "cam1"):
+        where, table = f"{path}, {name}", chain.get(name) if isinstance(chain, dict) else None
+        if not isinstance(table, dict):
+            raise RigFileError(f"{path}: holds no {name}; a camchain of two cameras has cam0 and cam1")
+        lens, model = table.get("distortion_model"), table.get("camera_model")
+        if model != "pinhole" or lens not in ("radtan", "none"):
+            raise RigFileError(f"{where}: {model} with {lens}; pinhole with radtan (Brown's k1 k2 p1 p2) can be read")
+        K, size = _matrix(*array_of(table, "intrinsics", (4,), where)), array_of(table, "resolution", (2,), where)
+        D = array_of(table, "distortion_coeffs", (-1,), where) if lens == "radtan" else np.zeros(0)
+        T = np.eye(4) if name == "cam0" else array_of(table, "T_cn_cnm1", (4, 4), where)
+        parts.append((camera_of(K, D, size, where), rotation_of(T[:3, :3], where), T[:3, 3]))
+    return rig_of(parts, world_is_table=False)
+
+
+# --- mrcal's .cameramodel, a file for each camera, where the lens model is Brown's ------------------------------------
+
+_TERMS = {"LENSMODEL_PINHOLE": 0, "LENSMODEL_OPENCV4": 4, "LENSMODEL_OPENCV5": 5}
+
+
+def sides_of(path: Path) -> tuple[Path, Path]:
+    """The two files of mrcal's rig: NAME-left and NAME-right."""
+    return path.with_name(f"{path.stem}-left{path.suffix}"), path.with_name(f"{path.stem}-right{path.suffix}")
+
+
+def write_mrcal(path: Path, rig: StereoRig) -> None:
+    """Write `sides_of` the path; the reference is the rig's world, lengths in metres. Raises OutputError."""
+    for side, camera, (R, t) in zip(sides_of(path), rig.cameras, rig.camera_poses(), strict=True):
+        text = (
+            "{\n"
+            "    'lensmodel':  'LENSMODEL_OPENCV5',\n"
+            "    # fx, fy, cx, cy, k1, k2, p1, p2, k3\n"
+            f"    'intrinsics': {_listed(camera.parameters)},\n"
+            "    # rotation vector and translation [m]: reference to camera\n"
+            f"    'extrinsics': {_listed(np.concatenate([_rotation_vector(R), t]))},\n"
+            f"    'imagersize': {_listed(camera.image_size)}\n"
+            "}\n"
+        )
+        write_whole(side, text.encode())
+
+
+def read_mrcal(paths: Sequence[Path], *, world_is_table: bool = False) -> StereoRig:
+    """A rig from two .cameramodel files with one reference, left first. Raises RigFileError, also for other lenses.
+
+    world_is_table : True if their reference is the table, k up
+    """
+    if len(paths) != 2:
+        raise RigFileError(f"{paths[0]}: mrcal keeps one camera per file; give two, left first")
+    parts = []
+    for path in paths:
+        try:
+            model = ast.literal_eval(content_of(path).strip())
+        except (ValueError, SyntaxError, MemoryError, RecursionError) as error:
+            raise RigFileError(f"{path}: not a .cameramodel of mrcal ({type(error).__name__})") from error
+        if not isinstance(model, dict):
+            raise RigFileError(f"{path}: not a .cameramodel of mrcal: no dictionary")
+        name = str(model.get("lensmodel", model.get("lens_model", "none")))
+        if name not in _TERMS:
+            raise RigFileError(
+                f"{path}: lens model {name}; {', '.join(_TERMS)} can be read. mrcal-convert-lensmodel fits one"
+            )
+        numbers = array_of(model, "intrinsics", (4 + _TERMS[name],), str(path))
+        camera = camera_of(
+            _matrix(*numbers[:4]), numbers[4:], array_of(model, "imagersize", (2,), str(path)), str(path)
+        )
+        rt = array_of(model, "extrinsics" if "extrinsics" in model else "rt_cam_ref", (6,), str(path))
+        parts.append((camera, rotation_of(rt[:3], str(path)), rt[3:]))
+    return rig_of(parts, world_is_table)
+
+
+# --- Direct linear transformation: the dltcoefs.csv of DLTdv8 and easyWand, a column of eleven for each camera --------
+#     u = (L1 X + L2 Y + L3 Z + L4) / (L9 X + L10 Y + L11 Z + 1),  v = (L5 X + L6 Y + L7 Z + L8) / (the same)
+# X, Y, Z are in metres. It describes a camera without a lens, and counts pixels from 1 at the top left.
+
+_FROM_ONE = np.array([[1.0, 0.0, 1.0], [0.0, 1.0, 1.0], [0.0, 0.0, 1.0]])  # pixels from 0 -> pixels from 1
+
+
+def write_dlt(path: Path, rig: StereoRig) -> None:
+    """Coefficients of both cameras (11 rows, left and right). Raises OutputError."""
+    columns = []
+    for camera, (R, t) in zip(rig.cameras, rig.camera_poses(), strict=True):
+        P = _FROM_ONE @ camera.camera_matrix @ np.column_stack([R, t])
+        columns.append((P / P[2, 3]).ravel()[:11])
+    write_whole(path, "".join(f"{left:.17g},{right:.17g}\n" for left, right in zip(*columns, strict=True)).encode())
+
+
+def read_dlt(
+    path: Path, *, image_size: tuple[int, int] | None = None, unit: float = 1.0, world_is_table: bool = False
+) -> StereoRig:
+    """Two cameras without distortion from their coefficients; (width, height) [px] stands in no such file.
+
+    unit : [m] length of the coefficients' unit
+    world_is_table : True if their axes are the table's, z up
+    Raises RigFileError, also where a camera is skewed: eleven free coefficients need not be a pinhole's.
+    """
+    try:
+        L = np.array([[float(cell) for cell in line.split(",")] for line in content_of(path).split()])
+    except ValueError as error:
+        raise RigFileError(f"{path}: not a table of DLT coefficients ({error})") from error
+    if L.shape != (11, 2) or not np.isfinite(L).all():
+        raise RigFileError(f"{path}: {L.shape} numbers; coefficients of two cameras are 11 rows of 2 finite ones")
+    if image_size is None:
+        raise RigFileError(f"{path}: does not tell the image size; give width and height")
+    parts = []
+    for number, column in enumerate(L.T, start=1):
+        P = np.linalg.inv(_FROM_ONE) @ np.append(column, 1.0).reshape(3, 4)
+        P *= np.sign(np.linalg.det(P[:, :3]))  # it is known up to its sign
+        K, R, (*centre, scale) = cv2.decomposeProjectionMatrix(P)[:3]
+        t = -R @ np.ravel(centre) / scale * unit
+        parts.append((camera_of(K / K[2, 2], np.zeros(0), np.array(image_size), f"{path}, camera {number}"), R, t))
+    return rig_of(parts, world_is_table)
+
+
+def _matrix(fx: float, fy: float, cx: float, cy: float) -> Array:
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+
+
+def _rotation_vector(R: Array) -> Array:
+    return np.asarray(cv2.Rodrigues(R)[0], float).ravel()
+
+
+def _listed(values: Any) -> str:
+    """Numbers, or rows of them, as TOML, YAML and Python write lists."""
+    return json.dumps(np.asarray(values).tolist())
