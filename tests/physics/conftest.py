@@ -1,7 +1,7 @@
-"""True motions of a rolling disc, integrated here from the reduced equations, and trajectories as a tracker gives them.
+"""True motions of a rolling disc, and trajectories as a tracker gives them.
 
-The equations are those of a disc that rolls without slip (three coupled second-order equations in theta, omega_2 and
-omega_3, with the moment M_m = -k_m F_z psidot |psidot|), integrated by SciPy; nothing is shared with disctrack.
+The motions are the simulation's, which test_rolling_equations holds against world vectors; the analysis of trajectories
+shares nothing with it.
 """
 
 from collections.abc import Callable
@@ -10,8 +10,6 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
-from scipy.optimize import brentq
 
 from calibration.cameras.camera import N_RIG, Camera, StereoRig
 from disctrack.analyse.derivatives import MotionState
@@ -19,18 +17,13 @@ from disctrack.disc import MA_2014
 from disctrack.frames import (
     continuous_quaternions,
     euler_from_rotation,
-    nodal_axes_world,
     quaternion_from_rotation,
     rotation_from_euler,
     rotation_from_vector,
     unwrap_euler,
 )
+from disctrack.rolling import Model, simulate, steady_precession
 from disctrack.trajectory import FrameStatus, Trajectory
-
-r, h, m = MA_2014.radius, MA_2014.half_thickness, MA_2014.mass
-J1, J3 = m * (r * r / 4 + h * h / 3), m * r * r / 2
-I1, I2, I3 = J1 + m * (r * r + h * h), J1 + m * h * h, J3 + m * r * r
-g = 9.81
 
 
 @dataclass(frozen=True)
@@ -45,7 +38,7 @@ class TrueMotion:
     acceleration: np.ndarray
     alpha: np.ndarray
     euler: np.ndarray
-    rates: np.ndarray  # psidot, thetadot, phidot, omega_1, omega_2, omega_3, omega_z
+    rates: np.ndarray  # psidot, thetadot, phidot, omega_3
 
     def __getitem__(self, part: slice) -> "TrueMotion":
         return TrueMotion(*(getattr(self, name)[part] for name in self.__dataclass_fields__))
@@ -59,83 +52,23 @@ class TrueMotion:
         return MotionState(self.position, self.R, self.velocity, self.omega, self.acceleration, self.alpha)
 
 
-def reduced_rates(_t, s, k_m):
-    psi, theta, _phi, thetadot, w2, w3, _x, _y = s
-    S, C = np.sin(theta), np.cos(theta)
-    psidot, L1, L2 = w2 / S, r * C - h * S, r * S + h * C
-    thetaddot = (I2 * psidot**2 * S * C - (I3 * S + m * r * h * C) * psidot * w3 + m * r * h * (psidot * S) ** 2) / I1
-    thetaddot -= m * g * L1 / I1
-    M_m = -k_m * m * (g + L1 * thetaddot - L2 * thetadot**2) * psidot * abs(psidot)
-    b2 = -J1 * thetadot * psidot * C + J3 * thetadot * w3 - m * h * psidot * thetadot * L2 + C * M_m
-    b3 = m * r * psidot * thetadot * L2 - S * M_m
-    det = I2 * I3 - (m * h * r) ** 2
-    w2dot, w3dot = (I3 * b2 + m * h * r * b3) / det, (m * h * r * b2 + I2 * b3) / det
-    u, w = h * w2 - r * w3, -L2 * thetadot
-    x = u * np.cos(psi) - w * np.sin(psi)
-    y = u * np.sin(psi) + w * np.cos(psi)
-    return np.array([psidot, thetadot, w3 - psidot * C, thetaddot, w2dot, w3dot, x, y])
-
-
-def steady_precession_rate(theta: float) -> float:
-    """Rate at which a disc whose centre rests keeps its nutation: omega_3 = h psidot sin theta / r."""
-
-    def torque(p):
-        S = np.sin(theta)
-        return reduced_rates(0, [0, theta, 0, 0, p * S, h * p * S / r, 0, 0], 0.0)[3]
-
-    guess = np.sqrt(4 * g / r / np.sin(theta))
-    return brentq(torque, guess / 2, guess * 2, xtol=1e-14)
-
-
 @lru_cache(maxsize=16)
-def integrate(theta_deg, duration, k_m=0.381e-7, nutation=0.05, stop_deg=0.5, rate=1000.0, spin=0.0) -> TrueMotion:
-    """Rolling from theta; `nutation` is the first thetadot over psidot theta, `spin` added to omega_3 [rad/s]."""
+def integrate(theta_deg, duration, k_m=0.381e-7, nutation=0.05, spin=0.0) -> TrueMotion:
+    """Rolling from theta to 0.5 deg; `nutation` is the first thetadot over psidot theta, `spin` added to omega_3."""
     theta = np.radians(theta_deg)
-    p = steady_precession_rate(theta)
-    start = [0.3, theta, 0.1, nutation * p * theta, p * np.sin(theta), h * p * np.sin(theta) / r + spin, 0.05, 0.04]
-
-    def lies(_t, s, *_):
-        return s[1] - np.radians(stop_deg)
-
-    lies.terminal = True
-    run = solve_ivp(
-        reduced_rates,
-        (0, duration),
-        start,
-        "DOP853",
-        rtol=1e-11,
-        atol=1e-13,
-        dense_output=True,
-        args=(k_m,),
-        events=lies,
-    )
-    time = np.arange(0, run.t[-1], 1 / rate)
-    s = run.sol(time).T
-    return motion_from_states(time, s, np.array([reduced_rates(0, column, k_m) for column in s]).T)
-
-
-def motion_from_states(time, s, rates) -> TrueMotion:
-    psi, theta, phi, thetadot, w2, w3, x, y = (column[:, None] for column in s.T)
-    psidot, _, phidot, thetaddot, w2dot, w3dot, xdot, ydot = (column[:, None] for column in rates)
-    S, C = np.sin(theta), np.cos(theta)
-    L1, L2 = r * C - h * S, r * S + h * C
-    u, w = h * w2 - r * w3, -L2 * thetadot
-    udot, wdot = h * w2dot - r * w3dot, -L1 * thetadot**2 - L2 * thetaddot
-    e1, e2, e3 = nodal_axes_world(psi[:, 0], theta[:, 0])
-    k = np.array([0.0, 0.0, 1.0])
-    omega = thetadot * e1 + w2 * e2 + w3 * e3
-    turning = np.cross(thetadot * e1 + psidot * k, omega)
-    zddot = L1 * thetaddot - L2 * thetadot**2
+    steady = steady_precession(theta, MA_2014, psi=0.3, phi=0.1, x=0.05, y=0.04)
+    start = steady.moved(thetadot=nutation * steady.psidot * theta, omega3=steady.omega3 + spin)
+    made = simulate(Model(MA_2014).with_values({"km.k_m": k_m}), start, duration, theta_end=np.radians(0.5))
     return TrueMotion(
-        time=time,
-        position=np.column_stack([x, y, r * S + h * C]),
-        R=rotation_from_euler(psi[:, 0], theta[:, 0], phi[:, 0]),
-        velocity=np.column_stack([xdot, ydot, L1 * thetadot]),
-        omega=omega,
-        acceleration=(udot - psidot * w) * e1 + (wdot + psidot * u) * np.cross(k, e1) + zddot * k,
-        alpha=thetaddot * e1 + w2dot * e2 + w3dot * e3 + turning,
-        euler=np.column_stack([psi, theta, phi]),
-        rates=np.column_stack([psidot, thetadot, phidot, thetadot, w2, w3, omega[:, 2]]),
+        time=made.time,
+        position=made.q[:, :3],
+        R=rotation_from_euler(*made.q[:, 3:].T),
+        velocity=made.qdot[:, :3],
+        omega=made.omega_world,
+        acceleration=made.acceleration_world,
+        alpha=made.angular_acceleration_world,
+        euler=made.q[:, 3:],
+        rates=np.column_stack([made.qdot[:, 3:], made.state[:, 7]]),
     )
 
 
@@ -182,7 +115,7 @@ def tracked(truth: TrueMotion, rng, missing=(), noise=1.0, sensitivity=None, rig
         disc=MA_2014,
         rig=rig,
         frame_rate=1000.0,
-        gravity=g,
+        gravity=9.81,
     )
 
 

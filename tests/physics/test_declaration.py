@@ -151,7 +151,7 @@ def test_a_hand_that_turns_the_disc_and_a_disc_at_rest_give_no_verdict(as_tracke
 @pytest.mark.parametrize("memory_ms", [15, 40, 100])
 def test_no_hand_is_taken_for_a_wrong_number(memory_ms, true_motion, as_tracked):
     """However a hand turns and lifts the disc, alone and after it has rolled; nor is a pose that never moves."""
-    rolled = true_motion(10.0, 0.15)
+    rolled = true_motion(10.0, 0.149)
 
     def wander(rng, size, n=400):
         smooth = gaussian_filter1d(rng.normal(size=(n + 8 * memory_ms, 3)), memory_ms, axis=0)[4 * memory_ms :][:n]

@@ -12,7 +12,6 @@ from disctrack import rolling
 from disctrack.disc import MA_2014
 from disctrack.rolling import CATALOGUE, EndReason, Model, Regime, State, steady_precession, struck_disc
 from tests.oracles import newton_euler
-from tests.oracles import steady_precession as oracle
 
 IDEAL = Model(MA_2014)
 STEEL = Model(MA_2014, effects=(CATALOGUE["km"](k_m=0.381e-7),))
@@ -43,19 +42,10 @@ def test_nutation_to_precession_ratio(disc, theta_deg, ratio):
 
 @pytest.mark.parametrize("theta_deg", [2.0, 8.0, 25.0, 60.0])
 @pytest.mark.parametrize("omega3", [None, -2.0, 3.0])
-def test_steady_precession_stays_steady_and_its_centre_on_the_circle(theta_deg, omega3):
+def test_steady_precession_stays_steady(theta_deg, omega3):
     theta = np.radians(theta_deg)
-    state = steady_precession(theta, MA_2014, omega3=omega3, psi=0.4, x=0.01)
-    motion = rolling.simulate(IDEAL, state, 0.5)
+    motion = rolling.simulate(IDEAL, steady_precession(theta, MA_2014, omega3=omega3, psi=0.4, x=0.01), 0.5)
     assert_allclose(motion.q[:, 4], theta, atol=1e-9)  # integration error over 20-200 rad of precession
-    r, h, p, q = MA_2014.radius, MA_2014.half_thickness, state.psidot, state.omega3
-    expected = oracle.centre(r, h, theta, p, q, 0.4, 0.01, 0.0, motion.time)
-    assert_allclose(motion.q[:, :3], expected, atol=1e-10)
-    psi = motion.q[:, 3]
-    contact = motion.q[:, :2] + (r * np.cos(theta) - h * np.sin(theta)) * np.column_stack([np.sin(psi), -np.cos(psi)])
-    middle = oracle.circle_middle(r, h, theta, p, q, 0.4, 0.01, 0.0)
-    run_on = np.linalg.norm(contact - middle, axis=1)
-    assert_allclose(run_on, oracle.contact_circle_radius(r, h, theta, p, q), atol=1e-9)
 
 
 def test_small_nutation_has_the_predicted_frequency_and_phase():
@@ -120,35 +110,6 @@ def test_published_friction_stops_the_disc_in_about_one_and_a_half_seconds(k_m, 
     assert motion.end is rolling.EndReason.NUTATION
     # (5.11) is the quasi-static thin disc; the phase of the nutation alone moves the end by some per cent
     assert_allclose(motion.end_time, 1.5, rtol=0.08)
-
-
-def exponents(motion, t_f, first=0.5, last=0.03):
-    """(n_E, n_theta, n_psidot): slopes against t_f - t in logarithms, over last < t_f - t <= first."""
-    remaining = t_f - motion.time
-    window = (remaining > last) & (remaining <= first)
-    x = np.log(remaining[window])
-    quantities = (motion.energy, motion.q[:, 4], motion.qdot[:, 3])
-    return np.array([np.polyfit(x, np.log(v[window]), 1)[0] for v in quantities])
-
-
-def to_the_end(disc):
-    """Motion from 9 deg with the centre at rest to 0.02 deg, and the instant of the singularity."""
-    model = Model(disc, effects=(CATALOGUE["km"](k_m=newton_euler.K_M),))
-    start = steady_precession(np.radians(9), disc)
-    motion = rolling.simulate(model, start, 4.0, rate=2000, theta_end=np.radians(0.02))
-    assert motion.end is rolling.EndReason.NUTATION
-    # what is left at 0.02 deg: 0.24 ms by (5.11)
-    rest = motion.end_state[3] ** 1.5 * disc.radius**2.5 / (newton_euler.K_M * (4 * 9.81) ** 1.5)
-    return motion, motion.end_time + rest
-
-
-@pytest.mark.parametrize(
-    ("half_thickness", "expected"), [(3e-3, (0.628, 0.692, -0.330)), (1e-9, (0.661, 0.678, -0.339))]
-)
-def test_exponents_of_the_last_half_second(half_thickness, expected):
-    motion, t_f = to_the_end(replace(MA_2014, half_thickness=half_thickness))
-    # the instant of the singularity is known to 0.5 ms, which moves n_theta by 0.003
-    assert_allclose(exponents(motion, t_f), expected, atol=0.005)
 
 
 def test_one_and_a_half_seconds_to_three_hundred_radians_per_second_take_less_than_fifty_milliseconds():
