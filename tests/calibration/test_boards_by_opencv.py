@@ -19,7 +19,6 @@ from calibration.judge.tolerances import BoardTolerances
 from calibration.rig_file import read_rig_file, write_rig
 from calibration.stereo import _observations
 from tests.calibration.conftest import corner_view, squared
-from tests.oracles import imperfect_laboratory as laboratory
 from tests.oracles import moved_boards, point_laboratory
 
 BOARD = Board(moved_boards.INNER_CORNERS, moved_boards.SQUARE)
@@ -153,8 +152,10 @@ def test_pairs_that_were_synchronised_have_no_motion():
 @pytest.mark.statistical
 @pytest.mark.parametrize("seed", [404, 416])
 def test_a_field_of_the_lenses_is_no_motion_of_the_boards(seed, rng):
-    plan, draws = laboratory.Plan(seed), np.random.default_rng([seed, 11])
-    found = point_laboratory.calibration_of(plan, *laboratory.cameras_of(plan, draws), draws, CalibrationSettings())
+    plan, draws = point_laboratory.Plan(seed), np.random.default_rng([seed, 11])
+    found = point_laboratory.calibration_of(
+        plan, *point_laboratory.cameras_of(plan, draws), draws, CalibrationSettings()
+    )
     assert found.lens is not None
     assert found.refinement.problem.motion is None
     assert not any("synchronised" in text for text in found.warnings)

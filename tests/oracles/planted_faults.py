@@ -106,7 +106,37 @@ def hide(images, places, rng):
     return images, np.arange(len(images))
 
 
-FAULTS = (repeat, drop, lose, reorder, swap, mirror, rescale, truncate, glare, shadow, smear, hide)
+def dim(images, places, rng):
+    """Little light: some 40 grey values between ink and paper."""
+    return np.rint(110 + 0.24 * (images - 110.0)).astype(np.uint8), np.arange(len(images))
+
+
+def blur(images, places, rng):
+    """A lens out of focus by a pixel and a half."""
+    flat = images.reshape(-1, *images.shape[2:])
+    return np.stack([cv2.GaussianBlur(image, (0, 0), 1.5) for image in flat]).reshape(images.shape), np.arange(
+        len(images)
+    )
+
+
+def flicker(images, places, rng):
+    """A lamp at 100 Hz, of 1000 pairs a second."""
+    light = 0.8 + 0.2 * np.sin(2 * np.pi * 0.1 * np.arange(len(images)) + rng.uniform(0, 6))
+    return np.rint(images * light[:, None, None, None]).astype(np.uint8), np.arange(len(images))
+
+
+def stick(images, places, rng):
+    """Pixels of both sensors show full scale, as many nothing."""
+    for camera in (0, 1):
+        pixels = images[:, camera].reshape(len(images), -1)
+        where = rng.permutation(pixels.shape[1])[:500]
+        pixels[:, where[::2]], pixels[:, where[1::2]] = 255, 0
+        images[:, camera] = pixels.reshape(images[:, camera].shape)
+    return images, np.arange(len(images))
+
+
+FAULTS = (repeat, drop, lose, reorder, swap, mirror, rescale, truncate, glare, shadow, smear, hide, dim, blur, flicker)
+FAULTS += (stick,)
 
 
 def _over(images, places, rng, change):

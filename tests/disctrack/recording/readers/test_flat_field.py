@@ -1,7 +1,5 @@
 """Dark and flat images: the sensor's pattern, laid over images by another code, is removed to the noise."""
 
-from dataclasses import replace
-
 import cv2
 import numpy as np
 import pytest
@@ -14,7 +12,6 @@ from disctrack.recording.readers.flat_field import flat_fields
 from disctrack.track.measurement import open_pairs
 from tests.disctrack.recording.readers.written import write_sequence
 from tests.disctrack.recording.test_recording import REFERENCE
-from tests.oracles import imperfect_laboratory as laboratory
 
 SIZE, FRAMES, FLATS = 64, 64, 40
 DEAD = (20, 33)
@@ -31,17 +28,20 @@ def scene():
 def folder(tmp_path_factory):
     """A recording whose left sensor has gains of 3 %, columns of one grey value, and a dead pixel."""
     folder, rng = tmp_path_factory.mktemp("flat"), np.random.default_rng(5)
-    faults = replace(laboratory.IDEAL, gains=0.03, columns=1.0)
-    plan = laboratory.Plan(size=SIZE, imperfections=faults)
-    camera = laboratory.Camera(rng, plan, 0.0, np.zeros(3))
-    camera.offset = camera.offset + 6.0  # black level
-    camera.gain[DEAD] = 0.02
+    gain, offset = 1 + 0.03 * rng.normal(size=(SIZE, SIZE)), 6.0 + rng.normal(size=SIZE)  # with a black level
+    gain[DEAD] = 0.02
+
+    def expose(radiance):
+        grey = radiance * gain + offset
+        grey = grey + rng.normal(size=grey.shape) * np.sqrt(0.64 + np.maximum(grey, 0) / 50)
+        return np.clip(np.rint(grey), 0, 255).astype(np.uint8)
+
     level = np.ones((SIZE, SIZE))
     for side in ("left", "right"):
         for kind, radiance, n in (("flat", 140 * level, FLATS), ("dark", 0 * level, FLATS), ("", scene(), FRAMES)):
-            write_sequence(folder / kind / side, [camera.expose(radiance, rng) for _ in range(n)])
+            write_sequence(folder / kind / side, [expose(radiance) for _ in range(n)])
     for side in ("left", "right"):
-        views = camera.expose(scene(), rng), np.zeros((SIZE // 2, SIZE, 3), np.uint8)
+        views = expose(scene()), np.zeros((SIZE // 2, SIZE, 3), np.uint8)
         write_sequence(folder / "views", views, names=[f"{side}0", f"{side}1"])
     return folder
 
