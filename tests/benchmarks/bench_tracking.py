@@ -5,8 +5,6 @@
 A round is all pairs. The two limits do what nobody can spare: read every byte, and compute with the pixels of the dots.
 """
 
-import dataclasses
-import tracemalloc
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -20,7 +18,6 @@ from scipy.optimize import least_squares
 from calibration.cameras.camera import StereoRig
 from disctrack.frames import rotation_from_quaternion, rotation_from_vector, vector_from_rotation
 from disctrack.recording.declaration import Recording
-from disctrack.recording.readers.base import FrameReader
 from disctrack.track.in_memory import measure_pairs
 from disctrack.track.measurement import ImagePairs, measure
 from disctrack.trajectory import Trajectory
@@ -99,32 +96,6 @@ def dot_pixels(trajectory: Trajectory) -> float:
         size = np.ptp(seen.reshape(2, disc.n_markers, len(angle), 2), axis=2) + 2 * DOT_MARGIN_PX
         found.append(np.nansum(size.prod(axis=-1)))
     return float(np.median(found))
-
-
-@pytest.mark.parametrize("n", [1, 10, 100, 1000, 10_000])
-@pytest.mark.benchmark(group="so many pairs, played forth and back")
-@pytest.mark.usefixtures("trajectory")
-def test_so_many_pairs(benchmark: Benchmark, pairs: ImagePairs, images, rig, recording, n: int) -> None:
-    sides = [Played(reader, images[:, i], n) for i, reader in enumerate((pairs.left, pairs.right))]
-    played = dataclasses.replace(pairs, left=sides[0], right=sides[1], start=0, stop=n)
-    benchmark.pedantic(measure, (recording, rig, played), rounds=2 if n < 1000 else 1)
-    tracemalloc.start()
-    measure(recording, rig, played)
-    benchmark.extra_info["MB at most"] = round(tracemalloc.get_traced_memory()[1] / 1e6, 1)
-    tracemalloc.stop()
-
-
-class Played(FrameReader):
-    """Frames in memory, forth and back."""
-
-    def __init__(self, like: FrameReader, frames: np.ndarray, n: int) -> None:
-        k = len(frames)
-        self._frames, self._order = frames, np.resize(np.r_[0:k, k - 2 : 0 : -1], n)
-        alike = {name: getattr(like, name) for name in ("camera", "image_size", "dtype", "bit_depth")}
-        super().__init__(files=["memory"] * n, **alike)
-
-    def _decoded(self, index: int, out: np.ndarray | None, where: str) -> np.ndarray:
-        return self._frames[self._order[index]]
 
 
 def test_plain_opencv_and_scipy(benchmark: Benchmark, images, rig, recording, trajectory: Trajectory) -> None:

@@ -17,7 +17,6 @@ import time
 from concurrent.futures import Future
 from multiprocessing.context import SpawnProcess
 from pathlib import Path
-from urllib.parse import unquote
 
 import cv2
 import h5py
@@ -26,17 +25,14 @@ import pytest
 
 from disctrack.batch import BatchOptions, find_recordings, pool, run, run_batch
 from disctrack.batch import measure as stage
-from disctrack.batch.columns import FITTED
 from disctrack.batch.locks import locked
 from disctrack.batch.measure import LOCK, do
 from disctrack.batch.plan import make_plan
-from disctrack.batch.pool import connect
 from disctrack.batch.records import MEASURED, is_done, read_record
 from disctrack.cli import main
-from disctrack.errors import ClusterError
 from disctrack.track.follow.tracking import prepare
 from disctrack.trajectory.file import read_trajectory
-from tests.pipeline.conftest import linked, naming_rig
+from tests.pipeline.conftest import linked
 
 FAST = ["--no-report"]
 MODEL = ["--distortion", "k1 k2 p1 p2", "--board", "flat"]  # choosing by held-out error is tested elsewhere
@@ -312,33 +308,6 @@ def test_a_read_only_folder_is_told_at_once_and_results_may_go_elsewhere(
     assert (tmp_path / "out" / "recording" / "trajectory.h5").is_file()
 
 
-@pytest.mark.slow
-def test_the_index_links_the_reports_and_compares_repeats(sample_clip, rig_file, tmp_path):
-    """Two parts of one motion: what is fitted to them is the same, and the comparison must say so."""
-    declared = naming_rig((sample_clip / "recording.toml").read_text(), rig_file)
-    for name, frames in (("run 1", slice(0, 300)), ("run 2", slice(15, 300))):
-        for camera in ("left", "right"):
-            (tmp_path / name / camera).mkdir(parents=True)
-            for file in sorted((sample_clip / camera).iterdir())[frames]:
-                (tmp_path / name / camera / file.name).symlink_to(file)
-        (tmp_path / name / "recording.toml").write_text(declared.replace("sample clip", name))
-    outcome = run_batch([tmp_path])
-    assert not outcome.problems
-    page = tmp_path / "batch_results" / "index.html"
-    links = [unquote(link) for link in re.findall(r'href="([^"]+\.html)"', page.read_text())]
-    assert len(links) == 2
-    assert all((page.parent / link).is_file() for link in links)
-    found = json.loads((page.parent / "summary.json").read_text())["repeats"]
-    assert {row["quantity"]: row["n"] for row in found} == {fitted.column: 2 for fitted in FITTED if fitted.repeated}
-    assert all(row["p_value"] > 1e-3 for row in found)  # one motion: within the sigmas
-    assert "Repeats" in page.read_text()
-    one, two = outcome.rows
-    later = one["t_f_s"] - two["t_f_s"]  # the second begins 15 ms later
-    assert later == pytest.approx(0.015, abs=4 * np.hypot(one["t_f_sigma_s"], two["t_f_sigma_s"]))
-    sigma = np.hypot(one["k_m_sigma_m_s2"], two["k_m_sigma_m_s2"])
-    assert one["k_m_m_s2"] == pytest.approx(two["k_m_m_s2"], abs=4 * sigma)
-
-
 REPOSITORY = Path(__file__).resolve().parents[2]
 NAMES = ("a", "b")
 PATIENCE = 120.0  # [s] on a busy machine
@@ -521,76 +490,26 @@ def test_recordings_for_which_no_process_can_be_started_fail_with_that_reason(da
     assert "no process could be started for it: Resource temporarily unavailable" in outcome.rows[0]["reason"]
 
 
-@pytest.mark.slow
-def test_two_batches_on_one_folder_measure_each_recording_once(day):
-    both = [start(day, "--json"), start(day, "--json")]
-    said = [process.communicate(timeout=PATIENCE) for process in both]
-    assert [process.returncode for process in both] == [0, 0], said
-    found = [row for output, _ in said for row in json.loads(output)["blocks"][0]["blocks"][1]["rows"]]
-    assert sorted((row[0], row[2]) for row in found) == [
-        (name, was) for name in NAMES for was in ("measured", "measured before")
-    ]
-    assert json.loads((day / "batch_results" / "summary.json").read_text())["counts"]["failed"] == 0
-
-
-@pytest.fixture
-def dask_cluster(tmp_path):
-    """A scheduler and two workers, each a process of this machine; its address, and the workers' processes."""
-    pytest.importorskip("distributed")
-    file, search = tmp_path / "scheduler.json", os.pathsep.join([str(REPOSITORY), os.environ.get("PYTHONPATH", "")])
-    words = {
-        "dask_scheduler": ["--port", "0", "--no-dashboard", "--scheduler-file", str(file)],
-        "dask_worker": ["--nthreads", "1", "--no-nanny", "--no-dashboard", "--scheduler-file", str(file)],
-    }
-    processes = [
-        subprocess.Popen(
-            [sys.executable, "-m", f"distributed.cli.{program}", *words[program]],
-            cwd=tmp_path,
-            env=os.environ | {"PYTHONPATH": search},
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )
-        for program in ("dask_scheduler", "dask_worker", "dask_worker")
-    ]
-    wait_until(lambda: file.exists() and file.read_text().endswith("}"))
-    yield json.loads(file.read_text())["address"], processes[1:]
-    for process in reversed(processes):
-        process.kill()
-        process.wait()
-
-
 @pytest.mark.statistical
 @_OF_ANOTHER_PROJECT
-def test_a_cluster_that_loses_a_worker_in_mid_run_completes_everything(dask_cluster, day, monkeypatch):
-    address, workers = dask_cluster
-    submitted = []
-
-    def connect_to_both(address):
-        wait_until(lambda: has_workers(address, len(workers)))
-        return connect(address)
+def test_a_cluster_that_loses_a_worker_in_mid_run_completes_everything(day):
+    distributed = pytest.importorskip("distributed")
 
     def kill_one():
         wait_until(lambda: all((day / name / "results" / LOCK).exists() for name in NAMES))
-        workers[0].kill()  # both recordings are being measured, so one of them is lost with it
-        submitted.append(time.monotonic())
+        os.kill(cluster.workers[0].pid, signal.SIGKILL)  # both recordings are being measured, so one is lost with it
 
-    monkeypatch.setattr(pool, "connect", connect_to_both)
-    killer = threading.Thread(target=kill_one, daemon=True)
-    killer.start()
-    outcome = run_batch([day], BatchOptions(report=False), cluster=address)
-    killer.join()
-    assert submitted
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
+        killer = threading.Thread(target=kill_one, daemon=True)
+        killer.start()
+        outcome = run_batch([day], BatchOptions(report=False), cluster=cluster.scheduler_address)
+        killer.join(timeout=1.0)
+        assert not killer.is_alive()
     # One that was whole when its worker died, before it could say so, is found done by the worker that takes it over.
     assert {row["status"] for row in outcome.rows} <= {"measured", "skipped"}
     ours = [numbers(day / name / "results" / "trajectory.h5") for name in NAMES]
     for key, values in ours[0].items():
         np.testing.assert_array_equal(values, ours[1][key], err_msg=key)
-
-
-def has_workers(address: str, n: int) -> bool:
-    with contextlib.suppress(ClusterError), contextlib.closing(connect(address)) as client:
-        return len(client.scheduler_info()["workers"]) == n
-    return False
 
 
 @pytest.mark.statistical

@@ -293,15 +293,6 @@ def test_run_and_the_stages_after_it_name_the_fault_first(name, recording, capsy
         assert comes_first(name, findings), findings[0]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", known_in("diagnose"))
-def test_a_diagnosis_repeats_it_first(name, recording, capsys):
-    folder = str(recording(name))
-    if ended(capsys, "run", folder, "--no-figures", "--no-video")[0] != 1:
-        _, findings, errors = ended(capsys, "diagnose", folder)
-        assert comes_first(name, findings) if findings else "disctrack: " in errors
-
-
 @pytest.mark.statistical
 @pytest.mark.parametrize(
     "names",

@@ -4,6 +4,7 @@ import csv
 import errno
 import fcntl
 import io
+import json
 import os
 import re
 import subprocess
@@ -26,7 +27,7 @@ from disctrack.batch.pool import Cluster, Died, do_all
 from disctrack.batch.records import BUSY, FAILED, MEASURED, Record, failed
 from disctrack.batch.repeats import repeats_of
 from disctrack.batch.report import report_of
-from disctrack.batch.summary import as_csv
+from disctrack.batch.summary import as_csv, write_summary
 from disctrack.errors import ClusterError, RecordingError, reason_of
 from disctrack.report.html import page
 from disctrack.report.terminal import full, short
@@ -306,6 +307,16 @@ def test_repeats_are_of_one_group_determined_and_no_copies():
     assert {name for fitted in FITTED for name in (fitted.column, fitted.sigma)} <= set(COLUMNS)
     assert "0.670 ± 0.010" in page_of(rows, [found])
     assert "Repeats" not in page_of(rows)
+
+
+def test_a_summary_lists_repeats_beside_the_recordings(tmp_path):
+    found = find_recordings([recordings_at(tmp_path, "a", "b")])
+    alike = {"repeats": "glass", "n_theta": 0.66, "n_theta_sigma": 0.01}
+    records = {name: Record(MEASURED, numbers=alike | {"input_sha256": name}) for name in "ab"}
+    write_summary(found, records, BatchOptions())
+    (repeat,) = json.loads((found.common / "summary.json").read_text())["repeats"]
+    assert (repeat["quantity"], repeat["n"]) == ("n_theta", 2)
+    assert "Repeats" in (found.common / "index.html").read_text()
 
 
 def test_names_are_text_in_a_spreadsheet_and_steer_no_terminal():
