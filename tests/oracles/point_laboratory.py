@@ -5,7 +5,7 @@ side, misprinted dots and a disc that rolls as in `newton_euler` give the pixels
 whatever follows (calibration, what the dots share, poses, table) is the product's own.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -29,16 +29,6 @@ CORNER_PX, DOT_PX = 0.0024, 0.0045  # noise per axis of corners and dots in good
 TERMS = {True: ("k1 k2 p1 p2 k3", "free"), False: ("k1 k2", "flat")}  # as views left out choose them here
 GAUSS = ((-0.7745966692414834, 5 / 18), (0.0, 8 / 18), (0.7745966692414834, 5 / 18))
 
-# What hides in the motion: laws and changes of the body that newton_euler follows.
-EFFECTS = {
-    "none": ((), {}),
-    "tilt": ((), {"gravity": (G * np.sin(np.radians(0.1)), 0.0, -G * np.cos(np.radians(0.1)))}),
-    "kz": ((newton_euler.pivoting_friction(30e-6),), {}),
-    "com": ((), {"com_body": (50e-6, 0.0, 0.0)}),
-    "rolling": ((newton_euler.classical_rolling_friction(30e-6),), {}),
-    "drag": ((lambda disc, now: (-2.5e-6 * now.omega, newton_euler.ZERO, newton_euler.ZERO),), {}),
-}
-
 
 @dataclass(frozen=True)
 class Plan:
@@ -53,7 +43,7 @@ class Plan:
     inner_corners: tuple[int, int] = (9, 6)
     square: float = 8e-3
     frame_rate: float = 1000.0
-    effect: str = "none"
+    disc: newton_euler.Disc = field(default_factory=newton_euler.of_the_paper)
     lens_field: float = 0.02  # [px] rms per axis
     bow: float = 60e-6  # [m] of the board, middle against short sides
     stretch: float = 2e-4  # squares longer along the long side
@@ -158,9 +148,8 @@ def recorded(plan):
     cameras, target = cameras_of(plan, rng)
     rig = calibration_of(plan, cameras, target, rng).rig
     times = np.arange(plan.n_frames) / plan.frame_rate
-    laws, changes = EFFECTS[plan.effect]
-    disc, psi = newton_euler.of_the_paper(*laws, **changes), 0.7 + 1.9 * plan.seed
-    spline = newton_euler.filmed_motion(disc, 12.0, 1.5, plan.n_frames / plan.frame_rate, plan.frame_rate, psi)
+    duration, psi = plan.n_frames / plan.frame_rate, 0.7 + 1.9 * plan.seed
+    spline = newton_euler.filmed_motion(plan.disc, 12.0, 1.5, duration, plan.frame_rate, psi)
     body = MA_2014.marker_centres_body.copy()
     body[:, :2] += plan.misprint * rng.normal(size=(len(body), 2))
     px = 0.0

@@ -4,12 +4,10 @@ The motions are the simulation's, which test_rolling_equations holds against wor
 shares nothing with it.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-import pytest
 
 from calibration.cameras.camera import N_RIG, Camera, StereoRig
 from disctrack.analyse.derivatives import MotionState
@@ -22,7 +20,7 @@ from disctrack.frames import (
     rotation_from_vector,
     unwrap_euler,
 )
-from disctrack.rolling import Model, simulate, steady_precession
+from disctrack.rolling import Model, Motion, simulate, steady_precession
 from disctrack.trajectory import FrameStatus, Trajectory
 
 
@@ -53,12 +51,16 @@ class TrueMotion:
 
 
 @lru_cache(maxsize=16)
-def integrate(theta_deg, duration, k_m=0.381e-7, nutation=0.05, spin=0.0) -> TrueMotion:
+def true_motion(theta_deg, duration, k_m=0.381e-7, nutation=0.05, spin=0.0) -> TrueMotion:
     """Rolling from theta to 0.5 deg; `nutation` is the first thetadot over psidot theta, `spin` added to omega_3."""
     theta = np.radians(theta_deg)
     steady = steady_precession(theta, MA_2014, psi=0.3, phi=0.1, x=0.05, y=0.04)
     start = steady.moved(thetadot=nutation * steady.psidot * theta, omega3=steady.omega3 + spin)
-    made = simulate(Model(MA_2014).with_values({"km.k_m": k_m}), start, duration, theta_end=np.radians(0.5))
+    model = Model(MA_2014).with_values({"km.k_m": k_m})
+    return of_simulation(simulate(model, start, duration, theta_end=np.radians(0.5)))
+
+
+def of_simulation(made: Motion) -> TrueMotion:
     return TrueMotion(
         time=made.time,
         position=made.q[:, :3],
@@ -84,7 +86,7 @@ def pose_covariance() -> np.ndarray:
     return correlation * np.outer(POSE_SIGMA, POSE_SIGMA)
 
 
-def tracked(truth: TrueMotion, rng, missing=(), noise=1.0, sensitivity=None, rig_covariance=None) -> Trajectory:
+def as_tracked(truth: TrueMotion, rng, missing=(), noise=1.0, sensitivity=None, rig_covariance=None) -> Trajectory:
     """Trajectory of a true motion: poses with noise and the covariance of that noise."""
     n = len(truth)
     P = noise**2 * pose_covariance()
@@ -117,13 +119,3 @@ def tracked(truth: TrueMotion, rng, missing=(), noise=1.0, sensitivity=None, rig
         frame_rate=1000.0,
         gravity=9.81,
     )
-
-
-@pytest.fixture(scope="session")
-def true_motion() -> Callable[..., TrueMotion]:
-    return integrate
-
-
-@pytest.fixture(scope="session")
-def as_tracked() -> Callable[..., Trajectory]:
-    return tracked

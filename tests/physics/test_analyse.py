@@ -16,15 +16,14 @@ from disctrack.disc import MA_2014
 from disctrack.errors import AnalysisError, OutputError
 from disctrack.frames import continuous_quaternions, quaternion_from_rotation, rotation_from_euler
 from disctrack.numbers import measured
-from disctrack.report.palette import BLUE
 from disctrack.track.measurement import at_full_length
 from disctrack.trajectory import FrameStatus
 from disctrack.trajectory.file import Provenance, read_group, read_trajectory, write_trajectory
-from tests.oracles.browser import BROWSER, screenshot
+from tests.physics.conftest import as_tracked, true_motion
 
 
 @pytest.fixture(scope="module")
-def late(true_motion, as_tracked):
+def late():
     rng = np.random.default_rng(20140703)
     return as_tracked(true_motion(theta_deg=9, duration=3.0)[-450:], rng, missing=range(100, 106))
 
@@ -40,7 +39,7 @@ def stored(folder: Path, trajectory) -> Path:
     return path
 
 
-def test_file_gets_the_groups_and_keeps_what_it_had(tmp_path, late, analysed, true_motion):
+def test_file_gets_the_groups_and_keeps_what_it_had(tmp_path, late, analysed):
     path = stored(tmp_path, late)
     write_analysis(path, analysed)
     again = read_trajectory(path)
@@ -67,7 +66,7 @@ def test_file_gets_the_groups_and_keeps_what_it_had(tmp_path, late, analysed, tr
 
 
 @pytest.mark.slow
-def test_recording_that_runs_on_after_the_end_gives_what_one_that_ends_there_gives(true_motion, as_tracked):
+def test_recording_that_runs_on_after_the_end_gives_what_one_that_ends_there_gives():
     """A patch stops the precession at 0.5 degrees within 20 ms, then the disc lies still for 0.2 s."""
     truth = true_motion(theta_deg=9, duration=3.0)[-600:]
     fall = np.clip(1 - np.arange(1, 221) / 20, 0, 1)
@@ -114,7 +113,7 @@ def test_disc_that_precesses_the_other_way_gives_the_same_exponents(late, analys
 
 @pytest.mark.statistical
 @pytest.mark.parametrize("tilt_deg", [0.5, 0.0])
-def test_disc_at_rest_gives_no_rates_and_no_exponents(tilt_deg, true_motion, as_tracked, rng):
+def test_disc_at_rest_gives_no_rates_and_no_exponents(tilt_deg, rng):
     base, tilt = true_motion(theta_deg=9, duration=3.0)[:300], np.radians(tilt_deg)
     place = [0.05, 0.04, MA_2014.radius * np.sin(tilt) + MA_2014.half_thickness * np.cos(tilt)]
     R = rotation_from_euler(0.3, tilt, 0.1)
@@ -182,11 +181,8 @@ def test_rest_that_was_left_out_costs_nothing_and_changes_no_number(tmp_path, la
     assert any("of 450 frames" in finding.text for finding in found.findings)
 
 
-BLUE_BGR = np.array([int(BLUE[i : i + 2], 16) for i in (5, 3, 1)])  # of the curves
-
-
 @pytest.fixture(scope="module")
-def reported(tmp_path_factory, true_motion, as_tracked):
+def reported(tmp_path_factory):
     """Report of a disc that rolls down to 0.5 degrees, with a gap."""
     folder = tmp_path_factory.mktemp("report")
     trajectory = as_tracked(
@@ -227,19 +223,3 @@ def test_every_figure_is_there_as_png_and_pdf(reported):
         if path.suffix == ".png":
             picture = cv2.imread(str(path))
             assert picture.std() > 5, path  # not blank
-
-
-def share_of_blue(picture: np.ndarray) -> float:
-    return float(np.mean(np.abs(picture.astype(int) - BLUE_BGR).max(axis=2) < 12))
-
-
-@pytest.mark.statistical
-@pytest.mark.skipif(BROWSER is None, reason="no browser on this machine")
-def test_report_shows_its_figures_in_a_browser(reported, tmp_path):
-    picture = screenshot(reported.report, tmp_path, (1280, 6000))
-    assert picture.shape == (6000, 1280, 3)
-    assert share_of_blue(picture) > 5e-4  # curves of 1 px, 500 px long, in some 15 figures
-    # negative control: the same page with its pictures damaged has no curves
-    damaged = tmp_path / "damaged.html"
-    damaged.write_text(reported.report.read_text().replace(";base64,", ";base64,AAAA"))
-    assert share_of_blue(screenshot(damaged, tmp_path, (1280, 6000))) < 0.2 * share_of_blue(picture)

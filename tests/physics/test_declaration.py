@@ -29,6 +29,7 @@ from disctrack.frames import (
     unwrap_euler,
 )
 from disctrack.trajectory import MarkerStatus, Trajectory
+from tests.physics.conftest import as_tracked, true_motion
 
 SIXTHS = np.radians(60.0 * np.arange(6))
 HONEST = [  # theta [deg], seconds, losses, nutation, spin [rad/s]
@@ -45,13 +46,13 @@ def at_another_rate(trajectory: Trajectory, factor: float) -> Trajectory:
 
 
 @pytest.fixture(scope="module")
-def honest(true_motion, as_tracked):
+def honest():
     return as_tracked(true_motion(8.0, 0.16, nutation=0.1), np.random.default_rng(4))
 
 
 @pytest.mark.statistical
 @pytest.mark.parametrize(("theta", "seconds", "k_m", "nutation", "spin"), HONEST)
-def test_honest_motions_are_not_contradicted(theta, seconds, k_m, nutation, spin, true_motion, as_tracked):
+def test_honest_motions_are_not_contradicted(theta, seconds, k_m, nutation, spin):
     motion = true_motion(theta, seconds, k_m, nutation, spin=spin)
     trajectory = as_tracked(motion, np.random.default_rng(1), missing=range(50, 58))
     gravity, _ = balance(trajectory)
@@ -100,9 +101,7 @@ def seen_in(Q, trajectory: Trajectory, height: float = 0.0) -> Trajectory:
 
 @pytest.mark.parametrize(("theta", "seconds", "k_m", "nutation", "spin"), HONEST)
 @pytest.mark.parametrize("turn_deg", [3.0, 25.0])
-def test_a_table_view_whose_board_did_not_lie_on_the_table_is_named(
-    turn_deg, theta, seconds, k_m, nutation, spin, true_motion, as_tracked
-):
+def test_a_table_view_whose_board_did_not_lie_on_the_table_is_named(turn_deg, theta, seconds, k_m, nutation, spin):
     """Before, the radius was said to be 0.5 mm: over another plane the height of the centre means nothing."""
     motion = true_motion(theta, seconds, k_m, nutation, spin=spin)
     trajectory = as_tracked(motion, np.random.default_rng(1), missing=range(50, 58))
@@ -124,7 +123,7 @@ def test_departures_that_a_table_or_an_edge_may_make_are_noted_and_no_contradict
 
 
 @pytest.mark.parametrize(("theta", "seconds"), [(3.3, 0.3), (9.0, 0.1)])
-def test_a_film_that_runs_backwards_gains_energy(theta, seconds, true_motion, as_tracked):
+def test_a_film_that_runs_backwards_gains_energy(theta, seconds):
     """However short: by 2 %, which is many of its sigmas."""
     motion = true_motion(theta, seconds)
     forwards = as_tracked(motion, np.random.default_rng(2))
@@ -135,7 +134,7 @@ def test_a_film_that_runs_backwards_gains_energy(theta, seconds, true_motion, as
     assert "in the order of time" in finding.sentence
 
 
-def test_a_hand_that_turns_the_disc_and_a_disc_at_rest_give_no_verdict(as_tracked, true_motion):
+def test_a_hand_that_turns_the_disc_and_a_disc_at_rest_give_no_verdict():
     """What the table's force alone does not explain says nothing about gravity."""
     motion = true_motion(10.0, 0.2)
     psi = 20.0 * motion.time
@@ -149,7 +148,7 @@ def test_a_hand_that_turns_the_disc_and_a_disc_at_rest_give_no_verdict(as_tracke
 
 @pytest.mark.statistical
 @pytest.mark.parametrize("memory_ms", [15, 40, 100])
-def test_no_hand_is_taken_for_a_wrong_number(memory_ms, true_motion, as_tracked):
+def test_no_hand_is_taken_for_a_wrong_number(memory_ms):
     """However a hand turns and lifts the disc, alone and after it has rolled; nor is a pose that never moves."""
     rolled = true_motion(10.0, 0.149)
 

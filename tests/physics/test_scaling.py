@@ -11,6 +11,7 @@ from disctrack.analyse.power_laws import count_nutation, fit_power_laws, power_l
 from disctrack.analyse.propagation import propagate, rates
 from disctrack.analyse.published import SURFACES, agreement, exponents_of, published_table
 from disctrack.disc import MA_2014
+from tests.physics.conftest import as_tracked, true_motion
 
 
 def known_law(n, rng, nutation=0.1, duration=0.6, unseen=0.03):
@@ -75,7 +76,7 @@ def test_wrong_instant_of_collapse_bends_the_exponent_as_stated(rng):
 
 
 @pytest.mark.statistical
-def test_nutation_does_not_move_the_exponents_of_a_rolling_disc(true_motion):
+def test_nutation_does_not_move_the_exponents_of_a_rolling_disc():
     """The same disc with and without nutation loses its energy by the same law: n_theta within 0.002."""
     calm = fit_power_laws(*of_motion(true_motion(theta_deg=9, duration=3.0, nutation=0.0)))
     for nutation in (0.05, 0.15):
@@ -88,7 +89,7 @@ def test_nutation_does_not_move_the_exponents_of_a_rolling_disc(true_motion):
     assert_allclose(calm.n_energy.value, 0.617, atol=0.005)
 
 
-def test_tracked_recording_gives_the_exponents_of_its_true_motion(true_motion, as_tracked, rng):
+def test_tracked_recording_gives_the_exponents_of_its_true_motion(rng):
     truth = true_motion(theta_deg=9, duration=3.0)[-700:]
     motion = differentiate(as_tracked(truth, rng))
     energy = analyse_energy(motion).propagated.value[:, 5]
@@ -100,7 +101,7 @@ def test_tracked_recording_gives_the_exponents_of_its_true_motion(true_motion, a
     assert abs(found.t_f - true.t_f) < 2e-4  # the paper's t_f is known to 0.2 ms
 
 
-def test_exponents_over_several_windows_each_have_their_own_end(true_motion):
+def test_exponents_over_several_windows_each_have_their_own_end():
     data = of_motion(true_motion(theta_deg=9, duration=3.0))
     fits = [fit_power_laws(*data, window=window) for window in (0.1, 0.3, 0.5, 1.0)]
     assert not fits[0].determined
@@ -110,7 +111,7 @@ def test_exponents_over_several_windows_each_have_their_own_end(true_motion):
         assert_allclose(fit.window[0], window, atol=2e-3)
 
 
-def test_brake_at_the_end_is_left_out(true_motion):
+def test_brake_at_the_end_is_left_out():
     """The last 20 ms, in which a patch brakes the precession, would pull the exponents if they were kept."""
     time, psi, theta, psidot, energy = of_motion(true_motion(theta_deg=9, duration=3.0)[-700:])
     free = fit_power_laws(time, psi, theta, psidot, energy)
@@ -131,7 +132,7 @@ def test_brake_at_the_end_is_left_out(true_motion):
 
 
 @pytest.mark.parametrize("part", [slice(0, 200), slice(0, 600), slice(0, 10)])
-def test_recording_far_from_collapse_gives_no_exponent_but_a_reason(part, true_motion):
+def test_recording_far_from_collapse_gives_no_exponent_but_a_reason(part):
     fit = fit_power_laws(*of_motion(true_motion(theta_deg=25, duration=0.6, nutation=0.1)[part]))
     assert not fit.determined
     assert fit.reason
@@ -147,7 +148,7 @@ def test_unknown_frames_are_passed_over(rng):
     assert abs(fit_power_laws(time, psi, theta, psidot, energy).n_theta.value - whole.n_theta.value) < 0.002
 
 
-def test_counted_ratio_lies_where_theory_puts_it(true_motion):
+def test_counted_ratio_lies_where_theory_puts_it():
     truth = true_motion(theta_deg=9, duration=3.0)
     count = count_nutation(truth.euler[:, 0], truth.euler[:, 1], np.full(len(truth), 6e-6), MA_2014)
     assert len(count.count) > 15

@@ -67,15 +67,13 @@ def sizes(document, name):
     return {p["name"]: (p["value"], p["sigma"]) for p in account["parameters"]}
 
 
-def assert_found(document, hidden, per_cent=1):
+def assert_found(document, hidden):
     """Each hidden effect {name: {parameter: value}}, no other, at its size, and noise is left."""
     assert document["verdict"] == "found", document["sentence"]
     assert len(document["effects"]) == len(hidden), document["sentence"]
     for name, truth in hidden.items():
         for parameter, (value, sigma) in sizes(document, name).items():
-            # three sigma, and 1 % for what small images add: edges of dots on 1/800 px
-            size = np.linalg.norm(list(truth.values()))
-            assert abs(value - truth[parameter]) < 3 * sigma + 0.01 * per_cent * size, parameter
+            assert abs(value - truth[parameter]) < 3 * sigma, parameter
     assert document["after"]["reduced_chi_square"] < 1.1
     assert document["after"]["held_out"]["ratio_to_noise_floor"] < 1.2
 
@@ -107,23 +105,7 @@ def test_nothing_is_found_in_images_of_an_independent_motion_without_an_effect(t
 
 SHAKEN = np.array([8e-6, -5e-6, 6e-6]), np.array([4e-6, 7e-6, -9e-6])  # [m] at the first frame, and a quarter later
 SHAKEN_NAMES = [f"u_{phase}_{axis}" for phase in ("cos", "sin") for axis in "xyz"]
-CASES = {  # what is hidden, and how: in the body and its laws, and in the measurement
-    "pivoting friction": ({"kz": {"k_z": 6e-5}}, of_the_paper(newton_euler.pivoting_friction(6e-5))),
-    "rolling moment": (
-        {"rolling_classical": {"delta": 2e-4}}, of_the_paper(newton_euler.classical_rolling_friction(2e-4))
-    ),
-    "centre of mass": ({"centre_of_mass": {"c_1": 7e-5, "c_2": -7e-5}}, of_the_paper(com_body=(7e-5, -7e-5, 0.0))),
-    "frame rate": ({"frame_rate": {"change": 0.012}}, of_the_paper(), Faults(frame_rate_hz=404.8)),
-    "tilt and a late camera": (
-        tilted(0.002, -1.0)[1] | {"time_offset": {"delay": 2e-4}}, of_the_paper(**tilted(0.002, -1.0)[0]),
-        Faults(right_delay_s=2e-4),
-    ),
-    "pivoting friction and an unbalanced disc": (
-        {"kz": {"k_z": 3e-5}, "centre_of_mass": {"c_1": 5e-5, "c_2": 3e-5}},
-        of_the_paper(newton_euler.pivoting_friction(3e-5), com_body=(5e-5, 3e-5, 0.0)),
-    ),
-}  # fmt: skip
-TABLES_AND_RIMS = {
+TABLES_AND_RIMS = {  # what is hidden, and how
     "spring": ({"spring": {"k": 0.8, "F_x": 0.0, "F_y": 0.0}}, of_the_paper(newton_euler.spring(0.8))),
     "adhesion": ({"rolling_adhesive": {"a": 1e-4}}, of_the_paper(newton_euler.adhesive_rolling_friction(1e-4))),
     "hollow": (
@@ -142,19 +124,12 @@ TABLES_AND_RIMS = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", CASES)
-def test_what_is_hidden_in_images_of_an_independent_motion_is_found(name, tmp_path):
-    truth, *hidden = CASES[name]
-    assert_found(diagnosis_of(hide(tmp_path, small_scene(50 + len(name), 150, 400.0), *hidden)), truth)
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("name", TABLES_AND_RIMS)
 def test_what_a_table_or_a_rim_does_is_found_in_images(name, tmp_path):
     truth, body = TABLES_AND_RIMS[name]
     document = diagnosis_of(hide(tmp_path, small_scene(80 + len(name), 250, 500.0), body))
     assert [e["name"] for e in document["effects"]] == list(truth), document["sentence"]
-    assert_found(document, truth, per_cent=0)
+    assert_found(document, truth)
 
 
 @pytest.mark.slow

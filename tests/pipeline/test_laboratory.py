@@ -5,7 +5,8 @@ import pytest
 
 from disctrack.diagnosis import diagnose
 from disctrack.diagnosis.recorded import with_declared_dots
-from tests.oracles.point_laboratory import IDEAL, Plan, errors_and_variances, recorded
+from tests.oracles.newton_euler import ZERO, classical_rolling_friction, of_the_paper, pivoting_friction
+from tests.oracles.point_laboratory import IDEAL, G, Plan, errors_and_variances, recorded
 
 # What frames share counts once in each laboratory: 10 of them scatter by sqrt(2 / 10) of their share.
 SHARED = (0.3, 2.0), (0.5, 1.5)
@@ -39,28 +40,35 @@ def test_errors_are_as_large_as_stated(name):
     assert np.all(rms < most_um), rms
 
 
-# What the diagnosis calls the effects that the laboratory plants, and their true sizes.
-PLANTED = {
-    "none": {},
-    "tilt": {"table_tilt.tilt_x": float(np.sin(np.radians(0.1))), "table_tilt.tilt_y": 0.0},
-    "kz": {"kz.k_z": 30e-6},
-    "com": {"centre_of_mass.c_1": 50e-6, "centre_of_mass.c_2": 0.0},
-    "rolling": {"rolling_classical.delta": 30e-6},
-    "drag": {"drag_rotation.c": 2.5e-6},
+def rotation_drag(disc, now):
+    return -2.5e-6 * now.omega, ZERO, ZERO
+
+
+TILT = np.radians(0.1)
+PLANTED = {  # the body with its laws, and what the diagnosis calls that, with the true sizes
+    "none": (of_the_paper(), {}),
+    "tilt": (
+        of_the_paper(gravity=(G * np.sin(TILT), 0.0, -G * np.cos(TILT))),
+        {"table_tilt.tilt_x": np.sin(TILT), "table_tilt.tilt_y": 0.0},
+    ),
+    "kz": (of_the_paper(pivoting_friction(30e-6)), {"kz.k_z": 30e-6}),
+    "com": (of_the_paper(com_body=(50e-6, 0.0, 0.0)), {"centre_of_mass.c_1": 50e-6, "centre_of_mass.c_2": 0.0}),
+    "rolling": (of_the_paper(classical_rolling_friction(30e-6)), {"rolling_classical.delta": 30e-6}),
+    "drag": (of_the_paper(rotation_drag), {"drag_rotation.c": 2.5e-6}),
 }
 
 
 def wrong_about(seed, effect):
     """What is said of a recording that is not as planted; empty where that is named within three sigma, and no more."""
-    plan = Plan(seed, 300, frame_rate=500.0, effect=effect)
-    tracking = recorded(plan)[0]
+    disc, truth = PLANTED[effect]
+    tracking = recorded(Plan(seed, 300, frame_rate=500.0, disc=disc))[0]
     dots = tracking.as_built
     told = {
         "marker_shift_um": 1e6 * dots.marker_shift[:, :2],
         "marker_shift_sigma_um": 1e6 * dots.marker_shift_sigma,
     }
     result = diagnose(with_declared_dots(tracking.trajectory, told))
-    fit, truth = result.diagnosis.after, PLANTED[effect]
+    fit = result.diagnosis.after
     claimed = {q for found in result.diagnosis.found if found.candidate.kind == "motion" for q in found.candidate.names}
     others = {name.partition(".")[0] for name in claimed} - {name.partition(".")[0] for name in truth}
     sized = truth.keys() <= claimed and all(abs(fit.values[q] - value) < 3 * fit.sigma(q) for q, value in truth.items())
