@@ -63,6 +63,15 @@ def test_decoding_alone(benchmark: Benchmark, pairs: ImagePairs, threads: int) -
     benchmark.pedantic(decode, rounds=ROUNDS)
 
 
+def test_read_alone(benchmark: Benchmark, pairs: ImagePairs, images: np.ndarray) -> None:
+    def read() -> None:
+        for i, pair in enumerate(images.copy()):
+            pairs.left.read(i, pair[0])
+            pairs.right.read(i, pair[1])
+
+    benchmark.pedantic(read, rounds=ROUNDS)
+
+
 def test_limit_of_memory(benchmark: Benchmark, images: np.ndarray) -> None:
     target = images.copy()
     benchmark.pedantic(np.copyto, (target, images), rounds=ROUNDS)
