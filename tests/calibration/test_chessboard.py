@@ -89,16 +89,6 @@ def test_added_light_shifts_no_corner(board_drawer):
     assert shift(added=30.0) < 1e-3  # the noise of a good image shifts a corner by 0.004 px
 
 
-def test_opencv_corners_at_the_usual_window_are_worse(board_drawer):
-    image, true = seen(board_drawer, (10, -50, 5), 3)
-    ours = find_corners(image, (9, 6)).points
-    theirs = cv2.cornerSubPix(
-        image, np.ascontiguousarray(true, np.float32).reshape(-1, 1, 2), (5, 5), (-1, -1), (3, 100, 1e-4)
-    ).reshape(-1, 2)
-    error = [np.sqrt(np.mean((points - true) ** 2)) for points in (ours, theirs)]
-    assert error[0] < 0.5 * error[1]
-
-
 @pytest.mark.statistical
 @pytest.mark.parametrize(
     "optical_blur", [0.02, pytest.param(0.1, marks=pytest.mark.slow), pytest.param(0.2, marks=pytest.mark.slow)]

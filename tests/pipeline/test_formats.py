@@ -62,14 +62,6 @@ def use_files(recording: Path, left: str, right: str) -> None:
     file.write_text(text)
 
 
-def use_mraw(recording: Path, kind: str = "cih", right: dict | None = None, **entries) -> None:
-    """Both cameras' frames as Photron writes them. right : what its header says otherwise"""
-    for name in CAMERAS:
-        own = OURS | entries | ((right or {}) if name == "right" else {})
-        write_mraw(recording / "raw" / name, grey_values(recording / name), 8, kind=kind, **own)
-    use_files(recording, f"raw/left.{kind}", f"raw/right.{kind}")
-
-
 def run(recording: Path, *words: str) -> Path:
     assert main(["run", str(recording), *QUICK, *words]) == 0
     return recording / "results" / "trajectory.h5"
@@ -86,7 +78,9 @@ def test_the_exposure_moves_poses_by_what_it_should(from_png, from_png_of_50_us)
 
 
 def test_poses_from_mraw_of_8_bit_are_those_from_png_to_the_last_bit(recording, from_png_of_50_us, capsys):
-    use_mraw(recording, "cihx")
+    for name in CAMERAS:
+        write_mraw(recording / "raw" / name, grey_values(recording / name), 8, kind="cihx", **OURS)
+    use_files(recording, "raw/left.cihx", "raw/right.cihx")
     found = run(recording, "-v")
     assert "exposure 50 µs, trigger Start" in said(capsys)
     assert_array_equal(read_trajectory(found).q, from_png_of_50_us.q)
@@ -111,17 +105,6 @@ def test_both_cameras_and_their_times_in_one_hdf5_file(recording, from_png, caps
     assert_array_equal(found.time, times)
     assert_array_equal(found.q, from_png.q)
     assert any("30 µs after" in finding.text for finding in found.findings)
-
-
-def test_doubts_about_the_headers_are_told_and_kept(recording, capsys):
-    use_mraw(recording, right={"Shutter_Type2": "90000"})
-    file = recording / "recording.toml"
-    file.write_text(file.read_text().replace("[cameras]", "[cameras]\nexposure_us = 500", 1))
-    found = run(recording, "-v")
-    told = said(capsys)
-    assert "the cameras exposed for different times" in told
-    assert "exposure_us is 500, the left camera's header says 50 µs" in told
-    assert "left 50 µs" in "".join(finding.text for finding in read_trajectory(found).findings)
 
 
 def test_a_part_of_a_recording_keeps_the_time_of_every_frame(recording):
