@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.board.corner_fit import CornerView, fit_view, local_axes
+from calibration.board.corner_fit import CornerView, fit_view, local_axes, squares_round
 from calibration.board.target import Board, board_orders
 from calibration.kit.arguments import checked
 from calibration.kit.arrays import Array
@@ -188,21 +188,16 @@ def _orient(corners: Array, grey: Array, inner_corners: tuple[int, int]) -> Arra
 
 
 def _first_square_is_dark(corners: Array, grey: Array, inner_corners: tuple[int, int]) -> float:
-    """Above 0 if the square outside corner 0 is dark, below if it is light; 1 where all neighbouring squares agree.
+    """Above 0 if the square outside corner 0 is dark, below if it is light; 1 where the squares at all corners agree.
 
     Neighbours are compared with each other, so that a shadow across the board does not count.
     """
     columns, rows = inner_corners
-    grid = corners.reshape(rows, columns, 2)
-    centres = 0.25 * (grid[1:, 1:] + grid[1:, :-1] + grid[:-1, 1:] + grid[:-1, :-1])
-    x, y = np.rint(centres).astype(int).transpose(2, 0, 1)
-    values = grey[np.clip(y, 0, grey.shape[0] - 1), np.clip(x, 0, grey.shape[1] - 1)].astype(float)
-    j, i = np.mgrid[: rows - 1, : columns - 1]
-    turned = values * np.where(
-        (i + j) % 2, 1.0, -1.0
-    )  # the square inside corner 0 has the colour of the one outside it
-    steps = [np.sign(turned[:, 1:] + turned[:, :-1]).ravel(), np.sign(turned[1:] + turned[:-1]).ravel()]
-    return float(np.concatenate(steps).mean())
+    axes = local_axes(corners, np.ones(len(corners), bool), inner_corners)
+    signs = np.sign(_saddles(grey, corners, axes, 0.5)).reshape(rows, columns)
+    signs[1::2] *= -1.0
+    signs[:, 1::2] *= -1.0
+    return float(-np.nansum(signs) / signs.size)
 
 
 def _larger_board(grey: Array, view: CornerView, inner_corners: tuple[int, int]) -> str | None:
@@ -238,17 +233,14 @@ def _crosses(grey: Array, line: Array, axes: Array, least: float) -> bool:
     return bool(inside.sum() >= 3 and inside.mean() >= 0.5 and np.mean(contrast[inside] > least) > 0.7)
 
 
-def _saddles(grey: Array, points: Array, axes: Array) -> Array:
+def _saddles(grey: Array, points: Array, axes: Array, aside: float = 0.3) -> Array:
     """(n,) By how much two opposite squares are lighter than the two others at points (n, 2), or these, below 0.
 
-    NaN where they do not lie in the image; axes (n, 2, 2) of a square.
+    NaN where they do not lie in the image; axes, aside : as of `squares_round`
     """
-    at = points[:, None] + 0.3 * np.array([[1.0, 1.0], [-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0]]) @ axes
-    inside = np.all((at >= 0) & (at < np.array(grey.shape[::-1]) - 1), axis=(1, 2), keepdims=True)
-    x, y = np.rint(np.where(inside, at, 0.0)).astype(int).transpose(2, 0, 1)
-    a, b = grey[y, x].reshape(-1, 2, 2).transpose(1, 0, 2)
+    a, b = squares_round(grey, points, axes, aside).transpose(1, 0, 2)
     lighter, darker = a.min(axis=1) - b.max(axis=1), b.min(axis=1) - a.max(axis=1)
-    return np.where(inside[:, 0, 0], np.where(lighter > 0, lighter, -np.maximum(darker, 0.0)), np.nan)
+    return np.where(lighter > 0, lighter, -np.maximum(darker, 0.0))
 
 
 def negatives(images: Sequence[NDArray], views: Sequence[CornerView | BoardNotFound], board: Board) -> str:

@@ -148,12 +148,8 @@ def _windows(points: Array, axes: Array, blur: float, shape: tuple[int, ...], pl
 
 def _starts(grey: Array, points: Array, axes: Array, blur: float, aside: float) -> Array:
     """Start values (n, 9): levels from the four squares round the corner, so many squares aside of both edges."""
-    offsets = aside * np.array([[1.0, 1.0], [-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0]])
-    at = np.rint(points[:, None] + offsets @ axes).astype(int)
-    x = np.clip(at[..., 0], 0, grey.shape[1] - 1)
-    y = np.clip(at[..., 1], 0, grey.shape[0] - 1)
-    levels = grey[y, x]
-    same, other = levels[:, :2].mean(-1), levels[:, 2:].mean(-1)
+    levels = squares_round(grey, points, axes, aside)
+    same, other = np.where(np.isnan(levels), levels[..., ::-1], levels).mean(-1).T
     starts = np.zeros((len(points), N_CORNER))
     starts[:, :2] = points
     starts[:, 2:4] = np.arctan2(axes[..., 1], axes[..., 0])
@@ -311,6 +307,17 @@ def local_axes(points: Array, ok: Mask, inner_corners: tuple[int, int]) -> Array
     image = np.column_stack([board, np.ones(len(board))]) @ H.T
     places, depth = image[:, :2] / image[:, 2:], image[:, 2:]
     return np.stack([(H[:2, axis] - places * H[2, axis]) / depth for axis in (0, 1)], axis=1)
+
+
+def squares_round(grey: Array, points: Array, axes: Array, aside: float) -> Array:
+    """(n, 2, 2) grey values of two opposite squares round points (n, 2), and of the two others; NaN out of view.
+
+    aside : how far from both edges, in squares; axes (n, 2, 2) of a square
+    """
+    at = points[:, None] + aside * np.array([[1.0, 1.0], [-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0]]) @ axes
+    inside = np.all((at >= 0) & (at <= np.array(grey.shape[::-1]) - 1), axis=-1)
+    x, y = np.rint(np.where(inside[..., None], at, 0.0)).astype(int).transpose(2, 0, 1)
+    return np.where(inside, grey[y, x], np.nan).reshape(-1, 2, 2)
 
 
 def _indices(inner_corners: tuple[int, int]) -> Array:

@@ -13,7 +13,8 @@ from calibration.cameras._projection import project_point
 from calibration.kit.compiled import njit
 
 # Columns: nine intrinsics of the left camera, nine of the right, turn and shift between them, turn and shift of the
-# board, residual. A left observation has the first nine and the last seven, a right one all but the first nine.
+# board, residual. A left observation has the first nine and the last seven, a right one all but the first nine: the
+# others are zero.
 N_COLUMNS = 31
 
 
@@ -27,7 +28,7 @@ def accumulate(view, camera, point, limit, pixels, weights, cameras, R_right_lef
     (V, n, 3, 31), the products of the points' columns with the others, and by_itself (V, n, 3, 3), among themselves.
     Returns False where a point lies behind its camera; the sums are then not to be used.
     """
-    row, d = np.empty((2, N_COLUMNS - 9)), np.empty((2, 3))
+    row, d = np.empty((2, N_COLUMNS)), np.empty((2, 3))
     arm, left, turned, X = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     d_left, by_point = np.empty((2, 3)), np.empty((2, 3))
     for i in range(len(view)):
@@ -47,32 +48,31 @@ def accumulate(view, camera, point, limit, pixels, weights, cameras, R_right_lef
         u, v_px = project_point(c, X[0], X[1], X[2], d)
         a, b = X[0] / X[2], X[1] / X[2]
         r2 = a * a + b * b
-        row[0, 0], row[0, 1], row[0, 2], row[0, 3] = (u - c[2]) / fx, 0.0, 1.0, 0.0
-        row[1, 0], row[1, 1], row[1, 2], row[1, 3] = 0.0, (v_px - c[3]) / fy, 0.0, 1.0
-        row[0, 4], row[0, 5], row[0, 8] = fx * a * r2, fx * a * r2 * r2, fx * a * r2 * r2 * r2
-        row[1, 4], row[1, 5], row[1, 8] = fy * b * r2, fy * b * r2 * r2, fy * b * r2 * r2 * r2
-        row[0, 6], row[0, 7] = fx * 2.0 * a * b, fx * (r2 + 2.0 * a * a)
-        row[1, 6], row[1, 7] = fy * (r2 + 2.0 * b * b), fy * 2.0 * a * b
-        k = 9
+        row[:] = 0.0
+        own = row[:, 9:18] if right else row[:, :9]
+        own[0, 0], own[0, 2] = (u - c[2]) / fx, 1.0
+        own[1, 1], own[1, 3] = (v_px - c[3]) / fy, 1.0
+        own[0, 4], own[0, 5], own[0, 8] = fx * a * r2, fx * a * r2 * r2, fx * a * r2 * r2 * r2
+        own[1, 4], own[1, 5], own[1, 8] = fy * b * r2, fy * b * r2 * r2, fy * b * r2 * r2 * r2
+        own[0, 6], own[0, 7] = fx * 2.0 * a * b, fx * (r2 + 2.0 * a * a)
+        own[1, 6], own[1, 7] = fy * (r2 + 2.0 * b * b), fy * 2.0 * a * b
         for axis in range(2):
             x, y, z = d[axis, 0], d[axis, 1], d[axis, 2]
             d_left[axis, 0], d_left[axis, 1], d_left[axis, 2] = x, y, z
             if right:
-                k = 15
-                row[axis, 9] = turned[1] * z - turned[2] * y
-                row[axis, 10] = turned[2] * x - turned[0] * z
-                row[axis, 11] = turned[0] * y - turned[1] * x
-                row[axis, 12], row[axis, 13], row[axis, 14] = x, y, z
+                row[axis, 18] = turned[1] * z - turned[2] * y
+                row[axis, 19] = turned[2] * x - turned[0] * z
+                row[axis, 20] = turned[0] * y - turned[1] * x
+                row[axis, 21], row[axis, 22], row[axis, 23] = x, y, z
                 for j in range(3):
                     d_left[axis, j] = x * R_right_left[0, j] + y * R_right_left[1, j] + z * R_right_left[2, j]
             x, y, z = d_left[axis, 0], d_left[axis, 1], d_left[axis, 2]
-            row[axis, k] = arm[1] * z - arm[2] * y
-            row[axis, k + 1] = arm[2] * x - arm[0] * z
-            row[axis, k + 2] = arm[0] * y - arm[1] * x
-            row[axis, k + 3], row[axis, k + 4], row[axis, k + 5] = x, y, z
-        row[0, k + 6], row[1, k + 6] = pixels[i, 0] - u, pixels[i, 1] - v_px
-        k += 7
-        x, y = row[0, k - 1], row[1, k - 1]
+            row[axis, 24] = arm[1] * z - arm[2] * y
+            row[axis, 25] = arm[2] * x - arm[0] * z
+            row[axis, 26] = arm[0] * y - arm[1] * x
+            row[axis, 27], row[axis, 28], row[axis, 29] = x, y, z
+        x, y = pixels[i, 0] - u, pixels[i, 1] - v_px
+        row[0, 30], row[1, 30] = x, y
         sigmas = math.sqrt(weights[i, 0, 0] * x * x + 2.0 * weights[i, 0, 1] * x * y + weights[i, 1, 1] * y * y)
         if not math.isfinite(sigmas):
             return False
@@ -84,27 +84,22 @@ def accumulate(view, camera, point, limit, pixels, weights, cameras, R_right_lef
         w1 = weights[i, 0, 1] / w0 if w0 > 0.0 else 0.0
         w2 = factor * math.sqrt(max(weights[i, 1, 1] - w1 * w1, 0.0))
         w0, w1 = factor * w0, factor * w1
-        for j in range(k):
+        for j in range(N_COLUMNS):
             row[0, j], row[1, j] = w0 * row[0, j] + w1 * row[1, j], w2 * row[1, j]
-        skip, rest = (9, 9) if right else (0, 15)  # of the columns, before the ninth of the row and from it on
-        for j in range(k):
-            into = j + (skip if j < 9 else rest)
+        for j in range(N_COLUMNS):
             x, y = row[0, j], row[1, j]
-            for q in range(9):
-                squares[v, into, q + skip] += x * row[0, q] + y * row[1, q]
-            for q in range(9, k):
-                squares[v, into, q + rest] += x * row[0, q] + y * row[1, q]
+            if x != 0.0 or y != 0.0:
+                for q in range(N_COLUMNS):
+                    squares[v, j, q] += x * row[0, q] + y * row[1, q]
         if of_point.shape[1]:
             for axis in range(2):
-                x, y, z = row[axis, k - 4], row[axis, k - 3], row[axis, k - 2]
+                x, y, z = row[axis, 27], row[axis, 28], row[axis, 29]
                 for j in range(3):
                     by_point[axis, j] = x * R_board[v, 0, j] + y * R_board[v, 1, j] + z * R_board[v, 2, j]
             for j in range(3):
                 x, y = by_point[0, j], by_point[1, j]
-                for q in range(9):
-                    of_point[v, p, j, q + skip] += x * row[0, q] + y * row[1, q]
-                for q in range(9, k):
-                    of_point[v, p, j, q + rest] += x * row[0, q] + y * row[1, q]
+                for q in range(N_COLUMNS):
+                    of_point[v, p, j, q] += x * row[0, q] + y * row[1, q]
                 for q in range(3):
                     by_itself[v, p, j, q] += x * by_point[0, q] + y * by_point[1, q]
     return True
