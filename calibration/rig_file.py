@@ -51,7 +51,7 @@ _OF_CAMERA = {
     "intrinsics": Dataset((N_INTRINSIC,), "px (first four), 1", ", ".join(INTRINSIC_PARAMETERS)),
     "image_size": Dataset((2,), "px", "width, height", "iu"),
 }
-_OF_RIG = {
+_BESIDE_CAMERAS = {
     "R_right_left": Dataset((3, 3), "1", "rotation from left to right camera axes"),
     "t_right_left": Dataset((3,), "m", "origin of the left camera in right camera axes"),
     "R_left_world": Dataset((3, 3), "1", "rotation from world to left camera axes"),
@@ -61,26 +61,6 @@ _OF_RIG = {
         "products of the units of the parameters (px, 1, rad, m)",
         "of the parameters named in `parameters`; rotation vectors multiply from the left; common to all frames",
     ),
-}
-_OF_OBSERVATIONS = {
-    "view": Dataset(("seen",), "1", "index of the place", "iu"),
-    "camera": Dataset(("seen",), "1", "0 left, 1 right", "iu"),
-    "point": Dataset(("seen",), "1", "board point", "iu"),
-    "pixels": Dataset(("seen", 2), "px", "located corner"),
-    "pixels_covariance": Dataset(("seen", 2, 2), "px^2", "of the located corner, from the image's own noise"),
-}
-_OF_RECORD = {
-    "board_points": Dataset(("points", 3), "m", "target points in board axes as refined"),
-    "board_thickness": Dataset((), "m", "from the table to the printed face"),
-    "unexplained_sigma": Dataset((), "px", "per axis, added to each corner's own noise"),
-    "R_left_board": Dataset(
-        ("places", 3, 3), "1", "rotation from board to left camera axes, per place: views, then right images apart"
-    ),
-    "t_left_board": Dataset(("places", 3), "m", "corner 0 in left camera axes, per place"),
-    "kept": Dataset(("seen",), "1", "1 where the corner was used", "u"),
-    "residuals": Dataset(("seen", 2), "px", "located minus predicted corner"),
-}
-_BEYOND_MODEL = {
     "allowances": Dataset(
         ("causes", N_RIG),
         "px, 1, rad, m",
@@ -93,6 +73,24 @@ _BEYOND_MODEL = {
     ),
     "lens_field_spacing": Dataset((), "px", "of the splines' grid"),
 }
+_SELDOM = ("allowances", "lens_field", "lens_field_spacing")  # of these, what not every rig has
+_OF_RECORD = {
+    "board_points": Dataset(("points", 3), "m", "target points in board axes as refined"),
+    "board_thickness": Dataset((), "m", "from the table to the printed face"),
+    "unexplained_sigma": Dataset((), "px", "per axis, added to each corner's own noise"),
+    "R_left_board": Dataset(
+        ("places", 3, 3), "1", "rotation from board to left camera axes, per place: views, then right images apart"
+    ),
+    "t_left_board": Dataset(("places", 3), "m", "corner 0 in left camera axes, per place"),
+    "kept": Dataset(("seen",), "1", "1 where the corner was used", "u"),
+    "residuals": Dataset(("seen", 2), "px", "located minus predicted corner"),
+    "view": Dataset(("seen",), "1", "index of the place", "iu"),
+    "camera": Dataset(("seen",), "1", "0 left, 1 right", "iu"),
+    "point": Dataset(("seen",), "1", "board point", "iu"),
+    "pixels": Dataset(("seen", 2), "px", "located corner"),
+    "pixels_covariance": Dataset(("seen", 2, 2), "px^2", "of the located corner, from the image's own noise"),
+}
+_OBSERVED = ("view", "camera", "point", "pixels", "pixels_covariance")  # fields of Observations, in order
 _TOLD = ("settings", "figures", "versions", "doubts", "warnings", "rejected_views", "rejected_corners")
 _LONG = {  # parts of a record in JSON that are datasets, as an attribute has 64 kB at most
     "rejected_corners": "JSON list of view, camera, corner, reason",
@@ -258,7 +256,7 @@ def beside_cameras(rig: StereoRig) -> dict[str, tuple[Any, Dataset, dict[str, st
 
     `read_beside_cameras` reads it from any group.
     """
-    values: dict[str, Any] = {name: getattr(rig, name) for name in _OF_RIG}
+    values: dict[str, Any] = {name: getattr(rig, name) for name in _BESIDE_CAMERAS if name not in _SELDOM}
     marks = {"covariance": {"parameters": ", ".join(RIG_PARAMETERS)}}
     if rig.allowances:
         values["allowances"] = np.stack([a.shift for a in rig.allowances])
@@ -266,7 +264,7 @@ def beside_cameras(rig: StereoRig) -> dict[str, tuple[Any, Dataset, dict[str, st
         marks["allowances"] = {"causes": json.dumps(causes), "assumed": json.dumps(assumed)}
     if rig.lens_field is not None:
         values |= {"lens_field": rig.lens_field.coefficients, "lens_field_spacing": rig.lens_field.spacing}
-    return {name: (value, (_OF_RIG | _BEYOND_MODEL)[name], marks.get(name, {})) for name, value in values.items()}
+    return {name: (value, _BESIDE_CAMERAS[name], marks.get(name, {})) for name, value in values.items()}
 
 
 def write_attributes(group: h5py.Group, document: Mapping[str, Any]) -> None:
@@ -298,10 +296,8 @@ def _write_record(group: h5py.Group, record: CalibrationRecord) -> None:
             group[name].attrs["description"] = _LONG[name]
         else:
             group.attrs[name] = json.dumps(part)
-    o = record.observations
-    seen = (o.view, o.camera, o.point, o.pixels, o.covariance)
-    values = {name: getattr(record, name) for name in _OF_RECORD} | dict(zip(_OF_OBSERVATIONS, seen, strict=True))
-    for name, row in (_OF_RECORD | _OF_OBSERVATIONS).items():
+    values = vars(record) | vars(record.observations) | {"pixels_covariance": record.observations.covariance}
+    for name, row in _OF_RECORD.items():
         put_array(group, name, values[name], row)
 
 
@@ -393,7 +389,8 @@ def read_beside_cameras(group: h5py.Group, of_cameras: Iterable[Sequence[NDArray
         if not (0 < width < 10**6 and 0 < height < 10**6 and parameters[0] > 0 and parameters[1] > 0):
             raise RigFileError(f"{group.name}: {name} camera of {width} x {height} px, focal lengths {parameters[:2]}")
         cameras.append(Camera.from_parameters(parameters, (int(width), int(height))))
-    values: dict[str, Any] = {name: _get(group, name, row) for name, row in _OF_RIG.items()}
+    there = {name: row for name, row in _BESIDE_CAMERAS.items() if name in group or name not in _SELDOM}
+    values: dict[str, Any] = {name: _get(group, name, row) for name, row in there.items()}
     for name in ("R_right_left", "R_left_world"):
         if not (np.abs(values[name] @ values[name].T - np.eye(3)).max() < 1e-6 and np.linalg.det(values[name]) > 0):
             raise RigFileError(f"{group.name}/{name} is not a rotation")
@@ -402,25 +399,18 @@ def read_beside_cameras(group: h5py.Group, of_cameras: Iterable[Sequence[NDArray
     correlation = values["covariance"] / scale / scale[:, None]
     if variance.min() < 0 or np.abs(correlation).max() > 1 + 1e-6 or not np.allclose(correlation, correlation.T):
         raise RigFileError(f"{group.name}/covariance is not a covariance")
-    is_table = bool(group.attrs.get("world_is_table", 0))
-    return StereoRig(cameras[0], cameras[1], world_is_table=is_table, **values, **_beyond_model(group))
-
-
-def _beyond_model(group: h5py.Group) -> dict[str, Any]:
-    """`lens_field` and `allowances` of a rig. Raises RigFileError."""
-    values = {name: _get(group, name, row) for name, row in _BEYOND_MODEL.items() if name in group}
-    field: LensField | None = None
-    allowances: tuple[Allowance, ...] = ()
     if "lens_field" in values:
-        field = LensField(values["lens_field"], float(values["lens_field_spacing"]))
-        if min(field.coefficients.shape[2:]) < 4 or not field.spacing > 0:
+        values["lens_field"] = LensField(values["lens_field"], float(values.pop("lens_field_spacing")))
+        if min(values["lens_field"].coefficients.shape[2:]) < 4 or not values["lens_field"].spacing > 0:
             raise RigFileError(f"{group.name}/lens_field is not a field of splines")
     if "allowances" in values:
-        causes, assumed = (json.loads(group["allowances"].attrs[name]) for name in ("causes", "assumed"))
-        allowances = tuple(map(Allowance, causes, values["allowances"], assumed))
-        if not len(allowances) == len(values["allowances"]) == len(causes):
+        shifts, marks = values["allowances"], group["allowances"].attrs
+        causes, assumed = json.loads(marks["causes"]), json.loads(marks["assumed"])
+        if not len(causes) == len(assumed) == len(shifts):
             raise RigFileError(f"{group.name}/allowances: rows and causes do not match")
-    return {"lens_field": field, "allowances": allowances}
+        values["allowances"] = tuple(map(Allowance, causes, shifts, assumed))
+    is_table = bool(group.attrs.get("world_is_table", 0))
+    return StereoRig(cameras[0], cameras[1], world_is_table=is_table, **values)
 
 
 def _read_record(group: h5py.Group) -> CalibrationRecord:
@@ -432,9 +422,8 @@ def _read_record(group: h5py.Group) -> CalibrationRecord:
     board, names, apart = target_of(text("board")), text("view_names"), tuple(text("apart"))
     sizes = {"points": len(board.points), "places": len(names) + len(apart), "seen": len(group["pixels"])}
     known: dict[str, Any] = {name: _get(group, name, row, sizes) for name, row in _OF_RECORD.items()}
-    seen = {name: _get(group, name, row, sizes) for name, row in _OF_OBSERVATIONS.items()}
     for name, limit in (("view", sizes["places"]), ("camera", 2), ("point", sizes["points"])):
-        index = seen[name] = seen[name].astype(np.intp)
+        index = known[name] = known[name].astype(np.intp)
         if len(index) and not (index.min() >= 0 and index.max() < limit):
             raise RigFileError(f"{group.name}/{name} points beyond the {limit} there are")
     table_view = int(group.attrs["table_view"])
@@ -445,7 +434,7 @@ def _read_record(group: h5py.Group) -> CalibrationRecord:
         "apart": apart,
         "told": {name: text(name) for name in _TOLD},
         "table_view": None if table_view < 0 else table_view,
-        "observations": Observations(*seen.values()),
+        "observations": Observations(*(known.pop(name) for name in _OBSERVED)),
         "kept": known["kept"].astype(bool),
     }
     return CalibrationRecord(**known)

@@ -52,14 +52,14 @@ def fit_lens_field(refinement: Refinement, nominal: Array) -> FieldFit | None:
     if len(views) < GOOD_VIEWS:
         return None
     coarse, finer = _grid(refinement, CELLS), _grid(refinement, 2 * CELLS)
-    priors = [_precision(coarse, sigma) for sigma in PRIORS_PX]
     left = refinement.unexplained_sigma**2
     for _ in range(2):  # once more with the noise that the field leaves
-        gain, error, left = _tried(refinement, used, coarse, priors, left)
+        gain, error, left = _worth(refinement, used, coarse, left)
     if gain < BETTER * error or gain < LEAST_GAIN:
         return None
     both = [_precision(finer, small, coarse, large) for large in PRIORS_PX for small in FINER_PX]
-    field = _likeliest(refinement, used, finer, both, left)
+    solution, _ = _likeliest(reduce(np.add, _squares(refinement, used, finer, left)), finer, both)
+    field = replace(finer, coefficients=solution[-finer.coefficients.size :].reshape(finer.coefficients.shape))
     o = refinement.observations
     moved = np.stack([field.displacement(o.pixels, camera) for camera in (0, 1)])[o.camera, np.arange(len(o))]
     corrected = replace(o, pixels=o.pixels - moved)
@@ -101,47 +101,35 @@ def _two_scales(few: int, many: int) -> Array:
     return onto
 
 
-def _tried(
-    refinement: Refinement, used: Observations, grid: LensField, priors: list[Array], extra: float
-) -> tuple[float, float, float]:
-    """A field on a grid, under that of the priors (precisions) with which views left out are met best.
+def _worth(refinement: Refinement, used: Observations, grid: LensField, extra: float) -> tuple[float, float, float]:
+    """Part of the chi-square of views left out that a field on a grid takes away, and its error.
 
-    extra : [px^2] by which corners scatter beside their noise
-    returns : part of the chi-square of views left out that the field takes away, its error, and `extra` as it leaves it
+    extra : [px^2] by which corners scatter beside their noise; the third item is what the field leaves of it
     """
     squares = np.stack(list(_squares(refinement, used, grid, extra)))
-    n_field, views = grid.coefficients.size, np.arange(len(squares))
-    chi_square = np.zeros((1 + len(priors), len(views)))  # of each view, left out; without a field first
+    total, views = squares.sum(0), np.arange(len(squares))
+    solution, prior = _likeliest(total, grid, [_precision(grid, sigma) for sigma in PRIORS_PX])
+    chi_square = np.zeros((2, len(views)))  # of each view, left out: without a field, and with one
     for fold in range(FOLDS):
         test = views[fold::FOLDS]
-        train = np.delete(squares, test, axis=0).sum(0)
-        for k, prior in enumerate((None, *priors)):
-            step = np.append(-_solved(train, n_field, prior)[0], 1.0)
+        train = total - squares[test].sum(0)
+        for k, precision in enumerate((1e12 * prior, prior)):  # held at zero, and free
+            step = np.append(-_solved(train, precision)[0], 1.0)
             chi_square[k, test] = squares[test] @ step @ step
-    mean, gained = chi_square[0].mean(), chi_square[0] - chi_square[1:]
-    best = int(np.argmax(gained.mean(axis=1)))
-    error = gained[best].std() / np.sqrt(len(views) - 1)
-    total = squares.sum(0)
-    solution = _solved(total, n_field, priors[best])[0]
+    mean, gained = chi_square[0].mean(), chi_square[0] - chi_square[1]
     step = np.append(-solution, 1.0)
     square, freedom = float(step @ total @ step), max(2 * len(used) - len(solution) - 6 * len(views), 1)
-    left = max(extra * min(square / freedom, 1.0), 1e-8)
-    return float(gained[best].mean() / mean), float(error / mean), left
+    error = gained.std() / np.sqrt(len(views) - 1)
+    return float(gained.mean() / mean), float(error / mean), max(extra * min(square / freedom, 1.0), 1e-8)
 
 
-def _likeliest(
-    refinement: Refinement, used: Observations, grid: LensField, priors: list[Array], extra: float
-) -> LensField:
-    """The field under that of the priors (precisions) under which all corners are likeliest; the others as above."""
-    total: Array = reduce(np.add, _squares(refinement, used, grid, extra))
-    n_field = grid.coefficients.size
-    best, likeliest = np.zeros(n_field), -np.inf
+def _likeliest(total: Array, grid: LensField, priors: list[Array]) -> tuple[Array, Array]:
+    """Parameters (s,) under that of the priors (precisions) under which all corners are likeliest, and that prior."""
+    found = []
     for prior in priors:
-        solution, volume = _solved(total, n_field, prior)
-        likelihood = total[:-1, -1] @ solution + 4 * np.linalg.slogdet(prior)[1] - volume
-        if likelihood > likeliest:
-            best, likeliest = solution[-n_field:], likelihood
-    return LensField(best.reshape(grid.coefficients.shape), grid.spacing)
+        solution, volume = _solved(total, prior)
+        found.append((total[:-1, -1] @ solution + 4 * np.linalg.slogdet(prior)[1] - volume, solution, prior))
+    return max(found, key=lambda one: float(one[0]))[1:]
 
 
 def _squares(refinement: Refinement, used: Observations, grid: LensField, extra: float) -> Iterator[Array]:
@@ -170,16 +158,15 @@ def _squares(refinement: Refinement, used: Observations, grid: LensField, extra:
         yield rest.T @ rest
 
 
-def _solved(square: Array, n_field: int, precision: Array | None) -> tuple[Array, float]:
+def _solved(square: Array, precision: Array) -> tuple[Array, float]:
     """Parameters (s,), the last of them the field with its prior, and the log determinant of their normal matrix.
 
-    precision : the prior's, the same of every camera and axis; None leaves the field out
+    precision : the prior's, the same of every camera and axis
     """
-    n = len(square) - 1 - (n_field if precision is None else 0)
-    matrix = square[:n, :n].copy()
-    if precision is not None:
-        matrix[-n_field:, -n_field:] += np.kron(np.eye(4), precision)
-    size, solution = np.maximum(np.diag(matrix), 1e-300), np.zeros(len(square) - 1)
-    scaled = matrix / np.sqrt(np.outer(size, size)) + 1e-12 * np.eye(n)
-    solution[:n] = np.linalg.solve(scaled, square[:n, -1] / np.sqrt(size)) / np.sqrt(size)
-    return solution, float(np.linalg.slogdet(scaled)[1] + np.log(size).sum())
+    matrix, n_field = square[:-1, :-1].copy(), 4 * len(precision)
+    matrix[-n_field:, -n_field:] += np.kron(np.eye(4), precision)
+    size = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    scaled = matrix / np.outer(size, size) + 1e-12 * np.eye(len(size))
+    return np.linalg.solve(scaled, square[:-1, -1] / size) / size, float(
+        np.linalg.slogdet(scaled)[1] + 2 * np.log(size).sum()
+    )

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibration.cameras.camera import N_INTRINSIC
+from calibration.cameras.camera import N_INTRINSIC, OF_CAMERAS
 from calibration.fit.stereo_model import N_STEREO, StereoModel, board_basis
 from calibration.kit.arrays import Array
 
@@ -47,15 +47,13 @@ class BoardPrior:
 
 @dataclass(frozen=True)
 class Prior:
-    """Deviations `rows @ parameters - at`, in sigmas, of the parameters that a `StereoModel` has before its poses.
+    """Deviations `rows @ parameters - at`, in sigmas, of the intrinsics of each camera of a `StereoModel`.
 
     Focal lengths come beside them, by their logarithms.
     """
 
-    rows: Array  # (k, 24)
-    at: Array  # (k,)
-    sides: tuple[float, float]  # [px] of the two images, the longer ones
-    heavy: tuple[slice, ...]  # rows that share one Cauchy distribution; the others are normal
+    rows: Array  # (2, 8, 9)
+    at: Array  # (2, 8)
     # Beside corners that are weighted by their noise, where views disagree by this much more (4 to 70 times in variance
     # on photographs), a prior counts that many times.
     weight: float = 1.0
@@ -63,20 +61,20 @@ class Prior:
 
     def normal(self, model: StereoModel) -> tuple[Array, Array, float]:
         """Information (24, 24) at the model, gradient (24,) towards the prior, and its part of chi-square."""
-        parameters = np.concatenate([*(camera.parameters for camera in model.cameras), np.zeros(6)])
-        rows, z = np.zeros((2, N_STEREO)), np.zeros(2)
-        for index, (camera, side) in enumerate(zip(model.cameras, self.sides, strict=True)):
-            f = 0.5 * (camera.fx + camera.fy)
-            rows[index, N_INTRINSIC * index : N_INTRINSIC * index + 2] = 0.5 / (f * FOCAL)
-            z[index] = np.log(max(f, 1e-300) / side) / FOCAL
-        rows, z = np.concatenate([self.rows, rows]), np.concatenate([self.rows @ parameters - self.at, z])
-        weight, cost = np.ones(len(z)), float(z @ z)
-        for group in self.heavy:
-            square = float(z[group] @ z[group])
-            weight[group] = 1.0 / (1.0 + square)
-            cost += float(np.log1p(square)) - square
-        weighted = self.weight * weight[:, None] * rows
-        return rows.T @ weighted, -weighted.T @ z, self.weight * cost
+        information, gradient, cost = np.zeros((N_STEREO, N_STEREO)), np.zeros(N_STEREO), 0.0
+        for camera, own, rows, at in zip(model.cameras, OF_CAMERAS, self.rows, self.at, strict=True):
+            f, focal = 0.5 * (camera.fx + camera.fy), np.zeros(N_INTRINSIC)
+            focal[:2] = 0.5 / (f * FOCAL)
+            J = np.vstack([rows, focal])
+            z = np.append(rows @ camera.parameters - at, np.log(max(f, 1e-300) / max(camera.image_size)) / FOCAL)
+            weight, cost = np.ones(len(z)), cost + float(z @ z)
+            for group in (slice(0, 1), slice(1, 3), slice(3, 6)):  # each of one Cauchy distribution, the others normal
+                square = float(z[group] @ z[group])
+                weight[group] = 1.0 / (1.0 + square)
+                cost += float(np.log1p(square)) - square
+            weighted = self.weight * weight[:, None] * J
+            information[own, own], gradient[own] = J.T @ weighted, -weighted.T @ z
+        return information, gradient, self.weight * cost
 
 
 def priors_of(model: StereoModel, nominal: Array, shape_basis: Array) -> Prior:
@@ -84,23 +82,17 @@ def priors_of(model: StereoModel, nominal: Array, shape_basis: Array) -> Prior:
 
     nominal : (n, 3) [m] the target's points as declared; shape_basis : (n, 3, s2) directions in which they may move
     """
-    rows, at, heavy = np.zeros((16, N_STEREO)), np.zeros(16), []
-    for index, camera in enumerate(model.cameras):
-        first, column = 8 * index, N_INTRINSIC * index
-        f = 0.5 * (camera.fx + camera.fy)
-        size = np.array(camera.image_size, float)
+    rows, at = np.zeros((2, 8, N_INTRINSIC)), np.zeros((2, 8))
+    for camera, own, middle in zip(model.cameras, rows, at, strict=True):
+        f, size = 0.5 * (camera.fx + camera.fy), np.array(camera.image_size, float)
         diagonal = float(np.hypot(*size))
         corner = 0.5 * diagonal / f
-        rows[first, column : column + 2] = np.array([1.0, -1.0]) / (f * ASPECT)
-        rows[first + 1 : first + 3, column + 2 : column + 4] = np.eye(2) / (CENTRE * diagonal)
-        at[first + 1 : first + 3] = 0.5 * (size - 1) / (CENTRE * diagonal)
-        radial, tangential = np.array([corner**2, corner**4, corner**6]) / RADIAL, 3 * corner / TANGENTIAL
-        for place, term in enumerate((4, 5, 8)):  # k1, k2, k3
-            rows[first + 3 + place, column + term] = radial[place]
-        rows[first + 6 : first + 8, column + 6 : column + 8] = tangential * np.eye(2)
-        heavy += [slice(first, first + 1), slice(first + 1, first + 3), slice(first + 3, first + 6)]
-    left, right = (float(max(camera.image_size)) for camera in model.cameras)
-    return Prior(rows, at, (left, right), tuple(heavy), board=board_prior(nominal, shape_basis))
+        own[0, :2] = np.array([1.0, -1.0]) / (f * ASPECT)
+        own[[1, 2], [2, 3]] = 1.0 / (CENTRE * diagonal)
+        middle[1:3] = 0.5 * (size - 1) / (CENTRE * diagonal)
+        own[[3, 4, 5], [4, 5, 8]] = np.array([corner**2, corner**4, corner**6]) / RADIAL  # k1, k2, k3
+        own[[6, 7], [6, 7]] = 3 * corner / TANGENTIAL
+    return Prior(rows, at, board=board_prior(nominal, shape_basis))
 
 
 def board_prior(nominal: Array, shape_basis: Array) -> BoardPrior | None:

@@ -170,25 +170,19 @@ def _object(value: Any, kind: type) -> Any:
     return held
 
 
-def _number(value: Any) -> float:
-    if not isinstance(value, Real) or isinstance(value, bool | np.bool_) or not math.isfinite(value):
-        raise TypeError
+def _finite(value: Any) -> float:
+    if not math.isfinite(value):
+        raise ValueError
     return float(value)
 
 
-def _whole(value: Any) -> int:
-    if not isinstance(value, Integral) or isinstance(value, bool | np.bool_):
-        raise TypeError
-    return int(value)
-
-
-def _of(*kinds: type) -> Callable[[Any], Any]:
-    """A value of one of these types, as it is."""
+def _of(*kinds: type, into: Callable[[Any], Any] = lambda value: value) -> Callable[[Any], Any]:
+    """A value of one of these types; True is no number."""
 
     def taken(value: Any) -> Any:
-        if not isinstance(value, kinds):
+        if not isinstance(value, kinds) or (isinstance(value, bool | np.bool_) and bool not in kinds):
             raise TypeError
-        return value
+        return into(value)
 
     return taken
 
@@ -203,8 +197,8 @@ def _array(value: Any) -> NDArray[Any]:
 _PLAIN: dict[Any, Rule] = {
     NoneType: (_of(NoneType), "None"),
     bool: (_of(bool, np.bool_), "True or False"),
-    int: (_whole, "a whole number"),
-    float: (_number, "a finite number"),
+    int: (_of(Integral, into=int), "a whole number"),
+    float: (_of(Real, into=_finite), "a finite number"),
     str: (_of(str), "text"),
     Path: (_of(str, os.PathLike), "a path"),
     os.PathLike[str]: (_of(os.PathLike), "a path"),
