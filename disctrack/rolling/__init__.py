@@ -9,7 +9,8 @@ from disctrack.disc import nutation_frequency, precession_rate
 from disctrack.rolling import effects
 from disctrack.rolling.effects import CATALOGUE, Effect, EffectParameter, ModelError
 from disctrack.rolling.model import Model, effects_from_tables
-from disctrack.rolling.motion import EndReason, Motion, Regime
+from disctrack.rolling.motion import EndReason, Motion
+from disctrack.rolling.records import Regime
 from disctrack.rolling.sensitivities import prepare, sensitivities
 from disctrack.rolling.simulate import simulate
 from disctrack.rolling.state import State, steady_precession, struck_disc

@@ -47,7 +47,7 @@ import numpy as np
 from calibration.kit.arrays import Numbers
 from calibration.kit.compiled import exact_part
 from disctrack.rolling._compiled import Addresses, call
-from disctrack.rolling.records import Record
+from disctrack.rolling.records import Record, Regime
 
 Vector: TypeAlias = tuple[complex, complex, complex]  # all numbers may be real
 State: TypeAlias = Sequence[complex]
@@ -56,7 +56,7 @@ State: TypeAlias = Sequence[complex]
 Contact: TypeAlias = tuple[Vector, Vector, complex, tuple[Vector, Vector, complex, Vector]]
 Forced: TypeAlias = tuple[complex, complex, complex, complex, complex, complex, complex]
 
-ROLLING, SLIPPING, FLYING = 0, 1, 2
+ROLLING, SLIPPING, FLYING = map(int, Regime)
 EVENTS = ("theta_end", "load", "grip", "upright")
 STICK_SPEED = 1e-7  # [m/s]; 1e-4 of what the tracking can see, and 1e-8 of the disc's speeds
 LOAD_STEP = 1e-4  # [s]; (200 rad/s times it)^2 / 12 = 3e-5 of F_z'', and rounding 1e-8 N/s^2
@@ -67,7 +67,6 @@ LIFT_OFF_GAP = 1e-12  # [m]; a landing is a fall below this, so that the start o
 
 # table: integers shared by all functions: regime, number of laws, address of the record `now` of all that is known of
 # the instant, then the address of each law and of its parameters.
-HEADER = 3
 
 
 @exact_part
@@ -106,21 +105,6 @@ def _solve(rows: tuple[Vector, Vector, Vector], b: Vector) -> Vector:
 
 
 @exact_part
-def _is_plain(body: Record) -> bool:
-    """A round rim on a level, flat table."""
-    return bool(
-        body.curvature == 0.0
-        and body.slope_x == 0.0
-        and body.slope_y == 0.0
-        and body.oval_c == 0.0
-        and body.oval_s == 0.0
-        and body.lobes_c == 0.0
-        and body.lobes_s == 0.0
-        and body.flat_depth == 0.0
-    )
-
-
-@exact_part
 def _support(body: Record, cb: complex, sb: complex) -> Vector:
     """Support function of the rim, less its edge's radius, and two derivatives; by cosine and sine of the angle."""
     c2, s2 = cb * cb - sb * sb, 2.0 * sb * cb
@@ -141,7 +125,7 @@ def _contact(body: Record, now: Record) -> Contact:
     """From place and angles in the record."""
     s, c = now.sin_theta, now.cos_theta
     zero, kappa, rho = 0.0 * s, body.curvature, body.edge_radius
-    if _is_plain(body):
+    if body.uneven == 0.0:
         arm, normal = (zero, rho - body.radius - rho * s, rho - body.half_thickness - rho * c), (zero, s, c)
         return arm, normal, -(s * arm[1] + c * arm[2]), (normal, normal, zero, normal)
     cf, sf, sp, cp = now.cos_phi, now.sin_phi, now.sin_psi, now.cos_psi
@@ -176,7 +160,7 @@ def _contact_rates(body: Record, now: Record, y: State, at: Contact) -> tuple[Ve
     """Rates of r_OA and of the normal, as vectors; nodal components."""
     s, c, rho, kappa = now.sin_theta, now.cos_theta, body.edge_radius, body.curvature
     arm, normal, _, (W, across, w, p) = at
-    if _is_plain(body):
+    if body.uneven == 0.0:
         a = _add(arm, _scale(rho, normal))
         return _cross((y[5], y[6], y[6] * c / s), a), (0.0 * s, 0.0 * s, 0.0 * s)
     arm3, omega, v = rho - body.half_thickness, (y[5], y[6], y[7]), _nodal(now.v_n, now.v_m, now.v_z, s, c)
@@ -237,8 +221,8 @@ def _apply_laws(table: Addresses, now: Record) -> None:
     now.table_vx = now.table_vy = now.table_vz = 0.0
     now.table_ax = now.table_ay = now.table_az = 0.0
     now.field_x = now.field_y = now.field_z = 0.0
-    for i in range(table[1]):
-        call(table[HEADER + 2 * i], (table[HEADER + 1 + 2 * i], table[2], table[2]))
+    for i in range(3, 3 + 2 * table[1], 2):
+        call(table[i], (table[i + 1], table[2], table[2]))
 
 
 @exact_part

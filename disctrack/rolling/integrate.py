@@ -18,10 +18,7 @@ from calibration.kit.compiled import exact_part, njit
 from disctrack.rolling._compiled import call
 from disctrack.rolling.records import Records
 
-REACHED_END, EVENT, TOO_MANY_STEPS, NOT_FINITE = range(4)
 RTOL_IMAGINARY = 1e-7  # error of fifth order per step; the derivatives then hold to about 1e-9 of their size
-MAX_STEPS = 200_000
-INSTANT = 1e-16  # [s] between which events are not told apart
 
 
 class CompiledSystem(NamedTuple):
@@ -35,9 +32,11 @@ class CompiledSystem(NamedTuple):
 
 
 class Solved(NamedTuple):
-    """Solution up to the end of the grid or to the first event; real or complex like its start."""
+    """Solution up to the end of the grid or to the first event; real or complex like its start.
 
-    status: int
+    Where neither is reached, the step became too small, a number not finite, or the steps were too many.
+    """
+
     y: Numbers  # (n_filled, n) at the grid points that were reached
     t_last: complex  # instant of the event, or the last grid point
     y_last: Numbers  # (n,)
@@ -46,7 +45,7 @@ class Solved(NamedTuple):
 
 
 def integrate(
-    system: CompiledSystem, t0: complex, y0: Numbers, grid: Array, rtol: float, atol: Array, max_steps: int = MAX_STEPS
+    system: CompiledSystem, t0: complex, y0: Numbers, grid: Array, rtol: float, atol: Array, max_steps: int
 ) -> Solved:
     """Solve dy/dt = f(t, y) from (t0, y0) to the grid's points, until a margin that was positive runs out.
 
@@ -54,8 +53,8 @@ def integrate(
     """
     solution = np.full((len(grid), len(y0)), np.nan, y0.dtype)
     t, y = np.array([t0], y0.dtype), y0.copy()
-    status, n_filled, event, n_steps = _dop853(system, t, y, grid, rtol, atol, max_steps, solution)
-    return Solved(status, solution[:n_filled], t[0], y, event, n_steps)
+    n_filled, event, n_steps = _dop853(system, t, y, grid, rtol, atol, max_steps, solution)
+    return Solved(solution[:n_filled], t[0], y, event, n_steps)
 
 
 def evaluate(system: CompiledSystem, t: Numbers, Y: Numbers, instant: Records) -> tuple[Numbers, Numbers, Records]:
@@ -151,33 +150,23 @@ def _ran_out(K: Numbers, n: int) -> int:
 
 @exact_part
 def _locate(
-    system: CompiledSystem, t_box: Numbers, t: complex, y: Numbers, h: float, event: int, made: dop853.Step
+    system: CompiledSystem, t_box: Numbers, t: complex, y: Numbers, h: complex, event: int, made: dop853.Step
 ) -> tuple[int, float]:
-    """Shorten the step to where the first margin has just run out, by the Illinois method; the end and K hold there.
+    """Which margin runs out first within a step, and at which part of it, by bisection along the step's polynomial.
 
-    event : number of the first margin that has run out after h.   Returns that at the end, and the length of the step.
+    event : number of the first margin that has run out at the step's end
     """
-    unit, n, side = 0.0 * y[0] + 1.0, y.size, 0
-    low, high, at_low, at_high = 0.0, h, made.K[0, n + event].real, made.K[dop853.N, n + event].real
-    while True:
-        trial = high
-        if high - low > 2.0 * INSTANT:
-            trial -= (high - low) * at_high / (at_high - at_low)  # where the chord is zero
-            trial = min(max(trial, low + INSTANT), high - INSTANT)
-        _step(system, t_box, t, y, trial * unit, made)
-        _rates(t + trial * unit, made.end, made.K[dop853.N], system, t_box)
-        if trial == high:
-            return event, high
-        found, before = _ran_out(made.K, n), side
-        side = 1 if found >= 0 else -1
-        kept = 0.5 if side == before else 1.0  # the side that is kept twice gives way
+    low, high = 0.0, 1.0
+    for _ in range(50):  # to rounding
+        trial = 0.5 * (low + high)
+        dop853.along(made.F, y, trial, made.stage)
+        _rates(t + trial * h, made.stage, made.K[dop853.N], system, t_box)
+        found = _ran_out(made.K, y.size)
         if found < 0:
-            low, at_high, margin = trial, kept * at_high, made.K[dop853.N, n + event].real
-            at_low = margin if margin > 0.0 else at_low  # not where it is no number
+            low = trial
         else:
-            high, at_high = trial, made.K[dop853.N, n + found].real
-            at_low = kept * at_low if found == event else made.K[0, n + found].real
-            event = found
+            high, event = trial, found
+    return event, high
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -190,8 +179,8 @@ def _dop853(
     atol: Array,
     max_steps: int,
     solution: Numbers,
-) -> tuple[int, np.signedinteger, int, int]:
-    """Fills the solution, moves t_last (1,) and y (n,); status, grid points reached, event, steps."""
+) -> tuple[np.signedinteger, int, int]:
+    """Fills the solution, moves t_last (1,) and y (n,); grid points reached, event or -1, steps."""
     n, unit = y.size, 0.0 * y[0] + 1.0  # one, in the kind of number of the state
     t_box, made = t_last.copy(), dop853.room(y, n + system.n_margins)
     K = made.K
@@ -200,7 +189,7 @@ def _dop853(
     h_next = _first_step(y, K[0], atol)
     for steps in range(max_steps):
         if i_grid == grid.size:
-            return REACHED_END, i_grid, -1, steps
+            return i_grid, -1, steps
         room = grid[-1] - t
         h = room if room.real <= h_next else h_next * unit
         if room.real < 1e-15:  # the last points coincide with t up to rounding
@@ -213,14 +202,17 @@ def _dop853(
         if not error <= 1.0:  # also when not a number
             h_next = h.real * (max(0.2, 0.9 * error**-0.125) if np.isfinite(error) else 0.1)
             if h_next < 1e-15:
-                return NOT_FINITE, i_grid, -1, steps
+                return i_grid, -1, steps
             continue
         h_next = h.real * (5.0 if error == 0.0 else min(5.0, 0.9 * error**-0.125))
         _rates(t + h, made.end, K[dop853.N], system, t_box)
         event = _ran_out(K, n)
         if event >= 0:
-            event, h_event = _locate(system, t_box, t, y, h.real, event, made)
-            h = h_event * unit
+            _polynomial(system, t_box, t, y, h, made)
+            event, part = _locate(system, t_box, t, y, h, event, made)
+            h = part * h
+            _step(system, t_box, t, y, h, made)
+            _rates(t + h, made.end, K[dop853.N], system, t_box)
         if grid[i_grid] <= (t + h).real:
             _polynomial(system, t_box, t, y, h, made)
             i_grid = _fill(made.F, t, y, h, grid, i_grid, solution)
@@ -228,6 +220,6 @@ def _dop853(
         t_last[0] = t
         _assign(y, made.end)
         if event >= 0:
-            return EVENT, i_grid, event, steps
+            return i_grid, event, steps
         _assign(K[0], K[dop853.N])
-    return TOO_MANY_STEPS, i_grid, -1, max_steps
+    return i_grid, -1, max_steps

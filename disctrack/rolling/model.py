@@ -12,7 +12,7 @@ import numpy as np
 from calibration.kit.arguments import Density, Gravity, checked
 from disctrack.disc import AIR_DENSITY, Disc
 from disctrack.rolling.effects import Effect, EffectParameter, ModelError, effect_class, effect_from_formulas
-from disctrack.rolling.records import BODY
+from disctrack.rolling.records import BODY, UNEVEN
 
 DEFAULT_THETA_END = np.radians(0.5)  # where the disc of Ma et al. (2014) comes to lie on its paper
 
@@ -108,6 +108,7 @@ def body_constants(model: Model, theta_end: float, values: Mapping[str, Any] | N
     for effect in model.effects:
         if effect.adjust is not None:
             effect.adjust(body, SimpleNamespace(**effect_values(effect, values)))
+    body.uneven = float(any(getattr(body, name) != 0.0 for name in UNEVEN))
     return vars(body)
 
 

@@ -1,7 +1,7 @@
 """A simulated motion: what the model predicts at the given times, and why it ended."""
 
 from dataclasses import dataclass
-from enum import Enum, IntEnum
+from enum import Enum
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -10,19 +10,10 @@ from numpy.typing import NDArray
 from calibration.kit.arrays import Array
 from calibration.kit.brief import Outline
 from disctrack.frames import COORDINATES, nodal_axes_world, rotation_from_euler
-from disctrack.rolling import equations
 from disctrack.rolling.model import Model
-from disctrack.rolling.records import ROLLING_COMPONENTS, Records
+from disctrack.rolling.records import ROLLING_COMPONENTS, Records, Regime
 
 Parts: TypeAlias = Any  # numbers of records: real in a motion, complex where derivatives are carried
-
-
-class Regime(IntEnum):
-    """State of the contact."""
-
-    ROLLING = equations.ROLLING
-    SLIPPING = equations.SLIPPING
-    FLYING = equations.FLYING
 
 
 class EndReason(Enum):

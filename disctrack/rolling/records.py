@@ -12,6 +12,7 @@ State vector y (SI, radians), of which each regime integrates the first 8, 10 or
 
 from __future__ import annotations
 
+from enum import IntEnum
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -20,8 +21,17 @@ from numpy.typing import NDArray
 Record: TypeAlias = "np.recarray[Any, Any]"  # the numbers of one kind below, read and written by name
 Records: TypeAlias = NDArray[np.void]  # many of them
 
-STATE_COMPONENTS = ("x", "y", "psi", "theta", "phi", "thetadot", "omega2", "omega3", "v_x", "v_y", "z", "v_z")
-ROLLING_COMPONENTS = STATE_COMPONENTS[:8]
+
+class Regime(IntEnum):
+    """State of the contact."""
+
+    ROLLING = 0
+    SLIPPING = 1
+    FLYING = 2
+
+
+ROLLING_COMPONENTS = ("x", "y", "psi", "theta", "phi", "thetadot", "omega2", "omega3")
+STATE_COMPONENTS = (*ROLLING_COMPONENTS, "v_x", "v_y", "z", "v_z")
 
 # Read by the laws of the effects. Vectors are in the contact frame (n0, m0, k), n0 = e1, m0 = k x n0.
 KINEMATICS = (
@@ -56,7 +66,7 @@ KINEMATICS = (
 )
 
 # Written by the laws: contact moment M + F_z * load, external force X at O; (n0, m0, k).
-WRENCH = (
+LAW_COMPONENTS = (
     "M_n",  # moments that do not depend on the load [N m]
     "M_m",
     "M_z",
@@ -66,6 +76,9 @@ WRENCH = (
     "X_n",  # force on the centre O [N]
     "X_m",
     "X_z",
+)
+WRENCH = (
+    *LAW_COMPONENTS,
     *(f"table_{a}" for a in "xyz"),  # where the table is, in the axes of cameras at rest [m]; q is relative to it
     *(f"table_v{a}" for a in "xyz"),  # its velocity [m/s]
     *(f"table_a{a}" for a in "xyz"),  # and acceleration [m/s^2]
@@ -128,7 +141,9 @@ BODY = (
     "air_density",  # [kg/m^3]
     "inverse_friction",  # 1/mu of Coulomb's law; 0 = never slips
     "theta_end",  # the motion ends here [rad]
+    "uneven",  # 1 unless a round rim rolls on a level, flat table: all of these are 0 then
 )
+UNEVEN = ("curvature", "slope_x", "slope_y", "oval_c", "oval_s", "lobes_c", "lobes_s", "flat_depth")
 
 
 def record_dtype(names: tuple[str, ...], scalar: type) -> np.dtype:

@@ -26,10 +26,6 @@ from disctrack.rolling.simulate import MAX_SWITCHES, MOST_STEPS, RTOL, _grid, _s
 from disctrack.rolling.state import State, steady_precession
 
 _SEED = 1e-30  # imaginary part; its square is far below the smallest rounding
-_UNEVEN = (
-    "curvature", "slope_x", "slope_y", "oval_c", "oval_s", "lobes_c", "lobes_s", "flat_depth",
-    "surface_vx", "surface_vy", "surface_turn",
-)  # fmt: skip
 _ASKEW = ("com_1", "com_2", "J_12", "J_13", "J_23")  # of a body that is not the same all round its axis
 # What a law reads that tells one direction of the table from another.
 _OF_DIRECTION = {"x", "y", "psi", *(f"{v}{a}" for v in ("table_", "table_v", "table_a", "field_") for a in "xy")}
@@ -92,7 +88,7 @@ def sensitivities(
             else:
                 values = {name: enlarged.values[name] + 1j * _SEED}
             moved = Assembly(enlarged, theta_end, complex, values)
-            run = follow(moved, y, grid, rtol, max_steps=max(max_steps - n_steps, 0))
+            run = follow(moved, y, grid, rtol, max_steps=max_steps - n_steps)
             spent, n_steps = spent + run.slip_steps, n_steps + run.n_steps
             found[: len(run.now), :, column] = _numbers(run).imag / _SEED
     q, qdot, _ = np.split(found[..., 0], [6, 12], axis=1)
@@ -117,7 +113,7 @@ def _turn(column: Array, motion: Array) -> None:
 
 def symmetries(model: Model, assembly: Assembly) -> set[str]:
     """Those of x, y, psi, phi at the start on which nothing depends but where, and which way round, the motion is."""
-    if any(assembly.constant(name) != 0.0 for name in _UNEVEN):
+    if any(assembly.constant(name) != 0.0 for name in ("uneven", "surface_vx", "surface_vy", "surface_turn")):
         return set()
     reads = {name for e in model.effects if e.law is not None for name in _names(type(e).law.__code__)}
     askew = any(assembly.constant(name) != 0.0 for name in _ASKEW)

@@ -10,15 +10,15 @@ from disctrack.rolling._assembly import Assembly
 from disctrack.rolling.effects import ModelError
 from disctrack.rolling.equations import EVENTS, FLYING, ROLLING, SLIPPING, STICK_SPEED
 from disctrack.rolling.model import DEFAULT_THETA_END, Model
-from disctrack.rolling.motion import EndReason, Motion, Path, Regime, Switch, coordinates, motion_of
-from disctrack.rolling.records import Records
+from disctrack.rolling.motion import EndReason, Motion, Path, Switch, coordinates, motion_of
+from disctrack.rolling.records import Records, Regime
 from disctrack.rolling.state import State
 
 RTOL = 1e-11  # of the integrator; keeps the energy without losses to 1e-11 over 1.5 s
 # m, m, rad, rad, rad, rad/s x 3, m/s x 2, m, m/s: about 1e-12 of what moves
 ATOL = np.array([1e-13, 1e-13, 1e-12, 1e-13, 1e-12, 1e-11, 1e-11, 1e-11, 1e-13, 1e-13, 1e-13, 1e-13])
 MAX_SWITCHES = 2000  # of slip and rolling: more is chatter
-MOST_STEPS = 10**9  # of the integrator, over all stretches
+MOST_STEPS = 500_000  # of the integrator, over all stretches
 MOST_INSTANTS = 1e8  # of a motion in memory
 
 
@@ -112,17 +112,15 @@ def follow(
             regime, y = SLIPPING, np.concatenate([y, assembly.at(ROLLING, t, y)[0][0, :2]])
         event = _event_at_start(assembly, regime, t, y)
         if event is None:
-            most = min(max(max_steps - n_steps, 0), integrate.MAX_STEPS)
+            most = max_steps - n_steps
             done = integrate.integrate(assembly.system(regime), t, y, grid[i:], rtol, ATOL[: len(y)], most)
             slip_steps += done.n_steps if regime == SLIPPING else 0
             n_steps += done.n_steps
             if len(done.y):  # none where the steps are used up before the first instant
                 add(grid[i : i + len(done.y)], done.y)
             i, t, y = i + len(done.y), done.t_last, done.y_last
-            if done.status == integrate.REACHED_END:
-                end = EndReason.TIME
-            elif done.status != integrate.EVENT:
-                end = EndReason.FAILED
+            if done.event < 0:
+                end = EndReason.TIME if i == len(grid) else EndReason.FAILED
             else:
                 event = done.event
                 if assembly.scalar is complex:

@@ -11,8 +11,6 @@ from calibration.kit.arrays import Array
 from disctrack.disc import Disc, followers, nutation_frequency, precession_rate
 from disctrack.rolling.effects import ModelError
 
-_FRICTION_ITERATIONS = 30  # fixed point for the direction of friction; each gains a factor of about (h/r)^2
-
 
 @checked
 @dataclass(frozen=True)
@@ -135,7 +133,7 @@ def struck_disc(
     ball = np.array([0.0, 0.0, -impulse])
     v0, omega0 = ball / disc.mass, np.cross(hit, ball) / J
     v, omega, normal = v0, omega0, 0.0
-    for _ in range(_FRICTION_ITERATIONS):
+    for _ in range(30):  # fixed point for the direction of friction; each gains a factor of about (h/r)^2
         slip = (v + np.cross(omega, arm)) * [1.0, 0.0, 1.0]
         push = np.array([0.0, 1.0, 0.0]) - friction * slip / max(float(np.linalg.norm(slip)), 1e-12)
         dv, domega = push / disc.mass, np.cross(arm, push) / J

@@ -19,7 +19,8 @@ from disctrack.files.software import __version__
 from disctrack.files.toml_tree import MOST
 from disctrack.files.whole import refuse_existing, write_whole
 from disctrack.frames import continuous_quaternions, quaternion_from_rotation, rotation_from_euler
-from disctrack.rolling.motion import Motion, Regime
+from disctrack.rolling.motion import Motion
+from disctrack.rolling.records import Regime
 from disctrack.rolling.simulate import simulate
 from disctrack.synthetic.description import load_scene
 from disctrack.synthetic.motion import effects_in_words, rolling_model, rolling_start

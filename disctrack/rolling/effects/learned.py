@@ -18,9 +18,8 @@ import numpy as np
 
 from calibration.kit.compiled import function_of
 from disctrack.rolling.effects.base import CATALOGUE, Effect, EffectParameter, ModelError, magnitude, sign
-from disctrack.rolling.records import KINEMATICS, WRENCH
+from disctrack.rolling.records import KINEMATICS, LAW_COMPONENTS
 
-_COMPONENTS = WRENCH[:9]
 _NUMPY_FUNCTIONS = ("sqrt", "exp", "log", "sin", "cos")
 _FUNCTIONS = {"magnitude": "magnitude", "sign": "sign"} | {name: f"np.{name}" for name in _NUMPY_FUNCTIONS}
 _ALLOWED = (
@@ -47,8 +46,8 @@ def effect_from_formulas(
         raise ModelError(f"there is an effect '{name}' already, with another law: choose another name")
     lines, free = [], []
     for component, formula in formulas.items():
-        if component not in _COMPONENTS:
-            raise ModelError(f"{name}: '{component}' is no component; a law sets {', '.join(_COMPONENTS)}")
+        if component not in LAW_COMPONENTS:
+            raise ModelError(f"{name}: '{component}' is no component; a law sets {', '.join(LAW_COMPONENTS)}")
         text, names = _translate(name, formula)
         lines.append(f"    w.{component} += {text}")
         free += [n for n in names if n not in free]
