@@ -1,5 +1,6 @@
 """The lens and the light: rays through the pixels' corners, blur over the cells, the table's texture, the lamp."""
 
+from collections.abc import Callable
 from functools import lru_cache
 
 import numpy as np
@@ -16,7 +17,7 @@ from disctrack.synthetic.raster import between
 _TEXTURE_SIZE = 1024  # texels per side
 _TEXEL = 0.25e-3  # [m]; the texture repeats after 256 mm
 _N_WAVES = 5
-_PERIODS = 0.4, 1.4  # of the waves that make up a lens field, along the image's longer side
+_PERIODS = 0.4, 1.4  # of the waves that make up a field, along the image's longer side
 
 
 @lru_cache(maxsize=8)
@@ -48,8 +49,16 @@ def lens_rays(camera: Camera, pad: int, field_px: float, key: list[int]) -> Arra
     rays = corner_rays(camera, pad)
     if not field_px:
         return rays
-    rng = np.random.default_rng(key)
-    size = np.array(camera.image_size, float)
+    rows, columns = np.mgrid[: rays.shape[0], : rays.shape[1]]
+    pixels = np.stack([columns, rows], axis=-1) - pad - 0.5
+    off = smooth_field(np.random.default_rng(key), camera.image_size, field_px)(pixels)
+    by_row, by_column = np.gradient(rays, axis=(0, 1))
+    return np.asarray(rays - by_column * off[..., :1] - by_row * off[..., 1:])
+
+
+def smooth_field(rng: np.random.Generator, image_size: tuple[int, int], rms_px: float) -> Callable[[Array], Array]:
+    """Of pixels (..., 2), by how much they lie off (..., 2): a sum of waves, of this rms per axis over the image."""
+    size = np.array(image_size, float)
     turns = 2 * np.pi * rng.uniform(*_PERIODS, (_N_WAVES, 1)) / size.max()
     angles = rng.uniform(0, 2 * np.pi, _N_WAVES)
     waves = turns * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
@@ -59,10 +68,7 @@ def lens_rays(camera: Camera, pad: int, field_px: float, key: list[int]) -> Arra
         return np.asarray(np.sin((pixels @ waves.T)[..., None, :] + phases).sum(-1))
 
     inside = raw(np.stack(np.meshgrid(*(np.linspace(0, n - 1, 33) for n in size)), axis=-1))
-    rows, columns = np.mgrid[: rays.shape[0], : rays.shape[1]]
-    off = field_px * (raw(np.stack([columns, rows], axis=-1) - pad - 0.5) - inside.mean((0, 1))) / inside.std((0, 1))
-    by_row, by_column = np.gradient(rays, axis=(0, 1))
-    return np.asarray(rays - by_column * off[..., :1] - by_row * off[..., 1:])
+    return lambda pixels: rms_px * (raw(pixels) - inside.mean((0, 1))) / inside.std((0, 1))
 
 
 def table_points(view: View, pad: int) -> Array:

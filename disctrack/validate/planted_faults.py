@@ -10,7 +10,7 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from json import JSONDecodeError, loads
@@ -274,27 +274,30 @@ def declare(folder: Path, tree: Tree) -> None:
     (folder / "recording.toml").write_text("".join(lines), encoding="utf-8")
 
 
-def reordered(folder: Path, order: Callable[[list[Path]], list[Path]]) -> None:
-    """Files of a folder in another order, without some or with some again: numbered anew, without gaps."""
+def reordered(folder: Path, change: Callable[[list[bytes]], Iterable[bytes]]) -> None:
+    """Files of a folder in another order, without some, with some again or with other contents: numbered anew."""
     files = sorted(folder.iterdir())
-    kept = [file.read_bytes() for file in order(files)]
+    contents = [file.read_bytes() for file in files]
     for file in files:
         file.unlink()  # it may be a link to another's
-    for number, content in enumerate(kept):
+    for number, content in enumerate(change(contents)):
         (folder / f"{number:06d}{files[0].suffix}").write_bytes(content)
 
 
 def redrawn(folder: Path, change: Callable[[NDArray, float], NDArray]) -> None:
     """Change images; the number is the share of the recording before each."""
-    files = sorted(folder.iterdir())
-    for number, file in enumerate(files):
-        image = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
-        assert image is not None
-        file.unlink()  # it may be a link to another's
-        cv2.imwrite(str(file), change(image, number / len(files)))
+    suffix = next(folder.iterdir()).suffix
+
+    def drawn(contents: list[bytes]) -> Iterator[bytes]:
+        for number, content in enumerate(contents):
+            image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
+            assert image is not None
+            yield cv2.imencode(suffix, change(image, number / len(contents)))[1].tobytes()
+
+    reordered(folder, drawn)
 
 
-def _files(**orders: Callable[[list[Path], int], list[Path]]) -> Change:
+def _files(**orders: Callable[[list[bytes], int], list[bytes]]) -> Change:
     """By folder, the order of its files, which the size is given to."""
 
     def change(folder: Path, tree: Tree, size: float) -> None:
@@ -304,31 +307,36 @@ def _files(**orders: Callable[[list[Path], int], list[Path]]) -> Change:
     return change
 
 
-def _lost(files: list[Path], k: int) -> list[Path]:
+def _lost(files: list[bytes], k: int) -> list[bytes]:
     middle = len(files) // 2
     return files[:middle] + files[middle + k :]
 
 
-def _again(files: list[Path], k: int) -> list[Path]:
+def _again(files: list[bytes], k: int) -> list[bytes]:
     """In the middle the recorder writes one image again and again."""
     middle = len(files) // 2
     return files[:middle] + k * [files[middle - 1]] + files[middle + k :]
 
 
-def _first_lost(files: list[Path], k: int) -> list[Path]:
+def _first_lost(files: list[bytes], k: int) -> list[bytes]:
     return files[k:]
 
 
-def _last_lost(files: list[Path], k: int) -> list[Path]:
+def _last_lost(files: list[bytes], k: int) -> list[bytes]:
     """Of the other camera, so that both end together."""
     return files[:-k]
 
 
-def _backwards(files: list[Path], k: int) -> list[Path]:
+def _damaged(files: list[bytes], k: int) -> list[bytes]:
+    """The end of the last files was never written."""
+    return files[:-k] + [file[: len(file) // 2] for file in files[-k:]]
+
+
+def _backwards(files: list[bytes], k: int) -> list[bytes]:
     return files[::-1]
 
 
-def _several(files: list[Path], k: int) -> list[Path]:
+def _several(files: list[bytes], k: int) -> list[bytes]:
     return k * files
 
 
@@ -393,14 +401,6 @@ def _wrong(section: str, key: str, *kinds: Kind) -> Planting:
     return Planting((1e-3, 1e-2, 1e-1) if of_views else (3e-3, 3e-2, 3e-1), "1", kinds, change, of_views)
 
 
-def _damaged(folder: Path, tree: Tree, size: float) -> None:
-    """The end of the right camera's last files was never written."""
-    for file in sorted((folder / "right").iterdir())[-int(size) :]:
-        whole = file.read_bytes()
-        file.unlink()
-        file.write_bytes(whole[: len(whole) // 2])
-
-
 _LOST = (Kind.DROPPED_FRAMES, Kind.DELAY, Kind.ONE_SIDED)
 _REPEATED = (Kind.REPEATED_IMAGES,)
 _CALIBRATED = (Kind.CALIBRATION,)
@@ -410,7 +410,7 @@ CHANGES = {
     "images lost by one": Planting((1, 3, 10, 20), "images", _LOST, _files(left=_last_lost, right=_lost)),
     "pairs repeated": Planting((1, 3, 10), "pairs", _REPEATED, _files(left=_again, right=_again)),
     "images repeated by one": Planting((1, 3, 10), "images", _REPEATED, _files(right=_again)),
-    "files damaged": Planting((1, 5, 50), "files", (Kind.UNREADABLE,), _damaged),
+    "files damaged": Planting((1, 5, 50), "files", (Kind.UNREADABLE,), _files(right=_damaged)),
     "glare": Planting((3, 30, 300), "grey values", (Kind.LIGHT, Kind.ONE_SIDED, *MOVED), _images(_lit, "right")),
     "camera knocked": Planting((0.02, 0.2, 2.0), "px", MOVED, _images(_knocked, "right")),
     "camera drifts": Planting((0.03, 0.3, 3.0), "px", MOVED, _images(_drifting, "right")),

@@ -3,8 +3,8 @@
 What is planted goes through other formulas than those of the diagnosis: cameras, table and dots through the renderer's
 `faults`, clocks through the instants at which the motion is simulated, exposures through a mean over instants. The rig
 that the trajectory carries differs from the true one by an error drawn from its covariance. A laboratory's residual
-lens field is a sum of plane waves with random directions and phases; glare moves each dot in its own way; the board
-that the table was taken from was bowed.
+lens field is a sum of waves as in the renderer's; glare moves each dot in its own way; the board that the table was
+taken from was bowed.
 """
 
 from collections.abc import Callable
@@ -22,6 +22,7 @@ from disctrack.rolling import simulate
 from disctrack.synthetic import board_poses, rig_after_faults, rig_of, true_disc_of
 from disctrack.synthetic.description import Scene
 from disctrack.synthetic.motion import rolling_model, rolling_start, true_frame_rate
+from disctrack.synthetic.optics import smooth_field
 from disctrack.track.pose import fit_poses
 from disctrack.track.refine.assembly import Taken, trajectory_of
 from disctrack.track.refine.self_calibration import DotsInFrames
@@ -32,8 +33,6 @@ Motion = Callable[[Array], Array]  # instants (k,) [s] -> coordinates q (k, 6)
 SIGMA_PX = 0.006  # of a dot's centre: 0.5 um and 1.3 mdeg per pose, as in the reference recordings
 CORNER_SIGMA_PX = 0.01
 STATION = 0.002  # [s] after the motion's first instant at which the first frame is taken
-_WAVES = 14
-_WAVELENGTHS = (0.4, 1.5)  # of the image's width
 _RADII, _ANGLES = 4, 16  # points of a dot over which the centre of its image is taken
 _INSTANTS = 4  # of an exposure: Gauss-Legendre, exact to the seventh power of time
 
@@ -104,7 +103,7 @@ def measured(
     ]
     pixels = np.stack(views, axis=1)
     if laboratory != Laboratory():
-        pixels = _shifted_dots(of_rig, pixels, scene.cameras.image_size[0], laboratory)
+        pixels = _shifted_dots(of_rig, pixels, scene.cameras.image_size, laboratory)
     pixels = pixels + sigma_px * rng.standard_normal(pixels.shape)
     dots = np.broadcast_to(sigma_px**2 * np.eye(2), (*pixels.shape, 2)).copy()
     q, declared = motion(times), scene.declared_disc
@@ -136,26 +135,13 @@ def _in_the_laboratory(scene: Scene, lab: Laboratory, rng: np.random.Generator) 
     return replace(scene, faults=faults)
 
 
-def _shifted_dots(rng: np.random.Generator, pixels: Array, width_px: float, laboratory: Laboratory) -> Array:
+def _shifted_dots(rng: np.random.Generator, pixels: Array, size: tuple[int, int], laboratory: Laboratory) -> Array:
     """Centres (n, 2, m, 2) as such a laboratory finds them."""
     found = pixels.copy()
     for camera in range(2):
-        found[:, camera] += plane_waves(rng, pixels[:, camera], width_px, laboratory.lens_px)
+        found[:, camera] += smooth_field(rng, size, laboratory.lens_px)(pixels[:, camera])
         for dot in range(pixels.shape[2]):
-            found[:, camera, dot] += plane_waves(rng, pixels[:, camera, dot], width_px, laboratory.glare_px)
-    return found
-
-
-def plane_waves(rng: np.random.Generator, places_px: Array, width_px: float, rms_px: float) -> Array:
-    """Random smooth vector field (..., 2) [px] at places (..., 2) of an image."""
-    found = np.zeros_like(places_px)
-    for axis in range(2):
-        length = width_px * np.exp(rng.uniform(np.log(_WAVELENGTHS[0]), np.log(_WAVELENGTHS[1]), _WAVES))
-        angle, phase = rng.uniform(0, 2 * np.pi, (2, _WAVES))
-        wave = 2 * np.pi / length[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-        amplitude = rng.standard_normal(_WAVES)
-        amplitude *= rms_px * np.sqrt(2.0) / np.linalg.norm(amplitude)
-        found[..., axis] = np.cos(places_px @ wave.T + phase) @ amplitude
+            found[:, camera, dot] += smooth_field(rng, size, laboratory.glare_px)(pixels[:, camera, dot])
     return found
 
 
