@@ -31,30 +31,20 @@ class CompiledSystem(NamedTuple):
     n_margins: int
 
 
-class Solved(NamedTuple):
-    """Solution up to the end of the grid or to the first event; real or complex like its start.
-
-    Where neither is reached, the step became too small, a number not finite, or the steps were too many.
-    """
-
-    y: Numbers  # (n_filled, n) at the grid points that were reached
-    t_last: complex  # instant of the event, or the last grid point
-    y_last: Numbers  # (n,)
-    event: int  # number of the margin that ran out, or -1
-    n_steps: int
-
-
 def integrate(
     system: CompiledSystem, t0: complex, y0: Numbers, grid: Array, rtol: float, atol: Array, max_steps: int
-) -> Solved:
+) -> tuple[Numbers, complex, Numbers, int, int]:
     """Solve dy/dt = f(t, y) from (t0, y0) to the grid's points, until a margin that was positive runs out.
 
     grid : (n_grid,) increasing, none before t0.   atol : (n,)
+    Returns y at the grid points that were reached (n_filled, n), instant and state of the event, or at the last grid
+    point, the number of the margin that ran out, or -1, and that of the steps. Where neither an event nor the last grid
+    point is reached, the step became too small, a number not finite, or the steps were too many.
     """
     solution = np.full((len(grid), len(y0)), np.nan, y0.dtype)
     t, y = np.array([t0], y0.dtype), y0.copy()
     n_filled, event, n_steps = _dop853(system, t, y, grid, rtol, atol, max_steps, solution)
-    return Solved(solution[:n_filled], t[0], y, event, n_steps)
+    return solution[:n_filled], t[0], y, event, n_steps
 
 
 def evaluate(system: CompiledSystem, t: Numbers, Y: Numbers, instant: Records) -> tuple[Numbers, Numbers, Records]:

@@ -111,21 +111,18 @@ def follow(
         if regime == ROLLING and assembly.on_a_film:
             regime, y = SLIPPING, np.concatenate([y, assembly.at(ROLLING, t, y)[0][0, :2]])
         event = _event_at_start(assembly, regime, t, y)
-        if event is None:
-            most = max_steps - n_steps
-            done = integrate.integrate(assembly.system(regime), t, y, grid[i:], rtol, ATOL[: len(y)], most)
-            slip_steps += done.n_steps if regime == SLIPPING else 0
-            n_steps += done.n_steps
-            if len(done.y):  # none where the steps are used up before the first instant
-                add(grid[i : i + len(done.y)], done.y)
-            i, t, y = i + len(done.y), done.t_last, done.y_last
-            if done.event < 0:
+        if event < 0:
+            system, atol = assembly.system(regime), ATOL[: len(y)]
+            Y, t, y, event, n = integrate.integrate(system, t, y, grid[i:], rtol, atol, max_steps - n_steps)
+            n_steps, slip_steps = n_steps + n, slip_steps + (n if regime == SLIPPING else 0)
+            if len(Y):  # none where the steps are used up before the first instant
+                add(grid[i : i + len(Y)], Y)
+            i += len(Y)
+            if event < 0:
                 end = EndReason.TIME if i == len(grid) else EndReason.FAILED
-            else:
-                event = done.event
-                if assembly.scalar is complex:
-                    t, y = _complex_instant(assembly, regime, event, t, y)
-        if event is not None:
+            elif assembly.scalar is complex:
+                t, y = _complex_instant(assembly, regime, event, t, y)
+        if end is None:
             end, new, y = _switch(assembly, regime, event, t, y)
             if end is None:
                 switches.append(Switch(float(np.real(t)), Regime(regime), Regime(new)))
@@ -138,14 +135,14 @@ def follow(
     return Path(now, regimes, switches, end, t, y, slip_steps, n_steps)
 
 
-def _event_at_start(assembly: Assembly, regime: int, t: complex, y: Numbers) -> int | None:
-    """An event that holds already where a stretch starts: the regime asked for is not the one that physics allows."""
+def _event_at_start(assembly: Assembly, regime: int, t: complex, y: Numbers) -> int:
+    """An event that holds already where a stretch starts, or -1: the regime is not the one that physics allows."""
     margins = assembly.at(regime, t, y)[1][0].real
     if regime == SLIPPING and not margins[EVENTS.index("grip")] > 0:  # without slip the direction of friction is open,
         return EVENTS.index("grip")  # and the load with it
     margins[EVENTS.index("upright")] += -1e-12 * np.sign(y[5].real)  # at exactly 90 deg the direction decides
     failed = np.flatnonzero(~(margins > 0))
-    return int(failed[0]) if failed.size else None
+    return int(failed[0]) if failed.size else -1
 
 
 def _complex_instant(assembly: Assembly, regime: int, event: int, t: complex, y: Numbers) -> tuple[complex, Numbers]:

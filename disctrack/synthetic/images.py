@@ -15,7 +15,7 @@ from disctrack.frames import CAMERAS, rotation_from_euler
 from disctrack.synthetic import optics, raster
 from disctrack.synthetic.cameras import View, image_of, views_of
 from disctrack.synthetic.description import Scene
-from disctrack.synthetic.sensor import Pattern, digitise, hot_pixels, sensor_pattern
+from disctrack.synthetic.sensor import digitise, hot_pixels, sensor_pattern
 
 PoseOverExposure = Callable[[Array], Array]  # (k,) times [s] from mid exposure -> (k, 6) q
 
@@ -34,13 +34,12 @@ class Stage:
     table: Array32  # (height, width) blurred table, before lamp and vignetting
     factor: Array32
     glare: Array32
-    pattern: Pattern | None
+    pattern: Callable[[Array32], Array32]
     hot: Array32 | None
 
     def finish(self, irradiance: Array32) -> Array32:
         """Lamp, vignetting and glare on a blurred image, as a sensor with its pattern has it."""
-        grey = irradiance * self.factor + self.glare
-        return grey if self.pattern is None else self.pattern.seen(grey)
+        return self.pattern(irradiance * self.factor + self.glare)
 
     def digitised(self, grey: Array32, scene: Scene, rng: np.random.Generator | None) -> Image:
         """The image that the camera writes."""

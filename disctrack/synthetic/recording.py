@@ -1,12 +1,11 @@
 """A whole recording on disk, as the pair of cameras would have written it, and the truth apart from it."""
 
-import shutil
-import tempfile
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import cv2
 import numpy as np
@@ -56,28 +55,24 @@ def write_recording(
         raise OutputError(f"{target}: exists; choose another name for the truth or remove it")
     motion = motion or motion_of(scene)
     truth = _truth(scene, motion, rig_of(scene))
-    part = Path()
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
-        part = Path(tempfile.mkdtemp(prefix=f"{folder.name}.", suffix=".part", dir=folder.parent))
-        part.chmod(0o755)  # as any new folder, not the user's alone
-        for name in ("left", "right", "calibration/left", "calibration/right"):
-            (part / name).mkdir(parents=True)
-        (part / "recording.toml").write_text(recording_toml(scene), encoding="utf-8")
-        _write_all([*_boards(part, scene, truth), *_frames(part, scene, motion, truth)], scene, progress)
-        if target is not None:
-            target.parent.mkdir(parents=True, exist_ok=True)
-        write_truth(target or part / TRUTH_NAME, truth, scene)
-        if folder.exists():
-            folder.rmdir()
-        part.rename(folder)
+        with TemporaryDirectory(prefix=f"{folder.name}.", suffix=".part", dir=folder.parent) as place:
+            part = Path(place, "recording")
+            for name in ("left", "right", "calibration/left", "calibration/right"):
+                (part / name).mkdir(parents=True)
+            (part / "recording.toml").write_text(recording_toml(scene), encoding="utf-8")
+            _write_all([*_boards(part, scene, truth), *_frames(part, scene, motion, truth)], scene, progress)
+            if target is not None:
+                target.parent.mkdir(parents=True, exist_ok=True)
+            write_truth(target or part / TRUTH_NAME, truth, scene)
+            if folder.exists():
+                folder.rmdir()
+            part.rename(folder)
     except OSError as error:
         raise OutputError(
             f"{folder}: the recording cannot be written ({error}); check the disk and the rights"
         ) from error
-    finally:
-        if part.name:
-            shutil.rmtree(part, ignore_errors=True)
     return truth
 
 

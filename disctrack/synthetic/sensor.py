@@ -1,6 +1,6 @@
 """From light to the numbers in a file: fixed pattern, photons, read noise, hot pixels, quantisation."""
 
-from typing import NamedTuple
+from collections.abc import Callable
 
 import numpy as np
 
@@ -8,28 +8,22 @@ from calibration.kit.arrays import Array32, Image
 from disctrack.synthetic.description import ImperfectionSettings, SensorSettings
 
 
-class Pattern(NamedTuple):
-    """What a sensor adds to the light, the same in every frame."""
-
-    gain: Array32  # (height, width)
-    offset: Array32  # (width,) [grey]
-    curve: float
-
-    def seen(self, grey: Array32) -> Array32:
-        """Grey values (height, width) as the sensor has them, before its noise."""
-        part = grey / np.float32(255.0)
-        curved = grey + np.float32(255.0 * 4.0 * self.curve) * part * (1 - part)
-        return np.asarray(curved * self.gain + self.offset, np.float32)
-
-
-def sensor_pattern(settings: ImperfectionSettings, image_size: tuple[int, int], key: list[int]) -> Pattern | None:
-    """Pattern of one camera; None for a sensor without any."""
+def sensor_pattern(
+    settings: ImperfectionSettings, image_size: tuple[int, int], key: list[int]
+) -> Callable[[Array32], Array32]:
+    """Grey values (height, width) as the sensor of one camera has them, the same in every frame, before its noise."""
     if not (settings.pixel_gain or settings.column_offset_dn or settings.response_curve):
-        return None
+        return lambda grey: grey
     rng = np.random.default_rng(key)
     gain = 1 + settings.pixel_gain * rng.standard_normal(image_size[::-1], dtype=np.float32)
     offset = settings.column_offset_dn * rng.standard_normal(image_size[0], dtype=np.float32)
-    return Pattern(gain.astype(np.float32), offset.astype(np.float32), settings.response_curve)
+    bend = np.float32(255.0 * 4.0 * settings.response_curve)
+
+    def seen(grey: Array32) -> Array32:
+        part = grey / np.float32(255.0)
+        return np.asarray((grey + bend * part * (1 - part)) * gain + offset, np.float32)
+
+    return seen
 
 
 def digitise(

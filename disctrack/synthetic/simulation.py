@@ -1,7 +1,6 @@
 """disctrack simulate: the motion of a scene into an HDF5 file that explains itself."""
 
 import hashlib
-import io
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -17,7 +16,7 @@ from disctrack.files.inputs import keep, refuse_input
 from disctrack.files.labelled_arrays import Variable, flags, write_variables
 from disctrack.files.software import __version__
 from disctrack.files.toml_tree import MOST
-from disctrack.files.whole import refuse_existing, write_whole
+from disctrack.files.whole import refuse_existing, whole_file
 from disctrack.frames import continuous_quaternions, quaternion_from_rotation, rotation_from_euler
 from disctrack.rolling.motion import Motion
 from disctrack.rolling.records import Regime
@@ -119,15 +118,13 @@ def write_motion(path: Path, motion: Motion, attributes: Mapping[str, str]) -> N
         "time": Variable(motion.time, ("time",), "s", "time"),
         "quaternion_component": Variable(np.array(list("wxyz")), ("quaternion_component",), "1", "component"),
     }
-    buffer = io.BytesIO()
-    with h5py.File(buffer, "w", track_order=True) as file:
+    with whole_file(path) as part, h5py.File(part, "w", track_order=True) as file:
         for group, variables in _variables(motion).items():
             write_variables(file.create_group(group, track_order=True) if group else file, variables, axes)
         _write_model(file, motion)
         file.attrs.update(schema=SCHEMA, schema_version=SCHEMA_VERSION, software="disctrack")
         file.attrs.update(software_version=__version__, end=motion.end.name, end_reason=motion.end.value)
         file.attrs.update({"end_time_s": motion.end_time, **_CONVENTIONS, **attributes, "complete": 1})
-    write_whole(path, buffer.getbuffer())
 
 
 def _variables(motion: Motion) -> dict[str, dict[str, Variable]]:

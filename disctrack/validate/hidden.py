@@ -23,7 +23,7 @@ from disctrack.rolling import Model, simulate
 from disctrack.synthetic.description import CameraSettings, MotionSettings, RollingMotion, Scene
 from disctrack.synthetic.motion import rolling_start
 from disctrack.trajectory import Trajectory
-from disctrack.validate.points import ORDINARY, STATION, Laboratory, measured
+from disctrack.validate.points import ORDINARY, Laboratory, measured
 
 # [SI] where what would surprise nobody (`Quantity.typical`) is not what a careful experimenter would overlook
 OVERLOOKED = {
@@ -132,11 +132,6 @@ def plant(name: str, size: float, rng: Generator) -> Planted:
         return Planted(truth, wrong=truth)
     if name == "rim_flat":
         return Planted(truth, effects=truth | {"rim_flat.angle": rng.uniform(0, 2 * np.pi)})
-    if name == "table_shaken":  # the diagnosis' phase is that at the first frame
-        turn = 2 * np.pi * candidate.shape[0].null * STATION
-        cosine, sine = numbers.reshape(2, 3)
-        c, s = np.cos(turn), np.sin(turn)
-        numbers = np.ravel([c * cosine - s * sine, s * cosine + c * sine])
     return Planted(truth, effects=dict(zip(truth, numbers.tolist(), strict=True)))
 
 

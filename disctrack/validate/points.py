@@ -147,7 +147,7 @@ def _shifted_dots(rng: np.random.Generator, pixels: Array, size: tuple[int, int]
 
 def _rolling(scene: Scene, psi: float, phi: float) -> Motion:
     model, start = rolling_model(scene), rolling_start(scene).moved(psi=psi, phi=phi)
-    return lambda times: simulate(model, start, times=np.r_[0.0, times]).q[1:]
+    return lambda times: simulate(model, start, times=np.r_[0.0, times] - STATION).q[1:]  # laws count from that frame
 
 
 def _exposed(motion: Motion, times: Array, faults: Faults, rig: StereoRig, disc: Disc) -> Array:

@@ -373,15 +373,17 @@ def test_lens_field_has_its_size_and_moves_the_image_by_it(plain):
 def test_sensor_pattern_is_fixed_and_has_its_size(rng):
     settings = ImperfectionSettings(pixel_gain=0.01, column_offset_dn=0.3, response_curve=0.03)
     pattern = sensor_pattern(settings, (400, 300), [1, 10, 0])
-    flat = pattern.seen(np.full((300, 400), 127.5, np.float32))
+    even = np.full((300, 400), 127.5, np.float32)
+    flat = pattern(even)
     assert_allclose(flat.mean(), 127.5 + 0.03 * 255, atol=0.1)
     assert_allclose(flat.mean(0).std(), np.hypot(0.3, 135 * 0.01 / np.sqrt(300)), rtol=0.15)
     assert_allclose((flat - flat.mean(0)).std(), 1.35, rtol=0.02)
-    assert_array_equal(sensor_pattern(settings, (400, 300), [1, 10, 0]).gain, pattern.gain)
+    assert_array_equal(sensor_pattern(settings, (400, 300), [1, 10, 0])(even), flat)
 
 
 def test_off_by_default_and_declared_only_where_exact():
-    assert sensor_pattern(ImperfectionSettings(), (40, 30), [1]) is None
+    even = np.full((30, 40), 127.5, np.float32)
+    assert sensor_pattern(ImperfectionSettings(), (40, 30), [1])(even) is even
     assert lens_rays(rig_of(ORDINARY).left, 3, 0.0, [1]) is corner_rays(rig_of(ORDINARY).left, 3)
     assert "square_tolerance_mm = 0.0" in recording_toml(Scene())
     assert "tolerance" not in recording_toml(replace(Scene(), imperfections=ImperfectionSettings(pixel_gain=0.01)))
