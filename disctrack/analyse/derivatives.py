@@ -40,14 +40,8 @@ from disctrack.frames import (
 from disctrack.trajectory import FrameStatus, Trajectory, part
 
 K = np.array([0.0, 0.0, 1.0])
-STATE = (
-    *(f"position_{axis}" for axis in "xyz"),
-    *(f"rotation_{axis}" for axis in "xyz"),
-    *(f"velocity_{axis}" for axis in "xyz"),
-    *(f"omega_{axis}" for axis in "xyz"),
-    *(f"acceleration_{axis}" for axis in "xyz"),
-    *(f"alpha_{axis}" for axis in "xyz"),
-)
+VECTORS = ("position", "rotation", "velocity", "omega", "acceleration", "alpha")
+STATE = tuple(f"{vector}_{axis}" for vector in VECTORS for axis in "xyz")
 N_STATE = len(STATE)  # 18
 CHANNEL_GROUPS = ((0, 1), (2,), (3, 4), (5,))  # horizontal, vertical, tilt, turn about the vertical: unlike spectra
 GROUP_NAMES = ("horizontal position", "height", "tilt", "turn about the vertical")

@@ -36,9 +36,7 @@ STATE_COMPONENTS = (*ROLLING_COMPONENTS, "v_x", "v_y", "z", "v_z")
 # Read by the laws of the effects. Vectors are in the contact frame (n0, m0, k), n0 = e1, m0 = k x n0.
 KINEMATICS = (
     "time",
-    "x",  # O in world axes [m]
-    "y",
-    "z",
+    *"xyz",  # O in world axes [m]
     "psi",  # precession, nutation, spin [rad]
     "theta",
     "phi",
@@ -50,32 +48,21 @@ KINEMATICS = (
     "omega2",  # psidot sin(theta)
     "omega3",  # psidot cos(theta) + phidot
     "omega_z",  # psidot + phidot cos(theta)
-    "v_n",  # velocity of O [m/s]
-    "v_m",
-    "v_z",
-    "slip_n",  # velocity of the disc's material point at the contact [m/s]; zero in pure rolling
-    "slip_m",
+    *(f"v_{a}" for a in "nmz"),  # velocity of O [m/s]
+    *(f"slip_{a}" for a in "nm"),  # velocity of the disc's material point at the contact [m/s]; zero in pure rolling
     "radius",  # of the contact circle [m]
     "half_thickness",
     "mass",
     "gravity",  # magnitude [m/s^2]
     "air_density",  # [kg/m^3]
-    "normal_n",  # of the table at the contact
-    "normal_m",
-    "normal_z",
+    *(f"normal_{a}" for a in "nmz"),  # of the table at the contact
 )
 
 # Written by the laws: contact moment M + F_z * load, external force X at O; (n0, m0, k).
 LAW_COMPONENTS = (
-    "M_n",  # moments that do not depend on the load [N m]
-    "M_m",
-    "M_z",
-    "load_n",  # moments per unit of normal force: lever arms [m]
-    "load_m",
-    "load_z",
-    "X_n",  # force on the centre O [N]
-    "X_m",
-    "X_z",
+    *(f"M_{a}" for a in "nmz"),  # moments that do not depend on the load [N m]
+    *(f"load_{a}" for a in "nmz"),  # moments per unit of normal force: lever arms [m]
+    *(f"X_{a}" for a in "nmz"),  # force on the centre O [N]
 )
 WRENCH = (
     *LAW_COMPONENTS,
@@ -87,17 +74,11 @@ WRENCH = (
 
 # Solved from the equations of motion.
 ANSWERS = (
-    "F_n",  # contact force on the disc [N]
-    "F_m",
-    "F_z",
+    *(f"F_{a}" for a in "nmz"),  # contact force on the disc [N]
     "N",  # its part along the normal of the table at the contact: F_z on a flat one
     "F_t",  # and the size of the rest, which friction has to supply
-    "a_n",  # acceleration of O relative to the table [m/s^2]
-    "a_m",
-    "a_z",
-    "alpha_1",  # angular acceleration along e1, e2, e3 [rad/s^2]
-    "alpha_2",
-    "alpha_3",
+    *(f"a_{a}" for a in "nmz"),  # acceleration of O relative to the table [m/s^2]
+    *(f"alpha_{i}" for i in "123"),  # angular acceleration along e1, e2, e3 [rad/s^2]
 )
 
 ANGLES = ("sin_psi", "cos_psi", "sin_phi", "cos_phi")  # read by the equations alone: laws that turn with psi say so
@@ -110,34 +91,22 @@ BODY = (
     "radius",  # r: the contact runs on the circle of this radius ...
     "half_thickness",  # ... this far below O along -e3
     "edge_radius",  # of the rounded edge; 0 = sharp
-    "oval_c",  # rim's support function r + oval_c cos 2 beta + oval_s sin 2 beta + lobes_c cos 3 beta + ..., by the
-    "oval_s",  # angle beta in the body [m]
-    "lobes_c",
-    "lobes_s",
+    *(f"oval_{a}" for a in "cs"),  # rim's support function r + oval_c cos 2 beta + oval_s sin 2 beta + ...
+    *(f"lobes_{a}" for a in "cs"),  # ... + lobes_c cos 3 beta + lobes_s sin 3 beta, by the angle beta in the body [m]
     "flat_depth",  # of a flat of the rim: support function less depth exp(sharpness (cos(beta - angle) - 1)) [m]
     "flat_cos",  # of its angle in the body
     "flat_sin",
     "flat_sharpness",  # 1 / width^2 [1/rad^2]
     "compliance",  # of the table: it sinks by so much per load [m/N]
     "creep",  # of the contact: velocity over F_t / F_z [m/s]
-    "surface_vx",  # velocity of the table's surface at the origin [m/s] ...
-    "surface_vy",
+    *(f"surface_v{a}" for a in "xy"),  # velocity of the table's surface at the origin [m/s] ...
     "surface_turn",  # ... and its rate of turn about the vertical [rad/s]
     "curvature",  # of the table, a sphere through the origin: positive in a hollow [1/m]
-    "slope_x",  # of the table at the origin, descending towards i, and j
-    "slope_y",
-    "com_1",  # centre of mass from O in body axes [m]
-    "com_2",
-    "com_3",
-    "J_11",
-    "J_22",
-    "J_33",
-    "J_12",
-    "J_13",
-    "J_23",
-    "g_x",  # gravity in world axes [m/s^2]
-    "g_y",
-    "g_z",
+    *(f"slope_{a}" for a in "xy"),  # of the table at the origin, descending towards i, and j
+    *(f"com_{i}" for i in "123"),  # centre of mass from O in body axes [m]
+    *(f"J_{i}{i}" for i in "123"),
+    *(f"J_{ij}" for ij in ("12", "13", "23")),
+    *(f"g_{a}" for a in "xyz"),  # gravity in world axes [m/s^2]
     "air_density",  # [kg/m^3]
     "inverse_friction",  # 1/mu of Coulomb's law; 0 = never slips
     "theta_end",  # the motion ends here [rad]

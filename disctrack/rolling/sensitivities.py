@@ -66,7 +66,8 @@ def sensitivities(
     """
     grid = _grid(None, 0.0, times)
     y0 = _start(state, theta_end)
-    enlarged = model.with_values(_missing(model, parameters))
+    lacking = {effect.name: effect for effect, _ in map(model.split_name, parameters) if not model.effect(effect.name)}
+    enlarged = model.with_effects(*(effect.absent() for effect in lacking.values()))
     components = tuple(STATE_COMPONENTS[: len(y0)] if components is None else components)
     names = (*components, *parameters)
     found = np.full((len(grid), 20, 1 + len(names)), np.nan)  # q, qdot and state: the motion, then its derivatives
@@ -130,17 +131,6 @@ def _names(code: CodeType) -> Iterator[str]:
     for inside in code.co_consts:
         if isinstance(inside, CodeType):
             yield from _names(inside)
-
-
-def _missing(model: Model, parameters: Sequence[str]) -> dict[str, float]:
-    """Null values of parameters whose effect the model lacks."""
-    present = {e.name for e in model.effects}
-    missing = {}
-    for full_name in parameters:
-        effect, name = model.split_name(full_name)
-        if effect.name not in present:
-            missing[full_name] = effect.absent().values[name]
-    return missing
 
 
 def prepare() -> None:
