@@ -1,7 +1,6 @@
 """How results show themselves: a few facts on one line, or as a small table in a notebook."""
 
 from collections.abc import Mapping
-from dataclasses import fields
 from enum import Enum
 from html import escape
 from pathlib import Path
@@ -37,11 +36,11 @@ class Brief:
 
 
 class Outline(Brief):
-    """A dataclass shown by its fields: numbers and words as they are, arrays by their shape, parts by their name."""
+    """A result shown by what it holds: numbers and words as they are, arrays by their shape, parts by their name."""
 
     def facts(self) -> dict[str, str]:
-        """What a glance should tell (`Brief`); fields that hold nothing are left out."""
-        shown = {f.name: _outlined(getattr(self, f.name)) for f in fields(self) if f.repr}  # type: ignore[arg-type]
+        """What a glance should tell (`Brief`); what holds nothing is left out."""
+        shown = {name: _outlined(value) for name, value in vars(self).items()}
         return {name: text for name, text in shown.items() if text}
 
 

@@ -184,27 +184,17 @@ def _between(breaks: Sequence[float], time: Array, good: Mask) -> list[slice]:
 
 def _differentiated(trajectory: Trajectory, good: Mask) -> MeasuredMotion:
     """Without breaks. good : (n,) frames with a pose"""
-    time, status = np.asarray(trajectory.time, float), trajectory.frame_status
-    interval = float(np.median(np.diff(time)))
-    samples = _Samples(
-        ticks=(time - time[0]) / interval,
-        position=np.where(good[:, None], trajectory.q[:, :3], 0.0),
-        R=_filled(rotation_from_quaternion(trajectory.quaternion), good, np.nan),
-        covariance=np.where(good[:, None, None], trajectory.pose_covariance, 0.0),
-        # a pose from one camera depends on the rig in another way, and the jump must not be differentiated
-        sensitivity=_filled(trajectory.calibration_sensitivity, good & (status == FrameStatus.MEASURED), np.nan),
-        good=good,
-    )
+    samples = _Samples(trajectory, good)
     processes = _fit_groups(samples)
     state, R, covariance, sensitivity = _smoothed(samples, processes)
-    per_order = interval ** -np.arange(3.0)
+    per_order = samples.interval ** -np.arange(3.0)
     state *= per_order[:, None]
     scale = np.repeat(per_order, 6)
     covariance *= np.outer(scale, scale)
     sensitivity *= scale[:, None]
     _rates_of_turned_frame(sensitivity, state[:, 1, 3:], state[:, 2, 3:])
     return MeasuredMotion(
-        time=time,
+        time=np.asarray(trajectory.time, float),
         position=state[:, 0, :3],
         R_world_body=R,
         velocity=state[:, 1, :3],
@@ -215,7 +205,7 @@ def _differentiated(trajectory: Trajectory, good: Mask) -> MeasuredMotion:
         calibration_sensitivity=sensitivity,
         measured=good,
         euler=_euler_near(R, trajectory.q[:, 3:]),
-        length=np.stack([p.length for p in processes], axis=1) * interval,
+        length=np.stack([p.length for p in processes], axis=1) * samples.interval,
         noise_scale=np.array([p.noise_scale for p in processes]),
         disc=trajectory.disc,
         gravity=trajectory.gravity,
@@ -244,16 +234,21 @@ def _pace(trajectory: Trajectory) -> float:
     return float(np.sqrt(2 * np.nanmean(step**2))) / length
 
 
-@dataclass(frozen=True)
 class _Samples:
     """What is differentiated; time in frame intervals."""
 
-    ticks: Array  # (n,)
-    position: Array  # (n, 3), 0 where not measured
-    R: Array  # (n, 3, 3), in gaps that of the nearest frame: they have no weight
-    covariance: Array  # (n, 6, 6), 0 where not measured
-    sensitivity: Array  # (n, 6, 30)
-    good: Mask  # (n,)
+    def __init__(self, trajectory: Trajectory, good: Mask) -> None:
+        """Of frames (n,) with a pose: in gaps rotations are those of the nearest frame, without weight."""
+        time = np.asarray(trajectory.time, float)
+        self.interval = float(np.median(np.diff(time)))  # [s]
+        self.ticks = (time - time[0]) / self.interval
+        self.good = good
+        self.position = np.where(good[:, None], trajectory.q[:, :3], 0.0)
+        self.R = _filled(rotation_from_quaternion(trajectory.quaternion), good, np.nan)
+        self.covariance = np.where(good[:, None, None], trajectory.pose_covariance, 0.0)
+        # a pose from one camera depends on the rig in another way, and the jump must not be differentiated
+        by_both = good & (trajectory.frame_status == FrameStatus.MEASURED)
+        self.sensitivity = _filled(trajectory.calibration_sensitivity, by_both, np.nan)
 
     @property
     def variance(self) -> Array:

@@ -36,47 +36,6 @@ class Switch:
     after: Regime
 
 
-@dataclass(frozen=True, repr=False)
-class Motion(Outline):
-    """Motion of the disc at n times. Forces and moments are those of the table on the disc, in (n0, m0, k)."""
-
-    model: Model
-    time: Array  # (n,) [s]
-    q: Array  # (n, 6) x, y, z [m], psi, theta, phi [rad], not wrapped
-    qdot: Array  # (n, 6)
-    state: Array  # (n, 8) records.ROLLING_COMPONENTS
-    omega_world: Array  # (n, 3) [rad/s]
-    acceleration_world: Array  # (n, 3) of the geometric centre O [m/s^2]
-    angular_acceleration_world: Array  # (n, 3) [rad/s^2]
-    energy_translation: Array  # (n,) [J] kinetic, of the centre of mass
-    energy_rotation: Array  # (n,) [J] kinetic, about the centre of mass
-    energy_potential: Array  # (n,) [J] zero where the disc lies flat at the origin
-    contact_force: Array  # (n, 3) F_n, F_m, F_z [N]
-    contact_moment: Array  # (n, 3) M_n, M_m, M_z [N m]
-    external_force: Array  # (n, 3) X_n, X_m, X_z at O, and a field's at the centre of mass [N]; no gravity
-    slip_velocity: Array  # (n, 2) of the disc's material point at the contact, along n0, m0 [m/s]; zero when rolling
-    power: Array  # (n,) [W] of contact force, moments and external force: dE/dt
-    regime: NDArray[np.uint8]  # (n,) Regime
-    switches: tuple[Switch, ...]
-    end: EndReason
-    end_time: float  # [s]; not necessarily one of `time`
-    end_state: Array  # (8,), (10,) or (12,) records.STATE_COMPONENTS at end_time
-
-    def __len__(self) -> int:
-        return len(self.time)
-
-    @property
-    def energy(self) -> Array:
-        """(n,) total mechanical energy [J]."""
-        return self.energy_translation + self.energy_rotation + self.energy_potential
-
-    @property
-    def friction_needed(self) -> Array:
-        """(n,) |F_t| / F_z."""
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return np.hypot(self.contact_force[:, 0], self.contact_force[:, 1]) / self.contact_force[:, 2]
-
-
 @dataclass(frozen=True)
 class Path:
     """Solution over all regimes, at n times; numbers are complex where imaginary parts carry derivatives."""
@@ -120,52 +79,72 @@ def moment_power(now: Records, moment: Array) -> Array:
     return np.sum(moment * rates, axis=-1)
 
 
-def motion_of(model: Model, body: Records, path: Path) -> Motion:
-    """All quantities of a `Motion` from its path; `body` is a record (1,) of records.BODY."""
-    now, b = path.now, body[0]
-    q, qdot = path.as_seen
-    nodal = np.stack(nodal_axes_world(now["psi"], now["theta"]), axis=-1)  # nodal -> world
-    n0, k = nodal[:, :, 0], np.tile([0.0, 0.0, 1.0], (len(now), 1))
-    contact = np.stack([n0, np.cross(k, n0), k], axis=-1)  # contact axes -> world
-    omega = _turned(nodal, columns(now, "thetadot", "omega2", "omega3"))
-    R = rotation_from_euler(now["psi"], now["theta"], now["phi"])
-    com = R @ np.array([b["com_1"], b["com_2"], b["com_3"]])
-    J = np.array([[b[f"J_{min(i, j)}{max(i, j)}"] for j in (1, 2, 3)] for i in (1, 2, 3)])
-    omega_body = np.einsum("nji,nj->ni", R, omega)
-    v_G = qdot[:, :3] + np.cross(omega, com)
-    gravity = np.array([b["g_x"], b["g_y"], b["g_z"]])
-    force, slip = columns(now, "F_n", "F_m", "F_z"), columns(now, "slip_n", "slip_m")
-    moment = columns(now, "M_n", "M_m", "M_z") + columns(now, "load_n", "load_m", "load_z") * now["N"][:, None]
-    pull = b["mass"] * columns(now, "field_x", "field_y", "field_z")  # at the centre of mass, and not at O
-    at_O = columns(now, "X_n", "X_m", "X_z")
-    table_velocity, table_acceleration = (columns(now, *(f"table_{d}{a}" for a in "xyz")) for d in "va")
-    slip[path.regime == Regime.ROLLING] = 0.0
-    slips = path.regime == Regime.SLIPPING
-    power = moment_power(now, moment) + np.where(slips, np.sum(force[:, :2] * slip, axis=-1), 0.0)
-    power += np.sum(_turned(contact, at_O) * qdot[:, :3], axis=-1) + np.sum(pull * v_G, axis=-1)
-    return Motion(
-        model=model,
-        time=now["time"],
-        q=q,
-        qdot=qdot,
-        state=columns(now, *ROLLING_COMPONENTS),
-        omega_world=omega,
-        acceleration_world=_turned(contact, columns(now, "a_n", "a_m", "a_z")) + table_acceleration,
-        angular_acceleration_world=_turned(nodal, columns(now, "alpha_1", "alpha_2", "alpha_3")),
-        energy_translation=0.5 * b["mass"] * np.sum(v_G**2, axis=-1),
-        energy_rotation=0.5 * np.einsum("ni,ij,nj->n", omega_body, J, omega_body),
-        energy_potential=-b["mass"] * (q[:, :3] + com - [0, 0, b["half_thickness"] + b["com_3"]]) @ gravity,
-        contact_force=force,
-        contact_moment=moment,
-        external_force=at_O + _turned(np.swapaxes(contact, 1, 2), pull),
-        slip_velocity=slip,
-        power=power + np.sum(_turned(contact, force) * table_velocity, axis=-1),
-        regime=path.regime,
-        switches=tuple(path.switches),
-        end=path.end,
-        end_time=path.end_time.real,
-        end_state=path.end_state,
-    )
+class Motion(Outline):
+    """Motion of the disc at n times. Forces and moments are those of the table on the disc, in (n0, m0, k)."""
+
+    def __init__(self, model: Model, body: Records, path: Path) -> None:
+        """From a path; `body` is a record (1,) of records.BODY."""
+        now, b = path.now, body[0]
+        nodal = np.stack(nodal_axes_world(now["psi"], now["theta"]), axis=-1)  # nodal -> world
+        n0, k = nodal[:, :, 0], np.tile([0.0, 0.0, 1.0], (len(now), 1))
+        contact = np.stack([n0, np.cross(k, n0), k], axis=-1)  # contact axes -> world
+        table_velocity, table_acceleration = (columns(now, *(f"table_{d}{a}" for a in "xyz")) for d in "va")
+        self.model = model
+        self.time: Array = now["time"]  # (n,) [s]
+        self.q: Array
+        self.qdot: Array
+        self.q, self.qdot = path.as_seen  # (n, 6) x, y, z [m], psi, theta, phi [rad], not wrapped; and their rates
+        self.state: Array = columns(now, *ROLLING_COMPONENTS)  # (n, 8)
+        self.omega_world = _turned(nodal, columns(now, "thetadot", "omega2", "omega3"))  # (n, 3) [rad/s]
+        # (n, 3) of the geometric centre O [m/s^2]
+        self.acceleration_world = _turned(contact, columns(now, "a_n", "a_m", "a_z")) + table_acceleration
+        # (n, 3) [rad/s^2]
+        self.angular_acceleration_world = _turned(nodal, columns(now, "alpha_1", "alpha_2", "alpha_3"))
+        R = rotation_from_euler(now["psi"], now["theta"], now["phi"])
+        com = R @ np.array([b["com_1"], b["com_2"], b["com_3"]])
+        J = np.array([[b[f"J_{min(i, j)}{max(i, j)}"] for j in (1, 2, 3)] for i in (1, 2, 3)])
+        omega_body = np.einsum("nji,nj->ni", R, self.omega_world)
+        v_G = self.qdot[:, :3] + np.cross(self.omega_world, com)
+        gravity = np.array([b["g_x"], b["g_y"], b["g_z"]])
+        rise = self.q[:, :3] + com - [0, 0, b["half_thickness"] + b["com_3"]]
+        # (n,) [J] kinetic, of the centre of mass and about it; potential, zero where the disc lies flat at the origin
+        self.energy_translation: Array = 0.5 * b["mass"] * np.sum(v_G**2, axis=-1)
+        self.energy_rotation: Array = 0.5 * np.einsum("ni,ij,nj->n", omega_body, J, omega_body)
+        self.energy_potential: Array = -b["mass"] * rise @ gravity
+        self.contact_force: Array = columns(now, "F_n", "F_m", "F_z")  # (n, 3) [N]
+        by_load = columns(now, "load_n", "load_m", "load_z") * now["N"][:, None]
+        self.contact_moment: Array = columns(now, "M_n", "M_m", "M_z") + by_load  # (n, 3) [N m]
+        at_O, pull = columns(now, "X_n", "X_m", "X_z"), b["mass"] * columns(now, "field_x", "field_y", "field_z")
+        # (n, 3) [N] at O, and a field's at the centre of mass; no gravity
+        self.external_force: Array = at_O + _turned(np.swapaxes(contact, 1, 2), pull)
+        slip = columns(now, "slip_n", "slip_m")
+        slip[path.regime == Regime.ROLLING] = 0.0
+        self.slip_velocity: Array = slip  # (n, 2) of the disc's material point at the contact, along n0, m0 [m/s]
+        slips = path.regime == Regime.SLIPPING
+        by_slip = np.where(slips, np.sum(self.contact_force[:, :2] * slip, axis=-1), 0.0)
+        power = moment_power(now, self.contact_moment) + by_slip
+        power += np.sum(_turned(contact, at_O) * self.qdot[:, :3], axis=-1) + np.sum(pull * v_G, axis=-1)
+        # (n,) [W] of contact force, moments and external force: dE/dt
+        self.power: Array = power + np.sum(_turned(contact, self.contact_force) * table_velocity, axis=-1)
+        self.regime = path.regime  # (n,) Regime
+        self.switches = tuple(path.switches)
+        self.end = path.end
+        self.end_time = float(path.end_time.real)  # [s]; not necessarily one of `time`
+        self.end_state: Array = path.end_state  # (8,), (10,) or (12,) records.STATE_COMPONENTS at end_time
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    @property
+    def energy(self) -> Array:
+        """(n,) total mechanical energy [J]."""
+        return self.energy_translation + self.energy_rotation + self.energy_potential
+
+    @property
+    def friction_needed(self) -> Array:
+        """(n,) |F_t| / F_z."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.hypot(self.contact_force[:, 0], self.contact_force[:, 1]) / self.contact_force[:, 2]
 
 
 def _turned(axes: Array, vectors: Array) -> Array:

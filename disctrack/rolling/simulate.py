@@ -10,7 +10,7 @@ from disctrack.rolling._assembly import Assembly
 from disctrack.rolling.effects import ModelError
 from disctrack.rolling.equations import EVENTS, FLYING, ROLLING, SLIPPING, STICK_SPEED
 from disctrack.rolling.model import DEFAULT_THETA_END, Model
-from disctrack.rolling.motion import EndReason, Motion, Path, Switch, coordinates, motion_of
+from disctrack.rolling.motion import EndReason, Motion, Path, Switch, coordinates
 from disctrack.rolling.records import Records, Regime
 from disctrack.rolling.state import State
 
@@ -45,7 +45,7 @@ def simulate(
     """
     grid = _grid(duration, rate, times)
     assembly = Assembly(model, theta_end)
-    return motion_of(model, assembly.body, follow(assembly, _start(state, theta_end), grid, rtol))
+    return Motion(model, assembly.body, follow(assembly, _start(state, theta_end), grid, rtol))
 
 
 def _grid(duration: float | None, rate: float, times: ArrayLike | None) -> Array:

@@ -1,7 +1,6 @@
 """Images of the disc and of the chessboard before the table, as the pair of cameras takes them."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -20,22 +19,21 @@ from disctrack.synthetic.sensor import digitise, hot_pixels, sensor_pattern
 PoseOverExposure = Callable[[Array], Array]  # (k,) times [s] from mid exposure -> (k, 6) q
 
 
-@dataclass(frozen=True)
 class Stage:
     """One camera and all that stands still before it, computed once."""
 
-    name: str
-    view: View
-    s: int
-    pad: int
-    weights: Array32
-    rays: Array
-    cells: Array32  # table in the cells of the padded image
-    table: Array32  # (height, width) blurred table, before lamp and vignetting
-    factor: Array32
-    glare: Array32
-    pattern: Callable[[Array32], Array32]
-    hot: Array32 | None
+    def __init__(self, index: int, view: View, scene: Scene) -> None:
+        """Of the camera of this number, and of the sections of the scene that say how it looks."""
+        sigma, size = scene.optics.blur_px[index], view.camera.image_size
+        self.name, self.view, self.s = CAMERAS[index], view, scene.render.subpixels
+        self.pad, self.weights = optics.blur_reach(sigma), optics.blur_weights(sigma, self.s)
+        self.rays = optics.lens_rays(view.camera, self.pad, scene.imperfections.lens_field_px, [scene.seed, 9, index])
+        self.cells = optics.table_cells(view, self.pad, self.s, scene)  # table in the cells of the padded image
+        # (height, width) blurred table, before lamp and vignetting
+        self.table = optics.blur_to_pixels(self.cells, self.weights, self.s)
+        self.factor, self.glare = optics.illumination(view, self.name, scene)
+        self.pattern = sensor_pattern(scene.imperfections, size, [scene.seed, 10, index])
+        self.hot = hot_pixels(scene.sensor, size, np.random.default_rng([scene.seed, 5, index]))
 
     def finish(self, irradiance: Array32) -> Array32:
         """Lamp, vignetting and glare on a blurred image, as a sensor with its pattern has it."""
@@ -58,25 +56,7 @@ def stages(rig: StereoRig, scene: Scene) -> tuple[Stage, ...]:
 
 @lru_cache(maxsize=4)
 def _stage(index: int, camera: Camera, R: bytes, t: bytes, scene: Scene) -> Stage:
-    view = View(camera, np.frombuffer(R).reshape(3, 3), np.frombuffer(t))
-    sigma, s = scene.optics.blur_px[index], scene.render.subpixels
-    pad, weights = optics.blur_reach(sigma), optics.blur_weights(sigma, s)
-    cells = optics.table_cells(view, pad, s, scene)
-    factor, glare = optics.illumination(view, CAMERAS[index], scene)
-    return Stage(
-        name=CAMERAS[index],
-        view=view,
-        s=s,
-        pad=pad,
-        weights=weights,
-        rays=optics.lens_rays(camera, pad, scene.imperfections.lens_field_px, [scene.seed, 9, index]),
-        cells=cells,
-        table=optics.blur_to_pixels(cells, weights, s),
-        factor=factor,
-        glare=glare,
-        pattern=sensor_pattern(scene.imperfections, camera.image_size, [scene.seed, 10, index]),
-        hot=hot_pixels(scene.sensor, camera.image_size, np.random.default_rng([scene.seed, 5, index])),
-    )
+    return Stage(index, View(camera, np.frombuffer(R).reshape(3, 3), np.frombuffer(t)), scene)
 
 
 def expected_disc_image(
