@@ -4,13 +4,11 @@ from importlib.resources import files
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import stdtr
 
 from calibration.kit.arrays import Array
 
 EXPONENTS = ("n_energy", "n_theta", "n_psidot")
 PREDICTED = (2 / 3, 2 / 3, -1 / 3)  # a rolling moment proportional to psidot^2, thin disc, slow precession
-SURFACES = ("steel", "glass")
 
 
 def published_table(surface: str) -> tuple[NDArray, NDArray]:
@@ -27,10 +25,3 @@ def published_table(surface: str) -> tuple[NDArray, NDArray]:
 def exponents_of(trials: NDArray) -> Array:
     """(n, 3) in the order of EXPONENTS."""
     return np.stack([trials[name] for name in EXPONENTS], axis=-1)
-
-
-def agreement(exponents: Array) -> tuple[Array, Array]:
-    """Student's t (3,) of the mean of each exponent against 2/3, 2/3, -1/3, and its two-sided p value (3,)."""
-    n = len(exponents)
-    t = (exponents.mean(axis=0) - PREDICTED) / (exponents.std(axis=0, ddof=1) / np.sqrt(n))
-    return t, 2 * stdtr(n - 1, -np.abs(t))

@@ -11,9 +11,8 @@ import numpy as np
 from disctrack.analyse.analysis import Analysis
 from disctrack.analyse.power_laws import MODEL_EXPONENTS, Exponent, PowerLaws
 from disctrack.analyse.propagation import DerivedSeries
-from disctrack.analyse.published import SURFACES, agreement, exponents_of, published_table
 from disctrack.findings import Finding
-from disctrack.numbers import Measured, measured, probability, unit_text
+from disctrack.numbers import Measured, measured, unit_text
 from disctrack.report.blocks import Cell, Figures, Listing, Report, Section, Text
 from disctrack.trajectory import FrameStatus
 from disctrack.trajectory.file import Provenance
@@ -61,7 +60,7 @@ def report_of(
             section("Motion", ("04", "05", "06", "07", "10", "11"), _instants_table(analysis)),
             section("Contact", ("08", "09")),
             section("Energy", ("12", "13")),
-            section("Scaling laws of the last stage", ("14", "15", "16"), *_exponents(analysis), *_published_tables()),
+            section("Scaling laws of the last stage", ("14", "15", "16"), *_exponents(analysis)),
             Section("Method", [_method(analysis, provenance)]),
         ],
         files=files,
@@ -199,29 +198,6 @@ def _windows_table(fits: Sequence[PowerLaws]) -> Listing:
     caption = "As the paper's tables 2 and 3, this recording, for several windows (value ± 1 σ)."
     different = list(dict.fromkeys(rows))  # windows longer than the recording repeat each other
     return Listing(("t_f - t (s)", "n_E", "n_θ", "n_ψ̇", "t_f (s)"), different, caption)
-
-
-def _published_tables() -> list[Listing]:
-    tables = []
-    for surface in SURFACES:
-        trials, printed = published_table(surface)
-        exponents = exponents_of(trials)
-        shown = [[f"{e:.4f}" for e in n] for n in (*exponents, exponents.mean(axis=0), exponents_of(printed))]
-        heads = [
-            *((row["case"], str(row["trial"])) for row in trials),
-            ("mean, recomputed", ""),
-            ("mean, as printed", ""),
-        ]
-        t_f = [*(f"{row['t_f']:.3f}" for row in trials), "", ""]
-        rows = [(*head, *n, at) for head, n, at in zip(heads, shown, t_f, strict=True)]
-        against = zip(*agreement(exponents), strict=True)
-        rows.append(
-            ("Student's t against 2/3, 2/3, -1/3", "", *(f"{t:.1f} (p {probability(p)})" for t, p in against), "")
-        )
-        caption = f"Ma et al. 2014, disc on {surface}."
-        header = ("case", "trial", "n_E", "n_θ", "n_ψ̇", "t_f (s)")
-        tables.append(Listing(header, rows, caption, folded=f"Published exponents on {surface}"))
-    return tables
 
 
 def _method(analysis: Analysis, provenance: Provenance) -> Listing:

@@ -204,8 +204,6 @@ def test_report_says_what_was_found(reported):
     assert "rolls without slip from the first frame" in page
     assert "6 of 1200 frames have no pose" in page
     assert "rolling &lt;down&gt;" in page  # names are not taken for markup
-    assert "0.6680" in page  # the recomputed average of the published table
-    assert "0.6872" in page  # and the printed one
     references = re.findall(r'(?:src|href)="([^"]{0,40})', page)
     assert references
     assert all(text.startswith("data:image/") for text in references)  # the links of pages are another matter
