@@ -1,15 +1,19 @@
 """JSON as every file of ours has it: no NaN, no infinity, no NumPy."""
 
 import json
+from dataclasses import is_dataclass
 from typing import Any
 
 import numpy as np
 
 
 def plain(item: Any) -> Any:
-    """The item of JSON's types: null for a number that is not finite, lists for tuples and arrays, text for keys."""
-    if isinstance(item, dict):
-        return {str(key): plain(value) for key, value in item.items()}
+    """The item of JSON's types: null for a number that is not finite, lists for tuples and arrays, text for keys.
+
+    Of a dataclass, its fields by their names.
+    """
+    if isinstance(item, dict) or is_dataclass(item):
+        return {str(key): plain(value) for key, value in (item if isinstance(item, dict) else vars(item)).items()}
     if isinstance(item, list | tuple):
         return [plain(value) for value in item]
     if isinstance(item, np.ndarray | np.generic):

@@ -4,7 +4,6 @@ The measured trajectory with hidden effects (`hidden`), which does not tell of t
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from time import perf_counter
 
 import numpy as np
@@ -21,24 +20,33 @@ AT_NOISE, HELD_OUT = 1.1, 1.2  # reduced chi-square, free run over its floor
 LEVELS = (0.5, 0.2, 0.05, 0.01, 0.005)
 
 
-@dataclass(frozen=True)
 class Verdict:
     """What became of one case."""
 
-    case: HiddenCase
-    n: int  # frames
-    verdict: str
-    found: tuple[str, ...]  # every effect claimed, its class after it in brackets
-    named: bool  # every hidden effect is among those claimed, or in the class of one
-    pull: float  # largest error of a coefficient in its sigmas; NaN where it is not named
-    extra: int  # claims beyond those hidden
-    chi_square: tuple[float, float]  # reduced, before and after
-    free_run: tuple[float, float]  # over its floor, before and after
-    gain: float  # of chi-square by all effects claimed
-    p_value: float  # that noise alone would let some effect gain as much as the best one does; NaN: not known
-    seconds: float
-    stands_out: float  # of the hidden effects the least, in sigmas, with all others fitted beside it; NaN: not known
-    needed: float  # sigmas that a claim takes
+    def __init__(
+        self, case: HiddenCase, parts: Sequence[Planted], n: int, result: DiscDiagnosis, seconds: float
+    ) -> None:
+        """Compare what was planted, one by one, with what the diagnosis of n frames claims."""
+        d, nan = result.diagnosis, float("nan")
+        pulls = [_pull_of(result, p) for p in parts]
+        left = [(e.reduced_chi_square, e.ratio_to_floor) for e in (result.before, result.after) if e] or [(nan, nan)]
+        self.case, self.n, self.verdict, self.seconds = case, n, d.verdict, seconds
+        # every effect claimed, its class after it in brackets
+        self.found = tuple(
+            _with_class(f.candidate.name, [r.candidate.name for r in f.cannot_be_told_from]) for f in d.found
+        )
+        self.named = None not in pulls  # every hidden effect is among those claimed, or in the class of one
+        # largest error of a coefficient in its sigmas; NaN where it is not named
+        self.pull = max((p for p in pulls if p is not None), default=nan)
+        self.extra = max(len(d.found) - len(parts), 0)  # claims beyond those hidden
+        self.chi_square = left[0][0], left[-1][0]  # reduced, before and after
+        self.free_run = left[0][1], left[-1][1]  # over its floor, before and after
+        self.gain = (d.before.cost - d.after.cost) / d.noise  # of chi-square by all effects claimed
+        # that noise alone would let some effect gain as much as the best one does; NaN: not known
+        self.p_value = d.chance.p_value if d.chance else nan
+        # of the hidden effects the least, in sigmas, with all others fitted beside it (NaN: not known); and what a
+        # claim takes
+        self.stands_out, self.needed = _standing_out(result, parts)
 
     @property
     def can_be_told(self) -> bool:
@@ -71,26 +79,7 @@ def hide(case: HiddenCase) -> Verdict:
     began = perf_counter()
     result = diagnose(trajectory)
     seconds = perf_counter() - began
-    stands_out, needed = _standing_out(result, parts)
-    pulls = [_pull_of(result, p) for p in parts]
-    d, nan = result.diagnosis, float("nan")
-    left = [(e.reduced_chi_square, e.ratio_to_floor) for e in (result.before, result.after) if e] or [(nan, nan)]
-    return Verdict(
-        case,
-        len(trajectory),
-        d.verdict,
-        tuple(_with_class(f.candidate.name, [r.candidate.name for r in f.cannot_be_told_from]) for f in d.found),
-        named=None not in pulls,
-        pull=max((p for p in pulls if p is not None), default=nan),
-        extra=max(len(d.found) - len(parts), 0),
-        chi_square=(left[0][0], left[-1][0]),
-        free_run=(left[0][1], left[-1][1]),
-        gain=(d.before.cost - d.after.cost) / d.noise,
-        p_value=d.chance.p_value if d.chance else nan,
-        seconds=seconds,
-        stands_out=stands_out,
-        needed=needed,
-    )
+    return Verdict(case, parts, len(trajectory), result, seconds)
 
 
 def _with_class(name: str, others: Sequence[str]) -> str:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from datetime import date
 from multiprocessing import get_context
 from pathlib import Path
@@ -50,7 +50,7 @@ class Validation:
     name: str
     headline: str
     tables: Sequence[Table]
-    outcomes: Sequence[object]  # dataclasses: one for each case, or sums over them
+    outcomes: Sequence[object]  # one for each case, or sums over them
     complaints: Sequence[str] = ()  # what a validation must not show
     remarks: Sequence[str] = ()  # what a reader should look at
 
@@ -78,7 +78,7 @@ def write_validation(folder: Path, validation: Validation) -> list[Path]:
     files = [folder / f"{validation.name}.md", folder / f"{validation.name}.json"]
     write_whole(files[0], validation.markdown().encode())
     tree = {"units": "SI, radians", "headline": validation.headline, "complaints": validation.complaints}
-    outcomes = [asdict(outcome) for outcome in validation.outcomes]  # type: ignore[call-overload]
+    outcomes = [vars(outcome) for outcome in validation.outcomes]
     write_whole(files[1], json_file(tree | {"outcomes": outcomes}))
     return files
 

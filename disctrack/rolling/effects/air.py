@@ -25,7 +25,6 @@ def air(body: Record, p: Record) -> None:
     "Moffatt 2000, Nature 404:833; mu = 1.81e-5 Pa s",
     EffectParameter("f", "1", 1.0, "factor on the lubrication layer", lower=0.0),
     belongs_to=("air",),
-    counter_rotating=True,  # reads psidot, works on phidot
 )
 def air_moffatt(p: Record, s: Record, w: Record) -> None:
     """Viscous air layer under the disc: power pi mu g r^2 / theta^2 on the adiabatic manifold."""
@@ -38,7 +37,6 @@ def air_moffatt(p: Record, s: Record, w: Record) -> None:
     "Bildsten 2002, Phys. Rev. E 66:056309; rho as declared",
     EffectParameter("beta", "1", 1.0, "factor of order one", lower=0.0),
     belongs_to=("air",),
-    counter_rotating=True,
 )
 def air_bildsten(p: Record, s: Record, w: Record) -> None:
     """Boundary layers on disc and table that are thinner than the gap: theta above about 0.5 deg."""

@@ -69,8 +69,9 @@ class Effect:
     title: ClassVar[str]
     source: ClassVar[str]
     parameters: ClassVar[tuple[EffectParameter, ...]]
-    passive: ClassVar[bool] = True  # its power is never positive ...
-    counter_rotating: ClassVar[bool] = False  # ... provided that psidot phidot < 0, as in every rolling down
+    passive: ClassVar[bool] = (
+        True  # its power is never positive; of laws in psidot if psidot phidot < 0, as in rolling down
+    )
     airborne: ClassVar[bool] = False  # acts also without contact
     sought: ClassVar[bool] = False  # the first shape among its parameters may lie anywhere: an angle, a frequency
     candidate: ClassVar[bool] = True  # may be proposed as an explanation; False for tools

@@ -10,7 +10,6 @@ from disctrack.rolling.records import Record
     "rolling friction on the precession, M_m = -k_m F_z psidot |psidot|",
     "Ma et al. 2014, (5.4); 0.381e-7 on steel, 0.28e-7 on glass",
     EffectParameter("k_m", "m s^2", 0.381e-7, "lever arm per squared precession rate", lower=0.0),
-    counter_rotating=True,  # reads psidot, works on phidot
 )
 def km(p: Record, s: Record, w: Record) -> None:
     """M_m = -k_m F_z psidot |psidot|: rolling friction growing with the square of the precession rate."""
@@ -44,7 +43,6 @@ def kn(p: Record, s: Record, w: Record) -> None:
     "generalises Ma et al. 2014, (5.4): p = 2, k = 1e4 k_m",
     EffectParameter("k", "m", 1e-4, "lever arm at 100 rad/s", lower=0.0),
     EffectParameter("p", "1", 1.5, "exponent of the precession rate", lower=0.0, upper=4.0, is_shape=True),
-    counter_rotating=True,
 )
 def rolling_power(p: Record, s: Record, w: Record) -> None:
     """M_m = -k F_z (|psidot| / 100 rad/s)^p sgn(psidot): the paper's law with a free exponent."""
