@@ -56,10 +56,7 @@ BY_SCALE = (Kind.DOTS_MISPLACED, Kind.RADIUS, Kind.THICKNESS, Kind.BOARD_THICKNE
 SIDE_TOLERANCE = 0.06  # of a length: beyond, dots that were printed to another scale would have another size, too
 RISE = 0.03  # of the radius: a rounded or bevelled edge of a millimetre
 MIN_LEAN = np.radians(2.0)  # of a plane: boards and tables lean by less
-MIN_ROUND = 2.0  # [rad] of precession
 SEEN_RARELY = 0.1  # share of the images
-MIN_DOTS_LEFT = 4  # that are seen
-DENSITIES = 50.0, 23e3  # [kg/m^3] a hard foam's, and osmium's
 MOST_HEIGHT = 3e-3  # [m] of the rim's plane from the foot of a board that lies on it, its thickness wrong or not
 CLAIM_POSITION = 5e-6  # [m] the accuracy that is claimed: Ma et al. 2014, end of section 3
 LAB_FRAME = 20e-6  # [m] to which it is known where a board on a table lies, with no particular care
@@ -320,7 +317,7 @@ def _radius_suspected(trajectory: Trajectory, ratio: float, height: float | None
 def density(disc: Disc) -> tuple[Finding, ...]:
     """A disc lighter than a hard foam or heavier than osmium: mass, radius or thickness is in another unit."""
     found = disc.mass / (2 * np.pi * disc.radius**2 * disc.half_thickness)
-    if DENSITIES[0] < found < DENSITIES[1]:
+    if 50.0 < found < 23e3:
         return ()
     sizes = {"mass_g": disc.mass, "radius_mm": disc.radius, "thickness_mm": 2 * disc.half_thickness}
     remedies = tuple(Remedy(f"[disc] {key}", declared=f"{1e3 * size:g}") for key, size in sizes.items())
@@ -406,7 +403,7 @@ def another_plane(trajectory: Trajectory, boards: Boards | None = None) -> tuple
         weight = _doubting(gap)
     side, ahead = np.linalg.svd(normal[None])[2][1:] @ e3.T
     turned, precessed = np.arccos(np.clip(normal[2], -1, 1)), np.ptp(np.unwrap(np.arctan2(ahead, side)))
-    rolls = precessed > MIN_ROUND and np.median(e3 @ normal) < np.cos(THETA_RANGE[0])
+    rolls = precessed > 2.0 and np.median(e3 @ normal) < np.cos(THETA_RANGE[0])
     if not (rolls and turned > MIN_LEAN and robust_sigma(gap) < SIGMAS * LAB_FRAME):
         return ()
     lies = None if boards is None else _view_on_plane(trajectory.rig, boards, normal, middle)
@@ -539,7 +536,7 @@ def unseen_dots(trajectory: Trajectory, declared: Disc) -> tuple[Finding, ...]:
     found = []
     rest = replace(declared, marker_centres_body=declared.marker_centres_body[share >= SEEN_RARELY])
     # three dots fit nearly anything; those of a symmetric layout do not tell how far the disc has turned
-    spoils = rest.n_markers < MIN_DOTS_LEFT or symmetry_order(rest) > symmetry_order(declared)
+    spoils = rest.n_markers < 4 or symmetry_order(rest) > symmetry_order(declared)
     for dot in np.flatnonzero(share < SEEN_RARELY) if (share > 0.5).sum() >= 3 else ():
         kinds, counts = np.unique(status[:, :, dot], return_counts=True)
         reason = MarkerStatus(int(kinds[counts.argmax()])).name.lower().replace("_", " ")

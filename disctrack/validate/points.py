@@ -33,8 +33,6 @@ Motion = Callable[[Array], Array]  # instants (k,) [s] -> coordinates q (k, 6)
 SIGMA_PX = 0.006  # of a dot's centre: 0.5 um and 1.3 mdeg per pose, as in the reference recordings
 CORNER_SIGMA_PX = 0.01
 STATION = 0.002  # [s] after the motion's first instant at which the first frame is taken
-_RADII, _ANGLES = 4, 16  # points of a dot over which the centre of its image is taken
-_INSTANTS = 4  # of an exposure: Gauss-Legendre, exact to the seventh power of time
 
 
 @dataclass(frozen=True)
@@ -153,7 +151,8 @@ def _rolling(scene: Scene, psi: float, phi: float) -> Motion:
 def _exposed(motion: Motion, times: Array, faults: Faults, rig: StereoRig, disc: Disc) -> Array:
     """Images of the dots (n, 2, m, 2), averaged over the exposure."""
     exposure, share = faults.exposure_s, faults.ellipse_centre_share
-    nodes, weights = np.polynomial.legendre.leggauss(_INSTANTS) if exposure else (np.zeros(1), np.array([2.0]))
+    # exact to the seventh power of time
+    nodes, weights = np.polynomial.legendre.leggauss(4) if exposure else (np.zeros(1), np.array([2.0]))
     images = 0.0
     for node, weight in zip(nodes, weights, strict=True):
         q = motion(times + 0.5 * node * exposure)
@@ -167,10 +166,10 @@ def _exposed(motion: Motion, times: Array, faults: Faults, rig: StereoRig, disc:
 
 def _image_centres(R: Array, t: Array, rig: StereoRig, disc: Disc) -> Array:
     """Centres of the areas that the dots' images cover (n, 2, m, 2), by quadrature over the dots."""
-    nodes, weights = np.polynomial.legendre.leggauss(_RADII)
-    radii, angles = 0.25 * disc.marker_diameter * (1 + nodes), 2 * np.pi * np.arange(_ANGLES) / _ANGLES
+    nodes, weights = np.polynomial.legendre.leggauss(4)
+    radii, angles = 0.25 * disc.marker_diameter * (1 + nodes), np.radians(np.arange(0.0, 360.0, 22.5))
     r, a = (grid.ravel() for grid in np.meshgrid(radii, angles, indexing="ij"))
-    weight = np.repeat(weights * radii, _ANGLES)
+    weight = np.repeat(weights * radii, len(angles))
     found = []
     for centre in disc.marker_centres_body:
         body = centre + np.stack([r * np.cos(a), r * np.sin(a), np.zeros(r.size)], axis=-1)
