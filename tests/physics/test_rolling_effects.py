@@ -9,7 +9,6 @@ from disctrack.disc import MA_2014
 from disctrack.errors import ArgumentError
 from disctrack.rolling import (
     CATALOGUE,
-    Effect,
     EffectParameter,
     Model,
     ModelError,
@@ -23,8 +22,6 @@ from disctrack.rolling.evaluate import effect_power, effect_wrench, kinematics
 
 MOVES_THE_TABLE = ("table_shaken", "table_settles")  # and exerts nothing in its axes
 LAWS = [name for name, effect in CATALOGUE.items() if effect.law is not None and name not in MOVES_THE_TABLE]
-
-
 COUNTER_ROTATING = ("km", "rolling_power", "air_moffatt", "air_bildsten")  # they read psidot and work on phidot
 
 
@@ -138,6 +135,10 @@ def test_a_new_effect_is_one_small_function():
         del CATALOGUE["test_magnet"]
 
 
+def km(p, s, w):
+    w.M_m -= s.psidot
+
+
 def simulated(theta=0.3, effects=(), times=(0.0, 0.01), **state):
     return rolling.simulate(Model(MA_2014, effects=effects), State(theta=theta, omega2=5.0, **state), times=times)
 
@@ -149,7 +150,7 @@ def simulated(theta=0.3, effects=(), times=(0.0, 0.01), **state):
         (lambda: Model(MA_2014).with_values({"km.mu": 1.0}), "no parameter; effect 'km' has k_m"),
         (lambda: Model(MA_2014).with_values({"kx.mu": 1.0}), "there is no effect 'kx'"),
         (lambda: simulated(effects=(CATALOGUE["km"](), CATALOGUE["km"]())), "twice"),
-        (lambda: type("Other", (Effect,), {"name": "km", "parameters": ()}), "two effects are called 'km'"),
+        (lambda: effect("another", "this test")(km), "two effects are called 'km'"),
         (lambda: simulated(v_x=1.0), "the state has v_x: give none for rolling"),
         (lambda: simulated(z=0.1, v_z=0.0), "the state has z, v_z: give none for rolling"),
         (lambda: simulated(v_x=0.0, v_y=0.0, z=0.1), "the state has v_x, v_y, z: give none for rolling"),

@@ -82,15 +82,6 @@ class Effect:
     formulas: ClassVar[dict[str, str] | None] = None  # of an effect written as formulas (effects.learned)
     adjust: ClassVar[Any] = None  # static method adjust(body, p), or None
 
-    def __init_subclass__(cls) -> None:
-        if cls.formulas is not None:  # what one recording taught is no candidate for the next one
-            return
-        if cls.name in CATALOGUE:
-            places = [f"{kind.__module__}.{kind.__qualname__}" for kind in (CATALOGUE[cls.name], cls)]
-            if places[0] != places[1]:
-                raise ModelError(f"two effects are called '{cls.name}': {', '.join(places)}")
-        CATALOGUE[cls.name] = cls
-
     def __init__(self, **values: float) -> None:
         """Values by parameter name, in the parameter's unit; those not given take their nominal value."""
         known = [p.name for p in self.parameters]
@@ -133,9 +124,9 @@ def effect(title: str, source: str, *parameters: EffectParameter, **traits: Any)
     """Make a law (p, s, w) or an adjustment (body, p) an effect of the catalogue; traits: fields of `Effect`."""
 
     def entered(function: Any) -> type[Effect]:
-        adjusts = function.__code__.co_argcount == 2
+        name, adjusts = function.__name__, function.__code__.co_argcount == 2
         members = {
-            "name": function.__name__,
+            "name": name,
             "title": title,
             "source": source,
             "parameters": parameters,
@@ -144,7 +135,11 @@ def effect(title: str, source: str, *parameters: EffectParameter, **traits: Any)
             "adjust" if adjusts else "law": staticmethod(function),
         }
         own = {"__doc__": function.__doc__, "__module__": function.__module__}
-        return type(function.__name__, (Effect,), own | members | traits)
+        modules = {function.__module__, CATALOGUE[name].__module__} if name in CATALOGUE else ""
+        if len(modules) > 1:
+            raise ModelError(f"two effects are called '{name}': in {' and '.join(sorted(modules))}")
+        CATALOGUE[name] = type(name, (Effect,), own | members | traits)
+        return CATALOGUE[name]
 
     return entered
 
