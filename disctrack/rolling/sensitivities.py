@@ -4,6 +4,11 @@ Each column is one more run of the same compiled integrator with an imaginary pa
 derivative): no difference is taken, and the way in which the instants of the switches between rolling, slip and flight
 move is included. Columns that follow from a symmetry of the model are written down: where nothing tells one place or
 direction of the table, or one angle of the body from another, a motion that begins elsewhere is the same motion there.
+
+From those by the state follow first-order responses of a rolling motion to any moment and force, without another run:
+with the fundamental matrix Phi(t) = dy(t)/dy(0) of the state and B(t), what a unit of moment or force adds to its rate,
+a small wrench f(t) moves the state by Phi(t) times the integral of Phi(s)^-1 B(s) f(s) ds (variation of constants). So
+hundreds of laws can be asked for what each would do, for the price of some sums.
 """
 
 from collections.abc import Iterator, Sequence
@@ -12,19 +17,24 @@ from types import CodeType
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.integrate import cumulative_simpson
 
 from calibration.kit.arrays import Array, Numbers
 from disctrack.disc import MA_2014
 from disctrack.frames import COORDINATES
 from disctrack.rolling._assembly import Assembly
 from disctrack.rolling._compiled import compile_law
+from disctrack.rolling.effects import effect_from_formulas
 from disctrack.rolling.effects.base import CATALOGUE, HELPERS
+from disctrack.rolling.equations import ROLLING
 from disctrack.rolling.model import DEFAULT_THETA_END, Model
 from disctrack.rolling.motion import EndReason, Path, columns
 from disctrack.rolling.records import ROLLING_COMPONENTS, STATE_COMPONENTS
-from disctrack.rolling.simulate import MAX_SWITCHES, MOST_STEPS, RTOL, _grid, _start, follow
+from disctrack.rolling.simulate import MAX_SWITCHES, MOST_STEPS, RTOL, _grid, _start, follow, simulate
 from disctrack.rolling.state import State, steady_precession
 
+COMPONENTS = ("M_n", "M_m", "M_z", "X_n", "X_m", "X_z")  # of a moment and a force that responses are asked for
+_PROBE = effect_from_formulas("probe", {c: f"{c}_given" for c in COMPONENTS})
 _SEED = 1e-30  # imaginary part; its square is far below the smallest rounding
 _ASKEW = ("com_1", "com_2", "J_12", "J_13", "J_23")  # of a body that is not the same all round its axis
 # What a law reads that tells one direction of the table from another.
@@ -131,6 +141,45 @@ def _names(code: CodeType) -> Iterator[str]:
     for inside in code.co_consts:
         if isinstance(inside, CodeType):
             yield from _names(inside)
+
+
+@dataclass(frozen=True)
+class Responses:
+    """Of a motion that rolls all the time; N instants, (nearly) equally far apart."""
+
+    time: Array  # (N,) [s]
+    q: Array  # (N, 6)
+    qdot: Array  # (N, 6)
+    kernel: Array  # (N, 8, 6) Phi^-1 B by COMPONENTS, per N m and per N
+
+    def of(self, courses: Array) -> Array:
+        """(N, 8, p) displacement of the initial state that stands for what wrenches (N, 6, p) have done up to then.
+
+        The state itself has moved by Phi times this; so has every prediction by its derivative by the initial state.
+        """
+        per_instant = self.kernel * np.gradient(self.time)[:, None, None]
+        return np.asarray(cumulative_simpson(np.einsum("nkc,ncp->nkp", per_instant, courses), axis=0, initial=0.0))
+
+
+def responses(model: Model, state: State, times: Array, theta_end: float = DEFAULT_THETA_END) -> Responses | None:
+    """Responses along the motion from `state` at times[0]; None where it does not roll over all of the times."""
+    motion = simulate(model, state, times=times, theta_end=theta_end, rtol=RTOL)
+    if len(motion) < len(times) or np.any(motion.regime != ROLLING):
+        return None
+    found = sensitivities(model, state, times, (), ROLLING_COMPONENTS, theta_end)
+    if not np.isfinite(found.dq).all():
+        return None
+    kernel = np.asarray(np.linalg.solve(found.dstate, _per_wrench(model, motion.state, times)), float)
+    return Responses(times, found.q, found.qdot, kernel)
+
+
+def _per_wrench(model: Model, states: Array, times: Array) -> Array:
+    """(N, 8, 6) derivative of the state's rate by moment and force, on which it depends linearly."""
+    rates = []
+    for row in np.vstack([np.zeros(len(COMPONENTS)), np.eye(len(COMPONENTS))]):
+        probe = _PROBE(**{f"{c}_given": x for c, x in zip(COMPONENTS, row, strict=True)})
+        rates.append(Assembly(model.with_effects(probe), DEFAULT_THETA_END).at(ROLLING, times, states)[0])
+    return np.asarray(np.stack(rates[1:], axis=-1) - rates[0][..., None], float)
 
 
 def prepare() -> None:
