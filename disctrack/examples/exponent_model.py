@@ -34,7 +34,7 @@ class Series:
     longest: float  # [s] longest time left in the fit
     start: float  # [rad] nutation at which the simulation begins
     disc: Disc = MA_2014
-    exponents: Array = field(default_factory=lambda: np.zeros((0, 3)))  # (n, 3) `published.EXPONENTS`
+    exponents: Array = field(default_factory=lambda: np.zeros((0, 3)))  # (n, 3) of energy, nutation and precession rate
     ln_duration: float = np.nan  # of the last stage, from that nutation on
 
 
@@ -74,7 +74,7 @@ class LastStage:
         self.curve = CubicSpline(motion.time[:n], curves[:n], axis=0, extrapolate=False) if ended else None
 
     def outcomes(self, reading: Mapping[str, float] = NO_ERRORS) -> Array:
-        """(4,) `published.EXPONENTS` and ln duration as the experimenter has them; NaN where no collapse is seen."""
+        """(4,) The exponents and ln duration as the experimenter has them; NaN where no collapse is seen."""
         if self.curve is None:
             return np.full(4, np.nan)
         wrong, disc = {**NO_ERRORS, **reading}, self.series.disc

@@ -16,12 +16,13 @@ has nothing to say to them.
 
 from collections.abc import Sequence
 from dataclasses import replace
+from importlib.resources import files
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import stats
 
 from calibration.kit.arrays import Array
-from disctrack.analyse.published import EXPONENTS, PREDICTED, exponents_of, published_table
 from disctrack.diagnosis.motion import motion_candidates
 from disctrack.disc import MA_2014
 from disctrack.discrepancy.fit import Fit
@@ -34,7 +35,8 @@ from disctrack.numbers import measured, rounded, score
 from disctrack.report.blocks import Listing, Section
 from disctrack.rolling import Model, effects
 
-THIN_DISC = np.array(PREDICTED)
+EXPONENTS = ("n_energy", "n_theta", "n_psidot")
+THIN_DISC = np.array([2 / 3, 2 / 3, -1 / 3])  # a rolling moment proportional to psidot^2, slow precession
 SETTINGS = Settings(noise=1.0, shortlist=12, max_effects=2)  # the trials' own scatter is the noise
 DURATION_SIGMA = 0.03  # of ln duration: simulation and measurement of figures 17 and 18 end within 50 ms of 1.5 s
 SPIN = "state.omega3"  # at the start of the last stage; each series has its own
@@ -44,6 +46,22 @@ SPIN_SIGMA = 2.0  # [rad/s]: the centre then runs on a circle of 1 mm
 TRIALS = {"steel": (0.381e-7, 0.5), "glass": (0.28e-7, 0.3)}
 LAST_STAGE = 1.5  # [s] simulated in section 5c
 STEP = 0.1  # of a quantity's scale, for differences: the simulation is smooth to 1e-8
+
+
+def published_table(surface: str) -> tuple[NDArray, NDArray]:
+    """Trials of table 2 (steel) or 3 (glass), and the printed average, which is not theirs for n_energy on steel.
+
+    Records with case, trial, t_f [s] and EXPONENTS; the average has no trial and no t_f
+    """
+    with files(__package__).joinpath("ma2014_exponents.csv").open(encoding="utf-8") as file:
+        rows = np.genfromtxt(file, delimiter=",", names=True, dtype=None, encoding="utf-8", skip_header=2)
+    mine = rows[rows["surface"] == surface]
+    return mine[mine["case"] != "average"], mine[mine["case"] == "average"][0]
+
+
+def exponents_of(trials: NDArray) -> Array:
+    """(n, 3) in the order of EXPONENTS."""
+    return np.stack([trials[name] for name in EXPONENTS], axis=-1)
 
 
 def sample_covariance(exponents: Array) -> Array:

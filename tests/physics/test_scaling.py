@@ -9,8 +9,8 @@ from disctrack.analyse.derivatives import differentiate
 from disctrack.analyse.energy import analyse_energy, energy_quantities
 from disctrack.analyse.power_laws import count_nutation, fit_power_laws, power_law_end
 from disctrack.analyse.propagation import propagate, rates
-from disctrack.analyse.published import exponents_of, published_table
 from disctrack.disc import MA_2014
+from disctrack.examples.published_exponents import exponents_of, published_table
 from tests.physics.conftest import as_tracked, true_motion
 
 
