@@ -8,12 +8,12 @@ from numpy.typing import ArrayLike
 
 from calibration.kit.arrays import Array
 from disctrack.disc import AIR_DENSITY, Disc
-from disctrack.rolling._assembly import Assembly
 from disctrack.rolling.effects import Effect
 from disctrack.rolling.equations import FLYING
 from disctrack.rolling.model import Model
 from disctrack.rolling.motion import moment_power
 from disctrack.rolling.records import KINEMATICS, WRENCH
+from disctrack.rolling.simulate import Assembly
 
 
 def kinematics(

@@ -22,7 +22,6 @@ from scipy.integrate import cumulative_simpson
 from calibration.kit.arrays import Array, Numbers
 from disctrack.disc import MA_2014
 from disctrack.frames import COORDINATES
-from disctrack.rolling._assembly import Assembly
 from disctrack.rolling._compiled import compile_law
 from disctrack.rolling.effects import effect_from_formulas
 from disctrack.rolling.effects.base import CATALOGUE, HELPERS
@@ -30,7 +29,7 @@ from disctrack.rolling.equations import ROLLING
 from disctrack.rolling.model import DEFAULT_THETA_END, Model
 from disctrack.rolling.motion import EndReason, Path, columns
 from disctrack.rolling.records import ROLLING_COMPONENTS, STATE_COMPONENTS
-from disctrack.rolling.simulate import MAX_SWITCHES, MOST_STEPS, RTOL, _grid, _start, follow, simulate
+from disctrack.rolling.simulate import MAX_SWITCHES, MOST_STEPS, RTOL, Assembly, _grid, _start, follow, simulate
 from disctrack.rolling.state import State, steady_precession
 
 COMPONENTS = ("M_n", "M_m", "M_z", "X_n", "X_m", "X_z")  # of a moment and a force that responses are asked for

@@ -8,7 +8,7 @@ from scipy.integrate import simpson, solve_ivp
 from disctrack import rolling
 from disctrack.disc import MA_2014
 from disctrack.rolling import CATALOGUE, Model, State
-from disctrack.rolling._assembly import Assembly
+from disctrack.rolling.simulate import Assembly
 from tests.oracles import newton_euler
 
 

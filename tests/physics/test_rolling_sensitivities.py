@@ -18,11 +18,11 @@ from disctrack.rolling import (
     sensitivities,
     steady_precession,
 )
-from disctrack.rolling._assembly import Assembly
 from disctrack.rolling._compiled import compile_law
 from disctrack.rolling.effects import effect_from_formulas
 from disctrack.rolling.records import ROLLING_COMPONENTS
 from disctrack.rolling.sensitivities import COMPONENTS, responses
+from disctrack.rolling.simulate import Assembly
 from disctrack.synthetic.description import Scene
 
 STATE = steady_precession(np.radians(15), MA_2014, omega3=2.5, nutation_amplitude=0.03, psi=0.4, phi=-1.0, x=0.02)
