@@ -3,7 +3,7 @@
 import argparse
 
 from disctrack.errors import SceneError
-from disctrack.rolling.effects import catalogue_table
+from disctrack.rolling.effects.base import catalogue_table
 from disctrack.synthetic.simulation import run_simulate
 
 

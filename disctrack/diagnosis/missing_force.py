@@ -22,8 +22,8 @@ from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.laws import MIN_SIGMAS, Family, Gain, LearnedLaw, evidence, proposal
 from disctrack.discrepancy.score import cleared, span
 from disctrack.discrepancy.system import Candidate, Quantity, Values
-from disctrack.rolling import Model, simulate
-from disctrack.rolling.effects import EffectParameter, effect_from_formulas
+from disctrack.rolling import EffectParameter, Model, simulate
+from disctrack.rolling.effects.learned import effect_from_formulas
 from disctrack.rolling.evaluate import kinematics
 from disctrack.rolling.sensitivities import COMPONENTS, Responses, responses
 

@@ -33,7 +33,7 @@ from disctrack.examples._command import GRAVITY, Outcome, command, report_of
 from disctrack.examples.exponent_model import NO_ERRORS, READING, LastStage, Series
 from disctrack.numbers import measured, rounded, score
 from disctrack.report.blocks import Listing, Section
-from disctrack.rolling import Model, effects
+from disctrack.rolling import CATALOGUE, Model
 
 EXPONENTS = ("n_energy", "n_theta", "n_psidot")
 THIN_DISC = np.array([2 / 3, 2 / 3, -1 / 3])  # a rolling moment proportional to psidot^2, slow precession
@@ -91,7 +91,7 @@ def exponent_candidates(surfaces: Sequence[str]) -> tuple[Candidate, ...]:
         return replace(c, quantities=tuple(replace(q, name=f"{q.name}@{s}") for q in c.quantities for s in surfaces))
 
     found = list[Candidate]()
-    for c in motion_candidates(Model(MA_2014, effects=(effects.effect_class("km").absent(),))):
+    for c in motion_candidates(Model(MA_2014, effects=(CATALOGUE["km"].absent(),))):
         shared = all(q.belongs_to and "surface" not in q.belongs_to for q in c.quantities)
         if not c.threshold:
             found.append(c if shared else on_each(c))

@@ -6,8 +6,8 @@ elsewhere, `run` writes a scene's motion to a file.
 """
 
 from disctrack.disc import nutation_frequency, precession_rate
-from disctrack.rolling import effects
-from disctrack.rolling.effects import CATALOGUE, Effect, EffectParameter, ModelError
+from disctrack.errors import ModelError
+from disctrack.rolling.effects.base import CATALOGUE, Effect, EffectParameter
 from disctrack.rolling.model import Model, effects_from_tables
 from disctrack.rolling.motion import EndReason, Motion
 from disctrack.rolling.records import Regime
@@ -25,7 +25,6 @@ __all__ = [
     "Motion",
     "Regime",
     "State",
-    "effects",
     "effects_from_tables",
     "nutation_frequency",
     "precession_rate",

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from calibration.kit.arrays import Array
 from disctrack.disc import AIR_DENSITY, Disc
-from disctrack.rolling.effects import Effect
+from disctrack.rolling.effects.base import Effect
 from disctrack.rolling.equations import FLYING
 from disctrack.rolling.model import Model
 from disctrack.rolling.motion import moment_power

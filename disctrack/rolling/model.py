@@ -11,7 +11,9 @@ import numpy as np
 
 from calibration.kit.arguments import Density, Gravity, checked
 from disctrack.disc import AIR_DENSITY, Disc
-from disctrack.rolling.effects import Effect, EffectParameter, ModelError, effect_class, effect_from_formulas
+from disctrack.errors import ModelError
+from disctrack.rolling.effects.base import Effect, EffectParameter, effect_class
+from disctrack.rolling.effects.learned import effect_from_formulas
 from disctrack.rolling.records import BODY, UNEVEN
 
 DEFAULT_THETA_END = np.radians(0.5)  # where the disc of Ma et al. (2014) comes to lie on its paper

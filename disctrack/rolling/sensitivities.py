@@ -23,8 +23,8 @@ from calibration.kit.arrays import Array, Numbers
 from disctrack.disc import MA_2014
 from disctrack.frames import COORDINATES
 from disctrack.rolling._compiled import compile_law
-from disctrack.rolling.effects import effect_from_formulas
 from disctrack.rolling.effects.base import CATALOGUE, HELPERS
+from disctrack.rolling.effects.learned import effect_from_formulas
 from disctrack.rolling.equations import ROLLING
 from disctrack.rolling.model import DEFAULT_THETA_END, Model
 from disctrack.rolling.motion import EndReason, Path, columns

@@ -8,9 +8,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from calibration.kit.arguments import FrameRate, Seconds, Times, checked
 from calibration.kit.arrays import Array, Numbers
+from disctrack.errors import ModelError
 from disctrack.rolling import integrate
 from disctrack.rolling._compiled import compile_law, compile_system
-from disctrack.rolling.effects import ModelError
 from disctrack.rolling.effects.base import HELPERS
 from disctrack.rolling.equations import EVENTS, FILM, FLYING, ROLLING, SLIPPING, STICK_SPEED, rates
 from disctrack.rolling.model import DEFAULT_THETA_END, Model, body_constants, effect_values

@@ -9,7 +9,7 @@ import numpy as np
 from calibration.kit.arguments import checked
 from calibration.kit.arrays import Array
 from disctrack.disc import Disc, followers, nutation_frequency, precession_rate
-from disctrack.rolling.effects import ModelError
+from disctrack.errors import ModelError
 
 
 @checked

@@ -17,7 +17,8 @@ from disctrack.rolling import (
     steady_precession,
     struck_disc,
 )
-from disctrack.rolling.effects import catalogue_table, effect, effect_from_formulas
+from disctrack.rolling.effects.base import catalogue_table, effect
+from disctrack.rolling.effects.learned import effect_from_formulas
 from disctrack.rolling.evaluate import effect_power, effect_wrench, kinematics
 
 MOVES_THE_TABLE = ("table_shaken", "table_settles")  # and exerts nothing in its axes

@@ -19,7 +19,7 @@ from disctrack.rolling import (
     steady_precession,
 )
 from disctrack.rolling._compiled import compile_law
-from disctrack.rolling.effects import effect_from_formulas
+from disctrack.rolling.effects.learned import effect_from_formulas
 from disctrack.rolling.records import ROLLING_COMPONENTS
 from disctrack.rolling.sensitivities import COMPONENTS, responses
 from disctrack.rolling.simulate import Assembly

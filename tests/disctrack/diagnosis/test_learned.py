@@ -19,7 +19,7 @@ from disctrack.discrepancy.laws import Family, busy_amounts, learn, with_law, wi
 from disctrack.discrepancy.system import Quantity
 from disctrack.faults.keys import Faults
 from disctrack.rolling import Model, sensitivities, simulate, steady_precession
-from disctrack.rolling.effects import effect_from_formulas
+from disctrack.rolling.effects.learned import effect_from_formulas
 from disctrack.rolling.model import body_constants
 from disctrack.synthetic.description import Scene
 from tests.oracles import newton_euler

@@ -11,7 +11,7 @@ from disctrack.diagnosis.law_library import families
 from disctrack.discrepancy.search import CLASS_GAIN
 from disctrack.frames import nodal_axes_world
 from disctrack.rolling import Model, State, simulate
-from disctrack.rolling.effects import effect_from_formulas
+from disctrack.rolling.effects.learned import effect_from_formulas
 from tests.oracles import newton_euler
 from tests.oracles.measured_disc import K_M, assert_sized, measured
 from tests.oracles.unknown_laws import DISC, PLACE, UNKNOWN, Unknown, motion, recording
