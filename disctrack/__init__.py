@@ -55,7 +55,7 @@ _HOME = {
     "disctrack.batch": ("run_batch",),
     "disctrack.rolling": ("Model", "State", "steady_precession", "simulate"),
     "disctrack.synthetic.simulation": ("run_simulate",),
-    "disctrack.synthetic": ("run_render",),
+    "disctrack.synthetic.recording": ("run_render",),
     "disctrack.errors": ("DiscTrackError",),
     "disctrack.files.software": ("__version__",),
 }
@@ -86,7 +86,7 @@ if TYPE_CHECKING:
     from disctrack.rolling import State as State
     from disctrack.rolling import simulate as simulate
     from disctrack.rolling import steady_precession as steady_precession
-    from disctrack.synthetic import run_render as run_render
+    from disctrack.synthetic.recording import run_render as run_render
     from disctrack.synthetic.simulation import run_simulate as run_simulate
     from disctrack.track.follow.live import LivePose as LivePose
     from disctrack.track.follow.live import Tracker as Tracker

@@ -7,9 +7,9 @@ from pathlib import Path
 from tqdm import tqdm
 
 from disctrack.errors import SceneError
-from disctrack.synthetic import run_render
 from disctrack.synthetic.description import Scene, load_scene, scene_toml
 from disctrack.synthetic.motion import effects_in_words
+from disctrack.synthetic.recording import run_render
 
 
 def run(arguments: argparse.Namespace) -> None:

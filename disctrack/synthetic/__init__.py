@@ -4,19 +4,3 @@ cameras (true rig, board poses) -> optics (rays, blur, lamp), raster (shapes) ->
 -> images (disc, chessboard) -> recording (folder) and truth (truth.h5).
 It shares no code with the location of markers and corners, so that those can be judged by it.
 """
-
-from disctrack.synthetic.cameras import board_poses, rig_after_faults, rig_of
-from disctrack.synthetic.recording import recording_toml, run_render, true_disc_of, write_recording
-from disctrack.synthetic.truth import Truth, read_truth
-
-__all__ = [
-    "Truth",
-    "board_poses",
-    "read_truth",
-    "recording_toml",
-    "rig_after_faults",
-    "rig_of",
-    "run_render",
-    "true_disc_of",
-    "write_recording",
-]

@@ -33,8 +33,8 @@ from disctrack.files.toml_tree import toml_value
 from disctrack.findings import DoubtWarning, Finding, Kind, Severity, finding_from_json
 from disctrack.frames import CAMERAS
 from disctrack.recording.declaration import Recording, read_recording
-from disctrack.synthetic import write_recording
 from disctrack.synthetic.description import Scene
+from disctrack.synthetic.recording import write_recording
 from disctrack.trajectory import Trajectory
 from disctrack.trajectory.file import read_trajectory
 from disctrack.validate.errors import compare

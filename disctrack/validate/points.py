@@ -19,10 +19,11 @@ from disctrack.disc import Disc
 from disctrack.faults.keys import Faults
 from disctrack.frames import rotation_from_euler
 from disctrack.rolling import simulate
-from disctrack.synthetic import board_poses, rig_after_faults, rig_of, true_disc_of
+from disctrack.synthetic.cameras import board_poses, rig_after_faults, rig_of
 from disctrack.synthetic.description import Scene
 from disctrack.synthetic.motion import rolling_model, rolling_start, true_frame_rate
 from disctrack.synthetic.optics import smooth_field
+from disctrack.synthetic.recording import true_disc_of
 from disctrack.track.pose import fit_poses
 from disctrack.track.refine.assembly import Taken, trajectory_of
 from disctrack.track.refine.self_calibration import DotsInFrames

@@ -19,7 +19,7 @@ from calibration.judge.tolerances import (
     with_tolerances,
 )
 from calibration.rig_file import read_rig, write_rig
-from disctrack.synthetic import rig_of
+from disctrack.synthetic.cameras import rig_of
 from disctrack.synthetic.description import Scene
 
 BOARD = Board((9, 6), 8e-3)

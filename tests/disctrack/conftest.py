@@ -8,7 +8,7 @@ import pytest
 from calibration.cameras.camera import StereoRig
 from disctrack import frames
 from disctrack.disc import Disc
-from disctrack.synthetic import rig_of
+from disctrack.synthetic.cameras import rig_of
 from disctrack.synthetic.description import Scene
 from tests.rendering import render_disc
 

@@ -13,9 +13,9 @@ import pytest
 from disctrack.cli import main
 from disctrack.errors import DiscTrackError, OutputError
 from disctrack.files.toml_tree import toml_value
-from disctrack.synthetic import read_truth
 from disctrack.synthetic import recording as render_recording
 from disctrack.synthetic.description import Scene
+from disctrack.synthetic.truth import read_truth
 from disctrack.trajectory import FrameStatus
 from disctrack.trajectory.file import read_details, read_trajectory
 

@@ -18,7 +18,7 @@ from disctrack.findings import Kind, in_doubt, leading
 from disctrack.recording.declaration import read_recording
 from disctrack.recording.readers import open_frames
 from disctrack.recording.readers.blocks import PairBlock
-from disctrack.synthetic import rig_of
+from disctrack.synthetic.cameras import rig_of
 from disctrack.synthetic.description import Scene
 from disctrack.track.follow.tracking import TrackingSettings, track
 from disctrack.track.judge.disc_not_seen import arrangement_found, moved_camera, unlike_declared

@@ -16,8 +16,7 @@ from disctrack.faults.dots import predict
 from disctrack.faults.keys import Faults
 from disctrack.frames import rotation_from_euler
 from disctrack.rolling import simulate
-from disctrack.synthetic import rig_of
-from disctrack.synthetic.cameras import rig_after_faults
+from disctrack.synthetic.cameras import rig_after_faults, rig_of
 from disctrack.synthetic.description import load_scene
 from disctrack.synthetic.motion import rolling_model, rolling_start
 from disctrack.synthetic.recording import true_disc_of

@@ -12,14 +12,14 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial import ConvexHull
 
 from calibration import find_corners
-from disctrack import synthetic
 from disctrack.commands.sample import SCENE
 from disctrack.disc import MA_2014
 from disctrack.errors import OutputError, SceneError
 from disctrack.faults.keys import CameraFault, Faults, Occluder
 from disctrack.frames import rotation_from_euler
 from disctrack.recording.declaration import read_recording
-from disctrack.synthetic import raster, rig_of
+from disctrack.synthetic import raster
+from disctrack.synthetic.cameras import rig_of
 from disctrack.synthetic.description import (
     AppearanceSettings,
     BoardSettings,
@@ -38,9 +38,9 @@ from disctrack.synthetic.description import (
 )
 from disctrack.synthetic.motion import motion_of
 from disctrack.synthetic.optics import corner_rays, lens_rays
-from disctrack.synthetic.recording import recording_toml
+from disctrack.synthetic.recording import recording_toml, write_recording
 from disctrack.synthetic.sensor import digitise, sensor_pattern
-from disctrack.synthetic.truth import SCHEMA
+from disctrack.synthetic.truth import SCHEMA, read_truth
 from tests.rendering import expected_disc, render_board, render_disc
 
 PLAIN = Scene(
@@ -64,7 +64,7 @@ POSES = np.column_stack(
 def rig():
     # stronger lenses than the default, so that the inverse of the distortion has work to do
     lens = RigSettings(k1=(-0.25, 0.2), k2=(0.5, -0.4), p1=(2e-3, -2e-3), p2=(-2e-3, 2e-3), k3=(0.3, 0.0))
-    return synthetic.rig_of(replace(PLAIN, rig=lens))
+    return rig_of(replace(PLAIN, rig=lens))
 
 
 def cv2_pixels(points_world, rig, index):
@@ -209,7 +209,7 @@ AWAY = np.array([5.0, 0, 0, 0, 0, 0])  # out of sight
 
 @pytest.fixture(scope="module")
 def top_rig():
-    return synthetic.rig_of(ABOVE)
+    return rig_of(ABOVE)
 
 
 def dot_moments(image, around, half=12):
@@ -392,7 +392,7 @@ def test_off_by_default_and_declared_only_where_exact():
 @pytest.mark.slow
 def test_two_cores_render_five_moving_pairs_per_second():
     scene = Scene()
-    rig = synthetic.rig_of(scene)
+    rig = rig_of(scene)
     n = 20
     q = np.tile([0.032, 0.020, 0.012, 0.5, 0.3, 0.7], (n, 1))
     qdot = np.tile([0.02, 0.03, 0.0, 55.0, 0.1, -54.0], (n, 1))  # rolling at 20 deg: the face wobbles, dots stay slow
@@ -442,7 +442,7 @@ NOISE_PX = 0.06
 
 @pytest.mark.statistical
 def test_recording_round_trip(scene, tmp_path):
-    truth = synthetic.write_recording(tmp_path / "r", scene)
+    truth = write_recording(tmp_path / "r", scene)
     recording = read_recording(tmp_path / "r")
     assert recording.name == "small"
     assert recording.frame_rate == 1000.0
@@ -450,7 +450,7 @@ def test_recording_round_trip(scene, tmp_path):
     assert recording.table.board_thickness == pytest.approx(0.003)
     assert images(tmp_path / "r", "left").shape == (4, 256, 256)
     assert len(list((tmp_path / "r/calibration/right").iterdir())) == 3
-    again = synthetic.read_truth(tmp_path / "r/truth.h5")
+    again = read_truth(tmp_path / "r/truth.h5")
     assert_array_equal(again.q, truth.q)
     assert_allclose(again.q, START + truth.time[:, None] * VELOCITY, atol=1e-12)
     assert_allclose(again.qdot, np.tile(VELOCITY, (4, 1)), atol=1e-9)
@@ -466,7 +466,7 @@ def markers_world(truth):
 
 
 def test_board_lies_with_the_side_of_dark_corners_on_the_left(scene, tmp_path):
-    truth = synthetic.write_recording(tmp_path / "r", scene)
+    truth = write_recording(tmp_path / "r", scene)
     squares = np.array([[-0.5, -0.5], [-0.5, 5.5], [8.5, -0.5], [8.5, 5.5]]) * 8e-3  # dark, dark, light, light
     points = np.column_stack([squares, np.full(4, 3e-3)])
     for camera, name in enumerate(("left", "right")):
@@ -478,7 +478,7 @@ def test_board_lies_with_the_side_of_dark_corners_on_the_left(scene, tmp_path):
 def test_a_recording_declares_the_disc_of_any_scene_as_it_is(tmp_path):
     places = tuple((12.3456789 * np.cos(a), 12.3456789 * np.sin(a)) for a in (0.1, 1.3, 3.1, 4.4))
     scene = replace(SMALL, name='the "third"\\\n run', markers=MarkerSettings(diameter_mm=5.123456, centres_mm=places))
-    (tmp_path / "recording.toml").write_text(synthetic.recording_toml(scene))
+    (tmp_path / "recording.toml").write_text(recording_toml(scene))
     recording = read_recording(tmp_path)
     assert recording.name == scene.name
     assert_array_equal(recording.disc.marker_centres_body, scene.declared_disc.marker_centres_body)
@@ -492,18 +492,18 @@ def test_faults_never_show_in_recording_toml(scene):
         hidden_markers=(2,),
         left=CameraFault(rotation_deg=(0.1, 0.0, 0.0)),
     )
-    assert synthetic.recording_toml(replace(scene, faults=faults)) == synthetic.recording_toml(scene)
+    assert recording_toml(replace(scene, faults=faults)) == recording_toml(scene)
 
 
 @pytest.mark.statistical
 def test_same_scene_gives_the_same_files_on_any_number_of_threads_and_another_seed_another_rig(scene, tmp_path):
     first, second = (
-        synthetic.write_recording(tmp_path / name, replace(scene, render=replace(scene.render, threads=n)))
+        write_recording(tmp_path / name, replace(scene, render=replace(scene.render, threads=n)))
         for name, n in (("a", 1), ("b", 3))
     )
     assert_array_equal(images(tmp_path / "a", "right"), images(tmp_path / "b", "right"))
     assert_array_equal(first.markers_px, second.markers_px)
-    other = synthetic.rig_of(replace(scene, seed=2))
+    other = rig_of(replace(scene, seed=2))
     for mine, theirs in zip(first.rig.cameras, other.cameras, strict=True):
         assert (mine.parameters[:4] != theirs.parameters[:4]).all()
     assert (np.abs(other.project(markers_world(first)) - first.markers_px) > 1e-3).all()
@@ -511,8 +511,8 @@ def test_same_scene_gives_the_same_files_on_any_number_of_threads_and_another_se
 
 def shift_of_faulty_dots(scene, tmp_path, faults, camera):
     """Dots of the first frame with the faults, minus where they would be without; checks that the images agree."""
-    clean = synthetic.write_recording(tmp_path / "clean", scene)
-    truth = synthetic.write_recording(tmp_path / "faulty", replace(scene, faults=faults))
+    clean = write_recording(tmp_path / "clean", scene)
+    truth = write_recording(tmp_path / "faulty", replace(scene, faults=faults))
     measured = dot_offsets_px(tmp_path / "faulty", camera, truth.markers_px[0, camera])
     assert np.abs(measured).max() < NOISE_PX  # the truth knows of it
     return truth.markers_px[0, camera] - clean.markers_px[0, camera]
@@ -521,16 +521,16 @@ def shift_of_faulty_dots(scene, tmp_path, faults, camera):
 @pytest.mark.statistical
 def test_delayed_camera_sees_the_disc_later(scene, tmp_path):
     shift = shift_of_faulty_dots(scene, tmp_path, Faults(right_delay_s=1e-3), camera=1)
-    truth = synthetic.read_truth(tmp_path / "faulty/truth.h5")
+    truth = read_truth(tmp_path / "faulty/truth.h5")
     assert_allclose(truth.q_right - truth.q, np.tile(VELOCITY * 1e-3, (4, 1)), atol=1e-12)
     assert np.abs(shift).max() > 0.5
     # the right camera's first frame is what the left's clock calls frame 1
-    clean = synthetic.read_truth(tmp_path / "clean/truth.h5")
+    clean = read_truth(tmp_path / "clean/truth.h5")
     assert_allclose(truth.markers_px[0, 1], clean.markers_px[1, 1], atol=1e-9)
 
 
 def test_wrong_frame_rate_stretches_the_motion(scene, tmp_path):
-    truth = synthetic.write_recording(tmp_path / "r", replace(scene, faults=Faults(frame_rate_hz=500.0)))
+    truth = write_recording(tmp_path / "r", replace(scene, faults=Faults(frame_rate_hz=500.0)))
     assert_allclose(np.diff(truth.time), 2e-3)
     assert_allclose(truth.q[3] - truth.q[0], VELOCITY * 6e-3, atol=1e-12)
     assert read_recording(tmp_path / "r").frame_rate == 1000.0
@@ -563,7 +563,7 @@ def changed(camera, from_centre):
 def test_what_happened_to_a_camera_shifts_its_picture(scene, tmp_path, side, fault, expected, tolerance):
     faults = Faults(**{("left", "right")[side]: fault})
     shift = shift_of_faulty_dots(scene, tmp_path, faults, side)
-    clean = synthetic.read_truth(tmp_path / "clean/truth.h5")
+    clean = read_truth(tmp_path / "clean/truth.h5")
     camera = clean.rig.cameras[side]
     from_centre = clean.markers_px[0, side] - [camera.cx, camera.cy]
     assert (np.abs(shift - expected(camera, from_centre)) <= tolerance).all()
@@ -574,7 +574,7 @@ def test_misprinted_dots_and_pattern_off_centre_shift_together(scene, tmp_path):
     misprint = tuple((0.1 * k, -0.1) for k in range(6))
     faults = Faults(misprint_mm=misprint, pattern_offset_mm=(0.2, 0.3))
     shift_of_faulty_dots(scene, tmp_path, faults, camera=0)
-    truth = synthetic.read_truth(tmp_path / "faulty/truth.h5")
+    truth = read_truth(tmp_path / "faulty/truth.h5")
     moved = truth.disc.marker_centres_body - scene.declared_disc.marker_centres_body
     assert_allclose(moved[:, :2] * 1e3, np.array(misprint) + np.array([0.2, 0.3]), atol=1e-12)
     assert_allclose(truth.paper_centre_body, [2e-4, 3e-4])
@@ -587,7 +587,7 @@ def test_misprinted_dots_and_pattern_off_centre_shift_together(scene, tmp_path):
 def test_hidden_dot_is_paper_and_occluder_is_dark(scene, tmp_path):
     rod = Occluder(camera="right", centre_px=(128.0, 100.0), width_px=10.0, grey=40.0, first_frame=2, last_frame=2)
     faulty = replace(scene, faults=Faults(hidden_markers=(3,), occluders=(rod,)))
-    truth = synthetic.write_recording(tmp_path / "r", faulty)
+    truth = write_recording(tmp_path / "r", faulty)
     u, v = np.rint(truth.markers_px[0, 0, 3]).astype(int)
     assert images(tmp_path / "r", "left")[0, v, u] > 170
     right = images(tmp_path / "r", "right")
@@ -596,7 +596,7 @@ def test_hidden_dot_is_paper_and_occluder_is_dark(scene, tmp_path):
 
 
 def test_missing_frames_have_no_file(scene, tmp_path):
-    synthetic.write_recording(tmp_path / "r", replace(scene, faults=Faults(right=CameraFault(missing_frames=(1,)))))
+    write_recording(tmp_path / "r", replace(scene, faults=Faults(right=CameraFault(missing_frames=(1,)))))
     assert sorted(p.name for p in (tmp_path / "r/right").iterdir()) == ["000000.png", "000002.png", "000003.png"]
     assert len(list((tmp_path / "r/left").iterdir())) == 4
 
@@ -605,7 +605,7 @@ def test_missing_frames_have_no_file(scene, tmp_path):
 def test_frame_shows_the_pose_of_its_mid_exposure(scene, tmp_path):
     quiet = replace(scene, sensor=SensorSettings(gain_e_per_dn=0.0, read_noise_dn=0.0))
     blurred = replace(quiet, cameras=replace(quiet.cameras, exposure_s=8e-4))
-    truth = synthetic.write_recording(tmp_path / "r", blurred)
+    truth = write_recording(tmp_path / "r", blurred)
     still = render_disc(truth.q, truth.rig, truth.disc, quiet)
     moving = images(tmp_path / "r", "left")
     for frame, (u, v) in enumerate(np.rint(truth.markers_px[:, 0, 0]).astype(int)):
@@ -621,12 +621,12 @@ def test_a_render_that_fails_leaves_nothing_behind_and_no_truth_is_replaced(scen
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        synthetic.write_recording(tmp_path / "r", scene, progress=stop)
+        write_recording(tmp_path / "r", scene, progress=stop)
     assert not (tmp_path / "r").exists()
     assert not (tmp_path / "r.part").exists()
     (tmp_path / "mine.h5").write_text("data")
     with pytest.raises(OutputError, match="exists"):
-        synthetic.write_recording(tmp_path / "r", scene, truth_path=tmp_path / "mine.h5")
+        write_recording(tmp_path / "r", scene, truth_path=tmp_path / "mine.h5")
     assert (tmp_path / "mine.h5").read_text() == "data"
 
 
@@ -634,7 +634,7 @@ def test_truth_of_another_file_is_refused(tmp_path):
     with h5py.File(tmp_path / "x.h5", "w") as file:
         file.attrs["schema"] = "something else"
     with pytest.raises(OutputError, match=SCHEMA):
-        synthetic.read_truth(tmp_path / "x.h5")
+        read_truth(tmp_path / "x.h5")
 
 
 @pytest.mark.parametrize(
@@ -668,14 +668,14 @@ def test_mistakes_in_a_scene_are_named(text, message, tmp_path):
 def test_a_lens_that_folds_is_refused():
     lens = replace(SMALL, rig=replace(SMALL.rig, k1=(-30.0, -30.0), k2=(0.0, 0.0)))
     with pytest.raises(SceneError, match="folds inside the picture"):
-        expected_disc(START, synthetic.rig_of(lens), lens.declared_disc, lens)
+        expected_disc(START, rig_of(lens), lens.declared_disc, lens)
 
 
 def test_sample_clip_is_what_its_scene_renders(sample_clip):
     scene = load_scene(SCENE)
-    truth = synthetic.read_truth(sample_clip.parent / "truth" / "clip.h5")
-    assert (sample_clip / "recording.toml").read_text() == synthetic.recording_toml(scene)
-    assert_allclose(synthetic.rig_of(scene).project(markers_world(truth)), truth.markers_px, atol=1e-9)
+    truth = read_truth(sample_clip.parent / "truth" / "clip.h5")
+    assert (sample_clip / "recording.toml").read_text() == recording_toml(scene)
+    assert_allclose(rig_of(scene).project(markers_world(truth)), truth.markers_px, atol=1e-9)
     assert_allclose(motion_of(scene).pose(truth.time), truth.q, atol=1e-9)  # integrator: 1e-11 relative
     stored = np.stack([images(sample_clip, name, 300)[-1] for name in ("left", "right")]).astype(float)
     again = expected_disc(truth.q[-1], truth.rig, truth.disc, scene)[0]

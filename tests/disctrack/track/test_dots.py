@@ -10,7 +10,7 @@ from scipy.ndimage import gaussian_filter
 
 from calibration.cameras.camera import normalised_maps
 from disctrack import frames
-from disctrack.synthetic import rig_of
+from disctrack.synthetic.cameras import rig_of
 from disctrack.synthetic.description import Scene
 from disctrack.track.dots.template import NoiseModel, measure_noise
 from disctrack.trajectory import MarkerStatus

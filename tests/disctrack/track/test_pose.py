@@ -7,7 +7,7 @@ from scipy.optimize import least_squares
 
 from disctrack import frames
 from disctrack.disc import MA_2014
-from disctrack.synthetic import rig_of
+from disctrack.synthetic.cameras import rig_of
 from disctrack.synthetic.description import Scene
 from disctrack.track.pose import PoseFits, fit_poses, marker_pixels
 from disctrack.track.refine.pose_scatter import scatter_of_poses

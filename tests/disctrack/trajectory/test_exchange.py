@@ -20,7 +20,7 @@ from calibration.rig_file import read_rig, write_rig
 from disctrack.cli import main
 from disctrack.errors import OutputError, RigFileError
 from disctrack.frames import COORDINATES, rotation_from_euler
-from disctrack.synthetic import rig_of
+from disctrack.synthetic.cameras import rig_of
 from disctrack.synthetic.description import Scene
 from disctrack.trajectory import Trajectory
 from disctrack.trajectory.exchange import formats, matlab, motion, opencv, rigs

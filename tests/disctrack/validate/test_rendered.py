@@ -10,7 +10,7 @@ from disctrack.cli import main
 from disctrack.faults.keys import CameraFault, Faults
 from disctrack.frames import rotation_from_euler
 from disctrack.recording.declaration import read_recording
-from disctrack.synthetic import rig_of
+from disctrack.synthetic.cameras import rig_of
 from disctrack.trajectory import part
 from disctrack.validate.accuracy import accuracy_validation, complaints, imperfect_validation, sum_up, verdict
 from disctrack.validate.errors import compare, joined, noise_consistency

@@ -11,7 +11,7 @@ from disctrack.commands.sample import SCENE
 from disctrack.disc import Disc
 from disctrack.findings import Kind
 from disctrack.recording.readers.blocks import PairBlock
-from disctrack.synthetic import rig_of
+from disctrack.synthetic.cameras import rig_of
 from disctrack.synthetic.description import Scene, load_scene
 from disctrack.synthetic.motion import motion_of
 from disctrack.track.follow.tracking import Tracking, track
