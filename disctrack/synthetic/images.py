@@ -159,8 +159,7 @@ def _exposure_rule(pose: PoseOverExposure, exposure: float, stage: Stage, disc: 
     return nodes / 2, weights / 2
 
 
-_ANGLES = np.radians(np.arange(0, 360, 10))
-_RING = np.column_stack([np.cos(_ANGLES), np.sin(_ANGLES), np.zeros(36)])
+_RING = np.array([[np.cos(angle), np.sin(angle), 0.0] for angle in np.radians(np.arange(0, 360, 10))])
 
 
 def _rims(radius: float, half_thickness: float) -> Array:
