@@ -407,17 +407,14 @@ def _creeping(
     t: complex, y: State, table: Addresses, body: Record, now: Record
 ) -> tuple[complex, complex, complex, complex]:
     """Velocity and acceleration along i and j of a contact that creeps; zeros where it does not, or slips."""
-    nothing = 0.0 * y[0]
-    pull, a_x, a_y, j_x, j_y = (nothing, nothing, nothing), nothing, nothing, nothing, nothing
-    c = body.creep
-    if c == 0.0 or table[0] != ROLLING:
-        return nothing, nothing, nothing, nothing
-    # the force that accelerates what creeps is part of the force by which it creeps
-    for _ in range(CREEP_PASSES):
-        forced = (a_x, a_y, j_x, j_y, nothing, nothing, nothing)
-        pull, rise, bend = _course(t, y, forced, table, body, now)
-        a_x, a_y, j_x, j_y = -c * rise[1], -c * rise[2], -c * bend[1], -c * bend[2]
-    return -c * pull[1], -c * pull[2], a_x, a_y
+    nothing, c = 0.0 * y[0], body.creep
+    pull, forced = (nothing, nothing, nothing), (nothing, nothing, nothing, nothing, nothing, nothing, nothing)
+    if c != 0.0 and table[0] == ROLLING:
+        # the force that accelerates what creeps is part of the force by which it creeps
+        for _ in range(CREEP_PASSES):
+            pull, rise, bend = _course(t, y, forced, table, body, now)
+            forced = (-c * rise[1], -c * rise[2], -c * bend[1], -c * bend[2], nothing, nothing, nothing)
+    return -c * pull[1], -c * pull[2], forced[0], forced[1]
 
 
 @exact_part

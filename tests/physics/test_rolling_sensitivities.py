@@ -131,7 +131,8 @@ def test_columns_by_symmetry_equal_those_of_the_complex_step(values, expected, s
 
 
 def test_a_law_by_formula_breaks_the_symmetries_that_it_reads():
-    law = effect_from_formulas("patch", {"M_m": "-c * exp(-(x * x + y * y) / 1e-4) * cos(phi)"})
+    law = effect_from_formulas("patch", {"M_m": "-c * exp(-(x * x + y * y) / 1e-4) * cos(phi) - c * x"})
+    assert [p.name for p in law.parameters] == ["c"]  # once, however often it stands there
     model = MODEL.with_effects(law(c=0.0))
     module = sys.modules["disctrack.rolling.sensitivities"]
     assert module.symmetries(model, Assembly(model, 0.01)) == set()

@@ -50,7 +50,7 @@ def effect_from_formulas(
             raise ModelError(f"{name}: '{component}' is no component; a law sets {', '.join(LAW_COMPONENTS)}")
         text, names = _translate(name, formula)
         lines.append(f"    w.{component} += {text}")
-        free += [n for n in names if n not in free]
+        free += [n for n in dict.fromkeys(names) if n not in free]
     given = {p.name: p for p in parameters}
     unused = set(given) - set(free)
     if unused or not lines:
@@ -91,12 +91,12 @@ def _translate(name: str, formula: str) -> tuple[str, list[str]]:
         if isinstance(node, ast.Call) and not (isinstance(node.func, ast.Name) and node.func.id in _FUNCTIONS):
             known = ", ".join(_FUNCTIONS)
             raise ModelError(f"{name}: '{formula}': no function {ast.unparse(node.func)}; there are {known}")
-        if isinstance(node, ast.Name) and node not in functions and node.id not in KINEMATICS:
-            parameters.append(node.id)
-    names = [n for n in ast.walk(tree) if isinstance(n, ast.Name)]
-    for node in names:
+    for node in [n for n in ast.walk(tree) if isinstance(n, ast.Name)]:
         if node in functions:
             node.id = _FUNCTIONS[node.id]
+        elif node.id in KINEMATICS:
+            node.id = f"s.{node.id}"
         else:
-            node.id = ("s." if node.id in KINEMATICS else "p.") + node.id
+            parameters.append(node.id)
+            node.id = f"p.{node.id}"
     return ast.unparse(tree), parameters
