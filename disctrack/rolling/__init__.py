@@ -5,8 +5,6 @@ Public verbs in the order of use: `Model`, `State` (or `steady_precession`, `str
 elsewhere, `run` writes a scene's motion to a file.
 """
 
-from disctrack.disc import nutation_frequency, precession_rate
-from disctrack.errors import ModelError
 from disctrack.rolling.effects.base import CATALOGUE, Effect, EffectParameter
 from disctrack.rolling.model import Model, effects_from_tables
 from disctrack.rolling.motion import EndReason, Motion
@@ -21,13 +19,10 @@ __all__ = [
     "EffectParameter",
     "EndReason",
     "Model",
-    "ModelError",
     "Motion",
     "Regime",
     "State",
     "effects_from_tables",
-    "nutation_frequency",
-    "precession_rate",
     "prepare",
     "sensitivities",
     "simulate",

@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 from scipy.integrate import simpson
 
 from disctrack import rolling
-from disctrack.disc import MA_2014
+from disctrack.disc import MA_2014, nutation_frequency, precession_rate
 from disctrack.rolling import CATALOGUE, EndReason, Model, Regime, State, steady_precession, struck_disc
 from tests.oracles import newton_euler
 
@@ -19,7 +19,7 @@ STEEL = Model(MA_2014, effects=(CATALOGUE["km"](k_m=0.381e-7),))
 
 @pytest.mark.parametrize(("theta_deg", "psidot"), [(2, 172.66), (5, 109.49), (8, 86.83), (25, 50.52)])
 def test_steady_precession_rate_with_the_centre_at_rest(theta_deg, psidot):
-    p, _ = rolling.precession_rate(np.radians(theta_deg), MA_2014)
+    p, _ = precession_rate(np.radians(theta_deg), MA_2014)
     assert_allclose(p, psidot, atol=0.006)  # the published table has two decimals
 
 
@@ -36,8 +36,8 @@ THIN = replace(MA_2014, half_thickness=1e-12)
 )
 def test_nutation_to_precession_ratio(disc, theta_deg, ratio):
     theta = np.radians(theta_deg)
-    p, _ = rolling.precession_rate(theta, disc)
-    assert_allclose(rolling.nutation_frequency(theta, disc) / p, ratio, atol=6e-5)  # four decimals
+    p, _ = precession_rate(theta, disc)
+    assert_allclose(nutation_frequency(theta, disc) / p, ratio, atol=6e-5)  # four decimals
 
 
 @pytest.mark.parametrize("theta_deg", [2.0, 8.0, 25.0, 60.0])
@@ -52,7 +52,7 @@ def test_small_nutation_has_the_predicted_frequency_and_phase():
     theta, amplitude, phase = np.radians(20), 1e-6, 0.7
     state = steady_precession(theta, MA_2014, nutation_amplitude=amplitude, nutation_phase=phase)
     motion = rolling.simulate(IDEAL, state, 0.5)
-    w = rolling.nutation_frequency(theta, MA_2014)
+    w = nutation_frequency(theta, MA_2014)
     # second-order terms are amplitude^2; the integrator adds 1e-10 rad
     assert_allclose(motion.q[:, 4] - theta, amplitude * np.cos(w * motion.time + phase), atol=3e-10)
 

@@ -6,12 +6,11 @@ from numpy.testing import assert_allclose
 
 from disctrack import rolling
 from disctrack.disc import MA_2014
-from disctrack.errors import ArgumentError
+from disctrack.errors import ArgumentError, ModelError
 from disctrack.rolling import (
     CATALOGUE,
     EffectParameter,
     Model,
-    ModelError,
     State,
     sensitivities,
     steady_precession,

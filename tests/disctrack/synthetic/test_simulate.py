@@ -8,9 +8,9 @@ import pytest
 from numpy.testing import assert_allclose
 
 from disctrack.cli import main
-from disctrack.errors import OutputError, SceneError
+from disctrack.errors import ModelError, OutputError, SceneError
 from disctrack.files.toml_tree import toml_value
-from disctrack.rolling import CATALOGUE, ModelError, Regime, effects_from_tables
+from disctrack.rolling import CATALOGUE, Regime, effects_from_tables
 from disctrack.synthetic.description import load_scene
 from disctrack.synthetic.motion import motion_of
 from disctrack.synthetic.simulation import run_simulate
