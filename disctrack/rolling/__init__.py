@@ -1,7 +1,7 @@
 """The rolling disc forwards: equations of motion, effects that are added to them, simulation, derivatives.
 
 Public verbs in the order of use: `Model`, `State` (or `steady_precession`, `struck_disc`), `simulate`,
-`sensitivities`. Effects are in `effects.CATALOGUE`; `evaluate` applies their laws to motions from
+`sensitivities`. Effects are in `CATALOGUE`; `evaluate` applies their laws to motions from
 elsewhere, `run` writes a scene's motion to a file.
 """
 
