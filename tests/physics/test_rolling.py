@@ -163,25 +163,6 @@ def test_slip_ends_where_an_independent_integration_ends_it_and_rolling_goes_on(
     assert_allclose(motion.q[-1, 3:], expected[3:], atol=1e-5)
 
 
-def test_a_table_gives_way_under_a_sliding_disc_too():
-    """The oracle's table moves as the load of the slip on a rigid one would let it sink: the same to first order."""
-    state, c, times = sliding_start(), 1e-7, np.linspace(0, 0.05, 401)
-    oracle = newton_euler.Disc(mu=0.3)
-    begin = lambda d: newton_euler.state_from_angles(d.at(0.0), *state.array[:8], velocity=state.array[8:])  # noqa: E731
-    q = lambda d: newton_euler.coordinates(d, newton_euler.follow(d, begin(d), times[::40], "slipping").y)  # noqa: E731
-    rigid = q(oracle)
-    oracle.gives_way = c
-    oracle.table = newton_euler.yielding(oracle, begin(oracle), times, "slipping")
-    expected = q(oracle) - rigid
-    soft = slippery(0.3, CATALOGUE["table_yielding"](c=c))
-    motions = [rolling.simulate(model, state, times=times[::40]) for model in (soft, slippery(0.3))]
-    assert all((motion.regime == Regime.SLIPPING).all() for motion in motions)
-    found = motions[0].q - motions[1].q
-    size = np.abs(expected).max(axis=0)
-    assert (size[:3] > 0.05 * c).all()
-    assert (np.abs(found - expected).max(axis=0) < 0.01 * size).all()  # friction's direction is held for 0.1 ms
-
-
 def test_a_stiff_table_does_not_change_when_the_disc_slips():
     """Sinking by a nanometre moves switches by microseconds, and slip that has just begun is no harder to follow."""
     state = steady_precession(np.radians(20), MA_2014, omega3=1.0, nutation_amplitude=np.radians(0.5), psi=0.5, phi=1.0)

@@ -7,7 +7,7 @@ from scipy.integrate import simpson, solve_ivp
 
 from disctrack import rolling
 from disctrack.disc import MA_2014
-from disctrack.rolling import CATALOGUE, Model, State
+from disctrack.rolling import CATALOGUE, Model, Regime, State
 from disctrack.rolling.simulate import Assembly
 from tests.oracles import newton_euler
 
@@ -160,27 +160,31 @@ def test_motion_agrees_with_the_world_vector_integration(name):
 
 
 @pytest.mark.statistical
-def test_a_table_that_gives_way_follows_the_load_of_the_rigid_one():
+@pytest.mark.parametrize(("slip", "c"), [((), 1e-7), ((), 1e-6), ((0.3, -0.1), 1e-7)])
+def test_a_table_that_gives_way_follows_the_load_of_the_rigid_one(slip, c):
     """The oracle's table moves as the load on a rigid one would let it sink: the same to first order in c."""
-    rigid = model_with(K_M | COM_EFFECT)
+    rigid, oracle = model_with(K_M | COM_EFFECT), newton_euler.Disc(laws=[KM_LAW], com_body=COM)
     start = rolling.steady_precession(np.radians(18), MA_2014, omega3=1.5, nutation_amplitude=np.radians(2), psi=0.3)
-    oracle = newton_euler.Disc(laws=[KM_LAW], com_body=COM)
-    fine = np.linspace(0, 0.25, 1001)
-    state = newton_euler.state_from_angles(oracle, *start.array)
-    q = lambda d, s: newton_euler.coordinates(d, newton_euler.follow(d, s, fine[::40]).y)  # noqa: E731
-    of_rigid = q(oracle, state)
-    for c in (1e-7, 1e-6):
-        oracle.gives_way = c
-        oracle.table = newton_euler.yielding(oracle, state, fine)
-        sunk = newton_euler.state_from_angles(oracle.at(0.0), *start.array)
-        expected = q(oracle, sunk) - of_rigid
-        model = rigid.with_effects(CATALOGUE["table_yielding"](c=c))
-        found = rolling.simulate(model, start, times=fine[::40]).q - rolling.simulate(rigid, start, times=fine[::40]).q
-        size = np.abs(expected).max(axis=0)
-        assert (size[:3] > c).all()
-        assert (np.abs(found - expected).max(axis=0) < 1500 * c * size).all()  # second order: 9e-5 and 9e-4
-    derivative = rolling.sensitivities(rigid, start, fine[::40], ["table_yielding.c"], components=[])
-    assert (np.abs(derivative.dq[..., 0] * c - expected).max(axis=0) < 1500 * c * size).all()
+    regime, fine, most = "rolling", np.linspace(0, 0.25, 1001), 1500 * c  # second order: 9e-5 and 9e-4
+    if slip:  # friction's direction is held for 0.1 ms
+        v_x, v_y = rolling.simulate(rigid, start, times=[0.0]).qdot[0, :2] + slip
+        start, rigid, oracle.mu = start.moved(v_x=v_x, v_y=v_y), rigid.with_effects(CATALOGUE["slip"](mu=0.3)), 0.3
+        regime, fine, most = "slipping", fine[:201], 0.01
+    begin = lambda: newton_euler.state_from_angles(oracle.at(0.0), *start.array[:8], start.array[8:] if slip else None)  # noqa: E731
+    q = lambda: newton_euler.coordinates(oracle, newton_euler.follow(oracle, begin(), fine[::40], regime).y)  # noqa: E731
+    of_rigid = q()
+    oracle.gives_way = c
+    oracle.table = newton_euler.yielding(oracle, begin(), fine, regime)
+    expected = q() - of_rigid
+    soft = rigid.with_effects(CATALOGUE["table_yielding"](c=c))
+    found, without = (rolling.simulate(model, start, times=fine[::40]) for model in (soft, rigid))
+    assert (found.regime == Regime[regime.upper()]).all()
+    size = np.abs(expected).max(axis=0)
+    assert (size[:3] > 0.02 * c).all()
+    assert (np.abs(found.q - without.q - expected).max(axis=0) < most * size).all()
+    if not slip:
+        derivative = rolling.sensitivities(rigid, start, fine[::40], ["table_yielding.c"], components=[])
+        assert (np.abs(derivative.dq[..., 0] * c - expected).max(axis=0) < 1500 * c * size).all()
 
 
 class _Creeping(newton_euler.Disc):
