@@ -1,6 +1,5 @@
 """Rendered images and recordings: shapes where OpenCV projects them; what was planted shows there and nowhere else."""
 
-import time
 import tomllib
 from dataclasses import replace
 
@@ -18,7 +17,6 @@ from disctrack.errors import OutputError, SceneError
 from disctrack.faults.keys import CameraFault, Faults, Occluder
 from disctrack.frames import rotation_from_euler
 from disctrack.recording.declaration import read_recording
-from disctrack.synthetic import raster
 from disctrack.synthetic.cameras import rig_of
 from disctrack.synthetic.description import (
     AppearanceSettings,
@@ -173,18 +171,6 @@ def test_an_error_of_the_lens_model_would_be_noticed(rig):
     assert np.abs(shift).max() > 10e-3  # ten times the tolerance above
 
 
-def test_area_and_moments_of_a_half_plane_in_a_cell(rng):
-    half_plane = raster.half_plane.py_func
-    grid = (np.arange(500) + 0.5) / 500 - 0.5
-    x, y = np.meshgrid(grid, grid)
-    for f0, a, b in [*(rng.normal(size=(40, 3)) * [0.5, 1.0, 1.0]), (0.1, 1.0, 0.0), (0.1, 1e-4, -1.0)]:
-        inside = f0 + a * x + b * y > 0
-        sampled = [np.mean(inside), np.mean(inside * x), np.mean(inside * y)]
-        assert_allclose(half_plane(f0, a, b), sampled, atol=2e-3)  # one line of 500 samples
-        # with the other half it makes the whole square: area 1, moments 0
-        assert_allclose(np.add(half_plane(f0, a, b), half_plane(-f0, -a, -b)), [1, 0, 0], atol=1e-9)
-
-
 # both cameras straight above the table at half the usual size: image x is world i, 0.5 mm per pixel
 ABOVE = Scene(
     cameras=CameraSettings(image_size=(256, 256), exposure_s=0.001),
@@ -243,14 +229,6 @@ def test_motion_blurs_along_the_path_by_its_length(speed, top_rig):
     path_px = speed * ABOVE.cameras.exposure_s / 0.5e-3
     assert_allclose(c_moving, c_still, atol=1e-3)  # q is the pose at mid exposure
     assert_allclose(m_moving - m_still, [path_px**2 / 12, 0.0], atol=2e-3)
-
-
-def test_wrong_mid_exposure_would_be_noticed(top_rig):
-    qdot = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
-    start = FLAT + qdot * ABOVE.cameras.exposure_s / 2  # q given at the exposure's end instead of its middle
-    found, _ = dot_moments(expected_disc(start, top_rig, MA_2014, ABOVE, qdot=qdot)[0, 0], dot_pixel(FLAT, top_rig)[0])
-    right, _ = dot_moments(expected_disc(FLAT, top_rig, MA_2014, ABOVE)[0, 0], dot_pixel(FLAT, top_rig)[0])
-    assert found[0] - right[0] == pytest.approx(1.0, abs=0.01)  # px: half of 1 m/s for 1 ms at 0.5 mm per pixel
 
 
 @pytest.mark.parametrize("bit_depth", [8, 10, 12, 16])
@@ -387,20 +365,6 @@ def test_off_by_default_and_declared_only_where_exact():
     assert lens_rays(rig_of(ORDINARY).left, 3, 0.0, [1]) is corner_rays(rig_of(ORDINARY).left, 3)
     assert "square_tolerance_mm = 0.0" in recording_toml(Scene())
     assert "tolerance" not in recording_toml(replace(Scene(), imperfections=ImperfectionSettings(pixel_gain=0.01)))
-
-
-@pytest.mark.slow
-def test_two_cores_render_five_moving_pairs_per_second():
-    scene = Scene()
-    rig = rig_of(scene)
-    n = 20
-    q = np.tile([0.032, 0.020, 0.012, 0.5, 0.3, 0.7], (n, 1))
-    qdot = np.tile([0.02, 0.03, 0.0, 55.0, 0.1, -54.0], (n, 1))  # rolling at 20 deg: the face wobbles, dots stay slow
-    render_disc(q[:1], rig, MA_2014, scene, np.random.default_rng(0), qdot=qdot[:1])  # compiles, draws the table
-    start = time.process_time()  # of all threads: other work on the machine does not count
-    render_disc(q, rig, MA_2014, scene, np.random.default_rng(1), qdot=qdot)
-    seconds_per_pair = (time.process_time() - start) / n
-    assert seconds_per_pair < 2 / 5  # two cores; measured 0.15 s
 
 
 SMALL = Scene(
