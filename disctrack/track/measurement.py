@@ -24,11 +24,9 @@ from disctrack.recording.declaration import Recording
 from disctrack.recording.readers import open_frames
 from disctrack.recording.readers.base import FrameReader
 from disctrack.recording.readers.blocks import PairBlock, Unreadable, check_pair, default_threads, iter_pair_blocks
-from disctrack.recording.readers.camera_header import check_headers
-from disctrack.recording.readers.file_numbers import check_same_numbers
 from disctrack.recording.readers.flat_field import flat_fielded, flat_fields
 from disctrack.recording.readers.part import frames_in_parts
-from disctrack.recording.readers.time_stamps import check_time_stamps, usable_times
+from disctrack.recording.readers.same_instants import check_headers, check_same_numbers, check_time_stamps, usable_times
 from disctrack.track.follow.motion_span import MotionSpan, find_motion
 from disctrack.track.follow.tracking import (
     ReadBlocks,

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields
+from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +15,48 @@ from numpy.typing import NDArray
 from calibration.kit.arrays import Array, Image
 from disctrack.errors import RecordingError
 
-if TYPE_CHECKING:
-    from disctrack.recording.readers.camera_header import CameraHeader
+
+@dataclass(frozen=True)
+class CameraHeader:
+    """What a camera wrote beside its frames of one recording; None, or an empty text, where the file does not tell."""
+
+    file: str  # that holds the header
+    device: str  # make, model, number
+    frame_rate: float  # [Hz] of the frames in the file
+    step: int  # one frame in so many of those recorded is in the file
+    saturation: int  # largest grey value that a pixel can have
+    exposure: float | None = None  # [s]
+    trigger: str = ""  # trigger mode
+    first_frame: int | None = None  # the camera's own number of frame 0; trigger modes differ in what is counted from
+    first_time: float | None = None  # [s] from the trigger to frame 0, by the camera's clock
+    trigger_time: float | None = None  # [s] since 1970, UTC, by the camera's clock
+    locked_clock: bool = False  # to a common time signal (IRIG)
+    recorded: datetime | None = None  # by the clock of the camera or its computer
+
+    @property
+    def rate(self) -> str:
+        """Rate of the frames in the file, and how it came about."""
+        every = f" ({self.step * self.frame_rate:g} Hz, one frame in {self.step} saved)" if self.step > 1 else ""
+        return f"{self.frame_rate:g} Hz{every}"
+
+    def sentence(self) -> str:
+        """The settings in one line."""
+        parts = [self.device, self.rate]
+        if self.exposure is not None:
+            parts.append(f"exposure {1e6 * self.exposure:g} µs")
+        if self.trigger:
+            parts.append(f"trigger {self.trigger}")
+        if self.first_frame is not None:
+            parts.append(f"first frame {self.first_frame}")
+        if self.recorded is not None:
+            parts.append(f"{self.recorded:%Y-%m-%d %H:%M:%S}")
+        return ", ".join(part for part in parts if part)
+
+    def as_dict(self) -> dict[str, object]:
+        """What the header says, of JSON's types, without the file's place."""
+        told = asdict(self) | {"recorded": self.recorded.isoformat() if self.recorded else None}
+        del told["file"]
+        return told
 
 
 @dataclass(eq=False, kw_only=True)

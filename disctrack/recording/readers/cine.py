@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from calibration.kit.arrays import Array
 from disctrack.errors import RecordingError
-from disctrack.recording.readers.base import only_file
-from disctrack.recording.readers.camera_header import CameraHeader
+from disctrack.recording.readers.base import CameraHeader, only_file
 from disctrack.recording.readers.raw import (
     PixelLayout,
     RawFile,

@@ -13,7 +13,6 @@ from itertools import pairwise
 from pathlib import Path
 
 from disctrack.errors import RecordingError
-from disctrack.recording.readers.base import FrameReader
 from disctrack.recording.readers.files import NUMBER, file_number
 
 MOST_SLOTS_PER_FILE = 100  # a sequence with fewer of its frames is no recording, but time stamps or a slip of the pen
@@ -57,26 +56,6 @@ def number_files(
             f"is the camera's own rate and every {step}th frame was kept, declare {step} times less"
         )
     return tuple(map(by_number.get, numbers)), numbers, tuple(notes), tuple(doubts)
-
-
-def check_same_numbers(left: FrameReader, right: FrameReader) -> tuple[str, ...]:
-    """What is doubtful about pairing two sequences by their order; frame i of both must be the same instant.
-
-    Raises RecordingError where both count with the same numbers, but do not begin with the same.
-    """
-    ours, theirs = left.numbers, right.numbers
-    if ours is None or theirs is None or (ours[0], ours.step) == (theirs[0], theirs.step):
-        return ()
-    spans = (
-        f"left files are numbered {ours[0]} to {ours[-1]} in steps of {ours.step}, right ones {theirs[0]} to "
-        f"{theirs[-1]} in steps of {theirs.step}"
-    )
-    if ours.step == theirs.step and (ours[-1] < theirs[0] or theirs[-1] < ours[0]):
-        return (f"{spans}: they are taken as pairs in their order, number {ours[0]} with {theirs[0]}",)
-    raise RecordingError(
-        f"{left.describe(0)}, {right.describe(0)}: {spans}, but equal numbers must be the same instant. Copy what is "
-        "missing, or number the frames of both cameras alike."
-    )
 
 
 def check_continuation(files: Sequence[Path], camera: str) -> None:

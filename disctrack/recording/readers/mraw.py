@@ -12,8 +12,7 @@ import numpy as np
 
 from disctrack.errors import RecordingError
 from disctrack.files.inputs import MOST_TEXT
-from disctrack.recording.readers.base import only_file
-from disctrack.recording.readers.camera_header import CameraHeader
+from disctrack.recording.readers.base import CameraHeader, only_file
 from disctrack.recording.readers.files import content_of
 from disctrack.recording.readers.raw import (
     PixelLayout,

@@ -10,9 +10,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from disctrack.errors import RecordingError
 from disctrack.recording.readers import FrameReader, open_frames
-from disctrack.recording.readers.camera_header import check_headers
 from disctrack.recording.readers.cine import linear_from_10_bits
-from disctrack.recording.readers.time_stamps import check_time_stamps
+from disctrack.recording.readers.same_instants import check_headers, check_time_stamps
 from tests.disctrack.recording.readers.written import lost_of
 from tests.oracles.camera_files import TRIGGER, write_cine, write_mraw
 

@@ -18,8 +18,7 @@ from disctrack.recording.readers import open_frames
 from disctrack.recording.readers.base import FrameReader
 from disctrack.recording.readers.blocks import iter_pair_blocks
 from disctrack.recording.readers.decoding import decode
-from disctrack.recording.readers.file_numbers import check_same_numbers
-from disctrack.recording.readers.time_stamps import check_time_stamps, usable_times
+from disctrack.recording.readers.same_instants import check_same_numbers, check_time_stamps, usable_times
 from tests.disctrack.recording.readers.written import write_sequence
 
 

@@ -1,0 +1,242 @@
+"""Can two cameras have recorded the same motion, frame i of both at the same instant?
+
+Their headers, the numbers in their files' names and the time stamps that files keep are compared. What cannot
+be is an error; doubt leads to a warning, with the frames' numbers, and to evenly spaced frames.
+"""
+
+import numpy as np
+
+from calibration.kit.arrays import Array
+from calibration.kit.brief import ranges
+from disctrack.errors import RecordingError
+from disctrack.frames import CAMERAS
+from disctrack.recording.readers.base import CameraHeader, FrameReader
+
+RATE_ROUNDING_HZ = 0.5  # headers give the rate in whole Hz
+CLOCK_TOLERANCE = 1e-3  # relative: cameras whose frames are stamped may run off the nominal rate; the stamps count
+SAME_EXPOSURE = 0.01  # relative; the two cameras' clocks round to different ticks
+SAME_TAKE_S = 600.0  # computers' clocks, and the time that saving one camera after the other takes
+RATE_TOLERANCE = 0.01  # of the declared rate; a clock's error is a thousandth of that, a wrong unit far more
+LOST = 1.5  # periods between two frames: beyond, at least one is missing
+SAME_INSTANT = 0.01  # of a period: at 60 rad/s and 1000 Hz the disc turns by 0.6 mrad in it
+
+
+def check_headers(
+    left: FrameReader, right: FrameReader, frame_rate: float, exposure: float | None, declared_in: str
+) -> tuple[str, ...]:
+    """Compare the cameras' headers with each other, and with the declared frame rate [Hz] and exposure [s].
+
+    Returns warnings. Raises RecordingError where frame i of both cannot belong together, or cannot have been taken at
+    the declared rate. Formats without a header pass, with a warning where they state another rate: it may be that of a
+    player.
+    """
+    warnings = []
+    for reader in (left, right):
+        header, camera, rate = reader.header, reader.camera, reader.frame_rate
+        declared = f"{declared_in}: [cameras] frame_rate_hz is {frame_rate:g}"
+        if header is None:
+            if rate is not None and abs(rate - frame_rate) > RATE_ROUNDING_HZ:
+                warnings.append(f"{declared}, the {camera} file states {rate:g} Hz")
+            continue
+        stamped = 0.0 if header.first_time is None else CLOCK_TOLERANCE * header.frame_rate
+        if abs(header.frame_rate - frame_rate) > max(RATE_ROUNDING_HZ, stamped):
+            raise RecordingError(
+                f"{declared}, but the {camera} camera's frames were recorded with {header.rate}, says {header.file}. "
+                "Every velocity would be wrong by their ratio: correct that."
+            )
+        if exposure is not None and header.exposure is not None and _differ(header.exposure, exposure):
+            warnings.append(
+                f"{declared_in}: [cameras] exposure_us is {1e6 * exposure:g}, the {camera} camera's header says "
+                f"{1e6 * header.exposure:g} µs ({header.file}); the declared one is used"
+            )
+    if left.header is not None and right.header is not None:
+        _check_instants(left.header, right.header)
+        warnings += _doubtful(left.header, right.header)
+    return tuple(warnings)
+
+
+def _check_instants(left: CameraHeader, right: CameraHeader) -> None:
+    """Raise RecordingError where frame i of both does not show the same instant."""
+    if abs(left.frame_rate - right.frame_rate) > 1e-6 * left.frame_rate:
+        raise RecordingError(
+            f"the left camera's frames were recorded with {left.rate} ({left.file}), the right one's with {right.rate} "
+            f"({right.file}): frame i of both does not show the same instant. Record with one rate, or export with the "
+            "same step."
+        )
+    numbers = left.first_frame, right.first_frame
+    if left.trigger == right.trigger and None not in numbers and numbers[0] != numbers[1]:
+        raise RecordingError(
+            f"the left file begins with the camera's frame {numbers[0]} ({left.file}), the right one with frame "
+            f"{numbers[1]} ({right.file}), at the same trigger mode: frame i of both does not show the same instant. "
+            "Export the same range of frames from both cameras."
+        )
+    offset, period = start_offset(left, right), 1.0 / left.frame_rate
+    if offset is not None and abs(offset[0]) > 0.5 * period:
+        raise RecordingError(
+            f"by the time stamps, counted from {offset[1]}, the first frame of the right camera ({right.file}) was "
+            f"taken {offset[0]:.4g} s after that of the left one ({left.file}); a frame lasts {period:.4g} s. "
+            "Export the frames of the same instants, of the same take."
+        )
+
+
+def _doubtful(left: CameraHeader, right: CameraHeader) -> list[str]:
+    found = []
+    if left.trigger != right.trigger:  # equal modes count from the same event; of unequal ones nothing is known
+        found.append(
+            f"the cameras were triggered in different modes: left {left.trigger or 'unknown'}, right "
+            f"{right.trigger or 'unknown'}. The headers do not say whether frame i of both shows the same instant"
+        )
+    if left.exposure is not None and right.exposure is not None and _differ(left.exposure, right.exposure):
+        found.append(
+            f"the cameras exposed for different times: left {1e6 * left.exposure:g} µs, right "
+            f"{1e6 * right.exposure:g} µs. The middles of the exposures lie "
+            f"{0.5e6 * abs(left.exposure - right.exposure):g} µs apart if both begin together"
+        )
+    if left.recorded is not None and right.recorded is not None:
+        apart = abs((left.recorded - right.recorded).total_seconds())
+        if apart > SAME_TAKE_S:
+            found.append(
+                f"the headers' dates lie {apart / 60:.0f} minutes apart: left {left.recorded:%Y-%m-%d %H:%M:%S}, right "
+                f"{right.recorded:%Y-%m-%d %H:%M:%S}. Are both files of the same take?"
+            )
+    return found
+
+
+def _differ(one: float, other: float) -> bool:
+    return abs(one - other) > SAME_EXPOSURE * max(one, other)
+
+
+def start_offset(left: CameraHeader, right: CameraHeader) -> tuple[float, str] | None:
+    """How much later [s] the right camera took its frame 0, and since when that is counted; None if not told.
+
+    Absolute where both clocks follow a common time signal, otherwise from each camera's own trigger.
+    """
+    if left.first_time is None or right.first_time is None:
+        return None
+    later = right.first_time - left.first_time
+    if left.locked_clock and right.locked_clock and left.trigger_time and right.trigger_time:
+        return later + (right.trigger_time - left.trigger_time), "the common clock's zero"
+    return later, "the trigger"
+
+
+def check_same_numbers(left: FrameReader, right: FrameReader) -> tuple[str, ...]:
+    """What is doubtful about pairing two sequences by their order; frame i of both must be the same instant.
+
+    Raises RecordingError where both count with the same numbers, but do not begin with the same.
+    """
+    ours, theirs = left.numbers, right.numbers
+    if ours is None or theirs is None or (ours[0], ours.step) == (theirs[0], theirs.step):
+        return ()
+    spans = (
+        f"left files are numbered {ours[0]} to {ours[-1]} in steps of {ours.step}, right ones {theirs[0]} to "
+        f"{theirs[-1]} in steps of {theirs.step}"
+    )
+    if ours.step == theirs.step and (ours[-1] < theirs[0] or theirs[-1] < ours[0]):
+        return (f"{spans}: they are taken as pairs in their order, number {ours[0]} with {theirs[0]}",)
+    raise RecordingError(
+        f"{left.describe(0)}, {right.describe(0)}: {spans}, but equal numbers must be the same instant. Copy what is "
+        "missing, or number the frames of both cameras alike."
+    )
+
+
+def usable_times(reader: FrameReader, frame_rate: float) -> Array | None:
+    """Time stamps (n,) [s] of a reader, or None where there are none that fit the declared frame rate [Hz]."""
+    times = reader.timestamps
+    return None if times is None or _fault(times, frame_rate) else times
+
+
+def check_time_stamps(
+    left: FrameReader, right: FrameReader, frame_rate: float
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Doubts: stamps that are not used and why, frames of one camera that the other has not; and warnings: frames lost
+    by each camera, and cameras that do not run together.
+
+    frame_rate [Hz] as declared. Times count from frame 0 where the file has a camera's header, which tells how they lie
+    to the other camera's.
+    """
+    doubts: list[str] = []
+    warnings: list[str] = []
+    usable: list[Array] = []
+    for camera, reader in zip(CAMERAS, (left, right), strict=True):
+        if reader.timestamps is None:
+            continue
+        fault = _fault(reader.timestamps, frame_rate)
+        if fault:
+            doubts.append(f"{camera} camera: time stamps are not used, frames are taken as evenly spaced: {fault}")
+        else:
+            usable.append(reader.timestamps)
+            warnings += _lost_frames(camera, reader.timestamps, frame_rate)
+    ours, theirs = left.header, right.header
+    offset = start_offset(ours, theirs) if ours is not None and theirs is not None else None
+    if len(usable) == 2 and len(usable[0]) == len(usable[1]) and (ours is None) == (theirs is None):
+        theirs_shifted = usable[1] + (0.0 if offset is None else offset[0])
+        slips = _slips(usable[0], theirs_shifted, 1.0 / frame_rate)
+        doubts += slips
+        warnings += [] if slips else _between_cameras(usable[0], theirs_shifted, 1.0 / frame_rate)
+    return tuple(doubts), tuple(warnings)
+
+
+def _fault(times: Array, frame_rate: float) -> str:
+    """Why time stamps cannot be used; "" where they can."""
+    bad = np.flatnonzero(~np.isfinite(times))
+    if len(bad):
+        return f"that of frame {bad[0]} is not a number"
+    steps = np.diff(times)
+    back = np.flatnonzero(steps <= 0)
+    if len(back):
+        return f"they do not increase from frame {back[0]} to {back[0] + 1}"
+    if len(steps) and abs(float(np.median(steps)) * frame_rate - 1.0) > RATE_TOLERANCE:
+        rate = 1.0 / float(np.median(steps))
+        return f"they give {rate:.6g} frames/s, frame_rate_hz of {frame_rate:.6g} (are they in seconds?)"
+    return ""
+
+
+def _lost_frames(camera: str, times: Array, frame_rate: float) -> list[str]:
+    steps = np.diff(times) * frame_rate
+    gaps = np.flatnonzero(steps > LOST)
+    if not len(gaps):
+        return []
+    lost = int(np.rint(steps[gaps] - 1).sum())
+    return [f"{camera} camera: by its time stamps {lost} frame{'s' * (lost > 1)} missing, after frame {ranges(gaps)}"]
+
+
+def _slips(left: Array, right: Array, period: float) -> list[str]:
+    """From where on frame i of both cameras is not the same instant, if anywhere."""
+    later = right - left
+    # against the first frames: what the clocks' zeros differ by is constant, lost frames come on top
+    slips = np.rint((later - later[0]) / period).astype(int)
+    changes = np.flatnonzero(np.diff(slips)) + 1
+    if len(changes):
+        return [
+            f"by the time stamps frame i of both cameras does not show the same instant from frame {changes[0]} on: "
+            f"one camera lost frames that the other has (the offset changes at frame {ranges(changes)}). Poses from "
+            "there on are wrong: take that frame from the other camera, too, or measure up to it with --frames"
+        ]
+    return []
+
+
+def _between_cameras(left: Array, right: Array, period: float) -> list[str]:
+    """How the right camera's times differ from the left one's: a constant, a drift, the rest."""
+    later = right - left
+    warnings = []
+    index = np.arange(len(later)) - 0.5 * (len(later) - 1)
+    offset = float(np.median(later))
+    drift = float(index @ later / max(float(index @ index), 1.0)) / period
+    rest = later - later.mean() - drift * period * index
+    if abs(offset) > SAME_INSTANT * period:
+        warnings.append(
+            f"by the time stamps the right camera's frames are taken {1e6 * offset:.4g} µs after the left one's, "
+            f"{abs(offset) / period:.2g} of a frame: the cameras are not synchronised, or their clocks have other zeros"
+        )
+    if abs(drift) * len(later) > SAME_INSTANT:
+        warnings.append(
+            f"by the time stamps the cameras' clocks drift apart by {1e6 * drift:+.3g} µs per second: each camera runs "
+            "on a clock of its own"
+        )
+    worst = int(np.argmax(np.abs(rest)))
+    if abs(rest[worst]) > SAME_INSTANT * period:
+        warnings.append(
+            f"by the time stamps the instants of the two cameras jitter by {1e6 * float(rest.std()):.3g} µs (rms), "
+            f"most at frame {worst}: {1e6 * float(rest[worst]):+.3g} µs"
+        )
+    return warnings
