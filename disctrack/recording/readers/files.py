@@ -1,8 +1,17 @@
-"""Which files a pattern means, and in which order."""
+"""Which files a pattern means, in which order, and the clock in their names: which run of digits counts the frames.
 
+Time is a frame's place in the sequence, so a gap that is closed would shift all that follows, and a file that does not
+belong would be a frame of its own. Where names leave a doubt, nothing is guessed: the files are named.
+"""
+
+import fnmatch
 import glob
+import math
 import os
 import re
+from collections import Counter
+from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 
 from disctrack.errors import RecordingError
@@ -19,6 +28,8 @@ FORMATS = {
 SUFFIXES = frozenset().union(*FORMATS.values())
 IMAGES = FORMATS["images"]
 NUMBER = "{number}"  # in a pattern: these digits count the frames
+MOST_SLOTS_PER_FILE = 100  # a sequence with fewer of its frames is no recording, but time stamps or a slip of the pen
+_SHOWN = 3
 
 
 def split_member(pattern: str) -> tuple[str, str]:
@@ -81,3 +92,146 @@ def content_of(file: Path, where: str, most: int = MOST_IMAGE) -> bytes:
         return read_regular(file, most)
     except OSError as error:
         raise RecordingError(f"{where}: cannot be read: {error.strerror}. Copy it again.") from error
+
+
+def number_files(
+    files: Sequence[Path], camera: str, pattern: str = ""
+) -> tuple[tuple[Path | None, ...], range | None, tuple[str, ...], tuple[str, ...]]:
+    """Files on their places in time (None where a number is missing), their numbers, what to know, and what is assumed.
+
+    pattern : tells by {number} which digits count; "" where the names must tell it themselves
+    Raises RecordingError that names the files if their names are not of one form, hold no number or one number twice,
+    or if the numbers have no common step.
+    """
+    if len(files) == 1:
+        number = file_number(files[0])
+        return tuple(files), None if number is None else range(number, number + 1), (), ()
+    columns = [_numbers_by_pattern(files, pattern)] if pattern else _numbers_by_form(files, camera)
+    clocks = {step: column for column in columns if (step := _common_step(column, asked=bool(pattern)))}
+    if len(clocks) > 1:
+        clocks = {step: column for step, column in clocks.items() if not _missing(column, step)} or clocks
+    if len(clocks) > 1:
+        raise RecordingError(
+            f"{files[0]} ...: the names of the {camera} frames hold several numbers that could count them. Say which "
+            f'with {NUMBER} in the pattern, e.g. {camera} = "{camera}/*_{NUMBER}.png".'
+        )
+    if not clocks:
+        _refuse_clock(files, columns[-1], camera)
+    ((step, column),) = clocks.items()
+    numbers, by_number = range(min(column), max(column) + 1, step), dict(zip(column, files, strict=True))
+    notes, doubts = [], []
+    if missing := _missing(column, step):
+        notes.append(
+            f"{len(missing)} file{'s' * (len(missing) > 1)} missing in the sequence, the first is number "
+            f"{missing[0]}; this camera says nothing of these frames"
+        )
+    if step > 1:
+        doubts.append(
+            f"the file numbers go in steps of {step}; they are taken as consecutive frames at frame_rate_hz. If that "
+            f"is the camera's own rate and every {step}th frame was kept, declare {step} times less"
+        )
+    return tuple(map(by_number.get, numbers)), numbers, tuple(notes), tuple(doubts)
+
+
+def check_continuation(files: Sequence[Path], camera: str) -> None:
+    """Raise RecordingError unless stacks that go on in the next file are numbered without a gap (the first may have
+    no number).
+    """
+    if len(files) < 2:
+        return
+    rest = files[1:] if files[1].stem.startswith(files[0].stem) else files
+    slots, numbers, _, _ = number_files(rest, camera)
+    absent = [number for number, file in zip(numbers or (), slots, strict=False) if file is None]
+    if absent or (numbers is not None and numbers.step != 1):
+        raise RecordingError(
+            f"{files[0]} ...: a {camera} stack that goes on in several files lacks number "
+            f"{absent[0] if absent else 'of every second one'}. How many frames it held is not known, so all that "
+            "follows would be shifted in time: copy it again, or measure the files before it."
+        )
+
+
+def _numbers_by_pattern(files: Sequence[Path], pattern: str) -> list[int]:
+    before, after = (
+        fnmatch.translate(part)[len("(?s:") : -len(r")\Z")] for part in Path(pattern).name.split(NUMBER, 1)
+    )
+    form = re.compile(f"(?s:{before}(?<![0-9])([0-9]+)(?![0-9]){after})\\Z")
+    matches = [form.match(file.name) for file in files]
+    odd = [file for file, match in zip(files, matches, strict=True) if match is None]
+    if odd:
+        raise RecordingError(
+            f"{_listed(odd)}: no number where the pattern {pattern} has {NUMBER}. Correct the pattern."
+        )
+    return [int(match[1]) for match in matches if match is not None]
+
+
+def _numbers_by_form(files: Sequence[Path], camera: str) -> list[list[int]]:
+    """The runs of digits that differ among names of one form, each a number per file."""
+    forms = [re.split(r"[0-9]+", file.stem) for file in files]
+    if all(len(form) == 1 for form in forms):
+        raise RecordingError(
+            f"{_listed(files)}: the names of the {camera} frames hold no number, so nothing tells their order and "
+            "whether one is missing. Number them as the camera counted them."
+        )
+    groups = Counter(map(tuple, forms)).most_common()
+    if len(groups) > 1:
+        usual = list(groups[0][0])
+        odd = [file for file, form in zip(files, forms, strict=True) if form != usual]
+        others = [file for file, form in zip(files, forms, strict=True) if form == usual]
+        raise RecordingError(
+            f"{_listed(odd)}: not named like the other {len(others)} {camera} frames ({_listed(others)}). It would be "
+            f"a frame of its own and shift those after it. Move it away{_pattern_hint(others, odd)}."
+        )
+    runs = [re.findall(r"[0-9]+", file.stem) for file in files]
+    columns = [[int(run) for run in column] for column in zip(*runs, strict=True)]
+    return [column for column in columns if len(set(column)) > 1] or columns[-1:]
+
+
+def _common_step(numbers: Sequence[int], asked: bool) -> int | None:
+    """Step of numbers that count frames, some of which may be missing; None for anything else, as time stamps.
+
+    A camera that counts by d leaves d as the most frequent difference; stamps that jitter have a common divisor that
+    no two of them differ by. asked: the user says that these are the numbers.
+    """
+    ordered = sorted(numbers)
+    steps = Counter(b - a for a, b in pairwise(ordered))
+    if 0 in steps:
+        return None
+    step = math.gcd(*steps)
+    if (ordered[-1] - ordered[0]) // step >= MOST_SLOTS_PER_FILE * len(ordered):
+        return None
+    return step if asked or steps[step] == max(steps.values()) else None
+
+
+def _missing(numbers: Sequence[int], step: int) -> list[int]:
+    return sorted(set(range(min(numbers), max(numbers) + 1, step)) - set(numbers))
+
+
+def _refuse_clock(files: Sequence[Path], numbers: Sequence[int], camera: str) -> None:
+    order = sorted(range(len(files)), key=lambda i: numbers[i])
+    for a, b in pairwise(order):
+        if numbers[a] == numbers[b]:
+            raise RecordingError(
+                f"{files[a]}, {files[b]}: two {camera} frames of number {numbers[a]}. Move one of them away, or write "
+                f"a pattern that leaves it out; {NUMBER} in the pattern says which digits count."
+            )
+    steps = sorted(b - a for a, b in pairwise(sorted(numbers)))
+    raise RecordingError(
+        f"{_listed([files[i] for i in order])}: the numbers of the {camera} frames have no common step (differences "
+        f"from {steps[0]} to {steps[-1]}), like time stamps. Number the frames as the camera counted them, or say with "
+        f"{NUMBER} in the pattern which digits count; time stamps are read from HDF5, TIFF and camera files."
+    )
+
+
+def _pattern_hint(usual: Sequence[Path], odd: Sequence[Path]) -> str:
+    """A pattern that takes the usual files only, if there is a simple one."""
+    names = [re.sub(r"[0-9]", "[0-9]", re.sub(r"([\[*?])", r"[\1]", file.name)) for file in usual]
+    folder = usual[0].parent.name
+    alike = len(set(names)) == 1 and len({file.parent for file in usual}) == 1
+    if not alike or any(fnmatch.fnmatch(file.name, names[0]) for file in odd):
+        return f", or write a pattern that leaves it out; {NUMBER} says which digits count"
+    return f', or write a pattern that leaves it out, as "{folder}/{names[0]}"'
+
+
+def _listed(files: Sequence[Path]) -> str:
+    shown = ", ".join([str(files[0]), *(file.name for file in files[1:_SHOWN])])
+    return shown + (f", ... {len(files) - _SHOWN} more" if len(files) > _SHOWN else "")

@@ -1,23 +1,33 @@
-"""Image sequences: one PNG, TIFF, BMP or JPEG file per frame."""
+"""Images in files: one PNG, TIFF, BMP or JPEG file per frame, or TIFF files of many pages that continue one another.
+
+Pages without compression are read at the speed of memory.
+"""
 
 from __future__ import annotations
 
 import hashlib
+import json
+import math
+import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.kit.arrays import Image
+from calibration.kit.arrays import Array, Image
 from calibration.kit.grey_levels import full_scale, level_step
 from disctrack.errors import RecordingError
 from disctrack.recording.readers.base import FrameReader, first_readable
 from disctrack.recording.readers.decoding import as_grey, decode
-from disctrack.recording.readers.file_numbers import check_continuation, number_files
-from disctrack.recording.readers.files import content_of
-from disctrack.recording.readers.tiff import is_stack, open_stack
+from disctrack.recording.readers.files import check_continuation, content_of, number_files
+from disctrack.recording.readers.raw import PixelLayout, RawFile, RawFrames, check_frame_size
+from disctrack.recording.readers.tiff_pages import Page, page_pixels, pages_of
 
 
 def open_images(files: Sequence[Path], camera: str, pattern: str = "") -> FrameReader:
@@ -27,9 +37,9 @@ def open_images(files: Sequence[Path], camera: str, pattern: str = "") -> FrameR
     can be read.
     pattern : tells by {number} which digits of the names count the frames; "" where the names alone must
     """
-    if files[0].suffix.lower() in (".tif", ".tiff") and (is_stack(files[0]) or is_stack(files[-1])):
+    if files[0].suffix.lower() in (".tif", ".tiff") and (_is_stack(files[0]) or _is_stack(files[-1])):
         check_continuation(files, camera)
-        return open_stack(files, camera)
+        return _open_stack(files, camera)
     slots, numbers, notes, doubts = number_files(files, camera, pattern)
 
     def decoded(index: int) -> tuple[NDArray, Image]:
@@ -80,3 +90,152 @@ class ImageSequence(FrameReader):
         if isinstance(file, str):
             raise RecordingError(f"{where}: there is no file with this number. Copy it again from the camera.")
         return content_of(file, where)
+
+
+def _is_stack(file: Path) -> bool:
+    """True for a TIFF file that holds more than one frame; False also for what is no TIFF file at all."""
+    found = 0
+    try:
+        for page in islice(pages_of(RawFile(file)), 2):
+            found += max(_pages_announced(page.description), 1)
+    except RecordingError:
+        return found > 0  # cut short after the first page
+    return found > 1
+
+
+def _open_stack(files: Sequence[Path], camera: str) -> FrameReader:
+    """Frames of all pages of the files, in order. Raises RecordingError if no page can be read.
+
+    The frame rate is taken from the notes of ImageJ or OME in the first page, time stamps from those of OME.
+    """
+    pages: list[Page] = []
+    sources: list[RawFile] = []
+    notes = []
+    for file in map(RawFile, files):
+        found, note = _pages(file)
+        pages += found
+        sources += [file] * len(found)
+        notes += [note] if note else []
+    if not pages:
+        raise RecordingError(f"{files[0]}: a TIFF file without a page that can be read. Export it again.")
+    first = pages[0]
+    rate, stamps = _times(first.description, len(pages))
+    check_frame_size(first.width, first.height, str(files[0]))
+    told: dict[str, Any] = {"camera": camera, "files": sources, "notes": tuple(notes)}
+    told |= {"timestamps": stamps, "frame_rate": rate}
+    offsets = np.array([page.plain_offset for page in pages], np.int64)
+    if (offsets >= 0).all() and all(page.layout == first.layout for page in pages):
+        layout = PixelLayout(first.width, first.height, first.dtype)
+        return RawFrames(offsets=offsets, layout=layout, **told)
+
+    def decoded(index: int) -> Image:
+        where = str(sources[index])
+        return as_grey(page_pixels(sources[index], pages[index], where), where)
+
+    image = first_readable(len(pages), camera, decoded)
+    size = image.shape[1], image.shape[0]
+    return TiffPages(pages=pages, image_size=size, dtype=image.dtype, **told)
+
+
+@dataclass(eq=False, kw_only=True)
+class TiffPages(FrameReader):
+    """Pages that are compressed, or otherwise not plain."""
+
+    files: Sequence[RawFile]
+    pages: Sequence[Page]
+
+    def _stored(self, index: int) -> bytes:
+        page = self.pages[index]
+        return page.layout.encode() + b"".join(page.pieces(self.files[index], ""))
+
+    def _decoded(self, index: int, out: Image | None, where: str) -> Image:
+        return as_grey(page_pixels(self.files[index], self.pages[index], where), where)
+
+
+def _pages(file: RawFile) -> tuple[list[Page], str | None]:
+    """Frames of one file, and a note where the chain of directories breaks off."""
+    pages: list[Page] = []
+    note = None
+    try:
+        for page in pages_of(file):
+            pages.append(page)
+    except RecordingError as error:
+        if not pages:
+            raise
+        note = f"only {len(pages)} pages are whole ({error})"
+    if len(pages) == 1:
+        pages = _without_directories(file, pages[0])
+    return pages, note
+
+
+def _without_directories(file: RawFile, first: Page) -> list[Page]:
+    """All frames of a file with one directory, as ImageJ writes stacks: the others follow the first without a gap."""
+    n, size = _pages_announced(first.description), first.width * first.height * first.dtype.itemsize
+    if n < 2 or size == 0:
+        return [first]
+    if first.plain_offset < 0:
+        raise RecordingError(
+            f"{file}: announces {n} frames in one directory, whose pixels are not plain (white is zero, rows "
+            "from another corner, compressed, or no grey values of 8 or 16 bit). Export it again, black as zero."
+        )
+    most = max(1, -(-file.size // size))  # of a file cut short the frames that begin in it; the next is the end
+    start = first.plain_offset
+    return [replace(first, places=(start + i * size,), sizes=(size,)) for i in range(min(n, most))]
+
+
+def _pages_announced(description: str) -> int:
+    """Frames behind one directory by ImageJ's note, or by that of tifffile where it left out the others."""
+    with suppress(ValueError, TypeError, KeyError, OverflowError, RecursionError):  # no note of that kind
+        if description.startswith("ImageJ="):
+            return int(_imagej(description)["images"])
+        *several, _, _ = json.loads(description)["shape"]
+        return math.prod(map(int, several)) if '"truncated"' in description else 0
+    return 0
+
+
+def _imagej(description: str) -> dict[str, str]:
+    return dict(re.findall(r"^(\w+)=(\S+)\s*$", description, re.MULTILINE))
+
+
+_TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "\u00b5s": 1e-6, "\u03bcs": 1e-6, "ns": 1e-9, "min": 60.0}
+
+
+def _times(description: str, n: int) -> tuple[float | None, Array | None]:
+    """Frame rate [Hz] and time stamps [s] by ImageJ's or OME's notes, None where they say nothing."""
+    if description.startswith("ImageJ="):
+        interval, rate = (_positive(_number(_imagej(description).get(key))) for key in ("finterval", "fps"))
+        return (1.0 / interval if interval else rate), None
+    if "<OME" in description[:1000]:
+        return _ome_times(description, n)
+    return None, None
+
+
+def _ome_times(description: str, n: int) -> tuple[float | None, Array | None]:
+    """OME schema 2016-06: Pixels/@TimeIncrement, Pixels/Plane/@DeltaT, each with its unit (default s)."""
+    try:
+        root = ElementTree.fromstring(description)
+    except (ElementTree.ParseError, ValueError):
+        return None, None
+    pixels = next((item for item in root.iter() if item.tag.endswith("Pixels")), None)
+    if pixels is None:
+        return None, None
+
+    def seconds(item: ElementTree.Element, key: str) -> float:
+        return _number(item.get(key)) * _TIME_UNITS.get(item.get(f"{key}Unit", "s"), math.nan)
+
+    stamps = np.array([seconds(item, "DeltaT") for item in pixels if item.tag.endswith("Plane")])
+    stamps = stamps[np.isfinite(stamps)]
+    interval = _positive(seconds(pixels, "TimeIncrement"))
+    return 1.0 / interval if interval else None, stamps if len(stamps) == n else None
+
+
+def _number(text: object) -> float:
+    """NaN where it is none."""
+    try:
+        return float(str(text))
+    except ValueError:
+        return math.nan
+
+
+def _positive(value: float) -> float | None:
+    return value if 0 < value < math.inf and 1.0 / value < math.inf else None
