@@ -92,7 +92,7 @@ def find_views(
         >>> len(find_views("calibration/left/*.png", "calibration/right/*.png", "clip"))
         18
     """
-    sides = [_views_of(pattern, Path(folder), camera) for pattern, camera in zip((left, right), CAMERAS, strict=True)]
+    sides = [views_of(pattern, Path(folder), camera) for pattern, camera in zip((left, right), CAMERAS, strict=True)]
     views = TargetImages(sides[0], sides[1], fields, parts)
     numbers = [[view.index if isinstance(view, FrameView) else file_number(view) for view in side] for side in sides]
     if numbers[0] != numbers[1] or len(sides[0]) != len(sides[1]):
@@ -106,7 +106,8 @@ def declared_views(recording: Recording, declared: CalibrationViews) -> TargetIm
     return find_views(declared.left, declared.right, recording.folder, fields, recording.parts)
 
 
-def _views_of(pattern: str, folder: Path, camera: str) -> tuple[View, ...]:
+def views_of(pattern: str, folder: Path, camera: str, most: float = MOST_VIEWS) -> tuple[View, ...]:
+    """Those of one camera, a file each or all frames of one. Raises RecordingError, also where they are too many."""
     files = match_files(split_member(pattern)[0], folder, camera)
     suffix = files[0].suffix.lower()
     if suffix in IMAGES and not (len(files) == 1 and suffix in (".tif", ".tiff")):
@@ -114,10 +115,10 @@ def _views_of(pattern: str, folder: Path, camera: str) -> tuple[View, ...]:
     reader = open_frames(pattern, folder, camera)
     if suffix in IMAGES and len(reader) == 1:
         return tuple(files)
-    if len(reader) > MOST_VIEWS:
+    if len(reader) > most:
         raise RecordingError(
             f"{files[0]}: {len(reader)} frames for the {camera} camera, and every frame is a view of the chessboard. "
-            f"Export at most {MOST_VIEWS} of them; 15 to 40 in different places are enough."
+            f"Export at most {most} of them; 15 to 40 in different places are enough."
         )
     return tuple(FrameView(files[0], reader, index) for index in range(len(reader)))
 
@@ -183,12 +184,16 @@ def calibrate_views(
     return found, tuple(problems)
 
 
+def pixels_of(view: View) -> NDArray:
+    """Grey values or colours of a view as they are stored. Raises RecordingError."""
+    if isinstance(view, FrameView):
+        return view.reader.read(view.index)
+    return decode(content_of(view, str(view)), str(view))
+
+
 def _pixels(view: View, flat: FlatField | None, part: ImagePart | None) -> NDArray:
     """Grey values or colours of a view. Raises RecordingError, which begins with the file or names the frame."""
-    if isinstance(view, FrameView):
-        image: NDArray = view.reader.read(view.index)
-    else:
-        image = decode(content_of(view, str(view)), str(view))
+    image = pixels_of(view)
     whole = flat.corrected(image) if flat is not None and flat.fits(image) else image
     if part is None:
         return whole

@@ -12,7 +12,7 @@ import re
 import tomllib
 import types
 import typing
-from dataclasses import field, fields, is_dataclass
+from dataclasses import Field, field, fields, is_dataclass
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
@@ -29,24 +29,6 @@ NOT_NEGATIVE, POSITIVE = (0.0, MOST), (1 / MOST, MOST)  # of what is positive, t
 def limited(default: Any, limits: tuple[float, float]) -> Any:
     """Field of a dataclass whose numbers lie within limits."""
     return field(default=default, metadata={"limits": limits})
-
-
-def check_limits(settings: Any, where: str, key: str = "", limits: tuple[float, float] = (-MOST, MOST)) -> None:
-    """Raise SceneError for a number of a dataclass beyond its limits; a default may say by nan that it is not given."""
-    if is_dataclass(settings):
-        for f in fields(settings):
-            value, own = getattr(settings, f.name), f.metadata.get("limits", limits)
-            not_given = isinstance(f.default, float) and math.isnan(f.default) and math.isnan(value)
-            if not not_given:
-                check_limits(value, where, f"{key}.{f.name}" if key else f.name, own)
-    elif isinstance(settings, dict):
-        for name, value in settings.items():
-            check_limits(value, where, f"{key}.{name}", limits)
-    elif isinstance(settings, tuple | list):
-        for value in settings:
-            check_limits(value, where, key, limits)
-    elif isinstance(settings, int | float) and not limits[0] <= settings <= limits[1]:  # nan, too
-        raise SceneError(f"{where}: {key} = {settings}; expected a number from {limits[0]:g} to {limits[1]:g}")
 
 
 def read_toml(path: Path, error: type[DiscTrackError]) -> dict[str, Any]:
@@ -80,31 +62,35 @@ def build(kind: Any, tree: dict[str, Any], where: str, section: str = "") -> Any
     Raises SceneError for an unknown key, naming the nearest known one, and for a value of the wrong kind.
     """
     hints = typing.get_type_hints(kind)
-    known = [f.name for f in fields(kind) if hints[f.name] is not Path]
+    known = {f.name: f for f in fields(kind) if hints[f.name] is not Path}
     values = {}
     for key, value in tree.items():
         if key not in known:
             near = get_close_matches(key, known, n=1, cutoff=0.0)
             place = f"[{section}]" if section else "the top level"
             raise SceneError(f"{where}: unknown key '{key}' in {place}; the nearest known key is '{near[0]}'")
-        values[key] = _convert(hints[key], value, where, f"{section}.{key}" if section else key)
+        values[key] = _convert(hints[key], value, where, f"{section}.{key}" if section else key, known[key])
     return kind(**values)
 
 
-def _convert(hint: Any, value: Any, where: str, key: str) -> Any:
-    """`value` as the annotation `hint` wants it: number, string, tuple of them, dataclass, or mapping."""
+def _convert(hint: Any, value: Any, where: str, key: str, f: Field) -> Any:
+    """`value` of the field f as the annotation `hint` wants it: number, string, tuple, dataclass, or mapping."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if is_dataclass(hint) and isinstance(value, dict):
         return build(hint, value, where, key)
     if origin is tuple and isinstance(value, list):
         kinds = [arguments[0]] * len(value) if arguments[-1] is Ellipsis else list(arguments)
         if len(kinds) == len(value):
-            return tuple(_convert(k, v, where, key) for k, v in zip(kinds, value, strict=True))
+            return tuple(_convert(k, v, where, key, f) for k, v in zip(kinds, value, strict=True))
         raise SceneError(f"{where}: {key} has {len(value)} values, {len(kinds)} are expected")
     if origin is dict and isinstance(value, dict):
-        return {str(k): _convert(arguments[1], v, where, f"{key}.{k}") for k, v in value.items()}
-    if hint is float and isinstance(value, int | float) and not isinstance(value, bool):
-        return float(value)
+        return {str(k): _convert(arguments[1], v, where, f"{key}.{k}", f) for k, v in value.items()}
+    if type(value) in (int, hint) and hint in (int, float):
+        least, most = f.metadata.get("limits", (-MOST, MOST))
+        not_given = f.default is math.nan and math.isnan(value)
+        if not (least <= value <= most or not_given):
+            raise SceneError(f"{where}: {key} = {value}; expected a number from {least:g} to {most:g}")
+        return hint(value)
     if isinstance(hint, type) and not isinstance(hint, types.GenericAlias) and type(value) is hint:
         return value
     wanted = getattr(hint, "__name__", str(hint)) if origin is None else f"a list ({hint})"

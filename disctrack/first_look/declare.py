@@ -16,16 +16,14 @@ from calibration.board.chessboard import BoardNotFound, find_corners
 from calibration.board.search import VIEWS_TRIED, board_size
 from calibration.kit.arrays import evenly
 from calibration.rig_file import read_rig
+from disctrack.calibrate.views import pixels_of, views_of
 from disctrack.errors import DiscTrackError, OutputError, RecordingError
 from disctrack.files.toml_tree import read_toml
 from disctrack.files.whole import write_whole
 from disctrack.first_look.sequences import CameraPair, Sequence, find_sequences, pair_cameras
 from disctrack.recording.declaration import FILE_NAME
 from disctrack.recording.declaration_text import Told, declaration_text
-from disctrack.recording.readers import open_frames
 from disctrack.recording.readers.base import FrameReader
-from disctrack.recording.readers.decoding import decode
-from disctrack.recording.readers.files import match_files, split_member
 
 
 @dataclass(frozen=True)
@@ -193,12 +191,8 @@ def _views_among(
 
 def some_images(pattern: str, folder: Path) -> list[NDArray]:
     """A few of one camera's views; they may be in colour. Raises RecordingError."""
-    files = match_files(split_member(pattern)[0], folder, "left")
-    if len(files) > 1:
-        chosen = [files[i] for i in evenly(len(files), VIEWS_TRIED)]
-        return [decode(file.read_bytes(), str(file)) for file in chosen]
-    reader = open_frames(pattern, folder, "left")
-    return [np.array(reader.read(i)) for i in evenly(len(reader), VIEWS_TRIED)]
+    views = views_of(pattern, folder, "left", most=np.inf)
+    return [pixels_of(views[i]) for i in evenly(len(views), VIEWS_TRIED)]
 
 
 def _length(folder: Path, sequence: Sequence) -> int:

@@ -89,10 +89,10 @@ _CENTRES = Key(
     _are_centres,
 )
 
-# What declares each kind of calibration target.
+# What declares views of each kind of calibration target.
 TARGET_KEYS: dict[str, tuple[str, ...]] = {
-    "chessboard": ("inner_corners", "square_mm"),
-    "charuco": ("squares", "square_mm", "marker_mm", "dictionary"),
+    "chessboard": ("left", "right", "inner_corners", "square_mm"),
+    "charuco": ("left", "right", "squares", "square_mm", "marker_mm", "dictionary"),
 }
 
 # Every key that a recording.toml may hold, in the order of the reference example. Ranges are wide enough for a coin and
@@ -306,14 +306,10 @@ def _nearest(name: str, section: str, kind: str = "key") -> str:
 
 def _refuse_missing(file: Path, declared: Mapping[str, Any]) -> None:
     """One message names all keys without a default that sections which are there lack."""
-    calibration = declared.get("calibration", {})
     needed = {section: [key for key, meant in keys.items() if meant.needed] for section, keys in KEYS.items()}
-    if "rig" in calibration:
-        needed["calibration"] = []
-    else:
-        needed["calibration"] = ["left", "right", *TARGET_KEYS.get(str(calibration.get("target", "chessboard")), ())]
+    by_rig, needed["calibration"] = _calibrated_by(declared.get("calibration", {}))
     for section, keys in needed.items():
-        if keys and section not in declared and not (section == "table" and "rig" in calibration):
+        if keys and section not in declared and not (section == "table" and by_rig):
             raise RecordingError(f"{file}: section [{section}] is missing; it holds {', '.join(KEYS[section])}.")
     names = [f"[{s}] {key}" for s, keys in needed.items() for key in keys if s in declared and key not in declared[s]]
     if names:
@@ -356,25 +352,27 @@ def _disc(file: Path, disc: Mapping[str, Any], markers: Mapping[str, Any]) -> Di
     return disc_from_mm(radius, disc["thickness_mm"], disc["mass_g"], centres, diameter, *tolerances)
 
 
+def _calibrated_by(calibration: Mapping[str, object]) -> tuple[bool, list[str]]:
+    """Is it a rig, and the keys of what it is otherwise: views of a target."""
+    by_rig = "rig" in calibration
+    return by_rig, [] if by_rig else list(TARGET_KEYS.get(str(calibration.get("target", "chessboard")), ()))
+
+
 def _refuse_mixed_calibration(file: Path, calibration: Mapping[str, Any]) -> None:
     """Raise RecordingError for keys of another target, and for views beside a rig."""
-    of_targets = dict.fromkeys(key for keys in TARGET_KEYS.values() for key in keys)
-    if "rig" in calibration:
-        views = [key for key in ("left", "right", *of_targets) if key in calibration]
-        if views:
-            raise RecordingError(
-                f"{file}: [calibration] has both rig and {', '.join(views)}. Keep the rig file, or the chessboard "
-                "views."
-            )
-        return
-    kind = calibration.get("target", "chessboard")
-    for key in of_targets:
-        if key in calibration and key not in TARGET_KEYS[kind]:
-            named = " or ".join(f'target = "{name}"' for name, keys in TARGET_KEYS.items() if key in keys)
-            raise RecordingError(
-                f"{file}: [calibration] {key} belongs to {named}; the target here is {kind}: "
-                f"{', '.join(TARGET_KEYS[kind])}."
-            )
+    by_rig, own = _calibrated_by(calibration)
+    of_views = dict.fromkeys(key for keys in TARGET_KEYS.values() for key in keys)
+    odd = [key for key in of_views if key in calibration and key not in own]
+    if odd and by_rig:
+        raise RecordingError(
+            f"{file}: [calibration] has both rig and {', '.join(odd)}. Keep the rig file, or the chessboard views."
+        )
+    if odd:
+        named = " or ".join(f'target = "{name}"' for name, keys in TARGET_KEYS.items() if odd[0] in keys)
+        raise RecordingError(
+            f"{file}: [calibration] {odd[0]} belongs to {named}; the target here is "
+            f"{calibration.get('target', 'chessboard')}: {', '.join(own)}."
+        )
 
 
 def _target(file: Path, calibration: Mapping[str, Any]) -> Target:

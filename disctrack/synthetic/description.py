@@ -20,7 +20,6 @@ from disctrack.files.toml_tree import (
     NOT_NEGATIVE,
     POSITIVE,
     build,
-    check_limits,
     limited,
     read_toml,
     toml_lines,
@@ -271,7 +270,6 @@ def scene_toml(scene: Scene) -> str:
 
 def _check(scene: Scene, where: str) -> None:
     """Raise SceneError for values that no recording can have."""
-    check_limits(scene, where)
     for bad, key, found, expected in _complaints(scene):
         if bad:
             raise SceneError(f"{where}: {key} = {found}; expected {expected}")

@@ -8,6 +8,7 @@ import os
 import threading
 import zlib
 from collections.abc import Generator, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
@@ -135,31 +136,25 @@ class VideoFile(FrameReader):
         import av
 
         damage = ""
-        packets = container.demux(container.streams.video[0])
-        while True:
-            try:
-                packet = next(packets, None)
-            except (av.FFmpegError, OSError, ValueError):
-                return  # what follows is not to be found any more
-            if packet is None:
-                return
-            if packet.is_keyframe and packet.size:
-                damage = ""
-            try:
-                if self._checked and packet.size and not checksums_hold(bytes(packet)):
-                    damage = damage or "wrong checksum"
-                frames = packet.decode()
-            except (av.FFmpegError, OSError, ValueError) as error:
-                damage = damage or str(error)
-                if packet.size:
-                    yield self._position(packet, count), None, damage
-                    count += 1
-                continue
-            for frame in frames:
-                position = self._position(frame, count)
-                problem = damage or ("marked as corrupt" if frame.is_corrupt else "")
-                yield position, None if problem else frame, problem
-                count = position + 1
+        with suppress(av.FFmpegError, OSError, ValueError):  # what follows a fault of the container is not to be found
+            for packet in container.demux(container.streams.video[0]):
+                if packet.is_keyframe and packet.size:
+                    damage = ""
+                frames: list[av.VideoFrame] = []
+                try:
+                    if self._checked and packet.size and not checksums_hold(bytes(packet)):
+                        damage = damage or "wrong checksum"
+                    frames = packet.decode()
+                except (av.FFmpegError, OSError, ValueError) as error:
+                    damage = damage or str(error)
+                    if packet.size:
+                        yield self._position(packet, count), None, damage
+                        count += 1
+                for frame in frames:
+                    position = self._position(frame, count)
+                    problem = damage or ("marked as corrupt" if frame.is_corrupt else "")
+                    yield position, None if problem else frame, problem
+                    count = position + 1
 
     def _position(self, item: av.Packet | av.VideoFrame, count: int) -> int:
         """Index of a packet or frame by its time; by counting where the container has no times."""

@@ -33,7 +33,7 @@ def test_settings_survive_their_text(title):
     settings = Outer(
         title,
         True,
-        ((1.0, float("inf")), (-0.0, 1e-300)),
+        ((1.0, 1e7), (-0.0, 1e-300)),
         {title or "k": 2.0},
         Inner(False, float(np.float64(0.1))),
         (Inner(), Inner(False)),
