@@ -10,9 +10,9 @@ from disctrack.first_look.declare import run_init
 def run(arguments: argparse.Namespace) -> None:
     """Look, write, and tell what is left to fill in."""
     known = {key: getattr(arguments, key) for key in UNKNOWN_TO_FILES if getattr(arguments, key) is not None}
-    done = run_init(arguments.folder, known, arguments.like)
-    rows = [(s, f"{key} = {toml_value(value)}  {remark}".rstrip()) for (s, key), (value, remark) in done.told.items()]
-    rows += [*(("note", note) for note in done.notes), ("written", str(done.file))]
-    rows += [("fill in", ", ".join(done.missing))] if done.missing else []
+    file, told, notes, missing = run_init(arguments.folder, known, arguments.like)
+    rows = [(s, f"{key} = {toml_value(value)}  {remark}".rstrip()) for (s, key), (value, remark) in told.items()]
+    rows += [*(("note", note) for note in notes), ("written", str(file))]
+    rows += [("fill in", ", ".join(missing))] if missing else []
     for heading, text in (*rows, ("then", f"disctrack check {arguments.folder}")):
         print(f"{heading:<13} {text}")

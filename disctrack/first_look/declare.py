@@ -4,19 +4,14 @@ A value that no file tells stands as a comment with FILL IN: the declaration is 
 guess of ours becomes a measurement.
 """
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from functools import cache, partial
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.board.chessboard import BoardNotFound, find_corners
-from calibration.board.search import VIEWS_TRIED, board_size
-from calibration.kit.arrays import evenly
+from calibration.board.search import board_size
 from calibration.rig_file import read_rig
-from disctrack.calibrate.views import pixels_of, views_of
 from disctrack.errors import DiscTrackError, OutputError, RecordingError
 from disctrack.files.toml_tree import read_toml
 from disctrack.files.whole import write_whole
@@ -26,18 +21,10 @@ from disctrack.recording.declaration_text import Told, declaration_text
 from disctrack.recording.readers.base import FrameReader
 
 
-@dataclass(frozen=True)
-class WrittenDeclaration:
-    """What `run_init` wrote."""
-
-    file: Path
-    told: Told  # what the files tell
-    notes: tuple[str, ...]
-    missing: tuple[str, ...]  # keys that the user has to fill in
-
-
-def run_init(folder: Path, known: Mapping[str, float] | None = None, like: Path | None = None) -> WrittenDeclaration:
-    """Write recording.toml into a folder of frames.
+def run_init(
+    folder: Path, known: Mapping[str, float] | None = None, like: Path | None = None
+) -> tuple[Path, Told, list[str], tuple[str, ...]]:
+    """Write recording.toml into a folder of frames. Returns it, what the files tell, notes, and keys left to fill in.
 
     known : values by key that the user gave; like : another recording.toml, or its folder, of the same disc,
     board and table, from which everything is taken that the files do not tell
@@ -52,27 +39,34 @@ def run_init(folder: Path, known: Mapping[str, float] | None = None, like: Path 
     given = {"gravity": {"g_m_s2": 9.81}} | example
     text, missing = declaration_text(folder.resolve().name, told, known or {}, given)
     write_whole(file, text.encode())
-    return WrittenDeclaration(file, told, tuple(notes), missing)
+    return file, told, notes, missing
 
 
 def look_into(folder: Path) -> tuple[Told, list[str]]:
     """What the frames of a folder tell, and notes. Raises RecordingError if no two cameras can be told apart."""
     sequences = find_sequences(folder)
-    shows_once = cache(partial(_shows_the_board_once, folder))  # seconds, for large images
     pairs, half = pair_cameras(sequences), None
-    if _may_be_one_camera(pairs, sequences, shows_once) and (half := _side_by_side(folder, sequences)):
+    # one camera: a sequence without a partner, or partners that are unlike; two and two are two cameras
+    named = any(pair.named for pair in pairs)
+    unlike = not named and (2 * len(pairs) < len(sequences) or any(pair.shows_the_board_once for pair in pairs))
+    if unlike and (half := _side_by_side(sequences)):
         pairs = [CameraPair(sequence, sequence, named=True) for sequence in sequences]
     if not pairs:
         raise _no_two_cameras(folder, sequences)
-    views, inner_corners, board_seen = _views_among(folder, pairs, 1 if half is None else 2)
+    views, inner_corners, board_seen = _views_among(pairs, 1 if half is None else 2)
     candidates = [pair for pair in pairs if pair is not views] or pairs
-    lengths = {id(pair): _length(folder, pair.left) for pair in candidates}
-    frames = max(candidates, key=lambda pair: lengths[id(pair)])
-    if views is None and half is None and shows_once(frames):
+    frames = max(candidates, key=lambda pair: len(pair.left))
+    if views is None and half is None and frames.shows_the_board_once:
         raise _no_two_cameras(folder, sequences)
     if frames is views:
-        raise _views_alone(folder, frames, inner_corners or (9, 6))
-    told, notes = _of_frames(folder, frames)
+        corners = inner_corners or (9, 6)
+        raise RecordingError(
+            f"{folder}: {views.left.pattern} and {views.right.pattern} show a chessboard, and nothing else is there. "
+            "Put the cameras' frames of the disc into the same folder. The cameras alone: disctrack calibrate "
+            f"--left '{folder / views.left.pattern}' --right '{folder / views.right.pattern}' "
+            f"--corners {corners[0]}x{corners[1]} --square-mm SIDE -o rig.h5"
+        )
+    told, notes = _of_frames(frames)
     if len(candidates) > 1:
         others = ", ".join(pair.left.pattern for pair in candidates if pair is not frames)
         notes.append(f"the longest of several pairs is taken for the recording; also there: {others}")
@@ -82,7 +76,7 @@ def look_into(folder: Path) -> tuple[Told, list[str]]:
         told["cameras", "right_part"] = [width, 0, width, height], ""
         notes.append("each image holds two views side by side, as the board in both halves shows")
     if views is not None:
-        left, right, count = views.left.pattern, views.right.pattern, _length(folder, views.left)
+        left, right, count = views.left.pattern, views.right.pattern, len(views.left)
         told["calibration", "left"], told["calibration", "right"] = (left, f"{count} views"), (right, "")
         if inner_corners is None:
             notes.append(f"{left}: {board_seen}")
@@ -96,9 +90,9 @@ def look_into(folder: Path) -> tuple[Told, list[str]]:
     return told, notes
 
 
-def _of_frames(folder: Path, frames: CameraPair) -> tuple[Told, list[str]]:
+def _of_frames(frames: CameraPair) -> tuple[Told, list[str]]:
     """What the cameras' frames tell, and notes."""
-    left, right = frames.left.open(folder), frames.right.open(folder, "right")
+    left, right = frames.left.open(), frames.right.open("right")
     width, height = left.image_size
     described, notes = f"{len(left)} frames of {width} x {height} px, {left.bit_depth} bit", []
     told: Told = {
@@ -117,15 +111,6 @@ def _of_frames(folder: Path, frames: CameraPair) -> tuple[Told, list[str]]:
     return told, notes
 
 
-def _views_alone(folder: Path, views: CameraPair, corners: tuple[int, int]) -> RecordingError:
-    return RecordingError(
-        f"{folder}: {views.left.pattern} and {views.right.pattern} show a chessboard, and nothing else is there. "
-        "Put the cameras' frames of the disc into the same folder. The cameras alone: disctrack calibrate "
-        f"--left '{folder / views.left.pattern}' --right '{folder / views.right.pattern}' "
-        f"--corners {corners[0]}x{corners[1]} --square-mm SIDE -o rig.h5"
-    )
-
-
 def _no_two_cameras(folder: Path, sequences: list[Sequence]) -> RecordingError:
     seen = ", ".join(sequence.pattern for sequence in sequences[:6]) or "no file that frames are read from"
     return RecordingError(
@@ -134,27 +119,10 @@ def _no_two_cameras(folder: Path, sequences: list[Sequence]) -> RecordingError:
     )
 
 
-def _may_be_one_camera(
-    pairs: list[CameraPair], sequences: list[Sequence], shows_once: Callable[[CameraPair], bool]
-) -> bool:
-    """Is a sequence without a partner, or are partners unlike? Where all are two and two there are two cameras."""
-    if any(pair.named for pair in pairs):
-        return False
-    return 2 * len(pairs) < len(sequences) or any(map(shows_once, pairs))
-
-
-def _shows_the_board_once(folder: Path, pair: CameraPair) -> bool:
-    """Does one of two sequences show a chessboard and the other none? Those are views and frames of one camera."""
-    if pair.named:
-        return False
-    left, right = (board_size(some_images(side.pattern, folder))[0] is None for side in (pair.left, pair.right))
-    return left != right
-
-
-def _side_by_side(folder: Path, sequences: list[Sequence]) -> tuple[int, int] | None:
+def _side_by_side(sequences: list[Sequence]) -> tuple[int, int] | None:
     """Width and height [px] of half an image, where there are images whose two halves both show a chessboard."""
-    for sequence in sorted(sequences, key=lambda sequence: _length(folder, sequence)):
-        halves = [np.array_split(image, 2, axis=1) for image in some_images(sequence.pattern, folder)]
+    for sequence in sorted(sequences, key=len):
+        halves = [np.array_split(image, 2, axis=1) for image in sequence.some_images()]
         if any(left.shape != right.shape for left, right in halves):
             continue
         size, _ = board_size([half for both in halves for half in both])
@@ -167,19 +135,17 @@ def _side_by_side(folder: Path, sequences: list[Sequence]) -> tuple[int, int] | 
     return None
 
 
-def _views_among(
-    folder: Path, pairs: list[CameraPair], side_by_side: int
-) -> tuple[CameraPair | None, tuple[int, int] | None, str]:
+def _views_among(pairs: list[CameraPair], side_by_side: int) -> tuple[CameraPair | None, tuple[int, int] | None, str]:
     """The pair that shows the chessboard: by its names, else by what is in the images, shortest first.
 
     side_by_side : how many cameras' images stand beside each other in one
     """
     named = [pair for pair in pairs if pair.looks_like_calibration]
-    others = sorted((pair for pair in pairs if pair not in named), key=lambda pair: _length(folder, pair.left))
+    others = sorted((pair for pair in pairs if pair not in named), key=lambda pair: len(pair.left))
     tried = [*named, *(others if not named and len(pairs) > 1 else [])]
     for pair in tried:
         sides = (pair.left, pair.right) if side_by_side == 1 else (pair.left,)
-        whole = [image for side in sides for image in some_images(side.pattern, folder)]
+        whole = [image for side in sides for image in side.some_images()]
         images = [part for image in whole for part in np.array_split(image, side_by_side, axis=1)]
         size, seen = board_size(images)
         if size is not None:
@@ -187,16 +153,6 @@ def _views_among(
     if named:
         return named[0], None, "no board found in the images that were tried"
     return None, None, ""
-
-
-def some_images(pattern: str, folder: Path) -> list[NDArray]:
-    """A few of one camera's views; they may be in colour. Raises RecordingError."""
-    views = views_of(pattern, folder, "left", most=np.inf)
-    return [pixels_of(views[i]) for i in evenly(len(views), VIEWS_TRIED)]
-
-
-def _length(folder: Path, sequence: Sequence) -> int:
-    return sequence.files if sequence.files > 1 else len(sequence.open(folder))
 
 
 def _frame_rate(left: FrameReader, right: FrameReader) -> tuple[float | None, str]:

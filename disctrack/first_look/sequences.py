@@ -5,8 +5,15 @@ import re
 from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.board.search import VIEWS_TRIED, board_size
+from calibration.kit.arrays import evenly
+from disctrack.calibrate.views import pixels_of, views_of
 from disctrack.errors import RecordingError
 from disctrack.recording.readers import open_frames
 from disctrack.recording.readers.base import FrameReader
@@ -24,13 +31,22 @@ _TOKEN = re.compile(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])|[0-9]+|[^A-Za-z0-9]+")
 class Sequence:
     """Frames of one camera, as `[cameras] left` would name them."""
 
-    pattern: str  # relative to the folder
+    folder: Path  # of the recording
+    pattern: str  # relative to it
     kind: str  # suffix of the files
     files: int
 
-    def open(self, folder: Path, camera: str = "left") -> FrameReader:
+    def __len__(self) -> int:
+        return self.files if self.files > 1 else len(self.open())
+
+    def open(self, camera: str = "left") -> FrameReader:
         """Reader of its frames. Raises RecordingError."""
-        return open_frames(self.pattern, folder, camera)
+        return open_frames(self.pattern, self.folder, camera)
+
+    def some_images(self) -> list[NDArray]:
+        """A few over its length; views may be in colour. Raises RecordingError."""
+        views = views_of(self.pattern, self.folder, "left", most=np.inf)
+        return [pixels_of(views[i]) for i in evenly(len(views), VIEWS_TRIED)]
 
 
 @dataclass(frozen=True)
@@ -46,6 +62,13 @@ class CameraPair:
         """True where the names speak of a calibration."""
         return bool(_CALIBRATION_WORDS.search(self.left.pattern) and _CALIBRATION_WORDS.search(self.right.pattern))
 
+    @cached_property
+    def shows_the_board_once(self) -> bool:
+        """Does one show a chessboard and the other none, so that they are views and frames of one camera?"""
+        return (
+            not self.named and len({board_size(side.some_images())[0] is None for side in (self.left, self.right)}) > 1
+        )
+
 
 def find_sequences(folder: Path) -> list[Sequence]:
     """Sequences of frames in the folder and below, results of earlier runs left out."""
@@ -55,14 +78,14 @@ def find_sequences(folder: Path) -> list[Sequence]:
     for place, names in _folders(folder):
         inside = place.relative_to(folder)
         images = [name for name in names if Path(name).suffix.lower() in IMAGES]
-        found += _image_sequences(inside, images)
+        found += _image_sequences(folder, inside, images)
         headers = {Path(name).stem for name in names if Path(name).suffix.lower() in FORMATS["mraw"] - {".mraw"}}
         for name in names:
             suffix, path = Path(name).suffix.lower(), (inside / name).as_posix()
             if suffix in FORMATS["hdf5"]:
-                found += [Sequence(f"{path}:{stack}", suffix, 1) for stack in _stacks(place / name)]
+                found += [Sequence(folder, f"{path}:{stack}", suffix, 1) for stack in _stacks(place / name)]
             elif suffix in SUFFIXES - IMAGES and not (suffix == ".mraw" and Path(name).stem in headers):
-                found.append(Sequence(path, suffix, 1))
+                found.append(Sequence(folder, path, suffix, 1))
     return found
 
 
@@ -104,7 +127,7 @@ def _folders(folder: Path) -> Iterable[tuple[Path, list[str]]]:
         yield Path(place), sorted((name for name in names if not name.startswith(".")), key=natural_key)
 
 
-def _image_sequences(inside: Path, names: list[str]) -> list[Sequence]:
+def _image_sequences(folder: Path, inside: Path, names: list[str]) -> list[Sequence]:
     """Images of one folder, grouped by what is left of their names when the counting number is taken out."""
     alike: dict[tuple[str, ...], list[list[str]]] = defaultdict(list)
     for name in names:
@@ -124,7 +147,7 @@ def _image_sequences(inside: Path, names: list[str]) -> list[Sequence]:
     for (pattern, suffix), count in groups.items():
         alone = suffixes.count(suffix) == 1 and "*" in pattern
         shown_pattern = f"*{Path(pattern).suffix}" if alone and inside != Path() else pattern
-        result.append(Sequence((inside / shown_pattern).as_posix(), suffix, count))
+        result.append(Sequence(folder, (inside / shown_pattern).as_posix(), suffix, count))
     return result
 
 

@@ -98,13 +98,12 @@ class _Mean:
     mean: Array32
     clipped: Mask  # in more than a twentieth of the images
     n: int
-    bit_depth: int
-    described: str  # size and depth
+    first: FrameReader  # that gave some of them
     sha256: str
 
 
-def _mean(pattern: str, folder: Path, camera: str, kind: str) -> _Mean:
-    """Mean of the frames of one file, or of all images that lie in a folder or match a pattern."""
+def _mean(pattern: str, folder: Path, camera: str, kind: str, like: _Mean | None = None) -> _Mean:
+    """Mean of the frames of one file, or of all images that lie in a folder or match a pattern; of those' size."""
     if (folder / pattern).is_dir():
         pattern = str(Path(pattern) / "*")
     files = match_files(split_member(pattern)[0], folder, f"{camera} camera's {kind}")
@@ -113,16 +112,16 @@ def _mean(pattern: str, folder: Path, camera: str, kind: str) -> _Mean:
         readers = [open_frames(glob.escape(file.name), file.parent, what) for file in files]
     else:
         readers = [open_frames(pattern, folder, what)]
-    first = readers[0]
-    described = in_words(first.image_size, first.bit_depth)
+    first = readers[0] if like is None else like.first
     total = np.zeros(first.image_size[::-1])
     clipped = np.zeros(total.shape, np.int64)
     digest, n = hashlib.sha256(), 0
     for reader in readers:
-        if (other := in_words(reader.image_size, reader.bit_depth)) != described:
+        found, expected = (in_words(one.image_size, one.bit_depth) for one in (reader, first))
+        if found != expected:
             raise RecordingError(
-                f"[cameras] {what}: {reader.describe(0)} is {other}, but {first.describe(0)} is {described}. Images "
-                "that are averaged must be alike: take the other one away."
+                f"[cameras] {what}: {reader.describe(0)} is {found}, but {first.describe(0)} is {expected}. Take both "
+                "with the settings of the recording, or take the other one away."
             )
         for index in range(len(reader)):
             image = reader.read(index)
@@ -130,22 +129,16 @@ def _mean(pattern: str, folder: Path, camera: str, kind: str) -> _Mean:
             clipped += image >= 2**first.bit_depth - 1
             n += 1
         digest.update(reader.content_sha256(0, len(reader)).encode())
-    where = f"{first.describe(0)} ([cameras] {what})"
-    mean = (total / n).astype(np.float32)
-    return _Mean(where, mean, clipped > 0.05 * n, n, first.bit_depth, described, digest.hexdigest())
+    where = f"{readers[0].describe(0)} ([cameras] {what})"
+    return _Mean(where, (total / n).astype(np.float32), clipped > 0.05 * n, n, readers[0], digest.hexdigest())
 
 
 def _flat_field(flat_images: str | None, dark_images: str | None, folder: Path, camera: str) -> FlatField | None:
     flat = None if flat_images is None else _mean(flat_images, folder, camera, "flat")
-    dark = None if dark_images is None else _mean(dark_images, folder, camera, "dark")
+    dark = None if dark_images is None else _mean(dark_images, folder, camera, "dark", flat)
     one = flat or dark
     if one is None:
         return None
-    if flat and dark and flat.described != dark.described:
-        raise RecordingError(
-            f"{flat.where}: {flat.described}, but {dark.where} has {dark.described}. Take both with the settings of "
-            "the recording."
-        )
     offset = np.zeros_like(one.mean) if dark is None else dark.mean
     gain, dead = np.ones_like(offset), np.zeros(offset.shape, bool)
     notes = []
@@ -159,7 +152,7 @@ def _flat_field(flat_images: str | None, dark_images: str | None, folder: Path, 
     if n := int(dead.sum()):
         notes.append(f"{camera} camera: {n} dead pixel{'s' * (n > 1)} by its flat image, replaced by their neighbours")
     digest = " ".join(m.sha256 if m else "-" for m in (flat, dark))
-    return FlatField(offset, gain, dead if dead.any() else None, one.bit_depth, digest, tuple(notes))
+    return FlatField(offset, gain, dead if dead.any() else None, one.first.bit_depth, digest, tuple(notes))
 
 
 def _gain(flat: _Mean, offset: Array32, dark: _Mean | None) -> tuple[Array32, Mask]:
@@ -177,10 +170,10 @@ def _gain(flat: _Mean, offset: Array32, dark: _Mean | None) -> tuple[Array32, Ma
             f"{flat.where} is not brighter (median {np.median(flat.mean):.1f}) than {dark.where} (median "
             f"{np.median(offset):.1f}): are the two exchanged?"
         )
-    if level < LEAST_LIGHT * 2**flat.bit_depth:
+    if level < LEAST_LIGHT * 2**flat.first.bit_depth:
         raise RecordingError(
-            f"{flat.where}: its median is {level:.1f} grey values above the dark image, of {2**flat.bit_depth - 1}. "
-            "That is too dark to tell gains. Take it of an evenly lit white surface, at about half of full scale."
+            f"{flat.where}: its median is {level:.1f} grey values above the dark image, of "
+            f"{2**flat.first.bit_depth - 1}. That is too dark to tell gains. Take it of an evenly lit white surface, at about half of full scale."
         )
     around = cv2.medianBlur(answer, 5)
     dead = np.asarray((np.abs(answer - around) > ODD * around) | flat.clipped | (answer <= 0.1 * level))

@@ -29,7 +29,6 @@ from disctrack.recording.readers.raw import (
     check_frame_size,
 )
 
-_MOST_OBJECTS = 10_000  # looked at in the search for the one stack
 _LARGEST_CACHE = 64 << 20  # bytes of decompressed chunks kept; more than one camera's chunk of many frames
 _LARGEST_CHUNK = 512 << 20  # bytes: what the library takes at once, whatever the file's size
 
@@ -80,16 +79,7 @@ def _stack(handle: h5py.File, member: str, file: Path) -> h5py.Dataset:
 def stacks_of(handle: h5py.File) -> list[h5py.Dataset]:
     """Data sets that may be frames; links to other files are not followed."""
     found: list[h5py.Dataset] = []
-    seen = 0
-
-    def look(name: str, item: object) -> bool | None:
-        nonlocal seen
-        seen += 1
-        if _is_stack(item):
-            found.append(item)
-        return True if seen > _MOST_OBJECTS else None
-
-    handle.visititems(look)
+    handle.visititems(lambda _, item: found.append(item) if _is_stack(item) else None)
     return found
 
 
