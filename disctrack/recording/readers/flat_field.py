@@ -173,7 +173,8 @@ def _gain(flat: _Mean, offset: Array32, dark: _Mean | None) -> tuple[Array32, Ma
     if level < LEAST_LIGHT * 2**flat.first.bit_depth:
         raise RecordingError(
             f"{flat.where}: its median is {level:.1f} grey values above the dark image, of "
-            f"{2**flat.first.bit_depth - 1}. That is too dark to tell gains. Take it of an evenly lit white surface, at about half of full scale."
+            f"{2**flat.first.bit_depth - 1}. That is too dark to tell gains. Take it of an evenly lit white surface, "
+            "at about half of full scale."
         )
     around = cv2.medianBlur(answer, 5)
     dead = np.asarray((np.abs(answer - around) > ODD * around) | flat.clipped | (answer <= 0.1 * level))
