@@ -21,8 +21,8 @@ from disctrack.files.json_text import json_file
 from disctrack.files.software import __version__
 from disctrack.files.text import csv_cell
 from disctrack.files.whole import write_whole
-from disctrack.recording.changed import changed_since
 from disctrack.recording.declaration import FILE_NAME
+from disctrack.recording.declaration_text import changed_since
 from disctrack.report.html import page
 from disctrack.trajectory.file import read_provenance
 

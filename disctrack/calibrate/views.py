@@ -16,11 +16,10 @@ from disctrack.errors import RecordingError
 from disctrack.frames import CAMERAS
 from disctrack.recording.declaration import CalibrationViews, Recording
 from disctrack.recording.readers import open_frames
-from disctrack.recording.readers.base import FrameReader
+from disctrack.recording.readers.base import FrameReader, ImagePart, ImageParts
 from disctrack.recording.readers.decoding import decode
 from disctrack.recording.readers.files import IMAGES, content_of, file_number, match_files, split_member
 from disctrack.recording.readers.flat_field import FlatField, FlatFields, flat_fields
-from disctrack.recording.readers.part import ImagePart, ImageParts
 
 MOST_VIEWS = 500  # ten times what a calibration needs; corners of one more take as long as those of the first
 

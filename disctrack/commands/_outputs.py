@@ -20,8 +20,8 @@ from disctrack.files.whole import check_writable as check_writable
 from disctrack.files.whole import write_whole
 from disctrack.findings import Kind, Severity, in_doubt, leading, of_kind
 from disctrack.progress import progress_bar, times_so_far
-from disctrack.recording.changed import changed_since, told_differences
 from disctrack.recording.declaration import FILE_NAME, Recording
+from disctrack.recording.declaration_text import changed_since, told_differences
 from disctrack.recording.readers.blocks import iter_pair_blocks
 from disctrack.report.blocks import Facts, Report, document
 from disctrack.report.html import link_pages

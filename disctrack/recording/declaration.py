@@ -18,7 +18,7 @@ from disctrack.errors import CalibrationError, RecordingError
 from disctrack.files.inputs import RECORDING_FILE, keep, why_not_regular
 from disctrack.files.toml_tree import read_toml
 from disctrack.frames import CAMERAS
-from disctrack.recording.readers.part import ImagePart, ImageParts
+from disctrack.recording.readers.base import ImagePart, ImageParts
 
 FILE_NAME = RECORDING_FILE
 MOST = 100  # dots of a disc; corners or squares along a side of a target

@@ -22,10 +22,9 @@ from disctrack.frames import CAMERAS
 from disctrack.progress import compiling
 from disctrack.recording.declaration import Recording
 from disctrack.recording.readers import open_frames
-from disctrack.recording.readers.base import FrameReader
+from disctrack.recording.readers.base import FrameReader, frames_in_parts
 from disctrack.recording.readers.blocks import PairBlock, Unreadable, check_pair, default_threads, iter_pair_blocks
 from disctrack.recording.readers.flat_field import flat_fielded, flat_fields
-from disctrack.recording.readers.part import frames_in_parts
 from disctrack.recording.readers.same_instants import check_headers, check_same_numbers, check_time_stamps, usable_times
 from disctrack.track.follow.motion_span import MotionSpan, find_motion
 from disctrack.track.follow.tracking import (

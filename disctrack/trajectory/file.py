@@ -414,20 +414,19 @@ def _reading(path: Path) -> contextlib.AbstractContextManager[h5py.File]:
 
 
 def _trajectory(file: h5py.File) -> Trajectory:
-    _check_units(file)
-    root, disc = read_variables(file, ("time", *COORDINATES)), _read_disc(file["disc"])
+    time, disc = _array(file, "time", "s"), _read_disc(file["disc"])
     lengths = {name: len(values) for name, (values, _) in _NAMED_AXES.items()}
-    lengths |= {"time": len(root["time"]), "marker": disc.n_markers}
+    lengths |= {"time": len(time), "marker": disc.n_markers}
     found: dict[str, Any] = {}
-    for attribute, (place, dims, *_) in _LAYOUT.items():
-        found[attribute] = read_array(file[place])
+    for attribute, (place, dims, unit, _) in _LAYOUT.items():
+        found[attribute] = _array(file, place, unit)
         expected = tuple(lengths[axis] for axis in dims)
         if found[attribute].shape != expected:
             raise TrajectoryFileError(f"{attribute} has shape {found[attribute].shape}; expected {expected}")
     found |= {name: float(file.attrs[key]) for name, key in _NUMBERS.items()}
     trajectory = Trajectory(
-        time=root["time"],
-        q=np.column_stack([root[name] for name in COORDINATES]),
+        time=time,
+        q=np.column_stack([_array(file, name, unit) for name, (unit, _) in _COORDINATES.items()]),
         disc=disc,
         rig=_rig(file["calibration"]),
         table_moved=tuple(file.attrs["table_moved_m_rad"].tolist()),
@@ -438,14 +437,12 @@ def _trajectory(file: h5py.File) -> Trajectory:
     return trajectory
 
 
-def _check_units(file: h5py.File) -> None:
-    """Raise ValueError where numbers are in other units than this program writes."""
-    units = {name + ending: unit for name, (unit, _) in _COORDINATES.items() for ending in ("", "_sigma")}
-    units |= {place: unit for place, _, unit, _ in _LAYOUT.values()} | {"time": "s"}
-    for name, unit in units.items():
-        found = str(file[name].attrs.get("units", unit)) if name in file else unit
-        if found != unit:
-            raise ValueError(f"{name} is in {found!r}; expected {unit!r}")
+def _array(file: h5py.File, place: str, unit: str) -> NDArray:
+    """Raises ValueError where numbers are in another unit than this program writes."""
+    found = str(file[place].attrs.get("units", unit))
+    if found != unit:
+        raise ValueError(f"{place} is in {found!r}; expected {unit!r}")
+    return read_array(file[place])
 
 
 def _read_disc(group: h5py.Group) -> Disc:

@@ -12,7 +12,7 @@ import pytest
 
 import disctrack
 from disctrack.cli import main
-from disctrack.recording.changed import told_differences
+from disctrack.recording.declaration_text import told_differences
 from disctrack.trajectory.file import read_group
 
 

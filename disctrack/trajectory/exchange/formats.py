@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import partial
+from inspect import signature
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -37,18 +38,16 @@ class Format:
     endings: tuple[str, ...]  # of file names; the longest that fits is meant
     holds: str  # "trajectory", "rig" or "points"
     write: Callable[[Path, Any], object]  # path, Trajectory or StereoRig
-    # path (or paths: `in_parts`) and what is asked of the user -> StereoRig, or points (n, 2, m, 2)
+    # path (or `paths`, where a rig may lie in several files) -> StereoRig, or points (n, 2, m, 2); what else it takes
+    # by name may be told by the user: world_is_table, cameras, image_size, unit
     read: Callable[..., Any] | None
     lost: str  # what of ours it has no place for
     # Terms of a lens that it holds, by which the others are fitted; None: it holds points without any lens
     terms: tuple[str, ...] | None = BROWN
-    asks: tuple[str, ...] = ()  # what a reader may be told: world_is_table, cameras, image_size, unit
-    in_parts: bool = False  # True where a rig may lie in several files
     mark: str = ""  # text by which a file is told from others of its ending
 
 
 SIGMAS = "sigmas but one of the place, the rig, the dots in the images"
-WORLD = ("world_is_table",)
 ROWS = (
     Format("table", (".csv",), "trajectory", partial(motion.write_csv, overwrite=True), None,
            "covariances, the rig, the dots"),
@@ -62,20 +61,17 @@ ROWS = (
            mark="_cam1_X"),
     Format("DLTdv8 points", ("xypts.csv",), "points", points.write_xypts, points.read_xypts, "sigmas, the lenses: the "
            "points are without their distortion, as dltcoefs.csv needs them", mark="pt1_cam1_X"),
-    Format("OpenCV", (".yml", ".yaml", ".xml"), "rig", opencv.write_opencv, opencv.read_opencv, "covariances",
-           asks=("image_size", "unit", *WORLD), in_parts=True),
+    Format("OpenCV", (".yml", ".yaml", ".xml"), "rig", opencv.write_opencv, opencv.read_opencv, "covariances"),
     Format("Kalibr", ("camchain.yaml", "kalibr.yaml"), "rig", rigs.write_kalibr, rigs.read_kalibr,
            "covariances, the world frame", FOUR, mark="cam0:"),
-    Format("Caliscope", (".toml",), "rig", rigs.write_caliscope, rigs.read_caliscope, "covariances",
-           asks=("cameras", *WORLD)),
+    Format("Caliscope", (".toml",), "rig", rigs.write_caliscope, rigs.read_caliscope, "covariances"),
     Format("Pose2Sim", ("pose2sim.toml", "calib.toml"), "rig", rigs.write_pose2sim, rigs.read_caliscope, "covariances",
-           FOUR, ("cameras", *WORLD)),
-    Format("mrcal", (".cameramodel",), "rig", rigs.write_mrcal, rigs.read_mrcal, "covariances", asks=WORLD,
-           in_parts=True),
+           FOUR),
+    Format("mrcal", (".cameramodel",), "rig", rigs.write_mrcal, rigs.read_mrcal, "covariances"),
     Format("DLT", ("dltcoefs.csv",), "rig", rigs.write_dlt, rigs.read_dlt, "covariances, the lenses: they belong to "
-           "points without distortion, those of xypts.csv", None, ("image_size", "unit", *WORLD)),
+           "points without distortion, those of xypts.csv", None),
     Format("MATLAB stereoParameters", (".mat",), "rig", matlab.write_stereo_parameters, matlab.read_stereo_parameters,
-           "covariances", asks=("unit", *WORLD)),
+           "covariances"),
 )  # fmt: skip
 
 
@@ -144,10 +140,11 @@ def read_foreign(paths: Sequence[Path], **told: Any) -> Any:
     row = _fitting(readable, first, head)
     if row is None or row.read is None:
         raise OutputError(f"{first}: no file of ours, and no format of this name is read; known are {_known(readable)}")
-    idle = [word for word in told if word not in row.asks]
+    asked = signature(row.read).parameters
+    idle = [word for word in told if word not in asked]
     if idle:
         raise OutputError(f"{_options(idle)}: says nothing about {first} as {row.name}; leave it out")
-    return row.read(paths if row.in_parts else the_one(paths), **told)
+    return row.read(paths if "paths" in asked else the_one(paths), **told)
 
 
 def _fitting(rows: Sequence[Format], path: Path, head: str = "") -> Format | None:
