@@ -21,7 +21,7 @@ from disctrack.errors import OutputError, TrajectoryFileError
 from disctrack.files.inputs import keep, refuse_input
 from disctrack.files.whole import refuse_existing, write_whole
 from disctrack.trajectory import Trajectory
-from disctrack.trajectory.exchange import matlab, motion, opencv, points, rigs
+from disctrack.trajectory.exchange import arrays, motion, points, rigs
 from disctrack.trajectory.exchange.lens import BROWN, within_brown
 from disctrack.trajectory.exchange.rig_parts import content_of, the_one
 from disctrack.trajectory.file import read_trajectory, trajectory_in
@@ -51,7 +51,7 @@ SIGMAS = "sigmas but one of the place, the rig, the dots in the images"
 ROWS = (
     Format("table", (".csv",), "trajectory", partial(motion.write_csv, overwrite=True), None,
            "covariances, the rig, the dots"),
-    Format("MATLAB", (".mat",), "trajectory", matlab.write_mat, None, "the rig"),
+    Format("MATLAB", (".mat",), "trajectory", arrays.write_mat, None, "the rig"),
     Format("C3D", (".c3d",), "trajectory", motion.write_c3d, None, SIGMAS),
     Format("TRC", (".trc",), "trajectory", motion.write_trc, None, "sigmas, the rig, the dots in the images"),
     Format("QTM", (".tsv",), "trajectory", motion.write_qtm, None, SIGMAS),
@@ -61,7 +61,7 @@ ROWS = (
            mark="_cam1_X"),
     Format("DLTdv8 points", ("xypts.csv",), "points", points.write_xypts, points.read_xypts, "sigmas, the lenses: the "
            "points are without their distortion, as dltcoefs.csv needs them", mark="pt1_cam1_X"),
-    Format("OpenCV", (".yml", ".yaml", ".xml"), "rig", opencv.write_opencv, opencv.read_opencv, "covariances"),
+    Format("OpenCV", (".yml", ".yaml", ".xml"), "rig", arrays.write_opencv, arrays.read_opencv, "covariances"),
     Format("Kalibr", ("camchain.yaml", "kalibr.yaml"), "rig", rigs.write_kalibr, rigs.read_kalibr,
            "covariances, the world frame", FOUR, mark="cam0:"),
     Format("Caliscope", (".toml",), "rig", rigs.write_caliscope, rigs.read_caliscope, "covariances"),
@@ -70,7 +70,7 @@ ROWS = (
     Format("mrcal", (".cameramodel",), "rig", rigs.write_mrcal, rigs.read_mrcal, "covariances"),
     Format("DLT", ("dltcoefs.csv",), "rig", rigs.write_dlt, rigs.read_dlt, "covariances, the lenses: they belong to "
            "points without distortion, those of xypts.csv", None),
-    Format("MATLAB stereoParameters", (".mat",), "rig", matlab.write_stereo_parameters, matlab.read_stereo_parameters,
+    Format("MATLAB stereoParameters", (".mat",), "rig", arrays.write_stereo_parameters, arrays.read_stereo_parameters,
            "covariances"),
 )  # fmt: skip
 

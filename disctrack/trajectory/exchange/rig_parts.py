@@ -27,46 +27,6 @@ def rig_of(parts: Sequence[tuple[Camera, Array, Array]], world_is_table: bool) -
     return StereoRig(left, right, **placed_at([(R, t) for _, R, t in parts]), world_is_table=world_is_table)
 
 
-def stereo_rig(
-    found: Mapping[str, Any],
-    names: Sequence[str],
-    sizes: Sequence[Array],
-    unit: float,
-    world_is_table: bool,
-    where: str,
-) -> StereoRig:
-    """A rig kept as OpenCV's functions have it: names of K and D of both cameras, of R and t from left to right.
-
-    Beside them, where the file has them, R_left_world, t_left_world and world_is_table. unit : [m]
-    Raises RigFileError.
-    """
-    *of_cameras, R, t = names
-    cameras = [
-        camera_of(array_of(found, K, (3, 3), where), array_of(found, D, (-1,), where), size, f"{where}: {K}, {D}")
-        for K, D, size in zip(of_cameras[::2], of_cameras[1::2], sizes, strict=True)
-    ]
-    world: dict[str, Any] = {"R_left_world": np.eye(3), "t_left_world": np.zeros(3), "world_is_table": 0.0} | dict(
-        found
-    )
-    return StereoRig(
-        cameras[0],
-        cameras[1],
-        rotation_of(array_of(found, R, (-1,), where), f"{where}: {R}"),
-        array_of(found, t, (3,), where) * unit,
-        rotation_of(array_of(world, "R_left_world", (-1,), where), f"{where}: R_left_world"),
-        array_of(world, "t_left_world", (3,), where) * unit,
-        world_is_table=world_is_table or bool(np.ravel(world["world_is_table"])[0]),
-    )
-
-
-def opencv_numbers(rig: StereoRig, names: Sequence[str]) -> dict[str, Any]:
-    """The inverse of `stereo_rig`, in metres: the world beside what stands under `names`."""
-    of_cameras = [number for camera in rig.cameras for number in (camera.camera_matrix, np.array([camera.distortion]))]
-    numbers = dict(zip(names, (*of_cameras, rig.R_right_left, rig.t_right_left[:, None]), strict=True))
-    world = {"R_left_world": rig.R_left_world, "t_left_world": rig.t_left_world[:, None]}
-    return numbers | world | {"world_is_table": int(rig.world_is_table)}
-
-
 def camera_of(K: Array, D: Array, size: Array, where: str) -> Camera:
     """From another program's camera matrix, up to 14 lens terms of OpenCV's order, and image size (width, height).
 
