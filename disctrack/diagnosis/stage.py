@@ -27,7 +27,7 @@ from disctrack.discrepancy.laws import WithLaw, explained_by_law, judged_as
 from disctrack.discrepancy.noise import with_memory
 from disctrack.discrepancy.search import Diagnosis, Found, Settings
 from disctrack.discrepancy.significance import wald
-from disctrack.discrepancy.system import System
+from disctrack.discrepancy.system import USED_UP, System
 from disctrack.errors import AnalysisError
 from disctrack.files.inputs import keep, refuse_input
 from disctrack.files.json_text import json_file
@@ -38,8 +38,6 @@ from disctrack.report.html import write_page
 from disctrack.trajectory import Trajectory
 from disctrack.trajectory.file import trajectory_in
 from disctrack.trajectory.reuse import content_of, origin_of, refuse_other, remember
-
-USED_UP = "the search ended when its work was used up: not all that may be missing was tried"
 
 
 @dataclass(frozen=True, repr=False)

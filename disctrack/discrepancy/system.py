@@ -15,6 +15,7 @@ import numpy as np
 from calibration.kit.arrays import Array, Mask
 
 Values = Mapping[str, float]
+USED_UP = "the search ended when its work was used up: not all that may be missing was tried"
 Transform = Callable[[Array], Array]  # of residual and derivative side by side (n, w, 1 + k), into as many numbers
 
 

@@ -240,7 +240,9 @@ def _along_stages(W, z, x, out):
 
 @entry
 def integrate(rhs, z, p, columns, span, n, knots, pieces, size, tolerance, max_steps, samples, out):
-    """Fill out (m, len(z)) with the solution at samples (m,), which increase; False where it has no end.
+    """Fill out (m, len(z)) with the solution at samples (m,), which increase; how many steps that takes.
+
+    Minus their number where it has no end.
 
     z : (n (1 + k),) states and their derivatives by k quantities at span[0]
     columns : (k,) index in p of each quantity; -1 for an initial state
@@ -259,7 +261,7 @@ def integrate(rhs, z, p, columns, span, n, knots, pieces, size, tolerance, max_s
         speed, most = max(speed, abs(K[0, i]) / size[i]), max(most, _RAN_AWAY * size[i])
     h = min(end - t, 0.01 / speed) if speed > 0 else 0.01 * (end - t)
     filled, stiff, rejected, at_limit, calm, first = 0, False, False, 0, 0, True
-    for _ in range(max_steps):
+    for taken in range(max_steps):
         remaining = end - t
         last = remaining <= h * (1.0 + 1e-9)
         step = remaining if last else h
@@ -270,7 +272,7 @@ def integrate(rhs, z, p, columns, span, n, knots, pieces, size, tolerance, max_s
             arrival = knots[i]  # to the bit: on the other side of it the inputs are others
             step, last = arrival - t, False
         if step < 1e-15 * max(abs(t), 1e-3):
-            return False
+            return -taken
         if stiff:
             worst, power = _implicit_step(rhs, t, step, z, drive, K[0], size, W), -0.25
             _along_stages(W, z, 1.0, new)
@@ -283,13 +285,13 @@ def integrate(rhs, z, p, columns, span, n, knots, pieces, size, tolerance, max_s
             h = step * max(0.2, 0.9 * worst**power) if np.isfinite(worst) else 0.1 * step
             rejected = True
             if h < 1e-14 * (end - span[0]):
-                return False
+                return -taken
             continue
         # how fast nearby motions part or meet, from two estimates of the state at the end of the step
         apart, together = 0.0, 0.0
         for i in range(n):
             if abs(new[i]) > most:
-                return False
+                return -taken
             apart += ((K[12, i] - K[11, i]) / size[i]) ** 2
             together += ((new[i] - made.stage[i]) / size[i]) ** 2
             for c in range(len(columns)):
@@ -335,8 +337,8 @@ def integrate(rhs, z, p, columns, span, n, knots, pieces, size, tolerance, max_s
             if stiff:
                 h, at_limit, calm = step, 0, 0
         if last:
-            return True
-    return False
+            return taken + 1
+    return -max_steps
 
 
 @entry

@@ -184,8 +184,9 @@ class Formulas:
         function = sympy.lambdify((_t, self.numbers), flat, "numpy")
 
         def evaluate(time: Array, p: Array) -> tuple[Array, Array]:
-            values = np.array([np.broadcast_to(v, time.shape) for v in function(time, p)], float)
-            w = len(self.late)
+            w, values = len(self.late), np.empty((len(flat), len(time)))
+            for row, found in zip(values, function(time, p), strict=True):
+                row[:] = found
             return values[:w], values[w:].reshape(w, len(fitted), len(time))
 
         return evaluate

@@ -8,6 +8,7 @@ first learned over stretches of half a turn with a start each, and these are joi
 """
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any
@@ -38,7 +39,7 @@ from disctrack.discrepancy.search import (
     is_noise,
     length,
 )
-from disctrack.discrepancy.system import Candidate, Quantity, System, Values
+from disctrack.discrepancy.system import Candidate, GivenUp, Quantity, System, Values
 
 NAME = "learned"  # of the term
 HARMONICS = 24
@@ -160,7 +161,7 @@ def learn(
     best = over.best(())
     several = diagnosis.verdict == "unexplained" or len(diagnosis.found) > 2
     if several and (best is None or not over.at_noise(best.fit)):
-        others = [over.best((c,)) for c in over.beside()]
+        others = [over.best((c,)) for c in over.beside() if system.budget.open()]
         best = min((o for o in (best, *others) if o is not None), key=lambda trial: trial.length, default=None)
     law = over.told(best) if best is not None else None
     if law is not None and over.is_worth_telling(law):
@@ -258,10 +259,12 @@ class _Competition:
         trials, bars = [], [np.inf] * len(shots)
         for length, law, quantities in scans[:REFITTED]:
             # along short stretches that the declared equations do not follow the first order says little
-            if length > (ROUGHLY * scans[0][0] + WORTH if self.far else scans[0][0] + CLASS_GAIN):
+            enough = ROUGHLY * scans[0][0] + WORTH if self.far else scans[0][0] + CLASS_GAIN
+            if length > enough or not self.system.budget.open():
                 break
-            if (trial := self._led(shots, law, beside, quantities, values, bars)) is not None:
-                trials.append(trial)
+            with suppress(GivenUp), self.system.budget.trial(self.system.trial_steps):
+                if (trial := self._led(shots, law, beside, quantities, values, bars)) is not None:
+                    trials.append(trial)
         if not trials:
             return None
         near = alike([trial for trial in trials if self.arrived(trial.fit)] or trials)

@@ -26,7 +26,7 @@ from disctrack.discrepancy.noise import (
 from disctrack.discrepancy.score import Linearisation
 from disctrack.discrepancy.search import NOT_CONVERGED, WIDTH, Diagnosis, Former, Settings, explain, with_shapes
 from disctrack.discrepancy.significance import wald
-from disctrack.discrepancy.system import Candidate, System, Values
+from disctrack.discrepancy.system import USED_UP, Candidate, System, Values
 from disctrack.errors import AnalysisError
 
 JUMP = 1e-3  # width of a jump over the rms of what jumps: it errs by 1e-6 of a friction's work
@@ -84,6 +84,7 @@ def ask(
     elif diagnosis.found and (diagnosis.verdict == "found" or any(f.candidate.shape for f in diagnosis.found)):
         diagnosis = with_shapes(judged, diagnosis)
         notes += diagnosis.remarks
+    notes += [] if system.budget.open() else [USED_UP]
     if system.held:
         held = ", ".join(system.held)
         notes.append(f"{held} cannot be distinguished from other numbers by these data: held as declared")

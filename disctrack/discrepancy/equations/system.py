@@ -16,11 +16,13 @@ from disctrack.discrepancy.equations.declared import Samples, Term
 from disctrack.discrepancy.equations.formulas import Formulas
 from disctrack.discrepancy.held_out import TRAIN_FRACTION
 from disctrack.discrepancy.search import CANCELLING
-from disctrack.discrepancy.system import Candidate, Quantity, System, Values
+from disctrack.discrepancy.system import Budget, Candidate, Quantity, System, Values
 from disctrack.errors import AnalysisError
 
 TOLERANCE = 1e-10  # of a step, relative to the size of a state
 MAX_STEPS = 400_000  # after which a motion is given up
+MOST_WORK = 2e8  # of an answer: steps of the integrator, times states and sensitivities, some 1 us each ...
+OF_ONE = 0.1  # ... and share of it, that one hypothesis among many may take
 LARGE = 5.0  # times all that moves the motion: terms each so large that their sum may be what describes it
 MOST_STATES = 80  # initial states that are fitted along where others would tell no more that is new
 EACH = "*"  # in the place of a stretch: each has a number of its own
@@ -59,6 +61,7 @@ class EquationSystem(System):
         self.sizes, self.widths = np.asarray(sizes, float), dict(widths)
         self.promoted, self.held = tuple(promoted), tuple(held)
         self.typical, self.aims = dict(typical or {}), dict(aims or {})
+        self.budget, self.trial_steps = Budget(MOST_WORK), OF_ONE * MOST_WORK
         lengths = [len(s.time) for s in self.stretches]
         first = np.cumsum([0] + [n + 1 for n in lengths])
         self.rows = [slice(int(a), int(a) + n) for a, n in zip(first, lengths, strict=False)]
@@ -80,7 +83,9 @@ class EquationSystem(System):
     def with_(self, **changes: object) -> EquationSystem:
         """The same with other stretches, promoted terms, ..."""
         names = ("formulas", "stretches", "sizes", "widths", "promoted", "held", "typical", "aims")
-        return EquationSystem(**{name: getattr(self, name) for name in names} | changes)
+        found = EquationSystem(**{name: getattr(self, name) for name in names} | changes)
+        found.budget = self.budget  # of all that answer one question
+        return found
 
     def _base(self) -> list[Quantity]:
         found = []
@@ -246,11 +251,13 @@ class EquationSystem(System):
         span = s.time[0], max(float(times[-1]), s.time[0] + 1e-9)
         out = np.empty((len(times), len(z0)))
         with np.errstate(all="ignore"):
-            whole = kernel.integrate(
+            steps = kernel.integrate(
                 f.rhs, z0, p, columns, np.array(span), n, *f.driven(s.knots, s.pieces, p), self.sizes, TOLERANCE,
                 MAX_STEPS, times, out,
             )  # fmt: skip
-        if not whole:
+        self.budget.work(abs(steps) * len(z0))
+        self.budget.step(abs(steps) * len(z0))
+        if steps <= 0:
             return None
         states, moved = out[:, :n], out[:, n:].reshape(len(times), k, n)
         seen, by_state, by_own = f.sensors_at(s, p, times, states)

@@ -7,6 +7,7 @@ so that formulas which are handed in mean the equations' numbers of the same nam
 
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from itertools import chain, combinations_with_replacement
 
 import numpy as np
@@ -213,7 +214,9 @@ def usual(equations: Equations) -> tuple[Term, ...]:
             found += [coulomb(y), quadratic(y)]
             continue
         fed = next((z for z, f in written.items() if z not in (y, *pairs) and re.search(rf"\b{y}\b", f)), "")
-        found += [asymmetric_spring(y, y, f"square_{y}"), cubic_spring(y, y, f"cube_{y}"), overflow(equations, y, fed)]
+        powers = asymmetric_spring(y, y, f"square_{y}"), cubic_spring(y, y, f"cube_{y}")
+        found += [replace(p, title=f"loss of {y} by its {p.name.partition('_')[0]}") for p in powers]
+        found.append(overflow(equations, y, fed))
     for x, v in pairs.items():
         found += [spring(v, x), asymmetric_spring(v, x), cubic_spring(v, x)]
     observed = equations.observed if equations.observed is not None else {}

@@ -145,8 +145,15 @@ def test_a_thread_that_twists_is_no_shaken_table():
         ("viscous_contact", "creep", {"c": (1.0 / 30.0, None)}),
         # by 40 um over 0.7 s, with the square of time from 2 ms before the first frame on
         ("table_sinks", "table_settles", {"v_z": (-0.004 * 40e-6 / 0.7**2, None), "a_z": (-2 * 40e-6 / 0.7**2, None)}),
-        # a height that falls by 3 um, where a curved table stood in; what else wear does goes to a law
-        ("wear", "table_settles", {"v_z": (-np.inf, np.inf)}),
+        # a height that falls by 3 um; its turns, which grow with it, are taken for a clock's
+        pytest.param(
+            "wear",
+            "table_settles",
+            {"v_z": (-np.inf, np.inf)},
+            marks=pytest.mark.xfail(
+                strict=True, reason="no effect is a radius that shrinks; a drift of the clock joins"
+            ),
+        ),
     ],
 )
 def test_an_effect_of_the_catalogue_is_named_and_sized(name, effect, sizes):
@@ -177,7 +184,8 @@ def test_one_friction_in_another_s_place_competes_with_laws():
     made = recording("drag_one_way")
     result = diagnose(made.trajectory)
     assert result.learned is not None
-    assert any("known effects" in note for note in result.notes)
+    left = {e.effects: e.fit.reduced_chi_square for e in result.diagnosis.ranked}
+    assert left["creep",] < 1.01 * left[result.learned.law.title,]
     assert np.mean(np.abs(pulls(made, result)[0]) < 3) > 0.85
 
 

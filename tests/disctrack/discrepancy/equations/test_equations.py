@@ -20,6 +20,7 @@ from disctrack.discrepancy.equations.declared import checked
 from disctrack.discrepancy.equations.formulas import Formulas
 from disctrack.discrepancy.equations.system import EquationSystem
 from disctrack.discrepancy.noise import fast_part, step_of
+from disctrack.discrepancy.system import USED_UP
 from disctrack.errors import AnalysisError
 
 TIME = np.arange(870) * 0.01
@@ -287,6 +288,14 @@ def test_what_no_term_describes_is_unexplained_and_what_comes_nearest_is_told():
     assert "would help most and still leave" in " ".join(answer.notes)
     left = {by: np.std(answer.forecast(run, by=by)["x"] - pushed) for by in ("before", "after")}
     assert left["after"] < left["before"]
+
+
+@pytest.mark.statistical
+def test_a_search_ends_when_its_work_is_used_up_and_says_so(monkeypatch, with_friction):
+    monkeypatch.setattr("disctrack.discrepancy.equations.system.MOST_WORK", 4e3)
+    run = Run(TIME, {"x": swinging(hidden_friction)}, sigma=SIGMA)
+    cut_short = diagnose(OSCILLATOR, run, FIVE)
+    assert [(bool(a.found), USED_UP in a.notes) for a in (with_friction, cut_short)] == [(True, False), (False, True)]
 
 
 @pytest.mark.statistical
