@@ -19,7 +19,6 @@ from dataclasses import replace
 from importlib.resources import files
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
 from calibration.kit.arrays import Array
@@ -48,19 +47,11 @@ LAST_STAGE = 1.5  # [s] simulated in section 5c
 STEP = 0.1  # of a quantity's scale, for differences: the simulation is smooth to 1e-8
 
 
-def published_table(surface: str) -> tuple[NDArray, NDArray]:
-    """Trials of table 2 (steel) or 3 (glass), and the printed average, which is not theirs for n_energy on steel.
-
-    Records with case, trial, t_f [s] and EXPONENTS; the average has no trial and no t_f
-    """
+def exponents_on(surface: str) -> Array:
+    """(n, 3) of the trials of table 2 (steel) or 3 (glass), in the order of EXPONENTS."""
     with files(__package__).joinpath("ma2014_exponents.csv").open(encoding="utf-8") as file:
         rows = np.genfromtxt(file, delimiter=",", names=True, dtype=None, encoding="utf-8", skip_header=2)
-    mine = rows[rows["surface"] == surface]
-    return mine[mine["case"] != "average"], mine[mine["case"] == "average"][0]
-
-
-def exponents_of(trials: NDArray) -> Array:
-    """(n, 3) in the order of EXPONENTS."""
+    trials = rows[(rows["surface"] == surface) & (rows["case"] != "average")]  # that is a printed one
     return np.stack([trials[name] for name in EXPONENTS], axis=-1)
 
 
@@ -78,7 +69,7 @@ def published_series() -> tuple[Series, ...]:
     found = []
     for surface, (k_m, longest) in TRIALS.items():
         start = (k_m * LAST_STAGE) ** (2 / 3) * 4 * GRAVITY / MA_2014.radius ** (5 / 3)
-        series = Series(surface, k_m, longest, float(start), exponents=exponents_of(published_table(surface)[0]))
+        series = Series(surface, k_m, longest, float(start), exponents=exponents_on(surface))
         stage = LastStage(series, {"km.k_m": k_m}, SPIN_AT_REST)
         found.append(replace(series, ln_duration=float(np.log(stage.duration))))
     return tuple(found)
