@@ -22,7 +22,7 @@ RTOL = 1e-11  # of the integrator; keeps the energy without losses to 1e-11 over
 # m, m, rad, rad, rad, rad/s x 3, m/s x 2, m, m/s: about 1e-12 of what moves
 ATOL = np.array([1e-13, 1e-13, 1e-12, 1e-13, 1e-12, 1e-11, 1e-11, 1e-11, 1e-13, 1e-13, 1e-13, 1e-13])
 MAX_SWITCHES = 2000  # of slip and rolling: more is chatter
-MOST_STEPS = 500_000  # of the integrator, over all stretches
+MOST_STEPS = 1_000_000  # of the integrator, over all stretches
 MOST_INSTANTS = 1e8  # of a motion in memory
 
 
