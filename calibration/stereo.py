@@ -314,7 +314,10 @@ def _require_fitted(
     """Raises CalibrationError where the table view is lost, or too few views are left."""
     if table_view is not None and (table_view in not_used or table_view in fit.pairs.apart):
         reason = _told(not_used[table_view]) if table_view in not_used else apart[0]
-        raise CalibrationError(f"the table view {table_view} cannot be used: {reason}")
+        raise CalibrationError(
+            f"the table view {table_view} cannot be used ({reason}): without it there is no lab frame. Name another "
+            "view whose board lies flat on the table, or take it again."
+        )
     n_used = len(np.unique(fit.refinement.observations.view[fit.refinement.kept]))
     if n_used < MIN_VIEWS:
         also = "".join(f"{what}: {by_what}. " for what, by_what in wide)
@@ -362,13 +365,6 @@ def _require_views(views: Views, names: Names, table_view: int | None) -> None:
                 f"the board was found in {found} of {len(side)} {CAMERA_NAMES[camera]} images, at least {MIN_VIEWS} "
                 f"are needed (15 to 40 are good). {_listed(lost)}"
             )
-    not_used = _not_used(views, names)
-    if table_view in not_used:
-        why = _told(not_used[table_view])
-        raise CalibrationError(
-            f"the board was not found in the table view {table_view} ({why}): without it there is no lab frame. Name "
-            "another view whose board lies flat on the table, or take it again."
-        )
 
 
 def _by_reason(images: Iterable[Image]) -> dict[str, list[str]]:

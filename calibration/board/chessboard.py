@@ -136,24 +136,15 @@ def _rough_corners(grey: NDArray[np.uint8], inner_corners: tuple[int, int], thor
         tried += [(quick, 2, flags), (slow, 1, exhaustive | cv2.CALIB_CB_ACCURACY)]
     for find, finer, how in tried:
         image = grey if finer == 1 else cv2.resize(grey, None, fx=finer, fy=finer, interpolation=cv2.INTER_CUBIC)
-        grid = _all_lines(find(image, inner_corners, None, how), inner_corners)
-        if grid is not None:
+        found, corners = find(image, inner_corners, None, how)
+        # finders take a part of a board for all of it
+        if found and _even(grid := np.asarray(corners, np.float64).reshape(*inner_corners[::-1], 2)):
             return (grid.reshape(-1, 2) + 0.5) / (scale * finer) - 0.5
     return None
 
 
-def _all_lines(answer: tuple[bool, NDArray | None], inner_corners: tuple[int, int]) -> Array | None:
-    """A finder's corners (rows, columns, 2) [px]; None where it found none, or passed over a line of them."""
-    found, corners = answer
-    columns, rows = inner_corners
-    if not found or corners is None or len(corners) != columns * rows:
-        return None
-    grid = np.asarray(corners, np.float64).reshape(rows, columns, 2)
-    return grid if _even(grid) else None
-
-
 def _even(grid: NDArray) -> bool:
-    """Whether no line of corners (rows, columns, 2) was passed over: finders take a part of a board for all of it."""
+    """Whether no line of corners (rows, columns, 2) was passed over."""
     for along in (grid, grid.swapaxes(0, 1)):
         step = np.median(np.linalg.norm(np.diff(along, axis=0), axis=-1), axis=1)
         if len(step) > 1 and (np.abs(np.diff(np.log(np.maximum(step, 1e-9)))) > np.log(MOST_UNEVEN)).any():
@@ -177,9 +168,7 @@ def _orient(corners: Array, grey: Array, inner_corners: tuple[int, int]) -> Arra
             "number of the board's inner corners, or it is no chessboard"
         )
     dark = [corners[order] for order, sign in zip(orders, signs, strict=True) if sign > 0]
-    if len(dark) == 1:
-        return dark[0]
-    # the colouring leaves several orders: i to the right in this image; the stereo pair makes the two cameras agree.
+    # where the colouring leaves several orders, i to the right in this image; the stereo pair makes the cameras agree.
     # With such counts all corner squares may be light: the print begins with one
     return max(
         dark or [corners[order] for order in orders],
@@ -207,18 +196,15 @@ def _larger_board(grey: Array, view: CornerView, inner_corners: tuple[int, int])
     axes = local_axes(view.points, view.accepted, inner_corners)
     least = 0.5 * float(np.median(np.abs(_saddles(grey, view.points, axes)[view.accepted])))
     axes = axes.reshape(rows, columns, 2, 2)
-    further = [0, 0]
-    for along, across in ((0, 1), (1, 0)):
-        for last, before in ((0, 1), (-1, -2)):
-            line, step = np.take(grid, last, across), np.take(grid, last, across) - np.take(grid, before, across)
-            line_axes = np.take(axes, last, across)
-            lines = 0
-            while _crosses(grey, line + (lines + 1) * step, line_axes, least):
-                lines += 1
-            further[along] += lines
+    further = [0, 0]  # rows, columns
+    for side in range(4):
+        line, before = np.rot90(grid, side)[:2]
+        step = line - before
+        while _crosses(grey, line + step, np.rot90(axes, side)[0], least):
+            line, further[side % 2] = line + step, further[side % 2] + 1
     if not any(further):
         return None
-    all_columns, all_rows = columns + further[0], rows + further[1]
+    all_columns, all_rows = columns + further[1], rows + further[0]
     return (
         f"the board goes on beyond the {columns} x {rows} inner corners that were declared: {all_columns} x {all_rows} "
         f"are in view. If that is all of them, declare inner_corners = [{all_columns}, {all_rows}]; a part of a board "

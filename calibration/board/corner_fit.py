@@ -86,7 +86,7 @@ def fit_view(
         axes = local_axes(points, ok, inner_corners)
         bends = _line_curvature(points, ok, fit.found[:, 2:4], inner_corners)
         known = np.concatenate([bends, _contrast_gradient(points, ok, fit.found[:, 5:7])], axis=1)
-    fit = _with_smaller_windows(grey, fit, windows, starts, known, noise)
+    _mend_with_smaller_windows(grey, fit, windows, starts, known, noise)
     return _judged(grey, fit, axes, rough, inner_corners, seen, plain)
 
 
@@ -106,8 +106,10 @@ class _Fit(NamedTuple):
         return np.where(self.converged & np.isfinite(value), value, np.inf)
 
 
-def _with_smaller_windows(grey: Array, fit: _Fit, windows: Array, starts: Array, known: Array, noise: Array) -> _Fit:
-    """Fit again, nearer to the corner, where something else reaches into the window (a narrow or dirty square)."""
+def _mend_with_smaller_windows(
+    grey: Array, fit: _Fit, windows: Array, starts: Array, known: Array, noise: Array
+) -> None:
+    """Fit again, in place, nearer to the corner where something else reaches into the window: a dirty square."""
     for factor in (0.6, 0.35):
         limit = BAD_WINDOW * max(float(np.median(fit.chi_square)), 1.0)
         bad = np.flatnonzero(fit.chi_square > limit)
@@ -117,10 +119,8 @@ def _with_smaller_windows(grey: Array, fit: _Fit, windows: Array, starts: Array,
         smaller[:, 10:12] *= factor
         again = _Fit(*fit_corners(grey, smaller, starts[bad], known[bad], noise, 30, 1e-5))
         better = again.chi_square < 0.5 * fit.chi_square[bad]
-        fit = _Fit(fit.found.copy(), fit.covariance.copy(), fit.sums.copy(), fit.converged.copy())
         for old, new in zip(fit, again, strict=True):
             old[bad[better]] = new[better]
-    return fit
 
 
 def _windows(points: Array, axes: Array, blur: float, shape: tuple[int, ...], plain: Array, most: float) -> Array:

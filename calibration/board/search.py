@@ -24,7 +24,6 @@ Progress = Callable[[str, int, int], None]
 LEAST_VIEWS = 2  # that must show the whole board
 SIZES_TRIED = 3  # of those that several images seem to show
 VIEWS_TRIED = 8  # over a whole set: what most of them show is the board; without one, the slow search waits
-REFUSED_TRIED = 4  # images without the declared board in which another is looked for, a quarter of a second each
 
 
 def find_target(image: NDArray, target: Target, thorough: bool = True) -> TargetView:
@@ -53,22 +52,22 @@ def located(images: Sequence[NDArray], target: Target, progress: Progress | None
         if progress:
             progress("corners", len(views), len(images))
 
-    def missing(among: Iterable[int]) -> list[int]:
-        return [index for index in among if not isinstance(views.get(index), CornerView)]
+    def lost(among: Iterable[int], thorough: bool) -> list[int]:
+        """Those in which it is not found."""
+        indices = list(among)
+        with ThreadPoolExecutor(2) as pool:  # OpenCV and the fit of corners leave the interpreter to the other
+            list(pool.map(locate, indices, [thorough] * len(indices)))
+        return [index for index in indices if isinstance(views[index], BoardNotFound)]
 
     sample = evenly(len(images), VIEWS_TRIED)
-    others = sorted(set(range(len(images))) - set(sample))
-    with ThreadPoolExecutor(2) as pool:  # OpenCV and the fit of corners leave the interpreter to the other
-        list(pool.map(locate, sample, [False] * len(sample)))
-        again = missing(sample)
-        if shown := other_board([images[i] for i in sample], [i in again for i in sample], target):
-            return [BoardNotFound(f"{target} is not in it. {shown}")] * len(images)
-        list(pool.map(locate, again, [True] * len(again)))
-        promising = missing(sample) != sample
-        list(pool.map(locate, others, [promising] * len(others)))
-        if not promising and missing(others) != others:
-            again = missing(range(len(images)))
-            list(pool.map(locate, again, [True] * len(again)))
+    quickly = lost(sample, False)
+    if shown := other_board([images[i] for i in sample], [i in quickly for i in sample], target):
+        return [BoardNotFound(f"{target} is not in it. {shown}")] * len(images)
+    without, others = lost(quickly, True), sorted(set(range(len(images))) - set(sample))
+    promising = without != sample
+    elsewhere = lost(others, promising)
+    if not promising and elsewhere != others:
+        lost([*without, *elsewhere], True)
     return [views[index] for index in range(len(images))]
 
 
@@ -80,7 +79,7 @@ def other_board(images: Sequence[NDArray], refused: Sequence[bool], target: Targ
     without = [image for image, lost in zip(images, refused, strict=True) if lost]
     if not isinstance(target, Board) or 2 * len(without) <= len(images):
         return ""
-    size, _ = board_size([without[i] for i in evenly(len(without), REFUSED_TRIED)], SEARCH_SIZE // 2)
+    size, _ = board_size([without[i] for i in evenly(len(without), VIEWS_TRIED // 2)], SEARCH_SIZE // 2)
     if size is None or size == target.inner_corners:
         return ""
     seen = sum(isinstance(find_corners(image, size, thorough=False), CornerView) for image in images)

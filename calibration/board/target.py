@@ -14,7 +14,6 @@ from calibration.kit.arrays import Array
 from calibration.kit.errors import CalibrationError
 
 LEAST_POINTS = 8  # of a view: fewer do not tell its pose
-SAME_PLACE = 0.01  # of the smallest distance between points: a reflection that maps points that close is a symmetry
 
 
 @dataclass(frozen=True)
@@ -46,19 +45,6 @@ class Target:
         return {"target": self.kind, **asdict(self)}
 
 
-def mirror_symmetries(points: Array) -> list[NDArray[np.intp]]:
-    """Orders of points (n, 2) after reflections in their plane, at right angles or at 45 deg, that keep the set."""
-    d = points - 0.5 * (points.min(0) + points.max(0))
-    apart = np.linalg.norm(d[:, None] - d, axis=-1)
-    limit = SAME_PLACE * float(apart[apart > 0].min())
-    found = []
-    for c, s in ((1, 0), (0, 1), (-1, 0), (0, -1)):
-        distance = np.linalg.norm((d @ np.array([[c, s], [s, -c]], float))[:, None] - d, axis=-1)
-        if distance.min(axis=1).max() < limit:
-            found.append(distance.argmin(axis=1))
-    return found
-
-
 @checked
 @dataclass(frozen=True)
 class Board(Target):
@@ -82,9 +68,7 @@ class Board(Target):
     @property
     def points(self) -> Array:
         """Inner corners (n, 3) [m] in board axes; the third coordinate is zero."""
-        columns, rows = self.inner_corners
-        j, i = np.mgrid[:rows, :columns]
-        return np.stack([i.ravel(), j.ravel(), np.zeros(i.size)], axis=-1) * self.square
+        return _grid(self.inner_corners) * self.square
 
     @property
     def orders(self) -> list[NDArray[np.intp]]:
@@ -136,12 +120,16 @@ class CharucoBoard(Target):
     @property
     def points(self) -> Array:
         """Inner corners (n, 3) [m], from the upper left, row by row."""
-        columns, rows = self.inner_corners
-        j, i = np.mgrid[:rows, :columns]
-        return np.stack([i.ravel(), rows - 1 - j.ravel(), np.zeros(i.size)], axis=-1) * self.square
+        return (_grid(self.inner_corners) * [1, -1, 1] + [0, self.inner_corners[1] - 1, 0]) * self.square
 
     def __str__(self) -> str:
         return f"a ChArUco board of {self.squares[0]} x {self.squares[1]} squares ({self.dictionary})"
+
+
+def _grid(counts: tuple[int, int]) -> Array:
+    """(n, 3) places along i first, then along j."""
+    j, i = np.mgrid[: counts[1], : counts[0]]
+    return np.stack([i.ravel(), j.ravel(), np.zeros(i.size)], axis=-1)
 
 
 def _counts(given: Any, least: int, what: str) -> tuple[int, int]:

@@ -17,6 +17,7 @@ from calibration.cameras.splines import LensField
 from calibration.kit.arguments import checked
 from calibration.kit.arrays import Array
 from calibration.kit.brief import Brief
+from calibration.kit.least_squares import solve_each
 
 CAMERA_NAMES = ("left", "right")  # for people, and in files
 INTRINSIC_PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
@@ -295,25 +296,17 @@ def triangulate(pixels: Array, rig: StereoRig) -> Array:
     """
     if rig.lens_field is not None:
         pixels = rig.lens_field.corrected(pixels)
-    rays = [
-        np.concatenate([normalise(view, camera), np.ones((len(view), 1))], axis=-1)
-        for view, camera in zip(pixels, rig.cameras, strict=True)
-    ]
-    rows, rhs = [], []
-    for ray, (R, t) in zip(rays, rig.camera_poses(), strict=True):
-        for axis in (0, 1):
-            rows.append(R[axis] - ray[:, axis, None] * R[2])
-            rhs.append(ray[:, axis] * t[2] - t[axis])
-    A, b = np.stack(rows, axis=-2), np.stack(rhs, axis=-1)
-    good = np.isfinite(A).all(axis=(-2, -1)) & np.isfinite(b).all(axis=-1)
+    rays = np.stack([normalise(view, camera) for view, camera in zip(pixels, rig.cameras, strict=True)])
+    R, t = (np.stack(of_both)[:, None] for of_both in zip(*rig.camera_poses(), strict=True))
+    A = np.moveaxis(R[..., :2, :] - rays[..., None] * R[..., 2:, :], 0, 1).reshape(-1, 4, 3)
+    b = np.moveaxis(rays * t[..., 2:] - t[..., :2], 0, 1).reshape(-1, 4, 1)
+    good = np.asarray(np.isfinite(b).all(axis=(-2, -1)), bool)
     points = np.full((len(good), 3), np.nan)
-    normal = np.swapaxes(A[good], -1, -2) @ A[good]
-    points[good] = np.linalg.solve(normal, (np.swapaxes(A[good], -1, -2) @ b[good][..., None]))[..., 0]
+    points[good] = solve_each(A[good], b[good])[..., 0]
     for _ in range(10):  # Gauss-Newton: the linear solution is off by the noise times the perspective
         found, d_world, _ = rig.project_with_jacobians(points[good])
         J = np.moveaxis(d_world, 0, 1).reshape(-1, 4, 3)
-        residual = np.moveaxis(pixels[:, good] - found, 0, 1).reshape(-1, 4, 1)
-        step = np.linalg.solve(np.swapaxes(J, -1, -2) @ J, np.swapaxes(J, -1, -2) @ residual)[..., 0]
+        step = solve_each(J, np.moveaxis(pixels[:, good] - found, 0, 1).reshape(-1, 4, 1))[..., 0]
         points[good] += step
         if not np.any(np.abs(step) > 1e-12):
             break

@@ -13,9 +13,8 @@ from calibration.cameras._projection import project_point
 from calibration.kit.compiled import njit
 
 # Columns: nine intrinsics of the left camera, nine of the right, turn and shift between them, turn and shift of the
-# board, residual. A left observation has the first nine and the last seven, a right one all but the first nine: the
-# others are zero.
-N_COLUMNS = 31
+# board at the left exposure, and at the right one, residual. What an observation does not reach is zero.
+N_COLUMNS = 37
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -23,9 +22,10 @@ def accumulate(view, camera, point, limit, pixels, weights, cameras, R_right_lef
                t_board, points, squares, of_point, by_itself, costs):  # fmt: skip
     """Sum the products of all whitened rows: Huber's with residuals beyond `limit` sigmas counted linearly.
 
-    view, camera, point (m,); pixels (m, 2); weights (m, 2, 2) [1/px^2]; cameras (2, 9); R_board (V, 3, 3), t_board
-    (V, 3), points (n, 3). Added to: squares (V, 31, 31), costs (V,); and, where it has room for all points, of_point
-    (V, n, 3, 31), the products of the points' columns with the others, and by_itself (V, n, 3, 3), among themselves.
+    view, camera, point (m,); pixels (m, 2); weights (m, 2, 2) [1/px^2]; cameras (2, 9); R_board (2 exposures, V, 3, 3),
+    t_board (2, V, 3), points (n, 3). Added to: squares (V, 37, 37), costs (V,); and, where it has room for all points,
+    of_point (V, n, 3, 37), the products of the points' columns with the others, and by_itself (V, n, 3, 3), among
+    themselves.
     Returns False where a point lies behind its camera; the sums are then not to be used.
     """
     row, d = np.empty((2, N_COLUMNS)), np.empty((2, 3))
@@ -33,9 +33,10 @@ def accumulate(view, camera, point, limit, pixels, weights, cameras, R_right_lef
     d_left, by_point = np.empty((2, 3)), np.empty((2, 3))
     for i in range(len(view)):
         v, p, right = view[i], point[i], camera[i] == 1
+        R, t, pose = R_board[camera[i], v], t_board[camera[i], v], 24 + 6 * camera[i]
         for j in range(3):
-            arm[j] = R_board[v, j, 0] * points[p, 0] + R_board[v, j, 1] * points[p, 1] + R_board[v, j, 2] * points[p, 2]
-            left[j] = arm[j] + t_board[v, j]
+            arm[j] = R[j, 0] * points[p, 0] + R[j, 1] * points[p, 1] + R[j, 2] * points[p, 2]
+            left[j] = arm[j] + t[j]
             X[j] = left[j]
         if right:
             for j in range(3):
@@ -67,12 +68,12 @@ def accumulate(view, camera, point, limit, pixels, weights, cameras, R_right_lef
                 for j in range(3):
                     d_left[axis, j] = x * R_right_left[0, j] + y * R_right_left[1, j] + z * R_right_left[2, j]
             x, y, z = d_left[axis, 0], d_left[axis, 1], d_left[axis, 2]
-            row[axis, 24] = arm[1] * z - arm[2] * y
-            row[axis, 25] = arm[2] * x - arm[0] * z
-            row[axis, 26] = arm[0] * y - arm[1] * x
-            row[axis, 27], row[axis, 28], row[axis, 29] = x, y, z
+            row[axis, pose] = arm[1] * z - arm[2] * y
+            row[axis, pose + 1] = arm[2] * x - arm[0] * z
+            row[axis, pose + 2] = arm[0] * y - arm[1] * x
+            row[axis, pose + 3], row[axis, pose + 4], row[axis, pose + 5] = x, y, z
         x, y = pixels[i, 0] - u, pixels[i, 1] - v_px
-        row[0, 30], row[1, 30] = x, y
+        row[0, 36], row[1, 36] = x, y
         sigmas = math.sqrt(weights[i, 0, 0] * x * x + 2.0 * weights[i, 0, 1] * x * y + weights[i, 1, 1] * y * y)
         if not math.isfinite(sigmas):
             return False
@@ -93,9 +94,9 @@ def accumulate(view, camera, point, limit, pixels, weights, cameras, R_right_lef
                     squares[v, j, q] += x * row[0, q] + y * row[1, q]
         if of_point.shape[1]:
             for axis in range(2):
-                x, y, z = row[axis, 27], row[axis, 28], row[axis, 29]
+                x, y, z = row[axis, pose + 3], row[axis, pose + 4], row[axis, pose + 5]
                 for j in range(3):
-                    by_point[axis, j] = x * R_board[v, 0, j] + y * R_board[v, 1, j] + z * R_board[v, 2, j]
+                    by_point[axis, j] = x * R[0, j] + y * R[1, j] + z * R[2, j]
             for j in range(3):
                 x, y = by_point[0, j], by_point[1, j]
                 for q in range(N_COLUMNS):

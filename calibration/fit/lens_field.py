@@ -57,7 +57,7 @@ def fit_lens_field(refinement: Refinement, nominal: Array) -> FieldFit | None:
         gain, error, left = _worth(refinement, used, coarse, left)
     if gain < BETTER * error or gain < LEAST_GAIN:
         return None
-    both = [_precision(finer, small, coarse, large) for large in PRIORS_PX for small in FINER_PX]
+    both = [_precision(finer, small, large) for large in PRIORS_PX for small in FINER_PX]
     solution, _ = _likeliest(reduce(np.add, _squares(refinement, used, finer, left)), finer, both)
     field = replace(finer, coefficients=solution[-finer.coefficients.size :].reshape(finer.coefficients.shape))
     o = refinement.observations
@@ -77,28 +77,16 @@ def _grid(refinement: Refinement, cells: int) -> LensField:
     )
 
 
-def _precision(grid: LensField, sigma: float, coarser: LensField | None = None, of_coarser: float = 0.0) -> Array:
+def _precision(grid: LensField, sigma: float, smooth: float = 0.0) -> Array:
     """Inverse covariance (ny nx, ny nx) of an axis' coefficients [px^-2].
 
-    Independent ones of sigma [px]; and beside them those of a grid of twice the spacing, each a sum of these splines.
-    So what varies within a few cells is small, and zero where no corner lies.
+    Independent ones of sigma [px]; and beside them what those of a grid of twice the spacing, of `smooth` [px], come to
+    on this one, roughly: half their variance along each axis, alike over two steps. So what varies within a few cells
+    is small, and zero where no corner lies.
     """
-    shape = grid.coefficients.shape[2:]
-    covariance = sigma**2 * np.eye(shape[0] * shape[1])
-    if coarser is not None:
-        onto = np.kron(*map(_two_scales, coarser.coefficients.shape[2:], shape))
-        covariance += of_coarser**2 * onto @ onto.T
-    return np.asarray(np.linalg.inv(covariance), np.float64)
-
-
-def _two_scales(few: int, many: int) -> Array:
-    """(many, few) cubic splines as sums of those of half the spacing: 1, 4, 6, 4, 1 eighths of them."""
-    onto = np.zeros((many, few))
-    for step, part in zip(range(-2, 3), (1, 4, 6, 4, 1), strict=True):
-        node = 2 * np.arange(few) - 1 + step  # node i of the coarser grid is node 2 i - 1 of the finer one
-        inside = (node >= 0) & (node < many)
-        onto[node[inside], np.flatnonzero(inside)] = part / 8.0
-    return onto
+    steps = (np.subtract.outer(np.arange(n), np.arange(n)) for n in grid.coefficients.shape[2:])
+    together = np.kron(*(0.5 * np.exp(-0.25 * step**2) for step in steps))
+    return np.asarray(np.linalg.inv(sigma**2 * np.eye(len(together)) + smooth**2 * together), np.float64)
 
 
 def _worth(refinement: Refinement, used: Observations, grid: LensField, extra: float) -> tuple[float, float, float]:

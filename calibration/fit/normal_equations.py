@@ -11,39 +11,29 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from calibration.fit._normal_kernel import N_COLUMNS, accumulate
 from calibration.fit.board_motion import BoardMotion, motions
 from calibration.fit.priors import Prior, board_prior
-from calibration.fit.stereo_model import N_STEREO, Observations, StereoModel, moved
+from calibration.fit.stereo_model import Observations, StereoModel, moved
 from calibration.kit import least_squares
 from calibration.kit.arrays import Array
 from calibration.kit.errors import CalibrationError
 from calibration.kit.least_squares import Minimum, Normal
 
 
-def _all_shared(stereo: Array, stereo_point: Array, point: Array, shape: Array) -> Array:
-    """(s, s) of all shared parameters, from one view's parts or from their sums.
+def _shared(stereo: Array, stereo_point: Array, point: Array, shape: Array) -> Array:
+    """(..., s, s) of all shared parameters, from each view's parts (n_views, ...) or from their sums.
 
-    stereo : (s1, s1) stereo parameters alone; stereo_point (s1, 3 n) between them and the target's points; point
-    (n, 3, 3) of each point; shape (3 n, s2) directions in which the points may move
+    stereo : (..., s1, s1) stereo parameters alone; stereo_point (..., s1, 3 n) between them and the target's points;
+    point (..., n, 3, 3) of each point; shape (3 n, s2) directions in which the points may move
     """
-    s1, s2 = len(stereo), shape.shape[1]
-    if not s2:
-        return stereo
-    total = np.empty((s1 + s2, s1 + s2))
-    total[:s1, :s1] = stereo
-    total[:s1, s1:] = stereo_point @ shape
-    total[s1:, :s1] = total[:s1, s1:].T
-    moved_points = (point @ shape.reshape(len(point), 3, s2)).reshape(-1, s2)
-    total[s1:, s1:] = shape.T @ moved_points
-    return total
-
-
-def _each_shared(stereo: Array, stereo_point: Array, point: Array, shape: Array) -> Array:
-    """(n_views, s, s) of each view's parts."""
-    return np.stack([_all_shared(*parts, shape) for parts in zip(stereo, stereo_point, point, strict=True)])
+    across = stereo_point @ shape
+    moved_points = point @ shape.reshape(*point.shape[-3:-1], shape.shape[1])
+    among = shape.T @ moved_points.reshape(*across.shape[:-2], *shape.shape)
+    return np.block([[stereo, across], [np.swapaxes(across, -1, -2), among]])
 
 
 @dataclass(frozen=True)
@@ -74,65 +64,46 @@ class Problem:
         if np.any(np.diff(o.view) < 0):
             raise ValueError("observations must be sorted by view")
         s1, s2, n = self.stereo_basis.shape[1], self.shape_basis.shape[-1], len(self.shape_basis)
-        V, exposures = self.n_views, 1 if self.motion is None else 2
-        places, boards = o.view, (model.R_left_board, model.t_left_board)
-        if model.boards_right is not None:
-            places = o.view + V * o.camera
-            R, t = (np.concatenate(both) for both in zip(boards, model.boards_right, strict=True))
-            boards = R, t
-        full, costs = np.zeros((exposures * V, N_COLUMNS, N_COLUMNS)), np.zeros(exposures * V)
-        of_point, point = (np.zeros((len(full), n if s2 else 0, 3, columns)) for columns in (N_COLUMNS, 3))
+        V, boards = self.n_views, zip((model.R_left_board, model.t_left_board), model.boards_in_right, strict=True)
+        full, costs = np.zeros((V, N_COLUMNS, N_COLUMNS)), np.zeros(V)
+        of_point, point = (np.zeros((V, n if s2 else 0, 3, columns)) for columns in (N_COLUMNS, 3))
         cameras = np.stack([camera.parameters for camera in model.cameras])
-        given = (o.pixels, self.weights, cameras, model.R_right_left, model.t_right_left, *boards, model.points)
-        if not _accumulated((places, o.camera, o.point), self.huber, given, full, of_point, point, costs):
+        given = (o.pixels, self.weights, cameras, model.R_right_left, model.t_right_left, *map(np.stack, boards))
+        if not _accumulated(
+            (o.view, o.camera, o.point), self.huber, (*given, model.points), full, of_point, point, costs
+        ):
             costs[...] = np.inf
-        free = np.zeros((N_COLUMNS, s1 + 7))
-        free[:N_STEREO, :s1], free[N_STEREO:, s1:] = self.stereo_basis, np.eye(7)
-        squares = (free.T @ full @ free).reshape(exposures, V, s1 + 7, s1 + 7)
+        poses = np.tile(np.eye(6), (2, 1)) if self.motion is None else np.eye(12)  # the same at both exposures, or two
+        free = scipy.linalg.block_diag(self.stereo_basis, poses, 1.0)
+        squares = free.T @ full @ free
         shape = self.shape_basis.reshape(3 * n, s2) if s2 else np.zeros((0, 0))
-        flat = of_point.reshape(exposures, V, len(shape), N_COLUMNS) @ free
-        of_shape = shape.T @ flat[..., s1:]  # (exposures, V, s2, 7)
-        stereo, stereo_point = squares[..., :s1, :s1].sum(0), np.swapaxes(flat[..., :s1], 2, 3).sum(0)
-        by_point = point.reshape(exposures, V, *point.shape[1:]).sum(0)
-        pose, costs = np.zeros((V, 6 * exposures, 6 * exposures)), costs.reshape(exposures, V).sum(0)
-        pose_gradient = np.concatenate([*squares[..., s1:-1, -1]], axis=1)
-        for k in range(exposures):
-            pose[:, 6 * k : 6 * k + 6, 6 * k : 6 * k + 6] = squares[k, :, s1:-1, s1:-1]
+        flat = of_point.reshape(V, len(shape), N_COLUMNS) @ free
+        of_shape = shape.T @ flat[..., s1:]  # (V, s2, k + 1)
+        stereo, stereo_point = squares[:, :s1, :s1], np.swapaxes(flat[..., :s1], 1, 2)
+        pose, pose_gradient = squares[:, s1:-1, s1:-1], squares[:, s1:-1, -1]
         if self.motion is not None:
             between, by_poses = motions(model)
             weights = self.motion.weights_of(V) * (np.bincount(o.view, minlength=V) > 0)[:, None]
             weighted = by_poses * weights[..., None]
-            pose += np.swapaxes(by_poses, 1, 2) @ weighted
-            pose_gradient -= np.einsum("vij,vi->vj", weighted, between)
+            pose = pose + np.swapaxes(by_poses, 1, 2) @ weighted
+            pose_gradient = pose_gradient - np.einsum("vij,vi->vj", weighted, between)
             costs += np.sum(between**2 * weights, axis=1)
-        prior, towards, prior_cost = self._known_beforehand(model)
+        known = np.zeros((s1 + s2, s1 + s2)), np.zeros(s1 + s2), 0.0
+        prior, towards, prior_cost = (
+            known if self.prior is None else self.prior.normal(model, self.stereo_basis, s2 > 0)
+        )
         return Normal(
-            shared=_all_shared(stereo.sum(0), stereo_point.sum(0), by_point.sum(0), shape),
-            cross=np.concatenate([*np.concatenate([squares[..., :s1, s1:-1], of_shape[..., :-1]], axis=2)], axis=2),
+            shared=_shared(stereo.sum(0), stereo_point.sum(0), point.sum(0), shape),
+            cross=np.concatenate([squares[:, :s1, s1:-1], of_shape[..., :-1]], axis=1),
             own=pose,
-            gradient=np.concatenate([squares[..., :s1, -1], of_shape[..., -1]], axis=2).sum(0),
+            gradient=np.concatenate([squares[:, :s1, -1], of_shape[..., -1]], axis=1),
             own_gradient=pose_gradient,
             costs=costs,
-            of_each=partial(_each_shared, stereo, stereo_point, by_point, shape),
+            of_each=partial(_shared, stereo, stereo_point, point, shape),
             prior=prior,
             prior_gradient=towards,
             prior_cost=prior_cost,
         )
-
-    def _known_beforehand(self, model: StereoModel) -> tuple[Array, Array, float]:
-        """Information (s, s) of the prior at the model, gradient (s,) towards it, and its part of chi-square."""
-        s1, s2 = self.stereo_basis.shape[1], self.shape_basis.shape[-1]
-        information, gradient, cost = np.zeros((s1 + s2, s1 + s2)), np.zeros(s1 + s2), 0.0
-        if self.prior is not None:
-            of_cameras, towards, cost = self.prior.normal(model)
-            information[:s1, :s1] = self.stereo_basis.T @ of_cameras @ self.stereo_basis
-            gradient[:s1] = self.stereo_basis.T @ towards
-            if s2 and self.prior.board is not None:
-                weight, (pull, of_board) = self.prior.weight, self.prior.board.normal(model.points)
-                information[s1:, s1:] = weight * self.prior.board.information
-                gradient[s1:] = weight * pull
-                cost += weight * of_board
-        return information, gradient, cost
 
     def stepped(self, model: StereoModel, shared: Array, poses: Array) -> StereoModel:
         """The model after a step."""
@@ -148,7 +119,7 @@ def _accumulated(indices: Sequence[NDArray[np.intp]], huber: float, values: Sequ
 
 def prepare() -> None:
     """Compile the kernel, or load it: once per installation some tenths of a second, then nothing."""
-    values = [np.zeros(shape) for shape in ((0, 2), (0, 2, 2), (2, 9), (3, 3), (3,), (0, 3, 3), (0, 3), (0, 3))]
+    values = [np.zeros(shape) for shape in ((0, 2), (0, 2, 2), (2, 9), (3, 3), (3,), (2, 0, 3, 3), (2, 0, 3), (0, 3))]
     sums = [np.zeros(shape) for shape in ((0, 1, 1), (0, 0, 3, 1), (0, 0, 3, 3), (0,))]
     _accumulated([np.zeros(0, np.int64)] * 3, np.inf, values, *sums)
 

@@ -17,10 +17,9 @@ import scipy
 from numpy.typing import NDArray
 
 from calibration.board.chessboard import BoardNotFound, CornerView
-from calibration.board.target import mirror_symmetries
 from calibration.cameras.camera import CAMERA_NAMES, Camera, by_turning, project_with_jacobians
 from calibration.fit.stereo_model import Observations, StereoModel
-from calibration.kit.arrays import Array, Mask
+from calibration.kit.arrays import Array, Mask, evenly
 from calibration.kit.errors import CalibrationError
 
 FLOOR = 1e-3  # of the image's longer side: rough cameras put boards no better; views that differ by less are one
@@ -31,7 +30,7 @@ BY_CHANCE = 2.0  # times that pairs lie together better than images of other pai
 TOO_FAR = 5.0
 MOST_LATE = 8  # views by which the two cameras may differ
 LEAST_PAIRS = 4  # of a hypothesis
-TRIED = 30  # pairs whose place is tried for all
+MOST_TRIED = 30  # pairs whose place is tried for all, views that OpenCV is given: time grows with the cube of them
 Pose = tuple[Array, Array]  # rotation (3, 3) and translation (3,) of the board in a camera's axes
 Names = Sequence[tuple[str, str]]
 Views = tuple[list[CornerView | BoardNotFound], list[CornerView | BoardNotFound]]
@@ -176,7 +175,7 @@ class Pairing:
 def likeliest(left: BoardPlaces, turns_of_right: Sequence[BoardPlaces], floor: float) -> Pairing:
     """The place of the cameras that pairs tell of; turns_of_right : with the board in each of its attitudes."""
     n = len(left.R)
-    tried = np.unique(np.linspace(0, n - 1, min(n, TRIED)).astype(int))
+    tried = np.array(evenly(n, MOST_TRIED))
     told = [told_by(left[tried], right[tried]) for right in turns_of_right]
     R, t = (np.concatenate(part) for part in zip(*told, strict=True))
     distance = np.stack([apart(left, right, R, t) for right in turns_of_right])  # (orders, candidates, n)
@@ -191,15 +190,10 @@ def likeliest(left: BoardPlaces, turns_of_right: Sequence[BoardPlaces], floor: f
     return replace(found, t_right_left=np.median(shifts[found.agrees], axis=0))
 
 
-def board_turns(nominal: Array, orders: Sequence[NDArray[np.intp]]) -> list[Array]:
-    """(3, 3) each: what an order of its points turns (or mirrors) the target by, about its middle."""
-    d, found = nominal - nominal.mean(0), []
-    for order in orders:
-        U, _, Vt = np.linalg.svd((d[order].T @ d)[:2, :2])
-        turn = np.eye(3)
-        turn[:2, :2] = U @ Vt
-        found.append(turn)
-    return found
+def board_turns(n: int) -> list[Array]:
+    """(3, 3) each: the n turns of a grid of points in its plane that map it onto itself, in the order of `orders`."""
+    quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    return [np.linalg.matrix_power(quarter, k * 4 // n) for k in range(n)]
 
 
 @dataclass(frozen=True)
@@ -238,19 +232,19 @@ def paired(
     sides: tuple[BoardPlaces, BoardPlaces],
     views: tuple[Sequence[int], Sequence[int]],
     nominal: Array,
-    orders: Sequence[NDArray[np.intp]],
+    n_orders: int,
     floor: float,
     names: Names,
 ) -> tuple[Pairing, tuple[str, ...]]:
     """The pairs as they are stored, and what is to be said of them. Raises CalibrationError where they are no pairs.
 
     sides : where each camera alone has the board; views : the numbers of these images, ascending
-    names : (left, right) of all views; orders : of the target's points that look the same
+    names : (left, right) of all views; n_orders : of the target's points that look the same
     """
-    left, right = sides
+    (left, right), is_square = sides, np.allclose(*np.ptp(nominal, axis=0)[:2])
     turns = {
-        False: [right.turned(turn) for turn in board_turns(nominal, orders)],
-        True: [right.turned(turn, True) for turn in board_turns(nominal, mirror_symmetries(nominal[:, :2]))],
+        False: [right.turned(turn) for turn in board_turns(n_orders)],
+        True: [right.turned(turn @ np.diag([-1.0, 1.0, 1.0]), True) for turn in board_turns(4 if is_square else 2)],
     }
     place = [{view: i for i, view in enumerate(side)} for side in views]
 

@@ -14,6 +14,7 @@ and shear of boards 0.3 % rms, 1.3 % at most. With ten good views little of this
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 
 from calibration.cameras.camera import N_INTRINSIC, OF_CAMERAS
 from calibration.fit.stereo_model import N_STEREO, StereoModel, board_basis
@@ -59,8 +60,11 @@ class Prior:
     weight: float = 1.0
     board: BoardPrior | None = None  # where the target's shape is refined
 
-    def normal(self, model: StereoModel) -> tuple[Array, Array, float]:
-        """Information (24, 24) at the model, gradient (24,) towards the prior, and its part of chi-square."""
+    def normal(self, model: StereoModel, stereo_basis: Array, shape: bool) -> tuple[Array, Array, float]:
+        """Information (s, s) at the model, gradient (s,) towards the prior, and its part of chi-square.
+
+        stereo_basis : (24, s1) free directions of intrinsics and stereo pose; shape : whether the board's are free, too
+        """
         information, gradient, cost = np.zeros((N_STEREO, N_STEREO)), np.zeros(N_STEREO), 0.0
         for camera, own, rows, at in zip(model.cameras, OF_CAMERAS, self.rows, self.at, strict=True):
             f, focal = 0.5 * (camera.fx + camera.fy), np.zeros(N_INTRINSIC)
@@ -72,9 +76,13 @@ class Prior:
                 square = float(z[group] @ z[group])
                 weight[group] = 1.0 / (1.0 + square)
                 cost += float(np.log1p(square)) - square
-            weighted = self.weight * weight[:, None] * J
-            information[own, own], gradient[own] = J.T @ weighted, -weighted.T @ z
-        return information, gradient, self.weight * cost
+            information[own, own], gradient[own] = J.T @ (weight[:, None] * J), -J.T @ (weight * z)
+        information, gradient = stereo_basis.T @ information @ stereo_basis, stereo_basis.T @ gradient
+        if shape and self.board is not None:
+            pull, of_board = self.board.normal(model.points)
+            information = scipy.linalg.block_diag(information, self.board.information)
+            gradient, cost = np.concatenate([gradient, pull]), cost + of_board
+        return self.weight * information, self.weight * gradient, self.weight * cost
 
 
 def priors_of(model: StereoModel, nominal: Array, shape_basis: Array) -> Prior:

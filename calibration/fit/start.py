@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from calibration.board.target import LEAST_POINTS
 from calibration.cameras.camera import CAMERA_NAMES, Camera, rotation_from_vector
-from calibration.fit.pairing import FLOOR, Names, Pairs, board_turns, paired, places_of
+from calibration.fit.pairing import FLOOR, MOST_TRIED, Names, Pairs, board_turns, paired, places_of
 from calibration.fit.stereo_model import Observations, StereoModel
-from calibration.kit.arrays import Array, Array32
+from calibration.kit.arrays import Array, Array32, evenly
 from calibration.kit.errors import CalibrationError
 
 MOST_K1 = 10.0  # of a lens that exists; beyond, the views do not tell of it
@@ -24,7 +24,6 @@ WIDE = 0.8  # half the image's diagonal in focal lengths, 77 deg across: below, 
 # Misfit of the median view, rational over polynomial. A 150 deg lens had 0.25 to 0.73, eight ordinary cameras, of 8 to
 # 20 views, 0.98 to 1.00.
 CLEARLY = 0.85
-MOST_VIEWS = 30  # OpenCV's time grows with the cube of them
 
 
 def for_opencv(
@@ -73,16 +72,6 @@ def start_camera(
     return camera, poses, rms**2 * sum(map(len, images))
 
 
-def _refuse_one_place(t_pair: Array, boards: Sequence[Array]) -> None:
-    """Raise CalibrationError where both cameras stand in one place: then no distance can be told."""
-    apart, distance = float(np.linalg.norm(t_pair)), float(np.median(np.linalg.norm(boards, axis=-1)))
-    if apart < ONE_PLACE * distance:
-        raise CalibrationError(
-            f"the left and the right images show the board from one place (the cameras would stand {1e3 * apart:.2g} "
-            f"mm apart, the board {1e3 * distance:.3g} mm away): do both patterns name the images of one camera?"
-        )
-
-
 def start_stereo(
     observations: Observations,
     nominal: Array,
@@ -104,11 +93,16 @@ def start_stereo(
         cameras.append(camera)
         poses.append(seen)
     floor = FLOOR * max(max(size) for size in image_sizes)
-    pairs, notes = paired((places[0], places[1]), (list(poses[0]), list(poses[1])), nominal, orders, floor, names)
+    pairs, notes = paired((places[0], places[1]), (list(poses[0]), list(poses[1])), nominal, len(orders), floor, names)
     both = [v for v in poses[0] if v in poses[1]]
     R_pair, t_pair = pairs.R_right_left, pairs.t_right_left
-    _refuse_one_place(t_pair, [poses[0][v][1] for v in both])
-    turns, middle = board_turns(nominal, orders), nominal.mean(0)
+    between, distance = (float(np.median(np.linalg.norm(t, axis=-1))) for t in (t_pair, [poses[0][v][1] for v in both]))
+    if between < ONE_PLACE * distance:  # then no distance can be told
+        raise CalibrationError(
+            f"the left and the right images show the board from one place (the cameras would stand {1e3 * between:.2g} "
+            f"mm apart, the board {1e3 * distance:.3g} mm away): do both patterns name the images of one camera?"
+        )
+    turns, middle = board_turns(len(orders)), nominal.mean(0)
     by_right = {}
     for v, (R, t) in poses[1].items():
         turn = turns[pairs.order[both.index(v)]] if v in both else np.eye(3)
@@ -132,7 +126,7 @@ def too_wide(observations: Observations, nominal: Array, cameras: tuple[Camera, 
         if 0.5 * float(np.hypot(*camera.image_size)) < WIDE * min(camera.fx, camera.fy):
             continue
         _, *seen = for_opencv(observations, index, nominal)
-        objects, images = (of_views[:: len(of_views) // MOST_VIEWS + 1] for of_views in seen)
+        objects, images = ([of_views[i] for i in evenly(len(of_views), MOST_TRIED)] for of_views in seen)
         if len(objects) < GOOD_VIEWS:
             continue
         begun = objects, images, camera.image_size, camera.camera_matrix, np.zeros(5)

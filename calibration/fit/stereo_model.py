@@ -20,13 +20,12 @@ from calibration.cameras.camera import (
     stepped,
 )
 from calibration.kit.arguments import checked
-from calibration.kit.arrays import Array
+from calibration.kit.arrays import Array, Mask
 from calibration.kit.errors import ArgumentError, CalibrationError
 
 RICHEST = "k1 k2 p1 p2 k3"
 DISTORTION_MODELS = ("none", "k1", "k1 k2", "k1 k2 p1 p2", "k1 k2 k3", RICHEST)  # by the terms that are free
 BOARD_MODELS = ("flat", "warped", "free")
-N_WARP = 5  # shape parameters of a warped board
 N_STEREO = 2 * N_INTRINSIC + 6  # left and right intrinsics, rotation and translation of the pair
 
 
@@ -102,11 +101,16 @@ class Terms:
         if self.board not in BOARD_MODELS:
             raise CalibrationError(f"board model {self.board!r} is unknown; choose of {', '.join(BOARD_MODELS)}")
 
-    def stereo_basis(self) -> Array:
-        """(24, n_free) columns span the free directions of intrinsics and stereo pose."""
+    @property
+    def free(self) -> Mask:
+        """(24,) of intrinsics and stereo pose."""
         free = {*INTRINSIC_PARAMETERS[:4], *self.distortion.split()}
         own = np.array([name in free for name in INTRINSIC_PARAMETERS])
-        return np.eye(N_STEREO)[:, np.concatenate([own, own, np.ones(6, bool)])]
+        return np.concatenate([own, own, np.ones(6, bool)])
+
+    def stereo_basis(self) -> Array:
+        """(24, n_free) columns span the free directions of intrinsics and stereo pose."""
+        return np.eye(N_STEREO)[:, self.free]
 
 
 def board_basis(nominal: Array, board: str) -> Array:
@@ -131,12 +135,12 @@ def board_basis(nominal: Array, board: str) -> Array:
     if board == "free":
         return q[:, 7:].reshape(n, 3, 3 * n - 7)
     x, y = (d / np.abs(d).max(0).clip(1e-12))[:, :2].T
-    warp = np.zeros((n, 3, N_WARP))
+    warp = np.zeros((n, 3, 5))
     warp[:, 2, :3] = np.stack([x * x, x * y, y * y], axis=-1)
     warp[:, :2, 3] = d[:, :2] * [0.5, -0.5] / size
     warp[:, :2, 4] = d[:, 1::-1] * 0.5 / size
-    flat = warp.reshape(3 * n, N_WARP)
-    return (flat - q[:, :7] @ (q[:, :7].T @ flat)).reshape(n, 3, N_WARP)
+    flat = warp.reshape(3 * n, -1)
+    return (flat - q[:, :7] @ (q[:, :7].T @ flat)).reshape(warp.shape)
 
 
 def predict_pixels(model: StereoModel, observations: Observations) -> Array:
@@ -187,10 +191,6 @@ def restricted(model: StereoModel, nominal: Array, terms: Terms) -> StereoModel:
     """The model with the terms that are not free put to zero: distortion, deviation of the board, fx - fy."""
     basis = board_basis(nominal, terms.board).reshape(nominal.size, -1)
     shape = np.linalg.pinv(basis) @ (model.points - nominal).reshape(-1)
-    model = replace(model, points=nominal + (basis @ shape).reshape(nominal.shape))
-    cameras, free = [], terms.distortion.split()
-    held = np.array([name in free for name in INTRINSIC_PARAMETERS[4:]])
-    for camera in model.cameras:
-        parameters = camera.parameters * np.concatenate([np.ones(4), held])
-        cameras.append(Camera.from_parameters(parameters, camera.image_size))
-    return replace(model, cameras=(cameras[0], cameras[1]))
+    held = np.concatenate([camera.parameters for camera in model.cameras]) * ~terms.free[: 2 * N_INTRINSIC]
+    points = nominal + (basis @ shape).reshape(nominal.shape)
+    return replace(model, points=points, cameras=stepped(model.cameras, -held))

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from enum import StrEnum
 
 import numpy as np
 
@@ -12,23 +11,15 @@ from calibration.fit.refinement import Refinement, TermsTried
 from calibration.fit.start import GOOD_VIEWS
 from calibration.judge.pairs import PairMotion
 from calibration.kit.arrays import Array
+from calibration.kit.least_squares import solve_each
 
 MIN_COVERAGE = 0.35  # share of the image's 8 x 8 cells with a corner: below, distortion is extrapolated elsewhere
 MIN_TILT_SPREAD_DEG = 20.0  # between the boards' normals: below, focal length and distance cannot be told apart
-# Of a point's distance, excellent, good and usable: 0.05, 0.5 and 5 mm at half a metre. Images of half the size, or of
-# half the noise, say as much about cameras that are as wrong.
-GRADES = (1e-4, 1e-3, 1e-2)
+# The verdict in one word, and up to which part of a point's distance: 0.05, 0.5, 5 mm at half a metre. Images of half
+# the size, or of half the noise, say as much about cameras that are as wrong.
+GRADES = {"excellent": 1e-4, "good": 1e-3, "usable": 1e-2, "poor": np.inf}
 BEYOND_USE = 0.05  # of a point's distance: no rig to be kept unasked
 TWICE = 2.0  # what is expected: views that disagree so much, or fit so badly when left out, leave something out of it
-
-
-class Grade(StrEnum):
-    """The verdict in one word; the best first."""
-
-    EXCELLENT = "excellent"
-    GOOD = "good"
-    USABLE = "usable"
-    POOR = "poor"
 
 
 @dataclass(frozen=True)
@@ -47,7 +38,7 @@ class Assessment:
     inflation: float  # of the covariance, from the scatter of views
     coverage: tuple[float, ...]  # of each camera: share of 8 x 8 image cells with a corner
     tilt_spread_deg: float  # greatest angle between two boards' normals
-    grade: Grade = Grade.POOR
+    grade: str = ""  # of GRADES
     verdict: str = ""  # the same with its reason: one sentence without its full stop
     figures: str = ""  # what a user gets on the table, and the misfit of views left out
     warnings: tuple[str, ...] = ()
@@ -124,7 +115,7 @@ def _shifts_of_points(rig: StereoRig, points_world: Array) -> Array:
     _, d_world, d_rig = rig.project_with_jacobians(points_world)
     J = np.moveaxis(d_world, 0, 1).reshape(len(points_world), 4, 3)
     K = np.moveaxis(d_rig, 0, 1).reshape(len(points_world), 4, -1)
-    return np.asarray(-np.linalg.solve(np.swapaxes(J, 1, 2) @ J, np.swapaxes(J, 1, 2) @ K), np.float64)
+    return -solve_each(J, K)
 
 
 def measurement_volume(refinement: Refinement, table_view: int | None) -> Array:
@@ -186,19 +177,22 @@ def assess(
         coverage=tuple(float(np.mean(cells_of(refinement, camera) > 0)) for camera in range(len(CAMERA_NAMES))),
         tilt_spread_deg=tilt_spread(refinement),
     )
-    grade, verdict = _verdict(found, chosen, wide, _moved(found, refinement))
-    told = (*map(": ".join, wide), *_warnings(found, refinement, chosen))
+    grade, verdict, told = _judgement(found, refinement, chosen, wide)
     return replace(found, grade=grade, verdict=verdict, figures=_figures(found, refinement.rms()), warnings=told)
 
 
-def _moved(found: Assessment, refinement: Refinement) -> bool:
-    """True where boards were given a motion between the exposures, and are seen to have one."""
-    return found.motion is not None and found.motion.is_seen and refinement.problem.motion is not None
-
-
-def _warnings(found: Assessment, refinement: Refinement, chosen: TermsTried) -> list[str]:
-    told = []
-    if (motion := found.motion) is not None and _moved(found, refinement):
+def _judgement(
+    found: Assessment, refinement: Refinement, chosen: TermsTried, wide: Sequence[tuple[str, str]]
+) -> tuple[str, str, tuple[str, ...]]:
+    """The worst of what the figures say, with the reason; and all of it that asks for something to be done."""
+    told, reasons = [": ".join(what) for what in wide], [(3, what) for what, _ in wide]
+    errors = found.triangulation_sigma[0], found.held_out_error
+    for error, what in zip(errors, ("a point is uncertain by", "views left out of the fit are off by"), strict=True):
+        if np.isfinite(share := error / found.distance):
+            part = f"{what} {_length(error)}, {_percent(share)} of the distance"
+            reasons.append((int(np.searchsorted([*GRADES.values()], share)), part))
+    if (motion := found.motion) is not None and motion.is_seen and refinement.problem.motion is not None:
+        reasons.append((2, "the two images of a pair do not show the board in one place"))
         told.append(
             "the pairs are not synchronised, or the lenses are not as modelled: the two images of a pair differ as if "
             f"the board had moved by {motion.distance * 1e3:.2g} mm between them ({motion.pixels:.2g} px; corners "
@@ -217,8 +211,9 @@ def _warnings(found: Assessment, refinement: Refinement, chosen: TermsTried) -> 
             f"{MIN_TILT_SPREAD_DEG:.0f} deg): focal lengths and distances are badly determined; tilt the board about "
             "two axes"
         )
-    n_views = len(np.unique(refinement.observations.view[refinement.kept]))
-    if n_views < GOOD_VIEWS:
+    if found.pairs < GOOD_VIEWS:
+        reasons.append((2 if found.pairs > 3 else 3, f"only {found.pairs} views were seen by both cameras"))
+    if (n_views := len(np.unique(refinement.observations.view[refinement.kept]))) < GOOD_VIEWS:
         told.append(f"{n_views} views are few (good: 15 to 40)")
     if found.inflation > TWICE:
         told.append(
@@ -227,33 +222,18 @@ def _warnings(found: Assessment, refinement: Refinement, chosen: TermsTried) -> 
             "modelled"
         )
     if chosen.held_out_rms_px > TWICE * chosen.rms_px:
+        reasons.append((2, "views left out of the fit are met far worse than those fitted"))
         told.append(
             f"views that were left out fit at {chosen.held_out_rms_px:.3f} px, those fitted at {chosen.rms_px:.3f} px: "
             "more and more varied views are needed"
         )
     if not refinement.converged:
         told.append("the refinement did not converge: the result is not the least-squares minimum")
-    return told
-
-
-def _verdict(found: Assessment, chosen: TermsTried, wide: Sequence[tuple[str, str]], moved: bool) -> tuple[Grade, str]:
-    """The worst of what the figures say, with the reason."""
-    # of equal grades the first is taken: the cause
-    reasons = [(3, what) for what, _ in wide]
-    errors = found.triangulation_sigma[0], found.held_out_error
-    for error, what in zip(errors, ("a point is uncertain by", "views left out of the fit are off by"), strict=True):
-        if np.isfinite(share := error / found.distance):
-            part = f"{what} {_length(error)}, {_percent(share)} of the distance"
-            reasons.append((int(np.searchsorted(GRADES, share)), part))
-    if found.pairs < GOOD_VIEWS:
-        reasons.append((2 if found.pairs > 3 else 3, f"only {found.pairs} views were seen by both cameras"))
-    if chosen.held_out_rms_px > TWICE * chosen.rms_px:
-        reasons.append((2, "views left out of the fit are met far worse than those fitted"))
-    if moved:
-        reasons.append((2, "the two images of a pair do not show the board in one place"))
-    worst, why = max(reasons, key=lambda item: item[0], default=(3, "nothing shows how good it is"))
-    grade = list(Grade)[worst]
-    return grade, f"{grade.value.capitalize()}: {why}"
+    worst, why = max(
+        reasons, key=lambda item: item[0], default=(3, "nothing shows how good it is")
+    )  # the first of equal
+    grade = [*GRADES][worst]
+    return grade, f"{grade.capitalize()}: {why}", tuple(told)
 
 
 def _figures(found: Assessment, rms: float) -> str:

@@ -41,7 +41,6 @@ FREE = BoardMotion(np.inf, np.inf)  # nothing known beforehand
 # Times as far apart as pairs of one side. None of 400 synthetic sets of boards that moved reaches 2; of 31 photographed
 # ones two have 8.8 and 4.5, where OpenCV's rig of one side misses the other's pairs as well, and the next one 2.2.
 STEP = 4.0
-LEAST_SIDE = 3  # pairs on either side of a step: fewer are not a place of the cameras, but boards that moved
 BY_ZOOM = 1.3  # times less squared misfit by two focal lengths; one and the same lens has 1.05
 
 
@@ -327,7 +326,7 @@ def camera_moved(observations: Observations, pairs: Pairs, table_view: int | Non
     model = pairs.model
     sides, R_pair, t_pair = [], model.R_right_left, model.t_right_left
     views = np.array([*pairs.left_poses], int)
-    if len(views) < 2 * LEAST_SIDE:
+    if len(views) < 2 * MIN_VIEWS:
         return None
     in_right = {v: (R_pair @ R, R_pair @ t + t_pair) for v, (R, t) in pairs.right_poses.items()}
     for index, poses in enumerate((pairs.left_poses, in_right)):
@@ -360,7 +359,7 @@ def _cuts(between: Array) -> list[tuple[int, float, float]]:
     between : (n, n) [px] by which what the pairs tell of the cameras differs
     """
     n, place = len(between), np.arange(len(between))
-    if n < 2 * LEAST_SIDE:
+    if n < 2 * MIN_VIEWS:  # fewer on a side are not a place of the cameras, but boards that moved
         return []
 
     def to_sides(cut: int) -> tuple[Array, Array]:
@@ -369,7 +368,7 @@ def _cuts(between: Array) -> list[tuple[int, float, float]]:
         own, other = (np.where(which, between, np.nan) for which in (same & (place[:, None] != place), ~same))
         return np.nanmedian(own, axis=1), np.nanmedian(other, axis=1)
 
-    at = min(range(LEAST_SIDE, n - LEAST_SIDE + 1), key=lambda cut: float(to_sides(cut)[0].sum()))
+    at = min(range(MIN_VIEWS, n - MIN_VIEWS + 1), key=lambda cut: float(to_sides(cut)[0].sum()))
     own, other = to_sides(at)
     pixels, scatter = float(np.median(other)), float(max(np.median(own[:at]), np.median(own[at:])))
     if not pixels > STEP * scatter:

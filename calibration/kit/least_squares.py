@@ -155,6 +155,12 @@ def scaled_solve(A: Array, b: Array) -> Array:
     return np.linalg.solve(A * scale[:, None] * scale, b * columns) * columns
 
 
+def solve_each(A: Array, b: Array) -> Array:
+    """Argmin |A x - b| of each of many small systems (n, m, k) and (n, m, j): x (n, k, j)."""
+    transposed = np.swapaxes(A, -1, -2)
+    return np.asarray(np.linalg.solve(transposed @ A, transposed @ b), float)
+
+
 Model = TypeVar("Model")
 
 

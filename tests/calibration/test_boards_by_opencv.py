@@ -13,7 +13,7 @@ from calibration.fit.board_motion import BoardMotion, motions, split
 from calibration.fit.normal_equations import Problem
 from calibration.fit.priors import BEND, MISPRINT, STRETCH, board_prior, priors_of
 from calibration.fit.stereo_model import board_basis, moved, predict_pixels
-from calibration.judge.assessment import Grade, stereo_covariance
+from calibration.judge.assessment import stereo_covariance
 from calibration.judge.pairs import motion_between_exposures
 from calibration.judge.tolerances import BoardTolerances
 from calibration.rig_file import read_rig_file, write_rig
@@ -70,8 +70,8 @@ def test_normal_equations_have_the_cost_and_the_gradient_that_they_say(scene_mak
         data = np.sum(within * (2 * distance - within))
         if problem.motion is not None:
             data += np.sum(motions(model)[0] ** 2 * problem.motion.weights)
-        if problem.prior is not None:
-            data += problem.prior.normal(model)[2] + 3.0 * problem.prior.board.normal(model.points)[1]
+        if (prior := problem.prior) is not None:
+            data += prior.normal(model, stereo_basis, False)[2] + 3.0 * prior.board.normal(model.points)[1]
         return data
 
     assert known != "outliers" or 0.1 < np.mean(distances(model) > problem.huber) < 0.9
@@ -104,7 +104,7 @@ def test_cameras_and_pair_are_right_where_boards_moved_between_the_exposures():
         assert not found.apart
         # each axis moves by 0.5 mm rms; the two poses share what moves along the common line of sight
         assert 0.4e-3 < found.assessment.motion.distance < 1.8e-3
-        assert found.assessment.grade in (Grade.USABLE, Grade.POOR)
+        assert found.assessment.grade in ("usable", "poor")
         # one place of the board for both images, as of cameras that are triggered together
         o, model = found.refinement.observations, replace(found.refinement.model, boards_right=None)
         together = refine_stereo(o, model, BOARD.points, found.refinement.terms)

@@ -115,7 +115,7 @@ def test_no_board_anywhere_and_none_in_the_table_view_are_errors(drawn):
     blank = np.full_like(left[0], 90)
     with pytest.raises(CalibrationError, match=r"found in 0 of 8 left images.*left 0 and 7 more: no board"):
         calibrate_stereo([blank] * 8, right, BOARD)
-    with pytest.raises(CalibrationError, match="not found in the table view 0"):
+    with pytest.raises(CalibrationError, match=r"table view 0 cannot be used .left 0 and right 0: no board.*lab frame"):
         calibrate_stereo([blank, *left[1:]], [blank, *right[1:]], BOARD, FLAT, table_view=0)
     with pytest.raises(CalibrationError, match="table view 11 does not exist"):
         calibrate_stereo(left, right, BOARD, FLAT, table_view=11)
