@@ -1,10 +1,18 @@
-"""The instrument in an imperfect laboratory, by points: errors are as large as stated, what is planted is named."""
+"""The instrument in an imperfect laboratory, by points: errors are as large as stated, what is planted is named.
+
+And in a perfect one by images that are cast without a line of the product's renderer.
+"""
 
 import numpy as np
 import pytest
 
+from calibration.rig_file import read_rig
+from disctrack.cli import main
 from disctrack.diagnosis import diagnose
 from disctrack.diagnosis.recorded import with_declared_dots
+from disctrack.trajectory import FrameStatus
+from disctrack.trajectory.file import read_trajectory
+from tests.oracles import cast_images
 from tests.oracles.newton_euler import ZERO, classical_rolling_friction, of_the_paper, pivoting_friction
 from tests.oracles.point_laboratory import IDEAL, G, Plan, errors_and_variances, recorded
 
@@ -89,3 +97,48 @@ def test_what_is_planted_is_named_within_three_sigma_and_nothing_else(planted):
     wrong = [said for seed, effect in planted if (said := wrong_about(seed, effect))]
     # 0.5 % of false alarms are allowed for noise alone; fields whose size is estimated may double or treble that
     assert len(wrong) <= 1, "\n".join(wrong)
+
+
+@pytest.fixture(scope="module")
+def cast(tmp_path_factory):
+    """Frames of 320 x 320 pixels; what the command makes of them with squares as declared; poses, and cameras."""
+    folder = tmp_path_factory.mktemp("cast") / "plain"
+    truth = cast_images.write(folder, Plan(1, 24, 320, 0.4, 14, square=6.5e-3, **IDEAL))
+    text = (folder / "recording.toml").read_text()
+
+    def measured(declared="square_mm = 6.5"):
+        (folder / "recording.toml").write_text(text.replace("square_mm = 6.5", declared))
+        assert main(["run", str(folder), "--overwrite", "--no-figures", "--no-video"]) == 0
+        return read_trajectory(folder / "results" / "trajectory.h5"), read_rig(folder / "results" / "rig.h5")
+
+    return measured, measured(), truth
+
+
+@pytest.mark.statistical
+def test_poses_of_cast_images_are_right_within_their_sigmas(cast):
+    _, (trajectory, _), (R, t, _) = cast
+    assert np.all(trajectory.frame_status == FrameStatus.MEASURED)
+    error, variance = errors_and_variances(trajectory, R, t)
+    shared = np.diagonal(trajectory.calibration_covariance, axis1=1, axis2=2).mean(0)
+    noise = variance.mean(0) - shared
+    assert np.all(np.abs(error.mean(0)) < 4 * np.sqrt(shared + noise / len(error)))
+    # the scatter of 24 frames is known within 30 % (two sigma), the correlated part of the dots aside
+    assert np.all((error.std(0) ** 2 < 2.0 * noise) & (error.std(0) ** 2 > 0.4 * noise))
+
+
+@pytest.mark.statistical
+def test_lenses_of_cast_images_are_right_within_their_sigmas(cast):
+    _, (_, rig), (_, _, cameras) = cast
+    for camera, true, first in zip(rig.cameras, cameras, (0, 9), strict=True):
+        sigma = np.sqrt(np.diagonal(rig.covariance)[first : first + 4])  # fx, fy, cx, cy
+        assert np.all(np.abs(camera.parameters[:4] - [true.focal, true.focal, *true.middle]) < 4 * sigma)
+        assert np.all(sigma < 3)  # px
+
+
+@pytest.mark.statistical
+def test_squares_declared_too_large_are_errors_beyond_the_sigmas_of_right_ones(cast):
+    """Negative control: the same images with squares 0.5 % larger, known to 1 um; by the sigmas of the right run."""
+    measured, (right, _), (R, t, _) = cast
+    wrong, _ = measured("square_mm = 6.5325\nsquare_tolerance_mm = 0.001")
+    variance = errors_and_variances(right, R, t)[1]
+    assert np.max(np.mean(errors_and_variances(wrong, R, t)[0] ** 2 / variance, axis=0)) > 9
