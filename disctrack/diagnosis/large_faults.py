@@ -23,7 +23,7 @@ from disctrack.faults.catalogue import faults_of, scene_faults
 from disctrack.faults.dots import cameras_with, centres_with
 from disctrack.frames import CAMERAS, euler_from_rotation, rotation_from_euler, unwrap_euler
 from disctrack.rolling import Model
-from disctrack.track.pose import fit_poses
+from disctrack.track.pose import DotsInFrames, fit_poses
 from disctrack.trajectory import Trajectory
 
 LARGE_PX = 1.0  # rms in the dots, from which a fault is sought without the linear approximation
@@ -69,16 +69,15 @@ def poses_with(trajectory: Trajectory, values: Values) -> Trajectory:
             course = CubicSpline(trajectory.time[seen], pixels[seen, 1, dot])
             moved[seen] = course(trajectory.time[seen] - faults.right_delay_s, extrapolate=False)
         pixels[:, 1, dot] = moved
-    fits = fit_poses(
+    dots = DotsInFrames(
+        cameras_with(faults, trajectory.rig),
+        replace(trajectory.disc, marker_centres_body=centres_with(faults, trajectory.disc)),
         pixels,
         trajectory.markers_covariance_px2,
-        cameras_with(faults, trajectory.rig),
-        centres_with(faults, trajectory.disc),
         rotation_from_euler(*trajectory.q[:, 3:].T),
         trajectory.q[:, :3],
-        reject_outliers=False,
-        with_sensitivity=False,
     )
+    fits = fit_poses(dots, reject_outliers=False, with_sensitivity=False)
     angles = np.full((len(trajectory), 3), np.nan)
     angles[fits.converged] = unwrap_euler(euler_from_rotation(fits.R_world_body[fits.converged]))
     return replace(

@@ -1,4 +1,4 @@
-"""Compiled fit of many poses to their dots (numba): Levenberg-Marquardt, one frame after the other; see `pose`."""
+"""Compiled fit of poses to their dots (numba): Levenberg-Marquardt, one frame after the other; see `pose`."""
 
 from __future__ import annotations
 
@@ -6,25 +6,78 @@ import math
 
 import numpy as np
 
+from calibration.cameras._projection import project_point
 from calibration.kit._cholesky import solve_in_place
-from disctrack.track.dots._kernels import _copy, _dot_by_pose, _entry, _part, _rotate_from_left
+from calibration.kit.compiled import RULES, njit
+from calibration.kit.compiled import part as _part
 
-MAX_DAMPING = 1e10
+_entry = njit(cache=True, **RULES)  # called from Python
+
 _MAX_ITERATIONS = 60
 
 
 @_part
-def _evaluate(observed, covariance, used, cameras, R_cw, t_cw, centres, R, t, pixels, residual, jacobian, sums):
+def _rotate_from_left(v, R, out):
+    """Out = exp([v]x) R by Rodrigues' formula."""
+    angle2 = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
+    angle = math.sqrt(angle2)
+    if angle < 1e-6:
+        a, b = 1.0, 0.5
+    else:
+        a, b = math.sin(angle) / angle, (1.0 - math.cos(angle)) / angle2
+    for j in range(3):
+        x, y, z = R[0, j], R[1, j], R[2, j]
+        cx, cy, cz = v[1] * z - v[2] * y, v[2] * x - v[0] * z, v[0] * y - v[1] * x
+        out[0, j] = x + a * cx + b * (v[1] * cz - v[2] * cy)
+        out[1, j] = y + a * cy + b * (v[2] * cx - v[0] * cz)
+        out[2, j] = z + a * cz + b * (v[0] * cy - v[1] * cx)
+
+
+@_part
+def _dot_by_pose(camera, R_cw, t_cw, centre, R, t, J, rows):
+    """Image u, v of a dot at `centre` (3,) on the disc, NaN behind the camera; fills J (2, 3), rows (2, 6).
+
+    The rows are d (u, v) / d pose, a translation and a rotation vector in world axes.
+    """
+    a0 = R[0, 0] * centre[0] + R[0, 1] * centre[1] + R[0, 2] * centre[2]
+    a1 = R[1, 0] * centre[0] + R[1, 1] * centre[1] + R[1, 2] * centre[2]
+    a2 = R[2, 0] * centre[0] + R[2, 1] * centre[1] + R[2, 2] * centre[2]
+    x, y, z = a0 + t[0], a1 + t[1], a2 + t[2]
+    p0 = t_cw[0] + R_cw[0, 0] * x + R_cw[0, 1] * y + R_cw[0, 2] * z
+    p1 = t_cw[1] + R_cw[1, 0] * x + R_cw[1, 1] * y + R_cw[1, 2] * z
+    depth = t_cw[2] + R_cw[2, 0] * x + R_cw[2, 1] * y + R_cw[2, 2] * z
+    u, v = project_point(camera, p0, p1, depth if depth > 0.0 else np.nan, J)
+    for axis in range(2):
+        row = rows[axis]
+        for i in range(3):
+            row[i] = J[axis, 0] * R_cw[0, i] + J[axis, 1] * R_cw[1, i] + J[axis, 2] * R_cw[2, i]
+        row[3] = a1 * row[2] - a2 * row[1]
+        row[4] = a2 * row[0] - a0 * row[2]
+        row[5] = a0 * row[1] - a1 * row[0]
+    return u, v
+
+
+@_part
+def _copy(out, values):
+    """Copy a matrix."""
+    for i in range(values.shape[0]):
+        for j in range(values.shape[1]):
+            out[i, j] = values[i, j]
+
+
+@_part
+def _evaluate(observed, covariance, used, cameras, centres, reach, R, t, filled, sums):
     """Fill pixels (2, m, 2), whitened residuals and Jacobian (2, m, 2, 6), zeros for dots not used; returns their cost.
 
-    sums (7, 6): J^T J, and J^T r as the last row.
+    sums (7, 6): J^T J, and J^T r as the last row. A dot that is farther away than `reach` [px] has Huber's weight.
     """
+    (pixels, residual, jacobian), (intrinsics, R_cw, t_cw) = filled, cameras
     J, row = np.empty((2, 3)), np.empty((2, 6))
     sums[:] = 0.0
     cost = 0.0
     for c in range(2):
         for m in range(centres.shape[0]):
-            u, v, _ = _dot_by_pose(cameras[c], R_cw[c], t_cw[c], centres[m], R, t, J, row)
+            u, v = _dot_by_pose(intrinsics[c], R_cw[c], t_cw[c], centres[m], R, t, J, row)
             pixels[c, m, 0], pixels[c, m, 1] = u, v
             # W with W C W^T = 1, as `pose.whitening` has it; no weight where C is not a covariance
             a, b = covariance[c, m, 0, 0], covariance[c, m, 0, 1]
@@ -36,15 +89,16 @@ def _evaluate(observed, covariance, used, cameras, R_cw, t_cw, centres, R, t, pi
                     for i in range(6):
                         jacobian[c, m, axis, i] = 0.0
                 continue
-            w00, w11 = 1.0 / math.sqrt(a), 1.0 / math.sqrt(remaining)
-            w10 = -b / a * w11
             du, dv = observed[c, m, 0] - u, observed[c, m, 1] - v
+            weight = 1.0 / max(1.0, math.hypot(du, dv) / reach)
+            w00, w11 = math.sqrt(weight / a), math.sqrt(weight / remaining)
+            w10 = -b / a * w11
             residual[c, m, 0], residual[c, m, 1] = w00 * du, w10 * du + w11 * dv
             for i in range(6):
                 jacobian[c, m, 0, i], jacobian[c, m, 1, i] = w00 * row[0, i], w10 * row[0, i] + w11 * row[1, i]
             for axis in range(2):
                 r = residual[c, m, axis]
-                cost += r * r
+                cost += (2.0 - weight) * r * r
                 for i in range(6):
                     slope = jacobian[c, m, axis, i]
                     sums[6, i] += slope * r
@@ -53,58 +107,56 @@ def _evaluate(observed, covariance, used, cameras, R_cw, t_cw, centres, R, t, pi
     return cost
 
 
+@_part
+def fit_pose(observed, covariance, used, cameras, centres, tolerance, reach, R, t, filled):
+    """As `fit`, of one frame; returns whether it converged. Dots farther away than `reach` [px] pull no harder."""
+    sums, trial_sums, damped, step = np.empty((7, 6)), np.empty((7, 6)), np.empty((6, 6)), np.zeros(6)
+    R_trial, t_trial = np.empty((3, 3)), np.empty(3)
+    cost, damping, solved, small = np.inf, 1e-7, True, False
+    for k in range(_MAX_ITERATIONS + 1 if tolerance >= 0.0 else 1):
+        _rotate_from_left(step[3:6], R, R_trial)
+        for i in range(3):
+            t_trial[i] = t[i] + step[i]
+        new = _evaluate(observed, covariance, used, cameras, centres, reach, R_trial, t_trial, filled, trial_sums)
+        if k == 0 or (solved and (new < cost or (small and new <= cost * (1.0 + 1e-9) + 1e-12))):
+            cost, damping = new, max(0.1 * damping, 1e-10)
+            _copy(R, R_trial)
+            _copy(sums, trial_sums)
+            for i in range(3):
+                t[i] = t_trial[i]
+        else:
+            damping = max(30.0 * damping, 1e-4)
+        if small:
+            return True
+        _copy(damped, sums[:6])
+        for i in range(6):
+            step[i] = sums[6, i]
+            damped[i, i] += damping * damped[i, i]
+            if damped[i, i] <= 1e-300:  # a parameter that no datum sees stays where it is
+                damped[i, i] = 1.0
+        solved = solve_in_place(damped, step)
+        length2 = 0.0
+        for i in range(6):
+            length2 += sums[i, i] * step[i] * step[i]
+            for j in range(i):
+                length2 += 2.0 * sums[i, j] * step[i] * step[j]
+        small = solved and length2 < tolerance * tolerance and damping < 1e-2
+    return False
+
+
 @_entry
-def fit(rows, observed, covariance, used, cameras, R_cw, t_cw, centres, tolerance, R, t, converged, pixels, residuals,
-        jacobian):  # fmt: skip
+def fit(rows, observed, covariance, used, cameras, centres, tolerance, R, t, converged, filled):
     """Fit the poses of some rows (k,) of n frames, from R (n, 3, 3), t (n, 3) on, which are moved to the minimum.
 
-    observed (n, 2, m, 2), covariance (n, 2, m, 2, 2), used (n, 2, m); cameras (2, 9). Marquardt 1963, with Nielsen-like
-    damping; a pose has converged when its Gauss-Newton step is shorter than `tolerance` standard deviations of its own
-    parameters, sqrt(step^T J^T J step); a negative tolerance leaves it where it is. Filled: converged (n,), pixels
-    (n, 2, m, 2) of all dots, NaN behind a camera; residuals (n, 2, m, 2), observed - pixels, and jacobian
-    (n, 2, m, 2, 6), both whitened, with zeros for dots that are not used.
+    observed (n, 2, m, 2), covariance (n, 2, m, 2, 2), used (n, 2, m); cameras as `pose.stacked` has them. Marquardt
+    1963, with Nielsen-like damping; a pose has converged when its Gauss-Newton step is shorter than `tolerance`
+    standard deviations of its own parameters, sqrt(step^T J^T J step); a negative tolerance leaves it where it is.
+    Filled: converged (n,), and of the last pose tried, which is the pose where it converged, pixels (n, 2, m, 2) of all
+    dots, NaN behind a camera; residuals (n, 2, m, 2), observed - pixels, and jacobian (n, 2, m, 2, 6), both whitened,
+    with zeros for dots that are not used.
     """
-    shape = residuals.shape[1:]
-    trial_pixels, trial_residuals, trial_jacobian = np.empty(shape), np.empty(shape), np.empty((*shape, 6))
-    sums, trial_sums, damped, step = np.empty((7, 6)), np.empty((7, 6)), np.empty((6, 6)), np.empty(6)
-    R_trial, t_trial = np.empty((3, 3)), np.empty(3)
+    pixels, residuals, jacobian = filled
     for f in rows:
-        cost, damping, converged[f], solved, small = np.inf, 1e-7, False, True, False
-        _copy(R_trial, R[f])
-        for i in range(3):
-            t_trial[i] = t[f, i]
-        for k in range(_MAX_ITERATIONS + 1 if tolerance >= 0.0 else 1):
-            new = _evaluate(observed[f], covariance[f], used[f], cameras, R_cw, t_cw, centres, R_trial, t_trial,
-                            trial_pixels, trial_residuals, trial_jacobian, trial_sums)  # fmt: skip
-            if k == 0 or (solved and (new < cost or (small and new <= cost * (1.0 + 1e-9) + 1e-12))):
-                cost, damping = new, max(0.1 * damping, 1e-10)
-                _copy(R[f], R_trial)
-                _copy(sums, trial_sums)
-                for i in range(3):
-                    t[f, i] = t_trial[i]
-                for c in range(2):
-                    _copy(pixels[f, c], trial_pixels[c])
-                    _copy(residuals[f, c], trial_residuals[c])
-                    for m in range(shape[1]):
-                        _copy(jacobian[f, c, m], trial_jacobian[c, m])
-            else:
-                damping = max(30.0 * damping, 1e-4)
-            if small or damping > MAX_DAMPING:
-                converged[f] = small
-                break
-            _copy(damped, sums[:6])
-            for i in range(6):
-                step[i] = sums[6, i]
-                damped[i, i] += damping * damped[i, i]
-                if damped[i, i] <= 1e-300:  # a parameter that no datum sees stays where it is
-                    damped[i, i] = 1.0
-            solved = solve_in_place(damped, step)
-            length2 = 0.0
-            for i in range(6):
-                length2 += sums[i, i] * step[i] * step[i]
-                for j in range(i):
-                    length2 += 2.0 * sums[i, j] * step[i] * step[j]
-            small = solved and length2 < tolerance * tolerance and damping < 1e-2
-            _rotate_from_left(step[3:6], R[f], R_trial)
-            for i in range(3):
-                t_trial[i] = t[f, i] + step[i]
+        of_frame = pixels[f], residuals[f], jacobian[f]
+        converged[f] = fit_pose(observed[f], covariance[f], used[f], cameras, centres, tolerance, np.inf, R[f], t[f],
+                                of_frame)  # fmt: skip

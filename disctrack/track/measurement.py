@@ -2,6 +2,7 @@
 
 import dataclasses
 import hashlib
+import json
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -360,13 +361,5 @@ def trajectory_provenance(
 
 def rig_sha256(rig: StereoRig) -> str:
     """SHA-256 (hex) of a rig's numbers, to the last bit."""
-    parts = [np.append(camera.parameters, camera.image_size) for camera in rig.cameras]
-    parts += [rig.R_right_left, rig.t_right_left, rig.R_left_world, rig.t_left_world, rig.covariance]
-    if rig.lens_field is not None:
-        parts.append(rig.lens_field.coefficients)
-    parts += [allowance.shift for allowance in rig.allowances]
-    words = [rig.world_is_table, *((allowance.cause, allowance.assumed) for allowance in rig.allowances)]
-    digest = hashlib.sha256(repr(words).encode())
-    for part in parts:
-        digest.update(np.ascontiguousarray(part, float).tobytes())
-    return digest.hexdigest()
+    numbers = json.dumps(dataclasses.asdict(rig), default=lambda value: value.tolist())
+    return hashlib.sha256(numbers.encode()).hexdigest()

@@ -4,13 +4,17 @@ The unknowns are a translation and a rotation vector in world axes that multipli
 singular at theta = 0; psi, theta, phi follow at the border (`frames.euler_from_rotation`).
 """
 
-from dataclasses import dataclass
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.cameras.camera import StereoRig
+from calibration.cameras.camera import N_RIG, StereoRig, by_turning
 from calibration.kit.arrays import Array, Mask
+from calibration.kit.least_squares import normal_of_rows
+from disctrack.disc import Disc
 from disctrack.track import _pose_kernel as kernel
 
 MIN_DOTS = 3  # six unknowns, two numbers per dot
@@ -41,46 +45,89 @@ class PoseFits:
         return np.where(self.degrees_of_freedom > 0, self.chi_square / np.maximum(self.degrees_of_freedom, 1), np.nan)
 
 
+@dataclass(frozen=True)
+class DotsInFrames:
+    """Dots seen in n frames, poses right within a few pixels, and what moves all beside rig and places of the dots.
+
+    A `shift` (30 + 2m + j,) of what the frames share: RIG_PARAMETERS, the dots' places in body axes, anything else.
+    """
+
+    rig: StereoRig
+    disc: Disc
+    pixels: Array  # (n, 2, m, 2); NaN where a dot was not seen
+    covariance: Array  # (n, 2, m, 2, 2) [px^2]
+    R: Array  # (n, 3, 3); NaN where there is no pose
+    t: Array  # (n, 3) [m]
+    further: Array | None = None  # (n, 2, m, 2, j) derivatives of the pixels by anything else
+
+    @property
+    def posed(self) -> Mask:
+        """(n,) True where there is a pose."""
+        return np.asarray(np.isfinite(self.t).all(axis=1))
+
+    def at(self, rows: NDArray[np.intp] | slice) -> DotsInFrames:
+        """Some of the frames."""
+        parts = {name: getattr(self, name)[rows] for name in ("pixels", "covariance", "R", "t")}
+        return replace(self, **parts)
+
+    def but(self, outlying: Mask) -> DotsInFrames:
+        """The frames with no pose for those that are outlying (n,)."""
+        return replace(
+            self, R=np.where(outlying[:, None, None], np.nan, self.R), t=np.where(outlying[:, None], np.nan, self.t)
+        )
+
+    def shifted(self, shift: Array) -> DotsInFrames:
+        """The pixels without what else moved them, rig and dots' places after the shift."""
+        places = slice(N_RIG, N_RIG + 2 * self.disc.n_markers)
+        moved = np.column_stack([shift[places].reshape(-1, 2), np.zeros(self.disc.n_markers)])
+        pixels = self.pixels if self.further is None else self.pixels - self.further @ shift[places.stop :]
+        disc = replace(self.disc, marker_centres_body=self.disc.marker_centres_body + moved)
+        return replace(self, rig=self.rig.perturbed(shift[:N_RIG]), disc=disc, pixels=pixels)
+
+    def fitted(self, shift: Array, reject: bool) -> tuple[DotsInFrames, PoseFits]:
+        """The frames with the poses that go with the shift; where a fit fails, the pose before."""
+        fits = fit_poses(self.shifted(shift), reject_outliers=reject, with_sensitivity=False)
+        ok = fits.converged
+        R = np.where(ok[:, None, None], fits.R_world_body, self.R)
+        return replace(self, R=R, t=np.where(ok[:, None], fits.t_world_body, self.t)), fits
+
+    def normal(self, shift: Array, used: Mask, free: Mask) -> tuple[Array, Array, float]:
+        """Normal matrix (k, k) and gradient (k,) of the free ones of what is shared, every frame's pose eliminated.
+
+        used : (n, 2, m) dots that count; free : (30 + 2m + j,)
+        And chi-square, by which the decrease that a shared number explains can be judged.
+        """
+        moved = self.shifted(shift)
+        arm, W = moved.disc.marker_centres_body @ np.swapaxes(self.R, 1, 2), whitening(self.covariance)
+        projected, by_point, by_rig = moved.rig.project_with_jacobians(arm + self.t[:, None])
+        residuals = W @ (moved.pixels - projected)[..., None]
+        by_pose = W @ np.concatenate([by_point, by_turning(by_point, arm[:, None])], axis=-1)
+        by_shared = np.zeros((*projected.shape, len(free)))
+        by_shared[..., :N_RIG] = W @ by_rig
+        # a step of a dot on the body moves its image as the same step of the body, turned into the body's axes
+        by_place = by_pose[..., :3] @ self.R[:, None, None, :, :2]
+        for k in range(self.disc.n_markers):
+            by_shared[:, :, k, :, N_RIG + 2 * k : N_RIG + 2 * k + 2] = by_place[:, :, k]
+        if self.further is not None:
+            by_shared[..., -self.further.shape[-1] :] = W @ self.further
+        # with the residuals as one more of what is shared, for their square
+        rows = np.concatenate([by_pose, by_shared[..., free], residuals, residuals], axis=-1)
+        rows = np.where((used & np.isfinite(rows).all(axis=(-2, -1)))[..., None, None], rows, 0.0)
+        matrix, gradient = normal_of_rows(rows.reshape(len(rows), -1, rows.shape[-1]), 6).eliminated()
+        return matrix[:-1, :-1], gradient[:-1], float(gradient[-1])
+
+
 def marker_pixels(R: Array, t: Array, rig: StereoRig, centres_body: Array) -> tuple[Array, Array]:
     """Images of the dots' centres (n, 2, m, 2) and their derivative (n, 2, m, 2, 6) by POSE_COMPONENTS.
 
     R (n, 3, 3), t (n, 3): body -> world; centres_body (m, 3). NaN behind a camera.
     """
-    shape = len(R), 2, len(centres_body)
+    shape, rows = (len(R), 2, len(centres_body)), np.arange(len(R))
     seen = np.zeros((*shape, 2)), np.tile(np.eye(2), (*shape, 1, 1)), np.ones(shape, bool)
-    pixels, _, J = _evaluated(*seen, rig, centres_body, R, t)
-    return pixels, J
-
-
-def misses(
-    markers_px: Array, markers_covariance_px2: Array, rig: StereoRig, centres_body: Array, R: Array, t: Array
-) -> tuple[Array, Array, Mask]:
-    """By what n poses miss their dots, in sigmas (n, 2, m, 2), its slopes (n, 2, m, 2, 6), and which dots tell so.
-
-    Shapes as in `fit_poses`; (n, 2, m) of the last. Zeros where a dot was not seen, or where there is no pose.
-    """
-    known = _known(markers_px, markers_covariance_px2, R, t)
-    observed, covariance = np.ascontiguousarray(markers_px), np.ascontiguousarray(markers_covariance_px2)
-    _, residuals, J = _evaluated(observed, covariance, known, rig, centres_body, R, t)
-    return residuals, J, known
-
-
-def _known(markers_px: Array, markers_covariance_px2: Array, R: Array, t: Array) -> Mask:
-    """(n, 2, m) True for dots that were seen in frames with a pose."""
-    seen = np.asarray(np.isfinite(markers_px).all(-1) & np.isfinite(markers_covariance_px2).all((-1, -2)))
-    posed = np.asarray(np.isfinite(R).all((1, 2)) & np.isfinite(t).all(1))
-    return seen & posed[:, None, None]
-
-
-def _evaluated(
-    observed: Array, covariance: Array, used: Mask, rig: StereoRig, centres_body: Array, R: Array, t: Array
-) -> tuple[Array, Array, Array]:
-    """Pixels, whitened residuals and Jacobian as `_pose_kernel.fit` fills them, of poses that stay where they are."""
-    filled = np.empty(observed.shape), np.empty(observed.shape), np.empty((*observed.shape, 6))
+    filled = pixels, _, J = np.empty((*shape, 2)), np.empty((*shape, 2)), np.empty((*shape, 2, 6))
     poses = np.array(R, float), np.array(t, float), np.empty(len(R), bool)
-    centres, rows = np.ascontiguousarray(centres_body, float), np.arange(len(R))
-    kernel.fit(rows, observed, covariance, used, *stacked(rig), centres, -1.0, *poses, *filled)
-    return filled
+    kernel.fit(rows, *seen, stacked(rig), np.ascontiguousarray(centres_body, float), -1.0, *poses, filled)
+    return pixels, J
 
 
 def stacked(rig: StereoRig) -> tuple[Array, Array, Array]:
@@ -103,35 +150,29 @@ def whitening(covariance: Array) -> Array:
     return W
 
 
-def fit_poses(
-    markers_px: Array,
-    markers_covariance_px2: Array,
-    rig: StereoRig,
-    centres_body: Array,
-    R_start: Array,
-    t_start: Array,
-    *,
-    reject_outliers: bool = True,
-    with_sensitivity: bool = True,
-) -> PoseFits:
-    """Fit the poses of n frames at once.
+def fit_poses(seen: DotsInFrames, *, reject_outliers: bool = True, with_sensitivity: bool = True) -> PoseFits:
+    """Fit the poses of n frames at once, from those on that they have.
 
-    markers_px (n, 2, m, 2), NaN where a dot was not seen; markers_covariance_px2 (n, 2, m, 2, 2); centres_body (m, 3)
-    [m]; R_start (n, 3, 3), t_start (n, 3) a pose within a few pixels. A frame with fewer than three dot images, or
-    without a start, is NaN. One camera alone is enough for a pose; its covariance tells how much worse it is.
+    A frame with fewer than three dot images, or without a start, is NaN. One camera alone is enough for a pose; its
+    covariance tells how much worse it is. `seen.further` is not looked at.
     """
-    n = len(markers_px)
-    seen = np.asarray(np.isfinite(markers_px).all(-1))
-    used = _known(markers_px, markers_covariance_px2, R_start, t_start)
-    observed = np.where(seen[..., None], markers_px, 0.0)
-    covariance = np.ascontiguousarray(markers_covariance_px2, float)
-    R, t = np.array(R_start, float, order="C"), np.array(t_start, float, order="C")
+    n, rig = len(seen.t), seen.rig
+    there = np.asarray(np.isfinite(seen.pixels).all(-1))
+    posed = np.asarray(np.isfinite(seen.R).all((1, 2)) & np.isfinite(seen.t).all(1))
+    used = there & np.isfinite(seen.covariance).all((-1, -2)) & posed[:, None, None]
+    observed = np.where(there[..., None], seen.pixels, 0.0)
+    covariance = np.ascontiguousarray(seen.covariance, float)
+    R, t = np.array(seen.R, float, order="C"), np.array(seen.t, float, order="C")
     good = np.zeros(n, bool)
     pixels, whitened, JW = np.full(observed.shape, np.nan), np.zeros(observed.shape), np.zeros((*observed.shape, 6))
-    centres, cameras, filled = np.ascontiguousarray(centres_body, float), stacked(rig), (pixels, whitened, JW)
-    rows = np.flatnonzero(np.isfinite(R).all((1, 2)) & np.isfinite(t).all(1))
+    centres, cameras, filled = (
+        np.ascontiguousarray(seen.disc.marker_centres_body, float),
+        stacked(rig),
+        (pixels, whitened, JW),
+    )
+    rows = np.flatnonzero(posed)
     for _ in range(MAX_REJECTED + 1):
-        kernel.fit(rows, observed, covariance, used, *cameras, centres, TOLERANCE, R, t, good, *filled)
+        kernel.fit(rows, observed, covariance, used, cameras, centres, TOLERANCE, R, t, good, filled)
         rows = _strike_worst_dot(whitened, JW, used, rows) if reject_outliers else rows[:0]
         if rows.size == 0:
             break
@@ -154,7 +195,7 @@ def fit_poses(
         t_world_body=np.where(good[:, None], t, np.nan),
         covariance=pose_covariance,
         sensitivity=sensitivity,
-        residuals_px=np.where((seen & good[:, None, None])[..., None], observed - pixels, np.nan),
+        residuals_px=np.where((there & good[:, None, None])[..., None], observed - pixels, np.nan),
         used=used & good[:, None, None],
         chi_square=np.where(good, np.sum(whitened**2, axis=(1, 2, 3)), np.nan),
         degrees_of_freedom=np.where(good, 2 * used.sum((1, 2)) - 6, 0),

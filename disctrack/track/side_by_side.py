@@ -3,9 +3,18 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.kit.arrays import Mask
+
 AT_ONCE = 4096  # frames whose derivatives, many times as large, are held together
 SHARED_FRAMES = 400  # at most, for what all frames share: it repeats in more of them
 MIN_FRAMES = 20  # for what frames share, or how they scatter
+FEW = 4  # frames: as many as one after the other tell of a fault that lasts
+
+
+def stretches(chosen: Mask, shortest: int = 1) -> NDArray[np.intp]:
+    """(k, 2) first and one past the last of every run of so many of the frames chosen (n,), or more."""
+    edges = np.flatnonzero(np.diff(np.r_[False, chosen, False].astype(int))).reshape(-1, 2)
+    return np.asarray(edges[edges[:, 1] - edges[:, 0] >= shortest])
 
 
 def evenly(rows: NDArray[np.intp], most: int) -> NDArray[np.intp]:

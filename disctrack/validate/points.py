@@ -24,9 +24,8 @@ from disctrack.synthetic.description import Scene
 from disctrack.synthetic.motion import rolling_model, rolling_start, true_frame_rate
 from disctrack.synthetic.optics import smooth_field
 from disctrack.synthetic.recording import true_disc_of
-from disctrack.track.pose import fit_poses
+from disctrack.track.pose import DotsInFrames, fit_poses
 from disctrack.track.refine.assembly import Taken, trajectory_of
-from disctrack.track.refine.self_calibration import DotsInFrames
 from disctrack.trajectory import Trajectory
 
 Motion = Callable[[Array], Array]  # instants (k,) [s] -> coordinates q (k, 6)
@@ -107,7 +106,7 @@ def measured(
     dots = np.broadcast_to(sigma_px**2 * np.eye(2), (*pixels.shape, 2)).copy()
     q, declared = motion(times), scene.declared_disc
     seen = DotsInFrames(believed_rig, declared, pixels, dots, rotation_from_euler(*q[:, 3:].T), q[:, :3])
-    fits = fit_poses(pixels, dots, believed_rig, declared.marker_centres_body, seen.R, seen.t, reject_outliers=False)
+    fits = fit_poses(seen, reject_outliers=False)
     taken = Taken(range(n), np.arange(n) / declared_rate, declared_rate, scene.gravity_m_s2)
     good = np.zeros(pixels.shape[:-1], np.uint8)  # the status of frames, and of their dots
     found = trajectory_of(seen, fits, np.zeros((n, 6, 6)), good[:, 0, 0], good[:, 0, 0], good, taken)

@@ -10,7 +10,7 @@ from disctrack.faults.keys import Faults
 from disctrack.frames import rotation_from_quaternion
 from disctrack.rolling import CATALOGUE, Model
 from disctrack.synthetic.description import CameraSettings, MotionSettings, RollingMotion, Scene
-from disctrack.track.refine.self_calibration import DotsInFrames
+from disctrack.track.pose import DotsInFrames
 from disctrack.validate import points
 from disctrack.validate.points import SIGMA_PX, Laboratory
 

@@ -19,11 +19,9 @@ import numpy as np
 from calibration.cameras._projection import project_point
 from calibration.kit._cholesky import solve_in_place, substitute
 from calibration.kit.arrays import Array
-from calibration.kit.compiled import RULES, njit
 from calibration.kit.compiled import part as _part
+from disctrack.track._pose_kernel import _copy, _entry, fit_pose
 from disctrack.trajectory import MarkerStatus
-
-_entry = njit(cache=True, **RULES)  # called from Python
 
 MEASURED, OUTSIDE, LOW_CONTRAST, OCCLUDED, NOT_CONVERGED, BLURRED, _, NOT_LOOKED_FOR = map(int, MarkerStatus)
 
@@ -124,6 +122,7 @@ _NODES = 64  # at most, over the length of an ellipse
 # [rad] farther from the expected attitude a pair is looked at once more: 3e-3 move centres by 4e-4 to 1e-3 px, in every
 # frame alike where the prediction lags
 _ATTITUDE_TOLERANCE = 6e-4
+_FOLLOWED_PX = 0.05  # of a dot that the disc is followed by
 
 # numba takes a literal for double precision, and with it all that it touches
 _f = np.float32
@@ -133,22 +132,22 @@ _INV_SQRT_2PI = _f(1.0 / math.sqrt(2.0 * math.pi))
 # Abramowitz & Stegun 7.1.26: erfc(x) = (a1 t + ... + a5 t^5) exp(-x^2), t = 1 / (1 + p x), to 1.5e-7
 _T = _f(0.3275911 / math.sqrt(2.0))
 _ERFC = tuple(_f(0.5 * a) for a in (0.254829592, -0.284496736, 1.421413741, -1.453152027, 1.061405429))
-# exp(-z^2 / 2) = e^16, e = exp(-z^2 / 32) a polynomial: 6e-8 for |z| < 6
-_Z2_MAX, _PER_Z2 = _f(36.0), _f(1.0 / 32.0)
+# exp(-z^2 / 2) = e^16, e = exp(-z^2 / 32) a polynomial in z^2: 6e-8 for |z| < 6
+_Z2_MAX = _f(36.0)
 _EXP = tuple(
     _f(c)
-    for c in np.polynomial.Chebyshev.interpolate(lambda t: np.exp(-t), 6, domain=[0.0, 36.0 / 32.0])
+    for c in np.polynomial.Chebyshev.interpolate(lambda z2: np.exp(-z2 / 32.0), 6, domain=[0.0, 36.0])
     .convert(kind=np.polynomial.Polynomial)
     .coef
 )
 
 
 @_part
-def _plane_gradient(map_x, map_y, P, iu, iv, G):
+def _plane_gradient(map_x, map_y, P, iu, iv, unit, G):
     """Derivatives of the exact map at the pixel (iu, iv) by central differences; returns the determinant.
 
-    G (3, 2): rows 0 and 1 are d plane point / d pixel; row 2 is the relative change per 10 px of the length that a
-    pixel spans along the direction moved: -2 d log w, w the denominator of the projective map.
+    G (3, 2): rows 0 and 1 are d plane point / d pixel, in units; row 2 is the relative change per 10 px of the length
+    that a pixel spans along the direction moved: -2 d log w, w the denominator of the projective map.
     """
     w = P[2, 0] * map_x[iv, iu] + P[2, 1] * map_y[iv, iu] + P[2, 2]
     for axis in range(2):
@@ -158,7 +157,7 @@ def _plane_gradient(map_x, map_y, P, iu, iv, G):
         w1, w0 = P[2, 0] * x1 + P[2, 1] * y1 + P[2, 2], P[2, 0] * x0 + P[2, 1] * y0 + P[2, 2]
         for i in range(2):
             first, last = P[i, 0] * x0 + P[i, 1] * y0 + P[i, 2], P[i, 0] * x1 + P[i, 1] * y1 + P[i, 2]
-            G[i, axis] = 0.5 * (last / w1 - first / w0)
+            G[i, axis] = 0.5 / unit * (last / w1 - first / w0)
         G[2, axis] = 10.0 * (w1 - w0) / w
     return G[0, 0] * G[1, 1] - G[0, 1] * G[1, 0]
 
@@ -193,8 +192,7 @@ def _edge_distance(dx, dy, radius, g00, g01, g10, g11, det2):
 def _edge_profile(z):
     """Fraction of the dot seen z sigmas outside its edge, and the bell that is minus its slope; both to 5e-7."""
     z2 = min(z * z, _Z2_MAX)
-    e = z2 * _PER_Z2
-    e = _EXP[0] + e * (_EXP[1] + e * (_EXP[2] + e * (_EXP[3] + e * (_EXP[4] + e * (_EXP[5] + e * _EXP[6])))))
+    e = _EXP[0] + z2 * (_EXP[1] + z2 * (_EXP[2] + z2 * (_EXP[3] + z2 * (_EXP[4] + z2 * (_EXP[5] + z2 * _EXP[6])))))
     e *= e
     e *= e
     e *= e
@@ -205,60 +203,31 @@ def _edge_profile(z):
 
 
 @_part
-def _conic(G, gentlest, steepest, longest, shortest):
-    """The form (xx, xy, yy), 1 on the ellipse of these semi-axes along those of G^T G; singular values of G given."""
-    xx, yy = G[0, 0] * G[0, 0] + G[1, 0] * G[1, 0], G[0, 1] * G[0, 1] + G[1, 1] * G[1, 1]
-    xy = G[0, 0] * G[0, 1] + G[1, 0] * G[1, 1]
-    apart = steepest * steepest - gentlest * gentlest
-    along, across = 1.0 / (longest * longest), 1.0 / (shortest * shortest)
-    slope = (across - along) / apart if apart > 1e-9 * steepest * steepest else 0.0
-    level = across - slope * steepest * steepest
-    return slope * xx + level, slope * xy, slope * yy + level
-
-
-@_part
-def _select_pixels(image, map_x, map_y, P, start, window, rim, neighbours, G, unit, steepest, p, u0, v0, pixels):
+def _select_pixels(image, map_x, map_y, P, start, window, rim, neighbours, G, steepest, p, u0, v0, pixels):
     """Fill the first rows of pixels with those in a band round the edge; returns number, mean grey in and outside.
 
-    unit: plane units per pixel; steepest: the longest step that one pixel can mean on the plane, in those units.
+    steepest: the longest step that one pixel can mean on the plane, in radii of the dot.
     """
-    x_lo, x_hi, y_lo, y_hi = window
+    (x_lo, x_hi, y_lo, y_hi), unit = window, start[2]
     band = 3.0 * p[ROW.sigma] + 1.0
     shift_x, shift_y, radius = _f(p[ROW.a]), _f(p[ROW.b]), _f(p[ROW.radius])
     outer = p[ROW.radius] + band * steepest
-    # Of each row the pixels in an ellipse longer by the band than the dot's own, by the linear map: its scale changes
-    # over the window, and a pixel is one more in doubt. In it no branch decides anything, so that it is vector code.
-    doubt = 0.05 * math.hypot(x_hi - x_lo, y_hi - y_lo) * math.hypot(G[2, 0], G[2, 1])
-    gentlest = abs(G[0, 0] * G[1, 1] - G[0, 1] * G[1, 0]) / steepest
-    more = band + 1.0
-    xx, xy, yy = _conic(
-        G,
-        gentlest,
-        steepest,
-        p[ROW.radius] / gentlest * (1.0 + doubt) + more,
-        p[ROW.radius] / steepest * (1.0 + doubt) + more,
-    )
     x_from, y_from = start[0] / unit, start[1] / unit
     X0, X1, X2, Y0, Y1, Y2 = P[0, 0], P[0, 1], P[0, 2], P[1, 0], P[1, 1], P[1, 2]
     w0, w1, w2 = unit * P[2, 0], unit * P[2, 1], unit * P[2, 2]
-    n = 0  # pixels that are to be chosen from, in the rows of derivatives
+    width = x_hi + 1 - x_lo
+    n = width * (y_hi + 1 - y_lo)  # pixels that are to be chosen from, in the rows of derivatives
     for y in range(y_lo, y_hi + 1):
-        dy = y - v0
-        reach2 = (xy * xy - xx * yy) * dy * dy + xx
-        if reach2 < 0.0:
-            continue
-        middle, reach = u0 - xy / xx * dy, math.sqrt(reach2) / xx
-        lo, hi = max(int(math.ceil(middle - reach)), x_lo), min(int(middle + reach) + 1, x_hi + 1)
         # views, for an index that is a sum might be negative, and is looked at one by one
-        xs, ys, greys = map_x[y, lo:hi], map_y[y, lo:hi], image[y, lo:hi]
-        X_row, Y_row, grey_row = pixels[0, n:], pixels[1, n:], pixels[4, n:]
-        x_row, y_row = pixels[2, n:], pixels[3, n:]
-        for k in range(hi - lo):
+        xs, ys, greys = map_x[y, x_lo:], map_y[y, x_lo:], image[y, x_lo:]
+        first = (y - y_lo) * width
+        X_row, Y_row, grey_row = pixels[0, first:], pixels[1, first:], pixels[4, first:]
+        x_row, y_row = pixels[2, first:], pixels[3, first:]
+        for k in range(width):
             w = 1.0 / (w0 * xs[k] + w1 * ys[k] + w2)
             X_row[k] = (X0 * xs[k] + X1 * ys[k] + X2) * w - x_from
             Y_row[k] = (Y0 * xs[k] + Y1 * ys[k] + Y2) * w - y_from
-            x_row[k], y_row[k], grey_row[k] = 0.1 * (lo + k - u0), 0.1 * (y - v0), greys[k]
-        n += max(hi - lo, 0)
+            x_row[k], y_row[k], grey_row[k] = 0.1 * (x_lo + k - u0), 0.1 * (y - v0), greys[k]
     # which of the dot's surroundings can come near any pixel at all
     reach = unit * (outer + math.hypot(p[ROW.a], p[ROW.b]))
     blur = p[ROW.sigma] * steepest * unit
@@ -358,7 +327,7 @@ def _whitened_model(pixels, n, p, G, det, clip):
 
 
 @_part
-def _ellipse_of(map_x, map_y, P, G, det, start, radius, reach, u0, v0, unit):
+def _ellipse_of(map_x, map_y, P, G, det, start, reach, u0, v0):
     """The image of a dot as an ellipse about its own centroid, to second order of the map.
 
     reach: pixels over which the map's second derivatives are taken.
@@ -375,7 +344,7 @@ def _ellipse_of(map_x, map_y, P, G, det, start, radius, reach, u0, v0, unit):
     for du in range(-1, 2):
         for dv in range(-1, 2):
             x, y = map_x[iv + reach * dv, iu + reach * du], map_y[iv + reach * dv, iu + reach * du]
-            w = unit * (P[2, 0] * x + P[2, 1] * y + P[2, 2])
+            w = start[2] * (P[2, 0] * x + P[2, 1] * y + P[2, 2])
             a, b = (P[0, 0] * x + P[0, 1] * y + P[0, 2]) / w, (P[1, 0] * x + P[1, 1] * y + P[1, 2]) / w
             uu, vv, uv = (1.0 if du != 0 else -2.0), (1.0 if dv != 0 else -2.0), 0.25 * du * dv
             uu, vv = (uu if dv == 0 else 0.0), (vv if du == 0 else 0.0)
@@ -385,11 +354,10 @@ def _ellipse_of(map_x, map_y, P, G, det, start, radius, reach, u0, v0, unit):
     s_uu, t_uu = scale * (i00 * uu_x + i01 * uu_y), scale * (i10 * uu_x + i11 * uu_y)
     s_vv, t_vv = scale * (i00 * vv_x + i01 * vv_y), scale * (i10 * vv_x + i11 * vv_y)
     s_uv, t_uv = scale * (i00 * uv_x + i01 * uv_y), scale * (i10 * uv_x + i11 * uv_y)
-    # the dot's points x = x0 + s(x0): their mean is <s> + <x0 div s>, with the ellipse's second moments r^2 c / 4
-    quarter = 0.25 * radius * radius
+    # the dot's points x = x0 + s(x0): their mean is <s> + <x0 div s>, with the ellipse's second moments c / 4
     div_u, div_v = s_uu + t_uv, s_uv + t_vv
-    shift_u = quarter * (0.5 * (s_uu * c00 + s_vv * c11) + s_uv * c01 + c00 * div_u + c01 * div_v)
-    shift_v = quarter * (0.5 * (t_uu * c00 + t_vv * c11) + t_uv * c01 + c01 * div_u + c11 * div_v)
+    shift_u = 0.25 * (0.5 * (s_uu * c00 + s_vv * c11) + s_uv * c01 + c00 * div_u + c01 * div_v)
+    shift_v = 0.25 * (0.5 * (t_uu * c00 + t_vv * c11) + t_uv * c01 + c01 * div_u + c11 * div_v)
     return Ellipse(start[3] - u0 + shift_u, start[4] - v0 + shift_v, i00, i01, i10, i11, math.cos(angle),
                    math.sin(angle), longer, 1.0 / (abs(det) * longer))  # fmt: skip
 
@@ -450,7 +418,7 @@ def _whitened_ellipse(pixels, n, p, ellipse, nodes, clip):
 
 
 @_part
-def _descend(pixels, n, p, G, det, px_per_unit, radius, clip, work, blurred, ellipse, nodes):
+def _descend(pixels, n, p, G, det, px_per_unit, clip, work, blurred, ellipse, nodes):
     """Levenberg-Marquardt on the eight template parameters; returns converged, chi-square, clipped.
 
     blurred: take the whole ellipse, with the expected radius as a prior, and not one edge at a time.
@@ -466,7 +434,7 @@ def _descend(pixels, n, p, G, det, px_per_unit, radius, clip, work, blurred, ell
     for _ in range(_MAX_ITERATIONS + 1):
         if blurred:
             chi2, n_clipped = _whitened_ellipse(pixels, n, p, ellipse, nodes, clip)
-            chi2 += ((p[ROW.radius] / radius - 1.0) / _RADIUS_PRIOR) ** 2
+            chi2 += ((p[ROW.radius] - 1.0) / _RADIUS_PRIOR) ** 2
         else:
             chi2, n_clipped = _whitened_model(pixels, n, p, G, det, clip)
         if converged:
@@ -500,21 +468,21 @@ def _descend(pixels, n, p, G, det, px_per_unit, radius, clip, work, blurred, ell
                 b += next_row[i] * residual[i]
             rhs[j], rhs[j + 1] = a, b
         if blurred:
-            M[ROW.radius, ROW.radius] += 1.0 / (_RADIUS_PRIOR * radius) ** 2
-            rhs[ROW.radius] += (radius - p[ROW.radius]) / (_RADIUS_PRIOR * radius) ** 2
+            M[ROW.radius, ROW.radius] += _RADIUS_PRIOR**-2
+            rhs[ROW.radius] += (1.0 - p[ROW.radius]) * _RADIUS_PRIOR**-2
         for i in range(8):
             previous[i], step[i] = p[i], rhs[i]
             M[i, i] *= 1.0 + damping
         if not solve_in_place(M, step):
             return False, chi2, n_clipped
         length = math.hypot(step[ROW.a], step[ROW.b])
-        scale = min(1.0, 0.4 * radius / max(length, 1e-30))
+        scale = min(1.0, 0.4 / max(length, 1e-30))
         gain = 0.0
         for i in range(8):
             p[i] += scale * step[i]
             gain += step[i] * rhs[i]
         p[ROW.sigma] = min(max(p[ROW.sigma], 0.4 * previous[ROW.sigma], 0.2), 2.0 * previous[ROW.sigma])
-        if not (0.5 * radius < p[ROW.radius] < 1.6 * radius and p[ROW.sigma] < 20.0):
+        if not (0.5 < p[ROW.radius] < 1.6 and p[ROW.sigma] < 20.0):
             return False, chi2, n_clipped
         length *= px_per_unit
         contraction = min(length / before, 1.0) if before < np.inf else 1.0
@@ -541,34 +509,27 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, neighbours, pixel
     height, width = image.shape
     G = np.empty((3, 2))
     nodes = np.empty((3, _NODES), np.float32)
-    u0, v0, radius, unit = start[3], start[4], start[2], 0.0
+    u0, v0, unit = start[3], start[4], start[2]  # all lengths on the plane are in radii of the dot
     for i in range(8):
         p[i] = 0.0
-    p[ROW.sigma] = sigma
+    p[ROW.radius], p[ROW.sigma] = 1.0, sigma
+    ellipse = Ellipse(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     n, n_clipped, det, chi2, largest, light, settled = 0, 0.0, 0.0, 0.0, 0.0, 1.0, False
     for selection in range(_MAX_SELECTIONS):
         if not (2.0 < u0 < width - 3.0 and 2.0 < v0 < height - 3.0):
             return OUTSIDE
-        det = _plane_gradient(map_x, map_y, P, int(u0 + 0.5), int(v0 + 0.5), G)
-        if selection == 0:
-            unit = math.sqrt(abs(det)) if det != 0.0 else 1.0
-            radius /= unit
-            p[ROW.radius] = radius
-        for i in range(2):
-            for j in range(2):
-                G[i, j] /= unit
-        det /= unit * unit
+        det = _plane_gradient(map_x, map_y, P, int(u0 + 0.5), int(v0 + 0.5), unit, G)
         norm2 = G[0, 0] * G[0, 0] + G[0, 1] * G[0, 1] + G[1, 0] * G[1, 0] + G[1, 1] * G[1, 1]
         largest = math.sqrt(0.5 * (norm2 + math.sqrt(max(norm2 * norm2 - 4 * det * det, 0.0))))
         if not abs(det) > 1e-9 * norm2:
             return BLURRED
         blur = max(p[ROW.sigma], 1.0)
-        if radius / largest < blur:  # even that template fails: nothing but a blot is left
+        if 1.0 / largest < blur:  # even that template fails: nothing but a blot is left
             return BLURRED
-        blurred = radius / largest < _MIN_SEMI_MINOR * blur
+        blurred = 1.0 / largest < _MIN_SEMI_MINOR * blur
         band = 3.0 * p[ROW.sigma] + 1.0
-        extent_x = radius * math.hypot(G[0, 1], G[1, 1]) / abs(det) + band
-        extent_y = radius * math.hypot(G[0, 0], G[1, 0]) / abs(det) + band
+        extent_x = math.hypot(G[0, 1], G[1, 1]) / abs(det) + band
+        extent_y = math.hypot(G[0, 0], G[1, 0]) / abs(det) + band
         window = (
             int(math.floor(u0 - extent_x)),
             int(math.ceil(u0 + extent_x)),
@@ -581,10 +542,11 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, neighbours, pixel
         if room > pixels.shape[1]:
             pixels = np.empty((16, room), np.float32)
         n, inside, outside = _select_pixels(
-            image, map_x, map_y, P, start, window, rim, neighbours, G, unit, largest, p, u0, v0, pixels
+            image, map_x, map_y, P, start, window, rim, neighbours, G, largest, p, u0, v0, pixels
         )
-        reach = max(1, int(0.5 * min(extent_x, extent_y)))
-        ellipse = _ellipse_of(map_x, map_y, P, G, det, start, radius, reach, u0, v0, unit)
+        if blurred:
+            reach = max(1, int(0.5 * min(extent_x, extent_y)))
+            ellipse = _ellipse_of(map_x, map_y, P, G, det, start, reach, u0, v0)
         if not (n >= 30 and math.isfinite(inside) and math.isfinite(outside)):
             return OCCLUDED
         if selection == 0:
@@ -607,7 +569,7 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, neighbours, pixel
         limit = np.inf
         while True:  # once, and again without the pixels that do not belong
             converged, chi2, n_clipped = _descend(
-                pixels, n, p, G, det, largest / abs(det), radius, limit, work, blurred, ellipse, nodes
+                pixels, n, p, G, det, largest / abs(det), limit, work, blurred, ellipse, nodes
             )
             if not converged:
                 return NOT_CONVERGED
@@ -618,7 +580,7 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, neighbours, pixel
             moved_v = start[4] + (G[0, 0] * p[ROW.b] - G[1, 0] * p[ROW.a]) / det - v0
             u0, v0 = u0 + moved_u, v0 + moved_v
             settled = math.hypot(moved_u, moved_v) < _SETTLED_PX
-            if not blurred and radius / largest < _MIN_SEMI_MINOR * p[ROW.sigma]:
+            if not blurred and 1.0 / largest < _MIN_SEMI_MINOR * p[ROW.sigma]:
                 settled = False  # more blurred than expected: once more, by the other template
             if not settled and selection < _MAX_SELECTIONS - 1:
                 break
@@ -703,14 +665,10 @@ def _look(images, readable, views, face, expected, R, t, pixels, work, results, 
             if facing <= 0.0:  # the camera sees the other face
                 status[c, i] = OCCLUDED
                 continue
-            for k in range(3):  # P = M^-1 by cofactors
+            for k in range(3):  # P = M^-1 by cofactors, but for a factor, which says nothing of places on a plane
                 for j in range(3):
                     a, b, d, e = (j + 1) % 3, (j + 2) % 3, (k + 1) % 3, (k + 2) % 3
                     P[k, j] = M[a, d] * M[b, e] - M[a, e] * M[b, d]
-            det = M[0, 0] * P[0, 0] + M[0, 1] * P[1, 0] + M[0, 2] * P[2, 0]
-            for k in range(3):
-                for j in range(3):
-                    P[k, j] /= det
             start[0], start[1], start[2] = x, y, radius
             start[3], start[4] = project_point(views.cameras[c], point[0], point[1], point[2], J)
             for k in range(m - 1):
@@ -723,102 +681,6 @@ def _look(images, readable, views, face, expected, R, t, pixels, work, results, 
                     point[k] += R_cb[k, 0] * p[ROW.a] + R_cb[k, 1] * p[ROW.b]
                 result.u, result.v = project_point(views.cameras[c], point[0], point[1], point[2], J)
                 status[c, i] = _judge_dot(result, radius, expected.sigma[c], expected.noise[c], expected.limits)
-
-
-@_part
-def _rotate_from_left(v, R, out):
-    """Out = exp([v]x) R by Rodrigues' formula."""
-    angle2 = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
-    angle = math.sqrt(angle2)
-    if angle < 1e-6:
-        a, b = 1.0, 0.5
-    else:
-        a, b = math.sin(angle) / angle, (1.0 - math.cos(angle)) / angle2
-    for j in range(3):
-        x, y, z = R[0, j], R[1, j], R[2, j]
-        cx, cy, cz = v[1] * z - v[2] * y, v[2] * x - v[0] * z, v[0] * y - v[1] * x
-        out[0, j] = x + a * cx + b * (v[1] * cz - v[2] * cy)
-        out[1, j] = y + a * cy + b * (v[2] * cx - v[0] * cz)
-        out[2, j] = z + a * cz + b * (v[0] * cy - v[1] * cx)
-
-
-@_part
-def _orthonormalise(R):
-    """Gram-Schmidt on the rows; without it R R_before^T R would treble any departure in every frame."""
-    for i in range(2):
-        for k in range(i):
-            dot = R[i, 0] * R[k, 0] + R[i, 1] * R[k, 1] + R[i, 2] * R[k, 2]
-            for j in range(3):
-                R[i, j] -= dot * R[k, j]
-        length = math.sqrt(R[i, 0] * R[i, 0] + R[i, 1] * R[i, 1] + R[i, 2] * R[i, 2])
-        for j in range(3):
-            R[i, j] /= length
-    R[2, 0] = R[0, 1] * R[1, 2] - R[0, 2] * R[1, 1]
-    R[2, 1] = R[0, 2] * R[1, 0] - R[0, 0] * R[1, 2]
-    R[2, 2] = R[0, 0] * R[1, 1] - R[0, 1] * R[1, 0]
-
-
-@_part
-def _dot_by_pose(camera, R_cw, t_cw, centre, R, t, J, rows):
-    """Image u, v and depth of a dot at `centre` (3,) on the disc; fills rows (2, 6), d (u, v) / d pose, and J (2, 3).
-
-    The pose is a translation and a rotation vector in world axes. The rows mean nothing behind the camera.
-    """
-    a0 = R[0, 0] * centre[0] + R[0, 1] * centre[1] + R[0, 2] * centre[2]
-    a1 = R[1, 0] * centre[0] + R[1, 1] * centre[1] + R[1, 2] * centre[2]
-    a2 = R[2, 0] * centre[0] + R[2, 1] * centre[1] + R[2, 2] * centre[2]
-    x, y, z = a0 + t[0], a1 + t[1], a2 + t[2]
-    p0 = t_cw[0] + R_cw[0, 0] * x + R_cw[0, 1] * y + R_cw[0, 2] * z
-    p1 = t_cw[1] + R_cw[1, 0] * x + R_cw[1, 1] * y + R_cw[1, 2] * z
-    depth = t_cw[2] + R_cw[2, 0] * x + R_cw[2, 1] * y + R_cw[2, 2] * z
-    u, v = project_point(camera, p0, p1, depth if depth > 0.0 else np.nan, J)
-    for axis in range(2):
-        row = rows[axis]
-        for i in range(3):
-            row[i] = J[axis, 0] * R_cw[0, i] + J[axis, 1] * R_cw[1, i] + J[axis, 2] * R_cw[2, i]
-        row[3] = a1 * row[2] - a2 * row[1]
-        row[4] = a2 * row[0] - a0 * row[2]
-        row[5] = a0 * row[1] - a1 * row[0]
-    return u, v, depth
-
-
-@_part
-def _pose_step(results, status, views, centres, R, t, step):
-    """One Gauss-Newton step (translation, world rotation vector) of the disc's pose from the dots of one pair.
-
-    Huber weights keep one wrong dot from pulling the prediction away. Returns the rms residual before the step [px],
-    or -1 where fewer than three dots or a singular system leave nothing to solve.
-    """
-    M, J, rows = np.empty((6, 6)), np.empty((2, 3)), np.empty((2, 6))
-    for i in range(6):
-        step[i] = 0.0
-        for j in range(6):
-            M[i, j] = 0.0
-    total, count = 0.0, 0
-    for c in range(2):
-        for m in range(centres.shape[0]):
-            if status[c, m] != MEASURED:
-                continue
-            u, v, depth = _dot_by_pose(views.cameras[c], views.R_cw[c], views.t_cw[c], centres[m], R, t, J, rows)
-            if depth <= 0.0:
-                return -1.0
-            du, dv = results[c, m].u - u, results[c, m].v - v
-            distance = math.hypot(du, dv)
-            total += distance * distance
-            count += 1
-            # 0.05 px is added: a prediction need not follow the noise of the best dots
-            w = 1.0 / (results[c, m].var_u + results[c, m].var_v + 0.0025)
-            if distance > 1.0:
-                w /= distance
-            for axis in range(2):
-                r, row = du if axis == 0 else dv, rows[axis]
-                for i in range(6):
-                    step[i] += w * row[i] * r
-                    for j in range(i + 1):
-                        M[i, j] += w * row[i] * row[j]
-    if count < 3 or not solve_in_place(M, step):
-        return -1.0
-    return math.sqrt(total / count)
 
 
 @_part
@@ -849,30 +711,40 @@ def _turn_on(to, since, R):
 
 
 @_part
-def _copy(out, values):
-    """Copy a matrix."""
-    for i in range(values.shape[0]):
-        for j in range(values.shape[1]):
-            out[i, j] = values[i, j]
+def _orthonormalise(R, work):
+    """One Newton step to R (3 - R^T R) / 2; without it R R_before^T R would treble any departure in every frame."""
+    _copy(work, R)
+    _turn_on(R, R, work)
+    for i in range(3):
+        for j in range(3):
+            R[i, j] = 1.5 * R[i, j] - 0.5 * work[i, j]
 
 
 @_part
-def _settle(results, status, views, centres, R, t):
-    """Move the pose R, t onto the dots of one pair; returns the rms residual [px], negative without an answer."""
-    step, R_new = np.empty(6), np.empty((3, 3))
-    rms = -1.0
-    for _ in range(5):
-        rms = _pose_step(results, status, views, centres, R, t, step)
-        if rms < 0.0:
-            return rms
-        for i in range(3):
-            t[i] += step[i]
-        _rotate_from_left(step[3:], R, R_new)
-        _copy(R, R_new)
-        if abs(step[0]) + abs(step[1]) + abs(step[2]) < 1e-6:  # a micrometre: a prediction needs no more
-            break
-    _orthonormalise(R)
-    return rms
+def _settle(results, status, views, centres, R, t, dots, filled):
+    """Move the pose R, t onto the dots of one pair; returns the rms residual [px], negative without an answer.
+
+    A prediction need not follow the noise of the best dots, nor, beyond a pixel, a wrong one.
+    """
+    observed, covariance, used = dots
+    count = 0
+    for c in range(2):
+        for m in range(centres.shape[0]):
+            observed[c, m, 0], observed[c, m, 1] = results[c, m].u, results[c, m].v
+            used[c, m] = status[c, m] == MEASURED
+            count += used[c, m]
+            for axis in range(2):
+                covariance[c, m, axis, axis] = results[c, m].var_u + results[c, m].var_v + _FOLLOWED_PX * _FOLLOWED_PX
+    cameras = views.cameras, views.R_cw, views.t_cw
+    if count < 3 or not fit_pose(observed, covariance, used, cameras, centres, 0.1, 1.0, R, t, filled):
+        return -1.0
+    total = 0.0
+    for c in range(2):
+        for m in range(centres.shape[0]):
+            if used[c, m]:
+                du, dv = observed[c, m, 0] - filled[0][c, m, 0], observed[c, m, 1] - filled[0][c, m, 1]
+                total += du * du + dv * dv
+    return math.sqrt(total / count)
 
 
 @_entry
@@ -885,14 +757,16 @@ def track_frames(images, readable, views, face, expected, heading, results, stat
     """
     (R_last, t_last), (R_before, t_before), (R_older, t_older) = heading
     pixels, work = np.empty((16, _PIXELS), np.float32), (np.empty((8, 8)), np.empty(8), np.empty(8), np.empty(8))
-    R, t, R_expected = np.empty((3, 3)), np.empty(3), np.empty((3, 3))
+    R, t, R_expected, shape = np.empty((3, 3)), np.empty(3), np.empty((3, 3)), (2, face.centres.shape[0])
+    dots = np.empty((*shape, 2)), np.zeros((*shape, 2, 2)), np.empty(shape, np.bool_)
+    filled = np.empty((*shape, 2)), np.empty((*shape, 2)), np.empty((*shape, 2, 6))
     for f in range(images.shape[0]):
         _predict(R_last, R_before, R_older, t_last, t_before, t_older, R, t)
         rms = -1.0
         for _ in range(3):
             _copy(R_expected, R)
             _look(images[f], readable[f], views, face, expected, R, t, pixels, work, results[f], status[f])
-            rms = _settle(results[f], status[f], views, face.centres, R, t)
+            rms = _settle(results[f], status[f], views, face.centres, R, t, dots, filled)
             turned = 0.0
             for i in range(3):
                 for j in range(3):
@@ -901,6 +775,7 @@ def track_frames(images, readable, views, face, expected, heading, results, stat
                 break
         if not 0.0 <= rms < max_rms:
             return f
+        _orthonormalise(R, R_expected)
         _copy(R_older, R_before)
         _copy(R_before, R_last)
         _copy(R_last, R)

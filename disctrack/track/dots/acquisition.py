@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 from calibration.cameras.camera import StereoRig, normalise, triangulate
 from calibration.kit.arrays import Array
 from calibration.kit.grey_levels import level_step
+from disctrack.analyse.declaration import SIDE_TOLERANCE
 from disctrack.disc import Disc
 from disctrack.frames import CAMERAS, euler_from_rotation, rotation_from_vector
-from disctrack.track.pose import fit_poses, marker_pixels
+from disctrack.track.pose import DotsInFrames, fit_poses, marker_pixels
 
 MAX_BLOBS = 24
 EPIPOLAR_PX = 4.0  # centroids of blobs err by up to 1 px under glare, the rig by little
-SIDE_TOLERANCE = 0.06  # of the distance between two dots: centroids err by 0.3 px, that is 0.1 mm of 13-52 mm
 INLIER_DIAMETERS = 0.35  # a blob belongs to a dot if it lies within this part of a dot's diameter
 MIN_EXPLAINED = 4
 BLOB_PX = 0.5  # standard deviation of a blob's centroid under uneven light
@@ -253,9 +253,8 @@ def _best_explanation(
                 facing = np.einsum("ni,ni->n", R[:, :, 2], eyes[camera] - t) > disc.half_thickness
                 ok = (gap.min(axis=2) < INLIER_DIAMETERS * diameters[camera]) & facing[:, None]
                 matched[:, camera] = np.where(ok[..., None], points[gap.argmin(axis=2)], np.nan)
-        fits = fit_poses(
-            matched, covariance, rig, disc.marker_centres_body, R, t, reject_outliers=False, with_sensitivity=False
-        )
+        seen = DotsInFrames(rig, disc, matched, covariance, R, t)
+        fits = fit_poses(seen, reject_outliers=False, with_sensitivity=False)
         R = np.where(fits.converged[:, None, None], fits.R_world_body, R)
         t = np.where(fits.converged[:, None], fits.t_world_body, t)
     explained = np.isfinite(matched).all(-1).sum((1, 2))

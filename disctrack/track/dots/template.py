@@ -111,9 +111,14 @@ def measure_noise(
     radius = 0.5 * disc.marker_diameter
     flat = max(4.0 * blur_px, 2.5)  # [px] from the edge: beyond, the blur's tail is below 1e-4 of the contrast
     for image, (R, t) in zip(images, poses_camera_body, strict=True):
-        for centre, (x0, x1, y0, y1) in _dot_windows(camera, R, t, disc, image.shape, flat + 5.0):
+        for centre in disc.marker_centres_body:
+            place = R @ centre + t
+            (u, v), reach = project(place[None], camera)[0], camera.fx * radius / place[2] + flat + 5.0
+            if not (reach <= u < image.shape[1] - reach and reach <= v < image.shape[0] - reach):
+                continue
+            window = slice(int(v - reach), int(v + reach) + 2), slice(int(u - reach), int(u + reach) + 2)
             M = np.column_stack([R[:, 0], R[:, 1], R[:, 2] * centre[2] + t])
-            xn, yn = maps[0][y0:y1, x0:x1], maps[1][y0:y1, x0:x1]
+            xn, yn = maps[0][window], maps[1][window]
             plane = np.einsum("ij,jvu->ivu", np.linalg.inv(M), np.stack([xn, yn, np.ones_like(xn)]))
             rho = np.hypot(plane[0] / plane[2] - centre[0], plane[1] / plane[2] - centre[1])
             step = np.hypot(*np.gradient(rho))  # plane units per pixel
@@ -123,7 +128,7 @@ def measure_noise(
                 if len(v) < 20:
                     continue
                 A = np.column_stack([np.ones(len(v)), u - u.mean(), v - v.mean()])
-                grey = image[y0:y1, x0:x1][part].astype(float)
+                grey = image[window][part].astype(float)
                 residual = grey - A @ np.linalg.lstsq(A, grey, rcond=None)[0]
                 means.append(grey.mean())
                 variances.append(residual @ residual / (len(v) - 3))
@@ -163,20 +168,3 @@ def no_more_than_left(flat: NoiseModel, assumed: NoiseModel, results: NDArray) -
     if left > LESS_THAN_FLAT:  # within the scatter of both
         return flat
     return replace(flat, read=flat.read * left, gain=flat.gain * left)
-
-
-def _dot_windows(
-    camera: Camera, R: Array, t: Array, disc: Disc, shape: tuple[int, ...], margin: float
-) -> list[tuple[Array, tuple[int, int, int, int]]]:
-    result = []
-    angle = np.radians(np.arange(0, 360, 15))
-    ring = 0.5 * disc.marker_diameter * np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
-    for centre in disc.marker_centres_body:
-        outline = project((centre + ring) @ R.T + t, camera)
-        if not np.isfinite(outline).all():
-            continue
-        (x0, y0), (x1, y1) = np.floor(outline.min(0) - margin), np.ceil(outline.max(0) + margin) + 1
-        if x0 < 0 or y0 < 0 or x1 > shape[1] or y1 > shape[0]:
-            continue
-        result.append((centre, (int(x0), int(x1), int(y0), int(y1))))
-    return result

@@ -17,7 +17,6 @@ import scipy
 from calibration.kit.arrays import Array
 from disctrack.track.dots.template import TYPICAL_BLUR_PX, NoiseModel
 
-BAND = 3.0  # blurs
 ACROSS, AROUND = 60, 32  # nodes of an edge
 SIZES, SHAPES = 5, np.geomspace(0.2, 1.0, 13)  # of dots (short over long axis) between which the pull is interpolated
 
@@ -92,7 +91,7 @@ def _response(sizes: Array, edge: Edge, changes: Changes) -> Array:
     centre.
     """
     sigma, level, contrast, noise = edge
-    d = np.linspace(-(BAND * sigma + 2.0), BAND * sigma + 1.0, ACROSS)  # as `_kernels` selects its pixels
+    d = np.linspace(-3.0 * sigma - 2.0, 3.0 * sigma + 1.0, ACROSS)  # as `_kernels` selects its pixels
     seen = 0.5 * np.array([math.erfc(x) for x in d / (np.sqrt(2.0) * sigma)])
     grey = 1.0 - contrast * seen
     first = contrast * np.exp(-0.5 * (d / sigma) ** 2) / (np.sqrt(2.0 * np.pi) * sigma)

@@ -36,10 +36,11 @@ from disctrack.trajectory import FrameStatus, MarkerStatus
 
 # A pair whose dots disagree by more than this with any rigid motion is lost: a tenth of a dot, ten times a poor rig
 MAX_PREDICTION_RMS_PX = 2.0
-NOISE_FRAMES, NOISE_STEP = 12, 3  # frames that blur is taken from, and every third of them for the noise
+NOISE_FRAMES = 12  # that blur is taken from, and every third of them for the noise
 MIN_TO_BEGIN = 5  # dot images that must be measured where the disc is found anew: three fit anything
-MOST_CARRIED = 60  # frames over which the last motion is carried on; each costs one look at the dots
-LONGEST_WAIT = 60  # frames between searches of a scene in which no disc was seen yet: one costs as much as some 600
+# Frames over which the last motion is carried on, each of which costs one look at the dots; and between searches of a
+# scene in which no disc was seen yet: one costs as much as some 600
+PATIENCE = 60
 UNUSUAL = 2.0  # times the usual misfit; of dots in compressed video, one in twenty leaves 1.25 times the median
 MOST_USUAL = 0.1  # of the contrast: dots that leave more than this are not the declared ones
 REPEAT_REACH = 4  # frames back that an image is compared with: recorders repeat from buffers of a few
@@ -97,7 +98,7 @@ class Search:
         """
         if self.since < self.failures:
             return False
-        if seen or not self.scenes or self.since >= min(2**self.failures, LONGEST_WAIT) or not readable.all():
+        if seen or not self.scenes or self.since >= min(2**self.failures, PATIENCE) or not readable.all():
             return True
         return any(map(StillScene.differs, self.scenes, pair))
 
@@ -268,7 +269,7 @@ def recover(follower: Follower, images: Image, readable: Mask) -> bool:
     First its last motion is carried on, with no acceleration, which one bad pose would have spoilt: that costs no more
     than any other frame; then, now and then, it is searched for in the whole images.
     """
-    if follower.heading is not None and follower.lost is not None and follower.lost <= MOST_CARRIED:
+    if follower.heading is not None and follower.lost is not None and follower.lost <= PATIENCE:
         carried = follower.heading.carried_on(follower.lost)
         if _holds(follower, carried, images, readable):
             follower.heading = carried
@@ -397,7 +398,7 @@ def _measure_blur_and_noise(follower: Follower, images: Image, readable: Mask, p
             edges[camera] = Edge(blur, level, contrast, edges[camera].noise)
             misfit = max(misfit, float(np.sqrt(np.median(fits["chi_square"]))))
             if blur_known:
-                flat = flat_noise(camera, range(0, done, NOISE_STEP), trial.R, trial.t)
+                flat = flat_noise(camera, range(0, done, 3), trial.R, trial.t)
                 noise = no_more_than_left(flat, edges[camera].noise, fits)
                 edges[camera] = edges[camera]._replace(noise=noise)
                 follower.saturated[camera] = _saturated(images[:done, camera], fits, noise)

@@ -18,7 +18,7 @@ from disctrack.errors import ArgumentError
 from disctrack.track.dots.template import dot_centres
 from disctrack.track.follow.following import Follower, Tables, TrackingSetup, empty_tables, follow_block
 from disctrack.track.follow.tracking import check_images
-from disctrack.track.pose import fit_poses
+from disctrack.track.pose import DotsInFrames, fit_poses
 from disctrack.track.refine.assembly import status_of
 from disctrack.trajectory import FrameStatus, coordinate_sigma
 
@@ -107,8 +107,8 @@ class Tracker:
         if followed[0] != FrameStatus.MEASURED:
             self._angles, rows = None, empty_tables(1, self.disc.n_markers)
         dots = dot_centres(rows.results, rows.status)
-        centres = self.disc.marker_centres_body
-        fit = fit_poses(dots.pixels, dots.covariance_px2, self.rig, centres, rows.R, rows.t, with_sensitivity=False)
+        seen = DotsInFrames(self.rig, self.disc, dots.pixels, dots.covariance_px2, rows.R, rows.t)
+        fit = fit_poses(seen, with_sensitivity=False)
         angles = np.full(3, np.nan)
         if fit.converged[0]:
             angles = frames.euler_from_rotation(fit.R_world_body[0])

@@ -21,8 +21,7 @@ from disctrack.track.dots.template import photon_transfer
 
 Pair = tuple[NDArray, NDArray]
 
-STRIDE = 16  # frames between two looks; irregular by JITTER, so that no turn of the disc comes back to every look
-JITTER = 5
+STRIDE = 16  # frames between two looks; irregular by up to 5, so that no turn of the disc comes back to every look
 MARGIN = 0.25  # [s] kept before the last frame at rest: a disc that tips over starts below what can be seen
 THRESHOLD = 5.0  # sigmas; of 65 000 pixels 0.04 exceed it by chance
 MIN_PIXELS = 12  # of a quarter of the image's pixels: fewer are hot pixels or an insect
@@ -125,7 +124,7 @@ def _last_still(left: FrameReader, right: FrameReader, frames: range) -> tuple[i
 def _looks(frames: range) -> Iterator[int]:
     """Frames to look at: two neighbours, one in STRIDE, and the last."""
     yield from frames[:2]
-    for offset in (STRIDE * i + 5 * i * i % (2 * JITTER + 1) - JITTER for i in range(1, len(frames) // STRIDE + 1)):
+    for offset in (STRIDE * i + 5 * i * i % 11 - 5 for i in range(1, len(frames) // STRIDE + 1)):
         if offset < len(frames) - 1:
             yield frames[offset]
     yield frames[-1]

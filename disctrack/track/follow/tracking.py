@@ -249,24 +249,19 @@ def _as_one_sensor(read_blocks: ReadBlocks, pairs: range) -> tuple[ReadBlocks, l
     """Blocks without a colour filter's pattern and pixels that do not see, and both as findings."""
     # from all over the recording: within a millisecond a disc moves by less than a pixel, and edges look stuck, too
     images = _some(read_blocks, pairs)
-    sensors = []
-    told: list[Finding] = []
+    sensors, said = [], []
     for camera, name in enumerate(frames.CAMERAS):
         pattern = mosaic_gains(images[:, camera])
         if pattern is not None:
             images[:, camera] = _without_mosaic(images[:, camera], pattern)
-            text = (
-                f"{name} camera: a colour filter lies on the sensor (gains of neighbouring pixels "
-                f"{' '.join(f'{gain:.2f}' for gain in pattern.ravel())}): they are divided by it, which is right for "
-                "grey discs only; a monochrome camera sees more"
-            )
-            told.append(Finding(Kind.SENSOR, Severity.WARNING, text, Subject("track", name)))
+            gains = " ".join(f"{gain:.2f}" for gain in pattern.ravel())
+            what = "they are divided by it, which is right for grey discs only; a monochrome camera sees more"
+            said.append((name, f"a colour filter lies on the sensor (gains of neighbouring pixels {gains}): {what}"))
         mask = stuck_pixels(images[:, camera])
         if mask is not None:
-            text = f"{name} camera: {int(mask.sum())} pixels show one value whatever passes; their neighbours stand in"
-            told.append(Finding(Kind.SENSOR, Severity.WARNING, text, Subject("track", name)))
+            said.append((name, f"{mask.sum()} pixels show one value whatever passes; their neighbours stand in"))
         sensors.append((pattern, mask))
-    if not told:
+    if not said:
         return read_blocks, []
 
     def repaired(start: int, stop: int) -> Iterator[PairBlock]:
@@ -279,7 +274,9 @@ def _as_one_sensor(read_blocks: ReadBlocks, pairs: range) -> tuple[ReadBlocks, l
                     repair(images[:, camera], mask)
             yield replace(block, images=images)
 
-    return repaired, told
+    return repaired, [
+        Finding(Kind.SENSOR, Severity.WARNING, f"{name} camera: {text}", Subject("track", name)) for name, text in said
+    ]
 
 
 def _without_mosaic(images: NDArray, gains: NDArray) -> NDArray:

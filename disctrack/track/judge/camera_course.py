@@ -15,8 +15,7 @@ from calibration.kit.arrays import Array, Mask
 from disctrack.findings import MISFITS, Finding, Kind, Remedy, Severity, Subject
 from disctrack.numbers import Measured
 from disctrack.track.judge.dropped_frames import HARDLY
-from disctrack.track.pose import PoseFits
-from disctrack.track.refine.self_calibration import DotsInFrames
+from disctrack.track.pose import DotsInFrames, PoseFits
 from disctrack.track.side_by_side import SHARED_FRAMES, evenly
 
 STRETCHES = 20

@@ -11,11 +11,13 @@ from disctrack.disc import Disc, symmetry_order
 from disctrack.findings import MISFITS, Finding, Kind, Remedy, Severity, Subject
 from disctrack.numbers import Measured
 from disctrack.track.follow.following import Follower
-from disctrack.track.judge.dropped_frames import HARDLY, LATE, SHORTEST, delay_of_right
+from disctrack.track.judge.dropped_frames import HARDLY, LATE, delay_of_right
+from disctrack.track.pose import DotsInFrames
 from disctrack.track.refine.intrinsic_scatter import Scatter
 from disctrack.track.refine.pose_scatter import GROUPS
-from disctrack.track.refine.self_calibration import AsBuilt, DotsInFrames
+from disctrack.track.refine.self_calibration import AsBuilt
 from disctrack.track.refine.table_contact import TableFromDisc
+from disctrack.track.side_by_side import FEW, stretches
 from disctrack.trajectory import FrameStatus, Trajectory
 
 MISPLACED_MM = 0.15  # a printer that stretches a sheet by 0.5 % moves a dot 26 mm off the centre by 0.13 mm
@@ -51,28 +53,19 @@ def repeated_images(repeated: Mask, trajectory: Trajectory) -> Iterator[Finding]
 
 def _named(trajectory: Trajectory, chosen: Mask, shortest: int = 1) -> tuple[str, tuple[tuple[int, int], ...]]:
     """Stretches of at least so many of the frames chosen (n,): in words, and first and last of each."""
-    edges = np.flatnonzero(np.diff(np.r_[False, chosen, False].astype(int))).reshape(-1, 2)
-    long = edges[edges[:, 1] - edges[:, 0] >= shortest]
+    long = stretches(chosen, shortest)
     rows = [row for first, end in long for row in range(first, end)]
-    stretches = [(int(trajectory.frame[first]), int(trajectory.frame[end - 1])) for first, end in long]
-    return ranges(trajectory.frame[rows]) if rows else "", tuple(stretches)
-
-
-def _table_gap(trajectory: Trajectory) -> Array:
-    """Height of the disc's lowest point above the table [m] in the frames that have a pose; empty without a table."""
-    if not trajectory.rig.world_is_table:
-        return np.empty(0)
-    z, theta = trajectory.q[trajectory.measured][:, [2, 4]].T
-    return z - trajectory.disc.resting_height(theta)
+    where = [(int(trajectory.frame[first]), int(trajectory.frame[end - 1])) for first, end in long]
+    return ranges(trajectory.frame[rows]) if rows else "", tuple(where)
 
 
 def off_the_table(trajectory: Trajectory, severity: Severity = Severity.WARNING) -> tuple[Finding, ...]:
     """Where the disc's lowest point lies if not on the table, or scatters about it by more than its noise."""
-    gap = _table_gap(trajectory)
-    if not gap.size:
+    if not (trajectory.rig.world_is_table and trajectory.measured.any()):
         return ()
-    psi, theta = trajectory.q[trajectory.measured][:, [3, 4]].T
+    z, psi, theta = trajectory.q[trajectory.measured, 2:5].T
     disc, C = trajectory.disc, trajectory.pose_covariance[trajectory.measured]
+    gap = z - disc.resting_height(theta)
     by_tilt = disc.half_thickness * np.sin(theta) - disc.radius * np.cos(theta)
     J = np.stack([np.ones_like(psi), by_tilt * np.cos(psi), by_tilt * np.sin(psi)], axis=1)  # z, turns about x and y
     noise = np.median(np.einsum("ni,nij,nj->n", J, C[:, 2:5, 2:5], J))
@@ -213,15 +206,15 @@ def _table_disagrees(table: TableFromDisc | None, trajectory: Trajectory) -> tup
 def _lost(trajectory: Trajectory) -> Iterator[Finding]:
     """Frames whose poses no motion joins to the others, and a recording that loses most of its frames."""
     status = trajectory.frame_status
-    told, stretches = _named(trajectory, status == FrameStatus.JUMPED, SHORTEST)
-    if stretches:
+    told, where = _named(trajectory, status == FrameStatus.JUMPED, FEW)
+    if where:
         text = (
             f"no motion leads from the other frames to frames {told}, which are refused: both cameras lost pairs "
             "there and the files were numbered on, the frames are in another order or of another recording, or the "
             "frame rate is far too high"
         )
-        where = Subject("track", frames=stretches)
-        yield Finding(Kind.CLOCK_JUMP, Severity.DOUBT, text, where, explains=(Kind.FRAMES_LOST,))
+        of = Subject("track", frames=where)
+        yield Finding(Kind.CLOCK_JUMP, Severity.DOUBT, text, of, explains=(Kind.FRAMES_LOST,))
     reasons = [s for s in FrameStatus if s.looked_for and not s.has_pose and s != FrameStatus.UNREADABLE]
     counts = {reason: int(np.sum(status == reason)) for reason in reasons}
     lost, measured, most = sum(counts.values()), int(trajectory.measured.sum()), max(reasons, key=lambda r: counts[r])
@@ -234,7 +227,7 @@ def _one_sided(trajectory: Trajectory) -> Iterator[Finding]:
     """Frames that rest on one camera: most of them, or a stretch."""
     by_one = trajectory.frame_status == FrameStatus.ONE_CAMERA
     one, both = int(by_one.sum()), int(np.sum(trajectory.frame_status == FrameStatus.MEASURED))
-    told, stretches = _named(trajectory, by_one, SHORTEST)
+    told, where = _named(trajectory, by_one, FEW)
     if one > both:
         text = (
             f"the dots of only one camera make sense in {one} of {one + both} measured frames: are left and right "
@@ -242,12 +235,12 @@ def _one_sided(trajectory: Trajectory) -> Iterator[Finding]:
         )
         explains = Kind.POSES_SCATTER, Kind.TABLE_DISAGREES, Kind.FRAMES_LOST, Kind.SHARPNESS, Kind.ACCURACY
         yield Finding(Kind.ONE_SIDED, Severity.DOUBT, text, explains=explains)
-    elif stretches:
+    elif where:
         text = (
             f"frames {told} rest on one camera, with its larger sigma: the other was covered, sees the disc edge-on, "
             "or lost images and is at another instant from there on"
         )
-        yield Finding(Kind.ONE_SIDED, Severity.NOTE, text, Subject("track", frames=stretches))
+        yield Finding(Kind.ONE_SIDED, Severity.NOTE, text, Subject("track", frames=where))
 
 
 def _symmetric(disc: Disc) -> Iterator[Finding]:

@@ -16,10 +16,9 @@ from calibration.kit.brief import ranges
 from disctrack.findings import MISFITS, Finding, Kind, Remedy, Severity, Subject
 from disctrack.frames import CAMERAS, vector_from_rotation
 from disctrack.numbers import Measured
-from disctrack.track.refine.self_calibration import DotsInFrames
-from disctrack.track.side_by_side import SHARED_FRAMES, evenly
+from disctrack.track.pose import DotsInFrames
+from disctrack.track.side_by_side import FEW, SHARED_FRAMES, evenly, stretches
 
-SHORTEST = 4  # frames of a stretch: glare, a hand, exchanged frames are told by the frames' own status
 # Share of the square of a misfit that a delay explains, from which on it is its cause; and below which it has no part
 # in it: what a camera that moved leaves looks a little like one
 LATE, HARDLY = 0.9, 0.3
@@ -29,8 +28,8 @@ def dropped_frames(refused: Mask, seen: DotsInFrames, pairs: range) -> tuple[Fin
     """Long stretches of frames refused (n,) for their dots."""
     slips: list[tuple[int, list[int], list[float]]] = []  # the images left out, rows, the delays that say so
     unexplained: list[int] = []
-    edges = np.flatnonzero(np.diff(np.r_[False, refused, False].astype(int))).reshape(-1, 2)
-    for first, end in edges[edges[:, 1] - edges[:, 0] >= SHORTEST]:
+    # what is shorter (glare, a hand, exchanged frames) is told by the frames' own status
+    for first, end in stretches(refused, FEW):
         delay, explained = delay_of_right(seen, np.arange(first, end))
         ahead = round(delay) if explained > LATE else 0
         if not ahead:
@@ -47,7 +46,7 @@ def dropped_frames(refused: Mask, seen: DotsInFrames, pairs: range) -> tuple[Fin
         before = np.arange(rows[0])
         delay, explained = delay_of_right(seen, before)
         by_both = np.isfinite(seen.pixels[before]).all(axis=-1).any(axis=-1).all(axis=-1) & seen.posed[before]
-        always = k == 0 and (round(delay) == ahead if explained > HARDLY else by_both.sum() < SHORTEST)
+        always = k == 0 and (round(delay) == ahead if explained > HARDLY else by_both.sum() < FEW)
         frames = [pairs[i] for i in rows]
         text = (
             f"frames {ranges(frames)} {refused_for}, as if the {camera} camera were "
@@ -85,12 +84,12 @@ def frames_ahead(left: Array, right: Array) -> int:
     def apart(a: Array, b: Array) -> float:
         turn = np.linalg.norm(vector_from_rotation(a @ np.swapaxes(b, 1, 2)), axis=1)
         turn = turn[np.isfinite(turn)]
-        return float(np.median(turn)) if len(turn) >= SHORTEST else np.inf
+        return float(np.median(turn)) if len(turn) >= FEW else np.inf
 
     n = len(left)
     misfit = {
         ahead: apart(left[max(ahead, 0) : n + min(ahead, 0)], right[max(-ahead, 0) : n - max(ahead, 0)])
-        for ahead in range(SHORTEST - n, n - SHORTEST + 1)
+        for ahead in range(FEW - n, n - FEW + 1)
     }
     best = min(misfit, key=misfit.__getitem__, default=0)
     one = misfit.get(best, np.inf) < 0.5 * min(apart(a[1:], a[:-1]) for a in (left, right))

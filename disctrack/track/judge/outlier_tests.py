@@ -17,13 +17,11 @@ from numpy.typing import NDArray
 from calibration.kit.arrays import Array, Mask
 from disctrack.frames import rotation_from_vector, vector_from_rotation
 from disctrack.track.pose import PoseFits
-from disctrack.track.side_by_side import AT_ONCE
+from disctrack.track.side_by_side import AT_ONCE, FEW, stretches
 from disctrack.trajectory import FrameStatus
 
-FEW = 4  # frames beside a cut that tell how large the misfit is there
 BLOCK = 16  # frames whose median is what is usual, with those of the blocks on both sides: half may be at fault
 SIGMAS = 4.0  # beyond which a dot's misfit is hardly chance (6e-5): such a dot loses its weight, and no frame is lost
-COMPANIONS = 1.0  # the same for the other dots of an image in which something is: glare is larger than a dot
 # Square of a centre's shift over that of the misfit, both in sigmas: a disturbance is taken for a shift in one part and
 # shows in the other. Of random glare, shadows, dirt and edges of a hand over dots the largest ratio was 1.96.
 HIDDEN_SHARE = 2.0
@@ -52,7 +50,8 @@ def unexpected_misfit(misfit: NDArray[np.floating], n_pixels: NDArray[np.floatin
         chance = np.maximum(spread / own, np.sqrt(2.0 / pixels)) * expected
         above = (shown - expected) / chance
         disturbed = (above > SIGMAS).any(axis=2)
-        excess = np.where(above > np.where(disturbed, COMPANIONS, SIGMAS)[..., None], shown - expected, 0.0)
+        # one sigma for the other dots of an image in which something is: glare is larger than a dot
+        excess = np.where(above > np.where(disturbed, 1.0, SIGMAS)[..., None], shown - expected, 0.0)
         return 1.0 + HIDDEN_SHARE * np.nan_to_num(excess * pixels / np.maximum(shown, 1.0))
 
 
@@ -307,9 +306,8 @@ def _still_over_the_repeats(repeated: Mask, rest: Mask) -> Mask:
     disc did: it is still where rest, or the recording's end, lies on one side of it.
     """
     n = len(repeated)
-    edges = np.flatnonzero(np.diff(np.r_[False, repeated, False].astype(int)))
     still = np.zeros(n, bool)
-    for first, end in edges.reshape(-1, 2):  # a handful, if any
+    for first, end in stretches(repeated):  # a handful, if any
         before, after = first - 2, end  # `rest` of a frame is about the frames on both sides of it
         alone = end - first == 1
         still[first:end] = rest[first] if alone else before < 0 or after >= n or rest[before] or rest[after]

@@ -17,22 +17,16 @@ from disctrack.track.judge.camera_course import camera_course
 from disctrack.track.judge.doubts import FAULTY, doubts_of, repeated_images
 from disctrack.track.judge.dropped_frames import dropped_frames
 from disctrack.track.judge.outlier_tests import judge_poses, outlying_frames, unexpected_misfit
-from disctrack.track.pose import MIN_DOTS, PoseFits, fit_poses, whitening
+from disctrack.track.pose import MIN_DOTS, DotsInFrames, PoseFits, fit_poses, whitening
 from disctrack.track.refine.exposure import exposure_by_smear, exposure_of, shift_by_exposure
 from disctrack.track.refine.glare import shift_by_glare
 from disctrack.track.refine.intrinsic_scatter import Scatter, split_scatter, without_shared_faults
 from disctrack.track.refine.pose_scatter import scatter_of_poses
-from disctrack.track.refine.self_calibration import (
-    AsBuilt,
-    DotsInFrames,
-    by_pattern,
-    refine_as_built,
-)
+from disctrack.track.refine.self_calibration import AsBuilt, by_pattern, refine_as_built
 from disctrack.track.refine.table_contact import OF_PATTERN, TableFromDisc, off_centre, table_from_disc
 from disctrack.track.side_by_side import SHARED_FRAMES, evenly
 from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
 
-MIN_GOOD_DOT_IMAGES = 6
 FITTED_AT_ONCE = 512  # frames, whose numbers stay in a core's cache
 
 
@@ -198,11 +192,9 @@ def _outlying(seen: DotsInFrames, workers: int) -> Mask:
 
 def fit_all(seen: DotsInFrames, workers: int = 1, judged: bool = True) -> PoseFits:
     """The poses of all frames, some hundreds at a time: what a fit needs beside its result is five times as large."""
-    centres = seen.disc.marker_centres_body
 
     def fitted(rows: slice) -> PoseFits:
-        part = seen.pixels[rows], seen.covariance[rows], seen.rig, centres, seen.R[rows], seen.t[rows]
-        return fit_poses(*part, reject_outliers=judged, with_sensitivity=judged)
+        return fit_poses(seen.at(rows), reject_outliers=judged, with_sensitivity=judged)
 
     n, one = len(seen.t), vars(fitted(slice(0, 1)))
     whole = {name: np.empty((n, *value.shape[1:]), value.dtype) for name, value in one.items()}
@@ -234,7 +226,7 @@ def status_of(followed: NDArray[np.uint8], fits: PoseFits) -> NDArray[np.uint8]:
     status, was = followed.copy(), followed == FrameStatus.MEASURED
     per_camera = fits.used.sum(axis=2)
     total = per_camera.sum(axis=1)
-    status[was & (total < MIN_GOOD_DOT_IMAGES)] = FrameStatus.FEW_MARKERS
+    status[was & (total < 2 * MIN_DOTS)] = FrameStatus.FEW_MARKERS
     status[was & (per_camera == 0).any(axis=1)] = FrameStatus.ONE_CAMERA
     status[was & (total < MIN_DOTS)] = FrameStatus.MARKERS_NOT_FOUND
     return status

@@ -41,8 +41,6 @@ from disctrack.track.pose import marker_pixels
 from disctrack.track.side_by_side import AT_ONCE, MIN_FRAMES, SHARED_FRAMES, evenly
 
 PARTS = 10  # stretches of the recording, each left out in turn: what the fit leaves has a memory
-OUTLYING = 4.0  # robust sigmas
-ALIKE = 1e-6  # of the largest: columns of the fit that differ by less from a sum of others are not told apart
 SURE = 3.0  # sigmas of T^2, or the exposure is taken as short
 APPROXIMATE = 0.1  # relative, of T^2: one blur stands for an edge that is smeared more here than there
 CONTRADICTS = 5.0  # sigmas between a declared exposure and the smear
@@ -226,7 +224,7 @@ def _slope(y: Array, x: Array, others: list[Array]) -> tuple[float, float]:
         rows = np.column_stack([design[told] / scale, y[told]])
         solution = _solved(rows.T @ rows)
         residual = y - design / scale @ solution
-        use &= np.abs(residual) <= OUTLYING * 1.4826 * np.median(np.abs(residual[use]))
+        use &= np.abs(residual) <= 4.0 * 1.4826 * np.median(np.abs(residual[use]))
     part = np.repeat(np.arange(n) * PARTS // n, m)[told]
     # without each of the parts: where one alone tells, the others do not agree with it
     others = [rows[part != k] for k in range(PARTS)]
@@ -237,7 +235,8 @@ def _slope(y: Array, x: Array, others: list[Array]) -> tuple[float, float]:
 
 def _solved(products: Array) -> Array:
     """Least squares from the products of the columns, of which the last is the right-hand side."""
-    return np.asarray(np.linalg.pinv(products[:-1, :-1], rcond=ALIKE**2, hermitian=True) @ products[:-1, -1])
+    # columns that differ by less than 1e-6 of the largest from a sum of others are not told apart
+    return np.asarray(np.linalg.pinv(products[:-1, :-1], rcond=1e-12, hermitian=True) @ products[:-1, -1])
 
 
 def _standardised(x: Array) -> Array:

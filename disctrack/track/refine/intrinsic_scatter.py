@@ -12,13 +12,8 @@ import numpy as np
 
 from calibration.cameras.camera import INTRINSIC_PARAMETERS, N_RIG, PAIR_SHIFT
 from calibration.kit.arrays import Array
-from disctrack.track.pose import PoseFits, whitening
-from disctrack.track.refine.self_calibration import (
-    DOT_SIGMA,
-    AsBuilt,
-    DotsInFrames,
-    fit_shared,
-)
+from disctrack.track.pose import DotsInFrames, PoseFits, whitening
+from disctrack.track.refine.self_calibration import DOT_SIGMA, AsBuilt, fit_shared
 from disctrack.track.side_by_side import MIN_FRAMES, SHARED_FRAMES, evenly
 
 LEAST_NOISE = 0.25  # of the variance that flat parts of the image tell: the rest may be the pixels' fixed pattern

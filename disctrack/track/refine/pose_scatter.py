@@ -7,19 +7,18 @@ of 5 mm. So only frames are counted between which the disc precesses by less.
 """
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from calibration.kit.arrays import Array
 from disctrack.track.judge.outlier_tests import differences, sums_over_time
 from disctrack.track.pose import PoseFits
+from disctrack.track.side_by_side import MIN_FRAMES
 
 SLOW = 0.2  # [rad] of precession from frame to frame
 # Horizontal place, height, tilt, turn about the vertical: light and view make each of them scatter in a way of its own.
 GROUPS = ((0, 1), (2,), (3, 4), (5,))
-MIN_FRAMES = 40  # fewer tell as much as eight independent ones, whose variance chance alone doubles now and then
-# Blows and smears are cut off with the largest fifth of the squares; what is left of chi-square with one degree of
-# freedom has this mean.
-KEPT, MEAN_KEPT = 0.8, 0.43772
+KEPT = 0.8  # of the squares: blows and smears are cut off with the largest
 # Successive sixth differences are correlated by -0.86, 0.54, -0.24, ...: n tell as much as n / 3.2 independent ones
 # (the sum of the squared correlations); without those that are cut off, n / 4.5 (4000 samples of white noise).
 WORTH = 4.5
@@ -40,7 +39,9 @@ def scatter_of_poses(fits: PoseFits) -> tuple[Array, Array, Array]:
     square = np.concatenate(parts) if parts else np.empty((0, 6))
     if len(square) < MIN_FRAMES:
         return found, sigma, factor
-    kept = np.sort(square, axis=0)[: int(KEPT * len(square))].mean(axis=0) / MEAN_KEPT
+    # what is kept of chi-square with one degree of freedom has this mean
+    mean = scipy.special.chdtr(3, scipy.special.chdtri(1, 1 - KEPT)) / KEPT
+    kept = np.sort(square, axis=0)[: int(KEPT * len(square))].mean(axis=0) / mean
     for i, group in enumerate(GROUPS):
         part = list(group)
         found[i], sigma[i] = kept[part].mean(), np.sqrt(2 * WORTH / (len(square) * len(part)))

@@ -22,15 +22,14 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.cameras.camera import N_RIG, PAIR_SHIFT, StereoRig
 from calibration.judge.tolerances import SIZE
 from calibration.kit.arrays import Array, Mask
-from calibration.kit.least_squares import normal_of_rows, scaled_solve
+from calibration.kit.least_squares import scaled_solve
 from disctrack.disc import Disc
-from disctrack.track.pose import PoseFits, fit_poses, misses, whitening
-from disctrack.track.side_by_side import SHARED_FRAMES, evenly
+from disctrack.track.pose import DotsInFrames, PoseFits
+from disctrack.track.side_by_side import MIN_FRAMES, SHARED_FRAMES, evenly
 
 DOT_SIGMA = 50e-6  # [m] how far a printed dot may lie from its declared place: tens of micrometres are usual
 # The template's and the camera model's own errors (0.002 px) repeat from frame to frame, so that a long recording must
@@ -38,7 +37,6 @@ DOT_SIGMA = 50e-6  # [m] how far a printed dot may lie from its declared place: 
 SYSTEMATIC_PX = 0.002
 SIZE_FLOOR = 3e-6  # relative, of the dots as a ruler: metal and paper grow by some 1e-5 per kelvin
 ITERATIONS = 3
-MIN_FRAMES = 10
 MANY_DOTS = 5  # from which one may be left out
 SUM_OF_LENGTHS = 1.35  # variance of the pattern's place by the sum of lengths over that by the sum of squares
 
@@ -93,78 +91,6 @@ def refine_as_built(frames: DotsInFrames) -> AsBuilt:
     moved = moved + size_share * size * _from_middle(disc)
     found = AsBuilt.moved(rig, disc, moved, remaining, joint.reduced_chi_square[-1])
     return replace(found, size=size, size_sigma=size_sigma, size_share=size_share)
-
-
-@dataclass(frozen=True)
-class DotsInFrames:
-    """Dots seen in n frames, the poses they had, and what moves all of them beside rig and places of the dots.
-
-    A `shift` (30 + 2m + j,) of what the frames share: RIG_PARAMETERS, the dots' places in body axes, anything else.
-    """
-
-    rig: StereoRig
-    disc: Disc
-    pixels: Array  # (n, 2, m, 2); NaN where a dot was not seen
-    covariance: Array  # (n, 2, m, 2, 2) [px^2]
-    R: Array  # (n, 3, 3); NaN where there is no pose
-    t: Array  # (n, 3) [m]
-    further: Array | None = None  # (n, 2, m, 2, j) derivatives of the pixels by anything else
-
-    @property
-    def posed(self) -> Mask:
-        """(n,) True where there is a pose."""
-        return np.asarray(np.isfinite(self.t).all(axis=1))
-
-    def at(self, rows: NDArray[np.intp]) -> DotsInFrames:
-        """Some of the frames."""
-        parts = {name: getattr(self, name)[rows] for name in ("pixels", "covariance", "R", "t")}
-        return replace(self, **parts)
-
-    def but(self, outlying: Mask) -> DotsInFrames:
-        """The frames with no pose for those that are outlying (n,)."""
-        return replace(
-            self, R=np.where(outlying[:, None, None], np.nan, self.R), t=np.where(outlying[:, None], np.nan, self.t)
-        )
-
-    def shifted(self, shift: Array) -> tuple[Array, Array, StereoRig, Array]:
-        """The pixels (n, 2, m, 2) without what else moved them, their covariance, the rig, the dots' places (m, 3)."""
-        places = slice(N_RIG, N_RIG + 2 * self.disc.n_markers)
-        moved = np.column_stack([shift[places].reshape(-1, 2), np.zeros(self.disc.n_markers)])
-        pixels = self.pixels if self.further is None else self.pixels - self.further @ shift[places.stop :]
-        return pixels, self.covariance, self.rig.perturbed(shift[:N_RIG]), self.disc.marker_centres_body + moved
-
-    def fitted(self, shift: Array, reject: bool) -> tuple[DotsInFrames, PoseFits]:
-        """The frames with the poses that go with the shift; where a fit fails, the pose before."""
-        fits = fit_poses(*self.shifted(shift), self.R, self.t, reject_outliers=reject, with_sensitivity=False)
-        ok = fits.converged
-        R = np.where(ok[:, None, None], fits.R_world_body, self.R)
-        return replace(self, R=R, t=np.where(ok[:, None], fits.t_world_body, self.t)), fits
-
-    def normal(self, shift: Array, used: Mask, free: Mask) -> tuple[Array, Array, float]:
-        """Normal matrix (k, k) and gradient (k,) of the free ones of what is shared, every frame's pose eliminated.
-
-        used : (n, 2, m) dots that count; free : (30 + 2m + j,)
-        And chi-square, by which the decrease that a shared number explains can be judged.
-        """
-        _, covariance, rig, centres = shifted = self.shifted(shift)
-        residuals, by_pose, known = misses(*shifted, self.R, self.t)
-        by_shared = np.zeros((*residuals.shape, len(free)))
-        W = whitening(covariance)
-        if free[:N_RIG].any():
-            points = centres @ np.swapaxes(self.R, 1, 2) + self.t[:, None]
-            by_shared[..., :N_RIG] = W @ rig.project_with_jacobians(points)[2]
-        # a step of a dot on the body moves its image as the same step of the body, turned into the body's axes
-        by_place = by_pose[..., :3] @ self.R[:, None, None, :, :2]
-        for k in range(self.disc.n_markers):
-            by_shared[:, :, k, :, N_RIG + 2 * k : N_RIG + 2 * k + 2] = by_place[:, :, k]
-        if self.further is not None:
-            by_shared[..., -self.further.shape[-1] :] = W @ self.further
-        known &= used & np.isfinite(by_pose).all(axis=(-2, -1))
-        # with the residuals as one more of what is shared, for their square
-        rows = np.concatenate([by_pose, by_shared[..., free], residuals[..., None], residuals[..., None]], axis=-1)
-        rows = np.where(known[..., None, None], rows, 0.0)
-        matrix, gradient = normal_of_rows(rows.reshape(len(rows), -1, rows.shape[-1]), 6).eliminated()
-        return matrix[:-1, :-1], gradient[:-1], float(gradient[-1])
 
 
 @dataclass(frozen=True)

@@ -9,10 +9,11 @@ from disctrack import frames
 from disctrack.disc import MA_2014
 from disctrack.synthetic.cameras import rig_of
 from disctrack.synthetic.description import Scene
-from disctrack.track.pose import PoseFits, fit_poses, marker_pixels
+from disctrack.track.pose import DotsInFrames, PoseFits, fit_poses, marker_pixels
 from disctrack.track.refine.pose_scatter import scatter_of_poses
 
 SIGMA_PX = 0.01
+CENTRES = MA_2014.marker_centres_body
 
 
 def poses(rng, n):
@@ -25,21 +26,20 @@ def rig():
     return rig_of(Scene())
 
 
-@pytest.fixture(scope="module")
-def centres():
-    return MA_2014.marker_centres_body
-
-
-def filmed(rng, n, rig, centres, sigma=SIGMA_PX):
+def filmed(rng, n, rig, sigma=SIGMA_PX):
     """n poses, and the dots as seen in them."""
     _, R, t = poses(rng, n)
-    return R, t, *noisy_markers(R, t, rig, centres, rng, sigma)
+    return R, t, *noisy_markers(R, t, rig, rng, sigma)
 
 
-def noisy_markers(R, t, rig, centres, rng, sigma=SIGMA_PX):
-    pixels, _ = marker_pixels(R, t, rig, centres)
+def noisy_markers(R, t, rig, rng, sigma=SIGMA_PX):
+    pixels, _ = marker_pixels(R, t, rig, CENTRES)
     covariance = np.broadcast_to(sigma**2 * np.eye(2), (*pixels.shape, 2)).copy()
     return pixels + sigma * rng.normal(size=pixels.shape), covariance
+
+
+def fitted(markers, covariance, rig, R, t, **how):
+    return fit_poses(DotsInFrames(rig, MA_2014, markers, covariance, R, t), **how)
 
 
 def near(R, t, rng, angle=5e-3, shift=2e-4):
@@ -58,40 +58,40 @@ def chi_square(fits, R, t):
     return np.einsum("ni,nij,nj->n", error, np.linalg.inv(fits.covariance), error)
 
 
-def test_jacobian_agrees_with_central_differences(rng, rig, centres):
+def test_jacobian_agrees_with_central_differences(rng, rig):
     _, R, t = poses(rng, 6)
-    pixels, J = marker_pixels(R, t, rig, centres)
-    assert_allclose(pixels, rig.project(centres @ np.swapaxes(R, 1, 2) + t[:, None]), atol=1e-10)
-    assert np.isnan(marker_pixels(R, t + 10 * rig.R_left_world[2] * [-1, -1, -1], rig, centres)[0][:, 0]).all()
+    pixels, J = marker_pixels(R, t, rig, CENTRES)
+    assert_allclose(pixels, rig.project(CENTRES @ np.swapaxes(R, 1, 2) + t[:, None]), atol=1e-10)
+    assert np.isnan(marker_pixels(R, t + 10 * rig.R_left_world[2] * [-1, -1, -1], rig, CENTRES)[0][:, 0]).all()
     for k, step in enumerate([1e-6] * 3 + [1e-5] * 3):
         v = np.zeros(6)
         v[k] = step
-        ahead, _ = marker_pixels(frames.rotation_from_vector(v[3:]) @ R, t + v[:3], rig, centres)
-        behind, _ = marker_pixels(frames.rotation_from_vector(-v[3:]) @ R, t - v[:3], rig, centres)
+        ahead, _ = marker_pixels(frames.rotation_from_vector(v[3:]) @ R, t + v[:3], rig, CENTRES)
+        behind, _ = marker_pixels(frames.rotation_from_vector(-v[3:]) @ R, t - v[:3], rig, CENTRES)
         numeric = (ahead - behind) / (2 * step)
         assert_allclose(numeric, J[..., k], atol=1e-6 * np.abs(J[..., k]).max())
 
 
-def test_pose_scatter_equals_the_predicted_covariance(rng, rig, centres):
-    R, t, markers, covariance = filmed(rng, 500, rig, centres)
-    fits = fit_poses(markers, covariance, rig, centres, *near(R, t, rng), with_sensitivity=False)
+def test_pose_scatter_equals_the_predicted_covariance(rng, rig):
+    R, t, markers, covariance = filmed(rng, 500, rig)
+    fits = fitted(markers, covariance, rig, *near(R, t, rng), with_sensitivity=False)
     assert fits.converged.all()
     # 500 x 6 degrees of freedom: the mean of chi-square / 6 scatters by sqrt(2 / 3000) = 0.026
     assert abs(chi_square(fits, R, t).mean() / 6 - 1) < 0.1
     assert abs(fits.reduced_chi_square.mean() - 1) < 0.06  # 500 x 18 degrees of freedom, 4 sigma
 
 
-def test_minimum_is_that_of_scipy(rng, rig, centres):
-    R, t, markers, covariance = filmed(rng, 4, rig, centres)
+def test_minimum_is_that_of_scipy(rng, rig):
+    R, t, markers, covariance = filmed(rng, 4, rig)
     A = SIGMA_PX * rng.normal(size=covariance.shape)  # each dot has ellipses of its own, one is not seen
     covariance += A @ np.swapaxes(A, -1, -2)
     markers[:, 0, 2] = np.nan
     start = near(R, t, rng)
-    fits = fit_poses(markers, covariance, rig, centres, *start, reject_outliers=False, with_sensitivity=False)
+    fits = fitted(markers, covariance, rig, *start, reject_outliers=False, with_sensitivity=False)
     for i in range(4):
 
         def residual(v, i=i):
-            points = centres @ (frames.rotation_from_vector(v[3:]) @ start[0][i]).T + start[1][i] + v[:3]
+            points = CENTRES @ (frames.rotation_from_vector(v[3:]) @ start[0][i]).T + start[1][i] + v[:3]
             missed = np.linalg.solve(np.linalg.cholesky(covariance[i]), (markers[i] - rig.project(points))[..., None])
             return missed[np.isfinite(missed)]
 
@@ -104,59 +104,58 @@ def test_minimum_is_that_of_scipy(rng, rig, centres):
         assert np.abs(turn).max() < 2e-3 * sigma[3:].max()
 
 
-def test_a_flat_disc_is_as_well_conditioned_as_any(rng, rig, centres):
+def test_a_flat_disc_is_as_well_conditioned_as_any(rng, rig):
     q, _, _ = poses(rng, 40)
     q[:, 4] = 0.0
     R, t = frames.rotation_from_euler(*q[:, 3:].T), q[:, :3]
-    markers, covariance = noisy_markers(R, t, rig, centres, rng)
-    fits = fit_poses(markers, covariance, rig, centres, *near(R, t, rng), with_sensitivity=False)
+    markers, covariance = noisy_markers(R, t, rig, rng)
+    fits = fitted(markers, covariance, rig, *near(R, t, rng), with_sensitivity=False)
     assert fits.converged.all()
     sigma_rotation = np.sqrt(np.diagonal(fits.covariance, axis1=1, axis2=2))[:, 3:]
     assert sigma_rotation.max() < np.radians(5e-3)
 
 
-def test_one_camera_still_gives_a_pose_with_a_larger_sigma(rng, rig, centres):
-    R, t, markers, covariance = filmed(rng, 60, rig, centres)
-    both = fit_poses(markers, covariance, rig, centres, R, t)
+def test_one_camera_still_gives_a_pose_with_a_larger_sigma(rng, rig):
+    R, t, markers, covariance = filmed(rng, 60, rig)
+    both = fitted(markers, covariance, rig, R, t)
     markers[:, 1] = np.nan
-    one = fit_poses(markers, covariance, rig, centres, R, t)
+    one = fitted(markers, covariance, rig, R, t)
     assert one.converged.all()
     assert np.all(np.linalg.det(one.covariance) > np.linalg.det(both.covariance))
     assert 0.7 < np.median(chi_square(one, R, t)) / 5.35 < 1.3  # median of chi-square with 6 degrees of freedom
 
 
-def test_three_dot_images_are_the_least_and_two_give_nothing(rng, rig, centres):
-    R, t, markers, covariance = filmed(rng, 2, rig, centres, 1e-4)
+def test_three_dot_images_are_the_least_and_two_give_nothing(rng, rig):
+    R, t, markers, covariance = filmed(rng, 2, rig, 1e-4)
     markers[0, 1], markers[0, 0, 3:] = np.nan, np.nan
     markers[1, 1], markers[1, 0, 2:] = np.nan, np.nan
-    fits = fit_poses(markers, covariance, rig, centres, R, t)
+    fits = fitted(markers, covariance, rig, R, t)
     assert fits.converged.tolist() == [True, False]
     assert np.isnan(fits.t_world_body[1]).all()
     assert fits.degrees_of_freedom.tolist() == [0, 0]
 
 
 @pytest.mark.parametrize("wrong_px", [0.3, 40.0])
-def test_a_wrong_dot_is_struck_and_named(rng, rig, centres, wrong_px):
-    R, t, markers, covariance = filmed(rng, 50, rig, centres)
+def test_a_wrong_dot_is_struck_and_named(rng, rig, wrong_px):
+    R, t, markers, covariance = filmed(rng, 50, rig)
     markers[::2, 0, 2, 0] += wrong_px
-    fits = fit_poses(markers, covariance, rig, centres, *near(R, t, rng))
+    fits = fitted(markers, covariance, rig, *near(R, t, rng))
     assert not fits.used[::2, 0, 2].any()
     assert fits.used.sum() == fits.used.size - 25  # no good dot with it
     assert chi_square(fits, R, t).mean() / 6 < 1.4
     assert_allclose(np.abs(fits.residuals_px[::2, 0, 2, 0]), wrong_px, atol=0.2)  # still reported
 
 
-def test_sensitivity_tells_where_the_pose_goes_when_the_rig_changes(rng, rig, centres):
-    R, t, markers, covariance = filmed(rng, 5, rig, centres)
-    fits = fit_poses(markers, covariance, rig, centres, R, t)
+def test_sensitivity_tells_where_the_pose_goes_when_the_rig_changes(rng, rig):
+    R, t, markers, covariance = filmed(rng, 5, rig)
+    fits = fitted(markers, covariance, rig, R, t)
     scale = np.array(
         [1.0, 1, 1, 1, 1e-3, 1e-2, 1e-4, 1e-4, 0.1] * 2 + [1e-4] * 3 + [1e-5] * 3 + [1e-4] * 3 + [1e-5] * 3
     )
     for k in range(30):
         delta = 0.1 * scale * (np.arange(30) == k)
         ahead, behind = (
-            fit_poses(markers, covariance, rig.perturbed(way * delta), centres, R, t, with_sensitivity=False)
-            for way in (1, -1)
+            fitted(markers, covariance, rig.perturbed(way * delta), R, t, with_sensitivity=False) for way in (1, -1)
         )
         change = pose_error(ahead, behind.R_world_body, behind.t_world_body)
         predicted = 2 * fits.sensitivity[:, :, k] * delta[k]
@@ -164,40 +163,40 @@ def test_sensitivity_tells_where_the_pose_goes_when_the_rig_changes(rng, rig, ce
         assert_allclose(change, predicted, atol=0.01 * np.abs(predicted).max() + 1e-9)
 
 
-def test_a_frame_without_a_start_is_nan_and_the_others_are_not(rng, rig, centres):
-    R, t, markers, covariance = filmed(rng, 3, rig, centres)
+def test_a_frame_without_a_start_is_nan_and_the_others_are_not(rng, rig):
+    R, t, markers, covariance = filmed(rng, 3, rig)
     t_start = t.copy()
     t_start[1] = np.nan
-    fits = fit_poses(markers, covariance, rig, centres, R, t_start)
+    fits = fitted(markers, covariance, rig, R, t_start)
     assert np.isfinite(fits.t_world_body).all(1).tolist() == [True, False, True]
-    nothing = fit_poses(markers, covariance, rig, centres, R, np.full_like(t, np.nan))
+    nothing = fitted(markers, covariance, rig, R, np.full_like(t, np.nan))
     assert not nothing.converged.any()
 
 
-def test_exchanged_cameras_are_noticed(rng, rig, centres):
+def test_exchanged_cameras_are_noticed(rng, rig):
     """Negative control: the residuals of a wrong assignment are nowhere near the noise."""
-    R, t, markers, covariance = filmed(rng, 5, rig, centres)
-    fits = fit_poses(markers[:, ::-1], covariance, rig, centres, R, t, reject_outliers=False)
+    R, t, markers, covariance = filmed(rng, 5, rig)
+    fits = fitted(markers[:, ::-1], covariance, rig, R, t, reject_outliers=False)
     reduced = np.where(fits.converged, fits.reduced_chi_square, np.inf)
     assert np.all(reduced > 1e3)
 
 
-def test_a_pose_does_not_depend_on_which_frames_are_fitted_with_it(rng, rig, centres):
+def test_a_pose_does_not_depend_on_which_frames_are_fitted_with_it(rng, rig):
     """Some with a dot that was struck, by unlike amounts, so that every round of rejection has another company."""
-    R, t, pixels, covariance = filmed(rng, 60, rig, centres)
+    R, t, pixels, covariance = filmed(rng, 60, rig)
     struck = rng.choice(60, 25, replace=False)
     pixels[struck, rng.integers(0, 2, 25), rng.integers(0, 6, 25)] += rng.uniform(0.1, 40.0, (25, 1))
     twice = struck[:8]
     pixels[twice, 1, rng.integers(0, 6, 8)] -= rng.uniform(1.0, 9.0, (8, 1))
     R_start, t_start = near(R, t, rng)
 
-    def fitted(rows):
-        return fit_poses(pixels[rows], covariance[rows], rig, centres, R_start[rows], t_start[rows])
+    def of(rows):
+        return fitted(pixels[rows], covariance[rows], rig, R_start[rows], t_start[rows])
 
-    together = fitted(np.arange(60))
+    together = of(np.arange(60))
     assert (together.used.sum((1, 2)) < 12).sum() >= 20  # the struck ones were felt
     for rows in (np.arange(10, 34), np.sort(struck), *np.arange(0, 60, 7)[:, None]):
-        alone = fitted(rows)
+        alone = of(rows)
         np.testing.assert_array_equal(alone.used, together.used[rows])
         # round-off of a position of 0.05 m; a median over the company moved poses by 3.7 um
         assert_allclose(alone.t_world_body, together.t_world_body[rows], rtol=0, atol=1e-12)

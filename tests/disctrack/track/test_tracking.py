@@ -18,8 +18,8 @@ from disctrack.recording.readers.blocks import PairBlock, Unreadable
 from disctrack.track.dots.template import dot_centres
 from disctrack.track.follow.tracking import PAIRS_TRIED, TrackingSettings, _as_one_sensor, stretch_edges, track
 from disctrack.track.measurement import measure, open_pairs, refuse_unreadable
+from disctrack.track.pose import DotsInFrames
 from disctrack.track.refine.assembly import fit_all
-from disctrack.track.refine.self_calibration import DotsInFrames
 from disctrack.trajectory import FrameStatus, MarkerStatus
 from disctrack.validate.errors import compare
 from tests.oracles.point_laboratory import tables_of
