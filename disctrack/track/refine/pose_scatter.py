@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from calibration.kit.arrays import Array
 from disctrack.track.judge.outlier_tests import differences, sums_over_time
 from disctrack.track.pose import PoseFits
-from disctrack.track.side_by_side import MIN_FRAMES
 
 SLOW = 0.2  # [rad] of precession from frame to frame
 # Horizontal place, height, tilt, turn about the vertical: light and view make each of them scatter in a way of its own.
 GROUPS = ((0, 1), (2,), (3, 4), (5,))
+MIN_FRAMES = 40  # fewer tell as much as eight independent ones, whose variance chance alone doubles now and then
 KEPT = 0.8  # of the squares: blows and smears are cut off with the largest
 # Successive sixth differences are correlated by -0.86, 0.54, -0.24, ...: n tell as much as n / 3.2 independent ones
 # (the sum of the squared correlations); without those that are cut off, n / 4.5 (4000 samples of white noise).

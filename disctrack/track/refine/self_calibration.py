@@ -29,7 +29,7 @@ from calibration.kit.arrays import Array, Mask
 from calibration.kit.least_squares import scaled_solve
 from disctrack.disc import Disc
 from disctrack.track.pose import DotsInFrames, PoseFits
-from disctrack.track.side_by_side import MIN_FRAMES, SHARED_FRAMES, evenly
+from disctrack.track.side_by_side import SHARED_FRAMES, evenly
 
 DOT_SIGMA = 50e-6  # [m] how far a printed dot may lie from its declared place: tens of micrometres are usual
 # The template's and the camera model's own errors (0.002 px) repeat from frame to frame, so that a long recording must
@@ -37,6 +37,7 @@ DOT_SIGMA = 50e-6  # [m] how far a printed dot may lie from its declared place: 
 SYSTEMATIC_PX = 0.002
 SIZE_FLOOR = 3e-6  # relative, of the dots as a ruler: metal and paper grow by some 1e-5 per kelvin
 ITERATIONS = 3
+MIN_FRAMES = 10
 MANY_DOTS = 5  # from which one may be left out
 SUM_OF_LENGTHS = 1.35  # variance of the pattern's place by the sum of lengths over that by the sum of squares
 

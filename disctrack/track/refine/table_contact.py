@@ -32,11 +32,12 @@ from disctrack import frames
 from disctrack.disc import Disc
 from disctrack.numbers import measured
 from disctrack.track.pose import PoseFits
-from disctrack.track.side_by_side import AT_ONCE, MIN_FRAMES
+from disctrack.track.side_by_side import AT_ONCE
 
 SOURCES = ("both", "board", "disc")
 OF_PATTERN = "where the dots are on the disc"
 DISAGREEMENT = "board and disc disagree about the table"
+MIN_FRAMES = 30  # fewer poses of a rolling disc lie too near each other: their plane would take up what moves them all
 # Below, the direction of the contact is noise; above, a disc stands on its rim and may well slide or fall.
 THETA_RANGE = np.radians(0.7), np.radians(85.0)
 MAX_SCATTER = 30e-6  # [m] of the gaps about their plane: beyond, the disc jumps or the poses are not those of a disc
