@@ -120,11 +120,15 @@ def _write_summary(
 
 
 def with_false_discovery(rows: Sequence[Row]) -> list[Row]:
-    """The rows with the share of false findings among all that are as improbable: the more that look, the more find."""
-    from disctrack.discrepancy.significance import false_discovery  # SciPy's statistics: only where wanted
+    """The rows with the share of false findings among all that are as improbable: the more that look, the more find.
+
+    Who believes every finding whose share is below 0.05 has 5 % false ones among them on average, if their noise is
+    independent or goes together (Benjamini and Hochberg 1995, Benjamini and Yekutieli 2001).
+    """
+    from scipy.stats import false_discovery_control  # only where wanted
 
     tested = [row for row in rows if row["diagnosis_p_value"] is not None]
-    shares = false_discovery([row["diagnosis_p_value"] for row in tested])
+    shares = false_discovery_control([row["diagnosis_p_value"] for row in tested])
     known = {row["recording"]: float(share) for row, share in zip(tested, shares, strict=True)}
     return [row | {"diagnosis_false_discovery": known.get(row["recording"])} for row in rows]
 

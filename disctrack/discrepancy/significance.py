@@ -1,4 +1,4 @@
-"""How surprising a gain of chi-square is, how many of many findings may be false, and whether a residual is noise.
+"""How surprising a gain of chi-square is, and whether a residual is noise.
 
 To first order all gains over a catalogue are lengths of projections of one vector of noise, and candidates overlap:
 fifty of them are fewer independent chances than fifty. So vectors of noise are drawn and put to the same candidates:
@@ -49,20 +49,6 @@ def wald(amounts: Array, covariance: Array) -> float:
     safe = np.where(sigma > 0, sigma, np.inf)  # a number at its bound, or that the data do not show, tells nothing
     inverse = np.linalg.pinv(covariance / np.outer(safe, safe), rcond=1e-10, hermitian=True)
     return float((amounts / safe) @ inverse @ (amounts / safe))
-
-
-def false_discovery(p_values: Sequence[float]) -> Array:
-    """For each of many p values, the share of false ones among all that are as small (Benjamini and Hochberg 1995).
-
-    Who believes every finding whose number is below 0.05 has 5 % false ones among them on average, if their noise is
-    independent or goes together (Benjamini and Yekutieli 2001).
-    """
-    p = np.asarray(p_values, float)
-    order = np.argsort(p)
-    n = len(p)
-    adjusted = np.empty(n)
-    adjusted[order] = np.minimum.accumulate((p[order] * n / np.arange(1, n + 1))[::-1])[::-1]
-    return np.minimum(adjusted, 1.0)
 
 
 DRAWS = 4000
@@ -119,7 +105,7 @@ def _among(observed: float, sorted_draws: Array) -> Chance:
 
 LAGS = 20
 LONG = 1500  # samples from which on the statistic's distribution is the asymptotic one even in its tail
-DRAWS, TAIL = 6000, 0.01  # series of noise, and the share of them beyond which the tail is taken for exponential
+SERIES, TAIL = 6000, 0.01  # series of noise, and the share of them beyond which the tail is taken for exponential
 
 
 @dataclass(frozen=True)
@@ -151,9 +137,9 @@ def no_memory(statistic: float, n: int, lags: int = LAGS) -> float:
     if n >= LONG:
         return float(stats.chi2.sf(statistic, lags))
     draws = _drawn(int(2.0 ** (np.floor(2 * np.log2(n)) / 2)), lags)
-    start = float(draws[-int(TAIL * DRAWS)])
+    start = float(draws[-int(TAIL * SERIES)])
     if statistic < start:
-        return float(1.0 - np.searchsorted(draws, statistic) / DRAWS)
+        return float(1.0 - np.searchsorted(draws, statistic) / SERIES)
     scale = float(np.mean(draws[draws >= start] - start))
     return TAIL * float(np.exp(-(statistic - start) / scale))
 
@@ -161,7 +147,7 @@ def no_memory(statistic: float, n: int, lags: int = LAGS) -> float:
 @lru_cache(maxsize=8)
 def _drawn(n: int, lags: int) -> Array:
     """Statistics of series of white noise, sorted."""
-    return np.sort(ljung_box(np.random.default_rng(n).standard_normal((n, DRAWS)), lags))
+    return np.sort(ljung_box(np.random.default_rng(n).standard_normal((n, SERIES)), lags))
 
 
 def whiteness(residual: Array, rate: float, lines: Mapping[str, float], lags: int = LAGS) -> Whiteness:

@@ -27,7 +27,7 @@ from disctrack.batch.pool import Cluster, Died, do_all
 from disctrack.batch.records import BUSY, FAILED, MEASURED, Record, failed
 from disctrack.batch.repeats import repeats_of
 from disctrack.batch.report import report_of
-from disctrack.batch.summary import as_csv, write_summary
+from disctrack.batch.summary import as_csv, with_false_discovery, write_summary
 from disctrack.errors import ClusterError, RecordingError, reason_of
 from disctrack.report.html import page
 from disctrack.report.terminal import full, short
@@ -317,6 +317,17 @@ def test_a_summary_lists_repeats_beside_the_recordings(tmp_path):
     (repeat,) = json.loads((found.common / "summary.json").read_text())["repeats"]
     assert (repeat["quantity"], repeat["n"]) == ("n_theta", 2)
     assert "Repeats" in (found.common / "index.html").read_text()
+
+
+def test_false_discoveries_are_counted_among_the_recordings_that_were_diagnosed():
+    """Benjamini and Hochberg's own example of fifteen p values, of which four stand at 5 %."""
+    known = [0.0001, 0.0004, 0.0019, 0.0095, 0.0201, 0.0278, 0.0298, 0.0344, 0.0459, 0.324, 0.4262, 0.5719, 0.6528,
+             0.759, 1.0, None]  # fmt: skip
+    rows = with_false_discovery([{"recording": f"r{i}", "diagnosis_p_value": p} for i, p in enumerate(known)])
+    *shares, undiagnosed = (row["diagnosis_false_discovery"] for row in rows)
+    assert sum(share <= 0.05 for share in shares) == 4
+    assert undiagnosed is None
+    assert with_false_discovery([]) == []
 
 
 def test_names_are_text_in_a_spreadsheet_and_steer_no_terminal():

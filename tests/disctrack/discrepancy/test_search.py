@@ -14,7 +14,7 @@ from disctrack.discrepancy.fit import Fit, fit
 from disctrack.discrepancy.held_out import held_out, training_rows
 from disctrack.discrepancy.score import Linearisation, score_all
 from disctrack.discrepancy.search import Found, Settings, explain, length
-from disctrack.discrepancy.significance import as_sigmas, chance, false_discovery, ljung_box, no_memory, whiteness
+from disctrack.discrepancy.significance import as_sigmas, chance, ljung_box, no_memory, whiteness
 from disctrack.discrepancy.system import Budget, Candidate, Quantity, System
 from disctrack.discrepancy.words import bounds, correlated
 from tests.oracles.linear_system import Linear, candidate, one
@@ -347,23 +347,6 @@ def test_what_is_there_is_improbable(rng):
     # a wave that may only be positive does not gain from its opposite, but its neighbours do
     assert of(rng.standard_normal(120) - 2.0 * system.columns["c10"]).p_value < 1e-10
     assert of(rng.standard_normal(120)).p_value > 1e-3
-
-
-def test_false_discoveries_among_many_recordings_are_as_stated(rng):
-    """Benjamini and Hochberg's own example of fifteen p values, and 300 batches with ten true effects in forty."""
-    known = [0.0001, 0.0004, 0.0019, 0.0095, 0.0201, 0.0278, 0.0298, 0.0344, 0.0459, 0.324, 0.4262, 0.5719, 0.6528,
-             0.759, 1.0]  # fmt: skip
-    assert int(np.sum(false_discovery(known) <= 0.05)) == 4
-    assert false_discovery([]).size == 0
-    shares = []
-    for _ in range(300):
-        z = rng.standard_normal(40)
-        z[:10] += 3.5
-        claimed = false_discovery(2 * stats.norm.sf(np.abs(z))) < 0.1
-        shares.append(claimed[10:].sum() / max(claimed.sum(), 1))
-    assert np.mean(shares) == pytest.approx(0.075, abs=4 * np.std(shares) / np.sqrt(300))
-    naive = 30 * 0.1 / (30 * 0.1 + 10)
-    assert np.mean(shares) < 0.5 * naive
 
 
 def test_the_tail_of_ljung_and_box_is_as_stated_in_short_series(rng):
