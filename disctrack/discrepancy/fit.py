@@ -15,7 +15,6 @@ MAX_ITERATIONS = 40
 TRIAL = 15  # iterations of one fit among many: what describes the data is there by then, and others wander
 TOLERANCE = 1e-3  # a fit has converged when a full step would lower chi-square by less, over what is left per datum
 _HALVINGS = 8
-NO_DERIVATIVE = np.zeros(0)
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -158,7 +157,7 @@ class _Problem:
             trial = values | dict(zip(self.names, inside.tolist(), strict=True))
             trial |= {name: values[name] + factor * change for name, change in own.items()}
             # derivatives cost many times more than the prediction, and most of all where the step led far off
-            if not self._cost(trial, self.system.linearise(trial, ())[0], NO_DERIVATIVE) < self.cost:
+            if not self._cost(trial, *self.system.linearise(trial, ())) < self.cost:
                 continue
             residual, derivative = self.system.linearise(trial, [*self.own.slots, *self.names])
             cost = self._cost(trial, residual, derivative)

@@ -71,8 +71,10 @@ def common_modes(system: System, fit: Fit) -> tuple[Array, Array] | None:
     return vectors[:, common], eigenvalues[common] / float(np.mean(eigenvalues[~common]))
 
 
-def whitened(system: System, modes: tuple[Array, Array]) -> System:
-    """The system with the scatter of these directions brought down to that of the others."""
+def whitened(system: System, fit: Fit) -> System | None:
+    """The system with the scatter of its common modes brought down to that of other directions; None if it has none."""
+    if (modes := common_modes(system, fit)) is None:
+        return None
     vectors, variances = modes
     matrix = np.eye(len(vectors)) + (vectors * (1.0 / np.sqrt(variances) - 1.0)) @ vectors.T
     return Transformed(system, lambda both: matrix @ both)

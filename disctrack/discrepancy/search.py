@@ -20,7 +20,7 @@ from calibration.kit.arrays import Mask
 from calibration.kit.brief import Outline
 from disctrack.discrepancy.fit import Fit, fit, no_fit
 from disctrack.discrepancy.held_out import HeldOut, held_out, training_rows
-from disctrack.discrepancy.noise import THIRD, common_modes, inflation, noise_variance, whitened
+from disctrack.discrepancy.noise import THIRD, inflation, noise_variance, whitened
 from disctrack.discrepancy.score import Linearisation, Score, angle, score_all
 from disctrack.discrepancy.shape import WORTH_A_SHAPE, with_free_shape, with_shape
 from disctrack.discrepancy.significance import TWO_SIDED, Chance, chance, price_of_a_number
@@ -158,12 +158,10 @@ def explain(
     """
     settings = settings or Settings()
     answer = _searched(system, start, settings, rows, former)
-    if settings.noise is None and answer.verdict != "unexplained":
-        # looked for only here: what a large effect does from frame to frame would pass for scatter
-        modes = common_modes(system, answer.after)
-        if modes is not None:
-            judged = whitened(system, modes)
-            answer = replace(_searched(judged, answer.before.values, settings, rows, former), judged=judged)
+    # looked for only here: what a large effect does from frame to frame would pass for scatter
+    wanted = settings.noise is None and answer.verdict != "unexplained"
+    if wanted and (judged := whitened(system, answer.after)) is not None:
+        answer = replace(_searched(judged, answer.before.values, settings, rows, former), judged=judged)
     return with_shapes(system, answer) if system.frees_shapes else answer
 
 
@@ -235,9 +233,7 @@ def is_noise(fit_: Fit, settings: Settings, noise: float, gain: float = 0.0) -> 
 class _Search:
     """The explanations of a system's data, and what was done with each, by its names."""
 
-    def __init__(
-        self, system: System, settings: Settings, rows: Mask | None = None, former: Former | None = None
-    ) -> None:
+    def __init__(self, system: System, settings: Settings, rows: Mask | None, former: Former | None) -> None:
         self.system, self.settings, self.former = system, settings, former or {}
         self.rows = training_rows(system) if rows is None else rows
         self.candidates = tuple(c for c in system.candidates if not c.sought)
@@ -436,8 +432,7 @@ class _Search:
         return self.pool[names]
 
     def _refit_without(self, e: Explanation, c: Candidate) -> Explanation:
-        rest = tuple(other for other in e.candidates if other is not c)
-        return self._explanation(rest, _without(e.fit.values, c, rest))
+        return self._explanation(*_without(e, c))
 
     def _enlarged(self, e: Explanation, with_thresholds: bool) -> list[tuple[Candidate, ...]]:
         """Terms, and pairs of them where one alone will not do, that are worth a refit beside those of `e`."""
@@ -615,7 +610,7 @@ class _Search:
 
     def _alternatives(self, e: Explanation, effect: Candidate) -> list[Alternative]:
         """Effects that predict nearly the same residual, refitted in place of one; they join the explanations."""
-        rest = tuple(c for c in e.candidates if c is not effect)
+        rest, start = _without(e, effect)
         reduced = _restricted(e.fit, self._quantities(rest))
         linear = Linearisation(self.system, reduced, [*self.candidates, effect])
         shape = {q.name for q in effect.shape}  # of which no amount is a part of the effect
@@ -629,7 +624,6 @@ class _Search:
         near = near[: MOST_ALTERNATIVES if strength < FAINT else MOST_ALTERNATIVES // 2]
         found = []
         for candidate in near:
-            start = _without(e.fit.values, effect, rest)
             other = self._explanation((*rest, candidate), start, (candidate,))
             loss = (other.fit.cost - e.fit.cost) / self.noise
             if other.fit.converged and loss < CLASS_GAIN:
@@ -637,8 +631,7 @@ class _Search:
         return found
 
     def _found(self, e: Explanation, candidate: Candidate, alike: list[Alternative]) -> Found:
-        rest = tuple(c for c in e.candidates if c is not candidate)
-        without = self._fit(rest, _without(e.fit.values, candidate, rest), patient=True)
+        without = self._fit(*_without(e, candidate), patient=True)
         held_gain = self._held_out(e.fit).gain_over(self._held_out(without), self.noise)
         gain = (without.cost - e.fit.cost) / self.noise
         return Found(candidate, gain, held_gain, self.threshold(len(candidate.names)), tuple(alike))
@@ -720,10 +713,11 @@ def _surprise(candidate: Candidate, fit_: Fit) -> float:
     return max(0.0, 2.0 * float(np.log((1.0 + size**2) / 2.0)))
 
 
-def _without(values: Values, candidate: Candidate, rest: Sequence[Candidate]) -> dict[str, float]:
-    """Values with the candidate's quantities back at null, unless another effect has them too."""
+def _without(e: Explanation, candidate: Candidate) -> tuple[tuple[Candidate, ...], dict[str, float]]:
+    """The other effects, and values with the candidate's quantities at null, unless another effect has them too."""
+    rest = tuple(c for c in e.candidates if c is not candidate)
     kept = {n for c in rest for n in c.names}
-    return dict(values) | {q.name: q.null for q in candidate.quantities if q.name not in kept}
+    return rest, e.fit.values | {q.name: q.null for q in candidate.quantities if q.name not in kept}
 
 
 def _restricted(fit_: Fit, quantities: tuple[Quantity, ...]) -> Fit:

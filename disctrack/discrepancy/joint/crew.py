@@ -34,7 +34,7 @@ class Crew:
         self._context, self._pools = Spawn(), list[ProcessPoolExecutor]()
         n = min(processes, len(items))
         if n <= 1:
-            self._here = _built(build, dict(enumerate(items)))
+            _begin(build, dict(enumerate(items)), self._here)
             return
         with quietly():
             self._pools = [ProcessPoolExecutor(1, self._context, end_with_parent) for _ in range(n)]
@@ -73,9 +73,9 @@ class Crew:
         asked = self._kept if numbers is None else [self._kept[i] for i in numbers]
         each = list(zip(asked, arguments, strict=True))
         if not self._pools:
-            return [_answer(self._here[i], method, given) for i, given in each]
+            return [_answer(i, method, given, self._here) for i, given in each]
         try:
-            begun = [self._pools[i % len(self._pools)].submit(_answer_of, i, method, given) for i, given in each]
+            begun = [self._pools[i % len(self._pools)].submit(_answer, i, method, given) for i, given in each]
             return [future.result() for future in begun]
         except BrokenProcessPool as error:
             raise AnalysisError(ENDED_EARLY) from error
@@ -84,19 +84,12 @@ class Crew:
 _objects: dict[int, Any] = {}  # of a process of its own
 
 
-def _begin(build: Build, items: dict[int, Any]) -> None:
-    _objects.update(_built(build, items))
+def _begin(build: Build, items: dict[int, Any], objects: dict[int, Any] = _objects) -> None:
+    objects.update({i: _tried(build, item) for i, item in items.items()})
 
 
-def _answer_of(number: int, method: str, arguments: tuple[Any, ...]) -> Any:
-    return _answer(_objects[number], method, arguments)
-
-
-def _built(build: Build, items: dict[int, Any]) -> dict[int, Any]:
-    return {i: _tried(build, item) for i, item in items.items()}
-
-
-def _answer(thing: Any, method: str, arguments: tuple[Any, ...]) -> Any:
+def _answer(number: int, method: str, arguments: tuple[Any, ...], objects: dict[int, Any] = _objects) -> Any:
+    thing = objects[number]
     return thing if isinstance(thing, DiscTrackError) else _tried(getattr(thing, method), *arguments)
 
 

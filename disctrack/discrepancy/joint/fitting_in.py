@@ -233,8 +233,5 @@ def apart(
 
 def _either_fits(blocks: Blocks, pair: tuple[int, int], kept: Sequence[int], level: float, small: float) -> bool:
     """Does each of the two fit those of `kept` but the other?   small : a statistic that tells nothing"""
-    for i, other in (pair, pair[::-1]):
-        judged = against_the_others(blocks, [k for k in kept if k != other])[i]
-        if judged.p_value <= level and judged.statistic >= small:
-            return False
-    return True
+    without = (against_the_others(blocks, [k for k in kept if k != other])[i] for i, other in (pair, pair[::-1]))
+    return not any(judged.p_value <= level and judged.statistic >= small for judged in without)

@@ -42,7 +42,6 @@ class Sharing:
         self.members = tuple(members)
         self.base: dict[str, Quantity] = {}
         self._groups: dict[str, dict[str, str]] = {}  # quantity of a law -> group -> shared name
-        self._sharers: dict[str, dict[str, list[int]]] = {}  # quantity of a law -> group -> members
         self._nulls: dict[str, float] = {}
         self._own: list[list[Quantity]] = [[] for _ in members]
         self._local_nulls: list[dict[str, float]] = [{} for _ in members]
@@ -73,17 +72,17 @@ class Sharing:
 
     def _by_group(self, local: str, of_members: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
         """What is the same in all members of each group of a quantity: name -> one for each group."""
-        groups = [[of_members[i] for i in members] for members in self._sharers[local].values()]
+        each = list(zip(of_members, self._terms, strict=True))
+        groups = [
+            [known for known, terms in each if shared in terms.get(local, ())]
+            for shared in self._groups[local].values()
+        ]
         found = {}
         for name in dict.fromkeys(name for group in groups for known in group for name in known):
-            each = [{known.get(name) for known in group} for group in groups]
-            if all(len(one) == 1 for one in each):
-                found[name] = [one.pop() for one in each]
+            found_in = [{known.get(name) for known in group} for group in groups]
+            if all(len(one) == 1 for one in found_in):
+                found[name] = [one.pop() for one in found_in]
         return found
-
-    def _grouped(self, i: int, local: str, group: str, shared: str) -> None:
-        self._groups.setdefault(local, {})[group] = shared
-        self._sharers.setdefault(local, {}).setdefault(group, []).append(i)
 
     def group(self, member: Member, q: Quantity) -> str:
         """Which of the groups that share a quantity like this the member belongs to; empty where there is one only."""
@@ -111,7 +110,7 @@ class Sharing:
             shared = replace(q, name=_named(q.name, group))
             self._share(i, q, shared, 1.0)
             if not np.isfinite(q.prior_sigma):
-                self._grouped(i, q.name, group, shared.name)
+                self._groups.setdefault(q.name, {})[group] = shared.name
 
     def _share(self, i: int, local: Quantity, shared: Quantity, factor: float, base: bool = True) -> Quantity:
         # among many recordings none of the shared ones is taken out beforehand: their rows are no longer those of data
@@ -152,7 +151,7 @@ class Sharing:
                     group = self.group(self.members[i], q)
                     name = _named(q.name, group)
                     new[name] = self._share(i, q, replace(q, name=name), 1.0, base=False)
-                    self._grouped(i, q.name, group, name)
+                    self._groups.setdefault(q.name, {})[group] = name
             name = f"{first.name} ({EACH})" if one_for_all else first.name
             title = f"{first.title}, with a value for each group" if one_for_all else first.title
             start = first.start * len(groups)

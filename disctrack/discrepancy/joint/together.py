@@ -139,8 +139,13 @@ def answer_together(
         kept = [i for k, i in enumerate(kept) if k not in out]
     progress("each recording against the others")
     diagnosis, alone = _with_memory(system, diagnosis, crew)
+    blocks, everyone = Blocks(system, diagnosis.after), list(range(len(kept)))
+    judged = {i: (blocks.fits_in(k, everyone), alone[k]) for k, i in enumerate(kept)}
     by_recording = (
-        *_of_recordings(described, kept, reasons, system, diagnosis, alone),
+        *(
+            OfRecording(name, dict(labels), reasons.get(i, ""), *judged.get(i, ()))
+            for i, (name, labels) in enumerate(described)
+        ),
         *(OfRecording(name, {}, reason) for name, reason in unread.items()),
     )
     laws = _bounds(system, diagnosis), _dependences(system, diagnosis)
@@ -201,39 +206,17 @@ def _with_memory(system: JointSystem, diagnosis: Diagnosis, crew: Crew) -> tuple
     return replace(diagnosis, after=grown), alone
 
 
-def _of_recordings(
-    described: Sequence[tuple[str, Mapping[str, str]]],
-    kept: Sequence[int],
-    reasons: dict[int, str],
-    system: JointSystem,
-    diagnosis: Diagnosis,
-    alone: Sequence[Alone | None],
-) -> tuple[OfRecording, ...]:
-    blocks = Blocks(system, diagnosis.after)
-    everyone = list(range(len(kept)))
-    found = []
-    for i, (name, labels) in enumerate(described):
-        if i in reasons:
-            found.append(OfRecording(name, dict(labels), reasons[i]))
-            continue
-        k = kept.index(i)
-        found.append(OfRecording(name, dict(labels), "", blocks.fits_in(k, everyone), alone[k]))
-    return tuple(found)
-
-
 def _bounds(system: JointSystem, diagnosis: Diagnosis) -> tuple[Bound, ...]:
     """Every candidate to first order beside what was found, and how its sigma falls with the number of recordings."""
     after = diagnosis.after
     found = {f.candidate.name for f in diagnosis.found}
-    everything = [*system.candidates]
     n = len(system.time)
     numbers = sorted({k for k in NUMBERS if k < n} | {n})
-    whole = Linearisation(system, after, everything)
-    scores = {s.candidate.name: s for s in score_all(whole, everything)}
+    whole = Linearisation(system, after, system.candidates)
+    scores = {s.candidate.name: s for s in score_all(whole, system.candidates)}
     first = sigmas_of_first(system, after, numbers)
     bounds = []
-    for c in everything:
-        by_number = {k: first[k][c.name] for k in numbers}
+    for c in system.candidates:
         if c.name in found:
             values = np.array([after.values[name] for name in c.names])
             sigma = np.array([after.sigma(name) for name in c.names])
@@ -241,7 +224,7 @@ def _bounds(system: JointSystem, diagnosis: Diagnosis) -> tuple[Bound, ...]:
             values, sigma = scores[c.name].values, scores[c.name].sigma
         single = len(c.names) == 1 and c.name not in found and bool(np.isfinite(sigma[0]))
         upper = float(abs(values[0] - c.quantities[0].null) + TWO_SIDED * sigma[0]) if single else None
-        bounds.append(Bound(c, values, sigma, by_number, upper))
+        bounds.append(Bound(c, values, sigma, {k: first[k][c.name] for k in numbers}, upper))
     return tuple(bounds)
 
 
