@@ -269,9 +269,7 @@ class Answer:
         rms = np.sqrt(np.nanmean(left**2, axis=0))
         ahead = np.full(len(names), np.nan)
         if held is not None:
-            free = []
-            for s, seen in self.predicted(held.train):
-                free.append((s.data - seen)[~fitted_rows(s)])
+            free = [(s.data - seen)[~fitted_rows(s)] for s, seen in self.predicted(held.train)]
             ahead = np.sqrt(np.nanmean(np.concatenate(free) ** 2, axis=0))
         noise = np.sqrt(np.nanmean(np.concatenate([s.sigma**2 for s in self.system.stretches]), axis=0))
         if not self.remembers:  # the fast part of the data holds some of the motion, that of the residual less

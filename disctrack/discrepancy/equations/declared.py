@@ -211,8 +211,6 @@ class Samples:
 
 def checked(equations: Equations, runs: Sequence[Run]) -> list[Samples]:
     """Runs as plain arrays. Raises AnalysisError with the run, what was found and what was expected."""
-    if isinstance(runs, Run):
-        runs = [runs]
     if not runs:
         raise AnalysisError("no run was given: Run(time, {'x': values}).")
     names = [run.name or f"run{i + 1}" for i, run in enumerate(runs)]

@@ -45,24 +45,23 @@ def free_run(system: EquationSystem, fitted: Fit, samples: Samples, left: Array,
     left : (w,) what the model leaves of each channel
     window : [s] of the run to which its initial state is fitted; 0: it begins as the fit or the run says
     """
-    alone = system.with_(stretches=[replace(samples, sigma=np.broadcast_to(left, samples.data.shape))])
+    alone = replace(system, stretches=[replace(samples, sigma=np.broadcast_to(left, samples.data.shape))])
     values, states = dict(fitted.values), [q for q in alone.base if q.is_initial]
-    numbers = [n for n in fitted.shared if n in alone.names_of(samples)]
+    by_state = [q.name for q in states] if window > 0 else []
+    numbers = [n for n in fitted.shared if n in alone.names_of(samples) and n not in by_state]
     covariance = fitted.amounts(numbers)[1]
-    by_state, spread, follows = [], np.zeros((0, 0)), np.zeros((0, len(numbers)))
-    if window > 0 and states:
+    spread, follows = np.zeros((0, 0)), np.zeros((0, len(numbers)))
+    if by_state:
         n = int(np.searchsorted(samples.time, window, side="right"))
-        seen = alone.with_(stretches=[alone.stretches[0].part(0, n, 0)])
-        begun = guessed(seen)[0]
+        begin = replace(alone, stretches=[alone.stretches[0].part(0, n, 0)])
+        begun = guessed(begin)[0]
         loose = [
             replace(q, null=begun[q.name], prior_sigma=OF_SIZE * q.scale) if np.isinf(q.prior_sigma) else q
             for q in states
         ]
-        start = fit(seen, loose, values | begun)
-        values, spread, by_state = values | start.values, start.covariance, [q.name for q in states]
-        numbers = [n for n in numbers if n not in by_state]
-        covariance = fitted.amounts(numbers)[1]
-        residual, J = seen.linearise(values, [*by_state, *numbers])
+        start = fit(begin, loose, values | begun)
+        values, spread = values | start.values, start.covariance
+        residual, J = begin.linearise(values, [*by_state, *numbers])
         J = J.reshape(-1, J.shape[-1])
         # one step more: where the band is wide, a fit ends before it has reached the minimum
         prior, by_prior = prior_rows(loose, values)
@@ -70,21 +69,17 @@ def free_run(system: EquationSystem, fitted: Fit, samples: Samples, left: Array,
         values |= {name: values[name] + float(d) for name, d in zip(by_state, step, strict=True)}
         # other numbers would have led to another start
         follows = -spread @ J[:, : len(by_state)].T @ J[:, len(by_state) :]
-    shape = samples.data.shape
     found = alone.predict(values, alone.stretches[0], [*by_state, *numbers])
-    channels = alone.formulas.channels
-    if found is None:
-        nothing = dict(zip(channels, np.full(shape, np.nan).T, strict=True))
-        return Forecast(samples.time, nothing, nothing)
-    of_start, of_numbers = np.split(found.derivative, [len(by_state)], axis=2)
-    of_numbers = of_numbers + of_start @ follows
-    variance = np.broadcast_to(left**2, shape).copy()
-    for J, C in ((of_start, spread), (of_numbers, covariance)):
-        variance += np.einsum("nwi,ij,nwj->nw", J, C, J)
-    sigma = np.sqrt(np.maximum(variance, 0.0))
-    return Forecast(
-        samples.time, dict(zip(channels, found.seen.T, strict=True)), dict(zip(channels, sigma.T, strict=True))
-    )
+    seen = sigma = np.full(samples.data.shape, np.nan)
+    if found is not None:
+        of_start, of_numbers = np.split(found.derivative, [len(by_state)], axis=2)
+        of_numbers = of_numbers + of_start @ follows
+        variance = np.broadcast_to(left**2, seen.shape).copy()
+        for J, C in ((of_start, spread), (of_numbers, covariance)):
+            variance += np.einsum("nwi,ij,nwj->nw", J, C, J)
+        seen, sigma = found.seen, np.sqrt(np.maximum(variance, 0.0))
+    by_channel = [dict(zip(alone.formulas.channels, each.T, strict=True)) for each in (seen, sigma)]
+    return Forecast(samples.time, *by_channel)
 
 
 def scored(found: Forecast, samples: Samples, channels: tuple[str, ...], since: float) -> dict[str, RunScore]:

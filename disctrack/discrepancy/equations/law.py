@@ -321,7 +321,7 @@ class _Competition:
         first, numbers = _set(shots[0], law, values)
         now, evident = dict(values) | {q.name: 0.0 for q in own} | numbers, np.inf
         for i, (system, longer) in enumerate(zip(shots, [*shots[1:], None], strict=True)):
-            there = system.with_(widths=first.widths)
+            there = replace(system, widths=first.widths)
             others, view = self._others(there, beside), there if longer else self.view(there)
             for _ in range(1 if longer else ROUNDS):
                 fitted = self._fitted(view, (*others, *own), now)
@@ -420,7 +420,7 @@ def _knowing(system: EquationSystem, channels: Mapping[str, Formula]) -> Equatio
     known = Formulas(replace(e, constants=constants), (*f.terms, term), channels)
     widths = {known.widths[a].name: system.widths[w.name] for a, w in f.widths.items() if a in known.widths}
     new = {w.name: 1.0 for w in known.widths.values() if w.name not in widths}
-    return system.with_(formulas=known, widths=widths | new)
+    return replace(system, formulas=known, widths=widths | new)
 
 
 def _names() -> list[str]:
@@ -452,7 +452,7 @@ def _set(system: EquationSystem, law: Along, values: Values) -> tuple[EquationSy
     numbers |= {f"{NAME}_reach": reach, f"{NAME}_bend": bend}
     mine = [w.name for a, w in system.formulas.widths.items() if any(s.name.startswith(of) for s in a.free_symbols)]
     size = float(np.sqrt(np.mean(visited**2)))
-    return system.with_(widths=system.widths | {w: 1e-3 * (size or 1.0) for w in mine}), numbers
+    return replace(system, widths=system.widths | {w: 1e-3 * (size or 1.0) for w in mine}), numbers
 
 
 def _visited(system: EquationSystem, variable: str, values: Values) -> Array:
@@ -510,7 +510,7 @@ def _shots(system: EquationSystem) -> list[EquationSystem]:
     samples = min(len(s.time) for s in stretches) / FEWEST
     most = max(1.0, min(turns, samples, MOST_STATES / (n * len(stretches))))
     counts = [2**level for level in range(int(np.log2(most)), 0, -1)]
-    return [*(system.with_(stretches=cut(stretches, [count] * len(stretches))) for count in counts), system]
+    return [*(replace(system, stretches=cut(stretches, [count] * len(stretches))) for count in counts), system]
 
 
 def _joining(values: Values, system: EquationSystem, longer: EquationSystem) -> dict[str, float]:

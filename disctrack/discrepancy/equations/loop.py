@@ -69,12 +69,9 @@ def ask(
             "the motion can be followed, but not how it depends on its parameters: so it is where equations jump, as "
             "at a stiff contact. Write the contact wider, or cut the data into runs without it."
         )
-    judged, remembers = diagnosis.judged or system, False
-    if settings.noise is None:
-        again, remembers, remark = _with_memory(system, diagnosis, settings)
-        if again is not None:
-            diagnosis, judged = again, again.judged or judged
-            notes.append(remark)
+    diagnosis, remembers, more = _with_memory(system, diagnosis, settings)
+    notes += more
+    judged = diagnosis.judged or system
     law = learn(system, diagnosis, channels, None if judged is system else judged)
     if law is not None and law.is_named(diagnosis):
         judged = law.system if judged is system else judged.over(law.system)
@@ -96,10 +93,10 @@ def _first_answer(system: EquationSystem, settings: Settings) -> tuple[EquationS
     samples = system.stretches
     system, declared = _prepared(system)
     start = led(system, declared)
-    followed = system.with_(stretches=first_part(system.stretches, start.followed))
+    followed = replace(system, stretches=first_part(system.stretches, start.followed))
     held = redundant(followed, start.values) if start.followed > 0.0 else ()
     if held:
-        system = system.with_(held=held)
+        system = replace(system, held=held)
         start = led(system, declared)
     soon = start.followed < min(turn(s) for s in system.stretches)
     leading = _leading(system, declared, [c.name for c in system.candidates]) if soon else {}
@@ -142,7 +139,7 @@ def _searched(
     diagnosis = explain(system, values, settings, system.training, former)
     if diagnosis.held_out_before is None and np.isfinite(diagnosis.before.chi_square):
         # no step leads down: by way of others, and without what the data do not tell apart
-        system = system.with_(held=(*system.held, *redundant(system, diagnosis.before.values)))
+        system = replace(system, held=(*system.held, *redundant(system, diagnosis.before.values)))
         values = trusted(system, system.base, diagnosis.before.values)
         diagnosis = explain(system, values, settings, system.training)
     if diagnosis.verdict == "unexplained" and not diagnosis.found:
@@ -185,7 +182,7 @@ def _aimed(system: EquationSystem, values: Mapping[str, float]) -> EquationSyste
             value = float(np.nanquantile(np.concatenate([x[i] for x in passed]), share))
             bounds = f.declared[name]
             tried[name] = float(np.clip(value, bounds.lower, bounds.upper))
-        there = system.with_(aims=tried)
+        there = replace(system, aims=tried)
         if not np.isfinite(there.linearise(values, [n for c in amounts for n in c.names])[1]).all():
             continue
         linear = Linearisation(there, here, amounts)
@@ -194,12 +191,12 @@ def _aimed(system: EquationSystem, values: Mapping[str, float]) -> EquationSyste
             if gain > best.get(c.name, (0.0, {}))[0]:
                 limits = {n: v for n, v in tried.items() if f.owner[n] == c.name}
                 best[c.name] = gain, limits | dict(zip(c.names, there_best.tolist(), strict=True))
-    return system.with_(aims={n: v for _, aims in best.values() for n, v in aims.items()})
+    return replace(system, aims={n: v for _, aims in best.values() for n, v in aims.items()})
 
 
 def _leading(system: EquationSystem, values: Values, names: Collection[str]) -> dict[frozenset[str], Values]:
     """Those with which, over growing windows, the model follows the data to their end, and where; the best first."""
-    ways = {name: led(system.with_(promoted=(name,)), dict(values)) for name in names}
+    ways = {name: led(replace(system, promoted=(name,)), dict(values)) for name in names}
     whole = {frozenset([name]): way.values for name, way in ways.items() if way.whole}
     return dict(sorted(whole.items(), key=lambda item: misfit(system, dict(item[1]))))
 
@@ -214,11 +211,11 @@ def _lost_soon(start: Start, leading: Sequence[str]) -> str:
 def _prepared(system: EquationSystem) -> tuple[EquationSystem, dict[str, float]]:
     """With sizes of states and widths of jumps read off the data, and initial states."""
     values, sizes = guessed(system)
-    system = system.with_(sizes=sizes)
+    system = replace(system, sizes=sizes)
     # states of the size that the data show, in place of a motion that is not known yet
     phase = 2 * np.pi * np.arange(64) / 64
     states = np.sqrt(2) * sizes * np.cos(phase[:, None] + np.arange(len(sizes)))
-    return system.with_(widths=_widths(system, [(system.stretches[0], states)])), values
+    return replace(system, widths=_widths(system, [(system.stretches[0], states)])), values
 
 
 def _widths(system: EquationSystem, along: Sequence[tuple[Samples, Array]]) -> dict[str, float]:
@@ -246,7 +243,7 @@ def _sharp_enough(system: EquationSystem, fitted: Fit) -> EquationSystem:
     residual = system.linearise(fitted.values, [])[0]
     while share > SHARPEST:
         share *= SHARPER
-        sharper = system.with_(widths={name: share * w for name, w in first.items()})
+        sharper = replace(system, widths={name: share * w for name, w in first.items()})
         moved = residual - (residual := sharper.linearise(fitted.values, [])[0])
         if np.sum(moved**2) < BLUNT * max(1.0, fitted.reduced_chi_square):
             break
@@ -260,16 +257,16 @@ def _sized(system: EquationSystem, values: Mapping[str, float]) -> EquationSyste
     if not found:
         return system
     sizes = np.maximum(np.max([np.abs(m.states).max(axis=0) for _, m in found], axis=0), 1e-9 * system.sizes)
-    system = system.with_(sizes=sizes, widths=_widths(system, [(s, m.states) for s, m in found]))
+    system = replace(system, sizes=sizes, widths=_widths(system, [(s, m.states) for s, m in found]))
     found_alike = sizes_alike(system, values)
     typical = {name: USUAL_SHARE * size for name, size in found_alike.items() if system.formulas.owner[name]}
-    return system.with_(typical=typical)
+    return replace(system, typical=typical)
 
 
 def redundant(system: EquationSystem, values: Mapping[str, float]) -> tuple[str, ...]:
     """Parameters that the data cannot part from others, to be held as declared."""
     # of many runs with numbers of their own a few tell it
-    system = system.with_(stretches=spread(system.stretches, len(system.formulas.states)))
+    system = replace(system, stretches=spread(system.stretches, len(system.formulas.states)))
     states = [q for q in system.base if q.is_initial]
     free = [q for q in system.base if not q.is_initial and np.isinf(q.prior_sigma)]
     if len(free) < 2:
@@ -299,7 +296,7 @@ def _in_stretches(
     durations = [float(s.time[-1] - s.time[0]) for s in system.stretches]
     pieces = cut(system.stretches, [max(1, int(np.ceil(d / length * (1 - 1e-9)))) for d in durations])
     chosen = spread(pieces, len(system.formulas.states), at_least=len(system.stretches))
-    system = system.with_(stretches=chosen)
+    system = replace(system, stretches=chosen)
     shared = {q.name: values[q.name] for q in system.base if not q.is_initial}
     guesses, _ = guessed(system)
     start = led(system, shared | guesses)
@@ -314,29 +311,30 @@ def _joined(
 ) -> tuple[EquationSystem, Diagnosis, str]:
     """With what was found in the stretches, does the model follow the whole runs? Then they are judged whole."""
     names = tuple(f.candidate.name for f in diagnosis.found)
-    whole = system.with_(stretches=samples, promoted=names)
+    whole = replace(system, stretches=samples, promoted=names)
     # a run's first stretch begins where the run does, under the same name
     start = led(whole, guessed(whole)[0] | diagnosis.after.values)
     if not start.whole:
         return system, diagnosis, f"with it the model follows {start.followed:.3g} s of {start.duration:.3g} s"
-    plain = _sized(whole, start.values).with_(promoted=())
+    plain = replace(_sized(whole, start.values), promoted=())
     joined, again = _searched(plain, start.values, settings, {frozenset(names): start.values})
     return joined, again, "with what was found the model follows the whole runs, and they are judged whole"
 
 
-def _with_memory(
-    system: EquationSystem, diagnosis: Diagnosis, settings: Settings
-) -> tuple[Diagnosis | None, bool, str]:
-    """Search again with noise that remembers, where what is left of the best model does and is as small as noise."""
-    if diagnosis.held_out_before is None:
-        return None, False, ""
+def _with_memory(system: EquationSystem, diagnosis: Diagnosis, settings: Settings) -> tuple[Diagnosis, bool, list[str]]:
+    """Search again with noise that remembers, where what is left of the best model does and is as small as noise.
+
+    returns : diagnosis, whether its noise remembers, and a remark on that
+    """
+    if settings.noise is not None or diagnosis.held_out_before is None:
+        return diagnosis, False, []
     residual, _ = system.linearise(diagnosis.after.values, [])
     present = np.zeros(residual.shape, bool)
     for rows, s in zip(system.rows, system.stretches, strict=True):
         present[rows] = np.isfinite(s.data)
     coefficients, share = autoregression(residual, present, system.rows)
     if not coefficients.any():
-        return None, False, ""
+        return diagnosis, False, []
     size = float(np.sqrt(np.sum(residual**2) / max(present.sum(), 1)))
     lasting = persistence(residual, system.rows) * float(np.median(np.diff(system.stretches[0].time)))
     shortest_turn = min(min(turn(s), _pace(s)) for s in system.stretches)
@@ -345,18 +343,19 @@ def _with_memory(
     as_noise &= size <= NO_SENSOR
     remembering = without_memory(system, system.rows, coefficients, present)
     base = fit(remembering, system.base, diagnosis.before.values) if as_noise else None
-    if diagnosis.verdict == "unexplained" and (base is None or not base.converged):
-        reason = f"what is left is {size:.3g} times the noise and lasts for {lasting:.2g} s: no sensor's noise"
-        return replace(_certain(system, diagnosis), reason=reason), False, f"{ERROR_THAT_LASTS}, not of the noise alone"
     if base is None or not base.converged:
-        return None, False, ""
+        if diagnosis.verdict != "unexplained":
+            return diagnosis, False, []
+        reason = f"what is left is {size:.3g} times the noise and lasts for {lasting:.2g} s: no sensor's noise"
+        diagnosis = replace(_certain(system, diagnosis), reason=reason)
+        return diagnosis, False, [f"{ERROR_THAT_LASTS}, not of the noise alone"]
     noise = float(share * size**2)
     scatter = 1.0 + 4.0 * float(np.sqrt(2.0 / max(base.n_data, 1)))  # of chi-square in a short recording
     known = replace(settings, noise=noise, at_noise=max(settings.at_noise, scatter))
     again = explain(remembering, base.values, known, system.training, _former(diagnosis))
     order = int(np.max(np.nonzero(coefficients)[1])) + 1
     text = f"what the model leaves remembers {order} sample{'s' if order > 1 else ''}; sigmas allow for that"
-    return replace(again, judged=again.judged or remembering), True, text
+    return replace(again, judged=again.judged or remembering), True, [text]
 
 
 def _pace(s: Samples) -> float:

@@ -219,7 +219,7 @@ def near_declared(q: Quantity) -> Quantity:
 
 def at_once(system: EquationSystem, declared: Mapping[str, float]) -> dict[str, float]:
     """All quantities fitted to all data (`trusted`). Of many runs some tell what all share, and the others follow."""
-    some = system.with_(stretches=spread(system.stretches, len(system.formulas.states)))
+    some = replace(system, stretches=spread(system.stretches, len(system.formulas.states)))
     values = trusted(some, some.base, declared)
     if len(some.stretches) < len(system.stretches):
         values |= fit(system, [q for q in system.base if q.slot], values, max_iterations=TRIAL).values
@@ -265,7 +265,7 @@ def _led(system: EquationSystem, values: dict[str, float], window: float, durati
     states = [q for q in system.base if q.is_initial]
     while not last:
         last = window >= duration
-        part = system.with_(stretches=first_part(system.stretches, duration if last else window))
+        part = replace(system, stretches=first_part(system.stretches, duration if last else window))
         if followed == 0.0:
             values |= fit(part, states, values, max_iterations=TRIAL).values
         tied = [q if q.is_initial else _near_last(q, values) for q in system.base]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import combinations, pairwise
 
 import numpy as np
@@ -38,54 +38,39 @@ class Prediction:
     derivative: Array  # (n, w, k)
 
 
+@dataclass(eq=False, repr=False)
 class EquationSystem(System):
-    """Samples of all stretches, one after the other, with a row without data between two of them."""
+    """Samples of all stretches, whose noise is known, with a row without data between two of them."""
 
+    formulas: Formulas
+    stretches: Sequence[Samples]
+    sizes: Array  # (n,) of the states
+    widths: dict[str, float]  # of jumps
+    promoted: Sequence[str] = ()  # terms that every fit has
+    held: Sequence[str] = ()  # parameters that no fit moves
+    typical: Mapping[str, float] = field(default_factory=dict)  # sizes of the terms' numbers that would surprise nobody
+    aims: Mapping[str, float] = field(default_factory=dict)  # by number that is tried along the motion: its start
+    budget: Budget = field(default_factory=lambda: Budget(MOST_WORK))  # of all that answer one question
+    trial_steps = OF_ONE * MOST_WORK
     several_minima = frees_shapes = True  # what users declare may bend anyhow
 
-    def __init__(
-        self, formulas: Formulas, stretches: Sequence[Samples], sizes: Array, widths: Mapping[str, float],
-        promoted: Sequence[str] = (), held: Sequence[str] = (), typical: Mapping[str, float] | None = None,
-        aims: Mapping[str, float] | None = None,
-    ) -> None:  # fmt: skip
-        """Make a system of stretches whose noise is known.
-
-        sizes : (n,) of the states
-        widths : of jumps
-        promoted : terms that every fit has
-        held : parameters that no fit moves
-        typical : sizes of the terms' numbers that would surprise nobody
-        aims : where the fit of a term begins that has a number tried along the motion
-        """
-        self.formulas, self.stretches = formulas, tuple(stretches)
-        self.sizes, self.widths = np.asarray(sizes, float), dict(widths)
-        self.promoted, self.held = tuple(promoted), tuple(held)
-        self.typical, self.aims = dict(typical or {}), dict(aims or {})
-        self.budget, self.trial_steps = Budget(MOST_WORK), OF_ONE * MOST_WORK
+    def __post_init__(self) -> None:
         lengths = [len(s.time) for s in self.stretches]
         first = np.cumsum([0] + [n + 1 for n in lengths])
         self.rows = [slice(int(a), int(a) + n) for a, n in zip(first, lengths, strict=False)]
         self.blocks = self.rows
-        n, w = int(first[-1]), len(formulas.channels)
+        n, self._w = int(first[-1]), len(self.formulas.channels)
         self.time, self.weights, self.training = np.zeros(n), np.zeros(n), np.zeros(n, bool)
         for rows, s in zip(self.rows, self.stretches, strict=True):
             elapsed = s.time - s.time[0]
             self.time[rows], self.time[rows.stop] = elapsed, elapsed[-1]
             self.weights[rows] = np.isfinite(s.data).sum(axis=1)
             self.training[rows] = fitted_rows(s)
-        self._w = w
         self._places: dict[str, dict[str, int]] = {}
-        self._defaults = formulas.defaults() | self.widths | self._limits()
-        self._per = {name: p.per for name, p in formulas.declared.items() if p.per}
+        self._defaults = self.formulas.defaults() | self.widths | self._limits()
+        self._per = {name: p.per for name, p in self.formulas.declared.items() if p.per}
         self.base = tuple(self._base())
-        self.candidates = tuple(self._candidate(t) for t in formulas.terms if t.name not in self.promoted)
-
-    def with_(self, **changes: object) -> EquationSystem:
-        """The same with other stretches, promoted terms, ..."""
-        names = ("formulas", "stretches", "sizes", "widths", "promoted", "held", "typical", "aims")
-        found = EquationSystem(**{name: getattr(self, name) for name in names} | changes)
-        found.budget = self.budget  # of all that answer one question
-        return found
+        self.candidates = tuple(self._candidate(t) for t in self.formulas.terms if t.name not in self.promoted)
 
     def _base(self) -> list[Quantity]:
         found = []
