@@ -246,5 +246,5 @@ def test_init_sees_two_views_in_each_image_and_only_there(halves, sample_clip, t
     assert main(["init", str(tmp_path / "one")]) != 0  # one camera: its halves do not show a board each
     assert "no two sequences" in capsys.readouterr().err
     for others, pairs in ((18, 0), (290, 1)):  # eighteen views are not the other camera of a motion
-        named = (Sequence("frames/*.png", ".png", 300), Sequence("views/*.png", ".png", others))
+        named = [Sequence(tmp_path, f"{of}/*.png", ".png", n) for of, n in (("frames", 300), ("views", others))]
         assert len(pair_cameras(named)) == pairs
