@@ -3,29 +3,25 @@
 from collections.abc import Iterator
 
 import numpy as np
-from matplotlib.axes import Axes
 
 from calibration.kit.arrays import Array
 from disctrack.analyse.analysis import Analysis
 from disctrack.analyse.power_laws import MODEL_EXPONENTS
 from disctrack.disc import MA_2014
-from disctrack.frames import CAMERAS
 from disctrack.numbers import measured
-from disctrack.report.figures import Curve, Drawn, chart, dress
-from disctrack.report.palette import AMBER, BLUE, COLOURS, GREEN, INK, MUTED, RED
+from disctrack.report.figures import Curve, Drawn, chart
+from disctrack.report.palette import AMBER, BLUE, GREEN, INK, MUTED, RED
 
-LAST_STAGE = 0.3  # [s] shown again in an inset, as in the paper's figures 4 and 10
 TIME, X, Y = "time (s)", "x (mm)", "y (mm)"
 SQUARE = (5.4, 4.8)  # [in] of what lies in a plane
 
 
 def all_figures(analysis: Analysis) -> tuple[Drawn, ...]:
     """Every figure that this recording has something to show in."""
-    drawn = [pose_quality(analysis), *path_of_centre(analysis)]
+    drawn = [*path_of_centre(analysis)]
     if np.isfinite(analysis.series("psidot").value).sum() > 1:  # else no direction of the tilt is known anywhere
         drawn += [path_of_contact(analysis), *rates(analysis), *contact(analysis), *energy(analysis)]
-    drawn += [*nutation_count(analysis), *contact_locus(analysis)]
-    drawn += [*power_laws(analysis), *exponents_against_window(analysis)]
+    drawn += [*nutation_count(analysis), *contact_locus(analysis), *power_laws(analysis)]
     return tuple(sorted(drawn, key=lambda figure: figure.name))
 
 
@@ -41,49 +37,14 @@ def _level(time: Array, value: float, colour: str = MUTED, label: str = "", styl
     return Curve(time[[0, -1]], np.full(2, value), colour, label, style)
 
 
-def _inset(axes: Axes, curve: Curve, bounds: tuple[float, float, float, float]) -> None:
-    """The last stage once more, where it is a small part of the recording."""
-    known = np.flatnonzero(np.isfinite(curve.y))
-    if known.size < 10 or np.ptp(curve.x[known]) < 2.5 * LAST_STAGE:
-        return
-    last = known[curve.x[known] >= curve.x[known[-1]] - LAST_STAGE]
-    inset = axes.inset_axes(bounds)
-    dress(inset)
-    inset.plot(curve.x[last], curve.y[last], color=BLUE, linewidth=1.0)
-    inset.tick_params(labelsize=7)
-    inset.set_title(f"last {LAST_STAGE:g} s", fontsize=8, color=MUTED)
-
-
-def pose_quality(analysis: Analysis) -> Drawn:
-    """Quality per frame: reprojection error and sigma of the measured poses."""
-    trajectory, time = analysis.trajectory, analysis.trajectory.time
-    rms = trajectory.reprojection_rms_px.T
-    sigma = np.sqrt(np.diagonal(trajectory.pose_covariance, axis1=1, axis2=2)).T
-    axis = tuple(zip("xyz", (BLUE, RED, GREEN), strict=True))
-    figure = chart(
-        TIME,
-        ("reprojection\nrms (px)", [Curve(time, rms[i], COLOURS[name], name, ".") for i, name in enumerate(CAMERAS)]),
-        ("σ of one\npose (µm)", [Curve(time, 1e6 * s, c, name) for s, (name, c) in zip(sigma[:3], axis, strict=True)]),
-        ("σ of one\npose (mdeg)", [Curve(time, 1e3 * np.degrees(s), c, f"about {name}")
-                                   for s, (name, c) in zip(sigma[3:], axis, strict=True)]),
-        size=(7.2, 5.4),
-    )  # fmt: skip
-    for axes in figure.axes:
-        axes.set_ylim(bottom=0)
-    caption = "Before smoothing: misfit of the dots, and the noise of each pose along and about the table's axes."
-    return Drawn("03_pose_quality", "Quality per frame", caption, figure)
-
-
 def path_of_centre(analysis: Analysis) -> Iterator[Drawn]:
     """Paper's figures 4 and 5: nutation, and the centre from above."""
     motion, x = analysis.motion, 1e3 * analysis.motion.position
     known = np.flatnonzero(motion.known)
     theta = np.degrees(motion.euler[:, 1])
     sigma = np.degrees(motion.tilt_sigma)
-    curve = Curve(motion.time, theta, BLUE)
-    figure = chart(TIME, ("nutation θ (deg)", [curve]))
+    figure = chart(TIME, ("nutation θ (deg)", [Curve(motion.time, theta, BLUE)]))
     figure.axes[0].set_ylim(0, 1.25 * float(np.nanmax(theta)))
-    _inset(figure.axes[0], curve, (0.58, 0.56, 0.4, 0.36))
     caption = (
         f"From {theta[known[0]]:.3f} to {theta[known[-1]]:.3f} deg; the noise is {1e3 * np.nanmedian(sigma):.2f} mdeg "
         "after smoothing, thinner than the line."
@@ -106,16 +67,7 @@ def path_of_contact(analysis: Analysis) -> Drawn:
     path = Curve(contact[part, 0], contact[part, 1], BLUE, "contact point", ":")
     centre = Curve(1e3 * motion.position[part, 0], 1e3 * motion.position[part, 1], RED, "centre")
     figure = chart(X, (Y, [path, centre]), size=SQUARE, equal=True)
-    (axes,) = figure.axes
-    theta = motion.euler[part, 1]
-    lows = part[np.flatnonzero((theta[1:-1] < theta[:-2]) & (theta[1:-1] <= theta[2:])) + 1]
-    lows = lows if len(lows) <= 12 else lows[:0]  # more would hide the path
-    for i, low in enumerate(lows):
-        axes.annotate(f"P{i + 1}", contact[low], fontsize=8, color=INK, xytext=(4, 4), textcoords="offset points")
-        axes.plot(*contact[low], ".", color=INK, markersize=6)
-    axes.legend(frameon=False, fontsize=9, loc="upper left", bbox_to_anchor=(0.0, 1.02), ncols=2, borderaxespad=0.0)
-    marks = "; P marks the minima of the nutation." if len(lows) else "."
-    caption = f"Seen from above, {motion.time[part[0]]:.3f} to {motion.time[part[-1]]:.3f} s{marks}"
+    caption = f"Seen from above, {motion.time[part[0]]:.3f} to {motion.time[part[-1]]:.3f} s."
     return Drawn("06_centre_and_contact", "Centre and contact point", caption, figure)
 
 
@@ -193,9 +145,7 @@ def contact_locus(analysis: Analysis) -> Iterator[Drawn]:
 def rates(analysis: Analysis) -> Iterator[Drawn]:
     """Paper's figures 10 to 12: precession, rates about the axis and the vertical, and the adiabatic condition."""
     time, sigma = analysis.motion.time, analysis.series("psidot").sigma
-    psidot = _series(analysis, "psidot", BLUE)
-    figure = chart(TIME, ("precession rate (rad/s)", [psidot]))
-    _inset(figure.axes[0], psidot, (0.08, 0.52, 0.42, 0.38))
+    figure = chart(TIME, ("precession rate (rad/s)", [_series(analysis, "psidot", BLUE)]))
     caption = (
         f"Read off the angular velocity, band ± 3 σ. σ grows as 1 / sin θ: from {np.nanmin(sigma):.3f} to "
         f"{np.nanmax(sigma):.3f} rad/s."
@@ -274,29 +224,3 @@ def power_laws(analysis: Analysis) -> Iterator[Drawn]:
             f"s. Grey: {'; '.join(name for name, _ in MODEL_EXPONENTS)}."
         )
         yield Drawn(name, f"Power law of {title}", caption, figure)
-
-
-def exponents_against_window(analysis: Analysis) -> Iterator[Drawn]:
-    """How the exponents depend on the window."""
-    fits = [fit for fit in analysis.laws_by_window if fit.determined]
-    longest = np.array([fit.window[0] for fit in fits])
-    new = np.flatnonzero(np.append(True, np.diff(longest) > 1e-3)) if fits else longest  # others repeat the recording
-    if len(new) < 2:
-        return
-    figure = chart("window before t_f (s)", ("exponent", [_level(longest[new], 2 / 3, style="--")]))
-    (axes,) = figure.axes
-    for name, colour, label, scale in (
-        ("n_theta", BLUE, "nutation", 1),
-        ("n_energy", RED, "energy", 1),
-        ("n_psidot", GREEN, "-2 × precession rate", -2),
-    ):
-        exponents = [getattr(fits[i], name) for i in new]
-        value = [scale * e.value for e in exponents]
-        half = [abs(scale) * e.half for e in exponents]
-        axes.errorbar(longest[new], value, half, fmt="o-", color=colour, markersize=4, capsize=2, label=label)
-    axes.legend(frameon=False, fontsize=9)
-    caption = (
-        "The same exponents for windows of several lengths, t_f fitted anew in each; bars are 95 % confidence, dashed "
-        "2/3. All three would lie on one line if energy, nutation and precession kept to one law."
-    )
-    yield Drawn("16b_exponents_by_window", "Exponents against the window", caption, figure)

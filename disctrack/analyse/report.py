@@ -10,7 +10,6 @@ import numpy as np
 
 from disctrack.analyse.analysis import Analysis
 from disctrack.analyse.power_laws import MODEL_EXPONENTS, Exponent, PowerLaws
-from disctrack.analyse.propagation import DerivedSeries
 from disctrack.findings import Finding
 from disctrack.numbers import Measured, measured, unit_text
 from disctrack.report.blocks import Cell, Figures, Listing, Report, Section, Text
@@ -22,8 +21,6 @@ if TYPE_CHECKING:
 
 # Below, sin and cos of the nutation are its first terms to 2e-4, and the exponents of the models are those of the law.
 ASYMPTOTIC_BELOW = np.radians(1.0)
-RATES_SHOWN = ("psidot", "thetadot", "omega_3", "omega_z")
-CONTACT_SHOWN = ("slip_n", "slip_m", "force_z", "friction_needed", "total", "power")
 
 
 def report_of(
@@ -56,8 +53,8 @@ def report_of(
         ],
         blocks=[
             Text(_what_was_filmed(analysis)),
-            section("Quality of the measurement", ("03",), _status_table(analysis)),
-            section("Motion", ("04", "05", "06", "07", "10", "11"), _instants_table(analysis)),
+            Section("Quality of the measurement", [_status_table(analysis)]),
+            section("Motion", ("04", "05", "06", "07", "10", "11")),
             section("Contact", ("08", "09")),
             section("Energy", ("12", "13")),
             section("Scaling laws of the last stage", ("14", "15", "16"), *_exponents(analysis)),
@@ -119,21 +116,6 @@ def _status_table(analysis: Analysis) -> Listing:
     status = analysis.trajectory.frame_status
     rows = [(str(int(np.sum(status == state))), state.sentence) for state in FrameStatus if np.any(status == state)]
     return Listing(("frames", "status"), rows, "Frame status.")
-
-
-def _instants_table(analysis: Analysis) -> Listing:
-    known = np.flatnonzero(analysis.motion.known)
-    frames = known[[0, len(known) // 2, -1]] if known.size > 2 else known[:0]
-    shown = [analysis.series(name) for name in (*RATES_SHOWN, *CONTACT_SHOWN)]
-    rows = [(series.long_name, *(_at(series, frame) for frame in frames)) for series in shown]
-    times = [f"at {analysis.motion.time[frame]:.3f} s" for frame in frames]
-    caption = "Some quantities at three instants: value ± 1 σ, of the noise and of the calibration together."
-    return Listing(("quantity", *times), rows if len(frames) else (), caption)
-
-
-def _at(series: DerivedSeries, frame: int) -> str:
-    value, sigma, common = (float(a[frame]) for a in (series.value, series.sigma, series.sigma_calibration))
-    return measured(value, float(np.hypot(sigma, common)), series.unit)
 
 
 def _at_95(exponent: Exponent) -> Cell:

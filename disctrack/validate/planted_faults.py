@@ -45,7 +45,6 @@ PAIRS = 100  # from so many on gravity and frame rate are judged
 THETA_DEG = 9.0  # of the scene
 SIZES = (0.1, 1.0, 10.0)  # times what surprises nobody: just visible, ordinary, gross
 MOST_SIGMAS = 5.0  # of six components of a hundred poses chance alone reaches 4.1
-MOST_TIMES = 3.0  # an ordinary run
 Tree = dict[str, Any]  # of a recording.toml
 # Of a recording that may be spoilt, its declaration, which is written afterwards, and the size; returns the true poses,
 # where they are others
@@ -60,7 +59,6 @@ class Ground:
     rig: Path
     scene: Scene | None  # that it was rendered from
     q: Array  # (n, 6) by frame: the truth, or what is found
-    seconds: tuple[float, float]  # of processor time that its run takes, with this rig and with a calibration
 
 
 FaultCase = tuple[Ground, str, float]  # a recording, a fault, its size
@@ -85,17 +83,10 @@ class FaultOutcome:
     fault: str
     size: float
     unit: str
-    position: float  # largest error in its stated sigmas, and
-    rotation: float  # the same of the rotation vector; NaN where there is no pose
+    worst: float  # largest error of a pose in its stated sigmas; 0 without a pose
     told: str  # the finding that names the fault; in brackets, another one
     named: bool
     code: int  # of exit
-    times: float  # an ordinary run
-
-    @property
-    def worst(self) -> float:
-        """The larger of the two errors; 0 without a pose."""
-        return float(np.nanmax([self.position, self.rotation, 0.0]))
 
     @property
     def complaint(self) -> str:
@@ -105,7 +96,7 @@ class FaultOutcome:
             return f"{where}: exit code {self.code}"
         if self.worst > MOST_SIGMAS and not self.named:
             return f"{where}: {self.worst:.1f} sigma off, and not named ({self.told})"
-        return f"{where}: {self.times:.1f} times an ordinary run" if self.times > MOST_TIMES else ""
+        return ""
 
 
 def untouched(folder: Path, recordings: Sequence[Path], seed: int = 29) -> Iterator[Ground]:
@@ -121,13 +112,10 @@ def untouched(folder: Path, recordings: Sequence[Path], seed: int = 29) -> Itera
 
 
 def _ground(folder: Path, scene: Scene | None, q: Array | None) -> Ground:
-    code, findings, trajectory, _ = _run(folder)
+    code, findings, trajectory = _run(folder)
     if code or trajectory is None:
         raise DiscTrackError(f"{folder.name}: something is wrong before anything is planted: {_said(findings)}")
-    ground = Ground(folder, folder / "results" / "rig.h5", scene, trajectory.q if q is None else q, (1.0, 1.0))
-    again = folder.with_name(f"{folder.name} again")
-    declare(again, _copied(read_recording(folder), again, ground.rig))
-    return replace(ground, seconds=(_run(again)[-1], _run(folder)[-1]))
+    return Ground(folder, folder / "results" / "rig.h5", scene, trajectory.q if q is None else q)
 
 
 def fault_cases(grounds: Sequence[Ground], names: Sequence[str] = (), sizes: slice = slice(None)) -> list[FaultCase]:
@@ -149,56 +137,40 @@ def plant_and_run(case: FaultCase) -> FaultOutcome:
         tree = _copied(read_recording(ground.recording), folder, None if planting.of_views else ground.rig)
         q = planting.change(folder, tree, size)
         declare(folder, tree)
-        code, findings, trajectory, seconds = _run(folder)
+        code, findings, trajectory = _run(folder)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
-    position, rotation = _in_sigmas(trajectory, ground.q if q is None else q)
+    worst = _in_sigmas(trajectory, ground.q if q is None else q)
     naming = [f for f in findings if f.kind in planting.named_by]
     told = _said(naming) if naming else f"({_said(findings)})" if findings else ""
-    of = ground.recording.name, fault, size, planting.unit
-    times = seconds / ground.seconds[planting.of_views]
-    return FaultOutcome(*of, position, rotation, told, bool(naming), code, times)
+    return FaultOutcome(ground.recording.name, fault, size, planting.unit, worst, told, bool(naming), code)
 
 
-def _run(folder: Path) -> tuple[int, list[Finding], Trajectory | None, float]:
-    """Exit code, findings, poses and processor time [s] of `disctrack run`; why it was refused is a finding, too."""
-    before = os.times()
+def _run(folder: Path) -> tuple[int, list[Finding], Trajectory | None]:
+    """Exit code, findings and poses of `disctrack run`; why it was refused is a finding, too."""
     words = ["run", str(folder), "--json", "--no-figures", "--no-video", "--overwrite"]
     ended = subprocess.run([sys.executable, "-m", "disctrack", *words], capture_output=True, text=True, check=False)
-    after = os.times()
-    seconds = sum(after[2:4]) - sum(before[2:4])
     try:
         found = [finding_from_json(finding) for finding in loads(ended.stdout)["findings"]]
     except JSONDecodeError:
         why = ended.stderr.strip()[-300:].replace(f"{folder.parent}{os.sep}", "")
-        return ended.returncode, [Finding(Kind.OTHER, Severity.REFUSAL, why)], None, seconds
+        return ended.returncode, [Finding(Kind.OTHER, Severity.REFUSAL, why)], None
     with catch_warnings(action="ignore", category=DoubtWarning):
-        trajectory = read_trajectory(folder / "results" / "trajectory.h5")
-    return ended.returncode, found, trajectory, seconds
+        return ended.returncode, found, read_trajectory(folder / "results" / "trajectory.h5")
 
 
 def _said(findings: Sequence[Finding]) -> str:
-    """The gravest finding in short: its kind with its number; a refusal in its own words."""
-    if not findings:
-        return ""
-    finding = findings[0]
-    if finding.severity == Severity.REFUSAL or finding.kind == Kind.CALIBRATION:
-        return finding.text.replace("|", "/").replace("\n", " ")[:120]
-    values = [str(number) for number in finding.numbers.values()]
-    values += [
-        f"{remedy.key} {remedy.fits}" for remedy in finding.remedies if remedy.fits and "centres" not in remedy.key
-    ]
-    return f"{finding.kind.value}{f': {values[0]}' if values else ''}, {finding.grave}"
+    """The gravest finding in short."""
+    return "".join(f"{f.kind.value}, {f.grave}: {f.text}"[:160].replace("\n", " ") for f in findings[:1])
 
 
-def _in_sigmas(trajectory: Trajectory | None, q: Array) -> tuple[float, float]:
-    """Largest errors of position and rotation in their stated sigmas."""
+def _in_sigmas(trajectory: Trajectory | None, q: Array) -> float:
+    """Largest error of a pose in its stated sigmas."""
     if trajectory is None or not trajectory.measured.any():
-        return float("nan"), float("nan")
+        return 0.0
     error = compare(trajectory, q[np.minimum(trajectory.frame, len(q) - 1)])
     variance = np.diagonal(error.covariance + error.calibration_covariance, axis1=1, axis2=2)
-    sigmas = np.abs(error.error / np.sqrt(variance))[error.found]
-    return float(sigmas[:, :3].max()), float(sigmas[:, 3:].max())
+    return float(np.abs(error.error / np.sqrt(variance))[error.found].max())
 
 
 def plantings(ground: Ground) -> dict[str, Planting]:
@@ -308,8 +280,8 @@ def _files(**orders: Callable[[list[bytes], int], list[bytes]]) -> Change:
 
 
 def _lost(files: list[bytes], k: int) -> list[bytes]:
-    middle = len(files) // 2
-    return files[:middle] + files[middle + k :]
+    """In the middle."""
+    return files[: len(files) // 2] + files[len(files) // 2 + k :]
 
 
 def _again(files: list[bytes], k: int) -> list[bytes]:
@@ -332,25 +304,19 @@ def _damaged(files: list[bytes], k: int) -> list[bytes]:
     return files[:-k] + [file[: len(file) // 2] for file in files[-k:]]
 
 
-def _backwards(files: list[bytes], k: int) -> list[bytes]:
-    return files[::-1]
-
-
-def _several(files: list[bytes], k: int) -> list[bytes]:
-    return k * files
-
-
 def _exchanged(folder: Path, tree: Tree, size: float) -> None:
     cameras = tree["cameras"]
     cameras["left"], cameras["right"] = cameras["right"], cameras["left"]
 
 
-def _images(change: Callable[[NDArray, float, float], NDArray], *folders: str) -> Change:
-    """What becomes of images, from the share of the recording before each, and the size."""
+def _images(
+    change: Callable[[NDArray, float], NDArray], *folders: str, course: Callable[[float], float] = lambda share: 1.0
+) -> Change:
+    """What becomes of images by the size, of which each has as much as the share of the recording before it tells."""
 
     def of_all(folder: Path, tree: Tree, size: float) -> None:
         for name in folders:
-            redrawn(folder / name, lambda image, share: change(image, share, size))
+            redrawn(folder / name, lambda image, share: change(image, size * course(share)))
 
     return of_all
 
@@ -363,23 +329,15 @@ def _moved(image: NDArray, by: float) -> NDArray:
     return moved if by else image
 
 
-def _knocked(image: NDArray, share: float, size: float) -> NDArray:
-    return _moved(image, size * (share > 0.5))
+def _mirrored(image: NDArray, size: float) -> NDArray:
+    return cv2.flip(image, 1)
 
 
-def _drifting(image: NDArray, share: float, size: float) -> NDArray:
-    return _moved(image, size * share)
+def _negative(image: NDArray, size: float) -> NDArray:
+    return cv2.bitwise_not(image)
 
 
-def _mirrored(image: NDArray, share: float, size: float) -> NDArray:
-    return np.ascontiguousarray(image[:, ::-1])
-
-
-def _negative(image: NDArray, share: float, size: float) -> NDArray:
-    return np.asarray(np.iinfo(image.dtype).max - image)
-
-
-def _lit(image: NDArray, share: float, size: float) -> NDArray:
+def _lit(image: NDArray, size: float) -> NDArray:
     """By a lamp's reflex of size grey values of 8 bits at most."""
     height, width = image.shape
     y, x = np.mgrid[:height, :width]
@@ -412,9 +370,9 @@ CHANGES = {
     "images repeated by one": Planting((1, 3, 10), "images", _REPEATED, _files(right=_again)),
     "files damaged": Planting((1, 5, 50), "files", (Kind.UNREADABLE,), _files(right=_damaged)),
     "glare": Planting((3, 30, 300), "grey values", (Kind.LIGHT, Kind.ONE_SIDED, *MOVED), _images(_lit, "right")),
-    "camera knocked": Planting((0.02, 0.2, 2.0), "px", MOVED, _images(_knocked, "right")),
-    "camera drifts": Planting((0.03, 0.3, 3.0), "px", MOVED, _images(_drifting, "right")),
-    "reversed": Planting((1,), "", (Kind.REVERSED,), _files(left=_backwards, right=_backwards)),
+    "camera knocked": Planting((0.02, 0.2, 2.0), "px", MOVED, _images(_moved, "right", course=round)),
+    "camera drifts": Planting((0.03, 0.3, 3.0), "px", MOVED, _images(_moved, "right", course=float)),
+    "reversed": Planting((1,), "", (Kind.REVERSED,), _files(**dict.fromkeys(CAMERAS, lambda files, k: files[::-1]))),
     "exchanged": Planting((1,), "", (Kind.EXCHANGED,), _exchanged),
     "mirrored": Planting((1,), "", (Kind.MIRRORED,), _images(_mirrored, "right")),
     "radius": _wrong("disc", "radius_mm", Kind.RADIUS, *HEIGHT),
@@ -424,7 +382,7 @@ CHANGES = {
     "square": _wrong("calibration", "square_mm", Kind.SQUARE),
     "negative views": Planting((1,), "", _CALIBRATED, _images(_negative, *_VIEWS), of_views=True),
     "repeated views": Planting(
-        (2, 3, 6), "times", _CALIBRATED, _files(**dict.fromkeys(_VIEWS, _several)), of_views=True
+        (2, 3, 6), "times", _CALIBRATED, _files(**dict.fromkeys(_VIEWS, lambda files, k: k * files)), of_views=True
     ),
     "views late in one": Planting(
         (1, 2, 4), "views", _CALIBRATED, _files(board_left=_last_lost, board_right=_first_lost), of_views=True
@@ -457,8 +415,7 @@ def _limits(outcomes: Sequence[FaultOutcome]) -> Table:
             planted = [o for o in of_fault if o.make == make]
             unnamed = [o for o in planted if not o.named]
             named = [o.size for o in planted if all(o.size > other.size for other in unnamed)]
-            worst = max((o.worst for o in unnamed), default=np.nan)
-            row += [min(named, default=np.nan), worst]
+            row += [min(named, default=np.nan), max((o.worst for o in unnamed), default=np.nan)]
         rows.append(row)
     head = ["fault", "unit", *(f"{make}: {what}" for make in makes for what in ("named from", "unnamed, sigma"))]
     note = "Named at this size and at all larger ones that were planted. Unnamed: the largest error of a pose in its "
