@@ -2,23 +2,17 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.cameras.camera import StereoRig
 from calibration.kit.arrays import Array, Mask
-from calibration.rig_file import read_rig_group, write_rig_group
+from calibration.rig_file import write_rig_group
 from disctrack.disc import Disc
-from disctrack.errors import OutputError, RigFileError
 from disctrack.frames import COORDINATES, rotation_from_euler
 from disctrack.synthetic.cameras import image_of, views_of
 from disctrack.synthetic.description import Scene, scene_toml
-
-SCHEMA = "disctrack truth"
-SCHEMA_VERSION = 2
 
 
 @dataclass(frozen=True)
@@ -49,64 +43,31 @@ class Truth:
         return np.stack(pixels, axis=1)
 
 
-_POSE = ", ".join(f"{c} {'m' if c in 'xyz' else 'rad'}" for c in COORDINATES)
-# Of every array of a Truth: where it lies in the file, unit and meaning
-_DATASETS = {
-    "time": ("s", "mid exposure of the left camera"),
-    "q": (_POSE, "pose at time, world frame = table"),
-    "qdot": ("m/s, rad/s", "rates of q at time"),
-    "q_right": (_POSE, "pose at the right camera's mid exposure"),
-    "disc/paper_centre_body": ("m", "centre of the paper on the upper face"),
-    "disc/markers_printed": ("1", "0: the dot has come off"),
-    "board/R_world_board": ("1", "orientation of the board in the calibration views"),
-    "board/t_world_board": ("m", "lower left inner corner in the calibration views"),
-}
-_CENTRES = "disc/marker_centres_body"
-_SIZES = ("radius", "half_thickness", "mass", "marker_diameter")  # of the disc
-_RIGS = ("rig", "rig_while_filming")
-
-
 def write_truth(path: Path, truth: Truth, scene: Scene) -> None:
     """Write `truth` and the scene it was rendered from."""
+    pose, disc = ", ".join(f"{c} {'m' if c in 'xyz' else 'rad'}" for c in COORDINATES), truth.disc
+    datasets = (
+        ("time", truth.time, "s", "mid exposure of the left camera"),
+        ("q", truth.q, pose, "pose at time, world frame = table"),
+        ("qdot", truth.qdot, "m/s, rad/s", "rates of q at time"),
+        ("q_right", truth.q_right, pose, "pose at the right camera's mid exposure"),
+        ("markers_px", truth.markers_px, "px", "images of the dots' own centres (frame, camera, marker, xy)"),
+        ("disc/paper_centre_body", truth.paper_centre_body, "m", "centre of the paper on the upper face"),
+        ("disc/markers_printed", truth.markers_printed.astype(np.uint8), "1", "0: the dot has come off"),
+        ("disc/marker_centres_body", disc.marker_centres_body, "m", "true centres of the dots"),
+        ("disc/declared_marker_centres_body", scene.declared_disc.marker_centres_body, "m", "as in recording.toml"),
+        ("board/R_world_board", truth.R_world_board, "1", "orientation of the board in the calibration views"),
+        ("board/t_world_board", truth.t_world_board, "m", "lower left inner corner in the calibration views"),
+    )
     with h5py.File(path, "w") as file:
-        file.attrs["schema"], file.attrs["schema_version"] = SCHEMA, SCHEMA_VERSION
+        file.attrs["schema"], file.attrs["schema_version"] = "disctrack truth", 2
         file.attrs["scene"] = scene_toml(scene)  # renders the same recording again
         file.attrs["frame_rate_hz"] = truth.frame_rate
-        for place, described in _DATASETS.items():
-            values = np.asarray(getattr(truth, Path(place).name))
-            _put(file, place, values.astype(np.uint8) if values.dtype == bool else values, *described)
-        _put(file, "markers_px", truth.markers_px, "px", "images of the dots' own centres (frame, camera, marker, xy)")
-        _put(file, _CENTRES, truth.disc.marker_centres_body, "m", "true centres of the dots")
-        declared = scene.declared_disc.marker_centres_body
-        _put(file, "disc/declared_marker_centres_body", declared, "m", "as in recording.toml")
-        file["disc"].attrs.update({name: getattr(truth.disc, name) for name in _SIZES})
-        for name in _RIGS:
+        for place, values, units, text in datasets:
+            data = file.create_dataset(place, data=values, compression="gzip" if values.size > 1000 else None)
+            data.attrs["units"], data.attrs["description"] = units, text
+        sizes = ("radius", "half_thickness", "mass", "marker_diameter")
+        file["disc"].attrs.update({name: getattr(disc, name) for name in sizes})
+        for name in ("rig", "rig_while_filming"):
             write_rig_group(file.create_group(name), getattr(truth, name))
         file.create_group("effects").attrs.update(truth.effects)
-
-
-def _put(file: h5py.File, name: str, values: NDArray[Any], units: str, text: str) -> None:
-    data = file.create_dataset(name, data=values, compression="gzip" if values.size > 1000 else None)
-    data.attrs["units"], data.attrs["description"] = units, text
-
-
-def read_truth(path: str | Path) -> Truth:
-    """Truth of a file that `write_truth` wrote; raises OutputError for anything else."""
-    try:
-        with h5py.File(path, "r") as file:
-            if file.attrs.get("schema") != SCHEMA:
-                raise OutputError(
-                    f"{path}: schema {file.attrs.get('schema')!r}; expected {SCHEMA!r}, as `render` writes"
-                )
-            found: dict[str, Any] = {Path(place).name: file[place][:] for place in _DATASETS}
-            found["markers_printed"] = found["markers_printed"].astype(bool)
-            found |= {name: read_rig_group(file[name]) for name in _RIGS}
-            sizes = {name: float(file["disc"].attrs[name]) for name in _SIZES}
-            return Truth(
-                **found,
-                frame_rate=float(file.attrs["frame_rate_hz"]),
-                disc=Disc(marker_centres_body=file[_CENTRES][:], **sizes),
-                effects={name: float(value) for name, value in file["effects"].attrs.items()},
-            )
-    except (OSError, KeyError, RigFileError) as error:
-        raise OutputError(f"{path}: not a truth file ({error}); render the recording again") from error

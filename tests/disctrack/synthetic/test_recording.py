@@ -11,6 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial import ConvexHull
 
 from calibration import find_corners
+from calibration.rig_file import read_rig_group
 from disctrack.commands.sample import SCENE
 from disctrack.disc import MA_2014
 from disctrack.errors import OutputError, SceneError
@@ -38,7 +39,6 @@ from disctrack.synthetic.motion import motion_of
 from disctrack.synthetic.optics import corner_rays, lens_rays
 from disctrack.synthetic.recording import recording_toml, write_recording
 from disctrack.synthetic.sensor import digitise, sensor_pattern
-from disctrack.synthetic.truth import SCHEMA, read_truth
 from tests.rendering import expected_disc, render_board, render_disc
 
 PLAIN = Scene(
@@ -414,19 +414,22 @@ def test_recording_round_trip(scene, tmp_path):
     assert recording.table.board_thickness == pytest.approx(0.003)
     assert images(tmp_path / "r", "left").shape == (4, 256, 256)
     assert len(list((tmp_path / "r/calibration/right").iterdir())) == 3
-    again = read_truth(tmp_path / "r/truth.h5")
-    assert_array_equal(again.q, truth.q)
-    assert_allclose(again.q, START + truth.time[:, None] * VELOCITY, atol=1e-12)
-    assert_allclose(again.qdot, np.tile(VELOCITY, (4, 1)), atol=1e-9)
     with h5py.File(tmp_path / "r/truth.h5") as file:
+        for name in ("time", "q", "qdot", "q_right", "markers_px"):
+            assert_array_equal(file[name], getattr(truth, name))
+        assert_array_equal(file["disc/marker_centres_body"], truth.disc.marker_centres_body)
+        assert file["disc"].attrs["radius"] == truth.disc.radius
+        assert_array_equal(file["board/t_world_board"], truth.t_world_board)
+        assert_array_equal(read_rig_group(file["rig"]).R_left_world, truth.rig.R_left_world)
         assert scene_from_tree(tomllib.loads(file.attrs["scene"])).board == scene.board
-    assert_allclose(again.markers_px, truth.markers_px, atol=1e-9)
-    assert_allclose(again.markers_px, truth.rig.project(markers_world(again)), atol=1e-9)
+    assert_allclose(truth.q, START + truth.time[:, None] * VELOCITY, atol=1e-12)
+    assert_allclose(truth.qdot, np.tile(VELOCITY, (4, 1)), atol=1e-9)
+    assert_allclose(truth.markers_px, truth.rig.project(markers_world(truth.q, truth.disc)), atol=1e-9)
 
 
-def markers_world(truth):
-    R = rotation_from_euler(*truth.q[:, 3:].T)
-    return truth.disc.marker_centres_body @ np.swapaxes(R, -1, -2) + truth.q[:, None, :3]
+def markers_world(q, disc):
+    R = rotation_from_euler(*q[:, 3:].T)
+    return disc.marker_centres_body @ np.swapaxes(R, -1, -2) + q[:, None, :3]
 
 
 def test_board_lies_with_the_side_of_dark_corners_on_the_left(scene, tmp_path):
@@ -470,26 +473,27 @@ def test_same_scene_gives_the_same_files_on_any_number_of_threads_and_another_se
     other = rig_of(replace(scene, seed=2))
     for mine, theirs in zip(first.rig.cameras, other.cameras, strict=True):
         assert (mine.parameters[:4] != theirs.parameters[:4]).all()
-    assert (np.abs(other.project(markers_world(first)) - first.markers_px) > 1e-3).all()
+    assert (np.abs(other.project(markers_world(first.q, first.disc)) - first.markers_px) > 1e-3).all()
 
 
 def shift_of_faulty_dots(scene, tmp_path, faults, camera):
-    """Dots of the first frame with the faults, minus where they would be without; checks that the images agree."""
+    """Dots of the first frame with the faults, minus where they would be without; the truths of both.
+
+    Checks that the images agree.
+    """
     clean = write_recording(tmp_path / "clean", scene)
     truth = write_recording(tmp_path / "faulty", replace(scene, faults=faults))
     measured = dot_offsets_px(tmp_path / "faulty", camera, truth.markers_px[0, camera])
     assert np.abs(measured).max() < NOISE_PX  # the truth knows of it
-    return truth.markers_px[0, camera] - clean.markers_px[0, camera]
+    return truth.markers_px[0, camera] - clean.markers_px[0, camera], truth, clean
 
 
 @pytest.mark.statistical
 def test_delayed_camera_sees_the_disc_later(scene, tmp_path):
-    shift = shift_of_faulty_dots(scene, tmp_path, Faults(right_delay_s=1e-3), camera=1)
-    truth = read_truth(tmp_path / "faulty/truth.h5")
+    shift, truth, clean = shift_of_faulty_dots(scene, tmp_path, Faults(right_delay_s=1e-3), camera=1)
     assert_allclose(truth.q_right - truth.q, np.tile(VELOCITY * 1e-3, (4, 1)), atol=1e-12)
     assert np.abs(shift).max() > 0.5
     # the right camera's first frame is what the left's clock calls frame 1
-    clean = read_truth(tmp_path / "clean/truth.h5")
     assert_allclose(truth.markers_px[0, 1], clean.markers_px[1, 1], atol=1e-9)
 
 
@@ -526,8 +530,7 @@ def changed(camera, from_centre):
 )
 def test_what_happened_to_a_camera_shifts_its_picture(scene, tmp_path, side, fault, expected, tolerance):
     faults = Faults(**{("left", "right")[side]: fault})
-    shift = shift_of_faulty_dots(scene, tmp_path, faults, side)
-    clean = read_truth(tmp_path / "clean/truth.h5")
+    shift, _, clean = shift_of_faulty_dots(scene, tmp_path, faults, side)
     camera = clean.rig.cameras[side]
     from_centre = clean.markers_px[0, side] - [camera.cx, camera.cy]
     assert (np.abs(shift - expected(camera, from_centre)) <= tolerance).all()
@@ -537,8 +540,7 @@ def test_what_happened_to_a_camera_shifts_its_picture(scene, tmp_path, side, fau
 def test_misprinted_dots_and_pattern_off_centre_shift_together(scene, tmp_path):
     misprint = tuple((0.1 * k, -0.1) for k in range(6))
     faults = Faults(misprint_mm=misprint, pattern_offset_mm=(0.2, 0.3))
-    shift_of_faulty_dots(scene, tmp_path, faults, camera=0)
-    truth = read_truth(tmp_path / "faulty/truth.h5")
+    _, truth, _ = shift_of_faulty_dots(scene, tmp_path, faults, camera=0)
     moved = truth.disc.marker_centres_body - scene.declared_disc.marker_centres_body
     assert_allclose(moved[:, :2] * 1e3, np.array(misprint) + np.array([0.2, 0.3]), atol=1e-12)
     assert_allclose(truth.paper_centre_body, [2e-4, 3e-4])
@@ -594,13 +596,6 @@ def test_a_render_that_fails_leaves_nothing_behind_and_no_truth_is_replaced(scen
     assert (tmp_path / "mine.h5").read_text() == "data"
 
 
-def test_truth_of_another_file_is_refused(tmp_path):
-    with h5py.File(tmp_path / "x.h5", "w") as file:
-        file.attrs["schema"] = "something else"
-    with pytest.raises(OutputError, match=SCHEMA):
-        read_truth(tmp_path / "x.h5")
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -637,12 +632,14 @@ def test_a_lens_that_folds_is_refused():
 
 def test_sample_clip_is_what_its_scene_renders(sample_clip):
     scene = load_scene(SCENE)
-    truth = read_truth(sample_clip.parent / "truth" / "clip.h5")
+    with h5py.File(sample_clip.parent / "truth" / "clip.h5") as file:
+        time, q, markers_px = (file[name][()] for name in ("time", "q", "markers_px"))
+    rig, disc = rig_of(scene), scene.declared_disc
     assert (sample_clip / "recording.toml").read_text() == recording_toml(scene)
-    assert_allclose(rig_of(scene).project(markers_world(truth)), truth.markers_px, atol=1e-9)
-    assert_allclose(motion_of(scene).pose(truth.time), truth.q, atol=1e-9)  # integrator: 1e-11 relative
+    assert_allclose(rig.project(markers_world(q, disc)), markers_px, atol=1e-9)
+    assert_allclose(motion_of(scene).pose(time), q, atol=1e-9)  # integrator: 1e-11 relative
     stored = np.stack([images(sample_clip, name, 300)[-1] for name in ("left", "right")]).astype(float)
-    again = expected_disc(truth.q[-1], truth.rig, truth.disc, scene)[0]
+    again = expected_disc(q[-1], rig, disc, scene)[0]
     # grey levels: noise of variance 0.04 + 190 / 400 + 1 / 12 on the paper and less elsewhere; the last frame's motion
     # during 0.2 ms is 0.05 px and moves edges by less than the noise
     assert np.std(stored - again) < np.sqrt(0.04 + 190 / 400 + 1 / 12)
