@@ -71,6 +71,11 @@ class Disc(Brief):
         """r_OA = -r e2 - h e3 (..., 3) [m] from the centre to the contact, in the axes of e2 and e3 (..., 3)."""
         return -self.radius * e2 - self.half_thickness * e3
 
+    def times_inertia(self, vector: Array, e3: Array) -> Array:
+        """J v (..., 3) of vectors (..., 3) in the axes of e3 (..., 3)."""
+        along = np.sum(vector * e3, axis=-1)[..., None] * e3
+        return self.moment_diametral * vector + (self.moment_axial - self.moment_diametral) * along
+
     @property
     def n_markers(self) -> int:
         """Number of dots on the upper face."""

@@ -1,15 +1,15 @@
 """From a trajectory to the physics: motion, contact, energy and scaling laws."""
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
 from calibration.kit.arrays import Array
 from calibration.kit.brief import Brief
-from disctrack.analyse.contact import Contact, analyse_contact
+from disctrack.analyse.contact import Circle, RollingOnset, locus_circle, rolling_onset
 from disctrack.analyse.derivatives import GROUP_NAMES, MeasuredMotion, differentiate
-from disctrack.analyse.energy import TOTAL, Energy, analyse_energy
+from disctrack.analyse.energy import TOTAL, Energy, energy_of
 from disctrack.analyse.power_laws import (
     WINDOW,
     NutationCount,
@@ -18,7 +18,7 @@ from disctrack.analyse.power_laws import (
     fit_power_laws,
     power_law_end,
 )
-from disctrack.analyse.propagation import RATES, DerivedSeries, propagate, rates
+from disctrack.analyse.quantities import ALL, COLUMN, DerivedSeries, propagate
 from disctrack.errors import AnalysisError
 from disctrack.findings import Finding, Kind, Severity, of_kind
 from disctrack.numbers import measured
@@ -40,8 +40,9 @@ class Analysis(Brief):
 
     trajectory: Trajectory
     motion: MeasuredMotion
-    rates: tuple[DerivedSeries, ...]
-    contact: Contact
+    derived: Mapping[str, DerivedSeries]  # by name, all of QUANTITIES
+    onset: RollingOnset
+    circle: Circle
     energy: Energy
     laws: PowerLaws  # of the last stage
     laws_by_window: tuple[PowerLaws, ...]  # one per entry of WINDOWS
@@ -52,7 +53,7 @@ class Analysis(Brief):
         """What a glance should tell (`Brief`)."""
         told = {
             "frames": f"{int(self.motion.known.sum())} of {len(self.motion)}",
-            "contact": self.contact.onset.verdict,
+            "contact": self.onset.verdict,
             "energy lost": measured(self.energy.loss, self.energy.loss_sigma, "J"),
         }
         laws = self.laws
@@ -62,10 +63,7 @@ class Analysis(Brief):
 
     def series(self, name: str) -> DerivedSeries:
         """The derived quantity of this name."""
-        for item in (*self.rates, *self.contact.series, *self.energy.series):
-            if item.name == name:
-                return item
-        raise KeyError(name)
+        return self.derived[name]
 
 
 def analyse(trajectory: Trajectory, window: float = WINDOW, circle_duration: float = CIRCLE_DURATION) -> Analysis:
@@ -85,29 +83,27 @@ def analyse(trajectory: Trajectory, window: float = WINDOW, circle_duration: flo
     if looked_for.size not in (0, len(trajectory)):
         trajectory = part(trajectory, slice(int(looked_for[0]), int(looked_for[-1]) + 1))
     motion = differentiate(trajectory)
-    found = propagate(motion, rates)
-    until, sense = _end_of_rolling(motion, found.value[:, 0])
-    contact = analyse_contact(motion, circle_duration, until)
-    if contact.onset.low > motion.time[motion.known][0]:  # the acceleration jumps where slip ends
-        onset = contact.onset
-        del motion, contact, found  # the new ones need not stand beside them
+    found = propagate(motion)
+    until, sense = _end_of_rolling(motion, found.value[:, COLUMN["psidot"]])
+    onset = rolling_onset(found, until)
+    if onset.low > motion.time[motion.known][0]:  # the acceleration jumps where slip ends
+        del motion, found  # the new ones need not stand beside them
         motion = differentiate(trajectory, breaks=(onset.time,))
-        contact = replace(analyse_contact(motion, circle_duration, until), onset=onset)
-        found = propagate(motion, rates)
-    energy = analyse_energy(motion)
-    psi, psidot = sense * motion.euler[:, 0], sense * found.value[:, 0]
-    data = (motion.time, psi, motion.euler[:, 1], psidot, energy.propagated.value[:, TOTAL])
+        found = propagate(motion)
+    psi, psidot = sense * motion.euler[:, 0], sense * found.value[:, COLUMN["psidot"]]
+    data = (motion.time, psi, motion.euler[:, 1], psidot, found.value[:, TOTAL])
     laws = fit_power_laws(*data, window=window)
     return Analysis(
         trajectory=trajectory,
         motion=motion,
-        rates=found.series(RATES),
-        contact=contact,
-        energy=energy,
+        derived={item.name: item for item in found.series(ALL)},
+        onset=onset,
+        circle=locus_circle(found, circle_duration, until),
+        energy=energy_of(found),
         laws=laws,
         laws_by_window=tuple(fit_power_laws(*data, window=float(w)) for w in WINDOWS),
         nutation_count=count_nutation(psi, motion.euler[:, 1], motion.tilt_sigma, motion.disc),
-        findings=of_kind(Kind.ANALYSIS, Severity.WARNING, _findings(trajectory, motion, contact)),
+        findings=of_kind(Kind.ANALYSIS, Severity.WARNING, _findings(trajectory, motion, onset)),
     )
 
 
@@ -119,7 +115,7 @@ def _end_of_rolling(motion: MeasuredMotion, psidot: Array) -> tuple[float, float
     return power_law_end(motion.time, sense * motion.euler[:, 0], sense * psidot), sense
 
 
-def _findings(trajectory: Trajectory, motion: MeasuredMotion, contact: Contact) -> Iterator[str]:
+def _findings(trajectory: Trajectory, motion: MeasuredMotion, onset: RollingOnset) -> Iterator[str]:
     """What an experimenter should know before using the numbers, beyond what the measurement's own findings say."""
     frames = trajectory.looked_for
     n, missing, unknown = (int(rows.sum()) for rows in (frames, frames & ~motion.measured, frames & ~motion.known))
@@ -134,7 +130,6 @@ def _findings(trajectory: Trajectory, motion: MeasuredMotion, contact: Contact) 
                 f"the scatter of the {name} is {np.sqrt(scale):.2f} times what the tracker states; the sigmas here "
                 "follow the scatter"
             )
-    onset = contact.onset
     if not onset.probability >= 0.5:
         return
     if onset.low > motion.time[motion.known][0]:

@@ -1,9 +1,4 @@
-"""What happens where the disc touches the table: slip, locus, forces, and since when it rolls.
-
-A is the lowest point of the lower edge, r_OA = -r e2 - h e3. Components are along n0 = e1, m0 = k x n0 and k.
-Against the printed equation (2.3) of Ma et al. 2014: its first line is the n0 component and its second the m0 component
-(the labels are exchanged), and its third line has r thetadot cos theta, because z = r sin theta + h cos theta.
-"""
+"""What the contact tells: since when the disc rolls, and the circle that its locus runs on."""
 
 from dataclasses import dataclass
 
@@ -11,26 +6,9 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from calibration.kit.arrays import Array
-from calibration.kit.brief import Outline
-from disctrack.analyse.derivatives import K, MeasuredMotion, MotionState
-from disctrack.analyse.propagation import SIGMAS, DerivedSeries, Propagated, propagate, rates
-from disctrack.disc import Disc
+from disctrack.analyse.quantities import SIGMAS, Propagated, from_to
 
-CONTACT = (
-    ("contact_x", "m", "contact point, x"),
-    ("contact_y", "m", "contact point, y"),
-    ("contact_z", "m", "lowest point of the edge above the table"),
-    ("slip_n", "m s-1", "velocity of the material point at the contact along n0 = e1"),
-    ("slip_m", "m s-1", "velocity of the material point at the contact along m0 = k x n0"),
-    ("slip_z", "m s-1", "velocity of the material point at the contact, upwards"),
-    ("locus_n", "m s-1", "velocity of the point of touch along n0"),
-    ("locus_m", "m s-1", "velocity of the point of touch along m0"),
-    ("force_n", "N", "contact force along n0"),
-    ("force_m", "N", "contact force along m0"),
-    ("force_z", "N", "normal contact force"),
-    ("friction_needed", "1", "horizontal over normal contact force"),
-)
-SLIP = slice(3, 5)
+SLIP, PLACE = from_to("slip_n", "slip_m"), from_to("contact_x", "contact_y")
 
 # What a calibrated radius, thickness and table (1e-4 each) leave of slip at the rates of a rolling disc (1 to 5 m/s at
 # the edge) is a few tenths of a millimetre per second: slip below this is rolling for every purpose.
@@ -67,57 +45,14 @@ class Circle:
     end: float  # [s]
 
 
-def contact_quantities(state: MotionState, disc: Disc, gravity: float) -> Array:
-    """All of CONTACT, (n, 12).
-
-    slip : of the disc's own point at the contact, v_O + omega x r_OA, eq. (2.3); locus : of the moving point of touch,
-    v_O + Omega_R x r_OA, where Omega_R = thetadot e1 + psidot k turns the nodal frame, in which r_OA is constant
-    force : of the table, from Newton's law with nothing else acting, eq. (2.6)
-    """
-    n0, e2, e3 = state.axes()
-    r_OA, m0 = disc.arm_to_contact(e2, e3), np.cross(K, n0)
-    psidot, thetadot = rates(state).T[:2, :, None]
-    slip = state.velocity + np.cross(state.omega_world, r_OA)
-    locus = state.velocity + np.cross(thetadot * n0 + psidot * K, r_OA)
-    force = disc.mass * (state.acceleration + gravity * K)
-    (slip_n, slip_m), (locus_n, locus_m), (force_n, force_m) = (
-        [np.sum(vector * axis, axis=1) for axis in (n0, m0)] for vector in (slip, locus, force)
-    )
-    needed = np.where(force[:, 2] > 0, np.hypot(force_n, force_m) / np.abs(force[:, 2]), np.nan)
-    along = slip_n, slip_m, slip[:, 2], locus_n, locus_m, force_n, force_m, force[:, 2], needed
-    return np.column_stack([state.position + r_OA, *along])
-
-
-@dataclass(frozen=True, repr=False)
-class Contact(Outline):
-    """Contact of a recording."""
-
-    series: tuple[DerivedSeries, ...]
-    onset: RollingOnset
-    circle: Circle
-    propagated: Propagated
-
-
-def analyse_contact(motion: MeasuredMotion, circle_duration: float = 0.6, until: float = np.inf) -> Contact:
-    """Contact point, slip, locus, forces; onset of rolling; circle through the locus of the last `circle_duration`.
-
-    until : end of the rolling motion [s]; a disc that is being stopped, or lies still, says nothing about rolling
-    """
-    found = propagate(motion, lambda state: contact_quantities(state, motion.disc, motion.gravity))
-    return Contact(
-        series=found.series(CONTACT),
-        onset=rolling_onset(motion, found, until),
-        circle=locus_circle(motion, found, circle_duration, until),
-        propagated=found,
-    )
-
-
-def rolling_onset(motion: MeasuredMotion, found: Propagated, until: float = np.inf) -> RollingOnset:
+def rolling_onset(found: Propagated, until: float = np.inf) -> RollingOnset:
     """Change from slip to rolling: posterior over the first rolling frame, flat prior, slip of unknown size before it.
 
     Before the onset each slip component has variance s^2 + noise, s unknown between 4 SLIP_TOLERANCE and 10 m/s; after
     it, SLIP_TOLERANCE^2 + noise. Neighbouring frames share noise: their likelihoods count by the independent share.
+    until : end of the rolling motion [s]; a disc that is being stopped, or lies still, says nothing about rolling
     """
+    motion = found.motion
     frames = np.flatnonzero(np.isfinite(found.value[:, SLIP]).all(axis=1) & (motion.time <= until))
     if frames.size < 2:
         why = "not determined: the contact velocity is not known in any two frames"
@@ -173,18 +108,19 @@ def _slip_distance(time: Array, v: Array, C: Array, share: Array) -> tuple[float
     return float(np.sum(speed * weight)), float(np.sqrt(variance))
 
 
-def locus_circle(motion: MeasuredMotion, found: Propagated, duration: float, until: float = np.inf) -> Circle:
+def locus_circle(found: Propagated, duration: float, until: float = np.inf) -> Circle:
     """Circle through the contact points of the last `duration` seconds before `until`, least squares of distances.
 
     Its sigma comes from the scatter about the circle with as many independent points as half turns; radii of arcs
     below a quarter turn are not given.
     """
-    known = np.flatnonzero(np.isfinite(found.value[:, :2]).all(axis=1) & (motion.time <= until))
+    motion = found.motion
+    known = np.flatnonzero(np.isfinite(found.value[:, PLACE]).all(axis=1) & (motion.time <= until))
     frames = known[motion.time[known] >= motion.time[known[-1]] - duration] if known.size else known
     arc = float(np.ptp(motion.euler[frames, 0])) if frames.size else 0.0
     if arc < np.pi / 2 or frames.size < 8:
         return Circle(np.full(2, np.nan), *(float("nan"),) * 7)
-    points = found.value[frames, :2]
+    points = found.value[frames, PLACE]
     centre, radius = _fit_circle(points)
     offset = points - centre
     distance = np.linalg.norm(offset, axis=1)
@@ -192,9 +128,9 @@ def locus_circle(motion: MeasuredMotion, found: Propagated, duration: float, unt
     gain = np.linalg.solve(J.T @ J, J.T)[2]
     rms = float(np.sqrt(np.mean((distance - radius) ** 2)))
     independent = min(len(frames), max(4.0, arc / np.pi))
-    noise = found.covariance_at(frames, slice(0, 2)).sum(axis=(1, 2)).mean() / 2
+    noise = found.covariance_at(frames, PLACE).sum(axis=(1, 2)).mean() / 2
     variance = gain @ gain * len(frames) / independent * max(rms**2, float(noise))
-    sensitivity = found.jacobian[frames, :2] @ motion.calibration_sensitivity[frames]
+    sensitivity = found.jacobian[frames, PLACE] @ motion.calibration_sensitivity[frames]
     per_rig = gain @ np.einsum("ni,nir->nr", J[:, :2], sensitivity)
     theta = motion.euler[frames, 1]
     expected = motion.disc.radius * np.cos(theta) - motion.disc.half_thickness * np.sin(theta)

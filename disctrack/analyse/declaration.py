@@ -28,8 +28,7 @@ import numpy as np
 from calibration.cameras.camera import StereoRig, triangulate
 from calibration.kit.arrays import Array, evenly, robust_sigma
 from disctrack.analyse.derivatives import K, MeasuredMotion, differentiate
-from disctrack.analyse.energy import TOTAL, energy_quantities
-from disctrack.analyse.propagation import SIGMAS
+from disctrack.analyse.quantities import COLUMN, SIGMAS, quantities
 from disctrack.disc import Disc, has_mirror_axis, symmetry_order
 from disctrack.errors import AnalysisError
 from disctrack.faults.clock_jump import clock_jumps
@@ -356,7 +355,7 @@ def _stretches(trajectory: Trajectory) -> list[slice]:
 def _blocks(motion: MeasuredMotion) -> tuple[Array, Array]:
     """Medians of gravity and energy over blocks of frames of one stretch, where the balance determines gravity."""
     disc = motion.disc
-    m, J1, J3 = disc.mass, disc.moment_diametral, disc.moment_axial
+    m = disc.mass
     e1, e2, e3 = motion.axes()
     theta = motion.euler[:, 1]
     turn_sigma = np.sqrt(np.trace(motion.covariance[:, 9:12, 9:12], axis1=1, axis2=2) / 3)
@@ -364,15 +363,12 @@ def _blocks(motion: MeasuredMotion) -> tuple[Array, Array]:
     good = moves & motion.measured & (theta > THETA_RANGE[0]) & (theta < THETA_RANGE[1])
     if good.sum() < BLOCK:
         return np.empty(0), np.empty(0)
-
-    def times_inertia(vector: Array) -> Array:
-        return J1 * vector + (J3 - J1) * np.sum(vector * e3, axis=1)[:, None] * e3
-
     arm = disc.arm_to_contact(e2, e3)
-    moment = times_inertia(motion.alpha_world) + np.cross(motion.omega_world, times_inertia(motion.omega_world))
+    spin = np.cross(motion.omega_world, disc.times_inertia(motion.omega_world, e3))
+    moment = disc.times_inertia(motion.alpha_world, e3) + spin
     left = np.sum(e1 * (moment - m * np.cross(arm, motion.acceleration)), axis=1)
     weight = m * np.sum(e1 * np.cross(arm, K), axis=1)
-    energy = energy_quantities(motion, disc, motion.gravity)[:, TOTAL] + m * motion.gravity * disc.half_thickness
+    energy = quantities(motion, disc, motion.gravity)[:, COLUMN["total"]] + m * motion.gravity * disc.half_thickness
     blocks = [rows[good[rows]] for rows in np.split(np.arange(len(good)), range(BLOCK, len(good), BLOCK))]
     blocks = [rows for rows in blocks if len(rows) > BLOCK // 2]
     gravity = [left[rows] @ weight[rows] / (weight[rows] @ weight[rows]) for rows in blocks]

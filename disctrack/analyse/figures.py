@@ -92,7 +92,7 @@ def nutation_count(analysis: Analysis) -> Iterator[Drawn]:
 
 def contact(analysis: Analysis) -> Iterator[Drawn]:
     """Slip with a confidence in place of the threshold by eye of the paper's figure 8, and the forces of the table."""
-    time, onset = analysis.motion.time, analysis.contact.onset
+    time, onset = analysis.motion.time, analysis.onset
     n, m = analysis.series("slip_n"), analysis.series("slip_m")
     sigma = np.sqrt(n.sigma**2 + m.sigma**2 + n.sigma_calibration**2 + m.sigma_calibration**2)
     speed = Curve(time, 1e3 * np.hypot(n.value, m.value), BLUE, "speed of the material point")
@@ -122,7 +122,7 @@ def contact(analysis: Analysis) -> Iterator[Drawn]:
 
 def contact_locus(analysis: Analysis) -> Iterator[Drawn]:
     """Paper's figure 9."""
-    circle, time = analysis.contact.circle, analysis.motion.time
+    circle, time = analysis.circle, analysis.motion.time
     if not np.isfinite(circle.radius):
         return
     part = (time >= circle.start) & (time <= circle.end)

@@ -39,7 +39,7 @@ def report_of(
     t_f = Measured(laws.t_f, laws.t_f_sigma)
     return Report(
         f"{provenance.recording}: from the trajectory to the physics",
-        f"The disc {analysis.contact.onset.verdict}. {_exponents_text(laws)}",
+        f"The disc {analysis.onset.verdict}. {_exponents_text(laws)}",
         _accuracy(analysis),
         [*findings, *analysis.findings],
         facts=[
@@ -94,7 +94,7 @@ def _what_was_filmed(analysis: Analysis) -> str:
 
 
 def _onset(analysis: Analysis) -> str:
-    onset = analysis.contact.onset
+    onset = analysis.onset
     if not np.isfinite(onset.time):
         return "not reached" if np.isfinite(onset.probability) else "not known"
     if onset.time == analysis.motion.time[analysis.motion.known][0]:

@@ -10,9 +10,9 @@ from calibration.kit.arguments import Seconds, checked
 from calibration.kit.brief import Brief
 from calibration.kit.threads import one_blas_thread
 from disctrack.analyse.analysis import CIRCLE_DURATION, WINDOWS, Analysis, analyse
-from disctrack.analyse.derivatives import GROUP_NAMES, N_STATE, STATE
+from disctrack.analyse.derivatives import GROUP_NAMES, N_STATE, STATE, MeasuredMotion
 from disctrack.analyse.power_laws import WINDOW
-from disctrack.analyse.propagation import DerivedSeries, Propagated
+from disctrack.analyse.quantities import QUANTITIES, DerivedSeries, Propagated
 from disctrack.analyse.report import report_of
 from disctrack.errors import AnalysisError
 from disctrack.files.inputs import keep
@@ -97,11 +97,15 @@ def write_analysis(path: Path, analysis: Analysis) -> None:
             found[name] = replace(item, data=of_all)
         return found
 
-    onset, circle, energy = analysis.contact.onset, analysis.contact.circle, analysis.energy
+    onset, circle, energy = analysis.onset, analysis.circle, analysis.energy
+    derived = {group: [analysis.series(name) for name, *_ in rows] for group, rows in QUANTITIES.items()}
     groups: dict[str, Group] = {
-        "motion": (whole(_motion_variables(analysis)), _motion_attributes(analysis)),
+        "motion": (
+            whole(_series_variables(derived["motion"]) | _motion_variables(analysis.motion)),
+            _motion_attributes(analysis),
+        ),
         "contact": (
-            whole(_series_variables(analysis.contact.series)),
+            whole(_series_variables(derived["contact"])),
             {
                 "rolling_onset_s": onset.time,
                 "rolling_onset_low_s": onset.low,
@@ -119,7 +123,7 @@ def write_analysis(path: Path, analysis: Analysis) -> None:
             },
         ),
         "energy": (
-            whole(_series_variables(energy.series)),
+            whole(_series_variables(derived["energy"])),
             {
                 "loss_J": energy.loss,
                 "loss_sigma_J": energy.loss_sigma,
@@ -150,8 +154,7 @@ def _series_variables(series: Sequence[DerivedSeries]) -> dict[str, Variable]:
     }
 
 
-def _motion_variables(analysis: Analysis) -> dict[str, Variable]:
-    motion = analysis.motion
+def _motion_variables(motion: MeasuredMotion) -> dict[str, Variable]:
     vectors = (
         ("position", motion.position, "m", "smoothed position of the centre"),
         ("velocity", motion.velocity, "m s-1", "velocity of the centre"),
@@ -167,7 +170,7 @@ def _motion_variables(analysis: Analysis) -> dict[str, Variable]:
     jacobian[:, 15:, 3:6] = euler_jacobian(motion.euler[:, 0], motion.euler[:, 1])
     what, bridged = "covariance, noise of the poses", (~motion.measured & motion.known).astype(np.uint8)
     return {
-        **_series_variables((*analysis.rates, *Propagated(values, jacobian, motion).series(names))),
+        **_series_variables(Propagated(values, jacobian, motion).series(names)),
         "covariance": Variable(motion.covariance, ("time", "state", "state_2"), "products of m, rad, s", what),
         "bridged": Variable(bridged, ("time",), "1", "1 where the frame has no pose of its own"),
     }

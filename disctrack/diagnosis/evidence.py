@@ -5,10 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibration.kit.arrays import Array
-from disctrack.analyse.contact import CONTACT, contact_quantities
-from disctrack.analyse.derivatives import K, MotionState, differentiate
-from disctrack.analyse.energy import analyse_energy
-from disctrack.analyse.propagation import RATES, propagate, rates
+from disctrack.analyse.derivatives import K, differentiate
+from disctrack.analyse.energy import energy_of
+from disctrack.analyse.quantities import COLUMN, from_to, propagate
 from disctrack.diagnosis.answer import DiscDiagnosis
 from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.diagnosis.errors import HALF_WINDOW, Ahead, energy_balance, free_run, simulated
@@ -59,22 +58,16 @@ def evidence(result: DiscDiagnosis) -> Evidence:
 
 def _measured(system: DiscSystem, before: Fit) -> tuple[Array | None, Measured | None, Course | None]:
     """The rate of precession, the energy lost and the missing force, as accelerations of the poses have them."""
-    psidot, first = [name for name, *_ in RATES].index("psidot"), [name for name, *_ in CONTACT].index("force_n")
-
-    def quantities(state: MotionState) -> Array:
-        contact = contact_quantities(state, system.disc, system.model.gravity)
-        return np.column_stack([rates(state)[:, psidot], contact[:, first : first + 3]])
-
     try:
         motion = differentiate(part(system.trajectory, system.rows))
-        energy = analyse_energy(motion)
     except AnalysisError:
         return None, None, None
-    found = propagate(motion, quantities)
-    sigma = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))
-    missing = Course(system.time, found.value[:, 1:] - force_of(system, before), sigma[:, 1:])
+    found, force = propagate(motion), from_to("force_n", "force_z")
+    variance = np.diagonal(found.covariance_at(np.arange(len(motion)), force), axis1=1, axis2=2)
+    missing = Course(system.time, found.value[:, force] - force_of(system, before), np.sqrt(variance))
+    energy = energy_of(found)
     lost = Measured(energy.loss, float(np.hypot(energy.loss_sigma, energy.loss_sigma_calibration)), "J")
-    return found.value[:, 0], lost, missing
+    return found.value[:, COLUMN["psidot"]], lost, missing
 
 
 def force_of(system: DiscSystem, fit: Fit) -> Array:

@@ -10,8 +10,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from disctrack.analyse.contact import RollingOnset, analyse_contact
+from disctrack.analyse.contact import RollingOnset, rolling_onset
 from disctrack.analyse.derivatives import differentiate
+from disctrack.analyse.quantities import propagate
 from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.diagnosis.errors import simulated
 from disctrack.diagnosis.large_faults import diagnose_with_large, find_clock, find_large
@@ -134,7 +135,7 @@ def _at_noise(system: DiscSystem, fit_: Fit, settings: Settings) -> bool:
 def _onset(rolling: DiscSystem) -> RollingOnset | None:
     """When rolling begins, from the contact's velocity; None where the velocities cannot be had."""
     try:
-        return analyse_contact(differentiate(part(rolling.trajectory, rolling.rows))).onset
+        return rolling_onset(propagate(differentiate(part(rolling.trajectory, rolling.rows))))
     except AnalysisError:
         return None
 

@@ -17,6 +17,7 @@ PHYSICS = (
     "trajectory",
     "rolling",
     "analyse.derivatives",
+    "analyse.quantities",
     "analyse.contact",
     "analyse.energy",
     "analyse.analysis",

@@ -86,8 +86,8 @@ def test_recording_that_runs_on_after_the_end_gives_what_one_that_ends_there_giv
     assert stopped.laws.determined
     assert abs(stopped.laws.n_theta.value - free.laws.n_theta.value) < 0.005
     assert abs(stopped.laws.t_f - free.laws.t_f) < 2e-3
-    assert "from the first frame" in stopped.contact.onset.verdict
-    assert_allclose(stopped.contact.circle.radius, free.contact.circle.radius, atol=2e-5)
+    assert "from the first frame" in stopped.onset.verdict
+    assert_allclose(stopped.circle.radius, free.circle.radius, atol=2e-5)
 
 
 @pytest.mark.statistical
@@ -121,14 +121,14 @@ def test_disc_at_rest_gives_no_rates_and_no_exponents(tilt_deg, rng):
     analysis = analyse(as_tracked(still, rng))
     assert not analysis.laws.determined
     assert np.isnan(analysis.laws.n_theta.value)
-    assert np.isnan(analysis.contact.circle.radius)
+    assert np.isnan(analysis.circle.radius)
     psidot = analysis.series("psidot")
     if tilt_deg:
         assert np.all(np.abs(psidot.value) < 6 * psidot.sigma)
         assert_allclose(np.nanmean(analysis.series("force_z").value), MA_2014.mass * 9.81, rtol=1e-3)
     else:  # flat on the table there is no direction of precession
         assert np.isnan(psidot.value).all()
-        assert not np.isfinite(analysis.contact.onset.time)
+        assert not np.isfinite(analysis.onset.time)
 
 
 @pytest.mark.statistical

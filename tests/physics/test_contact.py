@@ -8,10 +8,10 @@ from numpy.testing import assert_allclose
 from scipy.integrate import trapezoid
 from scipy.stats import norm
 
-from disctrack.analyse.contact import analyse_contact, contact_quantities
+from disctrack.analyse.contact import locus_circle, rolling_onset
 from disctrack.analyse.derivatives import SYSTEMATIC_LENGTH, differentiate
-from disctrack.analyse.energy import analyse_energy, energy_quantities
-from disctrack.analyse.propagation import propagate, rates
+from disctrack.analyse.energy import energy_of
+from disctrack.analyse.quantities import ALL, COLUMN, from_to, propagate, quantities
 from disctrack.disc import MA_2014
 from disctrack.errors import AnalysisError
 from disctrack.frames import rotation_from_vector, vector_from_rotation
@@ -25,6 +25,10 @@ MOTIONS = {
     "25 degrees, nutating": dict(theta_deg=25, duration=0.6, nutation=0.1),
     "60 degrees, nutating": dict(theta_deg=60, duration=0.8, nutation=0.2),
 }
+
+
+def exact(truth):
+    return quantities(truth.state, MA_2014, 9.81)
 
 
 def errors(motion, truth):
@@ -70,25 +74,19 @@ def four_motions():
 
 
 @pytest.mark.statistical
-@pytest.mark.parametrize(
-    ("quantities", "low", "high"),
-    [
-        (rates, 0.7, 1.35),
-        (lambda state: contact_quantities(state, MA_2014, 9.81), 0.65, 1.45),
-        (lambda state: energy_quantities(state, MA_2014, 9.81), 0.65, 1.45),
-    ],
-    ids=["rates", "contact", "energy"],
-)
-def test_derived_quantities_are_honest_about_their_noise(quantities, low, high, four_motions):
+def test_derived_quantities_are_honest_about_their_noise(four_motions):
     # each alone has 4 * 700 / 20 independent values: 12 % of scatter
     truth, motions = four_motions
     ratios = []
     for motion in motions:
-        found = propagate(motion, quantities)
+        found = propagate(motion)
         variance = np.diagonal(found.covariance, axis1=1, axis2=2)
-        ratios.append(np.mean((found.value - quantities(truth.state)) ** 2 / variance, axis=0))
-    assert np.all(np.mean(ratios, axis=0) > low), ratios
-    assert np.all(np.mean(ratios, axis=0) < high), ratios
+        ratios.append(np.mean((found.value - exact(truth)) ** 2 / variance, axis=0))
+    mean, rates = np.mean(ratios, axis=0), from_to("psidot", "omega_z")
+    assert np.all(mean > 0.65), ratios
+    assert np.all(mean < 1.45), ratios
+    assert np.all(mean[rates] > 0.7), ratios
+    assert np.all(mean[rates] < 1.35), ratios
 
 
 def test_covariance_that_is_too_small_is_noticed(rng):
@@ -174,7 +172,7 @@ def test_disc_at_rest_has_no_velocity_beyond_its_sigma(rng):
     sigma = np.sqrt(np.diagonal(motion.covariance, axis1=1, axis2=2))
     assert np.all(np.abs(errors(motion, still)) < 6 * sigma)
     # flat on the table there is no direction of precession: NaN, not a number
-    assert np.isnan(propagate(motion, rates).value[:, 0]).all()
+    assert np.isnan(propagate(motion).value[:, COLUMN["psidot"]]).all()
 
 
 def test_fast_spin_is_followed(rng):
@@ -258,7 +256,7 @@ def test_what_repeats_in_the_poses_is_carried_to_the_rates(rng):
     assert not silent.systematic_at(np.arange(5)).any()
 
 
-COLUMN = {"slip": slice(3, 6), "locus": slice(6, 8), "force": slice(8, 11), "needed": 11}
+SLIP, LOCUS, FORCE = from_to("slip_n", "slip_m"), from_to("locus_n", "locus_m"), from_to("force_n", "force_z")
 
 
 def sliding(truth, onset, speed, heading=0.7):
@@ -275,11 +273,11 @@ def sliding(truth, onset, speed, heading=0.7):
 
 def test_locus_moves_with_the_derivative_of_the_contact_point():
     truth = true_motion(theta_deg=25, duration=0.6, nutation=0.1)
-    q = contact_quantities(truth.state, MA_2014, 9.81)
+    q = exact(truth)
     psi = truth.euler[:, 0]
     n0, m0 = np.column_stack([np.cos(psi), np.sin(psi)]), np.column_stack([-np.sin(psi), np.cos(psi)])
-    velocity = np.gradient(q[:, :2], truth.time, axis=0)
-    found = q[:, 6, None] * n0 + q[:, 7, None] * m0
+    velocity = np.gradient(q[:, from_to("contact_x", "contact_y")], truth.time, axis=0)
+    found = q[:, LOCUS][:, :1] * n0 + q[:, LOCUS][:, 1:] * m0
     # central differences: interval^2 / 6 of the second derivative of 2 m/s at 80 rad/s
     assert_allclose(found[5:-5], velocity[5:-5], atol=2 * 1e-6 / 6 * 80**2)
 
@@ -287,7 +285,7 @@ def test_locus_moves_with_the_derivative_of_the_contact_point():
 @pytest.mark.parametrize(("onset", "speed"), [(0.25, 0.5), (0.25, 0.05), (0.1, 0.2)])
 def test_onset_of_rolling_lies_in_its_interval(onset, speed, rng):
     truth = sliding(true_motion(theta_deg=25, duration=0.6, nutation=0.1), onset, speed)
-    found = analyse_contact(differentiate(as_tracked(truth, rng))).onset
+    found = rolling_onset(propagate(differentiate(as_tracked(truth, rng))))
     assert found.probability > 0.99
     # slip below the tolerance is rolling by definition: it sinks below 4 tolerances this much before its end
     unseen = 4 * 0.5e-3 / (speed / onset)
@@ -307,10 +305,11 @@ def slip_to_roll():
 
 
 def test_slip_and_force_are_those_of_the_simulation(slip_to_roll):
-    q = contact_quantities(of_simulation(slip_to_roll).state, MA_2014, 9.81)
-    assert_allclose(q[:, COLUMN["slip"]][:, :2], slip_to_roll.slip_velocity, atol=1e-13)  # terms of 1 m/s cancel
-    assert_allclose(q[:, [2, 5]], 0, atol=1e-13)  # the point touches the table and does not leave it
-    assert_allclose(q[:, COLUMN["force"]], slip_to_roll.contact_force, atol=1e-11)  # of 2 N
+    q = exact(of_simulation(slip_to_roll))
+    assert_allclose(q[:, SLIP], slip_to_roll.slip_velocity, atol=1e-13)  # terms of 1 m/s cancel
+    # the point touches the table and does not leave it
+    assert_allclose(q[:, [COLUMN["contact_z"], COLUMN["slip_z"]]], 0, atol=1e-13)
+    assert_allclose(q[:, FORCE], slip_to_roll.contact_force, atol=1e-11)  # of 2 N
 
 
 @pytest.mark.statistical
@@ -320,31 +319,32 @@ def test_sliding_friction_is_measured_and_its_end_found(slip_to_roll, rng):
     (switch,) = simulated.switches
     truth = of_simulation(simulated)
     trajectory = as_tracked(truth, rng)
-    contact = analyse_contact(differentiate(trajectory))
-    assert abs(contact.onset.time - switch.time) < 1.5e-3  # one frame, and the tolerance's share
-    assert contact.onset.high - contact.onset.low < 5e-3
+    across = propagate(differentiate(trajectory))
+    onset = rolling_onset(across)
+    assert abs(onset.time - switch.time) < 1.5e-3  # one frame, and the tolerance's share
+    assert onset.high - onset.low < 5e-3
     path = trapezoid(np.hypot(*simulated.slip_velocity.T), simulated.time)
-    assert_allclose(contact.onset.slip_distance, path, rtol=1e-3)
-    motion = differentiate(trajectory, breaks=(contact.onset.time,))
-    propagated = analyse_contact(motion).propagated
-    needed = propagated.value[simulated.time < switch.time, COLUMN["needed"]]
+    assert_allclose(onset.slip_distance, path, rtol=1e-3)
+    motion = differentiate(trajectory, breaks=(onset.time,))
+    propagated = propagate(motion)
+    needed = propagated.value[simulated.time < switch.time, COLUMN["friction_needed"]]
     assert_allclose(np.median(needed), 0.2, rtol=5e-3)
     # in the last 35 ms of slip its direction turns round within 10 ms; the frame of the switch may be on the wrong side
     fair = (simulated.time < switch.time - 0.035) | (simulated.time > switch.time + 1e-3)
 
     def squared_error(found, frames):
-        error = found.value[frames, COLUMN["force"]] - simulated.contact_force[frames]
-        return np.mean(error**2 / np.diagonal(found.covariance, axis1=1, axis2=2)[frames, COLUMN["force"]])
+        error = found.value[frames, FORCE] - simulated.contact_force[frames]
+        return np.mean(error**2 / np.diagonal(found.covariance, axis1=1, axis2=2)[frames, FORCE])
 
     assert 0.5 < squared_error(propagated, fair) < 1.8  # 3 axes of 460 frames: about 70 independent values
     # negative control: across the jump, one smooth curve is wrong by far more than its sigma
     soon = fair & (simulated.time > switch.time) & (simulated.time < switch.time + 0.01)
-    assert squared_error(contact.propagated, soon) > 10 > 3 > squared_error(propagated, soon)
+    assert squared_error(across, soon) > 10 > 3 > squared_error(propagated, soon)
 
 
 def test_disc_that_slips_to_the_end_has_no_onset(rng):
     truth = sliding(true_motion(theta_deg=25, duration=0.6, nutation=0.1)[:400], 0.6, 0.2)
-    found = analyse_contact(differentiate(as_tracked(truth, rng))).onset
+    found = rolling_onset(propagate(differentiate(as_tracked(truth, rng))))
     assert np.isnan(found.time)
     assert found.probability < 0.01
     assert "slips to the end" in found.verdict
@@ -353,7 +353,7 @@ def test_disc_that_slips_to_the_end_has_no_onset(rng):
 def test_circle_through_the_locus_of_a_steady_disc_is_the_no_slip_radius(rng):
     """Centre at rest: radius r cos theta - h sin theta, 37.29 mm at 3 degrees, as in the paper's figure 9."""
     truth = true_motion(theta_deg=3, duration=0.3, k_m=0.0, nutation=0.0)
-    circle = analyse_contact(differentiate(as_tracked(truth, rng))).circle
+    circle = locus_circle(propagate(differentiate(as_tracked(truth, rng))), 0.6)
     theta = np.radians(3)
     assert_allclose(circle.expected, 0.0375 * np.cos(theta) - 0.003 * np.sin(theta), rtol=1e-6)
     assert abs(circle.radius - circle.expected) < 4 * circle.sigma
@@ -363,15 +363,11 @@ def test_circle_through_the_locus_of_a_steady_disc_is_the_no_slip_radius(rng):
 
 def test_short_arc_gives_no_circle(rng):
     truth = true_motion(theta_deg=25, duration=0.6, nutation=0.1)[:25]
-    circle = analyse_contact(differentiate(as_tracked(truth, rng))).circle
+    circle = locus_circle(propagate(differentiate(as_tracked(truth, rng))), 0.6)
     assert np.isnan(circle.radius)
 
 
-TOTAL, POWER, ADIABATIC, LEVEL = 5, 6, 7, 8
-
-
-def exact(truth):
-    return energy_quantities(truth.state, MA_2014, 9.81)
+TOTAL, POWER, ADIABATIC, LEVEL = (COLUMN[name] for name in ("total", "power", "adiabatic", "precession_level"))
 
 
 def test_energy_and_power_are_those_of_the_simulation(slip_to_roll):
@@ -404,8 +400,8 @@ def test_error_of_the_table_height_is_common_and_does_not_enter_the_loss(rng):
     rig_covariance = np.zeros((30, 30))
     rig_covariance[29, 29] = (2e-6) ** 2
     trajectory = as_tracked(truth, rng, sensitivity=sensitivity, rig_covariance=rig_covariance)
-    energy = analyse_energy(differentiate(trajectory))
-    total = energy.series[TOTAL]
+    found = propagate(differentiate(trajectory))
+    energy, total = energy_of(found), found.series(ALL)[TOTAL]
     assert_allclose(total.sigma_calibration, MA_2014.mass * 9.81 * 2e-6, rtol=1e-6)
     assert energy.loss_sigma_calibration < 1e-3 * total.sigma_calibration[0]
     E = exact(truth)

@@ -6,9 +6,8 @@ from numpy.testing import assert_allclose
 from scipy.ndimage import gaussian_filter1d
 
 from disctrack.analyse.derivatives import differentiate
-from disctrack.analyse.energy import analyse_energy, energy_quantities
 from disctrack.analyse.power_laws import count_nutation, fit_power_laws, power_law_end
-from disctrack.analyse.propagation import propagate, rates
+from disctrack.analyse.quantities import COLUMN, propagate, quantities
 from disctrack.disc import MA_2014
 from disctrack.examples.published_exponents import exponents_on
 from tests.physics.conftest import as_tracked, true_motion
@@ -35,7 +34,7 @@ def known_law(n, rng, nutation=0.1, duration=0.6, unseen=0.03):
 
 
 def of_motion(truth):
-    E = energy_quantities(truth.state, MA_2014, 9.81)[:, 5]
+    E = quantities(truth.state, MA_2014, 9.81)[:, COLUMN["total"]]
     return truth.time, truth.euler[:, 0], truth.euler[:, 1], truth.rates[:, 0], E
 
 
@@ -92,8 +91,7 @@ def test_nutation_does_not_move_the_exponents_of_a_rolling_disc():
 def test_tracked_recording_gives_the_exponents_of_its_true_motion(rng):
     truth = true_motion(theta_deg=9, duration=3.0)[-700:]
     motion = differentiate(as_tracked(truth, rng))
-    energy = analyse_energy(motion).propagated.value[:, 5]
-    psidot = propagate(motion, rates).value[:, 0]
+    psidot, energy = propagate(motion).value[:, [COLUMN["psidot"], COLUMN["total"]]].T
     found = fit_power_laws(motion.time, motion.euler[:, 0], motion.euler[:, 1], psidot, energy)
     true = fit_power_laws(*of_motion(truth))
     for name in ("n_theta", "n_psidot", "n_energy"):

@@ -1,0 +1,192 @@
+"""Rates, contact, forces and energy of a motion, each with two uncertainties that must not be mixed.
+
+A is the lowest point of the lower edge, r_OA = -r e2 - h e3. Components are along n0 = e1, m0 = k x n0 and k.
+Against the printed equations of Ma et al. 2014: the first line of (2.3) is the n0 component and its second the m0
+component (the labels are exchanged), and its third line has r thetadot cos theta, because z = r sin theta + h cos
+theta; (2.10) has its datum at rest, m g (z - h) instead of m g z, or a power law in the time to the end is not
+possible.
+
+Noise differs from frame to frame; the calibration's error is one and the same in all frames, and what else repeats
+(`MeasuredMotion.systematic_at`) changes with the motion only. The first averages out, the others do not: every derived
+quantity carries the two apart.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.kit.arrays import Array
+from calibration.kit.brief import Outline
+from disctrack.analyse.derivatives import FRAMES_AT_ONCE, N_STATE, K, MeasuredMotion, MotionState
+from disctrack.disc import Disc
+
+# Steps of central differences in the order of STATE: far above round-off, far below the scale on which the derived
+# quantities bend (sin theta of a disc at rest on its patch is 1e-2). They are quadratic at most in the rates.
+STEPS = np.repeat([1e-6, 1e-6, 1e-4, 1e-3, 1e-2, 1.0], 3)
+SIGMAS = 5.0  # of its own, below which a number is not told from zero; of theta, the direction of precession neither
+# By group of the file: name, unit, meaning; in the order of `quantities`
+QUANTITIES = {
+    "motion": (
+        ("psidot", "rad s-1", "precession rate"),
+        ("thetadot", "rad s-1", "nutation rate"),
+        ("phidot", "rad s-1", "spin rate relative to the nodal frame"),
+        ("omega_1", "rad s-1", "angular velocity along e1, horizontal"),
+        ("omega_2", "rad s-1", "angular velocity along e2, from the contact through the centre"),
+        ("omega_3", "rad s-1", "angular velocity along e3, the axis of the disc"),
+        ("omega_z", "rad s-1", "angular velocity along the vertical"),
+    ),
+    "contact": (
+        ("contact_x", "m", "contact point, x"),
+        ("contact_y", "m", "contact point, y"),
+        ("contact_z", "m", "lowest point of the edge above the table"),
+        ("slip_n", "m s-1", "velocity of the material point at the contact along n0 = e1"),
+        ("slip_m", "m s-1", "velocity of the material point at the contact along m0 = k x n0"),
+        ("slip_z", "m s-1", "velocity of the material point at the contact, upwards"),
+        ("locus_n", "m s-1", "velocity of the point of touch along n0"),
+        ("locus_m", "m s-1", "velocity of the point of touch along m0"),
+        ("force_n", "N", "contact force along n0"),
+        ("force_m", "N", "contact force along m0"),
+        ("force_z", "N", "normal contact force"),
+        ("friction_needed", "1", "horizontal over normal contact force"),
+    ),
+    "energy": (
+        ("translation", "J", "kinetic energy of the centre"),
+        ("rotation_1", "J", "kinetic energy of the rotation about e1"),
+        ("rotation_2", "J", "kinetic energy of the rotation about e2"),
+        ("rotation_3", "J", "kinetic energy of the rotation about e3"),
+        ("potential", "J", "potential energy, zero at rest (z = h)"),
+        ("total", "J", "mechanical energy, zero at rest"),
+        ("power", "W", "rate of change of the mechanical energy"),
+        ("adiabatic", "J", "3/2 m g r sin theta, the energy of slow steady precession of a thin disc"),
+        ("precession_level", "s-2", "psidot^2 sin theta; 4 g / r in slow steady precession of a thin disc"),
+    ),
+}
+ALL = tuple(row for rows in QUANTITIES.values() for row in rows)
+COLUMN = {name: i for i, (name, *_) in enumerate(ALL)}
+
+
+def from_to(first: str, last: str) -> slice:
+    """Columns of neighbouring quantities."""
+    return slice(COLUMN[first], COLUMN[last] + 1)
+
+
+def quantities(state: MotionState, disc: Disc, gravity: float) -> Array:
+    """All of QUANTITIES (n, 28); the Euler rates are read off omega itself.
+
+    slip : of the disc's own point at the contact, v_O + omega x r_OA, eq. (2.3); locus : of the moving point of touch,
+    v_O + Omega_R x r_OA, where Omega_R = thetadot e1 + psidot k turns the nodal frame, in which r_OA is constant
+    force : of the table, from Newton's law with nothing else acting, eq. (2.6)
+    """
+    m, J1, J3, s = disc.mass, disc.moment_diametral, disc.moment_axial, state.sine
+    n0, e2, e3 = state.axes()
+    r_OA, m0 = disc.arm_to_contact(e2, e3), np.cross(K, n0)
+    omega = [np.sum(state.omega_world * e, axis=1) for e in (n0, e2, e3)]
+    thetadot = omega[0]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        psidot = omega[1] / s
+    rates = psidot, thetadot, omega[2] - psidot * e3[:, 2], *omega, state.omega_world[:, 2]
+    slip = state.velocity + np.cross(state.omega_world, r_OA)
+    locus = state.velocity + np.cross(thetadot[:, None] * n0 + psidot[:, None] * K, r_OA)
+    force = m * (state.acceleration + gravity * K)
+    (slip_n, slip_m), (locus_n, locus_m), (force_n, force_m) = (
+        [np.sum(vector * axis, axis=1) for axis in (n0, m0)] for vector in (slip, locus, force)
+    )
+    needed = np.where(force[:, 2] > 0, np.hypot(force_n, force_m) / np.abs(force[:, 2]), np.nan)
+    contact = *(state.position + r_OA).T, slip_n, slip_m, slip[:, 2], locus_n, locus_m, *(force_n, force_m, force[:, 2])
+    translation = 0.5 * m * np.sum(state.velocity**2, axis=1)
+    rotation = [0.5 * J * w**2 for J, w in zip((J1, J1, J3), omega, strict=True)]
+    potential = m * gravity * (state.position[:, 2] - disc.half_thickness)
+    # omega . d(J omega)/dt = omega . J alpha, since omega . (omega x J omega) = 0
+    power = m * np.sum(state.velocity * (state.acceleration + gravity * K), axis=1)
+    power = power + np.sum(state.omega_world * disc.times_inertia(state.alpha_world, e3), axis=1)
+    total = translation + rotation[0] + rotation[1] + rotation[2] + potential
+    adiabatic, level = 1.5 * m * gravity * disc.radius * s, psidot**2 * s
+    energy = translation, *rotation, potential, total, power, adiabatic, level
+    return np.column_stack([*rates, *contact, needed, *energy])
+
+
+@dataclass(frozen=True, repr=False)
+class DerivedSeries(Outline):
+    """One derived quantity over the recording."""
+
+    name: str
+    unit: str
+    long_name: str
+    value: Array  # (n,)
+    sigma: Array  # (n,) from the noise of the poses
+    sigma_calibration: Array  # (n,) from the rig, common to all frames, and from what else repeats
+
+
+@dataclass(frozen=True)
+class Propagated:
+    """Values with the covariance that noise and calibration give them.
+
+    Kept is their derivative; covariances, several times as large, are made for the frames that are asked for.
+    """
+
+    value: Array  # (n, k)
+    jacobian: Array  # (n, k, 18) d value / d STATE
+    motion: MeasuredMotion
+
+    @property
+    def covariance(self) -> Array:
+        """(n, k, k) noise."""
+        return self.covariance_at(np.arange(len(self.value)))
+
+    def covariance_at(self, frames: NDArray[np.int64], columns: slice = slice(None), shared: bool = False) -> Array:
+        """(f, c, c) of some values in some frames: noise, or what all share: of the rig, and what else repeats."""
+        motion = self.motion
+
+        def some(rows: NDArray[np.int64]) -> Array:
+            J = self.jacobian[rows][:, columns]
+            if not shared:
+                return np.asarray(J @ motion.covariance[rows] @ J.swapaxes(1, 2))
+            S = J @ motion.calibration_sensitivity[rows]
+            by_rig = S @ motion.rig_covariance @ S.swapaxes(1, 2)
+            return np.asarray(by_rig + J @ motion.systematic_at(rows) @ J.swapaxes(1, 2))
+
+        return _by_parts(some, frames)
+
+    def series(self, names: Sequence[tuple[str, str, str]]) -> tuple[DerivedSeries, ...]:
+        """The columns one by one; names are (name, unit, long_name)."""
+
+        def variances(rows: NDArray[np.int64]) -> Array:
+            both = [self.covariance_at(rows, shared=shared) for shared in (False, True)]
+            return np.stack([np.diagonal(C, axis1=1, axis2=2) for C in both], axis=1)
+
+        sigmas = np.sqrt(np.maximum(_by_parts(variances, np.arange(len(self.value))), 0.0))
+        return tuple(
+            DerivedSeries(*name, self.value[:, i], sigmas[:, 0, i], sigmas[:, 1, i]) for i, name in enumerate(names)
+        )
+
+
+def _by_parts(function: Callable[[NDArray[np.int64]], Array], frames: NDArray[np.int64]) -> Array:
+    """A function of frames, some at a time: what it needs on the way may be larger than its result."""
+    parts = [function(frames[i : i + FRAMES_AT_ONCE]) for i in range(0, max(len(frames), 1), FRAMES_AT_ONCE)]
+    return np.concatenate(parts)
+
+
+def propagate(motion: MeasuredMotion) -> Propagated:
+    """All of QUANTITIES (n, 28), with noise and calibration carried through their derivatives.
+
+    NaN where the motion is unknown, and where theta is so small against its own sigma that e1 has no direction.
+    """
+    resolved = motion.sine > SIGMAS * motion.tilt_sigma
+
+    def displaced(step: Array, rows: NDArray[np.int64]) -> Array:
+        return quantities(motion.displaced(step, rows), motion.disc, motion.gravity)
+
+    def some(rows: NDArray[np.int64]) -> Array:
+        columns = []
+        for step in np.diag(STEPS):
+            up, down = (displaced(sign * step, rows) for sign in (1, -1))
+            columns.append((up - down) / (2 * step.sum()))
+        jacobian = np.stack(columns, axis=-1)  # (f, k, 18)
+        value = np.where(resolved[rows, None], displaced(np.zeros(N_STATE), rows), np.nan)
+        jacobian[~np.isfinite(value)] = np.nan
+        return np.concatenate([value[..., None], jacobian], axis=-1)
+
+    both = _by_parts(some, np.arange(len(motion)))
+    return Propagated(both[..., 0], both[..., 1:], motion)
