@@ -61,7 +61,6 @@ class Planted:
     truth: Mapping[str, float] = field(default_factory=dict)
     effects: Mapping[str, float] = field(default_factory=dict)  # of the motion: "effect.parameter"
     wrong: Mapping[str, float] = field(default_factory=dict)  # of the measurement: "fault.part" of the catalogue
-    laboratory: Laboratory = field(default_factory=Laboratory)
 
 
 @dataclass(frozen=True)
@@ -104,8 +103,7 @@ def plant(name: str, size: float, rng: Generator) -> Planted:
     """An effect of this size [SI], of one camera or dot drawn among those there are, with a sign or a direction."""
     candidates = alike(name)
     if not candidates:
-        imperfect = {"prints": Laboratory(print_m=size), "laboratory": ORDINARY}
-        return Planted(laboratory=imperfect.get(name, Laboratory()))
+        return Planted()
     candidate = candidates[int(rng.integers(len(candidates)))]
     quantities = candidate.quantities[:1] if name in FIRST_ALONE else candidate.quantities
     passive = quantities[0].lower == 0
@@ -152,9 +150,9 @@ def recorded(case: HiddenCase) -> tuple[list[Planted], Trajectory]:
     rng = np.random.default_rng([case.seed, 32])
     parts = [plant(name, size, rng) for name, size in case.hidden.items()]
     effects, wrong = ({k: v for p in parts for k, v in getattr(p, kind).items()} for kind in ("effects", "wrong"))
-    imperfect = [p.laboratory for p in parts if p.laboratory != Laboratory()] or [Laboratory()]
-    planted = Planted(effects=effects, wrong=wrong, laboratory=imperfect[-1])
-    return [p for p in parts if p.truth], measured(draw(case.seed, planted, case.rate), planted.laboratory)
+    laboratory = ORDINARY if "laboratory" in case.hidden else Laboratory(print_m=case.hidden.get("prints", 0.0))
+    scene = draw(case.seed, Planted(effects=effects, wrong=wrong), case.rate)
+    return [p for p in parts if p.truth], measured(scene, laboratory)
 
 
 def hidden_cases(
