@@ -17,7 +17,7 @@ from disctrack.discrepancy.significance import Whiteness, ljung_box, no_memory, 
 from disctrack.discrepancy.system import System, Values, subset
 from disctrack.frames import euler_jacobian
 from disctrack.rolling import Motion, simulate
-from disctrack.rolling.evaluate import effect_power, kinematics
+from disctrack.rolling.motion import effect_power
 
 HALF_WINDOW = 0.01  # [s] over which the error at a horizon is averaged: some frames, a fraction of a turn
 LEVEL = 1e-4  # probability with which noise alone is called more than noise, over all tests of a residual
@@ -102,11 +102,10 @@ def simulated(system: DiscSystem, values: Values) -> Motion:
 def energy_balance(system: DiscSystem, values: Values) -> dict[str, float]:
     """Energy lost in the recording [J], and the work of each effect, in the fitted motion."""
     motion = simulated(system, values)
-    k = kinematics(motion.q, motion.qdot, system.disc, system.model.gravity, motion.time, system.model.air_density)
     balance = {"lost": float(motion.energy[0] - motion.energy[-1])}
     for effect in motion.model.effects:
         if effect.law is not None:
-            power = effect_power(effect, k, motion.contact_force[:, 2])
+            power = effect_power(effect, motion.instants, motion.contact_force[:, 2])
             balance[f"by {effect.name}"] = float(-trapezoid(power, motion.time))
     if np.any(motion.slip_velocity):
         power = np.sum(motion.contact_force[:, :2] * motion.slip_velocity, axis=1)

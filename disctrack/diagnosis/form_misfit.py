@@ -29,8 +29,8 @@ from disctrack.discrepancy.laws import LearnedLaw, evidence
 from disctrack.discrepancy.score import DEPENDENT, cleared, span
 from disctrack.discrepancy.system import Values
 from disctrack.rolling import Motion, simulate
-from disctrack.rolling.evaluate import effect_wrench, kinematics
 from disctrack.rolling.model import body_constants
+from disctrack.rolling.motion import effect_wrench
 
 SIZES = np.logspace(-3, 0, 25)  # of a part of the misfit over the law's rms: before the data, each as probable
 HARMONICS = 2  # of the precession, beside which a part changes slowly
@@ -50,14 +50,13 @@ def moment_about_contact(
     only : the effects of these names
     """
     model = system.model_with(values)
-    k = kinematics(motion.q, motion.qdot, system.disc, model.gravity, motion.time, model.air_density)
     r, h = system.disc.radius, system.disc.half_thickness
     s, c = np.sin(motion.q[:, 4]), np.cos(motion.q[:, 4])
     arm = np.stack([0.0 * s, h * s - r * c, -r * s - h * c], axis=1)
     total = np.zeros((len(motion), 3))
     for effect in model.effects:
         if effect.law is not None and (only is None or effect.name in only):
-            moment, force = effect_wrench(effect, k, motion.contact_force[:, 2])
+            moment, force = effect_wrench(effect, motion.instants, motion.contact_force[:, 2])
             total += moment - np.cross(arm, force)
     if only is None:
         body = body_constants(model, THETA_END)

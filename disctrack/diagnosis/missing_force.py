@@ -24,7 +24,7 @@ from disctrack.discrepancy.score import cleared, span
 from disctrack.discrepancy.system import Candidate, Quantity, Values
 from disctrack.rolling import EffectParameter, Model, simulate
 from disctrack.rolling.effects.learned import effect_from_formulas
-from disctrack.rolling.evaluate import kinematics
+from disctrack.rolling.records import KINEMATICS
 from disctrack.rolling.sensitivities import COMPONENTS, Responses, responses
 
 if TYPE_CHECKING:
@@ -186,14 +186,12 @@ class DiscScan:
         self._absorbed = np.swapaxes(basis.reshape(n, w, -1), 1, 2) @ D
         self._right = np.einsum("nw,nwk->nk", left[: residual.size].reshape(n, w), D)
         self.chi_square = float(left @ left)
-        model, m = system.model, self.motion
-        k = kinematics(m.q, m.qdot, system.disc, model.gravity, m.time, model.air_density)
-        space: dict[str, Any] = {name: np.asarray(k[name]) for name in k.dtype.names or ()}
+        followed = simulate(system.model_with(fit_.values), state_of(fit_.values), times=self.motion.time)
+        space: dict[str, Any] = {name: np.asarray(followed.instants[name]) for name in KINEMATICS}
         space |= {f: getattr(np, f) for f in ("cos", "sin", "exp", "sqrt", "log")}
         space |= {"magnitude": np.abs, "sign": lambda x, width: x / np.sqrt(x * x + width * width)}
         self._space, self._courses = space, dict[str, Array]()
         # what a law adds to the load changes its own moment in second order
-        followed = simulate(system.model_with(fit_.values), state_of(fit_.values), times=self.motion.time)
         self._load = followed.contact_force[:, 2]
 
     def _course(self, formula: str) -> Array:

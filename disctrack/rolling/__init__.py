@@ -1,8 +1,7 @@
 """The rolling disc forwards: equations of motion, effects that are added to them, simulation, derivatives.
 
 Public verbs in the order of use: `Model`, `State` (or `steady_precession`, `struck_disc`), `simulate`,
-`sensitivities`. Effects are in `CATALOGUE`; `evaluate` applies their laws to motions from
-elsewhere, `run` writes a scene's motion to a file.
+`sensitivities`. Effects are in `CATALOGUE`.
 """
 
 from disctrack.rolling.effects.base import CATALOGUE, Effect, EffectParameter

@@ -2,16 +2,18 @@
 
 from dataclasses import dataclass
 from enum import Enum
+from types import SimpleNamespace
 from typing import Any, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from calibration.kit.arrays import Array
 from calibration.kit.brief import Outline
 from disctrack.frames import COORDINATES, nodal_axes_world, rotation_from_euler
+from disctrack.rolling.effects.base import Effect
 from disctrack.rolling.model import Model
-from disctrack.rolling.records import ROLLING_COMPONENTS, Records, Regime
+from disctrack.rolling.records import ROLLING_COMPONENTS, WRENCH, Record, Records, Regime
 
 Parts: TypeAlias = Any  # numbers of records: real in a motion, complex where derivatives are carried
 
@@ -79,6 +81,28 @@ def moment_power(now: Records, moment: Array) -> Array:
     return np.sum(moment * rates, axis=-1)
 
 
+def effect_wrench(effect: Effect, now: Record, load: ArrayLike) -> tuple[Array, Array]:
+    """Contact moment and force of one effect by its law in NumPy, each (..., 3) in (n0, m0, k) [N m, N].
+
+    now : (...) records.INSTANT, of which it reads the KINEMATICS.   load : (...) normal force F_z [N]
+    """
+    load = np.asarray(load, float)
+    w = SimpleNamespace(**{name: np.zeros(load.shape) for name in WRENCH})
+    if effect.law is not None:
+        effect.law(SimpleNamespace(**effect.values), now, w)
+    moment = [getattr(w, f"M_{a}") + load * getattr(w, f"load_{a}") for a in "nmz"]
+    c, s, m = np.cos(now.psi), np.sin(now.psi), now.mass
+    field_n, field_m = w.field_x * c + w.field_y * s, w.field_y * c - w.field_x * s
+    force = [w.X_n + m * field_n, w.X_m + m * field_m, w.X_z + m * w.field_z]
+    return np.stack(moment, axis=-1), np.stack(force, axis=-1)
+
+
+def effect_power(effect: Effect, now: Record, load: ArrayLike) -> Array:
+    """Power of an effect's moment, and of its force at O (...) [W]: never positive for a passive one."""
+    moment, force = effect_wrench(effect, now, load)
+    return moment_power(now, moment) + np.sum(force * columns(now, "v_n", "v_m", "v_z"), axis=-1)
+
+
 class Motion(Outline):
     """Motion of the disc at n times. Forces and moments are those of the table on the disc, in (n0, m0, k)."""
 
@@ -90,6 +114,7 @@ class Motion(Outline):
         contact = np.stack([n0, np.cross(k, n0), k], axis=-1)  # contact axes -> world
         table_velocity, table_acceleration = (columns(now, *(f"table_{d}{a}" for a in "xyz")) for d in "va")
         self.model = model
+        self.instants: Record = now.view(np.recarray)  # (n,) all that the equations know, in axes of the table
         self.time: Array = now["time"]  # (n,) [s]
         self.q: Array
         self.qdot: Array

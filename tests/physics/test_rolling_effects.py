@@ -18,11 +18,21 @@ from disctrack.rolling import (
 )
 from disctrack.rolling.effects.base import catalogue_table, effect
 from disctrack.rolling.effects.learned import effect_from_formulas
-from disctrack.rolling.evaluate import effect_power, effect_wrench, kinematics
+from disctrack.rolling.equations import FLYING
+from disctrack.rolling.motion import effect_power, effect_wrench
+from disctrack.rolling.simulate import Assembly
 
 MOVES_THE_TABLE = ("table_shaken", "table_settles")  # and exerts nothing in its axes
 LAWS = [name for name, effect in CATALOGUE.items() if effect.law is not None and name not in MOVES_THE_TABLE]
 COUNTER_ROTATING = ("km", "rolling_power", "air_moffatt", "air_bildsten")  # they read psidot and work on phidot
+
+
+def instants(q, qdot):
+    """All that laws read at coordinates and rates (n, 6), whatever the velocity of the centre: as in the air."""
+    (x, y, z, psi, theta, phi), (v_x, v_y, v_z, psidot, thetadot, phidot) = q.T, qdot.T
+    omega = thetadot, psidot * np.sin(theta), psidot * np.cos(theta) + phidot
+    states = np.stack([x, y, psi, theta, phi, *omega, v_x, v_y, z, v_z], axis=-1)
+    return Assembly(Model(MA_2014), 0.0).at(FLYING, np.zeros(len(q)), states)[2].view(np.recarray)
 
 
 def random_motion(rng, n, counter_rotating):
@@ -31,7 +41,7 @@ def random_motion(rng, n, counter_rotating):
     qdot = rng.normal(size=(n, 6)) * [1, 1, 1, 100, 10, 100]
     if counter_rotating:
         qdot[:, 5] = -np.sign(qdot[:, 3]) * np.abs(qdot[:, 5])
-    return kinematics(q, qdot, MA_2014)
+    return instants(q, qdot)
 
 
 def largest_power(effect, rng):
@@ -56,7 +66,7 @@ def test_laws_that_read_psidot_but_work_on_phidot_say_so(rng):
     for name in LAWS:
         effect = CATALOGUE[name]()
         if name in COUNTER_ROTATING:
-            assert effect_power(effect, random_motion(rng, 500, False), 2.0).max() > 0
+            assert effect_power(effect, random_motion(rng, 500, False), np.full(500, 2.0)).max() > 0
 
 
 @pytest.mark.parametrize("name", LAWS)
@@ -91,10 +101,8 @@ def test_power_relative_to_the_published_rolling_friction(name):
         theta = np.radians(theta_deg)
         state = steady_precession(theta, MA_2014)
         z = MA_2014.radius * np.sin(theta) + MA_2014.half_thickness * np.cos(theta)
-        motion = kinematics(
-            np.array([0, 0, z, 0, theta, 0]), np.array([0, 0, 0, state.psidot, 0, state.phidot]), MA_2014
-        )
-        load = MA_2014.mass * 9.81
+        motion = instants(np.array([[0, 0, z, 0, theta, 0]]), np.array([[0, 0, 0, state.psidot, 0, state.phidot]]))
+        load = [MA_2014.mass * 9.81]
         power = effect_power(CATALOGUE[name](), motion, load) / effect_power(CATALOGUE["km"](), motion, load)
         digits = len(f"{share:g}".split(".")[-1]) if share else 4
         assert_allclose(power, share, atol=1.01 * 10.0**-digits)  # the table is rounded or cut
@@ -105,9 +113,7 @@ def test_compiled_law_equals_the_law_in_numpy(name, rng):
     model = Model(MA_2014, effects=(CATALOGUE[name](),))
     state = steady_precession(np.radians(20), MA_2014, omega3=2.0, nutation_amplitude=0.05)
     motion = rolling.simulate(model, state, 0.05)
-    moment, force = effect_wrench(
-        CATALOGUE[name](), kinematics(motion.q, motion.qdot, MA_2014, time=motion.time), motion.contact_force[:, 2]
-    )
+    moment, force = effect_wrench(CATALOGUE[name](), motion.instants, motion.contact_force[:, 2])
     assert_allclose(motion.contact_moment, moment, rtol=1e-9, atol=1e-20)
     assert_allclose(motion.external_force, force, rtol=1e-9, atol=1e-20)
     assert np.abs(motion.contact_moment).max() + np.abs(motion.external_force).max() > 0
