@@ -13,10 +13,11 @@ from disctrack.discrepancy.fit import fit
 from disctrack.discrepancy.search import explain
 from disctrack.examples import published_exponents
 from disctrack.examples._command import command
-from disctrack.examples.exponent_model import LastStage, Series
 from disctrack.examples.published_exponents import (
     THIN_DISC,
     ExponentSystem,
+    LastStage,
+    Series,
     in_question,
     left_by,
     published_series,
