@@ -17,11 +17,9 @@ from functools import reduce
 import numpy as np
 
 from calibration.cameras.splines import LensField, spline_weights
-from calibration.fit.board_motion import motions
-from calibration.fit.normal_equations import inverse_covariance
 from calibration.fit.refinement import FOLDS, Refinement, refine_stereo
 from calibration.fit.start import GOOD_VIEWS
-from calibration.fit.stereo_model import Observations, predict
+from calibration.fit.stereo_model import Observations
 from calibration.kit.arrays import Array
 from calibration.kit.least_squares import eliminate
 
@@ -125,24 +123,12 @@ def _squares(refinement: Refinement, used: Observations, grid: LensField, extra:
     problem, n, shape = refinement.problem, grid.coefficients.size // 4, grid.coefficients.shape[2:]
     for view in np.unique(used.view):
         o = used[used.view == view]
-        m, (pixels, d_stereo, d_pose, d_point) = len(o), predict(refinement.model, o)
         index, weight = spline_weights(o.pixels, grid.spacing, shape)
-        field = np.zeros((m, 2, 4 * n))
+        field = np.zeros((len(o), 2, 4 * n))
         for axis in (0, 1):
             np.put_along_axis(field[:, axis], (2 * o.camera[:, None] + axis) * n + index, weight, axis=1)
-        if problem.motion is not None:  # a place of the board for each of the two images
-            d_pose = np.concatenate([np.where((o.camera == c)[:, None, None], d_pose, 0.0) for c in (0, 1)], axis=-1)
-        shared = [d_stereo @ problem.stereo_basis, d_point @ problem.shape_basis[o.point], field]
-        whole = np.concatenate([d_pose, *shared, (o.pixels - pixels)[..., None]], axis=-1)
-        L = np.linalg.cholesky(inverse_covariance(o.covariance, extra))
-        rows = (np.swapaxes(L, 1, 2) @ whole).reshape(2 * m, -1)
-        k = d_pose.shape[-1]
-        if problem.motion is not None:
-            between, by_poses = (values[view] for values in motions(refinement.model))
-            more = np.zeros((6, rows.shape[1]))
-            more[:, :k], more[:, -1] = by_poses, -between
-            rows = np.concatenate([rows, np.sqrt(problem.motion.weights_of(problem.n_views)[view])[:, None] * more])
-        rest = eliminate(rows, k)[1]
+        rows, of_view, _ = problem.seeing(o, extra).rows(refinement.model, field)
+        rest = eliminate(rows[of_view == view], 6 if problem.motion is None else 12)[1]
         yield rest.T @ rest
 
 

@@ -5,35 +5,19 @@ The six numbers of a board's pose are its view's own, 12 where boards moved betw
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
-from calibration.fit._normal_kernel import N_COLUMNS, accumulate
 from calibration.fit.board_motion import BoardMotion, motions
 from calibration.fit.priors import Prior, board_prior
-from calibration.fit.stereo_model import Observations, StereoModel, moved
+from calibration.fit.stereo_model import Observations, StereoModel, moved, predict
 from calibration.kit import least_squares
 from calibration.kit.arrays import Array
 from calibration.kit.errors import CalibrationError
-from calibration.kit.least_squares import Minimum, Normal
-
-
-def _shared(stereo: Array, stereo_point: Array, point: Array, shape: Array) -> Array:
-    """(..., s, s) of all shared parameters, from each view's parts (n_views, ...) or from their sums.
-
-    stereo : (..., s1, s1) stereo parameters alone; stereo_point (..., s1, 3 n) between them and the target's points;
-    point (..., n, 3, 3) of each point; shape (3 n, s2) directions in which the points may move
-    """
-    across = stereo_point @ shape
-    moved_points = point @ shape.reshape(*point.shape[-3:-1], shape.shape[1])
-    among = shape.T @ moved_points.reshape(*across.shape[:-2], *shape.shape)
-    return np.block([[stereo, across], [np.swapaxes(across, -1, -2), among]])
+from calibration.kit.least_squares import Minimum, Normal, normal_of_rows
 
 
 @dataclass(frozen=True)
@@ -58,70 +42,58 @@ class Problem:
         prior = self.prior and replace(self.prior, board=board_prior(nominal, basis))
         return replace(self, shape_basis=basis, prior=prior)
 
-    def linearise(self, model: StereoModel) -> Normal:
-        """Normal equations at the model."""
-        o = self.observations
-        if np.any(np.diff(o.view) < 0):
-            raise ValueError("observations must be sorted by view")
-        s1, s2, n = self.stereo_basis.shape[1], self.shape_basis.shape[-1], len(self.shape_basis)
-        V, boards = self.n_views, zip((model.R_left_board, model.t_left_board), model.boards_in_right, strict=True)
-        full, costs = np.zeros((V, N_COLUMNS, N_COLUMNS)), np.zeros(V)
-        of_point, point = (np.zeros((V, n if s2 else 0, 3, columns)) for columns in (N_COLUMNS, 3))
-        cameras = np.stack([camera.parameters for camera in model.cameras])
-        given = (o.pixels, self.weights, cameras, model.R_right_left, model.t_right_left, *map(np.stack, boards))
-        if not _accumulated(
-            (o.view, o.camera, o.point), self.huber, (*given, model.points), full, of_point, point, costs
-        ):
-            costs[...] = np.inf
-        poses = np.tile(np.eye(6), (2, 1)) if self.motion is None else np.eye(12)  # the same at both exposures, or two
-        free = scipy.linalg.block_diag(self.stereo_basis, poses, 1.0)
-        squares = free.T @ full @ free
-        shape = self.shape_basis.reshape(3 * n, s2) if s2 else np.zeros((0, 0))
-        flat = of_point.reshape(V, len(shape), N_COLUMNS) @ free
-        of_shape = shape.T @ flat[..., s1:]  # (V, s2, k + 1)
-        stereo, stereo_point = squares[:, :s1, :s1], np.swapaxes(flat[..., :s1], 1, 2)
-        pose, pose_gradient = squares[:, s1:-1, s1:-1], squares[:, s1:-1, -1]
+    def rows(self, model: StereoModel, beyond: Array | None = None) -> tuple[Array, NDArray[np.intp], Array]:
+        """Whitened rows (r, c) of all data, which view each is of (r,), and chi-square, or Huber's loss, by view.
+
+        Columns: pose of the board, or its two poses where boards move | stereo | shape | beyond (m, 2, b) | residual.
+        NaN where a point lies behind its camera.
+        """
+        o, V = self.observations, self.n_views
+        with np.errstate(all="ignore"):  # a step may put a board anywhere
+            pixels, d_stereo, d_pose, d_point = predict(model, o)
+            if self.motion is not None:
+                d_pose = np.concatenate(
+                    [np.where((o.camera == c)[:, None, None], d_pose, 0.0) for c in (0, 1)], axis=-1
+                )
+            residual = o.pixels - pixels
+            stereo = np.tensordot(d_stereo, self.stereo_basis, 1)
+            columns = [d_pose, stereo, d_point @ self.shape_basis[o.point], residual[..., None]]
+            columns[3:3] = [] if beyond is None else [beyond]
+            x, y = np.moveaxis(np.concatenate(columns, axis=-1), 1, 0)
+            sigmas = np.sqrt(quadratic(self.weights, residual))
+            within = np.minimum(sigmas, self.huber)
+            heeded = np.minimum(self.huber / np.maximum(sigmas, 1e-300), 1.0)
+            root = np.linalg.cholesky(self.weights * heeded[:, None, None])[..., None]  # its transpose whitens
+            rows = np.concatenate([root[:, 0, 0] * x + root[:, 1, 0] * y, root[:, 1, 1] * y])
+            view = np.tile(o.view, 2)
+            costs: Array = np.bincount(o.view, within * (2.0 * sigmas - within), V).astype(float)
         if self.motion is not None:
             between, by_poses = motions(model)
-            weights = self.motion.weights_of(V) * (np.bincount(o.view, minlength=V) > 0)[:, None]
-            weighted = by_poses * weights[..., None]
-            pose = pose + np.swapaxes(by_poses, 1, 2) @ weighted
-            pose_gradient = pose_gradient - np.einsum("vij,vi->vj", weighted, between)
-            costs += np.sum(between**2 * weights, axis=1)
-        known = np.zeros((s1 + s2, s1 + s2)), np.zeros(s1 + s2), 0.0
-        prior, towards, prior_cost = (
-            known if self.prior is None else self.prior.normal(model, self.stereo_basis, s2 > 0)
-        )
-        return Normal(
-            shared=_shared(stereo.sum(0), stereo_point.sum(0), point.sum(0), shape),
-            cross=np.concatenate([squares[:, :s1, s1:-1], of_shape[..., :-1]], axis=1),
-            own=pose,
-            gradient=np.concatenate([squares[:, :s1, -1], of_shape[..., -1]], axis=1),
-            own_gradient=pose_gradient,
-            costs=costs,
-            of_each=partial(_shared, stereo, stereo_point, point, shape),
-            prior=prior,
-            prior_gradient=towards,
-            prior_cost=prior_cost,
-        )
+            root = np.sqrt(self.motion.weights_of(V) * (np.bincount(o.view, minlength=V) > 0)[:, None])
+            tied = np.zeros((V, 6, rows.shape[1]))
+            tied[..., :12], tied[..., -1] = root[..., None] * by_poses, -root * between
+            rows, view = np.concatenate([rows, tied.reshape(6 * V, -1)]), np.append(view, np.repeat(np.arange(V), 6))
+            costs += np.sum(tied[..., -1] ** 2, axis=1)
+        return rows, view, costs
+
+    def linearise(self, model: StereoModel) -> Normal:
+        """Normal equations at the model."""
+        rows, view, costs = self.rows(model)
+        order, count = np.argsort(view, kind="stable"), np.bincount(view, minlength=self.n_views)
+        place, of_view = np.empty(len(view), int), np.zeros((self.n_views, count.max(), rows.shape[1]))
+        place[order] = np.arange(len(view)) - np.repeat(np.cumsum(count) - count, count)
+        of_view[view, place] = rows
+        normal = normal_of_rows(of_view, 6 if self.motion is None else 12)
+        normal = replace(normal, costs=np.where(np.isfinite(costs), costs, np.inf))
+        if self.prior is None:
+            return normal
+        prior, towards, cost = self.prior.normal(model, self.stereo_basis, self.shape_basis.shape[-1] > 0)
+        return replace(normal, prior=prior, prior_gradient=towards, prior_cost=cost)
 
     def stepped(self, model: StereoModel, shared: Array, poses: Array) -> StereoModel:
         """The model after a step."""
         s1 = self.stereo_basis.shape[1]
         return moved(model, self.stereo_basis @ shared[:s1], poses, self.shape_basis @ shared[s1:])
-
-
-def _accumulated(indices: Sequence[NDArray[np.intp]], huber: float, values: Sequence[Array], *sums: Array) -> bool:
-    """The kernel, given what it is compiled for."""
-    whole = [np.ascontiguousarray(index, np.int64) for index in indices]
-    return bool(accumulate(*whole, float(huber), *(np.ascontiguousarray(value, np.float64) for value in values), *sums))
-
-
-def prepare() -> None:
-    """Compile the kernel, or load it: once per installation some tenths of a second, then nothing."""
-    values = [np.zeros(shape) for shape in ((0, 2), (0, 2, 2), (2, 9), (3, 3), (3,), (2, 0, 3, 3), (2, 0, 3), (0, 3))]
-    sums = [np.zeros(shape) for shape in ((0, 1, 1), (0, 0, 3, 1), (0, 0, 3, 3), (0,))]
-    _accumulated([np.zeros(0, np.int64)] * 3, np.inf, values, *sums)
 
 
 def quadratic(matrix: Array, vector: Array) -> Array:

@@ -147,7 +147,7 @@ def pair_motions(problem: Problem, model: StereoModel) -> PairMotions:
     pairs = np.flatnonzero(np.minimum(*seen) >= LEAST_POINTS)
     images = len(np.unique(2 * o.view + o.camera))
     freedom = max(2 * len(o) - 6 * images, 1)
-    about = problem.stepped(model, np.zeros(len(normal.shared)), step)
+    about = problem.stepped(model, np.zeros(len(normal.prior)), step)
     right = o[o.camera == 1]
     d_pose, squares = predict(about, right)[2], np.zeros((problem.n_views, 6, 6))
     np.add.at(squares, right.view, np.swapaxes(d_pose, 1, 2) @ d_pose)

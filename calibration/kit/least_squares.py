@@ -37,13 +37,12 @@ class Normal:
     An own number that no data of its block show stays where it is, as if it were known to one of its units.
     """
 
-    shared: Array  # (s, s) of the data of all blocks, before the own numbers are eliminated
+    shared: Array  # (n, s, s) of each block's data, before the own numbers are eliminated
     cross: Array  # (n, s, k)
     own: Array  # (n, k, k)
     gradient: Array  # (n, s)
     own_gradient: Array  # (n, k)
     costs: Array  # (n,) chi-square, or whatever loss takes its place; inf where there is no prediction
-    of_each: Callable[[], Array]  # (n, s, s) each block's part of `shared`: large, and seldom wanted
     prior: Array  # (s, s) information
     prior_gradient: Array  # (s,) towards the prior
     prior_cost: float = 0.0
@@ -68,7 +67,7 @@ class Normal:
     def _without_own(self, carried: Array, step: Array, damping: float = 0.0) -> tuple[Array, Array]:
         n, s, k = self.cross.shape
         cross = np.swapaxes(self.cross, 1, 2).reshape(n * k, s).T
-        total = self.shared + self.prior
+        total = self.shared.sum(0) + self.prior
         matrix = total + damping * np.diag(np.diag(total)) - cross @ carried.reshape(n * k, s)
         return matrix, self.gradient.sum(0) + self.prior_gradient - cross @ step.reshape(-1)
 
@@ -105,7 +104,7 @@ class Normal:
             (first, first) by `common`
         """
         carried, own = self.carried()
-        information = self.of_each() - self.cross @ carried  # own numbers eliminated
+        information = self.shared - self.cross @ carried  # own numbers eliminated
         gradient = self.gradient - np.einsum("nsk,nk->ns", self.cross, own)
         total = information.sum(0) + self.prior
         scale = 1.0 / np.sqrt(np.diag(total))  # the numbers' units differ by 10^6
@@ -134,17 +133,15 @@ class Normal:
 def normal_of_rows(rows: Array, k: int) -> Normal:
     """Normal equations of rows (n, m, k + s + 1): [own | shared | residual], zero where a block has fewer."""
     products = np.swapaxes(rows, 1, 2) @ rows
-    of_each = products[:, k:-1, k:-1]
     return Normal(
-        shared=of_each.sum(0),
+        shared=products[:, k:-1, k:-1],
         cross=products[:, k:-1, :k],
         own=products[:, :k, :k],
         gradient=products[:, k:-1, -1],
         own_gradient=products[:, :k, -1],
         costs=products[:, -1, -1],
-        of_each=lambda: of_each,
-        prior=np.zeros(of_each.shape[1:]),
-        prior_gradient=np.zeros(of_each.shape[1]),
+        prior=np.zeros(2 * (rows.shape[-1] - k - 1,)),
+        prior_gradient=np.zeros(rows.shape[-1] - k - 1),
     )
 
 

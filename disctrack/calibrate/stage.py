@@ -13,7 +13,6 @@ from calibration import CalibrationSettings, StereoCalibration, StereoRig
 from calibration.board import corner_fit
 from calibration.board.search import Progress
 from calibration.board.target import Target
-from calibration.fit import normal_equations
 from calibration.kit.arguments import checked
 from calibration.kit.seal import check_seal
 from calibration.rig_file import CalibrationRecord, read_rig, read_rig_file, rig_bytes
@@ -210,7 +209,6 @@ def _reusable(path: Path, provenance: Provenance) -> dict[str, Any] | None:
 def _calibrate(source: CalibrationSource) -> tuple[StereoCalibration, tuple[str, ...]]:
     with compiling("corners", 8):
         corner_fit.prepare()
-        normal_equations.prepare()
     with progress_bar("calibrate", 2 * len(source.views), "image") as advance:
         done = 0
 

@@ -9,7 +9,6 @@ from multiprocessing import get_context
 import numpy as np
 
 from calibration.board import corner_fit
-from calibration.fit import normal_equations
 from calibration.kit.compiled import FOLDER
 from disctrack import rolling
 from disctrack.discrepancy.equations import _ode_kernel
@@ -26,7 +25,7 @@ def run(arguments: argparse.Namespace) -> None:
         ("tracking", 40, [partial(prepare, kind) for kind in (np.uint8, np.uint16)]),
         ("the simulation of motions", 30, [rolling.prepare]),
         ("rendering", 10, [raster.prepare]),
-        ("corners", 8, [corner_fit.prepare, normal_equations.prepare]),
+        ("corners", 8, [corner_fit.prepare]),
         ("equations", 5, [_ode_kernel.prepare]),
         ("readers", 1, [_pixel_kernels.prepare]),
     ]

@@ -79,7 +79,7 @@ def test_normal_equations_have_the_cost_and_the_gradient_that_they_say(scene_mak
     assert_allclose(normal.cost, cost(model), rtol=1e-12)
     s = stereo_basis.shape[1] + basis.shape[-1]
     for direction in rng.normal(size=(6, s + 3 * k)):
-        direction[:s] /= np.sqrt(np.diag(normal.shared + normal.prior))
+        direction[:s] /= np.sqrt(np.diag(normal.shared.sum(0) + normal.prior))
         direction[s:] /= np.sqrt(np.concatenate([np.diag(block) for block in normal.own]))
         shared, poses = 1e-3 * direction[:s], 1e-3 * direction[s:].reshape(3, k)
         there, back = (cost(problem.stepped(model, d * shared, d * poses)) for d in (1.0, -1.0))

@@ -122,10 +122,9 @@ def test_a_block_without_data_keeps_its_numbers_and_moves_no_other(rng):
     problem = Decays(np.nan_to_num(data))
     whole = problem.linearise(problem.start)
     seen = np.delete(np.arange(BLOCKS), 3)
-    parts = {name: getattr(whole, name).copy() for name in ("cross", "own", "gradient", "own_gradient", "costs")}
-    others = replace(
-        whole, **{name: part[seen] for name, part in parts.items()}, shared=np.delete(whole.of_each(), 3, 0).sum(0)
-    )
+    names = ("shared", "cross", "own", "gradient", "own_gradient", "costs")
+    parts = {name: getattr(whole, name).copy() for name in names}
+    others = replace(whole, **{name: part[seen] for name, part in parts.items()})
     for part in parts.values():
         part[3] = 0.0
     empty = replace(others, **parts)
