@@ -8,10 +8,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
-from calibration.kit.arrays import Array, Mask
+from calibration.kit.arrays import Array
 from calibration.kit.least_squares import triangle
 from disctrack.diagnosis.missing_force import DiscScan, law_of, scanned
 from disctrack.diagnosis.motion import (
@@ -62,29 +61,6 @@ class _Path:
     by_motion: Array  # (n, 6, k) pose components (rotation vector) by `names`
 
 
-@dataclass(frozen=True)
-class StaticView:
-    """Dots of k frames about their measured poses, and what would move them: no model of the motion."""
-
-    residual: Array  # (k, 4 m) whitened
-    across: Array  # (k, 4 m, 4 m) takes off what a pose can take
-    rig: Array  # (k, 4 m, r) by directions of the calibration's covariance, in their sigmas, whitened
-    dots: Array  # (k, 4 m, 2 m) by the dots' places on the face [m], whitened
-    faults: dict[str, Array]  # (k, 2, m, 2, p) [px] by the numbers of faults of the measurement
-    places: Array  # (k, 2, m, 2) [px]
-    used: Mask  # (k, 2, m)
-    whiten: Array  # (k, 2, m, 2, 2)
-
-    def across_poses(self, columns: Array) -> Array:
-        """(4 k m, c) of columns, given whitened, what no pose takes."""
-        free = self.across @ columns.reshape(*self.residual.shape, -1)
-        return np.asarray(free.reshape(self.residual.size, -1), float)
-
-    def whitened(self, shifts: Array) -> Array:
-        """The same of shifts of the dots (k, 2, m, 2, c) [px]."""
-        return self.across_poses(np.einsum("ncmab,ncmbk->ncmak", self.whiten, shifts))
-
-
 class DiscSystem(LawSystem):
     """Dots of a rolling disc in two cameras; samples are frames, a row holds the whitened numbers of all dots."""
 
@@ -113,6 +89,7 @@ class DiscSystem(LawSystem):
         self.systematic = systematic or Systematic()
         self.columns_known: dict[tuple[str, int], tuple[Array, list[Array]]] = {}  # of `sought`, along a motion nearby
         self.known = dict(known or {})
+        self.measured: _Path | None = None  # in the place of a motion
         self.starts_in_slip = starts_in_slip
         self.notes: tuple[str, ...] = ()  # on the frames that were left out
         if rows is None:
@@ -197,18 +174,21 @@ class DiscSystem(LawSystem):
         quantities = _nuisances("rig", rig.shape[-1], "direction of the calibration's covariance", ("rig",))
         quantities += [replace(one, name=f"dot_{i}.{axis}") for i in range(m) for axis in "xy"]
         columns = [rig, dots.reshape(n, -1, 2 * m)]
-        per_px = float(np.sqrt(np.mean(self._whiten[self.used] ** 2) * 2)) if self.used.any() else 1.0
         together = sizes.lens_fields  # of all recordings of the rig
         for name, size, length, own, meaning, fields in (
             ("lens_field", sizes.lens_px, sizes.lens_length_px, False, "mode of the lenses' residual fields", together),
             ("dot_field", sizes.dot_px, sizes.dot_length_px, True, "mode of the dots' own residual fields", ()),
         ):
             if size > 0:
-                shifts = size * field_columns(places, self.used, length, size * per_px, own, fields)
-                whitened = np.einsum("ncmab,ncmbk->ncmak", self._whiten, shifts)
-                columns.append(whitened.reshape(n, 4 * m, shifts.shape[-1]))  # perhaps no mode at all is seen
+                shifts = size * field_columns(places, self.used, length, size * self.per_px, own, fields)
+                columns.append(self.whitened(shifts))
                 quantities += _nuisances(name, shifts.shape[-1], meaning, ("rig",) if fields else ())
         return tuple(quantities), np.concatenate(columns, axis=-1)
+
+    def whitened(self, shifts: Array) -> Array:
+        """(n, 4 m, k) of shifts of the dots (n, 2, m, 2, k) [px]; k may be 0."""
+        found = np.einsum("ncmab,ncmbk->ncmak", self._whiten, shifts)
+        return np.asarray(found.reshape(len(found), 2 * self.used[0].size, shifts.shape[-1]), float)
 
     def _as_measured(self, delay: float = 0.0) -> _Path:
         """The measured motion, by a cubic through the poses; rows without a pose get what lies between."""
@@ -218,26 +198,15 @@ class DiscSystem(LawSystem):
         times = np.stack([self.time, self.time + delay])
         return _Path(course(times), course(times, 1), (), np.zeros((len(q), 6, 0)))
 
-    def static_view(self, rows: NDArray[np.intp], known: Values) -> StaticView:
-        """The dots of these rows about their measured poses. known : faults that the poses were found with."""
-        delay = scene_faults(self.disc, known).right_delay_s
-        sight = self._sight(self._as_measured(delay), known)
-        if delay:  # the right camera saw a pose earlier, or later
-            rows = rows[(self.time[rows] + delay > self.time[0]) & (self.time[rows] + delay < self.time[-1])]
-        faults = {
-            fault.name: np.stack([fault.column(part, sight)[rows] for part in fault.parts], axis=-1)
-            for fault in self.faults
-            if fault.of_poses_alone
-        }
-        nuisances, m = self._nuisance_columns[rows], self.disc.n_markers
-        n_rig = len(self.rig_directions)
-        whitened = (self._whiten[rows] @ sight.by_pose[rows]).reshape(len(rows), -1, 6)
-        across = np.eye(whitened.shape[1]) - whitened @ np.linalg.pinv(whitened)
-        residual = self._rows_of(self.observed - sight.pixels)[rows]
-        return StaticView(
-            residual, across, nuisances[..., :n_rig], nuisances[..., n_rig : n_rig + 2 * m], faults,
-            sight.pixels[rows], self.used[rows], self._whiten[rows],
-        )  # fmt: skip
+    def about_poses(self, known: Values) -> DiscSystem:
+        """The same dots about their measured poses, which take the place of a motion, whatever its values.
+
+        known : faults that the poses were found with
+        """
+        view, delay = copy(self), scene_faults(self.disc, known).right_delay_s
+        view.measured, met = self._as_measured(delay), self.time + delay  # by the right camera
+        view.weights = np.where((met >= self.time[0]) & (met <= self.time[-1]), self.weights, 0.0)
+        return view
 
     def start(self) -> dict[str, float]:
         """Values of the base quantities from the measured poses, good enough for Gauss-Newton, and the known faults."""
@@ -265,6 +234,11 @@ class DiscSystem(LawSystem):
                     setattr(part, name, getattr(self, name)[:n])
                 found.append(part)
         return tuple(found)
+
+    @property
+    def per_px(self) -> float:
+        """Sigmas of a dot's noise in a pixel, rms."""
+        return float(np.sqrt(np.mean(self._whiten[self.used] ** 2) * 2)) if self.used.any() else 1.0
 
     @property
     def rate(self) -> float:
@@ -350,7 +324,7 @@ class DiscSystem(LawSystem):
 
         The difference that the dots show once everything else in `values` (cameras, pattern) is taken into account.
         """
-        r, J, normal = self._pose_equations(values)
+        r, J, normal = self.pose_equations(values)
         covariance = np.linalg.inv(normal)
         sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
         delta = (covariance @ (np.swapaxes(J, 1, 2) @ r[..., None]))[..., 0]
@@ -359,12 +333,12 @@ class DiscSystem(LawSystem):
 
     def parts_of_residual(self, values: Values) -> tuple[Array, Array]:
         """The part (n, 6) of the whitened residual that a free pose per frame would take, and the rest (n, 4 m)."""
-        r, J, normal = self._pose_equations(values)
+        r, J, normal = self.pose_equations(values)
         gradient = np.swapaxes(J, 1, 2) @ r[..., None]
         pose = np.linalg.solve(np.linalg.cholesky(normal), gradient)[..., 0]
         return pose, r - (J @ np.linalg.solve(normal, gradient))[..., 0]
 
-    def _pose_equations(self, values: Values) -> tuple[Array, Array, Array]:
+    def pose_equations(self, values: Values) -> tuple[Array, Array, Array]:
         """Residual (n, 4 m), its derivative (n, 4 m, 6) and normal matrix (n, 6, 6) by a free pose per frame."""
         sight = self._sight(self._path(values, ()), values)
         r = self._residual(sight.pixels, values)
@@ -387,6 +361,8 @@ class DiscSystem(LawSystem):
 
     def _path(self, values: Values, names: Sequence[str]) -> _Path:
         """Motion at the true instants of both cameras, and the derivatives that belong to it."""
+        if self.measured is not None:
+            return self.measured
         times, delay = self.instants(values), scene_faults(self.disc, values).right_delay_s
         model, state = self.model_with({k: v for k, v in values.items() if np.isfinite(v)}), state_of(values)
         # a step of the fit may lead where no disc rolls, and where following it would take for ever

@@ -89,12 +89,16 @@ def poses_with(trajectory: Trajectory, values: Values) -> Trajectory:
     )
 
 
-def find_large(trajectory: Trajectory, model: Model, first: Systematic, known: Values) -> Assumed | None:
+def find_large(system: DiscSystem, first: Systematic) -> Assumed | None:
     """Faults that the dots alone show to be large, with the camera that the motion speaks for; None if there are none.
 
-    first : what `find_systematic` finds in the trajectory as it is
+    first : what `find_systematic` finds in the system
     """
-    if max(first.beside_px, first.lens_px, first.dot_px) < LARGE_PX:
+    trajectory, model, known = system.trajectory, system.model, system.known
+    _, columns = system.about_poses(known).linearise(known, list(first.amounts))
+    moved = columns @ np.array(list(first.amounts.values()))
+    moved_px = float(np.sqrt(np.sum(moved**2) / np.sum(system.weights))) / system.per_px
+    if max(moved_px, first.lens_px, first.dot_px) < LARGE_PX:
         return None
     best: Assumed | None = None
     for hypotheses in (SINGLE, DOUBLE):

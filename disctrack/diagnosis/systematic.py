@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
+from itertools import chain, pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -21,11 +21,11 @@ from scipy.stats import chi2
 
 from calibration.kit.arrays import Array, Mask
 from disctrack.diagnosis.stretch import MIN_FRAMES
-from disctrack.faults.catalogue import TYPICAL_STEPS, Fault
+from disctrack.faults.catalogue import TYPICAL_STEPS
 from disctrack.trajectory import MarkerStatus, Trajectory
 
 if TYPE_CHECKING:
-    from disctrack.diagnosis.disc_system import DiscSystem, StaticView
+    from disctrack.diagnosis.disc_system import DiscSystem
     from disctrack.discrepancy.system import Values
 
 
@@ -92,9 +92,7 @@ class Systematic:
     dot_length_px: float = 200.0
     print_m: float = 0.0  # rms of the dots' places on the face, per coordinate
     gain: float = 0.0  # of twice the log likelihood, over noise alone
-    beside: tuple[str, ...] = ()  # faults of the measurement that were fitted along
-    beside_px: float = 0.0  # rms of what they do to the dots about free poses
-    amounts: dict[str, float] = field(default_factory=dict)  # of their quantities
+    amounts: dict[str, float] = field(default_factory=dict)  # of faults of the measurement that were fitted along
     lens_fields: tuple[SmoothField, ...] = ()  # of each camera, where several recordings have them in common
     left: float = 1.0  # variance beside all that, over the noise, of the numbers that no pose can take
 
@@ -244,65 +242,66 @@ def _with_faults(
         best, sizes, chosen = trials[name], sizes | {name: faults[name]}, (*chosen, name)
 
 
-def _with_amounts(
-    found: Systematic,
-    evidence: Likelihood,
-    sizes: Sizes,
-    names: tuple[str, ...],
-    view: StaticView,
-    faults: Sequence[Fault],
-) -> Systematic:
-    """With the faults fitted along, their most probable amounts, and what these do to the dots."""
-    amounts, powers = dict[str, float](), 0.0
-    for fault in (f for f in faults if f.name in names):
-        values = evidence.amounts(sizes, fault.name)
-        powers += float(np.mean((view.faults[fault.name] @ values)[view.used] ** 2))
-        amounts |= dict(zip(fault.names(), values.tolist(), strict=True))
-    return replace(found, beside=names, beside_px=float(np.sqrt(powers)), amounts=amounts)
-
-
 def find_systematic(system: DiscSystem, known: Values | None = None, beside: Sequence[str] | None = None) -> Systematic:
     """Sizes of the systematic errors of the dots, next to whatever fault of the measurement explains them better.
 
     known : values of faults that the poses were found with
     beside : fit these faults along, and no others
     """
-    rows = np.flatnonzero(system.weights >= np.max(system.weights))
+    known, view = known or {}, system.about_poses(known or {})
+    rows = np.flatnonzero(view.weights >= np.max(view.weights))
     if len(rows) < MIN_FRAMES:
         return Systematic()
     rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(MAX_FRAMES, len(rows))).astype(int))]
-    view = system.static_view(rows, known or {})
-    data = view.across_poses(view.residual)[:, 0]
-    numbers = float(np.sum(system.weights[rows] - 6.0))
+    places, (residual, by_pose, normal) = view.pixels(known), (part[rows] for part in view.pose_equations(known))
+
+    def across(columns: Array) -> Array:
+        """(4 m k, c) of whitened columns (k, 4 m, c) what no pose takes."""
+        taken = by_pose @ np.linalg.solve(normal, np.swapaxes(by_pose, 1, 2) @ columns)
+        return np.asarray((columns - taken).reshape(residual.size, -1), float)
+
+    def columns_by(names: Sequence[str]) -> Array:
+        return across(view.linearise(known, names)[1][rows])
+
+    data = across(residual[..., None])[:, 0]
     size = max(float(np.sqrt(np.mean(data**2))), 1.0)
-    seen = [view.places[:, c][view.used[:, c]] for c in range(2) if view.used[:, c].any()]
-    extent = float(np.max([np.ptp(places, axis=0).max() for places in seen]))
+    used = view.used & np.isin(np.arange(len(view.used)), rows)[:, None, None]
+    extent = float(max(np.ptp(places[:, c][used[:, c]], axis=0).max() for c in range(2) if used[:, c].any()))
+
+    def field(length: float, own: bool = False) -> Array:
+        return across(view.whitened(field_columns(places, used, length, size, own))[rows])
+
+    of_poses = {fault.name: fault.names() for fault in system.faults if fault.of_poses_alone}
     typical = {fault.name: TYPICAL_STEPS * fault.step for fault in system.faults}
-    faults = {name: view.whitened(columns) for name, columns in view.faults.items()}
+    faults = {name: columns_by(quantities) for name, quantities in of_poses.items()}
     faults = {name: columns for name, columns in faults.items() if np.linalg.norm(columns) * typical[name] > 3.0}
-    groups = {"rig": view.across_poses(view.rig), "print": view.across_poses(view.dots), **faults}
-    groups["dot"] = view.whitened(field_columns(view.places, view.used, DOT_LENGTH * extent, size, own=True))
-    per_px = float(np.sqrt(np.mean(view.whiten[view.used] ** 2) * 2))
-    steps: Array = size / per_px * 2.0 ** np.arange(-7, 4.5, 1.0)
+    groups = {
+        "rig": columns_by([f"rig.{i}" for i in range(len(system.rig_directions))]),
+        "print": columns_by([f"dot_{i}.{axis}" for i in range(system.disc.n_markers) for axis in "xy"]),
+        **faults,
+        "dot": field(DOT_LENGTH * extent, own=True),
+    }
+    steps: Array = size / view.per_px * 2.0 ** np.arange(-7, 4.5, 1.0)
     grids = {"print": DOT_SIGMA * 2.0 ** np.arange(7.0), "lens": steps, "dot": steps}
     given = tuple(name for name in beside or () if name in faults)
     start = {"rig": 1.0, "print": DOT_SIGMA} | {name: WIDE * typical[name] for name in given}
-    amounts = {name: typical[name] for name in faults} if beside is None else {}
-
+    offered = {name: typical[name] for name in faults if beside is None}
     nothing, best = Likelihood(data, groups).twice_log(start), Systematic(gain=-np.inf)
     for share in (0.0, *LENS_LENGTHS):  # without any field, and with fields of the cameras as long
-        fields, sought = dict(groups), grids if share else {}
-        if share:
-            fields["lens"] = view.whitened(field_columns(view.places, view.used, share * extent, size))
-        evidence = Likelihood(data, fields)
+        sought, fields = (grids, {"lens": field(share * extent)}) if share else ({}, {})
+        evidence = Likelihood(data, groups | fields)
         value, sizes = _best_sizes(evidence, dict(start), sought)
-        value, sizes, chosen = _with_faults(evidence, sizes, amounts)
+        value, sizes, chosen = _with_faults(evidence, sizes, offered)
         if chosen:  # what a fault explains is no field
             value, sizes = _best_sizes(evidence, start | {name: typical[name] for name in chosen}, sought)
-        print_m, left = sizes["print"] if sizes["print"] > DOT_SIGMA else 0.0, evidence.left(sizes) / numbers
+        print_m, left = (
+            sizes["print"] if sizes["print"] > DOT_SIGMA else 0.0,
+            evidence.left(sizes) / np.sum(view.weights[rows] - 6.0),
+        )
         lens, dot = (sizes.get("lens", 0.0), share * extent), (sizes.get("dot", 0.0), DOT_LENGTH * extent)
-        found = Systematic(*lens, *dot, print_m, value - nothing, left=max(1.0, left) if share else 1.0)
-        found = _with_amounts(found, evidence, sizes, (*given, *chosen), view, system.faults)
+        told = (zip(of_poses[name], evidence.amounts(sizes, name).tolist(), strict=True) for name in (*given, *chosen))
+        amounts, left = dict(chain(*told)), max(1.0, left) if share else 1.0
+        found = Systematic(*lens, *dot, print_m, value - nothing, amounts, left=left)
         if not share or (found.present and found.gain > best.gain + WORTH):
             best = found
     return best
