@@ -15,12 +15,12 @@ from calibration.kit.least_squares import triangle
 from disctrack.diagnosis.missing_force import DiscScan, law_of, scanned
 from disctrack.diagnosis.motion import (
     SLIP,
+    SLIP_VELOCITY,
     THETA_END,
     candidate_of_fault,
     measurement_candidates,
     model_quantities,
     motion_candidates,
-    slipping_start_quantities,
     state_of,
     state_quantities,
 )
@@ -71,7 +71,6 @@ class DiscSystem(LawSystem):
         candidates: tuple[Candidate, ...] | None = None,
         *,
         rows: slice | None = None,
-        starts_in_slip: bool = False,
         systematic: Systematic | None = None,
         freed: tuple[Candidate, ...] = (),
         known: Values | None = None,
@@ -80,8 +79,7 @@ class DiscSystem(LawSystem):
 
         candidates : all of the catalogue and of the measurement, if not given
         rows : frames to take; those of `free_stretch` if not given
-        starts_in_slip : the velocity at the first instant is free, and so is the friction, unless the model declares it
-        freed : faults that are known to be there: every fit moves their quantities
+        freed : faults, or slip at the start, that are known to be there: every fit moves their quantities
         known : faults of the measurement that are held at these values; tolerances are about them
         systematic : sizes of the dots' systematic errors, that are fitted along as fields with these sizes as priors
         Raises AnalysisError.
@@ -90,7 +88,6 @@ class DiscSystem(LawSystem):
         self.columns_known: dict[tuple[str, int], tuple[Array, list[Array]]] = {}  # of `sought`, along a motion nearby
         self.known = dict(known or {})
         self.measured: _Path | None = None  # in the place of a motion
-        self.starts_in_slip = starts_in_slip
         self.notes: tuple[str, ...] = ()  # on the frames that were left out
         if rows is None:
             rows, self.notes = free_stretch(trajectory)
@@ -110,14 +107,14 @@ class DiscSystem(LawSystem):
         self.weights = np.asarray(2.0 * self.used.sum((1, 2)), float)
         self.trial_steps = TRIAL_SLIP_STEPS * len(self.time)
         self.budget = Budget(MOST_WORK * max(len(self.time), USUAL))  # a short one may take as long as the usual
-        of_slip = slipping_start_quantities(model) if starts_in_slip else ()
         if candidates is None:
             candidates = (*motion_candidates(model), *measurement_candidates(self.disc))
-        of_faults = tuple(q for c in freed for q in c.quantities)
-        fitted = (*state_quantities(), *of_slip, *model_quantities(model), *of_faults)
+        of_freed = tuple(q for c in freed for q in c.quantities)
+        self.starts_in_slip = any(q.name in SLIP_VELOCITY for q in of_freed)
+        fitted = (*state_quantities(), *model_quantities(model), *of_freed)
         sizes = tuple(self._sizes({q.name for q in fitted}))
         # where the rim levelled the table, each recording has a plane of its own, and that is no fault to be found
-        in_base = {q.name for q in (*of_slip, *of_faults, *(q for q in sizes if not q.belongs_to))}
+        in_base = {q.name for q in (*of_freed, *(q for q in sizes if not q.belongs_to))}
         self.candidates = tuple(c for c in candidates if not in_base & set(c.names))
         nuisances, self._nuisance_columns = self._nuisances()
         self._nuisance_column = {q.name: i for i, q in enumerate(nuisances)}

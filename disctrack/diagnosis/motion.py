@@ -37,15 +37,13 @@ def state_of(values: Values) -> State:
     return State(**{k.partition(".")[2]: float(v) for k, v in values.items() if k.startswith("state.")})
 
 
-def slipping_start_quantities(model: Model) -> tuple[Quantity, ...]:
+def slip_start(model: Model) -> Candidate:
     """Velocity of the centre at the first instant, and 1/mu unless the model has a coefficient of friction already."""
-    velocity = tuple(
-        Quantity(name, "m/s", 1e-3, meaning="velocity of the centre at the first instant") for name in SLIP_VELOCITY
-    )
-    if model.effect("slip"):
-        return velocity
-    (inverse,) = slip_candidate(CATALOGUE["slip"]).quantities
-    return (*velocity, replace(inverse, lower=1.0 / ROUGHEST))
+    usual, title = slip_candidate(CATALOGUE["slip"]), "the disc slips at first, with Coulomb friction |F_t| = mu F_z"
+    inverse = () if model.effect("slip") else (replace(usual.quantities[0], lower=1.0 / ROUGHEST),)
+    one = Quantity("", "m/s", 1e-3, meaning="velocity of the centre at the first instant")
+    quantities = *inverse, *(replace(one, name=name) for name in SLIP_VELOCITY)
+    return Candidate("slip_start", usual.effect, "motion", title, usual.source, quantities)
 
 
 def effect_quantity(effect: type[Effect], parameter: EffectParameter) -> Quantity:

@@ -16,8 +16,8 @@ from disctrack.analyse.quantities import propagate
 from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.diagnosis.errors import simulated
 from disctrack.diagnosis.large_faults import diagnose_with_large, find_clock, find_large
-from disctrack.diagnosis.motion import SLIP, SLIP_VELOCITY, slip_candidate
-from disctrack.diagnosis.starts import first_slip
+from disctrack.diagnosis.motion import slip_start
+from disctrack.diagnosis.starts import first_contact, first_motion
 from disctrack.diagnosis.stretch import free_stretch
 from disctrack.diagnosis.systematic import find_systematic, with_noise_of_frames
 from disctrack.discrepancy.fit import TRIAL, Fit, fit
@@ -27,10 +27,10 @@ from disctrack.discrepancy.search import FAR, Diagnosis, Found, Settings, beside
 from disctrack.discrepancy.system import Candidate, GivenUp
 from disctrack.errors import AnalysisError
 from disctrack.faults.clock_jump import clock_jumps, without_jumps
-from disctrack.rolling import CATALOGUE, Model, Regime
+from disctrack.rolling import Model, Regime
 from disctrack.trajectory import Trajectory, part
 
-LEAST_SLIP = 12e-3  # [m/s] a cubic over the first 20 ms errs by 9 mm/s at 3 deg; friction of 0.1 stops it in 12 ms
+LEAST_SLIP = 12e-3  # [m/s] friction of 0.1 stops it in 12 ms
 LASTS = 5  # frames of slip at mm/s at least: contact velocities that are errors of a fit stop within one
 SHOWN = 0.975  # probability of slip at the first frame from which on it is taken for shown
 
@@ -51,7 +51,7 @@ class MotionDiagnosis:
         (without, held_without), held, noise = self.rolling, diagnosis.held_out_before, diagnosis.noise
         gain = (without.cost - diagnosis.before.cost) / noise
         held_gain = held.gain_over(held_without, noise) if held else np.nan
-        candidate = _candidate(self.system)
+        candidate = slip_start(self.system.model)
         enough = threshold(self.system, diagnosis.settings, len(candidate.names))
         found = Found(candidate, float(gain), held_gain, enough, ())
         reason = f"with slip at the start, {diagnosis.reason}"
@@ -90,12 +90,11 @@ def _with_these_times(
 
 def _rolling_or_slipping(settings: Settings, rolling: DiscSystem, base: Fit) -> MotionDiagnosis:
     """The diagnosis of a motion without large faults."""
-    q = rolling.trajectory.q[rolling.rows]
     large = not base.reduced_chi_square <= FAR * noise_variance(rolling, base)
     if large and _slips_slowly(settings, rolling):
         return _slipping(settings, rolling, base, None)
-    may_slip = first_slip(rolling.time, q, rolling.disc) > LEAST_SLIP and not _at_noise(rolling, base, settings)
-    onset = _onset(rolling) if may_slip else None
+    rolls = _at_noise(rolling, base, settings) or first_contact(first_motion(rolling, rolling.known))[0] <= LEAST_SLIP
+    onset = None if rolls else _onset(rolling)
     if onset is None or onset.probability <= SHOWN or onset.low <= rolling.time[0]:
         return MotionDiagnosis(rolling, explain(rolling, base.values, settings), ())
     # the velocity at the contact is that of a rim as declared: where it is not round, what rolls seems to slip
@@ -112,7 +111,7 @@ def _slips_slowly(settings: Settings, rolling: DiscSystem) -> bool:
     Friction below what rolling needs holds the contact's velocity at mm/s, which no first poses show; a fit does. Three
     numbers that do away with all of it are not those of another effect.
     """
-    slipping = rolling.again(starts_in_slip=True)
+    slipping = rolling.again(freed=(slip_start(rolling.model),))
     try:
         with slipping.budget.trial(slipping.trial_steps):
             alone = fit(slipping, slipping.base, slipping.start(), TRIAL)
@@ -142,14 +141,14 @@ def _onset(rolling: DiscSystem) -> RollingOnset | None:
 
 def _slipping(settings: Settings, rolling: DiscSystem, base: Fit, onset: RollingOnset | None) -> MotionDiagnosis:
     """The diagnosis with slip at first, or of what comes after it where no coefficient of friction describes it."""
-    system = rolling.again(starts_in_slip=True)
+    system = rolling.again(freed=(slip_start(rolling.model),))
     diagnosis = explain(system, system.start(), settings)
     if diagnosis.verdict == "unexplained" and onset is not None and np.isfinite(onset.high):
         later = _after_slip(settings, rolling, onset, diagnosis)
         if later is not None:
             return later
     notes = _in_words(system, diagnosis)
-    if diagnosis.held_out_after is None or SLIP not in {q.name for q in system.base}:  # friction was declared
+    if diagnosis.held_out_after is None or system.model.effect("slip"):  # friction was declared
         return MotionDiagnosis(system, diagnosis, notes)
     held = held_out(diagnosis.judged or system, base.quantities, base.values, training_rows(system))
     return MotionDiagnosis(system, diagnosis, notes, (base, held))
@@ -174,13 +173,6 @@ def _after_slip(
         f"friction describes that ({left}): this is the diagnosis of what comes after it"
     )
     return MotionDiagnosis(system, diagnosis, (note,))
-
-
-def _candidate(system: DiscSystem) -> Candidate:
-    usual, fitted = slip_candidate(CATALOGUE["slip"]), {q.name: q for q in system.base}
-    quantities = tuple(fitted[name] for name in (SLIP, *SLIP_VELOCITY))
-    title = "the disc slips at first, with Coulomb friction |F_t| = mu F_z"
-    return Candidate("slip_start", usual.effect, "motion", title, usual.source, quantities)
 
 
 def _in_words(system: DiscSystem, diagnosis: Diagnosis) -> tuple[str, ...]:

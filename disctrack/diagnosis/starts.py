@@ -7,19 +7,21 @@ spectrum of what is left of the positions, and refits begin where they gain most
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.signal import find_peaks
 
 from calibration.kit.arrays import Array
+from disctrack.analyse.contact import CONTACT, contact_quantities
+from disctrack.analyse.derivatives import MeasuredMotion, differentiate
+from disctrack.analyse.smoothing import SEGMENT
 from disctrack.diagnosis.motion import SLIP, SLIP_VELOCITY, model_quantities, state_quantities
-from disctrack.diagnosis.stretch import FIRST_WINDOW
-from disctrack.disc import Disc
 from disctrack.discrepancy.fit import fit
 from disctrack.discrepancy.score import cleared, span
 from disctrack.discrepancy.system import Candidate, Values
-from disctrack.frames import nodal_axes_world, rotation_from_euler, vector_from_rotation
+from disctrack.trajectory import part
 
 if TYPE_CHECKING:
     from disctrack.diagnosis.disc_system import DiscSystem
@@ -35,63 +37,45 @@ NEAR = 10.0  # [sigma of a number], rms between two motions: micrometres of the 
 SLOW = 3.0  # periods in the recording that a vibration has at least
 
 
-def first_state(time: Array, q: Array) -> dict[str, float]:
-    """Initial state from poses (n, 6), some of them NaN, by a cubic in time through the first ones.
+def first_motion(system: DiscSystem, known: Values) -> MeasuredMotion:
+    """The first poses and their derivatives, by the clock as it is if these faults are there. Raises AnalysisError."""
+    n = int(np.flatnonzero(system.trajectory.measured[system.rows])[:SEGMENT][-1]) + 1
+    first = part(system.trajectory, slice(system.rows.start, system.rows.start + n))
+    return differentiate(replace(first, time=system.instants(known)[:n]))
 
-    A quarter turn of nutation at 12 Hz is a cubic. Returns state.x ... state.omega3, and the centre's velocity as
-    state.v_x, state.v_y, which a rolling disc does not need.
+
+def first_state(motion: MeasuredMotion) -> dict[str, float]:
+    """Initial state of a measured motion: state.x ... state.omega3, and the centre's velocity.
+
+    That is in state.v_x, state.v_y, which a rolling disc does not need.
     """
-    coefficients, (psi, theta, phi) = _cubic(time, q)
-    velocity, omega = coefficients[1, :2], coefficients[1, 3:]
-    rates = [omega @ axis for axis in nodal_axes_world(psi, theta)]
+    rates = [motion.omega_world[0] @ axis[0] for axis in motion.axes()]
     names = (*(q.name for q in state_quantities()), *SLIP_VELOCITY)
-    return dict(zip(names, map(float, (*coefficients[0, :2], psi, theta, phi, *rates, *velocity)), strict=True))
+    numbers = *motion.position[0, :2], *motion.euler[0], *rates, *motion.velocity[0, :2]
+    return dict(zip(names, map(float, numbers), strict=True))
 
 
-def first_friction(time: Array, q: Array, gravity: float) -> float:
-    """Horizontal over vertical contact force at the first instant, from the centre's acceleration: mu in slip."""
-    x, y, z = 2 * _cubic(time, q)[0][2, :3]
-    return float(np.clip(np.hypot(x, y) / max(gravity + z, 0.1 * gravity), *FRICTIONS))
-
-
-def first_slip(time: Array, q: Array, disc: Disc) -> float:
-    """Horizontal speed [m/s] of the disc's point at the contact at the first instant; rolling has none."""
-    coefficients, (psi, theta, _) = _cubic(time, q)
-    _, e2, e3 = nodal_axes_world(psi, theta)
-    slip = coefficients[1, :3] + np.cross(coefficients[1, 3:], disc.arm_to_contact(e2, e3))
-    return float(np.hypot(*slip[:2]))
-
-
-def _cubic(time: Array, q: Array) -> tuple[Array, Array]:
-    """Coefficients (4, 6) of the first poses' displacement and turn by powers of time [s], and the first angles."""
-    interval = float(np.median(np.diff(time)))
-    good = np.flatnonzero(np.isfinite(q).all(axis=1) & (time <= time[0] + max(FIRST_WINDOW, 10 * interval)))
-    t, poses = time[good] - time[0], q[good]
-    R = rotation_from_euler(*poses[:, 3:].T)
-    turned = vector_from_rotation(R @ R[0].T)
-    span_ = max(float(t[-1]), interval)
-    terms = np.vander(t / span_, min(4, max(2, len(t) // 3)), increasing=True)
-    coefficients = np.linalg.lstsq(terms, np.column_stack([poses[:, :3], turned]), rcond=None)[0]
-    found = np.zeros((4, 6))
-    found[: len(coefficients)] = coefficients / span_ ** np.arange(len(coefficients))[:, None]
-    return found, poses[0, 3:]
+def first_contact(motion: MeasuredMotion) -> tuple[float, float]:
+    """Slip [m/s] at the first instant, and horizontal over vertical contact force, which is mu where the disc slips."""
+    numbers = contact_quantities(motion, motion.disc, motion.gravity)[0].tolist()
+    found = dict(zip((name for name, *_ in CONTACT), numbers, strict=True))
+    mu = float(np.clip(found["friction_needed"], *FRICTIONS))
+    return float(np.hypot(found["slip_n"], found["slip_m"])), mu if np.isfinite(mu) else FRICTIONS[1]
 
 
 def start_values(system: DiscSystem, known: Values) -> dict[str, float]:
     """Values of state and declared effects from which the fit of the whole recording converges; `known` are kept."""
-    q = system.trajectory.q[system.rows]
-    names = {quantity.name for quantity in system.base}
-    times = system.instants(known)
-    values = dict(known) | {k: v for k, v in first_state(times, q).items() if k in names}
+    names, motion = {quantity.name for quantity in system.base}, first_motion(system, known)
+    values = dict(known) | {k: v for k, v in first_state(motion).items() if k in names}
     laws = model_quantities(system.model)
     values |= {law.name: system.model.values[law.name] for law in laws}
     if SLIP in names:
-        values[SLIP] = 1.0 / first_friction(times, q, system.model.gravity)
+        values[SLIP] = 1.0 / first_contact(motion)[1]
     state = tuple(quantity for quantity in system.base if quantity.is_initial or quantity.name == SLIP)
-    for stretch, part in zip(STRETCHES, system.beginnings(), strict=False):
+    for stretch, beginning in zip(STRETCHES, system.beginnings(), strict=False):
         # a law of friction shows only over several turns: held until the stretch is long enough
         moved = state if stretch < 0.1 else (*state, *laws)
-        values = fit(part, moved, values).values
+        values = fit(beginning, moved, values).values
     return values
 
 

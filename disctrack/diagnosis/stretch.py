@@ -16,7 +16,7 @@ AT_REST = 0.3  # [rad/s] a disc that rolls turns at 3 rad/s or more; one that is
 REST_SIGMAS = 6.0  # a turn between two poses that is smaller may be noise
 HAND = 0.005  # [s] next to a rest, in which what held the disc is still there, or there again
 FIRST_WINDOW = 0.02  # [s] in which the first state is read off the poses
-FIRST_POSES = 6  # in it at least: a cubic has four numbers
+FIRST_POSES = 6  # in it at least
 HELD = "the disc is at rest or held"
 OTHERWISE = ("the disc lies flat", HELD, "the disc slips")  # what frames show that are not of a motion on its own
 

@@ -7,6 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from calibration.cameras.camera import rotation_from_vector
+from disctrack.analyse.derivatives import differentiate
 from disctrack.diagnosis import diagnose
 from disctrack.diagnosis.model_file import declared_model, model_toml
 from disctrack.diagnosis.motion import measurement_candidates
@@ -36,7 +37,7 @@ def saved(system, values, folder):
 
 
 def rolling_state(trajectory):
-    first = first_state(trajectory.time, trajectory.q)
+    first = first_state(differentiate(trajectory))
     return {name: value for name, value in first.items() if not name.startswith("state.v_")}
 
 
