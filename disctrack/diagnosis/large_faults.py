@@ -10,7 +10,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.interpolate import CubicSpline
+from scipy.optimize import least_squares
 
+from calibration.kit.arrays import Array
 from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.diagnosis.motion import candidate_of_fault
 from disctrack.diagnosis.systematic import Systematic, find_systematic, with_noise_of_frames
@@ -27,7 +29,6 @@ from disctrack.track.pose import DotsInFrames, fit_poses
 from disctrack.trajectory import Trajectory
 
 LARGE_PX = 1.0  # rms in the dots, from which a fault is sought without the linear approximation
-ITERATIONS = 6
 WORSE = 4.0  # times the misfit of the best explanation, from which another is not pursued
 ENOUGH = 1.5  # reduced chi-square, up to which no second fault is looked for
 SINGLE = (("time_offset",), *((f"{camera}_{family}",) for family in ("turned", "shifted") for camera in CAMERAS))
@@ -45,7 +46,7 @@ class Assumed:
     system: DiscSystem
     base: Fit
     candidates: tuple[Candidate, ...]
-    gain: float  # of twice the log likelihood of the dots about free poses; infinite where the motion told
+    gain: float  # decrease of chi-square of the dots about free poses; infinite where the motion told
 
     @property
     def price(self) -> float:
@@ -89,12 +90,12 @@ def poses_with(trajectory: Trajectory, values: Values) -> Trajectory:
     )
 
 
-def find_large(system: DiscSystem, first: Systematic) -> Assumed | None:
+def find_large(as_tracked: Trajectory, system: DiscSystem, first: Systematic) -> Assumed | None:
     """Faults that the dots alone show to be large, with the camera that the motion speaks for; None if there are none.
 
-    first : what `find_systematic` finds in the system
+    system : of what was tracked, with the noise that it shows so far.   first : what `find_systematic` finds in it
     """
-    trajectory, model, known = system.trajectory, system.model, system.known
+    known = system.known
     _, columns = system.about_poses(known).linearise(known, list(first.amounts))
     moved = columns @ np.array(list(first.amounts.values()))
     moved_px = float(np.sqrt(np.sum(moved**2) / np.sum(system.weights))) / system.per_px
@@ -102,10 +103,10 @@ def find_large(system: DiscSystem, first: Systematic) -> Assumed | None:
         return None
     best: Assumed | None = None
     for hypotheses in (SINGLE, DOUBLE):
-        seen = [_found_statically(trajectory, model, names, known) for names in hypotheses]
+        seen = [_found_statically(system.trajectory, names, known) for names in hypotheses]
         least = min(left for left, *_ in seen)
         for names, (left, values, gain) in zip(hypotheses, seen, strict=True):
-            found = _assumed(trajectory, model, names, values, gain) if left < WORSE * least else None
+            found = _assumed(as_tracked, system.model, names, values, gain) if left < WORSE * least else None
             if found is not None and (best is None or found.price < best.price):
                 best = found
         if best is not None and best.base.reduced_chi_square < ENOUGH:
@@ -118,26 +119,28 @@ def _candidates(disc: Disc, names: Sequence[str]) -> tuple[Candidate, ...]:
 
 
 def _found_statically(
-    trajectory: Trajectory, model: Model, names: Sequence[str], known: Values
+    trajectory: Trajectory, names: Sequence[str], known: Values
 ) -> tuple[float, dict[str, float], float]:
-    """Amounts of these faults from the dots about free poses, which are found with them in turn.
+    """Amounts of these faults with which free poses leave least of the dots.
 
-    returns : median reduced chi-square of the poses that they leave, the amounts, gain of twice the log likelihood
+    returns : chi-square of the dots about those poses, the amounts, decrease of chi-square
     """
     quantities = [q for c in _candidates(trajectory.disc, names) for q in c.quantities]
-    values, gain = dict(known), 0.0
-    for _ in range(ITERATIONS):
-        seen = with_noise_of_frames(poses_with(trajectory, values))
-        good = np.flatnonzero(seen.measured)  # poses that are wrong by degrees tell no rest from motion
-        system = DiscSystem(seen, model, rows=slice(int(good[0]), int(good[-1]) + 1))
-        found = find_systematic(system, values, beside=names)
-        gain, steps = max(gain, found.gain), [found.amounts.get(q.name, 0.0) for q in quantities]
-        for q, step in zip(quantities, steps, strict=True):
-            values[q.name] = float(np.clip(values.get(q.name, 0.0) + step, 0.99 * q.lower, 0.99 * q.upper))
-        if all(abs(step) < 0.1 * q.scale for q, step in zip(quantities, steps, strict=True)):
-            break
-    left = float(np.nanmedian(poses_with(trajectory, values).reduced_chi_square))
-    return left if np.isfinite(left) else np.inf, values, gain
+    sigma = np.sqrt(0.5 * np.trace(trajectory.markers_covariance_px2, axis1=-2, axis2=-1))[..., None]
+
+    def amounts(steps: Array) -> dict[str, float]:
+        moved = {q.name: known.get(q.name, 0.0) + q.scale * x for q, x in zip(quantities, steps.tolist(), strict=True)}
+        return {**known, **moved}
+
+    def left(steps: Array) -> Array:
+        return np.nan_to_num(poses_with(trajectory, amounts(steps)).markers_residual_px / sigma).ravel()
+
+    def by_steps(steps: Array) -> Array:
+        return np.stack([(left(steps + one) - left(steps - one)) / 2 for one in np.eye(len(steps))], axis=1)
+
+    nothing = np.zeros(len(quantities))
+    found = least_squares(left, nothing, by_steps, xtol=1e-3)
+    return 2 * found.cost, amounts(found.x), float(np.sum(left(nothing) ** 2)) - 2 * found.cost
 
 
 def _assumed(trajectory: Trajectory, model: Model, names: Sequence[str], known: Values, gain: float) -> Assumed | None:
@@ -148,7 +151,7 @@ def _assumed(trajectory: Trajectory, model: Model, names: Sequence[str], known: 
         plain = DiscSystem(seen, model, known=known)
     except AnalysisError:
         return None
-    system = plain.again(systematic=find_systematic(plain, known, beside=names), freed=candidates)
+    system = plain.again(systematic=find_systematic(plain, known, names), freed=candidates)
     base = fit(system, system.base, system.start())
     return Assumed(system, base, candidates, gain) if np.isfinite(base.cost) else None
 

@@ -78,7 +78,7 @@ def _with_these_times(
     systematic = find_systematic(rolling)
     # what fields leave in numbers that no pose takes is in the poses as well, and nothing that a motion could explain
     settings = replace(settings, at_noise=settings.at_noise * systematic.left)
-    assumed = find_large(rolling, systematic)
+    assumed = find_large(as_tracked, rolling, systematic)
     if assumed is None:
         rolling = rolling.again(systematic=systematic)
         base = fit(rolling, rolling.base, rolling.start())

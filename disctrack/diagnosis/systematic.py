@@ -36,7 +36,6 @@ LENS_LENGTHS = (0.3, 0.6, 0.17)  # of a camera's field, over the extent of the d
 DOT_LENGTH = 0.5  # of the fields of single dots, likewise
 MAX_FRAMES = 200  # that are looked at: fields move slowly
 WORTH = 20.0  # of twice the log likelihood, that a fault or a field must gain: odds of 2e4
-WIDE = 100.0  # times its typical size, that a fault which is known to be there may have
 SEEN = 0.2  # a mode of a field that moves all dots together by less than this many sigmas is left out
 
 
@@ -242,7 +241,7 @@ def _with_faults(
         best, sizes, chosen = trials[name], sizes | {name: faults[name]}, (*chosen, name)
 
 
-def find_systematic(system: DiscSystem, known: Values | None = None, beside: Sequence[str] | None = None) -> Systematic:
+def find_systematic(system: DiscSystem, known: Values | None = None, beside: Sequence[str] = ()) -> Systematic:
     """Sizes of the systematic errors of the dots, next to whatever fault of the measurement explains them better.
 
     known : values of faults that the poses were found with
@@ -264,7 +263,7 @@ def find_systematic(system: DiscSystem, known: Values | None = None, beside: Seq
         return across(view.linearise(known, names)[1][rows])
 
     data = across(residual[..., None])[:, 0]
-    size = max(float(np.sqrt(np.mean(data**2))), 1.0)
+    size, numbers = max(float(np.sqrt(np.mean(data**2))), 1.0), float(np.sum(view.weights[rows] - 6.0))
     used = view.used & np.isin(np.arange(len(view.used)), rows)[:, None, None]
     extent = float(max(np.ptp(places[:, c][used[:, c]], axis=0).max() for c in range(2) if used[:, c].any()))
 
@@ -280,9 +279,9 @@ def find_systematic(system: DiscSystem, known: Values | None = None, beside: Seq
     groups["dot"] = field(DOT_LENGTH * extent, own=True)
     steps: Array = size / view.per_px * 2.0 ** np.arange(-7, 4.5, 1.0)
     grids = {"print": DOT_SIGMA * 2.0 ** np.arange(7.0), "lens": steps, "dot": steps}
-    given = tuple(name for name in beside or () if name in faults)
-    start = {"rig": 1.0, "print": DOT_SIGMA} | {name: WIDE * typical[name] for name in given}
-    offered = {name: typical[name] for name in faults if beside is None}
+    given = tuple(name for name in beside if name in faults)
+    start = {"rig": 1.0, "print": DOT_SIGMA} | {name: typical[name] for name in given}
+    offered = {name: typical[name] for name in faults if not beside}
     nothing, best = Likelihood(data, groups).twice_log(start), Systematic(gain=-np.inf)
     for share in (0.0, *LENS_LENGTHS):  # without any field, and with fields of the cameras as long
         sought, fields = (grids, {"lens": field(share * extent)}) if share else ({}, {})
@@ -291,14 +290,12 @@ def find_systematic(system: DiscSystem, known: Values | None = None, beside: Seq
         value, sizes, chosen = _with_faults(evidence, sizes, offered)
         if chosen:  # what a fault explains is no field
             value, sizes = _best_sizes(evidence, start | {name: typical[name] for name in chosen}, sought)
-        print_m, left = (
-            sizes["print"] if sizes["print"] > DOT_SIGMA else 0.0,
-            evidence.left(sizes) / np.sum(view.weights[rows] - 6.0),
-        )
+        print_m, left = sizes["print"] if sizes["print"] > DOT_SIGMA else 0.0, max(1.0, evidence.left(sizes) / numbers)
         lens, dot = (sizes.get("lens", 0.0), share * extent), (sizes.get("dot", 0.0), DOT_LENGTH * extent)
-        told = (zip(of_poses[name], evidence.amounts(sizes, name).tolist(), strict=True) for name in (*given, *chosen))
-        amounts, left = dict(chain(*told)), max(1.0, left) if share else 1.0
-        found = Systematic(*lens, *dot, print_m, value - nothing, amounts, left=left)
+        amounts = (
+            zip(of_poses[name], evidence.amounts(sizes, name).tolist(), strict=True) for name in (*given, *chosen)
+        )
+        found = Systematic(*lens, *dot, print_m, value - nothing, dict(chain(*amounts)), left=left if share else 1.0)
         if not share or (found.present and found.gain > best.gain + WORTH):
             best = found
     return best

@@ -124,7 +124,7 @@ class DiscMember:
         declared = declared_model(trajectory, model)
         self.system = DiscSystem(trajectory, declared.model, known=declared.faults)
         systematic = find_systematic(self.system)
-        assumed = find_large(self.system, systematic)
+        assumed = find_large(as_tracked, self.system, systematic)
         if assumed is not None:
             names = ", ".join(c.title for c in assumed.candidates)
             raise AnalysisError(f"its dots show a large fault of the measurement ({names}): diagnose it alone")
