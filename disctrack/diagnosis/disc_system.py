@@ -32,7 +32,7 @@ from disctrack.discrepancy.laws import Family, LawSystem, LearnedLaw
 from disctrack.discrepancy.system import Budget, Candidate, Quantity, Values
 from disctrack.faults.catalogue import faults_of, scene_faults
 from disctrack.faults.dots import Sight, predict
-from disctrack.frames import euler_rate_axes_world, rotation_from_euler
+from disctrack.frames import euler_jacobian, euler_rate_axes_world, rotation_from_euler
 from disctrack.rolling import Model, sensitivities, simulate
 from disctrack.track.pose import whitening
 from disctrack.track.refine.table_contact import ASSUMED_THICKNESS as MICROMETER
@@ -316,15 +316,18 @@ class DiscSystem(LawSystem):
         """(n, 6) part of the whitened residual that a free pose per frame would take: six numbers of variance 1."""
         return self.parts_of_residual(values)[0]
 
-    def pose_difference(self, values: Values) -> tuple[Array, Array]:
-        """Measured minus predicted pose and its standard deviations, both (n, 6), POSE_COMPONENTS; NaN without dots.
+    def coordinate_errors(self, values: Values) -> tuple[Array, Array]:
+        """Measured minus predicted coordinates and their standard deviations, both (n, 6); NaN without dots.
 
         The difference that the dots show once everything else in `values` (cameras, pattern) is taken into account.
         """
         r, J, normal = self.pose_equations(values)
+        to_coordinates = np.tile(np.eye(6), (len(r), 1, 1))
+        to_coordinates[:, 3:, 3:] = euler_jacobian(*self.poses(values)[:, 3:5].T)
         covariance = np.linalg.inv(normal)
-        sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
-        delta = (covariance @ (np.swapaxes(J, 1, 2) @ r[..., None]))[..., 0]
+        delta = (to_coordinates @ covariance @ (np.swapaxes(J, 1, 2) @ r[..., None]))[..., 0]
+        variance = np.diagonal(covariance, axis1=1, axis2=2)[..., None]
+        sigma = np.sqrt((to_coordinates**2 @ variance)[..., 0])
         known = (self.weights >= 6)[:, None]
         return np.where(known, delta, np.nan), np.where(known, sigma, np.nan)
 

@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import trapezoid
 
-from calibration.kit.arrays import Array
 from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.diagnosis.motion import state_of
 from disctrack.diagnosis.stretch import MIN_FRAMES
@@ -15,7 +14,6 @@ from disctrack.discrepancy.fit import Fit, fit
 from disctrack.discrepancy.held_out import HeldOut
 from disctrack.discrepancy.significance import Whiteness, ljung_box, no_memory, whiteness
 from disctrack.discrepancy.system import System, Values, subset
-from disctrack.frames import euler_jacobian
 from disctrack.rolling import Motion, simulate
 from disctrack.rolling.motion import effect_power
 
@@ -46,7 +44,7 @@ def errors(system: DiscSystem, fit_: Fit, held: HeldOut | None) -> Errors:
     pixels = system.observed - system.pixels(fit_.values, with_nuisances=True)
     pose = system.pose_residual(fit_.values)
     present = system.weights >= 6
-    error = coordinate_errors(system, fit_.values)[0][present]
+    error = system.coordinate_errors(fit_.values)[0][present]
     # of the fitted quantities, those without a prior take their share of the pose's numbers
     freedom = 6 * present.sum() - fit_.n_free
     return Errors(
@@ -58,15 +56,6 @@ def errors(system: DiscSystem, fit_: Fit, held: HeldOut | None) -> Errors:
         ratio_to_floor=held.ratio_to_floor if held else np.nan,
         whiteness=whiteness(pose[present], system.rate, frequencies(system, fit_.values)),
     )
-
-
-def coordinate_errors(system: DiscSystem, values: Values) -> tuple[Array, Array]:
-    """Measured minus fitted coordinates and their standard deviations, both (n, 6); NaN without dots."""
-    delta, sigma = system.pose_difference(values)
-    to_angles = euler_jacobian(*system.poses(values)[:, 3:5].T)
-    delta[:, 3:] = (to_angles @ delta[:, 3:, None])[..., 0]
-    sigma[:, 3:] = np.sqrt((to_angles**2 @ sigma[:, 3:, None] ** 2)[..., 0])
-    return delta, sigma
 
 
 def frequencies(system: DiscSystem, values: Values) -> dict[str, float]:
@@ -87,7 +76,7 @@ def free_run(system: DiscSystem, held: HeldOut, horizon: float) -> Ahead | None:
     if not near.any() or system.time[-1] < last + horizon:
         return None
     found = {"horizon_s": horizon}
-    for kind, error in zip(("", "noise_"), coordinate_errors(system, held.train.values), strict=True):
+    for kind, error in zip(("", "noise_"), system.coordinate_errors(held.train.values), strict=True):
         rms = np.sqrt(np.mean(error[near] ** 2, axis=0))
         found[f"{kind}theta_deg"], found[f"{kind}psi_deg"] = np.degrees(rms[[4, 3]]).tolist()
         found[f"{kind}position_mm"] = 1e3 * float(np.linalg.norm(rms[:3]))

@@ -11,11 +11,11 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.signal import find_peaks
+from scipy.signal import find_peaks, periodogram
 
 from calibration.kit.arrays import Array
-from disctrack.analyse.contact import CONTACT, contact_quantities
 from disctrack.analyse.derivatives import MeasuredMotion, differentiate
+from disctrack.analyse.quantities import COLUMN, from_to, quantities
 from disctrack.analyse.smoothing import SEGMENT
 from disctrack.diagnosis.motion import SLIP, SLIP_VELOCITY, model_quantities, state_quantities
 from disctrack.discrepancy.fit import fit
@@ -49,7 +49,7 @@ def first_state(motion: MeasuredMotion) -> dict[str, float]:
 
     That is in state.v_x, state.v_y, which a rolling disc does not need.
     """
-    rates = [motion.omega_world[0] @ axis[0] for axis in motion.axes()]
+    rates = quantities(motion, motion.disc, motion.gravity)[0, from_to("omega_1", "omega_3")]
     names = (*(q.name for q in state_quantities()), *SLIP_VELOCITY)
     numbers = *motion.position[0, :2], *motion.euler[0], *rates, *motion.velocity[0, :2]
     return dict(zip(names, map(float, numbers), strict=True))
@@ -57,10 +57,9 @@ def first_state(motion: MeasuredMotion) -> dict[str, float]:
 
 def first_contact(motion: MeasuredMotion) -> tuple[float, float]:
     """Slip [m/s] at the first instant, and horizontal over vertical contact force, which is mu where the disc slips."""
-    numbers = contact_quantities(motion, motion.disc, motion.gravity)[0].tolist()
-    found = dict(zip((name for name, *_ in CONTACT), numbers, strict=True))
-    mu = float(np.clip(found["friction_needed"], *FRICTIONS))
-    return float(np.hypot(found["slip_n"], found["slip_m"])), mu if np.isfinite(mu) else FRICTIONS[1]
+    at_first = quantities(motion, motion.disc, motion.gravity)[0]
+    slip = np.hypot(*at_first[from_to("slip_n", "slip_m")])
+    return float(slip), float(np.clip(np.nan_to_num(at_first[COLUMN["friction_needed"]], nan=np.inf), *FRICTIONS))
 
 
 def start_values(system: DiscSystem, known: Values) -> dict[str, float]:
@@ -111,11 +110,11 @@ def sought(system: DiscSystem, candidate: Candidate, values: Values, least: floa
 
 def _frequencies(system: DiscSystem, values: Values) -> Array:
     """Peaks [Hz] in the spectrum of measured less predicted positions, in units of their noise, and beside them."""
-    difference, sigma = (x[:, :3] for x in system.pose_difference(values))
+    difference, sigma = (x[:, :3] for x in system.coordinate_errors(values))
     left = np.nan_to_num(difference / sigma)
     n, rate = len(left), system.rate
-    spectrum = np.abs(np.fft.rfft(left - left.mean(axis=0), PADDED * n, axis=0))
-    power, frequency = np.sum(spectrum**2, axis=1), np.fft.rfftfreq(PADDED * n, 1 / rate)
+    frequency, powers = periodogram(left, rate, nfft=PADDED * n, axis=0)
+    power = powers.sum(axis=1)
     power[frequency < SLOW * rate / n] = 0.0
     peaks, _ = find_peaks(power)
     highest = frequency[peaks[np.argsort(power[peaks])[::-1][:PEAKS]]]

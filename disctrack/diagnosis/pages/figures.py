@@ -11,12 +11,12 @@ from scipy.stats import chi2
 
 from calibration.kit.arrays import Array
 from disctrack.diagnosis.answer import DiscDiagnosis
-from disctrack.diagnosis.errors import coordinate_errors, frequencies, simulated
+from disctrack.diagnosis.errors import frequencies, simulated
 from disctrack.diagnosis.evidence import Evidence, force_of
 from disctrack.diagnosis.missing_force import Course
 from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.held_out import HeldOut
-from disctrack.report.figures import BAND, NO_TITLE, Curve, Drawn, chart, panels, plain_powers
+from disctrack.report.figures import BAND, Curve, Drawn, chart, panels, plain_powers
 from disctrack.report.palette import AMBER, BLUE, GRID, INK, MUTED, RED
 
 N_TRIED = 14
@@ -106,7 +106,7 @@ def residuals(result: DiscDiagnosis) -> Drawn:
     figure, grid = panels(9.5, 6.2, 4, n, (0.95, 0.15, 0.55, 0.3), sharex=True)
     rows = [(0, "x", 1e6, "µm"), (1, "y", 1e6, "µm"), (2, "z", 1e6, "µm"), (4, "θ", 1e3 * np.degrees(1), "mdeg")]
     for column, (fit, _, name, colour) in enumerate(sides):
-        error, sigma = coordinate_errors(system, fit.values)
+        error, sigma = system.coordinate_errors(fit.values)
         for row, (i, label, scale, unit) in enumerate(rows):
             axes, noise = grid[n * row + column], 2 * scale * sigma[:, i]
             axes.fill_between(system.time, -noise, noise, color=GRID, lw=0)
@@ -129,7 +129,7 @@ def free_run(result: DiscDiagnosis) -> Drawn:
 
     for _, held, name, colour in _sides(result):
         assert held is not None
-        error, sigma = coordinate_errors(system, held.train.values)
+        error, sigma = system.coordinate_errors(held.train.values)
         add(error, colour, name)
         last = system.time[~held.test_rows & (system.weights > 0)].max()
     add(sigma, MUTED, "noise, 1 σ")
@@ -212,39 +212,22 @@ def _missing(result: DiscDiagnosis, beside: Evidence) -> list[Drawn]:
 
 def spectrum(result: DiscDiagnosis) -> Drawn:
     """Periodogram of the pose residual before and after, with the frequencies at which effects show."""
-    system, rate = result.system, result.system.rate
-    present = system.weights >= 6
-    figure, (axes,) = panels(9.5, 3.2, margins=NO_TITLE)
+    system, rate, curves = result.system, result.system.rate, list[Curve]()
     for fit, _, name, colour in _sides(result):
-        residual = system.pose_residual(fit.values)[present]
+        residual = system.pose_residual(fit.values)[system.weights >= 6]
         if np.isfinite(residual).all():
             frequency, power = periodogram(residual, rate, axis=0)
             # white noise of variance 1 has the same power at every frequency: 2 / rate
-            axes.semilogy(frequency[1:], (power[1:] * rate / 2).mean(axis=1), lw=0.9, color=colour, label=name)
-    axes.axhline(1.0, color=MUTED, lw=1, label="noise")
+            curves.append(Curve(frequency[1:], (power[1:] * rate / 2).mean(axis=1), colour, name))
+    figure = chart("frequency (Hz)", ("power over that of noise", curves), size=(9.5, 3.2))
+    (axes,) = figure.axes
+    axes.set_yscale("log")
+    axes.axhline(1.0, color=MUTED, lw=1)
     lines = {name: f for name, f in frequencies(system, result.diagnosis.after.values).items() if f < rate / 2}
-    top = min(rate / 2, 6 * max([4.0, *lines.values()]))
-    style: dict[str, Any] = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points", "rotation": 90}
-    style |= {"bbox": {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 0.5}}
     for f in lines.values():
         axes.axvline(f, color=AMBER, lw=0.8)
-    for names, f in _joined(lines, 0.02 * top):
-        axes.annotate(names, (f, 1.0), (2, -2), va="top", fontsize=8, color=INK, **style)
-    axes.set_xlim(0, top)
-    axes.set_xlabel("frequency (Hz)")
-    axes.set_ylabel("power over that of noise")
+    axes.set_xlim(0, min(rate / 2, 6 * max([4.0, *lines.values()])))
     plain_powers(axes.yaxis)
-    axes.legend(frameon=False, fontsize=9, loc="upper right")
-    caption = "Mean periodogram of the six whitened numbers of the pose residual; white noise lies at 1."
+    shown = ", ".join(f"{name} {f:.3g} Hz" for name, f in lines.items())
+    caption = f"Mean periodogram of the six whitened numbers of the pose residual; noise lies at 1. Amber: {shown}."
     return Drawn("spectrum", "Spectrum of the residual", caption, figure)
-
-
-def _joined(lines: dict[str, float], apart: float) -> list[tuple[str, float]]:
-    """Names of lines, those that lie too near to each other for two labels in one."""
-    found: list[tuple[str, float]] = []
-    for name, f in sorted(lines.items(), key=lambda item: item[1]):
-        if found and f - found[-1][1] < apart:
-            found[-1] = (f"{found[-1][0]}, {name}", found[-1][1])
-        else:
-            found.append((name, f))
-    return found

@@ -37,8 +37,7 @@ def saved(system, values, folder):
 
 
 def rolling_state(trajectory):
-    first = first_state(differentiate(trajectory))
-    return {name: value for name, value in first.items() if not name.startswith("state.v_")}
+    return {n: v for n, v in first_state(differentiate(trajectory)).items() if not n.startswith("state.v_")}
 
 
 @pytest.fixture
