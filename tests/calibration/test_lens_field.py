@@ -8,9 +8,8 @@ from numpy.testing import assert_allclose
 from scipy.interpolate import BSpline
 
 from calibration import StereoRig, Terms, refine_stereo, triangulate
-from calibration.cameras.splines import LensField, spline_weights
+from calibration.cameras.splines import spline_weights
 from calibration.fit.lens_field import fit_lens_field
-from calibration.rig_file import read_rig, write_rig
 
 SIGMA = 0.004  # [px] of good corners
 TERMS = Terms("k1 k2 p1 p2", "flat")
@@ -86,15 +85,3 @@ def test_few_views_get_no_field(refined):
     scene, (_, bent) = refined
     few = bent.observations[bent.observations.view < 6]
     assert fit_lens_field(refine_stereo(few, bent.model, scene.board.points, TERMS), scene.board.points) is None
-
-
-def test_field_is_kept_in_the_rig_file(tmp_path, rng, refined):
-    m = refined[0].model
-    field = LensField(rng.normal(size=(2, 2, 8, 8)), 102.4)
-    rig = StereoRig(*m.cameras, m.R_right_left, m.t_right_left, lens_field=field)
-    write_rig(tmp_path / "rig.h5", rig)
-    read = read_rig(tmp_path / "rig.h5").lens_field
-    assert_allclose(read.coefficients, field.coefficients, atol=0)
-    assert read.spacing == field.spacing
-    lost = np.full((2, 3, 2), np.nan)
-    assert np.isnan(read.corrected(lost)).all()

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from calibration import Board, Camera, Observations, RigFileError, StereoRig
-from calibration.cameras.camera import N_RIG, rotation_from_vector
+from calibration.cameras.camera import N_RIG, Allowance, rotation_from_vector
+from calibration.cameras.splines import LensField
 from calibration.rig_file import CalibrationRecord, read_rig, read_rig_file, write_rig
 from tests.equality import assert_equal
 
@@ -24,6 +25,8 @@ def rig(rng):
         t_left_world=np.array([-0.02, 0.03, 0.49]),
         covariance=A @ A.T,
         world_is_table=True,
+        allowances=(Allowance("the board's size", A[0], True), Allowance("its thickness", A[1])),
+        lens_field=LensField(rng.normal(size=(2, 2, 8, 8)), 102.4),
     )
 
 
