@@ -14,6 +14,8 @@ import numpy as np
 import pytest
 from numba.core.event import install_timer
 
+from disctrack.cli import main
+
 REPOSITORY = Path(__file__).resolve().parents[1]
 CIRCLES = ("statistical", "slow")  # run when they are named: -m statistical, -m slow, or the test itself
 DEFAULT_TEST_S = 2.0  # of processor time: some two thousand tests share three minutes of two cores
@@ -82,6 +84,17 @@ def _processor_time() -> float:
 def rng() -> np.random.Generator:
     """Seeded, so that a failure can be repeated."""
     return np.random.default_rng(20140703)
+
+
+@pytest.fixture
+def cli(capsys: pytest.CaptureFixture[str]):
+    """Runs a command, which ends with this exit code; what it printed, out and err."""
+
+    def run(*words: object, code: int = 0):
+        assert main([str(word) for word in words]) == code
+        return capsys.readouterr()
+
+    return run
 
 
 @pytest.fixture(scope="session")

@@ -71,39 +71,34 @@ def test_command_says_where_the_results_are(analysed_clip):
     assert (analysed_clip.parent / "report" / "report.html").stat().st_size > 1e5
 
 
-def test_a_second_analysis_is_reused_and_another_window_or_a_missing_figure_is_not(analysed_clip, capsys):
+def test_a_second_analysis_is_reused_and_another_window_or_a_missing_figure_is_not(analysed_clip, cli):
     report = analysed_clip.parent / "report"
-    command = ["analyse", str(analysed_clip), "-o", str(report)]
+    command = "analyse", analysed_clip, "-o", report
     before = (report / "report.html").stat().st_mtime_ns
-    assert main(command) == 0
-    told = capsys.readouterr().out
+    told = cli(*command).out
     assert "reused" in told
     assert "rolls without slip" in told
     assert len(told.splitlines()) <= 10
     assert (report / "report.html").stat().st_mtime_ns == before
-    assert main([*command, "--window", "0.4"]) == 1  # another result: kept unless told otherwise
-    said = capsys.readouterr().err
+    said = cli(*command, "--window", "0.4", code=1).err  # another result: kept unless told otherwise
     assert "with other settings" in said
     assert "--overwrite" in said
     made_from = report / "made_from.json"
     kept = made_from.read_text()
     # one of an earlier version: other sources, so another origin
     made_from.write_text(json.dumps(json.loads(kept) | {"version": "0.1.9+abc", "origin": "0"}))
-    assert main(command) == 1
-    said = capsys.readouterr().err
+    said = cli(*command, code=1).err
     assert "made by version 0.1.9+abc (this is " in said
     assert "--overwrite" in said
     made_from.write_text(kept)
 
 
-def test_a_declaration_that_changed_since_is_told_and_an_equal_one_is_not(analysed_clip, sample_clip, capsys):
+def test_a_declaration_that_changed_since_is_told_and_an_equal_one_is_not(analysed_clip, sample_clip, cli):
     beside = analysed_clip.with_name("recording.toml")
     declared = (sample_clip / "recording.toml").read_text()
-    command = ["analyse", str(analysed_clip), "-o", str(analysed_clip.parent / "report")]
     for text, told in ((declared, False), (declared.replace("square_mm = 6.0", "square_mm = 6.1"), True)):
         beside.write_text(text)
-        assert main(command) == 0
-        said = capsys.readouterr().err
+        said = cli("analyse", analysed_clip, "-o", analysed_clip.parent / "report").err
         assert ("[calibration] square_mm 6.1 (6.0 when it was measured)" in said) == told
         assert ("has changed" in said) == told
     beside.unlink()

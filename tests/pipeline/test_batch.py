@@ -29,7 +29,6 @@ from disctrack.batch.locks import locked
 from disctrack.batch.measure import LOCK, do
 from disctrack.batch.plan import make_plan
 from disctrack.batch.records import MEASURED, is_done, read_record
-from disctrack.cli import main
 from disctrack.track.follow.tracking import prepare
 from disctrack.trajectory.file import read_trajectory
 from tests.pipeline.conftest import linked
@@ -76,15 +75,14 @@ def in_this_process(monkeypatch):
 
 
 @pytest.mark.statistical
-def test_a_batch_calibrates_a_shared_rig_once_and_tells_of_every_recording(short_recording, tmp_path, capsys):
+def test_a_batch_calibrates_a_shared_rig_once_and_tells_of_every_recording(short_recording, tmp_path, cli):
     root = tmp_path / "day"
     for name in ("r2", "r10"):
         linked(short_recording, root / name)
     linked(short_recording, root / "bad toml")
     replace(root / "bad toml" / "recording.toml", b"x = = 3")
     replace(root / "r10" / "left" / "000005.png", b"junk")
-    assert main(["batch", str(root), "-j", "2", *FAST, *MODEL]) == 1
-    said, errors = capsys.readouterr()
+    said, errors = cli("batch", root, "-j", "2", *FAST, *MODEL, code=1)
     assert re.search(r"refusal +bad toml \(failed\).*not valid TOML", said, re.DOTALL)
     assert re.search(r"r10 \(measured\).*000005.png", said, re.DOTALL)
     assert "2 measured, 1 failed" in said
@@ -111,19 +109,15 @@ def test_a_batch_calibrates_a_shared_rig_once_and_tells_of_every_recording(short
 
 
 @pytest.mark.statistical
-def test_the_same_command_goes_on_where_something_was_wrong_and_nowhere_else(
-    recording, tmp_path, capsys, in_this_process
-):
+def test_the_same_command_goes_on_where_something_was_wrong_and_nowhere_else(recording, tmp_path, cli, in_this_process):
     root = tmp_path / "day"
     linked(recording, root / "r1")
     linked(recording, root / "bad toml")
     replace(root / "bad toml" / "recording.toml", b"x = = 3")
-    assert main(["batch", str(root), *FAST]) == 1
+    cli("batch", root, *FAST, code=1)
     kept = (root / "r1" / "results" / "trajectory.h5").stat().st_mtime_ns
     replace(root / "bad toml" / "recording.toml", (root / "r1" / "recording.toml").read_bytes())
-    capsys.readouterr()
-    assert main(["batch", str(root), *FAST, "--json"]) == 0
-    assert "1 measured, 1 measured before" in json.loads(capsys.readouterr().out)["verdict"]
+    assert "1 measured, 1 measured before" in json.loads(cli("batch", root, *FAST, "--json").out)["verdict"]
     assert (root / "r1" / "results" / "trajectory.h5").stat().st_mtime_ns == kept
     again = statuses(root / "batch_results" / "summary.json")
     assert again.pop("bad toml") == "measured"
@@ -199,54 +193,51 @@ def test_files_that_vanish_in_mid_run_cost_their_frames_or_their_recording(one, 
 
 
 @pytest.mark.statistical
-def test_the_summary_is_that_of_all_shards(recording, tmp_path, in_this_process):
+def test_the_summary_is_that_of_all_shards(recording, tmp_path, cli, in_this_process):
     root = tmp_path / "day"
     for name in ("a", "b", "c"):
         linked(recording, root / name)
-    options = ["batch", str(root), "-j", "1", *FAST]
+    command = "batch", root, "-j", "1", *FAST
     summary = root / "batch_results" / "summary.json"
-    assert main([*options, "--shard", "2/2"]) == 0
+    cli(*command, "--shard", "2/2")
     assert statuses(summary) == {"a": "not measured", "b": "measured", "c": "not measured"}
-    assert main([*options, "--summary-only"]) == 1
-    assert main([*options, "--shard", "1/2"]) == 0
+    cli(*command, "--summary-only", code=1)
+    cli(*command, "--shard", "1/2")
     assert statuses(summary) == {"a": "measured", "b": "skipped", "c": "measured"}
-    assert main([*options, "--summary-only"]) == 0
+    cli(*command, "--summary-only")
     (root / "c" / "results" / "trajectory.h5").unlink()
-    assert main([*options, "--summary-only"]) == 1
+    cli(*command, "--summary-only", code=1)
     assert statuses(summary)["c"] == "not measured"
 
 
 @pytest.mark.statistical
 def test_ctrl_c_in_the_diagnosis_of_all_keeps_the_summary_and_its_page_is_named(
-    recording, tmp_path, capsys, monkeypatch, in_this_process
+    recording, tmp_path, cli, monkeypatch, in_this_process
 ):
     def interrupted(*_):
         raise KeyboardInterrupt
 
     linked(recording, tmp_path / "day" / "a")
-    command = ["batch", str(tmp_path / "day"), "-j", "1", *FAST, "--together"]
+    command = "batch", tmp_path / "day", "-j", "1", *FAST, "--together"
     monkeypatch.setattr(run, "diagnose_all", interrupted)
-    assert main(command) == 130
+    cli(*command, code=130)
     assert statuses(tmp_path / "day" / "batch_results" / "summary.json") == {"a": "measured"}
     monkeypatch.setattr(run, "diagnose_all", lambda *_: "what it says")
-    assert main([*command, "-v"]) == 0
-    said = capsys.readouterr().out
+    said = cli(*command, "-v").out
     assert "what it says" in said
     assert "batch_results/together/diagnosis.html" in said
 
 
 @pytest.mark.statistical
-def test_a_summary_tells_of_declarations_that_changed_since(recording, tmp_path, capsys, in_this_process):
+def test_a_summary_tells_of_declarations_that_changed_since(recording, tmp_path, cli, in_this_process):
     file = linked(recording, tmp_path / "day" / "a") / "recording.toml"
-    command = ["batch", str(tmp_path / "day"), *FAST]
-    assert main(command) == 0
+    command = "batch", tmp_path / "day", *FAST
+    cli(*command)
     text = file.read_text()
     replace(file, re.sub("mass_g = .*", "mass_g = 200.5", text).encode())
-    capsys.readouterr()
-    assert main([*command, "--summary-only"]) == 3
-    assert "[disc] mass_g 200.5 (" in " ".join(capsys.readouterr().out.split())
-    assert main(command) == 0  # measures it anew
-    assert main([*command, "--summary-only"]) == 0
+    assert "[disc] mass_g 200.5 (" in " ".join(cli(*command, "--summary-only", code=3).out.split())
+    cli(*command)  # measures it anew
+    cli(*command, "--summary-only")
 
 
 @contextlib.contextmanager
@@ -272,14 +263,12 @@ def test_without_room_there_is_a_reason_and_nothing_half_written(room, one, reco
 
 
 @pytest.mark.statistical
-def test_without_room_for_the_summary_the_results_stay_and_the_line_says_so(recording, capsys, in_this_process):
-    assert main(["batch", str(recording), *FAST]) == 0
+def test_without_room_for_the_summary_the_results_stay_and_the_line_says_so(recording, cli, in_this_process):
+    cli("batch", recording, *FAST)
     summary = recording / "batch_results" / "summary.json"
     before = summary.read_bytes()
-    capsys.readouterr()
     with largest_file(1000):
-        assert main(["batch", str(recording), *FAST]) == 1
-    said, errors = capsys.readouterr()
+        said, errors = cli("batch", recording, *FAST, code=1)
     assert "1 measured before" in said
     assert "summary.json: cannot be written" in errors
     assert summary.read_bytes() == before
@@ -287,7 +276,7 @@ def test_without_room_for_the_summary_the_results_stay_and_the_line_says_so(reco
 
 @pytest.mark.statistical
 def test_a_read_only_folder_is_told_at_once_and_results_may_go_elsewhere(
-    recording, tmp_path, monkeypatch, capsys, in_this_process
+    recording, tmp_path, monkeypatch, cli, in_this_process
 ):
     make = Path.mkdir
 
@@ -297,13 +286,12 @@ def test_a_read_only_folder_is_told_at_once_and_results_may_go_elsewhere(
         make(self, *arguments, **named)
 
     monkeypatch.setattr(Path, "mkdir", unless_there)
-    assert main(["batch", str(recording), *FAST]) == 1
-    said, errors = capsys.readouterr()
+    said, errors = cli("batch", recording, *FAST, code=1)
     assert said == ""
     assert "batch_results: cannot be written: no permission" in errors
     assert "-o" in errors
     assert "another place with -o" in stage.do(jobs_of(recording)[0]).reason
-    assert main(["batch", str(recording), "-o", str(tmp_path / "out"), *FAST]) == 0
+    cli("batch", recording, "-o", tmp_path / "out", *FAST)
     assert not (recording / "results").exists()
     assert (tmp_path / "out" / "recording" / "trajectory.h5").is_file()
 
@@ -508,12 +496,11 @@ def test_a_cluster_that_loses_a_worker_in_mid_run_completes_everything(day):
 
 @pytest.mark.statistical
 @_OF_ANOTHER_PROJECT
-def test_a_dead_address_and_a_missing_extra_are_told_before_anything_is_done(day, monkeypatch, capsys):
+def test_a_dead_address_and_a_missing_extra_are_told_before_anything_is_done(day, monkeypatch, cli):
     pytest.importorskip("distributed")
     monkeypatch.setattr(pool, "CONNECT", 0.5)
-    assert main(["batch", str(day), "--cluster", "tcp://127.0.0.1:9"]) == 1
-    assert "no scheduler answers" in capsys.readouterr().err
+    command = "batch", day, "--cluster", "tcp://127.0.0.1:9"
+    assert "no scheduler answers" in cli(*command, code=1).err
     monkeypatch.setitem(sys.modules, "distributed", None)
-    assert main(["batch", str(day), "--cluster", "tcp://127.0.0.1:9"]) == 1
-    assert "disctrack[cluster]" in capsys.readouterr().err
+    assert "disctrack[cluster]" in cli(*command, code=1).err
     assert not list(day.rglob("*results"))

@@ -30,10 +30,9 @@ QUICK = ["--no-figures", "--no-video"]
 
 
 @pytest.mark.statistical
-def test_run_calibrates_tracks_draws_and_tells(short_recording, tmp_path, capsys):
+def test_run_calibrates_tracks_draws_and_tells(short_recording, tmp_path, cli):
     results = tmp_path / "results"
-    assert main(["run", str(short_recording), "-o", str(results), "--csv"]) == 0
-    output, errors = capsys.readouterr()
+    output, errors = cli("run", short_recording, "-o", results, "--csv")
     assert len(output.splitlines()) <= 10
     for word in ("Frames: ", "Calibration: ", "sigma x", "summary.txt", "disctrack analyse"):
         assert word in output
@@ -68,8 +67,7 @@ def test_run_calibrates_tracks_draws_and_tells(short_recording, tmp_path, capsys
 
     before = {file.name: file.stat().st_mtime_ns for file in results.iterdir()}
     (results / "dots.png").unlink()
-    assert main(["run", str(short_recording), "-o", str(results), "-v"]) == 0
-    output = capsys.readouterr().out
+    output = cli("run", short_recording, "-o", results, "-v").out
     # a terminal wraps at its own width, and paths may be told from where one stands
     told, kept = ([w for w in text.split() if "/" not in w] for text in (output, (results / "summary.txt").read_text()))
     assert told == kept
@@ -80,13 +78,11 @@ def test_run_calibrates_tracks_draws_and_tells(short_recording, tmp_path, capsys
         assert after[name] == before[name]
 
 
-def test_results_go_into_the_recording_by_default(recording, capsys):
-    assert main(["run", str(recording), *QUICK]) == 0
+def test_results_go_into_the_recording_by_default(recording, cli):
+    assert str(Path("results") / "trajectory.h5") in cli("run", recording, *QUICK).out
     assert (recording / "results" / "trajectory.h5").exists()
-    assert str(Path("results") / "trajectory.h5") in capsys.readouterr().out
     for option, told in (("--quiet", ""), ("--json", "{")):
-        assert main(["run", str(recording), option, *QUICK]) == 0
-        assert capsys.readouterr().out[:1] == told
+        assert cli("run", recording, option, *QUICK).out[:1] == told
 
 
 def test_track_takes_a_range_of_frames_and_keeps_the_length(recording, rig_file, tmp_path):
@@ -121,9 +117,9 @@ def rested(recording) -> Path:
 
 
 @pytest.mark.statistical
-def test_rest_before_and_after_the_motion_is_left_out_unless_asked_for(rested, capsys):
+def test_rest_before_and_after_the_motion_is_left_out_unless_asked_for(rested, cli):
     path = rested / "results" / "trajectory.h5"
-    assert main(["run", str(rested), *QUICK]) == 0
+    cli("run", rested, *QUICK)
     text = (rested / "results" / "summary.txt").read_text()
     assert "rest in frames 0-" in text
     assert "first pass" in text
@@ -135,10 +131,9 @@ def test_rest_before_and_after_the_motion_is_left_out_unless_asked_for(rested, c
     assert (trajectory.frame_status[70:154] == FrameStatus.MEASURED).all()
     assert np.isnan(trajectory.q[still]).all()
     assert_allclose(trajectory.time, np.arange(224) / trajectory.frame_rate, rtol=1e-12)
-    assert main(["run", str(rested), *QUICK]) == 0
-    assert "reused" in capsys.readouterr().out
-    assert main(["run", str(rested), *QUICK, "--all"]) == 1  # another setting: kept unless told
-    assert main(["run", str(rested), *QUICK, "--all", "--overwrite"]) == 0
+    assert "reused" in cli("run", rested, *QUICK).out
+    cli("run", rested, *QUICK, "--all", code=1)  # another setting: kept unless told
+    cli("run", rested, *QUICK, "--all", "--overwrite")
     every = read_trajectory(path)
     assert (every.frame_status == FrameStatus.MEASURED).all()
     sigma = np.sqrt(np.diagonal(every.pose_covariance, axis1=1, axis2=2))
@@ -149,13 +144,12 @@ def test_rest_before_and_after_the_motion_is_left_out_unless_asked_for(rested, c
 
 
 @pytest.mark.statistical
-def test_calibrate_without_a_recording(shared_data, tmp_path, capsys):
+def test_calibrate_without_a_recording(shared_data, tmp_path, cli):
     folder = shared_data / "opencv_stereo_chessboard"
     path = tmp_path / "rig.h5"
-    words = ["calibrate", "--left", str(folder / "left*.jpg"), "--right", str(folder / "right*.jpg")]
-    model = ["--distortion", "k1 k2", "--board", "flat", "--no-figures", "-v"]  # choosing takes longer
-    assert main([*words, "--corners", "9x6", "--square-mm", "25", "-o", str(path), *model]) == 0
-    output = capsys.readouterr().out
+    words = "--left", folder / "left*.jpg", "--right", folder / "right*.jpg", "--corners", "9x6", "--square-mm", "25"
+    model = "--distortion", "k1 k2", "--board", "flat"  # choosing takes longer
+    output = cli("calibrate", *words, "-o", path, *model, "--no-figures", "-v").out
     baseline = float(output.split("baseline")[1].split("mm")[0])
     assert 83.1 < baseline < 83.4  # reference.json beside the photographs: 83.2-83.3
     assert path.exists()
@@ -191,17 +185,16 @@ def test_the_sample_is_the_recording_of_the_repository(sample_clip, tmp_path):
     assert (tmp_path / "clip/recording.toml").read_text() == (sample_clip / "recording.toml").read_text()
 
 
-def test_open_shows_the_page_written_last(tmp_path, monkeypatch, capsys):
+def test_open_shows_the_page_written_last(tmp_path, monkeypatch, cli):
     opened = []
     monkeypatch.setattr("webbrowser.open", opened.append)
-    assert main(["open", str(tmp_path)]) == 1
-    assert "no page of results" in capsys.readouterr().err
+    assert "no page of results" in cli("open", tmp_path, code=1).err
     for age, name in ((20, "trajectory_diagnosis/diagnosis.html"), (10, "trajectory_analysis/report.html")):
         page = tmp_path / "results" / name
         page.parent.mkdir(parents=True)
         page.touch()
         os.utime(page, (1e9 - age, 1e9 - age))
-    assert main(["open", str(tmp_path)]) == 0
+    cli("open", tmp_path)
     assert opened == [page.as_uri()]
 
 
@@ -211,15 +204,13 @@ def test_a_range_that_is_cut_says_so(recording):
     assert not open_pairs(recording, (5, 24)).findings
 
 
-def test_print_says_what_to_declare_of_its_sheets(tmp_path, capsys):
-    assert main(["print", "-o", str(tmp_path)]) == 0
-    (centres,) = re.findall(r"centres_mm = (\[\[.*\]\])", capsys.readouterr().out)
+def test_print_says_what_to_declare_of_its_sheets(tmp_path, cli):
+    (centres,) = re.findall(r"centres_mm = (\[\[.*\]\])", cli("print", "-o", tmp_path).out)
     assert_allclose(json.loads(centres), 1e3 * MA_2014.marker_centres_body[:, :2], atol=1e-4)  # digits that it prints
 
 
-def test_printed_defaults_are_the_default_scene(tmp_path, capsys):
-    assert main(["render", "--defaults"]) == 0
-    (tmp_path / "scene.toml").write_text(capsys.readouterr().out)
+def test_printed_defaults_are_the_default_scene(tmp_path, cli):
+    (tmp_path / "scene.toml").write_text(cli("render", "--defaults").out)
     read = replace(load_scene(tmp_path / "scene.toml"), folder=Path())
     assert repr(read) == repr(Scene())  # to the last bit, and nan is nan
 
@@ -284,7 +275,7 @@ PATTERNS = "calibrate --left {r}/l*.png --right {r}/r*.png --corners 9x6 --squar
         (lambda r: change_images(r, lambda i: i[:200], ["right"]), "run {r}", r"(\d+) x \1 px.*\1 x 200 px"),
         (lambda r: change_images(r, in_colour), "run {r}", "colour"),
         (lambda r: change_images(r, lambda i: np.full_like(i, 90)), "run {r}", "found in none"),
-        (lambda r: change_images(r, lambda i: i[:200]), "track {r}", "272 x 200 px.*272 x 272 px"),
+        (lambda r: change_images(r, lambda i: i[:200]), "track {r}", r"000\.png: left .* 272 x 200 px.*272 x 272 px"),
         (another_file, "track {r} --rig {r}/other.h5", "other.h5"),
         (another_file, "analyse {r}/other.h5", "other.h5.*not a trajectory"),
         (lambda r: (r / "mine.h5").write_text("dear"), "track {r} -o {r}/mine.h5", "--overwrite"),
@@ -439,8 +430,7 @@ def test_what_queueing_systems_and_closed_terminals_send_ends_in_order(recording
     assert (kind.name in told) == (not ignored)
 
 
-def test_a_name_cannot_steer_the_terminal(tmp_path, capsys):
-    assert main(["run", str(tmp_path / "\x1b]0;a title\x07")]) == 1
-    told = capsys.readouterr().err
+def test_a_name_cannot_steer_the_terminal(tmp_path, cli):
+    told = cli("run", tmp_path / "\x1b]0;a title\x07", code=1).err
     assert "\\x1b]0;a title\\x07" in told
     assert told.rstrip("\n").isprintable()

@@ -112,18 +112,15 @@ def test_enlarged_model_simulates_the_measured_motion(diagnosed):
 
 
 @pytest.mark.statistical
-def test_against_the_enlarged_model_nothing_is_missing(diagnosed, capsys):
-    assert main(["diagnose", str(diagnosed[0]), "--json"]) == 0
-    words = json.loads(capsys.readouterr().out)["next"].split()[1:]  # the command that is printed
-    assert main(words) == 0
+def test_against_the_enlarged_model_nothing_is_missing(diagnosed, cli):
+    words = json.loads(cli("diagnose", diagnosed[0], "--json").out)["next"].split()[1:]  # the command that is printed
+    cli(*words)
     assert not (diagnosed[1] / words[-1] / "figures").exists()  # on request only
     assert json.loads((diagnosed[1] / words[-1] / "diagnosis.json").read_text())["verdict"] == "nothing missing"
 
 
-def test_errors_are_one_line(diagnosed, tmp_path, capsys):
-    assert main(["diagnose", str(diagnosed[0]), "--verbose"]) == 0
-    assert "reused" in capsys.readouterr().out
-    assert main(["diagnose", str(diagnosed[0]), "--model", "none"]) == 1  # another result: kept unless told otherwise
-    assert "--overwrite" in capsys.readouterr().err
-    assert main(["diagnose", str(diagnosed[0]), "-o", str(tmp_path / "x"), "--model", "no-such-model"]) == 1
-    assert "no such model" in capsys.readouterr().err
+def test_errors_are_one_line(diagnosed, tmp_path, cli):
+    command = "diagnose", diagnosed[0]
+    assert "reused" in cli(*command, "--verbose").out
+    assert "--overwrite" in cli(*command, "--model", "none", code=1).err  # another result: kept unless told otherwise
+    assert "no such model" in cli(*command, "-o", tmp_path / "x", "--model", "no-such-model", code=1).err

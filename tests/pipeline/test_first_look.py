@@ -23,25 +23,22 @@ DPI = 150
 
 
 @pytest.mark.statistical
-def test_init_finds_cameras_views_and_board_and_leaves_only_what_no_file_tells(sample_clip, tmp_path, capsys):
+def test_init_finds_cameras_views_and_board_and_leaves_only_what_no_file_tells(sample_clip, tmp_path, cli):
     folder = linked(sample_clip, tmp_path / "clip", os.symlink)
     declared = tomllib.loads((folder / "recording.toml").read_text())
     (folder / "recording.toml").unlink()
-    assert main(["init", str(folder), "--frame-rate-hz", "1000"]) == 0
+    told = cli("init", folder, "--frame-rate-hz", "1000").out
     written = tomllib.loads((folder / "recording.toml").read_text())
     for section, key in (
         ("cameras", "left"), ("cameras", "right"), ("cameras", "frame_rate_hz"),
         ("calibration", "left"), ("calibration", "right"), ("calibration", "inner_corners"), ("table", "view"),
     ):  # fmt: skip
         assert written[section][key] == declared[section][key], key
-    told = capsys.readouterr().out
     missing = {
         key for key in ("radius_mm", "thickness_mm", "mass_g", "diameter_mm", "centres_mm", "square_mm") if key in told
     }
     assert len(missing) == 6
-    # what is not known is refused, by name, and not guessed
-    assert main(["run", str(folder)]) == 1
-    said = capsys.readouterr().err  # all of them at once
+    said = cli("run", folder, code=1).err  # what is not known is refused, by name, all of it at once, and not guessed
     assert all(f"] {key}" in said for key in missing)
     assert "are missing" in said
 
@@ -168,21 +165,19 @@ def test_printed_board_is_the_one_that_is_declared(corners, square):
 
 
 @pytest.mark.statistical
-def test_check_finds_nothing_to_put_right_in_the_sample(sample_clip, tmp_path, capsys):
-    assert main(["check", str(sample_clip), "-v", "-o", str(tmp_path / "check.png")]) == 0
-    told = capsys.readouterr().out
+def test_check_finds_nothing_to_put_right_in_the_sample(sample_clip, tmp_path, cli):
+    told = cli("check", sample_clip, "-v", "-o", tmp_path / "check.png").out
     assert not re.search(r"^(refusal|doubt|warning) ", told, re.MULTILINE)
     for what in ("declaration", "frames", "chessboard", "light", "dots", "sharpness", "accuracy"):
         assert f"\n{what} " in told
     assert cv2.imread(str(tmp_path / "check.png")) is not None
 
 
-def test_init_says_that_the_cameras_differ_in_number_and_that_views_are_missing(sample_clip, tmp_path, capsys):
+def test_init_says_that_the_cameras_differ_in_number_and_that_views_are_missing(sample_clip, tmp_path, cli):
     for camera, n in (("left", 5), ("right", 4)):
         (tmp_path / camera).mkdir()
         for file in sorted((sample_clip / camera).iterdir())[:n]:
             (tmp_path / camera / file.name).symlink_to(file)
-    assert main(["init", str(tmp_path)]) == 0
-    said = capsys.readouterr().out
+    said = cli("init", tmp_path).out
     assert "left has 5 frames, right has 4" in said
     assert "no views of a chessboard" in said

@@ -234,17 +234,17 @@ def test_a_wrong_part_is_told(parts, told, halves, sample_clip, tmp_path):
 
 
 @pytest.mark.statistical
-def test_init_sees_two_views_in_each_image_and_only_there(halves, sample_clip, tmp_path, capsys):
+def test_init_sees_two_views_in_each_image_and_only_there(halves, sample_clip, tmp_path, cli):
     for name in ("frames", "views"):
         shutil.copytree(halves / name, tmp_path / "both" / name)
         shutil.copytree(sample_clip / {"frames": "left", "views": "calibration/left"}[name], tmp_path / "one" / name)
-    assert main(["init", str(tmp_path / "both")]) == 0
+    cli("init", tmp_path / "both")
     text = (tmp_path / "both" / "recording.toml").read_text()
     assert all(line.split("#")[0].strip() in text for line in HALVES.splitlines())
     assert 'right = "views/*.png"' in text
     assert "inner_corners = [9, 6]" in text
-    assert main(["init", str(tmp_path / "one")]) != 0  # one camera: its halves do not show a board each
-    assert "no two sequences" in capsys.readouterr().err
+    # one camera: its halves do not show a board each
+    assert "no two sequences" in cli("init", tmp_path / "one", code=1).err
     for others, pairs in ((18, 0), (290, 1)):  # eighteen views are not the other camera of a motion
         named = [Sequence(tmp_path, f"{of}/*.png", ".png", n) for of, n in (("frames", 300), ("views", others))]
         assert len(pair_cameras(named)) == pairs

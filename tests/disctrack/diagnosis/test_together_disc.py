@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from disctrack.cli import main
 from disctrack.diagnosis import diagnose
 from disctrack.diagnosis.plan import Planner, Proposal
 from disctrack.diagnosis.recorded import Recorded
@@ -58,17 +57,15 @@ def test_air_that_single_recordings_do_not_show_is_found_in_four_and_another_dis
 
 
 @pytest.mark.slow
-def test_nothing_is_claimed_of_recordings_without_an_effect_and_the_command_says_so(tmp_path, capsys):
+def test_nothing_is_claimed_of_recordings_without_an_effect_and_the_command_says_so(tmp_path, cli):
     paths = []
     for seed in range(4):
         paths.append(tmp_path / f"{seed}.h5")
         theta = 5.0 + seed
         trajectory = measured(seed=50 + seed, n=100, theta_deg=theta, **RIG)
         write_trajectory(paths[-1], trajectory, Provenance("one name", {"frames": str(seed)}, {}))
-    words = ["diagnose", *map(str, paths), "-o", str(tmp_path / "out"), "-j", "2"]
-    assert main(words) == 0
-    said = capsys.readouterr().out
-    assert "nothing is missing" in said
+    command = "diagnose", *paths, "-o", tmp_path / "out", "-j", "2"
+    assert "nothing is missing" in cli(*command).out
     document = json.loads((tmp_path / "out" / "diagnosis.json").read_text())
     assert document["verdict"] == "nothing missing"
     assert [r["left_out"] for r in document["recordings"]] == [""] * 4
@@ -81,23 +78,20 @@ def test_nothing_is_claimed_of_recordings_without_an_effect_and_the_command_says
     assert "What many recordings bring" in page
     for bound in document["bounds"]:  # of a vector every number
         assert all(f">{p['name']}" in page for p in bound["parameters"])
-    assert main(words) == 0  # the complete result is used again
-    assert main(["diagnose", str(paths[0]), str(paths[0])]) == 1
-    assert "more than once" in capsys.readouterr().err
+    cli(*command)  # the complete result is used again
+    assert "more than once" in cli("diagnose", paths[0], paths[0], code=1).err
 
 
 @pytest.mark.statistical
-def test_files_that_cannot_be_read_are_left_out_by_name_and_the_others_are_diagnosed(tmp_path, capsys):
+def test_files_that_cannot_be_read_are_left_out_by_name_and_the_others_are_diagnosed(tmp_path, cli):
     for seed in range(2):
         trajectory = measured(seed=50 + seed, n=60, theta_deg=5.0 + seed, **RIG)
         write_trajectory(tmp_path / f"{seed}.h5", trajectory, Provenance(f"run {seed}", {"frames": str(seed)}, {}))
     (tmp_path / "empty.h5").write_bytes(b"")
     (tmp_path / "cut.h5").write_bytes((tmp_path / "0.h5").read_bytes()[:9000])
-    names = ["0.h5", "empty.h5", "1.h5", "cut.h5"]
-    words = ["diagnose", *(str(tmp_path / name) for name in names), "-o", str(tmp_path / "out"), "-j", "1"]
+    files = [tmp_path / name for name in ("0.h5", "empty.h5", "1.h5", "cut.h5")]
     for _ in range(2):  # the second time the result is used again
-        assert main([*words, "--verbose"]) == 3
-        told = capsys.readouterr()
+        told = cli("diagnose", *files, "-o", tmp_path / "out", "-j", "1", "--verbose", code=3)
         out = " ".join(told.out.split())
         assert "2 recordings together (2 left out): nothing is missing" in out
         assert "empty.h5 was left out" in out
@@ -106,10 +100,8 @@ def test_files_that_cannot_be_read_are_left_out_by_name_and_the_others_are_diagn
     document = json.loads((tmp_path / "out" / "diagnosis.json").read_text())
     assert [name.rpartition("/")[2] for name in document["unusable"]] == ["empty.h5", "cut.h5"]
     assert "empty.h5" in (tmp_path / "out" / "diagnosis.html").read_text()
-    assert main([*words[:3], "-o", str(tmp_path / "other")]) == 1  # one alone is not many
-    assert "empty.h5" in capsys.readouterr().err
-    assert main([*words[:2], str(tmp_path / "mistyped.h5")]) == 1
-    assert "mistyped.h5" in capsys.readouterr().err
+    assert "empty.h5" in cli("diagnose", *files[:2], "-o", tmp_path / "other", code=1).err  # one alone is not many
+    assert "mistyped.h5" in cli("diagnose", files[0], tmp_path / "mistyped.h5", code=1).err
 
 
 @pytest.mark.slow

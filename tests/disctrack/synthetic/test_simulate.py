@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from disctrack.cli import main
 from disctrack.errors import ModelError, OutputError, SceneError
 from disctrack.files.toml_tree import toml_value
 from disctrack.rolling import CATALOGUE, Regime, effects_from_tables
@@ -150,15 +149,13 @@ def test_effects_survive_their_toml():
     assert effects_from_tables(tomllib.loads(f"effects = {text}")["effects"]) == effects
 
 
-def test_command_writes_the_motion_and_tells_how_it_went(scene, capsys):
-    assert main(["simulate", str(scene), "--duration", "0.05", "--rate", "1000"]) == 0
-    said = capsys.readouterr().out
+def test_command_writes_the_motion_and_tells_how_it_went(scene, cli):
+    said = cli("simulate", scene, "--duration", "0.05", "--rate", "1000").out
     assert "scene_motion.h5" in said
     assert "nutation 8" in said
     with h5py.File(scene.with_name("scene_motion.h5")) as file:
         assert len(file["time"]) == 51
 
 
-def test_command_lists_the_effects(capsys):
-    assert main(["simulate", "--list-effects"]) == 0
-    assert "| `km` |" in capsys.readouterr().out
+def test_command_lists_the_effects(cli):
+    assert "| `km` |" in cli("simulate", "--list-effects").out

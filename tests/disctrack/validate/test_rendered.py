@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from disctrack.cli import main
 from disctrack.faults.keys import CameraFault, Faults
 from disctrack.frames import rotation_from_euler
 from disctrack.recording.declaration import read_recording
@@ -111,18 +110,17 @@ def test_files_are_whole_and_a_page_keeps_what_stands_around_the_tables(outcomes
 
 
 @pytest.mark.statistical
-def test_command_prints_the_verdict_and_tells_of_failed_checks(outcomes, tmp_path, monkeypatch, capsys):
+def test_command_prints_the_verdict_and_tells_of_failed_checks(outcomes, tmp_path, monkeypatch, cli):
     """The measurement itself is that of the other tests."""
+    command = "validate", "--quick", "-o", tmp_path / "out"
     monkeypatch.setattr("disctrack.commands.validate.measure_all", lambda *_: outcomes)
-    assert main(["validate", "--quick", "-o", str(tmp_path / "out")]) == 0
-    assert capsys.readouterr().out.startswith(verdict(sum_up(outcomes)))
+    assert cli(*command).out.startswith(verdict(sum_up(outcomes)))
     static, *rolling = outcomes
     late = np.arange(len(static.own.q))[:, None] > 2
     lost = replace(static.own, error=np.where(late, static.own.error, np.nan))
     bad = [replace(static, own=lost), *rolling]
     monkeypatch.setattr("disctrack.commands.validate.measure_all", lambda *_: bad)
-    assert main(["validate", "--quick", "-o", str(tmp_path / "out")]) == 1
-    assert "were not found" in capsys.readouterr().err
+    assert "were not found" in cli(*command, code=1).err
 
 
 def test_static_poses_cover_the_range_and_stand_on_the_table(rng):
