@@ -165,16 +165,6 @@ def test_motion_across_a_gap_too_long_to_bridge_is_unknown(rng):
     assert all(0.6 < value < 1.6 for value in ratio.values()), ratio
 
 
-def test_disc_at_rest_has_no_velocity_beyond_its_sigma(rng):
-    still = imagined(300, position=np.tile([0.05, 0.04, 0.003], (300, 1)))
-    motion = differentiate(as_tracked(still, rng))
-    assert np.abs(motion.velocity).max() < 2e-5
-    sigma = np.sqrt(np.diagonal(motion.covariance, axis1=1, axis2=2))
-    assert np.all(np.abs(errors(motion, still)) < 6 * sigma)
-    # flat on the table there is no direction of precession: NaN, not a number
-    assert np.isnan(propagate(motion).value[:, COLUMN["psidot"]]).all()
-
-
 def test_fast_spin_is_followed(rng):
     """A coin that turns about the vertical at 60 rad/s turns by several radians inside one window."""
     spin = np.tile([0.0, 0.0, 60.0], (300, 1))

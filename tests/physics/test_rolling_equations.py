@@ -228,19 +228,6 @@ def test_a_contact_that_creeps_is_one_that_slips_on_a_film(c, most):
     assert_allclose(simpson(found.power, x=found.time), lost, rtol=1e-3)
 
 
-def test_creep_has_its_derivative_where_nothing_creeps():
-    model = Model(MA_2014, effects=(CATALOGUE["km"](k_m=4e-8),))
-    start = rolling.steady_precession(np.radians(16), MA_2014, omega3=1.5, nutation_amplitude=np.radians(1), psi=0.3)
-    times = np.linspace(0.0, 0.3, 31)
-    c = 1e-7
-    creeping = model.with_effects(CATALOGUE["creep"](c=c))
-    moved = rolling.simulate(creeping, start, times=times).q - rolling.simulate(model, start, times=times).q
-    size = np.abs(moved).max(axis=0)
-    found = rolling.sensitivities(model, start, times, ["creep.c"], components=[]).dq[..., 0] * c
-    assert (size > 0).all()
-    assert (np.abs(found - moved).max(axis=0) < 1e-3 * size).all()
-
-
 def test_accelerations_of_the_motion_are_the_second_derivatives_of_its_poses():
     model, _ = pair("body")
     state = rolling.steady_precession(np.radians(18), MA_2014, omega3=1.5, nutation_amplitude=np.radians(2))
@@ -251,15 +238,3 @@ def test_accelerations_of_the_motion_are_the_second_derivatives_of_its_poses():
     assert_allclose(motion.acceleration_world[1:-1], second, atol=1e-3)
     turn = (motion.omega_world[2:] - motion.omega_world[:-2]) / (2 * h_)
     assert_allclose(motion.angular_acceleration_world[1:-1], turn, atol=0.05)
-
-
-def test_free_flight_agrees_with_the_world_vector_integration():
-    state = State(0.1, 0.2, 0.3, 1.0, 0.4, 3.0, 8.0, 5.0, v_x=0.4, v_y=-0.2, z=0.3, v_z=0.5)
-    times, oracle = np.linspace(0, 0.2, 41), newton_euler.Disc()
-    motion = rolling.simulate(Model(MA_2014), state, times=times)
-    assert motion.end is rolling.EndReason.TIME
-    start = newton_euler.state_from_angles(oracle, *state.array[:8], (state.v_x, state.v_y))
-    start[2], start[9] = state.z, state.v_z
-    expected = newton_euler.coordinates(oracle, newton_euler.follow(oracle, start, times, "flying").y)
-    assert_allclose(motion.q, expected, atol=1e-9)  # two integrators at 1e-11
-    assert not motion.contact_force.any()

@@ -72,7 +72,7 @@ def test_derivative_by_every_parameter_of_the_catalogue(name):
 
 
 @pytest.mark.parametrize(
-    "name", ["kz.k_z", "table_tilt.tilt_x", "centre_of_mass.c_2", "air_bildsten.beta", "gravity.g_error"]
+    "name", ["kz.k_z", "table_tilt.tilt_x", "centre_of_mass.c_2", "air_bildsten.beta", "gravity.g_error", "creep.c"]
 )
 def test_an_effect_that_the_model_lacks_has_its_derivative_at_null(name):
     effect, parameter = name.split(".")

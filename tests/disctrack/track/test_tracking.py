@@ -13,11 +13,10 @@ from calibration.kit.stuck_pixels import stuck_pixels
 from disctrack import frames
 from disctrack.errors import RecordingError, TrackingError
 from disctrack.findings import Kind
-from disctrack.recording.declaration import read_recording
 from disctrack.recording.readers.blocks import PairBlock, Unreadable
 from disctrack.track.dots.template import dot_centres
 from disctrack.track.follow.tracking import PAIRS_TRIED, TrackingSettings, _as_one_sensor, stretch_edges, track
-from disctrack.track.measurement import measure, open_pairs, refuse_unreadable
+from disctrack.track.measurement import refuse_unreadable
 from disctrack.track.pose import DotsInFrames
 from disctrack.track.refine.assembly import fit_all
 from disctrack.trajectory import FrameStatus, MarkerStatus
@@ -137,39 +136,6 @@ def test_a_stretch_that_begins_on_another_branch_of_phi_is_followed_again(rollin
     assert len(whole.trajectory) == len(torn.trajectory)
 
 
-def test_lost_and_unreadable_pairs_are_gaps_with_a_reason_and_the_rest_is_measured(rolling, rendered_pairs):
-    images, q = rolling
-    images = images.copy()
-    readable = np.ones((N, 2), bool)
-    images[10:13] = 85  # something hides the disc
-    readable[20] = False, False
-    readable[30] = True, False
-    result = tracked(images, rendered_pairs, readable=readable)
-    status = result.trajectory.frame_status
-    assert (status[10:13] == FrameStatus.MARKERS_NOT_FOUND).all()
-    assert status[20] == FrameStatus.UNREADABLE
-    assert status[30] == FrameStatus.ONE_CAMERA
-    rest = np.delete(np.arange(N), [10, 11, 12, 20, 30])
-    assert (status[rest] == FrameStatus.MEASURED).all()
-    assert np.isnan(result.trajectory.q[[10, 11, 12, 20]]).all()
-    sigma = np.sqrt(np.diagonal(result.trajectory.pose_covariance, axis1=1, axis2=2))
-    assert (sigma[30, :3] > 5 * sigma[29, :3]).all()  # depth rests on the pattern's size in one image
-    assert (pulls(result.trajectory, q)[rest] < 6).all()
-    assert np.isfinite(result.trajectory.time).all()
-
-
-def test_a_hidden_dot_costs_sigma_not_truth(rolling, rendered_pairs):
-    images, q = rolling
-    images = images[:30].copy()
-    truth = replace(rendered_pairs, q=q, R=frames.rotation_from_euler(*q[:, 3:].T)).true_pixels
-    for i in range(10, 20):
-        u, v = np.round(truth[i, 0, 1]).astype(int)
-        images[i, 0, v - 18 : v + 18, u - 6 : u + 25] = 120
-    result = tracked(images, rendered_pairs)
-    assert np.isnan(result.trajectory.markers_px[10:20, 0, 1]).all()
-    assert (pulls(result.trajectory, q[:30]) < 6).all()
-
-
 def test_misprinted_dots_are_found_and_used(rolling, rendered_pairs):
     images, _ = rolling
     declared = rendered_pairs.disc.marker_centres_body.copy()
@@ -183,12 +149,6 @@ def test_misprinted_dots_are_found_and_used(rolling, rendered_pairs):
     assert found.scatter.whole < 1.2
     kept = tracked(images, rendered_pairs, disc=wrong, settings=TrackingSettings(refine_markers=False))
     assert kept.scatter.whole > 20  # the fault is loud when it is not refined
-
-
-def test_images_that_do_not_fit_the_rig_are_named_by_file_and_camera(rendered_pairs, sample_clip):
-    recording = read_recording(sample_clip)
-    with pytest.raises(TrackingError, match=r"left/000000\.png: left images are 272 x 272 px, but the rig's"):
-        measure(recording, rendered_pairs.rig, open_pairs(recording))
 
 
 @pytest.mark.parametrize("keep", [[0, 3], [0, 3, 6]])

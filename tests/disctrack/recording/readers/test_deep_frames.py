@@ -9,7 +9,6 @@ from numpy.testing import assert_allclose
 from calibration.cameras.camera import StereoRig
 from disctrack.commands.sample import SCENE
 from disctrack.disc import Disc
-from disctrack.findings import Kind
 from disctrack.recording.readers.blocks import PairBlock
 from disctrack.synthetic.cameras import rig_of
 from disctrack.synthetic.description import Scene, load_scene
@@ -69,15 +68,6 @@ def test_twelve_bits_scatter_less_than_the_same_frames_rounded_to_eight(dim, pla
     errors = [np.std(tracking.trajectory.q[:, :3] - centres, axis=0) for tracking in followed]
     # measured 0.5 on 60 frames; the ratio of two standard deviations of 24 scatters by 0.2 of itself, the mean by 0.12
     assert np.mean(errors[0] / errors[1]) < 0.75
-
-
-def test_clipped_light_is_told_and_light_below_it_is_not(dim):
-    images, rig, disc, _ = dim
-    clipped = np.minimum(images, np.uint16(0.9 * np.percentile(images, 98)))
-    assert Kind.LIGHT not in {finding.kind for finding in follow(images, rig, disc).findings}
-    found = [finding for finding in follow(clipped, rig, disc).findings if finding.kind == Kind.LIGHT]
-    assert [finding.subject.camera for finding in found] == ["left", "right"]
-    assert all(f"clipped at grey value {clipped.max()}" in finding.text for finding in found)
 
 
 def test_the_overlay_shows_deep_frames_as_bright_as_those_of_eight_bits(dim, plain, rng):
