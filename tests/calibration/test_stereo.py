@@ -239,13 +239,6 @@ def test_unknown_settings_are_refused():
         Board((9, 6), 0.0)
 
 
-def test_progress_is_told_view_by_view(drawn):
-    _, (left, right) = drawn
-    stages = []
-    calibrate_stereo(left, right, BOARD, FLAT, progress=lambda *state: stages.append(state))
-    assert ("corners", 16, 16) in stages
-
-
 @pytest.fixture(scope="module")
 def views(scene_maker):
     return corner_views(small_scene(scene_maker, n_views=12), np.random.default_rng(3))

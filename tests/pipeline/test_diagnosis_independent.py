@@ -17,7 +17,6 @@ from disctrack.synthetic.description import (
     CameraSettings,
     MotionSettings,
     RigSettings,
-    RollingMotion,
     Scene,
 )
 from disctrack.synthetic.motion import SceneMotion
@@ -146,27 +145,3 @@ def test_a_table_that_vibrates_with_its_cameras_is_found_in_images(tmp_path):
     for axis, true in enumerate(body.m * acceleration):
         (c, c_sigma), (s, s_sigma) = numbers[f"c_0_{2 * axis}"], numbers[f"c_0_{2 * axis + 1}"]
         assert abs(np.hypot(c, s) - true) < 3 * max(c_sigma, s_sigma)
-
-
-@pytest.mark.slow
-def test_a_saved_model_rendered_and_measured_again_lacks_nothing_against_itself(tmp_path):
-    """Paper 0.1 mm above the face and pivoting friction: found, saved, rendered from the file, known the next time."""
-    effects = {"km": {"k_m": newton_euler.K_M}, "kz": {"k_z": 6e-5}}
-    rolling = RollingMotion(effects=effects, theta_deg=15.0, omega3_rad_s=1.5)
-    scene = Scene(name="hidden", seed=24, cameras=CameraSettings(n_frames=120), board=BoardSettings(n_views=14))
-    scene = replace(scene, motion=MotionSettings(kind="rolling", rolling=rolling), faults=Faults(pattern_height_mm=0.1))
-    recording = tmp_path / "first" / "recording"
-    write_recording(recording, scene, truth_path=tmp_path / "elsewhere" / "truth.h5")
-    first = diagnosis_of(recording)
-    assert first["verdict"] == "found"
-    (height, pivoting) = first["effects"]
-    assert height["name"] == "pattern_height"
-    # three sigmas, and what the images' own errors add at 1/800 px
-    assert abs(height["parameters"][0]["value"] - 1e-4) < 3 * height["parameters"][0]["sigma"] + 5e-7
-    assert "kz" in {pivoting["name"], *(c["name"] for c in pivoting["class"])}
-    model = tmp_path / "first" / "out" / "diagnosis" / "model.toml"
-    again = tmp_path / "second" / "recording"
-    assert main(["render", str(model), "-o", str(again)]) == 0
-    assert diagnosis_of(again)["verdict"] == "found"
-    second = diagnosis_of(again, model=model)
-    assert second["verdict"] == "nothing missing", second["sentence"]

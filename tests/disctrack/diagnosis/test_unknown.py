@@ -85,12 +85,8 @@ def test_a_blow_is_an_impulse_at_an_instant():
 @pytest.mark.slow
 def test_a_force_that_grows_with_time_is_found_with_its_size_and_its_direction():
     """Known effects and a force that turns with the face come near it, and leave a memory of p = 1e-80."""
-    growing = np.array([1.2e-3, -3.8e-3, 0.0])  # [N/s]
-
-    def law(disc, now):
-        return newton_euler.ZERO, newton_euler.ZERO, disc.t * growing
-
-    result = diagnose(recording(Unknown(law)).trajectory)
+    growing = np.array([1.2e-3, -3.8e-3])  # [N/s]
+    result = diagnose(recording("growing_force").trajectory)
     assert result.learned is not None
     assert result.after.reduced_chi_square < 1.05
     half = 0.5 * (result.system.time[-1] - result.system.time[0])

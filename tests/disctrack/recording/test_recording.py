@@ -60,10 +60,10 @@ def test_lengths_and_masses_become_si(tmp_path):
     assert recording.disc.half_thickness == pytest.approx(0.003)
     assert recording.disc.mass == pytest.approx(0.20969)
     assert_allclose(recording.disc.marker_centres_body[0], [0.026, 0, 0.003])
-    assert recording.chessboard is not None
     assert recording.chessboard.square == pytest.approx(0.008)
-    assert recording.table is not None
-    assert recording.table.board_thickness == pytest.approx(0.003)
+    assert (recording.table.board_thickness, recording.table.source) == (pytest.approx(0.003), "both")
+    assert recording.disc.thickness_tolerance is None  # not declared
+    assert recording.board_tolerances.square is None
 
 
 def test_every_key_of_the_reference_recording_is_known(shared_data):
@@ -120,19 +120,12 @@ def test_each_missing_section_is_named(tmp_path, section):
         ("name =", "nane =", "unknown.*name"),
         ("mass_g = 209.69", "mass_g = 209.69\nframe_rate_hz = 5", "unknown.*'frame_rate_hz' of [cameras]"),
         ("square_mm = 8.0", "square_mm = 8.0\ntemperature = 20", "unknown.*Known here: left, right"),
-        ("frame_rate_hz = 1000.0", 'frame_rate_hz = "fast"', "a number"),
-        ("frame_rate_hz = 1000.0", "frame_rate_hz = true", "a number"),
-        ("frame_rate_hz = 1000.0", "frame_rate_hz = 0", "from 0.1 to 1e+07"),
-        ("frame_rate_hz = 1000.0", "frame_rate_hz = nan", "from 0.1 to 1e+07"),
         ("frame_rate_hz = 1000.0", f"frame_rate_hz = 1{'0' * 400}", "from 0.1 to 1e+07"),
         ("[cameras]", "[cameras]\nexposure_us = 1200", "exposure_us is 1200, longer than a frame: 1000 µs"),
         ("[gravity]", "[air]\npressure_hPa = 1\ndensity_kg_m3 = 1\n[gravity]", "both pressure_hPa and density_kg_m3"),
-        ("radius_mm = 37.5", "radius_mm = -37.5", "[disc] radius_mm is -37.5; expected a number from 0.1 to 10000"),
         ('left = "left/*.png"', "left = 3", "file pattern"),
         ("inner_corners = [9, 6]", "inner_corners = [9]", "two whole numbers"),
         ("inner_corners = [9, 6]", "inner_corners = 9", "two whole numbers"),
-        ("view = 0", "view = -1", "whole number"),
-        ("view = 0", "view = 0.5", "whole number"),
         ("[[26.0, 0.0], [13.0, 22.5167], [-13.0, 22.5167]]", "[[26.0, 0.0]]", "at least 3"),
         ("[[26.0, 0.0], [13.0, 22.5167]", "[[36.0, 0.0], [13.0, 22.5167]", "rim"),
         ("[[26.0, 0.0], [13.0, 22.5167]", "[[13.0, 22.0], [13.0, 22.5167]", "overlap"),
@@ -199,10 +192,6 @@ def test_any_value_at_any_key_is_read_or_refused_with_a_message(tmp_path, data):
 
 
 def test_tolerances_exposure_and_source_of_the_table_may_be_declared(tmp_path):
-    plain = read_recording(write(tmp_path, REFERENCE))
-    assert plain.table.source == "both"
-    assert plain.disc.thickness_tolerance is None  # not declared
-    assert plain.board_tolerances.square is None
     text = REFERENCE.replace("mass_g", "thickness_tolerance_mm = 0.02\nradius_tolerance_mm = 0\nmass_g", 1)
     text = text.replace("[table]", '[table]\nfrom = "disc"')
     read = read_recording(write(tmp_path, text.replace("[cameras]", "[cameras]\nexposure_us = 200")))

@@ -155,7 +155,3 @@ def test_command_writes_the_motion_and_tells_how_it_went(scene, cli):
     assert "nutation 8" in said
     with h5py.File(scene.with_name("scene_motion.h5")) as file:
         assert len(file["time"]) == 51
-
-
-def test_command_lists_the_effects(cli):
-    assert "| `km` |" in cli("simulate", "--list-effects").out
