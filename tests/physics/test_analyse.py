@@ -122,9 +122,9 @@ def test_disc_at_rest_gives_no_rates_and_no_exponents(tilt_deg, rng):
     assert not analysis.laws.determined
     assert np.isnan(analysis.laws.n_theta.value)
     assert np.isnan(analysis.circle.radius)
-    psidot, velocity = analysis.series("psidot"), analysis.series("velocity_x")
-    assert np.abs(velocity.value).max() < 2e-5
-    assert np.all(np.abs(velocity.value) < 6 * velocity.sigma)
+    psidot, motion = analysis.series("psidot"), analysis.motion
+    assert np.abs(motion.velocity).max() < 2e-5
+    assert np.all(np.abs(motion.velocity) < 6 * np.sqrt(np.diagonal(motion.covariance, axis1=1, axis2=2)[:, 6:9]))
     if tilt_deg:
         assert np.all(np.abs(psidot.value) < 6 * psidot.sigma)
         assert_allclose(np.nanmean(analysis.series("force_z").value), MA_2014.mass * 9.81, rtol=1e-3)
