@@ -1,20 +1,257 @@
-"""What no catalogue names, from the independent simulation: never noise, and described where a law can be had."""
+"""What no catalogue names is never noise: read from the residual as a moment and a law, as uncertain as its form."""
 
 from dataclasses import replace
+from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from disctrack.diagnosis import diagnose
+from disctrack.diagnosis import diagnose, form_misfit
+from disctrack.diagnosis.errors import simulated
+from disctrack.diagnosis.form_misfit import moment_about_contact
 from disctrack.diagnosis.law_library import families
+from disctrack.diagnosis.missing_force import law_of, missing_moment, probe
+from disctrack.diagnosis.pages.output import as_json
+from disctrack.disc import MA_2014
+from disctrack.discrepancy.fit import Fit, fit
+from disctrack.discrepancy.laws import Family, busy_amounts, learn, with_law, without_idle_terms
 from disctrack.discrepancy.search import CLASS_GAIN
+from disctrack.discrepancy.system import Quantity
+from disctrack.faults.keys import Faults
 from disctrack.frames import nodal_axes_world
-from disctrack.rolling import Model, State, simulate
+from disctrack.rolling import Model, State, sensitivities, simulate, steady_precession
 from disctrack.rolling.effects.learned import effect_from_formulas
+from disctrack.rolling.model import body_constants
 from tests.oracles import newton_euler
-from tests.oracles.measured_disc import K_M, assert_sized, measured
+from tests.oracles.measured_disc import K_M, assert_sized, measured, with_base_fit
 from tests.oracles.unknown_laws import DISC, PLACE, UNKNOWN, Unknown, motion, recording
+
+
+def hiding(name: str, component: str, formula: str, size: float, **options):
+    """Measured with an effect that no candidate list proposes."""
+    return measured({f"{name}.k": size}, laws=[effect_from_formulas(name, {component: formula})], **options)
+
+
+@pytest.mark.statistical
+def test_an_effect_in_no_catalogue_is_described_by_a_learned_law():
+    result = diagnose(hiding("hidden_magnet", "M_n", "-k * cos(psi + phi)", 4e-5, seed=5, n=450, omega3=2.0))
+    assert result.diagnosis.verdict == "unexplained"
+    assert result.learned is not None
+    assert set(result.learned.law.formulas) == {"M_n"}
+    # 10 000 numbers: 1 +- 0.014
+    assert result.after.reduced_chi_square < 1.05
+    assert result.after.ratio_to_floor < 1.2 < result.before.ratio_to_floor
+    first = as_json(result)["effects"][0]
+    assert first["kind"] == "learned"
+    assert first["phase_locked"]
+
+
+@pytest.mark.statistical
+def test_missing_moment_is_the_hidden_one():
+    """The true course of the moment lies within the band: pulls of order one, and the band is narrow."""
+    trajectory = hiding("hidden_cubic", "M_z", "-k * omega_z * omega_z * omega_z", 1e-6, seed=7, n=400)
+    system, base = with_base_fit(trajectory)
+    moment, _ = missing_moment(probe(system, base))
+    law = learn(system, base, 1.0)
+    system = system.knowing(law)
+    values = with_law(system, base, law).values
+    truth = moment_about_contact(system, values, simulated(system, values), {law.candidate.effect})
+    expected = np.interp(moment.time, system.time, truth[:, 2])
+    inner = slice(3, -3)  # at the ends the initial state absorbs a moment
+    error = moment.values[inner, 2] - expected[inner]
+    size = np.abs(expected).max()
+    # the fitted k_m and initial state take a part of any moment with them: the shape is left, to a tenth
+    assert np.sqrt(np.mean((error - error.mean()) ** 2)) < 0.1 * size
+
+
+@pytest.mark.statistical
+def test_in_noise_no_law_is_learned():
+    trajectory = measured(seed=8, n=300)
+    system, base = with_base_fit(trajectory)
+    assert learn(system, base, 1.0) is None
+
+
+@pytest.mark.parametrize(
+    ("amounts", "left", "title"),
+    [
+        ((-3.9e-4, 4e-7), (0,), "twice"),
+        ((1e-6, 4e-4), (1,), "twice, without its first term"),
+        ((-3.9e-4, 4e-5), (0, 1), "twice"),
+    ],
+)
+def test_a_term_that_the_refit_finds_to_be_zero_is_dropped(amounts, left, title):
+    pair = Family("twice", ({"M_z": "sin(2.0 * phi)"}, {"M_z": "cos(2.0 * phi)"}))
+    system = SimpleNamespace(law=partial(law_of, Model(MA_2014)))
+    law = system.law([pair], np.array([-4e-4, 1e-6]))
+    values = dict(zip(law.candidate.names, amounts, strict=True))
+    fitted = Fit(law.candidate.quantities, values, np.diag([6e-6, 7e-6]) ** 2, 1.0, 0.0, 100, True, 3)
+    shorter = without_idle_terms(system, law, fitted)
+    assert shorter.families[0].terms == tuple(pair.terms[i] for i in left)
+    assert shorter.title == title
+    if len(left) == 1:
+        assert shorter.formulas == {"M_z": f"c_0 * ({pair.terms[left[0]]['M_z']})"}
+        assert shorter.candidate.start == (amounts[left[0]],)
+
+
+def test_of_terms_that_move_together_those_stay_that_do_for_all(rng):
+    """Two columns nearly alike: each amount alone is open, together they are not. One is enough: as least squares."""
+    t = np.linspace(0, 1, 300)
+    A = np.stack([np.ones_like(t), 1.0 + 1e-3 * t, np.cos(9 * t)], axis=1)
+    y = 0.5 * A[:, 0] + rng.standard_normal(300)
+    values, covariance = np.linalg.lstsq(A, y)[0], np.linalg.inv(A.T @ A)
+    names = ("one", "nearly", "wave")
+    quantities = tuple(Quantity(name, "1", 1.0) for name in names)
+    fitted = Fit(quantities, dict(zip(names, values, strict=True)), covariance, 1.0, 0.0, 300, True, 3)
+    assert (np.abs(values / np.sqrt(np.diag(covariance))) < 3).all()
+    ((which, amount),) = busy_amounts(fitted, names).items()
+    assert which in (0, 1)
+    assert amount == pytest.approx(A[:, which] @ y / (A[:, which] @ A[:, which]), rel=1e-6)
+    silent = replace(fitted, values=dict(zip(names, 0.1 * values, strict=True)))
+    assert busy_amounts(silent, names) == {}
+
+
+@pytest.mark.statistical
+def test_a_law_is_looked_for_along_the_motion_that_follows_the_data():
+    """A spring that grows as the distance: from no spring at all nothing is near, beside a linear one its law is read.
+
+    The motion is the oracle's, with 40 N/m^2.
+    """
+    trajectory = recording("quadratic_spring").trajectory
+    system, base = with_base_fit(trajectory)
+    spring = next(c for c in system.candidates if c.name == "spring")
+    along = fit(system, (*base.quantities, *spring.quantities), base.values)
+    assert along.reduced_chi_square < 0.01 * base.reduced_chi_square
+    scan, far = system.scan(along, base.quantities), system.scan(base)
+    square = [f for f in scan.library() if f.title.endswith("distance squared")]
+    (near,), (wrong,) = scan.gains(square), far.gains(square)
+    n = np.sum(system.weights)
+    assert scan.chi_square - near.gain < 1.1 * n < 1.5 * n < far.chi_square - wrong.gain
+    assert near.values[0] == pytest.approx(40.0, abs=1.0)
+    assert wrong.values[0] > 60.0  # linear in the law, but along a motion that is no longer its own
+    law = learn(system, base, 1.0, along, against=along.cost)
+    assert law is not None
+    assert [f.title for f in law.families] == [f.title for f in square]
+    fitted = with_law(system.knowing(law), base, law)
+    assert fitted.reduced_chi_square < 1.1
+    assert_sized(fitted, {law.candidate.names[0]: 40.0}, 3)
+
+
+@pytest.mark.statistical
+def test_a_strong_spring_is_no_law_in_fewer_numbers():
+    """About the origin it is a force in proportion to the distance, with one number where the catalogue's has three."""
+    result = diagnose(recording(Unknown(newton_euler.spring(0.8), duration=0.4)).trajectory)
+    assert result.learned is None
+    assert [found.candidate.name for found in result.diagnosis.found] == ["spring"]
+    assert_sized(result.diagnosis.after, {"spring.k": 0.8}, 3)
+
+
+@pytest.mark.slow
+def test_a_law_that_a_found_effect_describes_alone_is_that_effect():
+    """A table tilted about one axis beside a wrong frame rate: a constant force is the tilt in one number less."""
+    faults, options = Faults(frame_rate_hz=500.05), {"seed": 3, "n": 250, "theta_deg": 11.0}
+    result = diagnose(measured({"table_tilt.tilt_x": 2e-3}, faults=faults, declared_rate=500.0, **options))
+    assert result.learned is None
+    alike = [{f.candidate.name, *(r.candidate.name for r in f.cannot_be_told_from)} for f in result.diagnosis.found]
+    assert any("table_tilt" in names for names in alike)
+    assert any({"frame_rate", "gravity"} <= names for names in alike)  # all laws at hand are quadratic in the rates
+    assert result.after.reduced_chi_square < 1.05
+    assert_sized(result.diagnosis.after, {"table_tilt.tilt_x": 2e-3}, 3)
+
+
+@pytest.mark.slow
+def test_a_law_that_describes_no_more_than_a_known_effect_is_told_beside_it():
+    """A weak spring: over so short a way a tilted table, and a force of constant size in one number less."""
+    options = {"nutation_deg": 0.5, "n": 150, "theta_deg": 10.0, "omega3": 1.0, "declared_rate": 500.0}
+    result = diagnose(measured({"spring.k": 0.05}, seed=11, rig_seed=5, **options))
+    assert result.learned is None
+    (found,) = result.diagnosis.found
+    assert "spring" in {found.candidate.name, *(r.candidate.name for r in found.cannot_be_told_from)}
+    assert any("a single law outside the catalogue describes the data too" in note for note in result.notes)
+
+
+def test_numbers_beside_a_misfit_scatter_as_generalised_least_squares_has_it(rng):
+    """Right = A p + f B u + noise: about the plain estimate, GLS' covariance and the square of what it moves by."""
+    A, B, right = rng.standard_normal((40, 3)), rng.standard_normal((40, 6)), rng.standard_normal(40)
+    taken, beside = form_misfit.absorbed(A, np.column_stack([B, right])), np.eye(40) - A @ np.linalg.pinv(A)
+    second, misfit = form_misfit._second_moment(beside @ B, beside @ right, [6], np.array([0.7]))
+    taken = taken[:, :6]
+    found = np.linalg.inv(A.T @ A) + taken @ second @ taken.T
+    weight = np.linalg.inv(np.eye(40) + 0.49 * B @ B.T)
+    covariance = np.linalg.inv(A.T @ weight @ A)
+    moved = covariance @ A.T @ weight @ right - np.linalg.lstsq(A, right, rcond=None)[0]
+    assert_allclose(found, covariance + np.outer(moved, moved), rtol=1e-9)
+    assert misfit == pytest.approx(0.7)
+
+
+def test_what_the_recording_does_not_show_of_a_misfit_is_as_large_as_before_the_data(rng):
+    """Of three parts one is seen and absent, one is seen and there, one leaves no trace: each has a size of its own."""
+    B = 1e3 * rng.standard_normal((400, 60))
+    B[:, 40:] = 0.0
+    right = rng.standard_normal(400) + 0.1 * B[:, 20:40] @ rng.standard_normal(20)
+    second, _ = form_misfit._second_moment(B, right, [20, 20, 20])
+    sizes = [float(np.sqrt(np.mean(np.diag(second)[20 * i : 20 * i + 20]))) for i in range(3)]
+    assert sizes[0] < 0.003
+    assert sizes[1] == pytest.approx(0.1, rel=0.4)
+    assert sizes[2] == pytest.approx(float(np.sqrt(np.mean(form_misfit.SIZES**2))), rel=1e-6)
+
+
+def moments_on_one_motion(*models):
+    """(n, 3) about the contact by each of the models, on the motion of the first."""
+    motion = simulate(models[0], steady_precession(np.radians(14.0), DISC), times=np.linspace(0.0, 0.1, 10))
+    systems = (SimpleNamespace(disc=DISC, model_with=lambda _, m=model: m) for model in models)
+    return [form_misfit.moment_about_contact(system, {}, motion) for system in systems]
+
+
+def test_the_moment_of_a_law_of_the_air_is_that_of_the_air_of_the_recording():
+    """In a third of the air, a third of the moment at the same instant."""
+    thick = Model(DISC, air_density=1.2).with_values({"air_quadratic.a": 0.5})
+    (first,), (thin,) = (moments_on_one_motion(model) for model in (thick, replace(thick, air_density=0.4)))
+    assert np.abs(first[0]).max() > 1e-8
+    assert_allclose(thin[0], first[0] / 3, rtol=1e-12)
+
+
+def test_a_tilted_table_counts_as_the_force_along_it():
+    """The same moment as a level force m g tilt at the centre, on the same motion."""
+    tilted = Model(DISC).with_values({"table_tilt.tilt_x": 1e-3, "table_tilt.tilt_y": -4e-4})
+    body = body_constants(tilted, 0.01)
+    force = {"spring.F_x": DISC.mass * body["g_x"], "spring.F_y": DISC.mass * body["g_y"]}
+    moments = moments_on_one_motion(tilted, Model(DISC).with_values({"spring.k": 0.0} | force))
+    assert np.abs(moments[1]).max() > 1e-6
+    assert_allclose(moments[0][:, 2], moments[1][:, 2], rtol=1e-9)
+    by_weight = 0.5 * (1e-3**2 + 4e-4**2) * DISC.mass * 9.81 * DISC.radius  # 1 - cos(tilt) of it is missing
+    assert_allclose(moments[0], moments[1], atol=1.01 * by_weight)
+
+
+def test_slip_that_takes_too_long_is_not_followed():
+    """A friction just below what rolling needs: thousands of steps for a tenth of a second, and no derivative."""
+    start = steady_precession(np.radians(14.0), DISC, omega3=1.0, nutation_amplitude=np.radians(0.5))
+    model, times = Model(DISC).with_values({"slip.mu": 0.06}), np.linspace(0.0, 0.3, 30)
+    whole = sensitivities(model, start, times, components=["theta"])
+    assert np.isfinite(whole.dq).all()
+    assert whole.slip_steps > 1000
+    cut = sensitivities(model, start, times, components=["theta"], max_steps=whole.slip_steps // 4)
+    assert not np.isfinite(cut.dq).all()
+    assert cut.slip_steps <= whole.slip_steps // 4
+
+
+def test_a_sum_or_a_law_with_alternatives_of_another_form_is_taken_for_another_s():
+    """One law that nothing else comes near to has its form nearly for certain; two that are needed have it not."""
+
+    def law(*families, others=()):
+        return SimpleNamespace(
+            families=[SimpleNamespace(kind=k, terms=[{c: "1.0"}]) for k, c in families], others=others
+        )
+
+    alone, other, other_axis = law(("angle", "M_n")), law(("hum", "X_n")), law(("angle", "M_z"))
+    assert form_misfit.form_is_another(alone) == form_misfit.SELDOM
+    assert form_misfit.form_is_another(law(("angle", "M_n"), ("hum", "X_n"))) == 1.0
+    assert form_misfit.form_is_another(alone, {"kz"}) == 1.0
+    for one in (other, other_axis, law(("angle", "M_n"), ("hum", "X_n")), law()):  # the last: known effects alone
+        assert form_misfit.form_is_another(law(("angle", "M_n"), others=[(one, 1.0)])) == pytest.approx(0.5)
+    same = [(law(("angle", "M_n")), 1.0)]  # a variation of the same idea, whose course is in the sigma anyway
+    assert form_misfit.form_is_another(law(("angle", "M_n"), others=same)) == form_misfit.SELDOM
 
 
 def contour_friction_below(mu: float, theta_deg: float):
