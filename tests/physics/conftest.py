@@ -10,16 +10,9 @@ from functools import lru_cache
 import numpy as np
 
 from calibration.cameras.camera import N_RIG, Camera, StereoRig
+from disctrack import frames
 from disctrack.analyse.derivatives import MotionState
 from disctrack.disc import MA_2014
-from disctrack.frames import (
-    continuous_quaternions,
-    euler_from_rotation,
-    quaternion_from_rotation,
-    rotation_from_euler,
-    rotation_from_vector,
-    unwrap_euler,
-)
 from disctrack.rolling import Model, Motion, simulate, steady_precession
 from disctrack.trajectory import FrameStatus, Trajectory
 
@@ -64,7 +57,7 @@ def of_simulation(made: Motion) -> TrueMotion:
     return TrueMotion(
         time=made.time,
         position=made.q[:, :3],
-        R=rotation_from_euler(*made.q[:, 3:].T),
+        R=frames.rotation_from_euler(*made.q[:, 3:].T),
         velocity=made.qdot[:, :3],
         omega=made.omega_world,
         acceleration=made.acceleration_world,
@@ -91,7 +84,7 @@ def as_tracked(truth: TrueMotion, rng, missing=(), noise=1.0, sensitivity=None, 
     n = len(truth)
     P = noise**2 * pose_covariance()
     error = rng.multivariate_normal(np.zeros(6), P, n, method="cholesky") if noise else np.zeros((n, 6))
-    R = rotation_from_vector(error[:, 3:]) @ truth.R
+    R = frames.rotation_from_vector(error[:, 3:]) @ truth.R
     position = truth.position + error[:, :3]
     status = np.full(n, FrameStatus.MEASURED, np.uint8)
     missing = list(missing)
@@ -102,11 +95,11 @@ def as_tracked(truth: TrueMotion, rng, missing=(), noise=1.0, sensitivity=None, 
     return Trajectory(
         time=truth.time,
         frame=np.arange(n),
-        q=np.column_stack([position, unwrap_euler(euler_from_rotation(R))]),
+        q=np.column_stack([position, frames.unwrap_euler(frames.euler_from_rotation(R))]),
         pose_covariance=np.broadcast_to(P if noise else pose_covariance(), (n, 6, 6)).copy(),
         calibration_sensitivity=np.zeros((n, 6, N_RIG)) if sensitivity is None else sensitivity,
         systematic_covariance=np.zeros((n, 6, 6)),
-        quaternion=continuous_quaternions(quaternion_from_rotation(R)),
+        quaternion=frames.continuous_quaternions(frames.quaternion_from_rotation(R)),
         frame_status=status,
         reprojection_rms_px=np.full((n, 2), 0.02),
         reduced_chi_square=np.ones(n),

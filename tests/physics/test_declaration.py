@@ -11,6 +11,7 @@ import pytest
 from scipy.ndimage import gaussian_filter1d
 
 from calibration.cameras.camera import Camera, StereoRig, placed_at
+from disctrack import frames
 from disctrack.analyse.declaration import (
     balance,
     contradictions,
@@ -19,15 +20,6 @@ from disctrack.analyse.declaration import (
     unseen_dots,
 )
 from disctrack.findings import Kind, Severity
-from disctrack.frames import (
-    continuous_quaternions,
-    euler_from_rotation,
-    quaternion_from_rotation,
-    rotation_from_euler,
-    rotation_from_quaternion,
-    rotation_from_vector,
-    unwrap_euler,
-)
 from disctrack.trajectory import MarkerStatus, Trajectory
 from tests.physics.conftest import as_tracked, true_motion
 
@@ -89,14 +81,16 @@ def test_a_number_that_the_balance_of_moments_contradicts_is_named_with_the_true
 
 def leaning(degrees: float):
     """(3, 3) of a board that leans."""
-    return rotation_from_vector(np.radians(degrees) * np.array([0.6, -0.8, 0.0]))
+    return frames.rotation_from_vector(np.radians(degrees) * np.array([0.6, -0.8, 0.0]))
 
 
 def seen_in(Q, trajectory: Trajectory, height: float = 0.0) -> Trajectory:
     """The same motion in a world that is turned by Q and lies lower."""
-    R = Q @ rotation_from_quaternion(trajectory.quaternion)
-    q = np.column_stack([trajectory.q[:, :3] @ Q.T + [0.0, 0.0, height], unwrap_euler(euler_from_rotation(R))])
-    return replace(trajectory, q=q, quaternion=continuous_quaternions(quaternion_from_rotation(R)))
+    R = Q @ frames.rotation_from_quaternion(trajectory.quaternion)
+    q = np.column_stack(
+        [trajectory.q[:, :3] @ Q.T + [0.0, 0.0, height], frames.unwrap_euler(frames.euler_from_rotation(R))]
+    )
+    return replace(trajectory, q=q, quaternion=frames.continuous_quaternions(frames.quaternion_from_rotation(R)))
 
 
 @pytest.mark.parametrize(("theta", "seconds", "k_m", "nutation", "spin"), HONEST)
@@ -158,8 +152,8 @@ def test_no_hand_is_taken_for_a_wrong_number(memory_ms):
 
     for seed in range(4):
         rng = np.random.default_rng(seed)
-        start = rotation_from_euler(rng.uniform(0, 6), np.radians(rng.uniform(5, 50)), 0.3)
-        R = rotation_from_vector(wander(rng, rng.uniform(0.02, 0.3))) @ start
+        start = frames.rotation_from_euler(rng.uniform(0, 6), np.radians(rng.uniform(5, 50)), 0.3)
+        R = frames.rotation_from_vector(wander(rng, rng.uniform(0.02, 0.3))) @ start
         position = wander(rng, 5e-3) + np.array([0.05, 0.04, 0.05])
         for before in (0, 150):
             parts = {"R": R, "position": position, "time": 1e-3 * np.arange(before, before + len(R))}
@@ -172,7 +166,7 @@ def test_no_hand_is_taken_for_a_wrong_number(memory_ms):
 
 def with_dots(trajectory: Trajectory, scale: float, unseen: tuple[int, ...] = ()) -> Trajectory:
     """Half a metre before the cameras, with the images of dots `scale` times as far apart as declared."""
-    R = rotation_from_quaternion(trajectory.quaternion)
+    R = frames.rotation_from_quaternion(trajectory.quaternion)
     points = scale * trajectory.disc.marker_centres_body @ R.swapaxes(1, 2)
     points = points + trajectory.q[:, None, :3] + [0.0, 0.0, 0.5]
     pixels = np.stack([1000.0 * (points + t)[..., :2] / points[..., 2:] + 255.5 for t in ([0, 0, 0], [-0.2, 0, 0])], 1)
@@ -226,7 +220,7 @@ def camera_rig(left, right):
 
 @pytest.mark.parametrize("azimuth", [0.0, 1.0, 2.5, 4.0])
 def test_a_mirrored_world_is_told_by_the_cameras_places_or_by_dots_without_an_axis(azimuth, honest):
-    turn = rotation_from_vector(np.array([0.0, 0.0, azimuth]))
+    turn = frames.rotation_from_vector(np.array([0.0, 0.0, azimuth]))
     left, right = np.array([[-0.15, -0.4, 0.5], [0.15, -0.4, 0.5]]) @ turn.T
     assert handedness(camera_rig(left, right), honest.disc) == ()
     mirror = [1.0, -1.0, 1.0]

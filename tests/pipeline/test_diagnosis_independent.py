@@ -12,13 +12,7 @@ import pytest
 
 from disctrack.cli import main
 from disctrack.faults.keys import Faults
-from disctrack.synthetic.description import (
-    BoardSettings,
-    CameraSettings,
-    MotionSettings,
-    RigSettings,
-    Scene,
-)
+from disctrack.synthetic import description
 from disctrack.synthetic.motion import SceneMotion
 from disctrack.synthetic.recording import write_recording
 from tests.oracles import newton_euler
@@ -30,13 +24,13 @@ CALIBRATION = ["--distortion", "k1 k2 p1 p2", "--board", "flat"]  # choosing by 
 
 def small_scene(seed, n_frames, frame_rate):
     """A quarter of the pixels and few chessboard views."""
-    return Scene(
+    return description.Scene(
         name="hidden",
         seed=seed,
-        cameras=CameraSettings(image_size=(272, 272), frame_rate_hz=frame_rate, n_frames=n_frames),
-        rig=RigSettings(mm_per_px=0.42),
-        board=BoardSettings(n_views=12, square_mm=6.0, shift_mm=15.0),
-        motion=MotionSettings(kind="table"),
+        cameras=description.CameraSettings(image_size=(272, 272), frame_rate_hz=frame_rate, n_frames=n_frames),
+        rig=description.RigSettings(mm_per_px=0.42),
+        board=description.BoardSettings(n_views=12, square_mm=6.0, shift_mm=15.0),
+        motion=description.MotionSettings(kind="table"),
     )
 
 
@@ -94,8 +88,8 @@ def test_a_tilted_table_in_images_of_an_independent_motion_is_found_and_sized(tm
 
 @pytest.mark.slow
 def test_nothing_is_found_in_images_of_an_independent_motion_without_an_effect(tmp_path):
-    cameras = CameraSettings(frame_rate_hz=400.0, n_frames=150)  # the paper's format
-    scene = Scene(name="hidden", seed=42, motion=MotionSettings(kind="table"), cameras=cameras)
+    cameras = description.CameraSettings(frame_rate_hz=400.0, n_frames=150)  # the paper's format
+    scene = description.Scene(name="hidden", seed=42, motion=description.MotionSettings(kind="table"), cameras=cameras)
     document = diagnosis_of(hide(tmp_path, scene, of_the_paper()))
     assert document["verdict"] == "nothing missing", document["sentence"]
     assert document["effects"] == []

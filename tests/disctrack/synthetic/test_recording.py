@@ -18,33 +18,18 @@ from disctrack.errors import OutputError, SceneError
 from disctrack.faults.keys import CameraFault, Faults, Occluder
 from disctrack.frames import rotation_from_euler
 from disctrack.recording.declaration import read_recording
+from disctrack.synthetic import description
 from disctrack.synthetic.cameras import rig_of
-from disctrack.synthetic.description import (
-    AppearanceSettings,
-    BoardSettings,
-    CameraSettings,
-    GlareSettings,
-    ImperfectionSettings,
-    LightSettings,
-    MarkerSettings,
-    MotionSettings,
-    OpticsSettings,
-    RigSettings,
-    Scene,
-    SensorSettings,
-    load_scene,
-    scene_from_tree,
-)
 from disctrack.synthetic.motion import motion_of
 from disctrack.synthetic.optics import corner_rays, lens_rays
 from disctrack.synthetic.recording import recording_toml, write_recording
 from disctrack.synthetic.sensor import digitise, sensor_pattern
 from tests.rendering import expected_disc, render_board, render_disc
 
-PLAIN = Scene(
-    appearance=AppearanceSettings(table=0.0, table_streaks=0.0, table_blotches=0.0),
-    light=LightSettings(directed=0.0),
-    optics=OpticsSettings(vignetting=0.0),
+PLAIN = description.Scene(
+    appearance=description.AppearanceSettings(table=0.0, table_streaks=0.0, table_blotches=0.0),
+    light=description.LightSettings(directed=0.0),
+    optics=description.OpticsSettings(vignetting=0.0),
 )
 POSES = np.column_stack(
     [
@@ -61,7 +46,7 @@ POSES = np.column_stack(
 @pytest.fixture(scope="module")
 def rig():
     # stronger lenses than the default, so that the inverse of the distortion has work to do
-    lens = RigSettings(k1=(-0.25, 0.2), k2=(0.5, -0.4), p1=(2e-3, -2e-3), p2=(-2e-3, 2e-3), k3=(0.3, 0.0))
+    lens = description.RigSettings(k1=(-0.25, 0.2), k2=(0.5, -0.4), p1=(2e-3, -2e-3), p2=(-2e-3, 2e-3), k3=(0.3, 0.0))
     return rig_of(replace(PLAIN, rig=lens))
 
 
@@ -133,7 +118,7 @@ def test_black_squares_lie_where_opencv_projects_them(index, rig):
     scene = replace(PLAIN, appearance=replace(PLAIN.appearance, board_white=0.0, board_black=200.0))
     R = rotation_from_euler(0.4, 0.3, -0.2)
     t = np.array([0.002, 0.004, 0.012])
-    fine = replace(scene, cameras=CameraSettings(bit_depth=16), render=replace(scene.render, subpixels=5))
+    fine = replace(scene, cameras=description.CameraSettings(bit_depth=16), render=replace(scene.render, subpixels=5))
     image = render_board(R, t, rig, fine)[0, index] / (65535 / 255)
     total, moment = 0.0, np.zeros(2)
     for i in range(-1, 9):
@@ -156,7 +141,7 @@ def test_edges_and_squares_have_converged(rig):
     scenes = [replace(PLAIN, render=replace(PLAIN.render, subpixels=s)) for s in (5, 10)]
     coarse, fine = (expected_disc(POSES, rig, MA_2014, scene) for scene in scenes)
     assert np.abs(coarse - fine).max() < 0.1  # grey levels of 165
-    deep = (replace(scene, cameras=CameraSettings(bit_depth=16)) for scene in scenes)
+    deep = (replace(scene, cameras=description.CameraSettings(bit_depth=16)) for scene in scenes)
     coarse, fine = (render_board(*board, rig, scene).astype(int) for scene in deep)
     assert np.abs(coarse - fine).max() / 257 < 0.1  # grey levels of 180
 
@@ -172,9 +157,9 @@ def test_an_error_of_the_lens_model_would_be_noticed(rig):
 
 
 # both cameras straight above the table at half the usual size: image x is world i, 0.5 mm per pixel
-ABOVE = Scene(
-    cameras=CameraSettings(image_size=(256, 256), exposure_s=0.001),
-    rig=RigSettings(
+ABOVE = description.Scene(
+    cameras=description.CameraSettings(image_size=(256, 256), exposure_s=0.001),
+    rig=description.RigSettings(
         mm_per_px=0.5,
         off_vertical_deg=(0.0, 0.0),
         azimuth_deg=(-90.0, -90.0),
@@ -184,9 +169,9 @@ ABOVE = Scene(
         p2=(0.0, 0.0),
         variation=0.0,
     ),
-    appearance=AppearanceSettings(table=0.0, table_streaks=0.0, table_blotches=0.0, rim=190.0),
-    light=LightSettings(directed=0.0),
-    optics=OpticsSettings(vignetting=0.0, blur_px=(0.8, 1.3)),
+    appearance=description.AppearanceSettings(table=0.0, table_streaks=0.0, table_blotches=0.0, rim=190.0),
+    light=description.LightSettings(directed=0.0),
+    optics=description.OpticsSettings(vignetting=0.0, blur_px=(0.8, 1.3)),
 )
 FLAT = np.array([0.032, 0.020, 0.001, 0.0, 0.0, 0.0])  # upper face at the target's height of 4 mm: 0.5 mm per pixel
 DOT = 0  # at (26, 0) mm
@@ -233,7 +218,7 @@ def test_motion_blurs_along_the_path_by_its_length(speed, top_rig):
 
 @pytest.mark.parametrize("bit_depth", [8, 10, 12, 16])
 def test_noise_variance_is_a_straight_line_in_grey(bit_depth, rng):
-    sensor = SensorSettings(gain_e_per_dn=50.0, read_noise_dn=0.8)
+    sensor = description.SensorSettings(gain_e_per_dn=50.0, read_noise_dn=0.8)
     grey = np.repeat(np.array([20.0, 85.0, 140.0, 190.0], np.float32), 40_000).reshape(4, 200, 200)
     levels = digitise(grey, sensor, bit_depth, rng)
     assert levels.dtype == (np.uint8 if bit_depth == 8 else np.uint16)
@@ -250,13 +235,13 @@ def test_noise_resembles_the_reference_recording(shared_data):
     frames = [cv2.imread(str(shared_data / f"rec_a/left/{i:06d}.png"), cv2.IMREAD_GRAYSCALE) for i in range(60)]
     table = np.stack(frames)[:, :60, :].astype(float)  # upper strip: the disc does not get there
     measured, mean = table.var(axis=0, ddof=1).mean(), table.mean()
-    defaults = SensorSettings()
+    defaults = description.SensorSettings()
     predicted = defaults.read_noise_dn**2 + mean / defaults.gain_e_per_dn + 1 / 12
     assert measured == pytest.approx(predicted, rel=0.02)  # 1.8 million values; the mean varies by +-3 grey levels
 
 
 def test_full_well_clips_and_black_level_lifts():
-    sensor = SensorSettings(black_level_dn=10.0)
+    sensor = description.SensorSettings(black_level_dn=10.0)
     levels = digitise(np.array([[0.0, 100.0, 300.0]], np.float32), sensor, 8, None)
     assert_array_equal(levels, [[10, 110, 255]])
 
@@ -267,7 +252,7 @@ def test_vignetting_and_gradient_are_where_the_scene_puts_them(top_rig):
         ABOVE,
         appearance=paper,
         optics=replace(ABOVE.optics, vignetting=0.2),
-        light=LightSettings(gradient_per_m=(2.0, 0.0)),
+        light=description.LightSettings(gradient_per_m=(2.0, 0.0)),
     )
     away = FLAT + AWAY
     image = expected_disc(away, top_rig, MA_2014, scene)[0, 0]
@@ -278,7 +263,10 @@ def test_vignetting_and_gradient_are_where_the_scene_puts_them(top_rig):
 
 def test_glare_stays_in_the_image_while_the_disc_moves(top_rig):
     glare = replace(
-        ABOVE, light=LightSettings(directed=0.0, glare=(GlareSettings("right", (100.0, 80.0), 10.0, 30.0),))
+        ABOVE,
+        light=description.LightSettings(
+            directed=0.0, glare=(description.GlareSettings("right", (100.0, 80.0), 10.0, 30.0),)
+        ),
     )
     poses = np.stack([FLAT, FLAT + np.array([0.01, 0.005, 0, 0, 0, 0])])
     added = expected_disc(poses, top_rig, MA_2014, glare) - expected_disc(poses, top_rig, MA_2014, ABOVE)
@@ -288,7 +276,7 @@ def test_glare_stays_in_the_image_while_the_disc_moves(top_rig):
 
 
 def test_a_face_turned_to_the_lamp_is_brighter(top_rig):
-    scene = replace(ABOVE, light=LightSettings(directed=0.5, direction=(0.0, 1.0, 1.0)))
+    scene = replace(ABOVE, light=description.LightSettings(directed=0.5, direction=(0.0, 1.0, 1.0)))
     towards, away = FLAT.copy(), FLAT.copy()
     towards[3:5], away[3:5] = (np.pi, 0.3), (0.0, 0.3)  # e3 leans to +j, to -j
     images = expected_disc(np.stack([towards, away]), top_rig, MA_2014, scene)[:, 0]
@@ -297,17 +285,17 @@ def test_a_face_turned_to_the_lamp_is_brighter(top_rig):
 
 
 def test_hot_pixels_stay_where_they_are(top_rig):
-    scene = replace(ABOVE, sensor=SensorSettings(hot_pixels=20, gain_e_per_dn=0.0, read_noise_dn=0.0))
+    scene = replace(ABOVE, sensor=description.SensorSettings(hot_pixels=20, gain_e_per_dn=0.0, read_noise_dn=0.0))
     poses = np.stack([FLAT + AWAY] * 2)  # black table only
     first, second = render_disc(poses, top_rig, MA_2014, scene)[:, 0]
     assert 10 < np.count_nonzero(first) <= 20
     assert_array_equal(first, second)
 
 
-ORDINARY = Scene(
-    cameras=CameraSettings(image_size=(272, 272)),
-    rig=RigSettings(mm_per_px=0.42),
-    board=BoardSettings(square_mm=8.0),
+ORDINARY = description.Scene(
+    cameras=description.CameraSettings(image_size=(272, 272)),
+    rig=description.RigSettings(mm_per_px=0.42),
+    board=description.BoardSettings(square_mm=8.0),
 )
 FLAT_ON_TABLE = np.eye(3), np.array([0.0, 0.0, 3e-3])
 
@@ -321,11 +309,11 @@ def corners_of(imperfections):
 
 @pytest.fixture(scope="module")
 def plain():
-    return corners_of(ImperfectionSettings())
+    return corners_of(description.ImperfectionSettings())
 
 
 def test_a_bowed_and_stretched_board_is_seen_where_its_points_are(plain):
-    seen = corners_of(ImperfectionSettings(board_bow_mm=0.2, board_stretch=2e-3))
+    seen = corners_of(description.ImperfectionSettings(board_bow_mm=0.2, board_stretch=2e-3))
     x, y = np.meshgrid(np.arange(9) * 8e-3, np.arange(6) * 8e-3)
     flat = np.column_stack([x.ravel(), y.ravel(), np.full(54, 3e-3)])
     along = 1.002 * flat[:, 0]
@@ -337,7 +325,7 @@ def test_a_bowed_and_stretched_board_is_seen_where_its_points_are(plain):
 
 
 def test_lens_field_has_its_size_and_moves_the_image_by_it(plain):
-    settings, rig = ImperfectionSettings(lens_field_px=0.2), rig_of(ORDINARY)
+    settings, rig = description.ImperfectionSettings(lens_field_px=0.2), rig_of(ORDINARY)
     camera, pad = rig.left, 3
     straight = corner_rays(camera, pad)
     bent = lens_rays(camera, pad, 0.2, [ORDINARY.seed, 9, 0])
@@ -349,7 +337,7 @@ def test_lens_field_has_its_size_and_moves_the_image_by_it(plain):
 
 
 def test_sensor_pattern_is_fixed_and_has_its_size(rng):
-    settings = ImperfectionSettings(pixel_gain=0.01, column_offset_dn=0.3, response_curve=0.03)
+    settings = description.ImperfectionSettings(pixel_gain=0.01, column_offset_dn=0.3, response_curve=0.03)
     pattern = sensor_pattern(settings, (400, 300), [1, 10, 0])
     even = np.full((300, 400), 127.5, np.float32)
     flat = pattern(even)
@@ -361,19 +349,21 @@ def test_sensor_pattern_is_fixed_and_has_its_size(rng):
 
 def test_off_by_default_and_declared_only_where_exact():
     even = np.full((30, 40), 127.5, np.float32)
-    assert sensor_pattern(ImperfectionSettings(), (40, 30), [1])(even) is even
+    assert sensor_pattern(description.ImperfectionSettings(), (40, 30), [1])(even) is even
     assert lens_rays(rig_of(ORDINARY).left, 3, 0.0, [1]) is corner_rays(rig_of(ORDINARY).left, 3)
-    assert "square_tolerance_mm = 0.0" in recording_toml(Scene())
-    assert "tolerance" not in recording_toml(replace(Scene(), imperfections=ImperfectionSettings(pixel_gain=0.01)))
+    assert "square_tolerance_mm = 0.0" in recording_toml(description.Scene())
+    assert "tolerance" not in recording_toml(
+        replace(description.Scene(), imperfections=description.ImperfectionSettings(pixel_gain=0.01))
+    )
 
 
-SMALL = Scene(
+SMALL = description.Scene(
     name="small",
-    cameras=CameraSettings(image_size=(256, 256), n_frames=4),
-    rig=RigSettings(mm_per_px=0.5),
-    board=BoardSettings(n_views=3),
-    light=LightSettings(directed=0.0),
-    motion=MotionSettings(kind="table", table="motion.csv"),
+    cameras=description.CameraSettings(image_size=(256, 256), n_frames=4),
+    rig=description.RigSettings(mm_per_px=0.5),
+    board=description.BoardSettings(n_views=3),
+    light=description.LightSettings(directed=0.0),
+    motion=description.MotionSettings(kind="table", table="motion.csv"),
 )
 VELOCITY = np.array([0.5, -0.3, 0.0, 10.0, 1.0, -5.0])  # m/s, rad/s
 START = np.array([0.032, 0.020, 0.012, 0.5, 0.3, 0.7])
@@ -421,7 +411,7 @@ def test_recording_round_trip(scene, tmp_path):
         assert file["disc"].attrs["radius"] == truth.disc.radius
         assert_array_equal(file["board/t_world_board"], truth.t_world_board)
         assert_array_equal(read_rig_group(file["rig"]).R_left_world, truth.rig.R_left_world)
-        assert scene_from_tree(tomllib.loads(file.attrs["scene"])).board == scene.board
+        assert description.scene_from_tree(tomllib.loads(file.attrs["scene"])).board == scene.board
     assert_allclose(truth.q, START + truth.time[:, None] * VELOCITY, atol=1e-12)
     assert_allclose(truth.qdot, np.tile(VELOCITY, (4, 1)), atol=1e-9)
     assert_allclose(truth.markers_px, truth.rig.project(markers_world(truth.q, truth.disc)), atol=1e-9)
@@ -444,7 +434,9 @@ def test_board_lies_with_the_side_of_dark_corners_on_the_left(scene, tmp_path):
 
 def test_a_recording_declares_the_disc_of_any_scene_as_it_is(tmp_path):
     places = tuple((12.3456789 * np.cos(a), 12.3456789 * np.sin(a)) for a in (0.1, 1.3, 3.1, 4.4))
-    scene = replace(SMALL, name='the "third"\\\n run', markers=MarkerSettings(diameter_mm=5.123456, centres_mm=places))
+    scene = replace(
+        SMALL, name='the "third"\\\n run', markers=description.MarkerSettings(diameter_mm=5.123456, centres_mm=places)
+    )
     (tmp_path / "recording.toml").write_text(recording_toml(scene))
     recording = read_recording(tmp_path)
     assert recording.name == scene.name
@@ -526,7 +518,7 @@ def test_missing_frames_have_no_file(scene, tmp_path):
 
 @pytest.mark.statistical
 def test_frame_shows_the_pose_of_its_mid_exposure(scene, tmp_path):
-    quiet = replace(scene, sensor=SensorSettings(gain_e_per_dn=0.0, read_noise_dn=0.0))
+    quiet = replace(scene, sensor=description.SensorSettings(gain_e_per_dn=0.0, read_noise_dn=0.0))
     blurred = replace(quiet, cameras=replace(quiet.cameras, exposure_s=8e-4))
     truth = write_recording(tmp_path / "r", blurred)
     still = render_disc(truth.q, truth.rig, truth.disc, quiet)
@@ -578,7 +570,7 @@ def test_a_render_that_fails_leaves_nothing_behind_and_no_truth_is_replaced(scen
 def test_mistakes_in_a_scene_are_named(text, message, tmp_path):
     (tmp_path / "scene.toml").write_text(text)
     with pytest.raises(SceneError, match=message):
-        motion_of(load_scene(tmp_path / "scene.toml"))
+        motion_of(description.load_scene(tmp_path / "scene.toml"))
 
 
 def test_a_lens_that_folds_is_refused():
@@ -588,7 +580,7 @@ def test_a_lens_that_folds_is_refused():
 
 
 def test_sample_clip_is_what_its_scene_renders(sample_clip):
-    scene = load_scene(SCENE)
+    scene = description.load_scene(SCENE)
     with h5py.File(sample_clip.parent / "truth" / "clip.h5") as file:
         time, q, markers_px = (file[name][()] for name in ("time", "q", "markers_px"))
     rig, disc = rig_of(scene), scene.declared_disc

@@ -8,17 +8,9 @@ import pytest
 from disctrack.faults.catalogue import faults_of
 from disctrack.recording.declaration import read_recording
 from disctrack.synthetic.description import Scene
-from disctrack.validate.planted_faults import (
-    FaultOutcome,
-    Ground,
-    fault_cases,
-    faults_validation,
-    plant_and_run,
-    plantings,
-    untouched,
-)
+from disctrack.validate import planted_faults
 
-WELL = FaultOutcome("rendered", "turned", 3e-4, "rad", 2.0, "camera moved, doubt", True, 3)
+WELL = planted_faults.FaultOutcome("rendered", "turned", 3e-4, "rad", 2.0, "camera moved, doubt", True, 3)
 # off by more than the sigmas, and not named: too small to be seen
 UNNAMED = {("pattern_offset", 3e-6)}
 
@@ -34,7 +26,7 @@ UNNAMED = {("pattern_offset", 3e-6)}
     ],
 )
 def test_a_pose_beyond_its_sigmas_that_nothing_names_is_a_complaint(outcome, said):
-    (complaint,) = faults_validation([outcome]).complaints or ("",)
+    (complaint,) = planted_faults.faults_validation([outcome]).complaints or ("",)
     assert said in complaint
     assert bool(said) == bool(complaint)
 
@@ -42,7 +34,7 @@ def test_a_pose_beyond_its_sigmas_that_nothing_names_is_a_complaint(outcome, sai
 def test_the_table_tells_from_which_size_on_a_fault_is_named_and_what_was_missed_below():
     small, large = replace(WELL, size=1e-5, worst=1.2, named=False), replace(WELL, size=1e-3, worst=90.0)
     filmed = [replace(one, make="clip", named=not one.named) for one in (small, WELL, large)]
-    lines = faults_validation([large, small, WELL, *filmed]).markdown().splitlines()
+    lines = planted_faults.faults_validation([large, small, WELL, *filmed]).markdown().splitlines()
     assert "| turned | rad | 0.0003 | 1.2 | - | 90 |" in lines
 
 
@@ -50,29 +42,31 @@ def test_every_fault_of_the_catalogue_that_a_run_can_show_is_planted(sample_clip
     disc = read_recording(sample_clip).disc
     kinds = {fault.name.removeprefix("right_") for fault in faults_of(disc) if fault.named_by}
     kinds = {name for name in kinds if not name.startswith(("left_", "misprint"))} | {"misprint_0"}
-    filmed = Ground(sample_clip, tmp_path, None, np.empty((0, 6)))
-    rendered = {name.removeprefix("right_") for name in plantings(replace(filmed, scene=Scene()))}
-    declared = {name.removeprefix("left_") for name in plantings(filmed)}
+    filmed = planted_faults.Ground(sample_clip, tmp_path, None, np.empty((0, 6)))
+    rendered = {name.removeprefix("right_") for name in planted_faults.plantings(replace(filmed, scene=Scene()))}
+    declared = {name.removeprefix("left_") for name in planted_faults.plantings(filmed)}
     assert kinds <= rendered
     assert kinds - declared == {"time_offset", "exposure_blur"}, "what is no matter of rig, disc, dots or rate"
-    assert {fault for _, fault, _ in fault_cases([filmed], ["radius"])} == {"radius"}
+    assert {fault for _, fault, _ in planted_faults.fault_cases([filmed], ["radius"])} == {"radius"}
 
 
 @pytest.fixture(scope="module")
 def grounds(sample_clip, tmp_path_factory):
-    return list(untouched(tmp_path_factory.mktemp("planted"), [sample_clip]))
+    return list(planted_faults.untouched(tmp_path_factory.mktemp("planted"), [sample_clip]))
 
 
 @pytest.mark.statistical
 def test_some_faults_of_one_size_are_named_or_within_the_sigmas(grounds):
     names = ("left_turned", "right_shifted", "pattern_offset", "radius", "pairs lost by both", "negative views")
-    outcomes = [plant_and_run(case) for case in fault_cases(grounds, names, slice(-1, None))]
-    assert faults_validation(outcomes).complaints == ()
+    outcomes = [
+        planted_faults.plant_and_run(case) for case in planted_faults.fault_cases(grounds, names, slice(-1, None))
+    ]
+    assert planted_faults.faults_validation(outcomes).complaints == ()
     assert {outcome.fault for outcome in outcomes} == set(names)
     assert sum(outcome.named for outcome in outcomes) >= len(outcomes) - 1
 
 
 @pytest.mark.slow
 def test_no_fault_of_any_size_is_silently_wrong_but_those_below_a_known_limit(grounds):
-    outcomes = [plant_and_run(case) for case in fault_cases(grounds)]
+    outcomes = [planted_faults.plant_and_run(case) for case in planted_faults.fault_cases(grounds)]
     assert {(o.fault, round(o.size, 9)) for o in outcomes if o.complaint} <= UNNAMED

@@ -11,35 +11,21 @@ from disctrack.frames import rotation_from_euler
 from disctrack.recording.declaration import read_recording
 from disctrack.synthetic.cameras import rig_of
 from disctrack.trajectory import part
+from disctrack.validate import rendered
 from disctrack.validate.accuracy import accuracy_validation, complaints, imperfect_validation, sum_up, verdict
 from disctrack.validate.errors import compare, joined, noise_consistency
-from disctrack.validate.rendered import (
-    FINAL,
-    ROLLING,
-    STATIC,
-    STRATA_DEG,
-    at_rest,
-    cameras_in_sight,
-    ideal_cases,
-    imperfect_case,
-    locate,
-    render,
-    render_and_measure,
-    scene_of,
-    static_poses,
-)
 from disctrack.validate.tables import write_into, write_validation
 
 GOAL_HEIGHT, GOAL_TILT = 5e-6, np.radians(5e-3)  # [m, rad] of the mean error in an imperfect laboratory
 
 
 def ideal(scene, *counts):
-    return [render_and_measure(case) for case in ideal_cases(scene, *counts)]
+    return [rendered.render_and_measure(case) for case in rendered.ideal_cases(scene, *counts)]
 
 
 @pytest.fixture(scope="module")
 def outcomes():
-    return ideal(scene_of(2014, quick=True), 24, 16)
+    return ideal(rendered.scene_of(2014, quick=True), 24, 16)
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +36,7 @@ def accuracy(outcomes):
 @pytest.mark.statistical
 def test_own_calibration_keeps_the_papers_claim_and_finds_every_pose_without_a_prior(accuracy):
     """With a quarter of the paper's pixels; for all but psi and phi, which 1/sin(theta) spoils."""
-    assert set(accuracy.rows) == {STATIC, ROLLING, FINAL}
+    assert set(accuracy.rows) == {rendered.STATIC, rendered.ROLLING, rendered.FINAL}
     assert complaints(accuracy) == ()
     two, one, none = accuracy.sights
     assert (two.found, two.gross) == (two.n, 0)
@@ -82,8 +68,8 @@ def test_a_biased_calibration_turns_the_verdict(outcomes):
 @pytest.mark.statistical
 def test_a_camera_turned_since_the_calibration_is_noticed_by_the_measurement_and_by_the_truth():
     turned = Faults(left=CameraFault(rotation_deg=(0.0, np.degrees(1e-3), 0.0)))
-    static, *_ = ideal_cases(replace(scene_of(2014, quick=True), faults=turned), 24, 1)
-    found = accuracy_validation([render_and_measure(static)])
+    static, *_ = rendered.ideal_cases(replace(rendered.scene_of(2014, quick=True), faults=turned), 24, 1)
+    found = accuracy_validation([rendered.render_and_measure(static)])
     assert "does not hold" in found.headline or "holds in part" in found.headline
     assert found.complaints
     assert found.remarks
@@ -124,12 +110,12 @@ def test_command_prints_the_verdict_and_tells_of_failed_checks(outcomes, tmp_pat
 
 
 def test_static_poses_cover_the_range_and_stand_on_the_table(rng):
-    scene = scene_of(1, quick=True)
+    scene = rendered.scene_of(1, quick=True)
     rig, disc = rig_of(scene), scene.declared_disc
-    q = static_poses(40, scene, rng)
+    q = rendered.static_poses(40, scene, rng)
     theta = np.degrees(q[:, 4])
-    counts = [np.sum((theta >= low) & (theta < high)) for low, high in STRATA_DEG]
-    assert counts == [5] * len(STRATA_DEG)
+    counts = [np.sum((theta >= low) & (theta < high)) for low, high in rendered.STRATA_DEG]
+    assert counts == [5] * len(rendered.STRATA_DEG)
     angle = np.linspace(0, 2 * np.pi, 3601)
     ring = disc.radius * np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
     rims = np.concatenate([ring + np.array([0, 0, z]) for z in (-disc.half_thickness, disc.half_thickness)])
@@ -137,33 +123,33 @@ def test_static_poses_cover_the_range_and_stand_on_the_table(rng):
     lowest = (rims @ np.swapaxes(R, 1, 2) + q[:, None, :3])[..., 2].min(axis=1)
     # 0.1 deg between the points of the ring: r (1 - cos 0.05 deg) = 14 nm
     np.testing.assert_allclose(lowest, 0, atol=2e-8)
-    assert set(cameras_in_sight(q, rig, disc)) >= {1, 2}
+    assert set(rendered.cameras_in_sight(q, rig, disc)) >= {1, 2}
 
 
 def seen_by_both(n, scene, rng):
     """n poses that both cameras see, from 3 to 30 deg of nutation, and one view of the board."""
     scene = replace(scene, board=replace(scene.board, n_views=1))
     rig, disc = rig_of(scene), scene.declared_disc
-    q = static_poses(64, scene, rng)
-    seen = (cameras_in_sight(q, rig, disc) == 2) & (np.radians(3) < q[:, 4]) & (q[:, 4] < np.radians(30))
-    return at_rest(scene, rng.choice(q[seen], n, replace=False))
+    q = rendered.static_poses(64, scene, rng)
+    seen = (rendered.cameras_in_sight(q, rig, disc) == 2) & (np.radians(3) < q[:, 4]) & (q[:, 4] < np.radians(30))
+    return rendered.at_rest(scene, rng.choice(q[seen], n, replace=False))
 
 
 def located(scene, folder):
     """What is found through the true cameras, with the truth."""
-    truth = render(folder / "recording", scene)
-    return locate(read_recording(folder / "recording"), truth.rig), truth
+    truth = rendered.render(folder / "recording", scene)
+    return rendered.locate(read_recording(folder / "recording"), truth.rig), truth
 
 
 def test_poses_at_rest_are_each_found_without_the_one_before(rng, tmp_path):
-    tracking, _ = located(seen_by_both(4, scene_of(1, quick=True), rng), tmp_path)
+    tracking, _ = located(seen_by_both(4, rendered.scene_of(1, quick=True), rng), tmp_path)
     assert tracking.acquisitions == 4
 
 
 @pytest.mark.parametrize(("bits", "read_noise"), [(8, 16.0), (12, 3.0), (16, 0.8)])
 def test_noisy_sensors_and_more_bits_are_measured_from_the_first_pair_on(bits, read_noise, rng, tmp_path):
     """The noise is measured before dots are judged by it: what is large in grey values is not a misfit."""
-    scene = scene_of(2, quick=True)
+    scene = rendered.scene_of(2, quick=True)
     cameras, sensor = replace(scene.cameras, bit_depth=bits), replace(scene.sensor, read_noise_dn=read_noise)
     tracking, truth = located(seen_by_both(3, replace(scene, cameras=cameras, sensor=sensor), rng), tmp_path)
     found = compare(part(tracking.trajectory, slice(None, None, 2)), truth.q)
@@ -178,7 +164,10 @@ def test_noisy_sensors_and_more_bits_are_measured_from_the_first_pair_on(bits, r
 
 @pytest.mark.slow
 def test_height_and_tilt_in_an_imperfect_laboratory_and_what_is_stated_of_them():
-    outcomes = [render_and_measure(imperfect_case(scene_of(seed, quick=True), 60)) for seed in (31, 32)]
+    outcomes = [
+        rendered.render_and_measure(rendered.imperfect_case(rendered.scene_of(seed, quick=True), 60))
+        for seed in (31, 32)
+    ]
     assert imperfect_validation(outcomes).markdown().count("+-") == 13
     pulls = []
     for outcome in outcomes:
