@@ -169,17 +169,12 @@ def rates(analysis: Analysis) -> Iterator[Drawn]:
 
 def energy(analysis: Analysis) -> Iterator[Drawn]:
     """Paper's figure 13; where the energy sits, and the power lost."""
-    time, found = analysis.motion.time, analysis.energy
+    time = analysis.motion.time
     level = Curve(time, 1e3 * analysis.series("adiabatic").value, RED, "3/2 m g r sin θ", "--")
     total = _series(analysis, "total", BLUE, "mechanical energy", 1e3)
     figure = chart(TIME, ("energy (mJ)", [total, level]))
     figure.axes[0].set_ylim(bottom=0)
-    caption = (
-        f"Mechanical energy, zero at rest (z = h). Lost in the recording: "
-        f"{measured(found.loss, found.loss_sigma, 'J')} (noise) ± {measured(found.loss_sigma_calibration, unit='J')} "
-        "(calibration)."
-    )
-    yield Drawn("13_energy", "Energy", caption, figure)
+    yield Drawn("13_energy", "Energy", "Mechanical energy, zero at rest (z = h).", figure)
     parts = (
         ("translation", AMBER, "translation"),
         ("rotation_1", GREEN, "rotation about e₁"),
@@ -218,9 +213,5 @@ def power_laws(analysis: Analysis) -> Iterator[Drawn]:
             curves.append(Curve(ends, below + slope * (ends - ends.mean()), MUTED, f"{slope:.3f}", style))
         figure = chart("ln (t_f - t), t in s", (label, curves), size=SQUARE)
         figure.axes[0].invert_xaxis()
-        caption = (
-            f"Exponent {exponent} (95 %: ± {measured(exponent.half)}) from {laws.window[0]:.3f} to "
-            f"{laws.window[1]:.3f} s before t_f = {measured(laws.t_f, laws.t_f_sigma)} "
-            f"s. Grey: {'; '.join(name for name, _ in MODEL_EXPONENTS)}."
-        )
+        caption = f"Grey: {'; '.join(name for name, _ in MODEL_EXPONENTS)}."
         yield Drawn(name, f"Power law of {title}", caption, figure)

@@ -21,7 +21,7 @@ from disctrack.findings import carried
 from disctrack.report.blocks import Markup, Report, Text
 from disctrack.report.html import page
 from disctrack.report.palette import RED
-from disctrack.trajectory import FrameStatus
+from disctrack.trajectory import FrameStatus, Trajectory
 
 Drawn = Callable[[int], NDArray]  # frame -> both images with the fit on them, (height, 2 width, 3) BGR
 
@@ -56,16 +56,17 @@ def motion_html(analysis: Analysis, name: str, drawn: Drawn | None = None) -> st
         "part to zoom, double click for the whole.</p></section>"
         f'<script type="application/json" id="motion-data">{data}</script><script>{script}</script>'
     )
-    report = Report(
-        f"{name}: the motion", "", _said(analysis), carried(analysis.trajectory.findings), blocks=[Text(body)]
-    )
+    trajectory = analysis.trajectory
+    every = f"; every {_stride(trajectory)}th frame is shown" * (_stride(trajectory) > 1)
+    said = f"{', '.join(map(' '.join, trajectory.facts().items()))}{every}"
+    report = Report(f"{name}: the motion", "", said, carried(trajectory.findings), blocks=[Text(body)])
     return page(report, {}, head=f"<style>{_STYLE}</style>")
 
 
 def page_data(analysis: Analysis, drawn: Drawn | None = None) -> dict[str, Any]:
     """What the page draws, of JSON's types; lengths in mm, angles in degrees, None where nothing is known."""
     trajectory = analysis.trajectory
-    rows = np.arange(0, len(trajectory), max(1, -(-len(trajectory) // MOST_ROWS)))
+    rows = np.arange(0, len(trajectory), _stride(trajectory))
     energy, psidot = analysis.series("total"), analysis.series("psidot")
     contact = [1e3 * analysis.series(f"contact_{axis}").value[rows] for axis in "xy"]
     q, disc = trajectory.q[rows], trajectory.disc
@@ -104,14 +105,8 @@ def page_data(analysis: Analysis, drawn: Drawn | None = None) -> dict[str, Any]:
     }
 
 
-def _said(analysis: Analysis) -> str:
-    trajectory = analysis.trajectory
-    shown = max(1, -(-len(trajectory) // MOST_ROWS))
-    every = "" if shown == 1 else f" Every {shown}th frame is shown."
-    return (
-        f"{int(trajectory.measured.sum())} of {len(trajectory)} frames have a pose, at {trajectory.frame_rate:g} pairs "
-        f"per second.{every}"
-    )
+def _stride(trajectory: Trajectory) -> int:
+    return max(1, -(-len(trajectory) // MOST_ROWS))
 
 
 def _in_words(q: Array) -> str:

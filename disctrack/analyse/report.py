@@ -12,7 +12,7 @@ from disctrack.analyse.analysis import Analysis
 from disctrack.analyse.power_laws import MODEL_EXPONENTS, Exponent, PowerLaws
 from disctrack.findings import Finding
 from disctrack.numbers import Measured, measured, unit_text
-from disctrack.report.blocks import Cell, Figures, Listing, Report, Section, Text
+from disctrack.report.blocks import Cell, Facts, Figures, Listing, Report, Section, Text
 from disctrack.trajectory import FrameStatus
 from disctrack.trajectory.file import Provenance
 
@@ -52,7 +52,7 @@ def report_of(
             ("exponent of θ (95 %)", _at_95(laws.n_theta) if laws.determined else "not determined"),
         ],
         blocks=[
-            Text(_what_was_filmed(analysis)),
+            Facts([*(trajectory.facts() | trajectory.disc.facts()).items()]),
             Section("Quality of the measurement", [_status_table(analysis)]),
             section("Motion", ("04", "05", "06", "07", "10", "11")),
             section("Contact", ("08", "09")),
@@ -80,17 +80,6 @@ def _accuracy(analysis: Analysis) -> str:
     velocity = measured(float(np.nanmedian(sigma[:, 6:9])), unit="m/s")
     turn = measured(float(np.nanmedian(sigma[:, 9:12])), unit="rad/s")
     return f"σ of velocity {velocity} and {turn} (noise, median); of the lab frame {_lab_frame(analysis)}"
-
-
-def _what_was_filmed(analysis: Analysis) -> str:
-    trajectory = analysis.trajectory
-    theta, disc = np.degrees(analysis.motion.euler[analysis.motion.known, 1]), trajectory.disc
-    return (
-        f"A disc of radius {1e3 * disc.radius:g} mm, thickness {2e3 * disc.half_thickness:g} mm and mass "
-        f"{1e3 * disc.mass:g} g was filmed by two cameras at {trajectory.frame_rate:g} pairs per second. "
-        f"{int(trajectory.measured.sum())} of {len(trajectory)} frames ({np.ptp(trajectory.time):.3f} s) have a pose. "
-        + (f"The nutation goes from {theta[0]:.2f} to {theta[-1]:.2f} degrees." if theta.size else "")
-    )
 
 
 def _onset(analysis: Analysis) -> str:

@@ -4,27 +4,17 @@ Public verbs in the order of use: `Model`, `State` (or `steady_precession`, `str
 `sensitivities`. Effects are in `CATALOGUE`.
 """
 
-from disctrack.rolling.effects.base import CATALOGUE, Effect, EffectParameter
-from disctrack.rolling.model import Model, effects_from_tables
-from disctrack.rolling.motion import EndReason, Motion
-from disctrack.rolling.records import Regime
-from disctrack.rolling.sensitivities import prepare, sensitivities
-from disctrack.rolling.simulate import simulate
-from disctrack.rolling.state import State, steady_precession, struck_disc
-
-__all__ = [
-    "CATALOGUE",
-    "Effect",
-    "EffectParameter",
-    "EndReason",
-    "Model",
-    "Motion",
-    "Regime",
-    "State",
-    "effects_from_tables",
-    "prepare",
-    "sensitivities",
-    "simulate",
-    "steady_precession",
-    "struck_disc",
-]
+from disctrack.rolling.effects.base import CATALOGUE as CATALOGUE
+from disctrack.rolling.effects.base import Effect as Effect
+from disctrack.rolling.effects.base import EffectParameter as EffectParameter
+from disctrack.rolling.model import Model as Model
+from disctrack.rolling.model import effects_from_tables as effects_from_tables
+from disctrack.rolling.motion import EndReason as EndReason
+from disctrack.rolling.motion import Motion as Motion
+from disctrack.rolling.records import Regime as Regime
+from disctrack.rolling.sensitivities import prepare as prepare
+from disctrack.rolling.sensitivities import sensitivities as sensitivities
+from disctrack.rolling.simulate import simulate as simulate
+from disctrack.rolling.state import State as State
+from disctrack.rolling.state import steady_precession as steady_precession
+from disctrack.rolling.state import struck_disc as struck_disc
