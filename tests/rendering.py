@@ -13,6 +13,7 @@ from disctrack.disc import Disc
 from disctrack.rolling import Model, simulate, steady_precession
 from disctrack.synthetic.description import Scene
 from disctrack.synthetic.images import expected_board_image, expected_disc_image, stages
+from disctrack.synthetic.sensor import digitise
 
 
 def expected_disc(
@@ -43,7 +44,7 @@ def render_disc(
     visible : (n, 2, m) or what broadcasts to it; False: that dot is missing on the paper
     """
     scene = scene or Scene()
-    return _digitised(expected_disc(q, rig, disc, scene, qdot=qdot, visible=visible), rig, scene, rng)
+    return _digitised(expected_disc(q, rig, disc, scene, qdot=qdot, visible=visible), scene, rng)
 
 
 def render_board(
@@ -58,19 +59,14 @@ def render_board(
     R, t = np.reshape(R_world_board, (-1, 3, 3)), np.reshape(t_world_board, (-1, 3))
     places = zip(R, t, strict=True)
     expected = [[expected_board_image(*place, stage, scene) for stage in stages(rig, scene)] for place in places]
-    return _digitised(expected, rig, scene, rng)
+    return _digitised(expected, scene, rng)
 
 
-def _digitised(expected, rig, scene, rng):
+def _digitised(expected, scene, rng):
     """Each image with noise of its own."""
     noise = iter([None] * (2 * len(expected)) if rng is None else rng.spawn(2 * len(expected)))
-    both = stages(rig, scene)
-    return np.array(
-        [
-            [stage.digitised(grey, scene, next(noise)) for grey, stage in zip(pair, both, strict=True)]
-            for pair in expected
-        ]
-    )
+    depth = scene.cameras.bit_depth
+    return np.array([[digitise(grey, scene.sensor, depth, next(noise)) for grey in pair] for pair in expected])
 
 
 def rolling_disc(rig: StereoRig, disc: Disc, scene: Scene, theta_deg: float, n: int) -> tuple[np.ndarray, np.ndarray]:

@@ -9,7 +9,6 @@ from calibration.kit.arrays import Array
 from calibration.kit.brief import Brief
 from disctrack.analyse.contact import Circle, RollingOnset, locus_circle, rolling_onset
 from disctrack.analyse.derivatives import GROUP_NAMES, MeasuredMotion, differentiate
-from disctrack.analyse.energy import TOTAL, Energy, energy_of
 from disctrack.analyse.power_laws import (
     WINDOW,
     NutationCount,
@@ -18,7 +17,7 @@ from disctrack.analyse.power_laws import (
     fit_power_laws,
     power_law_end,
 )
-from disctrack.analyse.quantities import ALL, COLUMN, DerivedSeries, propagate
+from disctrack.analyse.quantities import ALL, COLUMN, TOTAL, DerivedSeries, Energy, energy_of, propagate
 from disctrack.errors import AnalysisError
 from disctrack.findings import Finding, Kind, Severity, of_kind
 from disctrack.numbers import measured

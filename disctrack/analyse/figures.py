@@ -195,18 +195,20 @@ def power_laws(analysis: Analysis) -> Iterator[Drawn]:
     left, ends = laws.t_f - analysis.motion.time, np.log(np.array(laws.window))
     total, theta, psidot = analysis.series("total").value, analysis.motion.euler[:, 1], analysis.series("psidot").value
     drawn = (
-        ("14_energy_law", "the energy", total, laws.n_energy, laws.prefactors[2], 1.0, "ln E, E in J"),
-        ("15_nutation_law", "the nutation", theta, laws.n_theta, laws.prefactors[0], 1.0, "ln θ, θ in rad"),
-        ("16_precession_law", "the precession rate", psidot, laws.n_psidot, laws.prefactors[1], -0.5, "ln ψ̇, rad/s"),
+        ("14_energy_law", "the energy", total, laws.n_energy, 1.0, "ln E, E in J"),
+        ("15_nutation_law", "the nutation", theta, laws.n_theta, 1.0, "ln θ, θ in rad"),
+        ("16_precession_law", "the precession rate", psidot, laws.n_psidot, -0.5, "ln ψ̇, rad/s"),
     )  # fmt: skip
-    for name, title, value, exponent, prefactor, of_theta, label in drawn:
+    for name, title, value, exponent, of_theta, label in drawn:
         with np.errstate(invalid="ignore"):
             shown = (left > 0) & (value > 0)
         if not np.isfinite(exponent.value) or shown.sum() < 2:
             continue
-        line = np.log(prefactor) + exponent.value * ends
+        ln_left, ln_value = np.log(left[shown]), np.log(value[shown])
+        fitted = (ends.min() <= ln_left) & (ln_left <= ends.max())
+        line = np.mean((ln_value - exponent.value * ln_left)[fitted]) + exponent.value * ends
         said = f"fit, {measured(exponent.value, exponent.half)} (95 %)"
-        curves = [Curve(np.log(left[shown]), np.log(value[shown]), BLUE, "measured", "."), Curve(ends, line, RED, said)]
+        curves = [Curve(ln_left, ln_value, BLUE, "measured", "."), Curve(ends, line, RED, said)]
         for (_, n), style in zip(MODEL_EXPONENTS, (":", "--", "-.", "-"), strict=True):
             slope = of_theta * n
             below = line.mean() - 0.35 * np.sign(of_theta)

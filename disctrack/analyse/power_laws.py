@@ -79,7 +79,6 @@ class PowerLaws(Outline):
     n_psidot: Exponent = Exponent()
     n_energy: Exponent = Exponent()
     n_theta_per_t_f: float = NAN  # [1/s] change of n_theta for a given change of t_f
-    prefactors: tuple[float, float, float] = (NAN,) * 3  # theta [rad], psidot [rad/s], energy [J] at 1 s before t_f
 
     @property
     def determined(self) -> bool:
@@ -247,12 +246,11 @@ def _judged(fit: _Fit, ln_energy: Array) -> PowerLaws:
     def exponent(value: float, sigma: float) -> Exponent:
         return Exponent(float(value), float(sigma), half=float(quantile * sigma))
 
-    of_energy, energy_at_1s = Exponent(), NAN
+    of_energy = Exponent()
     if np.isfinite(ln_energy).all():
         found, left = fit.linear(ln_energy)
         own = _clustered(fit.design()[None], left, fit.period)[1, 1]
         of_energy = exponent(found[1, 0], np.sqrt(own + (_per_t_f(fit, ln_energy) * t_f_sigma) ** 2))
-        energy_at_1s = float(np.exp(found[0, 0]))
     return PowerLaws(
         "",
         (longest, shortest),
@@ -263,7 +261,6 @@ def _judged(fit: _Fit, ln_energy: Array) -> PowerLaws:
         exponent(linear[1, 1], sigma[1, 1]),
         of_energy,
         _per_t_f(fit, fit.data[:1]),
-        (float(np.exp(linear[0, 0])), float(np.exp(linear[0, 1])), energy_at_1s),
     )
 
 

@@ -43,7 +43,6 @@ def report_of(
         _accuracy(analysis),
         [*findings, *analysis.findings],
         facts=[
-            ("rolls without slip", _onset(analysis)),
             (
                 "energy lost (± 1 σ)",
                 Measured(energy.loss, np.hypot(energy.loss_sigma, energy.loss_sigma_calibration), "J"),
@@ -80,15 +79,6 @@ def _accuracy(analysis: Analysis) -> str:
     velocity = measured(float(np.nanmedian(sigma[:, 6:9])), unit="m/s")
     turn = measured(float(np.nanmedian(sigma[:, 9:12])), unit="rad/s")
     return f"σ of velocity {velocity} and {turn} (noise, median); of the lab frame {_lab_frame(analysis)}"
-
-
-def _onset(analysis: Analysis) -> str:
-    onset = analysis.onset
-    if not np.isfinite(onset.time):
-        return "not reached" if np.isfinite(onset.probability) else "not known"
-    if onset.time == analysis.motion.time[analysis.motion.known][0]:
-        return "from the start"
-    return f"from {onset.time:.4f} s"
 
 
 def _lab_frame(analysis: Analysis) -> str:

@@ -6,8 +6,7 @@ import numpy as np
 
 from calibration.kit.arrays import Array
 from disctrack.analyse.derivatives import K, differentiate
-from disctrack.analyse.energy import energy_of
-from disctrack.analyse.quantities import COLUMN, from_to, propagate
+from disctrack.analyse.quantities import COLUMN, energy_of, from_to, propagate
 from disctrack.diagnosis.answer import DiscDiagnosis
 from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.diagnosis.errors import HALF_WINDOW, Ahead, energy_balance, free_run, simulated

@@ -236,14 +236,6 @@ def _inertia_rows(body: Record, s: complex, c: complex) -> tuple[Vector, Vector,
 
 
 @exact_part
-def _speed_of_friction(body: Record, slip: Vector) -> complex:
-    """Slip over F_t / F_z: |slip| / mu with Coulomb's friction, c on a film."""
-    if body.inverse_friction == 0.0:
-        return body.creep
-    return body.inverse_friction * np.sqrt(_dot(slip, slip))
-
-
-@exact_part
 def _accelerations(regime: int, y: State, body: Record, now: Record, at: Contact) -> None:
     """Writes contact force, acceleration of O and angular acceleration into the record."""
     s, c, m = now.sin_theta, now.cos_theta, body.mass
@@ -281,7 +273,10 @@ def _accelerations(regime: int, y: State, body: Record, now: Record, at: Contact
         if regime == SLIPPING:
             slip_z = -(now.slip_n * now.normal_n + now.slip_m * now.normal_m) / now.normal_z
             slip = _nodal(now.slip_n, now.slip_m, slip_z, s, c)
-            d = _add(k, _scale(-1.0 / _speed_of_friction(body, slip), slip))
+            speed = body.creep  # over F_t / F_z: on a film, and with Coulomb's friction
+            if body.inverse_friction != 0.0:
+                speed = body.inverse_friction * np.sqrt(_dot(slip, slip))
+            d = _add(k, _scale(-1.0 / speed, slip))
             f0_z = f0_z - m * _dot(k_rate, slip)
             B = _add(_cross(D, d), L)
             J0, J1, J2 = _add(J0, _scale(B[0], Dk)), _add(J1, _scale(B[1], Dk)), _add(J2, _scale(B[2], Dk))
@@ -385,36 +380,30 @@ def _course(
 
 
 @exact_part
-def _course_of_load(t: complex, y: State, table: Addresses, body: Record, now: Record) -> Vector:
-    """F_z on the rigid table and its first two derivatives by time; zeros where the table does not give way."""
-    nothing = 0.0 * y[0]
-    if body.compliance == 0.0 or table[0] == FLYING:
-        return nothing, nothing, nothing
+def _giving_way(t: complex, y: State, table: Addresses, body: Record, now: Record) -> tuple[complex, Vector, Vector]:
+    """By how much the table is moved where it gives way to the load, and the contact creeps.
+
+    Its height; its velocity and its acceleration along i, j and upwards: zeros where neither is, or the disc flies.
+    """
+    regime, sinks, nothing = table[0], body.compliance, 0.0 * y[0]
+    creep = body.creep if regime == ROLLING else nothing
     forced = (nothing, nothing, nothing, nothing, nothing, nothing, nothing)
-    if table[0] == SLIPPING and body.inverse_friction != 0.0:
+    if regime == FLYING or (sinks == 0.0 and creep == 0.0):
+        return nothing, (nothing, nothing, nothing), (nothing, nothing, nothing)
+    if regime == SLIPPING and body.inverse_friction != 0.0:
         # slip that creeps follows its force at once, and turns any way within LOAD_STEP: its direction is held then
-        _kinematics(table[0], t, y, body, now)
+        _kinematics(regime, t, y, body, now)
         slow = 3.0 * LOAD_STEP * now.gravity / body.inverse_friction
         speed2, slow2 = now.slip_n * now.slip_n + now.slip_m * now.slip_m, slow * slow
         share = slow2 * slow2 / (slow2 * slow2 + speed2 * speed2)
         forced = (nothing, nothing, nothing, nothing, now.slip_n, now.slip_m, share)
-    load, rise, bend = _course(t, y, forced, table, body, now)
-    return load[0], rise[0], bend[0]
-
-
-@exact_part
-def _creeping(
-    t: complex, y: State, table: Addresses, body: Record, now: Record
-) -> tuple[complex, complex, complex, complex]:
-    """Velocity and acceleration along i and j of a contact that creeps; zeros where it does not, or slips."""
-    nothing, c = 0.0 * y[0], body.creep
-    pull, forced = (nothing, nothing, nothing), (nothing, nothing, nothing, nothing, nothing, nothing, nothing)
-    if c != 0.0 and table[0] == ROLLING:
+    pull, rise, bend = _course(t, y, forced, table, body, now)
+    for _ in range(CREEP_PASSES - 1 if creep != 0.0 else 0):
         # the force that accelerates what creeps is part of the force by which it creeps
-        for _ in range(CREEP_PASSES):
-            pull, rise, bend = _course(t, y, forced, table, body, now)
-            forced = (-c * rise[1], -c * rise[2], -c * bend[1], -c * bend[2], nothing, nothing, nothing)
-    return -c * pull[1], -c * pull[2], forced[0], forced[1]
+        forced = (-creep * rise[1], -creep * rise[2], -creep * bend[1], -creep * bend[2], nothing, nothing, nothing)
+        pull, rise, bend = _course(t, y, forced, table, body, now)
+    velocity = (-creep * pull[1], -creep * pull[2], -sinks * rise[0])
+    return -sinks * pull[0], velocity, (-creep * rise[1], -creep * rise[2], -sinks * bend[0])
 
 
 @exact_part
@@ -452,17 +441,14 @@ def _margins(regime: int, body: Record, now: Record, at: Contact) -> tuple[compl
 def rates(t: Numbers, y: Numbers, out: Numbers, table: Addresses, body: Record, now: Record) -> None:
     """Time derivative of the state, then the margins; fills the record on the way."""
     regime, state = table[0], _state(table[0], y)
-    load = _course_of_load(t[0], state, table, body, now)
-    v_x, v_y, a_x, a_y = _creeping(t[0], state, table, body, now)
+    sunk, (v_x, v_y, v_z), (a_x, a_y, a_z) = _giving_way(t[0], state, table, body, now)
     at = _kinematics(regime, t[0], state, body, now)
     _apply_laws(table, now)
     turning = _moving(state, body, now, at)
     v_x, v_y, a_x, a_y = v_x + turning[0], v_y + turning[1], a_x + turning[2], a_y + turning[3]
-    now.table_vx, now.table_vy = now.table_vx + v_x, now.table_vy + v_y
-    now.table_ax, now.table_ay = now.table_ax + a_x, now.table_ay + a_y
-    now.table_z -= body.compliance * load[0]
-    now.table_vz -= body.compliance * load[1]
-    now.table_az -= body.compliance * load[2]
+    now.table_z = now.table_z + sunk
+    now.table_vx, now.table_vy, now.table_vz = now.table_vx + v_x, now.table_vy + v_y, now.table_vz + v_z
+    now.table_ax, now.table_ay, now.table_az = now.table_ax + a_x, now.table_ay + a_y, now.table_az + a_z
     _accelerations(regime, state, body, now, at)
     rate, margins, n = _rates_of(state, now), _margins(regime, body, now, at), 8 + 2 * regime
     for i in range(n):

@@ -7,14 +7,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from calibration.cameras.camera import Camera, StereoRig
-from calibration.kit.arrays import Array, Array32, Image, Mask
+from calibration.kit.arrays import Array, Array32, Mask
 from disctrack.disc import Disc
 from disctrack.faults.keys import Occluder
 from disctrack.frames import CAMERAS, rotation_from_euler
 from disctrack.synthetic import optics, raster
 from disctrack.synthetic.cameras import View, image_of, views_of
 from disctrack.synthetic.description import Scene
-from disctrack.synthetic.sensor import digitise, hot_pixels, sensor_pattern
+from disctrack.synthetic.sensor import hot_pixels, sensor_pattern
 
 PoseOverExposure = Callable[[Array], Array]  # (k,) times [s] from mid exposure -> (k, 6) q
 
@@ -36,12 +36,8 @@ class Stage:
         self.hot = hot_pixels(scene.sensor, size, np.random.default_rng([scene.seed, 5, index]))
 
     def finish(self, irradiance: Array32) -> Array32:
-        """Lamp, vignetting and glare on a blurred image, as a sensor with its pattern has it."""
-        return self.pattern(irradiance * self.factor + self.glare)
-
-    def digitised(self, grey: Array32, scene: Scene, rng: np.random.Generator | None) -> Image:
-        """The image that the camera writes."""
-        return digitise(grey, scene.sensor, scene.cameras.bit_depth, rng, self.hot)
+        """Lamp, vignetting and glare on a blurred image, as a sensor with its pattern and its hot pixels has it."""
+        return self.pattern(irradiance * self.factor + self.glare) + self.hot
 
 
 def stages(rig: StereoRig, scene: Scene) -> tuple[Stage, ...]:

@@ -19,8 +19,9 @@ from disctrack.recording.declaration import KEYS
 from disctrack.recording.declaration_text import declaration_text
 from disctrack.synthetic.cameras import board_poses, rig_after_faults, rig_of
 from disctrack.synthetic.description import ImperfectionSettings, Scene, load_scene
-from disctrack.synthetic.images import Stage, expected_board_image, expected_disc_image, stages
+from disctrack.synthetic.images import expected_board_image, expected_disc_image, stages
 from disctrack.synthetic.motion import SceneMotion, motion_of, true_exposure, true_frame_rate
+from disctrack.synthetic.sensor import digitise
 from disctrack.synthetic.truth import Truth, write_truth
 
 Progress = Callable[[int, int], None]  # images done, images in all
@@ -137,7 +138,7 @@ def _boards(part: Path, scene: Scene, truth: Truth) -> Iterator[Job]:
         for view, (R, t) in enumerate(zip(truth.R_world_board, truth.t_world_board, strict=True)):
             picture = partial(expected_board_image, R, t, stage, scene)
             path = part / "calibration" / stage.name / f"{view:02d}.png"
-            yield path, partial(_exposed, picture, stage, scene, [scene.seed, 3, c, view])
+            yield path, partial(_exposed, picture, scene, [scene.seed, 3, c, view])
 
 
 def _frames(part: Path, scene: Scene, motion: SceneMotion, truth: Truth) -> Iterator[Job]:
@@ -148,16 +149,16 @@ def _frames(part: Path, scene: Scene, motion: SceneMotion, truth: Truth) -> Iter
         for i in sorted(set(range(len(truth.time))) - set(missing)):
             pose = partial(_pose_around, motion, truth.time[i] + c * _delay(scene))
             picture = partial(expected_disc_image, pose, exposure, i, stage, *looks)
-            yield part / stage.name / f"{i:06d}.png", partial(_exposed, picture, stage, scene, [scene.seed, 4, c, i])
+            yield part / stage.name / f"{i:06d}.png", partial(_exposed, picture, scene, [scene.seed, 4, c, i])
 
 
 def _pose_around(motion: SceneMotion, mid: float, dt: Array) -> Array:
     return motion.pose(mid + dt)
 
 
-def _exposed(picture: Callable[[], Array32], stage: Stage, scene: Scene, key: list[int]) -> Image:
+def _exposed(picture: Callable[[], Array32], scene: Scene, key: list[int]) -> Image:
     """Own noise for every image, so that neither order nor number of threads matters."""
-    return stage.digitised(picture(), scene, np.random.default_rng(key))
+    return digitise(picture(), scene.sensor, scene.cameras.bit_depth, np.random.default_rng(key))
 
 
 def _write_all(jobs: list[Job], scene: Scene, progress: Progress | None) -> None:

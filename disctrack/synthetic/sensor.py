@@ -26,19 +26,12 @@ def sensor_pattern(
     return seen
 
 
-def digitise(
-    expected: Array32,
-    settings: SensorSettings,
-    bit_depth: int,
-    rng: np.random.Generator | None,
-    hot: Array32 | None = None,
-) -> Image:
+def digitise(grey: Array32, settings: SensorSettings, bit_depth: int, rng: np.random.Generator | None) -> Image:
     """Image as the camera writes it, from the expected 8-bit grey values (..., height, width).
 
     Electrons are Poisson with mean gain * grey, read noise is Gaussian, the sum is scaled to the bit depth, rounded and
     clipped. Without `rng` the image is quantised only.
     """
-    grey = expected if hot is None else expected + hot
     if rng is not None:
         gain = np.float32(settings.gain_e_per_dn)
         if gain > 0:
@@ -50,10 +43,8 @@ def digitise(
     return np.clip(levels, 0, top).astype(np.uint8 if bit_depth == 8 else np.uint16)
 
 
-def hot_pixels(settings: SensorSettings, image_size: tuple[int, int], rng: np.random.Generator) -> Array32 | None:
-    """Excess grey of the sensor's hot pixels (height, width), the same in every frame; None without any."""
-    if settings.hot_pixels == 0:
-        return None
+def hot_pixels(settings: SensorSettings, image_size: tuple[int, int], rng: np.random.Generator) -> Array32:
+    """Excess grey of the sensor's hot pixels (height, width), the same in every frame."""
     excess = np.zeros((image_size[1], image_size[0]), np.float32)
     where = rng.choice(excess.size, settings.hot_pixels, replace=False)
     excess.flat[where] = rng.exponential(settings.hot_pixel_dn, settings.hot_pixels)

@@ -178,9 +178,7 @@ def _write_model(file: h5py.File, motion: Motion) -> None:
     )
     for effect in model.effects:
         child = group.create_group(effect.name)
-        child.attrs.update({"title": effect.title, "source": effect.source})
-        for parameter in effect.parameters:
-            child.attrs[parameter.name] = effect.values[parameter.name]
-            child.attrs[f"{parameter.name}_unit"] = parameter.unit
+        child.attrs.update({"title": effect.title, "source": effect.source, **effect.values})
+        child.attrs.update({f"{p.name}_unit": p.unit for p in effect.parameters})
     group.attrs["switches_time_s"] = np.array([s.time for s in motion.switches])
     group.attrs["switches_to"] = [s.after.name.lower() for s in motion.switches] or [""]

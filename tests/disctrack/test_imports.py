@@ -19,7 +19,6 @@ PHYSICS = (
     "analyse.derivatives",
     "analyse.quantities",
     "analyse.contact",
-    "analyse.energy",
     "analyse.analysis",
     "track.pose",
 )

@@ -10,8 +10,7 @@ from scipy.stats import norm
 
 from disctrack.analyse.contact import locus_circle, rolling_onset
 from disctrack.analyse.derivatives import SYSTEMATIC_LENGTH, differentiate
-from disctrack.analyse.energy import energy_of
-from disctrack.analyse.quantities import ALL, COLUMN, from_to, propagate, quantities
+from disctrack.analyse.quantities import ALL, COLUMN, energy_of, from_to, propagate, quantities
 from disctrack.disc import MA_2014
 from disctrack.errors import AnalysisError
 from disctrack.frames import rotation_from_vector, vector_from_rotation
