@@ -79,15 +79,15 @@ class MotionState(Outline):
         e1, e2, _ = nodal_axes_world(psi, np.arctan2(s, c))
         return e1, e2, e3
 
-    def displaced(self, step: Array, rows: NDArray[np.int64]) -> MotionState:
-        """Some instants after a small change (18,) in the order of STATE."""
+    def displaced(self, step: Array) -> MotionState:
+        """After a small change (18,) in the order of STATE."""
         return MotionState(
-            self.position[rows] + step[0:3],
-            rotation_from_vector(step[3:6]) @ self.R_world_body[rows],
-            self.velocity[rows] + step[6:9],
-            self.omega_world[rows] + step[9:12],
-            self.acceleration[rows] + step[12:15],
-            self.alpha_world[rows] + step[15:18],
+            self.position + step[0:3],
+            rotation_from_vector(step[3:6]) @ self.R_world_body,
+            self.velocity + step[6:9],
+            self.omega_world + step[9:12],
+            self.acceleration + step[12:15],
+            self.alpha_world + step[15:18],
         )
 
 

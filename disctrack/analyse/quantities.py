@@ -11,7 +11,7 @@ Noise differs from frame to frame; the calibration's error is one and the same i
 quantity carries the two apart.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from calibration.kit.arrays import Array
 from calibration.kit.brief import Outline
-from disctrack.analyse.derivatives import FRAMES_AT_ONCE, N_STATE, K, MeasuredMotion, MotionState
+from disctrack.analyse.derivatives import K, MeasuredMotion, MotionState
 from disctrack.disc import Disc, precession_rate
 from disctrack.errors import ModelError
 
@@ -138,35 +138,23 @@ class Propagated:
 
     def covariance_at(self, frames: NDArray[np.int64], columns: slice = slice(None), shared: bool = False) -> Array:
         """(f, c, c) of some values in some frames: noise, or what all share: of the rig, and what else repeats."""
-        motion = self.motion
-
-        def some(rows: NDArray[np.int64]) -> Array:
-            J = self.jacobian[rows][:, columns]
-            if not shared:
-                return np.asarray(J @ motion.covariance[rows] @ J.swapaxes(1, 2))
-            S = J @ motion.calibration_sensitivity[rows]
-            by_rig = S @ motion.rig_covariance @ S.swapaxes(1, 2)
-            return np.asarray(by_rig + J @ motion.systematic_at(rows) @ J.swapaxes(1, 2))
-
-        return _by_parts(some, frames)
+        motion, J = self.motion, self.jacobian[frames][:, columns]
+        if not shared:
+            return np.asarray(J @ motion.covariance[frames] @ J.swapaxes(1, 2))
+        S = J @ motion.calibration_sensitivity[frames]
+        by_rig = S @ motion.rig_covariance @ S.swapaxes(1, 2)
+        return np.asarray(by_rig + J @ motion.systematic_at(frames) @ J.swapaxes(1, 2))
 
     def series(self, names: Sequence[tuple[str, str, str]]) -> tuple[DerivedSeries, ...]:
         """The columns one by one; names are (name, unit, long_name)."""
-
-        def variances(rows: NDArray[np.int64]) -> Array:
-            both = [self.covariance_at(rows, shared=shared) for shared in (False, True)]
-            return np.stack([np.diagonal(C, axis1=1, axis2=2) for C in both], axis=1)
-
-        sigmas = np.sqrt(np.maximum(_by_parts(variances, np.arange(len(self.value))), 0.0))
-        return tuple(
-            DerivedSeries(*name, self.value[:, i], sigmas[:, 0, i], sigmas[:, 1, i]) for i, name in enumerate(names)
-        )
-
-
-def _by_parts(function: Callable[[NDArray[np.int64]], Array], frames: NDArray[np.int64]) -> Array:
-    """A function of frames, some at a time: what it needs on the way may be larger than its result."""
-    parts = [function(frames[i : i + FRAMES_AT_ONCE]) for i in range(0, max(len(frames), 1), FRAMES_AT_ONCE)]
-    return np.concatenate(parts)
+        motion, J, every = self.motion, self.jacobian, np.arange(len(self.value))
+        S = J @ motion.calibration_sensitivity
+        noise = np.sum(J @ motion.covariance * J, axis=-1)
+        shared = np.sum(S @ motion.rig_covariance * S, axis=-1)
+        shared += np.sum(J @ motion.systematic_at(every) * J, axis=-1)
+        sigma, common = (np.sqrt(np.maximum(variance, 0.0)) for variance in (noise, shared))
+        columns = zip(self.value.T, sigma.T, common.T, strict=True)
+        return tuple(DerivedSeries(*name, *column) for name, column in zip(names, columns, strict=True))
 
 
 def propagate(motion: MeasuredMotion) -> Propagated:
@@ -174,23 +162,14 @@ def propagate(motion: MeasuredMotion) -> Propagated:
 
     NaN where the motion is unknown, and where theta is so small against its own sigma that e1 has no direction.
     """
-    resolved = motion.sine > SIGMAS * motion.tilt_sigma
-
-    def displaced(step: Array, rows: NDArray[np.int64]) -> Array:
-        return quantities(motion.displaced(step, rows), motion.disc, motion.gravity)
-
-    def some(rows: NDArray[np.int64]) -> Array:
-        columns = []
-        for step in np.diag(STEPS):
-            up, down = (displaced(sign * step, rows) for sign in (1, -1))
-            columns.append((up - down) / (2 * step.sum()))
-        jacobian = np.stack(columns, axis=-1)  # (f, k, 18)
-        value = np.where(resolved[rows, None], displaced(np.zeros(N_STATE), rows), np.nan)
-        jacobian[~np.isfinite(value)] = np.nan
-        return np.concatenate([value[..., None], jacobian], axis=-1)
-
-    both = _by_parts(some, np.arange(len(motion)))
-    return Propagated(both[..., 0], both[..., 1:], motion)
+    resolved, columns = motion.sine > SIGMAS * motion.tilt_sigma, []
+    for step in np.diag(STEPS):
+        up, down = (quantities(motion.displaced(sign * step), motion.disc, motion.gravity) for sign in (1, -1))
+        columns.append((up - down) / (2 * step.sum()))
+    jacobian = np.stack(columns, axis=-1)  # (n, k, 18)
+    value = np.where(resolved[:, None], quantities(motion, motion.disc, motion.gravity), np.nan)
+    jacobian[~np.isfinite(value)] = np.nan
+    return Propagated(value, jacobian, motion)
 
 
 TOTAL, LEVEL = COLUMN["total"], COLUMN["precession_level"]

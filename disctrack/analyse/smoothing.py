@@ -129,7 +129,10 @@ def window_weights(lag: Array, noise_ratio: Array, length: float) -> tuple[Array
     """
     seen = np.isfinite(noise_ratio)
     mask = seen.astype(float)
-    cross = _cross_covariance(lag, length) * mask[:, None, :]
+    k, l2, a = kernel(lag, length), length**2, 1 / length**2
+    # of value, slope and curvature at lag 0 with the values at `lag` (u, 3, w), and with each other (3, 3)
+    cross = np.stack([k, lag / l2 * k, (lag**2 / l2 - 1) / l2 * k], axis=1) * mask[:, None, :]
+    own = np.array([[1.0, 0.0, -a], [0.0, a, 0.0], [-a, 0.0, 3 * a * a]])
     alike = lag[:1] if (lag == lag[0]).all() else lag  # of frames at one interval all windows are
     K = kernel(alike[:, :, None] - alike[:, None, :], length) * mask[:, :, None] * mask[:, None, :]
     diagonal = np.arange(lag.shape[1])
@@ -144,20 +147,8 @@ def window_weights(lag: Array, noise_ratio: Array, length: float) -> tuple[Array
     missing = target - from_process @ basis.swapaxes(1, 2)
     weights = from_process + missing @ np.linalg.solve(gram, from_basis)
     mixed = weights @ cross.swapaxes(1, 2)
-    prior = weights @ K @ weights.swapaxes(1, 2) - mixed - mixed.swapaxes(1, 2) + _own_covariance(length)
+    prior = weights @ K @ weights.swapaxes(1, 2) - mixed - mixed.swapaxes(1, 2) + own
     return weights, prior
-
-
-def _cross_covariance(lag: Array, length: float) -> Array:
-    """Covariance (u, 3, w) of value, slope and curvature at lag 0 with the values at `lag`."""
-    k = kernel(lag, length)
-    return np.stack([k, lag / length**2 * k, (lag**2 / length**2 - 1) / length**2 * k], axis=1)
-
-
-def _own_covariance(length: float) -> Array:
-    """Covariance (3, 3) of value, slope and curvature at one point."""
-    a = 1 / length**2
-    return np.array([[1.0, 0.0, -a], [0.0, a, 0.0], [-a, 0.0, 3 * a * a]])
 
 
 def moving_weights(

@@ -12,7 +12,7 @@ import numpy as np
 
 from calibration.cameras.camera import StereoRig
 from calibration.kit.arguments import checked
-from calibration.kit.arrays import Array, Array32, Image
+from calibration.kit.arrays import Array32, Image
 from disctrack.disc import AIR_DENSITY, Disc
 from disctrack.errors import OutputError
 from disctrack.recording.declaration import KEYS
@@ -147,13 +147,9 @@ def _frames(part: Path, scene: Scene, motion: SceneMotion, truth: Truth) -> Iter
     for c, stage in enumerate(stages(truth.rig_while_filming, scene)):
         missing = (scene.faults.left, scene.faults.right)[c].missing_frames
         for i in sorted(set(range(len(truth.time))) - set(missing)):
-            pose = partial(_pose_around, motion, truth.time[i] + c * _delay(scene))
+            pose = partial(lambda mid, dt: motion.pose(mid + dt), truth.time[i] + c * _delay(scene))
             picture = partial(expected_disc_image, pose, exposure, i, stage, *looks)
             yield part / stage.name / f"{i:06d}.png", partial(_exposed, picture, scene, [scene.seed, 4, c, i])
-
-
-def _pose_around(motion: SceneMotion, mid: float, dt: Array) -> Array:
-    return motion.pose(mid + dt)
 
 
 def _exposed(picture: Callable[[], Array32], scene: Scene, key: list[int]) -> Image:
