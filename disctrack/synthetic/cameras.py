@@ -130,31 +130,27 @@ def board_poses(scene: Scene, rig: StereoRig) -> tuple[Array, Array]:
     """
     board, rng = scene.board, np.random.default_rng([scene.seed, 2])
     middle = (np.array([*board.inner_corners, 1.0]) - 1) / 2 * board.square_mm * 1e-3
-    R = [np.eye(3)]
-    t = [np.array([0.0, 0.0, board.thickness_mm * 1e-3])]
+    R, t = [np.eye(3)], [np.array([0.0, 0.0, board.thickness_mm * 1e-3])]
     if not _in_view(R[0], t[0], rig, scene):
         raise SceneError("board: lying flat on the table it is not inside both images; move the target or the cameras")
     target = np.array([*scene.rig.target_mm[:2], 0.0]) * 1e-3
-    tries = 0
-    while len(R) < board.n_views:
-        tries += 1
-        if tries > 2000 * board.n_views:
-            raise SceneError(
-                f"board: only {len(R)} of {board.n_views} views found with all squares in both images;"
-                " lower board.shift_mm, board.max_tilt_deg or the number of views"
-            )
+    for _ in range(2000 * board.n_views):
+        if len(R) == board.n_views:
+            return np.stack(R), np.stack(t)
         direction = rng.uniform(0, 2 * np.pi)
         tilt = np.radians(board.max_tilt_deg) * np.sqrt(rng.uniform(0.05, 1.0))
         turn = np.radians(rng.uniform(-board.max_turn_deg, board.max_turn_deg))
-        R_try = rotation_from_vector(tilt * np.array([np.cos(direction), np.sin(direction), 0.0])) @ (
-            rotation_from_vector(np.array([0.0, 0.0, turn]))
-        )
+        tilted = rotation_from_vector(tilt * np.array([np.cos(direction), np.sin(direction), 0.0]))
+        R_try = tilted @ rotation_from_vector(np.array([0.0, 0.0, turn]))
         shift = np.array([*rng.uniform(-board.shift_mm, board.shift_mm, 2), rng.uniform(*board.height_mm)]) * 1e-3
         t_try = target + shift - R_try @ middle
         if _in_view(R_try, t_try, rig, scene):
             R.append(R_try)
             t.append(t_try)
-    return np.stack(R[: board.n_views]), np.stack(t[: board.n_views])
+    raise SceneError(
+        f"board: only {len(R)} of {board.n_views} views found with all squares in both images; lower board.shift_mm, "
+        "board.max_tilt_deg or the number of views"
+    )
 
 
 def _in_view(R_world_board: Array, t_world_board: Array, rig: StereoRig, scene: Scene) -> bool:

@@ -259,20 +259,15 @@ def load_scene(path: str | Path) -> Scene:
 def scene_from_tree(tree: dict[str, Any], where: str = "scene", folder: Path = Path()) -> Scene:
     """Scene of nested dictionaries as tomllib returns them; errors as in `load_scene`."""
     scene = replace(build(Scene, tree, where), folder=folder)
-    _check(scene, where)
+    for bad, key, found, expected in _complaints(scene):
+        if bad:
+            raise SceneError(f"{where}: {key} = {found}; expected {expected}")
     return scene
 
 
 def scene_toml(scene: Scene) -> str:
     """All of `scene` as a TOML file that `load_scene` reads back to the same scene (but for its folder)."""
     return "\n".join(toml_lines(scene)).lstrip() + "\n"
-
-
-def _check(scene: Scene, where: str) -> None:
-    """Raise SceneError for values that no recording can have."""
-    for bad, key, found, expected in _complaints(scene):
-        if bad:
-            raise SceneError(f"{where}: {key} = {found}; expected {expected}")
 
 
 def _complaints(scene: Scene) -> Iterator[tuple[bool, str, object, str]]:

@@ -2,31 +2,61 @@
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import cv2
+import h5py
 import numpy as np
 
 from calibration.cameras.camera import StereoRig
 from calibration.kit.arguments import checked
-from calibration.kit.arrays import Array32, Image
+from calibration.kit.arrays import Array, Array32, Image, Mask
+from calibration.rig_file import write_rig_group
 from disctrack.disc import AIR_DENSITY, Disc
 from disctrack.errors import OutputError
+from disctrack.frames import COORDINATES, rotation_from_euler
 from disctrack.recording.declaration import KEYS
 from disctrack.recording.declaration_text import declaration_text
-from disctrack.synthetic.cameras import board_poses, rig_after_faults, rig_of
-from disctrack.synthetic.description import ImperfectionSettings, Scene, load_scene
+from disctrack.synthetic.cameras import board_poses, image_of, rig_after_faults, rig_of, views_of
+from disctrack.synthetic.description import ImperfectionSettings, Scene, load_scene, scene_toml
 from disctrack.synthetic.images import expected_board_image, expected_disc_image, stages
 from disctrack.synthetic.motion import SceneMotion, motion_of, true_exposure, true_frame_rate
 from disctrack.synthetic.sensor import digitise
-from disctrack.synthetic.truth import Truth, write_truth
 
 Progress = Callable[[int, int], None]  # images done, images in all
 
-TRUTH_NAME = "truth.h5"
+TRUTH_NAME = "truth.h5"  # for validation only, no stage of the measurement reads it
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What is true of a recording, SI and radians."""
+
+    time: Array  # (n,) mid exposure of the left camera's frames [s]
+    q: Array  # (n, 6) at `time`, angles not wrapped
+    qdot: Array  # (n, 6) rates at `time`
+    q_right: Array  # (n, 6) at the right camera's mid exposure; equals q unless that camera is delayed
+    frame_rate: float  # true one [Hz]
+    rig: StereoRig  # while the chessboard was shown
+    rig_while_filming: StereoRig  # while the disc was filmed
+    disc: Disc  # with the true centres of the dots
+    paper_centre_body: Array  # (2,) [m]
+    markers_printed: Mask  # (m,) False for dots that have come off
+    R_world_board: Array  # (v, 3, 3) of the calibration views
+    t_world_board: Array  # (v, 3) [m]
+    effects: dict[str, float]  # "effect.parameter" of the rolling model, SI
+
+    @property
+    def markers_px(self) -> Array:
+        """(n, 2, m, 2) images of the dots' own centres at mid exposure, whether visible or not."""
+        pixels = []
+        for q, view in zip((self.q, self.q_right), views_of(self.rig_while_filming), strict=True):
+            R = rotation_from_euler(*q[:, 3:].T)
+            pixels.append(image_of(self.disc.marker_centres_body @ np.swapaxes(R, -1, -2) + q[:, None, :3], view))
+        return np.stack(pixels, axis=1)
 
 
 Job = tuple[Path, Callable[[], Image]]  # a file, and how its image is taken
@@ -66,7 +96,7 @@ def write_recording(
             _write_all([*_boards(part, scene, truth), *_frames(part, scene, motion, truth)], scene, progress)
             if target is not None:
                 target.parent.mkdir(parents=True, exist_ok=True)
-            write_truth(target or part / TRUTH_NAME, truth, scene)
+            _write_truth(target or part / TRUTH_NAME, truth, scene)
             if folder.exists():
                 folder.rmdir()
             part.rename(folder)
@@ -195,3 +225,33 @@ def recording_toml(scene: Scene) -> str:
         told |= dict.fromkeys(tolerances, (0.0, "here, what is declared is exact"))
     told["table", "view"] = 0, "in this view, counted from 0, the board lies flat on the table"
     return declaration_text(scene.name, told, {}, {})[0]
+
+
+def _write_truth(path: Path, truth: Truth, scene: Scene) -> None:
+    """Write `truth` and the scene it was rendered from."""
+    pose, disc = ", ".join(f"{c} {'m' if c in 'xyz' else 'rad'}" for c in COORDINATES), truth.disc
+    datasets = (
+        ("time", truth.time, "s", "mid exposure of the left camera"),
+        ("q", truth.q, pose, "pose at time, world frame = table"),
+        ("qdot", truth.qdot, "m/s, rad/s", "rates of q at time"),
+        ("q_right", truth.q_right, pose, "pose at the right camera's mid exposure"),
+        ("markers_px", truth.markers_px, "px", "images of the dots' own centres (frame, camera, marker, xy)"),
+        ("disc/paper_centre_body", truth.paper_centre_body, "m", "centre of the paper on the upper face"),
+        ("disc/markers_printed", truth.markers_printed.astype(np.uint8), "1", "0: the dot has come off"),
+        ("disc/marker_centres_body", disc.marker_centres_body, "m", "true centres of the dots"),
+        ("disc/declared_marker_centres_body", scene.declared_disc.marker_centres_body, "m", "as in recording.toml"),
+        ("board/R_world_board", truth.R_world_board, "1", "orientation of the board in the calibration views"),
+        ("board/t_world_board", truth.t_world_board, "m", "lower left inner corner in the calibration views"),
+    )
+    with h5py.File(path, "w") as file:
+        file.attrs["schema"], file.attrs["schema_version"] = "disctrack truth", 2
+        file.attrs["scene"] = scene_toml(scene)  # renders the same recording again
+        file.attrs["frame_rate_hz"] = truth.frame_rate
+        for place, values, units, text in datasets:
+            data = file.create_dataset(place, data=values, compression="gzip" if values.size > 1000 else None)
+            data.attrs["units"], data.attrs["description"] = units, text
+        sizes = ("radius", "half_thickness", "mass", "marker_diameter")
+        file["disc"].attrs.update({name: getattr(disc, name) for name in sizes})
+        for name in ("rig", "rig_while_filming"):
+            write_rig_group(file.create_group(name), getattr(truth, name))
+        file.create_group("effects").attrs.update(truth.effects)

@@ -21,8 +21,7 @@ from disctrack.frames import CAMERAS, rotation_from_euler
 from disctrack.recording.declaration import Recording, read_recording
 from disctrack.synthetic.cameras import rig_of
 from disctrack.synthetic.description import GlareSettings, Scene
-from disctrack.synthetic.recording import write_recording
-from disctrack.synthetic.truth import Truth
+from disctrack.synthetic.recording import Truth, write_recording
 from disctrack.track.follow.tracking import Tracking, track
 from disctrack.track.measurement import open_pairs
 from disctrack.track.pose import MIN_DOTS

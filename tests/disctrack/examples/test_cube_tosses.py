@@ -7,8 +7,16 @@ import numpy as np
 import pytest
 
 from disctrack.examples._command import command
-from disctrack.examples.cube_data import CLEARANCE, flights, read_tosses, without_copies
-from disctrack.examples.cube_tosses import CubeTosses, diagnosed, errors, example
+from disctrack.examples.cube_tosses import (
+    CLEARANCE,
+    CubeTosses,
+    diagnosed,
+    errors,
+    example,
+    flights,
+    read_tosses,
+    without_copies,
+)
 from tests.oracles import tossed_cube
 
 N = 50  # tosses that are simulated
