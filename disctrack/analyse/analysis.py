@@ -9,14 +9,7 @@ from calibration.kit.arrays import Array
 from calibration.kit.brief import Brief
 from disctrack.analyse.contact import Circle, RollingOnset, locus_circle, rolling_onset
 from disctrack.analyse.derivatives import GROUP_NAMES, MeasuredMotion, differentiate
-from disctrack.analyse.power_laws import (
-    WINDOW,
-    NutationCount,
-    PowerLaws,
-    count_nutation,
-    fit_power_laws,
-    power_law_end,
-)
+from disctrack.analyse.power_laws import WINDOW, NutationCount, PowerLaws, count_nutation, fit_power_laws, power_law_end
 from disctrack.analyse.quantities import ALL, COLUMN, TOTAL, DerivedSeries, Energy, energy_of, propagate
 from disctrack.errors import AnalysisError
 from disctrack.findings import Finding, Kind, Severity, of_kind

@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from calibration.kit.arrays import Array
 from disctrack.analyse.quantities import SIGMAS, Propagated, from_to
@@ -121,11 +120,15 @@ def locus_circle(found: Propagated, duration: float, until: float = np.inf) -> C
     if arc < np.pi / 2 or frames.size < 8:
         return Circle(np.full(2, np.nan), *(float("nan"),) * 7)
     points = found.value[frames, PLACE]
-    centre, radius = _fit_circle(points)
-    offset = points - centre
-    distance = np.linalg.norm(offset, axis=1)
-    J = np.column_stack([offset / distance[:, None], np.ones(len(frames))])
-    gain = np.linalg.solve(J.T @ J, J.T)[2]
+    centre = points.mean(axis=0)
+    for _ in range(30):  # Gauss-Newton, to rounding
+        offset = points - centre
+        distance = np.linalg.norm(offset, axis=1)
+        J = np.column_stack([offset / distance[:, None], np.ones(len(frames))])
+        by_distance = np.linalg.solve(J.T @ J, J.T)
+        *step, radius = by_distance @ distance
+        centre = centre + np.array(step)
+    gain = by_distance[2]
     rms = float(np.sqrt(np.mean((distance - radius) ** 2)))
     independent = min(len(frames), max(4.0, arc / np.pi))
     noise = found.covariance_at(frames, PLACE).sum(axis=(1, 2)).mean() / 2
@@ -136,7 +139,7 @@ def locus_circle(found: Propagated, duration: float, until: float = np.inf) -> C
     expected = motion.disc.radius * np.cos(theta) - motion.disc.half_thickness * np.sin(theta)
     return Circle(
         centre=centre,
-        radius=radius,
+        radius=float(radius),
         sigma=float(np.sqrt(variance)),
         sigma_calibration=float(np.sqrt(max(0.0, per_rig @ motion.rig_covariance @ per_rig))),
         rms=rms,
@@ -144,11 +147,3 @@ def locus_circle(found: Propagated, duration: float, until: float = np.inf) -> C
         start=float(motion.time[frames[0]]),
         end=float(motion.time[frames[-1]]),
     )
-
-
-def _fit_circle(points: Array) -> tuple[Array, float]:
-    """Centre (2,) and radius that leave the least squares of distances."""
-    middle = points.mean(axis=0)
-    start = *middle, float(np.linalg.norm(points - middle, axis=1).mean())
-    found = least_squares(lambda c: np.linalg.norm(points - c[:2], axis=1) - c[2], start, xtol=1e-15, x_scale=start[2])
-    return found.x[:2], float(found.x[2])

@@ -20,13 +20,7 @@ from calibration.cameras.camera import N_RIG
 from calibration.kit.arguments import checked
 from calibration.kit.arrays import Array, Mask
 from calibration.kit.brief import Outline
-from disctrack.analyse.smoothing import (
-    HALF_WINDOW_LENGTHS,
-    SEGMENT,
-    Process,
-    fit_process,
-    moving_weights,
-)
+from disctrack.analyse.smoothing import HALF_WINDOW_LENGTHS, SEGMENT, Process, fit_process, moving_weights
 from disctrack.disc import Disc
 from disctrack.errors import AnalysisError
 from disctrack.frames import (

@@ -14,19 +14,9 @@ from typing import Any
 
 from disctrack.disc import AIR_DENSITY, MA_2014, Disc, disc_from_mm
 from disctrack.errors import SceneError
-from disctrack.faults.keys import Faults
-from disctrack.files.toml_tree import (
-    MOST,
-    NOT_NEGATIVE,
-    POSITIVE,
-    build,
-    limited,
-    read_toml,
-    toml_lines,
-)
+from disctrack.faults.keys import Faults, Pair, Triple
+from disctrack.files.toml_tree import MOST, NOT_NEGATIVE, POSITIVE, build, limited, read_toml, toml_lines
 
-Pair = tuple[float, float]
-Triple = tuple[float, float, float]
 Pose = tuple[float, float, float, float, float, float]
 MOST_PIXELS = 16384  # a side
 
