@@ -428,7 +428,8 @@ def base_beside(base: Fit, kept: Sequence[Found]) -> Fit:
 def _law_beside(system: LawSystem, diagnosis: Diagnosis, kept: tuple[Found, ...], is_noise: IsNoise) -> WithLaw | None:
     """The law that takes the place of what was found but for `kept`; None if there is none."""
     noise, base = diagnosis.noise, base_beside(diagnosis.before, kept)
-    along = diagnosis.after if diagnosis.found else diagnosis.nearest
+    nearest = diagnosis.nearest.fit if diagnosis.nearest else None
+    along = diagnosis.after if diagnosis.found else nearest
     against = along.cost / noise if diagnosis.verdict == "found" and along else np.inf
     law = learn(system, base, noise, along, against, None if diagnosis.found else is_noise)
     if law is None:

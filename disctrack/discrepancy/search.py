@@ -33,7 +33,6 @@ ROUGH = 1e-2  # of chi-square at stake, below which what a fit may still gain in
 FAINT = 1e3  # chi-square of an effect, below which many others may do as well as it
 MOST_ALTERNATIVES = 12
 FOR_LAWS = 0.5  # of the budget, that the known effects leave to laws that nobody named
-NOT_CONVERGED = "its refit does not converge"
 CANCELLING = 0.1  # share of the least effect's power that a sum of effects keeps, below which they undo each other
 FAR, AGREES = 10.0, 2.0  # variances of the noise: a motion far from the data, and one that a beginning agrees with
 FIRST_ORDER = 1.0 / 3.0  # of what a faint effect is to describe, that it does to first order, at the shape assumed
@@ -104,6 +103,7 @@ class Tried:
     gain: float | None  # of the first refit, over the fit that was the best before it
     held_out_gain: float | None
     reason: str
+    stuck: bool = False  # its refit has not converged
 
 
 @dataclass(frozen=True, repr=False)
@@ -120,8 +120,7 @@ class Diagnosis(Outline):
     noise: float  # variance of the noise found in the residual's fast part, over that stated
     tried: tuple[Tried, ...]
     settings: Settings = field(default_factory=Settings)
-    partial: tuple[Candidate, ...] = ()  # effects that help most, refused because they leave too much
-    nearest: Fit | None = None  # with them
+    nearest: Explanation | None = None  # by effects that help most, refused because they leave too much
     ranked: tuple[Explanation, ...] = ()  # all that can be believed, the shortest first
     length: float = np.nan  # of the answer
     judged: System | None = None  # what the fits were made of: the system with its noise as found; None: unchanged
@@ -265,7 +264,6 @@ class _Search:
         after = self.nothing if alike is None else best
         found = tuple(self._found(best, c, r) for c, r in zip(best.candidates, alike or (), strict=alike is not None))
         ranked = tuple(replace(e, length=self.length(e)) for e in self._ranked())
-        partial = best if alike is None else None
         return Diagnosis(
             *self._verdict(after, found),
             found,
@@ -276,10 +274,9 @@ class _Search:
             self.noise,
             self._tried_all(scores, found),
             self.settings,
-            partial.candidates if partial else (),
-            partial.fit if partial else None,
-            ranked=ranked,
-            length=self.length(after),
+            best if alike is None else None,
+            ranked,
+            self.length(after),
             chance=by_chance,
         )
 
@@ -648,7 +645,8 @@ class _Search:
         held = None
         if trial is not None and trial.fit in self.free_runs:
             held = self._held_out_gain(self.nothing, trial)
-        return Tried(c, score.gain / self.noise, gain, held, self._why(score, gain, held, trial, found))
+        stuck = trial is not None and not trial.fit.converged
+        return Tried(c, score.gain / self.noise, gain, held, self._why(score, gain, held, trial, found), stuck)
 
     def _why(
         self, score: Score, gain: float | None, held: float | None, trial: Explanation | None, found: tuple[Found, ...]
@@ -670,7 +668,7 @@ class _Search:
             bound = "" if found else _bounds(score)
             return f"gains {gain:.3g}, noise alone reaches {threshold:.3g}{bound}"
         if trial and not trial.fit.converged:
-            return NOT_CONVERGED
+            return "its refit does not converge"
         if held is not None and held <= 0:
             return "the free run over held-out data does not improve"
         than_chosen = "less than what was chosen" if found else "too little of what is missing"

@@ -98,7 +98,8 @@ class Answer:
         known = " and ".join(c.name for c in law.instead.candidates)
         longer = f"{law.length - law.instead.length:+.3g} in -2 log evidence"
         text = law.text(self.equations.units)
-        named = law.candidate.name in {*self.found, *(c.name for c in self.diagnosis.partial)}
+        nearest = self.diagnosis.nearest
+        named = law.candidate.name in {*self.found, *(nearest.effects if nearest else ())}
         if not law.is_shorter:
             notes.append(f"one law describes the data in place of {known} ({longer}): {text}")
         elif not named:
@@ -116,14 +117,14 @@ class Answer:
 
     def _what_helps_most(self) -> list[str]:
         """Where no term is named: those that gain most, and what they leave."""
-        nearest, told = self.nearest, []
-        if not nearest or self.diagnosis.nearest is None:
+        nearest, told = self.diagnosis.nearest, []
+        if nearest is None:
             return []
-        for c in self.diagnosis.partial:
-            numbers = ((q.part, nearest.get(q.name, q.null)) for q in (*c.quantities, *c.shape))
+        for c in nearest.candidates:
+            numbers = ((q.part, self.nearest.get(q.name, q.null)) for q in (*c.quantities, *c.shape))
             sizes = ", ".join(f"{name} = {value:.4g}" for name, value in numbers)
             told.append(self._law_text(c) or f"{c.title} [{c.name}] ({sizes})")
-        left = self._errors(self.diagnosis.nearest, None)
+        left = self._errors(nearest.fit, None)
         sizes = ", ".join(f"{e.rms:.3g} of {self.before[c].rms:.3g} {self._unit(c)} of {c}" for c, e in left.items())
         return [f"{' and '.join(told)} would help most and still leave {sizes}".replace(" 1 of", " of")]
 
@@ -152,10 +153,8 @@ class Answer:
     @property
     def nearest(self) -> dict[str, float]:
         """All fitted numbers with the terms that help most, where they leave too much to be named; else empty."""
-        d = self.diagnosis
-        if not d.partial or d.nearest is None:
-            return {}
-        return {n: d.nearest.values[n] for n in d.nearest.names}
+        nearest = self.diagnosis.nearest
+        return {n: nearest.fit.values[n] for n in nearest.fit.names} if nearest else {}
 
     def _not_white(self) -> list[str]:
         """Where what is left is called noise by its size: is it so by its memory?"""
@@ -245,8 +244,8 @@ class Answer:
         """
         d = self.diagnosis
         fitted, errors = (d.before, self.before) if by == "before" else (d.after, self.after)
-        if by == "after" and self.nearest and d.nearest is not None:
-            fitted, errors = d.nearest, self._errors(d.nearest, None)
+        if by == "after" and d.nearest is not None:
+            fitted, errors = d.nearest.fit, self._errors(d.nearest.fit, None)
         of_noise = d.verdict != "unexplained" and by != "before"
         left = [e.noise if of_noise else np.nanmax([e.noise, e.rms, e.held_out]) for e in errors.values()]
         return free_run(self.system, fitted, self._checked(run), np.array(left), window)

@@ -222,7 +222,8 @@ class _Competition:
         """Known terms that may act with a law: those that were found or help most."""
         d = self.diagnosis
         tried = sorted(d.tried, key=lambda t: -(t.score if t.gain is None else t.gain))
-        named = [*(f.candidate.name for f in d.found), *(c.name for c in d.partial), *(t.candidate.name for t in tried)]
+        nearest = d.nearest.candidates if d.nearest else ()
+        named = [c.name for c in (*(f.candidate for f in d.found), *nearest, *(t.candidate for t in tried))]
         own = {c.name: c for c in self.system.candidates}
         return [own[name] for name in dict.fromkeys(named) if name in own][:WIDTH]
 
@@ -535,29 +536,30 @@ def with_law(diagnosis: Diagnosis, law: LearnedForce) -> Diagnosis:
     at_first = f"{diagnosis.before.reduced_chi_square:.3g}"
     reason = f"chi-square stays at {at_first}, with a law that was learned at {level}"
     if not law.at_noise:
-        nearest = with_memory(law.system, law.fit)
-        return replace(diagnosis, reason=reason, partial=law.candidates, nearest=nearest)
+        return replace(diagnosis, reason=reason, nearest=replace(law, fit=with_memory(law.system, law.fit)))
     ranked = sorted((*diagnosis.ranked, law), key=lambda e: e.length)
     diagnosis = replace(diagnosis, ranked=tuple(ranked), length=law.length)
     if law.along.variable == "t":
-        tried = tuple(_instead(t, ()) for t in diagnosis.tried)
+        tried = tuple(_instead(diagnosis, ()))
         return replace(
             diagnosis, verdict="unexplained", reason=reason, found=(), after=diagnosis.before, tried=tried,
-            held_out_after=diagnosis.held_out_before, partial=law.candidates, nearest=law.fit,
+            held_out_after=diagnosis.held_out_before, nearest=law,
         )  # fmt: skip
     assert diagnosis.held_out_before is not None
     held_gain = law.held_out.gain_over(diagnosis.held_out_before, diagnosis.noise)
     gain = (diagnosis.before.cost - law.fit.cost) / diagnosis.noise
     found = tuple(Found(c, gain, held_gain, 0.0, ()) for c in law.candidates)
     own = Tried(law.candidate, gain, gain, held_gain, "chosen")
-    tried = (own, *(_instead(t, law.beside) for t in diagnosis.tried))
+    tried = (own, *_instead(diagnosis, law.beside))
     return replace(
         diagnosis, verdict="found", reason=f"with a law that no term names, chi-square falls to {level}", found=found,
-        after=law.fit, held_out_after=law.held_out, tried=tried, partial=(), nearest=None,
+        after=law.fit, held_out_after=law.held_out, tried=tried, nearest=None,
     )  # fmt: skip
 
 
-def _instead(tried: Tried, beside: Sequence[Candidate]) -> Tried:
-    if tried.candidate.name in {c.name for c in beside}:
-        return replace(tried, reason="chosen")
-    return replace(tried, reason="the law that was learned describes more") if tried.reason == "chosen" else tried
+def _instead(diagnosis: Diagnosis, beside: Sequence[Candidate]) -> Iterator[Tried]:
+    """What was tried, with those known terms chosen that stay beside a law."""
+    outcomes = {f.candidate.name: "the law that was learned describes more" for f in diagnosis.found}
+    outcomes |= {c.name: "chosen" for c in beside}
+    for tried in diagnosis.tried:
+        yield replace(tried, reason=outcomes.get(tried.candidate.name, tried.reason))

@@ -24,7 +24,7 @@ from disctrack.discrepancy.noise import (
     without_memory,
 )
 from disctrack.discrepancy.score import Linearisation
-from disctrack.discrepancy.search import NOT_CONVERGED, WIDTH, Diagnosis, Former, Settings, explain, with_shapes
+from disctrack.discrepancy.search import WIDTH, Diagnosis, Former, Settings, explain, with_shapes
 from disctrack.discrepancy.significance import wald
 from disctrack.discrepancy.system import USED_UP, Candidate, System, Values
 from disctrack.errors import AnalysisError
@@ -40,7 +40,6 @@ SAFE = 0.5  # of the time over which the model can be made to follow: near its e
 SCANNED = 8  # values along the motion that are tried for a limit
 NEARLY = 0.2  # of the excess chi-square: what leaves less is named as the nearest description of what no term is
 STANDS = 8  # samples of the same largest or least value, above which a sensor stands at a limit
-ERROR_THAT_LASTS = "sigmas are those of what is left"  # note of an error that no term describes
 USUAL_SHARE = 0.1  # of the rms of the motion's own forces: a term of that size would surprise nobody
 
 
@@ -69,15 +68,14 @@ def ask(
             "the motion can be followed, but not how it depends on its parameters: so it is where equations jump, as "
             "at a stiff contact. Write the contact wider, or cut the data into runs without it."
         )
-    diagnosis, remembers, more = _with_memory(system, diagnosis, settings)
-    notes += more
+    diagnosis, remembers, of_memory = _with_memory(system, diagnosis, settings)
     judged = diagnosis.judged or system
     law = learn(system, diagnosis, channels, None if judged is system else judged)
-    if law is not None and law.is_named(diagnosis):
+    named = law is not None and law.is_named(diagnosis)
+    notes += of_memory if remembers or not (law and named and law.at_noise) else []
+    if law is not None and named:
         judged = law.system if judged is system else judged.over(law.system)
         system, diagnosis = law.system, with_law(diagnosis, law)
-        if law.at_noise:
-            notes = [n for n in notes if not n.startswith(ERROR_THAT_LASTS)]
     elif diagnosis.found and (diagnosis.verdict == "found" or any(f.candidate.shape for f in diagnosis.found)):
         diagnosis = with_shapes(judged, diagnosis)
         notes += diagnosis.remarks
@@ -144,7 +142,7 @@ def _searched(
         diagnosis = explain(system, values, settings, system.training)
     if diagnosis.verdict == "unexplained" and not diagnosis.found:
         # of an arm that friction stops, no step leads from a motion without end to the instant at which it stops
-        stuck = [t for t in diagnosis.tried if t.gain is not None and t.reason == NOT_CONVERGED]
+        stuck = [t for t in diagnosis.tried if t.stuck and t.gain is not None and t.gain > 0]
         names = [t.candidate.name for t in sorted(stuck, key=lambda t: -t.score)]
         if ways := _leading(system, guessed(system)[0], names[:WIDTH]):
             diagnosis = explain(system, diagnosis.before.values, settings, system.training, ways)
@@ -157,8 +155,8 @@ def _searched(
 def _former(diagnosis: Diagnosis) -> Former:
     """What an answer found or came nearest by, as where fits of nearly the same system may begin."""
     found = {frozenset(f.candidate.name for f in diagnosis.found): diagnosis.after.values}
-    if diagnosis.nearest is not None:
-        found[frozenset(c.name for c in diagnosis.partial)] = diagnosis.nearest.values
+    if (nearest := diagnosis.nearest) is not None:
+        found[frozenset(nearest.effects)] = nearest.fit.values
     return {names: values for names, values in found.items() if names}
 
 
@@ -348,7 +346,7 @@ def _with_memory(system: EquationSystem, diagnosis: Diagnosis, settings: Setting
             return diagnosis, False, []
         reason = f"what is left is {size:.3g} times the noise and lasts for {lasting:.2g} s: no sensor's noise"
         diagnosis = replace(_certain(system, diagnosis), reason=reason)
-        return diagnosis, False, [f"{ERROR_THAT_LASTS}, not of the noise alone"]
+        return diagnosis, False, ["sigmas are those of what is left, not of the noise alone"]
     noise = float(share * size**2)
     scatter = 1.0 + 4.0 * float(np.sqrt(2.0 / max(base.n_data, 1)))  # of chi-square in a short recording
     known = replace(settings, noise=noise, at_noise=max(settings.at_noise, scatter))
@@ -377,7 +375,7 @@ def _certain(system: EquationSystem, diagnosis: Diagnosis) -> Diagnosis:
         found=tuple(replace(f, gain=gain) for f, gain in zip(diagnosis.found, gains, strict=True)),
         before=with_memory(system, diagnosis.before),
         after=after,
-        nearest=None if nearest is None else with_memory(system, nearest),
+        nearest=None if nearest is None else replace(nearest, fit=with_memory(system, nearest.fit)),
     )
 
 
