@@ -44,6 +44,12 @@ def viscous(v: str, name: str = "") -> Term:
     return _on(v, f"-own_c*({v})", name or f"viscous_{v}", f"viscous friction on {v}", "Stokes 1851", c=_ANY)
 
 
+def deflected(v: str, x: str, name: str = "") -> Term:
+    """Viscous friction that grows with the square of the deflection; beside a negative one it keeps up a cycle."""
+    title = f"viscous friction on {v} by the square of {x}"
+    return _on(v, f"-own_c*({x})**2*({v})", name or f"deflected_{v}", title, "van der Pol 1926", c=_ANY)
+
+
 def quadratic(v: str, name: str = "") -> Term:
     """Drag in proportion to the square of the velocity."""
     title = f"quadratic drag on {v}"
@@ -218,7 +224,7 @@ def usual(equations: Equations) -> tuple[Term, ...]:
         found += [replace(p, title=f"loss of {y} by its {p.name.partition('_')[0]}") for p in powers]
         found.append(overflow(equations, y, fed))
     for x, v in pairs.items():
-        found += [spring(v, x), asymmetric_spring(v, x), cubic_spring(v, x)]
+        found += [spring(v, x), asymmetric_spring(v, x), cubic_spring(v, x), deflected(v, x)]
     observed = equations.observed if equations.observed is not None else {}
     for channel, formula in observed.items():
         found += [sensor_offset(channel), sensor_drift(channel), sensor_curvature(channel, str(formula))]

@@ -539,7 +539,8 @@ def limited(of_input, besides, sized):
 def swinging_against(force, sized):
     """A model loses the motion at the first blow of a stop: other terms lead on, and are nothing beside it."""
     offered = [terms.backlash("v", "x", "k"), terms.coulomb("v"), terms.cubic_spring("v", "x"),
-               terms.end_stop("v", "x"), terms.quadratic("v"), terms.asymmetric_spring("v", "x")]  # fmt: skip
+               terms.end_stop("v", "x"), terms.quadratic("v"), terms.asymmetric_spring("v", "x"),
+               terms.deflected("v", "x")]  # fmt: skip
     return case(
         ({"x": "v", "v": "-k*x - c*v"}, {"k": 45.0, "c": 0.2}), ({"x": "v", "v": f"-49*{force} - 0.3*v"}, [0.5, 0.0]),
         (0.015 * np.arange(600), {"x": 2e-4}), offered, sized, sigma=2e-4, by={"max_step": 0.005},
@@ -603,6 +604,8 @@ CASES = {
     "friction, which also takes more of small swings": swinging_against(
         "x - 0.15*tanh(v/1e-4)", {"coulomb_v.c": 0.15}
     ),
+    "friction that grows with the deflection": swinging_against("x - 4*x**2*v", {"deflected_v.c": 4}),
+    "a cycle that keeps up": swinging_against("x + (0.9 - 8*x**2)*v", {"deflected_v.c": 8}),
     "a spring alone": swinging_against("x", {}),
     # of unequal mass: what the play takes from one is missing on the other, too
     "play between two parts": case(
