@@ -72,8 +72,7 @@ class Fault:
         name, sides = f"{self.name}.{part}", []
         for sign in (1.0, -1.0):
             changed = dict(sight.values) | {name: sight.values.get(name, 0.0) + sign * self.step}
-            faults = scene_faults(sight.disc, changed)
-            sides.append(predict(sight.R, sight.t, sight.rig, sight.disc, faults)[0])
+            sides.append(_images(sight, scene_faults(sight.disc, changed)))
         return (sides[0] - sides[1]) / (2 * self.step)
 
     def to_scene(self, faults: Faults, v: Array, rate: float) -> Faults:
@@ -98,26 +97,13 @@ class Fault:
         return np.asarray((np.atleast_1d(value) - self.null) / self.factor, float)
 
 
-def _moved(sight: Sight, camera: int, by: Array) -> Array:
-    """Shift of the dots in one camera, all of a frame by a time that is later by `by` (n,) [s]."""
-    return np.einsum("nmap,np->nma", sight.by_pose[:, camera], sight.speed[camera] * by[:, None])
-
-
-def _delayed(fault: Fault, part: str, sight: Sight) -> Array:
-    moved = np.zeros_like(sight.pixels)
-    moved[:, 1] = _moved(sight, 1, np.ones(len(sight.time)))
-    return moved
-
-
-def _faster(fault: Fault, part: str, sight: Sight) -> Array:
-    """By clocks: central difference of the frames' true times."""
-    since, name = sight.time - sight.time[0], f"{fault.name}.{part}"
-    early, late = (
-        scene_faults(sight.disc, {**sight.values, name: sight.values.get(name, 0.0) + step}).true_times(since, 1.0)
-        for step in (-fault.step, fault.step)
-    )
-    later = (late - early) / (2 * fault.step)
-    return np.stack([_moved(sight, camera, later) for camera in range(2)], axis=1)
+def _images(sight: Sight, faults: Faults) -> Array:
+    """Images of the dots with these faults; the motion up to the true instant of an exposure is taken for straight."""
+    since = sight.time - sight.time[0]
+    late = faults.true_times(since, 1.0) - since
+    by_camera = np.stack([late, late + faults.right_delay_s])
+    moved: Array = np.einsum("ncmap,cnp,cn->ncma", sight.by_pose, sight.speed, by_camera)
+    return predict(sight.R, sight.t, sight.rig, sight.disc, faults)[0] + moved
 
 
 def _of_one_dot(fault: Fault, part: str, sight: Sight) -> Array:
@@ -146,13 +132,13 @@ def _row(dot: int, rows: tuple[Any, ...], rate: float) -> tuple[float, ...]:
 
 CLOCKS = (
     Fault("time_offset", "the right camera exposes later than the left", "synchronisation of the cameras",
-          ("delay",), "s", 1e-5, "right minus left", "right_delay_s", bounds=(-0.05, 0.05), along=_delayed,
+          ("delay",), "s", 1e-5, "right minus left", "right_delay_s", bounds=(-0.05, 0.05),
           seen="the dots of the two cameras contradict each other, the more the faster the disc is",
           remedy="check the trigger; renumber the images of the camera that is ahead by whole frames",
           named_by=(Kind.DELAY, Kind.DROPPED_FRAMES)),
     Fault("frame_rate", "the true frame rate differs from the declared one", "clock of the cameras",
           ("change",), "1", 1e-4, "true over declared minus one", "frame_rate_hz", bounds=(-0.6, 1.2),
-          of_poses_alone=False, along=_faster,
+          of_poses_alone=False,
           to_key=lambda v, _, rate: float(rate * (1.0 + v[0])) if v[0] else 0.0,
           from_key=lambda x, rate: x / rate - 1.0 if x else 0.0,
           seen="the balance of moments gives another gravity: g goes as the square of the rate",
@@ -160,7 +146,7 @@ CLOCKS = (
           named_by=(Kind.GRAVITY_OR_RATE,)),
     Fault("clock_drift", "the clock of the cameras changes its rate", "oscillator that warms, trigger that slows down",
           ("growth",), "1/s", 1e-4, "of the time between frames, relative, per second", "frame_interval_growth",
-          bounds=(-0.5, 0.5), of_poses_alone=False, along=_faster, seen="gravity seems to change slowly",
+          bounds=(-0.5, 0.5), of_poses_alone=False, seen="gravity seems to change slowly",
           remedy="trigger by a quartz; let the cameras warm up"),
     Fault("exposure_blur", "dots are averaged over an exposure", "centre moves by T^2/24 times its acceleration",
           ("T2",), "s^2", 1e-7, "square of the exposure", "exposure_s", bounds=(0.0, 1e-3), in_images=True,
