@@ -16,7 +16,7 @@ from functools import reduce
 
 import numpy as np
 
-from calibration.cameras.splines import LensField, spline_weights
+from calibration.cameras.splines import LensField
 from calibration.fit.refinement import FOLDS, Refinement, refine_stereo
 from calibration.fit.start import GOOD_VIEWS
 from calibration.fit.stereo_model import Observations
@@ -120,14 +120,13 @@ def _likeliest(total: Array, grid: LensField, priors: list[Array]) -> tuple[Arra
 
 def _squares(refinement: Refinement, used: Observations, grid: LensField, extra: float) -> Iterator[Array]:
     """Of each view (s + 1, s + 1): products of its rows [cameras, board, field | residual], its pose projected out."""
-    problem, n, shape = refinement.problem, grid.coefficients.size // 4, grid.coefficients.shape[2:]
+    problem, n = refinement.problem, grid.coefficients.size // 4
     for view in np.unique(used.view):
         o = used[used.view == view]
-        index, weight = spline_weights(o.pixels, grid.spacing, shape)
-        field = np.zeros((len(o), 2, 4 * n))
+        field = np.zeros((len(o), 2, 4, n))
         for axis in (0, 1):
-            np.put_along_axis(field[:, axis], (2 * o.camera[:, None] + axis) * n + index, weight, axis=1)
-        rows, of_view, _ = problem.seeing(o, extra).rows(refinement.model, field)
+            field[np.arange(len(o)), axis, 2 * o.camera + axis] = grid.splines(o.pixels)
+        rows, of_view, _ = problem.seeing(o, extra).rows(refinement.model, field.reshape(len(o), 2, -1))
         rest = eliminate(rows[of_view == view], 6 if problem.motion is None else 12)[1]
         yield rest.T @ rest
 

@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose
 from scipy.interpolate import BSpline
 
 from calibration import StereoRig, Terms, refine_stereo, triangulate
-from calibration.cameras.splines import spline_weights
+from calibration.cameras.splines import LensField
 from calibration.fit.lens_field import fit_lens_field
 
 SIGMA = 0.004  # [px] of good corners
@@ -32,14 +32,14 @@ def refined(scene_maker):
     return scene, [refine_stereo(seen, scene.model, scene.board.points, TERMS) for seen in (o, bent)]
 
 
-def test_weights_are_those_of_cubic_splines(rng):
-    pixels, spacing, shape = rng.uniform(0, 300, (20, 2)), 100.0, (6, 6)
-    index, weight = spline_weights(pixels, spacing, shape)
+def test_a_field_is_of_cubic_splines_whose_first_node_lies_one_spacing_before_the_image(rng):
+    pixels, field = rng.uniform(0, 300, (20, 2)), LensField(rng.normal(size=(2, 2, 6, 6)), 100.0)
     b = BSpline.basis_element(np.arange(5.0), extrapolate=False)
-    for point, k, w in zip(pixels, index, weight, strict=True):
-        x, y = (point / spacing)[:, None] - np.stack([k % shape[1], k // shape[1]]) + 3
-        assert_allclose(w, np.nan_to_num(b(x)) * np.nan_to_num(b(y)), atol=1e-12)
-    assert_allclose(weight.sum(axis=1), 1.0)
+    x, y = (np.nan_to_num(b(place[:, None] / 100.0 - np.arange(6) + 3)) for place in pixels.T)
+    weight = y[:, :, None] * x[:, None]
+    assert_allclose(field.splines(pixels).reshape(20, 6, 6), weight, atol=1e-12)
+    displacement = np.einsum("nyx,ayx->na", weight, field.coefficients[1])
+    assert_allclose(field.displacement(pixels, 1), displacement, atol=1e-12)
 
 
 def test_field_is_found_and_the_geometry_is_better_for_it(refined):
