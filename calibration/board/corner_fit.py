@@ -203,14 +203,10 @@ def _line_curvature(points: Array, ok: Mask, angles: Array, inner_corners: tuple
             use = line[ok[line]]
             if len(use) < 4:
                 continue
-            centre = points[use].mean(0)
             direction = points[use[-1]] - points[use[0]]
             direction = direction / np.linalg.norm(direction)
-            d = points[use] - centre
-            along, across = d @ direction, d @ np.array([-direction[1], direction[0]])  # both of mean 0
-            square = along * along
-            square = square - square.mean() - (square @ along) / square.sum() * along  # what a line leaves of it
-            bend = (square @ across) / (square @ square)
+            d = points[use] - points[use].mean(0)
+            bend = np.polyfit(d @ direction, d @ np.array([-direction[1], direction[0]]), 2)[0]
             # an edge angle may point either way along its line, the kernel's normal follows it
             edge = np.stack([np.cos(angles[line, axis]), np.sin(angles[line, axis])], axis=-1)
             curvature[line, axis] = bend * np.sign(edge @ direction)

@@ -1,7 +1,6 @@
 """The calibration views of a recording, or of two file patterns, brought to the calibration."""
 
 import hashlib
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -92,10 +91,20 @@ def find_views(
         18
     """
     sides = [views_of(pattern, Path(folder), camera) for pattern, camera in zip((left, right), CAMERAS, strict=True)]
-    views = TargetImages(sides[0], sides[1], fields, parts)
     numbers = [[view.index if isinstance(view, FrameView) else file_number(view) for view in side] for side in sides]
-    if numbers[0] != numbers[1] or len(sides[0]) != len(sides[1]):
-        _refuse_unpaired(views, numbers)
+    alone = [
+        [view.name for view, number in zip(side, own, strict=True) if number not in other]
+        for side, own, other in zip(sides, numbers, reversed(numbers), strict=True)
+    ]
+    views = TargetImages(sides[0], sides[1], fields, parts)
+    # where no number is in common, the two cameras count from different starts
+    if len(sides[0]) != len(sides[1]) or 0 < len(alone[0]) < len(sides[0]):
+        odd = [f"{camera} {', '.join(names[:3])}" for camera, names in zip(CAMERAS, alone, strict=True) if names]
+        raise RecordingError(
+            f"{views.place}: {len(sides[0])} left and {len(sides[1])} right calibration views do not pair up"
+            + (f": without a partner are {' and '.join(odd)}" if odd else "")
+            + ". Views are pairs, one image of each camera: add the missing ones, or move these away."
+        )
     return views
 
 
@@ -120,23 +129,6 @@ def views_of(pattern: str, folder: Path, camera: str, most: float = MOST_VIEWS) 
             f"Export at most {most} of them; 15 to 40 in different places are enough."
         )
     return tuple(FrameView(files[0], reader, index) for index in range(len(reader)))
-
-
-def _refuse_unpaired(views: TargetImages, numbers: Sequence[Sequence[int | None]]) -> None:
-    """Different counts are an error; equal counts are, too, where the numbers overlap but for a few."""
-    files = views.left, views.right
-    alone = [
-        [file for file, number in zip(files[c], numbers[c], strict=True) if number not in numbers[1 - c]]
-        for c in (0, 1)
-    ]
-    if len(files[0]) == len(files[1]) and len(alone[0]) in (0, len(files[0])):
-        return  # no number in common: the two cameras count from different starts
-    odd = [f"{CAMERAS[c]} {', '.join(file.name for file in alone[c][:3])}" for c in (0, 1) if alone[c]]
-    raise RecordingError(
-        f"{views.place}: {len(files[0])} left and {len(files[1])} right calibration views do not pair up"
-        + (f": without a partner are {' and '.join(odd)}" if odd else "")
-        + ". Views are pairs, one image of each camera: add the missing ones, or move these away."
-    )
 
 
 @checked
