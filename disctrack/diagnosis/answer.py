@@ -26,11 +26,6 @@ class Learned(Found):
     course: Course | None  # of the moment about the contact of all laws, with what the law's form may be off by
     misfit: float  # rms of that over the law's own, as the residual has it
 
-    @property
-    def is_moment(self) -> bool:
-        """Is it no force?"""
-        return all(component.startswith("M") for component in self.law.formulas)
-
     def text(self, fit: Fit) -> str:
         """The law with its numbers; where these do not stand out, its course alone is known."""
         if self.course is not None and not self.law.stands_out(fit):

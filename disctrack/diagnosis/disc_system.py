@@ -12,7 +12,7 @@ from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
 from calibration.kit.arrays import Array
 from calibration.kit.least_squares import triangle
-from disctrack.diagnosis.missing_force import DiscScan, law_of, scanned
+from disctrack.diagnosis.missing_force import DiscScan, law_of, responding
 from disctrack.diagnosis.motion import (
     SLIP,
     SLIP_VELOCITY,
@@ -244,7 +244,8 @@ class DiscSystem(LawSystem):
 
     def scan(self, fitted: Fit, beside: Sequence[Quantity] | None = None) -> DiscScan | None:
         """See LawSystem; None where the disc slips."""
-        return scanned(self, fitted, beside)
+        along = responding(self, fitted)
+        return None if along is None else DiscScan(self, fitted, beside, along)
 
     def law(self, families: Sequence[Family], values: Array) -> LearnedLaw:
         """See LawSystem."""

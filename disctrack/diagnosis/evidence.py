@@ -10,7 +10,6 @@ from disctrack.analyse.quantities import COLUMN, energy_of, from_to, propagate
 from disctrack.diagnosis.answer import DiscDiagnosis
 from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.diagnosis.errors import HALF_WINDOW, Ahead, energy_balance, free_run, simulated
-from disctrack.diagnosis.form_misfit import moment_about_contact
 from disctrack.diagnosis.missing_force import Course, missing_moment, probe
 from disctrack.diagnosis.stretch import MIN_FRAMES
 from disctrack.discrepancy.fit import Fit
@@ -31,7 +30,7 @@ class Evidence:
     energy_lost: Measured | None  # likewise
     force: Course | None  # [N] from the poses alone, minus that of the model before
     moment: Course | None  # [N m] that the model before fails to supply
-    moment_of_law: Course | None  # that what was found adds, read in the same way; of a learned moment the whole
+    moment_of_law: Course | None  # that what was found adds, read in the same way
     energy_before: dict[str, float]  # [J]
     ahead: tuple[tuple[Ahead, Ahead], ...]  # of the models before and after: errors of free runs
 
@@ -47,10 +46,6 @@ def evidence(result: DiscDiagnosis) -> Evidence:
         if blocks is not None:
             moment, scale = missing_moment(blocks)
             of_law = None if added is None else missing_moment(added, scale)[0]
-    if (learned := result.learned) is not None and learned.is_moment:
-        values, own = result.diagnosis.after.values, {learned.law.candidate.effect}
-        whole = moment_about_contact(system, values, simulated(system, values), own)
-        of_law = Course(system.time, whole, np.zeros_like(whole))
     energy = energy_balance(system, before.values) if before.converged else {}
     return Evidence(*_measured(system, before), moment, of_law, energy, _ahead(result))
 

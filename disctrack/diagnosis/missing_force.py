@@ -98,7 +98,7 @@ def missing_moment(blocks: Probed, scale: float | None = None) -> tuple[Course, 
 
 def what_is_missing(system: DiscSystem, fit_: Fit) -> str:
     """The missing moment in words, and the angle or rate that it goes with; empty where the disc slips."""
-    blocks, scan = probe(system, fit_), scanned(system, fit_)
+    blocks, scan = probe(system, fit_), system.scan(fit_)
     if blocks is None or scan is None:
         return ""
     missing, _ = missing_moment(blocks)
@@ -232,12 +232,6 @@ class DiscScan:
             gram = before - taken[:, own].T @ taken[:, own]
             found.append(proposal(family, gram, np.diag(before), right[own]))
         return found
-
-
-def scanned(system: DiscSystem, fit_: Fit, beside: Sequence[Quantity] | None = None) -> DiscScan | None:
-    """See `LawSystem.scan`; None where the disc slips."""
-    along = responding(system, fit_)
-    return None if along is None else DiscScan(system, fit_, beside, along)
 
 
 def law_of(model: Model, chosen: Sequence[Family], values: Array) -> LearnedLaw:

@@ -128,10 +128,6 @@ def smooth_field(places: Array, length: float, sigmas: float) -> SmoothField:
     counts = np.maximum(np.ceil((high - low) / length).astype(int) + 1, 2)
     x, y = (np.linspace(a, b, int(n)) for a, b, n in zip(low, high, counts, strict=True))
     centres = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
-    near = np.zeros(len(centres), bool)  # the bumps that no dot comes near to would all be one mode without effect
-    for block in np.array_split(places, max(1, len(places) // 4096)):
-        near |= np.any(np.sum((block[:, None] - centres) ** 2, axis=-1) < (2.5 * length) ** 2, axis=0)
-    centres = centres[near]
     bumps = _bumps(places, centres, length)
     gram = bumps.T @ bumps
     size = float(np.sqrt(np.trace(gram) / len(places)))  # rms of the sum of bumps with weights of unit variance

@@ -25,11 +25,7 @@ MISSING_MOMENT = (
     "dots to lie where they did. A missing force, inertia or an error of the measurement shows as the moment that does "
     "the same."
 )
-OF_LAW = (
-    " Blue is what was found, computed in the same way: within the band it is what was missing.",
-    " Blue, for a law outside the catalogue, is the whole of its moment; red holds only what the start and the other "
-    "fitted numbers cannot absorb, so that a steady part, along n0 above all, is smaller in red.",
-)
+OF_LAW = " Blue is what was found, computed in the same way: within the band it is what was missing."
 MISSING_FORCE = (
     "Force on the disc, measured minus that of the model before: mass times the acceleration of the centre, from the "
     "poses alone."
@@ -193,7 +189,7 @@ def _missing(result: DiscDiagnosis, beside: Evidence) -> list[Drawn]:
     found, learned = list[Drawn](), result.learned
     if beside.moment is not None:
         law = beside.moment_of_law if result.has_more else None
-        of_law = "" if law is None else OF_LAW[learned is not None and learned.is_moment]
+        of_law = "" if law is None else OF_LAW
         figure = _along_the_contact(beside.moment, law, "missing", 1e6, "µN m")
         found.append(Drawn("missing_moment", "The missing moment", f"{MISSING_MOMENT}{of_law}", figure))
     if beside.force is not None:
