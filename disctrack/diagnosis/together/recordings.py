@@ -123,33 +123,27 @@ class DiscMember:
         trajectory = with_noise(as_tracked, _noise(as_tracked))  # recordings are weighed by it
         declared = declared_model(trajectory, model)
         self.system = DiscSystem(trajectory, declared.model, known=declared.faults)
-        systematic = find_systematic(self.system)
-        assumed = find_large(as_tracked, self.system, systematic)
+        self.systematic = find_systematic(self.system)
+        assumed = find_large(as_tracked, self.system, self.systematic)
         if assumed is not None:
             names = ", ".join(c.title for c in assumed.candidates)
             raise AnalysisError(f"its dots show a large fault of the measurement ({names}): diagnose it alone")
-        self._prepare(systematic)
 
-    def _prepare(self, systematic: Systematic) -> None:
+    def told(self) -> tuple[Mapping[str, str], Systematic, list[Array]]:
+        """What the others need of it: its labels, its systematic errors, and places of dots per camera [px]."""
+        rows = np.unique(np.linspace(0, len(self.system.time) - 1, SEEN_PLACES).astype(int))
+        used, places = self.system.used[rows], self.system.observed[rows]
+        return self.labels, self.systematic, [places[:, c][used[:, c]] for c in range(2)]
+
+    def with_common(self, systematic: Systematic) -> Member:
+        """The member, fitted alone with systematic errors that it has in common with others. Raises AnalysisError."""
         self.system = system = self.system.again(systematic=systematic)
         self.base = fit(system, system.base, system.start())
         if not self.base.converged:
             raise AnalysisError(
                 f"the rolling model cannot be fitted to it alone (chi-square {self.base.reduced_chi_square:.3g})"
             )
-        self.member = self._member()
-
-    def told(self) -> tuple[Member, Systematic, list[Array]]:
-        """What the others need of it: itself as a member, its systematic errors, and places of dots per camera [px]."""
-        rows = np.unique(np.linspace(0, len(self.system.time) - 1, SEEN_PLACES).astype(int))
-        used, places = self.system.used[rows], self.system.observed[rows]
-        return self.member, self.system.systematic, [places[:, c][used[:, c]] for c in range(2)]
-
-    def with_common(self, systematic: Systematic) -> Member:
-        """The member with systematic errors that it has in common with others."""
-        if systematic != self.system.systematic:
-            self._prepare(systematic)
-        return self.member
+        return self._member()
 
     def share(self, own: Sequence[str]) -> None:
         """These quantities are its own, all others of the base are shared."""
@@ -223,15 +217,15 @@ def _noise(trajectory: Trajectory) -> float:
     return ratio if abs(ratio - 1.0) > SURE * np.sqrt(2 * (1 + THIRD) / max(numbers, 1.0)) else 1.0
 
 
-def in_common(told: Sequence[tuple[Member, Systematic, list[Array]]]) -> list[Systematic]:
+def in_common(told: Sequence[tuple[Mapping[str, str], Systematic, list[Array]]]) -> list[Systematic]:
     """The systematic errors as recordings of one rig, or of one disc, have them in common: the largest that one shows.
 
     What one recording is too short to show is there in it all the same.
     """
     common: list[Systematic] = []
-    for member, mine, _ in told:
-        rigs = [(s, p) for m, s, p in told if m.labels["rig"] == member.labels["rig"]]
-        discs = [s for m, s, _ in told if m.labels["disc"] == member.labels["disc"]]
+    for labels, mine, _ in told:
+        rigs = [(s, p) for of, s, p in told if of["rig"] == labels["rig"]]
+        discs = [s for of, s, _ in told if of["disc"] == labels["disc"]]
         lens = max((s for s, _ in rigs), key=lambda s: s.lens_px)
         dots = max((s for s, _ in rigs), key=lambda s: s.dot_px)
         fields: tuple[Any, ...] = ()

@@ -105,7 +105,7 @@ def answer_together(
 ) -> TogetherDiagnosis:
     """What does the model lack, of all the crew's recordings together?
 
-    crew : objects with the methods `told` (a Member first of all), `with_common`, `share`, `reduce` and `alone`
+    crew : objects with the methods `told`, `with_common` (a Member), `share`, `reduce` and `alone`
     described : name and labels of each
     in_common : of all that was told, what each is then given by `with_common`: errors that it shares with others
     unread : further recordings that are reported as left out, and why
