@@ -8,6 +8,7 @@ from disctrack.discrepancy.noise import SampleStretch, SmoothNoise, estimate
 from disctrack.examples._command import GRAVITY
 from disctrack.examples.ball_drop import DRAGS, OTHERS, analyse_drops, ask, drop, read_drops, report
 
+pytestmark = pytest.mark.statistical
 TIME = np.arange(45) / 15.0
 BALLS = {"foam": 0.0405, "rubber": 0.038, "lead": 0.00047}  # deceleration over v^2 [1/m]
 
@@ -41,7 +42,6 @@ def drops(rng, sigma, law, smooth=0.0):
     ]
 
 
-@pytest.mark.statistical
 def test_noise_with_a_memory_is_measured(rng):
     truth = SmoothNoise(0.05, 0.2, 0.5)
     root = np.linalg.cholesky(truth.covariance(TIME))
@@ -55,7 +55,6 @@ def test_noise_with_a_memory_is_measured(rng):
     assert found.memory == pytest.approx(truth.memory, rel=0.3)
 
 
-@pytest.mark.statistical
 def test_quadratic_drag_is_named_and_sized_where_heights_are_good(rng):
     found = analyse_drops(drops(rng, 2e-3, fallen))
     assert found.together.verdict == "found"
@@ -76,7 +75,6 @@ def test_quadratic_drag_is_named_and_sized_where_heights_are_good(rng):
     assert_allclose(seen["rubber,2"].seen[:, 0], h + 1e-3 * (h - 30) ** 2, atol=1e-7)
 
 
-@pytest.mark.statistical
 def test_free_fall_lacks_nothing(rng):
     for smooth in (0.0, 0.15):
         found = analyse_drops(drops(rng, 0.05, free, smooth))
@@ -84,7 +82,6 @@ def test_free_fall_lacks_nothing(rng):
         assert all(d.verdict == "nothing missing" for d in found.alone.values())
 
 
-@pytest.mark.statistical
 def test_the_drag_of_these_balls_is_certain_and_its_form_is_not_identifiable(answer):
     assert answer.together.verdict == "found"
     assert answer.together.diagnosis.before.reduced_chi_square == pytest.approx(13.23, abs=0.01)
@@ -97,7 +94,6 @@ def test_the_drag_of_these_balls_is_certain_and_its_form_is_not_identifiable(ans
     assert answer.forms["quadratic_drag",] > 50
 
 
-@pytest.mark.statistical
 def test_errors_on_the_second_drops_are_those_that_others_found(answer):
     """Medians of the published data by least squares, as listed in PROVENANCE.md to 0.01 m."""
     reference = {
@@ -110,7 +106,6 @@ def test_errors_on_the_second_drops_are_those_that_others_found(answer):
         assert np.all(np.abs(answer.errors[name] - [whole, forecast]) < [0.01, 0.03])
 
 
-@pytest.mark.statistical
 def test_heavy_balls_lack_nothing_and_light_ones_lack_drag(answer):
     for name in ("Bowling Ball", "Golf Ball", "Baseball"):
         assert answer.alone[name].verdict == "nothing missing"
@@ -119,7 +114,6 @@ def test_heavy_balls_lack_nothing_and_light_ones_lack_drag(answer):
         assert answer.alone[name].found[0].endswith("_drag")
 
 
-@pytest.mark.statistical
 def test_shuffled_residuals_of_the_balls_give_no_finding(answer, rng):
     shuffled = []
     for stretch, seen in answer.together.predicted(answer.together.diagnosis.after):

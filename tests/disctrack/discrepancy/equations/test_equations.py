@@ -215,11 +215,11 @@ def test_a_motor_that_runs_up_at_a_limited_current_is_not_led_astray(rng):
 
     The limit is learned as a law of the speed, beyond both of them as declared.
     """
-    time = np.arange(0, 3, 0.002)
-    angle = motion(lambda t, y: [y[1], min(600.0, (900.0 - y[1]) / 0.6)], [0.0, 0.0], time, max_step=0.01)[0]
-    motor = Equations({"angle": "w", "w": "(w_end - w)/tau"}, {"w_end": 500.0, "tau": 0.5}, units={"angle": "rad"})
-    run = Run(time, {"angle": angle + 0.02 * rng.standard_normal(len(time))}, known={"w": 0.0})
-    answer = diagnose(motor, run, [terms.coulomb("w")])
+    answer = case(
+        ({"angle": "w", "w": "(w_end - w)/tau"}, {"w_end": 500.0, "tau": 0.5}),
+        ({"angle": "w", "w": "Min(600, (900 - w)/0.6)"}, [0.0, 0.0]), (np.arange(0, 3, 0.002), {"angle": 0.02}),
+        [terms.coulomb("w")], {}, known={"w": 0.0}, by={"max_step": 0.01},
+    )[0](rng)  # fmt: skip
     law = answer.law
     truth = np.minimum(600.0, (900.0 - law.variable) / 0.6) - (500.0 - law.variable) / 0.5
     assert answer.found == ("learned",)
@@ -229,13 +229,12 @@ def test_a_motor_that_runs_up_at_a_limited_current_is_not_led_astray(rng):
 
 @pytest.mark.statistical
 def test_a_sensor_off_its_zero_that_loses_the_motion_at_once_is_told(rng):
-    time = np.arange(0, 12, 0.02)
-    drive = np.cos(6.0 * time)
-    x = motion(lambda t, y: [y[1], -49 * y[0] - 0.4 * y[1] + 10 * np.cos(6.0 * t)], [0.0, 0.0], time)[0] + 1.5
-    run = Run(time, {"x": x + 1e-3 * rng.standard_normal(len(time))}, inputs={"drive": drive})
-    numbers = {"w": 6.5, "b": 0.15, "g": 12.0}
-    told = " ".join(diagnose(Equations({"x": "v", "v": "-w**2*x - 2*b*v + g*drive"}, numbers, inputs=["drive"]), run,
-                             [terms.coulomb("v"), terms.sensor_offset("x")]).notes)  # fmt: skip
+    answer = case(
+        ({"x": "v", "v": "-w**2*x - 2*b*v + g*drive"}, {"w": 6.5, "b": 0.15, "g": 12.0}),
+        ({"x": "v", "v": "-49*(x - 1.5) - 0.4*v + 10*drive"}, [1.5, 0.0]), (np.arange(0, 12, 0.02), {"x": 1e-3}),
+        [terms.coulomb("v"), terms.sensor_offset("x")], {}, {"drive": lambda t: np.cos(6.0 * t)},
+    )[0](rng)  # fmt: skip
+    told = " ".join(answer.notes)
     assert "with offset_x it follows" in told
     assert "coulomb" not in told
 
@@ -406,42 +405,25 @@ def test_where_derivatives_have_no_end_it_is_said(rng):
         diagnose(Equations({"h": "-k*sqrt(Max(h, 0))"}, {"k": 0.06}), Run(time, {"h": level}, 1e-3))
 
 
-@pytest.fixture(scope="module")
-def tank():
+def tank(offered, sized):
     """A tank that overflows, filled by a multisine whose slowest line is the strongest; after a public benchmark."""
-    time = np.arange(0, 800, 1.0)
-    rng = np.random.default_rng(8)
-    lines = np.arange(1, 41) / 800.0
+    lines, phase = np.arange(1, 41) / 800.0, np.random.default_rng(8).uniform(0, 2 * np.pi, 40)
     size = np.where(np.arange(40) == 0, 0.08, 0.05)
-    phase = rng.uniform(0, 2 * np.pi, len(lines))
-
-    def pump(t):
-        return 1.0 + np.cos(2 * np.pi * np.asarray(t)[..., None] * lines + phase) @ size
-
-    y = motion(lambda t, y: [-0.5 * y[0] + pump(t) - 2.0 * max(y[0] - 2.3, 0.0)], [2.0], time, max_step=0.5)[0]
-    assert 0.1 < np.mean(y > 2.3) < 0.5
-    assert y[0] < 2.3
-    equations = Equations({"y": "-k*y + pump"}, {"k": 0.6}, inputs=["pump"], observed={"level": "y"})
-    return equations, Run(time, {"level": y + 2e-3 * rng.standard_normal(len(time))}, inputs={"pump": pump(time)})
+    return case(
+        ({"y": "-k*y + pump"}, {"k": 0.6}), ({"y": "-0.5*y + pump - 2*Max(y - 2.3, 0)"}, [2.0]),
+        (np.arange(0, 800, 1.0), {"y": 2e-3}), offered, sized,
+        {"pump": lambda t: 1.0 + np.cos(2 * np.pi * np.asarray(t)[..., None] * lines + phase) @ size},
+        by={"max_step": 0.5},
+    )  # fmt: skip
 
 
 @pytest.mark.statistical
-def test_what_sets_in_within_a_run_is_found_beside_a_term_that_names_the_channel(tank):
-    """The overflow moves nothing before it begins: its derivative starts from nought at a kink."""
-    equations, run = tank
-    overflow = Term("overflow", {"y": "-o*Max(y - top, 0)"}, parameters={"o": 0.0, "top": Parameter(2.2, shape=True)})
-    answer = diagnose(equations, run, [overflow, terms.sensor_scale("level"), terms.sensor_offset("level")])
-    assert_found(answer, ("overflow",), {"k": 0.5, "overflow.o": 2.0, "overflow.top": 2.3})
-
-
-@pytest.mark.statistical
-def test_what_lasts_as_long_as_the_data_themselves_is_no_noise(tank):
+def test_what_lasts_as_long_as_the_data_themselves_is_no_noise(rng):
     """The strongest line of a driven motion may be the slowest: how fast the data change is told by their memory.
 
     It is no noise but a law of the level: the overflow, which nobody offered.
     """
-    equations, run = tank
-    answer = diagnose(equations, run, [terms.sensor_drift("level")])
+    answer = tank([terms.sensor_drift("y")], {})[0](rng)
     law = answer.law
     truth = 0.1 * law.variable - 2.0 * np.maximum(law.variable - 2.3, 0.0)  # beyond k as declared
     assert answer.found == ("learned",)
@@ -568,6 +550,12 @@ CASES = {
         (np.arange(0, 40, 0.2), {"x": 0.05, "y": 0.05}),
         [*terms.products("x", ["x", "y"], 2), *terms.products("y", ["x", "y"], 2)], {"x_gets_x_x.amount": -0.02},
         told="whole runs",
+    ),
+    # which moves nothing before it begins: its derivative starts from nought at a kink, beside terms of the channel
+    "an overflow": tank(
+        [Term("overflow", {"y": "-o*Max(y - top, 0)"}, parameters={"o": 0.0, "top": Parameter(2.2, shape=True)}),
+         terms.sensor_scale("y"), terms.sensor_offset("y")],
+        {"k": 0.5, "overflow.o": 2.0, "overflow.top": 2.3},
     ),
     "a ball on a stiff contact": bouncing(4e4),
     "a ball on a stiffer one": bouncing(4e6),

@@ -10,6 +10,7 @@ from scipy.integrate import solve_ivp
 from disctrack.discrepancy.equations import Equations, Run, diagnose, terms
 from disctrack.discrepancy.equations.law import NAME
 
+pytestmark = pytest.mark.statistical
 OSCILLATOR = Equations({"x": "v", "v": "-omega**2*x - 2*beta*v"}, {"omega": 11.5, "beta": 0.12}, units={"x": "m"})
 DECLARED = {"x": 11.5**2, "v": 0.24, "t": 0.0}  # what the declared equations pull back with, by variable
 TRUE = {"x": 144.0, "v": 0.3, "t": 0.0}
@@ -51,7 +52,6 @@ def recorded(force, seed, sigma=SIGMA):
 QUICK = ("a drag that saturates", "a spring of a table", "an odd friction", "a push by time")
 
 
-@pytest.mark.statistical
 @pytest.mark.parametrize("name", [pytest.param(n, marks=() if n in QUICK else pytest.mark.slow) for n in LAWS])
 def test_a_law_of_one_variable_is_learned(name):
     """Within 3 sigma of the true force nearly everywhere, on a course that it does not follow by being open."""
@@ -71,7 +71,6 @@ def test_a_law_of_one_variable_is_learned(name):
         assert answer.after["x"].rms == pytest.approx(SIGMA, rel=0.1)
 
 
-@pytest.mark.statistical
 @pytest.mark.parametrize("name", KNOWN)
 def test_known_terms_stay_named_where_they_act(name):
     force, names = KNOWN[name]
@@ -85,7 +84,6 @@ def test_known_terms_stay_named_where_they_act(name):
     assert any("one law describes the data in place of" in note for note in answer.notes)
 
 
-@pytest.mark.statistical
 def test_a_law_beside_a_known_term():
     """A wavy spring and a sensor whose zero drifts: neither alone is noise."""
     run = recorded(lambda x, v, t: -9 * np.sin(6 * x), seed=13)
@@ -96,7 +94,6 @@ def test_a_law_beside_a_known_term():
     assert abs(answer.values["drift_X.b"] - 0.01) < 3.5 * answer.sigmas["drift_X.b"]
 
 
-@pytest.mark.statistical
 def test_a_law_is_a_force_where_a_mass_matrix_is_declared(rng):
     """A cart whose friction saturates carries a pendulum; M and the law are those that the motion was made with."""
     time = np.arange(0, 8, 0.01)
@@ -126,7 +123,6 @@ def test_a_law_is_a_force_where_a_mass_matrix_is_declared(rng):
     assert abs(answer.values["M"] - 1) < 3.5 * answer.sigmas["M"]
 
 
-@pytest.mark.statistical
 def test_the_law_is_told_on_the_page_and_in_json(tmp_path):
     variable, force = LAWS["a drag that saturates"]
     assert variable == "v"
@@ -145,7 +141,6 @@ def test_the_law_is_told_on_the_page_and_in_json(tmp_path):
     assert "a force on v that is a function of v, learned from what is left" in page.read_text()
 
 
-@pytest.mark.statistical
 def test_a_law_that_leaves_more_than_the_sensor_scatters_is_no_finding_and_foretells():
     """A good sensor sees a drive that nothing describes; beside known terms the law still comes nearest."""
     run = recorded(lambda x, v, t: -1.5 * np.tanh(v / 1e-3) - 0.3 * np.sin(v) + 0.03 * np.sin(1.3 * t), 16, 1e-5)
