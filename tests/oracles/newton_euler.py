@@ -269,20 +269,18 @@ def pivoting_friction(k_z):
     return lambda disc, now: (ZERO, -k_z * np.sign(now.omega[2]) * K, ZERO)
 
 
-def classical_rolling_friction(delta):
-    def law(disc, now):
-        horizontal = now.omega - now.omega[2] * K
-        return ZERO, -delta * horizontal / np.linalg.norm(horizontal), ZERO
+def rolling(now):
+    """Direction of the horizontal angular velocity."""
+    horizontal = now.omega - now.omega[2] * K
+    return horizontal / np.linalg.norm(horizontal)
 
-    return law
+
+def classical_rolling_friction(delta):
+    return lambda disc, now: (ZERO, -delta * rolling(now), ZERO)
 
 
 def adhesive_rolling_friction(a):
-    def law(disc, now):
-        horizontal = now.omega - now.omega[2] * K
-        return -a * horizontal / np.linalg.norm(horizontal), ZERO, ZERO
-
-    return law
+    return lambda disc, now: (-a * rolling(now), ZERO, ZERO)
 
 
 def spring(k, point=(0.0, 0.0)):

@@ -20,7 +20,7 @@ from scipy.interpolate import CubicHermiteSpline
 from disctrack.synthetic.description import Scene
 from tests.oracles import newton_euler
 from tests.oracles.measured_disc import K_M, measured
-from tests.oracles.newton_euler import ZERO, K
+from tests.oracles.newton_euler import ZERO, K, rolling
 
 DISC = Scene().declared_disc
 RATE = 500.0
@@ -71,12 +71,6 @@ def moment(of):
     return lambda disc, now: (of(disc, now), ZERO, ZERO)
 
 
-def rolling(now):
-    """Direction of the horizontal angular velocity."""
-    horizontal = now.omega - now.omega[2] * K
-    return horizontal / np.linalg.norm(horizontal)
-
-
 def uneven(gradient):
     """A table that is not flat: the weight times the slope under the contact, as a moment by the motion of the contact.
 
@@ -108,14 +102,14 @@ def hill(x, y, height, width):
     return gradient
 
 
-def groove(angle, offset, depth, width):
+def across(angle, offset, slope):
+    """A table that differs along one direction alone, by its slope there."""
     normal = level(angle)[:2]
+    return lambda A: slope(A[:2] @ normal - offset) * normal
 
-    def gradient(A):
-        s = A[:2] @ normal - offset
-        return 2 * s / width**2 * depth * np.exp(-((s / width) ** 2)) * normal
 
-    return gradient
+def groove(angle, offset, depth, width):
+    return across(angle, offset, lambda s: 2 * s / width**2 * depth * np.exp(-((s / width) ** 2)))
 
 
 def magnets(*places):
@@ -160,13 +154,7 @@ def over_iron(strength):
 
 def seam(angle, offset, height, width):
     """Two halves of a table, one higher than the other."""
-    normal = level(angle)[:2]
-
-    def gradient(A):
-        s = (A[:2] @ normal - offset) / width
-        return height / (width * np.sqrt(np.pi)) * np.exp(-s * s) * normal
-
-    return gradient
+    return across(angle, offset, lambda s: height / (width * np.sqrt(np.pi)) * np.exp(-((s / width) ** 2)))
 
 
 def nail(strength, place):
