@@ -57,7 +57,7 @@ def rolling_onset(found: Propagated, until: float = np.inf) -> RollingOnset:
         why = "not determined: the contact velocity is not known in any two frames"
         return RollingOnset(*(float("nan"),) * 6, n_late_slips=0, verdict=why)
     v = found.value[frames, SLIP]
-    C = found.covariance_at(frames, SLIP) + found.covariance_at(frames, SLIP, shared=True)
+    C = found.covariance(frames, SLIP) + found.covariance(frames, SLIP, shared=True)
     interval = float(np.median(np.diff(motion.time)))
     share = np.minimum(1.0, interval / (INDEPENDENT_AFTER_LENGTHS * motion.length.min(axis=1)[frames]))
     sizes = np.geomspace(4 * SLIP_TOLERANCE, 10.0, 60)
@@ -131,7 +131,7 @@ def locus_circle(found: Propagated, duration: float, until: float = np.inf) -> C
     gain = by_distance[2]
     rms = float(np.sqrt(np.mean((distance - radius) ** 2)))
     independent = min(len(frames), max(4.0, arc / np.pi))
-    noise = found.covariance_at(frames, PLACE).sum(axis=(1, 2)).mean() / 2
+    noise = found.covariance(frames, PLACE).sum(axis=(1, 2)).mean() / 2
     variance = gain @ gain * len(frames) / independent * max(rms**2, float(noise))
     sensitivity = found.jacobian[frames, PLACE] @ motion.calibration_sensitivity[frames]
     per_rig = gain @ np.einsum("ni,nir->nr", J[:, :2], sensitivity)

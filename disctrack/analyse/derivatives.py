@@ -16,7 +16,6 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.cameras.camera import N_RIG
 from calibration.kit.arguments import checked
 from calibration.kit.arrays import Array, Mask
 from calibration.kit.brief import Outline
@@ -179,7 +178,9 @@ def _between(breaks: Sequence[float], time: Array, good: Mask) -> list[slice]:
 def _differentiated(trajectory: Trajectory, good: Mask) -> MeasuredMotion:
     """Without breaks. good : (n,) frames with a pose"""
     samples = _Samples(trajectory, good)
-    processes = _fit_groups(samples)
+    segments, centres = _segments(samples)
+    groups = ([(t, d[list(g)], v[list(g)]) for t, d, v in segments] for g in CHANNEL_GROUPS)
+    processes = tuple(fit_process(group, centres, len(samples.ticks)) for group in groups)
     state, R, covariance, sensitivity = _smoothed(samples, processes)
     per_order = samples.interval ** -np.arange(3.0)
     state *= per_order[:, None]
@@ -264,13 +265,6 @@ def _require_samples(time: Array, good: Mask) -> None:
         )
 
 
-def _fit_groups(samples: _Samples) -> tuple[Process, ...]:
-    """One process per group of CHANNEL_GROUPS."""
-    segments, centres = _segments(samples)
-    groups = [[(t, d[list(g)], v[list(g)]) for t, d, v in segments] for g in CHANNEL_GROUPS]
-    return tuple(fit_process(group, centres, len(samples.ticks)) for group in groups)
-
-
 def _segments(samples: _Samples) -> tuple[list[tuple[Array, Array, Array]], Array]:
     """Overlapping segments (times, data, variance), and the middles that they stand for."""
     n = len(samples.ticks)
@@ -313,18 +307,16 @@ def _smoothed(samples: _Samples, processes: tuple[Process, ...]) -> tuple[Array,
 
     NaN in a gap where the samples around it leave more than KNOWN_FRACTION of the slope's own variance open.
     """
-    n = len(samples.ticks)
     half = int(np.ceil(HALF_WINDOW_LENGTHS * max(p.length.max() for p in processes)))
     scale = np.zeros(6)
     for group, process in zip(CHANNEL_GROUPS, processes, strict=True):
         scale[list(group)] = np.sqrt(process.noise_scale)
-    noise = samples.covariance * np.outer(scale, scale)
-    out = np.empty((n, 3, 6)), np.empty((n, 3, 3)), np.empty((n, 18, 18)), np.empty((n, 18, N_RIG))
-    for first in range(0, n, FRAMES_AT_ONCE):  # the windows of all frames at once would be larger than all the rest
-        rows = np.arange(first, min(first + FRAMES_AT_ONCE, n))
-        for whole, found in zip(out, _smoothed_rows(samples, noise, processes, half, rows), strict=True):
-            whole[rows] = found
-    return out
+    noise, rows = samples.covariance * np.outer(scale, scale), np.arange(len(samples.ticks))
+    # the windows of all frames at once would be larger than all the rest
+    parts = np.split(rows, range(FRAMES_AT_ONCE, len(rows), FRAMES_AT_ONCE))
+    found = (_smoothed_rows(samples, noise, processes, half, part) for part in parts)
+    state, R, covariance, sensitivity = map(np.concatenate, zip(*found, strict=True))
+    return state, R, covariance, sensitivity
 
 
 def _smoothed_rows(

@@ -131,12 +131,7 @@ class Propagated:
     jacobian: Array  # (n, k, 18) d value / d STATE
     motion: MeasuredMotion
 
-    @property
-    def covariance(self) -> Array:
-        """(n, k, k) noise."""
-        return self.covariance_at(np.arange(len(self.value)))
-
-    def covariance_at(self, frames: NDArray[np.int64], columns: slice = slice(None), shared: bool = False) -> Array:
+    def covariance(self, frames: NDArray[np.int64], columns: slice = slice(None), shared: bool = False) -> Array:
         """(f, c, c) of some values in some frames: noise, or what all share: of the rig, and what else repeats."""
         motion, J = self.motion, self.jacobian[frames][:, columns]
         if not shared:
@@ -210,7 +205,7 @@ def _loss(found: Propagated) -> tuple[float, float, float]:
     before, after = np.einsum("ns,nsr->nr", J, motion.calibration_sensitivity[ends])
     common = (after - before) @ motion.rig_covariance @ (after - before)
     common += np.einsum("ns,nst,nt->", J, motion.systematic_at(ends), J)
-    noise = found.covariance_at(ends, column).sum()
+    noise = found.covariance(ends, column).sum()
     first, last = found.value[ends, TOTAL]
     return float(first - last), float(np.sqrt(noise)), float(np.sqrt(max(0.0, common)))
 

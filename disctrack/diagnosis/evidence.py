@@ -57,7 +57,7 @@ def _measured(system: DiscSystem, before: Fit) -> tuple[Array | None, Measured |
     except AnalysisError:
         return None, None, None
     found, force = propagate(motion), from_to("force_n", "force_z")
-    variance = np.diagonal(found.covariance_at(np.arange(len(motion)), force), axis1=1, axis2=2)
+    variance = np.diagonal(found.covariance(np.arange(len(motion)), force), axis1=1, axis2=2)
     missing = Course(system.time, found.value[:, force] - force_of(system, before), np.sqrt(variance))
     energy = energy_of(found)
     lost = Measured(energy.loss, float(np.hypot(energy.loss_sigma, energy.loss_sigma_calibration)), "J")
