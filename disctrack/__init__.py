@@ -22,46 +22,12 @@ The other way round: `simulate(model, state)` gives a motion, `run_simulate` and
 Conventions (frames, angles, units, pixels) have one home: the docstring of disctrack.frames.
 """
 
+import ast
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-# In the order of the measurement: module -> the names it gives.
-_HOME = {
-    "disctrack.recording.declaration": ("read_recording", "Recording"),
-    "disctrack.recording.readers": ("open_frames", "FrameReader"),
-    "disctrack.recording.readers.blocks": ("iter_pair_blocks",),
-    "disctrack.calibrate.views": ("find_views", "calibrate_views"),
-    "disctrack.calibrate.stage": ("calibrate_recording",),
-    "calibration.rig_file": ("read_rig", "write_rig"),
-    "disctrack.disc": ("Disc",),
-    "disctrack.track.measurement": ("open_pairs", "measure", "Measurement", "trajectory_provenance"),
-    "disctrack.track.in_memory": ("measure_pairs",),
-    "disctrack.track.follow.live": ("Tracker", "LivePose"),
-    "disctrack.trajectory": ("Trajectory", "FrameStatus", "MarkerStatus"),
-    "disctrack.trajectory.file": (
-        "Provenance",
-        "write_trajectory",
-        "read_trajectory",
-        "write_group",
-        "read_group",
-    ),
-    "disctrack.trajectory.exchange.motion": ("write_csv",),
-    "disctrack.trajectory.exchange.formats": ("convert",),
-    "disctrack.track.video_overlay": ("write_overlay",),
-    "disctrack.analyse.derivatives": ("differentiate",),
-    "disctrack.analyse.stage": ("run_analyse",),
-    "disctrack.analyse.analysis": ("Analysis",),
-    "disctrack.diagnosis.stage": ("run_diagnose", "diagnose"),
-    "disctrack.batch": ("run_batch",),
-    "disctrack.rolling": ("Model", "State", "steady_precession", "simulate"),
-    "disctrack.synthetic.simulation": ("run_simulate",),
-    "disctrack.synthetic.recording": ("run_render",),
-    "disctrack.errors": ("DiscTrackError",),
-    "disctrack.files.software": ("__version__",),
-}
-_MODULE_OF = {name: module for module, names in _HOME.items() for name in names}
-__all__ = [name for name in _MODULE_OF if name != "__version__"]
-
+# The public names, for type checkers; each is imported when it is first used, from the module that is named here.
 if TYPE_CHECKING:
     from calibration.rig_file import read_rig as read_rig
     from calibration.rig_file import write_rig as write_rig
@@ -106,6 +72,10 @@ if TYPE_CHECKING:
     from disctrack.trajectory.file import read_trajectory as read_trajectory
     from disctrack.trajectory.file import write_group as write_group
     from disctrack.trajectory.file import write_trajectory as write_trajectory
+
+_IMPORTS = [node for node in ast.walk(ast.parse(Path(__file__).read_bytes())) if isinstance(node, ast.ImportFrom)]
+_MODULE_OF = {name.asname: str(node.module) for node in _IMPORTS for name in node.names if name.asname}
+__all__ = [name for name in _MODULE_OF if name != "__version__"]
 
 
 def __getattr__(name: str) -> Any:

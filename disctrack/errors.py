@@ -3,22 +3,10 @@
 import errno
 from typing import Any
 
-from calibration.kit.errors import ArgumentError, CalibrationError, DiscTrackError, RigFileError
-
-__all__ = [
-    "AnalysisError",
-    "ArgumentError",
-    "CalibrationError",
-    "ClusterError",
-    "DiscTrackError",
-    "OutputError",
-    "RecordingError",
-    "RigFileError",
-    "SceneError",
-    "TrackingError",
-    "TrajectoryFileError",
-    "reason_of",
-]
+from calibration.kit.errors import ArgumentError as ArgumentError
+from calibration.kit.errors import CalibrationError as CalibrationError
+from calibration.kit.errors import DiscTrackError
+from calibration.kit.errors import RigFileError as RigFileError
 
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
