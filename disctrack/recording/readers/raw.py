@@ -13,6 +13,7 @@ import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,6 +51,12 @@ class RawFile:
 
     def __str__(self) -> str:
         return str(self.path)
+
+    def stream(self) -> BinaryIO:
+        """The file from its beginning, for a library; it is closed apart."""
+        stream = os.fdopen(os.dup(self._descriptor), "rb")
+        stream.seek(0)
+        return stream
 
     def read_into(self, buffer: NDArray[np.uint8], offset: int, where: str) -> None:
         """Fill `buffer` (n,) with the bytes from `offset` on.

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 import tifffile
@@ -34,6 +35,10 @@ class Content(RawFile):
 
     def __init__(self, content: bytes) -> None:
         self._content, self.size, self.path = content, len(content), Path("TIFF content")
+
+    def stream(self) -> BinaryIO:
+        """All of it."""
+        return io.BytesIO(self._content)
 
     def _read_some(self, view: memoryview, offset: int) -> int:
         view[:] = self._content[offset : offset + len(view)]
@@ -87,49 +92,28 @@ def pages_of(source: RawFile) -> Iterator[Page]:
     layouts: dict[str, tifffile.TiffPage] = {}
     seen: set[int] = set()
     try:
-        tiff = tifffile.TiffFile(io.BufferedReader(_Stream(source)), name=str(source))
-        for index in count():
-            try:
-                page = tiff.pages[index]
-            except IndexError:
-                break
-            if page.offset in seen:
-                raise RecordingError(f"{source}: the chain of pages turns back to byte {page.offset}.")
-            if not isinstance(page, tifffile.TiffPage):  # others know less of themselves; nobody wanted them
-                raise TypeError("no page of its own")
-            seen.add(page.offset)
-            found = _page(page, layouts)
-            if not page.subfiletype & tifffile.FILETYPE.REDUCEDIMAGE:
-                yield found
-        link = source.bytes_at(tiff.pages.next_page_offset or 0, tiff.tiff.offsetsize, str(source))
-        if any(link):
-            raise RecordingError(f"{source}: the chain of pages breaks off, it is damaged. Copy it again.")
+        with source.stream() as stream:
+            tiff = tifffile.TiffFile(stream, name=str(source))
+            for index in count():
+                try:
+                    page = tiff.pages[index]
+                except IndexError:
+                    break
+                if page.offset in seen:
+                    raise RecordingError(f"{source}: the chain of pages turns back to byte {page.offset}.")
+                if not isinstance(page, tifffile.TiffPage):  # others know less of themselves; nobody wanted them
+                    raise TypeError("no page of its own")
+                seen.add(page.offset)
+                found = _page(page, layouts)
+                if not page.subfiletype & tifffile.FILETYPE.REDUCEDIMAGE:
+                    yield found
+            link = source.bytes_at(tiff.pages.next_page_offset or 0, tiff.tiff.offsetsize, str(source))
+            if any(link):
+                raise RecordingError(f"{source}: the chain of pages breaks off, it is damaged. Copy it again.")
     except (RecordingError, GeneratorExit):
         raise
     except Exception as error:  # whatever a damaged file makes of it
         raise RecordingError(f"{source}: not a readable TIFF file, or damaged ({error}).") from error
-
-
-class _Stream(io.RawIOBase):
-    """A source as tifffile wants it; never more bytes at once than the file has."""
-
-    def __init__(self, source: RawFile) -> None:
-        self._source, self._at = source, 0
-
-    def seekable(self) -> bool:
-        return True
-
-    readable = seekable
-
-    def seek(self, offset: int, whence: int = 0) -> int:
-        self._at = max(offset + (0, self._at, self._source.size)[whence], 0)
-        return self._at
-
-    def readinto(self, buffer: bytearray | memoryview) -> int:  # type: ignore[override]
-        size = max(min(len(buffer), self._source.size - self._at), 0)
-        buffer[:size] = self._source.bytes_at(self._at, size, str(self._source)) if size else b""
-        self._at += size
-        return size
 
 
 def _page(page: tifffile.TiffPage, layouts: dict[str, tifffile.TiffPage]) -> Page:
