@@ -32,6 +32,12 @@ class Key(NamedTuple):
     fits: Callable[[Any], bool]
     needed: bool = True  # in its section, where that is there
     between: tuple[float, float] | None = None  # of a number, both ends included, in the unit that the key names
+    example: str = ""  # what may stand there
+    remark: str = ""  # that a first declaration has beside it
+
+    def like(self, example: str, remark: str) -> Key:
+        """The key with an example and a remark."""
+        return self._replace(example=example, remark=remark)
 
 
 def _in_range(value: object, least: float, most: float) -> bool:
@@ -101,7 +107,7 @@ TARGET_KEYS: dict[str, tuple[str, ...]] = {
 KEYS: dict[str, dict[str, Key]] = {
     "": {"name": _LABEL, "case": _LABEL, "surface": _LABEL},
     "cameras": {
-        "frame_rate_hz": _number(0.1, 1e7),
+        "frame_rate_hz": _number(0.1, 1e7).like("1000.0", "frames per second of the cameras"),
         "left": _FILES,
         "right": _FILES,
         "exposure_us": _number(0, 1e7, needed=False),
@@ -113,20 +119,27 @@ KEYS: dict[str, dict[str, Key]] = {
         "right_part": _PART,
     },
     "disc": {
-        "radius_mm": _number(0.1, 1e4),
-        "thickness_mm": _number(0.001, 1e4),
-        "mass_g": _number(0.001, 1e7),
+        "radius_mm": _number(0.1, 1e4).like("37.5", "caliper"),
+        "thickness_mm": _number(0.001, 1e4).like("6.0", "caliper, with the paper"),
+        "mass_g": _number(0.001, 1e7).like("209.69", "balance, with the paper"),
         "radius_tolerance_mm": _TOLERANCE,
         "thickness_tolerance_mm": _TOLERANCE,
         "name": _LABEL,
     },
-    "markers": {"diameter_mm": _number(0.001, 1e3), "centres_mm": _CENTRES},
+    "markers": {
+        "diameter_mm": _number(0.001, 1e3).like("7.0", "as printed"),
+        "centres_mm": _CENTRES.like(
+            "[[26.0, 0.0], [13.0, 22.5], [-13.0, 22.5]]", "[x, y] of dots from the disc's centre"
+        ),
+    },
     "calibration": {
-        "left": _FILES,
-        "right": _FILES,
+        "left": _FILES.like('"calibration/left/*.png"', "views of a chessboard, 15 to 40 of them"),
+        "right": _FILES.like('"calibration/right/*.png"', "the same views, in the same order"),
         "target": _one_of(*TARGET_KEYS),
-        "inner_corners": _counts("inner corners along the long and the short side"),
-        "square_mm": _number(0.01, 1e4),
+        "inner_corners": _counts("inner corners along the long and the short side").like(
+            "[9, 6]", "long side first; count them"
+        ),
+        "square_mm": _number(0.01, 1e4).like("6.0", "side of a square, measured over many squares"),
         "squares": _counts("columns and rows of squares, dark and light", needed=False),
         "marker_mm": _number(0.01, 1e4, needed=False),
         "dictionary": _LABEL,
@@ -135,12 +148,12 @@ KEYS: dict[str, dict[str, Key]] = {
         "flatness_tolerance_mm": _TOLERANCE,
     },
     "table": {
-        "view": _VIEW,
-        "board_thickness_mm": _number(0, 1e3),
+        "view": _VIEW.like("0", "CHECK: in this view, counted from 0, the board lies flat on the table"),
+        "board_thickness_mm": _number(0, 1e3).like("3.0", "height of the printed face above the table"),
         "from": _one_of("board", "disc", "both"),
         "board_thickness_tolerance_mm": _TOLERANCE,
     },
-    "gravity": {"g_m_s2": _number(0.001, 1e3)},
+    "gravity": {"g_m_s2": _number(0.001, 1e3).like("9.81", "9.78 (equator) to 9.83")},
     "air": {"pressure_hPa": _number(1e-9, 1e5, needed=False), "density_kg_m3": _number(1e-9, 1e3, needed=False)},
 }
 
@@ -293,14 +306,11 @@ def _refuse_unknown_keys(file: Path, declared: Mapping[str, Any]) -> None:
 
 def _nearest(name: str, section: str, kind: str = "key") -> str:
     """What the writer probably meant: a name in the same section first, then anywhere."""
-    here = list(KEYS[section]) if section else ([s for s in KEYS if s] if kind == "section" else list(KEYS[""]))
-    close = difflib.get_close_matches(name, here, 1)
-    if close:
-        return f"Did you mean '{close[0]}'?"
-    homes = {key: home for home, keys in KEYS.items() for key in keys if home}
-    close = difflib.get_close_matches(name, homes, 1)
-    if close:
-        return f"Did you mean '{close[0]}' of [{homes[close[0]]}]?"
+    here = list(KEYS[section]) if section or kind == "key" else [s for s in KEYS if s]
+    elsewhere = {key: f" of [{home}]" for home, keys in KEYS.items() for key in keys if home}
+    for known in (dict.fromkeys(here, ""), elsewhere):
+        for close in difflib.get_close_matches(name, known, 1):
+            return f"Did you mean '{close}'{known[close]}?"
     return f"Known here: {', '.join(here)}."
 
 

@@ -18,23 +18,6 @@ HEADINGS = {  # of the sections, in their order
     "gravity": "",
     "air": "",
 }
-ROWS = {  # of the keys that a declaration needs: what may stand there, remark
-    ("cameras", "frame_rate_hz"): ("1000.0", "frames per second of the cameras"),
-    ("cameras", "left"): ("", ""),
-    ("cameras", "right"): ("", ""),
-    ("disc", "radius_mm"): ("37.5", "caliper"),
-    ("disc", "thickness_mm"): ("6.0", "caliper, with the paper"),
-    ("disc", "mass_g"): ("209.69", "balance, with the paper"),
-    ("markers", "diameter_mm"): ("7.0", "as printed"),
-    ("markers", "centres_mm"): ("[[26.0, 0.0], [13.0, 22.5], [-13.0, 22.5]]", "[x, y] of dots from the disc's centre"),
-    ("calibration", "left"): ('"calibration/left/*.png"', "views of a chessboard, 15 to 40 of them"),
-    ("calibration", "right"): ('"calibration/right/*.png"', "the same views, in the same order"),
-    ("calibration", "inner_corners"): ("[9, 6]", "long side first; count them"),
-    ("calibration", "square_mm"): ("6.0", "side of a square, measured over many squares"),
-    ("table", "view"): ("0", "CHECK: in this view, counted from 0, the board lies flat on the table"),
-    ("table", "board_thickness_mm"): ("3.0", "height of the printed face above the table"),
-    ("gravity", "g_m_s2"): ("9.81", "9.78 (equator) to 9.83"),
-}
 # Sections whose keys with a default hold for another recording of the same disc and board
 ALIKE = ("disc", "calibration", "table")
 
@@ -61,16 +44,14 @@ def declaration_text(
             continue
         rows = []
         given = {} if section in by_rig else {**example.get(section, {}), **known}
-        for key in KEYS[section]:
-            needed = (section, key) in ROWS
-            shown, remark = ROWS.get((section, key), ("", ""))
-            alike = needed or (section in ALIKE and key != "rig") or key == "exposure_us"
+        for key, meant in KEYS[section].items():
+            alike = meant.needed or (section in ALIKE and key != "rig") or key == "exposure_us"
             value, source = told.get((section, key), (given.get(key) if alike else None, ""))
             if value is not None:
-                rows.append(_aligned(f"{key} = {toml_value(value)}", source or remark))
-            elif needed and section not in by_rig:
+                rows.append(_aligned(f"{key} = {toml_value(value)}", source or meant.remark))
+            elif meant.needed and section not in by_rig:
                 missing.append(f"[{section}] {key}")
-                rows.append(_aligned(f"# {key} = {shown}", f"FILL IN: {remark}"))
+                rows.append(_aligned(f"# {key} = {meant.example}", f"FILL IN: {meant.remark}"))
         lines += ["", _aligned(f"[{section}]", heading), *rows] if rows else []
     return "\n".join(lines) + "\n", tuple(missing)
 
