@@ -28,7 +28,9 @@ from disctrack.batch import measure as stage
 from disctrack.batch.locks import locked
 from disctrack.batch.measure import LOCK, do
 from disctrack.batch.plan import make_plan
-from disctrack.batch.records import MEASURED, is_done, read_record
+from disctrack.batch.records import BUSY, MEASURED, is_done, read_record
+from disctrack.errors import CalibrationError
+from disctrack.findings import Kind
 from disctrack.track.follow.tracking import prepare
 from disctrack.trajectory.file import read_trajectory
 from tests.pipeline.conftest import linked
@@ -52,7 +54,7 @@ def statuses(path: Path) -> dict[str, str]:
 
 def jobs_of(folder: Path, **options):
     found = find_recordings([folder])
-    return make_plan(found, found.recordings, BatchOptions(report=False, **options))[1]
+    return make_plan(found, found.recordings, BatchOptions(report=False, **options))[0]
 
 
 @pytest.fixture
@@ -117,6 +119,31 @@ def one(recording):
     """Job of the short recording with the given rig."""
     (job,) = jobs_of(recording)
     return job
+
+
+def test_without_its_rig_a_recording_fails_with_the_rigs_reason_which_is_found_once(
+    short_recording, tmp_path, monkeypatch
+):
+    tried = []
+
+    def no_corners(*_, **__):
+        tried.append(1)
+        raise CalibrationError("no corners found")
+
+    monkeypatch.setattr(stage, "calibrate_into", no_corners)
+    for name in ("a", "b"):
+        linked(short_recording, tmp_path / name)
+    records = [stage.do(job) for job in jobs_of(tmp_path)]
+    assert [(record.status, record.reason) for record in records] == [("failed", "no rig: no corners found")] * 2
+    assert records[0].numbers["finding"] == Kind.CALIBRATION.value
+    assert len(tried) == 1
+
+
+def test_while_a_rig_is_made_its_recordings_are_put_back(short_recording, monkeypatch):
+    monkeypatch.setattr(stage, "BUSY_FOR", 0.0)
+    (job,) = jobs_of(short_recording)
+    with locked(Path(job.rig).with_name(LOCK)):
+        assert stage.do(job).status == BUSY
 
 
 @pytest.mark.statistical
@@ -367,7 +394,7 @@ def undisturbed(recording, tmp_path) -> Path:
     """The same day, measured without a fault, in this process."""
     root = a_day(recording, tmp_path / "undisturbed", ("a",))
     found = find_recordings([root])
-    _, (job,), *_ = make_plan(found, found.recordings, BatchOptions(report=False))
+    (job,), *_ = make_plan(found, found.recordings, BatchOptions(report=False))
     assert do(job).status == MEASURED
     return root
 
