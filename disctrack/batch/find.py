@@ -1,11 +1,13 @@
 """Which folders are recordings."""
 
 import os
-from collections.abc import Generator, Sequence
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from disctrack.errors import RecordingError
+from disctrack.files.folders import folders_below
 from disctrack.files.text import printable
 from disctrack.recording.declaration import FILE_NAME
 from disctrack.recording.readers.files import FORMATS, IMAGES, SUFFIXES, natural_key
@@ -50,45 +52,31 @@ def find_recordings(folders: Sequence[str | Path], output: str | Path | None = N
     for folder, root in zip(folders, roots, strict=True):
         if not root.is_dir():
             raise RecordingError(f"{folder}: no such folder. Give folders that hold recordings, at any depth.")
-    problems: list[str] = []
-    undeclared: list[Path] = []
+    unread: list[OSError] = []
     apart = None if output is None else Path(output).resolve()
     seen = set() if apart is None else {apart} - set(roots)
-    found = [place for root in roots for place in _search(root, seen, problems, undeclared)]
-    undeclared = [place for place in undeclared if not set(place.parents) & set(undeclared)]
+    found: list[Path] = []
+    undeclared: set[Path] = set()
+    of_images = Counter[Path]()  # folders with images in each folder
+    for place, inside, names in (folder for root in roots for folder in folders_below(root, seen, unread.append)):
+        suffixes = [Path(name).suffix.lower() for name in names]
+        is_recording = FILE_NAME in names
+        inside[:] = [name for name in inside if name != FOLDER and not (is_recording and name == RESULTS)]
+        if is_recording:
+            found.append(place)
+        elif not set(place.parents) & set(found):
+            of_images[place.parent] += not IMAGES.isdisjoint(suffixes)
+            undeclared |= {place} if sum(suffix in _FILMS for suffix in suffixes) > 1 else set()
+    undeclared |= {place for place, n in of_images.items() if n > 1} - set(found)
+    problems = [f"{error.filename} ({error.strerror})" for error in unread]
+    left_out = sorted(place for place in undeclared if not set(place.parents) & undeclared)
     if not found:
         shown = ", ".join(str(folder) for folder in folders)
         raise RecordingError(
             f"{shown}: no recording found. A recording is a folder with a {FILE_NAME} beside its images."
-            + (f" {undeclared[0]} has images: `disctrack init {undeclared[0]}` writes one." if undeclared else "")
+            + (f" {left_out[0]} has images: `disctrack init {left_out[0]}` writes one." if left_out else "")
             + (f" Not searched: {'; '.join(problems)}." if problems else "")
         )
     base = Path(os.path.commonpath(roots))
     order = sorted(found, key=lambda place: [natural_key(part) for part in place.parts])
-    return FoundRecordings(base, tuple(order), tuple(problems), tuple(undeclared), apart)
-
-
-def _search(folder: Path, seen: set[Path], problems: list[str], undeclared: list[Path]) -> Generator[Path, None, bool]:
-    """The recordings at and below the folder; whether images lie in it. Notes in the lists what a user must be told."""
-    place = folder.resolve()
-    if place in seen:
-        return False
-    seen.add(place)
-    try:
-        with os.scandir(folder) as entries:
-            visible = [(entry.name, entry.is_dir()) for entry in entries if not entry.name.startswith(".")]
-            is_recording = (folder / FILE_NAME).exists()
-    except OSError as error:
-        problems.append(f"{folder} ({error.strerror})")
-        return False
-    below = sorted(name for name, is_folder in visible if is_folder)
-    suffixes = [Path(name).suffix.lower() for name, is_folder in visible if not is_folder]
-    if is_recording:
-        yield folder
-    of_images = 0
-    for name in below:
-        if name != FOLDER and not (is_recording and name == RESULTS):
-            of_images += yield from _search(folder / name, seen, problems, [] if is_recording else undeclared)
-    if not is_recording and max(of_images, sum(suffix in _FILMS for suffix in suffixes)) > 1:
-        undeclared.append(folder)
-    return not is_recording and not IMAGES.isdisjoint(suffixes)
+    return FoundRecordings(base, tuple(order), tuple(problems), tuple(left_out), apart)

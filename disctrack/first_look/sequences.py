@@ -1,6 +1,5 @@
 """What a folder holds: sequences of frames, which two of them are the cameras, which two show the chessboard."""
 
-import os
 import re
 from collections import defaultdict
 from collections.abc import Iterable
@@ -15,6 +14,7 @@ from calibration.board.search import VIEWS_TRIED, board_size
 from calibration.kit.arrays import evenly
 from disctrack.calibrate.views import pixels_of, views_of
 from disctrack.errors import RecordingError
+from disctrack.files.folders import folders_below
 from disctrack.recording.readers import open_frames
 from disctrack.recording.readers.base import FrameReader
 from disctrack.recording.readers.files import FORMATS, IMAGES, SUFFIXES, natural_key
@@ -75,8 +75,9 @@ def find_sequences(folder: Path) -> list[Sequence]:
     if not folder.is_dir():
         raise RecordingError(f"{folder}: no such folder. Give the folder that holds the frames.")
     found: list[Sequence] = []
-    for place, names in _folders(folder):
-        inside = place.relative_to(folder)
+    for place, below, unsorted in folders_below(folder, set()):
+        inside, names = place.relative_to(folder), sorted(unsorted, key=natural_key)
+        below[:] = [name for name in below if len(inside.parts) < DEEPEST and not _OWN_FOLDERS.match(name)]
         images = [name for name in names if Path(name).suffix.lower() in IMAGES]
         found += _image_sequences(folder, inside, images)
         headers = {Path(name).stem for name in names if Path(name).suffix.lower() in FORMATS["mraw"] - {".mraw"}}
@@ -110,21 +111,6 @@ def pair_cameras(sequences: Iterable[Sequence]) -> list[CameraPair]:
             swap = named and _sides(ours, theirs)[::-1] in _SIDES
             pairs.append(CameraPair(*((other, first) if swap else (first, other)), named))
     return pairs
-
-
-def _folders(folder: Path) -> Iterable[tuple[Path, list[str]]]:
-    """Folders and their files, through links, too: views are often kept beside several recordings."""
-    seen: set[str] = set()
-    for place, inside, names in os.walk(folder, followlinks=True):
-        depth = len(Path(place).relative_to(folder).parts)
-        inside[:] = sorted(
-            name for name in inside if depth < DEEPEST and not name.startswith(".") and not _OWN_FOLDERS.match(name)
-        )
-        if (real := os.path.realpath(place)) in seen:  # a link to a folder that holds it
-            inside[:] = []
-            continue
-        seen.add(real)
-        yield Path(place), sorted((name for name in names if not name.startswith(".")), key=natural_key)
 
 
 def _image_sequences(folder: Path, inside: Path, names: list[str]) -> list[Sequence]:
