@@ -24,8 +24,11 @@ Arrays: many of a thing on leading axes, components last; image points are (n_fr
     camera 0 = left, 1 = right. A frame without an answer is NaN with a status, never a missing row.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
 from calibration.cameras.camera import rotation_from_vector as rotation_from_vector
 from calibration.kit.arrays import Array
@@ -109,15 +112,11 @@ def euler_rate_axes_world(psi: ArrayLike, theta: ArrayLike) -> Array:
 
 def euler_jacobian(psi: ArrayLike, theta: ArrayLike) -> Array:
     """d(psi, theta, phi)/d(world rotation vector), (..., 3, 3); entries grow as 1/sin theta, NaN at theta = 0."""
-    s, c = np.sin(theta), np.cos(theta)
-    sp, cp = np.sin(psi), np.cos(psi)
-    J = np.zeros((*np.broadcast(s, sp).shape, 3, 3))
+    e1, e2, _ = nodal_axes_world(psi, theta)
+    sine = np.sin(theta)[..., None]
     with np.errstate(divide="ignore", invalid="ignore"):
-        cot, csc = c / s, 1.0 / s
-        J[..., 0, 0], J[..., 0, 1], J[..., 0, 2] = -sp * cot, cp * cot, 1.0
-        J[..., 1, 0], J[..., 1, 1] = cp, sp
-        J[..., 2, 0], J[..., 2, 1] = sp * csc, -cp * csc
-    J[np.broadcast_to(s, J.shape[:-2]) == 0] = np.nan
+        J = np.stack([e2 / sine, e1, np.cross(e1, (0.0, 0.0, 1.0)) / sine], axis=-2)
+    J[np.broadcast_to(sine[..., 0], J.shape[:-2]) == 0] = np.nan
     return J
 
 
@@ -132,37 +131,21 @@ def skew(v: ArrayLike) -> Array:
 
 def vector_from_rotation(R: Array) -> Array:
     """Rotation vector (..., 3) [rad] of R (..., 3, 3), length in [0, pi]; inverse of `rotation_from_vector`."""
-    q = quaternion_from_rotation(R)
-    q = np.where(q[..., :1] < 0, -q, q)
-    sine = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
-    angle = 2 * np.arctan2(sine, q[..., :1])
-    scale = np.where(sine < 1e-9, 2.0, angle / np.where(sine == 0, 1.0, sine))
-    return scale * q[..., 1:]
+    return _known_rotations(R, 3, Rotation.as_rotvec)
 
 
 def quaternion_from_rotation(R: Array) -> Array:
-    """Unit quaternion (w, x, y, z) of R (..., 3, 3) -> (..., 4); NaN in, NaN out.
+    """Unit quaternion (w, x, y, z) of R (..., 3, 3) -> (..., 4)."""
+    return np.roll(_known_rotations(R, 4, Rotation.as_quat), 1, axis=-1)  # SciPy has the scalar part last
 
-    The largest of the four squared components is taken from the trace identities, the others follow from sums and
-    differences, so that no cancellation occurs at any angle.
-    """
+
+def _known_rotations(R: Array, size: int, told: Callable[[Rotation], Array]) -> Array:
+    """What SciPy tells of R (..., 3, 3), (..., size); NaN in, NaN out."""
     R = np.asarray(R, float)
-    d0, d1, d2 = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
-    squares = np.stack([1 + d0 + d1 + d2, 1 + d0 - d1 - d2, 1 - d0 + d1 - d2, 1 - d0 - d1 + d2], axis=-1)
-    a, b, c = R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]
-    d, e, f = R[..., 1, 0] + R[..., 0, 1], R[..., 0, 2] + R[..., 2, 0], R[..., 2, 1] + R[..., 1, 2]
-    rows = np.stack(
-        [
-            np.stack([squares[..., 0], a, b, c], axis=-1),
-            np.stack([a, squares[..., 1], d, e], axis=-1),
-            np.stack([b, d, squares[..., 2], f], axis=-1),
-            np.stack([c, e, f, squares[..., 3]], axis=-1),
-        ],
-        axis=-2,
-    )
-    best = np.argmax(np.where(np.isfinite(squares), squares, -1.0), axis=-1)
-    q = np.take_along_axis(rows, best[..., None, None], axis=-2)[..., 0, :]
-    return q / np.linalg.norm(q, axis=-1, keepdims=True)
+    found = np.full((*R.shape[:-2], size), np.nan)
+    known = np.isfinite(R).all(axis=(-2, -1))
+    found[known] = told(Rotation.from_matrix(R[known]))
+    return found
 
 
 def rotation_from_quaternion(q: Array) -> Array:
