@@ -7,10 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from disctrack.errors import RecordingError
-from disctrack.files.folders import folders_below
 from disctrack.files.text import printable
 from disctrack.recording.declaration import FILE_NAME
-from disctrack.recording.readers.files import FORMATS, IMAGES, SUFFIXES, natural_key
+from disctrack.recording.readers.files import FORMATS, IMAGES, SUFFIXES, folders_below, natural_key
 
 RESULTS = "results"  # beside a recording's images
 FOLDER = "batch_results"  # of a batch, for what belongs to no single recording

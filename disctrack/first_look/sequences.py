@@ -14,10 +14,9 @@ from calibration.board.search import VIEWS_TRIED, board_size
 from calibration.kit.arrays import evenly
 from disctrack.calibrate.views import pixels_of, views_of
 from disctrack.errors import RecordingError
-from disctrack.files.folders import folders_below
 from disctrack.recording.readers import open_frames
 from disctrack.recording.readers.base import FrameReader
-from disctrack.recording.readers.files import FORMATS, IMAGES, SUFFIXES, natural_key
+from disctrack.recording.readers.files import FORMATS, IMAGES, SUFFIXES, folders_below, natural_key
 
 DEEPEST = 4  # folders below the recording that are looked into
 _OWN_FOLDERS = re.compile(r"(results|batch_results|.*_analysis|.*_diagnosis)$")
