@@ -56,14 +56,10 @@ class Check:
     raw: list[NDArray] = field(default_factory=list)  # pairs in which the disc was not found
     not_read: dict[tuple[int, int], Unreadable] = field(default_factory=dict)  # by frame and camera
 
-    def warn(self, kind: Kind, text: str, advice: str = "", severity: Severity = Severity.WARNING) -> None:
-        """Add a finding, by default one that deserves a look."""
+    def add(self, kind: Kind, text: str, advice: str = "", severity: Severity = Severity.REFUSAL) -> None:
+        """Add a finding, by default what a run would end with."""
         remedies = (Remedy(action=advice),) if advice else ()
         self.findings.append(Finding(kind, severity, text, Subject("check"), remedies=remedies))
-
-    def refuse(self, kind: Kind, text: str, advice: str = "") -> None:
-        """Add what a run would end with."""
-        self.warn(kind, text, advice, Severity.REFUSAL)
 
     def images(self, pairs: ImagePairs, frames: Iterable[int]) -> list[NDArray]:
         """(2, h, w) images of each of these frames; those that cannot be read are left out, and named."""
@@ -76,7 +72,7 @@ class Check:
         try:
             yield
         except DiscTrackError as error:
-            self.refuse(kind, str(error), advice)
+            self.add(kind, str(error), advice)
 
     def report(self, files: Sequence[Path] = ()) -> Report:
         """The causes, and with `-v` what was seen."""
@@ -156,7 +152,7 @@ def _rig(seen: Check, recording: Recording) -> StereoRig:
     seen.seen.append(("chessboard", f"{text}, {found.assessment.verdict}, baseline {1e3 * found.rig.baseline:.1f} mm"))
     if used < 0.7 * len(chosen):
         advice = "the whole board must be in view of both cameras, with a light rim round it"
-        seen.warn(Kind.CALIBRATION, f"the chessboard was {text}", advice)
+        seen.add(Kind.CALIBRATION, f"the chessboard was {text}", advice, Severity.WARNING)
     said = (*left_out(found), *problems, *found.warnings)
     seen.findings += noticed_in({"doubts": found.doubts, "warnings": said})
     return found.rig
@@ -165,13 +161,13 @@ def _rig(seen: Check, recording: Recording) -> StereoRig:
 def _light(seen: Check, pairs: ImagePairs) -> None:
     images = np.array(seen.images(pairs, [round(place * (len(pairs) - 1)) for place in PLACES]))
     if not len(images):
-        seen.refuse(Kind.UNREADABLE, "none of the frames looked at can be read", "copy the frames again")
+        seen.add(Kind.UNREADABLE, "none of the frames looked at can be read", "copy the frames again")
         return
     for camera, name in enumerate(CAMERAS):
         low, high = np.percentile(images[:, camera], [1.0, 99.0])
         text = f"{name}: grey values {low:.0f} to {high:.0f}"
         if high - low < 1:
-            seen.refuse(Kind.LIGHT, f"{text}: the images are of one grey", "is the lens cap on, is the lamp lit?")
+            seen.add(Kind.LIGHT, f"{text}: the images are of one grey", "is the lens cap on, is the lamp lit?")
         seen.seen.append(("light", text))
 
 
@@ -200,10 +196,10 @@ def _motion(seen: Check, recording: Recording, rig: StereoRig, pairs: ImagePairs
             break  # the images are not those of the declared cameras: no other place tells more
     measured = sum(int(tracking.trajectory.measured.sum()) for _, tracking in done)
     if not done:
-        seen.refuse(Kind.DISC_NOT_FOUND, "the disc was found nowhere; compare [markers] with the picture", lost)
+        seen.add(Kind.DISC_NOT_FOUND, "the disc was found nowhere; compare [markers] with the picture", lost)
     elif measured < total:
         severity = Severity.DOUBT if 2 * measured < total else Severity.WARNING
-        seen.warn(Kind.FRAMES_LOST, f"{total - measured} of {total} frames looked at have no pose", lost, severity)
+        seen.add(Kind.FRAMES_LOST, f"{total - measured} of {total} frames looked at have no pose", lost, severity)
     noticed = _once(noticed)
     if not done:
         seen.findings += with_square(noticed, recording)

@@ -1,11 +1,9 @@
 """Rigs from and to formats with a table of numbers for each camera, and where it stands from a common reference."""
 
 import ast
-import json
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -13,6 +11,7 @@ import numpy as np
 from calibration.cameras.camera import StereoRig
 from calibration.kit.arrays import Array
 from disctrack.errors import OutputError, RigFileError
+from disctrack.files.toml_tree import toml_value
 from disctrack.files.whole import write_whole
 from disctrack.trajectory.exchange.rig_parts import array_of, camera_of, content_of, rig_of, rotation_of
 
@@ -41,11 +40,11 @@ def _write_toml(
     for table, more, camera, (R, t) in zip(tables, own, rig.cameras, rig.camera_poses(), strict=True):
         text += (
             f"[{table}]\n{more}\n"
-            f"size = {_listed(camera.image_size)}\n"
-            f"matrix = {_listed(camera.camera_matrix)}\n"
-            f"distortions = {_listed(camera.distortion[:terms])}\n"
-            f"translation = {_listed(t)}\n"
-            f"rotation = {_listed(_rotation_vector(R))}\n"
+            f"size = {toml_value(camera.image_size)}\n"
+            f"matrix = {toml_value(camera.camera_matrix)}\n"
+            f"distortions = {toml_value(camera.distortion[:terms])}\n"
+            f"translation = {toml_value(t)}\n"
+            f"rotation = {toml_value(_rotation_vector(R))}\n"
             "fisheye = false\n\n"
         )
     write_whole(path, (text + end).encode())
@@ -95,13 +94,13 @@ def write_kalibr(path: Path, rig: StereoRig) -> None:
             f"cam{number}:\n"
             f"  cam_overlaps: [{1 - number}]\n"
             "  camera_model: pinhole\n"
-            f"  distortion_coeffs: {_listed(camera.distortion[:4])}\n"
+            f"  distortion_coeffs: {toml_value(camera.distortion[:4])}\n"
             "  distortion_model: radtan\n"
-            f"  intrinsics: {_listed(camera.parameters[:4])}\n"
-            f"  resolution: {_listed(camera.image_size)}\n"
+            f"  intrinsics: {toml_value(camera.parameters[:4])}\n"
+            f"  resolution: {toml_value(camera.image_size)}\n"
             f"  rostopic: /cam{number}/image_raw\n"
         )
-    text += "  T_cn_cnm1:\n" + "".join(f"  - {_listed(row)}\n" for row in T)
+    text += "  T_cn_cnm1:\n" + "".join(f"  - {toml_value(row)}\n" for row in T)
     write_whole(path, text.encode())
 
 
@@ -147,10 +146,10 @@ def write_mrcal(path: Path, rig: StereoRig) -> None:
             "{\n"
             "    'lensmodel':  'LENSMODEL_OPENCV5',\n"
             "    # fx, fy, cx, cy, k1, k2, p1, p2, k3\n"
-            f"    'intrinsics': {_listed(camera.parameters)},\n"
+            f"    'intrinsics': {toml_value(camera.parameters)},\n"
             "    # rotation vector and translation [m]: reference to camera\n"
-            f"    'extrinsics': {_listed(np.concatenate([_rotation_vector(R), t]))},\n"
-            f"    'imagersize': {_listed(camera.image_size)}\n"
+            f"    'extrinsics': {toml_value(np.concatenate([_rotation_vector(R), t]))},\n"
+            f"    'imagersize': {toml_value(camera.image_size)}\n"
             "}\n"
         )
         write_whole(side, text.encode())
@@ -234,8 +233,3 @@ def _matrix(fx: float, fy: float, cx: float, cy: float) -> Array:
 
 def _rotation_vector(R: Array) -> Array:
     return np.asarray(cv2.Rodrigues(R)[0], float).ravel()
-
-
-def _listed(values: Any) -> str:
-    """Numbers, or rows of them, as TOML, YAML and Python write lists."""
-    return json.dumps(np.asarray(values).tolist())
