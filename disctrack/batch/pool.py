@@ -20,6 +20,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ThreadPoolExecutor, wait
 from multiprocessing.connection import Connection
+from multiprocessing.context import SpawnProcess
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING
@@ -102,7 +103,7 @@ class Processes:
     def __init__(self, size: int) -> None:
         self.size: float = size
         self._threads = ThreadPoolExecutor(size, thread_name_prefix="batch")
-        self._own = threading.local()  # the process of a thread
+        self._own = threading.local()  # the process that a thread keeps
         self._context = Spawn()
         self._ends = False
         self._folder = tempfile.TemporaryDirectory(prefix="disctrack-")
@@ -116,11 +117,23 @@ class Processes:
         """Do a job in this thread's process."""
         if self._ends:
             raise Died("the batch ended")
-        worker: _Worker = getattr(self._own, "worker", None) or _Worker(self._context, next(self._said))
-        self._own.worker = None
-        record = worker.done(job)
-        self._own.worker = worker
+        process, jobs, said = getattr(self._own, "kept", None) or self._begun()
+        self._own.kept = None
+        try:
+            jobs.send(job)
+            record: Record = jobs.recv()
+        except (EOFError, ConnectionError) as error:
+            raise Died(_why_it_ended(process, said)) from error
+        self._own.kept = process, jobs, said
         return record
+
+    def _begun(self) -> tuple[SpawnProcess, Connection, Path]:
+        """A new process, what it is told jobs by, and the file for whatever its libraries print. Raises OSError."""
+        (jobs, its_end), said = self._context.Pipe(), next(self._said)
+        process = self._context.Process(target=_work, args=(its_end, said))
+        process.start()
+        its_end.close()  # with the process its own goes, too: that ends what waits for an answer
+        return process, jobs, said
 
     def close(self) -> None:
         """End in order what still runs."""
@@ -192,41 +205,21 @@ def do_alone(job: Job) -> Record:
         return here.done(job)
 
 
-class _Worker:
-    """One process that does jobs one after the other."""
-
-    def __init__(self, context: Spawn, said: Path) -> None:
-        """Said : file for whatever its libraries print. Raises OSError where the process cannot be started."""
-        self._said = said
-        self._jobs, its_end = context.Pipe()
-        self.process = context.Process(target=_work, args=(its_end, said))
-        self.process.start()
-        its_end.close()  # with the process its own goes, too: that ends what waits for an answer
-
-    def done(self, job: Job) -> Record:
-        """Record of a job. Raises Died."""
-        try:
-            self._jobs.send(job)
-            record: Record = self._jobs.recv()
-        except (EOFError, ConnectionError) as error:
-            raise Died(self.why_it_ended()) from error
-        return record
-
-    def why_it_ended(self) -> str:
-        """Signal or exit code, and the last that it said."""
-        self.process.join()
-        said = self._said.read_text("utf-8", "replace").split() if self._said.exists() else []
-        code = self.process.exitcode
-        if code == -getattr(signal, "SIGKILL", 9):
-            text = (
-                "its process was killed (signal 9), as the system does when memory runs out. Run fewer side by side "
-                "with -j, or give the machine more memory."
-            )
-        elif code is not None and code < 0:
-            text = f"its process was ended by signal {-code} ({signal.strsignal(-code)})."
-        else:
-            text = f"its process ended by itself (exit code {code})."
-        return f"{text} It said: {' '.join(said)[-300:]}" if said else text
+def _why_it_ended(process: SpawnProcess, said: Path) -> str:
+    """Signal or exit code, and the last that it said."""
+    process.join()
+    words = said.read_text("utf-8", "replace").split() if said.exists() else []
+    code = process.exitcode
+    if code == -getattr(signal, "SIGKILL", 9):
+        text = (
+            "its process was killed (signal 9), as the system does when memory runs out. Run fewer side by side "
+            "with -j, or give the machine more memory."
+        )
+    elif code is not None and code < 0:
+        text = f"its process was ended by signal {-code} ({signal.strsignal(-code)})."
+    else:
+        text = f"its process ended by itself (exit code {code})."
+    return f"{text} It said: {' '.join(words)[-300:]}" if words else text
 
 
 def _work(jobs: Connection, said: Path) -> None:

@@ -4,7 +4,7 @@ import csv
 import dataclasses
 import io
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from filelock import Timeout
@@ -82,7 +82,8 @@ def write_summary(
     wait = 300.0  # [s] for another process that writes the summary
     try:
         with locked(found.common / ".summary.lock", wait):
-            return _write_summary(found, rows_of(found, records), options)
+            rows = with_false_discovery(rows_of(found, records))
+            return rows, tuple(_write(found, rows, options))
     except Timeout as error:
         raise OutputError(
             f"{found.common}: another process has been writing the summary for {wait:g} s. Make it anew with "
@@ -90,11 +91,8 @@ def write_summary(
         ) from error
 
 
-def _write_summary(
-    found: FoundRecordings, rows: list[Row], options: BatchOptions
-) -> tuple[list[Row], tuple[Path, ...]]:
-    folder, rows = found.common, with_false_discovery(rows)
-    repeats = repeats_of(rows)
+def _write(found: FoundRecordings, rows: Sequence[Row], options: BatchOptions) -> Iterator[Path]:
+    folder, repeats = found.common, repeats_of(rows)
     document = {
         "schema": SCHEMA,
         "schema_version": SCHEMA_VERSION,
@@ -116,7 +114,7 @@ def _write_summary(
     }
     for name, content in contents.items():
         write_whole(folder / name, content)
-    return rows, tuple(folder / name for name in contents)
+        yield folder / name
 
 
 def with_false_discovery(rows: Sequence[Row]) -> list[Row]:

@@ -461,15 +461,16 @@ def test_processes_end_with_a_batch_that_is_killed(recording, tmp_path):
 
 @pytest.mark.statistical
 def test_a_killed_worker_is_tried_again_and_a_deadly_recording_fails_alone(day, monkeypatch):
-    done, deaths = pool._Worker.done, {"a": 2, "b": 1}  # how often the process is killed
+    done, deaths = pool.Processes.done, {"a": 2, "b": 1}  # how often the process is killed
 
     def deadly(self, job):
         if deaths[job.name]:
             deaths[job.name] -= 1
-            self.process.kill()
+            self._own.kept = self._begun()
+            self._own.kept[0].kill()
         return done(self, job)
 
-    monkeypatch.setattr(pool._Worker, "done", deadly)
+    monkeypatch.setattr(pool.Processes, "done", deadly)
     outcome = run_batch([day], BatchOptions(report=False), side_by_side=2)
     a, b = outcome.rows
     assert (a["status"], b["status"]) == ("failed", "measured")
