@@ -30,7 +30,6 @@ from disctrack.batch.measure import LOCK, do
 from disctrack.batch.plan import make_plan
 from disctrack.batch.records import BUSY, MEASURED, is_done, read_record
 from disctrack.errors import CalibrationError
-from disctrack.findings import Kind
 from disctrack.track.follow.tracking import prepare
 from disctrack.trajectory.file import read_trajectory
 from tests.pipeline.conftest import linked
@@ -121,7 +120,7 @@ def one(recording):
     return job
 
 
-def test_without_its_rig_a_recording_fails_with_the_rigs_reason_which_is_found_once(
+def test_recordings_wait_for_their_rig_and_fail_with_its_reason_which_is_found_once(
     short_recording, tmp_path, monkeypatch
 ):
     tried = []
@@ -131,19 +130,13 @@ def test_without_its_rig_a_recording_fails_with_the_rigs_reason_which_is_found_o
         raise CalibrationError("no corners found")
 
     monkeypatch.setattr(stage, "calibrate_into", no_corners)
-    for name in ("a", "b"):
-        linked(short_recording, tmp_path / name)
-    records = [stage.do(job) for job in jobs_of(tmp_path)]
-    assert [(record.status, record.reason) for record in records] == [("failed", "no rig: no corners found")] * 2
-    assert records[0].numbers["finding"] == Kind.CALIBRATION.value
-    assert len(tried) == 1
-
-
-def test_while_a_rig_is_made_its_recordings_are_put_back(short_recording, monkeypatch):
     monkeypatch.setattr(stage, "BUSY_FOR", 0.0)
-    (job,) = jobs_of(short_recording)
-    with locked(Path(job.rig).with_name(LOCK)):
-        assert stage.do(job).status == BUSY
+    jobs = jobs_of(linked(short_recording, tmp_path / "a").parent) * 2
+    with locked(Path(jobs[0].rig).with_name(LOCK)):  # as while it is made
+        assert stage.do(jobs[0]).status == BUSY
+    records = [stage.do(job) for job in jobs]
+    assert [(record.status, record.reason) for record in records] == [("failed", "no rig: no corners found")] * 2
+    assert len(tried) == 1
 
 
 @pytest.mark.statistical
