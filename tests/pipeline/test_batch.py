@@ -17,6 +17,7 @@ import time
 from concurrent.futures import Future
 from multiprocessing.context import SpawnProcess
 from pathlib import Path
+from unittest.mock import Mock
 
 import cv2
 import h5py
@@ -120,23 +121,16 @@ def one(recording):
     return job
 
 
-def test_recordings_wait_for_their_rig_and_fail_with_its_reason_which_is_found_once(
-    short_recording, tmp_path, monkeypatch
-):
-    tried = []
-
-    def no_corners(*_, **__):
-        tried.append(1)
-        raise CalibrationError("no corners found")
-
-    monkeypatch.setattr(stage, "calibrate_into", no_corners)
+def test_recordings_wait_for_their_rig_and_fail_with_its_reason_found_once(short_recording, tmp_path, monkeypatch):
+    calibrate = Mock(side_effect=CalibrationError("no corners found"))
+    monkeypatch.setattr(stage, "calibrate_into", calibrate)
     monkeypatch.setattr(stage, "BUSY_FOR", 0.0)
     jobs = jobs_of(linked(short_recording, tmp_path / "a").parent) * 2
     with locked(Path(jobs[0].rig).with_name(LOCK)):  # as while it is made
         assert stage.do(jobs[0]).status == BUSY
     records = [stage.do(job) for job in jobs]
     assert [(record.status, record.reason) for record in records] == [("failed", "no rig: no corners found")] * 2
-    assert len(tried) == 1
+    assert calibrate.call_count == 1
 
 
 @pytest.mark.statistical
