@@ -149,10 +149,11 @@ class DiscSystem(LawSystem):
         They are so small that their columns at the measured poses serve for every prediction. Directions of the
         calibration's covariance are in units of their own sigma.
         """
-        q = self._as_measured().q[0]
-        R, n = rotation_from_euler(*q[:, 3:].T), len(q)
-        points = self.disc.marker_centres_body @ np.swapaxes(R, 1, 2) + q[:, None, :3]
-        places, by_point, by_rig = self.rig.project_with_jacobians(points)
+        q = self._as_measured(scene_faults(self.disc, self.known).right_delay_s).q  # (2, n, 6), as each camera meets it
+        R, n = rotation_from_euler(*np.moveaxis(q[..., 3:], -1, 0)), len(self.time)
+        points = self.disc.marker_centres_body @ np.swapaxes(R, -1, -2) + q[..., None, :3]
+        seen = self.rig.project_with_jacobians(points)
+        places, by_point, by_rig = (np.stack([x[0, :, 0], x[1, :, 1]], axis=1) for x in seen)
         spread = np.sqrt(np.maximum(np.diag(self.rig.covariance), 0.0))
         safe = np.where(spread > 0, spread, 1.0)
         eigenvalues, vectors = np.linalg.eigh(self.rig.covariance / np.outer(safe, safe))
@@ -163,7 +164,7 @@ class DiscSystem(LawSystem):
             V[singular > MIN_NUISANCE], float
         )  # by columns of `root`, the same for one rig
         rig = shift @ self.rig_directions.T
-        along = np.einsum("ncmap,npb->ncmab", by_point, R[:, :, :2])  # by the dots' places on the face
+        along = np.einsum("ncmap,cnpb->ncmab", by_point, R[..., :2])  # by the dots' places on the face
         m, sizes = self.disc.n_markers, self.systematic
         dots = (self._whiten @ along)[:, :, :, :, None, :] * np.eye(m)[None, None, :, None, :, None]
         sigma, bias = float(np.hypot(DOT_SIGMA, sizes.print_m)), "bias common to all images of a dot"

@@ -132,15 +132,21 @@ def _found_statically(
         moved = {q.name: known.get(q.name, 0.0) + q.scale * x for q, x in zip(quantities, steps.tolist(), strict=True)}
         return {**known, **moved}
 
+    def seen(steps: Array) -> Array:
+        return np.asarray(poses_with(trajectory, amounts(steps)).markers_residual_px / sigma, float)
+
     def left(steps: Array) -> Array:
-        return np.nan_to_num(poses_with(trajectory, amounts(steps)).markers_residual_px / sigma).ravel()
+        found = seen(steps)[there]
+        return np.where(np.isfinite(found), found, before)  # dots that lose their pose do not count as explained
 
     def by_steps(steps: Array) -> Array:
         return np.stack([(left(steps + one) - left(steps - one)) / 2 for one in np.eye(len(steps))], axis=1)
 
     nothing = np.zeros(len(quantities))
+    there = np.isfinite(begun := seen(nothing))
+    before = begun[there]
     found = least_squares(left, nothing, by_steps, xtol=1e-3)
-    return 2 * found.cost, amounts(found.x), float(np.sum(left(nothing) ** 2)) - 2 * found.cost
+    return 2 * found.cost, amounts(found.x), float(before @ before) - 2 * found.cost
 
 
 def _assumed(trajectory: Trajectory, model: Model, names: Sequence[str], known: Values, gain: float) -> Assumed | None:
