@@ -17,8 +17,17 @@ import numpy as np
 
 from disctrack.diagnosis import diagnose
 from disctrack.diagnosis.errors import left_over, simulated
-from disctrack.diagnosis.form_misfit import moment_about_contact
+from disctrack.rolling import Model
+from tests.oracles.required_wrench import required_wrench
 from tests.oracles.unknown_laws import UNKNOWN, Recording, recording
+
+
+def fitted_moment(result) -> tuple[np.ndarray, np.ndarray]:
+    """(times [s], moment (n, 3) about the contact) that the fitted motion needs, whatever supplies it."""
+    motion = simulated(result.system, result.diagnosis.after.values)
+    rates = motion.acceleration_world, motion.angular_acceleration_world
+    _, moment = required_wrench(Model(result.system.disc), motion.q, motion.qdot, *rates)
+    return motion.time, moment
 
 
 def trial(name: str, seed: int) -> dict:
@@ -51,10 +60,8 @@ def _against(made: Recording, result) -> dict:
     """Rms of truth and error of the moment, and the error in sigmas where the law has a course with sigmas."""
     of = lambda at: np.stack([np.interp(at, made.time, made.moment[:, i]) for i in range(3)], axis=1)  # noqa: E731
     rms = lambda x: np.sqrt(np.mean(x**2, axis=0)).tolist()  # noqa: E731
-    values = result.diagnosis.after.values
-    motion = simulated(result.system, values)
-    true, fitted = of(motion.time), moment_about_contact(result.system, values, motion)
-    found = {"rms_truth": rms(true), "rms_error": rms(fitted - true)}
+    at, moment = fitted_moment(result)
+    found = {"rms_truth": rms(of(at)), "rms_error": rms(moment - of(at))}
     course = result.learned.course if result.learned else None
     if course is not None:
         pull = (course.values - of(course.time)) / course.sigma
