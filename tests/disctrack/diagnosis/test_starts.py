@@ -372,7 +372,7 @@ def test_a_clock_that_runs_at_twice_the_declared_rate_is_found():
     assert any("precession" in note for note in result.notes)
 
 
-@pytest.mark.slow
+@pytest.mark.statistical
 @pytest.mark.parametrize(
     ("faults", "truth"),
     [
