@@ -209,7 +209,7 @@ def _motion(seen: Check, recording: Recording, rig: StereoRig, pairs: ImagePairs
         row = len(frames) // 2
         seen.shown += [(tracking.trajectory, row, images) for images in seen.images(pairs, [frames[row]])]
     whole = joined([tracking.trajectory for _, tracking in done])
-    blur_px = [edge.blur_px for edge in done[len(done) // 2][1].law.edges]
+    blur_px = done[len(done) // 2][1].details["blur_px"]
     for finding in contradictions(whole, recording.disc, recording, noticed, seen.boards, blur_px):
         graver = Severity.DOUBT if finding.kind == Kind.DOT_UNSEEN else finding.severity
         seen.findings.append(replace(finding, severity=graver))

@@ -18,7 +18,7 @@ from disctrack.findings import warn_of_doubts
 from disctrack.frames import CAMERAS
 from disctrack.recording.readers.blocks import PairBlock
 from disctrack.track.follow.tracking import TrackingSettings, prepare, track
-from disctrack.track.measurement import Measurement, Progress, details_of
+from disctrack.track.measurement import Measurement, Progress
 
 Images = NDArray[Any]  # of any real type; uint8 and uint16 are measured where they are
 
@@ -86,7 +86,7 @@ def measure_pairs(
     seconds = time.perf_counter() - began
     found = contradictions(tracking.trajectory, disc, noticed=tracking.findings)
     warn_of_doubts(found)
-    return Measurement(replace(tracking.trajectory, findings=found), (), details_of(tracking), seconds)
+    return Measurement(replace(tracking.trajectory, findings=found), (), tracking.details, seconds)
 
 
 def _sides(images: Images | tuple[Images, Images]) -> tuple[Images, Images]:

@@ -37,7 +37,6 @@ from disctrack.track.follow.tracking import (
     stretch_edges,
     track,
 )
-from disctrack.track.refine.table_contact import least_off_centre
 from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
 from disctrack.trajectory.file import Provenance
 
@@ -190,7 +189,7 @@ def measure(
         *(() if boards is None else boards.findings),
     )
     details = {
-        **details_of(tracking),
+        **tracking.details,
         "unreadable": [image.reason for image in unreadable],
         "first_pass": dataclasses.asdict(span),
         **pairs.camera_headers(),
@@ -199,7 +198,7 @@ def measure(
     for still in (slice(pairs.start, span.start), slice(span.stop, pairs.stop)):
         trajectory.frame_status[still] = FrameStatus.STILL
     trajectory = dataclasses.replace(trajectory, air_density=recording.air_density)
-    blur_px = [edge.blur_px for edge in tracking.law.edges]
+    blur_px = tracking.details["blur_px"]
     findings = contradictions(trajectory, recording.disc, recording, findings, boards, blur_px)
     trajectory = dataclasses.replace(trajectory, findings=findings)
     warn_of_doubts(trajectory.findings)
@@ -261,34 +260,6 @@ def refuse_unreadable(recording: Recording, lost: Sequence[Unreadable], n: int, 
             f"{recording.folder}: the files cannot be read: {len(lost)} of {n} images, the first: {first.reason} "
             "Is the disk still there?"
         ) from error
-
-
-def details_of(tracking: Tracking) -> dict[str, Any]:
-    """Numbers that tracking found on the way, of JSON's types."""
-    details: dict[str, Any] = {
-        "exposure_s": list(tracking.exposure),
-        "blur_px": [edge.blur_px for edge in tracking.law.edges],
-        "noise": [dataclasses.asdict(edge.noise) for edge in tracking.law.edges],
-        "variance_factor": tracking.scatter.whole,
-        "noise_factor": tracking.scatter.noise,
-        "pose_variance_factor": tracking.pose_scatter.round(3).tolist(),
-        "systematic_px": list(tracking.scatter.systematic_px),
-        "shared_sigma": [[sigma, cause] for sigma, cause in tracking.shared_sigma],
-        "size": {
-            "by_dots": tracking.as_built.size,
-            "sigma": tracking.as_built.size_sigma,
-            "share": tracking.as_built.size_share,
-        },
-        "marker_shift_um": (1e6 * tracking.as_built.marker_shift[:, :2]).round(3).tolist(),
-        "marker_shift_sigma_um": (1e6 * tracking.as_built.marker_shift_sigma).round(3).tolist(),
-        "acquisitions": tracking.acquisitions,
-    }
-    if tracking.table is not None:
-        fields = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in vars(tracking.table).items()}
-        theta = tracking.trajectory.q[:, 4]
-        fields["least_off_centre"] = least_off_centre(tracking.table, theta, tracking.as_built.disc)
-        details["table"] = {**fields, "told": tracking.table.sentence}
-    return details
 
 
 def exposures(recording: Recording, pairs: ImagePairs) -> tuple[tuple[float, float] | None, tuple[str, ...]]:

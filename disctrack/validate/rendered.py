@@ -170,7 +170,7 @@ def render_and_measure(scene: Scene) -> RenderedOutcome:
         own,
         true,
         cameras_in_sight(truth.q, truth.rig, recording.disc),
-        found[0].scatter.systematic_px,
+        tuple(found[0].details["systematic_px"]),
         tuple(finding.sentence for finding in found[0].findings),
     )
 

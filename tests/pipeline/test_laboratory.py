@@ -70,12 +70,7 @@ def wrong_about(seed, effect):
     """What is said of a recording that is not as planted; empty where that is named within three sigma, and no more."""
     disc, truth = PLANTED[effect]
     tracking = recorded(Plan(seed, 300, frame_rate=500.0, disc=disc))[0]
-    dots = tracking.as_built
-    told = {
-        "marker_shift_um": 1e6 * dots.marker_shift[:, :2],
-        "marker_shift_sigma_um": 1e6 * dots.marker_shift_sigma,
-    }
-    result = diagnose(with_declared_dots(tracking.trajectory, told))
+    result = diagnose(with_declared_dots(tracking.trajectory, tracking.details))
     fit = result.diagnosis.after
     claimed = {q for found in result.diagnosis.found if found.candidate.kind == "motion" for q in found.candidate.names}
     others = {name.partition(".")[0] for name in claimed} - {name.partition(".")[0] for name in truth}

@@ -130,7 +130,7 @@ def _check_dots(disc: Disc) -> None:
 
 def _slips(tracking: Tracking, read_blocks: ReadBlocks, pairs: range, setup: TrackingSetup) -> tuple[Finding, ...]:
     """More images left out by one camera than a delay of its dots tells: the pairing that fits the frames after it."""
-    apart = _apart(tracking) | (max(tracking.scatter.systematic_px) > MEETING_PX / 2)
+    apart = _apart(tracking) | (max(tracking.details["systematic_px"]) > MEETING_PX / 2)
     begun = np.flatnonzero(np.convolve(apart, np.ones(APART), "valid") == APART)
     if not begun.size or {Kind.DROPPED_FRAMES, Kind.DELAY} & {finding.kind for finding in tracking.findings}:
         return ()
@@ -171,7 +171,7 @@ def _senseless(tracking: Tracking, faulty: bool, read_blocks: ReadBlocks, pairs:
     kinds = {finding.kind for finding in tracking.findings}
     status = tracking.trajectory.frame_status
     contradicted = Kind.ONE_SIDED in kinds or 2 * np.sum(status == FrameStatus.CONTRADICTED) > len(status)
-    far = faulty and max(tracking.scatter.systematic_px) > MEETING_PX
+    far = faulty and max(tracking.details["systematic_px"]) > MEETING_PX
     if not (contradicted or far) or Kind.DROPPED_FRAMES in kinds:  # which makes cameras contradict each other
         return _some(read_blocks, pairs[:0])
     rows = np.flatnonzero(_apart(tracking) | (far & (status == FrameStatus.MEASURED)))

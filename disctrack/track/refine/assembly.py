@@ -1,7 +1,8 @@
 """From what was followed to the trajectory: what all frames share is refined, all poses are fitted and judged."""
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,7 @@ from calibration.kit.arrays import Array, Mask
 from disctrack import frames
 from disctrack.findings import Finding
 from disctrack.track.dots.template import DotCentres, dot_centres
-from disctrack.track.follow.following import Follower, Law, Tables, repeats
+from disctrack.track.follow.following import Follower, Tables, repeats
 from disctrack.track.judge.camera_course import camera_course
 from disctrack.track.judge.doubts import FAULTY, doubts_of, repeated_images
 from disctrack.track.judge.dropped_frames import dropped_frames
@@ -23,7 +24,7 @@ from disctrack.track.refine.glare import shift_by_glare
 from disctrack.track.refine.intrinsic_scatter import Scatter, split_scatter, without_shared_faults
 from disctrack.track.refine.pose_scatter import scatter_of_poses
 from disctrack.track.refine.self_calibration import AsBuilt, by_pattern, refine_as_built
-from disctrack.track.refine.table_contact import OF_PATTERN, TableFromDisc, off_centre, table_from_disc
+from disctrack.track.refine.table_contact import OF_PATTERN, off_centre, table_from_disc
 from disctrack.track.side_by_side import SHARED_FRAMES, evenly
 from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
 
@@ -45,15 +46,7 @@ class Tracking:
     """A trajectory and what the run found out on the way."""
 
     trajectory: Trajectory
-    law: Law  # noise and blur of the cameras
-    as_built: AsBuilt
-    scatter: Scatter  # of the dots about the fitted poses; the covariances of dots and poses hold its noise, what is
-    # left of it makes `Trajectory.systematic_covariance`
-    pose_scatter: Array  # (6,) variance of the poses about a smooth motion over what the dots tell, at least 1
-    shared_sigma: tuple[tuple[float, str], ...]  # x, y, z [m], turns [rad]: what frames share, most of it from what
-    table: TableFromDisc | None  # the plane that the rim touched; None without a table, or a rim that touched it
-    exposure: tuple[float, float]  # [s] of the left and the right camera, that the dots were moved by
-    acquisitions: int  # times the disc had to be searched for without a prior and was found
+    details: dict[str, Any]  # blur, noise, ... as `_details` has them: of JSON's types, stored with the result
     findings: tuple[Finding, ...]
 
 
@@ -103,18 +96,22 @@ def assemble(
     if table is not None:
         trajectory = replace(trajectory, table_moved=table.beyond)
     doubts = doubts_of(first, faults, scatter, shaken, table, trajectory, seen)
-    return Tracking(
-        trajectory=trajectory,
-        law=first.law,
-        as_built=as_built,
-        scatter=scatter,
-        pose_scatter=shaken,
-        shared_sigma=shared,
-        table=table,
-        exposure=exposure,
-        acquisitions=sum(f.acquisitions for f in followers),
-        findings=(*repeated_images(repeated, trajectory), *slips, *of_exposure, *of_course, *doubts),
-    )
+    details = {
+        "exposure_s": list(exposure),  # that the dots were moved by
+        "blur_px": [edge.blur_px for edge in first.law.edges],
+        "noise": [asdict(edge.noise) for edge in first.law.edges],
+        "pose_variance_factor": shaken.round(3).tolist(),  # of the poses about a smooth motion over what dots tell
+        "shared_sigma": [[sigma, cause] for sigma, cause in shared],
+        "acquisitions": sum(f.acquisitions for f in followers),  # times the disc was searched for and found
+        "variance_factor": scatter.whole,
+        "noise_factor": scatter.noise,
+        "systematic_px": list(scatter.systematic_px),
+        **as_built.details,
+    }
+    if table is not None:
+        details["table"] = table.details(trajectory.q[:, 4], seen.disc)
+    findings = (*repeated_images(repeated, trajectory), *slips, *of_exposure, *of_course, *doubts)
+    return Tracking(trajectory, details, findings)
 
 
 def _as_they_were(

@@ -20,6 +20,7 @@ size is moved by its share.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -55,6 +56,15 @@ class AsBuilt:
     size_sigma: float = float("nan")  # of the dots as a ruler
     size_share: float = 0.0  # of that, which the rig has been made larger by
     off_centre: float = 0.0  # [m] by which the pattern may be off the disc's centre, as the table tells
+
+    @property
+    def details(self) -> dict[str, Any]:
+        """Of JSON's types."""
+        return {
+            "size": {"by_dots": self.size, "sigma": self.size_sigma, "share": self.size_share},
+            "marker_shift_um": (1e6 * self.marker_shift[:, :2]).round(3).tolist(),
+            "marker_shift_sigma_um": (1e6 * self.marker_shift_sigma).round(3).tolist(),
+        }
 
     @classmethod
     def as_declared(cls, rig: StereoRig, disc: Disc) -> AsBuilt:

@@ -22,6 +22,7 @@ This is geometry alone. A table that is not level leans in the world and against
 """
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import scipy
@@ -76,6 +77,16 @@ class TableFromDisc:
         )
         used = {"both": "the two are combined", "board": "the board counts", "disc": "the disc counts"}[self.source]
         return f"{told}; {used} ([table] from)"
+
+    def details(self, theta: Array, disc: Disc) -> dict[str, Any]:
+        """Of JSON's types, with the distance of the dots' middle from the disc's that no sigma would hold [m].
+
+        theta : (n,) as of `off_centre`. From that distance on board and disc disagree.
+        """
+        fields = {name: v.tolist() if isinstance(v, np.ndarray) else v for name, v in vars(self).items()}
+        lean = FROM_SIGMAS * np.hypot(self.sigma, self.board_sigma)[1:].max()
+        least = float(disc.radius * lean / np.sin(np.nanmedian(theta)))
+        return {**fields, "least_off_centre": least, "told": self.sentence}
 
 
 def table_from_disc(
@@ -170,12 +181,6 @@ def off_centre(table: TableFromDisc | None, theta: Array, disc: Disc) -> float:
     if table is None or table.source != "both":
         return 0.0
     return float(disc.radius * np.hypot(*table.beyond[1:]) / np.sin(np.nanmedian(theta)))
-
-
-def least_off_centre(table: TableFromDisc, theta: Array, disc: Disc) -> float:
-    """Distance [m] from which on board and disc disagree: a smaller one is in no sigma. theta : as of `off_centre`."""
-    lean = FROM_SIGMAS * np.hypot(table.sigma, table.board_sigma)[1:].max()
-    return float(disc.radius * lean / np.sin(np.nanmedian(theta)))
 
 
 def radius_tolerance(disc: Disc) -> float:

@@ -14,7 +14,7 @@ from disctrack.track.judge.doubts import off_the_table
 from disctrack.track.refine import table_contact
 from disctrack.track.refine.assembly import fit_all
 from disctrack.track.refine.self_calibration import motions_of_pattern
-from disctrack.track.refine.table_contact import least_off_centre, off_centre, table_from_disc
+from disctrack.track.refine.table_contact import off_centre, table_from_disc
 from tests.oracles.measured_disc import assert_sized, dots_of, measured
 
 TURN, HEIGHT = (6e-4, -4e-4), 60e-6
@@ -106,7 +106,7 @@ def test_told_is_from_where_on_a_pattern_off_the_centre_shows():
         off = share * least
         shifted = replace(copy, t_world_body=fits.t_world_body + off * fits.R_world_body[:, :, 0])
         table = table_from_disc(shifted, none.copy(), trajectory.rig, trajectory.disc)[3]
-        least = least_off_centre(table, trajectory.q[:, 4], trajectory.disc)
+        least = table.details(trajectory.q[:, 4], trajectory.disc)["least_off_centre"]
         doubted.append(off_centre(table, trajectory.q[:, 4], trajectory.disc) > 0.3 * off)
     assert doubted == [False, False, True]
 

@@ -68,9 +68,9 @@ def test_a_rolling_disc_is_measured_to_the_predicted_sigma(rolling, rendered_pai
     # mean over 60 frames: sigma / 8, plus the template's 3e-4 px or 0.03 um
     assert np.abs(error[:, :3].mean(axis=0)).max() < 0.25e-6
     assert np.abs(error[:, 3:].mean(axis=0)).max() < np.radians(0.5e-3)
-    assert result.scatter.whole < 1.15
-    assert result.acquisitions == 1
-    assert (result.as_built.marker_shift == 0).all()  # good dots are left where they are declared
+    assert result.details["variance_factor"] < 1.15
+    assert result.details["acquisitions"] == 1
+    assert not np.any(result.details["marker_shift_um"])  # good dots are left where they are declared
     # angles are continuous, and the quaternion tells the same rotation
     assert np.abs(np.diff(trajectory.q[:, 3:], axis=0)).max() < 0.3
     R = frames.rotation_from_quaternion(trajectory.quaternion)
@@ -83,8 +83,8 @@ def test_the_number_of_workers_changes_no_bit_of_the_result(rolling, rendered_pa
     monkeypatch.setattr("disctrack.track.follow.tracking.SHORTEST_SPLIT", 20)
     monkeypatch.setattr("disctrack.track.refine.assembly.FITTED_AT_ONCE", 16)
     one, two = (tracked(images, rendered_pairs, size=15, workers=workers) for workers in (1, 2))
-    assert two.acquisitions == one.acquisitions == 2
-    assert (one.law, one.scatter) == (two.law, two.scatter)
+    assert one.details["acquisitions"] == 2
+    assert one.details == two.details
     for name in ("q", "pose_covariance", "calibration_sensitivity", "markers_px", "marker_status", "quaternion"):
         assert np.array_equal(getattr(one.trajectory, name), getattr(two.trajectory, name), equal_nan=True), name
     change = pulls(one.trajectory, whole.trajectory.q)
@@ -104,7 +104,7 @@ def test_stretches_without_a_disc_change_nothing_whoever_gets_there_first(rollin
     images[:20] = 85  # no disc in the first of four stretches of 15 pairs, nor at the start of the second
     runs = [tracked(images, rendered_pairs, size=15, workers=workers) for workers in (1, 3, 4)]
     for run in runs[1:]:
-        assert run.law == runs[0].law
+        assert run.details == runs[0].details
         assert np.array_equal(run.trajectory.q, runs[0].trajectory.q, equal_nan=True)
     assert (runs[0].trajectory.frame_status[:20] == FrameStatus.MARKERS_NOT_FOUND).all()
     assert (runs[0].trajectory.frame_status[20:] == FrameStatus.MEASURED).all()
@@ -142,13 +142,13 @@ def test_misprinted_dots_are_found_and_used(rolling, rendered_pairs):
     declared[2, 0] += 60e-6  # the declaration is wrong by what a printer does
     wrong = replace(rendered_pairs.disc, marker_centres_body=declared)
     found = tracked(images, rendered_pairs, disc=wrong)
-    shift = found.as_built.marker_shift
+    shift = 1e-6 * np.array(found.details["marker_shift_um"])
     relative = shift[2] - np.delete(shift, 2, axis=0).mean(axis=0)
     # the mean displacement and turn of the pattern are gauge: the other five move to balance
     assert -75e-6 < relative[0] < -45e-6
-    assert found.scatter.whole < 1.2
+    assert found.details["variance_factor"] < 1.2
     kept = tracked(images, rendered_pairs, disc=wrong, settings=TrackingSettings(refine_markers=False))
-    assert kept.scatter.whole > 20  # the fault is loud when it is not refined
+    assert kept.details["variance_factor"] > 20  # the fault is loud when it is not refined
 
 
 @pytest.mark.parametrize("keep", [[0, 3], [0, 3, 6]])

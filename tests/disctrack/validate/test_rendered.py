@@ -10,6 +10,7 @@ from disctrack.faults.keys import CameraFault, Faults
 from disctrack.frames import rotation_from_euler
 from disctrack.recording.declaration import read_recording
 from disctrack.synthetic.cameras import rig_of
+from disctrack.track.dots.template import NoiseModel
 from disctrack.trajectory import part
 from disctrack.validate import rendered
 from disctrack.validate.accuracy import accuracy_validation, complaints, imperfect_validation, sum_up, verdict
@@ -143,7 +144,7 @@ def located(scene, folder):
 
 def test_poses_at_rest_are_each_found_without_the_one_before(rng, tmp_path):
     tracking, _ = located(seen_by_both(4, rendered.scene_of(1, quick=True), rng), tmp_path)
-    assert tracking.acquisitions == 4
+    assert tracking.details["acquisitions"] == 4
 
 
 @pytest.mark.parametrize(("bits", "read_noise"), [(8, 16.0), (12, 3.0), (16, 0.8)])
@@ -157,7 +158,7 @@ def test_noisy_sensors_and_more_bits_are_measured_from_the_first_pair_on(bits, r
     # on 40 numbers chance allows 1 +- 0.33
     assert 0.3 < noise_consistency(found).value < 2.0
     grey = (2**bits - 1) / 255
-    assert tracking.law.edges[0].noise.variance(100 * grey) == pytest.approx(
+    assert NoiseModel(**tracking.details["noise"][0]).variance(100 * grey) == pytest.approx(
         (read_noise**2 + 100 / 50) * grey**2, rel=0.35
     )  # 12 flat parts of some 100 pixels each
 

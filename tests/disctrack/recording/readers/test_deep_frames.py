@@ -57,7 +57,7 @@ def test_poses_do_not_depend_on_the_unit_of_grey(dim, plain, scale):
     # metres and radians; the same sums in other units, so round-off only
     assert_allclose(scaled.trajectory.q, plain.trajectory.q, rtol=0, atol=1e-9)
     assert_allclose(scaled.trajectory.pose_covariance, plain.trajectory.pose_covariance, rtol=1e-6)
-    assert scaled.law.edges[0].noise.step == scale
+    assert scaled.details["noise"][0]["step"] == scale
 
 
 def test_twelve_bits_scatter_less_than_the_same_frames_rounded_to_eight(dim, plain):
