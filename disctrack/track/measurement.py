@@ -1,4 +1,7 @@
-"""The measurement from end to end: a recording's files -> rig -> trajectory, with what is needed to reuse results."""
+"""The measurement from end to end: a recording's files, or frames in memory, become a trajectory.
+
+With what is needed to reuse results.
+"""
 
 import dataclasses
 import hashlib
@@ -10,13 +13,15 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calibration.cameras.camera import StereoRig
-from calibration.kit.arguments import Threads, checked
+from calibration.kit.arguments import FrameRate, Gravity, Threads, Times, checked, grey_values
 from calibration.kit.arrays import Array
 from calibration.kit.brief import Brief
 from calibration.kit.threads import one_blas_thread
 from disctrack.analyse.declaration import Boards, contradictions, with_square
+from disctrack.disc import Disc
 from disctrack.errors import RecordingError, TrackingError
 from disctrack.findings import Finding, Kind, Severity, of_kind, warn_of_doubts
 from disctrack.frames import CAMERAS
@@ -41,8 +46,10 @@ from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
 from disctrack.trajectory.file import Provenance
 
 Progress = Callable[[int], None]
+Images = NDArray[np.generic]  # of any real type; uint8 and uint16 are measured where they are
 
 WHOLE_BELOW = 2.0  # [s] a recording as short as this was cut to what is wanted, and rest in it is wanted too
+BLOCK = 64  # pairs in memory
 
 
 @dataclass(frozen=True)
@@ -198,11 +205,90 @@ def measure(
     for still in (slice(pairs.start, span.start), slice(span.stop, pairs.stop)):
         trajectory.frame_status[still] = FrameStatus.STILL
     trajectory = dataclasses.replace(trajectory, air_density=recording.air_density)
-    blur_px = tracking.details["blur_px"]
-    findings = contradictions(trajectory, recording.disc, recording, findings, boards, blur_px)
+    findings = contradictions(trajectory, recording.disc, recording, findings, boards, details["blur_px"])
     trajectory = dataclasses.replace(trajectory, findings=findings)
-    warn_of_doubts(trajectory.findings)
+    warn_of_doubts(findings)
     return Measurement(trajectory, unreadable, details, seconds)
+
+
+@one_blas_thread
+@checked
+def measure_pairs(
+    images: tuple[Images, Images] | Images,
+    rig: StereoRig,
+    disc: Disc,
+    frame_rate: FrameRate,
+    *,
+    gravity: Gravity = 9.81,
+    settings: TrackingSettings | None = None,
+    timestamps: Times | None = None,
+    threads: Threads = 1,
+    progress: Progress = lambda n: None,
+) -> Measurement:
+    """Measure the disc's pose in every pair; every frame is measured (no rest is left out).
+
+    images     : (n, 2, height, width) grey values, left and right; or the pair of arrays (n, height, width)
+    rig, disc  : or what holds them: the path of a rig file, a calibration, a recording
+    frame_rate : [Hz]; timestamps (n,) [s], increasing, where the camera wrote them
+    gravity    : [m/s^2], kept with the trajectory for the physics
+    Raises TrackingError if the arrays are not such images, do not belong to the rig, or show the disc in no pair.
+
+        >>> pairs = open_pairs("clip")
+        >>> images = np.array([[pairs.left.read(i), pairs.right.read(i)] for i in range(20)])
+        >>> len(measure_pairs(images, "clip/results/rig.h5", read_recording("clip"), 1000.0).trajectory)
+        20
+    """
+    if not isinstance(images, tuple | list):
+        images = grey_values(images, "images")
+    left, right = _sides(images)
+    n = len(left)
+    times = None if timestamps is None else np.asarray(timestamps, float)
+    if times is not None and (times.shape != (n,) or not np.all(np.diff(times) > 0)):
+        raise TrackingError(f"timestamps of shape {times.shape} for {n} pairs; expected ({n},), increasing, in seconds")
+    prepare(left.dtype)
+
+    def read_blocks(start: int, stop: int) -> Iterator[PairBlock]:
+        for first in range(start, stop, BLOCK):
+            rows = slice(first, min(first + BLOCK, stop))
+            # pairs that lie together are measured where they are: of their pixels the dots' alone are looked at
+            together = isinstance(images, np.ndarray) and images.flags.carray
+            pair = images[rows] if together else np.stack([left[rows], right[rows]], axis=1)
+            yield PairBlock(np.arange(rows.start, rows.stop), pair)
+
+    began = time.perf_counter()
+    tracking = track(
+        read_blocks,
+        range(n),
+        rig,
+        disc,
+        frame_rate,
+        gravity=gravity,
+        settings=settings,
+        timestamps=times,
+        workers=threads,
+        progress=progress,
+    )
+    seconds = time.perf_counter() - began
+    found = contradictions(tracking.trajectory, disc, noticed=tracking.findings)
+    warn_of_doubts(found)
+    trajectory = dataclasses.replace(tracking.trajectory, findings=found)
+    return Measurement(trajectory, (), tracking.details, seconds)
+
+
+def _sides(images: Images | tuple[Images, Images]) -> tuple[Images, Images]:
+    expected = "expected (n, 2, height, width), or two arrays (n, height, width) of one type"
+    if isinstance(images, tuple | list) and len(images) == 2:
+        left, right = (grey_values(side, f"{name} images") for side, name in zip(images, CAMERAS, strict=True))
+    else:
+        whole = np.asarray(images)
+        if whole.ndim != 4 or whole.shape[1] != 2:
+            raise TrackingError(f"images of shape {whole.shape}; {expected}")
+        left, right = whole[:, 0], whole[:, 1]
+    if left.shape != right.shape or left.ndim != 3 or left.dtype != right.dtype:
+        raise TrackingError(f"images of shape {left.shape} {left.dtype} and {right.shape} {right.dtype}; {expected}")
+    if not len(left):
+        raise TrackingError("no image in the arrays")
+    return left, right
 
 
 def _tracked(

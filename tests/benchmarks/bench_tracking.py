@@ -18,8 +18,7 @@ from scipy.optimize import least_squares
 from calibration.cameras.camera import StereoRig
 from disctrack.frames import rotation_from_quaternion, rotation_from_vector, vector_from_rotation
 from disctrack.recording.declaration import Recording
-from disctrack.track.in_memory import measure_pairs
-from disctrack.track.measurement import ImagePairs, measure
+from disctrack.track.measurement import ImagePairs, measure, measure_pairs
 from disctrack.trajectory import Trajectory
 
 # Counted in track/dots/_kernels.py: +, -, *, / and roots for a pixel of a dot, each time its model and the normal
