@@ -22,7 +22,7 @@ from disctrack.synthetic.cameras import rig_of
 from disctrack.synthetic.description import Scene
 from disctrack.track.follow.tracking import TrackingSettings, track
 from disctrack.track.judge.disc_not_seen import arrangement_found, moved_camera, unlike_declared
-from disctrack.track.refine.intrinsic_scatter import MIN_FRAMES
+from disctrack.track.refine.scatter import MIN_FRAMES
 from disctrack.trajectory import FrameStatus
 from disctrack.validate.errors import compare
 from tests.disctrack.recording.readers.written import write_video

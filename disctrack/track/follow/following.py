@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -30,7 +30,6 @@ from disctrack.track.dots.template import (
     typical_noise,
 )
 from disctrack.track.dots.template_response import Edge
-from disctrack.track.follow.motion_span import StillScene
 from disctrack.track.pose import stacked
 from disctrack.trajectory import FrameStatus, MarkerStatus
 
@@ -38,8 +37,8 @@ from disctrack.trajectory import FrameStatus, MarkerStatus
 MAX_PREDICTION_RMS_PX = 2.0
 NOISE_FRAMES = 12  # that blur is taken from, and every third of them for the noise
 MIN_TO_BEGIN = 5  # dot images that must be measured where the disc is found anew: three fit anything
-# Frames over which the last motion is carried on, each of which costs one look at the dots; and between searches of a
-# scene in which no disc was seen yet: one costs as much as some 600
+# Frames over which the last motion is carried on, each of which costs one look at the dots; and at most between
+# searches, of which one costs as much as some 600
 PATIENCE = 60
 UNUSUAL = 2.0  # times the usual misfit; of dots in compressed video, one in twenty leaves 1.25 times the median
 MOST_USUAL = 0.1  # of the contrast: dots that leave more than this are not the declared ones
@@ -83,33 +82,6 @@ class Heading(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Search:
-    """When the disc is searched for, and what the images showed where it was not found."""
-
-    failures: int = 0  # in succession
-    since: int = 0  # frames since the last of them
-    scenes: tuple[StillScene, ...] = ()
-
-    def is_due(self, pair: Image, readable: Mask, seen: bool) -> bool:
-        """True where there is reason to hope.
-
-        A disc that was seen before comes out from behind a hand after some frames: the wait grows by one with every
-        failure. Where none was seen yet, the pair (2, height, width) must show something new, or the wait doubles.
-        """
-        if self.since < self.failures:
-            return False
-        if seen or not self.scenes or self.since >= min(2**self.failures, PATIENCE) or not readable.all():
-            return True
-        return any(map(StillScene.differs, self.scenes, pair))
-
-    def failed(self, images: Image, readable: Mask) -> Search:
-        """After a search of the first of the pairs; the second tells how pixels scatter without anything new."""
-        known = len(images) > 1 and bool(readable[:2].all())
-        scenes = tuple(map(StillScene, *images[:2])) if known else ()
-        return replace(self, failures=self.failures + 1, since=0, scenes=scenes)
-
-
-@dataclass(frozen=True)
 class TrackingSetup:
     """What does not change while a recording is followed."""
 
@@ -149,20 +121,19 @@ class Follower:
     law: Law = field(default_factory=Law)
     heading: Heading | None = None
     lost: int | None = 0  # frames since the last pose; None while the disc is followed
-    search: Search = field(default_factory=Search)
+    failures: int = 0  # searches in vain, one after the other
+    waited: int = 0  # frames since the last of them
     measured: bool = False  # blur and noise known
     acquisitions: int = 0
     first_reason: str = ""
     saturated: list[int | None] = field(default_factory=lambda: [None, None])  # grey value at which the dots' brighter
     # side is clipped
     first_row: int = 0  # of the tables
-    found: Pose | None = None  # by a search, in this block; `before`, in a block before of one pair
-    before: Pose | None = None
 
     def without_pose(self) -> None:
         """One more frame is gone in which the disc is lost."""
         self.lost = (self.lost or 0) + 1
-        self.search = replace(self.search, since=self.search.since + 1)
+        self.waited += 1
 
 
 def run(
@@ -215,7 +186,6 @@ def empty_tables(n: int, m: int) -> Tables:
 def follow_block(follower: Follower, images: Image, readable: Mask, tables: Tables, start: int) -> None:
     """Fill the tables' rows from `start` on with what n pairs show; images (n, 2, height, width), readable (n, 2)."""
     n, i = len(images), 0
-    follower.found, follower.before = None, follower.found if n == 1 else None
     rows = tables.part(slice(start, start + n))
     # an image of one camera alone that is a copy of an earlier one: no two are equal, by their noise. Where both are,
     # nothing may have moved: that is judged by the motion
@@ -226,7 +196,7 @@ def follow_block(follower: Follower, images: Image, readable: Mask, tables: Tabl
         anew = follower.lost is not None
         seen = bool(readable[i].any())
         if not seen:  # what was searched in vain before tells nothing of what comes after
-            follower.search = Search()
+            follower.failures = 0
         if not seen or (anew and not recover(follower, images[i:], readable[i:])):
             rows.frame_status[i] = FrameStatus.MARKERS_NOT_FOUND if seen else FrameStatus.UNREADABLE
             follower.without_pose()
@@ -240,7 +210,7 @@ def follow_block(follower: Follower, images: Image, readable: Mask, tables: Tabl
         if anew and done > 1:
             _go_back(follower, images, readable, rows, i)
         i += done
-        follower.search = Search()
+        follower.failures = 0
         follower.lost = 0 if i < n else None
 
 
@@ -267,19 +237,19 @@ def recover(follower: Follower, images: Image, readable: Mask) -> bool:
     """Set a heading that leads to the disc in the first of the pairs; False where it is not found.
 
     First its last motion is carried on, with no acceleration, which one bad pose would have spoilt: that costs no more
-    than any other frame; then, now and then, it is searched for in the whole images.
+    than any other frame; then it is searched for in the whole images, after waits that grow by a frame each time.
     """
     if follower.heading is not None and follower.lost is not None and follower.lost <= PATIENCE:
         carried = follower.heading.carried_on(follower.lost)
         if _holds(follower, carried, images, readable):
             follower.heading = carried
             return True
-    if not follower.search.is_due(images[0], readable[0], follower.heading is not None):
+    if follower.waited < min(follower.failures, PATIENCE):
         return False
     if _search(follower, images, readable):
         follower.acquisitions += 1
         return True
-    follower.search = follower.search.failed(images, readable)
+    follower.failures, follower.waited = follower.failures + 1, 0
     return False
 
 
@@ -335,15 +305,15 @@ def _search(follower: Follower, images: Image, readable: Mask) -> bool:
         following = _found(follower, images[1], readable[1])
         if following is not None:
             following = _nearest_alike(pose, following, follower.setup.disc)
-    elif follower.before is not None:  # pairs come one by one: as from the pair before
-        R, t = follower.before
+    elif follower.heading is not None and follower.lost == 0:  # pairs come one by one: as from the pair before
+        R, t = follower.heading.last
         following = pose[0] @ R.T @ pose[0], 2 * pose[1] - t
     heading = Heading.leading_to(pose, following)
     if not follower.measured:
         _measure_blur_and_noise(follower, images, readable, pose, heading)
     if not _holds(follower, heading, images, readable):
         return False
-    follower.heading, follower.found = heading, pose
+    follower.heading = heading
     return True
 
 

@@ -30,9 +30,9 @@ from disctrack.track.follow.following import (
     follow_block,
     run,
 )
+from disctrack.track.judge.cameras import frames_ahead, left_out
 from disctrack.track.judge.disc_not_seen import MEETING_PX, why_not_seen
 from disctrack.track.judge.doubts import MOVED
-from disctrack.track.judge.dropped_frames import frames_ahead, left_out
 from disctrack.track.pose import marker_pixels
 from disctrack.track.refine.assembly import Taken, Tracking, TrackingSettings, assemble
 from disctrack.track.side_by_side import evenly

@@ -11,10 +11,9 @@ from disctrack.disc import Disc, symmetry_order
 from disctrack.findings import MISFITS, Finding, Kind, Remedy, Severity, Subject
 from disctrack.numbers import Measured
 from disctrack.track.follow.following import Follower
-from disctrack.track.judge.dropped_frames import HARDLY, LATE, delay_of_right
+from disctrack.track.judge.cameras import HARDLY, LATE, delay_of_right
 from disctrack.track.pose import DotsInFrames
-from disctrack.track.refine.intrinsic_scatter import Scatter
-from disctrack.track.refine.pose_scatter import GROUPS
+from disctrack.track.refine.scatter import GROUPS, Scatter
 from disctrack.track.refine.self_calibration import AsBuilt
 from disctrack.track.refine.table_contact import TableFromDisc
 from disctrack.track.side_by_side import FEW, stretches

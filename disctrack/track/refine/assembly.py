@@ -14,15 +14,13 @@ from disctrack import frames
 from disctrack.findings import Finding
 from disctrack.track.dots.template import DotCentres, dot_centres
 from disctrack.track.follow.following import Follower, Tables, repeats
-from disctrack.track.judge.camera_course import camera_course
+from disctrack.track.judge.cameras import camera_course, dropped_frames
 from disctrack.track.judge.doubts import FAULTY, doubts_of, repeated_images
-from disctrack.track.judge.dropped_frames import dropped_frames
 from disctrack.track.judge.outlier_tests import judge_poses, outlying_frames, unexpected_misfit
 from disctrack.track.pose import MIN_DOTS, DotsInFrames, PoseFits, fit_poses, whitening
 from disctrack.track.refine.exposure import exposure_by_smear, exposure_of, shift_by_exposure
 from disctrack.track.refine.glare import shift_by_glare
-from disctrack.track.refine.intrinsic_scatter import Scatter, split_scatter, without_shared_faults
-from disctrack.track.refine.pose_scatter import scatter_of_poses
+from disctrack.track.refine.scatter import Scatter, scatter_of_poses, split_scatter, without_shared_faults
 from disctrack.track.refine.self_calibration import AsBuilt, by_pattern, refine_as_built
 from disctrack.track.refine.table_contact import OF_PATTERN, off_centre, table_from_disc
 from disctrack.track.side_by_side import SHARED_FRAMES, evenly

@@ -8,8 +8,7 @@ import pytest
 from disctrack.faults.keys import CameraFault, Faults
 from disctrack.findings import Kind
 from disctrack.frames import rotation_from_vector
-from disctrack.track.judge.camera_course import camera_course
-from disctrack.track.judge.dropped_frames import dropped_frames, frames_ahead
+from disctrack.track.judge.cameras import camera_course, dropped_frames, frames_ahead
 from disctrack.track.refine.assembly import fit_all
 from tests.oracles.measured_disc import dots_of, measured
 

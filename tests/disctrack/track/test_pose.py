@@ -10,7 +10,7 @@ from disctrack.disc import MA_2014
 from disctrack.synthetic.cameras import rig_of
 from disctrack.synthetic.description import Scene
 from disctrack.track.pose import DotsInFrames, PoseFits, fit_poses, marker_pixels
-from disctrack.track.refine.pose_scatter import scatter_of_poses
+from disctrack.track.refine.scatter import scatter_of_poses
 
 SIGMA_PX = 0.01
 CENTRES = MA_2014.marker_centres_body

@@ -12,7 +12,7 @@ from disctrack.disc import MA_2014
 from disctrack.faults.keys import CameraFault, Faults
 from disctrack.frames import rotation_from_euler, rotation_from_vector, vector_from_rotation
 from disctrack.track.refine.assembly import fit_all
-from disctrack.track.refine.intrinsic_scatter import split_scatter, without_shared_faults
+from disctrack.track.refine.scatter import split_scatter, without_shared_faults
 from disctrack.track.refine.self_calibration import (
     declared_places_kept,
     motions_of_pattern,
