@@ -129,10 +129,10 @@ def _check_dots(disc: Disc) -> None:
 
 
 def _slips(tracking: Tracking, read_blocks: ReadBlocks, pairs: range, setup: TrackingSetup) -> tuple[Finding, ...]:
-    """More images left out by one camera than a delay of its dots tells: the pairing that fits the frames after it."""
+    """Images left out by one camera, by the pairing that fits the frames after it."""
     apart = _apart(tracking) | (max(tracking.details["systematic_px"]) > MEETING_PX / 2)
     begun = np.flatnonzero(np.convolve(apart, np.ones(APART), "valid") == APART)
-    if not begun.size or {Kind.DROPPED_FRAMES, Kind.DELAY} & {finding.kind for finding in tracking.findings}:
+    if not begun.size or Kind.DELAY in {finding.kind for finding in tracking.findings}:
         return ()
     first, start = int(begun[0]), pairs[begun[0]]
     edges = [start, min(start + PAIRED, pairs.stop)]

@@ -34,40 +34,13 @@ STRETCHES = 20
 SURE = 5.0  # sigmas of the difference before and after; a drift, whose scatter is its own, reaches 7
 
 
-def dropped_frames(refused: Mask, seen: DotsInFrames, pairs: range) -> tuple[Finding, ...]:
-    """Long stretches of frames refused (n,) for their dots."""
-    slips: list[tuple[int, list[int], list[float]]] = []  # the images left out, rows, the delays that say so
-    unexplained: list[int] = []
-    # what is shorter (glare, a hand, exchanged frames) is told by the frames' own status
-    for first, end in stretches(refused, FEW):
-        delay, explained = delay_of_right(seen, np.arange(first, end))
-        ahead = round(delay) if explained > LATE else 0
-        if not ahead:
-            unexplained += pairs[first:end]
-            continue
-        if not slips or ahead != slips[-1][0]:  # between two of one delay the disc may turn about a camera's line
-            slips.append((ahead, [], []))
-        slips[-1][1].extend(range(first, end))
-        slips[-1][2].append(delay)
-    said = []
-    refused_for = "are refused: the dots of the two cameras contradict each other"
-    for k, (ahead, rows, delays) in enumerate(slips):
-        camera, other = CAMERAS[::-1] if ahead > 0 else CAMERAS
-        before = np.arange(rows[0])
-        delay, explained = delay_of_right(seen, before)
-        by_both = np.isfinite(seen.pixels[before]).all(axis=-1).any(axis=-1).all(axis=-1) & seen.posed[before]
-        always = k == 0 and (round(delay) == ahead if explained > HARDLY else by_both.sum() < FEW)
-        frames = [pairs[i] for i in rows]
-        text = (
-            f"frames {ranges(frames)} {refused_for}, as if the {camera} camera were "
-            f"{abs(float(np.mean(delays))):.2f} frames ahead of the {other}"
-        )
-        since = pairs[0] if always else frames[0]
-        said.append(left_out(text, ahead, (frames[0], frames[-1]), since, always))
-    if unexplained:
-        text = f"frames {ranges(unexplained)} {refused_for}"
-        said.append(Finding(Kind.CAMERAS_CONTRADICT, Severity.DOUBT, text, explains=(Kind.FRAMES_LOST,)))
-    return tuple(said)
+def contradicting(refused: Mask, pairs: range) -> tuple[Finding, ...]:
+    """Long stretches of frames refused (n,) for their dots: what is shorter is told by the frames' own status."""
+    frames = [pairs[row] for first, end in stretches(refused, FEW) for row in range(first, end)]
+    if not frames:
+        return ()
+    text = f"frames {ranges(frames)} are refused: the dots of the two cameras contradict each other"
+    return (Finding(Kind.CAMERAS_CONTRADICT, Severity.DOUBT, text, explains=(Kind.FRAMES_LOST,)),)
 
 
 def left_out(text: str, ahead: int, frames: tuple[int, int], since: int, always: bool) -> Finding:

@@ -14,7 +14,7 @@ from disctrack import frames
 from disctrack.findings import Finding
 from disctrack.track.dots.template import DotCentres, dot_centres
 from disctrack.track.follow.following import Follower, Tables, repeats
-from disctrack.track.judge.cameras import camera_course, dropped_frames
+from disctrack.track.judge.cameras import camera_course, contradicting
 from disctrack.track.judge.doubts import FAULTY, doubts_of, repeated_images
 from disctrack.track.judge.outlier_tests import judge_poses, outlying_frames, unexpected_misfit
 from disctrack.track.pose import MIN_DOTS, DotsInFrames, PoseFits, fit_poses, whitening
@@ -77,7 +77,6 @@ def assemble(
     fits, systematic, scatter = _scattered(fits, dots, faults, outlying)
     seen = replace(seen, R=fits.R_world_body, t=fits.t_world_body)
     fits, verdicts = _judged(fits, dots, repeated, outlying, taken.frame_rate, disc.radius)
-    slips = dropped_frames(verdicts == FrameStatus.CONTRADICTED, seen, taken.pairs)
     course, of_course = camera_course(seen, fits, taken.pairs)
     systematic += course
     moved = by_pattern(as_built, fits.R_world_body)
@@ -108,7 +107,8 @@ def assemble(
     }
     if table is not None:
         details["table"] = table.details(trajectory.q[:, 4], seen.disc)
-    findings = (*repeated_images(repeated, trajectory), *slips, *of_exposure, *of_course, *doubts)
+    pieces = contradicting(verdicts == FrameStatus.CONTRADICTED, taken.pairs)
+    findings = (*repeated_images(repeated, trajectory), *pieces, *of_exposure, *of_course, *doubts)
     return Tracking(trajectory, details, findings)
 
 

@@ -8,7 +8,7 @@ import pytest
 from disctrack.faults.keys import CameraFault, Faults
 from disctrack.findings import Kind
 from disctrack.frames import rotation_from_vector
-from disctrack.track.judge.cameras import camera_course, dropped_frames, frames_ahead
+from disctrack.track.judge.cameras import camera_course, frames_ahead
 from disctrack.track.refine.assembly import fit_all
 from tests.oracles.measured_disc import dots_of, measured
 
@@ -59,24 +59,6 @@ def test_what_is_wrong_throughout_is_no_course(faults):
         _, (by_course, told) = judged(measured(n=N, faults=faults, seed=seed))
         assert told == ()
         assert not by_course.any()
-
-
-@pytest.mark.parametrize(("ahead", "said"), [((1, 1), ["right"]), ((1, -1), ["right", "left"])])
-def test_one_delay_in_several_stretches_is_one_sentence(ahead, said):
-    """Between stretches of one and the same delay the cameras only happen to agree."""
-    trajectory = measured(n=60)
-    markers = trajectory.markers_px.copy()
-    refused = np.zeros(60, bool)
-    for (first, end), k in zip(((8, 18), (30, 42)), ahead, strict=True):
-        markers[first:end, 1] = trajectory.markers_px[first + k : end + k, 1]
-        refused[first:end] = True
-    seen = dots_of(replace(trajectory, markers_px=markers))
-    fits = fit_all(seen, judged=False)
-    told = dropped_frames(refused, replace(seen, R=fits.R_world_body, t=fits.t_world_body), range(60))
-    assert [finding.kind for finding in told] == [Kind.DROPPED_FRAMES] * len(said)
-    assert [finding.subject.camera for finding in told] == said
-    assert {finding.numbers["images"].value for finding in told} == {1}
-    assert "at frame 8" in told[0].text
 
 
 @pytest.mark.parametrize(("lost", "turn_deg", "told"), [(20, 0.0, 20), (-37, 0.0, -37), (0, 0.0, 0), (0, 0.5, 0)])
