@@ -110,10 +110,9 @@ def moved_camera(pairs: NDArray, rig: StereoRig, disc: Disc) -> Iterator[Finding
     seen = seen.at(np.flatnonzero(by_both.all(axis=1)))
     if 2 * len(seen.t) < len(pairs) or len(seen.t) < MIN_DOTS:
         return
-    free = np.zeros(N_RIG + 2 * disc.n_markers, bool)
-    free[PAIR_TURN] = free[PAIR_SHIFT] = True
-    information = np.diag(np.repeat([TURN**-2, SHIFT**-2], 3))
-    found = fit_shared(seen, free, information)
+    sigma = np.zeros(N_RIG + 2 * disc.n_markers)
+    sigma[PAIR_TURN], sigma[PAIR_SHIFT] = TURN, SHIFT
+    found = fit_shared(seen, sigma)
     rms = BLOB_PX * np.sqrt(found.reduced_chi_square)
     moved = rig.perturbed(found.shift[:N_RIG])
     turn = np.linalg.norm(vector_from_rotation(moved.R_right_left @ rig.R_right_left.T))

@@ -103,48 +103,42 @@ def _at_fault_since_a_jump(residuals: Array, reduced: Array) -> Mask:
 
     reduced : (n,) chi-square of the frames in which both cameras tell, NaN in the others
     """
-    at_fault = np.zeros(len(reduced), bool)
     rows = np.flatnonzero(np.isfinite(reduced))
-    if len(rows) < 2:
-        return at_fault
     step = residuals[rows[1:]] - residuals[rows[:-1]]
     both: Mask = np.asarray(np.isfinite(step).all(-1))
     square = 0.5 * np.sum(np.where(both[..., None], step, 0.0) ** 2, axis=(1, 2, 3))
     change = square / np.maximum(2 * both.sum((1, 2)) - 6, 1)
     usual = np.fmax(_usual(change[:, None])[0][:, 0], 1.0)
-    cuts = np.flatnonzero((change > OUTLYING * usual) & (np.diff(rows) <= BLOCK)) + 1
-    if not len(cuts):
-        return at_fault
-    starts, ends = np.r_[0, cuts], np.r_[cuts, len(rows)]
-    first = np.array([np.median(reduced[rows[a : min(b, a + FEW)]]) for a, b in zip(starts, ends, strict=True)])
-    last = np.array([np.median(reduced[rows[max(a, b - FEW) : b]]) for a, b in zip(starts, ends, strict=True)])
-    long = ends - starts >= 2  # one frame alone is no measure for the others
+    pieces = np.split(rows, np.flatnonzero((change > OUTLYING * usual) & (np.diff(rows) <= BLOCK)) + 1)
+    long = np.array([len(piece) >= 2 for piece in pieces])  # one frame alone is no measure for the others
     if not long.any():
-        return at_fault
+        return np.zeros(len(reduced), bool)
+    first, last = (
+        np.array([np.median(reduced[piece[end]]) for piece in pieces]) for end in (slice(FEW), slice(-FEW, None))
+    )
     best = int(np.argmin(np.where(long, np.maximum(first, last), np.inf)))
 
     def as_usual(left: int, right: int, kept: int) -> bool:
         here, there = (last[left], first[right]) if kept == left else (first[right], last[left])
         return bool(there <= OUTLYING * max(1.0, here))
 
-    for part in np.flatnonzero(~_connected(len(starts), best, as_usual)):
-        at_fault[rows[starts[part]] : rows[ends[part] - 1] + 1] = True
-    return at_fault
+    return _unconnected(len(reduced), pieces, best, as_usual)
 
 
-def _connected(n: int, best: int, fits: Callable[[int, int, int], bool]) -> Mask:
-    """(n,) True for the parts of a recording that agree with the best of them, and those that agree with these.
+def _unconnected(n: int, pieces: list[NDArray[np.intp]], best: int, fits: Callable[[int, int, int], bool]) -> Mask:
+    """(n,) True in the pieces of a recording that agree neither with the best of them nor with one that does.
 
-    fits(left, right, kept) compares a part with the nearest that is kept already, which is one of the two.
+    fits(left, right, kept) compares a piece with the nearest that is kept already, which is one of the two.
     """
-    kept = np.zeros(n, bool)
-    kept[best] = True
-    for parts in (range(best + 1, n), range(best - 1, -1, -1)):
+    apart = np.zeros(n, bool)
+    for others in (range(best + 1, len(pieces)), range(best - 1, -1, -1)):
         nearest = best
-        for part in parts:
-            if fits(min(part, nearest), max(part, nearest), nearest):
-                kept[part], nearest = True, part
-    return kept
+        for k in others:
+            if fits(min(k, nearest), max(k, nearest), nearest):
+                nearest = k
+            else:
+                apart[pieces[k][0] : pieces[k][-1] + 1] = True
+    return apart
 
 
 def judge_poses(
@@ -253,22 +247,14 @@ def torn_off(fits: PoseFits, period: float, radius: float) -> Mask:
     radius. A pose farther than that from where the frames before lead, and the frames after, begins another motion.
     Over frames without a pose, too: where a false motion ends, the true one goes on.
     """
-    refused = np.zeros(len(fits.converged), bool)
     rows = np.flatnonzero(fits.converged)
-    if len(rows) < 2:
-        return refused
-    torn = _torn(fits, rows[:-1], rows[1:], period, radius)
-    if not torn.any():
-        return refused
-    pieces = np.split(rows, np.flatnonzero(torn) + 1)
+    pieces = np.split(rows, np.flatnonzero(_torn(fits, rows[:-1], rows[1:], period, radius)) + 1)
     longest = int(np.argmax([len(piece) for piece in pieces]))
 
     def leads_on(left: int, right: int, kept: int) -> bool:
         return not _torn(fits, pieces[left][-1:], pieces[right][:1], period, radius)[0]
 
-    for piece in np.flatnonzero(~_connected(len(pieces), longest, leads_on)):
-        refused[pieces[piece]] = True
-    return refused
+    return _unconnected(len(fits.converged), pieces, longest, leads_on)
 
 
 def _torn(fits: PoseFits, last: NDArray[np.intp], first: NDArray[np.intp], period: float, radius: float) -> Mask:

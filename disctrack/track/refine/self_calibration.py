@@ -93,10 +93,9 @@ def refine_as_built(frames: DotsInFrames) -> AsBuilt:
     rows = evenly(np.flatnonzero(enough), SHARED_FRAMES)
     if len(rows) < MIN_FRAMES:
         return AsBuilt.as_declared(rig, disc)
-    m = disc.n_markers
-    free = np.arange(N_RIG + 2 * m) >= N_RIG
-    joint = fit_shared(frames.at(rows), free, np.eye(2 * m) / DOT_SIGMA**2, repeats=SYSTEMATIC_PX)
-    moved, remaining = joint.shift[N_RIG:].reshape(m, 2), joint.covariance[N_RIG:, N_RIG:]
+    sigma = np.r_[np.zeros(N_RIG), np.full(2 * disc.n_markers, DOT_SIGMA)]
+    joint = fit_shared(frames.at(rows), sigma, repeats=SYSTEMATIC_PX)
+    moved, remaining = joint.shift[N_RIG:].reshape(-1, 2), joint.covariance[N_RIG:, N_RIG:]
     size, size_sigma = pattern_size(disc, moved, remaining)
     rig, size_share = sized_by_pattern(rig, size, size_sigma)
     moved = moved + size_share * size * _from_middle(disc)
@@ -114,13 +113,14 @@ class SharedFit:
     frames: DotsInFrames  # with the poses before the last step
 
 
-def fit_shared(frames: DotsInFrames, free: Mask, information: Array, repeats: float = 0.0) -> SharedFit:
-    """Fit what is free (30 + 2m + j,) of what the frames share, by Gauss-Newton.
+def fit_shared(frames: DotsInFrames, sigma: Array, repeats: float = 0.0) -> SharedFit:
+    """Fit what the frames share by Gauss-Newton.
 
-    information : (k, k) of the prior about zero
+    sigma : (30 + 2m + j,) of the prior about zero; what has none is not free
     repeats : [px] errors that are common to all frames: they bound what these tell together
     """
-    shift, reduced = np.zeros(len(free)), []
+    shift, reduced, free = np.zeros(len(sigma)), [], sigma > 0
+    information = np.diag(sigma[free] ** -2)
     for iteration in range(ITERATIONS):
         frames, fits = frames.fitted(shift, reject=iteration > 0)
         ok = fits.converged
