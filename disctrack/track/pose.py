@@ -72,9 +72,7 @@ class DotsInFrames:
 
     def but(self, outlying: Mask) -> DotsInFrames:
         """The frames with no pose for those that are outlying (n,)."""
-        return replace(
-            self, R=np.where(outlying[:, None, None], np.nan, self.R), t=np.where(outlying[:, None], np.nan, self.t)
-        )
+        return replace(self, t=np.where(outlying[:, None], np.nan, self.t))
 
     def shifted(self, shift: Array) -> DotsInFrames:
         """The pixels without what else moved them, rig and dots' places after the shift."""

@@ -74,7 +74,7 @@ def said(capsys) -> str:
 
 
 def test_the_exposure_moves_poses_by_what_it_should(from_png, from_png_of_50_us):
-    """Theta by g T^2 / (6 r) while the disc rolls (exposure.py), within what a nutation of 0.04 deg changes."""
+    """Theta by g T^2 / (6 r) while the disc rolls (dot_shifts.py), within what a nutation of 0.04 deg changes."""
     moved = from_png_of_50_us.q[:, 4] - from_png.q[:, 4]
     assert np.mean(moved) == pytest.approx(9.81 * 50e-6**2 / (6 * 0.0375), rel=0.2)
 

@@ -31,7 +31,7 @@ class Edge(NamedTuple):
 
 
 def pulls_by_exposure(radius: float, affine: Array, edge: Edge) -> Array:
-    """(n, m, 8) shifts by an exposure, over T^2 / 24 and products of velocity v and growth G (see `exposure`).
+    """(n, m, 8) shifts by an exposure, over T^2 / 24 and products of velocity v and growth G (see `dot_shifts`).
 
     radius [m] of the dots; affine (n, m, 2, 2) [px/m] from their plane to the image; NaN where it is. Axes 1, 2 are the
     image's long and short one. The first four numbers are of a shift along axis 1, by v1 G11, v1 G22, v2 G12, v2 G21;
@@ -116,13 +116,13 @@ def _response(sizes: Array, edge: Edge, changes: Changes) -> Array:
 
 
 def _contrast_graded(band: _Band, axis: int) -> Array:
-    """See `glare`: by a contrast that grows by 1 per px along the axis."""
+    """See `dot_shifts`: by a contrast that grows by 1 per px along the axis."""
     place = band.u[axis][..., None] + band.n[axis][..., None] * band.d
     return np.asarray(-place * band.seen)[None]
 
 
 def _edge_smeared(band: _Band, axis: int) -> Array:
-    """See `exposure`: products of v and G as listed: n.v, t.v and n.Gu, t.Gu, with how they change along the edge."""
+    """See `dot_shifts`: products of v and G as listed: n.v, t.v and n.Gu, t.Gu, with how they change along the edge."""
     (n1, n2), (u1, u2), bend = band.n, band.u, band.bend
     t1, t2 = -n2, n1
     of_v = {1: (n1, t1, bend * t1), 2: (n2, t2, bend * t2)}

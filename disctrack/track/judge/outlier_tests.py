@@ -142,22 +142,18 @@ def _unconnected(n: int, pieces: list[NDArray[np.intp]], best: int, fits: Callab
 
 
 def judge_poses(
-    fits: PoseFits,
-    repeated: Mask,
-    struck: NDArray[np.int64],
-    outlying: Mask,
-    period: float,
-    radius: float,
-) -> tuple[NDArray[np.uint8], Array]:
+    fits: PoseFits, repeated: Mask, outlying: Mask, period: float, radius: float
+) -> tuple[PoseFits, NDArray[np.uint8]]:
     """Judge every pose by its residuals and by the motion of its neighbours.
 
-    Returns of n frames MEASURED, or why the pose is refused (REPEATED, CONTRADICTED or JUMPED), and the factor, at
-    least 1, on its covariance.
+    Returns the poses without those that are refused, their covariances, altered, as their residuals have them, and of n
+    frames MEASURED, or why the pose is refused (REPEATED, CONTRADICTED or JUMPED).
 
     fits : with the covariances and chi-squares scaled as they will be told; repeated (n,): both images are those of a
-    frame before; struck (n,): dots left out as outliers; outlying (n,): frames by which no other is to be judged;
-    period [s] of the frames; radius [m] of the disc
+    frame before; outlying (n,): frames by which no other is to be judged; period [s] of the frames; radius [m] of the
+    disc
     """
+    struck = (np.isfinite(fits.residuals_px).all(-1) & ~fits.used).sum(axis=(1, 2))  # dots left out as outliers
     status = np.full(len(struck), FrameStatus.MEASURED, np.uint8)
     freedom = fits.degrees_of_freedom
     reduced = np.where(outlying, np.nan, fits.reduced_chi_square)
@@ -187,7 +183,8 @@ def judge_poses(
     status[contradicted] = FrameStatus.CONTRADICTED
     status[lost] = FrameStatus.REPEATED
     status[~fits.converged] = FrameStatus.MEASURED  # nothing to judge
-    return status, np.maximum(np.nan_to_num(factor, nan=1.0), 1.0)
+    fits.covariance[...] *= np.maximum(np.nan_to_num(factor, nan=1.0), 1.0)[:, None, None]
+    return replace(fits, converged=fits.converged & (status == FrameStatus.MEASURED)), status
 
 
 def _of_six(chance: float) -> float:

@@ -18,8 +18,7 @@ from disctrack.track.judge.cameras import camera_course, contradicting
 from disctrack.track.judge.doubts import FAULTY, doubts_of, repeated_images
 from disctrack.track.judge.outlier_tests import judge_poses, outlying_frames, unexpected_misfit
 from disctrack.track.pose import MIN_DOTS, DotsInFrames, PoseFits, fit_poses, whitening
-from disctrack.track.refine.exposure import exposure_by_smear, exposure_of, shift_by_exposure
-from disctrack.track.refine.glare import shift_by_glare
+from disctrack.track.refine.dot_shifts import exposure_by_smear, exposure_of, shift_by_exposure, shift_by_glare
 from disctrack.track.refine.scatter import Scatter, scatter_of_poses, split_scatter, without_shared_faults
 from disctrack.track.refine.self_calibration import AsBuilt, by_pattern, refine_as_built
 from disctrack.track.refine.table_contact import OF_PATTERN, off_centre, table_from_disc
@@ -76,7 +75,8 @@ def assemble(
     fits = fit_all(seen, workers)
     fits, systematic, scatter = _scattered(fits, dots, faults, outlying)
     seen = replace(seen, R=fits.R_world_body, t=fits.t_world_body)
-    fits, verdicts = _judged(fits, dots, repeated, outlying, taken.frame_rate, disc.radius)
+    again = np.asarray(repeated.all(axis=1))
+    fits, verdicts = judge_poses(fits, again, outlying, 1 / taken.frame_rate, disc.radius)
     course, of_course = camera_course(seen, fits, taken.pairs)
     systematic += course
     moved = by_pattern(as_built, fits.R_world_body)
@@ -167,16 +167,6 @@ def _scattered(
     systematic = fits.covariance * scatter.systematic
     fits.covariance[...] *= scatter.noise
     return replace(fits, chi_square=fits.chi_square / scatter.whole), systematic, scatter
-
-
-def _judged(
-    fits: PoseFits, dots: DotCentres, repeated: Mask, outlying: Mask, frame_rate: float, radius: float
-) -> tuple[PoseFits, NDArray[np.uint8]]:
-    """Poses without those that are refused, and what each is worth."""
-    struck = (np.isfinite(dots.pixels).all(-1) & ~fits.used).sum(axis=(1, 2)) * fits.converged
-    status, factor = judge_poses(fits, np.asarray(repeated.all(axis=1)), struck, outlying, 1 / frame_rate, radius)
-    fits.covariance[...] *= factor[:, None, None]
-    return replace(fits, converged=fits.converged & (status == FrameStatus.MEASURED)), status
 
 
 def _outlying(seen: DotsInFrames, workers: int) -> Mask:

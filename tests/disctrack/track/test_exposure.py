@@ -12,9 +12,8 @@ from disctrack.track.dots.template import NoiseModel
 from disctrack.track.dots.template_response import Edge
 from disctrack.track.follow.tracking import TrackingSettings
 from disctrack.track.pose import marker_pixels
-from disctrack.track.refine import exposure as smears
-from disctrack.track.refine.exposure import shift_by_exposure
-from disctrack.track.refine.glare import shift_by_glare
+from disctrack.track.refine import dot_shifts as smears
+from disctrack.track.refine.dot_shifts import shift_by_exposure, shift_by_glare
 from disctrack.trajectory import FrameStatus
 from tests.oracles.flat_dots import covered, locate_in_window
 from tests.rendering import render_disc
@@ -136,7 +135,7 @@ def test_a_dot_seen_obliquely_is_pulled_as_an_ellipse(rendered_pairs):
 @pytest.mark.statistical
 def test_theta_is_that_of_mid_exposure(measured, rendered_pairs):
     q, runs = measured
-    expected = -9.81 * EXPOSURE**2 / (6 * rendered_pairs.disc.radius)  # steady precession, exposure.py
+    expected = -9.81 * EXPOSURE**2 / (6 * rendered_pairs.disc.radius)  # steady precession, dot_shifts.py
     none, told, smeared, _ = (run.trajectory for run in runs)
     errors = [trajectory.q[:, 4] - q[:, 4] for trajectory in (none, told, smeared)]
     sigma = np.sqrt(np.mean(none.pose_covariance[:, 3, 3] + none.pose_covariance[:, 4, 4]) / 2 / N)

@@ -1,28 +1,42 @@
-"""What an exposure does to the dots of a moving disc, taken off; the exposure time itself, where nobody declares it.
+"""What shifts dots beside their places, taken off: an exposure while the disc moves, light that is added to an image.
 
-Over an exposure T a dot is smeared, and its template finds it beside its place at mid exposure by T^2 / 24 times
-(second order of the path; the first vanishes)
+**Exposure**, whose time is found where nobody declares it. Over an exposure T a dot is smeared, and its template finds
+it beside its place at mid exposure by T^2 / 24 times (second order of the path; the first vanishes)
 
     c'' + p,    p bilinear in c' and A' A^-1,
 
 c the image of the dot's centre, A (2, 2) the affine map from the disc's plane to the image there, primes rates. The
-first term is the mean of the path: while the disc rolls it makes theta read low by sin(theta) (psidot T)^2 / 24 =
-g T^2 / (6 r), at every theta alike (steady precession, psidot^2 sin(theta) = 4 g / r), 0.6 mdeg at 0.5 ms and
-r = 37.5 mm. The other comes from a dot whose outline changes while it moves, which smears one side more than the other:
-the image I(d) of the edge, d the signed distance, changes by T^2 / 24 (I' d_tt + I'' v_n^2) with
-d_tt = -n.a - kappa v_t^2 + 2 v_t dv_n/ds, and of that the template takes what looks to its normal equations like a
-shift: mostly I'', as light that may slope over the paper takes up the halo of the smeared side (`template_pull`). A dot
-seen obliquely is an ellipse, whose ends bend more and count less than its sides: at 70 deg from the normal, what a
-circle of the same area would be pulled by is twice too much.
+first term is the mean of the path: while the disc rolls it makes theta read low by sin(theta) (psidot T)^2 / 24 = g T^2
+/ (6 r), at every theta alike (steady precession, psidot^2 sin(theta) = 4 g / r), 0.6 mdeg at 0.5 ms and r = 37.5 mm.
+The other comes from a dot whose outline changes while it moves, which smears one side more than the other: the image
+I(d) of the edge, d the signed distance, changes by T^2 / 24 (I' d_tt + I'' v_n^2) with d_tt = -n.a - kappa v_t^2 + 2
+v_t dv_n/ds, and of that the template takes what looks to its normal equations like a shift: mostly I'', as light that
+may slope over the paper takes up the halo of the smeared side (`template_response`). A dot seen obliquely is an
+ellipse, whose ends bend more and count less than its sides: at 70 deg from the normal, what a circle of the same area
+would be pulled by is twice too much.
 
 The smear tells T: an edge with normal n whose image moves by v T during the exposure is blurred by (v.n)^2 T^2 / 12
 more (variance of a uniform distribution), on the mean over the dot's edge. How fast a dot is changes with its place
 about the point of contact, not with the dot or its distance, which the optics' blur depends on: the two are told apart
 by a linear fit. Variance of the path and shift of its mean are both in proportion to T^2, whatever light does during
 the exposure.
+
+**Glare.** Light that falls off over a dot multiplies paper and ink alike, and the template has a slope for it. Light
+that is added takes more of the ink's share: the contrast c changes with the place in the image, and inside the dot
+
+    I = L (1 - c S)  has  d I / dx = dL/dx (1 - c S) - L dc/dx S,
+
+whose last term the template takes in part for a shift (`template_response`): 0.1 grey values per px of glare move a dot
+of 17 px by some 0.004 px, in all frames alike. The contrasts themselves tell: those of all frames are fitted by a
+constant of each dot (ink and paper differ) and one of each frame (lamps flicker, an attitude is better lit than
+another), and a polynomial of the place in the image, whose gradient counts.
 """
 
+from collections.abc import Callable
+
 import numpy as np
+from numpy.polynomial.polynomial import polyder, polyval2d
+from numpy.typing import NDArray
 
 from calibration.cameras.camera import StereoRig
 from calibration.kit.arrays import Array, Mask
@@ -34,6 +48,7 @@ from disctrack.track.dots.template_response import (
     Edge,
     half_axes,
     plane_to_image,
+    pulls_by_contrast,
     pulls_by_exposure,
     turned_to_axes,
 )
@@ -44,6 +59,14 @@ PARTS = 10  # stretches of the recording, each left out in turn: what the fit le
 SURE = 3.0  # sigmas of T^2, or the exposure is taken as short
 APPROXIMATE = 0.1  # relative, of T^2: one blur stands for an edge that is smeared more here than there
 CONTRADICTS = 5.0  # sigmas between a declared exposure and the smear
+DEGREE = 4  # of the polynomial: glare as wide as the disc's path
+POWERS = [(i, k - i) for k in range(1, DEGREE + 1) for i in range(k + 1)]
+SAME = 1 / 16  # of a dot's diameter, about a pixel
+# Standard deviations of what one term adds to the contrast over the dots' path, in those of the contrast itself: the
+# likeliest is the prior, so that noise, and large terms that cancel where the dots are, shift nothing. It must be
+# likelier than no gradient by this much
+PRIORS = (0.01, 0.03, 0.1, 0.3, 1.0)
+LIKELIER = 6.0  # of natural logarithms
 
 
 def shift_by_exposure(
@@ -243,3 +266,94 @@ def _standardised(x: Array) -> Array:
     known = x[np.isfinite(x)]
     spread = np.std(known) if known.size else 0.0
     return np.asarray((x - np.mean(known)) / spread if spread else np.zeros_like(x))
+
+
+def shift_by_glare(R: Array, t: Array, contrast: Array, rig: StereoRig, disc: Disc, edges: tuple[Edge, Edge]) -> Array:
+    """(n, 2, m, 2) [px] by which templates find the dots beside their places; zero where not known.
+
+    R (n, 3, 3), t (n, 3) [m]: poses, NaN where there is none; contrast (n, 2, m) of each dot with its paper, NaN where
+    it was not seen; edges: of the dots in each camera. One dot tells nothing of the light at another.
+    """
+    n = len(R)
+    shift = np.zeros((n, 2, disc.n_markers, 2))
+    apart = _apart(R, t, disc)
+    chosen = evenly(apart, SHARED_FRAMES)
+    pixels = marker_pixels(R[chosen], t[chosen], rig, disc.marker_centres_body)[0]
+    gradients = [_gradient(pixels[:, c], contrast[chosen, c]) for c in (0, 1)]
+    for first in range(0, n if any(gradients) else 0, AT_ONCE):
+        rows = slice(first, first + AT_ONCE)
+        places, J = marker_pixels(R[rows], t[rows], rig, disc.marker_centres_body)
+        affine = plane_to_image(J, R[rows])
+        for camera, (gradient, edge) in enumerate(zip(gradients, edges, strict=True)):
+            if gradient is not None:
+                axes = turned_to_axes(affine[:, camera])
+                along = (axes @ gradient(places[:, camera])[..., None])[..., 0]
+                along *= pulls_by_contrast(0.5 * disc.marker_diameter, affine[:, camera], edge)
+                shift[rows, camera] = np.nan_to_num((along[..., None, :] @ axes)[..., 0, :])
+    return shift
+
+
+def _apart(R: Array, t: Array, disc: Disc) -> NDArray[np.intp]:
+    """Frames between which the dots went on by SAME of their diameter: what one at rest is off by repeats in all."""
+    places = np.einsum("nij,mj->nmi", R, disc.marker_centres_body) + t[:, None]
+    places = places[known := np.flatnonzero(np.isfinite(places).all(axis=(1, 2)))]
+    steps = np.linalg.norm(np.diff(places, axis=0, prepend=places[:1]), axis=-1).mean(axis=1)
+    path = np.floor(np.cumsum(steps) / (SAME * disc.marker_diameter))
+    return known[np.unique(path, return_index=True)[1]]
+
+
+def _gradient(places: Array, contrast: Array) -> Callable[[Array], Array] | None:
+    """Of the contrast, (..., 2) [1/px] at places (..., 2) [px], but for constants of dots and frames.
+
+    From places (n, m, 2) [px] and contrasts (n, m) of m dots; None where they are too few, or tell of no gradient.
+    """
+    known = np.isfinite(contrast) & np.isfinite(places).all(axis=-1)
+    if np.sum(known.sum(axis=1) >= 2) < MIN_FRAMES:
+        return None
+    middle = np.mean(places[known], axis=0)
+    scale = float(np.abs(places[known] - middle).max())
+    x, y = np.moveaxis((places - middle) / scale, -1, 0)
+    terms = np.stack([x**i * y**j for i, j in POWERS], axis=-1)
+    dots = np.broadcast_to(np.eye(contrast.shape[1]), (*contrast.shape, contrast.shape[1]))
+    rows = np.where(known[..., None], np.concatenate([terms, dots, contrast[..., None]], axis=-1), 0.0)
+    use = known
+    for _ in range(3):
+        centred = _without_frames(rows, use)[use]
+        own = centred[:, len(POWERS) : -1]  # of the dots
+        left = centred - own @ np.linalg.lstsq(own, centred, rcond=None)[0]
+        coefficients, likelier = _likeliest(left[:, : len(POWERS)], left[:, -1])
+        away = np.full(contrast.shape, np.inf)
+        away[use] = np.abs(left[:, -1] - left[:, : len(POWERS)] @ coefficients)
+        use = away <= 4.0 * 1.4826 * np.median(away[use]) + 1e-9
+    if likelier < LIKELIER:
+        return None
+    table = np.zeros((DEGREE + 1, DEGREE + 1))
+    table[tuple(np.transpose(POWERS))] = coefficients
+
+    def gradient(places: Array) -> Array:
+        x, y = np.moveaxis((places - middle) / scale, -1, 0)
+        return np.stack([polyval2d(x, y, polyder(table, axis=axis)) for axis in (0, 1)], axis=-1) / scale
+
+    return gradient
+
+
+def _likeliest(A: Array, b: Array) -> tuple[Array, float]:
+    """Coefficients of b over A's columns under the likeliest of PRIORS, and how much likelier than none it is."""
+    normal, rhs = A.T @ A, A.T @ b
+    best = np.linalg.pinv(normal, rcond=1e-9, hermitian=True) @ rhs
+    noise = max(float(b @ b - rhs @ best) / max(len(b) - 2 * A.shape[1], 1), 1e-14)
+    found, likeliest = np.zeros(A.shape[1]), -np.inf
+    for prior in np.array(PRIORS) * np.sqrt(np.mean(b**2)):
+        matrix = np.eye(A.shape[1]) + prior**2 / noise * normal
+        coefficients = prior**2 / noise * np.linalg.solve(matrix, rhs)
+        likelier = 0.5 * (float(rhs @ coefficients) / noise - float(np.linalg.slogdet(matrix)[1]))
+        if likelier > likeliest:
+            found, likeliest = coefficients, likelier
+    return found, likeliest
+
+
+def _without_frames(rows: Array, use: Mask) -> Array:
+    """Rows (n, m, k) less their means over the dots of each frame that are used (n, m)."""
+    weight = use[..., None].astype(float)
+    mean = (rows * weight).sum(axis=1, keepdims=True) / np.maximum(weight.sum(axis=1, keepdims=True), 1.0)
+    return np.where(use[..., None], rows - mean, 0.0)
