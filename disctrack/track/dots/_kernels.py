@@ -66,21 +66,6 @@ class Expected(NamedTuple):
     limits: Limits
 
 
-class Ellipse(NamedTuple):
-    """What the blurred ellipse is made of."""
-
-    from_u: float  # [px] of the centre from that of the window
-    from_v: float
-    i00: float  # plane -> pixel
-    i01: float
-    i10: float
-    i11: float
-    axis_u: float  # unit vector of the long axis in the image
-    axis_v: float
-    long: float  # semi-axes over the radius
-    short: float
-
-
 class Rows(NamedTuple):
     """Of what is kept of every pixel (16, n), in single precision; the first eight are the template's parameters, too.
 
@@ -203,7 +188,7 @@ def _edge_profile(z):
 
 
 @_part
-def _select_pixels(image, map_x, map_y, P, start, window, rim, neighbours, G, steepest, p, u0, v0, pixels):
+def _select_pixels(image, map_x, map_y, P, start, window, rim, centres, own, G, steepest, p, u0, v0, pixels):
     """Fill the first rows of pixels with those in a band round the edge; returns number, mean grey in and outside.
 
     steepest: the longest step that one pixel can mean on the plane, in radii of the dot.
@@ -232,9 +217,9 @@ def _select_pixels(image, map_x, map_y, P, start, window, rim, neighbours, G, st
     reach = unit * (outer + math.hypot(p[ROW.a], p[ROW.b]))
     blur = p[ROW.sigma] * steepest * unit
     crowded = math.hypot(start[0], start[1]) + reach > rim - 2.5 * blur
-    for j in range(neighbours.shape[0]):
-        apart = math.hypot(start[0] - neighbours[j, 0], start[1] - neighbours[j, 1])
-        crowded |= apart - reach - start[2] < 3.0 * blur
+    for j in range(centres.shape[0]):
+        apart = math.hypot(start[0] - centres[j, 0], start[1] - centres[j, 1])
+        crowded |= j != own and apart - reach - start[2] < 3.0 * blur
     g00, g01, g10, g11 = _f(G[0, 0]), _f(G[0, 1]), _f(G[1, 0]), _f(G[1, 1])
     for i in range(n):
         d, slope, nx, ny, inv_g, curvature = _edge_distance(
@@ -249,8 +234,8 @@ def _select_pixels(image, map_x, map_y, P, start, window, rim, neighbours, G, st
             X, Y = start[0] + unit * pixels[0, i], start[1] + unit * pixels[1, i]
             blur = p[ROW.sigma] * unit / pixels[6, i]
             good = math.hypot(X, Y) <= rim - 2.5 * blur
-            for j in range(neighbours.shape[0]):
-                good &= math.hypot(X - neighbours[j, 0], Y - neighbours[j, 1]) - start[2] >= 3.0 * blur
+            for j in range(centres.shape[0]):
+                good &= j == own or math.hypot(X - centres[j, 0], Y - centres[j, 1]) - start[2] >= 3.0 * blur
         for row in range(6):
             pixels[ROW.x + row, kept] = pixels[row, i]
         kept += 1 if good else 0
@@ -327,18 +312,14 @@ def _whitened_model(pixels, n, p, G, det, clip):
 
 
 @_part
-def _ellipse_of(map_x, map_y, P, G, det, start, reach, u0, v0):
-    """The image of a dot as an ellipse about its own centroid, to second order of the map.
+def _centroid_of(map_x, map_y, P, G, det, start, reach, u0, v0):
+    """Place [px] of the centroid of a dot's image from the middle of its window, to second order of the map.
 
     reach: pixels over which the map's second derivatives are taken.
     """
     iu, iv = int(u0 + 0.5), int(v0 + 0.5)
     i00, i01, i10, i11 = G[1, 1] / det, -G[0, 1] / det, -G[1, 0] / det, G[0, 0] / det
     c00, c01, c11 = i00 * i00 + i01 * i01, i00 * i10 + i01 * i11, i10 * i10 + i11 * i11
-    half_sum, half_difference = 0.5 * (c00 + c11), 0.5 * (c00 - c11)
-    spread = math.hypot(half_difference, c01)
-    angle = 0.5 * math.atan2(c01, half_difference)
-    longer = math.sqrt(half_sum + spread)
     # second derivatives of pixel -> plane, in the pixel's own frame: q = - G^-1 d2 plane
     uu_x, uu_y, vv_x, vv_y, uv_x, uv_y = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for du in range(-1, 2):
@@ -358,18 +339,22 @@ def _ellipse_of(map_x, map_y, P, G, det, start, reach, u0, v0):
     div_u, div_v = s_uu + t_uv, s_uv + t_vv
     shift_u = 0.25 * (0.5 * (s_uu * c00 + s_vv * c11) + s_uv * c01 + c00 * div_u + c01 * div_v)
     shift_v = 0.25 * (0.5 * (t_uu * c00 + t_vv * c11) + t_uv * c01 + c01 * div_u + c11 * div_v)
-    return Ellipse(start[3] - u0 + shift_u, start[4] - v0 + shift_v, i00, i01, i10, i11, math.cos(angle),
-                   math.sin(angle), longer, 1.0 / (abs(det) * longer))  # fmt: skip
+    return start[3] - u0 + shift_u, start[4] - v0 + shift_v
 
 
 @_part
-def _whitened_ellipse(pixels, n, p, ellipse, nodes, clip):
+def _whitened_ellipse(pixels, n, p, G, det, centroid, nodes, clip):
     """As `_whitened_model` by the integral of the Gaussian over the whole ellipse; nodes (3, _NODES) is scratch.
 
     Along the long axis x = a sin t, where the trapezoidal rule converges exponentially; across it the error function.
     """
-    in_sigma = 1.0 / p[ROW.sigma]
-    a, b = p[ROW.radius] * ellipse.long * in_sigma, p[ROW.radius] * ellipse.short * in_sigma
+    i00, i01, i10, i11 = G[1, 1] / det, -G[0, 1] / det, -G[1, 0] / det, G[0, 0] / det  # plane -> pixel
+    c00, c01, c11 = i00 * i00 + i01 * i01, i00 * i10 + i01 * i11, i10 * i10 + i11 * i11
+    half_difference = 0.5 * (c00 - c11)
+    angle = 0.5 * math.atan2(c01, half_difference)
+    axis_u, axis_v = math.cos(angle), math.sin(angle)  # unit vector of the long axis in the image
+    longer, in_sigma = math.sqrt(0.5 * (c00 + c11) + math.hypot(half_difference, c01)), 1.0 / p[ROW.sigma]
+    a, b = p[ROW.radius] * longer * in_sigma, p[ROW.radius] * (1.0 / (abs(det) * longer)) * in_sigma
     n_nodes = min(int(3.2 * a) + 8, _NODES)
     every = math.pi / n_nodes
     for k in range(n_nodes):
@@ -377,13 +362,13 @@ def _whitened_ellipse(pixels, n, p, ellipse, nodes, clip):
         nodes[0, k], nodes[1, k], nodes[2, k] = a * math.sin(t), b * math.cos(t), a * every * math.cos(t)
     round_edge = _f(a * b * every)
     A_px, B_px = p[ROW.a], p[ROW.b]
-    from_x = _f(ellipse.from_u + ellipse.i00 * A_px + ellipse.i01 * B_px)
-    from_y = _f(ellipse.from_v + ellipse.i10 * A_px + ellipse.i11 * B_px)
-    along_x, along_y = _f(ellipse.axis_u * in_sigma), _f(ellipse.axis_v * in_sigma)
-    A_along = _f(in_sigma * (ellipse.axis_u * ellipse.i00 + ellipse.axis_v * ellipse.i10))
-    A_across = _f(in_sigma * (ellipse.axis_u * ellipse.i10 - ellipse.axis_v * ellipse.i00))
-    B_along = _f(in_sigma * (ellipse.axis_u * ellipse.i01 + ellipse.axis_v * ellipse.i11))
-    B_across = _f(in_sigma * (ellipse.axis_u * ellipse.i11 - ellipse.axis_v * ellipse.i01))
+    from_x = _f(centroid[0] + i00 * A_px + i01 * B_px)
+    from_y = _f(centroid[1] + i10 * A_px + i11 * B_px)
+    along_x, along_y = _f(axis_u * in_sigma), _f(axis_v * in_sigma)
+    A_along = _f(in_sigma * (axis_u * i00 + axis_v * i10))
+    A_across = _f(in_sigma * (axis_u * i10 - axis_v * i00))
+    B_along = _f(in_sigma * (axis_u * i01 + axis_v * i11))
+    B_across = _f(in_sigma * (axis_u * i11 - axis_v * i01))
     inv_radius, inv_sigma, ten = _f(1.0 / p[ROW.radius]), _f(in_sigma), _f(10.0)
     contrast, level, slope_x, slope_y = _f(p[ROW.contrast]), _f(p[ROW.level]), _f(p[ROW.slope_x]), _f(p[ROW.slope_y])
     limit = _f(clip)
@@ -418,7 +403,7 @@ def _whitened_ellipse(pixels, n, p, ellipse, nodes, clip):
 
 
 @_part
-def _descend(pixels, n, p, G, det, px_per_unit, clip, work, blurred, ellipse, nodes):
+def _descend(pixels, n, p, G, det, px_per_unit, clip, work, blurred, centroid, nodes):
     """Levenberg-Marquardt on the eight template parameters; returns converged, chi-square, clipped.
 
     blurred: take the whole ellipse, with the expected radius as a prior, and not one edge at a time.
@@ -433,7 +418,7 @@ def _descend(pixels, n, p, G, det, px_per_unit, clip, work, blurred, ellipse, no
         previous[i] = p[i]
     for _ in range(_MAX_ITERATIONS + 1):
         if blurred:
-            chi2, n_clipped = _whitened_ellipse(pixels, n, p, ellipse, nodes, clip)
+            chi2, n_clipped = _whitened_ellipse(pixels, n, p, G, det, centroid, nodes, clip)
             chi2 += ((p[ROW.radius] - 1.0) / _RADIUS_PRIOR) ** 2
         else:
             chi2, n_clipped = _whitened_model(pixels, n, p, G, det, clip)
@@ -495,14 +480,14 @@ def _descend(pixels, n, p, G, det, px_per_unit, clip, work, blurred, ellipse, no
 
 
 @_part
-def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, neighbours, pixels, work, p, result):
+def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, centres, own, pixels, work, p, result):
     """Fit the image of one circular dot to the grey values round its edge. Returns a MarkerStatus code.
 
     image (H, W); map_x, map_y (H, W): normalised coordinates of every pixel; P (3, 3): normalised image -> target
     plane; start (5,): expected centre and radius on the plane, pixel of that centre; sigma: blur to start from [px];
     noise (3,): variance = noise[0] + noise[1] grey, and the square of the grey values' step; rim: radius of an edge
-    about the plane's origin whose blur must not reach the pixels used, nor that of `neighbours` (k, 2), the other dots'
-    centres; pixels and work (matrix, right-hand side, step, parameters before it) are scratch.
+    about the plane's origin whose blur must not reach the pixels used, nor that of other dots, whose `centres` (m, 3)
+    those but its `own` are; pixels and work (matrix, right-hand side, step, parameters before it) are scratch.
     p (8,) receives the template's parameters (a, b: shift on the plane from the expected centre), result (a DOT) the
     judgement of the fit and the centre's covariance in pixels. The caller projects the centre itself (U, V).
     """
@@ -513,7 +498,7 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, neighbours, pixel
     for i in range(8):
         p[i] = 0.0
     p[ROW.radius], p[ROW.sigma] = 1.0, sigma
-    ellipse = Ellipse(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    centroid = 0.0, 0.0
     n, n_clipped, det, chi2, largest, light, settled = 0, 0.0, 0.0, 0.0, 0.0, 1.0, False
     for selection in range(_MAX_SELECTIONS):
         if not (2.0 < u0 < width - 3.0 and 2.0 < v0 < height - 3.0):
@@ -542,11 +527,11 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, neighbours, pixel
         if room > pixels.shape[1]:
             pixels = np.empty((16, room), np.float32)
         n, inside, outside = _select_pixels(
-            image, map_x, map_y, P, start, window, rim, neighbours, G, largest, p, u0, v0, pixels
+            image, map_x, map_y, P, start, window, rim, centres, own, G, largest, p, u0, v0, pixels
         )
         if blurred:
             reach = max(1, int(0.5 * min(extent_x, extent_y)))
-            ellipse = _ellipse_of(map_x, map_y, P, G, det, start, reach, u0, v0)
+            centroid = _centroid_of(map_x, map_y, P, G, det, start, reach, u0, v0)
         if not (n >= 30 and math.isfinite(inside) and math.isfinite(outside)):
             return OCCLUDED
         if selection == 0:
@@ -569,7 +554,7 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, neighbours, pixel
         limit = np.inf
         while True:  # once, and again without the pixels that do not belong
             converged, chi2, n_clipped = _descend(
-                pixels, n, p, G, det, largest / abs(det), limit, work, blurred, ellipse, nodes
+                pixels, n, p, G, det, largest / abs(det), limit, work, blurred, centroid, nodes
             )
             if not converged:
                 return NOT_CONVERGED
@@ -642,7 +627,6 @@ def _look(images, readable, views, face, expected, R, t, pixels, work, results, 
     m = centres.shape[0]
     R_cb, P, M = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     point, start, p, J = np.empty(3), np.empty(5), np.empty(8), np.empty((2, 3))
-    neighbours = np.empty((max(m - 1, 0), 2))
     for c in range(images.shape[0]):
         for i in range(3):
             for j in range(3):
@@ -671,11 +655,8 @@ def _look(images, readable, views, face, expected, R, t, pixels, work, results, 
                     P[k, j] = M[a, d] * M[b, e] - M[a, e] * M[b, d]
             start[0], start[1], start[2] = x, y, radius
             start[3], start[4] = project_point(views.cameras[c], point[0], point[1], point[2], J)
-            for k in range(m - 1):
-                other = k + 1 if k >= i else k
-                neighbours[k, 0], neighbours[k, 1] = centres[other, 0], centres[other, 1]
             status[c, i] = _fit_dot(images[c], views.map_x[c], views.map_y[c], P, start, expected.sigma[c],
-                                    expected.noise[c], face.rim, neighbours, pixels, work, p, result)  # fmt: skip
+                                    expected.noise[c], face.rim, centres, i, pixels, work, p, result)  # fmt: skip
             if status[c, i] == MEASURED:
                 for k in range(3):
                     point[k] += R_cb[k, 0] * p[ROW.a] + R_cb[k, 1] * p[ROW.b]
