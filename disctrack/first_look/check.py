@@ -32,7 +32,7 @@ from disctrack.frames import CAMERAS
 from disctrack.recording.declaration import Recording, read_recording
 from disctrack.recording.readers.blocks import Unreadable
 from disctrack.report.blocks import Facts, Report, Section
-from disctrack.track.follow.tracking import Tracking, TrackingSettings, track
+from disctrack.track.follow.tracking import Taken, Tracking, TrackingSettings, track
 from disctrack.track.measurement import ImagePairs, check_rig, exposures, images_lost, open_pairs
 from disctrack.track.run_summary import left_out, sigma_text
 from disctrack.trajectory import Trajectory
@@ -184,8 +184,8 @@ def _motion(seen: Check, recording: Recording, rig: StereoRig, pairs: ImagePairs
         total += n
         try:
             settings = TrackingSettings(first_pass=False, exposure=exposures(recording, pairs)[0])
-            reading, rate = pairs.reading(seen.not_read), recording.frame_rate
-            tracking = track(reading, frames, rig, recording.disc, rate, gravity=recording.gravity, settings=settings)
+            taken = Taken(frames, recording.frame_rate, recording.gravity)
+            tracking = track(pairs.reading(seen.not_read), taken, rig, recording.disc, settings)
             done.append((frames, tracking))
             noticed += [*tracking.findings, *lost_pairs(tracking.trajectory)]
         except DiscTrackError as error:

@@ -35,6 +35,7 @@ from disctrack.recording.readers.same_instants import check_headers, check_same_
 from disctrack.track.follow.motion_span import MotionSpan, find_motion
 from disctrack.track.follow.tracking import (
     ReadBlocks,
+    Taken,
     Tracking,
     TrackingSettings,
     check_images,
@@ -256,18 +257,8 @@ def measure_pairs(
             yield PairBlock(np.arange(rows.start, rows.stop), pair)
 
     began = time.perf_counter()
-    tracking = track(
-        read_blocks,
-        range(n),
-        rig,
-        disc,
-        frame_rate,
-        gravity=gravity,
-        settings=settings,
-        timestamps=times,
-        workers=threads,
-        progress=progress,
-    )
+    taken = Taken(range(n), frame_rate, gravity, times)
+    tracking = track(read_blocks, taken, rig, disc, settings, threads, progress)
     seconds = time.perf_counter() - began
     found = contradictions(tracking.trajectory, disc, noticed=tracking.findings)
     warn_of_doubts(found)
@@ -307,20 +298,11 @@ def _tracked(
     workers = 1  # stretches that are followed side by side: one per core, where frames can be read anywhere
     if pairs.left.random_access and pairs.right.random_access:
         workers = max(1, min(threads, len(stretch_edges(tracked, recording.disc)) - 1))
-    readers = max(1, threads // workers)  # each worker has its own three blocks
+    reading = pairs.reading(not_read, max(1, threads // workers))  # each worker has its own three blocks
+    stamps = None if stamps is None else stamps[span.start : span.stop]
+    taken = Taken(tracked, recording.frame_rate, recording.gravity, stamps)
     try:
-        tracking = track(
-            pairs.reading(not_read, readers),
-            tracked,
-            rig,
-            recording.disc,
-            recording.frame_rate,
-            gravity=recording.gravity,
-            settings=settings,
-            timestamps=None if stamps is None else stamps[span.start : span.stop],
-            workers=workers,
-            progress=progress,
-        )
+        tracking = track(reading, taken, rig, recording.disc, settings, workers, progress)
     except TrackingError as error:
         refuse_unreadable(recording, list(not_read.values()), 2 * len(tracked), error)
         error.findings = with_square(error.findings, recording)

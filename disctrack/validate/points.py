@@ -107,7 +107,7 @@ def measured(
     q, declared = motion(times), scene.declared_disc
     seen = DotsInFrames(believed_rig, declared, pixels, dots, rotation_from_euler(*q[:, 3:].T), q[:, :3])
     fits = fit_poses(seen, reject_outliers=False)
-    taken = Taken(range(n), np.arange(n) / declared_rate, declared_rate, scene.gravity_m_s2)
+    taken = Taken(range(n), declared_rate, scene.gravity_m_s2)
     good = np.zeros(pixels.shape[:-1], np.uint8)  # the status of frames, and of their dots
     found = trajectory_of(seen, fits, np.zeros((n, 6, 6)), good[:, 0, 0], good[:, 0, 0], good, taken)
     # of a bowed board the rim tells the tracking by how much the table is another

@@ -22,7 +22,7 @@ from disctrack.recording.declaration import Recording, read_recording
 from disctrack.synthetic.cameras import rig_of
 from disctrack.synthetic.description import GlareSettings, Scene
 from disctrack.synthetic.recording import Truth, write_recording
-from disctrack.track.follow.tracking import Tracking, track
+from disctrack.track.follow.tracking import Taken, Tracking, track
 from disctrack.track.measurement import open_pairs
 from disctrack.track.pose import MIN_DOTS
 from disctrack.trajectory import part
@@ -189,7 +189,7 @@ def render(folder: Path, scene: Scene) -> Truth:
 def locate(recording: Recording, rig: StereoRig) -> Tracking:
     """The disc in all pairs, through these cameras."""
     pairs = open_pairs(recording)
-    return track(pairs.reading({}), range(len(pairs)), rig, recording.disc, recording.frame_rate)
+    return track(pairs.reading({}), Taken(range(len(pairs)), recording.frame_rate), rig, recording.disc)
 
 
 def static_poses(n: int, scene: Scene, rng: np.random.Generator) -> Array:

@@ -177,7 +177,7 @@ def tracked(px, R, t, times, rig, frame_rate, settings=None, workers=1):
     """What tracking makes of located dots (n, 2, m, 2), followed near poses R, t."""
     setup = TrackingSetup(rig, MA_2014, None)  # no image is looked at
     follower = Follower(setup, Law((Edge(noise=NoiseModel(0.64, 0.02)),) * 2), measured=True)
-    taken = Taken(range(len(px)), times, frame_rate, G)
+    taken = Taken(range(len(px)), frame_rate, G, times)
     return assemble([follower], tables_of(px, R, t, DOT_PX), settings or TrackingSettings(), taken, workers)
 
 

@@ -20,7 +20,7 @@ from disctrack.recording.readers import open_frames
 from disctrack.recording.readers.blocks import PairBlock
 from disctrack.synthetic.cameras import rig_of
 from disctrack.synthetic.description import Scene
-from disctrack.track.follow.tracking import TrackingSettings, track
+from disctrack.track.follow.tracking import Taken, TrackingSettings, track
 from disctrack.track.judge.disc_not_seen import arrangement_found, moved_camera, unlike_declared
 from disctrack.track.refine.scatter import MIN_FRAMES
 from disctrack.trajectory import FrameStatus
@@ -41,7 +41,7 @@ def measure(images, rig, disc, rate=1000.0):
             yield PairBlock(rows, np.ascontiguousarray(images[rows]), ())
 
     # on the board's table, whatever frames are left: the disc's own moves all poses by its share of the shared sigma
-    return track(blocks, range(len(images)), rig, disc, rate, settings=TrackingSettings(table="board"))
+    return track(blocks, Taken(range(len(images)), rate), rig, disc, TrackingSettings(table="board"))
 
 
 class Laboratory:

@@ -30,23 +30,12 @@ class Edge(NamedTuple):
     noise: NoiseModel = NoiseModel(1.0, 0.02)
 
 
-def pulls_by_exposure(radius: float, affine: Array, edge: Edge) -> Array:
-    """(n, m, 8) shifts by an exposure, over T^2 / 24 and products of velocity v and growth G (see `dot_shifts`).
+def pulls(radius: float, affine: Array, edge: Edge, changes: Changes) -> Array:
+    """(n, m, 2 k) shifts by k changes of the image, along its long and its short axis, of dots of this radius [m].
 
-    radius [m] of the dots; affine (n, m, 2, 2) [px/m] from their plane to the image; NaN where it is. Axes 1, 2 are the
-    image's long and short one. The first four numbers are of a shift along axis 1, by v1 G11, v1 G22, v2 G12, v2 G21;
-    the others along axis 2, by v2 G11, v2 G22, v1 G12, v1 G21: the others vanish by symmetry.
+    affine (n, m, 2, 2) [px/m] from their plane to the image; NaN where it is. What `_response` tells is linear in the
+    dots' size and in the logarithm of their shape.
     """
-    return _tabulated(radius, affine, edge, _edge_smeared)
-
-
-def pulls_by_contrast(radius: float, affine: Array, edge: Edge) -> Array:
-    """(n, m, 2) [px^2] shifts along the long and the short axis by the gradient of the contrast; arguments as above."""
-    return _tabulated(radius, affine, edge, _contrast_graded)
-
-
-def _tabulated(radius: float, affine: Array, edge: Edge, changes: Changes) -> Array:
-    """What `_response` tells of dots of this size, linear in that and in the logarithm of their shape."""
     long, short = half_axes(affine)
     size, shape = radius * np.sqrt(long * short), short / long
     known = np.isfinite(size)
@@ -115,14 +104,18 @@ def _response(sizes: Array, edge: Edge, changes: Changes) -> Array:
     return np.concatenate(found, axis=-1)
 
 
-def _contrast_graded(band: _Band, axis: int) -> Array:
-    """See `dot_shifts`: by a contrast that grows by 1 per px along the axis."""
+def contrast_graded(band: _Band, axis: int) -> Array:
+    """By a contrast that grows by 1 per px along the axis, see `dot_shifts`: shifts in px^2."""
     place = band.u[axis][..., None] + band.n[axis][..., None] * band.d
     return np.asarray(-place * band.seen)[None]
 
 
-def _edge_smeared(band: _Band, axis: int) -> Array:
-    """See `dot_shifts`: products of v and G as listed: n.v, t.v and n.Gu, t.Gu, with how they change along the edge."""
+def edge_smeared(band: _Band, axis: int) -> Array:
+    """By an exposure, over T^2 / 24 and products of velocity v and growth G, see `dot_shifts`.
+
+    Shifts along axis 1 go by v1 G11, v1 G22, v2 G12, v2 G21; along axis 2 by v2 G11, v2 G22, v1 G12, v1 G21: the others
+    vanish by symmetry. They follow from n.v, t.v and n.Gu, t.Gu, with how these change along the edge.
+    """
     (n1, n2), (u1, u2), bend = band.n, band.u, band.bend
     t1, t2 = -n2, n1
     of_v = {1: (n1, t1, bend * t1), 2: (n2, t2, bend * t2)}

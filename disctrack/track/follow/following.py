@@ -151,23 +151,10 @@ def run(
     """
     limits = limits._replace(misfit=max(limits.misfit, UNUSUAL * law.misfit))
     known = Heading(*((np.array(R, order="C"), np.array(t)) for R, t in heading))  # the loop moves them on
-    done = kernels.track_frames(
-        images,
-        readable,
-        setup.views,
-        face_of(setup.disc),
-        kernels.Expected(
-            np.array([edge.blur_px for edge in law.edges]),
-            np.stack([edge.noise.parameters for edge in law.edges]),
-            limits,
-        ),
-        known,
-        rows.results,
-        rows.status,
-        rows.R,
-        rows.t,
-        MAX_PREDICTION_RMS_PX,
-    )
+    blur, noise = zip(*((edge.blur_px, edge.noise.parameters) for edge in law.edges), strict=True)
+    fixed = setup.views, face_of(setup.disc), kernels.Expected(np.array(blur), np.stack(noise), limits)
+    filled = rows.results, rows.status, rows.R, rows.t
+    done = kernels.track_frames(images, readable, *fixed, known, *filled, MAX_PREDICTION_RMS_PX)
     return int(done), known
 
 

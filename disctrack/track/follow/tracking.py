@@ -3,7 +3,7 @@
 The disc is followed through each stretch in `following`; what comes of it is put together in `assembly`.
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from threading import Event, Lock
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from calibration.cameras.camera import Camera, StereoRig
-from calibration.kit.arrays import Array, Mask
+from calibration.kit.arrays import Mask
 from calibration.kit.grey_levels import mosaic_gains
 from calibration.kit.stuck_pixels import repair, stuck_pixels
 from disctrack import frames
@@ -62,59 +62,52 @@ def prepare(dtype: DTypeLike = np.uint8) -> None:
 
 def track(
     read_blocks: ReadBlocks,
-    pairs: range,
+    taken: Taken,
     rig: StereoRig,
     disc: Disc,
-    frame_rate: float,
-    *,
-    gravity: float = 9.81,
     settings: TrackingSettings | None = None,
-    timestamps: Array | None = None,
     workers: int = 1,
     progress: Callable[[int], object] = lambda n: None,
 ) -> Tracking:
     """Measure the disc's pose in every pair of a recording.
 
-    read_blocks(start, stop) gives the pairs start..stop-1 in blocks, in order; pairs: which to measure (step 1).
-    frame_rate [Hz]; timestamps (len(pairs),) [s] where the camera wrote them. workers: threads that follow stretches
-    of a long recording side by side; the result is the same to the last bit for any number of them. progress(n) is
-    called when n more pairs are done, from any thread but one at a time.
+    read_blocks(start, stop) gives the pairs start..stop-1 in blocks, in order; taken: which to measure (step 1).
+    workers: threads that follow stretches of a long recording side by side; the result is the same to the last bit for
+    any number of them. progress(n) is called when n more pairs are done, from any thread but one at a time.
     Raises TrackingError if the images do not belong to the rig or if the disc is found in no pair at all.
     """
-    settings = settings or TrackingSettings()
+    settings, pairs = settings or TrackingSettings(), taken.pairs
     _check_dots(disc)
     read_blocks, stuck = _as_one_sensor(read_blocks, pairs)
-    if timestamps is None:
-        timestamps = np.array(pairs) / frame_rate
-    taken = Taken(pairs, np.asarray(timestamps, float), frame_rate, gravity)
     setup = TrackingSetup.of(rig, disc)
     edges = stretch_edges(pairs, disc)
 
-    def measured(looked_for: Disc, progress: Callable[[int], object]) -> tuple[Tracking, bool]:
-        """With the dots looked for at the places of a disc; and whether the images are in doubt."""
+    def measured(looked_for: Disc, progress: Callable[[int], object]) -> Tracking:
+        """With the dots looked for at the places of a disc."""
         again = replace(setup, disc=looked_for)
         followers, tables = _followed(read_blocks, edges, again, workers, progress)
         if not np.isfinite(tables.t).any():
             raise _not_found(followers, pairs, why_not_seen(_some(read_blocks, pairs), rig, disc))
         for follower in followers:
             follower.setup = setup
-        tracking = assemble(followers, tables, settings, taken, workers)
-        return tracking, in_doubt(f for f in tracking.findings if f.kind not in DECLARED)
+        return assemble(followers, tables, settings, taken, workers)
 
-    tracking, faulty = measured(disc, progress)
+    tracking = measured(disc, progress)
     slips = _slips(tracking, read_blocks, pairs, setup)
     for slip in slips:
         read_blocks = _without(read_blocks, frames.CAMERAS.index(slip.subject.camera), slip.subject.frames[0][0])
-        tracking, faulty = measured(disc, lambda n: None)
+        tracking = measured(disc, lambda n: None)
     found = tracking.trajectory.disc
-    if np.abs(found.marker_centres_body - disc.marker_centres_body).max() > LOOK_AGAIN and not faulty:
-        tracking, faulty = measured(found, lambda n: None)
+    if np.abs(found.marker_centres_body - disc.marker_centres_body).max() > LOOK_AGAIN and not _faulty(tracking):
+        tracking = measured(found, lambda n: None)
     tracking = replace(tracking, findings=(*slips, *tracking.findings))
-    arranged = why_not_seen(_senseless(tracking, faulty, read_blocks, pairs), rig, disc)
-    # in doubt only here: dots found elsewhere than declared are what the second look above is for
-    doubt = {Kind.DOTS_MISPLACED: Severity.DOUBT}
-    noticed = (*arranged, *tracking.findings, *stuck)
-    return replace(tracking, findings=tuple(replace(f, severity=doubt.get(f.kind, f.severity)) for f in noticed))
+    arranged = why_not_seen(_senseless(tracking, read_blocks, pairs), rig, disc)
+    return replace(tracking, findings=(*arranged, *tracking.findings, *stuck))
+
+
+def _faulty(tracking: Tracking) -> bool:
+    """Whether the images are in doubt."""
+    return in_doubt(f for f in tracking.findings if f.kind not in DECLARED)
 
 
 def _check_dots(disc: Disc) -> None:
@@ -138,11 +131,7 @@ def _slips(tracking: Tracking, read_blocks: ReadBlocks, pairs: range, setup: Tra
     edges = [start, min(start + PAIRED, pairs.stop)]
     alone = (_without(read_blocks, other, start) for other in (1, 0))
     ahead = frames_ahead(*(_followed(one, edges, setup, 1, lambda n: None)[1].R for one in alone))
-    if not ahead:
-        return ()
-    camera, other = frames.CAMERAS[::-1] if ahead > 0 else frames.CAMERAS
-    text = f"the {camera} camera is {abs(ahead)} frames ahead of the {other}, and its images are not used from there on"
-    return (left_out(text, ahead, (start, pairs[-1]), start, first == 0),)
+    return (left_out(ahead, pairs, first),) if ahead else ()
 
 
 def _apart(tracking: Tracking) -> Mask:
@@ -155,23 +144,19 @@ def _apart(tracking: Tracking) -> Mask:
 def _without(read_blocks: ReadBlocks, camera: int, since: int) -> ReadBlocks:
     """The same, but for a camera's images from a frame on."""
 
-    def rest(start: int, stop: int) -> Iterator[PairBlock]:
-        for block in read_blocks(start, stop):
-            gone = [Unreadable(int(frame), camera, "of another instant") for frame in block.frames if frame >= since]
-            yield replace(block, unreadable=(*block.unreadable, *gone))
+    def without(block: PairBlock) -> PairBlock:
+        gone = [Unreadable(int(frame), camera, "of another instant") for frame in block.frames if frame >= since]
+        return replace(block, unreadable=(*block.unreadable, *gone))
 
-    return rest
+    return lambda start, stop: map(without, read_blocks(start, stop))
 
 
-def _senseless(tracking: Tracking, faulty: bool, read_blocks: ReadBlocks, pairs: range) -> NDArray:
-    """(k, 2, height, width) images in which the dots make no sense as declared; none where they do.
-
-    faulty : the images are in doubt
-    """
+def _senseless(tracking: Tracking, read_blocks: ReadBlocks, pairs: range) -> NDArray:
+    """(k, 2, height, width) images in which the dots make no sense as declared; none where they do."""
     kinds = {finding.kind for finding in tracking.findings}
     status = tracking.trajectory.frame_status
     contradicted = Kind.ONE_SIDED in kinds or 2 * np.sum(status == FrameStatus.CONTRADICTED) > len(status)
-    far = faulty and max(tracking.details["systematic_px"]) > MEETING_PX
+    far = _faulty(tracking) and max(tracking.details["systematic_px"]) > MEETING_PX
     if not (contradicted or far) or Kind.DROPPED_FRAMES in kinds:  # which makes cameras contradict each other
         return _some(read_blocks, pairs[:0])
     rows = np.flatnonzero(_apart(tracking) | (far & (status == FrameStatus.MEASURED)))
@@ -264,17 +249,16 @@ def _as_one_sensor(read_blocks: ReadBlocks, pairs: range) -> tuple[ReadBlocks, l
     if not said:
         return read_blocks, []
 
-    def repaired(start: int, stop: int) -> Iterator[PairBlock]:
-        for block in read_blocks(start, stop):
-            images = block.images.copy()  # they may be the caller's own
-            for camera, (pattern, mask) in enumerate(sensors):
-                if pattern is not None:
-                    images[:, camera] = _without_mosaic(images[:, camera], pattern)
-                if mask is not None:
-                    repair(images[:, camera], mask)
-            yield replace(block, images=images)
+    def repaired(block: PairBlock) -> PairBlock:
+        images = block.images.copy()  # they may be the caller's own
+        for camera, (pattern, mask) in enumerate(sensors):
+            if pattern is not None:
+                images[:, camera] = _without_mosaic(images[:, camera], pattern)
+            if mask is not None:
+                repair(images[:, camera], mask)
+        return replace(block, images=images)
 
-    return repaired, [
+    return lambda start, stop: map(repaired, read_blocks(start, stop)), [
         Finding(Kind.SENSOR, Severity.WARNING, f"{name} camera: {text}", Subject("track", name)) for name, text in said
     ]
 

@@ -20,12 +20,11 @@ from numpy.typing import NDArray
 
 from calibration.cameras.camera import N_RIG, PAIR_SHIFT, PAIR_TURN, WORLD_SHIFT, WORLD_TURN, StereoRig
 from calibration.kit.arrays import Array, Mask
-from calibration.kit.brief import ranges
 from disctrack.findings import MISFITS, Finding, Kind, Remedy, Severity, Subject
 from disctrack.frames import CAMERAS, vector_from_rotation
 from disctrack.numbers import Measured
 from disctrack.track.pose import DotsInFrames, PoseFits
-from disctrack.track.side_by_side import FEW, SHARED_FRAMES, evenly, stretches
+from disctrack.track.side_by_side import FEW, SHARED_FRAMES, evenly
 
 # Share of the square of a misfit that a delay explains, from which on it is its cause; and below which it has no part
 # in it: what a camera that moved leaves looks a little like one
@@ -34,25 +33,19 @@ STRETCHES = 20
 SURE = 5.0  # sigmas of the difference before and after; a drift, whose scatter is its own, reaches 7
 
 
-def contradicting(refused: Mask, pairs: range) -> tuple[Finding, ...]:
-    """Long stretches of frames refused (n,) for their dots: what is shorter is told by the frames' own status."""
-    frames = [pairs[row] for first, end in stretches(refused, FEW) for row in range(first, end)]
-    if not frames:
-        return ()
-    text = f"frames {ranges(frames)} are refused: the dots of the two cameras contradict each other"
-    return (Finding(Kind.CAMERAS_CONTRADICT, Severity.DOUBT, text, explains=(Kind.FRAMES_LOST,)),)
+def left_out(ahead: int, pairs: range, first: int) -> Finding:
+    """One camera left out images at a row of the pairs, or before: the right one where `ahead` is positive.
 
-
-def left_out(text: str, ahead: int, frames: tuple[int, int], since: int, always: bool) -> Finding:
-    """One camera left out images: the right one where `ahead`, the frames by which it is, is positive.
-
-    frames : first and last that it spoils;  since : where it was, or before if always
+    ahead : frames by which it is ahead of the other
     """
-    n, camera = abs(ahead), CAMERAS[int(ahead > 0)]
-    text = f"{text}: it left out {n} image{'s' * (n > 1)} {'before' if always else 'at'} frame {since}"
-    of, numbers = Subject("track", camera, (frames,)), {"images": Measured(n)}
+    n, (camera, other), frame = abs(ahead), CAMERAS[::-1] if ahead > 0 else CAMERAS, pairs[first]
+    text = (
+        f"the {camera} camera is {n} frame{'s' * (n > 1)} ahead of the {other}, and its images are not used from there "
+        f"on: it left out {n} image{'s' * (n > 1)} {'at' if first else 'before'} frame {frame}"
+    )
+    of, numbers = Subject("track", camera, ((frame, pairs[-1]),)), {"images": Measured(n)}
     remedy = Remedy(action=f"number its images from there on higher by {n}")
-    explains = MISFITS if always else (Kind.DELAY, *MISFITS)
+    explains = (Kind.DELAY, *MISFITS) if first else MISFITS
     return Finding(Kind.DROPPED_FRAMES, Severity.DOUBT, text, of, numbers, (remedy,), explains)
 
 

@@ -95,7 +95,7 @@ def misplaced_dots(declared: Disc, found: Array) -> tuple[Finding, ...]:
     )
     of = Subject("track", dot=int(far[0]) if len(far) == 1 else None)
     remedy = Remedy("[markers] centres_mm", f"[{centres}]")
-    return (Finding(Kind.DOTS_MISPLACED, Severity.WARNING, text, of, remedies=(remedy,)),)
+    return (Finding(Kind.DOTS_MISPLACED, Severity.DOUBT, text, of, remedies=(remedy,)),)
 
 
 def _shaken(factor: Array, trajectory: Trajectory) -> tuple[Finding, ...]:
@@ -203,7 +203,7 @@ def _table_disagrees(table: TableFromDisc | None, trajectory: Trajectory) -> tup
 
 
 def _lost(trajectory: Trajectory) -> Iterator[Finding]:
-    """Frames whose poses no motion joins to the others, and a recording that loses most of its frames."""
+    """Frames whose poses no motion joins to the others, whose dots contradict each other; most of the frames lost."""
     status = trajectory.frame_status
     told, where = _named(trajectory, status == FrameStatus.JUMPED, FEW)
     if where:
@@ -214,6 +214,10 @@ def _lost(trajectory: Trajectory) -> Iterator[Finding]:
         )
         of = Subject("track", frames=where)
         yield Finding(Kind.CLOCK_JUMP, Severity.DOUBT, text, of, explains=(Kind.FRAMES_LOST,))
+    told, where = _named(trajectory, status == FrameStatus.CONTRADICTED, FEW)
+    if where:
+        text = f"frames {told} are refused: the dots of the two cameras contradict each other"
+        yield Finding(Kind.CAMERAS_CONTRADICT, Severity.DOUBT, text, explains=(Kind.FRAMES_LOST,))
     reasons = [s for s in FrameStatus if s.looked_for and not s.has_pose and s != FrameStatus.UNREADABLE]
     counts = {reason: int(np.sum(status == reason)) for reason in reasons}
     lost, measured, most = sum(counts.values()), int(trajectory.measured.sum()), max(reasons, key=lambda r: counts[r])

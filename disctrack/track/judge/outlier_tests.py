@@ -57,18 +57,15 @@ def unexpected_misfit(misfit: NDArray[np.floating], n_pixels: NDArray[np.floatin
 
 def _usual(values: Array) -> tuple[Array, Array]:
     """Running median over time and its robust spread, of values (n, ...) with NaN; same shape, by blocks of frames."""
-    n, shape = len(values), values.shape[1:]
-    blocks = max(1, int(np.ceil(n / BLOCK)))
-    padded = np.full((blocks * BLOCK, int(np.prod(shape, dtype=int))), np.nan)
-    padded[:n] = values.reshape(n, -1)
-    cut = padded.reshape(blocks, BLOCK, -1)
-    with np.errstate(all="ignore"):
-        before, after = np.arange(blocks) - 1, np.minimum(np.arange(blocks) + 1, blocks - 1)
-        around = np.concatenate([cut[np.maximum(before, 0)], cut, cut[after]], axis=1)
-        middle = _nanmedian(around)
-        spread = 1.4826 * _nanmedian(np.abs(around - middle[:, None]))
+    n, blocks = len(values), -(-len(values) // BLOCK) + 2
+    padded = np.full((blocks * BLOCK, *values.shape[1:]), np.nan)
+    padded[BLOCK : BLOCK + n] = values
+    cut = padded.reshape(blocks, BLOCK, *values.shape[1:])
+    around = np.concatenate([cut[:-2], cut[1:-1], cut[2:]], axis=1)
+    middle = _nanmedian(around)
+    spread = 1.4826 * _nanmedian(np.abs(around - middle[:, None]))
     rows = np.arange(n) // BLOCK
-    return middle[rows].reshape(n, *shape), spread[rows].reshape(n, *shape)
+    return middle[rows], spread[rows]
 
 
 def _nanmedian(values: Array) -> Array:

@@ -7,14 +7,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.cameras.camera import StereoRig
 from calibration.cameras.causes import causes
 from calibration.kit.arrays import Array, Mask
 from disctrack import frames
 from disctrack.findings import Finding
 from disctrack.track.dots.template import DotCentres, dot_centres
 from disctrack.track.follow.following import Follower, Tables, repeats
-from disctrack.track.judge.cameras import camera_course, contradicting
+from disctrack.track.judge.cameras import camera_course
 from disctrack.track.judge.doubts import FAULTY, doubts_of, repeated_images
 from disctrack.track.judge.outlier_tests import judge_poses, outlying_frames, unexpected_misfit
 from disctrack.track.pose import MIN_DOTS, DotsInFrames, PoseFits, fit_poses, whitening
@@ -49,12 +48,17 @@ class Tracking:
 
 @dataclass(frozen=True)
 class Taken:
-    """When the pairs were taken, and under which gravity."""
+    """Which pairs are measured, when they were taken, and under which gravity."""
 
     pairs: range
-    time: Array  # (n,) [s]
     frame_rate: float  # [Hz]
-    gravity: float  # [m/s^2]
+    gravity: float = 9.81  # [m/s^2]
+    stamps: Array | None = None  # (n,) [s] where the camera wrote them
+
+    @property
+    def time(self) -> Array:
+        """(n,) [s]."""
+        return np.array(self.pairs) / self.frame_rate if self.stamps is None else np.asarray(self.stamps, float)
 
 
 def assemble(
@@ -67,8 +71,7 @@ def assemble(
     first = next((follower for follower in followers if follower.measured), followers[0])
     rig, disc = first.setup.rig, first.setup.disc
     repeated, dots = repeats(tables.digest), dot_centres(tables.results, tables.status)
-    exposure, of_exposure = _as_they_were(tables, dots, first, settings, taken)
-    _clean(tables, dots, repeated, rig)
+    exposure, of_exposure = _as_they_were(tables, dots, repeated, first, settings, taken)
     seen = DotsInFrames(rig, disc, dots.pixels, dots.covariance_px2, tables.R, tables.t)
     as_built, faults, outlying = _shared(seen, settings, workers)
     seen = replace(seen, rig=as_built.rig, disc=as_built.disc)
@@ -107,15 +110,17 @@ def assemble(
     }
     if table is not None:
         details["table"] = table.details(trajectory.q[:, 4], seen.disc)
-    pieces = contradicting(verdicts == FrameStatus.CONTRADICTED, taken.pairs)
-    findings = (*repeated_images(repeated, trajectory), *pieces, *of_exposure, *of_course, *doubts)
+    findings = (*repeated_images(repeated, trajectory), *of_exposure, *of_course, *doubts)
     return Tracking(trajectory, details, findings)
 
 
 def _as_they_were(
-    tables: Tables, dots: DotCentres, first: Follower, settings: TrackingSettings, taken: Taken
+    tables: Tables, dots: DotCentres, repeated: Mask, first: Follower, settings: TrackingSettings, taken: Taken
 ) -> tuple[tuple[float, float], tuple[Finding, ...]]:
-    """Move the dots to where they were in the middle of the exposure but for glare, and tell by which exposure."""
+    """Move the dots to where they were in the middle of the exposure but for glare and lenses, and tell the exposure.
+
+    Those of images (n, 2) that are copies of others are taken out; what misfits beyond noise is in the covariances.
+    """
     where, rig, disc = (tables.R, tables.t, taken.time), first.setup.rig, first.setup.disc
     edges = first.law.edges
     found = exposure_by_smear(*where, dots.blur_px, rig, disc)
@@ -123,28 +128,19 @@ def _as_they_were(
     dots.pixels[...] -= shift_by_glare(tables.R, tables.t, dots.contrast, rig, disc, edges)
     if any(exposure):
         dots.pixels[...] -= shift_by_exposure(*where, np.array(exposure), rig, disc, edges)
-    return exposure, findings
-
-
-def _clean(tables: Tables, dots: DotCentres, repeated: Mask, rig: StereoRig) -> None:
-    """Take out dots of images (n, 2) that are copies of others, state misfits beyond noise, take off the lens field."""
     alone = repeated & ~repeated.all(axis=1, keepdims=True)
     dots.pixels[alone] = np.nan  # over the edges of stretches, too
     tables.status[alone] = MarkerStatus.NOT_LOOKED_FOR
     dots.covariance_px2[...] *= unexpected_misfit(dots.misfit, dots.n_pixels)[..., None, None]
     if rig.lens_field is not None:
         dots.pixels[...] = rig.lens_field.corrected(dots.pixels)
+    return exposure, findings
 
 
 def _shared(seen: DotsInFrames, settings: TrackingSettings, workers: int) -> tuple[AsBuilt, AsBuilt | None, Mask]:
     """What the frames share, what is wrong with it, and which frames (n,) are outlying and do not enter."""
     outlying = _outlying(seen, workers)
     faults = without_shared_faults(seen.but(outlying))
-    if faults is not None:  # misprinted dots raise the misfit of all frames, and hide faults of some
-        more = _outlying(replace(seen, disc=faults.disc), workers) & ~outlying
-        if more.any():
-            outlying |= more
-            faults = without_shared_faults(seen.but(outlying))
     if not settings.refine_markers:
         return AsBuilt.as_declared(seen.rig, seen.disc), faults, outlying
     as_built = refine_as_built(seen.but(outlying))

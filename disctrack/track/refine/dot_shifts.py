@@ -46,10 +46,11 @@ from disctrack.frames import CAMERAS
 from disctrack.track.dots.template_response import (
     AROUND,
     Edge,
+    contrast_graded,
+    edge_smeared,
     half_axes,
     plane_to_image,
-    pulls_by_contrast,
-    pulls_by_exposure,
+    pulls,
     turned_to_axes,
 )
 from disctrack.track.pose import marker_pixels
@@ -195,7 +196,7 @@ def _pulled(radius: float, affine: Array, growth: Array, velocity: Array, edge: 
 
     affine (n, m, 2, 2) [px/m]; growth (n, m, 2, 2) [1/s] A' A^-1; velocity (n, m, 2) [px/s].
     """
-    T = pulls_by_exposure(radius, affine, edge)
+    T = pulls(radius, affine, edge, edge_smeared)
     axes = turned_to_axes(affine)
     v = (axes @ velocity[..., None])[..., 0]
     G = axes @ growth @ np.swapaxes(axes, -1, -2)
@@ -288,7 +289,7 @@ def shift_by_glare(R: Array, t: Array, contrast: Array, rig: StereoRig, disc: Di
             if gradient is not None:
                 axes = turned_to_axes(affine[:, camera])
                 along = (axes @ gradient(places[:, camera])[..., None])[..., 0]
-                along *= pulls_by_contrast(0.5 * disc.marker_diameter, affine[:, camera], edge)
+                along *= pulls(0.5 * disc.marker_diameter, affine[:, camera], edge, contrast_graded)
                 shift[rows, camera] = np.nan_to_num((along[..., None, :] @ axes)[..., 0, :])
     return shift
 

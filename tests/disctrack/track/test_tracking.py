@@ -15,7 +15,7 @@ from disctrack.errors import RecordingError, TrackingError
 from disctrack.findings import Kind
 from disctrack.recording.readers.blocks import PairBlock, Unreadable
 from disctrack.track.dots.template import dot_centres
-from disctrack.track.follow.tracking import PAIRS_TRIED, TrackingSettings, _as_one_sensor, stretch_edges, track
+from disctrack.track.follow.tracking import PAIRS_TRIED, Taken, TrackingSettings, _as_one_sensor, stretch_edges, track
 from disctrack.track.measurement import refuse_unreadable
 from disctrack.track.pose import DotsInFrames
 from disctrack.track.refine.assembly import fit_all
@@ -41,7 +41,7 @@ def blocks_of(images, readable=None, size=16):
 def tracked(images, pairs, *, readable=None, size=16, rig=None, disc=None, **options):
     """The images of the scene of these pairs tracked."""
     read = blocks_of(images, readable, size)
-    return track(read, range(len(images)), rig or pairs.rig, disc or pairs.disc, 1000.0, **options)
+    return track(read, Taken(range(len(images)), 1000.0), rig or pairs.rig, disc or pairs.disc, **options)
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from disctrack.recording.readers.blocks import PairBlock
 from disctrack.synthetic.cameras import rig_of
 from disctrack.synthetic.description import Scene, load_scene
 from disctrack.synthetic.motion import motion_of
-from disctrack.track.follow.tracking import Tracking, track
+from disctrack.track.follow.tracking import Taken, Tracking, track
 from disctrack.track.video_overlay import draw_pair
 from tests.rendering import render_disc
 
@@ -21,7 +21,8 @@ N = 24
 
 
 def follow(images: np.ndarray, rig: StereoRig, disc: Disc) -> Tracking:
-    return track(lambda a, b: [PairBlock(np.arange(a, b), images[a:b], ())], range(len(images)), rig, disc, 1000.0)
+    taken = Taken(range(len(images)), 1000.0)
+    return track(lambda a, b: [PairBlock(np.arange(a, b), images[a:b], ())], taken, rig, disc)
 
 
 def dim_scene(light: float) -> Scene:
