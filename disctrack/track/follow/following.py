@@ -130,11 +130,6 @@ class Follower:
     # side is clipped
     first_row: int = 0  # of the tables
 
-    def without_pose(self) -> None:
-        """One more frame is gone in which the disc is lost."""
-        self.lost = (self.lost or 0) + 1
-        self.waited += 1
-
 
 def run(
     setup: TrackingSetup,
@@ -186,7 +181,7 @@ def follow_block(follower: Follower, images: Image, readable: Mask, tables: Tabl
             follower.failures = 0
         if not seen or (anew and not recover(follower, images[i:], readable[i:])):
             rows.frame_status[i] = FrameStatus.MARKERS_NOT_FOUND if seen else FrameStatus.UNREADABLE
-            follower.without_pose()
+            follower.lost, follower.waited = (follower.lost or 0) + 1, follower.waited + 1
             i += 1
             continue
         assert follower.heading is not None

@@ -139,7 +139,9 @@ def _as_they_were(
 
 def _shared(seen: DotsInFrames, settings: TrackingSettings, workers: int) -> tuple[AsBuilt, AsBuilt | None, Mask]:
     """What the frames share, what is wrong with it, and which frames (n,) are outlying and do not enter."""
-    outlying = _outlying(seen, workers)
+    # the dots miss the pose that fits best by far more than in others
+    fits = fit_all(seen, workers, judged=False)
+    outlying = outlying_frames((whitening(seen.covariance) @ fits.residuals_px[..., None])[..., 0])
     faults = without_shared_faults(seen.but(outlying))
     if not settings.refine_markers:
         return AsBuilt.as_declared(seen.rig, seen.disc), faults, outlying
@@ -163,12 +165,6 @@ def _scattered(
     systematic = fits.covariance * scatter.systematic
     fits.covariance[...] *= scatter.noise
     return replace(fits, chi_square=fits.chi_square / scatter.whole), systematic, scatter
-
-
-def _outlying(seen: DotsInFrames, workers: int) -> Mask:
-    """(n,) True where the dots miss the pose that fits best by far more than in others."""
-    fits = fit_all(seen, workers, judged=False)
-    return outlying_frames((whitening(seen.covariance) @ fits.residuals_px[..., None])[..., 0])
 
 
 def fit_all(seen: DotsInFrames, workers: int = 1, judged: bool = True) -> PoseFits:
