@@ -11,7 +11,8 @@ import numpy as np
 
 from calibration.board.chessboard import BoardNotFound, find_corners
 from calibration.board.search import board_size
-from disctrack.errors import OutputError, RecordingError
+from calibration.rig_file import read_rig
+from disctrack.errors import DiscTrackError, OutputError, RecordingError
 from disctrack.files.toml_tree import read_toml
 from disctrack.files.whole import write_whole
 from disctrack.first_look.sequences import CameraPair, Sequence, find_sequences, pair_cameras
@@ -81,6 +82,8 @@ def look_into(folder: Path) -> tuple[Told, list[str]]:
             notes.append(f"{left}: {board_seen}")
         else:
             told["calibration", "inner_corners"] = list(inner_corners), f"long side first; {board_seen}"
+    elif (rig_file := _rig_beside(folder)) is not None:
+        told["calibration", "rig"] = rig_file, "a rig that was calibrated before"
     else:
         said = "no views of a chessboard are there: put them into calibration/left and calibration/right, or name a rig"
         notes.append(said)
@@ -164,3 +167,15 @@ def _frame_rate(left: FrameReader, right: FrameReader) -> tuple[float | None, st
         if reader.frame_rate is not None:
             return float(reader.frame_rate), f"stated by the {camera} file"
     return None, ""
+
+
+def _rig_beside(folder: Path) -> str | None:
+    """A rig file of disctrack in the folder or the one above."""
+    for place, shown in ((folder, ""), (folder.parent, "../")):
+        for file in sorted(place.glob("*.h5")):
+            try:
+                read_rig(file)
+            except DiscTrackError:
+                continue
+            return f"{shown}{file.name}"
+    return None

@@ -38,15 +38,18 @@ def declaration_text(
         f"name = {toml_value(name)}",
     ]
     missing = []
+    by_rig = {"calibration", "table"} if ("calibration", "rig") in told else set()  # what a rig file stands for
     for section, heading in HEADINGS.items():
+        if section in by_rig - {"calibration"}:
+            continue
         rows = []
-        given = {**example.get(section, {}), **known}
+        given = {} if section in by_rig else {**example.get(section, {}), **known}
         for key, meant in KEYS[section].items():
             alike = meant.needed or (section in ALIKE and key != "rig") or key == "exposure_us"
             value, source = told.get((section, key), (given.get(key) if alike else None, ""))
             if value is not None:
                 rows.append(_aligned(f"{key} = {toml_value(value)}", source or meant.remark))
-            elif meant.needed:
+            elif meant.needed and section not in by_rig:
                 missing.append(f"[{section}] {key}")
                 rows.append(_aligned(f"# {key} = {meant.example}", f"FILL IN: {meant.remark}"))
         lines += ["", _aligned(f"[{section}]", heading), *rows] if rows else []
