@@ -173,7 +173,9 @@ def test_check_finds_nothing_to_put_right_in_the_sample(sample_clip, tmp_path, c
     assert cv2.imread(str(tmp_path / "check.png")) is not None
 
 
-def test_init_says_that_the_cameras_differ_in_number_and_that_views_are_missing(sample_clip, tmp_path, cli):
+def test_init_says_that_cameras_differ_in_number_and_views_are_missing_or_a_rig_is_there(
+    sample_clip, rig_file, tmp_path, cli
+):
     for camera, n in (("left", 5), ("right", 4)):
         (tmp_path / camera).mkdir()
         for file in sorted((sample_clip / camera).iterdir())[:n]:
@@ -181,3 +183,9 @@ def test_init_says_that_the_cameras_differ_in_number_and_that_views_are_missing(
     said = cli("init", tmp_path).out
     assert "left has 5 frames, right has 4" in said
     assert "no views of a chessboard" in said
+    (tmp_path / "recording.toml").unlink()
+    (tmp_path / "rig.h5").symlink_to(rig_file)
+    assert "no views of a chessboard" not in cli("init", tmp_path).out
+    written = tomllib.loads((tmp_path / "recording.toml").read_text())
+    assert written["calibration"] == {"rig": "rig.h5"}
+    assert "table" not in written
