@@ -25,10 +25,11 @@ Arrays: many of a thing on leading axes, components last; image points are (n_fr
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation
 
 from calibration.cameras.camera import rotation_from_vector as rotation_from_vector
 from calibration.kit.arrays import Array
@@ -131,20 +132,20 @@ def skew(v: ArrayLike) -> Array:
 
 def vector_from_rotation(R: Array) -> Array:
     """Rotation vector (..., 3) [rad] of R (..., 3, 3), length in [0, pi]; inverse of `rotation_from_vector`."""
-    return _known_rotations(R, 3, Rotation.as_rotvec)
+    return _known_rotations(R, 3, lambda turn: turn.as_rotvec())
 
 
 def quaternion_from_rotation(R: Array) -> Array:
     """Unit quaternion (w, x, y, z) of R (..., 3, 3) -> (..., 4)."""
-    return np.roll(_known_rotations(R, 4, Rotation.as_quat), 1, axis=-1)  # SciPy has the scalar part last
+    return np.roll(_known_rotations(R, 4, lambda turn: turn.as_quat()), 1, axis=-1)  # SciPy has the scalar part last
 
 
-def _known_rotations(R: Array, size: int, told: Callable[[Rotation], Array]) -> Array:
+def _known_rotations(R: Array, size: int, told: Callable[[Any], Array]) -> Array:
     """What SciPy tells of R (..., 3, 3), (..., size); NaN in, NaN out."""
     R = np.asarray(R, float)
     found = np.full((*R.shape[:-2], size), np.nan)
     known = np.isfinite(R).all(axis=(-2, -1))
-    found[known] = told(Rotation.from_matrix(R[known]))
+    found[known] = told(scipy.spatial.transform.Rotation.from_matrix(R[known]))
     return found
 
 
