@@ -25,7 +25,6 @@ Arrays: many of a thing on leading axes, components last; image points are (n_fr
 """
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import scipy
@@ -140,7 +139,7 @@ def quaternion_from_rotation(R: Array) -> Array:
     return np.roll(_known_rotations(R, 4, lambda turn: turn.as_quat()), 1, axis=-1)  # SciPy has the scalar part last
 
 
-def _known_rotations(R: Array, size: int, told: Callable[[Any], Array]) -> Array:
+def _known_rotations(R: Array, size: int, told: Callable[..., Array]) -> Array:
     """What SciPy tells of R (..., 3, 3), (..., size); NaN in, NaN out."""
     R = np.asarray(R, float)
     found = np.full((*R.shape[:-2], size), np.nan)
