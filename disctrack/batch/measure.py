@@ -1,4 +1,4 @@
-"""What one process does with one job: it takes a recording from its images to its report."""
+"""What one process does with one job: calibrate a rig, or take a recording from its images to its report."""
 
 import contextlib
 import dataclasses
@@ -28,11 +28,12 @@ from disctrack.batch.records import (
 from disctrack.batch.repeats import group_of
 from disctrack.calibrate.stage import boards_in, calibrate_into, is_rig_of, source_of
 from disctrack.diagnosis.recorded import first_to_mend
-from disctrack.errors import AnalysisError, CalibrationError, DiscTrackError, TrackingError, reason_of
+from disctrack.errors import AnalysisError, DiscTrackError, TrackingError, reason_of
 from disctrack.files.json_text import plain
+from disctrack.files.whole import write_whole
 from disctrack.findings import Kind, leading
 from disctrack.progress import recorded_times, timed
-from disctrack.recording.declaration import Recording, read_recording
+from disctrack.recording.declaration import read_recording
 from disctrack.track.measurement import measure, open_pairs, trajectory_provenance
 from disctrack.trajectory import Trajectory
 from disctrack.trajectory.file import Details, Provenance
@@ -45,31 +46,27 @@ BUSY_FOR = 1.0  # [s] to wait for another batch before the recording is put back
 def do(job: Job) -> Record:
     """Do a job. Never raises an Exception: what went wrong is in the record, and in the recording's folder."""
     try:
-        return make_recording(job)
+        return make_rig(job) if job.kind == "rig" else make_recording(job)
     except Timeout:
         return Record(BUSY)
     except Exception as error:
         return failed(reason_of(error))
 
 
-_no_rig: dict[str, CalibrationError] = {}  # what this process could not calibrate, and why
-
-
-def make_rig(job: Job, recording: Recording) -> None:
-    """Calibrate into job.rig unless another recording with the same views did. Raises Timeout, CalibrationError."""
+def make_rig(job: Job) -> Record:
+    """Calibrate into job.rig, unless the same was done before, here or by `disctrack run`. Raises Timeout."""
     path = Path(job.rig)
-    if recording.rig_file is not None:
-        return
-    if job.rig in _no_rig:
-        raise _no_rig[job.rig]
     with locked(path.with_name(LOCK), BUSY_FOR):
-        source = source_of(recording, job.options.calibration)
-        try:
-            if not is_rig_of(path, source):
-                calibrate_into(path, source, overwrite=True, figures=job.options.report)
-        except DiscTrackError as error:
-            _no_rig[job.rig] = CalibrationError(f"no rig: {error}")
-            raise _no_rig[job.rig] from error
+        source = source_of(read_recording(job.folder), job.options.calibration)
+        if is_rig_of(path, source) and not job.options.overwrite:
+            return Record(SKIPPED)
+        earlier = [Path(file) for file in job.adopt] if not job.options.overwrite else []
+        same = next((file for file in earlier if is_rig_of(file, source)), None)
+        if same is not None:
+            write_whole(path, same.read_bytes())
+            return Record(SKIPPED)
+        calibrate_into(path, source, overwrite=True, figures=job.options.report)
+    return Record(MEASURED)
 
 
 def make_recording(job: Job) -> Record:
@@ -78,10 +75,8 @@ def make_recording(job: Job) -> Record:
     with locked(results / LOCK, BUSY_FOR):
         try:
             return _make_recording(job, results)
-        except Timeout:  # the rig is being made
-            raise
         except Exception as error:
-            kind = Kind.CALIBRATION if isinstance(error, CalibrationError) else Kind.OTHER
+            kind = Kind.OTHER
             if isinstance(error, TrackingError):
                 kind = error.findings[0].kind if error.findings else Kind.DISC_NOT_FOUND
             record = failed(reason_of(error), kind)
@@ -91,9 +86,8 @@ def make_recording(job: Job) -> Record:
 
 
 def _make_recording(job: Job, results: Path) -> Record:
-    recording = read_recording(job.folder)
-    make_rig(job, recording)
     began, used = time.perf_counter(), time.process_time()
+    recording = read_recording(job.folder)
     rig, pairs = read_rig(job.rig), open_pairs(recording)
     path, provenance = results / "trajectory.h5", trajectory_provenance(recording, rig, pairs, None)
 

@@ -1,5 +1,6 @@
-"""What is to be done: one job per recording; recordings of the same views share a rig."""
+"""What is to be done: each rig once, then one job per recording."""
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -42,22 +43,25 @@ class BatchOptions:
 class Job:
     """One piece of work for one process."""
 
-    name: str  # of the recording
-    folder: str
+    kind: str  # "rig" or "recording"
+    name: str  # of the recording; for a rig, the first recording that needs it
+    folder: str  # of that recording
     results: str  # folder for what comes out
-    rig: str  # rig file: given, or to be made by whoever comes first
+    rig: str  # rig file: what a "rig" makes and a "recording" uses
     options: BatchOptions
     threads: int = 1  # that read images
+    adopt: tuple[str, ...] = ()  # rig files of earlier runs that may be the same
 
 
 def make_plan(
     found: FoundRecordings, recordings: Sequence[Path], options: BatchOptions
-) -> tuple[list[Job], dict[str, Record], tuple[Path, ...]]:
+) -> tuple[list[Job], list[Job], dict[str, Record], tuple[Path, ...]]:
     """Read every recording.toml, count the images, and find who shares a rig by the content of the views.
 
-    returns : jobs, what fails before it begins by the recording's name, and folders of images that no recording.toml
-        speaks of
+    returns : jobs of rigs and of recordings, what fails before it begins by the recording's name, and folders of images
+        that no recording.toml speaks of
     """
+    rigs: dict[str, Job] = {}
     jobs: list[Job] = []
     failures: dict[str, Record] = {}
     undeclared = found.undeclared
@@ -67,10 +71,11 @@ def make_plan(
             recording = read_recording(folder)
             about = Kind.READING
             undeclared = tuple(place for place in undeclared if not _has_views_of(place, recording))
-            jobs.append(_job(found, recording, name, options))
+            jobs.append(_job(found, recording, name, options, rigs))
         except Exception as error:  # whatever is wrong with one recording, the others are measured
             failures[name] = failed(reason_of(error), about)
-    return jobs, failures, undeclared
+    needed = {job.rig for job in jobs}
+    return [job for path, job in rigs.items() if path in needed], jobs, failures, undeclared
 
 
 def _has_views_of(place: Path, recording: Recording) -> bool:
@@ -78,10 +83,15 @@ def _has_views_of(place: Path, recording: Recording) -> bool:
     return recording.views is not None and (recording.folder / recording.views.left).resolve().is_relative_to(place)
 
 
-def _job(found: FoundRecordings, recording: Recording, name: str, options: BatchOptions) -> Job:
+def _job(found: FoundRecordings, recording: Recording, name: str, options: BatchOptions, rigs: dict[str, Job]) -> Job:
+    folder = recording.folder
     open_pairs(recording)  # raises where there is nothing to measure
-    rig = recording.rig_file
-    if rig is None:  # named by the content of all that it depends on
-        made_from = source_of(recording, options.calibration).provenance.fingerprint[:16]
-        rig = found.common / "rigs" / made_from / "rig.h5"
-    return Job(name, str(recording.folder), str(found.results(recording.folder)), str(rig), options)
+    results = found.results(folder)
+    if recording.rig_file is not None:
+        return Job("recording", name, str(folder), str(results), str(recording.rig_file), options)
+    # named by the content of all that it depends on
+    made_from = source_of(recording, options.calibration).provenance.fingerprint[:16]
+    rig, earlier = found.common / "rigs" / made_from / "rig.h5", str(results / "rig.h5")
+    job = rigs.get(str(rig)) or Job("rig", name, str(folder), str(rig.parent), str(rig), options)
+    rigs[str(rig)] = dataclasses.replace(job, adopt=(*job.adopt, earlier))
+    return Job("recording", name, str(folder), str(results), str(rig), options)

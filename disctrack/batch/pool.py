@@ -29,8 +29,9 @@ import cv2
 
 from disctrack.batch.measure import do
 from disctrack.batch.plan import Job
-from disctrack.batch.records import BUSY, Record, failed
+from disctrack.batch.records import BUSY, FAILED, Record, failed
 from disctrack.errors import ClusterError, reason_of
+from disctrack.findings import Kind
 from disctrack.processes import Spawn, end_with_parent
 
 if TYPE_CHECKING:
@@ -46,12 +47,29 @@ class Died(Exception):
     """The process that did a job ended before the job did; its text says why."""
 
 
-def do_all(jobs: Sequence[Job], pool: Processes | Cluster, done: Callable[[Job, Record], None]) -> None:
-    """Do every job; `done` is called with each that is finished for good. Raises ClusterError.
+def do_all(
+    rigs: Sequence[Job], recordings: Sequence[Job], pool: Processes | Cluster, done: Callable[[Job, Record], None]
+) -> None:
+    """Do every job; `done` is called with each recording that is finished for good. Raises ClusterError.
 
-    A job at which another batch works, or whose rig is being made, is asked for again until that is done. A job whose
-    process died gets a second try at the end, alone, when there is most memory.
+    Rigs come first; a recording without its rig fails for the rig's reason. A job at which another batch works is asked
+    for again until that one is done with it. A job whose process died gets a second try at the end, alone, when there
+    is most memory.
     """
+    no_rig: dict[str, str] = {}
+
+    def made(rig: Job, record: Record) -> None:
+        if record.status == FAILED:
+            no_rig[rig.rig] = record.reason
+
+    _do_jobs(rigs, pool, made)
+    for job in recordings:
+        if job.rig in no_rig:
+            done(job, failed(f"no rig: {no_rig[job.rig]}", Kind.CALIBRATION))
+    _do_jobs([job for job in recordings if job.rig not in no_rig], pool, done)
+
+
+def _do_jobs(jobs: Sequence[Job], pool: Processes | Cluster, done: Callable[[Job, Record], None]) -> None:
     for job in _tried(jobs, pool, pool.size, done):
         for again, death in _tried([job], pool, 1, done).items():
             done(again, failed(f"twice, {death}"))

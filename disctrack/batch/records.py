@@ -14,7 +14,7 @@ from disctrack.trajectory.file import read_provenance
 RECORD = "batch.json"
 SCHEMA, SCHEMA_VERSION = "disctrack batch record", 1
 MEASURED, SKIPPED, FAILED, NOT_MEASURED = "measured", "skipped", "failed", "not measured"
-BUSY = "busy"  # another batch is at it, or at its rig
+BUSY = "busy"  # another batch is at it
 
 Stages = dict[str, float | bool]  # what is made of a trajectory, with which settings
 

@@ -95,12 +95,12 @@ def run_batch(
         if not 1 <= first <= step:
             raise ArgumentError(f"run_batch: shard is {shard}; expected (i, n) with i from 1 to n")
         mine = found.recordings[first - 1 :: step]
-        jobs, records, undeclared = make_plan(found, mine, options)
+        rigs, jobs, records, undeclared = make_plan(found, mine, options)
         if cluster is None:
             # cores that no other recording uses read images ahead
             threads = max(1, cores // max(1, min(n, len(jobs))))
             jobs = [replace(job, threads=threads) for job in jobs]
-        stopped = _do(jobs, records, pool)
+        stopped = _do(rigs, jobs, records, pool)
     for job in jobs:
         records.setdefault(job.name, Record(NOT_MEASURED, stopped))
     whole = shard is None  # or else whoever sums up the shards
@@ -116,7 +116,7 @@ def summarise_batch(
     return _summed_up(found, found.recordings, {}, options or BatchOptions(), False, default_threads())
 
 
-def _do(jobs: list[Job], records: dict[str, Record], pool: Processes | Cluster) -> str:
+def _do(rigs: list[Job], jobs: list[Job], records: dict[str, Record], pool: Processes | Cluster) -> str:
     """Fill `records` with what becomes of the recordings; returns why some have none."""
     n = len(jobs) + len(records)
 
@@ -127,7 +127,7 @@ def _do(jobs: list[Job], records: dict[str, Record], pool: Processes | Cluster) 
 
     try:
         with progress_bar("batch", len(jobs), "recording") as advance:
-            do_all(jobs, pool, done)
+            do_all(rigs, jobs, pool, done)
     except KeyboardInterrupt:
         return INTERRUPTED
     except ClusterError as error:

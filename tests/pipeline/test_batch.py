@@ -17,7 +17,6 @@ import time
 from concurrent.futures import Future
 from multiprocessing.context import SpawnProcess
 from pathlib import Path
-from unittest.mock import Mock
 
 import cv2
 import h5py
@@ -29,8 +28,7 @@ from disctrack.batch import measure as stage
 from disctrack.batch.locks import locked
 from disctrack.batch.measure import LOCK, do
 from disctrack.batch.plan import make_plan
-from disctrack.batch.records import BUSY, MEASURED, is_done, read_record
-from disctrack.errors import CalibrationError
+from disctrack.batch.records import MEASURED, is_done, read_record
 from disctrack.track.follow.tracking import prepare
 from disctrack.trajectory.file import read_trajectory
 from tests.pipeline.conftest import linked
@@ -54,7 +52,7 @@ def statuses(path: Path) -> dict[str, str]:
 
 def jobs_of(folder: Path, **options):
     found = find_recordings([folder])
-    return make_plan(found, found.recordings, BatchOptions(report=False, **options))[0]
+    return make_plan(found, found.recordings, BatchOptions(report=False, **options))[1]
 
 
 @pytest.fixture
@@ -119,18 +117,6 @@ def one(recording):
     """Job of the short recording with the given rig."""
     (job,) = jobs_of(recording)
     return job
-
-
-def test_recordings_wait_for_their_rig_and_fail_with_its_reason_found_once(short_recording, tmp_path, monkeypatch):
-    calibrate = Mock(side_effect=CalibrationError("no corners found"))
-    monkeypatch.setattr(stage, "calibrate_into", calibrate)
-    monkeypatch.setattr(stage, "BUSY_FOR", 0.0)
-    jobs = jobs_of(linked(short_recording, tmp_path / "a").parent) * 2
-    with locked(Path(jobs[0].rig).with_name(LOCK)):  # as while it is made
-        assert stage.do(jobs[0]).status == BUSY
-    records = [stage.do(job) for job in jobs]
-    assert [(record.status, record.reason) for record in records] == [("failed", "no rig: no corners found")] * 2
-    assert calibrate.call_count == 1
 
 
 @pytest.mark.statistical
@@ -381,7 +367,7 @@ def undisturbed(recording, tmp_path) -> Path:
     """The same day, measured without a fault, in this process."""
     root = a_day(recording, tmp_path / "undisturbed", ("a",))
     found = find_recordings([root])
-    (job,), *_ = make_plan(found, found.recordings, BatchOptions(report=False))
+    _, (job,), *_ = make_plan(found, found.recordings, BatchOptions(report=False))
     assert do(job).status == MEASURED
     return root
 

@@ -24,7 +24,7 @@ from disctrack.batch.find import find_recordings
 from disctrack.batch.locks import locked
 from disctrack.batch.plan import BatchOptions, Job
 from disctrack.batch.pool import Cluster, Died, do_all
-from disctrack.batch.records import BUSY, FAILED, MEASURED, Record
+from disctrack.batch.records import BUSY, FAILED, MEASURED, Record, failed
 from disctrack.batch.repeats import repeats_of
 from disctrack.batch.report import report_of
 from disctrack.batch.summary import as_csv, with_false_discovery, write_summary
@@ -92,8 +92,12 @@ def test_no_folder_and_no_recording_are_told_apart(tmp_path):
         find_recordings([tmp_path])
 
 
-def job(name):
-    return Job(name, f"/{name}", f"/{name}/results", "given.h5", BatchOptions())
+def job(name, rig="given.h5", kind="recording"):
+    return Job(kind, name, f"/{name}", f"/{name}/results", rig, BatchOptions())
+
+
+RIG = job("a", "shared.h5", "rig")
+WITH_RIG = [job("a", "shared.h5"), job("b"), job("c", "shared.h5")]
 
 
 class Pool:
@@ -104,7 +108,7 @@ class Pool:
         self.begun, self.running, self.at_once = [], [], []  # .at_once : how many ran when each began, itself included
 
     def submit(self, job):
-        self.begun.append(job.name)
+        self.begun.append((job.kind, job.name))
         return self._threads.submit(self._do, job)
 
     def _do(self, job):
@@ -112,30 +116,44 @@ class Pool:
         self.at_once.append(len(self.running))
         time.sleep(0.05)
         self.running.remove(job.name)
-        answer = (self.answers.get(job.name) or [GOOD]).pop(0)
+        answer = (self.answers.get(f"{job.kind}_{job.name}") or [GOOD]).pop(0)
         if isinstance(answer, Exception):
             raise answer
         return answer
 
 
-def done_by(pool, recordings):
+def done_by(pool, recordings, rigs=()):
     results = {}
-    do_all(recordings, pool, lambda job, result: results.__setitem__(job.name, result))
+    do_all(rigs, recordings, pool, lambda job, result: results.__setitem__(job.name, result))
     return results
 
 
+def test_recordings_wait_for_their_rigs():
+    pool = Pool(size=3)
+    results = done_by(pool, WITH_RIG, [RIG])
+    assert pool.begun == [("rig", "a"), ("recording", "a"), ("recording", "b"), ("recording", "c")]
+    assert pool.at_once[0] == 1
+    assert [results[name].status for name in "abc"] == [MEASURED] * 3
+
+
+def test_without_its_rig_a_recording_fails_with_the_rigs_reason_and_others_go_on():
+    results = done_by(Pool(rig_a=[failed("no corners found")]), WITH_RIG, [RIG])
+    assert "no corners found" in results["a"].reason
+    assert [results[name].status for name in "abc"] == [FAILED, MEASURED, FAILED]
+
+
 def test_a_recording_at_which_another_batch_works_is_asked_for_again_after_the_others():
-    pool = Pool(size=1, a=[Record(BUSY), GOOD])
+    pool = Pool(size=1, recording_a=[Record(BUSY), GOOD])
     assert done_by(pool, [job("a"), job("b")])["a"].status == MEASURED
-    assert pool.begun == ["a", "b", "a"]
+    assert [name for _, name in pool.begun] == ["a", "b", "a"]
 
 
 def test_a_job_whose_process_died_is_tried_once_more_at_the_end_and_alone():
-    pool = Pool(a=[Died("killed"), Died("killed")], b=[Died("killed"), GOOD])
+    pool = Pool(recording_a=[Died("killed"), Died("killed")], recording_b=[Died("killed"), GOOD])
     results = done_by(pool, [job(name) for name in "abcd"])
     assert results["a"].reason == "twice, killed"
     assert [results[name].status for name in "abcd"] == [FAILED, MEASURED, MEASURED, MEASURED]
-    assert sorted(pool.begun[4:]) == ["a", "b"]  # in the order in which their processes died
+    assert sorted(name for _, name in pool.begun[4:]) == ["a", "b"]  # in the order in which their processes died
     assert pool.at_once[4:] == [1, 1]
 
 
