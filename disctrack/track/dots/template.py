@@ -18,7 +18,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.cameras.camera import Camera, project
 from calibration.kit.arrays import Array, Image, robust_sigma
 from calibration.kit.grey_levels import full_scale, level_step
 from disctrack.disc import Disc
@@ -95,33 +94,27 @@ def dot_centres(results: NDArray, status: NDArray[np.uint8]) -> DotCentres:
 
 
 def measure_noise(
-    images: list[Image],
-    camera: Camera,
-    poses_camera_body: list[tuple[Array, Array]],
-    disc: Disc,
-    maps: tuple[Array, Array],
-    blur_px: float = TYPICAL_BLUR_PX,
+    images: list[Image], pixels: Array, affine: Array, disc: Disc, blur_px: float = TYPICAL_BLUR_PX
 ) -> NoiseModel:
     """Photon transfer from the dots themselves: variance against mean in the flat parts inside and beside each dot.
 
-    In each flat part a plane is fitted and the mean square about it taken, so light gradients do not count as noise;
-    parts struck by a hot pixel or a print fault are dropped (beyond 4 median absolute deviations of their class).
+    images (n) of one camera; pixels (n, m, 2) of the dots' centres in them, NaN where a dot is not seen; affine
+    (n, m, 2, 2) [px/m] from the disc's plane to the image there. In each flat part a plane is fitted and the mean
+    square about it taken, so light gradients do not count as noise; parts struck by a hot pixel or a print fault are
+    dropped (beyond 4 median absolute deviations of their class).
     """
     means, variances, weights = [], [], []
     radius = 0.5 * disc.marker_diameter
     flat = max(4.0 * blur_px, 2.5)  # [px] from the edge: beyond, the blur's tail is below 1e-4 of the contrast
-    for image, (R, t) in zip(images, poses_camera_body, strict=True):
-        for centre in disc.marker_centres_body:
-            place = R @ centre + t
-            (u, v), reach = project(place[None], camera)[0], camera.fx * radius / place[2] + flat + 5.0
-            if not (reach <= u < image.shape[1] - reach and reach <= v < image.shape[0] - reach):
+    for image, centres, maps in zip(images, pixels, affine, strict=True):
+        for (x, y), to_image in zip(centres, maps, strict=True):
+            reach = radius * np.linalg.norm(to_image, 2) + flat + 5.0
+            if not (reach <= x < image.shape[1] - reach and reach <= y < image.shape[0] - reach):
                 continue
-            window = slice(int(v - reach), int(v + reach) + 2), slice(int(u - reach), int(u + reach) + 2)
-            M = np.column_stack([R[:, 0], R[:, 1], R[:, 2] * centre[2] + t])
-            xn, yn = maps[0][window], maps[1][window]
-            plane = np.einsum("ij,jvu->ivu", np.linalg.inv(M), np.stack([xn, yn, np.ones_like(xn)]))
-            rho = np.hypot(plane[0] / plane[2] - centre[0], plane[1] / plane[2] - centre[1])
-            step = np.hypot(*np.gradient(rho))  # plane units per pixel
+            window = slice(int(y - reach), int(y + reach) + 2), slice(int(x - reach), int(x + reach) + 2)
+            v, u = np.mgrid[window]
+            rho = np.hypot(*np.einsum("ij,jvu->ivu", np.linalg.inv(to_image), np.stack([u - x, v - y])))
+            step = np.hypot(*np.gradient(rho))  # [m] per pixel
             distance = (rho - radius) / step
             for part in (distance < -flat, (distance > flat) & (distance < flat + 4.5)):
                 v, u = np.nonzero(part)

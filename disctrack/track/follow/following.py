@@ -29,8 +29,8 @@ from disctrack.track.dots.template import (
     no_more_than_left,
     typical_noise,
 )
-from disctrack.track.dots.template_response import Edge
-from disctrack.track.pose import stacked
+from disctrack.track.dots.template_response import Edge, plane_to_image
+from disctrack.track.pose import marker_pixels, stacked
 from disctrack.trajectory import FrameStatus, MarkerStatus
 
 # A pair whose dots disagree by more than this with any rigid motion is lost: a tenth of a dot, ten times a poor rig
@@ -319,12 +319,10 @@ def _measure_blur_and_noise(follower: Follower, images: Image, readable: Mask, p
     n = min(NOISE_FRAMES, len(images))
 
     def flat_noise(camera: int, frames: Sequence[int], R: Array, t: Array) -> NoiseModel:
-        """Of flat parts beside and in the dots, at poses R, t of each frame."""
-        R_cw, t_cw = setup.rig.camera_poses()[camera]
-        poses = [(R_cw @ R[k], R_cw @ t[k] + t_cw) for k in frames]
-        seen = [images[k, camera] for k in frames]
-        maps = setup.views.map_x[camera], setup.views.map_y[camera]
-        return measure_noise(seen, setup.rig.cameras[camera], poses, setup.disc, maps, edges[camera].blur_px)
+        """Of flat parts beside and in the dots, at poses R, t of these frames."""
+        pixels, J = marker_pixels(R, t, setup.rig, setup.disc.marker_centres_body)
+        affine, seen = plane_to_image(J, R)[:, camera], [images[k, camera] for k in frames]
+        return measure_noise(seen, pixels[:, camera], affine, setup.disc, edges[camera].blur_px)
 
     for camera in range(2):
         # a first idea of the noise, or good dots of a noisy camera, or of more than 8 bits, would look like misfits;
@@ -350,7 +348,7 @@ def _measure_blur_and_noise(follower: Follower, images: Image, readable: Mask, p
             edges[camera] = Edge(blur, level, contrast, edges[camera].noise)
             misfit = max(misfit, float(np.sqrt(np.median(fits["chi_square"]))))
             if blur_known:
-                flat = flat_noise(camera, range(0, done, 3), trial.R, trial.t)
+                flat = flat_noise(camera, range(0, done, 3), trial.R[:done:3], trial.t[:done:3])
                 noise = no_more_than_left(flat, edges[camera].noise, fits)
                 edges[camera] = edges[camera]._replace(noise=noise)
                 follower.saturated[camera] = _saturated(images[:done, camera], fits, noise)

@@ -13,6 +13,8 @@ from disctrack import frames
 from disctrack.synthetic.cameras import rig_of
 from disctrack.synthetic.description import Scene
 from disctrack.track.dots.template import NoiseModel, measure_noise
+from disctrack.track.dots.template_response import plane_to_image
+from disctrack.track.pose import marker_pixels
 from disctrack.trajectory import MarkerStatus
 from tests.disctrack.conftest import RenderedPairs, disc_on_table
 from tests.oracles.flat_dots import locate_on_disc, locate_on_plane
@@ -212,11 +214,10 @@ def test_the_other_face_shows_no_dots(rendered_pairs):
 
 
 def test_photon_transfer_finds_the_sensors_law(rendered_pairs):
-    camera, index = 0, range(0, 24, 2)
-    poses = [poses_in_camera(rendered_pairs, i, camera) for i in index]
-    images = [rendered_pairs.images[i, camera] for i in index]
-    view = rendered_pairs.rig.cameras[camera]
-    law = measure_noise(images, view, poses, rendered_pairs.disc, normalised_maps(view))
+    p, index = rendered_pairs, range(0, 24, 2)
+    R = p.R[index]
+    pixels, J = marker_pixels(R, p.q[index, :3], p.rig, p.disc.marker_centres_body)
+    law = measure_noise([p.images[i, 0] for i in index], pixels[:, 0], plane_to_image(J, R)[:, 0], p.disc)
     # about 12 x 6 patches of 500 pixels each: a variance is known to 1 %, a few per cent with the paper's shading
     assert_allclose(law.variance(np.array([25.0, 185.0])), SENSOR_NOISE.variance(np.array([25.0, 185.0])), rtol=0.05)
 
