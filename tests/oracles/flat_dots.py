@@ -6,8 +6,17 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from calibration.cameras.camera import Camera, normalised_maps
+from calibration.kit.compiled import RULES, njit
 from disctrack.track.dots import _kernels as kernels
 from disctrack.track.dots.template import TYPICAL_BLUR_PX, dot_centres, face_of, typical_noise
+
+
+@njit(cache=True, **RULES)
+def look(images, views, face, expected, R, t, results, status):
+    """Compiled as what it calls."""
+    pixels, work = np.empty((16, 4096), np.float32), (np.empty((8, 8)), np.empty(8), np.empty(8), np.empty(8))
+    readable = np.ones(len(images), np.bool_)
+    kernels._look(images, readable, views, face, expected, R, t, pixels, work, results, status)
 
 
 def locate_on_disc(image, camera, R, t, disc, *, maps=None, noise=None, blur_px=TYPICAL_BLUR_PX):
@@ -19,7 +28,7 @@ def locate_on_disc(image, camera, R, t, disc, *, maps=None, noise=None, blur_px=
     expected = kernels.Expected(np.array([blur_px]), parameters[None], kernels.Limits())
     pose = np.ascontiguousarray(R, float), np.ascontiguousarray(t, float)
     image = np.ascontiguousarray(image)[None]
-    kernels.look(image, np.ones(1, bool), views, face_of(disc), expected, *pose, results, status)
+    look(image, views, face_of(disc), expected, *pose, results, status)
     return dot_centres(results[0], status[0])
 
 

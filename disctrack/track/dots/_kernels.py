@@ -312,34 +312,22 @@ def _whitened_model(pixels, n, p, G, det, clip):
 
 
 @_part
-def _centroid_of(map_x, map_y, P, G, det, start, reach, u0, v0):
-    """Place [px] of the centroid of a dot's image from the middle of its window, to second order of the map.
+def _image_centroid(camera, point, R, radius, J):
+    """Centroid u, v [px] of the image of a circle about a point (3,) in the plane of R's first columns, camera axes.
 
-    reach: pixels over which the map's second derivatives are taken.
+    By a rule over four points that is exact to the third order; J (2, 3) is scratch.
     """
-    iu, iv = int(u0 + 0.5), int(v0 + 0.5)
-    i00, i01, i10, i11 = G[1, 1] / det, -G[0, 1] / det, -G[1, 0] / det, G[0, 0] / det
-    c00, c01, c11 = i00 * i00 + i01 * i01, i00 * i10 + i01 * i11, i10 * i10 + i11 * i11
-    # second derivatives of pixel -> plane, in the pixel's own frame: q = - G^-1 d2 plane
-    uu_x, uu_y, vv_x, vv_y, uv_x, uv_y = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    for du in range(-1, 2):
-        for dv in range(-1, 2):
-            x, y = map_x[iv + reach * dv, iu + reach * du], map_y[iv + reach * dv, iu + reach * du]
-            w = start[2] * (P[2, 0] * x + P[2, 1] * y + P[2, 2])
-            a, b = (P[0, 0] * x + P[0, 1] * y + P[0, 2]) / w, (P[1, 0] * x + P[1, 1] * y + P[1, 2]) / w
-            uu, vv, uv = (1.0 if du != 0 else -2.0), (1.0 if dv != 0 else -2.0), 0.25 * du * dv
-            uu, vv = (uu if dv == 0 else 0.0), (vv if du == 0 else 0.0)
-            uu_x, uu_y, vv_x, vv_y = uu_x + uu * a, uu_y + uu * b, vv_x + vv * a, vv_y + vv * b
-            uv_x, uv_y = uv_x + uv * a, uv_y + uv * b
-    scale = -1.0 / (reach * reach)
-    s_uu, t_uu = scale * (i00 * uu_x + i01 * uu_y), scale * (i10 * uu_x + i11 * uu_y)
-    s_vv, t_vv = scale * (i00 * vv_x + i01 * vv_y), scale * (i10 * vv_x + i11 * vv_y)
-    s_uv, t_uv = scale * (i00 * uv_x + i01 * uv_y), scale * (i10 * uv_x + i11 * uv_y)
-    # the dot's points x = x0 + s(x0): their mean is <s> + <x0 div s>, with the ellipse's second moments c / 4
-    div_u, div_v = s_uu + t_uv, s_uv + t_vv
-    shift_u = 0.25 * (0.5 * (s_uu * c00 + s_vv * c11) + s_uv * c01 + c00 * div_u + c01 * div_v)
-    shift_v = 0.25 * (0.5 * (t_uu * c00 + t_vv * c11) + t_uv * c01 + c01 * div_u + c11 * div_v)
-    return start[3] - u0 + shift_u, start[4] - v0 + shift_v
+    whole, sum_u, sum_v = 0.0, 0.0, 0.0
+    for k in range(4):
+        axis, arm = k % 2, math.sqrt(0.5) * (radius if k < 2 else -radius)
+        x, y, z = point[0] + arm * R[0, axis], point[1] + arm * R[1, axis], point[2] + arm * R[2, axis]
+        u, v = project_point(camera, x, y, z, J)
+        a, b, c, d = 0.0, 0.0, 0.0, 0.0
+        for i in range(3):
+            a, b, c, d = a + J[0, i] * R[i, 0], b + J[0, i] * R[i, 1], c + J[1, i] * R[i, 0], d + J[1, i] * R[i, 1]
+        area = a * d - b * c
+        whole, sum_u, sum_v = whole + area, sum_u + area * u, sum_v + area * v
+    return sum_u / whole, sum_v / whole
 
 
 @_part
@@ -484,10 +472,11 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, centres, own, pix
     """Fit the image of one circular dot to the grey values round its edge. Returns a MarkerStatus code.
 
     image (H, W); map_x, map_y (H, W): normalised coordinates of every pixel; P (3, 3): normalised image -> target
-    plane; start (5,): expected centre and radius on the plane, pixel of that centre; sigma: blur to start from [px];
-    noise (3,): variance = noise[0] + noise[1] grey, and the square of the grey values' step; rim: radius of an edge
-    about the plane's origin whose blur must not reach the pixels used, nor that of other dots, whose `centres` (m, 3)
-    those but its `own` are; pixels and work (matrix, right-hand side, step, parameters before it) are scratch.
+    plane; start (7,): expected centre and radius on the plane, pixel of that centre, and of the centroid of the dot's
+    image; sigma: blur to start from [px]; noise (3,): variance = noise[0] + noise[1] grey, and the square of the grey
+    values' step; rim: radius of an edge about the plane's origin whose blur must not reach the pixels used, nor that of
+    other dots, whose `centres` (m, 3) those but its `own` are; pixels and work (matrix, right-hand side, step,
+    parameters before it) are scratch.
     p (8,) receives the template's parameters (a, b: shift on the plane from the expected centre), result (a DOT) the
     judgement of the fit and the centre's covariance in pixels. The caller projects the centre itself (U, V).
     """
@@ -498,7 +487,6 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, centres, own, pix
     for i in range(8):
         p[i] = 0.0
     p[ROW.radius], p[ROW.sigma] = 1.0, sigma
-    centroid = 0.0, 0.0
     n, n_clipped, det, chi2, largest, light, settled = 0, 0.0, 0.0, 0.0, 0.0, 1.0, False
     for selection in range(_MAX_SELECTIONS):
         if not (2.0 < u0 < width - 3.0 and 2.0 < v0 < height - 3.0):
@@ -529,9 +517,6 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, centres, own, pix
         n, inside, outside = _select_pixels(
             image, map_x, map_y, P, start, window, rim, centres, own, G, largest, p, u0, v0, pixels
         )
-        if blurred:
-            reach = max(1, int(0.5 * min(extent_x, extent_y)))
-            centroid = _centroid_of(map_x, map_y, P, G, det, start, reach, u0, v0)
         if not (n >= 30 and math.isfinite(inside) and math.isfinite(outside)):
             return OCCLUDED
         if selection == 0:
@@ -553,6 +538,7 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, centres, own, pix
             grey[i] *= in_light  # a product in double precision, rounded once
         limit = np.inf
         while True:  # once, and again without the pixels that do not belong
+            centroid = start[5] - u0, start[6] - v0
             converged, chi2, n_clipped = _descend(
                 pixels, n, p, G, det, largest / abs(det), limit, work, blurred, centroid, nodes
             )
@@ -626,7 +612,7 @@ def _look(images, readable, views, face, expected, R, t, pixels, work, results, 
     centres, radius, R_cw, t_cw = face.centres, face.radius, views.R_cw, views.t_cw
     m = centres.shape[0]
     R_cb, P, M = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    point, start, p, J = np.empty(3), np.empty(5), np.empty(8), np.empty((2, 3))
+    point, start, p, J = np.empty(3), np.empty(7), np.empty(8), np.empty((2, 3))
     for c in range(images.shape[0]):
         for i in range(3):
             for j in range(3):
@@ -655,6 +641,7 @@ def _look(images, readable, views, face, expected, R, t, pixels, work, results, 
                     P[k, j] = M[a, d] * M[b, e] - M[a, e] * M[b, d]
             start[0], start[1], start[2] = x, y, radius
             start[3], start[4] = project_point(views.cameras[c], point[0], point[1], point[2], J)
+            start[5], start[6] = _image_centroid(views.cameras[c], point, R_cb, radius, J)
             status[c, i] = _fit_dot(images[c], views.map_x[c], views.map_y[c], P, start, expected.sigma[c],
                                     expected.noise[c], face.rim, centres, i, pixels, work, p, result)  # fmt: skip
             if status[c, i] == MEASURED:
@@ -764,10 +751,3 @@ def track_frames(images, readable, views, face, expected, heading, results, stat
         for i in range(3):
             t_older[i], t_before[i], t_last[i], t_out[f, i] = t_before[i], t_last[i], t[i], t[i]
     return images.shape[0]
-
-
-@_entry
-def look(images, readable, views, face, expected, R, t, results, status):
-    """`_look` where Python calls it."""
-    pixels, work = np.empty((16, _PIXELS), np.float32), (np.empty((8, 8)), np.empty(8), np.empty(8), np.empty(8))
-    _look(images, readable, views, face, expected, R, t, pixels, work, results, status)
