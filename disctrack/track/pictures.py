@@ -3,11 +3,9 @@
 from collections.abc import Callable
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from calibration.kit.arrays import Array
 from disctrack.frames import CAMERAS
 from disctrack.report.figures import BAND, Curve, chart, lay_out
 from disctrack.report.palette import COLOURS, INK, MUTED
@@ -70,43 +68,37 @@ def _lost_marked(figure: Figure, trajectory: Trajectory) -> Figure:
 
 def dots_figure(trajectory: Trajectory) -> Figure:
     """Residual [px] (observed - projected) of every dot, a row per camera: cloud, mean and its standard error."""
-    residuals, m = trajectory.markers_residual_px, trajectory.disc.n_markers
+    residuals, m = np.ma.masked_invalid(trajectory.markers_residual_px), trajectory.disc.n_markers
     figure = Figure(figsize=(1.75 * m + 1.0, 5.0))
     lay_out(figure, (2, 1), gaps=(0.0, 0.3))
-    finite = np.abs(residuals[np.isfinite(residuals)])
-    reach = float(np.percentile(finite, 99.5)) * 1.3 if finite.size else 1.0
+    reach = 1.3 * float(np.percentile(np.abs(residuals.compressed()), 99.5)) if residuals.count() else 1.0
+    middle = 2 * reach * np.arange(m)
     for row, name in enumerate(CAMERAS):
         # one pair of axes for all dots, each in a cell of its own: axes and their ticks cost more than what is in them
         axes = figure.add_subplot(2, 1, row + 1)
         axes.axhline(0, color=MUTED, linewidth=0.6)
-        for marker in range(m):
-            _dot(axes, residuals[:, row, marker], COLOURS[name], reach, 2 * reach * marker)
+        of_dots = residuals[:, row]
+        x, y = np.moveaxis(np.ma.masked_outside(of_dots, -reach, reach), -1, 0)
+        axes.plot(middle + x, y, ".", color=COLOURS[name], markersize=2, alpha=0.35)
+        seen, rms = of_dots.count(axis=0)[:, 0], np.sqrt((of_dots**2).mean(axis=(0, 2)))
+        mean, error = of_dots.mean(axis=0), 3 * of_dots.std(axis=0) / np.sqrt(np.maximum(seen, 1))[:, None]
+        for k, cell in enumerate(middle):
+            axes.axvline(cell, color=MUTED, linewidth=0.6)
+            axes.axvline(cell + reach, color=INK, linewidth=0.8)
+            if seen[k]:
+                axes.errorbar(cell + mean[k, 0], mean[k, 1], error[k, 1], error[k, 0], color=INK, linewidth=1.2)
+            text = f"n {seen[k]}\nrms {rms[k]:.4f}" if seen[k] else "not seen"
+            axes.text(cell - 0.94 * reach, 0.94 * reach, text, fontsize=7, va="top")
         axes.set_xlim(-reach, (2 * m - 1) * reach)
         axes.set_ylim(-reach, reach)
         axes.set_aspect("equal")
-        axes.set_xticks(2 * reach * np.arange(m), [f"dot {marker}" for marker in range(m)])
+        axes.set_xticks(middle, [f"dot {marker}" for marker in range(m)])
         axes.yaxis.set_major_locator(MaxNLocator(5))
         axes.tick_params(labelsize=8)
         axes.set_ylabel(f"{name}: y (px)")
     title = "Observed minus projected, per dot and camera; x at the scale of y (cross: mean ± 3 standard errors)"
     figure.suptitle(title, fontsize=10)
     return figure
-
-
-def _dot(axes: Axes, residuals: Array, colour: str, reach: float, middle: float) -> None:
-    """One dot's cloud about x = middle, in a cell of twice the reach."""
-    seen = residuals[np.isfinite(residuals).all(axis=1)]
-    shown = seen[(np.abs(seen) <= reach).all(axis=1)]
-    axes.axvline(middle, color=MUTED, linewidth=0.6)
-    axes.axvline(middle + reach, color=INK, linewidth=0.8)
-    if len(seen) > 1:
-        axes.plot(middle + shown[:, 0], shown[:, 1], ".", color=colour, markersize=2, alpha=0.35)
-        mean, error = seen.mean(axis=0), 3 * seen.std(axis=0) / np.sqrt(len(seen))
-        axes.errorbar(middle + mean[0], mean[1], error[1], error[0], color=INK, linewidth=1.2)
-        text = f"n {len(seen)}\nrms {np.sqrt(np.mean(seen**2)):.4f}"
-    else:
-        text = "not seen"
-    axes.text(middle - 0.94 * reach, 0.94 * reach, text, fontsize=7, va="top")
 
 
 FIGURES: dict[str, Callable[[Trajectory], Figure]] = {

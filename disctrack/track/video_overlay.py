@@ -14,7 +14,7 @@ from calibration.kit.arrays import Array, Mask
 from calibration.kit.grey_levels import full_scale
 from disctrack.errors import OutputError
 from disctrack.files.whole import whole_file
-from disctrack.frames import CAMERAS, rotation_from_quaternion
+from disctrack.frames import CAMERAS, nodal_axes_world, rotation_from_quaternion
 from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
 
 ColourImage = NDArray[Any]  # (height, width, 3) uint8, BGR
@@ -82,7 +82,8 @@ def draw_pair(images: NDArray, trajectory: Trajectory, row: int) -> ColourImage:
     whole = np.zeros((height + CAPTION_LINE * len(captions) + 6, 2 * width, 3), np.uint8)
     pictures = [whole[:height, :width], whole[:height, width:]]
     for image, picture in zip(images, pictures, strict=True):
-        cv2.cvtColor(_to_8_bit(image), cv2.COLOR_GRAY2BGR, dst=picture)
+        # deep images are scaled from the full scale of their camera, so that brightness is steady
+        cv2.cvtColor(cv2.convertScaleAbs(image, alpha=255 / full_scale(image)), cv2.COLOR_GRAY2BGR, dst=picture)
     if trajectory.measured[row]:
         _draw_disc(pictures, trajectory, row)
     for camera, picture in enumerate(pictures):
@@ -96,13 +97,6 @@ def draw_pair(images: NDArray, trajectory: Trajectory, row: int) -> ColourImage:
 def _write(picture: ColourImage, line: int, text: str, colour: str) -> None:
     place, font = (8, CAPTION_LINE * (line + 1) - 3), cv2.FONT_HERSHEY_SIMPLEX
     cv2.putText(picture, text, place, font, 0.45, _COLOURS[colour], 1, cv2.LINE_AA)
-
-
-def _to_8_bit(image: NDArray) -> NDArray[np.uint8]:
-    """For the eye only: deep images are scaled from the full scale of their camera, so that brightness is steady."""
-    if image.dtype == np.uint8:
-        return image
-    return np.asarray(image * (255.0 / full_scale(image)), np.uint8)
 
 
 def _caption(trajectory: Trajectory, row: int) -> list[str]:
@@ -130,9 +124,8 @@ def _draw_disc(pictures: list[ColourImage], trajectory: Trajectory, row: int) ->
     dots = disc.marker_centres_body[:, None] + 0.5 * disc.marker_diameter * _circle()
     outlines = np.stack([lower, upper, *dots]) @ R.T + t
     lower = outlines[0]
-    psi, theta = trajectory.q[row, 3], trajectory.q[row, 4]
-    e2 = np.array([-np.sin(psi) * np.cos(theta), np.cos(psi) * np.cos(theta), np.sin(theta)])
-    contact = t - disc.radius * e2 - h * R[:, 2]
+    _, e2, e3 = nodal_axes_world(*trajectory.q[row, 3:5])
+    contact = t + disc.arm_to_contact(e2, e3)
     points = np.concatenate([outlines.reshape(-1, 3), contact[None]])
     for picture, seen, (R_cw, t_cw) in zip(pictures, rig.project(points), rig.camera_poses(), strict=True):
         lower_px, upper_px, *dots_px = seen[:-1].reshape(-1, POINTS, 2)
