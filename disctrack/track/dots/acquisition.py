@@ -124,16 +124,31 @@ def seen_by_one_camera(
     """
     blobs = dot_blobs(image, diameter_px)
     best = np.full((disc.n_markers, 3), np.nan), np.eye(3), np.zeros(3)
-    R_cw, t_cw = rig.camera_poses()[camera]
     for R, t in _candidates_from_one_camera(blobs[:, :2], camera, rig, disc):
-        pixels = rig.project(disc.marker_centres_body @ R.T + t)[camera]
-        gap = np.linalg.norm(pixels[:, None] - blobs[:, :2], axis=-1)
-        reach = INLIER_DIAMETERS * rig.cameras[camera].fx * disc.marker_diameter / float(R_cw[2] @ t + t_cw[2])
-        seen, nearest = gap.min(axis=1) < reach, gap.argmin(axis=1)
+        gap = _gaps(R[None], t[None], blobs[:, :2], camera, rig, disc)[0]
+        seen, nearest = gap.min(axis=1) < 1, gap.argmin(axis=1)
         one_each = len(set(nearest[seen])) == seen.sum()  # a disc far off, or edge on, has many dots in one blob
         if one_each and seen.sum() > np.isfinite(best[0][:, 0]).sum():
             best = np.where(seen[:, None], blobs[nearest], np.nan), R, t
     return best
+
+
+def _gaps(R: Array, t: Array, blobs: Array, camera: int, rig: StereoRig, disc: Disc) -> Array:
+    """(n, m, k) how far blobs (k, 2) lie from the dots of poses R (n, 3, 3), t (n, 3) in a camera's image.
+
+    A blob belongs to a dot below 1, that is INLIER_DIAMETERS; infinite behind the camera, or where the face looks away.
+    """
+    pixels = marker_pixels(R, t, rig, disc.marker_centres_body)[0][:, camera]
+    R_cw, t_cw = rig.camera_poses()[camera]
+    facing = np.einsum("ni,ni->n", R[:, :, 2], -R_cw.T @ t_cw - t) > disc.half_thickness
+    reach = INLIER_DIAMETERS * rig.cameras[camera].fx * disc.marker_diameter / (t @ R_cw[2] + t_cw[2])
+    gap = np.linalg.norm(pixels[:, :, None] - blobs, axis=-1) / reach[:, None, None]
+    return np.where(facing[:, None, None] & np.isfinite(gap), gap, np.inf)
+
+
+def _score(gap: Array) -> Array:
+    """(n,) dots that blobs lie on, by their nearest (n, m): 1 for its centre, 0 where it belongs to none."""
+    return np.asarray(np.sum(np.clip(1 - gap**2, 0, None), axis=1))
 
 
 def _candidates_from_stereo(blobs: list[Array], rig: StereoRig, disc: Disc) -> list[Pose]:
@@ -163,7 +178,7 @@ def _candidates_from_stereo(blobs: list[Array], rig: StereoRig, disc: Disc) -> l
     # score by the points that fall on dots; keep the distinct best
     predicted = centres @ np.swapaxes(R, 1, 2) + t[:, None]
     gap = np.linalg.norm(predicted[:, :, None] - points[None, None], axis=-1).min(axis=2)
-    return _best(R, t, np.sum(np.clip(1 - (gap / (INLIER_DIAMETERS * disc.marker_diameter)) ** 2, 0, None), axis=1))
+    return _best(R, t, _score(gap / (INLIER_DIAMETERS * disc.marker_diameter)))
 
 
 def _sides(triangles: Array) -> Array:
@@ -206,30 +221,13 @@ def _candidates_from_one_camera(blobs: Array, camera: int, rig: StereoRig, disc:
         solved = [cv2.solveP3P(model, image, np.eye(3), None, flags=cv2.SOLVEPNP_AP3P) for image in images]
         turns = np.array([turn for n, turns, _ in solved for turn in turns[:n]]).reshape(-1, 3)
         shifts = np.array([shift for n, _, shifts in solved for shift in shifts[:n]]).reshape(-1, 3)
-        turned = rotation_from_vector(turns)
-        R, t = np.concatenate([R, turned]), np.concatenate([t, shifts])
-        score = np.concatenate([score, _blob_score(turned, shifts, rays, disc)])
+        turned, placed = R_cw.T @ rotation_from_vector(turns), (shifts - t_cw) @ R_cw
+        R, t = np.concatenate([R, turned]), np.concatenate([t, placed])
+        score = np.append(score, _score(_gaps(turned, placed, blobs, camera, rig, disc).min(axis=2)))
         if score.max(initial=0.0) > len(centres) - 1.0:
             break  # all dots but for what blobs err by: no other triple knows better
     good = score > MIN_EXPLAINED - 0.5
-    return [(R_cw.T @ R, R_cw.T @ (t - t_cw)) for R, t in _best(R[good], t[good], score[good])]
-
-
-def _blob_score(R: Array, t: Array, rays: Array, disc: Disc) -> Array:
-    """(n,) how well blobs (k, 2) [normalised] agree with poses R_camera_body (n, 3, 3), t_camera_body (n, 3).
-
-    A dot counts 1 where a blob lies on its centre, 0 from INLIER_DIAMETERS on; -1 for a face that looks away.
-    """
-    points = disc.marker_centres_body @ np.swapaxes(R, 1, 2) + t[:, None]
-    middle = points.mean(axis=1)
-    possible = np.isfinite(points).all((1, 2)) & (points[..., 2] > 0).all(axis=1)
-    possible &= np.einsum("ni,ni->n", R[:, :, 2], middle) <= 0
-    score = np.full(len(R), -1.0)
-    points, middle = points[possible], middle[possible]
-    gap = np.linalg.norm((points[..., :2] / points[..., 2:])[:, :, None] - rays, axis=-1).min(axis=2)
-    reach = INLIER_DIAMETERS * disc.marker_diameter / middle[:, 2:]
-    score[possible] = np.sum(np.clip(1 - (gap / reach) ** 2, 0, None), axis=1)
-    return score
+    return _best(R[good], t[good], score[good])
 
 
 def _best_explanation(
@@ -241,18 +239,12 @@ def _best_explanation(
     R, t = (np.array(parts) for parts in zip(*candidates, strict=True))
     shape = len(R), 2, disc.n_markers
     covariance = np.broadcast_to(BLOB_PX**2 * np.eye(2), (*shape, 2, 2))
-    diameters, eyes = expected_diameter_px(rig, disc), [-R_cw.T @ t_cw for R_cw, t_cw in rig.camera_poses()]
     for _ in range(2):  # once with the triple's pose, once with the refined one
-        pixels, _ = marker_pixels(R, t, rig, disc.marker_centres_body)
         matched = np.full((*shape, 2), np.nan)
         for camera, points in enumerate(blobs):
             if len(points):
-                gap = np.linalg.norm(pixels[:, camera, :, None] - points[None, None], axis=-1)
-                gap = np.where(np.isfinite(gap), gap, np.inf)
-                # the camera is on the side of the upper face
-                facing = np.einsum("ni,ni->n", R[:, :, 2], eyes[camera] - t) > disc.half_thickness
-                ok = (gap.min(axis=2) < INLIER_DIAMETERS * diameters[camera]) & facing[:, None]
-                matched[:, camera] = np.where(ok[..., None], points[gap.argmin(axis=2)], np.nan)
+                gap = _gaps(R, t, points, camera, rig, disc)
+                matched[:, camera] = np.where((gap.min(axis=2) < 1)[..., None], points[gap.argmin(axis=2)], np.nan)
         seen = DotsInFrames(rig, disc, matched, covariance, R, t)
         fits = fit_poses(seen, reject_outliers=False, with_sensitivity=False)
         R = np.where(fits.converged[:, None, None], fits.R_world_body, R)
