@@ -182,12 +182,12 @@ def fit_poses(seen: DotsInFrames, *, reject_outliers: bool = True, with_sensitiv
     good[good] = regular
     pose_covariance = np.full((n, 6, 6), np.nan)
     pose_covariance[good] = np.linalg.inv(normal[regular])
-    sensitivity = np.full((n, 6, 30), np.nan)
+    sensitivity = np.full((n, 6, N_RIG), np.nan)
     W = whitening(np.where(used[..., None, None], covariance, 0.0))
-    for some in np.array_split(np.flatnonzero(good), good.sum() // 512 + 1) if with_sensitivity else ():
-        d_rig = rig.project_with_jacobians(centres @ np.swapaxes(R[some], 1, 2) + t[some][:, None])[2]
-        by_rig = np.swapaxes(JW[some], 1, 2) @ (W[some] @ d_rig).reshape(len(some), JW.shape[1], 30)
-        sensitivity[some] = -pose_covariance[some] @ by_rig
+    if with_sensitivity:
+        d_rig = rig.project_with_jacobians(centres @ np.swapaxes(R[good], 1, 2) + t[good][:, None])[2]
+        by_rig = np.swapaxes(JW[good], 1, 2) @ (W[good] @ d_rig).reshape(-1, JW.shape[1], N_RIG)
+        sensitivity[good] = -pose_covariance[good] @ by_rig
     return PoseFits(
         R_world_body=np.where(good[:, None, None], R, np.nan),
         t_world_body=np.where(good[:, None], t, np.nan),

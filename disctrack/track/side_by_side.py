@@ -5,10 +5,15 @@ from numpy.typing import NDArray
 
 from calibration.kit.arrays import Mask
 
-AT_ONCE = 4096  # frames whose derivatives, many times as large, are held together
+AT_ONCE = 512  # frames: what their poses need beside the result is many times as large, and stays in a core's cache
 SHARED_FRAMES = 400  # at most, for what all frames share: it repeats in more of them
 MIN_FRAMES = 20  # for what frames share, or how they scatter
 FEW = 4  # frames: as many as one after the other tell of a fault that lasts
+
+
+def parts(n: int) -> list[slice]:
+    """Of n frames, some at a time."""
+    return [slice(first, first + AT_ONCE) for first in range(0, n, AT_ONCE)]
 
 
 def stretches(chosen: Mask, shortest: int = 1) -> NDArray[np.intp]:

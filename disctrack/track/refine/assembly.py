@@ -21,17 +21,14 @@ from disctrack.track.refine.dot_shifts import exposure_by_smear, exposure_of, sh
 from disctrack.track.refine.scatter import Scatter, scatter_of_poses, split_scatter, without_shared_faults
 from disctrack.track.refine.self_calibration import AsBuilt, by_pattern, refine_as_built
 from disctrack.track.refine.table_contact import OF_PATTERN, off_centre, table_from_disc
-from disctrack.track.side_by_side import SHARED_FRAMES, evenly
+from disctrack.track.side_by_side import SHARED_FRAMES, evenly, parts
 from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
-
-FITTED_AT_ONCE = 512  # frames, whose numbers stay in a core's cache
 
 
 @dataclass(frozen=True)
 class TrackingSettings:
     """What a user may choose; the whole of it is written into the result."""
 
-    refine_markers: bool = True  # the dots' places on the disc, over the whole sequence
     table: str = "both"  # board, disc or both: what tells where the table is (table_contact.py)
     exposure: tuple[float, float] | None = None  # [s] of the left and the right camera; None: as the dots' smear tells
     first_pass: bool = True  # leave out what lies still before the motion starts and after it ends (motion_span.py)
@@ -73,7 +70,7 @@ def assemble(
     repeated, dots = repeats(tables.digest), dot_centres(tables.results, tables.status)
     exposure, of_exposure = _as_they_were(tables, dots, repeated, first, settings, taken)
     seen = DotsInFrames(rig, disc, dots.pixels, dots.covariance_px2, tables.R, tables.t)
-    as_built, faults, outlying = _shared(seen, settings, workers)
+    as_built, faults, outlying = _shared(seen, workers)
     seen = replace(seen, rig=as_built.rig, disc=as_built.disc)
     fits = fit_all(seen, workers)
     fits, systematic, scatter = _scattered(fits, dots, faults, outlying)
@@ -137,14 +134,12 @@ def _as_they_were(
     return exposure, findings
 
 
-def _shared(seen: DotsInFrames, settings: TrackingSettings, workers: int) -> tuple[AsBuilt, AsBuilt | None, Mask]:
+def _shared(seen: DotsInFrames, workers: int) -> tuple[AsBuilt, AsBuilt | None, Mask]:
     """What the frames share, what is wrong with it, and which frames (n,) are outlying and do not enter."""
     # the dots miss the pose that fits best by far more than in others
     fits = fit_all(seen, workers, judged=False)
     outlying = outlying_frames((whitening(seen.covariance) @ fits.residuals_px[..., None])[..., 0])
     faults = without_shared_faults(seen.but(outlying))
-    if not settings.refine_markers:
-        return AsBuilt.as_declared(seen.rig, seen.disc), faults, outlying
     as_built = refine_as_built(seen.but(outlying))
     if faults is not None and as_built.reduced_chi_square > FAULTY * max(1.0, faults.reduced_chi_square):
         as_built = faults  # dots refined alone would be moved to make up for wrong cameras
@@ -182,7 +177,7 @@ def fit_all(seen: DotsInFrames, workers: int = 1, judged: bool = True) -> PoseFi
 
     # NumPy lets go of the interpreter where arrays are large: parts of some hundred frames are worked on side by side
     with ThreadPoolExecutor(workers, thread_name_prefix="part") as pool:
-        list(pool.map(fill, [slice(first, first + FITTED_AT_ONCE) for first in range(0, n, FITTED_AT_ONCE)]))
+        list(pool.map(fill, parts(n)))
     return PoseFits(**whole)
 
 

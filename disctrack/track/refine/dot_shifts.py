@@ -54,7 +54,7 @@ from disctrack.track.dots.template_response import (
     turned_to_axes,
 )
 from disctrack.track.pose import marker_pixels
-from disctrack.track.side_by_side import AT_ONCE, MIN_FRAMES, SHARED_FRAMES, evenly
+from disctrack.track.side_by_side import MIN_FRAMES, SHARED_FRAMES, evenly, parts
 
 PARTS = 10  # stretches of the recording, each left out in turn: what the fit leaves has a memory
 SURE = 3.0  # sigmas of T^2, or the exposure is taken as short
@@ -80,11 +80,10 @@ def shift_by_exposure(
     0.1 of itself (T as long as the frame interval), what differences leave out is (psidot / frame_rate)^2 / 12 of the
     shift.
     """
-    each = np.empty((len(R), 2, disc.n_markers, 2))
-    for first in range(0, len(R), AT_ONCE):  # their derivatives are ten times as large
-        rows = slice(max(first - 1, 0), first + AT_ONCE + 1)
-        part = _second_order(R[rows], t[rows], time[rows], rig, disc, edges)
-        each[first : first + AT_ONCE] = part[first - rows.start :][:AT_ONCE]
+    each = np.full((len(R), 2, disc.n_markers, 2), np.nan)
+    for part in parts(len(R)):
+        rows = slice(max(part.start - 1, 0), part.stop + 1)  # with their neighbours
+        each[rows][1:-1] = _second_order(R[rows], t[rows], time[rows], rig, disc, edges)[1:-1]
     known: Mask = np.asarray(np.isfinite(each).all(axis=(1, 2, 3)))
     wanted = np.flatnonzero(np.isfinite(t).all(axis=1) & ~known)
     for beside in (wanted - 1, wanted + 1):  # a gap: as of a neighbour
@@ -177,10 +176,9 @@ def _second_order(R: Array, t: Array, time: Array, rig: StereoRig, disc: Disc, e
     pixels, J = marker_pixels(R, t, rig, disc.marker_centres_body)
     affine = plane_to_image(J, R)
     velocity, acceleration = _rate(pixels, time), np.full_like(pixels, np.nan)
-    if len(pixels) > 2:
-        before, after = (np.diff(time)[part, None, None, None] for part in (slice(-1), slice(1, None)))
-        step = np.diff(pixels, axis=0)
-        acceleration[1:-1] = 2 * (step[1:] / after - step[:-1] / before) / (before + after)
+    since = np.diff(time)[:, None, None, None]
+    slope = np.diff(pixels, axis=0) / since
+    acceleration[1:-1] = 2 * (slope[1:] - slope[:-1]) / (since[1:] + since[:-1])
     known = np.isfinite(affine).all(axis=(-2, -1), keepdims=True)
     affine = np.where(known, affine, np.eye(2))  # of a dot behind a camera; its rates are NaN
     growth = _rate(affine, time) @ np.linalg.inv(affine)
@@ -210,8 +208,7 @@ def _pulled(radius: float, affine: Array, growth: Array, velocity: Array, edge: 
 def _rate(values: Array, time: Array) -> Array:
     """Central differences of `values` (n, ...) at `time` (n,) [s]; NaN at the ends and beside gaps."""
     rate = np.full_like(values, np.nan)
-    if len(values) > 2:
-        rate[1:-1] = (values[2:] - values[:-2]) / (time[2:] - time[:-2]).reshape(-1, *[1] * (values.ndim - 1))
+    rate[1:-1] = (values[2:] - values[:-2]) / (time[2:] - time[:-2]).reshape(-1, *[1] * (values.ndim - 1))
     return rate
 
 
@@ -281,8 +278,7 @@ def shift_by_glare(R: Array, t: Array, contrast: Array, rig: StereoRig, disc: Di
     chosen = evenly(apart, SHARED_FRAMES)
     pixels = marker_pixels(R[chosen], t[chosen], rig, disc.marker_centres_body)[0]
     gradients = [_gradient(pixels[:, c], contrast[chosen, c]) for c in (0, 1)]
-    for first in range(0, n if any(gradients) else 0, AT_ONCE):
-        rows = slice(first, first + AT_ONCE)
+    for rows in parts(n if any(gradients) else 0):
         places, J = marker_pixels(R[rows], t[rows], rig, disc.marker_centres_body)
         affine = plane_to_image(J, R[rows])
         for camera, (gradient, edge) in enumerate(zip(gradients, edges, strict=True)):

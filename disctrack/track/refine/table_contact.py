@@ -33,7 +33,7 @@ from disctrack import frames
 from disctrack.disc import Disc
 from disctrack.numbers import measured
 from disctrack.track.pose import PoseFits
-from disctrack.track.side_by_side import AT_ONCE
+from disctrack.track.side_by_side import parts
 
 SOURCES = ("both", "board", "disc")
 OF_PATTERN = "where the dots are on the disc"
@@ -263,8 +263,7 @@ def _contacts(
     gain = inverse @ A.T * kept
     azimuth = np.unwrap(np.arctan2(arm[:, 1], arm[:, 0])[kept])
     independent = np.clip(PLACES * np.ptp(azimuth) / (2 * np.pi), 1.0, PLACES)
-    parts = [slice(first, first + AT_ONCE) for first in range(0, len(rows), AT_ONCE)]
-    gap_by_rig = [np.einsum("ni,nij->nj", by_pose[part], fits.sensitivity[rows[part]]) for part in parts]
+    gap_by_rig = [np.einsum("ni,nij->nj", by_pose[part], fits.sensitivity[rows[part]]) for part in parts(len(rows))]
     sine = np.sqrt(np.maximum(1.0 - (R[:, :, 2] @ normal) ** 2, 0.0))
     by_disc = gain @ np.stack([sine * radius_tolerance(disc), R[:, 2, 2] * 0.5 * thickness_tolerance(disc)], axis=1)
     covariance = inverse * (noise + repeats * max(kept.sum() / independent, 1.0))
@@ -291,8 +290,7 @@ def _on_plane(
     shift = np.array([0.0, 0.0, height - table.applied[1:] @ table.middle])
     both = np.zeros((6, 6))
     both[:3, :3] = both[3:, 3:] = Q.T
-    for first in range(0, len(systematic), AT_ONCE):  # in place: of a long recording these are the largest arrays
-        rows = slice(first, first + AT_ONCE)
+    for rows in parts(len(systematic)):  # in place: of a long recording these are the largest arrays
         fits.sensitivity[rows] = both @ fits.sensitivity[rows]
         for covariance in (fits.covariance, systematic):
             covariance[rows] = both @ covariance[rows] @ both.T
