@@ -15,8 +15,7 @@ from disctrack.track.dots.template import TYPICAL_BLUR_PX, dot_centres, face_of,
 def look(images, views, face, expected, R, t, results, status):
     """Compiled as what it calls."""
     pixels, work = np.empty((16, 4096), np.float32), (np.empty((8, 8)), np.empty(8), np.empty(8), np.empty(8))
-    readable = np.ones(len(images), np.bool_)
-    kernels._look(images, readable, views, face, expected, R, t, pixels, work, results, status)
+    kernels._look(images, np.ones(len(images), np.bool_), views, face, expected, R, t, pixels, work, results, status)
 
 
 def locate_on_disc(image, camera, R, t, disc, *, maps=None, noise=None, blur_px=TYPICAL_BLUR_PX):

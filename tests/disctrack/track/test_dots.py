@@ -215,9 +215,8 @@ def test_the_other_face_shows_no_dots(rendered_pairs):
 
 def test_photon_transfer_finds_the_sensors_law(rendered_pairs):
     p, index = rendered_pairs, range(0, 24, 2)
-    R = p.R[index]
-    pixels, J = marker_pixels(R, p.q[index, :3], p.rig, p.disc.marker_centres_body)
-    law = measure_noise([p.images[i, 0] for i in index], pixels[:, 0], plane_to_image(J, R)[:, 0], p.disc)
+    pixels, J = marker_pixels(p.R[index], p.q[index, :3], p.rig, p.disc.marker_centres_body)
+    law = measure_noise([p.images[i, 0] for i in index], pixels[:, 0], plane_to_image(J, p.R[index])[:, 0], p.disc)
     # about 12 x 6 patches of 500 pixels each: a variance is known to 1 %, a few per cent with the paper's shading
     assert_allclose(law.variance(np.array([25.0, 185.0])), SENSOR_NOISE.variance(np.array([25.0, 185.0])), rtol=0.05)
 

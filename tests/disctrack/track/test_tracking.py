@@ -217,22 +217,14 @@ def test_edges_that_compression_spoils_cost_accuracy_and_no_camera(rolling, rend
     assert 0.3 < np.nanmean(error**2 / stated) < 3.0
 
 
-RECORDING = SimpleNamespace(folder=Path("rec"))
-
-
-def lost_images(n):
-    return [Unreadable(n - i, i % 2, f"left/{n - i}.png: cannot be read: No such device.") for i in range(n)]
-
-
-def test_most_images_unreadable_is_the_cause_that_is_told():
+def test_most_images_unreadable_is_the_cause_that_is_told_and_a_few_are_not():
+    lost = [Unreadable(n, n % 2, f"left/{n}.png: cannot be read: No such device.") for n in range(150, 0, -1)]
+    known = SimpleNamespace(folder=Path("rec")), lost, 200, TrackingError("found in none")
+    refuse_unreadable(known[0], lost[50:], *known[2:])
     with pytest.raises(
         RecordingError, match=r"rec: the files cannot be read: 150 of 200 images, the first: left/1\.png"
     ):
-        refuse_unreadable(RECORDING, lost_images(150), 200, TrackingError("found in none"))
-
-
-def test_a_few_are_not():
-    refuse_unreadable(RECORDING, lost_images(100), 200, TrackingError("found in none"))
+        refuse_unreadable(*known)
 
 
 @pytest.mark.parametrize(
