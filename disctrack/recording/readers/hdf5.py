@@ -92,6 +92,8 @@ def _open(handle: h5py.File, stack: h5py.Dataset, file: Path, camera: str) -> Fr
             f"{where}: one chunk {stack.chunks} holds more than {_LARGEST_CHUNK >> 20} MB, all of which is read for "
             "any frame in it. Write it again with chunks of one frame."
         )
+    if stack.external:
+        raise RecordingError(f"{where}: its pixels lie in {stack.external[0][0]}. Write them into {file}.")
     stored = _frames_stored(stack)
     if n == 0 or stored == 0:
         raise RecordingError(f"{where}: a stack without frames.")
@@ -109,7 +111,7 @@ def _open(handle: h5py.File, stack: h5py.Dataset, file: Path, camera: str) -> Fr
         "frame_rate": rate if rate is not None and rate > 0 else None,
     }
     whole = _fills_its_bytes(stack)
-    offset = stack.id.get_offset() if stack.chunks is None and not stack.external and not stack.is_virtual else None
+    offset = stack.id.get_offset() if stack.chunks is None and not stack.is_virtual else None
     if offset is not None and whole:
         layout = PixelLayout(width, height, stack.dtype)
         handle.close()
@@ -132,7 +134,7 @@ def _open(handle: h5py.File, stack: h5py.Dataset, file: Path, camera: str) -> Fr
 
 def _frames_stored(stack: h5py.Dataset) -> int:
     """Most frames that can have been written, by the space they take."""
-    if stack.is_virtual or stack.external:
+    if stack.is_virtual:
         return int(stack.shape[0])
     if stack.chunks is None:
         return int(stack.id.get_storage_size() // max(1, int(np.prod(stack.shape[1:])) * stack.dtype.itemsize))
@@ -147,21 +149,10 @@ def _fills_its_bytes(stack: h5py.Dataset) -> bool:
 
 def _check_other_files(stack: h5py.Dataset, file: Path, where: str) -> None:
     """Raise RecordingError where pixels lie in other files that are not there: the library would deliver zeros."""
-    if stack.is_virtual:
-        for name in sorted({source.file_name for source in stack.virtual_sources()} - {"."}):
-            if "%" not in name and not (file.parent / name).exists() and not Path(name).exists():
-                raise RecordingError(f"{where}: takes frames from {name}, which is not there. Copy it beside {file}.")
-    needed = int(np.prod(stack.shape, dtype=np.int64)) * stack.dtype.itemsize
-    present = 0
-    for name, start, size in stack.external or ():
-        if not Path(name).exists():  # by the library's rule, from the folder that the command is given in
-            raise RecordingError(f"{where}: its pixels lie in {name}, which is not there. Write them into {file}.")
-        present += max(0, min(Path(name).stat().st_size - start, size))
-    if stack.external and present < needed:
-        raise RecordingError(
-            f"{where}: its pixels lie in {stack.external[0][0]}, which holds {present} of their {needed} bytes. "
-            "Copy it again."
-        )
+    sources = stack.virtual_sources() if stack.is_virtual else ()
+    for name in sorted({source.file_name for source in sources} - {"."}):
+        if "%" not in name and not (file.parent / name).exists() and not Path(name).exists():
+            raise RecordingError(f"{where}: takes frames from {name}, which is not there. Copy it beside {file}.")
 
 
 def _filters(stack: h5py.Dataset) -> set[int]:

@@ -205,18 +205,11 @@ def test_hdf5_frames_that_lie_in_other_files_are_those_or_refused(tmp_path):
     with h5py.File(tmp_path / "external.h5", "w") as file:
         place = [(str(tmp_path / "pixels.bin"), 16, h5py.h5f.UNLIMITED)]
         file.create_dataset("frames", frames.shape, np.uint8, external=place)[...] = frames
-    for name in ("virtual", "external"):
-        reader = open_frames(f"{name}.h5", tmp_path, "left")
-        assert lost_of(reader, frames) == {}
+    assert lost_of(open_frames("virtual.h5", tmp_path, "left"), frames) == {}
     (tmp_path / "part2.hdf").unlink()
     with pytest.raises(RecordingError, match=r"takes frames from part2\.hdf, which is not there"):
         open_frames("virtual.h5", tmp_path, "left")
-    content = (tmp_path / "pixels.bin").read_bytes()
-    (tmp_path / "pixels.bin").write_bytes(content[:-1])
-    with pytest.raises(RecordingError, match="holds 191 of their 192 bytes"):
-        open_frames("external.h5", tmp_path, "left")
-    (tmp_path / "pixels.bin").unlink()
-    with pytest.raises(RecordingError, match=r"pixels\.bin, which is not there"):
+    with pytest.raises(RecordingError, match=r"its pixels lie in .*pixels\.bin\. Write them into"):
         open_frames("external.h5", tmp_path, "left")
 
 
