@@ -74,10 +74,9 @@ def _answer(words: Sequence[str], received: Sequence[int]) -> int:
         if sys.stderr.isatty():  # what is imported now takes seconds
             print(f"{arguments.command} ...", end="\r", file=sys.stderr, flush=True)
         from disctrack.files.inputs import inputs_kept  # here, so that --help does not wait for what it imports
-        from disctrack.progress import recorded_times
 
         command = importlib.import_module(f"disctrack.commands.{arguments.command.replace('-', '_')}")
-        with inputs_kept(), recorded_times(), catch_warnings():
+        with inputs_kept(), catch_warnings():
             simplefilter("ignore", DoubtWarning)  # reports say it
             return int(command.run(arguments) or DONE)
     except KeyboardInterrupt:

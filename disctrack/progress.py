@@ -9,51 +9,8 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextvars import ContextVar
-from dataclasses import dataclass
 
 from tqdm import tqdm
-
-
-@dataclass(frozen=True)
-class StageTime:
-    """What a stage took."""
-
-    stage: str
-    seconds: float  # by the clock
-    processor_seconds: float  # of this process, all its threads
-    count: int | None = None  # of what it went through
-    unit: str | None = None
-
-
-_recorded: ContextVar[list[StageTime] | None] = ContextVar("recorded", default=None)
-
-
-@contextlib.contextmanager
-def recorded_times() -> Iterator[list[StageTime]]:
-    """List that every stage which ends well in the meantime is added to."""
-    times: list[StageTime] = []
-    token = _recorded.set(times)
-    try:
-        yield times
-    finally:
-        _recorded.reset(token)
-
-
-def times_so_far() -> tuple[StageTime, ...]:
-    """Of the stages since `recorded_times` began."""
-    return tuple(_recorded.get() or ())
-
-
-@contextlib.contextmanager
-def timed(what: str, count: int | None = None, unit: str | None = None) -> Iterator[None]:
-    """Add the time of a stage to those recorded, without a word."""
-    began, used = time.perf_counter(), time.process_time()
-    yield
-    times = _recorded.get()
-    if times is not None:
-        seconds, processor = time.perf_counter() - began, time.process_time() - used
-        times.append(StageTime(what, round(seconds, 3), round(processor, 3), count, unit))
 
 
 @contextlib.contextmanager
@@ -63,7 +20,7 @@ def progress_bar(what: str, total: int, unit: str) -> Iterator[Callable[[int], N
     What is reported beyond the total is not shown.
     """
     began = time.perf_counter()
-    with timed(what, total, unit), tqdm(total=total, desc=what, unit=f" {unit}", disable=None, leave=False) as bar:
+    with tqdm(total=total, desc=what, unit=f" {unit}", disable=None, leave=False) as bar:
         yield lambda n: bar.update(max(0, min(n, total - bar.n))) and None
     _tell(began, f"{what}: {total} {unit}{'' if total == 1 else 's'}")
 
@@ -90,8 +47,7 @@ def steps(what: str) -> Iterator[Callable[[str], None]]:
     if ticking is not None:
         ticking.start()
     try:
-        with timed(what):
-            yield say
+        yield say
     finally:
         over.set()
         if ticking is not None:

@@ -32,7 +32,6 @@ from disctrack.errors import AnalysisError, DiscTrackError, TrackingError, reaso
 from disctrack.files.json_text import plain
 from disctrack.files.whole import write_whole
 from disctrack.findings import Kind, leading
-from disctrack.progress import recorded_times, timed
 from disctrack.recording.declaration import read_recording
 from disctrack.track.measurement import measure, open_pairs, trajectory_provenance
 from disctrack.trajectory import Trajectory
@@ -92,18 +91,15 @@ def _make_recording(job: Job, results: Path) -> Record:
     path, provenance = results / "trajectory.h5", trajectory_provenance(recording, rig, pairs, None)
 
     def measured() -> tuple[Trajectory, Details]:
-        with timed("track"):
-            found = measure(recording, rig, pairs, threads=job.threads, boards=boards_in(Path(job.rig), recording))
+        found = measure(recording, rig, pairs, threads=job.threads, boards=boards_in(Path(job.rig), recording))
         return found.trajectory, found.details
 
-    with recorded_times() as times:
-        trajectory, _, fresh = kept_or_made(path, provenance, measured, job.options.overwrite)
-        record = None if fresh else read_record(results)  # is_done: of this provenance, as the trajectory is
-        if record is not None and is_done(results, record, job.options.stages):
-            return dataclasses.replace(record, status=SKIPPED)
-        record = _after_tracking(results, path, trajectory, provenance, job)
-    numbers = record.numbers | {f"processor_seconds_{t.stage}": t.processor_seconds for t in times}
-    numbers |= {
+    trajectory, _, fresh = kept_or_made(path, provenance, measured, job.options.overwrite)
+    record = None if fresh else read_record(results)  # is_done: of this provenance, as the trajectory is
+    if record is not None and is_done(results, record, job.options.stages):
+        return dataclasses.replace(record, status=SKIPPED)
+    record = _after_tracking(results, path, trajectory, provenance, job)
+    numbers = record.numbers | {
         "name": recording.name,
         "repeats": group_of(recording),
         "rig": job.rig,
@@ -125,8 +121,7 @@ def _after_tracking(results: Path, path: Path, trajectory: Trajectory, provenanc
     missing = [f.sentence for f in noticed if f.doubtful or f.kind == Kind.UNREADABLE]
     numbers |= {"severity": noticed[0].grave, "finding": noticed[0].kind.value} if noticed else {}
     try:
-        with timed("analyse"):
-            analysis, report = _analyse(path, trajectory, job)
+        analysis, report = _analyse(path, trajectory, job)
         numbers |= analysed_numbers(analysis)
         files |= {"report": report.relative_to(results).as_posix()} if report is not None else {}
     except AnalysisError as error:
@@ -139,8 +134,7 @@ def _after_tracking(results: Path, path: Path, trajectory: Trajectory, provenanc
                 raise AnalysisError("a number is declared wrong, and a missing effect would be read into it")
             from disctrack.diagnosis import run_diagnose
 
-            with timed("diagnose"):
-                diagnosed = run_diagnose(path, overwrite=True).summary
+            diagnosed = run_diagnose(path, overwrite=True).summary
             numbers |= diagnosed_numbers(dict(diagnosed.data))
             files["diagnosis_report"] = diagnosed.files[0].relative_to(results).as_posix()
         except AnalysisError as error:

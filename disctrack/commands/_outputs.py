@@ -4,9 +4,8 @@ import argparse
 import json
 import os
 import sys
-import time
 from collections.abc import Iterator
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 from numpy.typing import NDArray
@@ -14,12 +13,10 @@ from numpy.typing import NDArray
 from calibration import CalibrationSettings, StereoRig
 from disctrack.calibrate.stage import boards_in
 from disctrack.commands import DONE, INCOMPLETE
-from disctrack.files.json_text import json_file, json_text
-from disctrack.files.software import software_version
+from disctrack.files.json_text import json_text
 from disctrack.files.whole import check_writable as check_writable
-from disctrack.files.whole import write_whole
 from disctrack.findings import Kind, Severity, in_doubt, leading, of_kind
-from disctrack.progress import progress_bar, times_so_far
+from disctrack.progress import progress_bar
 from disctrack.recording.declaration import FILE_NAME, Recording
 from disctrack.recording.declaration_text import changed_since, told_differences
 from disctrack.recording.readers.blocks import iter_pair_blocks
@@ -175,30 +172,6 @@ def pair_of(pairs: ImagePairs, row: int) -> NDArray:
     """Both images of a frame (2, height, width); one that cannot be read is black."""
     (block,) = iter_pair_blocks(pairs.left, pairs.right, row, row + 1)
     return block.images[0]
-
-
-def write_times(folder: Path, command: str) -> list[Path]:
-    """Keep in times.json what the stages of this command took; returns it, or nothing where all was reused.
-
-    The processor's seconds are those of the whole process: with its imports, and with what is in no stage. Raises
-    OutputError.
-    """
-    stages = times_so_far()
-    if not stages:
-        return []
-    path = folder / "times.json"
-    try:
-        document = dict(json.loads(path.read_text(encoding="utf-8")))
-    except (OSError, ValueError, TypeError):  # not there, or not ours to mend
-        document = {}
-    document[command] = {
-        "version": software_version(),
-        "seconds": round(sum(stage.seconds for stage in stages), 3),
-        "processor_seconds": round(time.process_time(), 3),
-        "stages": [asdict(stage) for stage in stages],
-    }
-    write_whole(path, json_file(document))
-    return [path]
 
 
 def relative(path: Path) -> Path:

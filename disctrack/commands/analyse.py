@@ -43,9 +43,8 @@ def run(arguments: argparse.Namespace) -> int:
         )
     with steps("motion.html"):
         _write_motion_page(page, outcome.analysis, path, arguments.recording)
-    files = (*outcome.summary.files, page, *outputs.write_times(folder, "analyse"))
     outputs.link_pages_of(path)
-    return outputs.tell(replace(outcome.summary, files=files), arguments, folder)
+    return outputs.tell(replace(outcome.summary, files=(*outcome.summary.files, page)), arguments, folder)
 
 
 def _write_motion_page(page: Path, analysis: Analysis, trajectory: Path, recording: Path | None) -> None:

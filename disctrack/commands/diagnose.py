@@ -3,7 +3,6 @@
 import argparse
 import contextlib
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 from disctrack import rolling
@@ -49,9 +48,8 @@ def run(arguments: argparse.Namespace) -> int:
             settle=arguments.plan,
             figures=arguments.figures,
         )
-    files = (*outcome.summary.files, *outputs.write_times(folder, "diagnose"))
     outputs.link_pages_of(path)
-    return outputs.tell(replace(outcome.summary, files=files), arguments, folder)
+    return outputs.tell(outcome.summary, arguments, folder)
 
 
 def _together(paths: list[Path], arguments: argparse.Namespace) -> int:

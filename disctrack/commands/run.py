@@ -39,7 +39,7 @@ def run(arguments: argparse.Namespace) -> int:
         tracked,
         verdict=f"{tracked.verdict} {verdict}",
         blocks=[Section("Calibration", [Facts(whole), *known.blocks]), Section("Tracking", tracked.blocks)],
-        files=[*known.files, *tracked.files, summary, *outputs.write_times(folder, "run")],
+        files=[*known.files, *tracked.files, summary],
         page=summary,
     )
     write_whole(summary, ("\n".join(full(report)) + "\n").encode())

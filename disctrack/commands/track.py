@@ -1,7 +1,6 @@
 """`disctrack track`: a recording and a rig become a trajectory."""
 
 import argparse
-from dataclasses import replace
 
 from calibration.rig_file import read_rig
 from disctrack.commands import _outputs as outputs
@@ -26,6 +25,4 @@ def run(arguments: argparse.Namespace) -> int:
     pairs = pipeline.open_pairs(recording, arguments.frames or (None, None))
     refuse_input(path)
     outputs.check_writable(path.parent)
-    report = outputs.track_into(path, recording, rig, rig_file, pairs, arguments)
-    report = replace(report, files=[*report.files, *outputs.write_times(path.parent, "track")])
-    return outputs.tell(report, arguments, path.parent)
+    return outputs.tell(outputs.track_into(path, recording, rig, rig_file, pairs, arguments), arguments, path.parent)

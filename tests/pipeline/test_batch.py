@@ -102,8 +102,6 @@ def test_a_batch_calibrates_a_rig_once_tells_of_every_recording_and_goes_on_wher
             assert (cell == "") if value is None else (str(value) == cell), column
     trajectory = read_trajectory(root / "r2" / "results" / "trajectory.h5")
     assert rows["r2"]["pairs_measured"] == len(trajectory)
-    parts = [rows["r2"][f"processor_seconds_{stage}"] for stage in ("track", "analyse")]
-    assert 0 < sum(parts) <= rows["r2"]["processor_seconds"] + 1e-3
     assert rows["r2"]["z_sigma_m"] == np.median(trajectory.coordinate_sigma[:, 2])
     assert (root / "batch_results" / rows["r2"]["trajectory"]).samefile(root / "r2" / "results" / "trajectory.h5")
     page = (root / "batch_results" / "index.html").read_text()
