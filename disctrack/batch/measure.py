@@ -30,7 +30,6 @@ from disctrack.calibrate.stage import boards_in, calibrate_into, is_rig_of, sour
 from disctrack.diagnosis.recorded import first_to_mend
 from disctrack.errors import AnalysisError, DiscTrackError, TrackingError, reason_of
 from disctrack.files.json_text import plain
-from disctrack.files.whole import write_whole
 from disctrack.findings import Kind, leading
 from disctrack.recording.declaration import read_recording
 from disctrack.track.measurement import measure, open_pairs, trajectory_provenance
@@ -53,16 +52,11 @@ def do(job: Job) -> Record:
 
 
 def make_rig(job: Job) -> Record:
-    """Calibrate into job.rig, unless the same was done before, here or by `disctrack run`. Raises Timeout."""
+    """Calibrate into job.rig, unless the same was done before. Raises Timeout."""
     path = Path(job.rig)
     with locked(path.with_name(LOCK), BUSY_FOR):
         source = source_of(read_recording(job.folder), job.options.calibration)
         if is_rig_of(path, source) and not job.options.overwrite:
-            return Record(SKIPPED)
-        earlier = [Path(file) for file in job.adopt] if not job.options.overwrite else []
-        same = next((file for file in earlier if is_rig_of(file, source)), None)
-        if same is not None:
-            write_whole(path, same.read_bytes())
             return Record(SKIPPED)
         calibrate_into(path, source, overwrite=True, figures=job.options.report)
     return Record(MEASURED)

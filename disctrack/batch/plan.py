@@ -1,6 +1,5 @@
 """What is to be done: each rig once, then one job per recording."""
 
-import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -50,7 +49,6 @@ class Job:
     rig: str  # rig file: what a "rig" makes and a "recording" uses
     options: BatchOptions
     threads: int = 1  # that read images
-    adopt: tuple[str, ...] = ()  # rig files of earlier runs that may be the same
 
 
 def make_plan(
@@ -91,7 +89,6 @@ def _job(found: FoundRecordings, recording: Recording, name: str, options: Batch
         return Job("recording", name, str(folder), str(results), str(recording.rig_file), options)
     # named by the content of all that it depends on
     made_from = source_of(recording, options.calibration).provenance.fingerprint[:16]
-    rig, earlier = found.common / "rigs" / made_from / "rig.h5", str(results / "rig.h5")
-    job = rigs.get(str(rig)) or Job("rig", name, str(folder), str(rig.parent), str(rig), options)
-    rigs[str(rig)] = dataclasses.replace(job, adopt=(*job.adopt, earlier))
+    rig = found.common / "rigs" / made_from / "rig.h5"
+    rigs.setdefault(str(rig), Job("rig", name, str(folder), str(rig.parent), str(rig), options))
     return Job("recording", name, str(folder), str(results), str(rig), options)

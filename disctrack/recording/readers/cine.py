@@ -35,14 +35,11 @@ _SETUP_MARK = 140  # where the setup's own mark and length stand
 # Field of the camera setup (4 bytes): its offset. Fields beyond the setup's stated length are not in the file.
 _SETUP_FIELDS = {
     "Serial": 743,
-    "bFlipH": 756,
-    "bFlipV": 760,
     "FrameRate": 768,
     "Shutter": 772,
     "CameraVersion": 792,
     "CFA": 808,
     "RealBPP": 896,
-    "FRPSteps": 1048,
     "ShutterNs": 1568,
     "EDRShutterNs": 1572,
 }
@@ -71,7 +68,7 @@ def open_cine(files: Sequence[Path], camera: str) -> RawFrames:
         timestamps=None if times is None else times - times[0],
         frame_rate=header.frame_rate,
         header=header,
-        notes=(header.sentence(), *doubts, *_setup_notes(cine)),
+        notes=(header.sentence(), *doubts, *_range_notes(cine)),
     )
 
 
@@ -233,15 +230,7 @@ def _header(cine: _Cine, depth: int, times: Array | None, step: int) -> CameraHe
     )
 
 
-def _setup_notes(cine: _Cine) -> list[str]:
-    """What in the setup bears on the grey values or on time."""
-    notes = []
-    if cine.field("FRPSteps"):
-        notes.append("the frame rate was changed during the recording (frame rate profile)")
+def _range_notes(cine: _Cine) -> list[str]:
     if 0 < cine.field("EDRShutterNs") < cine.field("ShutterNs"):
-        notes.append("bright pixels are compressed (extreme dynamic range): edges of the dots may be biased")
-    if cine.field("bFlipH") or cine.field("bFlipV"):
-        notes.append(
-            "the setup asks to show the images mirrored; they are used as stored: the calibration views must be, too"
-        )
-    return notes
+        return ["bright pixels are compressed (extreme dynamic range): edges of the dots may be biased"]
+    return []

@@ -21,7 +21,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.kit.arrays import Array, Image
-from calibration.kit.grey_levels import full_scale, level_step
 from disctrack.errors import RecordingError
 from disctrack.recording.readers.base import FrameReader, first_readable
 from disctrack.recording.readers.decoding import as_grey, decode
@@ -48,26 +47,16 @@ def open_images(files: Sequence[Path], camera: str, pattern: str = "") -> FrameR
         return stored, as_grey(stored, name)
 
     stored, first = first_readable(len(files), camera, decoded)
+    alike = f"images are stored with {stored.shape[-1]} channels of equal value; one is used, without loss"
     return ImageSequence(
         camera=camera,
         files=[file or f"missing file of {camera} frame {index}" for index, file in enumerate(slots)],
         numbers=numbers,
         image_size=(first.shape[1], first.shape[0]),
         dtype=first.dtype,
-        notes=(*notes, *_depth_notes(stored, first)),
+        notes=(*notes, *([alike] if stored.ndim == 3 else [])),
         doubts=doubts,
     )
-
-
-def _depth_notes(stored: NDArray, grey: Image) -> list[str]:
-    notes = []
-    if stored.ndim == 3:
-        notes.append(f"images are stored with {stored.shape[2]} channels of equal value; one is used, without loss")
-    if grey.dtype == np.uint16:
-        step, top = level_step(grey), full_scale(grey)
-        used = f"{(top // step).bit_length()} of them in use, in steps of {step}; first frame: up to {grey.max()}"
-        notes.append(f"images have 16 bits per pixel ({used}); used as they are")
-    return notes
 
 
 @dataclass(eq=False, kw_only=True)
