@@ -34,8 +34,7 @@ from disctrack.findings import Kind, leading
 from disctrack.recording.declaration import read_recording
 from disctrack.track.measurement import measure, open_pairs, trajectory_provenance
 from disctrack.trajectory import Trajectory
-from disctrack.trajectory.file import Details, Provenance
-from disctrack.trajectory.reuse import kept_or_made
+from disctrack.trajectory.file import Details, Provenance, kept_or_made
 
 LOCK = ".batch.lock"
 BUSY_FOR = 1.0  # [s] to wait for another batch before the recording is put back: longer than to look for it again

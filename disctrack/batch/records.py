@@ -57,7 +57,7 @@ def is_done(folder: Path, record: Record | None, asked: Stages) -> bool:
     """True if the record tells of a measured recording with all stages asked for, and all its files are there.
 
     The trajectory must be the record's; whether that is the result of the present inputs is another question
-    (`disctrack.trajectory.reuse.kept_or_made`).
+    (`disctrack.trajectory.file.kept_or_made`).
     """
     if record is None or record.status != MEASURED or "trajectory" not in record.files:
         return False

@@ -29,8 +29,8 @@ from disctrack.track.measurement import ImagePairs, measure, trajectory_provenan
 from disctrack.track.video_overlay import shown_rows, write_overlay
 from disctrack.trajectory import Trajectory
 from disctrack.trajectory.exchange.motion import write_csv
-from disctrack.trajectory.file import Details, Provenance, read_provenance
-from disctrack.trajectory.reuse import SUMMARY, kept_or_made
+from disctrack.trajectory.file import Details, Provenance, kept_or_made, read_provenance
+from disctrack.trajectory.reuse import SUMMARY
 
 RESULTS = "results"
 

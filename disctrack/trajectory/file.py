@@ -11,7 +11,7 @@ import hashlib
 import io
 import json
 import platform
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -143,6 +143,37 @@ def trajectory_in(path: Path) -> Path:
         if file.is_file():
             return file
     raise TrajectoryFileError(f"{path}: no results/trajectory.h5 in this folder; 'disctrack run {path}' makes it")
+
+
+def kept_or_made(
+    path: Path,
+    provenance: Provenance,
+    make: Callable[[], tuple[Trajectory, Details]],
+    overwrite: bool = False,
+    other: Callable[[Provenance], str] | None = None,
+) -> tuple[Trajectory, Details, bool]:
+    """Trajectory and details as the file has them if that is a result of this provenance, or made now and written.
+
+    overwrite : make it, whatever is there
+    other : what to say of the result of another provenance, which is then refused; without it, that is replaced
+    returns : also, True if it was made now. Raises OutputError for what may not be replaced
+    """
+    if path.exists() and not overwrite:
+        try:
+            there = read_provenance(path)
+        except TrajectoryFileError as error:
+            raise OutputError(f"{error} It is kept: move it away, or replace it with --overwrite.") from error
+        if there.fingerprint == provenance.fingerprint:
+            return read_trajectory(path), read_details(path), False
+        if other is not None:
+            raise OutputError(
+                f"{path}: exists, and is not the complete result of these images, settings and version "
+                f"({other(there) or f'made by {there.version}'}). Keep it and choose another place with -o, or replace "
+                "it with --overwrite."
+            )
+    trajectory, details = make()
+    write_trajectory(path, trajectory, provenance, overwrite=True, details=details)
+    return trajectory, details, True
 
 
 def read_provenance(path: Path) -> Provenance:

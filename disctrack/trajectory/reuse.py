@@ -1,61 +1,21 @@
-"""Results are reused where they were made, completely, from the same inputs, settings and version."""
+"""Results of the stages after a trajectory are reused where they are complete, of the same origin and version."""
 
 import contextlib
 import hashlib
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from disctrack.errors import OutputError, TrajectoryFileError
 from disctrack.files.json_text import json_file, plain
 from disctrack.files.software import software_version
 from disctrack.files.whole import refuse_existing, write_whole
 from disctrack.report.blocks import Report, document, restored
 from disctrack.report.terminal import full
-from disctrack.trajectory import Trajectory
-from disctrack.trajectory.file import (
-    Details,
-    Provenance,
-    read_details,
-    read_provenance,
-    read_trajectory,
-    write_trajectory,
-)
+from disctrack.trajectory.file import read_provenance
 
 FILE_NAME, SUMMARY = "made_from.json", "summary.txt"
-
-
-def kept_or_made(
-    path: Path,
-    provenance: Provenance,
-    make: Callable[[], tuple[Trajectory, Details]],
-    overwrite: bool = False,
-    other: Callable[[Provenance], str] | None = None,
-) -> tuple[Trajectory, Details, bool]:
-    """Trajectory and details as the file has them if that is a result of this provenance, or made now and written.
-
-    overwrite : make it, whatever is there
-    other : what to say of the result of another provenance, which is then refused; without it, that is replaced
-    returns : also, True if it was made now. Raises OutputError for what may not be replaced
-    """
-    if path.exists() and not overwrite:
-        try:
-            there = read_provenance(path)
-        except TrajectoryFileError as error:
-            raise OutputError(f"{error} It is kept: move it away, or replace it with --overwrite.") from error
-        if there.fingerprint == provenance.fingerprint:
-            return read_trajectory(path), read_details(path), False
-        if other is not None:
-            raise OutputError(
-                f"{path}: exists, and is not the complete result of these images, settings and version "
-                f"({other(there) or f'made by {there.version}'}). Keep it and choose another place with -o, or replace "
-                "it with --overwrite."
-            )
-    trajectory, details = make()
-    write_trajectory(path, trajectory, provenance, overwrite=True, details=details)
-    return trajectory, details, True
 
 
 def origin_of(trajectory: Path, settings: Mapping[str, Any]) -> str:

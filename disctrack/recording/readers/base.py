@@ -24,7 +24,6 @@ class CameraHeader:
     device: str  # make, model, number
     frame_rate: float  # [Hz] of the frames in the file
     step: int  # one frame in so many of those recorded is in the file
-    saturation: int  # largest grey value that a pixel can have
     exposure: float | None = None  # [s]
     trigger: str = ""  # trigger mode
     first_frame: int | None = None  # the camera's own number of frame 0; trigger modes differ in what is counted from

@@ -58,7 +58,7 @@ def open_cine(files: Sequence[Path], camera: str) -> RawFrames:
     starts = np.frombuffer(file.bytes_at(cine.table, 8 * n, f"{file}: table of {n} images"), "<i8")
     check_present(file, camera, layout, n, count_present(layout, starts, file.size))
     times, step, doubts = _times(cine)
-    header = _header(cine, depth, times, step)
+    header = _header(cine, times, step)
     return RawFrames(
         camera=camera,
         files=[file] * n,
@@ -209,7 +209,7 @@ def _find_block(cine: _Cine, wanted: int) -> tuple[int, int] | None:
     return None
 
 
-def _header(cine: _Cine, depth: int, times: Array | None, step: int) -> CameraHeader:
+def _header(cine: _Cine, times: Array | None, step: int) -> CameraHeader:
     rate = cine.field("FrameRate")
     if not rate:
         raise RecordingError(f"{cine.file}: the camera setup states no frame rate. Export the recording again.")
@@ -226,7 +226,6 @@ def _header(cine: _Cine, depth: int, times: Array | None, step: int) -> CameraHe
         trigger_time=second + cine.trigger if second else None,
         locked_clock=bool(second) and not cine.clock_is_free,
         recorded=datetime(1970, 1, 1) + timedelta(seconds=second) if second else None,
-        saturation=(1 << depth) - 1,
     )
 
 

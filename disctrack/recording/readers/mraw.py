@@ -56,18 +56,18 @@ def open_mraw(files: Sequence[Path], camera: str) -> RawFrames:
     """
     header_file, data_file = _pair_of(files, camera)
     entries = _Entries(header_file)
-    layout, depth, saturation = _layout(entries)
+    layout, depth = _layout(entries)
     file, notes = RawFile(data_file), []
     n = entries.whole("Total Frame")
     check_present(file, camera, layout, n, min(n, file.size // layout.frame_bytes))
-    if layout.stored_bits == 16 and saturation != 0xFFFF:
+    if layout.stored_bits == 16 and depth < 16:
         largest = int(np.frombuffer(file.bytes_at(0, layout.frame_bytes, str(file)), "<u2").max())
-        if largest > saturation:
-            notes.append(f"grey values go up to {largest}, not {saturation} as the header says; used as they are")
-            depth, saturation = 16, 0xFFFF
+        if largest >> depth:
+            notes.append(f"grey values go up to {largest}, not {2**depth - 1} as the header says; used as they are")
+            depth = 16
     if file.size >= (n + 1) * layout.frame_bytes:
         notes.append(f"{data_file.name} is longer than the {n} frames of its header; what follows them is not read")
-    header, remarks, doubts = _header(entries, saturation)
+    header, remarks, doubts = _header(entries)
     return RawFrames(
         camera=camera,
         files=[file] * n,
@@ -172,8 +172,8 @@ def _trigger_name(mode: str, pdc_mode: str) -> str:
     return _TRIGGERS[number] if number < len(_TRIGGERS) else f"mode {code}"
 
 
-def _layout(entries: _Entries) -> tuple[PixelLayout, int, int]:
-    """How the pixels lie, the bits that carry grey values, and the largest one that the header allows."""
+def _layout(entries: _Entries) -> tuple[PixelLayout, int]:
+    """How the pixels lie, and the bits that carry grey values."""
     file = entries.file
     if entries.text("File Format").lower() != "mraw":
         raise RecordingError(
@@ -195,15 +195,13 @@ def _layout(entries: _Entries) -> tuple[PixelLayout, int, int]:
             f"{file}: 'Color Bit' is {bits}; expected 8, 10, 12 or 16. Save the frames in one of these."
         )
     check_frame_size(width, height, str(file), bits)
-    effective = effective if 0 < effective <= bits else bits
     high = bits == 16 and entries.text("EffectiveBit Side").lower() == "higher"
     packed = bits if bits in (10, 12) else 0
     layout = PixelLayout(width, height, np.dtype("u1" if bits == 8 else "<u2"), packed)
-    depth = 16 if high else bit_depth_of(bits, effective)
-    return layout, depth, ((1 << effective) - 1) << (bits - effective if high else 0)
+    return layout, 16 if high else bit_depth_of(bits, effective)
 
 
-def _header(entries: _Entries, saturation: int) -> tuple[CameraHeader, list[str], tuple[str, ...]]:
+def _header(entries: _Entries) -> tuple[CameraHeader, list[str], tuple[str, ...]]:
     """Settings of the recording, what about them cannot be, and what had to be assumed of the frames' times."""
     rate = entries.number("Record Rate(fps)")
     if rate is None:
@@ -233,7 +231,6 @@ def _header(entries: _Entries, saturation: int) -> tuple[CameraHeader, list[str]
         trigger=entries.text("Trigger Mode")[:40],
         first_frame=int(first) if re.fullmatch(r"-?[0-9]{1,15}", first) else None,
         recorded=_date(f"{entries.text('Date')} {entries.text('Time')}".strip()),
-        saturation=saturation,
     )
     return header, remarks, tuple(doubts)
 

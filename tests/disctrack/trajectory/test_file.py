@@ -21,6 +21,7 @@ from disctrack.numbers import Measured
 from disctrack.trajectory import FrameStatus, Trajectory
 from disctrack.trajectory.file import (
     Provenance,
+    kept_or_made,
     read_findings,
     read_group,
     read_provenance,
@@ -29,7 +30,6 @@ from disctrack.trajectory.file import (
     write_groups,
     write_trajectory,
 )
-from disctrack.trajectory.reuse import kept_or_made
 from tests.equality import assert_equal
 from tests.oracles.measured_disc import measured
 
