@@ -32,27 +32,19 @@ def steps(what: str) -> Iterator[Callable[[str], None]]:
     Yields a function that is told which step begins, for terminals to show with the stage's age.
     """
     began, over = time.perf_counter(), threading.Event()
-    now = [what]
+    with tqdm(desc=what, bar_format="{desc} ... {elapsed}", disable=None, leave=False) as bar:
 
-    def tick() -> None:
-        while not over.wait(1.0):
-            _show(f"{now[0]} ... {time.perf_counter() - began:.0f} s")
+        def tick() -> None:
+            while not over.wait(1.0):
+                bar.refresh()
 
-    def say(step: str) -> None:
-        now[0] = f"{what}: {step}"
-        _show(f"{now[0]} ...")
-
-    _show(f"{what} ...")
-    ticking = threading.Thread(target=tick, daemon=True) if sys.stderr.isatty() else None
-    if ticking is not None:
+        ticking = threading.Thread(target=tick, daemon=True)
         ticking.start()
-    try:
-        yield say
-    finally:
-        over.set()
-        if ticking is not None:
+        try:
+            yield lambda step: bar.set_description_str(f"{what}: {step}")
+        finally:
+            over.set()
             ticking.join()
-        _show("")
     _tell(began, what)
 
 
@@ -77,12 +69,6 @@ def compiling(what: str, seconds: int) -> Iterator[None]:
         yield
     if said:
         _tell(began, f"inner loops of {what} compiled")
-
-
-def _show(text: str) -> None:
-    """One line that the next one replaces; nothing where stderr is no terminal."""
-    if sys.stderr.isatty():
-        print(f"\r\x1b[K{text}", end="", file=sys.stderr, flush=True)
 
 
 def _tell(began: float, what: str) -> None:
