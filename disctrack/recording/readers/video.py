@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.kit.arrays import Image
+from calibration.kit.brief import ranges
 from disctrack.errors import RecordingError
 from disctrack.recording.readers.base import FrameReader, first_readable, only_file
 from disctrack.recording.readers.decoding import as_grey
@@ -78,6 +79,7 @@ class VideoFile(FrameReader):
             dtype=first.dtype,
             bit_depth=_depth(frame),
             notes=(*_format_notes(frame), *((lossy,) if codec_name not in _LOSSLESS else ())),
+            doubts=tuple(_gap_doubts(self._times)),
             random_access=False,
         )
 
@@ -229,6 +231,19 @@ def _opened(file: Path, camera: str) -> InputContainer:
         return container
     except (av.FFmpegError, IndexError, OSError, ValueError) as error:
         raise RecordingError(f"{file}: not a readable video for the {camera} camera ({error}).") from error
+
+
+def _gap_doubts(times: NDArray[np.int64]) -> list[str]:
+    """A doubt where the container's clock skips: the recorder lost frames there."""
+    steps = np.diff(times)
+    if len(steps) < 3:
+        return []
+    typical = float(np.median(steps))
+    gaps = np.flatnonzero(steps > 1.5 * typical + 1)
+    if not len(gaps) or len(gaps) > 0.1 * len(steps):
+        return []
+    where, n = ranges(gaps), int(np.rint(steps[gaps] / typical - 1).sum())
+    return [f"the video's clock skips after frame {where}: {n} frame{'s' * (n > 1)} lost, and time shifts there"]
 
 
 def _depth(frame: av.VideoFrame) -> int:

@@ -55,7 +55,6 @@ def test_frames_come_back_as_they_were_written_in_any_order(tmp_path, kind):
     assert_array_equal(out, frames[4])
     told = " ".join(reader.notes)
     assert ("not stretched" in told) == ("gray" not in kind.options.get("pixels", "gray"))
-    assert ("16 bits" in told) == (kind in IMAGES and kind.bits == 16)
 
 
 @pytest.mark.parametrize("kind", [IMAGES[0], TIFFS[0], STACKS[3], CAMERAS[0], *VIDEOS], ids=str)
