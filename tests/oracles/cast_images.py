@@ -4,12 +4,14 @@ Each camera's rays, SUB x SUB a pixel, are cast backwards on to the table, the b
 blurred there and gathered to pixels. The lenses have no residual field.
 """
 
+import re
+
 import cv2
 import numpy as np
 
 from disctrack.disc import MA_2014
 from tests.oracles import newton_euler
-from tests.oracles.point_laboratory import BOARD_THICKNESS, G, board_pose, cameras_of, pose_of
+from tests.oracles.point_laboratory import board_pose, cameras_of, pose_of
 
 SUB = 4  # rays per pixel and axis
 BLUR = 0.62  # [px] of the lens
@@ -72,8 +74,11 @@ def disc_image(camera, rays, R, t, rng):
     return exposed(grey + within(nearest - 0.5 * MA_2014.marker_diameter) * (INK - grey), rng)
 
 
-def write(folder, plan):
-    """A recording's folder; returns the true poses R (n, 3, 3), t (n, 3), and the cameras."""
+def write(folder, plan, declared):
+    """A recording's folder; returns the true poses R (n, 3, 3), t (n, 3), and the cameras.
+
+    declared : recording.toml of another recording of this disc, but for its squares and what is known of tolerances
+    """
     rng = np.random.default_rng([plan.seed, 7])
     cameras, target = cameras_of(plan, rng)
     duration = plan.n_frames / plan.frame_rate
@@ -88,30 +93,6 @@ def write(folder, plan):
             (folder / kind).mkdir(parents=True)
             for i, image in enumerate(images):
                 cv2.imwrite(str(folder / kind / f"{i:04d}.png"), image)
-    centres = [[1e3 * a, 1e3 * b] for a, b, _ in MA_2014.marker_centres_body.tolist()]
-    (folder / "recording.toml").write_text(
-        f"""name = "{folder.name}"
-[cameras]
-frame_rate_hz = {plan.frame_rate}
-left = "left/*.png"
-right = "right/*.png"
-[disc]
-radius_mm = {1e3 * MA_2014.radius}
-thickness_mm = {2e3 * MA_2014.half_thickness}
-mass_g = {1e3 * MA_2014.mass}
-[markers]
-diameter_mm = {1e3 * MA_2014.marker_diameter}
-centres_mm = {centres}
-[calibration]
-left = "calibration/left/*.png"
-right = "calibration/right/*.png"
-inner_corners = {[*plan.inner_corners]}
-square_mm = {1e3 * plan.square}
-[table]
-view = 0
-board_thickness_mm = {1e3 * BOARD_THICKNESS}
-[gravity]
-g_m_s2 = {G}
-"""
-    )
+    text = re.sub(".*_tolerance_mm = .*\n", "", declared)
+    (folder / "recording.toml").write_text(re.sub("square_mm = .*", f"square_mm = {1e3 * plan.square}", text))
     return R, t, cameras

@@ -7,11 +7,9 @@ import numpy as np
 import pytest
 
 from calibration.rig_file import read_rig
+from disctrack import FrameStatus, diagnose, read_trajectory
 from disctrack.cli import main
-from disctrack.diagnosis import diagnose
 from disctrack.diagnosis.recorded import with_declared_dots
-from disctrack.trajectory import FrameStatus
-from disctrack.trajectory.file import read_trajectory
 from tests.oracles import cast_images
 from tests.oracles.newton_euler import ZERO, classical_rolling_friction, of_the_paper, pivoting_friction
 from tests.oracles.point_laboratory import IDEAL, G, Plan, errors_and_variances, recorded
@@ -95,10 +93,11 @@ def test_what_is_planted_is_named_within_three_sigma_and_nothing_else(planted):
 
 
 @pytest.fixture(scope="module")
-def cast(tmp_path_factory):
+def cast(sample_clip, tmp_path_factory):
     """Frames of 320 x 320 pixels; what the command makes of them with squares as declared; poses, and cameras."""
     folder = tmp_path_factory.mktemp("cast") / "plain"
-    truth = cast_images.write(folder, Plan(1, 24, 320, 0.4, 14, square=6.5e-3, **IDEAL))
+    declared_there = (sample_clip / "recording.toml").read_text()
+    truth = cast_images.write(folder, Plan(1, 24, 320, 0.4, 14, square=6.5e-3, **IDEAL), declared_there)
     text = (folder / "recording.toml").read_text()
 
     def measured(declared="square_mm = 6.5"):
