@@ -35,6 +35,7 @@ class Disc:
     com_body: Sequence[float] = (0, 0, 0)
     edge: float = 0.0
     mu: float = np.inf
+    friction: Callable | None = None  # speed of slip -> coefficient, in place of mu
     laws: Sequence[Callable] = ()
     bowl: tuple | None = None  # centre and radius of a sphere that it rolls in
     waves: tuple = ()  # of the rim: (number around, cosine, sine) of its support function
@@ -159,11 +160,12 @@ def accelerations(disc, state, regime):
         A[6:9], b[6:9] = constraint, right
     elif regime == "slipping":
         A[6], b[6] = n @ constraint, n @ right - now.normal_rate @ now.v_contact
-        direction = now.v_contact / np.linalg.norm(now.v_contact)
+        speed = np.linalg.norm(now.v_contact)
+        direction, mu = now.v_contact / speed, disc.mu if disc.friction is None else disc.friction(speed)
         # F + mu N direction has no part in the table's plane
         for row, axis in ((7, np.array([1.0, 0, 0])), (8, np.array([0, 1.0, 0]))):
             axis = axis - (axis @ n) * n
-            A[row, 6:9] = axis + disc.mu * (axis @ direction) * n
+            A[row, 6:9] = axis + mu * (axis @ direction) * n
     else:
         A[6:9, 6:9] = np.eye(3)
     solution = np.linalg.solve(A, b)

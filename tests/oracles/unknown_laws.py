@@ -322,26 +322,16 @@ UNKNOWN: dict[str, Unknown] = {
     ),
     "dipole_below": Unknown(dipole(4e-9, (0.06, 0.05, -0.05))),
     "jet": Unknown(jet(2e-2, 1.0, 0.01, 0.02, 0.3)),
-    "force_and_rim": Unknown(
-        both(
-            force(lambda d, n: d.t * np.array([1.2e-3, -3.8e-3, 0.0])),
-            by_load(lambda d, n: -2e-4 * smooth((np.cos(n.phi - 1.0) - 0.5) / 0.1) * rolling(n)),
-        )
-    ),
-    "drag_and_steps": Unknown(
-        both(
-            force(lambda d, n: -0.012 * (n.v @ level(0.5)) * level(0.5)),
-            by_load(lambda d, n: -1.5e-4 * smooth((d.t - 0.35) / 0.005) * rolling(n)),
-        )
-    ),
     "pad": Unknown(  # a table that leans, as far as it gives way, to where the contact is
         force(lambda d, n: d.m * 9.81 * 2e-3 * np.tanh((contact(n)[0] - 0.03) / 0.02) * np.array([1.0, 0.0, 0.0]))
     ),
 }
+UNKNOWN["force_and_rim"] = Unknown(both(UNKNOWN["growing_force"].law, UNKNOWN["rough_rim"].law))
+UNKNOWN["drag_and_steps"] = Unknown(both(UNKNOWN["drag_one_way"].law, UNKNOWN["friction_steps"].law))
 
 
 class _Body(newton_euler.Disc):
-    """A disc with a number that its laws remember, a centre of mass that wanders, or friction by the speed of slip."""
+    """A disc with a number that its laws remember, or with a centre of mass that wanders."""
 
     memory = 0.0
 
@@ -350,7 +340,8 @@ class _Body(newton_euler.Disc):
         if unknown.law is not None:
             laws.append(unknown.law)
         self._unknown = unknown
-        super().__init__(DISC.radius, DISC.half_thickness, DISC.mass, laws=tuple(laws))
+        sizes = DISC.radius, DISC.half_thickness, DISC.mass
+        super().__init__(*sizes, laws=tuple(laws), friction=unknown.friction)
 
     def moved(self, t, state):
         """At an instant and a state."""
@@ -358,9 +349,6 @@ class _Body(newton_euler.Disc):
         if self._unknown.com is not None:
             self.com = np.array(self._unknown.com(t))
         self.r, self.wears = DISC.radius - self._unknown.wears * t, self._unknown.wears
-        if self._unknown.friction is not None:
-            now = newton_euler.Instant(self, state[:15])
-            self.mu = float(self._unknown.friction(np.linalg.norm(now.v_contact)))
         return self
 
 

@@ -15,9 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
-from disctrack.diagnosis import diagnose
+from disctrack import Model, diagnose
 from disctrack.diagnosis.errors import left_over, simulated
-from disctrack.rolling import Model
 from tests.oracles.required_wrench import required_wrench
 from tests.oracles.unknown_laws import UNKNOWN, Recording, recording
 

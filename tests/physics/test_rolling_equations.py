@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from scipy.integrate import simpson, solve_ivp
+from scipy.integrate import simpson
 
 from disctrack import rolling
 from disctrack.disc import MA_2014
@@ -187,30 +187,18 @@ def test_a_table_that_gives_way_follows_the_load_of_the_rigid_one(slip, c):
         assert (np.abs(derivative.dq[..., 0] * c - expected).max(axis=0) < 1500 * c * size).all()
 
 
-class _Creeping(newton_euler.Disc):
-    """A disc that slips all the time, on a film: friction in proportion to the speed of slip."""
-
-    c = 1.0
-
-    def moved(self, state):
-        self.mu = np.linalg.norm(newton_euler.Instant(self, state).v_contact) / self.c
-        return self
-
-
 @pytest.mark.statistical
 @pytest.mark.parametrize(("c", "most"), [(1e-3, 1e-4), (0.02, 1e-3)])
 def test_a_contact_that_creeps_is_one_that_slips_on_a_film(c, most):
     """The oracle slips with its inertia; ours follows the force by a series, by which 0.02 would err by a per cent."""
     rigid = model_with(K_M | COM_EFFECT)
     start = rolling.steady_precession(np.radians(16), MA_2014, omega3=1.5, nutation_amplitude=np.radians(1), psi=0.3)
-    oracle = _Creeping(laws=[KM_LAW], com_body=COM)
-    oracle.c = c
+    oracle = newton_euler.Disc(laws=[KM_LAW], com_body=COM, friction=lambda speed: speed / c)
     state = newton_euler.state_from_angles(oracle, *start.array)
     force = newton_euler.accelerations(oracle, state, "rolling")[2]
     state[7:9] -= c * force[:2] / force[2]
     times = np.linspace(0.0, 0.3, 301)
-    slips = lambda t, s: newton_euler.rate(oracle.moved(s), s, "slipping")  # noqa: E731
-    solution = solve_ivp(slips, (0.0, times[-1]), state, "LSODA", times, rtol=1e-10, atol=1e-12)
+    solution = newton_euler.follow(oracle, state, times, "slipping", rtol=1e-10, method="LSODA")
     expected = newton_euler.coordinates(oracle, solution.y)
     settled = 20  # ms, after which the slip follows its force
     now = newton_euler.Instant(oracle, solution.y[:, settled])
