@@ -52,19 +52,6 @@ def test_a_speed_has_a_slope_where_nothing_moves():
     assert smooth(sympy.sqrt(X**2 + 1), widths, {X, V}) == sympy.sqrt(X**2 + 1)  # the control: it never vanishes
 
 
-@pytest.mark.statistical
-def test_the_drag_of_a_thrown_ball_is_followed_from_rest(rng):
-    """Falling from rest: v = sqrt(g / c) tanh(sqrt(g c) t), by hand."""
-    g, c, time = 9.81, 0.02, np.linspace(0, 3, 200)
-    fallen = np.log(np.cosh(np.sqrt(g * c) * time)) / c
-    drag = "sqrt(vx**2 + vy**2 + vz**2)"
-    rates = {"x": "vx", "vx": f"-c*vx*{drag}", "y": "vy", "vy": f"-c*vy*{drag}", "z": "vz", "vz": f"g - c*vz*{drag}"}
-    data = {"x": 0 * time, "y": 0 * time, "z": fallen}
-    run = Run(time, {k: v + 1e-3 * rng.standard_normal(200) for k, v in data.items()})
-    answer = diagnose(Equations(rates, {"c": 0.03}, {"g": g}), run, ())
-    assert abs(answer.values["c"] - c) < 4 * answer.sigmas["c"]
-
-
 TIME = np.arange(0, 8, 0.02)
 DRAG = [terms.quadratic("w"), terms.viscous("w")]
 
