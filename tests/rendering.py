@@ -8,9 +8,8 @@ from functools import partial
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calibration.cameras.camera import StereoRig
-from disctrack.disc import Disc
-from disctrack.rolling import Model, simulate, steady_precession
+from calibration import StereoRig
+from disctrack import Disc, Model, simulate, steady_precession
 from disctrack.synthetic.description import Scene
 from disctrack.synthetic.images import expected_board_image, expected_disc_image, stages
 from disctrack.synthetic.sensor import digitise

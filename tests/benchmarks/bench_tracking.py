@@ -15,11 +15,10 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from calibration.cameras.camera import StereoRig
+from calibration import StereoRig
+from disctrack import Recording, Trajectory, measure, measure_pairs
 from disctrack.frames import rotation_from_quaternion, rotation_from_vector, vector_from_rotation
-from disctrack.recording.declaration import Recording
-from disctrack.track.measurement import ImagePairs, measure, measure_pairs
-from disctrack.trajectory import Trajectory
+from disctrack.track.measurement import ImagePairs
 
 # Counted in track/dots/_kernels.py: +, -, *, / and roots for a pixel of a dot, each time its model and the normal
 # equations are evaluated (edge distance 40, profile 25, model and derivatives 55, sums 90); and how often that is.

@@ -7,10 +7,9 @@ import cv2
 import numpy as np
 import pytest
 
-from calibration.cameras.camera import StereoRig
-from disctrack.calibrate.stage import calibrate_recording
-from disctrack.recording.declaration import Recording, read_recording
-from disctrack.track.measurement import ImagePairs, open_pairs
+from calibration import StereoRig
+from disctrack import Recording, calibrate_recording, open_pairs, read_recording
+from disctrack.track.measurement import ImagePairs
 
 MOST = 300  # pairs that are kept in memory
 

@@ -8,14 +8,13 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from calibration import Board, CalibrationSettings, Terms, calibrate_from_corners, refine_stereo
+from calibration import Board, BoardTolerances, CalibrationSettings, Terms, calibrate_from_corners, refine_stereo
 from calibration.fit.board_motion import BoardMotion, motions, split
 from calibration.fit.normal_equations import Problem
 from calibration.fit.priors import BEND, MISPRINT, STRETCH, board_prior, priors_of
 from calibration.fit.stereo_model import board_basis, moved, predict_pixels
 from calibration.judge.assessment import stereo_covariance
 from calibration.judge.pairs import motion_between_exposures
-from calibration.judge.tolerances import BoardTolerances
 from calibration.rig_file import read_rig_file, write_rig
 from calibration.stereo import _observations
 from tests.calibration.conftest import corner_view, squared

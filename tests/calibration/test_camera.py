@@ -7,16 +7,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from calibration.cameras.camera import (
-    N_RIG,
-    Camera,
-    StereoRig,
-    normalise,
-    normalised_maps,
-    project,
-    rotation_from_vector,
-    triangulate,
-)
+from calibration import Camera, StereoRig, triangulate
+from calibration.cameras.camera import N_RIG, normalise, normalised_maps, project, rotation_from_vector
 
 CAMERA = Camera(1500.0, 1510.0, 250.0, 260.0, (-0.11, 0.15, 1e-3, -2e-3, 0.02), (512, 512))
 

@@ -8,14 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from calibration import (
-    Board,
-    CalibrationSettings,
-    calibrate_from_corners,
-    calibrate_stereo,
-    find_corners,
-    triangulate,
-)
+from calibration import Board, CalibrationSettings, calibrate_from_corners, calibrate_stereo, find_corners, triangulate
 from calibration.judge.assessment import stereo_covariance
 from calibration.rig_file import read_rig_group
 from tests.calibration.conftest import squared

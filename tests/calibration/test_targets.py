@@ -14,15 +14,13 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from calibration import BoardNotFound, CalibrationError, CornerView
+from calibration import Board, BoardNotFound, CalibrationError, Camera, CornerView
 from calibration.board import chessboard
 from calibration.board.charuco import find_charuco
 from calibration.board.search import board_size, located, other_board
-from calibration.board.target import Board, CharucoBoard, target_of
-from calibration.cameras.camera import Camera
-from disctrack.calibrate.stage import calibrate_recording
+from calibration.board.target import CharucoBoard, target_of
+from disctrack import calibrate_recording, read_recording
 from disctrack.errors import RecordingError
-from disctrack.recording.declaration import read_recording
 
 CHARUCO = CharucoBoard((9, 6), 12e-3, 8.5e-3, "DICT_4X4_50")
 K = np.array([[620.0, 0.0, 201.0], [0.0, 615.0, 148.0], [0.0, 0.0, 1.0]])

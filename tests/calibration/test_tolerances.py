@@ -6,18 +6,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from calibration import Board
+from calibration import Board, BoardTolerances, Terms, refine_stereo
 from calibration.cameras.camera import N_RIG
-from calibration.fit.refinement import refine_stereo
-from calibration.fit.stereo_model import Terms
-from calibration.judge.tolerances import (
-    BoardShape,
-    BoardTolerances,
-    board_shape,
-    on_the_table,
-    rig_with_covariance,
-    with_tolerances,
-)
+from calibration.judge.tolerances import BoardShape, board_shape, on_the_table, rig_with_covariance, with_tolerances
 from disctrack.synthetic.cameras import rig_of
 from disctrack.synthetic.description import Scene
 

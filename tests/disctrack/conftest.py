@@ -5,9 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from calibration.cameras.camera import StereoRig
-from disctrack import frames
-from disctrack.disc import Disc
+from calibration import StereoRig
+from disctrack import Disc, frames
 from disctrack.synthetic.cameras import rig_of
 from disctrack.synthetic.description import Scene
 from tests.rendering import render_disc

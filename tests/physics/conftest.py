@@ -10,11 +10,10 @@ from functools import lru_cache
 import numpy as np
 
 from calibration.cameras.camera import N_RIG, Camera, StereoRig
-from disctrack import frames
+from disctrack import FrameStatus, Trajectory, frames
 from disctrack.analyse.derivatives import MotionState
 from disctrack.disc import MA_2014
 from disctrack.rolling import Model, Motion, simulate, steady_precession
-from disctrack.trajectory import FrameStatus, Trajectory
 
 
 @dataclass(frozen=True)

@@ -10,15 +10,14 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from disctrack import FrameStatus, Provenance, read_group, read_trajectory, run_analyse, write_trajectory
 from disctrack.analyse.analysis import analyse
-from disctrack.analyse.stage import run_analyse, write_analysis
+from disctrack.analyse.stage import write_analysis
 from disctrack.disc import MA_2014
 from disctrack.errors import AnalysisError, OutputError
 from disctrack.frames import continuous_quaternions, quaternion_from_rotation, rotation_from_euler
 from disctrack.numbers import measured
 from disctrack.track.measurement import at_full_length
-from disctrack.trajectory import FrameStatus
-from disctrack.trajectory.file import Provenance, read_group, read_trajectory, write_trajectory
 from tests.physics.conftest import as_tracked, true_motion
 
 

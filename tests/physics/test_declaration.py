@@ -11,7 +11,7 @@ import pytest
 from scipy.ndimage import gaussian_filter1d
 
 from calibration.cameras.camera import Camera, StereoRig, placed_at
-from disctrack import frames
+from disctrack import MarkerStatus, Trajectory, frames
 from disctrack.analyse.declaration import (
     balance,
     contradictions,
@@ -20,7 +20,6 @@ from disctrack.analyse.declaration import (
     unseen_dots,
 )
 from disctrack.findings import Kind, Severity
-from disctrack.trajectory import MarkerStatus, Trajectory
 from tests.physics.conftest import as_tracked, true_motion
 
 SIXTHS = np.radians(60.0 * np.arange(6))

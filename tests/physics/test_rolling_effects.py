@@ -4,18 +4,10 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from disctrack import rolling
+from disctrack import Model, State, rolling, steady_precession
 from disctrack.disc import MA_2014
 from disctrack.errors import ArgumentError, ModelError
-from disctrack.rolling import (
-    CATALOGUE,
-    EffectParameter,
-    Model,
-    State,
-    sensitivities,
-    steady_precession,
-    struck_disc,
-)
+from disctrack.rolling import CATALOGUE, EffectParameter, sensitivities, struck_disc
 from disctrack.rolling.effects.base import catalogue_table, effect
 from disctrack.rolling.effects.learned import effect_from_formulas
 from disctrack.rolling.equations import FLYING

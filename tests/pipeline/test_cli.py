@@ -17,13 +17,11 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from disctrack import open_pairs
+from disctrack import FrameStatus, open_pairs, read_trajectory
 from disctrack.cli import COMMANDS, main
 from disctrack.commands import INTERRUPTED
 from disctrack.disc import MA_2014
 from disctrack.synthetic.description import Scene, load_scene
-from disctrack.trajectory import FrameStatus
-from disctrack.trajectory.file import read_trajectory
 from tests.pipeline.conftest import linked
 
 QUICK = ["--no-figures", "--no-video"]

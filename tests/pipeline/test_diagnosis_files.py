@@ -7,12 +7,11 @@ import tomllib
 import numpy as np
 import pytest
 
+from disctrack import Provenance, diagnose, read_group, read_trajectory, write_trajectory
 from disctrack.cli import main
-from disctrack.diagnosis import diagnose
 from disctrack.diagnosis.evidence import evidence, force_of
 from disctrack.synthetic.description import load_scene
 from disctrack.synthetic.motion import simulate_scene
-from disctrack.trajectory.file import Provenance, read_group, read_trajectory, write_trajectory
 from tests.oracles.measured_disc import measured
 
 

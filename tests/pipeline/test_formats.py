@@ -10,15 +10,13 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from calibration.rig_file import read_rig
-from disctrack.calibrate.views import declared_views, find_views
+from disctrack import find_views, iter_pair_blocks, open_pairs, read_recording, read_trajectory
+from disctrack.calibrate.views import declared_views
 from disctrack.cli import main
 from disctrack.errors import RecordingError
 from disctrack.first_look.sequences import Sequence, pair_cameras
-from disctrack.recording.declaration import read_recording
-from disctrack.recording.readers.blocks import iter_pair_blocks
-from disctrack.track.measurement import open_pairs
 from disctrack.trajectory import part
-from disctrack.trajectory.file import read_details, read_trajectory
+from disctrack.trajectory.file import read_details
 from tests.disctrack.recording.readers.written import write_hdf5
 from tests.equality import assert_equal
 from tests.oracles.camera_files import write_mraw

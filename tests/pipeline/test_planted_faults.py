@@ -11,19 +11,16 @@ import pytest
 from scipy.spatial.distance import pdist
 
 from calibration.rig_file import read_rig
-from disctrack import frames
-from disctrack.disc import Disc, disc_from_mm
+from disctrack import Disc, FrameStatus, frames, open_frames, read_recording
+from disctrack.disc import disc_from_mm
 from disctrack.errors import TrackingError
 from disctrack.findings import Kind, in_doubt, leading
-from disctrack.recording.declaration import read_recording
-from disctrack.recording.readers import open_frames
 from disctrack.recording.readers.blocks import PairBlock
 from disctrack.synthetic.cameras import rig_of
 from disctrack.synthetic.description import Scene
 from disctrack.track.follow.tracking import Taken, TrackingSettings, track
 from disctrack.track.judge.disc_not_seen import arrangement_found, moved_camera, unlike_declared
 from disctrack.track.refine.scatter import MIN_FRAMES
-from disctrack.trajectory import FrameStatus
 from disctrack.validate.errors import compare
 from tests.disctrack.recording.readers.written import write_video
 from tests.oracles.planted_faults import FAULTS, glare

@@ -7,8 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from calibration.cameras.camera import rotation_from_vector
-from disctrack.analyse.derivatives import differentiate
-from disctrack.diagnosis import diagnose
+from disctrack import diagnose, differentiate, simulate
 from disctrack.diagnosis.model_file import declared_model, model_toml
 from disctrack.diagnosis.motion import measurement_candidates
 from disctrack.diagnosis.starts import first_state
@@ -16,7 +15,6 @@ from disctrack.faults.catalogue import scene_faults
 from disctrack.faults.dots import predict
 from disctrack.faults.keys import Faults
 from disctrack.frames import rotation_from_euler
-from disctrack.rolling import simulate
 from disctrack.synthetic.cameras import rig_after_faults, rig_of
 from disctrack.synthetic.description import load_scene
 from disctrack.synthetic.motion import rolling_model, rolling_start

@@ -6,12 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from disctrack.diagnosis import diagnose
+from disctrack import Provenance, diagnose, write_trajectory
 from disctrack.diagnosis.plan import Planner, Proposal
 from disctrack.diagnosis.recorded import Recorded
 from disctrack.diagnosis.together.recordings import diagnose_together
 from disctrack.synthetic.description import Scene
-from disctrack.trajectory.file import Provenance, write_trajectory
 from tests.oracles import newton_euler
 from tests.oracles.measured_disc import K_M, assert_sized, measured
 

@@ -9,10 +9,9 @@ import cv2
 import numpy as np
 import pytest
 
+from disctrack import open_frames, read_recording
 from disctrack.errors import OutputError, RecordingError
 from disctrack.files.inputs import open_regular, read_regular, refuse_input
-from disctrack.recording.declaration import read_recording
-from disctrack.recording.readers import open_frames
 from disctrack.recording.readers.raw import RawFile
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="pipes and devices lie elsewhere there")

@@ -16,9 +16,8 @@ import calibration
 import disctrack
 from calibration.kit import compiled
 from calibration.kit.compiled import njit
-from disctrack import cli
+from disctrack import cli, read_trajectory
 from disctrack.progress import compiling
-from disctrack.trajectory.file import read_trajectory
 
 ROOT = Path(disctrack.__file__).parents[1]
 

@@ -9,13 +9,12 @@ from numpy.testing import assert_allclose
 from scipy.ndimage import gaussian_filter
 
 from calibration.cameras.camera import normalised_maps
-from disctrack import frames
+from disctrack import MarkerStatus, frames
 from disctrack.synthetic.cameras import rig_of
 from disctrack.synthetic.description import Scene
 from disctrack.track.dots.template import NoiseModel, measure_noise
 from disctrack.track.dots.template_response import plane_to_image
 from disctrack.track.pose import marker_pixels
-from disctrack.trajectory import MarkerStatus
 from tests.disctrack.conftest import RenderedPairs, disc_on_table
 from tests.oracles.flat_dots import locate_on_disc, locate_on_plane
 from tests.rendering import expected_disc, render_disc

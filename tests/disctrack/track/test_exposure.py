@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from disctrack import frames, measure_pairs, rolling
+from disctrack import FrameStatus, frames, measure_pairs, rolling
 from disctrack.findings import Kind, Severity
 from disctrack.track.dots.template import NoiseModel
 from disctrack.track.dots.template_response import Edge
@@ -14,7 +14,6 @@ from disctrack.track.follow.tracking import TrackingSettings
 from disctrack.track.pose import marker_pixels
 from disctrack.track.refine import dot_shifts as smears
 from disctrack.track.refine.dot_shifts import shift_by_exposure, shift_by_glare
-from disctrack.trajectory import FrameStatus
 from tests.oracles.flat_dots import covered, locate_in_window
 from tests.rendering import render_disc
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from calibration.kit.stuck_pixels import stuck_pixels
-from disctrack import frames
+from disctrack import FrameStatus, MarkerStatus, frames
 from disctrack.errors import RecordingError, TrackingError
 from disctrack.findings import Kind
 from disctrack.recording.readers.blocks import PairBlock, Unreadable
@@ -19,7 +19,6 @@ from disctrack.track.follow.tracking import PAIRS_TRIED, Taken, _as_one_sensor, 
 from disctrack.track.measurement import refuse_unreadable
 from disctrack.track.pose import DotsInFrames
 from disctrack.track.refine.assembly import fit_all
-from disctrack.trajectory import FrameStatus, MarkerStatus
 from disctrack.validate.errors import compare
 from tests.oracles.point_laboratory import tables_of
 from tests.rendering import expected_disc, rolling_disc

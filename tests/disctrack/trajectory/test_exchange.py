@@ -13,19 +13,18 @@ import pytest
 from scipy.io import loadmat
 
 import disctrack
-from calibration import triangulate
-from calibration.cameras.camera import N_RIG, StereoRig, project
+from calibration import StereoRig, triangulate
+from calibration.cameras.camera import N_RIG, project
 from calibration.cameras.splines import LensField
 from calibration.rig_file import read_rig, write_rig
+from disctrack import Provenance, Trajectory, write_trajectory
 from disctrack.cli import main
 from disctrack.errors import OutputError, RigFileError
 from disctrack.frames import COORDINATES, rotation_from_euler
 from disctrack.synthetic.cameras import rig_of
 from disctrack.synthetic.description import Scene
-from disctrack.trajectory import Trajectory
 from disctrack.trajectory.exchange import arrays, formats, motion, rigs
 from disctrack.trajectory.exchange import points as point_tables
-from disctrack.trajectory.file import Provenance, write_trajectory
 from tests.disctrack.trajectory.test_file import make_trajectory
 
 

@@ -13,23 +13,13 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from calibration.cameras.camera import N_RIG, Allowance
 from calibration.cameras.splines import LensField
+from disctrack import FrameStatus, Provenance, Trajectory, read_group, read_trajectory, write_group, write_trajectory
 from disctrack.errors import OutputError, TrajectoryFileError
 from disctrack.files.labelled_arrays import Variable
 from disctrack.findings import DoubtWarning, Finding, Kind, Remedy, Severity, Subject
 from disctrack.frames import euler_from_rotation, rotation_from_euler, rotation_from_vector
 from disctrack.numbers import Measured
-from disctrack.trajectory import FrameStatus, Trajectory
-from disctrack.trajectory.file import (
-    Provenance,
-    kept_or_made,
-    read_findings,
-    read_group,
-    read_provenance,
-    read_trajectory,
-    write_group,
-    write_groups,
-    write_trajectory,
-)
+from disctrack.trajectory.file import kept_or_made, read_findings, read_provenance, write_groups
 from tests.equality import assert_equal
 from tests.oracles.measured_disc import measured
 

@@ -4,12 +4,9 @@ import cv2
 import numpy as np
 import pytest
 
-from disctrack.calibrate.views import find_views
+from disctrack import find_views, open_frames, open_pairs, read_recording
 from disctrack.errors import RecordingError
-from disctrack.recording.declaration import read_recording
-from disctrack.recording.readers import open_frames
 from disctrack.recording.readers.flat_field import flat_fields
-from disctrack.track.measurement import open_pairs
 from tests.disctrack.recording.readers.written import write_sequence
 from tests.disctrack.recording.test_recording import REFERENCE
 

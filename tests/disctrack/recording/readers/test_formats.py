@@ -14,10 +14,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from disctrack.errors import DiscTrackError, RecordingError
-from disctrack.recording.readers import open_frames
-from disctrack.recording.readers.base import FrameReader
-from disctrack.recording.readers.blocks import iter_pair_blocks
+from disctrack import DiscTrackError, FrameReader, iter_pair_blocks, open_frames
+from disctrack.errors import RecordingError
 from disctrack.recording.readers.decoding import decode
 from tests.disctrack.recording.readers.written import (
     CAMERAS,

@@ -13,10 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_array_equal
 
+from disctrack import FrameReader, iter_pair_blocks, open_frames
 from disctrack.errors import RecordingError
-from disctrack.recording.readers import open_frames
-from disctrack.recording.readers.base import FrameReader
-from disctrack.recording.readers.blocks import iter_pair_blocks
 from disctrack.recording.readers.decoding import decode
 from disctrack.recording.readers.same_instants import check_same_numbers, check_time_stamps, usable_times
 from tests.disctrack.recording.readers.written import write_sequence
