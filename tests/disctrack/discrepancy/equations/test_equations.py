@@ -640,6 +640,7 @@ def test_what_is_missing_is_named_and_sized(name, rng):
     notes = " ".join(answer.notes)
     assert told in notes
     assert name != "a noisy sensor of an arm at rest" or "stretches" not in notes
+    assert "delay_u.tau" not in sized or answer.sigmas["delay_u.tau"] < 1e-3
 
 
 @pytest.mark.statistical
