@@ -12,11 +12,9 @@ from disctrack.rolling import CATALOGUE, Model
 from disctrack.synthetic.description import CameraSettings, MotionSettings, RollingMotion, Scene
 from disctrack.track.pose import DotsInFrames
 from disctrack.validate import points
-from disctrack.validate.points import SIGMA_PX, Laboratory
+from disctrack.validate.points import SIGMA_PX
 
-__all__ = ["K_M", "SIGMA_PX", "Laboratory", "assert_sized", "dots_of", "measured", "system_of", "with_base_fit"]
-
-
+__all__ = ["SIGMA_PX"]
 K_M = CATALOGUE["km"]().values["k_m"]  # [m s^2] as published, known of to every diagnosis
 
 
@@ -61,6 +59,13 @@ def with_base_fit(trajectory, names=None, model="paper"):
     """The same, and its base fit."""
     system = system_of(trajectory, names, model)
     return system, fit(system, system.base, system.start())
+
+
+def assert_found(result, truth, sigmas, most=np.inf):
+    """A diagnosis found the effects of these numbers and no others, each number as below."""
+    found = {f.candidate.name for f in result.diagnosis.found}
+    assert found == {name.partition(".")[0] for name in truth}, result.sentence
+    assert_sized(result.diagnosis.after, truth, sigmas, most)
 
 
 def assert_sized(fit, truth, sigmas, most=np.inf):

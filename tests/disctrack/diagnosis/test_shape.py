@@ -8,7 +8,7 @@ from disctrack.discrepancy.fit import fit
 from disctrack.discrepancy.search import explain
 from disctrack.discrepancy.shape import profiled
 from disctrack.validate.hidden import HiddenCase, recorded
-from tests.oracles.measured_disc import assert_sized, measured, system_of, with_base_fit
+from tests.oracles.measured_disc import assert_found, assert_sized, measured, system_of, with_base_fit
 
 
 @pytest.mark.statistical
@@ -35,24 +35,21 @@ def test_an_exponent_that_cannot_be_seen_is_said_to_be_assumed():
 
 
 @pytest.mark.slow
-def test_a_law_beyond_the_declared_one_is_found_by_its_exponent():
-    """With p = 2.8 beside the k_m of p = 2 the law at its nominal p = 1.5 would have to be negative."""
-    hidden = {"rolling_power.k": 1.5e-4, "rolling_power.p": 2.8}
-    result = diagnose(measured(hidden, seed=71, n=400, theta_deg=8.0))
-    (found,) = result.diagnosis.found
-    assert found.candidate.name == "rolling_power"
-    assert_sized(result.diagnosis.after, {"rolling_power.p": 2.8}, 4)
+@pytest.mark.parametrize(
+    ("hidden", "sized", "told", "how"),
+    [
+        # beside the k_m of p = 2 the law at its nominal p = 1.5 would have to be negative
+        ({"k": 1.5e-4, "p": 2.8}, "rolling_power.p", "p = ", {"seed": 71, "theta_deg": 8.0}),
+        ({"k": 6e-5, "omega_s": 4.0}, "pivoting_contensou.omega_s", "", {"seed": 74}),
+    ],
+    ids=["an exponent beyond the declared one's", "the pivoting rate at which creep begins"],
+)
+def test_a_law_is_found_with_its_shape(hidden, sized, told, how):
+    name, _, shape = sized.partition(".")
+    result = diagnose(measured({f"{name}.{part}": value for part, value in hidden.items()}, n=400, **how))
+    assert_found(result, {sized: hidden[shape]}, 4)
     assert result.after.reduced_chi_square < 1.1
-    assert "p = " in result.sentence
-
-
-@pytest.mark.slow
-def test_the_pivoting_rate_at_which_creep_begins_is_measured():
-    hidden = {"pivoting_contensou.k": 6e-5, "pivoting_contensou.omega_s": 4.0}
-    result = diagnose(measured(hidden, seed=74, n=400))
-    (found,) = result.diagnosis.found
-    assert found.candidate.name == "pivoting_contensou"
-    assert_sized(result.diagnosis.after, {"pivoting_contensou.omega_s": 4.0}, 4)
+    assert told in result.sentence
     assert "pivoting_contensou.a" not in result.diagnosis.after.names  # without slip its radius does nothing
 
 
