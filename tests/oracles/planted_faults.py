@@ -1,7 +1,7 @@
 """Faults of a recording, planted into its images: what cameras, recorders, hands and lamps do to a measurement.
 
-Each takes images (n, 2, height, width) uint8, which it may change, where the disc is seen (n, 2, 2) [px] (x, y), and a
-generator; it returns the images and the frames' numbers among the untouched ones (n,), -1 where none can be told.
+Each takes images (n, 2, height, width) uint8, which it changes, where the disc is seen (n, 2, 2) [px] (x, y), and a
+generator. It returns the numbers of the frames that are kept; None: all of them.
 """
 
 from __future__ import annotations
@@ -15,21 +15,19 @@ def repeat(images, places, rng):
     i, back = int(rng.integers(6, len(images))), int(rng.integers(1, 4))
     cameras = [[0], [1], [0, 1]][rng.integers(3)]
     images[i, cameras] = images[i - back, cameras]
-    return images, np.arange(len(images))
 
 
 def drop(images, places, rng):
     """A camera leaves out a frame: from there on it is one frame ahead of the other."""
     i, camera = int(rng.integers(2, len(images) - 2)), int(rng.integers(2))
     images[i:-1, camera] = images[i + 1 :, camera].copy()
-    return images[:-1], np.arange(len(images) - 1)
+    return np.arange(len(images) - 1)
 
 
 def lose(images, places, rng):
     """Both cameras lose frames, and nobody tells: time shifts."""
     i, gone = int(rng.integers(8, len(images) - 12)), int(rng.integers(1, 5))
-    kept = np.r_[0:i, i + gone : len(images)]
-    return images[kept], kept
+    return np.r_[0:i, i + gone : len(images)]
 
 
 def reorder(images, places, rng):
@@ -37,21 +35,18 @@ def reorder(images, places, rng):
     i, apart = int(rng.integers(4, len(images) - 8)), int(rng.integers(1, 4))
     cameras = [[0], [1], [0, 1]][rng.integers(3)]
     images[np.ix_([i, i + apart], cameras)] = images[np.ix_([i + apart, i], cameras)]
-    return images, np.arange(len(images))
 
 
 def swap(images, places, rng):
     """Left and right are exchanged for some frames."""
     i, length = int(rng.integers(4, len(images) - 8)), int(rng.integers(1, 6))
     images[i : i + length] = images[i : i + length, ::-1].copy()
-    return images, np.arange(len(images))
 
 
 def mirror(images, places, rng):
     """A camera's images come mirrored for some frames."""
     i, length, camera = int(rng.integers(4, len(images) - 8)), int(rng.integers(1, 6)), int(rng.integers(2))
     images[i : i + length, camera] = images[i : i + length, camera, :, ::-1].copy()
-    return images, np.arange(len(images))
 
 
 def rescale(images, places, rng):
@@ -64,29 +59,27 @@ def rescale(images, places, rng):
         images[k, camera] = cv2.warpAffine(
             images[k, camera], matrix, (width, height), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
         )
-    return images, np.arange(len(images))
 
 
 def truncate(images, places, rng):
     """The lower part of an image never reached the disk."""
     i, camera = int(rng.integers(4, len(images))), int(rng.integers(2))
     images[i, camera, int(places[i, camera, 1] + rng.uniform(-40, 40)) :] = int(rng.choice([0, 128, 255]))
-    return images, np.arange(len(images))
 
 
 def glare(images, places, rng):
     """A lamp's reflection over part of an image, for some frames."""
-    return _over(images, places, rng, _glare)
+    _over(images, places, rng, _glare)
 
 
 def shadow(images, places, rng):
     """A shadow with its penumbra."""
-    return _over(images, places, rng, _shadow)
+    _over(images, places, rng, _shadow)
 
 
 def smear(images, places, rng):
     """A finger's mark, or dirt on the disc: some dark spots."""
-    return _over(images, places, rng, _spots)
+    _over(images, places, rng, _spots)
 
 
 def hide(images, places, rng):
@@ -103,26 +96,23 @@ def hide(images, places, rng):
             hidden = np.clip(0.5 + u / 2.0, 0, 1)
             grey = images[k, camera] * (1 - hidden) + (texture + rng.normal(0, 1.5, u.shape)) * hidden
             images[k, camera] = np.clip(np.rint(grey), 0, 255)
-    return images, np.arange(len(images))
 
 
 def dim(images, places, rng):
     """Little light: some 40 grey values between ink and paper."""
-    return np.rint(110 + 0.24 * (images - 110.0)).astype(np.uint8), np.arange(len(images))
+    images[:] = np.rint(110 + 0.24 * (images - 110.0))
 
 
 def blur(images, places, rng):
     """A lens out of focus by a pixel and a half."""
-    flat = images.reshape(-1, *images.shape[2:])
-    return np.stack([cv2.GaussianBlur(image, (0, 0), 1.5) for image in flat]).reshape(images.shape), np.arange(
-        len(images)
-    )
+    for image in images.reshape(-1, *images.shape[2:]):
+        image[:] = cv2.GaussianBlur(image, (0, 0), 1.5)
 
 
 def flicker(images, places, rng):
     """A lamp at 100 Hz, of 1000 pairs a second."""
     light = 0.8 + 0.2 * np.sin(2 * np.pi * 0.1 * np.arange(len(images)) + rng.uniform(0, 6))
-    return np.rint(images * light[:, None, None, None]).astype(np.uint8), np.arange(len(images))
+    images[:] = np.rint(images * light[:, None, None, None])
 
 
 def stick(images, places, rng):
@@ -132,7 +122,6 @@ def stick(images, places, rng):
         where = rng.permutation(pixels.shape[1])[:500]
         pixels[:, where[::2]], pixels[:, where[1::2]] = 255, 0
         images[:, camera] = pixels.reshape(images[:, camera].shape)
-    return images, np.arange(len(images))
 
 
 FAULTS = (repeat, drop, lose, reorder, swap, mirror, rescale, truncate, glare, shadow, smear, hide, dim, blur, flicker)
@@ -148,7 +137,6 @@ def _over(images, places, rng, change):
     for k in range(i, i + length):
         u, v = x - places[k, camera, 0] - where[0], y - places[k, camera, 1] - where[1]
         images[k, camera] = np.clip(np.rint(paint(images[k, camera].astype(float), u, v)), 0, 255)
-    return images, np.arange(len(images))
 
 
 def _glare(rng):
