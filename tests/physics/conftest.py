@@ -17,16 +17,10 @@ from disctrack.rolling import Model, Motion, simulate, steady_precession
 
 
 @dataclass(frozen=True)
-class TrueMotion:
+class TrueMotion(MotionState):
     """Motion known to round-off, at n instants; world axes, SI."""
 
     time: np.ndarray
-    position: np.ndarray
-    R: np.ndarray
-    velocity: np.ndarray
-    omega: np.ndarray
-    acceleration: np.ndarray
-    alpha: np.ndarray
     euler: np.ndarray
     rates: np.ndarray  # psidot, thetadot, phidot, omega_3
 
@@ -35,11 +29,6 @@ class TrueMotion:
 
     def __len__(self) -> int:
         return len(self.time)
-
-    @property
-    def state(self) -> MotionState:
-        """What quantities are derived from."""
-        return MotionState(self.position, self.R, self.velocity, self.omega, self.acceleration, self.alpha)
 
 
 @lru_cache(maxsize=16)
@@ -56,11 +45,11 @@ def of_simulation(made: Motion) -> TrueMotion:
     return TrueMotion(
         time=made.time,
         position=made.q[:, :3],
-        R=frames.rotation_from_euler(*made.q[:, 3:].T),
+        R_world_body=frames.rotation_from_euler(*made.q[:, 3:].T),
         velocity=made.qdot[:, :3],
-        omega=made.omega_world,
+        omega_world=made.omega_world,
         acceleration=made.acceleration_world,
-        alpha=made.angular_acceleration_world,
+        alpha_world=made.angular_acceleration_world,
         euler=made.q[:, 3:],
         rates=np.column_stack([made.qdot[:, 3:], made.state[:, 7]]),
     )
@@ -83,7 +72,7 @@ def as_tracked(truth: TrueMotion, rng, missing=(), noise=1.0, sensitivity=None, 
     n = len(truth)
     P = noise**2 * pose_covariance()
     error = rng.multivariate_normal(np.zeros(6), P, n, method="cholesky") if noise else np.zeros((n, 6))
-    R = frames.rotation_from_vector(error[:, 3:]) @ truth.R
+    R = frames.rotation_from_vector(error[:, 3:]) @ truth.R_world_body
     position = truth.position + error[:, :3]
     status = np.full(n, FrameStatus.MEASURED, np.uint8)
     missing = list(missing)

@@ -77,7 +77,7 @@ def test_recording_that_runs_on_after_the_end_gives_what_one_that_ends_there_giv
         truth,
         time=truth.time[0] + np.arange(n) * 1e-3,
         position=position,
-        R=rotation_from_euler(*euler.T),
+        R_world_body=rotation_from_euler(*euler.T),
         euler=euler,
     )
     free = analyse(as_tracked(truth, np.random.default_rng(1)))
@@ -116,7 +116,7 @@ def test_disc_at_rest_gives_no_rates_and_no_exponents(tilt_deg, rng):
     base, tilt = true_motion(theta_deg=9, duration=3.0)[:300], np.radians(tilt_deg)
     place = [0.05, 0.04, MA_2014.radius * np.sin(tilt) + MA_2014.half_thickness * np.cos(tilt)]
     R = rotation_from_euler(0.3, tilt, 0.1)
-    still = replace(base, position=np.tile(place, (300, 1)), R=np.tile(R, (300, 1, 1)))
+    still = replace(base, position=np.tile(place, (300, 1)), R_world_body=np.tile(R, (300, 1, 1)))
     analysis = analyse(as_tracked(still, rng))
     assert not analysis.laws.determined
     assert np.isnan(analysis.laws.n_theta.value)

@@ -133,8 +133,9 @@ def test_a_hand_that_turns_the_disc_and_a_disc_at_rest_give_no_verdict():
     psi = 20.0 * motion.time
     axes = np.stack([np.cos(psi), np.sin(psi), 0 * psi], -1)
     e3 = np.stack([np.sin(psi) * 0.2, -np.cos(psi) * 0.2, np.full(len(psi), np.sqrt(0.96))], -1)
-    held = replace(motion, R=np.stack([axes, np.cross(e3, axes), e3], -1), position=motion.position[:1] + 0 * e3)
-    resting = replace(held, R=np.broadcast_to(held.R[0], held.R.shape))
+    R = np.stack([axes, np.cross(e3, axes), e3], -1)
+    held = replace(motion, R_world_body=R, position=motion.position[:1] + 0 * e3)
+    resting = replace(held, R_world_body=np.broadcast_to(R[0], R.shape))
     for motion in (held, resting):
         assert not [f for f in contradictions(as_tracked(motion, np.random.default_rng(3))) if f.kind != Kind.RADIUS]
 
@@ -155,11 +156,11 @@ def test_no_hand_is_taken_for_a_wrong_number(memory_ms):
         R = frames.rotation_from_vector(wander(rng, rng.uniform(0.02, 0.3))) @ start
         position = wander(rng, 5e-3) + np.array([0.05, 0.04, 0.05])
         for before in (0, 150):
-            parts = {"R": R, "position": position, "time": 1e-3 * np.arange(before, before + len(R))}
+            parts = {"R_world_body": R, "position": position, "time": 1e-3 * np.arange(before, before + len(R))}
             joined = {k: np.concatenate([getattr(rolled, k)[:before], v]) for k, v in parts.items()}
             found = contradictions(as_tracked(replace(rolled, **joined), rng))
             assert {finding.kind for finding in found} <= {Kind.CLOCK_JUMP}  # from rolling to the hand in one frame
-        still = replace(rolled, R=np.tile(start, (150, 1, 1)), position=np.tile(position[0], (150, 1)))
+        still = replace(rolled, R_world_body=np.tile(start, (150, 1, 1)), position=np.tile(position[0], (150, 1)))
         assert contradictions(as_tracked(still, rng, noise=0.0)) == ()
 
 

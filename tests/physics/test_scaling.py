@@ -34,7 +34,7 @@ def known_law(n, rng, nutation=0.1, duration=0.6, unseen=0.03):
 
 
 def of_motion(truth):
-    E = quantities(truth.state, MA_2014, 9.81)[:, COLUMN["total"]]
+    E = quantities(truth, MA_2014, 9.81)[:, COLUMN["total"]]
     return truth.time, truth.euler[:, 0], truth.euler[:, 1], truth.rates[:, 0], E
 
 
