@@ -82,6 +82,33 @@ def scene_maker():
     return make_scene
 
 
+PAD = 4  # pixels round an image that are drawn, too
+
+
+def rays_of(camera, sub):
+    """x and y where z is 1, each ((height + 2 PAD) sub, (width + 2 PAD) sub), of sub x sub rays per pixel."""
+    x, y = ((np.arange((n + 2 * PAD) * sub) + 0.5) / sub - 0.5 - PAD for n in camera.image_size)
+    k1, k2, p1, p2, k3 = camera.distortion
+    xd, yd = np.meshgrid((x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy)
+    a, b = xd, yd
+    for _ in range(6):  # the inverse of weak distortion by repeated substitution
+        r2 = a * a + b * b
+        f = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        a, b = (xd - 2 * p1 * a * b - p2 * (r2 + 2 * a * a)) / f, (yd - p1 * (r2 + 2 * b * b) - 2 * p2 * a * b) / f
+    return a, b
+
+
+def exposed(grey, sub, sigma, rng):
+    """Image of what such rays meet (float32): blur of sigma [px], mean over the pixel; with rng noise and rounding."""
+    height, width = (n // sub for n in grey.shape)
+    soft = cv2.GaussianBlur(grey, (0, 0), sigma * sub).reshape(height, sub, width, sub)
+    image = soft.mean((1, 3), dtype=float)[PAD:-PAD, PAD:-PAD]
+    if rng is None:
+        return image
+    noisy = image + rng.normal(size=image.shape) * np.sqrt(0.65 + 0.02 * image)
+    return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
+
+
 def draw_board(camera, R, t, board, sub=4, sigma=0.6, light=200.0, dark=20.0, table=80.0, rng=None, rim=1.6) -> Array:
     """Image of a chessboard, drawn without any corner model.
 
@@ -90,18 +117,7 @@ def draw_board(camera, R, t, board, sub=4, sigma=0.6, light=200.0, dark=20.0, ta
 
     Without rng: exact grey values, float.
     """
-    pad = 4
-    width, height = (n + 2 * pad for n in camera.image_size)
-    offsets = (np.arange(sub) + 0.5) / sub - 0.5 - pad
-    x = (np.arange(width)[:, None] + offsets).ravel()
-    y = (np.arange(height)[:, None] + offsets).ravel()
-    k1, k2, p1, p2, k3 = camera.distortion
-    xd, yd = np.meshgrid((x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy)
-    a, b = xd, yd
-    for _ in range(6):  # the inverse of weak distortion by repeated substitution
-        r2 = a * a + b * b
-        f = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        a, b = (xd - 2 * p1 * a * b - p2 * (r2 + 2 * a * a)) / f, (yd - p1 * (r2 + 2 * b * b) - 2 * p2 * a * b) / f
+    a, b = rays_of(camera, sub)
     normal = R[:, 2]
     depth = (normal @ t) / (a * normal[0] + b * normal[1] + normal[2])
     points = np.stack([a * depth - t[0], b * depth - t[1], depth - t[2]])
@@ -111,12 +127,7 @@ def draw_board(camera, R, t, board, sub=4, sigma=0.6, light=200.0, dark=20.0, ta
     paper = (-rim - 1 < X) & (columns + rim > X) & (-rim - 1 < Y) & (rows + rim > Y)
     ink = 0.5 * (1 + _stripes(X) * _stripes(Y))  # the square outside corner (0, 0) is dark
     grey = np.where(paper, light + np.where(inside, ink, 0) * (dark - light), table).astype(np.float32)
-    grey = cv2.GaussianBlur(grey, (0, 0), sigma * sub)
-    image = grey.reshape(height, sub, width, sub).mean((1, 3), dtype=float)[pad:-pad, pad:-pad]
-    if rng is None:
-        return image
-    noisy = image + rng.normal(size=image.shape) * np.sqrt(0.65 + 0.02 * image)
-    return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
+    return exposed(grey, sub, sigma, rng)
 
 
 def _stripes(X: Array) -> Array:

@@ -1,7 +1,7 @@
 """Images of the laboratory of points, by ray casting that has no part in the product's renderer.
 
 Each camera's rays, SUB x SUB a pixel, are cast backwards on to the table, the board and the disc; what they meet is
-blurred there and gathered to pixels. The lenses have no residual field.
+blurred there and gathered to pixels, as boards are for the tests of the corners. The lenses have no residual field.
 """
 
 import re
@@ -9,24 +9,14 @@ import re
 import cv2
 import numpy as np
 
+from calibration import Board, Camera
 from disctrack.disc import MA_2014
+from tests.calibration.conftest import draw_board, exposed, rays_of
 from tests.oracles import newton_euler
 from tests.oracles.point_laboratory import board_pose, cameras_of, pose_of
 
-SUB = 4  # rays per pixel and axis
-BLUR = 0.62  # [px] of the lens
+SUB, BLUR = 4, 0.62  # rays per pixel and axis; of the lens [px]
 TABLE, RIM, PAPER, INK, BLACK, WHITE = 85, 58, 190, 25, 20, 200  # grey values
-
-
-def rays_of(camera):
-    """(2, size SUB, size SUB): x and y where z is 1."""
-    fine = (np.arange(camera.size * SUB) + 0.5) / SUB - 0.5
-    distorted = (np.stack(np.meshgrid(fine, fine)) - camera.middle[:, None, None]) / camera.focal
-    ray = distorted
-    for _ in range(12):
-        r2 = np.sum(ray * ray, axis=0)
-        ray = distorted / (1 + r2 * (camera.k1 + r2 * camera.k2))
-    return ray
 
 
 def on_plane(camera, rays, R, t, height):
@@ -42,27 +32,6 @@ def within(distance):
     return np.clip(0.5 - distance / np.hypot(*np.gradient(distance)), 0, 1)
 
 
-def exposed(fine, rng):
-    """Grey values (uint8) of pixels, from those of sub-pixels: blur, and a sensor's noise."""
-    soft = cv2.GaussianBlur(fine, (0, 0), BLUR * SUB, borderType=cv2.BORDER_REPLICATE)
-    grey = soft.reshape(len(soft) // SUB, SUB, -1, SUB).mean((1, 3))
-    noisy = grey + rng.normal(size=grey.shape) * np.sqrt(0.64 + grey / 50)
-    return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
-
-
-def board_image(camera, rays, plan, R, t, rng):
-    """One view of the board; R, t of its printed face, with the origin at the first corner."""
-    x, y = (v / plan.square for v in on_plane(camera, rays, R, t, 0.0))
-
-    def side(cell):  # +1 and -1 in turn
-        return (1 - 2 * within(np.abs(cell - 2 * np.rint(0.5 * cell)) - 0.5 + 1e-12)) * -1
-
-    last = np.array(plan.inner_corners) - 1
-    beyond = np.maximum(np.maximum(-1 - x, x - last[0] - 1), np.maximum(-1 - y, y - last[1] - 1))
-    black = (0.5 + 0.5 * side(x - 0.5) * side(y - 0.5)) * within(beyond)
-    return exposed(TABLE + within(beyond - 1) * (WHITE + (BLACK - WHITE) * black - TABLE), rng)
-
-
 def disc_image(camera, rays, R, t, rng):
     """One image of the disc of Ma et al. at R, t."""
     grey, h = np.full(rays[0].shape, float(TABLE)), MA_2014.half_thickness
@@ -71,7 +40,8 @@ def disc_image(camera, rays, R, t, rng):
         grey += within(np.hypot(x, y) - MA_2014.radius) * (RIM - grey)
     grey += within(np.hypot(x, y) - MA_2014.radius + 1.5e-3) * (PAPER - grey)
     nearest = np.min([np.hypot(x - a, y - b) for a, b, _ in MA_2014.marker_centres_body], axis=0)
-    return exposed(grey + within(nearest - 0.5 * MA_2014.marker_diameter) * (INK - grey), rng)
+    grey += within(nearest - 0.5 * MA_2014.marker_diameter) * (INK - grey)
+    return exposed(grey.astype(np.float32), SUB, BLUR, rng)
 
 
 def write(folder, plan, declared):
@@ -84,10 +54,14 @@ def write(folder, plan, declared):
     duration = plan.n_frames / plan.frame_rate
     spline = newton_euler.filmed_motion(plan.disc, 12.0, 1.5, duration, plan.frame_rate, psi=2.6)
     R, t = pose_of(spline(np.arange(plan.n_frames) / plan.frame_rate))
+    board = Board(plan.inner_corners, plan.square)
     boards = [board_pose(view, plan, target, rng) for view in range(plan.n_views)]
     for name, camera in zip(("left", "right"), cameras, strict=True):
-        rays = rays_of(camera)
-        views = [board_image(camera, rays, plan, *pose, rng) for pose in boards]
+        lens = (camera.focal, camera.focal, *camera.middle, (camera.k1, camera.k2, 0.0, 0.0, 0.0))
+        view = Camera(*lens, (camera.size, camera.size))
+        faces = [(camera.R @ R_board, camera.R @ (t_board - camera.place)) for R_board, t_board in boards]
+        views = [draw_board(view, *face, board, SUB, BLUR, WHITE, BLACK, TABLE, rng, rim=1.0) for face in faces]
+        rays = rays_of(view, SUB)
         frames = [disc_image(camera, rays, *pose, rng) for pose in zip(R, t, strict=True)]
         for kind, images in ((f"calibration/{name}", views), (name, frames)):
             (folder / kind).mkdir(parents=True)
