@@ -1,5 +1,6 @@
 """The commands: one line runs the measurement, a second reuses it, the summary tells; bad input ends in one line."""
 
+import contextlib
 import csv
 import errno
 import json
@@ -369,26 +370,33 @@ def test_a_recording_folder_that_is_read_only(recording, monkeypatch, capsys, co
     assert "-o" in message
 
 
+@pytest.fixture
+def run_doing(monkeypatch, capsys):
+    """Exit code and errors of `disctrack run` that does this instead, where a signal is handled so beforehand."""
+
+    def run(what, kind, handler):
+        monkeypatch.setattr("disctrack.commands.run.run", what)
+        before = signal.signal(kind, handler)
+        try:
+            code, told = main(["run", "x"]), capsys.readouterr().err
+            assert signal.getsignal(kind) is handler
+        finally:
+            signal.signal(kind, before)
+        return code, told
+
+    return run
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="signals are POSIX")
 @pytest.mark.parametrize("struck", [True, False])
-def test_ctrl_c_that_a_library_turns_into_its_own_error_is_told_as_ctrl_c(recording, monkeypatch, capsys, struck):
-    from disctrack.commands import run as command
-
+def test_ctrl_c_that_a_library_turns_into_its_own_error_is_told_as_ctrl_c(run_doing, struck):
     def loaded(arguments):
-        try:
+        with contextlib.suppress(KeyboardInterrupt):
             if struck:
                 signal.raise_signal(signal.SIGINT)
-        except KeyboardInterrupt:
-            pass
         raise ImportError("initialization failed")
 
-    monkeypatch.setattr(command, "run", loaded)
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background has it ignored
-    try:
-        code, told = main(["run", str(recording)]), capsys.readouterr().err
-        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    finally:
-        signal.signal(signal.SIGINT, before)
+    code, told = run_doing(loaded, signal.SIGINT, signal.default_int_handler)  # a job in the background has it ignored
     assert (code == INTERRUPTED) == ("interrupted" in told) == struck
     assert ("internal error" in told) == (not struck)
 
@@ -396,10 +404,8 @@ def test_ctrl_c_that_a_library_turns_into_its_own_error_is_told_as_ctrl_c(record
 @pytest.mark.skipif(sys.platform == "win32", reason="signals are POSIX")
 @pytest.mark.parametrize("kind", [signal.SIGTERM, signal.SIGHUP])
 @pytest.mark.parametrize("ignored", [False, True])
-def test_what_queueing_systems_and_closed_terminals_send_ends_in_order(recording, monkeypatch, capsys, kind, ignored):
+def test_what_queueing_systems_and_closed_terminals_send_ends_in_order(run_doing, kind, ignored):
     """In one line and with the code of a shell; not where the caller ignores it, as nohup does."""
-    from disctrack.commands import run as command
-
     ended: list[str] = []
 
     def going_on(arguments):
@@ -409,14 +415,7 @@ def test_what_queueing_systems_and_closed_terminals_send_ends_in_order(recording
             ended.append("cleared up")
         return 0
 
-    monkeypatch.setattr(command, "run", going_on)
-    chosen = signal.SIG_IGN if ignored else signal.SIG_DFL
-    before = signal.signal(kind, chosen)
-    try:
-        code, told = main(["run", str(recording)]), capsys.readouterr().err
-        assert signal.getsignal(kind) is chosen
-    finally:
-        signal.signal(kind, before)
+    code, told = run_doing(going_on, kind, signal.SIG_IGN if ignored else signal.SIG_DFL)
     assert ended == ["cleared up"]
     assert code == (0 if ignored else 128 + kind)
     assert told.count("\n") == (not ignored)

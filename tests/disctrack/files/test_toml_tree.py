@@ -1,44 +1,27 @@
 """Settings survive their TOML, whatever they hold."""
 
 import tomllib
-from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
 
 from disctrack.errors import RecordingError
+from disctrack.faults.keys import Faults, Occluder
 from disctrack.files.toml_tree import build, read_toml, toml_lines, toml_value
-
-
-@dataclass(frozen=True)
-class Inner:
-    on: bool = True
-    share: float = 0.5
-
-
-@dataclass(frozen=True)
-class Outer:
-    title: str = "x"
-    off: bool = False
-    pairs: tuple[tuple[float, float], ...] = ()
-    named: dict[str, float] = field(default_factory=dict)
-    inner: Inner = field(default_factory=Inner)
-    many: tuple[Inner, ...] = ()
+from disctrack.synthetic.description import CameraSettings, MarkerSettings, MotionSettings, RollingMotion, Scene
 
 
 @pytest.mark.parametrize(
     "title", ["", 'a "b" \\ c', "ψ̇ µm", "disc \U0001d703 \U0001f4bf", "tab\tline\nend\x00\x1f\x7f"]
 )
 def test_settings_survive_their_text(title):
-    settings = Outer(
-        title,
-        True,
-        ((1.0, 1e7), (-0.0, 1e-300)),
-        {title or "k": 2.0},
-        Inner(False, float(np.float64(0.1))),
-        (Inner(), Inner(False)),
-    )
-    assert build(Outer, tomllib.loads("\n".join(toml_lines(settings))), "test") == settings
+    settings = Scene(
+        title, cameras=CameraSettings(frame_rate_hz=float(np.float64(0.1))),
+        markers=MarkerSettings(centres_mm=((1.0, 1e7), (-0.0, 1e-300))),
+        motion=MotionSettings(rolling=RollingMotion(effects={title or "k": {"k": 2.0}})),
+        faults=Faults(occluders=(Occluder(), Occluder(last_frame=7))),
+    )  # fmt: skip
+    assert repr(build(Scene, tomllib.loads("\n".join(toml_lines(settings))), "test")) == repr(settings)  # nan is nan
 
 
 def test_numbers_of_numpy_are_numbers():
