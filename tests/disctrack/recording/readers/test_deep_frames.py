@@ -6,23 +6,15 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from calibration.cameras.camera import StereoRig
+from disctrack import measure_pairs
 from disctrack.commands.sample import SCENE
-from disctrack.disc import Disc
-from disctrack.recording.readers.blocks import PairBlock
 from disctrack.synthetic.cameras import rig_of
 from disctrack.synthetic.description import Scene, load_scene
 from disctrack.synthetic.motion import motion_of
-from disctrack.track.follow.tracking import Taken, Tracking, track
 from disctrack.track.video_overlay import draw_pair
 from tests.rendering import render_disc
 
 N = 24
-
-
-def follow(images: np.ndarray, rig: StereoRig, disc: Disc) -> Tracking:
-    taken = Taken(range(len(images)), 1000.0)
-    return track(lambda a, b: [PairBlock(np.arange(a, b), images[a:b], ())], taken, rig, disc)
 
 
 def dim_scene(light: float) -> Scene:
@@ -48,13 +40,13 @@ def dim():
 
 @pytest.fixture(scope="module")
 def plain(dim):
-    return follow(*dim[:3])
+    return measure_pairs(*dim[:3], 1000.0)
 
 
 @pytest.mark.parametrize("scale", [16, 13])
 def test_poses_do_not_depend_on_the_unit_of_grey(dim, plain, scale):
     images, rig, disc, _ = dim
-    scaled = follow(images * np.uint16(scale), rig, disc)
+    scaled = measure_pairs(images * np.uint16(scale), rig, disc, 1000.0)
     # metres and radians; the same sums in other units, so round-off only
     assert_allclose(scaled.trajectory.q, plain.trajectory.q, rtol=0, atol=1e-9)
     assert_allclose(scaled.trajectory.pose_covariance, plain.trajectory.pose_covariance, rtol=1e-6)
@@ -65,7 +57,7 @@ def test_twelve_bits_scatter_less_than_the_same_frames_rounded_to_eight(dim, pla
     images, rig, disc, centres = dim
     eight = np.rint(images * (255 / 4095)).astype(np.uint8)
     assert 10 < eight.max() < 20  # the premise: rounding to whole grey values of 8 bits is felt
-    followed = (plain, follow(eight, rig, disc))
+    followed = (plain, measure_pairs(eight, rig, disc, 1000.0))
     errors = [np.std(tracking.trajectory.q[:, :3] - centres, axis=0) for tracking in followed]
     # measured 0.5 on 60 frames; the ratio of two standard deviations of 24 scatters by 0.2 of itself, the mean by 0.12
     assert np.mean(errors[0] / errors[1]) < 0.75
