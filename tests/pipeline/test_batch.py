@@ -14,9 +14,11 @@ import subprocess
 import sys
 import threading
 import time
-from concurrent.futures import Future
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from multiprocessing.context import SpawnProcess
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import h5py
@@ -59,19 +61,10 @@ def jobs_of(folder: Path, **options):
 def in_this_process(monkeypatch):
     """No processes of its own, where a test is about something else: starting them takes longer than measuring."""
 
-    class Here:
-        def __init__(self, size):
-            self.size = size
-
-        def submit(self, job):
-            future = Future()
-            future.set_result(stage.do(job))
-            return future
-
-        def close(self):
-            pass
-
-    monkeypatch.setattr("disctrack.batch.run.Processes", Here)
+    with ThreadPoolExecutor(1) as pool:
+        here = partial(SimpleNamespace, submit=partial(pool.submit, stage.do), close=lambda: None)
+        monkeypatch.setattr("disctrack.batch.run.Processes", lambda size: here(size=size))
+        yield
 
 
 @pytest.mark.statistical
