@@ -23,7 +23,6 @@ from disctrack.track.measurement import ImagePairs
 # Counted in track/dots/_kernels.py: +, -, *, / and roots for a pixel of a dot, each time its model and the normal
 # equations are evaluated (edge distance 40, profile 25, model and derivatives 55, sums 90); and how often that is.
 OPERATIONS, EVALUATIONS = 210, 4
-DOT_MARGIN_PX = 6  # of a dot's window beyond its rim
 ROUNDS = 5
 
 pytestmark = [pytest.mark.slow, pytest.mark.benchmark(group="all pairs of the recording")]
@@ -100,7 +99,7 @@ def dot_pixels(trajectory: Trajectory) -> float:
     for row in np.flatnonzero(trajectory.measured)[::10]:
         R, t = rotation_from_quaternion(trajectory.quaternion[row]), trajectory.q[row, :3]
         seen = rig.project(((disc.marker_centres_body[:, None] + circle) @ R.T + t).reshape(-1, 3))
-        size = np.ptp(seen.reshape(2, disc.n_markers, len(angle), 2), axis=2) + 2 * DOT_MARGIN_PX
+        size = np.ptp(seen.reshape(2, disc.n_markers, len(angle), 2), axis=2) + 2 * 6  # px of a window beyond the rim
         found.append(np.nansum(size.prod(axis=-1)))
     return float(np.median(found))
 

@@ -80,7 +80,6 @@ def write_mraw(stem: Path, images: np.ndarray, bits: int, *, kind: str = "cih", 
     return header
 
 
-SETUP_BYTES = 12432
 TRIGGER = (0x40000000 | 1, 1_700_000_000)  # a quarter second after the whole one; lowest bit: no common time signal
 
 
@@ -98,7 +97,7 @@ def write_cine(
     notes: tuple[int, ...] = (8,),
     compression: int = 0,
     packing: int | None = None,
-    setup_bytes: int = SETUP_BYTES,
+    setup_bytes: int = 12432,
     **setup: int,
 ) -> Path:
     """Write images (n, height, width) of stored codes as a cine; returns the file.

@@ -272,10 +272,7 @@ def test_velocity_that_happens_to_be_that_of_rolling_starts_rolling():
     assert (motion.regime == Regime.ROLLING).all()
 
 
-TABLE_1 = [(0.020, 0.0105), (0.010, 0.0175), (0.020, 0.0175), (0.020, 0.0225)]
-
-
-@pytest.mark.parametrize(("a", "b"), TABLE_1)
+@pytest.mark.parametrize(("a", "b"), [(0.020, 0.0105), (0.010, 0.0175), (0.020, 0.0175), (0.020, 0.0225)])
 @pytest.mark.parametrize("friction", [0.0, 0.2])
 def test_impact_balances_momentum_and_the_edge_does_not_go_down(a, b, friction):
     P, psi = 0.05, 0.6

@@ -146,14 +146,16 @@ def test_an_error_of_the_lens_model_would_be_noticed(rig):
 
 
 # both cameras straight above the table at half the usual size: image x is world i, 0.5 mm per pixel
-STRAIGHT = dict.fromkeys(("off_vertical_deg", "k1", "k2", "p1", "p2"), (0.0, 0.0))
 ABOVE = replace(
     PLAIN,
     cameras=description.CameraSettings(image_size=(256, 256), exposure_s=0.001),
-    rig=description.RigSettings(mm_per_px=0.5, azimuth_deg=(-90.0, -90.0), variation=0.0, **STRAIGHT),
+    rig=description.RigSettings(
+        mm_per_px=0.5, azimuth_deg=(-90.0, -90.0), variation=0.0,
+        **dict.fromkeys(("off_vertical_deg", "k1", "k2", "p1", "p2"), (0.0, 0.0)),
+    ),
     appearance=replace(PLAIN.appearance, rim=190.0),
     optics=replace(PLAIN.optics, blur_px=(0.8, 1.3)),
-)
+)  # fmt: skip
 FLAT = np.array([0.032, 0.020, 0.001, 0.0, 0.0, 0.0])  # upper face at the target's height of 4 mm: 0.5 mm per pixel
 DOT = 0  # at (26, 0) mm
 AWAY = np.array([5.0, 0, 0, 0, 0, 0])  # out of sight
@@ -278,13 +280,12 @@ ORDINARY = description.Scene(
     rig=description.RigSettings(mm_per_px=0.42),
     board=description.BoardSettings(square_mm=8.0),
 )
-FLAT_ON_TABLE = np.eye(3), np.array([0.0, 0.0, 3e-3])
 
 
 def corners_of(imperfections):
     """(2 cameras, 54, 2) of the board on the table, without noise."""
     scene = replace(ORDINARY, imperfections=imperfections)
-    left, right = render_board(*FLAT_ON_TABLE, rig_of(scene), scene)[0]
+    left, right = render_board(np.eye(3), [0.0, 0.0, 3e-3], rig_of(scene), scene)[0]
     return np.stack([find_corners(image, (9, 6)).points for image in (left, right)])
 
 
@@ -369,10 +370,6 @@ def dot_offsets_px(folder, camera_index, expected_px):
         of = cv2.moments(np.clip(150.0 - image[y - 8 : y + 9, x - 8 : x + 9], 0, None))
         found.append([x - 8 + of["m10"] / of["m00"], y - 8 + of["m01"] / of["m00"]])
     return np.array(found) - expected_px
-
-
-# perspective shifts a dot's centroid from its centre's image by 0.02 px here, noise by less
-NOISE_PX = 0.06
 
 
 @pytest.mark.statistical
@@ -465,7 +462,8 @@ def test_images_with_a_fault_show_the_dots_where_the_truth_has_them(scene, tmp_p
     """Where faults move dots by the diagnosis' own formulas is compared with these in test_enlarged."""
     truth = write_recording(tmp_path / "r", replace(scene, faults=faults))
     for camera, pixels in enumerate(truth.markers_px[0]):
-        assert np.abs(dot_offsets_px(tmp_path / "r", camera, pixels)).max() < NOISE_PX
+        # perspective shifts a dot's centroid from its centre's image by 0.02 px here, noise by less
+        assert np.abs(dot_offsets_px(tmp_path / "r", camera, pixels)).max() < 0.06
     faultless = scene.declared_disc.marker_centres_body @ rotation_from_euler(*START[3:]).T + START[:3]
     assert np.abs(truth.markers_px[0] - rig_of(scene).project(faultless)).max() > 0.5
     assert_allclose(truth.q_right - truth.q, np.tile(VELOCITY * faults.right_delay_s, (4, 1)), atol=1e-12)
