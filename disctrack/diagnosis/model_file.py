@@ -6,13 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.cameras.camera import StereoRig, placed_at
+from calibration.cameras.camera import StereoRig
 from calibration.kit.arrays import Array
 from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.discrepancy.system import Values
 from disctrack.errors import AnalysisError
 from disctrack.faults.catalogue import scene_faults, values_in_scene
-from disctrack.faults.dots import true_table
+from disctrack.faults.dots import cameras_with
 from disctrack.rolling import CATALOGUE, Model, effects_from_tables
 from disctrack.synthetic.description import RigSettings, Scene, load_scene, scene_toml
 from disctrack.trajectory import Trajectory
@@ -142,6 +142,5 @@ def _above_the_table(system: DiscSystem, values: Values) -> tuple[StereoRig, Val
     rendered and levelled again.
     """
     own = {q.name for q in system.base if q.name.startswith(OF_TABLE)}
-    turn, shift = true_table(scene_faults(system.disc, {name: value for name, value in values.items() if name in own}))
-    poses = [(R @ turn, t + R @ shift) for R, t in system.rig.camera_poses()]
-    return replace(system.rig, **placed_at(poses)), {n: v for n, v in values.items() if n not in own}
+    off = scene_faults(system.disc, {name: value for name, value in values.items() if name in own})
+    return cameras_with(off, system.rig), {name: value for name, value in values.items() if name not in own}

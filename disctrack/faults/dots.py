@@ -24,11 +24,17 @@ def centres_with(faults: Faults, disc: Disc) -> Array:
 
 
 def cameras_with(faults: Faults, rig: StereoRig) -> StereoRig:
-    """The rig with what became of its cameras after the calibration."""
+    """The rig while the disc was filmed, in axes of the true table.
+
+    As calibrated, but for what became of the cameras since, and for a table that is not where the calibration's table
+    view says.
+    """
+    tilt = rotation_from_vector(np.radians([*faults.table_turn_deg, 0.0]))
+    lift = np.array([0.0, 0.0, 1e-3 * faults.table_height_mm])
     cameras, poses = [], []
     for camera, (R, t), fault in zip(rig.cameras, rig.camera_poses(), (faults.left, faults.right), strict=True):
-        turn = rotation_from_vector(np.radians(fault.rotation_deg)).T
-        poses.append((turn @ R, turn @ (t - 1e-3 * np.array(fault.translation_mm))))
+        turn = rotation_from_vector(np.radians(fault.rotation_deg)).T  # the camera turns, its picture turns back
+        poses.append((turn @ R @ tilt, turn @ (t + R @ lift - 1e-3 * np.array(fault.translation_mm))))
         k1, k2, p1, p2, k3 = camera.distortion
         x, y = fault.principal_point_change_px
         cameras.append(
@@ -43,12 +49,6 @@ def cameras_with(faults: Faults, rig: StereoRig) -> StereoRig:
         )
     left, right = cameras
     return replace(rig, left=left, right=right, **placed_at(poses))
-
-
-def true_table(faults: Faults) -> tuple[Array, Array]:
-    """Turn (3, 3) and shift (3,) [m] of the true table in calibrated axes."""
-    lift = np.array([0.0, 0.0, 1e-3 * faults.table_height_mm])
-    return rotation_from_vector(np.radians([*faults.table_turn_deg, 0.0])), lift
 
 
 @dataclass(frozen=True)
@@ -71,13 +71,12 @@ def predict(R: Array, t: Array, rig: StereoRig, disc: Disc, faults: Faults) -> t
 
     R (2, n, 3, 3), t (2, n, 3): poses per camera, body -> world. What is wrong with clocks or images has no part in it.
     """
-    centres, (tilt, lift), rig = centres_with(faults, disc), true_table(faults), cameras_with(faults, rig)
+    centres, rig = centres_with(faults, disc), cameras_with(faults, rig)
     pixels, by_pose = [], []
     for i, (camera, (R_cw, t_cw)) in enumerate(zip(rig.cameras, rig.camera_poses(), strict=True)):
         arm = centres @ np.swapaxes(R[i], 1, 2)
-        world = (arm + t[i][:, None]) @ tilt.T + lift
-        view, d_point, _ = project_with_jacobians(world @ R_cw.T + t_cw, camera)
-        d_world = d_point @ (R_cw @ tilt)
+        view, d_point, _ = project_with_jacobians((arm + t[i][:, None]) @ R_cw.T + t_cw, camera)
+        d_world = d_point @ R_cw
         pixels.append(view)
         by_pose.append(np.concatenate([d_world, np.cross(arm[..., None, :], d_world)], axis=-1))
     return np.stack(pixels, axis=1), np.stack(by_pose, axis=1)

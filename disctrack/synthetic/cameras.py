@@ -1,6 +1,5 @@
 """The true rig and the poses of the chessboard that a scene stands for: seeded, so that every recording has its own."""
 
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -8,7 +7,6 @@ import numpy as np
 from calibration.cameras.camera import Camera, StereoRig, placed_at
 from calibration.kit.arrays import Array
 from disctrack.errors import SceneError
-from disctrack.faults.keys import CameraFault
 from disctrack.frames import rotation_from_vector
 from disctrack.synthetic.description import Scene
 
@@ -29,14 +27,6 @@ class View(NamedTuple):
 def views_of(rig: StereoRig) -> list[View]:
     """The cameras of a rig where they stand."""
     return [View(camera, *pose) for camera, pose in zip(rig.cameras, rig.camera_poses(), strict=True)]
-
-
-def _rig(views: list[View], rig: StereoRig | None = None) -> StereoRig:
-    left, right = views
-    places: dict[str, Any] = placed_at([(view.R_camera_world, view.t_camera_world) for view in views])
-    if rig is not None:
-        return replace(rig, left=left.camera, right=right.camera, **places)
-    return StereoRig(left.camera, right.camera, **places, world_is_table=True)
 
 
 def brown(points: Array, camera: Camera) -> tuple[Array, Array]:
@@ -63,7 +53,9 @@ def image_of(points_world: Array, view: View) -> Array:
 def rig_of(scene: Scene) -> StereoRig:
     """The rig as it was while it was calibrated, with the table as world."""
     rng = np.random.default_rng([scene.seed, 1])
-    return _rig([_camera(scene, index, rng) for index in (0, 1)])
+    left, right = (_camera(scene, index, rng) for index in (0, 1))
+    places: dict[str, Any] = placed_at([(view.R_camera_world, view.t_camera_world) for view in (left, right)])
+    return StereoRig(left.camera, right.camera, **places, world_is_table=True)
 
 
 def _camera(scene: Scene, index: int, rng: np.random.Generator) -> View:
@@ -92,34 +84,6 @@ def _camera(scene: Scene, index: int, rng: np.random.Generator) -> View:
         image_size=scene.cameras.image_size,
     )
     return View(camera, R, -R @ (target + distance * away))
-
-
-def rig_after_faults(rig: StereoRig, scene: Scene) -> StereoRig:
-    """The rig while the disc was filmed, in axes of the true table.
-
-    As calibrated, but for what `scene.faults` did to the cameras since, and for a table that is not where the
-    calibration's table view says.
-    """
-    turn_table = rotation_from_vector(np.radians([*scene.faults.table_turn_deg, 0.0]))
-    lift_table = np.array([0.0, 0.0, scene.faults.table_height_mm * 1e-3])
-    views = []
-    for (camera, R, t), fault in zip(views_of(rig), (scene.faults.left, scene.faults.right), strict=True):
-        turn = rotation_from_vector(np.radians(fault.rotation_deg)).T  # the camera turns, its picture turns back
-        moved = turn @ (t + R @ lift_table - np.array(fault.translation_mm) * 1e-3)
-        views.append(View(_changed_lens(camera, fault), turn @ R @ turn_table, moved))
-    return _rig(views, rig)
-
-
-def _changed_lens(camera: Camera, fault: CameraFault) -> Camera:
-    k1, k2, p1, p2, k3 = camera.distortion
-    return replace(
-        camera,
-        fx=camera.fx * fault.focal_scale,
-        fy=camera.fy * fault.focal_scale,
-        cx=camera.cx + fault.principal_point_change_px[0],
-        cy=camera.cy + fault.principal_point_change_px[1],
-        distortion=(k1 + fault.k1_change, k2, p1, p2, k3),
-    )
 
 
 def board_poses(scene: Scene, rig: StereoRig) -> tuple[Array, Array]:

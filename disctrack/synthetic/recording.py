@@ -17,10 +17,11 @@ from calibration.kit.arrays import Array, Array32, Image, Mask
 from calibration.rig_file import write_rig_group
 from disctrack.disc import AIR_DENSITY, Disc
 from disctrack.errors import OutputError
+from disctrack.faults.dots import cameras_with, centres_with
 from disctrack.frames import COORDINATES, rotation_from_euler
 from disctrack.recording.declaration import KEYS
 from disctrack.recording.declaration_text import declaration_text
-from disctrack.synthetic.cameras import board_poses, image_of, rig_after_faults, rig_of, views_of
+from disctrack.synthetic.cameras import board_poses, image_of, rig_of, views_of
 from disctrack.synthetic.description import ImperfectionSettings, Scene, load_scene, scene_toml
 from disctrack.synthetic.images import expected_board_image, expected_disc_image, stages
 from disctrack.synthetic.motion import SceneMotion, motion_of, true_exposure, true_frame_rate
@@ -122,17 +123,11 @@ def run_render(
 
 def true_disc_of(scene: Scene) -> Disc:
     """The disc with its dots where they really are."""
-    declared, faults = scene.declared_disc, scene.faults
-    centres = declared.marker_centres_body.copy()
-    if faults.misprint_mm:
-        centres[:, :2] += np.array(faults.misprint_mm) * 1e-3
-    if faults.misprint_sigma_mm > 0:
-        rng = np.random.default_rng([scene.seed, 6])
-        centres[:, :2] += faults.misprint_sigma_mm * 1e-3 * rng.standard_normal((declared.n_markers, 2))
-    c, s = np.cos(np.radians(faults.pattern_turn_deg)), np.sin(np.radians(faults.pattern_turn_deg))
-    centres[:, :2] = faults.pattern_scale * centres[:, :2] @ np.array([[c, s], [-s, c]])
-    centres += np.array([*faults.pattern_offset_mm, faults.pattern_height_mm]) * 1e-3
-    return replace(declared, marker_centres_body=centres)
+    disc, faults = scene.declared_disc, scene.faults
+    drawn = np.random.default_rng([scene.seed, 6]).standard_normal((disc.n_markers, 2))
+    centres = disc.marker_centres_body.copy()
+    centres[:, :2] += faults.misprint_sigma_mm * 1e-3 * drawn
+    return replace(disc, marker_centres_body=centres_with(faults, replace(disc, marker_centres_body=centres)))
 
 
 def _truth(scene: Scene, motion: SceneMotion, rig: StereoRig) -> Truth:
@@ -148,7 +143,7 @@ def _truth(scene: Scene, motion: SceneMotion, rig: StereoRig) -> Truth:
         q_right=motion.pose(time + _delay(scene)),
         frame_rate=rate,
         rig=rig,
-        rig_while_filming=rig_after_faults(rig, scene),
+        rig_while_filming=cameras_with(faults, rig),
         disc=true_disc_of(scene),
         paper_centre_body=np.array(faults.pattern_offset_mm) * 1e-3,
         markers_printed=visible,

@@ -27,7 +27,7 @@ from calibration.rig_file import read_rig, write_rig
 from disctrack.disc import Disc
 from disctrack.errors import DiscTrackError
 from disctrack.faults.catalogue import HEIGHT, MOVED, TYPICAL_STEPS, Fault, faults_of, scene_faults
-from disctrack.faults.dots import cameras_with, centres_with, true_table
+from disctrack.faults.dots import cameras_with, centres_with
 from disctrack.faults.keys import Faults
 from disctrack.files.toml_tree import toml_value
 from disctrack.findings import DoubtWarning, Finding, Kind, Severity, finding_from_json
@@ -216,9 +216,7 @@ def _declared_wrong(fault: Fault, ground: Ground, folder: Path, tree: Tree, size
     tree["disc"]["thickness_mm"] = 2e3 * float(disc.half_thickness + 1e-3 * wrong.pattern_height_mm)
     tree["cameras"]["frame_rate_hz"] *= wrong.frame_rate_hz or 1.0
     tree["calibration"]["rig"] = str(folder / "rig.h5")
-    rig, (turn, lift) = cameras_with(wrong, rig), true_table(wrong)
-    R = rig.R_left_world @ turn  # the table is that of the calibrated axes
-    write_rig(folder / "rig.h5", replace(rig, R_left_world=R, t_left_world=rig.t_left_world + R @ lift))
+    write_rig(folder / "rig.h5", cameras_with(wrong, rig))
 
 
 def _copied(recording: Recording, folder: Path, rig: Path | None = None) -> Tree:

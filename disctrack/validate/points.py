@@ -16,10 +16,11 @@ from calibration.cameras.camera import N_RIG, StereoRig
 from calibration.kit.arrays import Array
 from calibration.kit.least_squares import normal_of_rows
 from disctrack.disc import Disc
+from disctrack.faults.dots import cameras_with
 from disctrack.faults.keys import Faults
 from disctrack.frames import rotation_from_euler
 from disctrack.rolling import simulate
-from disctrack.synthetic.cameras import board_poses, rig_after_faults, rig_of
+from disctrack.synthetic.cameras import board_poses, rig_of
 from disctrack.synthetic.description import Scene
 from disctrack.synthetic.motion import rolling_model, rolling_start, true_frame_rate
 from disctrack.synthetic.optics import smooth_field
@@ -91,7 +92,7 @@ def measured(
     error = sigma * of_rig.multivariate_normal(np.zeros(N_RIG), covariance / np.outer(sigma, sigma), method="eigh")
     scene = _in_the_laboratory(scene, laboratory, of_rig)
     faults, disc, rate = scene.faults, true_disc_of(scene), true_frame_rate(scene)
-    true_rig = rig_after_faults(believed_rig.perturbed(error), scene)
+    true_rig = cameras_with(faults, believed_rig.perturbed(error))
     believed_rig = replace(believed_rig, covariance=covariance, world_is_table=True)
     motion = motion or _rolling(scene, *rng.uniform(-3, 3, 2))
     times = faults.true_times(np.arange(n) / rate, rate) + STATION

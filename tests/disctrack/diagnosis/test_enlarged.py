@@ -2,9 +2,11 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from scipy.spatial.transform import Rotation
 
 from calibration.cameras.camera import rotation_from_vector
 from disctrack import diagnose, differentiate, simulate
@@ -15,7 +17,7 @@ from disctrack.faults.catalogue import scene_faults
 from disctrack.faults.dots import predict
 from disctrack.faults.keys import Faults
 from disctrack.frames import rotation_from_euler
-from disctrack.synthetic.cameras import rig_after_faults, rig_of
+from disctrack.synthetic.cameras import rig_of
 from disctrack.synthetic.description import load_scene
 from disctrack.synthetic.motion import rolling_model, rolling_start
 from disctrack.synthetic.recording import true_disc_of
@@ -55,19 +57,38 @@ def test_every_fault_of_the_measurement_survives_the_file(short, everything_wron
         assert again[name] == pytest.approx(value, rel=1e-12), name  # degrees and back, 1 + change and back
 
 
+def turned(vector_deg, points):
+    return Rotation.from_rotvec(vector_deg, degrees=True).apply(points.reshape(-1, 3)).reshape(points.shape)
+
+
+def seen_with(faults, rig, camera, points):
+    """Pixels of points of the true table's world, one camera after the other moved and refocused, by OpenCV's lens."""
+    lens, (R, t), fault = rig.cameras[camera], rig.camera_poses()[camera], (faults.left, faults.right)[camera]
+    calibrated = turned([*faults.table_turn_deg, 0.0], points) + np.array([0.0, 0.0, 1e-3 * faults.table_height_mm])
+    before = calibrated @ R.T + t - 1e-3 * np.array(fault.translation_mm)
+    now = turned(-np.array(fault.rotation_deg), before)
+    focal, middle = fault.focal_scale * np.array([lens.fx, lens.fy]), fault.principal_point_change_px
+    matrix = np.array([[focal[0], 0.0, lens.cx + middle[0]], [0.0, focal[1], lens.cy + middle[1]], [0.0, 0.0, 1.0]])
+    bent = np.array([lens.distortion[0] + fault.k1_change, *lens.distortion[1:]])
+    return cv2.projectPoints(now.reshape(-1, 3), np.zeros(3), np.zeros(3), matrix, bent)[0].reshape(*now.shape[:-1], 2)
+
+
 def test_images_of_a_faulty_scene_are_those_that_the_diagnosis_predicts(short, everything_wrong, tmp_path):
-    """The renderer moves cameras, table and dots by formulas of its own."""
+    """Cameras, table and dots are moved here by formulas that share nothing with those of the faults."""
     system = system_of(short)
-    state = rolling_state(short)
-    scene = load_scene(saved(system, state | everything_wrong, tmp_path))
-    rig, q = rig_of(scene), short.q[:5]
+    scene = load_scene(saved(system, rolling_state(short) | everything_wrong, tmp_path))
+    rig, q, faults = rig_of(scene), short.q[:5], scene.faults
+    centres = scene.declared_disc.marker_centres_body + np.pad(1e-3 * np.array(faults.misprint_mm), ((0, 0), (0, 1)))
+    centres = turned([0.0, 0.0, faults.pattern_turn_deg], centres) * [faults.pattern_scale, faults.pattern_scale, 1.0]
+    centres += 1e-3 * np.array([*faults.pattern_offset_mm, faults.pattern_height_mm])
+    assert_allclose(true_disc_of(scene).marker_centres_body, centres, atol=1e-12)
     R = rotation_from_euler(*q[:, 3:].T)
-    centres = true_disc_of(scene).marker_centres_body
-    rendered = rig_after_faults(rig, scene).project(centres @ np.swapaxes(R, 1, 2) + q[:, None, :3])
+    world = centres @ np.swapaxes(R, 1, 2) + q[:, None, :3]
+    seen = np.stack([seen_with(faults, rig, camera, world) for camera in (0, 1)], axis=1)
     poses = np.stack([R, R]), np.stack([q[:, :3]] * 2)
     predicted, _ = predict(*poses, rig, short.disc, scene_faults(short.disc, everything_wrong))
     # arithmetic; the faults move the dots by some pixels
-    assert_allclose(np.moveaxis(rendered, -3, 1), predicted, atol=1e-9)
+    assert_allclose(seen, predicted, atol=1e-9)
     plain, _ = predict(*poses, rig, short.disc, scene_faults(short.disc, {}))
     assert np.abs(plain - predicted).max() > 0.1
 

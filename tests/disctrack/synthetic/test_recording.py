@@ -459,7 +459,7 @@ def test_same_scene_gives_the_same_files_on_any_number_of_threads_and_another_se
     ids=["late", "turned", "moved", "another lens", "misprinted"],
 )
 def test_images_with_a_fault_show_the_dots_where_the_truth_has_them(scene, tmp_path, faults):
-    """Where faults move dots by the diagnosis' own formulas is compared with these in test_enlarged."""
+    """Where faults move dots is held against formulas of its own in test_enlarged."""
     truth = write_recording(tmp_path / "r", replace(scene, faults=faults))
     for camera, pixels in enumerate(truth.markers_px[0]):
         # perspective shifts a dot's centroid from its centre's image by 0.02 px here, noise by less
