@@ -4,6 +4,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from calibration.cameras._brown import distorted
 from calibration.cameras.camera import Camera, StereoRig, placed_at
 from calibration.kit.arrays import Array
 from disctrack.errors import SceneError
@@ -29,25 +30,12 @@ def views_of(rig: StereoRig) -> list[View]:
     return [View(camera, *pose) for camera, pose in zip(rig.cameras, rig.camera_poses(), strict=True)]
 
 
-def brown(points: Array, camera: Camera) -> tuple[Array, Array]:
-    """Brown's polynomial as printed: factor (..., 1) and shift (..., 2) of points (..., 2) at distance 1 (x/z, y/z).
-
-    Not `calibration.cameras.camera`'s, so that a mistake there shows up as a disagreement between rendered images,
-    or the truth, and projected points.
-    """
-    k1, k2, p1, p2, k3 = camera.distortion
-    x, y = points[..., 0], points[..., 1]
-    s = x * x + y * y
-    shift = np.stack([2 * p1 * x * y + p2 * (s + 2 * x * x), p1 * (s + 2 * y * y) + 2 * p2 * x * y], axis=-1)
-    return (1 + s * (k1 + s * (k2 + s * k3)))[..., None], shift
-
-
 def image_of(points_world: Array, view: View) -> Array:
     """Pixels (..., 2) of points (..., 3) [m]; for bounding boxes and truth only."""
     points = np.asarray(points_world, float) @ view.R_camera_world.T + view.t_camera_world
-    flat, camera = points[..., :2] / points[..., 2:], view.camera
-    factor, shift = brown(flat, camera)
-    return np.asarray((flat * factor + shift) * [camera.fx, camera.fy] + [camera.cx, camera.cy])
+    flat, camera = np.moveaxis(points[..., :2] / points[..., 2:], -1, 0), view.camera
+    x, y, *_ = distorted(*flat, *camera.distortion)
+    return np.stack([camera.fx * x + camera.cx, camera.fy * y + camera.cy], axis=-1)
 
 
 def rig_of(scene: Scene) -> StereoRig:
