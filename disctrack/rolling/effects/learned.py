@@ -35,7 +35,6 @@ def effect_from_formulas(
     *,
     title: str = "",
     source: str = "learned from a residual",
-    passive: bool = False,
 ) -> type[Effect]:
     """Effect class whose law adds these formulas to the wrench; no part of the catalogue: models carry it.
 
@@ -62,7 +61,7 @@ def effect_from_formulas(
         "title": title or "; ".join(f"{k} = {v}" for k, v in formulas.items()),
         "source": source,
         "parameters": tuple(given.get(n, EffectParameter(n, "SI", 1.0, "number of the formula")) for n in free),
-        "passive": passive,
+        "passive": False,
         "formulas": dict(formulas),
         "law": staticmethod(_function("\n".join(lines))),
     }
