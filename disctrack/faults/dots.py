@@ -11,8 +11,6 @@ from disctrack.disc import Disc
 from disctrack.faults.keys import Faults
 from disctrack.frames import rotation_from_vector, rotation_z
 
-RIM_POINTS = 24  # of a dot's outline, for the centre of its image
-
 
 def centres_with(faults: Faults, disc: Disc) -> Array:
     """(m, 3) where the dots are on the body [m]."""
@@ -85,16 +83,14 @@ def predict(R: Array, t: Array, rig: StereoRig, disc: Disc, faults: Faults) -> t
 def ellipse_centre_shift(R: Array, t: Array, rig: StereoRig, disc: Disc) -> Array:
     """Centre of the dots' images minus image of their centres (n, 2, m, 2) [px]; R (n, 3, 3), t (n, 3).
 
-    The image of a circle is an ellipse, to the lens' distortion; its centre is that of the area inside.
+    The image of a circle is an ellipse, to the lens' distortion; its centre is that of the area inside, here by a rule
+    over four points that is exact to third order.
     """
-    angles = 2 * np.pi * np.arange(RIM_POINTS) / RIM_POINTS
-    ring = 0.5 * disc.marker_diameter * np.stack([np.cos(angles), np.sin(angles), np.zeros(RIM_POINTS)], axis=-1)
-    body = np.concatenate([disc.marker_centres_body[:, None], disc.marker_centres_body[:, None] + ring], axis=1)
-    world = body.reshape(-1, 3) @ np.swapaxes(R, 1, 2) + t[:, None]
-    images = np.moveaxis(rig.project(world), -3, 1)  # (n, 2, m * (1 + rim), 2)
-    images = images.reshape(*images.shape[:2], disc.n_markers, 1 + RIM_POINTS, 2)
-    centre, outline = images[..., 0, :], images[..., 1:, :] - images[..., :1, :]
-    following = np.roll(outline, -1, axis=-2)
-    cross = outline[..., 0] * following[..., 1] - outline[..., 1] * following[..., 0]
-    shift = np.sum((outline + following) * cross[..., None], axis=-2) / (3 * np.sum(cross, axis=-1))[..., None]
+    arms = np.sqrt(0.125) * disc.marker_diameter * np.array([[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0], [0, 0, 0]])
+    body = (disc.marker_centres_body[:, None] + arms).reshape(-1, 3)
+    pixels, by_point, _ = rig.project_with_jacobians(body @ np.swapaxes(R, 1, 2) + t[:, None])
+    area = np.linalg.det(by_point @ R[:, None, None, :, :2])
+    pixels, area = (found.reshape(len(R), 2, disc.n_markers, 5, -1) for found in (pixels, area))
+    around, centre = np.s_[..., :4, :], pixels[..., 4, :]
+    shift = np.sum((pixels * area)[around], axis=-2) / np.sum(area[around], axis=-2) - centre
     return np.where(np.isfinite(centre), shift, 0.0)

@@ -33,8 +33,8 @@ def views_of(rig: StereoRig) -> list[View]:
 def image_of(points_world: Array, view: View) -> Array:
     """Pixels (..., 2) of points (..., 3) [m]; for bounding boxes and truth only."""
     points = np.asarray(points_world, float) @ view.R_camera_world.T + view.t_camera_world
-    flat, camera = np.moveaxis(points[..., :2] / points[..., 2:], -1, 0), view.camera
-    x, y, *_ = distorted(*flat, *camera.distortion)
+    flat, camera = points[..., :2] / points[..., 2:], view.camera
+    x, y, *_ = distorted(flat[..., 0], flat[..., 1], *camera.distortion)
     return np.stack([camera.fx * x + camera.cx, camera.fy * y + camera.cy], axis=-1)
 
 

@@ -16,7 +16,7 @@ from calibration.cameras.camera import N_RIG, StereoRig
 from calibration.kit.arrays import Array
 from calibration.kit.least_squares import normal_of_rows
 from disctrack.disc import Disc
-from disctrack.faults.dots import cameras_with
+from disctrack.faults.dots import cameras_with, ellipse_centre_shift
 from disctrack.faults.keys import Faults
 from disctrack.frames import rotation_from_euler
 from disctrack.rolling import simulate
@@ -160,21 +160,6 @@ def _exposed(motion: Motion, times: Array, faults: Faults, rig: StereoRig, disc:
         R, t = rotation_from_euler(*q[:, 3:].T), q[:, :3]
         seen = np.moveaxis(rig.project(disc.marker_centres_body @ np.swapaxes(R, 1, 2) + t[:, None]), -3, 1)
         if share:
-            seen = (1 - share) * seen + share * _image_centres(R, t, rig, disc)
+            seen = seen + share * ellipse_centre_shift(R, t, rig, disc)
         images = images + 0.5 * weight * seen
     return np.asarray(images)
-
-
-def _image_centres(R: Array, t: Array, rig: StereoRig, disc: Disc) -> Array:
-    """Centres of the areas that the dots' images cover (n, 2, m, 2), by quadrature over the dots."""
-    nodes, weights = np.polynomial.legendre.leggauss(4)
-    radii, angles = 0.25 * disc.marker_diameter * (1 + nodes), np.radians(np.arange(0.0, 360.0, 22.5))
-    r, a = (grid.ravel() for grid in np.meshgrid(radii, angles, indexing="ij"))
-    weight = np.repeat(weights * radii, len(angles))
-    found = []
-    for centre in disc.marker_centres_body:
-        body = centre + np.stack([r * np.cos(a), r * np.sin(a), np.zeros(r.size)], axis=-1)
-        pixels, by_point, _ = rig.project_with_jacobians(body @ np.swapaxes(R, 1, 2) + t[:, None])
-        area = np.abs(np.linalg.det(by_point @ R[:, None, None, :, :2])) * weight  # (n, 2, points)
-        found.append(np.sum(pixels * area[..., None], axis=2) / np.sum(area, axis=2)[..., None])
-    return np.stack(found, axis=2)
