@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from calibration.kit.arguments import FrameRate, Seconds, Times, checked
 from calibration.kit.arrays import Array, Numbers
 from disctrack.errors import ModelError
+from disctrack.files.toml_tree import MOST
 from disctrack.rolling import integrate
 from disctrack.rolling._compiled import compile_law, compile_system
 from disctrack.rolling.effects.base import HELPERS
@@ -23,7 +24,6 @@ RTOL = 1e-11  # of the integrator; keeps the energy without losses to 1e-11 over
 ATOL = np.array([1e-13, 1e-13, 1e-12, 1e-13, 1e-12, 1e-11, 1e-11, 1e-11, 1e-13, 1e-13, 1e-13, 1e-13])
 MAX_SWITCHES = 2000  # of slip and rolling: more is chatter
 MOST_STEPS = 1_000_000  # of the integrator, over all stretches
-MOST_INSTANTS = 1e8  # of a motion in memory
 
 
 @checked
@@ -57,9 +57,9 @@ def _grid(duration: float | None, rate: float, times: ArrayLike | None) -> Array
     if times is None:
         if duration is None:
             raise ModelError("neither a duration nor times are given")
-        if duration * rate > MOST_INSTANTS:
+        if duration * rate > MOST:
             instants = f"{duration:g} s at {rate:g} Hz are {duration * rate:.3g} instants"
-            raise ModelError(f"{instants}; expected at most {MOST_INSTANTS:g}")
+            raise ModelError(f"{instants}; expected at most {MOST:g}")
         return np.arange(int(np.floor(duration * rate * (1 + 1e-12))) + 1) / rate
     grid = np.ascontiguousarray(times, float)
     if grid.ndim != 1 or len(grid) == 0 or not np.isfinite(grid).all() or (np.diff(grid) <= 0).any():

@@ -15,7 +15,6 @@ from disctrack.errors import SceneError
 from disctrack.files.inputs import keep, refuse_input
 from disctrack.files.labelled_arrays import Variable, flags, write_variables
 from disctrack.files.software import __version__
-from disctrack.files.toml_tree import MOST
 from disctrack.files.whole import refuse_existing, whole_file
 from disctrack.frames import continuous_quaternions, quaternion_from_rotation, rotation_from_euler
 from disctrack.rolling.motion import Motion
@@ -71,9 +70,6 @@ def run_simulate(
     refuse_existing(output, overwrite)
     rate = scene.cameras.frame_rate_hz if rate is None else rate
     duration = max(scene.cameras.n_frames - 1, 1) / scene.cameras.frame_rate_hz if duration is None else duration
-    if duration * rate > MOST:
-        instants = f"{duration:g} s at {rate:g} Hz are {duration * rate:.3g} instants"
-        raise SceneError(f"{scene_path}: {instants}; expected at most {MOST:g}")
     motion = simulate(rolling_model(scene), rolling_start(scene), duration, rate=rate)
     text = scene_path.read_text(encoding="utf-8")
     settings = {"duration_s": duration, "rate_hz": rate}
