@@ -12,7 +12,8 @@ part of it: a model that may use one carries it, Model.laws). A compiled law is 
 helpers' do not change.
 
 Signs: M is the moment of the table on the disc at the contact, in (n0, m0, k). Its power is
-M_n thetadot - M_m phidot sin(theta) + M_z omega_z + X . v_O, and for a passive effect it is never positive.
+M_n thetadot - M_m phidot sin(theta) + M_z omega_z + X . v_O. For a passive law it is never positive (for one in psidot
+if psidot phidot < 0, as in rolling down): its amounts have the lower bound 0.
 """
 
 from __future__ import annotations
@@ -69,9 +70,6 @@ class Effect:
     title: ClassVar[str]
     source: ClassVar[str]
     parameters: ClassVar[tuple[EffectParameter, ...]]
-    passive: ClassVar[bool] = (
-        True  # its power is never positive; of laws in psidot if psidot phidot < 0, as in rolling down
-    )
     airborne: ClassVar[bool] = False  # acts also without contact
     sought: ClassVar[bool] = False  # the first shape among its parameters may lie anywhere: an angle, a frequency
     candidate: ClassVar[bool] = True  # may be proposed as an explanation; False for tools
@@ -92,7 +90,7 @@ class Effect:
         for p in self.parameters:
             value = self._values[p.name]
             if not p.lower <= value <= p.upper or not (np.isfinite(value) or value == p.null):
-                feeds = self.passive and value < p.lower
+                feeds = self.law is not None and value < p.lower == 0
                 raise ModelError(
                     f"{self.name}.{p.name} = {value:g} {p.unit} is outside [{p.lower:g}, {p.upper:g}]"
                     + (": a passive effect cannot feed the disc with energy" if feeds else "")
@@ -130,7 +128,6 @@ def effect(title: str, source: str, *parameters: EffectParameter, **traits: Any)
             "title": title,
             "source": source,
             "parameters": parameters,
-            "passive": not adjusts,
             "belongs_to": ("disc",) if adjusts else ("disc", "surface"),
             "adjust" if adjusts else "law": staticmethod(function),
         }

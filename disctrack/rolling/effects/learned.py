@@ -61,7 +61,6 @@ def effect_from_formulas(
         "title": title or "; ".join(f"{k} = {v}" for k, v in formulas.items()),
         "source": source,
         "parameters": tuple(given.get(n, EffectParameter(n, "SI", 1.0, "number of the formula")) for n in free),
-        "passive": False,
         "formulas": dict(formulas),
         "law": staticmethod(_function("\n".join(lines))),
     }

@@ -13,7 +13,6 @@ from disctrack.rolling.records import Record
     EffectParameter("F_x", "N", 1e-3, "force at the origin along i: k times the x of the point"),
     EffectParameter("F_y", "N", 1e-3, "force at the origin along j: k times the y of the point"),
     belongs_to=("rig", "surface"),
-    passive=False,  # a potential: it gives back what it takes
     airborne=True,
 )
 def spring(p: Record, s: Record, w: Record) -> None:
@@ -30,7 +29,6 @@ def spring(p: Record, s: Record, w: Record) -> None:
     *(EffectParameter(f"a_sin_{a}", "m/s^2", 0.1, f"along {a}, a quarter of a period later") for a in "xyz"),
     EffectParameter("frequency", "Hz", 50.0, "of the vibration", lower=0.1, upper=1e4, is_shape=True),
     belongs_to=(),
-    passive=False,
     airborne=True,
     candidate=False,
 )
@@ -52,7 +50,6 @@ def table_vibration(p: Record, s: Record, w: Record) -> None:
     *(EffectParameter(f"u_sin_{a}", "m", 1e-6, f"along {a}, a quarter of a period later") for a in "xyz"),
     EffectParameter("frequency", "Hz", 50.0, "of the vibration", lower=0.1, upper=1e4, is_shape=True),
     belongs_to=(),
-    passive=False,
     airborne=True,
     sought=True,
 )
@@ -76,7 +73,6 @@ def table_shaken(p: Record, s: Record, w: Record) -> None:
     EffectParameter("v_z", "m/s", 1e-5, "speed of the table upwards at t = 0"),
     EffectParameter("a_z", "m/s^2", 3e-5, "its acceleration"),
     belongs_to=(),
-    passive=False,
     airborne=True,
 )
 def table_settles(p: Record, s: Record, w: Record) -> None:
