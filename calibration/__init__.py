@@ -4,24 +4,11 @@ found = calibrate_stereo(left_images, right_images, Board((9, 6), 8e-3), table_v
 found.rig, found.rms_px, found.assessment.verdict
 """
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-# Imported when asked for: the physics needs the camera model and the errors, not the image library behind the others.
-_HOME = {
-    "board.chessboard": ("BoardNotFound", "CornerView", "find_corners"),
-    "board.target": ("Board",),
-    "cameras.camera": ("Camera", "StereoRig", "triangulate"),
-    "fit.refinement": ("refine_stereo",),
-    "fit.stereo_model": ("Observations", "StereoModel", "Terms"),
-    "judge.tolerances": ("BoardTolerances",),
-    "kit.errors": ("CalibrationError", "DiscTrackError", "RigFileError"),
-    "points": ("calibrate_from_points",),
-    "stereo": ("CalibrationSettings", "StereoCalibration", "calibrate_from_corners", "calibrate_stereo"),
-}
-_MODULE_OF = {name: module for module, names in _HOME.items() for name in names}
-__all__ = [*_MODULE_OF]
+from calibration.kit.public import imported_when_used
 
+# The physics needs the camera model and the errors, not the image library behind the others.
 if TYPE_CHECKING:
     from calibration.board.chessboard import BoardNotFound as BoardNotFound
     from calibration.board.chessboard import CornerView as CornerView
@@ -44,8 +31,4 @@ if TYPE_CHECKING:
     from calibration.stereo import calibrate_from_corners as calibrate_from_corners
     from calibration.stereo import calibrate_stereo as calibrate_stereo
 
-
-def __getattr__(name: str) -> Any:
-    if name not in _MODULE_OF:
-        raise AttributeError(f"module 'calibration' has no attribute {name!r}")
-    return getattr(import_module(f"calibration.{_MODULE_OF[name]}"), name)
+__getattr__, __all__ = imported_when_used(__file__)

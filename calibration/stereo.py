@@ -225,7 +225,7 @@ def calibrate_from_corners(
     count_once(views, names, table_view)
     _require_views(views, names, table_view)
     start, notes = _begin(views, board, names)
-    observations, cameras = _observations(views), start.model.cameras
+    observations, cameras = _observations(views), start.model.rig.cameras
     wide = too_wide(observations, board.points, cameras)
     moved = camera_moved(observations, start, table_view)
     if moved and (lenses := zoomed(observations, moved, cameras, board.points)):
@@ -323,7 +323,7 @@ def _require_fitted(
         also = "".join(f"{what}: {by_what}. " for what, by_what in wide)
         listed = _listed(image for images in not_used.values() for image in images)
         raise CalibrationError(f"{also}Only {n_used} views can be used, at least {MIN_VIEWS} are needed: {listed}")
-    for name, camera in zip(CAMERA_NAMES, fit.refinement.model.cameras, strict=True):
+    for name, camera in zip(CAMERA_NAMES, fit.refinement.model.rig.cameras, strict=True):
         if not min(camera.fx, camera.fy) > 0.0:
             raise CalibrationError(
                 f"{name} camera: focal lengths {camera.fx:.1f} and {camera.fy:.1f} px are those of no camera: the "

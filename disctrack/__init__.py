@@ -22,12 +22,10 @@ The other way round: `simulate(model, state)` gives a motion, `run_simulate` and
 Conventions (frames, angles, units, pixels) have one home: the docstring of disctrack.frames.
 """
 
-import ast
-from importlib import import_module
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-# The public names, for type checkers; each is imported when it is first used, from the module that is named here.
+from calibration.kit.public import imported_when_used
+
 if TYPE_CHECKING:
     from calibration.rig_file import read_rig as read_rig
     from calibration.rig_file import write_rig as write_rig
@@ -73,16 +71,9 @@ if TYPE_CHECKING:
     from disctrack.trajectory.file import write_group as write_group
     from disctrack.trajectory.file import write_trajectory as write_trajectory
 
-_IMPORTS = [node for node in ast.walk(ast.parse(Path(__file__).read_bytes())) if isinstance(node, ast.ImportFrom)]
-_MODULE_OF = {name.asname: str(node.module) for node in _IMPORTS for name in node.names if name.asname}
-__all__ = [name for name in _MODULE_OF if name != "__version__"]
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _MODULE_OF:
-        raise AttributeError(f"module 'disctrack' has no attribute {name!r}")
-    return getattr(import_module(_MODULE_OF[name]), name)
+__getattr__, _names = imported_when_used(__file__)
+__all__ = [name for name in _names if name != "__version__"]
 
 
 def __dir__() -> list[str]:
-    return list(_MODULE_OF)
+    return _names

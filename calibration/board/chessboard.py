@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.board.corner_fit import CornerView, fit_view, local_axes, squares_round
+from calibration.board.corner_fit import CornerView, fit_view, grey_at, local_axes, squares_round
 from calibration.board.target import Board, board_orders
 from calibration.kit.arguments import checked
 from calibration.kit.arrays import Array
@@ -235,7 +235,7 @@ def negatives(images: Sequence[NDArray], views: Sequence[CornerView | BoardNotFo
     Its own marks cannot: the colouring of a negative is that of the board turned by 180 deg.
     """
     dark = [
-        margin_is_dark(image, view.points[view.accepted], board.points[view.accepted], board)
+        margin_is_dark(image.reshape(*image.shape[:2], -1).mean(axis=-1), view, board.inner_corners)
         for image, view in zip(images, views, strict=True)
         if isinstance(view, CornerView)
     ]
@@ -247,32 +247,17 @@ def negatives(images: Sequence[NDArray], views: Sequence[CornerView | BoardNotFo
     )
 
 
-def margin_is_dark(image: NDArray, corners: Array, points: Array, board: Board) -> bool:
+def margin_is_dark(grey: Array, view: CornerView, inner_corners: tuple[int, int]) -> bool:
     """Whether the paper just outside a chessboard's squares is as dark as the dark squares.
 
-    corners (n, 2) [px] in the image of points (n, 3) [m] of the board. False where too little of it is in view.
+    False where too little of it is in view.
     """
-    flat, _ = cv2.findHomography(points[:, :2], corners)
-    columns, rows = board.inner_corners
-    if flat is None:
-        return False
-
-    def grey(i: NDArray, j: NDArray) -> Array:
-        places = np.stack([i, j], axis=-1).reshape(1, -1, 2) * board.square
-        x, y = np.rint(cv2.perspectiveTransform(places, flat)[0]).astype(int).T
-        inside = (x >= 0) & (y >= 0) & (x < image.shape[1]) & (y < image.shape[0])
-        return np.asarray(image[y[inside], x[inside]].reshape(inside.sum(), -1).mean(axis=1))
-
-    i, j = np.meshgrid(np.arange(columns - 1) + 0.5, np.arange(rows - 1) + 0.5)
-    squares = grey(i, j)
-    along, across = np.arange(columns), np.arange(rows)
-    edges = [(along, np.full(columns, -MARGIN)), (along, np.full(columns, rows - 1 + MARGIN))]
-    edges += [(np.full(rows, -MARGIN), across), (np.full(rows, columns - 1 + MARGIN), across)]
-    margin = np.concatenate([grey(*edge) for edge in edges])
-    if len(margin) < columns + rows or not len(squares):
-        return False
-    light, dark = np.quantile(squares, [0.8, 0.2])
-    return bool(np.median(margin) < dark + 0.25 * (light - dark))
+    grid = view.points.reshape(*inner_corners[::-1], 2)
+    edges = (np.rot90(grid, side)[:2] for side in range(4))
+    margin = np.concatenate([grey_at(grey, line + MARGIN * (line - before)) for line, before in edges])
+    light, dark = np.nanquantile(grey_at(grey, 0.5 * (grid[1:, 1:] + grid[:-1, :-1])), [0.8, 0.2])
+    seen = np.isfinite(margin)
+    return bool(seen.mean() > 0.5 and np.median(margin[seen]) < dark + 0.25 * (light - dark))
 
 
 __all__ = ["BoardNotFound", "CornerView", "board_in", "board_orders", "find_corners", "luminance", "negatives"]

@@ -310,10 +310,15 @@ def squares_round(grey: Array, points: Array, axes: Array, aside: float) -> Arra
 
     aside : how far from both edges, in squares; axes (n, 2, 2) of a square
     """
-    at = points[:, None] + aside * np.array([[1.0, 1.0], [-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0]]) @ axes
-    inside = np.all((at >= 0) & (at <= np.array(grey.shape[::-1]) - 1), axis=-1)
-    x, y = np.rint(np.where(inside[..., None], at, 0.0)).astype(int).transpose(2, 0, 1)
-    return np.where(inside, grey[y, x], np.nan).reshape(-1, 2, 2)
+    signs = np.array([[1.0, 1.0], [-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0]])
+    return grey_at(grey, points[:, None] + aside * signs @ axes).reshape(-1, 2, 2)
+
+
+def grey_at(grey: Array, places: Array) -> Array:
+    """Grey values (...) of the pixels at places (..., 2); NaN out of view."""
+    inside = np.all((places >= 0) & (places <= np.array(grey.shape[::-1]) - 1), axis=-1)
+    x, y = np.moveaxis(np.rint(np.where(inside[..., None], places, 0.0)).astype(int), -1, 0)
+    return np.where(inside, grey[y, x], np.nan)
 
 
 def _indices(inner_corners: tuple[int, int]) -> Array:

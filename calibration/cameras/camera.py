@@ -236,7 +236,10 @@ class StereoRig(Brief):
     def perturbed(self, delta: Array) -> StereoRig:
         """The rig after a small change delta (30,) of RIG_PARAMETERS (SI units, rotation vectors in radians)."""
         delta = np.asarray(delta, float)
-        left, right = stepped(self.cameras, delta)
+        left, right = (
+            Camera.from_parameters(camera.parameters + delta[own], camera.image_size)
+            for camera, own in zip(self.cameras, OF_CAMERAS, strict=True)
+        )
         return replace(
             self,
             left=left,
@@ -246,15 +249,6 @@ class StereoRig(Brief):
             R_left_world=rotation_from_vector(delta[WORLD_TURN]) @ self.R_left_world,
             t_left_world=self.t_left_world + delta[WORLD_SHIFT],
         )
-
-
-def stepped(cameras: Sequence[Camera], step: Array) -> tuple[Camera, Camera]:
-    """Both cameras after a step of RIG_PARAMETERS, of which those before the first place are enough."""
-    left, right = (
-        Camera.from_parameters(camera.parameters + step[own], camera.image_size)
-        for camera, own in zip(cameras, OF_CAMERAS, strict=True)
-    )
-    return left, right
 
 
 def by_turning(d_point: Array, arm: Array) -> Array:

@@ -68,7 +68,7 @@ def fit_lens_field(refinement: Refinement, nominal: Array) -> FieldFit | None:
 
 def _grid(refinement: Refinement, cells: int) -> LensField:
     """A field of zero with so many cells along the longer side of the images."""
-    size = np.array([camera.image_size for camera in refinement.model.cameras]).max(0)
+    size = np.array([camera.image_size for camera in refinement.model.rig.cameras]).max(0)
     spacing = float(size.max()) / cells
     return LensField(
         np.zeros((2, 2, int(np.ceil(size[1] / spacing)) + 3, int(np.ceil(size[0] / spacing)) + 3)), spacing

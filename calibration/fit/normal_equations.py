@@ -87,7 +87,7 @@ class Problem:
         normal = replace(normal, costs=np.where(np.isfinite(costs), costs, np.inf))
         if self.prior is None:
             return normal
-        prior, towards, cost = self.prior.normal(model, self.stereo_basis, self.shape_basis.shape[-1] > 0)
+        prior, towards, cost = self.prior.normal(model, self.stereo_basis)
         return replace(normal, prior=prior, prior_gradient=towards, prior_cost=cost)
 
     def stepped(self, model: StereoModel, shared: Array, poses: Array) -> StereoModel:

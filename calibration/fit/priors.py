@@ -60,13 +60,13 @@ class Prior:
     weight: float = 1.0
     board: BoardPrior | None = None  # where the target's shape is refined
 
-    def normal(self, model: StereoModel, stereo_basis: Array, shape: bool) -> tuple[Array, Array, float]:
+    def normal(self, model: StereoModel, stereo_basis: Array) -> tuple[Array, Array, float]:
         """Information (s, s) at the model, gradient (s,) towards the prior, and its part of chi-square.
 
-        stereo_basis : (24, s1) free directions of intrinsics and stereo pose; shape : whether the board's are free, too
+        stereo_basis : (24, s1) free directions of intrinsics and stereo pose
         """
         information, gradient, cost = np.zeros((N_STEREO, N_STEREO)), np.zeros(N_STEREO), 0.0
-        for camera, own, rows, at in zip(model.cameras, OF_CAMERAS, self.rows, self.at, strict=True):
+        for camera, own, rows, at in zip(model.rig.cameras, OF_CAMERAS, self.rows, self.at, strict=True):
             f, focal = 0.5 * (camera.fx + camera.fy), np.zeros(N_INTRINSIC)
             focal[:2] = 0.5 / (f * FOCAL)
             J = np.vstack([rows, focal])
@@ -78,7 +78,7 @@ class Prior:
                 cost += float(np.log1p(square)) - square
             information[own, own], gradient[own] = J.T @ (weight[:, None] * J), -J.T @ (weight * z)
         information, gradient = stereo_basis.T @ information @ stereo_basis, stereo_basis.T @ gradient
-        if shape and self.board is not None:
+        if self.board is not None:
             pull, of_board = self.board.normal(model.points)
             information = scipy.linalg.block_diag(information, self.board.information)
             gradient, cost = np.concatenate([gradient, pull]), cost + of_board
@@ -91,7 +91,7 @@ def priors_of(model: StereoModel, nominal: Array, shape_basis: Array) -> Prior:
     nominal : (n, 3) [m] the target's points as declared; shape_basis : (n, 3, s2) directions in which they may move
     """
     rows, at = np.zeros((2, 8, N_INTRINSIC)), np.zeros((2, 8))
-    for camera, own, middle in zip(model.cameras, rows, at, strict=True):
+    for camera, own, middle in zip(model.rig.cameras, rows, at, strict=True):
         f, size = 0.5 * (camera.fx + camera.fy), np.array(camera.image_size, float)
         diagonal = float(np.hypot(*size))
         corner = 0.5 * diagonal / f

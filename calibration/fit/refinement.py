@@ -184,11 +184,10 @@ def _robust_start(problem: Problem, model: StereoModel) -> tuple[StereoModel, fl
     """Huber's fit with the noise set by the median residual, and the extra variance [px^2] it shows."""
     observations = problem.observations
     model = replace(model, boards_right=None)
-    for basis in (problem.shape_basis[..., :0], problem.shape_basis)[: 1 + bool(problem.shape_basis.shape[-1])]:
-        for _ in range(2):
-            extra = _median_variance(observations.pixels - predict_pixels(model, observations))
-            rough = replace(problem.seeing(observations, extra), shape_basis=basis, huber=2.0)
-            model = minimise(rough, model, iterations=30, tolerance=1e-5, rough=True).model
+    for _ in range(2):
+        extra = _median_variance(observations.pixels - predict_pixels(model, observations))
+        rough = replace(problem.seeing(observations, extra), huber=2.0)
+        model = minimise(rough, model, iterations=30, tolerance=1e-5, rough=True).model
     return model, _median_variance(observations.pixels - predict_pixels(model, observations))
 
 

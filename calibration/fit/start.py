@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.board.target import LEAST_POINTS
-from calibration.cameras.camera import CAMERA_NAMES, Camera, rotation_from_vector
+from calibration.cameras.camera import CAMERA_NAMES, Camera, StereoRig, rotation_from_vector
 from calibration.fit.pairing import FLOOR, MOST_TRIED, Names, Pairs, board_turns, paired, places_of
 from calibration.fit.stereo_model import Observations, StereoModel
 from calibration.kit.arrays import Array, Array32, evenly
@@ -110,7 +110,7 @@ def start_stereo(
     R_board, t_board = np.tile(np.eye(3), (n_views, 1, 1)), np.tile([0.0, 0.0, 1.0], (n_views, 1))
     for view, (R, t) in (by_right | poses[0]).items():
         R_board[view], t_board[view] = R, t
-    model = StereoModel((cameras[0], cameras[1]), R_pair, t_pair, R_board, t_board, nominal.copy())
+    model = StereoModel(StereoRig(cameras[0], cameras[1], R_pair, t_pair), R_board, t_board, nominal.copy())
     left, right = ({v: side[v] for v in both} for side in (poses[0], by_right))
     apart = {v: "" for v, agrees in zip(both, pairs.agrees, strict=True) if not agrees}
     return Pairs(model, left, right, apart), {v: orders[k] for v, k in zip(both, pairs.order, strict=True)}, notes

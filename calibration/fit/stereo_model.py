@@ -11,13 +11,10 @@ from numpy.typing import NDArray
 from calibration.cameras.camera import (
     INTRINSIC_PARAMETERS,
     N_INTRINSIC,
-    PAIR_SHIFT,
-    PAIR_TURN,
-    Camera,
+    N_RIG,
     StereoRig,
     by_turning,
     rotation_from_vector,
-    stepped,
 )
 from calibration.kit.arguments import checked
 from calibration.kit.arrays import Array, Mask
@@ -59,9 +56,7 @@ class Observations:
 class StereoModel:
     """Everything that predicts where the target's points appear."""
 
-    cameras: tuple[Camera, Camera]
-    R_right_left: Array  # (3, 3)
-    t_right_left: Array  # (3,) [m]
+    rig: StereoRig  # the cameras; its world is the left one's axes
     R_left_board: Array  # (n_views, 3, 3)
     t_left_board: Array  # (n_views, 3) [m]
     points: Array  # (n, 3) target points in board axes [m], as refined
@@ -69,13 +64,8 @@ class StereoModel:
     boards_right: tuple[Array, Array] | None = None
 
     @property
-    def rig(self) -> StereoRig:
-        """The cameras; the world is the left one's axes."""
-        return StereoRig(*self.cameras, self.R_right_left, self.t_right_left)
-
-    @property
     def boards_in_right(self) -> tuple[Array, Array]:
-        """The same, where they did not move as well."""
+        """(n_views, 3, 3) and (n_views, 3) [m] of the boards at the right camera's exposure, moved or not."""
         return self.boards_right or (self.R_left_board, self.t_left_board)
 
     def placed(self, poses: Mapping[int, tuple[Array, Array]]) -> StereoModel:
@@ -177,9 +167,7 @@ def moved(model: StereoModel, stereo: Array, poses: Array, displacement: Array) 
         R, t = model.boards_right
         boards_right = rotation_from_vector(poses[:, 6:9]) @ R, t + poses[:, 9:]
     return StereoModel(
-        cameras=stepped(model.cameras, stereo),
-        R_right_left=rotation_from_vector(stereo[PAIR_TURN]) @ model.R_right_left,
-        t_right_left=model.t_right_left + stereo[PAIR_SHIFT],
+        rig=model.rig.perturbed(np.pad(stereo, (0, N_RIG - N_STEREO))),
         R_left_board=turns @ model.R_left_board,
         t_left_board=model.t_left_board + poses[:, 3:6],
         points=model.points + displacement,
@@ -191,6 +179,8 @@ def restricted(model: StereoModel, nominal: Array, terms: Terms) -> StereoModel:
     """The model with the terms that are not free put to zero: distortion, deviation of the board, fx - fy."""
     basis = board_basis(nominal, terms.board).reshape(nominal.size, -1)
     shape = np.linalg.pinv(basis) @ (model.points - nominal).reshape(-1)
-    held = np.concatenate([camera.parameters for camera in model.cameras]) * ~terms.free[: 2 * N_INTRINSIC]
+    held = np.zeros(N_RIG)
+    held[: 2 * N_INTRINSIC] = np.concatenate([camera.parameters for camera in model.rig.cameras])
+    held[:N_STEREO][terms.free] = 0.0
     points = nominal + (basis @ shape).reshape(nominal.shape)
-    return replace(model, points=points, cameras=stepped(model.cameras, -held))
+    return replace(model, points=points, rig=model.rig.perturbed(-held))

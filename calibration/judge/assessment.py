@@ -90,7 +90,7 @@ def cells_of(refinement: Refinement, camera: int) -> Array:
     """(8, 8) how many used corners lie in each cell of a grid on the image, along x and along y."""
     o = refinement.observations
     pixels = o.pixels[refinement.kept & (o.camera == camera)]
-    edges = [np.linspace(-0.5, size - 0.5, 9) for size in refinement.model.cameras[camera].image_size]
+    edges = [np.linspace(-0.5, size - 0.5, 9) for size in refinement.model.rig.cameras[camera].image_size]
     return np.histogram2d(pixels[:, 0], pixels[:, 1], bins=edges)[0]
 
 

@@ -324,14 +324,14 @@ def camera_moved(observations: Observations, pairs: Pairs, table_view: int | Non
     table_view : its stretch tells how the cameras stand; None: the one with the most pairs does
     """
     model = pairs.model
-    sides, R_pair, t_pair = [], model.R_right_left, model.t_right_left
+    sides, R_pair, t_pair = [], model.rig.R_right_left, model.rig.t_right_left
     views = np.array([*pairs.left_poses], int)
     if len(views) < 2 * MIN_VIEWS:
         return None
     in_right = {v: (R_pair @ R, R_pair @ t + t_pair) for v, (R, t) in pairs.right_poses.items()}
     for index, poses in enumerate((pairs.left_poses, in_right)):
         mine = observations[observations.camera == index]
-        sides.append(places_of({v: poses[v] for v in views}, mine, model.points, model.cameras[index]))
+        sides.append(places_of({v: poses[v] for v in views}, mine, model.points, model.rig.cameras[index]))
     tells = np.all([np.isfinite(side.covariance).all(axis=(1, 2)) for side in sides], axis=0)
     views, (left, right) = views[tells], (side[tells] for side in sides)
     R, t = told_by(left, right)

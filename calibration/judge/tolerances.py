@@ -211,16 +211,16 @@ def rig_with_covariance(
         free, cross = stereo, stereo @ np.swapaxes(carried, 1, 2)
     covariance = np.zeros((N_RIG, N_RIG))
     covariance[:N_STEREO, :N_STEREO] = basis @ free @ basis.T
-    R_left_world, t_left_world = np.eye(3), np.zeros(3)
+    rig = model.rig
     if table_view is not None:
         R, t = model.R_left_board[table_view], model.t_left_board[table_view]
         t = t if origin is None else t + R @ origin
         R_left_world, t_left_world = table_pose(R, t, board_thickness)
+        rig = replace(rig, R_left_world=R_left_world, t_left_world=t_left_world, world_is_table=True)
         # t_world = t - h R k: turning R by v shifts it by -v x (h R k) = (h R k) x v
         M = np.eye(6)
         M[3:, :3] = np.cross(board_thickness * R[:, 2], np.eye(3)).T
         covariance[N_STEREO:, N_STEREO:] = M @ poses[table_view] @ M.T
         covariance[:N_STEREO, N_STEREO:] = basis @ cross[table_view] @ M.T
         covariance[N_STEREO:, :N_STEREO] = covariance[:N_STEREO, N_STEREO:].T
-    place = (model.R_right_left, model.t_right_left, R_left_world, t_left_world)
-    return StereoRig(*model.cameras, *place, 0.5 * (covariance + covariance.T), table_view is not None)
+    return replace(rig, covariance=0.5 * (covariance + covariance.T))

@@ -1,12 +1,14 @@
 """A known stereo pair before a known board: what every synthetic test starts from."""
 
-from dataclasses import dataclass
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 import pytest
 
-from calibration import Board, Camera, CornerView, Observations, StereoModel
+from calibration import Board, Camera, CornerView, Observations, StereoModel, StereoRig
 from calibration.cameras.camera import project, rotation_from_vector
 from calibration.kit.arrays import Array
 
@@ -18,13 +20,17 @@ class Scene:
     model: StereoModel
     board: Board
 
+    def with_rig(self, **changed) -> Scene:
+        """The same boards before a changed rig."""
+        return replace(self, model=replace(self.model, rig=replace(self.model.rig, **changed)))
+
     def pixels(self, camera: int) -> Array:
         """(n_views, n_points, 2) [px] without noise."""
         m = self.model
         points = np.einsum("vij,nj->vni", m.R_left_board, m.points) + m.t_left_board[:, None]
         if camera:
-            points = points @ m.R_right_left.T + m.t_right_left
-        return project(points, m.cameras[camera])
+            points = points @ m.rig.R_right_left.T + m.rig.t_right_left
+        return project(points, m.rig.cameras[camera])
 
     def observations(self, sigma: float, rng: np.random.Generator | None = None) -> Observations:
         """All corners with Gaussian noise of unequal size: sigma x 0.5 to 2, correlated between x and y."""
@@ -60,7 +66,7 @@ def make_scene(n_views=12, inner_corners=(9, 6), square=8e-3, distortion=True, d
         R_board[v] = turn @ towards
         t_board[v] = target + rng.uniform(-0.015, 0.015, 3) - R_board[v] @ centre
     points = board.points + (0 if deviation is None else deviation)
-    return Scene(StereoModel(cameras, R_pair, t_pair, R_board, t_board, points), board)
+    return Scene(StereoModel(StereoRig(*cameras, R_pair, t_pair), R_board, t_board, points), board)
 
 
 def corner_view(points, sigma=0.1, image_size=(640, 480)) -> CornerView:

@@ -8,6 +8,7 @@ from numpy.testing import assert_allclose
 from calibration import Board, BoardNotFound, Camera, CornerView, find_corners
 from calibration.board.chessboard import luminance, margin_is_dark
 from calibration.cameras.camera import project, rotation_from_vector
+from tests.calibration.conftest import corner_view
 
 CAMERA = Camera(900.0, 905.0, 158.0, 122.0, (-0.1, 0.1, 3e-4, -2e-4, 0.0), (320, 240))
 BOARD = Board((9, 6), 8e-3)
@@ -225,8 +226,8 @@ def test_paper_round_the_squares_tells_a_negative_from_a_positive(board_drawer, 
     """Nothing else does: the colouring of a negative is that of the board turned by 180 deg."""
     board = Board((9, 6), 6e-3)
     image, true = seen(board_drawer, seed=3, board=board, table=60.0, rim=rim)  # darker than paper
-    assert not margin_is_dark(image, true, board.points, board)
-    assert margin_is_dark(255 - image, true, board.points, board)
+    assert not margin_is_dark(image, corner_view(true), (9, 6))
+    assert margin_is_dark(255 - image, corner_view(true), (9, 6))
 
 
 def test_equal_channels_change_nothing(board_drawer):

@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.interpolate import BSpline
 
-from calibration import StereoRig, Terms, refine_stereo, triangulate
+from calibration import Terms, refine_stereo, triangulate
 from calibration.cameras.splines import LensField
 from calibration.fit.lens_field import fit_lens_field
 
@@ -53,11 +53,10 @@ def test_field_is_found_and_the_geometry_is_better_for_it(refined):
 
     def length_error(model, field):
         """Of the distances between neighbouring corners, triangulated from noiseless images [m]."""
-        rig = StereoRig(*model.cameras, model.R_right_left, model.t_right_left)
         errors = []
         for v in range(16):
             seen = np.stack([p + field_of(p, c) for c, p in enumerate((scene.pixels(0)[v], scene.pixels(1)[v]))])
-            points = triangulate(field.corrected(seen) if field else seen, rig)
+            points = triangulate(field.corrected(seen) if field else seen, model.rig)
             errors.append(np.linalg.norm(np.diff(points, axis=0), axis=1)[:8] - scene.board.square)
         return np.std(errors)
 

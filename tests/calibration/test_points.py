@@ -19,7 +19,7 @@ def test_points_and_one_sigma_give_the_rig_and_say_that_the_noise_was_overstated
     left, right = noisy(scene, rng, 0.04)
     left[3] = None
     found = calibrate_from_points(left, right, scene.board, (512, 512), 0.04, PLAIN)
-    t = scene.model.t_right_left
+    t = scene.model.rig.t_right_left
     C = found.rig.covariance[21:24, 21:24]
     error = found.rig.t_right_left - t
     assert error @ np.linalg.solve(C, error) < 16  # chi-square of three

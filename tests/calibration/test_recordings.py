@@ -68,7 +68,10 @@ def test_halves_of_the_opencv_photographs_agree_within_what_each_states(opencv_p
         ]
         basis = fits[0].problem.stereo_basis
         (one, R_one), (two, R_two) = (
-            (np.concatenate([*(c.parameters for c in f.model.cameras), np.zeros(3), f.model.t_right_left]), f.model)
+            (
+                np.concatenate([*(c.parameters for c in f.model.rig.cameras), np.zeros(3), f.model.rig.t_right_left]),
+                f.model.rig,
+            )
             for f in fits
         )
         difference = one - two

@@ -31,7 +31,7 @@ def disturbed(scene, rng, size=1.0):
 
 
 def parameters(model):
-    return np.concatenate([model.cameras[0].parameters, model.cameras[1].parameters, model.t_right_left])
+    return np.concatenate([*(camera.parameters for camera in model.rig.cameras), model.rig.t_right_left])
 
 
 def rig_error(found, truth):
@@ -48,8 +48,8 @@ def true_rig(scene, view, thickness):
     m = scene.model
     R, t = table_pose(m.R_left_board[view], m.t_left_board[view], thickness)
     found = refine_stereo(scene.observations(1e-3), m, scene.board.points, FULL)
-    place = {"R_right_left": m.R_right_left, "t_right_left": m.t_right_left, "R_left_world": R, "t_left_world": t}
-    return replace(rig_with_covariance(found, view, thickness, 1.0), left=m.cameras[0], right=m.cameras[1], **place)
+    covariance = rig_with_covariance(found, view, thickness, 1.0).covariance
+    return replace(m.rig, R_left_world=R, t_left_world=t, covariance=covariance)
 
 
 def test_a_minimum_is_one_where_only_rounding_is_left_to_gain(scene_maker, rng):
@@ -72,7 +72,7 @@ def test_exact_corners_give_back_the_exact_rig(scene_maker, rng):
     assert found.converged
     assert found.rms() < 1e-7  # round-off: pixels of size 500 in double precision, some 1e-13 each, ill-conditioned
     assert_allclose(parameters(found.model)[:4], parameters(scene.model)[:4], rtol=1e-7)
-    assert_allclose(found.model.t_right_left, scene.model.t_right_left, atol=1e-9)
+    assert_allclose(found.model.rig.t_right_left, scene.model.rig.t_right_left, atol=1e-9)
 
 
 def rig_errors(scene, seeds, inflation=1.0):
@@ -130,7 +130,7 @@ def test_gross_outliers_are_rejected_and_do_no_harm(scene_maker, rng):
     assert (~dirty.kept).sum() <= 27
     # 25 of 1296 points fewer: far less than a standard deviation of change
     sigma = np.sqrt(np.diag(rig_with_covariance(clean, None, 0, 1.0).covariance))[:9]
-    change = dirty.model.cameras[0].parameters - clean.model.cameras[0].parameters
+    change = dirty.model.rig.cameras[0].parameters - clean.model.rig.cameras[0].parameters
     assert np.abs(change[sigma > 0] / sigma[sigma > 0]).max() < 1.0
 
 
@@ -147,15 +147,18 @@ def test_rejection_that_does_not_settle_leaves_a_fit_of_the_points_that_it_names
 def test_pixels_that_are_not_square_are_no_hindrance_to_the_start(scene_maker, rng, aspect):
     scene = scene_maker(n_views=10)
     cameras = tuple(
-        replace(c, fy=c.fy * aspect, cy=c.cy * aspect, image_size=(512, int(512 * aspect))) for c in scene.model.cameras
+        replace(c, fy=c.fy * aspect, cy=c.cy * aspect, image_size=(512, int(512 * aspect)))
+        for c in scene.model.rig.cameras
     )
-    scene = replace(scene, model=replace(scene.model, cameras=cameras))
+    scene = scene.with_rig(left=cameras[0], right=cameras[1])
     o = scene.observations(0.02, rng)
     sizes = cameras[0].image_size, cameras[1].image_size
     begun, _, _ = start_stereo(o, scene.board.points, sizes, [("left", "right")] * 10)
     assert not begun.apart
     found = refine_stereo(o, begun.model, scene.board.points, FULL)
-    assert_allclose(found.model.cameras[0].fy / found.model.cameras[0].fx, cameras[0].fy / cameras[0].fx, rtol=2e-3)
+    assert_allclose(
+        found.model.rig.cameras[0].fy / found.model.rig.cameras[0].fx, cameras[0].fy / cameras[0].fx, rtol=2e-3
+    )
 
 
 def test_a_bent_board_is_chosen_and_recovered(scene_maker, rng):
@@ -176,7 +179,7 @@ def test_a_flat_board_stays_flat_and_a_lens_without_distortion_has_none_within_i
     o = scene.observations(0.02, rng)
     found, _ = choose_board(o, scene.model, scene.board.points, (Terms(), Terms(board="warped")))
     assert found.terms.board == "flat"
-    distortion = np.concatenate([camera.distortion for camera in found.model.cameras])
+    distortion = np.concatenate([camera.distortion for camera in found.model.rig.cameras])
     of_distortion = [*range(4, 9), *range(13, 18)]
     B = found.problem.stereo_basis[of_distortion]
     assert squared(distortion, B @ found.normal.covariances()[0] @ B.T) < 2.96  # of 10 numbers: p = 0.001

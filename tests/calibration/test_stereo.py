@@ -35,19 +35,18 @@ def small_scene(scene_maker, **options):
     scene = scene_maker(inner_corners=BOARD.inner_corners, square=BOARD.square, **options)
     cameras = tuple(
         Camera(c.fx * 0.45, c.fy * 0.45, 119.0 + i, 96.0 - i, (-0.15, 0, 0, 0, 0), (240, 192))
-        for i, c in enumerate(scene.model.cameras)
+        for i, c in enumerate(scene.model.rig.cameras)
     )
-    return replace(scene, model=replace(scene.model, cameras=cameras))
+    return scene.with_rig(left=cameras[0], right=cameras[1])
 
 
 def draw(scene, board_drawer, rng, board=BOARD, sub=4):
-    m = scene.model
+    m, rig = scene.model, scene.model.rig
     images = ([], [])
     for R, t in zip(m.R_left_board, m.t_left_board, strict=True):
-        images[0].append(board_drawer(m.cameras[0], R, t, board, sub=sub, rng=rng))
-        images[1].append(
-            board_drawer(m.cameras[1], m.R_right_left @ R, m.R_right_left @ t + m.t_right_left, board, sub=sub, rng=rng)
-        )
+        images[0].append(board_drawer(rig.left, R, t, board, sub=sub, rng=rng))
+        R, t = rig.R_right_left @ R, rig.R_right_left @ t + rig.t_right_left
+        images[1].append(board_drawer(rig.right, R, t, board, sub=sub, rng=rng))
     return images
 
 
@@ -67,7 +66,7 @@ def corner_views(scene, rng, sigma=0.02):
     """What `find_corners` would return, without images."""
     return [
         [corner_view(p + rng.normal(size=p.shape) * sigma, sigma, camera.image_size) for p in scene.pixels(c)]
-        for c, camera in enumerate(scene.model.cameras)
+        for c, camera in enumerate(scene.model.rig.cameras)
     ]
 
 
@@ -76,10 +75,7 @@ def test_lab_frame_from_images_is_right_within_its_uncertainty(calibrated):
     R, t = table_pose(scene.model.R_left_board[3], scene.model.t_left_board[3], THICKNESS)
     points = np.array([[0.0, 0, 0], [50e-3, 0, 0], [0, 25e-3, 0], [25e-3, 10e-3, 10e-3]])
     m = scene.model
-    true_rig = replace(
-        found.rig, left=m.cameras[0], right=m.cameras[1], R_right_left=m.R_right_left, t_right_left=m.t_right_left,
-        R_left_world=R, t_left_world=t,
-    )  # fmt: skip
+    true_rig = replace(m.rig, R_left_world=R, t_left_world=t)
     error = triangulate(true_rig.project(points), found.rig) - points
     sigma = point_uncertainty(found.rig, points)
     assert np.abs(error / sigma).max() < 4.5
@@ -168,7 +164,7 @@ def test_parallel_views_are_warned_of(scene_maker, rng):
     m = scene.model
     shift = rng.uniform(-0.02, 0.02, (8, 3))
     parallel = StereoModel(
-        m.cameras, m.R_right_left, m.t_right_left,
+        m.rig,
         np.stack([m.R_left_board[0] @ rotation_from_vector(np.array([0, 0, 0.1 * v])) for v in range(8)]),
         m.t_left_board[0] + shift, m.points,
     )  # fmt: skip
@@ -179,7 +175,7 @@ def test_parallel_views_are_warned_of(scene_maker, rng):
     assert not any("normals differ" in w for w in many.warnings)
     # and the covariance says the same as the warning, although square pixels are known beforehand
     assert found.rig.covariance[0, 0] > many.rig.covariance[0, 0]
-    error = found.rig.left.parameters[:4] - m.cameras[0].parameters[:4]
+    error = found.rig.left.parameters[:4] - m.rig.left.parameters[:4]
     assert np.abs(error / np.sqrt(np.diag(found.rig.covariance)[:4])).max() < 4
 
 
@@ -197,7 +193,7 @@ def test_a_board_that_looks_the_same_after_a_turn_still_gives_one_pair(scene_mak
     assert not found.rejected_views
     assert found.rms_px < 0.03
     assert any("looks the same after a turn" in w for w in found.warnings)
-    assert_allclose(found.rig.t_right_left, scene.model.t_right_left, atol=5e-3)  # 5 x 5 corners tell little
+    assert_allclose(found.rig.t_right_left, scene.model.rig.t_right_left, atol=5e-3)  # 5 x 5 corners tell little
 
 
 def in_a_mirror(view, board):
@@ -287,7 +283,7 @@ def test_boards_of_two_sizes_end_in_a_rig_or_a_sentence(views, scene_maker):
     mixed = [[b if v % 3 == 1 else a for v, (a, b) in enumerate(zip(*s, strict=True))] for s in zip(views, other)]  # noqa: B905
     found = calibrate_from_corners(*mixed, BOARD, FLAT)
     assert found.apart == (1, 4, 7, 10)
-    assert_allclose(found.rig.baseline, np.linalg.norm(m.t_right_left), rtol=0.01)
+    assert_allclose(found.rig.baseline, m.rig.baseline, rtol=0.01)
 
 
 @pytest.mark.statistical
@@ -297,8 +293,7 @@ def test_every_pair_of_a_square_board_is_used_whichever_way_a_camera_sees_it(sce
     board = Board(counts, 6e-3)
     scene = scene_maker(n_views=16, inner_corners=counts, square=6e-3)
     near = rotation_from_vector(np.array([0.0, -0.06, 0.0]))
-    m = replace(scene.model, R_right_left=near, t_right_left=np.array([-0.02, 0.0, 0.002]))
-    views = corner_views(replace(scene, model=m), rng, 0.1)
+    views = corner_views(scene.with_rig(R_right_left=near, t_right_left=np.array([-0.02, 0.0, 0.002])), rng, 0.1)
     for turned in (0, 1):  # and the right camera upside down
         right = [view.reordered(board.orders[(turned + v // 3) % board.symmetry]) for v, view in enumerate(views[1])]
         found = calibrate_from_corners(views[0], right, board, CalibrationSettings("k1", "flat"))
@@ -342,10 +337,10 @@ def test_an_image_that_is_missing_makes_no_two_views_one(views):
 def test_a_lens_that_was_zoomed_between_the_views_is_named_and_costs_its_later_images(scene_maker, zoom):
     scene = scene_maker(n_views=20)
     m, board = scene.model, scene.board
-    right = m.cameras[1]
-    zoomed = replace(m, cameras=(m.cameras[0], replace(right, fx=zoom * right.fx, fy=zoom * right.fy)))
+    right = m.rig.right
+    zoomed = scene.with_rig(right=replace(right, fx=zoom * right.fx, fy=zoom * right.fy))
     left, before = corner_views(scene, np.random.default_rng(0))
-    after = corner_views(replace(scene, model=zoomed), np.random.default_rng(1))[1]
+    after = corner_views(zoomed, np.random.default_rng(1))[1]
     right_views = [*before[:12], *after[12:]]
     found = calibrate_from_corners(left, right_views, board, CalibrationSettings(board="flat"))
     (text,) = [text for text in found.warnings if "zoomed" in text]
@@ -355,7 +350,7 @@ def test_a_lens_that_was_zoomed_between_the_views_is_named_and_costs_its_later_i
     assert found.assessment.pairs == 12
     sigma = np.sqrt(np.diag(found.rig.covariance))
     assert abs(found.rig.right.fx - right.fx) < 4 * sigma[9]
-    assert np.abs((found.rig.t_right_left - m.t_right_left) / sigma[21:24]).max() < 4
+    assert np.abs((found.rig.t_right_left - m.rig.t_right_left) / sigma[21:24]).max() < 4
 
 
 def test_images_of_half_the_size_are_no_better_a_calibration(scene_maker):
@@ -364,11 +359,11 @@ def test_images_of_half_the_size_are_no_better_a_calibration(scene_maker):
     m = scene.model
     half = tuple(
         replace(c, fx=c.fx / 2, fy=c.fy / 2, cx=c.cx / 2 - 0.25, cy=c.cy / 2 - 0.25, image_size=(120, 96))
-        for c in m.cameras
+        for c in m.rig.cameras
     )
     found = []
-    for model, sigma in ((m, 0.1), (replace(m, cameras=half), 0.05)):
-        sides = corner_views(replace(scene, model=model), np.random.default_rng(2), sigma)
+    for one, sigma in ((scene, 0.1), (scene.with_rig(left=half[0], right=half[1]), 0.05)):
+        sides = corner_views(one, np.random.default_rng(2), sigma)
         found.append(calibrate_from_corners(*sides, BOARD, FLAT).assessment)
     whole, less = found
     assert less.verdict.split(":")[0] == whole.verdict.split(":")[0]

@@ -73,9 +73,9 @@ def test_stretch_and_bow_are_seen_by_the_views(scene_maker, rng, board):
     d = (BOARD.points - BOARD.points.mean(0))[:, 0] / (5 * BOARD.square)
     assert abs(shape.lift - 60e-6 * np.mean(1 - d**2)) < 5 * shape.lift_sigma < 5e-6
     # both sides are as likely to be off: half of the stretch is taken for each, so lengths are 0.01 % short
-    truth = np.linalg.norm(scene.model.t_right_left)
+    truth = np.linalg.norm(scene.model.rig.t_right_left)
     sigma = 4 * np.sqrt(rig_with_covariance(refinement, 0, THICK, 1.0).covariance[21, 21]) / truth
-    assert_allclose(np.linalg.norm(refinement.model.t_right_left) / truth - 1, -1e-4, atol=sigma + 2e-5)
+    assert_allclose(np.linalg.norm(refinement.model.rig.t_right_left) / truth - 1, -1e-4, atol=sigma + 2e-5)
     # and the world's origin lies below corner 0
     corner = refinement.model.points[0] - on_the_table(BOARD.points, shape)
     assert_allclose(corner[:2], 0.0, atol=4 * (shape.stretch_sigma * 0.032 + 0.005 * 0.25e-3))
