@@ -136,14 +136,11 @@ def record_of(calibration: StereoCalibration) -> CalibrationRecord:
         ],
         "assessment": asdict(calibration.assessment),
     }
-    model, observations, apart = r.model, r.observations, calibration.apart
-    if model.boards_right is not None:  # every right image has a place of its own
-        n = len(model.R_left_board)
-        apart = (*apart, *range(n - len(apart)), *apart)
-        observations = replace(observations, view=observations.view + n * observations.camera)
-        boards = zip((model.R_left_board, model.t_left_board), model.boards_right, strict=True)
-        R, t = (np.concatenate(both) for both in boards)
-        model = replace(model, R_left_board=R, t_left_board=t, boards_right=None)
+    model, seen = r.model, r.observations
+    apart = np.flatnonzero(model.apart)  # the right images' places come behind those of the views
+    place = np.arange(len(model.apart))
+    place[apart] = len(place) + np.arange(len(apart))
+    R, t = (np.concatenate([of[:, 0], of[apart, 1]]) for of in (model.R_left_board, model.t_left_board))
     told = {
         "settings": asdict(calibration.settings),
         "figures": figures,
@@ -156,14 +153,14 @@ def record_of(calibration: StereoCalibration) -> CalibrationRecord:
     return CalibrationRecord(
         **{name: getattr(calibration, name) for name in ("board", "board_points", "table_view", "board_thickness")},
         view_names=tuple((str(a), str(b)) for a, b in calibration.view_names),
-        observations=observations,
+        observations=replace(seen, view=np.where(seen.camera == 1, place[seen.view], seen.view)),
         kept=r.kept,
         residuals=r.residuals,
         unexplained_sigma=r.unexplained_sigma,
-        R_left_board=model.R_left_board,
-        t_left_board=model.t_left_board,
+        R_left_board=R,
+        t_left_board=t,
         told=json.loads(json.dumps(told, default=lambda o: o.item() if hasattr(o, "item") else str(o))),
-        apart=apart,
+        apart=tuple(apart.tolist()),
     )
 
 

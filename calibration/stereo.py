@@ -70,7 +70,7 @@ class StereoCalibration(Brief):
     assessment: Assessment
     warnings: tuple[str, ...] = field(default=())
     doubts: tuple[str, ...] = ()  # what may make the rig wrong by more than its sigmas
-    apart: tuple[int, ...] = ()  # views whose right image has a place of the board of its own, n_views + 0, 1, ...
+    apart: tuple[int, ...] = ()  # views whose two images are not taken for one place of the board
     lens: FieldFit | None = None  # where views left out were met better with it; the observations are corrected by it
 
     def facts(self) -> dict[str, str]:
@@ -112,13 +112,8 @@ class StereoCalibration(Brief):
     @property
     def rms_per_view_px(self) -> Array:
         """(n_views, 2 cameras) [px]; NaN where a view was not used."""
-        image = 2 * self.views_of_observations() + self.refinement.observations.camera
+        image = 2 * self.refinement.observations.view + self.refinement.observations.camera
         return np.array([self.refinement.rms(image == i) for i in range(2 * len(self.view_names))]).reshape(-1, 2)
-
-    def views_of_observations(self) -> NDArray[np.intp]:
-        """(m,) the number of the view, also where its right image has a place of the board of its own."""
-        places = np.concatenate([np.arange(len(self.view_names)), np.array(self.apart, np.intp)])
-        return places[self.refinement.observations.view]
 
     def rejected_corners(self) -> list[tuple[int, int, int, str]]:
         """(view, camera, corner, reason) of every corner that was found but not used."""
@@ -128,12 +123,11 @@ class StereoCalibration(Brief):
                 if isinstance(view, CornerView):
                     found = np.flatnonzero(~view.accepted & [reason != "" for reason in view.reasons])
                     rejected += [(v, camera, int(i), view.reasons[i]) for i in found]  # without one: not in view
-        r, view_of = self.refinement, self.views_of_observations()
-        o = r.observations
+        r, o = self.refinement, self.refinement.observations
         for i in np.flatnonzero(~r.kept):
             distance = float(np.linalg.norm(r.residuals[i]))
             reason = f"{distance:.3f} px from where all other corners put it"
-            rejected.append((int(view_of[i]), int(o.camera[i]), int(o.point[i]), reason))
+            rejected.append((int(o.view[i]), int(o.camera[i]), int(o.point[i]), reason))
         return rejected
 
 

@@ -15,7 +15,6 @@ from calibration.judge.pairs import (
     camera_moved,
     judge_pairs,
     motion_between_exposures,
-    own_places,
 )
 from calibration.kit.arrays import Array
 
@@ -51,17 +50,16 @@ def fit_jointly(
     """
     moved = camera_moved(observations, start, table_view)  # seen best by cameras that no pair has pulled yet
     # rough poses may be degrees off: refined cameras judge those anew that do not agree
-    used = start if moved is None and len(start.left_poses) >= LEAST_PAIRS else replace(start, apart={})
+    used = start if moved is None and len(start.views) >= LEAST_PAIRS else replace(start, apart={})
     used = used if moved is None else used.set_apart(moved.others, MOVED_CAMERA)
 
     def refined(by: Pairs, tried: Sequence[Terms], motion: BoardMotion | None = None) -> Refined:
-        places = own_places(observations, by.model, sorted(by.apart), by.right_poses)
-        return choose_board(*places, nominal, tried, motion)
+        return choose_board(observations, by.joined(observations), nominal, tried, motion)
 
     refinement, candidates = refined(used, tried)
     bad_images: dict[tuple[int, int], str] = {}
     for _ in range(REJUDGED):
-        pairs = judge_pairs(observations, refinement, sorted(used.apart), moved.others if moved else ())
+        pairs = judge_pairs(observations, refinement, moved.others if moved else ())
         moved = camera_moved(observations, pairs, table_view)
         pairs = pairs if moved is None else pairs.set_apart(moved.others, MOVED_CAMERA)
         if sorted(pairs.apart) == sorted(used.apart) and not pairs.bad_images:
@@ -86,10 +84,7 @@ def fit_jointly(
 
 def _without_images(observations: Observations, pairs: Pairs) -> tuple[Observations, Pairs]:
     """Leave out images that do not even fit alone."""
-    by_right = {}
     for view, camera in pairs.bad_images:
         observations = observations[(observations.view != view) | (observations.camera != camera)]
-        if camera == 0 and view in pairs.right_poses:
-            by_right[view] = pairs.right_poses[view]
     apart = {view: why for view, why in pairs.apart.items() if not {(view, 0), (view, 1)} & set(pairs.bad_images)}
-    return observations, replace(pairs, model=pairs.model.placed(by_right), apart=apart, bad_images={})
+    return observations, replace(pairs, apart=apart, bad_images={})

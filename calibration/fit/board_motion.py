@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calibration.fit.stereo_model import StereoModel
-from calibration.kit.arrays import Array
+from calibration.kit.arrays import Array, Mask
 
 TAILS = 4.0  # degrees of freedom of Student's distribution, as usual where few pairs would have to tell them
 LEAST = 1e-7  # [rad], and of the board's distance: far below what any view tells of a pose
@@ -45,24 +45,18 @@ class BoardMotion:
         return bool(np.allclose(self.weights, other.weights, rtol=0.05, atol=0.0))
 
 
-def split(model: StereoModel) -> StereoModel:
-    """The model with places of the boards at the right camera's exposure: those of the left one, to begin with."""
-    return replace(model, boards_right=model.boards_in_right)
-
-
 def motions(model: StereoModel) -> tuple[Array, Array]:
     """Turns and shifts (n_views, 6) of the boards, in the left camera's axes, and their derivative (n_views, 6, 12).
 
     By steps of the two poses of a board, as `stereo_model.moved` takes them; turns to first order.
     """
-    R, t = model.boards_in_right
-    middle = model.points.mean(0)
-    arms = [model.R_left_board @ middle, R @ middle]
-    turn = R @ np.swapaxes(model.R_left_board, 1, 2)
+    R, t = np.moveaxis(model.R_left_board, 1, 0), np.moveaxis(model.t_left_board, 1, 0)
+    arms = R @ model.points.mean(0)
+    turn = R[1] @ np.swapaxes(R[0], 1, 2)
     vector = [0.5 * (turn[:, i, j] - turn[:, j, i]) for i, j in ((2, 1), (0, 2), (1, 0))]
-    shift = (arms[1] + t) - (arms[0] + model.t_left_board)
+    shift = (arms[1] + t[1]) - (arms[0] + t[0])
     motion = np.concatenate([np.stack(vector, axis=1), shift], axis=1)
-    by_poses = np.zeros((len(R), 6, 12))
+    by_poses = np.zeros((len(turn), 6, 12))
     for first, (arm, sign) in zip((0, 6), zip(arms, (-1.0, 1.0), strict=True), strict=True):
         by_poses[:, :, first : first + 6] = sign * np.eye(6)
         for axis in range(3):  # a turn v of the board about its origin moves the middle by v x arm
@@ -70,18 +64,19 @@ def motions(model: StereoModel) -> tuple[Array, Array]:
     return motion, by_poses
 
 
-def learnt(motion: BoardMotion, model: StereoModel, covariance: Array) -> tuple[BoardMotion, float]:
+def learnt(motion: BoardMotion, model: StereoModel, covariance: Array, apart: Mask) -> tuple[BoardMotion, float]:
     """The motion's size as the pairs tell it, one step of the fixed point, and the number of motions determined.
 
     covariance : (n_views, 12, 12) of the poses, the shared parameters' part included
+    apart : (n_views,) that are no pairs, and tell nothing
     """
     m, J = motions(model)
     C = np.einsum("vij,vjk,vik->vi", J, covariance, J)
     weights = motion.weights_of(len(m))
-    determined = np.clip(1.0 - C * weights, 0.0, 1.0)
-    heeded = weights[:, 0] / motion.weights[0]
+    determined = np.clip(1.0 - C * weights, 0.0, 1.0) * ~apart[:, None]
+    heeded = weights[:, 0] / motion.weights[0] * ~apart
     sizes = []
-    distance = float(np.median(np.linalg.norm(model.t_left_board, axis=1)))
+    distance = float(np.median(np.linalg.norm(model.t_left_board[:, 0], axis=1)))
     for part, least in ((slice(0, 3), LEAST), (slice(3, 6), LEAST * distance)):
         square = float(np.sum(heeded[:, None] * m[:, part] ** 2)) / max(float(determined[:, part].sum()) - 2.0, 1.0)
         sizes.append(max(float(np.sqrt(square)), least))

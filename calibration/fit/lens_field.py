@@ -127,7 +127,7 @@ def _squares(refinement: Refinement, used: Observations, grid: LensField, extra:
         for axis in (0, 1):
             field[np.arange(len(o)), axis, 2 * o.camera + axis] = grid.splines(o.pixels)
         rows, of_view, _ = problem.seeing(o, extra).rows(refinement.model, field.reshape(len(o), 2, -1))
-        rest = eliminate(rows[of_view == view], 6 if problem.motion is None else 12)[1]
+        rest = eliminate(rows[of_view == view], problem.n_own)[1]
         yield rest.T @ rest
 
 

@@ -1,6 +1,6 @@
 """Cameras, stereo pose, board shape and board poses as a problem of least squares, whose blocks are the views.
 
-The six numbers of a board's pose are its view's own, 12 where boards moved between the two exposures.
+The six numbers of a board's pose are its view's own, 12 where its two images show it in two places.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from calibration.fit.board_motion import BoardMotion, motions
 from calibration.fit.priors import Prior, board_prior
 from calibration.fit.stereo_model import Observations, StereoModel, moved, predict
 from calibration.kit import least_squares
-from calibration.kit.arrays import Array
+from calibration.kit.arrays import Array, Mask
 from calibration.kit.errors import CalibrationError
 from calibration.kit.least_squares import Minimum, Normal, normal_of_rows
 
@@ -28,10 +28,20 @@ class Problem:
     weights: Array  # (m, 2, 2) inverse covariance [1/px^2]
     stereo_basis: Array  # (24, s1) free directions of intrinsics and stereo pose
     shape_basis: Array  # (n, 3, s2) free directions of the target's points
-    n_views: int
+    apart: Mask  # (n_views,) whose two images have places of the board that nothing ties
     huber: float = np.inf  # residuals beyond this many sigmas count linearly
     prior: Prior | None = None  # of the cameras
     motion: BoardMotion | None = None  # of the boards between the two exposures, for a model that has such places
+
+    @property
+    def n_views(self) -> int:
+        """Views, seen or not."""
+        return len(self.apart)
+
+    @property
+    def n_own(self) -> int:
+        """Numbers of a view's own: of one place of the board, or of two."""
+        return 6 if self.motion is None and not self.apart.any() else 12
 
     def seeing(self, observations: Observations, extra: float) -> Problem:
         """The same with other observations, whose covariances are by `extra` [px^2] larger in both axes."""
@@ -45,16 +55,15 @@ class Problem:
     def rows(self, model: StereoModel, beyond: Array | None = None) -> tuple[Array, NDArray[np.intp], Array]:
         """Whitened rows (r, c) of all data, which view each is of (r,), and chi-square, or Huber's loss, by view.
 
-        Columns: pose of the board, or its two poses where boards move | stereo | shape | beyond (m, 2, b) | residual.
+        Columns: pose of the board, or both where some views have two | stereo | shape | beyond (m, 2, b) | residual.
         NaN where a point lies behind its camera.
         """
         o, V = self.observations, self.n_views
         with np.errstate(all="ignore"):  # a step may put a board anywhere
             pixels, d_stereo, d_pose, d_point = predict(model, o)
-            if self.motion is not None:
-                d_pose = np.concatenate(
-                    [np.where((o.camera == c)[:, None, None], d_pose, 0.0) for c in (0, 1)], axis=-1
-                )
+            if self.n_own == 12:
+                place = o.camera * (self.apart[o.view] | (self.motion is not None))
+                d_pose = np.concatenate([np.where((place == c)[:, None, None], d_pose, 0.0) for c in (0, 1)], axis=-1)
             residual = o.pixels - pixels
             stereo = np.tensordot(d_stereo, self.stereo_basis, 1)
             columns = [d_pose, stereo, d_point @ self.shape_basis[o.point], residual[..., None]]
@@ -69,7 +78,7 @@ class Problem:
             costs: Array = np.bincount(o.view, within * (2.0 * sigmas - within), V).astype(float)
         if self.motion is not None:
             between, by_poses = motions(model)
-            root = np.sqrt(self.motion.weights_of(V) * (np.bincount(o.view, minlength=V) > 0)[:, None])
+            root = np.sqrt(self.motion.weights_of(V) * ((np.bincount(o.view, minlength=V) > 0) & ~self.apart)[:, None])
             tied = np.zeros((V, 6, rows.shape[1]))
             tied[..., :12], tied[..., -1] = root[..., None] * by_poses, -root * between
             rows, view = np.concatenate([rows, tied.reshape(6 * V, -1)]), np.append(view, np.repeat(np.arange(V), 6))
@@ -83,7 +92,7 @@ class Problem:
         place, of_view = np.empty(len(view), int), np.zeros((self.n_views, count.max(), rows.shape[1]))
         place[order] = np.arange(len(view)) - np.repeat(np.cumsum(count) - count, count)
         of_view[view, place] = rows
-        normal = normal_of_rows(of_view, 6 if self.motion is None else 12)
+        normal = normal_of_rows(of_view, self.n_own)
         normal = replace(normal, costs=np.where(np.isfinite(costs), costs, np.inf))
         if self.prior is None:
             return normal
@@ -92,8 +101,10 @@ class Problem:
 
     def stepped(self, model: StereoModel, shared: Array, poses: Array) -> StereoModel:
         """The model after a step."""
-        s1 = self.stereo_basis.shape[1]
-        return moved(model, self.stereo_basis @ shared[:s1], poses, self.shape_basis @ shared[s1:])
+        s1, steps = self.stereo_basis.shape[1], poses.reshape(self.n_views, -1, 6)
+        if self.motion is None:
+            steps = np.where(self.apart[:, None, None], steps, steps[:, :1])
+        return moved(model, self.stereo_basis @ shared[:s1], steps, self.shape_basis @ shared[s1:])
 
 
 def quadratic(matrix: Array, vector: Array) -> Array:

@@ -133,16 +133,22 @@ Paired = tuple[list[int], BoardPlaces, list[BoardPlaces]]  # left views, and whe
 class Pairs:
     """Which pairs show the board in one place, as cameras see it that have a place of it for each image."""
 
-    model: StereoModel  # its poses those of the views: of both images together, or of the left one of a pair apart
-    left_poses: dict[int, Pose]  # of the left image of each pair alone
-    right_poses: dict[int, Pose]  # of the right one alone, in the left camera's axes
+    model: StereoModel  # its boards where each image alone has them
+    views: NDArray[np.intp]  # of which both images tell that
     apart: dict[int, str]  # view -> why its two images are not taken for one place
     bad_images: dict[tuple[int, int], str] = field(default_factory=dict)  # (view, camera) -> why not even alone
 
     def set_apart(self, views: Sequence[int], why: str) -> Pairs:
-        """With these apart, too, each at the place that its left image alone gives the board."""
-        model = self.model.placed({v: self.left_poses[v] for v in views})
-        return replace(self, model=model, apart=self.apart | dict.fromkeys(views, why))
+        """With these apart, too."""
+        return replace(self, apart=self.apart | dict.fromkeys(views, why))
+
+    def joined(self, observations: Observations) -> StereoModel:
+        """The model with one place for both images but of those apart: by the left one, where that was observed."""
+        R, t = self.model.R_left_board.copy(), self.model.t_left_board.copy()
+        both = np.setdiff1d(np.arange(len(R)), [*self.apart])
+        image = np.where(np.isin(both, observations.view[observations.camera == 0]), 0, 1)
+        R[both], t[both] = (of[both, image][:, None] for of in (R, t))
+        return replace(self.model, R_left_board=R, t_left_board=t)
 
 
 @dataclass(frozen=True)

@@ -16,11 +16,10 @@ import scipy
 
 from calibration.board.target import LEAST_POINTS
 from calibration.cameras.camera import triangulate
-from calibration.fit.board_motion import BoardMotion, learnt, split
+from calibration.fit.board_motion import BoardMotion, learnt
 from calibration.fit.normal_equations import Normal, Problem, inverse_covariance, minimise, quadratic
 from calibration.fit.priors import priors_of
 from calibration.fit.stereo_model import (
-    N_STEREO,
     Observations,
     StereoModel,
     Terms,
@@ -73,7 +72,7 @@ class Refinement:
 
 def _degrees_of_freedom(problem: Problem) -> int:
     used = problem.observations
-    seen = len(np.unique(used.view))
+    seen = len(np.unique(2 * used.view + used.camera * problem.apart[used.view]))
     left = 2 * len(used) - problem.stereo_basis.shape[1] - problem.shape_basis.shape[-1] - 6 * seen
     if left <= 0:
         raise CalibrationError(
@@ -97,7 +96,8 @@ def refine_stereo(
     """Refine everything `terms` frees, from image points of any flat target.
 
     observations : image points with covariances, of any target with known points: corners of squares or dots
-    start : cameras, stereo pose and board poses to a few percent and degrees, see `calibration.fit.start`
+    start : cameras, stereo pose and board poses to a few percent and degrees, see `calibration.fit.start`; where it has
+        two places of a board, so has what is refined
     nominal : (n, 3) [m] the target's points as declared
     reject_beyond : sigmas, after the noise that the residuals themselves show: of 10^4 good points none lies beyond
     begin : an earlier refinement of the same observations with other terms: spares the robust start
@@ -112,14 +112,14 @@ def refine_stereo(
     motion = begin.problem.motion if motion is None and begin is not None else motion
     prior = priors_of(model, nominal, shape_basis) if priors else None
     weights, bases = inverse_covariance(observations.covariance, 0.0), (terms.stereo_basis(), shape_basis)
-    problem = Problem(observations, weights, *bases, len(start.R_left_board), prior=prior)
+    problem = Problem(observations, weights, *bases, start.apart if begin is None else begin.problem.apart, prior=prior)
     if begin is None:
         kept = np.ones(len(observations), bool)
         model, extra = _robust_start(problem, model)
     else:
         kept, extra = begin.kept, begin.unexplained_sigma**2
-    rough = replace(problem, motion=motion), model if motion is None else split(model)
-    problem, model, kept, extra, dof, total = _settled(*rough, kept, extra, reject_beyond)
+    rough = replace(problem, motion=motion)
+    problem, model, kept, extra, dof, total = _settled(rough, model, kept, extra, reject_beyond)
     used = observations[kept]
     # noise and points are settled: now the minimum itself, and once more with the noise that is seen there, so that
     # nothing is left of where the rough rounds happened to stop
@@ -162,7 +162,7 @@ def _settled(
         model, total = minimum.model, total + minimum.iterations
         steady = True
         if motion is not None:
-            moves, determined = learnt(motion, model, minimum.normal.covariances()[1][: problem.n_views])
+            moves, determined = learnt(motion, model, minimum.normal.covariances()[1], problem.apart)
             dof, steady = dof - determined, moves.is_near(motion)
             problem = replace(problem, motion=moves)
         if prior is not None:
@@ -183,7 +183,6 @@ def _settled(
 def _robust_start(problem: Problem, model: StereoModel) -> tuple[StereoModel, float]:
     """Huber's fit with the noise set by the median residual, and the extra variance [px^2] it shows."""
     observations = problem.observations
-    model = replace(model, boards_right=None)
     for _ in range(2):
         extra = _median_variance(observations.pixels - predict_pixels(model, observations))
         rough = replace(problem.seeing(observations, extra), huber=2.0)
@@ -242,21 +241,11 @@ def error_in_space(model: StereoModel, seen: Observations) -> float:
     return float(off / np.sqrt(len(d)))
 
 
-def fit_poses(
-    observations: Observations, model: StereoModel, sigma: float, motion: BoardMotion | None = None
-) -> StereoModel:
-    """Poses of the target in the views of the observations, everything else held."""
-    model = replace(model, boards_right=None) if motion is None else split(model)
-    problem = Problem(
-        observations,
-        inverse_covariance(observations.covariance, sigma**2),
-        np.zeros((N_STEREO, 0)),
-        np.zeros((*model.points.shape, 0)),
-        len(model.R_left_board),
-        huber=3.0,
-        motion=motion,
-    )
-    return minimise(problem, model, iterations=12, tolerance=NEGLIGIBLE, damping=1e-7, rough=True).model
+def fit_poses(problem: Problem, model: StereoModel) -> StereoModel:
+    """Poses of the target in the views of the problem's observations, everything else held."""
+    nothing = problem.stereo_basis[:, :0], problem.shape_basis[..., :0]
+    poses = replace(problem, stereo_basis=nothing[0], shape_basis=nothing[1], prior=None, huber=3.0)
+    return minimise(poses, model, iterations=12, tolerance=NEGLIGIBLE, damping=1e-7, rough=True).model
 
 
 def candidate(refinement: Refinement, quietest: Refinement) -> TermsTried:
@@ -264,17 +253,18 @@ def candidate(refinement: Refinement, quietest: Refinement) -> TermsTried:
 
     The noise, the points that count in distances and the boards' motion are those of another fit, for all candidates.
     """
-    o, problem, views = refinement.observations, refinement.problem, np.unique(refinement.problem.observations.view)
-    used, sigma, motion = o[refinement.kept], quietest.unexplained_sigma, quietest.problem.motion
+    o, problem = refinement.observations, replace(refinement.problem, motion=quietest.problem.motion)
+    used, sigma, views = o[refinement.kept], quietest.unexplained_sigma, np.unique(problem.observations.view)
     residuals, tested, errors = np.zeros_like(o.pixels), np.isin(o.view, views), []
     for fold in range(min(FOLDS, len(views))):
         left_out = views[fold :: min(FOLDS, len(views))]
         train, test = ~np.isin(used.view, left_out), np.isin(o.view, left_out)
-        others = replace(problem, motion=motion).seeing(used[train], sigma**2)
+        others = problem.seeing(used[train], sigma**2)
         model = minimise(others, refinement.model, iterations=8, tolerance=NEGLIGIBLE, damping=1e-7, rough=True).model
-        model = fit_poses(o[test], model, sigma, motion)
+        model = fit_poses(problem.seeing(o[test], sigma**2), model)
         residuals[test] = o.pixels[test] - predict_pixels(model, o[test])
-        errors += [error_in_space(model, o[quietest.kept & (o.view == v)]) for v in left_out]
+        pairs = left_out[~problem.apart[left_out]]
+        errors += [error_in_space(model, o[quietest.kept & (o.view == v)]) for v in pairs]
     chi_square = np.minimum(quadratic(inverse_covariance(o.covariance, sigma**2), residuals), TRUNCATE)
     chi_square = np.where(np.isfinite(chi_square), chi_square, TRUNCATE)  # behind a camera
     sums, count = (np.bincount(o.view[tested], of, problem.n_views) for of in (chi_square[tested], None))

@@ -107,13 +107,14 @@ def start_stereo(
     for v, (R, t) in poses[1].items():
         turn = turns[pairs.order[both.index(v)]] if v in both else np.eye(3)
         by_right[v] = R_pair.T @ R @ turn, R_pair.T @ (t + R @ (middle - turn @ middle) - t_pair)
-    R_board, t_board = np.tile(np.eye(3), (n_views, 1, 1)), np.tile([0.0, 0.0, 1.0], (n_views, 1))
-    for view, (R, t) in (by_right | poses[0]).items():
-        R_board[view], t_board[view] = R, t
+    R_board, t_board = np.tile(np.eye(3), (n_views, 2, 1, 1)), np.tile([0.0, 0.0, 1.0], (n_views, 2, 1))
+    for image, alone in enumerate((by_right | poses[0], poses[0] | by_right)):
+        for view, (R, t) in alone.items():
+            R_board[view, image], t_board[view, image] = R, t
     model = StereoModel(StereoRig(cameras[0], cameras[1], R_pair, t_pair), R_board, t_board, nominal.copy())
-    left, right = ({v: side[v] for v in both} for side in (poses[0], by_right))
     apart = {v: "" for v, agrees in zip(both, pairs.agrees, strict=True) if not agrees}
-    return Pairs(model, left, right, apart), {v: orders[k] for v, k in zip(both, pairs.order, strict=True)}, notes
+    orders_seen = {v: orders[k] for v, k in zip(both, pairs.order, strict=True)}
+    return Pairs(model, np.array(both), apart), orders_seen, notes
 
 
 def too_wide(observations: Observations, nominal: Array, cameras: tuple[Camera, Camera]) -> tuple[tuple[str, str], ...]:

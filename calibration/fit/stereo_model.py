@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -57,23 +56,14 @@ class StereoModel:
     """Everything that predicts where the target's points appear."""
 
     rig: StereoRig  # the cameras; its world is the left one's axes
-    R_left_board: Array  # (n_views, 3, 3)
-    t_left_board: Array  # (n_views, 3) [m]
+    R_left_board: Array  # (n_views, 2, 3, 3) of the board at each camera's exposure, in the left camera's axes
+    t_left_board: Array  # (n_views, 2, 3) [m]
     points: Array  # (n, 3) target points in board axes [m], as refined
-    # (n_views, 3, 3) and (n_views, 3) [m] of the boards at the right camera's exposure, where they moved after the left
-    boards_right: tuple[Array, Array] | None = None
 
     @property
-    def boards_in_right(self) -> tuple[Array, Array]:
-        """(n_views, 3, 3) and (n_views, 3) [m] of the boards at the right camera's exposure, moved or not."""
-        return self.boards_right or (self.R_left_board, self.t_left_board)
-
-    def placed(self, poses: Mapping[int, tuple[Array, Array]]) -> StereoModel:
-        """With the boards of some views elsewhere: R (3, 3) and t (3,) [m] in the left camera's axes."""
-        R, t = self.R_left_board.copy(), self.t_left_board.copy()
-        for view, pose in poses.items():
-            R[view], t[view] = pose
-        return replace(self, R_left_board=R, t_left_board=t)
+    def apart(self) -> Mask:
+        """(n_views,) whose images show the board each at a place of its own."""
+        return np.asarray(np.ptp(self.t_left_board, axis=1).any(axis=1), bool)
 
 
 @dataclass(frozen=True)
@@ -150,28 +140,20 @@ def predict(model: StereoModel, observations: Observations) -> tuple[Array, Arra
 
 def _arms(model: StereoModel, observations: Observations) -> tuple[Array, Array, Array]:
     """Rotation (m, 3, 3) of the board, its point turned by it (m, 3), and the board's place (m, 3)."""
-    R, t = model.R_left_board[observations.view], model.t_left_board[observations.view]
-    if model.boards_right is not None:
-        right = observations.camera == 1
-        R[right], t[right] = (of[observations.view[right]] for of in model.boards_right)
+    R, t = (of[observations.view, observations.camera] for of in (model.R_left_board, model.t_left_board))
     return R, np.einsum("mij,mj->mi", R, model.points[observations.point]), t
 
 
 def moved(model: StereoModel, stereo: Array, poses: Array, displacement: Array) -> StereoModel:
-    """The model after a step: stereo (24,), poses (n_views, 6) rotation vectors and shifts, displacement (n, 3).
+    """The model after a step: stereo (24,), displacement (n, 3), and poses, rotation vectors and shifts.
 
-    poses : (n_views, 12) where the boards have places of their own at the right camera's exposure, those last
+    poses : (n_views, 2, 6) of each image, or (n_views, 1, 6) of both
     """
-    turns, boards_right = rotation_from_vector(poses[:, :3]), None
-    if model.boards_right is not None:
-        R, t = model.boards_right
-        boards_right = rotation_from_vector(poses[:, 6:9]) @ R, t + poses[:, 9:]
     return StereoModel(
         rig=model.rig.perturbed(np.pad(stereo, (0, N_RIG - N_STEREO))),
-        R_left_board=turns @ model.R_left_board,
-        t_left_board=model.t_left_board + poses[:, 3:6],
+        R_left_board=rotation_from_vector(poses[..., :3]) @ model.R_left_board,
+        t_left_board=model.t_left_board + poses[..., 3:],
         points=model.points + displacement,
-        boards_right=boards_right,
     )
 
 

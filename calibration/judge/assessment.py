@@ -97,7 +97,7 @@ def cells_of(refinement: Refinement, camera: int) -> Array:
 def tilt_spread(refinement: Refinement) -> float:
     """Greatest angle between the normals of two boards [deg]."""
     views = np.unique(refinement.observations.view[refinement.kept])
-    normals = refinement.model.R_left_board[views][:, :, 2]
+    normals = refinement.model.R_left_board[views, 0, :, 2]
     return float(np.degrees(np.arccos(np.clip(normals @ normals.T, -1, 1))).max())
 
 
@@ -125,7 +125,7 @@ def measurement_volume(refinement: Refinement, table_view: int | None) -> Array:
         size = np.ptp(points, axis=0)[:2].min()
         return np.concatenate([points + np.array([0, 0, height]) for height in (0.0, 0.5 * size)])
     views = np.unique(refinement.observations.view[refinement.kept])
-    R, t = refinement.model.R_left_board[views], refinement.model.t_left_board[views]
+    R, t = refinement.model.R_left_board[views, 0], refinement.model.t_left_board[views, 0]
     return (np.einsum("vij,nj->vni", R, points) + t[:, None]).reshape(-1, 3)
 
 

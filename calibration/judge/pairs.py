@@ -16,7 +16,7 @@ taken, where all else scatters it. Distances are measured in pixels, as a pair's
 pair tells badly (a shift along the axis) counts as little as it is known.
 """
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -26,9 +26,9 @@ from numpy.typing import NDArray
 
 from calibration.board.target import LEAST_POINTS
 from calibration.cameras.camera import CAMERA_NAMES, Camera
-from calibration.fit.board_motion import LEAST, BoardMotion, motions, split
+from calibration.fit.board_motion import LEAST, BoardMotion, motions
 from calibration.fit.normal_equations import Problem
-from calibration.fit.pairing import TOO_FAR, Pairs, Pose, apart, places_of, rotation_vectors, told_by
+from calibration.fit.pairing import TOO_FAR, Pairs, apart, places_of, rotation_vectors, told_by
 from calibration.fit.refinement import Refinement, fit_poses
 from calibration.fit.start import MIN_VIEWS, start_camera
 from calibration.fit.stereo_model import Observations, StereoModel, predict, predict_pixels
@@ -37,26 +37,10 @@ from calibration.kit.least_squares import scaled_solve
 
 MOVED = 2.0  # times what corners' scatter makes of a board at rest, and times that scatter, that motion is named
 LEAST_PAIRS = 6  # fewer cannot judge one another: one tells how the cameras stand, and a median is of the others
-FREE = BoardMotion(np.inf, np.inf)  # nothing known beforehand
 # Times as far apart as pairs of one side. None of 400 synthetic sets of boards that moved reaches 2; of 31 photographed
 # ones two have 8.8 and 4.5, where OpenCV's rig of one side misses the other's pairs as well, and the next one 2.2.
 STEP = 4.0
 BY_ZOOM = 1.3  # times less squared misfit by two focal lengths; one and the same lens has 1.05
-
-
-def own_places(
-    observations: Observations, model: StereoModel, apart: Sequence[int], right_poses: Mapping[int, Pose]
-) -> tuple[Observations, StereoModel]:
-    """Give the right images of some pairs a place of the board of their own, behind those of the views, in order.
-
-    model : poses of the board for every view; right_poses : (R, t) in the left camera's axes by the right image alone
-    """
-    n, place = len(model.R_left_board), observations.view.copy()
-    for k, view in enumerate(apart):
-        place[(observations.view == view) & (observations.camera == 1)] = n + k
-    R = np.concatenate([model.R_left_board, *(right_poses[view][0][None] for view in apart)])
-    t = np.concatenate([model.t_left_board, *(right_poses[view][1][None] for view in apart)])
-    return replace(observations, view=place), replace(model, R_left_board=R, t_left_board=t)
 
 
 @dataclass(frozen=True)
@@ -138,16 +122,16 @@ class PairMotions:
 
 
 def pair_motions(problem: Problem, model: StereoModel) -> PairMotions:
-    """By the images that have points enough, about a minimum; the model may have places of the boards for each."""
-    problem, model, o = replace(problem, motion=FREE), split(model), problem.observations
-    normal = problem.linearise(model)
+    """Of the views that are not apart, by images that have points enough, about a minimum."""
+    free, o = replace(problem, motion=None, apart=np.ones_like(problem.apart)), problem.observations
+    normal = free.linearise(model)
     carried, step = normal.carried()
     m, J = motions(model)
     seen = [np.bincount(o.view[o.camera == c], minlength=problem.n_views) for c in (0, 1)]
-    pairs = np.flatnonzero(np.minimum(*seen) >= LEAST_POINTS)
+    pairs = np.flatnonzero((np.minimum(*seen) >= LEAST_POINTS) & ~problem.apart)
     images = len(np.unique(2 * o.view + o.camera))
     freedom = max(2 * len(o) - 6 * images, 1)
-    about = problem.stepped(model, np.zeros(len(normal.prior)), step)
+    about = free.stepped(model, np.zeros(len(normal.prior)), step)
     right = o[o.camera == 1]
     d_pose, squares = predict(about, right)[2], np.zeros((problem.n_views, 6, 6))
     np.add.at(squares, right.view, np.swapaxes(d_pose, 1, 2) @ d_pose)
@@ -164,7 +148,7 @@ def pair_motions(problem: Problem, model: StereoModel) -> PairMotions:
         noise=max(float(normal.costs.sum() - np.sum(normal.own_gradient * step)), 1e-12) / freedom,
         scatter=float(np.sqrt(2 * np.sum((o.pixels - predict_pixels(about, o)) ** 2) / freedom)),
         problem=problem,
-        distance=float(np.median(np.linalg.norm(model.t_left_board[pairs], axis=1))) if len(pairs) else np.nan,
+        distance=float(np.median(np.linalg.norm(model.t_left_board[pairs, 0], axis=1))) if len(pairs) else np.nan,
     )
 
 
@@ -223,9 +207,7 @@ def motion_between_exposures(refinement: Refinement) -> PairMotion | None:
     )
 
 
-def judge_pairs(
-    observations: Observations, fit: Refinement, apart: Sequence[int], elsewhere: Collection[int] = ()
-) -> Pairs:
+def judge_pairs(observations: Observations, fit: Refinement, elsewhere: Collection[int] = ()) -> Pairs:
     """Compare one place of the board for both images of a pair with a place for each.
 
     One place has six parameters less. What chi-square it costs tells how far the board moved: some of it in every pair,
@@ -233,16 +215,14 @@ def judge_pairs(
     median pair; so never more than half of them are. The median of fewer than LEAST_PAIRS tells nothing, and none of so
     few is set apart, nor one that alone tells how the cameras stand.
 
-    observations : with the views' numbers; fit : of the same, the pairs `apart` with places of their own
+    observations : with the views' numbers; fit : of the same, some pairs perhaps apart
     elsewhere : views at which the cameras stood otherwise to each other: no measure of what is usual
     """
-    o = observations[np.argsort(observations.view, kind="stable")]
-    n, sigma = len(fit.model.R_left_board) - len(apart), max(fit.unexplained_sigma, 1e-3)
-    R, t, of_right = fit.model.R_left_board, fit.model.t_left_board, np.arange(n)
-    of_right[list(apart)] = n + np.arange(len(apart))
-    begun = replace(fit.model, R_left_board=R[:n], t_left_board=t[:n], boards_right=(R[of_right], t[of_right]))
-    alone = fit_poses(o, begun, sigma, FREE)
-    pairs = pair_motions(replace(fit.problem.seeing(o, sigma**2), n_views=n, huber=3.0), alone)
+    o, sigma = observations[np.argsort(observations.view, kind="stable")], max(fit.unexplained_sigma, 1e-3)
+    problem = replace(fit.problem.seeing(o, sigma**2), motion=None, huber=3.0)
+    none, every = np.zeros_like(problem.apart), np.ones_like(problem.apart)
+    alone = fit_poses(replace(problem, apart=every), fit.model)
+    pairs = pair_motions(replace(problem, apart=none), alone)
     square = np.nan_to_num(np.sum((o.pixels - predict_pixels(alone, o)) ** 2, axis=-1), nan=1e12)
     images, image = np.unique(2 * o.view + o.camera, return_inverse=True)
     rms = np.sqrt(np.bincount(image, square) / np.bincount(image))
@@ -252,14 +232,13 @@ def judge_pairs(
         misfit = f"RMS {rms[i]:.3f} px by itself, the median image has {typical:.3f} px"
         bad[divmod(int(images[i]), 2)] = f"{misfit}: blurred, or the board was found wrongly"
     if len(pairs.views) >= LEAST_PAIRS:
-        cost = pairs.cost_of_rest(~np.isin(pairs.views, apart))
+        cost = pairs.cost_of_rest(~problem.apart[pairs.views])
         usual = max(float(np.median(cost[~np.isin(pairs.views, list(elsewhere))])), 6.0)
         for k in np.flatnonzero(cost > TOO_FAR**2 * usual):
             found[int(pairs.views[k])] = f"{pairs.pixels[k]:.2g} px apart, where corners scatter by {typical:.2g} px"
-    boards = (alone.R_left_board, alone.t_left_board), alone.boards_in_right
-    left, right = ({int(v): (one[0][v], one[1][v]) for v in pairs.views} for one in boards)
-    model = replace(begun, boards_right=None).placed({v: left[v] for v in {*found, *apart} & set(left)})
-    return Pairs(model, left, right, found, bad)
+    R, t = fit.model.R_left_board.copy(), fit.model.t_left_board.copy()
+    R[pairs.views], t[pairs.views] = alone.R_left_board[pairs.views], alone.t_left_board[pairs.views]
+    return Pairs(replace(fit.model, R_left_board=R, t_left_board=t), pairs.views, found, bad)
 
 
 @dataclass(frozen=True)
@@ -323,15 +302,16 @@ def camera_moved(observations: Observations, pairs: Pairs, table_view: int | Non
 
     table_view : its stretch tells how the cameras stand; None: the one with the most pairs does
     """
-    model = pairs.model
-    sides, R_pair, t_pair = [], model.rig.R_right_left, model.rig.t_right_left
-    views = np.array([*pairs.left_poses], int)
+    model, views, sides = pairs.model, pairs.views, []
+    R_pair = model.rig.R_right_left
     if len(views) < 2 * MIN_VIEWS:
         return None
-    in_right = {v: (R_pair @ R, R_pair @ t + t_pair) for v, (R, t) in pairs.right_poses.items()}
-    for index, poses in enumerate((pairs.left_poses, in_right)):
+    for index, (R, t) in enumerate(model.rig.camera_poses()):
         mine = observations[observations.camera == index]
-        sides.append(places_of({v: poses[v] for v in views}, mine, model.points, model.rig.cameras[index]))
+        poses = zip(R @ model.R_left_board[views, index], model.t_left_board[views, index] @ R.T + t, strict=True)
+        sides.append(
+            places_of(dict(zip(views.tolist(), poses, strict=True)), mine, model.points, model.rig.cameras[index])
+        )
     tells = np.all([np.isfinite(side.covariance).all(axis=(1, 2)) for side in sides], axis=0)
     views, (left, right) = views[tells], (side[tells] for side in sides)
     R, t = told_by(left, right)

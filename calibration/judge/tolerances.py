@@ -213,7 +213,7 @@ def rig_with_covariance(
     covariance[:N_STEREO, :N_STEREO] = basis @ free @ basis.T
     rig = model.rig
     if table_view is not None:
-        R, t = model.R_left_board[table_view], model.t_left_board[table_view]
+        R, t = model.R_left_board[table_view, 0], model.t_left_board[table_view, 0]
         t = t if origin is None else t + R @ origin
         R_left_world, t_left_world = table_pose(R, t, board_thickness)
         rig = replace(rig, R_left_world=R_left_world, t_left_world=t_left_world, world_is_table=True)

@@ -27,7 +27,8 @@ class Scene:
     def pixels(self, camera: int) -> Array:
         """(n_views, n_points, 2) [px] without noise."""
         m = self.model
-        points = np.einsum("vij,nj->vni", m.R_left_board, m.points) + m.t_left_board[:, None]
+        R, t = m.R_left_board[:, camera], m.t_left_board[:, camera]
+        points = np.einsum("vij,nj->vni", R, m.points) + t[:, None]
         if camera:
             points = points @ m.rig.R_right_left.T + m.rig.t_right_left
         return project(points, m.rig.cameras[camera])
@@ -58,13 +59,13 @@ def make_scene(n_views=12, inner_corners=(9, 6), square=8e-3, distortion=True, d
     target = np.array([0.0, 0.0, 0.5])  # both cameras look here
     t_pair = np.array([0.01, -0.005, 0.51]) - R_pair @ target
     centre = board.points.mean(0)
-    R_board, t_board = np.empty((n_views, 3, 3)), np.empty((n_views, 3))
+    R_board, t_board = np.empty((n_views, 2, 3, 3)), np.empty((n_views, 2, 3))
     towards = rotation_from_vector(np.array([0.0, 0.4, 0.0])) @ np.diag([1.0, -1.0, -1.0])  # faces between the cameras
     for v in range(n_views):
         axis = rng.normal(size=3)
         turn = rotation_from_vector(axis / np.linalg.norm(axis) * np.radians(rng.uniform(5, 45)))
         R_board[v] = turn @ towards
-        t_board[v] = target + rng.uniform(-0.015, 0.015, 3) - R_board[v] @ centre
+        t_board[v] = target + rng.uniform(-0.015, 0.015, 3) - turn @ towards @ centre
     points = board.points + (0 if deviation is None else deviation)
     return Scene(StereoModel(StereoRig(*cameras, R_pair, t_pair), R_board, t_board, points), board)
 

@@ -9,7 +9,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from calibration import Board, BoardTolerances, CalibrationSettings, Terms, calibrate_from_corners, refine_stereo
-from calibration.fit.board_motion import BoardMotion, motions, split
+from calibration.fit.board_motion import BoardMotion, motions
 from calibration.fit.normal_equations import Problem
 from calibration.fit.priors import BEND, MISPRINT, STRETCH, board_prior, priors_of
 from calibration.fit.stereo_model import board_basis, moved, predict_pixels
@@ -48,11 +48,11 @@ def test_normal_equations_have_the_cost_and_the_gradient_that_they_say(scene_mak
     nominal, moving = scene.board.points, known == "motion"
     observations = scene.observations(0.1, rng)
     observations = observations[np.argsort(observations.view, kind="stable")]
-    begun, k = (split(scene.model), 12) if moving else (scene.model, 6)
+    k = 12 if moving else 6
     deviation = 1e-4 * rng.normal(size=nominal.shape)
-    model = moved(begun, 1e-4 * rng.normal(size=24), 1e-3 * rng.normal(size=(3, k)), deviation)
+    model = moved(scene.model, 1e-4 * rng.normal(size=24), 1e-3 * rng.normal(size=(3, k // 6, 6)), deviation)
     basis, stereo_basis = board_basis(nominal, "warped" if moving else "free"), Terms("k1").stereo_basis()
-    problem = Problem(observations, np.linalg.inv(observations.covariance), stereo_basis, basis, 3)
+    problem = Problem(observations, np.linalg.inv(observations.covariance), stereo_basis, basis, np.zeros(3, bool))
     problem = {
         "motion": replace(problem, motion=BoardMotion(2e-3, 5e-4)),
         "prior": replace(problem, prior=replace(priors_of(scene.model, nominal, basis), weight=3.0)),
@@ -105,8 +105,9 @@ def test_cameras_and_pair_are_right_where_boards_moved_between_the_exposures():
         assert 0.4e-3 < found.assessment.motion.distance < 1.8e-3
         assert found.assessment.grade in ("usable", "poor")
         # one place of the board for both images, as of cameras that are triggered together
-        o, model = found.refinement.observations, replace(found.refinement.model, boards_right=None)
-        together = refine_stereo(o, model, BOARD.points, found.refinement.terms)
+        r, model = found.refinement, found.refinement.model
+        as_left = {name: getattr(model, name)[:, [0, 0]] for name in ("R_left_board", "t_left_board")}
+        together = refine_stereo(r.observations, replace(model, **as_left), BOARD.points, r.terms)
         by_one_place = np.array([p for camera in together.model.rig.cameras for p in camera.parameters[:2]])
         truth = np.array([K[i, i] for K in rig.matrices for i in (0, 1)])
         assert np.linalg.norm(error[[0, 1, 4, 5]]) < 0.8 * np.linalg.norm(by_one_place - truth)
@@ -193,13 +194,11 @@ def test_motions_that_no_pair_shows_for_itself_are_in_the_sigma():
 
 def test_a_rig_file_keeps_where_the_boards_were(tmp_path):
     found = calibrated(moved_boards.make_rig(1), 6, 1, shift=1e-3, turn=1e-3)
-    assert found.refinement.model.boards_right is not None
+    assert found.refinement.model.apart.all()
     write_rig(tmp_path / "rig.h5", found)
     _, record = read_rig_file(tmp_path / "rig.h5")
-    model = replace(
-        found.refinement.model, R_left_board=record.R_left_board, t_left_board=record.t_left_board, boards_right=None
-    )
-    o = record.observations
+    places = {name: getattr(record, name)[:, None].repeat(2, axis=1) for name in ("R_left_board", "t_left_board")}
+    model, o = replace(found.refinement.model, **places), record.observations
     assert_allclose(o.pixels - predict_pixels(model, o), record.residuals, atol=1e-9)
     assert [found.view_names[v] for v in record.apart] == list(found.view_names)
 

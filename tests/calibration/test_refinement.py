@@ -26,7 +26,7 @@ def disturbed(scene, rng, size=1.0):
     stereo[[0, 1, 9, 10]] = rng.normal(size=4) * 20 * size
     stereo[[2, 3, 11, 12]] = rng.normal(size=4) * 5 * size
     stereo[18:21], stereo[21:24] = rng.normal(size=3) * 0.01 * size, rng.normal(size=3) * 2e-3 * size
-    poses = rng.normal(size=(n, 6)) * np.array([0.02, 0.02, 0.02, 1e-3, 1e-3, 1e-3]) * size
+    poses = rng.normal(size=(n, 1, 6)) * np.array([0.02, 0.02, 0.02, 1e-3, 1e-3, 1e-3]) * size
     return replace(moved(scene.model, stereo, poses, np.zeros_like(scene.model.points)), points=scene.board.points)
 
 
@@ -46,7 +46,7 @@ def rig_error(found, truth):
 
 def true_rig(scene, view, thickness):
     m = scene.model
-    R, t = table_pose(m.R_left_board[view], m.t_left_board[view], thickness)
+    R, t = table_pose(m.R_left_board[view, 0], m.t_left_board[view, 0], thickness)
     found = refine_stereo(scene.observations(1e-3), m, scene.board.points, FULL)
     covariance = rig_with_covariance(found, view, thickness, 1.0).covariance
     return replace(m.rig, R_left_world=R, t_left_world=t, covariance=covariance)

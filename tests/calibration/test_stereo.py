@@ -43,7 +43,7 @@ def small_scene(scene_maker, **options):
 def draw(scene, board_drawer, rng, board=BOARD, sub=4):
     m, rig = scene.model, scene.model.rig
     images = ([], [])
-    for R, t in zip(m.R_left_board, m.t_left_board, strict=True):
+    for R, t in zip(m.R_left_board[:, 0], m.t_left_board[:, 0], strict=True):
         images[0].append(board_drawer(rig.left, R, t, board, sub=sub, rng=rng))
         R, t = rig.R_right_left @ R, rig.R_right_left @ t + rig.t_right_left
         images[1].append(board_drawer(rig.right, R, t, board, sub=sub, rng=rng))
@@ -72,7 +72,7 @@ def corner_views(scene, rng, sigma=0.02):
 
 def test_lab_frame_from_images_is_right_within_its_uncertainty(calibrated):
     scene, found = calibrated
-    R, t = table_pose(scene.model.R_left_board[3], scene.model.t_left_board[3], THICKNESS)
+    R, t = table_pose(scene.model.R_left_board[3, 0], scene.model.t_left_board[3, 0], THICKNESS)
     points = np.array([[0.0, 0, 0], [50e-3, 0, 0], [0, 25e-3, 0], [25e-3, 10e-3, 10e-3]])
     m = scene.model
     true_rig = replace(m.rig, R_left_world=R, t_left_world=t)
@@ -166,7 +166,7 @@ def test_parallel_views_are_warned_of(scene_maker, rng):
     parallel = StereoModel(
         m.rig,
         np.stack([m.R_left_board[0] @ rotation_from_vector(np.array([0, 0, 0.1 * v])) for v in range(8)]),
-        m.t_left_board[0] + shift, m.points,
+        m.t_left_board[0] + shift[:, None], m.points,
     )  # fmt: skip
     found = calibrate_from_corners(*corner_views(replace(scene, model=parallel), rng), BOARD, FLAT)
     many = calibrate_from_corners(*corner_views(scene, rng), BOARD, FLAT)
