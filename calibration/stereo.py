@@ -231,7 +231,7 @@ def calibrate_from_corners(
     shapes = BOARD_MODELS if seen.min() >= LEAST_SEEN else BOARD_MODELS[:-1]  # the points tell a place each, or not
     distortion = RICHEST if settings.distortion == "auto" else settings.distortion
     tried = [Terms(distortion, shape) for shape in (shapes if settings.board == "auto" else (settings.board,))]
-    fit = fit_jointly(observations, start, board.points, tried, table_view)
+    fit = fit_jointly(observations, start, board.points, tried, moved, table_view)
     for (v, camera), why in fit.bad_images.items():
         views[camera][v] = BoardNotFound(why)
     apart = _told_apart(fit, names, table_view)

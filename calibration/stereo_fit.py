@@ -41,14 +41,15 @@ def fit_jointly(
     start: Pairs,
     nominal: Array,
     tried: Sequence[Terms],
+    moved: CameraMoved | None,
     table_view: int | None = None,
 ) -> JointFit:
     """Refine, judge the pairs by what is refined, and refine again; then see whether boards moved, or lenses bend.
 
     start : by rough cameras; tried : terms with the board's shapes to choose of, simplest first
+    moved : by the start: it is seen best by cameras that no pair has pulled yet
     table_view : where a camera was moved, the cameras' places are those at it
     """
-    moved = camera_moved(observations, start, table_view)  # seen best by cameras that no pair has pulled yet
     # rough poses may be degrees off: refined cameras judge those anew that do not agree
     used = start if moved is None and len(start.views) >= LEAST_PAIRS else replace(start, apart={})
     used = used if moved is None else used.set_apart(moved.others, MOVED_CAMERA)

@@ -159,6 +159,7 @@ def assess(
     the tolerances of the board; wide : what `start.too_wide` found
     """
     kept = refinement.observations[refinement.kept]
+    both = np.intersect1d(kept.view[kept.camera == 0], kept.view[kept.camera == 1])
     volume = measurement_volume(refinement, table_view)
     sigma = np.linalg.norm(point_uncertainty(rig, volume), axis=-1)
     along, across = length_uncertainty(rig, volume)
@@ -171,7 +172,7 @@ def assess(
         direction_sigma=across,
         place_sigma=tuple(zip(place.tolist(), most, strict=True)),
         distance=float(np.linalg.norm(rig.R_left_world @ volume.mean(0) + rig.t_left_world)),
-        pairs=len(np.intersect1d(kept.view[kept.camera == 0], kept.view[kept.camera == 1])),
+        pairs=int(np.sum(~refinement.problem.apart[both])),
         motion=motion,
         inflation=inflation,
         coverage=tuple(float(np.mean(cells_of(refinement, camera) > 0)) for camera in range(len(CAMERA_NAMES))),

@@ -58,22 +58,17 @@ def repaired_views(views: Sequence[NDArray], camera: str) -> tuple[list[NDArray]
     first = views[0] if len(views) else np.zeros((0, 0))
     if any(view.shape != first.shape or view.dtype not in (np.uint8, np.uint16) for view in views) or first.ndim > 3:
         return list(views), ""
-    channels = first.shape[2] if first.ndim == 3 else 1
-
-    def channel(view: NDArray, k: int) -> NDArray:
-        return view.reshape(*first.shape[:2], channels)[..., k]
-
-    blind = {}
-    for k in range(channels):
-        mask = stuck_pixels([np.ascontiguousarray(channel(view, k)) for view in views], of_board=True)
-        if mask is not None:
-            blind[k] = mask
+    channels = [np.moveaxis(np.atleast_3d(view), 2, 0) for view in views]
+    masks = [
+        stuck_pixels([np.ascontiguousarray(c) for c in side], of_board=True) for side in zip(*channels, strict=True)
+    ]
+    blind = {k: mask for k, mask in enumerate(masks) if mask is not None}
     if not blind:
         return list(views), ""
-    mended = [np.array(view) for view in views]
+    mended = [view.copy() for view in views]
     for view in mended:
         for k, mask in blind.items():
-            repair(channel(view, k), mask)
+            repair(np.atleast_3d(view)[..., k], mask)
     n = int(np.any([*blind.values()], axis=0).sum())
     return mended, f"{camera} camera: {n} pixels show one value in all views; their neighbours stand in for them"
 

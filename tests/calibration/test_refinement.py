@@ -155,7 +155,7 @@ def test_pixels_that_are_not_square_are_no_hindrance_to_the_start(scene_maker, r
     sizes = cameras[0].image_size, cameras[1].image_size
     begun, _, _ = start_stereo(o, scene.board.points, sizes, [("left", "right")] * 10)
     assert not begun.apart
-    found = refine_stereo(o, begun.model, scene.board.points, FULL)
+    found = refine_stereo(o, begun.joined(o), scene.board.points, FULL)
     assert_allclose(
         found.model.rig.cameras[0].fy / found.model.rig.cameras[0].fx, cameras[0].fy / cameras[0].fx, rtol=2e-3
     )
@@ -168,7 +168,7 @@ def test_a_bent_board_is_chosen_and_recovered(scene_maker, rng):
     o = scene.observations(0.02, rng)
     begun, _, _ = start_stereo(o, scene.board.points, ((512, 512), (512, 512)), [("left", "right")] * 12)
     assert not begun.apart
-    found, table = choose_board(o, begun.model, scene.board.points, (Terms(), Terms(board="warped")))
+    found, table = choose_board(o, begun.joined(o), scene.board.points, (Terms(), Terms(board="warped")))
     assert found.terms.board == "warped"
     assert_allclose(found.model.points[:, 2], scene.model.points[:, 2], atol=5e-6)  # 0.02 px of 0.25 mm, 24 images each
     assert [c.terms.board for c in table] == ["warped"]  # the flat one leaves far more: not worth views left out

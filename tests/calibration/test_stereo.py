@@ -12,7 +12,6 @@ from calibration import (
     CalibrationError,
     CalibrationSettings,
     Camera,
-    StereoModel,
     calibrate_from_corners,
     calibrate_stereo,
 )
@@ -163,11 +162,8 @@ def test_parallel_views_are_warned_of(scene_maker, rng):
     scene = small_scene(scene_maker, n_views=8)
     m = scene.model
     shift = rng.uniform(-0.02, 0.02, (8, 3))
-    parallel = StereoModel(
-        m.rig,
-        np.stack([m.R_left_board[0] @ rotation_from_vector(np.array([0, 0, 0.1 * v])) for v in range(8)]),
-        m.t_left_board[0] + shift[:, None], m.points,
-    )  # fmt: skip
+    turns = rotation_from_vector(np.outer(np.arange(8), [0, 0, 0.1]))[:, None]
+    parallel = replace(m, R_left_board=m.R_left_board[0] @ turns, t_left_board=m.t_left_board[0] + shift[:, None])
     found = calibrate_from_corners(*corner_views(replace(scene, model=parallel), rng), BOARD, FLAT)
     many = calibrate_from_corners(*corner_views(scene, rng), BOARD, FLAT)
     assert found.assessment.tilt_spread_deg < 1
