@@ -9,7 +9,8 @@ import numpy as np
 from disctrack.discrepancy.fit import fit
 from disctrack.discrepancy.joint.reduction import Reduction
 from disctrack.discrepancy.joint.sharing import Member
-from disctrack.discrepancy.system import Candidate, Quantity, System
+from disctrack.discrepancy.system import Candidate, Quantity
+from tests.oracles.linear_system import Predicted
 
 TIME = np.linspace(0.0, 3.0, 200)
 SIGMA = 0.01
@@ -20,31 +21,23 @@ def one(name, belongs_to, **more):
     return (Quantity(name, "1", 0.01, belongs_to=belongs_to, typical=0.1, **more),)
 
 
-class Decay(System):
+class Decay(Predicted):
     def __init__(self, observed, density=1.0):
         self.root_density = density**0.5
-        self.time, self.observed, self.weights = TIME, observed, np.ones(len(TIME))
-        self.base = (Quantity("state.a", "1", 0.1), Quantity("state.b", "1", 0.1),
-                     Quantity("friction.g", "1/s", 0.01, null=1.0, belongs_to=CONTACT))  # fmt: skip
-        self.candidates = (
+        base = (Quantity("state.a", "1", 0.1), Quantity("state.b", "1", 0.1),
+                Quantity("friction.g", "1/s", 0.01, null=1.0, belongs_to=CONTACT))  # fmt: skip
+        candidates = (
             Candidate("drag", "drag", "motion", "drag of the air", "", one("drag.c", AIR, lower=0.0)),
             Candidate("hum", "hum", "measurement", "hum", "", (*one("hum.c", RIG), *one("hum.s", RIG))),
             Candidate("growth", "growth", "motion", "growth", "", one("growth.k", DISC)),
         )
+        super().__init__(TIME, observed, base, candidates, SIGMA)
 
-    def linearise(self, values, names):
-        get = lambda n, default=0.0: values.get(n, default)  # noqa: E731
-        t, g = TIME, get("friction.g", 1.0)
-        fall = np.exp(-g * t)
-        by = {
-            "state.a": fall, "state.b": np.ones_like(t), "drag.c": self.root_density * t * fall, "growth.k": t**2,
-            "hum.c": np.cos(9 * t), "hum.s": np.sin(9 * t),
-        }  # fmt: skip
-        linear = {k: v for k, v in by.items() if k in values}
-        predicted = sum((get(k) * v for k, v in linear.items()), np.zeros_like(t))
-        by["friction.g"] = -t * fall * (get("state.a") + t * self.root_density * get("drag.c"))
-        J = np.array([by[n] for n in names]).reshape(len(names), len(t)).T / SIGMA
-        return ((self.observed - predicted) / SIGMA)[:, None], J[:, None]
+    def predicted(self, values):
+        get, t = lambda n, default=0.0: values.get(n, default), TIME
+        fall = np.exp(-get("friction.g", 1.0) * t)
+        x = fall * (get("state.a") + t * self.root_density * get("drag.c")) + get("state.b") + get("growth.k") * t**2
+        return x + get("hum.c") * np.cos(9 * t) + get("hum.s") * np.sin(9 * t)
 
 
 class DecayMember:
@@ -78,7 +71,7 @@ def runs(rng, n, drag=0.0, rate=0.8, **changed):
         truth = {"state.a": 1 + 0.2 * rng.standard_normal(), "state.b": 0.1 * rng.standard_normal(),
                  "friction.g": own["rate"], "drag.c": own["drag"], "growth.k": own["growth"],
                  "hum.c": own["hum"]}  # fmt: skip
-        clean = -Decay(np.zeros_like(TIME), own["density"]).linearise(truth, [])[0][:, 0] * SIGMA
+        clean = Decay(np.zeros_like(TIME), own["density"]).predicted(truth)
         labels = {"disc": f"{own['mass']:g} kg", "surface": "glass", "rig": "rig 1", "air": f"{own['density']:g}"}
         covariates = {"mass": own["mass"], "density": own["density"]}
         items.append((f"run {i}", clean + SIGMA * rng.standard_normal(len(TIME)), labels, covariates, own["density"]))

@@ -17,13 +17,13 @@ from disctrack.diagnosis.systematic import find_systematic, noise_over_stated, w
 from disctrack.discrepancy.fit import fit
 from disctrack.discrepancy.noise import inflation
 from disctrack.discrepancy.search import FAR, Settings
-from disctrack.discrepancy.system import Quantity, System
 from disctrack.errors import AnalysisError
 from disctrack.faults.keys import CameraFault, Faults
 from disctrack.rolling import Model, Regime, State, simulate, steady_precession
 from disctrack.synthetic.description import Scene
 from disctrack.trajectory import MarkerStatus, Trajectory
 from disctrack.validate.points import ORDINARY, Laboratory
+from tests.oracles.linear_system import Linear, one
 from tests.oracles.measured_disc import K_M, assert_sized, measured, system_of
 
 DISC = Scene().declared_disc
@@ -275,28 +275,18 @@ def test_an_imperfect_laboratory_claims_nothing_about_the_motion():
     assert "systematic errors of 0.0" in result.sentence
 
 
-class Line(System):
-    """Rows of 24 numbers that are a multiple of a smooth course, and noise."""
-
-    candidates, base = (), (Quantity("a", "1", 0.1),)
-
-    def __init__(self, noise):
-        n, w = noise.shape
-        self.time, self.noise, self.weights = np.arange(n, dtype=float), noise, np.full(n, float(w))
-        self.course = 0.01 * np.sin(0.02 * np.arange(n))[:, None] * np.cos(np.arange(w))
-
-    def linearise(self, values, names):
-        return self.noise - values["a"] * self.course, self.course[..., None][..., : len(names)]
-
-
 def test_sigmas_know_that_neighbouring_rows_err_alike(rng):
     """Images of a dot two pixels apart share pixels of uneven gain: a correlation that one series hides."""
+
+    time = np.arange(250.0)
+    course = 0.01 * np.sin(0.02 * time)[:, None] * np.cos(np.arange(24))
 
     def pulls(share):
         found = []
         for _ in range(200):
             white = rng.standard_normal((251, 24))
-            line = Line((white[1:] + share * white[:-1]) / np.sqrt(1 + share**2))
+            noise = (white[1:] + share * white[:-1]) / np.sqrt(1 + share**2)
+            line = Linear(time, noise, {"a": course}, [one("a")])
             fitted = fit(line, line.base, {})
             factor = inflation(line, fitted)[0]
             found.append((fitted.values["a"] / fitted.sigma("a"), fitted.values["a"] / fitted.sigma("a") / factor))

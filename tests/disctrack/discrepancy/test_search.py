@@ -15,28 +15,26 @@ from disctrack.discrepancy.held_out import held_out, training_rows
 from disctrack.discrepancy.score import Linearisation, score_all
 from disctrack.discrepancy.search import Found, Settings, explain, length
 from disctrack.discrepancy.significance import as_sigmas, chance, ljung_box, no_memory, whiteness
-from disctrack.discrepancy.system import Budget, Candidate, Quantity, System
+from disctrack.discrepancy.system import Budget, Candidate, Quantity
 from disctrack.discrepancy.words import bounds, correlated
-from tests.oracles.linear_system import Linear, candidate, one
+from tests.oracles.linear_system import Linear, Predicted, candidate, one
 
 SIGMA = 0.01
 
 
-class Oscillator(System):
+class Oscillator(Predicted):
     """x'' = -w0^2 x - 2 d x' + f: started at (a, b); what it may lack: damping, a drift, a hum at 3 Hz, its twin."""
 
     def __init__(self, observed, time):
-        self.time, self.observed = time, observed
-        self.weights = np.where(np.isfinite(observed), 1.0, 0.0)
-        self.base = (Quantity("a", "m", 0.1), Quantity("b", "m", 0.1), Quantity("w0", "rad/s", 0.1, null=7.0))
-        one = lambda name, **more: (Quantity(name, "1", 0.1, **more),)  # noqa: E731
-        self.candidates = (
-            Candidate("damping", "damping", "motion", "linear damping", "", one("d", lower=0.0)),
-            Candidate("drift", "drift", "measurement", "drift", "", one("drift")),
-            Candidate("hum", "hum", "measurement", "hum", "", (*one("hum_c"), *one("hum_s"))),
-            Candidate("twin", "twin", "measurement", "minus the drift", "", one("twin")),
-            Candidate("nothing", "nothing", "motion", "moves nothing", "", one("nothing")),
+        base = Quantity("a", "m", 0.1), Quantity("b", "m", 0.1), Quantity("w0", "rad/s", 0.1, null=7.0)
+        candidates = (
+            candidate("damping", one("d", lower=0.0)),
+            replace(candidate("drift"), kind="measurement"),
+            replace(candidate("hum", one("hum_c"), one("hum_s")), kind="measurement"),
+            replace(candidate("twin"), kind="measurement"),  # minus the drift
+            candidate("nothing"),
         )
+        super().__init__(time, observed, base, candidates, SIGMA)
 
     def predicted(self, values: Mapping[str, float]):
         get = lambda n: values.get(n, 0.0)  # noqa: E731
@@ -45,16 +43,6 @@ class Oscillator(System):
         x = envelope * (get("a") * np.cos(get("w0") * t) + get("b") * np.sin(get("w0") * t))
         hum = get("hum_c") * np.cos(6 * np.pi * t) + get("hum_s") * np.sin(6 * np.pi * t)
         return x + (get("drift") - get("twin")) * t + hum
-
-    def linearise(self, values, names):
-        known = self.weights > 0
-        r = np.where(known, np.where(known, self.observed, 0.0) - self.predicted(values), 0.0) / SIGMA
-        columns = []
-        for name in names:
-            up, down = ({**values, name: values.get(name, 0.0) + s * 1e-6} for s in (1, -1))
-            columns.append((self.predicted(up) - self.predicted(down)) / 2e-6 / SIGMA * known)
-        J = np.stack(columns, axis=-1) if columns else np.zeros((len(r), 0))
-        return r[:, None], J[:, None]
 
 
 def oscillator(rng, hidden=None, n=400):
