@@ -26,7 +26,7 @@ from disctrack.rolling.effects.learned import effect_from_formulas
 from disctrack.rolling.model import body_constants
 from tests.oracles import newton_euler
 from tests.oracles.measured_disc import K_M, assert_found, assert_sized, measured, with_base_fit
-from tests.oracles.unknown_laws import DISC, PLACE, UNKNOWN, Unknown, motion, recording
+from tests.oracles.unknown_laws import DISC, PLACE, UNKNOWN, Unknown, by_load, force, motion, recording, smooth
 
 
 def hiding(name: str, component: str, formula: str, size: float, **options):
@@ -253,20 +253,12 @@ def test_a_sum_or_a_law_with_alternatives_of_another_form_is_taken_for_another_s
     assert form_misfit.form_is_another(law(("angle", "M_n"), others=same)) == form_misfit.SELDOM
 
 
-def contour_friction_below(mu: float, theta_deg: float):
-    """Dry contour friction that sets in at a nutation."""
-    edge = np.sin(np.radians(theta_deg))
-
-    def law(disc, now):
-        share = 0.5 * (1 - np.tanh((now.sine - edge) / (0.05 * edge)))
-        return newton_euler.ZERO, mu * disc.r * np.sign(now.phidot) / now.sine * share * now.m0, newton_euler.ZERO
-
-    return law
-
-
 @pytest.mark.slow
 def test_a_law_below_a_nutation_is_told_with_the_nutation():
-    result = diagnose(recording(Unknown(contour_friction_below(1e-3, 2.5), 4.0, 0.3, 1.6)).trajectory)
+    edge = np.sin(np.radians(2.5))  # at which dry contour friction sets in
+    share = lambda n: smooth((edge - n.sine) / (0.05 * edge))  # noqa: E731
+    contour = by_load(lambda d, n: 1e-3 * d.r * np.sign(n.phidot) / n.sine * share(n) * n.m0)
+    result = diagnose(recording(Unknown(contour, 4.0, 0.3, 1.6)).trajectory)
     assert result.diagnosis.verdict == "unexplained"
     assert result.holds
     assert result.holds["first"] is not None
@@ -283,12 +275,8 @@ def test_a_law_below_a_nutation_is_told_with_the_nutation():
 def test_a_dent_that_hits_once_a_turn_is_found_with_its_place_and_its_blow():
     """A lever arm of 0.3 mm while a spot of the rim, 0.15 rad wide, is at the contact."""
 
-    def law(disc, now, size=3e-4, width=0.15):
-        phi = now.phi - 1.0
-        bump = size * np.exp((np.cos(phi) - 1) / width**2) * np.sign(now.phidot)
-        return newton_euler.ZERO, bump * now.m0, newton_euler.ZERO
-
-    result = diagnose(recording(Unknown(law, 14.0, 1.0, 0.9)).trajectory)
+    dent = by_load(lambda d, n: 3e-4 * np.exp((np.cos(n.phi - 1.0) - 1) / 0.15**2) * np.sign(n.phidot) * n.m0)
+    result = diagnose(recording(Unknown(dent, 14.0, 1.0, 0.9)).trajectory)
     assert result.learned is not None
     fit = result.diagnosis.after
     assert result.after.reduced_chi_square < 1.05
@@ -301,15 +289,10 @@ def test_a_blow_is_an_impulse_at_an_instant():
     """1.7 mN s within 12 ms, as a soft hammer gives them; frames begin 2 ms after the motion."""
     impulse = np.array([1.5e-3, -0.8e-3, 0.0])
 
-    def law(disc, now):
-        phase = (disc.t - 0.31) / 0.012
-        return (
-            newton_euler.ZERO,
-            newton_euler.ZERO,
-            impulse * np.pi / 0.024 * np.cos(np.pi * phase) * (abs(phase) < 0.5),
-        )
+    def at(phase):
+        return impulse * np.pi / 0.024 * np.cos(np.pi * phase) * (abs(phase) < 0.5)
 
-    result = diagnose(recording(Unknown(law)).trajectory)
+    result = diagnose(recording(Unknown(force(lambda d, n: at((d.t - 0.31) / 0.012)))).trajectory)
     assert result.learned is not None
     blow = {"learned.impulse_x_0": impulse[0], "learned.impulse_y_0": impulse[1]}
     assert_sized(result.diagnosis.after, blow, 3, 0.05e-3)
