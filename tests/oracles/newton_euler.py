@@ -33,6 +33,7 @@ class Disc:
     gravity: Sequence[float] = (0, 0, -9.81)
     J_body: NDArray | None = None
     com_body: Sequence[float] = (0, 0, 0)
+    wanders: Callable | None = None  # t -> centre of mass in the body, in place of com_body
     edge: float = 0.0
     mu: float = np.inf
     friction: Callable | None = None  # speed of slip -> coefficient, in place of mu
@@ -49,11 +50,13 @@ class Disc:
     def __post_init__(self):
         J1 = self.m * self.r**2 / 4 + self.m * self.h**2 / 3
         self.J = np.diag([J1, J1, self.m * self.r**2 / 2]) if self.J_body is None else self.J_body
-        self.g, self.com = np.array(self.gravity, float), np.array(self.com_body, float)
+        self.g, self.com, self.unworn = np.array(self.gravity, float), np.array(self.com_body, float), self.r
 
     def at(self, t):
         """Itself, at an instant."""
-        self.t = t
+        self.t, self.r = t, self.unworn - self.wears * t
+        if self.wanders is not None:
+            self.com = np.array(self.wanders(t))
         return self
 
 
@@ -65,7 +68,7 @@ class Instant:
     """Geometry and rates at one state."""
 
     def __init__(self, disc, state):
-        self.O, self.v, self.omega, self.phi = state[:3], state[7:10], state[10:13], state[14]
+        self.O, self.v, self.omega, self.phi, self.memory = state[:3], state[7:10], state[10:13], state[14], state[15:]
         self.R = Rotation.from_quat(state[3:7], scalar_first=True).as_matrix()
         d = self.R[:, 2]
         d_rate = np.cross(self.omega, d)

@@ -238,7 +238,7 @@ UNKNOWN: dict[str, Unknown] = {
     "torque_by_attitude": Unknown(moment(lambda d, n: 6e-4 * np.cross(n.d, level(0.4)))),
     "quadratic_spring": Unknown(force(lambda d, n: -40.0 * np.linalg.norm(n.O[:2]) * np.array([*n.O[:2], 0.0]))),
     "hysteresis": Unknown(
-        lambda d, n: (ZERO, -4e-8 * d.memory * n.m0, ZERO), rate_of_memory=lambda d, n, z: (n.psidot**2 - z) / 0.05
+        lambda d, n: (ZERO, -4e-8 * n.memory[0] * n.m0, ZERO), rate_of_memory=lambda d, n, z: (n.psidot**2 - z) / 0.05
     ),
     "periodic_kicks": Unknown(kicks(0.06, 2e-5, 0.9)),
     "eddy_half": Unknown(force(lambda d, n: -0.02 * smooth((n.O[0] - 0.032) / 1e-4) * n.v * (1, 1, 0))),
@@ -266,51 +266,51 @@ UNKNOWN: dict[str, Unknown] = {
         moment(lambda d, n: -1.5e-5 * n.psidot * np.exp(-np.sum((contact(n)[:2] - PLACE) ** 2) / 0.015**2) * n.m0)
     ),
     "hinged_frame": Unknown(
-        force(lambda d, n: d.m * 9.81 * d.memory * np.array([1.0, 0.0, 0.0])),
+        force(lambda d, n: d.m * 9.81 * n.memory[0] * np.array([1.0, 0.0, 0.0])),
         rate_of_memory=lambda d, n, z: (5e-3 * (contact(n)[0] + 0.1) - z) / 0.04,
         remembered=lambda n: 5e-3 * (contact(n)[0] + 0.1),
     ),
     "fan": Unknown(force(lambda d, n: -0.01 * (n.v - 0.5 * smooth((d.t - 0.3) / 0.02) * level(1.3)) * (1, 1, 0))),
     "liquid": Unknown(
-        lambda d, n: (-4e-6 * (n.omega @ n.d - d.memory) * n.d, ZERO, ZERO),
+        lambda d, n: (-4e-6 * (n.omega @ n.d - n.memory[0]) * n.d, ZERO, ZERO),
         omega3=1.5,
         rate_of_memory=lambda d, n, z: (n.omega @ n.d - z) / 0.1,
         remembered=lambda n: 0.0,
     ),
     "thrust": Unknown(force(lambda d, n: 3e-3 * n.d)),
     "twisted_thread": Unknown(
-        moment(lambda d, n: -3e-6 * d.memory * K),
+        moment(lambda d, n: -3e-6 * n.memory[0] * K),
         rate_of_memory=lambda d, n, z: n.omega[2],
         remembered=lambda n: 0.0,
         omega3=1.5,
     ),
     "worn_in": Unknown(  # friction that falls with the distance rolled
-        by_load(lambda d, n: -1.5e-4 * np.exp(-d.memory / 0.4) * rolling(n)),
+        by_load(lambda d, n: -1.5e-4 * np.exp(-n.memory[0] / 0.4) * rolling(n)),
         rate_of_memory=lambda d, n, z: d.r * np.linalg.norm(n.omega - n.omega[2] * K),
         remembered=lambda n: 0.0,
     ),
     "cross_drag": Unknown(force(lambda d, n: 6e-4 * n.psidot * n.sine * n.n0)),
     "nail": Unknown(nail(3e-10, (0.05, 0.01, -0.02))),
     "warming": Unknown(  # friction that falls with the heat of what it has dissipated, which cools
-        by_load(lambda d, n: -2e-4 / (1 + d.memory / 2e-4) * rolling(n)),
+        by_load(lambda d, n: -2e-4 / (1 + n.memory[0] / 2e-4) * rolling(n)),
         rate_of_memory=lambda d, n, z: (
             2e-4 * d.m * 9.81 / (1 + z / 2e-4) * np.linalg.norm(n.omega - n.omega[2] * K) - z / 0.3
         ),
         remembered=lambda n: 0.0,
     ),
     "slipping_thread": Unknown(  # which holds up to a moment, and slips
-        moment(lambda d, n: -6e-5 * d.memory * K),
+        moment(lambda d, n: -6e-5 * n.memory[0] * K),
         omega3=1.5,
         rate_of_memory=lambda d, n, z: n.omega[2] - abs(n.omega[2]) * z / 0.25,
         remembered=lambda n: 0.0,
     ),
     "presliding": Unknown(  # friction that builds up over a way, by Dahl
-        by_load(lambda d, n: -1.5e-4 * d.memory * n.m0),
+        by_load(lambda d, n: -1.5e-4 * n.memory[0] * n.m0),
         rate_of_memory=lambda d, n, z: n.psidot * n.sine * (1 - z * np.sign(n.psidot) * abs(z)) / 0.3,
         remembered=lambda n: -0.5,
     ),
     "loose_ball": Unknown(  # in a tube of the face, in oil
-        lambda d, n: (np.cross(d.memory * n.R[:, 0], -0.0981 * K), ZERO, ZERO),
+        lambda d, n: (np.cross(n.memory[0] * n.R[:, 0], -0.0981 * K), ZERO, ZERO),
         rate_of_memory=lambda d, n, z: (-3e-3 * n.R[2, 0] - z) / 0.02,
         remembered=lambda n: 0.0,
     ),
@@ -330,31 +330,12 @@ UNKNOWN["force_and_rim"] = Unknown(both(UNKNOWN["growing_force"].law, UNKNOWN["r
 UNKNOWN["drag_and_steps"] = Unknown(both(UNKNOWN["drag_one_way"].law, UNKNOWN["friction_steps"].law))
 
 
-class _Body(newton_euler.Disc):
-    """A disc with a number that its laws remember, or with a centre of mass that wanders."""
-
-    memory = 0.0
-
-    def __init__(self, unknown: Unknown) -> None:
-        laws = [newton_euler.precession_friction(K_M)]
-        if unknown.law is not None:
-            laws.append(unknown.law)
-        self._unknown = unknown
-        sizes = DISC.radius, DISC.half_thickness, DISC.mass
-        super().__init__(*sizes, laws=tuple(laws), friction=unknown.friction)
-
-    def moved(self, t, state):
-        """At an instant and a state."""
-        self.t, self.memory = t, state[15] if len(state) > 15 else 0.0
-        if self._unknown.com is not None:
-            self.com = np.array(self._unknown.com(t))
-        self.r, self.wears = DISC.radius - self._unknown.wears * t, self._unknown.wears
-        return self
-
-
 def motion(unknown: Unknown):
     """(times, q (n, 6), speeds (n, 6), true moment (n, 3) along n0, m0, k; NaN where there is none)."""
-    body = _Body(unknown)
+    laws = [newton_euler.precession_friction(K_M), *([unknown.law] if unknown.law else [])]
+    sizes = DISC.radius, DISC.half_thickness, DISC.mass
+    how = {"friction": unknown.friction, "wanders": unknown.com, "wears": unknown.wears}
+    body = newton_euler.Disc(*sizes, laws=laws, **how)
     regime = "rolling" if unknown.friction is None else "slipping"
     theta = np.radians(unknown.theta_deg)
     omega2 = np.sqrt(4 * 9.81 * np.sin(theta) / body.r)
@@ -367,13 +348,13 @@ def motion(unknown: Unknown):
         state = np.append(state, now.psidot**2 if unknown.remembered is None else unknown.remembered(now))
 
     def rate(t, s):
-        ydot = newton_euler.rate(body.moved(t, s), s[:15], regime)
+        ydot = newton_euler.rate(body.at(t), s, regime)
         if unknown.rate_of_memory is None:
             return ydot
-        return np.append(ydot, unknown.rate_of_memory(body, newton_euler.Instant(body, s[:15]), s[15]))
+        return np.append(ydot, unknown.rate_of_memory(body, newton_euler.Instant(body, s), s[15]))
 
     def low(t, s):
-        return newton_euler.Instant(body, s[:15]).sine - np.sin(np.radians(1.2))
+        return newton_euler.Instant(body, s).sine - np.sin(np.radians(1.2))
 
     low.terminal = True
     times = np.arange(0.0, unknown.duration, 1 / SAMPLES)
@@ -384,12 +365,11 @@ def motion(unknown: Unknown):
     q = newton_euler.coordinates(body, found.y[:15])
     speed, wrench = np.zeros_like(q), np.full((len(q), 3), np.nan)
     for i, (t, s) in enumerate(zip(found.t, states, strict=True)):
-        now = newton_euler.Instant(body.moved(t, s), s[:15])
+        now = newton_euler.Instant(body.at(t), s)
         speed[i] = *now.v, now.psidot, now.thetadot, now.phidot
     if regime == "rolling" and unknown.com is None and unknown.shift is None and not unknown.wears:
         for i in range(0, len(q), 6):
-            body.moved(found.t[i], states[i])
-            wrench[i] = moment_of(body, states[i][:15])
+            wrench[i] = moment_of(body.at(found.t[i]), states[i])
     if unknown.shift is not None:
         q, later = q + unknown.shift(found.t), unknown.shift(found.t + 1e-5)
         speed += (later - unknown.shift(found.t)) / 1e-5
