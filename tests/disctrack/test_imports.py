@@ -42,13 +42,6 @@ def test_the_block_is_felt_where_such_a_library_is_needed():
     assert "ModuleNotFoundError" in done.stderr
 
 
-def test_importing_the_package_loads_nothing_heavy():
-    heavy = {"numpy", "cv2", "scipy", "matplotlib", "h5py", "numba"}
-    for module in ("disctrack", "disctrack.cli"):  # which tells NumPy how many threads it may have
-        done = run(f"import {module}, sys; print(sorted({heavy!r} & set(sys.modules)))")
-        assert done.stdout.strip() == "[]", done.stdout + done.stderr
-
-
 @pytest.mark.statistical
 def test_a_measurement_waits_for_no_part_of_scipy():
     """Each takes from a tenth to half a second: more than following the disc through the sample recording."""

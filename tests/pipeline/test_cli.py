@@ -150,7 +150,8 @@ def test_calibrate_without_a_recording(shared_data, tmp_path, cli):
 
 
 def test_help_is_there_for_every_command_and_comes_at_once():
-    heavy = {"numpy", "cv2", "scipy", "h5py", "matplotlib", "numba", "skimage"}  # each takes longer than all else here
+    # each takes longer than all else here; and it is this command that tells NumPy how many threads it may have
+    heavy = {"numpy", "cv2", "scipy", "h5py", "matplotlib", "numba", "skimage"}
     code = (
         "import sys, disctrack.cli\n"
         "for words in (['--help'], *([name, '--help'] for name in disctrack.cli.COMMANDS)):\n"
