@@ -26,7 +26,7 @@ from disctrack.errors import OutputError, RigFileError
 from disctrack.files.whole import whole_file, write_whole
 from disctrack.frames import COORDINATES
 from disctrack.trajectory import FrameStatus, Trajectory
-from disctrack.trajectory.exchange.rig_parts import array_of, camera_of, content_of, rotation_of
+from disctrack.trajectory.exchange.rigs import array_of, camera_of, content_of, rotation_of
 from disctrack.trajectory.file import labelled
 
 _YAML = ("M1", "D1", "M2", "D2", "R", "T")

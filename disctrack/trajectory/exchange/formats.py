@@ -21,9 +21,9 @@ from disctrack.errors import OutputError, TrajectoryFileError
 from disctrack.files.inputs import keep, refuse_input
 from disctrack.files.whole import refuse_existing, write_whole
 from disctrack.trajectory import Trajectory
-from disctrack.trajectory.exchange import arrays, motion, points, rigs
+from disctrack.trajectory.exchange import arrays, motion, rigs
 from disctrack.trajectory.exchange.lens import BROWN, within_brown
-from disctrack.trajectory.exchange.rig_parts import content_of, the_one
+from disctrack.trajectory.exchange.rigs import content_of, the_one
 from disctrack.trajectory.file import read_trajectory, trajectory_in
 
 OWN = (".h5", ".nc")  # netCDF-4 is HDF5: other programs go by the second name
@@ -57,9 +57,9 @@ ROWS = (
     Format("QTM", (".tsv",), "trajectory", motion.write_qtm, None, SIGMAS),
     Format("XMALab transformations", ("transformation.csv", "transformations.csv"), "trajectory",
            motion.write_transformations, None, "sigmas, times, the rig, the dots"),
-    Format("XMALab points", ("points.csv",), "points", points.write_points, points.read_points, "sigmas",
+    Format("XMALab points", ("points.csv",), "points", motion.write_points, motion.read_points, "sigmas",
            mark="_cam1_X"),
-    Format("DLTdv8 points", ("xypts.csv",), "points", points.write_xypts, points.read_xypts, "sigmas, the lenses: the "
+    Format("DLTdv8 points", ("xypts.csv",), "points", motion.write_xypts, motion.read_xypts, "sigmas, the lenses: the "
            "points are without their distortion, as dltcoefs.csv needs them", mark="pt1_cam1_X"),
     Format("OpenCV", (".yml", ".yaml", ".xml"), "rig", arrays.write_opencv, arrays.read_opencv, "covariances"),
     Format("Kalibr", ("camchain.yaml", "kalibr.yaml"), "rig", rigs.write_kalibr, rigs.read_kalibr,

@@ -1,19 +1,23 @@
-"""A trajectory as other programs keep the motion of a body: tables, points, rotations."""
+"""A trajectory as other programs keep it: tables, points in space and in images, rotations."""
 
 import csv
 import io
+import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
+from calibration.cameras.camera import normalise
 from calibration.kit.arguments import checked
 from calibration.kit.arrays import Array
-from disctrack.errors import OutputError
+from disctrack.errors import OutputError, RigFileError
 from disctrack.files.whole import refuse_existing, whole_file, write_whole
 from disctrack.frames import CAMERAS, COORDINATES, rotation_from_quaternion
 from disctrack.trajectory import FrameStatus, Trajectory
-from disctrack.trajectory.exchange.points import table
+from disctrack.trajectory.exchange.rigs import content_of
 
 
 def body_points(trajectory: Trajectory) -> tuple[Array, list[str]]:
@@ -142,7 +146,7 @@ def write_qtm(path: Path, trajectory: Trajectory) -> None:
     values[:, 8] = place_sigma_mm(trajectory)
     values[known, 9:] = np.swapaxes(R[known], 1, 2).reshape(-1, 9)
     head = _QTM_HEAD.format(n=len(known), rate=trajectory.frame_rate)
-    write_whole(path, head.encode() + table(_QTM_COLUMNS, values, "\t"))
+    write_whole(path, head.encode() + _table(_QTM_COLUMNS, values, "\t"))
 
 
 _QTM_HEAD = """NO_OF_FRAMES\t{n}
@@ -169,9 +173,69 @@ def write_transformations(path: Path, trajectory: Trajectory) -> None:
     T[:, :3, :3], T[:, :3, 3], T[:, 3, 3] = rotations(trajectory), 1e3 * trajectory.q[:, :3], 1.0
     T[~trajectory.measured] = np.nan
     columns = np.swapaxes(T, 1, 2).reshape(-1, 16)
-    write_whole(path, table([f"DISC_{head}" for head in _TRANSFORMATION], columns))
+    write_whole(path, _table([f"DISC_{head}" for head in _TRANSFORMATION], columns))
 
 
 _TRANSFORMATION = (
     "R11", "R12", "R13", "01", "R21", "R22", "R23", "02", "R31", "R32", "R33", "03", "TX", "TY", "TZ", "1"
 )  # fmt: skip
+
+
+# --- Image points as tables of text: a row for each frame, columns NAME_camJ_X, NAME_camJ_Y of every point and camera -
+
+
+def _table(names: Sequence[str], columns: ArrayLike, separator: str = ",") -> bytes:
+    """Heading and numbers (n, names), NaN where there is none; ten digits."""
+    rows = [separator.join(names), *(separator.join(f"{v:.10g}" for v in row) for row in np.asarray(columns, float))]
+    return ("\n".join(rows) + "\n").replace("nan", "NaN").encode()
+
+
+def _write_points(path: Path, points: Array, names: Sequence[str]) -> None:
+    """Points (n, cameras, m, 2) with m names; NaN where a dot has no centre."""
+    headings = [f"{name}_cam{c}_{axis}" for name in names for c in range(1, points.shape[1] + 1) for axis in "XY"]
+    write_whole(path, _table(headings, points.swapaxes(1, 2).reshape(len(points), -1)))
+
+
+def write_points(path: Path, trajectory: Trajectory) -> None:
+    """XMALab's DOT_i_camJ_X, DOT_i_camJ_Y [px]: dots as the images show them, lens and all, from 0 at the top left.
+
+    XMALab asks on import: "distorted", no offset, not inverted. Raises OutputError.
+    """
+    points, field = trajectory.markers_px, trajectory.rig.lens_field
+    if field is not None:
+        points = field.distorted(points)
+    _write_points(path, points, [f"DOT_{i}" for i in range(points.shape[2])])
+
+
+def write_xypts(path: Path, trajectory: Trajectory) -> None:
+    """DLTdv8's ptI_camJ_X, ptI_camJ_Y [px], from 1 at the top left, without the lens' distortion. Raises OutputError.
+
+    They belong to coefficients of the direct linear transformation, which describe a camera without a lens.
+    """
+    rig, seen = trajectory.rig, trajectory.markers_px
+    straight = [
+        normalise(seen[:, c], camera) * (camera.fx, camera.fy) + (camera.cx, camera.cy) + 1.0
+        for c, camera in enumerate(rig.cameras)
+    ]
+    _write_points(path, np.stack(straight, axis=1), [f"pt{i}" for i in range(1, seen.shape[2] + 1)])
+
+
+def read_points(path: Path) -> Array:
+    """Points (n, cameras, m, 2) of a table with such headings; NaN where there is none. Raises RigFileError."""
+    first, *lines = content_of(path).splitlines() or [""]
+    found = [re.fullmatch(r"\s*(.+)_cam(\d+)_([XY])\s*", name) for name in first.split(",")]
+    names, cameras = dict.fromkeys(m[1] for m in found if m), {m[2] for m in found if m}
+    if not found or not all(found) or len(found) != 2 * len(names) * len(cameras):
+        raise RigFileError(
+            f"{path}: the first line is '{first[:60]}'; expected NAME_cam1_X,NAME_cam1_Y,NAME_cam2_X,..."
+        )
+    try:
+        values = np.array([[float(cell or "nan") for cell in line.split(",")] for line in lines if line.strip()])
+        return values.reshape(len(values), len(names), len(cameras), 2).swapaxes(1, 2)
+    except ValueError as error:
+        raise RigFileError(f"{path}: not a table of numbers with {len(found)} columns ({error})") from error
+
+
+def read_xypts(path: Path) -> Array:
+    """Points (n, cameras, points, 2) [px], counted from 0. Raises RigFileError."""
+    return read_points(path) - 1.0

@@ -24,7 +24,6 @@ from disctrack.frames import COORDINATES, rotation_from_euler
 from disctrack.synthetic.cameras import rig_of
 from disctrack.synthetic.description import Scene
 from disctrack.trajectory.exchange import arrays, formats, motion, rigs
-from disctrack.trajectory.exchange import points as point_tables
 from tests.disctrack.trajectory.test_file import make_trajectory
 
 
@@ -137,7 +136,7 @@ def test_dlt_coefficients_describe_the_points_of_xypts(rig, trajectory, tmp_path
     (path,), notes = disctrack.convert(tmp_path / "own.h5", tmp_path / "clip_dltcoefs.csv")
     assert "lens" in notes[0]
     L = np.loadtxt(path, delimiter=",")
-    point_tables.write_xypts(tmp_path / "clip_xypts.csv", trajectory)
+    motion.write_xypts(tmp_path / "clip_xypts.csv", trajectory)
     with (tmp_path / "clip_xypts.csv").open() as stream:
         rows = list(csv.DictReader(stream))
     body = trajectory.disc.marker_centres_body[4]
@@ -373,7 +372,7 @@ def test_points_of_motion_capture_stand_y_up_in_a_trc_file(trajectory, tmp_path)
 
 def test_xmalab_has_the_images_points_and_matrices_by_columns(trajectory, tmp_path):
     bent = replace(trajectory, rig=with_field(trajectory.rig))
-    point_tables.write_points(tmp_path / "clip_points.csv", bent)
+    motion.write_points(tmp_path / "clip_points.csv", bent)
     points = formats.read_foreign([tmp_path / "clip_points.csv"])
     assert bent.rig.lens_field.corrected(points) == pytest.approx(trajectory.markers_px, abs=1e-6, nan_ok=True)
     motion.write_transformations(tmp_path / "clip_transformation.csv", trajectory)
