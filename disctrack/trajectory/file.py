@@ -489,16 +489,13 @@ def _rig(group: h5py.Group) -> StereoRig:
     )
 
 
-_ROUNDED = 1e-3  # of a quaternion's length, by whoever wrote it with few digits
-_MOST_METRES, _MOST_RADIANS = 1e3, 1e6  # beyond, no disc was filmed and squares lose all digits
-
-
 def _check_values(trajectory: Trajectory) -> None:
     """Raise ValueError, which names the first frame, where a value can be no measurement."""
     frame, q, C = trajectory.frame, trajectory.q, trajectory.pose_covariance
     with np.errstate(invalid="ignore"):
         steps = np.diff(trajectory.time)
-        far = (np.abs(q) > np.r_[[_MOST_METRES] * 3, [_MOST_RADIANS] * 3]) | np.isinf(q)
+        # beyond so many metres and radians, no disc was filmed and squares lose all digits
+        far = (np.abs(q) > np.repeat([1e3, 1e6], 3)) | np.isinf(q)
     if not np.isfinite(trajectory.time).all() or (steps <= 0).any():
         row = int(np.argmax(~(steps > 0))) + 1
         raise ValueError(f"time does not increase at frame {frame[row]}: {trajectory.time[row]:g} s")
@@ -510,7 +507,7 @@ def _check_values(trajectory: Trajectory) -> None:
         if unknown.any():
             raise ValueError(f"frame {frame[np.argwhere(unknown)[0][0]]} has an unknown status {status[unknown][0]}")
     posed = np.flatnonzero(np.isfinite(q).all(axis=1))
-    off = np.abs(np.linalg.norm(trajectory.quaternion[posed], axis=1) - 1) > _ROUNDED
+    off = np.abs(np.linalg.norm(trajectory.quaternion[posed], axis=1) - 1) > 1e-3  # who writes few digits rounds it
     if off.any() or not np.isfinite(trajectory.quaternion[posed]).all():
         raise ValueError(f"quaternion of frame {frame[posed[int(np.argmax(off))]]} is no rotation")
     sound: Mask = np.asarray(np.isfinite(C[posed]).all(axis=(1, 2)))

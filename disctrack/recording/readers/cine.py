@@ -29,9 +29,6 @@ from disctrack.recording.readers.raw import (
 _FILE_HEADER = struct.Struct("<2sHHHiIiIIIIII")
 _BITMAP_HEADER = struct.Struct("<IiiHHII")
 _BLOCK_HEADER = struct.Struct("<IHH")
-_TIMES_BLOCK = 1002
-_MOST_BLOCKS = 1000  # real files have two or three
-_SETUP_MARK = 140  # where the setup's own mark and length stand
 # Field of the camera setup (4 bytes): its offset. Fields beyond the setup's stated length are not in the file.
 _SETUP_FIELDS = {
     "Serial": 743,
@@ -90,7 +87,7 @@ class _Cine:
         _, self.width, height, _, self.bits, self.packing, self.image_bytes = bitmap
         self.height = abs(height)
         self.bottom_up = height > 0 and self.packing == 0  # as in a bitmap; packed images begin with the upper row
-        mark_and_length = file.bytes_at(setup_at + _SETUP_MARK, 4, f"{file}: camera setup")
+        mark_and_length = file.bytes_at(setup_at + 140, 4, f"{file}: camera setup")
         length = int.from_bytes(mark_and_length[2:], "little")
         if mark_and_length[:2] != b"ST":
             raise RecordingError(f"{file}: no camera setup where the header says. Export the recording again.")
@@ -176,7 +173,7 @@ def _times(cine: _Cine) -> tuple[Array | None, int, list[str]]:
 
     Between them, of how many recorded frames one was saved: the setup does not tell.
     """
-    block, n = _find_block(cine, _TIMES_BLOCK), cine.n_images
+    block, n = _block_of_times(cine), cine.n_images
     if block is None:
         return None, 1, ["the file has no time stamps; frames are taken as evenly spaced"]
     start, size = block
@@ -193,17 +190,17 @@ def _times(cine: _Cine) -> tuple[Array | None, int, list[str]]:
     return times, step, []
 
 
-def _find_block(cine: _Cine, wanted: int) -> tuple[int, int] | None:
-    """Offset and size of the content of a tagged block between the setup and the table of images."""
+def _block_of_times(cine: _Cine) -> tuple[int, int] | None:
+    """Offset and size of what is in block 1002, a tagged one between the setup and the table of images."""
     position = cine.blocks
-    for _ in range(_MOST_BLOCKS):
+    for _ in range(1000):  # real files have two or three
         if position + _BLOCK_HEADER.size > min(cine.table, cine.file.size):
             return None
         content = cine.file.bytes_at(position, _BLOCK_HEADER.size, str(cine.file))
         size, kind, _ = _BLOCK_HEADER.unpack(content)
         if size < _BLOCK_HEADER.size or position + size > cine.file.size:
             return None
-        if kind == wanted:
+        if kind == 1002:
             return position + _BLOCK_HEADER.size, size - _BLOCK_HEADER.size
         position += size
     return None

@@ -14,7 +14,6 @@ from typing import Any, cast
 
 import h5py
 import numpy as np
-from h5py import h5z
 
 from calibration.kit.arrays import Array, Image
 from disctrack.errors import RecordingError
@@ -117,13 +116,13 @@ def _open(handle: h5py.File, stack: h5py.Dataset, file: Path, camera: str) -> Fr
         handle.close()
         starts = offset + layout.frame_bytes * np.arange(n)
         return RawFrames(files=[RawFile(file)] * n, offsets=starts, layout=layout, **told)
-    filters, together = _filters(stack), stack.chunks[0] if stack.chunks else 1
-    deflated = h5z.FILTER_DEFLATE in filters <= {h5z.FILTER_SHUFFLE, h5z.FILTER_DEFLATE}
+    together, n_filters = stack.chunks[0] if stack.chunks else 1, stack.id.get_create_plist().get_nfilters()
+    deflated = stack.compression == "gzip" and n_filters == 1 + stack.shuffle
     slow = f"chunks of {together} frames are decompressed anew for each of them; chunks of one frame are read faster"
     return Hdf5Frames(
         files=cast(Sequence[str], np.broadcast_to(where, n)),  # a virtual one may announce any n
         stack=stack,
-        shuffled=h5z.FILTER_SHUFFLE in filters,
+        shuffled=stack.shuffle,
         random_access=bool(whole and deflated and stack.chunks == (1, height, width)),
         notes=(slow,) if together > max(1, _LARGEST_CACHE // (width * height * stack.dtype.itemsize)) else (),
         image_size=(int(width), int(height)),
@@ -153,11 +152,6 @@ def _check_other_files(stack: h5py.Dataset, file: Path, where: str) -> None:
     for name in sorted({source.file_name for source in sources} - {"."}):
         if "%" not in name and not (file.parent / name).exists() and not Path(name).exists():
             raise RecordingError(f"{where}: takes frames from {name}, which is not there. Copy it beside {file}.")
-
-
-def _filters(stack: h5py.Dataset) -> set[int]:
-    plist = stack.id.get_create_plist()
-    return {int(plist.get_filter(i)[0]) for i in range(plist.get_nfilters())}
 
 
 def _attribute(stack: h5py.Dataset, name: str) -> float | None:

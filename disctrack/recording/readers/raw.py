@@ -26,8 +26,6 @@ from disctrack.recording.readers.base import FrameReader, room_for
 
 # A header may claim any size; no camera of this kind has more pixels, and reading one must not exhaust the memory.
 MOST_PIXELS = 1 << 27
-# Even a black image does not shrink by more than this when compressed (deflate: 1032); small ones are let pass.
-_MOST_PER_BYTE, _SMALL_IMAGE = 1500, 1 << 22  # pixels per byte of the file; pixels
 # A file that was cut short is worth measuring while most of it is there; a header that promises far more than the file
 # holds is not believed: all that follows is sized by it.
 LEAST_PRESENT = 0.5
@@ -207,7 +205,8 @@ def check_frame_size(width: int, height: int, where: str, bits: int = 8, n_bytes
     bits    : of a pixel in the file; those of a frame must fill whole bytes
     n_bytes : of what is compressed in any way, and must be able to hold that many pixels
     """
-    most = MOST_PIXELS if n_bytes is None else min(MOST_PIXELS, max(_SMALL_IMAGE, _MOST_PER_BYTE * n_bytes))
+    # even a black image does not shrink by more than this when compressed (deflate: 1032); small ones are let pass
+    most = MOST_PIXELS if n_bytes is None else min(MOST_PIXELS, max(1 << 22, 1500 * n_bytes))
     if width <= 0 or height <= 0 or width * height > most:
         raise RecordingError(
             f"{where}: the header claims images of {width} x {height} px, which no camera of this kind has, or the "

@@ -24,8 +24,8 @@ from disctrack.recording.readers.raw import MOST_PIXELS, RawFile, check_frame_si
 
 logging.getLogger("tifffile").addHandler(logging.NullHandler())  # it logs what it finds odd; here that is an error
 
-_LZW = 5
-_READ = frozenset((1, _LZW, 7, 8, 32773, 32946))  # compressions: none, LZW, JPEG, deflate, PackBits, deflate
+_LZW = tifffile.COMPRESSION.LZW
+_READ = {tifffile.COMPRESSION[name] for name in ("NONE", "LZW", "JPEG", "ADOBE_DEFLATE", "PACKBITS", "DEFLATE")}
 # Tags by which the pixels of two pages are decoded alike.
 _LAYOUT = (256, 257, 258, 259, 262, 266, 274, 277, 278, 284, 317, 320, 322, 323, 338, 339, 347)
 
