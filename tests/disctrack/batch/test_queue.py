@@ -27,7 +27,7 @@ from disctrack.batch.pool import Cluster, Died, do_all
 from disctrack.batch.records import BUSY, FAILED, MEASURED, Record, failed
 from disctrack.batch.repeats import repeats_of
 from disctrack.batch.report import report_of
-from disctrack.batch.summary import as_csv, with_false_discovery, write_summary
+from disctrack.batch.run import as_csv, with_false_discovery, write_summary
 from disctrack.errors import ClusterError, RecordingError, reason_of
 from disctrack.report.html import page
 from disctrack.report.terminal import full, short
