@@ -1,13 +1,12 @@
 """Many recordings: found, planned, measured side by side, summed up.
 
-`find` (which folders are recordings) -> `plan` (each rig once, then one job per recording) -> `pool` (who works, what
-waits; `measure` is what they do) -> `records` (kept beside the results) -> `repeats`, `report` (of all).
+`plan` (which folders are recordings; each rig once, then one job per recording) -> `pool` (who works, what waits;
+`measure` is what they do) -> `records` (kept beside the results) -> `repeats`, `report` (of all).
 `run` is the whole, and writes the summary. Results are judged by content: the hash of inputs, settings and version,
 never by their mere existence.
 """
 
-from disctrack.batch.find import find_recordings
-from disctrack.batch.plan import BatchOptions
+from disctrack.batch.plan import BatchOptions, find_recordings
 from disctrack.batch.run import BatchOutcome, run_batch, summarise_batch
 
 __all__ = [

@@ -17,9 +17,8 @@ from tqdm import tqdm
 
 from calibration.kit.arguments import checked
 from disctrack.batch.columns import COLUMNS, Row
-from disctrack.batch.find import FoundRecordings, find_recordings
 from disctrack.batch.locks import locked
-from disctrack.batch.plan import BatchOptions, Job, make_plan
+from disctrack.batch.plan import BatchOptions, FoundRecordings, Job, find_recordings, make_plan
 from disctrack.batch.pool import Cluster, Processes, do_all
 from disctrack.batch.records import FAILED, MEASURED, NOT_MEASURED, SKIPPED, Record, is_done, read_record
 from disctrack.batch.repeats import REPEATS, repeats_of

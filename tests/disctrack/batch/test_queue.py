@@ -20,9 +20,8 @@ from scipy import optimize, stats
 
 from disctrack.batch import locks
 from disctrack.batch.columns import COLUMNS, FITTED, copies
-from disctrack.batch.find import find_recordings
 from disctrack.batch.locks import locked
-from disctrack.batch.plan import BatchOptions, Job
+from disctrack.batch.plan import BatchOptions, Job, find_recordings
 from disctrack.batch.pool import Cluster, Died, do_all
 from disctrack.batch.records import BUSY, FAILED, MEASURED, Record, failed
 from disctrack.batch.repeats import repeats_of
