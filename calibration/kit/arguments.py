@@ -133,9 +133,7 @@ def _rule(kind: Any) -> Rule:
 
 def _first_that_fits(value: Any, options: tuple[Any, ...]) -> Any:
     """The value as the first of several kinds that it fits."""
-    if any(type(value) is option for option in options):
-        return value  # before what it may stand for
-    for option in options:
+    for option in sorted(options, key=lambda option: type(value) is not option):  # before what it may stand for
         with suppress(TypeError, ValueError):
             return _fit(value, option)
     raise TypeError

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibration.cameras.camera import StereoRig, placed_at, project_with_jacobians
+from calibration.cameras.camera import Camera, StereoRig, placed_at, project_with_jacobians
 from calibration.kit.arrays import Array
 from disctrack.disc import Disc
 from disctrack.faults.keys import Faults
@@ -33,18 +33,10 @@ def cameras_with(faults: Faults, rig: StereoRig) -> StereoRig:
     for camera, (R, t), fault in zip(rig.cameras, rig.camera_poses(), (faults.left, faults.right), strict=True):
         turn = rotation_from_vector(np.radians(fault.rotation_deg)).T  # the camera turns, its picture turns back
         poses.append((turn @ R @ tilt, turn @ (t + R @ lift - 1e-3 * np.array(fault.translation_mm))))
-        k1, k2, p1, p2, k3 = camera.distortion
-        x, y = fault.principal_point_change_px
-        cameras.append(
-            replace(
-                camera,
-                fx=camera.fx * fault.focal_scale,
-                fy=camera.fy * fault.focal_scale,
-                cx=camera.cx + x,
-                cy=camera.cy + y,
-                distortion=(k1 + fault.k1_change, k2, p1, p2, k3),
-            )
-        )
+        parameters = camera.parameters
+        parameters[:2] *= fault.focal_scale
+        parameters[2:5] += [*fault.principal_point_change_px, fault.k1_change]
+        cameras.append(Camera.from_parameters(parameters, camera.image_size))
     left, right = cameras
     return replace(rig, left=left, right=right, **placed_at(poses))
 
