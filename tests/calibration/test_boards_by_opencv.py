@@ -3,7 +3,6 @@
 import re
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -18,6 +17,7 @@ from calibration.judge.pairs import motion_between_exposures
 from calibration.rig_file import read_rig_file, write_rig
 from calibration.stereo import _observations
 from tests.calibration.conftest import corner_view, squared
+from tests.calibration.test_refinement import rig_error
 from tests.oracles import moved_boards, point_laboratory
 
 BOARD = Board(moved_boards.INNER_CORNERS, moved_boards.SQUARE)
@@ -32,14 +32,8 @@ def calibrated(rig, n, seed, **motion):
 
 def errors(found, rig):
     """Of intrinsics, of the pair's rotation and of its translation, and their covariance."""
-    intrinsics = [
-        np.array([c.fx, c.fy, c.cx, c.cy]) - [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
-        for c, K in zip((found.rig.left, found.rig.right), rig.matrices, strict=True)
-    ]
-    turn = cv2.Rodrigues(found.rig.R_right_left @ rig.R.T)[0].ravel()
     places = [*range(4), *range(9, 13), *range(18, 24)]
-    error = np.concatenate([*intrinsics, turn, found.rig.t_right_left - rig.t])
-    return error, found.rig.covariance[np.ix_(places, places)]
+    return rig_error(found.rig, rig)[places], found.rig.covariance[np.ix_(places, places)]
 
 
 @pytest.mark.parametrize("known", ["motion", "prior", "outliers"])
@@ -108,9 +102,8 @@ def test_cameras_and_pair_are_right_where_boards_moved_between_the_exposures():
         r, model = found.refinement, found.refinement.model
         as_left = {name: getattr(model, name)[:, [0, 0]] for name in ("R_left_board", "t_left_board")}
         together = refine_stereo(r.observations, replace(model, **as_left), BOARD.points, r.terms)
-        by_one_place = np.array([p for camera in together.model.rig.cameras for p in camera.parameters[:2]])
-        truth = np.array([K[i, i] for K in rig.matrices for i in (0, 1)])
-        assert np.linalg.norm(error[[0, 1, 4, 5]]) < 0.8 * np.linalg.norm(by_one_place - truth)
+        by_one_place = rig_error(together.model.rig, rig)
+        assert np.linalg.norm(error[[0, 1, 4, 5]]) < 0.8 * np.linalg.norm(by_one_place[[0, 1, 9, 10]])
     pair, everything = np.mean(ratios, axis=0)
     assert 0.5 < pair < 1.7  # chi-square of 36 at three sigma
     assert 0.6 < everything < 1.6

@@ -5,39 +5,31 @@ Webcams of 640 x 480 px, 8 to 15 cm apart, before a board of 9 x 6 inner corners
 middle by `turn` [rad], normal, per axis.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration import Camera, StereoRig
+
 INNER_CORNERS, SQUARE, IMAGE_SIZE = (9, 6), 0.025, (640, 480)
 EDGE = 8.0  # [px] that corners keep from the image's rim
 
 
-@dataclass(frozen=True)
-class Rig:
-    """Two cameras as OpenCV describes them."""
-
-    matrices: tuple[NDArray, NDArray]  # (3, 3) [px]
-    distortions: tuple[NDArray, NDArray]  # k1, k2, p1, p2, k3
-    R: NDArray  # (3, 3) left to right
-    t: NDArray  # (3,) [m]
-
-
-def make_rig(seed: int) -> Rig:
+def make_rig(seed: int) -> StereoRig:
     """A rig of its own for every seed."""
     rng = np.random.default_rng(seed)
-    matrices, distortions = [], []
+    cameras = []
     for _ in range(2):
         f = rng.uniform(700.0, 1000.0)
         cx, cy = np.array([320.0, 240.0]) + 8.0 * rng.normal(size=2)
-        matrices.append(np.array([[f, 0.0, cx], [0.0, f * (1 + 3e-4 * rng.normal()), cy], [0.0, 0.0, 1.0]]))
-        tangential = 5e-4 * rng.normal(size=2)
-        distortions.append(np.array([rng.uniform(-0.2, 0.1), rng.uniform(-0.1, 0.2), *tangential, 0.0]))
+        fy, (p1, p2) = f * (1 + 3e-4 * rng.normal()), 5e-4 * rng.normal(size=2)
+        bends = rng.uniform(-0.2, 0.1), rng.uniform(-0.1, 0.2), p1, p2, 0.0
+        cameras.append(Camera(f, fy, cx, cy, bends, IMAGE_SIZE))
     R = cv2.Rodrigues(np.array([0.02 * rng.normal(), rng.uniform(0.1, 0.3), 0.02 * rng.normal()]))[0]
     centre = np.array([rng.uniform(0.08, 0.15), *(3e-3 * rng.normal(size=2))])
-    return Rig((matrices[0], matrices[1]), (distortions[0], distortions[1]), R, -R @ centre)
+    return StereoRig(*cameras, R, -R @ centre)
 
 
 def board() -> NDArray:
@@ -47,7 +39,7 @@ def board() -> NDArray:
 
 
 def pairs(
-    rig: Rig,
+    rig: StereoRig,
     n: int,
     seed: int,
     noise: float = 0.1,
@@ -70,8 +62,8 @@ def pairs(
         R = cv2.Rodrigues(rng.normal(size=3) * [0.35, 0.35, 0.15])[0]
         place = np.array([rng.uniform(-0.12, 0.2), rng.uniform(-0.1, 0.1), rng.uniform(0.4, 0.75)])
         R_later, later = cv2.Rodrigues(turn * rng.normal(size=3))[0] @ R, place + shift * rng.normal(size=3)
-        left = _image(arms @ R.T + place, rig, 0)
-        right = _image((arms @ R_later.T + later) @ rig.R.T + rig.t, rig, 1)
+        left = _image(arms @ R.T + place, rig.left)
+        right = _image((arms @ R_later.T + later) @ rig.R_right_left.T + rig.t_right_left, rig.right)
         errors = [root @ rng.normal(size=(len(points), 2)) * noise for _ in range(2)]
         both = np.concatenate([left, right])
         if np.all(both > EDGE) and np.all(both < np.array(IMAGE_SIZE) - 1 - EDGE):
@@ -80,12 +72,13 @@ def pairs(
     return left, right
 
 
-def _image(points: NDArray, rig: Rig, camera: int) -> NDArray:
-    matrix, distortion = rig.matrices[camera], rig.distortions[camera]
-    return cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, distortion)[0].reshape(-1, 2)
+def _image(points: NDArray, camera: Camera) -> NDArray:
+    lens = camera.camera_matrix, np.array(camera.distortion)
+    return cv2.projectPoints(points, np.zeros(3), np.zeros(3), *lens)[0].reshape(-1, 2)
 
 
-def turned(rig: Rig, turn: NDArray, shift: NDArray) -> Rig:
+def turned(rig: StereoRig, turn: NDArray, shift: NDArray) -> StereoRig:
     """The rig after its right camera was turned by a rotation vector [rad] about its centre, and shifted [m]."""
-    R = cv2.Rodrigues(np.asarray(turn, float))[0] @ rig.R
-    return replace(rig, R=R, t=R @ (rig.R.T @ rig.t) - R @ np.asarray(shift, float))
+    R = cv2.Rodrigues(np.asarray(turn, float))[0]
+    t = R @ rig.t_right_left - R @ rig.R_right_left @ np.asarray(shift, float)
+    return replace(rig, R_right_left=R @ rig.R_right_left, t_right_left=t)
