@@ -196,8 +196,7 @@ def test_a_rig_file_keeps_where_the_boards_were(tmp_path):
     assert [found.view_names[v] for v in record.apart] == list(found.view_names)
 
 
-TURN = np.radians([0.05, -0.04, 0.03])  # 0.07 deg: 1.1 px, as when somebody touches a camera
-SHIFT = np.array([1e-4, 0.0, 0.0])
+TOUCH = np.radians([0.05, -0.04, 0.03]), np.array([1e-4, 0.0, 0.0])  # 0.07 deg: 1.1 px
 
 
 def calibrated_in_parts(parts, table_view=None, noise=0.1, **motion):
@@ -223,46 +222,36 @@ def rig():
     return moved_boards.make_rig(3)
 
 
+# turn and shift of the right camera before each further stretch; pairs in each; those that are apart; what is said
+MOVES = {
+    "touched": ([TOUCH], (12, 7), range(12, 19), "from left 12 and right 12 on", {}),
+    "touched before the table": ([TOUCH], (12, 7), range(12), "those with the view on the table", {"table_view": 14}),
+    "pushed by degrees, not synchronised": (
+        [(np.radians([4.0, -1.0, 0.0]), [0.02, 0.0, 0.0])], (14, 9), range(14, 23), "", {"shift": 2e-3, "turn": 2e-3}
+    ),
+    "touched and turned": ([TOUCH, (10 * TOUCH[0][::-1], TOUCH[1])], (8, 6, 5), range(8, 19), "", {}),
+}  # fmt: skip
+
+
 @pytest.mark.statistical
-def test_a_camera_touched_between_the_views_is_named_and_sized(rig):
-    later = moved_boards.turned(rig, TURN, SHIFT)
-    found = calibrated_in_parts([(rig, 12), (later, 7)])
+@pytest.mark.parametrize("name", MOVES)
+def test_a_camera_that_was_moved_between_the_views_is_named_and_sized(name, rig):
+    moves, pairs, apart, said, how = MOVES[name]
+    rigs = [rig]
+    for move in moves:
+        rigs.append(moved_boards.turned(rigs[-1], *move))
+    found = calibrated_in_parts(list(zip(rigs, pairs, strict=True)), **how)
     (text,) = told(found)
-    assert "from left 12 and right 12 on" in text
-    (step,) = [float(size) for size in re.findall(r"by ([0-9.]+) deg", text)]
-    assert_allclose(step, np.degrees(np.linalg.norm(TURN)), atol=0.02)  # by medians of pairs that scatter by 0.03
-    assert found.apart == tuple(range(12, 19))
-    assert not any("not synchronised" in other for other in found.warnings)
-    assert pair_error(found, rig) < 3.0  # chi-square of six over six, at three sigma
-    # negative control: the other stretch is as far off as the camera was turned
-    assert pair_error(found, later) > 5.0
-
-
-@pytest.mark.statistical
-def test_the_cameras_stand_as_they_did_at_the_view_on_the_table(rig):
-    later = moved_boards.turned(rig, TURN, SHIFT)
-    found = calibrated_in_parts([(rig, 12), (later, 7)], table_view=14)
-    assert "those with the view on the table" in told(found)[0]
-    assert found.apart == tuple(range(12))
-    assert pair_error(found, later) < 3.0
-
-
-@pytest.mark.statistical
-def test_a_camera_pushed_by_degrees_in_pairs_that_were_not_synchronised(rig):
-    later = moved_boards.turned(rig, np.radians([4.0, -1.0, 0.0]), np.array([0.02, 0.0, 0.0]))
-    found = calibrated_in_parts([(rig, 14), (later, 9)], shift=2e-3, turn=2e-3)
-    assert found.apart == tuple(range(14, 23))
-    assert "by 4 deg" in told(found)[0] or "by 4.1 deg" in told(found)[0]
-    assert any("not synchronised" in text for text in found.warnings)
-    assert pair_error(found, rig) < 3.0
-
-
-@pytest.mark.statistical
-def test_a_camera_that_was_moved_twice_leaves_three_stretches(rig):
-    later = moved_boards.turned(rig, TURN, SHIFT)
-    found = calibrated_in_parts([(rig, 8), (later, 6), (moved_boards.turned(later, 10 * TURN[::-1], SHIFT), 5)])
-    assert found.apart == tuple(range(8, 19))
-    assert told(found)[0].count(" on the cameras stand otherwise") == 2
+    assert said in text
+    steps = [float(size) for size in re.findall(r"by ([0-9.]+) deg", text)]
+    sizes = [np.degrees(np.linalg.norm(turn)) for turn, _ in moves]
+    assert_allclose(steps, sizes, rtol=0.03, atol=0.02)  # by medians of pairs that scatter by 0.03
+    assert found.apart == tuple(apart)
+    assert any("not synchronised" in other for other in found.warnings) == ("not synchronised" in name)
+    kept, *others = rigs[::-1] if "table" in name else rigs
+    assert pair_error(found, kept) < 3.0  # chi-square of six over six, at three sigma
+    # negative control: another stretch is as far off as the camera was turned
+    assert max(pair_error(found, other) for other in others) > 5.0
 
 
 @pytest.mark.statistical
