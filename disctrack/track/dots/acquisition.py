@@ -99,11 +99,10 @@ def acquire_from_blobs(
     """As `acquire` from the centroids of candidate blobs in the left and in the right image, each (k, 2)."""
     candidates = _candidates_from_stereo(blobs, rig, disc)
     best = _best_explanation(candidates, blobs, rig, disc)
-    if by_one and (best is None or best[3] < 2 * disc.n_markers - 3):
+    if by_one and (best is None or best[2] < 2 * disc.n_markers - 3):
         for camera in (0, 1):
-            single = _best_explanation(_candidates_from_one_camera(blobs[camera], camera, rig, disc), blobs, rig, disc)
-            if single is not None and (best is None or single[0] < best[0]):
-                best = single
+            candidates += _candidates_from_one_camera(blobs[camera], camera, rig, disc)
+        best = _best_explanation(candidates, blobs, rig, disc)
     if best is None:
         counts = " and ".join(f"{len(b)} in the {name}" for b, name in zip(blobs, CAMERAS, strict=True))
         reason = (
@@ -111,7 +110,7 @@ def acquire_from_blobs(
             "is the upper face visible, are diameter and centres right, does the rig belong to these images?"
         )
         return None, 0, reason
-    return best[1:3], best[3], ""
+    return best[:2], best[2], ""
 
 
 def seen_by_one_camera(
@@ -167,14 +166,10 @@ def _candidates_from_stereo(blobs: list[Array], rig: StereoRig, disc: Disc) -> l
         return []
     centres = disc.marker_centres_body
     orders = np.array([*permutations(range(len(points)), 3)])
-    sides = _sides(points[orders])
-    found_points, found_dots = [], []
-    for triple in combinations(centres, 3):
-        body = np.array(triple)
-        match = orders[np.all(np.abs(sides / _sides(body) - 1.0) < SIDE_TOLERANCE, axis=1)]
-        found_points.append(points[match])
-        found_dots.append(np.broadcast_to(body, (len(match), 3, 3)))
-    R, t = rigid_motions(np.concatenate(found_dots), np.concatenate(found_points))
+    triples = np.array([*combinations(centres, 3)])
+    apart = np.abs(_sides(points[orders]) / _sides(triples)[:, None] - 1.0).max(axis=2)
+    dots, order = np.nonzero(apart < SIDE_TOLERANCE)
+    R, t = rigid_motions(triples[dots], points[orders[order]])
     # score by the points that fall on dots; keep the distinct best
     predicted = centres @ np.swapaxes(R, 1, 2) + t[:, None]
     gap = np.linalg.norm(predicted[:, :, None] - points[None, None], axis=-1).min(axis=2)
@@ -232,8 +227,8 @@ def _candidates_from_one_camera(blobs: Array, camera: int, rig: StereoRig, disc:
 
 def _best_explanation(
     candidates: list[Pose], blobs: list[Array], rig: StereoRig, disc: Disc
-) -> tuple[float, Array, Array, int] | None:
-    """Refine the candidates on the blobs they explain; (cost, R, t, explained dot images) of the best, or None."""
+) -> tuple[Array, Array, int] | None:
+    """Refine the candidates on the blobs they explain; R, t and explained dot images of the best, or None."""
     if not candidates:
         return None
     R, t = (np.array(parts) for parts in zip(*candidates, strict=True))
@@ -258,4 +253,4 @@ def _best_explanation(
         cost += 0.5 * np.minimum(gap, 5e-3) / disc.half_thickness
     cost = np.where((explained >= MIN_EXPLAINED) & (rms < 2.5) & fits.converged, cost, np.inf)
     k = int(np.argmin(cost))
-    return (float(cost[k]), R[k], t[k], int(explained[k])) if np.isfinite(cost[k]) else None
+    return (R[k], t[k], int(explained[k])) if np.isfinite(cost[k]) else None
