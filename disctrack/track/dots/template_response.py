@@ -114,22 +114,14 @@ def edge_smeared(band: _Band, axis: int) -> Array:
     """By an exposure, over T^2 / 24 and products of velocity v and growth G, see `dot_shifts`.
 
     Shifts along axis 1 go by v1 G11, v1 G22, v2 G12, v2 G21; along axis 2 by v2 G11, v2 G22, v1 G12, v1 G21: the others
-    vanish by symmetry. They follow from n.v, t.v and n.Gu, t.Gu, with how these change along the edge.
+    vanish by symmetry. Of d_tt and v_n^2 the parts by v and G u together are 2 t.v d(n.Gu)/ds, where the terms of the
+    bend cancel, and 2 n.v n.Gu.
     """
-    (n1, n2), (u1, u2), bend = band.n, band.u, band.bend
-    t1, t2 = -n2, n1
-    of_v = {1: (n1, t1, bend * t1), 2: (n2, t2, bend * t2)}
-    of_G = {}
-    for i, j in ((1, 1), (2, 2), (1, 2), (2, 1)):
-        u, tangent = (u1, t1) if j == 1 else (u2, t2)
-        n, t = (n1, t1) if i == 1 else (n2, t2)
-        of_G[i, j] = n * u, t * u, bend * t * u + n * tangent
-    own, other = (1, 2) if axis == 0 else (2, 1)
-    changes = []
-    for v, (i, j) in ((own, (1, 1)), (own, (2, 2)), (other, (1, 2)), (other, (2, 1))):
-        (vn, vt, dvn), (gn, gt, dgn) = of_v[v], of_G[i, j]
-        at, squared = 2 * (vt * dgn + gt * dvn) - 2 * bend * vt * gt, 2 * vn * gn
-        changes.append(band.first * at[..., None] + band.second * squared[..., None])
+    n, u, bend, changes = np.stack(band.n), np.stack(band.u), band.bend, []
+    t = np.stack([-n[1], n[0]])
+    for v, (i, j) in ((axis, (0, 0)), (axis, (1, 1)), (1 - axis, (0, 1)), (1 - axis, (1, 0))):
+        along = bend * t[i] * u[j] + n[i] * t[j]
+        changes.append(2 * band.first * (t[v] * along)[..., None] + 2 * band.second * (n[v] * n[i] * u[j])[..., None])
     return np.stack(changes)
 
 
