@@ -63,8 +63,6 @@ class TableFromDisc:
     applied: Array  # (3,) by which the world was moved
     beyond: tuple[float, float, float]  # sizes of what of this both sigmas do not allow: at the origin [m], slopes
     probability: float  # that board and disc differ by as much if both sigmas are right
-    scatter: float  # [m] of the gaps about the plane
-    n_frames: int
 
     @property
     def sentence(self) -> str:
@@ -105,17 +103,17 @@ def table_from_disc(
     found = _contacts(fits, systematic, disc, by_pattern) if rig.world_is_table else None
     if found is None or np.abs(found[0][1:]).max() > STEEP:
         return fits, systematic, rig, None
-    plane, middle, H, noise, by_disc, by_place, scatter, n = found
+    plane, middle, H, noise, by_disc, by_place = found
     noise = noise + by_place @ by_place.T
     # a thicker disc lifts the centre between its faces by half of what it lifts the dots by, which are measured
-    by_thickness = by_disc[:, 1]
-    by_disc = by_disc * [1.0, 2.0]
-    V, board = noise + by_disc @ by_disc.T, H @ rig.covariance @ H.T
-    difference = np.linalg.solve(board + V, plane) @ plane
-    told_sigma, told_board = np.sqrt(np.diag(V - 3.0 * np.outer(by_thickness, by_thickness))), np.sqrt(np.diag(board))
+    of_dots, narrower = np.array([1.0, 2.0]), np.ones(2)
+    V, board = noise + (by_disc * of_dots**2) @ by_disc.T, H @ rig.covariance @ H.T
+    chance = float(scipy.special.chdtrc(3, np.linalg.solve(board + V, plane) @ plane))
+    of_disc, of_board = (np.sqrt(np.diag(C)) for C in (noise + by_disc @ by_disc.T, board))
     if source == "both":
-        rig, by_disc = _narrowed(rig, by_disc, disc, plane, H, noise)
-        V, board = noise + by_disc @ by_disc.T, H @ rig.covariance @ H.T
+        rig, narrower = _narrowed(rig, by_disc * of_dots, disc, plane, H, noise)
+        by_disc = by_disc * narrower
+        V, board = noise + (by_disc * of_dots**2) @ by_disc.T, H @ rig.covariance @ H.T
     # where they differ by more than three of both sigmas, it is the board that bends and lies on dust
     allowed = np.diag(board + V)
     excess = np.where(plane**2 > FROM_SIGMAS**2 * allowed, plane**2 - allowed, 0.0)
@@ -126,31 +124,19 @@ def table_from_disc(
     in_doubt = np.sqrt(beyond) * (source == "both")
     beyond[0] += middle**2 @ beyond[1:]  # at the origin
     height, slope_x, slope_y = np.sqrt(beyond).tolist()
-    told = TableFromDisc(
-        source,
-        plane,
-        middle,
-        told_sigma,
-        told_board,
-        gain @ plane,
-        (height, slope_x, slope_y),
-        float(scipy.special.chdtrc(3, difference)),
-        scatter,
-        n,
-    )
+    told = TableFromDisc(source, plane, middle, of_disc, of_board, gain @ plane, (height, slope_x, slope_y), chance)
     # of the disc's thickness, what the board's share of the height leaves, and what no sigma allows
-    narrower = float(np.linalg.norm(by_disc[:, 1])) / max(2.0 * float(np.linalg.norm(by_thickness)), 1e-150)
-    left = ((1.0 - gain[0, 0]) * narrower * thickness_tolerance(disc) / 2.0) ** 2 + in_doubt[0] ** 2
+    left = ((1.0 - gain[0, 0]) * narrower[1] * thickness_tolerance(disc) / 2.0) ** 2 + in_doubt[0] ** 2
     e3 = np.nan_to_num(fits.R_world_body[..., 2])
     systematic[:, :3, :3] += left * e3[:, :, None] * e3[:, None, :]
     if source != "board":
-        rig = _as_sure_as_both(rig, middle, gain, H, V, by_disc, by_place, in_doubt)
+        rig = _as_sure_as_both(rig, middle, gain, H, noise, by_disc, by_place, in_doubt)
         fits, systematic, rig = _on_plane(fits, systematic, rig, told)
     return fits, systematic, rig, told
 
 
 def _as_sure_as_both(
-    rig: StereoRig, middle: Array, gain: Array, H: Array, V: Array, by_disc: Array, by_place: Array, in_doubt: Array
+    rig: StereoRig, middle: Array, gain: Array, H: Array, noise: Array, by_disc: Array, by_place: Array, in_doubt: Array
 ) -> StereoRig:
     """The rig with covariance and allowances of a world whose table is moved by gain @ plane.
 
@@ -162,12 +148,12 @@ def _as_sure_as_both(
     M[WORLD_SHIFT] = turn[:, 2:] * np.array([1.0, *-middle])
     moved = M @ gain
     kept = np.eye(N_RIG) - moved @ H
-    stated = V - 0.75 * np.outer(by_disc[:, 1], by_disc[:, 1])
+    stated = noise + by_disc @ by_disc.T
     doubted = M * in_doubt
     covariance = kept @ rig.covariance @ kept.T + moved @ stated @ moved.T + doubted @ doubted.T
     allowances = [replace(a, shift=kept @ a.shift) for a in rig.allowances]
     allowances.append(Allowance("the disc's radius", moved @ by_disc[:, 0]))
-    allowances.append(Allowance("the disc's thickness", moved @ by_disc[:, 1] / 2.0))
+    allowances.append(Allowance("the disc's thickness", moved @ by_disc[:, 1]))
     allowances += [Allowance(OF_PATTERN, moved @ column) for column in by_place.T if column.any()]
     allowances += [Allowance(DISAGREEMENT, column) for column in doubted.T if column.any()]
     return replace(rig, covariance=0.5 * (covariance + covariance.T), allowances=tuple(allowances))
@@ -196,7 +182,7 @@ def thickness_tolerance(disc: Disc) -> float:
 def _narrowed(
     rig: StereoRig, by_disc: Array, disc: Disc, plane: Array, H: Array, noise: Array
 ) -> tuple[StereoRig, Array]:
-    """Rig and departures of the plane by the disc's sizes (3, 2), what was assumed of either as small as `plane` is.
+    """Rig with what was assumed of it as small as `plane` is, and factors (2,) on what was assumed of the disc's sizes.
 
     Height or slopes, whichever would show it best, tell of an assumption; nothing becomes larger.
     """
@@ -219,16 +205,16 @@ def _narrowed(
     narrower = (shifts * scale[:, None])[of_board]
     allowances = tuple(replace(a, shift=a.shift * k) for a, k in zip(rig.allowances, scale, strict=True))
     covariance = rig.covariance - assumed + narrower.T @ narrower
-    by_disc = by_disc.copy()
-    by_disc[:, of_disc] *= factors(by_disc[:, of_disc])
-    return replace(rig, covariance=covariance, allowances=allowances), by_disc
+    sizes = np.ones(2)
+    sizes[of_disc] = factors(by_disc[:, of_disc])
+    return replace(rig, covariance=covariance, allowances=allowances), sizes
 
 
 def _contacts(
     fits: PoseFits, systematic: Array, disc: Disc, by_pattern: Array
-) -> tuple[Array, Array, Array, Array, Array, Array, float, int] | None:
+) -> tuple[Array, Array, Array, Array, Array, Array] | None:
     """See `TableFromDisc`: plane, middle, d plane / d RIG_PARAMETERS (3, 30), covariance of the plane by noise, its
-    departures for one tolerance of radius and thickness (3, 2), by the pattern's place (3, k), scatter, frames.
+    departures for one tolerance of radius and thickness (3, 2), by the pattern's place (3, k).
     """
     with np.errstate(invalid="ignore"):
         theta = np.arccos(np.clip(fits.R_world_body[:, 2, 2], -1, 1))
@@ -268,7 +254,7 @@ def _contacts(
     by_disc = gain @ np.stack([sine * radius_tolerance(disc), R[:, 2, 2] * 0.5 * thickness_tolerance(disc)], axis=1)
     covariance = inverse * (noise + repeats * max(kept.sum() / independent, 1.0))
     by_rig = -gain @ np.concatenate(gap_by_rig)
-    return plane, middle, by_rig, covariance, by_disc, gain @ gap_by_place, spread, int(kept.sum())
+    return plane, middle, by_rig, covariance, by_disc, gain @ gap_by_place
 
 
 def _contact(R: Array, t: Array, disc: Disc, normal: Array) -> tuple[Array, Array]:
@@ -288,8 +274,7 @@ def _on_plane(
     height, a, b = table.applied
     Q = frames.rotation_from_vector(np.array([b, -a, 0.0]))  # R_old_new
     shift = np.array([0.0, 0.0, height - table.applied[1:] @ table.middle])
-    both = np.zeros((6, 6))
-    both[:3, :3] = both[3:, 3:] = Q.T
+    both = np.kron(np.eye(2), Q.T)
     for rows in parts(len(systematic)):  # in place: of a long recording these are the largest arrays
         fits.sensitivity[rows] = both @ fits.sensitivity[rows]
         for covariance in (fits.covariance, systematic):
