@@ -114,9 +114,9 @@ def exposure_by_smear(R: Array, t: Array, time: Array, blur_px: Array, rig: Ster
         R_camera_world, t_camera_world = rig.camera_poses()[camera]
         distance = points @ R_camera_world[2] + t_camera_world[2]
         long, short = half_axes(affine[:, camera])
-        optics = [_standardised(x) for x in (distance, *np.moveaxis(pixels[own, camera], -1, 0), short / long)]
+        optics = distance, *np.moveaxis(pixels[own, camera], -1, 0), short / long
         squared = blur_px[chosen, camera] ** 2
-        return _slope(squared, smear[:, camera], [optics[0] ** 2, *optics])
+        return _slope(squared, smear[:, camera], [distance**2, *optics])
 
     return np.transpose([of_camera(camera) for camera in (0, 1)])
 
@@ -227,43 +227,31 @@ def _smear(velocity: Array, affine: Array) -> Array:
 
 def _slope(y: Array, x: Array, others: list[Array]) -> tuple[float, float]:
     """Of y (n, m) over x (n, m), with its sigma: beside a constant of each column and slopes over `others` (n, m)."""
-    n, m = y.shape
-    use = np.isfinite(y) & np.isfinite([*others, x]).all(axis=0)
-    often = use.sum(axis=0) >= MIN_FRAMES
-    if n < MIN_FRAMES or not often.any():
-        return np.nan, np.inf
-    y, use, m = y[:, often].ravel(), use[:, often].ravel(), int(often.sum())
-    constants = np.broadcast_to(np.eye(m), (n, m, m))
-    rest = np.stack([*others, x], axis=-1)[:, often]
-    design = np.concatenate([constants, rest], axis=-1).reshape(n * m, -1)
-    scale = np.abs(design[use]).max(axis=0)
+    rows = np.stack([*others, x, y], axis=-1)
+    use = np.isfinite(rows).all(axis=-1)
+    use &= use.sum(axis=0) >= MIN_FRAMES
+    rows[~use] = 0.0
+    scale = np.abs(rows[..., :-1]).max(axis=(0, 1), initial=0.0)
     if not scale[-1] > 0:  # nothing moves
         return np.nan, np.inf
-    scale[scale == 0.0] = 1.0
+    rows[..., :-1] /= np.where(scale > 0.0, scale, 1.0)
+
+    def fitted(use: Mask) -> tuple[Array, Array]:
+        """Slopes, and how far (n, m) y is from them where it is used."""
+        centred = _without_means(rows, use, axis=0)
+        products = centred.reshape(-1, rows.shape[-1]).T @ centred.reshape(-1, rows.shape[-1])
+        # columns that differ by less than 1e-6 of the largest from a sum of others are not told apart
+        slopes = np.linalg.pinv(products[:-1, :-1], rcond=1e-12, hermitian=True) @ products[:-1, -1]
+        return slopes, np.where(use, np.abs(centred[..., -1] - centred[..., :-1] @ slopes), np.inf)
+
     for _ in range(4):
-        told = use.copy()
-        rows = np.column_stack([design[told] / scale, y[told]])
-        solution = _solved(rows.T @ rows)
-        residual = y - design / scale @ solution
-        use &= np.abs(residual) <= 4.0 * 1.4826 * np.median(np.abs(residual[use]))
-    part = np.repeat(np.arange(n) * PARTS // n, m)[told]
+        told, (slopes, away) = use, fitted(use)
+        use = away <= 4.0 * 1.4826 * np.median(away[told])
     # without each of the parts: where one alone tells, the others do not agree with it
-    others = [rows[part != k] for k in range(PARTS)]
-    without = np.array([_solved(rows.T @ rows)[-1] for rows in others])
+    part = np.arange(len(y))[:, None] * PARTS // len(y)
+    without = np.array([fitted(told & (part != k))[0][-1] for k in range(PARTS)])
     sigma = np.sqrt((PARTS - 1) * np.var(without))
-    return float(solution[-1] / scale[-1]), float(sigma / scale[-1])
-
-
-def _solved(products: Array) -> Array:
-    """Least squares from the products of the columns, of which the last is the right-hand side."""
-    # columns that differ by less than 1e-6 of the largest from a sum of others are not told apart
-    return np.asarray(np.linalg.pinv(products[:-1, :-1], rcond=1e-12, hermitian=True) @ products[:-1, -1])
-
-
-def _standardised(x: Array) -> Array:
-    known = x[np.isfinite(x)]
-    spread = np.std(known) if known.size else 0.0
-    return np.asarray((x - np.mean(known)) / spread if spread else np.zeros_like(x))
+    return float(slopes[-1] / scale[-1]), float(sigma / scale[-1])
 
 
 def shift_by_glare(R: Array, t: Array, contrast: Array, rig: StereoRig, disc: Disc, edges: tuple[Edge, Edge]) -> Array:
@@ -315,7 +303,7 @@ def _gradient(places: Array, contrast: Array) -> Callable[[Array], Array] | None
     rows = np.where(known[..., None], np.concatenate([terms, dots, contrast[..., None]], axis=-1), 0.0)
     use = known
     for _ in range(3):
-        centred = _without_frames(rows, use)[use]
+        centred = _without_means(rows, use, axis=1)[use]
         own = centred[:, len(POWERS) : -1]  # of the dots
         left = centred - own @ np.linalg.lstsq(own, centred, rcond=None)[0]
         coefficients, likelier = _likeliest(left[:, : len(POWERS)], left[:, -1])
@@ -349,8 +337,8 @@ def _likeliest(A: Array, b: Array) -> tuple[Array, float]:
     return found, likeliest
 
 
-def _without_frames(rows: Array, use: Mask) -> Array:
-    """Rows (n, m, k) less their means over the dots of each frame that are used (n, m)."""
+def _without_means(rows: Array, use: Mask, axis: int) -> Array:
+    """Rows (n, m, k) less their means over frames (axis 0) or dots (1), of those used (n, m); zero for the others."""
     weight = use[..., None].astype(float)
-    mean = (rows * weight).sum(axis=1, keepdims=True) / np.maximum(weight.sum(axis=1, keepdims=True), 1.0)
+    mean = (rows * weight).sum(axis=axis, keepdims=True) / np.maximum(weight.sum(axis=axis, keepdims=True), 1.0)
     return np.where(use[..., None], rows - mean, 0.0)
