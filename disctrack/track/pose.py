@@ -162,15 +162,11 @@ def fit_poses(seen: DotsInFrames, *, reject_outliers: bool = True, with_sensitiv
     covariance = np.ascontiguousarray(seen.covariance, float)
     R, t = np.array(seen.R, float, order="C"), np.array(seen.t, float, order="C")
     good = np.zeros(n, bool)
-    pixels, whitened, JW = np.full(observed.shape, np.nan), np.zeros(observed.shape), np.zeros((*observed.shape, 6))
-    centres, cameras, filled = (
-        np.ascontiguousarray(seen.disc.marker_centres_body, float),
-        stacked(rig),
-        (pixels, whitened, JW),
-    )
+    shape, centres = observed.shape, np.ascontiguousarray(seen.disc.marker_centres_body, float)
+    filled = pixels, whitened, JW = np.full(shape, np.nan), np.zeros(shape), np.zeros((*shape, 6))
     rows = np.flatnonzero(posed)
     for _ in range(MAX_REJECTED + 1):
-        kernel.fit(rows, observed, covariance, used, cameras, centres, TOLERANCE, R, t, good, filled)
+        kernel.fit(rows, observed, covariance, used, stacked(rig), centres, TOLERANCE, R, t, good, filled)
         rows = _strike_worst_dot(whitened, JW, used, rows) if reject_outliers else rows[:0]
         if rows.size == 0:
             break

@@ -26,7 +26,7 @@ import numpy as np
 
 from calibration.cameras.camera import N_RIG, PAIR_SHIFT, StereoRig
 from calibration.judge.tolerances import SIZE
-from calibration.kit.arrays import Array, Mask
+from calibration.kit.arrays import Array
 from calibration.kit.least_squares import scaled_solve
 from disctrack.disc import Disc
 from disctrack.track.pose import DotsInFrames, PoseFits
@@ -121,6 +121,8 @@ def fit_shared(frames: DotsInFrames, sigma: Array, repeats: float = 0.0) -> Shar
     """
     shift, reduced, free = np.zeros(len(sigma)), [], sigma > 0
     information = np.diag(sigma[free] ** -2)
+    variance = float(np.nanmedian(0.5 * np.trace(frames.covariance, axis1=-2, axis2=-1)))
+    share = variance / (variance + len(frames.t) * repeats**2)  # n frames count at most as (sigma / repeats)^2 frames
     for iteration in range(ITERATIONS):
         frames, fits = frames.fitted(shift, reject=iteration > 0)
         ok = fits.converged
@@ -128,7 +130,7 @@ def fit_shared(frames: DotsInFrames, sigma: Array, repeats: float = 0.0) -> Shar
         used = fits.used & ok[:, None, None]
         normal, gradient, _ = frames.normal(shift, used, free)
         # dots that scatter more than the image noise alone makes them tell accordingly less, whatever is common to them
-        scale = _information_scale(frames.covariance, used, repeats) / _scatter_left(fits, normal, gradient)
+        scale = share / _scatter_left(fits, normal, gradient)
         matrix = scale * normal + information
         shift[free] += scaled_solve(matrix, scale * gradient - information @ shift[free])
     covariance = np.zeros((len(shift), len(shift)))
@@ -266,11 +268,3 @@ def _scatter_left(fits: PoseFits, normal: Array, gradient: Array) -> float:
     chi_square, freedom = fits.chi_square[fits.converged].sum(), fits.degrees_of_freedom[fits.converged].sum()
     explained = gradient @ np.linalg.lstsq(normal, gradient, rcond=1e-12)[0]
     return max(1.0, float(chi_square - explained) / max(float(freedom), 1.0))
-
-
-def _information_scale(covariance: Array, used: Mask, repeats: float) -> float:
-    """Factor on the data's information: n frames of sigma count at most as (sigma / repeats)^2 frames."""
-    if not repeats:
-        return 1.0
-    variance = float(np.median(0.5 * np.trace(covariance, axis1=-2, axis2=-1)[used]))
-    return 1.0 / (1.0 + len(used) * repeats**2 / max(variance, 1e-9 * repeats**2))
