@@ -36,8 +36,8 @@ K = np.array([0.0, 0.0, 1.0])
 VECTORS = ("position", "rotation", "velocity", "omega", "acceleration", "alpha")
 STATE = tuple(f"{vector}_{axis}" for vector in VECTORS for axis in "xyz")
 N_STATE = len(STATE)  # 18
-CHANNEL_GROUPS = ((0, 1), (2,), (3, 4), (5,))  # horizontal, vertical, tilt, turn about the vertical: unlike spectra
-GROUP_NAMES = ("horizontal position", "height", "tilt", "turn about the vertical")
+# Of POSE_COMPONENTS, those of unlike spectra, which light and view make scatter in a way of their own
+CHANNELS = {"horizontal position": [0, 1], "height": [2], "tilt": [3, 4], "turn about the vertical": [5]}
 FRAMES_AT_ONCE = 256
 MIN_FRAMES = 12  # a line and a curvature per channel, and enough left over to judge the noise
 # Of the image's longer side: what repeats is as smooth as half a cell of the splines that have taken out the lens
@@ -179,7 +179,7 @@ def _differentiated(trajectory: Trajectory, good: Mask) -> MeasuredMotion:
     """Without breaks. good : (n,) frames with a pose"""
     samples = _Samples(trajectory, good)
     segments, centres = _segments(samples)
-    groups = ([(t, d[list(g)], v[list(g)]) for t, d, v in segments] for g in CHANNEL_GROUPS)
+    groups = ([(t, d[channels], v[channels]) for t, d, v in segments] for channels in CHANNELS.values())
     processes = tuple(fit_process(group, centres, len(samples.ticks)) for group in groups)
     state, R, covariance, sensitivity = _smoothed(samples, processes)
     per_order = samples.interval ** -np.arange(3.0)
@@ -309,8 +309,8 @@ def _smoothed(samples: _Samples, processes: tuple[Process, ...]) -> tuple[Array,
     """
     half = int(np.ceil(HALF_WINDOW_LENGTHS * max(p.length.max() for p in processes)))
     scale = np.zeros(6)
-    for group, process in zip(CHANNEL_GROUPS, processes, strict=True):
-        scale[list(group)] = np.sqrt(process.noise_scale)
+    for channels, process in zip(CHANNELS.values(), processes, strict=True):
+        scale[channels] = np.sqrt(process.noise_scale)
     noise, rows = samples.covariance * np.outer(scale, scale), np.arange(len(samples.ticks))
     # the windows of all frames at once would be larger than all the rest
     parts = np.split(rows, range(FRAMES_AT_ONCE, len(rows), FRAMES_AT_ONCE))
@@ -326,8 +326,7 @@ def _smoothed_rows(
     k = len(rows)
     weights, prior = np.zeros((k, 6, 3, 2 * half + 1)), np.zeros((k, 6, 3, 3))
     unknown = np.zeros(k, bool)
-    for group, process in zip(CHANNEL_GROUPS, processes, strict=True):
-        channels = list(group)
+    for channels, process in zip(CHANNELS.values(), processes, strict=True):
         variance = samples.variance[:, channels].mean(axis=1)
         W, P = moving_weights(samples.ticks, variance, process, half, rows)
         weights[:, channels], prior[:, channels] = W[:, None], P[:, None]

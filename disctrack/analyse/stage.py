@@ -10,7 +10,7 @@ from calibration.kit.arguments import Seconds, checked
 from calibration.kit.brief import Brief
 from calibration.kit.threads import one_blas_thread
 from disctrack.analyse.analysis import CIRCLE_DURATION, WINDOWS, Analysis, analyse
-from disctrack.analyse.derivatives import GROUP_NAMES, N_STATE, STATE, MeasuredMotion
+from disctrack.analyse.derivatives import CHANNELS, N_STATE, STATE, MeasuredMotion
 from disctrack.analyse.power_laws import WINDOW
 from disctrack.analyse.quantities import QUANTITIES, DerivedSeries, Propagated
 from disctrack.analyse.report import report_of
@@ -181,7 +181,7 @@ def _motion_attributes(analysis: Analysis) -> dict[str, object]:
     return {
         "method": "Gaussian-process regression in moving windows, squared-exponential covariance on a straight line; "
         "length and amplitude by restricted maximum likelihood",
-        "groups": ", ".join(GROUP_NAMES),
+        "groups": ", ".join(CHANNELS),
         "median_length_s": np.median(motion.length, axis=0),
         "noise_scale": motion.noise_scale,
         "warnings": "\n".join(finding.text for finding in analysis.findings),

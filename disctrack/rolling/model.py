@@ -116,10 +116,8 @@ def body_constants(model: Model, theta_end: float, values: Mapping[str, Any] | N
 
 def effect_values(effect: Effect, values: Mapping[str, Any] | None) -> dict[str, Any]:
     """Parameter values of one effect, those in `values` (by full name) taking precedence."""
-    own: dict[str, Any] = effect.values
-    for name in own:
-        own[name] = (values or {}).get(f"{effect.name}.{name}", own[name])
-    return own
+    given = values or {}
+    return {name: given.get(f"{effect.name}.{name}", value) for name, value in effect.values.items()}
 
 
 def effects_from_tables(

@@ -7,13 +7,14 @@ import numpy as np
 from calibration.kit.arrays import Array, Mask, robust_sigma
 from calibration.kit.brief import ranges
 from disctrack import frames
+from disctrack.analyse.derivatives import CHANNELS
 from disctrack.disc import Disc, symmetry_order
 from disctrack.findings import MISFITS, Finding, Kind, Remedy, Severity, Subject
 from disctrack.numbers import Measured
 from disctrack.track.follow.following import Follower
 from disctrack.track.judge.cameras import HARDLY, LATE, delay_of_right
 from disctrack.track.pose import DotsInFrames
-from disctrack.track.refine.scatter import GROUPS, Scatter
+from disctrack.track.refine.scatter import Scatter
 from disctrack.track.refine.self_calibration import AsBuilt
 from disctrack.track.refine.table_contact import TableFromDisc
 from disctrack.track.side_by_side import FEW, stretches
@@ -100,12 +101,11 @@ def misplaced_dots(declared: Disc, found: Array) -> tuple[Finding, ...]:
 
 def _shaken(factor: Array, trajectory: Trajectory) -> tuple[Finding, ...]:
     """Poses that scatter far more than their dots tell, with how far."""
-    names = ("horizontal position", "height", "tilt", "turn about the vertical")
     variance = np.nanmedian(np.diagonal(trajectory.pose_covariance[trajectory.measured], axis1=1, axis2=2), axis=0)
     told = []
-    for name, group in zip(names, GROUPS, strict=True):
+    for name, group in CHANNELS.items():
         if factor[group[0]] > FAULTY:
-            times, sigma = np.sqrt(factor[group[0]]), np.sqrt(np.mean(variance[list(group)]))
+            times, sigma = np.sqrt(factor[group[0]]), np.sqrt(np.mean(variance[group]))
             length = f"{1e6 * sigma:.1f} µm" if group[0] < 3 else f"{1e3 * np.degrees(sigma):.1f} mdeg"
             told.append(f"{name} by {length} ({times:.1f} times)")
     if not told:

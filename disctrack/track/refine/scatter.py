@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from calibration.cameras.camera import INTRINSIC_PARAMETERS, N_RIG, PAIR_SHIFT
 from calibration.kit.arrays import Array
+from disctrack.analyse.derivatives import CHANNELS
 from disctrack.track.judge.outlier_tests import differences, sums_over_time
 from disctrack.track.pose import DotsInFrames, PoseFits, whitening
 from disctrack.track.refine.self_calibration import DOT_SIGMA, AsBuilt, fit_shared
@@ -31,8 +32,6 @@ LEAST_NOISE = 0.25  # of the variance that flat parts of the image tell: the res
 _WIDE = {"fx": 20.0, "fy": 20.0, "cx": 10.0, "cy": 10.0, "k1": 0.05, "k2": 0.2, "k3": 0.5, "p1": 5e-3, "p2": 5e-3}
 _WIDE_POSE = np.repeat([0.02, 0.01], 3)
 SLOW = 0.2  # [rad] of precession from frame to frame
-# Horizontal place, height, tilt, turn about the vertical: light and view make each of them scatter in a way of its own.
-GROUPS = ((0, 1), (2,), (3, 4), (5,))
 MIN_POSES = 40  # fewer tell as much as eight independent ones, whose variance chance alone doubles now and then
 KEPT = 0.8  # of the squares: blows and smears are cut off with the largest
 # Successive sixth differences are correlated by -0.86, 0.54, -0.24, ...: n tell as much as n / 3.2 independent ones
@@ -133,7 +132,7 @@ def _trimmed_mean(reduced: Array) -> float:
 def scatter_of_poses(fits: PoseFits) -> tuple[Array, Array, Array]:
     """Variance of the poses from frame to frame over what their dots, as the covariances have it, tell.
 
-    From sixth differences: (4,) found, by GROUPS, NaN where no frames are slow enough; (4,) its sigma by chance alone;
+    From sixth differences: (4,) found, by CHANNELS, NaN where no frames are slow enough; (4,) its sigma by chance;
     (6,) at least 1, for the variances of POSE_COMPONENTS: the part of the excess that is no chance.
     """
     found, sigma, factor = np.full(4, np.nan), np.full(4, np.nan), np.ones(6)
@@ -148,8 +147,7 @@ def scatter_of_poses(fits: PoseFits) -> tuple[Array, Array, Array]:
     # what is kept of chi-square with one degree of freedom has this mean
     mean = scipy.special.chdtr(3, scipy.special.chdtri(1, 1 - KEPT)) / KEPT
     kept = np.sort(square, axis=0)[: int(KEPT * len(square))].mean(axis=0) / mean
-    for i, group in enumerate(GROUPS):
-        part = list(group)
+    for i, part in enumerate(CHANNELS.values()):
         found[i], sigma[i] = kept[part].mean(), np.sqrt(2 * WORTH / (len(square) * len(part)))
         excess = found[i] - 1.0
         # nothing below three sigmas, all of what is far above
