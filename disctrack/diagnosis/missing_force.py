@@ -1,6 +1,6 @@
 """How the disc answers to small moments and forces: the missing moment over time, and what each law would do.
 
-The motion's first-order response to any moment and force (rolling.sensitivities) turns every law of a library into a
+The motion's first-order response to any moment and force (rolling.simulate) turns every law of a library into a
 predicted residual, and the residual into the moment that the model fails to supply.
 """
 
@@ -25,7 +25,7 @@ from disctrack.discrepancy.system import Candidate, Quantity, Values
 from disctrack.rolling import EffectParameter, Model, simulate
 from disctrack.rolling.effects.learned import effect_from_formulas
 from disctrack.rolling.records import KINEMATICS
-from disctrack.rolling.sensitivities import COMPONENTS, Responses, responses
+from disctrack.rolling.simulate import COMPONENTS, Responses, responses
 
 if TYPE_CHECKING:
     from disctrack.diagnosis.disc_system import DiscSystem

@@ -12,8 +12,8 @@ from disctrack.rolling.model import effects_from_tables as effects_from_tables
 from disctrack.rolling.motion import EndReason as EndReason
 from disctrack.rolling.motion import Motion as Motion
 from disctrack.rolling.records import Regime as Regime
-from disctrack.rolling.sensitivities import prepare as prepare
-from disctrack.rolling.sensitivities import sensitivities as sensitivities
+from disctrack.rolling.simulate import prepare as prepare
+from disctrack.rolling.simulate import sensitivities as sensitivities
 from disctrack.rolling.simulate import simulate as simulate
 from disctrack.rolling.state import State as State
 from disctrack.rolling.state import steady_precession as steady_precession
