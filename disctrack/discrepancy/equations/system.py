@@ -20,7 +20,8 @@ from disctrack.discrepancy.system import Budget, Candidate, Quantity, System, Va
 from disctrack.errors import AnalysisError
 
 TOLERANCE = 1e-10  # of a step, relative to the size of a state
-MAX_STEPS = 400_000  # after which a motion is given up
+MAX_STEPS = 400_000  # after which a motion is given up ...
+HARDER = 50  # ... or after so many times those of the motion from which a fit's step leads to it: it leads astray
 MOST_WORK = 2e8  # of an answer: steps of the integrator, times states and sensitivities, some 1 us each ...
 OF_ONE = 0.1  # ... and share of it, that one hypothesis among many may take
 LARGE = 5.0  # times all that moves the motion: terms each so large that their sum may be what describes it
@@ -67,6 +68,7 @@ class EquationSystem(System):
             self.weights[rows] = np.isfinite(s.data).sum(axis=1)
             self.training[rows] = fitted_rows(s)
         self._places: dict[str, dict[str, int]] = {}
+        self._steps: dict[str, int] = {}  # by stretch: of the motion with which derivatives were asked for last
         self._defaults = self.formulas.defaults() | self.widths | self._limits()
         self._per = {name: p.per for name, p in self.formulas.declared.items() if p.per}
         self.base = tuple(self._base())
@@ -234,12 +236,14 @@ class EquationSystem(System):
         times, which_time = np.unique(s.time + late, return_inverse=True)
         at = which_time.reshape(late.shape).T, np.arange(self._w)  # sensors that are late see other instants
         span = s.time[0], max(float(times[-1]), s.time[0] + 1e-9)
+        most = MAX_STEPS if names else min(MAX_STEPS, HARDER * self._steps.get(s.name, MAX_STEPS))
         out = np.empty((len(times), len(z0)))
         with np.errstate(all="ignore"):
             steps = kernel.integrate(
                 f.rhs, z0, p, columns, np.array(span), n, *f.driven(s.knots, s.pieces, p), self.sizes, TOLERANCE,
-                MAX_STEPS, times, out,
+                most, times, out,
             )  # fmt: skip
+        self._steps |= {s.name: steps} if names and steps > 0 else {}
         self.budget.work(abs(steps) * len(z0))
         self.budget.step(abs(steps) * len(z0))
         if steps <= 0:
