@@ -108,7 +108,7 @@ class Answer:
             notes.append(f"of known terms {known} come nearest (the law: {longer})")
         if law.held and named:
             notes.append(f"{' and '.join(law.held)} acts as a part of the law, and says nothing by itself")
-        if law.along.variable == "t":
+        if law.along.of_time:
             notes.append("a force that depends on time alone describes any motion, and is never what is missing")
         if law.alike:
             others = " or ".join(a.title for a in law.alike)

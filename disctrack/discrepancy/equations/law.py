@@ -1,16 +1,17 @@
-"""A force that no term names, learned from what the equations leave: a function of one state, of an input or of time.
+"""A force that no term names, learned from what the equations leave: of one or two states or inputs, or of time.
 
 The function is a normal process: a line, cosines over the range that the motion visits, and for velocities a jump at
 rest, each amplitude with a standard deviation that falls with its wave number (Solin & Sarkka 2020). How large and how
-smooth it is follows from the data (evidence, MacKay 1992); so does which equation it acts in, and along what. It stands
-in the equations as any term does, with exact derivatives. Where the declared equations are far from the data, it is
-first learned over stretches of half a turn with a start each, and these are joined two by two.
+smooth it is follows from the data (evidence, MacKay 1992); so does which equation it acts in, and along what. Two
+variables are looked at where no law of one is enough. It stands in the equations as any term does, with exact
+derivatives. Where the declared equations are far from the data, it is first learned over short stretches with a start
+each, and these are joined two by two.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import product
+from itertools import combinations, product
 from typing import Any
 
 import numpy as np
@@ -42,20 +43,20 @@ from disctrack.discrepancy.search import (
 from disctrack.discrepancy.system import Candidate, GivenUp, Quantity, System, Values
 
 NAME = "learned"  # of the term
-HARMONICS = 24
+HARMONICS = (24, 8)  # of a law of one variable, and in any direction of one of two
 MARGIN = 0.2  # of the range that is visited, beyond it: what cosines do at their ends is not the law's
 SMOOTH = (0.7, 1.5, 3.0, 6.0)  # wave numbers from which on amplitudes fall ...
 FALLS = (1.5, 1.0)  # ... as these powers of 1 + (wave number over it) squared: without kinks, and with some
 FINE, STRAIGHT = 0.03, 1e4  # of the largest value: the variable's inverse hyperbolic sine beyond it, or itself
 SIZES = np.logspace(-4, 2, 31)  # prior sigma of the first amplitudes, over the rms of the equation that it stands in
-FEWEST = 10  # samples of such a stretch
+FEWEST, SHORT = 10, 0.2  # samples, and share of a turn, of a short stretch: over it a step by any law is nearly linear
 MOST_LAWS = 40  # that are looked at in any case
 REFITTED = 4  # laws that are fitted in full: the next one may wander for longer than these take
 WORTH = 50.0  # of -2 log evidence to first order: a law that is so much worse than another is not fitted ...
 ROUGHLY = 4.0  # ... times that of the other, where the declared equations are far from the data
 PLAUSIBLE = 4.0  # the same, by which a rougher law may be less probable than the best one
 ROUNDS = 3  # in which size and smoothness follow the fit, and the fit them
-POINTS = 61  # of the course that is told
+POINTS = (61, 400)  # of the course that is told
 TURNING = 2  # times that a velocity changes its sign, from which on friction may jump with it
 
 
@@ -64,15 +65,28 @@ class Along:
     """Where a law acts, and what it is a function of."""
 
     equation: str  # state whose equation it stands in
-    variable: str  # state, input, or "t"
+    variables: tuple[str, ...]  # one or two states or inputs; or "t" alone
     jumps: bool = False  # with the variable's sign, as friction does
     fine: bool = False  # of finer waves near zero, as drag that falls with speed has them
 
     @property
     def title(self) -> str:
         """In words."""
-        of = "time" if self.variable == "t" else self.variable
-        return f"a force on {self.equation} that is a function of {of}"
+        return f"a force on {self.equation} that is a function of {'time' if self.of_time else self.variable}"
+
+    @property
+    def variable(self) -> str:
+        """What it is a function of."""
+        return " and ".join(self.variables)
+
+    @property
+    def of_time(self) -> bool:
+        """Of time alone, which any motion has, and which foretells nothing?"""
+        return self.variables == ("t",)
+
+    def units(self, of_states: Mapping[str, str]) -> list[str]:
+        """Of its variables."""
+        return ["s"] if self.of_time else [of_states.get(name, "1") for name in self.variables]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,9 +113,9 @@ class LearnedForce(WithForce):
 
     held_out: HeldOut
     held: tuple[str, ...]  # parameters that are a part of the law, and held as declared
-    variable: Array  # (POINTS,) from the least to the largest that is visited
-    force: Array  # (POINTS,) beyond the declared equations
-    sigma: Array  # (POINTS,)
+    variable: Array  # (k,) from the least to the largest that is visited; of two (k, 2) along the motion
+    force: Array  # (k,) beyond the declared equations
+    sigma: Array  # (k,)
     instead: Explanation  # the shortest by known terms alone
     at_noise: bool  # is what it leaves noise?
     system: EquationSystem  # that knows the law
@@ -135,18 +149,22 @@ class LearnedForce(WithForce):
         }
 
     def text(self, units: Mapping[str, str]) -> str:
-        """Its course at five places."""
-        at = np.linspace(0, len(self.variable) - 1, 5).round().astype(int)
-        course = ", ".join(f"{self.force[i]:.3g}({self.sigma[i]:.2g}) at {self.variable[i]:.3g}" for i in at)
-        unit = units.get(self.along.variable, "s" if self.along.variable == "t" else "1")
+        """Its course at five places: over the range of one variable, or from the least to the largest by two."""
+        places = self.variable.reshape(len(self.force), -1)
+        order = np.argsort(self.force) if places.shape[1] > 1 else np.arange(len(places))
+        told = []
+        for i in order[np.linspace(0, len(order) - 1, 5).round().astype(int)]:
+            place = zip(places[i], self.along.units(units), strict=True)
+            where = ", ".join(f"{x:.3g} {unit if unit != '1' else ''}".rstrip() for x, unit in place)
+            told.append(f"{self.force[i]:.3g}({self.sigma[i]:.2g}) at {where}")
         held = f", beyond {' and '.join(self.held)} as declared" if self.held else ""
-        return f"{self.along.title} [{NAME}{held}]: {course}{'' if unit == '1' else f' {unit}'}"
+        return f"{self.along.title} [{NAME}{held}]: {'; '.join(told)}"
 
 
 def learn(
     system: EquationSystem, diagnosis: Diagnosis, channels: Mapping[str, Formula], judged: System | None = None
 ) -> LearnedForce | None:
-    """The law of one variable with which the data are most probable, beside known terms where it takes them.
+    """The law with which the data are most probable, beside known terms, or of two variables, where it takes them.
 
     channels : formulas of what is observed, without terms
     judged : the system with its noise as judged, if that remembers
@@ -157,16 +175,18 @@ def learn(
         return None
     if len(system.stretches) * len(system.formulas.states) > MOST_STATES:  # more than are fitted side by side
         return None
-    over = _Competition(_knowing(system, channels), diagnosis, judged)
-    best = over.best(())
+    one, law, tells = _Competition(1, _knowing(system, channels, 1), diagnosis, judged), None, False
     several = diagnosis.verdict == "unexplained" or len(diagnosis.found) > 2
-    if several and (best is None or not over.at_noise(best.fit)):
-        others = [over.best((c,)) for c in over.beside() if system.budget.open()]
-        best = min((o for o in (best, *others) if o is not None), key=lambda trial: trial.length, default=None)
-    law = over.told(best) if best is not None else None
-    if law is not None and over.is_worth_telling(law):
-        return law
-    return _nearest(over.system, diagnosis, judged)
+    for variables, beside_known in ((1, False), (1, True), (2, False))[: 3 if several else 1]:
+        if law is not None and tells and law.at_noise:
+            break
+        over = one if variables == 1 else _Competition(2, _knowing(system, channels, 2), diagnosis, judged)
+        for beside in [(c,) for c in over.beside()] if beside_known else [()]:
+            trial = over.best(beside) if system.budget.open() else None
+            if trial is not None and (law is None or trial.length < law.length):
+                law = over.told(trial)
+                tells = over.is_worth_telling(law)
+    return law if tells else _nearest(one.system, diagnosis, judged)
 
 
 def _nearest(system: EquationSystem, diagnosis: Diagnosis, judged: System | None) -> LearnedForce | None:
@@ -183,9 +203,9 @@ def _nearest(system: EquationSystem, diagnosis: Diagnosis, judged: System | None
     before = held_out(view, known.fit.quantities, known.fit.values, system.training)
     known = replace(known, length=length(view, d.settings, noise, known.fit, known.candidates))
     left = replace(d, noise=noise, before=known.fit, held_out_before=before, ranked=(known,))
-    over = _Competition(system, left, judged)
+    over = _Competition(1, system, left, judged)
     best = over.best(known.candidates)
-    if best is None or best.along.variable == "t":  # which any motion has, and which foretells nothing
+    if best is None or best.along.of_time:
         return None
     law = over.told(best)
     foretells = law.held_out.chi_square < before.chi_square  # itself, and not by being open
@@ -195,7 +215,7 @@ def _nearest(system: EquationSystem, diagnosis: Diagnosis, judged: System | None
 class _Competition:
     """Laws among each other and with the known terms that were found, by the evidence of the same samples."""
 
-    def __init__(self, system: EquationSystem, diagnosis: Diagnosis, judged: System | None) -> None:
+    def __init__(self, variables: int, system: EquationSystem, diagnosis: Diagnosis, judged: System | None) -> None:
         self.system, self.diagnosis, self.noise = system, diagnosis, diagnosis.noise
         self._judged = judged
         base = diagnosis.before
@@ -203,8 +223,9 @@ class _Competition:
         self.begin = dict(base.values)
         chi_square = float(np.sum(system.linearise(self.begin, [])[0] ** 2))
         self.far = not chi_square < FAR * self.noise * max(float(np.sum(system.weights)), 1.0)
-        self.laws = tuple(_laws(system, self.begin))
-        self.looked = 2.0 * float(np.log(len(self.laws)))
+        self.laws = tuple(_laws(system, self.begin, variables))
+        self.looked = 2.0 * float(np.log(max(len(self.laws), 1)))
+        self.shots = _shots(system) if self.far else [system]
 
     def view(self, system: EquationSystem) -> System:
         """With the noise as judged, where the samples are those that were judged."""
@@ -242,8 +263,7 @@ class _Competition:
 
     def best(self, beside: tuple[Candidate, ...]) -> WithForce | None:
         """The law that makes the data most probable beside these terms."""
-        shots = _shots(self.system) if self.far else [self.system]
-        first = shots[0]
+        first = self.shots[0]
         values = self.begin
         if self.far:
             values = self.begin | self.declared | guessed(first)[0]
@@ -257,21 +277,21 @@ class _Competition:
         scans.sort(key=lambda scan: scan[0])
         if not scans:
             return None
-        trials, bars = [], [np.inf] * len(shots)
+        trials, bars = [], [np.inf] * len(self.shots)
         for length, law, quantities in scans[:REFITTED]:
-            # along short stretches that the declared equations do not follow the first order says little
+            # along stretches that the declared equations do not follow the first order says little
             enough = ROUGHLY * scans[0][0] + WORTH if self.far else scans[0][0] + CLASS_GAIN
             if length > enough or not self.system.budget.open():
                 break
             with suppress(GivenUp), self.system.budget.trial(self.system.trial_steps):
-                if (trial := self._led(shots, law, beside, quantities, values, bars)) is not None:
+                if (trial := self._led(law, beside, quantities, values, bars)) is not None:
                     trials.append(trial)
         if not trials:
             return None
         near = alike([trial for trial in trials if self.arrived(trial.fit)] or trials)
         # a function of time describes any motion: one of the motion itself says more, and is tried by every other run
-        best = min(near, key=lambda trial: trial.along.variable == "t")
-        others = (Along(t.along.equation, t.along.variable) for t in near if t.along.title != best.along.title)
+        best = min(near, key=lambda trial: trial.along.of_time)
+        others = (Along(t.along.equation, t.along.variables) for t in near if t.along.title != best.along.title)
         return replace(best, alike=tuple(dict.fromkeys(others)))
 
     def _others(self, system: EquationSystem, beside: Sequence[Candidate]) -> tuple[Quantity, ...]:
@@ -291,8 +311,9 @@ class _Competition:
         columns = linear.cleared(columns)
         if not (np.isfinite(columns).all() and np.isfinite(right).all()):
             return np.inf, own
-        size, root, found = sizes_alike(system, values).get(f"{NAME}.a0", 1.0), np.sqrt(self.noise), []
-        waves = np.array([int(n) if (n := q.part.removeprefix("a")).isdigit() else 0 for q in own])
+        size, root, found = sizes_alike(system, values).get(own[0].name, 1.0), np.sqrt(self.noise), []
+        basis = _basis(len(law.variables))
+        waves = np.array([basis[q.part][1] for q in own])
         for smooth, fall in product(SMOOTH, FALLS):
             falls = (1.0 + (waves / smooth) ** 2) ** -fall  # prior sigma of each amplitude over that of the first
             # the faster driver gives up where columns are alike
@@ -305,23 +326,22 @@ class _Competition:
         shortest = min(length for length, _ in found)
         # of those that the data do not refute the roughest: what it leaves open is not called known for being smooth
         plausible = [prior for length, prior in found if length < shortest + PLAUSIBLE]
-        prior = max(plausible, key=lambda prior: float(prior[HARMONICS])) / root
+        prior = max(plausible, key=lambda prior: float(prior[np.argmax(waves)])) / root
         quantities = zip(own, prior.tolist(), strict=True)  # of chi-squares that are not yet in units of the noise
         return shortest + float(right @ right) / self.noise + self.looked, tuple(
             replace(q, prior_sigma=sigma, scale=1e-3 * sigma) for q, sigma in quantities
         )
 
     def _led(
-        self, shots: Sequence[EquationSystem], law: Along, beside: tuple[Candidate, ...], own: tuple[Quantity, ...],
-        values: Values, bars: list[float],
-    ) -> WithForce | None:  # fmt: skip
+        self, law: Along, beside: tuple[Candidate, ...], own: tuple[Quantity, ...], values: Values, bars: list[float]
+    ) -> WithForce | None:
         """The law's fit to stretches that are joined two by two; None where it loses the data, or to another law.
 
         bars : -2 log evidence of the best law so far in each of these; this one's are put in
         """
-        first, numbers = _set(shots[0], law, values)
+        first, numbers = _set(self.shots[0], law, values)
         now, evident = dict(values) | {q.name: 0.0 for q in own} | numbers, np.inf
-        for i, (system, longer) in enumerate(zip(shots, [*shots[1:], None], strict=True)):
+        for i, (system, longer) in enumerate(zip(self.shots, [*self.shots[1:], None], strict=True)):
             there = replace(system, widths=first.widths)
             others, view = self._others(there, beside), there if longer else self.view(there)
             for _ in range(1 if longer else ROUNDS):
@@ -359,43 +379,47 @@ class _Competition:
         law, fitted, own = best.along, best.fit, best.candidate.quantities
         there = _set(self.system, law, fitted.values)[0]
         held = held_out(self.view(there), fitted.quantities, fitted.values, there.training)
-        visited = _visited(there, law.variable, fitted.values)
-        x = np.linspace(visited.min(), visited.max(), POINTS)
+        visited = _visited(there, law.variables, fitted.values)
+        k = len(law.variables) - 1
+        at = np.linspace(visited.min(axis=0), visited.max(axis=0), POINTS[0])
+        if k:
+            at = visited[np.linspace(0, len(visited) - 1, POINTS[1]).astype(int)]
         # what a declared number has become is a part of the law, where it acts as such a one would
         part = sorted(_part_of_law(there.formulas, law, there.held))
         names = [*(q.name for q in own), *part]
-        force, columns = _course(there, law, names, fitted.values, x)
+        force, columns = _course(there, law, names, fitted.values, at)
         variance = np.einsum("ij,jk,ik->i", columns, fitted.amounts(names)[1], columns)
         # waves finer than those that are fitted go on as the inverse square of their number
-        finer = HARMONICS / 6.0 * own[HARMONICS].prior_sigma ** 2
+        finer = (HARMONICS[0] / 6.0, np.pi / 16.0 * HARMONICS[1] ** 2)[k] * min(q.prior_sigma for q in own) ** 2
         sigma = np.sqrt(max(self.noise, fitted.reduced_chi_square) * np.maximum(variance, 0.0) + self.noise * finer)
         nothing = Explanation((), self.diagnosis.before)
         instead = next((e for e in self.diagnosis.ranked if e.candidates), nothing)
         return LearnedForce(
-            **vars(best), held_out=held, held=tuple(part), variable=x, force=force, sigma=sigma, instead=instead,
-            at_noise=self.at_noise(fitted), system=there,
+            **vars(best), held_out=held, held=tuple(part), variable=at if k else at[:, 0], force=force, sigma=sigma,
+            instead=instead, at_noise=self.at_noise(fitted), system=there,
         )  # fmt: skip
 
 
-def _laws(system: EquationSystem, values: Values) -> Iterator[Along]:
-    """Every law that is looked for: in every equation of a force, along every state, input, and time.
+def _laws(system: EquationSystem, values: Values, n: int) -> Iterator[Along]:
+    """Every law of n variables that is looked for: in every equation of a force, along states, inputs, or time alone.
 
     In a large system, along what stands in that equation already, and time.
     """
     equations = system.formulas.equations
-    everything = (*equations.states, *equations.inputs, "t")
+    moving = (*equations.states, *equations.inputs)
     velocities = {str(f).strip() for f in equations.rates.values()} & set(equations.rates)
-    many = len(_forced(equations)) * len(everything) > MOST_LAWS
+    choices = [*combinations(moving, n), *[("t",)][: 2 - n]]
+    many = len(_forced(equations)) * len(choices) > MOST_LAWS
     for equation in _forced(equations):
         there = {s.name for s in system.formulas.forces[equations.states.index(equation)].free_symbols} | {"t"}
-        for variable in everything:
-            if many and variable not in there:
+        for variables in choices:
+            if many and not there.issuperset(variables):
                 continue
-            yield Along(equation, variable)
-            if variable in {equation, *velocities}:
-                yield Along(equation, variable, fine=True)
-                if np.sum(np.diff(np.sign(_visited(system, variable, values))) != 0) >= TURNING:
-                    yield Along(equation, variable, jumps=True)
+            yield Along(equation, variables)
+            if n == 1 and variables[0] in {equation, *velocities}:
+                yield Along(equation, variables, fine=True)
+                if np.sum(np.diff(np.sign(_visited(system, variables, values)[:, 0])) != 0) >= TURNING:
+                    yield Along(equation, variables, jumps=True)
 
 
 def _forced(equations: Equations) -> list[str]:
@@ -403,29 +427,43 @@ def _forced(equations: Equations) -> list[str]:
     return [s for s, f in equations.rates.items() if str(f).strip() not in equations.rates]
 
 
-def _knowing(system: EquationSystem, channels: Mapping[str, Formula]) -> EquationSystem:
-    """The same system with the law as one more term; where it acts, and along what, is said by numbers."""
+def _knowing(system: EquationSystem, channels: Mapping[str, Formula], n: int) -> EquationSystem:
+    """The same system with a law of n variables as one more term; where it acts, and along what, is said by numbers."""
     f = system.formulas
     e = f.equations
-    argument = " + ".join(f"{NAME}_of_{name}*{name}" for name in (*e.states, *e.inputs, "t"))
-    place = f"({NAME}_bend*asinh(({argument})/{NAME}_bend) - {NAME}_from)/{NAME}_span"
-    waves = " + ".join(f"own_a{k}*cos({k}*pi*{place})" for k in range(1, HARMONICS + 1))
-    course = f"own_a0 + own_slope*({argument})/{NAME}_reach + {waves} + own_jump*sign({argument})"
-    numbers = [f"{NAME}_of_{name}" for name in (*e.states, *e.inputs, "t")] + [f"{NAME}_on_{s}" for s in _forced(e)]
-    scales = [f"{NAME}_span", f"{NAME}_reach", f"{NAME}_bend"]
-    constants = {**e.constants, **dict.fromkeys([*numbers, f"{NAME}_from"], 0.0), **dict.fromkeys(scales, 1.0)}
+    words = {"sign": "sign"}
+    constants = {f"{NAME}_on_{s}": 0.0 for s in _forced(e)}
+    for i in range(n):
+        own = f"{NAME}_{i}"
+        words[f"x{i}"] = "(" + " + ".join(f"{own}_of_{name}*{name}" for name in (*e.states, *e.inputs, "t")) + ")"
+        words[f"r{i}"] = f"{own}_reach"
+        words[f"p{i}"] = f"({own}_bend*asinh({words[f'x{i}']}/{own}_bend) - {own}_from)/{own}_span"
+        constants |= dict.fromkeys([f"{own}_of_{name}" for name in (*e.states, *e.inputs, "t")] + [f"{own}_from"], 0.0)
+        constants |= dict.fromkeys([f"{own}_span", f"{own}_reach", f"{own}_bend"], 1.0)
+    course = " + ".join(f"own_{name}*{formula.format(**words)}" for name, (formula, _) in _basis(n).items())
     term = Term(
         NAME, {s: f"{NAME}_on_{s}*({course})" for s in _forced(e)},
-        parameters={name: Parameter(0.0) for name in _names()}, title="a force that no term names",
+        parameters={name: Parameter(0.0) for name in _basis(n)}, title="a force that no term names",
     )  # fmt: skip
-    known = Formulas(replace(e, constants=constants), (*f.terms, term), channels)
+    known = Formulas(replace(e, constants={**e.constants, **constants}), (*f.terms, term), channels)
     widths = {known.widths[a].name: system.widths[w.name] for a, w in f.widths.items() if a in known.widths}
     new = {w.name: 1.0 for w in known.widths.values() if w.name not in widths}
     return replace(system, formulas=known, widths=widths | new)
 
 
-def _names() -> list[str]:
-    return [f"a{k}" for k in range(HARMONICS + 1)] + ["slope", "jump"]
+def _basis(n: int) -> dict[str, tuple[str, float]]:
+    """Of a law of n variables, by amplitude: what it multiplies, by places {p} over the range and variables {x}.
+
+    With it the wave number.
+    """
+    most = HARMONICS[n - 1]
+    found = {}
+    for waves in product(range(most + 1), repeat=n):
+        cosines = [f"cos({k}*pi*{{p{i}}})" for i, k in enumerate(waves) if k]
+        if (number := float(np.linalg.norm(waves))) <= most:
+            found["a" + "_".join(map(str, waves))] = "*".join(cosines) or "1", number
+    found |= {f"slope{i or ''}": (f"{{x{i}}}/{{r{i}}}", 0.0) for i in range(n)}
+    return found if n > 1 else found | {"jump": ("sign({x0})", 0.0)}
 
 
 def _candidate(law: Along, own: tuple[Quantity, ...]) -> Candidate:
@@ -434,37 +472,39 @@ def _candidate(law: Along, own: tuple[Quantity, ...]) -> Candidate:
 
 def _amplitudes(system: EquationSystem, law: Along) -> tuple[Quantity, ...]:
     """Of the law, without priors as yet."""
-    own = {q.name: q for c in system.candidates if c.name == NAME for q in c.quantities}
-    return tuple(own[f"{NAME}.{n}"] for n in _names() if law.jumps or n != "jump")
+    own = (q for c in system.candidates if c.name == NAME for q in c.quantities)
+    return tuple(q for q in own if law.jumps or q.part != "jump")
 
 
 def _set(system: EquationSystem, law: Along, values: Values) -> tuple[EquationSystem, dict[str, float]]:
     """The system for one law, and the numbers that say where it acts and over which range."""
-    visited = _visited(system, law.variable, values)
-    low, high = float(visited.min()), float(visited.max())
-    reach = max(abs(low), abs(high), 1e-12)
-    bend = reach * (FINE if law.fine else STRAIGHT)
-    low, high = (float(bend * np.arcsinh(end / bend)) for end in (low, high))
-    span = max(high - low, 1e-12 * reach)
-    of, on = f"{NAME}_of_", f"{NAME}_on_"
-    numbers = {n: 0.0 for n in system.formulas.constants if n.startswith((of, on))}
-    numbers |= {of + law.variable: 1.0, on + law.equation: 1.0}
-    numbers |= {f"{NAME}_from": low - MARGIN * span, f"{NAME}_span": (1 + 2 * MARGIN) * span}
-    numbers |= {f"{NAME}_reach": reach, f"{NAME}_bend": bend}
+    numbers = {n: 0.0 for n in system.formulas.constants if n.startswith(f"{NAME}_")}
+    numbers[f"{NAME}_on_{law.equation}"] = 1.0
+    visited = _visited(system, law.variables, values)
+    for i, (variable, x) in enumerate(zip(law.variables, visited.T, strict=True)):
+        reach = max(float(np.abs(x).max()), 1e-12)
+        bend = reach * (FINE if law.fine else STRAIGHT)
+        low, high = (float(bend * np.arcsinh(end / bend)) for end in (x.min(), x.max()))
+        span = max(high - low, 1e-12 * reach)
+        own = {f"of_{variable}": 1.0, "from": low - MARGIN * span, "span": (1 + 2 * MARGIN) * span}
+        own |= {"reach": reach, "bend": bend}
+        numbers |= {f"{NAME}_{i}_{n}": x for n, x in own.items()}
+    of = f"{NAME}_0_of_"
     mine = [w.name for a, w in system.formulas.widths.items() if any(s.name.startswith(of) for s in a.free_symbols)]
-    size = float(np.sqrt(np.mean(visited**2)))
+    size = float(np.sqrt(np.mean(visited[:, 0] ** 2)))
     return replace(system, widths=system.widths | {w: 1e-3 * (size or 1.0) for w in mine}), numbers
 
 
-def _visited(system: EquationSystem, variable: str, values: Values) -> Array:
-    """Values of a state, an input or time at the samples of all stretches, one after the other."""
-    e = system.formulas.equations
-    if variable == "t":
-        return np.concatenate([s.time for s in system.stretches])
-    if variable in e.inputs:
-        return np.concatenate([system.inputs_of(s)[list(e.inputs).index(variable)] for s in system.stretches])
-    found = [p.states[:, e.states.index(variable)] for p in system.predictions(values) if p is not None]
-    return np.concatenate(found or [np.array([-1.0, 1.0])])
+def _visited(system: EquationSystem, variables: Sequence[str], values: Values) -> Array:
+    """States, inputs or time (n, k) at the samples of all stretches, one after the other."""
+    e, found = system.formulas.equations, [np.zeros((0, len(variables)))]
+    for s, motion in zip(system.stretches, system.predictions(values), strict=True):
+        states = dict(zip(e.states, motion.states.T if motion else [], strict=False))
+        known = {"t": s.time, **dict(zip(e.inputs, system.inputs_of(s), strict=False)), **states}
+        if known.keys() >= {*variables}:
+            found.append(np.stack([known[name] for name in variables], axis=1))
+    everything = np.concatenate(found)
+    return everything if len(everything) else np.tile([[-1.0], [1.0]], len(variables))
 
 
 def _part_of_law(f: Formulas, law: Along, held: Sequence[str]) -> set[str]:
@@ -478,40 +518,40 @@ def _part_of_law(f: Formulas, law: Along, held: Sequence[str]) -> set[str]:
         if f.owner[name] or f.declared[name].per or name in held or symbol in elsewhere:
             continue
         acts = f.forces[here].diff(symbol)
-        if acts != 0 and {s.name for s in acts.free_symbols} & driving <= {law.variable}:
+        if acts != 0 and {s.name for s in acts.free_symbols} & driving <= {*law.variables}:
             found.add(name)
     return found
 
 
-def _course(system: EquationSystem, law: Along, names: Sequence[str], values: Values, x: Array) -> tuple[Array, Array]:
-    """What these numbers make where the law acts beyond their declared values (n,), and by each of them (n, k)."""
+def _course(system: EquationSystem, law: Along, names: Sequence[str], values: Values, at: Array) -> tuple[Array, Array]:
+    """What these numbers make at places (n, k), beyond their declared values, where the law acts; and each of them."""
     f, s = system.formulas, system.stretches[0]
-    states = np.tile(system.start_of(values, s), (len(x), 1))
-    times = x if law.variable == "t" else np.asarray(np.arange(len(x)) + 0.5, float)
-    if law.variable in f.equations.states:
-        states[:, f.equations.states.index(law.variable)] = x
-    elif law.variable in f.equations.inputs:
-        pieces = np.zeros((len(s.pieces), 5, len(x)))
-        pieces[list(f.equations.inputs).index(law.variable), 3] = x
-        s = replace(s, knots=np.arange(len(x) + 1.0), pieces=pieces)
+    states = np.tile(system.start_of(values, s), (len(at), 1))
+    times = at[:, 0] if law.of_time else np.asarray(np.arange(len(at)) + 0.5, float)
+    pieces = np.zeros((len(s.pieces), 5, len(at)))
+    for variable, x in zip(law.variables, at.T, strict=True):
+        if variable in f.equations.states:
+            states[:, f.equations.states.index(variable)] = x
+        elif variable in f.equations.inputs:
+            pieces[list(f.equations.inputs).index(variable), 3] = x
+            s = replace(s, knots=np.arange(len(at) + 1.0), pieces=pieces)
     declared = {name: f.declared[name].value for name in names}
     here = f.equations.states.index(law.equation)
     (now, _, by_number), (before, *_) = (
         f.rates_at(s, system.numbers({**values, **changed}, s), times, states) for changed in ({}, declared)
     )
-    acting = by_number[:, here, f.names.index(f"{NAME}.a0")]
+    acting = by_number[:, here, f.names.index(names[0])]  # of the constant
     own = by_number[:, here, [f.names.index(name) for name in names]]
     return (now - before)[:, here] / acting, own / acting[:, None]
 
 
 def _shots(system: EquationSystem) -> list[EquationSystem]:
-    """The stretches cut into shorter ones of half a turn, and these joined two by two until they are whole again."""
-    n, stretches = len(system.formulas.states), system.stretches
-    turns = max(float(s.time[-1] - s.time[0]) / (0.5 * turn(s)) for s in stretches)
-    samples = min(len(s.time) for s in stretches) / FEWEST
-    most = max(1.0, min(turns, samples, MOST_STATES / (n * len(stretches))))
-    counts = [2**level for level in range(int(np.log2(most)), 0, -1)]
-    return [*(replace(system, stretches=cut(stretches, [count] * len(stretches))) for count in counts), system]
+    """The stretches cut into short ones, and these joined two by two until they are whole again."""
+    lasting = max(float(s.time[-1] - s.time[0]) / turn(s) for s in system.stretches)
+    most = min(lasting / SHORT, min(len(s.time) for s in system.stretches) / FEWEST)
+    counts = [2**level for level in range(int(np.log2(max(most, 1.0))), 0, -1)]
+    shorter = (cut(system.stretches, [count] * len(system.stretches)) for count in counts)
+    return [*(replace(system, stretches=some) for some in shorter), system]
 
 
 def _joining(values: Values, system: EquationSystem, longer: EquationSystem) -> dict[str, float]:
@@ -539,7 +579,7 @@ def with_law(diagnosis: Diagnosis, law: LearnedForce) -> Diagnosis:
         return replace(diagnosis, reason=reason, nearest=replace(law, fit=with_memory(law.system, law.fit)))
     ranked = sorted((*diagnosis.ranked, law), key=lambda e: e.length)
     diagnosis = replace(diagnosis, ranked=tuple(ranked), length=law.length)
-    if law.along.variable == "t":
+    if law.along.of_time:
         tried = tuple(_instead(diagnosis, ()))
         return replace(
             diagnosis, verdict="unexplained", reason=reason, found=(), after=diagnosis.before, tried=tried,

@@ -30,10 +30,17 @@ def write_answer(answer: Answer, path: Path) -> list[Path]:
 
 def _law(answer: Answer, law: LearnedForce) -> Drawn:
     """The law that was learned with its band."""
-    of = "time" if law.along.variable == "t" else law.along.variable
-    unit = answer.equations.units.get(law.along.variable, "s" if law.along.variable == "t" else "1")
-    course = Curve(law.variable, law.force, BLUE, f"learned, ± {BAND:g} σ", sigma=law.sigma)
-    picture = chart(in_unit(of, unit), (f"added to d{law.along.equation}/dt", [course]), size=(9, 3.5))
+    along, added = law.along, f"added to d{law.along.equation}/dt"
+    named = ("time",) if along.of_time else along.variables
+    labels = [in_unit(name, unit) for name, unit in zip(named, along.units(answer.equations.units), strict=True)]
+    if len(labels) == 1:
+        course = Curve(law.variable, law.force, BLUE, f"learned, ± {BAND:g} σ", sigma=law.sigma)
+        picture = chart(labels[0], (added, [course]), size=(9, 3.5))
+    else:
+        picture, (axes,) = panels(7, 4)
+        points = axes.scatter(law.variable[:, 0], law.variable[:, 1], 9, law.force, cmap="coolwarm")
+        picture.colorbar(points, label=added)
+        axes.set(xlabel=labels[0], ylabel=labels[1])
     held = f", beyond {' and '.join(law.held)} as declared" if law.held else ""
     return Drawn("law", "law", f"{law.along.title}, learned from what is left{held}.", picture)
 

@@ -1,5 +1,5 @@
-"""A force that no term names, learned as a function of one variable: its course, its alternatives, and that it is
-not claimed where known terms do. Motions come from SciPy's `solve_ivp`."""
+"""A force that no term names, learned as a function of one variable or two: its course, its alternatives, and that it
+is not claimed where known terms do. Motions come from SciPy's `solve_ivp`."""
 
 import json
 
@@ -69,6 +69,25 @@ def test_a_law_of_one_variable_is_learned(name):
     # known terms are told with their odds, and what is left is noise
     if variable != "t":
         assert answer.after["x"].rms == pytest.approx(SIGMA, rel=0.1)
+
+
+def test_a_law_of_two_variables_is_learned_where_none_of_one_will_do(tmp_path):
+    """A drag that drives near the middle and brakes outside, less and less: a swing that no term sustains."""
+
+    def force(x, v):
+        return v * (1.5 - 4 * x**2 / (x**2 + 0.25))
+
+    answer = diagnose(OSCILLATOR, recorded(lambda x, v, t: force(x, v), seed=17), [])
+    law = answer.law
+    assert answer.found == (NAME,)
+    assert (law.along.equation, law.along.variables, set(law.held)) == ("v", ("x", "v"), {"omega", "beta"})
+    truth = force(*law.variable.T) + law.variable @ [DECLARED["x"] - TRUE["x"], DECLARED["v"] - TRUE["v"]]
+    assert np.mean(np.abs(law.force - truth) < 3 * law.sigma) > 0.95
+    assert np.sqrt(np.mean(law.sigma**2)) < 0.3 * np.std(truth)
+    assert answer.after["x"].rms == pytest.approx(SIGMA, rel=0.1)
+    told, page = answer.write(tmp_path)
+    assert np.shape(json.loads(told.read_text())["law"]["at"]) == (len(law.force), 2)
+    assert "a force on v that is a function of x and v, learned from what is left" in page.read_text()
 
 
 @pytest.mark.parametrize("name", KNOWN)
