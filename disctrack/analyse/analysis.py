@@ -8,7 +8,7 @@ import numpy as np
 from calibration.kit.arrays import Array
 from calibration.kit.brief import Brief
 from disctrack.analyse.contact import Circle, RollingOnset, locus_circle, rolling_onset
-from disctrack.analyse.derivatives import MeasuredMotion, differentiate
+from disctrack.analyse.derivatives import GROUP_NAMES, MeasuredMotion, differentiate
 from disctrack.analyse.power_laws import WINDOW, NutationCount, PowerLaws, count_nutation, fit_power_laws, power_law_end
 from disctrack.analyse.quantities import ALL, COLUMN, TOTAL, DerivedSeries, Energy, energy_of, propagate
 from disctrack.errors import AnalysisError
@@ -18,6 +18,7 @@ from disctrack.trajectory import Trajectory, part
 
 WINDOWS = np.array([0.2, 0.3, 0.4, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0])  # [s] before t_f, for the exponents' dependence
 CIRCLE_DURATION = 0.6  # [s], as for the paper's figure 9
+EXPECTED_NOISE_SCALE = (0.7, 1.5)  # found over stated variance of the poses: outside, the report says so
 
 
 @dataclass(frozen=True, repr=False)
@@ -115,6 +116,12 @@ def _findings(trajectory: Trajectory, motion: MeasuredMotion, onset: RollingOnse
             f"{missing} of {n} frames have no pose of their own; {missing - unknown} were bridged from their "
             f"neighbours (their sigmas are larger), {unknown} stay unknown"
         )
+    for name, scale in zip(GROUP_NAMES, motion.noise_scale, strict=True):
+        if not EXPECTED_NOISE_SCALE[0] <= scale <= EXPECTED_NOISE_SCALE[1]:
+            yield (
+                f"the scatter of the {name} is {np.sqrt(scale):.2f} times what the tracker states; the sigmas here "
+                "follow the scatter"
+            )
     if not onset.probability >= 0.5:
         return
     if onset.low > motion.time[motion.known][0]:
