@@ -8,7 +8,7 @@ import numpy as np
 from calibration.kit.arrays import Array
 from calibration.kit.brief import Brief
 from disctrack.analyse.contact import Circle, RollingOnset, locus_circle, rolling_onset
-from disctrack.analyse.derivatives import GROUP_NAMES, MeasuredMotion, differentiate
+from disctrack.analyse.derivatives import CHANNELS, MeasuredMotion, differentiate
 from disctrack.analyse.power_laws import WINDOW, NutationCount, PowerLaws, count_nutation, fit_power_laws, power_law_end
 from disctrack.analyse.quantities import ALL, COLUMN, TOTAL, DerivedSeries, Energy, energy_of, propagate
 from disctrack.errors import AnalysisError
@@ -116,7 +116,7 @@ def _findings(trajectory: Trajectory, motion: MeasuredMotion, onset: RollingOnse
             f"{missing} of {n} frames have no pose of their own; {missing - unknown} were bridged from their "
             f"neighbours (their sigmas are larger), {unknown} stay unknown"
         )
-    for name, scale in zip(GROUP_NAMES, motion.noise_scale, strict=True):
+    for name, scale in zip(CHANNELS, motion.noise_scale, strict=True):
         if not EXPECTED_NOISE_SCALE[0] <= scale <= EXPECTED_NOISE_SCALE[1]:
             yield (
                 f"the scatter of the {name} is {np.sqrt(scale):.2f} times what the tracker states; the sigmas here "
