@@ -81,7 +81,8 @@ def keep(path: Path) -> None:
 def refuse_input(path: Path) -> None:
     """Raise OutputError if an output of this name would replace an input, also through links or another spelling."""
     file = _file(path)
-    if _read and file in _read:
+    # an input that the command has written anew is another file: the inode of the old one may be anybody's since then
+    if _read and file in _read and _file(_read[file]) == file:
         also = f" (as {_read[file]})" if _read[file] != path else ""
         raise OutputError(f"{path}: is read by this command{also}, and no output replaces an input. {_ELSEWHERE}")
     if told := _claimed(path):

@@ -11,7 +11,7 @@ import pytest
 
 from disctrack import open_frames, read_recording
 from disctrack.errors import OutputError, RecordingError
-from disctrack.files.inputs import open_regular, read_regular, refuse_input
+from disctrack.files.inputs import inputs_kept, keep, open_regular, read_regular, refuse_input
 from disctrack.recording.readers.raw import RawFile
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="pipes and devices lie elsewhere there")
@@ -99,3 +99,17 @@ def test_a_result_among_frames_or_views_is_refused_and_one_beside_or_below_them_
     )
     with pytest.raises(OutputError, match=refused) if refused else contextlib.nullcontext():
         refuse_input(tmp_path / "rec" / place)
+
+
+def test_a_file_that_has_the_inode_of_an_input_written_anew_is_no_input(tmp_path):
+    """Groups are added to a trajectory by a whole new file; the disk may give the old one's inode to a page."""
+    trajectory, page, link = (tmp_path / name for name in ("trajectory.h5", "report.html", "link.h5"))
+    trajectory.write_text("as tracked")
+    link.symlink_to(trajectory)
+    with inputs_kept():
+        keep(trajectory)
+        with pytest.raises(OutputError, match="is read by this command"):
+            refuse_input(link)
+        trajectory.rename(page)  # as a page that was given it
+        trajectory.write_text("with more groups")
+        refuse_input(page)
