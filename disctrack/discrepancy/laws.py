@@ -357,8 +357,7 @@ def explained_by_law(
 
     Of those that describe the data as well as the shortest, the one that claims the fewest known effects.
     """
-    known, noise = _known(system, diagnosis), diagnosis.noise
-    beside = _beside(system, diagnosis, doubtful, known)
+    noise, beside = diagnosis.noise, _beside(system, diagnosis, doubtful)
     found = [_law_beside(system, diagnosis, kept, is_noise) for kept in beside if system.budget.open()]
     answers = [a for a in found if a is not None and a.fit.converged]
     if not answers:
@@ -367,7 +366,8 @@ def explained_by_law(
     left, at_noise = best.fit.reduced_chi_square, diagnosis.settings.at_noise * noise
     ranked = sorted((*diagnosis.ranked, *answers), key=lambda e: e.length)
     listed = replace(diagnosis, ranked=tuple(ranked), length=ranked[0].length)
-    if not best.length < known or _is_known(diagnosis, best.fit):
+    many = len(best.law.families) + sum(f.candidate.kind == "motion" for f in best.kept)
+    if not best.length < _known(system, diagnosis, many) or _is_known(diagnosis, best.fit):
         text = f"a single law outside the catalogue describes the data too ({left:.4g}): {best.law.title}"
         return None, replace(listed, remarks=(*diagnosis.remarks, text)) if left <= at_noise else diagnosis
     if left > FAR * noise:
@@ -381,18 +381,18 @@ def _is_known(diagnosis: Diagnosis, by_law: Fit) -> bool:
     return alone and diagnosis.after.cost <= by_law.cost
 
 
-def _known(system: System, diagnosis: Diagnosis) -> float:
+def _known(system: System, diagnosis: Diagnosis, many: int) -> float:
     """Length of the shortest explanation by known effects.
 
-    Of two that are as good, what is known: a single effect of the motion has that credit, and no sum has.
+    Of two that are as good, what is known: not more effects of the motion than the other takes have that credit.
     """
     found = [f.candidate for f in diagnosis.found]
     answer = length(system, diagnosis.settings, diagnosis.noise, diagnosis.after, found)
     lengths = [(answer, found), *((e.length, e.candidates) for e in diagnosis.ranked)]
-    return min(its - CLASS_GAIN * (sum(c.kind == "motion" for c in of) == 1) for its, of in lengths)
+    return min(its - CLASS_GAIN * (0 < sum(c.kind == "motion" for c in of) <= many) for its, of in lengths)
 
 
-def _beside(system: LawSystem, diagnosis: Diagnosis, doubtful: bool, known: float) -> tuple[tuple[Found, ...], ...]:
+def _beside(system: LawSystem, diagnosis: Diagnosis, doubtful: bool) -> tuple[tuple[Found, ...], ...]:
     """Sets of what was found, beside each of which a law is looked for in the place of the others.
 
     A single known effect has to compete where what it leaves is `doubtful`, or where a law comes as near to first
@@ -411,7 +411,7 @@ def _beside(system: LawSystem, diagnosis: Diagnosis, doubtful: bool, known: floa
     if not of_motion:
         return ()
     near = shortest_to_first_order(system, base_beside(diagnosis.before, faults), diagnosis.after, diagnosis.noise)
-    return (faults,) if of_motion[0].candidate.sought or near - CLASS_GAIN < known else ()
+    return (faults,) if of_motion[0].candidate.sought or near - CLASS_GAIN < _known(system, diagnosis, 1) else ()
 
 
 def judged_as(diagnosis: Diagnosis, system: System) -> System:
