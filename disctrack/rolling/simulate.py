@@ -12,8 +12,9 @@ a small wrench f(t) moves the state by Phi(t) times the integral of Phi(s)^-1 B(
 hundreds of laws can be asked for what each would do, for the price of some sums.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from types import CodeType
 from typing import Any
 
 import numpy as np
@@ -336,19 +337,24 @@ def _turn(column: Array, motion: Array) -> None:
 
 
 def symmetries(model: Model, assembly: Assembly) -> set[str]:
-    """Those of x, y, psi, phi at the start on which nothing depends but where, and which way round, the motion is.
-
-    What a law reads stands in its code: it holds no function of its own.
-    """
+    """Those of x, y, psi, phi at the start on which nothing depends but where, and which way round, the motion is."""
     if any(assembly.constant(name) != 0.0 for name in ("uneven", "surface_vx", "surface_vy", "surface_turn")):
         return set()
-    reads = {name for e in model.effects if e.law is not None for name in type(e).law.__code__.co_names}
+    reads = {name for e in model.effects if e.law is not None for name in _names(type(e).law.__code__)}
     askew = any(assembly.constant(name) != 0.0 for name in _ASKEW)
     if askew or assembly.constant("J_11") != assembly.constant("J_22"):
         reads.add("phi")
     if _OF_DIRECTION & reads or assembly.constant("g_x") != 0.0 or assembly.constant("g_y") != 0.0:
         reads.add("psi")
     return {"x", "y", "psi", "phi"} - reads
+
+
+def _names(code: CodeType) -> Iterator[str]:
+    """All attributes and globals that a function names, and the functions and comprehensions within it."""
+    yield from code.co_names
+    for inside in code.co_consts:
+        if isinstance(inside, CodeType):
+            yield from _names(inside)
 
 
 @dataclass(frozen=True)

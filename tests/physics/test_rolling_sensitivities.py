@@ -133,6 +133,18 @@ def test_a_law_by_formula_breaks_the_symmetries_that_it_reads():
     assert symmetries(model, Assembly(model, 0.01)) == set()
 
 
+def test_a_law_reads_what_the_functions_within_it_read():
+    """Of a user's law with a comprehension: else its columns would be those of a table that is alike all round."""
+
+    def law(p, s, w):
+        w.M_m -= p.c * sum([s.x * s.psi * k for k in (1.0, 2.0)])
+
+    kind = effect_from_formulas("within", {"M_m": "c"})
+    kind.law = staticmethod(law)
+    model = MODEL.with_effects(kind(c=0.0))
+    assert symmetries(model, Assembly(MODEL, 0.01)) == {"y", "phi"}
+
+
 def sliding(mu):
     return MODEL.with_effects(CATALOGUE["slip"](mu=mu))
 
