@@ -235,7 +235,7 @@ def negatives(images: Sequence[NDArray], views: Sequence[CornerView | BoardNotFo
     Its own marks cannot: the colouring of a negative is that of the board turned by 180 deg.
     """
     dark = [
-        margin_is_dark(image.reshape(*image.shape[:2], -1).mean(axis=-1), view, board.inner_corners)
+        margin_is_dark(image, view, board.inner_corners)
         for image, view in zip(images, views, strict=True)
         if isinstance(view, CornerView)
     ]
@@ -247,15 +247,15 @@ def negatives(images: Sequence[NDArray], views: Sequence[CornerView | BoardNotFo
     )
 
 
-def margin_is_dark(grey: Array, view: CornerView, inner_corners: tuple[int, int]) -> bool:
+def margin_is_dark(image: NDArray, view: CornerView, inner_corners: tuple[int, int]) -> bool:
     """Whether the paper just outside a chessboard's squares is as dark as the dark squares.
 
     False where too little of it is in view.
     """
     grid = view.points.reshape(*inner_corners[::-1], 2)
     edges = (np.rot90(grid, side)[:2] for side in range(4))
-    margin = np.concatenate([grey_at(grey, line + MARGIN * (line - before)) for line, before in edges])
-    light, dark = np.nanquantile(grey_at(grey, 0.5 * (grid[1:, 1:] + grid[:-1, :-1])), [0.8, 0.2])
+    margin = np.concatenate([grey_at(image, line + MARGIN * (line - before)) for line, before in edges])
+    light, dark = np.nanquantile(grey_at(image, 0.5 * (grid[1:, 1:] + grid[:-1, :-1])), [0.8, 0.2])
     seen = np.isfinite(margin)
     return bool(seen.mean() > 0.5 and np.median(margin[seen]) < dark + 0.25 * (light - dark))
 

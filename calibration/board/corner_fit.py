@@ -314,11 +314,11 @@ def squares_round(grey: Array, points: Array, axes: Array, aside: float) -> Arra
     return grey_at(grey, points[:, None] + aside * signs @ axes).reshape(-1, 2, 2)
 
 
-def grey_at(grey: Array, places: Array) -> Array:
-    """Grey values (...) of the pixels at places (..., 2); NaN out of view."""
-    inside = np.all((places >= 0) & (places <= np.array(grey.shape[::-1]) - 1), axis=-1)
+def grey_at(image: NDArray, places: Array) -> Array:
+    """Grey values (...), means of an image's channels, of the pixels at places (..., 2); NaN out of view."""
+    inside = np.all((places >= 0) & (places <= np.array(image.shape[1::-1]) - 1), axis=-1)
     x, y = np.moveaxis(np.rint(np.where(inside[..., None], places, 0.0)).astype(int), -1, 0)
-    return np.where(inside, grey[y, x], np.nan)
+    return np.where(inside, image[y, x].reshape(*x.shape, -1).mean(axis=-1), np.nan)
 
 
 def _indices(inner_corners: tuple[int, int]) -> Array:
