@@ -83,7 +83,7 @@ class ImagePairs:
         return {"camera_headers": told} if told else {}
 
     def inputs(self) -> dict[str, str]:
-        """SHA-256 of each camera's frames; what was read already is not read again."""
+        """SHA-256 of each camera's frames."""
         with ThreadPoolExecutor(2) as pool:  # hashing a gigabyte takes a second
             digests = pool.map(lambda reader: reader.content_sha256(self.start, self.stop), (self.left, self.right))
             return {f"{name} frames": digest for name, digest in zip(CAMERAS, digests, strict=True)}

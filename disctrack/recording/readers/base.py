@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,6 +73,10 @@ class FrameReader:
     files: Sequence[object]  # in which each frame lies, as messages name it
     image_size: tuple[int, int]  # width, height [px]
     dtype: np.dtype  # of grey values in memory
+    # a frame's grey values, in the array that is given or anywhere else. RecordingErrors begin with the text
+    decoded: Callable[[int, Image | None, str], Image]
+    stored: Callable[[int], bytes | memoryview]  # what a frame is made from. Raises RecordingError
+    coding: str = ""  # by what, beside size and type, that becomes grey values
     bit_depth: int = 0  # bits that carry grey values: 8 (uint8), or 9 to 16 (uint16); 0 stands for all of the type's
     timestamps: Array | None = None  # (n,) [s] by the camera's clock, where the file has them
     frame_rate: float | None = None  # [Hz] where the file states the camera's own, not that of a player
@@ -81,28 +85,18 @@ class FrameReader:
     notes: tuple[str, ...] = ()  # what the user should know about how the frames are read, one sentence each
     doubts: tuple[str, ...] = ()  # what had to be assumed of the frames' instants
     random_access: bool = True  # False where frames are read fastest in order, by one thread
-    _coding = ""  # by what, beside size and type, stored bytes become grey values
+    one_file_each: bool = False  # so that the file's name tells the frame
     _digests: dict[int, bytes] = field(default_factory=dict)  # of frames whose content was seen
 
     def __post_init__(self) -> None:
         self.bit_depth = self.bit_depth or 8 * self.dtype.itemsize
-        self.notes = tuple(f"{self.camera} camera: {note}" for note in self.notes)
-        self.doubts = tuple(f"{self.camera} camera: {doubt}" for doubt in self.doubts)
 
     def __len__(self) -> int:
         return len(self.files)
 
-    def _decoded(self, index: int, out: Image | None, where: str) -> Image:
-        """Frame `index`, in `out` or anywhere else. RecordingErrors begin with `where`."""
-        raise NotImplementedError
-
-    def _stored(self, index: int) -> bytes | memoryview:
-        """What frame `index` is made from. Raises RecordingError."""
-        return np.ascontiguousarray(self.read(index)).reshape(-1).data
-
     def describe(self, index: int) -> str:
         """Where frame `index` lies, for messages."""
-        return f"{self.files[index]}, frame {index}"
+        return str(self.files[index]) if self.one_file_each else f"{self.files[index]}, frame {index}"
 
     def read(self, index: int, out: Image | None = None) -> Image:
         """Frame `index`, (height, width) grey values as the camera wrote them; into `out` if given, and returned.
@@ -110,7 +104,7 @@ class FrameReader:
         Raises RecordingError with file, camera, frame, what was found and what to do.
         """
         where = f"{self.files[index]} ({self.camera} camera, frame {index})"
-        image = self._decoded(index, out, where)
+        image = self.decoded(index, out, where)
         if image.shape[::-1] != self.image_size or image.dtype != self.dtype:
             found = in_words(image.shape[::-1], 8 * image.itemsize)
             first = in_words(self.image_size, 8 * self.dtype.itemsize)
@@ -119,7 +113,7 @@ class FrameReader:
 
     def content_sha256(self, start: int, stop: int) -> str:
         """SHA-256 (hex) of what frames start..stop-1 are made from; equal if and only if the input is the same."""
-        total = hashlib.sha256(f"{self.image_size} {self.dtype} {self.bit_depth} {self._coding}".encode())
+        total = hashlib.sha256(f"{self.image_size} {self.dtype} {self.bit_depth} {self.coding}".encode())
         for index in range(start, stop):
             total.update(self._digest(index))
         return total.hexdigest()
@@ -127,31 +121,19 @@ class FrameReader:
     def _digest(self, index: int) -> bytes:
         if index not in self._digests:
             try:
-                self._digests[index] = hashlib.sha256(self._stored(index)).digest()
+                self._digests[index] = hashlib.sha256(self.stored(index)).digest()
             except RecordingError:
                 return b"unreadable"
         return self._digests[index]
 
 
-class Changed(FrameReader):
-    """Frames of another reader that are changed after they are read; in all else that reader."""
+def changed(reader: FrameReader, change: Callable[[Image], Image], by: str) -> FrameReader:
+    """Frames of a reader that are changed after they are read; in all else that reader.
 
-    def __init__(self, reader: FrameReader, change: Callable[[Image], Image], by: str, **different: Any) -> None:
-        """By : all that tells how they are changed, for the digest of the content; different : other fields."""
-        vars(self).update({f.name: getattr(reader, f.name) for f in fields(FrameReader)} | different)
-        self._reader, self._change, self._by = reader, change, by
-
-    def describe(self, index: int) -> str:
-        """As of the other reader."""
-        return self._reader.describe(index)
-
-    def read(self, index: int, out: Image | None = None) -> Image:
-        """Frame `index`, changed."""
-        return _into(out, self._change(self._reader.read(index)))
-
-    def content_sha256(self, start: int, stop: int) -> str:
-        """Of the frames and of how they are changed."""
-        return hashlib.sha256(f"{self._reader.content_sha256(start, stop)} {self._by}".encode()).hexdigest()
+    by : all that tells how they are changed, for the digest of the content
+    """
+    coding = f"{reader.coding} {reader.image_size} {reader.bit_depth} {by}"
+    return replace(reader, decoded=lambda index, out, where: change(reader.read(index)), coding=coding)
 
 
 @dataclass(frozen=True)
@@ -197,7 +179,7 @@ def frames_in_parts(readers: Sequence[FrameReader], parts: ImageParts, where: st
                 f"rows {part.y} to {part.y + part.height - 1}, but {reader.describe(0)} has {width} x {height} px. It "
                 "is [x, y, width, height] in pixels, from the upper left corner."
             )
-        found.append(Changed(reader, part.of, str(part), image_size=(part.width, part.height)))
+        found.append(replace(changed(reader, part.of, str(part)), image_size=(part.width, part.height)))
     return found
 
 

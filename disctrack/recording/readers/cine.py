@@ -15,15 +15,15 @@ from numpy.typing import NDArray
 
 from calibration.kit.arrays import Array
 from disctrack.errors import RecordingError
-from disctrack.recording.readers.base import CameraHeader, only_file
+from disctrack.recording.readers.base import CameraHeader, FrameReader, only_file
 from disctrack.recording.readers.raw import (
     PixelLayout,
     RawFile,
-    RawFrames,
     bit_depth_of,
     check_frame_size,
     check_present,
     count_present,
+    raw_frames,
 )
 
 _FILE_HEADER = struct.Struct("<2sHHHiIiIIIIII")
@@ -46,7 +46,7 @@ _FRACTION = 0xFFFFFFFC  # of a second, in 2**-32 s; the two lowest bits are flag
 _PACKED = {256: 10, 1024: 12}
 
 
-def open_cine(files: Sequence[Path], camera: str) -> RawFrames:
+def open_cine(files: Sequence[Path], camera: str) -> FrameReader:
     """Frames of one camera. Raises RecordingError if the file is damaged, compressed or of colours."""
     file = RawFile(only_file(files, camera))
     cine = _Cine(file)
@@ -56,7 +56,7 @@ def open_cine(files: Sequence[Path], camera: str) -> RawFrames:
     check_present(file, camera, layout, n, count_present(layout, starts, file.size))
     times, step, doubts = _times(cine)
     header = _header(cine, times, step)
-    return RawFrames(
+    return raw_frames(
         camera=camera,
         files=[file] * n,
         offsets=_pixels(cine, starts, layout),

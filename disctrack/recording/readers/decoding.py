@@ -7,6 +7,7 @@ colour, interlaced, fewer than 8 bits) are left to OpenCV.
 
 import struct
 import zlib
+from pathlib import Path
 
 import cv2
 import imagecodecs
@@ -17,8 +18,8 @@ from calibration.kit.arrays import Image
 from disctrack.errors import RecordingError
 from disctrack.recording.readers._pixel_kernels import undo_filters
 from disctrack.recording.readers.base import room_for
-from disctrack.recording.readers.raw import check_frame_size
-from disctrack.recording.readers.tiff_pages import Content, page_pixels, pages_of
+from disctrack.recording.readers.raw import RawFile, check_frame_size
+from disctrack.recording.readers.tiff_pages import page_pixels, pages_of
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _TIFF_SIGNATURES = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
@@ -36,7 +37,7 @@ def decode(content: bytes, where: str, out: NDArray | None = None) -> NDArray:
     if content.startswith(_PNG_SIGNATURE):
         return _png(content, where, out)
     if content[:4] in _TIFF_SIGNATURES:
-        source = Content(content)
+        source = RawFile(Path("TIFF content"), content)
         try:
             page = next(pages_of(source))
         except (RecordingError, StopIteration) as error:

@@ -10,7 +10,7 @@ stays so. One that hardly answers the light, or far more than its neighbours, is
 import glob
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -21,7 +21,7 @@ from calibration.kit.stuck_pixels import MOST, repair
 from disctrack.errors import RecordingError
 from disctrack.frames import CAMERAS
 from disctrack.recording.readers import open_frames
-from disctrack.recording.readers.base import Changed, FrameReader, in_words
+from disctrack.recording.readers.base import FrameReader, changed, in_words
 from disctrack.recording.readers.files import IMAGES, match_files, split_member
 
 ODD = 0.5  # relative, by which a dead pixel's answer to light differs from its neighbours'; gains differ by 0.05
@@ -87,7 +87,8 @@ def _corrected(reader: FrameReader, field: FlatField | None) -> FrameReader:
             f"{reader.camera}_dark have {images}. Take these with the settings of the recording, or leave them out."
         )
     notes = (*reader.notes, *field.notes)
-    return Changed(reader, field.corrected, field.sha256, notes=notes, bit_depth=16, dtype=np.dtype(np.uint16))
+    corrected = changed(reader, field.corrected, field.sha256)
+    return replace(corrected, notes=notes, bit_depth=16, dtype=np.dtype(np.uint16))
 
 
 @dataclass(frozen=True)

@@ -5,10 +5,8 @@ data set (or of its group) that are understood: `frame_rate` [Hz], `bit_depth`; 
 data set (n,) beside it. A data set that lies in one piece is read at the speed of memory.
 """
 
-import hashlib
 import threading
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -23,9 +21,9 @@ from disctrack.recording.readers.raw import (
     LEAST_PRESENT,
     PixelLayout,
     RawFile,
-    RawFrames,
     bit_depth_of,
     check_frame_size,
+    raw_frames,
 )
 
 _LARGEST_CACHE = 64 << 20  # bytes of decompressed chunks kept; more than one camera's chunk of many frames
@@ -115,18 +113,20 @@ def _open(handle: h5py.File, stack: h5py.Dataset, file: Path, camera: str) -> Fr
         layout = PixelLayout(width, height, stack.dtype)
         handle.close()
         starts = offset + layout.frame_bytes * np.arange(n)
-        return RawFrames(files=[RawFile(file)] * n, offsets=starts, layout=layout, **told)
+        return raw_frames(files=[RawFile(file)] * n, offsets=starts, layout=layout, **told)
     together, n_filters = stack.chunks[0] if stack.chunks else 1, stack.id.get_create_plist().get_nfilters()
     deflated = stack.compression == "gzip" and n_filters == 1 + stack.shuffle
     slow = f"chunks of {together} frames are decompressed anew for each of them; chunks of one frame are read faster"
-    return Hdf5Frames(
+    apart = bool(whole and deflated and stack.chunks == (1, height, width))
+    decoded = _decoding(stack, apart)
+    return FrameReader(
         files=cast(Sequence[str], np.broadcast_to(where, n)),  # a virtual one may announce any n
-        stack=stack,
-        shuffled=stack.shuffle,
-        random_access=bool(whole and deflated and stack.chunks == (1, height, width)),
-        notes=(slow,) if together > max(1, _LARGEST_CACHE // (width * height * stack.dtype.itemsize)) else (),
         image_size=(int(width), int(height)),
         dtype=stack.dtype.newbyteorder("="),
+        decoded=decoded,
+        stored=lambda index: decoded(index, None, "").data,
+        random_access=apart,
+        notes=(slow,) if together > max(1, _LARGEST_CACHE // (width * height * stack.dtype.itemsize)) else (),
         **told,
     )
 
@@ -175,58 +175,54 @@ def _timestamps(stack: h5py.Dataset, n: int, where: str) -> Array | None:
     return np.asarray(values[()], np.float64)
 
 
-@dataclass(eq=False, kw_only=True)
-class Hdf5Frames(FrameReader):
-    """A data set in chunks, with or without compression.
+def _decoding(stack: h5py.Dataset, apart: bool) -> Callable[[int, Image | None, str], Image]:
+    """What gives a frame of a data set in chunks, with or without compression.
 
-    The library does one thing at a time. Where each frame is a chunk, compressed by deflate as most are, it delivers
-    the compressed bytes only, and frames are inflated side by side: with random access.
+    The library does one thing at a time. Where each frame is a chunk, compressed by deflate as most are (`apart`), it
+    delivers the compressed bytes only, and frames are inflated side by side: with random access.
     """
+    lock, dtype, (_, height, width) = threading.Lock(), stack.dtype.newbyteorder("="), stack.shape
 
-    stack: h5py.Dataset
-    shuffled: bool
-
-    def __post_init__(self) -> None:
-        self._lock = threading.Lock()
-        super().__post_init__()
-
-    def _decoded(self, index: int, out: Image | None, where: str) -> Image:
-        image, content = room_for(out, self.image_size, self.dtype), None
-        with self._lock:
+    def decoded(index: int, out: Image | None, where: str) -> Image:
+        image, content = room_for(out, (width, height), dtype), None
+        with lock:
             try:
-                size = self._stored_size(index)
+                size = _stored_size(stack, index)
                 if size == 0:
                     raise RecordingError(f"{where}: was never written to the file. Copy or write it again.")
-                if self.random_access and size <= 2 * image.nbytes:
-                    mask, content = self.stack.id.read_direct_chunk((index, 0, 0))
+                if apart and size <= 2 * image.nbytes:
+                    mask, content = stack.id.read_direct_chunk((index, 0, 0))
                     content = None if mask else content  # some filter was left out
                 if content is None:
-                    self.stack.read_direct(image, np.s_[index])
+                    stack.read_direct(image, np.s_[index])
             except (OSError, RuntimeError, ValueError) as error:
                 raise RecordingError(f"{where}: cannot be read ({error}). Copy the file again.") from error
         if content is not None:
-            self._inflate(content, image, where)
-        self._digests[index] = hashlib.sha256(image.data).digest()
+            _inflate(stack, content, image, where)
         return image
 
-    def _inflate(self, content: bytes, image: Image, where: str) -> None:
-        """Undo deflate and, before it, shuffle (all first bytes of the pixels, then all second ones)."""
-        whole = inflated(content, image.nbytes)
-        if whole is None:
-            raise RecordingError(
-                f"{where}: damaged (its {len(content)} compressed bytes do not hold the {image.nbytes} of an image). "
-                "Copy the file again."
-            )
-        raw = np.frombuffer(whole, np.uint8)
-        if self.shuffled and self.dtype.itemsize > 1:
-            raw = np.ascontiguousarray(raw.reshape(self.dtype.itemsize, -1).T).reshape(-1)
-        image[...] = raw.view(self.stack.dtype).reshape(image.shape)
+    return decoded
 
-    def _stored_size(self, index: int) -> int:
-        """Bytes of the frame's chunks; 0 where one is missing: the library would deliver zeros without a word."""
-        if self.stack.chunks is None:
-            return 1
-        (frames, rows, columns), (_, height, width) = self.stack.chunks, self.stack.shape
-        corners = ((index - index % frames, y, x) for y in range(0, height, rows) for x in range(0, width, columns))
-        found = [self.stack.id.get_chunk_info_by_coord(corner) for corner in corners]
-        return 0 if any(info.byte_offset is None for info in found) else sum(int(info.size) for info in found)
+
+def _inflate(stack: h5py.Dataset, content: bytes, image: Image, where: str) -> None:
+    """Undo deflate and, before it, shuffle (all first bytes of the pixels, then all second ones)."""
+    whole = inflated(content, image.nbytes)
+    if whole is None:
+        raise RecordingError(
+            f"{where}: damaged (its {len(content)} compressed bytes do not hold the {image.nbytes} of an image). "
+            "Copy the file again."
+        )
+    raw = np.frombuffer(whole, np.uint8)
+    if stack.shuffle and image.itemsize > 1:
+        raw = np.ascontiguousarray(raw.reshape(image.itemsize, -1).T).reshape(-1)
+    image[...] = raw.view(stack.dtype).reshape(image.shape)
+
+
+def _stored_size(stack: h5py.Dataset, index: int) -> int:
+    """Bytes of the frame's chunks; 0 where one is missing: the library would deliver zeros without a word."""
+    if stack.chunks is None:
+        return 1
+    (frames, rows, columns), (_, height, width) = stack.chunks, stack.shape
+    corners = ((index - index % frames, y, x) for y in range(0, height, rows) for x in range(0, width, columns))
+    found = [stack.id.get_chunk_info_by_coord(corner) for corner in corners]
+    return 0 if any(info.byte_offset is None for info in found) else sum(int(info.size) for info in found)

@@ -5,13 +5,12 @@ Pages without compression are read at the speed of memory.
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 import re
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -25,7 +24,7 @@ from disctrack.errors import RecordingError
 from disctrack.recording.readers.base import FrameReader, first_readable
 from disctrack.recording.readers.decoding import as_grey, decode
 from disctrack.recording.readers.files import check_continuation, content_of, number_files
-from disctrack.recording.readers.raw import PixelLayout, RawFile, RawFrames, check_frame_size
+from disctrack.recording.readers.raw import PixelLayout, RawFile, check_frame_size, raw_frames
 from disctrack.recording.readers.tiff_pages import Page, page_pixels, pages_of
 
 
@@ -41,44 +40,31 @@ def open_images(files: Sequence[Path], camera: str, pattern: str = "") -> FrameR
         return _open_stack(files, camera)
     slots, numbers, notes, doubts = number_files(files, camera, pattern)
 
-    def decoded(index: int) -> tuple[NDArray, Image]:
-        name = str(files[index])
-        stored = decode(content_of(files[index], name), name)
-        return stored, as_grey(stored, name)
+    def stored(index: int, where: str = "") -> bytes:
+        file = slots[index]
+        if file is None:
+            raise RecordingError(f"{where}: there is no file with this number. Copy it again from the camera.")
+        return content_of(file, where)
 
-    stored, first = first_readable(len(files), camera, decoded)
-    alike = f"images are stored with {stored.shape[-1]} channels of equal value; one is used, without loss"
-    return ImageSequence(
+    def looked_at(index: int) -> tuple[NDArray, Image]:
+        name = str(files[index])
+        image = decode(content_of(files[index], name), name)
+        return image, as_grey(image, name)
+
+    whole, first = first_readable(len(files), camera, looked_at)
+    alike = f"images are stored with {whole.shape[-1]} channels of equal value; one is used, without loss"
+    return FrameReader(
         camera=camera,
         files=[file or f"missing file of {camera} frame {index}" for index, file in enumerate(slots)],
         numbers=numbers,
         image_size=(first.shape[1], first.shape[0]),
         dtype=first.dtype,
-        notes=(*notes, *([alike] if stored.ndim == 3 else [])),
+        decoded=lambda index, out, where: as_grey(decode(stored(index, where), where, out), where),
+        stored=stored,
+        notes=(*notes, *([alike] if whole.ndim == 3 else [])),
         doubts=doubts,
+        one_file_each=True,
     )
-
-
-@dataclass(eq=False, kw_only=True)
-class ImageSequence(FrameReader):
-    """One file per frame. Files are opened when a frame is read, and never written."""
-
-    files: Sequence[Path | str]  # words where a number is missing
-
-    def describe(self, index: int) -> str:
-        """The file's name."""
-        return str(self.files[index])
-
-    def _decoded(self, index: int, out: Image | None, where: str) -> Image:
-        content = self._stored(index, where)
-        self._digests[index] = hashlib.sha256(content).digest()
-        return as_grey(decode(content, where, out), where)
-
-    def _stored(self, index: int, where: str = "") -> bytes:
-        file = self.files[index]
-        if isinstance(file, str):
-            raise RecordingError(f"{where}: there is no file with this number. Copy it again from the camera.")
-        return content_of(file, where)
 
 
 def _is_stack(file: Path) -> bool:
@@ -115,30 +101,19 @@ def _open_stack(files: Sequence[Path], camera: str) -> FrameReader:
     offsets = np.array([page.plain_offset for page in pages], np.int64)
     if (offsets >= 0).all() and all(page.layout == first.layout for page in pages):
         layout = PixelLayout(first.width, first.height, first.dtype)
-        return RawFrames(offsets=offsets, layout=layout, **told)
+        return raw_frames(offsets=offsets, layout=layout, **told)
 
-    def decoded(index: int) -> Image:
-        where = str(sources[index])
+    def pixels(index: int, out: Image | None, where: str) -> Image:
         return as_grey(page_pixels(sources[index], pages[index], where), where)
 
-    image = first_readable(len(pages), camera, decoded)
-    size = image.shape[1], image.shape[0]
-    return TiffPages(pages=pages, image_size=size, dtype=image.dtype, **told)
-
-
-@dataclass(eq=False, kw_only=True)
-class TiffPages(FrameReader):
-    """Pages that are compressed, or otherwise not plain."""
-
-    files: Sequence[RawFile]
-    pages: Sequence[Page]
-
-    def _stored(self, index: int) -> bytes:
-        page = self.pages[index]
-        return page.layout.encode() + b"".join(page.pieces(self.files[index], ""))
-
-    def _decoded(self, index: int, out: Image | None, where: str) -> Image:
-        return as_grey(page_pixels(self.files[index], self.pages[index], where), where)
+    image = first_readable(len(pages), camera, lambda index: pixels(index, None, str(sources[index])))
+    return FrameReader(
+        image_size=(image.shape[1], image.shape[0]),
+        dtype=image.dtype,
+        decoded=pixels,
+        stored=lambda index: pages[index].layout.encode() + b"".join(pages[index].pieces(sources[index], "")),
+        **told,
+    )
 
 
 def _pages(file: RawFile) -> tuple[list[Page], str | None]:

@@ -12,15 +12,15 @@ import numpy as np
 
 from disctrack.errors import RecordingError
 from disctrack.files.inputs import MOST_TEXT
-from disctrack.recording.readers.base import CameraHeader, only_file
+from disctrack.recording.readers.base import CameraHeader, FrameReader, only_file
 from disctrack.recording.readers.files import content_of
 from disctrack.recording.readers.raw import (
     PixelLayout,
     RawFile,
-    RawFrames,
     bit_depth_of,
     check_frame_size,
     check_present,
+    raw_frames,
 )
 
 # Where the entries that matter lie: name in the .cih, path below <cih> in the .cihx.
@@ -49,7 +49,7 @@ _ENTRIES = {
 _TRIGGERS = ("Start", "Center", "End", "Random", "Manual", "Random Reset", "Random Center", "Random Manual")
 
 
-def open_mraw(files: Sequence[Path], camera: str) -> RawFrames:
+def open_mraw(files: Sequence[Path], camera: str) -> FrameReader:
     """Frames of one camera. files: the header, or the .mraw file, or both.
 
     Raises RecordingError if header or frames are missing, do not fit each other, or are not grey values.
@@ -68,7 +68,7 @@ def open_mraw(files: Sequence[Path], camera: str) -> RawFrames:
     if file.size >= (n + 1) * layout.frame_bytes:
         notes.append(f"{data_file.name} is longer than the {n} frames of its header; what follows them is not read")
     header, remarks, doubts = _header(entries)
-    return RawFrames(
+    return raw_frames(
         camera=camera,
         files=[file] * n,
         offsets=np.arange(n, dtype=np.int64) * layout.frame_bytes,

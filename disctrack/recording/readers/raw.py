@@ -7,13 +7,14 @@ raising an error.
 
 from __future__ import annotations
 
+import io
 import os
 import threading
 import weakref
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,45 +35,42 @@ LEAST_PRESENT = 0.5
 class RawFile:
     """A file that stays open and is read at any offset, by several threads at once.
 
+    content : of the file, where that was read already
     Raises RecordingError if it cannot be opened.
     """
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self._lock = threading.Lock()  # for systems without positioned reads
+    def __init__(self, path: Path, content: bytes | None = None) -> None:
+        self.path, self._content, self._lock = path, content, threading.Lock()
         try:
-            self._descriptor = open_regular(path)
-            weakref.finalize(self, os.close, self._descriptor)
-            self.size = os.fstat(self._descriptor).st_size
+            self._stream = self.stream()
         except OSError as error:
             raise RecordingError(f"{path}: cannot be read: {error.strerror}.") from error
+        weakref.finalize(self, self._stream.close)
+        self.size = self._stream.seek(0, os.SEEK_END)
 
     def __str__(self) -> str:
         return str(self.path)
 
-    def stream(self) -> BinaryIO:
+    def stream(self) -> io.FileIO | io.BytesIO:
         """The file from its beginning, for a library; it is closed apart."""
-        stream = os.fdopen(os.dup(self._descriptor), "rb")
-        stream.seek(0)
-        return stream
+        return io.FileIO(open_regular(self.path)) if self._content is None else io.BytesIO(self._content)
 
     def read_into(self, buffer: NDArray[np.uint8], offset: int, where: str) -> None:
         """Fill `buffer` (n,) with the bytes from `offset` on.
 
         Raises RecordingError that begins with `where` if the file ends before, or cannot be read any more.
         """
-        view, done = buffer.data, 0
-        while done < len(view):
-            try:
-                n = self._read_some(view[done:], offset + done)
-            except OSError as error:
-                raise RecordingError(f"{where}: cannot be read: {error.strerror}. Copy the file again.") from error
-            if n == 0:
-                raise RecordingError(
-                    f"{where}: the file ends {len(view) - done} bytes before the end of what lies at byte {offset}. "
-                    "It is cut short: copy it again from the camera."
-                )
-            done += n
+        try:
+            with self._lock:
+                self._stream.seek(offset)
+                done = self._stream.readinto(buffer.data)
+        except OSError as error:
+            raise RecordingError(f"{where}: cannot be read: {error.strerror}. Copy the file again.") from error
+        if done < len(buffer):
+            raise RecordingError(
+                f"{where}: the file ends {len(buffer) - done} bytes before the end of what lies at byte {offset}. "
+                "It is cut short: copy it again from the camera."
+            )
 
     def bytes_at(self, offset: int, size: int, where: str) -> bytes:
         """`size` bytes from `offset` on; errors as in `read_into`, and none is read if the file is too short."""
@@ -84,15 +82,6 @@ class RawFile:
         buffer = np.empty(size, np.uint8)
         self.read_into(buffer, offset, where)
         return buffer.tobytes()
-
-    def _read_some(self, view: memoryview, offset: int) -> int:
-        if hasattr(os, "preadv"):
-            return os.preadv(self._descriptor, [view], offset)
-        with self._lock:
-            os.lseek(self._descriptor, offset, os.SEEK_SET)
-            piece = os.read(self._descriptor, len(view))
-            view[: len(piece)] = piece
-            return len(piece)
 
 
 @dataclass(frozen=True)
@@ -133,48 +122,49 @@ class PixelLayout:
             np.take(self.table, out, out=out, mode="clip")
 
 
-@dataclass(eq=False, kw_only=True)
-class RawFrames(FrameReader):
+def raw_frames(
+    camera: str,
+    files: Sequence[RawFile],
+    offsets: NDArray[np.integer],
+    layout: PixelLayout,
+    notes: tuple[str, ...] = (),
+    **told: Any,
+) -> FrameReader:
     """Frames of equal size at known places in one or several files.
 
     Frame i begins at byte offsets[i] of files[i]; it is lost where that is below 0, or where the file ends before its
-    end.
+    end.   told : other fields of the reader
     """
+    n, image_size, dtype = len(offsets), (layout.width, layout.height), layout.dtype.newbyteorder("=")
+    if lost := n - count_present(layout, offsets, np.array([file.size for file in files])):
+        notes = (*notes, f"{files[0]}: lacks {lost} of {n} frames; they are left without an answer")
 
-    image_size: tuple[int, int] = field(init=False)
-    dtype: np.dtype = field(init=False)
-    files: Sequence[RawFile]
-    offsets: NDArray[np.integer]
-    layout: PixelLayout
-
-    def __post_init__(self) -> None:
-        layout, n = self.layout, len(self.offsets)
-        self.image_size, self.dtype = (layout.width, layout.height), layout.dtype.newbyteorder("=")
-        self._coding = f"{layout.stored_bits} {layout.dtype.str} {layout.bottom_up} {layout.table is not None}"
-        lost = n - count_present(layout, self.offsets, np.array([file.size for file in self.files]))
-        if lost:
-            cut = f"{self.files[0]}: lacks {lost} of {n} frames; they are left without an answer"
-            self.notes = (*self.notes, cut)
-        super().__post_init__()
-
-    def _fill(self, buffer: NDArray[np.uint8], index: int, where: str) -> NDArray[np.uint8]:
-        if self.offsets[index] < 0:
+    def filled(index: int, where: str, buffer: NDArray[np.uint8] | None = None) -> NDArray[np.uint8]:
+        if offsets[index] < 0:
             raise RecordingError(f"{where}: there is no image of the right size where the file says. Copy it again.")
-        self.files[index].read_into(buffer, int(self.offsets[index]), where)
+        buffer = np.empty(layout.frame_bytes, np.uint8) if buffer is None else buffer
+        files[index].read_into(buffer, int(offsets[index]), where)
         return buffer
 
-    def _stored(self, index: int) -> memoryview:
-        return self._fill(np.empty(self.layout.frame_bytes, np.uint8), index, "").data
-
-    def _decoded(self, index: int, out: Image | None, where: str) -> Image:
-        image = room_for(out, self.image_size, self.dtype)
-        if not self.layout.is_plain:
-            self.layout.decode(self._fill(np.empty(self.layout.frame_bytes, np.uint8), index, where), image)
+    def decoded(index: int, out: Image | None, where: str) -> Image:
+        image = room_for(out, image_size, dtype)
+        if not layout.is_plain:
+            layout.decode(filled(index, where), image)
             return image
-        self._fill(image.reshape(-1).view(np.uint8), index, where)
-        if not self.layout.dtype.isnative:
-            image.byteswap(inplace=True)
-        return image
+        filled(index, where, image.reshape(-1).view(np.uint8))
+        return image if layout.dtype.isnative else image.byteswap(inplace=True)
+
+    return FrameReader(
+        camera=camera,
+        files=files,
+        image_size=image_size,
+        dtype=dtype,
+        decoded=decoded,
+        stored=lambda index: filled(index, "").data,
+        coding=f"{layout.stored_bits} {layout.dtype.str} {layout.bottom_up} {layout.table is not None}",
+        notes=notes,
+        **told,
+    )
 
 
 def count_present(layout: PixelLayout, offsets: NDArray[np.integer], ends: NDArray[np.integer] | int) -> int:

@@ -6,13 +6,10 @@ a damaged file makes of it is an error that names the file.
 
 from __future__ import annotations
 
-import io
 import logging
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import count
-from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 import tifffile
@@ -28,21 +25,6 @@ _LZW = tifffile.COMPRESSION.LZW
 _READ = {tifffile.COMPRESSION[name] for name in ("NONE", "LZW", "JPEG", "ADOBE_DEFLATE", "PACKBITS", "DEFLATE")}
 # Tags by which the pixels of two pages are decoded alike.
 _LAYOUT = (256, 257, 258, 259, 262, 266, 274, 277, 278, 284, 317, 320, 322, 323, 338, 339, 347)
-
-
-class Content(RawFile):
-    """A file's content that was read already."""
-
-    def __init__(self, content: bytes) -> None:
-        self._content, self.size, self.path = content, len(content), Path("TIFF content")
-
-    def stream(self) -> BinaryIO:
-        """All of it."""
-        return io.BytesIO(self._content)
-
-    def _read_some(self, view: memoryview, offset: int) -> int:
-        view[:] = self._content[offset : offset + len(view)]
-        return len(view)
 
 
 @dataclass(frozen=True)

@@ -37,17 +37,40 @@ _Decoded: TypeAlias = (
 )
 
 
-def open_video(files: Sequence[Path], camera: str) -> VideoFile:
-    """Reader of one video. Raises RecordingError if PyAV is not installed or the file is no video."""
-    return VideoFile(only_file(files, camera), camera)
+def open_video(files: Sequence[Path], camera: str) -> FrameReader:
+    """Reader of one video. Raises RecordingError if PyAV is not installed or the file is no video.
+
+    Grey values are the luma plane as it is stored, not stretched from limited to full range. There are no time stamps:
+    those of the container are a player's, not the camera's.
+    """
+    file = only_file(files, camera)
+    video = _Video(file, camera)
+
+    def looked_at(index: int) -> tuple[av.VideoFrame, Image]:
+        where = f"{file}, frame {index}"
+        frame = video.frame(index, where)
+        return frame, _luma(frame, where)
+
+    frame, first = first_readable(len(video.times), camera, looked_at)
+    lossy = f"{video.codec} may compress with loss, which costs accuracy; ffv1 is free of loss"
+    return FrameReader(
+        camera=camera,
+        files=[file] * len(video.times),
+        image_size=(first.shape[1], first.shape[0]),
+        dtype=first.dtype,
+        decoded=video.decoded,
+        stored=video.stored,
+        bit_depth=_depth(frame),
+        notes=(*_format_notes(frame), *((lossy,) if video.codec not in _LOSSLESS else ())),
+        doubts=tuple(_gap_doubts(video.times)),
+        random_access=False,
+    )
 
 
-class VideoFile(FrameReader):
+class _Video:
     """Frames of a video in order of presentation. Best read forwards, by one thread.
 
-    Grey values are the luma plane as it is stored, not stretched from limited to full range. Frames are found by their
-    time in the container: going back starts at the key frame before. There are no time stamps: those of the container
-    are a player's, not the camera's.
+    They are found by their time in the container: going back starts at the key frame before.
     """
 
     def __init__(self, file: Path, camera: str) -> None:
@@ -61,44 +84,27 @@ class VideoFile(FrameReader):
         with _opened(file, camera) as container:
             codec = container.streams.video[0].codec_context
             check_frame_size(codec.width, codec.height, str(file))
-            codec_name = str(codec.name)
+            self.codec = str(codec.name)
             # in order of presentation, in units of the container; without usable times frames are counted
-            self._times, self._keys, self._timed, self._checked = _index(container, codec_name, file)
+            self.times, self._keys, self._timed, self._checked = _index(container, self.codec, file)
 
-        def looked_at(index: int) -> tuple[av.VideoFrame, Image]:
-            where = f"{file}, frame {index}"
-            frame = self._frame(index, where)
-            return frame, _luma(frame, where)
-
-        frame, first = first_readable(len(self._times), camera, looked_at)
-        lossy = f"{codec_name} may compress with loss, which costs accuracy; ffv1 is free of loss"
-        super().__init__(
-            camera=camera,
-            files=[file] * len(self._times),
-            image_size=(first.shape[1], first.shape[0]),
-            dtype=first.dtype,
-            bit_depth=_depth(frame),
-            notes=(*_format_notes(frame), *((lossy,) if codec_name not in _LOSSLESS else ())),
-            doubts=tuple(_gap_doubts(self._times)),
-            random_access=False,
-        )
-
-    def _decoded(self, index: int, out: Image | None, where: str) -> Image:
+    def decoded(self, index: int, out: Image | None, where: str) -> Image:
+        """Grey values of a frame, where `out` is given in the decoder's memory. Raises RecordingError."""
         with self._lock:
-            image = _luma(self._frame(index, where), where)
+            image = _luma(self.frame(index, where), where)
             return image.copy() if out is None else image
 
-    def content_sha256(self, start: int, stop: int) -> str:
-        """SHA-256 of the file and the range: compressed frames cannot be told apart without decoding them."""
+    def stored(self, index: int) -> bytes:
+        """SHA-256 of the file, and the frame: compressed ones cannot be told apart without decoding them."""
         if self._content is None:
             try:
                 with self.file.open("rb") as stream:
                     self._content = hashlib.file_digest(stream, "sha256").digest()
             except OSError:  # the file went away: what was measured stays, but no other run will be taken for the same
                 self._content = b"unreadable" + os.urandom(16)
-        return hashlib.sha256(self._content + f"{start}:{stop}".encode()).hexdigest()
+        return self._content + str(index).encode()
 
-    def _frame(self, index: int, where: str) -> av.VideoFrame:
+    def frame(self, index: int, where: str) -> av.VideoFrame:
         """The decoded frame. Raises RecordingError."""
         key = int(self._keys[np.searchsorted(self._keys, index, side="right") - 1])
         if self._container is None or not min(key, index - _DECODED_ON) <= self._next <= index:
@@ -108,7 +114,7 @@ class VideoFile(FrameReader):
                 raise RecordingError(f"{where}: {error}") from error
         self._next = index + 1
         while self._held[0] < index:
-            self._held = next(self._frames, (len(self._times), None, ""))
+            self._held = next(self._frames, (len(self.times), None, ""))
         position, frame, problem = self._held
         if position > index:
             raise RecordingError(f"{where}: the video does not hold this frame, or it is cut short. Copy it again.")
@@ -125,7 +131,7 @@ class VideoFile(FrameReader):
         try:
             if key:
                 stream = self._container.streams.video[0]
-                self._container.seek(int(self._times[key]), stream=stream, backward=True)
+                self._container.seek(int(self.times[key]), stream=stream, backward=True)
         except (OSError, ValueError):
             self._container.close()
             self._container, self._next = _opened(self.file, self.camera), 0
@@ -158,7 +164,7 @@ class VideoFile(FrameReader):
 
     def _position(self, item: av.Packet | av.VideoFrame, count: int) -> int:
         """Index of a packet or frame by its time; by counting where the container has no times."""
-        return int(np.searchsorted(self._times, item.pts)) if self._timed and item.pts is not None else count
+        return int(np.searchsorted(self.times, item.pts)) if self._timed and item.pts is not None else count
 
 
 def _index(

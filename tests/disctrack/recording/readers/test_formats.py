@@ -7,6 +7,7 @@ import struct
 import tracemalloc
 import zlib
 from pathlib import Path
+from unittest.mock import Mock
 
 import cv2
 import h5py
@@ -473,10 +474,8 @@ def test_a_single_file_that_is_deleted_while_it_is_read_loses_nothing(tmp_path, 
 def test_a_network_that_goes_away_is_an_error_of_the_frame(tmp_path, monkeypatch):
     reader = open_frames(SINGLE[2].written(tmp_path, FRAMES), tmp_path, "left")
 
-    def gone(*_: object) -> int:
-        raise OSError(116, "Stale file handle")
-
-    monkeypatch.setattr(os, "preadv", gone)
+    gone = Mock(**{"readinto.side_effect": OSError(116, "Stale file handle")})
+    monkeypatch.setattr(reader.files[0], "_stream", gone)
     (block,) = iter_pair_blocks(reader, reader, block=len(FRAMES))
     assert len(block.unreadable) == 2 * len(FRAMES)
     assert re.search(r"left\..*left camera, frame 0.*Stale file handle", block.unreadable[0].reason)
