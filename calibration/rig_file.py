@@ -5,7 +5,7 @@ import io
 import json
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict
 from importlib import metadata
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,7 +14,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.board.target import Target, target_of
+from calibration.board.target import target_of
 from calibration.cameras.camera import (
     CAMERA_NAMES,
     INTRINSIC_PARAMETERS,
@@ -26,9 +26,7 @@ from calibration.cameras.camera import (
     StereoRig,
 )
 from calibration.cameras.splines import LensField
-from calibration.fit.stereo_model import Observations
 from calibration.kit.arguments import checked
-from calibration.kit.arrays import Array, Mask
 from calibration.kit.errors import RigFileError
 from calibration.kit.seal import check_seal, sealed
 from calibration.stereo import StereoCalibration
@@ -90,36 +88,19 @@ _OF_RECORD = {
     "pixels": Dataset(("seen", 2), "px", "located corner"),
     "pixels_covariance": Dataset(("seen", 2, 2), "px^2", "of the located corner, from the image's own noise"),
 }
-_OBSERVED = ("view", "camera", "point", "pixels", "pixels_covariance")  # fields of Observations, in order
 _TOLD = ("settings", "figures", "versions", "doubts", "warnings", "rejected_views", "rejected_corners")
-_LONG = {  # parts of a record in JSON that are datasets, as an attribute has 64 kB at most
+_IN_JSON = (*_TOLD, "board", "view_names", "apart")
+_LONG = {  # of these, what is a dataset, as an attribute has 64 kB at most
     "rejected_corners": "JSON list of view, camera, corner, reason",
     "board": "JSON object: kind of target and its fields, lengths in m",
 }
+# What a rig file holds beside the rig, where it comes from, by its names there: the arrays of `_OF_RECORD`, what is in
+# JSON, and `table_view`, None without one. Observations are all located corners that were offered to the refinement;
+# those of the right images of views `apart` refer to places of the board n_views + 0, 1, ...
+Record = dict[str, Any]
 
 
-@dataclass(frozen=True)
-class CalibrationRecord:
-    """What a rig file holds beside the rig: where it comes from."""
-
-    board: Target
-    board_points: Array  # (n, 3) [m] as refined
-    table_view: int | None
-    board_thickness: float  # [m]
-    view_names: tuple[tuple[str, str], ...]
-    observations: Observations  # all located corners that were offered to the refinement
-    kept: Mask  # (m,)
-    residuals: Array  # (m, 2) observed - predicted [px]
-    unexplained_sigma: float  # [px]
-    R_left_board: Array  # (n_views + those apart, 3, 3), to which the observations' `view` refers
-    t_left_board: Array  # (n_views + those apart, 3) [m]
-    # of JSON's types: settings; figures (rms, chosen terms, cross-validation table, assessment); versions of software;
-    # doubts; warnings; rejected_views (view: reason); rejected_corners (view, camera, corner, reason)
-    told: dict[str, Any]
-    apart: tuple[int, ...] = ()  # views whose right image has a place of the board of its own, n_views + 0, 1, ...
-
-
-def record_of(calibration: StereoCalibration) -> CalibrationRecord:
+def record_of(calibration: StereoCalibration) -> Record:
     """What is worth keeping of a calibration, without the images."""
     r = calibration.refinement
     tried = ("n_parameters", "rms_px", "held_out_rms_px", "held_out_chi_square", "noise_px")
@@ -145,23 +126,23 @@ def record_of(calibration: StereoCalibration) -> CalibrationRecord:
         "settings": asdict(calibration.settings),
         "figures": figures,
         "versions": versions(("disctrack", "numpy", "scipy", "opencv-contrib-python-headless", "numba", "h5py")),
-        "doubts": calibration.doubts,
-        "warnings": calibration.warnings,
-        "rejected_views": calibration.rejected_views,
+        **{name: getattr(calibration, name) for name in ("doubts", "warnings", "rejected_views", "view_names")},
         "rejected_corners": calibration.rejected_corners(),
+        "board": calibration.board.described(),
+        "apart": apart.tolist(),
     }
-    return CalibrationRecord(
-        **{name: getattr(calibration, name) for name in ("board", "board_points", "table_view", "board_thickness")},
-        view_names=tuple((str(a), str(b)) for a, b in calibration.view_names),
-        observations=replace(seen, view=np.where(seen.camera == 1, place[seen.view], seen.view)),
-        kept=r.kept,
-        residuals=r.residuals,
-        unexplained_sigma=r.unexplained_sigma,
-        R_left_board=R,
-        t_left_board=t,
-        told=json.loads(json.dumps(told, default=lambda o: o.item() if hasattr(o, "item") else str(o))),
-        apart=tuple(apart.tolist()),
-    )
+    return {
+        **json.loads(json.dumps(told, default=lambda o: o.item() if hasattr(o, "item") else str(o))),
+        **vars(seen),
+        **{name: getattr(calibration, name) for name in ("board_points", "table_view", "board_thickness")},
+        "pixels_covariance": seen.covariance,
+        "view": np.where(seen.camera == 1, place[seen.view], seen.view),
+        "kept": r.kept.astype(np.uint8),
+        "residuals": r.residuals,
+        "unexplained_sigma": r.unexplained_sigma,
+        "R_left_board": R,
+        "t_left_board": t,
+    }
 
 
 def versions(packages: Sequence[str]) -> dict[str, str]:
@@ -177,12 +158,9 @@ def versions(packages: Sequence[str]) -> dict[str, str]:
 
 
 @checked
-def write_rig(
-    path: str | os.PathLike[str], content: StereoRig | StereoCalibration, record: CalibrationRecord | None = None
-) -> None:
+def write_rig(path: str | os.PathLike[str], content: StereoRig | StereoCalibration) -> None:
     """Write a rig file: whole or not at all (a temporary file beside it, fsync, rename).
 
-    record : where a rig comes from; a calibration has its own
     Raises RigFileError if it cannot be written.
 
         >>> write_rig("rig.h5", read_rig("clip/results/rig.h5"))
@@ -193,7 +171,7 @@ def write_rig(
     part = path.with_name(path.name + ".part")
     try:
         with open(part, "wb") as handle:
-            handle.write(rig_bytes(content, record))
+            handle.write(rig_bytes(content))
             handle.flush()
             os.fsync(handle.fileno())
         os.replace(part, path)
@@ -203,16 +181,11 @@ def write_rig(
         raise RigFileError(f"{path}: the rig cannot be written ({error}): no such folder, or no room in it") from error
 
 
-def rig_bytes(
-    content: StereoRig | StereoCalibration,
-    record: CalibrationRecord | None = None,
-    attributes: Mapping[str, Any] = {},
-) -> memoryview:
+def rig_bytes(content: StereoRig | StereoCalibration, attributes: Mapping[str, Any] = {}) -> memoryview:
     """A rig file, made in memory: the HDF5 library crashes where a disk is full.
 
     attributes : of the root, beside its own
     """
-    rig, record = (content, record) if isinstance(content, StereoRig) else (content.rig, record_of(content))
     buffer = io.BytesIO()
     with h5py.File(buffer, "w") as file:
         file.attrs.update(schema=SCHEMA, schema_version=SCHEMA_VERSION)
@@ -221,16 +194,16 @@ def rig_bytes(
             "points_right = R_right_left @ points_left + t_right_left; Brown distortion, OpenCV's coefficients; "
             "pixel (0, 0) is the centre of the top-left pixel; camera axes: x right, y down, z along the view."
         )
-        write_rig_group(file.create_group("rig"), rig)
-        if record is not None:
-            _write_record(file.create_group("calibration"), record)
+        write_rig_group(file.create_group("rig"), content if isinstance(content, StereoRig) else content.rig)
+        if isinstance(content, StereoCalibration):
+            _write_record(file.create_group("calibration"), record_of(content))
         file.attrs.update(attributes, complete=1)
     return sealed(buffer)
 
 
 def put_array(group: h5py.Group, name: str, value: Any, row: Dataset) -> None:
     """A dataset with its unit and description."""
-    data = np.asarray(value, np.uint8 if row.kind == "u" else None)
+    data = np.asarray(value)
     options = {"compression": "gzip", "shuffle": True, "fletcher32": True} if data.size > 1000 else {}
     dataset = group.create_dataset(name, data=data, **options)
     dataset.attrs.update(units=row.units, description=row.description)
@@ -283,19 +256,17 @@ def write_attributes(group: h5py.Group, document: Mapping[str, Any]) -> None:
                 group.attrs[name] = array.astype(np.uint8 if array.dtype == bool else array.dtype)
 
 
-def _write_record(group: h5py.Group, record: CalibrationRecord) -> None:
-    write_attributes(group, {name: record.told[name] for name in ("settings", "figures", "versions")})
-    group.attrs["table_view"] = -1 if record.table_view is None else record.table_view
-    board = {"board": record.board.described(), "view_names": record.view_names, "apart": record.apart}
-    for name, part in (record.told | board).items():
+def _write_record(group: h5py.Group, record: Record) -> None:
+    write_attributes(group, {name: record[name] for name in ("settings", "figures", "versions")})
+    group.attrs["table_view"] = -1 if record["table_view"] is None else record["table_view"]
+    for name in _IN_JSON:
         if name in _LONG:
-            group.create_dataset(name, data=json.dumps(part), dtype=h5py.string_dtype())
+            group.create_dataset(name, data=json.dumps(record[name]), dtype=h5py.string_dtype())
             group[name].attrs["description"] = _LONG[name]
         else:
-            group.attrs[name] = json.dumps(part)
-    values = vars(record) | vars(record.observations) | {"pixels_covariance": record.observations.covariance}
+            group.attrs[name] = json.dumps(record[name])
     for name, row in _OF_RECORD.items():
-        put_array(group, name, values[name], row)
+        put_array(group, name, record[name], row)
 
 
 # --- reading ---------------------------------------------------------------------------------------------------------
@@ -311,7 +282,7 @@ def read_rig(path: str | os.PathLike[str]) -> StereoRig:
     return read_rig_file(path)[0]
 
 
-def read_rig_file(path: str | os.PathLike[str]) -> tuple[StereoRig, CalibrationRecord | None]:
+def read_rig_file(path: str | os.PathLike[str]) -> tuple[StereoRig, Record | None]:
     """The rig, and where it comes from; None of one that was imported without its corners.
 
     Raises RigFileError if the file is missing, damaged or something else.
@@ -366,7 +337,7 @@ def _get(group: h5py.Group, name: str, row: Dataset, sizes: Mapping[str, int] | 
     values = np.asarray(dataset[()])
     if values.dtype.kind == "f" and not np.isfinite(values).all():
         raise RigFileError(f"{group.name}/{name} holds values that are not finite")
-    return values
+    return values[()]
 
 
 def read_rig_group(group: h5py.Group) -> StereoRig:
@@ -410,28 +381,17 @@ def read_beside_cameras(group: h5py.Group, of_cameras: Iterable[Sequence[NDArray
     return StereoRig(cameras[0], cameras[1], world_is_table=is_table, **values)
 
 
-def _read_record(group: h5py.Group) -> CalibrationRecord:
+def _read_record(group: h5py.Group) -> Record:
     def text(name: str) -> Any:
         if name == "doubts" and name not in group.attrs:  # of an earlier file
             return []
         return json.loads(group[name].asstr()[()] if name in _LONG else group.attrs[name])
 
-    board, names, apart = target_of(text("board")), text("view_names"), tuple(text("apart"))
-    sizes = {"points": len(board.points), "places": len(names) + len(apart), "seen": len(group["pixels"])}
-    known: dict[str, Any] = {name: _get(group, name, row, sizes) for name, row in _OF_RECORD.items()}
-    for name, limit in (("view", sizes["places"]), ("camera", 2), ("point", sizes["points"])):
-        index = known[name] = known[name].astype(np.intp)
-        if len(index) and not (index.min() >= 0 and index.max() < limit):
+    record, table_view = {name: text(name) for name in _IN_JSON}, int(group.attrs["table_view"])
+    points, places = len(target_of(record["board"]).points), len(record["view_names"]) + len(record["apart"])
+    sizes = {"points": points, "places": places, "seen": len(group["pixels"])}
+    record |= {name: _get(group, name, row, sizes) for name, row in _OF_RECORD.items()}
+    for name, limit in (("view", places), ("camera", 2), ("point", points)):
+        if len(record[name]) and not (record[name].min() >= 0 and record[name].max() < limit):
             raise RigFileError(f"{group.name}/{name} points beyond the {limit} there are")
-    table_view = int(group.attrs["table_view"])
-    known |= {name: float(known[name]) for name in ("board_thickness", "unexplained_sigma")}
-    known |= {
-        "board": board,
-        "view_names": tuple((str(left), str(right)) for left, right in names),
-        "apart": apart,
-        "told": {name: text(name) for name in _TOLD},
-        "table_view": None if table_view < 0 else table_view,
-        "observations": Observations(*(known.pop(name) for name in _OBSERVED)),
-        "kept": known["kept"].astype(bool),
-    }
-    return CalibrationRecord(**known)
+    return record | {"table_view": None if table_view < 0 else table_view}

@@ -15,7 +15,7 @@ from calibration.board.search import Progress
 from calibration.board.target import Target
 from calibration.kit.arguments import checked
 from calibration.kit.seal import check_seal
-from calibration.rig_file import CalibrationRecord, read_rig, read_rig_file, rig_bytes
+from calibration.rig_file import Record, read_rig, read_rig_file, rig_bytes
 from disctrack.analyse.declaration import Boards
 from disctrack.calibrate.views import TargetImages, calibrate_views, declared_views
 from disctrack.errors import CalibrationError, OutputError, RecordingError, RigFileError
@@ -101,14 +101,14 @@ def boards_in(rig_file: Path, recording: Recording) -> Boards | None:
     return boards_of(record, None if recording.views is None else declared_views(recording, recording.views))
 
 
-def boards_of(record: CalibrationRecord, views: TargetImages | None, numbers: Sequence[int] = ()) -> Boards:
+def boards_of(record: Record, views: TargetImages | None, numbers: Sequence[int] = ()) -> Boards:
     """Where the board was in views; their numbers count those, too, that could not be read. numbers : of `views`"""
     known = {} if views is None else {str(view): i for i, view in enumerate(views.left)}
-    found = [known.get(left, i) for i, (left, _) in enumerate(record.view_names)]
+    found = [known.get(left, i) for i, (left, _) in enumerate(record["view_names"])]
     found = [numbers[i] for i in found] if numbers else found
-    places = dict(zip(found, zip(record.R_left_board, record.t_left_board, strict=True), strict=False))
-    view = None if record.table_view is None else found[record.table_view]
-    return Boards(places, view, record.board_thickness, noticed_in(record.told))
+    places = dict(zip(found, zip(record["R_left_board"], record["t_left_board"], strict=True), strict=False))
+    view = None if record["table_view"] is None else found[record["table_view"]]
+    return Boards(places, view, record["board_thickness"], noticed_in(record))
 
 
 def noticed_in(told: Mapping[str, Any]) -> tuple[Finding, ...]:

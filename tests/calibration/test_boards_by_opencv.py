@@ -7,7 +7,15 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from calibration import Board, BoardTolerances, CalibrationSettings, Terms, calibrate_from_corners, refine_stereo
+from calibration import (
+    Board,
+    BoardTolerances,
+    CalibrationSettings,
+    Observations,
+    Terms,
+    calibrate_from_corners,
+    refine_stereo,
+)
 from calibration.fit.board_motion import BoardMotion, motions
 from calibration.fit.normal_equations import Problem
 from calibration.fit.priors import BEND, MISPRINT, STRETCH, board_prior, priors_of
@@ -190,10 +198,11 @@ def test_a_rig_file_keeps_where_the_boards_were(tmp_path):
     assert found.refinement.model.apart.all()
     write_rig(tmp_path / "rig.h5", found)
     _, record = read_rig_file(tmp_path / "rig.h5")
-    places = {name: getattr(record, name)[:, None].repeat(2, axis=1) for name in ("R_left_board", "t_left_board")}
-    model, o = replace(found.refinement.model, **places), record.observations
-    assert_allclose(o.pixels - predict_pixels(model, o), record.residuals, atol=1e-9)
-    assert [found.view_names[v] for v in record.apart] == list(found.view_names)
+    places = {name: record[name][:, None].repeat(2, axis=1) for name in ("R_left_board", "t_left_board")}
+    model = replace(found.refinement.model, **places)
+    o = Observations(*(record[name] for name in ("view", "camera", "point", "pixels", "pixels_covariance")))
+    assert_allclose(o.pixels - predict_pixels(model, o), record["residuals"], atol=1e-9)
+    assert [found.view_names[v] for v in record["apart"]] == list(found.view_names)
 
 
 TOUCH = np.radians([0.05, -0.04, 0.03]), np.array([1e-4, 0.0, 0.0])  # 0.07 deg: 1.1 px

@@ -129,8 +129,8 @@ def test_exchanged_images_are_found_out(scene_maker, rng, tmp_path):
     assert np.isfinite(found.rms_per_view_px).all()
     write_rig(tmp_path / "rig.h5", found)
     _, record = read_rig_file(tmp_path / "rig.h5")
-    assert record.apart == (2, 7)
-    assert record.R_left_board.shape == (12, 3, 3)
+    assert record["apart"] == [2, 7]
+    assert record["R_left_board"].shape == (12, 3, 3)
     with pytest.raises(CalibrationError, match="table view 2 cannot be used"):
         calibrate_from_corners(left, right, BOARD, FLAT, table_view=2)
 
