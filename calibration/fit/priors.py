@@ -32,33 +32,20 @@ RIPPLE = 3e-3  # the same out of the plane
 
 
 @dataclass(frozen=True)
-class BoardPrior:
-    """Of a target's shape: normal about the declared points, along the directions in which they may move."""
-
-    nominal: Array  # (n, 3) [m]
-    to_shape: Array  # (s2, 3 n) parameters of the shape from displacements of the points
-    information: Array  # (s2, s2)
-
-    def normal(self, points: Array) -> tuple[Array, float]:
-        """Gradient (s2,) towards the prior at points (n, 3) [m], and its part of chi-square."""
-        shape = self.to_shape @ (points - self.nominal).reshape(-1)
-        pull = self.information @ shape
-        return -pull, float(shape @ pull)
-
-
-@dataclass(frozen=True)
 class Prior:
     """Deviations `rows @ parameters - at`, in sigmas, of the intrinsics of each camera of a `StereoModel`.
 
-    Focal lengths come beside them, by their logarithms.
+    Focal lengths come beside them, by their logarithms. The target's shape is normal about the declared points.
     """
 
     rows: Array  # (2, 8, 9)
     at: Array  # (2, 8)
+    # Of the target: its points as declared (n, 3) [m]; the parameters of its shape, as far as that is refined, from the
+    # displacements of these (s2, 3 n); and their information (s2, s2)
+    board: tuple[Array, Array, Array]
     # Beside corners that are weighted by their noise, where views disagree by this much more (4 to 70 times in variance
     # on photographs), a prior counts that many times.
     weight: float = 1.0
-    board: BoardPrior | None = None  # where the target's shape is refined
 
     def normal(self, model: StereoModel, stereo_basis: Array) -> tuple[Array, Array, float]:
         """Information (s, s) at the model, gradient (s,) towards the prior, and its part of chi-square.
@@ -78,10 +65,11 @@ class Prior:
                 cost += float(np.log1p(square)) - square
             information[own, own], gradient[own] = J.T @ (weight[:, None] * J), -J.T @ (weight * z)
         information, gradient = stereo_basis.T @ information @ stereo_basis, stereo_basis.T @ gradient
-        if self.board is not None:
-            pull, of_board = self.board.normal(model.points)
-            information = scipy.linalg.block_diag(information, self.board.information)
-            gradient, cost = np.concatenate([gradient, pull]), cost + of_board
+        nominal, to_shape, of_shape = self.board
+        shape = to_shape @ (model.points - nominal).reshape(-1)
+        pull = of_shape @ shape
+        information = scipy.linalg.block_diag(information, of_shape)
+        gradient, cost = np.concatenate([gradient, -pull]), cost + float(shape @ pull)
         return self.weight * information, self.weight * gradient, self.weight * cost
 
 
@@ -100,16 +88,14 @@ def priors_of(model: StereoModel, nominal: Array, shape_basis: Array) -> Prior:
         middle[1:3] = 0.5 * (size - 1) / (CENTRE * diagonal)
         own[[3, 4, 5], [4, 5, 8]] = np.array([corner**2, corner**4, corner**6]) / RADIAL  # k1, k2, k3
         own[[6, 7], [6, 7]] = 3 * corner / TANGENTIAL
-    return Prior(rows, at, board=board_prior(nominal, shape_basis))
+    return Prior(rows, at, board_prior(nominal, shape_basis))
 
 
-def board_prior(nominal: Array, shape_basis: Array) -> BoardPrior | None:
-    """Of the target's shape along `shape_basis` (n, 3, s2); None if it has none. The smooth part and the rest apart."""
-    if not shape_basis.shape[-1]:
-        return None
+def board_prior(nominal: Array, shape_basis: Array) -> tuple[Array, Array, Array]:
+    """`Prior.board` of a shape along `shape_basis` (n, 3, s2): of the smooth part and of the rest, apart."""
     basis, smooth = (b.reshape(nominal.size, -1) for b in (shape_basis, board_basis(nominal, "warped")))
     size = float(np.abs(nominal - nominal.mean(0)).max())
     along = np.linalg.pinv(smooth) @ basis
     rest = (basis - smooth @ along) / (size * np.tile([MISPRINT, MISPRINT, RIPPLE], len(nominal)))[:, None]
     along = along / (size * np.array([BEND, BEND, BEND, STRETCH, STRETCH]))[:, None]
-    return BoardPrior(nominal, np.asarray(np.linalg.pinv(basis)), along.T @ along + rest.T @ rest)
+    return nominal, np.asarray(np.linalg.pinv(basis)), along.T @ along + rest.T @ rest
