@@ -202,38 +202,6 @@ def board_turns(n: int) -> list[Array]:
     return [np.linalg.matrix_power(quarter, k * 4 // n) for k in range(n)]
 
 
-@dataclass(frozen=True)
-class Order:
-    """A hypothesis of which images are pairs: left view v and the right one v + late, or last - v + late."""
-
-    late: int = 0
-    reversed: bool = False
-    mirrored: bool = False  # the images of one camera
-
-    def partner(self, v: int, names: Names) -> int:
-        """The right view of a left one."""
-        return (len(names) - 1 - v if self.reversed else v) + self.late
-
-    def told(self, found: Pairing, both: Sequence[int], stored: Pairing, names: Names) -> str:
-        """Why the pairs `both`, left views of this order, are believed against those stored, and what to do."""
-        if self.mirrored:
-            return (
-                f"the images of one of the two cameras are mirrored: if they are, {found.agrees.sum()} of {len(both)} "
-                f"pairs agree on one place of the cameras, as stored {stored.agrees.sum()}. Switch the mirroring off "
-                "where that camera's images are exported, or flip all of them, those of the motion too; so, too, if "
-                "it looks through a mirror"
-            )
-        v = both[int(np.argmin(found.distance))]
-        which = "in reversed order" if self.reversed else f"{abs(self.late)} {'late' if self.late > 0 else 'early'}"
-        return (
-            f"the left and the right views are no pairs as they are stored: the right ones come {which}. So paired, "
-            f"they agree on one place of the cameras to {np.median(found.distance):.2g} px, as stored to "
-            f"{np.median(stored.distance):.2g} px: {names[v][0]} shows the board where "
-            f"{names[self.partner(v, names)][1]} does. A frame was lost, or one camera began earlier: name or move "
-            "the files so that pairs have one number"
-        )
-
-
 def paired(
     sides: tuple[BoardPlaces, BoardPlaces],
     views: tuple[Sequence[int], Sequence[int]],
@@ -248,40 +216,58 @@ def paired(
     names : (left, right) of all views; n_orders : of the target's points that look the same
     """
     (left, right), is_square = sides, np.allclose(*np.ptp(nominal, axis=0)[:2])
-    turns = {
-        False: [right.turned(turn) for turn in board_turns(n_orders)],
-        True: [right.turned(turn @ np.diag([-1.0, 1.0, 1.0]), True) for turn in board_turns(4 if is_square else 2)],
-    }
+    as_seen = [right.turned(turn) for turn in board_turns(n_orders)]
+    mirrored = [right.turned(turn @ np.diag([-1.0, 1.0, 1.0]), True) for turn in board_turns(4 if is_square else 2)]
     place = [{view: i for i, view in enumerate(side)} for side in views]
 
-    def pairs_of(order: Order, among: Sequence[int]) -> Paired:
-        both = [v for v in among if order.partner(v, names) in place[1]]
-        b = np.array([place[1][order.partner(v, names)] for v in both], int)
-        return both, left[np.array([place[0][v] for v in both], int)], [one[b] for one in turns[order.mirrored]]
+    def pairs_of(right_of: NDArray, among: Sequence[int] = views[0], turns: Sequence[BoardPlaces] = as_seen) -> Paired:
+        both = [v for v in among if right_of[v] in place[1]]
+        b = np.array([place[1][right_of[v]] for v in both], int)
+        return both, left[np.array([place[0][v] for v in both], int)], [one[b] for one in turns]
 
-    def by(order: Order, least: int = LEAST_PAIRS) -> tuple[Pairing, list[int]] | None:
-        both, of_left, of_right = pairs_of(order, views[0])
-        return (likeliest(of_left, of_right, floor), both) if len(both) >= least and of_right else None
-
-    as_stored = by(Order(), 1)
-    if as_stored is None:
-        raise CalibrationError("no view shows the target to both cameras: the pair cannot be calibrated")
-    stored, both = as_stored
+    number = np.arange(len(names))
+    both, of_left, of_right = pairs_of(number)
     n = len(both)
+    if not n:
+        raise CalibrationError("no view shows the target to both cameras: the pair cannot be calibrated")
+    stored = likeliest(of_left, of_right, floor)
     if n < LEAST_PAIRS - 1 or (stored.agrees.all() and stored.usual < TOO_FAR * floor):
         return stored, ()
     shifts = [k for k in range(-MOST_LATE, MOST_LATE + 1) if abs(k) <= n - LEAST_PAIRS]
-    tried = [Order(k, backwards) for backwards in (False, True) for k in shifts if k or backwards]
-    others = {order: found for order in (Order(mirrored=True), *tried) if (found := by(order)) is not None}
+    orders = [(f"{abs(k)} {'late' if k > 0 else 'early'}", number + k) for k in shifts if k]
+    orders += [("in reversed order", number[::-1] + k) for k in shifts]
+    tried = [("", number, pairs_of(number, turns=mirrored)), *((how, by, pairs_of(by)) for how, by in orders)]
+    others = [(how, by, which, likeliest(a, b, floor)) for how, by, (which, a, b) in tried if len(which) >= LEAST_PAIRS]
     if others:
-        likely = max(others, key=lambda order: others[order][0].evidence)
-        if others[likely][0].is_likelier(stored):
-            raise CalibrationError(likely.told(*others[likely], stored, names))
-    _require_agreement(stored, [found.evidence for order, (found, _) in others.items() if not order.mirrored])
+        how, by, which, found = max(others, key=lambda one: one[-1].evidence)
+        if found.is_likelier(stored):
+            raise CalibrationError(_told(how, found, stored, [(names[v][0], names[by[v]][1]) for v in which]))
+    _require_agreement(stored, [found.evidence for how, _, _, found in others if how])
     notes = _late(pairs_of, [v for v, fits in zip(both, stored.agrees, strict=True) if not fits], stored, names)
     if notes and 2 * stored.agrees.sum() <= n:
         raise CalibrationError(f"{'; '.join(notes)}. As stored {stored.agrees.sum()} of {n} pairs are right")
     return stored, notes
+
+
+def _told(how: str, found: Pairing, stored: Pairing, names: Names) -> str:
+    """Why pairs of these names are believed against those stored, and what to do.
+
+    how : the right views come; "": as stored, with the images of one camera mirrored
+    """
+    if not how:
+        return (
+            f"the images of one of the two cameras are mirrored: if they are, {found.agrees.sum()} of {len(names)} "
+            f"pairs agree on one place of the cameras, as stored {stored.agrees.sum()}. Switch the mirroring off "
+            "where that camera's images are exported, or flip all of them, those of the motion too; so, too, if "
+            "it looks through a mirror"
+        )
+    shown = names[int(np.argmin(found.distance))]
+    return (
+        f"the left and the right views are no pairs as they are stored: the right ones come {how}. So paired, "
+        f"they agree on one place of the cameras to {np.median(found.distance):.2g} px, as stored to "
+        f"{np.median(stored.distance):.2g} px: {shown[0]} shows the board where {shown[1]} does. A frame was lost, or "
+        "one camera began earlier: name or move the files so that pairs have one number"
+    )
 
 
 def _require_agreement(stored: Pairing, others: Sequence[float]) -> None:
@@ -298,12 +284,12 @@ def _require_agreement(stored: Pairing, others: Sequence[float]) -> None:
 
 
 def _late(
-    pairs_of: Callable[[Order, Sequence[int]], Paired], odd: Sequence[int], found: Pairing, names: Names
+    pairs_of: Callable[[NDArray, Sequence[int]], Paired], odd: Sequence[int], found: Pairing, names: Names
 ) -> tuple[str, ...]:
     """A warning about pairs, of those that do not fit, that would with a later or an earlier right view."""
     rest, told = list(odd), []
     for k in sorted(range(-MOST_LATE, MOST_LATE + 1), key=abs)[1:]:
-        both, left, turns = pairs_of(Order(k), rest)
+        both, left, turns = pairs_of(np.arange(len(names)) + k, rest)
         off = np.min([apart(left, right, found.R_right_left[None], found.t_right_left[None])[0] for right in turns], 0)
         which = [v for v, distance in zip(both, off, strict=True) if distance < TOO_FAR * found.usual]
         rest = [v for v in rest if v not in which]
