@@ -66,7 +66,9 @@ def fit_jointly(
         if sorted(pairs.apart) == sorted(used.apart) and not pairs.bad_images:
             break
         bad_images |= pairs.bad_images
-        observations, used = _without_images(observations, pairs)
+        for view, camera in pairs.bad_images:
+            observations = observations[(observations.view != view) | (observations.camera != camera)]
+        used = pairs
         refinement, again = refined(used, (refinement.terms,))
         candidates = (*candidates, *again)
     motion, lens = motion_between_exposures(refinement), fit_lens_field(refinement, nominal)
@@ -81,11 +83,3 @@ def fit_jointly(
         candidates = (*candidates, *again)
         lens = fit_lens_field(refinement, nominal)
     return JointFit(lens.refinement if lens else refinement, lens, candidates, pairs, moved, motion, bad_images)
-
-
-def _without_images(observations: Observations, pairs: Pairs) -> tuple[Observations, Pairs]:
-    """Leave out images that do not even fit alone."""
-    for view, camera in pairs.bad_images:
-        observations = observations[(observations.view != view) | (observations.camera != camera)]
-    apart = {view: why for view, why in pairs.apart.items() if not {(view, 0), (view, 1)} & set(pairs.bad_images)}
-    return observations, replace(pairs, apart=apart, bad_images={})

@@ -12,7 +12,6 @@ about it is their error.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -75,35 +74,31 @@ def fit_view(
     starts = _starts(grey, rough, axes, blur, 0.7 * min(plain, 0.57))
     for iterations, tolerance, most in ((12, 1e-2, FIRST_REACH), (30, 1e-5, np.inf)):
         windows = _windows(starts[:, :2], axes, blur, grey.shape, -plain * np.sign(starts[:, 6]), most)
-        fit = _Fit(*fit_corners(grey, windows, starts, known, noise, iterations, tolerance))
-        ok = fit.converged & seen
-        ok &= _displacement(fit.found[:, :2], ok, axes, inner_corners) < MAX_DISPLACEMENT
+        fit: _Fit = fit_corners(grey, windows, starts, known, noise, iterations, tolerance)
+        found, _, sums, converged = fit
+        ok = converged & seen
+        ok &= _displacement(found[:, :2], ok, axes, inner_corners) < MAX_DISPLACEMENT
         if not ok.any():
             break
-        noise, blur = _measured_noise(fit.sums[ok]), float(np.median(fit.found[ok, 4]))
-        starts = np.where(ok[:, None], fit.found, starts)
-        points = np.where(ok[:, None], fit.found[:, :2], rough)
+        noise, blur = _measured_noise(sums[ok]), float(np.median(found[ok, 4]))
+        starts = np.where(ok[:, None], found, starts)
+        points = np.where(ok[:, None], found[:, :2], rough)
         axes = local_axes(points, ok, inner_corners)
-        bends = _line_curvature(points, ok, fit.found[:, 2:4], inner_corners)
-        known = np.concatenate([bends, _contrast_gradient(points, ok, fit.found[:, 5:7])], axis=1)
+        bends = _line_curvature(points, ok, found[:, 2:4], inner_corners)
+        known = np.concatenate([bends, _contrast_gradient(points, ok, found[:, 5:7])], axis=1)
     _mend_with_smaller_windows(grey, fit, windows, starts, known, noise)
     return _judged(grey, fit, axes, rough, inner_corners, seen, plain)
 
 
-class _Fit(NamedTuple):
-    """What the kernel returns for the corners of a view."""
+_Fit = tuple[Array, Array, Array, Mask]  # what the kernel returns for the corners of a view
 
-    found: Array
-    covariance: Array
-    sums: Array
-    converged: Mask
 
-    @property
-    def chi_square(self) -> Array:
-        """Reduced chi-square over the whole window (n,); inf where there was no fit."""
-        with np.errstate(invalid="ignore", divide="ignore"):
-            value = self.sums[:, 0] / np.maximum(self.sums[:, 1] - N_CORNER, 1.0)
-        return np.where(self.converged & np.isfinite(value), value, np.inf)
+def _chi_square(fit: _Fit) -> Array:
+    """Reduced chi-square over the whole window (n,); inf where there was no fit."""
+    _, _, sums, converged = fit
+    with np.errstate(invalid="ignore", divide="ignore"):
+        value = sums[:, 0] / np.maximum(sums[:, 1] - N_CORNER, 1.0)
+    return np.where(converged & np.isfinite(value), value, np.inf)
 
 
 def _mend_with_smaller_windows(
@@ -111,14 +106,14 @@ def _mend_with_smaller_windows(
 ) -> None:
     """Fit again, in place, nearer to the corner where something else reaches into the window: a dirty square."""
     for factor in (0.6, 0.35):
-        limit = BAD_WINDOW * max(float(np.median(fit.chi_square)), 1.0)
-        bad = np.flatnonzero(fit.chi_square > limit)
+        chi_square = _chi_square(fit)
+        bad = np.flatnonzero(chi_square > BAD_WINDOW * max(float(np.median(chi_square)), 1.0))
         if not len(bad):
             break
         smaller = windows[bad].copy()
         smaller[:, 10:12] *= factor
-        again = _Fit(*fit_corners(grey, smaller, starts[bad], known[bad], noise, 30, 1e-5))
-        better = again.chi_square < 0.5 * fit.chi_square[bad]
+        again = fit_corners(grey, smaller, starts[bad], known[bad], noise, 30, 1e-5)
+        better = _chi_square(again) < 0.5 * chi_square[bad]
         for old, new in zip(fit, again, strict=True):
             old[bad[better]] = new[better]
 
@@ -241,20 +236,20 @@ def _judged(
     grey: Array, fit: _Fit, axes: Array, rough: Array, counts: tuple[int, int], seen: Mask, plain: float
 ) -> CornerView:
     """Test every corner; where the fine model does not hold, the saddle point stands in with its own covariance."""
-    found, sums = fit.found, fit.sums
+    found, by_noise, sums, ended = fit
     spacing = float(np.median(np.linalg.norm(axes, axis=-1)))
     edge_pixels = sums[:, 1] - sums[:, 4] - sums[:, 7]
     with np.errstate(invalid="ignore", divide="ignore"):
         chi_square = sums[:, 8] / np.maximum(edge_pixels, 1.0)
     contrast = 2 * np.abs(found[:, 6])
-    converged = fit.converged & np.isfinite(fit.covariance).all((1, 2)) & seen
+    converged = ended & np.isfinite(by_noise).all((1, 2)) & seen
     typical = float(np.median(contrast[converged])) if converged.any() else 0.0
     spread = float(np.median(chi_square[converged])) if converged.any() else 1.0
     chi_limit = MAX_CHI_SQUARE * max(spread, 1.0)  # compressed images have correlated noise: judge against the view
     faint = converged & (contrast < MIN_CONTRAST_RATIO * typical)
     displaced = _displacement(found[:, :2], converged, axes, counts)
     fine = converged & (displaced < MAX_DISPLACEMENT) & ~faint & (chi_square < chi_limit)
-    covariance = fit.covariance * np.maximum(chi_square, 1.0)[:, None, None]
+    covariance = by_noise * np.maximum(chi_square, 1.0)[:, None, None]
     points, reasons = found[:, :2].copy(), np.where(faint, "covered, or in glare", "").astype(object)
     saddles = saddle_points(grey, np.where(fine[:, None], points, rough), spacing * min(plain / WINDOW, 1.0))
     expected, sigma = smooth_grid(np.where(fine[:, None], points, saddles), counts, seen)

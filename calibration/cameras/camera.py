@@ -74,29 +74,19 @@ def project_with_jacobians(points_camera: Array, camera: Camera) -> tuple[Array,
     """Pixels (..., 2), d pixel / d point (..., 2, 3) and d pixel / d intrinsics (..., 2, 9); NaN behind the camera."""
     a, b, iz = _on_unit_depth(points_camera)
     xd, yd, xd_a, xd_b, yd_b = distorted(a, b, *camera.distortion)
-    yd_a = xd_b
-    pixels = np.stack([camera.fx * xd + camera.cx, camera.fy * yd + camera.cy], axis=-1)
-
-    d_point = np.empty((*a.shape, 2, 3))
-    d_point[..., 0, 0] = camera.fx * xd_a * iz
-    d_point[..., 0, 1] = camera.fx * xd_b * iz
-    d_point[..., 0, 2] = -camera.fx * (xd_a * a + xd_b * b) * iz
-    d_point[..., 1, 0] = camera.fy * yd_a * iz
-    d_point[..., 1, 1] = camera.fy * yd_b * iz
-    d_point[..., 1, 2] = -camera.fy * (yd_a * a + yd_b * b) * iz
-
-    r2 = a * a + b * b
-    d_intrinsics = np.zeros((*a.shape, 2, N_INTRINSIC))
-    d_intrinsics[..., 0, 0], d_intrinsics[..., 1, 1] = xd, yd
-    d_intrinsics[..., 0, 2] = d_intrinsics[..., 1, 3] = 1.0
-    for column, factor in ((4, r2), (5, r2**2), (8, r2**3)):
-        d_intrinsics[..., 0, column] = camera.fx * a * factor
-        d_intrinsics[..., 1, column] = camera.fy * b * factor
-    d_intrinsics[..., 0, 6] = camera.fx * 2 * a * b
-    d_intrinsics[..., 1, 6] = camera.fy * (r2 + 2 * b * b)
-    d_intrinsics[..., 0, 7] = camera.fx * (r2 + 2 * a * a)
-    d_intrinsics[..., 1, 7] = camera.fy * 2 * a * b
-    return pixels, d_point, d_intrinsics
+    fx, fy, x, y, r2 = camera.fx, camera.fy, camera.fx * a, camera.fy * b, a * a + b * b
+    d_point = [
+        [fx * xd_a, fx * xd_b, -fx * (xd_a * a + xd_b * b)],
+        [fy * xd_b, fy * yd_b, -fy * (xd_b * a + yd_b * b)],
+    ]
+    zero, one = np.zeros_like(a), np.ones_like(a)
+    d_intrinsics = [
+        [xd, zero, one, zero, x * r2, x * r2**2, fx * 2 * a * b, fx * (r2 + 2 * a * a), x * r2**3],
+        [zero, yd, zero, one, y * r2, y * r2**2, fy * (r2 + 2 * b * b), fy * 2 * a * b, y * r2**3],
+    ]
+    pixels = np.stack([fx * xd + camera.cx, fy * yd + camera.cy], axis=-1)
+    by_point, by_intrinsics = (np.moveaxis(np.array(rows), (0, 1), (-2, -1)) for rows in (d_point, d_intrinsics))
+    return pixels, by_point * iz[..., None, None], by_intrinsics
 
 
 def _on_unit_depth(points_camera: Array) -> tuple[Array, Array, Array]:

@@ -281,16 +281,12 @@ def candidate(refinement: Refinement, quietest: Refinement) -> TermsTried:
     )
 
 
-def best(candidates: list[TermsTried]) -> int:
-    """Least held-out chi-square; a simpler model that is not clearly worse comes first."""
-    winner = min(candidates, key=lambda c: c.held_out_chi_square)
-    for i in sorted(range(len(candidates)), key=lambda i: candidates[i].n_parameters):
-        difference = candidates[i].per_view - winner.per_view
-        difference = difference[np.isfinite(difference)]
-        error = float(np.std(difference) / np.sqrt(max(len(difference) - 1, 1)))
-        if np.mean(difference) <= SIMPLER_WITHIN * error:
-            return i
-    return candidates.index(winner)
+def is_near(row: TermsTried, best: TermsTried) -> bool:
+    """Whether a model's held-out chi-square is not clearly worse than the least."""
+    difference = row.per_view - best.per_view
+    difference = difference[np.isfinite(difference)]
+    error = float(np.std(difference) / np.sqrt(max(len(difference) - 1, 1)))
+    return bool(np.mean(difference) <= SIMPLER_WITHIN * error)
 
 
 def choose_board(
@@ -311,4 +307,5 @@ def choose_board(
     quietest = min(fits, key=lambda fit: fit.unexplained_sigma)
     fits = [fit for fit in fits if fit.unexplained_sigma <= HOPELESS * quietest.unexplained_sigma + 1e-3]
     table = [candidate(fit, quietest) for fit in fits]
-    return fits[best(table)], tuple(table)
+    best = min(table, key=lambda row: row.held_out_chi_square)
+    return next(fit for fit, row in zip(fits, table, strict=True) if is_near(row, best)), tuple(table)

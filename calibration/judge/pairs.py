@@ -231,14 +231,15 @@ def judge_pairs(observations: Observations, fit: Refinement, elsewhere: Collecti
     for i in np.flatnonzero(rms > TOO_FAR * typical) if len(rms) >= LEAST_PAIRS else ():
         misfit = f"RMS {rms[i]:.3f} px by itself, the median image has {typical:.3f} px"
         bad[divmod(int(images[i]), 2)] = f"{misfit}: blurred, or the board was found wrongly"
+    whole = ~np.isin(pairs.views, [view for view, _ in bad])
     if len(pairs.views) >= LEAST_PAIRS:
         cost = pairs.cost_of_rest(~problem.apart[pairs.views])
         usual = max(float(np.median(cost[~np.isin(pairs.views, list(elsewhere))])), 6.0)
-        for k in np.flatnonzero(cost > TOO_FAR**2 * usual):
+        for k in np.flatnonzero(whole & (cost > TOO_FAR**2 * usual)):
             found[int(pairs.views[k])] = f"{pairs.pixels[k]:.2g} px apart, where corners scatter by {typical:.2g} px"
     R, t = fit.model.R_left_board.copy(), fit.model.t_left_board.copy()
     R[pairs.views], t[pairs.views] = alone.R_left_board[pairs.views], alone.t_left_board[pairs.views]
-    return Pairs(replace(fit.model, R_left_board=R, t_left_board=t), pairs.views, found, bad)
+    return Pairs(replace(fit.model, R_left_board=R, t_left_board=t), pairs.views[whole], found, bad)
 
 
 @dataclass(frozen=True)
