@@ -18,7 +18,7 @@ from calibration.kit.arrays import Array, evenly
 from disctrack.analyse.analysis import Analysis
 from disctrack.files.json_text import plain
 from disctrack.findings import carried
-from disctrack.report.blocks import Markup, Report, Text
+from disctrack.report.blocks import Markup, Report
 from disctrack.report.html import page
 from disctrack.report.palette import RED
 from disctrack.trajectory import FrameStatus, Trajectory
@@ -59,7 +59,7 @@ def motion_html(analysis: Analysis, name: str, drawn: Drawn | None = None) -> st
     trajectory = analysis.trajectory
     every = f"; every {_stride(trajectory)}th frame is shown" * (_stride(trajectory) > 1)
     said = f"{', '.join(map(' '.join, trajectory.facts().items()))}{every}"
-    report = Report(f"{name}: the motion", "", said, carried(trajectory.findings), blocks=[Text(body)])
+    report = Report(f"{name}: the motion", "", said, carried(trajectory.findings), blocks=[body])
     return page(report, {}, head=f"<style>{_STYLE}</style>")
 
 

@@ -12,7 +12,7 @@ from disctrack.analyse.analysis import Analysis
 from disctrack.analyse.power_laws import MODEL_EXPONENTS, Exponent, PowerLaws
 from disctrack.findings import Finding
 from disctrack.numbers import Measured, measured, unit_text
-from disctrack.report.blocks import Cell, Facts, Figures, Listing, Report, Section, Text
+from disctrack.report.blocks import Cell, Facts, Figures, Listing, Report, Section
 from disctrack.trajectory import FrameStatus
 from disctrack.trajectory.file import Provenance
 
@@ -32,7 +32,7 @@ def report_of(
 ) -> Report:
     """All of an analysis. findings : of the measurement;  files : written, the page first, the trajectory last"""
 
-    def section(title: str, numbers: tuple[str, ...], *blocks: Listing | Text) -> Section:
+    def section(title: str, numbers: tuple[str, ...], *blocks: Listing | str) -> Section:
         return Section(title, [*blocks, Figures([d for d in drawn if d.name.startswith(numbers)])])
 
     trajectory, laws, energy = analysis.trajectory, analysis.laws, analysis.energy
@@ -104,10 +104,10 @@ def _at_95(exponent: Exponent) -> Cell:
     return measured(exponent.value, exponent.half)
 
 
-def _exponents(analysis: Analysis) -> list[Listing | Text]:
+def _exponents(analysis: Analysis) -> list[Listing | str]:
     laws = analysis.laws
     if not laws.determined:
-        return [Text(f"No exponents are given: {laws.reason}.")]
+        return [f"No exponents are given: {laws.reason}."]
     asymptotic = _largest_nutation(analysis) <= ASYMPTOTIC_BELOW
     named = ("energy", laws.n_energy, 1.0), ("nutation", laws.n_theta, 1.0), ("precession rate", laws.n_psidot, -0.5)
     rows = [
@@ -125,7 +125,7 @@ def _exponents(analysis: Analysis) -> list[Listing | Text]:
     )
     header = ("exponent of", "95 %", "1 σ", *(name.split(",")[0] for name, _ in MODEL_EXPONENTS))
     return [
-        Text(said),
+        said,
         Listing(header, rows, "Exponents in (t_f - t) and the models that they agree with."),
         _windows_table(analysis.laws_by_window),
     ]

@@ -9,7 +9,7 @@ from disctrack.batch.records import FAILED, MEASURED, NOT_MEASURED, SKIPPED
 from disctrack.findings import Finding, Kind, Severity, of_kind
 from disctrack.frames import CAMERAS
 from disctrack.numbers import measured, probability, rounded
-from disctrack.report.blocks import Listing, Markup, Report, Section, Text
+from disctrack.report.blocks import Listing, Markup, Report, Section
 
 SAID = {SKIPPED: "measured before"}  # which is read long after the batch that found it done
 
@@ -31,7 +31,7 @@ def report_of(
     data = '<p>All columns: <a href="summary.csv">summary.csv</a>, <a href="summary.json">summary.json</a>.</p>'
     link = f'<p><a href="{together}">What the model lacks, all recordings together</a></p>'
     same = [f"{names}: the same images, one recording for any mean" for names in copies(rows)]
-    what = Text(
+    what = (
         "Values with one standard deviation; a dash where the recording does not determine a number. k_m from the dots "
         "is the only loss of a rolling model fitted to all images; in a diagnosis other losses enter beside it, and so "
         "its k_m differs."
@@ -42,8 +42,8 @@ def report_of(
         _verdict(rows),
         findings=[*_noticed(rows), *of_kind(Kind.OTHER, Severity.WARNING, same), *others],
         blocks=[
-            Section("Results", [what, table, Text(Markup(data))]),
-            Section("All recordings together", [Text(Markup(link))] if together else ()),
+            Section("Results", [what, table, Markup(data)]),
+            Section("All recordings together", [Markup(link)] if together else ()),
             Section("Repeats", _repeats(repeats) if repeats else ()),
         ],
         files=files,
@@ -83,7 +83,7 @@ def _noticed(rows: Sequence[Row]) -> list[Finding]:
     return found
 
 
-def _repeats(repeats: Sequence[Row]) -> list[Text | Listing]:
+def _repeats(repeats: Sequence[Row]) -> list[str | Listing]:
     said = (
         "Mean and standard deviation over the recordings of one disc on one surface, from one case as declared. "
         "χ² is their squared spread over the stated variances, per degree of freedom: far above 1, with a small "
@@ -103,7 +103,7 @@ def _repeats(repeats: Sequence[Row]) -> list[Text | Listing]:
     ]
     header = ("recordings", "", "n", "mean ± standard deviation", "χ²", "p")
     files = '<p>With weighted means: <a href="repeats.csv">repeats.csv</a>.</p>'
-    return [Text(said), Listing(header, cells), Text(Markup(files))]
+    return [said, Listing(header, cells), Markup(files)]
 
 
 def _counted(n: int, what: str) -> str:

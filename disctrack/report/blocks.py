@@ -1,4 +1,7 @@
-"""What a report is made of: each stage fills these blocks, and the writers set them (terminal, HTML, JSON)."""
+"""What a report is made of: each stage fills these blocks, and the writers set them (terminal, HTML, JSON).
+
+A paragraph is a string, and a list of sentences a list of strings; all else is one of the classes.
+"""
 
 from __future__ import annotations
 
@@ -22,20 +25,6 @@ _NOTHING: Mapping[str, Any] = MappingProxyType({})
 
 class Markup(str):
     """HTML that goes into a page as it is; no other writer shows it."""
-
-
-@dataclass(frozen=True)
-class Text:
-    """A paragraph."""
-
-    said: str
-
-
-@dataclass(frozen=True)
-class Items:
-    """A list of sentences."""
-
-    said: Sequence[str]
 
 
 @dataclass(frozen=True)
@@ -93,6 +82,8 @@ class Report:
 
 def is_empty(block: Any) -> bool:
     """True where a block has nothing to show."""
+    if isinstance(block, (str, list)):
+        return not block
     content = next(value for name, value in vars(block).items() if name not in ("title", "header"))
     return all(map(is_empty, content)) if isinstance(block, Section) else not content
 
@@ -142,11 +133,11 @@ def _block(block: Any) -> dict[str, Any] | None:
     if isinstance(block, Section):
         inner = [shown for b in block.blocks if (shown := _block(b))]
         return {"title": block.title, "blocks": inner} if inner else None
-    if is_empty(block) or isinstance(block, Figures) or (isinstance(block, Text) and isinstance(block.said, Markup)):
+    if is_empty(block) or isinstance(block, (Figures, Markup)):
         return None
     if isinstance(block, Facts):
         return {"facts": {name: _cell(value) for name, value in block.rows}}
     if isinstance(block, Listing):
         rows = [[_cell(cell) for cell in row] for row in block.rows]
         return {"caption": block.caption or block.folded, "header": list(block.header), "rows": rows}
-    return {"text": block.said if isinstance(block, Text) else list(block.said)}
+    return {"text": block}

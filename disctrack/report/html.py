@@ -16,12 +16,10 @@ from disctrack.report.blocks import (
     Cell,
     Facts,
     Figures,
-    Items,
     Listing,
     Markup,
     Report,
     Section,
-    Text,
     figures_in,
     is_empty,
 )
@@ -54,7 +52,7 @@ def page(report: Report, pictures: Mapping[str, str], head: str = "") -> str:
         f"<h1>{title}</h1>{NAV[0]}{NAV[1]}",
         f"<ul class=findings>{findings}</ul>" if findings else "",
         f"<p class=lead>{_text(report.verdict)}</p>" if report.verdict else "",
-        _html(Text(report.accuracy), pictures),
+        _html(report.accuracy, pictures),
         f"<div class=tiles>{tiles}</div>" if tiles else "",
         *(_html(block, pictures) for block in report.blocks),
     ]
@@ -95,10 +93,10 @@ def _html(block: Any, pictures: Mapping[str, str]) -> str:
     if isinstance(block, Section):
         inner = "\n".join(html for b in block.blocks if (html := _html(b, pictures)))
         return f"<section><h2>{escape(block.title)}</h2>\n{inner}</section>"
-    if isinstance(block, Text):
-        return block.said if isinstance(block.said, Markup) else f"<p>{_text(block.said)}</p>"
-    if isinstance(block, Items):
-        return f"<ul>{''.join(f'<li>{_text(said)}</li>' for said in block.said)}</ul>"
+    if isinstance(block, str):
+        return block if isinstance(block, Markup) else f"<p>{_text(block)}</p>"
+    if isinstance(block, list):
+        return f"<ul>{''.join(f'<li>{_text(said)}</li>' for said in block)}</ul>"
     if isinstance(block, Facts):
         return _table(Listing(("", ""), block.rows))
     if isinstance(block, Figures):

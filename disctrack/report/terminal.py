@@ -9,7 +9,7 @@ from itertools import chain
 from typing import Any, TextIO
 
 from disctrack.files.text import printable
-from disctrack.report.blocks import Cell, Facts, Items, Listing, Markup, Report, Section, Text, is_empty
+from disctrack.report.blocks import Cell, Facts, Listing, Markup, Report, Section, is_empty
 
 MOST_LINES = 10
 WIDTH = 100  # of lines in a file, and at most in a terminal
@@ -91,10 +91,10 @@ def _blocks(blocks: Iterable[Any], width: int) -> list[str]:
         if isinstance(block, Section):
             inner = _blocks(block.blocks, width)
             lines += ["", block.title, *inner] if inner else []
-        elif isinstance(block, Text):
-            lines += [] if isinstance(block.said, Markup) else _wrapped(block.said, width)
-        elif isinstance(block, Items):
-            for said in block.said:
+        elif isinstance(block, str):
+            lines += [] if isinstance(block, Markup) else _wrapped(block, width)
+        elif isinstance(block, list):
+            for said in block:
                 lines += _wrapped(said, width, "- ", "  ")
         elif isinstance(block, Facts):
             lines += _facts(block.rows, width)

@@ -1,27 +1,13 @@
 """From the motion section of a scene to the pose of the disc at any instant: at rest, by a table, or rolling."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
-
 import numpy as np
-from scipy.interpolate import CubicHermiteSpline, CubicSpline
+from scipy.interpolate import CubicHermiteSpline, CubicSpline, PPoly
 
-from calibration.kit.arrays import Array
 from disctrack.errors import SceneError
 from disctrack.rolling import Model, Motion, State, effects_from_tables, simulate, steady_precession, struck_disc
 from disctrack.synthetic.description import RollingMotion, Scene
 
 _SAMPLES_PER_FRAME = 4  # of the simulated motion; a cubic between them errs by 3e-8 of a nutation oscillation
-
-
-@dataclass(frozen=True)
-class SceneMotion:
-    """Pose of the disc over time, and for which frames it is known."""
-
-    pose: Callable[[Array], Array]  # (k,) times [s] -> (k, 6) q, SI and radians, angles not wrapped
-    rates: Callable[[Array], Array]  # (k,) times [s] -> (k, 6) dq/dt
-    n_frames: int
-    simulated: Motion | None = None  # the rolling model's own result, where the motion is one
 
 
 def true_frame_rate(scene: Scene) -> float:
@@ -34,22 +20,20 @@ def true_exposure(scene: Scene) -> float:
     return scene.faults.exposure_s or scene.cameras.exposure_s
 
 
-def motion_of(scene: Scene) -> SceneMotion:
-    """Motion that the scene asks for; raises SceneError where it cannot be had."""
+def motion_of(scene: Scene) -> tuple[PPoly, int]:
+    """Motion that the scene asks for: q (k, 6) at times (k,) [s], and the number of frames for which it is known.
+
+    SI and radians, angles not wrapped. Raises SceneError where it cannot be had.
+    """
     return {"static": _static, "table": _table, "rolling": _rolling}[scene.motion.kind](scene)
 
 
-def _static(scene: Scene) -> SceneMotion:
+def _static(scene: Scene) -> tuple[PPoly, int]:
     q = np.array(scene.motion.poses) * np.r_[np.full(3, 1e-3), np.full(3, np.pi / 180)]
-    rate = true_frame_rate(scene)
-
-    def pose(time: Array) -> Array:
-        return q[np.clip(np.rint(np.asarray(time) * rate).astype(int), 0, len(q) - 1)]
-
-    return SceneMotion(pose, lambda time: np.zeros_like(pose(time)), len(q))
+    return PPoly(q[None], (np.arange(len(q) + 1) - 0.5) / true_frame_rate(scene)), len(q)
 
 
-def _table(scene: Scene) -> SceneMotion:
+def _table(scene: Scene) -> tuple[PPoly, int]:
     path = scene.folder / scene.motion.table
     try:
         rows = np.load(path) if path.suffix == ".npy" else np.loadtxt(path, delimiter=",", ndmin=2)
@@ -59,18 +43,16 @@ def _table(scene: Scene) -> SceneMotion:
         raise SceneError(f"{path}: shape {rows.shape}; expected 2 or more rows of 7 with increasing t [s]")
     if not np.isfinite(rows).all():
         raise SceneError(f"{path}: row {np.flatnonzero(~np.isfinite(rows).all(axis=1))[0]} holds no finite number")
-    spline = CubicSpline(rows[:, 0], rows[:, 1:])
     n = _frames_within(scene, rows[0, 0], rows[-1, 0], str(path))
-    return SceneMotion(spline, spline.derivative(), n)
+    return CubicSpline(rows[:, 0], rows[:, 1:]), n
 
 
-def _rolling(scene: Scene) -> SceneMotion:
+def _rolling(scene: Scene) -> tuple[PPoly, int]:
     motion = simulate_scene(scene)
     if len(motion) < 2:
         raise SceneError(f"the rolling model: over before anything is filmed: {motion.end.value}")
-    spline = CubicHermiteSpline(motion.time, motion.q, motion.qdot)
     n = _frames_within(scene, motion.time[0], motion.time[-1], "the rolling model")
-    return SceneMotion(spline, spline.derivative(), n, motion)
+    return CubicHermiteSpline(motion.time, motion.q, motion.qdot), n
 
 
 def _margin(scene: Scene) -> tuple[float, float]:

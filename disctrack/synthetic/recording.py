@@ -10,6 +10,7 @@ from tempfile import TemporaryDirectory
 import cv2
 import h5py
 import numpy as np
+from scipy.interpolate import PPoly
 
 from calibration.cameras.camera import StereoRig
 from calibration.kit.arguments import checked
@@ -24,7 +25,7 @@ from disctrack.recording.declaration_text import declaration_text
 from disctrack.synthetic.cameras import board_poses, image_of, rig_of, views_of
 from disctrack.synthetic.description import ImperfectionSettings, Scene, load_scene, scene_toml
 from disctrack.synthetic.images import expected_board_image, expected_disc_image, stages
-from disctrack.synthetic.motion import SceneMotion, motion_of, true_exposure, true_frame_rate
+from disctrack.synthetic.motion import motion_of, rolling_model, true_exposure, true_frame_rate
 from disctrack.synthetic.sensor import digitise
 
 Progress = Callable[[int, int], None]  # images done, images in all
@@ -66,14 +67,12 @@ Job = tuple[Path, Callable[[], Image]]  # a file, and how its image is taken
 def write_recording(
     folder: str | Path,
     scene: Scene,
-    motion: SceneMotion | None = None,
     *,
     truth_path: str | Path | None = None,
     progress: Progress | None = None,
 ) -> Truth:
     """Render `scene` into a new recording folder, and what is true of it into an HDF5 file.
 
-    motion     : pose over time; None: as the scene's motion section says
     truth_path : None: truth.h5 in the folder; recording.toml does not name it, so that no reader finds it by that
 
     The folder appears under its name when all is written. Raises OutputError where it exists already or cannot be
@@ -85,8 +84,8 @@ def write_recording(
     target = None if truth_path is None else Path(truth_path)
     if target is not None and target.exists():
         raise OutputError(f"{target}: exists; choose another name for the truth or remove it")
-    motion = motion or motion_of(scene)
-    truth = _truth(scene, motion, rig_of(scene))
+    pose, n_frames = motion_of(scene)
+    truth = _truth(scene, pose, n_frames, rig_of(scene))
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         with TemporaryDirectory(prefix=f"{folder.name}.", suffix=".part", dir=folder.parent) as place:
@@ -94,7 +93,7 @@ def write_recording(
             for name in ("left", "right", "calibration/left", "calibration/right"):
                 (part / name).mkdir(parents=True)
             (part / "recording.toml").write_text(recording_toml(scene), encoding="utf-8")
-            _write_all([*_boards(part, scene, truth), *_frames(part, scene, motion, truth)], scene, progress)
+            _write_all([*_boards(part, scene, truth), *_frames(part, scene, pose, truth)], scene, progress)
             if target is not None:
                 target.parent.mkdir(parents=True, exist_ok=True)
             _write_truth(target or part / TRUTH_NAME, truth, scene)
@@ -130,17 +129,17 @@ def true_disc_of(scene: Scene) -> Disc:
     return replace(disc, marker_centres_body=centres_with(faults, replace(disc, marker_centres_body=centres)))
 
 
-def _truth(scene: Scene, motion: SceneMotion, rig: StereoRig) -> Truth:
+def _truth(scene: Scene, pose: PPoly, n_frames: int, rig: StereoRig) -> Truth:
     rate, faults = true_frame_rate(scene), scene.faults
-    time = faults.true_times(np.arange(motion.n_frames) / rate, rate)
+    time = faults.true_times(np.arange(n_frames) / rate, rate)
     visible = np.ones(scene.declared_disc.n_markers, bool)
     visible[list(faults.hidden_markers)] = False
     R, t = board_poses(scene, rig)
     return Truth(
         time=time,
-        q=motion.pose(time),
-        qdot=motion.rates(time),
-        q_right=motion.pose(time + _delay(scene)),
+        q=pose(time),
+        qdot=pose(time, 1),
+        q_right=pose(time + _delay(scene)),
         frame_rate=rate,
         rig=rig,
         rig_while_filming=cameras_with(faults, rig),
@@ -149,7 +148,7 @@ def _truth(scene: Scene, motion: SceneMotion, rig: StereoRig) -> Truth:
         markers_printed=visible,
         R_world_board=R,
         t_world_board=t,
-        effects={} if motion.simulated is None else dict(motion.simulated.model.values),
+        effects=dict(rolling_model(scene).values) if scene.motion.kind == "rolling" else {},
     )
 
 
@@ -166,14 +165,14 @@ def _boards(part: Path, scene: Scene, truth: Truth) -> Iterator[Job]:
             yield path, partial(_exposed, picture, scene, [scene.seed, 3, c, view])
 
 
-def _frames(part: Path, scene: Scene, motion: SceneMotion, truth: Truth) -> Iterator[Job]:
+def _frames(part: Path, scene: Scene, pose: PPoly, truth: Truth) -> Iterator[Job]:
     exposure = 0.0 if scene.motion.kind == "static" else true_exposure(scene)
     looks = (scene, truth.disc, truth.paper_centre_body, truth.markers_printed)
     for c, stage in enumerate(stages(truth.rig_while_filming, scene)):
         missing = (scene.faults.left, scene.faults.right)[c].missing_frames
         for i in sorted(set(range(len(truth.time))) - set(missing)):
-            pose = partial(lambda mid, dt: motion.pose(mid + dt), truth.time[i] + c * _delay(scene))
-            picture = partial(expected_disc_image, pose, exposure, i, stage, *looks)
+            around = partial(lambda mid, dt: pose(mid + dt), truth.time[i] + c * _delay(scene))
+            picture = partial(expected_disc_image, around, exposure, i, stage, *looks)
             yield part / stage.name / f"{i:06d}.png", partial(_exposed, picture, scene, [scene.seed, 4, c, i])
 
 

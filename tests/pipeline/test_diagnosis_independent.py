@@ -13,7 +13,6 @@ import pytest
 from disctrack.cli import main
 from disctrack.faults.keys import Faults
 from disctrack.synthetic import description
-from disctrack.synthetic.motion import SceneMotion
 from disctrack.synthetic.recording import write_recording
 from tests.oracles import newton_euler
 from tests.oracles.newton_euler import LEAD, of_the_paper
@@ -30,7 +29,6 @@ def small_scene(seed, n_frames, frame_rate):
         cameras=description.CameraSettings(image_size=(272, 272), frame_rate_hz=frame_rate, n_frames=n_frames),
         rig=description.RigSettings(mm_per_px=0.42),
         board=description.BoardSettings(n_views=12, square_mm=6.0, shift_mm=15.0),
-        motion=description.MotionSettings(kind="table"),
     )
 
 
@@ -38,8 +36,10 @@ def hide(folder, scene, body, faults=None):
     """Render the motion of a body into folder/recording, its truth elsewhere. Returns the recording's folder."""
     rate, n = scene.cameras.frame_rate_hz, scene.cameras.n_frames
     spline = newton_euler.filmed_motion(body, 14.0, 1.5, n / rate, rate)
-    motion, scene = SceneMotion(spline, spline.derivative(), n), replace(scene, faults=faults or Faults())
-    write_recording(folder / "recording", scene, motion, truth_path=folder / "elsewhere" / "truth.h5")
+    np.save(folder / "motion.npy", np.column_stack([spline.x, spline(spline.x)]))
+    motion = description.MotionSettings("table", table="motion.npy")
+    scene = replace(scene, faults=faults or Faults(), motion=motion, folder=folder)
+    write_recording(folder / "recording", scene, truth_path=folder / "elsewhere" / "truth.h5")
     return folder / "recording"
 
 
@@ -89,7 +89,7 @@ def test_a_tilted_table_in_images_of_an_independent_motion_is_found_and_sized(tm
 @pytest.mark.slow
 def test_nothing_is_found_in_images_of_an_independent_motion_without_an_effect(tmp_path):
     cameras = description.CameraSettings(frame_rate_hz=400.0, n_frames=150)  # the paper's format
-    scene = description.Scene(name="hidden", seed=42, motion=description.MotionSettings(kind="table"), cameras=cameras)
+    scene = description.Scene(name="hidden", seed=42, cameras=cameras)
     document = diagnosis_of(hide(tmp_path, scene, of_the_paper()))
     assert document["verdict"] == "nothing missing", document["sentence"]
     assert document["effects"] == []

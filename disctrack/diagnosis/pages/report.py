@@ -16,7 +16,7 @@ from disctrack.discrepancy.significance import TWO_SIDED
 from disctrack.discrepancy.words import effect_text, significance_text
 from disctrack.findings import Finding, Kind, Severity, of_kind
 from disctrack.numbers import Measured, in_unit, measured, probability, rounded, score
-from disctrack.report.blocks import Cell, Figures, Items, Listing, Report, Section, Text
+from disctrack.report.blocks import Cell, Figures, Listing, Report, Section
 
 if TYPE_CHECKING:
     from disctrack.report.figures import Drawn
@@ -64,8 +64,8 @@ def report_of(
         result.accuracy_text,
         [*findings, *of_kind(Kind.DIAGNOSIS, Severity.NOTE, notes)],
         blocks=[
-            Text(f"Verdict: {d.verdict}, because {d.reason}. Model: {MODELS.get(result.model, result.model)}."),
-            Section("Missing effects", [Items(effects)]),
+            f"Verdict: {d.verdict}, because {d.reason}. Model: {MODELS.get(result.model, result.model)}.",
+            Section("Missing effects", [effects]),
             planned_section(result.plan),
             Section("Explanations that compete", [explanations_table(d)]),
             Section("Before and after" if result.has_more else "The model", _before_after(result, beside)),
@@ -77,7 +77,7 @@ def report_of(
     )
 
 
-def _before_after(result: DiscDiagnosis, beside: Evidence | None) -> list[Listing | Text]:
+def _before_after(result: DiscDiagnosis, beside: Evidence | None) -> list[Listing | str]:
     before, after = result.before, result.after
     if before is None or after is None or beside is None:
         return []
@@ -104,7 +104,7 @@ def _before_after(result: DiscDiagnosis, beside: Evidence | None) -> list[Listin
     remark = f"The recording is too short for free runs of {' and '.join(short)} s." if short else ""
     one = [(name, value) for name, value, _ in rows if not name.startswith("change of ")]
     made = Listing(("", "before", "after"), rows) if result.has_more else Listing(("", "model"), one)
-    return [made, Text(WORDS), Text(remark)]
+    return [made, WORDS, remark]
 
 
 def _line(errors: Errors) -> str:
@@ -167,7 +167,7 @@ def planned_section(plan: Plan | None) -> Section:
     shown = [("none: what there is", "", *map(_cell, plan.now)), *(cells for is_best, cells in rows if is_best)]
     others = [cells for is_best, cells in rows[::-1] if not is_best]
     tables = Listing(header, shown), Listing(header, others, folded="All other recordings")
-    return Section(title, [Items(said), Text(PLANNED), *tables])
+    return Section(title, [said, PLANNED, *tables])
 
 
 def _cell(value: float) -> str:

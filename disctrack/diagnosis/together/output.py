@@ -20,7 +20,7 @@ from disctrack.discrepancy.words import effect_text, significance_text
 from disctrack.files.json_text import plain
 from disctrack.findings import Kind, Severity, of_kind
 from disctrack.numbers import Measured, in_unit, measured, probability, rounded
-from disctrack.report.blocks import Facts, Figures, Items, Listing, Report, Section, Text
+from disctrack.report.blocks import Facts, Figures, Listing, Report, Section
 from disctrack.report.palette import AMBER, BLUE, MUTED
 
 if TYPE_CHECKING:
@@ -127,19 +127,19 @@ def report_of(answer: TogetherDiagnosis, drawn: Sequence[Drawn], files: Sequence
     effects = [f"{effect_text(f, d)}. {significance_text(f)}." for f in d.found]
     laws = [(q.name, Measured(d.after.values[q.name], d.after.sigma(q.name), q.unit)) for q in _free(d)]
     tables = [table for x in answer.dependences for table in _dependence_tables(x)]
-    dependences = [Items([_dependence(x) for x in answer.dependences]), *tables]
+    dependences = [[_dependence(x) for x in answer.dependences], *tables]
     return Report(
         "Many recordings: what does the model lack?",
         verdict_text(answer),
         accuracy_text(answer),
         of_kind(Kind.DIAGNOSIS, Severity.WARNING, filter(None, (misfits_text(answer), *answer.notes))),
         blocks=[
-            Text(f"Verdict: {d.verdict}, because {d.reason}."),
-            Section("Missing effects", [Items(effects)]),
+            f"Verdict: {d.verdict}, because {d.reason}.",
+            Section("Missing effects", [effects]),
             Section("Laws, all recordings together (± 1 σ)", [Facts(laws), Figures(drawn)]),
             Section("How the laws depend on what was declared", dependences),
             Section("Each recording against the others", [_recordings(answer)]),
-            Section("What many recordings bring", [Text(MANY), _by_number(answer)]),
+            Section("What many recordings bring", [MANY, _by_number(answer)]),
             planned_section(answer.plan),
             Section("What was tried", [tried_table(d)]),
         ],

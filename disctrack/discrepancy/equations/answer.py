@@ -29,7 +29,7 @@ from disctrack.files.json_text import json_file, plain
 from disctrack.files.whole import write_whole
 from disctrack.findings import Kind, Severity, of_kind
 from disctrack.numbers import in_unit, probability, rounded
-from disctrack.report.blocks import Figures, Items, Listing, Report, Section
+from disctrack.report.blocks import Figures, Listing, Report, Section
 from disctrack.report.terminal import full
 
 if TYPE_CHECKING:
@@ -325,7 +325,7 @@ class Answer:
             f"Verdict: {self.verdict}. {self.sentence}",
             findings=of_kind(Kind.DIAGNOSIS, Severity.NOTE, (f"{note}." for note in self.notes)),
             blocks=[
-                Section("Equations", [Items(equations)]),
+                Section("Equations", [equations]),
                 Section("Before and after", [_before_after(self)]),
                 Section("In pictures", [Figures(drawn)]),
                 *tables(self.diagnosis, ("state.", f"{NAME}.")),

@@ -16,12 +16,10 @@ from disctrack.report import palette
 from disctrack.report.blocks import (
     Facts,
     Figures,
-    Items,
     Listing,
     Markup,
     Report,
     Section,
-    Text,
     document,
     restored,
 )
@@ -60,9 +58,9 @@ CHANGED = Measured(6.004e-5, 2.1e-7, "m")
 
 def report(**more):
     blocks = [
-        Text("All of it."),
+        "All of it.",
         Section("Numbers", [Listing(("a", "b"), [("x", CHANGED)], "A table"), Facts([("length", CHANGED)])]),
-        Section("Nothing", [Listing(("a",), ()), Items([])]),
+        Section("Nothing", [Listing(("a",), ()), []]),
     ]
     return Report(**{"title": "t", "verdict": "Something is missing.", "accuracy": "σ 1 µm", "blocks": blocks} | more)
 

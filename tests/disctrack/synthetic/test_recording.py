@@ -550,7 +550,7 @@ def test_sample_clip_is_what_its_scene_renders(sample_clip):
     rig, disc = rig_of(scene), scene.declared_disc
     assert (sample_clip / "recording.toml").read_text() == recording_toml(scene)
     assert_allclose(rig.project(markers_world(q, disc)), markers_px, atol=1e-9)
-    assert_allclose(motion_of(scene).pose(time), q, atol=1e-9)  # integrator: 1e-11 relative
+    assert_allclose(motion_of(scene)[0](time), q, atol=1e-9)  # integrator: 1e-11 relative
     stored = np.stack([images(sample_clip, name, 300)[-1] for name in ("left", "right")]).astype(float)
     again = expected_disc(q[-1], rig, disc, scene)[0]
     # grey levels: noise of variance 0.04 + 190 / 400 + 1 / 12 on the paper and less elsewhere; the last frame's motion

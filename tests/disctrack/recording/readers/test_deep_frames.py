@@ -33,7 +33,7 @@ def dim_scene(light: float) -> Scene:
 def dim():
     """12-bit images (N, 2, h, w) at 8 % of the light, their rig, disc and true centres (N, 3) [m]."""
     scene = dim_scene(0.08)
-    q = motion_of(scene).pose(np.arange(N) / 1000.0)
+    q = motion_of(scene)[0](np.arange(N) / 1000.0)
     rig, disc = rig_of(scene), scene.declared_disc
     return render_disc(q, rig, disc, scene, np.random.default_rng(5)), rig, disc, q[:, :3]
 
