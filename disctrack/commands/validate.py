@@ -9,7 +9,7 @@ from pathlib import Path
 from disctrack.commands import DONE, FAILED
 from disctrack.files.whole import make_folder
 from disctrack.validate.accuracy import accuracy_validation, imperfect_validation
-from disctrack.validate.diagnoses import diagnosis_validation, hide
+from disctrack.validate.diagnoses import Verdict, diagnosis_validation
 from disctrack.validate.hidden import hidden_cases
 from disctrack.validate.planted_faults import fault_cases, faults_validation, plant_and_run, untouched
 from disctrack.validate.rendered import render_and_measure, rendered_cases
@@ -35,7 +35,7 @@ def _validation(a: argparse.Namespace) -> Validation:
     if a.diagnosis is not None:
         first = 1 if a.seed is None else a.seed
         hidden = hidden_cases(a.diagnosis, range(first, first + a.seeds), a.pairs, a.frame_rate)
-        return diagnosis_validation(measure_all(hide, list(hidden), a.jobs, say))
+        return diagnosis_validation(measure_all(Verdict, list(hidden), a.jobs, say))
     if a.faults is not None:
         with tempfile.TemporaryDirectory(prefix="disctrack-validate-") as folder:
             grounds = list(untouched(Path(folder), a.faults))

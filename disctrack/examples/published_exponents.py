@@ -52,9 +52,7 @@ TRIALS = {"steel": (0.381e-7, 0.5), "glass": (0.28e-7, 0.3)}
 LAST_STAGE = 1.5  # [s] simulated in section 5c
 STEP = 0.1  # of a quantity's scale, for differences: the simulation is smooth to 1e-8
 FRAME = 1e-3  # [s] between pairs of the paper's cameras
-SAMPLING = 2e-3  # [s] of the simulation; a cubic spline then follows the last nutations read to 1e-4
 SHORTEST = float(np.exp(-3))  # [s] time left where the curves of the paper's figures 14 to 16 end
-RTOL = 1e-7  # collapse then comes out to 1e-10 s
 END_SHARE = 1e-3  # of the start nutation, where the simulation ends: 0.05 ms before collapse with the paper's k_m
 MAX_DURATION = 8.0  # [s]; a motion that has not ended by then is no answer
 
@@ -98,7 +96,7 @@ class LastStage:
         self.series = series
         model = Model(series.disc, GRAVITY).with_values(dict(values))
         state = steady_precession(series.start, series.disc, GRAVITY, omega3=omega3)
-        motion = simulate(model, state, MAX_DURATION, rate=1 / SAMPLING, theta_end=END_SHARE * series.start, rtol=RTOL)
+        motion = simulate(model, state, MAX_DURATION, rate=1 / FRAME, theta_end=END_SHARE * series.start)
         curves = _observed(motion, series.disc)
         # a strong moment can stop the precession in the very last milliseconds; what is read lies before
         n = int(np.argmin(np.append(np.isfinite(curves).all(axis=1), False)))

@@ -3,7 +3,7 @@
 The measured trajectory with hidden effects (`hidden`), which does not tell of them, is handed to the diagnosis.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from time import perf_counter
 
 import numpy as np
@@ -12,7 +12,7 @@ from scipy import stats
 from disctrack.diagnosis import DiscDiagnosis, diagnose
 from disctrack.discrepancy.fit import Fit, fit
 from disctrack.discrepancy.significance import wald
-from disctrack.validate.hidden import HiddenCase, Planted, recorded
+from disctrack.validate.hidden import HiddenCase, Values, recorded
 from disctrack.validate.tables import Table, Validation
 
 ENOUGH = 3.0  # [sigma] a coefficient may be off
@@ -23,14 +23,16 @@ LEVELS = (0.5, 0.2, 0.05, 0.01, 0.005)
 class Verdict:
     """What became of one case."""
 
-    def __init__(
-        self, case: HiddenCase, parts: Sequence[Planted], n: int, result: DiscDiagnosis, seconds: float
-    ) -> None:
-        """Compare what was planted, one by one, with what the diagnosis of n frames claims."""
+    def __init__(self, case: HiddenCase) -> None:
+        """Plant, diagnose, compare what is true of each planted effect with what is claimed."""
+        truths, planted, trajectory = recorded(case)
+        began = perf_counter()
+        result = diagnose(trajectory)
+        self.seconds = perf_counter() - began
         d, nan = result.diagnosis, float("nan")
-        pulls = [_pull_of(result, p) for p in parts]
+        pulls = [_pull_of(result, truth) for truth in truths]
         left = [(e.reduced_chi_square, e.ratio_to_floor) for e in (result.before, result.after) if e] or [(nan, nan)]
-        self.case, self.n, self.verdict, self.seconds = case, n, d.verdict, seconds
+        self.case, self.n, self.verdict = case, len(trajectory), d.verdict
         # every effect claimed, its class after it in brackets
         self.found = tuple(
             _with_class(f.candidate.name, [r.candidate.name for r in f.cannot_be_told_from]) for f in d.found
@@ -38,7 +40,7 @@ class Verdict:
         self.named = None not in pulls  # every hidden effect is among those claimed, or in the class of one
         # largest error of a coefficient in its sigmas; NaN where it is not named
         self.pull = max((p for p in pulls if p is not None), default=nan)
-        self.extra = max(len(d.found) - len(parts), 0)  # claims beyond those hidden
+        self.extra = max(len(d.found) - len(truths), 0)  # claims beyond those hidden
         self.chi_square = left[0][0], left[-1][0]  # reduced, before and after
         self.free_run = left[0][1], left[-1][1]  # over its floor, before and after
         self.gain = (d.before.cost - d.after.cost) / d.noise  # of chi-square by all effects claimed
@@ -46,7 +48,7 @@ class Verdict:
         self.p_value = d.chance.p_value if d.chance else nan
         # of the hidden effects the least, in sigmas, with all others fitted beside it (NaN: not known); and what a
         # claim takes
-        self.stands_out, self.needed = _standing_out(result, parts)
+        self.stands_out, self.needed = _standing_out(result, truths, planted)
 
     @property
     def can_be_told(self) -> bool:
@@ -73,55 +75,45 @@ class Verdict:
         return size * self.needed / self.stands_out if self.case.asked and not others else float("nan")
 
 
-def hide(case: HiddenCase) -> Verdict:
-    """Plant, diagnose, compare."""
-    parts, trajectory = recorded(case)
-    began = perf_counter()
-    result = diagnose(trajectory)
-    seconds = perf_counter() - began
-    return Verdict(case, parts, len(trajectory), result, seconds)
-
-
 def _with_class(name: str, others: Sequence[str]) -> str:
     return f"{name} ({', '.join(others)})" if others else name
 
 
-def _standing_out(result: DiscDiagnosis, parts: Sequence[Planted]) -> tuple[float, float]:
+def _standing_out(result: DiscDiagnosis, truths: Sequence[Values], planted: Values) -> tuple[float, float]:
     """By how many sigmas the least of the planted effects stands out of the joint model, and how many a claim takes.
 
     Fisher's information at the truth: the gain is a' C^-1 a for amounts a with covariance C, all else fitted along, the
     other planted effects, too. NaN where the joint model has no fit, or the catalogue no such numbers.
     """
     system, d = result.system, result.diagnosis
-    meant = [next((c for c in system.candidates if set(p.truth) <= set(c.names)), None) for p in parts]
+    meant = [next((c for c in system.candidates if set(truth) <= set(c.names)), None) for truth in truths]
     own = [c for c in meant if c is not None]
-    if not parts or not d.before.converged or len(own) < len(parts):
+    if not truths or not d.before.converged or len(own) < len(truths):
         return np.nan, np.nan
     quantities = {q.name: q for q in system.base} | {q.name: q for c in own for q in c.quantities}
-    truth = {k: v for p in parts for k, v in (*p.effects.items(), *p.truth.items())}
-    joint = fit(system, tuple(quantities.values()), d.before.values | truth)
+    joint = fit(system, tuple(quantities.values()), d.before.values | planted)
     if not joint.converged:
         return np.nan, np.nan
     found = []
-    for part, candidate in zip(parts, own, strict=True):
+    for truth, candidate in zip(truths, own, strict=True):
         index = [joint.names.index(n) for n in candidate.names]
-        amount = np.array([part.truth.get(q.name, q.null) - q.null for q in candidate.quantities])
+        amount = np.array([truth.get(q.name, q.null) - q.null for q in candidate.quantities])
         sigmas = np.sqrt(wald(amount, joint.covariance[np.ix_(index, index)]) / d.noise)
         needed = np.sqrt(stats.chi2.isf(d.settings.false_alarm / max(len(system.candidates), 1), len(index)))
         found.append((float(sigmas), float(needed)))
     return min(found, key=lambda one: one[0] / one[1])
 
 
-def _pull_of(result: DiscDiagnosis, planted: Planted) -> float | None:
-    """Largest pull of the planted values where the effect, or a class that holds it, is claimed; None: it is not."""
-    d, truth = result.diagnosis, planted.truth
+def _pull_of(result: DiscDiagnosis, truth: Values) -> float | None:
+    """Largest pull of the true values where the effect, or a class that holds it, is claimed; None: it is not."""
+    d = result.diagnosis
     claims = [_pull(d.after, truth) for f in d.found if set(truth) <= set(f.candidate.names)]
     others = [a for f in d.found for a in f.cannot_be_told_from if set(truth) <= set(a.candidate.names)]
     # two claims may have it in their classes: it is in the place of one of them that it fits
     return min(claims or [_pull(other.fit, truth) for other in others], default=None)
 
 
-def _pull(fit: Fit, truth: Mapping[str, float]) -> float:
+def _pull(fit: Fit, truth: Values) -> float:
     return max(abs(fit.values[k] - v) / max(fit.sigma(k), 1e-300) for k, v in truth.items())
 
 

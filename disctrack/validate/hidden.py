@@ -7,7 +7,7 @@ that a careful experimenter would still overlook; directions and signs are drawn
 
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cache
 from re import sub
 
@@ -19,7 +19,7 @@ from disctrack.diagnosis.systematic import DOT_SIGMA
 from disctrack.discrepancy.system import Candidate
 from disctrack.errors import DiscTrackError
 from disctrack.faults.catalogue import scene_faults
-from disctrack.rolling import Model, simulate
+from disctrack.rolling import CATALOGUE, Model, simulate
 from disctrack.synthetic.description import CameraSettings, MotionSettings, RollingMotion, Scene
 from disctrack.synthetic.motion import rolling_start
 from disctrack.trajectory import Trajectory
@@ -52,15 +52,7 @@ INVISIBLE = ("pattern_rotation",)  # no recording of one disc shows it, and noth
 FIRST_ALONE = ("spring", "table_curved")  # of the candidate's numbers
 DURATION = (0.4, 0.9)  # [s]
 FLATTEST_DEG = 0.9  # the last frame's nutation: below, the disc touches its paper
-
-
-@dataclass(frozen=True)
-class Planted:
-    """What goes into the data, and the values of the diagnosis' quantities that are true then."""
-
-    truth: Mapping[str, float] = field(default_factory=dict)
-    effects: Mapping[str, float] = field(default_factory=dict)  # of the motion: "effect.parameter"
-    wrong: Mapping[str, float] = field(default_factory=dict)  # of the measurement: "fault.part" of the catalogue
+Values = dict[str, float]  # by name of a quantity
 
 
 @dataclass(frozen=True)
@@ -99,11 +91,15 @@ def alike(name: str) -> Sequence[Candidate]:
     return _catalogue().get(name, ())
 
 
-def plant(name: str, size: float, rng: Generator) -> Planted:
-    """An effect of this size [SI], of one camera or dot drawn among those there are, with a sign or a direction."""
+def plant(name: str, size: float, rng: Generator) -> tuple[Values, Values]:
+    """An effect of this size [SI], of one camera or dot drawn among those there are, with a sign or a direction.
+
+    returns : what is true of the diagnosis' quantities then, and all that goes into the data: "effect.parameter" of the
+        motion, "fault.part" of the measurement
+    """
     candidates = alike(name)
     if not candidates:
-        return Planted()
+        return {}, {}
     candidate = candidates[int(rng.integers(len(candidates)))]
     quantities = candidate.quantities[:1] if name in FIRST_ALONE else candidate.quantities
     passive = quantities[0].lower == 0
@@ -114,24 +110,22 @@ def plant(name: str, size: float, rng: Generator) -> Planted:
         numbers = np.array([size if passive else size * rng.choice([-1.0, 1.0])])
     numbers = np.abs(numbers) if passive else numbers
     truth = {q.name: float(number) for q, number in zip(quantities, numbers, strict=True)}
-    if candidate.kind == "measurement":
-        return Planted(truth, wrong=truth)
-    if name == "rim_flat":
-        return Planted(truth, effects=truth | {"rim_flat.angle": rng.uniform(0, 2 * np.pi)})
-    return Planted(truth, effects=dict(zip(truth, numbers.tolist(), strict=True)))
+    beside = {"rim_flat.angle": rng.uniform(0, 2 * np.pi)} if name == "rim_flat" else {}
+    return truth, truth | beside
 
 
-def draw(seed: int, planted: Planted, rate: float = HiddenCase.rate) -> Scene:
+def draw(seed: int, planted: Values, rate: float = HiddenCase.rate) -> Scene:
     """A motion that lasts as long as it is filmed, whatever is planted in it."""
     rng = np.random.default_rng([seed, 31])
     disc = Scene().declared_disc
-    faults = scene_faults(disc, planted.wrong, rate)
+    faults = scene_faults(disc, planted, rate)
+    of_motion = {name: value for name, value in planted.items() if name.partition(".")[0] in CATALOGUE}
     for _ in range(200):
         theta = float(rng.uniform(3.0, 15.0))  # [deg]
         n = int(rate * rng.uniform(*DURATION))
         nutation = theta * float(rng.uniform(0.02, 0.1))
         omega3 = float(rng.uniform(-2.0, 3.0))  # [rad/s]
-        model = Model(disc).with_values({"km.k_m": float(rng.uniform(0.2e-7, 0.5e-7))} | dict(planted.effects))
+        model = Model(disc).with_values({"km.k_m": float(rng.uniform(0.2e-7, 0.5e-7))} | of_motion)
         effects = {effect.name: effect.values for effect in model.effects}
         rolling = RollingMotion(theta_deg=theta, nutation_deg=nutation, omega3_rad_s=omega3, effects=effects)
         motion_of = MotionSettings("rolling", rolling=rolling)
@@ -145,14 +139,14 @@ def draw(seed: int, planted: Planted, rate: float = HiddenCase.rate) -> Scene:
     raise DiscTrackError(f"no motion of {DURATION[0]} s among those drawn: what is planted stops the disc at once")
 
 
-def recorded(case: HiddenCase) -> tuple[list[Planted], Trajectory]:
-    """What is planted, one by one, and the recording with all of it."""
+def recorded(case: HiddenCase) -> tuple[list[Values], Values, Trajectory]:
+    """What is true of each planted effect's quantities, all that is planted, and the recording with it."""
     rng = np.random.default_rng([case.seed, 32])
     parts = [plant(name, size, rng) for name, size in case.hidden.items()]
-    effects, wrong = ({k: v for p in parts for k, v in getattr(p, kind).items()} for kind in ("effects", "wrong"))
+    planted = {name: value for _, values in parts for name, value in values.items()}
     laboratory = ORDINARY if "laboratory" in case.hidden else Laboratory(print_m=case.hidden.get("prints", 0.0))
-    scene = draw(case.seed, Planted(effects=effects, wrong=wrong), case.rate)
-    return [p for p in parts if p.truth], measured(scene, laboratory)
+    trajectory = measured(draw(case.seed, planted, case.rate), laboratory)
+    return [truth for truth, _ in parts if truth], planted, trajectory
 
 
 def hidden_cases(

@@ -9,7 +9,7 @@ from disctrack.diagnosis import DiscSystem
 from disctrack.diagnosis.model_file import declared_model
 from disctrack.discrepancy.fit import fit
 from disctrack.errors import DiscTrackError
-from disctrack.validate.diagnoses import diagnosis_validation, hide, what_was_wrong
+from disctrack.validate.diagnoses import Verdict, diagnosis_validation, what_was_wrong
 from disctrack.validate.hidden import INVISIBLE, HiddenCase, alike, draw, hidden_cases, plant, sizes
 from disctrack.validate.points import measured
 from tests.oracles.measured_disc import assert_sized
@@ -23,23 +23,23 @@ def visible(name):
 @pytest.mark.parametrize("name", [visible(name) for name in sizes() if name not in INVISIBLE])
 def test_a_planted_effect_is_what_the_diagnosis_calls_by_that_name(name):
     """Fitted alone, it comes out at the planted size within its sigma, and leaves noise."""
-    planted = plant(name, sizes()[name], np.random.default_rng(7))
+    truth, planted = plant(name, sizes()[name], np.random.default_rng(7))
     scene = draw(5, planted)
     trajectory = measured(replace(scene, cameras=replace(scene.cameras, n_frames=150)))
     system = DiscSystem(trajectory, declared_model(trajectory, "paper").model)
-    candidate = next(c for c in system.candidates if set(planted.truth) <= set(c.names))
+    candidate = next(c for c in system.candidates if set(truth) <= set(c.names))
     base = tuple(q for q in system.base if q.name not in candidate.names)
-    of_shape = {k: v for k, v in planted.effects.items() if k not in planted.truth}
+    of_shape = {k: v for k, v in planted.items() if k not in truth}
     found = fit(system, (*base, *candidate.quantities), system.start() | of_shape)
     assert found.converged
     # 3600 numbers: 1 +- 0.024
     assert found.reduced_chi_square < 1.1
-    assert_sized(found, planted.truth, 4)
+    assert_sized(found, truth, 4)
 
 
 @pytest.mark.statistical
 def test_a_verdict_tells_what_became_of_the_hidden_effect():
-    verdict = hide(HiddenCase({"time_offset": 1e-4}, seed=3))
+    verdict = Verdict(HiddenCase({"time_offset": 1e-4}, seed=3))
     assert verdict.named
     assert verdict.within
     assert verdict.at_noise
@@ -50,24 +50,24 @@ def test_a_verdict_tells_what_became_of_the_hidden_effect():
     # by itself it gains what it stands out by; scatter of a normal number
     assert verdict.stands_out == pytest.approx(np.sqrt(verdict.gain), abs=4)
     # and of the size that it is found from it gains what a claim takes, within the same scatter
-    faint = hide(replace(verdict.case, hidden={"time_offset": verdict.found_from}))
+    faint = Verdict(replace(verdict.case, hidden={"time_offset": verdict.found_from}))
     assert faint.stands_out == pytest.approx(faint.needed, rel=0.2)
 
 
 @pytest.mark.statistical
 def test_an_effect_below_its_sigma_is_not_asked_for():
     """A hundredth of what is found leaves a bound; two that the recording cannot tell apart do so, however large."""
-    faint = hide(HiddenCase({"time_offset": 1e-7}, seed=3))
+    faint = Verdict(HiddenCase({"time_offset": 1e-7}, seed=3))
     assert not faint.named
     assert not faint.can_be_told
-    alike = hide(HiddenCase({"frame_rate": 0.012, "gravity": 0.05}, seed=3))
+    alike = Verdict(HiddenCase({"frame_rate": 0.012, "gravity": 0.05}, seed=3))
     assert alike.gain > 1e4
     assert not alike.can_be_told
 
 
 @pytest.mark.statistical
 def test_nothing_is_found_where_nothing_is_hidden_and_the_table_says_so():
-    verdict = hide(HiddenCase({"nothing": 1.0}, seed=4))
+    verdict = Verdict(HiddenCase({"nothing": 1.0}, seed=4))
     assert verdict.verdict == "nothing missing"
     assert verdict.found == ()
     validation = diagnosis_validation([verdict])
@@ -92,7 +92,7 @@ def test_cases_are_told_by_name_and_size_and_pairs_are_drawn_anew_for_each_seed(
 @pytest.mark.slow
 def test_beside_an_effect_that_was_looked_for_another_of_the_catalogue_is_tried_before_a_law_outside_of_it():
     """A shaken table and a dot 20 um off: the shaking alone left chi-square 1.006, but no noise."""
-    verdict = hide(HiddenCase({name: sizes()[name] for name in ("table_shaken", "misprint")}, seed=10, rate=500.0))
+    verdict = Verdict(HiddenCase({name: sizes()[name] for name in ("table_shaken", "misprint")}, seed=10, rate=500.0))
     assert verdict.named
     assert verdict.within
     assert verdict.verdict == "found"
