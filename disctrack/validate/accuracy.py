@@ -10,7 +10,7 @@ from disctrack.analyse.declaration import CLAIM_POSITION
 from disctrack.frames import COORDINATES, POSE_COMPONENTS
 from disctrack.validate.errors import Consistency, PoseErrors, calibration_consistency, joined, noise_consistency
 from disctrack.validate.rendered import EXPOSURE, STATIC, STRATA_DEG, RenderedOutcome
-from disctrack.validate.tables import Table, Validation
+from disctrack.validate.tables import Validation, table
 
 CLAIM_ROTATION = np.radians(0.05)  # Ma et al. 2014, end of section 3
 REGULAR_DEG = 5.0  # psi and phi are summed up from here on; below, 1/sin(theta) is all there is to see
@@ -94,7 +94,7 @@ def _rows(own: PoseErrors, true: PoseErrors) -> tuple[AccuracyRow, ...]:
     return tuple(rows)
 
 
-def _strata_table(own: PoseErrors, law: float) -> Table:
+def _strata_table(own: PoseErrors, law: float) -> str:
     """Root mean squares of the poses in each stratum of nutation."""
     theta, rows = np.degrees(own.q[:, 4]), []
     for low, high in STRATA_DEG:
@@ -105,7 +105,7 @@ def _strata_table(own: PoseErrors, law: float) -> Table:
             rows.append([f"{low:g}-{high:g}", len(some.q), _UM * _rms(some.of("position")), *angles, by_law])
     head = ["theta [deg]", "n", "position [µm]", "rotation [mdeg]", "theta [mdeg]", "psi [mdeg]", "phi [mdeg]"]
     law_said = f"{_MDEG * law:.2f} / sin(theta)"
-    return Table("As a function of nutation (static poses)", [*head, law_said], rows, "Root mean squares.", ".2f")
+    return table("As a function of nutation (static poses)", [*head, law_said], rows, "Root mean squares.", ".2f")
 
 
 def _sight(own: PoseErrors, cameras: int) -> SightCount:
@@ -164,17 +164,17 @@ def accuracy_validation(outcomes: Sequence[RenderedOutcome]) -> Validation:
     sights = [[s.cameras, s.n, s.found, s.gross, _UM * s.position, _MDEG * s.rotation] for s in accuracy.sights]
     head = ["cameras", "poses", "found", "wrong", "position rms [µm]", "rotation rms [mdeg]"]
     note = "0 cameras: the dots are seen at a grazing angle. There a pose need not be found; none may be wrong."
-    tables.append(Table("Who sees the face (static poses)", head, sights, note, ".2f"))
+    tables.append(table("Who sees the face (static poses)", head, sights, note, ".2f"))
     honest = [[name, c.value, c.uncertainty, c.n] for name, c in accuracy.consistency.items()]
     head = ["squared error over predicted variance", "value", "standard error", "poses or rigs"]
     corners = ", ".join(f"{outcome.corners_px:.4f}" for outcome in outcomes)
     note = f"Target {CONSISTENT[0]} to {CONSISTENT[1]} within 3 standard errors. Corner rms by recording: {corners} px."
-    tables.append(Table("Errors against stated uncertainty", head, honest, note, ".2f"))
+    tables.append(table("Errors against stated uncertainty", head, honest, note, ".2f"))
     warnings = sorted({warning for outcome in outcomes for warning in outcome.warnings})
     return Validation("validation", verdict(accuracy), tables, [accuracy], complaints(accuracy), warnings)
 
 
-def _accuracy_table(name: str, rows: Sequence[AccuracyRow]) -> Table:
+def _accuracy_table(name: str, rows: Sequence[AccuracyRow]) -> str:
     head = ["quantity", "unit", "n", "bias", "scatter", "95 %", "noise", "calibration", "claim / 95 %"]
     lines = []
     for row in rows:
@@ -187,7 +187,7 @@ def _accuracy_table(name: str, rows: Sequence[AccuracyRow]) -> Table:
         note += f" psi and phi from {REGULAR_DEG:.0f} deg of nutation on."
     if name != STATIC:
         note = f"Exposure {1e3 * EXPOSURE:g} ms, corrected for by the smear of the dots."
-    return Table(f"{name[0].upper()}{name[1:]}", head, lines, note, ".2f")
+    return table(f"{name[0].upper()}{name[1:]}", head, lines, note, ".2f")
 
 
 def imperfect_validation(outcomes: Sequence[RenderedOutcome]) -> Validation:
@@ -207,4 +207,4 @@ def imperfect_validation(outcomes: Sequence[RenderedOutcome]) -> Validation:
         "lens may be off by, are larger than these errors."
     )
     headline = f"Mean errors in {len(outcomes)} recordings."
-    return Validation("imperfect", headline, [Table("Imperfect laboratory", head, lines, note, ".2f")], outcomes)
+    return Validation("imperfect", headline, [table("Imperfect laboratory", head, lines, note, ".2f")], outcomes)

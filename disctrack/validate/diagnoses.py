@@ -13,7 +13,7 @@ from disctrack.diagnosis import DiscDiagnosis, diagnose
 from disctrack.discrepancy.fit import Fit, fit
 from disctrack.discrepancy.significance import wald
 from disctrack.validate.hidden import HiddenCase, Values, recorded
-from disctrack.validate.tables import Table, Validation
+from disctrack.validate.tables import Validation, table
 
 ENOUGH = 3.0  # [sigma] a coefficient may be off
 AT_NOISE, HELD_OUT = 1.1, 1.2  # reduced chi-square, free run over its floor
@@ -152,7 +152,7 @@ def diagnosis_validation(verdicts: Sequence[Verdict]) -> Validation:
     return Validation("diagnosis", " ".join(headline), tuple(tables), verdicts, remarks=wrong)
 
 
-def _rates_table(verdicts: Sequence[Verdict]) -> Table:
+def _rates_table(verdicts: Sequence[Verdict]) -> str:
     groups: dict[tuple[tuple[str, float], ...], list[Verdict]] = {}
     for v in verdicts:
         groups.setdefault(tuple(v.case.hidden.items()), []).append(v)
@@ -165,10 +165,10 @@ def _rates_table(verdicts: Sequence[Verdict]) -> Table:
         rows.append([" + ".join(names), " + ".join(f"{s:.3g}" for s in sizes), *shares, *medians])
     head = ["hidden", "size", "distinguishable", "named", "within 3 sigma", "noise left", "claim too many",
             "stands out by, sigma", "found from", "time, s"]  # fmt: skip
-    return Table("What was hidden, and what became of it", head, rows, "Sizes in SI units; the last three are medians.")
+    return table("What was hidden, and what became of it", head, rows, "Sizes in SI units; the last three are medians.")
 
 
-def _levels_table(p_values: Sequence[float]) -> Table:
+def _levels_table(p_values: Sequence[float]) -> str:
     """Are the stated probabilities true where nothing is hidden? With exact intervals (Clopper and Pearson 1934)."""
     p = np.asarray(p_values)[np.isfinite(p_values)]
     rows = []
@@ -177,4 +177,4 @@ def _levels_table(p_values: Sequence[float]) -> Table:
         interval = seen.proportion_ci(0.95, "exact")
         rows.append([f"{level:g}", f"{seen.k} of {len(p)}", f"{interval.low:.4f} to {interval.high:.4f}"])
     head = ["stated probability below", "recordings in which nothing is hidden", "95 % interval of the rate"]
-    return Table("Stated probabilities of chance", head, rows)
+    return table("Stated probabilities of chance", head, rows)

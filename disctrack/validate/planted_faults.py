@@ -39,7 +39,7 @@ from disctrack.trajectory import Trajectory
 from disctrack.trajectory.file import read_trajectory
 from disctrack.validate.errors import compare
 from disctrack.validate.rendered import rolling_scene, scene_of
-from disctrack.validate.tables import Table, Validation
+from disctrack.validate.tables import Validation, table
 
 PAIRS = 100  # from so many on gravity and frame rate are judged
 THETA_DEG = 9.0  # of the scene
@@ -399,7 +399,7 @@ def faults_validation(outcomes: Sequence[FaultOutcome]) -> Validation:
     return Validation("faults", headline, [_limits(outcomes)], outcomes, complaints)
 
 
-def _limits(outcomes: Sequence[FaultOutcome]) -> Table:
+def _limits(outcomes: Sequence[FaultOutcome]) -> str:
     """A line for each fault; what one camera or the other has is one."""
     makes = list(dict.fromkeys(o.make for o in outcomes))
     groups: dict[tuple[str, str], list[FaultOutcome]] = {}
@@ -417,4 +417,4 @@ def _limits(outcomes: Sequence[FaultOutcome]) -> Table:
         rows.append(row)
     head = ["fault", "unit", *(f"{make}: {what}" for make in makes for what in ("named from", "unnamed, sigma"))]
     note = "Named at this size and at all larger ones that were planted. Unnamed: the largest error of a pose in its "
-    return Table("Detection limits", head, rows, note + "stated sigmas that nothing named.")
+    return table("Detection limits", head, rows, note + "stated sigmas that nothing named.")

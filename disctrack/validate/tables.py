@@ -1,6 +1,6 @@
 """What a validation hands over, and its one writer: Markdown for people, JSON for programs, a section of a page."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from datetime import date
@@ -20,27 +20,20 @@ Case = TypeVar("Case")
 Outcome = TypeVar("Outcome")
 
 
-@dataclass(frozen=True)
-class Table:
-    """Rows of text and numbers below a head, with a title above and a note below."""
+def table(title: str, head: Sequence[str], rows: Iterable[Sequence[object]], note: str = "", form: str = ".3g") -> str:
+    """Rows of text and numbers below a head as Markdown, with a title above and a note below.
 
-    title: str
-    head: Sequence[str]
-    rows: Sequence[Sequence[object]]
-    note: str = ""
-    form: str = ".3g"  # of numbers that are not whole; a dash stands where there is none
+    form : of numbers that are not whole; a dash stands where there is none
+    """
 
-    def markdown(self, level: int = 2) -> str:
-        """As people read it, under a heading of this level."""
-        rows = [[self._text(cell) for cell in row] for row in self.rows]
-        lines = [self.head, ["---"] * len(self.head), *rows]
-        text = "\n".join("| " + " | ".join(line) + " |" for line in lines)
-        return f"{level * '#'} {self.title}\n\n{text}\n" + (f"\n{self.note}\n" if self.note else "")
-
-    def _text(self, cell: object) -> str:
+    def text(cell: object) -> str:
         if isinstance(cell, float):
-            return format(cell, self.form) if np.isfinite(cell) else "-"
+            return format(cell, form) if np.isfinite(cell) else "-"
         return str(cell)
+
+    lines = [head, ["---"] * len(head), *(map(text, row) for row in rows)]
+    shown = "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    return f"## {title}\n\n{shown}\n" + (f"\n{note}\n" if note else "")
 
 
 @dataclass(frozen=True)
@@ -49,7 +42,7 @@ class Validation:
 
     name: str
     headline: str
-    tables: Sequence[Table]
+    tables: Sequence[str]  # as `table` makes them
     outcomes: Sequence[object]  # one for each case, or sums over them
     complaints: Sequence[str] = ()  # what a validation must not show
     remarks: Sequence[str] = ()  # what a reader should look at
@@ -57,7 +50,7 @@ class Validation:
     def markdown(self) -> str:
         """The headline, what is wrong, and all tables."""
         lists = ["\n".join(f"- {line}" for line in lines) + "\n" for lines in (self.complaints, self.remarks) if lines]
-        return "\n".join([f"{self.headline}\n", *lists, *(table.markdown() for table in self.tables)])
+        return "\n".join([f"{self.headline}\n", *lists, *self.tables])
 
 
 def measure_all(
@@ -92,5 +85,5 @@ def write_into(page: Path, validation: Validation, command: str) -> None:
     if begun and not ended:
         raise OutputError(f"{page}: '{begin}' without '{end}' below; expected both, or neither for a new section")
     source = f"Written by `{command}`, disctrack {__version__}, {date.today().isoformat()}."
-    tables = "\n".join(table.markdown(3) for table in validation.tables)
+    tables = "\n".join(f"#{table}" for table in validation.tables)  # under a heading of the page
     write_whole(page, f"{before}{begin}\n{validation.headline}\n\n{tables}\n{source}\n{end}{after or chr(10)}".encode())
