@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from disctrack.files.json_text import plain
@@ -19,8 +18,6 @@ if TYPE_CHECKING:
     from disctrack.report.figures import Drawn
 
 Cell = str | Measured
-
-_NOTHING: Mapping[str, Any] = MappingProxyType({})
 
 
 class Markup(str):

@@ -6,7 +6,7 @@ import sys
 import textwrap
 from collections.abc import Iterable, Sequence
 from itertools import chain
-from typing import Any, TextIO
+from typing import Any
 
 from disctrack.files.text import printable
 from disctrack.report.blocks import Cell, Facts, Listing, Markup, Report, Section, is_empty
@@ -50,13 +50,12 @@ def _around(result: list[str], entries: list[list[str]], report: Report) -> list
     return [*chain(*entries[:n]), *result, *chain(*entries[n:])]
 
 
-def show(report: Report, stream: TextIO | None = None, *, verbose: bool = False) -> None:
-    """Print the report; in colour where the stream is a terminal and NO_COLOR is not set (https://no-color.org)."""
-    stream = stream or sys.stdout
+def show(report: Report, *, verbose: bool = False) -> None:
+    """Print the report; in colour where stdout is a terminal and NO_COLOR is not set (https://no-color.org)."""
     width = min(WIDTH, shutil.get_terminal_size((WIDTH, 24)).columns)
-    colour = stream.isatty() and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
+    colour = sys.stdout.isatty() and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
     lines = full(report, width) if verbose else short(report, width, colour=colour)
-    print("\n".join(lines), file=stream, flush=True)
+    print("\n".join(lines), flush=True)
 
 
 def _cut(lines: list[str], most: int = _MOST_OF_ONE) -> list[str]:

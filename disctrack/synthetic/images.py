@@ -114,9 +114,10 @@ def _add(
     high = np.ceil(pixels.max(axis=0)).astype(int) + 3
     (left, top), (x, y) = np.maximum(low, corner), corner
     right, bottom = np.minimum(high, corner + np.array(cells.shape[::-1]) // s)
-    box = raster.Box(int(top), int(bottom), int(left), int(right), y, x, s)
     if top < bottom and left < right:
-        raster.add_shape(cells, step, box, stage.rays, view.R_camera_world @ R, R.T @ (view.centre - t), shape)
+        near = cells[(top - y) * s : (bottom - y) * s, (left - x) * s : (right - x) * s]
+        rays = stage.rays[top : bottom + 1, left : right + 1]
+        raster.add_shape(near, step, rays, view.R_camera_world @ R, R.T @ (view.centre - t), shape)
 
 
 def _face(

@@ -9,7 +9,7 @@ from signed distances at its corners and its centre: that on either side of a st
 exact; curvature is allowed for in second order. The error of a blurred edge is of third order in the cell's size.
 """
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numba import types
@@ -26,18 +26,6 @@ _CLEAR, _CLEAR_OF_TIPS = 0.6, 1.0  # of the spread of a pixel's corners, beyond 
 # were straight, 1 for a right angle that reaches in between two of the corners
 _BENT = 0.02  # of that spread in a cell: more between its centre and its corners' mean, and the edge has a corner there
 _SAMPLES = 16  # a side, of a cell with a corner
-
-
-class Box(NamedTuple):
-    """Pixels of the sensor in which a shape is drawn, and where the window that it is drawn into begins."""
-
-    top: int
-    bottom: int
-    left: int
-    right: int
-    y: int  # of the window
-    x: int
-    s: int  # cells of a pixel along either axis
 
 
 def round_shape(height: float, centre: tuple[float, float], radius: float, within: float) -> Array:
@@ -158,10 +146,9 @@ def _deposit(cells: Array32, y: int, x: int, value: float, moment_x: float, mome
 
 @part
 def _add_crossed(
-    cells: Array32, step: float, box: Box, row: int, column: int, rays: Array, R: Array, eye: Array, shape: Array
+    cells: Array32, step: float, s: int, row: int, column: int, rays: Array, R: Array, eye: Array, shape: Array
 ) -> None:  # fmt: skip
     """Add a shape in the cells of a pixel that its edge crosses."""
-    s = box.s
     f = np.empty((2, s + 1))  # at the cells' corners, upper and lower line
     for i in range(-1, s):
         for j in range(s + 1):
@@ -180,38 +167,35 @@ def _add_crossed(
             else:
                 middle += (mean - middle) / 3.0
                 area, m_x, m_y = half_plane(middle, 0.5 * (b + d - a - c), 0.5 * (c + d - a - b))
-            y, x = (row - box.y) * s + i, (column - box.x) * s + j
-            _deposit(cells, y, x, step * area, step * m_x, step * m_y)
+            _deposit(cells, row * s + i, column * s + j, step * area, step * m_x, step * m_y)
 
 
 @njit(cache=True, **_RULES)
-def add_shape(cells: Array32, step: float, box: Box, rays: Array, R: Array, eye: Array, shape: Array) -> None:
+def add_shape(cells: Array32, step: float, rays: Array, R: Array, eye: Array, shape: Array) -> None:
     """Add `step` times the covered part of each cell to `cells`.
 
-    cells : (rows * s, columns * s) of a window of the sensor   rays : (..., ..., 2) at the corners of all pixels
+    cells : (rows * s, columns * s) of some pixels   rays : (rows + 1, columns + 1, 2) at the corners of these
     R, eye : R_camera_body, and the camera's centre in body axes [m]   shape : as `round_shape` and the others give it
     """
-    s = box.s
+    rows, columns = rays.shape[0] - 1, rays.shape[1] - 1
+    s = cells.shape[0] // rows
     clear = _CLEAR_OF_TIPS if shape[0] == _SHEET else _CLEAR
-    f = np.empty((2, box.right - box.left + 1))  # at the pixels' corners, upper and lower line
-    for row in range(box.top - 1, box.bottom):
-        for k in range(box.right - box.left + 1):
-            f[0, k] = f[1, k]
-            f[1, k] = _distance(rays[row + 1, box.left + k, 0], rays[row + 1, box.left + k, 1], R, eye, shape)
-        for k in range(box.right - box.left if row >= box.top else 0):
+    f = np.empty((2, columns + 1))  # at the pixels' corners, upper and lower line
+    for row in range(-1, rows):
+        for k in range(columns + 1):
+            f[0, k], f[1, k] = f[1, k], _distance(rays[row + 1, k, 0], rays[row + 1, k, 1], R, eye, shape)
+        for k in range(columns if row >= 0 else 0):
             a, b, c, d = f[0, k], f[0, k + 1], f[1, k], f[1, k + 1]
             low, high = min(min(a, b), min(c, d)), max(max(a, b), max(c, d))
             if low < 0.0 < high or abs(0.25 * (a + b + c + d)) <= clear * (high - low):
-                _add_crossed(cells, step, box, row, box.left + k, rays, R, eye, shape)
+                _add_crossed(cells, step, s, row, k, rays, R, eye, shape)
             elif low > 0.0:
-                y, x = (row - box.y) * s, (box.left + k - box.x) * s
-                for i in range(y, y + s):
-                    for j in range(x, x + s):
+                for i in range(row * s, (row + 1) * s):
+                    for j in range(k * s, (k + 1) * s):
                         cells[i, j] += step
 
 
 def prepare() -> None:
     """Compile what draws, or load it."""
-    number, box = types.float64, types.NamedUniTuple(types.int64, len(Box._fields), Box)
-    rays, row = number[:, :, ::1], number[::1]
-    add_shape.compile((types.float32[:, ::1], number, box, rays, number[:, ::1], row, row))
+    number, row = types.float64, types.float64[::1]
+    add_shape.compile((types.float32[:, :], number, number[:, :, :], number[:, ::1], row, row))

@@ -123,7 +123,8 @@ def test_colour_is_for_terminals_without_no_color(monkeypatch):
     shown = {}
     for no_color, stream in (("", Terminal()), ("1", Terminal()), ("", io.StringIO())):
         monkeypatch.setenv("NO_COLOR", no_color)
-        show(report(findings=of_kind(Kind.OTHER, Severity.DOUBT, ["wrong"])), stream)
+        monkeypatch.setattr("sys.stdout", stream)
+        show(report(findings=of_kind(Kind.OTHER, Severity.DOUBT, ["wrong"])))
         shown[no_color, stream.isatty()] = "\x1b[31" in stream.getvalue()
     assert shown == {("", True): True, ("1", True): False, ("", False): False}
 
