@@ -118,14 +118,9 @@ def _ground(folder: Path, scene: Scene | None, q: Array | None) -> Ground:
     return Ground(folder, folder / "results" / "rig.h5", scene, trajectory.q if q is None else q)
 
 
-def fault_cases(grounds: Sequence[Ground], names: Sequence[str] = (), sizes: slice = slice(None)) -> list[FaultCase]:
-    """Every fault (or these) at all of its sizes (or these) in each recording."""
-    return [
-        (ground, name, size)
-        for ground in grounds
-        for name, planting in plantings(ground).items()
-        for size in (planting.sizes[sizes] if not names or name in names else ())
-    ]
+def fault_cases(grounds: Sequence[Ground]) -> list[FaultCase]:
+    """Every fault at all of its sizes in each recording."""
+    return [(ground, name, size) for ground in grounds for name, p in plantings(ground).items() for size in p.sizes]
 
 
 def plant_and_run(case: FaultCase) -> FaultOutcome:

@@ -71,10 +71,7 @@ def in_this_process(monkeypatch):
 def test_a_batch_calibrates_a_rig_once_tells_of_every_recording_and_goes_on_where_it_failed(
     short_recording, tmp_path, cli
 ):
-    root = tmp_path / "day"
-    for name in ("r2", "r10"):
-        linked(short_recording, root / name)
-    linked(short_recording, root / "bad toml")
+    root = a_day(short_recording, tmp_path / "day", ("r2", "r10", "bad toml"))
     replace(root / "bad toml" / "recording.toml", b"x = = 3")
     replace(root / "r10" / "left" / "000005.png", b"junk")
     said, errors = cli("batch", root, "-j", "2", *FAST, *MODEL, code=1)
@@ -173,9 +170,7 @@ def test_files_that_vanish_in_mid_run_cost_their_frames_or_their_recording(one, 
 
 @pytest.mark.statistical
 def test_the_summary_is_that_of_all_shards(recording, tmp_path, cli, in_this_process):
-    root = tmp_path / "day"
-    for name in ("a", "b", "c"):
-        linked(recording, root / name)
+    root = a_day(recording, tmp_path / "day", tuple("abc"))
     command = "batch", root, "-j", "1", *FAST
     summary = root / "batch_results" / "summary.json"
     cli(*command, "--shard", "2/2")
@@ -357,8 +352,7 @@ def assert_whole(root: Path, reference: Path) -> int:
 def undisturbed(recording, tmp_path) -> Path:
     """The same day, measured without a fault, in this process."""
     root = a_day(recording, tmp_path / "undisturbed", ("a",))
-    found = find_recordings([root])
-    _, (job,), *_ = make_plan(found, found.recordings, BatchOptions(report=False))
+    (job,) = jobs_of(root)
     assert do(job).status == MEASURED
     return root
 
