@@ -17,7 +17,7 @@ from disctrack.frames import rotation_from_quaternion, vector_from_rotation
 from disctrack.track.dots._kernels import DOT
 from disctrack.track.dots.template import NoiseModel
 from disctrack.track.dots.template_response import Edge
-from disctrack.track.follow.following import Follower, Law, Tables, TrackingSetup
+from disctrack.track.follow.following import Follower, Tables
 from disctrack.track.refine.assembly import Taken, TrackingSettings, assemble
 from disctrack.trajectory import FrameStatus, MarkerStatus
 from tests.calibration.conftest import corner_view
@@ -175,8 +175,8 @@ def tables_of(px, R, t, sigma):
 
 def tracked(px, R, t, times, rig, frame_rate, settings=None, workers=1):
     """What tracking makes of located dots (n, 2, m, 2), followed near poses R, t."""
-    setup = TrackingSetup(rig, MA_2014, None)  # no image is looked at
-    follower = Follower(setup, Law((Edge(noise=NoiseModel(0.64, 0.02)),) * 2), measured=True)
+    edges = (Edge(noise=NoiseModel(0.64, 0.02)),) * 2
+    follower = Follower(rig, MA_2014, None, edges, measured=True)  # no image is looked at
     taken = Taken(range(len(px)), frame_rate, G, times)
     return assemble([follower], tables_of(px, R, t, DOT_PX), settings or TrackingSettings(), taken, workers)
 

@@ -58,14 +58,6 @@ class Limits(NamedTuple):
     blur: float = 3.0  # fitted blur, in typical blurs (plus 1 px): an image smeared beyond use
 
 
-class Expected(NamedTuple):
-    """What dots should look like in the images of each camera."""
-
-    sigma: Array  # (c,) [px] of an edge
-    noise: Array  # (c, 3) variance = noise[0] + noise[1] grey, and the square of the grey values' step
-    limits: Limits
-
-
 class Rows(NamedTuple):
     """Of what is kept of every pixel (16, n), in single precision; the first eight are the template's parameters, too.
 
@@ -603,7 +595,7 @@ def _judge_dot(result, radius, typical_sigma, noise, limits):
 
 
 @_part
-def _look(images, readable, views, face, expected, R, t, pixels, work, results, status):
+def _look(images, readable, views, face, sigma, noise, limits, R, t, pixels, work, results, status):
     """Locate and judge the dots in the images (cameras, H, W) of one instant, the disc being near the pose R, t.
 
     Filled: results (cameras, m) of DOT, status (cameras, m); u, v are the image of the dot's own centre, not the centre
@@ -642,13 +634,13 @@ def _look(images, readable, views, face, expected, R, t, pixels, work, results, 
             start[0], start[1], start[2] = x, y, radius
             start[3], start[4] = project_point(views.cameras[c], point[0], point[1], point[2], J)
             start[5], start[6] = _image_centroid(views.cameras[c], point, R_cb, radius, J)
-            status[c, i] = _fit_dot(images[c], views.map_x[c], views.map_y[c], P, start, expected.sigma[c],
-                                    expected.noise[c], face.rim, centres, i, pixels, work, p, result)  # fmt: skip
+            status[c, i] = _fit_dot(images[c], views.map_x[c], views.map_y[c], P, start, sigma[c],
+                                    noise[c], face.rim, centres, i, pixels, work, p, result)  # fmt: skip
             if status[c, i] == MEASURED:
                 for k in range(3):
                     point[k] += R_cb[k, 0] * p[ROW.a] + R_cb[k, 1] * p[ROW.b]
                 result.u, result.v = project_point(views.cameras[c], point[0], point[1], point[2], J)
-                status[c, i] = _judge_dot(result, radius, expected.sigma[c], expected.noise[c], expected.limits)
+                status[c, i] = _judge_dot(result, radius, sigma[c], noise[c], limits)
 
 
 @_part
@@ -716,12 +708,13 @@ def _settle(results, status, views, centres, R, t, dots, filled):
 
 
 @_entry
-def track_frames(images, readable, views, face, expected, heading, results, status, R_out, t_out, max_rms):
+def track_frames(images, readable, views, face, sigma, noise, limits, heading, results, status, R_out, t_out, max_rms):
     """Follow the disc through a block of pairs, each predicted from the three before (`_predict`).
 
-    images (n, 2, H, W); readable (n, 2); heading: the last three poses ((R, t), ...), which are updated. Filled:
-    results (n, 2, m) of DOT, status (n, 2, m), R_out (n, 3, 3), t_out (n, 3). Returns the number of frames followed;
-    less than n where the disc was lost at that frame.
+    images (n, 2, H, W); readable (n, 2); sigma (2,) [px] of the dots' edges in each camera; noise (2, 3), whose
+    variance is noise[0] + noise[1] grey, and the square of the grey values' step; heading: the last three poses
+    ((R, t), ...), which are updated. Filled: results (n, 2, m) of DOT, status (n, 2, m), R_out (n, 3, 3), t_out (n, 3).
+    Returns the number of frames followed; less than n where the disc was lost at that frame.
     """
     (R_last, t_last), (R_before, t_before), (R_older, t_older) = heading
     pixels, work = np.empty((16, _PIXELS), np.float32), (np.empty((8, 8)), np.empty(8), np.empty(8), np.empty(8))
@@ -733,7 +726,7 @@ def track_frames(images, readable, views, face, expected, heading, results, stat
         rms = -1.0
         for _ in range(3):
             _copy(R_expected, R)
-            _look(images[f], readable[f], views, face, expected, R, t, pixels, work, results[f], status[f])
+            _look(images[f], readable[f], views, face, sigma, noise, limits, R, t, pixels, work, results[f], status[f])
             rms = _settle(results[f], status[f], views, face.centres, R, t, dots, filled)
             turned = 0.0
             for i in range(3):

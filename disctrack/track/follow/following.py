@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -45,14 +45,6 @@ MOST_USUAL = 0.1  # of the contrast: dots that leave more than this are not the 
 REPEAT_REACH = 4  # frames back that an image is compared with: recorders repeat from buffers of a few
 
 
-@dataclass(frozen=True)
-class Law:
-    """How the dots' edges look in each camera, and how well dots fit."""
-
-    edges: tuple[Edge, Edge] = (Edge(), Edge())
-    misfit: float = 1.0  # rms residual over the noise that dots usually leave: compressed edges leave 4 and more
-
-
 class Heading(NamedTuple):
     """The last three poses, from which the next is predicted (`_kernels.track_frames`)."""
 
@@ -81,20 +73,11 @@ class Heading(NamedTuple):
         return Heading.steady(last, before)
 
 
-@dataclass(frozen=True)
-class TrackingSetup:
-    """What does not change while a recording is followed."""
-
-    rig: StereoRig
-    disc: Disc
-    views: kernels.Views
-
-    @classmethod
-    def of(cls, rig: StereoRig, disc: Disc) -> TrackingSetup:
-        """With the cameras' maps, which take a while."""
-        with ThreadPoolExecutor(2) as pool:
-            maps_x, maps_y = zip(*pool.map(normalised_maps, rig.cameras), strict=True)
-        return cls(rig, disc, kernels.Views(np.stack(maps_x), np.stack(maps_y), *stacked(rig)))
+def views_of(rig: StereoRig) -> kernels.Views:
+    """The cameras as the loop over frames has them: with their maps, which take a while."""
+    with ThreadPoolExecutor(2) as pool:
+        maps_x, maps_y = zip(*pool.map(normalised_maps, rig.cameras), strict=True)
+    return kernels.Views(np.stack(maps_x), np.stack(maps_y), *stacked(rig))
 
 
 @dataclass
@@ -117,8 +100,11 @@ class Tables:
 class Follower:
     """One stretch of the recording: what is known of the disc between its blocks."""
 
-    setup: TrackingSetup
-    law: Law = field(default_factory=Law)
+    rig: StereoRig
+    disc: Disc
+    views: kernels.Views
+    edges: tuple[Edge, ...] = (Edge(), Edge())  # how those of the dots look in each camera
+    misfit: float = 1.0  # rms residual over the noise that dots usually leave: compressed edges leave 4 and more
     heading: Heading | None = None
     lost: int | None = 0  # frames since the last pose; None while the disc is followed
     failures: int = 0  # searches in vain, one after the other
@@ -126,14 +112,12 @@ class Follower:
     measured: bool = False  # blur and noise known
     acquisitions: int = 0
     first_reason: str = ""
-    saturated: list[int | None] = field(default_factory=lambda: [None, None])  # grey value at which the dots' brighter
-    # side is clipped
+    saturated: tuple[int | None, ...] = (None, None)  # grey value at which the dots' brighter side is clipped
     first_row: int = 0  # of the tables
 
 
 def run(
-    setup: TrackingSetup,
-    law: Law,
+    follower: Follower,
     heading: Heading,
     images: Image,
     readable: Mask,
@@ -144,10 +128,10 @@ def run(
 
     limits : a dot is refused for a misfit that exceeds them, and is unusual in this recording
     """
-    limits = limits._replace(misfit=max(limits.misfit, UNUSUAL * law.misfit))
+    limits = limits._replace(misfit=max(limits.misfit, UNUSUAL * follower.misfit))
     known = Heading(*((np.array(R, order="C"), np.array(t)) for R, t in heading))  # the loop moves them on
-    blur, noise = zip(*((edge.blur_px, edge.noise.parameters) for edge in law.edges), strict=True)
-    fixed = setup.views, face_of(setup.disc), kernels.Expected(np.array(blur), np.stack(noise), limits)
+    blur, noise = zip(*((edge.blur_px, edge.noise.parameters) for edge in follower.edges), strict=True)
+    fixed = follower.views, face_of(follower.disc), np.array(blur), np.stack(noise), limits
     filled = rows.results, rows.status, rows.R, rows.t
     done = kernels.track_frames(images, readable, *fixed, known, *filled, MAX_PREDICTION_RMS_PX)
     return int(done), known
@@ -185,9 +169,7 @@ def follow_block(follower: Follower, images: Image, readable: Mask, tables: Tabl
             i += 1
             continue
         assert follower.heading is not None
-        done, follower.heading = run(
-            follower.setup, follower.law, follower.heading, images[i:], readable[i:], rows.part(slice(i, None))
-        )
+        done, follower.heading = run(follower, follower.heading, images[i:], readable[i:], rows.part(slice(i, None)))
         rows.frame_status[i : i + done] = FrameStatus.MEASURED
         if anew and done > 1:
             _go_back(follower, images, readable, rows, i)
@@ -237,8 +219,8 @@ def recover(follower: Follower, images: Image, readable: Mask) -> bool:
 
 def _holds(follower: Follower, heading: Heading, images: Image, readable: Mask) -> bool:
     """True where the first of the pairs shows dots enough at the place where the heading leads."""
-    trial = empty_tables(1, follower.setup.disc.n_markers)
-    done, _ = run(follower.setup, follower.law, heading, images[:1], readable[:1], trial)
+    trial = empty_tables(1, follower.disc.n_markers)
+    done, _ = run(follower, heading, images[:1], readable[:1], trial)
     if done and _enough(trial.status):
         return True
     if not follower.first_reason:
@@ -263,11 +245,11 @@ def _go_back(follower: Follower, images: Image, readable: Mask, rows: Tables, fo
         first -= 1
     if first == found:
         return
-    trial = empty_tables(found - first, follower.setup.disc.n_markers)
+    trial = empty_tables(found - first, follower.disc.n_markers)
     heading = Heading.steady((rows.R[found], rows.t[found]), (rows.R[found + 1], rows.t[found + 1]))
     pairs: Image = np.ascontiguousarray(images[first:found][::-1])  # type: ignore[assignment]  # the stubs forget it
     usable = np.ascontiguousarray(readable[first:found][::-1])
-    done, _ = run(follower.setup, follower.law, heading, pairs, usable, trial)
+    done, _ = run(follower, heading, pairs, usable, trial)
     for k in range(done):
         if not _enough(trial.status[k : k + 1]):
             break
@@ -286,7 +268,7 @@ def _search(follower: Follower, images: Image, readable: Mask) -> bool:
     if len(images) > 1 and readable[1].any():
         following = _found(follower, images[1], readable[1])
         if following is not None:
-            following = _nearest_alike(pose, following, follower.setup.disc)
+            following = _nearest_alike(pose, following, follower.disc)
     elif follower.heading is not None and follower.lost == 0:  # pairs come one by one: as from the pair before
         R, t = follower.heading.last
         following = pose[0] @ R.T @ pose[0], 2 * pose[1] - t
@@ -300,7 +282,7 @@ def _search(follower: Follower, images: Image, readable: Mask) -> bool:
 
 
 def _found(follower: Follower, pair: Image, readable: Mask) -> Pose | None:
-    pose, _, reason = acquire(np.where(readable[:, None, None], pair, 0), follower.setup.rig, follower.setup.disc)
+    pose, _, reason = acquire(np.where(readable[:, None, None], pair, 0), follower.rig, follower.disc)
     follower.first_reason = follower.first_reason or reason
     return pose
 
@@ -315,14 +297,14 @@ def _nearest_alike(pose: Pose, following: Pose, disc: Disc) -> Pose:
 
 def _measure_blur_and_noise(follower: Follower, images: Image, readable: Mask, pose: Pose, heading: Heading) -> None:
     """Measure the law of the cameras' noise and blur; where the disc is not there after all, nothing is kept."""
-    setup, edges, misfit = follower.setup, list(Law().edges), Law().misfit
+    disc, edges, misfit, saturated = follower.disc, [Edge(), Edge()], 1.0, list(follower.saturated)
     n = min(NOISE_FRAMES, len(images))
 
     def flat_noise(camera: int, frames: Sequence[int], R: Array, t: Array) -> NoiseModel:
         """Of flat parts beside and in the dots, at poses R, t of these frames."""
-        pixels, J = marker_pixels(R, t, setup.rig, setup.disc.marker_centres_body)
+        pixels, J = marker_pixels(R, t, follower.rig, disc.marker_centres_body)
         affine, seen = plane_to_image(J, R)[:, camera], [images[k, camera] for k in frames]
-        return measure_noise(seen, pixels[:, camera], affine, setup.disc, edges[camera].blur_px)
+        return measure_noise(seen, pixels[:, camera], affine, disc, edges[camera].blur_px)
 
     for camera in range(2):
         # a first idea of the noise, or good dots of a noisy camera, or of more than 8 bits, would look like misfits;
@@ -333,10 +315,10 @@ def _measure_blur_and_noise(follower: Follower, images: Image, readable: Mask, p
             edges[camera] = Edge(noise=typical_noise(images[int(np.argmax(readable[:n, camera])), camera]))
     for blur_known in (False, True):  # the second time with the blur of the first, and the misfit that is usual
         # how the noise is taken to be tells why dots are refused, if they are
-        follower.law = Law((edges[0], edges[1]), misfit)
-        trial = empty_tables(n, setup.disc.n_markers)
+        follower.edges, follower.misfit = tuple(edges), misfit
+        trial = empty_tables(n, disc.n_markers)
         limits = kernels.Limits() if blur_known else kernels.Limits(blur=np.inf, share=MOST_USUAL)
-        done, _ = run(setup, follower.law, heading, images[:n], readable[:n], trial, limits)
+        done, _ = run(follower, heading, images[:n], readable[:n], trial, limits)
         if done == 0 or not _enough(trial.status[:1]):
             return
         good = trial.status[:done] == MarkerStatus.MEASURED
@@ -351,8 +333,9 @@ def _measure_blur_and_noise(follower: Follower, images: Image, readable: Mask, p
                 flat = flat_noise(camera, range(0, done, 3), trial.R[:done:3], trial.t[:done:3])
                 noise = no_more_than_left(flat, edges[camera].noise, fits)
                 edges[camera] = edges[camera]._replace(noise=noise)
-                follower.saturated[camera] = _saturated(images[:done, camera], fits, noise)
-    follower.law, follower.measured = Law((edges[0], edges[1]), misfit), True
+                saturated[camera] = _saturated(images[:done, camera], fits, noise)
+    follower.edges, follower.misfit = tuple(edges), misfit
+    follower.saturated, follower.measured = tuple(saturated), True
 
 
 def _saturated(images: Image, fits: NDArray, noise: NoiseModel) -> int | None:

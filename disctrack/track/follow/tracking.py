@@ -23,12 +23,11 @@ from disctrack.recording.readers.blocks import PairBlock, Unreadable
 from disctrack.track.follow.following import (
     Follower,
     Heading,
-    Law,
     Tables,
-    TrackingSetup,
     empty_tables,
     follow_block,
     run,
+    views_of,
 )
 from disctrack.track.judge.cameras import frames_ahead, left_out
 from disctrack.track.judge.disc_not_seen import MEETING_PX, why_not_seen
@@ -54,10 +53,10 @@ ReadBlocks = Callable[[int, int], Iterable[PairBlock]]  # pairs start ... stop-1
 def prepare(dtype: DTypeLike = np.uint8) -> None:
     """Compile the inner loops for images of this type, or load them: some seconds once per installation."""
     camera, still = Camera(1.0, 1.0, 0.0, 0.0, (0.0,) * 5, (8, 8)), (np.eye(3), np.zeros(3))
-    setup = TrackingSetup.of(StereoRig(camera, camera, *still, *still), MA_2014)
+    rig = StereoRig(camera, camera, *still, *still)
     rows, nothing = empty_tables(0, MA_2014.n_markers), np.zeros((0, 2, 8, 8), dtype)
-    run(setup, Law(), Heading(still, still, still), nothing, np.zeros((0, 2), bool), rows)
-    marker_pixels(rows.R, rows.t, setup.rig, MA_2014.marker_centres_body)
+    run(Follower(rig, MA_2014, views_of(rig)), Heading(still, still, still), nothing, np.zeros((0, 2), bool), rows)
+    marker_pixels(rows.R, rows.t, rig, MA_2014.marker_centres_body)
 
 
 def track(
@@ -79,21 +78,20 @@ def track(
     settings, pairs = settings or TrackingSettings(), taken.pairs
     _check_dots(disc)
     read_blocks, stuck = _as_one_sensor(read_blocks, pairs)
-    setup = TrackingSetup.of(rig, disc)
+    begin = Follower(rig, disc, views_of(rig))
     edges = stretch_edges(pairs, disc)
 
     def measured(looked_for: Disc, progress: Callable[[int], object]) -> Tracking:
         """With the dots looked for at the places of a disc."""
-        again = replace(setup, disc=looked_for)
-        followers, tables = _followed(read_blocks, edges, again, workers, progress)
+        followers, tables = _followed(read_blocks, edges, replace(begin, disc=looked_for), workers, progress)
         if not np.isfinite(tables.t).any():
             raise _not_found(followers, pairs, why_not_seen(_some(read_blocks, pairs), rig, disc))
         for follower in followers:
-            follower.setup = setup
+            follower.disc = disc
         return assemble(followers, tables, settings, taken, workers)
 
     tracking = measured(disc, progress)
-    slips = _slips(tracking, read_blocks, pairs, setup)
+    slips = _slips(tracking, read_blocks, pairs, begin)
     for slip in slips:
         read_blocks = _without(read_blocks, frames.CAMERAS.index(slip.subject.camera), slip.subject.frames[0][0])
         tracking = measured(disc, lambda n: None)
@@ -121,7 +119,7 @@ def _check_dots(disc: Disc) -> None:
         )
 
 
-def _slips(tracking: Tracking, read_blocks: ReadBlocks, pairs: range, setup: TrackingSetup) -> tuple[Finding, ...]:
+def _slips(tracking: Tracking, read_blocks: ReadBlocks, pairs: range, begin: Follower) -> tuple[Finding, ...]:
     """Images left out by one camera, by the pairing that fits the frames after it."""
     apart = _apart(tracking) | (max(tracking.details["systematic_px"]) > MEETING_PX / 2)
     begun = np.flatnonzero(np.convolve(apart, np.ones(APART), "valid") == APART)
@@ -130,7 +128,7 @@ def _slips(tracking: Tracking, read_blocks: ReadBlocks, pairs: range, setup: Tra
     first, start = int(begun[0]), pairs[begun[0]]
     edges = [start, min(start + PAIRED, pairs.stop)]
     alone = (_without(read_blocks, other, start) for other in (1, 0))
-    ahead = frames_ahead(*(_followed(one, edges, setup, 1, lambda n: None)[1].R for one in alone))
+    ahead = frames_ahead(*(_followed(one, edges, begin, 1, lambda n: None)[1].R for one in alone))
     return (left_out(ahead, pairs, first),) if ahead else ()
 
 
@@ -174,14 +172,14 @@ def _not_found(followers: list[Follower], pairs: range, why: tuple[Finding, ...]
 def _followed(
     read_blocks: ReadBlocks,
     edges: list[int],
-    setup: TrackingSetup,
+    begin: Follower,
     workers: int,
     progress: Callable[[int], object],
 ) -> tuple[list[Follower], Tables]:
     """The disc followed through the stretches between edges; arguments as of `track`."""
     first = edges[0]
-    tables = empty_tables(edges[-1] - first, setup.disc.n_markers)
-    followers = [Follower(setup, first_row=edge - first) for edge in edges[:-1]]
+    tables = empty_tables(edges[-1] - first, begin.disc.n_markers)
+    followers = [replace(begin, first_row=edge - first) for edge in edges[:-1]]
     given_up, telling = Event(), Lock()
 
     def follow(k: int, tell: Callable[[int], object]) -> None:
@@ -189,7 +187,7 @@ def _followed(
         for block in read_blocks(edges[k], edges[k + 1]):
             if given_up.is_set():
                 break
-            check_images(block.images.shape[:1:-1], setup.rig)
+            check_images(block.images.shape[:1:-1], begin.rig)
             follow_block(followers[k], block.images, block.readable, tables, int(block.frames[0]) - first)
             with telling:
                 tell(len(block.images))
@@ -205,7 +203,7 @@ def _followed(
         if _torn(tables, start):  # another branch of phi was found: go on from the stretch before
             followers[k] = replace(before, lost=None, first_row=start)
             gone = tables.part(slice(start, edges[k + 1] - first))
-            for name, empty in vars(empty_tables(1, setup.disc.n_markers)).items():
+            for name, empty in vars(empty_tables(1, begin.disc.n_markers)).items():
                 getattr(gone, name)[...] = empty
             follow(k, lambda n: None)
     return followers, tables

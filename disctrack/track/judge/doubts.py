@@ -160,11 +160,11 @@ def doubts_of(
 
     seen : the dots, with the poses that were fitted to them
     """
-    misplaced = misplaced_dots(follower.setup.disc, trajectory.disc.marker_centres_body)
+    misplaced = misplaced_dots(follower.disc, trajectory.disc.marker_centres_body)
     found = [
         *_lost(trajectory),
         *_one_sided(trajectory),
-        *_symmetric(follower.setup.disc),
+        *_symmetric(follower.disc),
         *_clipped(follower),
         *misplaced,
     ]

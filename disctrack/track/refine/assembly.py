@@ -66,7 +66,7 @@ def assemble(
     workers : threads; the result is the same to the last bit for any number of them
     """
     first = next((follower for follower in followers if follower.measured), followers[0])
-    rig, disc = first.setup.rig, first.setup.disc
+    rig, disc = first.rig, first.disc
     repeated, dots = repeats(tables.digest), dot_centres(tables.results, tables.status)
     exposure, of_exposure = _as_they_were(tables, dots, repeated, first, settings, taken)
     seen = DotsInFrames(rig, disc, dots.pixels, dots.covariance_px2, tables.R, tables.t)
@@ -95,8 +95,8 @@ def assemble(
     doubts = doubts_of(first, faults, scatter, shaken, table, trajectory, seen)
     details = {
         "exposure_s": list(exposure),  # that the dots were moved by
-        "blur_px": [edge.blur_px for edge in first.law.edges],
-        "noise": [asdict(edge.noise) for edge in first.law.edges],
+        "blur_px": [edge.blur_px for edge in first.edges],
+        "noise": [asdict(edge.noise) for edge in first.edges],
         "pose_variance_factor": shaken.round(3).tolist(),  # of the poses about a smooth motion over what dots tell
         "shared_sigma": [[sigma, cause] for sigma, cause in shared],
         "acquisitions": sum(f.acquisitions for f in followers),  # times the disc was searched for and found
@@ -118,8 +118,8 @@ def _as_they_were(
 
     Those of images (n, 2) that are copies of others are taken out; what misfits beyond noise is in the covariances.
     """
-    where, rig, disc = (tables.R, tables.t, taken.time), first.setup.rig, first.setup.disc
-    edges = first.law.edges
+    where, rig, disc = (tables.R, tables.t, taken.time), first.rig, first.disc
+    edges = first.edges
     found = exposure_by_smear(*where, dots.blur_px, rig, disc)
     exposure, findings = exposure_of(found, settings.exposure, 1 / taken.frame_rate)
     dots.pixels[...] -= shift_by_glare(tables.R, tables.t, dots.contrast, rig, disc, edges)

@@ -71,7 +71,7 @@ LIKELIER = 6.0  # of natural logarithms
 
 
 def shift_by_exposure(
-    R: Array, t: Array, time: Array, exposure: Array, rig: StereoRig, disc: Disc, edges: tuple[Edge, Edge]
+    R: Array, t: Array, time: Array, exposure: Array, rig: StereoRig, disc: Disc, edges: tuple[Edge, ...]
 ) -> Array:
     """(n, 2, m, 2) [px] by which the dots of an exposure lie beside their places at mid exposure; zero where not known.
 
@@ -171,7 +171,7 @@ def _in_words(camera: str, squared: float, sigma: float) -> str:
     return f"{camera} below {1e6 * np.sqrt(max(squared, 0.0) + SURE * sigma):.0f} µs"
 
 
-def _second_order(R: Array, t: Array, time: Array, rig: StereoRig, disc: Disc, edges: tuple[Edge, Edge]) -> Array:
+def _second_order(R: Array, t: Array, time: Array, rig: StereoRig, disc: Disc, edges: tuple[Edge, ...]) -> Array:
     """(n, 2, m, 2) [px/s^2] the bracket of the module's first equation; NaN at the ends and beside gaps."""
     pixels, J = marker_pixels(R, t, rig, disc.marker_centres_body)
     affine = plane_to_image(J, R)
@@ -254,7 +254,7 @@ def _slope(y: Array, x: Array, others: list[Array]) -> tuple[float, float]:
     return float(slopes[-1] / scale[-1]), float(sigma / scale[-1])
 
 
-def shift_by_glare(R: Array, t: Array, contrast: Array, rig: StereoRig, disc: Disc, edges: tuple[Edge, Edge]) -> Array:
+def shift_by_glare(R: Array, t: Array, contrast: Array, rig: StereoRig, disc: Disc, edges: tuple[Edge, ...]) -> Array:
     """(n, 2, m, 2) [px] by which templates find the dots beside their places; zero where not known.
 
     R (n, 3, 3), t (n, 3) [m]: poses, NaN where there is none; contrast (n, 2, m) of each dot with its paper, NaN where
