@@ -54,11 +54,11 @@ if TYPE_CHECKING:
     from disctrack.synthetic.simulation import run_simulate as run_simulate
     from disctrack.track.follow.live import LivePose as LivePose
     from disctrack.track.follow.live import Tracker as Tracker
-    from disctrack.track.measurement import Measurement as Measurement
     from disctrack.track.measurement import measure as measure
     from disctrack.track.measurement import measure_pairs as measure_pairs
     from disctrack.track.measurement import open_pairs as open_pairs
     from disctrack.track.measurement import trajectory_provenance as trajectory_provenance
+    from disctrack.track.refine.assembly import Measurement as Measurement
     from disctrack.track.video_overlay import write_overlay as write_overlay
     from disctrack.trajectory import FrameStatus as FrameStatus
     from disctrack.trajectory import MarkerStatus as MarkerStatus

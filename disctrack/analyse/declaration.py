@@ -389,9 +389,7 @@ def another_plane(trajectory: Trajectory, boards: Boards | None = None) -> tuple
     start = normal = e3.mean(axis=0) / np.linalg.norm(e3.mean(axis=0))  # it precesses about the normal
     weight = np.ones(len(centre))
     for _ in range(10):  # lowest points as seen from the plane through the last ones
-        down = (e3 @ normal)[:, None] * e3 - normal
-        rim = disc.radius * down / np.linalg.norm(down, axis=1, keepdims=True)
-        lowest = centre + rim - disc.half_thickness * np.sign(e3 @ normal)[:, None] * e3
+        lowest = centre + lowest_arm(e3, normal, disc)
         middle = weight @ lowest / weight.sum()
         normal = np.linalg.svd(np.sqrt(weight)[:, None] * (lowest - middle), full_matrices=False)[2][2]
         normal = normal * np.sign(normal @ start)
@@ -415,6 +413,13 @@ def another_plane(trajectory: Trajectory, boards: Boards | None = None) -> tuple
     remedy = Remedy("[table] view", told[0], told[1], action)
     of = Subject(view=declared)
     return (Finding(Kind.TABLE_VIEW, Severity.DOUBT, text, of, remedies=(remedy,), explains=OFF),)
+
+
+def lowest_arm(e3: Array, normal: Array, disc: Disc) -> Array:
+    """From the centre to the disc's lowest points against a normal (n, 3) [m], by the axis e3 (n, 3)."""
+    cosine = (e3 @ normal)[:, None]
+    down = cosine * e3 - normal  # in the disc's plane
+    return disc.arm_to_contact(-down / np.linalg.norm(down, axis=1, keepdims=True), np.sign(cosine) * e3)
 
 
 def _view_on_plane(rig: StereoRig, boards: Boards, normal: Array, middle: Array) -> int | None:

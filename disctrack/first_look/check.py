@@ -32,7 +32,7 @@ from disctrack.frames import CAMERAS
 from disctrack.recording.declaration import Recording, read_recording
 from disctrack.recording.readers.blocks import Unreadable
 from disctrack.report.blocks import Facts, Report, Section
-from disctrack.track.follow.tracking import Taken, Tracking, TrackingSettings, track
+from disctrack.track.follow.tracking import Measurement, Taken, TrackingSettings, track
 from disctrack.track.measurement import ImagePairs, check_rig, exposures, images_lost, open_pairs
 from disctrack.track.run_summary import left_out, sigma_text
 from disctrack.trajectory import Trajectory
@@ -172,7 +172,7 @@ def _light(seen: Check, pairs: ImagePairs) -> None:
 
 
 def _motion(seen: Check, recording: Recording, rig: StereoRig, pairs: ImagePairs) -> None:
-    done: list[tuple[range, Tracking]] = []
+    done: list[tuple[range, Measurement]] = []
     noticed: list[Finding] = []
     total, lost = 0, ""
     for place in PLACES:
@@ -187,7 +187,7 @@ def _motion(seen: Check, recording: Recording, rig: StereoRig, pairs: ImagePairs
             taken = Taken(frames, recording.frame_rate, recording.gravity)
             tracking = track(pairs.reading(seen.not_read), taken, rig, recording.disc, settings)
             done.append((frames, tracking))
-            noticed += [*tracking.findings, *lost_pairs(tracking.trajectory)]
+            noticed += [*tracking.trajectory.findings, *lost_pairs(tracking.trajectory)]
         except DiscTrackError as error:
             lost = str(error)
             noticed += getattr(error, "findings", ())

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from calibration.cameras.camera import StereoRig
 from calibration.kit.arguments import FrameRate, Gravity, Threads, Times, checked, grey_values
 from calibration.kit.arrays import Array
-from calibration.kit.brief import Brief
 from calibration.kit.threads import one_blas_thread
 from disctrack.analyse.declaration import Boards, contradictions, with_square
 from disctrack.disc import Disc
@@ -34,9 +33,9 @@ from disctrack.recording.readers.flat_field import flat_fielded, flat_fields
 from disctrack.recording.readers.same_instants import check_headers, check_same_numbers, check_time_stamps, usable_times
 from disctrack.track.follow.motion_span import MotionSpan, find_motion
 from disctrack.track.follow.tracking import (
+    Measurement,
     ReadBlocks,
     Taken,
-    Tracking,
     TrackingSettings,
     check_images,
     prepare,
@@ -87,26 +86,6 @@ class ImagePairs:
         with ThreadPoolExecutor(2) as pool:  # hashing a gigabyte takes a second
             digests = pool.map(lambda reader: reader.content_sha256(self.start, self.stop), (self.left, self.right))
             return {f"{name} frames": digest for name, digest in zip(CAMERAS, digests, strict=True)}
-
-
-@dataclass(frozen=True, repr=False)
-class Measurement(Brief):
-    """A tracked recording, with what was noticed in `trajectory.findings`.
-
-    >>> measurement = measure("clip", "clip/results/rig.h5", open_pairs("clip", (0, 40)))
-    >>> measurement.trajectory.q.shape, measurement.unreadable
-    ((300, 6), ())
-    """
-
-    trajectory: Trajectory
-    unreadable: tuple[Unreadable, ...]
-    details: dict[str, Any]  # blur, noise, ...: of JSON's types, stored with the result
-    seconds: float  # spent on reading and tracking
-
-    def facts(self) -> dict[str, str]:
-        """What a glance should tell (`Brief`)."""
-        told = self.trajectory.facts()
-        return told | {"unreadable images": f"{len(self.unreadable)}"} if self.unreadable else told
 
 
 @checked
@@ -185,31 +164,29 @@ def measure(
     began = time.perf_counter()
     span = _span(pairs, recording.frame_rate, settings)
     progress(len(pairs) - (span.stop - span.start))
-    tracking, unreadable = _tracked(
-        recording, rig, pairs, settings, span, stamps, threads or default_threads(), progress
-    )
+    found = _tracked(recording, rig, pairs, settings, span, stamps, threads or default_threads(), progress)
     seconds = time.perf_counter() - began
     findings = (
         *pairs.findings,
         *of_kind(Kind.EXPOSURE, Severity.NOTE, headers),
-        *images_lost(unreadable),
-        *tracking.findings,
+        *images_lost(found.unreadable),
+        *found.trajectory.findings,
         *(() if boards is None else boards.findings),
     )
     details = {
-        **tracking.details,
-        "unreadable": [image.reason for image in unreadable],
+        **found.details,
+        "unreadable": [image.reason for image in found.unreadable],
         "first_pass": dataclasses.asdict(span),
         **pairs.camera_headers(),
     }
-    trajectory = at_full_length(tracking.trajectory, len(pairs.left), span.start, stamps)
+    trajectory = at_full_length(found.trajectory, len(pairs.left), span.start, stamps)
     for still in (slice(pairs.start, span.start), slice(span.stop, pairs.stop)):
         trajectory.frame_status[still] = FrameStatus.STILL
     trajectory = dataclasses.replace(trajectory, air_density=recording.air_density)
     findings = contradictions(trajectory, recording.disc, recording, findings, boards, details["blur_px"])
     trajectory = dataclasses.replace(trajectory, findings=findings)
     warn_of_doubts(findings)
-    return Measurement(trajectory, unreadable, details, seconds)
+    return Measurement(trajectory, details, found.unreadable, seconds)
 
 
 @one_blas_thread
@@ -258,12 +235,11 @@ def measure_pairs(
 
     began = time.perf_counter()
     taken = Taken(range(n), frame_rate, gravity, times)
-    tracking = track(read_blocks, taken, rig, disc, settings, threads, progress)
+    found = track(read_blocks, taken, rig, disc, settings, threads, progress)
     seconds = time.perf_counter() - began
-    found = contradictions(tracking.trajectory, disc, noticed=tracking.findings)
-    warn_of_doubts(found)
-    trajectory = dataclasses.replace(tracking.trajectory, findings=found)
-    return Measurement(trajectory, (), tracking.details, seconds)
+    findings = contradictions(found.trajectory, disc, noticed=found.trajectory.findings)
+    warn_of_doubts(findings)
+    return Measurement(dataclasses.replace(found.trajectory, findings=findings), found.details, seconds=seconds)
 
 
 def _sides(images: Images | tuple[Images, Images]) -> tuple[Images, Images]:
@@ -291,8 +267,8 @@ def _tracked(
     stamps: Array | None,
     threads: int,
     progress: Progress,
-) -> tuple[Tracking, tuple[Unreadable, ...]]:
-    """The disc tracked through the span, and the images that could not be read; stamps : of all frames [s]."""
+) -> Measurement:
+    """The disc tracked through the span; stamps : of all frames [s]."""
     not_read: dict[tuple[int, int], Unreadable] = {}  # some are tried twice
     tracked = range(span.start, span.stop)
     workers = 1  # stretches that are followed side by side: one per core, where frames can be read anywhere
@@ -302,12 +278,12 @@ def _tracked(
     stamps = None if stamps is None else stamps[span.start : span.stop]
     taken = Taken(tracked, recording.frame_rate, recording.gravity, stamps)
     try:
-        tracking = track(reading, taken, rig, recording.disc, settings, workers, progress)
+        found = track(reading, taken, rig, recording.disc, settings, workers, progress)
     except TrackingError as error:
         refuse_unreadable(recording, list(not_read.values()), 2 * len(tracked), error)
         error.findings = with_square(error.findings, recording)
         raise
-    return tracking, tuple(not_read[place] for place in sorted(not_read))
+    return dataclasses.replace(found, unreadable=tuple(not_read[place] for place in sorted(not_read)))
 
 
 def images_lost(unreadable: Iterable[Unreadable]) -> tuple[Finding, ...]:

@@ -22,7 +22,7 @@ from disctrack.recording.declaration import Recording, read_recording
 from disctrack.synthetic.cameras import rig_of
 from disctrack.synthetic.description import GlareSettings, Scene
 from disctrack.synthetic.recording import Truth, write_recording
-from disctrack.track.follow.tracking import Taken, Tracking, track
+from disctrack.track.follow.tracking import Measurement, Taken, track
 from disctrack.track.measurement import open_pairs
 from disctrack.track.pose import MIN_DOTS
 from disctrack.trajectory import part
@@ -171,7 +171,7 @@ def render_and_measure(scene: Scene) -> RenderedOutcome:
         true,
         cameras_in_sight(truth.q, truth.rig, recording.disc),
         tuple(found[0].details["systematic_px"]),
-        tuple(finding.sentence for finding in found[0].findings),
+        tuple(finding.sentence for finding in found[0].trajectory.findings),
     )
 
 
@@ -186,7 +186,7 @@ def render(folder: Path, scene: Scene) -> Truth:
     return truth
 
 
-def locate(recording: Recording, rig: StereoRig) -> Tracking:
+def locate(recording: Recording, rig: StereoRig) -> Measurement:
     """The disc in all pairs, through these cameras."""
     pairs = open_pairs(recording)
     return track(pairs.reading({}), Taken(range(len(pairs)), recording.frame_rate), rig, recording.disc)

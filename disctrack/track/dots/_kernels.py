@@ -40,14 +40,6 @@ class Views(NamedTuple):
     t_cw: Array  # (c, 3)
 
 
-class Face(NamedTuple):
-    """The dots on the disc."""
-
-    centres: Array  # (m, 3) [m]
-    radius: float  # [m] of a dot
-    rim: float  # [m] of the edge whose blur must not reach the pixels used
-
-
 class Limits(NamedTuple):
     """When a converged fit is refused."""
 
@@ -601,7 +593,7 @@ def _look(images, readable, views, face, sigma, noise, limits, R, t, pixels, wor
     Filled: results (cameras, m) of DOT, status (cameras, m); u, v are the image of the dot's own centre, not the centre
     of its elliptical image.
     """
-    centres, radius, R_cw, t_cw = face.centres, face.radius, views.R_cw, views.t_cw
+    (centres, radius, rim), R_cw, t_cw = face, views.R_cw, views.t_cw
     m = centres.shape[0]
     R_cb, P, M = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     point, start, p, J = np.empty(3), np.empty(7), np.empty(8), np.empty((2, 3))
@@ -635,7 +627,7 @@ def _look(images, readable, views, face, sigma, noise, limits, R, t, pixels, wor
             start[3], start[4] = project_point(views.cameras[c], point[0], point[1], point[2], J)
             start[5], start[6] = _image_centroid(views.cameras[c], point, R_cb, radius, J)
             status[c, i] = _fit_dot(images[c], views.map_x[c], views.map_y[c], P, start, sigma[c],
-                                    noise[c], face.rim, centres, i, pixels, work, p, result)  # fmt: skip
+                                    noise[c], rim, centres, i, pixels, work, p, result)  # fmt: skip
             if status[c, i] == MEASURED:
                 for k in range(3):
                     point[k] += R_cb[k, 0] * p[ROW.a] + R_cb[k, 1] * p[ROW.b]
@@ -711,14 +703,14 @@ def _settle(results, status, views, centres, R, t, dots, filled):
 def track_frames(images, readable, views, face, sigma, noise, limits, heading, results, status, R_out, t_out, max_rms):
     """Follow the disc through a block of pairs, each predicted from the three before (`_predict`).
 
-    images (n, 2, H, W); readable (n, 2); sigma (2,) [px] of the dots' edges in each camera; noise (2, 3), whose
-    variance is noise[0] + noise[1] grey, and the square of the grey values' step; heading: the last three poses
-    ((R, t), ...), which are updated. Filled: results (n, 2, m) of DOT, status (n, 2, m), R_out (n, 3, 3), t_out (n, 3).
-    Returns the number of frames followed; less than n where the disc was lost at that frame.
+    images (n, 2, H, W); readable (n, 2); face: as `template.face_of` has it; sigma (2,) [px] of the dots' edges in each
+    camera; noise (2, 3): variance = noise[0] + noise[1] grey, and the square of the grey values' step; heading: the
+    last three poses ((R, t), ...), which are updated. Filled: results (n, 2, m) of DOT, status (n, 2, m), R_out
+    (n, 3, 3), t_out (n, 3). Returns the number of frames followed; less than n where the disc was lost at that frame.
     """
     (R_last, t_last), (R_before, t_before), (R_older, t_older) = heading
     pixels, work = np.empty((16, _PIXELS), np.float32), (np.empty((8, 8)), np.empty(8), np.empty(8), np.empty(8))
-    R, t, R_expected, shape = np.empty((3, 3)), np.empty(3), np.empty((3, 3)), (2, face.centres.shape[0])
+    R, t, R_expected, shape = np.empty((3, 3)), np.empty(3), np.empty((3, 3)), (2, face[0].shape[0])
     dots = np.empty((*shape, 2)), np.zeros((*shape, 2, 2)), np.empty(shape, np.bool_)
     filled = np.empty((*shape, 2)), np.empty((*shape, 2)), np.empty((*shape, 2, 6))
     for f in range(images.shape[0]):
@@ -727,7 +719,7 @@ def track_frames(images, readable, views, face, sigma, noise, limits, heading, r
         for _ in range(3):
             _copy(R_expected, R)
             _look(images[f], readable[f], views, face, sigma, noise, limits, R, t, pixels, work, results[f], status[f])
-            rms = _settle(results[f], status[f], views, face.centres, R, t, dots, filled)
+            rms = _settle(results[f], status[f], views, face[0], R, t, dots, filled)
             turned = 0.0
             for i in range(3):
                 for j in range(3):

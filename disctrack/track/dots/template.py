@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from calibration.kit.arrays import Array, Image, robust_sigma
 from calibration.kit.grey_levels import full_scale, level_step
 from disctrack.disc import Disc
-from disctrack.track.dots import _kernels as kernels
 from disctrack.trajectory import MarkerStatus
 
 TYPICAL_BLUR_PX = 0.8  # start value where nothing is known yet
@@ -66,8 +65,8 @@ class DotCentres:
     contrast: Array  # (..., m) 1 - dark / light
 
 
-def face_of(disc: Disc) -> kernels.Face:
-    """The dots on the disc, and the radius [m] within which the face is one even background for them.
+def face_of(disc: Disc) -> tuple[Array, float, float]:
+    """The dots' centres (m, 3) and radius, and the radius within which the face is one even background for them [m].
 
     Paper ends, and edges are bevelled, a few per cent inside the disc's radius; a dot printed farther out than that
     moves the limit with it.
@@ -75,7 +74,7 @@ def face_of(disc: Disc) -> kernels.Face:
     centres = np.ascontiguousarray(disc.marker_centres_body)
     outermost = float(np.hypot(*centres[:, :2].T).max()) + 0.5 * disc.marker_diameter
     rim = max(0.95 * disc.radius, min(outermost + 0.15 * disc.marker_diameter, disc.radius))
-    return kernels.Face(centres, 0.5 * disc.marker_diameter, rim)
+    return centres, 0.5 * disc.marker_diameter, rim
 
 
 def dot_centres(results: NDArray, status: NDArray[np.uint8]) -> DotCentres:

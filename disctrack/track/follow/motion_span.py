@@ -6,7 +6,7 @@ and a pause in the middle stays. "Differs" means more than noise, a change of th
 VIBRATION_PX: anything else counts as motion, a hand as well as the disc, so that doubt costs time and not data.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -39,25 +39,22 @@ class MotionSpan:
     verdict: str
 
 
-class StillScene:
-    """One camera's view at rest, and how its pixels scatter without motion."""
+def still_scene(first: NDArray, second: NDArray) -> Callable[[NDArray], bool]:
+    """Of one camera's view at rest: whether more has changed in an image than noise and the brightness of the whole."""
+    mean = _reduced(first)
+    steep = np.hypot(cv2.Sobel(mean, -1, 1, 0, scale=0.125), cv2.Sobel(mean, -1, 0, 1, scale=0.125))
+    tremble = 0.5 * VIBRATION_PX * steep  # the reduced image has half the pixels per side
+    weight = 1.0 / np.sqrt(_noise(mean, _reduced(second) - mean, steep) + tremble**2)
+    centred = mean - mean.mean()
+    square = float(np.vdot(centred, centred)) or 1.0
 
-    def __init__(self, first: NDArray, second: NDArray) -> None:
-        self._mean = _reduced(first)
-        steep = np.hypot(cv2.Sobel(self._mean, -1, 1, 0, scale=0.125), cv2.Sobel(self._mean, -1, 0, 1, scale=0.125))
-        variance = _noise(self._mean, _reduced(second) - self._mean, steep)
-        tremble = 0.5 * VIBRATION_PX * steep  # the reduced image has half the pixels per side
-        self._weight = 1.0 / np.sqrt(variance + tremble**2)
-        self._centred = self._mean - self._mean.mean()
-        self._square = float(np.vdot(self._centred, self._centred)) or 1.0
-
-    def differs(self, image: NDArray) -> bool:
-        """True where more has changed than noise and the brightness of the whole."""
+    def differs(image: NDArray) -> bool:
         now = _reduced(image)
-        level = float(now.mean())
-        gain = float(np.vdot(self._centred, now)) / self._square
-        z = np.abs(now - level - gain * self._centred) * self._weight
+        gain = float(np.vdot(centred, now)) / square
+        z = np.abs(now - float(now.mean()) - gain * centred) * weight
         return int(np.count_nonzero(z > THRESHOLD)) >= MIN_PIXELS
+
+    return differs
 
 
 def _reduced(image: NDArray) -> Array32:
@@ -114,8 +111,8 @@ def _last_still(left: FrameReader, right: FrameReader, frames: range) -> tuple[i
         looked += 1
         if len(scenes) < 2:
             scenes.append(pair)
-            still = tuple(map(StillScene, scenes[0], pair))
-        elif any(map(StillScene.differs, still, pair)):
+            still = tuple(map(still_scene, scenes[0], pair))
+        elif any(differs(image) for differs, image in zip(still, pair, strict=True)):
             return last, looked
         last = frame
     return None, looked

@@ -33,7 +33,7 @@ from disctrack.track.judge.cameras import frames_ahead, left_out
 from disctrack.track.judge.disc_not_seen import MEETING_PX, why_not_seen
 from disctrack.track.judge.doubts import MOVED
 from disctrack.track.pose import marker_pixels
-from disctrack.track.refine.assembly import Taken, Tracking, TrackingSettings, assemble
+from disctrack.track.refine.assembly import Measurement, Taken, TrackingSettings, assemble
 from disctrack.track.side_by_side import evenly
 from disctrack.trajectory import FrameStatus, MarkerStatus
 
@@ -67,7 +67,7 @@ def track(
     settings: TrackingSettings | None = None,
     workers: int = 1,
     progress: Callable[[int], object] = lambda n: None,
-) -> Tracking:
+) -> Measurement:
     """Measure the disc's pose in every pair of a recording.
 
     read_blocks(start, stop) gives the pairs start..stop-1 in blocks, in order; taken: which to measure (step 1).
@@ -81,7 +81,7 @@ def track(
     begin = Follower(rig, disc, views_of(rig))
     edges = stretch_edges(pairs, disc)
 
-    def measured(looked_for: Disc, progress: Callable[[int], object]) -> Tracking:
+    def measured(looked_for: Disc, progress: Callable[[int], object]) -> Measurement:
         """With the dots looked for at the places of a disc."""
         followers, tables = _followed(read_blocks, edges, replace(begin, disc=looked_for), workers, progress)
         if not np.isfinite(tables.t).any():
@@ -96,16 +96,18 @@ def track(
         read_blocks = _without(read_blocks, frames.CAMERAS.index(slip.subject.camera), slip.subject.frames[0][0])
         tracking = measured(disc, lambda n: None)
     found = tracking.trajectory.disc
-    if np.abs(found.marker_centres_body - disc.marker_centres_body).max() > LOOK_AGAIN and not _faulty(tracking):
+    if np.abs(found.marker_centres_body - disc.marker_centres_body).max() > LOOK_AGAIN and not _faulty(
+        tracking.trajectory.findings
+    ):
         tracking = measured(found, lambda n: None)
-    tracking = replace(tracking, findings=(*slips, *tracking.findings))
-    arranged = why_not_seen(_senseless(tracking, read_blocks, pairs), rig, disc)
-    return replace(tracking, findings=(*arranged, *tracking.findings, *stuck))
+    noticed = (*slips, *tracking.trajectory.findings)
+    arranged = why_not_seen(_senseless(tracking, noticed, read_blocks, pairs), rig, disc)
+    return replace(tracking, trajectory=replace(tracking.trajectory, findings=(*arranged, *noticed, *stuck)))
 
 
-def _faulty(tracking: Tracking) -> bool:
+def _faulty(noticed: Iterable[Finding]) -> bool:
     """Whether the images are in doubt."""
-    return in_doubt(f for f in tracking.findings if f.kind not in DECLARED)
+    return in_doubt(f for f in noticed if f.kind not in DECLARED)
 
 
 def _check_dots(disc: Disc) -> None:
@@ -119,11 +121,11 @@ def _check_dots(disc: Disc) -> None:
         )
 
 
-def _slips(tracking: Tracking, read_blocks: ReadBlocks, pairs: range, begin: Follower) -> tuple[Finding, ...]:
+def _slips(tracking: Measurement, read_blocks: ReadBlocks, pairs: range, begin: Follower) -> tuple[Finding, ...]:
     """Images left out by one camera, by the pairing that fits the frames after it."""
     apart = _apart(tracking) | (max(tracking.details["systematic_px"]) > MEETING_PX / 2)
     begun = np.flatnonzero(np.convolve(apart, np.ones(APART), "valid") == APART)
-    if not begun.size or Kind.DELAY in {finding.kind for finding in tracking.findings}:
+    if not begun.size or Kind.DELAY in {finding.kind for finding in tracking.trajectory.findings}:
         return ()
     first, start = int(begun[0]), pairs[begun[0]]
     edges = [start, min(start + PAIRED, pairs.stop)]
@@ -132,7 +134,7 @@ def _slips(tracking: Tracking, read_blocks: ReadBlocks, pairs: range, begin: Fol
     return (left_out(ahead, pairs, first),) if ahead else ()
 
 
-def _apart(tracking: Tracking) -> Mask:
+def _apart(tracking: Measurement) -> Mask:
     """(n,) frames in which dots were looked for in both images, and make no sense together."""
     status = tracking.trajectory.frame_status
     looked = (tracking.trajectory.marker_status != MarkerStatus.NOT_LOOKED_FOR).any(axis=2).all(axis=1)
@@ -149,12 +151,12 @@ def _without(read_blocks: ReadBlocks, camera: int, since: int) -> ReadBlocks:
     return lambda start, stop: map(without, read_blocks(start, stop))
 
 
-def _senseless(tracking: Tracking, read_blocks: ReadBlocks, pairs: range) -> NDArray:
+def _senseless(tracking: Measurement, noticed: tuple[Finding, ...], read_blocks: ReadBlocks, pairs: range) -> NDArray:
     """(k, 2, height, width) images in which the dots make no sense as declared; none where they do."""
-    kinds = {finding.kind for finding in tracking.findings}
+    kinds = {finding.kind for finding in noticed}
     status = tracking.trajectory.frame_status
     contradicted = Kind.ONE_SIDED in kinds or 2 * np.sum(status == FrameStatus.CONTRADICTED) > len(status)
-    far = _faulty(tracking) and max(tracking.details["systematic_px"]) > MEETING_PX
+    far = _faulty(noticed) and max(tracking.details["systematic_px"]) > MEETING_PX
     if not (contradicted or far) or Kind.DROPPED_FRAMES in kinds:  # which makes cameras contradict each other
         return _some(read_blocks, pairs[:0])
     rows = np.flatnonzero(_apart(tracking) | (far & (status == FrameStatus.MEASURED)))

@@ -3,10 +3,12 @@
 from collections.abc import Iterator
 
 import numpy as np
+from scipy.special import erfc
 
 from calibration.kit.arrays import Array, Mask, robust_sigma
 from calibration.kit.brief import ranges
 from disctrack import frames
+from disctrack.analyse.declaration import LAB_FRAME
 from disctrack.analyse.derivatives import CHANNELS
 from disctrack.disc import Disc, symmetry_order
 from disctrack.findings import MISFITS, Finding, Kind, Remedy, Severity, Subject
@@ -16,14 +18,12 @@ from disctrack.track.judge.cameras import HARDLY, LATE, delay_of_right
 from disctrack.track.pose import DotsInFrames
 from disctrack.track.refine.scatter import Scatter
 from disctrack.track.refine.self_calibration import AsBuilt
-from disctrack.track.refine.table_contact import TableFromDisc
+from disctrack.track.refine.table_contact import FROM_SIGMAS, TableFromDisc
 from disctrack.track.side_by_side import FEW, stretches
 from disctrack.trajectory import FrameStatus, Trajectory
 
 MISPLACED_MM = 0.15  # a printer that stretches a sheet by 0.5 % moves a dot 26 mm off the centre by 0.13 mm
-MAX_TABLE_GAP = 20e-6  # [m] the thickness of a board on the table is known to some 10 um
 FAULTY = 2.0  # times the variance of the noise, from which on a scatter has another cause
-DISAGREE = 0.003  # chance that board and disc differ by that much: three standard deviations
 ORDINARY_PX = 0.03  # rms of systematic misfit that good lenses have beyond their polynomial: no camera has moved
 HOPELESS = 25.0  # times the variance of the noise: no result of such dots is right within its sigmas
 NO_TOLERANCE = 0.4e-3  # [m] between the board's table and the disc's: a number declared wrong, or cameras that moved
@@ -70,7 +70,7 @@ def off_the_table(trajectory: Trajectory, severity: Severity = Severity.WARNING)
     J = np.stack([np.ones_like(psi), by_tilt * np.cos(psi), by_tilt * np.sin(psi)], axis=1)  # z, turns about x and y
     noise = np.median(np.einsum("ni,nij,nj->n", J, C[:, 2:5, 2:5], J))
     spread = robust_sigma(gap)
-    if max(abs(np.median(gap)), np.sqrt(max(spread**2 - FAULTY * noise, 0.0))) <= MAX_TABLE_GAP:
+    if max(abs(np.median(gap)), np.sqrt(max(spread**2 - FAULTY * noise, 0.0))) <= LAB_FRAME:
         return ()
     seen = Measured(1e6 * float(np.median(gap)), 1e6 * float(gap.std()), "um")
     text = (
@@ -189,7 +189,7 @@ def _table_disagrees(table: TableFromDisc | None, trajectory: Trajectory) -> tup
     """Board and disc that differ about the table by more than their tolerances; else a disc that is not on it."""
     apart = table is not None and abs(table.plane[0]) > NO_TOLERANCE
     severity = Severity.DOUBT if apart else Severity.WARNING
-    if table is None or table.probability >= DISAGREE:
+    if table is None or table.probability >= erfc(FROM_SIGMAS / np.sqrt(2)):
         return off_the_table(trajectory, severity)
     text = (
         f"the disc's lowest point does not roll on the board's table: {table.sentence}. They differ by more than "

@@ -9,8 +9,10 @@ from numpy.typing import NDArray
 
 from calibration.cameras.causes import causes
 from calibration.kit.arrays import Array, Mask
+from calibration.kit.brief import Brief
 from disctrack import frames
 from disctrack.findings import Finding
+from disctrack.recording.readers.blocks import Unreadable
 from disctrack.track.dots.template import DotCentres, dot_centres
 from disctrack.track.follow.following import Follower, Tables, repeats
 from disctrack.track.judge.cameras import camera_course
@@ -34,13 +36,24 @@ class TrackingSettings:
     first_pass: bool = True  # leave out what lies still before the motion starts and after it ends (motion_span.py)
 
 
-@dataclass(frozen=True)
-class Tracking:
-    """A trajectory and what the run found out on the way."""
+@dataclass(frozen=True, repr=False)
+class Measurement(Brief):
+    """A tracked recording, with what was noticed in `trajectory.findings`.
+
+    >>> measurement = measure("clip", "clip/results/rig.h5", open_pairs("clip", (0, 40)))
+    >>> measurement.trajectory.q.shape, measurement.unreadable
+    ((300, 6), ())
+    """
 
     trajectory: Trajectory
-    details: dict[str, Any]  # blur, noise, ... as `_details` has them: of JSON's types, stored with the result
-    findings: tuple[Finding, ...]
+    details: dict[str, Any]  # blur, noise, ...: of JSON's types, stored with the result
+    unreadable: tuple[Unreadable, ...] = ()
+    seconds: float = 0.0  # spent on reading and tracking
+
+    def facts(self) -> dict[str, str]:
+        """What a glance should tell (`Brief`)."""
+        told = self.trajectory.facts()
+        return told | {"unreadable images": f"{len(self.unreadable)}"} if self.unreadable else told
 
 
 @dataclass(frozen=True)
@@ -60,7 +73,7 @@ class Taken:
 
 def assemble(
     followers: list[Follower], tables: Tables, settings: TrackingSettings, taken: Taken, workers: int = 1
-) -> Tracking:
+) -> Measurement:
     """Trajectory of frames that were followed in one piece or in several; alters `tables`, which nobody else holds.
 
     workers : threads; the result is the same to the last bit for any number of them
@@ -108,7 +121,7 @@ def assemble(
     if table is not None:
         details["table"] = table.details(trajectory.q[:, 4], seen.disc)
     findings = (*repeated_images(repeated, trajectory), *of_exposure, *of_course, *doubts)
-    return Tracking(trajectory, details, findings)
+    return Measurement(replace(trajectory, findings=findings), details)
 
 
 def _as_they_were(

@@ -40,6 +40,7 @@ from numpy.typing import NDArray
 
 from calibration.cameras.camera import StereoRig
 from calibration.kit.arrays import Array, Mask
+from disctrack.analyse.quantities import SIGMAS
 from disctrack.disc import Disc
 from disctrack.findings import Finding, Kind, Severity
 from disctrack.frames import CAMERAS
@@ -59,9 +60,7 @@ from disctrack.track.side_by_side import MIN_FRAMES, SHARED_FRAMES, evenly, part
 PARTS = 10  # stretches of the recording, each left out in turn: what the fit leaves has a memory
 SURE = 3.0  # sigmas of T^2, or the exposure is taken as short
 APPROXIMATE = 0.1  # relative, of T^2: one blur stands for an edge that is smeared more here than there
-CONTRADICTS = 5.0  # sigmas between a declared exposure and the smear
 DEGREE = 4  # of the polynomial: glare as wide as the disc's path
-POWERS = [(i, k - i) for k in range(1, DEGREE + 1) for i in range(k + 1)]
 SAME = 1 / 16  # of a dot's diameter, about a pixel
 # Standard deviations of what one term adds to the contrast over the dots' path, in those of the contrast itself: the
 # likeliest is the prior, so that noise, and large terms that cancel where the dots are, shift nothing. It must be
@@ -137,7 +136,7 @@ def exposure_of(
     expected = np.array(declared) ** 2
     value, sigma = found
     doubt = np.hypot(sigma, APPROXIMATE * np.fmax(np.abs(value), expected))
-    if not (np.abs(value - expected) > CONTRADICTS * doubt).any():
+    if not (np.abs(value - expected) > SIGMAS * doubt).any():
         return declared, ()
     said = " and ".join(f"{1e6 * T:g}" for T in declared)
     text = (
@@ -296,24 +295,25 @@ def _gradient(places: Array, contrast: Array) -> Callable[[Array], Array] | None
     if np.sum(known.sum(axis=1) >= 2) < MIN_FRAMES:
         return None
     middle = np.mean(places[known], axis=0)
+    powers = [(i, k - i) for k in range(1, DEGREE + 1) for i in range(k + 1)]
     scale = float(np.abs(places[known] - middle).max())
     x, y = np.moveaxis((places - middle) / scale, -1, 0)
-    terms = np.stack([x**i * y**j for i, j in POWERS], axis=-1)
+    terms = np.stack([x**i * y**j for i, j in powers], axis=-1)
     dots = np.broadcast_to(np.eye(contrast.shape[1]), (*contrast.shape, contrast.shape[1]))
     rows = np.where(known[..., None], np.concatenate([terms, dots, contrast[..., None]], axis=-1), 0.0)
     use = known
     for _ in range(3):
         centred = _without_means(rows, use, axis=1)[use]
-        own = centred[:, len(POWERS) : -1]  # of the dots
+        own = centred[:, len(powers) : -1]  # of the dots
         left = centred - own @ np.linalg.lstsq(own, centred, rcond=None)[0]
-        coefficients, likelier = _likeliest(left[:, : len(POWERS)], left[:, -1])
+        coefficients, likelier = _likeliest(left[:, : len(powers)], left[:, -1])
         away = np.full(contrast.shape, np.inf)
-        away[use] = np.abs(left[:, -1] - left[:, : len(POWERS)] @ coefficients)
+        away[use] = np.abs(left[:, -1] - left[:, : len(powers)] @ coefficients)
         use = away <= 4.0 * 1.4826 * np.median(away[use]) + 1e-9
     if likelier < LIKELIER:
         return None
     table = np.zeros((DEGREE + 1, DEGREE + 1))
-    table[tuple(np.transpose(POWERS))] = coefficients
+    table[tuple(np.transpose(powers))] = coefficients
 
     def gradient(places: Array) -> Array:
         x, y = np.moveaxis((places - middle) / scale, -1, 0)

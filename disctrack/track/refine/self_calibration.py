@@ -30,7 +30,7 @@ from calibration.kit.arrays import Array
 from calibration.kit.least_squares import scaled_solve
 from disctrack.disc import Disc
 from disctrack.track.pose import DotsInFrames, PoseFits
-from disctrack.track.side_by_side import SHARED_FRAMES, evenly
+from disctrack.track.side_by_side import MIN_FRAMES, SHARED_FRAMES, evenly
 
 DOT_SIGMA = 50e-6  # [m] how far a printed dot may lie from its declared place: tens of micrometres are usual
 # The template's and the camera model's own errors (0.002 px) repeat from frame to frame, so that a long recording must
@@ -38,7 +38,6 @@ DOT_SIGMA = 50e-6  # [m] how far a printed dot may lie from its declared place: 
 SYSTEMATIC_PX = 0.002
 SIZE_FLOOR = 3e-6  # relative, of the dots as a ruler: metal and paper grow by some 1e-5 per kelvin
 ITERATIONS = 3
-MIN_FRAMES = 10
 MANY_DOTS = 5  # from which one may be left out
 SUM_OF_LENGTHS = 1.35  # variance of the pattern's place by the sum of lengths over that by the sum of squares
 
@@ -67,12 +66,6 @@ class AsBuilt:
         }
 
     @classmethod
-    def as_declared(cls, rig: StereoRig, disc: Disc) -> AsBuilt:
-        """Nothing refined."""
-        m = disc.n_markers
-        return cls(rig, disc, np.zeros((m, 3)), np.full((m, 2), DOT_SIGMA))
-
-    @classmethod
     def moved(cls, rig: StereoRig, disc: Disc, shift: Array, covariance: Array, reduced_chi_square: float) -> AsBuilt:
         """Dots moved by the part of displacements (m, 2) of covariance (2m, 2m) that is theirs, not their sigma's."""
         motions = _pattern_motions(disc).reshape(-1, 3)
@@ -92,7 +85,7 @@ def refine_as_built(frames: DotsInFrames) -> AsBuilt:
     enough = frames.posed & (np.isfinite(frames.pixels).all(-1).sum((1, 2)) >= 4)
     rows = evenly(np.flatnonzero(enough), SHARED_FRAMES)
     if len(rows) < MIN_FRAMES:
-        return AsBuilt.as_declared(rig, disc)
+        return AsBuilt(rig, disc, np.zeros((disc.n_markers, 3)), np.full((disc.n_markers, 2), DOT_SIGMA))
     sigma = np.r_[np.zeros(N_RIG), np.full(2 * disc.n_markers, DOT_SIGMA)]
     joint = fit_shared(frames.at(rows), sigma, repeats=SYSTEMATIC_PX)
     moved, remaining = joint.shift[N_RIG:].reshape(-1, 2), joint.covariance[N_RIG:, N_RIG:]

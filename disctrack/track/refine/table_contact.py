@@ -30,6 +30,8 @@ import scipy
 from calibration.cameras.camera import N_RIG, WORLD_SHIFT, WORLD_TURN, Allowance, StereoRig
 from calibration.kit.arrays import Array, robust_sigma
 from disctrack import frames
+from disctrack.analyse.declaration import lowest_arm
+from disctrack.analyse.derivatives import K
 from disctrack.disc import Disc
 from disctrack.numbers import measured
 from disctrack.track.pose import PoseFits
@@ -223,11 +225,12 @@ def _contacts(
         return None
     R, t = fits.R_world_body[rows], fits.t_world_body[rows]
     plane, kept = np.zeros(3), np.ones(len(rows), bool)
-    middle = np.median(_contact(R, t, disc, np.array([0.0, 0.0, 1.0]))[0], axis=0)[:2]
+    middle = np.median(t + lowest_arm(R[..., 2], K, disc), axis=0)[:2]
     for _ in range(6):
         normal = np.array([-plane[1], -plane[2], 1.0])
         normal /= np.linalg.norm(normal)
-        contact, arm = _contact(R, t, disc, normal)
+        arm = lowest_arm(R[..., 2], normal, disc)
+        contact = t + arm
         gap = (contact - [*middle, plane[0]]) @ normal
         A = np.column_stack([np.ones(len(rows)), contact[:, :2] - middle])
         information = A[kept].T @ A[kept] + np.diag((1e-6 / _WIDE) ** 2)  # beside gaps that scatter by a micrometre
@@ -255,16 +258,6 @@ def _contacts(
     covariance = inverse * (noise + repeats * max(kept.sum() / independent, 1.0))
     by_rig = -gain @ np.concatenate(gap_by_rig)
     return plane, middle, by_rig, covariance, by_disc, gain @ gap_by_place
-
-
-def _contact(R: Array, t: Array, disc: Disc, normal: Array) -> tuple[Array, Array]:
-    """The disc's lowest points (n, 3) against a normal, and the same from the centre."""
-    e3 = R[:, :, 2]
-    cosine = e3 @ normal
-    down = cosine[:, None] * e3 - normal  # in the disc's plane
-    arm = disc.radius * down / np.linalg.norm(down, axis=1, keepdims=True)
-    arm = arm - disc.half_thickness * np.sign(cosine)[:, None] * e3
-    return t + arm, arm
 
 
 def _on_plane(

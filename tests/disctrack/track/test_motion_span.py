@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from disctrack.errors import RecordingError
-from disctrack.track.follow.motion_span import MARGIN, STRIDE, StillScene, find_motion
+from disctrack.track.follow.motion_span import MARGIN, STRIDE, find_motion, still_scene
 
 RATE = 200.0  # [Hz] so that the margin is 50 frames
 MARGIN_FRAMES = round(MARGIN * RATE)
@@ -127,9 +127,9 @@ def test_frames_that_cannot_be_read_are_passed_over():
 def test_a_scene_tells_a_fifth_of_a_pixel_from_noise_and_noise_from_motion():
     still = DrawnCamera(lambda i: (64.0, 64.0, 0.0), 1)
     moved = DrawnCamera(lambda i: (64.25, 64.0, 0.0), 1)  # drawn in steps of an eighth
-    scene = StillScene(still.read(0), still.read(1))
-    assert not any(scene.differs(still.read(i)) for i in range(2, 60))
-    assert all(scene.differs(moved.read(i)) for i in range(2, 20))
+    differs = still_scene(still.read(0), still.read(1))
+    assert not any(differs(still.read(i)) for i in range(2, 60))
+    assert all(differs(moved.read(i)) for i in range(2, 20))
 
 
 def test_rest_seen_by_a_quiet_camera_is_rest_in_any_unit_of_grey(rng):
@@ -139,6 +139,6 @@ def test_rest_seen_by_a_quiet_camera_is_rest_in_any_unit_of_grey(rng):
     rest = [np.rint(scene + 0.15 * rng.standard_normal(scene.shape)).astype(np.uint8) for _ in range(6)]
     moved = np.roll(rest[5], 2, axis=1)
     for scale in (1, 16, 257):
-        still = StillScene(*(image.astype(np.uint16) * np.uint16(scale) for image in rest[:2]))
-        assert not any(still.differs(image.astype(np.uint16) * np.uint16(scale)) for image in rest[2:])
-        assert still.differs(moved.astype(np.uint16) * np.uint16(scale))
+        differs = still_scene(*(image.astype(np.uint16) * np.uint16(scale) for image in rest[:2]))
+        assert not any(differs(image.astype(np.uint16) * np.uint16(scale)) for image in rest[2:])
+        assert differs(moved.astype(np.uint16) * np.uint16(scale))

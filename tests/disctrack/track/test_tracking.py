@@ -191,9 +191,9 @@ def test_behind_a_colour_filter_the_disc_is_measured_as_without(rolling, rendere
     filtered = np.rint(filtered).astype(np.uint8)
 
     result = tracked(filtered, rendered_pairs)
-    assert sum("a colour filter lies on the sensor" in f.text for f in result.findings) == 2
+    assert sum("a colour filter lies on the sensor" in f.text for f in result.trajectory.findings) == 2
     plain = tracked(images, rendered_pairs)
-    assert not any("colour filter" in f.text for f in plain.findings)
+    assert not any("colour filter" in f.text for f in plain.trajectory.findings)
     rms = [np.sqrt(np.mean(compare(t.trajectory, q).error ** 2, axis=0)) for t in (plain, result)]
     # rounding to grey values that are 0.55 and 0.75 as large adds 1/12 of their square to the noise
     assert (rms[1] < 1.6 * rms[0]).all()
