@@ -419,7 +419,8 @@ def lowest_arm(e3: Array, normal: Array, disc: Disc) -> Array:
     """From the centre to the disc's lowest points against a normal (n, 3) [m], by the axis e3 (n, 3)."""
     cosine = (e3 @ normal)[:, None]
     down = cosine * e3 - normal  # in the disc's plane
-    return disc.arm_to_contact(-down / np.linalg.norm(down, axis=1, keepdims=True), np.sign(cosine) * e3)
+    along = disc.radius * down / np.linalg.norm(down, axis=1, keepdims=True)
+    return np.asarray(along - disc.half_thickness * np.sign(cosine) * e3)
 
 
 def _view_on_plane(rig: StereoRig, boards: Boards, normal: Array, middle: Array) -> int | None:
