@@ -12,12 +12,11 @@ from disctrack.track.dots.template import TYPICAL_BLUR_PX, dot_centres, face_of,
 
 
 @njit(cache=True, **RULES)
-def look(images, views, face, sigma, noise, limits, R, t, results, status):
+def look(images, views, face, expected, R, t, results, status):
     """Compiled as what it calls."""
     pixels, work = np.empty((16, 4096), np.float32), (np.empty((8, 8)), np.empty(8), np.empty(8), np.empty(8))
-    kernels._look(
-        images, np.ones(len(images), np.bool_), views, face, sigma, noise, limits, R, t, pixels, work, results, status
-    )
+    (sigma, noise, limits), seen = expected, np.ones(len(images), np.bool_)
+    kernels._look(images, seen, views, face, sigma, noise, limits, R, t, pixels, work, results, status)
 
 
 def locate_on_disc(image, camera, R, t, disc, *, maps=None, noise=None, blur_px=TYPICAL_BLUR_PX):
@@ -29,7 +28,7 @@ def locate_on_disc(image, camera, R, t, disc, *, maps=None, noise=None, blur_px=
     expected = np.array([blur_px]), parameters[None], kernels.Limits()
     pose = np.ascontiguousarray(R, float), np.ascontiguousarray(t, float)
     image = np.ascontiguousarray(image)[None]
-    look(image, views, face_of(disc), *expected, *pose, results, status)
+    look(image, views, face_of(disc), expected, *pose, results, status)
     return dot_centres(results[0], status[0])
 
 

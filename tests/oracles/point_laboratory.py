@@ -175,8 +175,8 @@ def tables_of(px, R, t, sigma):
 
 def tracked(px, R, t, times, rig, frame_rate, settings=None, workers=1):
     """What tracking makes of located dots (n, 2, m, 2), followed near poses R, t."""
-    edges = (Edge(noise=NoiseModel(0.64, 0.02)),) * 2
-    follower = Follower(rig, MA_2014, None, edges, measured=True)  # no image is looked at
+    # no image is looked at
+    follower = Follower(rig, MA_2014, None, (Edge(noise=NoiseModel(0.64, 0.02)),) * 2, measured=True)
     taken = Taken(range(len(px)), frame_rate, G, times)
     return assemble([follower], tables_of(px, R, t, DOT_PX), settings or TrackingSettings(), taken, workers)
 

@@ -112,9 +112,8 @@ def moved_camera(pairs: NDArray, rig: StereoRig, disc: Disc) -> Iterator[Finding
         return
     sigma = np.zeros(N_RIG + 2 * disc.n_markers)
     sigma[PAIR_TURN], sigma[PAIR_SHIFT] = TURN, SHIFT
-    found = fit_shared(seen, sigma)
-    rms = BLOB_PX * np.sqrt(found.reduced_chi_square)
-    moved = rig.perturbed(found.shift[:N_RIG])
+    found, _, reduced, _ = fit_shared(seen, sigma)
+    rms, moved = BLOB_PX * np.sqrt(reduced), rig.perturbed(found[:N_RIG])
     turn = np.linalg.norm(vector_from_rotation(moved.R_right_left @ rig.R_right_left.T))
     shift = np.linalg.norm(moved.t_right_left - rig.t_right_left)
     if rms[-1] < MEETING_PX and rms[0] > BETTER * rms[-1] and max(turn / TURN, shift / SHIFT) < MOST_SIGMAS:

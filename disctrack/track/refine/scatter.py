@@ -56,12 +56,12 @@ def without_shared_faults(frames: DotsInFrames) -> AsBuilt | None:
     camera = [_WIDE[name] for name in INTRINSIC_PARAMETERS]
     wide = np.concatenate([camera, camera, _WIDE_POSE, _WIDE_POSE, np.full(2 * m, DOT_SIGMA), [1.0]])
     wide[:N_RIG] *= (np.diag(rig.covariance) > 0) & (np.arange(N_RIG) < PAIR_SHIFT.stop)
-    joint = fit_shared(replace(frames.at(rows), further=by_delay[..., None]), wide)
+    shift, covariance, _, last = fit_shared(replace(frames.at(rows), further=by_delay[..., None]), wide)
     dots = slice(N_RIG, N_RIG + 2 * m)
-    _, fits = joint.frames.fitted(joint.shift, reject=True)
+    _, fits = last.fitted(shift, reject=True)
     spent = int(fits.degrees_of_freedom[fits.converged].sum())
     reduced = trimmed_reduced_chi_square(fits) * spent / max(spent - int(np.count_nonzero(wide)), 1)
-    return AsBuilt.moved(rig, disc, joint.shift[dots].reshape(m, 2), joint.covariance[dots, dots], reduced)
+    return AsBuilt.moved(rig, disc, shift[dots].reshape(m, 2), covariance[dots, dots], reduced)
 
 
 @dataclass(frozen=True)

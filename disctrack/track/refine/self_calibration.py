@@ -87,30 +87,24 @@ def refine_as_built(frames: DotsInFrames) -> AsBuilt:
     if len(rows) < MIN_FRAMES:
         return AsBuilt(rig, disc, np.zeros((disc.n_markers, 3)), np.full((disc.n_markers, 2), DOT_SIGMA))
     sigma = np.r_[np.zeros(N_RIG), np.full(2 * disc.n_markers, DOT_SIGMA)]
-    joint = fit_shared(frames.at(rows), sigma, repeats=SYSTEMATIC_PX)
-    moved, remaining = joint.shift[N_RIG:].reshape(-1, 2), joint.covariance[N_RIG:, N_RIG:]
+    shift, covariance, reduced, _ = fit_shared(frames.at(rows), sigma, repeats=SYSTEMATIC_PX)
+    moved, remaining = shift[N_RIG:].reshape(-1, 2), covariance[N_RIG:, N_RIG:]
     size, size_sigma = pattern_size(disc, moved, remaining)
     rig, size_share = sized_by_pattern(rig, size, size_sigma)
     moved = moved + size_share * size * _from_middle(disc)
-    found = AsBuilt.moved(rig, disc, moved, remaining, joint.reduced_chi_square[-1])
+    found = AsBuilt.moved(rig, disc, moved, remaining, reduced[-1])
     return replace(found, size=size, size_sigma=size_sigma, size_share=size_share)
 
 
-@dataclass(frozen=True)
-class SharedFit:
-    """What frames share, fitted with a free pose for every frame."""
-
-    shift: Array  # (30 + 2m + j,) of RIG_PARAMETERS, of the dots' places, of anything else
-    covariance: Array  # of it; zero where it was not free
-    reduced_chi_square: list[float]  # before each step
-    frames: DotsInFrames  # with the poses before the last step
-
-
-def fit_shared(frames: DotsInFrames, sigma: Array, repeats: float = 0.0) -> SharedFit:
-    """Fit what the frames share by Gauss-Newton.
+def fit_shared(
+    frames: DotsInFrames, sigma: Array, repeats: float = 0.0
+) -> tuple[Array, Array, list[float], DotsInFrames]:
+    """Fit what the frames share by Gauss-Newton, with a free pose for every frame.
 
     sigma : (30 + 2m + j,) of the prior about zero; what has none is not free
     repeats : [px] errors that are common to all frames: they bound what these tell together
+    returns : shift (30 + 2m + j,) of RIG_PARAMETERS, of the dots' places, of anything else; its covariance, zero where
+        it was not free; reduced chi-square before each step; the frames with the poses before the last one
     """
     shift, reduced, free = np.zeros(len(sigma)), [], sigma > 0
     information = np.diag(sigma[free] ** -2)
@@ -128,7 +122,7 @@ def fit_shared(frames: DotsInFrames, sigma: Array, repeats: float = 0.0) -> Shar
         shift[free] += scaled_solve(matrix, scale * gradient - information @ shift[free])
     covariance = np.zeros((len(shift), len(shift)))
     covariance[np.ix_(free, free)] = scaled_solve(matrix, np.eye(len(matrix)))
-    return SharedFit(shift, covariance, reduced, frames)
+    return shift, covariance, reduced, frames
 
 
 def share_of_places(disc: Disc, shift: Array, sigma: Array) -> float:
