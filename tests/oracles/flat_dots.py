@@ -29,7 +29,8 @@ def locate_on_disc(image, camera, R, t, disc, *, maps=None, noise=None, blur_px=
     pose = np.ascontiguousarray(R, float), np.ascontiguousarray(t, float)
     image = np.ascontiguousarray(image)[None]
     look(image, views, face_of(disc), expected, *pose, results, status)
-    return dot_centres(results[0], status[0])
+    dots, pixels, covariance = dot_centres(results[0], status[0])
+    return SimpleNamespace(pixels=pixels, covariance_px2=covariance, status=status[0], dots=dots)
 
 
 def locate_on_plane(image, image_from_plane, centres, radius, **known):

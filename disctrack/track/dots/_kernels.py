@@ -25,7 +25,9 @@ from disctrack.trajectory import MarkerStatus
 
 MEASURED, OUTSIDE, LOW_CONTRAST, OCCLUDED, NOT_CONVERGED, BLURRED, _, NOT_LOOKED_FOR = map(int, MarkerStatus)
 
-# Of a dot: pixel of its centre, covariance of that, and what is needed to judge the fit.
+# Of a dot: pixel of its centre, covariance of that by the image's noise, and what is needed to judge the fit: reduced
+# chi-square of its grey values and their number; sigma of the edge [px], smear of its motion included; radius [m]; grey
+# value of the paper, and contrast with it, 1 - dark / light; share of the pixels that do not fit.
 _OF_DOT = ("u", "v", "var_u", "var_v", "cov_uv", "chi_square", "sigma", "radius", "level", "contrast")
 DOT = np.dtype([(name, float) for name in (*_OF_DOT, "clipped", "n_pixels")])
 

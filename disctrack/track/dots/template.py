@@ -51,20 +51,6 @@ def typical_noise(image: Image) -> NoiseModel:
     return NoiseModel(grey**2, 0.02 * grey, float(level_step(image)))
 
 
-@dataclass(frozen=True)
-class DotCentres:
-    """Centres of dots (..., m) and what was found with them; NaN unless MEASURED."""
-
-    pixels: Array  # (..., m, 2)
-    covariance_px2: Array  # (..., m, 2, 2) from the image's noise, enlarged where the model misfits
-    status: NDArray[np.uint8]  # (..., m) MarkerStatus
-    misfit: Array  # (..., m) reduced chi-square of the grey values
-    n_pixels: Array  # (..., m) grey values that it was taken over
-    blur_px: Array  # (..., m) sigma of the edge, smear of its motion included
-    radius: Array  # (..., m) fitted radius, plane units
-    contrast: Array  # (..., m) 1 - dark / light
-
-
 def face_of(disc: Disc) -> tuple[Array, float, float]:
     """The dots' centres (m, 3) and radius, and the radius within which the face is one even background for them [m].
 
@@ -77,19 +63,18 @@ def face_of(disc: Disc) -> tuple[Array, float, float]:
     return centres, 0.5 * disc.marker_diameter, rim
 
 
-def dot_centres(results: NDArray, status: NDArray[np.uint8]) -> DotCentres:
-    """Arrays with names from the kernels' table of results (..., m) of DOT and status (..., m)."""
-    good = status == MarkerStatus.MEASURED
+def dot_centres(results: NDArray, status: NDArray[np.uint8]) -> tuple[NDArray, Array, Array]:
+    """The kernels' table of results (..., m) of DOT, NaN unless their status (..., m) is MEASURED; the dots' centres.
 
-    def of(*names: str) -> Array:
-        return np.stack([np.where(good, results[name], np.nan) for name in names], axis=-1)
-
-    misfit = of("chi_square")[..., 0]
-    covariance = of("var_u", "cov_uv", "cov_uv", "var_v").reshape(*good.shape, 2, 2)
+    These are pixels (..., m, 2) and their covariance (..., m, 2, 2) [px^2].
+    """
+    known = results.copy()
+    known[status != MarkerStatus.MEASURED] = np.nan
+    pixels = np.stack([known["u"], known["v"]], axis=-1)
+    covariance = np.stack([known[name] for name in ("var_u", "cov_uv", "cov_uv", "var_v")], axis=-1)
     # grey values that scatter more than the noise model says (print, speckle, compression) scatter the centre too
-    covariance *= np.maximum(misfit, 1.0)[..., None, None]
-    further = np.moveaxis(of("n_pixels", "sigma", "radius", "contrast"), -1, 0)
-    return DotCentres(of("u", "v"), covariance, status, misfit, *further)
+    covariance *= np.maximum(known["chi_square"], 1.0)[..., None]
+    return known, pixels, covariance.reshape(*status.shape, 2, 2)
 
 
 def measure_noise(

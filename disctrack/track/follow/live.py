@@ -106,8 +106,8 @@ class Tracker:
         followed = rows.frame_status
         if followed[0] != FrameStatus.MEASURED:
             self._angles, rows = None, empty_tables(1, self.disc.n_markers)
-        dots = dot_centres(rows.results, rows.status)
-        seen = DotsInFrames(self.rig, self.disc, dots.pixels, dots.covariance_px2, rows.R, rows.t)
+        _, *centres = dot_centres(rows.results, rows.status)
+        seen = DotsInFrames(self.rig, self.disc, *centres, rows.R, rows.t)
         fit = fit_poses(seen, with_sensitivity=False)
         angles = np.full(3, np.nan)
         if fit.converged[0]:
@@ -121,7 +121,7 @@ class Tracker:
             fit.R_world_body[0],
             fit.covariance[0],
             FrameStatus(status_of(followed, fit)[0]),
-            dots.pixels[0],
+            seen.pixels[0],
             fit.residuals_px[0],
             float(fit.reduced_chi_square[0]),
         )

@@ -13,7 +13,7 @@ from calibration.kit.brief import Brief
 from disctrack import frames
 from disctrack.findings import Finding
 from disctrack.recording.readers.blocks import Unreadable
-from disctrack.track.dots.template import DotCentres, dot_centres
+from disctrack.track.dots.template import dot_centres
 from disctrack.track.follow.following import Follower, Tables, repeats
 from disctrack.track.judge.cameras import camera_course
 from disctrack.track.judge.doubts import FAULTY, doubts_of, repeated_images
@@ -80,13 +80,16 @@ def assemble(
     """
     first = next((follower for follower in followers if follower.measured), followers[0])
     rig, disc = first.rig, first.disc
-    repeated, dots = repeats(tables.digest), dot_centres(tables.results, tables.status)
-    exposure, of_exposure = _as_they_were(tables, dots, repeated, first, settings, taken)
-    seen = DotsInFrames(rig, disc, dots.pixels, dots.covariance_px2, tables.R, tables.t)
+    repeated, (dots, *centres) = repeats(tables.digest), dot_centres(tables.results, tables.status)
+    seen = DotsInFrames(rig, disc, *centres, tables.R, tables.t)
+    alone = repeated & ~repeated.all(axis=1, keepdims=True)
+    seen.pixels[alone] = np.nan  # over the edges of stretches, too
+    tables.status[alone] = MarkerStatus.NOT_LOOKED_FOR
+    exposure, of_exposure = _as_they_were(seen, dots, first, settings, taken)
     as_built, faults, outlying = _shared(seen, workers)
     seen = replace(seen, rig=as_built.rig, disc=as_built.disc)
     fits = fit_all(seen, workers)
-    fits, systematic, scatter = _scattered(fits, dots, faults, outlying)
+    fits, systematic, scatter = _scattered(fits, seen.covariance, faults, outlying)
     seen = replace(seen, R=fits.R_world_body, t=fits.t_world_body)
     again = np.asarray(repeated.all(axis=1))
     fits, verdicts = judge_poses(fits, again, outlying, 1 / taken.frame_rate, disc.radius)
@@ -125,25 +128,21 @@ def assemble(
 
 
 def _as_they_were(
-    tables: Tables, dots: DotCentres, repeated: Mask, first: Follower, settings: TrackingSettings, taken: Taken
+    seen: DotsInFrames, dots: NDArray, first: Follower, settings: TrackingSettings, taken: Taken
 ) -> tuple[tuple[float, float], tuple[Finding, ...]]:
     """Move the dots to where they were in the middle of the exposure but for glare and lenses, and tell the exposure.
 
-    Those of images (n, 2) that are copies of others are taken out; what misfits beyond noise is in the covariances.
+    seen : altered; what misfits beyond noise is in the covariances then.  dots (n, 2, m) of `_kernels.DOT`
     """
-    where, rig, disc = (tables.R, tables.t, taken.time), first.rig, first.disc
-    edges = first.edges
-    found = exposure_by_smear(*where, dots.blur_px, rig, disc)
+    where, rig, disc, edges = (seen.R, seen.t, taken.time), seen.rig, seen.disc, first.edges
+    found = exposure_by_smear(*where, dots["sigma"], rig, disc)
     exposure, findings = exposure_of(found, settings.exposure, 1 / taken.frame_rate)
-    dots.pixels[...] -= shift_by_glare(tables.R, tables.t, dots.contrast, rig, disc, edges)
+    seen.pixels[...] -= shift_by_glare(seen.R, seen.t, dots["contrast"], rig, disc, edges)
     if any(exposure):
-        dots.pixels[...] -= shift_by_exposure(*where, np.array(exposure), rig, disc, edges)
-    alone = repeated & ~repeated.all(axis=1, keepdims=True)
-    dots.pixels[alone] = np.nan  # over the edges of stretches, too
-    tables.status[alone] = MarkerStatus.NOT_LOOKED_FOR
-    dots.covariance_px2[...] *= unexpected_misfit(dots.misfit, dots.n_pixels)[..., None, None]
+        seen.pixels[...] -= shift_by_exposure(*where, np.array(exposure), rig, disc, edges)
+    seen.covariance[...] *= unexpected_misfit(dots["chi_square"], dots["n_pixels"])[..., None, None]
     if rig.lens_field is not None:
-        dots.pixels[...] = rig.lens_field.corrected(dots.pixels)
+        seen.pixels[...] = rig.lens_field.corrected(seen.pixels)
     return exposure, findings
 
 
@@ -160,7 +159,7 @@ def _shared(seen: DotsInFrames, workers: int) -> tuple[AsBuilt, AsBuilt | None, 
 
 
 def _scattered(
-    fits: PoseFits, dots: DotCentres, faults: AsBuilt | None, outlying: Mask
+    fits: PoseFits, covariance: Array, faults: AsBuilt | None, outlying: Mask
 ) -> tuple[PoseFits, Array, Scatter]:
     """Poses and dots with covariances of the noise they have, the part (n, 6, 6) that repeats, and what was found."""
     ordinary = replace(
@@ -168,8 +167,8 @@ def _scattered(
         degrees_of_freedom=np.where(outlying, 0, fits.degrees_of_freedom),
         used=fits.used & ~outlying[:, None, None],
     )
-    scatter = split_scatter(ordinary, dots.covariance_px2, faults)
-    dots.covariance_px2[...] *= scatter.noise  # in place: nobody else holds them
+    scatter = split_scatter(ordinary, covariance, faults)
+    covariance[...] *= scatter.noise  # in place: nobody else holds them
     systematic = fits.covariance * scatter.systematic
     fits.covariance[...] *= scatter.noise
     return replace(fits, chi_square=fits.chi_square / scatter.whole), systematic, scatter

@@ -33,15 +33,10 @@ def poses_in_camera(pairs, index, camera, turned=0.0, moved=0.0, rng=None):
 def locate_all(pairs, images, noise, rng=None, turned=0.0, moved=0.0, disc=None, **known):
     maps = [normalised_maps(camera) for camera in pairs.rig.cameras]
     found = []
-    for index in range(len(images)):
-        for camera in (0, 1):
-            R, t = poses_in_camera(pairs, index, camera, turned, moved, rng)
-            view = pairs.rig.cameras[camera]
-            found.append(
-                locate_on_disc(
-                    images[index, camera], view, R, t, disc or pairs.disc, maps=maps[camera], noise=noise, **known
-                )
-            )
+    for index, camera in np.ndindex(len(images), 2):
+        R, t = poses_in_camera(pairs, index, camera, turned, moved, rng)
+        image, view = images[index, camera], pairs.rig.cameras[camera]
+        found.append(locate_on_disc(image, view, R, t, disc or pairs.disc, maps=maps[camera], noise=noise, **known))
     centres = np.stack([dots.pixels for dots in found]).reshape(len(images), 2, -1, 2)
     covariance = np.stack([dots.covariance_px2 for dots in found]).reshape(*centres.shape, 2)
     return centres, covariance, found
@@ -139,7 +134,7 @@ def test_a_dot_of_another_size_moves_no_centre(rendered_pairs, rng):
     found, _, dots = locate_all(pairs, pairs.images, SENSOR_NOISE, disc=wrong_size)
     # a third of a sigma: the band of pixels starts 0.4 px farther out, so other noise enters
     assert np.sqrt(np.nanmean((found - declared) ** 2)) < 1.3e-3
-    radii = np.concatenate([d.radius for d in dots])
+    radii = np.concatenate([d.dots["radius"] for d in dots])
     # a radius is an edge found all round: 0.004 px of 14 px, plus the renderer's exactness
     assert_allclose(np.nanmean(radii), 0.5 * pairs.disc.marker_diameter, rtol=3e-4)
 
@@ -156,7 +151,7 @@ def test_light_dots_on_dark_are_found_as_well_as_dark_on_light(rendered_pairs, g
         sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
         assert sigma.max() < 0.008
         assert np.abs((centres - pairs.true_pixels) / sigma).max() < 4  # 24 numbers: 4 sigma once in 600 runs
-    assert all((d.contrast[np.isfinite(d.contrast)] < 0).all() for d in dots)
+    assert all((d.dots["contrast"][np.isfinite(d.dots["contrast"])] < 0).all() for d in dots)
 
 
 def test_uneven_light_and_hot_pixels_move_no_centre(rendered_pairs, rng):
@@ -232,7 +227,7 @@ def test_a_dot_wider_than_the_rows_kept_for_it_loses_no_pixel():
     assert found.status[0] == MarkerStatus.MEASURED
     # the band of pixels reaches from 3 blurs and 2 px inside the edge to 3 and 1 px outside
     outer, inner = radius + 3 * blur + 1, radius - 3 * blur - 2
-    assert_allclose(found.n_pixels[0], np.pi * (outer**2 - inner**2), rtol=0.01)
+    assert_allclose(found.dots["n_pixels"][0], np.pi * (outer**2 - inner**2), rtol=0.01)
     # a curved edge's blur is modelled to first order in blur over radius: an error of their ratio squared
     # of the 0.3 px by which the band of pixels is not centred
     assert_allclose(found.pixels[0], centre, atol=0.3 * (blur / radius) ** 2)

@@ -248,9 +248,9 @@ def test_what_the_fit_of_all_poses_needs_beside_its_result_does_not_grow_with_th
     for n in (1536, 4608):
         k = np.arange(n) % len(R)
         tables = tables_of(rendered_pairs.true_pixels[k], R[k], t[k], 0.01)
-        dots = dot_centres(tables.results, tables.status)
+        _, *centres = dot_centres(tables.results, tables.status)
         tracemalloc.start()
-        fits = fit_all(DotsInFrames(rig, disc, dots.pixels, dots.covariance_px2, tables.R, tables.t))
+        fits = fit_all(DotsInFrames(rig, disc, *centres, tables.R, tables.t))
         peak = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
         assert fits.converged.all()
