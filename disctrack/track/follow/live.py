@@ -106,8 +106,8 @@ class Tracker:
         followed = rows.frame_status
         if followed[0] != FrameStatus.MEASURED:
             self._angles, rows = None, empty_tables(1, self.disc.n_markers)
-        _, *centres = dot_centres(rows.results, rows.status)
-        seen = DotsInFrames(self.rig, self.disc, *centres, rows.R, rows.t)
+        _, pixels, covariance = dot_centres(rows.results, rows.status)
+        seen = DotsInFrames(self.rig, self.disc, pixels, covariance, rows.R, rows.t)
         fit = fit_poses(seen, with_sensitivity=False)
         angles = np.full(3, np.nan)
         if fit.converged[0]:

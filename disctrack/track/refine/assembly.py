@@ -80,8 +80,8 @@ def assemble(
     """
     first = next((follower for follower in followers if follower.measured), followers[0])
     rig, disc = first.rig, first.disc
-    repeated, (dots, *centres) = repeats(tables.digest), dot_centres(tables.results, tables.status)
-    seen = DotsInFrames(rig, disc, *centres, tables.R, tables.t)
+    repeated, (dots, pixels, covariance) = repeats(tables.digest), dot_centres(tables.results, tables.status)
+    seen = DotsInFrames(rig, disc, pixels, covariance, tables.R, tables.t)
     alone = repeated & ~repeated.all(axis=1, keepdims=True)
     seen.pixels[alone] = np.nan  # over the edges of stretches, too
     tables.status[alone] = MarkerStatus.NOT_LOOKED_FOR
