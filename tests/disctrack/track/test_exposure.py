@@ -225,7 +225,7 @@ def located(rendered_pairs):
                 lit = plain * (1 - 4e-4 * place @ [1.0, 0.5]) + added
                 of_plain, of_lit = (locate_in_window(image, centre, A, noise=NOISE) for image in (plain, lit))
                 shift[frame, dot] = (of_lit.pixels - of_plain.pixels)[0]
-                contrast[frame, 0, dot] = of_lit.contrast[0]
+                contrast[frame, 0, dot] = of_lit.dots["contrast"][0]
         found[kind] = contrast, shift
     edge = Edge(0.65, PAPER, 1 - DARK / PAPER, NOISE)
 
