@@ -46,34 +46,25 @@ def write_variables(
             dataset.dims[position].attach_scale(root[axis_name])
 
 
-_REFERENCES = ("DIMENSION_LIST", "REFERENCE_LIST")  # between scales and datasets: they mean nothing in another file
-
-
 def copy_without(source: h5py.File, target: h5py.File, groups: Collection[str], axes: Collection[str]) -> None:
     """All of a file but these groups of its root, and those of these axes that nothing else refers to."""
-    kept = [name for name in source if name not in groups]
-    used: dict[str, list[str]] = {}  # dataset -> its axes
-
-    def note(name: str, item: Any) -> None:
-        if isinstance(item, h5py.Dataset) and not item.is_scale:
-            used[name] = [dimension[0].name.lstrip("/") for dimension in item.dims if len(dimension)]
-
-    for name in kept:
-        note(name, source[name])
-        if isinstance(source[name], h5py.Group):
-            source[name].visititems(lambda below, item, above=name: note(f"{above}/{below}", item))
-    needed = {axis for names in used.values() for axis in names}
-    for name in kept:
-        if name not in axes or name in needed:
+    there: list[str] = []
+    source.visit(there.append)
+    kept = [source[path] for path in there if path.partition("/")[0] not in groups]
+    axes_of = {
+        item.name: [dimension[0].name for dimension in item.dims if len(dimension)]
+        for item in kept
+        if isinstance(item, h5py.Dataset) and not item.is_scale
+    }
+    needed = {axis for names in axes_of.values() for axis in names}
+    for name in source:
+        if name not in groups and (name not in axes or f"/{name}" in needed):
             source.copy(name, target)
+            # references between scales and datasets mean nothing in another file
+            target[name].attrs.pop("REFERENCE_LIST", None)
     target.attrs.update(source.attrs)
-    for name in target:
-        for reference in _REFERENCES:
-            if reference in target[name].attrs:
-                del target[name].attrs[reference]
-    for name, names in used.items():
-        if "DIMENSION_LIST" in target[name].attrs:
-            del target[name].attrs["DIMENSION_LIST"]
+    for name, names in axes_of.items():
+        target[name].attrs.pop("DIMENSION_LIST", None)
         for position, axis in enumerate(names):
             target[name].dims[position].attach_scale(target[axis])
 

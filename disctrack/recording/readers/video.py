@@ -76,8 +76,7 @@ class _Video:
     def __init__(self, file: Path, camera: str) -> None:
         self.file, self.camera = file, camera
         self._lock = threading.Lock()
-        self._container: InputContainer | None = None
-        self._frames: Generator[_Decoded, None, None]
+        self._frames: Generator[_Decoded, None, None] | None = None
         self._next = 0  # the next frame of the decoder is this one, or one that follows
         self._held: _Decoded = (-1, None, "")
         self._content: bytes | None = None
@@ -107,14 +106,15 @@ class _Video:
     def frame(self, index: int, where: str) -> av.VideoFrame:
         """The decoded frame. Raises RecordingError."""
         key = int(self._keys[np.searchsorted(self._keys, index, side="right") - 1])
-        if self._container is None or not min(key, index - _DECODED_ON) <= self._next <= index:
-            try:
-                self._start_at(key)
-            except RecordingError as error:  # the file is opened anew
-                raise RecordingError(f"{where}: {error}") from error
+        if self._frames is None or not min(key, index - _DECODED_ON) <= self._next <= index:
+            self._frames, self._held = self._from(key), (-1, None, "")
         self._next = index + 1
-        while self._held[0] < index:
-            self._held = next(self._frames, (len(self.times), None, ""))
+        try:
+            while self._held[0] < index:
+                self._held = next(self._frames, (len(self.times), None, ""))
+        except RecordingError as error:  # the file is opened anew
+            self._frames = None
+            raise RecordingError(f"{where}: {error}") from error
         position, frame, problem = self._held
         if position > index:
             raise RecordingError(f"{where}: the video does not hold this frame, or it is cut short. Copy it again.")
@@ -122,28 +122,24 @@ class _Video:
             raise RecordingError(f"{where}: cannot be decoded ({problem}). Copy or export the video again.")
         return frame
 
-    def _start_at(self, key: int) -> None:
-        """Decode from a key frame on; from the beginning where it cannot be found."""
-        if self._container is not None:
-            self._frames.close()
-            self._container.close()
-        self._container, self._next, self._held = _opened(self.file, self.camera), key, (-1, None, "")
-        try:
-            if key:
-                stream = self._container.streams.video[0]
-                self._container.seek(int(self.times[key]), stream=stream, backward=True)
-        except (OSError, ValueError):
-            self._container.close()
-            self._container, self._next = _opened(self.file, self.camera), 0
-        self._frames = self._decoding(self._container, self._next)
+    def _from(self, count: int) -> Generator[_Decoded, None, None]:
+        """All frames from a key frame on in order, from the beginning where it cannot be found.
 
-    def _decoding(self, container: InputContainer, count: int) -> Generator[_Decoded, None, None]:
-        """All frames from number `count` on in order; after damage none is trusted up to the next key frame."""
+        After damage none is trusted up to the next key frame. Raises RecordingError where the file is no longer there.
+        """
+        container = _opened(self.file, self.camera)
         import av
 
-        damage = ""
-        with suppress(av.FFmpegError, OSError, ValueError):  # what follows a fault of the container is not to be found
-            for packet in container.demux(container.streams.video[0]):
+        stream, damage = container.streams.video[0], ""
+        # what follows a fault of the container is not to be found
+        with container, suppress(av.FFmpegError, OSError, ValueError):
+            try:
+                if count:
+                    container.seek(int(self.times[count]), stream=stream, backward=True)
+            except (OSError, ValueError):
+                yield from self._from(0)
+                return
+            for packet in container.demux(stream):
                 if packet.is_keyframe and packet.size:
                     damage = ""
                 frames: list[av.VideoFrame] = []
