@@ -11,8 +11,6 @@ import h5py
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-CHUNK_ROWS = 1024
-
 
 @dataclass(frozen=True)
 class Variable:
@@ -80,9 +78,9 @@ def _create(group: h5py.Group, name: str, variable: Variable) -> h5py.Dataset:
     elif data.ndim == 0 or data.size == 0:
         dataset = group.create_dataset(name, data=data)
     else:
-        chunks = (min(CHUNK_ROWS, data.shape[0]), *data.shape[1:])
-        dataset = group.create_dataset(name, data=data, chunks=chunks, compression="gzip", compression_opts=1,
-                                       shuffle=True, fletcher32=True)  # fmt: skip
+        dataset = group.create_dataset(
+            name, data=data, compression="gzip", compression_opts=1, shuffle=True, fletcher32=True
+        )
     dataset.attrs["units"] = variable.units
     dataset.attrs["long_name"] = variable.long_name
     for key, value in variable.attributes.items():

@@ -40,7 +40,6 @@ _SETUP_FIELDS = {
     "ShutterNs": 1568,
     "EDRShutterNs": 1572,
 }
-_SETUP_BYTES = max(_SETUP_FIELDS.values()) + 4
 _FRACTION = 0xFFFFFFFC  # of a second, in 2**-32 s; the two lowest bits are flags
 # Way of packing (biCompression): bits per stored pixel; 0 is none.
 _PACKED = {256: 10, 1024: 12}
@@ -91,7 +90,7 @@ class _Cine:
         length = int.from_bytes(mark_and_length[2:], "little")
         if mark_and_length[:2] != b"ST":
             raise RecordingError(f"{file}: no camera setup where the header says. Export the recording again.")
-        self.setup = file.bytes_at(setup_at, min(length, _SETUP_BYTES), f"{file}: camera setup")
+        self.setup = file.bytes_at(setup_at, length, f"{file}: camera setup")
         self.blocks = setup_at + length  # where they begin
 
     def field(self, name: str) -> int:

@@ -19,6 +19,7 @@ from disctrack.recording.readers.base import FrameReader, only_file, room_for
 from disctrack.recording.readers.decoding import inflated
 from disctrack.recording.readers.raw import (
     LEAST_PRESENT,
+    MOST_PIXELS,
     PixelLayout,
     RawFile,
     bit_depth_of,
@@ -27,7 +28,6 @@ from disctrack.recording.readers.raw import (
 )
 
 _LARGEST_CACHE = 64 << 20  # bytes of decompressed chunks kept; more than one camera's chunk of many frames
-_LARGEST_CHUNK = 512 << 20  # bytes: what the library takes at once, whatever the file's size
 
 
 def open_hdf5(files: Sequence[Path], camera: str, member: str = "") -> FrameReader:
@@ -84,9 +84,10 @@ def _open(handle: h5py.File, stack: h5py.Dataset, file: Path, camera: str) -> Fr
     n, height, width = stack.shape
     where = f"{file}:{stack.name}"
     check_frame_size(width, height, where)
-    if stack.chunks and np.prod(stack.chunks, dtype=float) * stack.dtype.itemsize > _LARGEST_CHUNK:
+    most = 4 * MOST_PIXELS  # bytes: the library takes a chunk at once, whatever the file's size
+    if stack.chunks and np.prod(stack.chunks, dtype=float) * stack.dtype.itemsize > most:
         raise RecordingError(
-            f"{where}: one chunk {stack.chunks} holds more than {_LARGEST_CHUNK >> 20} MB, all of which is read for "
+            f"{where}: one chunk {stack.chunks} holds more than {most >> 20} MB, all of which is read for "
             "any frame in it. Write it again with chunks of one frame."
         )
     if stack.external:
