@@ -15,8 +15,8 @@ from disctrack.track.dots.template import TYPICAL_BLUR_PX, dot_centres, face_of,
 def look(images, views, face, expected, R, t, results, status):
     """Compiled as what it calls."""
     pixels, work = np.empty((16, 4096), np.float32), (np.empty((8, 8)), np.empty(8), np.empty(8), np.empty(8))
-    (sigma, noise, limits), seen = expected, np.ones(len(images), np.bool_)
-    kernels._look(images, seen, views, face, sigma, noise, limits, R, t, pixels, work, results, status)
+    (maps, cameras), (sigma, noise, limits), seen = views, expected, np.ones(len(images), np.bool_)
+    kernels._look(images, seen, maps, cameras, face, sigma, noise, limits, R, t, pixels, work, results, status)
 
 
 def locate_on_disc(image, camera, R, t, disc, *, maps=None, noise=None, blur_px=TYPICAL_BLUR_PX):
@@ -24,7 +24,7 @@ def locate_on_disc(image, camera, R, t, disc, *, maps=None, noise=None, blur_px=
     map_x, map_y = maps if maps is not None else normalised_maps(camera)
     parameters = (noise or typical_noise(image)).parameters
     results, status = np.full((1, disc.n_markers), np.nan, kernels.DOT), np.zeros((1, disc.n_markers), np.uint8)
-    views = kernels.Views(map_x[None], map_y[None], camera.parameters[None], np.eye(3)[None], np.zeros((1, 3)))
+    views = (map_x[None], map_y[None]), (camera.parameters[None], np.eye(3)[None], np.zeros((1, 3)))
     expected = np.array([blur_px]), parameters[None], kernels.Limits()
     pose = np.ascontiguousarray(R, float), np.ascontiguousarray(t, float)
     image = np.ascontiguousarray(image)[None]

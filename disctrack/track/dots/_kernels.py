@@ -18,7 +18,6 @@ import numpy as np
 
 from calibration.cameras._projection import project_point
 from calibration.kit._cholesky import solve_in_place, substitute
-from calibration.kit.arrays import Array
 from calibration.kit.compiled import part as _part
 from disctrack.track._pose_kernel import _copy, _entry, fit_pose
 from disctrack.trajectory import MarkerStatus
@@ -30,16 +29,6 @@ MEASURED, OUTSIDE, LOW_CONTRAST, OCCLUDED, NOT_CONVERGED, BLURRED, _, NOT_LOOKED
 # value of the paper, and contrast with it, 1 - dark / light; share of the pixels that do not fit.
 _OF_DOT = ("u", "v", "var_u", "var_v", "cov_uv", "chi_square", "sigma", "radius", "level", "contrast")
 DOT = np.dtype([(name, float) for name in (*_OF_DOT, "clipped", "n_pixels")])
-
-
-class Views(NamedTuple):
-    """Where the cameras (c) stand and what they do to a point."""
-
-    map_x: Array  # (c, height, width) undistorted normalised coordinates of every pixel
-    map_y: Array
-    cameras: Array  # (c, 9) INTRINSIC_PARAMETERS
-    R_cw: Array  # (c, 3, 3)
-    t_cw: Array  # (c, 3)
 
 
 class Limits(NamedTuple):
@@ -589,13 +578,13 @@ def _judge_dot(result, radius, typical_sigma, noise, limits):
 
 
 @_part
-def _look(images, readable, views, face, sigma, noise, limits, R, t, pixels, work, results, status):
+def _look(images, readable, maps, cameras, face, sigma, noise, limits, R, t, pixels, work, results, status):
     """Locate and judge the dots in the images (cameras, H, W) of one instant, the disc being near the pose R, t.
 
     Filled: results (cameras, m) of DOT, status (cameras, m); u, v are the image of the dot's own centre, not the centre
     of its elliptical image.
     """
-    (centres, radius, rim), R_cw, t_cw = face, views.R_cw, views.t_cw
+    (centres, radius, rim), (intrinsics, R_cw, t_cw) = face, cameras
     m = centres.shape[0]
     R_cb, P, M = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     point, start, p, J = np.empty(3), np.empty(7), np.empty(8), np.empty((2, 3))
@@ -626,14 +615,14 @@ def _look(images, readable, views, face, sigma, noise, limits, R, t, pixels, wor
                     a, b, d, e = (j + 1) % 3, (j + 2) % 3, (k + 1) % 3, (k + 2) % 3
                     P[k, j] = M[a, d] * M[b, e] - M[a, e] * M[b, d]
             start[0], start[1], start[2] = x, y, radius
-            start[3], start[4] = project_point(views.cameras[c], point[0], point[1], point[2], J)
-            start[5], start[6] = _image_centroid(views.cameras[c], point, R_cb, radius, J)
-            status[c, i] = _fit_dot(images[c], views.map_x[c], views.map_y[c], P, start, sigma[c],
+            start[3], start[4] = project_point(intrinsics[c], point[0], point[1], point[2], J)
+            start[5], start[6] = _image_centroid(intrinsics[c], point, R_cb, radius, J)
+            status[c, i] = _fit_dot(images[c], maps[0][c], maps[1][c], P, start, sigma[c],
                                     noise[c], rim, centres, i, pixels, work, p, result)  # fmt: skip
             if status[c, i] == MEASURED:
                 for k in range(3):
                     point[k] += R_cb[k, 0] * p[ROW.a] + R_cb[k, 1] * p[ROW.b]
-                result.u, result.v = project_point(views.cameras[c], point[0], point[1], point[2], J)
+                result.u, result.v = project_point(intrinsics[c], point[0], point[1], point[2], J)
                 status[c, i] = _judge_dot(result, radius, sigma[c], noise[c], limits)
 
 
@@ -675,7 +664,7 @@ def _orthonormalise(R, work):
 
 
 @_part
-def _settle(results, status, views, centres, R, t, dots, filled):
+def _settle(results, status, cameras, centres, R, t, dots, filled):
     """Move the pose R, t onto the dots of one pair; returns the rms residual [px], negative without an answer.
 
     A prediction need not follow the noise of the best dots, nor, beyond a pixel, a wrong one.
@@ -689,7 +678,6 @@ def _settle(results, status, views, centres, R, t, dots, filled):
             count += used[c, m]
             for axis in range(2):
                 covariance[c, m, axis, axis] = results[c, m].var_u + results[c, m].var_v + _FOLLOWED_PX * _FOLLOWED_PX
-    cameras = views.cameras, views.R_cw, views.t_cw
     if count < 3 or not fit_pose(observed, covariance, used, cameras, centres, 0.1, 1.0, R, t, filled):
         return -1.0
     total = 0.0
@@ -702,10 +690,12 @@ def _settle(results, status, views, centres, R, t, dots, filled):
 
 
 @_entry
-def track_frames(images, readable, views, face, sigma, noise, limits, heading, results, status, R_out, t_out, max_rms):
+def track_frames(images, readable, maps, cameras, face, sigma, noise, limits, heading, results, status, R_out, t_out,
+                 max_rms):  # fmt: skip
     """Follow the disc through a block of pairs, each predicted from the three before (`_predict`).
 
-    images (n, 2, H, W); readable (n, 2); face: as `template.face_of` has it; sigma (2,) [px] of the dots' edges in each
+    images (n, 2, H, W); readable (n, 2); maps: x and y (2, H, W) undistorted normalised coordinates of the cameras'
+    pixels; cameras as `pose.stacked` has them, face as `template.face_of`; sigma (2,) [px] of the dots' edges in each
     camera; noise (2, 3): variance = noise[0] + noise[1] grey, and the square of the grey values' step; heading: the
     last three poses ((R, t), ...), which are updated. Filled: results (n, 2, m) of DOT, status (n, 2, m), R_out
     (n, 3, 3), t_out (n, 3). Returns the number of frames followed; less than n where the disc was lost at that frame.
@@ -720,8 +710,9 @@ def track_frames(images, readable, views, face, sigma, noise, limits, heading, r
         rms = -1.0
         for _ in range(3):
             _copy(R_expected, R)
-            _look(images[f], readable[f], views, face, sigma, noise, limits, R, t, pixels, work, results[f], status[f])
-            rms = _settle(results[f], status[f], views, face[0], R, t, dots, filled)
+            _look(images[f], readable[f], maps, cameras, face, sigma, noise, limits, R, t, pixels, work, results[f],
+                  status[f])  # fmt: skip
+            rms = _settle(results[f], status[f], cameras, face[0], R, t, dots, filled)
             turned = 0.0
             for i in range(3):
                 for j in range(3):

@@ -73,11 +73,11 @@ class Heading(NamedTuple):
         return Heading.steady(last, before)
 
 
-def views_of(rig: StereoRig) -> kernels.Views:
-    """The cameras as the loop over frames has them: with their maps, which take a while."""
+def maps_of(rig: StereoRig) -> tuple[Array, Array]:
+    """Undistorted normalised coordinates x and y (2, height, width) of the cameras' pixels, which take a while."""
     with ThreadPoolExecutor(2) as pool:
         maps_x, maps_y = zip(*pool.map(normalised_maps, rig.cameras), strict=True)
-    return kernels.Views(np.stack(maps_x), np.stack(maps_y), *stacked(rig))
+    return np.stack(maps_x), np.stack(maps_y)
 
 
 @dataclass
@@ -102,7 +102,7 @@ class Follower:
 
     rig: StereoRig
     disc: Disc
-    views: kernels.Views
+    maps: tuple[Array, Array]  # of its cameras
     edges: tuple[Edge, ...] = (Edge(), Edge())  # how those of the dots look in each camera
     misfit: float = 1.0  # rms residual over the noise that dots usually leave: compressed edges leave 4 and more
     heading: Heading | None = None
@@ -131,7 +131,7 @@ def run(
     limits = limits._replace(misfit=max(limits.misfit, UNUSUAL * follower.misfit))
     known = Heading(*((np.array(R, order="C"), np.array(t)) for R, t in heading))  # the loop moves them on
     blur, noise = zip(*((edge.blur_px, edge.noise.parameters) for edge in follower.edges), strict=True)
-    fixed = follower.views, face_of(follower.disc), np.array(blur), np.stack(noise), limits
+    fixed = follower.maps, stacked(follower.rig), face_of(follower.disc), np.array(blur), np.stack(noise), limits
     filled = rows.results, rows.status, rows.R, rows.t
     done = kernels.track_frames(images, readable, *fixed, known, *filled, MAX_PREDICTION_RMS_PX)
     return int(done), known

@@ -16,7 +16,7 @@ from disctrack import frames
 from disctrack.disc import Disc
 from disctrack.errors import ArgumentError
 from disctrack.track.dots.template import dot_centres
-from disctrack.track.follow.following import Follower, Tables, empty_tables, follow_block, views_of
+from disctrack.track.follow.following import Follower, Tables, empty_tables, follow_block, maps_of
 from disctrack.track.follow.tracking import check_images
 from disctrack.track.pose import DotsInFrames, fit_poses
 from disctrack.track.refine.assembly import status_of
@@ -74,7 +74,7 @@ class Tracker:
     def __init__(self, rig: StereoRig, disc: Disc) -> None:
         self.rig, self.disc = rig, disc
         self.frame = -1
-        self._follower = Follower(rig, disc, views_of(rig))
+        self._follower = Follower(rig, disc, maps_of(rig))
         self._angles: Array | None = None  # of the last pose
 
     def __repr__(self) -> str:

@@ -26,8 +26,8 @@ from disctrack.track.follow.following import (
     Tables,
     empty_tables,
     follow_block,
+    maps_of,
     run,
-    views_of,
 )
 from disctrack.track.judge.cameras import frames_ahead, left_out
 from disctrack.track.judge.disc_not_seen import MEETING_PX, why_not_seen
@@ -55,7 +55,7 @@ def prepare(dtype: DTypeLike = np.uint8) -> None:
     camera, still = Camera(1.0, 1.0, 0.0, 0.0, (0.0,) * 5, (8, 8)), (np.eye(3), np.zeros(3))
     rig = StereoRig(camera, camera, *still, *still)
     rows, nothing = empty_tables(0, MA_2014.n_markers), np.zeros((0, 2, 8, 8), dtype)
-    run(Follower(rig, MA_2014, views_of(rig)), Heading(still, still, still), nothing, np.zeros((0, 2), bool), rows)
+    run(Follower(rig, MA_2014, maps_of(rig)), Heading(still, still, still), nothing, np.zeros((0, 2), bool), rows)
     marker_pixels(rows.R, rows.t, rig, MA_2014.marker_centres_body)
 
 
@@ -78,7 +78,7 @@ def track(
     settings, pairs = settings or TrackingSettings(), taken.pairs
     _check_dots(disc)
     read_blocks, stuck = _as_one_sensor(read_blocks, pairs)
-    begin = Follower(rig, disc, views_of(rig))
+    begin = Follower(rig, disc, maps_of(rig))
     edges = stretch_edges(pairs, disc)
 
     def measured(looked_for: Disc, progress: Callable[[int], object]) -> Measurement:

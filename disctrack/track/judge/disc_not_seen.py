@@ -12,7 +12,7 @@ see of a dot tells where it is in the unit of the rig, to some 0.2 mm: enough to
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import chain, islice
 
 import numpy as np
@@ -139,17 +139,6 @@ def _by_each_camera(pairs: NDArray, rig: StereoRig, disc: Disc) -> DotsInFrames:
     return DotsInFrames(rig, disc, pixels, np.broadcast_to(BLOB_PX**2 * np.eye(2), (*pixels.shape, 2)), R, t)
 
 
-@dataclass(frozen=True)
-class SeenDots:
-    """Dots that both cameras number alike."""
-
-    which: Mask  # (m,) of the declared dots; k of them
-    points: Array  # (k, 3) [m] in the rig's world and unit
-    areas: Array  # (2, k) [px^2] of their blobs
-    scale: Measured  # their distances over those declared
-    misfit_px: float  # largest, of the blobs against one point in space
-
-
 def unlike_declared(pair: NDArray, rig: StereoRig, disc: Disc) -> tuple[Finding, ...]:
     """Which declared number makes no sense, and what it should be, where that is seen.
 
@@ -158,27 +147,32 @@ def unlike_declared(pair: NDArray, rig: StereoRig, disc: Disc) -> tuple[Finding,
     several = list(_seen_dots(pair, rig, disc))
     if not several:
         return ()
-    seen = max(several, key=lambda found: found.which.sum())
-    if abs(np.log(seen.scale.value)) > SIDE_TOLERANCE:
-        return (other_scale(seen.scale, explains=NONSENSE),)
-    (R,), (t,) = rigid_motions(disc.marker_centres_body[None, seen.which], seen.points[None])
+    which, points, _, scale, misfit_px = max(several, key=lambda found: found[0].sum())
+    if abs(np.log(scale.value)) > SIDE_TOLERANCE:
+        return (other_scale(scale, explains=NONSENSE),)
+    (R,), (t,) = rigid_motions(disc.marker_centres_body[None, which], points[None])
     # by the middle one of the searches: one for blobs far smaller than the dots finds what is darkest in them
     J = marker_pixels(R[None], t[None], rig, disc.marker_centres_body)[1]
     expected = np.pi / 4 * disc.marker_diameter**2 * np.abs(np.linalg.det(plane_to_image(J, R[None])[0]))
-    sizes = [np.median(np.sqrt(found.areas / expected[:, found.which])) for found in several]
+    sizes = [np.median(np.sqrt(areas / expected[:, numbered])) for numbered, _, areas, *_ in several]
     diameter = disc.marker_diameter * float(np.median(sizes))
     if abs(np.log(diameter / disc.marker_diameter)) > SIZE_TOLERANCE:
         remedy = Remedy("[markers] diameter_mm", f"{1e3 * diameter:.2g}", f"{1e3 * disc.marker_diameter:g}")
         text = "the dots' images are of another size"
         return (Finding(Kind.DIAMETER, Severity.DOUBT, text, remedies=(remedy,), explains=NONSENSE),)
-    if not seen.which.all() or seen.misfit_px > MEETING_PX:
+    if not which.all() or misfit_px > MEETING_PX:
         return ()
-    shift = (seen.points - t) @ R - disc.marker_centres_body
+    shift = (points - t) @ R - disc.marker_centres_body
     return misplaced_dots(disc, disc.marker_centres_body + declared_places_kept(disc, shift[:, :2]))
 
 
-def _seen_dots(pair: NDArray, rig: StereoRig, disc: Disc) -> Iterator[SeenDots]:
-    """By the searches for blobs of several sizes, as far as they find dots."""
+def _seen_dots(pair: NDArray, rig: StereoRig, disc: Disc) -> Iterator[tuple[Mask, Array, Array, Measured, float]]:
+    """Dots that both cameras number alike, by the searches for blobs of several sizes, as far as they find any.
+
+    yields : which of the declared dots (m,), k of them; their places (k, 3) [m] in the rig's world and unit; areas
+        (2, k) [px^2] of their blobs; their distances over those declared; misfit [px] of the blobs against one point in
+        space, the largest
+    """
     for diameter in DOT_DIAMETERS_PX:
         blobs = np.stack([seen_by_one_camera(pair[camera], camera, diameter, rig, disc)[0] for camera in (0, 1)])
         which: Mask = np.asarray(np.isfinite(blobs).all((0, 2)))
@@ -193,4 +187,4 @@ def _seen_dots(pair: NDArray, rig: StereoRig, disc: Disc) -> Iterator[SeenDots]:
         if misfit < EPIPOLAR_PX and scale > 0 and np.abs(ratios / scale - 1).max() < MISPLACED:
             # uneven light shifts all blobs alike: more of them tell it no better
             uncertain = float(np.sqrt(2) * BLOB_PX / np.median(apart(pixels[0])))
-            yield SeenDots(which, points, blobs[:, which, 2], Measured(scale, scale * uncertain), misfit)
+            yield which, points, blobs[:, which, 2], Measured(scale, scale * uncertain), misfit
