@@ -21,7 +21,6 @@ MIN_DOTS = 3  # six unknowns, two numbers per dot
 # A dot is refused when chi-square falls without it by more than twice this, times what is usual for the other dots:
 # chance alone does it once in 3e5 dots.
 OUTLIER_CHI_SQUARE = 25.0
-MAX_REJECTED = 4  # more would make a frame fit whose cameras contradict each other
 TOLERANCE = 1e-3  # standard deviations: the Gauss-Newton step at which a pose has converged
 
 
@@ -165,11 +164,9 @@ def fit_poses(seen: DotsInFrames, *, reject_outliers: bool = True, with_sensitiv
     shape, centres = observed.shape, np.ascontiguousarray(seen.disc.marker_centres_body, float)
     filled = pixels, whitened, JW = np.full(shape, np.nan), np.zeros(shape), np.zeros((*shape, 6))
     rows = np.flatnonzero(posed)
-    for _ in range(MAX_REJECTED + 1):
+    while rows.size:
         kernel.fit(rows, observed, covariance, used, stacked(rig), centres, TOLERANCE, R, t, good, filled)
         rows = _strike_worst_dot(whitened, JW, used, rows) if reject_outliers else rows[:0]
-        if rows.size == 0:
-            break
 
     JW = JW.reshape(n, -1, 6)
     good &= used.sum((1, 2)) >= MIN_DOTS
