@@ -1,11 +1,9 @@
 """Numbers as people write them: the one place where a value and its standard deviation are rounded."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from math import floor, inf, isfinite, log10, nan
-from types import MappingProxyType
 
-_PREFIXES: Mapping[str, float] = MappingProxyType({"n": 1e-9, "µ": 1e-6, "m": 1e-3, "": 1.0})
+_PREFIXES = {"n": 1e-9, "µ": 1e-6, "m": 1e-3, "": 1.0}
 _PREFIXED = ("m", "s", "rad", "N", "Hz", "J", "W", "N m", "m/s", "m/s²")
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _LONGEST = 7  # digits before or after the point; powers of ten beyond

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
+import h5py
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,6 +18,7 @@ from disctrack.errors import RecordingError
 from disctrack.recording.readers import open_frames
 from disctrack.recording.readers.base import FrameReader
 from disctrack.recording.readers.files import FORMATS, IMAGES, SUFFIXES, folders_below, natural_key
+from disctrack.recording.readers.hdf5 import stacks_of
 
 DEEPEST = 4  # folders below the recording that are looked into
 _OWN_FOLDERS = re.compile(r"(results|batch_results|.*_analysis|.*_diagnosis)$")
@@ -138,10 +140,6 @@ def _image_sequences(folder: Path, inside: Path, names: list[str]) -> list[Seque
 
 def _stacks(file: Path) -> list[str]:
     """Paths of the data sets in an HDF5 file that can be frames: (n, height, width) of 8 or 16 bit."""
-    import h5py
-
-    from disctrack.recording.readers.hdf5 import stacks_of
-
     try:
         with h5py.File(file, "r") as opened:
             return sorted((stack.name for stack in stacks_of(opened)), key=natural_key)

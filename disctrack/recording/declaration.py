@@ -22,7 +22,6 @@ from disctrack.recording.readers.base import ImagePart, ImageParts
 
 FILE_NAME = RECORDING_FILE
 MOST = 100  # dots of a disc; corners or squares along a side of a target
-MOST_COLUMNS = 10**6  # [px] of an image
 
 
 class Key(NamedTuple):
@@ -50,7 +49,7 @@ def _number(least: float, most: float, needed: bool = True) -> Key:
     )
 
 
-def _whole(value: object, n: int, least: int, most: int) -> bool:
+def _whole(value: object, n: int, least: int, most: float) -> bool:
     """Is this a list of n whole numbers in a range?"""
     return isinstance(value, list) and len(value) == n and all(type(x) is int and least <= x <= most for x in value)
 
@@ -84,8 +83,8 @@ _FILES = _text('a file pattern in quotes, e.g. "left/*.png"', needed=True)
 _MORE_FILES = _FILES._replace(needed=False)
 _TOLERANCE = _number(0, 2, needed=False)
 _PART = Key(
-    f"[x, y, width, height] in pixels up to {MOST_COLUMNS}, a width and a height above 0",
-    lambda value: _whole(value, 4, 0, MOST_COLUMNS) and min(value[2:]) > 0,
+    "[x, y, width, height] in pixels, a width and a height above 0",
+    lambda value: _whole(value, 4, 0, math.inf) and min(value[2:]) > 0,
     needed=False,
 )
 _VIEW = Key("a whole number from 0 to 100000", lambda value: _whole([value], 1, 0, 100_000), between=(0, 1e5))

@@ -87,8 +87,7 @@ def _what_is_there(pattern: str, folder: Path) -> str:
     names = sorted(os.listdir(place), key=natural_key)
     if not names:
         return f"The folder {place} is empty."
-    shown = ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
-    return f"The folder holds {shown}; frames are {', '.join(sorted(SUFFIXES))}. Correct the pattern."
+    return f"The folder holds {_listed(names)}; frames are {', '.join(sorted(SUFFIXES))}. Correct the pattern."
 
 
 def natural_key(name: str) -> list[tuple[int, int, str]]:
@@ -249,6 +248,6 @@ def _pattern_hint(usual: Sequence[Path], odd: Sequence[Path]) -> str:
     return f', or write a pattern that leaves it out, as "{folder}/{names[0]}"'
 
 
-def _listed(files: Sequence[Path]) -> str:
-    shown = ", ".join([str(files[0]), *(file.name for file in files[1:_SHOWN])])
+def _listed(files: Sequence[Path | str]) -> str:
+    shown = ", ".join([str(files[0]), *(os.path.basename(file) for file in files[1:_SHOWN])])
     return shown + (f", ... {len(files) - _SHOWN} more" if len(files) > _SHOWN else "")

@@ -36,25 +36,17 @@ def within_brown(rig: StereoRig, terms: tuple[str, ...]) -> tuple[StereoRig, str
 
 def _refitted(rig: StereoRig, number: int, terms: tuple[str, ...]) -> tuple[Camera, Array]:
     """The camera, and by how much (n, 2) [px] it shows the rays of an image elsewhere."""
-    camera = rig.cameras[number]
-    free = [i for i, name in enumerate(INTRINSIC_PARAMETERS) if name not in BROWN or name in terms]
+    camera, field = rig.cameras[number], rig.lens_field
+    free = np.array([name not in BROWN or name in terms for name in INTRINSIC_PARAMETERS])
     x, y = (np.linspace(0, size - 1, 40) for size in camera.image_size)
     seen = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    rays = _rays(rig, number, seen)
-    good = np.isfinite(rays).all(axis=1)
-    rays, seen = rays[good], seen[good]
-    values = np.where(np.isin(np.arange(len(INTRINSIC_PARAMETERS)), free), camera.parameters, 0.0)
+    flat = normalise(seen if field is None else seen - field.displacement(seen, number), camera)
+    good = np.isfinite(flat).all(axis=1)
+    rays, seen = np.column_stack([flat, np.ones(len(flat))])[good], seen[good]
+    values = np.where(free, camera.parameters, 0.0)
     for _ in range(20):  # steps of Gauss and Newton
         found, _, slopes = project_with_jacobians(rays, Camera.from_parameters(values, camera.image_size))
-        J = slopes[..., free].reshape(-1, len(free))
+        J = slopes[..., free].reshape(found.size, -1)
         values[free] += np.linalg.lstsq(J, (seen - found).ravel(), rcond=None)[0]
     fitted = Camera.from_parameters(values, camera.image_size)
     return fitted, project(rays, fitted) - seen
-
-
-def _rays(rig: StereoRig, number: int, seen: Array) -> Array:
-    """(n, 3) in the camera's axes, at unit depth, of points (n, 2) as the image shows them."""
-    if rig.lens_field is not None:
-        seen = seen - rig.lens_field.displacement(seen, number)
-    flat = normalise(seen, rig.cameras[number])
-    return np.column_stack([flat, np.ones(len(flat))])
