@@ -16,12 +16,11 @@ from filelock import Timeout
 from tqdm import tqdm
 
 from calibration.kit.arguments import checked
-from disctrack.batch.columns import COLUMNS, Row
+from disctrack.batch.columns import COLUMNS, REPEATS, Row, repeats_of
 from disctrack.batch.locks import locked
 from disctrack.batch.plan import BatchOptions, FoundRecordings, Job, find_recordings, make_plan
 from disctrack.batch.pool import Cluster, Processes, do_all
 from disctrack.batch.records import FAILED, MEASURED, NOT_MEASURED, SKIPPED, Record, is_done, read_record
-from disctrack.batch.repeats import REPEATS, repeats_of
 from disctrack.batch.report import counts, report_of
 from disctrack.errors import AnalysisError, ArgumentError, ClusterError, OutputError, reason_of
 from disctrack.files.json_text import json_file

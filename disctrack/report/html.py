@@ -12,17 +12,7 @@ from urllib.parse import quote
 
 from disctrack.files.text import printable
 from disctrack.files.whole import write_whole
-from disctrack.report.blocks import (
-    Cell,
-    Facts,
-    Figures,
-    Listing,
-    Markup,
-    Report,
-    Section,
-    figures_in,
-    is_empty,
-)
+from disctrack.report.blocks import Cell, Facts, Figures, Listing, Markup, Report, Section, figures_in, is_empty
 from disctrack.report.palette import AMBER, BLUE, GRID, INK, RED
 
 SENTENCE = 48  # characters of a cell from which on it is no number, name or link

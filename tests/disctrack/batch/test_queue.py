@@ -19,12 +19,11 @@ from filelock import Timeout
 from scipy import optimize, stats
 
 from disctrack.batch import locks
-from disctrack.batch.columns import COLUMNS, FITTED, copies
+from disctrack.batch.columns import COLUMNS, FITTED, copies, repeats_of
 from disctrack.batch.locks import locked
 from disctrack.batch.plan import BatchOptions, Job, find_recordings
 from disctrack.batch.pool import Cluster, Died, do_all
 from disctrack.batch.records import BUSY, FAILED, MEASURED, Record, failed
-from disctrack.batch.repeats import repeats_of
 from disctrack.batch.report import report_of
 from disctrack.batch.run import as_csv, with_false_discovery, write_summary
 from disctrack.errors import ClusterError, RecordingError, reason_of

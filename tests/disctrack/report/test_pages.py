@@ -13,16 +13,7 @@ from disctrack.files.json_text import json_file, json_text, plain
 from disctrack.findings import Kind, Severity, of_kind
 from disctrack.numbers import Measured, measured, probability, rounded, score
 from disctrack.report import palette
-from disctrack.report.blocks import (
-    Facts,
-    Figures,
-    Listing,
-    Markup,
-    Report,
-    Section,
-    document,
-    restored,
-)
+from disctrack.report.blocks import Facts, Figures, Listing, Markup, Report, Section, document, restored
 from disctrack.report.figures import Drawn, draw
 from disctrack.report.html import link_pages, page, write_page
 from disctrack.report.terminal import full, short, show
