@@ -29,7 +29,7 @@ import cv2
 
 from disctrack.batch.measure import do
 from disctrack.batch.plan import Job
-from disctrack.batch.records import BUSY, FAILED, Record, failed
+from disctrack.batch.records import BUSY, DIED, FAILED, Record, failed
 from disctrack.errors import ClusterError, reason_of
 from disctrack.findings import Kind
 from disctrack.processes import Spawn, end_with_parent
@@ -41,10 +41,6 @@ CONNECT = 10.0  # [s] for a scheduler to answer
 LOOK = 0.1  # [s] after which Ctrl-C is heard at the latest
 # [s] that processes have to clear up, and after which they are asked once more
 _STOPPING, _ASK_AGAIN = 9.0, 2.0
-
-
-class Died(Exception):
-    """The process that did a job ended before the job did; its text says why."""
 
 
 def do_all(
@@ -71,15 +67,15 @@ def do_all(
 
 def _do_jobs(jobs: Sequence[Job], pool: Processes | Cluster, done: Callable[[Job, Record], None]) -> None:
     for job in _tried(jobs, pool, pool.size, done):
-        for again, death in _tried([job], pool, 1, done).items():
-            done(again, failed(f"twice, {death}"))
+        for again, why in _tried([job], pool, 1, done).items():
+            done(again, failed(f"twice, {why}"))
 
 
 def _tried(
     jobs: Sequence[Job], pool: Processes | Cluster, at_once: float, done: Callable[[Job, Record], None]
-) -> dict[Job, Died]:
+) -> dict[Job, str]:
     """Do the jobs, so many side by side; returns those whose process died, and why."""
-    ready, died = deque(jobs), dict[Job, Died]()
+    ready, died = deque(jobs), dict[Job, str]()
     running: dict[Future[Record], Job] = {}
     while ready or running:
         while ready and len(running) < at_once:
@@ -87,12 +83,10 @@ def _tried(
             running[pool.submit(job)] = job
         for future in wait(running, LOOK, FIRST_COMPLETED).done:
             job = running.pop(future)
-            try:
-                record = _result(future)
-            except Died as death:
-                died[job] = death
-                continue
-            if record.status == BUSY:
+            record = _result(future)
+            if record.status == DIED:
+                died[job] = record.reason
+            elif record.status == BUSY:
                 ready.append(job)
             else:
                 done(job, record)
@@ -100,11 +94,9 @@ def _tried(
 
 
 def _result(future: Future[Record]) -> Record:
-    """Record of a job that has ended. Raises Died, and ClusterError where nothing further can be done."""
+    """Record of a job that has ended. Raises ClusterError where nothing further can be done."""
     try:
         return future.result()
-    except Died:
-        raise
     except CancelledError as error:  # not by us
         raise ClusterError(
             "the connection to the cluster's scheduler was lost. What is finished is kept; the same command continues."
@@ -128,20 +120,20 @@ class Processes:
         self._said = (Path(self._folder.name) / str(i) for i in itertools.count())
 
     def submit(self, job: Job) -> Future[Record]:
-        """Begin a job; its future may raise Died, and OSError where no process can be started for it."""
+        """Begin a job; its future raises OSError where no process can be started for it."""
         return self._threads.submit(self.done, job)
 
     def done(self, job: Job) -> Record:
-        """Do a job in this thread's process."""
+        """Do a job in this thread's process; its record says where that ended before the job did, and why."""
         if self._ends:
-            raise Died("the batch ended")
+            return Record(DIED, "the batch ended")
         process, jobs, said = getattr(self._own, "kept", None) or self._begun()
         self._own.kept = None
         try:
             jobs.send(job)
             record: Record = jobs.recv()
-        except (EOFError, ConnectionError) as error:
-            raise Died(_why_it_ended(process, said)) from error
+        except (EOFError, ConnectionError):
+            return Record(DIED, _why_it_ended(process, said))
         self._own.kept = process, jobs, said
         return record
 
@@ -181,7 +173,7 @@ class Cluster:
         self._executor = self._client.get_executor(pure=False)  # a job that is tried again is another task
 
     def submit(self, job: Job) -> Future[Record]:
-        """Begin a job; its future may raise Died, and what is wrong with the cluster."""
+        """Begin a job; its future raises what is wrong with the cluster."""
         future: Future[Record] = self._executor.submit(do_alone, job)
         return future
 
@@ -217,7 +209,7 @@ def connect(address: str) -> Client:
 
 
 def do_alone(job: Job) -> Record:
-    """Do a job on one of a cluster's machines, in a process of its own. Raises Died."""
+    """Do a job on one of a cluster's machines, in a process of its own."""
     multiprocessing.current_process().daemon = False  # dask's workers are, and Python allows daemons no processes
     with contextlib.closing(Processes(1)) as here:
         return here.done(job)

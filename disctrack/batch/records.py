@@ -14,7 +14,7 @@ from disctrack.trajectory.file import read_provenance
 RECORD = "batch.json"
 SCHEMA, SCHEMA_VERSION = "disctrack batch record", 1
 MEASURED, SKIPPED, FAILED, NOT_MEASURED = "measured", "skipped", "failed", "not measured"
-BUSY = "busy"  # another batch is at it
+BUSY, DIED = "busy", "died"  # another batch is at it; the process that did it ended before it was done
 
 Stages = dict[str, float | bool]  # what is made of a trajectory, with which settings
 
@@ -23,7 +23,7 @@ Stages = dict[str, float | bool]  # what is made of a trajectory, with which set
 class Record:
     """Outcome of one job; a recording's is written last, so that all it speaks of is there."""
 
-    status: str  # MEASURED, FAILED, or of a job that was not done now SKIPPED, BUSY, NOT_MEASURED
+    status: str  # MEASURED, FAILED, or of a job that was not done now SKIPPED, BUSY, DIED, NOT_MEASURED
     reason: str = ""
     fingerprint: str = ""  # of the trajectory's inputs, settings and version
     stages: Stages = field(default_factory=dict)

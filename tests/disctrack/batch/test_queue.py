@@ -22,15 +22,15 @@ from disctrack.batch import locks
 from disctrack.batch.columns import COLUMNS, FITTED, copies, repeats_of
 from disctrack.batch.locks import locked
 from disctrack.batch.plan import BatchOptions, Job, find_recordings
-from disctrack.batch.pool import Cluster, Died, do_all
-from disctrack.batch.records import BUSY, FAILED, MEASURED, Record, failed
+from disctrack.batch.pool import Cluster, do_all
+from disctrack.batch.records import BUSY, DIED, FAILED, MEASURED, Record, failed
 from disctrack.batch.report import report_of
 from disctrack.batch.run import as_csv, with_false_discovery, write_summary
 from disctrack.errors import ClusterError, RecordingError, reason_of
 from disctrack.report.html import page
 from disctrack.report.terminal import full, short
 
-GOOD = Record(MEASURED)
+GOOD, KILLED = Record(MEASURED), Record(DIED, "killed")
 
 
 def touched(root, *files):
@@ -114,10 +114,7 @@ class Pool:
         self.at_once.append(len(self.running))
         time.sleep(0.05)
         self.running.remove(job.name)
-        answer = (self.answers.get(f"{job.kind}_{job.name}") or [GOOD]).pop(0)
-        if isinstance(answer, Exception):
-            raise answer
-        return answer
+        return (self.answers.get(f"{job.kind}_{job.name}") or [GOOD]).pop(0)
 
 
 def done_by(pool, recordings, rigs=()):
@@ -147,7 +144,7 @@ def test_a_recording_at_which_another_batch_works_is_asked_for_again_after_the_o
 
 
 def test_a_job_whose_process_died_is_tried_once_more_at_the_end_and_alone():
-    pool = Pool(recording_a=[Died("killed"), Died("killed")], recording_b=[Died("killed"), GOOD])
+    pool = Pool(recording_a=[KILLED, KILLED], recording_b=[KILLED, GOOD])
     results = done_by(pool, [job(name) for name in "abcd"])
     assert results["a"].reason == "twice, killed"
     assert [results[name].status for name in "abcd"] == [FAILED, MEASURED, MEASURED, MEASURED]
@@ -177,7 +174,7 @@ def cluster(monkeypatch):
 
 
 def test_answers_of_a_cluster_are_results_deaths_and_failures(cluster):
-    cluster.answers = [GOOD, Died("killed"), RuntimeError("worker lost too often"), GOOD]
+    cluster.answers = [GOOD, KILLED, RuntimeError("worker lost too often"), GOOD]
     results = done_by(Cluster("tcp://there"), [job("a"), job("b"), job("c")])
     assert {name: result.status for name, result in results.items()} == {"a": MEASURED, "b": MEASURED, "c": FAILED}
     assert "worker lost too often" in results["c"].reason
