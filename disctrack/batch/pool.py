@@ -17,7 +17,7 @@ import tempfile
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ThreadPoolExecutor, wait
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
@@ -43,54 +43,45 @@ LOOK = 0.1  # [s] after which Ctrl-C is heard at the latest
 _STOPPING, _ASK_AGAIN = 9.0, 2.0
 
 
-def do_all(
-    rigs: Sequence[Job], recordings: Sequence[Job], pool: Processes | Cluster, done: Callable[[Job, Record], None]
-) -> None:
-    """Do every job; `done` is called with each recording that is finished for good. Raises ClusterError.
+def do_all(rigs: Sequence[Job], recordings: Sequence[Job], pool: Processes | Cluster) -> Iterator[tuple[Job, Record]]:
+    """Do every job; yields each recording that is finished for good. Raises ClusterError.
 
     Rigs come first; a recording without its rig fails for the rig's reason. A job at which another batch works is asked
     for again until that one is done with it. A job whose process died gets a second try at the end, alone, when there
     is most memory.
     """
-    no_rig: dict[str, str] = {}
-
-    def made(rig: Job, record: Record) -> None:
-        if record.status == FAILED:
-            no_rig[rig.rig] = record.reason
-
-    _do_jobs(rigs, pool, made)
+    no_rig = {rig.rig: record.reason for rig, record in _finished(rigs, pool) if record.status == FAILED}
     for job in recordings:
         if job.rig in no_rig:
-            done(job, failed(f"no rig: {no_rig[job.rig]}", Kind.CALIBRATION))
-    _do_jobs([job for job in recordings if job.rig not in no_rig], pool, done)
+            yield job, failed(f"no rig: {no_rig[job.rig]}", Kind.CALIBRATION)
+    yield from _finished([job for job in recordings if job.rig not in no_rig], pool)
 
 
-def _do_jobs(jobs: Sequence[Job], pool: Processes | Cluster, done: Callable[[Job, Record], None]) -> None:
-    for job in _tried(jobs, pool, pool.size, done):
-        for again, why in _tried([job], pool, 1, done).items():
-            done(again, failed(f"twice, {why}"))
+def _finished(jobs: Sequence[Job], pool: Processes | Cluster) -> Iterator[tuple[Job, Record]]:
+    died = []
+    for job, record in _ended(jobs, pool, pool.size):
+        if record.status == DIED:
+            died.append(job)
+        else:
+            yield job, record
+    for job in died:
+        for _, record in _ended([job], pool, 1):
+            yield job, failed(f"twice, {record.reason}") if record.status == DIED else record
 
 
-def _tried(
-    jobs: Sequence[Job], pool: Processes | Cluster, at_once: float, done: Callable[[Job, Record], None]
-) -> dict[Job, str]:
-    """Do the jobs, so many side by side; returns those whose process died, and why."""
-    ready, died = deque(jobs), dict[Job, str]()
-    running: dict[Future[Record], Job] = {}
+def _ended(jobs: Sequence[Job], pool: Processes | Cluster, at_once: float) -> Iterator[tuple[Job, Record]]:
+    """Do the jobs, so many side by side; yields each as it ends, if only because its process died."""
+    ready, running = deque(jobs), dict[Future[Record], Job]()
     while ready or running:
         while ready and len(running) < at_once:
             job = ready.popleft()
             running[pool.submit(job)] = job
         for future in wait(running, LOOK, FIRST_COMPLETED).done:
-            job = running.pop(future)
-            record = _result(future)
-            if record.status == DIED:
-                died[job] = record.reason
-            elif record.status == BUSY:
+            job, record = running.pop(future), _result(future)
+            if record.status == BUSY:
                 ready.append(job)
             else:
-                done(job, record)
-    return died
+                yield job, record
 
 
 def _result(future: Future[Record]) -> Record:

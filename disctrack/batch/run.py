@@ -132,15 +132,12 @@ def summarise_batch(
 def _do(rigs: list[Job], jobs: list[Job], records: dict[str, Record], pool: Processes | Cluster) -> str:
     """Fill `records` with what becomes of the recordings; returns why some have none."""
     n = len(jobs) + len(records)
-
-    def done(job: Job, record: Record) -> None:
-        records[job.name] = record
-        advance(1)
-        tqdm.write(f"{len(records):4d} of {n}  {job.name}: {record.status}", file=sys.stderr)
-
     try:
         with progress_bar("batch", len(jobs), "recording") as advance:
-            do_all(rigs, jobs, pool, done)
+            for job, record in do_all(rigs, jobs, pool):
+                records[job.name] = record
+                advance(1)
+                tqdm.write(f"{len(records):4d} of {n}  {job.name}: {record.status}", file=sys.stderr)
     except KeyboardInterrupt:
         return INTERRUPTED
     except ClusterError as error:

@@ -118,9 +118,7 @@ class Pool:
 
 
 def done_by(pool, recordings, rigs=()):
-    results = {}
-    do_all(rigs, recordings, pool, lambda job, result: results.__setitem__(job.name, result))
-    return results
+    return {job.name: result for job, result in do_all(rigs, recordings, pool)}
 
 
 def test_recordings_wait_for_their_rigs():
