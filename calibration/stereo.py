@@ -12,7 +12,6 @@ from calibration.board.chessboard import BoardNotFound, CornerView, negatives
 from calibration.board.search import Progress, located
 from calibration.board.target import Board, Target
 from calibration.cameras.camera import CAMERA_NAMES, StereoRig
-from calibration.fit.lens_field import FieldFit
 from calibration.fit.pairing import Names, Pairs, Views, count_once
 from calibration.fit.refinement import Refinement, TermsTried
 from calibration.fit.start import MIN_VIEWS, start_stereo, too_wide
@@ -71,7 +70,6 @@ class StereoCalibration(Brief):
     warnings: tuple[str, ...] = field(default=())
     doubts: tuple[str, ...] = ()  # what may make the rig wrong by more than its sigmas
     apart: tuple[int, ...] = ()  # views whose two images are not taken for one place of the board
-    lens: FieldFit | None = None  # where views left out were met better with it; the observations are corrected by it
 
     def facts(self) -> dict[str, str]:
         """What a glance should tell (`Brief`)."""
@@ -114,6 +112,14 @@ class StereoCalibration(Brief):
         """(n_views, 2 cameras) [px]; NaN where a view was not used."""
         image = 2 * self.refinement.observations.view + self.refinement.observations.camera
         return np.array([self.refinement.rms(image == i) for i in range(2 * len(self.view_names))]).reshape(-1, 2)
+
+    @property
+    def lens_rms_px(self) -> tuple[float, ...]:
+        """Root mean square per axis of the lens field of each camera, where corners are used; () without one."""
+        field, r = self.rig.lens_field, self.refinement
+        pixels = [r.observations.pixels[r.kept & (r.observations.camera == c)] for c in range(len(CAMERA_NAMES))]
+        moved = [field.displacement(seen, c) for c, seen in enumerate(pixels)] if field else []
+        return tuple(float(np.sqrt(np.mean(by**2))) for by in moved)
 
     def rejected_corners(self) -> list[tuple[int, int, int, str]]:
         """(view, camera, corner, reason) of every corner that was found but not used."""
@@ -250,7 +256,6 @@ def calibrate_from_corners(
         candidates=fit.candidates,
         assessment=assessment,
         warnings=(*_used_alone(views, names), *notes, *apart, *shape_note, *assessment.warnings),
-        lens=fit.lens,
     )
 
 
@@ -291,7 +296,7 @@ def _judged(
         covariance, note = covariance + left_out, [_not_as_told(settings.board, shape, sigmas)] if sigmas > 1.0 else []
     origin = on_the_table(board.points, shape)
     rig = rig_with_covariance(refinement, table_view, board_thickness, inflation, covariance, origin)
-    rig = replace(rig, lens_field=fit.lens.field if fit.lens else None)
+    rig = replace(rig, lens_field=fit.lens_field)
     with_board = with_tolerances(rig, board.points, table_view, board_thickness, settings.tolerances, shape)
     chosen = next(row for row in reversed(fit.candidates) if row.terms == refinement.terms)
     assessment = assess(refinement, chosen, rig, with_board, table_view, inflation, fit.motion, wide)

@@ -3,8 +3,9 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from calibration.cameras.splines import LensField
 from calibration.fit.board_motion import BoardMotion
-from calibration.fit.lens_field import FieldFit, fit_lens_field
+from calibration.fit.lens_field import fit_lens_field
 from calibration.fit.pairing import Pairs
 from calibration.fit.refinement import Refinement, TermsTried, choose_board
 from calibration.fit.stereo_model import Observations, Terms
@@ -27,8 +28,8 @@ Refined = tuple[Refinement, tuple[TermsTried, ...]]
 class JointFit:
     """What `fit_jointly` arrives at."""
 
-    refinement: Refinement  # with the field of the lenses, where there is one
-    lens: FieldFit | None
+    refinement: Refinement  # of observations that the field of the lenses has corrected, where there is one
+    lens_field: LensField | None
     candidates: tuple[TermsTried, ...]  # all that were compared
     pairs: Pairs
     moved: CameraMoved | None
@@ -71,15 +72,15 @@ def fit_jointly(
         used = pairs
         refinement, again = refined(used, (refinement.terms,))
         candidates = (*candidates, *again)
-    motion, lens = motion_between_exposures(refinement), fit_lens_field(refinement, nominal)
+    motion, (field, corrected) = motion_between_exposures(refinement), fit_lens_field(refinement, nominal)
     likely = motion is not None and motion.is_likely
-    if motion is not None and likely and lens is not None:
+    if motion is not None and likely and field is not None:
         # a field puts boards elsewhere for each camera, too, and what is left of it does: by the scatter before it
-        left = motion_between_exposures(lens.refinement) or motion
+        left = motion_between_exposures(corrected) or motion
         motion = replace(left, scatter=max(motion.scatter, left.scatter))
         likely = motion.is_seen
     if motion is not None and likely:
         refinement, again = refined(used, tried, motion.as_random(nominal))
         candidates = (*candidates, *again)
-        lens = fit_lens_field(refinement, nominal)
-    return JointFit(lens.refinement if lens else refinement, lens, candidates, pairs, moved, motion, bad_images)
+        field, corrected = fit_lens_field(refinement, nominal)
+    return JointFit(corrected, field, candidates, pairs, moved, motion, bad_images)

@@ -11,7 +11,7 @@ that when it is left out.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import reduce
 
 import numpy as np
@@ -30,40 +30,30 @@ BETTER = 2.5  # standard errors by which the views that were left out must be me
 LEAST_GAIN = 0.03  # and part of their chi-square: less is not worth its parameters
 
 
-@dataclass(frozen=True)
-class FieldFit:
-    """The field and what it is worth."""
+def fit_lens_field(refinement: Refinement, nominal: Array) -> tuple[LensField | None, Refinement]:
+    """The field of both lenses, and the refinement of observations that it has corrected.
 
-    field: LensField
-    refinement: Refinement  # with observations that the field has corrected
-    rms_px: tuple[float, ...]  # of the field per axis where corners were seen, of each camera
-    gain: float  # part of the chi-square of views left out that it takes away
-
-
-def fit_lens_field(refinement: Refinement, nominal: Array) -> FieldFit | None:
-    """The field of both lenses; None where it does not help on views that were left out.
+    None, and the refinement as it is, where a field does not help on views that were left out.
 
     nominal : (n, 3) [m] the target's points as declared
     """
     used = refinement.observations[refinement.kept]
     views = np.unique(used.view)
     if len(views) < GOOD_VIEWS:
-        return None
+        return None, refinement
     coarse, finer = _grid(refinement, CELLS), _grid(refinement, 2 * CELLS)
     left = refinement.unexplained_sigma**2
     for _ in range(2):  # once more with the noise that the field leaves
         gain, error, left = _worth(refinement, used, coarse, left)
     if gain < BETTER * error or gain < LEAST_GAIN:
-        return None
+        return None, refinement
     both = [_precision(finer, small, large) for large in PRIORS_PX for small in FINER_PX]
     solution, _ = _likeliest(reduce(np.add, _squares(refinement, used, finer, left)), finer, both)
     field = replace(finer, coefficients=solution[-finer.coefficients.size :].reshape(finer.coefficients.shape))
     o = refinement.observations
     moved = np.stack([field.displacement(o.pixels, camera) for camera in (0, 1)])[o.camera, np.arange(len(o))]
     corrected = replace(o, pixels=o.pixels - moved)
-    again = refine_stereo(corrected, refinement.model, nominal, refinement.terms, begin=refinement)
-    rms = tuple(float(np.sqrt(np.mean(moved[again.kept & (o.camera == c)] ** 2))) for c in (0, 1))
-    return FieldFit(field, again, rms, gain)
+    return field, refine_stereo(corrected, refinement.model, nominal, refinement.terms, begin=refinement)
 
 
 def _grid(refinement: Refinement, cells: int) -> LensField:

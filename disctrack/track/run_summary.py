@@ -32,8 +32,8 @@ def calibration_rows(found: StereoCalibration, problems: Sequence[str] = ()) -> 
         ("rig", _rig_text(found.rig)),
         ("model", _model_text(found)),
     ]
-    if found.lens is not None:
-        left, right = found.lens.rms_px
+    if found.lens_rms_px:
+        left, right = found.lens_rms_px
         lines.append(("", f"lenses beyond their polynomials: {left:.3f} and {right:.3f} px rms per axis, corrected"))
     corners = len(found.rejected_corners())
     if corners:

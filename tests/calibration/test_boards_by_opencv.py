@@ -157,7 +157,7 @@ def test_a_field_of_the_lenses_is_no_motion_of_the_boards(seed, rng):
     found = point_laboratory.calibration_of(
         plan, *point_laboratory.cameras_of(plan, draws), draws, CalibrationSettings()
     )
-    assert found.lens is not None
+    assert found.rig.lens_field is not None
     assert found.refinement.problem.motion is None
     assert not any("synchronised" in text for text in found.warnings)
     # without the field it passes for one
