@@ -228,7 +228,7 @@ def calibrate_from_corners(
     observations, cameras = _observations(views), start.model.rig.cameras
     wide = too_wide(observations, board.points, cameras)
     moved = camera_moved(observations, start, table_view)
-    if moved and (lenses := zoomed(observations, moved, cameras, board.points)):
+    if moved.steps and (lenses := zoomed(observations, moved, cameras, board.points)):
         for camera, why in lenses.items():
             for v in moved.others:
                 views[camera][v] = BoardNotFound(why)
@@ -409,8 +409,8 @@ def _choice_of_origin(board: Target) -> str:
 
 def _told_apart(fit: JointFit, names: Names, table_view: int | None) -> list[str]:
     """Warnings about pairs whose images are used each for its own camera."""
-    told = [fit.moved.told(names, table_view)] if fit.moved else []
-    apart = {v: why for v, why in fit.pairs.apart.items() if not (fit.moved and v in fit.moved.others)}
+    told = [fit.moved.told(names, table_view)] if fit.moved.steps else []
+    apart = {v: why for v, why in fit.pairs.apart.items() if v not in fit.moved.others}
     if not apart:
         return told
     shown = [f"{names[v][0]} and {names[v][1]} ({why})" for v, why in list(apart.items())[:3]]

@@ -19,7 +19,6 @@ from calibration.judge.pairs import (
 )
 from calibration.kit.arrays import Array
 
-MOVED_CAMERA = "a camera was moved"
 REJUDGED = 2  # times that pairs are judged by the refined cameras, and these refined again
 Refined = tuple[Refinement, tuple[TermsTried, ...]]
 
@@ -32,7 +31,7 @@ class JointFit:
     lens_field: LensField | None
     candidates: tuple[TermsTried, ...]  # all that were compared
     pairs: Pairs
-    moved: CameraMoved | None
+    moved: CameraMoved
     motion: PairMotion | None  # of the boards between the exposures
     bad_images: dict[tuple[int, int], str]  # (view, camera) that cannot be used -> reason
 
@@ -42,7 +41,7 @@ def fit_jointly(
     start: Pairs,
     nominal: Array,
     tried: Sequence[Terms],
-    moved: CameraMoved | None,
+    moved: CameraMoved,
     table_view: int | None = None,
 ) -> JointFit:
     """Refine, judge the pairs by what is refined, and refine again; then see whether boards moved, or lenses bend.
@@ -52,8 +51,8 @@ def fit_jointly(
     table_view : where a camera was moved, the cameras' places are those at it
     """
     # rough poses may be degrees off: refined cameras judge those anew that do not agree
-    used = start if moved is None and len(start.views) >= LEAST_PAIRS else replace(start, apart={})
-    used = used if moved is None else used.set_apart(moved.others, MOVED_CAMERA)
+    used = start if not moved.steps and len(start.views) >= LEAST_PAIRS else replace(start, apart={})
+    used = used.set_apart(moved.others)
 
     def refined(by: Pairs, tried: Sequence[Terms], motion: BoardMotion | None = None) -> Refined:
         return choose_board(observations, by.joined(observations), nominal, tried, motion)
@@ -61,9 +60,9 @@ def fit_jointly(
     refinement, candidates = refined(used, tried)
     bad_images: dict[tuple[int, int], str] = {}
     for _ in range(REJUDGED):
-        pairs = judge_pairs(observations, refinement, moved.others if moved else ())
+        pairs = judge_pairs(observations, refinement, moved.others)
         moved = camera_moved(observations, pairs, table_view)
-        pairs = pairs if moved is None else pairs.set_apart(moved.others, MOVED_CAMERA)
+        pairs = pairs.set_apart(moved.others)
         if sorted(pairs.apart) == sorted(used.apart) and not pairs.bad_images:
             break
         bad_images |= pairs.bad_images

@@ -138,9 +138,9 @@ class Pairs:
     apart: dict[int, str]  # view -> why its two images are not taken for one place
     bad_images: dict[tuple[int, int], str] = field(default_factory=dict)  # (view, camera) -> why not even alone
 
-    def set_apart(self, views: Sequence[int], why: str) -> Pairs:
+    def set_apart(self, views: Sequence[int]) -> Pairs:
         """With these apart, too."""
-        return replace(self, apart=self.apart | dict.fromkeys(views, why))
+        return replace(self, apart=self.apart | dict.fromkeys(views, ""))
 
     def joined(self, observations: Observations) -> StereoModel:
         """The model with one place for both images but of those apart: by the left one, where that was observed."""

@@ -244,7 +244,7 @@ def judge_pairs(observations: Observations, fit: Refinement, elsewhere: Collecti
 
 @dataclass(frozen=True)
 class CameraMoved:
-    """The stretches of pairs between such steps."""
+    """The stretches of pairs between such steps; one where there are none."""
 
     stretches: tuple[tuple[int, ...], ...]  # the views of the pairs; one more than steps
     # of each step: turn [rad], shift [m], and [px] between pairs on either side of it and between those of one side, in
@@ -298,15 +298,15 @@ def zoomed(
     return found
 
 
-def camera_moved(observations: Observations, pairs: Pairs, table_view: int | None) -> CameraMoved | None:
-    """Find the steps; None where there are none, or too few pairs.
+def camera_moved(observations: Observations, pairs: Pairs, table_view: int | None) -> CameraMoved:
+    """Find the steps; of too few pairs none.
 
     table_view : its stretch tells how the cameras stand; None: the one with the most pairs does
     """
     model, views, sides = pairs.model, pairs.views, []
     R_pair = model.rig.R_right_left
     if len(views) < 2 * MIN_VIEWS:
-        return None
+        return CameraMoved((tuple(views.tolist()),), (), 0)
     for index, (R, t) in enumerate(model.rig.camera_poses()):
         mine = observations[observations.camera == index]
         poses = zip(R @ model.R_left_board[views, index], model.t_left_board[views, index] @ R.T + t, strict=True)
@@ -318,8 +318,6 @@ def camera_moved(observations: Observations, pairs: Pairs, table_view: int | Non
     R, t = told_by(left, right)
     between = apart(left, right, R, t)
     cuts = _cuts(0.5 * (between + between.T))
-    if not cuts:
-        return None
     stretches = np.split(np.arange(len(views)), [at for at, _, _ in cuts])
     steps = []
     for (_, pixels, scatter), (before, after) in zip(cuts, pairwise(stretches), strict=True):
