@@ -12,9 +12,9 @@ from calibration.board.chessboard import BoardNotFound, CornerView, negatives
 from calibration.board.search import Progress, located
 from calibration.board.target import Board, Target
 from calibration.cameras.camera import CAMERA_NAMES, StereoRig
-from calibration.fit.pairing import Names, Pairs, Views, count_once
+from calibration.fit.pairing import MIN_VIEWS, Names, Pairs, Views, count_once
 from calibration.fit.refinement import Refinement, TermsTried
-from calibration.fit.start import MIN_VIEWS, start_stereo, too_wide
+from calibration.fit.start import start_stereo, too_wide
 from calibration.fit.stereo_model import BOARD_MODELS, RICHEST, Observations, Terms
 from calibration.judge.assessment import Assessment, assess, stereo_covariance
 from calibration.judge.pairs import camera_moved, gradients_by_motion, zoomed

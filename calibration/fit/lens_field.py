@@ -17,8 +17,8 @@ from functools import reduce
 import numpy as np
 
 from calibration.cameras.splines import LensField
+from calibration.fit.pairing import GOOD_VIEWS
 from calibration.fit.refinement import FOLDS, Refinement, refine_stereo
-from calibration.fit.start import GOOD_VIEWS
 from calibration.fit.stereo_model import Observations
 from calibration.kit.arrays import Array
 from calibration.kit.least_squares import eliminate

@@ -29,7 +29,8 @@ BY_CHANCE = 2.0  # times that pairs lie together better than images of other pai
 # far; the motions of hand-held boards have longer tails.
 TOO_FAR = 5.0
 MOST_LATE = 8  # views by which the two cameras may differ
-LEAST_PAIRS = 4  # of a hypothesis
+MIN_VIEWS = 3  # Zhang: fewer do not determine a camera, and so many pairs agree by chance
+GOOD_VIEWS = 8  # fewer judge neither lenses nor one another
 MOST_TRIED = 30  # pairs whose place is tried for all, views that OpenCV is given: time grows with the cube of them
 Pose = tuple[Array, Array]  # rotation (3, 3) and translation (3,) of the board in a camera's axes
 Names = Sequence[tuple[str, str]]
@@ -73,8 +74,8 @@ def count_once(views: Views, names: Names, table_view: int | None) -> None:
     both = np.array([v for v in first if found[:, v].all()], int)
     for camera, name in enumerate(CAMERA_NAMES):
         alike = same[camera][np.ix_(both, both)]
-        if len(both) and alike.sum(axis=1).max() >= max(LEAST_PAIRS, 0.5 * len(both)):
-            which = both[alike[alike.sum(axis=1).argmax()]]
+        which = both[alike[alike.sum(axis=1).argmax()]] if len(both) else both
+        if len(which) > MIN_VIEWS and 2 * len(which) >= len(both):
             raise CalibrationError(
                 f"{len(which)} {name} images show the board in one place, {names[which[0]][camera]} to "
                 f"{names[which[-1]][camera]}, where the {CAMERA_NAMES[1 - camera]} ones show it in as many: are they "
@@ -231,13 +232,13 @@ def paired(
     if not n:
         raise CalibrationError("no view shows the target to both cameras: the pair cannot be calibrated")
     stored = likeliest(of_left, of_right, floor)
-    if n < LEAST_PAIRS - 1 or (stored.agrees.all() and stored.usual < TOO_FAR * floor):
+    if n < MIN_VIEWS or (stored.agrees.all() and stored.usual < TOO_FAR * floor):
         return stored, ()
-    shifts = [k for k in range(-MOST_LATE, MOST_LATE + 1) if abs(k) <= n - LEAST_PAIRS]
+    shifts = [k for k in range(-MOST_LATE, MOST_LATE + 1) if abs(k) < n - MIN_VIEWS]
     orders = [(f"{abs(k)} {'late' if k > 0 else 'early'}", number + k) for k in shifts if k]
     orders += [("in reversed order", number[::-1] + k) for k in shifts]
     tried = [("", number, pairs_of(number, turns=mirrored)), *((how, by, pairs_of(by)) for how, by in orders)]
-    others = [(how, by, which, likeliest(a, b, floor)) for how, by, (which, a, b) in tried if len(which) >= LEAST_PAIRS]
+    others = [(how, by, which, likeliest(a, b, floor)) for how, by, (which, a, b) in tried if len(which) > MIN_VIEWS]
     if others:
         how, by, which, found = max(others, key=lambda one: one[-1].evidence)
         if found.is_likelier(stored):
@@ -273,7 +274,7 @@ def _told(how: str, found: Pairing, stored: Pairing, names: Names) -> str:
 def _require_agreement(stored: Pairing, others: Sequence[float]) -> None:
     """Raise CalibrationError where pairs lie together no better than those of other orders, with this evidence, do."""
     n = len(stored.distance)
-    if n < 2 * LEAST_PAIRS or not others or stored.usual < TOO_FAR * stored.floor:
+    if n < GOOD_VIEWS or not others or stored.usual < TOO_FAR * stored.floor:
         return
     if stored.evidence <= float(np.median(others)) + 2.0 * np.log(BY_CHANCE):
         raise CalibrationError(
@@ -293,7 +294,7 @@ def _late(
         off = np.min([apart(left, right, found.R_right_left[None], found.t_right_left[None])[0] for right in turns], 0)
         which = [v for v, distance in zip(both, off, strict=True) if distance < TOO_FAR * found.usual]
         rest = [v for v in rest if v not in which]
-        if len(which) >= LEAST_PAIRS - 1:
+        if len(which) >= MIN_VIEWS:
             told.append(
                 f"{names[which[0]][0]} to {names[which[-1]][0]}: {len(which)} pairs agree with the others if the right "
                 f"view {abs(k)} {'later' if k > 0 else 'earlier'} is taken ({names[which[0] + k][1]} in place of "

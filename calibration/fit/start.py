@@ -11,15 +11,13 @@ from numpy.typing import NDArray
 
 from calibration.board.target import LEAST_POINTS
 from calibration.cameras.camera import CAMERA_NAMES, Camera, StereoRig, rotation_from_vector
-from calibration.fit.pairing import FLOOR, MOST_TRIED, Names, Pairs, board_turns, paired, places_of
+from calibration.fit.pairing import FLOOR, GOOD_VIEWS, MOST_TRIED, Names, Pairs, board_turns, paired, places_of
 from calibration.fit.stereo_model import Observations, StereoModel
 from calibration.kit.arrays import Array, Array32, evenly
 from calibration.kit.errors import CalibrationError
 
 MOST_K1 = 10.0  # of a lens that exists; beyond, the views do not tell of it
 ONE_PLACE = 1e-3  # of the board's distance: rays that meet at 0.06 deg tell no distance
-MIN_VIEWS = 3  # Zhang: fewer do not determine a camera
-GOOD_VIEWS = 8  # fewer judge neither lenses nor one another
 WIDE = 0.8  # half the image's diagonal in focal lengths, 77 deg across: below, the polynomial describes ordinary lenses
 # Misfit of the median view, rational over polynomial. A 150 deg lens had 0.25 to 0.73, eight ordinary cameras, of 8 to
 # 20 views, 0.98 to 1.00.

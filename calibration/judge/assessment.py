@@ -5,10 +5,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibration.cameras.camera import CAMERA_NAMES, StereoRig
-from calibration.cameras.causes import causes
+from calibration.cameras.camera import CAMERA_NAMES, StereoRig, causes
+from calibration.fit.pairing import GOOD_VIEWS
 from calibration.fit.refinement import Refinement, TermsTried
-from calibration.fit.start import GOOD_VIEWS
 from calibration.judge.pairs import PairMotion
 from calibration.kit.arrays import Array
 from calibration.kit.least_squares import solve_each

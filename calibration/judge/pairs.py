@@ -28,9 +28,9 @@ from calibration.board.target import LEAST_POINTS
 from calibration.cameras.camera import CAMERA_NAMES, Camera
 from calibration.fit.board_motion import LEAST, BoardMotion, motions
 from calibration.fit.normal_equations import Problem
-from calibration.fit.pairing import TOO_FAR, Pairs, apart, places_of, rotation_vectors, told_by
+from calibration.fit.pairing import MIN_VIEWS, TOO_FAR, Pairs, apart, places_of, rotation_vectors, told_by
 from calibration.fit.refinement import Refinement, fit_poses
-from calibration.fit.start import MIN_VIEWS, start_camera
+from calibration.fit.start import start_camera
 from calibration.fit.stereo_model import Observations, StereoModel, predict, predict_pixels
 from calibration.kit.arrays import Array, Mask
 from calibration.kit.least_squares import scaled_solve

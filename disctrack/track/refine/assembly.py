@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.cameras.causes import causes
+from calibration.cameras.camera import causes
 from calibration.kit.arrays import Array, Mask
 from calibration.kit.brief import Brief
 from disctrack import frames
