@@ -14,7 +14,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.board.target import target_of
+from calibration.board.target import described, target_of
 from calibration.cameras.camera import (
     CAMERA_NAMES,
     INTRINSIC_PARAMETERS,
@@ -128,7 +128,7 @@ def record_of(calibration: StereoCalibration) -> Record:
         "versions": versions(("disctrack", "numpy", "scipy", "opencv-contrib-python-headless", "numba", "h5py")),
         **{name: getattr(calibration, name) for name in ("doubts", "warnings", "rejected_views", "view_names")},
         "rejected_corners": calibration.rejected_corners(),
-        "board": calibration.board.described(),
+        "board": described(calibration.board),
         "apart": apart.tolist(),
     }
     return {

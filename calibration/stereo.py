@@ -266,7 +266,7 @@ def _begin(views: Views, board: Target, names: Names) -> tuple[Pairs, list[str]]
     """
     sizes = tuple(next(v.image_size for v in side if isinstance(v, CornerView)) for side in views)
     start, orders, notes = start_stereo(_observations(views), board.points, (sizes[0], sizes[1]), names, board.orders)
-    if board.symmetry == 1:
+    if len(board.orders) == 1:
         return start, [*notes]
     for v, order in orders.items():
         view = views[1][v]

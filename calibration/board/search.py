@@ -16,7 +16,7 @@ from calibration.board.chessboard import (
     luminance,
     reduced,
 )
-from calibration.board.target import Board, CharucoBoard, Target
+from calibration.board.target import Board, Target
 from calibration.kit.arrays import evenly
 
 TargetView = CornerView | BoardNotFound
@@ -30,9 +30,7 @@ def find_target(image: NDArray, target: Target, thorough: bool = True) -> Target
     """The target's points in one image. Raises ValueError if it is no image."""
     if isinstance(target, Board):
         return find_corners(image, target.inner_corners, thorough)
-    if isinstance(target, CharucoBoard):
-        return find_charuco(image, target)
-    raise TypeError(f"no finder for {target}")
+    return find_charuco(image, target)
 
 
 def located(images: Sequence[NDArray], target: Target, progress: Progress | None = None) -> list[TargetView]:

@@ -1,10 +1,10 @@
-"""The calibration target: which points it carries, and where.
+"""The calibration target, a chessboard plain or with markers: which points it carries, and where.
 
 Board axes of every target: i to the right and j upwards as the pattern stands upright, k out of the print.
 """
 
 from dataclasses import asdict, dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,46 +16,15 @@ from calibration.kit.errors import CalibrationError
 LEAST_POINTS = 8  # of a view: fewer do not tell its pose
 
 
-@dataclass(frozen=True)
-class Target:
-    """Flat target with known points."""
-
-    kind: ClassVar[str]  # its name in recording.toml
-
-    @property
-    def points(self) -> Array:
-        """Points (n, 3) [m] in board axes; the third coordinate is zero."""
-        raise NotImplementedError
-
-    @property
-    def orders(self) -> list[NDArray[np.intp]]:
-        """The turns in its plane after which the target looks the same, as orders of its points; the first is none."""
-        return [np.arange(len(self.points))]
-
-    @property
-    def symmetry(self) -> int:
-        """In how many attitudes the target looks the same: 1, 2 or 4."""
-        return len(self.orders)
-
-    def __str__(self) -> str:
-        raise NotImplementedError
-
-    def described(self) -> dict[str, Any]:
-        """Kind and fields, as `target_of` takes them."""
-        return {"target": self.kind, **asdict(self)}
-
-
 @checked
 @dataclass(frozen=True)
-class Board(Target):
+class Board:
     """A chessboard. Board axes: origin at corner 0, i along the first count, j along the second, k out of the print.
 
     Seen from the printed side, corner 0 is the lower left inner corner and the square outside it is dark; with an odd
     first and an even second count (9 x 6) the whole short side there has dark corner squares. Corners run along i
     first, then along j.
     """
-
-    kind: ClassVar[str] = "chessboard"
 
     inner_corners: tuple[int, int]  # along i (the long side), along j (the short side)
     square: float  # side of a square [m]
@@ -72,7 +41,7 @@ class Board(Target):
 
     @property
     def orders(self) -> list[NDArray[np.intp]]:
-        """Turns after which the colouring is the same, too."""
+        """The turns in its plane after which it looks the same, as orders of its points; the first is none."""
         columns, rows = self.inner_corners
         orders = board_orders(self.inner_corners)
         if (columns + rows) % 2:
@@ -92,13 +61,11 @@ def board_orders(inner_corners: tuple[int, int]) -> list[NDArray[np.intp]]:
 
 
 @dataclass(frozen=True)
-class CharucoBoard(Target):
+class CharucoBoard:
     """A chessboard with an ArUco marker in every light square; points are its inner corners in OpenCV's order.
 
     Upright as OpenCV draws it, the origin is the lower left inner corner.
     """
-
-    kind: ClassVar[str] = "charuco"
 
     squares: tuple[int, int]  # columns, rows of squares, dark and light
     square: float  # side of a square [m]
@@ -122,6 +89,11 @@ class CharucoBoard(Target):
         """Inner corners (n, 3) [m], from the upper left, row by row."""
         return (_grid(self.inner_corners) * [1, -1, 1] + [0, self.inner_corners[1] - 1, 0]) * self.square
 
+    @property
+    def orders(self) -> list[NDArray[np.intp]]:
+        """As of a chessboard: its markers are told apart whichever way they lie."""
+        return [np.arange(len(self.points))]
+
     def __str__(self) -> str:
         return f"a ChArUco board of {self.squares[0]} x {self.squares[1]} squares ({self.dictionary})"
 
@@ -139,10 +111,16 @@ def _counts(given: Any, least: int, what: str) -> tuple[int, int]:
     return counts[0], counts[1]
 
 
-_KINDS: dict[str, type[Target]] = {kind.kind: kind for kind in (Board, CharucoBoard)}
+Target = Board | CharucoBoard
+_KINDS: dict[str, type[Target]] = {"chessboard": Board, "charuco": CharucoBoard}  # by their names in recording.toml
+
+
+def described(target: Target) -> dict[str, Any]:
+    """Kind and fields, as `target_of` takes them."""
+    return {"target": next(name for name, kind in _KINDS.items() if isinstance(target, kind)), **asdict(target)}
 
 
 def target_of(description: dict[str, Any]) -> Target:
-    """The target that `Target.described` wrote down."""
+    """The target that `described` wrote down."""
     fields = dict(description)
     return _KINDS[fields.pop("target")](**fields)

@@ -12,7 +12,7 @@ import h5py
 from calibration import CalibrationSettings, StereoCalibration, StereoRig
 from calibration.board import corner_fit
 from calibration.board.search import Progress
-from calibration.board.target import Target
+from calibration.board.target import Target, described
 from calibration.kit.arguments import checked
 from calibration.kit.seal import check_seal
 from calibration.rig_file import Record, read_rig, read_rig_file, rig_bytes
@@ -52,7 +52,7 @@ class CalibrationSource:
             recording=self.name,
             inputs={"calibration views": self.views.sha256()},
             settings={
-                **self.board.described(),
+                **described(self.board),
                 "table_view": self.table_view,
                 "board_thickness_m": self.board_thickness,
                 "distortion": self.settings.distortion,
