@@ -5,12 +5,13 @@ pulls it by more than the noise of all others. Cameras replace such pixels by th
 """
 
 from collections.abc import Sequence
+from functools import reduce
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.kit.arrays import Image, Mask
+from calibration.kit.arrays import Mask
 
 OFF = 0.12  # of the images' range, by which a pixel differs from the median of its neighbours in every image
 STEADY = 0.04  # of the range: it changes by no more than that, whatever passes
@@ -20,7 +21,7 @@ PASSED = 0.3  # of the range, by which the light around a pixel changed: squares
 OFTEN = 0.3  # of the views, in which such a pixel differs from its neighbours
 
 
-def stuck_pixels(images: Sequence[Image] | NDArray, of_board: bool = False) -> Mask | None:
+def stuck_pixels(images: Sequence[NDArray] | NDArray, of_board: bool = False) -> Mask | None:
     """(height, width) True where a pixel of grey images (n, height, width) keeps its value and does not see.
 
     That is one that is off its neighbours in all images. Of views of a board its squares are as dark as a dead pixel
@@ -30,23 +31,21 @@ def stuck_pixels(images: Sequence[Image] | NDArray, of_board: bool = False) -> M
     """
     if len(images) < MIN_IMAGES:
         return None
-    low, high = np.array(images[0]), np.array(images[0])
-    around = [cv2.medianBlur(low, 3) for _ in range(2)]
-    scale = float(max(int(image.max()) for image in images) - min(int(image.min()) for image in images))
-    off = np.zeros(low.shape, np.int32)
-    for image in images:
-        np.minimum(low, image, out=low)
-        np.maximum(high, image, out=high)
-        level = cv2.medianBlur(np.ascontiguousarray(image), 3)
-        np.minimum(around[0], level, out=around[0])
-        np.maximum(around[1], level, out=around[1])
+    around = [cv2.medianBlur(np.ascontiguousarray(image), 3) for image in images]
+    scale = float(reduce(np.maximum, images).max()) - float(reduce(np.minimum, images).min())
+    off = np.zeros(around[0].shape, np.int32)
+    for image, level in zip(images, around, strict=True):
         off += np.abs(image.astype(np.int32) - level) > OFF * scale
     blind = off == len(images)
     if of_board:
-        changed = around[1].astype(np.int32) - around[0]
-        blind = (changed > PASSED * scale) & (off > OFTEN * len(images))
-    found = blind & (high.astype(np.int32) - low <= STEADY * scale)
+        blind = (_changed(around) > PASSED * scale) & (off > OFTEN * len(images))
+    found = blind & (_changed(images) <= STEADY * scale)
     return found if 0 < found.sum() <= MOST * found.size else None
+
+
+def _changed(images: Sequence[NDArray] | NDArray) -> NDArray[np.int32]:
+    """(height, width) by how much each pixel changes over the images."""
+    return reduce(np.maximum, images).astype(np.int32) - reduce(np.minimum, images)
 
 
 def repaired_views(views: Sequence[NDArray], camera: str) -> tuple[list[NDArray], str]:
