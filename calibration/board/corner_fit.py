@@ -336,10 +336,8 @@ def smooth_grid(points: Array, inner_corners: tuple[int, int], seen: Mask) -> tu
     columns, rows = inner_corners
     seen = seen if seen.sum() >= LEAST_POINTS else np.ones(len(points), bool)
     board = _indices(inner_corners)
-    H, _ = cv2.findHomography(board[seen], points[seen], cv2.LMEDS)
-    if H is None:
-        H, _ = cv2.findHomography(board[seen], points[seen])
-    plane = np.asarray(cv2.perspectiveTransform(board[None], np.asarray(H, float))[0], float)
+    H = np.asarray(cv2.findHomography(board[seen], points[seen], cv2.LMEDS)[0], float)
+    plane = np.asarray(cv2.perspectiveTransform(board[None], H)[0], float)
     degree = max(degree_for(int(seen.sum()), 3), 1)
     u, v = 2 * board[:, 0] / (columns - 1) - 1, 2 * board[:, 1] / (rows - 1) - 1
     A = np.stack([u**a * v**b for a in range(degree + 1) for b in range(degree + 1 - a)], axis=-1)

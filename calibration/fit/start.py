@@ -84,12 +84,10 @@ def start_stereo(
     Raises CalibrationError where the images do not tell a camera, or are no pairs; see `pairing`.
     """
     orders, n_views = orders or [np.arange(len(nominal))], len(names)
-    cameras, poses, places = [], [], []
-    for index in (0, 1):
-        camera, seen, _ = start_camera(observations, index, nominal, image_sizes[index])
-        places.append(places_of(seen, observations[observations.camera == index], nominal, camera))
-        cameras.append(camera)
-        poses.append(seen)
+    begun = [start_camera(observations, index, nominal, size) for index, size in enumerate(image_sizes)]
+    cameras, poses, _ = zip(*begun, strict=True)
+    sides = [observations[observations.camera == index] for index in (0, 1)]
+    places = [places_of(seen, o, nominal, camera) for o, (camera, seen, _) in zip(sides, begun, strict=True)]
     floor = FLOOR * max(max(size) for size in image_sizes)
     pairs, notes = paired((places[0], places[1]), (list(poses[0]), list(poses[1])), nominal, len(orders), floor, names)
     both = [v for v in poses[0] if v in poses[1]]

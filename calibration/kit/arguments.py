@@ -168,12 +168,6 @@ def _object(value: Any, kind: type) -> Any:
     return held
 
 
-def _finite(value: Any) -> float:
-    if not math.isfinite(value):
-        raise ValueError
-    return float(value)
-
-
 def _of(*kinds: type, into: Callable[[Any], Any] = lambda value: value) -> Callable[[Any], Any]:
     """A value of one of these types; True is no number."""
 
@@ -196,7 +190,7 @@ _PLAIN: dict[Any, Rule] = {
     NoneType: (_of(NoneType), "None"),
     bool: (_of(bool, np.bool_), "True or False"),
     int: (_of(Integral, into=int), "a whole number"),
-    float: (_of(Real, into=_finite), "a finite number"),
+    float: (_of(Real, into=lambda value: Range("").take(float(value))), "a finite number"),
     str: (_of(str), "text"),
     Path: (_of(str, os.PathLike), "a path"),
     os.PathLike[str]: (_of(os.PathLike), "a path"),

@@ -57,6 +57,7 @@ def test_what_is_read_back_is_what_was_written(content, tmp_path):
     kept = record_of(content)
     for name in record:
         assert_equal(np.asarray(record[name]), np.asarray(kept[name]), name)
+    assert record["R_left_board"].shape == (9, 3, 3)
     assert (record["apart"], record["table_view"], record["doubts"]) == ([5], 1, ["are the images negative?"])
     assert [p.name for p in tmp_path.iterdir()] == ["rig.h5"]  # no temporary file stays
     changed = replace(content.rig, covariance=content.rig.covariance * (1 + 1e-15))
