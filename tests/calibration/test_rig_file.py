@@ -10,7 +10,7 @@ from calibration import BoardNotFound, CalibrationSettings, Camera, RigFileError
 from calibration.cameras.camera import N_RIG, Allowance, rotation_from_vector
 from calibration.cameras.splines import LensField
 from calibration.rig_file import read_rig, read_rig_file, record_of, write_rig
-from tests.calibration.conftest import corner_view
+from tests.calibration.test_stereo import corner_views
 from tests.equality import assert_equal
 
 
@@ -34,11 +34,8 @@ def rig(rng):
 @pytest.fixture(scope="module")
 def calibrated(scene_maker):
     """From views one of which is lost to the left camera, and one shows the board elsewhere to the right one."""
-    scene, rng = scene_maker(n_views=8), np.random.default_rng(6)
-    sides = [
-        [corner_view(p + rng.normal(scale=0.02, size=p.shape), 0.02, (512, 512)) for p in scene.pixels(c)]
-        for c in (0, 1)
-    ]
+    scene = scene_maker(n_views=8)
+    sides = corner_views(scene, np.random.default_rng(6))
     sides[0][2] = BoardNotFound("glare")
     sides[1][5] = replace(sides[1][5], points=sides[1][5].points + np.array([40.0, 0.0]))
     names = [(f"l{v}.png", f"rechts ü{v}.png") for v in range(8)]
