@@ -22,10 +22,10 @@ from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.laws import MIN_SIGMAS, Family, Gain, LearnedLaw, evidence, proposal
 from disctrack.discrepancy.score import cleared, span
 from disctrack.discrepancy.system import Candidate, Quantity, Values
-from disctrack.rolling import EffectParameter, Model, simulate
+from disctrack.rolling import EffectParameter, Model, Motion
 from disctrack.rolling.effects.learned import effect_from_formulas
 from disctrack.rolling.records import KINEMATICS
-from disctrack.rolling.simulate import COMPONENTS, Responses, responses
+from disctrack.rolling.simulate import COMPONENTS, moved_start, responses
 
 if TYPE_CHECKING:
     from disctrack.diagnosis.disc_system import DiscSystem
@@ -37,6 +37,9 @@ WIDTH = 0.7  # of a probe over the distance to the next: their sum is flat to 1e
 TELLING = 0.3  # share of chi-square to first order, from which on it is said what the missing moment goes with
 INSTANTS_PER_SECOND = 1000.0  # of the responses: Simpson's rule errs by 0.4 % of a hum of 150 Hz
 CHUNK = 120  # families of the library that are asked for at a time
+
+
+Along = tuple[Motion, Array, NDArray[np.intp]]  # a motion, how it answers, and which of its instants are the frames'
 
 
 @dataclass(frozen=True)
@@ -109,14 +112,14 @@ def what_is_missing(system: DiscSystem, fit_: Fit) -> str:
     return f"{text}; {100 * share:.0f} % of it would be {best.family.title}" if share > TELLING else text
 
 
-def responding(system: DiscSystem, fit_: Fit) -> tuple[Responses, NDArray[np.intp]] | None:
-    """Responses along the fitted motion, and which of their instants are the frames'; None where it does not roll."""
+def responding(system: DiscSystem, fit_: Fit) -> Along | None:
+    """The fitted motion with its responses, and which instants are the frames'; None where it does not roll."""
     instants = system.instants(fit_.values)
     per_frame = int(np.ceil(INSTANTS_PER_SECOND * float(np.median(np.diff(instants)))))
     n = len(instants)
     fine = np.interp(np.arange(per_frame * (n - 1) + 1) / per_frame, np.arange(n), instants)
     found = responses(system.model_with(fit_.values), state_of(fit_.values), fine, THETA_END)
-    return None if found is None else (found, np.arange(n) * per_frame)
+    return None if found is None else (*found, np.arange(n) * per_frame)
 
 
 def probe(system: DiscSystem, fit_: Fit, other: Values | None = None) -> Probed | None:
@@ -127,7 +130,7 @@ def probe(system: DiscSystem, fit_: Fit, other: Values | None = None) -> Probed 
     along = responding(system, fit_)
     if along is None:
         return None
-    motion, frames = along
+    motion, kernel, frames = along
     span = float(motion.time[-1] - motion.time[0])
     turns = max(float(np.abs(motion.q[-1, i] - motion.q[0, i])) / (2 * np.pi) for i in (3, 5))
     k = int(np.clip(np.ceil(PROBES_PER_TURN * turns), 20, MAX_PROBES))
@@ -141,15 +144,12 @@ def probe(system: DiscSystem, fit_: Fit, other: Values | None = None) -> Probed 
     courses = np.zeros((len(bells), len(COMPONENTS), len(AXES), k))
     for i in range(len(AXES)):
         courses[:, i, i] = bells
-    moved = motion.of(courses.reshape(len(bells), len(COMPONENTS), -1))[frames]
+    moved = moved_start(motion.time, kernel, courses.reshape(len(bells), len(COMPONENTS), -1))[frames]
     by_start = derivative[..., [fit_.names.index(f"state.{name}") for name in STATE_SCALES]]
     everything = np.concatenate([derivative, by_start @ moved, residual[..., None]], axis=-1)
     data = triangle(everything.reshape(-1, everything.shape[-1]))
     prior = np.concatenate([matrix, np.zeros((len(matrix), 3 * k)), right[:, None]], axis=1)
     return Probed(data, prior, len(fit_.names), middles, span / k)
-
-
-Along = tuple[Responses, NDArray[np.intp]]  # a motion, and which of its instants are the frames'
 
 
 class DiscScan:
@@ -162,7 +162,7 @@ class DiscScan:
     """
 
     def __init__(self, system: DiscSystem, fit_: Fit, beside: Sequence[Quantity] | None, along: Along) -> None:
-        self.motion, self._frames = along
+        self.motion, self._kernel, self._frames = along
         self._rate, self._disc = float(1.0 / np.median(np.diff(system.time))), system.disc
         fitted = fit_.quantities if beside is None else tuple(beside)
         moved = [q for q in fitted if not is_linear(q)]
@@ -186,13 +186,12 @@ class DiscScan:
         self._absorbed = np.swapaxes(basis.reshape(n, w, -1), 1, 2) @ D
         self._right = np.einsum("nw,nwk->nk", left[: residual.size].reshape(n, w), D)
         self.chi_square = float(left @ left)
-        followed = simulate(system.model_with(fit_.values), state_of(fit_.values), times=self.motion.time)
-        space: dict[str, Any] = {name: np.asarray(followed.instants[name]) for name in KINEMATICS}
+        space: dict[str, Any] = {name: np.asarray(self.motion.instants[name]) for name in KINEMATICS}
         space |= {f: getattr(np, f) for f in ("cos", "sin", "exp", "sqrt", "log")}
         space |= {"magnitude": np.abs, "sign": lambda x, width: x / np.sqrt(x * x + width * width)}
         self._space, self._courses = space, dict[str, Array]()
         # what a law adds to the load changes its own moment in second order
-        self._load = followed.contact_force[:, 2]
+        self._load = self.motion.contact_force[:, 2]
 
     def _course(self, formula: str) -> Array:
         if formula not in self._courses:
@@ -220,7 +219,7 @@ class DiscScan:
                 factor = self._load if kind == "load" else 1.0
                 course = factor * self._course(formula)
                 courses[:, COMPONENTS.index(f"M_{axis}" if kind == "load" else component), column] += course
-        g = self.motion.of(courses)[self._frames]
+        g = moved_start(self.motion.time, self._kernel, courses)[self._frames]
         seen = self._normal @ g
         taken = np.tensordot(self._absorbed, g, axes=([0, 2], [0, 1]))
         right = np.tensordot(self._right, g, axes=([0, 1], [0, 1]))

@@ -357,34 +357,30 @@ def _names(code: CodeType) -> Iterator[str]:
             yield from _names(inside)
 
 
-@dataclass(frozen=True)
-class Responses:
-    """Of a motion that rolls all the time; N instants, (nearly) equally far apart."""
+def moved_start(time: Array, kernel: Array, courses: Array) -> Array:
+    """(N, 8, p) displacement of the initial state that stands for what wrenches (N, 6, p) have done up to then.
 
-    time: Array  # (N,) [s]
-    q: Array  # (N, 6)
-    qdot: Array  # (N, 6)
-    kernel: Array  # (N, 8, 6) Phi^-1 B by COMPONENTS, per N m and per N
-
-    def of(self, courses: Array) -> Array:
-        """(N, 8, p) displacement of the initial state that stands for what wrenches (N, 6, p) have done up to then.
-
-        The state itself has moved by Phi times this; so has every prediction by its derivative by the initial state.
-        """
-        per_instant = self.kernel * np.gradient(self.time)[:, None, None]
-        return np.asarray(cumulative_simpson(np.einsum("nkc,ncp->nkp", per_instant, courses), axis=0, initial=0.0))
+    The state itself has moved by Phi times this; so has every prediction by its derivative by the initial state.
+    time, kernel : of `responses`
+    """
+    per_instant = kernel * np.gradient(time)[:, None, None]
+    return np.asarray(cumulative_simpson(np.einsum("nkc,ncp->nkp", per_instant, courses), axis=0, initial=0.0))
 
 
-def responses(model: Model, state: State, times: Array, theta_end: float = DEFAULT_THETA_END) -> Responses | None:
-    """Responses along the motion from `state` at times[0]; None where it does not roll over all of the times."""
+def responses(
+    model: Model, state: State, times: Array, theta_end: float = DEFAULT_THETA_END
+) -> tuple[Motion, Array] | None:
+    """Motion from `state` at times[0], at N times (nearly) equally far apart, and how it answers to what moves it.
+
+    That is Phi^-1 B (N, 8, 6) by COMPONENTS, per N m and per N. None where it does not roll over all of the times.
+    """
     motion = simulate(model, state, times=times, theta_end=theta_end, rtol=RTOL)
     if len(motion) < len(times) or np.any(motion.regime != ROLLING):
         return None
     found = sensitivities(model, state, times, (), ROLLING_COMPONENTS, theta_end)
     if not np.isfinite(found.dq).all():
         return None
-    kernel = np.asarray(np.linalg.solve(found.dstate, _per_wrench(model, motion.state, times)), float)
-    return Responses(times, found.q, found.qdot, kernel)
+    return motion, np.asarray(np.linalg.solve(found.dstate, _per_wrench(model, motion.state, times)), float)
 
 
 def _per_wrench(model: Model, states: Array, times: Array) -> Array:

@@ -19,7 +19,7 @@ from disctrack.rolling import (
 from disctrack.rolling._compiled import compile_law
 from disctrack.rolling.effects.learned import effect_from_formulas
 from disctrack.rolling.records import ROLLING_COMPONENTS
-from disctrack.rolling.simulate import COMPONENTS, Assembly, responses, symmetries
+from disctrack.rolling.simulate import COMPONENTS, Assembly, moved_start, responses, symmetries
 from disctrack.synthetic.description import Scene
 
 STATE = steady_precession(np.radians(15), MA_2014, omega3=2.5, nutation_amplitude=0.03, psi=0.4, phi=-1.0, x=0.02)
@@ -217,11 +217,11 @@ def nutating():
 def test_a_pulse_of_any_component_moves_the_disc_as_its_sensitivity_says(nutating):
     model, state = nutating
     times = np.linspace(0.0, 0.5, 1001)
-    found = responses(model, state, times, THETA_END)
+    motion, kernel = responses(model, state, times, THETA_END)
     course = np.exp(-0.5 * ((times - 0.2) / 0.02) ** 2)
     wrenches = course[:, None, None] * np.eye(len(COMPONENTS))
     by_start = sensitivities(model, state, times, (), None, THETA_END).dq
-    moved = by_start @ found.of(wrenches)
+    moved = by_start @ moved_start(motion.time, kernel, wrenches)
     probe = effect_from_formulas("pulse", {c: f"of_{c} * exp(-((time - 0.2) / 0.02)**2 / 2)" for c in COMPONENTS})
     names = [f"pulse.of_{c}" for c in COMPONENTS]
     probed = model.knowing(probe).with_values(dict.fromkeys(names, 0.0))
