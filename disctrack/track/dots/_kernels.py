@@ -448,10 +448,10 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, centres, own, pix
 
     image (H, W); map_x, map_y (H, W): normalised coordinates of every pixel; P (3, 3): normalised image -> target
     plane; start (7,): expected centre and radius on the plane, pixel of that centre, and of the centroid of the dot's
-    image; sigma: blur to start from [px]; noise (3,): variance = noise[0] + noise[1] grey, and the square of the grey
-    values' step; rim: radius of an edge about the plane's origin whose blur must not reach the pixels used, nor that of
-    other dots, whose `centres` (m, 3) those but its `own` are; pixels and work (matrix, right-hand side, step,
-    parameters before it) are scratch.
+    image; sigma: blur to start from [px]; noise (3,): variance = noise[0] + noise[1] grey, and the grey values' step;
+    rim: radius of an edge about the plane's origin whose blur must not reach the pixels used, nor that of other dots,
+    whose `centres` (m, 3) those but its `own` are; pixels and work (matrix, right-hand side, step, parameters before
+    it) are scratch.
     p (8,) receives the template's parameters (a, b: shift on the plane from the expected centre), result (a DOT) the
     judgement of the fit and the centre's covariance in pixels. The caller projects the centre itself (U, V).
     """
@@ -498,7 +498,7 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, centres, own, pix
             light = max(inside, outside, 1e-6)  # the unit of grey from here on: no result depends on the file's own
             p[ROW.level], p[ROW.contrast] = outside / light, 1.0 - inside / max(outside, 1e-6)
         dark = p[ROW.level] * (1.0 - p[ROW.contrast])
-        read, gain, step2 = noise[0] / (light * light), noise[1] / light, noise[2] / (light * light)
+        read, gain, step2 = noise[0] / (light * light), noise[1] / light, noise[2] * noise[2] / (light * light)
         if abs(p[ROW.level] - dark) < 4.0 * math.sqrt(max(read + gain * max(p[ROW.level], dark), 0.1 * step2)):
             return LOW_CONTRAST
         in_light = 1.0 / light
@@ -696,7 +696,7 @@ def track_frames(images, readable, maps, cameras, face, sigma, noise, limits, he
 
     images (n, 2, H, W); readable (n, 2); maps: x and y (2, H, W) undistorted normalised coordinates of the cameras'
     pixels; cameras as `pose.stacked` has them, face as `template.face_of`; sigma (2,) [px] of the dots' edges in each
-    camera; noise (2, 3): variance = noise[0] + noise[1] grey, and the square of the grey values' step; heading: the
+    camera; noise (2, 3): variance = noise[0] + noise[1] grey, and the grey values' step; heading: the
     last three poses ((R, t), ...), which are updated. Filled: results (n, 2, m) of DOT, status (n, 2, m), R_out
     (n, 3, 3), t_out (n, 3). Returns the number of frames followed; less than n where the disc was lost at that frame.
     """

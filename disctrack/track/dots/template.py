@@ -13,7 +13,7 @@ Free per dot: centre (2), R, sigma, L, g (2), c. R and sigma do not couple with 
 printed too large, or motion blur, costs no accuracy.
 """
 
-from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,8 +27,7 @@ TYPICAL_BLUR_PX = 0.8  # start value where nothing is known yet
 LESS_THAN_FLAT = 0.9  # share of the noise of flat parts, from which on down what fits leave is believed instead
 
 
-@dataclass(frozen=True)
-class NoiseModel:
+class NoiseModel(NamedTuple):
     """Variance of a pixel of mean grey value I: read + gain * I (photon transfer); grey values as in the file."""
 
     read: float
@@ -38,11 +37,6 @@ class NoiseModel:
     def variance(self, grey: Array) -> Array:
         """Variance [grey^2] at mean grey values of any shape; never below that of rounding, step^2 / 12."""
         return np.maximum(self.read + self.gain * np.asarray(grey, float), self.step**2 / 12.0)
-
-    @property
-    def parameters(self) -> Array:
-        """(read, gain, step^2)."""
-        return np.array([self.read, self.gain, self.step**2])
 
 
 def typical_noise(image: Image) -> NoiseModel:
@@ -144,4 +138,4 @@ def no_more_than_left(flat: NoiseModel, assumed: NoiseModel, results: NDArray) -
     left = float(np.median(results["chi_square"] * assumed.variance(middle) / flat.variance(middle)))
     if left > LESS_THAN_FLAT:  # within the scatter of both
         return flat
-    return replace(flat, read=flat.read * left, gain=flat.gain * left)
+    return flat._replace(read=flat.read * left, gain=flat.gain * left)

@@ -130,8 +130,8 @@ def run(
     """
     limits = limits._replace(misfit=max(limits.misfit, UNUSUAL * follower.misfit))
     known = Heading(*((np.array(R, order="C"), np.array(t)) for R, t in heading))  # the loop moves them on
-    blur, noise = zip(*((edge.blur_px, edge.noise.parameters) for edge in follower.edges), strict=True)
-    fixed = follower.maps, stacked(follower.rig), face_of(follower.disc), np.array(blur), np.stack(noise), limits
+    blur, noise = np.array([edge.blur_px for edge in follower.edges]), np.array([edge.noise for edge in follower.edges])
+    fixed = follower.maps, stacked(follower.rig), face_of(follower.disc), blur, noise, limits
     filled = rows.results, rows.status, rows.R, rows.t
     done = kernels.track_frames(images, readable, *fixed, known, *filled, MAX_PREDICTION_RMS_PX)
     return int(done), known

@@ -1,7 +1,7 @@
 """From what was followed to the trajectory: what all frames share is refined, all poses are fitted and judged."""
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -112,7 +112,7 @@ def assemble(
     details = {
         "exposure_s": list(exposure),  # that the dots were moved by
         "blur_px": [edge.blur_px for edge in first.edges],
-        "noise": [asdict(edge.noise) for edge in first.edges],
+        "noise": [edge.noise._asdict() for edge in first.edges],
         "pose_variance_factor": shaken.round(3).tolist(),  # of the poses about a smooth motion over what dots tell
         "shared_sigma": [[sigma, cause] for sigma, cause in shared],
         "acquisitions": sum(f.acquisitions for f in followers),  # times the disc was searched for and found
