@@ -180,7 +180,7 @@ class Samples:
     """A run that has been checked, or a stretch of one: plain arrays."""
 
     run: str
-    stretch: int  # 0, 1, ... of its run
+    stretch: int  # sample of its run with which it begins
     time: Array  # (n,) [s] since the run's first sample
     data: Array  # (n, w) NaN where missing
     sigma: Array  # (n, w)
@@ -196,15 +196,15 @@ class Samples:
 
     @property
     def name(self) -> str:
-        """Run, and which stretch of it, where it is not whole."""
+        """Run, and the sample with which it begins, where that is not the first: whatever its length."""
         return self.run if self.stretch == 0 else f"{self.run}#{self.stretch + 1}"
 
-    def part(self, first: int, last: int, number: int) -> Samples:
+    def part(self, first: int, last: int) -> Samples:
         """Samples first <= i < last as a stretch with a start of its own."""
         rows = slice(first, last)
-        own = number == 0
+        own = first == 0
         return replace(
-            self, stretch=number, time=self.time[rows], data=self.data[rows], sigma=self.sigma[rows],
+            self, stretch=self.stretch + first, time=self.time[rows], data=self.data[rows], sigma=self.sigma[rows],
             start=self.start if own else {}, known=self.known if own else {}, at_rest=self.at_rest and own,
         )  # fmt: skip
 

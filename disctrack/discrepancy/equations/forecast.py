@@ -53,7 +53,7 @@ def free_run(system: EquationSystem, fitted: Fit, samples: Samples, left: Array,
     spread, follows = np.zeros((0, 0)), np.zeros((0, len(numbers)))
     if by_state:
         n = int(np.searchsorted(samples.time, window, side="right"))
-        begin = replace(alone, stretches=[alone.stretches[0].part(0, n, 0)])
+        begin = replace(alone, stretches=[alone.stretches[0].part(0, n)])
         begun = guessed(begin)[0]
         loose = [
             replace(q, null=begun[q.name], prior_sigma=OF_SIZE * q.scale) if np.isinf(q.prior_sigma) else q

@@ -21,8 +21,8 @@ from calibration.kit.arrays import Array
 from disctrack.discrepancy.equations.declared import Equations, Parameter, Term
 from disctrack.discrepancy.equations.expressions import Formula
 from disctrack.discrepancy.equations.formulas import Formulas
-from disctrack.discrepancy.equations.start import guessed, near_declared, sizes_alike, trusted, turn
-from disctrack.discrepancy.equations.system import MOST_STATES, EquationSystem, cut
+from disctrack.discrepancy.equations.start import cut_short, guessed, near_declared, sizes_alike, trusted
+from disctrack.discrepancy.equations.system import MOST_STATES, EquationSystem
 from disctrack.discrepancy.fit import TRIAL, Fit, fit, no_fit
 from disctrack.discrepancy.held_out import HeldOut, held_out
 from disctrack.discrepancy.laws import evidence
@@ -49,7 +49,6 @@ SMOOTH = (0.7, 1.5, 3.0, 6.0)  # wave numbers from which on amplitudes fall ...
 FALLS = (1.5, 1.0)  # ... as these powers of 1 + (wave number over it) squared: without kinks, and with some
 FINE, STRAIGHT = 0.03, 1e4  # of the largest value: the variable's inverse hyperbolic sine beyond it, or itself
 SIZES = np.logspace(-4, 2, 31)  # prior sigma of the first amplitudes, over the rms of the equation that it stands in
-FEWEST, SHORT = 10, 0.2  # samples, and share of a turn, of a short stretch: over it a step by any law is nearly linear
 MOST_LAWS = 40  # that are looked at in any case
 REFITTED = 4  # laws that are fitted in full: the next one may wander for longer than these take
 WORTH = 50.0  # of -2 log evidence to first order: a law that is so much worse than another is not fitted ...
@@ -225,7 +224,7 @@ class _Competition:
         self.far = not chi_square < FAR * self.noise * max(float(np.sum(system.weights)), 1.0)
         self.laws = tuple(_laws(system, self.begin, variables))
         self.looked = 2.0 * float(np.log(max(len(self.laws), 1)))
-        self.shots = _shots(system) if self.far else [system]
+        self.shots = cut_short(system) if self.far else [system]
 
     def view(self, system: EquationSystem) -> System:
         """With the noise as judged, where the samples are those that were judged."""
@@ -355,8 +354,6 @@ class _Competition:
             if evident > bars[i] + WORTH:
                 return None
             bars[i] = min(bars[i], evident)
-            if longer:
-                now |= _joining(now, there, longer)
         fitted = self._fitted(view, (*others, *own), now)
         # known numbers and terms are priced as where no law is; of the law, the evidence has paid
         prices = length(view, self.diagnosis.settings, self.noise, fitted, beside) - fitted.cost / self.noise
@@ -543,27 +540,6 @@ def _course(system: EquationSystem, law: Along, names: Sequence[str], values: Va
     acting = by_number[:, here, f.names.index(names[0])]  # of the constant
     own = by_number[:, here, [f.names.index(name) for name in names]]
     return (now - before)[:, here] / acting, own / acting[:, None]
-
-
-def _shots(system: EquationSystem) -> list[EquationSystem]:
-    """The stretches cut into short ones, and these joined two by two until they are whole again."""
-    lasting = max(float(s.time[-1] - s.time[0]) / turn(s) for s in system.stretches)
-    most = min(lasting / SHORT, min(len(s.time) for s in system.stretches) / FEWEST)
-    counts = [2**level for level in range(int(np.log2(max(most, 1.0))), 0, -1)]
-    shorter = (cut(system.stretches, [count] * len(system.stretches)) for count in counts)
-    return [*(replace(system, stretches=some) for some in shorter), system]
-
-
-def _joining(values: Values, system: EquationSystem, longer: EquationSystem) -> dict[str, float]:
-    """Starts of longer stretches, from those that began there."""
-    begun = {(s.run, s.time[0]): s.name for s in system.stretches}
-    found = {}
-    for s in longer.stretches:
-        for state in system.formulas.equations.states:
-            key = f"state.{state}[{begun[s.run, s.time[0]]}]"
-            if key in values:
-                found[f"state.{state}[{s.name}]"] = values[key]
-    return found
 
 
 def with_law(diagnosis: Diagnosis, law: LearnedForce) -> Diagnosis:

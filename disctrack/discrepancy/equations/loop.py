@@ -11,8 +11,8 @@ from disctrack.discrepancy.equations import terms as library
 from disctrack.discrepancy.equations.declared import Equations, Run, Samples, Term, checked
 from disctrack.discrepancy.equations.formulas import Formulas
 from disctrack.discrepancy.equations.law import LearnedForce, learn, with_law
-from disctrack.discrepancy.equations.start import LOST, Start, guessed, led, misfit, sizes_alike, trusted, turn
-from disctrack.discrepancy.equations.system import EquationSystem, cut, first_part, fitted_rows, spread
+from disctrack.discrepancy.equations.start import LOST, guessed, lasting, led, misfit, sizes_alike, trusted, turn
+from disctrack.discrepancy.equations.system import EquationSystem, fitted_rows, spread
 from disctrack.discrepancy.fit import Fit, fit, no_fit
 from disctrack.discrepancy.noise import (
     autoregression,
@@ -36,7 +36,6 @@ REDUNDANT = 1e-5  # share of a parameter's effect left beside the others', below
 SLOW = 0.05  # of a turn of the motion: what is left and lasts longer is taken for the motion's own
 NO_SENSOR = 5.0  # times the noise that was declared or is seen from sample to sample: no sensor's error
 FORGOTTEN = float(np.arccos(np.exp(-1.0)) / (2 * np.pi))  # of its turn, after which an oscillation's memory is 1/e
-SAFE = 0.5  # of the time over which the model can be made to follow: near its end chi-square is full of minima
 SCANNED = 8  # values along the motion that are tried for a limit
 NEARLY = 0.2  # of the excess chi-square: what leaves less is named as the nearest description of what no term is
 STANDS = 8  # samples of the same largest or least value, above which a sensor stands at a limit
@@ -64,10 +63,7 @@ def ask(
     system, diagnosis, more = _first_answer(whole, settings)
     notes += more
     if not np.isfinite(diagnosis.before.chi_square):
-        raise AnalysisError(
-            "the motion can be followed, but not how it depends on its parameters: so it is where equations jump, as "
-            "at a stiff contact. Write the contact wider, or cut the data into runs without it."
-        )
+        raise AnalysisError(_not_followed(system, diagnosis.before.values))
     diagnosis, remembers, of_memory = _with_memory(system, diagnosis, settings)
     judged = diagnosis.judged or system
     law = learn(system, diagnosis, channels, None if judged is system else judged)
@@ -88,37 +84,42 @@ def ask(
 
 def _first_answer(system: EquationSystem, settings: Settings) -> tuple[EquationSystem, Diagnosis, list[str]]:
     """The search over as much as the model can be made to follow, and remarks on how far that is."""
-    samples = system.stretches
-    system, declared = _prepared(system)
-    start = led(system, declared)
-    followed = replace(system, stretches=first_part(system.stretches, start.followed))
-    held = redundant(followed, start.values) if start.followed > 0.0 else ()
-    if held:
-        system = replace(system, held=held)
-        start = led(system, declared)
-    soon = start.followed < min(turn(s) for s in system.stretches)
-    leading = _leading(system, declared, [c.name for c in system.candidates]) if soon else {}
-    if soon and start.followed == 0.0 and not leading:
-        raise AnalysisError(_not_followed(system, declared))
-    names = [name for names in leading for name in names]
-    notes = [_lost_soon(start, names)] if soon else []
-    if leading:
-        values = next(iter(leading.values()))
-        system, diagnosis = _searched(_sized(system, values), values, settings, leading)
-        if not {f.candidate.name for f in diagnosis.found} & {*names}:
-            notes = [f"the fit goes by way of {names[0]}: without it, growing windows lose the data"]
-        return system, diagnosis, notes
-    values = start.values
-    if not start.whole:
-        system, values, note = _in_stretches(system, values, SAFE * start.followed)
-        notes.append(note)
-    if not np.isfinite(system.linearise(values, [])[0]).all():
-        raise AnalysisError(_not_followed(system, values))
-    system, diagnosis = _searched(_sized(system, values), values, settings)
-    if not start.whole and diagnosis.found:
-        system, diagnosis, remark = _joined(system, samples, diagnosis, settings)
-        notes.append(remark)
-    return system, diagnosis, notes
+    whole, declared = _prepared(system)
+    start = led(whole, declared)
+    if held := redundant(start.system, start.values) if start.followed > 0.0 else ():
+        whole = replace(whole, held=held)
+        start = led(whole, declared)
+    if not start.followed:
+        ways = _leading(whole, declared, [(c.name,) for c in whole.candidates])
+        if not ways:
+            raise AnalysisError(_not_followed(whole, declared))
+        return _by_way_of(ways, whole, settings)
+    system, diagnosis = _searched(_sized(start.system, start.values), start.values, settings)
+    if start.whole:
+        return system, diagnosis, []
+    # stretches may be too short to tell what is missing: then by way of the terms that help most
+    found = tuple(f.candidate.name for f in diagnosis.found)
+    most = sorted(diagnosis.tried, key=lambda t: -t.score)[:WIDTH]
+    ways = _leading(whole, diagnosis.after.values, [found] if found else [(t.candidate.name,) for t in most])
+    if ways:
+        return _by_way_of(ways, whole, settings)
+    told = (
+        f"the model loses the data after {start.followed:.2g} s: runs are taken in {len(system.stretches)} stretches "
+        f"of {lasting(system):.3g} s with an initial state each"
+    )
+    return system, diagnosis, [told, *(["with it the model does not follow the whole runs"] if found else [])]
+
+
+def _by_way_of(
+    ways: dict[frozenset[str], dict[str, float]], whole: EquationSystem, settings: Settings
+) -> tuple[EquationSystem, Diagnosis, list[str]]:
+    """The search over whole runs, which the model follows with these terms."""
+    names, values = next(iter(ways.items()))
+    system, diagnosis = _searched(_sized(whole, values), values, settings, ways)
+    if {f.candidate.name for f in diagnosis.found} & frozenset().union(*ways):
+        return system, diagnosis, ["with what was found the model follows the whole runs, and they are judged whole"]
+    told = f"the fit goes by way of {' and '.join(sorted(names))}: without it, longer stretches lose the data"
+    return system, diagnosis, [told]
 
 
 def _searched(
@@ -143,8 +144,8 @@ def _searched(
     if diagnosis.verdict == "unexplained" and not diagnosis.found:
         # of an arm that friction stops, no step leads from a motion without end to the instant at which it stops
         stuck = [t for t in diagnosis.tried if t.stuck and t.gain is not None and t.gain > 0]
-        names = [t.candidate.name for t in sorted(stuck, key=lambda t: -t.score)]
-        if ways := _leading(system, guessed(system)[0], names[:WIDTH]):
+        names = [(t.candidate.name,) for t in sorted(stuck, key=lambda t: -t.score)]
+        if ways := _leading(system, {}, names[:WIDTH]):
             diagnosis = explain(system, diagnosis.before.values, settings, system.training, ways)
     sharper = _sharp_enough(system, diagnosis.after)
     if sharper is system:
@@ -192,18 +193,13 @@ def _aimed(system: EquationSystem, values: Mapping[str, float]) -> EquationSyste
     return replace(system, aims={n: v for _, aims in best.values() for n, v in aims.items()})
 
 
-def _leading(system: EquationSystem, values: Values, names: Collection[str]) -> dict[frozenset[str], Values]:
-    """Those with which, over growing windows, the model follows the data to their end, and where; the best first."""
-    ways = {name: led(replace(system, promoted=(name,)), dict(values)) for name in names}
-    whole = {frozenset([name]): way.values for name, way in ways.items() if way.whole}
-    return dict(sorted(whole.items(), key=lambda item: misfit(system, dict(item[1]))))
-
-
-def _lost_soon(start: Start, leading: Sequence[str]) -> str:
-    text = f"the model loses the data after {start.followed:.2g} s, less than a turn"
-    if leading:
-        return f"{text}; with {' or '.join(leading)} it follows them to their end: {leading[0]} does so best"
-    return f"{text}: sizes of terms mean little"
+def _leading(
+    system: EquationSystem, values: Values, terms: Collection[tuple[str, ...]]
+) -> dict[frozenset[str], dict[str, float]]:
+    """Those with which, over longer and longer stretches, the model follows the data to their end; the best first."""
+    ways = {frozenset(names): led(replace(system, promoted=names), values) for names in terms}
+    whole = {names: way.values for names, way in ways.items() if way.whole}
+    return dict(sorted(whole.items(), key=lambda item: misfit(system, item[1])))
 
 
 def _prepared(system: EquationSystem) -> tuple[EquationSystem, dict[str, float]]:
@@ -287,38 +283,6 @@ def redundant(system: EquationSystem, values: Mapping[str, float]) -> tuple[str,
     return tuple(sorted(weak))
 
 
-def _in_stretches(
-    system: EquationSystem, values: Mapping[str, float], length: float
-) -> tuple[EquationSystem, dict[str, float], str]:
-    """The runs cut where the model loses them, each stretch with a start of its own."""
-    durations = [float(s.time[-1] - s.time[0]) for s in system.stretches]
-    pieces = cut(system.stretches, [max(1, int(np.ceil(d / length * (1 - 1e-9)))) for d in durations])
-    chosen = spread(pieces, len(system.formulas.states), at_least=len(system.stretches))
-    system = replace(system, stretches=chosen)
-    shared = {q.name: values[q.name] for q in system.base if not q.is_initial}
-    guesses, _ = guessed(system)
-    start = led(system, shared | guesses)
-    text = f"runs are taken in {len(pieces)} stretches of {length:.3g} s with an initial state each"
-    if len(chosen) < len(pieces):
-        text += f", of which {len(chosen)} spread over the runs are used"
-    return system, start.values, text
-
-
-def _joined(
-    system: EquationSystem, samples: Sequence[Samples], diagnosis: Diagnosis, settings: Settings
-) -> tuple[EquationSystem, Diagnosis, str]:
-    """With what was found in the stretches, does the model follow the whole runs? Then they are judged whole."""
-    names = tuple(f.candidate.name for f in diagnosis.found)
-    whole = replace(system, stretches=samples, promoted=names)
-    # a run's first stretch begins where the run does, under the same name
-    start = led(whole, guessed(whole)[0] | diagnosis.after.values)
-    if not start.whole:
-        return system, diagnosis, f"with it the model follows {start.followed:.3g} s of {start.duration:.3g} s"
-    plain = replace(_sized(whole, start.values), promoted=())
-    joined, again = _searched(plain, start.values, settings, {frozenset(names): start.values})
-    return joined, again, "with what was found the model follows the whole runs, and they are judged whole"
-
-
 def _with_memory(system: EquationSystem, diagnosis: Diagnosis, settings: Settings) -> tuple[Diagnosis, bool, list[str]]:
     """Search again with noise that remembers, where what is left of the best model does and is as small as noise.
 
@@ -384,6 +348,11 @@ def _not_followed(system: EquationSystem, values: Mapping[str, float]) -> str:
     what = "is nothing like the data"
     if not np.isfinite(lost):
         what = "has no value somewhere on the way (the root of a negative number, a division by zero, no end of growth)"
+    elif not np.isfinite(system.linearise(values, [q.name for q in system.base])[1]).all():
+        return (
+            "the motion can be followed, but not how it depends on its parameters: so it is where equations jump, as "
+            "at a stiff contact. Write the contact wider, or cut the data into runs without it."
+        )
     guess = ", ".join(f"{k.partition('.')[2]} = {v:.4g}" for k, v in list(values.items())[:4] if k.startswith("state."))
     return (
         f"the model does not follow the data even over a short time (residual over {LOST:.0%} of the signal): "

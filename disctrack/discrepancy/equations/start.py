@@ -1,7 +1,8 @@
-"""Where a fit begins: states read off the data, then windows that grow as far as the model follows the motion.
+"""Where a fit begins: in short stretches with a start each, joined two by two as far as the model follows the motion.
 
-Over many turns of an oscillation chi-square has many minima; over half a turn it has one. A fit that begins there and
-is led to longer and longer windows stays in it, for as long as the model can follow at all.
+Over many turns of an oscillation chi-square has many minima; over a fifth of one it has one, and all stretches together
+tell what the whole tells. A fit that begins there and is led to longer and longer stretches (multiple shooting, Bock
+1981) stays in it, for as long as the model can follow at all.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,18 +16,16 @@ from calibration.kit.arrays import Array
 from disctrack.discrepancy.elimination import prior_rows
 from disctrack.discrepancy.equations.declared import Samples
 from disctrack.discrepancy.equations.formulas import Formulas
-from disctrack.discrepancy.equations.system import EquationSystem, first_part, spread
+from disctrack.discrepancy.equations.system import MOST_STATES, EquationSystem, cut
 from disctrack.discrepancy.fit import TRIAL, fit
 from disctrack.discrepancy.search import AGREES
-from disctrack.discrepancy.system import Quantity, System
+from disctrack.discrepancy.system import Quantity, System, Values
 
-GROWTH = 1.7  # of the window from fit to fit: a phase that is right over it is right to a radian over the next
+FEWEST, SHORT = 10, 0.2  # samples, and share of a turn, of a short stretch: over it a step by any law is nearly linear
 LOST = 0.3  # rms of the residual over that of the signal, from which on the model no longer follows the motion
-LOOSE = 0.6  # the same where growing windows follow for less than a turn: most of the motion is still that of the model
-_LEASH = 0.3  # relative change of a parameter from window to window, of which none is surprised
-_FAR = 1.0  # relative change of a parameter from its declared value, which is said to be right to some 30 %
+LOOSE = 0.6  # the same where it is not followed in short stretches: most of it is still that of the model
 _WINDOWS = (8, 12, 18, 27, 40, 60, 90, 135, 200)  # samples of the local polynomial
-_ATTEMPTS = 100  # steps of a fit to all data at once
+_ATTEMPTS = 100  # steps within regions of trust
 _NOWHERE = 1e8  # residual of what has no value
 _INSTANTS = 24  # at which the sizes of the states are looked at
 
@@ -75,7 +74,7 @@ def states_from_data(formulas: Formulas, s: Samples, p: Array, first: int, begin
     # first what is shown: slopes have other solutions besides, and are those of parameters not yet fitted
     for slopes in (0.0, 0.1):
         scale = np.maximum(np.abs(begin), 1e-3)
-        begin = np.asarray(least_squares(misfit, begin, max_nfev=60, x_scale=scale, args=(slopes,)).x, float)
+        begin = np.asarray(least_squares(misfit, begin, method="lm", x_scale=scale, args=(slopes,)).x, float)
     return begin
 
 
@@ -141,14 +140,15 @@ def sizes_alike(system: EquationSystem, values: Mapping[str, float]) -> dict[str
 class Start:
     """Values from which Gauss-Newton converges, as far as the model follows the motion."""
 
+    system: EquationSystem  # in stretches over which it does so safely
     values: dict[str, float]
-    followed: float  # [s] from the start of a stretch
-    duration: float  # [s] of the longest stretch
+    followed: float  # [s] of the longest stretch over which it does
+    whole: bool = False  # does it follow all runs to their end?
 
-    @property
-    def whole(self) -> bool:
-        """True where the model follows all stretches to their end."""
-        return self.followed >= self.duration * (1 - 1e-9)
+
+def lasting(system: EquationSystem) -> float:
+    """Duration [s] of the longest stretch."""
+    return max(float(s.time[-1] - s.time[0]) for s in system.stretches)
 
 
 def misfit(system: EquationSystem, values: dict[str, float]) -> float:
@@ -166,64 +166,64 @@ def misfits(system: EquationSystem, values: dict[str, float]) -> Array:
         if found is None:
             return np.full_like(size, np.inf)
         noise = np.where(np.isfinite(s.data), s.sigma**2, 0.0).sum(axis=0)
+        present = np.maximum(np.isfinite(s.data).sum(axis=0), 1)
         square += np.maximum(np.nansum((s.data - found.seen) ** 2, axis=0) - AGREES * noise, 0.0)
-        size += np.nansum((s.data - np.nanmean(s.data, axis=0)) ** 2, axis=0) + noise
+        size += np.nansum((s.data - np.nansum(s.data, axis=0) / present) ** 2, axis=0) + noise
     return np.asarray(np.sqrt(square / np.maximum(size, 1e-300)), float)
 
 
-def led(system: EquationSystem, values: dict[str, float]) -> Start:
-    """Fit over windows that grow from half a turn to the whole, or until the model loses the motion."""
-    duration = max(float(s.time[-1] - s.time[0]) for s in system.stretches)
-    window = max(0.5 * min(turn(s) for s in system.stretches), duration / 4000)
-    found = _led(system, values, window, duration)
-    shortest = 12 * max(float(np.median(np.diff(s.time))) for s in system.stretches)
-    while found.followed == 0.0 and window > shortest:
-        # what turns and drifts, or is chaotic, has no half turn: begin with less
-        window = max(0.25 * window, shortest)
-        found = _led(system, values, window, duration)
-    return _not_astray(system, values, found)
+def cut_short(system: EquationSystem, share: float = SHORT, most: float = np.inf) -> list[EquationSystem]:
+    """The stretches cut into shares of a turn, and these joined two by two until they are whole again.
 
-
-def _not_astray(system: EquationSystem, declared: dict[str, float], found: Start) -> Start:
-    """What growing windows lead to, or what all data at once do where that describes them better.
-
-    The first part of a motion may not tell parameters apart that the whole does (a motor that runs up), and a model
-    that lacks something then takes them far away.
+    most : stretches that are used, evenly over the runs, where longer ones begin; of each run one at least
     """
-    parameters = [q for q in system.base if not q.is_initial]
-    shift = [abs(found.values.get(q.name, q.null) - q.null) / max(abs(q.null), q.scale) for q in parameters]
-    if found.whole and max(shift, default=0.0) < _FAR:
-        return found
-    enough = LOST if found.followed >= min(turn(s) for s in system.stretches) else LOOSE
-    led_to = misfit(system, found.values)
-    if not found.whole and max(shift, default=0.0) >= _FAR:  # what led so far off and then lost the motion is no start
-        found = replace(found, values=found.values | {q.name: declared.get(q.name, q.null) for q in parameters})
-    tied = [near_declared(q) for q in system.base]
-    attempts = [lambda: fit(system, tied, declared, max_iterations=30).values]
-    if not system.promoted:  # for one term after the other it would take too long
-        attempts.append(lambda: at_once(system, declared))
-    for attempt in attempts:
-        values = declared | attempt()
-        left = misfits(system, values)
-        # of several sensors one may show little but what is missing: most of the motion is followed all the same
-        mostly = found.followed == 0.0 and len(left) > 2 and np.median(left) < LOST
-        if mostly or np.max(left) < min(led_to, enough):
-            return Start(values, found.duration, found.duration)
-    return found
+    rows = [max(FEWEST, int(share * turn(s) / (s.time[-1] - s.time[0]) * len(s.time))) for s in system.stretches]
+    found: list[EquationSystem] = []
+    every = 0
+    while True:
+        parts = [cut(s, n) for s, n in zip(system.stretches, rows, strict=True)]
+        if (count := sum(map(len, parts))) == len(parts):
+            return [*found, system]
+        every = max(1, every // 2 if every else 2 ** int(np.ceil(np.log2(max(count / most, 1.0)))))
+        found.append(replace(system, stretches=[part for some in parts for part in some[::every]]))
+        rows = [2 * n for n in rows]
+
+
+def led(system: EquationSystem, values: Values) -> Start:
+    """Fit to short stretches that are joined two by two to the whole, or until the model loses the motion."""
+    most = MOST_STATES / len(system.formulas.states)
+    for share in (SHORT, SHORT / 4):  # what turns and drifts, or is chaotic, may be followed for less
+        found = _led(cut_short(system, share, most), values)
+        if found.followed > 0.0:
+            return found
+    # short stretches do not tell a state that no sensor shows, as a known start of the whole may
+    at_once = trusted(system, [near_declared(q) for q in system.base], guessed(system)[0] | dict(values))
+    # one of several sensors may show little but what is missing
+    followed = lasting(system) if np.median(misfits(system, at_once)) <= LOOSE else 0.0
+    return Start(system, at_once, followed, followed > 0.0)
+
+
+def _led(systems: Sequence[EquationSystem], values: Values) -> Start:
+    now = dict(values) | guessed(systems[0])[0]
+    now |= fit(systems[0], [q for q in systems[0].base if q.is_initial], now, TRIAL).values
+    reached: list[tuple[EquationSystem, dict[str, float]]] = []
+    for part in systems:
+        trial = now | fit(part, [near_declared(q) for q in part.base], now, TRIAL).values
+        if not misfit(part, trial) <= LOST:
+            break
+        now = trial  # a longer stretch begins where the first of those does that it is made of
+        reached.append((part, now))
+    if not reached:
+        return Start(systems[0], trial, 0.0)
+    whole = len(reached) == len(systems)
+    # near the end of what it can follow chi-square is full of minima: half of that is safe
+    chosen, values = reached[-1 if whole else max(len(reached) - 2, 0)]
+    return Start(chosen, values, lasting(reached[-1][0]), whole)
 
 
 def near_declared(q: Quantity) -> Quantity:
     """Of a parameter that the data may not tell, one that stays near; of a term's number zero is the absence."""
     return q if q.declared is None else replace(q, prior_sigma=min(q.prior_sigma, max(abs(q.null), q.scale)))
-
-
-def at_once(system: EquationSystem, declared: Mapping[str, float]) -> dict[str, float]:
-    """All quantities fitted to all data (`trusted`). Of many runs some tell what all share, and the others follow."""
-    some = replace(system, stretches=spread(system.stretches, len(system.formulas.states)))
-    values = trusted(some, some.base, declared)
-    if len(some.stretches) < len(system.stretches):
-        values |= fit(system, [q for q in system.base if q.slot], values, max_iterations=TRIAL).values
-    return values
 
 
 def trusted(system: System, quantities: Sequence[Quantity], declared: Mapping[str, float]) -> dict[str, float]:
@@ -258,29 +258,3 @@ def trusted(system: System, quantities: Sequence[Quantity], declared: Mapping[st
         lambda x: -np.nan_to_num(both(x)[1]), bounds=(lower, upper), x_scale=size, max_nfev=_ATTEMPTS,
     )  # fmt: skip
     return dict(declared) | dict(zip(names, found.x.tolist(), strict=True))
-
-
-def _led(system: EquationSystem, values: dict[str, float], window: float, duration: float) -> Start:
-    values, followed, last = dict(values), 0.0, False
-    states = [q for q in system.base if q.is_initial]
-    while not last:
-        last = window >= duration
-        part = replace(system, stretches=first_part(system.stretches, duration if last else window))
-        if followed == 0.0:
-            values |= fit(part, states, values, max_iterations=TRIAL).values
-        tied = [q if q.is_initial else _near_last(q, values) for q in system.base]
-        trial = values | fit(part, tied, values, max_iterations=TRIAL).values
-        lost = misfit(part, trial)
-        if lost > LOST and followed > 0.0:
-            break
-        values = trial
-        if lost <= LOST:
-            followed = min(window, duration)
-        window *= GROWTH
-    return Start(values, followed, duration)
-
-
-def _near_last(q: Quantity, values: dict[str, float]) -> Quantity:
-    """The quantity with a prior about where the last window left it: one that a short window does not tell stays."""
-    value = values.get(q.name, q.null)
-    return replace(q, null=value, prior_sigma=min(q.prior_sigma, _LEASH * max(abs(q.null), q.scale, abs(value))))

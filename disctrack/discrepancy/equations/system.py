@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations, pairwise
@@ -27,7 +26,6 @@ OF_ONE = 0.1  # ... and share of it, that one hypothesis among many may take
 LARGE = 5.0  # times all that moves the motion: terms each so large that their sum may be what describes it
 MOST_STATES = 80  # initial states that are fitted along where others would tell no more that is new
 EACH = "*"  # in the place of a stretch: each has a number of its own
-FEWEST = 4  # samples of a stretch
 
 
 @dataclass(frozen=True)
@@ -297,29 +295,14 @@ def fitted_rows(s: Samples) -> Mask:
     return np.asarray(s.time - s.time[0] <= TRAIN_FRACTION * (s.time[-1] - s.time[0]), bool)
 
 
-def cut(samples: Sequence[Samples], counts: Sequence[int]) -> list[Samples]:
-    """Every stretch in so many of equal lengths."""
-    found, numbers = [], Counter[str]()
-    for s, count in zip(samples, counts, strict=True):
-        edges = np.searchsorted(s.time, s.time[0] + (s.time[-1] - s.time[0]) * np.arange(count + 1) / count)
-        edges[-1] = len(s.time)
-        for a, b in pairwise(edges.tolist()):
-            if b - a >= FEWEST:
-                found.append(s.part(a, b, numbers[s.run]))
-            numbers[s.run] += 1
-    return found
+def cut(s: Samples, rows: int) -> list[Samples]:
+    """A stretch in parts that begin with data and have so many of them, the last one up to twice as many."""
+    present = np.flatnonzero(np.isfinite(s.data).any(axis=1))
+    edges = [0, *present[rows : len(present) - rows + 1 : rows].tolist(), len(s.time)]
+    return [s.part(a, b) for a, b in pairwise(edges)]
 
 
-def spread(samples: Sequence[Samples], n_states: int, at_least: int = 1) -> list[Samples]:
-    """As many stretches as have MOST_STATES initial states together, evenly from first to last; or at least so many."""
-    most = max(at_least, MOST_STATES // n_states)
-    return [samples[i] for i in np.unique(np.linspace(0, len(samples) - 1, min(most, len(samples))).astype(int))]
-
-
-def first_part(samples: Sequence[Samples], duration: float) -> list[Samples]:
-    """Every stretch, no further than `duration` [s] from its start, but 8 samples at least."""
-    found = []
-    for s in samples:
-        n = max(8, int(np.searchsorted(s.time, s.time[0] + duration, side="right")))
-        found.append(replace(s, time=s.time[:n], data=s.data[:n], sigma=s.sigma[:n]))
-    return found
+def spread(samples: Sequence[Samples], n_states: int) -> list[Samples]:
+    """As many stretches as have MOST_STATES initial states together, evenly from first to last."""
+    rows = np.linspace(0, len(samples) - 1, min(max(1, MOST_STATES // n_states), len(samples)))
+    return [samples[i] for i in np.unique(rows.astype(int))]
