@@ -62,7 +62,7 @@ def stereo_covariance(refinement: Refinement, common: Array | None = None) -> Ar
     """
     problem = refinement.problem
     s1, views = problem.stereo_basis.shape[1], len(np.unique(problem.observations.view))
-    shift, spread, inverse, by_common = refinement.normal.shifts(s1, common)
+    shift, spread, inverse, scale = refinement.normal.shifts(s1, common)
     expected = inverse.T @ spread @ inverse
     values, vectors = np.linalg.eigh(expected)
     root = vectors * np.sqrt(np.maximum(values, 1e-12 * values.max()))  # expected = root root^T
@@ -74,9 +74,9 @@ def stereo_covariance(refinement: Refinement, common: Array | None = None) -> Ar
     factor, directions = np.linalg.eigh(kept * seen + (1 - kept) * mean * np.eye(s1))
     least = np.exp(np.mean(np.log(np.maximum(factor, 1e-12 * mean))))
     beyond = root @ directions * np.sqrt(np.maximum(np.maximum(factor, least) - 1.0, 0.0))
+    by_common = 0.0 if common is None else inverse.T @ (common.sum(0) * scale[:, None] * scale) @ inverse
     at_minimum = inverse[:s1] + by_common
     share = s1 / max(float(np.trace(np.linalg.solve(at_minimum, expected))), 1e-12)  # noise moves fewer than all
-    scale = 1.0 / np.sqrt(np.diag(refinement.normal.eliminated()[0]))
     by_prior = np.zeros((s1, s1))
     if problem.prior is not None:  # it was weighted as if it were one of views that disagree as much
         told = max(problem.prior.weight - 1.0, 0.0) * refinement.normal.prior * scale[:, None] * scale

@@ -100,8 +100,7 @@ class Normal:
         E[g_b g_b^T] = H_b - H_b H^-1 H_b. The prior is no block, and part of H alone.
 
         common : (n, s, s) covariance of what else the blocks' gradients contain, apart from their data's noise
-        returns : shifts (n, first), the sum of the expected g_b g_b^T (s, s), H^-1 (s, first), and the covariance
-            (first, first) by `common`
+        returns : shifts (n, first), the sum of the expected g_b g_b^T (s, s), H^-1 (s, first), and the scale (s,)
         """
         carried, own = self.carried()
         information = self.shared - self.cross @ carried  # own numbers eliminated
@@ -112,14 +111,12 @@ class Normal:
         inverse = np.linalg.inv(total * scale[:, None] * scale)
         expected = (information - information @ inverse @ information).sum(0)
         covariance: Array = inverse[:, :first]
-        by_common = np.zeros((first, first))
         if common is not None:
             common = common * scale[:, None] * scale
             total, part = common.sum(0), information @ inverse
             left = common - part @ common - np.swapaxes(part @ common, 1, 2)
             expected = expected + (left + part @ total @ np.swapaxes(part, 1, 2)).sum(0)
-            by_common = covariance.T @ total @ covariance
-        return gradient @ covariance, expected, covariance, by_common
+        return gradient @ covariance, expected, covariance, scale
 
     def disagreement(self, first: int) -> float:
         """Variance of the `first` shared numbers as the blocks disagree about them, over what noise predicts."""
