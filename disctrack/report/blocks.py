@@ -26,7 +26,7 @@ class Markup(str):
 
 @dataclass(frozen=True)
 class Facts:
-    """Named numbers and short answers, one below the other."""
+    """Named numbers and short answers, one below the other; a row without a name belongs to the one above it."""
 
     rows: Sequence[tuple[str, Cell]]
 
@@ -133,7 +133,10 @@ def _block(block: Any) -> dict[str, Any] | None:
     if is_empty(block) or isinstance(block, (Figures, Markup)):
         return None
     if isinstance(block, Facts):
-        return {"facts": {name: _cell(value) for name, value in block.rows}}
+        facts: dict[str, list[object]] = {}
+        for name, value in block.rows:
+            facts.setdefault(name or next(reversed(facts), ""), []).append(_cell(value))
+        return {"facts": {name: told if len(told) > 1 else told[0] for name, told in facts.items()}}
     if isinstance(block, Listing):
         rows = [[_cell(cell) for cell in row] for row in block.rows]
         return {"caption": block.caption or block.folded, "header": list(block.header), "rows": rows}

@@ -12,7 +12,7 @@ from disctrack.discrepancy.equations.declared import Equations, Run, Samples, Te
 from disctrack.discrepancy.equations.formulas import Formulas
 from disctrack.discrepancy.equations.law import LearnedForce, learn, with_law
 from disctrack.discrepancy.equations.start import LOST, guessed, lasting, led, misfit, sizes_alike, trusted, turn
-from disctrack.discrepancy.equations.system import EquationSystem, fitted_rows, spread
+from disctrack.discrepancy.equations.system import MOST_STATES, EquationSystem, fitted_rows
 from disctrack.discrepancy.fit import Fit, fit, no_fit
 from disctrack.discrepancy.noise import (
     autoregression,
@@ -260,7 +260,8 @@ def _sized(system: EquationSystem, values: Mapping[str, float]) -> EquationSyste
 def redundant(system: EquationSystem, values: Mapping[str, float]) -> tuple[str, ...]:
     """Parameters that the data cannot part from others, to be held as declared."""
     # of many runs with numbers of their own a few tell it
-    system = replace(system, stretches=spread(system.stretches, len(system.formulas.states)))
+    every = -(-len(system.stretches) * len(system.formulas.states) // MOST_STATES)
+    system = replace(system, stretches=system.stretches[::every])
     states = [q for q in system.base if q.is_initial]
     free = [q for q in system.base if not q.is_initial and np.isinf(q.prior_sigma)]
     if len(free) < 2:

@@ -300,9 +300,3 @@ def cut(s: Samples, rows: int) -> list[Samples]:
     present = np.flatnonzero(np.isfinite(s.data).any(axis=1))
     edges = [0, *present[rows : len(present) - rows + 1 : rows].tolist(), len(s.time)]
     return [s.part(a, b) for a, b in pairwise(edges)]
-
-
-def spread(samples: Sequence[Samples], n_states: int) -> list[Samples]:
-    """As many stretches as have MOST_STATES initial states together, evenly from first to last."""
-    rows = np.linspace(0, len(samples) - 1, min(max(1, MOST_STATES // n_states), len(samples)))
-    return [samples[i] for i in np.unique(rows.astype(int))]

@@ -50,7 +50,9 @@ CHANGED = Measured(6.004e-5, 2.1e-7, "m")
 def report(**more):
     blocks = [
         "All of it.",
-        Section("Numbers", [Listing(("a", "b"), [("x", CHANGED)], "A table"), Facts([("length", CHANGED)])]),
+        Section(
+            "Numbers", [Listing(("a", "b"), [("x", CHANGED)], "A table"), Facts([("length", CHANGED), ("", "twice")])]
+        ),
         Section("Nothing", [Listing(("a",), ()), []]),
     ]
     return Report(**{"title": "t", "verdict": "Something is missing.", "accuracy": "σ 1 µm", "blocks": blocks} | more)
@@ -84,6 +86,7 @@ def test_nothing_to_show_leaves_no_empty_frame():
 def test_every_writer_shows_the_same_number():
     kept = json.loads(json_text(document(report())))
     assert kept["blocks"][1]["blocks"][0]["rows"] == [["x", {"value": 6.004e-5, "sigma": 2.1e-7, "unit": "m"}]]
+    assert kept["blocks"][1]["blocks"][1]["facts"]["length"][1] == "twice"  # what goes on without a name is not lost
     assert "60.04 ± 0.21 µm" in page(report(), {})
     assert any(line.split() == ["x", "60.04", "±", "0.21", "µm"] for line in full(report()))
 
