@@ -34,7 +34,7 @@ from disctrack.track.judge.disc_not_seen import MEETING_PX, why_not_seen
 from disctrack.track.judge.doubts import MOVED
 from disctrack.track.pose import marker_pixels
 from disctrack.track.refine.assembly import Measurement, Taken, TrackingSettings, assemble
-from disctrack.track.side_by_side import FEW, evenly, stretches
+from disctrack.track.side_by_side import evenly
 from disctrack.trajectory import FrameStatus, MarkerStatus
 
 SHORTEST_SPLIT = 1000  # pairs; a stretch must outweigh its own search for the disc, and measuring blur and noise
@@ -42,7 +42,7 @@ SHORTEST_SPLIT = 1000  # pairs; a stretch must outweigh its own search for the d
 # wrong that templates are made for: places 0.1 mm off, rms, shift centres by 0.3e-3 to 2e-3 px, in all frames alike.
 LOOK_AGAIN = 60e-6
 DECLARED = (Kind.DOTS_MISPLACED, Kind.TABLE_DISAGREES)  # of numbers, not of images
-PAIRED = 60  # frames whose images are paired anew, after some without dots of both cameras
+APART, PAIRED = 10, 60  # frames without dots of both cameras, from which on others are paired; of so many
 PAIRS_TRIED = 12  # for pixels that do not see, and for what is wrong where no disc is found
 MAX_EDGE_TURN = np.radians(25.0)  # by which the poses on both sides of an edge may miss each other's prediction
 
@@ -124,7 +124,7 @@ def _check_dots(disc: Disc) -> None:
 def _slips(tracking: Measurement, read_blocks: ReadBlocks, pairs: range, begin: Follower) -> tuple[Finding, ...]:
     """Images left out by one camera, by the pairing that fits the frames after it."""
     apart = _apart(tracking) | (max(tracking.details["systematic_px"]) > MEETING_PX / 2)
-    begun = stretches(apart, FEW)[:, 0]
+    begun = np.flatnonzero(np.convolve(apart, np.ones(APART), "valid") == APART)
     if not begun.size or Kind.DELAY in {finding.kind for finding in tracking.trajectory.findings}:
         return ()
     first, start = int(begun[0]), pairs[begun[0]]
