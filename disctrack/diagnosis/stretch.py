@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 from calibration.kit.arrays import Array, Mask
 from disctrack.errors import AnalysisError
 from disctrack.frames import rotation_from_euler, vector_from_rotation
+from disctrack.track.side_by_side import stretches
 from disctrack.trajectory import Trajectory
 
 Rows = NDArray[np.int64]
@@ -35,7 +36,7 @@ def free_stretch(trajectory: Trajectory, start: float = -np.inf) -> tuple[slice,
     measured = np.flatnonzero(trajectory.measured)
     time, flat = trajectory.time[measured], trajectory.q[measured, 4] < MIN_THETA
     why = np.select([flat, at_rest(trajectory, measured), time < start], OTHERWISE, "")
-    first, last = _longest(why == "")
+    first, last = max(stretches(why == "").tolist(), key=lambda run: run[1] - run[0], default=(0, 0))
     if first > 0 and why[first - 1] == HELD:
         first = int(np.searchsorted(time, time[first - 1] + HAND))
     if last < len(measured) and why[last] == HELD:
@@ -77,16 +78,6 @@ def at_rest(trajectory: Trajectory, measured: Rows) -> Mask:
     # a single step may look like a rest where the noise is large; a rest lasts
     lasting = still & (np.append(still[1:], still[-1]) | np.insert(still[:-1], 0, still[0]))
     return np.asarray(np.append(lasting, False) | np.insert(lasting, 0, False), bool)
-
-
-def _longest(good: Mask) -> tuple[int, int]:
-    """Longest run of True as [first, last); (0, 0) where there is none."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], good.astype(np.int8), [0]])))
-    if edges.size == 0:
-        return 0, 0
-    starts, ends = edges[::2], edges[1::2]
-    i = int(np.argmax(ends - starts))
-    return int(starts[i]), int(ends[i])
 
 
 def _dense_start(time: Array, first: int) -> int:
