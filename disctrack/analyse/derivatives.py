@@ -9,9 +9,8 @@ acceleration in world axes. Euler rates are then read off the angular velocity, 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,9 +42,6 @@ MIN_FRAMES = 12  # a line and a curvature per channel, and enough left over to j
 # Of the image's longer side: what repeats is as smooth as half a cell of the splines that have taken out the lens
 SYSTEMATIC_LENGTH = 0.1
 KNOWN_FRACTION = 0.25  # of the process' own variance of the first derivative: above it the samples say too little
-
-
-Stretch = TypeVar("Stretch", Trajectory, "MeasuredMotion")
 
 
 @dataclass(frozen=True, repr=False)
@@ -144,26 +140,31 @@ def differentiate(trajectory: Trajectory, breaks: Sequence[float] = ()) -> Measu
     time = np.asarray(trajectory.time, float)
     good = trajectory.measured & np.isfinite(trajectory.pose_covariance).all(axis=(1, 2))
     _require_samples(time, good)
-    pieces = [_differentiated(part(trajectory, rows), good[rows]) for rows in _between(breaks, time, good)]
-    if len(pieces) == 1:
-        return pieces[0]
-    scales, sizes = [piece.noise_scale for piece in pieces], [len(piece) for piece in pieces]
-    return replace(
-        joined(pieces),
+    pieces = _between(breaks, time, good)
+    found = (_differentiated(part(trajectory, rows), good[rows]) for rows in pieces)
+    *of_frames, scales = zip(*found, strict=True)
+    state, R, euler, covariance, sensitivity, length = map(np.concatenate, of_frames)
+    velocity, acceleration = state[:, 1], state[:, 2]
+    return MeasuredMotion(
+        position=state[:, 0, :3],
+        R_world_body=R,
+        velocity=velocity[:, :3],
+        omega_world=velocity[:, 3:],
+        acceleration=acceleration[:, :3],
+        alpha_world=acceleration[:, 3:],
+        time=time,
+        covariance=covariance,
+        calibration_sensitivity=sensitivity,
+        measured=good,
+        euler=euler,
+        length=length,
+        noise_scale=np.average(scales, axis=0, weights=[(rows.stop - rows.start) / len(time) for rows in pieces]),
+        disc=trajectory.disc,
+        gravity=trajectory.gravity,
         rig_covariance=trajectory.rig.covariance,
-        noise_scale=np.average(scales, axis=0, weights=sizes),
+        systematic_covariance=_filled(trajectory.systematic_covariance, good, 0.0),
         systematic_pace=_pace(trajectory),
     )
-
-
-def joined(pieces: Sequence[Stretch]) -> Stretch:
-    """Successive stretches of one recording as one: with the rows of all, and all else as the first has it."""
-    rows: dict[str, Any] = {
-        name: np.concatenate([getattr(piece, name) for piece in pieces])
-        for name, value in vars(pieces[0]).items()
-        if isinstance(value, np.ndarray) and len(value) == len(pieces[0])
-    }
-    return replace(pieces[0], **rows)
 
 
 def _between(breaks: Sequence[float], time: Array, good: Mask) -> list[slice]:
@@ -175,8 +176,11 @@ def _between(breaks: Sequence[float], time: Array, good: Mask) -> list[slice]:
     return [slice(*ends) for ends in pairwise([*starts, len(time)])]
 
 
-def _differentiated(trajectory: Trajectory, good: Mask) -> MeasuredMotion:
-    """Without breaks. good : (n,) frames with a pose"""
+def _differentiated(trajectory: Trajectory, good: Mask) -> tuple[Array, ...]:
+    """Of frames without a break: state (n, 3 orders, 6), R, Euler angles, covariance, sensitivity, length, noise scale.
+
+    good : (n,) frames with a pose
+    """
     samples = _Samples(trajectory, good)
     segments, centres = _segments(samples)
     groups = ([(t, d[channels], v[channels]) for t, d, v in segments] for channels in CHANNELS.values())
@@ -188,26 +192,9 @@ def _differentiated(trajectory: Trajectory, good: Mask) -> MeasuredMotion:
     covariance *= np.outer(scale, scale)
     sensitivity *= scale[:, None]
     _rates_of_turned_frame(sensitivity, state[:, 1, 3:], state[:, 2, 3:])
-    return MeasuredMotion(
-        time=np.asarray(trajectory.time, float),
-        position=state[:, 0, :3],
-        R_world_body=R,
-        velocity=state[:, 1, :3],
-        omega_world=state[:, 1, 3:],
-        acceleration=state[:, 2, :3],
-        alpha_world=state[:, 2, 3:],
-        covariance=covariance,
-        calibration_sensitivity=sensitivity,
-        measured=good,
-        euler=_euler_near(R, trajectory.q[:, 3:]),
-        length=np.stack([p.length for p in processes], axis=1) * samples.interval,
-        noise_scale=np.array([p.noise_scale for p in processes]),
-        disc=trajectory.disc,
-        gravity=trajectory.gravity,
-        rig_covariance=trajectory.rig.covariance,
-        systematic_covariance=_filled(trajectory.systematic_covariance, good, 0.0),
-        systematic_pace=_pace(trajectory),
-    )
+    length = np.stack([p.length for p in processes], axis=1) * samples.interval
+    noise_scale = np.array([p.noise_scale for p in processes])
+    return state, R, _euler_near(R, trajectory.q[:, 3:]), covariance, sensitivity, length, noise_scale
 
 
 def _filled(matrices: Array, good: Mask, otherwise: float) -> Array:

@@ -21,6 +21,7 @@ from disctrack.findings import carried
 from disctrack.frames import euler_jacobian
 from disctrack.report.blocks import Report
 from disctrack.report.html import write_page
+from disctrack.trajectory import among
 from disctrack.trajectory.file import Group, read_group, read_provenance, read_trajectory, trajectory_in, write_groups
 from disctrack.trajectory.reuse import origin_of, refuse_other, remember
 
@@ -89,13 +90,10 @@ def write_analysis(path: Path, analysis: Analysis) -> None:
 
     def whole(variables: dict[str, Variable]) -> dict[str, Variable]:
         """Those of the frames from `first` on as those of all frames of the file."""
-        found = {}
-        for name, item in variables.items():
-            data = np.asarray(item.data)
-            of_all = np.full((len(file_time), *data.shape[1:]), np.nan if data.dtype.kind == "f" else 0, data.dtype)
-            of_all[first : first + len(data)] = data
-            found[name] = replace(item, data=of_all)
-        return found
+        return {
+            name: replace(item, data=among(len(file_time), first, np.asarray(item.data)))
+            for name, item in variables.items()
+        }
 
     onset, circle, energy = analysis.onset, analysis.circle, analysis.energy
     derived = {group: [analysis.series(name) for name, *_ in rows] for group, rows in QUANTITIES.items()}

@@ -16,7 +16,6 @@ from calibration import CalibrationSettings, StereoCalibration, StereoRig
 from calibration.kit.arrays import evenly
 from calibration.rig_file import record_of
 from disctrack.analyse.declaration import Boards, across, contradictions, lost_pairs, turned_board, with_square
-from disctrack.analyse.derivatives import joined
 from disctrack.calibrate.stage import boards_in, boards_of, given_rig, noticed_in, source_of
 from disctrack.errors import DiscTrackError, RecordingError
 from disctrack.findings import (
@@ -35,7 +34,7 @@ from disctrack.report.blocks import Facts, Report, Section
 from disctrack.track.follow.tracking import Measurement, Taken, TrackingSettings, track
 from disctrack.track.measurement import ImagePairs, check_rig, exposures, images_lost, open_pairs
 from disctrack.track.run_summary import left_out, sigma_text
-from disctrack.trajectory import Trajectory
+from disctrack.trajectory import Trajectory, joined
 
 KEYS_EXPLAINED = Path(__file__).resolve().parents[1] / "docs" / "recording-toml.md"  # it is installed with the package
 VIEWS_LOOKED_AT = 12  # of the chessboard: half of what a good rig takes

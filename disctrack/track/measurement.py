@@ -42,7 +42,7 @@ from disctrack.track.follow.tracking import (
     stretch_edges,
     track,
 )
-from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
+from disctrack.trajectory import FrameStatus, at_full_length
 from disctrack.trajectory.file import Provenance
 
 Progress = Callable[[int], None]
@@ -326,30 +326,6 @@ def _span(pairs: ImagePairs, frame_rate: float, settings: TrackingSettings) -> M
     if not (pairs.left.random_access and pairs.right.random_access):
         return MotionSpan(pairs.start, pairs.stop, 0, "every frame: these files can only be read in order")
     return find_motion(pairs.left, pairs.right, pairs.start, pairs.stop, frame_rate)
-
-
-_FILL = {"frame_status": FrameStatus.NOT_PROCESSED, "marker_status": MarkerStatus.NOT_LOOKED_FOR}
-
-
-def at_full_length(part: Trajectory, n: int, start: int, timestamps: Array | None = None) -> Trajectory:
-    """The trajectory of frames start.. as one of all n frames; the others are NaN with the status NOT_PROCESSED.
-
-    timestamps (n,) [s] where the camera wrote them; otherwise frames are evenly spaced.
-    """
-    length = len(part)
-    if length == n:
-        return part
-    whole: dict[str, Any] = {}
-    for field in dataclasses.fields(part):
-        value = getattr(part, field.name)
-        if isinstance(value, np.ndarray):
-            fill = _FILL.get(field.name, np.nan if value.dtype.kind == "f" else 0)
-            whole[field.name] = np.full((n, *value.shape[1:]), fill, value.dtype)
-            whole[field.name][start : start + length] = value
-    whole["frame"] = np.arange(n)
-    whole["time"] = np.arange(n) / part.frame_rate if timestamps is None else np.array(timestamps, float)
-    whole["time"][start : start + length] = part.time
-    return dataclasses.replace(part, **whole)
 
 
 @checked

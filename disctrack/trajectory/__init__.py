@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -168,14 +169,45 @@ class Trajectory(Brief):
         return coordinate_sigma(self.q, self.calibration_covariance)
 
 
+def _changed(trajectory: Trajectory, change: Callable[[str, NDArray], NDArray]) -> Trajectory:
+    """With its arrays, all of which have a row for each frame, changed; change : name, array -> array"""
+    arrays = {name: value for name, value in vars(trajectory).items() if isinstance(value, np.ndarray)}
+    changed: dict[str, Any] = {name: change(name, value) for name, value in arrays.items()}
+    return replace(trajectory, **changed)
+
+
 def part(trajectory: Trajectory, rows: slice) -> Trajectory:
     """The trajectory of these frames only."""
-    n = len(trajectory)
-    everything: dict[str, Any] = {f.name: getattr(trajectory, f.name) for f in fields(trajectory)}
-    per_frame: dict[str, Any] = {
-        k: v[rows] for k, v in everything.items() if isinstance(v, np.ndarray) and v.shape[:1] == (n,)
-    }
-    return replace(trajectory, **per_frame)
+    return _changed(trajectory, lambda name, value: value[rows])
+
+
+def joined(pieces: Sequence[Trajectory]) -> Trajectory:
+    """Successive parts of one recording as one trajectory; what is not of a frame is as the first has it."""
+    return _changed(pieces[0], lambda name, value: np.concatenate([vars(piece)[name] for piece in pieces]))
+
+
+def at_full_length(part: Trajectory, n: int, start: int, timestamps: Array | None = None) -> Trajectory:
+    """The trajectory of frames start.. as one of all n frames; the others are NaN with the status NOT_PROCESSED.
+
+    timestamps (n,) [s] where the camera wrote them; otherwise frames are evenly spaced.
+    """
+    if len(part) == n:
+        return part
+    time = np.arange(n) / part.frame_rate if timestamps is None else np.array(timestamps, float)
+    time[start : start + len(part)] = part.time
+    whole = _changed(part, lambda name, value: among(n, start, value, _FILL.get(name)))
+    return replace(whole, frame=np.arange(n), time=time)
+
+
+_FILL = {"frame_status": FrameStatus.NOT_PROCESSED, "marker_status": MarkerStatus.NOT_LOOKED_FOR}
+
+
+def among(n: int, start: int, rows: NDArray, fill: float | None = None) -> NDArray:
+    """Rows of frames start.. among those of n frames; of the others NaN, 0 where numbers are whole, or `fill`."""
+    empty = np.nan if rows.dtype.kind == "f" else 0
+    whole = np.full((n, *rows.shape[1:]), empty if fill is None else fill, rows.dtype)
+    whole[start : start + len(rows)] = rows
+    return whole
 
 
 def coordinate_sigma(q: Array, pose_covariance: Array) -> Array:

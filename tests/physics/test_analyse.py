@@ -17,7 +17,7 @@ from disctrack.disc import MA_2014
 from disctrack.errors import AnalysisError, OutputError
 from disctrack.frames import continuous_quaternions, quaternion_from_rotation, rotation_from_euler
 from disctrack.numbers import measured
-from disctrack.track.measurement import at_full_length
+from disctrack.trajectory import at_full_length
 from tests.physics.conftest import as_tracked, true_motion
 
 
