@@ -5,8 +5,9 @@ import argparse
 from disctrack.commands import _outputs as outputs
 from disctrack.disc import MA_2014
 from disctrack.files.whole import refuse_existing
-from disctrack.first_look.targets import board_figure, dots_figure, write_sheet
+from disctrack.first_look.targets import board_figure, dots_figure
 from disctrack.recording.declaration import read_recording
+from disctrack.report.figures import save_figure
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -25,7 +26,7 @@ def run(arguments: argparse.Namespace) -> None:
         board: board_figure(corners, square_mm, arguments.paper),
     }
     for path, figure in sheets.items():
-        print(f"{'sheet':<13} {outputs.relative(write_sheet(path, figure))}")
+        print(f"{'sheet':<13} {outputs.relative(save_figure(figure, path))}")
     print(f"{'':<13} print at 100 %, and measure the bar of 100 mm on each sheet")
     centres = ", ".join(f"[{1e3 * x:.4f}, {1e3 * y:.4f}]" for x, y, _ in disc.marker_centres_body)
     print(f"{'declare':<13} [markers] diameter_mm = {1e3 * disc.marker_diameter:g}")

@@ -1,17 +1,14 @@
 """The declared dots and board as PDF, true to scale: drawn from recording.toml, so that print and declaration agree."""
 
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_pdf import PdfPages
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 
 from disctrack.disc import Disc
 from disctrack.errors import OutputError
-from disctrack.files.whole import whole_file
 
 PAPERS_MM = {"a4": (210.0, 297.0), "a3": (297.0, 420.0), "letter": (215.9, 279.4)}
 MARGIN_MM = 8.0  # that printers leave white
@@ -94,10 +91,3 @@ def _footer(axes: Axes, width: float, text: str) -> None:
     for end in (x, x + RULER_MM):
         axes.plot([end, end], [y - 1.5, y + 1.5], color="black", linewidth=0.5)
     axes.text(width / 2, y - 4.5, text, fontsize=7, ha="center", va="center")
-
-
-def write_sheet(path: Path, figure: Figure) -> Path:
-    """PDF of one sheet, whole or not at all. Raises OutputError."""
-    with whole_file(path, suffix=".pdf") as part, PdfPages(part, metadata={"CreationDate": None}) as pdf:
-        pdf.savefig(figure)
-    return path
