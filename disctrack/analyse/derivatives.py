@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from calibration.kit.arguments import checked
 from calibration.kit.arrays import Array, Mask
 from calibration.kit.brief import Outline
-from disctrack.analyse.smoothing import HALF_WINDOW_LENGTHS, SEGMENT, Process, fit_process, moving_weights
+from disctrack.analyse.smoothing import HALF_WINDOW_LENGTHS, SEGMENT, fit_process, moving_weights
 from disctrack.disc import Disc
 from disctrack.errors import AnalysisError
 from disctrack.frames import (
@@ -184,17 +184,22 @@ def _differentiated(trajectory: Trajectory, good: Mask) -> tuple[Array, ...]:
     samples = _Samples(trajectory, good)
     segments, centres = _segments(samples)
     groups = ([(t, d[channels], v[channels]) for t, d, v in segments] for channels in CHANNELS.values())
-    processes = tuple(fit_process(group, centres, len(samples.ticks)) for group in groups)
-    state, R, covariance, sensitivity = _smoothed(samples, processes)
+    processes = (fit_process(group, centres, len(good)) for group in groups)
+    length, amplitude2, noise_scale = map(np.array, zip(*processes, strict=True))  # (4, n), (4, n), (4,)
+    scale = np.sqrt(np.repeat(noise_scale, [len(channels) for channels in CHANNELS.values()]))
+    samples.covariance *= np.outer(scale, scale)
+    # the windows of all frames at once would be larger than all the rest
+    parts = np.split(np.arange(len(good)), range(FRAMES_AT_ONCE, len(good), FRAMES_AT_ONCE))
+    found = (_smoothed(samples, length, amplitude2, rows) for rows in parts)
+    state, R, covariance, sensitivity = map(np.concatenate, zip(*found, strict=True))
     per_order = samples.interval ** -np.arange(3.0)
     state *= per_order[:, None]
     scale = np.repeat(per_order, 6)
     covariance *= np.outer(scale, scale)
     sensitivity *= scale[:, None]
     _rates_of_turned_frame(sensitivity, state[:, 1, 3:], state[:, 2, 3:])
-    length = np.stack([p.length for p in processes], axis=1) * samples.interval
-    noise_scale = np.array([p.noise_scale for p in processes])
-    return state, R, _euler_near(R, trajectory.q[:, 3:]), covariance, sensitivity, length, noise_scale
+    euler = _euler_near(R, trajectory.q[:, 3:])
+    return state, R, euler, covariance, sensitivity, length.T * samples.interval, noise_scale
 
 
 def _filled(matrices: Array, good: Mask, otherwise: float) -> Array:
@@ -231,11 +236,6 @@ class _Samples:
         # a pose from one camera depends on the rig in another way, and the jump must not be differentiated
         by_both = good & (trajectory.frame_status == FrameStatus.MEASURED)
         self.sensitivity = _filled(trajectory.calibration_sensitivity, by_both, np.nan)
-
-    @property
-    def variance(self) -> Array:
-        """(n, 6), infinite where not measured."""
-        return np.where(self.good[:, None], np.diagonal(self.covariance, axis1=1, axis2=2), np.inf)
 
 
 def _require_samples(time: Array, good: Mask) -> None:
@@ -289,35 +289,23 @@ def _sine_vectors(R: Array, R_reference: Array) -> tuple[Array, Array]:
     return s, gain
 
 
-def _smoothed(samples: _Samples, processes: tuple[Process, ...]) -> tuple[Array, Array, Array, Array]:
-    """State (n, 3 orders, 6), R (n, 3, 3), covariance (n, 18, 18), sensitivity (n, 18, 30), all per interval.
-
-    NaN in a gap where the samples around it leave more than KNOWN_FRACTION of the slope's own variance open.
-    """
-    half = int(np.ceil(HALF_WINDOW_LENGTHS * max(p.length.max() for p in processes)))
-    scale = np.zeros(6)
-    for channels, process in zip(CHANNELS.values(), processes, strict=True):
-        scale[channels] = np.sqrt(process.noise_scale)
-    noise, rows = samples.covariance * np.outer(scale, scale), np.arange(len(samples.ticks))
-    # the windows of all frames at once would be larger than all the rest
-    parts = np.split(rows, range(FRAMES_AT_ONCE, len(rows), FRAMES_AT_ONCE))
-    found = (_smoothed_rows(samples, noise, processes, half, part) for part in parts)
-    state, R, covariance, sensitivity = map(np.concatenate, zip(*found, strict=True))
-    return state, R, covariance, sensitivity
-
-
-def _smoothed_rows(
-    samples: _Samples, noise: Array, processes: tuple[Process, ...], half: int, rows: NDArray[np.int64]
+def _smoothed(
+    samples: _Samples, length: Array, amplitude2: Array, rows: NDArray[np.int64]
 ) -> tuple[Array, Array, Array, Array]:
-    """Some frames from the samples round them, by weights (k, 6, 3, w) and what these leave open (k, 6, 3, 3)."""
-    k = len(rows)
+    """Some frames: state (k, 3 orders, 6), R (k, 3, 3), covariance (k, 18, 18), sensitivity (k, 18, 30), per interval.
+
+    By weights (k, 6, 3, w) of the samples round them, and what these leave open (k, 6, 3, 3). NaN in a gap where that
+    is more than KNOWN_FRACTION of the slope's own variance.
+    length, amplitude2 : (4, n) of the groups' processes
+    """
+    k, half = len(rows), int(np.ceil(HALF_WINDOW_LENGTHS * length.max()))
     weights, prior = np.zeros((k, 6, 3, 2 * half + 1)), np.zeros((k, 6, 3, 3))
     unknown = np.zeros(k, bool)
-    for channels, process in zip(CHANNELS.values(), processes, strict=True):
-        variance = samples.variance[:, channels].mean(axis=1)
-        W, P = moving_weights(samples.ticks, variance, process, half, rows)
+    variance = np.where(samples.good[:, None], np.diagonal(samples.covariance, axis1=1, axis2=2), np.inf)
+    for channels, own, A2 in zip(CHANNELS.values(), length, amplitude2, strict=True):
+        W, P = moving_weights(samples.ticks, variance[:, channels].mean(axis=1), own, A2, half, rows)
         weights[:, channels], prior[:, channels] = W[:, None], P[:, None]
-        open_fraction = P[:, 1, 1] * process.length[rows] ** 2 / process.amplitude2[rows]
+        open_fraction = P[:, 1, 1] * own[rows] ** 2 / A2[rows]
         unknown |= ~np.isfinite(open_fraction) | (~samples.good[rows] & (open_fraction > KNOWN_FRACTION))
     window = np.clip(rows[:, None] + np.arange(-half, half + 1), 0, len(samples.ticks) - 1)
     R = samples.R[rows]
@@ -325,7 +313,7 @@ def _smoothed_rows(
         s, _ = _sine_vectors(samples.R[window], R[:, None])
         R = rotation_from_vector(np.einsum("kcw,kwc->kc", weights[:, 3:, 0], s)) @ R
     s, gain = _sine_vectors(samples.R[window], R[:, None])
-    noise_window = gain @ noise[window] @ gain.swapaxes(-1, -2)
+    noise_window = gain @ samples.covariance[window] @ gain.swapaxes(-1, -2)
     data = np.concatenate([samples.position[window], s], axis=-1)
     state = np.einsum("kcow,kwc->koc", weights, data)
     covariance = np.empty((k, 3, 6, 3, 6))  # order and channel, as STATE

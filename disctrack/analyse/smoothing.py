@@ -11,7 +11,6 @@ than a state-space smoother with an integrated Wiener process, whose spectrum fa
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -28,22 +27,13 @@ MIN_WINDOW_SAMPLES = 4  # a line and a curvature, and one to spare
 NOISE_SCALES = 2.0 ** np.arange(-3.0, 3.01, 0.05)  # variance found over variance stated
 
 
-@dataclass(frozen=True)
-class Process:
-    """What the data say about the curve: one length and one amplitude per sample."""
-
-    length: Array  # (n,) l in sample intervals
-    amplitude2: Array  # (n,) A^2 in the square of the data's unit
-    noise_scale: float  # variance found over variance stated
-
-
 def kernel(lag: Array, length: float) -> Array:
     """Covariance exp(-lag^2 / 2 l^2) of the process with unit amplitude."""
     return np.exp(-0.5 * (lag / length) ** 2)
 
 
-def fit_process(segments: Sequence[tuple[Array, Array, Array]], centres: Array, n: int) -> Process:
-    """Length, amplitude and noise scale of a group of channels that share them.
+def fit_process(segments: Sequence[tuple[Array, Array, Array]], centres: Array, n: int) -> tuple[Array, Array, float]:
+    """Of a group of channels: length (n,) in intervals, A^2 (n,), and the variance found over that stated.
 
     segments : per segment: sample times (m,) in intervals, data (c, m), stated variances (c, m); m may differ
     centres : (n_segments,) sample index that each segment stands for
@@ -65,11 +55,8 @@ def fit_process(segments: Sequence[tuple[Array, Array, Array]], centres: Array, 
     # A disc's motion is a sum of near-sinusoids, smoother than any sample of the process: the likelihood prefers an l
     # that is a little too long. One step shorter the predicted variance of accelerations is that of their errors.
     allowed = np.searchsorted(LENGTHS, np.sqrt(1.15) * _sloped(length), side="right") - 1  # nearest of the grid
-    return Process(
-        length=LENGTHS[np.maximum(allowed - 1, 0)],
-        amplitude2=np.exp(np.interp(sample, centres, np.log(amplitude2))),
-        noise_scale=float(NOISE_SCALES[scale_index]),
-    )
+    amplitude2 = np.exp(np.interp(sample, centres, np.log(amplitude2)))
+    return LENGTHS[np.maximum(allowed - 1, 0)], amplitude2, float(NOISE_SCALES[scale_index])
 
 
 def _sloped(length: Array) -> Array:
@@ -154,13 +141,15 @@ def window_weights(lag: Array, noise_ratio: Array, length: float) -> tuple[Array
 def moving_weights(
     times: Array,
     variance: Array,
-    process: Process,
+    length: Array,
+    amplitude2: Array,
     half_window: int,
     points: NDArray[np.int64],
 ) -> tuple[Array, Array]:
     """Weights (k, 3, 2 half_window + 1) and remaining prior covariance (k, 3, 3) for some samples.
 
-    times : (n,) in sample intervals; variance : (n,) stated, infinite where there is no sample
+    times : (n,) in sample intervals; variance : (n,) of the noise, infinite where there is no sample
+    length, amplitude2 : (n,) as of `fit_process`
     points : (k,) which samples
     Derivatives are per interval. The ends are windows whose outer samples are missing. Windows with the same length,
     ratio and pattern of noise share one solution; noise is told apart in factors of two for this purpose (weights may
@@ -176,19 +165,19 @@ def moving_weights(
     with np.errstate(divide="ignore"):
         noise_class = np.round(np.log2(variance / typical))
     patterns = np.where(inside, noise_class[clipped], np.inf)
-    ratio = np.round(2 * np.log10(process.amplitude2[points] / (typical * process.noise_scale))) / 2
+    ratio = np.round(2 * np.log10(amplitude2[points] / typical)) / 2
     weights, prior = np.zeros((len(points), 3, 2 * w + 1)), np.full((len(points), 3, 3), np.inf)
-    lengths = process.length[points]
-    for length in np.unique(lengths):
-        reach = min(w, int(np.ceil(HALF_WINDOW_LENGTHS * length)))
+    lengths = length[points]
+    for of_rows in np.unique(lengths):
+        reach = min(w, int(np.ceil(HALF_WINDOW_LENGTHS * of_rows)))
         columns = slice(w - reach, w + reach + 1)
         enough = np.isfinite(patterns[:, columns]).sum(axis=1) >= MIN_WINDOW_SAMPLES
-        rows = np.flatnonzero((lengths == length) & enough)
+        rows = np.flatnonzero((lengths == of_rows) & enough)
         if rows.size == 0:
             continue
         keys = np.concatenate([ratio[rows, None], patterns[rows, columns], lag[rows, columns]], axis=1)
         unique, inverse = np.unique(keys, axis=0, return_inverse=True)
         patterns_of, lags = np.split(unique[:, 1:], 2, axis=1)
-        W, P = window_weights(lags, 2.0**patterns_of / 10.0 ** unique[:, :1], float(length))
+        W, P = window_weights(lags, 2.0**patterns_of / 10.0 ** unique[:, :1], float(of_rows))
         weights[rows, :, columns], prior[rows] = W[inverse.ravel()], P[inverse.ravel()]
-    return weights, prior * process.amplitude2[points, None, None]
+    return weights, prior * amplitude2[points, None, None]
