@@ -96,43 +96,38 @@ def write_analysis(path: Path, analysis: Analysis) -> None:
         }
 
     onset, circle, energy = analysis.onset, analysis.circle, analysis.energy
-    derived = {group: [analysis.series(name) for name, *_ in rows] for group, rows in QUANTITIES.items()}
-    groups: dict[str, Group] = {
-        "motion": (
-            whole(_series_variables(derived["motion"]) | _motion_variables(analysis.motion)),
-            _motion_attributes(analysis),
-        ),
-        "contact": (
-            whole(_series_variables(derived["contact"])),
-            {
-                "rolling_onset_s": onset.time,
-                "rolling_onset_low_s": onset.low,
-                "rolling_onset_high_s": onset.high,
-                "rolling_probability": onset.probability,
-                "rolling_verdict": onset.verdict,
-                "slip_distance_m": onset.slip_distance,
-                "slip_distance_sigma_m": onset.slip_distance_sigma,
-                "locus_circle_radius_m": circle.radius,
-                "locus_circle_radius_sigma_m": circle.sigma,
-                "locus_circle_radius_sigma_calibration_m": circle.sigma_calibration,
-                "locus_circle_expected_radius_m": circle.expected,
-                "locus_circle_centre_m": circle.centre,
-                "locus_circle_interval_s": np.array([circle.start, circle.end]),
-            },
-        ),
-        "energy": (
-            whole(_series_variables(derived["energy"])),
-            {
-                "loss_J": energy.loss,
-                "loss_sigma_J": energy.loss_sigma,
-                "loss_sigma_calibration_J": energy.loss_sigma_calibration,
-                "precession_level_over_4g_r": energy.level_ratio,
-                "precession_level_over_4g_r_sigma": energy.level_ratio_sigma,
-                "precession_level_over_4g_r_steady": energy.level_ratio_steady,
-            },
-        ),
-        "scaling": _scaling_group(analysis),
+    attributes: dict[str, dict[str, object]] = {
+        "motion": _motion_attributes(analysis),
+        "contact": {
+            "rolling_onset_s": onset.time,
+            "rolling_onset_low_s": onset.low,
+            "rolling_onset_high_s": onset.high,
+            "rolling_probability": onset.probability,
+            "rolling_verdict": onset.verdict,
+            "slip_distance_m": onset.slip_distance,
+            "slip_distance_sigma_m": onset.slip_distance_sigma,
+            "locus_circle_radius_m": circle.radius,
+            "locus_circle_radius_sigma_m": circle.sigma,
+            "locus_circle_radius_sigma_calibration_m": circle.sigma_calibration,
+            "locus_circle_expected_radius_m": circle.expected,
+            "locus_circle_centre_m": circle.centre,
+            "locus_circle_interval_s": np.array([circle.start, circle.end]),
+        },
+        "energy": {
+            "loss_J": energy.loss,
+            "loss_sigma_J": energy.loss_sigma,
+            "loss_sigma_calibration_J": energy.loss_sigma_calibration,
+            "precession_level_over_4g_r": energy.level_ratio,
+            "precession_level_over_4g_r_sigma": energy.level_ratio_sigma,
+            "precession_level_over_4g_r_steady": energy.level_ratio_steady,
+        },
     }
+    groups: dict[str, Group] = {}
+    for group, rows in QUANTITIES.items():
+        variables = _series_variables([analysis.series(name) for name, *_ in rows])
+        more = _motion_variables(analysis.motion) if group == "motion" else {}
+        groups[group] = whole(variables | more), attributes[group]
+    groups["scaling"] = _scaling_group(analysis)
     axes = {"scaling_window": Variable(WINDOWS, ("scaling_window",), "s", "longest time before t_f in the fit")}
     what = "position, rotation vector, velocity, angular velocity, acceleration, angular acceleration; world axes"
     axes |= {name: Variable(np.array(STATE), (name,), "1", what) for name in ("state", "state_2")}

@@ -15,8 +15,6 @@ from disctrack.recording.readers.decoding import decode
 from disctrack.track.pictures import INK
 from disctrack.track.video_overlay import draw_pair
 
-MOST_PIXELS = 900  # of a shown image's longer side
-
 
 def check_figure(seen: Check) -> Figure | None:
     """Table view and frames, left and right; None where nothing could be read."""
@@ -73,4 +71,4 @@ def _draw_table(axes: Axes, images: tuple[NDArray, NDArray], seen: Check) -> Non
 def _shown(image: NDArray) -> NDArray[np.uint8]:
     """(h, w, 3) for the eye, stretched to 8 bit and reduced."""
     grey = np.asarray(cv2.normalize(image.astype(np.float32), None, 0, 255, cv2.NORM_MINMAX), np.uint8)  # type: ignore[call-overload]
-    return np.asarray(np.repeat(reduced(grey, MOST_PIXELS)[0][..., None], 3, axis=-1), np.uint8)
+    return np.asarray(np.repeat(reduced(grey)[0][..., None], 3, axis=-1), np.uint8)
