@@ -37,7 +37,6 @@ STATE = tuple(f"{vector}_{axis}" for vector in VECTORS for axis in "xyz")
 N_STATE = len(STATE)  # 18
 # Of POSE_COMPONENTS, those of unlike spectra, which light and view make scatter in a way of their own
 CHANNELS = {"horizontal position": [0, 1], "height": [2], "tilt": [3, 4], "turn about the vertical": [5]}
-FRAMES_AT_ONCE = 256
 MIN_FRAMES = 12  # a line and a curvature per channel, and enough left over to judge the noise
 # Of the image's longer side: what repeats is as smooth as half a cell of the splines that have taken out the lens
 SYSTEMATIC_LENGTH = 0.1
@@ -188,8 +187,8 @@ def _differentiated(trajectory: Trajectory, good: Mask) -> tuple[Array, ...]:
     length, amplitude2, noise_scale = map(np.array, zip(*processes, strict=True))  # (4, n), (4, n), (4,)
     scale = np.sqrt(np.repeat(noise_scale, [len(channels) for channels in CHANNELS.values()]))
     samples.covariance *= np.outer(scale, scale)
-    # the windows of all frames at once would be larger than all the rest
-    parts = np.split(np.arange(len(good)), range(FRAMES_AT_ONCE, len(good), FRAMES_AT_ONCE))
+    # some frames at a time: the windows of all at once would be larger than all the rest
+    parts = np.split(np.arange(len(good)), range(SEGMENT, len(good), SEGMENT))
     found = (_smoothed(samples, length, amplitude2, rows) for rows in parts)
     state, R, covariance, sensitivity = map(np.concatenate, zip(*found, strict=True))
     per_order = samples.interval ** -np.arange(3.0)
