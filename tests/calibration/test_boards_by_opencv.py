@@ -24,9 +24,9 @@ from calibration.judge.assessment import stereo_covariance
 from calibration.judge.pairs import motion_between_exposures
 from calibration.rig_file import read_rig_file, write_rig
 from calibration.stereo import _observations
-from tests.calibration.conftest import corner_view, make_scene, squared
 from tests.calibration.test_refinement import rig_error
 from tests.oracles import moved_boards, point_laboratory
+from tests.oracles.drawn_boards import corner_view, make_scene, squared
 
 BOARD = Board(moved_boards.INNER_CORNERS, moved_boards.SQUARE)
 EXACT = BoardTolerances(square=0.0, flatness=0.0, thickness=0.0)
@@ -45,8 +45,8 @@ def errors(found, rig):
 
 
 @pytest.mark.parametrize("known", ["motion", "prior", "outliers"])
-def test_normal_equations_have_the_cost_and_the_gradient_that_they_say(scene_maker, rng, known):
-    scene = scene_maker(n_views=3, inner_corners=(4, 3))
+def test_normal_equations_have_the_cost_and_the_gradient_that_they_say(rng, known):
+    scene = make_scene(n_views=3, inner_corners=(4, 3))
     nominal, moving = scene.board.points, known == "motion"
     observations = scene.observations(0.1, rng)
     observations = observations[np.argsort(observations.view, kind="stable")]

@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose
 from calibration import Board, BoardNotFound, Camera, CornerView, find_corners
 from calibration.board.chessboard import luminance, margin_is_dark
 from calibration.cameras.camera import project, rotation_from_vector
-from tests.calibration.conftest import corner_view
+from tests.oracles.drawn_boards import corner_view, draw_board
 
 CAMERA = Camera(900.0, 905.0, 158.0, 122.0, (-0.1, 0.1, 3e-4, -2e-4, 0.0), (320, 240))
 BOARD = Board((9, 6), 8e-3)
@@ -22,20 +22,20 @@ def facing(board, R, distance=0.36):
     return R, np.array([0.0, 0.0, distance]) - R @ board.points.mean(0)
 
 
-def seen(board_drawer, tilt=TILT, seed=None, board=BOARD, camera=CAMERA, distance=0.36, **drawing):
+def seen(tilt=TILT, seed=None, board=BOARD, camera=CAMERA, distance=0.36, **drawing):
     """Image of a board, exact without a seed of its noise, and where its corners are in it."""
     R, t = facing(board, rotation_from_vector(np.radians(tilt)), distance)
     rng = None if seed is None else np.random.default_rng(seed)
-    return board_drawer(camera, R, t, board, rng=rng, **drawing), project(board.points @ R.T + t, camera)
+    return draw_board(camera, R, t, board, rng=rng, **drawing), project(board.points @ R.T + t, camera)
 
 
 @pytest.fixture(scope="module")
-def views(board_drawer):
+def views():
     """(located, true) corners of views from frontal to steep, edges along the rows and askew."""
     found = []
     # no edges at 0 or 45 deg, where the grid of rays of the drawing itself would show
     for seed, tilt in enumerate([(3, 4, 7), TILT, (-35, 10, 33), (10, -50, 5), (55, 0, -20), (5, 8, 38)]):
-        image, true = seen(board_drawer, tilt, 11 + seed)
+        image, true = seen(tilt, 11 + seed)
         view = find_corners(image, (9, 6))
         assert isinstance(view, CornerView), view
         found.append((view, true))
@@ -65,8 +65,8 @@ def lit(image, added, fall_off):
 
 
 @pytest.mark.statistical
-def test_added_light_shifts_no_corner(board_drawer):
-    image, true = seen(board_drawer, (10, 12, 7), sub=6)
+def test_added_light_shifts_no_corner():
+    image, true = seen((10, 12, 7), sub=6)
 
     def found(grey):
         return find_corners(np.rint(16 * grey).astype(np.uint16), (9, 6)).points
@@ -84,8 +84,8 @@ def test_added_light_shifts_no_corner(board_drawer):
 @pytest.mark.parametrize(
     "optical_blur", [0.02, pytest.param(0.1, marks=pytest.mark.slow), pytest.param(0.2, marks=pytest.mark.slow)]
 )
-def test_edges_sharper_than_the_pixel_are_located_as_well(board_drawer, optical_blur):
-    image, true = seen(board_drawer, (-35, 10, 33), 1, sub=8, sigma=optical_blur)
+def test_edges_sharper_than_the_pixel_are_located_as_well(optical_blur):
+    image, true = seen((-35, 10, 33), 1, sub=8, sigma=optical_blur)
     view = find_corners(image, (9, 6))
     assert isinstance(view, CornerView), view
     assert view.accepted.all()
@@ -108,10 +108,10 @@ def spoiled(image, how):
 
 @pytest.mark.statistical
 @pytest.mark.parametrize("how", ["sharpened", "jpeg", "small", "half-tone"])
-def test_spoiled_images_lose_no_corner_and_state_their_error(board_drawer, how):
+def test_spoiled_images_lose_no_corner_and_state_their_error(how):
     squares, rms = [], []
     for seed, tilt in enumerate([(3, 4, 7), TILT, (-35, 10, 33)]):
-        image, true = seen(board_drawer, tilt, seed, sigma=0.4)
+        image, true = seen(tilt, seed, sigma=0.4)
         image = spoiled(spoiled(image, how), "jpeg")
         true = (true + 0.5) * 0.6 - 0.5 if how == "small" else true
         view = find_corners(image, (9, 6))
@@ -128,16 +128,16 @@ def test_spoiled_images_lose_no_corner_and_state_their_error(board_drawer, how):
 
 
 @pytest.mark.parametrize("turn", [0, 37, 90, 145, 180, 222, 270, 301])
-def test_order_follows_the_dark_side_however_the_board_lies(board_drawer, turn):
+def test_order_follows_the_dark_side_however_the_board_lies(turn):
     board = Board((9, 6), 6e-3)
     tilted = rotation_from_vector(np.array([0.3, -0.2, 0.0]))
     R, t = facing(board, tilted @ rotation_from_vector(np.radians([0, 0, turn])))
-    view = find_corners(board_drawer(CAMERA, R, t, board, rng=np.random.default_rng(turn)), (9, 6))
+    view = find_corners(draw_board(CAMERA, R, t, board, rng=np.random.default_rng(turn)), (9, 6))
     assert_allclose(view.points, project(board.points @ R.T + t, CAMERA), atol=0.05)
 
 
-def test_a_print_whose_corner_squares_are_light_is_found_as_well(board_drawer):
-    image, _ = seen(board_drawer, board=Board((9, 7), 7e-3))
+def test_a_print_whose_corner_squares_are_light_is_found_as_well():
+    image, _ = seen(board=Board((9, 7), 7e-3))
     dark, light = find_corners(image, (9, 7)), find_corners(image[:, ::-1], (9, 7))  # in a mirror the colours change
     assert isinstance(light, CornerView)
     assert light.accepted.all()
@@ -148,10 +148,10 @@ def test_a_print_whose_corner_squares_are_light_is_found_as_well(board_drawer):
 
 
 @pytest.mark.parametrize("counts", [(5, 4), (4, 5), (7, 6), (12, 7), (3, 4)])
-def test_other_boards_are_found_in_their_own_order(board_drawer, counts):
+def test_other_boards_are_found_in_their_own_order(counts):
     board = Board(counts, 70e-3 / max(counts))
     assert len(board.orders) == 1
-    image, true = seen(board_drawer, (20, 15, 130), 1, board)
+    image, true = seen((20, 15, 130), 1, board)
     view = find_corners(image, counts)
     assert isinstance(view, CornerView), view
     assert_allclose(view.points, true, atol=0.1)  # squares down to 10 px, and blur of 0.6 px
@@ -159,16 +159,16 @@ def test_other_boards_are_found_in_their_own_order(board_drawer, counts):
 
 @pytest.mark.statistical
 @pytest.mark.parametrize("counts", [(8, 6), (9, 5), (10, 6), (9, 7), (6, 4)])
-def test_wrong_counts_are_refused(board_drawer, counts):
-    found = find_corners(seen(board_drawer, seed=2)[0], counts)
+def test_wrong_counts_are_refused(counts):
+    found = find_corners(seen(seed=2)[0], counts)
     assert isinstance(found, BoardNotFound)
     assert "inner corners" in found.reason.lower()
     # OpenCV sees these parts of the board as a board; of larger counts there is none
     assert ("declare inner_corners = [9, 6]" in found.reason) == (counts in ((8, 6), (9, 5)))
 
 
-def test_an_image_too_large_for_the_rough_search_loses_nothing(board_drawer):
-    image, _ = seen(board_drawer, (10, 20, 30), 6)
+def test_an_image_too_large_for_the_rough_search_loses_nothing():
+    image, _ = seen((10, 20, 30), 6)
     large = np.full((1200, 2000), 80, np.uint8)
     large[700:940, 1500:1820] = image
     offset = np.array([1500, 700])
@@ -176,10 +176,10 @@ def test_an_image_too_large_for_the_rough_search_loses_nothing(board_drawer):
 
 
 @pytest.mark.statistical
-def test_squares_of_150_px_are_located_as_well_as_they_state(board_drawer):
+def test_squares_of_150_px_are_located_as_well_as_they_state():
     """Their first window is a small part of them."""
     board, camera = Board((4, 3), 8e-3), Camera(2400.0, 2410.0, 519.0, 403.0, (0.0,) * 5, (1040, 800))
-    image, true = seen(board_drawer, (12.0, 9.0, 7.0), 8, board, camera, distance=0.13, sub=3)
+    image, true = seen((12.0, 9.0, 7.0), 8, board, camera, distance=0.13, sub=3)
     view = find_corners(image, (4, 3))
     sigma = np.sqrt(np.diagonal(view.covariance, axis1=1, axis2=2))
     pull = (view.points - true) / sigma
@@ -209,8 +209,8 @@ def test_an_empty_or_noisy_image_holds_no_board(rng):
 
 
 @pytest.mark.statistical
-def test_a_dirty_corner_is_rejected_with_its_reason(board_drawer):
-    image, true = seen(board_drawer, seed=4)
+def test_a_dirty_corner_is_rejected_with_its_reason():
+    image, true = seen(seed=4)
     cv2.circle(image, tuple(int(v) for v in np.rint(true[22] + [3, 2])), 5, 110, -1)
     view = find_corners(image, (9, 6))
     assert isinstance(view, CornerView)
@@ -222,16 +222,16 @@ def test_a_dirty_corner_is_rejected_with_its_reason(board_drawer):
 
 
 @pytest.mark.parametrize("rim", [0.3, 1.0])
-def test_paper_round_the_squares_tells_a_negative_from_a_positive(board_drawer, rim):
+def test_paper_round_the_squares_tells_a_negative_from_a_positive(rim):
     """Nothing else does: the colouring of a negative is that of the board turned by 180 deg."""
     board = Board((9, 6), 6e-3)
-    image, true = seen(board_drawer, seed=3, board=board, table=60.0, rim=rim)  # darker than paper
+    image, true = seen(seed=3, board=board, table=60.0, rim=rim)  # darker than paper
     assert not margin_is_dark(image, corner_view(true), (9, 6))
     assert margin_is_dark(255 - image, corner_view(true), (9, 6))
 
 
-def test_equal_channels_change_nothing(board_drawer):
-    image, _ = seen(board_drawer, seed=5)
+def test_equal_channels_change_nothing():
+    image, _ = seen(seed=5)
     plain = find_corners(image, (9, 6))
     triple = find_corners(np.dstack([image] * 3), (9, 6))
     assert np.array_equal(triple.points, plain.points)

@@ -10,6 +10,7 @@ from scipy.interpolate import BSpline
 from calibration import Terms, refine_stereo, triangulate
 from calibration.cameras.splines import LensField
 from calibration.fit.lens_field import fit_lens_field
+from tests.oracles.drawn_boards import make_scene
 
 SIGMA = 0.004  # [px] of good corners
 TERMS = Terms("k1 k2 p1 p2", "flat")
@@ -23,9 +24,9 @@ def field_of(pixels, camera):
 
 
 @pytest.fixture(scope="module")
-def refined(scene_maker):
+def refined():
     """Refinements of sixteen views, through plain lenses and through such a field."""
-    scene = scene_maker(n_views=16)
+    scene = make_scene(n_views=16)
     o = scene.observations(SIGMA, np.random.default_rng(3))
     moved = np.where((o.camera == 0)[:, None], field_of(o.pixels, 0), field_of(o.pixels, 1))
     bent = replace(o, pixels=o.pixels + moved)
@@ -64,9 +65,9 @@ def test_field_is_found_and_the_geometry_is_better_for_it(refined):
 
 
 @pytest.mark.statistical
-def test_what_varies_within_a_cell_is_found_too(scene_maker):
+def test_what_varies_within_a_cell_is_found_too():
     """Waves of a third of the image: a grid of five cells leaves of them what is seen in chi-square."""
-    scene = scene_maker(n_views=16)
+    scene = make_scene(n_views=16)
     o = scene.observations(SIGMA, np.random.default_rng(4))
     waves = np.sin(o.pixels @ [[0.035, 0.02], [0.015, -0.038]] + o.camera[:, None])
     bent = refine_stereo(replace(o, pixels=o.pixels + 0.03 * waves), scene.model, scene.board.points, TERMS)

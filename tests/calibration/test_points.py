@@ -6,6 +6,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from calibration import Board, CalibrationError, CalibrationSettings, calibrate_from_points
+from tests.oracles.drawn_boards import make_scene
 
 PLAIN = CalibrationSettings("k1 k2 p1 p2", "flat")
 
@@ -14,8 +15,8 @@ def noisy(scene, rng, sigma):
     return [[p + rng.normal(size=p.shape) * sigma for p in scene.pixels(camera)] for camera in (0, 1)]
 
 
-def test_points_and_one_sigma_give_the_rig_and_say_that_the_noise_was_overstated(scene_maker, rng):
-    scene = scene_maker(n_views=8)
+def test_points_and_one_sigma_give_the_rig_and_say_that_the_noise_was_overstated(rng):
+    scene = make_scene(n_views=8)
     left, right = noisy(scene, rng, 0.04)
     left[3] = None
     found = calibrate_from_points(left, right, scene.board, (512, 512), 0.04, PLAIN)
@@ -29,8 +30,8 @@ def test_points_and_one_sigma_give_the_rig_and_say_that_the_noise_was_overstated
     assert_allclose(careful.rig.t_right_left, found.rig.t_right_left, atol=1e-5)
 
 
-def test_what_cannot_be_right_is_named(scene_maker, rng):
-    scene = scene_maker(n_views=5)
+def test_what_cannot_be_right_is_named(rng):
+    scene = make_scene(n_views=5)
     left, right = noisy(scene, rng, 0.04)
 
     def refused(match, left=left, right=right, board=scene.board, size=(512, 512), sigma=0.04):

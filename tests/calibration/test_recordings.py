@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 from calibration import Board, CalibrationSettings, calibrate_from_corners, calibrate_stereo, find_corners, triangulate
 from calibration.judge.assessment import stereo_covariance
 from calibration.rig_file import read_rig_group
-from tests.calibration.conftest import squared
 from tests.calibration.test_refinement import rig_error
+from tests.oracles.drawn_boards import squared
 
 
 def read_pairs(folder, pattern, indices):

@@ -14,7 +14,7 @@ from calibration.fit.refinement import choose_board
 from calibration.fit.start import start_stereo
 from calibration.fit.stereo_model import board_basis, moved
 from calibration.judge.tolerances import rig_with_covariance, table_pose
-from tests.calibration.conftest import squared
+from tests.oracles.drawn_boards import make_scene, squared
 
 FULL = Terms("k1 k2 p1 p2")
 
@@ -52,9 +52,9 @@ def true_rig(scene, view, thickness):
     return replace(m.rig, R_left_world=R, t_left_world=t, covariance=covariance)
 
 
-def test_a_minimum_is_one_where_only_rounding_is_left_to_gain(scene_maker, rng):
+def test_a_minimum_is_one_where_only_rounding_is_left_to_gain(rng):
     """No tolerance can be met where rounding moves chi-square by more: pixels 0.7 wide ended so, in a warning."""
-    scene = scene_maker(n_views=8)
+    scene = make_scene(n_views=8)
     found = refine_stereo(scene.observations(0.005), scene.model, scene.board.points, FULL)
     impossible = [
         minimise(found.problem, disturbed(scene, rng, size), tolerance=0.0, damping=1e-6, iterations=iterations)
@@ -65,8 +65,8 @@ def test_a_minimum_is_one_where_only_rounding_is_left_to_gain(scene_maker, rng):
     assert np.ptp(costs[:3]) < 1e-6 < costs[3] - costs[0]
 
 
-def test_exact_corners_give_back_the_exact_rig(scene_maker, rng):
-    scene = scene_maker()
+def test_exact_corners_give_back_the_exact_rig(rng):
+    scene = make_scene()
     o = scene.observations(0.01)
     found = refine_stereo(o, disturbed(scene, rng), scene.board.points, FULL, priors=False)
     assert found.converged
@@ -90,20 +90,20 @@ def rig_errors(scene, seeds, inflation=1.0):
 
 
 @pytest.mark.parametrize("seeds", [16, pytest.param(200, marks=pytest.mark.slow)])
-def test_squared_error_of_the_rig_equals_its_covariance(scene_maker, seeds):
-    errors, mean = rig_errors(scene_maker(n_views=10), seeds)
+def test_squared_error_of_the_rig_equals_its_covariance(seeds):
+    errors, mean = rig_errors(make_scene(n_views=10), seeds)
     # mean of n chi-squares of p degrees of freedom over p: scatter sqrt(2 / (n p))
     assert abs(mean - 1) < 4.0 * np.sqrt(2 / errors.size)
     each = np.mean(np.square(errors), axis=0)
     assert np.abs(each - 1).max() < 1.2 * 4.0 * np.sqrt(2 / seeds)  # every parameter by itself, 28 at once
 
 
-def test_a_covariance_of_half_the_size_would_be_noticed(scene_maker):
-    assert rig_errors(scene_maker(n_views=10), 10, 0.5)[1] > 1.5
+def test_a_covariance_of_half_the_size_would_be_noticed():
+    assert rig_errors(make_scene(n_views=10), 10, 0.5)[1] > 1.5
 
 
-def test_thickness_of_the_board_moves_the_origin_down_and_couples_it_to_the_tilt(scene_maker):
-    scene = scene_maker(n_views=8)
+def test_thickness_of_the_board_moves_the_origin_down_and_couples_it_to_the_tilt():
+    scene = make_scene(n_views=8)
     found = refine_stereo(scene.observations(0.02), scene.model, scene.board.points, FULL)
     thin, thick = (rig_with_covariance(found, 0, h, 1.0) for h in (0.0, 20e-3))
     assert_allclose(thick.t_left_world, thin.t_left_world - 20e-3 * thin.R_left_world[:, 2], atol=1e-12)
@@ -118,8 +118,8 @@ def test_thickness_of_the_board_moves_the_origin_down_and_couples_it_to_the_tilt
         assert_allclose(shift, np.cross(arm, np.eye(3)[axis]), atol=1e-6)
 
 
-def test_gross_outliers_are_rejected_and_do_no_harm(scene_maker, rng):
-    scene = scene_maker()
+def test_gross_outliers_are_rejected_and_do_no_harm(rng):
+    scene = make_scene()
     o = scene.observations(0.02, rng)
     clean = refine_stereo(o, disturbed(scene, rng), scene.board.points, FULL)
     bad = rng.choice(len(o), 25, replace=False)
@@ -134,8 +134,8 @@ def test_gross_outliers_are_rejected_and_do_no_harm(scene_maker, rng):
     assert np.abs(change[sigma > 0] / sigma[sigma > 0]).max() < 1.0
 
 
-def test_rejection_that_does_not_settle_leaves_a_fit_of_the_points_that_it_names(scene_maker, rng):
-    scene = scene_maker(n_views=8)
+def test_rejection_that_does_not_settle_leaves_a_fit_of_the_points_that_it_names(rng):
+    scene = make_scene(n_views=8)
     o = scene.observations(0.05, rng)
     # beyond one sigma lie a third of all good points: each round strikes others
     found = refine_stereo(o, disturbed(scene, rng), scene.board.points, FULL, reject_beyond=1.0)
@@ -144,8 +144,8 @@ def test_rejection_that_does_not_settle_leaves_a_fit_of_the_points_that_it_names
 
 
 @pytest.mark.parametrize("aspect", [0.5, 1.33])
-def test_pixels_that_are_not_square_are_no_hindrance_to_the_start(scene_maker, rng, aspect):
-    scene = scene_maker(n_views=10)
+def test_pixels_that_are_not_square_are_no_hindrance_to_the_start(rng, aspect):
+    scene = make_scene(n_views=10)
     cameras = tuple(
         replace(c, fy=c.fy * aspect, cy=c.cy * aspect, image_size=(512, int(512 * aspect)))
         for c in scene.model.rig.cameras
@@ -161,10 +161,10 @@ def test_pixels_that_are_not_square_are_no_hindrance_to_the_start(scene_maker, r
     )
 
 
-def test_a_bent_board_is_chosen_and_recovered(scene_maker, rng):
-    flat = scene_maker(n_views=12)
+def test_a_bent_board_is_chosen_and_recovered(rng):
+    flat = make_scene(n_views=12)
     basis = board_basis(flat.board.points, "warped")
-    scene = scene_maker(n_views=12, deviation=basis @ np.array([0.15e-3, 0.05e-3, -0.1e-3, 0.0, 0.0]))
+    scene = make_scene(n_views=12, deviation=basis @ np.array([0.15e-3, 0.05e-3, -0.1e-3, 0.0, 0.0]))
     o = scene.observations(0.02, rng)
     begun, _, _ = start_stereo(o, scene.board.points, ((512, 512), (512, 512)), [("left", "right")] * 12)
     assert not begun.apart
@@ -174,8 +174,8 @@ def test_a_bent_board_is_chosen_and_recovered(scene_maker, rng):
     assert [c.terms.board for c in table] == ["warped"]  # the flat one leaves far more: not worth views left out
 
 
-def test_a_flat_board_stays_flat_and_a_lens_without_distortion_has_none_within_its_sigma(scene_maker, rng):
-    scene = scene_maker(distortion=False)
+def test_a_flat_board_stays_flat_and_a_lens_without_distortion_has_none_within_its_sigma(rng):
+    scene = make_scene(distortion=False)
     o = scene.observations(0.02, rng)
     found, _ = choose_board(o, scene.model, scene.board.points, (Terms(), Terms(board="warped")))
     assert found.terms.board == "flat"
@@ -185,8 +185,8 @@ def test_a_flat_board_stays_flat_and_a_lens_without_distortion_has_none_within_i
     assert squared(distortion, B @ found.normal.covariances()[0] @ B.T) < 2.96  # of 10 numbers: p = 0.001
 
 
-def test_errors_common_to_a_view_inflate_the_covariance(scene_maker, rng):
-    scene = scene_maker(n_views=16)
+def test_errors_common_to_a_view_inflate_the_covariance(rng):
+    scene = make_scene(n_views=16)
     o = scene.observations(0.02, rng)
     quiet = refine_stereo(o, scene.model, scene.board.points, FULL).disagreement
     shear = rng.normal(size=(16, 2, 2)) * 3e-4  # a bend of the images that changes from view to view

@@ -12,6 +12,7 @@ from calibration.cameras.splines import LensField
 from calibration.rig_file import read_rig, read_rig_file, record_of, write_rig
 from tests.calibration.test_stereo import corner_views
 from tests.equality import assert_equal
+from tests.oracles.drawn_boards import make_scene
 
 
 @pytest.fixture
@@ -32,9 +33,9 @@ def rig(rng):
 
 
 @pytest.fixture(scope="module")
-def calibrated(scene_maker):
+def calibrated():
     """From views one of which is lost to the left camera, and one shows the board elsewhere to the right one."""
-    scene = scene_maker(n_views=8)
+    scene = make_scene(n_views=8)
     sides = corner_views(scene, np.random.default_rng(6))
     sides[0][2] = BoardNotFound("glare")
     sides[1][5] = replace(sides[1][5], points=sides[1][5].points + np.array([40.0, 0.0]))

@@ -19,7 +19,7 @@ from calibration.board.chessboard import board_orders
 from calibration.cameras.camera import rotation_from_vector, triangulate
 from calibration.judge.assessment import point_uncertainty
 from calibration.judge.tolerances import BoardTolerances, table_pose
-from tests.calibration.conftest import corner_view
+from tests.oracles.drawn_boards import corner_view, draw_board, make_scene
 
 BOARD = Board((7, 4), 9e-3)
 THICKNESS = 2e-3
@@ -28,9 +28,9 @@ EXACT = BoardTolerances(square=0.0, flatness=0.0, thickness=0.0)  # what is decl
 FLAT = CalibrationSettings(distortion="k1", board="flat", tolerances=EXACT)
 
 
-def small_scene(scene_maker, **options):
+def small_scene(**options):
     """The scene seen by cameras of fewer pixels, so that drawing it is quick."""
-    scene = scene_maker(inner_corners=BOARD.inner_corners, square=BOARD.square, **options)
+    scene = make_scene(inner_corners=BOARD.inner_corners, square=BOARD.square, **options)
     cameras = tuple(
         Camera(c.fx * 0.45, c.fy * 0.45, 119.0 + i, 96.0 - i, (-0.15, 0, 0, 0, 0), (240, 192))
         for i, c in enumerate(scene.model.rig.cameras)
@@ -38,20 +38,20 @@ def small_scene(scene_maker, **options):
     return scene.with_rig(left=cameras[0], right=cameras[1])
 
 
-def draw(scene, board_drawer, rng, board=BOARD, sub=4):
+def draw(scene, rng, board=BOARD, sub=4):
     m, rig = scene.model, scene.model.rig
     images = ([], [])
     for R, t in zip(m.R_left_board[:, 0], m.t_left_board[:, 0], strict=True):
-        images[0].append(board_drawer(rig.left, R, t, board, sub=sub, rng=rng))
+        images[0].append(draw_board(rig.left, R, t, board, sub=sub, rng=rng))
         R, t = rig.R_right_left @ R, rig.R_right_left @ t + rig.t_right_left
-        images[1].append(board_drawer(rig.right, R, t, board, sub=sub, rng=rng))
+        images[1].append(draw_board(rig.right, R, t, board, sub=sub, rng=rng))
     return images
 
 
 @pytest.fixture(scope="module")
-def drawn(scene_maker, board_drawer):
-    scene = small_scene(scene_maker, n_views=8)
-    return scene, draw(scene, board_drawer, np.random.default_rng(8))
+def drawn():
+    scene = small_scene(n_views=8)
+    return scene, draw(scene, np.random.default_rng(8))
 
 
 @pytest.fixture(scope="module")
@@ -115,8 +115,8 @@ def test_no_board_anywhere_and_none_in_the_table_view_are_errors(drawn):
         calibrate_stereo(left, right, BOARD, FLAT, table_view=11)
 
 
-def test_exchanged_images_are_found_out(scene_maker, rng):
-    scene = small_scene(scene_maker, n_views=10)
+def test_exchanged_images_are_found_out(rng):
+    scene = small_scene(n_views=10)
     left, right = corner_views(scene, rng)
     right[2], right[7] = right[7], right[2]
     found = calibrate_from_corners(left, right, BOARD, FLAT)
@@ -131,8 +131,8 @@ def test_exchanged_images_are_found_out(scene_maker, rng):
 
 
 @pytest.mark.statistical
-def test_a_board_that_moved_between_the_exposures_costs_the_pair_and_no_camera(scene_maker, rng):
-    left, right = corner_views(small_scene(scene_maker, n_views=10), rng)
+def test_a_board_that_moved_between_the_exposures_costs_the_pair_and_no_camera(rng):
+    left, right = corner_views(small_scene(n_views=10), rng)
     right[4] = replace(right[4], points=right[4].points + np.array([1.5, -1.0]))
     found = calibrate_from_corners(left, right, BOARD, FLAT)
     assert found.apart == (4,)
@@ -146,15 +146,15 @@ def test_a_board_that_moved_between_the_exposures_costs_the_pair_and_no_camera(s
     assert found.rig.covariance[0, 0] < without.rig.covariance[0, 0]
 
 
-def test_so_few_pairs_that_none_can_judge_another_are_all_used(scene_maker, rng):
-    left, right = corner_views(small_scene(scene_maker, n_views=3), rng)
+def test_so_few_pairs_that_none_can_judge_another_are_all_used(rng):
+    left, right = corner_views(small_scene(n_views=3), rng)
     right[1] = replace(right[1], points=right[1].points + np.array([1.5, -1.0]))
     assert not calibrate_from_corners(left, right, BOARD, FLAT).apart
 
 
 @pytest.mark.statistical
-def test_parallel_views_are_warned_of(scene_maker, rng):
-    scene = small_scene(scene_maker, n_views=8)
+def test_parallel_views_are_warned_of(rng):
+    scene = small_scene(n_views=8)
     m = scene.model
     shift = rng.uniform(-0.02, 0.02, (8, 3))
     turns = rotation_from_vector(np.outer(np.arange(8), [0, 0, 0.1]))[:, None]
@@ -171,10 +171,10 @@ def test_parallel_views_are_warned_of(scene_maker, rng):
 
 
 @pytest.mark.parametrize("counts", [(7, 5), (6, 4), (5, 5), (4, 4)])
-def test_a_board_that_looks_the_same_after_a_turn_still_gives_one_pair(scene_maker, rng, counts):
+def test_a_board_that_looks_the_same_after_a_turn_still_gives_one_pair(rng, counts):
     board = Board(counts, 9e-3)
     assert len(board.orders) > 1
-    scene = scene_maker(n_views=8, inner_corners=counts, square=9e-3)
+    scene = make_scene(n_views=8, inner_corners=counts, square=9e-3)
     scene = replace(scene, board=board)
     left, right = corner_views(scene, rng, 0.01)
     orders = board_orders(counts)
@@ -197,9 +197,9 @@ def in_a_mirror(view, board):
 
 
 @pytest.mark.parametrize("counts", [(7, 4), (6, 5), (5, 5), (6, 4)])
-def test_one_camera_that_shows_a_mirror_image_is_named_and_two_are_one_world(scene_maker, rng, counts):
+def test_one_camera_that_shows_a_mirror_image_is_named_and_two_are_one_world(rng, counts):
     board = Board(counts, 9e-3)
-    scene = replace(scene_maker(n_views=9, inner_corners=counts, square=9e-3), board=board)
+    scene = replace(make_scene(n_views=9, inner_corners=counts, square=9e-3), board=board)
     sides = corner_views(scene, rng)
     mirrored = [[in_a_mirror(view, board) for view in side] for side in sides]
     for pair in ((sides[0], mirrored[1]), (mirrored[0], sides[1])):
@@ -208,8 +208,8 @@ def test_one_camera_that_shows_a_mirror_image_is_named_and_two_are_one_world(sce
     assert calibrate_from_corners(*mirrored, board, FLAT).rms_px < 0.2
 
 
-def test_the_images_of_one_camera_twice_are_no_pair(scene_maker, rng):
-    left, right = corner_views(small_scene(scene_maker, n_views=6), rng, 0.02)
+def test_the_images_of_one_camera_twice_are_no_pair(rng):
+    left, right = corner_views(small_scene(n_views=6), rng, 0.02)
     with pytest.raises(CalibrationError, match=r"from one place .* do both patterns name the images of one camera"):
         calibrate_from_corners(left, left, BOARD, FLAT)
     assert calibrate_from_corners(left, right, BOARD, FLAT).rms_px < 0.1
@@ -227,8 +227,8 @@ def test_unknown_settings_are_refused():
 
 
 @pytest.fixture(scope="module")
-def views(scene_maker):
-    return corner_views(small_scene(scene_maker, n_views=12), np.random.default_rng(3))
+def views():
+    return corner_views(small_scene(n_views=12), np.random.default_rng(3))
 
 
 @pytest.mark.parametrize(
@@ -265,9 +265,9 @@ def test_a_frame_that_was_lost_near_the_end_costs_the_pairs_behind_it_and_is_nam
     assert found.rms_px < 0.05
 
 
-def test_boards_of_two_sizes_end_in_a_rig_or_a_sentence(views, scene_maker):
+def test_boards_of_two_sizes_end_in_a_rig_or_a_sentence(views):
     """Every other view shows a board of twice the size, twice as far away: each pair tells of twice the baseline."""
-    scene = small_scene(scene_maker, n_views=12)
+    scene = small_scene(n_views=12)
     m = scene.model
     far = replace(m, points=1.5 * m.points, t_left_board=m.t_left_board + np.array([0, 0, 0.05]))
     other = corner_views(replace(scene, model=far), np.random.default_rng(4))
@@ -279,10 +279,10 @@ def test_boards_of_two_sizes_end_in_a_rig_or_a_sentence(views, scene_maker):
 
 @pytest.mark.statistical
 @pytest.mark.parametrize("counts", [(7, 7), (6, 6)])
-def test_every_pair_of_a_square_board_is_used_whichever_way_a_camera_sees_it(scene_maker, rng, counts):
+def test_every_pair_of_a_square_board_is_used_whichever_way_a_camera_sees_it(rng, counts):
     """Cameras near to each other: what a pair tells of their distance scatters by more than a tenth of it."""
     board = Board(counts, 6e-3)
-    scene = scene_maker(n_views=16, inner_corners=counts, square=6e-3)
+    scene = make_scene(n_views=16, inner_corners=counts, square=6e-3)
     near = rotation_from_vector(np.array([0.0, -0.06, 0.0]))
     views = corner_views(scene.with_rig(R_right_left=near, t_right_left=np.array([-0.02, 0.0, 0.002])), rng, 0.1)
     for turned in (0, 1):  # and the right camera upside down
@@ -295,7 +295,7 @@ def test_every_pair_of_a_square_board_is_used_whichever_way_a_camera_sees_it(sce
 
 
 @pytest.mark.statistical
-def test_views_of_one_place_count_once(scene_maker, views):
+def test_views_of_one_place_count_once(views):
     once = calibrate_from_corners(*views, BOARD, FLAT)
     thrice = calibrate_from_corners(*[3 * side for side in views], BOARD, FLAT, table_view=14)
     assert len(thrice.rejected_views) == 24
@@ -308,7 +308,7 @@ def test_views_of_one_place_count_once(scene_maker, views):
     sigma = [float(np.sqrt(t @ f.rig.covariance[21:24, 21:24] @ t)) for f in (once, thrice)]
     assert_allclose(sigma[1], sigma[0], rtol=1e-3)
     # a board at rest in a video: other noise in every frame, the same place
-    scene = small_scene(scene_maker, n_views=12)
+    scene = small_scene(n_views=12)
     again = corner_views(scene, np.random.default_rng(9))
     rest = calibrate_from_corners(*[a + b for a, b in zip(views, again, strict=True)], BOARD, FLAT)
     assert len(rest.rejected_views) == 12
@@ -325,8 +325,8 @@ def test_an_image_that_is_missing_makes_no_two_views_one(views):
 
 @pytest.mark.statistical
 @pytest.mark.parametrize("zoom", [1.05, 0.95])
-def test_a_lens_that_was_zoomed_between_the_views_is_named_and_costs_its_later_images(scene_maker, zoom):
-    scene = scene_maker(n_views=20)
+def test_a_lens_that_was_zoomed_between_the_views_is_named_and_costs_its_later_images(zoom):
+    scene = make_scene(n_views=20)
     m, board = scene.model, scene.board
     right = m.rig.right
     zoomed = scene.with_rig(right=replace(right, fx=zoom * right.fx, fy=zoom * right.fy))
@@ -344,9 +344,9 @@ def test_a_lens_that_was_zoomed_between_the_views_is_named_and_costs_its_later_i
     assert np.abs((found.rig.t_right_left - m.rig.t_right_left) / sigma[21:24]).max() < 4
 
 
-def test_images_of_half_the_size_are_no_better_a_calibration(scene_maker):
+def test_images_of_half_the_size_are_no_better_a_calibration():
     """The same cameras with half the pixels, corners as uncertain in space: the same verdict, half the misfit in px."""
-    scene = small_scene(scene_maker, n_views=12)
+    scene = small_scene(n_views=12)
     m = scene.model
     half = tuple(
         replace(c, fx=c.fx / 2, fy=c.fy / 2, cx=c.cx / 2 - 0.25, cy=c.cy / 2 - 0.25, image_size=(120, 96))

@@ -21,6 +21,7 @@ from calibration.board.search import board_size, located, other_board
 from calibration.board.target import CharucoBoard, described, target_of
 from disctrack import calibrate_recording, read_recording
 from disctrack.errors import RecordingError
+from tests.oracles.drawn_boards import draw_board
 
 CHARUCO = CharucoBoard((9, 6), 12e-3, 8.5e-3, "DICT_4X4_50")
 K = np.array([[620.0, 0.0, 201.0], [0.0, 615.0, 148.0], [0.0, 0.0, 1.0]])
@@ -188,9 +189,9 @@ def test_a_target_that_is_not_wholly_declared_is_refused_by_its_key(keys, said, 
 
 
 @pytest.mark.statistical
-def test_images_of_another_board_are_told_by_its_size(board_drawer):
+def test_images_of_another_board_are_told_by_its_size():
     camera, R = Camera(700.0, 700.0, 160.0, 120.0, (0.0,) * 5, (320, 240)), cv2.Rodrigues(np.array([3.0, 0.2, 0.1]))[0]
-    image = board_drawer(camera, R, np.array([-0.03, 0.02, 0.3]), Board((7, 5), 8e-3), rng=np.random.default_rng(1))
+    image = draw_board(camera, R, np.array([-0.03, 0.02, 0.3]), Board((7, 5), 8e-3), rng=np.random.default_rng(1))
     declared = Board((8, 5), 8e-3)
     views = located([image] * 16, declared)
     assert all("8 of 8 images looked at show 7 x 5: inner_corners = [7, 5]" in view.reason for view in views)

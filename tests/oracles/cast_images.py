@@ -11,8 +11,8 @@ import numpy as np
 
 from calibration import Board, Camera
 from disctrack.disc import MA_2014
-from tests.calibration.conftest import draw_board, exposed, rays_of
 from tests.oracles import newton_euler
+from tests.oracles.drawn_boards import draw_board, exposed, rays_of
 from tests.oracles.point_laboratory import board_pose, cameras_of, pose_of
 
 SUB, BLUR = 4, 0.62  # rays per pixel and axis; of the lens [px]

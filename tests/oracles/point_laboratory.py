@@ -20,8 +20,8 @@ from disctrack.track.dots.template_response import Edge
 from disctrack.track.follow.following import Follower, Tables
 from disctrack.track.refine.assembly import Taken, TrackingSettings, assemble
 from disctrack.trajectory import FrameStatus, MarkerStatus
-from tests.calibration.conftest import corner_view
 from tests.oracles import newton_euler
+from tests.oracles.drawn_boards import corner_view
 
 G = 9.81
 BOARD_THICKNESS = 3e-3

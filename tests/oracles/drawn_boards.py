@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-import pytest
 
 from calibration import Board, Camera, CornerView, Observations, StereoModel, StereoRig
 from calibration.cameras.camera import project, rotation_from_vector
@@ -84,11 +83,6 @@ def squared(error, covariance) -> float:
     return float(z @ np.linalg.solve(covariance / np.outer(sigma, sigma), z)) / len(z)
 
 
-@pytest.fixture(scope="session")
-def scene_maker():
-    return make_scene
-
-
 PAD = 4  # pixels round an image that are drawn, too
 
 
@@ -142,8 +136,3 @@ def _stripes(X: Array) -> Array:
     footprint = np.hypot(*np.gradient(X))
     nearest = np.rint(X)
     return np.clip(2 * (X - nearest) / footprint, -1, 1) * np.where(nearest % 2 == 0, 1, -1)
-
-
-@pytest.fixture(scope="session")
-def board_drawer():
-    return draw_board
