@@ -14,6 +14,7 @@ from calibration import (
     Observations,
     Terms,
     calibrate_from_corners,
+    calibrate_from_points,
     refine_stereo,
 )
 from calibration.fit.board_motion import BoardMotion, motions
@@ -26,16 +27,19 @@ from calibration.rig_file import read_rig_file, write_rig
 from calibration.stereo import _observations
 from tests.calibration.test_refinement import rig_error
 from tests.oracles import moved_boards, point_laboratory
-from tests.oracles.drawn_boards import corner_view, make_scene, squared
+from tests.oracles.drawn_boards import make_scene, squared
 
 BOARD = Board(moved_boards.INNER_CORNERS, moved_boards.SQUARE)
 EXACT = BoardTolerances(square=0.0, flatness=0.0, thickness=0.0)
 SETTINGS = CalibrationSettings(distortion="k1 k2 p1 p2", board="flat", tolerances=EXACT)
 
 
+def calibrated_from(left, right, settings=SETTINGS, table_view=None):
+    return calibrate_from_points(left, right, BOARD, moved_boards.IMAGE_SIZE, 0.1, settings, table_view)
+
+
 def calibrated(rig, n, seed, **motion):
-    left, right = moved_boards.pairs(rig, n, seed, **motion)
-    return calibrate_from_corners([corner_view(p) for p in left], [corner_view(p) for p in right], BOARD, SETTINGS)
+    return calibrated_from(*moved_boards.pairs(rig, n, seed, **motion))
 
 
 def errors(found, rig):
@@ -123,13 +127,12 @@ def test_boards_that_were_held_still_count_for_more_than_those_that_moved():
     rig = moved_boards.make_rig(2)
     still, moving = (moved_boards.pairs(rig, 6, seed, shift=size, turn=size) for seed, size in ((1, 0.0), (2, 2e-3)))
     left, right = (np.concatenate(both) for both in zip(still, moving, strict=True))
-    found = calibrate_from_corners([corner_view(p) for p in left], [corner_view(p) for p in right], BOARD, SETTINGS)
+    found = calibrated_from(left, right)
     heeded = found.refinement.problem.motion.heeded
     assert heeded[:6].min() > 1.5 * heeded[6:].max()
     error, C = errors(found, rig)
     # the six still pairs alone
-    views = [[corner_view(p) for p in side[:6]] for side in (left, right)]
-    alone, _ = errors(calibrate_from_corners(*views, BOARD, SETTINGS), rig)
+    alone, _ = errors(calibrated_from(left[:6], right[:6]), rig)
     assert np.all(np.abs(error) < 4 * np.sqrt(np.diag(C)))
     assert np.linalg.norm(error[[0, 1, 4, 5]]) < 1.5 * np.linalg.norm(alone[[0, 1, 4, 5]]) + 0.3
 
@@ -208,12 +211,11 @@ def test_a_rig_file_keeps_where_the_boards_were(tmp_path):
 TOUCH = np.radians([0.05, -0.04, 0.03]), np.array([1e-4, 0.0, 0.0])  # 0.07 deg: 1.1 px
 
 
-def calibrated_in_parts(parts, table_view=None, noise=0.1, **motion):
+def calibrated_in_parts(parts, table_view=None, **motion):
     """parts : (rig, number of pairs) in the order in which the views are taken."""
-    taken = [moved_boards.pairs(rig, n, 10 + k, noise=noise, **motion) for k, (rig, n) in enumerate(parts)]
+    taken = [moved_boards.pairs(rig, n, 10 + k, **motion) for k, (rig, n) in enumerate(parts)]
     left, right = (np.concatenate(side) for side in zip(*taken, strict=True))
-    views = ([corner_view(p, noise) for p in side] for side in (left, right))
-    return calibrate_from_corners(*views, BOARD, SETTINGS, table_view)
+    return calibrated_from(left, right, SETTINGS, table_view)
 
 
 def pair_error(found, rig):
@@ -279,9 +281,7 @@ def mean_square(n, distortion="auto", board="auto", rigs=16, displaced=None):
     for seed in range(rigs):
         rig = moved_boards.make_rig(seed)
         points = None if displaced is None else moved_boards.board() + displaced[seed]
-        left, right = moved_boards.pairs(rig, n, seed, correlation=0.4, points=points)
-        views = [corner_view(p) for p in left], [corner_view(p) for p in right]
-        calibration = calibrate_from_corners(*views, BOARD, settings)
+        calibration = calibrated_from(*moved_boards.pairs(rig, n, seed, correlation=0.4, points=points), settings)
         found.append(squared(*errors(calibration, rig)))
         told.append(" ".join(calibration.warnings))
     return np.mean(found), told

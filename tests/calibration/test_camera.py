@@ -7,32 +7,21 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from calibration import Camera, StereoRig, triangulate
+from calibration import Camera, triangulate
 from calibration.cameras.camera import N_RIG, normalise, normalised_maps, project, rotation_from_vector
+from tests.oracles.drawn_boards import make_scene
 
 CAMERA = Camera(1500.0, 1510.0, 250.0, 260.0, (-0.11, 0.15, 1e-3, -2e-3, 0.02), (512, 512))
 
 
 @pytest.fixture
-def points(rng):
-    return rng.uniform([-0.07, -0.07, 0.35], [0.07, 0.07, 0.5], (200, 3))
-
-
-@pytest.fixture
 def rig():
-    turn, look = np.array([0.1, 0.5, 0.2]), np.array([1.0, 0.5, 0.2])
-    return StereoRig(
-        CAMERA,
-        Camera(1490.0, 1495.0, 262.0, 249.0, (-0.12, 0.2, -5e-4, 1e-3, 0.0), (512, 512)),
-        rotation_from_vector(turn),
-        np.array([0.1, 0.02, 0.1]),
-        rotation_from_vector(look),
-        np.array([0.0, 0.02, 0.5]),
-    )
+    look = rotation_from_vector(np.array([1.0, 0.5, 0.2]))
+    return make_scene().with_rig(left=CAMERA, R_left_world=look, t_left_world=np.array([0.0, 0.02, 0.5])).model.rig
 
 
-def test_projection_is_opencvs(points):
-    zero = np.zeros(3)
+def test_projection_is_opencvs(rng):
+    points, zero = rng.uniform([-0.07, -0.07, 0.35], [0.07, 0.07, 0.5], (200, 3)), np.zeros(3)
     expected, _ = cv2.projectPoints(points, zero, zero, CAMERA.camera_matrix, np.array(CAMERA.distortion))
     assert_allclose(project(points, CAMERA), expected.reshape(-1, 2), atol=1e-10)
 

@@ -6,7 +6,7 @@ import h5py
 import numpy as np
 import pytest
 
-from calibration import BoardNotFound, CalibrationSettings, Camera, RigFileError, StereoRig, calibrate_from_corners
+from calibration import BoardNotFound, CalibrationSettings, RigFileError, calibrate_from_corners
 from calibration.cameras.camera import N_RIG, Allowance, rotation_from_vector
 from calibration.cameras.splines import LensField
 from calibration.rig_file import read_rig, read_rig_file, record_of, write_rig
@@ -18,11 +18,8 @@ from tests.oracles.drawn_boards import make_scene
 @pytest.fixture
 def rig(rng):
     A = rng.normal(size=(N_RIG, N_RIG)) * 10.0 ** rng.uniform(-6, 0, N_RIG)[:, None]
-    return StereoRig(
-        left=Camera(2015.3, 2040.6, 255.2, 258.3, (-0.12, 0.38, 6e-4, -4e-4, 0.01), (512, 480)),
-        right=Camera(2053.4, 2051.8, 258.4, 251.8, (-0.10, 0.2, -5e-4, 3e-4, 0.0), (512, 480)),
-        R_right_left=rotation_from_vector(np.array([0.1, -0.9, 0.3])),
-        t_right_left=np.array([-0.37, -0.18, 0.2]),
+    return replace(
+        make_scene().model.rig,
         R_left_world=rotation_from_vector(np.array([2.0, 0.5, -0.3])),
         t_left_world=np.array([-0.02, 0.03, 0.49]),
         covariance=A @ A.T,

@@ -38,26 +38,15 @@ def small_scene(**options):
     return scene.with_rig(left=cameras[0], right=cameras[1])
 
 
-def draw(scene, rng, board=BOARD, sub=4):
-    m, rig = scene.model, scene.model.rig
-    images = ([], [])
-    for R, t in zip(m.R_left_board[:, 0], m.t_left_board[:, 0], strict=True):
-        images[0].append(draw_board(rig.left, R, t, board, sub=sub, rng=rng))
-        R, t = rig.R_right_left @ R, rig.R_right_left @ t + rig.t_right_left
-        images[1].append(draw_board(rig.right, R, t, board, sub=sub, rng=rng))
-    return images
-
-
 @pytest.fixture(scope="module")
 def drawn():
-    scene = small_scene(n_views=8)
-    return scene, draw(scene, np.random.default_rng(8))
-
-
-@pytest.fixture(scope="module")
-def calibrated(drawn):
-    scene, (left, right) = drawn
-    return scene, calibrate_stereo(left, right, BOARD, FLAT, table_view=3, board_thickness=THICKNESS)
+    scene, images, rng = small_scene(n_views=8), ([], []), np.random.default_rng(8)
+    m, rig = scene.model, scene.model.rig
+    for R, t in zip(m.R_left_board[:, 0], m.t_left_board[:, 0], strict=True):
+        images[0].append(draw_board(rig.left, R, t, BOARD, rng=rng))
+        R, t = rig.R_right_left @ R, rig.R_right_left @ t + rig.t_right_left
+        images[1].append(draw_board(rig.right, R, t, BOARD, rng=rng))
+    return scene, images
 
 
 def corner_views(scene, rng, sigma=0.02):
@@ -68,8 +57,9 @@ def corner_views(scene, rng, sigma=0.02):
     ]
 
 
-def test_lab_frame_from_images_is_right_within_its_uncertainty(calibrated):
-    scene, found = calibrated
+def test_lab_frame_from_images_is_right_within_its_uncertainty(drawn):
+    scene, (left, right) = drawn
+    found = calibrate_stereo(left, right, BOARD, FLAT, table_view=3, board_thickness=THICKNESS)
     R, t = table_pose(scene.model.R_left_board[3, 0], scene.model.t_left_board[3, 0], THICKNESS)
     points = np.array([[0.0, 0, 0], [50e-3, 0, 0], [0, 25e-3, 0], [25e-3, 10e-3, 10e-3]])
     m = scene.model

@@ -42,15 +42,15 @@ def pairs(
     rig: StereoRig,
     n: int,
     seed: int,
-    noise: float = 0.1,
     shift: float = 0.0,
     turn: float = 0.0,
     correlation: float = 0.0,
     points: NDArray | None = None,
+    places: tuple = ((-0.12, 0.2), (-0.1, 0.1), (0.4, 0.75)),
 ) -> tuple[NDArray, NDArray]:
-    """Left and right corners (n, 54, 2) [px] with noise [px]; neighbours' errors correlate by `correlation`.
+    """Left and right corners (n, 54, 2) [px] with noise of 0.1 px; neighbours' errors correlate by `correlation`.
 
-    points : (54, 3) [m] of a board that is not as declared
+    points : (54, 3) [m] of a board that is not as declared; places : of its middle [m], least and most of x, y, z
     """
     rng = np.random.default_rng(1000 + seed)
     points = board() if points is None else points
@@ -60,13 +60,13 @@ def pairs(
     seen: list[tuple[NDArray, NDArray]] = []
     while len(seen) < n:
         R = cv2.Rodrigues(rng.normal(size=3) * [0.35, 0.35, 0.15])[0]
-        place = np.array([rng.uniform(-0.12, 0.2), rng.uniform(-0.1, 0.1), rng.uniform(0.4, 0.75)])
+        place = np.array([rng.uniform(*between) for between in places])
         R_later, later = cv2.Rodrigues(turn * rng.normal(size=3))[0] @ R, place + shift * rng.normal(size=3)
         left = _image(arms @ R.T + place, rig.left)
         right = _image((arms @ R_later.T + later) @ rig.R_right_left.T + rig.t_right_left, rig.right)
-        errors = [root @ rng.normal(size=(len(points), 2)) * noise for _ in range(2)]
-        both = np.concatenate([left, right])
-        if np.all(both > EDGE) and np.all(both < np.array(IMAGE_SIZE) - 1 - EDGE):
+        errors = [root @ rng.normal(size=(len(points), 2)) * 0.1 for _ in range(2)]
+        both, farthest = np.concatenate([left, right]), np.array(rig.left.image_size) - 1 - EDGE
+        if np.all(both > EDGE) and np.all(both < farthest) and np.all((arms @ R.T + place)[:, 2] > 0.05):
             seen.append((left + errors[0], right + errors[1]))
     left, right = (np.stack(side) for side in zip(*seen, strict=True))
     return left, right
