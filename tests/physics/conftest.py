@@ -14,6 +14,8 @@ from disctrack import FrameStatus, Trajectory, frames
 from disctrack.analyse.derivatives import MotionState
 from disctrack.disc import MA_2014
 from disctrack.rolling import Model, Motion, simulate, steady_precession
+from disctrack.track.pose import DotsInFrames, PoseFits
+from disctrack.track.refine.assembly import Taken, trajectory_of
 
 
 @dataclass(frozen=True)
@@ -80,23 +82,10 @@ def as_tracked(truth: TrueMotion, rng, missing=(), noise=1.0, sensitivity=None, 
     camera = Camera(1000.0, 1000.0, 255.5, 255.5, (0.0, 0.0, 0.0, 0.0, 0.0), (512, 512))
     covariance = np.zeros((N_RIG, N_RIG)) if rig_covariance is None else rig_covariance
     rig = StereoRig(camera, camera, np.eye(3), np.array([-0.2, 0, 0]), covariance=covariance, world_is_table=True)
-    return Trajectory(
-        time=truth.time,
-        frame=np.arange(n),
-        q=np.column_stack([position, frames.unwrap_euler(frames.euler_from_rotation(R))]),
-        pose_covariance=np.broadcast_to(P if noise else pose_covariance(), (n, 6, 6)).copy(),
-        calibration_sensitivity=np.zeros((n, 6, N_RIG)) if sensitivity is None else sensitivity,
-        systematic_covariance=np.zeros((n, 6, 6)),
-        quaternion=frames.continuous_quaternions(frames.quaternion_from_rotation(R)),
-        frame_status=status,
-        reprojection_rms_px=np.full((n, 2), 0.02),
-        reduced_chi_square=np.ones(n),
-        markers_px=np.full((n, 2, 6, 2), np.nan),
-        markers_covariance_px2=np.full((n, 2, 6, 2, 2), np.nan),
-        markers_residual_px=np.full((n, 2, 6, 2), np.nan),
-        marker_status=np.zeros((n, 2, 6), np.uint8),
-        disc=MA_2014,
-        rig=rig,
-        frame_rate=1000.0,
-        gravity=9.81,
-    )
+    dots, good = np.full((n, 2, 6, 2), np.nan), np.zeros((n, 2, 6), np.uint8)  # no dot was looked at
+    stated = np.broadcast_to(P if noise else pose_covariance(), (n, 6, 6)).copy()
+    by_rig = np.zeros((n, 6, N_RIG)) if sensitivity is None else sensitivity
+    fits = PoseFits(R, position, stated, by_rig, dots, good == 0, np.ones(n), np.ones(n, int), np.ones(n, bool))
+    seen = DotsInFrames(rig, MA_2014, dots, dots[..., None, :].repeat(2, axis=-2), R, position)
+    taken = Taken(range(n), 1000.0, 9.81, truth.time)
+    return trajectory_of(seen, fits, np.zeros((n, 6, 6)), good[:, 0, 0], status, good, taken)

@@ -53,11 +53,6 @@ def test_honest_motions_are_not_contradicted(theta, seconds, k_m, nutation, spin
     assert abs(np.median(gravity) / 9.81 - 1) < max(5 * sigma / 9.81, 2e-3)
 
 
-def with_radius(trajectory: Trajectory, factor: float) -> Trajectory:
-    """The same poses of a disc whose radius is declared `factor` times as large."""
-    return replace(trajectory, disc=replace(trajectory.disc, radius=factor * trajectory.disc.radius))
-
-
 @pytest.mark.parametrize(
     ("wrong", "key", "true", "hint"),
     [
@@ -66,7 +61,8 @@ def with_radius(trajectory: Trajectory, factor: float) -> Trajectory:
         *[(lambda t, g=g: replace(t, gravity=g), "[gravity] g_m_s2", 9.81, hint)
           for g, hint in ((9810.0, "mm/s²"), (1.62, ""), (98.1, ""))],
         # the balance of moments alone knows radius / rate^2: that the rim is on the table tells which of the two it is
-        *[(lambda t, f=f: with_radius(t, f), "[disc] radius_mm", 37.5, "") for f in (2.0, 10.0)],
+        *[(lambda t, f=f: replace(t, disc=replace(t.disc, radius=f * t.disc.radius)), "[disc] radius_mm", 37.5, "")
+          for f in (2.0, 10.0)],
     ],
 )  # fmt: skip
 def test_a_number_that_the_balance_of_moments_contradicts_is_named_with_the_true_one(wrong, key, true, hint, honest):
@@ -78,27 +74,19 @@ def test_a_number_that_the_balance_of_moments_contradicts_is_named_with_the_true
     assert finding.doubtful
 
 
-def leaning(degrees: float):
-    """(3, 3) of a board that leans."""
-    return frames.rotation_from_vector(np.radians(degrees) * np.array([0.6, -0.8, 0.0]))
-
-
-def seen_in(Q, trajectory: Trajectory, height: float = 0.0) -> Trajectory:
-    """The same motion in a world that is turned by Q and lies lower."""
-    R = Q @ frames.rotation_from_quaternion(trajectory.quaternion)
-    q = np.column_stack(
-        [trajectory.q[:, :3] @ Q.T + [0.0, 0.0, height], frames.unwrap_euler(frames.euler_from_rotation(R))]
-    )
-    return replace(trajectory, q=q, quaternion=frames.continuous_quaternions(frames.quaternion_from_rotation(R)))
-
-
 @pytest.mark.parametrize(("theta", "seconds", "k_m", "nutation", "spin"), HONEST)
 @pytest.mark.parametrize("turn_deg", [3.0, 25.0])
 def test_a_table_view_whose_board_did_not_lie_on_the_table_is_named(turn_deg, theta, seconds, k_m, nutation, spin):
     """Before, the radius was said to be 0.5 mm: over another plane the height of the centre means nothing."""
     motion = true_motion(theta, seconds, k_m, nutation, spin=spin)
     trajectory = as_tracked(motion, np.random.default_rng(1), missing=range(50, 58))
-    (finding,) = contradictions(seen_in(leaning(turn_deg), trajectory, 0.02))
+    # the same motion in a world that leans and lies lower
+    Q = frames.rotation_from_vector(np.radians(turn_deg) * np.array([0.6, -0.8, 0.0]))
+    R = Q @ frames.rotation_from_quaternion(trajectory.quaternion)
+    position, angles = trajectory.q[:, :3] @ Q.T + [0.0, 0.0, 0.02], frames.euler_from_rotation(R)
+    q, quaternion = np.column_stack([position, frames.unwrap_euler(angles)]), frames.quaternion_from_rotation(R)
+    quaternion = frames.continuous_quaternions(quaternion)
+    (finding,) = contradictions(replace(trajectory, q=q, quaternion=quaternion))
     assert finding.remedies[0].key == "[table] view"
     assert f"turned by {turn_deg:.1f} deg" in finding.sentence
     assert finding.doubtful

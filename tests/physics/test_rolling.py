@@ -129,15 +129,11 @@ def slippery(mu, *effects):
     return Model(MA_2014, effects=(*effects, CATALOGUE["slip"](mu=mu)))
 
 
-def sliding_start():
-    """A disc at 40 deg whose centre moves 0.3 m/s too fast for rolling."""
-    rolling_state = steady_precession(np.radians(40), MA_2014, nutation_amplitude=0.05)
-    qdot = rolling.simulate(Model(MA_2014), rolling_state, times=[0.0]).qdot[0]
-    return rolling_state.moved(v_x=qdot[0] + 0.3, v_y=qdot[1] - 0.1)
-
-
 def test_slip_ends_where_an_independent_integration_ends_it_and_rolling_goes_on():
-    state, mu = sliding_start(), 0.35
+    """A disc at 40 deg whose centre moves 0.3 m/s too fast for rolling."""
+    state, mu = steady_precession(np.radians(40), MA_2014, nutation_amplitude=0.05), 0.35
+    qdot = rolling.simulate(Model(MA_2014), state, times=[0.0]).qdot[0]
+    state = state.moved(v_x=qdot[0] + 0.3, v_y=qdot[1] - 0.1)
     motion = rolling.simulate(slippery(mu), state, 0.15)
     assert [s.after for s in motion.switches] == [Regime.ROLLING]
     oracle = newton_euler.Disc(mu=mu)
@@ -190,13 +186,9 @@ def test_slip_starts_when_rolling_needs_more_than_the_cone_and_energy_falls_by_i
     assert_allclose(enough.q, free.q, atol=1e-12)
 
 
-@pytest.fixture
-def jump():
-    """A disc flung upwards about its edge so fast that the table would have to pull."""
-    return State(theta=np.radians(30), thetadot=35.0, omega2=10.0, omega3=1.0)
-
-
-def test_contact_is_lost_where_the_table_would_have_to_pull_and_the_flight_keeps_energy_and_momentum(jump):
+def test_contact_is_lost_where_the_table_would_have_to_pull_and_the_flight_keeps_energy_and_momentum():
+    """A disc flung upwards about its edge."""
+    jump = State(theta=np.radians(30), thetadot=35.0, omega2=10.0, omega3=1.0)
     motion = rolling.simulate(Model(MA_2014), jump, 0.5, rate=4000)
     assert motion.switches[0].after is Regime.FLYING
     flying = motion.regime == Regime.FLYING
