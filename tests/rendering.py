@@ -14,6 +14,19 @@ from disctrack.synthetic.description import Scene
 from disctrack.synthetic.images import expected_board_image, expected_disc_image, stages
 from disctrack.synthetic.sensor import digitise
 
+SMALL_SCENE = """
+[cameras]
+image_size = [128, 128]
+n_frames = 4
+[rig]
+mm_per_px = 1.0
+[board]
+n_views = 2
+max_tilt_deg = 20
+[motion]
+kind = "{kind}"
+"""
+
 
 def expected_disc(
     q: ArrayLike, rig: StereoRig, disc: Disc, scene: Scene | None = None, *, qdot=None, visible=None
@@ -68,10 +81,13 @@ def _digitised(expected, scene, rng):
     return np.array([[digitise(grey, scene.sensor, depth, next(noise)) for grey in pair] for pair in expected])
 
 
+def rolling_poses(disc: Disc, theta_deg: float, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Poses q (n, 6) of a disc that rolls from this nutation on, in the middle of the field, and their rates."""
+    motion = simulate(Model(disc, 9.81), steady_precession(np.radians(theta_deg), disc, 9.81), times=times)
+    return motion.q + np.pad([0.032, 0.02] - motion.q[:, :2].mean(axis=0), (0, 4)), motion.qdot
+
+
 def rolling_disc(rig: StereoRig, disc: Disc, scene: Scene, theta_deg: float, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Images of a disc that rolls from this nutation on, 1000 pairs/s, and its poses q (n, 6)."""
-    start = steady_precession(np.radians(theta_deg), disc, 9.81)
-    motion = simulate(Model(disc, 9.81), start, duration=(n - 0.5) / 1000)
-    q = motion.q[:n].copy()
-    q[:, :2] += np.array([0.032, 0.02]) - q[:, :2].mean(axis=0)
-    return render_disc(q, rig, disc, scene, np.random.default_rng(3), qdot=motion.qdot[:n]), q
+    """Images of it, 1000 pairs/s, and its poses."""
+    q, qdot = rolling_poses(disc, theta_deg, np.arange(n) / 1000)
+    return render_disc(q, rig, disc, scene, np.random.default_rng(3), qdot=qdot), q

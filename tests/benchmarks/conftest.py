@@ -10,6 +10,7 @@ import pytest
 from calibration import StereoRig
 from disctrack import Recording, calibrate_recording, open_pairs, read_recording
 from disctrack.track.measurement import ImagePairs
+from tests.pipeline.conftest import images_of
 
 MOST = 300  # pairs that are kept in memory
 
@@ -35,6 +36,5 @@ def pairs(recording: Recording) -> ImagePairs:
 @pytest.fixture(scope="session")
 def images(recording: Recording) -> np.ndarray:
     """The frames in memory, (n, 2, height, width)."""
-    opened = open_pairs(recording, (0, MOST))
     cv2.setNumThreads(1)
-    return np.stack([[opened.left.read(i), opened.right.read(i)] for i in range(len(opened))])
+    return images_of(recording, MOST)

@@ -11,18 +11,8 @@ import pytest
 import disctrack
 from disctrack.cli import main
 from disctrack.files.labelled_arrays import Variable
+from tests.rendering import SMALL_SCENE
 
-SCENE = """
-[cameras]
-image_size = [128, 128]
-n_frames = 4
-[rig]
-mm_per_px = 1.0
-[board]
-n_views = 2
-[motion]
-kind = "rolling"
-"""
 NAMES = [name for name in disctrack.__all__ if inspect.isclass(item := getattr(disctrack, name)) or callable(item)]
 
 
@@ -32,7 +22,7 @@ def measured(sample_clip, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("examples")
     shutil.copytree(sample_clip, folder / "clip", ignore=shutil.ignore_patterns("results"))
     assert main(["run", str(folder / "clip"), "--no-figures", "--no-video"]) == 0
-    (folder / "scene.toml").write_text(SCENE)
+    (folder / "scene.toml").write_text(SMALL_SCENE.format(kind="rolling"))
     return folder
 
 

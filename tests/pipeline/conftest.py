@@ -11,6 +11,8 @@ from disctrack import open_pairs
 from disctrack.cli import main
 
 SHORT = 24  # frames: enough for the noise to be measured
+QUICK = ["--no-figures", "--no-video"]
+MODEL = ["--distortion", "k1 k2 p1 p2", "--board", "flat"]  # choosing by held-out error is tested elsewhere
 
 
 @pytest.fixture(scope="session")
@@ -30,9 +32,16 @@ def short_recording(sample_clip, tmp_path_factory) -> Path:
 def rig_file(short_recording, tmp_path_factory) -> Path:
     """Rig of the short recording."""
     path = tmp_path_factory.mktemp("rig") / "rig.h5"
-    model = ["--distortion", "k1 k2 p1 p2", "--board", "flat"]  # choosing by held-out error is tested elsewhere
-    assert main(["calibrate", str(short_recording), "-o", str(path), "--no-figures", *model]) == 0
+    assert main(["calibrate", str(short_recording), "-o", str(path), "--no-figures", *MODEL]) == 0
     return path
+
+
+@pytest.fixture(scope="session")
+def untouched_file(short_recording, rig_file, tmp_path_factory) -> Path:
+    """Trajectory of the short recording, with this rig; not to be changed by a test."""
+    file = tmp_path_factory.mktemp("untouched") / "trajectory.h5"
+    assert main(["track", str(short_recording), "--rig", str(rig_file), "-o", str(file), *QUICK]) == 0
+    return file
 
 
 def linked(recording: Path, folder: Path, link=os.link) -> Path:

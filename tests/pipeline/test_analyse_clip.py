@@ -14,6 +14,7 @@ import disctrack
 from disctrack.cli import main
 from disctrack.recording.declaration_text import told_differences
 from disctrack.trajectory.file import read_group
+from tests.pipeline.conftest import QUICK
 
 
 @pytest.fixture(scope="module")
@@ -21,17 +22,11 @@ def analysed_clip(sample_clip, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("clip")
     rig, trajectory = folder / "rig.h5", folder / "trajectory.h5"
     assert main(["calibrate", str(sample_clip), "-o", str(rig), "--no-figures"]) == 0
-    assert (
-        main(["track", str(sample_clip), "--rig", str(rig), "-o", str(trajectory), "--no-figures", "--no-video"]) == 0
-    )
+    assert main(["track", str(sample_clip), "--rig", str(rig), "-o", str(trajectory), *QUICK]) == 0
     with contextlib.redirect_stdout(io.StringIO()) as said:
         assert main(["analyse", str(folder), "-o", str(folder / "report")]) == 0  # the folder's trajectory.h5
     (folder / "said.txt").write_text(said.getvalue())
     return trajectory
-
-
-def squared_error(found, true, sigma, sigma_calibration):
-    return float(np.mean((found - true) ** 2 / (sigma**2 + sigma_calibration**2)))
 
 
 def test_rates_from_images_agree_with_the_drawn_motion(analysed_clip, sample_clip):
@@ -42,7 +37,7 @@ def test_rates_from_images_agree_with_the_drawn_motion(analysed_clip, sample_cli
     names = ("velocity_x", "velocity_y", "velocity_z", "psidot", "thetadot", "phidot")
     for i, name in enumerate(names):
         sigma, common = motion[f"{name}_sigma"], motion[f"{name}_sigma_calibration"]
-        assert 0.3 < squared_error(motion[name], qdot[:, i], sigma, common) < 4, name
+        assert 0.3 < np.mean((motion[name] - qdot[:, i]) ** 2 / (sigma**2 + common**2)) < 4, name
     assert np.sqrt(np.mean((motion["velocity_x"] - qdot[:, 0]) ** 2)) < 5e-5  # [m/s]
 
 

@@ -33,10 +33,9 @@ from disctrack.batch.plan import make_plan
 from disctrack.batch.records import MEASURED, is_done, read_record
 from disctrack.track.follow.tracking import prepare
 from disctrack.trajectory.file import read_trajectory
-from tests.pipeline.conftest import linked
+from tests.pipeline.conftest import MODEL, linked
 
 FAST = ["--no-report"]
-MODEL = ["--distortion", "k1 k2 p1 p2", "--board", "flat"]  # choosing by held-out error is tested elsewhere
 
 
 def replace(file: Path, content: bytes) -> None:
@@ -348,21 +347,12 @@ def assert_whole(root: Path, reference: Path) -> int:
     return finished
 
 
-@pytest.fixture
-def undisturbed(recording, tmp_path) -> Path:
-    """The same day, measured without a fault, in this process."""
-    root = a_day(recording, tmp_path / "undisturbed", ("a",))
-    (job,) = jobs_of(root)
-    assert do(job).status == MEASURED
-    return root
-
-
 @pytest.mark.statistical
 @pytest.mark.parametrize("kills", [1, pytest.param(50, marks=pytest.mark.slow)])
-def test_a_batch_killed_at_random_instants_leaves_only_whole_results_and_can_go_on(
-    recording, tmp_path, undisturbed, kills
-):
-    root = a_day(recording, tmp_path / "day", ("a",))
+def test_a_batch_killed_at_random_instants_leaves_only_whole_results_and_can_go_on(recording, tmp_path, kills):
+    root, undisturbed = (a_day(recording, tmp_path / name, ("a",)) for name in ("day", "undisturbed"))
+    (job,) = jobs_of(undisturbed)
+    assert do(job).status == MEASURED  # in this process
     results = root / "a" / "results"
     process = start(root)
     wait_until(lambda: begun(root), process)

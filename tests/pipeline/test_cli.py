@@ -23,9 +23,7 @@ from disctrack.cli import COMMANDS, main
 from disctrack.commands import INTERRUPTED
 from disctrack.disc import MA_2014
 from disctrack.synthetic.description import Scene, load_scene
-from tests.pipeline.conftest import linked
-
-QUICK = ["--no-figures", "--no-video"]
+from tests.pipeline.conftest import QUICK, linked
 
 
 @pytest.mark.statistical
@@ -90,9 +88,9 @@ def test_track_takes_a_range_of_frames_and_keeps_the_length(recording, rig_file,
     assert_allclose(trajectory.time, np.arange(24) / trajectory.frame_rate, rtol=1e-12)
 
 
-@pytest.fixture
-def rested(recording) -> Path:
-    """The recording with 100 frames of rest before and after it: its first and its last pair, over and over.
+@pytest.mark.statistical
+def test_rest_before_and_after_the_motion_is_left_out_unless_asked_for(recording, cli):
+    """100 frames of rest before and after it: its first and its last pair, over and over.
 
     It is said to be slow, so that it lasts longer than what is measured whole in any case; the margin is 32 frames.
     """
@@ -107,14 +105,9 @@ def rested(recording) -> Path:
         for i in range(100):
             os.link(folder / "000100.png", folder / f"{i:06d}.png")
             os.link(folder / f"{last - 1:06d}.png", folder / f"{last + i:06d}.png")
-    return recording
-
-
-@pytest.mark.statistical
-def test_rest_before_and_after_the_motion_is_left_out_unless_asked_for(rested, cli):
-    path = rested / "results" / "trajectory.h5"
-    cli("run", rested, *QUICK)
-    text = (rested / "results" / "summary.txt").read_text()
+    path = recording / "results" / "trajectory.h5"
+    cli("run", recording, *QUICK)
+    text = (recording / "results" / "summary.txt").read_text()
     assert "rest in frames 0-" in text
     assert "first pass" in text
     trajectory = read_trajectory(path)
@@ -125,16 +118,16 @@ def test_rest_before_and_after_the_motion_is_left_out_unless_asked_for(rested, c
     assert (trajectory.frame_status[70:154] == FrameStatus.MEASURED).all()
     assert np.isnan(trajectory.q[still]).all()
     assert_allclose(trajectory.time, np.arange(224) / trajectory.frame_rate, rtol=1e-12)
-    assert "reused" in cli("run", rested, *QUICK).out
-    cli("run", rested, *QUICK, "--all", code=1)  # another setting: kept unless told
-    cli("run", rested, *QUICK, "--all", "--overwrite")
+    assert "reused" in cli("run", recording, *QUICK).out
+    cli("run", recording, *QUICK, "--all", code=1)  # another setting: kept unless told
+    cli("run", recording, *QUICK, "--all", "--overwrite")
     every = read_trajectory(path)
     assert (every.frame_status == FrameStatus.MEASURED).all()
     sigma = np.sqrt(np.diagonal(every.pose_covariance, axis1=1, axis2=2))
     change = np.abs(every.q - trajectory.q)[~still]
     assert (change[:, :3] < 0.5 * sigma[~still, :3]).all()  # noise laws measured on different frames
     with pytest.raises(SystemExit):
-        main(["run", str(rested), "--all", "--frames", "0:5"])
+        main(["run", str(recording), "--all", "--frames", "0:5"])
 
 
 @pytest.mark.statistical
@@ -227,16 +220,12 @@ def edit(recording: Path, written: str, found: str) -> None:
     (recording / "recording.toml").write_text(text.replace(written, found, 1))
 
 
-def put(file: Path, image: np.ndarray) -> None:
-    """Write another image; the file is linked to the original, which must stay."""
-    file.unlink()
-    assert cv2.imwrite(str(file), image)
-
-
 def change_images(recording: Path, change, cameras=("left", "right")) -> None:
     for camera in cameras:
         for file in (recording / camera).iterdir():
-            put(file, change(cv2.imread(str(file), cv2.IMREAD_UNCHANGED)))
+            image = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+            file.unlink()  # it is linked to the original, which must stay
+            assert cv2.imwrite(str(file), change(image))
 
 
 def in_colour(image: np.ndarray) -> np.ndarray:

@@ -14,22 +14,16 @@ from disctrack.cli import main
 from disctrack.faults.keys import Faults
 from disctrack.synthetic import description
 from disctrack.synthetic.recording import write_recording
+from disctrack.validate.rendered import scene_of
 from tests.oracles import newton_euler
 from tests.oracles.newton_euler import LEAD, of_the_paper
-
-G = 9.81
-CALIBRATION = ["--distortion", "k1 k2 p1 p2", "--board", "flat"]  # choosing by held-out error is tested elsewhere
+from tests.pipeline.conftest import MODEL, QUICK
 
 
 def small_scene(seed, n_frames, frame_rate):
     """A quarter of the pixels and few chessboard views."""
-    return description.Scene(
-        name="hidden",
-        seed=seed,
-        cameras=description.CameraSettings(image_size=(272, 272), frame_rate_hz=frame_rate, n_frames=n_frames),
-        rig=description.RigSettings(mm_per_px=0.42),
-        board=description.BoardSettings(n_views=12, square_mm=6.0, shift_mm=15.0),
-    )
+    scene = scene_of(seed, quick=True)
+    return replace(scene, cameras=replace(scene.cameras, frame_rate_hz=frame_rate, n_frames=n_frames))
 
 
 def hide(folder, scene, body, faults=None):
@@ -47,7 +41,7 @@ def diagnosis_of(recording, model="paper"):
     out = recording.parent / "out"
     if not (out / "trajectory.h5").exists():
         # 3: a doubt is told, as a camera that is late by 200 us leaves 11 times the dots' scatter
-        assert main(["run", str(recording), "-o", str(out), "--no-figures", "--no-video", *CALIBRATION]) in (0, 3)
+        assert main(["run", str(recording), "-o", str(out), *QUICK, *MODEL]) in (0, 3)
     # a hollow table is a doubt about the thickness of the disc to the tracking: diagnosed anyway, and told again
     asked = ["-o", str(out / "diagnosis"), "--overwrite", "--anyway", "--model", str(model)]
     assert main(["diagnose", str(out / "trajectory.h5"), *asked]) in (0, 3)
@@ -71,18 +65,12 @@ def assert_found(document, hidden):
     assert document["after"]["held_out"]["ratio_to_noise_floor"] < 1.2
 
 
-def tilted(slope, direction):
-    """Gravity in the axes of a table that descends by `slope` towards `direction`."""
-    x, y = slope * np.cos(direction), slope * np.sin(direction)
-    return {"gravity": (G * x, G * y, -G * np.sqrt(1 - slope**2))}, {"table_tilt": {"tilt_x": x, "tilt_y": y}}
-
-
 @pytest.mark.statistical
 def test_a_tilted_table_in_images_of_an_independent_motion_is_found_and_sized(tmp_path):
-    scene = small_scene(41, 70, 300.0)
-    changes, truth = tilted(0.0061, 2.0)
-    document = diagnosis_of(hide(tmp_path, scene, of_the_paper(**changes)))
-    assert_found(document, truth)
+    x, y = 0.0061 * np.cos(2.0), 0.0061 * np.sin(2.0)  # by which the table descends
+    body = of_the_paper(gravity=(9.81 * x, 9.81 * y, -9.81 * np.sqrt(1 - x**2 - y**2)))
+    document = diagnosis_of(hide(tmp_path, small_scene(41, 70, 300.0), body))
+    assert_found(document, {"table_tilt": {"tilt_x": x, "tilt_y": y}})
     assert document["before"]["reduced_chi_square"] > 10
 
 

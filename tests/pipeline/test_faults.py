@@ -17,8 +17,8 @@ from disctrack.synthetic import recording as render_recording
 from disctrack.synthetic.description import Scene
 from disctrack.trajectory import FrameStatus
 from disctrack.trajectory.file import read_details, read_trajectory
-
-QUICK = ["--no-figures", "--no-video"]
+from tests.pipeline.conftest import QUICK
+from tests.rendering import SMALL_SCENE
 
 
 def measured(recording, code: int = 0):
@@ -28,21 +28,8 @@ def measured(recording, code: int = 0):
     return read_trajectory(file), read_details(file)
 
 
-@pytest.fixture(scope="session")
-def untouched_file(short_recording, rig_file, tmp_path_factory):
-    """Trajectory file of the recording without any fault."""
-    file = tmp_path_factory.mktemp("untouched") / "trajectory.h5"
-    assert main(["track", str(short_recording), "--rig", str(rig_file), "-o", str(file), *QUICK]) == 0
-    return file
-
-
-@pytest.fixture(scope="session")
-def untouched(untouched_file):
-    """Trajectory of the recording without any fault."""
-    return read_trajectory(untouched_file)
-
-
-def test_frames_missing_in_one_piece_are_lost_one_without_its_pair_is_not_and_time_goes_on(recording, untouched):
+def test_frames_missing_in_one_piece_are_lost_one_without_its_pair_is_not_and_time_goes_on(recording, untouched_file):
+    untouched = read_trajectory(untouched_file)
     (recording / "right" / "000015.png").unlink()
     for camera in ("left", "right"):
         for i in (8, 9, 10):
@@ -201,18 +188,6 @@ def test_random_command_lines_end_with_an_exit_code_and_no_internal_error(tmp_pa
         assert code in (0, 1, 2), (words, capsys.readouterr().err)
 
 
-SMALL = """
-[cameras]
-image_size = [128, 128]
-n_frames = 3
-[rig]
-mm_per_px = 1.0
-[board]
-n_views = 2
-max_tilt_deg = 20
-[motion]
-kind = "{kind}"
-"""
 COUNTS = {"n_frames", "n_views", "subpixels", "threads"}  # large ones are lawful, and only take long
 WRONG_KINDS = ("word", True, [], [[]], [1.0], "", "\0", {})
 
@@ -248,7 +223,7 @@ def test_random_scenes_end_in_a_recording_or_a_sentence(tmp_path, capsys, n):
     rng = np.random.default_rng(1414)
     keys = list(leaves(Scene()))
     for i in range(n):
-        lines = tomllib.loads(SMALL.format(kind=rng.choice(["static", "rolling"])))
+        lines = tomllib.loads(SMALL_SCENE.format(kind=rng.choice(["static", "rolling"])))
         for j in rng.integers(0, len(keys), rng.integers(1, 3)):
             path, default = keys[j]
             part = lines

@@ -20,31 +20,25 @@ from disctrack.trajectory.file import read_details
 from tests.disctrack.recording.readers.written import write_hdf5
 from tests.equality import assert_equal
 from tests.oracles.camera_files import write_mraw
+from tests.pipeline.conftest import MODEL, QUICK, linked
 
-QUICK = ["--no-figures", "--no-video"]
 CAMERAS = ("left", "right")
 OURS = {"Record_Rate": "1000", "Shutter_Type2": "50000"}  # of a Photron header: as declared, and 50 µs
 
 
-def tracked(source, rig_file, folder, declared=""):
-    """Trajectory from the PNG files, with the same rig."""
-    shutil.copytree(source, folder)
-    file = folder / "recording.toml"
-    file.write_text(file.read_text().replace("[cameras]", f"[cameras]\n{declared}", 1))
-    path = folder / "trajectory.h5"
-    assert main(["track", str(folder), "--rig", str(rig_file), "-o", str(path), *QUICK]) == 0
-    return read_trajectory(path)
-
-
 @pytest.fixture(scope="module")
-def from_png(short_recording, rig_file, tmp_path_factory):
-    return tracked(short_recording, rig_file, tmp_path_factory.mktemp("png") / "recording")
+def from_png(untouched_file):
+    return read_trajectory(untouched_file)
 
 
 @pytest.fixture(scope="module")
 def from_png_of_50_us(short_recording, rig_file, tmp_path_factory):
     """With the exposure declared that the cameras' headers tell."""
-    return tracked(short_recording, rig_file, tmp_path_factory.mktemp("png") / "recording", "exposure_us = 50")
+    folder = linked(short_recording, tmp_path_factory.mktemp("png") / "recording")
+    file, path = folder / "recording.toml", folder / "trajectory.h5"
+    file.write_text(file.read_text().replace("[cameras]", "[cameras]\nexposure_us = 50", 1))
+    assert main(["track", str(folder), "--rig", str(rig_file), "-o", str(path), *QUICK]) == 0
+    return read_trajectory(path)
 
 
 def grey_values(folder: Path) -> np.ndarray:
@@ -120,8 +114,7 @@ def test_chessboard_views_in_one_file_per_camera_give_the_same_rig(short_recordi
     write_hdf5(tmp_path / "right.h5", views["right"], compression="gzip")
     text = text.replace("calibration/left/*.png", "left.cih").replace("calibration/right/*.png", "right.h5")
     (tmp_path / "recording.toml").write_text(text)
-    model = ["--distortion", "k1 k2 p1 p2", "--board", "flat", "--no-figures"]
-    assert main(["calibrate", str(tmp_path), "-o", str(tmp_path / "rig.h5"), *model]) == 0
+    assert main(["calibrate", str(tmp_path), "-o", str(tmp_path / "rig.h5"), *MODEL, "--no-figures"]) == 0
     assert_equal(read_rig(tmp_path / "rig.h5"), read_rig(rig_file))
 
 
@@ -176,7 +169,7 @@ def frames_of(folder: Path) -> np.ndarray:
 def test_rig_and_poses_are_those_of_two_cameras_to_the_last_bit(halves, sample_clip, tmp_path):
     np.testing.assert_array_equal(frames_of(halves), frames_of(sample_clip))
     for folder, result in ((halves, "one"), (sample_clip, "two")):
-        asked = ["--frames", f"0:{FRAMES}", "--no-figures", "--no-video", "--output", str(tmp_path / result)]
+        asked = ["--frames", f"0:{FRAMES}", *QUICK, "--output", str(tmp_path / result)]
         assert main(["run", str(folder), *asked]) == 0
     assert_equal(*(read_rig(tmp_path / result / "rig.h5") for result in ("one", "two")))
     one, two = (read_trajectory(tmp_path / result / "trajectory.h5") for result in ("one", "two"))
