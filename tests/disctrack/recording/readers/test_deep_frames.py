@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 from disctrack import measure_pairs
 from disctrack.commands.sample import SCENE
 from disctrack.synthetic.cameras import rig_of
-from disctrack.synthetic.description import Scene, load_scene
+from disctrack.synthetic.description import load_scene
 from disctrack.synthetic.motion import motion_of
 from disctrack.track.video_overlay import draw_pair
 from tests.rendering import render_disc
@@ -17,22 +17,20 @@ from tests.rendering import render_disc
 N = 24
 
 
-def dim_scene(light: float) -> Scene:
-    """The sample clip's scene by little light, with a sensor whose noise is far below a grey value of 8 bits."""
+@pytest.fixture(scope="module")
+def dim():
+    """12-bit images (N, 2, h, w) at 8 % of the light, their rig, disc and true centres (N, 3) [m].
+
+    The sample clip's scene, with a sensor whose noise is far below a grey value of 8 bits.
+    """
     scene = load_scene(SCENE)
     surfaces = ("paper", "dot", "rim", "side", "underside")
-    return replace(
+    scene = replace(
         scene,
-        appearance=replace(scene.appearance, **{name: light * getattr(scene.appearance, name) for name in surfaces}),
+        appearance=replace(scene.appearance, **{name: 0.08 * getattr(scene.appearance, name) for name in surfaces}),
         cameras=replace(scene.cameras, n_frames=N, bit_depth=12),
         sensor=replace(scene.sensor, read_noise_dn=0.05),
     )
-
-
-@pytest.fixture(scope="module")
-def dim():
-    """12-bit images (N, 2, h, w) at 8 % of the light, their rig, disc and true centres (N, 3) [m]."""
-    scene = dim_scene(0.08)
     q = motion_of(scene)[0](np.arange(N) / 1000.0)
     rig, disc = rig_of(scene), scene.declared_disc
     return render_disc(q, rig, disc, scene, np.random.default_rng(5)), rig, disc, q[:, :3]
