@@ -58,10 +58,6 @@ class DecayMember:
         return self.reduction.reduce(values, names)
 
 
-def build(item):
-    return DecayMember(item)
-
-
 def runs(rng, n, drag=0.0, rate=0.8, **changed):
     """(name, data, labels, covariates, density) of n runs; changed: run_3={"rate": 0.9, "mass": 2.0, ...}."""
     items = []
@@ -100,9 +96,3 @@ def fitted_at_once(items, extra=()):
     covariance = np.linalg.inv(found.jac.T @ found.jac)
     k = len(names)
     return dict(zip(names, found.x[:k], strict=True)), np.sqrt(np.diag(covariance))[:k], 2 * found.cost
-
-
-def renamed(item, **labels):
-    """The same run with other labels."""
-    name, data, known, covariates, density = item
-    return (name, data, {**known, **labels}, covariates, density)

@@ -45,6 +45,7 @@ class Disc:
     carries: tuple | None = None  # velocity (3,) of the table's surface at the origin, and its rate of turn
     gives_way: float = 0.0  # compliance of a table that `yielding` makes move [m/N]
     wears: float = 0.0  # [m/s] by which the radius shrinks; `r` is that of the instant
+    rate_of_memory: Callable | None = None  # (disc, instant, memory) -> rate of one more number, which laws may read
     t: float = 0.0  # the instant that laws may ask for
 
     def __post_init__(self):
@@ -210,21 +211,14 @@ def rate(disc, state, regime):
     a, omegadot, _, now = accelerations(disc, state, regime)
     w, v = state[3], state[4:7]  # of the quaternion
     spin = 0.5 * np.array([-now.omega @ v, *(w * now.omega + np.cross(now.omega, v))])
-    return np.concatenate([now.v, spin, a, omegadot, [now.psidot, now.phidot]])
+    memory = [disc.rate_of_memory(disc, now, now.memory[0])] if disc.rate_of_memory else []
+    return np.concatenate([now.v, spin, a, omegadot, [now.psidot, now.phidot], memory])
 
 
-def follow(disc, state, times, regime="rolling", rtol=1e-11, atol=1e-12, events=None, method="DOP853"):
+def follow(disc, state, times, regime="rolling", **options):
     """solve_ivp over the times; returns its result."""
-    return solve_ivp(
-        lambda t, s: rate(disc.at(t), s, regime),
-        (times[0], times[-1]),
-        state,
-        method,
-        times,
-        rtol=rtol,
-        atol=atol,
-        events=events,
-    )
+    options = {"method": "DOP853", "rtol": 1e-11, "atol": 1e-12} | options
+    return solve_ivp(lambda t, s: rate(disc.at(t), s, regime), (times[0], times[-1]), state, t_eval=times, **options)
 
 
 def coordinates(disc, states):

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calibration import Board, CalibrationSettings, calibrate_from_points
+from calibration import Board, CalibrationSettings, calibrate_from_corners
 from disctrack.disc import MA_2014
 from disctrack.frames import rotation_from_quaternion, vector_from_rotation
 from disctrack.track.dots._kernels import DOT
@@ -21,6 +21,7 @@ from disctrack.track.follow.following import Follower, Tables
 from disctrack.track.refine.assembly import Taken, TrackingSettings, assemble
 from disctrack.trajectory import FrameStatus, MarkerStatus
 from tests.oracles import newton_euler
+from tests.oracles.drawn_boards import corner_view
 
 G = 9.81
 BOARD_THICKNESS = 3e-3
@@ -130,10 +131,10 @@ def calibration_of(plan, cameras, target, rng, settings=None):
         R, t = board_pose(view, plan, target, rng)
         for side, camera in zip(views, cameras, strict=True):
             seen = camera.project(points @ R.T + t) + CORNER_PX * rng.normal(size=(len(points), 2))
-            side.append(seen)
+            side.append(corner_view(seen, CORNER_PX, (camera.size, camera.size)))
     if settings is None:
         settings = CalibrationSettings(*TERMS[plan.lens_field > 0])
-    return calibrate_from_points(*views, board, (plan.size, plan.size), CORNER_PX, settings, 0, BOARD_THICKNESS)
+    return calibrate_from_corners(*views, board, settings, 0, BOARD_THICKNESS)
 
 
 def pose_of(q):

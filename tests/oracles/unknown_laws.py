@@ -14,7 +14,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicHermiteSpline
 
 from disctrack.synthetic.description import Scene
@@ -38,7 +37,7 @@ class Unknown:
     omega3: float = 0.6
     duration: float = 0.7
     rate_of_memory: Callable | None = None  # (disc, instant, memory) -> rate of one more number, which the law reads
-    remembered: Callable | None = None  # (instant) -> that number at the start; psidot^2, if not given
+    remembered: Callable = lambda now: 0.0  # (instant) -> that number at the start; nothing, if not given
     wears: float = 0.0  # [m/s] by which the radius shrinks
     com: Callable | None = None  # instant -> centre of mass in the body
     friction: Callable | None = None  # slip speed -> coefficient: the disc slips, and there is no true moment
@@ -238,7 +237,9 @@ UNKNOWN: dict[str, Unknown] = {
     "torque_by_attitude": Unknown(moment(lambda d, n: 6e-4 * np.cross(n.d, level(0.4)))),
     "quadratic_spring": Unknown(force(lambda d, n: -40.0 * np.linalg.norm(n.O[:2]) * np.array([*n.O[:2], 0.0]))),
     "hysteresis": Unknown(
-        lambda d, n: (ZERO, -4e-8 * n.memory[0] * n.m0, ZERO), rate_of_memory=lambda d, n, z: (n.psidot**2 - z) / 0.05
+        lambda d, n: (ZERO, -4e-8 * n.memory[0] * n.m0, ZERO),
+        rate_of_memory=lambda d, n, z: (n.psidot**2 - z) / 0.05,
+        remembered=lambda n: n.psidot**2,
     ),
     "periodic_kicks": Unknown(kicks(0.06, 2e-5, 0.9)),
     "eddy_half": Unknown(force(lambda d, n: -0.02 * smooth((n.O[0] - 0.032) / 1e-4) * n.v * (1, 1, 0))),
@@ -275,19 +276,16 @@ UNKNOWN: dict[str, Unknown] = {
         lambda d, n: (-4e-6 * (n.omega @ n.d - n.memory[0]) * n.d, ZERO, ZERO),
         omega3=1.5,
         rate_of_memory=lambda d, n, z: (n.omega @ n.d - z) / 0.1,
-        remembered=lambda n: 0.0,
     ),
     "thrust": Unknown(force(lambda d, n: 3e-3 * n.d)),
     "twisted_thread": Unknown(
         moment(lambda d, n: -3e-6 * n.memory[0] * K),
         rate_of_memory=lambda d, n, z: n.omega[2],
-        remembered=lambda n: 0.0,
         omega3=1.5,
     ),
     "worn_in": Unknown(  # friction that falls with the distance rolled
         by_load(lambda d, n: -1.5e-4 * np.exp(-n.memory[0] / 0.4) * rolling(n)),
         rate_of_memory=lambda d, n, z: d.r * np.linalg.norm(n.omega - n.omega[2] * K),
-        remembered=lambda n: 0.0,
     ),
     "cross_drag": Unknown(force(lambda d, n: 6e-4 * n.psidot * n.sine * n.n0)),
     "nail": Unknown(nail(3e-10, (0.05, 0.01, -0.02))),
@@ -296,13 +294,11 @@ UNKNOWN: dict[str, Unknown] = {
         rate_of_memory=lambda d, n, z: (
             2e-4 * d.m * 9.81 / (1 + z / 2e-4) * np.linalg.norm(n.omega - n.omega[2] * K) - z / 0.3
         ),
-        remembered=lambda n: 0.0,
     ),
     "slipping_thread": Unknown(  # which holds up to a moment, and slips
         moment(lambda d, n: -6e-5 * n.memory[0] * K),
         omega3=1.5,
         rate_of_memory=lambda d, n, z: n.omega[2] - abs(n.omega[2]) * z / 0.25,
-        remembered=lambda n: 0.0,
     ),
     "presliding": Unknown(  # friction that builds up over a way, by Dahl
         by_load(lambda d, n: -1.5e-4 * n.memory[0] * n.m0),
@@ -312,7 +308,6 @@ UNKNOWN: dict[str, Unknown] = {
     "loose_ball": Unknown(  # in a tube of the face, in oil
         lambda d, n: (np.cross(n.memory[0] * n.R[:, 0], -0.0981 * K), ZERO, ZERO),
         rate_of_memory=lambda d, n, z: (-3e-3 * n.R[2, 0] - z) / 0.02,
-        remembered=lambda n: 0.0,
     ),
     "two_materials": Unknown(
         both(
@@ -335,7 +330,7 @@ def motion(unknown: Unknown):
     laws = [newton_euler.precession_friction(K_M), *([unknown.law] if unknown.law else [])]
     sizes = DISC.radius, DISC.half_thickness, DISC.mass
     how = {"friction": unknown.friction, "wanders": unknown.com, "wears": unknown.wears}
-    body = newton_euler.Disc(*sizes, laws=laws, **how)
+    body = newton_euler.Disc(*sizes, laws=laws, **how, rate_of_memory=unknown.rate_of_memory)
     regime = "rolling" if unknown.friction is None else "slipping"
     theta = np.radians(unknown.theta_deg)
     omega2 = np.sqrt(4 * 9.81 * np.sin(theta) / body.r)
@@ -344,22 +339,15 @@ def motion(unknown: Unknown):
     if regime == "slipping":
         state[7:9] += (5e-3, -3e-3)
     if unknown.rate_of_memory is not None:
-        now = newton_euler.Instant(body, state)
-        state = np.append(state, now.psidot**2 if unknown.remembered is None else unknown.remembered(now))
-
-    def rate(t, s):
-        ydot = newton_euler.rate(body.at(t), s, regime)
-        if unknown.rate_of_memory is None:
-            return ydot
-        return np.append(ydot, unknown.rate_of_memory(body, newton_euler.Instant(body, s), s[15]))
+        state = np.append(state, unknown.remembered(newton_euler.Instant(body, state)))
 
     def low(t, s):
         return newton_euler.Instant(body, s).sine - np.sin(np.radians(1.2))
 
     low.terminal = True
     times = np.arange(0.0, unknown.duration, 1 / SAMPLES)
-    method = "DOP853" if regime == "rolling" else "LSODA"
-    found = solve_ivp(rate, (0, times[-1]), state, method, times, rtol=1e-10, atol=1e-11, max_step=1e-3, events=low)
+    method = {"method": "DOP853" if regime == "rolling" else "LSODA"}
+    found = newton_euler.follow(body, state, times, regime, rtol=1e-10, atol=1e-11, max_step=1e-3, events=low, **method)
     assert found.success, found.message
     states = found.y.T
     q = newton_euler.coordinates(body, found.y[:15])

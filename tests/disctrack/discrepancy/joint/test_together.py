@@ -17,12 +17,12 @@ from disctrack.discrepancy.joint.fitting_in import Blocks, apart
 from disctrack.discrepancy.joint.sharing import JointSystem, Sharing
 from disctrack.discrepancy.search import Settings, explain
 from disctrack.errors import AnalysisError
-from tests.oracles.decaying_runs import build, fitted_at_once, renamed, runs
+from tests.oracles.decaying_runs import DecayMember, fitted_at_once, runs
 
 
 def joint(items, processes=1):
-    crew = Crew(build, items, processes)
-    sharing = Sharing([build(item).member for item in items])
+    crew = Crew(DecayMember, items, processes)
+    sharing = Sharing([DecayMember(item).member for item in items])
     crew.call("share", [([q.name for q in own],) for own in sharing.own])
     return JointSystem(sharing, crew), crew
 
@@ -150,7 +150,8 @@ def test_law_of_the_air_is_told_from_one_that_each_pressure_has_its_own(rng):
 
 
 def test_quantities_of_an_undeclared_kind_are_shared_by_all_who_do_not_declare_it(rng):
-    items = [renamed(item, surface="") for item in runs(rng, 3)] + runs(rng, 2)
+    items = [(name, data, labels | {"surface": ""}, *more) for name, data, labels, *more in runs(rng, 3)]
+    items += runs(rng, 2)
     system, _ = joint(items)
     assert [q.name for q in system.base] == ["friction.g[no surface declared]", "friction.g[glass]"]
 
@@ -264,7 +265,7 @@ def test_after_ctrl_c_the_processes_are_gone_without_a_word_of_their_own(tmp_pat
 
 
 def test_a_run_that_cannot_be_prepared_is_an_error_in_its_place(rng):
-    crew = Crew(build, [*runs(rng, 1), None])
+    crew = Crew(DecayMember, [*runs(rng, 1), None])
     good, bad = crew.call("share", [(["state.a", "state.b"],)] * 2)
     assert good is None
     assert isinstance(bad, AnalysisError)
