@@ -34,13 +34,9 @@ def independent(seed, f=0.0, axial=1.0):
     return Recorded(f"run {seed}", trajectory)
 
 
-@pytest.fixture(scope="module")
-def filmed():
-    return [independent(seed, F) for seed in range(4)]
-
-
 @pytest.mark.slow
-def test_air_that_single_recordings_do_not_show_is_found_in_four_and_another_disc_is_named(filmed):
+def test_air_that_single_recordings_do_not_show_is_found_in_four_and_another_disc_is_named():
+    filmed = [independent(seed, F) for seed in range(4)]
     alone = diagnose(filmed[0].trajectory).diagnosis
     assert "air_moffatt" not in {f.candidate.name for f in alone.found}
     answer = diagnose_together([*filmed[:2], independent(9, F, axial=1.02), *filmed[2:]])

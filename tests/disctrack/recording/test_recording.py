@@ -56,12 +56,10 @@ def message(folder: Path, text: str | bytes) -> str:
 
 def test_lengths_and_masses_become_si(tmp_path):
     recording = read_recording(write(tmp_path, REFERENCE))
-    assert recording.disc.radius == pytest.approx(0.0375)
-    assert recording.disc.half_thickness == pytest.approx(0.003)
-    assert recording.disc.mass == pytest.approx(0.20969)
-    assert_allclose(recording.disc.marker_centres_body[0], [0.026, 0, 0.003])
-    assert recording.chessboard.square == pytest.approx(0.008)
-    assert (recording.table.board_thickness, recording.table.source) == (pytest.approx(0.003), "both")
+    disc, board, table = recording.disc, recording.chessboard, recording.table
+    found = disc.radius, disc.half_thickness, disc.mass, *disc.marker_centres_body[0], board.square
+    assert_allclose((*found, table.board_thickness), [0.0375, 0.003, 0.20969, 0.026, 0, 0.003, 0.008, 0.003])
+    assert table.source == "both"
     assert recording.disc.thickness_tolerance is None  # not declared
     assert recording.board_tolerances.square is None
 

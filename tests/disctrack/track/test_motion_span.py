@@ -18,10 +18,8 @@ DOTS = np.array([[18.0, 0.0], [-9.0, 15.6], [-9.0, -15.6], [8.0, 9.0]])
 class DrawnCamera:
     """Frames of a disc with four dots at place(i) [px], drawn when asked for; None: no disc."""
 
-    def __init__(self, place: Callable[[int], tuple[float, float, float] | None], seed: int, **light) -> None:
-        self.place, self.seed = place, seed
-        self.brightness: Callable[[int], float] = light.get("brightness", lambda i: 1.0)
-        self.broken: frozenset[int] = frozenset(light.get("broken", ()))
+    def __init__(self, place, seed: int, brightness: Callable[[int], float] = lambda i: 1.0, broken=()) -> None:
+        self.place, self.seed, self.brightness, self.broken = place, seed, brightness, broken
         self.read_frames: list[int] = []
 
     def read(self, index: int, out=None):

@@ -49,11 +49,6 @@ def rolling(rendered_pairs):
     return rolling_disc(rendered_pairs.rig, rendered_pairs.disc, rendered_pairs.scene, 10, N)
 
 
-def pulls(trajectory, q):
-    """(n, 6) errors in their own sigmas."""
-    return np.abs(compare(trajectory, q).error) / np.sqrt(np.diagonal(trajectory.pose_covariance, axis1=1, axis2=2))
-
-
 def test_a_rolling_disc_is_measured_to_the_predicted_sigma(rolling, rendered_pairs):
     images, q = rolling
     result = tracked(images, rendered_pairs)
@@ -86,7 +81,8 @@ def test_the_number_of_workers_changes_no_bit_of_the_result(rolling, rendered_pa
     assert one.details == two.details
     for name in ("q", "pose_covariance", "calibration_sensitivity", "markers_px", "marker_status", "quaternion"):
         assert np.array_equal(getattr(one.trajectory, name), getattr(two.trajectory, name), equal_nan=True), name
-    change = pulls(one.trajectory, whole.trajectory.q)
+    sigma = np.sqrt(np.diagonal(one.trajectory.pose_covariance, axis1=1, axis2=2))
+    change = np.abs(compare(one.trajectory, whole.trajectory.q).error) / sigma
     # a template keeps its attitude until the pose has turned by a tolerance, which moves a dot by up to 1e-3 px of a
     # scatter of 4e-3 px; when that happens hangs on the last digit of a pose, and for some frames after a start
     assert change.max() < 0.5

@@ -20,13 +20,10 @@ from disctrack.validate.tables import write_into, write_validation
 GOAL_HEIGHT, GOAL_TILT = 5e-6, np.radians(5e-3)  # [m, rad] of the mean error in an imperfect laboratory
 
 
-def ideal(scene, *counts):
-    return [rendered.render_and_measure(case) for case in rendered.ideal_cases(scene, *counts)]
-
-
 @pytest.fixture(scope="module")
 def outcomes():
-    return ideal(rendered.scene_of(2014, quick=True), 24, 16)
+    cases = rendered.ideal_cases(rendered.scene_of(2014, quick=True), 24, 16)
+    return [rendered.render_and_measure(case) for case in cases]
 
 
 @pytest.fixture(scope="module")

@@ -224,17 +224,6 @@ def test_a_motor_that_runs_up_at_a_limited_current_is_not_led_astray(rng):
     assert np.mean(np.abs(law.force - truth) < 3 * law.sigma) > 0.85
 
 
-@pytest.mark.statistical
-def test_a_sensor_off_its_zero_that_loses_the_motion_at_once_is_found(rng):
-    answer = case(
-        ({"x": "v", "v": "-w**2*x - 2*b*v + g*drive"}, {"w": 6.5, "b": 0.15, "g": 12.0}),
-        ({"x": "v", "v": "-49*(x - 1.5) - 0.4*v + 10*drive"}, [1.5, 0.0]), (np.arange(0, 12, 0.02), {"x": 1e-3}),
-        [terms.coulomb("v"), terms.sensor_offset("x")], {}, {"drive": lambda t: np.cos(6.0 * t)},
-    )[0](rng)  # fmt: skip
-    assert_found(answer, ("offset_x",), {"offset_x.b": 1.5, "w": 7.0})
-    assert any("whole runs" in note for note in answer.notes)
-
-
 @pytest.mark.slow
 def test_friction_in_the_joint_of_a_chaotic_double_pendulum_is_named(rng):
     """Twenty seconds of which no model can follow more than six; masses, lengths and frictions are all fitted."""
@@ -566,6 +555,12 @@ CASES = {
         (np.arange(0, 40, 0.2), {"x": 0.05, "y": 0.05}),
         [*terms.products("x", ["x", "y"], 2), *terms.products("y", ["x", "y"], 2)], {"x_gets_x_x.amount": -0.02},
         told="whole runs",
+    ),
+    "a sensor off its zero": case(
+        ({"x": "v", "v": "-w**2*x - 2*b*v + g*drive"}, {"w": 6.5, "b": 0.15, "g": 12.0}),
+        ({"x": "v", "v": "-49*(x - 1.5) - 0.4*v + 10*drive"}, [1.5, 0.0]), (np.arange(0, 12, 0.02), {"x": 1e-3}),
+        [terms.coulomb("v"), terms.sensor_offset("x")], {"offset_x.b": 1.5, "w": 7.0},
+        {"drive": lambda t: np.cos(6.0 * t)}, told="whole runs",
     ),
     # which moves nothing before it begins: its derivative starts from nought at a kink, beside terms of the channel
     "an overflow": tank(
