@@ -223,6 +223,7 @@ def test_what_repeats_in_the_poses_is_carried_to_the_rates(rng):
     assert not silent.systematic_at(np.arange(5)).any()
 
 
+TOTAL, POWER, ADIABATIC, LEVEL = (COLUMN[name] for name in ("total", "power", "adiabatic", "precession_level"))
 SLIP, LOCUS, FORCE = from_to("slip_n", "slip_m"), from_to("locus_n", "locus_m"), from_to("force_n", "force_z")
 
 
@@ -271,12 +272,15 @@ def slip_to_roll():
     return simulate(model, start, 0.5)
 
 
-def test_slip_and_force_are_those_of_the_simulation(slip_to_roll):
+def test_slip_force_energy_and_power_are_those_of_the_simulation(slip_to_roll):
     q = exact(of_simulation(slip_to_roll))
     assert_allclose(q[:, SLIP], slip_to_roll.slip_velocity, atol=1e-13)  # terms of 1 m/s cancel
     # the point touches the table and does not leave it
     assert_allclose(q[:, [COLUMN["contact_z"], COLUMN["slip_z"]]], 0, atol=1e-13)
     assert_allclose(q[:, FORCE], slip_to_roll.contact_force, atol=1e-11)  # of 2 N
+    assert_allclose(q[:, TOTAL], slip_to_roll.energy, rtol=1e-12)
+    assert_allclose(q[:, POWER], slip_to_roll.power, atol=1e-12)
+    assert slip_to_roll.power.min() < -0.1  # slip takes energy
 
 
 @pytest.mark.statistical
@@ -332,16 +336,6 @@ def test_short_arc_gives_no_circle(rng):
     truth = true_motion(theta_deg=25, duration=0.6, nutation=0.1)[:25]
     circle = locus_circle(propagate(differentiate(as_tracked(truth, rng))), 0.6)
     assert np.isnan(circle.radius)
-
-
-TOTAL, POWER, ADIABATIC, LEVEL = (COLUMN[name] for name in ("total", "power", "adiabatic", "precession_level"))
-
-
-def test_energy_and_power_are_those_of_the_simulation(slip_to_roll):
-    E = exact(of_simulation(slip_to_roll))
-    assert_allclose(E[:, TOTAL], slip_to_roll.energy, rtol=1e-12)
-    assert_allclose(E[:, POWER], slip_to_roll.power, atol=1e-12)
-    assert slip_to_roll.power.min() < -0.1  # slip takes energy
 
 
 def test_datum_at_rest_is_what_makes_the_adiabatic_energy_right():
