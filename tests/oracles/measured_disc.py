@@ -55,9 +55,9 @@ def system_of(trajectory, names=None, model="paper"):
     return DiscSystem(trajectory, declared, None if names is None else motion_candidates(declared, names))
 
 
-def with_base_fit(trajectory, names=None, model="paper"):
+def with_base_fit(trajectory):
     """The same, and its base fit."""
-    system = system_of(trajectory, names, model)
+    system = system_of(trajectory)
     return system, fit(system, system.base, system.start())
 
 

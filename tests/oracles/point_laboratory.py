@@ -173,12 +173,12 @@ def tables_of(px, R, t, sigma):
     return Tables(results, measured[0], R.copy(), t.copy(), measured[1], np.zeros((n, 2), np.uint64))
 
 
-def tracked(px, R, t, times, rig, frame_rate, settings=None, workers=1):
+def tracked(px, R, t, times, rig, frame_rate):
     """What tracking makes of located dots (n, 2, m, 2), followed near poses R, t."""
     # no image is looked at
     follower = Follower(rig, MA_2014, None, (Edge(noise=NoiseModel(0.64, 0.02)),) * 2, measured=True)
     taken = Taken(range(len(px)), frame_rate, G, times)
-    return assemble([follower], tables_of(px, R, t, DOT_PX), settings or TrackingSettings(), taken, workers)
+    return assemble([follower], tables_of(px, R, t, DOT_PX), TrackingSettings(), taken, 1)
 
 
 def errors_and_variances(trajectory, R, t):

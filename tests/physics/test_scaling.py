@@ -13,15 +13,15 @@ from disctrack.examples.published_exponents import exponents_on
 from tests.physics.conftest import as_tracked, true_motion
 
 
-def known_law(n, rng, nutation=0.1, duration=0.6, unseen=0.03):
+def known_law(n, rng, nutation=0.1):
     """Time, psi, theta, psidot, energy that follow (t_f - t)^n with a nutation and the noise of a smoothed track."""
-    time = np.arange(0, duration - unseen, 1e-3)
-    t_f = duration + rng.uniform(0, 1e-3)
+    time = np.arange(0, 0.57, 1e-3)
+    t_f = 0.6 + rng.uniform(0, 1e-3)
     left = t_f - time
     psidot = 70 * left ** (-n / 2)
     psi = -70 * left ** (1 - n / 2) / (1 - n / 2)
     phase = 0.785 * psi + rng.uniform(0, 2 * np.pi)
-    a = nutation * (left / duration) ** 0.3
+    a = nutation * (left / 0.6) ** 0.3
     theta = 0.13 * left**n * np.exp(a * np.cos(phase) + a**2 / 2 * np.cos(2 * phase))
     ripple = np.exp(-0.8 * a * np.cos(phase) + 0.3 * a**2 * np.cos(2 * phase))
     psi = psi + np.cumsum(psidot * (ripple - 1)) * 1e-3

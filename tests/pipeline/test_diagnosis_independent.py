@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from disctrack.cli import main
-from disctrack.faults.keys import Faults
 from disctrack.synthetic import description
 from disctrack.synthetic.recording import write_recording
 from disctrack.validate.rendered import scene_of
@@ -26,24 +25,22 @@ def small_scene(seed, n_frames, frame_rate):
     return replace(scene, cameras=replace(scene.cameras, frame_rate_hz=frame_rate, n_frames=n_frames))
 
 
-def hide(folder, scene, body, faults=None):
+def hide(folder, scene, body):
     """Render the motion of a body into folder/recording, its truth elsewhere. Returns the recording's folder."""
     rate, n = scene.cameras.frame_rate_hz, scene.cameras.n_frames
     spline = newton_euler.filmed_motion(body, 14.0, 1.5, n / rate, rate)
     np.save(folder / "motion.npy", np.column_stack([spline.x, spline(spline.x)]))
     motion = description.MotionSettings("table", table="motion.npy")
-    scene = replace(scene, faults=faults or Faults(), motion=motion, folder=folder)
+    scene = replace(scene, motion=motion, folder=folder)
     write_recording(folder / "recording", scene, truth_path=folder / "elsewhere" / "truth.h5")
     return folder / "recording"
 
 
-def diagnosis_of(recording, model="paper"):
+def diagnosis_of(recording):
     out = recording.parent / "out"
-    if not (out / "trajectory.h5").exists():
-        # 3: a doubt is told, as a camera that is late by 200 us leaves 11 times the dots' scatter
-        assert main(["run", str(recording), "-o", str(out), *QUICK, *MODEL]) in (0, 3)
+    assert main(["run", str(recording), "-o", str(out), *QUICK, *MODEL]) in (0, 3)
     # a hollow table is a doubt about the thickness of the disc to the tracking: diagnosed anyway, and told again
-    asked = ["-o", str(out / "diagnosis"), "--overwrite", "--anyway", "--model", str(model)]
+    asked = ["-o", str(out / "diagnosis"), "--anyway"]
     assert main(["diagnose", str(out / "trajectory.h5"), *asked]) in (0, 3)
     return json.loads((out / "diagnosis" / "diagnosis.json").read_text())
 

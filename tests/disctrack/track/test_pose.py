@@ -42,10 +42,9 @@ def fitted(markers, covariance, rig, R, t, **how):
     return fit_poses(DotsInFrames(rig, MA_2014, markers, covariance, R, t), **how)
 
 
-def near(R, t, rng, angle=5e-3, shift=2e-4):
-    return frames.rotation_from_vector(rng.normal(scale=angle, size=(len(R), 3))) @ R, t + rng.normal(
-        scale=shift, size=t.shape
-    )
+def near(R, t, rng):
+    turn = frames.rotation_from_vector(rng.normal(scale=5e-3, size=(len(R), 3)))
+    return turn @ R, t + rng.normal(scale=2e-4, size=t.shape)
 
 
 def pose_error(fits, R, t):

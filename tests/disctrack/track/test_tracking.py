@@ -37,10 +37,10 @@ def blocks_of(images, readable=None, size=16):
     return read
 
 
-def tracked(images, pairs, *, readable=None, size=16, rig=None, disc=None, **options):
+def tracked(images, pairs, *, readable=None, size=16, disc=None, **options):
     """The images of the scene of these pairs tracked."""
     read = blocks_of(images, readable, size)
-    return track(read, Taken(range(len(images)), 1000.0), rig or pairs.rig, disc or pairs.disc, **options)
+    return track(read, Taken(range(len(images)), 1000.0), pairs.rig, disc or pairs.disc, **options)
 
 
 @pytest.fixture(scope="module")
