@@ -81,7 +81,7 @@ def test_what_was_found_supplies_the_missing_force(diagnosed):
     assert np.mean(left**2) < 2
 
 
-def test_table_holds_every_error_before_and_after(diagnosed):
+def test_page_says_the_sentence_and_shows_the_figures_and_every_error_before_and_after(diagnosed):
     page = (diagnosed[1] / "diagnosis.html").read_text()
     for row in (
         *("reduced chi-square of the dots", "rms of the dots [px]", "Ljung-Box", "highest line of the spectrum"),
@@ -91,10 +91,6 @@ def test_table_holds_every_error_before_and_after(diagnosed):
         assert row in page, row
     assert "too short for free runs of 0.3 and 0.5 s" in page  # 0.3 s of film
     assert not re.search(r"\bnan\b", re.sub(r"base64,[^\"]*", "", page))
-
-
-def test_page_shows_the_figures_and_says_the_sentence(diagnosed):
-    page = (diagnosed[1] / "diagnosis.html").read_text()
     assert "Missing in the model" in page
     assert page.count("<figure>") == len(list((diagnosed[1] / "figures").glob("*.png"))) >= 7
 
