@@ -183,8 +183,8 @@ def friction_numbers(trajectory: Trajectory) -> Row:
     and no more than a hint. `k_m_undetermined` says why there is no k_m.
     """
     try:
-        declared = declared_model(trajectory)
-        system = DiscSystem(trajectory, declared.model, candidates=(), known=declared.faults)
+        model, faults = declared_model(trajectory)
+        system = DiscSystem(trajectory, model, candidates=(), known=faults)
         found = fit(system, system.base, system.start())
     except AnalysisError as error:
         return {"k_m_undetermined": str(error)}

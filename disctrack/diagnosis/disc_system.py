@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence, Set
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -51,14 +51,7 @@ MOST_SIGMAS = 10.0  # of a size's tolerance, within which it is sought: else a w
 SLIP_STARTS = (0.9, 0.7, 0.5)  # of the friction that rolling needs at most
 
 
-@dataclass(frozen=True)
-class _Path:
-    """Motion of the disc as each camera meets it."""
-
-    q: Array  # (2, n, 6)
-    qdot: Array  # (2, n, 6)
-    names: tuple[str, ...]
-    by_motion: Array  # (n, 6, k) pose components (rotation vector) by `names`
+Path = tuple[Array, Array]  # q and qdot of the disc as each camera meets it, both (2, n, 6)
 
 
 class DiscSystem(LawSystem):
@@ -87,7 +80,7 @@ class DiscSystem(LawSystem):
         self.systematic = systematic or Systematic()
         self.columns_known: dict[tuple[str, int], tuple[Array, list[Array]]] = {}  # of `sought`, along a motion nearby
         self.known = dict(known or {})
-        self.measured: _Path | None = None  # in the place of a motion
+        self.measured: Path | None = None  # in the place of a motion
         self.notes: tuple[str, ...] = ()  # on the frames that were left out
         if rows is None:
             rows, self.notes = free_stretch(trajectory)
@@ -149,7 +142,7 @@ class DiscSystem(LawSystem):
         They are so small that their columns at the measured poses serve for every prediction. Directions of the
         calibration's covariance are in units of their own sigma.
         """
-        q = self._as_measured(scene_faults(self.disc, self.known).right_delay_s).q  # (2, n, 6), as each camera meets it
+        q, _ = self._as_measured(scene_faults(self.disc, self.known).right_delay_s)
         R, n = rotation_from_euler(*np.moveaxis(q[..., 3:], -1, 0)), len(self.time)
         points = self.disc.marker_centres_body @ np.swapaxes(R, -1, -2) + q[..., None, :3]
         seen = self.rig.project_with_jacobians(points)
@@ -172,15 +165,17 @@ class DiscSystem(LawSystem):
         quantities = _nuisances("rig", rig.shape[-1], "direction of the calibration's covariance", ("rig",))
         quantities += [replace(one, name=f"dot_{i}.{axis}") for i in range(m) for axis in "xy"]
         columns = [rig, dots.reshape(n, -1, 2 * m)]
-        together = sizes.lens_fields  # of all recordings of the rig
-        for name, size, length, own, meaning, fields in (
+        together = sizes.lens_places  # of all recordings of the rig
+        for name, size, length, own, meaning, of_rig in (
             ("lens_field", sizes.lens_px, sizes.lens_length_px, False, "mode of the lenses' residual fields", together),
             ("dot_field", sizes.dot_px, sizes.dot_length_px, True, "mode of the dots' own residual fields", ()),
         ):
             if size > 0:
-                shifts = size * field_columns(places, self.used, length, size * self.per_px, own, fields)
+                # for all of them, modes are kept down to where a field of ten sigmas of a single dot cannot be seen
+                sigmas = 10.0 if of_rig else size * self.per_px
+                shifts = size * field_columns(places, self.used, length, sigmas, own, of_rig)
                 columns.append(self.whitened(shifts))
-                quantities += _nuisances(name, shifts.shape[-1], meaning, ("rig",) if fields else ())
+                quantities += _nuisances(name, shifts.shape[-1], meaning, ("rig",) if of_rig else ())
         return tuple(quantities), np.concatenate(columns, axis=-1)
 
     def whitened(self, shifts: Array) -> Array:
@@ -188,13 +183,13 @@ class DiscSystem(LawSystem):
         found = np.einsum("ncmab,ncmbk->ncmak", self._whiten, shifts)
         return np.asarray(found.reshape(len(found), 2 * self.used[0].size, shifts.shape[-1]), float)
 
-    def _as_measured(self, delay: float = 0.0) -> _Path:
+    def _as_measured(self, delay: float) -> Path:
         """The measured motion, by a cubic through the poses; rows without a pose get what lies between."""
         q = self.trajectory.q[self.rows]
         known = np.isfinite(q).all(axis=1)
         course = CubicSpline(self.time[known], q[known])
         times = np.stack([self.time, self.time + delay])
-        return _Path(course(times), course(times, 1), (), np.zeros((len(q), 6, 0)))
+        return course(times), course(times, 1)
 
     def about_poses(self, known: Values) -> DiscSystem:
         """The same dots about their measured poses, which take the place of a motion, whatever its values.
@@ -283,14 +278,14 @@ class DiscSystem(LawSystem):
     def linearise(self, values: Values, names: Sequence[str]) -> tuple[Array, Array]:
         """Whitened dots (n, 4 m), observed minus predicted, and the prediction's derivative (n, 4 m, k)."""
         self.budget.work(len(names) * len(self.time))
-        path = self._path(values, names)
+        path, moved, by_motion = self._path(values, names)
         sight = self._sight(path, values)
         residual = self._residual(sight.pixels, values)
         derivative = np.zeros((*residual.shape, len(names)))
         column = {name: i for i, name in enumerate(names)}
-        if path.names:
+        if moved:
             whitened = (self._whiten @ sight.by_pose).reshape(*residual.shape, 6)
-            derivative[..., [column[n] for n in path.names]] = whitened @ path.by_motion
+            derivative[..., [column[n] for n in moved]] = whitened @ by_motion
         common = [n for n in names if n in self._nuisance_column]
         if common:
             mine = self._nuisance_columns[..., [self._nuisance_column[n] for n in common]]
@@ -303,7 +298,7 @@ class DiscSystem(LawSystem):
 
     def pixels(self, values: Values, with_nuisances: bool = False) -> Array:
         """Predicted images of the dots (n, 2, m, 2) [px], with the biases that nuisances stand for if wanted."""
-        pixels = self._sight(self._path(values, ()), values).pixels
+        pixels = self._sight(self._path(values)[0], values).pixels
         if not with_nuisances:
             return pixels
         whitened = (self._nuisance_columns @ self._nuisance_values(values)).reshape(pixels.shape)
@@ -312,7 +307,8 @@ class DiscSystem(LawSystem):
 
     def poses(self, values: Values) -> Array:
         """Predicted coordinates q (n, 6) in the left camera's instants, in axes of the true table."""
-        return self._path(values, ()).q[0]
+        (q, _), *_ = self._path(values)
+        return q[0]
 
     def pose_residual(self, values: Values) -> Array:
         """(n, 6) part of the whitened residual that a free pose per frame would take: six numbers of variance 1."""
@@ -342,7 +338,7 @@ class DiscSystem(LawSystem):
 
     def pose_equations(self, values: Values) -> tuple[Array, Array, Array]:
         """Residual (n, 4 m), its derivative (n, 4 m, 6) and normal matrix (n, 6, 6) by a free pose per frame."""
-        sight = self._sight(self._path(values, ()), values)
+        sight = self._sight(self._path(values)[0], values)
         r = self._residual(sight.pixels, values)
         J = (self._whiten @ sight.by_pose).reshape(len(r), -1, 6)
         normal = np.swapaxes(J, 1, 2) @ J
@@ -361,10 +357,14 @@ class DiscSystem(LawSystem):
     def _rows_of(self, pixels: Array) -> Array:
         return np.asarray((self._whiten @ pixels[..., None]).reshape(len(self.time), -1), float)
 
-    def _path(self, values: Values, names: Sequence[str]) -> _Path:
-        """Motion at the true instants of both cameras, and the derivatives that belong to it."""
+    def _path(self, values: Values, names: Sequence[str] = ()) -> tuple[Path, tuple[str, ...], Array]:
+        """Motion at the true instants of both cameras, and by which of the names it moves.
+
+        Their derivatives (n, 6, k) are those of pose components, of the rotation by its vector.
+        """
+        still = np.zeros((len(self.time), 6, 0))
         if self.measured is not None:
-            return self.measured
+            return self.measured, (), still
         times, delay = self.instants(values), scene_faults(self.disc, values).right_delay_s
         model, state = self.model_with({k: v for k, v in values.items() if np.isfinite(v)}), state_of(values)
         # a step of the fit may lead where no disc rolls, and where following it would take for ever
@@ -372,7 +372,7 @@ class DiscSystem(LawSystem):
         nowhere = not THETA_END < state.theta <= np.pi / 2 or max(abs(state.psidot), abs(state.omega3)) > fastest
         if nowhere or (self.starts_in_slip and model.effect("slip") is None):  # 1/mu = 0: no velocity is free
             nothing = np.full((2, len(times), 6), np.nan)
-            return _Path(nothing, nothing, (), np.zeros((len(times), 6, 0)))
+            return (nothing, nothing), (), still
         components = [n for n in names if n.startswith("state.")]
         parameters = {n: n for n in names if model.has_name(n) and np.isfinite(values.get(n, 0.0))}
         if SLIP in names and values.get(SLIP, 0.0) > 0:
@@ -393,11 +393,11 @@ class DiscSystem(LawSystem):
         if delay and np.isfinite(moving.q).all():
             spline = CubicHermiteSpline(times, moving.q, moving.qdot)
             q[1], qdot[1] = spline(times + delay), spline(times + delay, 1)
-        return _Path(q, qdot, moved, by_motion)
+        return (q, qdot), moved, by_motion
 
-    def _sight(self, path: _Path, values: Values) -> Sight:
+    def _sight(self, path: Path, values: Values) -> Sight:
         """The dots as both cameras meet them on this path."""
-        q, speed = path.q, path.qdot.copy()
+        q, speed = path[0], path[1].copy()
         axes = euler_rate_axes_world(q[..., 3], q[..., 4])
         speed[..., 3:] = (axes @ speed[..., 3:, None])[..., 0]
         R, t = rotation_from_euler(q[..., 3], q[..., 4], q[..., 5]), q[..., :3]

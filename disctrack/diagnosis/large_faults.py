@@ -179,11 +179,12 @@ def find_clock(system: DiscSystem) -> Assumed | None:
     return Assumed(freed, base, candidates, np.inf) if base.converged else None
 
 
-def diagnose_with_large(assumed: Assumed, settings: Settings) -> tuple[Diagnosis, tuple[str, ...]]:
+def diagnose_with_large(assumed: Assumed, settings: Settings) -> Diagnosis:
     """The diagnosis with the large faults among what was found, and a remark for people."""
     diagnosis = explain(assumed.system, assumed.base.values, settings)
     found = [Found(c, assumed.gain, assumed.gain, 0.0, ()) for c in assumed.candidates]
     said = " and ".join(c.title for c in assumed.candidates)
     how = "the precession, which gravity sets" if np.isinf(assumed.gain) else "the dots alone"
     note = f"{said}: so much that it was found from {how}, and before and after are both with it"
-    return beside(diagnosis, found, ", from the dots about free poses"), (note,)
+    diagnosis = beside(diagnosis, found, ", from the dots about free poses")
+    return replace(diagnosis, remarks=(note, *diagnosis.remarks))

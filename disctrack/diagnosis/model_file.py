@@ -1,7 +1,6 @@
 """The enlarged model as a scene file: what `simulate`, `render` and the next `diagnose` read."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,35 +21,24 @@ NONE = "none"
 OF_TABLE = ("table_height.", "table_plane.")
 
 
-@dataclass(frozen=True)
-class Declared:
-    """A model to start from: effects of the motion, and faults of the measurement that are known already."""
-
-    model: Model
-    faults: Mapping[str, float]
-    name: str
-
-
-def declared_model(trajectory: Trajectory, choice: str = PAPER) -> Declared:
+def declared_model(trajectory: Trajectory, choice: str = PAPER) -> tuple[Model, Values]:
     """Model by name or file: "paper" (rolling with the paper's k_m), "none" (no losses), or a saved model or scene.
 
-    Disc, gravity and air are those of the trajectory. Raises AnalysisError, SceneError, ModelError.
+    Disc, gravity and air are those of the trajectory. With it come the faults of the measurement that are known
+    already. Raises AnalysisError, SceneError, ModelError.
     """
     bare = Model(trajectory.disc, trajectory.gravity, air_density=trajectory.air_density)
     if choice == PAPER:
-        return Declared(bare.with_effects(CATALOGUE["km"]()), {}, choice)
+        return bare.with_effects(CATALOGUE["km"]()), {}
     if choice == NONE:
-        return Declared(bare, {}, choice)
+        return bare, {}
     if not Path(choice).is_file():
         raise AnalysisError(f"{choice}: no such model. Give '{PAPER}', '{NONE}', or the file of a saved model (TOML).")
     scene = load_scene(choice)
     rolling = scene.motion.rolling
     effects = effects_from_tables(rolling.effects, rolling.formulas)
-    return Declared(
-        replace(bare, effects=effects),
-        values_in_scene(trajectory.disc, scene.faults, scene.cameras.frame_rate_hz),
-        str(choice),
-    )
+    faults = values_in_scene(trajectory.disc, scene.faults, scene.cameras.frame_rate_hz)
+    return replace(bare, effects=effects), faults
 
 
 def model_toml(system: DiscSystem, values: Values, name: str) -> str:

@@ -65,12 +65,8 @@ class Proposal:
         return f"{start}, {', '.join(changes)}" if changes else f"{start}, the same again"
 
 
-@dataclass(frozen=True)
-class Question:
-    """What a recording leaves open: an effect and its alternative, or the size of an effect that was not found."""
-
-    effect: Candidate
-    alternative: Candidate | None = None
+# What a recording leaves open: which of two effects it is, the one that was found first; or how large the only one is
+Question = tuple[Candidate, ...]
 
 
 @dataclass(frozen=True)
@@ -95,7 +91,7 @@ class Plan:
         known = [r for r in self.rows if np.isfinite(r.answers[i])]
         if not known:
             return None
-        pick: Callable[..., Proposed] = min if self.questions[i].alternative is None else max
+        pick: Callable[..., Proposed] = min if len(self.questions[i]) == 1 else max
         return pick(known, key=lambda r: r.answers[i])
 
 
@@ -259,14 +255,11 @@ def plan(
 
     said : as for `Planner`
     """
-    candidates = {c.name: c for q in questions for c in (q.effect, q.alternative) if c is not None}
+    candidates = {c.name: c for q in questions for c in q}
     planner = Planner(system, fit, list(candidates.values()), noise, said)
 
     def answers(rows: Array) -> tuple[float, ...]:
-        return tuple(
-            planner.sigma(rows, q.effect) if q.alternative is None else planner.sigmas(rows, q.effect, q.alternative)
-            for q in questions
-        )
+        return tuple(planner.sigma(rows, *q) if len(q) == 1 else planner.sigmas(rows, *q) for q in questions)
 
     now = answers(planner.now)
 
@@ -292,7 +285,7 @@ def open_questions(diagnosis: Diagnosis, system: DiscSystem) -> tuple[Question, 
 
     Of the latter those whose standard deviation is largest beside their usual size.
     """
-    found = [Question(f.candidate, r.candidate) for f in diagnosis.found for r in f.cannot_be_told_from]
+    found: list[Question] = [(f.candidate, r.candidate) for f in diagnosis.found for r in f.cannot_be_told_from]
     named = {f.candidate.name for f in diagnosis.found}
     single = [
         c
@@ -306,4 +299,4 @@ def open_questions(diagnosis: Diagnosis, system: DiscSystem) -> tuple[Question, 
         return sigma / c.quantities[0].typical if np.isfinite(sigma) else 0.0
 
     unsettled = sorted(single, key=share, reverse=True)
-    return tuple([*found[:OPEN], *(Question(c) for c in unsettled[: max(OPEN - len(found), 2)])])
+    return (*found[:OPEN], *((c,) for c in unsettled[: max(OPEN - len(found), 2)]))

@@ -5,8 +5,7 @@ the contact's velocity decides, which needs no model of the motion. Slip is fitt
 at the first instant, and where no coefficient describes it, the diagnosis begins where rolling does.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -24,7 +23,7 @@ from disctrack.discrepancy.fit import TRIAL, Fit, fit
 from disctrack.discrepancy.held_out import HeldOut, held_out, training_rows
 from disctrack.discrepancy.noise import noise_variance
 from disctrack.discrepancy.search import FAR, Diagnosis, Found, Settings, beside, explain, threshold
-from disctrack.discrepancy.system import Candidate, GivenUp
+from disctrack.discrepancy.system import Candidate, GivenUp, Values
 from disctrack.errors import AnalysisError
 from disctrack.faults.clock_jump import clock_jumps, without_jumps
 from disctrack.rolling import Model, Regime
@@ -35,45 +34,40 @@ LASTS = 5  # frames of slip at mm/s at least: contact velocities that are errors
 SHOWN = 0.975  # probability of slip at the first frame from which on it is taken for shown
 
 
-@dataclass(frozen=True)
-class MotionDiagnosis:
-    """Diagnosis of a motion that may begin in slip, or was measured with a large fault."""
-
-    system: DiscSystem
-    diagnosis: Diagnosis  # of the model with slip, where the disc slips
-    notes: tuple[str, ...]
-    rolling: tuple[Fit, HeldOut] | None = None  # what the model without it makes of a recording that begins in slip
-
-    def with_slip(self, diagnosis: Diagnosis) -> Diagnosis:
-        """The diagnosis with slip among what was found, and rolling from the first frame on as the model before."""
-        if self.rolling is None:
-            return diagnosis
-        (without, held_without), held, noise = self.rolling, diagnosis.held_out_before, diagnosis.noise
-        gain = (without.cost - diagnosis.before.cost) / noise
-        held_gain = held.gain_over(held_without, noise) if held else np.nan
-        candidate = slip_start(self.system.model)
-        enough = threshold(self.system, diagnosis.settings, len(candidate.names))
-        found = Found(candidate, float(gain), held_gain, enough, ())
-        reason = f"with slip at the start, {diagnosis.reason}"
-        return replace(beside(diagnosis, [found]), reason=reason, before=without, held_out_before=held_without)
+# what the model without slip makes of a recording that begins in it
+Rolling = tuple[Fit, HeldOut]
+# of a motion that may begin in slip, or was measured with a large fault; with slip in the model, where the disc slips
+Answer = tuple[DiscSystem, Diagnosis, Rolling | None]
 
 
-def diagnose_motion(
-    trajectory: Trajectory, model: Model, faults: Mapping[str, float], settings: Settings | None = None
-) -> MotionDiagnosis:
+def diagnose_motion(trajectory: Trajectory, model: Model, faults: Values, settings: Settings | None = None) -> Answer:
     """Diagnose the motion, rolling or slipping at its start, with the times it has if pairs were lost.
 
     Raises AnalysisError.
     """
     jumps = clock_jumps(trajectory)
-    answer = _with_these_times(without_jumps(trajectory, jumps), model, faults, settings or Settings())
+    system, diagnosis, rolling = _with_these_times(
+        without_jumps(trajectory, jumps), model, faults, settings or Settings()
+    )
     lost = tuple(f"frame {trajectory.frame[jump.row]}: {jump.words}; counted with them" for jump in jumps)
-    return replace(answer, notes=(*lost, *answer.system.notes, *answer.notes))
+    return system, _noted(diagnosis, *lost, *system.notes), rolling
 
 
-def _with_these_times(
-    as_tracked: Trajectory, model: Model, faults: Mapping[str, float], settings: Settings
-) -> MotionDiagnosis:
+def with_slip(system: DiscSystem, diagnosis: Diagnosis, rolling: Rolling | None) -> Diagnosis:
+    """The diagnosis with slip among what was found, and rolling from the first frame on as the model before."""
+    if rolling is None:
+        return diagnosis
+    (without, held_without), held, noise = rolling, diagnosis.held_out_before, diagnosis.noise
+    gain = (without.cost - diagnosis.before.cost) / noise
+    held_gain = held.gain_over(held_without, noise) if held else np.nan
+    candidate = slip_start(system.model)
+    enough = threshold(system, diagnosis.settings, len(candidate.names))
+    found = Found(candidate, float(gain), held_gain, enough, ())
+    reason = f"with slip at the start, {diagnosis.reason}"
+    return replace(beside(diagnosis, [found]), reason=reason, before=without, held_out_before=held_without)
+
+
+def _with_these_times(as_tracked: Trajectory, model: Model, faults: Values, settings: Settings) -> Answer:
     rolling = DiscSystem(with_noise_of_frames(as_tracked), model, known=faults)
     systematic = find_systematic(rolling)
     # what fields leave in numbers that no pose takes is in the poses as well, and nothing that a motion could explain
@@ -84,11 +78,11 @@ def _with_these_times(
         base = fit(rolling, rolling.base, rolling.start())
         assumed = None if base.converged else find_clock(rolling)
     if assumed is not None:
-        return MotionDiagnosis(assumed.system, *diagnose_with_large(assumed, settings))
+        return assumed.system, diagnose_with_large(assumed, settings), None
     return _rolling_or_slipping(settings, rolling, base)
 
 
-def _rolling_or_slipping(settings: Settings, rolling: DiscSystem, base: Fit) -> MotionDiagnosis:
+def _rolling_or_slipping(settings: Settings, rolling: DiscSystem, base: Fit) -> Answer:
     """The diagnosis of a motion without large faults."""
     large = not base.reduced_chi_square <= FAR * noise_variance(rolling, base)
     if large and _slips_slowly(settings, rolling):
@@ -96,12 +90,12 @@ def _rolling_or_slipping(settings: Settings, rolling: DiscSystem, base: Fit) -> 
     rolls = _at_noise(rolling, base, settings) or first_contact(first_motion(rolling, rolling.known))[0] <= LEAST_SLIP
     onset = None if rolls else _onset(rolling)
     if onset is None or onset.probability <= SHOWN or onset.low <= rolling.time[0]:
-        return MotionDiagnosis(rolling, explain(rolling, base.values, settings), ())
+        return rolling, explain(rolling, base.values, settings), None
     # the velocity at the contact is that of a rim as declared: where it is not round, what rolls seems to slip
     others = rolling.again(_without_slip(rolling))
     diagnosis = explain(others, base.values, settings)
     if diagnosis.verdict == "found":
-        return MotionDiagnosis(others, diagnosis, ())
+        return others, diagnosis, None
     return _slipping(settings, rolling, base, onset)
 
 
@@ -123,6 +117,10 @@ def _slips_slowly(settings: Settings, rolling: DiscSystem) -> bool:
     return bool((motion.regime[:LASTS] == Regime.SLIPPING).all())
 
 
+def _noted(diagnosis: Diagnosis, *notes: str) -> Diagnosis:
+    return replace(diagnosis, remarks=(*notes, *diagnosis.remarks))
+
+
 def _without_slip(system: DiscSystem) -> tuple[Candidate, ...]:
     return tuple(c for c in system.candidates if c.effect != "slip")
 
@@ -139,7 +137,7 @@ def _onset(rolling: DiscSystem) -> RollingOnset | None:
         return None
 
 
-def _slipping(settings: Settings, rolling: DiscSystem, base: Fit, onset: RollingOnset | None) -> MotionDiagnosis:
+def _slipping(settings: Settings, rolling: DiscSystem, base: Fit, onset: RollingOnset | None) -> Answer:
     """The diagnosis with slip at first, or of what comes after it where no coefficient of friction describes it."""
     system = rolling.again(freed=(slip_start(rolling.model),))
     diagnosis = explain(system, system.start(), settings)
@@ -147,16 +145,13 @@ def _slipping(settings: Settings, rolling: DiscSystem, base: Fit, onset: Rolling
         later = _after_slip(settings, rolling, onset, diagnosis)
         if later is not None:
             return later
-    notes = _in_words(system, diagnosis)
-    if diagnosis.held_out_after is None or system.model.effect("slip"):  # friction was declared
-        return MotionDiagnosis(system, diagnosis, notes)
-    held = held_out(diagnosis.judged or system, base.quantities, base.values, training_rows(system))
-    return MotionDiagnosis(system, diagnosis, notes, (base, held))
+    without = None
+    if diagnosis.held_out_after is not None and not system.model.effect("slip"):  # else friction was declared
+        without = base, held_out(diagnosis.judged or system, base.quantities, base.values, training_rows(system))
+    return system, _noted(diagnosis, *_in_words(system, diagnosis)), without
 
 
-def _after_slip(
-    settings: Settings, rolling: DiscSystem, onset: RollingOnset, slipping: Diagnosis
-) -> MotionDiagnosis | None:
+def _after_slip(settings: Settings, rolling: DiscSystem, onset: RollingOnset, slipping: Diagnosis) -> Answer | None:
     """Diagnosis from the instant of rolling on; None where too little is left, or it is not explained either."""
     try:
         rows, notes = free_stretch(rolling.trajectory, onset.high)
@@ -172,7 +167,7 @@ def _after_slip(
         f"the disc slips until {onset.time:.4f} s (95 %: {onset.low:.4f} to {onset.high:.4f} s), and no coefficient of "
         f"friction describes that ({left}): this is the diagnosis of what comes after it"
     )
-    return MotionDiagnosis(system, diagnosis, (note,))
+    return system, _noted(diagnosis, note), None
 
 
 def _in_words(system: DiscSystem, diagnosis: Diagnosis) -> tuple[str, ...]:

@@ -20,7 +20,7 @@ from disctrack.diagnosis.pages.output import as_json, write_diagnosis
 from disctrack.diagnosis.pages.report import report_of
 from disctrack.diagnosis.plan import open_questions, plan
 from disctrack.diagnosis.recorded import read_recorded
-from disctrack.diagnosis.slip_start import diagnose_motion
+from disctrack.diagnosis.slip_start import diagnose_motion, with_slip
 from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.held_out import held_out, training_rows
 from disctrack.discrepancy.laws import WithLaw, explained_by_law, judged_as
@@ -64,15 +64,14 @@ def diagnose(trajectory: Trajectory, model: str = PAPER, settings: Settings | No
         >>> diagnose("clip").sentence.partition(".")[0]
         'Nothing is missing'
     """
-    declared = declared_model(trajectory, model)
-    answer = diagnose_motion(trajectory, declared.model, declared.faults, settings)
-    system, diagnosis, notes = answer.system, answer.diagnosis, answer.notes
+    declared, faults = declared_model(trajectory, model)
+    system, diagnosis, rolling = diagnose_motion(trajectory, declared, faults, settings)
     if diagnosis.held_out_before is None or diagnosis.held_out_after is None:
-        return DiscDiagnosis(system, diagnosis, declared.name, notes=notes)
+        return DiscDiagnosis(system, diagnosis, str(model), notes=diagnosis.remarks)
     left = left_over(system, diagnosis.after, diagnosis.noise)
     diagnosis = judged_by_what_is_left(diagnosis, left)
     found, diagnosis = _beyond_the_catalogue(system, diagnosis, left)
-    holds, learned, notes = {}, None, (*notes, *diagnosis.remarks)
+    holds, learned, notes = {}, None, diagnosis.remarks
     if diagnosis.verdict == "unexplained":
         holds = regimes(system, judged_as(diagnosis, system), diagnosis.before, diagnosis.noise)
         notes = (*notes, where_it_holds(holds), "" if found else what_is_missing(system, diagnosis.after))
@@ -82,11 +81,11 @@ def diagnose(trajectory: Trajectory, model: str = PAPER, settings: Settings | No
     else:
         diagnosis = replace(diagnosis, after=with_memory(judged_as(diagnosis, system), diagnosis.after))
     notes = (*notes, "" if system.budget.open() else USED_UP)
-    diagnosis = answer.with_slip(diagnosis)
+    diagnosis = with_slip(system, diagnosis, rolling)
     before = errors(system, diagnosis.before, diagnosis.held_out_before)
     after = errors(system, diagnosis.after, diagnosis.held_out_after)
     energy, said = energy_balance(system, diagnosis.after.values), tuple(note for note in notes if note)
-    return DiscDiagnosis(system, diagnosis, declared.name, before, after, energy, learned, said, holds, left)
+    return DiscDiagnosis(system, diagnosis, str(model), before, after, energy, learned, said, holds, left)
 
 
 def with_plan(result: DiscDiagnosis) -> DiscDiagnosis:

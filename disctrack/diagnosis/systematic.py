@@ -92,7 +92,7 @@ class Systematic:
     print_m: float = 0.0  # rms of the dots' places on the face, per coordinate
     gain: float = 0.0  # of twice the log likelihood, over noise alone
     amounts: dict[str, float] = field(default_factory=dict)  # of faults of the measurement that were fitted along
-    lens_fields: tuple[SmoothField, ...] = ()  # of each camera, where several recordings have them in common
+    lens_places: tuple[Array, ...] = ()  # of each camera, of all recordings that have its field in common
     left: float = 1.0  # variance beside all that, over the noise, of the numbers that no pose can take
 
     @property
@@ -106,22 +106,10 @@ class Systematic:
         return float(np.hypot(self.lens_px, self.dot_px))
 
 
-@dataclass(frozen=True, eq=False)
-class SmoothField:
-    """A random field with unit variance of places in the image, smooth over a length; k independent modes."""
+def field_modes(at: Array, places: Array, length: float, sigmas: float) -> Array:
+    """(..., k) modes at (..., 2) [px] of a random field with unit variance, smooth over a length.
 
-    centres: Array  # (g, 2) [px]
-    length: float  # [px]
-    mixing: Array  # (g, k)
-
-    def modes(self, places: Array) -> Array:
-        """(..., k) at places (..., 2)."""
-        return _bumps(places, self.centres, self.length) @ self.mixing
-
-
-def smooth_field(places: Array, length: float, sigmas: float) -> SmoothField:
-    """The field over places (n, 2) at which dots were seen.
-
+    places : (n, 2) at which dots were seen
     sigmas : size of the field over the noise of one place; modes that all n places together do not see are left out
     """
     low, high = places.min(axis=0) - MARGIN * length, places.max(axis=0) + MARGIN * length
@@ -133,7 +121,7 @@ def smooth_field(places: Array, length: float, sigmas: float) -> SmoothField:
     size = float(np.sqrt(np.trace(gram) / len(places)))  # rms of the sum of bumps with weights of unit variance
     eigenvalues, vectors = np.linalg.eigh(gram / size**2)
     seen = sigmas * np.sqrt(np.maximum(eigenvalues, 0.0)) > SEEN
-    return SmoothField(centres, length, vectors[:, seen] / size)
+    return _bumps(at, centres, length) @ (vectors[:, seen] / size)
 
 
 def _bumps(places: Array, centres: Array, length: float) -> Array:
@@ -142,19 +130,19 @@ def _bumps(places: Array, centres: Array, length: float) -> Array:
 
 
 def field_columns(
-    places: Array, used: Mask, length: float, sigmas: float, own: bool = False, fields: Sequence[SmoothField] = ()
+    places: Array, used: Mask, length: float, sigmas: float, own: bool = False, in_common: Sequence[Array] = ()
 ) -> Array:
     """(n, 2, m, 2, k) shifts [px] by fields of unit size, one for each camera and coordinate.
 
     own : each dot has such fields of its own; else they are common to all dots
-    fields : of each camera, if they are not to be made for these places
+    in_common : of each camera, the places for which the fields are made, if not for these
     """
     found, m = [], places.shape[2]
     for camera in range(2):
         for dots in [slice(i, i + 1) for i in range(m)] if own else [slice(m)]:
             here, seen = places[:, camera, dots], used[:, camera, dots]
             if seen.any():
-                modes = (fields[camera] if fields else smooth_field(here[seen], length, sigmas)).modes(here)
+                modes = field_modes(here, in_common[camera] if in_common else here[seen], length, sigmas)
                 for axis in range(2):
                     column = np.zeros((*places.shape, modes.shape[-1]))
                     column[:, camera, dots, axis] = modes

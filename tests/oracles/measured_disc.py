@@ -51,7 +51,7 @@ def dots_of(trajectory):
 
 def system_of(trajectory, names=None, model="paper"):
     """What a diagnosis with this model asks.   names : of the only effects that may be missing, if not all"""
-    declared = declared_model(trajectory, model).model
+    declared, _ = declared_model(trajectory, model)
     return DiscSystem(trajectory, declared, None if names is None else motion_candidates(declared, names))
 
 

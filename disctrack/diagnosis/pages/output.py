@@ -84,8 +84,8 @@ def plan_json(plan: Plan | None) -> dict[str, Any] | None:
         return None
     return {
         "questions": [
-            {"effect": q.effect.name, "alternative": None if q.alternative is None else q.alternative.name, "now": x}
-            for q, x in zip(plan.questions, plan.now, strict=True)
+            {"effect": effect.name, "alternative": other[0].name if other else None, "now": x}
+            for (effect, *other), x in zip(plan.questions, plan.now, strict=True)
         ],
         "recordings": [
             {**vars(r.proposal), "text": r.proposal.text, "lasts_s": r.duration, "answers": list(r.answers)}

@@ -145,18 +145,17 @@ def planned_section(plan: Plan | None) -> Section:
         return Section(title, ())
     best = [plan.best(i) for i in range(len(plan.questions))]
     header, said = ["one more recording", "lasts [s]"], []
-    for q, now, proposed in zip(plan.questions, plan.now, best, strict=True):
-        between, unit = f"{q.effect.name} or {q.alternative.name}" if q.alternative else "", q.effect.quantities[0].unit
-        header.append(f"{between} [sigmas]" if between else in_unit(f"σ of {q.effect.name}", unit))
+    for question, now, proposed in zip(plan.questions, plan.now, best, strict=True):
+        effect, unit = question[0].name, question[0].quantities[0].unit
+        between = " or ".join(c.name for c in question) if len(question) > 1 else ""
+        header.append(f"{between} [sigmas]" if between else in_unit(f"σ of {effect}", unit))
         if proposed is None:
-            said.append(f"For {between or f'the size of {q.effect.name}'} no recording that was tried can be made.")
+            said.append(f"For {between or f'the size of {effect}'} no recording that was tried can be made.")
             continue
         i, text = len(said), proposed.proposal.text
         if not between:
             limit, at_present = _limit(proposed.answers[i], unit), _limit(now, unit)
-            said.append(
-                f"The size of {q.effect.name} is known to {at_present} (95 %), and would be to {limit}: {text}."
-            )
+            said.append(f"The size of {effect} is known to {at_present} (95 %), and would be to {limit}: {text}.")
         elif proposed.answers[i] < ENOUGH:
             said.append(f"No recording that was tried separates {between.replace(' or ', ' from ')}.")
         else:

@@ -107,8 +107,9 @@ def _recording_json(r: OfRecording) -> dict[str, Any]:
         told |= {"chi_square_shared": f.chi_square, "difference_to_the_others": f.statistic}
         told |= {"degrees": f.degrees, "p_value": f.p_value}
     if (a := r.alone) is not None:
-        numbers = _known({n: (a.values[n], sigma * a.inflation[n]) for n, sigma in a.sigmas.items()})
-        told["alone"] = {"chi_square": a.chi_square, "degrees": a.degrees, "parameters": numbers}
+        shared = [q.name for q in a.quantities if q.belongs_to and not np.isfinite(q.prior_sigma)]
+        numbers = _known({name: (a.values[name], a.sigma(name)) for name in shared})
+        told["alone"] = {"chi_square": a.chi_square, "degrees": a.degrees_of_freedom, "parameters": numbers}
     return told
 
 
@@ -170,7 +171,7 @@ def _recordings(answer: TogetherDiagnosis) -> Listing:
     for r in answer.recordings:
         cells = ["", "", "", r.reason]
         if r.fits_in is not None and r.alone is not None:
-            f, degrees = r.fits_in, max(r.alone.degrees, 1)
+            f, degrees = r.fits_in, max(r.alone.degrees_of_freedom, 1)
             cells = [rounded(chi_square / degrees, 4) for chi_square in (f.chi_square, r.alone.chi_square)]
             cells += [f"{rounded(f.statistic)} / {f.degrees} (p {probability(f.p_value)})", ""]
         rows.append([r.name, *(r.labels.get(k, "") for k in kinds), *cells])
@@ -207,9 +208,8 @@ def figures(answer: TogetherDiagnosis) -> tuple[Drawn, ...]:
         points = []
         for i, a in enumerate(r.alone for r in used):
             for local in sharing.local_names(i, [q.name]):
-                sigma = 0.0 if a is None else a.sigmas.get(local, 0.0) * a.inflation.get(local, 1.0)
-                if a is not None and a.converged and np.isfinite(sigma) and sigma > 0:
-                    points.append((i, a.values[local], sigma))
+                if a is not None and a.converged and a.sigma(local) > 0:
+                    points.append((i, a.values[local], a.sigma(local)))
         if len(points) < 2:
             continue
         figure, (axes,) = panels(9.5, 2.6)

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -13,12 +12,12 @@ from disctrack.diagnosis.large_faults import find_large
 from disctrack.diagnosis.model_file import PAPER, declared_model
 from disctrack.diagnosis.plan import OPEN, Plan, Question, Say, plan
 from disctrack.diagnosis.recorded import Recorded, first_to_mend
-from disctrack.diagnosis.systematic import Systematic, find_systematic, noise_over_stated, smooth_field, with_noise
+from disctrack.diagnosis.systematic import Systematic, find_systematic, noise_over_stated, with_noise
 from disctrack.discrepancy.fit import Fit, fit
 from disctrack.discrepancy.joint.crew import Crew
 from disctrack.discrepancy.joint.reduction import Reduced, Reduction
 from disctrack.discrepancy.joint.sharing import Member
-from disctrack.discrepancy.joint.together import Alone, TogetherDiagnosis, answer_together
+from disctrack.discrepancy.joint.together import TogetherDiagnosis, answer_together
 from disctrack.discrepancy.noise import THIRD, inflation
 from disctrack.discrepancy.search import Settings
 from disctrack.discrepancy.system import Values
@@ -65,12 +64,12 @@ def _plan(answer: TogetherDiagnosis, crew: Crew) -> Plan | None:
     local = {c.name for c in sharing.members[longest].candidates}
     open_sizes = [b for b in answer.bounds if b.upper is not None and b.candidate.kind == "motion"]
     open_sizes.sort(key=lambda b: -float(b.sigma[0]) / b.candidate.quantities[0].typical)
-    questions = [Question(f.candidate, r.candidate) for f in diagnosis.found for r in f.cannot_be_told_from]
-    questions += [Question(b.candidate) for b in open_sizes]
-    questions = [q for q in questions if {c.name for c in (q.effect, q.alternative) if c is not None} <= local][:OPEN]
+    questions: list[Question] = [(f.candidate, r.candidate) for f in diagnosis.found for r in f.cannot_be_told_from]
+    questions += [(b.candidate,) for b in open_sizes]
+    questions = [question for question in questions if {c.name for c in question} <= local][:OPEN]
     if not questions:
         return None
-    tested = [q for x in questions for c in (x.effect, x.alternative) if c is not None for q in c.quantities]
+    tested = [q for question in questions for c in question for q in c.quantities]
     everything = {q.name: q for q in (*tested, *after.quantities)}
     names = {there: shared for there, shared in sharing.shared_names(longest).items() if shared in everything}
     others = [n for n in everything if n not in set(names.values())]
@@ -121,8 +120,8 @@ class DiscMember:
         recorded, self.labels, model = item
         self.name, as_tracked = recorded.name, recorded.trajectory
         trajectory = with_noise(as_tracked, _noise(as_tracked))  # recordings are weighed by it
-        declared = declared_model(trajectory, model)
-        self.system = DiscSystem(trajectory, declared.model, known=declared.faults)
+        declared, faults = declared_model(trajectory, model)
+        self.system = DiscSystem(trajectory, declared, known=faults)
         self.systematic = find_systematic(self.system)
         assumed = find_large(as_tracked, self.system, self.systematic)
         if assumed is not None:
@@ -154,22 +153,17 @@ class DiscMember:
         """What it says of shared quantities."""
         return self._reduction.reduce({**self.system.known, **values}, names)
 
-    def alone(self, values: Values, names: Sequence[str]) -> Alone:
-        """The recording fitted alone with these of its candidates' quantities free, from the shared solution on."""
+    def alone(self, values: Values, names: Sequence[str]) -> tuple[Fit, Fit]:
+        """The recording fitted alone with these of its candidates' quantities free, from the shared solution on.
+
+        Of the second fit sigmas know the memory of what is left.
+        """
         system = self.system
         known = {q.name: q for c in system.candidates for q in c.quantities}
         extra = [known[n] for n in names if n in known]
         found = fit(system, (*system.base, *extra), self._everything(values))
-        factors = dict(zip(found.names, inflation(system, found), strict=True))
-        kept = [q.name for q in found.quantities if q.belongs_to and not np.isfinite(q.prior_sigma)]
-        return Alone(
-            found.values,
-            {n: found.sigma(n) for n in kept},
-            {n: float(factors[n]) for n in kept},
-            found.chi_square,
-            found.degrees_of_freedom,
-            found.converged,
-        )
+        growth = inflation(system, found)
+        return found, replace(found, covariance=found.covariance * np.outer(growth, growth))
 
     def planned(self, values: Values, names: Sequence[str], questions: Sequence[Question], said: Say) -> Plan:
         """Recordings that would answer questions; `said` is what all recordings together know of quantities.
@@ -228,18 +222,12 @@ def in_common(told: Sequence[tuple[Mapping[str, str], Systematic, list[Array]]])
         discs = [s for of, s, _ in told if of["disc"] == labels["disc"]]
         lens = max((s for s, _ in rigs), key=lambda s: s.lens_px)
         dots = max((s for s, _ in rigs), key=lambda s: s.dot_px)
-        fields: tuple[Any, ...] = ()
-        if lens.lens_px:
-            # modes are kept down to where a field of ten sigmas of a single dot cannot be seen
-            fields = tuple(
-                smooth_field(np.concatenate([p[c] for _, p in rigs]), lens.lens_length_px, 10.0) for c in range(2)
-            )
         common.append(
             replace(
                 mine,
                 lens_px=lens.lens_px,
                 lens_length_px=lens.lens_length_px,
-                lens_fields=fields,
+                lens_places=tuple(np.concatenate([p[c] for _, p in rigs]) for c in range(2)),
                 dot_px=dots.dot_px,
                 dot_length_px=dots.dot_length_px,
                 print_m=max(s.print_m for s in discs),

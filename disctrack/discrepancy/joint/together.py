@@ -32,18 +32,6 @@ OWN_LEVEL = 1e-3  # probability that a recording which the model describes is sa
 
 
 @dataclass(frozen=True)
-class Alone:
-    """What one recording says of itself with a model, fitted alone."""
-
-    values: dict[str, float]  # of all its quantities
-    sigmas: dict[str, float]  # of those that it may share and that have no prior
-    inflation: dict[str, float]  # by which these grow because what is left has a memory
-    chi_square: float
-    degrees: int
-    converged: bool
-
-
-@dataclass(frozen=True)
 class OfRecording:
     """What the joint diagnosis says of one recording."""
 
@@ -51,7 +39,7 @@ class OfRecording:
     labels: dict[str, str]
     reason: str  # why it was left out; empty where it was not
     fits_in: FitsIn | None = None  # against all others, in the final model
-    alone: Alone | None = None  # the final model fitted to it alone
+    alone: Fit | None = None  # the final model fitted to it alone; its sigmas know the memory of what is left
 
 
 @dataclass(frozen=True)
@@ -105,7 +93,8 @@ def answer_together(
 ) -> TogetherDiagnosis:
     """What does the model lack, of all the crew's recordings together?
 
-    crew : objects with the methods `told`, `with_common` (a Member), `share`, `reduce` and `alone`
+    crew : objects with the methods `told`, `with_common` (a Member), `share`, `reduce` and `alone` (a Fit, and the same
+        with sigmas that know the memory of what is left)
     described : name and labels of each
     in_common : of all that was told, what each is then given by `with_common`: errors that it shares with others
     unread : further recordings that are reported as left out, and why
@@ -183,27 +172,25 @@ def _without_variants(diagnosis: Diagnosis) -> Diagnosis:
     return replace(diagnosis, found=tuple(found))
 
 
-def _with_memory(system: JointSystem, diagnosis: Diagnosis, crew: Crew) -> tuple[Diagnosis, list[Alone | None]]:
+def _with_memory(system: JointSystem, diagnosis: Diagnosis, crew: Crew) -> tuple[Diagnosis, list[Fit | None]]:
     """Standard deviations that know the memory of what is left in each recording; and each recording fitted alone."""
     after, sharing = diagnosis.after, system.sharing
     extra = [n for f in diagnosis.found for n in f.candidate.names]
     asked = [
         (sharing.local_values(i, after.values), sharing.local_names(i, extra)) for i in range(len(sharing.members))
     ]
-    answers = crew.call("alone", asked)
-    alone = [a if isinstance(a, Alone) else None for a in answers]
-    fitted = [(i, a) for i, a in enumerate(alone) if a is not None and a.converged]
+    alone = [None if isinstance(a, DiscTrackError) else a for a in crew.call("alone", asked)]
+    fitted = [(i, *fits) for i, fits in enumerate(alone) if fits is not None and fits[0].converged]
     growth = np.ones(len(after.quantities))
     for k, q in enumerate(after.quantities):
         if np.isfinite(q.prior_sigma):
             continue
-        of_each = [(a, local) for i, a in fitted for local in sharing.local_names(i, [q.name])]
-        seen = [(a, local) for a, local in of_each if 0 < a.sigmas.get(local, 0.0) < np.inf]
-        weights = [a.sigmas[local] ** -2 for a, local in seen]
-        if seen:
-            growth[k] = np.sqrt(max(np.average([a.inflation[local] ** 2 for a, local in seen], weights=weights), 1.0))
-    grown = replace(after, covariance=after.covariance * np.outer(growth, growth))
-    return replace(diagnosis, after=grown), alone
+        named = [(*fits, local) for i, *fits in fitted for local in sharing.local_names(i, [q.name])]
+        sigma = np.array([(white.sigma(n), grown.sigma(n)) for white, grown, n in named if white.sigma(n) > 0])
+        if sigma.size:
+            growth[k] = np.sqrt(max(np.average((sigma[:, 1] / sigma[:, 0]) ** 2, weights=sigma[:, 0] ** -2), 1.0))
+    after = replace(after, covariance=after.covariance * np.outer(growth, growth))
+    return replace(diagnosis, after=after), [None if fits is None else fits[1] for fits in alone]
 
 
 def _bounds(system: JointSystem, diagnosis: Diagnosis) -> tuple[Bound, ...]:
@@ -276,8 +263,8 @@ def _notes(recordings: Sequence[OfRecording], unusable: Sequence[str]) -> tuple[
                 "third would have to go, and the sizes are those of no recording"
             )
         if r.alone is not None and r.alone.converged:
-            excess = (r.alone.chi_square / r.alone.degrees - 1) / np.sqrt(2 / r.alone.degrees)
-            if stats.norm.sf(excess) * len(recordings) < OWN_LEVEL and r.alone.chi_square > 1.1 * r.alone.degrees:
-                ratio = r.alone.chi_square / r.alone.degrees
+            ratio = r.alone.reduced_chi_square
+            excess = (ratio - 1) / np.sqrt(2 / r.alone.degrees_of_freedom)
+            if stats.norm.sf(excess) * len(recordings) < OWN_LEVEL and ratio > 1.1:
                 notes.append(f"{r.name} is not described by the model even alone (chi-square {ratio:.3g})")
     return tuple(notes)

@@ -51,7 +51,7 @@ def everything_wrong(short, rng):
 def test_every_fault_of_the_measurement_survives_the_file(short, everything_wrong, tmp_path):
     system = system_of(short)
     values = rolling_state(short) | {"km.k_m": 3e-8} | everything_wrong
-    again = declared_model(short, str(saved(system, values, tmp_path))).faults
+    _, again = declared_model(short, str(saved(system, values, tmp_path)))
     assert set(again) == set(everything_wrong)
     for name, value in everything_wrong.items():
         assert again[name] == pytest.approx(value, rel=1e-12), name  # degrees and back, 1 + change and back

@@ -57,7 +57,7 @@ def test_a_law_is_found_with_its_shape(hidden, sized, told, how):
 def test_a_flat_of_the_rim_beside_a_fault_of_a_camera_is_no_inertia():
     """The flat's place has to be looked for, and only an effect that stands in for it is met by the search."""
     *_, trajectory = recorded(HiddenCase({"rim_flat": 1e-5, "distortion": 0.05}, seed=2014, rate=500.0))
-    model = declared_model(trajectory).model
+    model, _ = declared_model(trajectory)
     every = {c.name: c for c in DiscSystem(trajectory, model).candidates}
 
     def found(*names):
