@@ -31,7 +31,6 @@ from disctrack.trajectory import Trajectory, part
 
 LEAST_SLIP = 12e-3  # [m/s] friction of 0.1 stops it in 12 ms
 LASTS = 5  # frames of slip at mm/s at least: contact velocities that are errors of a fit stop within one
-SHOWN = 0.975  # probability of slip at the first frame from which on it is taken for shown
 
 
 # what the model without slip makes of a recording that begins in it
@@ -89,7 +88,8 @@ def _rolling_or_slipping(settings: Settings, rolling: DiscSystem, base: Fit) -> 
         return _slipping(settings, rolling, base, None)
     rolls = _at_noise(rolling, base, settings) or first_contact(first_motion(rolling, rolling.known))[0] <= LEAST_SLIP
     onset = None if rolls else _onset(rolling)
-    if onset is None or onset.probability <= SHOWN or onset.low <= rolling.time[0]:
+    # shown are both: that it slips at the first frame, and that it rolls in the end
+    if onset is None or not (onset.low > rolling.time[0] and np.isfinite(onset.high)):
         return rolling, explain(rolling, base.values, settings), None
     # the velocity at the contact is that of a rim as declared: where it is not round, what rolls seems to slip
     others = rolling.again(_without_slip(rolling))
@@ -141,7 +141,7 @@ def _slipping(settings: Settings, rolling: DiscSystem, base: Fit, onset: Rolling
     """The diagnosis with slip at first, or of what comes after it where no coefficient of friction describes it."""
     system = rolling.again(freed=(slip_start(rolling.model),))
     diagnosis = explain(system, system.start(), settings)
-    if diagnosis.verdict == "unexplained" and onset is not None and np.isfinite(onset.high):
+    if diagnosis.verdict == "unexplained" and onset is not None:
         later = _after_slip(settings, rolling, onset, diagnosis)
         if later is not None:
             return later

@@ -7,7 +7,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.signal import periodogram
-from scipy.stats import chi2
 
 from calibration.kit.arrays import Array
 from disctrack.diagnosis.answer import DiscDiagnosis
@@ -16,6 +15,7 @@ from disctrack.diagnosis.evidence import Evidence, force_of
 from disctrack.diagnosis.missing_force import Course
 from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.held_out import HeldOut
+from disctrack.discrepancy.search import threshold
 from disctrack.report.figures import BAND, Curve, Drawn, chart, panels, plain_powers
 from disctrack.report.palette import AMBER, BLUE, GRID, INK, MUTED, RED
 
@@ -154,8 +154,7 @@ def candidates(result: DiscDiagnosis) -> Drawn:
     axes.set_yticks(range(len(tried)), [t.candidate.name for t in tried])
     axes.invert_yaxis()
     axes.set_xscale("log")
-    level = diagnosis.settings.false_alarm / max(len(result.system.candidates), 1)
-    axes.axvline(float(chi2.isf(level, 1)), color=RED, lw=1)
+    axes.axvline(threshold(result.system, diagnosis.settings, 1), color=RED, lw=1)
     plain_powers(axes.xaxis)
     axes.set_xlabel(
         "decrease of chi-square when it is added to the model (red line: what noise alone can reach with one number)"

@@ -6,7 +6,7 @@ a camera that was touched) have another size in it than in the others? Of an eff
 may have any size, and nobody differs by it.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,7 +14,7 @@ from scipy import stats
 
 from calibration.kit.arrays import Array
 from calibration.kit.least_squares import triangle
-from disctrack.discrepancy.elimination import compress, prior_rows
+from disctrack.discrepancy.elimination import prior_rows
 from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.joint.sharing import JointSystem
 from disctrack.discrepancy.score import INVISIBLE
@@ -68,17 +68,30 @@ class Blocks:
         self._sigma = np.array([q.prior_sigma for q in quantities])
         self.chi_square = np.sum(residual**2, axis=1)
 
-    def fits_in(self, i: int, kept: list[int]) -> FitsIn:
-        """Recording i against those of `kept` that it is not.
+    def others(self, kept: Sequence[int]) -> Iterator[tuple[int, Array]]:
+        """Each recording of `kept`, and rows (m, b + c + 1) of what the others say, and what is known beforehand.
+
+        They are by what is shared, by the candidates' sizes, and the right side. No recording is passed over twice.
+        """
+        c = self._by_candidate.shape[-1]
+        rows = [np.concatenate([self.matrix[k], self._by_candidate[k], self.right[k][:, None]], axis=1) for k in kept]
+        prior = np.concatenate([self.prior[1], np.zeros((len(self.prior[0]), c)), self.prior[0][:, None]], axis=1)
+        before, after = [triangle(prior)], [np.zeros((0, prior.shape[1]))]
+        for block in rows[:-1]:
+            before.append(triangle(np.concatenate([before[-1], block])))
+        for block in rows[:0:-1]:
+            after.append(triangle(np.concatenate([after[-1], block])))
+        for i, *rest in zip(kept, before, reversed(after), strict=True):
+            yield i, np.concatenate(rest)
+
+    def fits_in(self, i: int, others: Array) -> FitsIn:
+        """Recording i against the others.
 
         What the others predict of the combinations of shared quantities that the recording itself determines, in
         sigmas of both: chi-square of as many degrees. Combinations of cameras' and dots' errors that the recording
         knows no better than the calibration does are left out: their derivatives are mostly noise of its poses.
         """
-        others = [k for k in kept if k != i]
-        right = self.right[others].reshape(-1)
-        matrix = np.concatenate([self.matrix[others].reshape(len(right), -1), self.prior[1]])
-        rest = compress(np.concatenate([right, self.prior[0]]), matrix)
+        rest = others[:, -1], others[:, : len(self.names)]
         length = np.linalg.norm(self.matrix[i], axis=0)
         scale = np.where(np.isfinite(self._sigma), self._sigma, LAW / np.where(length > 0, length, 1.0))
         U, singular, _ = np.linalg.svd(self.matrix[i] * scale, full_matrices=False)
@@ -91,28 +104,17 @@ class Blocks:
         p = float(stats.chi2.sf(statistic, degrees)) if degrees > 0 else 1.0
         return FitsIn(statistic, max(degrees, 0), p, float(self.chi_square[i]))
 
-    def differences(self, kept: Sequence[int]) -> dict[int, list[tuple[float, int]]]:
-        """Of each recording of `kept` and each candidate: fall of chi-square with a size of its own, and of degrees.
+    def differences(self, i: int, others: Array) -> list[tuple[float, int]]:
+        """Of each candidate: fall of chi-square where recording i has a size of its own, and of degrees.
 
         All that is shared is free; the candidate has one size for the others, which is its own size, too, before.
         """
         c, b = self._by_candidate.shape[-1], len(self.names)
-        rows = [np.concatenate([self.matrix[k], self._by_candidate[k], self.right[k][:, None]], axis=1) for k in kept]
-        prior = np.concatenate([self.prior[1], np.zeros((len(self.prior[0]), c)), self.prior[0][:, None]], axis=1)
-        before, after = [triangle(prior)], [np.zeros((0, b + c + 1))]
-        for block in rows[:-1]:
-            before.append(triangle(np.concatenate([before[-1], block])))
-        for block in rows[:0:-1]:
-            after.append(triangle(np.concatenate([after[-1], block])))
-        found = {}
-        for i, block, *rest in zip(kept, rows, before, reversed(after), strict=True):
-            others = np.concatenate(rest)
-            apart_, right = np.zeros((len(others), c)), others[:, b + c :]
-            theirs = np.concatenate([others[:, : b + c], apart_, right], axis=1)
-            mine = np.concatenate([block[:, :b], 0 * block[:, b:-1], block[:, b:]], axis=1)
-            left = triangle(np.concatenate([theirs, mine]))[b:, b:]  # what is shared takes its best values
-            found[i] = [self._difference(left, self._columns[k], c) for k in range(len(self.candidates))]
-        return found
+        theirs = np.concatenate([others[:, :-1], np.zeros((len(others), c)), others[:, -1:]], axis=1)
+        own = self._by_candidate[i]
+        mine = np.concatenate([self.matrix[i], 0 * own, own, self.right[i][:, None]], axis=1)
+        left = triangle(np.concatenate([theirs, mine]))[b:, b:]  # what is shared takes its best values
+        return [self._difference(left, columns, c) for columns in self._columns]
 
     def _difference(self, left: Array, columns: list[int], c: int) -> tuple[float, int]:
         """Left : (m, 2 c + 1) by the candidates' sizes in the others, in the recording itself, and what is left."""
@@ -143,10 +145,9 @@ def against_the_others(blocks: Blocks, kept: list[int]) -> dict[int, FitsIn]:
     Where the candidates' sizes scatter over all recordings by more than the noise, as in every laboratory a little, a
     recording has to stand out of that. p is the smaller of both tests', for the number of candidates.
     """
-    found = {i: blocks.fits_in(i, kept) for i in kept}
-    if not blocks.candidates:
-        return found
-    falls = blocks.differences(kept)
+    found, falls = dict[int, FitsIn](), dict[int, list[tuple[float, int]]]()
+    for i, others in blocks.others(kept):
+        found[i], falls[i] = blocks.fits_in(i, others), blocks.differences(i, others)
     scatter = _scatter(blocks, falls)
     for i, fall in falls.items():
         told = [
@@ -191,9 +192,9 @@ def _scatter(blocks: Blocks, falls: dict[int, list[tuple[float, int]]]) -> list[
 
     calm = sorted(falls, key=lambda i: -stands_out(falls[i]))[: len(falls) - len(falls) // 3]
     found = []
-    among = blocks.differences(sorted(calm)) if len(calm) > 2 else {}
+    among = [blocks.differences(*each) for each in blocks.others(sorted(calm))] if len(calm) > 2 else []
     for k in range(len(blocks.candidates)):
-        usual = [fall[k][0] / stats.chi2.median(fall[k][1]) for fall in among.values() if fall[k][1] > 0]
+        usual = [fall[k][0] / stats.chi2.median(fall[k][1]) for fall in among if fall[k][1] > 0]
         ratio = float(np.median(usual)) if usual else 1.0
         found.append(LEFT_ASIDE * ratio if ratio > NOISE else 1.0)
     return found

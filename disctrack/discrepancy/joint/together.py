@@ -128,8 +128,8 @@ def answer_together(
         kept = [i for k, i in enumerate(kept) if k not in out]
     progress("each recording against the others")
     diagnosis, alone = _with_memory(system, diagnosis, crew)
-    blocks, everyone = Blocks(system, diagnosis.after), list(range(len(kept)))
-    judged = {i: (blocks.fits_in(k, everyone), alone[k]) for k, i in enumerate(kept)}
+    blocks = Blocks(system, diagnosis.after)
+    judged = {kept[k]: (blocks.fits_in(k, others), alone[k]) for k, others in blocks.others(range(len(kept)))}
     by_recording = (
         *(
             OfRecording(name, dict(labels), reasons.get(i, ""), *judged.get(i, ()))
