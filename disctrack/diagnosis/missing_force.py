@@ -30,7 +30,6 @@ from disctrack.rolling.simulate import COMPONENTS, moved_start, responses
 if TYPE_CHECKING:
     from disctrack.diagnosis.disc_system import DiscSystem
 
-AXES = ("n", "m", "z")
 PROBES_PER_TURN = 7  # of the fastest angle, so that a moment locked to it is resolved
 MAX_PROBES = 90
 WIDTH = 0.7  # of a probe over the distance to the next: their sum is flat to 1e-4
@@ -141,8 +140,8 @@ def probe(system: DiscSystem, fit_: Fit, other: Values | None = None) -> Probed 
         residual = residual - system.linearise(other, [])[0]
         right = right - prior_rows(fit_.quantities, {**fit_.values, **other})[0]  # numbers strained before may relax
     bells = np.exp(-0.5 * ((motion.time[:, None] - middles) / (WIDTH * span / k)) ** 2)
-    courses = np.zeros((len(bells), len(COMPONENTS), len(AXES), k))
-    for i in range(len(AXES)):
+    courses = np.zeros((len(bells), len(COMPONENTS), 3, k))
+    for i in range(3):
         courses[:, i, i] = bells
     moved = moved_start(motion.time, kernel, courses.reshape(len(bells), len(COMPONENTS), -1))[frames]
     by_start = derivative[..., [fit_.names.index(f"state.{name}") for name in STATE_SCALES]]

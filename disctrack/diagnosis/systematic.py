@@ -22,6 +22,7 @@ from scipy.stats import chi2
 from calibration.kit.arrays import Array, Mask
 from disctrack.diagnosis.stretch import MIN_FRAMES
 from disctrack.faults.catalogue import TYPICAL_STEPS
+from disctrack.track.side_by_side import evenly
 from disctrack.trajectory import MarkerStatus, Trajectory
 
 if TYPE_CHECKING:
@@ -235,7 +236,7 @@ def find_systematic(system: DiscSystem, known: Values | None = None, beside: Seq
     rows = np.flatnonzero(view.weights >= np.max(view.weights))
     if len(rows) < MIN_FRAMES:
         return Systematic()
-    rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(MAX_FRAMES, len(rows))).astype(int))]
+    rows = evenly(rows, MAX_FRAMES)
     places, (residual, by_pose, normal) = view.pixels(known), (part[rows] for part in view.pose_equations(known))
 
     def across(columns: Array) -> Array:

@@ -12,28 +12,26 @@ from disctrack.diagnosis.large_faults import find_large
 from disctrack.diagnosis.model_file import PAPER, declared_model
 from disctrack.diagnosis.plan import OPEN, Plan, Question, Say, plan
 from disctrack.diagnosis.recorded import Recorded, first_to_mend
-from disctrack.diagnosis.systematic import Systematic, find_systematic, noise_over_stated, with_noise
+from disctrack.diagnosis.systematic import MAX_FRAMES, Systematic, find_systematic, noise_over_stated, with_noise
 from disctrack.discrepancy.fit import Fit, fit
 from disctrack.discrepancy.joint.crew import Crew
 from disctrack.discrepancy.joint.reduction import Reduced, Reduction
 from disctrack.discrepancy.joint.sharing import Member
 from disctrack.discrepancy.joint.together import TogetherDiagnosis, answer_together
 from disctrack.discrepancy.noise import THIRD, inflation
-from disctrack.discrepancy.search import Settings
 from disctrack.discrepancy.system import Values
 from disctrack.errors import AnalysisError
 from disctrack.findings import Kind
+from disctrack.track.side_by_side import evenly
 from disctrack.trajectory import MarkerStatus, Trajectory
 
 SURE = 4.0  # sigmas of the noise that frames show, from which it is not the one stated
-SEEN_PLACES = 60  # frames of a recording whose dots tell where the lenses' fields are needed
 Item = tuple[Recorded, Mapping[str, str], str]  # what a process needs to know: a recording, its labels, the model
 
 
 def diagnose_together(
     recordings: Sequence[Recorded],
     model: str = PAPER,
-    settings: Settings | None = None,
     processes: int = 1,
     progress: Callable[[str], None] = lambda text: None,
     settle: bool = False,
@@ -52,7 +50,7 @@ def diagnose_together(
     described = [(recorded.name, label) for recorded, label, _ in items]
     progress(f"{len(items)} recordings, each alone")
     with Crew(build, items, processes) as crew:
-        answer = answer_together(crew, described, in_common, settings, progress, unread or {})
+        answer = answer_together(crew, described, in_common, progress, unread or {})
         return replace(answer, plan=_plan(answer, crew)) if settle else answer
 
 
@@ -130,7 +128,7 @@ class DiscMember:
 
     def told(self) -> tuple[Mapping[str, str], Systematic, list[Array]]:
         """What the others need of it: its labels, its systematic errors, and places of dots per camera [px]."""
-        rows = np.unique(np.linspace(0, len(self.system.time) - 1, SEEN_PLACES).astype(int))
+        rows = evenly(np.arange(len(self.system.time)), MAX_FRAMES)
         used, places = self.system.used[rows], self.system.observed[rows]
         return self.labels, self.systematic, [places[:, c][used[:, c]] for c in range(2)]
 

@@ -10,9 +10,9 @@ from scipy import stats
 from scipy.optimize import least_squares
 
 from calibration.kit.arrays import Array
+from disctrack.discrepancy.score import INVISIBLE
 
 LEVEL = 0.01  # probability below which a hypothesis is refused, and with which chance alone brings a dependence forth
-SAME = 1e-6  # smallest part of a covariate's logarithms that the others, and the constants, leave: less is no other
 
 
 @dataclass(frozen=True)
@@ -109,8 +109,10 @@ def _shapes(
         for chosen in names:
             powers = np.array([logarithms[k] for k in chosen]).reshape(-1, n)
             columns = np.column_stack([level[:, None] == np.arange(constants), powers.T]).astype(float)
-            small = np.linalg.svd(columns, compute_uv=False).min() <= SAME * np.sqrt(n)
-            if not chosen or (not small and n > columns.shape[1]):
+            same = np.linalg.svd(columns, compute_uv=False).min() <= INVISIBLE * np.sqrt(
+                n
+            )  # as the others, or constant
+            if not chosen or (not same and n > columns.shape[1]):
                 yield kind, chosen, level, powers
 
 

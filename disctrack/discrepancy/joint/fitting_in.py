@@ -21,7 +21,6 @@ from disctrack.discrepancy.score import INVISIBLE
 from disctrack.discrepancy.search import CLASS_GAIN
 from disctrack.discrepancy.system import Candidate
 
-LAW = 1e6  # sigmas: length to which the derivative by a number without a prior is scaled, so that it is never left out
 SPOILT = 1e-2  # of the first one's statistic: by so much less the others may be judged wrongly where it moved the fit
 TWIN = 0.5  # of the statistic of the one that fits worst, from which on another may be the one that is wrong
 TWINS = 3  # of those that are looked at: a twin fits about as badly as the worst
@@ -93,7 +92,9 @@ class Blocks:
         """
         rest = others[:, -1], others[:, : len(self.names)]
         length = np.linalg.norm(self.matrix[i], axis=0)
-        scale = np.where(np.isfinite(self._sigma), self._sigma, LAW / np.where(length > 0, length, 1.0))
+        # without a prior a number is left out only where the recording sees nothing of it
+        free = 1.0 / INVISIBLE / np.where(length > 0, length, 1.0)
+        scale = np.where(np.isfinite(self._sigma), self._sigma, free)
         U, singular, _ = np.linalg.svd(self.matrix[i] * scale, full_matrices=False)
         U = U[:, singular > DETERMINED]
         mine = U.T @ self.right[i], U.T @ self.matrix[i]

@@ -87,9 +87,8 @@ def answer_together(
     crew: Crew,
     described: Sequence[tuple[str, Mapping[str, str]]],
     in_common: Callable[[list[Any]], list[Any]],
-    settings: Settings | None = None,
-    progress: Callable[[str], None] = lambda text: None,
-    unread: Mapping[str, str] | None = None,
+    progress: Callable[[str], None],
+    unread: Mapping[str, str],
 ) -> TogetherDiagnosis:
     """What does the model lack, of all the crew's recordings together?
 
@@ -101,8 +100,8 @@ def answer_together(
     The crew is left with the recordings that the answer rests on.
     Raises AnalysisError where fewer than two can be used.
     """
-    settings = replace(settings or Settings(), noise=1.0)
-    names, n, unread = [name for name, _ in described], len(described), unread or {}
+    settings = Settings(noise=1.0)
+    names, n = [name for name, _ in described], len(described)
     told = crew.call("told", [()] * n)
     reasons = {i: str(t) for i, t in enumerate(told) if isinstance(t, DiscTrackError)}
     kept = [i for i in range(n) if i not in reasons]
