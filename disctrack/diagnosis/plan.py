@@ -4,7 +4,7 @@ The fitted model is started anew, filmed by the same cameras with the same noise
 the shared quantities (laws, cameras, dots) is put beside what this recording says; initial states are each one's own.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any
@@ -88,11 +88,9 @@ class Plan:
 
     def best(self, i: int) -> Proposed | None:
         """The proposal that answers question i best."""
-        known = [r for r in self.rows if np.isfinite(r.answers[i])]
-        if not known:
-            return None
-        pick: Callable[..., Proposed] = min if len(self.questions[i]) == 1 else max
-        return pick(known, key=lambda r: r.answers[i])
+        known = (r for r in self.rows if np.isfinite(r.answers[i]))
+        more = 1 if len(self.questions[i]) > 1 else -1  # sigmas between two effects, and not those of a size
+        return max(known, key=lambda r: more * r.answers[i], default=None)
 
 
 # What is known of quantities, whatever others are: their names (k,), and rows (m, k) of a least-squares problem
@@ -106,17 +104,17 @@ class Planner:
         self,
         system: DiscSystem,
         fit: Fit,
-        candidates: Sequence[Candidate],
+        questions: Sequence[Question],
         noise: float = 1.0,
         said: Say | None = None,
     ) -> None:
-        """Fit : of the enlarged model.   candidates : whose columns will be asked for.
+        """Fit : of the enlarged model.   questions : that will be asked.
 
         noise : variance of the dots over that stated
         said : what is known of quantities, where that is more than this recording says
         """
         self.system, self.fit, self._noise = system, fit, noise
-        new = {q.name: q for c in candidates for q in c.quantities}
+        new = {q.name: q for question in questions for c in question for q in c.quantities}
         self.tested = tuple(new.values())
         fitted = [q for q in fit.quantities if not q.is_initial and q.name not in new]
         self._shared = [q for q in fitted if q.belongs_to]
@@ -150,20 +148,18 @@ class Planner:
             return None
         return np.concatenate([self.now, said]), float(planned.time[-1] - planned.time[0])
 
-    def sigmas(self, rows: Array, effect: Candidate, alternative: Candidate) -> float:
-        """Root of the chi-square that the alternative leaves where the effect is true at its fitted size."""
-        matrix = np.concatenate([rows, self._priors])
-        amounts = np.array([self.fit.values.get(q.name, q.null) - q.null for q in effect.quantities])
-        signal = matrix[:, self._columns(effect)] @ amounts
-        return float(np.linalg.norm(cleared(signal, span(matrix[:, [*self._base, *self._columns(alternative)]]))))
+    def answer(self, rows: Array, question: Question) -> float:
+        """Root of the chi-square that the alternative leaves where the effect is true at its fitted size.
 
-    def sigma(self, rows: Array, candidate: Candidate) -> float:
-        """Standard deviation of its first number; infinite where nothing is seen of it."""
+        Without an alternative the standard deviation of its first number; infinite where nothing is seen of it.
+        """
         matrix = np.concatenate([rows, self._priors])
-        return float(sigmas(matrix[:, self._columns(candidate)], span(matrix[:, self._base]))[0])
-
-    def _columns(self, candidate: Candidate) -> list[int]:
-        return [self.column[n] for n in candidate.names]
+        columns, *alternative = (matrix[:, [self.column[n] for n in c.names]] for c in question)
+        basis = span(np.column_stack([matrix[:, self._base], *alternative]))
+        if not alternative:
+            return float(sigmas(columns, basis)[0])
+        amounts = np.array([self.fit.values.get(q.name, q.null) - q.null for q in question[0].quantities])
+        return float(np.linalg.norm(cleared(columns @ amounts, basis)))
 
     def _said(self, system: DiscSystem, values: Values, known: Iterable[Quantity], another: bool = False) -> Array:
         """(m, k) what a recording says of the shared quantities among those known, its own at their best.
@@ -255,11 +251,10 @@ def plan(
 
     said : as for `Planner`
     """
-    candidates = {c.name: c for q in questions for c in q}
-    planner = Planner(system, fit, list(candidates.values()), noise, said)
+    planner = Planner(system, fit, questions, noise, said)
 
     def answers(rows: Array) -> tuple[float, ...]:
-        return tuple(planner.sigma(rows, *q) if len(q) == 1 else planner.sigmas(rows, *q) for q in questions)
+        return tuple(planner.answer(rows, question) for question in questions)
 
     now = answers(planner.now)
 

@@ -49,7 +49,7 @@ def diagnose_together(
     items = [(recorded, label, model) for recorded, label in zip(recordings, labels, strict=True)]
     described = [(recorded.name, label) for recorded, label, _ in items]
     progress(f"{len(items)} recordings, each alone")
-    with Crew(build, items, processes) as crew:
+    with Crew(DiscMember, items, processes) as crew:
         answer = answer_together(crew, described, in_common, progress, unread or {})
         return replace(answer, plan=_plan(answer, crew)) if settle else answer
 
@@ -114,9 +114,13 @@ class DiscMember:
     """One recording of the disc: prepared, fitted alone, and then asked for what it says of the shared quantities."""
 
     def __init__(self, item: Item) -> None:
-        """Raises AnalysisError where it cannot be fitted with the others."""
+        """Raises AnalysisError where it cannot be fitted with the others, or is declared wrongly."""
         recorded, self.labels, model = item
         self.name, as_tracked = recorded.name, recorded.trajectory
+        # laws in proportion to the load would fit a disc of any weight all the same
+        wrong = [f for f in as_tracked.findings if f.kind == Kind.DENSITY] or first_to_mend(as_tracked.findings)
+        if wrong:
+            raise AnalysisError("; ".join(f.sentence for f in wrong))
         trajectory = with_noise(as_tracked, _noise(as_tracked))  # recordings are weighed by it
         declared, faults = declared_model(trajectory, model)
         self.system = DiscSystem(trajectory, declared, known=faults)
@@ -232,13 +236,3 @@ def in_common(told: Sequence[tuple[Mapping[str, str], Systematic, list[Array]]])
             )
         )
     return common
-
-
-def build(item: Item) -> DiscMember:
-    """For a crew. Raises AnalysisError where it cannot be used, or is declared wrongly."""
-    findings = item[0].trajectory.findings
-    # laws in proportion to the load would fit a disc of any weight all the same
-    wrong = [f for f in findings if f.kind == Kind.DENSITY] or first_to_mend(findings)
-    if wrong:
-        raise AnalysisError("; ".join(f.sentence for f in wrong))
-    return DiscMember(item)

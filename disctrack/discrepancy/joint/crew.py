@@ -27,7 +27,7 @@ class Crew:
     def __init__(self, build: Build, items: Sequence[Any], processes: int = 1) -> None:
         """What `build` raises is kept in place of its object, as a DiscTrackError.
 
-        build : a module's function, as it has to be found by other processes
+        build : a module's function or class, as it has to be found by other processes
         """
         self._kept = list(range(len(items)))  # numbers of the objects that are asked, in their order
         self._here: dict[int, Any] = {}
