@@ -105,7 +105,6 @@ def answer_together(
     told = crew.call("told", [()] * n)
     reasons = {i: str(t) for i, t in enumerate(told) if isinstance(t, DiscTrackError)}
     kept = [i for i in range(n) if i not in reasons]
-    _enough(kept, names, reasons, unread)
     crew.keep(kept)
     refitted = crew.call("with_common", [(s,) for s in in_common([told[i] for i in kept])])
     reasons |= {i: str(m) for i, m in zip(kept, refitted, strict=True) if isinstance(m, DiscTrackError)}
@@ -113,7 +112,10 @@ def answer_together(
     kept = [i for i in kept if i not in reasons]
     unusable = (*(names[i] for i in reasons), *unread)
     for round_ in range(ROUNDS + 1):
-        _enough(kept, names, reasons, unread)
+        if len(kept) < 2:
+            left_out = {names[i]: reason for i, reason in reasons.items()} | dict(unread)
+            said = "; ".join(f"{name}: {reason}" for name, reason in list(left_out.items())[:5])
+            raise AnalysisError(f"fewer than two recordings can be diagnosed together. {said}")
         crew.keep(kept)
         system, diagnosis = _search(members, crew, settings, progress)
         most = len(members) - (2 * n + 2) // 3 if round_ < ROUNDS else 0
@@ -138,14 +140,6 @@ def answer_together(
     )
     laws = _bounds(system, diagnosis), _dependences(system, diagnosis)
     return TogetherDiagnosis(diagnosis, system, by_recording, *laws, _notes(by_recording, unusable), unusable)
-
-
-def _enough(kept: Sequence[int], names: Sequence[str], reasons: Mapping[int, str], unread: Mapping[str, str]) -> None:
-    if len(kept) >= 2:
-        return
-    told = {names[i]: reason for i, reason in reasons.items()} | dict(unread)
-    said = "; ".join(f"{name}: {reason}" for name, reason in list(told.items())[:5])
-    raise AnalysisError(f"fewer than two recordings can be diagnosed together. {said}")
 
 
 def _search(

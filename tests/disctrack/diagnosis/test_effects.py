@@ -59,9 +59,8 @@ def test_no_recording_is_proposed_to_tell_gravity_from_the_frame_rate():
     result = diagnose(measured(faults=Faults(frame_rate_hz=1004.0), seed=14, n=300))
     (found,) = result.diagnosis.found
     assert len(found.cannot_be_told_from) == 1
-    assert (
-        with_plan(result).plan.best(0).answers[0] < 0.01
-    )  # all laws at hand are quadratic in the rates: time can be stretched
+    # all laws at hand are quadratic in the rates: time can be stretched
+    assert with_plan(result).plan.best(0).answers[0] < 0.01
 
 
 HIDDEN = {  # faults, or effects; what is found, within so many sigmas, which are smaller than that; how it is measured

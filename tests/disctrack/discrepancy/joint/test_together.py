@@ -104,9 +104,10 @@ def test_differences_in_an_effect_and_to_the_others_are_chi_squares_and_name_nob
     for _ in range(40):
         system, _ = joint(runs(rng, 8))
         found = fit(system, system.base, system.sharing.start())
-        falls += Blocks(system, found, system.candidates).differences(range(8)).values()
-        blocks = Blocks(system, found)
-        judged += [blocks.fits_in(*each) for each in blocks.others(range(8))]
+        blocks = Blocks(system, found, system.candidates)
+        for each in blocks.others(range(8)):
+            falls.append(blocks.differences(*each))
+            judged.append(blocks.fits_in(*each))
         false += bool(apart(system, found, 0.005, candidates=system.candidates))
     falls = np.array(falls)  # (320, candidates, 2)
     assert_allclose(falls[..., 1], np.tile([1, 2, 1], (320, 1)))
