@@ -334,7 +334,7 @@ def autoregression(residual: Array, present: Mask, rows: Sequence[slice]) -> tup
     top = int(min(MAX_MEMORY, max(1, n // 40)))
     found, ratio = np.zeros((residual.shape[1], top)), 0.0
     for c, x in enumerate(residual.T):
-        lags = [sum(float(x[r][lag:] @ x[r][: len(x[r]) - lag]) for r in rows) for lag in range(top + 1)]
+        lags = [sum(float(x[r][lag:] @ x[r][: max(len(x[r]) - lag, 0)]) for r in rows) for lag in range(top + 1)]
         if not lags[0] > 0:
             continue
         covariance, best, share = np.array(lags), 0.0, 1.0

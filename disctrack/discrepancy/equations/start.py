@@ -55,7 +55,7 @@ def states_from_data(formulas: Formulas, s: Samples, p: Array, first: int, begin
     """
     w = len(formulas.channels)
     local = [local_polynomial(s, c, first) for c in range(w)]
-    value_size = np.array([np.nanstd(s.data[:, c]) or 1.0 for c in range(w)])
+    value_size = np.array([(np.std(x[np.isfinite(x)]) if np.isfinite(x).any() else 0.0) or 1.0 for x in s.data.T])
     slope_size = value_size / max(turn(s), 1e-300) * 2 * np.pi
 
     def misfit(y: Array, slopes: float) -> Array:
@@ -175,18 +175,17 @@ def misfits(system: EquationSystem, values: dict[str, float]) -> Array:
 def cut_short(system: EquationSystem, share: float = SHORT, most: float = np.inf) -> list[EquationSystem]:
     """The stretches cut into shares of a turn, and these joined two by two until they are whole again.
 
-    most : stretches that are used, evenly over the runs, where longer ones begin; of each run one at least
+    most : stretches that are used: those that begin where longer ones do
     """
-    rows = [max(FEWEST, int(share * turn(s) / (s.time[-1] - s.time[0]) * len(s.time))) for s in system.stretches]
-    found: list[EquationSystem] = []
-    every = 0
-    while True:
-        parts = [cut(s, n) for s, n in zip(system.stretches, rows, strict=True)]
-        if (count := sum(map(len, parts))) == len(parts):
-            return [*found, system]
-        every = max(1, every // 2 if every else 2 ** int(np.ceil(np.log2(max(count / most, 1.0)))))
-        found.append(replace(system, stretches=[part for some in parts for part in some[::every]]))
-        rows = [2 * n for n in rows]
+    spacing = min(float(np.median(np.diff(s.time))) for s in system.stretches)
+    duration = max(share * min(turn(s) for s in system.stretches), FEWEST * spacing)
+    levels: list[list[Samples]] = []
+    while not levels or len(levels[-1]) > len(system.stretches):
+        levels.append([part for s in system.stretches for part in cut(s, duration)])
+        duration *= 2
+    begun = {part.name for part in next(parts for parts in levels if len(parts) <= max(most, len(levels[-1])))}
+    some = ([part for part in parts if part.name in begun] for parts in levels[:-1])
+    return [*(replace(system, stretches=parts) for parts in some), system]
 
 
 def led(system: EquationSystem, values: Values) -> Start:

@@ -295,8 +295,8 @@ def fitted_rows(s: Samples) -> Mask:
     return np.asarray(s.time - s.time[0] <= TRAIN_FRACTION * (s.time[-1] - s.time[0]), bool)
 
 
-def cut(s: Samples, rows: int) -> list[Samples]:
-    """A stretch in parts that begin with data and have so many of them, the last one up to twice as many."""
+def cut(s: Samples, duration: float) -> list[Samples]:
+    """A stretch in parts of so many seconds, that begin with data; those of twice the duration begin where some do."""
     present = np.flatnonzero(np.isfinite(s.data).any(axis=1))
-    edges = [0, *present[rows : len(present) - rows + 1 : rows].tolist(), len(s.time)]
-    return [s.part(a, b) for a, b in pairwise(edges)]
+    new = np.flatnonzero(np.diff(np.floor((s.time[present] - s.time[0]) / duration))) + 1
+    return [s.part(a, b) for a, b in pairwise([0, *present[new].tolist(), len(s.time)])]
