@@ -250,7 +250,7 @@ class _Competition:
     def is_worth_telling(self, law: LearnedForce) -> bool:
         """Does it describe the data, or nearly all of what is missing, and samples that it has not seen as well?
 
-        As known terms are asked: where it is not noise that is left, they must leave more.
+        As known terms are asked: where it is not noise that is left, they must leave more, and foretell less.
         """
         d = self.diagnosis
         if not self.arrived(law.fit) or d.held_out_before is None:
@@ -258,7 +258,8 @@ class _Competition:
         if not law.held_out.gain_over(d.held_out_before, self.noise) > CLASS_GAIN:
             return False
         most = d.settings.unexplained_share * d.before.excess(self.noise)
-        return law.at_noise or (law.is_shorter and law.fit.excess(self.noise) < most)
+        foretells = d.held_out_after is None or law.held_out.chi_square < d.held_out_after.chi_square
+        return law.at_noise or (law.is_shorter and foretells and law.fit.excess(self.noise) < most)
 
     def best(self, beside: tuple[Candidate, ...]) -> WithForce | None:
         """The law that makes the data most probable beside these terms."""

@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 
 import numpy as np
-from scipy.special import erfc
+import scipy
 
 from calibration.kit.arrays import Array, Mask, robust_sigma
 from calibration.kit.brief import ranges
@@ -189,7 +189,7 @@ def _table_disagrees(table: TableFromDisc | None, trajectory: Trajectory) -> tup
     """Board and disc that differ about the table by more than their tolerances; else a disc that is not on it."""
     apart = table is not None and abs(table.plane[0]) > NO_TOLERANCE
     severity = Severity.DOUBT if apart else Severity.WARNING
-    if table is None or table.probability >= erfc(FROM_SIGMAS / np.sqrt(2)):
+    if table is None or table.probability >= scipy.special.erfc(FROM_SIGMAS / np.sqrt(2)):
         return off_the_table(trajectory, severity)
     text = (
         f"the disc's lowest point does not roll on the board's table: {table.sentence}. They differ by more than "
