@@ -98,7 +98,8 @@ def _open_stack(files: Sequence[Path], camera: str) -> FrameReader:
     check_frame_size(first.width, first.height, str(files[0]))
     told: dict[str, Any] = {"camera": camera, "files": sources, "notes": tuple(notes)}
     told |= {"timestamps": stamps, "frame_rate": rate}
-    offsets = np.array([page.plain_offset for page in pages], np.int64)
+    beyond = 2**62  # the end of any file: a damaged directory may name an offset that no integer holds
+    offsets = np.array([min(page.plain_offset, beyond) for page in pages], np.int64)
     if (offsets >= 0).all() and all(page.layout == first.layout for page in pages):
         layout = PixelLayout(first.width, first.height, first.dtype)
         return raw_frames(offsets=offsets, layout=layout, **told)

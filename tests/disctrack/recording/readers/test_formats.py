@@ -295,7 +295,7 @@ def test_a_damaged_packet_costs_its_frames_up_to_the_next_key_frame_and_no_other
 FRAMES = frames_of(8, 8, 6)
 PICTURES = [kind for kind in IMAGES if kind.bits == 8]
 SINGLE = [
-    *(TIFFS[i] for i in (0, 2, 4, 5)),
+    *(TIFFS[i] for i in (0, 2, 4, 5, 1)),
     Format("tif", 8, write_tiff, {"bigtiff": True}),
     Format("h5", 8, write_hdf5, {"attributes": {"frame_rate": 1000.0}}),
     Format("h5", 8, write_hdf5, {**EACH, "chunks": (2, *FRAMES.shape[1:])}),
