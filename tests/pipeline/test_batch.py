@@ -375,6 +375,15 @@ def test_a_batch_killed_at_random_instants_leaves_only_whole_results_and_can_go_
     assert not list(root.rglob("*.part*"))  # those that killed processes left are cleared away
 
 
+def test_what_a_terminal_sends_spares_even_the_first_process():
+    """It is begun together with one that keeps count of what the system lends, which unblocks Ctrl-C."""
+    blocked = "len({signal.SIGINT, signal.SIGHUP} & signal.pthread_sigmask(signal.SIG_BLOCK, ()))"
+    process = f"Spawn().Process(target=exec, args=('import signal, sys; sys.exit({blocked})',))"
+    code = f"from disctrack.processes import Spawn; process = {process}; process.start(); process.join()"
+    ended = subprocess.run([sys.executable, "-c", f"{code}; raise SystemExit(process.exitcode)"], cwd=REPOSITORY)
+    assert ended.returncode == 2
+
+
 @pytest.mark.statistical
 @pytest.mark.parametrize("kind", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_an_interrupted_batch_says_so_clears_up_and_can_go_on(recording, tmp_path, kind):
