@@ -104,55 +104,38 @@ def _jpeg_size(content: bytes) -> tuple[int, int]:
 
 def _png(content: bytes, where: str, out: NDArray | None) -> NDArray:
     position, end, view = 8, len(content), memoryview(content)
-    ihdr: tuple[int, ...] = ()
-    data: list[memoryview] = []
-    transparent = False
-    while position + 12 <= end:
-        (length,) = struct.unpack_from(">I", content, position)
-        kind = content[position + 4 : position + 8]
-        start, stop = position + 8, position + 8 + length
+    chunks: dict[bytes, list[memoryview]] = {}
+    while position + 12 <= end and b"IEND" not in chunks:
+        kind, stop = content[position + 4 : position + 8], position + 8 + _number_at(content, position)
         if stop + 4 > end:
             break
-        if zlib.crc32(view[position + 4 : stop]) != struct.unpack_from(">I", content, stop)[0]:
+        if zlib.crc32(view[position + 4 : stop]) != _number_at(content, stop):
             name = kind.decode("latin-1")
             raise RecordingError(
                 f"{where}: the PNG is damaged: wrong checksum of chunk {name!r} at byte {position}. {_AGAIN}"
             )
-        if kind == b"IHDR" and length == 13:
-            ihdr = struct.unpack_from(">IIBBBBB", content, start)
-            check_frame_size(ihdr[0], ihdr[1], where, n_bytes=end)
-        elif kind == b"IDAT":
-            data.append(view[start:stop])
-        elif kind == b"tRNS":
-            transparent = True
-        elif kind == b"IEND" and ihdr:
-            width, height, depth, colour, _, _, interlaced = ihdr
-            if colour or interlaced or transparent or depth not in (8, 16):
-                return _by_opencv(content, where)
-            image = _plain_grey(b"".join(data), width, height, depth, out)
-            if image is None:
-                raise RecordingError(f"{where}: not a readable image, or damaged. {_AGAIN}")
-            return image
+        chunks.setdefault(kind, []).append(view[position + 8 : stop])
         position = stop + 4
-    raise RecordingError(f"{where}: the PNG file is truncated after {end} bytes (no end chunk). {_AGAIN}")
-
-
-def _plain_grey(stream: bytes, width: int, height: int, depth: int, out: NDArray | None) -> NDArray | None:
-    """Pixels (height, width) uint8 or uint16 into `out` or a new array; None if the stream is not what IHDR says.
-
-    The stream carries a checksum of its own, which is verified.
-    """
+    if b"IEND" not in chunks or [len(header) for header in chunks.get(b"IHDR", ())] != [13]:
+        raise RecordingError(f"{where}: the PNG file is truncated after {end} bytes (no end chunk). {_AGAIN}")
+    width, height, depth, colour, _, _, interlaced = struct.unpack(">IIBBBBB", *chunks[b"IHDR"])
+    check_frame_size(width, height, where, n_bytes=end)
+    if colour or interlaced or b"tRNS" in chunks or depth not in (8, 16):
+        return _by_opencv(content, where)
     stride = width * depth // 8
-    raw = inflated(stream, (stride + 1) * height)
-    if raw is None:
-        return None
+    raw = inflated(b"".join(chunks.get(b"IDAT", ())), (stride + 1) * height)
     out = room_for(out, (width, height), np.dtype(f"u{depth // 8}"))
-    rows = np.frombuffer(raw, np.uint8).reshape(height, stride + 1)
-    if not undo_filters(rows, depth // 8, out.view(np.uint8)):
-        return None
+    if raw is None or not undo_filters(
+        np.frombuffer(raw, np.uint8).reshape(height, stride + 1), depth // 8, out.view(np.uint8)
+    ):
+        raise RecordingError(f"{where}: not a readable image, or damaged. {_AGAIN}")
     if depth == 16 and np.little_endian:
         out.byteswap(inplace=True)
     return out
+
+
+def _number_at(content: bytes, position: int) -> int:
+    return int.from_bytes(content[position : position + 4], "big")
 
 
 def inflated(stream: bytes, size: int) -> bytes | bytearray | None:
