@@ -24,7 +24,7 @@ from disctrack.errors import RecordingError
 from disctrack.recording.readers.base import FrameReader, first_readable
 from disctrack.recording.readers.decoding import as_grey, decode
 from disctrack.recording.readers.files import check_continuation, content_of, number_files
-from disctrack.recording.readers.raw import PixelLayout, RawFile, check_frame_size, raw_frames
+from disctrack.recording.readers.raw import RawFile, check_frame_size, raw_frames
 from disctrack.recording.readers.tiff_pages import Page, page_pixels, pages_of
 
 
@@ -95,14 +95,13 @@ def _open_stack(files: Sequence[Path], camera: str) -> FrameReader:
         raise RecordingError(f"{files[0]}: a TIFF file without a page that can be read. Export it again.")
     first = pages[0]
     rate, stamps = _times(first.description, len(pages))
-    check_frame_size(first.width, first.height, str(files[0]))
+    check_frame_size(first.plain.width, first.plain.height, str(files[0]))
     told: dict[str, Any] = {"camera": camera, "files": sources, "notes": tuple(notes)}
     told |= {"timestamps": stamps, "frame_rate": rate}
     beyond = 2**62  # the end of any file: a damaged directory may name an offset that no integer holds
     offsets = np.array([min(page.plain_offset, beyond) for page in pages], np.int64)
-    if (offsets >= 0).all() and all(page.layout == first.layout for page in pages):
-        layout = PixelLayout(first.width, first.height, first.dtype)
-        return raw_frames(offsets=offsets, layout=layout, **told)
+    if (offsets >= 0).all() and all(page.coding == first.coding for page in pages):
+        return raw_frames(offsets=offsets, layout=first.plain, **told)
 
     def pixels(index: int, out: Image | None, where: str) -> Image:
         return as_grey(page_pixels(sources[index], pages[index], where), where)
@@ -112,7 +111,7 @@ def _open_stack(files: Sequence[Path], camera: str) -> FrameReader:
         image_size=(image.shape[1], image.shape[0]),
         dtype=image.dtype,
         decoded=pixels,
-        stored=lambda index: pages[index].layout.encode() + b"".join(pages[index].pieces(sources[index], "")),
+        stored=lambda index: pages[index].coding.encode() + b"".join(pages[index].pieces(sources[index], "")),
         **told,
     )
 
@@ -135,7 +134,7 @@ def _pages(file: RawFile) -> tuple[list[Page], str | None]:
 
 def _without_directories(file: RawFile, first: Page) -> list[Page]:
     """All frames of a file with one directory, as ImageJ writes stacks: the others follow the first without a gap."""
-    n, size = _pages_announced(first.description), first.width * first.height * first.dtype.itemsize
+    n, size = _pages_announced(first.description), first.plain.frame_bytes
     if n < 2 or size == 0:
         return [first]
     if first.plain_offset < 0:

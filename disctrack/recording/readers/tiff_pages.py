@@ -17,14 +17,14 @@ from numpy.typing import NDArray
 
 from disctrack.errors import RecordingError
 from disctrack.recording.readers._pixel_kernels import lzw_codes_follow
-from disctrack.recording.readers.raw import MOST_PIXELS, RawFile, check_frame_size
+from disctrack.recording.readers.raw import MOST_PIXELS, PixelLayout, RawFile, check_frame_size
 
 logging.getLogger("tifffile").addHandler(logging.NullHandler())  # it logs what it finds odd; here that is an error
 
 _LZW = tifffile.COMPRESSION.LZW
 _READ = {tifffile.COMPRESSION[name] for name in ("NONE", "LZW", "JPEG", "ADOBE_DEFLATE", "PACKBITS", "DEFLATE")}
 # Tags by which the pixels of two pages are decoded alike.
-_LAYOUT = (256, 257, 258, 259, 262, 266, 274, 277, 278, 284, 317, 320, 322, 323, 338, 339, 347)
+_CODING = (256, 257, 258, 259, 262, 266, 274, 277, 278, 284, 317, 320, 322, 323, 338, 339, 347)
 
 
 @dataclass(frozen=True)
@@ -33,36 +33,27 @@ class Page:
 
     places: tuple[int, ...]  # byte offsets of strips or tiles
     sizes: tuple[int, ...]  # [bytes]
-    layout: str  # all by which the pixels are decoded
-    like: tifffile.TiffPage  # the first page of the file with this layout; of it no more than the layout is meant
+    coding: str  # all by which the pixels are decoded
+    like: tifffile.TiffPage  # the first page of the file with this coding; of it no more than the coding is meant
     description: str
 
     @property
-    def width(self) -> int:
-        """[px]."""
-        return int(self.like.imagewidth)
-
-    @property
-    def height(self) -> int:
-        """[px]."""
-        return int(self.like.imagelength)
-
-    @property
-    def dtype(self) -> np.dtype:
-        """Of a pixel in the file, in its order of bytes."""
-        return np.dtype(self.like.dtype).newbyteorder(self.like.parent.byteorder)
+    def plain(self) -> PixelLayout:
+        """How the pixels lie where they lie as they are."""
+        dtype = np.dtype(self.like.dtype).newbyteorder(self.like.parent.byteorder)
+        return PixelLayout(int(self.like.imagewidth), int(self.like.imagelength), dtype)
 
     @property
     def plain_offset(self) -> int:
         """Where grey values of whole bytes lie, upright, one after the other and as they are; -1 if they do not."""
-        page, size = self.like, self.width * self.height * self.dtype.itemsize
+        page, plain = self.like, self.plain
         grey = page.photometric == tifffile.PHOTOMETRIC.MINISBLACK and page.samplesperpixel == 1 and page.fillorder == 1
-        whole = page.bitspersample in (8, 16) and self.dtype.kind == "u"
+        whole = page.bitspersample in (8, 16) and plain.dtype.kind == "u"
         if not (grey and whole) or page.compression != 1 or page.is_tiled or _orientation(page) != 1:
             return -1
         follow = all(a + n == b for a, n, b in zip(self.places, self.sizes, self.places[1:], strict=False))
         one = len(self.places) == 1
-        return self.places[0] if one or (follow and sum(self.sizes) == size) else -1
+        return self.places[0] if one or (follow and sum(self.sizes) == plain.frame_bytes) else -1
 
     def pieces(self, source: RawFile, where: str) -> list[bytes]:
         """Strips or tiles as they are stored. Raises RecordingError."""
@@ -71,7 +62,7 @@ class Page:
 
 def pages_of(source: RawFile) -> Iterator[Page]:
     """The pages of a file but for thumbnails. Raises RecordingError where they break off, or there is none."""
-    layouts: dict[str, tifffile.TiffPage] = {}
+    first: dict[str, tifffile.TiffPage] = {}  # of each coding
     seen: set[int] = set()
     try:
         with source.stream() as stream:
@@ -86,7 +77,7 @@ def pages_of(source: RawFile) -> Iterator[Page]:
                 if not isinstance(page, tifffile.TiffPage):  # others know less of themselves; nobody wanted them
                     raise TypeError("no page of its own")
                 seen.add(page.offset)
-                found = _page(page, layouts)
+                found = _page(page, first)
                 if not page.subfiletype & tifffile.FILETYPE.REDUCEDIMAGE:
                     yield found
             link = source.bytes_at(tiff.pages.next_page_offset or 0, tiff.tiff.offsetsize, str(source))
@@ -98,13 +89,12 @@ def pages_of(source: RawFile) -> Iterator[Page]:
         raise RecordingError(f"{source}: not a readable TIFF file, or damaged ({error}).") from error
 
 
-def _page(page: tifffile.TiffPage, layouts: dict[str, tifffile.TiffPage]) -> Page:
+def _page(page: tifffile.TiffPage, first: dict[str, tifffile.TiffPage]) -> Page:
     if int(page.imagewidth) < 0 or int(page.imagelength) < 0 or len(page.dataoffsets) != len(page.databytecounts):
         raise RecordingError(f"the directory at byte {page.offset} is damaged")
-    layout = page.parent.byteorder + repr([page.tags.valueof(code) for code in _LAYOUT])
+    coding = page.parent.byteorder + repr([page.tags.valueof(code) for code in _CODING])
     places, sizes = (tuple(map(int, numbers)) for numbers in (page.dataoffsets, page.databytecounts))
-    like = layouts.setdefault(layout, page)
-    return Page(places, sizes, layout, like, page.description)
+    return Page(places, sizes, coding, first.setdefault(coding, page), page.description)
 
 
 def _orientation(page: tifffile.TiffPage) -> int:
@@ -127,8 +117,8 @@ def page_pixels(source: RawFile, page: Page, where: str) -> NDArray:
 
 def _check(page: Page, where: str) -> None:
     """Raise RecordingError unless a page's numbers fit each other, and its pixels are compressed in a known way."""
-    like = page.like
-    check_frame_size(page.width, page.height, where, n_bytes=sum(page.sizes))
+    like, width, height = page.like, page.plain.width, page.plain.height
+    check_frame_size(width, height, where, n_bytes=sum(page.sizes))
     if like.compression not in _READ:
         name = getattr(like.compression, "name", "unknown")
         raise RecordingError(
@@ -139,8 +129,8 @@ def _check(page: Page, where: str) -> None:
     n = int(np.prod(like.chunked, dtype=float)) if like.dtype is not None and like.shaped[1] == 1 else -1
     if n != len(page.places) or like.samplesperpixel > 4 or max(tile * n, sum(page.sizes)) > 4 * MOST_PIXELS:
         raise RecordingError(
-            f"{where}: {len(page.places)} pieces of {sum(page.sizes)} bytes in all do not make up its {page.width} x "
-            f"{page.height} px; the page is damaged. Copy it again."
+            f"{where}: {len(page.places)} pieces of {sum(page.sizes)} bytes in all do not make up its {width} x "
+            f"{height} px; the page is damaged. Copy it again."
         )
 
 
