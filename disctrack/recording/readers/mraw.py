@@ -55,10 +55,10 @@ def open_mraw(files: Sequence[Path], camera: str) -> FrameReader:
     Raises RecordingError if header or frames are missing, do not fit each other, or are not grey values.
     """
     header_file, data_file = _pair_of(files, camera)
-    entries = _Entries(header_file)
+    entries = _entries(header_file)
     layout, depth = _layout(entries)
     file, notes = RawFile(data_file), []
-    n = entries.whole("Total Frame")
+    n = _whole(entries, "Total Frame")
     check_present(file, camera, layout, n, min(n, file.size // layout.frame_bytes))
     if layout.stored_bits == 16 and depth < 16:
         largest = int(np.frombuffer(file.bytes_at(0, layout.frame_bytes, str(file)), "<u2").max())
@@ -102,46 +102,36 @@ def _pair_of(files: Sequence[Path], camera: str) -> tuple[Path, Path]:
     return header, beside[".mraw"]
 
 
-class _Entries:
-    """Entries of a header as texts, under their names in the .cih; the methods convert one or refuse it."""
+Entries = dict[str, str]  # of a header, by their names in the .cih, "" where there is none; and "file", its place
 
-    def __init__(self, file: Path) -> None:
-        self.file = file
-        content = content_of(file, str(file), MOST_TEXT)
-        self._texts = _from_xml(content, file) if file.suffix.lower() == ".cihx" else _from_text(content)
 
-    def text(self, name: str) -> str:
-        """The entry, "" where there is none."""
-        return self._texts.get(name, "")
+def _entries(file: Path) -> Entries:
+    content = content_of(file, str(file), MOST_TEXT)
+    if file.suffix.lower() == ".cihx":
+        return _from_xml(content, file) | {"file": str(file)}
+    rows = [line.partition(" : ") for line in content.decode("utf-8", "replace").splitlines()]
+    texts = {name.strip(): value.strip() for name, separator, value in reversed(rows) if separator}  # the first counts
+    return dict.fromkeys(_ENTRIES, "") | texts | {"file": str(file)}
 
-    def whole(self, name: str) -> int:
-        """A number of at least 0; RecordingError where there is none."""
-        found = self.text(name)
-        if not re.fullmatch(r"[0-9]{1,15}", found):
-            raise RecordingError(f"{self.file}: '{name}' is {found[:40]!r}; expected a whole number. {_EXPORT}")
-        return int(found)
 
-    def number(self, name: str) -> float | None:
-        """A positive finite number, or None. "1/800" is one, too."""
-        numerator, _, denominator = self.text(name).partition("/")
-        try:
-            value = float(numerator) / (float(denominator) if denominator else 1.0)
-        except (ValueError, ZeroDivisionError):
-            return None
+def _whole(entries: Entries, name: str) -> int:
+    """A number of at least 0; RecordingError where there is none."""
+    found = entries[name]
+    if not re.fullmatch(r"[0-9]{1,15}", found):
+        raise RecordingError(f"{entries['file']}: '{name}' is {found[:40]!r}; expected a whole number. {_EXPORT}")
+    return int(found)
+
+
+def _number(text: str) -> float | None:
+    """A positive finite number, or None. "1/800" is one, too."""
+    with contextlib.suppress(ValueError, ZeroDivisionError):
+        numerator, _, denominator = text.partition("/")
+        value = float(numerator) / (float(denominator) if denominator else 1.0)
         return value if math.isfinite(value) and value > 0 else None
+    return None
 
 
 _EXPORT = "Export the recording again, or copy its header again."
-
-
-def _from_text(content: bytes) -> dict[str, str]:
-    """Lines "name : value"; the first of a name counts."""
-    texts: dict[str, str] = {}
-    for line in content.decode("utf-8", "replace").splitlines():
-        name, separator, value = line.partition(" : ")
-        if separator:
-            texts.setdefault(name.strip(), value.strip())
-    return texts
 
 
 def _from_xml(content: bytes, file: Path) -> dict[str, str]:
@@ -172,15 +162,15 @@ def _trigger_name(mode: str, pdc_mode: str) -> str:
     return _TRIGGERS[number] if number < len(_TRIGGERS) else f"mode {code}"
 
 
-def _layout(entries: _Entries) -> tuple[PixelLayout, int]:
+def _layout(entries: Entries) -> tuple[PixelLayout, int]:
     """How the pixels lie, and the bits that carry grey values."""
-    file = entries.file
-    if entries.text("File Format").lower() != "mraw":
+    file = entries["file"]
+    if entries["File Format"].lower() != "mraw":
         raise RecordingError(
-            f"{file}: the frames were saved as {entries.text('File Format')[:20] or 'nothing known'}, not as MRAW. "
+            f"{file}: the frames were saved as {entries['File Format'][:20] or 'nothing known'}, not as MRAW. "
             "Name the image files instead."
         )
-    kind, device = entries.text("Color Type").lower(), entries.text("Camera Type")
+    kind, device = entries["Color Type"].lower(), entries["Camera Type"]
     mosaic = kind == "raw" and re.search(r"-C\b", device)  # the type's letter: -M- monochrome, -C- colour
     if kind not in ("mono", "raw", "") or mosaic:
         found = "a colour mosaic" if mosaic else f"of colour type {kind[:20]!r}"
@@ -188,49 +178,51 @@ def _layout(entries: _Entries) -> tuple[PixelLayout, int]:
             f"{file}: the frames are {found} ({device[:60]}); expected grey values. A conversion here would mix what "
             "the sensor measured: record with a monochrome camera."
         )
-    width, height = entries.whole("Image Width"), entries.whole("Image Height")
-    bits, effective = entries.whole("Color Bit"), entries.whole("EffectiveBit Depth")
+    width, height = _whole(entries, "Image Width"), _whole(entries, "Image Height")
+    bits, effective = _whole(entries, "Color Bit"), _whole(entries, "EffectiveBit Depth")
     if bits not in (8, 10, 12, 16):
         raise RecordingError(
             f"{file}: 'Color Bit' is {bits}; expected 8, 10, 12 or 16. Save the frames in one of these."
         )
     check_frame_size(width, height, str(file), bits)
-    high = bits == 16 and entries.text("EffectiveBit Side").lower() == "higher"
+    high = bits == 16 and entries["EffectiveBit Side"].lower() == "higher"
     packed = bits if bits in (10, 12) else 0
     layout = PixelLayout(width, height, np.dtype("u1" if bits == 8 else "<u2"), packed)
     return layout, 16 if high else bit_depth_of(bits, effective)
 
 
-def _header(entries: _Entries) -> tuple[CameraHeader, list[str], tuple[str, ...]]:
+def _header(entries: Entries) -> tuple[CameraHeader, list[str], tuple[str, ...]]:
     """Settings of the recording, what about them cannot be, and what had to be assumed of the frames' times."""
-    rate = entries.number("Record Rate(fps)")
+    rate = _number(entries["Record Rate(fps)"])
     if rate is None:
-        shown = entries.text("Record Rate(fps)")[:40]
-        raise RecordingError(f"{entries.file}: 'Record Rate(fps)' is {shown!r}; expected a number above 0. {_EXPORT}")
+        shown = entries["Record Rate(fps)"][:40]
+        raise RecordingError(
+            f"{entries['file']}: 'Record Rate(fps)' is {shown!r}; expected a number above 0. {_EXPORT}"
+        )
     remarks, doubts = [], []
-    step, n = max(int(entries.number("Save Step") or 1), 1), entries.whole("Total Frame")
-    recorded = entries.number("Original Total Frame")
+    step, n = max(int(_number(entries["Save Step"]) or 1), 1), _whole(entries, "Total Frame")
+    recorded = _number(entries["Original Total Frame"])
     if step > 1 and recorded is not None and (n - 1) * step >= recorded:
         doubts.append(
             f"the header says that one frame in {step} was saved, but {n} of {recorded:g} recorded frames are there; "
             "taken as consecutive"
         )
         step = 1
-    nanoseconds = entries.number("Shutter Type2(nsec)")
-    exposure = nanoseconds / 1e9 if nanoseconds else entries.number("Shutter Speed(s)")
+    nanoseconds = _number(entries["Shutter Type2(nsec)"])
+    exposure = nanoseconds / 1e9 if nanoseconds else _number(entries["Shutter Speed(s)"])
     if exposure is not None and exposure * rate > 1.001:
         remarks.append(f"the header's exposure of {exposure:g} s is longer than a frame of {1 / rate:g} s; not used")
         exposure = None
-    first, name = entries.text("Start Frame"), entries.text("User Defined Camera Name")
+    first, name = entries["Start Frame"], entries["User Defined Camera Name"]
     header = CameraHeader(
-        file=str(entries.file),
-        device=entries.text("Camera Type")[:80] + (f" ({name[:40]})" if name else ""),
+        file=entries["file"],
+        device=entries["Camera Type"][:80] + (f" ({name[:40]})" if name else ""),
         frame_rate=rate / step,
         step=step,
         exposure=exposure,
-        trigger=entries.text("Trigger Mode")[:40],
+        trigger=entries["Trigger Mode"][:40],
         first_frame=int(first) if re.fullmatch(r"-?[0-9]{1,15}", first) else None,
-        recorded=_date(f"{entries.text('Date')} {entries.text('Time')}".strip()),
+        recorded=_date(f"{entries['Date']} {entries['Time']}".strip()),
     )
     return header, remarks, tuple(doubts)
 
