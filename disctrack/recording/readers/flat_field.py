@@ -91,97 +91,86 @@ def _corrected(reader: FrameReader, field: FlatField | None) -> FrameReader:
     return replace(corrected, notes=notes, bit_depth=16, dtype=np.dtype(np.uint16))
 
 
-@dataclass(frozen=True)
-class _Mean:
-    """Of the images that a key names."""
-
-    where: str  # for messages
-    mean: Array32
-    clipped: Mask  # in more than a twentieth of the images
-    n: int
-    first: FrameReader  # that gave some of them
-    sha256: str
-
-
-def _mean(pattern: str, folder: Path, camera: str, kind: str, like: _Mean | None = None) -> _Mean:
-    """Mean of the frames of one file, or of all images that lie in a folder or match a pattern; of those' size."""
+def _readers(pattern: str | None, folder: Path, camera: str, kind: str) -> list[FrameReader]:
+    """Of one file, or of each image that lies in a folder or matches a pattern; none where nothing is declared."""
+    if pattern is None:
+        return []
     if (folder / pattern).is_dir():
         pattern = str(Path(pattern) / "*")
     files = match_files(split_member(pattern)[0], folder, f"{camera} camera's {kind}")
-    what = f"{camera}_{kind}"
     if files[0].suffix.lower() in IMAGES:
-        readers = [open_frames(glob.escape(file.name), file.parent, what) for file in files]
-    else:
-        readers = [open_frames(pattern, folder, what)]
-    first = readers[0] if like is None else like.first
-    total = np.zeros(first.image_size[::-1])
-    clipped = np.zeros(total.shape, np.int64)
-    digest, n = hashlib.sha256(), 0
-    for reader in readers:
-        found, expected = (in_words(one.image_size, one.bit_depth) for one in (reader, first))
-        if found != expected:
-            raise RecordingError(
-                f"[cameras] {what}: {reader.describe(0)} is {found}, but {first.describe(0)} is {expected}. Take both "
-                "with the settings of the recording, or take the other one away."
-            )
-        for index in range(len(reader)):
-            image = reader.read(index)
-            total += image
-            clipped += image >= 2**first.bit_depth - 1
-            n += 1
-        digest.update(reader.content_sha256(0, len(reader)).encode())
-    where = f"{readers[0].describe(0)} ([cameras] {what})"
-    return _Mean(where, (total / n).astype(np.float32), clipped > 0.05 * n, n, readers[0], digest.hexdigest())
+        return [open_frames(glob.escape(file.name), file.parent, f"{camera}_{kind}") for file in files]
+    return [open_frames(pattern, folder, f"{camera}_{kind}")]
 
 
 def _flat_field(flat_images: str | None, dark_images: str | None, folder: Path, camera: str) -> FlatField | None:
-    flat = None if flat_images is None else _mean(flat_images, folder, camera, "flat")
-    dark = None if dark_images is None else _mean(dark_images, folder, camera, "dark", flat)
-    one = flat or dark
-    if one is None:
+    flats, darks = _readers(flat_images, folder, camera, "flat"), _readers(dark_images, folder, camera, "dark")
+    if not flats + darks:
         return None
-    offset = np.zeros_like(one.mean) if dark is None else dark.mean
+    first = (flats + darks)[0]
+    for reader in flats + darks:
+        found, expected = (in_words(one.image_size, one.bit_depth) for one in (reader, first))
+        if found != expected:
+            raise RecordingError(
+                f"[cameras] {reader.camera}: {reader.describe(0)} is {found}, but {first.describe(0)} is {expected}. "
+                "Take both with the settings of the recording, or take the other one away."
+            )
+    offset = _mean(darks)[0] if darks else np.zeros(first.image_size[::-1], np.float32)
     gain, dead = np.ones_like(offset), np.zeros(offset.shape, bool)
     notes = []
-    if flat is not None:
-        gain, dead = _gain(flat, offset, dark)
-        if flat.n < ENOUGH:
+    if flats:
+        gain, dead = _gain(flats, darks, offset)
+        n = sum(map(len, flats))
+        if n < ENOUGH:
             notes.append(
-                f"[cameras] {camera}_flat is the mean of {flat.n} image{'s' * (flat.n > 1)}: its own noise "
+                f"[cameras] {camera}_flat is the mean of {n} image{'s' * (n > 1)}: its own noise "
                 f"becomes a pattern of the sensor. Average {ENOUGH} or more"
             )
     if n := int(dead.sum()):
         notes.append(f"{camera} camera: {n} dead pixel{'s' * (n > 1)} by its flat image, replaced by their neighbours")
-    digest = " ".join(m.sha256 if m else "-" for m in (flat, dark))
-    return FlatField(offset, gain, dead if dead.any() else None, one.first.bit_depth, digest, tuple(notes))
+    digest = hashlib.sha256()
+    for reader in flats + darks:
+        digest.update(f"{reader.camera} {reader.content_sha256(0, len(reader))}".encode())
+    return FlatField(offset, gain, dead if dead.any() else None, first.bit_depth, digest.hexdigest(), tuple(notes))
 
 
-def _gain(flat: _Mean, offset: Array32, dark: _Mean | None) -> tuple[Array32, Mask]:
+def _mean(readers: Sequence[FrameReader]) -> tuple[Array32, Mask]:
+    """Of all frames, and which pixels are clipped in more than a twentieth of them."""
+    total, n, full = np.zeros(readers[0].image_size[::-1]), sum(map(len, readers)), 2 ** readers[0].bit_depth - 1
+    clipped = np.zeros(total.shape, np.int64)
+    for image in (reader.read(index) for reader in readers for index in range(len(reader))):
+        total += image
+        clipped += image >= full
+    return (total / n).astype(np.float32), clipped > 0.05 * n
+
+
+def _gain(flats: Sequence[FrameReader], darks: Sequence[FrameReader], offset: Array32) -> tuple[Array32, Mask]:
     """Factors on the pixels' signals, and which pixels are dead. Raises RecordingError."""
-    saturated = float(np.mean(flat.clipped))
+    flat, *dark = (f"{readers[0].describe(0)} ([cameras] {readers[0].camera})" for readers in (flats, darks) if readers)
+    mean, clipped = _mean(flats)
+    full, saturated = 2 ** flats[0].bit_depth, float(np.mean(clipped))
     if saturated > MOST:
         raise RecordingError(
-            f"{flat.where}: {100 * saturated:.2g} % of its pixels are saturated, so that their gains are not "
+            f"{flat}: {100 * saturated:.2g} % of its pixels are saturated, so that their gains are not "
             "known. Take it with less light, or a shorter exposure: half of full scale is good."
         )
-    answer = flat.mean - offset
+    answer = mean - offset
     level = float(np.median(answer))
-    if dark is not None and level <= 0:
+    if dark and level <= 0:
         raise RecordingError(
-            f"{flat.where} is not brighter (median {np.median(flat.mean):.1f}) than {dark.where} (median "
+            f"{flat} is not brighter (median {np.median(mean):.1f}) than {dark[0]} (median "
             f"{np.median(offset):.1f}): are the two exchanged?"
         )
-    if level < LEAST_LIGHT * 2**flat.first.bit_depth:
+    if level < LEAST_LIGHT * full:
         raise RecordingError(
-            f"{flat.where}: its median is {level:.1f} grey values above the dark image, of "
-            f"{2**flat.first.bit_depth - 1}. That is too dark to tell gains. Take it of an evenly lit white surface, "
-            "at about half of full scale."
+            f"{flat}: its median is {level:.1f} grey values above the dark image, of {full - 1}. That is too dark to "
+            "tell gains. Take it of an evenly lit white surface, at about half of full scale."
         )
     around = cv2.medianBlur(answer, 5)
-    dead = np.asarray((np.abs(answer - around) > ODD * around) | flat.clipped | (answer <= 0.1 * level))
+    dead = np.asarray((np.abs(answer - around) > ODD * around) | clipped | (answer <= 0.1 * level))
     if dead.mean() > MOST:
         raise RecordingError(
-            f"{flat.where}: {100 * dead.mean():.2g} % of its pixels hardly answer the light, or far more than their "
+            f"{flat}: {100 * dead.mean():.2g} % of its pixels hardly answer the light, or far more than their "
             "neighbours. Take it out of focus, of an evenly lit white surface without an edge in view."
         )
     gain = np.where(dead, 1.0, level / np.where(dead, 1.0, answer)).astype(np.float32)
