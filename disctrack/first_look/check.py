@@ -29,7 +29,7 @@ from disctrack.findings import (
 )
 from disctrack.frames import CAMERAS
 from disctrack.recording.declaration import Recording, read_recording
-from disctrack.recording.readers.blocks import Unreadable
+from disctrack.recording.readers.blocks import NotRead
 from disctrack.report.blocks import Facts, Report, Section
 from disctrack.track.follow.tracking import Measurement, Taken, TrackingSettings, track
 from disctrack.track.measurement import ImagePairs, check_rig, exposures, images_lost, open_pairs
@@ -53,7 +53,7 @@ class Check:
     boards: Boards | None = None
     shown: list[tuple[Trajectory, int, NDArray]] = field(default_factory=list)  # trajectory, row, images (2, h, w)
     raw: list[NDArray] = field(default_factory=list)  # pairs in which the disc was not found
-    not_read: dict[tuple[int, int], Unreadable] = field(default_factory=dict)  # by frame and camera
+    not_read: NotRead = field(default_factory=dict)
 
     def add(self, kind: Kind, text: str, advice: str = "", severity: Severity = Severity.REFUSAL) -> None:
         """Add a finding, by default what a run would end with."""
@@ -118,7 +118,7 @@ def run_check(folder: Path, progress: Callable[[str], None] = lambda step: None)
             check_rig(rig, pairs)
             progress("dots")
             _motion(seen, recording, rig, pairs)
-    seen.findings += images_lost(seen.not_read.values())
+    seen.findings += images_lost(seen.not_read)
     return seen
 
 

@@ -7,7 +7,7 @@ import dataclasses
 import hashlib
 import json
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
@@ -28,7 +28,7 @@ from disctrack.progress import compiling
 from disctrack.recording.declaration import Recording
 from disctrack.recording.readers import open_frames
 from disctrack.recording.readers.base import FrameReader, frames_in_parts
-from disctrack.recording.readers.blocks import PairBlock, Unreadable, check_pair, default_threads, iter_pair_blocks
+from disctrack.recording.readers.blocks import NotRead, PairBlock, check_pair, default_threads, iter_pair_blocks
 from disctrack.recording.readers.flat_field import flat_fielded, flat_fields
 from disctrack.recording.readers.same_instants import check_headers, check_same_numbers, check_time_stamps, usable_times
 from disctrack.track.follow.motion_span import MotionSpan, find_motion
@@ -65,12 +65,12 @@ class ImagePairs:
     def __len__(self) -> int:
         return self.stop - self.start
 
-    def reading(self, not_read: dict[tuple[int, int], Unreadable], threads: int | None = None) -> ReadBlocks:
-        """What gives pairs start..stop-1 in blocks; images that cannot be read are put into `not_read`, each once."""
+    def reading(self, not_read: NotRead, threads: int | None = None) -> ReadBlocks:
+        """What gives pairs start..stop-1 in blocks; images that cannot be read are put into `not_read`."""
 
         def read_blocks(start: int, stop: int) -> Iterator[PairBlock]:
             for block in iter_pair_blocks(self.left, self.right, start, stop, threads=threads):
-                not_read.update({(image.frame, image.camera): image for image in block.unreadable})
+                not_read.update(block.unreadable)
                 yield block
 
         return read_blocks
@@ -175,7 +175,7 @@ def measure(
     )
     details = {
         **found.details,
-        "unreadable": [image.reason for image in found.unreadable],
+        "unreadable": [*found.unreadable.values()],
         "first_pass": dataclasses.asdict(span),
         **pairs.camera_headers(),
     }
@@ -269,7 +269,7 @@ def _tracked(
     progress: Progress,
 ) -> Measurement:
     """The disc tracked through the span; stamps : of all frames [s]."""
-    not_read: dict[tuple[int, int], Unreadable] = {}  # some are tried twice
+    not_read: NotRead = {}  # some are tried twice
     tracked = range(span.start, span.stop)
     workers = 1  # stretches that are followed side by side: one per core, where frames can be read anywhere
     if pairs.left.random_access and pairs.right.random_access:
@@ -280,28 +280,26 @@ def _tracked(
     try:
         found = track(reading, taken, rig, recording.disc, settings, workers, progress)
     except TrackingError as error:
-        refuse_unreadable(recording, list(not_read.values()), 2 * len(tracked), error)
+        refuse_unreadable(recording, not_read, 2 * len(tracked), error)
         error.findings = with_square(error.findings, recording)
         raise
-    return dataclasses.replace(found, unreadable=tuple(not_read[place] for place in sorted(not_read)))
+    return dataclasses.replace(found, unreadable=dict(sorted(not_read.items())))
 
 
-def images_lost(unreadable: Iterable[Unreadable]) -> tuple[Finding, ...]:
+def images_lost(not_read: NotRead) -> tuple[Finding, ...]:
     """What is to be said of images that could not be read."""
-    reasons = [image.reason for image in sorted(unreadable, key=lambda image: (image.frame, image.camera))]
-    if not reasons:
+    if not not_read:
         return ()
-    n, where = len(reasons), "their frames rest on one camera or none"
-    text = f"{n} image{'s' * (n > 1)} could not be read; {where}. The first: {reasons[0]}"
+    n, where = len(not_read), "their frames rest on one camera or none"
+    text = f"{n} image{'s' * (n > 1)} could not be read; {where}. The first: {not_read[min(not_read)]}"
     return (Finding(Kind.UNREADABLE, Severity.WARNING, text, explains=(Kind.FRAMES_LOST,)),)
 
 
-def refuse_unreadable(recording: Recording, lost: Sequence[Unreadable], n: int, error: TrackingError) -> None:
+def refuse_unreadable(recording: Recording, lost: NotRead, n: int, error: TrackingError) -> None:
     """Raise RecordingError where most of n images cannot be read: that is why no disc was found in them."""
     if 2 * len(lost) > n:
-        first = min(lost, key=lambda image: (image.frame, image.camera))
         raise RecordingError(
-            f"{recording.folder}: the files cannot be read: {len(lost)} of {n} images, the first: {first.reason} "
+            f"{recording.folder}: the files cannot be read: {len(lost)} of {n} images, the first: {lost[min(lost)]} "
             "Is the disk still there?"
         ) from error
 

@@ -3,7 +3,7 @@
 import os
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,13 +17,7 @@ from disctrack.recording.readers.base import FrameReader, in_words
 BLOCK_BYTES = 16 << 20  # large enough to hide the switch between blocks, small enough for six of them in 100 MB
 
 
-@dataclass(frozen=True)
-class Unreadable:
-    """One image that could not be read."""
-
-    frame: int
-    camera: int  # 0 left, 1 right
-    reason: str
+NotRead = dict[tuple[int, int], str]  # why an image could not be read, by frame and camera (0 left, 1 right)
 
 
 @dataclass(frozen=True)
@@ -35,14 +29,14 @@ class PairBlock:
 
     frames: NDArray[np.int64]  # (n,)
     images: NDArray  # (n, 2 cameras, height, width) uint8 or uint16; 0 where not readable
-    unreadable: tuple[Unreadable, ...] = ()
+    unreadable: NotRead = field(default_factory=dict)
 
     @property
     def readable(self) -> Mask:
         """(n, 2) True where the image could be read."""
         good = np.ones(self.images.shape[:2], bool)
-        for image in self.unreadable:
-            good[image.frame - self.frames[0], image.camera] = False
+        for frame, camera in self.unreadable:
+            good[frame - self.frames[0], camera] = False
         return good
 
 
@@ -104,7 +98,7 @@ def iter_pair_blocks(
     readers = left, right
     pools = [pool if r.random_access else ThreadPoolExecutor(1, thread_name_prefix="read") for r in readers]
 
-    def submitted(number: int) -> list[Future[list[Unreadable]]]:
+    def submitted(number: int) -> list[Future[NotRead]]:
         """Reading of a block as tasks: a few frames each, or a camera's whole block where files are read in order."""
         images, frames, tasks = ring[number % len(ring)], range(starts[number], stops[number]), []
         for camera, reader in enumerate(readers):
@@ -119,21 +113,21 @@ def iter_pair_blocks(
         for number, first in enumerate(starts):
             if number + n_ahead < len(starts):
                 pending.append(submitted(number + n_ahead))
-            unreadable = [image for future in pending.pop(0) for image in future.result()]
+            unreadable = {place: why for future in pending.pop(0) for place, why in future.result().items()}
             frames = np.arange(first, stops[number])
-            yield PairBlock(frames, ring[number % len(ring)][: len(frames)], tuple(unreadable))
+            yield PairBlock(frames, ring[number % len(ring)][: len(frames)], unreadable)
     finally:
         for threads_of_one in {pool, *pools}:
             threads_of_one.shutdown(wait=True, cancel_futures=True)
 
 
-def _fill(images: NDArray, reader: FrameReader, camera: int, frames: range) -> list[Unreadable]:
+def _fill(images: NDArray, reader: FrameReader, camera: int, frames: range) -> NotRead:
     """Fill images (n, height, width) with the reader's frames; those that could not be read are 0 and returned."""
-    failed = []
+    failed: NotRead = {}
     for image, frame in zip(images, frames, strict=False):
         try:
             reader.read(frame, image)
         except RecordingError as error:
             image[...] = 0
-            failed.append(Unreadable(frame, camera, str(error)))
+            failed[frame, camera] = str(error)
     return failed

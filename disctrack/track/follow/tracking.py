@@ -19,7 +19,7 @@ from disctrack import frames
 from disctrack.disc import MA_2014, Disc, symmetry_order
 from disctrack.errors import TrackingError
 from disctrack.findings import Finding, Kind, Severity, Subject, in_doubt
-from disctrack.recording.readers.blocks import PairBlock, Unreadable
+from disctrack.recording.readers.blocks import PairBlock
 from disctrack.track.follow.following import (
     Follower,
     Heading,
@@ -145,8 +145,8 @@ def _without(read_blocks: ReadBlocks, camera: int, since: int) -> ReadBlocks:
     """The same, but for a camera's images from a frame on."""
 
     def without(block: PairBlock) -> PairBlock:
-        gone = [Unreadable(int(frame), camera, "of another instant") for frame in block.frames if frame >= since]
-        return replace(block, unreadable=(*block.unreadable, *gone))
+        gone = {(int(frame), camera): "of another instant" for frame in block.frames if frame >= since}
+        return replace(block, unreadable=block.unreadable | gone)
 
     return lambda start, stop: map(without, read_blocks(start, stop))
 

@@ -1,7 +1,7 @@
 """From what was followed to the trajectory: what all frames share is refined, all poses are fitted and judged."""
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ from calibration.kit.arrays import Array, Mask
 from calibration.kit.brief import Brief
 from disctrack import frames
 from disctrack.findings import Finding
-from disctrack.recording.readers.blocks import Unreadable
+from disctrack.recording.readers.blocks import NotRead
 from disctrack.track.dots.template import dot_centres
 from disctrack.track.follow.following import Follower, Tables, repeats
 from disctrack.track.judge.cameras import camera_course
@@ -42,12 +42,12 @@ class Measurement(Brief):
 
     >>> measurement = measure("clip", "clip/results/rig.h5", open_pairs("clip", (0, 40)))
     >>> measurement.trajectory.q.shape, measurement.unreadable
-    ((300, 6), ())
+    ((300, 6), {})
     """
 
     trajectory: Trajectory
     details: dict[str, Any]  # blur, noise, ...: of JSON's types, stored with the result
-    unreadable: tuple[Unreadable, ...] = ()
+    unreadable: NotRead = field(default_factory=dict)
     seconds: float = 0.0  # spent on reading and tracking
 
     def facts(self) -> dict[str, str]:

@@ -13,7 +13,7 @@ from calibration.kit.stuck_pixels import stuck_pixels
 from disctrack import FrameStatus, MarkerStatus, frames
 from disctrack.errors import RecordingError, TrackingError
 from disctrack.findings import Kind
-from disctrack.recording.readers.blocks import PairBlock, Unreadable
+from disctrack.recording.readers.blocks import PairBlock
 from disctrack.track.dots.template import dot_centres
 from disctrack.track.follow.tracking import PAIRS_TRIED, Taken, _as_one_sensor, stretch_edges, track
 from disctrack.track.measurement import refuse_unreadable
@@ -32,7 +32,7 @@ def blocks_of(images, readable=None, size=16):
     def read(start, stop):
         for a in range(start, stop, size):
             b = min(a + size, stop)
-            yield PairBlock(np.arange(a, b), images[a:b], tuple(Unreadable(*of, "") for of in gone if a <= of[0] < b))
+            yield PairBlock(np.arange(a, b), images[a:b], {(i, camera): "" for i, camera in gone if a <= i < b})
 
     return read
 
@@ -213,9 +213,9 @@ def test_edges_that_compression_spoils_cost_accuracy_and_no_camera(rolling, rend
 
 
 def test_most_images_unreadable_is_the_cause_that_is_told_and_a_few_are_not():
-    lost = [Unreadable(n, n % 2, f"left/{n}.png: cannot be read: No such device.") for n in range(150, 0, -1)]
+    lost = {(n, n % 2): f"left/{n}.png: cannot be read: No such device." for n in range(150, 0, -1)}
     known = SimpleNamespace(folder=Path("rec")), lost, 200, TrackingError("found in none")
-    refuse_unreadable(known[0], lost[50:], *known[2:])
+    refuse_unreadable(known[0], dict([*lost.items()][50:]), *known[2:])
     with pytest.raises(
         RecordingError, match=r"rec: the files cannot be read: 150 of 200 images, the first: left/1\.png"
     ):

@@ -66,7 +66,7 @@ def test_blocks_of_both_cameras_hold_every_pair_once_and_in_order(tmp_path, kind
     for size, threads in ((1, 3), (4, 2), (N, 3), (50, 1)):
         seen = []
         for block in iter_pair_blocks(*readers, block=size, threads=threads):
-            assert block.unreadable == ()
+            assert not block.unreadable
             for camera, frames in enumerate(both):
                 assert_array_equal(block.images[:, camera], frames[block.frames])
             seen.extend(block.frames)
@@ -469,4 +469,4 @@ def test_a_network_that_goes_away_is_an_error_of_the_frame(tmp_path, monkeypatch
     monkeypatch.setattr(reader.files[0], "_stream", gone)
     (block,) = iter_pair_blocks(reader, reader, block=len(FRAMES))
     assert len(block.unreadable) == 2 * len(FRAMES)
-    assert re.search(r"left\..*left camera, frame 0.*Stale file handle", block.unreadable[0].reason)
+    assert re.search(r"left\..*left camera, frame 0.*Stale file handle", block.unreadable[0, 0])

@@ -41,7 +41,7 @@ def collect(readers, **how):
     return (
         np.concatenate([b[0] for b in blocks]),
         np.concatenate([b[1] for b in blocks]),
-        [(image.frame, image.camera, image.reason) for b in blocks for image in b[2]],
+        [(*place, reason) for b in blocks for place, reason in b[2].items()],
     )
 
 
