@@ -212,8 +212,7 @@ def _on_the_disk(folder: Path, results: Path) -> Record:
         return record
     if not is_done(results, record, {}):
         return Record(NOT_MEASURED, "its files are not those that were measured, or not all there")
-    measured = read_provenance(results / record.files["trajectory"]).declared
-    changed = changed_since(folder, measured) if measured else ""
+    changed = changed_since(folder, read_provenance(results / record.files["trajectory"]).declared)
     stale = f"{FILE_NAME} has changed: {changed}; the batch without --summary-only measures it anew" if changed else ""
     return replace(record, status=SKIPPED, reason="; ".join(filter(None, [stale, record.reason])))
 

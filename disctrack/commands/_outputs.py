@@ -1,7 +1,6 @@
 """What the commands share: options, checks before the work, files after it."""
 
 import argparse
-import json
 import os
 import sys
 from collections.abc import Iterator
@@ -18,7 +17,7 @@ from disctrack.files.whole import check_writable as check_writable
 from disctrack.findings import Kind, Severity, in_doubt, leading, of_kind
 from disctrack.progress import progress_bar
 from disctrack.recording.declaration import FILE_NAME, Recording
-from disctrack.recording.declaration_text import changed_since, told_differences
+from disctrack.recording.declaration_text import changed_since
 from disctrack.recording.readers.blocks import iter_pair_blocks
 from disctrack.report.blocks import Facts, Report, document
 from disctrack.report.html import link_pages
@@ -59,8 +58,7 @@ def track_into(
         return found.trajectory, found.details
 
     def changed(made: Provenance) -> str:
-        now = json.loads(json.dumps(recording.declared, default=str))
-        found = told_differences(now, made.declared)
+        found = changed_since(recording.folder, made.declared)
         return f"{FILE_NAME}: {found}" if found else ""
 
     provenance = trajectory_provenance(recording, rig, pairs, settings)
@@ -85,10 +83,8 @@ def recording_of(trajectory: Path) -> Path | None:
 
 def tell_stale(trajectory: Path) -> None:
     """Say on stderr where the recording.toml beside a trajectory is no longer the one that it was measured with."""
-    folder = recording_of(trajectory)
-    kept = read_provenance(trajectory).declared
-    changed = changed_since(folder, kept) if folder is not None and kept else ""
-    if folder is not None and changed:
+    folder, kept = recording_of(trajectory), read_provenance(trajectory).declared
+    if folder is not None and (changed := changed_since(folder, kept)):
         place = relative(folder)
         print(
             f"disctrack: {place / FILE_NAME} has changed: {changed}. What follows is of {relative(trajectory)} as it "

@@ -63,20 +63,15 @@ def _aligned(text: str, remark: str) -> str:
 def changed_since(folder: Path, measured: Mapping[str, object]) -> str:
     """Keys of the folder's recording.toml whose values are no longer those declared when it was measured.
 
-    measured : the tree of the declaration that the trajectory file keeps
+    measured : the tree of the declaration that the trajectory file keeps, if it does
     returns  : "[calibration] square_mm 6.1 (6.0 when it was measured)", several by commas; empty where all is the
-        same, or where there is no declaration that can be read
+        same, or where there is no declaration that was kept, or can be read
     """
     try:
         now = json.loads(json.dumps(read_toml(folder / FILE_NAME, RecordingError), default=str))
     except (OSError, RecordingError):
         return ""
-    return told_differences(now, measured)
-
-
-def told_differences(now: Mapping[str, object], then: Mapping[str, object]) -> str:
-    """Two declarations key by key, in words; empty where they say the same."""
-    found = list(_differences(now, then))
+    found = list(_differences(now, measured)) if measured else []
     more = [f"and {len(found) - _MOST_TOLD} more"] if len(found) > _MOST_TOLD else []
     return ", ".join([*found[:_MOST_TOLD], *more])
 

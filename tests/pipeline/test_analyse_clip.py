@@ -12,7 +12,7 @@ import pytest
 
 import disctrack
 from disctrack.cli import main
-from disctrack.recording.declaration_text import told_differences
+from disctrack.recording.declaration_text import changed_since
 from disctrack.trajectory.file import read_group
 from tests.pipeline.conftest import QUICK
 
@@ -96,10 +96,10 @@ def test_a_declaration_that_changed_since_is_told_and_an_equal_one_is_not(analys
         said = cli("analyse", analysed_clip, "-o", analysed_clip.parent / "report").err
         assert ("[calibration] square_mm 6.1 (6.0 when it was measured)" in said) == told
         assert ("has changed" in said) == told
+    beside.write_text("[disc]\nmass_g = 1.0\n")
+    changed = changed_since(beside.parent, {"disc": {"mass_g": 1.0, "radius_mm": 2}})
+    assert changed == "[disc] radius_mm not declared (2 when it was measured)"
     beside.unlink()
-    assert told_differences({"disc": {"mass_g": 1.0}}, {"disc": {"mass_g": 1.0, "radius_mm": 2}}) == (
-        "[disc] radius_mm not declared (2 when it was measured)"
-    )
 
 
 def test_asymptotic_exponents_are_not_refused_where_the_law_is_not_asymptotic(analysed_clip):
