@@ -17,7 +17,7 @@ from calibration.fit.refinement import Refinement, TermsTried
 from calibration.fit.start import start_stereo, too_wide
 from calibration.fit.stereo_model import BOARD_MODELS, RICHEST, Observations, Terms
 from calibration.judge.assessment import Assessment, assess, stereo_covariance
-from calibration.judge.pairs import camera_moved, gradients_by_motion, zoomed
+from calibration.judge.pairs import gradients_by_motion, moved_cameras, moved_told, zoomed
 from calibration.judge.tolerances import (
     BoardShape,
     BoardTolerances,
@@ -225,19 +225,19 @@ def calibrate_from_corners(
     count_once(views, names, table_view)
     _require_views(views, names, table_view)
     start, notes = _begin(views, board, names)
-    observations, cameras = _observations(views), start.model.rig.cameras
-    wide = too_wide(observations, board.points, cameras)
-    moved = camera_moved(observations, start, table_view)
-    if moved.steps and (lenses := zoomed(observations, moved, cameras, board.points)):
+    observations = _observations(views)
+    wide = too_wide(observations, board.points, start.model.rig.cameras)
+    start = moved_cameras(observations, start, table_view)
+    if start.steps and (lenses := zoomed(observations, start, board.points)):
         for camera, why in lenses.items():
-            for v in moved.others:
+            for v in start.others:
                 views[camera][v] = BoardNotFound(why)
         return calibrate_from_corners(*views, board, settings, table_view, board_thickness, names)
     seen = np.bincount(observations.point, minlength=len(board.points))
     shapes = BOARD_MODELS if seen.min() >= LEAST_SEEN else BOARD_MODELS[:-1]  # the points tell a place each, or not
     distortion = RICHEST if settings.distortion == "auto" else settings.distortion
     tried = [Terms(distortion, shape) for shape in (shapes if settings.board == "auto" else (settings.board,))]
-    fit = fit_jointly(observations, start, board.points, tried, moved, table_view)
+    fit = fit_jointly(observations, start, board.points, tried, table_view)
     for (v, camera), why in fit.bad_images.items():
         views[camera][v] = BoardNotFound(why)
     apart = _told_apart(fit, names, table_view)
@@ -409,8 +409,8 @@ def _choice_of_origin(board: Target) -> str:
 
 def _told_apart(fit: JointFit, names: Names, table_view: int | None) -> list[str]:
     """Warnings about pairs whose images are used each for its own camera."""
-    told = [fit.moved.told(names, table_view)] if fit.moved.steps else []
-    apart = {v: why for v, why in fit.pairs.apart.items() if v not in fit.moved.others}
+    told = [moved_told(fit.pairs, names, table_view)] if fit.pairs.steps else []
+    apart = {v: why for v, why in fit.pairs.odd.items() if v not in fit.pairs.others}
     if not apart:
         return told
     shown = [f"{names[v][0]} and {names[v][1]} ({why})" for v, why in list(apart.items())[:3]]

@@ -9,14 +9,7 @@ from calibration.fit.lens_field import fit_lens_field
 from calibration.fit.pairing import Pairs
 from calibration.fit.refinement import Refinement, TermsTried, choose_board
 from calibration.fit.stereo_model import Observations, Terms
-from calibration.judge.pairs import (
-    LEAST_PAIRS,
-    CameraMoved,
-    PairMotion,
-    camera_moved,
-    judge_pairs,
-    motion_between_exposures,
-)
+from calibration.judge.pairs import LEAST_PAIRS, PairMotion, judge_pairs, motion_between_exposures
 from calibration.kit.arrays import Array
 
 REJUDGED = 2  # times that pairs are judged by the refined cameras, and these refined again
@@ -31,7 +24,6 @@ class JointFit:
     lens_field: LensField | None
     candidates: tuple[TermsTried, ...]  # all that were compared
     pairs: Pairs
-    moved: CameraMoved
     motion: PairMotion | None  # of the boards between the exposures
     bad_images: dict[tuple[int, int], str]  # (view, camera) that cannot be used -> reason
 
@@ -41,18 +33,16 @@ def fit_jointly(
     start: Pairs,
     nominal: Array,
     tried: Sequence[Terms],
-    moved: CameraMoved,
-    table_view: int | None = None,
+    table_view: int | None,
 ) -> JointFit:
     """Refine, judge the pairs by what is refined, and refine again; then see whether boards moved, or lenses bend.
 
-    start : by rough cameras; tried : terms with the board's shapes to choose of, simplest first
-    moved : by the start: it is seen best by cameras that no pair has pulled yet
+    start : by rough cameras: that one was moved is seen best by those that no pair has pulled yet
+    tried : terms with the board's shapes to choose of, simplest first
     table_view : where a camera was moved, the cameras' places are those at it
     """
     # rough poses may be degrees off: refined cameras judge those anew that do not agree
-    used = start if not moved.steps and len(start.views) >= LEAST_PAIRS else replace(start, apart={})
-    used = used.set_apart(moved.others)
+    pairs = used = start if not start.steps and len(start.views) >= LEAST_PAIRS else replace(start, odd={})
 
     def refined(by: Pairs, tried: Sequence[Terms], motion: BoardMotion | None = None) -> Refined:
         return choose_board(observations, by.joined(observations), nominal, tried, motion)
@@ -60,10 +50,8 @@ def fit_jointly(
     refinement, candidates = refined(used, tried)
     bad_images: dict[tuple[int, int], str] = {}
     for _ in range(REJUDGED):
-        pairs = judge_pairs(observations, refinement, moved.others)
-        moved = camera_moved(observations, pairs, table_view)
-        pairs = pairs.set_apart(moved.others)
-        if sorted(pairs.apart) == sorted(used.apart) and not pairs.bad_images:
+        pairs = judge_pairs(observations, refinement, pairs.others, table_view)
+        if pairs.apart == used.apart and not pairs.bad_images:
             break
         bad_images |= pairs.bad_images
         for view, camera in pairs.bad_images:
@@ -82,4 +70,4 @@ def fit_jointly(
         refinement, again = refined(used, tried, motion.as_random(nominal))
         candidates = (*candidates, *again)
         field, corrected = fit_lens_field(refinement, nominal)
-    return JointFit(corrected, field, candidates, pairs, moved, motion, bad_images)
+    return JointFit(corrected, field, candidates, pairs, motion, bad_images)

@@ -136,12 +136,24 @@ class Pairs:
 
     model: StereoModel  # its boards where each image alone has them
     views: NDArray[np.intp]  # of which both images tell that
-    apart: dict[int, str]  # view -> why its two images are not taken for one place
+    odd: dict[int, str]  # view -> why its two images are not taken for one place
     bad_images: dict[tuple[int, int], str] = field(default_factory=dict)  # (view, camera) -> why not even alone
+    # Where a camera was moved between the views: the stretches of pairs before and after such steps, and of each step
+    # turn [rad], shift [m], and [px] between pairs on either side of it and between those of one side, in the right
+    # image: root mean square of the usual two
+    stretches: tuple[tuple[int, ...], ...] = ()
+    steps: tuple[tuple[float, float, float, float], ...] = ()
+    kept: int = 0  # the stretch that tells how the cameras stand
 
-    def set_apart(self, views: Sequence[int]) -> Pairs:
-        """With these apart, too."""
-        return replace(self, apart=self.apart | dict.fromkeys(views, ""))
+    @property
+    def others(self) -> tuple[int, ...]:
+        """The views of the other stretches."""
+        return tuple(v for k, stretch in enumerate(self.stretches) if k != self.kept for v in stretch)
+
+    @property
+    def apart(self) -> set[int]:
+        """Views whose two images are used each for its own camera."""
+        return {*self.odd, *self.others}
 
     def joined(self, observations: Observations) -> StereoModel:
         """The model with one place for both images but of those apart: by the left one, where that was observed."""

@@ -108,9 +108,9 @@ def start_stereo(
         for view, (R, t) in alone.items():
             R_board[view, image], t_board[view, image] = R, t
     model = StereoModel(StereoRig(cameras[0], cameras[1], R_pair, t_pair), R_board, t_board, nominal.copy())
-    apart = {v: "" for v, agrees in zip(both, pairs.agrees, strict=True) if not agrees}
+    odd = {v: "" for v, agrees in zip(both, pairs.agrees, strict=True) if not agrees}
     orders_seen = {v: orders[k] for v, k in zip(both, pairs.order, strict=True)}
-    return Pairs(model, np.array(both), apart), orders_seen, notes
+    return Pairs(model, np.array(both), odd), orders_seen, notes
 
 
 def too_wide(observations: Observations, nominal: Array, cameras: tuple[Camera, Camera]) -> tuple[tuple[str, str], ...]:

@@ -16,7 +16,7 @@ taken, where all else scatters it. Distances are measured in pixels, as a pair's
 pair tells badly (a shift along the axis) counts as little as it is known.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -25,10 +25,10 @@ import scipy
 from numpy.typing import NDArray
 
 from calibration.board.target import LEAST_POINTS
-from calibration.cameras.camera import CAMERA_NAMES, Camera
+from calibration.cameras.camera import CAMERA_NAMES
 from calibration.fit.board_motion import LEAST, BoardMotion, motions
 from calibration.fit.normal_equations import Problem
-from calibration.fit.pairing import MIN_VIEWS, TOO_FAR, Pairs, apart, places_of, rotation_vectors, told_by
+from calibration.fit.pairing import MIN_VIEWS, TOO_FAR, Names, Pairs, apart, places_of, rotation_vectors, told_by
 from calibration.fit.refinement import Refinement, fit_poses
 from calibration.fit.start import start_camera
 from calibration.fit.stereo_model import Observations, StereoModel, predict, predict_pixels
@@ -207,8 +207,10 @@ def motion_between_exposures(refinement: Refinement) -> PairMotion | None:
     )
 
 
-def judge_pairs(observations: Observations, fit: Refinement, elsewhere: Collection[int] = ()) -> Pairs:
-    """Compare one place of the board for both images of a pair with a place for each.
+def judge_pairs(
+    observations: Observations, fit: Refinement, elsewhere: Collection[int], table_view: int | None
+) -> Pairs:
+    """Compare one place of the board for both images of a pair with a place for each; and `moved_cameras`.
 
     One place has six parameters less. What chi-square it costs tells how far the board moved: some of it in every pair,
     as boards bend and lenses are not as modelled. A pair is apart where it costs TOO_FAR (in amplitude) more than the
@@ -239,74 +241,58 @@ def judge_pairs(observations: Observations, fit: Refinement, elsewhere: Collecti
             found[int(pairs.views[k])] = f"{pairs.pixels[k]:.2g} px apart, where corners scatter by {typical:.2g} px"
     R, t = fit.model.R_left_board.copy(), fit.model.t_left_board.copy()
     R[pairs.views], t[pairs.views] = alone.R_left_board[pairs.views], alone.t_left_board[pairs.views]
-    return Pairs(replace(fit.model, R_left_board=R, t_left_board=t), pairs.views[whole], found, bad)
+    model = replace(fit.model, R_left_board=R, t_left_board=t)
+    return moved_cameras(observations, Pairs(model, pairs.views[whole], found, bad), table_view)
 
 
-@dataclass(frozen=True)
-class CameraMoved:
-    """The stretches of pairs between such steps; one where there are none."""
-
-    stretches: tuple[tuple[int, ...], ...]  # the views of the pairs; one more than steps
-    # of each step: turn [rad], shift [m], and [px] between pairs on either side of it and between those of one side, in
-    # the right image: root mean square of the usual two
-    steps: tuple[tuple[float, float, float, float], ...]
-    kept: int  # the stretch that tells how the cameras stand
-
-    @property
-    def others(self) -> tuple[int, ...]:
-        """The views of the other stretches."""
-        return tuple(v for k, stretch in enumerate(self.stretches) if k != self.kept for v in stretch)
-
-    def told(self, names: Sequence[tuple[str, str]], table_view: int | None) -> str:
-        """In words, for whoever took the views."""
-        steps = "; ".join(
-            f"from {names[view][0]} and {names[view][1]} on the cameras stand otherwise to each other than before, by "
-            f"{np.degrees(turn):.2g} deg and {1e3 * shift:.2g} mm ({pixels:.2g} px, where the pairs on either side "
-            f"agree to {scatter:.2g} px)"
-            for (view, *_), (turn, shift, pixels, scatter) in zip(self.stretches[1:], self.steps, strict=True)
-        )
-        kept = self.stretches[self.kept]
-        which = "most pairs" if table_view is None else "the view on the table"
-        return (
-            f"{steps}: a camera was moved or turned while the views were taken. How they stand to each other is taken "
-            f"from the {len(kept)} pairs {names[kept[0]][0]} to {names[kept[-1]][0]}, those with {which}; the images "
-            "of the others serve each its own camera. If the motion was recorded with the cameras as they stood at "
-            "other views, calibrate from these alone, or take new ones"
-        )
+def moved_told(pairs: Pairs, names: Names, table_view: int | None) -> str:
+    """That a camera was moved, in words, for whoever took the views."""
+    steps = "; ".join(
+        f"from {names[view][0]} and {names[view][1]} on the cameras stand otherwise to each other than before, by "
+        f"{np.degrees(turn):.2g} deg and {1e3 * shift:.2g} mm ({pixels:.2g} px, where the pairs on either side agree "
+        f"to {scatter:.2g} px)"
+        for (view, *_), (turn, shift, pixels, scatter) in zip(pairs.stretches[1:], pairs.steps, strict=True)
+    )
+    kept = pairs.stretches[pairs.kept]
+    which = "most pairs" if table_view is None else "the view on the table"
+    return (
+        f"{steps}: a camera was moved or turned while the views were taken. How they stand to each other is taken from "
+        f"the {len(kept)} pairs {names[kept[0]][0]} to {names[kept[-1]][0]}, those with {which}; the images of the "
+        "others serve each its own camera. If the motion was recorded with the cameras as they stood at other views, "
+        "calibrate from these alone, or take new ones"
+    )
 
 
-def zoomed(
-    observations: Observations, moved: CameraMoved, cameras: tuple[Camera, Camera], nominal: Array
-) -> dict[int, str]:
+def zoomed(observations: Observations, pairs: Pairs, nominal: Array) -> dict[int, str]:
     """Cameras whose focal length is another one in the other stretches, and what is to be said of their images there.
 
     A camera with other focal lengths in both parts, alone and roughly, must fit clearly better than one for all views.
     """
     found = {}
-    other = np.isin(observations.view, moved.others)
-    paired = np.isin(observations.view, [v for stretch in moved.stretches for v in stretch])
-    for index, camera in enumerate(cameras):
+    other = np.isin(observations.view, pairs.others)
+    paired = np.isin(observations.view, [v for stretch in pairs.stretches for v in stretch])
+    for index, camera in enumerate(pairs.model.rig.cameras):
         parts = (paired, paired & ~other, paired & other)
         rough = [start_camera(observations[part], index, nominal, camera.image_size) for part in parts]
         focal, square = [one.fx for one, *_ in rough], [misfit for *_, misfit in rough]
         if square[0] > BY_ZOOM * (square[1] + square[2]):
             found[index] = (
                 f"the {CAMERA_NAMES[index]} camera was zoomed or focused anew while the views were taken: its "
-                f"focal length is {focal[1]:.0f} px in the {len(moved.stretches[moved.kept])} views that are used, "
+                f"focal length is {focal[1]:.0f} px in the {len(pairs.stretches[pairs.kept])} views that are used, "
                 f"{focal[2]:.0f} px here. If the motion was recorded so, calibrate from these views alone"
             )
     return found
 
 
-def camera_moved(observations: Observations, pairs: Pairs, table_view: int | None) -> CameraMoved:
-    """Find the steps; of too few pairs none.
+def moved_cameras(observations: Observations, pairs: Pairs, table_view: int | None) -> Pairs:
+    """The pairs in stretches between which a camera was moved; of too few pairs one.
 
     table_view : its stretch tells how the cameras stand; None: the one with the most pairs does
     """
     model, views, sides = pairs.model, pairs.views, []
     R_pair = model.rig.R_right_left
     if len(views) < 2 * MIN_VIEWS:
-        return CameraMoved((tuple(views.tolist()),), (), 0)
+        return pairs
     for index, (R, t) in enumerate(model.rig.camera_poses()):
         mine = observations[observations.camera == index]
         poses = zip(R @ model.R_left_board[views, index], model.t_left_board[views, index] @ R.T + t, strict=True)
@@ -329,11 +315,11 @@ def camera_moved(observations: Observations, pairs: Pairs, table_view: int | Non
     kept = int(np.argmax([len(stretch) for stretch in stretches]))
     if table_view is not None:
         kept = int(np.searchsorted([views[at] for at, _, _ in cuts], table_view, "right"))
-    return CameraMoved(tuple(tuple(views[s].tolist()) for s in stretches), tuple(steps), kept)
+    return replace(pairs, stretches=tuple(tuple(views[s].tolist()) for s in stretches), steps=tuple(steps), kept=kept)
 
 
 def _cuts(between: Array) -> list[tuple[int, float, float]]:
-    """Where n pairs part, in order: the clearest step, then those on either side of it; as in `CameraMoved.steps`.
+    """Where n pairs part, in order: the clearest step, then those on either side of it; as in `Pairs.steps`.
 
     between : (n, n) [px] by which what the pairs tell of the cameras differs
     """
