@@ -21,11 +21,15 @@ def ranges(numbers: ArrayLike) -> str:
 
 
 class Brief:
-    """A result that holds large arrays and is shown by a few facts. Dataclasses that inherit it take `repr=False`."""
+    """A result that is shown by a few facts. Dataclasses that inherit it take `repr=False`."""
 
     def facts(self) -> Mapping[str, str]:
-        """What a glance should tell: heading -> value with its unit."""
-        raise NotImplementedError
+        """What a glance should tell, heading -> value with its unit: here all that the result holds.
+
+        Numbers and words as they are, arrays by their shape, parts by their name; what holds nothing is left out.
+        """
+        shown = {name: _outlined(value) for name, value in vars(self).items()}
+        return {name: text for name, text in shown.items() if text}
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({', '.join(f'{name} {value}' for name, value in self.facts().items())})"
@@ -33,15 +37,6 @@ class Brief:
     def _repr_html_(self) -> str:
         rows = "".join(f"<tr><th>{escape(k)}</th><td>{escape(v)}</td></tr>" for k, v in self.facts().items())
         return f"<table><caption>{type(self).__name__}</caption>{rows}</table>"
-
-
-class Outline(Brief):
-    """A result shown by what it holds: numbers and words as they are, arrays by their shape, parts by their name."""
-
-    def facts(self) -> dict[str, str]:
-        """What a glance should tell (`Brief`); what holds nothing is left out."""
-        shown = {name: _outlined(value) for name, value in vars(self).items()}
-        return {name: text for name, text in shown.items() if text}
 
 
 LONGEST = 60  # characters of a word that is shown whole

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from calibration.kit.arguments import checked
 from calibration.kit.arrays import Array, Mask
-from calibration.kit.brief import Outline
+from calibration.kit.brief import Brief
 from disctrack.analyse.smoothing import HALF_WINDOW_LENGTHS, SEGMENT, fit_process, moving_weights
 from disctrack.disc import Disc
 from disctrack.errors import AnalysisError
@@ -44,7 +44,7 @@ KNOWN_FRACTION = 0.25  # of the process' own variance of the first derivative: a
 
 
 @dataclass(frozen=True, repr=False)
-class MotionState(Outline):
+class MotionState(Brief):
     """Motion of the disc at n instants, world axes."""
 
     position: Array  # (n, 3) centre [m]

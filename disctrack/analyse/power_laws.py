@@ -18,7 +18,7 @@ from scipy.signal import find_peaks
 from scipy.special import stdtrit
 
 from calibration.kit.arrays import Array
-from calibration.kit.brief import Outline
+from calibration.kit.brief import Brief
 from disctrack.analyse.derivatives import MIN_FRAMES
 from disctrack.disc import Disc, nutation_frequency, precession_rate
 from disctrack.errors import ModelError
@@ -67,7 +67,7 @@ class Exponent(Measured):
 
 
 @dataclass(frozen=True, repr=False)
-class PowerLaws(Outline):
+class PowerLaws(Brief):
     """Exponents over one window; NaN with a reason where the data do not determine them."""
 
     reason: str = ""  # empty when determined

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.kit.arrays import Array
-from calibration.kit.brief import Outline
+from calibration.kit.brief import Brief
 from disctrack.analyse.derivatives import K, MeasuredMotion, MotionState
 from disctrack.disc import Disc, precession_rate
 from disctrack.errors import ModelError
@@ -109,7 +109,7 @@ def quantities(state: MotionState, disc: Disc, gravity: float) -> Array:
 
 
 @dataclass(frozen=True, repr=False)
-class DerivedSeries(Outline):
+class DerivedSeries(Brief):
     """One derived quantity over the recording."""
 
     name: str
@@ -171,7 +171,7 @@ TOTAL, LEVEL = COLUMN["total"], COLUMN["precession_level"]
 
 
 @dataclass(frozen=True, repr=False)
-class Energy(Outline):
+class Energy(Brief):
     """Energy of a recording."""
 
     loss: float  # [J] from the first to the last known frame, positive when lost

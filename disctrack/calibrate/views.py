@@ -10,7 +10,7 @@ from calibration import CalibrationSettings, StereoCalibration, calibrate_stereo
 from calibration.board.search import Progress
 from calibration.board.target import Target
 from calibration.kit.arguments import Thickness, checked
-from calibration.kit.brief import Outline
+from calibration.kit.brief import Brief
 from disctrack.errors import RecordingError
 from disctrack.frames import CAMERAS
 from disctrack.recording.declaration import CalibrationViews, Recording
@@ -44,7 +44,7 @@ View = Path | FrameView
 
 
 @dataclass(frozen=True, repr=False)
-class TargetImages(Outline):
+class TargetImages(Brief):
     """Synchronised views; number i of the left and of the right show the board in the same place."""
 
     left: tuple[View, ...]

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from calibration.kit.arrays import Array
-from calibration.kit.brief import Outline
+from calibration.kit.brief import Brief
 from calibration.kit.least_squares import OwnNumbers, covariance_within, solve_bounded
 from disctrack.discrepancy.elimination import Own, Projection, is_linear, prior_rows, projection
 from disctrack.discrepancy.system import Quantity, System, Values
@@ -18,7 +18,7 @@ _HALVINGS = 8
 
 
 @dataclass(frozen=True, repr=False, eq=False)
-class Fit(Outline):
+class Fit(Brief):
     """Minimum of chi-square, data and priors together."""
 
     quantities: tuple[Quantity, ...]

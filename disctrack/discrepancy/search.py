@@ -17,7 +17,7 @@ import numpy as np
 from scipy import stats
 
 from calibration.kit.arrays import Mask
-from calibration.kit.brief import Outline
+from calibration.kit.brief import Brief
 from disctrack.discrepancy.fit import Fit, fit, no_fit
 from disctrack.discrepancy.held_out import HeldOut, held_out, training_rows
 from disctrack.discrepancy.noise import THIRD, inflation, noise_variance, whitened
@@ -107,7 +107,7 @@ class Tried:
 
 
 @dataclass(frozen=True, repr=False)
-class Diagnosis(Outline):
+class Diagnosis(Brief):
     """Answer of the search."""
 
     verdict: Verdict

@@ -12,7 +12,7 @@ from typing import Any, ClassVar, NamedTuple
 from calibration.board.target import Board, CharucoBoard, Target
 from calibration.judge.tolerances import BoardTolerances
 from calibration.kit.arguments import checked
-from calibration.kit.brief import Outline
+from calibration.kit.brief import Brief
 from disctrack.disc import AIR_DENSITY, STANDARD_PRESSURE, Disc, disc_from_mm
 from disctrack.errors import CalibrationError, RecordingError
 from disctrack.files.inputs import RECORDING_FILE, keep, why_not_regular
@@ -176,7 +176,7 @@ class TableView:
 
 
 @dataclass(frozen=True, repr=False)
-class Recording(Outline):
+class Recording(Brief):
     """What recording.toml declares, in SI units; exactly one of `views` and `rig_file` is given.
 
     >>> recording = read_recording("clip")

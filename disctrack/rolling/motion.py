@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calibration.kit.arrays import Array
-from calibration.kit.brief import Outline
+from calibration.kit.brief import Brief
 from disctrack.frames import COORDINATES, nodal_axes_world, rotation_from_euler
 from disctrack.rolling.effects.base import Effect
 from disctrack.rolling.model import Model
@@ -103,7 +103,7 @@ def effect_power(effect: Effect, now: Record, load: ArrayLike) -> Array:
     return moment_power(now, moment) + np.sum(force * columns(now, "v_n", "v_m", "v_z"), axis=-1)
 
 
-class Motion(Outline):
+class Motion(Brief):
     """Motion of the disc at n times. Forces and moments are those of the table on the disc, in (n0, m0, k)."""
 
     def __init__(self, model: Model, body: Records, path: Path) -> None:

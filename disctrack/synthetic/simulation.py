@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 
 from calibration.kit.arguments import checked
-from calibration.kit.brief import Outline
+from calibration.kit.brief import Brief
 from disctrack.errors import SceneError
 from disctrack.files.inputs import keep, refuse_input
 from disctrack.files.labelled_arrays import Variable, flags, write_variables
@@ -33,7 +33,7 @@ _CONVENTIONS = {
 
 
 @dataclass(frozen=True, repr=False)
-class SimulationRun(Outline):
+class SimulationRun(Brief):
     """What `run_simulate` did."""
 
     path: Path

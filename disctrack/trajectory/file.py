@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from calibration.cameras.camera import RIG_PARAMETERS, StereoRig
 from calibration.kit.arguments import checked
 from calibration.kit.arrays import Mask
-from calibration.kit.brief import Outline
+from calibration.kit.brief import Brief
 from calibration.kit.seal import sealed
 from calibration.rig_file import beside_cameras, complete_file, read_beside_cameras, versions, write_attributes
 from disctrack.disc import Disc
@@ -57,7 +57,7 @@ _CONVENTIONS = {
 
 @checked
 @dataclass(frozen=True, repr=False)
-class Provenance(Outline):
+class Provenance(Brief):
     """What a result was made from; equal fingerprints mean that making it again would give it again.
 
     >>> Provenance("by hand", inputs={}, settings={}).recording
