@@ -15,7 +15,6 @@ from pathlib import Path
 from disctrack.errors import OutputError
 
 RECORDING_FILE = "recording.toml"
-_LEVELS = 4  # folders above an output in which a recording may lie that names it
 MOST_TEXT = 16 << 20  # [bytes] of a file that people write, or a camera beside its frames; real ones have 100 kB
 MOST_IMAGE = 1 << 30  # [bytes] of a file with one image
 _KINDS = {
@@ -113,7 +112,7 @@ def _claimed(path: Path) -> str:
     "" where there is none.
     """
     place = Path(_name(path))
-    for folder in list(place.parents)[:_LEVELS]:
+    for folder in place.parents:
         file = folder / RECORDING_FILE
         for pattern in _patterns(file) if file.is_file() else ():
             if place.exists() and (place.match(pattern)):

@@ -84,6 +84,7 @@ def test_a_file_is_read_up_to_its_bound(tmp_path):
     [
         *(("left/*.png", f"{place}/trajectory.h5", "lies among the frames") for place in ("left", "right", "views")),
         *(("left/*.png", f"{place}/trajectory.h5", "") for place in (".", "results", "left/results", "..")),
+        ("a/b/c/d/left/*.png", "a/b/c/d/left/trajectory.h5", "lies among the frames"),  # however far below
         ("left_*.png", "trajectory.h5", ""),  # frames in the recording's own folder
         ("left_*.png", "left_1.png", "no output replaces an input"),
     ],
