@@ -29,7 +29,7 @@ RIG_PARAMETERS = (
 )
 N_RIG = len(RIG_PARAMETERS)  # 30
 # Which of them are of what: the cameras' own; the right one against the left one; the world against the left one
-OF_CAMERAS = OF_LEFT, OF_RIGHT = slice(0, N_INTRINSIC), slice(N_INTRINSIC, 2 * N_INTRINSIC)
+OF_CAMERAS = slice(0, N_INTRINSIC), slice(N_INTRINSIC, 2 * N_INTRINSIC)
 PAIR_TURN, PAIR_SHIFT = slice(18, 21), slice(21, 24)
 WORLD_TURN, WORLD_SHIFT = slice(24, 27), slice(27, 30)
 

@@ -33,7 +33,6 @@ from calibration.kit.errors import CalibrationError
 
 FREE_ROUNDS = 6  # of rejection, in which a point may come back; in as many more it may not, so that they come to an end
 MOST_DISAGREEMENT = 100.0  # of views among each other that is believed, and the least: few of them tell it badly
-HOPELESS = 1.5  # times the noise of the best model, left in the views it was fitted to: not worth views left out
 FOLDS = 5
 NEGLIGIBLE = 1e-5  # of chi-square, still to be gained: of 10^4 points, a third of a sigma of one parameter
 TRUNCATE = 30.0  # squared sigmas: one bad corner must not decide between two models
@@ -305,7 +304,6 @@ def choose_board(
         begin = fits[0] if fits else None
         fits.append(refine_stereo(observations, start, nominal, terms, begin=begin, motion=None if begin else motion))
     quietest = min(fits, key=lambda fit: fit.unexplained_sigma)
-    fits = [fit for fit in fits if fit.unexplained_sigma <= HOPELESS * quietest.unexplained_sigma + 1e-3]
     table = [candidate(fit, quietest) for fit in fits]
     best = min(table, key=lambda row: row.held_out_chi_square)
     return next(fit for fit, row in zip(fits, table, strict=True) if is_near(row, best)), tuple(table)

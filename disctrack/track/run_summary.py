@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from calibration import StereoCalibration, StereoRig
-from calibration.cameras.camera import OF_LEFT, OF_RIGHT, PAIR_SHIFT, PAIR_TURN
+from calibration.cameras.camera import OF_CAMERAS, PAIR_SHIFT, PAIR_TURN
 from calibration.kit.arrays import Array
 from calibration.kit.brief import SHOWN_RANGES, ranges
 from disctrack.frames import CAMERAS, vector_from_rotation
@@ -51,7 +51,7 @@ def _rig_text(rig: StereoRig) -> str:
     turn = float(np.degrees(np.sqrt(axis @ C[PAIR_TURN, PAIR_TURN] @ axis)))
     focal = [
         f"{name} {measured(camera.fx, np.sqrt(C[i, i]))} x {measured(camera.fy, np.sqrt(C[i + 1, i + 1]))}"
-        for name, camera, i in (("left", rig.left, OF_LEFT.start), ("right", rig.right, OF_RIGHT.start))
+        for name, camera, i in zip(CAMERAS, rig.cameras, (own.start for own in OF_CAMERAS), strict=True)
     ]
     return (
         f"baseline {measured(1e3 * rig.baseline, baseline, 'mm')}, cameras turned by "

@@ -171,7 +171,7 @@ def test_a_bent_board_is_chosen_and_recovered(rng):
     found, table = choose_board(o, begun.joined(o), scene.board.points, (Terms(), Terms(board="warped")))
     assert found.terms.board == "warped"
     assert_allclose(found.model.points[:, 2], scene.model.points[:, 2], atol=5e-6)  # 0.02 px of 0.25 mm, 24 images each
-    assert [c.terms.board for c in table] == ["warped"]  # the flat one leaves far more: not worth views left out
+    assert table[0].held_out_chi_square > 1.5 * table[1].held_out_chi_square
 
 
 def test_a_flat_board_stays_flat_and_a_lens_without_distortion_has_none_within_its_sigma(rng):
