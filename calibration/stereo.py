@@ -3,7 +3,6 @@
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from hashlib import sha256
 
 import numpy as np
 from numpy.typing import NDArray
@@ -169,11 +168,7 @@ def calibrate_stereo(
     (left, note_left), (right, note_right) = (
         repaired_views(side, name) for side, name in zip((left_images, right_images), CAMERA_NAMES, strict=True)
     )
-    digests = [sha256(image.tobytes()).digest() for image in (*left, *right)]
-    images = dict(zip(digests, (*left, *right), strict=True))  # copies are looked at once
-    seen_in = dict(zip(images, located([*images.values()], board, progress), strict=True))
-    views = [seen_in[digest] for digest in digests]
-    n = len(left_images)
+    views, n = located([*left, *right], board, progress), len(left_images)
     found = calibrate_from_corners(views[:n], views[n:], board, settings, table_view, board_thickness, names)
     seen = [view for side in found.corner_views for view in side]
     negative = negatives([*left, *right], seen, board) if isinstance(board, Board) else ""

@@ -19,35 +19,33 @@ from calibration.board.chessboard import (
 from calibration.board.target import Board, Target
 from calibration.kit.arrays import evenly
 
-TargetView = CornerView | BoardNotFound
 Progress = Callable[[str, int, int], None]
 LEAST_VIEWS = 2  # that must show the whole board
 SIZES_TRIED = 3  # of those that several images seem to show
 VIEWS_TRIED = 8  # over a whole set: what most of them show is the board; without one, the slow search waits
 
 
-def find_target(image: NDArray, target: Target, thorough: bool = True) -> TargetView:
-    """The target's points in one image. Raises ValueError if it is no image."""
-    if isinstance(target, Board):
-        return find_corners(image, target.inner_corners, thorough)
-    return find_charuco(image, target)
-
-
-def located(images: Sequence[NDArray], target: Target, progress: Progress | None = None) -> list[TargetView]:
+def located(
+    images: Sequence[NDArray], target: Target, progress: Progress | None = None
+) -> list[CornerView | BoardNotFound]:
     """The target in every image.
 
     A sample over all of them is searched first. Where most of it does not show the target to the quick search but
     another board, that is reason enough not to search on; where the slow search finds none either, the others are
     searched quickly.
     """
-    views: dict[int, TargetView] = {}
+    views: dict[int, CornerView | BoardNotFound] = {}
 
     def locate(index: int, thorough: bool) -> None:
+        is_new, image = index not in views, images[index]
         try:
-            views[index] = find_target(images[index], target, thorough)
+            if isinstance(target, Board):
+                views[index] = find_corners(image, target.inner_corners, thorough)
+            else:
+                views[index] = find_charuco(image, target)
         except ValueError as error:
             views[index] = BoardNotFound(str(error))
-        if progress:
+        if progress and is_new:
             progress("corners", len(views), len(images))
 
     def lost(among: Iterable[int], thorough: bool) -> list[int]:

@@ -210,11 +210,4 @@ def _calibrate(source: CalibrationSource) -> tuple[StereoCalibration, tuple[str,
     with compiling("corners", 8):
         corner_fit.prepare()
     with progress_bar("calibrate", 2 * len(source.views), "image") as advance:
-        done = 0
-
-        def report(stage: str, now: int, total: int) -> None:
-            nonlocal done
-            advance(now - done)
-            done = now
-
-        return source.calibrated(report)
+        return source.calibrated(lambda stage, done, total: advance(1))
