@@ -21,7 +21,6 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
 from calibration.board.target import LEAST_POINTS
@@ -86,32 +85,25 @@ class PairMotions:
         return np.asarray(np.sum(np.where(values > 1e-6, white**2 / np.maximum(values, 1e-6), 0.0), axis=1))
 
     def likely_size(self) -> BoardMotion:
-        """The most likely size of random motions; about a minimum with one place of the board for both images."""
+        """The most likely size of random motions; about a minimum with one place of the board for both images.
+
+        With P the inverse covariance of the motions where everything shared is free, a variance is right where the
+        squares of P m that belong to it are in sum the trace of P, and grows or falls by their ratio.
+        """
         s1 = self.problem.stereo_basis.shape[1]  # the board's shape is held: it is known better than motions move it
-        everyone = np.ones(len(self.views), bool)
+        W, everyone = self.by_shared[..., :s1], np.ones(len(self.views), bool)
         at_noise = replace(self, alone=(self.alone[0] / self.noise, self.alone[1] / self.noise))
-
-        def variances(sizes: Array) -> Array:
-            turn, part = np.exp(np.clip(sizes, np.log(LEAST), 0.0))
-            return np.repeat([turn, part * self.distance], 3) ** 2
-
-        def unlikely(sizes: Array) -> float:
-            """-2 log likelihood, everything shared marginalised."""
-            V = self.noise * self.covariance + np.diag(variances(sizes))
+        least = np.square([LEAST, LEAST * self.distance])
+        variances = 1e6 * least
+        for _ in range(100):  # what tends to zero gets there by a part each time
+            V = self.noise * self.covariance + np.diag(np.repeat(variances, 3))
             information, gradient = at_noise.shared(V, everyone, s1)
-            sign, volume = np.linalg.slogdet(information)
-            if sign <= 0.0:  # motions so large that nothing is left of how the cameras stand
-                return np.inf
-            chi_square = np.sum(self.motion * np.linalg.solve(V, self.motion[..., None])[..., 0])
-            chi_square -= gradient @ np.linalg.solve(information, gradient)
-            return float(np.linalg.slogdet(V)[1].sum() + volume + chi_square)
-
-        # an attribute of `scipy` is imported when it is asked for: a measurement with a rig does not wait for it
-        rough = {"method": "Nelder-Mead", "options": {"xatol": 0.02, "fatol": 0.02}}  # of logarithms
-        begun = np.log([(1e-4, 1e-4), (1e-3, 1e-4), (1e-5, 1e-5)])
-        tried = [scipy.optimize.minimize(unlikely, start, **rough) for start in begun]
-        S = variances(min(tried, key=lambda one: float(one.fun)).x)
-        return BoardMotion(float(S[0] ** 0.5), float(S[3] ** 0.5))
+            inverse, known = scaled_solve(information, np.eye(s1)), np.linalg.inv(V)
+            P = known - known @ W @ inverse @ np.swapaxes(known @ W, 1, 2)
+            Pm = (known @ (self.motion - W @ (inverse @ gradient))[..., None])[..., 0]
+            squares, traces = (np.sum(of.reshape(-1, 2, 3), axis=(0, 2)) for of in (Pm**2, np.einsum("nii->ni", P)))
+            variances = np.maximum(variances * squares / traces, least)
+        return BoardMotion(*np.sqrt(variances).tolist())
 
     def gradients(self, size: BoardMotion) -> Array:
         """(n_views, s, s) covariance of what motions of this size add to each view's gradient by the shared numbers."""
