@@ -48,7 +48,7 @@ def fit_lens_field(refinement: Refinement, nominal: Array) -> tuple[LensField | 
     if gain < BETTER * error or gain < LEAST_GAIN:
         return None, refinement
     both = [_precision(finer, small, large) for large in PRIORS_PX for small in FINER_PX]
-    solution, _ = _likeliest(reduce(np.add, _squares(refinement, used, finer, left)), finer, both)
+    solution, _ = _likeliest(reduce(np.add, _squares(refinement, used, finer, left)), both)
     field = replace(finer, coefficients=solution[-finer.coefficients.size :].reshape(finer.coefficients.shape))
     o = refinement.observations
     moved = np.stack([field.displacement(o.pixels, camera) for camera in (0, 1)])[o.camera, np.arange(len(o))]
@@ -84,7 +84,7 @@ def _worth(refinement: Refinement, used: Observations, grid: LensField, extra: f
     """
     squares = np.stack(list(_squares(refinement, used, grid, extra)))
     total, views = squares.sum(0), np.arange(len(squares))
-    solution, prior = _likeliest(total, grid, [_precision(grid, sigma) for sigma in PRIORS_PX])
+    solution, prior = _likeliest(total, [_precision(grid, sigma) for sigma in PRIORS_PX])
     chi_square = np.zeros((2, len(views)))  # of each view, left out: without a field, and with one
     for fold in range(FOLDS):
         test = views[fold::FOLDS]
@@ -99,7 +99,7 @@ def _worth(refinement: Refinement, used: Observations, grid: LensField, extra: f
     return float(gained.mean() / mean), float(error / mean), max(extra * min(square / freedom, 1.0), 1e-8)
 
 
-def _likeliest(total: Array, grid: LensField, priors: list[Array]) -> tuple[Array, Array]:
+def _likeliest(total: Array, priors: list[Array]) -> tuple[Array, Array]:
     """Parameters (s,) under that of the priors (precisions) under which all corners are likeliest, and that prior."""
     found = []
     for prior in priors:

@@ -277,7 +277,7 @@ def zoomed(observations: Observations, pairs: Pairs, nominal: Array) -> dict[int
 
 
 def moved_cameras(observations: Observations, pairs: Pairs, table_view: int | None) -> Pairs:
-    """The pairs in stretches between which a camera was moved; of too few pairs one.
+    """The pairs with the stretches between which a camera was moved; too few pairs have none.
 
     table_view : its stretch tells how the cameras stand; None: the one with the most pairs does
     """
