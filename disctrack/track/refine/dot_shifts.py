@@ -47,8 +47,6 @@ from disctrack.frames import CAMERAS
 from disctrack.track.dots.template_response import (
     AROUND,
     Edge,
-    contrast_graded,
-    edge_smeared,
     half_axes,
     plane_to_image,
     pulls,
@@ -193,15 +191,12 @@ def _pulled(radius: float, affine: Array, growth: Array, velocity: Array, edge: 
 
     affine (n, m, 2, 2) [px/m]; growth (n, m, 2, 2) [1/s] A' A^-1; velocity (n, m, 2) [px/s].
     """
-    T = pulls(radius, affine, edge, edge_smeared)
     axes = turned_to_axes(affine)
-    v = (axes @ velocity[..., None])[..., 0]
-    G = axes @ growth @ np.swapaxes(axes, -1, -2)
-    along = (T[..., 0] * G[..., 0, 0] + T[..., 1] * G[..., 1, 1]) * v[..., 0]
-    along += (T[..., 2] * G[..., 0, 1] + T[..., 3] * G[..., 1, 0]) * v[..., 1]
-    across = (T[..., 4] * G[..., 0, 0] + T[..., 5] * G[..., 1, 1]) * v[..., 1]
-    across += (T[..., 6] * G[..., 0, 1] + T[..., 7] * G[..., 1, 0]) * v[..., 0]
-    return np.asarray((np.stack([along, across], -1)[..., None, :] @ axes)[..., 0, :])
+    v, G = (axes @ velocity[..., None])[..., 0], axes @ growth @ np.swapaxes(axes, -1, -2)
+    # the products that `_response` goes by: of the long axis, and of the short one
+    rates = v[..., [[0, 0, 1, 1], [1, 1, 0, 0]]] * G[..., [[0, 1, 0, 1], [1, 0, 1, 0]], [[0, 1, 1, 0], [1, 0, 0, 1]]]
+    along = np.sum(pulls(radius, affine, edge)[..., 1:] * rates, axis=-1)
+    return np.asarray((along[..., None, :] @ axes)[..., 0, :])
 
 
 def _rate(values: Array, time: Array) -> Array:
@@ -272,7 +267,7 @@ def shift_by_glare(R: Array, t: Array, contrast: Array, rig: StereoRig, disc: Di
             if gradient is not None:
                 axes = turned_to_axes(affine[:, camera])
                 along = (axes @ gradient(places[:, camera])[..., None])[..., 0]
-                along *= pulls(0.5 * disc.marker_diameter, affine[:, camera], edge, contrast_graded)
+                along *= pulls(0.5 * disc.marker_diameter, affine[:, camera], edge)[..., 0]
                 shift[rows, camera] = np.nan_to_num((along[..., None, :] @ axes)[..., 0, :])
     return shift
 
