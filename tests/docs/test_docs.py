@@ -18,7 +18,7 @@ import pytest
 
 import disctrack.cli
 from disctrack.cli import COMMANDS
-from disctrack.faults.catalogue import _MISPRINT, CLOCKS, OF_CAMERAS, OF_THE_PAPER, OF_THE_TABLE
+from disctrack.faults.catalogue import FAULTS
 from disctrack.recording.declaration import KEYS, TARGET_KEYS, read_recording
 from disctrack.rolling import CATALOGUE
 from disctrack.trajectory.exchange.formats import ROWS
@@ -210,18 +210,11 @@ def test_every_effect_is_named():
         assert f"`{name}`" in text, name
 
 
-def test_the_faults_stand_as_the_catalogue_has_them():
-    rows = ["| fault | what you see | what to do |", "|---|---|---|"]
-    same: dict[tuple[str, str], list[str]] = {}
-    for fault in (*CLOCKS, *OF_CAMERAS, _MISPRINT, *OF_THE_PAPER, *OF_THE_TABLE):
-        if fault.in_images:  # sought in the dots of other programs
-            continue
-        what = f"`{fault.declared}`: {fault.remedy}" if fault.declared else fault.remedy or "nothing"
+def test_every_fault_that_a_search_finds_by_itself_stands_on_its_page():
+    text = text_of(DOCS / "faults.md")
+    for fault in FAULTS:
         title = " ".join(fault.title.format("").split())
-        same.setdefault((fault.seen, what), []).append(f"`{fault.name}`: {title}")
-    rows += [f"| {'; '.join(which)} | {seen} | {what} |" for (seen, what), which in same.items()]
-    table = "\n".join(rows)
-    assert table in text_of(DOCS / "faults.md"), table
+        assert fault.in_images or f"`{fault.name}`: {title}" in text, title  # those are sought in other programs' dots
 
 
 def test_every_command_is_in_the_documentation():
