@@ -30,7 +30,6 @@ class ClockJump:
 
     row: int  # the first frame after it
     frames: int  # pairs that were lost
-    gain: float  # by which the misfit of the stretch falls, in its usual size
 
     @property
     def words(self) -> str:
@@ -57,7 +56,7 @@ def clock_jumps(trajectory: Trajectory) -> tuple[ClockJump, ...]:
     jumps: list[ClockJump] = []
     for row, misfit in sorted(found, key=lambda one: one[1].min() / one[1][0]):
         if all(abs(row - jump.row) >= SIDE for jump in jumps):
-            jumps.append(ClockJump(row, int(misfit.argmin()), float((misfit[0] - misfit.min()) / usual)))
+            jumps.append(ClockJump(row, int(misfit.argmin())))
     return tuple(sorted(jumps, key=lambda jump: jump.row))
 
 

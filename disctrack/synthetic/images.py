@@ -146,13 +146,10 @@ def _top(disc: Disc) -> float:
 
 def _exposure_rule(pose: PoseOverExposure, exposure: float, stage: Stage, disc: Disc) -> tuple[Array, Array]:
     """Nodes in units of the exposure (from -1/2 to 1/2) and weights of sum 1."""
-    if exposure == 0:
-        return np.zeros(1), np.ones(1)
     outline = _outline(pose(np.array([-0.5, 0.5]) * exposure), disc, stage.view)
     path_px = float(np.max(np.linalg.norm(outline[1] - outline[0], axis=-1)))
-    if path_px < 0.02:  # its variance, path^2 / 12, is 5e-5 of the blur's
-        return np.zeros(1), np.ones(1)
-    nodes, weights = np.polynomial.legendre.leggauss(2 + int(path_px / 0.8))
+    # one below 0.02 px: its variance, path^2 / 12, is 5e-5 of the blur's
+    nodes, weights = np.polynomial.legendre.leggauss(1 if path_px < 0.02 else 2 + int(path_px / 0.8))
     return nodes / 2, weights / 2
 
 

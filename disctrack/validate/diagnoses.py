@@ -11,6 +11,7 @@ from scipy import stats
 
 from disctrack.diagnosis import DiscDiagnosis, diagnose
 from disctrack.discrepancy.fit import Fit, fit
+from disctrack.discrepancy.search import threshold
 from disctrack.discrepancy.significance import wald
 from disctrack.validate.hidden import HiddenCase, Values, recorded
 from disctrack.validate.tables import Validation, table
@@ -99,7 +100,7 @@ def _standing_out(result: DiscDiagnosis, truths: Sequence[Values], planted: Valu
         index = [joint.names.index(n) for n in candidate.names]
         amount = np.array([truth.get(q.name, q.null) - q.null for q in candidate.quantities])
         sigmas = np.sqrt(wald(amount, joint.covariance[np.ix_(index, index)]) / d.noise)
-        needed = np.sqrt(stats.chi2.isf(d.settings.false_alarm / max(len(system.candidates), 1), len(index)))
+        needed = np.sqrt(threshold(system, d.settings, len(index)))
         found.append((float(sigmas), float(needed)))
     return min(found, key=lambda one: one[0] / one[1])
 

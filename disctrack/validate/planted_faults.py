@@ -251,15 +251,12 @@ def reordered(folder: Path, change: Callable[[list[bytes]], Iterable[bytes]]) ->
 
 def redrawn(folder: Path, change: Callable[[NDArray, float], NDArray]) -> None:
     """Change images; the number is the share of the recording before each."""
-    suffix = next(folder.iterdir()).suffix
-
-    def drawn(contents: list[bytes]) -> Iterator[bytes]:
-        for number, content in enumerate(contents):
-            image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
-            assert image is not None
-            yield cv2.imencode(suffix, change(image, number / len(contents)))[1].tobytes()
-
-    reordered(folder, drawn)
+    files = sorted(folder.iterdir())
+    for number, file in enumerate(files):
+        image = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+        assert image is not None
+        file.unlink()  # it may be a link to another's
+        cv2.imwrite(str(file), change(image, number / len(files)))
 
 
 def _files(**orders: Callable[[list[bytes], int], list[bytes]]) -> Change:

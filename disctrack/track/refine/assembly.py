@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.cameras.camera import causes
+from calibration.cameras.camera import StereoRig, causes
 from calibration.kit.arrays import Array, Mask
 from calibration.kit.brief import Brief
 from disctrack import frames
@@ -97,13 +97,12 @@ def assemble(
     systematic += course
     moved = by_pattern(as_built, fits.R_world_body)
     fits, systematic, rig, table = table_from_disc(fits, systematic, as_built.rig, disc, settings.table, moved)
-    as_built = replace(as_built, rig=rig, off_centre=off_centre(table, np.arccos(fits.R_world_body[:, 2, 2]), disc))
-    moved = by_pattern(as_built, fits.R_world_body)
+    moved = by_pattern(as_built, fits.R_world_body, off_centre(table, np.arccos(fits.R_world_body[:, 2, 2]), disc))
     systematic += moved @ moved.swapaxes(1, 2)
     # after the table: what poses scatter beside their dots need not be white, and frames do not average it there
     *_, shaken = scatter_of_poses(fits)
     fits.covariance[...] *= np.sqrt(np.outer(shaken, shaken))
-    shared = _shared_sigma(fits, systematic, as_built)
+    shared = _shared_sigma(fits, systematic, rig, moved)
     seen = replace(seen, rig=rig)
     trajectory = trajectory_of(seen, fits, systematic, verdicts, tables.frame_status, tables.status, taken)
     if table is not None:
@@ -114,7 +113,7 @@ def assemble(
         "blur_px": [edge.blur_px for edge in first.edges],
         "noise": [edge.noise._asdict() for edge in first.edges],
         "pose_variance_factor": shaken.round(3).tolist(),  # of the poses about a smooth motion over what dots tell
-        "shared_sigma": [[sigma, cause] for sigma, cause in shared],
+        "shared_sigma": shared,
         "acquisitions": sum(f.acquisitions for f in followers),  # times the disc was searched for and found
         "variance_factor": scatter.whole,
         "noise_factor": scatter.noise,
@@ -193,16 +192,19 @@ def fit_all(seen: DotsInFrames, workers: int = 1, judged: bool = True) -> PoseFi
     return PoseFits(**whole)
 
 
-def _shared_sigma(fits: PoseFits, systematic: Array, as_built: AsBuilt) -> tuple[tuple[float, str], ...]:
-    """Of the pose's components: the part of sigma that frames share, over the recording, and most of it from what."""
+def _shared_sigma(fits: PoseFits, systematic: Array, rig: StereoRig, moved: Array) -> list[list[object]]:
+    """Of the pose's components: the part of sigma that frames share, over the recording, and most of it from what.
+
+    moved : (n, 6, 3) of `by_pattern`
+    """
     rows = evenly(np.flatnonzero(fits.converged & np.isfinite(systematic).all(axis=(1, 2))), SHARED_FRAMES)
     if not rows.size:
-        return ()
+        return []
     whole = np.mean(np.diagonal(systematic[rows], axis1=1, axis2=2), axis=0)
-    of_pattern = np.mean(np.sum(by_pattern(as_built, fits.R_world_body[rows]) ** 2, axis=2), axis=0)
+    of_pattern = np.mean(np.sum(moved[rows] ** 2, axis=2), axis=0)
     further = {"what repeats in the dots": whole - of_pattern, OF_PATTERN: of_pattern}
-    sigma, most = causes(as_built.rig, fits.sensitivity[rows], further)
-    return tuple((float(value), cause) for value, cause in zip(sigma, most, strict=True))
+    sigma, most = causes(rig, fits.sensitivity[rows], further)
+    return [[float(value), cause] for value, cause in zip(sigma, most, strict=True)]
 
 
 def status_of(followed: NDArray[np.uint8], fits: PoseFits) -> NDArray[np.uint8]:

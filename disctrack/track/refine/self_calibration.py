@@ -54,7 +54,6 @@ class AsBuilt:
     size: float = 0.0  # relative, by which dots that are as declared make all lengths longer than the board does
     size_sigma: float = float("nan")  # of the dots as a ruler
     size_share: float = 0.0  # of that, which the rig has been made larger by
-    off_centre: float = 0.0  # [m] by which the pattern may be off the disc's centre, as the table tells
 
     @property
     def details(self) -> dict[str, Any]:
@@ -157,10 +156,13 @@ def pattern_place(disc: Disc, shift: Array, sigma: Array) -> tuple[float, float]
     return variance / m, variance / float(np.sum(_from_middle(disc) ** 2))
 
 
-def by_pattern(as_built: AsBuilt, R: Array) -> Array:
-    """(n, 6, 3) change of poses R (n, 3, 3) whose dots are off as a whole, too, by one sigma of each way of it."""
+def by_pattern(as_built: AsBuilt, R: Array, off_centre: float = 0.0) -> Array:
+    """(n, 6, 3) change of poses R (n, 3, 3) whose dots are off as a whole, too, by one sigma of each way of it.
+
+    off_centre : [m] by which the pattern may be off the disc's centre beside that, as the table tells
+    """
     place, turn = pattern_place(as_built.disc, as_built.marker_shift, as_built.marker_shift_sigma)
-    place += as_built.off_centre**2
+    place += off_centre**2
     return motions_of_pattern(R, as_built.disc) * np.sqrt([place, place, turn])
 
 
