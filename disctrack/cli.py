@@ -19,7 +19,7 @@ from contextlib import contextmanager, suppress
 from types import FrameType
 from warnings import catch_warnings, simplefilter
 
-from disctrack.commands import DONE, FAILED, INCOMPLETE, INTERNAL, INTERRUPTED, USAGE, options
+from disctrack.commands import DONE, FAILED, INCOMPLETE, INTERNAL, USAGE, options
 from disctrack.files.software import __version__
 from disctrack.files.text import printable
 from disctrack.findings import DoubtWarning
@@ -170,7 +170,7 @@ def _parser() -> tuple[argparse.ArgumentParser, dict[str, argparse.ArgumentParse
         prog="disctrack",
         description="Six degrees of freedom of a spinning, rolling disc from two synchronised high-speed cameras.",
         epilog=f"Exit codes: {DONE} done, {FAILED} failed, {USAGE} wrong usage, {INCOMPLETE} done but some input could "
-        f"not be read, {INTERRUPTED} interrupted (143 by SIGTERM, 129 by SIGHUP).",
+        f"not be read, {128 + signal.SIGINT} interrupted (143 by SIGTERM, 129 by SIGHUP).",
     )
     parser.add_argument("--version", action="version", version=f"disctrack {__version__}")
     subparsers = parser.add_subparsers(dest="command", metavar="COMMAND")

@@ -5,4 +5,3 @@ FAILED = 1  # nothing was written; the reason is on stderr
 USAGE = 2  # argparse's own
 INCOMPLETE = 3  # the result is written, but some of the input could not be read
 INTERNAL = 70
-INTERRUPTED = 130

@@ -18,11 +18,10 @@ from calibration.cameras.camera import Camera, StereoRig, placed_at
 from calibration.kit.arrays import Array
 from disctrack.errors import OutputError, RigFileError
 from disctrack.files.inputs import read_regular
-from disctrack.files.toml_tree import toml_value
+from disctrack.files.toml_tree import MOST, toml_value
 from disctrack.files.whole import write_whole
 
 MAX_BYTES = 50_000_000  # mrcal keeps the whole calibration in a camera's file
-MAX_SIDE = 1_000_000  # [px]
 
 
 def rig_of(parts: Sequence[tuple[Camera, Array, Array]], world_is_table: bool) -> StereoRig:
@@ -43,7 +42,7 @@ def camera_of(K: Array, D: Array, size: Array, where: str) -> Camera:
             f"{where}: the camera matrix is {K.tolist()}; expected fx, 0, cx; 0, fy, cy; 0, 0, 1: without skew "
             "(MATLAB keeps it transposed, and R, too)"
         )
-    if not (size >= 1).all() or not (size < MAX_SIDE).all():
+    if not (size >= 1).all() or not (size < MOST).all():
         raise RigFileError(f"{where}: no image size")
     if len(D) > 14 or not np.isfinite(D).all() or np.any(D[5:] != 0):
         raise RigFileError(f"{where}: the lens terms are {D.tolist()}; k1 k2 p1 p2 k3 can be read, and no further")
