@@ -529,13 +529,12 @@ def other_scale(scale: Measured, square: float | None = None, explains: tuple[Ki
     return _contradiction((board, lengths), text, numbers={"scale": scale}, explains=explains)
 
 
-def unseen_dots(trajectory: Trajectory, declared: Disc) -> tuple[Finding, ...]:
+def unseen_dots(trajectory: Trajectory, declared: Disc) -> Iterator[Finding]:
     """Dots that are hardly ever measured: declared in the wrong place, or not as printed."""
     status = trajectory.marker_status[trajectory.measured]
     if not len(status):
-        return ()
+        return
     share = np.mean(status == MarkerStatus.MEASURED, axis=0).max(axis=0)
-    found = []
     rest = replace(declared, marker_centres_body=declared.marker_centres_body[share >= SEEN_RARELY])
     # three dots fit nearly anything; those of a symmetric layout do not tell how far the disc has turned
     spoils = rest.n_markers < 4 or symmetry_order(rest) > symmetry_order(declared)
@@ -549,8 +548,7 @@ def unseen_dots(trajectory: Trajectory, declared: Disc) -> tuple[Finding, ...]:
         )
         severity = Severity.DOUBT if spoils else Severity.WARNING
         remedy = Remedy(f"[markers] centres_mm, entry {dot}", declared=f"[{x:g}, {y:g}]")
-        found.append(Finding(Kind.DOT_UNSEEN, severity, text, Subject(dot=int(dot)), remedies=(remedy,)))
-    return tuple(found)
+        yield Finding(Kind.DOT_UNSEEN, severity, text, Subject(dot=int(dot)), remedies=(remedy,))
 
 
 def turned_board(inner_corners: Sequence[int]) -> tuple[Finding, ...]:

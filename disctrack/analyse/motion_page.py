@@ -6,7 +6,7 @@ energy with a common cursor, and the residuals of the frame under it. The drawin
 
 import base64
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from importlib.resources import files
 from typing import Any
 
@@ -101,7 +101,7 @@ def page_data(analysis: Analysis, drawn: Drawn | None = None) -> dict[str, Any]:
         "residual_px": _plain(residual, 5),
         "residual_reach_px": float(1.2 * np.percentile(finite, 99.5)) if finite.size else 1.0,
         "rms_px": _plain(trajectory.reprojection_rms_px[rows], 5),
-        "pictures": [] if drawn is None else _pictures(rows, drawn),
+        "pictures": [] if drawn is None else list(_pictures(rows, drawn)),
     }
 
 
@@ -121,17 +121,14 @@ def _plain(values: Array, digits: int) -> object:
     return plain(np.round(np.asarray(values, float), digits))
 
 
-def _pictures(rows: NDArray[np.intp], drawn: Drawn) -> list[dict[str, Any]]:
-    found = []
+def _pictures(rows: NDArray[np.intp], drawn: Drawn) -> Iterator[dict[str, Any]]:
     for k in evenly(len(rows), MOST_PICTURES):
         picture = drawn(int(rows[k]))
         scale = min(1.0, 300 / picture.shape[0])
         small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
         good, coded = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 72])
         if good:
-            uri = f"data:image/jpeg;base64,{base64.b64encode(coded.tobytes()).decode()}"
-            found.append({"row": k, "uri": uri})
-    return found
+            yield {"row": k, "uri": f"data:image/jpeg;base64,{base64.b64encode(coded.tobytes()).decode()}"}
 
 
 _STYLE = f"""

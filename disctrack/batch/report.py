@@ -1,6 +1,6 @@
 """A batch as a report: it links the single reports, compares the recordings, and says what is wrong with some."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from urllib.parse import quote
 
@@ -72,15 +72,13 @@ def _verdict(rows: Sequence[Row]) -> str:
     )
 
 
-def _noticed(rows: Sequence[Row]) -> list[Finding]:
+def _noticed(rows: Sequence[Row]) -> Iterator[Finding]:
     """Why recordings have no result, or one that is not all it could be."""
-    found = []
     for row in (row for row in rows if row["reason"]):
         severity = max(Severity.WARNING, Severity[(row["severity"] or "note").upper()])
         severity = Severity.REFUSAL if row["status"] in (FAILED, NOT_MEASURED) else severity
         text = f"{row['recording']} ({row['status']}): {row['reason']}"
-        found.append(Finding(Kind(row["finding"]), severity, text))
-    return found
+        yield Finding(Kind(row["finding"]), severity, text)
 
 
 def _repeats(repeats: Sequence[Row]) -> list[str | Listing]:

@@ -5,7 +5,7 @@ A paragraph is a string, and a list of sentences a list of strings; all else is 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -85,13 +85,11 @@ def is_empty(block: Any) -> bool:
     return all(map(is_empty, content)) if isinstance(block, Section) else not content
 
 
-def figures_in(blocks: Iterable[Any]) -> list[Drawn]:
+def figures_in(blocks: Iterable[Any]) -> Iterator[Drawn]:
     """All figures of the blocks, in their order."""
-    found: list[Drawn] = []
     for block in blocks:
-        found += block.drawn if isinstance(block, Figures) else []
-        found += figures_in(block.blocks) if isinstance(block, Section) else []
-    return found
+        yield from block.drawn if isinstance(block, Figures) else []
+        yield from figures_in(block.blocks) if isinstance(block, Section) else []
 
 
 def document(report: Report) -> dict[str, Any]:

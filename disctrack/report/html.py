@@ -20,7 +20,7 @@ SENTENCE = 48  # characters of a cell from which on it is no number, name or lin
 
 def write_page(path: Path, report: Report, kinds: Sequence[str] = ()) -> list[Path]:
     """Write the page, and of its figures files of these kinds ("png", "pdf"); returns those. Raises OutputError."""
-    drawn = figures_in(report.blocks)
+    drawn = [*figures_in(report.blocks)]
     files: list[Path] = []
     pictures: dict[str, str] = {}
     if drawn:

@@ -4,7 +4,7 @@ import os
 import shutil
 import sys
 import textwrap
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain
 from typing import Any
 
@@ -37,7 +37,7 @@ def full(report: Report, width: int = WIDTH) -> list[str]:
     first = _entry("verdict", report.verdict, width) + _entry("accuracy", report.accuracy, width)
     lines = [report.title, ""] if report.title else []
     lines += _around(first, [_entry(f.grave, f.sentence, width) for f in report.graver_first()], report)
-    lines += _facts(report.facts, width) + _blocks(report.blocks, width)
+    lines += [*_facts(report.facts, width), *_blocks(report.blocks, width)]
     lines += _entry("page", "" if report.page is None else str(report.page), width)
     for i, file in enumerate(report.files):
         lines += _entry("" if i else "files", str(file), width)
@@ -82,24 +82,22 @@ def _wrapped(said: str, width: int, first: str = "", then: str = "") -> list[str
     )  # fmt: skip
 
 
-def _blocks(blocks: Iterable[Any], width: int) -> list[str]:
-    lines: list[str] = []
+def _blocks(blocks: Iterable[Any], width: int) -> Iterator[str]:
     for block in blocks:
         if is_empty(block):
             continue
         if isinstance(block, Section):
-            inner = _blocks(block.blocks, width)
-            lines += ["", block.title, *inner] if inner else []
+            inner = [*_blocks(block.blocks, width)]
+            yield from ["", block.title, *inner] if inner else []
         elif isinstance(block, str):
-            lines += [] if isinstance(block, Markup) else _wrapped(block, width)
+            yield from [] if isinstance(block, Markup) else _wrapped(block, width)
         elif isinstance(block, list):
             for said in block:
-                lines += _wrapped(said, width, "- ", "  ")
+                yield from _wrapped(said, width, "- ", "  ")
         elif isinstance(block, Facts):
-            lines += _facts(block.rows, width)
+            yield from _facts(block.rows, width)
         elif isinstance(block, Listing):
-            lines += _table(block, width)
-    return lines
+            yield from _table(block, width)
 
 
 def _facts(rows: Iterable[tuple[str, Cell]], width: int) -> list[str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
@@ -165,12 +165,11 @@ class ImagePart:
 ImageParts = tuple[ImagePart | None, ...]  # of the left and of the right camera
 
 
-def frames_in_parts(readers: Sequence[FrameReader], parts: ImageParts, where: str) -> list[FrameReader]:
+def frames_in_parts(readers: Sequence[FrameReader], parts: ImageParts, where: str) -> Iterator[FrameReader]:
     """Both cameras' readers, of the declared parts. Raises RecordingError, which begins with `where`, if one is cut."""
-    found: list[FrameReader] = []
     for reader, part in zip(readers, parts, strict=True):
         if part is None:
-            found.append(reader)
+            yield reader
             continue
         width, height = reader.image_size
         if not part.lies_in(width, height):
@@ -179,8 +178,7 @@ def frames_in_parts(readers: Sequence[FrameReader], parts: ImageParts, where: st
                 f"rows {part.y} to {part.y + part.height - 1}, but {reader.describe(0)} has {width} x {height} px. It "
                 "is [x, y, width, height] in pixels, from the upper left corner."
             )
-        found.append(replace(changed(reader, part.of, str(part)), image_size=(part.width, part.height)))
-    return found
+        yield replace(changed(reader, part.of, str(part)), image_size=(part.width, part.height))
 
 
 def in_words(image_size: tuple[int, ...], bit_depth: int) -> str:

@@ -6,7 +6,7 @@ against the file's size before anything is read or made of that size.
 """
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from datetime import datetime, timedelta
 from pathlib import Path
 
@@ -225,7 +225,6 @@ def _header(cine: _Cine, times: Array | None, step: int) -> CameraHeader:
     )
 
 
-def _range_notes(cine: _Cine) -> list[str]:
+def _range_notes(cine: _Cine) -> Iterator[str]:
     if 0 < cine.field("EDRShutterNs") < cine.field("ShutterNs"):
-        return ["bright pixels are compressed (extreme dynamic range): edges of the dots may be biased"]
-    return []
+        yield "bright pixels are compressed (extreme dynamic range): edges of the dots may be biased"

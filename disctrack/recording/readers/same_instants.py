@@ -4,6 +4,8 @@ Their headers, the numbers in their files' names and the time stamps that files 
 be is an error; doubt leads to a warning, with the frames' numbers, and to evenly spaced frames.
 """
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from calibration.kit.arrays import Array
@@ -79,15 +81,14 @@ def _check_instants(left: CameraHeader, right: CameraHeader) -> None:
         )
 
 
-def _doubtful(left: CameraHeader, right: CameraHeader) -> list[str]:
-    found = []
+def _doubtful(left: CameraHeader, right: CameraHeader) -> Iterator[str]:
     if left.trigger != right.trigger:  # equal modes count from the same event; of unequal ones nothing is known
-        found.append(
+        yield (
             f"the cameras were triggered in different modes: left {left.trigger or 'unknown'}, right "
             f"{right.trigger or 'unknown'}. The headers do not say whether frame i of both shows the same instant"
         )
     if left.exposure is not None and right.exposure is not None and _differ(left.exposure, right.exposure):
-        found.append(
+        yield (
             f"the cameras exposed for different times: left {1e6 * left.exposure:g} µs, right "
             f"{1e6 * right.exposure:g} µs. The middles of the exposures lie "
             f"{0.5e6 * abs(left.exposure - right.exposure):g} µs apart if both begin together"
@@ -95,11 +96,10 @@ def _doubtful(left: CameraHeader, right: CameraHeader) -> list[str]:
     if left.recorded is not None and right.recorded is not None:
         apart = abs((left.recorded - right.recorded).total_seconds())
         if apart > SAME_TAKE_S:
-            found.append(
+            yield (
                 f"the headers' dates lie {apart / 60:.0f} minutes apart: left {left.recorded:%Y-%m-%d %H:%M:%S}, right "
                 f"{right.recorded:%Y-%m-%d %H:%M:%S}. Are both files of the same take?"
             )
-    return found
 
 
 def _differ(one: float, other: float) -> bool:
@@ -170,7 +170,7 @@ def check_time_stamps(
     offset = start_offset(ours, theirs) if ours is not None and theirs is not None else None
     if len(usable) == 2 and len(usable[0]) == len(usable[1]) and (ours is None) == (theirs is None):
         theirs_shifted = usable[1] + (0.0 if offset is None else offset[0])
-        slips = _slips(usable[0], theirs_shifted, 1.0 / frame_rate)
+        slips = [*_slips(usable[0], theirs_shifted, 1.0 / frame_rate)]
         doubts += slips
         warnings += [] if slips else _between_cameras(usable[0], theirs_shifted, 1.0 / frame_rate)
     return tuple(doubts), tuple(warnings)
@@ -191,52 +191,47 @@ def _fault(times: Array, frame_rate: float) -> str:
     return ""
 
 
-def _lost_frames(camera: str, times: Array, frame_rate: float) -> list[str]:
+def _lost_frames(camera: str, times: Array, frame_rate: float) -> Iterator[str]:
     steps = np.diff(times) * frame_rate
     gaps = np.flatnonzero(steps > LOST)
-    if not len(gaps):
-        return []
-    lost = int(np.rint(steps[gaps] - 1).sum())
-    return [f"{camera} camera: by its time stamps {lost} frame{'s' * (lost > 1)} missing, after frame {ranges(gaps)}"]
+    if lost := int(np.rint(steps[gaps] - 1).sum()):
+        yield f"{camera} camera: by its time stamps {lost} frame{'s' * (lost > 1)} missing, after frame {ranges(gaps)}"
 
 
-def _slips(left: Array, right: Array, period: float) -> list[str]:
+def _slips(left: Array, right: Array, period: float) -> Iterator[str]:
     """From where on frame i of both cameras is not the same instant, if anywhere."""
     later = right - left
     # against the first frames: what the clocks' zeros differ by is constant, lost frames come on top
     slips = np.rint((later - later[0]) / period).astype(int)
     changes = np.flatnonzero(np.diff(slips)) + 1
     if len(changes):
-        return [
+        yield (
             f"by the time stamps frame i of both cameras does not show the same instant from frame {changes[0]} on: "
             f"one camera lost frames that the other has (the offset changes at frame {ranges(changes)}). Poses from "
             "there on are wrong: take that frame from the other camera, too, or measure up to it with --frames"
-        ]
-    return []
+        )
 
 
-def _between_cameras(left: Array, right: Array, period: float) -> list[str]:
+def _between_cameras(left: Array, right: Array, period: float) -> Iterator[str]:
     """How the right camera's times differ from the left one's: a constant, a drift, the rest."""
     later = right - left
-    warnings = []
     index = np.arange(len(later)) - 0.5 * (len(later) - 1)
     offset = float(np.median(later))
     drift = float(index @ later / max(float(index @ index), 1.0)) / period
     rest = later - later.mean() - drift * period * index
     if abs(offset) > SAME_INSTANT * period:
-        warnings.append(
+        yield (
             f"by the time stamps the right camera's frames are taken {1e6 * offset:.4g} µs after the left one's, "
             f"{abs(offset) / period:.2g} of a frame: the cameras are not synchronised, or their clocks have other zeros"
         )
     if abs(drift) * len(later) > SAME_INSTANT:
-        warnings.append(
+        yield (
             f"by the time stamps the cameras' clocks drift apart by {1e6 * drift:+.3g} µs per second: each camera runs "
             "on a clock of its own"
         )
     worst = int(np.argmax(np.abs(rest)))
     if abs(rest[worst]) > SAME_INSTANT * period:
-        warnings.append(
+        yield (
             f"by the time stamps the instants of the two cameras jitter by {1e6 * float(rest.std()):.3g} µs (rms), "
             f"most at frame {worst}: {1e6 * float(rest[worst]):+.3g} µs"
         )
-    return warnings

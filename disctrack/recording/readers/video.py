@@ -7,7 +7,7 @@ import hashlib
 import os
 import threading
 import zlib
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
@@ -235,17 +235,16 @@ def _opened(file: Path, camera: str) -> InputContainer:
         raise RecordingError(f"{file}: not a readable video for the {camera} camera ({error}).") from error
 
 
-def _gap_doubts(times: NDArray[np.int64]) -> list[str]:
+def _gap_doubts(times: NDArray[np.int64]) -> Iterator[str]:
     """A doubt where the container's clock skips: the recorder lost frames there."""
     steps = np.diff(times)
     if len(steps) < 3:
-        return []
+        return
     typical = float(np.median(steps))
     gaps = np.flatnonzero(steps > 1.5 * typical + 1)
-    if not len(gaps) or len(gaps) > 0.1 * len(steps):
-        return []
-    where, n = ranges(gaps), int(np.rint(steps[gaps] / typical - 1).sum())
-    return [f"the video's clock skips after frame {where}: {n} frame{'s' * (n > 1)} lost, and time shifts there"]
+    if 0 < len(gaps) <= 0.1 * len(steps):
+        where, n = ranges(gaps), int(np.rint(steps[gaps] / typical - 1).sum())
+        yield f"the video's clock skips after frame {where}: {n} frame{'s' * (n > 1)} lost, and time shifts there"
 
 
 def _depth(frame: av.VideoFrame) -> int:
@@ -253,16 +252,15 @@ def _depth(frame: av.VideoFrame) -> int:
     return int(frame.format.components[0].bits)
 
 
-def _format_notes(frame: av.VideoFrame) -> list[str]:
+def _format_notes(frame: av.VideoFrame) -> Iterator[str]:
     """What the user should know of the pixel format."""
-    name, notes = frame.format.name, []
+    name = frame.format.name
     if name.startswith("yuvj") or (name.startswith("yuv") and frame.color_range == 2):
-        notes.append(f"luma of {name} (full range) is used as it is")
+        yield f"luma of {name} (full range) is used as it is"
     elif name.startswith(("yuv", "nv", "p0", "uyvy", "yuyv")):
-        notes.append(f"luma of {name} is used as it is, not stretched: limited range has black at 16 and white at 235")
+        yield f"luma of {name} is used as it is, not stretched: limited range has black at 16 and white at 235"
     if name.startswith(("yuv4", "yuvj4")) and _depth(frame) == 8 and any(_varies(p) for p in frame.planes[1:3]):
-        notes.append("the video has colour: its luma is a mixture of what the sensor measured")
-    return notes
+        yield "the video has colour: its luma is a mixture of what the sensor measured"
 
 
 def _varies(plane: VideoPlane) -> bool:
