@@ -4,8 +4,6 @@ Fields may be bool, int, float, str, tuples, dictionaries by name, and dataclass
 Numbers of a field that is `limited` lie within its limits, all others within +-MOST.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import re

@@ -3,8 +3,6 @@
 Bits lie with the most significant one first.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

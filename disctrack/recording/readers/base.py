@@ -1,7 +1,5 @@
 """What all readers have in common; a format says where a frame lies, and how its bytes become grey values."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace

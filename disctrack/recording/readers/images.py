@@ -3,8 +3,6 @@
 Pages without compression are read at the speed of memory.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import re

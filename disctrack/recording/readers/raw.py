@@ -5,8 +5,6 @@ same copy and its page faults, and a file that is cut short or a network that go
 raising an error.
 """
 
-from __future__ import annotations
-
 import io
 import os
 import threading

@@ -4,8 +4,6 @@ Both take a file at its word. Here nothing is read or made that the file cannot 
 a damaged file makes of it is an error that names the file.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Iterator
 from dataclasses import dataclass
