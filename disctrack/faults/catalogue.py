@@ -1,8 +1,8 @@
 """The faults, one by one: quantities, where a scene holds each, and its words.
 
 An entry says in `key` which of a scene's `Faults` its numbers are; where that is not all, in `to_key`, `from_key` how a
-scene states them, and in `along` what they do to the dots. Candidates of the diagnosis, scenes, saved models and
-planted faults are made from these entries; what a user sees of each, and does about it, stands in docs/faults.md.
+scene states them, and in `along` what they do to the dots. Candidates of the diagnosis, scenes, saved models,
+planted faults and the page of faults are made from these entries.
 
 Quantities are addressed by name, as parameters of the effects of the motion are: "right_turned.rotation_x". Null is
 always zero: as calibrated, as declared.
@@ -49,6 +49,10 @@ class Fault:
     along: Callable[["Fault", str, Sight], Array] | None = None  # the column of a part; None: by difference
     to_key: Callable[[Array, Any, float], Any] | None = None  # numbers, the key so far, declared rate [Hz] -> the key
     from_key: Callable[[Any, float], Any] | None = None
+    each: str = ""  # "camera": either camera has its own; "dot": each dot; the title has a gap for it
+    seen: str = ""  # what a user notices
+    remedy: str = ""
+    declared: str = ""  # the key of recording.toml that would explain it
     named_by: tuple[Kind, ...] = ()  # findings of a run that are about it; none: it does not show in one
 
     def names(self) -> tuple[str, ...]:
@@ -128,56 +132,82 @@ def _row(dot: int, rows: tuple[Any, ...], rate: float) -> tuple[float, ...]:
 
 
 _KNOCK = "mount, cable, knock"
-FAULTS = (  # with a gap in the title: of either camera, of each dot
+_MISSED, _AGAIN = "the cameras contradict each other on the same dots, throughout", "calibrate again where you record"
+FAULTS = (
     Fault("time_offset", "the right camera exposes later than the left", "synchronisation of the cameras",
           ("delay",), "s", 1e-5, "right minus left", "right_delay_s", bounds=(-0.05, 0.05),
+          seen="the dots of the two cameras contradict each other, the more the faster the disc is",
+          remedy="check the trigger; renumber the images of the camera that is ahead by whole frames",
           named_by=(Kind.DELAY, Kind.DROPPED_FRAMES)),
     Fault("frame_rate", "the true frame rate differs from the declared one", "clock of the cameras",
           ("change",), "1", 1e-4, "true over declared minus one", "frame_rate_hz", bounds=(-0.6, 1.2),
           of_poses_alone=False,
           to_key=lambda v, _, rate: float(rate * (1.0 + v[0])) if v[0] else 0.0,
           from_key=lambda x, rate: x / rate - 1.0 if x else 0.0,
+          seen="the balance of moments gives another gravity: g goes as the square of the rate",
+          remedy="declare the rate that the camera's software states", declared="[cameras] frame_rate_hz",
           named_by=(Kind.GRAVITY_OR_RATE,)),
     Fault("clock_drift", "the clock of the cameras changes its rate", "oscillator that warms, trigger that slows down",
           ("growth",), "1/s", 1e-4, "of the time between frames, relative, per second", "frame_interval_growth",
-          bounds=(-0.5, 0.5), of_poses_alone=False),
+          bounds=(-0.5, 0.5), of_poses_alone=False, seen="gravity seems to change slowly",
+          remedy="trigger by a quartz; let the cameras warm up"),
     Fault("turned", "the {} camera turned after its calibration", _KNOCK, ("rotation_x", "rotation_y", "rotation_z"),
-          "rad", 1e-5, "in its own axes", "rotation_deg", _DEG, bounds=(-0.06, 0.06), named_by=MOVED),
+          "rad", 1e-5, "in its own axes", "rotation_deg", _DEG, bounds=(-0.06, 0.06), each="camera",
+          seen=_MISSED, remedy=_AGAIN, named_by=MOVED),
     Fault("shifted", "the {} camera moved after its calibration", _KNOCK,
           ("translation_x", "translation_y", "translation_z"), "m", 1e-5, "in its own axes", "translation_mm",
-          1e3, bounds=(-0.01, 0.01), named_by=MOVED),
+          1e3, bounds=(-0.01, 0.01), each="camera",
+          seen=_MISSED, remedy=_AGAIN, named_by=MOVED),
     Fault("focal", "the focal length of the {} camera changed", "focus, temperature", ("change",), "1", 1e-5,
-          "relative", "focal_scale", null=1.0, bounds=(-0.05, 0.05), named_by=MOVED),
+          "relative", "focal_scale", null=1.0, bounds=(-0.05, 0.05), each="camera",
+          seen=_MISSED, remedy=_AGAIN, named_by=MOVED),
     Fault("principal_point", "the principal point of the {} camera moved", "lens not fixed", ("x", "y"), "px", 0.01,
-          "in the image", "principal_point_change_px", bounds=(-5.0, 5.0), named_by=MOVED),
+          "in the image", "principal_point_change_px", bounds=(-5.0, 5.0), each="camera",
+          seen=_MISSED, remedy=_AGAIN, named_by=MOVED),
     Fault("distortion", "the distortion of the {} camera changed", "focus, aperture, other lens", ("k1",), "1", 1e-3,
-          "change of Brown's k1", "k1_change", bounds=(-1.0, 1.0), named_by=MOVED),
+          "change of Brown's k1", "k1_change", bounds=(-1.0, 1.0), each="camera",
+          seen=_MISSED, remedy=_AGAIN, named_by=MOVED),
     Fault("misprint", "dot {} is not where it was declared", "printing", ("x", "y"), "m", 1e-6, "body axes",
-          "misprint_mm", belongs_to=("disc",), along=_of_one_dot, named_by=(Kind.DOTS_MISPLACED, Kind.DOT_UNSEEN)),
+          "misprint_mm", belongs_to=("disc",), along=_of_one_dot, each="dot",
+          seen="one dot misses its place in every frame", remedy="measure it on the sheet",
+          declared="[markers] centres_mm", named_by=(Kind.DOTS_MISPLACED, Kind.DOT_UNSEEN)),
     Fault("pattern_offset", "the dots as a whole are off the disc's centre", "gluing of the paper", ("x", "y"), "m",
           1e-6, "body axes", "pattern_offset_mm", 1e3, belongs_to=("disc",),
+          seen="the centre circles about another point once a turn of the spin",
+          remedy="centre the sheet, or measure by how much it is off", declared="[markers] centres_mm",
           named_by=(Kind.DOTS_MISPLACED, Kind.TABLE_DISAGREES)),
     Fault("pattern_rotation", "the dots as a whole are turned on the face",
           "gluing; the same as another spin angle", ("angle",), "rad", 1e-5, "about e3", "pattern_turn_deg",
-          _DEG, belongs_to=("disc",)),  # which nothing shows: it is where phi is counted from
+          _DEG, belongs_to=("disc",), seen="nothing: it is where phi is counted from"),
     Fault("pattern_scale", "the dots as a whole are printed too large", "printer", ("change",), "1", 1e-5, "relative",
-          "pattern_scale", null=1.0, belongs_to=("disc",), named_by=(Kind.SQUARE, Kind.DOTS_MISPLACED)),
+          "pattern_scale", null=1.0, belongs_to=("disc",),
+          seen="dots and chessboard contradict each other in their scale",
+          remedy="measure the printed sheet with a caliper", declared="[markers] centres_mm",
+          named_by=(Kind.SQUARE, Kind.DOTS_MISPLACED)),
     Fault("pattern_height", "the dots lie higher than half the thickness", "paper, glue, thickness", ("offset",), "m",
-          1e-6, "along e3", "pattern_height_mm", 1e3, belongs_to=("disc",), named_by=HEIGHT),
+          1e-6, "along e3", "pattern_height_mm", 1e3, belongs_to=("disc",),
+          seen="the disc's lowest point lies off the table",
+          remedy="measure the thickness with its paper", declared="[disc] thickness_mm", named_by=HEIGHT),
     Fault("table_plane", "the table is not parallel to the calibration's table view", "board on a burr",
           ("tilt_x", "tilt_y"), "rad", 1e-5, "turn of the true table, calibrated axes", "table_turn_deg",
-          _DEG, named_by=(Kind.TABLE_VIEW, *HEIGHT)),
+          _DEG, seen="the disc's lowest point rises towards one side",
+          remedy="lay the board flat, and take the table view again", declared="[table] view",
+          named_by=(Kind.TABLE_VIEW, *HEIGHT)),
     Fault("table_height", "the table is not where the calibration's table view says", "thickness of the board",
           ("offset",), "m", 1e-6, "true height of the table in the calibrated axes", "table_height_mm", 1e3,
-          named_by=HEIGHT),
+          seen="the disc's lowest point lies off the table", remedy="measure the board's thickness",
+          declared="[table] board_thickness_mm", named_by=HEIGHT),
     Fault("exposure_blur", "dots are averaged over an exposure", "centre moves by T^2/24 times its acceleration",
           ("T2",), "s^2", 1e-7, "square of the exposure", "exposure_s", bounds=(0.0, 1e-3), in_images=True,
           of_poses_alone=False, along=_blurred, to_key=lambda v, *_: float(np.sqrt(max(v[0], 0.0))),
-          from_key=lambda x, _: x**2, named_by=(Kind.EXPOSURE,)),
+          from_key=lambda x, _: x**2, seen="dots smeared along their way, nutation too small",
+          remedy="declare the exposure, or expose for a shorter time", declared="[cameras] exposure_us",
+          named_by=(Kind.EXPOSURE,)),
     Fault("ellipse_centre", "centres of ellipses were taken for images of the centres", "perspective of circles",
           ("share",), "1", 0.1, "1: not corrected at all, -1: corrected twice", "ellipse_centre_share",
           bounds=(-2.0, 2.0), in_images=True,
-          along=lambda _, part, sight: ellipse_centre_shift(sight.R[0], sight.t[0], sight.rig, sight.disc)),
+          along=lambda _, part, sight: ellipse_centre_shift(sight.R[0], sight.t[0], sight.rig, sight.disc),
+          seen="dots of another program lie off", remedy="correct its centres, or measure with disctrack"),
 )  # fmt: skip
 
 
@@ -193,11 +223,11 @@ def _faults_of(n_markers: int) -> tuple[Fault, ...]:
 
 def _each(fault: Fault, n_markers: int) -> Iterator[Fault]:
     """A fault of a camera, or of a dot, for each of them; any other as it is."""
-    if "{} camera" in fault.title:
+    if fault.each == "camera":
         for camera in CAMERAS:
             name, title, key = f"{camera}_{fault.name}", fault.title.format(camera), f"{camera}.{fault.key}"
             yield replace(fault, name=name, title=title, key=key)
-    elif "{}" in fault.title:
+    elif fault.each == "dot":
         for i in range(n_markers):
             one = replace(fault, name=f"{fault.name}_{i}", title=fault.title.format(i))
             yield replace(one, to_key=partial(_with_row, i, n_markers), from_key=partial(_row, i))
