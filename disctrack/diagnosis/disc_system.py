@@ -11,7 +11,6 @@ import numpy as np
 from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
 from calibration.kit.arrays import Array
-from calibration.kit.least_squares import triangle
 from disctrack.diagnosis.missing_force import DiscScan, law_of, responding
 from disctrack.diagnosis.motion import (
     SLIP,
@@ -40,7 +39,6 @@ from disctrack.track.refine.table_contact import thickness_tolerance
 from disctrack.trajectory import MarkerStatus, Trajectory
 
 RTOL = 1e-10  # of the integration: a millionth of the noise
-MIN_NUISANCE = 0.1  # a direction of the rig's covariance that moves all dots together by less than this many sigmas
 MAX_SWITCHES = (50, 200)  # and per second: slip at every extremum of a nutation of 30 Hz has 120; more is chatter
 # slip that hardly exceeds friction creeps: it follows within v / (3 mu g), and a step has to be as short
 TRIAL_SLIP_STEPS = 1_000  # for every frame, in a fit that is one trial among many; where slip is true, hundreds
@@ -151,12 +149,7 @@ class DiscSystem(LawSystem):
         safe = np.where(spread > 0, spread, 1.0)
         eigenvalues, vectors = np.linalg.eigh(self.rig.covariance / np.outer(safe, safe))
         root = spread[:, None] * vectors * np.sqrt(np.maximum(eigenvalues, 0.0))
-        shift = (self._whiten @ by_rig).reshape(n, -1, root.shape[0]) @ root
-        _, singular, V = np.linalg.svd(triangle(shift.reshape(-1, root.shape[1])))
-        self.rig_directions = np.asarray(
-            V[singular > MIN_NUISANCE], float
-        )  # by columns of `root`, the same for one rig
-        rig = shift @ self.rig_directions.T
+        rig = (self._whiten @ by_rig).reshape(n, -1, root.shape[0]) @ root
         along = np.einsum("ncmap,cnpb->ncmab", by_point, R[..., :2])  # by the dots' places on the face
         m, sizes = self.disc.n_markers, self.systematic
         dots = (self._whiten @ along)[:, :, :, :, None, :] * np.eye(m)[None, None, :, None, :, None]

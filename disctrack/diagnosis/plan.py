@@ -118,11 +118,8 @@ class Planner:
         self.tested = tuple(new.values())
         fitted = [q for q in fit.quantities if not q.is_initial and q.name not in new]
         self._shared = [q for q in fitted if q.belongs_to]
-        n_rig = system.rig_directions.shape[1]
-        laws = [q for q in self._shared if not q.name.startswith("rig.")]
-        # directions of the rig in common, laws and dots, what is tested
-        names = [f"rig.common_{j}" for j in range(n_rig)] + [q.name for q in (*laws, *self.tested)]
-        spread = [1.0] * n_rig + [q.prior_sigma for q in laws] + [np.inf] * len(self.tested)
+        names = [q.name for q in (*self._shared, *self.tested)]
+        spread = [q.prior_sigma for q in self._shared] + [np.inf] * len(self.tested)
         self._priors = np.diag(1.0 / np.array(spread))
         self.column = {name: j for j, name in enumerate(names)}
         self._base = [j for j, name in enumerate(names) if name not in new]
@@ -180,9 +177,7 @@ class Planner:
             raise AnalysisError("the motion cannot be followed")
         mixing = np.zeros((len(names), len(self.column)))
         for row, name in enumerate(names):
-            if name.startswith("rig."):
-                mixing[row, : system.rig_directions.shape[1]] = system.rig_directions[int(name[4:])]
-            elif name in self.column:
+            if name in self.column:
                 mixing[row, self.column[name]] = 1.0
         return np.asarray(triangle(reduced[1] @ mixing) / np.sqrt(self._noise), float)
 

@@ -259,7 +259,7 @@ def find_systematic(system: DiscSystem, known: Values | None = None, beside: Seq
     typical = {fault.name: TYPICAL_STEPS * fault.step for fault in system.faults}
     faults = {name: columns_by(quantities) for name, quantities in of_poses.items()}
     faults = {name: columns for name, columns in faults.items() if np.linalg.norm(columns) * typical[name] > 3.0}
-    groups = {"rig": columns_by([f"rig.{i}" for i in range(len(system.rig_directions))]), **faults}
+    groups = {"rig": columns_by([q.name for q in system.base if q.owner == "rig"]), **faults}
     groups["print"] = columns_by([f"dot_{i}.{axis}" for i in range(system.disc.n_markers) for axis in "xy"])
     groups["dot"] = field(DOT_LENGTH * extent, own=True)
     steps: Array = size / view.per_px * 2.0 ** np.arange(-7, 4.5, 1.0)

@@ -69,7 +69,7 @@ def _plan(answer: TogetherDiagnosis, crew: Crew) -> Plan | None:
         return None
     tested = [q for question in questions for c in question for q in c.quantities]
     everything = {q.name: q for q in (*tested, *after.quantities)}
-    names = {there: shared for there, shared in sharing.shared_names(longest).items() if shared in everything}
+    names = {there: shared for shared, there in sharing.local[longest].items() if shared in everything}
     others = [n for n in everything if n not in set(names.values())]
     values = {n: q.null for n, q in everything.items()} | after.values
     _, derivative = system.linearise(values, [*others, *names.values()])
@@ -183,14 +183,11 @@ class DiscMember:
 
     def _member(self) -> Member:
         system, disc = self.system, self.system.disc
-        common = [f"rig.common_{j}" for j in range(system.rig_directions.shape[1])]
-        rows = enumerate(system.rig_directions.tolist())
-        known = {q.name: q for q in system.base}
         return Member(
             self.name,
             system.base,
             system.candidates,
-            {n: v for n, v in self.base.values.items() if n in known},
+            self.base.values,
             int(np.sum(system.weights)),
             self.labels,
             covariates={
@@ -199,8 +196,6 @@ class DiscMember:
                 "thickness": 2 * disc.half_thickness,
                 "density of the air": _density(system.trajectory),
             },
-            links={f"rig.{i}": dict(zip(common, row, strict=True)) for i, row in rows},
-            linked={name: replace(known["rig.0"], name=name) for name in common if "rig.0" in known},
         )
 
 

@@ -29,9 +29,6 @@ class Member:
     n_data: int
     labels: Mapping[str, str]  # "disc", "surface", "rig", "air" -> which one it was
     covariates: Mapping[str, float] = field(default_factory=dict)  # declared: "mass", "radius", ... in SI
-    # Base quantities that are sums of common ones, e.g. of directions in which a rig may err: name -> common -> factor
-    links: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
-    linked: Mapping[str, Quantity] = field(default_factory=dict)  # the common ones
 
 
 class Sharing:
@@ -45,7 +42,8 @@ class Sharing:
         self._nulls: dict[str, float] = {}
         self._own: list[list[Quantity]] = [[] for _ in members]
         self._local_nulls: list[dict[str, float]] = [{} for _ in members]
-        self._terms: list[dict[str, dict[str, float]]] = [{} for _ in members]
+        # of each member: what it shares -> its own quantity, which is off its null by the sum of what these are off
+        self.local: list[dict[str, str]] = [{} for _ in members]
         for i, member in enumerate(members):
             for q in member.base:
                 self._base_quantity(i, q)
@@ -72,11 +70,8 @@ class Sharing:
 
     def _by_group(self, local: str, of_members: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
         """What is the same in all members of each group of a quantity: name -> one for each group."""
-        each = list(zip(of_members, self._terms, strict=True))
-        groups = [
-            [known for known, terms in each if shared in terms.get(local, ())]
-            for shared in self._groups[local].values()
-        ]
+        each = list(zip(of_members, self.local, strict=True))
+        groups = [[known for known, parts in each if shared in parts] for shared in self._groups[local].values()]
         found = {}
         for name in dict.fromkeys(name for group in groups for known in group for name in known):
             found_in = [{known.get(name) for known in group} for group in groups]
@@ -98,28 +93,21 @@ class Sharing:
 
     def _base_quantity(self, i: int, q: Quantity) -> None:
         member = self.members[i]
-        links = member.links.get(q.name)
         if not q.belongs_to or (is_linear(q) and self._alone(member, q)):
             self._own[i].append(q)
-        elif links is not None:
-            for stem, factor in links.items():
-                common = member.linked[stem]
-                self._share(i, q, replace(common, name=_named(stem, self.group(member, common))), factor)
-        else:
-            group = self.group(member, q)
-            shared = replace(q, name=_named(q.name, group))
-            self._share(i, q, shared, 1.0)
-            if not np.isfinite(q.prior_sigma):
-                self._groups.setdefault(q.name, {})[group] = shared.name
+            return
+        group = self.group(member, q)
+        shared = self._share(i, q, group)
+        self.base.setdefault(shared.name, shared)
+        if not np.isfinite(q.prior_sigma):
+            self._groups.setdefault(q.name, {})[group] = shared.name
 
-    def _share(self, i: int, local: Quantity, shared: Quantity, factor: float, base: bool = True) -> Quantity:
+    def _share(self, i: int, local: Quantity, group: str) -> Quantity:
         # among many recordings none of the shared ones is taken out beforehand: their rows are no longer those of data
-        shared = replace(shared, linear=False)
-        if base:
-            self.base.setdefault(shared.name, shared)
+        shared = replace(local, name=f"{local.name}[{group}]" if group else local.name, linear=False)
         self._nulls[shared.name] = shared.null
         self._local_nulls[i][local.name] = local.null
-        self._terms[i].setdefault(local.name, {})[shared.name] = factor
+        self.local[i][shared.name] = local.name
         return shared
 
     def _all_candidates(self) -> tuple[Candidate, ...]:
@@ -140,7 +128,7 @@ class Sharing:
         if one_for_all:
             for i, c in having.items():
                 for q in c.quantities:
-                    self._share(i, q, q, 1.0, base=False)
+                    self._share(i, q, "")
             quantities = tuple(replace(q, linear=False) for q in first.quantities)
             title = first.title + (", one value for all" if len(groups) > 1 else "")
             variants.append(replace(first, quantities=quantities, title=title))
@@ -149,9 +137,9 @@ class Sharing:
             for i, c in having.items():
                 for q in c.quantities:
                     group = self.group(self.members[i], q)
-                    name = _named(q.name, group)
-                    new[name] = self._share(i, q, replace(q, name=name), 1.0, base=False)
-                    self._groups.setdefault(q.name, {})[group] = name
+                    shared = self._share(i, q, group)
+                    new[shared.name] = shared
+                    self._groups.setdefault(q.name, {})[group] = shared.name
             name = f"{first.name} ({EACH})" if one_for_all else first.name
             title = f"{first.title}, with a value for each group" if one_for_all else first.title
             start = first.start * len(groups)
@@ -160,51 +148,25 @@ class Sharing:
 
     def local_names(self, i: int, names: Sequence[str]) -> tuple[str, ...]:
         """The member's quantities that these shared ones are part of."""
-        wanted = set(names)
-        return tuple(local for local, terms in self._terms[i].items() if wanted & terms.keys())
+        return tuple(dict.fromkeys(self.local[i][name] for name in names if name in self.local[i]))
 
     def local_values(self, i: int, shared: Values) -> dict[str, float]:
         """The member's shared quantities, those at null among them only where the base has them."""
-        values = {}
-        for local, terms in self._terms[i].items():
-            amount = sum(f * (shared[n] - self._nulls[n]) for n, f in terms.items() if n in shared)
-            if amount or any(n in self.base for n in terms):
-                values[local] = self._local_nulls[i][local] + amount
+        values: dict[str, float] = {}
+        for name, local in self.local[i].items():
+            away = shared.get(name, self._nulls[name]) - self._nulls[name]
+            if away or name in self.base:
+                values[local] = values.get(local, self._local_nulls[i][local]) + away
         return values
 
-    def shared_names(self, i: int) -> dict[str, str]:
-        """The member's quantities that are shared as they are, and its rig's common ones: name there -> shared name."""
-        member = self.members[i]
-        found = {stem: _named(stem, self.group(member, q)) for stem, q in member.linked.items()}
-        for local, terms in self._terms[i].items():
-            same = [n for n, factor in terms.items() if factor == 1.0]
-            if local not in member.links and same:
-                found[local] = same[0]
-        return found
-
-    def mixing(self, i: int, local: Sequence[str], names: Sequence[str]) -> np.ndarray:
-        """(local, names) derivative of the member's quantities by the shared ones."""
-        column = {n: j for j, n in enumerate(names)}
-        matrix = np.zeros((len(local), len(names)))
-        for row, name in enumerate(local):
-            for shared, factor in self._terms[i][name].items():
-                if shared in column:
-                    matrix[row, column[shared]] = factor
-        return matrix
-
     def start(self) -> dict[str, float]:
-        """Shared base quantities: the median of what their recordings give alone; linked ones at null."""
-        found: dict[str, list[float]] = {}
-        for member, terms in zip(self.members, self._terms, strict=True):
-            for local, shared in terms.items():
-                if local in member.start and local not in member.links:
-                    for name in shared:
-                        found.setdefault(name, []).append(member.start[local])
-        return {n: float(np.median(found[n])) if n in found else q.null for n, q in self.base.items()}
-
-
-def _named(name: str, group: str) -> str:
-    return f"{name}[{group}]" if group else name
+        """Shared base quantities: the median of what their recordings give alone."""
+        found: dict[str, list[float]] = {name: [] for name in self.base}
+        for member, parts in zip(self.members, self.local, strict=True):
+            for name, local in parts.items():
+                if name in found:
+                    found[name].append(member.start[local])
+        return {name: float(np.median(alone)) for name, alone in found.items()}
 
 
 class JointSystem(System):
@@ -231,5 +193,7 @@ class JointSystem(System):
         for i, (right, matrix) in reduced.items():
             residual[i] = 0.0
             residual[i, : len(right)] = right
-            derivative[i, : len(right)] = matrix @ sharing.mixing(i, local[i], names)
+            for column, name in enumerate(names):
+                if name in sharing.local[i]:
+                    derivative[i, : len(right), column] = matrix[:, local[i].index(sharing.local[i][name])]
         return residual, derivative
