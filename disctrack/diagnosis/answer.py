@@ -6,12 +6,11 @@ from dataclasses import dataclass, field
 from calibration.kit.brief import Brief
 from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.diagnosis.errors import LEVEL, Errors, LeftOver, Span
-from disctrack.diagnosis.law_library import locked
+from disctrack.diagnosis.law_library import LearnedLaw, locked
 from disctrack.diagnosis.missing_force import Course
 from disctrack.diagnosis.plan import Plan
 from disctrack.diagnosis.systematic import Systematic
 from disctrack.discrepancy.fit import Fit
-from disctrack.discrepancy.laws import LearnedLaw
 from disctrack.discrepancy.search import Diagnosis, Found
 from disctrack.discrepancy.words import effect_text
 from disctrack.numbers import Measured, probability, rounded

@@ -11,7 +11,8 @@ import numpy as np
 from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
 from calibration.kit.arrays import Array
-from disctrack.diagnosis.missing_force import DiscScan, law_of, responding
+from disctrack.diagnosis.law_library import LearnedLaw
+from disctrack.diagnosis.missing_force import DiscScan, responding
 from disctrack.diagnosis.motion import (
     SLIP,
     SLIP_VELOCITY,
@@ -27,8 +28,7 @@ from disctrack.diagnosis.starts import STRETCHES, sought, start_values
 from disctrack.diagnosis.stretch import free_stretch
 from disctrack.diagnosis.systematic import DOT_SIGMA, Systematic, field_columns
 from disctrack.discrepancy.fit import Fit
-from disctrack.discrepancy.laws import Family, LawSystem, LearnedLaw
-from disctrack.discrepancy.system import Budget, Candidate, Quantity, Values
+from disctrack.discrepancy.system import Budget, Candidate, Quantity, System, Values
 from disctrack.faults.catalogue import faults_of, scene_faults
 from disctrack.faults.dots import Sight, predict
 from disctrack.frames import euler_jacobian, euler_rate_axes_world, rotation_from_euler
@@ -52,8 +52,10 @@ SLIP_STARTS = (0.9, 0.7, 0.5)  # of the friction that rolling needs at most
 Path = tuple[Array, Array]  # q and qdot of the disc as each camera meets it, both (2, n, 6)
 
 
-class DiscSystem(LawSystem):
+class DiscSystem(System):
     """Dots of a rolling disc in two cameras; samples are frames, a row holds the whitened numbers of all dots."""
+
+    frees_shapes = True
 
     def __init__(
         self,
@@ -232,16 +234,16 @@ class DiscSystem(LawSystem):
         return float(1.0 / np.median(np.diff(self.time)))
 
     def scan(self, fitted: Fit, beside: Sequence[Quantity] | None = None) -> DiscScan | None:
-        """See LawSystem; None where the disc slips."""
+        """Answers to laws along the fitted motion; None where the disc slips.
+
+        beside : quantities to be fitted beside a law, if not those of the fit. What the others do is given back to the
+        residual to first order: so a law is looked for in their place, along a motion that follows the data.
+        """
         along = responding(self, fitted)
         return None if along is None else DiscScan(self, fitted, beside, along)
 
-    def law(self, families: Sequence[Family], values: Array) -> LearnedLaw:
-        """See LawSystem."""
-        return law_of(self.model, families, values)
-
     def knowing(self, law: LearnedLaw) -> DiscSystem:
-        """See LawSystem."""
+        """The same system, in whose values numbers of this law may be named."""
         known = copy(self)
         known.model = self.model.knowing(law.effect)
         return known

@@ -22,11 +22,12 @@ from scipy.linalg import solve_triangular
 from calibration.kit.arrays import Array
 from calibration.kit.least_squares import triangle
 from disctrack.diagnosis.disc_system import DiscSystem
+from disctrack.diagnosis.law_library import LearnedLaw
 from disctrack.diagnosis.missing_force import WIDTH, Course, Probed, probe
 from disctrack.diagnosis.motion import THETA_END, state_of
 from disctrack.discrepancy.fit import Fit
-from disctrack.discrepancy.laws import LearnedLaw, evidence
 from disctrack.discrepancy.score import DEPENDENT, cleared, span
+from disctrack.discrepancy.significance import evidence
 from disctrack.discrepancy.system import Values
 from disctrack.rolling import Motion, simulate
 from disctrack.rolling.model import body_constants

@@ -5,19 +5,91 @@ records.KINEMATICS and gets a coefficient of its own. Numbers in braces are the 
 fast something hums): a grid of them is looked over, and the best is fitted along with the coefficients.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from itertools import chain, product
+from typing import Any
 
 import numpy as np
 
 from calibration.kit.arrays import Array
 from disctrack.disc import Disc
-from disctrack.discrepancy.laws import Family, LearnedLaw, Parts
+from disctrack.discrepancy.fit import Fit
+from disctrack.discrepancy.significance import as_sigmas, wald
+from disctrack.discrepancy.system import Candidate, Values
 
+MIN_SIGMAS = 3.0  # of a coefficient after the refit; what helped to first order may not help the motion
+WIDTHS = ("width", "softness", "length", "lasting")  # shapes that go with the amount
 HIGHEST_HARMONIC = 4  # of the angles
 DRIFT_DEGREE = 4  # of the polynomials in time
 FASTEST_HUM = 150.0  # [Hz]
 MOMENTS = ("n", "m", "z")
+
+Parts = Mapping[str, str]  # component of the force -> formula
+
+
+@dataclass(frozen=True)
+class Family:
+    """Terms that belong together, each with a coefficient of its own."""
+
+    title: str
+    terms: tuple[Parts, ...]
+    shape: Mapping[str, float] = field(default_factory=dict)  # numbers in braces, fitted along with the coefficients
+    kind: str = "moment"  # families of one kind are variations of one idea
+    names: tuple[str, ...] = ()  # of the coefficients, where they mean something by themselves
+
+    @property
+    def n_numbers(self) -> int:
+        """Numbers that a fit would move."""
+        return len(self.terms) + len(self.shape)
+
+    def formulas(self) -> tuple[Parts, ...]:
+        """The terms with the shape's numbers in place."""
+        numbers = {k: f"({v!r})" for k, v in self.shape.items()}
+        return tuple({c: f.format(**numbers) for c, f in parts.items()} for parts in self.terms)
+
+
+@dataclass(frozen=True)
+class LearnedLaw:
+    """Families of terms that describe what is missing."""
+
+    candidate: Candidate
+    effect: Any  # what the system has to know to predict with it
+    families: tuple[Family, ...]
+    amounts: tuple[tuple[str, ...], ...] = ()  # names of each family's coefficients ...
+    shapes: tuple[tuple[str, ...], ...] = ()  # ... and of the numbers of its shape
+    values: Values = field(default_factory=dict)  # of everything, where its fit ended
+    alike: tuple[str, ...] = ()  # other laws that describe the data as well
+    others: tuple[tuple[LearnedLaw, float], ...] = ()  # laws that fit as well, however long, with their odds
+    looked: float = 0.0  # chi-square that each family pays for having been looked for among so many
+
+    @property
+    def title(self) -> str:
+        """What the law means, in words."""
+        return "; and ".join(family.title for family in self.families)
+
+    def stands_out(self, fitted: Fit) -> bool:
+        """Do the coefficients of each of its families differ from zero, in a fit whose sigmas hold all doubts?"""
+        return all(differ_from_zero(*fitted.amounts(names)) for names in self.amounts)
+
+    @property
+    def widths(self) -> set[str]:
+        """Numbers of the shapes that go with an amount: along their profiles only are they found."""
+        pairs = zip(self.families, self.shapes, strict=True)
+        return {name for family, names in pairs for key, name in zip(family.shape, names, strict=True) if key in WIDTHS}
+
+    @property
+    def formulas(self) -> dict[str, str]:
+        """Component of the force -> formula."""
+        return dict(self.effect.formulas or {})
+
+
+def differ_from_zero(amounts: Array, covariance: Array) -> bool:
+    """Do amounts (k,) with this covariance (k, k), together?"""
+    return as_sigmas(wald(amounts, covariance), len(amounts)) > MIN_SIGMAS
+
 
 # Of the motion's own numbers: (words, formula).
 SCALARS = (

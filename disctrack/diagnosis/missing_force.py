@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 
 from calibration.kit.arrays import Array
 from calibration.kit.least_squares import triangle
-from disctrack.diagnosis.law_library import SHAPES, families
+from disctrack.diagnosis.law_library import MIN_SIGMAS, SHAPES, Family, LearnedLaw, families
 from disctrack.diagnosis.motion import STATE_SCALES, THETA_END, state_of
 from disctrack.discrepancy.elimination import is_linear, prior_rows, projection
 from disctrack.discrepancy.fit import Fit
-from disctrack.discrepancy.laws import MIN_SIGMAS, Family, Gain, LearnedLaw, evidence, proposal
 from disctrack.discrepancy.score import cleared, span
+from disctrack.discrepancy.significance import evidence
 from disctrack.discrepancy.system import Candidate, Quantity, Values
 from disctrack.rolling import EffectParameter, Model, Motion
 from disctrack.rolling.effects.learned import effect_from_formulas
@@ -35,6 +35,7 @@ MAX_PROBES = 90
 WIDTH = 0.7  # of a probe over the distance to the next: their sum is flat to 1e-4
 TELLING = 0.3  # share of chi-square to first order, from which on it is said what the missing moment goes with
 INSTANTS_PER_SECOND = 1000.0  # of the responses: Simpson's rule errs by 0.4 % of a hum of 150 Hz
+INVISIBLE = 1e-8  # share of a column's power left after clearing, below which the data do not show it
 CHUNK = 120  # families of the library that are asked for at a time
 
 
@@ -151,13 +152,35 @@ def probe(system: DiscSystem, fit_: Fit, other: Values | None = None) -> Probed 
     return Probed(data, prior, len(fit_.names), middles, span / k)
 
 
+@dataclass(frozen=True)
+class Gain:
+    """What a family gains to first order."""
+
+    family: Family
+    gain: float  # decrease of chi-square
+    values: Array  # coefficients of its terms
+
+
+def proposal(family: Family, gram: Array, before: Array, right: Array) -> Gain:
+    """Gain and values from the normal equations of one family; directions that nothing shows count for nothing.
+
+    before : (k,) squares of its columns as they were before what is fitted was cleared out
+    """
+    size = np.sqrt(np.maximum(before, 1e-300))
+    eigenvalues, vectors = np.linalg.eigh(gram / np.outer(size, size))
+    seen = eigenvalues > INVISIBLE
+    along = vectors[:, seen].T @ (right / size)
+    values = vectors[:, seen] @ (along / eigenvalues[seen]) / size
+    return Gain(family, float(np.sum(along**2 / eigenvalues[seen])), values)
+
+
 class DiscScan:
     """Gains of families at one fit. All that is asked of a frame's dots is compressed to the eight numbers of a state.
 
     A column of the least-squares problem is D g: D (n, w, 8) by the initial state, g (n, 8) the response. Inner
     products of columns, cleared of what the fitted quantities W absorb, are sums over g' (D' D) g less those of W' D g.
 
-    beside : as of `LawSystem.scan`
+    beside : as of `DiscSystem.scan`
     """
 
     def __init__(self, system: DiscSystem, fit_: Fit, beside: Sequence[Quantity] | None, along: Along) -> None:
@@ -199,11 +222,11 @@ class DiscScan:
         return self._courses[formula]
 
     def library(self) -> list[Family]:
-        """See `laws.Scan`."""
+        """The laws that are looked for along this motion."""
         return list(families(self.motion.q, self.motion.time, self._rate, self._disc))
 
     def gains(self, chosen: Iterable[Family]) -> list[Gain]:
-        """See `laws.Scan`."""
+        """What each would gain."""
         everything = list(chosen)
         parts = (everything[first : first + CHUNK] for first in range(0, len(everything), CHUNK))
         return [gain for part in parts for gain in self._gains(part)]

@@ -14,6 +14,7 @@ from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.diagnosis.errors import LeftOver, energy_balance, errors, left_over, regimes, where_it_holds
 from disctrack.diagnosis.evidence import evidence
 from disctrack.diagnosis.form_misfit import with_form
+from disctrack.diagnosis.laws import WithLaw, explained_by_law, judged_as
 from disctrack.diagnosis.missing_force import what_is_missing
 from disctrack.diagnosis.model_file import PAPER, declared_model, model_toml
 from disctrack.diagnosis.pages.output import as_json, write_diagnosis
@@ -23,11 +24,10 @@ from disctrack.diagnosis.recorded import read_recorded
 from disctrack.diagnosis.slip_start import diagnose_motion, with_slip
 from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.held_out import held_out, training_rows
-from disctrack.discrepancy.laws import WithLaw, explained_by_law, judged_as
 from disctrack.discrepancy.noise import with_memory
 from disctrack.discrepancy.search import Diagnosis, Found, Settings
 from disctrack.discrepancy.significance import wald
-from disctrack.discrepancy.system import USED_UP, System
+from disctrack.discrepancy.system import USED_UP
 from disctrack.errors import AnalysisError
 from disctrack.files.inputs import keep, refuse_input
 from disctrack.files.json_text import json_file
@@ -70,7 +70,7 @@ def diagnose(trajectory: Trajectory, model: str = PAPER, settings: Settings | No
         return DiscDiagnosis(system, diagnosis, str(model), notes=diagnosis.remarks)
     left = left_over(system, diagnosis.after, diagnosis.noise)
     diagnosis = judged_by_what_is_left(diagnosis, left)
-    found, diagnosis = _beyond_the_catalogue(system, diagnosis, left)
+    found, diagnosis = explained_by_law(system, diagnosis, left)
     holds, learned, notes = {}, None, diagnosis.remarks
     if diagnosis.verdict == "unexplained":
         holds = regimes(system, judged_as(diagnosis, system), diagnosis.before, diagnosis.noise)
@@ -116,23 +116,6 @@ def judged_by_what_is_left(diagnosis: Diagnosis, left: LeftOver | None) -> Diagn
         )
     reason = f"{diagnosis.reason}; but the residuals of the poses {but}" if but else diagnosis.reason
     return replace(diagnosis, verdict=verdict, reason=reason)
-
-
-def _beyond_the_catalogue(
-    system: DiscSystem, diagnosis: Diagnosis, left: LeftOver | None
-) -> tuple[WithLaw | None, Diagnosis]:
-    """The explanation with a law if that is the shortest, and the diagnosis with what is said of others."""
-    noise = diagnosis.noise
-    limit = noise * (1.0 + 4.0 * float(np.sqrt(2.0 / np.sum(system.weights))))
-
-    def is_noise(known: System, fitted: Fit) -> bool:
-        assert isinstance(known, DiscSystem)
-        if fitted.reduced_chi_square > limit:
-            return False
-        remains = left_over(known, fitted, noise)
-        return remains is None or not remains.of_the_motion
-
-    return explained_by_law(system, diagnosis, left is not None and left.doubtful, is_noise)
 
 
 def _with_law(

@@ -51,6 +51,15 @@ def wald(amounts: Array, covariance: Array) -> float:
     return float((amounts / safe) @ inverse @ (amounts / safe))
 
 
+def evidence(shown: Array, along: Array, sizes: Array) -> Array:
+    """-2 log evidence (s,), but for a constant, of a normal process of these prior sizes (MacKay 1992).
+
+    shown : (k,) singular values of what it adds to the whitened data, for size 1.   along : (k,) the residual there
+    """
+    power = (sizes[:, None] * shown) ** 2
+    return np.asarray(np.sum(np.log1p(power) - along**2 * power / (1 + power), axis=1), float)
+
+
 DRAWS = 4000
 LAST = 40  # of the draws that are largest: beyond them the tail is that of one chance, times their number
 SEED = 20261122

@@ -25,7 +25,6 @@ from disctrack.discrepancy.equations.start import cut_short, guessed, near_decla
 from disctrack.discrepancy.equations.system import MOST_STATES, EquationSystem
 from disctrack.discrepancy.fit import TRIAL, Fit, fit, no_fit
 from disctrack.discrepancy.held_out import HeldOut, held_out
-from disctrack.discrepancy.laws import evidence
 from disctrack.discrepancy.noise import with_memory
 from disctrack.discrepancy.score import Linearisation
 from disctrack.discrepancy.search import (
@@ -40,6 +39,7 @@ from disctrack.discrepancy.search import (
     is_noise,
     length,
 )
+from disctrack.discrepancy.significance import evidence
 from disctrack.discrepancy.system import Candidate, GivenUp, Quantity, System, Values
 
 NAME = "learned"  # of the term

@@ -1,7 +1,6 @@
 """What no catalogue names is never noise: read from the residual as a moment and a law, as uncertain as its form."""
 
 from dataclasses import replace
-from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,12 +10,12 @@ from numpy.testing import assert_allclose
 from disctrack.diagnosis import diagnose, form_misfit
 from disctrack.diagnosis.errors import simulated
 from disctrack.diagnosis.form_misfit import moment_about_contact
-from disctrack.diagnosis.law_library import families
+from disctrack.diagnosis.law_library import Family, families
+from disctrack.diagnosis.laws import busy_amounts, learn, with_law, without_idle_terms
 from disctrack.diagnosis.missing_force import law_of, missing_moment, probe
 from disctrack.diagnosis.pages.output import as_json
 from disctrack.disc import MA_2014
 from disctrack.discrepancy.fit import Fit, fit
-from disctrack.discrepancy.laws import Family, busy_amounts, learn, with_law, without_idle_terms
 from disctrack.discrepancy.search import CLASS_GAIN
 from disctrack.discrepancy.system import Quantity
 from disctrack.faults.keys import Faults
@@ -83,8 +82,8 @@ def test_in_noise_no_law_is_learned():
 )
 def test_a_term_that_the_refit_finds_to_be_zero_is_dropped(amounts, left, title):
     pair = Family("twice", ({"M_z": "sin(2.0 * phi)"}, {"M_z": "cos(2.0 * phi)"}))
-    system = SimpleNamespace(law=partial(law_of, Model(MA_2014)))
-    law = system.law([pair], np.array([-4e-4, 1e-6]))
+    system = SimpleNamespace(model=Model(MA_2014))
+    law = law_of(system.model, [pair], np.array([-4e-4, 1e-6]))
     values = dict(zip(law.candidate.names, amounts, strict=True))
     fitted = Fit(law.candidate.quantities, values, np.diag([6e-6, 7e-6]) ** 2, 1.0, 0.0, 100, True, 3)
     shorter = without_idle_terms(system, law, fitted)

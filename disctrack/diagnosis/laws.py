@@ -8,161 +8,34 @@ explanation; the answer is the shortest one.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibration.kit.arrays import Array
+from disctrack.diagnosis.disc_system import DiscSystem
+from disctrack.diagnosis.errors import LeftOver, left_over
+from disctrack.diagnosis.law_library import MIN_SIGMAS, Family, LearnedLaw, differ_from_zero
+from disctrack.diagnosis.missing_force import Gain, law_of
 from disctrack.discrepancy.fit import TRIAL, Fit, fit
 from disctrack.discrepancy.search import CLASS_GAIN, FAR, Diagnosis, Explanation, Found, alike, gain_of_memory, length
 from disctrack.discrepancy.shape import profiled
-from disctrack.discrepancy.significance import as_sigmas, price_of_a_number, wald
-from disctrack.discrepancy.system import Candidate, Quantity, System, Values
+from disctrack.discrepancy.significance import price_of_a_number
+from disctrack.discrepancy.system import Quantity, System
 
 MAX_TERMS = 3
 REFITTED = 5  # families that are fitted in full in each round ...
 OF_ONE_KIND = 2  # ... of them of one kind
 LONGER = 2  # of other kinds, that come nearest to the data in more numbers, beside known effects that describe them
-MIN_SIGMAS = 3.0  # of a coefficient after the refit; what helped to first order may not help the motion
 EXACT = 0.02  # of chi-square: what a first-order gain may err by where the motion is far from the data
 UNLIKELY = 1e-3  # odds below which a law does not count
 NEARLY = 20.0  # chi-square by which a refit may be better than the first order ...
 COARSE = 0.1  # ... and share of what is missing, by which one may be that moves a shape off the library's grid
-WIDTHS = ("width", "softness", "length", "lasting")  # shapes that go with the amount
-INVISIBLE = 1e-8  # share of a column's power left after clearing, below which the data do not show it
-
-Parts = Mapping[str, str]  # component of the force -> formula
-
-
-@dataclass(frozen=True)
-class Family:
-    """Terms that belong together, each with a coefficient of its own."""
-
-    title: str
-    terms: tuple[Parts, ...]
-    shape: Mapping[str, float] = field(default_factory=dict)  # numbers in braces, fitted along with the coefficients
-    kind: str = "moment"  # families of one kind are variations of one idea
-    names: tuple[str, ...] = ()  # of the coefficients, where they mean something by themselves
-
-    @property
-    def n_numbers(self) -> int:
-        """Numbers that a fit would move."""
-        return len(self.terms) + len(self.shape)
-
-    def formulas(self) -> tuple[Parts, ...]:
-        """The terms with the shape's numbers in place."""
-        numbers = {k: f"({v!r})" for k, v in self.shape.items()}
-        return tuple({c: f.format(**numbers) for c, f in parts.items()} for parts in self.terms)
-
-
-@dataclass(frozen=True)
-class Gain:
-    """What a family gains to first order."""
-
-    family: Family
-    gain: float  # decrease of chi-square
-    values: Array  # coefficients of its terms
-
-
-@dataclass(frozen=True)
-class LearnedLaw:
-    """Families of terms that describe what is missing."""
-
-    candidate: Candidate
-    effect: Any  # what the system has to know to predict with it
-    families: tuple[Family, ...]
-    amounts: tuple[tuple[str, ...], ...] = ()  # names of each family's coefficients ...
-    shapes: tuple[tuple[str, ...], ...] = ()  # ... and of the numbers of its shape
-    values: Values = field(default_factory=dict)  # of everything, where its fit ended
-    alike: tuple[str, ...] = ()  # other laws that describe the data as well
-    others: tuple[tuple[LearnedLaw, float], ...] = ()  # laws that fit as well, however long, with their odds
-    looked: float = 0.0  # chi-square that each family pays for having been looked for among so many
-
-    @property
-    def title(self) -> str:
-        """What the law means, in words."""
-        return "; and ".join(family.title for family in self.families)
-
-    def stands_out(self, fitted: Fit) -> bool:
-        """Do the coefficients of each of its families differ from zero, in a fit whose sigmas hold all doubts?"""
-        return all(_differ_from_zero(*fitted.amounts(names)) for names in self.amounts)
-
-    @property
-    def widths(self) -> set[str]:
-        """Numbers of the shapes that go with an amount: along their profiles only are they found."""
-        pairs = zip(self.families, self.shapes, strict=True)
-        return {name for family, names in pairs for key, name in zip(family.shape, names, strict=True) if key in WIDTHS}
-
-    @property
-    def formulas(self) -> dict[str, str]:
-        """Component of the force -> formula."""
-        return dict(self.effect.formulas or {})
-
-
-class Scan(Protocol):
-    """How the data answer to laws along one fitted motion."""
-
-    chi_square: float  # that the fitted quantities leave
-
-    def library(self) -> Sequence[Family]:
-        """The laws that are looked for along this motion."""
-
-    def gains(self, families: Iterable[Family]) -> list[Gain]:
-        """What each would gain."""
-
-
-class LawSystem(System):
-    """A system in which laws can be learned."""
-
-    frees_shapes = True
-
-    def scan(self, fitted: Fit, beside: Sequence[Quantity] | None = None) -> Scan | None:
-        """Answers to laws along the fitted motion; None where it has no first order.
-
-        beside : quantities to be fitted beside a law, if not those of the fit. What the others do is given back to the
-        residual to first order: so a law is looked for in their place, along a motion that follows the data.
-        """
-        raise NotImplementedError
-
-    def law(self, families: Sequence[Family], values: Array) -> LearnedLaw:
-        """The effect that these make; values (k,): family by family, coefficients and then shapes."""
-        raise NotImplementedError
-
-    def knowing(self, law: LearnedLaw) -> LawSystem:
-        """The same system, in whose values numbers of this law may be named."""
-        raise NotImplementedError
-
-
-IsNoise = Callable[[System, Fit], bool]
-
-
-def evidence(shown: Array, along: Array, sizes: Array) -> Array:
-    """-2 log evidence (s,), but for a constant, of a normal process of these prior sizes (MacKay 1992).
-
-    shown : (k,) singular values of what it adds to the whitened data, for size 1.   along : (k,) the residual there
-    """
-    power = (sizes[:, None] * shown) ** 2
-    return np.asarray(np.sum(np.log1p(power) - along**2 * power / (1 + power), axis=1), float)
-
-
-def proposal(family: Family, gram: Array, before: Array, right: Array) -> Gain:
-    """Gain and values from the normal equations of one family; directions that nothing shows count for nothing.
-
-    before : (k,) squares of its columns as they were before what is fitted was cleared out
-    """
-    size = np.sqrt(np.maximum(before, 1e-300))
-    eigenvalues, vectors = np.linalg.eigh(gram / np.outer(size, size))
-    seen = eigenvalues > INVISIBLE
-    along = vectors[:, seen].T @ (right / size)
-    values = vectors[:, seen] @ (along / eigenvalues[seen]) / size
-    return Gain(family, float(np.sum(along**2 / eigenvalues[seen])), values)
 
 
 def learn(
-    system: LawSystem, base: Fit, noise: float, along: Fit | None = None, against: float = np.inf,
-    is_noise: IsNoise | None = None,
+    system: DiscSystem, base: Fit, noise: float, along: Fit | None = None, against: float = np.inf,
+    to_noise: bool = False,
 ) -> LearnedLaw | None:  # fmt: skip
     """The law of few terms that describes what is missing; None if none survives, or where there is no first order.
 
@@ -171,7 +44,7 @@ def learn(
     motion, in the place of what it has beyond the base
     against : chi-square over the noise that another explanation leaves; then only a law of a single term is sought, and
     only one that may, to first order, come as near to the data
-    is_noise : ends the search for further terms, which else goes on as long as each gains more than its price
+    to_noise : what is noise ends the search for further terms, which else goes on while each gains more than its price
     """
     price, law, known = price_of_a_number(system.weights), None, system
     current, shortest = base, base.cost / noise
@@ -200,10 +73,18 @@ def learn(
             looked=looked,
         )
         known = system.knowing(law)
-        if len(law.families) == MAX_TERMS or np.isfinite(against) or (is_noise and is_noise(known, current)):
+        enough = len(law.families) == MAX_TERMS or np.isfinite(against)
+        if enough or (to_noise and _leaves_noise(known, current, noise)):
             break
         scan = known.scan(current)
     return without_idle_terms(system, law, current) if law is not None else None
+
+
+def _leaves_noise(known: DiscSystem, fitted: Fit, noise: float) -> bool:
+    if fitted.reduced_chi_square > noise * (1.0 + 4.0 * float(np.sqrt(2.0 / np.sum(known.weights)))):
+        return False
+    left = left_over(known, fitted, noise)
+    return left is None or not left.of_the_motion
 
 
 def base_alone(base: Fit, along: Fit) -> Fit:
@@ -212,7 +93,7 @@ def base_alone(base: Fit, along: Fit) -> Fit:
     return replace(base, values=base.values | along.values | beyond)
 
 
-def shortest_to_first_order(system: LawSystem, base: Fit, along: Fit, noise: float) -> float:
+def shortest_to_first_order(system: DiscSystem, base: Fit, along: Fit, noise: float) -> float:
     """Chi-square with all prices of the law without a shape that comes nearest; infinite where there is no first order.
 
     along : fit of known effects, in the place of which the law stands beside the base's
@@ -258,11 +139,11 @@ def _worth_a_refit(
     return found
 
 
-def _refitted(system: LawSystem, base: Fit, law: LearnedLaw | None, current: Fit, new: Gain) -> tuple[LearnedLaw, Fit]:
+def _refitted(system: DiscSystem, base: Fit, law: LearnedLaw | None, current: Fit, new: Gain) -> tuple[LearnedLaw, Fit]:
     """The law enlarged by a family, fitted to the data."""
     before = law.families if law else ()
     values = [current.values[n] for n in law.candidate.names] if law else []
-    enlarged = system.law((*before, new.family), np.array([*values, *new.values, *new.family.shape.values()]))
+    enlarged = law_of(system.model, (*before, new.family), np.array([*values, *new.values, *new.family.shape.values()]))
     start = replace(enlarged, values=current.values)
     known = system.knowing(enlarged)
     fitted = with_law(known, base, start)
@@ -292,7 +173,7 @@ def _one_by_one(system: System, base: Fit, law: LearnedLaw, widths: Sequence[Qua
     return fitted
 
 
-def without_idle_terms(system: LawSystem, law: LearnedLaw, fitted: Fit) -> LearnedLaw:
+def without_idle_terms(system: DiscSystem, law: LearnedLaw, fitted: Fit) -> LearnedLaw:
     """The law without the terms that the fit to the data itself finds to be zero, if it has others; else the same.
 
     Terms that go together may each be open where their family is not: it is judged as a whole, and so are they.
@@ -308,12 +189,8 @@ def without_idle_terms(system: LawSystem, law: LearnedLaw, fitted: Fit) -> Learn
             values += [*busy.values(), *(fitted.values[n] for n in shapes)]
     if not kept or len(values) == len(law.candidate.quantities):
         return law
-    shorter = system.law(kept, np.array(values))
+    shorter = law_of(system.model, kept, np.array(values))
     return replace(shorter, values=fitted.values, alike=law.alike, others=law.others, looked=law.looked)
-
-
-def _differ_from_zero(amounts: Array, covariance: Array) -> bool:
-    return as_sigmas(wald(amounts, covariance), len(amounts)) > MIN_SIGMAS
 
 
 def busy_amounts(fitted: Fit, names: Sequence[str]) -> dict[int, float]:
@@ -322,7 +199,7 @@ def busy_amounts(fitted: Fit, names: Sequence[str]) -> dict[int, float]:
     One after the other goes, each judged with those before it out: of two that move together one may do for both.
     """
     amounts, covariance = fitted.amounts(names)
-    if not _differ_from_zero(amounts, covariance):
+    if not differ_from_zero(amounts, covariance):
         return {}
     size = np.where(np.diag(covariance) > 0, np.sqrt(np.diag(covariance)), 1.0)
     precision = np.linalg.pinv(covariance / np.outer(size, size), rcond=1e-12, hermitian=True)
@@ -341,7 +218,7 @@ class WithLaw(Explanation):
     """An explanation with a law: known effects that stay beside it, fitted together."""
 
     law: LearnedLaw
-    system: LawSystem  # knows the law
+    system: DiscSystem  # knows the law
     kept: tuple[Found, ...]
 
     @property
@@ -351,26 +228,26 @@ class WithLaw(Explanation):
 
 
 def explained_by_law(
-    system: LawSystem, diagnosis: Diagnosis, doubtful: bool, is_noise: IsNoise
+    system: DiscSystem, diagnosis: Diagnosis, left: LeftOver | None
 ) -> tuple[WithLaw | None, Diagnosis]:
     """The explanation with a law if that is the shortest one; and the diagnosis with those with laws in its list.
 
     Of those that describe the data as well as the shortest, the one that claims the fewest known effects.
     """
-    noise, beside = diagnosis.noise, _beside(system, diagnosis, doubtful)
-    found = [_law_beside(system, diagnosis, kept, is_noise) for kept in beside if system.budget.open()]
+    noise, beside = diagnosis.noise, _beside(system, diagnosis, left is not None and left.doubtful)
+    found = [_law_beside(system, diagnosis, kept) for kept in beside if system.budget.open()]
     answers = [a for a in found if a is not None and a.fit.converged]
     if not answers:
         return None, diagnosis
     best = min(alike(answers), key=lambda a: sum(f.candidate.kind == "motion" for f in a.kept))
-    left, at_noise = best.fit.reduced_chi_square, diagnosis.settings.at_noise * noise
+    chi_square, at_noise = best.fit.reduced_chi_square, diagnosis.settings.at_noise * noise
     ranked = sorted((*diagnosis.ranked, *answers), key=lambda e: e.length)
     listed = replace(diagnosis, ranked=tuple(ranked), length=ranked[0].length)
     many = len(best.law.families) + sum(f.candidate.kind == "motion" for f in best.kept)
     if not best.length < _known(system, diagnosis, many) or _is_known(diagnosis, best.fit):
-        text = f"a single law outside the catalogue describes the data too ({left:.4g}): {best.law.title}"
-        return None, replace(listed, remarks=(*diagnosis.remarks, text)) if left <= at_noise else diagnosis
-    if left > FAR * noise:
+        text = f"a single law outside the catalogue describes the data too ({chi_square:.4g}): {best.law.title}"
+        return None, replace(listed, remarks=(*diagnosis.remarks, text)) if chi_square <= at_noise else diagnosis
+    if chi_square > FAR * noise:
         return None, diagnosis
     return replace(best, law=replace(best.law, others=_others(best, answers, diagnosis))), listed
 
@@ -392,7 +269,7 @@ def _known(system: System, diagnosis: Diagnosis, many: int) -> float:
     return min(its - CLASS_GAIN * (0 < sum(c.kind == "motion" for c in of) <= many) for its, of in lengths)
 
 
-def _beside(system: LawSystem, diagnosis: Diagnosis, doubtful: bool) -> tuple[tuple[Found, ...], ...]:
+def _beside(system: DiscSystem, diagnosis: Diagnosis, doubtful: bool) -> tuple[tuple[Found, ...], ...]:
     """Sets of what was found, beside each of which a law is looked for in the place of the others.
 
     A single known effect has to compete where what it leaves is `doubtful`, or where a law comes as near to first
@@ -425,13 +302,13 @@ def base_beside(base: Fit, kept: Sequence[Found]) -> Fit:
     return replace(base, quantities=tuple(quantities.values()))
 
 
-def _law_beside(system: LawSystem, diagnosis: Diagnosis, kept: tuple[Found, ...], is_noise: IsNoise) -> WithLaw | None:
+def _law_beside(system: DiscSystem, diagnosis: Diagnosis, kept: tuple[Found, ...]) -> WithLaw | None:
     """The law that takes the place of what was found but for `kept`; None if there is none."""
     noise, base = diagnosis.noise, base_beside(diagnosis.before, kept)
     nearest = diagnosis.nearest.fit if diagnosis.nearest else None
     along = diagnosis.after if diagnosis.found else nearest
     against = along.cost / noise if diagnosis.verdict == "found" and along else np.inf
-    law = learn(system, base, noise, along, against, None if diagnosis.found else is_noise)
+    law = learn(system, base, noise, along, against, to_noise=not diagnosis.found)
     if law is None:
         return None
     known = system.knowing(law)
