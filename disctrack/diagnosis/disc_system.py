@@ -28,6 +28,7 @@ from disctrack.diagnosis.starts import STRETCHES, sought, start_values
 from disctrack.diagnosis.stretch import free_stretch
 from disctrack.diagnosis.systematic import DOT_SIGMA, Systematic, field_columns
 from disctrack.discrepancy.fit import Fit
+from disctrack.discrepancy.held_out import square_root
 from disctrack.discrepancy.system import Budget, Candidate, Quantity, System, Values
 from disctrack.faults.catalogue import faults_of, scene_faults
 from disctrack.faults.dots import Sight, predict
@@ -147,11 +148,7 @@ class DiscSystem(System):
         points = self.disc.marker_centres_body @ np.swapaxes(R, -1, -2) + q[..., None, :3]
         seen = self.rig.project_with_jacobians(points)
         places, by_point, by_rig = (np.stack([x[0, :, 0], x[1, :, 1]], axis=1) for x in seen)
-        spread = np.sqrt(np.maximum(np.diag(self.rig.covariance), 0.0))
-        safe = np.where(spread > 0, spread, 1.0)
-        eigenvalues, vectors = np.linalg.eigh(self.rig.covariance / np.outer(safe, safe))
-        root = spread[:, None] * vectors * np.sqrt(np.maximum(eigenvalues, 0.0))
-        rig = (self._whiten @ by_rig).reshape(n, -1, root.shape[0]) @ root
+        rig = self.whitened(by_rig) @ square_root(self.rig.covariance)
         along = np.einsum("ncmap,cnpb->ncmab", by_point, R[..., :2])  # by the dots' places on the face
         m, sizes = self.disc.n_markers, self.systematic
         dots = (self._whiten @ along)[:, :, :, :, None, :] * np.eye(m)[None, None, :, None, :, None]
@@ -175,7 +172,7 @@ class DiscSystem(System):
 
     def whitened(self, shifts: Array) -> Array:
         """(n, 4 m, k) of shifts of the dots (n, 2, m, 2, k) [px]; k may be 0."""
-        found = np.einsum("ncmab,ncmbk->ncmak", self._whiten, shifts)
+        found = self._whiten @ shifts
         return np.asarray(found.reshape(len(found), 2 * self.used[0].size, shifts.shape[-1]), float)
 
     def _as_measured(self, delay: float) -> Path:
@@ -279,8 +276,7 @@ class DiscSystem(System):
         derivative = np.zeros((*residual.shape, len(names)))
         column = {name: i for i, name in enumerate(names)}
         if moved:
-            whitened = (self._whiten @ sight.by_pose).reshape(*residual.shape, 6)
-            derivative[..., [column[n] for n in moved]] = whitened @ by_motion
+            derivative[..., [column[n] for n in moved]] = self.whitened(sight.by_pose) @ by_motion
         common = [n for n in names if n in self._nuisance_column]
         if common:
             mine = self._nuisance_columns[..., [self._nuisance_column[n] for n in common]]
@@ -288,17 +284,18 @@ class DiscSystem(System):
         for fault in self.faults:
             for name, part in zip(fault.names(), fault.parts, strict=True):
                 if name in column:
-                    derivative[..., column[name]] = self._rows_of(fault.column(part, sight))
+                    derivative[..., column[name]] = self.whitened(fault.column(part, sight)[..., None])[..., 0]
         return residual, derivative
 
-    def pixels(self, values: Values, with_nuisances: bool = False) -> Array:
-        """Predicted images of the dots (n, 2, m, 2) [px], with the biases that nuisances stand for if wanted."""
-        pixels = self._sight(self._path(values)[0], values).pixels
-        if not with_nuisances:
-            return pixels
-        whitened = (self._nuisance_columns @ self._nuisance_values(values)).reshape(pixels.shape)
-        inverse = np.linalg.inv(np.where(self.used[..., None, None], self._whiten, np.eye(2)))
-        return pixels + np.where(self.used[..., None], (inverse @ whitened[..., None])[..., 0], 0.0)
+    def pixels(self, values: Values) -> Array:
+        """Predicted images of the dots (n, 2, m, 2) [px], without the biases that nuisances stand for."""
+        return self._sight(self._path(values)[0], values).pixels
+
+    def residual_px(self, values: Values) -> Array:
+        """What is left of the dots' images (n, 2, m, 2) [px]; zero where a dot is not used."""
+        whiten = np.where(self.used[..., None, None], self._whiten, np.eye(2))
+        residual = self.linearise(values, [])[0].reshape(*self.observed.shape, 1)
+        return np.asarray(np.linalg.solve(whiten, residual)[..., 0], float)
 
     def poses(self, values: Values) -> Array:
         """Predicted coordinates q (n, 6) in the left camera's instants, in axes of the true table."""
@@ -335,7 +332,7 @@ class DiscSystem(System):
         """Residual (n, 4 m), its derivative (n, 4 m, 6) and normal matrix (n, 6, 6) by a free pose per frame."""
         sight = self._sight(self._path(values)[0], values)
         r = self._residual(sight.pixels, values)
-        J = (self._whiten @ sight.by_pose).reshape(len(r), -1, 6)
+        J = self.whitened(sight.by_pose)
         normal = np.swapaxes(J, 1, 2) @ J
         normal[self.weights < 6] = np.eye(6)
         return r, J, normal
@@ -345,12 +342,9 @@ class DiscSystem(System):
 
     def _residual(self, pixels: Array, values: Values) -> Array:
         """Whitened rows of observed minus predicted dots, the nuisances' part taken off."""
-        residual = self._rows_of(self.observed - pixels)
+        residual = self.whitened((self.observed - pixels)[..., None])[..., 0]
         weights = self._nuisance_values(values)
         return residual - self._nuisance_columns @ weights if weights.any() else residual
-
-    def _rows_of(self, pixels: Array) -> Array:
-        return np.asarray((self._whiten @ pixels[..., None]).reshape(len(self.time), -1), float)
 
     def _path(self, values: Values, names: Sequence[str] = ()) -> tuple[Path, tuple[str, ...], Array]:
         """Motion at the true instants of both cameras, and by which of the names it moves.

@@ -41,7 +41,6 @@ class Errors:
 
 def errors(system: DiscSystem, fit_: Fit, held: HeldOut | None) -> Errors:
     """All errors of a fit, and of the free run after the shorter fit."""
-    pixels = system.observed - system.pixels(fit_.values, with_nuisances=True)
     pose = system.pose_residual(fit_.values)
     present = system.weights >= 6
     error = system.coordinate_errors(fit_.values)[0][present]
@@ -50,7 +49,7 @@ def errors(system: DiscSystem, fit_: Fit, held: HeldOut | None) -> Errors:
     return Errors(
         reduced_chi_square=fit_.reduced_chi_square,
         reduced_chi_square_pose=float(np.sum(pose[present] ** 2) / max(freedom, 1)),
-        rms_px=float(np.sqrt(np.mean(pixels[system.used] ** 2))),
+        rms_px=float(np.sqrt(np.mean(system.residual_px(fit_.values)[system.used] ** 2))),
         rms_position_um=float(1e6 * np.sqrt(np.mean(error[:, :3] ** 2))),
         rms_theta_mdeg=float(1e3 * np.degrees(np.sqrt(np.mean(error[:, 4] ** 2)))),
         ratio_to_floor=held.ratio_to_floor if held else np.nan,

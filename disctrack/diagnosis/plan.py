@@ -17,9 +17,9 @@ from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.diagnosis.motion import state_of
 from disctrack.diagnosis.stretch import MIN_FRAMES, MIN_THETA
 from disctrack.discrepancy.fit import Fit
-from disctrack.discrepancy.joint.reduction import Reduction
-from disctrack.discrepancy.joint.sharing import LAWS
-from disctrack.discrepancy.score import Linearisation, cleared, score, sigmas, span
+from disctrack.discrepancy.joint.sharing import LAWS, Reduction
+from disctrack.discrepancy.joint.together import Bound
+from disctrack.discrepancy.score import Score, cleared, sigmas, span
 from disctrack.discrepancy.search import Diagnosis
 from disctrack.discrepancy.system import Candidate, Quantity, Values
 from disctrack.errors import AnalysisError, DiscTrackError
@@ -270,23 +270,15 @@ def plan(
     return replace(first, rows=(*first.rows, *made(changed)))
 
 
-def open_questions(diagnosis: Diagnosis, system: DiscSystem) -> tuple[Question, ...]:
+def open_questions(diagnosis: Diagnosis, sizes: Iterable[Score | Bound]) -> tuple[Question, ...]:
     """What is open in a diagnosis: effects and their alternatives, then effects of the motion with an upper bound only.
 
     Of the latter those whose standard deviation is largest beside their usual size.
+    sizes : of effects, as far as the data tell them
     """
     found: list[Question] = [(f.candidate, r.candidate) for f in diagnosis.found for r in f.cannot_be_told_from]
-    named = {f.candidate.name for f in diagnosis.found}
-    single = [
-        c
-        for c in system.candidates
-        if c.kind == "motion" and len(c.quantities) == 1 and not (c.threshold or c.sought) and c.name not in named
-    ]
-    linear = Linearisation(system, diagnosis.after, single)
-
-    def share(c: Candidate) -> float:
-        sigma = float(score(linear, c).sigma[0])
-        return sigma / c.quantities[0].typical if np.isfinite(sigma) else 0.0
-
-    unsettled = sorted(single, key=share, reverse=True)
-    return (*found[:OPEN], *((c,) for c in unsettled[: max(OPEN - len(found), 2)]))
+    known = {f.candidate.name for f in diagnosis.found}
+    single = [s for s in sizes if s.candidate.kind == "motion" and len(s.sigma) == 1 and np.isfinite(s.sigma[0])]
+    single = [s for s in single if s.candidate.name not in known]
+    single.sort(key=lambda s: -float(s.sigma[0]) / s.candidate.quantities[0].typical)
+    return (*found[:OPEN], *((s.candidate,) for s in single[: max(OPEN - len(found), 2)]))

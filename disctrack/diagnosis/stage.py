@@ -25,6 +25,7 @@ from disctrack.diagnosis.slip_start import diagnose_motion, with_slip
 from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.held_out import held_out, training_rows
 from disctrack.discrepancy.noise import with_memory
+from disctrack.discrepancy.score import Linearisation, score_all
 from disctrack.discrepancy.search import Diagnosis, Found, Settings
 from disctrack.discrepancy.significance import wald
 from disctrack.discrepancy.system import USED_UP
@@ -93,7 +94,9 @@ def with_plan(result: DiscDiagnosis) -> DiscDiagnosis:
     diagnosis = result.diagnosis
     if result.after is None or not diagnosis.after.converged:
         return result
-    questions = open_questions(diagnosis, result.system)
+    candidates = [c for c in result.system.candidates if c.kind == "motion" and not (c.threshold or c.sought)]
+    scores = score_all(Linearisation(result.system, diagnosis.after, candidates), candidates)
+    questions = open_questions(diagnosis, scores)
     return replace(result, plan=plan(result.system, diagnosis.after, questions, diagnosis.noise))
 
 

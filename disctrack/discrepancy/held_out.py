@@ -66,7 +66,7 @@ def held_out(system: System, quantities: Sequence[Quantity], start: Values, rows
     finite = np.isfinite(residual[test]).all() and np.isfinite(derivative[test]).all()
     if not finite or len(train.heads) < len(own.blocks):
         return HeldOut(train, test, np.inf, float(n_data), -np.inf, n_data)
-    root = _square_root(train.covariance)
+    root = square_root(train.covariance)
     k = root.shape[1]
     # B: the prediction's derivative by independent numbers of variance one that make up what the fit leaves open
     both = np.zeros((*residual.shape, k + 1))
@@ -114,7 +114,8 @@ def _over_ones(B: Array, others: Array) -> Array:
     return triangle(np.concatenate([np.concatenate([B, others], axis=1), ones]))
 
 
-def _square_root(covariance: Array) -> Array:
+def square_root(covariance: Array) -> Array:
+    """R (k, k) with R R^T = covariance (k, k), which may be singular, of numbers of any sizes."""
     if covariance.size == 0:  # a model without quantities
         return covariance
     scale = np.sqrt(np.maximum(np.diag(covariance), 0.0))

@@ -7,8 +7,7 @@ c t exp(-g t), the air's, that goes with the root of its density; a hum, the rig
 import numpy as np
 
 from disctrack.discrepancy.fit import fit
-from disctrack.discrepancy.joint.reduction import Reduction
-from disctrack.discrepancy.joint.sharing import Member
+from disctrack.discrepancy.joint.sharing import Member, Reduction
 from disctrack.discrepancy.system import Candidate, Quantity
 from tests.oracles.linear_system import Predicted
 

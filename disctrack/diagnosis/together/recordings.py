@@ -10,13 +10,12 @@ from calibration.kit.least_squares import triangle
 from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.diagnosis.large_faults import find_large
 from disctrack.diagnosis.model_file import PAPER, declared_model
-from disctrack.diagnosis.plan import OPEN, Plan, Question, Say, plan
+from disctrack.diagnosis.plan import Plan, Question, Say, open_questions, plan
 from disctrack.diagnosis.recorded import Recorded, first_to_mend
 from disctrack.diagnosis.systematic import MAX_FRAMES, Systematic, find_systematic, noise_over_stated, with_noise
-from disctrack.discrepancy.fit import Fit, fit
+from disctrack.discrepancy.fit import Fit, fit, no_fit
 from disctrack.discrepancy.joint.crew import Crew
-from disctrack.discrepancy.joint.reduction import Reduced, Reduction
-from disctrack.discrepancy.joint.sharing import Member
+from disctrack.discrepancy.joint.sharing import Member, Reduced, Reduction
 from disctrack.discrepancy.joint.together import TogetherDiagnosis, answer_together
 from disctrack.discrepancy.noise import THIRD, inflation
 from disctrack.discrepancy.system import Values
@@ -60,11 +59,8 @@ def _plan(answer: TogetherDiagnosis, crew: Crew) -> Plan | None:
     sharing, after = system.sharing, diagnosis.after
     longest = int(np.argmax(system.weights))
     local = {c.name for c in sharing.members[longest].candidates}
-    open_sizes = [b for b in answer.bounds if b.upper is not None and b.candidate.kind == "motion"]
-    open_sizes.sort(key=lambda b: -float(b.sigma[0]) / b.candidate.quantities[0].typical)
-    questions: list[Question] = [(f.candidate, r.candidate) for f in diagnosis.found for r in f.cannot_be_told_from]
-    questions += [(b.candidate,) for b in open_sizes]
-    questions = [question for question in questions if {c.name for c in question} <= local][:OPEN]
+    questions = open_questions(diagnosis, [b for b in answer.bounds if b.candidate.name in local])
+    questions = tuple(question for question in questions if {c.name for c in question} <= local)
     if not questions:
         return None
     tested = [q for question in questions for c in question for q in c.quantities]
@@ -174,9 +170,7 @@ class DiscMember:
         """
         known = {q.name: q for c in self.system.candidates for q in c.quantities}
         quantities = (*self.system.base, *(known[n] for n in names))
-        zero = np.zeros((len(quantities),) * 2)
-        fitted = Fit(quantities, self._everything(values), zero, 0.0, 0.0, 1, True, 0)
-        return plan(self.system, fitted, questions, said=said)
+        return plan(self.system, no_fit(quantities, self._everything(values)), questions, said=said)
 
     def _everything(self, shared: Values) -> dict[str, float]:
         return {**self.base.values, **self._reduction.own_values, **self.system.known, **shared}

@@ -1,6 +1,8 @@
 """Who shares what: quantities of single recordings, and those of many of which they are made.
 
-For the search, many recordings are one system: its samples are recordings, its rows what each says of the shared.
+For the search, many recordings are one system: its samples are recordings, its rows what each says of the shared. An
+initial state matters to nobody else: once it is eliminated, what is left is the least-squares problem in the shared
+quantities alone, a few dozen rows, however long the recording. Its minimum is followed as the shared quantities move.
 """
 
 from collections.abc import Mapping, Sequence
@@ -10,11 +12,14 @@ from typing import Any
 import numpy as np
 
 from calibration.kit.arrays import Array
-from disctrack.discrepancy.elimination import is_linear
+from calibration.kit.least_squares import eliminate
+from disctrack.discrepancy.elimination import is_linear, prior_rows, projection
+from disctrack.discrepancy.fit import fit
 from disctrack.discrepancy.joint.crew import Crew
 from disctrack.discrepancy.system import Candidate, Quantity, System, Values
 
 EACH = "each its own"  # of the candidates whose amounts differ from group to group
+Reduced = tuple[Array, Array]  # right side (m,) and matrix (m, s) of the problem in the shared quantities
 LAWS = ("surface", "air")  # whose laws may well have the same constant with another disc, or on another surface
 
 
@@ -41,7 +46,6 @@ class Sharing:
         self._groups: dict[str, dict[str, str]] = {}  # quantity of a law -> group -> shared name
         self._nulls: dict[str, float] = {}
         self._own: list[list[Quantity]] = [[] for _ in members]
-        self._local_nulls: list[dict[str, float]] = [{} for _ in members]
         # of each member: what it shares -> its own quantity, which is off its null by the sum of what these are off
         self.local: list[dict[str, str]] = [{} for _ in members]
         for i, member in enumerate(members):
@@ -106,7 +110,6 @@ class Sharing:
         # among many recordings none of the shared ones is taken out beforehand: their rows are no longer those of data
         shared = replace(local, name=f"{local.name}[{group}]" if group else local.name, linear=False)
         self._nulls[shared.name] = shared.null
-        self._local_nulls[i][local.name] = local.null
         self.local[i][shared.name] = local.name
         return shared
 
@@ -154,9 +157,10 @@ class Sharing:
         """The member's shared quantities, those at null among them only where the base has them."""
         values: dict[str, float] = {}
         for name, local in self.local[i].items():
-            away = shared.get(name, self._nulls[name]) - self._nulls[name]
+            null = self._nulls[name]
+            away = shared.get(name, null) - null
             if away or name in self.base:
-                values[local] = values.get(local, self._local_nulls[i][local]) + away
+                values[local] = values.get(local, null) + away
         return values
 
     def start(self) -> dict[str, float]:
@@ -167,6 +171,38 @@ class Sharing:
                 if name in found:
                     found[name].append(member.start[local])
         return {name: float(np.median(alone)) for name, alone in found.items()}
+
+
+class Reduction:
+    """A system in which some quantities of the base always take their best values."""
+
+    def __init__(self, system: System, own: Sequence[Quantity], start: Values) -> None:
+        """Own : quantities that have no bounds.   start : their values, from which their first fit begins."""
+        self.system, self.own = system, tuple(own)
+        self.moved = [q for q in own if not is_linear(q)]
+        self._first = self.own_values = {q.name: start.get(q.name, q.null) for q in self.moved}
+
+    def reduce(self, shared: Values, names: Sequence[str]) -> Reduced | None:
+        """The problem in the shared quantities `names`, at the values `shared`; None where there is no prediction."""
+        for start in (self.own_values, self._first):  # where the point that was followed leads nowhere, from the first
+            found = fit(self.system, self.own, {**shared, **start})
+            if found.converged:
+                self.own_values = {name: found.values[name] for name in start}
+                return self._eliminated(shared, names)
+        return None
+
+    def _eliminated(self, shared: Values, names: Sequence[str]) -> Reduced | None:
+        values = {**shared, **self.own_values}
+        common = projection(self.system, self.own, values)
+        values |= dict(zip(common.names, common.null.tolist(), strict=True))
+        residual, derivative = self.system.linearise(values, [*self.own_values, *names])
+        stacked = np.column_stack([derivative.reshape(residual.size, -1), residual.reshape(-1)])
+        if not np.isfinite(stacked).all():
+            return None
+        prior, matrix = prior_rows(self.moved, values)
+        known = np.column_stack([matrix, np.zeros((len(prior), len(names))), prior])
+        _, left = eliminate(np.concatenate([common.cleared(stacked), known]), len(self.moved))
+        return left[:, -1], left[:, :-1]
 
 
 class JointSystem(System):

@@ -122,7 +122,7 @@ def test_a_shuffled_residual_of_the_disc_gives_no_finding():
     trajectory = measured({"table_tilt.tilt_x": 5e-4}, seed=10, n=160, declared_rate=500.0)
     system, base = with_base_fit(trajectory)
     assert base.reduced_chi_square > 2
-    residual = system.observed - system.pixels(base.values, with_nuisances=True)
+    residual = system.residual_px(base.values)
     order = np.random.default_rng(3).permutation(len(residual))
     shuffled = replace(trajectory, markers_px=system.pixels(base.values) + residual[order])
     answer = explain(system_of(shuffled), base.values)
