@@ -10,9 +10,9 @@ from disctrack.diagnosis.law_library import LearnedLaw, locked
 from disctrack.diagnosis.missing_force import Course
 from disctrack.diagnosis.plan import Plan
 from disctrack.diagnosis.systematic import Systematic
+from disctrack.discrepancy.document import effect_text
 from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.search import Diagnosis, Found
-from disctrack.discrepancy.words import effect_text
 from disctrack.numbers import Measured, probability, rounded
 
 

@@ -25,11 +25,11 @@ from scipy.integrate import cumulative_trapezoid
 from scipy.spatial.transform import Rotation
 
 from calibration.kit.arrays import Array, Mask
+from disctrack.discrepancy.document import effect_text
 from disctrack.discrepancy.noise import SampleStretch, SmoothNoise, estimate
 from disctrack.discrepancy.score import INVISIBLE
 from disctrack.discrepancy.search import Diagnosis, Settings, explain
 from disctrack.discrepancy.system import System, Values
-from disctrack.discrepancy.words import effect_text
 from disctrack.examples._command import GRAVITY, Outcome, command, effect, report_of
 from disctrack.numbers import rounded
 from disctrack.report.blocks import Listing, Section

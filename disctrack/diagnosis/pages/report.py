@@ -11,9 +11,8 @@ from disctrack.diagnosis.errors import Errors
 from disctrack.diagnosis.evidence import HORIZONS, Evidence
 from disctrack.diagnosis.model_file import NONE, PAPER
 from disctrack.diagnosis.plan import ENOUGH, Plan
-from disctrack.discrepancy.document import explanations_table, tried_table
+from disctrack.discrepancy.document import effect_text, explanations_table, significance_text, tried_table
 from disctrack.discrepancy.significance import TWO_SIDED
-from disctrack.discrepancy.words import effect_text, significance_text
 from disctrack.findings import Finding, Kind, Severity, of_kind
 from disctrack.numbers import Measured, in_unit, measured, probability, rounded, score
 from disctrack.report.blocks import Cell, Figures, Listing, Report, Section

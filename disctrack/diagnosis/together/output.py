@@ -11,12 +11,11 @@ import numpy as np
 from disctrack.diagnosis.answer import unnamed
 from disctrack.diagnosis.pages.output import plan_json
 from disctrack.diagnosis.pages.report import planned_section
-from disctrack.discrepancy.document import declared_json, document, tried_table
+from disctrack.discrepancy.document import declared_json, document, effect_text, significance_text, tried_table
 from disctrack.discrepancy.joint.covariates import alike
 from disctrack.discrepancy.joint.together import Bound, Dependence, OfRecording, TogetherDiagnosis
 from disctrack.discrepancy.search import Diagnosis
 from disctrack.discrepancy.system import Quantity
-from disctrack.discrepancy.words import effect_text, significance_text
 from disctrack.files.json_text import plain
 from disctrack.findings import Kind, Severity, of_kind
 from disctrack.numbers import Measured, in_unit, measured, probability, rounded

@@ -13,7 +13,7 @@ from scipy import stats
 
 from calibration.kit.arrays import Array
 from calibration.kit.threads import one_blas_thread
-from disctrack.discrepancy.document import document, tables
+from disctrack.discrepancy.document import document, effect_text, tables
 from disctrack.discrepancy.equations.declared import Equations, Run, Samples, Term, checked
 from disctrack.discrepancy.equations.forecast import Forecast, RunScore, free_run, scored
 from disctrack.discrepancy.equations.law import NAME, LearnedForce
@@ -23,7 +23,6 @@ from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.search import Diagnosis, Settings, Verdict
 from disctrack.discrepancy.significance import LAGS, ljung_box, no_memory
 from disctrack.discrepancy.system import Candidate, System
-from disctrack.discrepancy.words import effect_text
 from disctrack.errors import OutputError
 from disctrack.files.json_text import json_file, plain
 from disctrack.files.whole import write_whole

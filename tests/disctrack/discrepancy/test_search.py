@@ -10,13 +10,13 @@ from numpy.testing import assert_allclose
 from scipy import stats
 from scipy.stats import chi2
 
+from disctrack.discrepancy.document import bounds, correlated
 from disctrack.discrepancy.fit import Fit, fit
 from disctrack.discrepancy.held_out import held_out, training_rows
 from disctrack.discrepancy.score import Linearisation, score_all
 from disctrack.discrepancy.search import Found, Settings, explain, length
 from disctrack.discrepancy.significance import as_sigmas, chance, ljung_box, no_memory, whiteness
 from disctrack.discrepancy.system import Budget, Candidate, Quantity
-from disctrack.discrepancy.words import bounds, correlated
 from tests.oracles.linear_system import Linear, Predicted, candidate, one
 
 SIGMA = 0.01
