@@ -17,7 +17,6 @@ from disctrack.diagnosis.motion import (
     SLIP,
     SLIP_VELOCITY,
     THETA_END,
-    candidate_of_fault,
     measurement_candidates,
     model_quantities,
     motion_candidates,
@@ -127,7 +126,7 @@ class DiscSystem(System):
         sizes |= {"table_height.offset": height, "table_plane.tilt_x": slope_y, "table_plane.tilt_y": slope_x}
         of_motion = motion_candidates(self.model, ("contact_radius", "contact_height"))
         of_table = ("table_height", "table_plane")
-        faults = [candidate_of_fault(fault) for fault in self.faults if fault.name in ("pattern_height", *of_table)]
+        faults = measurement_candidates(self.disc, ("pattern_height", *of_table))
         for candidate in (*of_motion, *faults):
             for q in candidate.quantities:
                 sigma, most = sizes[q.name], MOST_SIGMAS * sizes[q.name]

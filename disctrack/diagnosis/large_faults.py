@@ -14,14 +14,13 @@ from scipy.optimize import least_squares
 
 from calibration.kit.arrays import Array
 from disctrack.diagnosis.disc_system import DiscSystem
-from disctrack.diagnosis.motion import candidate_of_fault
+from disctrack.diagnosis.motion import measurement_candidates
 from disctrack.diagnosis.systematic import Systematic, find_systematic, with_noise_of_frames
-from disctrack.disc import Disc
 from disctrack.discrepancy.fit import Fit, fit
 from disctrack.discrepancy.search import Diagnosis, Found, Settings, beside, explain
 from disctrack.discrepancy.system import Candidate, Values
 from disctrack.errors import AnalysisError
-from disctrack.faults.catalogue import faults_of, scene_faults
+from disctrack.faults.catalogue import scene_faults
 from disctrack.faults.dots import cameras_with, centres_with
 from disctrack.frames import CAMERAS, euler_from_rotation, rotation_from_euler, unwrap_euler
 from disctrack.rolling import Model
@@ -114,10 +113,6 @@ def find_large(as_tracked: Trajectory, system: DiscSystem, first: Systematic) ->
     return best
 
 
-def _candidates(disc: Disc, names: Sequence[str]) -> tuple[Candidate, ...]:
-    return tuple(candidate_of_fault(fault) for fault in faults_of(disc) if fault.name in names)
-
-
 def _found_statically(
     trajectory: Trajectory, names: Sequence[str], known: Values
 ) -> tuple[float, dict[str, float], float]:
@@ -125,7 +120,7 @@ def _found_statically(
 
     returns : chi-square of the dots about those poses, the amounts, decrease of chi-square
     """
-    quantities = [q for c in _candidates(trajectory.disc, names) for q in c.quantities]
+    quantities = [q for c in measurement_candidates(trajectory.disc, names) for q in c.quantities]
     sigma = np.sqrt(0.5 * np.trace(trajectory.markers_covariance_px2, axis1=-2, axis2=-1))[..., None]
 
     def amounts(steps: Array) -> dict[str, float]:
@@ -151,7 +146,7 @@ def _found_statically(
 
 def _assumed(trajectory: Trajectory, model: Model, names: Sequence[str], known: Values, gain: float) -> Assumed | None:
     """The motion fitted with these faults among what moves; None where that fails."""
-    candidates = _candidates(trajectory.disc, names)
+    candidates = measurement_candidates(trajectory.disc, names)
     seen = with_noise_of_frames(poses_with(trajectory, known))
     try:
         plain = DiscSystem(seen, model, known=known)
@@ -171,7 +166,7 @@ def find_clock(system: DiscSystem) -> Assumed | None:
     speed = np.median(psidot**2 * np.sin(q[good, 4])) * system.disc.radius / (4 * system.model.gravity)
     if STEADY[0] < speed < STEADY[1]:
         return None
-    candidates = _candidates(system.disc, ["frame_rate"])
+    candidates = measurement_candidates(system.disc, ["frame_rate"])
     (q_rate,) = candidates[0].quantities
     change = float(np.clip(1.0 / np.sqrt(speed) - 1.0, q_rate.lower, q_rate.upper))
     freed = system.again(freed=candidates, known={**system.known, q_rate.name: change})

@@ -1,6 +1,6 @@
 """Effects of the motion and faults of the measurement, from their two catalogues, as candidates of the engine."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -109,6 +109,6 @@ def candidate_of_fault(fault: Fault) -> Candidate:
     return Candidate(fault.name, fault.name, "measurement", fault.title, fault.source, quantities)
 
 
-def measurement_candidates(disc: Disc) -> tuple[Candidate, ...]:
-    """Every fault that a search may find by its quantities alone."""
-    return tuple(candidate_of_fault(fault) for fault in faults_of(disc))
+def measurement_candidates(disc: Disc, names: Collection[str] | None = None) -> tuple[Candidate, ...]:
+    """Every fault that a search may find by its quantities alone.   names : only these faults, if given"""
+    return tuple(candidate_of_fault(fault) for fault in faults_of(disc) if names is None or fault.name in names)

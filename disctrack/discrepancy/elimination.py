@@ -89,17 +89,6 @@ def projection(system: System, quantities: Sequence[Quantity], values: Values) -
     return known[key]
 
 
-def compress(residual: Array, derivative: Array, common: Projection | None = None) -> tuple[Array, Array]:
-    """Smaller least-squares problem with the same solutions: (right side (m,), matrix (m, k)), m = k + 1 at most.
-
-    The Q of [derivative, residual] is dropped; norms and angles of all combinations of columns stay, once what linear
-    quantities in `common` absorb is taken off.
-    """
-    stacked = np.column_stack([derivative.reshape(residual.size, -1), residual.reshape(-1)])
-    R = triangle(stacked if common is None else common.cleared(stacked))
-    return R[:, -1], R[:, :-1]
-
-
 @dataclass(frozen=True, eq=False)
 class Block:
     """Rows with their own quantities."""
@@ -128,19 +117,20 @@ class Own:
         self.rest = np.flatnonzero(rest)  # rows without own quantities
 
     def reduced(
-        self, residual: Array, derivative: Array, values: Values, common: Projection | None = None
+        self, residual: Array, derivative: Array, values: Values, common: Projection
     ) -> tuple[Array, Array, tuple[OwnNumbers, ...]]:
         """Least-squares problem (right (m,), matrix (m, k)) of the shared quantities, and the heads of all blocks.
+
+        It is compressed (m = k + 1 at most): the Q of all rows is dropped, and norms and angles of all combinations of
+        columns stay, once what linear quantities absorb is taken off.
 
         residual, derivative : (n, w), (n, w, slots + k) of a linearisation by [*slots, *shared names]
         common : linear quantities, of a system without blocks
         """
-        if not self.blocks:
-            return *compress(residual, derivative, common), ()
         n = len(self.slots)
         stacked = np.concatenate([derivative, residual[..., None]], axis=-1)
         width = stacked.shape[-1] - n
-        heads, tails = [], [stacked[self.rest][..., n:].reshape(-1, width)]
+        heads, tails = [], [common.cleared(stacked[self.rest][..., n:].reshape(-1, width))]
         for block in self.blocks:
             p = len(block.columns)
             here = stacked[block.rows]
