@@ -11,6 +11,7 @@ import numpy as np
 from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
 from calibration.kit.arrays import Array
+from calibration.kit.least_squares import triangle
 from disctrack.diagnosis.law_library import LearnedLaw
 from disctrack.diagnosis.missing_force import DiscScan, responding
 from disctrack.diagnosis.motion import (
@@ -39,6 +40,7 @@ from disctrack.track.refine.table_contact import thickness_tolerance
 from disctrack.trajectory import MarkerStatus, Trajectory
 
 RTOL = 1e-10  # of the integration: a millionth of the noise
+MIN_NUISANCE = 0.1  # a direction of the rig's covariance that moves all dots together by less than this many sigmas
 MAX_SWITCHES = (50, 200)  # and per second: slip at every extremum of a nutation of 30 Hz has 120; more is chatter
 # slip that hardly exceeds friction creeps: it follows within v / (3 mu g), and a step has to be as short
 TRIAL_SLIP_STEPS = 1_000  # for every frame, in a fit that is one trial among many; where slip is true, hundreds
@@ -148,6 +150,9 @@ class DiscSystem(System):
         seen = self.rig.project_with_jacobians(points)
         places, by_point, by_rig = (np.stack([x[0, :, 0], x[1, :, 1]], axis=1) for x in seen)
         rig = self.whitened(by_rig) @ square_root(self.rig.covariance)
+        _, singular, V = np.linalg.svd(triangle(rig.reshape(-1, rig.shape[-1])))
+        shown = V[singular > MIN_NUISANCE]
+        rig = rig @ shown.T @ shown  # by the same numbers in all recordings of the rig
         along = np.einsum("ncmap,cnpb->ncmab", by_point, R[..., :2])  # by the dots' places on the face
         m, sizes = self.disc.n_markers, self.systematic
         dots = (self._whiten @ along)[:, :, :, :, None, :] * np.eye(m)[None, None, :, None, :, None]

@@ -65,7 +65,8 @@ def _plan(answer: TogetherDiagnosis, crew: Crew) -> Plan | None:
         return None
     tested = [q for question in questions for c in question for q in c.quantities]
     everything = {q.name: q for q in (*tested, *after.quantities)}
-    names = {there: shared for shared, there in sharing.local[longest].items() if shared in everything}
+    parts = reversed(sharing.local[longest].items())  # of those that are sums, the first part stays
+    names = {there: shared for shared, there in parts if shared in everything}
     others = [n for n in everything if n not in set(names.values())]
     values = {n: q.null for n, q in everything.items()} | after.values
     _, derivative = system.linearise(values, [*others, *names.values()])
