@@ -293,7 +293,7 @@ def _judged(
     rig = rig_with_covariance(refinement, table_view, board_thickness, inflation, covariance, origin)
     rig = replace(rig, lens_field=fit.lens_field)
     with_board = with_tolerances(rig, board.points, table_view, board_thickness, settings.tolerances, shape)
-    chosen = next(row for row in reversed(fit.candidates) if row.terms == refinement.terms)
+    chosen = next(row for row in fit.candidates if row.terms == refinement.terms)
     assessment = assess(refinement, chosen, rig, with_board, table_view, inflation, fit.motion, wide)
     return with_board, assessment, note
 

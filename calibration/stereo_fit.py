@@ -13,7 +13,6 @@ from calibration.judge.pairs import LEAST_PAIRS, PairMotion, judge_pairs, motion
 from calibration.kit.arrays import Array
 
 REJUDGED = 2  # times that pairs are judged by the refined cameras, and these refined again
-Refined = tuple[Refinement, tuple[TermsTried, ...]]
 
 
 @dataclass(frozen=True)
@@ -22,7 +21,7 @@ class JointFit:
 
     refinement: Refinement  # of observations that the field of the lenses has corrected, where there is one
     lens_field: LensField | None
-    candidates: tuple[TermsTried, ...]  # all that were compared
+    candidates: tuple[TermsTried, ...]  # of which its terms were chosen
     pairs: Pairs
     motion: PairMotion | None  # of the boards between the exposures
     bad_images: dict[tuple[int, int], str]  # (view, camera) that cannot be used -> reason
@@ -44,10 +43,10 @@ def fit_jointly(
     # rough poses may be degrees off: refined cameras judge those anew that do not agree
     pairs = used = start if not start.steps and len(start.views) >= LEAST_PAIRS else replace(start, odd={})
 
-    def refined(by: Pairs, tried: Sequence[Terms], motion: BoardMotion | None = None) -> Refined:
+    def refined(by: Pairs, motion: BoardMotion | None = None) -> tuple[Refinement, tuple[TermsTried, ...]]:
         return choose_board(observations, by.joined(observations), nominal, tried, motion)
 
-    refinement, candidates = refined(used, tried)
+    refinement, candidates = refined(used)
     bad_images: dict[tuple[int, int], str] = {}
     for _ in range(REJUDGED):
         pairs = judge_pairs(observations, refinement, pairs.others, table_view)
@@ -57,8 +56,7 @@ def fit_jointly(
         for view, camera in pairs.bad_images:
             observations = observations[(observations.view != view) | (observations.camera != camera)]
         used = pairs
-        refinement, again = refined(used, (refinement.terms,))
-        candidates = (*candidates, *again)
+        refinement, candidates = refined(used)
     motion, (field, corrected) = motion_between_exposures(refinement), fit_lens_field(refinement, nominal)
     likely = motion is not None and motion.is_likely
     if motion is not None and likely and field is not None:
@@ -67,7 +65,6 @@ def fit_jointly(
         motion = replace(left, scatter=max(motion.scatter, left.scatter))
         likely = motion.is_seen
     if motion is not None and likely:
-        refinement, again = refined(used, tried, motion.as_random(nominal))
-        candidates = (*candidates, *again)
+        refinement, candidates = refined(used, motion.as_random(nominal))
         field, corrected = fit_lens_field(refinement, nominal)
     return JointFit(corrected, field, candidates, pairs, motion, bad_images)
