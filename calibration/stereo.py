@@ -233,7 +233,7 @@ def calibrate_from_corners(
     distortion = RICHEST if settings.distortion == "auto" else settings.distortion
     tried = [Terms(distortion, shape) for shape in (shapes if settings.board == "auto" else (settings.board,))]
     fit = fit_jointly(observations, start, board.points, tried, table_view)
-    for (v, camera), why in fit.bad_images.items():
+    for (v, camera), why in fit.pairs.bad_images.items():
         views[camera][v] = BoardNotFound(why)
     apart = _told_apart(fit, names, table_view)
     _require_fitted(fit, _not_used(views, names), apart, wide, table_view)

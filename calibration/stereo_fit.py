@@ -12,8 +12,6 @@ from calibration.fit.stereo_model import Observations, Terms
 from calibration.judge.pairs import LEAST_PAIRS, PairMotion, judge_pairs, motion_between_exposures
 from calibration.kit.arrays import Array
 
-REJUDGED = 2  # times that pairs are judged by the refined cameras, and these refined again
-
 
 @dataclass(frozen=True)
 class JointFit:
@@ -24,7 +22,6 @@ class JointFit:
     candidates: tuple[TermsTried, ...]  # of which its terms were chosen
     pairs: Pairs
     motion: PairMotion | None  # of the boards between the exposures
-    bad_images: dict[tuple[int, int], str]  # (view, camera) that cannot be used -> reason
 
 
 def fit_jointly(
@@ -41,18 +38,15 @@ def fit_jointly(
     table_view : where a camera was moved, the cameras' places are those at it
     """
     # rough poses may be degrees off: refined cameras judge those anew that do not agree
-    pairs = used = start if not start.steps and len(start.views) >= LEAST_PAIRS else replace(start, odd={})
+    used = start if not start.steps and len(start.views) >= LEAST_PAIRS else replace(start, odd={})
 
     def refined(by: Pairs, motion: BoardMotion | None = None) -> tuple[Refinement, tuple[TermsTried, ...]]:
         return choose_board(observations, by.joined(observations), nominal, tried, motion)
 
     refinement, candidates = refined(used)
-    bad_images: dict[tuple[int, int], str] = {}
-    for _ in range(REJUDGED):
-        pairs = judge_pairs(observations, refinement, pairs.others, table_view)
-        if pairs.apart == used.apart and not pairs.bad_images:
-            break
-        bad_images |= pairs.bad_images
+    # once: it is by a place of the board for each image, and finds as many by cameras that no bad pair pulls any more
+    pairs = judge_pairs(observations, refinement, used.others, table_view)
+    if pairs.apart != used.apart or pairs.bad_images:
         for view, camera in pairs.bad_images:
             observations = observations[(observations.view != view) | (observations.camera != camera)]
         used = pairs
@@ -67,4 +61,4 @@ def fit_jointly(
     if motion is not None and likely:
         refinement, candidates = refined(used, motion.as_random(nominal))
         field, corrected = fit_lens_field(refinement, nominal)
-    return JointFit(corrected, field, candidates, pairs, motion, bad_images)
+    return JointFit(corrected, field, candidates, pairs, motion)
