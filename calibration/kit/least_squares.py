@@ -212,12 +212,16 @@ def minimise(
 
 
 def triangle(matrix: Array) -> Array:
-    """R of the QR decomposition of a tall matrix (m, k), in pieces of rows that stay in the processor's cache."""
+    """R of the QR decomposition of a tall matrix (m, k), in pieces of rows that stay in the processor's cache.
+
+    Its diagonal is positive: signs are open, and noise that is drawn for the rows would be another with other signs.
+    """
     m, k = matrix.shape
     piece = 8 * max(k, 1)
     whole = m // piece
     if whole < 2:
-        return np.asarray(np.linalg.qr(matrix, mode="r"), float)
+        R = np.linalg.qr(matrix, mode="r")
+        return np.asarray(np.where(np.diag(R) < 0, -1.0, 1.0)[:, None] * R, float)
     parts = np.asarray(np.linalg.qr(matrix[: whole * piece].reshape(whole, piece, k), mode="r")).reshape(-1, k)
     return triangle(np.vstack([parts, matrix[whole * piece :]]))
 
