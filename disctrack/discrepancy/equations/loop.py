@@ -11,7 +11,17 @@ from disctrack.discrepancy.equations import terms as library
 from disctrack.discrepancy.equations.declared import Equations, Run, Samples, Term, checked
 from disctrack.discrepancy.equations.formulas import Formulas
 from disctrack.discrepancy.equations.law import LearnedForce, learn, with_law
-from disctrack.discrepancy.equations.start import LOST, guessed, lasting, led, misfit, sizes_alike, trusted, turn
+from disctrack.discrepancy.equations.start import (
+    LOST,
+    guessed,
+    lasting,
+    led,
+    misfit,
+    sizes_alike,
+    telling,
+    trusted,
+    turn,
+)
 from disctrack.discrepancy.equations.system import MOST_STATES, EquationSystem, fitted_rows
 from disctrack.discrepancy.fit import Fit, fit, no_fit
 from disctrack.discrepancy.noise import (
@@ -299,17 +309,17 @@ def _with_memory(system: EquationSystem, diagnosis: Diagnosis, settings: Setting
     if not coefficients.any():
         return diagnosis, False, []
     size = float(np.sqrt(np.sum(residual**2) / max(present.sum(), 1)))
-    lasting = persistence(residual, system.rows) * float(np.median(np.diff(system.stretches[0].time)))
-    shortest_turn = min(min(turn(s), _pace(s)) for s in system.stretches)
+    memory = persistence(residual, system.rows) * float(np.median(np.diff(telling(system)[0].time)))
+    shortest_turn = min(min(turn(s), _pace(s)) for s in telling(system))
     # so slow an error is the motion's own: that it can be predicted sample by sample does not make it noise
-    as_noise = diagnosis.verdict != "unexplained" or lasting <= SLOW * shortest_turn
+    as_noise = diagnosis.verdict != "unexplained" or memory <= SLOW * shortest_turn
     as_noise &= size <= NO_SENSOR
     remembering = without_memory(system, system.rows, coefficients, present)
     base = fit(remembering, system.base, diagnosis.before.values) if as_noise else None
     if base is None or not base.converged:
         if diagnosis.verdict != "unexplained":
             return diagnosis, False, []
-        reason = f"what is left is {size:.3g} times the noise and lasts for {lasting:.2g} s: no sensor's noise"
+        reason = f"what is left is {size:.3g} times the noise and lasts for {memory:.2g} s: no sensor's noise"
         diagnosis = replace(_certain(system, diagnosis), reason=reason)
         return diagnosis, False, ["sigmas are those of what is left, not of the noise alone"]
     noise = float(share * size**2)
@@ -327,7 +337,8 @@ def _pace(s: Samples) -> float:
     Of such data the strongest line is the slowest, and says nothing of how fast they change.
     """
     rows = np.isfinite(s.data)
-    away = np.where(rows, (s.data - np.nanmean(s.data, axis=0)) / s.sigma, 0.0)
+    mean = np.nansum(s.data, axis=0) / np.maximum(rows.sum(axis=0), 1)  # a channel may show nothing in a stretch
+    away = np.where(rows, (s.data - mean) / s.sigma, 0.0)
     return persistence(away, [slice(0, len(away))]) * float(np.median(np.diff(s.time))) / FORGOTTEN
 
 

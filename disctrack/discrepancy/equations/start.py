@@ -96,6 +96,12 @@ def turn(s: Samples) -> float:
     return found
 
 
+def telling(system: EquationSystem) -> list[Samples]:
+    """Stretches of half as many samples as the longest, or more: a few before a gap tell no turn."""
+    most = max(len(s.time) for s in system.stretches)
+    return [s for s in system.stretches if 2 * len(s.time) >= most]
+
+
 def guessed(system: EquationSystem) -> tuple[dict[str, float], Array]:
     """Initial states of every stretch by the names of their quantities, and the sizes (n,) of the states."""
     f = system.formulas
@@ -177,8 +183,8 @@ def cut_short(system: EquationSystem, share: float = SHORT, most: float = np.inf
 
     most : stretches that are used: those that begin where longer ones do
     """
-    spacing = min(float(np.median(np.diff(s.time))) for s in system.stretches)
-    duration = max(share * min(turn(s) for s in system.stretches), FEWEST * spacing)
+    spacing = min(float(np.median(np.diff(s.time))) for s in telling(system))
+    duration = max(share * min(turn(s) for s in telling(system)), FEWEST * spacing)
     levels: list[list[Samples]] = []
     while not levels or len(levels[-1]) > len(system.stretches):
         levels.append([part for s in system.stretches for part in cut(s, duration)])

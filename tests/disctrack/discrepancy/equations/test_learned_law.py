@@ -71,6 +71,20 @@ def test_a_law_of_one_variable_is_learned(name):
         assert answer.after["x"].rms == pytest.approx(SIGMA, rel=0.1)
 
 
+def test_a_sample_long_before_all_others_tells_no_turn(rng):
+    time = np.append(0.0, 2.0 + 0.05 * np.arange(300))
+    swing = solve_ivp(
+        lambda t, y: [y[1], -20 * y[0] - 30 * y[0] ** 3 - 0.3 * y[1]], time[[0, -1]], [1.2, 0.0],
+        t_eval=time, rtol=1e-9, atol=1e-11,
+    )  # fmt: skip
+    run = Run(time, {"x": swing.y[0] + SIGMA * rng.standard_normal(len(time))}, sigma=SIGMA)
+    declared = Equations({"x": "v", "v": "-k*x - c*v"}, {"k": 25.0, "c": 0.3})
+    answer = diagnose(declared, run, [terms.constant("v")])
+    assert answer.found == (NAME,)
+    course = answer.law.variable
+    assert np.median(np.abs(answer.law.force - (5 * course - 30 * course**3)) / answer.law.sigma) < 2.0
+
+
 def test_a_law_of_two_variables_is_learned_where_none_of_one_will_do(tmp_path):
     """A drag that drives near the middle and brakes outside, less and less: a swing that no term sustains."""
 
