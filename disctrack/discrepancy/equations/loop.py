@@ -11,17 +11,7 @@ from disctrack.discrepancy.equations import terms as library
 from disctrack.discrepancy.equations.declared import Equations, Run, Samples, Term, checked
 from disctrack.discrepancy.equations.formulas import Formulas
 from disctrack.discrepancy.equations.law import LearnedForce, learn, with_law
-from disctrack.discrepancy.equations.start import (
-    LOST,
-    guessed,
-    lasting,
-    led,
-    misfit,
-    sizes_alike,
-    telling,
-    trusted,
-    turn,
-)
+from disctrack.discrepancy.equations.start import LOST, ample, guessed, lasting, led, misfit, sizes_alike, trusted, turn
 from disctrack.discrepancy.equations.system import MOST_STATES, EquationSystem, fitted_rows
 from disctrack.discrepancy.fit import Fit, fit, no_fit
 from disctrack.discrepancy.noise import (
@@ -309,8 +299,8 @@ def _with_memory(system: EquationSystem, diagnosis: Diagnosis, settings: Setting
     if not coefficients.any():
         return diagnosis, False, []
     size = float(np.sqrt(np.sum(residual**2) / max(present.sum(), 1)))
-    memory = persistence(residual, system.rows) * float(np.median(np.diff(telling(system)[0].time)))
-    shortest_turn = min(min(turn(s), _pace(s)) for s in telling(system))
+    memory = persistence(residual, system.rows) * float(np.median(np.diff(ample(system)[0].time)))
+    shortest_turn = min(min(turn(s), _pace(s)) for s in ample(system))
     # so slow an error is the motion's own: that it can be predicted sample by sample does not make it noise
     as_noise = diagnosis.verdict != "unexplained" or memory <= SLOW * shortest_turn
     as_noise &= size <= NO_SENSOR

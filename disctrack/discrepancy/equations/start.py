@@ -96,7 +96,7 @@ def turn(s: Samples) -> float:
     return found
 
 
-def telling(system: EquationSystem) -> list[Samples]:
+def ample(system: EquationSystem) -> list[Samples]:
     """Stretches of half as many samples as the longest, or more: a few before a gap tell no turn."""
     most = max(len(s.time) for s in system.stretches)
     return [s for s in system.stretches if 2 * len(s.time) >= most]
@@ -183,8 +183,8 @@ def cut_short(system: EquationSystem, share: float = SHORT, most: float = np.inf
 
     most : stretches that are used: those that begin where longer ones do
     """
-    spacing = min(float(np.median(np.diff(s.time))) for s in telling(system))
-    duration = max(share * min(turn(s) for s in telling(system)), FEWEST * spacing)
+    spacing = min(float(np.median(np.diff(s.time))) for s in ample(system))
+    duration = max(share * min(turn(s) for s in ample(system)), FEWEST * spacing)
     levels: list[list[Samples]] = []
     while not levels or len(levels[-1]) > len(system.stretches):
         levels.append([part for s in system.stretches for part in cut(s, duration)])
