@@ -30,12 +30,12 @@ def quietly() -> Iterator[None]:
         sys.modules["__main__"] = ModuleType("__main__")
         os.environ.update(ONE_THREAD)
         blocked = signal.pthread_sigmask(signal.SIG_BLOCK, kinds) if kinds else set()
-        if kinds:
-            from multiprocessing.resource_tracker import ensure_running  # not on Windows
-
-            ensure_running()  # it begins with the first process, and leaves Ctrl-C unblocked
-            signal.pthread_sigmask(signal.SIG_BLOCK, kinds)
         try:
+            if kinds:
+                from multiprocessing.resource_tracker import ensure_running  # not on Windows
+
+                ensure_running()  # it begins with the first process, and leaves Ctrl-C unblocked
+                signal.pthread_sigmask(signal.SIG_BLOCK, kinds)
             yield
         finally:
             sys.modules["__main__"] = script

@@ -31,6 +31,7 @@ from disctrack.batch.locks import locked
 from disctrack.batch.measure import LOCK, do
 from disctrack.batch.plan import make_plan
 from disctrack.batch.records import MEASURED, is_done, read_record
+from disctrack.processes import Spawn
 from disctrack.track.follow.tracking import prepare
 from disctrack.trajectory.file import read_trajectory
 from tests.pipeline.conftest import MODEL, linked
@@ -382,6 +383,20 @@ def test_what_a_terminal_sends_spares_even_the_first_process():
     code = f"from disctrack.processes import Spawn; process = {process}; process.start(); process.join()"
     ended = subprocess.run([sys.executable, "-c", f"{code}; raise SystemExit(process.exitcode)"], cwd=REPOSITORY)
     assert ended.returncode == 2
+
+
+def test_where_no_process_can_be_started_all_is_as_before(monkeypatch):
+    def refused():
+        raise OSError(errno.EAGAIN, "no more processes")
+
+    def found():
+        return sys.modules["__main__"], dict(os.environ), signal.pthread_sigmask(signal.SIG_BLOCK, ())
+
+    monkeypatch.setattr("multiprocessing.resource_tracker.ensure_running", refused)
+    before = found()
+    with pytest.raises(OSError, match="no more processes"):
+        Spawn().Process(target=print).start()
+    assert found() == before
 
 
 @pytest.mark.statistical
