@@ -127,11 +127,7 @@ class Planner:
             kept = [q for q in fit.quantities if q.name not in new]
             self.now = self._said(system, fit.values, [*kept, *self.tested])
         else:
-            known, rows = said
-            self.now = np.zeros((len(rows), len(names)))
-            for j, name in enumerate(known):
-                if name in self.column:
-                    self.now[:, self.column[name]] = rows[:, j]
+            self.now = self._placed(*said)
 
     def with_(self, proposal: Proposal) -> tuple[Array, float] | None:
         """Rows of this recording and of the proposed one, and how long that lasts; None where it cannot be made."""
@@ -175,11 +171,15 @@ class Planner:
         reduced = Reduction(system, own, start).reduce(start, names)
         if reduced is None:
             raise AnalysisError("the motion cannot be followed")
-        mixing = np.zeros((len(names), len(self.column)))
-        for row, name in enumerate(names):
+        return np.asarray(triangle(self._placed(names, reduced[1])) / np.sqrt(self._noise), float)
+
+    def _placed(self, names: Sequence[str], rows: Array) -> Array:
+        """Rows (m, k) by these quantities, in the planner's columns; others are left out."""
+        placed = np.zeros((len(rows), len(self.column)))
+        for j, name in enumerate(names):
             if name in self.column:
-                mixing[row, self.column[name]] = 1.0
-        return np.asarray(triangle(reduced[1] @ mixing) / np.sqrt(self._noise), float)
+                placed[:, self.column[name]] = rows[:, j]
+        return placed
 
     def _planned(self, proposal: Proposal) -> tuple[DiscSystem, dict[str, float]]:
         """The system of a recording as proposed, by the same cameras with the same noise, and its fitted values.
