@@ -11,12 +11,12 @@ from calibration.board.chessboard import BoardNotFound, CornerView, negatives
 from calibration.board.search import Progress, located
 from calibration.board.target import Board, Target
 from calibration.cameras.camera import CAMERA_NAMES, StereoRig
-from calibration.fit.pairing import MIN_VIEWS, Names, Pairs, Views, count_once
+from calibration.fit.pairing import FLOOR, MIN_VIEWS, Names, Pairs, Views, count_once
 from calibration.fit.refinement import Refinement, TermsTried
 from calibration.fit.start import start_stereo, too_wide
 from calibration.fit.stereo_model import BOARD_MODELS, RICHEST, Observations, Terms
 from calibration.judge.assessment import Assessment, assess, stereo_covariance
-from calibration.judge.pairs import gradients_by_motion, moved_cameras, moved_told, zoomed
+from calibration.judge.pairs import compared, motion_between_exposures, moved_told, zoomed
 from calibration.judge.tolerances import (
     BoardShape,
     BoardTolerances,
@@ -222,7 +222,7 @@ def calibrate_from_corners(
     start, notes = _begin(views, board, names)
     observations = _observations(views)
     wide = too_wide(observations, board.points, start.model.rig.cameras)
-    start = moved_cameras(observations, start, table_view)
+    start = compared(observations, start, table_view, FLOOR)
     if start.steps and (lenses := zoomed(observations, start, board.points)):
         for camera, why in lenses.items():
             for v in start.others:
@@ -285,7 +285,8 @@ def _judged(
     refinement, note = fit.refinement, []
     inflation = max(refinement.disagreement, 1.0)
     shape = board_shape(refinement, board.points, inflation)
-    covariance = stereo_covariance(refinement, gradients_by_motion(refinement))
+    moved = None if refinement.problem.motion else motion_between_exposures(refinement)
+    covariance = stereo_covariance(refinement, moved and moved[1])
     if refinement.terms.board in shapes:
         left_out, sigmas = shape_left_out(refinement, board.points, shapes, inflation)
         covariance, note = covariance + left_out, [_not_as_told(settings.board, shape, sigmas)] if sigmas > 1.0 else []

@@ -9,7 +9,7 @@ from calibration.fit.lens_field import fit_lens_field
 from calibration.fit.pairing import Pairs
 from calibration.fit.refinement import Refinement, TermsTried, choose_board
 from calibration.fit.stereo_model import Observations, Terms
-from calibration.judge.pairs import LEAST_PAIRS, PairMotion, judge_pairs, motion_between_exposures
+from calibration.judge.pairs import PairMotion, judge_pairs, motion_between_exposures
 from calibration.kit.arrays import Array
 
 
@@ -38,24 +38,25 @@ def fit_jointly(
     table_view : where a camera was moved, the cameras' places are those at it
     """
     # rough poses may be degrees off: refined cameras judge those anew that do not agree
-    used = start if not start.steps and len(start.views) >= LEAST_PAIRS else replace(start, odd={})
+    used = replace(start, odd={}) if start.steps else start
 
     def refined(by: Pairs, motion: BoardMotion | None = None) -> tuple[Refinement, tuple[TermsTried, ...]]:
         return choose_board(observations, by.joined(observations), nominal, tried, motion)
 
     refinement, candidates = refined(used)
     # once: it is by a place of the board for each image, and finds as many by cameras that no bad pair pulls any more
-    pairs = judge_pairs(observations, refinement, used.others, table_view)
+    pairs = judge_pairs(observations, refinement, table_view)
     if pairs.apart != used.apart or pairs.bad_images:
         for view, camera in pairs.bad_images:
             observations = observations[(observations.view != view) | (observations.camera != camera)]
         used = pairs
         refinement, candidates = refined(used)
-    motion, (field, corrected) = motion_between_exposures(refinement), fit_lens_field(refinement, nominal)
+    found, (field, corrected) = motion_between_exposures(refinement), fit_lens_field(refinement, nominal)
+    motion = found and found[0]
     likely = motion is not None and motion.is_likely
-    if motion is not None and likely and field is not None:
+    if found is not None and motion is not None and likely and field is not None:
         # a field puts boards elsewhere for each camera, too, and what is left of it does: by the scatter before it
-        left = motion_between_exposures(corrected) or motion
+        left, _ = motion_between_exposures(corrected) or found
         motion = replace(left, scatter=max(motion.scatter, left.scatter))
         likely = motion.is_seen
     if motion is not None and likely:

@@ -136,7 +136,7 @@ class Pairs:
 
     model: StereoModel  # its boards where each image alone has them
     views: NDArray[np.intp]  # of which both images tell that
-    odd: dict[int, str]  # view -> why its two images are not taken for one place
+    odd: dict[int, str] = field(default_factory=dict)  # view -> why its two images are not taken for one place
     bad_images: dict[tuple[int, int], str] = field(default_factory=dict)  # (view, camera) -> why not even alone
     # Where a camera was moved between the views: the stretches of pairs before and after such steps, and of each step
     # turn [rad], shift [m], and [px] between pairs on either side of it and between those of one side, in the right

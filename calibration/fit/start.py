@@ -77,7 +77,7 @@ def start_stereo(
     names: Names,
     orders: Sequence[NDArray[np.intp]] | None = None,
 ) -> tuple[Pairs, dict[int, NDArray[np.intp]], tuple[str, ...]]:
-    """Rough cameras, how they stand to each other, and which images are pairs; those that do not agree are apart.
+    """Rough cameras, how they stand to each other, and which images are pairs.
 
     names : (left, right) of all views; orders : in which the target looks the same; only as it is without
     returns also : of pairs, in which order the right image shows the target's points; and notes about them
@@ -108,9 +108,8 @@ def start_stereo(
         for view, (R, t) in alone.items():
             R_board[view, image], t_board[view, image] = R, t
     model = StereoModel(StereoRig(cameras[0], cameras[1], R_pair, t_pair), R_board, t_board, nominal.copy())
-    odd = {v: "" for v, agrees in zip(both, pairs.agrees, strict=True) if not agrees}
     orders_seen = {v: orders[k] for v, k in zip(both, pairs.order, strict=True)}
-    return Pairs(model, np.array(both), odd), orders_seen, notes
+    return Pairs(model, np.array(both)), orders_seen, notes
 
 
 def too_wide(observations: Observations, nominal: Array, cameras: tuple[Camera, Camera]) -> tuple[tuple[str, str], ...]:

@@ -167,7 +167,7 @@ def test_a_field_of_the_lenses_is_no_motion_of_the_boards(seed, rng):
     left, right = found.corner_views
     begun, terms, points = found.refinement.model, found.refinement.terms, found.board.points
     plain = refine_stereo(_observations((list(left), list(right))), begun, points, terms)
-    assert motion_between_exposures(plain).is_seen
+    assert motion_between_exposures(plain)[0].is_seen
     # and boards that do move are still told: 0.1 px are 25 um here
     moving = [replace(view, points=view.points + 0.1 * rng.normal(size=2)) for view in right]
     both = calibrate_from_corners(left, moving, found.board, CalibrationSettings(), 0, 3e-3)
@@ -182,7 +182,7 @@ def test_motions_that_no_pair_shows_for_itself_are_in_the_sigma():
         rig = moved_boards.make_rig(100 + seed)
         found = calibrated(rig, 5, seed, shift=0.1e-3, turn=0.1e-3)
         assert found.refinement.problem.motion is None
-        sizes.append(motion_between_exposures(found.refinement).size.shift)
+        sizes.append(motion_between_exposures(found.refinement)[0].size.shift)
         error, C = errors(found, rig)
         by_corners = stereo_covariance(found.refinement)[-6:, -6:]  # and by how the views disagree
         pair = error[-6:]
@@ -193,7 +193,7 @@ def test_motions_that_no_pair_shows_for_itself_are_in_the_sigma():
     assert without > 1.5 * pair
     assert_allclose(np.median(sizes), 0.1e-3, rtol=0.4)
     at_rest = (calibrated(moved_boards.make_rig(seed), 8, seed).refinement for seed in range(3))
-    assert max(motion_between_exposures(fit).size.shift for fit in at_rest) < 0.02e-3
+    assert max(motion_between_exposures(fit)[0].size.shift for fit in at_rest) < 0.02e-3
 
 
 def test_a_rig_file_keeps_where_the_boards_were(tmp_path):
