@@ -14,11 +14,12 @@ from disctrack import frames
 from disctrack.findings import Finding
 from disctrack.recording.readers.blocks import NotRead
 from disctrack.track.dots.template import dot_centres
+from disctrack.track.dots.template_response import plane_to_image
 from disctrack.track.follow.following import Follower, Tables, repeats
 from disctrack.track.judge.cameras import camera_course
 from disctrack.track.judge.doubts import FAULTY, doubts_of, repeated_images
 from disctrack.track.judge.outlier_tests import judge_poses, outlying_frames, unexpected_misfit
-from disctrack.track.pose import MIN_DOTS, DotsInFrames, PoseFits, fit_poses, whitening
+from disctrack.track.pose import MIN_DOTS, DotsInFrames, PoseFits, fit_poses, marker_pixels, whitening
 from disctrack.track.refine.dot_shifts import exposure_by_smear, exposure_of, shift_by_exposure, shift_by_glare
 from disctrack.track.refine.scatter import Scatter, scatter_of_poses, split_scatter, without_shared_faults
 from disctrack.track.refine.self_calibration import AsBuilt, by_pattern, refine_as_built
@@ -133,15 +134,16 @@ def _as_they_were(
 
     seen : altered; what misfits beyond noise is in the covariances then.  dots (n, 2, m) of `_kernels.DOT`
     """
-    where, rig, disc, edges = (seen.R, seen.t, taken.time), seen.rig, seen.disc, first.edges
-    found = exposure_by_smear(*where, dots["sigma"], rig, disc)
+    places, J = marker_pixels(seen.R, seen.t, seen.rig, seen.disc.marker_centres_body)
+    where, of = (places, plane_to_image(J, seen.R)), (0.5 * seen.disc.marker_diameter, first.edges)
+    found = exposure_by_smear(*where, taken.time, dots["sigma"])
     exposure, findings = exposure_of(found, settings.exposure, 1 / taken.frame_rate)
-    seen.pixels[...] -= shift_by_glare(seen.R, seen.t, dots["contrast"], rig, disc, edges)
+    seen.pixels[...] -= shift_by_glare(*where, dots["contrast"], *of)
     if any(exposure):
-        seen.pixels[...] -= shift_by_exposure(*where, np.array(exposure), rig, disc, edges)
+        seen.pixels[...] -= shift_by_exposure(*where, taken.time, np.array(exposure), *of)
     seen.covariance[...] *= unexpected_misfit(dots["chi_square"], dots["n_pixels"])[..., None, None]
-    if rig.lens_field is not None:
-        seen.pixels[...] = rig.lens_field.corrected(seen.pixels)
+    if seen.rig.lens_field is not None:
+        seen.pixels[...] = seen.rig.lens_field.corrected(seen.pixels)
     return exposure, findings
 
 

@@ -38,28 +38,23 @@ import numpy as np
 from numpy.polynomial.polynomial import polyder, polyval2d
 from numpy.typing import NDArray
 
-from calibration.cameras.camera import StereoRig
 from calibration.kit.arrays import Array, Mask
 from disctrack.analyse.quantities import SIGMAS
-from disctrack.disc import Disc
 from disctrack.findings import Finding, Kind, Severity
 from disctrack.frames import CAMERAS
 from disctrack.track.dots.template_response import (
     AROUND,
     Edge,
     half_axes,
-    plane_to_image,
     pulls,
     turned_to_axes,
 )
-from disctrack.track.pose import marker_pixels
-from disctrack.track.side_by_side import MIN_FRAMES, SHARED_FRAMES, evenly, parts
+from disctrack.track.side_by_side import MIN_FRAMES, SHARED_FRAMES, evenly
 
 PARTS = 10  # stretches of the recording, each left out in turn: what the fit leaves has a memory
 SURE = 3.0  # sigmas of T^2, or the exposure is taken as short
 APPROXIMATE = 0.1  # relative, of T^2: one blur stands for an edge that is smeared more here than there
 DEGREE = 4  # of the polynomial: glare as wide as the disc's path
-SAME = 1 / 16  # of a dot's diameter, about a pixel
 # Standard deviations of what one term adds to the contrast over the dots' path, in those of the contrast itself: the
 # likeliest is the prior, so that noise, and large terms that cancel where the dots are, shift nothing. It must be
 # likelier than no gradient by this much
@@ -68,54 +63,36 @@ LIKELIER = 6.0  # of natural logarithms
 
 
 def shift_by_exposure(
-    R: Array, t: Array, time: Array, exposure: Array, rig: StereoRig, disc: Disc, edges: tuple[Edge, ...]
+    pixels: Array, affine: Array, time: Array, exposure: Array, radius: float, edges: tuple[Edge, ...]
 ) -> Array:
     """(n, 2, m, 2) [px] by which the dots of an exposure lie beside their places at mid exposure; zero where not known.
 
-    R (n, 3, 3), t (n, 3) [m]: poses, NaN where there is none; time (n,) [s]; exposure (2,) of the left and the right
-    camera [s]; edges: of the dots in each camera. Rates are those of three poses in a row: their noise adds at most
-    0.1 of itself (T as long as the frame interval), what differences leave out is (psidot / frame_rate)^2 / 12 of the
-    shift.
+    pixels (n, 2, m, 2) of dots of this radius [m], affine (n, 2, m, 2, 2) [px/m] from the disc's plane to the image,
+    NaN where there is no pose; time (n,) [s]; exposure (2,) of the left and the right camera [s]; edges: of the dots in
+    each camera. Rates are those of three poses in a row: their noise adds at most 0.1 of itself (T as long as the frame
+    interval), what differences leave out is (psidot / frame_rate)^2 / 12 of the shift.
     """
-    each = np.full((len(R), 2, disc.n_markers, 2), np.nan)
-    for part in parts(len(R)):
-        rows = slice(max(part.start - 1, 0), part.stop + 1)  # with their neighbours
-        each[rows][1:-1] = _second_order(R[rows], t[rows], time[rows], rig, disc, edges)[1:-1]
-    known: Mask = np.asarray(np.isfinite(each).all(axis=(1, 2, 3)))
-    wanted = np.flatnonzero(np.isfinite(t).all(axis=1) & ~known)
-    for beside in (wanted - 1, wanted + 1):  # a gap: as of a neighbour
-        use = known[np.clip(beside, 0, len(known) - 1)]
-        each[wanted[use]] = each[beside[use]]
-    shift = np.asarray(exposure)[:, None, None] ** 2 / 24 * each
-    return np.where(np.isfinite(shift), shift, 0.0)
+    found = each = _second_order(pixels, affine, time, radius, edges)
+    for away in (-1, 1):  # beside a gap: as of a neighbour
+        found = np.where(np.isfinite(found), found, np.roll(each, away, axis=0))
+    return np.nan_to_num(exposure[:, None, None] ** 2 / 24 * found)
 
 
-def exposure_by_smear(R: Array, t: Array, time: Array, blur_px: Array, rig: StereoRig, disc: Disc) -> Array:
+def exposure_by_smear(pixels: Array, affine: Array, time: Array, blur_px: Array) -> Array:
     """(2, 2) T^2 of the left and the right camera [s^2] by the dots' edges, and its sigmas.
 
     Arguments as of `shift_by_exposure`; blur_px (n, 2, m) sigma of an edge. NaN, sigma infinite, where nothing tells.
-    The squared blur is fitted by a constant of every dot, what changes with the distance (to second order), with the
-    place in the image and with how obliquely a dot is seen (to first: blurs of curved edges are off by some 1e-4 px,
-    which would hide a twentieth of 200 us), and T^2 times the smear of one second's exposure. Sigmas are those of the
-    jackknife over stretches of the recording, as what a lens adds is not white.
+    The squared blur is fitted by a constant of every dot, what changes with the distance, as the size does (to second
+    order), with the place in the image and with how obliquely a dot is seen (to first: blurs of curved edges are off by
+    some 1e-4 px, which would hide a twentieth of 200 us), and T^2 times the smear of one second's exposure. Sigmas are
+    those of the jackknife over stretches of the recording, as what a lens adds is not white.
     """
-    chosen = evenly(np.arange(len(t)), SHARED_FRAMES)
-    rows = np.unique(np.clip(chosen[:, None] + np.arange(-1, 2), 0, len(t) - 1))  # with their neighbours
-    own = np.searchsorted(rows, chosen)
-    pixels, J = marker_pixels(R[rows], t[rows], rig, disc.marker_centres_body)
-    affine = plane_to_image(J[own], R[chosen])
-    smear = _smear(_rate(pixels, time[rows])[own], affine)
-    points = disc.marker_centres_body @ np.swapaxes(R[chosen], 1, 2) + t[chosen, None]
-
-    def of_camera(camera: int) -> tuple[float, float]:
-        R_camera_world, t_camera_world = rig.camera_poses()[camera]
-        distance = points @ R_camera_world[2] + t_camera_world[2]
-        long, short = half_axes(affine[:, camera])
-        optics = distance, *np.moveaxis(pixels[own, camera], -1, 0), short / long
-        squared = blur_px[chosen, camera] ** 2
-        return _slope(squared, smear[:, camera], [distance**2, *optics])
-
-    return np.transpose([of_camera(camera) for camera in (0, 1)])
+    chosen = evenly(np.arange(len(time)), SHARED_FRAMES)
+    smear = _smear(_rate(pixels, time)[chosen], affine[chosen])
+    long, short = half_axes(affine[chosen])
+    x, y = np.moveaxis(pixels[chosen], -1, 0)
+    rows = np.stack([long**-2, 1 / long, x, y, short / long, smear, blur_px[chosen] ** 2], axis=-1)
+    return np.transpose([_slope(rows[:, camera]) for camera in (0, 1)])
 
 
 def exposure_of(
@@ -168,22 +145,18 @@ def _in_words(camera: str, squared: float, sigma: float) -> str:
     return f"{camera} below {1e6 * np.sqrt(max(squared, 0.0) + SURE * sigma):.0f} µs"
 
 
-def _second_order(R: Array, t: Array, time: Array, rig: StereoRig, disc: Disc, edges: tuple[Edge, ...]) -> Array:
+def _second_order(pixels: Array, affine: Array, time: Array, radius: float, edges: tuple[Edge, ...]) -> Array:
     """(n, 2, m, 2) [px/s^2] the bracket of the module's first equation; NaN at the ends and beside gaps."""
-    pixels, J = marker_pixels(R, t, rig, disc.marker_centres_body)
-    affine = plane_to_image(J, R)
     velocity, acceleration = _rate(pixels, time), np.full_like(pixels, np.nan)
     since = np.diff(time)[:, None, None, None]
     slope = np.diff(pixels, axis=0) / since
     acceleration[1:-1] = 2 * (slope[1:] - slope[:-1]) / (since[1:] + since[:-1])
     known = np.isfinite(affine).all(axis=(-2, -1), keepdims=True)
-    affine = np.where(known, affine, np.eye(2))  # of a dot behind a camera; its rates are NaN
-    growth = _rate(affine, time) @ np.linalg.inv(affine)
-    pulled = np.empty_like(pixels)
+    growth = _rate(affine, time) @ np.linalg.inv(np.where(known, affine, np.eye(2)))  # NaN without a pose
     for camera, edge in enumerate(edges):
         of = affine[:, camera], growth[:, camera], velocity[:, camera]
-        pulled[:, camera] = _pulled(0.5 * disc.marker_diameter, *of, edge)
-    return np.asarray(acceleration + pulled)
+        acceleration[:, camera] += _pulled(radius, *of, edge)
+    return acceleration
 
 
 def _pulled(radius: float, affine: Array, growth: Array, velocity: Array, edge: Edge) -> Array:
@@ -219,9 +192,8 @@ def _smear(velocity: Array, affine: Array) -> Array:
     return np.asarray((length * outwards**2).sum(axis=-1) / length.sum(axis=-1) / 12)
 
 
-def _slope(y: Array, x: Array, others: list[Array]) -> tuple[float, float]:
-    """Of y (n, m) over x (n, m), with its sigma: beside a constant of each column and slopes over `others` (n, m)."""
-    rows = np.stack([*others, x, y], axis=-1)
+def _slope(rows: Array) -> tuple[float, float]:
+    """Of the last of the rows (n, m, k) over the one before, with its sigma: beside constants of m and other slopes."""
     use = np.isfinite(rows).all(axis=-1)
     use &= use.sum(axis=0) >= MIN_FRAMES
     rows[~use] = 0.0
@@ -231,7 +203,7 @@ def _slope(y: Array, x: Array, others: list[Array]) -> tuple[float, float]:
     rows[..., :-1] /= np.where(scale > 0.0, scale, 1.0)
 
     def fitted(use: Mask) -> tuple[Array, Array]:
-        """Slopes, and how far (n, m) y is from them where it is used."""
+        """Slopes, and how far (n, m) the last is from them where it is used."""
         centred = _without_means(rows, use, axis=0)
         products = centred.reshape(-1, rows.shape[-1]).T @ centred.reshape(-1, rows.shape[-1])
         # columns that differ by less than 1e-6 of the largest from a sum of others are not told apart
@@ -242,43 +214,35 @@ def _slope(y: Array, x: Array, others: list[Array]) -> tuple[float, float]:
         told, (slopes, away) = use, fitted(use)
         use = away <= 4.0 * 1.4826 * np.median(away[told])
     # without each of the parts: where one alone tells, the others do not agree with it
-    part = np.arange(len(y))[:, None] * PARTS // len(y)
+    part = np.arange(len(rows))[:, None] * PARTS // len(rows)
     without = np.array([fitted(told & (part != k))[0][-1] for k in range(PARTS)])
     sigma = np.sqrt((PARTS - 1) * np.var(without))
     return float(slopes[-1] / scale[-1]), float(sigma / scale[-1])
 
 
-def shift_by_glare(R: Array, t: Array, contrast: Array, rig: StereoRig, disc: Disc, edges: tuple[Edge, ...]) -> Array:
+def shift_by_glare(pixels: Array, affine: Array, contrast: Array, radius: float, edges: tuple[Edge, ...]) -> Array:
     """(n, 2, m, 2) [px] by which templates find the dots beside their places; zero where not known.
 
-    R (n, 3, 3), t (n, 3) [m]: poses, NaN where there is none; contrast (n, 2, m) of each dot with its paper, NaN where
-    it was not seen; edges: of the dots in each camera. One dot tells nothing of the light at another.
+    Arguments as of `shift_by_exposure`; contrast (n, 2, m) of each dot with its paper, NaN where it was not seen. One
+    dot tells nothing of the light at another.
     """
-    n = len(R)
-    shift = np.zeros((n, 2, disc.n_markers, 2))
-    apart = _apart(R, t, disc)
-    chosen = evenly(apart, SHARED_FRAMES)
-    pixels = marker_pixels(R[chosen], t[chosen], rig, disc.marker_centres_body)[0]
-    gradients = [_gradient(pixels[:, c], contrast[chosen, c]) for c in (0, 1)]
-    for rows in parts(n if any(gradients) else 0):
-        places, J = marker_pixels(R[rows], t[rows], rig, disc.marker_centres_body)
-        affine = plane_to_image(J, R[rows])
-        for camera, (gradient, edge) in enumerate(zip(gradients, edges, strict=True)):
-            if gradient is not None:
-                axes = turned_to_axes(affine[:, camera])
-                along = (axes @ gradient(places[:, camera])[..., None])[..., 0]
-                along *= pulls(0.5 * disc.marker_diameter, affine[:, camera], edge)[..., 0]
-                shift[rows, camera] = np.nan_to_num((along[..., None, :] @ axes)[..., 0, :])
+    shift, chosen = np.zeros_like(pixels), evenly(_apart(pixels), SHARED_FRAMES)
+    for camera, edge in enumerate(edges):
+        gradient = _gradient(pixels[chosen, camera], contrast[chosen, camera])
+        if gradient is not None:
+            axes = turned_to_axes(affine[:, camera])
+            along = (axes @ gradient(pixels[:, camera])[..., None])[..., 0]
+            along *= pulls(radius, affine[:, camera], edge)[..., 0]
+            shift[:, camera] = np.nan_to_num((along[..., None, :] @ axes)[..., 0, :])
     return shift
 
 
-def _apart(R: Array, t: Array, disc: Disc) -> NDArray[np.intp]:
-    """Frames between which the dots went on by SAME of their diameter: what one at rest is off by repeats in all."""
-    places = np.einsum("nij,mj->nmi", R, disc.marker_centres_body) + t[:, None]
-    places = places[known := np.flatnonzero(np.isfinite(places).all(axis=(1, 2)))]
-    steps = np.linalg.norm(np.diff(places, axis=0, prepend=places[:1]), axis=-1).mean(axis=1)
-    path = np.floor(np.cumsum(steps) / (SAME * disc.marker_diameter))
-    return known[np.unique(path, return_index=True)[1]]
+def _apart(pixels: Array) -> NDArray[np.intp]:
+    """Frames between which the dots went on by a pixel: what one at rest is off by repeats in all."""
+    known = np.flatnonzero(np.isfinite(pixels).all(axis=(1, 2, 3)))
+    places = pixels[known]
+    steps = np.linalg.norm(np.diff(places, axis=0, prepend=places[:1]), axis=-1).mean(axis=(1, 2))
+    return known[np.unique(np.floor(np.cumsum(steps)), return_index=True)[1]]
 
 
 def _gradient(places: Array, contrast: Array) -> Callable[[Array], Array] | None:
