@@ -12,6 +12,7 @@ unequal shapes takes longer to compile than the loop); and only what Python call
 from __future__ import annotations
 
 import math
+from collections import namedtuple
 from typing import NamedTuple
 
 import numpy as np
@@ -41,31 +42,15 @@ class Limits(NamedTuple):
     blur: float = 3.0  # fitted blur, in typical blurs (plus 1 px): an image smeared beyond use
 
 
-class Rows(NamedTuple):
-    """Of what is kept of every pixel (16, n), in single precision; the first eight are the template's parameters, too.
-
-    Of a pixel these rows are derivatives by the parameter, over the pixel's sigma.
-    """
-
-    a: int = 0  # shift of the centre on the plane
-    b: int = 1
-    radius: int = 2
-    sigma: int = 3
-    level: int = 4
-    slope_x: int = 5
-    slope_y: int = 6
-    contrast: int = 7
-    x: int = 8  # place on the plane from the expected centre [px]
-    y: int = 9
-    offset_x: int = 10  # place in the image from the expected centre [10 px]
-    offset_y: int = 11
-    grey: int = 12
-    distance: int = 13  # from the edge [px]
-    residual: int = 14  # over the pixel's sigma
-    weight: int = 15  # one over that
-
-
-ROW = Rows()
+# What is kept of every pixel, (16, n) in single precision; the first eight are the template's parameters, too: of a
+# pixel these rows are derivatives by the parameter, over the pixel's sigma
+Rows = namedtuple(
+    "Rows",
+    "a b radius sigma level slope_x slope_y contrast "  # a, b: shift of the centre on the plane
+    "x y offset_x offset_y "  # from the expected centre: place on the plane [px], in the image [10 px]
+    "grey distance residual weight",  # distance from the edge [px]; residual over the pixel's sigma, and one over that
+)
+ROW = Rows(*range(len(Rows._fields)))
 _PIXELS = 4096 + 64  # of a dot of 60 px; more are made room for. No power of two: rows would share lines of the cache
 _MAX_SELECTIONS = 4
 _MAX_ITERATIONS = 20

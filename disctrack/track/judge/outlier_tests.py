@@ -6,7 +6,7 @@ taken from the frames around, so that a frame is judged by its neighbours and by
 """
 
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from math import comb
 
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from calibration.kit.arrays import Array, Mask
 from disctrack.frames import rotation_from_vector, vector_from_rotation
 from disctrack.track.pose import PoseFits
-from disctrack.track.side_by_side import AT_ONCE, FEW, stretches
+from disctrack.track.side_by_side import FEW, stretches
 from disctrack.trajectory import FrameStatus
 
 BLOCK = 16  # frames whose median is what is usual, with those of the blocks on both sides: half may be at fault
@@ -206,8 +206,8 @@ def departure(fits: PoseFits, weights: Mapping[int, float]) -> Array:
     frame to frame far better. NaN where one of the poses is missing.
     """
     square = np.full(len(fits.converged), np.nan)
-    for rows, away, spread in sums_over_time(fits, weights):
-        square[rows] = np.einsum("ni,ni->n", away, np.linalg.solve(spread, away[..., None])[..., 0])
+    rows, away, spread = sums_over_time(fits, weights)
+    square[rows] = np.einsum("ni,ni->n", away, np.linalg.solve(spread, away[..., None])[..., 0])
     return square
 
 
@@ -216,22 +216,22 @@ def differences(order: int, first: int) -> dict[int, float]:
     return {first + k: (-1.0) ** k * comb(order, k) for k in range(order + 1)}
 
 
-def sums_over_time(fits: PoseFits, weights: Mapping[int, float]) -> Iterator[tuple[NDArray[np.intp], Array, Array]]:
-    """Weighted sums of neighbours as in `departure`, some thousands at a time.
+def sums_over_time(fits: PoseFits, weights: Mapping[int, float]) -> tuple[NDArray[np.intp], Array, Array]:
+    """Weighted sums of neighbours as in `departure`.
 
-    yields : frames (k,); sums (k, 6) in POSE_COMPONENTS; the covariance (k, 6, 6) that noise gives them
+    returns : frames (k,); sums (k, 6) in POSE_COMPONENTS; the covariance (k, 6, 6) that noise gives them
     """
-    n, R, t, C = len(fits.converged), fits.R_world_body, fits.t_world_body, fits.covariance
-    offsets, weight = np.array([*weights]), np.array([*weights.values()])
-    rows = np.arange(max(-offsets.min(), 0), n - max(offsets.max(), 0))
-    near = rows[:, None] + offsets
-    good = fits.converged[near].all(axis=1)
-    for some in np.array_split(rows[good], len(rows) // AT_ONCE + 1):
-        near = some[:, None] + offsets
-        middle = near[:, [len(offsets) // 2]]
-        turn = vector_from_rotation(R[near] @ np.swapaxes(R[middle], 2, 3))  # by little, from there
-        away = np.einsum("k,nki->ni", weight, np.concatenate([t[near], turn], axis=2))
-        yield some, away, np.einsum("k,nkij->nij", weight**2, C[near])
+    R, t, C, offsets = fits.R_world_body, fits.t_world_body, fits.covariance, np.array([*weights])
+    rows = np.arange(max(-offsets.min(), 0), len(t) - max(offsets.max(), 0))
+    rows = rows[fits.converged[rows[:, None] + offsets].all(axis=1)]
+    back = np.swapaxes(R[rows + offsets[len(offsets) // 2]], 1, 2)
+    away, spread = np.zeros((len(rows), 6)), np.zeros((len(rows), 6, 6))
+    for offset, weight in weights.items():
+        near = rows + offset
+        turn = vector_from_rotation(R[near] @ back)  # by little, from there
+        away += weight * np.concatenate([t[near], turn], axis=1)
+        spread += weight**2 * C[near]
+    return rows, away, spread
 
 
 def torn_off(fits: PoseFits, period: float, radius: float) -> Mask:

@@ -136,12 +136,9 @@ def scatter_of_poses(fits: PoseFits) -> tuple[Array, Array, Array]:
     (6,) at least 1, for the variances of POSE_COMPONENTS: the part of the excess that is no chance.
     """
     found, sigma, factor = np.full(4, np.nan), np.full(4, np.nan), np.ones(6)
-    parts = [
-        away[slow] ** 2 / np.diagonal(spread[slow], axis1=1, axis2=2)
-        for rows, away, spread in sums_over_time(fits, differences(6, -3))
-        for slow in [_precession(fits.R_world_body, rows) < SLOW]
-    ]
-    square = np.concatenate(parts) if parts else np.empty((0, 6))
+    rows, away, spread = sums_over_time(fits, differences(6, -3))
+    slow = _precession(fits.R_world_body, rows) < SLOW
+    square = away[slow] ** 2 / np.diagonal(spread[slow], axis1=1, axis2=2)
     if len(square) < MIN_POSES:
         return found, sigma, factor
     # what is kept of chi-square with one degree of freedom has this mean
