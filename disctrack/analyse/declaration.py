@@ -31,7 +31,7 @@ from disctrack.analyse.derivatives import K, MeasuredMotion, differentiate
 from disctrack.analyse.quantities import COLUMN, SIGMAS, quantities
 from disctrack.disc import Disc, has_mirror_axis, symmetry_order
 from disctrack.errors import AnalysisError
-from disctrack.faults.clock_jump import clock_jumps
+from disctrack.faults.clock_jump import clock_jumps, in_words
 from disctrack.findings import MISFITS, Finding, Kind, Remedy, Severity, Subject
 from disctrack.frames import CAMERAS, rotation_from_quaternion
 from disctrack.numbers import Measured, measured, rounded
@@ -176,15 +176,15 @@ def unsharp(trajectory: Trajectory, blur_px: Sequence[float]) -> Iterator[Findin
 
 def lost_pairs(trajectory: Trajectory) -> Iterator[Finding]:
     """Pairs that both cameras lost while the files were numbered on."""
-    for jump in clock_jumps(trajectory):
-        frame = int(trajectory.frame[jump.row])
+    for row, lost in clock_jumps(trajectory).items():
+        frame = int(trajectory.frame[row])
         yield Finding(
             Kind.CLOCK_JUMP,
             Severity.DOUBT,
-            f"frame {frame}: {jump.words}; all later times are wrong",
+            f"frame {frame}: {in_words(lost)}; all later times are wrong",
             Subject(frames=((frame, frame),)),
-            {"pairs": Measured(jump.frames)},
-            (Remedy(action=f"number the files from {frame} on higher by {jump.frames}"),),
+            {"pairs": Measured(lost)},
+            (Remedy(action=f"number the files from {frame} on higher by {lost}"),),
             (Kind.GRAVITY_OR_RATE, Kind.REVERSED, Kind.POSES_SCATTER),
         )
 

@@ -25,7 +25,7 @@ from disctrack.discrepancy.noise import noise_variance
 from disctrack.discrepancy.search import FAR, Diagnosis, Found, Settings, beside, explain, threshold
 from disctrack.discrepancy.system import Candidate, GivenUp, Values
 from disctrack.errors import AnalysisError
-from disctrack.faults.clock_jump import clock_jumps, without_jumps
+from disctrack.faults.clock_jump import clock_jumps, in_words, without_jumps
 from disctrack.rolling import Model, Regime
 from disctrack.trajectory import Trajectory, part
 
@@ -48,7 +48,7 @@ def diagnose_motion(trajectory: Trajectory, model: Model, faults: Values, settin
     system, diagnosis, rolling = _with_these_times(
         without_jumps(trajectory, jumps), model, faults, settings or Settings()
     )
-    lost = tuple(f"frame {trajectory.frame[jump.row]}: {jump.words}; counted with them" for jump in jumps)
+    lost = tuple(f"frame {trajectory.frame[row]}: {in_words(n)}; counted with them" for row, n in jumps.items())
     return system, _noted(diagnosis, *lost, *system.notes), rolling
 
 

@@ -6,8 +6,8 @@ that are higher by k after the cut can, with one k for all twelve numbers of the
 camera that moved changes places: neither is a later pose of the same motion.
 """
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,24 +24,19 @@ EXPLAINED = 0.05  # of the misfit, that may be left by a jump
 UNEVEN = 0.1  # of a period: frames with time stamps of their own need no number
 
 
-@dataclass(frozen=True)
-class ClockJump:
-    """Pairs lost between two frames."""
-
-    row: int  # the first frame after it
-    frames: int  # pairs that were lost
-
-    @property
-    def words(self) -> str:
-        """What it is."""
-        return f"the clock jumps by {self.frames} frame{'s' * (self.frames > 1)}: both cameras lost as many pairs there"
+def in_words(lost: int) -> str:
+    """What a jump is, by which so many pairs were lost."""
+    return f"the clock jumps by {lost} frame{'s' * (lost > 1)}: both cameras lost as many pairs there"
 
 
-def clock_jumps(trajectory: Trajectory) -> tuple[ClockJump, ...]:
-    """Every jump of the recording, in the order of time; none where the frames have uneven times of their own."""
+def clock_jumps(trajectory: Trajectory) -> dict[int, int]:
+    """First row after every jump of the recording, in the order of time -> pairs that were lost there.
+
+    None where the frames have uneven times of their own.
+    """
     period = 1.0 / trajectory.frame_rate
     if len(trajectory) < 2 * SIDE or np.abs(np.diff(trajectory.time) / period - 1).max() > UNEVEN:
-        return ()
+        return {}
     q, R = trajectory.q, rotation_from_quaternion(trajectory.quaternion)
     seen = trajectory.measured & np.isfinite(q).all(axis=1) & np.isfinite(R).all(axis=(1, 2))
     pose = np.where(seen[:, None], np.column_stack([q[:, :3] / trajectory.disc.radius, R.reshape(-1, 9)]), 0.0)
@@ -53,11 +48,11 @@ def clock_jumps(trajectory: Trajectory) -> tuple[ClockJump, ...]:
         found += zip((rows + gap).tolist(), misfit, strict=True)
     usual = float(np.median([misfit[0] for _, misfit in found])) if found else 0.0
     found = [(row, m) for row, m in found if m[0] > STANDS_OUT * usual and m.min() < EXPLAINED * m[0]]
-    jumps: list[ClockJump] = []
+    jumps: dict[int, int] = {}
     for row, misfit in sorted(found, key=lambda one: one[1].min() / one[1][0]):
-        if all(abs(row - jump.row) >= SIDE for jump in jumps):
-            jumps.append(ClockJump(row, int(misfit.argmin())))
-    return tuple(sorted(jumps, key=lambda jump: jump.row))
+        if all(abs(row - other) >= SIDE for other in jumps):
+            jumps[row] = int(misfit.argmin())
+    return dict(sorted(jumps.items()))
 
 
 def _cuts(seen: NDArray[np.bool_]) -> Iterator[tuple[int, NDArray[np.intp]]]:
@@ -81,9 +76,9 @@ def _misfit(stretches: Array, numbers: Array) -> Array:
     return np.asarray(np.sum(left**2, axis=(1, 2)))
 
 
-def without_jumps(trajectory: Trajectory, jumps: Sequence[ClockJump]) -> Trajectory:
+def without_jumps(trajectory: Trajectory, jumps: Mapping[int, int]) -> Trajectory:
     """The trajectory with the times and numbers that its frames have if these pairs were lost."""
     lost = np.zeros(len(trajectory), np.int64)
-    for jump in jumps:
-        lost[jump.row :] += jump.frames
+    for row, pairs in jumps.items():
+        lost[row:] += pairs
     return replace(trajectory, time=trajectory.time + lost / trajectory.frame_rate, frame=trajectory.frame + lost)
