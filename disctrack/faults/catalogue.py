@@ -25,7 +25,6 @@ from disctrack.frames import CAMERAS
 MOVED = (Kind.CAMERA_MOVED, Kind.DOTS_MISFIT, Kind.CAMERAS_CONTRADICT, Kind.TABLE_DISAGREES)
 HEIGHT = (Kind.TABLE_DISAGREES, Kind.THICKNESS, Kind.BOARD_THICKNESS)
 TYPICAL_STEPS = 30  # a fault of so many steps surprises nobody: 1/3 px, 0.02 deg, 0.3 mm, 0.3 ms
-_DEG = 180 / np.pi
 
 
 @dataclass(frozen=True)
@@ -39,8 +38,7 @@ class Fault:
     unit: str
     step: float  # of a fit: a hundredth of a pixel or so in the image
     meaning: str
-    key: str  # of a scene's `Faults`: "table_height_mm", "left.rotation_deg"
-    factor: float = 1.0  # the scene's key holds null + factor times the numbers
+    key: str  # of a scene's `Faults`, in the unit of its name: "table_height_mm", "left.rotation_deg"
     null: float = 0.0
     bounds: tuple[float, float] = (-np.inf, np.inf)  # beyond which no laboratory's lies
     belongs_to: tuple[str, ...] = ("rig",)  # what two recordings must have in common to share it
@@ -54,6 +52,11 @@ class Fault:
     remedy: str = ""
     declared: str = ""  # the key of recording.toml that would explain it
     named_by: tuple[Kind, ...] = ()  # findings of a run that are about it; none: it does not show in one
+
+    @property
+    def factor(self) -> float:
+        """By which its numbers are those of the scene's key but for null."""
+        return {"deg": float(np.degrees(1.0)), "mm": 1e3}.get(self.key.rpartition("_")[2], 1.0)
 
     def names(self) -> tuple[str, ...]:
         """Of its quantities."""
@@ -152,11 +155,11 @@ FAULTS = (
           bounds=(-0.5, 0.5), of_poses_alone=False, seen="gravity seems to change slowly",
           remedy="trigger by a quartz; let the cameras warm up"),
     Fault("turned", "the {} camera turned after its calibration", _KNOCK, ("rotation_x", "rotation_y", "rotation_z"),
-          "rad", 1e-5, "in its own axes", "rotation_deg", _DEG, bounds=(-0.06, 0.06), each="camera",
+          "rad", 1e-5, "in its own axes", "rotation_deg", bounds=(-0.06, 0.06), each="camera",
           seen=_MISSED, remedy=_AGAIN, named_by=MOVED),
     Fault("shifted", "the {} camera moved after its calibration", _KNOCK,
           ("translation_x", "translation_y", "translation_z"), "m", 1e-5, "in its own axes", "translation_mm",
-          1e3, bounds=(-0.01, 0.01), each="camera",
+          bounds=(-0.01, 0.01), each="camera",
           seen=_MISSED, remedy=_AGAIN, named_by=MOVED),
     Fault("focal", "the focal length of the {} camera changed", "focus, temperature", ("change",), "1", 1e-5,
           "relative", "focal_scale", null=1.0, bounds=(-0.05, 0.05), each="camera",
@@ -172,29 +175,29 @@ FAULTS = (
           seen="one dot misses its place in every frame", remedy="measure it on the sheet",
           declared="[markers] centres_mm", named_by=(Kind.DOTS_MISPLACED, Kind.DOT_UNSEEN)),
     Fault("pattern_offset", "the dots as a whole are off the disc's centre", "gluing of the paper", ("x", "y"), "m",
-          1e-6, "body axes", "pattern_offset_mm", 1e3, belongs_to=("disc",),
+          1e-6, "body axes", "pattern_offset_mm", belongs_to=("disc",),
           seen="the centre circles about another point once a turn of the spin",
           remedy="centre the sheet, or measure by how much it is off", declared="[markers] centres_mm",
           named_by=(Kind.DOTS_MISPLACED, Kind.TABLE_DISAGREES)),
     Fault("pattern_rotation", "the dots as a whole are turned on the face",
           "gluing; the same as another spin angle", ("angle",), "rad", 1e-5, "about e3", "pattern_turn_deg",
-          _DEG, belongs_to=("disc",), seen="nothing: it is where phi is counted from"),
+          belongs_to=("disc",), seen="nothing: it is where phi is counted from"),
     Fault("pattern_scale", "the dots as a whole are printed too large", "printer", ("change",), "1", 1e-5, "relative",
           "pattern_scale", null=1.0, belongs_to=("disc",),
           seen="dots and chessboard contradict each other in their scale",
           remedy="measure the printed sheet with a caliper", declared="[markers] centres_mm",
           named_by=(Kind.SQUARE, Kind.DOTS_MISPLACED)),
     Fault("pattern_height", "the dots lie higher than half the thickness", "paper, glue, thickness", ("offset",), "m",
-          1e-6, "along e3", "pattern_height_mm", 1e3, belongs_to=("disc",),
+          1e-6, "along e3", "pattern_height_mm", belongs_to=("disc",),
           seen="the disc's lowest point lies off the table",
           remedy="measure the thickness with its paper", declared="[disc] thickness_mm", named_by=HEIGHT),
     Fault("table_plane", "the table is not parallel to the calibration's table view", "board on a burr",
           ("tilt_x", "tilt_y"), "rad", 1e-5, "turn of the true table, calibrated axes", "table_turn_deg",
-          _DEG, seen="the disc's lowest point rises towards one side",
+          seen="the disc's lowest point rises towards one side",
           remedy="lay the board flat, and take the table view again", declared="[table] view",
           named_by=(Kind.TABLE_VIEW, *HEIGHT)),
     Fault("table_height", "the table is not where the calibration's table view says", "thickness of the board",
-          ("offset",), "m", 1e-6, "true height of the table in the calibrated axes", "table_height_mm", 1e3,
+          ("offset",), "m", 1e-6, "true height of the table in the calibrated axes", "table_height_mm",
           seen="the disc's lowest point lies off the table", remedy="measure the board's thickness",
           declared="[table] board_thickness_mm", named_by=HEIGHT),
     Fault("exposure_blur", "dots are averaged over an exposure", "centre moves by T^2/24 times its acceleration",
