@@ -127,6 +127,12 @@ def marker_pixels(R: Array, t: Array, rig: StereoRig, centres_body: Array) -> tu
     return pixels, J
 
 
+def dots_at(R: Array, t: Array, rig: StereoRig, disc: Disc) -> tuple[Array, Array]:
+    """Images of a disc's dots (n, 2, m, 2), and maps (n, 2, m, 2, 2) [px/m] from its plane to the image there."""
+    pixels, J = marker_pixels(R, t, rig, disc.marker_centres_body)
+    return pixels, J[..., :3] @ R[:, None, None, :, :2]  # a step in the plane moves a dot as it moves the disc
+
+
 def stacked(rig: StereoRig) -> tuple[Array, Array, Array]:
     """Of the cameras: INTRINSIC_PARAMETERS (2, 9), R_camera_world (2, 3, 3), t_camera_world (2, 3)."""
     R, t = zip(*rig.camera_poses(), strict=True)

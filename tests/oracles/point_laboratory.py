@@ -15,8 +15,7 @@ from calibration import Board, CalibrationSettings, calibrate_from_corners
 from disctrack.disc import MA_2014
 from disctrack.frames import rotation_from_quaternion, vector_from_rotation
 from disctrack.track.dots._kernels import DOT
-from disctrack.track.dots.template import NoiseModel
-from disctrack.track.dots.template_response import Edge
+from disctrack.track.dots.template import Edge, NoiseModel
 from disctrack.track.follow.following import Follower, Tables
 from disctrack.track.refine.assembly import Taken, TrackingSettings, assemble
 from disctrack.trajectory import FrameStatus, MarkerStatus

@@ -23,14 +23,14 @@ from disctrack.frames import rotation_z
 from disctrack.track.dots import _kernels as kernels
 from disctrack.track.dots.acquisition import Pose, acquire
 from disctrack.track.dots.template import (
+    Edge,
     NoiseModel,
     face_of,
     measure_noise,
     no_more_than_left,
     typical_noise,
 )
-from disctrack.track.dots.template_response import Edge, plane_to_image
-from disctrack.track.pose import marker_pixels, stacked
+from disctrack.track.pose import dots_at, stacked
 from disctrack.trajectory import FrameStatus, MarkerStatus
 
 # A pair whose dots disagree by more than this with any rigid motion is lost: a tenth of a dot, ten times a poor rig
@@ -302,9 +302,9 @@ def _measure_blur_and_noise(follower: Follower, images: Image, readable: Mask, p
 
     def flat_noise(camera: int, frames: Sequence[int], R: Array, t: Array) -> NoiseModel:
         """Of flat parts beside and in the dots, at poses R, t of these frames."""
-        pixels, J = marker_pixels(R, t, follower.rig, disc.marker_centres_body)
-        affine, seen = plane_to_image(J, R)[:, camera], [images[k, camera] for k in frames]
-        return measure_noise(seen, pixels[:, camera], affine, disc, edges[camera].blur_px)
+        pixels, affine = dots_at(R, t, follower.rig, disc)
+        seen = [images[k, camera] for k in frames]
+        return measure_noise(seen, pixels[:, camera], affine[:, camera], disc, edges[camera].blur_px)
 
     for camera in range(2):
         # a first idea of the noise, or good dots of a noisy camera, or of more than 8 bits, would look like misfits;

@@ -35,9 +35,8 @@ from disctrack.track.dots.acquisition import (
     rigid_motions,
     seen_by_one_camera,
 )
-from disctrack.track.dots.template_response import plane_to_image
 from disctrack.track.judge.doubts import misplaced_dots
-from disctrack.track.pose import MIN_DOTS, DotsInFrames, marker_pixels
+from disctrack.track.pose import MIN_DOTS, DotsInFrames, dots_at
 from disctrack.track.refine.self_calibration import declared_places_kept, fit_shared
 
 Turn = Callable[[NDArray], NDArray]
@@ -152,8 +151,8 @@ def unlike_declared(pair: NDArray, rig: StereoRig, disc: Disc) -> tuple[Finding,
         return (other_scale(scale, explains=NONSENSE),)
     (R,), (t,) = rigid_motions(disc.marker_centres_body[None, which], points[None])
     # by the middle one of the searches: one for blobs far smaller than the dots finds what is darkest in them
-    J = marker_pixels(R[None], t[None], rig, disc.marker_centres_body)[1]
-    expected = np.pi / 4 * disc.marker_diameter**2 * np.abs(np.linalg.det(plane_to_image(J, R[None])[0]))
+    (affine,) = dots_at(R[None], t[None], rig, disc)[1]
+    expected = np.pi / 4 * disc.marker_diameter**2 * np.abs(np.linalg.det(affine))
     sizes = [np.median(np.sqrt(areas / expected[:, numbered])) for numbered, _, areas, *_ in several]
     diameter = disc.marker_diameter * float(np.median(sizes))
     if abs(np.log(diameter / disc.marker_diameter)) > SIZE_TOLERANCE:

@@ -14,12 +14,11 @@ from disctrack import frames
 from disctrack.findings import Finding
 from disctrack.recording.readers.blocks import NotRead
 from disctrack.track.dots.template import dot_centres
-from disctrack.track.dots.template_response import plane_to_image
 from disctrack.track.follow.following import Follower, Tables, repeats
 from disctrack.track.judge.cameras import camera_course
 from disctrack.track.judge.doubts import FAULTY, doubts_of, repeated_images
 from disctrack.track.judge.outlier_tests import judge_poses, outlying_frames, unexpected_misfit
-from disctrack.track.pose import MIN_DOTS, DotsInFrames, PoseFits, fit_poses, marker_pixels, whitening
+from disctrack.track.pose import MIN_DOTS, DotsInFrames, PoseFits, dots_at, fit_poses, whitening
 from disctrack.track.refine.dot_shifts import exposure_by_smear, exposure_of, shift_by_exposure, shift_by_glare
 from disctrack.track.refine.scatter import Scatter, scatter_of_poses, split_scatter, without_shared_faults
 from disctrack.track.refine.self_calibration import AsBuilt, by_pattern, refine_as_built
@@ -81,11 +80,10 @@ def assemble(
     """
     first = next((follower for follower in followers if follower.measured), followers[0])
     rig, disc = first.rig, first.disc
-    repeated, (dots, pixels, covariance) = repeats(tables.digest), dot_centres(tables.results, tables.status)
+    repeated = repeats(tables.digest)  # over the edges of stretches, too
+    tables.status[repeated & ~repeated.all(axis=1, keepdims=True)] = MarkerStatus.NOT_LOOKED_FOR
+    dots, pixels, covariance = dot_centres(tables.results, tables.status)
     seen = DotsInFrames(rig, disc, pixels, covariance, tables.R, tables.t)
-    alone = repeated & ~repeated.all(axis=1, keepdims=True)
-    seen.pixels[alone] = np.nan  # over the edges of stretches, too
-    tables.status[alone] = MarkerStatus.NOT_LOOKED_FOR
     exposure, of_exposure = _as_they_were(seen, dots, first, settings, taken)
     as_built, faults, outlying = _shared(seen, workers)
     seen = replace(seen, rig=as_built.rig, disc=as_built.disc)
@@ -134,8 +132,7 @@ def _as_they_were(
 
     seen : altered; what misfits beyond noise is in the covariances then.  dots (n, 2, m) of `_kernels.DOT`
     """
-    places, J = marker_pixels(seen.R, seen.t, seen.rig, seen.disc.marker_centres_body)
-    where, of = (places, plane_to_image(J, seen.R)), (0.5 * seen.disc.marker_diameter, first.edges)
+    where, of = dots_at(seen.R, seen.t, seen.rig, seen.disc), (0.5 * seen.disc.marker_diameter, first.edges)
     found = exposure_by_smear(*where, taken.time, dots["sigma"])
     exposure, findings = exposure_of(found, settings.exposure, 1 / taken.frame_rate)
     seen.pixels[...] -= shift_by_glare(*where, dots["contrast"], *of)

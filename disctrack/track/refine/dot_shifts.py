@@ -11,7 +11,7 @@ first term is the mean of the path: while the disc rolls it makes theta read low
 The other comes from a dot whose outline changes while it moves, which smears one side more than the other: the image
 I(d) of the edge, d the signed distance, changes by T^2 / 24 (I' d_tt + I'' v_n^2) with d_tt = -n.a - kappa v_t^2 + 2
 v_t dv_n/ds, and of that the template takes what looks to its normal equations like a shift: mostly I'', as light that
-may slope over the paper takes up the halo of the smeared side (`template_response`). A dot seen obliquely is an
+may slope over the paper takes up the halo of the smeared side (`template.pulls`). A dot seen obliquely is an
 ellipse, whose ends bend more and count less than its sides: at 70 deg from the normal, what a circle of the same area
 would be pulled by is twice too much.
 
@@ -26,7 +26,7 @@ that is added takes more of the ink's share: the contrast c changes with the pla
 
     I = L (1 - c S)  has  d I / dx = dL/dx (1 - c S) - L dc/dx S,
 
-whose last term the template takes in part for a shift (`template_response`): 0.1 grey values per px of glare move a dot
+whose last term the template takes in part for a shift (`template.pulls`): 0.1 grey values per px of glare move a dot
 of 17 px by some 0.004 px, in all frames alike. The contrasts themselves tell: those of all frames are fitted by a
 constant of each dot (ink and paper differ) and one of each frame (lamps flicker, an attitude is better lit than
 another), and a polynomial of the place in the image, whose gradient counts.
@@ -42,7 +42,7 @@ from calibration.kit.arrays import Array, Mask
 from disctrack.analyse.quantities import SIGMAS
 from disctrack.findings import Finding, Kind, Severity
 from disctrack.frames import CAMERAS
-from disctrack.track.dots.template_response import (
+from disctrack.track.dots.template import (
     AROUND,
     Edge,
     half_axes,

@@ -13,8 +13,7 @@ from disctrack import MarkerStatus, frames
 from disctrack.synthetic.cameras import rig_of
 from disctrack.synthetic.description import Scene
 from disctrack.track.dots.template import NoiseModel, measure_noise
-from disctrack.track.dots.template_response import plane_to_image
-from disctrack.track.pose import marker_pixels
+from disctrack.track.pose import dots_at
 from tests.disctrack.conftest import RenderedPairs, disc_on_table
 from tests.oracles.flat_dots import locate_on_disc, locate_on_plane
 from tests.rendering import expected_disc, render_disc
@@ -209,8 +208,8 @@ def test_the_other_face_shows_no_dots(rendered_pairs):
 
 def test_photon_transfer_finds_the_sensors_law(rendered_pairs):
     p, index = rendered_pairs, range(0, 24, 2)
-    pixels, J = marker_pixels(p.R[index], p.q[index, :3], p.rig, p.disc.marker_centres_body)
-    law = measure_noise([p.images[i, 0] for i in index], pixels[:, 0], plane_to_image(J, p.R[index])[:, 0], p.disc)
+    pixels, affine = dots_at(p.R[index], p.q[index, :3], p.rig, p.disc)
+    law = measure_noise([p.images[i, 0] for i in index], pixels[:, 0], affine[:, 0], p.disc)
     # about 12 x 6 patches of 500 pixels each: a variance is known to 1 %, a few per cent with the paper's shading
     assert_allclose(law.variance(np.array([25.0, 185.0])), SENSOR_NOISE.variance(np.array([25.0, 185.0])), rtol=0.05)
 

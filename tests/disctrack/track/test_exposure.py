@@ -8,10 +8,9 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from disctrack import FrameStatus, frames, measure_pairs
 from disctrack.findings import Kind, Severity
-from disctrack.track.dots.template import NoiseModel
-from disctrack.track.dots.template_response import Edge, plane_to_image
+from disctrack.track.dots.template import Edge, NoiseModel
 from disctrack.track.follow.tracking import TrackingSettings
-from disctrack.track.pose import marker_pixels
+from disctrack.track.pose import dots_at
 from disctrack.track.refine import dot_shifts as smears
 from disctrack.track.refine.dot_shifts import shift_by_exposure, shift_by_glare
 from tests.oracles.flat_dots import covered, locate_in_window
@@ -32,12 +31,6 @@ def rolled(disc, theta_deg, rate=RATE):
 def motion(rendered_pairs):
     """At 10 deg."""
     return rolled(rendered_pairs.disc, 10)
-
-
-def dots_of(R, t, rig, disc):
-    """Pixels of the dots, the maps from their plane to the image there, and their radius."""
-    pixels, J = marker_pixels(R, t, rig, disc.marker_centres_body)
-    return pixels, plane_to_image(J, R), 0.5 * disc.marker_diameter
 
 
 def filmed(pairs, motion, seed, exposure=EXPOSURE, moving=True):
@@ -96,8 +89,8 @@ def test_the_shift_is_that_of_the_template(motion, rendered_pairs, dark, noise):
     known[20], where[20] = np.nan, np.nan
     edge = Edge(0.65, 50000.0, 1 - dark / 50000, noise)
     exposures = np.array([EXPOSURE, EXPOSURE])
-    pixels, affine, radius = dots_of(known, where, rig, disc)
-    found = shift_by_exposure(pixels, affine, np.arange(N) / RATE, exposures, radius, (edge, edge))
+    radius, dots = 0.5 * disc.marker_diameter, dots_at(known, where, rig, disc)
+    found = shift_by_exposure(*dots, np.arange(N) / RATE, exposures, radius, (edge, edge))
     assert not found[20].any()
 
     dots = ((3, 0), (9, 1), (14, 2), (28, 3), (33, 4), (37, 0), (6, 2), (11, 4))
@@ -126,8 +119,8 @@ def test_a_dot_seen_obliquely_is_pulled_as_an_ellipse(rendered_pairs):
     assert len(oblique) >= 4
     edge = Edge(0.7, 50000.0, 0.8, noise)
     exposures = np.array([1, 1]) / rate
-    pixels, affine, radius = dots_of(R[:, 4], q[:, 4, :3], rig, disc)
-    found = shift_by_exposure(pixels, affine, np.arange(N) / rate, exposures, radius, (edge, edge))
+    radius, dots = 0.5 * disc.marker_diameter, dots_at(R[:, 4], q[:, 4, :3], rig, disc)
+    found = shift_by_exposure(*dots, np.arange(N) / rate, exposures, radius, (edge, edge))
     expected, _, ellipses = _against_drawn_dots(q, R, found, oblique, rig, disc, 10000, noise, 0.7)
     size = np.sqrt(np.mean(expected**2))
     assert size > 0.002  # px
@@ -169,7 +162,7 @@ def test_a_blur_that_changes_with_obliqueness_is_no_exposure(motion, rendered_pa
     """Of 2e-4 px, as curved edges have; a dot's smear by 200 µs is some 1e-3 px of blur."""
     q, rig, disc = motion[0][:, 4], rendered_pairs.rig, rendered_pairs.disc
     R = frames.rotation_from_euler(*q[:, 3:].T)
-    pixels, affine, _ = dots_of(R, q[:, :3], rig, disc)
+    pixels, affine = dots_at(R, q[:, :3], rig, disc)
     time = np.arange(N) / RATE
     smear = 200e-6**2 * smears._smear(np.gradient(pixels, time, axis=0), affine)
     singular = np.linalg.svd(affine, compute_uv=False)
@@ -206,7 +199,7 @@ def located(rendered_pairs):
     rig, disc = rendered_pairs.rig, rendered_pairs.disc
     q, _ = rolling_poses(disc, 15, np.arange(SHOTS) / 200)
     R, t = frames.rotation_from_euler(*q[:, 3:].T), q[:, :3]
-    pixels, maps, radius = dots_of(R, t, rig, disc)
+    radius, (pixels, maps) = 0.5 * disc.marker_diameter, dots_at(R, t, rig, disc)
     affine = radius * maps[:, 0]
     middle = pixels[:, 0].mean(axis=(0, 1))
     y, x = np.mgrid[:64, :64]
