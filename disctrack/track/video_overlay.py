@@ -1,6 +1,7 @@
 """A video that shows the eye what was measured: fitted disc and dots drawn over the frames of both cameras."""
 
 import contextlib
+import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,6 @@ from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
 ColourImage = NDArray[Any]  # (height, width, 3) uint8, BGR
 
 PLAYBACK_HZ = 25.0
-MOST_FRAMES = 1500  # a minute of video; of longer recordings every second, third, ... pair is shown
 POINTS = 120  # of an outline
 CAPTION_LINE = 18  # height of a line [px]
 _SUBPIXEL_BITS = 4  # OpenCV draws at fractions of 1/16 px
@@ -68,8 +68,8 @@ def write_overlay(
 
 
 def shown_rows(start: int, stop: int) -> range:
-    """Rows that an overlay of start..stop-1 shows: all, or evenly spaced ones of a long recording."""
-    return range(start, stop, max(1, -(-(stop - start) // MOST_FRAMES)))
+    """Rows that an overlay of start..stop-1 shows: all, or every second, third, ... one, for a minute of video."""
+    return range(start, stop, max(1, math.ceil((stop - start) / (60 * PLAYBACK_HZ))))
 
 
 def draw_pair(images: NDArray, trajectory: Trajectory, row: int) -> ColourImage:

@@ -98,19 +98,19 @@ def acquire_from_blobs(
 ) -> tuple[Pose | None, int, str]:
     """As `acquire` from the centroids of candidate blobs in the left and in the right image, each (k, 2)."""
     candidates = _candidates_from_stereo(blobs, rig, disc)
-    best = _best_explanation(candidates, blobs, rig, disc)
-    if by_one and (best is None or best[2] < 2 * disc.n_markers - 3):
+    pose, explained = _best_explanation(candidates, blobs, rig, disc)
+    if by_one and explained < 2 * disc.n_markers - 3:
         for camera in (0, 1):
             candidates += _candidates_from_one_camera(blobs[camera], camera, rig, disc)
-        best = _best_explanation(candidates, blobs, rig, disc)
-    if best is None:
+        pose, explained = _best_explanation(candidates, blobs, rig, disc)
+    reason = ""
+    if pose is None:
         counts = " and ".join(f"{len(b)} in the {name}" for b, name in zip(blobs, CAMERAS, strict=True))
         reason = (
             f"no arrangement of the blobs found ({counts} image) matches the {disc.n_markers} dots of [markers]: "
             "is the upper face visible, are diameter and centres right, does the rig belong to these images?"
         )
-        return None, 0, reason
-    return best[:2], best[2], ""
+    return pose, explained, reason
 
 
 def seen_by_one_camera(
@@ -227,10 +227,10 @@ def _candidates_from_one_camera(blobs: Array, camera: int, rig: StereoRig, disc:
 
 def _best_explanation(
     candidates: list[Pose], blobs: list[Array], rig: StereoRig, disc: Disc
-) -> tuple[Array, Array, int] | None:
-    """Refine the candidates on the blobs they explain; R, t and explained dot images of the best, or None."""
+) -> tuple[Pose | None, int]:
+    """Refine the candidates on the blobs they explain; the best, if any is good, and dot images that it explains."""
     if not candidates:
-        return None
+        return None, 0
     R, t = (np.array(parts) for parts in zip(*candidates, strict=True))
     shape = len(R), 2, disc.n_markers
     covariance = np.broadcast_to(BLOB_PX**2 * np.eye(2), (*shape, 2, 2))
@@ -253,4 +253,4 @@ def _best_explanation(
         cost += 0.5 * np.minimum(gap, 5e-3) / disc.half_thickness
     cost = np.where((explained >= MIN_EXPLAINED) & (rms < 2.5) & fits.converged, cost, np.inf)
     k = int(np.argmin(cost))
-    return (R[k], t[k], int(explained[k])) if np.isfinite(cost[k]) else None
+    return ((R[k], t[k]), int(explained[k])) if np.isfinite(cost[k]) else (None, 0)

@@ -32,7 +32,6 @@ LEAST_NOISE = 0.25  # of the variance that flat parts of the image tell: the res
 _WIDE = {"fx": 20.0, "fy": 20.0, "cx": 10.0, "cy": 10.0, "k1": 0.05, "k2": 0.2, "k3": 0.5, "p1": 5e-3, "p2": 5e-3}
 _WIDE_POSE = np.repeat([0.02, 0.01], 3)
 SLOW = 0.2  # [rad] of precession from frame to frame
-MIN_POSES = 40  # fewer tell as much as eight independent ones, whose variance chance alone doubles now and then
 KEPT = 0.8  # of the squares: blows and smears are cut off with the largest
 # Successive sixth differences are correlated by -0.86, 0.54, -0.24, ...: n tell as much as n / 3.2 independent ones
 # (the sum of the squared correlations); without those that are cut off, n / 4.5 (4000 samples of white noise).
@@ -139,7 +138,7 @@ def scatter_of_poses(fits: PoseFits) -> tuple[Array, Array, Array]:
     rows, away, spread = sums_over_time(fits, differences(6, -3))
     slow = _precession(fits.R_world_body, rows) < SLOW
     square = away[slow] ** 2 / np.diagonal(spread[slow], axis1=1, axis2=2)
-    if len(square) < MIN_POSES:
+    if len(square) < 8 * WORTH:  # the variance of so few independent ones chance alone doubles now and then
         return found, sigma, factor
     # what is kept of chi-square with one degree of freedom has this mean
     mean = scipy.special.chdtr(3, scipy.special.chdtri(1, 1 - KEPT)) / KEPT

@@ -37,7 +37,6 @@ from disctrack.numbers import measured
 from disctrack.track.pose import PoseFits
 from disctrack.track.side_by_side import parts
 
-SOURCES = ("both", "board", "disc")
 OF_PATTERN = "where the dots are on the disc"
 DISAGREEMENT = "board and disc disagree about the table"
 MIN_FRAMES = 30  # fewer poses of a rolling disc lie too near each other: their plane would take up what moves them all
@@ -50,14 +49,13 @@ ASSUMED_RADIUS, ASSUMED_THICKNESS = 7.5e-6, 3e-6
 FROM_SIGMAS = 3.0  # of both on, board and disc disagree
 STEEP = 0.1  # slope of a plane that is no table: the board of the declared view lay elsewhere
 PLACES = 6.0  # at which the cameras' smooth errors are independent, in a whole turn of the contact
-_WIDE = np.array([1e-2, 0.1, 0.1])  # [m, rad, rad] bounds what a short arc of contacts leaves open
 
 
 @dataclass(frozen=True)
 class TableFromDisc:
     """The plane that the rim touched, in the axes of the board's table, and what was made of it."""
 
-    source: str  # one of SOURCES: what the world's table is
+    source: str  # "board", "disc" or "both": what the world's table is
     plane: Array  # (3,) height in the middle of the contacts [m], slopes along x and y, against the table by the board
     middle: Array  # (2,) [m] of the contacts, x and y
     sigma: Array  # (3,) of the plane by the disc: noise, what repeats, tolerances of the disc
@@ -95,7 +93,7 @@ def table_from_disc(
     """Poses, their systematic covariance and rig with the world's table where board and disc have it.
 
     fits : with the covariances of the frames' noise; systematic (n, 6, 6). What is returned holds their arrays, altered
-    source : one of SOURCES; with "board" nothing is moved, and the difference is told
+    source : "board", "disc" or "both"; with "board" nothing is moved, and the difference is told
     by_pattern : (n, 6, k) how poses change by one sigma of the pattern's own place on the disc, which is not in
         `systematic`: a pattern off the centre by d lifts and lowers the rim by d sin(theta) as the disc turns, which
         looks like a table that leans while phi follows -psi
@@ -225,6 +223,7 @@ def _contacts(
         return None
     R, t = fits.R_world_body[rows], fits.t_world_body[rows]
     plane, kept = np.zeros(3), np.ones(len(rows), bool)
+    wide = STEEP * np.array([disc.radius, 1.0, 1.0])  # bounds what a short arc of contacts leaves open
     middle = np.median(t + lowest_arm(R[..., 2], K, disc), axis=0)[:2]
     for _ in range(6):
         normal = np.array([-plane[1], -plane[2], 1.0])
@@ -233,7 +232,7 @@ def _contacts(
         contact = t + arm
         gap = (contact - [*middle, plane[0]]) @ normal
         A = np.column_stack([np.ones(len(rows)), contact[:, :2] - middle])
-        information = A[kept].T @ A[kept] + np.diag((1e-6 / _WIDE) ** 2)  # beside gaps that scatter by a micrometre
+        information = A[kept].T @ A[kept] + np.diag((1e-6 / wide) ** 2)  # beside gaps that scatter by a micrometre
         step = np.linalg.solve(information, A[kept].T @ gap[kept])
         plane = plane + step
         left = gap - A @ step
