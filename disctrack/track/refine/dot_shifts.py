@@ -33,6 +33,7 @@ another), and a polynomial of the place in the image, whose gradient counts.
 """
 
 from collections.abc import Callable
+from itertools import product
 
 import numpy as np
 from numpy.polynomial.polynomial import polyder, polyval2d
@@ -49,7 +50,7 @@ from disctrack.track.dots.template import (
     pulls,
     turned_to_axes,
 )
-from disctrack.track.side_by_side import MIN_FRAMES, SHARED_FRAMES, evenly
+from disctrack.track.side_by_side import MIN_FRAMES, SHARED_FRAMES, evenly, parts
 
 PARTS = 10  # stretches of the recording, each left out in turn: what the fit leaves has a memory
 SURE = 3.0  # sigmas of T^2, or the exposure is taken as short
@@ -153,9 +154,9 @@ def _second_order(pixels: Array, affine: Array, time: Array, radius: float, edge
     acceleration[1:-1] = 2 * (slope[1:] - slope[:-1]) / (since[1:] + since[:-1])
     known = np.isfinite(affine).all(axis=(-2, -1), keepdims=True)
     growth = _rate(affine, time) @ np.linalg.inv(np.where(known, affine, np.eye(2)))  # NaN without a pose
-    for camera, edge in enumerate(edges):
-        of = affine[:, camera], growth[:, camera], velocity[:, camera]
-        acceleration[:, camera] += _pulled(radius, *of, edge)
+    for (camera, edge), rows in product(enumerate(edges), parts(len(time))):
+        of = affine[rows, camera], growth[rows, camera], velocity[rows, camera]
+        acceleration[rows, camera] += _pulled(radius, *of, edge)
     return acceleration
 
 
