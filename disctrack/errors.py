@@ -1,6 +1,8 @@
 """The errors that disctrack raises on purpose; `cli` alone turns them into a line and an exit code."""
 
 import errno
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from calibration.kit.errors import ArgumentError as ArgumentError
@@ -52,6 +54,18 @@ class TrajectoryFileError(DiscTrackError):
 
 class ModelError(DiscTrackError):
     """A model of the motion cannot be built: unknown effect or parameter, a value out of bounds, no such motion."""
+
+
+@contextmanager
+def told_as(error: type[DiscTrackError], said: str, *kinds: type[Exception], then: str = "") -> Iterator[None]:
+    """What is raised within of these kinds, by a library mostly, becomes an error of ours: `said`, why, what to do."""
+    try:
+        yield
+    except DiscTrackError:
+        raise
+    except kinds as reason:
+        why = getattr(reason, "strerror", "") or " ".join(str(reason).split()) or type(reason).__name__
+        raise error(f"{said}: {why.removesuffix('.')}.{f' {then}' if then else ''}") from reason
 
 
 def reason_of(error: BaseException) -> str:

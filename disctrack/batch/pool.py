@@ -30,7 +30,7 @@ import cv2
 from disctrack.batch.measure import do
 from disctrack.batch.plan import Job
 from disctrack.batch.records import BUSY, DIED, FAILED, Record, failed
-from disctrack.errors import ClusterError, reason_of
+from disctrack.errors import ClusterError, reason_of, told_as
 from disctrack.findings import Kind
 from disctrack.processes import Spawn, end_with_parent
 
@@ -177,22 +177,14 @@ class Cluster:
 
 def connect(address: str) -> Client:
     """Client of the scheduler. Raises ClusterError if dask.distributed is not installed or nobody answers."""
-    try:
+    remedy = "Install disctrack[cluster], here and on the cluster's machines, or leave --cluster out."
+    with told_as(ClusterError, "--cluster needs dask.distributed", ImportError, then=remedy):
         import distributed
-    except ImportError as error:
-        raise ClusterError(
-            "--cluster needs dask.distributed: install disctrack[cluster], here and on the cluster's machines, or "
-            "leave --cluster out."
-        ) from error
     logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what matters of it is told here
-    try:
+    remedy = "Give the address that dask-scheduler printed, e.g. tcp://host:8786."
+    said = f"--cluster {address}: no scheduler answers"
+    with told_as(ClusterError, said, OSError, ValueError, TypeError, then=remedy):
         client = distributed.Client(address, timeout=CONNECT, set_as_default=False)
-    except (OSError, TimeoutError, ValueError, TypeError) as error:
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise ClusterError(
-            f"--cluster {address}: no scheduler answers ({reason}). Give the address that dask-scheduler printed, e.g. "
-            "tcp://host:8786."
-        ) from error
     if not client.scheduler_info()["workers"]:
         client.close()
         raise ClusterError(f"--cluster {address}: the scheduler has no workers. Start dask-worker on some machines.")

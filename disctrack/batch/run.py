@@ -22,7 +22,7 @@ from disctrack.batch.plan import BatchOptions, FoundRecordings, Job, find_record
 from disctrack.batch.pool import Cluster, Processes, do_all
 from disctrack.batch.records import FAILED, MEASURED, NOT_MEASURED, SKIPPED, Record, is_done, read_record
 from disctrack.batch.report import counts, report_of
-from disctrack.errors import AnalysisError, ArgumentError, ClusterError, OutputError, reason_of
+from disctrack.errors import AnalysisError, ArgumentError, ClusterError, OutputError, reason_of, told_as
 from disctrack.files.json_text import json_file
 from disctrack.files.software import __version__
 from disctrack.files.text import csv_cell
@@ -241,15 +241,11 @@ def write_summary(
     has everything. Raises OutputError.
     """
     wait = 300.0  # [s] for another process that writes the summary
-    try:
-        with locked(found.common / ".summary.lock", wait):
-            rows = with_false_discovery(rows_of(found, records))
-            return rows, tuple(_write(found, rows, options))
-    except Timeout as error:
-        raise OutputError(
-            f"{found.common}: another process has been writing the summary for {wait:g} s. Make it anew with "
-            "--summary-only."
-        ) from error
+    said = f"{found.common}: another process has been writing the summary for {wait:g} s"
+    remedy = "Make it anew with --summary-only."
+    with told_as(OutputError, said, Timeout, then=remedy), locked(found.common / ".summary.lock", wait):
+        rows = with_false_discovery(rows_of(found, records))
+        return rows, tuple(_write(found, rows, options))
 
 
 def _write(found: FoundRecordings, rows: Sequence[Row], options: BatchOptions) -> Iterator[Path]:

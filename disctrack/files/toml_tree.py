@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from disctrack.errors import DiscTrackError, SceneError
+from disctrack.errors import DiscTrackError, SceneError, told_as
 from disctrack.files.inputs import MOST_TEXT, read_regular
 
 MOST = 1e7  # no length, angle, rate, grey value or number of frames of a laboratory is larger in its unit
@@ -31,9 +31,11 @@ def limited(default: Any, limits: tuple[float, float]) -> Any:
 
 def read_toml(path: Path, error: type[DiscTrackError]) -> dict[str, Any]:
     """The file's tree. Raises `error` with the file, what is wrong with it, and what to do."""
+    with told_as(error, f"{path}: cannot be read", OSError, then="Give the path of a TOML file."):
+        content = read_regular(path, MOST_TEXT)
     text = ""
     try:
-        text = read_regular(path, MOST_TEXT).decode("utf-8")
+        text = content.decode("utf-8")
         return tomllib.loads(text)
     except UnicodeDecodeError as reason:
         raise error(f"{path}: byte {reason.start} is not UTF-8 text. Save the file as UTF-8.") from reason
@@ -50,8 +52,6 @@ def read_toml(path: Path, error: type[DiscTrackError]) -> dict[str, Any]:
         raise error(f"{path}: nested too deeply for a file of settings.") from reason
     except ValueError as reason:  # e.g. an integer of thousands of digits, a date that does not exist
         raise error(f"{path}: a value cannot be read: {reason}.") from reason
-    except OSError as reason:
-        raise error(f"{path}: cannot be read: {reason.strerror}. Give the path of a TOML file.") from reason
 
 
 def build(kind: Any, tree: dict[str, Any], where: str, section: str = "") -> Any:

@@ -14,7 +14,7 @@ from calibration.judge.tolerances import BoardTolerances
 from calibration.kit.arguments import checked
 from calibration.kit.brief import Brief
 from disctrack.disc import AIR_DENSITY, STANDARD_PRESSURE, Disc, disc_from_mm
-from disctrack.errors import CalibrationError, RecordingError
+from disctrack.errors import CalibrationError, RecordingError, told_as
 from disctrack.files.inputs import RECORDING_FILE, keep, why_not_regular
 from disctrack.files.toml_tree import read_toml
 from disctrack.frames import CAMERAS
@@ -276,7 +276,8 @@ def _air_density(file: Path, air: Mapping[str, float]) -> float:
 
 
 def _recording_file(path: Path) -> Path:
-    try:
+    said = f"{path!s:.200}: not a usable path"  # a name too long, or with a null character
+    with told_as(RecordingError, said, OSError, ValueError, then="Give a recording's folder."):
         if path.is_dir():
             path = path / FILE_NAME
         elif not path.exists() and path.name != FILE_NAME:
@@ -285,8 +286,6 @@ def _recording_file(path: Path) -> Path:
             raise RecordingError(f"{path}: cannot be read: {fault}. Give a recording's folder.")
         if not path.is_file():
             raise RecordingError(f"{path}: not found. A recording is a folder with a {FILE_NAME} beside its images.")
-    except (OSError, ValueError) as error:  # a name too long, or with a null character
-        raise RecordingError(f"{path!s:.200}: not a usable path ({error}). Give a recording's folder.") from error
     return path
 
 

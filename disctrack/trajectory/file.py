@@ -27,7 +27,7 @@ from calibration.kit.brief import Brief
 from calibration.kit.seal import sealed
 from calibration.rig_file import beside_cameras, complete_file, read_beside_cameras, versions, write_attributes
 from disctrack.disc import Disc
-from disctrack.errors import OutputError, TrajectoryFileError
+from disctrack.errors import OutputError, TrajectoryFileError, told_as
 from disctrack.files.json_text import json_text
 from disctrack.files.labelled_arrays import Variable, copy_without, flags, read_array, read_variables, write_variables
 from disctrack.files.software import software_version
@@ -273,10 +273,8 @@ def to_xarray(trajectory: Trajectory) -> xarray.Dataset:
 
     Raises OutputError where xarray is not installed.
     """
-    try:
+    with told_as(OutputError, "to_xarray needs xarray", ImportError, then="Install it: pip install xarray"):
         import xarray
-    except ImportError as error:
-        raise OutputError("to_xarray needs xarray: pip install xarray") from error
 
     def described(item: Variable) -> tuple:
         return item.dims, np.asarray(item.data), {"units": item.units, "long_name": item.long_name, **item.attributes}

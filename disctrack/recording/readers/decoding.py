@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.kit.arrays import Image
-from disctrack.errors import RecordingError
+from disctrack.errors import RecordingError, told_as
 from disctrack.recording.readers._pixel_kernels import undo_filters
 from disctrack.recording.readers.base import room_for
 from disctrack.recording.readers.raw import RawFile, check_frame_size
@@ -48,10 +48,8 @@ def decode(content: bytes, where: str, out: NDArray | None = None) -> NDArray:
 
 
 def _by_opencv(content: bytes, where: str) -> NDArray:
-    try:
+    with told_as(RecordingError, f"{where}: not a readable image", cv2.error, MemoryError):
         image: NDArray | None = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
-    except (cv2.error, MemoryError) as error:
-        raise RecordingError(f"{where}: not a readable image ({error.__class__.__name__}).") from error
     if image is None:
         raise RecordingError(f"{where}: not a readable image, or damaged. {_AGAIN}")
     return image

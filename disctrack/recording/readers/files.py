@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
 
-from disctrack.errors import RecordingError
+from disctrack.errors import RecordingError, told_as
 from disctrack.files.inputs import MOST_IMAGE, keep, read_regular, why_not_regular
 
 # Suffixes of each format, by the module that reads it with `open_MODULE`: (files, camera) -> FrameReader
@@ -104,10 +104,8 @@ def file_number(file: Path) -> int | None:
 
 def content_of(file: Path, where: str, most: int = MOST_IMAGE) -> bytes:
     """Of a file of at most so many bytes. Raises RecordingError that begins with `where`."""
-    try:
+    with told_as(RecordingError, f"{where}: cannot be read", OSError, then="Copy it again."):
         return read_regular(file, most)
-    except OSError as error:
-        raise RecordingError(f"{where}: cannot be read: {error.strerror}. Copy it again.") from error
 
 
 def number_files(

@@ -14,7 +14,7 @@ import h5py
 import numpy as np
 
 from calibration.kit.arrays import Array, Image
-from disctrack.errors import RecordingError
+from disctrack.errors import RecordingError, told_as
 from disctrack.recording.readers.base import FrameReader, only_file, room_for
 from disctrack.recording.readers.decoding import inflated
 from disctrack.recording.readers.raw import (
@@ -27,24 +27,21 @@ from disctrack.recording.readers.raw import (
     raw_frames,
 )
 
+_DAMAGED = (OSError, RuntimeError, KeyError, ValueError, TypeError)  # what a damaged file makes of it
 _LARGEST_CACHE = 64 << 20  # bytes of decompressed chunks kept; more than one camera's chunk of many frames
 
 
 def open_hdf5(files: Sequence[Path], camera: str, member: str = "") -> FrameReader:
     """Reader of one data set. Raises RecordingError if there is none, or several and none is named."""
     file = only_file(files, camera)
-    try:
+    with told_as(RecordingError, f"{file}: not a readable HDF5 file", OSError, then="Copy it again."):
         handle = h5py.File(file, "r", rdcc_nbytes=_LARGEST_CACHE, rdcc_w0=1.0)
-    except OSError as error:
-        raise RecordingError(f"{file}: not a readable HDF5 file ({error}). Copy it again.") from error
     try:
-        return _open(handle, _stack(handle, member, file), file, camera)
+        with told_as(RecordingError, f"{file}: the HDF5 file is damaged", *_DAMAGED, then="Copy it again."):
+            return _open(handle, _stack(handle, member, file), file, camera)
     except RecordingError:
         handle.close()
         raise
-    except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:  # whatever a damaged file makes of it
-        handle.close()
-        raise RecordingError(f"{file}: the HDF5 file is damaged ({error}). Copy it again.") from error
 
 
 def _is_stack(item: object) -> bool:
@@ -186,18 +183,15 @@ def _decoding(stack: h5py.Dataset, apart: bool) -> Callable[[int, Image | None, 
 
     def decoded(index: int, out: Image | None, where: str) -> Image:
         image, content = room_for(out, (width, height), dtype), None
-        with lock:
-            try:
-                size = _stored_size(stack, index)
-                if size == 0:
-                    raise RecordingError(f"{where}: was never written to the file. Copy or write it again.")
-                if apart and size <= 2 * image.nbytes:
-                    mask, content = stack.id.read_direct_chunk((index, 0, 0))
-                    content = None if mask else content  # some filter was left out
-                if content is None:
-                    stack.read_direct(image, np.s_[index])
-            except (OSError, RuntimeError, ValueError) as error:
-                raise RecordingError(f"{where}: cannot be read ({error}). Copy the file again.") from error
+        with lock, told_as(RecordingError, f"{where}: cannot be read", *_DAMAGED, then="Copy the file again."):
+            size = _stored_size(stack, index)
+            if size == 0:
+                raise RecordingError(f"{where}: was never written to the file. Copy or write it again.")
+            if apart and size <= 2 * image.nbytes:
+                mask, content = stack.id.read_direct_chunk((index, 0, 0))
+                content = None if mask else content  # some filter was left out
+            if content is None:
+                stack.read_direct(image, np.s_[index])
         if content is not None:
             _inflate(stack, content, image, where)
         return image

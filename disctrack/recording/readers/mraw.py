@@ -10,7 +10,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from disctrack.errors import RecordingError
+from disctrack.errors import RecordingError, told_as
 from disctrack.files.inputs import MOST_TEXT
 from disctrack.recording.readers.base import CameraHeader, FrameReader, only_file
 from disctrack.recording.readers.files import content_of
@@ -84,10 +84,8 @@ def open_mraw(files: Sequence[Path], camera: str) -> FrameReader:
 def _pair_of(files: Sequence[Path], camera: str) -> tuple[Path, Path]:
     """Header and frames, from one of them or both. PFV writes either header, or both alike: .cihx is taken."""
     stem = only_file(sorted({file.with_suffix("") for file in files}), camera)
-    try:
+    with told_as(RecordingError, f"{stem.parent}: cannot be read", OSError):
         beside = {file.suffix.lower(): file for file in stem.parent.iterdir() if file.with_suffix("") == stem}
-    except OSError as error:
-        raise RecordingError(f"{stem.parent}: cannot be read: {error.strerror}.") from error
     header = beside.get(".cihx", beside.get(".cih"))
     if header is None:
         raise RecordingError(
@@ -142,10 +140,8 @@ def _from_xml(content: bytes, file: Path) -> dict[str, str]:
     start, stop = content.find(b"<cih>"), content.rfind(b"</cih>")
     if start < 0 or stop < start:
         raise RecordingError(f"{file}: holds no <cih> ... </cih>, so it is no Photron header, or cut short. {_EXPORT}")
-    try:
+    with told_as(RecordingError, f"{file}: the XML in it is damaged", ElementTree.ParseError, ValueError, then=_EXPORT):
         root = ElementTree.fromstring(content[start : stop + len(b"</cih>")].decode("utf-8", "replace"))
-    except (ElementTree.ParseError, ValueError) as error:
-        raise RecordingError(f"{file}: the XML in it is damaged ({error}). {_EXPORT}") from error
     texts = {name: (root.findtext(path) or "").strip() for name, path in _ENTRIES.items()}
     texts["Trigger Mode"] = _trigger_name(texts["Trigger Mode"], root.findtext("recordInfo/triggerMode/pdcMode") or "")
     rate = texts["Shutter Speed(s)"]  # here it is 1/s

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.kit.arrays import Image
-from disctrack.errors import RecordingError
+from disctrack.errors import RecordingError, told_as
 from disctrack.files.inputs import open_regular
 from disctrack.recording.readers._pixel_kernels import unpack_10, unpack_12
 from disctrack.recording.readers.base import FrameReader, room_for
@@ -39,10 +39,8 @@ class RawFile:
 
     def __init__(self, path: Path, content: bytes | None = None) -> None:
         self.path, self._content, self._lock = path, content, threading.Lock()
-        try:
+        with told_as(RecordingError, f"{path}: cannot be read", OSError):
             self._stream = self.stream()
-        except OSError as error:
-            raise RecordingError(f"{path}: cannot be read: {error.strerror}.") from error
         weakref.finalize(self, self._stream.close)
         self.size = self._stream.seek(0, os.SEEK_END)
 
@@ -58,12 +56,9 @@ class RawFile:
 
         Raises RecordingError that begins with `where` if the file ends before, or cannot be read any more.
         """
-        try:
-            with self._lock:
-                self._stream.seek(offset)
-                done = self._stream.readinto(buffer.data)
-        except OSError as error:
-            raise RecordingError(f"{where}: cannot be read: {error.strerror}. Copy the file again.") from error
+        with self._lock, told_as(RecordingError, f"{where}: cannot be read", OSError, then="Copy the file again."):
+            self._stream.seek(offset)
+            done = self._stream.readinto(buffer.data)
         if done < len(buffer):
             raise RecordingError(
                 f"{where}: the file ends {len(buffer) - done} bytes before the end of what lies at byte {offset}. "

@@ -13,7 +13,7 @@ import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
-from disctrack.errors import RecordingError
+from disctrack.errors import RecordingError, told_as
 from disctrack.recording.readers._pixel_kernels import lzw_codes_follow
 from disctrack.recording.readers.raw import MOST_PIXELS, PixelLayout, RawFile, check_frame_size
 
@@ -62,29 +62,25 @@ def pages_of(source: RawFile) -> Iterator[Page]:
     """The pages of a file but for thumbnails. Raises RecordingError where they break off, or there is none."""
     first: dict[str, tifffile.TiffPage] = {}  # of each coding
     seen: set[int] = set()
-    try:
-        with source.stream() as stream:
-            tiff = tifffile.TiffFile(stream, name=str(source))
-            for index in count():
-                try:
-                    page = tiff.pages[index]
-                except IndexError:
-                    break
-                if page.offset in seen:
-                    raise RecordingError(f"{source}: the chain of pages turns back to byte {page.offset}.")
-                if not isinstance(page, tifffile.TiffPage):  # others know less of themselves; nobody wanted them
-                    raise TypeError("no page of its own")
-                seen.add(page.offset)
-                found = _page(page, first)
-                if not page.subfiletype & tifffile.FILETYPE.REDUCEDIMAGE:
-                    yield found
-            link = source.bytes_at(tiff.pages.next_page_offset or 0, tiff.tiff.offsetsize, str(source))
-            if any(link):
-                raise RecordingError(f"{source}: the chain of pages breaks off, it is damaged. Copy it again.")
-    except (RecordingError, GeneratorExit):
-        raise
-    except Exception as error:  # whatever a damaged file makes of it
-        raise RecordingError(f"{source}: not a readable TIFF file, or damaged ({error}).") from error
+    said = f"{source}: not a readable TIFF file, or damaged"
+    with told_as(RecordingError, said, Exception), source.stream() as stream:
+        tiff = tifffile.TiffFile(stream, name=str(source))
+        for index in count():
+            try:
+                page = tiff.pages[index]
+            except IndexError:
+                break
+            if page.offset in seen:
+                raise RecordingError(f"{source}: the chain of pages turns back to byte {page.offset}.")
+            if not isinstance(page, tifffile.TiffPage):  # others know less of themselves; nobody wanted them
+                raise TypeError("no page of its own")
+            seen.add(page.offset)
+            found = _page(page, first)
+            if not page.subfiletype & tifffile.FILETYPE.REDUCEDIMAGE:
+                yield found
+        link = source.bytes_at(tiff.pages.next_page_offset or 0, tiff.tiff.offsetsize, str(source))
+        if any(link):
+            raise RecordingError(f"{source}: the chain of pages breaks off, it is damaged. Copy it again.")
 
 
 def _page(page: tifffile.TiffPage, first: dict[str, tifffile.TiffPage]) -> Page:
@@ -104,13 +100,9 @@ def page_pixels(source: RawFile, page: Page, where: str) -> NDArray:
 
     Raises RecordingError that begins with `where`.
     """
-    try:
+    with told_as(RecordingError, f"{where}: the page is damaged", Exception, then="Copy or export it again."):
         _check(page, where)
         return np.ascontiguousarray(_decoded(page.like, page.pieces(source, where)))
-    except RecordingError:
-        raise
-    except Exception as error:  # whatever damaged numbers and pieces make of it
-        raise RecordingError(f"{where}: the page is damaged ({error}). Copy or export it again.") from error
 
 
 def _check(page: Page, where: str) -> None:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from calibration.kit.arrays import Image
 from calibration.kit.brief import ranges
-from disctrack.errors import RecordingError
+from disctrack.errors import RecordingError, told_as
 from disctrack.recording.readers.base import FrameReader, first_readable, only_file
 from disctrack.recording.readers.decoding import as_grey
 from disctrack.recording.readers.raw import MOST_PIXELS, check_frame_size
@@ -219,11 +219,12 @@ def checksums_hold(packet: bytes) -> bool:
 
 
 def _opened(file: Path, camera: str) -> InputContainer:
-    try:
+    with told_as(
+        RecordingError, f"{file}: videos need PyAV", ImportError, then="Install it: pip install disctrack[video]"
+    ):
         import av
-    except ImportError as error:
-        raise RecordingError(f"{file}: videos need PyAV. Install it: pip install disctrack[video]") from error
-    try:
+    said = f"{file}: not a readable video for the {camera} camera"
+    with told_as(RecordingError, said, av.FFmpegError, IndexError, OSError, ValueError):
         container = av.open(str(file), options=_CONTAINERS)
         codec = container.streams.video[0].codec_context
         if codec is None:
@@ -231,8 +232,6 @@ def _opened(file: Path, camera: str) -> InputContainer:
         codec.thread_type = "NONE"  # the other camera's file is decoded beside this one
         codec.options = {"err_detect": "explode", "max_pixels": str(MOST_PIXELS)}
         return container
-    except (av.FFmpegError, IndexError, OSError, ValueError) as error:
-        raise RecordingError(f"{file}: not a readable video for the {camera} camera ({error}).") from error
 
 
 def _gap_doubts(times: NDArray[np.int64]) -> Iterator[str]:

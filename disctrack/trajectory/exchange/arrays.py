@@ -22,7 +22,7 @@ from scipy.io import loadmat, savemat
 
 from calibration.cameras.camera import StereoRig
 from calibration.kit.arrays import Array
-from disctrack.errors import OutputError, RigFileError
+from disctrack.errors import OutputError, RigFileError, told_as
 from disctrack.files.whole import whole_file, write_whole
 from disctrack.frames import COORDINATES
 from disctrack.trajectory import FrameStatus, Trajectory
@@ -89,7 +89,8 @@ def _nodes(path: Path) -> dict[str, Any]:
     """What a file holds of a rig. Raises RigFileError."""
     text = content_of(path)
     found: dict[str, Any] = {}
-    try:
+    said = f"{path}: not a stereo rig in OpenCV's YAML, XML or JSON format"
+    with told_as(RigFileError, said, cv2.error, ValueError, TypeError, SystemError):
         storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         for name in (*_YAML, *_BESIDE):
             matrix = storage.getNode(name).mat()
@@ -99,8 +100,6 @@ def _nodes(path: Path) -> dict[str, Any]:
             found["unit"] = "m"
         if storage.getNode("world_is_table").real() == 1.0:
             found["world_is_table"] = True
-    except (cv2.error, ValueError, TypeError, SystemError) as error:
-        raise RigFileError(f"{path}: not a stereo rig in OpenCV's YAML, XML or JSON format ({error})") from error
     return found
 
 
@@ -140,10 +139,9 @@ def read_stereo_parameters(path: Path, *, unit: float | None = None, world_is_ta
     world_is_table : True if the world of R_left_world is the table, k up, whether or not the file says so
     Raises RigFileError.
     """
-    try:
+    kinds = OSError, ValueError, NotImplementedError, TypeError
+    with told_as(RigFileError, f"{path}: not a MAT file of version 5", *kinds, then="Save it with -v6 or -v7."):
         found = loadmat(path)
-    except (OSError, ValueError, NotImplementedError, TypeError) as error:
-        raise RigFileError(f"{path}: not a MAT file of version 5 ({error}); save it with -v6 or -v7") from error
     if "intrinsicMatrix1" not in found:
         there = ", ".join(name for name in found if not name.startswith("__"))
         raise RigFileError(

@@ -17,7 +17,7 @@ from calibration.kit.arguments import checked
 from calibration.kit.seal import check_seal
 from calibration.rig_file import SCHEMA as RIG
 from calibration.rig_file import read_rig, write_rig
-from disctrack.errors import OutputError, TrajectoryFileError
+from disctrack.errors import OutputError, TrajectoryFileError, told_as
 from disctrack.files.inputs import keep, refuse_input
 from disctrack.files.whole import refuse_existing, write_whole
 from disctrack.trajectory import Trajectory
@@ -189,10 +189,8 @@ def _is_ours(path: Path) -> bool:
 def _own(paths: Sequence[Path]) -> Trajectory | StereoRig:
     path, schema = the_one(paths), None
     if path.is_file() and h5py.is_hdf5(path):
-        try:
+        with told_as(TrajectoryFileError, f"{path}: damaged", ValueError, then="Take the original."):
             check_seal(path)
-        except ValueError as error:
-            raise TrajectoryFileError(f"{path}: {error}. Take the original.") from error
         with h5py.File(path, "r") as file:
             schema = file.attrs.get("schema")
     return read_rig(path) if schema == RIG else read_trajectory(path)

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from calibration.cameras.camera import normalise
 from calibration.kit.arguments import checked
 from calibration.kit.arrays import Array
-from disctrack.errors import OutputError, RigFileError
+from disctrack.errors import OutputError, RigFileError, told_as
 from disctrack.files.whole import refuse_existing, whole_file, write_whole
 from disctrack.frames import CAMERAS, COORDINATES, rotation_from_quaternion
 from disctrack.trajectory import FrameStatus, Trajectory
@@ -77,10 +77,8 @@ def write_c3d(path: Path, trajectory: Trajectory) -> None:
     program builds the rigid body; a point's residual is its one-sigma in mm, -1 in frames without a pose. C3D keeps
     single precision: 1e-4 mm at 1 m. Raises OutputError, also where ezc3d is not installed.
     """
-    try:
+    with told_as(OutputError, f"{path}: C3D needs ezc3d", ImportError, then="Install it: pip install ezc3d"):
         import ezc3d
-    except ImportError as error:
-        raise OutputError(f"{path}: C3D needs ezc3d: pip install ezc3d") from error
     points, labels = body_points(trajectory)
     file = ezc3d.c3d()
     described = [_DESCRIPTIONS.get(label, "centre of a dot") for label in labels]
@@ -229,11 +227,9 @@ def read_points(path: Path) -> Array:
         raise RigFileError(
             f"{path}: the first line is '{first[:60]}'; expected NAME_cam1_X,NAME_cam1_Y,NAME_cam2_X,..."
         )
-    try:
+    with told_as(RigFileError, f"{path}: not a table of numbers with {len(found)} columns", ValueError):
         values = np.array([[float(cell or "nan") for cell in line.split(",")] for line in lines if line.strip()])
         return values.reshape(len(values), len(names), len(cameras), 2).swapaxes(1, 2)
-    except ValueError as error:
-        raise RigFileError(f"{path}: not a table of numbers with {len(found)} columns ({error})") from error
 
 
 def read_xypts(path: Path) -> Array:

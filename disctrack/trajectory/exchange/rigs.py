@@ -16,7 +16,7 @@ import numpy as np
 
 from calibration.cameras.camera import Camera, StereoRig, placed_at
 from calibration.kit.arrays import Array
-from disctrack.errors import OutputError, RigFileError
+from disctrack.errors import OutputError, RigFileError, told_as
 from disctrack.files.inputs import read_regular
 from disctrack.files.toml_tree import MOST, toml_value
 from disctrack.files.whole import write_whole
@@ -52,10 +52,9 @@ def camera_of(K: Array, D: Array, size: Array, where: str) -> Camera:
 
 def array_of(table: Mapping[str, Any], key: str, shape: tuple[int, ...], where: str) -> Array:
     """The finite numbers under a key, in that shape. Raises RigFileError."""
-    try:
+    said = f"{where}: '{key}' is missing, or not numbers of shape {shape}"
+    with told_as(RigFileError, said, KeyError, TypeError, ValueError):
         value = np.asarray(table[key], float).reshape(shape)
-    except (KeyError, TypeError, ValueError) as error:
-        raise RigFileError(f"{where}: '{key}' is missing, or not numbers of shape {shape}") from error
     if not np.isfinite(value).all():
         raise RigFileError(f"{where}: '{key}' holds numbers that are not finite")
     return value
@@ -73,10 +72,8 @@ def rotation_of(rotation: Array, where: str) -> Array:
 
 def content_of(path: Path) -> str:
     """The file's text. Raises RigFileError."""
-    try:
+    with told_as(RigFileError, f"{path}: cannot be read", OSError, UnicodeDecodeError):
         return read_regular(path, MAX_BYTES).decode()
-    except (OSError, UnicodeDecodeError) as error:
-        raise RigFileError(f"{path}: cannot be read ({error})") from error
 
 
 def the_one(paths: Sequence[Path]) -> Path:
@@ -128,10 +125,8 @@ def read_caliscope(path: Path, *, cameras: tuple[str, str] | None = None, world_
     world_is_table : True if the file's reference is the table, k up; otherwise the heights mean nothing
     Raises RigFileError that names what the file holds.
     """
-    try:
+    with told_as(RigFileError, f"{path}: not TOML", ValueError):
         content = tomllib.loads(content_of(path))
-    except ValueError as error:
-        raise RigFileError(f"{path}: not TOML: {error}") from error
     tables = content.get("cameras", content)
     found = {name: table for name, table in tables.items() if isinstance(table, dict) and "matrix" in table}
     names = cameras or tuple(found)
@@ -177,14 +172,12 @@ def write_kalibr(path: Path, rig: StereoRig) -> None:
 
 def read_kalibr(path: Path) -> StereoRig:
     """cam0 and cam1 of a camchain. Raises RigFileError; OutputError where PyYAML is not installed."""
-    try:
+    with told_as(
+        OutputError, f"{path}: Kalibr's YAML needs PyYAML", ImportError, then="Install it: pip install pyyaml"
+    ):
         import yaml
-    except ImportError as error:
-        raise OutputError(f"{path}: Kalibr's YAML needs PyYAML: pip install pyyaml") from error
-    try:
+    with told_as(RigFileError, f"{path}: not YAML", yaml.YAMLError):
         chain = yaml.safe_load(content_of(path))
-    except yaml.YAMLError as error:
-        raise RigFileError(f"{path}: not YAML: {error}") from error
     parts = []
     for name in ("cam0", "cam1"):
         where, table = f"{path}, {name}", chain.get(name) if isinstance(chain, dict) else None
@@ -235,10 +228,9 @@ def read_mrcal(paths: Sequence[Path], *, world_is_table: bool = False) -> Stereo
         raise RigFileError(f"{paths[0]}: mrcal keeps one camera per file; give two, left first")
     parts = []
     for path in paths:
-        try:
+        kinds = ValueError, SyntaxError, MemoryError, RecursionError
+        with told_as(RigFileError, f"{path}: not a .cameramodel of mrcal", *kinds):
             model = ast.literal_eval(content_of(path).strip())
-        except (ValueError, SyntaxError, MemoryError, RecursionError) as error:
-            raise RigFileError(f"{path}: not a .cameramodel of mrcal ({type(error).__name__})") from error
         if not isinstance(model, dict):
             raise RigFileError(f"{path}: not a .cameramodel of mrcal: no dictionary")
         name = str(model.get("lensmodel", model.get("lens_model", "none")))
@@ -280,10 +272,8 @@ def read_dlt(
     world_is_table : True if their axes are the table's, z up
     Raises RigFileError, also where a camera is skewed: eleven free coefficients need not be a pinhole's.
     """
-    try:
+    with told_as(RigFileError, f"{path}: not a table of DLT coefficients", ValueError):
         L = np.array([[float(cell) for cell in line.split(",")] for line in content_of(path).split()])
-    except ValueError as error:
-        raise RigFileError(f"{path}: not a table of DLT coefficients ({error})") from error
     if L.shape != (11, 2) or not np.isfinite(L).all():
         raise RigFileError(f"{path}: {L.shape} numbers; coefficients of two cameras are 11 rows of 2 finite ones")
     if image_size is None:
