@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import itertools
 import logging
-import math
 import multiprocessing
 import os
 import signal
@@ -16,7 +15,6 @@ import sys
 import tempfile
 import threading
 import time
-from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ThreadPoolExecutor, wait
 from multiprocessing.connection import Connection
@@ -59,27 +57,24 @@ def do_all(rigs: Sequence[Job], recordings: Sequence[Job], pool: Processes | Clu
 
 def _finished(jobs: Sequence[Job], pool: Processes | Cluster) -> Iterator[tuple[Job, Record]]:
     died = []
-    for job, record in _ended(jobs, pool, pool.size):
+    for job, record in _ended(jobs, pool):
         if record.status == DIED:
             died.append(job)
         else:
             yield job, record
     for job in died:
-        for _, record in _ended([job], pool, 1):
+        for _, record in _ended([job], pool):
             yield job, failed(f"twice, {record.reason}") if record.status == DIED else record
 
 
-def _ended(jobs: Sequence[Job], pool: Processes | Cluster, at_once: float) -> Iterator[tuple[Job, Record]]:
-    """Do the jobs, so many side by side; yields each as it ends, if only because its process died."""
-    ready, running = deque(jobs), dict[Future[Record], Job]()
-    while ready or running:
-        while ready and len(running) < at_once:
-            job = ready.popleft()
-            running[pool.submit(job)] = job
+def _ended(jobs: Sequence[Job], pool: Processes | Cluster) -> Iterator[tuple[Job, Record]]:
+    """Do the jobs, as many side by side as the pool can; yields each as it ends, if only because its process died."""
+    running = {pool.submit(job): job for job in jobs}
+    while running:
         for future in wait(running, LOOK, FIRST_COMPLETED).done:
             job, record = running.pop(future), _result(future)
             if record.status == BUSY:
-                ready.append(job)
+                running[pool.submit(job)] = job  # behind all others
             else:
                 yield job, record
 
@@ -102,7 +97,6 @@ class Processes:
     """Processes of this machine, a thread for each, which gives it one job after the other."""
 
     def __init__(self, size: int) -> None:
-        self.size: float = size
         self._threads = ThreadPoolExecutor(size, thread_name_prefix="batch")
         self._own = threading.local()  # the process that a thread keeps
         self._context = Spawn()
@@ -159,7 +153,6 @@ class Cluster:
 
     def __init__(self, address: str) -> None:
         """Raises ClusterError if dask.distributed is not installed or nobody answers."""
-        self.size: float = math.inf  # the scheduler deals them out
         self._client = connect(address)
         self._executor = self._client.get_executor(pure=False)  # a job that is tried again is another task
 

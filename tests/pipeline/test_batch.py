@@ -63,7 +63,7 @@ def in_this_process(monkeypatch):
 
     with ThreadPoolExecutor(1) as pool:
         here = partial(SimpleNamespace, submit=partial(pool.submit, stage.do), close=lambda: None)
-        monkeypatch.setattr("disctrack.batch.run.Processes", lambda size: here(size=size))
+        monkeypatch.setattr("disctrack.batch.run.Processes", lambda size: here())
         yield
 
 

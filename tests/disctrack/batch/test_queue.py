@@ -102,7 +102,7 @@ class Pool:
     """Gives the answers to each job one after the other (GOOD, unless others are listed), a moment later."""
 
     def __init__(self, size=2, **answers):
-        self.size, self.answers, self._threads = size, answers, ThreadPoolExecutor(size)
+        self.answers, self._threads = answers, ThreadPoolExecutor(size)
         self.begun, self.running, self.at_once = [], [], []  # .at_once : how many ran when each began, itself included
 
     def submit(self, job):
