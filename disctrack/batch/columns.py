@@ -18,6 +18,8 @@ Row = dict[str, Any]  # column -> value of JSON's types, None where it is not kn
 
 UNITS = ("m",) * 3 + ("rad",) * 3  # of COORDINATES
 
+PATHS = ("trajectory", "report", "diagnosis_report")  # columns of files that a recording's results may have
+
 # Reduced chi-square of the rolling model with k_m alone; what thousands of dots scatter by is far below.
 LACKS_SOMETHING = 1.5
 FALSE_DISCOVERY = 0.05  # share of false ones among the recordings in which something is said to be missing

@@ -1,11 +1,9 @@
 """What one process does with one job: calibrate a rig, or take a recording from its images to its report.
 
-The numbers of its row in the summary are with sigmas, in SI units; NaN where one is not known, which a record has as
-None.
+The numbers of its row are with sigmas, in SI units; NaN where one is not known, which is kept as None.
 """
 
 import contextlib
-import dataclasses
 import hashlib
 import json
 import time
@@ -22,7 +20,7 @@ from disctrack.analyse.stage import run_analyse, write_analysis
 from disctrack.batch.columns import UNITS, Row, group_of
 from disctrack.batch.locks import locked
 from disctrack.batch.plan import Job
-from disctrack.batch.records import BUSY, MEASURED, SKIPPED, Record, failed, is_done, read_record, write_record
+from disctrack.batch.records import BUSY, MEASURED, SKIPPED, failed, is_done, outcome, read_row, write_row
 from disctrack.calibrate.stage import boards_in, calibrate_into, is_rig_of, source_of
 from disctrack.diagnosis import DiscSystem, run_diagnose
 from disctrack.diagnosis.model_file import declared_model
@@ -35,34 +33,34 @@ from disctrack.frames import CAMERAS, COORDINATES
 from disctrack.recording.declaration import read_recording
 from disctrack.track.measurement import measure, open_pairs, trajectory_provenance
 from disctrack.trajectory import Trajectory
-from disctrack.trajectory.file import Details, Provenance, kept_or_made
+from disctrack.trajectory.file import Details, kept_or_made
 
 LOCK = ".batch.lock"
 BUSY_FOR = 1.0  # [s] to wait for another batch before the recording is put back: longer than to look for it again
 
 
-def do(job: Job) -> Record:
-    """Do a job. Never raises an Exception: what went wrong is in the record, and in the recording's folder."""
+def do(job: Job) -> Row:
+    """Do a job. Never raises an Exception: what went wrong is in the row, and in the recording's folder."""
     try:
         return make_rig(job) if job.kind == "rig" else make_recording(job)
     except Timeout:
-        return Record(BUSY)
+        return outcome(BUSY)
     except Exception as error:
         return failed(reason_of(error))
 
 
-def make_rig(job: Job) -> Record:
+def make_rig(job: Job) -> Row:
     """Calibrate into job.rig, unless the same was done before. Raises Timeout."""
     path = Path(job.rig)
     with locked(path.with_name(LOCK), BUSY_FOR):
         source = source_of(read_recording(job.folder), job.options.calibration)
         if is_rig_of(path, source) and not job.options.overwrite:
-            return Record(SKIPPED)
+            return outcome(SKIPPED)
         calibrate_into(path, source, overwrite=True, figures=job.options.report)
-    return Record(MEASURED)
+    return outcome(MEASURED)
 
 
-def make_recording(job: Job) -> Record:
+def make_recording(job: Job) -> Row:
     """Track, analyse and, if asked for, diagnose; what is done already with the same inputs is kept. Raises Timeout."""
     results = Path(job.results)
     with locked(results / LOCK, BUSY_FOR):
@@ -72,13 +70,13 @@ def make_recording(job: Job) -> Record:
             kind = Kind.OTHER
             if isinstance(error, TrackingError):
                 kind = error.findings[0].kind if error.findings else Kind.DISC_NOT_FOUND
-            record = failed(reason_of(error), kind)
+            row = failed(reason_of(error), kind)
             with contextlib.suppress(DiscTrackError):  # or else the batch that runs now is the only one to know
-                write_record(results, record)
-            return record
+                write_row(results, row)
+            return row
 
 
-def _make_recording(job: Job, results: Path) -> Record:
+def _make_recording(job: Job, results: Path) -> Row:
     began, used = time.perf_counter(), time.process_time()
     recording = read_recording(job.folder)
     rig, pairs = read_rig(job.rig), open_pairs(recording)
@@ -89,11 +87,10 @@ def _make_recording(job: Job, results: Path) -> Record:
         return found.trajectory, found.details
 
     trajectory, _, fresh = kept_or_made(path, provenance, measured, job.options.overwrite)
-    record = None if fresh else read_record(results)  # is_done: of this provenance, as the trajectory is
-    if record is not None and is_done(results, record, job.options.stages):
-        return dataclasses.replace(record, status=SKIPPED)
-    record = _after_tracking(results, path, trajectory, provenance, job)
-    numbers = record.numbers | {
+    kept = None if fresh else read_row(results)  # is_done: of this provenance, as the trajectory is
+    if kept is not None and is_done(results, kept, job.options.stages):
+        return kept | {"status": SKIPPED}
+    row: Row = plain(_after_tracking(results, path, trajectory, job)) | {
         "name": recording.name,
         "repeats": group_of(recording),
         "rig": job.rig,
@@ -103,35 +100,34 @@ def _make_recording(job: Job, results: Path) -> Record:
         "seconds": round(time.perf_counter() - began, 3),
         "processor_seconds": round(time.process_time() - used, 3),
     }
-    record = dataclasses.replace(record, numbers=plain(numbers))
-    write_record(results, record)
-    return record
+    write_row(results, row)
+    return row
 
 
-def _after_tracking(results: Path, path: Path, trajectory: Trajectory, provenance: Provenance, job: Job) -> Record:
+def _after_tracking(results: Path, path: Path, trajectory: Trajectory, job: Job) -> Row:
     """Analysis, loss coefficient, diagnosis; one of them that is not possible is a reason, not a failure."""
-    files, numbers = {"trajectory": path.name}, tracked_numbers(trajectory)
+    row = {"trajectory": path.name, "stages": job.options.stages, **tracked_numbers(trajectory)}
     noticed = leading(trajectory.findings)
     missing = [f.sentence for f in noticed if f.doubtful or f.kind == Kind.UNREADABLE]
-    numbers |= {"severity": noticed[0].grave, "finding": noticed[0].kind.value} if noticed else {}
+    row |= {"severity": noticed[0].grave, "finding": noticed[0].kind.value} if noticed else {}
     try:
         analysis, report = _analyse(path, trajectory, job)
-        numbers |= analysed_numbers(analysis)
-        files |= {"report": report.relative_to(results).as_posix()} if report is not None else {}
+        row |= analysed_numbers(analysis)
+        row |= {"report": report.relative_to(results).as_posix()} if report is not None else {}
     except AnalysisError as error:
         missing.append(f"not analysed: {reason_of(error)}")
-    numbers |= friction_numbers(trajectory)
+    row |= friction_numbers(trajectory)
     if job.options.diagnose:
         wrong = first_to_mend(trajectory.findings)
         try:
             if wrong:
                 raise AnalysisError("a number is declared wrong, and a missing effect would be read into it")
             diagnosed = run_diagnose(path, overwrite=True).summary
-            numbers |= diagnosed_numbers(dict(diagnosed.data))
-            files["diagnosis_report"] = diagnosed.files[0].relative_to(results).as_posix()
+            row |= diagnosed_numbers(dict(diagnosed.data))
+            row["diagnosis_report"] = diagnosed.files[0].relative_to(results).as_posix()
         except AnalysisError as error:
             missing.append(f"not diagnosed: {reason_of(error)}")
-    return Record(MEASURED, "; ".join(missing), provenance.fingerprint, job.options.stages, files, numbers)
+    return row | outcome(MEASURED, "; ".join(missing))
 
 
 def _analyse(path: Path, trajectory: Trajectory, job: Job) -> tuple[Analysis, Path | None]:

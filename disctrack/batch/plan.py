@@ -8,7 +8,8 @@ from pathlib import Path
 
 from calibration import CalibrationSettings
 from disctrack.analyse.analysis import WINDOW
-from disctrack.batch.records import Record, Stages, failed
+from disctrack.batch.columns import Row
+from disctrack.batch.records import Stages, failed
 from disctrack.calibrate.stage import source_of
 from disctrack.errors import RecordingError, reason_of
 from disctrack.files.text import printable
@@ -125,7 +126,7 @@ class Job:
 
 def make_plan(
     found: FoundRecordings, recordings: Sequence[Path], options: BatchOptions
-) -> tuple[list[Job], list[Job], dict[str, Record], tuple[Path, ...]]:
+) -> tuple[list[Job], list[Job], dict[str, Row], tuple[Path, ...]]:
     """Read every recording.toml, count the images, and find who shares a rig by the content of the views.
 
     returns : jobs of rigs and of recordings, what fails before it begins by the recording's name, and folders of images
@@ -133,7 +134,7 @@ def make_plan(
     """
     rigs: dict[str, Job] = {}
     jobs: list[Job] = []
-    failures: dict[str, Record] = {}
+    failures: dict[str, Row] = {}
     undeclared = found.undeclared
     for folder in recordings:
         name, about = found.name(folder), Kind.DECLARATION

@@ -25,9 +25,10 @@ from typing import TYPE_CHECKING
 
 import cv2
 
+from disctrack.batch.columns import Row
 from disctrack.batch.measure import do
 from disctrack.batch.plan import Job
-from disctrack.batch.records import BUSY, DIED, FAILED, Record, failed
+from disctrack.batch.records import BUSY, DIED, FAILED, failed, outcome
 from disctrack.errors import ClusterError, reason_of, told_as
 from disctrack.findings import Kind
 from disctrack.processes import Spawn, end_with_parent
@@ -41,46 +42,46 @@ LOOK = 0.1  # [s] after which Ctrl-C is heard at the latest
 _STOPPING, _ASK_AGAIN = 9.0, 2.0
 
 
-def do_all(rigs: Sequence[Job], recordings: Sequence[Job], pool: Processes | Cluster) -> Iterator[tuple[Job, Record]]:
+def do_all(rigs: Sequence[Job], recordings: Sequence[Job], pool: Processes | Cluster) -> Iterator[tuple[Job, Row]]:
     """Do every job; yields each recording that is finished for good. Raises ClusterError.
 
     Rigs come first; a recording without its rig fails for the rig's reason. A job at which another batch works is asked
     for again until that one is done with it. A job whose process died gets a second try at the end, alone, when there
     is most memory.
     """
-    no_rig = {rig.rig: record.reason for rig, record in _finished(rigs, pool) if record.status == FAILED}
+    no_rig = {rig.rig: row["reason"] for rig, row in _finished(rigs, pool) if row["status"] == FAILED}
     for job in recordings:
         if job.rig in no_rig:
             yield job, failed(f"no rig: {no_rig[job.rig]}", Kind.CALIBRATION)
     yield from _finished([job for job in recordings if job.rig not in no_rig], pool)
 
 
-def _finished(jobs: Sequence[Job], pool: Processes | Cluster) -> Iterator[tuple[Job, Record]]:
+def _finished(jobs: Sequence[Job], pool: Processes | Cluster) -> Iterator[tuple[Job, Row]]:
     died = []
-    for job, record in _ended(jobs, pool):
-        if record.status == DIED:
+    for job, row in _ended(jobs, pool):
+        if row["status"] == DIED:
             died.append(job)
         else:
-            yield job, record
+            yield job, row
     for job in died:
-        for _, record in _ended([job], pool):
-            yield job, failed(f"twice, {record.reason}") if record.status == DIED else record
+        for _, row in _ended([job], pool):
+            yield job, failed(f"twice, {row['reason']}") if row["status"] == DIED else row
 
 
-def _ended(jobs: Sequence[Job], pool: Processes | Cluster) -> Iterator[tuple[Job, Record]]:
+def _ended(jobs: Sequence[Job], pool: Processes | Cluster) -> Iterator[tuple[Job, Row]]:
     """Do the jobs, as many side by side as the pool can; yields each as it ends, if only because its process died."""
     running = {pool.submit(job): job for job in jobs}
     while running:
         for future in wait(running, LOOK, FIRST_COMPLETED).done:
-            job, record = running.pop(future), _result(future)
-            if record.status == BUSY:
+            job, row = running.pop(future), _result(future)
+            if row["status"] == BUSY:
                 running[pool.submit(job)] = job  # behind all others
             else:
-                yield job, record
+                yield job, row
 
 
-def _result(future: Future[Record]) -> Record:
-    """Record of a job that has ended. Raises ClusterError where nothing further can be done."""
+def _result(future: Future[Row]) -> Row:
+    """Row of a job that has ended. Raises ClusterError where nothing further can be done."""
     try:
         return future.result()
     except CancelledError as error:  # not by us
@@ -104,23 +105,23 @@ class Processes:
         self._folder = tempfile.TemporaryDirectory(prefix="disctrack-")
         self._said = (Path(self._folder.name) / str(i) for i in itertools.count())
 
-    def submit(self, job: Job) -> Future[Record]:
+    def submit(self, job: Job) -> Future[Row]:
         """Begin a job; its future raises OSError where no process can be started for it."""
         return self._threads.submit(self.done, job)
 
-    def done(self, job: Job) -> Record:
-        """Do a job in this thread's process; its record says where that ended before the job did, and why."""
+    def done(self, job: Job) -> Row:
+        """Do a job in this thread's process; its row says where that ended before the job did, and why."""
         if self._ends:
-            return Record(DIED, "the batch ended")
+            return outcome(DIED, "the batch ended")
         process, jobs, said = getattr(self._own, "kept", None) or self._begun()
         self._own.kept = None
         try:
             jobs.send(job)
-            record: Record = jobs.recv()
+            row: Row = jobs.recv()
         except (EOFError, ConnectionError):
-            return Record(DIED, _why_it_ended(process, said))
+            return outcome(DIED, _why_it_ended(process, said))
         self._own.kept = process, jobs, said
-        return record
+        return row
 
     def _begun(self) -> tuple[SpawnProcess, Connection, Path]:
         """A new process, what it is told jobs by, and the file for whatever its libraries print. Raises OSError."""
@@ -156,9 +157,9 @@ class Cluster:
         self._client = connect(address)
         self._executor = self._client.get_executor(pure=False)  # a job that is tried again is another task
 
-    def submit(self, job: Job) -> Future[Record]:
+    def submit(self, job: Job) -> Future[Row]:
         """Begin a job; its future raises what is wrong with the cluster."""
-        future: Future[Record] = self._executor.submit(do_alone, job)
+        future: Future[Row] = self._executor.submit(do_alone, job)
         return future
 
     def close(self) -> None:
@@ -184,7 +185,7 @@ def connect(address: str) -> Client:
     return client
 
 
-def do_alone(job: Job) -> Record:
+def do_alone(job: Job) -> Row:
     """Do a job on one of a cluster's machines, in a process of its own."""
     multiprocessing.current_process().daemon = False  # dask's workers are, and Python allows daemons no processes
     with contextlib.closing(Processes(1)) as here:
@@ -219,11 +220,11 @@ def _work(jobs: Connection, said: Path) -> None:
     while True:
         job = jobs.recv()  # struck here, it ends in order, and gives back what it has of the system
         try:
-            record = do(job)
+            row = do(job)
         except SystemExit:  # half-written files are gone
             signal.signal(signal.SIGTERM, signal.SIG_DFL)
             signal.raise_signal(signal.SIGTERM)
-        jobs.send(record)
+        jobs.send(row)
 
 
 def _stop(number: int, frame: FrameType | None) -> None:

@@ -16,11 +16,11 @@ from filelock import Timeout
 from tqdm import tqdm
 
 from calibration.kit.arguments import checked
-from disctrack.batch.columns import COLUMNS, REPEATS, Row, repeats_of
+from disctrack.batch.columns import COLUMNS, PATHS, REPEATS, Row, repeats_of
 from disctrack.batch.locks import locked
 from disctrack.batch.plan import BatchOptions, FoundRecordings, Job, find_recordings, make_plan
 from disctrack.batch.pool import Cluster, Processes, do_all
-from disctrack.batch.records import FAILED, MEASURED, NOT_MEASURED, SKIPPED, Record, is_done, read_record
+from disctrack.batch.records import FAILED, MEASURED, NOT_MEASURED, SKIPPED, is_done, outcome, read_row
 from disctrack.batch.report import counts, report_of
 from disctrack.errors import AnalysisError, ArgumentError, ClusterError, OutputError, reason_of, told_as
 from disctrack.files.json_text import json_file
@@ -38,7 +38,6 @@ from disctrack.trajectory.file import read_provenance
 
 INTERRUPTED = "interrupted before it was done"
 SCHEMA, SCHEMA_VERSION = "disctrack batch summary", 1
-_PATHS = ("trajectory", "report", "diagnosis_report")
 TOGETHER = "together/diagnosis.html"  # of all recordings, below the folder of the summary
 
 
@@ -115,10 +114,10 @@ def run_batch(
             jobs = [replace(job, threads=threads) for job in jobs]
         stopped = _do(rigs, jobs, records, pool)
     for job in jobs:
-        records.setdefault(job.name, Record(NOT_MEASURED, stopped))
+        records.setdefault(job.name, outcome(NOT_MEASURED, stopped))
     whole = shard is None  # or else whoever sums up the shards
-    outcome = _summed_up(found, mine, records, options, stopped == INTERRUPTED, n if whole else 0)
-    return replace(outcome, undeclared=tuple(os.path.relpath(place, found.base) for place in undeclared))
+    done = _summed_up(found, mine, records, options, stopped == INTERRUPTED, n if whole else 0)
+    return replace(done, undeclared=tuple(os.path.relpath(place, found.base) for place in undeclared))
 
 
 def summarise_batch(
@@ -129,15 +128,15 @@ def summarise_batch(
     return _summed_up(found, found.recordings, {}, options or BatchOptions(), False, default_threads())
 
 
-def _do(rigs: list[Job], jobs: list[Job], records: dict[str, Record], pool: Processes | Cluster) -> str:
+def _do(rigs: list[Job], jobs: list[Job], records: dict[str, Row], pool: Processes | Cluster) -> str:
     """Fill `records` with what becomes of the recordings; returns why some have none."""
     n = len(jobs) + len(records)
     try:
         with progress_bar("batch", len(jobs), "recording") as advance:
-            for job, record in do_all(rigs, jobs, pool):
-                records[job.name] = record
+            for job, row in do_all(rigs, jobs, pool):
+                records[job.name] = row
                 advance(1)
-                tqdm.write(f"{len(records):4d} of {n}  {job.name}: {record.status}", file=sys.stderr)
+                tqdm.write(f"{len(records):4d} of {n}  {job.name}: {row['status']}", file=sys.stderr)
     except KeyboardInterrupt:
         return INTERRUPTED
     except ClusterError as error:
@@ -148,7 +147,7 @@ def _do(rigs: list[Job], jobs: list[Job], records: dict[str, Record], pool: Proc
 def _summed_up(
     found: FoundRecordings,
     mine: Sequence[Path],
-    records: dict[str, Record],
+    records: dict[str, Row],
     options: BatchOptions,
     interrupted: bool,
     processes: int,
@@ -193,36 +192,36 @@ def diagnose_all(folder: Path, rows: Sequence[Row], processes: int) -> str:
         raise AnalysisError(f"the recordings could not be diagnosed: {reason_of(error)}") from error
 
 
-def rows_of(found: FoundRecordings, records: Mapping[str, Record]) -> list[Row]:
+def rows_of(found: FoundRecordings, records: Mapping[str, Row]) -> list[Row]:
     """A row for every recording: from `records` (by name) where it took part now, else from what lies on the disk."""
     rows = []
     for folder in found.recordings:
         name = found.name(folder)
-        record = records[name] if name in records else _on_the_disk(folder, found.results(folder))
-        rows.append(_row(found, folder, name, record))
+        row = records[name] if name in records else _on_the_disk(folder, found.results(folder))
+        rows.append(_row(found, folder, name, row))
     return rows
 
 
-def _on_the_disk(folder: Path, results: Path) -> Record:
+def _on_the_disk(folder: Path, results: Path) -> Row:
     """With a reason where the declaration is no longer the one that was measured."""
-    record = read_record(results)
-    if record is None:
-        return Record(NOT_MEASURED, "not measured yet, or by another shard that has not come to it")
-    if record.status != MEASURED:
-        return record
-    if not is_done(results, record, {}):
-        return Record(NOT_MEASURED, "its files are not those that were measured, or not all there")
-    changed = changed_since(folder, read_provenance(results / record.files["trajectory"]).declared)
+    row = read_row(results)
+    if row is None:
+        return outcome(NOT_MEASURED, "not measured yet, or by another shard that has not come to it")
+    if row["status"] != MEASURED:
+        return row
+    if not is_done(results, row, {}):
+        return outcome(NOT_MEASURED, "its files are not those that were measured, or not all there")
+    changed = changed_since(folder, read_provenance(results / row["trajectory"]).declared)
     stale = f"{FILE_NAME} has changed: {changed}; the batch without --summary-only measures it anew" if changed else ""
-    return replace(record, status=SKIPPED, reason="; ".join(filter(None, [stale, record.reason])))
+    return row | outcome(SKIPPED, "; ".join(filter(None, [stale, row["reason"]])))
 
 
-def _row(found: FoundRecordings, folder: Path, name: str, record: Record) -> Row:
-    known: Row = {"recording": name, "status": record.status, "reason": record.reason}
-    known |= {column: value for column, value in record.numbers.items() if column in COLUMNS}
-    paths = {what: found.results(folder) / record.files[what] for what in _PATHS if what in record.files}
-    paths |= {"folder": folder} | ({"rig": Path(known["rig"])} if known.get("rig") else {})
-    return dict.fromkeys(COLUMNS) | known | {what: _relative(path, found.common) for what, path in paths.items()}
+def _row(found: FoundRecordings, folder: Path, name: str, known: Row) -> Row:
+    """All columns; paths relative to the summary's folder."""
+    row: Row = {column: known.get(column) for column in COLUMNS} | {"recording": name}
+    paths = {what: found.results(folder) / row[what] for what in PATHS if row[what]}
+    paths |= {"folder": folder} | ({"rig": Path(row["rig"])} if row["rig"] else {})
+    return row | {what: _relative(path, found.common) for what, path in paths.items()}
 
 
 def _relative(path: Path, folder: Path) -> str:
@@ -233,7 +232,7 @@ def _relative(path: Path, folder: Path) -> str:
 
 
 def write_summary(
-    found: FoundRecordings, records: Mapping[str, Record], options: BatchOptions
+    found: FoundRecordings, records: Mapping[str, Row], options: BatchOptions
 ) -> tuple[list[Row], tuple[Path, ...]]:
     """Write summary.json, summary.csv, repeats.csv and index.html; returns the rows and the files.
 

@@ -30,7 +30,7 @@ from disctrack.batch import measure as stage
 from disctrack.batch.locks import locked
 from disctrack.batch.measure import LOCK, do
 from disctrack.batch.plan import make_plan
-from disctrack.batch.records import MEASURED, is_done, read_record
+from disctrack.batch.records import MEASURED, is_done, read_row
 from disctrack.processes import Spawn
 from disctrack.track.follow.tracking import prepare
 from disctrack.trajectory.file import read_trajectory
@@ -109,27 +109,27 @@ def one(recording):
 
 @pytest.mark.statistical
 def test_what_counts_is_content_not_existence(one, recording):
-    assert stage.do(one).status == "measured"
+    assert stage.do(one)["status"] == "measured"
     results = recording / "results"
-    assert stage.do(one).status == "skipped"
+    assert stage.do(one)["status"] == "skipped"
     (recording / "recording.toml").touch()
-    assert stage.do(one).status == "skipped"
+    assert stage.do(one)["status"] == "skipped"
 
     image = cv2.imread(str(recording / "left" / "000003.png"), cv2.IMREAD_UNCHANGED)
-    before = read_record(results)
+    before = read_row(results)
     replace(recording / "left" / "000003.png", cv2.imencode(".png", image ^ 1)[1].tobytes())
-    assert stage.do(one).status == "measured"
-    assert read_record(results).numbers["input_sha256"] != before.numbers["input_sha256"]
+    assert stage.do(one)["status"] == "measured"
+    assert read_row(results)["input_sha256"] != before["input_sha256"]
 
     (wider,) = jobs_of(recording, window=0.4)
-    assert stage.do(wider).status == "measured"
-    assert stage.do(wider).status == "skipped"
+    assert stage.do(wider)["status"] == "measured"
+    assert stage.do(wider)["status"] == "skipped"
     toml = (recording / "recording.toml").read_text()
     replace(recording / "recording.toml", toml.replace("mass_g = 209.69", "mass_g = 209.7").encode())
     (heavier,) = jobs_of(recording, window=0.4)
-    assert stage.do(heavier).status == "measured"
+    assert stage.do(heavier)["status"] == "measured"
     (again,) = jobs_of(recording, window=0.4, overwrite=True)
-    assert stage.do(again).status == "measured"
+    assert stage.do(again)["status"] == "measured"
 
 
 def test_a_file_of_unknown_origin_is_kept(one, recording):
@@ -137,8 +137,8 @@ def test_a_file_of_unknown_origin_is_kept(one, recording):
     foreign.parent.mkdir()
     foreign.write_bytes(b"years of work")
     result = stage.do(one)
-    assert result.status == "failed"
-    assert "--overwrite" in result.reason
+    assert result["status"] == "failed"
+    assert "--overwrite" in result["reason"]
     assert foreign.read_bytes() == b"years of work"
 
 
@@ -154,18 +154,18 @@ def test_files_that_vanish_in_mid_run_cost_their_frames_or_their_recording(one, 
 
     monkeypatch.setattr(stage, "measure", after_the_last_images_went)
     spoilt = stage.do(one)
-    assert spoilt.status == "measured"
-    assert spoilt.numbers["pairs_measured"] == 20
-    assert "8 images could not be read" in spoilt.reason
+    assert spoilt["status"] == "measured"
+    assert spoilt["pairs_measured"] == 20
+    assert "8 images could not be read" in spoilt["reason"]
     monkeypatch.undo()
 
     for file in sorted((recording / "right").iterdir())[-2:]:
         file.unlink()
     failed = stage.do(one)
-    assert failed.status == "failed"
-    assert "left has 20 frames" in failed.reason
+    assert failed["status"] == "failed"
+    assert "left has 20 frames" in failed["reason"]
     shutil.rmtree(recording)
-    assert "recording.toml" in stage.do(one).reason
+    assert "recording.toml" in stage.do(one)["reason"]
 
 
 @pytest.mark.statistical
@@ -231,8 +231,8 @@ def test_without_room_there_is_a_reason_and_nothing_half_written(room, one, reco
     prepare()  # what is compiled is kept in files, too
     with largest_file(room):
         result = stage.do(one)
-    assert result.status == "failed"
-    assert "would exceed the size limit" in result.reason
+    assert result["status"] == "failed"
+    assert "would exceed the size limit" in result["reason"]
     assert [file.name for file in results.iterdir()] == (["batch.json"] if room > 1000 else [])
 
 
@@ -264,7 +264,7 @@ def test_a_read_only_folder_is_told_at_once_and_results_may_go_elsewhere(
     assert said == ""
     assert "batch_results: cannot be written: no permission" in errors
     assert "-o" in errors
-    assert "another place with -o" in stage.do(jobs_of(recording)[0]).reason
+    assert "another place with -o" in stage.do(jobs_of(recording)[0])["reason"]
     cli("batch", recording, "-o", tmp_path / "out", *FAST)
     assert not (recording / "results").exists()
     assert (tmp_path / "out" / "recording" / "trajectory.h5").is_file()
@@ -339,10 +339,10 @@ def assert_whole(root: Path, reference: Path) -> int:
                 json.loads(file.read_text())
             else:
                 assert file.name == LOCK
-        record = read_record(results)
-        if record is not None:
-            assert record.status == MEASURED
-            assert is_done(results, record, {"report": False})
+        row = read_row(results)
+        if row is not None:
+            assert row["status"] == MEASURED
+            assert is_done(results, row, {"report": False})
             assert numbers(results / "trajectory.h5").keys() == expected.keys()
             finished += 1
     return finished
@@ -353,7 +353,7 @@ def assert_whole(root: Path, reference: Path) -> int:
 def test_a_batch_killed_at_random_instants_leaves_only_whole_results_and_can_go_on(recording, tmp_path, kills):
     root, undisturbed = (a_day(recording, tmp_path / name, ("a",)) for name in ("day", "undisturbed"))
     (job,) = jobs_of(undisturbed)
-    assert do(job).status == MEASURED  # in this process
+    assert do(job)["status"] == MEASURED  # in this process
     results = root / "a" / "results"
     process = start(root)
     wait_until(lambda: begun(root), process)

@@ -23,14 +23,14 @@ from disctrack.batch.columns import COLUMNS, FITTED, copies, repeats_of
 from disctrack.batch.locks import locked
 from disctrack.batch.plan import BatchOptions, Job, find_recordings
 from disctrack.batch.pool import Cluster, do_all
-from disctrack.batch.records import BUSY, DIED, FAILED, MEASURED, Record, failed
+from disctrack.batch.records import BUSY, DIED, FAILED, MEASURED, failed, outcome, read_row
 from disctrack.batch.report import report_of
 from disctrack.batch.run import as_csv, with_false_discovery, write_summary
 from disctrack.errors import ClusterError, RecordingError, reason_of
 from disctrack.report.html import page
 from disctrack.report.terminal import full, short
 
-GOOD, KILLED = Record(MEASURED), Record(DIED, "killed")
+GOOD, KILLED = outcome(MEASURED), outcome(DIED, "killed")
 
 
 def touched(root, *files):
@@ -126,26 +126,26 @@ def test_recordings_wait_for_their_rigs():
     results = done_by(pool, WITH_RIG, [RIG])
     assert pool.begun == [("rig", "a"), ("recording", "a"), ("recording", "b"), ("recording", "c")]
     assert pool.at_once[0] == 1
-    assert [results[name].status for name in "abc"] == [MEASURED] * 3
+    assert [results[name]["status"] for name in "abc"] == [MEASURED] * 3
 
 
 def test_without_its_rig_a_recording_fails_with_the_rigs_reason_and_others_go_on():
     results = done_by(Pool(rig_a=[failed("no corners found")]), WITH_RIG, [RIG])
-    assert "no corners found" in results["a"].reason
-    assert [results[name].status for name in "abc"] == [FAILED, MEASURED, FAILED]
+    assert "no corners found" in results["a"]["reason"]
+    assert [results[name]["status"] for name in "abc"] == [FAILED, MEASURED, FAILED]
 
 
 def test_a_recording_at_which_another_batch_works_is_asked_for_again_after_the_others():
-    pool = Pool(size=1, recording_a=[Record(BUSY), GOOD])
-    assert done_by(pool, [job("a"), job("b")])["a"].status == MEASURED
+    pool = Pool(size=1, recording_a=[outcome(BUSY), GOOD])
+    assert done_by(pool, [job("a"), job("b")])["a"]["status"] == MEASURED
     assert [name for _, name in pool.begun] == ["a", "b", "a"]
 
 
 def test_a_job_whose_process_died_is_tried_once_more_at_the_end_and_alone():
     pool = Pool(recording_a=[KILLED, KILLED], recording_b=[KILLED, GOOD])
     results = done_by(pool, [job(name) for name in "abcd"])
-    assert results["a"].reason == "twice, killed"
-    assert [results[name].status for name in "abcd"] == [FAILED, MEASURED, MEASURED, MEASURED]
+    assert results["a"]["reason"] == "twice, killed"
+    assert [results[name]["status"] for name in "abcd"] == [FAILED, MEASURED, MEASURED, MEASURED]
     assert sorted(name for _, name in pool.begun[4:]) == ["a", "b"]  # in the order in which their processes died
     assert pool.at_once[4:] == [1, 1]
 
@@ -174,8 +174,8 @@ def cluster(monkeypatch):
 def test_answers_of_a_cluster_are_results_deaths_and_failures(cluster):
     cluster.answers = [GOOD, KILLED, RuntimeError("worker lost too often"), GOOD]
     results = done_by(Cluster("tcp://there"), [job("a"), job("b"), job("c")])
-    assert {name: result.status for name, result in results.items()} == {"a": MEASURED, "b": MEASURED, "c": FAILED}
-    assert "worker lost too often" in results["c"].reason
+    assert {name: result["status"] for name, result in results.items()} == {"a": MEASURED, "b": MEASURED, "c": FAILED}
+    assert "worker lost too often" in results["c"]["reason"]
 
 
 def test_a_lost_scheduler_is_told_and_no_recording_is_blamed(cluster):
@@ -305,11 +305,24 @@ def test_repeats_are_of_one_group_determined_and_no_copies():
 def test_a_summary_lists_repeats_beside_the_recordings(tmp_path):
     found = find_recordings([recordings_at(tmp_path, "a", "b")])
     alike = {"repeats": "glass", "n_theta": 0.66, "n_theta_sigma": 0.01}
-    records = {name: Record(MEASURED, numbers=alike | {"input_sha256": name}) for name in "ab"}
+    records = {name: outcome(MEASURED) | alike | {"input_sha256": name} for name in "ab"}
     write_summary(found, records, BatchOptions())
     (repeat,) = json.loads((found.common / "summary.json").read_text())["repeats"]
     assert (repeat["quantity"], repeat["n"]) == ("n_theta", 2)
     assert "Repeats" in (found.common / "index.html").read_text()
+
+
+def test_a_row_that_the_first_version_kept_is_read(tmp_path):
+    """It kept columns, and the files that are columns, apart."""
+    kept = {"schema": "disctrack batch record", "schema_version": 1, "fingerprint": "f", "stages": {"report": True}}
+    kept |= {"status": MEASURED, "reason": "", "files": {"trajectory": "trajectory.h5"}, "numbers": {"pairs": 20}}
+    (tmp_path / "batch.json").write_text(json.dumps(kept))
+    row = read_row(tmp_path)
+    assert (row["status"], row["trajectory"], row["pairs"], row["stages"]) == (
+        MEASURED, "trajectory.h5", 20, {"report": True},
+    )  # fmt: skip
+    (tmp_path / "batch.json").write_text(json.dumps(kept | {"schema_version": 3}))
+    assert read_row(tmp_path) is None
 
 
 def test_false_discoveries_are_counted_among_the_recordings_that_were_diagnosed():
