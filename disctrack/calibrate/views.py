@@ -15,7 +15,7 @@ from disctrack.errors import RecordingError
 from disctrack.frames import CAMERAS
 from disctrack.recording.declaration import CalibrationViews, Recording
 from disctrack.recording.readers import open_frames
-from disctrack.recording.readers.base import FrameReader, ImagePart, ImageParts
+from disctrack.recording.readers.base import FrameReader, Part, Parts, cut_out
 from disctrack.recording.readers.decoding import decode
 from disctrack.recording.readers.files import IMAGES, content_of, file_number, match_files, split_member
 from disctrack.recording.readers.flat_field import FlatField, FlatFields, flat_fields
@@ -50,7 +50,7 @@ class TargetImages(Brief):
     left: tuple[View, ...]
     right: tuple[View, ...]
     fields: FlatFields = (None, None)  # by which grey views of the frames' own size are corrected
-    parts: ImageParts = (None, None)  # that are looked at
+    parts: Parts = (None, None)  # that are looked at
 
     def __len__(self) -> int:
         return len(self.left)
@@ -68,7 +68,7 @@ class TargetImages(Brief):
             if flat is not None:
                 digest.update(flat.sha256.encode())
             if part is not None:
-                digest.update(str(part).encode())
+                digest.update(str(list(part)).encode())
             for view in side:
                 if not isinstance(view, FrameView):
                     digest.update(hashlib.sha256(content_of(view, str(view))).digest())
@@ -79,7 +79,7 @@ class TargetImages(Brief):
 
 @checked
 def find_views(
-    left: str, right: str, folder: str | Path, fields: FlatFields = (None, None), parts: ImageParts = (None, None)
+    left: str, right: str, folder: str | Path, fields: FlatFields = (None, None), parts: Parts = (None, None)
 ) -> TargetImages:
     """Views that the two patterns match, paired by their order: a file each, or all frames of one file each.
 
@@ -182,13 +182,8 @@ def pixels_of(view: View) -> NDArray:
     return decode(content_of(view, str(view)), str(view))
 
 
-def _pixels(view: View, flat: FlatField | None, part: ImagePart | None) -> NDArray:
+def _pixels(view: View, flat: FlatField | None, part: Part | None) -> NDArray:
     """Grey values or colours of a view. Raises RecordingError, which begins with the file or names the frame."""
     image = pixels_of(view)
     whole = flat.corrected(image) if flat is not None and flat.fits(image) else image
-    if part is None:
-        return whole
-    height, width = whole.shape[:2]
-    if (width, height) != (part.width, part.height) and not part.lies_in(width, height):
-        raise RecordingError(f"{view}: {width} x {height} px do not hold the part {part} that [cameras] declares.")
-    return part.of(whole)
+    return whole if part is None else cut_out(whole, part, str(view))

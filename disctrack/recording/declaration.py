@@ -18,7 +18,7 @@ from disctrack.errors import CalibrationError, RecordingError, told_as
 from disctrack.files.inputs import RECORDING_FILE, keep, why_not_regular
 from disctrack.files.toml_tree import read_toml
 from disctrack.frames import CAMERAS
-from disctrack.recording.readers.base import ImagePart, ImageParts
+from disctrack.recording.readers.base import Parts
 
 FILE_NAME = RECORDING_FILE
 MOST = 100  # dots of a disc; corners or squares along a side of a target
@@ -203,7 +203,7 @@ class Recording(Brief):
     # left, right: file patterns, or folders of images to be averaged, that show the gain and the offset of a camera's
     # pixels: of an evenly lit surface, and without any light
     sensors: tuple[tuple[str | None, str | None], ...] = ((None, None), (None, None))
-    parts: ImageParts = (None, None)  # left, right: where a camera's images are a part of the files'
+    parts: Parts = (None, None)  # left, right: where a camera's images are a part of the files'
 
     @property
     def file(self) -> Path:
@@ -262,7 +262,7 @@ def read_recording(path: str | Path) -> Recording:
         air_density=_air_density(file, declared.get("air", {})),
         declared=declared,
         sensors=tuple((cameras.get(f"{name}_flat"), cameras.get(f"{name}_dark")) for name in CAMERAS),
-        parts=tuple(ImagePart(*part) if (part := cameras.get(f"{name}_part")) else None for name in CAMERAS),
+        parts=tuple(tuple(part) if (part := cameras.get(f"{name}_part")) else None for name in CAMERAS),
     )
 
 

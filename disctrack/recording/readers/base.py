@@ -4,6 +4,7 @@ import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -134,49 +135,40 @@ def changed(reader: FrameReader, change: Callable[[Image], Image], by: str) -> F
     return replace(reader, decoded=lambda index, out, where: change(reader.read(index)), coding=coding)
 
 
-@dataclass(frozen=True)
-class ImagePart:
-    """Columns x to x + width - 1 and rows y to y + height - 1 [px] of an image, as the images of a camera.
+# x, y, width, height [px]: columns and rows of an image as the images of a camera. Of one sensor behind mirrors, or of
+# two cameras' images that are stored in one
+Part = tuple[int, int, int, int]
+Parts = tuple[Part | None, ...]  # of the left and of the right camera
 
-    Of one sensor behind mirrors, or of two cameras' images that are stored in one.
+
+def cut_out(image: NDArray, part: Part, where: str) -> NDArray:
+    """The part of an image (h, w) or (h, w, channels); an image of the part's own size is that part already.
+
+    Raises RecordingError, which begins with `where`, if it is cut.
     """
-
-    x: int
-    y: int
-    width: int
-    height: int
-
-    def of(self, image: NDArray) -> NDArray:
-        """The part of an image (h, w) or (h, w, channels); an image of the part's own size is that part already."""
-        if image.shape[:2] == (self.height, self.width):
-            return image
-        return np.ascontiguousarray(image[self.y : self.y + self.height, self.x : self.x + self.width])
-
-    def lies_in(self, width: int, height: int) -> bool:
-        """Whether an image of this size [px] has the whole part."""
-        return self.x + self.width <= width and self.y + self.height <= height
-
-    def __str__(self) -> str:
-        return f"[{self.x}, {self.y}, {self.width}, {self.height}]"
+    x, y, width, height = part
+    found = image[y : y + height, x : x + width] if image.shape[:2] != (height, width) else image
+    if found.shape[:2] != (height, width):
+        size = f"{image.shape[1]} x {image.shape[0]} px"
+        raise RecordingError(f"{where}: {size} do not hold the part {list(part)} that [cameras] declares.")
+    return np.ascontiguousarray(found)
 
 
-ImageParts = tuple[ImagePart | None, ...]  # of the left and of the right camera
-
-
-def frames_in_parts(readers: Sequence[FrameReader], parts: ImageParts, where: str) -> Iterator[FrameReader]:
+def frames_in_parts(readers: Sequence[FrameReader], parts: Parts, where: str) -> Iterator[FrameReader]:
     """Both cameras' readers, of the declared parts. Raises RecordingError, which begins with `where`, if one is cut."""
     for reader, part in zip(readers, parts, strict=True):
         if part is None:
             yield reader
             continue
-        width, height = reader.image_size
-        if not part.lies_in(width, height):
+        (x, y, *size), (width, height) = part, reader.image_size
+        if x + size[0] > width or y + size[1] > height:
             raise RecordingError(
-                f"{where}: [cameras] {reader.camera}_part is {part}, columns {part.x} to {part.x + part.width - 1} and "
-                f"rows {part.y} to {part.y + part.height - 1}, but {reader.describe(0)} has {width} x {height} px. It "
-                "is [x, y, width, height] in pixels, from the upper left corner."
+                f"{where}: [cameras] {reader.camera}_part is {list(part)}, columns {x} to {x + size[0] - 1} and rows "
+                f"{y} to {y + size[1] - 1}, but {reader.describe(0)} has {width} x {height} px. It is [x, y, width, "
+                "height] in pixels, from the upper left corner."
             )
-        yield replace(changed(reader, part.of, str(part)), image_size=(part.width, part.height))
+        cut = changed(reader, partial(cut_out, part=part, where=where), str(list(part)))
+        yield replace(cut, image_size=part[2:])
 
 
 def in_words(image_size: tuple[int, ...], bit_depth: int) -> str:
