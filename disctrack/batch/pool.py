@@ -57,27 +57,20 @@ def do_all(rigs: Sequence[Job], recordings: Sequence[Job], pool: Processes | Clu
 
 
 def _finished(jobs: Sequence[Job], pool: Processes | Cluster) -> Iterator[tuple[Job, Row]]:
-    died = []
-    for job, row in _ended(jobs, pool):
-        if row["status"] == DIED:
-            died.append(job)
-        else:
-            yield job, row
-    for job in died:
-        for _, row in _ended([job], pool):
-            yield job, failed(f"twice, {row['reason']}") if row["status"] == DIED else row
-
-
-def _ended(jobs: Sequence[Job], pool: Processes | Cluster) -> Iterator[tuple[Job, Row]]:
-    """Do the jobs, as many side by side as the pool can; yields each as it ends, if only because its process died."""
-    running = {pool.submit(job): job for job in jobs}
+    """Do the jobs, as many side by side as the pool can; yields each as it ends for good."""
+    running, died, again = {pool.submit(job): job for job in jobs}, list[Job](), list[Job]()
     while running:
         for future in wait(running, LOOK, FIRST_COMPLETED).done:
             job, row = running.pop(future), _result(future)
             if row["status"] == BUSY:
                 running[pool.submit(job)] = job  # behind all others
+            elif row["status"] == DIED and job not in again:
+                died.append(job)
             else:
-                yield job, row
+                yield job, failed(f"twice, {row['reason']}") if row["status"] == DIED else row
+        if died and not running:
+            again.append(died.pop(0))
+            running[pool.submit(again[-1])] = again[-1]
 
 
 def _result(future: Future[Row]) -> Row:
