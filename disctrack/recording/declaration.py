@@ -228,9 +228,8 @@ def read_recording(path: str | Path) -> Recording:
     file = _recording_file(Path(path))
     keep(file)
     declared = read_toml(file, RecordingError)
-    _refuse_unknown_keys(file, declared)
+    _refuse_odd(file, declared)
     _refuse_missing(file, declared)
-    _refuse_unfit(file, declared)
     cameras, calibration = declared["cameras"], declared["calibration"]
     rate = float(cameras["frame_rate_hz"])
     exposure = float(cameras["exposure_us"]) / 1e6 if "exposure_us" in cameras else None
@@ -289,17 +288,20 @@ def _recording_file(path: Path) -> Path:
     return path
 
 
-def _refuse_unknown_keys(file: Path, declared: Mapping[str, Any]) -> None:
+def _refuse_odd(file: Path, declared: Mapping[str, Any]) -> None:
+    """Raise RecordingError for a key that nobody knows, and for a value that cannot be a known one's."""
     for key, value in declared.items():
-        if key in KEYS and key != "":
-            if not isinstance(value, dict):
-                raise RecordingError(f"{file}: '{key}' is {_shown(value)}; expected a section [{key}].")
-            for name in value:
-                if name not in KEYS[key]:
-                    raise RecordingError(f"{file}: unknown key '{name}' in [{key}]. {_nearest(name, key)}")
-        elif key not in KEYS[""]:
-            kind = "section" if isinstance(value, dict) else "key"
-            raise RecordingError(f"{file}: unknown {kind} '{key}'. {_nearest(key, '', kind)}")
+        section, entries = (key, value) if key and key in KEYS else ("", {key: value})
+        if not isinstance(entries, dict):
+            raise RecordingError(f"{file}: '{key}' is {_shown(value)}; expected a section [{key}].")
+        for name, given in entries.items():
+            meant, place = KEYS[section].get(name), f"[{section}] " if section else ""
+            if meant is None:
+                kind = "section" if isinstance(given, dict) and not section else "key"
+                within = f" in [{section}]" if section else ""
+                raise RecordingError(f"{file}: unknown {kind} '{name}'{within}. {_nearest(name, section, kind)}")
+            if not meant.fits(given):
+                raise RecordingError(f"{file}: {place}{name} is {_shown(given)}; expected {meant.expected}.")
 
 
 def _nearest(name: str, section: str, kind: str = "key") -> str:
@@ -323,15 +325,6 @@ def _refuse_missing(file: Path, declared: Mapping[str, Any]) -> None:
     if names:
         said = "is missing. Add it" if len(names) == 1 else "are missing. Add them"
         raise RecordingError(f"{file}: {', '.join(names)} {said}: every length in mm, mass in g, time in s.")
-
-
-def _refuse_unfit(file: Path, declared: Mapping[str, Any]) -> None:
-    for section, keys in KEYS.items():
-        given = declared.get(section, {}) if section else declared
-        for key, meant in keys.items():
-            if key in given and not meant.fits(given[key]):
-                where = f"[{section}] {key}" if section else key
-                raise RecordingError(f"{file}: {where} is {_shown(given[key])}; expected {meant.expected}.")
 
 
 def _shown(value: object) -> str:
