@@ -104,13 +104,11 @@ def open_pairs(recording: Recording, frames: tuple[int | None, int | None] = (No
     ]
     readers = flat_fielded(readers, flat_fields(recording.folder, recording.sensors))
     left, right = frames_in_parts(readers, recording.parts, str(recording.file))
-    headers = check_headers(left, right, recording.frame_rate, recording.exposure, str(recording.file))
+    headers = [*check_headers(left, right, recording.frame_rate, recording.exposure, str(recording.file))]
     check_pair(left, right)
-    stamp_doubts, stamp_warnings = check_time_stamps(left, right, recording.frame_rate)
     findings = (
         *of_kind(Kind.READING, Severity.DOUBT, (*left.doubts, *right.doubts, *check_same_numbers(left, right))),
-        *of_kind(Kind.TIME_STAMPS, Severity.DOUBT, stamp_doubts),
-        *of_kind(Kind.TIME_STAMPS, Severity.WARNING, stamp_warnings),
+        *check_time_stamps(left, right, recording.frame_rate),
         *of_kind(Kind.HEADERS, Severity.WARNING, headers),
         *of_kind(Kind.READING, Severity.NOTE, (*left.notes, *right.notes)),
     )

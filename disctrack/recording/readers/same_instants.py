@@ -5,13 +5,14 @@ be is an error; doubt leads to a warning, with the frames' numbers, and to evenl
 """
 
 from collections.abc import Iterator
+from functools import partial
 
 import numpy as np
 
 from calibration.kit.arrays import Array
 from calibration.kit.brief import ranges
 from disctrack.errors import RecordingError
-from disctrack.frames import CAMERAS
+from disctrack.findings import Finding, Kind, Severity
 from disctrack.recording.readers.base import CameraHeader, FrameReader
 
 RATE_ROUNDING_HZ = 0.5  # headers give the rate in whole Hz
@@ -25,20 +26,19 @@ SAME_INSTANT = 0.01  # of a period: at 60 rad/s and 1000 Hz the disc turns by 0.
 
 def check_headers(
     left: FrameReader, right: FrameReader, frame_rate: float, exposure: float | None, declared_in: str
-) -> tuple[str, ...]:
+) -> Iterator[str]:
     """Compare the cameras' headers with each other, and with the declared frame rate [Hz] and exposure [s].
 
-    Returns warnings. Raises RecordingError where frame i of both cannot belong together, or cannot have been taken at
+    Yields warnings. Raises RecordingError where frame i of both cannot belong together, or cannot have been taken at
     the declared rate. Formats without a header pass, with a warning where they state another rate: it may be that of a
     player.
     """
-    warnings = []
     for reader in (left, right):
         header, camera, rate = reader.header, reader.camera, reader.frame_rate
         declared = f"{declared_in}: [cameras] frame_rate_hz is {frame_rate:g}"
         if header is None:
             if rate is not None and abs(rate - frame_rate) > RATE_ROUNDING_HZ:
-                warnings.append(f"{declared}, the {camera} file states {rate:g} Hz")
+                yield f"{declared}, the {camera} file states {rate:g} Hz"
             continue
         stamped = 0.0 if header.first_time is None else CLOCK_TOLERANCE * header.frame_rate
         if abs(header.frame_rate - frame_rate) > max(RATE_ROUNDING_HZ, stamped):
@@ -47,18 +47,16 @@ def check_headers(
                 "Every velocity would be wrong by their ratio: correct that."
             )
         if exposure is not None and header.exposure is not None and _differ(header.exposure, exposure):
-            warnings.append(
+            yield (
                 f"{declared_in}: [cameras] exposure_us is {1e6 * exposure:g}, the {camera} camera's header says "
                 f"{1e6 * header.exposure:g} µs ({header.file}); the declared one is used"
             )
     if left.header is not None and right.header is not None:
-        _check_instants(left.header, right.header)
-        warnings += _doubtful(left.header, right.header)
-    return tuple(warnings)
+        yield from _compared(left.header, right.header)
 
 
-def _check_instants(left: CameraHeader, right: CameraHeader) -> None:
-    """Raise RecordingError where frame i of both does not show the same instant."""
+def _compared(left: CameraHeader, right: CameraHeader) -> Iterator[str]:
+    """What is doubtful. Raises RecordingError where frame i of both does not show the same instant."""
     if abs(left.frame_rate - right.frame_rate) > 1e-6 * left.frame_rate:
         raise RecordingError(
             f"the left camera's frames were recorded with {left.rate} ({left.file}), the right one's with {right.rate} "
@@ -79,9 +77,6 @@ def _check_instants(left: CameraHeader, right: CameraHeader) -> None:
             f"taken {offset[0]:.4g} s after that of the left one ({left.file}); a frame lasts {period:.4g} s. "
             "Export the frames of the same instants, of the same take."
         )
-
-
-def _doubtful(left: CameraHeader, right: CameraHeader) -> Iterator[str]:
     if left.trigger != right.trigger:  # equal modes count from the same event; of unequal ones nothing is known
         yield (
             f"the cameras were triggered in different modes: left {left.trigger or 'unknown'}, right "
@@ -119,24 +114,24 @@ def start_offset(left: CameraHeader, right: CameraHeader) -> tuple[float, str] |
     return later, "the trigger"
 
 
-def check_same_numbers(left: FrameReader, right: FrameReader) -> tuple[str, ...]:
+def check_same_numbers(left: FrameReader, right: FrameReader) -> Iterator[str]:
     """What is doubtful about pairing two sequences by their order; frame i of both must be the same instant.
 
     Raises RecordingError where both count with the same numbers, but do not begin with the same.
     """
     ours, theirs = left.numbers, right.numbers
     if ours is None or theirs is None or (ours[0], ours.step) == (theirs[0], theirs.step):
-        return ()
+        return
     spans = (
         f"left files are numbered {ours[0]} to {ours[-1]} in steps of {ours.step}, right ones {theirs[0]} to "
         f"{theirs[-1]} in steps of {theirs.step}"
     )
-    if ours.step == theirs.step and (ours[-1] < theirs[0] or theirs[-1] < ours[0]):
-        return (f"{spans}: they are taken as pairs in their order, number {ours[0]} with {theirs[0]}",)
-    raise RecordingError(
-        f"{left.describe(0)}, {right.describe(0)}: {spans}, but equal numbers must be the same instant. Copy what is "
-        "missing, or number the frames of both cameras alike."
-    )
+    if ours.step != theirs.step or not (ours[-1] < theirs[0] or theirs[-1] < ours[0]):
+        raise RecordingError(
+            f"{left.describe(0)}, {right.describe(0)}: {spans}, but equal numbers must be the same instant. Copy what "
+            "is missing, or number the frames of both cameras alike."
+        )
+    yield f"{spans}: they are taken as pairs in their order, number {ours[0]} with {theirs[0]}"
 
 
 def usable_times(reader: FrameReader, frame_rate: float) -> Array | None:
@@ -145,35 +140,31 @@ def usable_times(reader: FrameReader, frame_rate: float) -> Array | None:
     return None if times is None or _fault(times, frame_rate) else times
 
 
-def check_time_stamps(
-    left: FrameReader, right: FrameReader, frame_rate: float
-) -> tuple[tuple[str, ...], tuple[str, ...]]:
+def check_time_stamps(left: FrameReader, right: FrameReader, frame_rate: float) -> Iterator[Finding]:
     """Doubts: stamps that are not used and why, frames of one camera that the other has not; and warnings: frames lost
     by each camera, and cameras that do not run together.
 
     frame_rate [Hz] as declared. Times count from frame 0 where the file has a camera's header, which tells how they lie
     to the other camera's.
     """
-    doubts: list[str] = []
-    warnings: list[str] = []
+    doubt, warning = (partial(Finding, Kind.TIME_STAMPS, how) for how in (Severity.DOUBT, Severity.WARNING))
     usable: list[Array] = []
-    for camera, reader in zip(CAMERAS, (left, right), strict=True):
+    for reader in (left, right):
         if reader.timestamps is None:
             continue
-        fault = _fault(reader.timestamps, frame_rate)
-        if fault:
-            doubts.append(f"{camera} camera: time stamps are not used, frames are taken as evenly spaced: {fault}")
+        if fault := _fault(reader.timestamps, frame_rate):
+            said = "time stamps are not used, frames are taken as evenly spaced"
+            yield doubt(f"{reader.camera} camera: {said}: {fault}")
         else:
             usable.append(reader.timestamps)
-            warnings += _lost_frames(camera, reader.timestamps, frame_rate)
+            yield from map(warning, _lost_frames(reader.camera, reader.timestamps, frame_rate))
     ours, theirs = left.header, right.header
     offset = start_offset(ours, theirs) if ours is not None and theirs is not None else None
     if len(usable) == 2 and len(usable[0]) == len(usable[1]) and (ours is None) == (theirs is None):
         theirs_shifted = usable[1] + (0.0 if offset is None else offset[0])
         slips = [*_slips(usable[0], theirs_shifted, 1.0 / frame_rate)]
-        doubts += slips
-        warnings += [] if slips else _between_cameras(usable[0], theirs_shifted, 1.0 / frame_rate)
-    return tuple(doubts), tuple(warnings)
+        yield from map(doubt, slips)
+        yield from [] if slips else map(warning, _between_cameras(usable[0], theirs_shifted, 1.0 / frame_rate))
 
 
 def _fault(times: Array, frame_rate: float) -> str:

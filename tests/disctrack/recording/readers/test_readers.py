@@ -140,7 +140,7 @@ def test_equal_numbers_are_the_same_instant(tmp_path, frames, theirs, verdict):
     left, right = (open_frames(f"{camera}/*.png", tmp_path, camera) for camera in ("left", "right"))
     if verdict is not None and verdict.startswith("equal"):
         with pytest.raises(RecordingError, match=verdict):
-            check_same_numbers(left, right)
+            list(check_same_numbers(left, right))
     else:
         assert [verdict in doubt for doubt in check_same_numbers(left, right)] == ([True] if verdict else [])
 
@@ -247,10 +247,11 @@ EVEN = 17.25 + np.arange(N) / RATE
 
 
 def warnings_of(left, right=EVEN) -> tuple[str, ...]:
-    doubts, warnings = check_time_stamps(
-        *(SimpleNamespace(timestamps=stamps, header=None) for stamps in (left, right)), RATE
-    )
-    return (*warnings, *doubts)
+    readers = [
+        SimpleNamespace(camera=name, timestamps=stamps, header=None)
+        for name, stamps in (("left", left), ("right", right))
+    ]
+    return tuple(finding.text for finding in check_time_stamps(*readers, RATE))
 
 
 def without(times: np.ndarray, *lost: int) -> np.ndarray:
