@@ -18,7 +18,7 @@ from calibration.kit.seal import check_seal
 from calibration.rig_file import Record, read_rig, read_rig_file, rig_bytes
 from disctrack.analyse.declaration import Boards
 from disctrack.calibrate.views import TargetImages, calibrate_views, declared_views
-from disctrack.errors import CalibrationError, OutputError, RecordingError, RigFileError
+from disctrack.errors import CalibrationError, OutputError, RecordingError, RigFileError, told_as
 from disctrack.files.inputs import keep, refuse_input
 from disctrack.files.whole import write_whole
 from disctrack.findings import Finding, Kind, Severity, of_kind
@@ -194,16 +194,13 @@ def is_rig_of(path: Path, source: CalibrationSource) -> bool:
 
 def _reusable(path: Path, provenance: Provenance) -> dict[str, Any] | None:
     """What is told of the rig in `path` if it was made, completely, from the same; None otherwise."""
-    try:
+    said = f"{path}: exists and is not a readable rig file"
+    remedy = "Move it away, or replace it with --overwrite."
+    with told_as(RigFileError, said, Exception, then=remedy):  # the HDF5 library raises many kinds on damaged files
         check_seal(path)
         with h5py.File(path, "r") as file:
             same = file.attrs.get("fingerprint") == provenance.fingerprint and int(file.attrs.get("complete", 0)) == 1
             return dict(json.loads(file.attrs["summary"])) if same else None
-    except Exception as error:  # the HDF5 library raises many kinds on damaged files
-        raise RigFileError(
-            f"{path}: exists and is not a readable rig file ({' '.join(str(error).split())[:120]}). Move it away, or "
-            "replace it with --overwrite."
-        ) from error
 
 
 def _calibrate(source: CalibrationSource) -> tuple[StereoCalibration, tuple[str, ...]]:

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline, CubicSpline, PPoly
 
-from disctrack.errors import SceneError
+from disctrack.errors import SceneError, told_as
 from disctrack.rolling import Model, Motion, State, effects_from_tables, simulate, steady_precession, struck_disc
 from disctrack.synthetic.description import RollingMotion, Scene
 
@@ -35,10 +35,9 @@ def _static(scene: Scene) -> tuple[PPoly, int]:
 
 def _table(scene: Scene) -> tuple[PPoly, int]:
     path = scene.folder / scene.motion.table
-    try:
+    remedy = "Expected are rows t, x, y, z, psi, theta, phi."
+    with told_as(SceneError, f"{path}: no table of motion", OSError, ValueError, then=remedy):
         rows = np.load(path) if path.suffix == ".npy" else np.loadtxt(path, delimiter=",", ndmin=2)
-    except (OSError, ValueError) as error:
-        raise SceneError(f"{path}: no table of motion ({error}); expected rows t, x, y, z, psi, theta, phi") from error
     if rows.ndim != 2 or rows.shape[1] != 7 or len(rows) < 2 or not (np.diff(rows[:, 0]) > 0).all():
         raise SceneError(f"{path}: shape {rows.shape}; expected 2 or more rows of 7 with increasing t [s]")
     if not np.isfinite(rows).all():

@@ -17,7 +17,7 @@ from calibration.kit.arguments import checked
 from calibration.kit.arrays import Array, Array32, Image, Mask
 from calibration.rig_file import write_rig_group
 from disctrack.disc import AIR_DENSITY, Disc
-from disctrack.errors import OutputError
+from disctrack.errors import OutputError, told_as
 from disctrack.faults.dots import cameras_with, centres_with
 from disctrack.frames import COORDINATES, rotation_from_euler
 from disctrack.recording.declaration import KEYS
@@ -86,7 +86,8 @@ def write_recording(
         raise OutputError(f"{target}: exists; choose another name for the truth or remove it")
     pose, n_frames = motion_of(scene)
     truth = _truth(scene, pose, n_frames, rig_of(scene))
-    try:
+    said = f"{folder}: the recording cannot be written"
+    with told_as(OutputError, said, OSError, then="Check the disk and the rights."):
         folder.parent.mkdir(parents=True, exist_ok=True)
         with TemporaryDirectory(prefix=f"{folder.name}.", suffix=".part", dir=folder.parent) as place:
             part = Path(place, "recording")
@@ -100,10 +101,6 @@ def write_recording(
             if folder.exists():
                 folder.rmdir()
             part.rename(folder)
-    except OSError as error:
-        raise OutputError(
-            f"{folder}: the recording cannot be written ({error}); check the disk and the rights"
-        ) from error
     return truth
 
 

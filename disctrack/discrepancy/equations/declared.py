@@ -13,7 +13,7 @@ from scipy.interpolate import CubicSpline
 from calibration.kit.arrays import Array
 from disctrack.discrepancy.equations.expressions import Formula, checked_name, unknown_name
 from disctrack.discrepancy.noise import SmoothNoise
-from disctrack.errors import AnalysisError
+from disctrack.errors import AnalysisError, told_as
 
 
 @dataclass(frozen=True)
@@ -311,10 +311,8 @@ def _inputs(equations: Equations, run: Run, name: str, time: Array) -> tuple[Arr
 
 def _column(values: ArrayLike, what: str, n: int | None = None) -> Array:
     """Numbers (n,). Raises AnalysisError."""
-    try:
+    with told_as(AnalysisError, f"{what}: not numbers", TypeError, ValueError):
         found = np.asarray(values, float)
-    except (TypeError, ValueError) as error:
-        raise AnalysisError(f"{what}: not numbers ({error}).") from error
     if found.ndim != 1:
         raise AnalysisError(f"{what}: expected one number per sample, found an array of shape {found.shape}.")
     if n is not None and len(found) != n:
