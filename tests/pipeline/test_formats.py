@@ -15,6 +15,7 @@ from disctrack.calibrate.views import declared_views
 from disctrack.cli import main
 from disctrack.errors import RecordingError
 from disctrack.first_look.sequences import Sequence, pair_cameras
+from disctrack.recording.readers.base import cut_out
 from disctrack.trajectory import part
 from disctrack.trajectory.file import read_details
 from tests.disctrack.recording.readers.written import write_hdf5
@@ -189,8 +190,10 @@ def test_results_depend_on_the_parts_and_cut_views_are_taken_whole(halves, sampl
     views = [declared_views(recording, recording.views) for recording in (declared, exchanged)]
     assert views[0].sha256() != views[1].sha256()
     cut = np.arange(SIZE * SIZE).reshape(SIZE, SIZE)
-    assert views[0].parts[1].of(cut) is cut
-    np.testing.assert_array_equal(views[0].parts[1].of(np.hstack([cut.T, cut])), cut)
+    assert cut_out(cut, views[0].parts[1], "view") is cut
+    np.testing.assert_array_equal(cut_out(np.hstack([cut.T, cut]), views[0].parts[1], "view"), cut)
+    with pytest.raises(RecordingError, match=r"view: 280 x 272 px do not hold the part \[272, 0, 272, 272\]"):
+        cut_out(np.zeros((SIZE, SIZE + 8)), views[0].parts[1], "view")
 
 
 @pytest.mark.parametrize(
