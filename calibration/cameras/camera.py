@@ -22,16 +22,18 @@ from calibration.kit.least_squares import solve_each
 CAMERA_NAMES = ("left", "right")  # for people, and in files
 INTRINSIC_PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 N_INTRINSIC = len(INTRINSIC_PARAMETERS)
+_AXES = "xyz"
 _PLACES = ("right_left_rotation", "right_left_translation", "left_world_rotation", "left_world_translation")
 RIG_PARAMETERS = (
     *(f"{camera}_{name}" for camera in CAMERA_NAMES for name in INTRINSIC_PARAMETERS),
-    *(f"{place}_{axis}" for place in _PLACES for axis in "xyz"),
+    *(f"{place}_{axis}" for place in _PLACES for axis in _AXES),
 )
 N_RIG = len(RIG_PARAMETERS)  # 30
 # Which of them are of what: the cameras' own; the right one against the left one; the world against the left one
 OF_CAMERAS = slice(0, N_INTRINSIC), slice(N_INTRINSIC, 2 * N_INTRINSIC)
-PAIR_TURN, PAIR_SHIFT = slice(18, 21), slice(21, 24)
-WORLD_TURN, WORLD_SHIFT = slice(24, 27), slice(27, 30)
+PAIR_TURN, PAIR_SHIFT, WORLD_TURN, WORLD_SHIFT = (
+    slice(first, first + len(_AXES)) for first in range(len(CAMERA_NAMES) * N_INTRINSIC, N_RIG, len(_AXES))
+)
 
 
 @checked

@@ -24,8 +24,8 @@ from calibration.kit.arrays import Array
 from calibration.kit.least_squares import eliminate
 
 CELLS = 5  # of the spline's grid along the longer side of the image; twice as many of the finer one
-PRIORS_PX = (0.01, 0.03, 0.1)  # standard deviation of a coefficient; views left out choose
-FINER_PX = (0.003, 0.01, 0.03)  # the same of a coefficient of the finer grid
+# Standard deviations of a coefficient that are tried: but the smallest of the coarse grid, the largest of the finer one
+SIZES_PX = (0.003, 0.01, 0.03, 0.1)
 BETTER = 2.5  # standard errors by which the views that were left out must be met better
 LEAST_GAIN = 0.03  # and part of their chi-square: less is not worth its parameters
 
@@ -47,7 +47,7 @@ def fit_lens_field(refinement: Refinement, nominal: Array) -> tuple[LensField | 
         gain, error, left = _worth(refinement, used, coarse, left)
     if gain < BETTER * error or gain < LEAST_GAIN:
         return None, refinement
-    both = [_precision(finer, small, large) for large in PRIORS_PX for small in FINER_PX]
+    both = [_precision(finer, small, large) for large in SIZES_PX[1:] for small in SIZES_PX[:-1]]
     solution, _ = _likeliest(reduce(np.add, _squares(refinement, used, finer, left)), both)
     field = replace(finer, coefficients=solution[-finer.coefficients.size :].reshape(finer.coefficients.shape))
     o = refinement.observations
@@ -84,7 +84,7 @@ def _worth(refinement: Refinement, used: Observations, grid: LensField, extra: f
     """
     squares = np.stack(list(_squares(refinement, used, grid, extra)))
     total, views = squares.sum(0), np.arange(len(squares))
-    solution, prior = _likeliest(total, [_precision(grid, sigma) for sigma in PRIORS_PX])
+    solution, prior = _likeliest(total, [_precision(grid, sigma) for sigma in SIZES_PX[1:]])
     chi_square = np.zeros((2, len(views)))  # of each view, left out: without a field, and with one
     for fold in range(FOLDS):
         test = views[fold::FOLDS]

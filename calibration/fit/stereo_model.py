@@ -11,6 +11,7 @@ from calibration.cameras.camera import (
     INTRINSIC_PARAMETERS,
     N_INTRINSIC,
     N_RIG,
+    PAIR_SHIFT,
     StereoRig,
     by_turning,
     rotation_from_vector,
@@ -22,7 +23,7 @@ from calibration.kit.errors import ArgumentError, CalibrationError
 RICHEST = "k1 k2 p1 p2 k3"
 DISTORTION_MODELS = ("none", "k1", "k1 k2", "k1 k2 p1 p2", "k1 k2 k3", RICHEST)  # by the terms that are free
 BOARD_MODELS = ("flat", "warped", "free")
-N_STEREO = 2 * N_INTRINSIC + 6  # left and right intrinsics, rotation and translation of the pair
+N_STEREO = PAIR_SHIFT.stop  # left and right intrinsics, rotation and translation of the pair come first
 
 
 @checked
