@@ -93,11 +93,8 @@ class Problem:
         place[order] = np.arange(len(view)) - np.repeat(np.cumsum(count) - count, count)
         of_view[view, place] = rows
         normal = normal_of_rows(of_view, self.n_own)
-        normal = replace(normal, costs=np.where(np.isfinite(costs), costs, np.inf))
-        if self.prior is None:
-            return normal
-        prior, towards, cost = self.prior.normal(model, self.stereo_basis)
-        return replace(normal, prior=prior, prior_gradient=towards, prior_cost=cost)
+        prior = normal.prior if self.prior is None else self.prior.normal(model, self.stereo_basis)
+        return replace(normal, costs=np.where(np.isfinite(costs), costs, np.inf), prior=prior)
 
     def stepped(self, model: StereoModel, shared: Array, poses: Array) -> StereoModel:
         """The model after a step."""

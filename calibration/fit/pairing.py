@@ -156,11 +156,12 @@ class Pairs:
         return {*self.odd, *self.others}
 
     def joined(self, observations: Observations) -> StereoModel:
-        """The model with one place for both images but of those apart: by the left one, where that was observed."""
+        """The model with one place for both images but of those apart: by the image that shows more of the board."""
         R, t = self.model.R_left_board.copy(), self.model.t_left_board.copy()
+        image = 2 * observations.view + observations.camera
         both = np.setdiff1d(np.arange(len(R)), [*self.apart])
-        image = np.where(np.isin(both, observations.view[observations.camera == 0]), 0, 1)
-        R[both], t[both] = (of[both, image][:, None] for of in (R, t))
+        fuller = np.bincount(image, minlength=2 * len(R)).reshape(-1, 2).argmax(axis=1)[both]
+        R[both], t[both] = (of[both, fuller][:, None] for of in (R, t))
         return replace(self.model, R_left_board=R, t_left_board=t)
 
 

@@ -47,8 +47,8 @@ class Prior:
     # on photographs), a prior counts that many times.
     weight: float = 1.0
 
-    def normal(self, model: StereoModel, stereo_basis: Array) -> tuple[Array, Array, float]:
-        """Information (s, s) at the model, gradient (s,) towards the prior, and its part of chi-square.
+    def normal(self, model: StereoModel, stereo_basis: Array) -> Array:
+        """(s + 1, s + 1) `Normal.prior`: information at the model, gradient towards the prior, and its loss.
 
         stereo_basis : (24, s1) free directions of intrinsics and stereo pose
         """
@@ -69,8 +69,8 @@ class Prior:
         shape = to_shape @ (model.points - nominal).reshape(-1)
         pull = of_shape @ shape
         information = scipy.linalg.block_diag(information, of_shape)
-        gradient, cost = np.concatenate([gradient, -pull]), cost + float(shape @ pull)
-        return self.weight * information, self.weight * gradient, self.weight * cost
+        towards, cost = np.concatenate([gradient, -pull])[:, None], cost + float(shape @ pull)
+        return self.weight * np.block([[information, towards], [towards.T, np.array([[cost]])]])
 
 
 def priors_of(model: StereoModel, nominal: Array, shape_basis: Array) -> Prior:

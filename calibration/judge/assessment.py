@@ -79,7 +79,7 @@ def stereo_covariance(refinement: Refinement, common: Array | None = None) -> Ar
     share = s1 / max(float(np.trace(np.linalg.solve(at_minimum, expected))), 1e-12)  # noise moves fewer than all
     by_prior = np.zeros((s1, s1))
     if problem.prior is not None:  # it was weighted as if it were one of views that disagree as much
-        told = max(problem.prior.weight - 1.0, 0.0) * refinement.normal.prior * scale[:, None] * scale
+        told = max(problem.prior.weight - 1.0, 0.0) * refinement.normal.prior[:-1, :-1] * scale[:, None] * scale
         by_prior = inverse.T @ told @ inverse
     result: Array = (at_minimum + share * beyond @ beyond.T + by_prior) * scale[:s1, None] * scale[:s1]
     return result

@@ -83,25 +83,26 @@ def motion_between_exposures(refinement: Refinement) -> tuple[PairMotion, Array]
         return None
     free = replace(problem, motion=None, apart=np.ones_like(problem.apart))
     normal = free.linearise(model)
-    carried, step = normal.carried()
+    carried = normal.carried()
     m, J = (of[pairs] for of in motions(model))
-    m, W = m + (J @ step[pairs, :, None])[..., 0], J @ carried[pairs]
+    told = J @ carried[pairs]  # (n, 6, s + 1) [W | m]
+    told[..., -1] += m
+    m, W = told[..., -1], told[..., :-1]
     C = J @ np.linalg.solve(normal.own_held()[pairs], np.swapaxes(J, 1, 2))
     freedom = max(2 * len(o) - 6 * len(np.unique(2 * o.view + o.camera)), 1)
-    noise = max(float(normal.costs.sum() - np.sum(normal.own_gradient * step)), 1e-12) / freedom
-    about = free.stepped(model, np.zeros(len(normal.prior)), step)
+    square, s = normal.eliminated(carried=carried), W.shape[-1]
+    noise = max(float(normal.costs.sum()) - normal.gain(np.zeros(s), carried[..., -1]), 1e-12) / freedom
+    about = free.stepped(model, np.zeros(s), carried[..., -1])
     right = o[o.camera == 1]
     d_pose, squares = predict(about, right)[2], np.zeros((n_views, 6, 6))
     np.add.at(squares, right.view, np.swapaxes(d_pose, 1, 2) @ d_pose)
     back = np.linalg.inv(J[:, :, 6:])
     # m^T square_px m is a motion's mean square displacement [px^2] in the right image
     square_px = np.swapaxes(back, 1, 2) @ (squares[pairs] / seen[1][pairs, None, None]) @ back
-    information, gradient = normal.eliminated()
-    s1 = problem.stereo_basis.shape[1]  # the board's shape is held: it is known better than motions move it
-    alone = information[:s1, :s1] / noise, gradient[:s1] / noise
+    taken = np.r_[: problem.stereo_basis.shape[1], s]  # of a board as it is: known better than motions move it
     distance = float(np.median(np.linalg.norm(model.t_left_board[pairs, 0], axis=1)))
-    size = _likely_size(m, noise * C, W[..., :s1], alone, distance)
-    gradients, known = np.zeros((n_views, *information.shape)), np.linalg.solve(C, W)
+    size = _likely_size(told[..., taken], noise * C, square[np.ix_(taken, taken)] / noise, distance)
+    gradients, known = np.zeros((n_views, s, s)), np.linalg.solve(C, W)
     gradients[pairs] = np.swapaxes(known, 1, 2) @ (known / size.weights[:, None])
     found = PairMotion(
         distance=float(np.median(np.linalg.norm(m[:, 3:], axis=1))),
@@ -114,22 +115,23 @@ def motion_between_exposures(refinement: Refinement) -> tuple[PairMotion, Array]
     return found, gradients
 
 
-def _likely_size(m: Array, C: Array, W: Array, alone: tuple[Array, Array], distance: float) -> BoardMotion:
+def _likely_size(told: Array, C: Array, alone: Array, distance: float) -> BoardMotion:
     """The most likely size of random motions; about a minimum with one place of the board for both images.
 
     With P the inverse covariance of the motions where everything shared is free, a variance is right where the
     squares of P m that belong to it are in sum the trace of P, and grows or falls by their ratio.
 
-    alone : normal matrix (s, s) and gradient (s,) of the shared by all images, and by the prior
+    told : (n, 6, s + 1) [W | m]; alone : (s + 1, s + 1) products of [shared | residual] by all images, and by the prior
     """
     least = np.square([LEAST, LEAST * distance])
     variances = 1e6 * least
     for _ in range(100):  # what tends to zero gets there by a part each time
         known = np.linalg.inv(C + np.diag(np.repeat(variances, 3)))
-        into = np.swapaxes(known @ W, 1, 2)
-        inverse = scaled_solve(alone[0] + (into @ W).sum(0), np.eye(W.shape[-1]))
-        best = inverse @ (alone[1] + (into @ m[..., None])[..., 0].sum(0))
-        P, Pm = known - known @ W @ inverse @ into, (known @ (m - W @ best)[..., None])[..., 0]
+        into = np.swapaxes(known @ told, 1, 2)
+        square = alone + (into @ told).sum(0)
+        inverse = scaled_solve(square[:-1, :-1], np.eye(len(square) - 1))
+        P = known - np.swapaxes(into[:, :-1], 1, 2) @ inverse @ into[:, :-1]
+        Pm = np.append(-inverse @ square[:-1, -1], 1.0) @ into
         squares, traces = (np.sum(of.reshape(-1, 2, 3), axis=(0, 2)) for of in (Pm**2, np.einsum("nii->ni", P)))
         variances = np.maximum(variances * squares / traces, least)
     return BoardMotion(*np.sqrt(variances).tolist())
@@ -155,10 +157,7 @@ def judge_pairs(observations: Observations, fit: Refinement, table_view: int | N
         for i, own in zip(images[is_bad], rms[is_bad], strict=True)
     }
     views = np.flatnonzero(np.bincount(images[~is_bad & (count >= LEAST_POINTS)] // 2) == len(CAMERA_NAMES))
-    R, t = fit.model.R_left_board.copy(), fit.model.t_left_board.copy()
-    R[views], t[views] = alone.R_left_board[views], alone.t_left_board[views]
-    model = replace(fit.model, R_left_board=R, t_left_board=t)
-    return compared(observations, Pairs(model, views, {}, bad), table_view)
+    return compared(observations, Pairs(alone, views, bad_images=bad), table_view)
 
 
 def moved_told(pairs: Pairs, names: Names, table_view: int | None) -> str:

@@ -32,66 +32,61 @@ NEAR = 1e-3  # sigmas from a bound, within which a number stands at it
 
 @dataclass(frozen=True)
 class Normal:
-    """Normal equations of one linearisation: s shared numbers, and k own ones of each of n blocks.
+    """Normal equations of one linearisation: k own numbers of each of n blocks, and s shared ones.
 
+    Everything is products of whitened rows [own | shared | residual]: information, gradient and chi-square in one.
     An own number that no data of its block show stays where it is, as if it were known to one of its units.
     """
 
-    shared: Array  # (n, s, s) of each block's data, before the own numbers are eliminated
-    cross: Array  # (n, s, k)
-    own: Array  # (n, k, k)
-    gradient: Array  # (n, s)
-    own_gradient: Array  # (n, k)
+    products: Array  # (n, k + s + 1, k + s + 1) of each block's data
+    k: int
     costs: Array  # (n,) chi-square, or whatever loss takes its place; inf where there is no prediction
-    prior: Array  # (s, s) information
-    prior_gradient: Array  # (s,) towards the prior
-    prior_cost: float = 0.0
+    prior: Array  # (s + 1, s + 1) [shared | residual] of what is known beforehand, its loss in the place of chi-square
 
     @property
     def cost(self) -> float:
         """Of all blocks and the prior; inf where a prediction failed."""
-        return float(self.costs.sum()) + self.prior_cost
+        return float(self.costs.sum() + self.prior[-1, -1])
 
     def own_held(self, damping: float = 0.0) -> Array:
         """(n, k, k) of the own numbers, with a one on the diagonal where no data show a number."""
-        diagonal = np.einsum("nii->ni", self.own)
-        held: Array = self.own + (damping * diagonal + (diagonal == 0.0))[..., None] * np.eye(self.own.shape[-1])
+        own = self.products[:, : self.k, : self.k]
+        diagonal = np.einsum("nii->ni", own)
+        held: Array = own + (damping * diagonal + (diagonal == 0.0))[..., None] * np.eye(self.k)
         return held
 
-    def carried(self, damping: float = 0.0) -> tuple[Array, Array]:
-        """How the own numbers follow the shared ones, (n, k, s), and their step at fixed shared ones (n, k)."""
-        right = np.concatenate([np.swapaxes(self.cross, 1, 2), self.own_gradient[..., None]], axis=2)
-        solved = np.asarray(np.linalg.solve(self.own_held(damping), right), float)
-        return solved[..., :-1], solved[..., -1]
+    def carried(self, damping: float = 0.0) -> Array:
+        """(n, k, s + 1) how the own numbers follow the shared ones, and their step at fixed shared ones."""
+        return np.asarray(np.linalg.solve(self.own_held(damping), self.products[:, : self.k, self.k :]), float)
 
-    def _without_own(self, carried: Array, step: Array, damping: float = 0.0) -> tuple[Array, Array]:
-        n, s, k = self.cross.shape
-        cross = np.swapaxes(self.cross, 1, 2).reshape(n * k, s).T
-        total = self.shared.sum(0) + self.prior
-        matrix = total + damping * np.diag(np.diag(total)) - cross @ carried.reshape(n * k, s)
-        return matrix, self.gradient.sum(0) + self.prior_gradient - cross @ step.reshape(-1)
-
-    def eliminated(self) -> tuple[Array, Array]:
-        """Normal matrix (s, s) and gradient (s,) of the shared numbers with the prior, the own ones at their best."""
-        return self._without_own(*self.carried())
+    def eliminated(self, damping: float = 0.0, carried: Array | None = None) -> Array:
+        """(s + 1, s + 1) products of [shared | residual] with the prior, the own numbers at their best."""
+        carried, k = self.carried(damping) if carried is None else carried, self.k
+        total = self.products[:, k:, k:].sum(0) + self.prior
+        total[:-1, :-1] += damping * np.diag(np.diag(total)[:-1])
+        width = len(total)
+        result: Array = total - self.products[:, :k, k:].reshape(-1, width).T @ carried.reshape(-1, width)
+        return result
 
     def step(self, damping: float = 0.0) -> tuple[Array, Array]:
         """Damped step of the shared numbers (s,) and of the own ones (n, k)."""
-        carried, own = self.carried(damping)
-        step = scaled_solve(*self._without_own(carried, own, damping))
-        return step, own - carried @ step
+        carried = self.carried(damping)
+        square = self.eliminated(damping, carried)
+        step = scaled_solve(square[:-1, :-1], square[:-1, -1])
+        return step, carried[..., -1] - carried[..., :-1] @ step
 
     def gain(self, shared: Array, own: Array) -> float:
         """What an undamped step promises to take from the cost."""
-        return float(shared @ (self.gradient.sum(0) + self.prior_gradient) + np.sum(own * self.own_gradient))
+        gradient = self.products[:, self.k : -1, -1].sum(0) + self.prior[:-1, -1]
+        return float(shared @ gradient + np.sum(own * self.products[:, : self.k, -1]))
 
     def covariances(self) -> tuple[Array, Array, Array]:
         """Of the shared numbers (s, s), of each block's own (n, k, k), and between shared and own (n, s, k)."""
-        carried, own = self.carried()
-        information, _ = self._without_own(carried, own)
+        carried = self.carried()
+        information = self.eliminated(carried=carried)[:-1, :-1]
         shared = scaled_solve(information, np.eye(len(information)))
-        cross = -shared @ np.swapaxes(carried, 1, 2)
-        return shared, np.linalg.inv(self.own_held()) - carried @ cross, cross
+        cross = -shared @ np.swapaxes(carried[..., :-1], 1, 2)
+        return shared, np.linalg.inv(self.own_held()) - carried[..., :-1] @ cross, cross
 
     def shifts(self, first: int, common: Array | None = None) -> tuple[Array, Array, Array, Array]:
         """What each block, left out in turn, says of the `first` shared numbers, each in units of a `scale`.
@@ -102,10 +97,10 @@ class Normal:
         common : (n, s, s) covariance of what else the blocks' gradients contain, apart from their data's noise
         returns : shifts (n, first), the sum of the expected g_b g_b^T (s, s), H^-1 (s, first), and the scale (s,)
         """
-        carried, own = self.carried()
-        information = self.shared - self.cross @ carried  # own numbers eliminated
-        gradient = self.gradient - np.einsum("nsk,nk->ns", self.cross, own)
-        total = information.sum(0) + self.prior
+        k = self.k
+        squares = self.products[:, k:, k:] - np.swapaxes(self.products[:, :k, k:], 1, 2) @ self.carried()
+        information, gradient = squares[:, :-1, :-1], squares[:, :-1, -1]
+        total = information.sum(0) + self.prior[:-1, :-1]
         scale = 1.0 / np.sqrt(np.diag(total))  # the numbers' units differ by 10^6
         information, gradient = information * scale[:, None] * scale, gradient * scale
         inverse = np.linalg.inv(total * scale[:, None] * scale)
@@ -130,16 +125,7 @@ class Normal:
 def normal_of_rows(rows: Array, k: int) -> Normal:
     """Normal equations of rows (n, m, k + s + 1): [own | shared | residual], zero where a block has fewer."""
     products = np.swapaxes(rows, 1, 2) @ rows
-    return Normal(
-        shared=products[:, k:-1, k:-1],
-        cross=products[:, k:-1, :k],
-        own=products[:, :k, :k],
-        gradient=products[:, k:-1, -1],
-        own_gradient=products[:, :k, -1],
-        costs=products[:, -1, -1],
-        prior=np.zeros(2 * (rows.shape[-1] - k - 1,)),
-        prior_gradient=np.zeros(rows.shape[-1] - k - 1),
-    )
+    return Normal(products, k, products[:, -1, -1], np.zeros(2 * (rows.shape[-1] - k,)))
 
 
 def scaled_solve(A: Array, b: Array) -> Array:

@@ -107,11 +107,10 @@ class DotsInFrames:
             by_shared[:, :, k, :, N_RIG + 2 * k : N_RIG + 2 * k + 2] = by_place[:, :, k]
         if self.further is not None:
             by_shared[..., -self.further.shape[-1] :] = W @ self.further
-        # with the residuals as one more of what is shared, for their square
-        rows = np.concatenate([by_pose, by_shared[..., free], residuals, residuals], axis=-1)
+        rows = np.concatenate([by_pose, by_shared[..., free], residuals], axis=-1)
         rows = np.where((used & np.isfinite(rows).all(axis=(-2, -1)))[..., None, None], rows, 0.0)
-        matrix, gradient = normal_of_rows(rows.reshape(len(rows), -1, rows.shape[-1]), 6).eliminated()
-        return matrix[:-1, :-1], gradient[:-1], float(gradient[-1])
+        square = normal_of_rows(rows.reshape(len(rows), -1, rows.shape[-1]), 6).eliminated()
+        return square[:-1, :-1], square[:-1, -1], float(square[-1, -1])
 
 
 def marker_pixels(R: Array, t: Array, rig: StereoRig, centres_body: Array) -> tuple[Array, Array]:

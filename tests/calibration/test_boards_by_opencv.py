@@ -76,7 +76,7 @@ def test_normal_equations_have_the_cost_and_the_gradient_that_they_say(rng, know
         if problem.motion is not None:
             data += np.sum(motions(model)[0] ** 2 * problem.motion.weights)
         if (prior := problem.prior) is not None:
-            data += prior.normal(model, stereo_basis)[2]
+            data += prior.normal(model, stereo_basis)[-1, -1]
         return data
 
     assert known != "outliers" or 0.1 < np.mean(distances(model) > problem.huber) < 0.9
@@ -84,8 +84,9 @@ def test_normal_equations_have_the_cost_and_the_gradient_that_they_say(rng, know
     assert_allclose(normal.cost, cost(model), rtol=1e-12)
     s = stereo_basis.shape[1] + basis.shape[-1]
     for direction in rng.normal(size=(6, s + 3 * k)):
-        direction[:s] /= np.sqrt(np.diag(normal.shared.sum(0) + normal.prior))
-        direction[s:] /= np.sqrt(np.concatenate([np.diag(block) for block in normal.own]))
+        squares = np.einsum("nii->ni", normal.products)[:, :-1]
+        direction[:s] /= np.sqrt(squares[:, k:].sum(0) + np.diag(normal.prior)[:-1])
+        direction[s:] /= np.sqrt(squares[:, :k].reshape(-1))
         shared, poses = 1e-3 * direction[:s], 1e-3 * direction[s:].reshape(3, k)
         there, back = (cost(problem.stepped(model, d * shared, d * poses)) for d in (1.0, -1.0))
         # turns of the motion count to first order: some 1e-3 of it here
@@ -319,7 +320,8 @@ def test_what_is_known_of_a_board_is_the_same_whichever_model_has_it(model):
     prior, free = priors_of(at, nominal, board_basis(nominal, model)), Terms().stereo_basis()
 
     def cost(points):
-        return prior.normal(replace(at, points=points), free)[2] - prior.normal(replace(at, points=nominal), free)[2]
+        own, declared = (prior.normal(replace(at, points=p), free)[-1, -1] for p in (points, nominal))
+        return own - declared
 
     d, size = nominal - nominal.mean(0), 0.1  # half of eight squares of 25 mm
     stretched = nominal + STRETCH * d * [0.5, -0.5, 0.0]

@@ -10,9 +10,11 @@ from scipy.spatial.transform import Rotation
 from calibration import Terms, refine_stereo
 from calibration.cameras.camera import N_RIG
 from calibration.fit.normal_equations import minimise
+from calibration.fit.pairing import FLOOR
 from calibration.fit.refinement import choose_board
 from calibration.fit.start import start_stereo
 from calibration.fit.stereo_model import board_basis, moved
+from calibration.judge.pairs import compared
 from calibration.judge.tolerances import rig_with_covariance, table_pose
 from tests.oracles.drawn_boards import make_scene, squared
 
@@ -154,7 +156,7 @@ def test_pixels_that_are_not_square_are_no_hindrance_to_the_start(rng, aspect):
     o = scene.observations(0.02, rng)
     sizes = cameras[0].image_size, cameras[1].image_size
     begun, _, _ = start_stereo(o, scene.board.points, sizes, [("left", "right")] * 10)
-    assert not begun.apart
+    assert not compared(o, begun, None, FLOOR).apart
     found = refine_stereo(o, begun.joined(o), scene.board.points, FULL)
     assert_allclose(
         found.model.rig.cameras[0].fy / found.model.rig.cameras[0].fx, cameras[0].fy / cameras[0].fx, rtol=2e-3
@@ -167,7 +169,7 @@ def test_a_bent_board_is_chosen_and_recovered(rng):
     scene = make_scene(n_views=12, deviation=basis @ np.array([0.15e-3, 0.05e-3, -0.1e-3, 0.0, 0.0]))
     o = scene.observations(0.02, rng)
     begun, _, _ = start_stereo(o, scene.board.points, ((512, 512), (512, 512)), [("left", "right")] * 12)
-    assert not begun.apart
+    assert not compared(o, begun, None, FLOOR).apart
     found, table = choose_board(o, begun.joined(o), scene.board.points, (Terms(), Terms(board="warped")))
     assert found.terms.board == "warped"
     assert_allclose(found.model.points[:, 2], scene.model.points[:, 2], atol=5e-6)  # 0.02 px of 0.25 mm, 24 images each
