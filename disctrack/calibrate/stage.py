@@ -101,11 +101,10 @@ def boards_in(rig_file: Path, recording: Recording) -> Boards | None:
     return boards_of(record, None if recording.views is None else declared_views(recording, recording.views))
 
 
-def boards_of(record: Record, views: TargetImages | None, numbers: Sequence[int] = ()) -> Boards:
-    """Where the board was in views; their numbers count those, too, that could not be read. numbers : of `views`"""
+def boards_of(record: Record, views: TargetImages | None) -> Boards:
+    """Where the board was in views; their numbers are those in `views`, of which not all may have been looked at."""
     known = {} if views is None else {str(view): i for i, view in enumerate(views.left)}
     found = [known.get(left, i) for i, (left, _) in enumerate(record["view_names"])]
-    found = [numbers[i] for i in found] if numbers else found
     places = dict(zip(found, zip(record["R_left_board"], record["t_left_board"], strict=True), strict=False))
     view = None if record["table_view"] is None else found[record["table_view"]]
     return Boards(places, view, record["board_thickness"], noticed_in(record))

@@ -145,7 +145,7 @@ def _rig(seen: Check, recording: Recording) -> StereoRig:
     chosen = sorted({*evenly(len(views), VIEWS_LOOKED_AT), table})
     some = replace(views, left=tuple(views.left[i] for i in chosen), right=tuple(views.right[i] for i in chosen))
     found, problems = replace(source, views=some, table_view=chosen.index(table)).calibrated(None)
-    seen.calibration, seen.boards = found, boards_of(record_of(found), some, chosen)
+    seen.calibration, seen.boards = found, boards_of(record_of(found), views)
     used = len(chosen) - len(problems) - len(found.rejected_views)
     text = f"found in {used} of {len(chosen)} pairs of views looked at ({len(views)} in all)"
     seen.seen.append(("chessboard", f"{text}, {found.assessment.verdict}, baseline {1e3 * found.rig.baseline:.1f} mm"))
