@@ -173,8 +173,8 @@ def with_tolerances(
             # turned about the board's other side, so that z grows along this one; the middle stays where it is
             slope = flatness / half[axis]
             allow(FLATNESS, -slope * middle[axis] * R[:, 2], turn=slope * R @ across)
-    D = np.stack([a.shift for a in found], axis=1) if found else np.zeros((N_RIG, 0))
-    return replace(rig, covariance=rig.covariance + D @ D.T, allowances=tuple(found))
+    D = np.reshape([a.shift for a in found], (-1, N_RIG))
+    return replace(rig, covariance=rig.covariance + D.T @ D, allowances=tuple(found))
 
 
 def table_pose(R_left_board: Array, t_left_board: Array, board_thickness: float) -> tuple[Array, Array]:
@@ -199,28 +199,20 @@ def rig_with_covariance(
     origin : (3,) [m] that lies one thickness above the world's, in board axes; corner 0 without
     stereo : covariance of the free stereo parameters where it is known better, see `assessment.stereo_covariance`
     """
-    model, normal = refinement.model, refinement.normal
-    basis = refinement.problem.stereo_basis
-    n_free = basis.shape[1]
-    shared, poses, cross = normal.covariances()
-    free, cross = inflation * shared[:n_free, :n_free], inflation * cross[:, :n_free, :6]
-    poses = inflation * poses[:, :6, :6]  # at the left camera's exposure
-    if stereo is not None:
-        carried = np.swapaxes(np.linalg.solve(free, cross), 1, 2)  # how far a pose follows the stereo parameters
-        poses = poses + carried @ (stereo - free) @ np.swapaxes(carried, 1, 2)
-        free, cross = stereo, stereo @ np.swapaxes(carried, 1, 2)
-    covariance = np.zeros((N_RIG, N_RIG))
-    covariance[:N_STEREO, :N_STEREO] = basis @ free @ basis.T
-    rig = model.rig
+    model, basis = refinement.model, refinement.problem.stereo_basis
+    n_free, rig = basis.shape[1], model.rig
+    shared, poses, cross = refinement.normal.covariances()
+    view, M = table_view or 0, np.zeros((6, 6))  # d world / d pose of the board; without a table nothing is told of it
+    free, shifted = shared[:n_free, :n_free], cross[view, :n_free, :6]  # of the pose at the left camera's exposure
+    follows = np.linalg.solve(free, shifted).T  # how the pose follows the stereo parameters
     if table_view is not None:
         R, t = model.R_left_board[table_view, 0], model.t_left_board[table_view, 0]
-        t = t if origin is None else t + R @ origin
-        R_left_world, t_left_world = table_pose(R, t, board_thickness)
+        R_left_world, t_left_world = table_pose(R, t if origin is None else t + R @ origin, board_thickness)
         rig = replace(rig, R_left_world=R_left_world, t_left_world=t_left_world, world_is_table=True)
         # t_world = t - h R k: turning R by v shifts it by -v x (h R k) = (h R k) x v
         M = np.eye(6)
         M[3:, :3] = np.cross(board_thickness * R[:, 2], np.eye(3)).T
-        covariance[N_STEREO:, N_STEREO:] = M @ poses[table_view] @ M.T
-        covariance[:N_STEREO, N_STEREO:] = basis @ cross[table_view] @ M.T
-        covariance[N_STEREO:, :N_STEREO] = covariance[:N_STEREO, N_STEREO:].T
+    by_stereo = np.concatenate([basis, M @ follows])
+    covariance = by_stereo @ (inflation * free if stereo is None else stereo) @ by_stereo.T
+    covariance[N_STEREO:, N_STEREO:] += inflation * M @ (poses[view, :6, :6] - follows @ shifted) @ M.T
     return replace(rig, covariance=0.5 * (covariance + covariance.T))
