@@ -1,6 +1,7 @@
 """What the contact tells: since when the disc rolls, and the circle that its locus runs on."""
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
@@ -20,26 +21,30 @@ INDEPENDENT_AFTER_LENGTHS = 0.6
 class RollingOnset:
     """Since when the disc rolls without slip, as a probability over the frames."""
 
-    time: float  # [s] median; the first frame when slip before it is not shown; NaN when it does not roll
-    low: float  # [s] 2.5 % point
-    high: float  # [s] 97.5 % point
-    probability: float  # that there is pure rolling at the end of the recording
-    slip_distance: float  # [m] path of slip before the onset (of the whole recording when it never rolls)
-    slip_distance_sigma: float  # [m]
+    # [s] median; the first frame when slip before it is not shown; NaN when it does not roll
+    time: Annotated[float, "rolling_onset_s"]
+    low: Annotated[float, "rolling_onset_low_s"]  # [s] 2.5 % point
+    high: Annotated[float, "rolling_onset_high_s"]  # [s] 97.5 % point
+    probability: Annotated[float, "rolling_probability"]  # that there is pure rolling at the end of the recording
+    # [m] path of slip before the onset (of the whole recording when it never rolls)
+    slip_distance: Annotated[float, "slip_distance_m"]
+    slip_distance_sigma: Annotated[float, "slip_distance_sigma_m"]  # [m]
     n_late_slips: int  # frames after the onset whose slip exceeds 5 sigma
-    verdict: str
+    verdict: Annotated[str, "rolling_verdict"]
 
 
 @dataclass(frozen=True)
 class Circle:
     """Circle fitted to the contact locus in the plane of the table."""
 
-    centre: Array  # (2,) [m]; NaN when the arc does not determine it
-    radius: float  # [m]
-    sigma: float  # [m] of the radius, noise and what the locus does beside a circle
-    sigma_calibration: float  # [m]
+    centre: Annotated[Array, "locus_circle_centre_m"]  # (2,) [m]; NaN when the arc does not determine it
+    radius: Annotated[float, "locus_circle_radius_m"]  # [m]
+    # [m] of the radius, noise and what the locus does beside a circle
+    sigma: Annotated[float, "locus_circle_radius_sigma_m"]
+    sigma_calibration: Annotated[float, "locus_circle_radius_sigma_calibration_m"]  # [m]
     rms: float  # [m] of the distances from the circle
-    expected: float  # [m] mean of r cos theta - h sin theta, the radius when the centre rests
+    # [m] mean of r cos theta - h sin theta, the radius when the centre rests
+    expected: Annotated[float, "locus_circle_expected_radius_m"]
     start: float  # [s]
     end: float  # [s]
 

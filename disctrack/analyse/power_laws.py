@@ -9,6 +9,7 @@ the phases at which the window happens to begin and end.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 from numpy.polynomial import Polynomial
@@ -70,11 +71,12 @@ class Exponent(Measured):
 class PowerLaws(Brief):
     """Exponents over one window; NaN with a reason where the data do not determine them."""
 
-    reason: str = ""  # empty when determined
-    window: tuple[float, float] = (NAN, NAN)  # [s] longest and shortest time left, t_f - t
+    reason: Annotated[str, "reason_undetermined"] = ""  # empty when determined
+    # [s] longest and shortest time left, t_f - t
+    window: Annotated[tuple[float, float], "window_s"] = (NAN, NAN)
     n_periods: float = NAN  # of nutation in the window
-    t_f: float = NAN  # [s]
-    t_f_sigma: float = NAN  # [s]
+    t_f: Annotated[float, "t_f_s"] = NAN  # [s]
+    t_f_sigma: Annotated[float, "t_f_sigma_s"] = NAN  # [s]
     n_theta: Exponent = Exponent()
     n_psidot: Exponent = Exponent()
     n_energy: Exponent = Exponent()
@@ -92,9 +94,10 @@ class NutationCount:
 
     turns: Array  # (n,) precession turns since the start, at the maxima of theta
     count: Array  # (n,) 0, 1, 2, ...
-    slope: float  # NaN with fewer than 4 maxima
-    sigma: float
-    expected: tuple[float, float]  # of small oscillations at the first and the last nutation of this disc
+    slope: Annotated[float, "nutation_over_precession_counted"]  # NaN with fewer than 4 maxima
+    sigma: Annotated[float, "nutation_over_precession_counted_sigma"]
+    # of small oscillations at the first and the last nutation of this disc
+    expected: Annotated[tuple[float, float], "nutation_over_precession_expected"]
 
 
 def fit_power_laws(

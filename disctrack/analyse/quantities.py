@@ -13,6 +13,7 @@ quantity carries the two apart.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -174,12 +175,15 @@ TOTAL, LEVEL = COLUMN["total"], COLUMN["precession_level"]
 class Energy(Brief):
     """Energy of a recording."""
 
-    loss: float  # [J] from the first to the last known frame, positive when lost
-    loss_sigma: float  # [J] noise
-    loss_sigma_calibration: float  # [J]; most of the calibration's error is common to both ends and cancels
-    level_ratio: float  # mean of psidot^2 sin theta over 4 g / r, over whole nutation periods if there are any
-    level_ratio_sigma: float  # from the scatter about it
-    level_ratio_steady: float  # what steady precession of this disc with its centre at rest has at the median theta
+    loss: Annotated[float, "loss_J"]  # [J] from the first to the last known frame, positive when lost
+    loss_sigma: Annotated[float, "loss_sigma_J"]  # [J] noise
+    # [J]; most of the calibration's error is common to both ends and cancels
+    loss_sigma_calibration: Annotated[float, "loss_sigma_calibration_J"]
+    # mean of psidot^2 sin theta over 4 g / r, over whole nutation periods if there are any
+    level_ratio: Annotated[float, "precession_level_over_4g_r"]
+    level_ratio_sigma: Annotated[float, "precession_level_over_4g_r_sigma"]  # from the scatter about it
+    # what steady precession of this disc with its centre at rest has at the median theta
+    level_ratio_steady: Annotated[float, "precession_level_over_4g_r_steady"]
 
 
 def energy_of(found: Propagated) -> Energy:

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import get_type_hints
 
 import numpy as np
 
@@ -95,32 +96,11 @@ def write_analysis(path: Path, analysis: Analysis) -> None:
             for name, item in variables.items()
         }
 
-    onset, circle, energy = analysis.onset, analysis.circle, analysis.energy
+    circle, contact = analysis.circle, _attributes(analysis.onset) | _attributes(analysis.circle)
     attributes: dict[str, dict[str, object]] = {
         "motion": _motion_attributes(analysis),
-        "contact": {
-            "rolling_onset_s": onset.time,
-            "rolling_onset_low_s": onset.low,
-            "rolling_onset_high_s": onset.high,
-            "rolling_probability": onset.probability,
-            "rolling_verdict": onset.verdict,
-            "slip_distance_m": onset.slip_distance,
-            "slip_distance_sigma_m": onset.slip_distance_sigma,
-            "locus_circle_radius_m": circle.radius,
-            "locus_circle_radius_sigma_m": circle.sigma,
-            "locus_circle_radius_sigma_calibration_m": circle.sigma_calibration,
-            "locus_circle_expected_radius_m": circle.expected,
-            "locus_circle_centre_m": circle.centre,
-            "locus_circle_interval_s": np.array([circle.start, circle.end]),
-        },
-        "energy": {
-            "loss_J": energy.loss,
-            "loss_sigma_J": energy.loss_sigma,
-            "loss_sigma_calibration_J": energy.loss_sigma_calibration,
-            "precession_level_over_4g_r": energy.level_ratio,
-            "precession_level_over_4g_r_sigma": energy.level_ratio_sigma,
-            "precession_level_over_4g_r_steady": energy.level_ratio_steady,
-        },
+        "contact": contact | {"locus_circle_interval_s": np.array([circle.start, circle.end])},
+        "energy": _attributes(analysis.energy),
     }
     groups: dict[str, Group] = {}
     for group, rows in QUANTITIES.items():
@@ -132,6 +112,12 @@ def write_analysis(path: Path, analysis: Analysis) -> None:
     what = "position, rotation vector, velocity, angular velocity, acceleration, angular acceleration; world axes"
     axes |= {name: Variable(np.array(STATE), (name,), "1", what) for name in ("state", "state_2")}
     write_groups(path, groups, axes=axes)
+
+
+def _attributes(result: object) -> dict[str, object]:
+    """Of a result, the fields that are annotated with their name in the file, by that name."""
+    hints = get_type_hints(type(result), include_extras=True).items()
+    return {hint.__metadata__[0]: getattr(result, name) for name, hint in hints if hasattr(hint, "__metadata__")}
 
 
 def _series_variables(series: Sequence[DerivedSeries]) -> dict[str, Variable]:
@@ -182,16 +168,8 @@ def _motion_attributes(analysis: Analysis) -> dict[str, object]:
 
 
 def _scaling_group(analysis: Analysis) -> Group:
-    laws, count, fits = analysis.laws, analysis.nutation_count, analysis.laws_by_window
-    attributes: dict[str, object] = {
-        "window_s": np.array(laws.window),
-        "t_f_s": laws.t_f,
-        "t_f_sigma_s": laws.t_f_sigma,
-        "reason_undetermined": laws.reason,
-        "nutation_over_precession_counted": count.slope,
-        "nutation_over_precession_counted_sigma": count.sigma,
-        "nutation_over_precession_expected": np.array(count.expected),
-    }
+    laws, fits = analysis.laws, analysis.laws_by_window
+    attributes = _attributes(laws) | _attributes(analysis.nutation_count)
     found = {"t_f": ([fit.t_f for fit in fits], "s", "instant of collapse fitted in the window")}
     found["t_f_sigma"] = [fit.t_f_sigma for fit in fits], "s", "standard deviation of t_f"
     for name, text in (("n_theta", "nutation"), ("n_psidot", "precession rate"), ("n_energy", "energy")):
