@@ -11,10 +11,12 @@ begins in what the official window shows, and compared with the best published.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from time import process_time
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.io import loadmat
 
 from calibration.kit.arrays import Array
@@ -25,21 +27,24 @@ from disctrack.numbers import rounded
 from disctrack.report.blocks import Listing, Report
 
 Columns = dict[str, Array]
+Records = dict[str, tuple[ArrayLike, Array, Array]]  # by name, time [s], input, output
 
 
 @dataclass(frozen=True)
 class Benchmark:
-    """One system, with the way from its files to runs."""
+    """One system, with the way from its files to records of one input and one output."""
 
     name: str
     files: tuple[str, ...]  # without .mat or .csv
     equations: Equations
     offered: Sequence[Term] | None
-    runs: Callable[..., tuple[list[Run], list[Run]]]  # of the columns of each file: for estimation and for the test
+    records: Callable[..., list[Records]]  # of the columns of each file: for estimation and for the test
     window: float  # [s] of a test that may tell its start
     unit: str
     scale: float  # units in one of the data's
     published: float  # best error [unit]
+    run: Callable[..., Run] = Run  # of a record
+    every: int = 1  # of so many samples one is fitted
 
 
 def columns(path: Path) -> Columns:
@@ -51,54 +56,28 @@ def columns(path: Path) -> Columns:
     return {name: np.ravel(values) for name, values in loadmat(path).items() if not name.startswith("_")}
 
 
-def _positions(*files: Columns) -> tuple[list[Run], list[Run]]:
-    train, test = (
-        Run(
-            d["t"] - d["t"][0],
-            {"q": d["qm"]},
-            inputs={"F": d["gtau"] * d["vir"]},
-            hold="hold",
-            known={"v": (0.0, 1e-3)},
-        )
-        for d in files
-    )
-    return [train.thinned(20)], [test]
+def _positions(*files: Columns) -> list[Records]:
+    return [{"": (d["t"] - d["t"][0], d["gtau"] * d["vir"], d["qm"])} for d in files]
 
 
-def _levels(d: Columns) -> tuple[list[Run], list[Run]]:
-    time = 4.0 * np.arange(len(d["uEst"]))
-    sides = ("Est", "Val")
-    train, test = (Run(time, {"y": d[f"y{s}"]}, inputs={"u": d[f"u{s}"]}, start={"h1": 4.0}) for s in sides)
-    return [train], [test]
+def _levels(d: Columns) -> list[Records]:
+    return [{"": (4.0 * np.arange(len(d["uEst"])), d[f"u{side}"], d[f"y{side}"])} for side in ("Est", "Val")]
 
 
-def _speeds(d: Columns) -> tuple[list[Run], list[Run]]:
-    time, parts = 0.02 * np.arange(400), (slice(400), slice(400, None))
-    train, test = (
-        [
-            Run(
-                time[: len(d[z][part])],
-                {"speed": d[z][part]},
-                inputs={"u": d[u][part]},
-                hold="hold",
-                name=f"{z} {side}",
-            )
-            for u, z in (("u11", "z11"), ("u12", "z12"))
-        ]
-        for part, side in zip(parts, ("estimation", "test"), strict=True)
-    )
-    return train, test
+def _speeds(d: Columns) -> list[Records]:
+    names, time = (("u11", "z11"), ("u12", "z12")), 0.02 * np.arange(400)
+    sides = {"estimation": slice(400), "test": slice(400, None)}
+    return [
+        {f"{z} {side}": (time[: len(d[z][part])], d[u][part], d[z][part]) for u, z in names}
+        for side, part in sides.items()
+    ]
 
 
-def _voltages(d: Columns) -> tuple[list[Run], list[Run]]:
+def _voltages(d: Columns) -> list[Records]:
     multisine = slice(40_650, 127_400)
     u, y = d["V1"][multisine], d["V2"][multisine]
     part = int(0.75 * len(u))  # for estimation, of which so many samples tell all
-    train, test = (
-        Run(np.arange(len(y[rows])) / 610.35, {"y": y[rows]}, inputs={"u": u[rows]})
-        for rows in (slice(3000), slice(part, None))
-    )
-    return [train], [test]
+    return [{"": (np.arange(len(y[rows])) / 610.35, u[rows], y[rows])} for rows in (slice(3000), slice(part, None))]
 
 
 BENCHMARKS = (
@@ -106,7 +85,7 @@ BENCHMARKS = (
         "EMPS", ("DATA_EMPS", "DATA_EMPS_PULSES"),
         Equations({"q": "v", "v": "(F - Fv*v)/M"}, {"M": 90.0, "Fv": 220.0}, inputs=["F"], units={"q": "m"}),
         [terms.coulomb("v"), terms.constant("v"), terms.quadratic("v"), terms.spring("v", "q")],
-        _positions, 0.02, "mm", 1e3, 2.64,
+        _positions, 0.02, "mm", 1e3, 2.64, partial(Run, hold="hold", known={"v": (0.0, 1e-3)}), 20,
     ),
     Benchmark(
         "cascaded tanks", ("dataBenchmark",),
@@ -115,7 +94,7 @@ BENCHMARKS = (
             {name: Parameter(0.05, lower=0.0) for name in ("k1", "k2", "k3", "k4")}, inputs=["u"],
             observed={"y": "h2"}, units={"y": "V"},
         ),
-        None, _levels, 16.0, "V", 1.0, 0.191,
+        None, _levels, 16.0, "V", 1.0, 0.191, partial(Run, start={"h1": 4.0}),
     ),
     Benchmark(
         "coupled drives", ("DATAUNIF",),
@@ -124,7 +103,7 @@ BENCHMARKS = (
             {"gain": 2.0, "lag": Parameter(0.3, lower=0.01), "omega": 14.0, "c": 5.0}, inputs=["u"],
             observed={"speed": "abs(p)"},
         ),
-        None, _speeds, 0.06, "ticks/s", 1.0, 0.12,
+        None, _speeds, 0.06, "ticks/s", 1.0, 0.12, partial(Run, hold="hold"),
     ),
     Benchmark(
         "Silverbox", ("SNLS80mV",),
@@ -144,10 +123,20 @@ def present(folder: Path, benchmark: Benchmark) -> list[Path]:
     return found if len(found) == len(benchmark.files) else []
 
 
+def runs_of(b: Benchmark, files: Sequence[Columns]) -> tuple[list[Run], list[Run]]:
+    """For estimation, and for the test."""
+    (u, *_), (y, *_) = b.equations.inputs, b.equations.observed or b.equations.rates
+    train, test = (
+        [b.run(time, {y: seen}, inputs={u: given}, name=name) for name, (time, given, seen) in records.items()]
+        for records in b.records(*files)
+    )
+    return [run.thinned(b.every) if b.every > 1 else run for run in train], test
+
+
 def measured(benchmark: Benchmark, paths: Sequence[Path]) -> tuple[Answer, dict[str, float]]:
     """The answer, and error [unit] and share within the 95 % band of its tests, with the processor time [s]."""
     began = process_time()
-    train, test = benchmark.runs(*(columns(path) for path in paths))
+    train, test = runs_of(benchmark, [columns(path) for path in paths])
     answer = diagnose(benchmark.equations, train, benchmark.offered)
     scores = [score for run in test for score in answer.score(run, window=benchmark.window).values()]
     error = benchmark.scale * float(np.mean([s.rms for s in scores]))
