@@ -16,15 +16,7 @@ from numpy.typing import NDArray
 from calibration.kit.arrays import Array
 from disctrack.errors import RecordingError
 from disctrack.recording.readers.base import CameraHeader, FrameReader, only_file
-from disctrack.recording.readers.raw import (
-    PixelLayout,
-    RawFile,
-    bit_depth_of,
-    check_frame_size,
-    check_present,
-    count_present,
-    raw_frames,
-)
+from disctrack.recording.readers.raw import PixelLayout, RawFile, bit_depth_of, check_frame_size, raw_frames
 
 _FILE_HEADER = struct.Struct("<2sHHHiIiIIIIII")
 _BITMAP_HEADER = struct.Struct("<IiiHHII")
@@ -52,7 +44,7 @@ def open_cine(files: Sequence[Path], camera: str) -> FrameReader:
     layout, depth = _layout(cine)
     n = cine.n_images
     starts = np.frombuffer(file.bytes_at(cine.table, 8 * n, f"{file}: table of {n} images"), "<i8")
-    check_present(file, camera, layout, n, count_present(layout, starts, file.size))
+    file.check_announced(camera, layout, n, layout.count_whole(starts, file.size))
     times, step, doubts = _times(cine)
     header = _header(cine, times, step)
     return raw_frames(

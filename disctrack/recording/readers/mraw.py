@@ -14,14 +14,7 @@ from disctrack.errors import RecordingError, told_as
 from disctrack.files.inputs import MOST_TEXT
 from disctrack.recording.readers.base import CameraHeader, FrameReader, only_file
 from disctrack.recording.readers.files import content_of
-from disctrack.recording.readers.raw import (
-    PixelLayout,
-    RawFile,
-    bit_depth_of,
-    check_frame_size,
-    check_present,
-    raw_frames,
-)
+from disctrack.recording.readers.raw import PixelLayout, RawFile, bit_depth_of, check_frame_size, raw_frames
 
 # Where the entries that matter lie: name in the .cih, path below <cih> in the .cihx.
 _ENTRIES = {
@@ -59,7 +52,7 @@ def open_mraw(files: Sequence[Path], camera: str) -> FrameReader:
     layout, depth = _layout(entries)
     file, notes = RawFile(data_file), []
     n = _whole(entries, "Total Frame")
-    check_present(file, camera, layout, n, min(n, file.size // layout.frame_bytes))
+    file.check_announced(camera, layout, n, min(n, file.size // layout.frame_bytes))
     if layout.stored_bits == 16 and depth < 16:
         largest = int(np.frombuffer(file.bytes_at(0, layout.frame_bytes, str(file)), "<u2").max())
         if largest >> depth:

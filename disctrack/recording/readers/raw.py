@@ -5,6 +5,8 @@ same copy and its page faults, and a file that is cut short or a network that go
 raising an error.
 """
 
+from __future__ import annotations
+
 import io
 import os
 import threading
@@ -76,6 +78,17 @@ class RawFile:
         self.read_into(buffer, offset, where)
         return buffer.tobytes()
 
+    def check_announced(self, camera: str, layout: PixelLayout, n: int, present: int) -> None:
+        """Raise RecordingError unless frames are announced, and `present` of the n, most of them, are in the file."""
+        if n < 1:
+            raise RecordingError(f"{self} ({camera} camera): its header states no frame. Export it again.")
+        if present < LEAST_PRESENT * n or present * layout.frame_bytes > self.size:
+            raise RecordingError(
+                f"{self} ({camera} camera): the header states {n} frames of {layout.width} x {layout.height} px, "
+                f"{layout.stored_bits} bit, which need {n * layout.frame_bytes} bytes, but the file has {self.size}: "
+                "it is cut short, or the header is of another file. Copy both again."
+            )
+
 
 @dataclass(frozen=True)
 class PixelLayout:
@@ -104,6 +117,10 @@ class PixelLayout:
         """True where the bytes of the file are the image, but for their order in a pixel."""
         return not (self.packed_bits or self.padding or self.bottom_up) and self.table is None
 
+    def count_whole(self, offsets: NDArray[np.integer], ends: NDArray[np.integer] | int) -> int:
+        """How many of the frames at offsets (n,) lie wholly before the ends of their files."""
+        return int(np.sum((offsets >= 0) & (offsets <= np.subtract(ends, self.frame_bytes))))
+
     def decode(self, stored: NDArray[np.uint8], out: Image) -> None:
         """Bytes of one frame (frame_bytes,) into pixels (height, width), contiguous, native uint8 or uint16."""
         if self.packed_bits:
@@ -129,7 +146,7 @@ def raw_frames(
     end.   told : other fields of the reader
     """
     n, image_size, dtype = len(offsets), (layout.width, layout.height), layout.dtype.newbyteorder("=")
-    if lost := n - count_present(layout, offsets, np.array([file.size for file in files])):
+    if lost := n - layout.count_whole(offsets, np.array([file.size for file in files])):
         notes = (*notes, f"{files[0]}: lacks {lost} of {n} frames; they are left without an answer")
 
     def filled(index: int, where: str, buffer: NDArray[np.uint8] | None = None) -> NDArray[np.uint8]:
@@ -158,23 +175,6 @@ def raw_frames(
         notes=notes,
         **told,
     )
-
-
-def count_present(layout: PixelLayout, offsets: NDArray[np.integer], ends: NDArray[np.integer] | int) -> int:
-    """How many of the frames at offsets (n,) lie wholly before the ends of their files."""
-    return int(np.sum((offsets >= 0) & (offsets <= np.subtract(ends, layout.frame_bytes))))
-
-
-def check_present(file: RawFile, camera: str, layout: PixelLayout, n: int, present: int) -> None:
-    """Raise RecordingError unless there are frames, and `present` of the n promised, most of them, are in the file."""
-    if n < 1:
-        raise RecordingError(f"{file} ({camera} camera): its header states no frame. Export it again.")
-    if present < LEAST_PRESENT * n or present * layout.frame_bytes > file.size:
-        raise RecordingError(
-            f"{file} ({camera} camera): the header states {n} frames of {layout.width} x {layout.height} px, "
-            f"{layout.stored_bits} bit, which need {n * layout.frame_bytes} bytes, but the file has {file.size}: it is "
-            "cut short, or the header is of another file. Copy both again."
-        )
 
 
 def bit_depth_of(stored_bits: int, effective_bits: int) -> int:
