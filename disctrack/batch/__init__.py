@@ -9,10 +9,4 @@ never by their mere existence.
 from disctrack.batch.plan import BatchOptions, find_recordings
 from disctrack.batch.run import BatchOutcome, run_batch, summarise_batch
 
-__all__ = [
-    "BatchOptions",
-    "BatchOutcome",
-    "find_recordings",
-    "run_batch",
-    "summarise_batch",
-]
+__all__ = ["BatchOptions", "BatchOutcome", "find_recordings", "run_batch", "summarise_batch"]

@@ -18,15 +18,7 @@ from calibration.rig_file import record_of
 from disctrack.analyse.declaration import Boards, across, contradictions, lost_pairs, turned_board, with_square
 from disctrack.calibrate.stage import boards_in, boards_of, given_rig, noticed_in, source_of
 from disctrack.errors import DiscTrackError, RecordingError
-from disctrack.findings import (
-    Finding,
-    Kind,
-    Remedy,
-    Severity,
-    Subject,
-    in_doubt,
-    leading,
-)
+from disctrack.findings import Finding, Kind, Remedy, Severity, Subject, in_doubt, leading
 from disctrack.frames import CAMERAS
 from disctrack.recording.declaration import Recording, read_recording
 from disctrack.recording.readers.blocks import NotRead

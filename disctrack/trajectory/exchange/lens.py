@@ -4,14 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from calibration.cameras.camera import (
-    INTRINSIC_PARAMETERS,
-    Camera,
-    StereoRig,
-    normalise,
-    project,
-    project_with_jacobians,
-)
+from calibration.cameras.camera import INTRINSIC_PARAMETERS, Camera, StereoRig, normalise, project_with_jacobians
 from calibration.kit.arrays import Array
 
 BROWN = ("k1", "k2", "p1", "p2", "k3")
@@ -49,4 +42,4 @@ def _refitted(rig: StereoRig, number: int, terms: tuple[str, ...]) -> tuple[Came
         J = slopes[..., free].reshape(found.size, -1)
         values[free] += np.linalg.lstsq(J, (seen - found).ravel(), rcond=None)[0]
     fitted = Camera.from_parameters(values, camera.image_size)
-    return fitted, project(rays, fitted) - seen
+    return fitted, project_with_jacobians(rays, fitted)[0] - seen
