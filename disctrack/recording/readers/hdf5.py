@@ -27,7 +27,6 @@ from disctrack.recording.readers.raw import (
     raw_frames,
 )
 
-_DAMAGED = (OSError, RuntimeError, KeyError, ValueError, TypeError)  # what a damaged file makes of it
 _LARGEST_CACHE = 64 << 20  # bytes of decompressed chunks kept; more than one camera's chunk of many frames
 
 
@@ -37,7 +36,7 @@ def open_hdf5(files: Sequence[Path], camera: str, member: str = "") -> FrameRead
     with told_as(RecordingError, f"{file}: not a readable HDF5 file", OSError, then="Copy it again."):
         handle = h5py.File(file, "r", rdcc_nbytes=_LARGEST_CACHE, rdcc_w0=1.0)
     try:
-        with told_as(RecordingError, f"{file}: the HDF5 file is damaged", *_DAMAGED, then="Copy it again."):
+        with told_as(RecordingError, f"{file}: the HDF5 file is damaged", Exception, then="Copy it again."):
             return _open(handle, _stack(handle, member, file), file, camera)
     except RecordingError:
         handle.close()
@@ -183,7 +182,7 @@ def _decoding(stack: h5py.Dataset, apart: bool) -> Callable[[int, Image | None, 
 
     def decoded(index: int, out: Image | None, where: str) -> Image:
         image, content = room_for(out, (width, height), dtype), None
-        with lock, told_as(RecordingError, f"{where}: cannot be read", *_DAMAGED, then="Copy the file again."):
+        with lock, told_as(RecordingError, f"{where}: cannot be read", Exception, then="Copy the file again."):
             size = _stored_size(stack, index)
             if size == 0:
                 raise RecordingError(f"{where}: was never written to the file. Copy or write it again.")

@@ -223,8 +223,7 @@ def _opened(file: Path, camera: str) -> InputContainer:
         RecordingError, f"{file}: videos need PyAV", ImportError, then="Install it: pip install disctrack[video]"
     ):
         import av
-    said = f"{file}: not a readable video for the {camera} camera"
-    with told_as(RecordingError, said, av.FFmpegError, IndexError, OSError, ValueError):
+    with told_as(RecordingError, f"{file}: not a readable video for the {camera} camera", Exception):
         container = av.open(str(file), options=_CONTAINERS)
         codec = container.streams.video[0].codec_context
         if codec is None:

@@ -89,8 +89,7 @@ def _nodes(path: Path) -> dict[str, Any]:
     """What a file holds of a rig. Raises RigFileError."""
     text = content_of(path)
     found: dict[str, Any] = {}
-    said = f"{path}: not a stereo rig in OpenCV's YAML, XML or JSON format"
-    with told_as(RigFileError, said, cv2.error, ValueError, TypeError, SystemError):
+    with told_as(RigFileError, f"{path}: not a stereo rig in OpenCV's YAML, XML or JSON format", Exception):
         storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         for name in (*_YAML, *_BESIDE):
             matrix = storage.getNode(name).mat()
@@ -139,8 +138,7 @@ def read_stereo_parameters(path: Path, *, unit: float | None = None, world_is_ta
     world_is_table : True if the world of R_left_world is the table, k up, whether or not the file says so
     Raises RigFileError.
     """
-    kinds = OSError, ValueError, NotImplementedError, TypeError
-    with told_as(RigFileError, f"{path}: not a MAT file of version 5", *kinds, then="Save it with -v6 or -v7."):
+    with told_as(RigFileError, f"{path}: not a MAT file of version 5", Exception, then="Save it with -v6 or -v7."):
         found = loadmat(path)
     if "intrinsicMatrix1" not in found:
         there = ", ".join(name for name in found if not name.startswith("__"))

@@ -176,7 +176,7 @@ def read_kalibr(path: Path) -> StereoRig:
         OutputError, f"{path}: Kalibr's YAML needs PyYAML", ImportError, then="Install it: pip install pyyaml"
     ):
         import yaml
-    with told_as(RigFileError, f"{path}: not YAML", yaml.YAMLError):
+    with told_as(RigFileError, f"{path}: not YAML", Exception):
         chain = yaml.safe_load(content_of(path))
     parts = []
     for name in ("cam0", "cam1"):
@@ -228,8 +228,7 @@ def read_mrcal(paths: Sequence[Path], *, world_is_table: bool = False) -> Stereo
         raise RigFileError(f"{paths[0]}: mrcal keeps one camera per file; give two, left first")
     parts = []
     for path in paths:
-        kinds = ValueError, SyntaxError, MemoryError, RecursionError
-        with told_as(RigFileError, f"{path}: not a .cameramodel of mrcal", *kinds):
+        with told_as(RigFileError, f"{path}: not a .cameramodel of mrcal", Exception):
             model = ast.literal_eval(content_of(path).strip())
         if not isinstance(model, dict):
             raise RigFileError(f"{path}: not a .cameramodel of mrcal: no dictionary")

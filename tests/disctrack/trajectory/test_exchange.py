@@ -263,6 +263,19 @@ def test_what_is_no_rig_of_browns_cameras_is_refused_by_name(rig, tmp_path, name
         formats.read_foreign(list(written))
 
 
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("rig.mat", "no mat", "not a MAT file"),
+        ("camchain.yaml", "cam0: 2020-99-99", "not YAML: month must be in 1..12"),
+    ],
+)
+def test_whatever_a_library_makes_of_a_file_is_told_as_ours(tmp_path, name, content, said):
+    (tmp_path / name).write_text(content)
+    with pytest.raises(RigFileError, match=f"{name}: {said}"):
+        formats.read_foreign([tmp_path / name])
+
+
 def test_what_a_file_does_not_tell_may_be_told(rig, tmp_path):
     rigs.write_caliscope(tmp_path / "rig.toml", rig)
     text = (tmp_path / "rig.toml").read_text()
