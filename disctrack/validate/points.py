@@ -26,7 +26,7 @@ from disctrack.synthetic.motion import rolling_model, rolling_start, true_frame_
 from disctrack.synthetic.optics import smooth_field
 from disctrack.synthetic.recording import true_disc_of
 from disctrack.track.pose import DotsInFrames, fit_poses
-from disctrack.track.refine.assembly import Taken, trajectory_of
+from disctrack.track.refine.assembly import Taken, status_of, trajectory_of
 from disctrack.trajectory import Trajectory
 
 Motion = Callable[[Array], Array]  # instants (k,) [s] -> coordinates q (k, 6)
@@ -110,7 +110,7 @@ def measured(
     fits = fit_poses(seen, reject_outliers=False)
     taken = Taken(range(n), declared_rate, scene.gravity_m_s2)
     good = np.zeros(pixels.shape[:-1], np.uint8)  # the status of frames, and of their dots
-    found = trajectory_of(seen, fits, np.zeros((n, 6, 6)), good[:, 0, 0], good[:, 0, 0], good, taken)
+    found = trajectory_of(seen, fits, np.zeros((n, 6, 6)), status_of(good[:, 0, 0], fits), good, taken)
     # of a bowed board the rim tells the tracking by how much the table is another
     return replace(found, table_moved=(laboratory.board_bow_m, laboratory.board_tilt, laboratory.board_tilt))
 

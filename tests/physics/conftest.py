@@ -88,4 +88,4 @@ def as_tracked(truth: TrueMotion, rng, missing=(), noise=1.0, sensitivity=None, 
     fits = PoseFits(R, position, stated, by_rig, dots, good == 0, np.ones(n), np.ones(n, int), np.ones(n, bool))
     seen = DotsInFrames(rig, MA_2014, dots, dots[..., None, :].repeat(2, axis=-2), R, position)
     taken = Taken(range(n), 1000.0, 9.81, truth.time)
-    return trajectory_of(seen, fits, np.zeros((n, 6, 6)), good[:, 0, 0], status, good, taken)
+    return trajectory_of(seen, fits, np.zeros((n, 6, 6)), status, good, taken)

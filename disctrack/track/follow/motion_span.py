@@ -74,11 +74,8 @@ def _noise(mean: Array32, difference: Array32, steep: Array32) -> Array32:
     alike = np.array_split(np.argsort(grey), NOISE_BINS)
     levels = np.array([grey[part].mean() for part in alike])
     variances = np.array([robust_sigma(change[part]) ** 2 for part in alike])
-    return (
-        photon_transfer(levels, variances, np.ones(NOISE_BINS), 1.0)
-        .variance(np.asarray(mean, float))
-        .astype(np.float32)
-    )
+    law = photon_transfer(levels, variances, np.ones(NOISE_BINS), 1.0)
+    return law.variance(np.asarray(mean, float)).astype(np.float32)
 
 
 def find_motion(left: FrameReader, right: FrameReader, start: int, stop: int, frame_rate: float) -> MotionSpan:

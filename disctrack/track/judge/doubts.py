@@ -17,7 +17,6 @@ from disctrack.track.follow.following import Follower
 from disctrack.track.judge.cameras import HARDLY, LATE, delay_of_right
 from disctrack.track.pose import DotsInFrames
 from disctrack.track.refine.scatter import Scatter
-from disctrack.track.refine.self_calibration import AsBuilt
 from disctrack.track.refine.table_contact import FROM_SIGMAS, TableFromDisc
 from disctrack.track.side_by_side import FEW, stretches
 from disctrack.trajectory import FrameStatus, Trajectory
@@ -149,7 +148,6 @@ def _misfit(seen: str, ahead: float, explained: float, frame_rate: float) -> Fin
 
 def doubts_of(
     follower: Follower,
-    by_free_cameras: AsBuilt | None,
     scatter: Scatter,
     shaken: Array,
     table: TableFromDisc | None,
@@ -168,9 +166,8 @@ def doubts_of(
         *_clipped(follower),
         *misplaced,
     ]
-    own = scatter.whole if by_free_cameras is None else max(1.0, by_free_cameras.reduced_chi_square)
     systematic_px = max(scatter.systematic_px)
-    if scatter.whole > min(FAULTY * own, HOPELESS) and systematic_px > ORDINARY_PX:
+    if scatter.whole > min(FAULTY * scatter.free, HOPELESS) and systematic_px > ORDINARY_PX:
         times = np.sqrt(scatter.whole / scatter.noise)
         text = f"the dots miss their fitted places by {times:.1f} times their scatter ({systematic_px:.3f} px)"
         found.append(_misfit(text, *delay_of_right(seen, np.flatnonzero(seen.posed)), trajectory.frame_rate))

@@ -92,6 +92,7 @@ def assemble(
     seen = replace(seen, R=fits.R_world_body, t=fits.t_world_body)
     again = np.asarray(repeated.all(axis=1))
     fits, verdicts = judge_poses(fits, again, outlying, 1 / taken.frame_rate, disc.radius)
+    status = np.where(verdicts == FrameStatus.MEASURED, status_of(tables.frame_status, fits), verdicts)
     course, of_course = camera_course(seen, fits, taken.pairs)
     systematic += course
     moved = by_pattern(as_built, fits.R_world_body)
@@ -103,10 +104,10 @@ def assemble(
     fits.covariance[...] *= np.sqrt(np.outer(shaken, shaken))
     shared = _shared_sigma(fits, systematic, rig, moved)
     seen = replace(seen, rig=rig)
-    trajectory = trajectory_of(seen, fits, systematic, verdicts, tables.frame_status, tables.status, taken)
+    trajectory = trajectory_of(seen, fits, systematic, status, tables.status, taken)
     if table is not None:
         trajectory = replace(trajectory, table_moved=table.beyond)
-    doubts = doubts_of(first, faults, scatter, shaken, table, trajectory, seen)
+    doubts = doubts_of(first, scatter, shaken, table, trajectory, seen)
     details = {
         "exposure_s": list(exposure),  # that the dots were moved by
         "blur_px": [edge.blur_px for edge in first.edges],
@@ -165,7 +166,7 @@ def _scattered(
         degrees_of_freedom=np.where(outlying, 0, fits.degrees_of_freedom),
         used=fits.used & ~outlying[:, None, None],
     )
-    scatter = split_scatter(ordinary, covariance, faults)
+    scatter = split_scatter(ordinary, covariance, None if faults is None else faults.reduced_chi_square)
     covariance[...] *= scatter.noise  # in place: nobody else holds them
     systematic = fits.covariance * scatter.systematic
     fits.covariance[...] *= scatter.noise
@@ -221,27 +222,21 @@ def trajectory_of(
     seen: DotsInFrames,
     fits: PoseFits,
     systematic: Array,
-    verdicts: NDArray[np.uint8],
-    followed: NDArray[np.uint8],
+    status: NDArray[np.uint8],
     located: NDArray[np.uint8],
     taken: Taken,
 ) -> Trajectory:
     """The trajectory of poses that were fitted to dots; what is refused is taken out of the arrays of `fits`, too.
 
-    systematic : (n, 6, 6) covariance of what repeats; verdicts (n,) of `judge_poses`; followed (n,) FrameStatus before
-    the fits; located (n, 2, m) MarkerStatus
+    systematic : (n, 6, 6) covariance of what repeats; status (n,) FrameStatus; located (n, 2, m) MarkerStatus
     """
     euler = frames.unwrap_euler(frames.euler_from_rotation(fits.R_world_body))
     euler[~fits.converged] = np.nan
-    status = status_of(followed, fits)
-    refused = verdicts != FrameStatus.MEASURED
-    status[refused] = verdicts[refused]
     marker_status = located.copy()
-    kept = fits.used & ~refused[:, None, None]
-    struck = ~kept & (fits.converged | refused)[:, None, None]
-    marker_status[struck & (located == MarkerStatus.MEASURED)] = MarkerStatus.REJECTED
+    struck = np.isfinite(fits.residuals_px).all(axis=-1) & ~(fits.used & fits.converged[:, None, None])
+    marker_status[struck] = MarkerStatus.REJECTED
     for without_answer in (euler, fits.t_world_body, fits.R_world_body, fits.covariance, fits.sensitivity, systematic):
-        without_answer[refused] = np.nan
+        without_answer[~fits.converged] = np.nan
     squared = np.where(fits.used, np.sum(fits.residuals_px**2, axis=-1), 0.0)
     with np.errstate(invalid="ignore", divide="ignore"):
         rms = np.sqrt(squared.sum(axis=2) / fits.used.sum(axis=2))

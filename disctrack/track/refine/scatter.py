@@ -68,21 +68,24 @@ class Scatter:
     """Variance of the dots about the fitted poses over what the image noise predicts, and what it is made of."""
 
     whole: float  # at least 1
+    free: float  # at least 1, where cameras, dots and delay are free
     noise: float  # from one frame to the next
     systematic: float  # the rest: repeats, or varies slowly
     systematic_px: tuple[float, float]  # rms of that rest per axis, left and right camera
 
 
-def split_scatter(fits: PoseFits, markers_covariance_px2: Array, by_free_cameras: AsBuilt | None) -> Scatter:
+def split_scatter(fits: PoseFits, markers_covariance_px2: Array, by_free_cameras: float | None) -> Scatter:
     """What the dots do not fit, as noise and as what repeats.
 
+    by_free_cameras : reduced chi-square of `without_shared_faults`, if that is known
     Where no three successive frames are complete, all that passes a refinement of what frames share is noise.
     """
     whole = trimmed_reduced_chi_square(fits)
+    free = max(1.0, whole if by_free_cameras is None else by_free_cameras)
     noise = frame_to_frame_chi_square(fits, markers_covariance_px2)
     if noise is None:
         whole = max(1.0, whole)
-        noise = whole if by_free_cameras is None else min(whole, max(1.0, by_free_cameras.reduced_chi_square))
+        noise = min(whole, free)
     noise = max(noise, LEAST_NOISE)
     # chance alone: both are means over n frames, the second differences of overlapping triples tell half as much
     freedom = float(np.sum(fits.degrees_of_freedom[fits.degrees_of_freedom >= 6]))
@@ -95,7 +98,7 @@ def split_scatter(fits: PoseFits, markers_covariance_px2: Array, by_free_cameras
         # of a normal distribution the median square is 0.455 variances; smears and objects in view do not count
         left, right = (float(np.sqrt(np.median(one**2) / 0.455 * share)) if one.size else 0.0 for one in seen)
         systematic_px = left, right
-    return Scatter(max(1.0, whole), noise, systematic, systematic_px)
+    return Scatter(max(1.0, whole), free, noise, systematic, systematic_px)
 
 
 def frame_to_frame_chi_square(fits: PoseFits, markers_covariance_px2: Array) -> float | None:
