@@ -141,15 +141,11 @@ def stacked(rig: StereoRig) -> tuple[Array, Array, Array]:
 def whitening(covariance: Array) -> Array:
     """W (..., 2, 2) with W C W^T = 1 for covariances C (..., 2, 2); zeros where C is not a covariance."""
     a, b, c = covariance[..., 0, 0], covariance[..., 0, 1], covariance[..., 1, 1]
-    W = np.zeros_like(covariance)
     with np.errstate(invalid="ignore", divide="ignore"):
-        remaining = c - b * b / a
-        good = (a > 0) & (remaining > 0) & np.isfinite(remaining)
-        l11, l22 = np.sqrt(a), np.sqrt(remaining)
-        W[..., 0, 0] = np.where(good, 1 / l11, 0.0)
-        W[..., 1, 0] = np.where(good, -b / (a * l22), 0.0)
-        W[..., 1, 1] = np.where(good, 1 / l22, 0.0)
-    return W
+        l11, l22 = np.sqrt(a), np.sqrt(c - b * b / a)
+        W = np.stack([1 / l11, np.zeros_like(a), -b / (a * l22), 1 / l22], axis=-1).reshape(covariance.shape)
+    good = np.isfinite(l22) & np.isfinite(W).all(axis=(-2, -1))
+    return np.where(good[..., None, None], W, 0.0)
 
 
 def fit_poses(seen: DotsInFrames, *, reject_outliers: bool = True, with_sensitivity: bool = True) -> PoseFits:

@@ -158,31 +158,23 @@ def no_more_than_left(flat: NoiseModel, assumed: NoiseModel, results: NDArray) -
     return flat._replace(read=flat.read * left, gain=flat.gain * left)
 
 
-def pulls(radius: float, affine: Array, edge: Edge) -> Array:
-    """(n, m, 2, 5) shifts by changes of the image, along its long and its short axis, of dots of this radius [m].
+def pulls(radius: float, affine: Array, edge: Edge) -> tuple[Array, Array]:
+    """Shifts (n, m, 2, 5) by changes of the image, along its long and its short axis, and rotations into these.
 
-    affine (n, m, 2, 2) [px/m] from their plane to the image; NaN where it is. What `_response` tells is linear in the
-    dots' size and in the logarithm of their shape.
+    affine (n, m, 2, 2) [px/m] from the plane of dots of this radius [m] to the image; NaN where it is. What `_response`
+    tells is linear in the dots' size and in the logarithm of their shape.
     """
-    long, short = half_axes(affine)
+    long, short, axes = axes_of(affine)
     size, shape = radius * np.sqrt(long * short), short / long
     known = np.isfinite(size)
     if not known.any():
-        return np.full((*size.shape, 2, 5), np.nan)
+        return np.full((*size.shape, 2, 5), np.nan), axes
     sizes = np.linspace(size[known].min(), size[known].max() * (1 + 1e-9), SIZES)
     table = scipy.interpolate.RegularGridInterpolator(
         (sizes, np.log(SHAPES)), _response(sizes, edge), bounds_error=False, fill_value=None
     )
     size, shape = np.where(known, size, sizes[0]), np.clip(np.where(known, shape, 1.0), SHAPES[0], SHAPES[-1])
-    return np.where(known[..., None, None], table(np.stack([size, np.log(shape)], axis=-1)), np.nan)
-
-
-def turned_to_axes(affine: Array) -> Array:
-    """(..., 2, 2) rotations of the image into the long and the short axis of the images of a circle by these maps."""
-    xx, yy, xy = _second_moments(affine)
-    turn = 0.5 * np.arctan2(2 * xy, xx - yy)
-    c, s = np.cos(turn), np.sin(turn)
-    return np.stack([np.stack([c, s], axis=-1), np.stack([-s, c], axis=-1)], axis=-2)
+    return np.where(known[..., None, None], table(np.stack([size, np.log(shape)], axis=-1)), np.nan), axes
 
 
 def _response(sizes: Array, edge: Edge) -> Array:
@@ -223,14 +215,12 @@ def _response(sizes: Array, edge: Edge) -> Array:
     return np.stack(found, axis=2)
 
 
-def _second_moments(affine: Array) -> tuple[Array, Array, Array]:
-    """xx, yy and xy of the images of a unit circle by maps (..., 2, 2)."""
-    xx, yy = (affine[..., i, 0] ** 2 + affine[..., i, 1] ** 2 for i in range(2))
-    return xx, yy, (affine[..., 0, :] * affine[..., 1, :]).sum(axis=-1)
-
-
-def half_axes(affine: Array) -> tuple[Array, Array]:
-    """The long and the short one of the images of a unit circle by maps (..., 2, 2)."""
-    xx, yy, xy = _second_moments(affine)
+def axes_of(affine: Array) -> tuple[Array, Array, Array]:
+    """Long and short half axes of the images of a unit circle by maps (..., 2, 2), and rotations into them."""
+    xx, yy = np.moveaxis(np.sum(affine**2, axis=-1), -1, 0)
+    xy = np.sum(affine[..., 0, :] * affine[..., 1, :], axis=-1)
     long = np.sqrt(0.5 * (xx + yy) + np.hypot(0.5 * (xx - yy), xy))
-    return long, np.abs(affine[..., 0, 0] * affine[..., 1, 1] - affine[..., 0, 1] * affine[..., 1, 0]) / long
+    area = np.abs(affine[..., 0, 0] * affine[..., 1, 1] - affine[..., 0, 1] * affine[..., 1, 0])
+    turn = 0.5 * np.arctan2(2 * xy, xx - yy)
+    c, s = np.cos(turn), np.sin(turn)
+    return long, area / long, np.stack([c, s, -s, c], axis=-1).reshape(affine.shape)

@@ -22,14 +22,7 @@ from disctrack.disc import Disc, symmetry_order
 from disctrack.frames import rotation_z
 from disctrack.track.dots import _kernels as kernels
 from disctrack.track.dots.acquisition import Pose, acquire
-from disctrack.track.dots.template import (
-    Edge,
-    NoiseModel,
-    face_of,
-    measure_noise,
-    no_more_than_left,
-    typical_noise,
-)
+from disctrack.track.dots.template import Edge, NoiseModel, face_of, measure_noise, no_more_than_left, typical_noise
 from disctrack.track.pose import dots_at, stacked
 from disctrack.trajectory import FrameStatus, MarkerStatus
 

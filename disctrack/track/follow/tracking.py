@@ -20,21 +20,13 @@ from disctrack.disc import MA_2014, Disc, symmetry_order
 from disctrack.errors import TrackingError
 from disctrack.findings import Finding, Kind, Severity, Subject, in_doubt
 from disctrack.recording.readers.blocks import PairBlock
-from disctrack.track.follow.following import (
-    Follower,
-    Heading,
-    Tables,
-    empty_tables,
-    follow_block,
-    maps_of,
-    run,
-)
+from disctrack.track.follow.following import Follower, Heading, Tables, empty_tables, follow_block, maps_of, run
 from disctrack.track.judge.cameras import frames_ahead, left_out
 from disctrack.track.judge.disc_not_seen import MEETING_PX, why_not_seen
 from disctrack.track.judge.doubts import MOVED
 from disctrack.track.pose import marker_pixels
 from disctrack.track.refine.assembly import Measurement, Taken, TrackingSettings, assemble
-from disctrack.track.side_by_side import evenly
+from disctrack.track.side_by_side import evenly, stretches
 from disctrack.trajectory import FrameStatus, MarkerStatus
 
 SHORTEST_SPLIT = 1000  # pairs; a stretch must outweigh its own search for the disc, and measuring blur and noise
@@ -124,10 +116,11 @@ def _check_dots(disc: Disc) -> None:
 def _slips(tracking: Measurement, read_blocks: ReadBlocks, pairs: range, begin: Follower) -> tuple[Finding, ...]:
     """Images left out by one camera, by the pairing that fits the frames after it."""
     apart = _apart(tracking) | (max(tracking.details["systematic_px"]) > MEETING_PX / 2)
-    begun = np.flatnonzero(np.convolve(apart, np.ones(APART), "valid") == APART)
-    if not begun.size or Kind.DELAY in {finding.kind for finding in tracking.trajectory.findings}:
+    long = stretches(apart, APART)
+    if not len(long) or Kind.DELAY in {finding.kind for finding in tracking.trajectory.findings}:
         return ()
-    first, start = int(begun[0]), pairs[begun[0]]
+    first = int(long[0, 0])
+    start = pairs[first]
     edges = [start, min(start + PAIRED, pairs.stop)]
     alone = (_without(read_blocks, other, start) for other in (1, 0))
     ahead = frames_ahead(*(_followed(one, edges, begin, 1, lambda n: None)[1].R for one in alone))

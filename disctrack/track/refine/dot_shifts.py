@@ -43,13 +43,7 @@ from calibration.kit.arrays import Array, Mask
 from disctrack.analyse.quantities import SIGMAS
 from disctrack.findings import Finding, Kind, Severity
 from disctrack.frames import CAMERAS
-from disctrack.track.dots.template import (
-    AROUND,
-    Edge,
-    half_axes,
-    pulls,
-    turned_to_axes,
-)
+from disctrack.track.dots.template import AROUND, Edge, axes_of, pulls
 from disctrack.track.side_by_side import MIN_FRAMES, SHARED_FRAMES, evenly, parts
 
 PARTS = 10  # stretches of the recording, each left out in turn: what the fit leaves has a memory
@@ -90,7 +84,7 @@ def exposure_by_smear(pixels: Array, affine: Array, time: Array, blur_px: Array)
     """
     chosen = evenly(np.arange(len(time)), SHARED_FRAMES)
     smear = _smear(_rate(pixels, time)[chosen], affine[chosen])
-    long, short = half_axes(affine[chosen])
+    long, short, _ = axes_of(affine[chosen])
     x, y = np.moveaxis(pixels[chosen], -1, 0)
     rows = np.stack([long**-2, 1 / long, x, y, short / long, smear, blur_px[chosen] ** 2], axis=-1)
     return np.transpose([_slope(rows[:, camera]) for camera in (0, 1)])
@@ -165,11 +159,11 @@ def _pulled(radius: float, affine: Array, growth: Array, velocity: Array, edge: 
 
     affine (n, m, 2, 2) [px/m]; growth (n, m, 2, 2) [1/s] A' A^-1; velocity (n, m, 2) [px/s].
     """
-    axes = turned_to_axes(affine)
+    pull, axes = pulls(radius, affine, edge)
     v, G = (axes @ velocity[..., None])[..., 0], axes @ growth @ np.swapaxes(axes, -1, -2)
     # the products that `_response` goes by: of the long axis, and of the short one
     rates = v[..., [[0, 0, 1, 1], [1, 1, 0, 0]]] * G[..., [[0, 1, 0, 1], [1, 0, 1, 0]], [[0, 1, 1, 0], [1, 0, 0, 1]]]
-    along = np.sum(pulls(radius, affine, edge)[..., 1:] * rates, axis=-1)
+    along = np.sum(pull[..., 1:] * rates, axis=-1)
     return np.asarray((along[..., None, :] @ axes)[..., 0, :])
 
 
@@ -231,9 +225,8 @@ def shift_by_glare(pixels: Array, affine: Array, contrast: Array, radius: float,
     for camera, edge in enumerate(edges):
         gradient = _gradient(pixels[chosen, camera], contrast[chosen, camera])
         if gradient is not None:
-            axes = turned_to_axes(affine[:, camera])
-            along = (axes @ gradient(pixels[:, camera])[..., None])[..., 0]
-            along *= pulls(radius, affine[:, camera], edge)[..., 0]
+            pull, axes = pulls(radius, affine[:, camera], edge)
+            along = pull[..., 0] * (axes @ gradient(pixels[:, camera])[..., None])[..., 0]
             shift[:, camera] = np.nan_to_num((along[..., None, :] @ axes)[..., 0, :])
     return shift
 

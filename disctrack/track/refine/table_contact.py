@@ -28,7 +28,7 @@ import numpy as np
 import scipy
 
 from calibration.cameras.camera import N_RIG, WORLD_SHIFT, WORLD_TURN, Allowance, StereoRig
-from calibration.kit.arrays import Array, robust_sigma
+from calibration.kit.arrays import Array, Mask, robust_sigma
 from disctrack import frames
 from disctrack.analyse.declaration import lowest_arm
 from disctrack.analyse.derivatives import K
@@ -189,25 +189,20 @@ def _narrowed(
     shifts = np.array([a.shift for a in rig.allowances]).reshape(-1, N_RIG)
     of_board = np.array([a.assumed for a in rig.allowances], bool)
     of_disc = np.array([disc.radius_tolerance is None, disc.thickness_tolerance is None])
-    assumed = shifts[of_board].T @ shifts[of_board]
     declared = by_disc[:, ~of_disc]
-    told = np.diag(H @ (rig.covariance - assumed) @ H.T + noise + declared @ declared.T)
+    known = rig.covariance - (shifts.T * of_board) @ shifts
+    told = np.diag(H @ known @ H.T + noise + declared @ declared.T)
     seen = np.maximum(plane**2, told)  # less than what can be told is not known
 
-    def factors(columns: Array) -> Array:
-        whole = np.maximum(np.sum(columns**2, axis=1), 1e-300)  # (3,)
+    def factors(columns: Array, assumed: Mask) -> Array:
+        whole = np.maximum(np.sum(columns[:, assumed] ** 2, axis=1), 1e-300)  # (3,)
         most = np.argmax(columns**2 / told[:, None], axis=0)  # where it would show best
-        found: Array = np.sqrt(np.minimum(1.0, seen / whole))[most]
-        return found
+        return np.where(assumed, np.sqrt(np.minimum(1.0, seen / whole))[most], 1.0)
 
-    scale = np.ones(len(shifts))
-    scale[of_board] = factors(H @ shifts[of_board].T)
-    narrower = (shifts * scale[:, None])[of_board]
+    scale = factors(H @ shifts.T, of_board)
     allowances = tuple(replace(a, shift=a.shift * k) for a, k in zip(rig.allowances, scale, strict=True))
-    covariance = rig.covariance - assumed + narrower.T @ narrower
-    sizes = np.ones(2)
-    sizes[of_disc] = factors(by_disc[:, of_disc])
-    return replace(rig, covariance=covariance, allowances=allowances), sizes
+    covariance = known + (shifts.T * (of_board * scale**2)) @ shifts
+    return replace(rig, covariance=covariance, allowances=allowances), factors(by_disc, of_disc)
 
 
 def _contacts(
