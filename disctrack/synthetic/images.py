@@ -27,7 +27,7 @@ class Stage:
         sigma, size = scene.optics.blur_px[index], view.camera.image_size
         self.name, self.view, self.s = CAMERAS[index], view, scene.render.subpixels
         self.pad, self.weights = optics.blur_reach(sigma), optics.blur_weights(sigma, self.s)
-        self.rays = optics.lens_rays(view.camera, self.pad, scene.imperfections.lens_field_px, [scene.seed, 9, index])
+        self.rays = optics.corner_rays(view.camera, self.pad, scene.imperfections.lens_field_px, (scene.seed, 9, index))
         self.cells = optics.table_cells(view, self.pad, self.s, scene)  # table in the cells of the padded image
         # (height, width) blurred table, before lamp and vignetting
         self.table = optics.blur_to_pixels(self.cells, self.weights, self.s)
