@@ -332,6 +332,17 @@ class DiscSystem(System):
         pose = np.linalg.solve(np.linalg.cholesky(normal), gradient)[..., 0]
         return pose, r - (J @ np.linalg.solve(normal, gradient))[..., 0]
 
+    def together(self, values: Values, width: int) -> Array:
+        """How each camera sees the disc moved (n, 4 m, 12): where it shakes, or exposes at another time."""
+        moved = self.pose_equations(values)[1].reshape(len(self.time), 2, width // 2, 6)
+        enough = (self.used.sum(axis=-1) > 3)[..., None, None]
+        moved = np.where(enough, moved, 0.0)
+        root = np.linalg.cholesky(np.where(enough, np.swapaxes(moved, -1, -2) @ moved, np.eye(6)))
+        own = np.swapaxes(np.linalg.solve(root, np.swapaxes(moved, -1, -2)), -1, -2)
+        found = np.zeros((len(moved), 2, width // 2, 2, 6))
+        found[:, 0, :, 0], found[:, 1, :, 1] = own[:, 0], own[:, 1]
+        return found.reshape(len(moved), width, 12)
+
     def pose_equations(self, values: Values) -> tuple[Array, Array, Array]:
         """Residual (n, 4 m), its derivative (n, 4 m, 6) and normal matrix (n, 6, 6) by a free pose per frame."""
         sight = self._sight(self._path(values)[0], values)

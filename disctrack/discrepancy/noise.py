@@ -32,16 +32,15 @@ MARGIN = 1.5  # over the largest eigenvalue that independent noise brings (March
 THIRD = 2.31  # samples per independent one among third differences: 1 + 2 (15^2 + 6^2 + 1) / 20^2
 
 
-def third_differences(system: System, fit: Fit) -> tuple[Array, NDArray[np.intp]]:
-    """Third differences in time of the residual (k, w) where four samples follow each other, and their rows (k,).
+def third_differences(system: System, numbers: Array) -> tuple[Array, NDArray[np.intp]]:
+    """Third differences in time of (n, w) where four samples follow each other, (k, w), and their rows (k,).
 
     Whatever is missing in a model of a motion that is sampled well moves slowly from sample to sample; differences of
     third order pass white noise (variance 20) and stop the rest.
     """
-    residual, _ = system.linearise(fit.values, [])
     present = system.weights > 0
     rows = np.flatnonzero(present[3:] & present[2:-1] & present[1:-2] & present[:-3])
-    return np.diff(residual, 3, axis=0)[rows], rows
+    return np.diff(numbers, 3, axis=0)[rows], rows
 
 
 def noise_variance(system: System, fit_: Fit) -> float:
@@ -49,26 +48,31 @@ def noise_variance(system: System, fit_: Fit) -> float:
 
     1 where there are too few samples for that.
     """
-    difference, rows = third_differences(system, fit_)
+    difference, rows = third_differences(system, system.linearise(fit_.values, [])[0])
     if len(rows) < 20:
         return 1.0
     return float(np.sum(difference**2) / 20.0 / np.sum(system.weights[rows]))
 
 
 def common_modes(system: System, fit: Fit) -> tuple[Array, Array] | None:
-    """Directions (w, k) in which rows scatter more than independent noise does, and their variances (k,); or None."""
-    difference, rows = third_differences(system, fit)
-    full = system.weights[rows] >= difference.shape[1]  # missing numbers are zeros, not noise
-    difference = difference[full]
-    k, width = difference.shape
+    """Directions (n, w, b) in which rows may scatter as a whole, and their variances (b,); None where none does.
+
+    Of all directions in which they may, each counts as it is seen to scatter, and none for less than single numbers do.
+    """
+    residual, _ = system.linearise(fit.values, [])
+    along = system.together(fit.values, residual.shape[1])
+    single, rows = third_differences(system, residual)
+    inside, _ = third_differences(system, (np.swapaxes(along, 1, 2) @ residual[..., None])[..., 0])
+    full = system.weights[rows] >= residual.shape[1]  # missing numbers are zeros, not noise
+    single, inside = single[full], inside[full]
+    (k, width), b = single.shape, inside.shape[1]
     if width < 2 or k < 4 * width:
         return None
-    eigenvalues, vectors = np.linalg.eigh(difference.T @ difference / (20.0 * k))
-    edge = (1.0 + np.sqrt(width * THIRD / k)) ** 2
-    common = eigenvalues > MARGIN * edge * np.median(eigenvalues)
-    if not common.any():
+    variances, vectors = np.linalg.eigh(inside.T @ inside / (20.0 * k))
+    others = (np.sum(single**2) - np.sum(inside**2)) / (20.0 * k * (width - b)) if b < width else np.median(variances)
+    if not variances[-1] > MARGIN * (1.0 + np.sqrt(b * THIRD / k)) ** 2 * others:
         return None
-    return vectors[:, common], eigenvalues[common] / float(np.mean(eigenvalues[~common]))
+    return along @ vectors, np.maximum(variances / others, 1.0)
 
 
 def whitened(system: System, fit: Fit) -> System | None:
@@ -76,8 +80,8 @@ def whitened(system: System, fit: Fit) -> System | None:
     if (modes := common_modes(system, fit)) is None:
         return None
     vectors, variances = modes
-    matrix = np.eye(len(vectors)) + (vectors * (1.0 / np.sqrt(variances) - 1.0)) @ vectors.T
-    return Transformed(system, lambda both: matrix @ both)
+    less = (vectors * (1.0 - 1.0 / np.sqrt(variances))) @ np.swapaxes(vectors, 1, 2)
+    return Transformed(system, lambda both: both - less @ both)
 
 
 SHORTEST = 40  # samples from which a memory is looked for

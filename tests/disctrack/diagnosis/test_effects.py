@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from scipy import stats
 
 from disctrack.diagnosis import diagnose
 from disctrack.diagnosis.pages.output import as_json
@@ -116,17 +117,24 @@ def test_a_wrong_effect_offered_alone_is_refused_by_the_free_run():
 
 
 @pytest.mark.statistical
-@pytest.mark.xfail(strict=True, reason="scatter of whole frames is weighted too little: 3 of 30 orders are named")
-def test_a_shuffled_residual_of_the_disc_gives_no_finding():
-    """The frames of a residual that a tilted table has left, in random order: large, and no effect makes it."""
-    trajectory = measured({"table_tilt.tilt_x": 5e-4}, seed=10, n=160, declared_rate=500.0)
-    system, base = with_base_fit(trajectory)
-    assert base.reduced_chi_square > 2
-    residual = system.residual_px(base.values)
-    order = np.random.default_rng(3).permutation(len(residual))
-    shuffled = replace(trajectory, markers_px=system.pixels(base.values) + residual[order])
-    answer = explain(system_of(shuffled), base.values)
-    assert answer.found == ()
+def test_frames_that_scatter_as_a_whole_are_as_significant_as_chance_has_it():
+    """What a tilted table leaves, frame by frame in random order and with a random sign: large, and made by no effect.
+
+    About a motion whose tolerances are at their middle: what a fit has strained would truly be there.
+    """
+    p_values = []
+    for seed in range(16):
+        trajectory = measured({"table_tilt.tilt_x": 1e-3}, seed=100 + seed, n=160, declared_rate=500.0)
+        system, base = with_base_fit(trajectory)
+        assert base.reduced_chi_square > 4
+        rng = np.random.default_rng(seed)
+        scatter = rng.permutation(system.residual_px(base.values)) * rng.choice([-1.0, 1.0], (160, 1, 1, 1))
+        values = base.values | {q.name: q.null for q in base.quantities if np.isfinite(q.prior_sigma)}
+        answer = explain(system_of(replace(trajectory, markers_px=system.pixels(values) + scatter)), values)
+        assert answer.found == ()
+        p_values.append(answer.chance.p_value)
+    # Fisher's sum of uniform ones
+    assert -2 * np.sum(np.log(p_values)) < stats.chi2.isf(1e-3, 2 * len(p_values))
 
 
 @pytest.mark.statistical
@@ -138,10 +146,10 @@ def test_a_camera_that_shakes_is_no_effect_of_the_motion():
     system, base = with_base_fit(replace(trajectory, markers_px=trajectory.markers_px + shake))
     assert base.reduced_chi_square > 5
     vectors, variances = common_modes(system, base)
-    # both directions of the right camera's dots and none else: 1 + 6 (0.02 / 0.006)^2 = 68, within 20 %
-    assert variances == pytest.approx([68, 68], rel=0.35)
-    right = np.repeat([False, True], 12)
-    assert np.abs(vectors[~right]).max() < 0.1
+    # two directions of the right camera's dots and none else: 1 + 6 (0.02 / 0.006)^2 = 68, within 20 %
+    assert variances[-2:] == pytest.approx([68, 68], rel=0.35)
+    assert variances[:-2].max() < 3
+    assert np.abs(vectors[:, :12, -2:]).max() < 0.1
     assert explain(system, base.values).found == ()
 
 
