@@ -164,7 +164,6 @@ def calibrate_stereo(
         )
     names = names or [(f"left {i}", f"right {i}") for i in range(len(left_images))]
     check_sizes(left_images, right_images, names)
-    settings = settings or CalibrationSettings()
     (left, note_left), (right, note_right) = (
         repaired_views(side, name) for side, name in zip((left_images, right_images), CAMERA_NAMES, strict=True)
     )
@@ -172,8 +171,8 @@ def calibrate_stereo(
     found = calibrate_from_corners(views[:n], views[n:], board, settings, table_view, board_thickness, names)
     seen = [view for side in found.corner_views for view in side]
     negative = negatives([*left, *right], seen, board) if isinstance(board, Board) else ""
-    found = replace(found, doubts=(negative,) if negative else ())
-    return replace(found, warnings=(*filter(None, (note_left, note_right)), *found.warnings))
+    notes = filter(None, (note_left, note_right))
+    return replace(found, doubts=(negative,) if negative else (), warnings=(*notes, *found.warnings))
 
 
 def check_sizes(left: Sequence[NDArray], right: Sequence[NDArray], names: Sequence[tuple[str, str]]) -> None:

@@ -153,6 +153,7 @@ def _settled(
     returns : problem and model, points that were fitted, extra variance, degrees of freedom, steps that were taken
     """
     observations, total = problem.observations, 0
+    place = 2 * observations.view + observations.camera * problem.apart[observations.view]  # of the board
     for turn in range(2 * FREE_ROUNDS):
         used, motion, prior = observations[kept], problem.motion, problem.prior
         problem = problem.seeing(used, extra)
@@ -172,6 +173,7 @@ def _settled(
         before, extra = extra, _extra_variance(residuals[kept], used.covariance, dof)
         good = _mahalanobis2(residuals, observations.covariance, extra) < reject_beyond**2
         good = good & kept if turn >= FREE_ROUNDS else good
+        good &= np.bincount(place, good)[place] >= min(LEAST_POINTS, len(model.points))  # fewer tell no place
         if steady and abs(extra - before) <= 0.01 * before + 1e-10 and bool((good == kept).all()):
             break
         if turn < 2 * FREE_ROUNDS - 1:  # what is returned belongs to the points that were fitted

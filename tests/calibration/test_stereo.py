@@ -121,6 +121,20 @@ def test_exchanged_images_are_found_out(rng):
 
 
 @pytest.mark.statistical
+@pytest.mark.parametrize("size", [3.0, 6.0, 12.0])
+def test_an_image_whose_corners_are_wrong_costs_itself_alone_however_wrong_they_are(size):
+    scene = make_scene(n_views=14)
+    left, right = corner_views(scene, np.random.default_rng(5), 0.02)
+    wrong = size * np.random.default_rng(1).normal(size=right[4].points.shape)
+    right[4] = replace(right[4], points=right[4].points + wrong)
+    found = calibrate_from_corners(left, right, scene.board)
+    (text,) = [text for text in found.warnings if "blurred, or the board was found wrongly" in text]
+    assert text.startswith("right 4: left out, the other image of the pair is used for its own camera: RMS ")
+    assert not found.apart
+    assert found.rms_px < 0.05
+
+
+@pytest.mark.statistical
 def test_a_board_that_moved_between_the_exposures_costs_the_pair_and_no_camera(rng):
     left, right = corner_views(small_scene(n_views=10), rng)
     right[4] = replace(right[4], points=right[4].points + np.array([1.5, -1.0]))
