@@ -18,15 +18,11 @@ from tests.oracles.drawn_boards import make_scene
 @pytest.fixture
 def rig(rng):
     A = rng.normal(size=(N_RIG, N_RIG)) * 10.0 ** rng.uniform(-6, 0, N_RIG)[:, None]
-    return replace(
-        make_scene().model.rig,
-        R_left_world=rotation_from_vector(np.array([2.0, 0.5, -0.3])),
-        t_left_world=np.array([-0.02, 0.03, 0.49]),
-        covariance=A @ A.T,
-        world_is_table=True,
-        allowances=(Allowance("the board's size", A[0], True), Allowance("its thickness", A[1])),
-        lens_field=LensField(rng.normal(size=(2, 2, 8, 8)), 102.4),
-    )
+    R, t = rotation_from_vector(np.array([2.0, 0.5, -0.3])), np.array([-0.02, 0.03, 0.49])
+    allowances = Allowance("the board's size", A[0], True), Allowance("its thickness", A[1])
+    field = LensField(rng.normal(size=(2, 2, 8, 8)), 102.4)
+    known = {"covariance": A @ A.T, "world_is_table": True, "allowances": allowances, "lens_field": field}
+    return replace(make_scene().model.rig, R_left_world=R, t_left_world=t, **known)
 
 
 @pytest.fixture(scope="module")

@@ -109,12 +109,7 @@ def test_other_markers_are_not_found_and_unknown_ones_refused(rng):
 
 @pytest.mark.parametrize(
     ("target", "symmetry"),
-    [
-        (Board((9, 6), 8e-3), 1),
-        (Board((9, 5), 8e-3), 2),
-        (Board((6, 6), 8e-3), 4),
-        (CHARUCO, 1),
-    ],
+    [(Board((9, 6), 8e-3), 1), (Board((9, 5), 8e-3), 2), (Board((6, 6), 8e-3), 4), (CHARUCO, 1)],
     ids=str,
 )
 def test_targets_know_their_symmetry_and_survive_a_file(target, symmetry):

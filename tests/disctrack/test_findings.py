@@ -21,21 +21,14 @@ from disctrack.numbers import Measured
 
 NOISE = Finding(Kind.POSES_SCATTER, Severity.WARNING, "poses scatter")
 MISFIT = Finding(Kind.DOTS_MISFIT, Severity.DOUBT, "dots miss their places", explains=(Kind.POSES_SCATTER,))
-EXCHANGED = Finding(
-    Kind.EXCHANGED,
-    Severity.DOUBT,
-    "the left and right images are exchanged",
-    Subject("check", frames=((3, 7), (9, 9))),
-    remedies=(Remedy("left, right", action="exchange the two patterns"),),
-    explains=(Kind.DOTS_MISFIT, Kind.ONE_SIDED),
-)
-SQUARE = Finding(
-    Kind.SQUARE,
-    Severity.DOUBT,
-    "the dots are 0.9877 ± 0.0010 times as far apart as declared",
-    numbers={"scale": Measured(0.98765, 0.001)},
-    remedies=(Remedy("square_mm", "8.00", "8.1"), Remedy("centres_mm", action="multiply by 0.988")),
-)
+THERE = Subject("check", frames=((3, 7), (9, 9)))
+BOTH = Remedy("left, right", action="exchange the two patterns")
+OF_THAT = {"remedies": (BOTH,), "explains": (Kind.DOTS_MISFIT, Kind.ONE_SIDED)}
+EXCHANGED = Finding(Kind.EXCHANGED, Severity.DOUBT, "the left and right images are exchanged", THERE, **OF_THAT)
+SCALE = {"scale": Measured(0.98765, 0.001)}
+MENDED = Remedy("square_mm", "8.00", "8.1"), Remedy("centres_mm", action="multiply by 0.988")
+FARTHER = "the dots are 0.9877 ± 0.0010 times as far apart as declared"
+SQUARE = Finding(Kind.SQUARE, Severity.DOUBT, FARTHER, numbers=SCALE, remedies=MENDED)
 
 
 def test_the_cause_comes_first_and_its_consequences_are_left_out():

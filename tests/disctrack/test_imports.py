@@ -11,17 +11,8 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-PHYSICS = (
-    "frames",
-    "disc",
-    "trajectory",
-    "rolling",
-    "analyse.derivatives",
-    "analyse.quantities",
-    "analyse.contact",
-    "analyse.analysis",
-    "track.pose",
-)
+ANALYSIS = ("derivatives", "quantities", "contact", "analysis")
+PHYSICS = ("frames", "disc", "trajectory", "rolling", *(f"analyse.{name}" for name in ANALYSIS), "track.pose")
 PACKAGES = ("calibration", "disctrack")
 FORBIDDEN = ("cv2", "h5py", "matplotlib", "skimage", "tqdm")
 
@@ -72,16 +63,9 @@ def rows_of_the_page() -> list[list[str]]:
 
 # Each folder or module of a package may ask for what stands above it, at whatever place in the file it does so. A new
 # one belongs where what it needs is above, and what needs it below; names in one row know nothing of each other.
+CALIBRATED = ["points", "rig_file"]
 STAIRS = {
-    "calibration": (
-        ("kit",),
-        ("board", "cameras"),
-        ("fit",),
-        ("judge",),
-        ("stereo_fit",),
-        ("stereo",),
-        ("points", "rig_file"),
-    ),
+    "calibration": (["kit"], ["board", "cameras"], ["fit"], ["judge"], ["stereo_fit"], ["stereo"], CALIBRATED),
     "disctrack": (*rows_of_the_page(), ("__main__",)),
 }
 SOURCES = {

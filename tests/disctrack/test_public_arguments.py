@@ -14,18 +14,8 @@ import calibration
 import disctrack
 from disctrack.errors import ArgumentError
 
-MADE = {
-    "Board",
-    "CalibrationSettings",
-    "Camera",
-    "Disc",
-    "Model",
-    "Observations",
-    "Provenance",
-    "State",
-    "StereoRig",
-    "Tracker",
-}
+MADE = {"Board", "CalibrationSettings", "Camera", "Observations", "StereoRig"}
+MADE |= {"Disc", "Model", "Provenance", "State", "Tracker"}
 PUBLIC = {
     name: getattr(package, name)
     for package in (calibration, disctrack)

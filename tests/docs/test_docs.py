@@ -237,9 +237,8 @@ def test_every_public_name_is_in_the_reference():
 
 @pytest.mark.statistical
 def test_a_wrong_option_or_block_would_be_noticed(workplace):
-    assert commands_of("disctrack run x --no-such\n# disctrack nothing\ncat <<'END'\ndisctrack hidden\nEND\n") == [
-        ["disctrack", "run", "x", "--no-such"]
-    ]
+    block = "disctrack run x --no-such\n# disctrack nothing\ncat <<'END'\ndisctrack hidden\nEND\n"
+    assert commands_of(block) == [["disctrack", "run", "x", "--no-such"]]
     with pytest.raises(AssertionError):
         run_shell("disctrack simulate no-such-scene.toml", workplace)
 
@@ -251,13 +250,9 @@ def test_an_editor_knows_the_types_of_the_recipes(tmp_path):
     page = text_of(DOCS / "python.md")
     script = "\n".join(block for kind, _, block in blocks_of(page) if kind == "python")
     (tmp_path / "recipes.py").write_text(script + "\nreveal_type(answer)\nreveal_type(dataset)\n")
-    done = subprocess.run(
-        [sys.executable, "-m", "mypy", "--strict", "--cache-dir", str(tmp_path / "cache"), "recipes.py"],
-        cwd=tmp_path,
-        env=os.environ | {"MYPYPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-    )
+    command = [sys.executable, "-m", "mypy", "--strict", "--cache-dir", str(tmp_path / "cache"), "recipes.py"]
+    environment = os.environ | {"MYPYPATH": str(ROOT)}
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "DiscDiagnosis" in done.stdout
     assert "Dataset" in done.stdout

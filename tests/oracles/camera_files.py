@@ -57,14 +57,9 @@ def write_mraw(stem: Path, images: np.ndarray, bits: int, *, kind: str = "cih", 
     entries replace or add to those of the header; spaces in their names are written as underscores, brackets left out.
     """
     n, height, width = images.shape
-    told = {
-        **CIH,
-        "Total Frame": f"{n}",
-        "Image Width": f"{width}",
-        "Image Height": f"{height}",
-        "Color Bit": f"{bits}",
-        "EffectiveBit Depth": f"{depth or bits}",
-    }
+    sizes = {"Total Frame": n, "Image Width": width, "Image Height": height}
+    sizes |= {"Color Bit": bits, "EffectiveBit Depth": depth or bits}
+    told = CIH | {name: str(size) for name, size in sizes.items()}
     names = {"".join(c if c.isalnum() else "_" for c in name.split("(")[0]): name for name in told}
     told |= {names[name]: value for name, value in entries.items()}
     stem.parent.mkdir(parents=True, exist_ok=True)

@@ -83,12 +83,8 @@ def fitted_at_once(items, extra=()):
     def misfit(x):
         shared = dict(zip(names, x[: len(names)], strict=True))
         own = x[len(names) :].reshape(-1, 2)
-        return np.concatenate(
-            [
-                s.linearise({**shared, "state.a": a, "state.b": b}, [])[0][:, 0]
-                for s, (a, b) in zip(systems, own, strict=True)
-            ]
-        )
+        values = [shared | {"state.a": a, "state.b": b} for a, b in own]
+        return np.concatenate([s.linearise(v, [])[0][:, 0] for s, v in zip(systems, values, strict=True)])
 
     start = np.concatenate([[1.0], np.zeros(len(extra)), np.tile([1.0, 0.0], len(items))])
     found = least_squares(misfit, start, xtol=1e-15, ftol=1e-15, gtol=1e-15)

@@ -39,14 +39,9 @@ def measured(
 
 def dots_of(trajectory):
     """The dots of a trajectory with its poses."""
-    return DotsInFrames(
-        trajectory.rig,
-        trajectory.disc,
-        trajectory.markers_px,
-        trajectory.markers_covariance_px2,
-        rotation_from_quaternion(trajectory.quaternion),
-        trajectory.q[:, :3],
-    )
+    dots = trajectory.markers_px, trajectory.markers_covariance_px2
+    poses = rotation_from_quaternion(trajectory.quaternion), trajectory.q[:, :3]
+    return DotsInFrames(trajectory.rig, trajectory.disc, *dots, *poses)
 
 
 def system_of(trajectory, names=None, model="paper"):

@@ -39,14 +39,7 @@ def board() -> NDArray:
 
 
 def pairs(
-    rig: StereoRig,
-    n: int,
-    seed: int,
-    shift: float = 0.0,
-    turn: float = 0.0,
-    correlation: float = 0.0,
-    points: NDArray | None = None,
-    places: tuple = ((-0.12, 0.2), (-0.1, 0.1), (0.4, 0.75)),
+    rig, n, seed, shift=0.0, turn=0.0, correlation=0.0, points=None, places=((-0.12, 0.2), (-0.1, 0.1), (0.4, 0.75))
 ) -> tuple[NDArray, NDArray]:
     """Left and right corners (n, 54, 2) [px] with noise of 0.1 px; neighbours' errors correlate by `correlation`.
 

@@ -8,13 +8,7 @@ from disctrack.rolling import Model
 _K = np.array([0.0, 0.0, 1.0])
 
 
-def required_wrench(
-    model: Model,
-    q: np.ndarray,
-    qdot: np.ndarray,
-    acceleration_world: np.ndarray,
-    angular_acceleration_world: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
+def required_wrench(model: Model, q, qdot, acceleration_world, angular_acceleration_world):
     """Contact force and contact moment that a motion needs, each (..., 3) in (n0, m0, k) [N, N m].
 
     q, qdot : (..., 6).   acceleration_world of the centre O, angular_acceleration_world : (..., 3)

@@ -72,14 +72,8 @@ def test_recording_that_runs_on_after_the_end_gives_what_one_that_ends_there_giv
     turned = np.cumsum(fall)[:, None] * 1e-3 * truth.rates[-1, [0, 1, 2]] * [1, 0, 1]
     euler = np.concatenate([truth.euler, truth.euler[-1] + turned])
     position = np.concatenate([truth.position, np.tile(truth.position[-1], (220, 1))])
-    n = len(euler)
-    still = replace(
-        truth,
-        time=truth.time[0] + np.arange(n) * 1e-3,
-        position=position,
-        R_world_body=rotation_from_euler(*euler.T),
-        euler=euler,
-    )
+    time = truth.time[0] + np.arange(len(euler)) * 1e-3
+    still = replace(truth, time=time, position=position, R_world_body=rotation_from_euler(*euler.T), euler=euler)
     free = analyse(as_tracked(truth, np.random.default_rng(1)))
     stopped = analyse(as_tracked(still, np.random.default_rng(1)))
     assert stopped.laws.determined
@@ -95,14 +89,9 @@ def test_disc_that_precesses_the_other_way_gives_the_same_exponents(late, analys
     q = late.q * np.array([1, -1, 1, -1, 1, -1])
     q[:, 3] += np.pi  # the mirrored e1 points the other way
     q[:, 5] += np.pi
-    R = rotation_from_euler(*q[:, 3:].T)
+    quaternion = continuous_quaternions(quaternion_from_rotation(rotation_from_euler(*q[:, 3:].T)))
     flip = np.diag([1.0, -1.0, 1.0, -1.0, 1.0, -1.0])
-    mirrored = replace(
-        late,
-        q=q,
-        quaternion=continuous_quaternions(quaternion_from_rotation(R)),
-        pose_covariance=flip @ late.pose_covariance @ flip,
-    )
+    mirrored = replace(late, q=q, quaternion=quaternion, pose_covariance=flip @ late.pose_covariance @ flip)
     here, there = analysed.laws, analyse(mirrored).laws
     assert here.determined
     assert_allclose(there.n_theta.value, here.n_theta.value, atol=1e-6)

@@ -12,13 +12,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from calibration.cameras.camera import Camera, StereoRig, placed_at
 from disctrack import MarkerStatus, Trajectory, frames
-from disctrack.analyse.declaration import (
-    balance,
-    contradictions,
-    handedness,
-    other_scale,
-    unseen_dots,
-)
+from disctrack.analyse.declaration import balance, contradictions, handedness, other_scale, unseen_dots
 from disctrack.findings import Kind, Severity
 from tests.physics.conftest import as_tracked, true_motion
 
@@ -185,10 +179,8 @@ def test_a_dot_without_which_the_layout_repeats_spoils_the_spin_angle(honest):
     hexagon = honest.disc.marker_centres_body.copy()
     hexagon[:, :2] = 0.03 * np.column_stack([np.cos(SIXTHS), np.sin(SIXTHS)])
     seventh = np.vstack([hexagon, hexagon[:1] * [0.4, 0.4, 1.0]])
-    (finding,) = unseen_dots(
-        with_dots(replace(honest, disc=replace(honest.disc, marker_centres_body=seventh)), 1.0, unseen=(6,)),
-        replace(honest.disc, marker_centres_body=seventh),
-    )
+    disc = replace(honest.disc, marker_centres_body=seventh)
+    (finding,) = unseen_dots(with_dots(replace(honest, disc=disc), 1.0, unseen=(6,)), disc)
     assert finding.doubtful, "six dots in a hexagon are left"
 
 

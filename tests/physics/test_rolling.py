@@ -264,11 +264,7 @@ def test_impact_balances_momentum_and_the_edge_does_not_go_down(a, b, friction):
     P, psi = 0.05, 0.6
     state = struck_disc(MA_2014, a, b, P, friction=friction, psi=psi)
     m, r, h = MA_2014.mass, MA_2014.radius, MA_2014.half_thickness
-    e1, e2, e3 = (
-        np.array([np.cos(psi), np.sin(psi), 0]),
-        np.array([0, 0, 1.0]),
-        np.array([np.sin(psi), -np.cos(psi), 0]),
-    )
+    e1, e2, e3 = np.array([[np.cos(psi), np.sin(psi), 0], [0, 0, 1], [np.sin(psi), -np.cos(psi), 0]])
     motion = rolling.simulate(Model(MA_2014, effects=(CATALOGUE["slip"](mu=0.2),)), state, times=[0.0, 1e-6])
     v, omega = motion.qdot[0, :3], motion.omega_world[0]
     from_table = m * v + P * e3

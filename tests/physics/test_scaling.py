@@ -115,14 +115,9 @@ def test_brake_at_the_end_is_left_out():
     free = fit_power_laws(time, psi, theta, psidot, energy)
     extra = np.arange(1, 61) * 1e-3
     fall = np.clip(1 - extra / 0.02, 0.01, 1)
-    braked_psidot = np.concatenate([psidot, psidot[-1] * fall])
-    braked = (
-        np.concatenate([time, time[-1] + extra]),
-        np.concatenate([psi, psi[-1] + np.cumsum(psidot[-1] * fall) * 1e-3]),
-        np.concatenate([theta, np.full(60, theta[-1])]),
-        braked_psidot,
-        np.concatenate([energy, np.full(60, energy[-1])]),
-    )
+    turned, level = psi[-1] + np.cumsum(psidot[-1] * fall) * 1e-3, np.ones(60)
+    more = time[-1] + extra, turned, theta[-1] * level, psidot[-1] * fall, energy[-1] * level
+    braked = [np.concatenate(both) for both in zip((time, psi, theta, psidot, energy), more, strict=True)]
     assert time[-1] - 0.03 < power_law_end(braked[0], braked[1], braked[3]) <= time[-1] + 0.02
     fit = fit_power_laws(*braked)
     assert abs(fit.n_theta.value - free.n_theta.value) < 0.01

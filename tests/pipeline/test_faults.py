@@ -51,18 +51,14 @@ def contents(folder) -> dict[str, bytes]:
     return {str(file.relative_to(folder)): file.read_bytes() for file in folder.rglob("*") if file.is_file()}
 
 
+OURS = ("left/000003.png", "recording.toml", "rig.h5")
+
+
 @pytest.mark.parametrize(
     ("command", "target"),
     [
-        ("track", "left/000003.png"),
-        ("track", "recording.toml"),
-        ("track", "rig.h5"),
-        ("track", "link.h5"),
-        ("track", "hard.h5"),
-        ("track", "views/../right/000001.png"),
-        ("calibrate", "left/000003.png"),  # of a recording that this command does not read
-        ("calibrate", "recording.toml"),
-        ("calibrate", "rig.h5"),
+        *(("track", target) for target in (*OURS, "link.h5", "hard.h5", "views/../right/000001.png")),
+        *(("calibrate", target) for target in OURS),  # of a recording that this command does not read
     ],
 )
 def test_no_output_replaces_an_input(recording, rig_file, short_recording, cli, command, target):

@@ -80,10 +80,7 @@ def wrong_about(seed, effect):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "planted",
-    [
-        [(seed, "none") for seed in range(141, 161)],
-        [(seed, [*PLANTED][1 + seed % 5]) for seed in range(161, 171)],
-    ],
+    [[(seed, "none") for seed in range(141, 161)], [(seed, [*PLANTED][1 + seed % 5]) for seed in range(161, 171)]],
     ids=["nothing", "something"],
 )
 def test_what_is_planted_is_named_within_three_sigma_and_nothing_else(planted):

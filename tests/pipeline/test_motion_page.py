@@ -27,9 +27,8 @@ def measured(sample_clip, rig_file):
 def page(measured, tmp_path_factory):
     trajectory, analysis, images = measured
     file = tmp_path_factory.mktemp("page") / "motion.html"
-    file.write_text(
-        motion_html(analysis, "a <clip> & more", lambda row: draw_pair(images[row], trajectory, row)), encoding="utf-8"
-    )
+    made = motion_html(analysis, "a <clip> & more", lambda row: draw_pair(images[row], trajectory, row))
+    file.write_text(made, encoding="utf-8")
     return file
 
 
@@ -47,9 +46,8 @@ def test_the_page_holds_the_trajectory_and_nothing_from_outside(page, measured):
     lever = disc.radius * np.cos(tilt) - disc.half_thickness * np.sin(tilt)
     expected = trajectory.q[:, :2] + lever[:, None] * np.column_stack([np.sin(psi), -np.cos(psi)])
     found = np.array(data["contact"], float)
-    assert 1e-3 * found[5:-5] == pytest.approx(
-        expected[5:-5], abs=5e-5
-    )  # the page's curve is smoothed over noise of psi
+    # the page's curve is smoothed over noise of psi
+    assert 1e-3 * found[5:-5] == pytest.approx(expected[5:-5], abs=5e-5)
     assert len(data["pictures"]) == 60
     assert "a &lt;clip&gt; &amp; more" in text
     assert not re.search(r'(src|href)="(?!data:)', text)

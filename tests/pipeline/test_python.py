@@ -105,19 +105,17 @@ def test_the_live_loop_gives_the_poses_of_the_recording(taken):
 
 def test_the_live_loop_loses_a_hidden_disc_and_finds_it_again_and_one_covered_camera_is_said(taken):
     _declared, rig, images, by_files = taken
-    tracker = disctrack.Tracker(rig, by_files.trajectory.disc)
-    dark = np.zeros_like(images[0])
+    whole, dark = by_files.trajectory, np.zeros_like(images[0])
+    tracker = disctrack.Tracker(rig, whole.disc)
     statuses = [tracker.next(*(dark if 8 <= i < 11 else images[i])).status for i in range(20)]
     assert [status.has_pose for status in statuses] == [not 8 <= i < 11 for i in range(20)]
     again = tracker.next(*images[20])
-    assert again.q[:3] == pytest.approx(
-        by_files.trajectory.q[20, :3], abs=5 * by_files.trajectory.coordinate_sigma.max()
-    )
-    turn = (again.q[3:] - by_files.trajectory.q[20, 3:]) / (2 * np.pi)
+    assert again.q[:3] == pytest.approx(whole.q[20, :3], abs=5 * whole.coordinate_sigma.max())
+    turn = (again.q[3:] - whole.q[20, 3:]) / (2 * np.pi)
     assert turn == pytest.approx(np.rint(turn), abs=1e-3)  # turns while it was hidden are not known
     covered = tracker.next(images[21, 0], dark[1])
     assert covered.status == FrameStatus.ONE_CAMERA
-    assert covered.sigma[:3].max() > 3 * by_files.trajectory.coordinate_sigma[21, :3].max()
+    assert covered.sigma[:3].max() > 3 * whole.coordinate_sigma[21, :3].max()
     with pytest.raises(TrackingError, match="calibrated at"):
         tracker.next(images[0, 0, :-8], images[0, 1, :-8])
 

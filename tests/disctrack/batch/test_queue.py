@@ -16,6 +16,7 @@ from urllib.parse import unquote
 import numpy as np
 import pytest
 from filelock import Timeout
+from numpy.testing import assert_allclose
 from scipy import optimize, stats
 
 from disctrack.batch import locks
@@ -66,10 +67,8 @@ def test_recordings_are_found_at_any_depth_in_natural_order_and_results_are_not_
 def test_images_without_a_declaration_are_told(tmp_path):
     """The uppermost folder of a recording that was forgotten; not its views, results, or a single film of something."""
     root = recordings_at(tmp_path, "day 1/r1", "day 1/r2")
-    touched(
-        root,
-        *(f"day 1/{name}/0.png" for name in ("r1/left", "r1/right", "r2/calibration/left", "r2/calibration/right")),
-    )
+    images = "r1/left", "r1/right", "r2/calibration/left", "r2/calibration/right"
+    touched(root, *(f"day 1/{name}/0.png" for name in images))
     assert find_recordings([root]).undeclared == ()
     # pictures of two rigs that a batch calibrated are no images of two cameras
     touched(root, *(f"batch_results/rigs/{rig}/calibration_residuals.png" for rig in ("one", "other")))
@@ -230,19 +229,13 @@ def page_of(*given):
 
 
 def test_the_page_links_reports_by_paths_that_work_and_shows_what_was_written_as_text():
-    there = row(
-        recording="day <1>/r #2",
-        pairs=10,
-        pairs_measured=9,
-        report="../day <1>/r #2/results/report.html",
-        k_m_m_s2=3.81e-8,
-        k_m_sigma_m_s2=1e-11,
-        k_m_reduced_chi_square=23.9,
-    )
+    report = "../day <1>/r #2/results/report.html"
+    k_m = {"k_m_m_s2": 3.81e-8, "k_m_sigma_m_s2": 1e-11, "k_m_reduced_chi_square": 23.9}
+    there = row(recording="day <1>/r #2", pairs=10, pairs_measured=9, report=report, **k_m)
     lost = row(recording="x", status=FAILED, reason="<b>no</b> rig")
     text = page_of([there, lost])
     (link,) = [a for a in re.findall(r'href="([^"]+)"', text) if "report" in a]
-    assert unquote(link) == there["report"]
+    assert unquote(link) == report
     assert "#" not in link
     assert "day &lt;1&gt;/r #2" in text
     assert "&lt;b&gt;no&lt;/b&gt; rig" in text
@@ -252,9 +245,8 @@ def test_the_page_links_reports_by_paths_that_work_and_shows_what_was_written_as
 
 
 def test_recordings_of_the_same_images_are_told():
-    rows = [
-        row(recording=name, input_sha256=digest) for name, digest in zip("abcd", ("1", "2", "1", None), strict=True)
-    ]
+    digests = {"a": "1", "b": "2", "c": "1", "d": None}
+    rows = [row(recording=name, input_sha256=digest) for name, digest in digests.items()]
     assert copies(rows) == ["a, c"]
     assert "a, c: the same images" in "\n".join(short(report_of(rows)))
     assert "the same images" not in page_of(rows[1:])
@@ -275,16 +267,13 @@ def test_means_and_spread_of_repeats_agree_with_least_squares(rng):
     for added in (0.0, 0.01):
         there = value + added * rng.standard_normal(7)
         (found,) = repeats_of(repeats_with(there, sigma))
-        fit, covariance = optimize.curve_fit(
-            lambda x, a: a + 0 * x, np.zeros(7), there, sigma=sigma, absolute_sigma=True
-        )
-        np.testing.assert_allclose(
-            [found["weighted_mean"], found["weighted_mean_sigma"] ** 2], [fit[0], covariance[0, 0]]
-        )
+        how = {"sigma": sigma, "absolute_sigma": True}
+        fit, covariance = optimize.curve_fit(lambda x, a: a + 0 * x, np.zeros(7), there, **how)
+        assert_allclose([found["weighted_mean"], found["weighted_mean_sigma"] ** 2], [fit[0], covariance[0, 0]])
         chi_square = np.sum(((there - fit[0]) / sigma) ** 2)
-        np.testing.assert_allclose(found["reduced_chi_square"], chi_square / 6, rtol=1e-6)
-        np.testing.assert_allclose(found["p_value"], stats.chi2.sf(chi_square, 6), rtol=1e-5)
-        np.testing.assert_allclose([found["mean"], found["standard_deviation"]], [there.mean(), there.std(ddof=1)])
+        assert_allclose(found["reduced_chi_square"], chi_square / 6, rtol=1e-6)
+        assert_allclose(found["p_value"], stats.chi2.sf(chi_square, 6), rtol=1e-5)
+        assert_allclose([found["mean"], found["standard_deviation"]], [there.mean(), there.std(ddof=1)])
         assert (found["p_value"] > 1e-3) == (added == 0.0)
 
 

@@ -219,12 +219,8 @@ def recording(effects=None, *, laboratory=ORDINARY, faults=None, seed=1, n=300):
         effects, faults=faults, laboratory=laboratory, seed=seed, n=n, declared_rate=500.0, theta_deg=9.0
     )
     inflated = max(1.0, float(np.median(trajectory.reduced_chi_square)))
-    return replace(
-        trajectory,
-        markers_covariance_px2=inflated * trajectory.markers_covariance_px2,
-        pose_covariance=inflated * trajectory.pose_covariance,
-        reduced_chi_square=trajectory.reduced_chi_square / inflated,
-    ), inflated
+    larger = {name: inflated * getattr(trajectory, name) for name in ("markers_covariance_px2", "pose_covariance")}
+    return replace(trajectory, **larger, reduced_chi_square=trajectory.reduced_chi_square / inflated), inflated
 
 
 def systematic_of(trajectory):
@@ -300,7 +296,7 @@ def test_sigmas_know_that_neighbouring_rows_err_alike(rng):
 
 
 @pytest.mark.parametrize(
-    ("left", "of_the_motion", "of_the_measurement", "doubtful"),
+    ("left", "motion", "measurement", "doubtful"),
     [
         (LeftOver(1.10, 1.00, 1e-40, 0.5, 36), True, False, True),
         (LeftOver(1.10, 1.10, 1e-40, 1e-40, 36), False, True, False),
@@ -314,10 +310,8 @@ def test_sigmas_know_that_neighbouring_rows_err_alike(rng):
         (LeftOver(1.80, 1.18, 2e-3, 5e-3, 36), False, False, True),
     ],
 )
-def test_what_is_left_is_the_motions_only_where_the_poses_alone_hold_it(
-    left, of_the_motion, of_the_measurement, doubtful
-):
-    assert (left.of_the_motion, left.of_the_measurement, left.doubtful) == (of_the_motion, of_the_measurement, doubtful)
+def test_what_is_left_is_the_motions_only_where_the_poses_alone_hold_it(left, motion, measurement, doubtful):
+    assert (left.of_the_motion, left.of_the_measurement, left.doubtful) == (motion, measurement, doubtful)
 
 
 TURN_DEG, SHIFT_MM = (0.6, -0.7, 0.4), (1.2, -1.4, 0.8)

@@ -348,6 +348,9 @@ def test_a_thread_that_twists_is_no_shaken_table():
     assert np.sqrt(np.mean(result.learned.course.sigma[:, 2] ** 2)) < np.sqrt(np.mean(true[:, 2] ** 2))
 
 
+NO_SHRINKING = pytest.mark.xfail(strict=True, reason="no effect is a radius that shrinks; a drift of the clock joins")
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "effect", "sizes"),
@@ -359,14 +362,7 @@ def test_a_thread_that_twists_is_no_shaken_table():
         # by 40 um over 0.7 s, with the square of time from 2 ms before the first frame on
         ("table_sinks", "table_settles", {"v_z": (-0.004 * 40e-6 / 0.7**2, None), "a_z": (-2 * 40e-6 / 0.7**2, None)}),
         # a height that falls by 3 um; its turns, which grow with it, are taken for a clock's
-        pytest.param(
-            "wear",
-            "table_settles",
-            {"v_z": (-np.inf, np.inf)},
-            marks=pytest.mark.xfail(
-                strict=True, reason="no effect is a radius that shrinks; a drift of the clock joins"
-            ),
-        ),
+        pytest.param("wear", "table_settles", {"v_z": (-np.inf, np.inf)}, marks=NO_SHRINKING),
     ],
 )
 def test_an_effect_of_the_catalogue_is_named_and_sized(name, effect, sizes):
@@ -412,8 +408,7 @@ def test_a_law_that_ends_at_the_bound_of_its_shape_has_a_course():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("name", "beside"),
-    [("loose_ball", "rolling_classical"), ("pad", "table_shaken"), ("eddy_half", "table_shaken")],
+    ("name", "beside"), [("loose_ball", "rolling_classical"), ("pad", "table_shaken"), ("eddy_half", "table_shaken")]
 )
 def test_a_known_effect_that_stands_in_with_a_law_is_not_claimed(name, beside):
     """A ball in oil, a table that gives way, a brake over half of it: sums that come near to these are no finding."""

@@ -22,13 +22,9 @@ from disctrack.discrepancy.score import Linearisation, score_all
 from disctrack.discrepancy.system import subset
 
 SIGMA = 2e-3
-SWINGS = Equations(
-    {"x": "v", "v": "-k*x - c*v"},
-    # an offset of the sensor that is known from elsewhere, and a spring, differ from run to run
-    {"k": Parameter(140.0, per="run"), "c": 0.3, "b": Parameter(0.0, sigma=0.01, per="run")},
-    observed={"x": "x + b"},
-    units={"x": "m"},
-)
+# an offset of the sensor that is known from elsewhere, and a spring, differ from run to run
+NUMBERS = {"k": Parameter(140.0, per="run"), "c": 0.3, "b": Parameter(0.0, sigma=0.01, per="run")}
+SWINGS = Equations({"x": "v", "v": "-k*x - c*v"}, NUMBERS, observed={"x": "x + b"}, units={"x": "m"})
 OFFERED = [terms.coulomb("v"), terms.quadratic("v"), terms.constant("v")]
 
 

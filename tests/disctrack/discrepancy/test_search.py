@@ -175,10 +175,8 @@ def test_what_acts_in_the_fitted_part_alone_is_claimed_if_it_is_obvious(rng):
 def test_a_quantity_that_the_data_do_not_see_is_open_and_its_neighbour_is_not(rng):
     time = np.linspace(0, 1, 50)
     system = line(SIGMA * rng.standard_normal(50), time)
-    (slope, _) = sorted(
-        score_all(Linearisation(system, fit(system, (), {}), system.candidates), system.candidates),
-        key=lambda s: -len(s.sigma),
-    )
+    scores = score_all(Linearisation(system, fit(system, (), {}), system.candidates), system.candidates)
+    (slope, _) = sorted(scores, key=lambda s: -len(s.sigma))
     assert slope.sigma[0] == pytest.approx(SIGMA / np.sqrt(np.sum(time**2)), rel=1e-6)
     assert slope.sigma[1] == np.inf
 

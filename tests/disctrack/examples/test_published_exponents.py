@@ -13,17 +13,7 @@ from disctrack.discrepancy.fit import fit
 from disctrack.discrepancy.search import explain
 from disctrack.examples import published_exponents
 from disctrack.examples._command import command
-from disctrack.examples.published_exponents import (
-    THIN_DISC,
-    ExponentSystem,
-    LastStage,
-    Series,
-    in_question,
-    left_by,
-    published_series,
-    sample_covariance,
-    sigmas_off,
-)
+from disctrack.examples.published_exponents import ExponentSystem, LastStage, Series, in_question, left_by, sigmas_off
 
 QUICK = replace(published_exponents.SETTINGS, shortlist=3, max_effects=1, judged=2)
 FEW = ("t_f", "air_bildsten", "contour_viscous", "theta_zero", "kz")
@@ -31,7 +21,7 @@ FEW = ("t_f", "air_bildsten", "contour_viscous", "theta_zero", "kz")
 
 @pytest.fixture(scope="module")
 def published() -> tuple[Series, ...]:
-    return published_series()
+    return published_exponents.published_series()
 
 
 def offering(series, names):
@@ -54,7 +44,7 @@ def tables(published, values, rng, n):
 
 def test_the_glass_trials_contradict_the_paper_s_exponents_by_three_and_a_half_sigma(published):
     """All three exponents together; Student's t of each is that of the analysis."""
-    steel, glass = (sigmas_off(s.exponents, THIN_DISC) for s in published)
+    steel, glass = (sigmas_off(s.exponents, published_exponents.THIN_DISC) for s in published)
     assert 3.4 < glass < 3.5
     assert steel < 2
 
@@ -74,7 +64,7 @@ def test_the_widened_covariance_makes_chi_square_of_the_mean_its_number_of_expon
     for _ in range(2000):
         trials = rng.normal(size=(15, 3))
         mean = trials.mean(axis=0)
-        chi_square.append(15 * mean @ np.linalg.solve(sample_covariance(trials), mean))
+        chi_square.append(15 * mean @ np.linalg.solve(published_exponents.sample_covariance(trials), mean))
     assert abs(np.mean(chi_square) - 3) < 0.25
 
 
@@ -117,8 +107,8 @@ def test_chi_square_of_the_system_is_the_distance_of_all_trials_from_the_predict
     expected = 0.0
     for i, s in enumerate(published):
         outcome = system.outcomes(i, values)
-        d = s.exponents - outcome[:3]
-        expected += float(np.einsum("ni,ij,nj", d, np.linalg.inv(sample_covariance(s.exponents)), d))
+        d, spread = s.exponents - outcome[:3], published_exponents.sample_covariance(s.exponents)
+        expected += float(np.einsum("ni,ij,nj", d, np.linalg.inv(spread), d))
         expected += ((s.ln_duration - outcome[3]) / 0.03) ** 2
     residual, derivative = system.linearise(values, ["contour_viscous.c@glass", "t_f.bias"])
     assert_allclose(np.sum(residual**2), expected, rtol=1e-9)
@@ -131,10 +121,7 @@ def test_chi_square_of_the_system_is_the_distance_of_all_trials_from_the_predict
 @pytest.mark.statistical
 @pytest.mark.parametrize(
     ("planted", "size", "offered", "n"),
-    [
-        ("t_f.bias", -0.012, FEW, 16),
-        ("air_bildsten.beta", 0.3, ("air_bildsten", "theta_zero"), 12),
-    ],
+    [("t_f.bias", -0.012, FEW, 16), ("air_bildsten.beta", 0.3, ("air_bildsten", "theta_zero"), 12)],
 )
 def test_what_is_planted_is_found_in_its_class_and_sized(published, planted, size, offered, n):
     """With the published scatter, and so many trials per surface that something is missing for sure."""

@@ -73,8 +73,7 @@ def test_every_key_of_the_reference_recording_is_known(shared_data):
 
 
 @pytest.mark.parametrize(
-    ("air", "density"),
-    [("", 1.2), ("[air]\npressure_hPa = 101.325\n", 0.12), ("[air]\ndensity_kg_m3 = 0.3\n", 0.3)],
+    ("air", "density"), [("", 1.2), ("[air]\npressure_hPa = 101.325\n", 0.12), ("[air]\ndensity_kg_m3 = 0.3\n", 0.3)]
 )
 def test_density_of_the_air_is_declared_or_follows_from_the_pressure(tmp_path, air, density):
     assert read_recording(write(tmp_path, REFERENCE + air)).air_density == pytest.approx(density)

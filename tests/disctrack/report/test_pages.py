@@ -48,24 +48,15 @@ CHANGED = Measured(6.004e-5, 2.1e-7, "m")
 
 
 def report(**more):
-    blocks = [
-        "All of it.",
-        Section(
-            "Numbers", [Listing(("a", "b"), [("x", CHANGED)], "A table"), Facts([("length", CHANGED), ("", "twice")])]
-        ),
-        Section("Nothing", [Listing(("a",), ()), []]),
-    ]
+    numbers = [Listing(("a", "b"), [("x", CHANGED)], "A table"), Facts([("length", CHANGED), ("", "twice")])]
+    blocks = ["All of it.", Section("Numbers", numbers), Section("Nothing", [Listing(("a",), ()), []])]
     return Report(**{"title": "t", "verdict": "Something is missing.", "accuracy": "σ 1 µm", "blocks": blocks} | more)
 
 
 def test_a_page_is_whole_and_shows_text_as_text():
     table = Listing(["a", NASTY], [(NASTY, "1"), (Markup("<b>2</b>"), "3")], NASTY, classes=["done", "failed"])
-    found = report(
-        title=NASTY,
-        verdict=NASTY,
-        findings=of_kind(Kind.OTHER, Severity.DOUBT, [NASTY]),
-        blocks=[Section(NASTY, [table])],
-    )
+    doubts = of_kind(Kind.OTHER, Severity.DOUBT, [NASTY])
+    found = report(title=NASTY, verdict=NASTY, findings=doubts, blocks=[Section(NASTY, [table])])
     tree = Tree(page(found, {}))
     assert tree.open == []
     assert "script" not in tree.seen
@@ -183,11 +174,8 @@ def test_a_figure_is_written_whole_and_shown(tmp_path):
 
 
 def test_json_holds_no_number_that_json_does_not_know():
-    document = {
-        "a": [np.nan, np.float32(np.inf), (1, np.int64(2))],
-        "b": {3: np.array([[1.0, np.nan]]), "t": np.bool_(True)},
-        "c": "ψ",
-    }
+    numbers = [np.nan, np.float32(np.inf), (1, np.int64(2))]
+    document = {"a": numbers, "b": {3: np.array([[1.0, np.nan]]), "t": np.bool_(True)}, "c": "ψ"}
     expected = {"a": [None, None, [1, 2]], "b": {"3": [[1.0, None]], "t": True}, "c": "ψ"}
     assert json.loads(json_text(document)) == expected == plain(document)
     assert json_file(document).endswith(b"}\n")

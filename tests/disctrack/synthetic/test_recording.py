@@ -31,16 +31,12 @@ PLAIN = description.Scene(
     light=description.LightSettings(directed=0.0),
     optics=description.OpticsSettings(vignetting=0.0),
 )
-POSES = np.column_stack(
-    [
-        [0.032, 0.030, 0.034, 0.033],
-        [0.020, 0.022, 0.018, 0.020],
-        [0.0045, 0.011, 0.025, 0.037],
-        [0.3, 2.2, -1.9, 0.5],
-        np.radians([0.5, 15.0, 40.0, 75.0]),
-        [1.0, -2.0, 0.4, 3.0],
-    ]
-)
+POSES = [
+    [0.032, 0.020, 0.0045, 0.3, np.radians(0.5), 1.0],
+    [0.030, 0.022, 0.011, 2.2, np.radians(15.0), -2.0],
+    [0.034, 0.018, 0.025, -1.9, np.radians(40.0), 0.4],
+    [0.033, 0.020, 0.037, 0.5, np.radians(75.0), 3.0],
+]
 
 
 @pytest.fixture(scope="module")
@@ -81,10 +77,8 @@ def test_dots_lie_where_opencv_projects_their_outlines(q, index, rig):
     if not upper_face_visible(q, rig, index):
         pytest.skip("this camera looks at the underside")
     without = replace(PLAIN, appearance=replace(PLAIN.appearance, dot=PLAIN.appearance.paper))
-    dark = (
-        expected_disc(q, rig, MA_2014, without)[0, index].astype(float)
-        - expected_disc(q, rig, MA_2014, PLAIN)[0, index]
-    )
+    light, seen = (expected_disc(q, rig, MA_2014, scene)[0, index].astype(float) for scene in (without, PLAIN))
+    dark = light - seen
     R = rotation_from_euler(*q[3:])
     for centre in MA_2014.marker_centres_body:
         outline = cv2_pixels(circle(centre, MA_2014.marker_diameter / 2) @ R.T + q[:3], rig, index)
@@ -230,13 +224,8 @@ def test_full_well_clips_and_black_level_lifts():
 
 
 def test_vignetting_and_gradient_are_where_the_scene_puts_them(top_rig):
-    paper = replace(ABOVE.appearance, table=100.0)
-    scene = replace(
-        ABOVE,
-        appearance=paper,
-        optics=replace(ABOVE.optics, vignetting=0.2),
-        light=description.LightSettings(gradient_per_m=(2.0, 0.0)),
-    )
+    light, optics = description.LightSettings(gradient_per_m=(2.0, 0.0)), replace(ABOVE.optics, vignetting=0.2)
+    scene = replace(ABOVE, appearance=replace(ABOVE.appearance, table=100.0), optics=optics, light=light)
     away = FLAT + AWAY
     image = expected_disc(away, top_rig, MA_2014, scene)[0, 0]
     assert image[128, 128] == pytest.approx(100.0, abs=0.2)
@@ -245,12 +234,8 @@ def test_vignetting_and_gradient_are_where_the_scene_puts_them(top_rig):
 
 
 def test_glare_stays_in_the_image_while_the_disc_moves(top_rig):
-    glare = replace(
-        ABOVE,
-        light=description.LightSettings(
-            directed=0.0, glare=(description.GlareSettings("right", (100.0, 80.0), 10.0, 30.0),)
-        ),
-    )
+    spot = description.GlareSettings("right", (100.0, 80.0), 10.0, 30.0)
+    glare = replace(ABOVE, light=description.LightSettings(directed=0.0, glare=(spot,)))
     poses = np.stack([FLAT, FLAT + np.array([0.01, 0.005, 0, 0, 0, 0])])
     added = expected_disc(poses, top_rig, MA_2014, glare) - expected_disc(poses, top_rig, MA_2014, ABOVE)
     assert_allclose(added[:, 0], 0.0, atol=1e-3)
@@ -275,10 +260,8 @@ def test_hot_pixels_stay_where_they_are(top_rig):
     assert_array_equal(first, second)
 
 
-ORDINARY = description.Scene(
-    cameras=description.CameraSettings(image_size=(272, 272)),
-    rig=description.RigSettings(mm_per_px=0.42),
-    board=description.BoardSettings(square_mm=8.0),
+ORDINARY = description.scene_from_tree(
+    {"cameras": {"image_size": [272, 272]}, "rig": {"mm_per_px": 0.42}, "board": {"square_mm": 8.0}}
 )
 
 
@@ -334,9 +317,8 @@ def test_off_by_default_and_declared_only_where_exact():
     assert sensor_pattern(description.ImperfectionSettings(), (40, 30), [1])(even) is even
     assert_array_equal(corner_rays(rig_of(ORDINARY).left, 3, 0.0, (1,)), corner_rays(rig_of(ORDINARY).left, 3))
     assert "square_tolerance_mm = 0.0" in recording_toml(description.Scene())
-    assert "tolerance" not in recording_toml(
-        replace(description.Scene(), imperfections=description.ImperfectionSettings(pixel_gain=0.01))
-    )
+    uneven = description.Scene(imperfections=description.ImperfectionSettings(pixel_gain=0.01))
+    assert "tolerance" not in recording_toml(uneven)
 
 
 SMALL = description.Scene(
@@ -422,13 +404,8 @@ def test_a_recording_declares_the_disc_of_any_scene_as_it_is(tmp_path):
 
 
 def test_faults_never_show_in_recording_toml(scene):
-    faults = Faults(
-        right_delay_s=1e-4,
-        frame_rate_hz=990.0,
-        misprint_sigma_mm=0.1,
-        hidden_markers=(2,),
-        left=CameraFault(rotation_deg=(0.1, 0.0, 0.0)),
-    )
+    left = CameraFault(rotation_deg=(0.1, 0.0, 0.0))
+    faults = Faults(right_delay_s=1e-4, frame_rate_hz=990.0, misprint_sigma_mm=0.1, hidden_markers=(2,), left=left)
     assert recording_toml(replace(scene, faults=faults)) == recording_toml(scene)
 
 

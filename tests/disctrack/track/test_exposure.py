@@ -67,12 +67,8 @@ def _against_drawn_dots(q, R, found, chosen, rig, disc, dark, noise, blur_px):
             affine = np.swapaxes(edges - centres[:, None], 1, 2) @ circle / 8
             window = np.round(centres[4]) - 31
             cover = [covered(centres[k] - window, affine[k], 0.6, SIMPSON) for k in (np.arange(9), [4] * 9)]
-            smeared, still = (
-                locate_in_window(
-                    50000 - (50000 - dark) * share, centres[4], affine[4], noise=noise, blur_px=blur_px
-                ).pixels[0]
-                for share in cover
-            )
+            at = {"centre": centres[4], "affine": affine[4], "noise": noise, "blur_px": blur_px}
+            smeared, still = (locate_in_window(50000 - (50000 - dark) * share, **at).pixels[0] for share in cover)
             expected.append(smeared - still)
             by_path.append(SIMPSON @ centres - centres[4])
             given.append(found[frame, camera, dot])
@@ -205,10 +201,8 @@ def located(rendered_pairs):
     y, x = np.mgrid[:64, :64]
     found = {}
     for kind, glare in (("falls off", 0.0), ("glare", 3000.0)):
-        contrast, shift = (
-            np.full((SHOTS, 2, disc.n_markers), np.nan, np.float32),
-            np.zeros((SHOTS, disc.n_markers, 2)),
-        )
+        contrast = np.full((SHOTS, 2, disc.n_markers), np.nan, np.float32)
+        shift = np.zeros((SHOTS, disc.n_markers, 2))
         for frame in range(SHOTS):
             for dot in range(disc.n_markers):
                 centre, A = pixels[frame, 0, dot], affine[frame, dot]

@@ -68,9 +68,8 @@ def test_the_outline_lies_on_the_rim_of_the_disc(trajectory):
     hits = eye + rays * (((point - eye) @ normal) / (rays @ normal))[:, None]
     radius = np.linalg.norm(hits - point, axis=1)
     # a line one pixel wide with soft edges: 1.5 px, on a face that is seen obliquely
-    assert np.abs(radius - MA_2014.radius).max() < 1.5 * np.linalg.norm(eye - point) / camera.fx / np.cos(
-        np.radians(60)
-    )
+    pixel = np.linalg.norm(eye - point) / camera.fx / np.cos(np.radians(60))
+    assert np.abs(radius - MA_2014.radius).max() < 1.5 * pixel
 
 
 def test_a_lost_frame_shows_the_reason_and_no_disc(trajectory):

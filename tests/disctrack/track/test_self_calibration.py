@@ -103,10 +103,8 @@ def test_the_place_of_a_pattern_is_as_uncertain_as_its_dots_are_misplaced(m, rng
 
 def test_dots_as_declared_and_one_that_is_not_leave_the_pattern_where_it_is(rng):
     sigma = np.full((6, 2), 6e-7)
-    assert pattern_place(MA_2014, np.column_stack([0.5 * sigma * rng.normal(size=(6, 2)), np.zeros(6)]), sigma) == (
-        0,
-        0,
-    )
+    within = np.column_stack([0.5 * sigma * rng.normal(size=(6, 2)), np.zeros(6)])
+    assert pattern_place(MA_2014, within, sigma) == (0, 0)
     one = np.zeros((6, 3))
     one[2, 0] = 1e-3
     assert pattern_place(MA_2014, one, sigma) == (0, 0)

@@ -154,9 +154,8 @@ def test_dots_that_carry_no_pose_are_refused(rendered_pairs, keep):
 
 def test_a_sensor_without_noise_is_not_refused_for_the_templates_own_misfit(rendered_pairs):
     q = rendered_pairs.q[[4, 5, 6]]
-    images = np.round(16 * expected_disc(q, rendered_pairs.rig, rendered_pairs.disc, rendered_pairs.scene)).astype(
-        np.uint16
-    )
+    exact = expected_disc(q, rendered_pairs.rig, rendered_pairs.disc, rendered_pairs.scene)
+    images = np.round(16 * exact).astype(np.uint16)
     apart = np.array([[True, True], [False, False]] * 2 + [[True, True]])  # three poses that are not of one motion
     result = tracked(images[[0, 0, 1, 1, 2]], rendered_pairs, readable=apart)
     assert (result.trajectory.marker_status[::2] == MarkerStatus.MEASURED).all()
@@ -216,9 +215,8 @@ def test_most_images_unreadable_is_the_cause_that_is_told_and_a_few_are_not():
     lost = {(n, n % 2): f"left/{n}.png: cannot be read: No such device." for n in range(150, 0, -1)}
     known = SimpleNamespace(folder=Path("rec")), lost, 200, TrackingError("found in none")
     refuse_unreadable(known[0], dict([*lost.items()][50:]), *known[2:])
-    with pytest.raises(
-        RecordingError, match=r"rec: the files cannot be read: 150 of 200 images, the first: left/1\.png"
-    ):
+    said = r"rec: the files cannot be read: 150 of 200 images, the first: left/1\.png"
+    with pytest.raises(RecordingError, match=said):
         refuse_unreadable(*known)
 
 

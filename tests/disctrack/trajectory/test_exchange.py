@@ -430,8 +430,7 @@ def test_convert_goes_by_the_ending_and_replaces_nothing(rig, trajectory, tmp_pa
     results = tmp_path / "clip" / "results"
     results.mkdir(parents=True)
     write_trajectory(results / "trajectory.h5", trajectory, Provenance("clip", {}, {}))
-    assert (
-        converted("./clip", "clip.nc")[0] == converted("./clip", "clip.mat")[0] == converted("clip.nc", "c.yml")[0] == 0
-    )
+    for words in (("./clip", "clip.nc"), ("./clip", "clip.mat"), ("clip.nc", "c.yml")):
+        assert converted(*words)[0] == 0
     assert np.array_equal(disctrack.read_trajectory(tmp_path / "clip.nc").q, trajectory.q, equal_nan=True)
     assert loadmat(tmp_path / "clip.mat", simplify_cells=True)["disctrack"]["q"].shape == (30, 6)

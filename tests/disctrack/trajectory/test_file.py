@@ -34,14 +34,10 @@ def make_trajectory(rng: np.random.Generator, n: int = 30) -> Trajectory:
     made.frame_status[lost] = FrameStatus.UNREADABLE, FrameStatus.MARKERS_NOT_FOUND
     field = LensField(rng.normal(0, 0.02, (2, 2, 5, 6)), 128.0)
     allowances = Allowance("the board's size", part, True), Allowance("its thickness", 2 * part)
-    return dataclasses.replace(
-        made,
-        systematic_covariance=np.full((n, 6, 6), 0.25),
-        marker_status=rng.integers(0, 8, made.marker_status.shape, dtype=np.uint8),
-        rig=dataclasses.replace(made.rig, lens_field=field, allowances=allowances),
-        air_density=0.3,
-        table_moved=(1e-4, 0.0, 2e-3),
-    )
+    status = rng.integers(0, 8, made.marker_status.shape, dtype=np.uint8)
+    rig = dataclasses.replace(made.rig, lens_field=field, allowances=allowances)
+    more = {"systematic_covariance": np.full((n, 6, 6), 0.25), "air_density": 0.3, "table_moved": (1e-4, 0.0, 2e-3)}
+    return dataclasses.replace(made, marker_status=status, rig=rig, **more)
 
 
 @pytest.fixture
@@ -117,15 +113,9 @@ def test_xarray_opens_root_and_groups_with_their_axes(file, trajectory, engine):
         assert_array_equal(data["covariance"].values, trajectory.rig.covariance)
 
 
-SEEN = Finding(
-    Kind.SQUARE,
-    Severity.DOUBT,
-    "on another scale",
-    Subject("track", frames=((3, 7),)),
-    {"scale": Measured(0.9877, 1e-4)},
-    (Remedy("square_mm", "8.00", "8.1"),),
-    (Kind.RADIUS,),
-)
+REMEDY = Remedy("square_mm", "8.00", "8.1")
+MORE = Subject("track", frames=((3, 7),)), {"scale": Measured(0.9877, 1e-4)}, (REMEDY,), (Kind.RADIUS,)
+SEEN = Finding(Kind.SQUARE, Severity.DOUBT, "on another scale", *MORE)
 
 
 def test_findings_come_back_and_doubts_are_python_warnings(tmp_path, trajectory):
@@ -220,12 +210,7 @@ def test_an_existing_file_is_kept_unless_told_otherwise(file, trajectory):
 
 
 @pytest.mark.parametrize(
-    "change",
-    [
-        {"inputs": {"images": "cd" * 32}},
-        {"settings": {"refine": False}},
-        {"version": "0.0.0"},
-    ],
+    "change", [{"inputs": {"images": "cd" * 32}}, {"settings": {"refine": False}}, {"version": "0.0.0"}]
 )
 def test_a_result_is_reused_only_for_the_same_inputs_settings_and_version(file, trajectory, change):
     other = dataclasses.replace(PROVENANCE, **change)

@@ -155,9 +155,8 @@ def test_noisy_sensors_and_more_bits_are_measured_from_the_first_pair_on(bits, r
     # on 40 numbers chance allows 1 +- 0.33
     assert 0.3 < noise_consistency(found).value < 2.0
     grey = (2**bits - 1) / 255
-    assert NoiseModel(**tracking.details["noise"][0]).variance(100 * grey) == pytest.approx(
-        (read_noise**2 + 100 / 50) * grey**2, rel=0.35
-    )  # 12 flat parts of some 100 pixels each
+    variance = NoiseModel(**tracking.details["noise"][0]).variance(100 * grey)
+    assert variance == pytest.approx((read_noise**2 + 100 / 50) * grey**2, rel=0.35)  # 12 flat parts, 100 pixels each
 
 
 @pytest.mark.slow

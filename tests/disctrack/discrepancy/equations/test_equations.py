@@ -107,10 +107,8 @@ def test_noise_of_known_memory_and_numbers_of_a_group_of_runs(rng):
         assert abs(answer.values[f"k[{spring}]"] - k) < 4 * answer.sigmas[f"k[{spring}]"]
     assert answer.system.training.sum() == 14 + 40 + 40  # of run a the first second
     residual, _ = answer.system.linearise(answer.values, [])
-    left = [
-        run.data["x"] - seen[:, 0]
-        for run, (_, seen) in zip(runs, answer.predicted(answer.diagnosis.after), strict=True)
-    ]
+    predicted = answer.predicted(answer.diagnosis.after)
+    left = [run.data["x"] - seen[:, 0] for run, (_, seen) in zip(runs, predicted, strict=True)]
     expected = sum(x @ np.linalg.solve(noise.covariance(time), x) for x in left)
     assert_allclose(np.sum(residual**2), expected, rtol=1e-6)
     with pytest.raises(AnalysisError, match="run a: fewer than 8 samples until fit_until"):
@@ -196,11 +194,8 @@ def test_many_times_the_declared_noise_is_no_noise_whatever_it_remembers():
     x = swinging(lambda x, v: 0.0)
     white = np.random.default_rng(1).standard_normal(len(TIME) + 100)
     noise = SIGMA * lfilter([np.sqrt(1 - 0.6**2)], [1.0, -0.6], white)[100:]
-    for size, sigma, verdict in (
-        (10, SIGMA, "unexplained"),
-        (3, SIGMA, "nothing missing"),
-        (10, None, "nothing missing"),
-    ):
+    verdicts = (10, SIGMA, "unexplained"), (3, SIGMA, "nothing missing"), (10, None, "nothing missing")
+    for size, sigma, verdict in verdicts:
         answer = diagnose(OSCILLATOR, Run(TIME, {"x": x + size * noise}, sigma=sigma), FIVE)
         assert answer.verdict == verdict
         assert ("no sensor's noise" in answer.diagnosis.reason) == (verdict == "unexplained")
@@ -778,9 +773,8 @@ def test_single_samples_far_off_are_told(rng, wrong):
     time = np.arange(120.0)
     speed = motion(lambda t, v: [-0.12 - 3.5e-4 * v[0] ** 2], [33.0], time)[0] + 0.02 * rng.standard_normal(120)
     speed[list(wrong)] += 4.0
-    answer = diagnose(
-        Equations({"v": "-a"}, {"a": 0.2}, units={"v": "m/s"}), Run(time, {"v": speed}), [terms.quadratic("v")]
-    )
+    rolling = Equations({"v": "-a"}, {"a": 0.2}, units={"v": "m/s"})
+    answer = diagnose(rolling, Run(time, {"v": speed}), [terms.quadratic("v")])
     assert answer.found == ("quadratic_v",)
     told = [note for note in answer.notes if "farther off" in note]
     assert len(told) == bool(wrong)
@@ -797,9 +791,8 @@ def test_a_friction_that_stops_an_arm_is_led_to_over_longer_stretches(rng, frict
     )[0]  # fmt: skip
     x = np.concatenate([x, np.full(240, x[-1])]) if friction else 0.5 * np.exp(-0.3 * time) * np.cos(7 * time)
     run = Run(time, {"x": x + 1e-3 * np.sin(2 * time) + 1e-4 * rng.standard_normal(600)}, sigma=1e-4)
-    answer = diagnose(
-        Equations({"x": "v", "v": "-k*x - c*v"}, {"k": 45.0, "c": 0.5}), run, [terms.coulomb("v"), terms.constant("v")]
-    )
+    spring = Equations({"x": "v", "v": "-k*x - c*v"}, {"k": 45.0, "c": 0.5})
+    answer = diagnose(spring, run, [terms.coulomb("v"), terms.constant("v")])
     # what wanders is no friction: without one, the wandering itself is shown as a function of time, which is no finding
     assert answer.found == (("coulomb_v",) if friction else ())
     assert friction or answer.law.along.variable == "t"

@@ -137,9 +137,8 @@ def test_what_leaves_more_than_the_sensor_scatters_is_not_found():
     tank = Equations({"h": "k*u - c*sqrt(Max(h, 0.001))"}, {"k": 0.3, "c": 0.15}, inputs=["u"])
     for sigma in (None, 1e-3):
         data = np.array(level) + noise(600, sigma=1e-3)
-        answer = diagnose(
-            tank, Run(time, {"h": data}, inputs={"u": pump}, hold="hold", sigma=sigma), [terms.viscous("h")]
-        )
+        run = Run(time, {"h": data}, inputs={"u": pump}, hold="hold", sigma=sigma)
+        answer = diagnose(tank, run, [terms.viscous("h")])
         assert answer.after["h"].rms < 5e-3 or answer.verdict == "unexplained"
 
 

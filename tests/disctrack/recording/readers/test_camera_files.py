@@ -87,7 +87,11 @@ def test_what_cannot_be_read_is_refused_with_the_reason(tmp_path, rng, kind, opt
 
 
 LATER = np.arange(-3, 4) / 2000
-LOCKED = (TRIGGER[0] & ~1, TRIGGER[1])
+
+
+def locked(later):
+    """To a common clock, and triggered so many seconds later."""
+    return {"trigger": (TRIGGER[0] & ~1, TRIGGER[1] + later)}
 
 
 @pytest.mark.parametrize(
@@ -101,13 +105,7 @@ LOCKED = (TRIGGER[0] & ~1, TRIGGER[1])
         ("cine", {}, {"rate": 1000}, 2000.0, "the right camera's frames were recorded with 1000 Hz"),
         ("cine", {}, {"first_image": 9}, 2000.0, "begins with the camera's frame -3.*the right one with frame 9"),
         ("cine", {}, {"times": LATER + 3e-4}, 2000.0, "taken 0.0003 s after that of the left one.*lasts 0.0005 s"),
-        (
-            "cine",
-            {"trigger": LOCKED},
-            {"trigger": (LOCKED[0], LOCKED[1] + 60)},
-            2000.0,
-            "the common clock.*taken 60 s after",
-        ),
+        ("cine", locked(0), locked(60), 2000.0, "the common clock.*taken 60 s after"),
     ],
 )
 def test_frames_of_different_instants_are_an_error(tmp_path, rng, kind, left, right, declared, reason):
@@ -118,11 +116,7 @@ def test_frames_of_different_instants_are_an_error(tmp_path, rng, kind, left, ri
 @pytest.mark.parametrize(
     ("kind", "right", "reason"),
     [
-        (
-            "cih",
-            {"Trigger_Mode": "Manual", "Start_Frame": "7"},
-            "triggered in different modes: left Start, right Manual",
-        ),
+        ("cih", {"Trigger_Mode": "Manual", "Start_Frame": "7"}, "in different modes: left Start, right Manual"),
         ("cih", {"Shutter_Type2": "200000"}, "left 100 µs, right 200 µs.*lie 50 µs apart"),
         ("cih", {}, "exposure_us is 500, the left camera's header says 100 µs"),
         ("cih", {"Date": "2026/1/19"}, "1440 minutes apart"),

@@ -38,11 +38,8 @@ def open_pair(folder: Path) -> tuple[FrameReader, FrameReader]:
 
 def collect(readers, **how):
     blocks = [(b.frames, b.images.copy(), b.unreadable) for b in iter_pair_blocks(*readers, **how)]
-    return (
-        np.concatenate([b[0] for b in blocks]),
-        np.concatenate([b[1] for b in blocks]),
-        [(*place, reason) for b in blocks for place, reason in b[2].items()],
-    )
+    numbers, images = (np.concatenate([block[i] for block in blocks]) for i in (0, 1))
+    return numbers, images, [(*place, reason) for block in blocks for place, reason in block[2].items()]
 
 
 @pytest.mark.parametrize("channels", [3, 4])
@@ -127,12 +124,7 @@ def test_a_counter_beside_a_time_stamp_is_found_or_told_by_the_pattern(tmp_path,
 
 @pytest.mark.parametrize(
     ("theirs", "verdict"),
-    [
-        (range(11), None),
-        (range(100, 111), "taken as pairs"),
-        (range(1, 12), "equal numbers"),
-        (range(0, 22, 2), "equal"),
-    ],
+    [(range(11), None), (range(100, 111), "as pairs"), (range(1, 12), "equal numbers"), (range(0, 22, 2), "equal")],
 )
 def test_equal_numbers_are_the_same_instant(tmp_path, frames, theirs, verdict):
     write_sequence(tmp_path / "left", frames[:, 0])
@@ -171,12 +163,7 @@ def _flip(content: bytes) -> bytes:
 
 @pytest.mark.parametrize(
     ("damage", "reason"),
-    [
-        (_truncate, "truncated"),
-        (_flip, "checksum"),
-        (lambda c: b"", "empty"),
-        (lambda c: b"not an image", "not a readable"),
-    ],
+    [(_truncate, "truncated"), (_flip, "checksum"), (lambda c: b"", "empty"), (lambda c: b"text", "not a readable")],
 )
 @pytest.mark.parametrize(("camera", "frame"), [("right", 6), ("left", 0)])
 def test_a_damaged_image_is_named_and_the_others_are_delivered(pair, frames, capfd, damage, reason, camera, frame):

@@ -116,19 +116,10 @@ class Format:
 
 
 IMAGES = [Format(s, b, write_images) for s, b in (("png", 8), ("png", 16), ("tif", 8), ("tif", 16), ("bmp", 8))]
+LAYOUTS = [{}, {"bigtiff": True, "byteorder": ">"}, {"imagej": True}]
+LAYOUTS += [{"rowsperstrip": 5}, {"compression": "zlib", "predictor": True}, {"tile": (16, 16), "compression": "zlib"}]
 TIFFS = [
-    *(
-        Format("tif", bits, write_tiff, options)
-        for bits in (8, 16)
-        for options in (
-            {},
-            {"bigtiff": True, "byteorder": ">"},
-            {"imagej": True},
-            {"rowsperstrip": 5},
-            {"compression": "zlib", "predictor": True},
-            {"tile": (16, 16), "compression": "zlib"},
-        )
-    ),
+    *(Format("tif", bits, write_tiff, options) for bits in (8, 16) for options in LAYOUTS),
     *(Format("tiff", bits, write_pages_by_opencv, {"compression": c}) for bits in (8, 16) for c in (1, 5, 8, 32773)),
 ]
 EACH = {"chunks": (1, HEIGHT, WIDTH), "compression": "gzip"}
