@@ -75,12 +75,8 @@ def test_what_varies_within_a_cell_is_found_too():
     assert found < 1.5
 
 
-def test_plain_lenses_get_no_field(refined):
-    scene, (plain, _) = refined
+def test_plain_lenses_and_few_views_get_no_field(refined):
+    scene, (plain, bent) = refined
     assert fit_lens_field(plain, scene.board.points) == (None, plain)
-
-
-def test_few_views_get_no_field(refined):
-    scene, (_, bent) = refined
     few = bent.observations[bent.observations.view < 6]
     assert fit_lens_field(refine_stereo(few, bent.model, scene.board.points, TERMS), scene.board.points)[0] is None

@@ -63,9 +63,9 @@ def rows_of_the_page() -> list[list[str]]:
 
 # Each folder or module of a package may ask for what stands above it, at whatever place in the file it does so. A new
 # one belongs where what it needs is above, and what needs it below; names in one row know nothing of each other.
-CALIBRATED = ["points", "rig_file"]
+CALIBRATION = ("kit", "board cameras", "fit", "judge", "stereo_fit", "stereo", "points rig_file")
 STAIRS = {
-    "calibration": (["kit"], ["board", "cameras"], ["fit"], ["judge"], ["stereo_fit"], ["stereo"], CALIBRATED),
+    "calibration": [row.split() for row in CALIBRATION],
     "disctrack": (*rows_of_the_page(), ("__main__",)),
 }
 SOURCES = {
@@ -85,12 +85,8 @@ def statements(file: str) -> list[ast.AST]:
 @cache
 def asked_for(file: str) -> set[str]:
     """Files of ours that a file asks for, at whatever place in it, but for types."""
-    for_types = {
-        below
-        for node in statements(file)
-        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test)
-        for below in ast.walk(node)
-    }
+    conditions = [node for node in statements(file) if isinstance(node, ast.If)]
+    for_types = {below for node in conditions if "TYPE_CHECKING" in ast.dump(node.test) for below in ast.walk(node)}
     found = set()
     for node in statements(file):
         if isinstance(node, ast.Import):
@@ -147,14 +143,9 @@ def test_no_file_asks_for_one_that_asks_for_it():
 
 def test_a_public_class_has_a_name_of_its_own():
     """Plan, Motion or Found say nothing where two things bear the name; each example speaks its own language."""
-    classes = Counter(
-        node.name
-        for file in SOURCES
-        if not file.startswith("disctrack.examples")
-        for node in statements(file)
-        if isinstance(node, ast.ClassDef) and node.name[0] != "_"
-    )
-    assert [name for name, n in classes.items() if n > 1] == []
+    files = [file for file in SOURCES if not file.startswith("disctrack.examples")]
+    classes = Counter(node.name for file in files for node in statements(file) if isinstance(node, ast.ClassDef))
+    assert [name for name, n in classes.items() if n > 1 and name[0] != "_"] == []
 
 
 def test_discrepancy_knows_no_disc():

@@ -16,12 +16,8 @@ from disctrack.errors import ArgumentError
 
 MADE = {"Board", "CalibrationSettings", "Camera", "Observations", "StereoRig"}
 MADE |= {"Disc", "Model", "Provenance", "State", "Tracker"}
-PUBLIC = {
-    name: getattr(package, name)
-    for package in (calibration, disctrack)
-    for name in package.__all__
-    if inspect.isfunction(getattr(package, name)) or name in MADE
-}
+OFFERED = {name: getattr(package, name) for package in (calibration, disctrack) for name in package.__all__}
+PUBLIC = {name: item for name, item in OFFERED.items() if inspect.isfunction(item) or name in MADE}
 PLAIN = {str: "text", float: 0.5, int: 1, bool: True, Path: Path("x"), os.PathLike[str]: Path("x"), NoneType: None}
 
 

@@ -34,11 +34,8 @@ def executed(notebook: Path, root: Path = ROOT) -> nbformat.NotebookNode:
 
 def texts(content: nbformat.NotebookNode) -> list[list[str]]:
     """What each cell of code printed and showed as text; of a figure that there is one."""
-    return [
-        [str(output.get("text") or _of(output.get("data", {}))) for output in cell.outputs]
-        for cell in content.cells
-        if cell.cell_type == "code"
-    ]
+    cells = [cell for cell in content.cells if cell.cell_type == "code"]
+    return [[str(output.get("text") or _of(output.get("data", {}))) for output in cell.outputs] for cell in cells]
 
 
 def _of(data: dict[str, str]) -> str:

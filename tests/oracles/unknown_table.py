@@ -64,12 +64,9 @@ def _against(made: Recording, result) -> dict:
     course = result.learned.course if result.learned else None
     if course is not None:
         pull = (course.values - of(course.time)) / course.sigma
-        found |= {
-            "misfit": result.learned.misfit,
-            "pull": float(np.sqrt(np.mean(pull**2))),
-            "rms_sigma": rms(course.sigma),
-        }
-        found |= {"within_3": float(np.mean(np.abs(pull) < 3.0)), "worst": float(np.abs(pull).max())}
+        found |= {"misfit": result.learned.misfit, "pull": float(np.sqrt(np.mean(pull**2)))}
+        found |= {"rms_sigma": rms(course.sigma), "within_3": float(np.mean(np.abs(pull) < 3.0))}
+        found |= {"worst": float(np.abs(pull).max())}
     return found
 
 

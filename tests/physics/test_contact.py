@@ -55,10 +55,8 @@ def squared_error_over_variance(motion, truth, frames=slice(None)):
 def test_squared_error_is_the_predicted_variance(name, seeds, low, high):
     # smoothed noise is correlated over 20 frames: a copy holds 100 values and scatters by 15 %, a mean by 8 and 3 %
     truth = true_motion(**MOTIONS[name])[-700:]
-    found = [
-        squared_error_over_variance(differentiate(as_tracked(truth, np.random.default_rng(seed))), truth)
-        for seed in range(seeds)
-    ]
+    motions = (differentiate(as_tracked(truth, np.random.default_rng(seed))) for seed in range(seeds))
+    found = [squared_error_over_variance(motion, truth) for motion in motions]
     for quantity in QUANTITIES:
         assert low <= np.mean([f[quantity] for f in found]) <= high, quantity
 

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
+from types import SimpleNamespace
 from urllib.parse import unquote
 
 import numpy as np
@@ -153,19 +154,12 @@ def test_a_job_whose_process_died_is_tried_once_more_at_the_end_and_alone():
 def cluster(monkeypatch):
     """A cluster whose futures have an answer, an error, or were cancelled."""
 
-    class Client:
-        def get_executor(self, pure: bool):
-            return self
+    def submit(do, job):
+        future, answer = Future(), client.answers.pop(0)
+        (future.set_exception if isinstance(answer, Exception) else future.set_result)(answer)
+        return future
 
-        def submit(self, do, job):
-            future = Future()
-            if isinstance(answer := self.answers.pop(0), Exception):
-                future.set_exception(answer)
-            else:
-                future.set_result(answer)
-            return future
-
-    client = Client()
+    client = SimpleNamespace(submit=submit, get_executor=lambda pure: client)
     monkeypatch.setattr("disctrack.batch.pool.connect", lambda address: client)
     return client
 

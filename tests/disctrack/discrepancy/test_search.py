@@ -160,10 +160,8 @@ def test_what_acts_in_the_fitted_part_alone_is_claimed_if_it_is_obvious(rng):
     blow, rows = np.exp(-(((time - 0.3) / 0.1) ** 2)), time <= 0.65
     columns = {"blow": blow, "stays": np.where(rows, np.exp(-((time / 0.6) ** 4)), 1.0)}
     observed = 0.014 * blow + SIGMA * rng.standard_normal(900)
-    answer, wrong = (
-        explain(Linear(time, observed, columns, (), [candidate(name)], SIGMA), {}, Settings(noise=1.0), rows)
-        for name in columns
-    )
+    systems = (Linear(time, observed, columns, (), [candidate(name)], SIGMA) for name in columns)
+    answer, wrong = (explain(system, {}, Settings(noise=1.0), rows) for system in systems)
     assert [f.candidate.name for f in answer.found] == ["blow"]
     assert abs(answer.after.values["blow"] - 0.014) < 4 * answer.after.sigma("blow")
     (tried,) = wrong.tried

@@ -20,10 +20,8 @@ def positions(rng, path, frequencies):
             v += 0.00025 * (35.0 * volts[i] - 200 * v - 20 * np.tanh(v / 1e-4)) / 95
             x += 0.00025 * v
         q[i + 1] = x
-    savemat(
-        path,
-        {"t": t[:, None], "qm": (q + 1e-6 * rng.standard_normal(6000))[:, None], "vir": volts[:, None], "gtau": 35.0},
-    )
+    seen = q + 1e-6 * rng.standard_normal(6000)
+    savemat(path, {"t": t[:, None], "qm": seen[:, None], "vir": volts[:, None], "gtau": 35.0})
 
 
 @pytest.mark.statistical

@@ -57,10 +57,8 @@ def test_table_is_found_where_the_rim_rolls(leaning):
 
 
 def test_board_and_disc_count_as_their_sigmas_say(leaning):
-    told = {
-        source: table_from_disc(*poses_of(leaning), leaning.rig, leaning.disc, source)[3]
-        for source in ("board", "both")
-    }
+    given = leaning.rig, leaning.disc
+    told = {source: table_from_disc(*poses_of(leaning), *given, source)[3] for source in ("board", "both")}
     assert_allclose(told["board"].applied, 0.0, atol=0)
     assert_allclose(told["both"].applied, told["both"].plane, rtol=0.1)  # it differs by more than a board may
     assert told["both"].probability < 1e-2
@@ -137,17 +135,13 @@ def test_derivative_by_the_rig_agrees_with_differences(leaning):
     assert_allclose(other - plane, -by_rig @ step, rtol=0.02, atol=2e-7)
 
 
-def test_disc_in_the_air_tells_of_no_table(leaning):
+def test_disc_in_the_air_few_frames_or_a_world_without_table_tell_of_none(leaning):
     time = np.linspace(0, 1, len(leaning))
-    fits, none = poses_of(leaning, lift=2e-3 * time * (1 - time))
-    assert table_from_disc(fits, none, leaning.rig, leaning.disc)[3] is None
-
-
-def test_few_frames_or_a_flat_disc_tell_of_no_table(leaning):
-    fits, none = poses_of(leaning)
+    (fits, none), (flying, _) = poses_of(leaning), poses_of(leaning, lift=2e-3 * time * (1 - time))
     lost = replace(fits, converged=np.arange(len(leaning)) < 19)
-    assert table_from_disc(lost, none, leaning.rig, leaning.disc)[3] is None
-    assert table_from_disc(fits, none, replace(leaning.rig, world_is_table=False), leaning.disc)[3] is None
+    elsewhere = replace(leaning.rig, world_is_table=False)
+    for poses, rig in ((flying, leaning.rig), (lost, leaning.rig), (fits, elsewhere)):
+        assert table_from_disc(poses, none, rig, leaning.disc)[3] is None
 
 
 def test_scatter_about_the_table_is_told_where_noise_does_not_explain_it():

@@ -55,9 +55,7 @@ def grounds(sample_clip, tmp_path_factory):
 @pytest.mark.statistical
 def test_some_faults_of_one_size_are_named_or_within_the_sigmas(grounds):
     names = ("left_turned", "right_shifted", "pattern_offset", "radius", "pairs lost by both", "negative views")
-    largest = {
-        (ground.recording, name): (ground, name, size) for ground, name, size in planted_faults.fault_cases(grounds)
-    }
+    largest = {(case[0].recording, case[1]): case for case in planted_faults.fault_cases(grounds)}
     outcomes = [planted_faults.plant_and_run(case) for (_, name), case in largest.items() if name in names]
     assert planted_faults.faults_validation(outcomes).complaints == ()
     assert {outcome.fault for outcome in outcomes} == set(names)

@@ -161,10 +161,8 @@ def test_noisy_sensors_and_more_bits_are_measured_from_the_first_pair_on(bits, r
 
 @pytest.mark.slow
 def test_height_and_tilt_in_an_imperfect_laboratory_and_what_is_stated_of_them():
-    outcomes = [
-        rendered.render_and_measure(rendered.imperfect_case(rendered.scene_of(seed, quick=True), 60))
-        for seed in (31, 32)
-    ]
+    cases = [rendered.imperfect_case(rendered.scene_of(seed, quick=True), 60) for seed in (31, 32)]
+    outcomes = [rendered.render_and_measure(case) for case in cases]
     assert imperfect_validation(outcomes).markdown().count("+-") == 13
     pulls = []
     for outcome in outcomes:

@@ -12,7 +12,7 @@ from disctrack.errors import RecordingError
 from disctrack.recording.readers import FrameReader, open_frames
 from disctrack.recording.readers.cine import linear_from_10_bits
 from disctrack.recording.readers.same_instants import check_headers, check_time_stamps
-from tests.disctrack.recording.readers.written import lost_of
+from tests.disctrack.recording.readers.written import assert_refused, lost_of
 from tests.oracles.camera_files import TRIGGER, write_cine, write_mraw
 
 
@@ -196,16 +196,13 @@ def test_an_impossible_exposure_or_step_is_not_used_and_said(tmp_path, rng):
 def test_header_and_frames_must_lie_together(tmp_path, rng):
     header = write(tmp_path, rng)
     header.rename(tmp_path / "kept")
-    with pytest.raises(RecordingError, match=r"there is no left\.cihx or \.cih beside it"):
-        open_frames("left.mraw", tmp_path, "left")
+    assert_refused(tmp_path, "left.mraw", r"there is no left\.cihx or \.cih beside it")
     (tmp_path / "kept").rename(header)
     (tmp_path / "left.mraw").unlink()
-    with pytest.raises(RecordingError, match=r"there is no left\.mraw beside it"):
-        open_frames("left.cih", tmp_path, "left")
+    assert_refused(tmp_path, "left.cih", r"there is no left\.mraw beside it")
     write(tmp_path, rng)
     write(tmp_path, rng, camera="left_2")
-    with pytest.raises(RecordingError, match="name one recording"):
-        open_frames("left*.cih", tmp_path, "left")
+    assert_refused(tmp_path, "left*.cih", "name one recording")
 
 
 def test_a_header_of_nested_or_expanding_xml_costs_nothing(tmp_path, rng):
@@ -213,11 +210,9 @@ def test_a_header_of_nested_or_expanding_xml_costs_nothing(tmp_path, rng):
     bomb = b'<!DOCTYPE cih [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;">]>'
     for content in (bomb + b"<cih>&b;</cih>", b"<cih>" + bomb + b"&b;</cih>", b"<cih>" + b"<a>" * 20_000 + b"</cih>"):
         header.write_bytes(content)
-        with pytest.raises(RecordingError, match="the XML in it is damaged"):
-            open_frames("left.cihx", tmp_path, "left")
+        assert_refused(tmp_path, "left.cihx", "the XML in it is damaged")
     header.write_bytes(b"<cih>" + b"<a>" * 20_000 + b"</a>" * 20_000 + b"</cih>")
-    with pytest.raises(RecordingError, match="saved as nothing known"):
-        open_frames("left.cihx", tmp_path, "left")
+    assert_refused(tmp_path, "left.cihx", "saved as nothing known")
 
 
 def test_rows_padded_as_in_a_bitmap_are_read(tmp_path, rng):
@@ -350,8 +345,7 @@ def test_a_cine_s_time_stamps_tell_how_many_frames_were_left_out(request):
 
 def test_a_cine_of_a_colour_sensor_is_refused(request):
     camera_files = folder_of("invalid_color.cine", request)
-    with pytest.raises(RecordingError, match="colour recording"):
-        open_frames("invalid_color.cine", camera_files, "left")
+    assert_refused(camera_files, "invalid_color.cine", "colour recording")
 
 
 @pytest.mark.parametrize(

@@ -25,12 +25,9 @@ def dim():
     """
     scene = load_scene(SCENE)
     surfaces = ("paper", "dot", "rim", "side", "underside")
-    scene = replace(
-        scene,
-        appearance=replace(scene.appearance, **{name: 0.08 * getattr(scene.appearance, name) for name in surfaces}),
-        cameras=replace(scene.cameras, n_frames=N, bit_depth=12),
-        sensor=replace(scene.sensor, read_noise_dn=0.05),
-    )
+    dark = replace(scene.appearance, **{name: 0.08 * getattr(scene.appearance, name) for name in surfaces})
+    cameras, sensor = replace(scene.cameras, n_frames=N, bit_depth=12), replace(scene.sensor, read_noise_dn=0.05)
+    scene = replace(scene, appearance=dark, cameras=cameras, sensor=sensor)
     q = motion_of(scene)[0](np.arange(N) / 1000.0)
     rig, disc = rig_of(scene), scene.declared_disc
     return render_disc(q, rig, disc, scene, np.random.default_rng(5)), rig, disc, q[:, :3]

@@ -77,10 +77,8 @@ def test_the_pattern_is_removed_to_the_noise_and_a_dead_pixel_is_filled(folder):
 def test_results_depend_on_the_flats_and_views_of_the_same_size_are_corrected(folder):
     plain, corrected = (declared(folder, flats) for flats in ("", ALL))
     assert open_pairs(plain).inputs() != open_pairs(corrected).inputs()
-    views = [
-        find_views("views/left*.png", "views/right*.png", folder, fields)
-        for fields in ((None, None), flat_fields(folder, corrected.sensors))
-    ]
+    fields = (None, None), flat_fields(folder, corrected.sensors)
+    views = [find_views("views/left*.png", "views/right*.png", folder, of_both) for of_both in fields]
     assert views[0].sha256() != views[1].sha256()
     one, other = (v.fields[0] for v in views)
     assert one is None

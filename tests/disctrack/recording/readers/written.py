@@ -11,7 +11,7 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from disctrack.errors import RecordingError
-from disctrack.recording.readers.base import FrameReader
+from disctrack.recording.readers import FrameReader, open_frames
 from tests.oracles.camera_files import write_cine, write_mraw
 
 N, HEIGHT, WIDTH = 30, 18, 22
@@ -31,6 +31,12 @@ def lost_of(reader: FrameReader, frames: np.ndarray) -> dict[int, str]:
         except RecordingError as error:
             lost[index] = str(error)
     return lost
+
+
+def assert_refused(folder: Path, pattern: str, said: str) -> None:
+    """Files of a left camera that cannot be opened, for a reason that is told."""
+    with pytest.raises(RecordingError, match=said):
+        open_frames(pattern, folder, "left")
 
 
 def write_sequence(folder: Path, images, suffix: str = "png", names=None) -> list[Path]:
