@@ -257,15 +257,16 @@ class DiscSystem(System):
         return self.model.with_values(effects)
 
     def starts(self, candidate: Candidate, values: Values, least: float = 0.0) -> Sequence[tuple[float, ...]]:
-        """For slip: coefficients at which the fitted motion would slip seldom, often, and most of the time.
+        """For slip: of coefficients at which the motion would slip seldom, often, or mostly, that nearest to the data.
 
         For others: values of the shape, where that has to be looked for.
         """
         if not candidate.threshold:
             return sought(self, candidate, values, least)
         motion = simulate(self.model_with(values), state_of(values), times=self.instants(values))
-        needed = float(np.max(motion.friction_needed))
-        return [(1.0 / (share * needed),) for share in SLIP_STARTS]
+        tried = 1.0 / (np.array(SLIP_STARTS) * np.max(motion.friction_needed))
+        left = [np.sum(self.linearise({**values, SLIP: inverse}, [])[0] ** 2) for inverse in tried]
+        return [(float(tried[np.argmin(np.nan_to_num(left, nan=np.inf))]),)]
 
     def instants(self, values: Values) -> Array:
         """(n,) true times of the frames [s], by the left camera."""
