@@ -526,23 +526,23 @@ class _Search:
             return no_fit(quantities, values)
 
     def _best_fit(self, current: Explanation, extra: Sequence[Candidate]) -> Fit | None:
-        """Refit with the extra candidates, from each of its starts where one acts beyond a threshold only."""
-        together = [*current.candidates, *extra]
-        starts: list[dict[str, float]] = [{}]
+        """Refit with the extra candidates; where one acts beyond a threshold only, from its start, if it has any."""
+        together, start = [*current.candidates, *extra], dict[str, float]()
         for c in extra:
             if c.threshold:
-                starts = [dict(zip(c.names, s, strict=True)) for s in self.system.starts(c, current.fit.values)]
+                if not (starts := self.system.starts(c, current.fit.values)):
+                    return None
+                start |= dict(zip(c.names, starts[0], strict=True))
         if extra and all(c.threshold for c in extra):
-            for start in starts:
-                followed = self._followed(current, together, start)
-                if followed is not None and self._at_noise(followed):
-                    return followed
-        fits = [self._fit(together, current.fit.values | start) for start in starts]
+            followed = self._followed(current, together, start)
+            if followed is not None and self._at_noise(followed):
+                return followed
+        fits = [self._fit(together, current.fit.values | start)]
         declared = {q.name: q.declared for q in self.system.base if q.declared is not None}
-        if declared and fits and not any(f.converged for f in fits):
+        if declared and not fits[0].converged:
             # without the effect the others may have gone so far to make up for it that no step leads back
             fits.append(self._fit(together, current.fit.values | declared))
-        return min(fits, key=lambda f: (not f.converged, f.cost)) if fits else None
+        return min(fits, key=lambda f: (not f.converged, f.cost))
 
     def _followed(self, current: Explanation, together: Sequence[Candidate], start: Values) -> Fit | None:
         """Refit that comes from longer and longer beginnings; None where one of them does not fit to the noise.

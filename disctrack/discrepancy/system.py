@@ -149,7 +149,7 @@ class System:
         raise NotImplementedError
 
     def starts(self, candidate: Candidate, values: Values, least: float = 0.0) -> Sequence[tuple[float, ...]]:
-        """Values from which refits of a candidate with a threshold begin, given a fit without it.
+        """Where a refit of a candidate with a threshold begins (at one place, or nowhere), given a fit without it.
 
         Of any other: of its shape, where the system knows where to look; none, where the shape's range is tried.
         least : gain to first order, below which a shape that has to be looked for is worth no refit

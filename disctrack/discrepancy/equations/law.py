@@ -224,8 +224,7 @@ class _Competition:
         self.far = not chi_square < FAR * self.noise * max(float(np.sum(system.weights)), 1.0)
         self.laws = tuple(_laws(system, self.begin, variables))
         self.looked = 2.0 * float(np.log(max(len(self.laws), 1)))
-        most = MOST_STATES / len(system.formulas.states)
-        self.shots = cut_short(system, most=most) if self.far else [system]
+        self.shots = cut_short(system) if self.far else [system]
 
     def view(self, system: EquationSystem) -> System:
         """With the noise as judged, where the samples are those that were judged."""

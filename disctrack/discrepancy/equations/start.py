@@ -178,13 +178,14 @@ def misfits(system: EquationSystem, values: dict[str, float]) -> Array:
     return np.asarray(np.sqrt(square / np.maximum(size, 1e-300)), float)
 
 
-def cut_short(system: EquationSystem, share: float = SHORT, most: float = np.inf) -> list[EquationSystem]:
+def cut_short(system: EquationSystem, share: float = SHORT) -> list[EquationSystem]:
     """The stretches cut into shares of a turn, and these joined two by two until they are whole again.
 
-    most : stretches that are used: those that begin where longer ones do
+    No more than MOST_STATES tell: those that begin where longer ones do.
     """
-    spacing = min(float(np.median(np.diff(s.time))) for s in ample(system))
-    duration = max(share * min(turn(s) for s in ample(system)), FEWEST * spacing)
+    most, long = MOST_STATES / len(system.formulas.states), ample(system)
+    spacing = min(float(np.median(np.diff(s.time))) for s in long)
+    duration = max(share * min(turn(s) for s in long), FEWEST * spacing)
     levels: list[list[Samples]] = []
     while not levels or len(levels[-1]) > len(system.stretches):
         levels.append([part for s in system.stretches for part in cut(s, duration)])
@@ -196,9 +197,8 @@ def cut_short(system: EquationSystem, share: float = SHORT, most: float = np.inf
 
 def led(system: EquationSystem, values: Values) -> Start:
     """Fit to short stretches that are joined two by two to the whole, or until the model loses the motion."""
-    most = MOST_STATES / len(system.formulas.states)
     for share in (SHORT, SHORT / 4):  # what turns and drifts, or is chaotic, may be followed for less
-        found = _led(cut_short(system, share, most), values)
+        found = _led(cut_short(system, share), values)
         if found.followed > 0.0:
             return found
     # short stretches do not tell a state that no sensor shows, as a known start of the whole may
