@@ -60,14 +60,14 @@ def common_modes(system: System, fit: Fit) -> tuple[Array, Array] | None:
     Of all directions in which they may, each counts as it is seen to scatter, and none for less than single numbers do.
     """
     residual, _ = system.linearise(fit.values, [])
-    along = system.together(fit.values, residual.shape[1])
     single, rows = third_differences(system, residual)
-    inside, _ = third_differences(system, (np.swapaxes(along, 1, 2) @ residual[..., None])[..., 0])
     full = system.weights[rows] >= residual.shape[1]  # missing numbers are zeros, not noise
-    single, inside = single[full], inside[full]
-    (k, width), b = single.shape, inside.shape[1]
+    k, width = single[full].shape
     if width < 2 or k < 4 * width:
         return None
+    along = system.together(fit.values, width)
+    inside, _ = third_differences(system, (np.swapaxes(along, 1, 2) @ residual[..., None])[..., 0])
+    single, inside, b = single[full], inside[full], along.shape[-1]
     variances, vectors = np.linalg.eigh(inside.T @ inside / (20.0 * k))
     others = (np.sum(single**2) - np.sum(inside**2)) / (20.0 * k * (width - b)) if b < width else np.median(variances)
     if not variances[-1] > MARGIN * (1.0 + np.sqrt(b * THIRD / k)) ** 2 * others:
