@@ -14,7 +14,7 @@ from disctrack.analyse.derivatives import differentiate
 from disctrack.analyse.quantities import propagate
 from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.diagnosis.errors import simulated
-from disctrack.diagnosis.large_faults import diagnose_with_large, find_clock, find_large
+from disctrack.diagnosis.large_faults import large_faults
 from disctrack.diagnosis.motion import slip_start
 from disctrack.diagnosis.starts import first_contact, first_motion
 from disctrack.diagnosis.stretch import free_stretch
@@ -22,7 +22,7 @@ from disctrack.diagnosis.systematic import find_systematic, with_noise_of_frames
 from disctrack.discrepancy.fit import TRIAL, Fit, fit
 from disctrack.discrepancy.held_out import HeldOut, held_out, training_rows
 from disctrack.discrepancy.noise import noise_variance
-from disctrack.discrepancy.search import FAR, Diagnosis, Found, Settings, beside, explain, threshold
+from disctrack.discrepancy.search import FAR, Diagnosis, Former, Found, Settings, beside, explain, threshold
 from disctrack.discrepancy.system import Candidate, GivenUp, Values
 from disctrack.errors import AnalysisError
 from disctrack.faults.clock_jump import clock_jumps, in_words, without_jumps
@@ -71,14 +71,30 @@ def _with_these_times(as_tracked: Trajectory, model: Model, faults: Values, sett
     systematic = find_systematic(rolling)
     # what fields leave in numbers that no pose takes is in the poses as well, and nothing that a motion could explain
     settings = replace(settings, at_noise=settings.at_noise * systematic.left)
-    assumed = find_large(as_tracked, rolling, systematic)
-    if assumed is None:
-        rolling = rolling.again(systematic=systematic)
-        base = fit(rolling, rolling.base, rolling.start())
-        assumed = None if base.converged else find_clock(rolling)
-    if assumed is not None:
-        return assumed.system, diagnose_with_large(assumed, settings), None
-    return _rolling_or_slipping(settings, rolling, base)
+    if (large := large_faults(as_tracked, rolling, systematic)) is not None:
+        system, former = large
+        without = system.start() | dict.fromkeys(system.known, 0.0) | dict(faults)
+        return system, _guided(system, without, settings, former, "the dots alone"), None
+    rolling = rolling.again(systematic=systematic)
+    return _rolling_or_slipping(settings, rolling, fit(rolling, rolling.base, rolling.start()))
+
+
+def _guided(system: DiscSystem, start: Values, settings: Settings, former: Former, source: str) -> Diagnosis:
+    """The diagnosis by a search that begins with these explanations, and remarks on those of them that are found."""
+    diagnosis = explain(system, start, settings, former=former)
+    found = (f.candidate for f in diagnosis.found if any(f.candidate.name in names for names in former))
+    return _noted(diagnosis, *(f"{c.title}: its initial guess is from {source}, as it is large" for c in found))
+
+
+def _by_clock(rolling: DiscSystem) -> Former:
+    """Initial guess by the frame rate at which the disc precesses as gravity determines for steady rolling."""
+    q = rolling.trajectory.q[rolling.rows]
+    good = np.isfinite(q).all(axis=1)
+    psidot = np.gradient(q[good, 3], rolling.time[good])
+    # a thin disc has psidot^2 sin(theta) = 4 g / r
+    speed = np.median(psidot**2 * np.sin(q[good, 4])) * rolling.disc.radius / (4 * rolling.model.gravity)
+    change = {"frame_rate.change": float(1.0 / np.sqrt(speed) - 1.0)}
+    return {frozenset(["frame_rate"]): rolling.again(known={**rolling.known, **change}).start()}
 
 
 def _rolling_or_slipping(settings: Settings, rolling: DiscSystem, base: Fit) -> Answer:
@@ -90,7 +106,10 @@ def _rolling_or_slipping(settings: Settings, rolling: DiscSystem, base: Fit) -> 
     onset = None if rolls else _onset(rolling)
     # shown are both: that it slips at the first frame, and that it rolls in the end
     if onset is None or not (onset.low > rolling.time[0] and np.isfinite(onset.high)):
-        return rolling, explain(rolling, base.values, settings), None
+        if base.converged:
+            return rolling, explain(rolling, base.values, settings), None
+        guessed = _guided(rolling, base.values, settings, _by_clock(rolling), "the precession, which gravity sets")
+        return rolling, guessed, None
     # the velocity at the contact is that of a rim as declared: where it is not round, what rolls seems to slip
     others = rolling.again(_without_slip(rolling))
     diagnosis = explain(others, base.values, settings)

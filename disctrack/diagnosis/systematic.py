@@ -226,13 +226,12 @@ def _with_faults(
         best, sizes, chosen = trials[name], sizes | {name: faults[name]}, (*chosen, name)
 
 
-def find_systematic(system: DiscSystem, known: Values | None = None, beside: Sequence[str] = ()) -> Systematic:
-    """Sizes of the systematic errors of the dots, next to whatever fault of the measurement explains them better.
+def find_systematic(system: DiscSystem) -> Systematic:
+    """Sizes of the systematic errors of the dots, with the faults of the measurement that explain them better.
 
-    known : values of faults that the poses were found with
-    beside : fit these faults along, and no others
+    The poses were found with the faults that the system knows.
     """
-    known, view = known or {}, system.about_poses(known or {})
+    known, view = system.known, system.about_poses(system.known)
     rows = np.flatnonzero(view.weights >= np.max(view.weights))
     if len(rows) < MIN_FRAMES:
         return Systematic()
@@ -264,9 +263,7 @@ def find_systematic(system: DiscSystem, known: Values | None = None, beside: Seq
     groups["dot"] = field(DOT_LENGTH * extent, own=True)
     steps: Array = size / view.per_px * 2.0 ** np.arange(-7, 4.5, 1.0)
     grids = {"print": DOT_SIGMA * 2.0 ** np.arange(7.0), "lens": steps, "dot": steps}
-    given = tuple(name for name in beside if name in faults)
-    start = {"rig": 1.0, "print": DOT_SIGMA} | {name: typical[name] for name in given}
-    offered = {name: typical[name] for name in faults if not beside}
+    start, offered = {"rig": 1.0, "print": DOT_SIGMA}, {name: typical[name] for name in faults}
     nothing, best = Likelihood(data, groups).twice_log(start), Systematic(gain=-np.inf)
     for share in (0.0, *LENS_LENGTHS):  # without any field, and with fields of the cameras as long
         sought, fields = (grids, {"lens": field(share * extent)}) if share else ({}, {})
@@ -278,7 +275,7 @@ def find_systematic(system: DiscSystem, known: Values | None = None, beside: Seq
         print_m, left = sizes["print"] if sizes["print"] > DOT_SIGMA else 0.0, max(1.0, evidence.left(sizes) / numbers)
         lens, dot = (sizes.get("lens", 0.0), share * extent), (sizes.get("dot", 0.0), DOT_LENGTH * extent)
         amounts = (
-            zip(of_poses[name], evidence.amounts(sizes, name).tolist(), strict=True) for name in (*given, *chosen)
+            zip(of_poses[name], evidence.amounts(sizes, name).tolist(), strict=True) for name in chosen
         )
         found = Systematic(*lens, *dot, print_m, value - nothing, dict(chain(*amounts)), left=left if share else 1.0)
         if not share or (found.present and found.gain > best.gain + WORTH):

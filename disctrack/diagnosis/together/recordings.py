@@ -8,7 +8,7 @@ import numpy as np
 from calibration.kit.arrays import Array
 from calibration.kit.least_squares import triangle
 from disctrack.diagnosis.disc_system import DiscSystem
-from disctrack.diagnosis.large_faults import find_large
+from disctrack.diagnosis.large_faults import large_faults
 from disctrack.diagnosis.model_file import PAPER, declared_model
 from disctrack.diagnosis.plan import Plan, Question, Say, open_questions, plan
 from disctrack.diagnosis.recorded import Recorded, first_to_mend
@@ -122,9 +122,8 @@ class DiscMember:
         declared, faults = declared_model(trajectory, model)
         self.system = DiscSystem(trajectory, declared, known=faults)
         self.systematic = find_systematic(self.system)
-        assumed = find_large(as_tracked, self.system, self.systematic)
-        if assumed is not None:
-            names = ", ".join(c.title for c in assumed.candidates)
+        if (large := large_faults(as_tracked, self.system, self.systematic)) is not None:
+            names = " or ".join(name for guess in large[1] for name in guess)
             raise AnalysisError(f"its dots show a large fault of the measurement ({names}): diagnose it alone")
 
     def told(self) -> tuple[Mapping[str, str], Systematic, list[Array]]:
