@@ -1,11 +1,11 @@
-"""What the diagnosis of a trajectory of the disc holds, and says in plain words."""
+"""The diagnosis of one trajectory of the disc, and its sentences."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from calibration.kit.brief import Brief
 from disctrack.diagnosis.disc_system import DiscSystem
-from disctrack.diagnosis.errors import LEVEL, Errors, LeftOver, Span
+from disctrack.diagnosis.errors import LEVEL, Errors, ResidualTests, ValidRange
 from disctrack.diagnosis.law_library import LearnedLaw, locked
 from disctrack.diagnosis.missing_force import Course
 from disctrack.diagnosis.plan import Plan
@@ -22,12 +22,12 @@ class Learned(Found):
 
     law: LearnedLaw
     power: float  # mean over the recording [W]; negative where it takes energy from the disc
-    course: Course | None  # of the moment about the contact of all laws, with what the law's form may be off by
-    misfit: float  # rms of that over the law's own, as the residual has it
+    course: Course | None  # moment of all laws about the contact, with the uncertainty of the law's form
+    misfit: float  # rms of the discrepancy of the form over that of the law
 
     def text(self, fit: Fit) -> str:
-        """The law with its numbers; where these do not stand out, its course alone is known."""
-        if self.course is not None and not self.law.stands_out(fit):
+        """The law with its coefficients; if they are not significant, only its time course."""
+        if self.course is not None and not self.law.is_significant(fit):
             return (
                 f"its form is not determined here: it is {self.course.text} (nearest of the library: {self.law.title})"
             )
@@ -50,21 +50,20 @@ class DiscDiagnosis(Brief):
     after: Errors | None = None
     energy: Mapping[str, float] = field(default_factory=dict)  # [J]
     learned: Learned | None = None
-    notes: tuple[str, ...] = ()  # on the frames that were diagnosed, and those that were not
-    holds: Mapping[str, Span | None] = field(default_factory=dict)  # where a model that fails does (`errors.regimes`)
-    left: LeftOver | None = None  # tests of the residual; None where too few rows are complete
-    plan: Plan | None = None  # recordings that would settle what is open, where it was asked for
+    notes: tuple[str, ...] = ()  # on frames that were left out, and on doubts
+    holds: Mapping[str, ValidRange | None] = field(default_factory=dict)  # of a model that fails elsewhere
+    tests: ResidualTests | None = None  # None if too few rows are complete
+    plan: Plan | None = None  # recordings that would answer the open questions, if requested
 
     def facts(self) -> dict[str, str]:
-        """What a glance should tell (`Brief`)."""
-        told = {"verdict": self.diagnosis.verdict, "says": self.sentence}
+        """The main facts (`Brief`)."""
         d = self.diagnosis
-        chi = [fit.reduced_chi_square for fit in (d.before, d.after)]
-        return told | {"reduced chi-square": f"{chi[0]:.4g} before, {chi[1]:.4g} after"}
+        chi = " before, ".join(f"{fit.reduced_chi_square:.4g}" for fit in (d.before, d.after))
+        return {"verdict": d.verdict, "says": self.sentence, "reduced chi-square": f"{chi} after"}
 
     @property
     def has_more(self) -> bool:
-        """Is the model after larger than that before?"""
+        """Has the model after more terms than that before?"""
         return bool(self.diagnosis.found) or self.learned is not None
 
     @property
@@ -82,8 +81,8 @@ class DiscDiagnosis(Brief):
         if self.learned is not None:
             first = f"Missing in the model: {effects}. " if effects else ""
             law = self.learned.text(diagnosis.after)
-            told = "described by " if self.learned.law.stands_out(diagnosis.after) else ""
-            return f"{first}A law is missing that the catalogue does not name; {told}{law}."
+            described = "described by " if self.learned.law.is_significant(diagnosis.after) else ""
+            return f"{first}A law is missing that the catalogue does not name; {described}{law}."
         if diagnosis.verdict == "nothing missing":
             return f"Nothing is missing{' in the motion' if self.remarks else ''}."
         if diagnosis.verdict == "found":
@@ -96,11 +95,11 @@ class DiscDiagnosis(Brief):
 
     @property
     def accuracy_text(self) -> str:
-        """What the model leaves unexplained, in the units of an experimenter; empty where there is no answer."""
+        """Size of the residuals; empty where there is no answer."""
         after, before = self.after, self.diagnosis.before.reduced_chi_square
         if after is None:
             return ""
-        white = self.left is None or self.left.white
+        white = self.tests is None or self.tests.white
         noise = " noise of" if white and self.diagnosis.verdict != "unexplained" and self.learned is None else ""
         chi, fell = after.reduced_chi_square, ""
         if before > chi + 1e-9:
@@ -112,22 +111,22 @@ class DiscDiagnosis(Brief):
 
     @property
     def remarks(self) -> list[str]:
-        """What the residuals say of the measurement, and where they are no noise."""
+        """Systematic errors of the measurement, and whether the residuals are noise."""
         if self.after is None:
             return []
         found = [_errors_of_dots(self.system.systematic)] if self.system.systematic.present else []
-        return found if self.left is None or self.left.white else [*found, _not_noise(self.left)]
+        return found if self.tests is None or self.tests.white else [*found, _not_noise(self.tests)]
 
 
 def unnamed(effects: str) -> str:
-    """What is said where the model fails, and `effects` are the nearest description, if there is one."""
+    """The verdict if the model fails; `effects` are the nearest description, if there is one."""
     if effects:
         return f"Something is missing that the catalogue does not name; the nearest description is {effects}."
     return "Something is missing that no effect of the catalogue describes."
 
 
 def _errors_of_dots(systematic: Systematic) -> str:
-    """The measurement's systematic errors, as far as the dots show them."""
+    """Systematic errors of the measurement, as estimated from the dots."""
     parts = []
     if systematic.lens_px:
         parts.append(f"{systematic.lens_px:.2g} px in the cameras' fields, over {systematic.lens_length_px:.0f} px")
@@ -139,12 +138,12 @@ def _errors_of_dots(systematic: Systematic) -> str:
     return f"The measurement has systematic errors{total} ({', '.join(parts)}), which all sigmas contain."
 
 
-def _not_noise(left: LeftOver) -> str:
-    where = "in the poses" if left.of_the_motion else "in all numbers of the dots alike"
-    if left.other_p_value >= LEVEL and not left.of_the_motion:
+def _not_noise(tests: ResidualTests) -> str:
+    where = "in the poses" if tests.of_the_motion else "in all components of the dots alike"
+    if tests.other_p_value >= LEVEL and not tests.of_the_motion:
         where = "in the poses, though no larger than the intrinsic scatter allows"
-    p = min(left.pose_p_value, left.other_p_value)
+    p = min(tests.pose_p_value, tests.other_p_value)
     return (
-        f"The residuals are not noise: autocorrelated (p {probability(p)}, corrected for {left.n_tests} tests), "
-        f"{where}: {left.pose_chi_square:.3f} of the noise in the poses, {left.other_chi_square:.3f} elsewhere."
+        f"The residuals are not noise: autocorrelated (p {probability(p)}, corrected for {tests.n_tests} tests), "
+        f"{where}: {tests.pose_chi_square:.3f} of the noise in the poses, {tests.other_chi_square:.3f} elsewhere."
     )

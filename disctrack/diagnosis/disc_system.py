@@ -13,7 +13,7 @@ from scipy.interpolate import CubicHermiteSpline, CubicSpline
 from calibration.kit.arrays import Array
 from calibration.kit.least_squares import triangle
 from disctrack.diagnosis.law_library import LearnedLaw
-from disctrack.diagnosis.missing_force import DiscScan, responding
+from disctrack.diagnosis.missing_force import DiscScan, response
 from disctrack.diagnosis.motion import (
     SLIP,
     SLIP_VELOCITY,
@@ -240,7 +240,7 @@ class DiscSystem(System):
         beside : quantities to be fitted beside a law, if not those of the fit. What the others do is given back to the
         residual to first order: so a law is looked for in their place, along a motion that follows the data.
         """
-        along = responding(self, fitted)
+        along = response(self, fitted)
         return None if along is None else DiscScan(self, fitted, beside, along)
 
     def knowing(self, law: LearnedLaw) -> DiscSystem:

@@ -1,4 +1,4 @@
-"""How far a fitted model is from the measurement, what it leaves, and where in the recording it holds."""
+"""Errors of a fitted model: residuals and their tests, free runs, energy balance, and where the model is valid."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -18,12 +18,12 @@ from disctrack.rolling import Motion, simulate
 from disctrack.rolling.motion import effect_power
 
 HALF_WINDOW = 0.01  # [s] over which the error at a horizon is averaged: some frames, a fraction of a turn
-LEVEL = 1e-4  # probability with which noise alone is called more than noise, over all tests of a residual
-DOUBTFUL = 0.05  # probability of what is left of the poses, below which laws outside the catalogue compete
-MUCH = 25.0  # variances of the noise, beyond which nobody can say what the motion lacks
-LIKE = 2.0  # times the excess of the numbers that no pose takes, up to which that of the poses is no motion's
+LEVEL = 1e-4  # significance level of the whiteness of a residual, over all its tests
+DOUBTFUL = 0.05  # p-value of the residuals of the poses, below which laws outside the catalogue compete
+MUCH = 25.0  # variances of the noise, beyond which errors of the measurement hide any effect of the motion
+LIKE = 2.0  # times the excess of the components that no pose absorbs, up to which that of the poses is explained by it
 
-Ahead = dict[str, float]  # errors of a free run some time ahead, and what the noise of the measurement alone would give
+Ahead = dict[str, float]  # errors of a free run at some horizon, and those that noise of the measurement alone causes
 
 
 @dataclass(frozen=True)
@@ -31,20 +31,20 @@ class Errors:
     """Errors of one model against one measurement."""
 
     reduced_chi_square: float  # of the dots in all images
-    reduced_chi_square_pose: float  # of the six numbers per frame that a pose can take
+    reduced_chi_square_pose: float  # of the six components per frame that a pose can absorb
     rms_px: float  # per image coordinate
     rms_position_um: float  # rms of measured minus fitted position, per axis
     rms_theta_mdeg: float  # rms of measured minus fitted nutation angle
-    ratio_to_floor: float  # free run: rms of the residual over what noise and the fit's own uncertainty allow
+    ratio_to_floor: float  # free run: rms of the residual over that expected from noise and the fit's uncertainty
     whiteness: Whiteness
 
 
 def errors(system: DiscSystem, fit_: Fit, held: HeldOut | None) -> Errors:
-    """All errors of a fit, and of the free run after the shorter fit."""
+    """All errors of a fit, and of the free run that follows a fit of the first part."""
     pose = system.pose_residual(fit_.values)
     present = system.weights >= 6
     error = system.coordinate_errors(fit_.values)[0][present]
-    # of the fitted quantities, those without a prior take their share of the pose's numbers
+    # fitted quantities without a prior reduce the degrees of freedom of the poses
     freedom = 6 * present.sum() - fit_.n_free
     return Errors(
         reduced_chi_square=fit_.reduced_chi_square,
@@ -58,17 +58,17 @@ def errors(system: DiscSystem, fit_: Fit, held: HeldOut | None) -> Errors:
 
 
 def frequencies(system: DiscSystem, values: Values) -> dict[str, float]:
-    """Frequencies [Hz] at which effects show: mean precession, nutation, spin of the body about the vertical."""
+    """Frequencies [Hz] of the effects: mean precession, nutation, spin, rotation of the body about the vertical."""
     q = system.poses(values)
     psi, phi = (q[-1, [3, 5]] - q[0, [3, 5]]) / (2 * np.pi * (system.time[-1] - system.time[0]))
-    # of nutation: between the thin disc's 0.775 and 0.84 at 40 degrees (corrected equations of Ma et al. 2014)
+    # nutation over precession: between the thin disc's 0.775 and 0.84 at 40 deg (corrected equations of Ma et al. 2014)
     turning = {"precession": psi, "spin": phi, "turn of the face": psi + phi, "nutation": 0.79 * psi}
     turning |= {"twice the precession": 2 * psi, "half the frame rate": 0.5 * system.rate}
     return {name: abs(float(f)) for name, f in turning.items()}
 
 
 def free_run(system: DiscSystem, held: HeldOut, horizon: float) -> Ahead | None:
-    """Errors of the free run at a horizon [s] after the last frame that was fitted; None beyond the recording."""
+    """Errors of the free run at a horizon [s] after the last fitted frame; None beyond the end of the recording."""
     last = system.time[~held.test_rows & (system.weights > 0)].max()
     near = np.abs(system.time - last - horizon) <= HALF_WINDOW
     near &= held.test_rows & (system.weights >= 6)
@@ -88,7 +88,7 @@ def simulated(system: DiscSystem, values: Values) -> Motion:
 
 
 def energy_balance(system: DiscSystem, values: Values) -> dict[str, float]:
-    """Energy lost in the recording [J], and the work of each effect, in the fitted motion."""
+    """Energy lost during the recording [J], and the part of it by each effect, in the fitted motion."""
     motion = simulated(system, values)
     balance = {"lost": float(motion.energy[0] - motion.energy[-1])}
     for effect in motion.model.effects:
@@ -102,52 +102,53 @@ def energy_balance(system: DiscSystem, values: Values) -> dict[str, float]:
 
 
 @dataclass(frozen=True)
-class LeftOver:
-    """Is what a fit leaves noise, and if not, is it of the motion or of the measurement?
+class ResidualTests:
+    """Are the residuals of a fit noise, and if not, are they caused by the motion or by the measurement?
 
-    A frame's dots are more numbers than a pose. What is missing in the motion shows in the six that a pose takes and in
-    no other; what is wrong with lenses, dots or light shows in all. Probabilities allow for the number of tests.
+    The dots of a frame have more components than a pose. An effect missing from the motion changes only the six
+    components that a pose can absorb; an error of lenses, dots or light changes all. P-values are corrected for the
+    number of tests (Bonferroni).
     """
 
-    pose_chi_square: float  # per number of the poses, over the noise
-    other_chi_square: float  # per number that no pose takes, over the noise
-    pose_p_value: float  # of so much memory in the poses' part, if it were noise: Ljung-Box, and lines
-    other_p_value: float  # likewise, of the rest: Ljung-Box
+    pose_chi_square: float  # per component of the poses, over the noise
+    other_chi_square: float  # per component that no pose absorbs, over the noise
+    pose_p_value: float  # of the autocorrelation (Ljung-Box) and of the lines in the spectrum of the poses' components
+    other_p_value: float  # of the autocorrelation of the others
     n_tests: int
 
     @property
     def white(self) -> bool:
-        """Is nothing to be seen but noise?"""
+        """Are the residuals white noise?"""
         return min(self.pose_p_value, self.other_p_value) >= LEVEL
 
     @property
     def of_the_motion(self) -> bool:
-        """Do the poses hold more than noise, and more than what the measurement is seen to do to all numbers?"""
-        return self.pose_p_value < LEVEL and not self.as_in_all
+        """Are the residuals of the poses not noise, and larger than errors of the measurement make them?"""
+        return self.pose_p_value < LEVEL and not self.alike
 
     @property
     def doubtful(self) -> bool:
         """May an effect of the motion be missing, although chi-square is that of noise?
 
-        The poses' part is less like noise than that of one recording in twenty, and the numbers that no pose takes do
-        not show as much of it: what those show is the measurement's, and is in the poses as well.
+        The residuals of the poses are significant at 5 %, and are not explained by errors of the measurement, which
+        would change the components that no pose absorbs by as much.
         """
-        return self.pose_p_value < DOUBTFUL and not (self.other_p_value < DOUBTFUL and self.as_in_all)
+        return self.pose_p_value < DOUBTFUL and not (self.other_p_value < DOUBTFUL and self.alike)
 
     @property
-    def as_in_all(self) -> bool:
-        """Do the numbers that no pose takes exceed the noise as the poses do?"""
+    def alike(self) -> bool:
+        """Do the components that no pose absorbs exceed the noise as those of the poses do?"""
         return self.pose_chi_square - 1.0 <= LIKE * max(self.other_chi_square - 1.0, 0.0)
 
     @property
     def of_the_measurement(self) -> bool:
-        """Is there more than noise, but as much in the numbers that no pose takes, and not much in all?"""
+        """Are the residuals larger than noise, but alike in all components, and not so large that they hide effects?"""
         excess = self.other_chi_square - 1.0
-        return 0.05 < excess < MUCH and self.as_in_all
+        return 0.05 < excess < MUCH and self.alike
 
 
-def left_over(system: DiscSystem, fit_: Fit, noise: float) -> LeftOver | None:
-    """Tests of what the fit leaves; None where too few rows are complete. noise : variance over that stated."""
+def residual_tests(system: DiscSystem, fit_: Fit, noise: float) -> ResidualTests | None:
+    """Tests of the residuals of a fit; None if too few rows are complete.   noise : variance over that stated"""
     most = np.max(system.weights)
     full = system.weights >= most
     n = int(full.sum())
@@ -156,7 +157,7 @@ def left_over(system: DiscSystem, fit_: Fit, noise: float) -> LeftOver | None:
     pose, other = (part[full] for part in system.parts_of_residual(fit_.values))
     tested = whiteness(pose, system.rate, {})
     lags, channels = min(20, max(1, n // 4)), other.shape[1]
-    return LeftOver(
+    return ResidualTests(
         float(np.sum(pose**2) / max(6 * n - fit_.n_free, 1) / noise),
         float(np.sum(other**2) / max((most - 6) * n, 1) / noise),
         min(1.0, 2 * tested.p_value, 2 * 6 * float(tested.peak_p_value.min())),
@@ -165,13 +166,15 @@ def left_over(system: DiscSystem, fit_: Fit, noise: float) -> LeftOver | None:
     )
 
 
-Span = Mapping[str, float]  # frames that the model describes, and the nutation at the end that lies in the recording
+ValidRange = Mapping[
+    str, float
+]  # frames that the model describes, and the nutation where they end within the recording
 
 
-def regimes(system: DiscSystem, judged: System, base: Fit, noise: float) -> dict[str, Span | None]:
-    """The longest beginning and the longest end that the base model describes to noise; None where it is too short.
+def valid_ranges(system: DiscSystem, judged: System, base: Fit, noise: float) -> dict[str, ValidRange | None]:
+    """Longest first part and longest last part that the base model describes to noise; None where it is too short.
 
-    judged : the system with its noise as found
+    judged : the system whitened by the noise that was found
     """
     frames = np.flatnonzero(system.weights > 0)
     theta = np.degrees(system.trajectory.q[system.rows, 4])
@@ -181,7 +184,7 @@ def regimes(system: DiscSystem, judged: System, base: Fit, noise: float) -> dict
         limit = noise * (1.0 + 4.0 * np.sqrt(2.0 / max(trial.degrees_of_freedom, 1)))  # four sigmas of chi-square
         return bool(trial.converged and trial.reduced_chi_square <= limit)
 
-    def longest(part: Callable[[int], NDArray[np.intp]], at: int) -> Span | None:
+    def longest(part: Callable[[int], NDArray[np.intp]], at: int) -> ValidRange | None:
         low, high = max(len(frames) // 5, MIN_FRAMES), len(frames)
         if low >= high or not holds(part(low)):
             return None
@@ -195,13 +198,13 @@ def regimes(system: DiscSystem, judged: System, base: Fit, noise: float) -> dict
     return {"first": longest(lambda k: frames[:k], -1), "last": longest(lambda k: frames[-k:], 0)}
 
 
-def where_it_holds(parts: Mapping[str, Span | None]) -> str:
-    """The longest parts in words."""
-    said = []
-    if first := parts["first"]:
-        said.append(f"holds until {first['stop']:.3f} s (nutation {first['theta_deg']:.2f} deg) and fails after")
-    if last := parts["last"]:
-        said.append(f"holds from {last['start']:.3f} s on (nutation {last['theta_deg']:.2f} deg)")
-    if not said:
-        return "The model fails throughout the recording: what is missing acts all the time."
-    return f"The model {'; and, fitted anew, it '.join(said)}."
+def validity_text(ranges: Mapping[str, ValidRange | None]) -> str:
+    """The valid ranges in words."""
+    texts = []
+    if first := ranges["first"]:
+        texts.append(f"holds until {first['stop']:.3f} s (nutation {first['theta_deg']:.2f} deg) and fails after")
+    if last := ranges["last"]:
+        texts.append(f"holds from {last['start']:.3f} s on (nutation {last['theta_deg']:.2f} deg)")
+    if not texts:
+        return "The model fails throughout the recording: the missing effect acts all the time."
+    return f"The model {'; refitted, it '.join(texts)}."

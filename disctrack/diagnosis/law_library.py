@@ -70,7 +70,7 @@ class LearnedLaw:
         """What the law means, in words."""
         return "; and ".join(family.title for family in self.families)
 
-    def stands_out(self, fitted: Fit) -> bool:
+    def is_significant(self, fitted: Fit) -> bool:
         """Do the coefficients of each of its families differ from zero, in a fit whose sigmas hold all doubts?"""
         return all(differ_from_zero(*fitted.amounts(names)) for names in self.amounts)
 

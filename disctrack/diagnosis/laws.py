@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from disctrack.diagnosis.disc_system import DiscSystem
-from disctrack.diagnosis.errors import LeftOver, left_over
+from disctrack.diagnosis.errors import ResidualTests, residual_tests
 from disctrack.diagnosis.law_library import MIN_SIGMAS, Family, LearnedLaw, differ_from_zero
 from disctrack.diagnosis.missing_force import Gain, law_of
 from disctrack.discrepancy.fit import TRIAL, Fit, fit
@@ -83,7 +83,7 @@ def learn(
 def _leaves_noise(known: DiscSystem, fitted: Fit, noise: float) -> bool:
     if fitted.reduced_chi_square > noise * (1.0 + 4.0 * float(np.sqrt(2.0 / np.sum(known.weights)))):
         return False
-    left = left_over(known, fitted, noise)
+    left = residual_tests(known, fitted, noise)
     return left is None or not left.of_the_motion
 
 
@@ -228,7 +228,7 @@ class WithLaw(Explanation):
 
 
 def explained_by_law(
-    system: DiscSystem, diagnosis: Diagnosis, left: LeftOver | None
+    system: DiscSystem, diagnosis: Diagnosis, left: ResidualTests | None
 ) -> tuple[WithLaw | None, Diagnosis]:
     """The explanation with a law if that is the shortest one; and the diagnosis with those with laws in its list.
 

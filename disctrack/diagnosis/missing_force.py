@@ -1,7 +1,7 @@
-"""How the disc answers to small moments and forces: the missing moment over time, and what each law would do.
+"""Linear response of the disc to small moments and forces: the missing moment over time, and the gain of each law.
 
-The motion's first-order response to any moment and force (rolling.simulate) turns every law of a library into a
-predicted residual, and the residual into the moment that the model fails to supply.
+The impulse response of the motion (Green's function, `rolling.simulate`) converts every law of a library into the
+residual that it would cause, and the measured residual into the moment that is missing from the model.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ if TYPE_CHECKING:
 
 PROBES_PER_TURN = 7  # of the fastest angle, so that a moment locked to it is resolved
 MAX_PROBES = 90
-WIDTH = 0.7  # of a probe over the distance to the next: their sum is flat to 1e-4
-TELLING = 0.3  # share of chi-square to first order, from which on it is said what the missing moment goes with
-INSTANTS_PER_SECOND = 1000.0  # of the responses: Simpson's rule errs by 0.4 % of a hum of 150 Hz
-INVISIBLE = 1e-8  # share of a column's power left after clearing, below which the data do not show it
-CHUNK = 120  # families of the library that are asked for at a time
+WIDTH = 0.7  # standard deviation of a probe over the spacing of the probes: their sum is flat to 1e-4
+CORRELATED = 0.3  # share of chi-square to first order, from which the report names the law that the moment follows
+INSTANTS_PER_SECOND = 1000.0  # of the responses: Simpson's rule errs by 0.4 % at 150 Hz
+INVISIBLE = 1e-8  # share of a column's power after projection, below which the data do not determine it
+CHUNK = 120  # families of the library that are evaluated at a time
 
 
-Along = tuple[Motion, Array, NDArray[np.intp]]  # a motion, how it answers, and which of its instants are the frames'
+Response = tuple[Motion, Array, NDArray[np.intp]]  # a motion, its Green's function, indices of the frames' instants
 
 
 @dataclass(frozen=True)
@@ -52,16 +52,16 @@ class Course:
 
     @property
     def text(self) -> str:
-        """How large a moment is, when it is largest, and from when to when it stands out."""
+        """Size of a moment, the instant of its maximum, and the interval in which it is significant."""
         size = np.sum(self.values**2, axis=1)
         rms, largest = np.sqrt(np.mean(self.values**2, axis=0)), self.time[np.argmax(size)]
         known = np.flatnonzero(size > MIN_SIGMAS**2 * np.sum(self.sigma**2, axis=1))
         text = (
-            f"a moment of {', '.join(f'{1e6 * x:.2g}' for x in rms)} uN m rms along n0, m0, k, or a force that does "
-            f"the same; it is largest at {largest:.3f} s"
+            f"a moment of {', '.join(f'{1e6 * x:.2g}' for x in rms)} uN m rms along n0, m0, k, or an equivalent "
+            f"force; it is largest at {largest:.3f} s"
         )
         first, last = self.time[known[[0, -1]]] if known.size else (largest, largest)
-        return f"{text} and stands out from {first:.3f} to {last:.3f} s" if last > first else text
+        return f"{text} and significant from {first:.3f} to {last:.3f} s" if last > first else text
 
 
 @dataclass(frozen=True)
@@ -76,10 +76,11 @@ class Probed:
 
 
 def missing_moment(blocks: Probed, scale: float | None = None) -> tuple[Course, float]:
-    """The moment that the model fails to supply, smooth over the distance of the probes, and its scale.
+    """The moment that is missing from the model, smooth over the spacing of the probes, and its scale.
 
-    scale : [N m] that its second differences have before the data; if not given, that which makes the data most
-    probable (empirical Bayes)
+    A Gaussian process whose second differences are independent.
+    scale : [N m] prior standard deviation of the second differences; by default that of the largest marginal
+        likelihood (empirical Bayes)
     """
     R, k = np.vstack([blocks.data, blocks.prior]), len(blocks.time)
     right, fitted, probes = R[:, -1], R[:, : blocks.n_fitted], R[:, blocks.n_fitted : -1]
@@ -90,7 +91,7 @@ def missing_moment(blocks: Probed, scale: float | None = None) -> tuple[Course, 
     U, shown, V = np.linalg.svd(probes @ root, full_matrices=False)
     sizes = np.logspace(-9, -1, 65)  # [N m] prior standard deviation of the second difference
     a = float(sizes[int(np.argmin(evidence(shown, U.T @ right, sizes)))]) if scale is None else scale
-    known = (a * shown) ** 2 / (1 + (a * shown) ** 2)  # share of each combination that the data tell
+    known = (a * shown) ** 2 / (1 + (a * shown) ** 2)  # share of each combination that the data determine
     along = root @ V.T
     moment = along @ (known * (U.T @ right) / np.where(shown > 0, shown, 1.0))
     variance = a**2 * (np.sum(root**2, axis=1) - np.sum(along**2 * known, axis=1))
@@ -99,21 +100,21 @@ def missing_moment(blocks: Probed, scale: float | None = None) -> tuple[Course, 
     return Course(blocks.time, factor * moment.reshape(3, k).T, factor * sigma.reshape(3, k).T), a
 
 
-def what_is_missing(system: DiscSystem, fit_: Fit) -> str:
-    """The missing moment in words, and the angle or rate that it goes with; empty where the disc slips."""
+def missing_text(system: DiscSystem, fit_: Fit) -> str:
+    """The missing moment in words, and the law that it follows approximately; empty if the disc slips."""
     blocks, scan = probe(system, fit_), system.scan(fit_)
     if blocks is None or scan is None:
         return ""
     missing, _ = missing_moment(blocks)
     gains = scan.gains(family for family in scan.library() if not family.shape and family.n_numbers <= 2)
     best = max(gains, key=lambda g: g.gain)
-    text = f"what the model lacks is {missing.text}"
+    text = f"missing in the model is {missing.text}"
     share = best.gain / scan.chi_square
-    return f"{text}; {100 * share:.0f} % of it would be {best.family.title}" if share > TELLING else text
+    return f"{text}; {100 * share:.0f} % of it is described by {best.family.title}" if share > CORRELATED else text
 
 
-def responding(system: DiscSystem, fit_: Fit) -> Along | None:
-    """The fitted motion with its responses, and which instants are the frames'; None where it does not roll."""
+def response(system: DiscSystem, fit_: Fit) -> Response | None:
+    """The fitted motion with its Green's function, and the indices of the frames; None if it does not roll."""
     instants = system.instants(fit_.values)
     per_frame = int(np.ceil(INSTANTS_PER_SECOND * float(np.median(np.diff(instants)))))
     n = len(instants)
@@ -123,14 +124,15 @@ def responding(system: DiscSystem, fit_: Fit) -> Along | None:
 
 
 def probe(system: DiscSystem, fit_: Fit, other: Values | None = None) -> Probed | None:
-    """Responses of the dots to short moments along n0, m0, k, compressed part by part; None where the disc slips.
+    """Responses of the dots to short moments along n0, m0, k, as a compressed least-squares problem.
 
-    other : values whose prediction takes the place of the data, so that its moment is read in the same way
+    None if the disc slips.
+    other : values whose prediction replaces the data, so that its moment is estimated in the same way
     """
-    along = responding(system, fit_)
-    if along is None:
+    found = response(system, fit_)
+    if found is None:
         return None
-    motion, kernel, frames = along
+    motion, kernel, frames = found
     span = float(motion.time[-1] - motion.time[0])
     turns = max(float(np.abs(motion.q[-1, i] - motion.q[0, i])) / (2 * np.pi) for i in (3, 5))
     k = int(np.clip(np.ceil(PROBES_PER_TURN * turns), 20, MAX_PROBES))
@@ -139,7 +141,9 @@ def probe(system: DiscSystem, fit_: Fit, other: Values | None = None) -> Probed 
     right, matrix = prior_rows(fit_.quantities, fit_.values)
     if other is not None:
         residual = residual - system.linearise(other, [])[0]
-        right = right - prior_rows(fit_.quantities, {**fit_.values, **other})[0]  # numbers strained before may relax
+        right = (
+            right - prior_rows(fit_.quantities, {**fit_.values, **other})[0]
+        )  # quantities may return to their priors
     bells = np.exp(-0.5 * ((motion.time[:, None] - middles) / (WIDTH * span / k)) ** 2)
     courses = np.zeros((len(bells), len(COMPONENTS), 3, k))
     for i in range(3):
@@ -154,7 +158,7 @@ def probe(system: DiscSystem, fit_: Fit, other: Values | None = None) -> Probed 
 
 @dataclass(frozen=True)
 class Gain:
-    """What a family gains to first order."""
+    """Decrease of chi-square by a family to first order."""
 
     family: Family
     gain: float  # decrease of chi-square
@@ -162,9 +166,9 @@ class Gain:
 
 
 def proposal(family: Family, gram: Array, before: Array, right: Array) -> Gain:
-    """Gain and values from the normal equations of one family; directions that nothing shows count for nothing.
+    """Gain and values from the normal equations of one family; undetermined directions are left out.
 
-    before : (k,) squares of its columns as they were before what is fitted was cleared out
+    before : (k,) squares of its columns before the fitted quantities were projected out
     """
     size = np.sqrt(np.maximum(before, 1e-300))
     eigenvalues, vectors = np.linalg.eigh(gram / np.outer(size, size))
@@ -175,15 +179,16 @@ def proposal(family: Family, gram: Array, before: Array, right: Array) -> Gain:
 
 
 class DiscScan:
-    """Gains of families at one fit. All that is asked of a frame's dots is compressed to the eight numbers of a state.
+    """Gains of families at one fit, to first order; the dots of a frame are compressed to the eight initial conditions.
 
-    A column of the least-squares problem is D g: D (n, w, 8) by the initial state, g (n, 8) the response. Inner
-    products of columns, cleared of what the fitted quantities W absorb, are sums over g' (D' D) g less those of W' D g.
+    A column of the least-squares problem is D g: D (n, w, 8) the derivative by the initial state, g (n, 8) the response
+    as a shift of that state. Inner products of columns orthogonal to those of the fitted quantities, with orthonormal
+    basis W, are the sums over frames of g' (D' D) g minus the products of the sums of W' D g.
 
-    beside : as of `DiscSystem.scan`
+    beside : as for `DiscSystem.scan`
     """
 
-    def __init__(self, system: DiscSystem, fit_: Fit, beside: Sequence[Quantity] | None, along: Along) -> None:
+    def __init__(self, system: DiscSystem, fit_: Fit, beside: Sequence[Quantity] | None, along: Response) -> None:
         self.motion, self._kernel, self._frames = along
         self._rate, self._disc = float(1.0 / np.median(np.diff(system.time))), system.disc
         fitted = fit_.quantities if beside is None else tuple(beside)
@@ -212,7 +217,7 @@ class DiscScan:
         space |= {f: getattr(np, f) for f in ("cos", "sin", "exp", "sqrt", "log")}
         space |= {"magnitude": np.abs, "sign": lambda x, width: x / np.sqrt(x * x + width * width)}
         self._space, self._courses = space, dict[str, Array]()
-        # what a law adds to the load changes its own moment in second order
+        # the change of the load by the law itself is of second order
         self._load = self.motion.contact_force[:, 2]
 
     def _course(self, formula: str) -> Array:
@@ -222,11 +227,11 @@ class DiscScan:
         return self._courses[formula]
 
     def library(self) -> list[Family]:
-        """The laws that are looked for along this motion."""
+        """The laws that are tried along this motion."""
         return list(families(self.motion.q, self.motion.time, self._rate, self._disc))
 
     def gains(self, chosen: Iterable[Family]) -> list[Gain]:
-        """What each would gain."""
+        """Gain of each family."""
         everything = list(chosen)
         parts = (everything[first : first + CHUNK] for first in range(0, len(everything), CHUNK))
         return [gain for part in parts for gain in self._gains(part)]
@@ -256,9 +261,9 @@ class DiscScan:
 
 
 def law_of(model: Model, chosen: Sequence[Family], values: Array) -> LearnedLaw:
-    """The effect by formula of these families; values (k,): family by family, coefficients and then shapes.
+    """The sum of these families as an effect; values (k,): of each family the coefficients, then the shape.
 
-    It is called "learned", or "learned_2" and so on where the model has learned laws already.
+    Its name is "learned", or "learned_2" and so on if the model has learned laws already.
     """
     names = ("learned", *(f"learned_{i}" for i in range(2, len(model.effects) + 2)))
     name = next(name for name in names if model.effect(name) is None)

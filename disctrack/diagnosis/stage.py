@@ -11,17 +11,24 @@ from calibration.kit.brief import Brief
 from calibration.kit.threads import one_blas_thread
 from disctrack.diagnosis.answer import DiscDiagnosis, Learned
 from disctrack.diagnosis.disc_system import DiscSystem
-from disctrack.diagnosis.errors import LeftOver, energy_balance, errors, left_over, regimes, where_it_holds
-from disctrack.diagnosis.evidence import evidence
+from disctrack.diagnosis.errors import (
+    ResidualTests,
+    energy_balance,
+    errors,
+    residual_tests,
+    valid_ranges,
+    validity_text,
+)
 from disctrack.diagnosis.form_misfit import with_form
 from disctrack.diagnosis.laws import WithLaw, explained_by_law, judged_as
-from disctrack.diagnosis.missing_force import what_is_missing
+from disctrack.diagnosis.missing_force import missing_text
 from disctrack.diagnosis.model_file import PAPER, declared_model, model_toml
 from disctrack.diagnosis.pages.output import as_json, write_diagnosis
 from disctrack.diagnosis.pages.report import report_of
 from disctrack.diagnosis.plan import open_questions, plan
 from disctrack.diagnosis.recorded import read_recorded
 from disctrack.diagnosis.slip_start import diagnose_motion, with_slip
+from disctrack.diagnosis.supplement import supplement
 from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.held_out import held_out, training_rows
 from disctrack.discrepancy.noise import with_memory
@@ -57,7 +64,7 @@ class DiagnoseOutcome(Brief):
 @one_blas_thread
 @checked
 def diagnose(trajectory: Trajectory, model: str = PAPER, settings: Settings | None = None) -> DiscDiagnosis:
-    """What does the model lack? Fit, trace, refit, judge.
+    """Which effect is missing from the model? Fit, search, refit, test.
 
     model : "paper", "none", or a TOML file (`model_file.declared_model`)
     Raises AnalysisError, SceneError, ModelError.
@@ -69,28 +76,28 @@ def diagnose(trajectory: Trajectory, model: str = PAPER, settings: Settings | No
     system, diagnosis, rolling = diagnose_motion(trajectory, declared, faults, settings)
     if diagnosis.held_out_before is None or diagnosis.held_out_after is None:
         return DiscDiagnosis(system, diagnosis, str(model), notes=diagnosis.remarks)
-    left = left_over(system, diagnosis.after, diagnosis.noise)
-    diagnosis = judged_by_what_is_left(diagnosis, left)
-    found, diagnosis = explained_by_law(system, diagnosis, left)
+    tests = residual_tests(system, diagnosis.after, diagnosis.noise)
+    diagnosis = _verdict_by_residuals(diagnosis, tests)
+    found, diagnosis = explained_by_law(system, diagnosis, tests)
     holds, learned, notes = {}, None, diagnosis.remarks
     if diagnosis.verdict == "unexplained":
-        holds = regimes(system, judged_as(diagnosis, system), diagnosis.before, diagnosis.noise)
-        notes = (*notes, where_it_holds(holds), "" if found else what_is_missing(system, diagnosis.after))
+        holds = valid_ranges(system, judged_as(diagnosis, system), diagnosis.before, diagnosis.noise)
+        notes = (*notes, validity_text(holds), "" if found else missing_text(system, diagnosis.after))
     if found is not None:
-        system, learned, diagnosis, doubted = _with_law(system, diagnosis, found)
-        left, notes = left_over(system, diagnosis.after, diagnosis.noise), (*notes, *doubted)
+        system, learned, diagnosis, not_claimed = _with_law(system, diagnosis, found)
+        tests, notes = residual_tests(system, diagnosis.after, diagnosis.noise), (*notes, *not_claimed)
     else:
         diagnosis = replace(diagnosis, after=with_memory(judged_as(diagnosis, system), diagnosis.after))
     notes = (*notes, "" if system.budget.open() else USED_UP)
     diagnosis = with_slip(system, diagnosis, rolling)
     before = errors(system, diagnosis.before, diagnosis.held_out_before)
     after = errors(system, diagnosis.after, diagnosis.held_out_after)
-    energy, said = energy_balance(system, diagnosis.after.values), tuple(note for note in notes if note)
-    return DiscDiagnosis(system, diagnosis, str(model), before, after, energy, learned, said, holds, left)
+    energy, texts = energy_balance(system, diagnosis.after.values), tuple(note for note in notes if note)
+    return DiscDiagnosis(system, diagnosis, str(model), before, after, energy, learned, texts, holds, tests)
 
 
 def with_plan(result: DiscDiagnosis) -> DiscDiagnosis:
-    """The diagnosis with the recordings that would settle what it leaves open; as it is where it has no answer."""
+    """The diagnosis with further recordings that would answer its open questions; unchanged if it has no answer."""
     diagnosis = result.diagnosis
     if result.after is None or not diagnosis.after.converged:
         return result
@@ -100,22 +107,25 @@ def with_plan(result: DiscDiagnosis) -> DiscDiagnosis:
     return replace(result, plan=plan(result.system, diagnosis.after, questions, diagnosis.noise))
 
 
-def judged_by_what_is_left(diagnosis: Diagnosis, left: LeftOver | None) -> Diagnosis:
-    """The verdict on the motion: what is left may be its, although chi-square is small, or the measurement's."""
-    if left is None or not diagnosis.after.converged:
+def _verdict_by_residuals(diagnosis: Diagnosis, tests: ResidualTests | None) -> Diagnosis:
+    """The verdict, corrected by whether the residuals are those of the motion or of the measurement.
+
+    Residuals may be autocorrelated although chi-square is small, and chi-square may be large by errors of the dots.
+    """
+    if tests is None or not diagnosis.after.converged:
         return diagnosis
     verdict, but = diagnosis.verdict, ""
-    if verdict != "unexplained" and left.of_the_motion:
+    if verdict != "unexplained" and tests.of_the_motion:
         verdict = "unexplained"
         but = (
-            f"are not noise (p = {left.pose_p_value:.1g} over {left.n_tests} tests), while those that no pose can "
+            f"are not noise (p = {tests.pose_p_value:.1g} over {tests.n_tests} tests), while those that no pose can "
             "absorb are"
         )
-    elif verdict == "unexplained" and left.of_the_measurement:
+    elif verdict == "unexplained" and tests.of_the_measurement:
         verdict = "found" if diagnosis.found else "nothing missing"
         but = (
-            f"({left.pose_chi_square:.3g} of the noise) are no more than errors of the measurement leave in those "
-            f"that no pose can absorb ({left.other_chi_square:.3g})"
+            f"({tests.pose_chi_square:.3g} of the noise) are no more than errors of the measurement leave in those "
+            f"that no pose can absorb ({tests.other_chi_square:.3g})"
         )
     reason = f"{diagnosis.reason}; but the residuals of the poses {but}" if but else diagnosis.reason
     return replace(diagnosis, verdict=verdict, reason=reason)
@@ -124,7 +134,7 @@ def judged_by_what_is_left(diagnosis: Diagnosis, left: LeftOver | None) -> Diagn
 def _with_law(
     system: DiscSystem, diagnosis: Diagnosis, found: WithLaw
 ) -> tuple[DiscSystem, Learned, Diagnosis, tuple[str, ...]]:
-    """The system that knows the law, the law with its course, the diagnosis with it, and remarks."""
+    """The system extended by the law, the law with its time course, the diagnosis with it, and remarks."""
     law, fitted, kept, noise = found.law, found.fit, found.kept, diagnosis.noise
     known = system.knowing(law)
     judged = judged_as(diagnosis, known)
@@ -133,11 +143,11 @@ def _with_law(
     held_gain = held.gain_over(diagnosis.held_out_before, noise)
     work = energy_balance(known, fitted.values)[f"by {law.candidate.name}"]
     power = -work / float(known.time[-1] - known.time[0])
-    left = left_over(known, fitted, noise)
-    as_found = known, with_memory(judged, fitted), law, noise, left is not None and not left.white
+    tests = residual_tests(known, fitted, noise)
+    as_found = known, with_memory(judged, fitted), law, noise, tests is not None and not tests.white
     after, of_another, course, misfit = with_form(*as_found, _of_motion(kept))
-    established, doubted = _beside_any_form(kept, of_another, law.looked)
-    if _of_motion(established):  # what holds beside any law does not stand in with this one
+    established, not_claimed = _for_any_form(kept, of_another, law.looked)
+    if _of_motion(established):  # an effect that is significant with any form of the law is no part of its misfit
         after, _, course, misfit = with_form(*as_found, _of_motion(f for f in kept if f not in established))
     gain = (diagnosis.before.cost - fitted.cost) / noise
     learned = Learned(law.candidate, gain, held_gain, np.nan, (), law, power, course, misfit)
@@ -145,28 +155,29 @@ def _with_law(
     diagnosis = replace(
         diagnosis, verdict="unexplained", found=established, after=after, held_out_after=held, reason=reason
     )
-    return known, learned, diagnosis, doubted
+    return known, learned, diagnosis, not_claimed
 
 
-def _beside_any_form(kept: Sequence[Found], fitted: Fit, looked: float) -> tuple[tuple[Found, ...], tuple[str, ...]]:
-    """Effects beside a law that stand out although the law's form may be another; and a note of each of the others.
+def _for_any_form(kept: Sequence[Found], fitted: Fit, looked: float) -> tuple[tuple[Found, ...], tuple[str, ...]]:
+    """Effects that are significant even if the law has another form; and a note on each of the others.
 
-    These stay in the fit: with the law they describe the data.
-    kept : effects beside the law.   fitted : with sigmas as they are if the law's form is another's: a library seldom
-    holds the law that no catalogue names.   looked : chi-square that a law pays for having been looked for; so does an
-    effect whose place or frequency was
+    The others stay in the fit: together with the law they describe the data.
+    kept : effects fitted with the law
+    fitted : with standard deviations that hold if the law has another form than the one selected from the library
+    looked : chi-square by which the selection of a law is corrected for multiple comparisons; an effect whose place or
+        frequency was searched for is corrected likewise
     """
     established, notes = list[Found](), list[str]()
     for found in kept:
         candidate = found.candidate
-        shape = {q.name for q in candidate.shape}  # an exponent or a frequency is no amount
+        shape = {q.name for q in candidate.shape}  # an exponent or a frequency has no null hypothesis of zero
         gain = wald(*fitted.amounts([name for name in candidate.names if name not in shape]))
         if gain > found.threshold + looked * candidate.sought:
             established.append(found)
             continue
         notes.append(
-            f"{candidate.title} [{candidate.name}] helps the law to describe the data, and is not claimed: with what "
-            f"the law's form may be off by it stands out by {np.sqrt(gain):.2g} sigma"
+            f"{candidate.title} [{candidate.name}] is fitted with the law but not claimed: if the law has another form "
+            f"its significance is {np.sqrt(gain):.2g} sigma"
         )
     return tuple(established), tuple(notes)
 
@@ -187,8 +198,8 @@ def run_diagnose(
 ) -> DiagnoseOutcome:
     """Diagnose a trajectory file; write diagnosis.json, diagnosis.html with figures, model.toml, and the file's group.
 
-    output : folder; without it `<name>_diagnosis` beside the file
-    settle : also compute which further recordings would settle what is left open
+    output : folder; by default `<name>_diagnosis` next to the file
+    settle : also compute which further recordings would answer the open questions
     figures : also write every figure of the page as PNG and PDF
     Raises TrajectoryFileError, AnalysisError, SceneError, ModelError, OutputError.
 
@@ -196,7 +207,7 @@ def run_diagnose(
         >>> sorted(file.name for file in outcome.files)[:2]
         ['diagnosis.html', 'diagnosis.json']
     """
-    from disctrack.diagnosis.pages.figures import all_figures  # matplotlib is wanted here only
+    from disctrack.diagnosis.pages.figures import all_figures  # needs matplotlib
 
     path = trajectory_in(Path(path))
     keep(path)
@@ -212,13 +223,13 @@ def run_diagnose(
     except AnalysisError as error:
         raise AnalysisError(f"{path}: {error}") from error
     result = with_plan(result) if settle else result
-    beside = evidence(result) if result.before is not None else None
-    document = {"recording": recorded.name, **as_json(result, beside)}
-    write_diagnosis(path, result, beside, document)
+    more = supplement(result) if result.before is not None else None
+    document = {"recording": recorded.name, **as_json(result, more)}
+    write_diagnosis(path, result, more, document)
     write_whole(report, json_file(document))
     write_whole(toml, model_toml(result.system, result.diagnosis.after.values, recorded.name).encode())
     whole = report_of(
-        result, beside, recorded.name, all_figures(result, beside), carried(recorded.trajectory.findings),
+        result, more, recorded.name, all_figures(result, more), carried(recorded.trajectory.findings),
         files=(page, report, toml, path),
     )  # fmt: skip
     files = write_page(page, whole, ("png", "pdf") if figures else ())

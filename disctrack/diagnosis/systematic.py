@@ -27,7 +27,6 @@ from disctrack.trajectory import MarkerStatus, Trajectory
 
 if TYPE_CHECKING:
     from disctrack.diagnosis.disc_system import DiscSystem
-    from disctrack.discrepancy.system import Values
 
 
 INFLATED = 0.8  # variance from frame to frame over that stated, below which the statement holds more than noise
@@ -274,9 +273,7 @@ def find_systematic(system: DiscSystem) -> Systematic:
             value, sizes = _best_sizes(evidence, start | {name: typical[name] for name in chosen}, sought)
         print_m, left = sizes["print"] if sizes["print"] > DOT_SIGMA else 0.0, max(1.0, evidence.left(sizes) / numbers)
         lens, dot = (sizes.get("lens", 0.0), share * extent), (sizes.get("dot", 0.0), DOT_LENGTH * extent)
-        amounts = (
-            zip(of_poses[name], evidence.amounts(sizes, name).tolist(), strict=True) for name in chosen
-        )
+        amounts = (zip(of_poses[name], evidence.amounts(sizes, name).tolist(), strict=True) for name in chosen)
         found = Systematic(*lens, *dot, print_m, value - nothing, dict(chain(*amounts)), left=left if share else 1.0)
         if not share or (found.present and found.gain > best.gain + WORTH):
             best = found

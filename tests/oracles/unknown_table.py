@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from disctrack import Model, diagnose
-from disctrack.diagnosis.errors import left_over, simulated
+from disctrack.diagnosis.errors import residual_tests, simulated
 from tests.oracles.required_wrench import required_wrench
 from tests.oracles.unknown_laws import UNKNOWN, Recording, recording
 
@@ -35,7 +35,7 @@ def trial(name: str, seed: int) -> dict:
     began = time.process_time()
     result = diagnose(made.trajectory)
     seconds = time.process_time() - began
-    left = left_over(result.system, result.diagnosis.after, result.diagnosis.noise) if result.after else None
+    left = residual_tests(result.system, result.diagnosis.after, result.diagnosis.noise) if result.after else None
     said = result.sentence
     as_noise = ("Residuals: noise" in said or "Nothing is missing" in said) and "not noise" not in said
     answer = {

@@ -9,7 +9,7 @@ import pytest
 
 from disctrack import Provenance, diagnose, read_group, read_trajectory, write_trajectory
 from disctrack.cli import main
-from disctrack.diagnosis.evidence import evidence, force_of
+from disctrack.diagnosis.supplement import force_of, supplement
 from disctrack.synthetic.description import load_scene
 from disctrack.synthetic.motion import simulate_scene
 from tests.oracles.measured_disc import measured
@@ -68,7 +68,7 @@ def test_group_holds_the_moment_and_force_that_were_missing(diagnosed):
 def test_what_was_found_supplies_the_missing_force(diagnosed):
     """Two routes: accelerations of the poses without a model, and the force of the enlarged model."""
     result = diagnose(read_trajectory(diagnosed[0]))
-    beside = evidence(result)
+    beside = supplement(result)
     added = force_of(result.system, result.diagnosis.after) - force_of(result.system, result.diagnosis.before)
     missing, sigma = beside.force.values, beside.force.sigma
     inner = slice(30, -30)

@@ -11,8 +11,8 @@ from scipy.signal import periodogram
 from calibration.kit.arrays import Array
 from disctrack.diagnosis.answer import DiscDiagnosis
 from disctrack.diagnosis.errors import frequencies, simulated
-from disctrack.diagnosis.evidence import Evidence, force_of
 from disctrack.diagnosis.missing_force import Course
+from disctrack.diagnosis.supplement import Supplement, force_of
 from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.held_out import HeldOut
 from disctrack.discrepancy.search import threshold
@@ -21,26 +21,25 @@ from disctrack.report.palette import AMBER, BLUE, GRID, INK, MUTED, RED
 
 N_TRIED = 14
 MISSING_MOMENT = (
-    "Contact moment M_n, M_m, M_z that the model before fails to supply: what short moments would have to be for the "
-    "dots to lie where they did. A missing force, inertia or an error of the measurement shows as the moment that does "
-    "the same."
+    "Contact moment M_n, M_m, M_z that is missing from the model before, estimated from the residuals of the dots by "
+    "its impulse response. A missing force, inertia or an error of the measurement appears as the equivalent moment."
 )
-OF_LAW = " Blue is what was found, computed in the same way: within the band it is what was missing."
+OF_LAW = " Blue: moment of the effects found, estimated in the same way; within the band it explains the residuals."
 MISSING_FORCE = (
-    "Force on the disc, measured minus that of the model before: mass times the acceleration of the centre, from the "
-    "poses alone."
+    "Force on the disc, measured minus that of the model before. Measured: mass times the acceleration of the centre, "
+    "the second derivative of the poses."
 )
 COURSE_OF_LAWS = (
-    "Moment about the contact of all laws of the model and of the law outside the catalogue, a force at the centre "
-    "included as the moment that it has about the contact. The band holds what the law's form may be off by "
-    "({:.2g} % of the law) and the other laws that fit as well."
+    "Moment about the contact of all laws of the model and of the law outside the catalogue; forces at the centre are "
+    "included. The band contains the uncertainty of the law's form ({:.2g} % of the law) and the other laws that fit "
+    "as well."
 )
 
-Side = tuple[Fit, HeldOut | None, str, str]  # the fit of a model, its free run, its name, its colour
+Side = tuple[Fit, HeldOut | None, str, str]  # fit of a model, its free run, name and colour
 
 
 def _sides(result: DiscDiagnosis) -> list[Side]:
-    """The models that are shown: before and after, or the only one where nothing was added to it."""
+    """The models that are shown: before and after, or the only one if nothing was added to it."""
     after = result.diagnosis.after, result.diagnosis.held_out_after
     if not result.has_more:
         return [(*after, "model", BLUE)]
@@ -48,21 +47,21 @@ def _sides(result: DiscDiagnosis) -> list[Side]:
     return [(*before, "model before", RED), (*after, "model after", BLUE)]
 
 
-def all_figures(result: DiscDiagnosis, beside: Evidence | None) -> tuple[Drawn, ...]:
-    """Every figure of a diagnosis whose base fit converged; of another what was tried."""
-    if beside is None:
+def all_figures(result: DiscDiagnosis, more: Supplement | None) -> tuple[Drawn, ...]:
+    """All figures of a diagnosis whose base fit converged; otherwise only that of the candidates."""
+    if more is None:
         return (candidates(result),) if result.diagnosis.tried else ()
-    over_time, path = superposed(result, beside)
+    over_time, path = superposed(result, more)
     found = [over_time, residuals(result), spectrum(result), free_run(result)]
-    found += [*_missing(result, beside), candidates(result), path]
+    found += [*_missing(result, more), candidates(result), path]
     return tuple(replace(d, name=f"{i:02d}_{d.name}") for i, d in enumerate(found, start=1))
 
 
-def superposed(result: DiscDiagnosis, beside: Evidence) -> tuple[Drawn, Drawn]:
+def superposed(result: DiscDiagnosis, more: Supplement) -> tuple[Drawn, Drawn]:
     """Nutation, precession rate and path: measurement, model before, model after (figures 17 and 18 of the paper)."""
     system, time = result.system, result.system.time
     q = system.trajectory.q[system.rows]
-    rate = np.full(len(time), np.nan) if beside.psidot is None else beside.psidot
+    rate = np.full(len(time), np.nan) if more.psidot is None else more.psidot
     nutation, precession, path = (
         [Curve(x, y, MUTED, "measured", ".")]
         for x, y in ((time, np.degrees(q[:, 4])), (time, rate), (1e3 * q[:, 0], 1e3 * q[:, 1]))
@@ -88,7 +87,7 @@ def superposed(result: DiscDiagnosis, beside: Evidence) -> tuple[Drawn, Drawn]:
 
 
 def _frame(axes: Axes, values: Array) -> None:
-    """The data decide what is shown, with room for the legend; a model that misses them may leave the picture."""
+    """Limits by the data, with room for the legend; a model far from them may leave the axes."""
     known = values[np.isfinite(values)]
     if known.size:
         low, high = float(known.min()), float(known.max())
@@ -115,7 +114,7 @@ def residuals(result: DiscDiagnosis) -> Drawn:
 
 
 def free_run(result: DiscDiagnosis) -> Drawn:
-    """Error of the free run over the part that the fit has not seen."""
+    """Error of the free run over the held-out data."""
     system = result.system
     position, nutation = list[Curve](), list[Curve]()
 
@@ -135,7 +134,7 @@ def free_run(result: DiscDiagnosis) -> Drawn:
     for axes in figure.axes:
         axes.set_yscale("log")
         axes.axvline(last, color=AMBER, lw=1)
-    caption = "Error of the free run: the model is fitted up to the vertical line and continues alone after it."
+    caption = "Error of the free run: the model is fitted up to the vertical line and predicts the frames after it."
     return Drawn("free_run", "Free run over held-out data", caption, figure)
 
 
@@ -145,7 +144,7 @@ def candidates(result: DiscDiagnosis) -> Drawn:
     tried = diagnosis.tried[:N_TRIED]
     figure, (axes,) = panels(9.5, 0.6 + 0.28 * max(len(tried), 3))
     gains = np.array([max(t.gain if t.gain is not None else t.score, 1e-2) for t in tried])
-    beyond = ~np.isfinite(gains)  # without it nothing fits: its bar ends beyond all others
+    beyond = ~np.isfinite(gains)  # without it nothing fits: the longest bar
     gains[beyond] = 10.0 * max([100.0, *gains[~beyond]])
     named = {f.candidate.name for f in diagnosis.found}
     alike = {r.candidate.name for f in diagnosis.found for r in f.cannot_be_told_from}
@@ -167,9 +166,9 @@ def candidates(result: DiscDiagnosis) -> Drawn:
 
 
 def _along_the_contact(known: Course, added: Course | None, label: str, scale: float, unit: str) -> Figure:
-    """What is missing along n0, m0 and k with its band, and what was found adds to it.
+    """The missing moment or force along n0, m0 and k with its band, and that added by the effects found.
 
-    But for the ends, where derivatives are poor and splines of short moments run away.
+    Without the ends, where derivatives are poorly determined.
     """
     rows = []
     for i, axis in enumerate(("n0", "m0", "k")):
@@ -183,20 +182,20 @@ def _along_the_contact(known: Course, added: Course | None, label: str, scale: f
     return chart("time (s)", *rows, size=(9.5, 5.4))
 
 
-def _missing(result: DiscDiagnosis, beside: Evidence) -> list[Drawn]:
-    """The moment and the force that the model before fails to supply, and how well the laws are known."""
+def _missing(result: DiscDiagnosis, more: Supplement) -> list[Drawn]:
+    """The moment and the force missing from the model before, and the laws with their uncertainty."""
     found, learned = list[Drawn](), result.learned
-    if beside.moment is not None:
-        law = beside.moment_of_law if result.has_more else None
+    if more.moment is not None:
+        law = more.moment_of_law if result.has_more else None
         of_law = "" if law is None else OF_LAW
-        figure = _along_the_contact(beside.moment, law, "missing", 1e6, "µN m")
+        figure = _along_the_contact(more.moment, law, "missing", 1e6, "µN m")
         found.append(Drawn("missing_moment", "The missing moment", f"{MISSING_MOMENT}{of_law}", figure))
-    if beside.force is not None:
+    if more.force is not None:
         added = None
         if result.has_more:
-            more = force_of(result.system, result.diagnosis.after) - force_of(result.system, result.diagnosis.before)
-            added = Course(beside.force.time, more, np.zeros_like(more))
-        figure = _along_the_contact(beside.force, added, "missing", 1e3, "mN")
+            change = force_of(result.system, result.diagnosis.after) - force_of(result.system, result.diagnosis.before)
+            added = Course(more.force.time, change, np.zeros_like(change))
+        figure = _along_the_contact(more.force, added, "missing", 1e3, "mN")
         found.append(Drawn("missing_force", "The missing force", MISSING_FORCE, figure))
     if learned is not None and learned.course is not None:
         title, caption = "How well the laws are known along the recording", COURSE_OF_LAWS.format(100 * learned.misfit)

@@ -10,9 +10,9 @@ import numpy as np
 
 from calibration.kit.arrays import Array
 from disctrack.diagnosis.errors import Ahead, Errors
-from disctrack.diagnosis.evidence import Evidence
 from disctrack.diagnosis.law_library import locked
 from disctrack.diagnosis.plan import Plan
+from disctrack.diagnosis.supplement import Supplement
 from disctrack.discrepancy.document import declared_json, document, effect_json
 from disctrack.discrepancy.fit import Fit
 from disctrack.files.json_text import json_text, plain
@@ -58,10 +58,10 @@ def _learned(learned: Learned, fit: Fit) -> dict[str, Any]:
     }
 
 
-def as_json(result: DiscDiagnosis, beside: Evidence | None = None) -> dict[str, Any]:
+def as_json(result: DiscDiagnosis, more: Supplement | None = None) -> dict[str, Any]:
     """All of a diagnosis in JSON's types; the keys are those of diagnosis.json."""
     d, frame, rows = result.diagnosis, result.system.trajectory.frame, result.system.rows
-    ahead = ([run[side] for run in beside.ahead] if beside else [] for side in range(2))
+    ahead = ([run[side] for run in more.ahead] if more else [] for side in range(2))
     before, after = (_errors(e, runs) for e, runs in zip((result.before, result.after), ahead, strict=True))
     before["parameters"], after["parameters"] = declared_json(d.before), declared_json(d.after)
     found = document(d, result.model, result.sentence, before, after)
@@ -72,14 +72,14 @@ def as_json(result: DiscDiagnosis, beside: Evidence | None = None) -> dict[str, 
         "chance": vars(d.chance) if d.chance else {},
         "holds": result.holds,
         "energy_J": result.energy,
-        "energy_before_J": beside.energy_before if beside else {},
+        "energy_before_J": more.energy_before if more else {},
         "plan": plan_json(result.plan),
     }
     return dict(plain(found))
 
 
 def plan_json(plan: Plan | None) -> dict[str, Any] | None:
-    """Recordings that would answer what is open."""
+    """Further recordings that would answer the open questions."""
     if plan is None:
         return None
     return {
@@ -95,8 +95,8 @@ def plan_json(plan: Plan | None) -> dict[str, Any] | None:
     }
 
 
-def write_diagnosis(path: Path, result: DiscDiagnosis, beside: Evidence | None, document: dict[str, Any]) -> None:
-    """Add the group `diagnosis` to the trajectory file: residuals before and after, and the whole answer as JSON."""
+def write_diagnosis(path: Path, result: DiscDiagnosis, more: Supplement | None, document: dict[str, Any]) -> None:
+    """Add the group `diagnosis` to the trajectory file: residuals before and after, and the answer as JSON."""
     system, n = result.system, len(result.system.trajectory)
     variables, axes = dict[str, Variable](), {"coordinate": _axis("coordinate", COORDINATES, "coordinate")}
     axes["contact_axis"] = _axis("contact_axis", ("n0", "m0", "k"), "axis of the contact frame")
@@ -110,12 +110,12 @@ def write_diagnosis(path: Path, result: DiscDiagnosis, beside: Evidence | None, 
         variables[f"residual_{name}"] = Variable(residual, ("time", "pose_component"), "1", what)
         what = f"x, y, z, psi, theta, phi of the model {name}"
         variables[f"q_{name}"] = Variable(predicted, ("time", "coordinate"), "m and rad", what)
-    if beside is not None and beside.force is not None:
+    if more is not None and more.force is not None:
         force, sigma = np.full((2, n, 3), np.nan)
-        force[system.rows], sigma[system.rows] = beside.force.values, beside.force.sigma
+        force[system.rows], sigma[system.rows] = more.force.values, more.force.sigma
         what = "mass times measured acceleration, minus the force of the model before"
         variables |= _with_sigma("missing_force", force, sigma, "time", "N", what)
-    if beside is not None and (missing := beside.moment) is not None:
+    if more is not None and (missing := more.moment) is not None:
         axes["probe_time"] = Variable(missing.time, ("probe_time",), "s", "middle of a probe of the moment")
         what = "contact moment that the model before fails to supply"
         variables |= _with_sigma("missing_moment", missing.values, missing.sigma, "probe_time", "N m", what)

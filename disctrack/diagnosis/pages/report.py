@@ -8,9 +8,9 @@ import numpy as np
 
 from disctrack.diagnosis.answer import DiscDiagnosis
 from disctrack.diagnosis.errors import Errors
-from disctrack.diagnosis.evidence import HORIZONS, Evidence
 from disctrack.diagnosis.model_file import NONE, PAPER
 from disctrack.diagnosis.plan import ENOUGH, Plan
+from disctrack.diagnosis.supplement import HORIZONS, Supplement
 from disctrack.discrepancy.document import effect_text, explanations_table, significance_text, tried_table
 from disctrack.discrepancy.significance import TWO_SIDED
 from disctrack.findings import Finding, Kind, Severity, of_kind
@@ -22,30 +22,30 @@ if TYPE_CHECKING:
 
 MODELS = {PAPER: "rolling with the losses of Ma et al. 2014 (paper)", NONE: "rolling without losses (none)"}
 WORDS = (
-    "Reduced chi-square: mean square of the residuals over that of the noise, 1 where only noise is left. rms: "
-    "root mean square, over dots and both image axes, or over the three axes of the position. Ljung-Box: small where "
-    "residuals of neighbouring frames are alike, as those of white noise are not. Free run: the model, fitted to the "
-    "first part of the recording, continues alone over the rest, the held-out data; its noise floor is the error that "
-    "it would have if it lacked nothing."
+    "Reduced chi-square: mean square of the residuals over that of the noise, 1 if they are noise. rms: "
+    "root mean square, over dots and both image axes, or over the three axes of the position. Ljung-Box: p-value of "
+    "the autocorrelation of the residuals, small if they are not white noise. Free run: the model, fitted to the "
+    "first part of the recording, predicts the rest, the held-out data; its noise floor is the error of a complete "
+    "model."
 )
 PLANNED = (
-    "Computed from the fitted model: each recording is simulated with the same cameras and noise, and added to "
-    "what there is; laws, cameras and dots are shared, the initial state is its own. Another disc has a k_m of its "
-    "own, laws in question keep their coefficient; air drag goes with the density as its law says. More dots and a "
-    "third view count as numbers of the same kind."
+    "Computed from the fitted model: each recording is simulated with the same cameras and noise, and its Fisher "
+    "information is added to the present one. Laws, cameras and dots are shared, each recording has its own initial "
+    "state. Another disc has its own k_m, the laws in question keep their coefficients; air drag scales with the "
+    "density. More dots and a third view count as further data with the same noise."
 )
 Row = tuple[str, Cell, Cell]
 
 
 def report_of(
     result: DiscDiagnosis,
-    beside: Evidence | None,
+    more: Supplement | None,
     recording: str,
     drawn: "Sequence[Drawn]",
     findings: Sequence[Finding],
     files: Sequence[Path],
 ) -> Report:
-    """All of a diagnosis. findings : of the measurement that was diagnosed;  files : that were written, page first"""
+    """The whole report.   findings : on the measurement that was diagnosed;  files : that were written, page first"""
     d = result.diagnosis
     effects = [f"{effect_text(f, d)}. {significance_text(f)}." for f in d.found]
     if (learned := result.learned) is not None:
@@ -67,7 +67,7 @@ def report_of(
             Section("Missing effects", [effects]),
             planned_section(result.plan),
             Section("Explanations that compete", [explanations_table(d)]),
-            Section("Before and after" if result.has_more else "The model", _before_after(result, beside)),
+            Section("Before and after" if result.has_more else "The model", _before_after(result, more)),
             Section("In pictures", [Figures(drawn)]),
             Section("What was tried", [tried_table(d)]),
         ],
@@ -76,9 +76,9 @@ def report_of(
     )
 
 
-def _before_after(result: DiscDiagnosis, beside: Evidence | None) -> list[Listing | str]:
+def _before_after(result: DiscDiagnosis, more: Supplement | None) -> list[Listing | str]:
     before, after = result.before, result.after
-    if before is None or after is None or beside is None:
+    if before is None or after is None or more is None:
         return []
     shown: dict[str, Callable[[Errors], str]] = {
         "reduced chi-square of the dots": lambda e: rounded(e.reduced_chi_square, 4),
@@ -92,22 +92,22 @@ def _before_after(result: DiscDiagnosis, beside: Evidence | None) -> list[Listin
     }
     rows: list[Row] = [(name, of(before), of(after)) for name, of in shown.items()]
     words = {"theta_deg": "nutation [deg]", "psi_deg": "precession [deg]", "position_mm": "position [mm]"}
-    for first, last in beside.ahead:
+    for first, last in more.ahead:
         for key, what in words.items():
             noise = rounded(first[f"noise_{key}"], 2)
             name = f"free run {first['horizon_s']:g} s ahead: {what}, noise {noise}"
             rows.append((name, rounded(first[key]), rounded(last[key])))
-    rows += [*_laws(result), *_energy(result, beside)]
-    reached = [runs[0]["horizon_s"] for runs in beside.ahead]
+    rows += [*_laws(result), *_energy(result, more)]
+    reached = [runs[0]["horizon_s"] for runs in more.ahead]
     short = [f"{h:g}" for h in HORIZONS if h not in reached]
     remark = f"The recording is too short for free runs of {' and '.join(short)} s." if short else ""
     one = [(name, value) for name, value, _ in rows if not name.startswith("change of ")]
-    made = Listing(("", "before", "after"), rows) if result.has_more else Listing(("", "model"), one)
-    return [made, WORDS, remark]
+    table = Listing(("", "before", "after"), rows) if result.has_more else Listing(("", "model"), one)
+    return [table, WORDS, remark]
 
 
 def _line(errors: Errors) -> str:
-    """The strongest line of the pose residual: where, near what, and whether noise has as strong ones."""
+    """The most significant line in the spectrum of the pose residual: frequency, known frequency near it, p-value."""
     w = errors.whiteness
     i = int(np.argmin(w.peak_p_value))
     near = f" ({w.peak_near[i]})" if w.peak_near[i] else ""
@@ -126,46 +126,44 @@ def _laws(result: DiscDiagnosis) -> list[Row]:
     return rows
 
 
-def _energy(result: DiscDiagnosis, beside: Evidence) -> list[Row]:
-    """Energy balance of both models, and the loss that the poses alone show."""
-    before, after = (
-        {k: rounded(1e3 * v, 5) for k, v in side.items()} for side in (beside.energy_before, result.energy)
-    )
+def _energy(result: DiscDiagnosis, more: Supplement) -> list[Row]:
+    """Energy balance of both models, and the loss computed from the poses without a model."""
+    before, after = ({k: rounded(1e3 * v, 5) for k, v in side.items()} for side in (more.energy_before, result.energy))
     rows: list[Row] = [(f"energy {k} [mJ]", before.get(k, ""), after.get(k, "")) for k in {**before, **after}]
-    if beside.energy_lost is not None:
-        rows.append(("energy lost, from the poses alone (± 1 σ)", beside.energy_lost, ""))
+    if more.energy_lost is not None:
+        rows.append(("energy lost, from the poses alone (± 1 σ)", more.energy_lost, ""))
     return rows
 
 
 def planned_section(plan: Plan | None) -> Section:
-    """What is open, the recording that would say most on each question, and all others."""
+    """The open questions, the most informative recording for each, and all others."""
     title = "Recordings that would settle what is open"
     if plan is None or not plan.questions:
         return Section(title, ())
     best = [plan.best(i) for i in range(len(plan.questions))]
-    header, said = ["one more recording", "lasts [s]"], []
+    header, answers = ["one more recording", "lasts [s]"], []
     for question, now, proposed in zip(plan.questions, plan.now, best, strict=True):
         effect, unit = question[0].name, question[0].quantities[0].unit
         between = " or ".join(c.name for c in question) if len(question) > 1 else ""
         header.append(f"{between} [sigmas]" if between else in_unit(f"σ of {effect}", unit))
         if proposed is None:
-            said.append(f"For {between or f'the size of {effect}'} no recording that was tried can be made.")
+            answers.append(f"For {between or f'the size of {effect}'} no recording that was tried can be made.")
             continue
-        i, text = len(said), proposed.proposal.text
+        i, text = len(answers), proposed.proposal.text
         if not between:
             limit, at_present = _limit(proposed.answers[i], unit), _limit(now, unit)
-            said.append(f"The size of {effect} is known to {at_present} (95 %), and would be to {limit}: {text}.")
+            answers.append(f"The size of {effect} is known to {at_present} (95 %), and would be to {limit}: {text}.")
         elif proposed.answers[i] < ENOUGH:
-            said.append(f"No recording that was tried separates {between.replace(' or ', ' from ')}.")
+            answers.append(f"No recording that was tried separates {between.replace(' or ', ' from ')}.")
         else:
             sigmas = rounded(proposed.answers[i])
-            said.append(f"To separate {between.replace(' or ', ' from ')}: {text} ({sigmas} sigmas).")
-    different = {r.answers: r for r in reversed(plan.rows)}.values()  # a disc at rest is filmed to no purpose
+            answers.append(f"To separate {between.replace(' or ', ' from ')}: {text} ({sigmas} sigmas).")
+    different = {r.answers: r for r in reversed(plan.rows)}.values()  # longer films than the motion add nothing
     rows = [(r in best, (r.proposal.text, rounded(r.duration, 2), *map(_cell, r.answers))) for r in different]
     shown = [("none: what there is", "", *map(_cell, plan.now)), *(cells for is_best, cells in rows if is_best)]
     others = [cells for is_best, cells in rows[::-1] if not is_best]
     tables = Listing(header, shown), Listing(header, others, folded="All other recordings")
-    return Section(title, [said, PLANNED, *tables])
+    return Section(title, [answers, PLANNED, *tables])
 
 
 def _cell(value: float) -> str:

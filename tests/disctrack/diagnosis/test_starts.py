@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 
 from disctrack.diagnosis import diagnose, slip_start
 from disctrack.diagnosis.disc_system import DiscSystem
-from disctrack.diagnosis.errors import LeftOver
+from disctrack.diagnosis.errors import ResidualTests
 from disctrack.diagnosis.large_faults import poses_with
 from disctrack.diagnosis.pages.output import as_json
 from disctrack.diagnosis.stretch import at_rest, free_stretch
@@ -298,16 +298,16 @@ def test_sigmas_know_that_neighbouring_rows_err_alike(rng):
 @pytest.mark.parametrize(
     ("left", "motion", "measurement", "doubtful"),
     [
-        (LeftOver(1.10, 1.00, 1e-40, 0.5, 36), True, False, True),
-        (LeftOver(1.10, 1.10, 1e-40, 1e-40, 36), False, True, False),
-        (LeftOver(1.30, 1.20, 1e-9, 1e-9, 36), False, True, False),
-        (LeftOver(9.00, 1.20, 1e-9, 1e-9, 36), True, False, True),
-        (LeftOver(1.00, 1.00, 0.4, 0.6, 36), False, False, False),
-        (LeftOver(1.09, 0.99, 0.02, 1.0, 36), False, False, True),  # a groove that a tilt stands in for
-        (LeftOver(1.00, 1.03, 0.3, 4e-10, 36), False, False, False),  # a misprint beside a shaken table
-        (LeftOver(1.22, 1.27, 0.4, 3e-4, 36), False, True, False),  # lenses with fields: nothing of the motion
-        (LeftOver(1.18, 1.18, 2e-3, 5e-3, 36), False, True, False),  # likewise, and seen in the poses
-        (LeftOver(1.80, 1.18, 2e-3, 5e-3, 36), False, False, True),
+        (ResidualTests(1.10, 1.00, 1e-40, 0.5, 36), True, False, True),
+        (ResidualTests(1.10, 1.10, 1e-40, 1e-40, 36), False, True, False),
+        (ResidualTests(1.30, 1.20, 1e-9, 1e-9, 36), False, True, False),
+        (ResidualTests(9.00, 1.20, 1e-9, 1e-9, 36), True, False, True),
+        (ResidualTests(1.00, 1.00, 0.4, 0.6, 36), False, False, False),
+        (ResidualTests(1.09, 0.99, 0.02, 1.0, 36), False, False, True),  # a groove that a tilt stands in for
+        (ResidualTests(1.00, 1.03, 0.3, 4e-10, 36), False, False, False),  # a misprint beside a shaken table
+        (ResidualTests(1.22, 1.27, 0.4, 3e-4, 36), False, True, False),  # lenses with fields: nothing of the motion
+        (ResidualTests(1.18, 1.18, 2e-3, 5e-3, 36), False, True, False),  # likewise, and seen in the poses
+        (ResidualTests(1.80, 1.18, 2e-3, 5e-3, 36), False, False, True),
     ],
 )
 def test_what_is_left_is_the_motions_only_where_the_poses_alone_hold_it(left, motion, measurement, doubtful):

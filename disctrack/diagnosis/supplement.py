@@ -1,4 +1,4 @@
-"""What a report shows beside the answer: rates and forces from the poses alone, the missing moment, free runs."""
+"""What a report shows in addition to the answer: rates and forces without a model, the missing moment, free runs."""
 
 from dataclasses import dataclass
 
@@ -19,27 +19,27 @@ from disctrack.frames import nodal_axes_world
 from disctrack.numbers import Measured
 from disctrack.trajectory import part
 
-HORIZONS = (0.1, 0.3, 0.5)  # [s] after the last frame that the fit has seen
+HORIZONS = (0.1, 0.3, 0.5)  # [s] after the last fitted frame
 
 
 @dataclass(frozen=True)
-class Evidence:
-    """Beside the answer; None where it cannot be had."""
+class Supplement:
+    """Results in addition to the answer; None where they cannot be computed."""
 
-    psidot: Array | None  # (n,) [rad/s] from the poses alone, NaN where they say nothing
+    psidot: Array | None  # (n,) [rad/s] derivative of the poses, without a model; NaN where it is not determined
     energy_lost: Measured | None  # likewise
-    force: Course | None  # [N] from the poses alone, minus that of the model before
-    moment: Course | None  # [N m] that the model before fails to supply
-    moment_of_law: Course | None  # that what was found adds, read in the same way
+    force: Course | None  # [N] from the accelerations of the poses, minus that of the model before
+    moment: Course | None  # [N m] that is missing from the model before
+    moment_of_law: Course | None  # that the effects found add, estimated in the same way
     energy_before: dict[str, float]  # [J]
-    ahead: tuple[tuple[Ahead, Ahead], ...]  # of the models before and after: errors of free runs
+    ahead: tuple[tuple[Ahead, Ahead], ...]  # errors of free runs of the models before and after
 
 
-def evidence(result: DiscDiagnosis) -> Evidence:
-    """All that a report shows beside a diagnosis whose base fit converged."""
+def supplement(result: DiscDiagnosis) -> Supplement:
+    """Results in addition to a diagnosis whose base fit converged."""
     system, before = result.system, result.diagnosis.before
     moment, of_law = None, None
-    # a fit that fails by whole turns has no linear response to ask for
+    # a motion that is off by whole turns is not in the range of a linear response
     if before.converged and not any(f.candidate.name == "slip_start" for f in result.diagnosis.found):
         blocks = probe(system, before)
         added = probe(system, before, result.diagnosis.after.values) if result.has_more else None
@@ -47,11 +47,11 @@ def evidence(result: DiscDiagnosis) -> Evidence:
             moment, scale = missing_moment(blocks)
             of_law = None if added is None else missing_moment(added, scale)[0]
     energy = energy_balance(system, before.values) if before.converged else {}
-    return Evidence(*_measured(system, before), moment, of_law, energy, _ahead(result))
+    return Supplement(*_measured(system, before), moment, of_law, energy, _ahead(result))
 
 
 def _measured(system: DiscSystem, before: Fit) -> tuple[Array | None, Measured | None, Course | None]:
-    """The rate of precession, the energy lost and the missing force, as accelerations of the poses have them."""
+    """The rate of precession, the energy lost and the missing force, from derivatives of the poses."""
     try:
         motion = differentiate(part(system.trajectory, system.rows))
     except AnalysisError:
@@ -65,7 +65,7 @@ def _measured(system: DiscSystem, before: Fit) -> tuple[Array | None, Measured |
 
 
 def force_of(system: DiscSystem, fit: Fit) -> Array:
-    """(n, 3) on the centre in the fitted motion along n0, m0, k, gravity taken off [N]; NaN after its end."""
+    """(n, 3) contact force of the fitted motion along n0, m0, k [N], from the acceleration; NaN after its end."""
     motion = simulated(system, fit.values)
     n0, _, _ = nodal_axes_world(motion.q[:, 3], motion.q[:, 4])
     total = system.disc.mass * (motion.acceleration_world + system.model.gravity * K)
@@ -76,7 +76,7 @@ def force_of(system: DiscSystem, fit: Fit) -> Array:
 
 
 def _ahead(result: DiscDiagnosis) -> tuple[tuple[Ahead, Ahead], ...]:
-    """Errors at the horizons that the part held out reaches, and else after fits that end in time for it."""
+    """Errors at each horizon: of the free run over the held-out data, or beyond it of a run after a shorter fit."""
     system, found = result.system, []
     last = system.time[system.weights > 0].max()
     for horizon in HORIZONS:
