@@ -24,7 +24,7 @@ from disctrack.batch.records import BUSY, MEASURED, SKIPPED, failed, is_done, ou
 from disctrack.calibrate.stage import boards_in, calibrate_into, is_rig_of, source_of
 from disctrack.diagnosis import DiscSystem, run_diagnose
 from disctrack.diagnosis.model_file import declared_model
-from disctrack.diagnosis.recorded import first_to_mend
+from disctrack.diagnosis.recorded import wrong_declarations
 from disctrack.discrepancy.fit import fit
 from disctrack.errors import AnalysisError, DiscTrackError, TrackingError, reason_of
 from disctrack.files.json_text import plain
@@ -118,7 +118,7 @@ def _after_tracking(results: Path, path: Path, trajectory: Trajectory, job: Job)
         missing.append(f"not analysed: {reason_of(error)}")
     row |= friction_numbers(trajectory)
     if job.options.diagnose:
-        wrong = first_to_mend(trajectory.findings)
+        wrong = wrong_declarations(trajectory.findings)
         try:
             if wrong:
                 raise AnalysisError("a number is declared wrong, and a missing effect would be read into it")

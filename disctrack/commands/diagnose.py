@@ -9,7 +9,7 @@ from disctrack import rolling
 from disctrack.commands import INCOMPLETE
 from disctrack.commands import _outputs as outputs
 from disctrack.diagnosis import run_diagnose
-from disctrack.diagnosis.recorded import first_to_mend
+from disctrack.diagnosis.recorded import wrong_declarations
 from disctrack.diagnosis.together.stage import run_together
 from disctrack.errors import TrajectoryFileError
 from disctrack.findings import carried
@@ -33,7 +33,7 @@ def run(arguments: argparse.Namespace) -> int:
     if known is not None and not (arguments.overwrite or more):
         return outputs.tell(known, arguments, folder, reused=True)
     findings = carried(read_findings(path))
-    if first_to_mend(findings) and not arguments.anyway:
+    if wrong_declarations(findings) and not arguments.anyway:
         said = "Not diagnosed: a number is declared wrong, and a missing effect would be read into it."
         then = f"mend it and run again; or `disctrack diagnose {outputs.relative(path)} --anyway`"
         return outputs.tell(Report("", said, findings=findings, then=then), arguments, folder)

@@ -1,7 +1,8 @@
-"""Which further recording would tell what this one cannot? Computed for recordings that were not made yet.
+"""Experimental design: which further recording would answer the questions that this one leaves open?
 
-The fitted model is started anew, filmed by the same cameras with the same noise, and linearised. What it would say of
-the shared quantities (laws, cameras, dots) is put beside what this recording says; initial states are each one's own.
+The fitted model is simulated from other initial conditions, with the same cameras and noise, and linearised. Its Fisher
+information on the shared quantities (laws, cameras, dots) is added to that of this recording; every recording has an
+initial state of its own.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -36,22 +37,22 @@ CHANGES = {  # of a recording, by factors
     "numbers": ("with {:g} times the dots, or further views", (1.5, 2.0)),
 }
 NUTATION_SHARE = 0.05  # amplitude of the nutation oscillation over the nutation angle
-OPEN = 6  # questions that further recordings are sought for
-ENOUGH = 5.0  # sigmas from which on a recording answers a question
+OPEN = 6  # questions at most
+ENOUGH = 5.0  # sigmas between two effects, from which a recording distinguishes them
 
 
 @dataclass(frozen=True)
 class Proposal:
-    """A recording that could be made; factors are those on what this recording had."""
+    """A possible recording; factors are relative to this one."""
 
-    theta_deg: float | None = None  # at the start; None: as in this recording
+    theta_deg: float | None = None  # initial nutation; None: as in this recording
     omega3: float | None = None  # [rad/s] spin
     duration: float | None = None  # [s] at most: it ends where the disc comes to rest
     mass: float = 1.0  # of a disc of the same size, from another material
     radius: float = 1.0  # of a disc of the same material and thickness, with its dots
     pressure: float = 1.0  # of the air
     rate: float = 1.0  # of the frames
-    numbers: float = 1.0  # of the dots' images in a frame: more dots, or another view
+    numbers: float = 1.0  # of data in a frame: more dots, or another view
 
     @property
     def text(self) -> str:
@@ -65,13 +66,13 @@ class Proposal:
         return f"{start}, {', '.join(changes)}" if changes else f"{start}, the same again"
 
 
-# What a recording leaves open: which of two effects it is, the one that was found first; or how large the only one is
+# An open question: which of two effects is present (the one found comes first), or how large a single one is
 Question = tuple[Candidate, ...]
 
 
 @dataclass(frozen=True)
 class Proposed:
-    """One proposal and what it would bring to each question."""
+    """One proposal and its answer to each question."""
 
     proposal: Proposal
     duration: float  # [s] until the disc comes to rest, at most that of the proposal
@@ -80,7 +81,7 @@ class Proposed:
 
 @dataclass(frozen=True)
 class Plan:
-    """Recordings that would settle what this one leaves open."""
+    """Further recordings and their answers to the open questions."""
 
     questions: tuple[Question, ...]
     now: tuple[float, ...]  # the answers of this recording alone
@@ -93,12 +94,12 @@ class Plan:
         return max(known, key=lambda r: more * r.answers[i], default=None)
 
 
-# What is known of quantities, whatever others are: their names (k,), and rows (m, k) of a least-squares problem
-Say = tuple[Sequence[str], Array]
+# Information on quantities, all others marginalised: names (k,), and rows (m, k) whose R^T R is the Fisher information
+Information = tuple[Sequence[str], Array]
 
 
 class Planner:
-    """The say of this recording on laws, cameras and dots, and that of recordings beside it."""
+    """Information of this recording on laws, cameras and dots, and with that of further recordings."""
 
     def __init__(
         self,
@@ -106,12 +107,12 @@ class Planner:
         fit: Fit,
         questions: Sequence[Question],
         noise: float = 1.0,
-        said: Say | None = None,
+        information: Information | None = None,
     ) -> None:
-        """Fit : of the enlarged model.   questions : that will be asked.
+        """Fit : of the enlarged model.   questions : that `answer` is called with.
 
         noise : variance of the dots over that stated
-        said : what is known of quantities, where that is more than this recording says
+        information : present information; by default that of this recording
         """
         self.system, self.fit, self._noise = system, fit, noise
         new = {q.name: q for question in questions for c in question for q in c.quantities}
@@ -123,28 +124,29 @@ class Planner:
         self._priors = np.diag(1.0 / np.array(spread))
         self.column = {name: j for j, name in enumerate(names)}
         self._base = [j for j, name in enumerate(names) if name not in new]
-        if said is None:
+        if information is None:
             kept = [q for q in fit.quantities if q.name not in new]
-            self.now = self._said(system, fit.values, [*kept, *self.tested])
+            self.now = self._information(system, fit.values, [*kept, *self.tested])
         else:
-            self.now = self._placed(*said)
+            self.now = self._placed(*information)
 
     def with_(self, proposal: Proposal) -> tuple[Array, float] | None:
-        """Rows of this recording and of the proposed one, and how long that lasts; None where it cannot be made."""
+        """Rows of this recording and of the proposed one, and the latter's duration; None if it is impossible."""
         try:
             planned, values = self._planned(proposal)
-            foreseen = {name for c in planned.candidates for name in c.names}
-            found = [q for q in self._shared if q.name in foreseen]
-            known = {q.name: q for q in (*planned.base, *found, *self.tested)}
-            said = self._said(planned, values, known.values(), proposal.mass != 1.0 or proposal.radius != 1.0)
-        except DiscTrackError:  # no such precession, or over at once: not a recording to propose
+            possible = {name for c in planned.candidates for name in c.names}
+            found = [q for q in self._shared if q.name in possible]
+            quantities = {q.name: q for q in (*planned.base, *found, *self.tested)}
+            another = proposal.mass != 1.0 or proposal.radius != 1.0
+            rows = self._information(planned, values, quantities.values(), another)
+        except DiscTrackError:  # there is no such precession, or it ends at once
             return None
-        return np.concatenate([self.now, said]), float(planned.time[-1] - planned.time[0])
+        return np.concatenate([self.now, rows]), float(planned.time[-1] - planned.time[0])
 
     def answer(self, rows: Array, question: Question) -> float:
-        """Root of the chi-square that the alternative leaves where the effect is true at its fitted size.
+        """Distance [sigmas] of the effect at its fitted size from all that the alternative can predict.
 
-        Without an alternative the standard deviation of its first number; infinite where nothing is seen of it.
+        Without an alternative the standard deviation of the effect's first quantity; infinite if not determined.
         """
         matrix = np.concatenate([rows, self._priors])
         columns, *alternative = (matrix[:, [self.column[n] for n in c.names]] for c in question)
@@ -154,15 +156,17 @@ class Planner:
         amounts = np.array([self.fit.values.get(q.name, q.null) - q.null for q in question[0].quantities])
         return float(np.linalg.norm(cleared(columns @ amounts, basis)))
 
-    def _said(self, system: DiscSystem, values: Values, known: Iterable[Quantity], another: bool = False) -> Array:
-        """(m, k) what a recording says of the shared quantities among those known, its own at their best.
+    def _information(
+        self, system: DiscSystem, values: Values, quantities: Iterable[Quantity], another: bool = False
+    ) -> Array:
+        """(m, k) rows of a recording on the shared ones among these quantities; its own ones are eliminated.
 
-        another : disc, which has its own k_m, its own inertia and its own dots, as in a diagnosis of both together;
-        laws that were found or are asked for have one constant
+        another : it is of another disc, which has its own k_m, inertia and dots, as in a joint diagnosis; laws that
+            were found or are in question have one coefficient for both
         """
         here, in_base = system is self.system, {q.name for q in system.base}
         own, shared = list[Quantity](), list[Quantity]()
-        for q in known:
+        for q in quantities:
             one_for_all = q.name not in in_base and any(kind in LAWS for kind in q.belongs_to)
             its_own = not q.belongs_to or (another and "disc" in q.belongs_to and not one_for_all)
             (own if its_own and not (here and q in self.tested) else shared).append(q)
@@ -174,7 +178,7 @@ class Planner:
         return np.asarray(triangle(self._placed(names, reduced[1])) / np.sqrt(self._noise), float)
 
     def _placed(self, names: Sequence[str], rows: Array) -> Array:
-        """Rows (m, k) by these quantities, in the planner's columns; others are left out."""
+        """Rows (m, k) of these quantities, in the planner's columns; others are left out."""
         placed = np.zeros((len(rows), len(self.column)))
         for j, name in enumerate(names):
             if name in self.column:
@@ -182,12 +186,12 @@ class Planner:
         return placed
 
     def _planned(self, proposal: Proposal) -> tuple[DiscSystem, dict[str, float]]:
-        """The system of a recording as proposed, by the same cameras with the same noise, and its fitted values.
+        """The system of the proposed recording, with the same cameras and noise, and the values of its quantities.
 
-        Raises DiscTrackError where its motion is too short.
+        Raises DiscTrackError if its motion is too short.
         """
         system, old = self.system, self.system.trajectory
-        disc = replace(  # of another material, or larger from the same plate, its dots with it
+        disc = replace(  # of another material, or larger of the same thickness, with larger distances of the dots
             system.disc,
             mass=system.disc.mass * proposal.mass * proposal.radius**2,
             radius=system.disc.radius * proposal.radius,
@@ -217,7 +221,7 @@ class Planner:
         pixels = np.moveaxis(pixels, -3, 1)
         usual = np.nanmedian(old.markers_covariance_px2.reshape(-1, 2, 2), axis=0) / proposal.numbers
         seen = np.where(np.isfinite(pixels).all(-1), MarkerStatus.MEASURED, MarkerStatus.OUTSIDE)
-        # of arrays by frame, those of any frames: no stage but this one reads them
+        # other arrays by frame are not used by the system
         trajectory = replace(
             part(old, slice(0, 1)),
             time=motion.time,
@@ -240,13 +244,13 @@ def plan(
     fit: Fit,
     questions: Sequence[Question],
     noise: float = 1.0,
-    said: Say | None = None,
+    information: Information | None = None,
 ) -> Plan:
-    """What each of many recordings would bring to the questions: starts first, then changes of the best of them.
+    """Answers of many possible recordings: first other initial conditions, then changes of the best of them.
 
-    said : as for `Planner`
+    information : as for `Planner`
     """
-    planner = Planner(system, fit, questions, noise, said)
+    planner = Planner(system, fit, questions, noise, information)
 
     def answers(rows: Array) -> tuple[float, ...]:
         return tuple(planner.answer(rows, question) for question in questions)
@@ -255,8 +259,8 @@ def plan(
 
     def made(proposals: Iterable[Proposal]) -> Iterator[Proposed]:
         for proposal in proposals:
-            if (said := planner.with_(proposal)) is not None:
-                yield Proposed(proposal, said[1], answers(said[0]))
+            if (possible := planner.with_(proposal)) is not None:
+                yield Proposed(proposal, possible[1], answers(possible[0]))
 
     again = Proposal()
     first = Plan(tuple(questions), now, tuple(made((*(Proposal(*start) for start in STARTS), again))))
@@ -271,10 +275,10 @@ def plan(
 
 
 def open_questions(diagnosis: Diagnosis, sizes: Iterable[Score | Bound]) -> tuple[Question, ...]:
-    """What is open in a diagnosis: effects and their alternatives, then effects of the motion with an upper bound only.
+    """Open questions of a diagnosis: effects and their alternatives, then effects of the motion with an upper limit.
 
-    Of the latter those whose standard deviation is largest beside their usual size.
-    sizes : of effects, as far as the data tell them
+    Of the latter those whose standard deviation is largest compared with their typical size.
+    sizes : of effects, as estimated from the data
     """
     found: list[Question] = [(f.candidate, r.candidate) for f in diagnosis.found for r in f.cannot_be_told_from]
     known = {f.candidate.name for f in diagnosis.found}

@@ -61,6 +61,6 @@ def with_declared_dots(trajectory: Trajectory, details: Mapping[str, Any]) -> Tr
     return replace(trajectory, disc=replace(trajectory.disc, marker_centres_body=places))
 
 
-def first_to_mend(findings: Iterable[Finding]) -> tuple[Finding, ...]:
+def wrong_declarations(findings: Iterable[Finding]) -> tuple[Finding, ...]:
     """What is declared wrongly: a missing effect would be read into it. Dots are measured where they are."""
     return tuple(f for f in doubts(findings) if f.kind != Kind.DOTS_MISPLACED and any(r.key for r in f.remedies))

@@ -16,7 +16,7 @@ from scipy.ndimage import fourier_shift
 
 from calibration.rig_file import read_rig
 from disctrack.cli import main
-from disctrack.diagnosis.recorded import first_to_mend
+from disctrack.diagnosis.recorded import wrong_declarations
 from disctrack.findings import Finding, Kind, Severity, finding_from_json, in_doubt, leading
 from disctrack.first_look.check import run_check
 from disctrack.frames import CAMERAS
@@ -287,7 +287,7 @@ def test_run_and_the_stages_after_it_name_the_fault_first(name, recording, capsy
         again, findings, errors = ended(capsys, "analyse", folder)
         assert again == code, errors
         assert comes_first(name, findings), findings[0]
-    if known.stages == "diagnose" or first_to_mend(findings):
+    if known.stages == "diagnose" or wrong_declarations(findings):
         again, findings, errors = ended(capsys, "diagnose", folder)
         assert again == code, errors
         assert comes_first(name, findings), findings[0]

@@ -1,4 +1,4 @@
-"""Recordings of the rolling disc diagnosed together, and which further one would settle what they leave open."""
+"""Joint diagnosis of recordings of the rolling disc, and which further one would answer their open questions."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -10,8 +10,8 @@ from calibration.kit.least_squares import triangle
 from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.diagnosis.large_faults import large_faults
 from disctrack.diagnosis.model_file import PAPER, declared_model
-from disctrack.diagnosis.plan import Plan, Question, Say, open_questions, plan
-from disctrack.diagnosis.recorded import Recorded, first_to_mend
+from disctrack.diagnosis.plan import Information, Plan, Question, open_questions, plan
+from disctrack.diagnosis.recorded import Recorded, wrong_declarations
 from disctrack.diagnosis.systematic import MAX_FRAMES, Systematic, find_systematic, noise_over_stated, with_noise
 from disctrack.discrepancy.fit import Fit, fit, no_fit
 from disctrack.discrepancy.joint.crew import Crew
@@ -24,8 +24,8 @@ from disctrack.findings import Kind
 from disctrack.track.side_by_side import evenly
 from disctrack.trajectory import MarkerStatus, Trajectory
 
-SURE = 4.0  # sigmas of the noise that frames show, from which it is not the one stated
-Item = tuple[Recorded, Mapping[str, str], str]  # what a process needs to know: a recording, its labels, the model
+SURE = 4.0  # sigmas by which the scatter of the frames has to differ from the stated noise to replace it
+Item = tuple[Recorded, Mapping[str, str], str]  # recording, its labels, the model
 
 
 def diagnose_together(
@@ -36,13 +36,13 @@ def diagnose_together(
     settle: bool = False,
     unread: Mapping[str, str] | None = None,
 ) -> TogetherDiagnosis:
-    """What does the model lack, of all recordings together?
+    """Which effect is missing from the model of all recordings together?
 
-    model : as `diagnose`
-    unread : further recordings that are reported as left out, and why
-    processes : among which the recordings are dealt out; the answer does not depend on their number
-    settle : also compute which further recording would settle what is left open
-    Raises AnalysisError where fewer than two recordings can be used.
+    model : as for `diagnose`
+    unread : further recordings that are reported as left out, with the reasons
+    processes : that share the recordings; the answer does not depend on their number
+    settle : also compute which further recording would answer the open questions
+    Raises AnalysisError if fewer than two recordings can be used.
     """
     labels = labels_of(recordings)
     items = [(recorded, label, model) for recorded, label in zip(recordings, labels, strict=True)]
@@ -54,7 +54,7 @@ def diagnose_together(
 
 
 def _plan(answer: TogetherDiagnosis, crew: Crew) -> Plan | None:
-    """Recordings beside all these, with disc, surface and cameras of the longest of them."""
+    """Further recordings, with disc, surface and cameras of the longest one."""
     system, diagnosis = answer.system, answer.diagnosis
     sharing, after = system.sharing, diagnosis.after
     longest = int(np.argmax(system.weights))
@@ -65,7 +65,7 @@ def _plan(answer: TogetherDiagnosis, crew: Crew) -> Plan | None:
         return None
     tested = [q for question in questions for c in question for q in c.quantities]
     everything = {q.name: q for q in (*tested, *after.quantities)}
-    parts = reversed(sharing.local[longest].items())  # of those that are sums, the first part stays
+    parts = reversed(sharing.local[longest].items())  # of a sum of shared quantities the first one is kept
     names = {there: shared for shared, there in parts if shared in everything}
     others = [n for n in everything if n not in set(names.values())]
     values = {n: q.null for n, q in everything.items()} | after.values
@@ -74,15 +74,15 @@ def _plan(answer: TogetherDiagnosis, crew: Crew) -> Plan | None:
     priors = np.zeros((len(others), rows.shape[1]))
     priors[:, : len(others)] = np.diag([1.0 / everything[n].prior_sigma for n in others])
     R = triangle(np.concatenate([rows, priors]))
-    said = tuple(names), R[len(others) :, len(others) :]
+    information = tuple(names), R[len(others) :, len(others) :]
     extra = sharing.local_names(longest, [n for f in diagnosis.found for n in f.candidate.names])
-    asked = sharing.local_values(longest, after.values), extra, questions, said
-    (found,) = crew.call("planned", [asked], [longest])
+    arguments = sharing.local_values(longest, after.values), extra, questions, information
+    (found,) = crew.call("planned", [arguments], [longest])
     return found if isinstance(found, Plan) else None
 
 
 def labels_of(recordings: Sequence[Recorded]) -> list[dict[str, str]]:
-    """Disc, surface, rig and air of every recording, in words that tell them apart."""
+    """Names of disc, surface, rig and air of every recording, different where these differ."""
     keys = [_rig_key(r.trajectory) for r in recordings]
     rigs = {key: i + 1 for i, key in enumerate(dict.fromkeys(keys))}
     found = []
@@ -95,7 +95,7 @@ def labels_of(recordings: Sequence[Recorded]) -> list[dict[str, str]]:
 
 
 def _rig_key(trajectory: Trajectory) -> bytes:
-    """Equal for recordings that were calibrated together."""
+    """Equal for recordings with the same calibration."""
     rig = trajectory.rig
     cameras = np.array([(c.fx, c.fy, c.cx, c.cy, *c.distortion) for c in rig.cameras])
     parts = [cameras, rig.R_right_left, rig.t_right_left, rig.R_left_world, rig.t_left_world, rig.covariance]
@@ -103,22 +103,22 @@ def _rig_key(trajectory: Trajectory) -> bytes:
 
 
 def _density(trajectory: Trajectory) -> float:
-    """Of the air [kg/m^3], as far as it is known: what differs by less is one air."""
+    """Density of the air [kg/m^3], rounded: smaller differences are not significant."""
     return float(f"{trajectory.air_density:.3g}")
 
 
 class DiscMember:
-    """One recording of the disc: prepared, fitted alone, and then asked for what it says of the shared quantities."""
+    """One recording of the disc: prepared, fitted alone, then reduced to its information on the shared quantities."""
 
     def __init__(self, item: Item) -> None:
-        """Raises AnalysisError where it cannot be fitted with the others, or is declared wrongly."""
+        """Raises AnalysisError if it cannot be fitted with the others, or is declared wrongly."""
         recorded, self.labels, model = item
         self.name, as_tracked = recorded.name, recorded.trajectory
-        # laws in proportion to the load would fit a disc of any weight all the same
-        wrong = [f for f in as_tracked.findings if f.kind == Kind.DENSITY] or first_to_mend(as_tracked.findings)
+        # a wrong weight would not show in laws that are proportional to the load
+        wrong = [f for f in as_tracked.findings if f.kind == Kind.DENSITY] or wrong_declarations(as_tracked.findings)
         if wrong:
             raise AnalysisError("; ".join(f.sentence for f in wrong))
-        trajectory = with_noise(as_tracked, _noise(as_tracked))  # recordings are weighed by it
+        trajectory = with_noise(as_tracked, _noise(as_tracked))  # which sets the weight of the recording
         declared, faults = declared_model(trajectory, model)
         self.system = DiscSystem(trajectory, declared, known=faults)
         self.systematic = find_systematic(self.system)
@@ -127,13 +127,13 @@ class DiscMember:
             raise AnalysisError(f"its dots show a large fault of the measurement ({names}): diagnose it alone")
 
     def told(self) -> tuple[Mapping[str, str], Systematic, list[Array]]:
-        """What the others need of it: its labels, its systematic errors, and places of dots per camera [px]."""
+        """Labels, systematic errors, and positions of the dots in each camera [px], for `in_common`."""
         rows = evenly(np.arange(len(self.system.time)), MAX_FRAMES)
         used, places = self.system.used[rows], self.system.observed[rows]
         return self.labels, self.systematic, [places[:, c][used[:, c]] for c in range(2)]
 
     def with_common(self, systematic: Systematic) -> Member:
-        """The member, fitted alone with systematic errors that it has in common with others. Raises AnalysisError."""
+        """The member, fitted alone with systematic errors that it shares with others. Raises AnalysisError."""
         self.system = system = self.system.again(systematic=systematic)
         self.base = fit(system, system.base, system.start())
         if not self.base.converged:
@@ -143,18 +143,18 @@ class DiscMember:
         return self._member()
 
     def share(self, own: Sequence[str]) -> None:
-        """These quantities are its own, all others of the base are shared."""
+        """Declare which quantities are its own; all others of the base are shared."""
         mine = [q for q in self.system.base if q.name in set(own)]
         self._reduction = Reduction(self.system, mine, self.base.values)
 
     def reduce(self, values: Values, names: Sequence[str]) -> Reduced | None:
-        """What it says of shared quantities."""
+        """Its information on shared quantities."""
         return self._reduction.reduce({**self.system.known, **values}, names)
 
     def alone(self, values: Values, names: Sequence[str]) -> tuple[Fit, Fit]:
-        """The recording fitted alone with these of its candidates' quantities free, from the shared solution on.
+        """The recording fitted alone with these quantities of its candidates, starting at the shared solution.
 
-        Of the second fit sigmas know the memory of what is left.
+        In the second fit the standard deviations allow for the autocorrelation of the residuals.
         """
         system = self.system
         known = {q.name: q for c in system.candidates for q in c.quantities}
@@ -163,14 +163,16 @@ class DiscMember:
         growth = inflation(system, found)
         return found, replace(found, covariance=found.covariance * np.outer(growth, growth))
 
-    def planned(self, values: Values, names: Sequence[str], questions: Sequence[Question], said: Say) -> Plan:
-        """Recordings that would answer questions; `said` is what all recordings together know of quantities.
+    def planned(
+        self, values: Values, names: Sequence[str], questions: Sequence[Question], information: Information
+    ) -> Plan:
+        """Further recordings that would answer questions.   information : of all recordings together
 
-        values : of the shared quantities.   names : of those that are no part of the base
+        values : of the shared quantities.   names : of those that are not in the base
         """
         known = {q.name: q for c in self.system.candidates for q in c.quantities}
         quantities = (*self.system.base, *(known[n] for n in names))
-        return plan(self.system, no_fit(quantities, self._everything(values)), questions, said=said)
+        return plan(self.system, no_fit(quantities, self._everything(values)), questions, information=information)
 
     def _everything(self, shared: Values) -> dict[str, float]:
         return {**self.base.values, **self._reduction.own_values, **self.system.known, **shared}
@@ -194,7 +196,7 @@ class DiscMember:
 
 
 def _noise(trajectory: Trajectory) -> float:
-    """Variance of the dots from frame to frame over that stated; 1 where it differs by no more than its own scatter."""
+    """Variance of the dots from frame to frame over that stated; 1 if the difference is not significant."""
     ratio = noise_over_stated(trajectory)
     if not 0 < ratio < np.inf:
         return 1.0
@@ -202,15 +204,15 @@ def _noise(trajectory: Trajectory) -> float:
     return ratio if abs(ratio - 1.0) > SURE * np.sqrt(2 * (1 + THIRD) / max(numbers, 1.0)) else 1.0
 
 
-def in_common(told: Sequence[tuple[Mapping[str, str], Systematic, list[Array]]]) -> list[Systematic]:
-    """The systematic errors as recordings of one rig, or of one disc, have them in common: the largest that one shows.
+def in_common(members: Sequence[tuple[Mapping[str, str], Systematic, list[Array]]]) -> list[Systematic]:
+    """Systematic errors that recordings of one rig, or of one disc, share: the largest one found in any of them.
 
-    What one recording is too short to show is there in it all the same.
+    A short recording may not determine an error that it has.
     """
     common: list[Systematic] = []
-    for labels, mine, _ in told:
-        rigs = [(s, p) for of, s, p in told if of["rig"] == labels["rig"]]
-        discs = [s for of, s, _ in told if of["disc"] == labels["disc"]]
+    for labels, mine, _ in members:
+        rigs = [(s, p) for of, s, p in members if of["rig"] == labels["rig"]]
+        discs = [s for of, s, _ in members if of["disc"] == labels["disc"]]
         lens = max((s for s, _ in rigs), key=lambda s: s.lens_px)
         dots = max((s for s, _ in rigs), key=lambda s: s.dot_px)
         common.append(
