@@ -24,7 +24,7 @@ from disctrack.diagnosis.motion import (
     state_of,
     state_quantities,
 )
-from disctrack.diagnosis.starts import STRETCHES, sought, start_values
+from disctrack.diagnosis.starts import STRETCHES, shape_guesses, start_values
 from disctrack.diagnosis.stretch import free_stretch
 from disctrack.diagnosis.systematic import DOT_SIGMA, Systematic, field_columns
 from disctrack.discrepancy.fit import Fit
@@ -80,7 +80,7 @@ class DiscSystem(System):
         Raises AnalysisError.
         """
         self.systematic = systematic or Systematic()
-        self.columns_known: dict[tuple[str, int], tuple[Array, list[Array]]] = {}  # of `sought`, along a motion nearby
+        self.columns_known: dict[tuple[str, int], tuple[Array, list[Array]]] = {}  # by `starts`
         self.known = dict(known or {})
         self.measured: Path | None = None  # in the place of a motion
         self.notes: tuple[str, ...] = ()  # on the frames that were left out
@@ -262,7 +262,7 @@ class DiscSystem(System):
         For others: values of the shape, where that has to be looked for.
         """
         if not candidate.threshold:
-            return sought(self, candidate, values, least)
+            return shape_guesses(self, candidate, values, least)
         motion = simulate(self.model_with(values), state_of(values), times=self.instants(values))
         tried = 1.0 / (np.array(SLIP_STARTS) * np.max(motion.friction_needed))
         left = [np.sum(self.linearise({**values, SLIP: inverse}, [])[0] ** 2) for inverse in tried]

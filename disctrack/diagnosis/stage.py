@@ -23,11 +23,11 @@ from disctrack.diagnosis.form_misfit import with_form
 from disctrack.diagnosis.laws import WithLaw, explained_by_law, judged_as
 from disctrack.diagnosis.missing_force import missing_text
 from disctrack.diagnosis.model_file import PAPER, declared_model, model_toml
+from disctrack.diagnosis.motion_search import diagnose_motion, with_slip
 from disctrack.diagnosis.pages.output import as_json, write_diagnosis
 from disctrack.diagnosis.pages.report import report_of
 from disctrack.diagnosis.plan import open_questions, plan
 from disctrack.diagnosis.recorded import read_recorded
-from disctrack.diagnosis.slip_start import diagnose_motion, with_slip
 from disctrack.diagnosis.supplement import supplement
 from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.held_out import held_out, training_rows

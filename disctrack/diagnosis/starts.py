@@ -1,8 +1,8 @@
-"""Where fits begin: a motion at its first poses, and numbers of an effect's shape that have to be looked for.
+"""Initial guesses of fits: the state from the first poses, and shape parameters for which a grid has to be searched.
 
-An angle on the rim and a frequency of the table have no derivative at an effect's null, and the data are far from
-quadratic in them. So the effect's amounts are fitted to first order at many angles round the rim, or at peaks in the
-spectrum of what is left of the positions, and refits begin where they gain most.
+Chi-square has no derivative by an angle on the rim or a frequency of the table while the effect is absent, and many
+local minima. So the amplitudes of the effect are fitted to first order at many angles round the rim, or at the peaks in
+the spectrum of the position residuals, and refits begin where chi-square decreases most.
 """
 
 from __future__ import annotations
@@ -27,28 +27,25 @@ if TYPE_CHECKING:
     from disctrack.diagnosis.disc_system import DiscSystem
 
 
-STRETCHES = (0.03, 0.08, 0.2, 0.5)  # [s] a linear step from one stretch's fit stays in the next one's basin
-FRICTIONS = (0.03, 1.0)  # coefficients to begin with are sought between these
+STRETCHES = (0.03, 0.08, 0.2, 0.5)  # [s] from the fit of one, Gauss-Newton converges for the next
+FRICTIONS = (0.03, 1.0)  # range of the initial guess of a coefficient of friction
 ANGLES = 48  # round the rim: 7.5 deg apart, half the width of a flat
-PEAKS = 6  # of the spectrum, padded ...
-PADDED = 8  # ... to this many times the length of the recording, for peaks between its frequencies
-REFITS = 2  # begin at so many of them
-NEAR = 10.0  # [sigma of a number], rms between two motions: micrometres of the centimetres by which they move
-SLOW = 3.0  # periods in the recording that a vibration has at least
+PEAKS = 6  # highest peaks of the spectrum that are tried
+PADDED = 8  # zero padding of the spectrum, in lengths of the recording
+REFITS = 2  # initial guesses that are returned
+NEAR = 10.0  # [sigma] rms difference of two motions, up to which the derivatives by a small effect are the same
+SLOW = 3.0  # periods of a vibration in the recording at least
 
 
 def first_motion(system: DiscSystem, known: Values) -> MeasuredMotion:
-    """The first poses and their derivatives, by the clock as it is if these faults are there. Raises AnalysisError."""
+    """The first poses and their derivatives, at the instants corrected for these faults. Raises AnalysisError."""
     n = int(np.flatnonzero(system.trajectory.measured[system.rows])[:SEGMENT][-1]) + 1
     first = part(system.trajectory, slice(system.rows.start, system.rows.start + n))
     return differentiate(replace(first, time=system.instants(known)[:n]))
 
 
 def first_state(motion: MeasuredMotion) -> dict[str, float]:
-    """Initial state of a measured motion: state.x ... state.omega3, and the centre's velocity.
-
-    That is in state.v_x, state.v_y, which a rolling disc does not need.
-    """
+    """Initial state of a measured motion: state.x ... state.omega3, and for slip the centre's state.v_x, state.v_y."""
     rates = quantities(motion, motion.disc, motion.gravity)[0, from_to("omega_1", "omega_3")]
     names = (*(q.name for q in state_quantities()), *SLIP_VELOCITY)
     numbers = *motion.position[0, :2], *motion.euler[0], *rates, *motion.velocity[0, :2]
@@ -63,7 +60,7 @@ def first_contact(motion: MeasuredMotion) -> tuple[float, float]:
 
 
 def start_values(system: DiscSystem, known: Values) -> dict[str, float]:
-    """Values of state and declared effects from which the fit of the whole recording converges; `known` are kept."""
+    """State and declared effects from which the fit of the whole recording converges; `known` values are held."""
     names, motion = {quantity.name for quantity in system.base}, first_motion(system, known)
     values = dict(known) | {k: v for k, v in first_state(motion).items() if k in names}
     laws = model_quantities(system.model)
@@ -72,16 +69,16 @@ def start_values(system: DiscSystem, known: Values) -> dict[str, float]:
         values[SLIP] = 1.0 / first_contact(motion)[1]
     state = tuple(quantity for quantity in system.base if quantity.is_initial or quantity.name == SLIP)
     for stretch, beginning in zip(STRETCHES, system.beginnings(), strict=False):
-        # a law of friction shows only over several turns: held until the stretch is long enough
+        # laws of friction are determined over several turns only: held in short stretches
         moved = state if stretch < 0.1 else (*state, *laws)
         values = fit(beginning, moved, values).values
     return values
 
 
-def sought(system: DiscSystem, candidate: Candidate, values: Values, least: float) -> list[tuple[float, ...]]:
-    """Values of the candidate's shape to begin with, the best first; empty where none has to be looked for.
+def shape_guesses(system: DiscSystem, candidate: Candidate, values: Values, least: float) -> list[tuple[float, ...]]:
+    """Initial guesses of the candidate's shape, the best first; empty if it needs none.
 
-    least : gain to first order, below which none is worth a refit
+    least : gain to first order, below which a guess is not returned
     """
     if not candidate.sought:
         return []
@@ -92,11 +89,11 @@ def sought(system: DiscSystem, candidate: Candidate, values: Values, least: floa
     basis = span(np.concatenate([derivative.reshape(-1, len(priors)), priors]))
     r, no_prior = residual.ravel(), np.zeros((len(priors), len(candidate.names)))
     by_amounts = system.columns_known.get((candidate.name, r.size))
-    # the same for motions so near to each other that a small effect does the same to both
+    # reused for motions so close to each other that the derivatives are the same
     if by_amounts is None or float(np.mean((r - by_amounts[0]) ** 2)) >= NEAR**2:
         null = {q.name: q.null for q in (*candidate.quantities, *rest)} | dict(values)
         by_amounts = r, [system.linearise({**null, first.name: float(x)}, candidate.names)[1] for x in places]
-        if first.unit == "rad":  # the same places whatever is left
+        if first.unit == "rad":  # the grid does not depend on the residual
             system.columns_known[candidate.name, r.size] = by_amounts
     gains = []
     for derivatives in by_amounts[1]:
@@ -109,14 +106,14 @@ def sought(system: DiscSystem, candidate: Candidate, values: Values, least: floa
 
 
 def _frequencies(system: DiscSystem, values: Values) -> Array:
-    """Peaks [Hz] in the spectrum of measured less predicted positions, in units of their noise, and beside them."""
+    """Peaks [Hz] in the spectrum of the whitened position residuals, and frequencies half a bin from them."""
     difference, sigma = (x[:, :3] for x in system.coordinate_errors(values))
-    left = np.nan_to_num(difference / sigma)
-    n, rate = len(left), system.rate
-    frequency, powers = periodogram(left, rate, nfft=PADDED * n, axis=0)
+    residual = np.nan_to_num(difference / sigma)
+    n, rate = len(residual), system.rate
+    frequency, powers = periodogram(residual, rate, nfft=PADDED * n, axis=0)
     power = powers.sum(axis=1)
     power[frequency < SLOW * rate / n] = 0.0
     peaks, _ = find_peaks(power)
     highest = frequency[peaks[np.argsort(power[peaks])[::-1][:PEAKS]]]
-    # noise moves and splits peaks by as much
+    # noise shifts and splits peaks by as much
     return np.ravel(highest[:, None] + 0.5 * rate / n * np.array([0.0, -1.0, 1.0]))

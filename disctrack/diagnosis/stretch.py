@@ -1,4 +1,4 @@
-"""Which frames of a recording belong to one motion of the disc on its own, and what the others are."""
+"""Selection of the frames of a recording in which the disc moves freely, and the reasons why others are left out."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,21 +11,21 @@ from disctrack.trajectory import Trajectory
 
 Rows = NDArray[np.int64]
 
-MIN_THETA = np.radians(0.7)  # below, the disc of Ma et al. touches its paper, and leaves the model
+MIN_THETA = np.radians(0.7)  # below, the disc of Ma et al. touches its paper, and the model does not hold
 MIN_FRAMES = 40
-AT_REST = 0.3  # [rad/s] a disc that rolls turns at 3 rad/s or more; one that is let go does so after 10 ms
-REST_SIGMAS = 6.0  # a turn between two poses that is smaller may be noise
-HAND = 0.005  # [s] next to a rest, in which what held the disc is still there, or there again
-FIRST_WINDOW = 0.02  # [s] in which the first state is read off the poses
+AT_REST = 0.3  # [rad/s] a rolling disc rotates at 3 rad/s or more, 10 ms after it was released
+REST_SIGMAS = 6.0  # of the rotation between two poses, below which it may be noise
+HAND = 0.005  # [s] next to a rest, in which a hand may still touch the disc
+FIRST_WINDOW = 0.02  # [s] in which the initial state is estimated from the poses
 FIRST_POSES = 6  # in it at least
 HELD = "the disc is at rest or held"
-OTHERWISE = ("the disc lies flat", HELD, "the disc slips")  # what frames show that are not of a motion on its own
+OTHERWISE = ("the disc lies flat", HELD, "the disc slips")  # reasons why frames are not of a free motion
 
 
 def free_stretch(trajectory: Trajectory, start: float = -np.inf) -> tuple[slice, tuple[str, ...]]:
-    """The longest run of frames from `start` [s] on in which the disc moves, is not flat, and nobody holds it.
+    """The longest run of frames from `start` [s] on in which the disc moves freely and does not lie flat.
 
-    Lost frames do not end a run. With it come remarks on what is left out. Raises AnalysisError where no run has
+    Lost frames do not end a run. Also remarks on the frames that are left out. Raises AnalysisError if no run has
     MIN_FRAMES poses.
     """
     if not trajectory.rig.world_is_table:
@@ -43,16 +43,16 @@ def free_stretch(trajectory: Trajectory, start: float = -np.inf) -> tuple[slice,
         last = int(np.searchsorted(time, time[last] - HAND, side="right"))
     first = _dense_start(time[:last], first)
     if last - first < MIN_FRAMES:
-        told = "; ".join([f"{len(measured)} of {len(trajectory)} frames have a pose", *_told(why)])
+        counts = "; ".join([f"{len(measured)} of {len(trajectory)} frames have a pose", *_counts(why)])
         run = f"; the longest motion on its own has {max(last - first, 0)}" if last - first < len(measured) else ""
         raise AnalysisError(
-            f"{told}{run}. A diagnosis needs {MIN_FRAMES} poses of one motion (nutation above "
+            f"{counts}{run}. A diagnosis needs {MIN_FRAMES} poses of one motion (nutation above "
             f"{np.degrees(MIN_THETA):.1f} deg). Track more of the recording, or film it again."
         )
     rows, notes = slice(int(measured[first]), int(measured[last - 1]) + 1), list[str]()
     for which, part in (("first", slice(first)), ("last", slice(last, None))):
         if (out := time[part]).size:
-            reason = "; ".join(_told(why[part])) or "they are cut off from the longest run of frames in free motion"
+            reason = "; ".join(_counts(why[part])) or "they are cut off from the longest run of frames in free motion"
             notes.append(f"the {which} {out.size} frames ({out[0]:.4f} to {out[-1]:.4f} s) are left out: {reason}")
     lost = rows.stop - rows.start - (last - first)
     if lost:
@@ -60,14 +60,14 @@ def free_stretch(trajectory: Trajectory, start: float = -np.inf) -> tuple[slice,
     return rows, tuple(notes)
 
 
-def _told(why: NDArray[np.str_]) -> list[str]:
-    """How many frames are not of the motion, for each reason."""
+def _counts(why: NDArray[np.str_]) -> list[str]:
+    """How many frames are left out for each reason."""
     counts = {text: int(np.sum(why == text)) for text in OTHERWISE}
     return [f"{text} in {n} of them" for text, n in counts.items() if n]
 
 
 def at_rest(trajectory: Trajectory, measured: Rows) -> Mask:
-    """(k,) True for frames among `measured` from or to which the disc does not turn."""
+    """(k,) True for frames among `measured` before or after which the disc does not rotate."""
     if len(measured) < 2:
         return np.ones(len(measured), bool)
     R = rotation_from_euler(*trajectory.q[measured, 3:].T)
@@ -75,13 +75,13 @@ def at_rest(trajectory: Trajectory, measured: Rows) -> Mask:
     variance = np.trace(trajectory.pose_covariance[measured, 3:, 3:], axis1=1, axis2=2)
     noise = REST_SIGMAS * np.sqrt(variance[1:] + variance[:-1])
     still = turn < np.maximum(AT_REST * np.diff(trajectory.time[measured]), noise)
-    # a single step may look like a rest where the noise is large; a rest lasts
+    # where the noise is large a single step may look like rest; two in a row do not
     lasting = still & (np.append(still[1:], still[-1]) | np.insert(still[:-1], 0, still[0]))
     return np.asarray(np.append(lasting, False) | np.insert(lasting, 0, False), bool)
 
 
 def _dense_start(time: Array, first: int) -> int:
-    """The first frame from `first` on that enough others follow soon: a state can be read off there."""
+    """The first frame from `first` on that is followed by enough others for an estimate of the state."""
     interval = float(np.median(np.diff(time))) if len(time) > 1 else 1.0
     window = max(FIRST_WINDOW, 10 * interval)
     following = np.searchsorted(time, time + window, side="right") - np.arange(len(time))

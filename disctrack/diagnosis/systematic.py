@@ -1,10 +1,10 @@
-"""Systematic errors of the dots' places, as far as the dots themselves show them: no model of the motion is asked.
+"""Systematic errors of the positions of the dots, estimated from the dots alone, without a model of the motion.
 
-Two cameras see a rigid pattern: of the 4 m numbers of a frame six are its pose, and the others should be noise. What
-they scatter from frame to frame is the noise. What is left beside it moves slowly, and is a smooth function of the
-place in the image (lens, board), of the dot (print), or of both (glare, gradients of light). The sizes and the length
-of these fields are found by restricted maximum likelihood from the numbers that no pose can absorb; the same fields,
-with these sizes as priors, then stand beside the motion, and take from it what a pose could have absorbed.
+Two cameras see a rigid pattern of m dots: of the 4 m components of a frame six are its pose, and the others should be
+noise. Their scatter from frame to frame is the noise. The remaining residuals change slowly, and are a smooth function
+of the position in the image (lens, board), of the dot (print), or of both (glare, gradients of light). The standard
+deviations and the correlation length of these random fields are estimated by restricted maximum likelihood from the
+components that no pose absorbs. The same fields, with these priors, are then fitted along with the motion as nuisances.
 """
 
 from __future__ import annotations
@@ -29,20 +29,20 @@ if TYPE_CHECKING:
     from disctrack.diagnosis.disc_system import DiscSystem
 
 
-INFLATED = 0.8  # variance from frame to frame over that stated, below which the statement holds more than noise
-MARGIN = 0.6  # of a field's length, by which its grid exceeds the places
+INFLATED = 0.8  # variance from frame to frame over that stated, below which the latter contains systematic errors
+MARGIN = 0.6  # of a field's correlation length, by which its grid exceeds the positions
 DOT_SIGMA = 3e-7  # [m] a common bias of one dot's centre in all images: 1/800 px, below what edges of dots allow
-LENS_LENGTHS = (0.3, 0.6, 0.17)  # of a camera's field, over the extent of the dots' places
-DOT_LENGTH = 0.5  # of the fields of single dots, likewise
-MAX_FRAMES = 200  # that are looked at: fields move slowly
-WORTH = 20.0  # of twice the log likelihood, that a fault or a field must gain: odds of 2e4
-SEEN = 0.2  # a mode of a field that moves all dots together by less than this many sigmas is left out
+LENS_LENGTHS = (0.3, 0.6, 0.17)  # correlation lengths of a camera's field, over the extent of the positions
+DOT_LENGTH = 0.5  # correlation length of the fields of single dots, likewise
+MAX_FRAMES = 200  # that are used: fields change slowly
+WORTH = 20.0  # increase of twice the log likelihood by which a fault or a field is accepted: odds of 2e4
+SEEN = 0.2  # sigmas by which a mode of a field moves all dots together at least; smaller ones are left out
 
 
 def noise_over_stated(trajectory: Trajectory) -> float:
-    """Variance of the dots from frame to frame over that stated; 1 where too few frames follow each other.
+    """Variance of the dots from frame to frame over that stated; 1 if too few frames follow each other.
 
-    From third differences of what the poses leave of the dots: neither motion nor any slow error passes them.
+    From third differences in time of the residuals about the poses, which suppress the motion and all slow errors.
     """
     residual = trajectory.markers_residual_px
     seen = (trajectory.marker_status == MarkerStatus.MEASURED) & np.isfinite(residual).all(-1)
@@ -55,17 +55,17 @@ def noise_over_stated(trajectory: Trajectory) -> float:
     difference = np.diff(scaled, 3, axis=1)[:, together]
     numbers = 2.0 * seen.sum(axis=(1, 2))
     free = np.mean(np.clip((numbers - 6.0) / np.maximum(numbers, 1.0), 0.0, 1.0)[numbers > 6])
-    # without the twentieth that is largest: a heavy tail of single bad frames is no noise of the others
+    # trimmed by the largest 5 %: single bad frames are outliers
     squares = np.sort(np.ravel(difference) ** 2)
     of_normal = chi2.cdf(chi2.ppf(0.95, 1), 3) / 0.95
     return float(np.mean(squares[: int(0.95 * squares.size)]) / of_normal / 20.0 / free)
 
 
 def with_noise_of_frames(trajectory: Trajectory) -> Trajectory:
-    """The trajectory with its covariances brought down to the scatter from frame to frame.
+    """The trajectory with its covariances reduced to the scatter from frame to frame.
 
-    A covariance that was enlarged to cover systematic errors says nothing of the noise: motions look like rests, and
-    effects like chance.
+    With a covariance that was enlarged to cover systematic errors, a slow motion looks like rest, and effects are not
+    significant.
     """
     ratio = noise_over_stated(trajectory)
     return with_noise(trajectory, ratio) if 0 < ratio < INFLATED else trajectory
@@ -83,34 +83,34 @@ def with_noise(trajectory: Trajectory, ratio: float) -> Trajectory:
 
 @dataclass(frozen=True)
 class Systematic:
-    """Sizes of the systematic errors of a recording's dots; zero: none is seen."""
+    """Sizes of the systematic errors of the dots of a recording; zero if not significant."""
 
-    lens_px: float = 0.0  # rms of each camera's field of the place in the image, per coordinate
-    lens_length_px: float = 100.0  # over which it changes
+    lens_px: float = 0.0  # rms of each camera's field, per coordinate
+    lens_length_px: float = 100.0  # its correlation length
     dot_px: float = 0.0  # rms of each dot's own field in each camera
     dot_length_px: float = 200.0
-    print_m: float = 0.0  # rms of the dots' places on the face, per coordinate
-    gain: float = 0.0  # of twice the log likelihood, over noise alone
-    amounts: dict[str, float] = field(default_factory=dict)  # of faults of the measurement that were fitted along
-    lens_places: tuple[Array, ...] = ()  # of each camera, of all recordings that have its field in common
-    left: float = 1.0  # variance beside all that, over the noise, of the numbers that no pose can take
+    print_m: float = 0.0  # rms error of the dots' positions on the face, per coordinate
+    gain: float = 0.0  # increase of twice the log likelihood over that of noise alone
+    amounts: dict[str, float] = field(default_factory=dict)  # of the faults of the measurement that were found
+    lens_places: tuple[Array, ...] = ()  # positions in each camera, of all recordings that share its field
+    left: float = 1.0  # remaining variance over the noise, of the components that no pose absorbs
 
     @property
     def present(self) -> bool:
-        """Is there anything beside noise?"""
+        """Is there any systematic error?"""
         return max(self.lens_px, self.dot_px, self.print_m) > 0
 
     @property
     def rms_px(self) -> float:
-        """Of all fields together, per coordinate."""
+        """Rms of all fields together, per coordinate."""
         return float(np.hypot(self.lens_px, self.dot_px))
 
 
 def field_modes(at: Array, places: Array, length: float, sigmas: float) -> Array:
-    """(..., k) modes at (..., 2) [px] of a random field with unit variance, smooth over a length.
+    """(..., k) modes at (..., 2) [px] of a random field of unit variance with a correlation length.
 
-    places : (n, 2) at which dots were seen
-    sigmas : size of the field over the noise of one place; modes that all n places together do not see are left out
+    places : (n, 2) positions of the dots
+    sigmas : rms of the field over the noise of one position; modes that all n together do not determine are left out
     """
     low, high = places.min(axis=0) - MARGIN * length, places.max(axis=0) + MARGIN * length
     counts = np.maximum(np.ceil((high - low) / length).astype(int) + 1, 2)
@@ -134,8 +134,8 @@ def field_columns(
 ) -> Array:
     """(n, 2, m, 2, k) shifts [px] by fields of unit size, one for each camera and coordinate.
 
-    own : each dot has such fields of its own; else they are common to all dots
-    in_common : of each camera, the places for which the fields are made, if not for these
+    own : each dot has fields of its own; otherwise they are common to all dots
+    in_common : of each camera, the positions that define the modes, if not these
     """
     found, m = [], places.shape[2]
     for camera in range(2):
@@ -151,9 +151,10 @@ def field_columns(
 
 
 class Likelihood:
-    """Likelihood of numbers (n,) that are noise of unit variance plus columns (n, k_i) times numbers of unit variance.
+    """Marginal likelihood of data (n,): noise of unit variance plus columns (n, k_i) times normal numbers.
 
-    Everything is in inner products, so that sizes of the groups of columns are tried without touching the data.
+    The numbers of a group i have a common standard deviation, its size. All is computed from inner products, so that
+    trying sizes takes no operation on the data.
     """
 
     def __init__(self, data: Array, groups: Mapping[str, Array]) -> None:
@@ -164,19 +165,16 @@ class Likelihood:
         self._gram, self._inner, self._power = columns.T @ columns, columns.T @ data, float(data @ data)
 
     def twice_log(self, sizes: Mapping[str, float]) -> float:
-        """Twice the log likelihood, up to a constant, where the columns of each group are multiplied by its size.
-
-        Groups without a size do not act.
-        """
+        """Twice the log likelihood at these sizes, up to a constant; the size of all other groups is zero."""
         root, known, *_ = self._solved(sizes)
         return float(known @ known - 2 * np.sum(np.log(np.diag(root))) - self._power)
 
     def left(self, sizes: Mapping[str, float]) -> float:
-        """Square of the data beside the most probable columns of these sizes, and of the numbers these have."""
+        """Chi-square of data and numbers at the most probable numbers."""
         return self._power - float(np.sum(self._solved(sizes)[1] ** 2))
 
     def amounts(self, sizes: Mapping[str, float], name: str) -> Array:
-        """Most probable numbers of one group's columns, in the units that the columns are given in."""
+        """Most probable numbers of one group, in the units of its columns."""
         root, known, index, scaled = self._solved(sizes)
         values = np.zeros(len(self._inner))
         values[index] = scaled * solve_triangular(root, known, lower=True, trans=1)
@@ -196,7 +194,7 @@ Sizes = dict[str, float]
 
 
 def _best_sizes(evidence: Likelihood, sizes: Sizes, grids: Mapping[str, Array]) -> tuple[float, Sizes]:
-    """Sizes of the groups in `grids` that make the data most probable: one after the other, up and down its grid."""
+    """Sizes of the groups in `grids` that maximise the likelihood, by coordinate ascent on their grids."""
     best, before = evidence.twice_log(sizes), -np.inf
     while best - before >= 1.0:
         before = best
@@ -215,7 +213,7 @@ def _best_sizes(evidence: Likelihood, sizes: Sizes, grids: Mapping[str, Array]) 
 def _with_faults(
     evidence: Likelihood, sizes: Sizes, faults: Mapping[str, float]
 ) -> tuple[float, Sizes, tuple[str, ...]]:
-    """The faults that make the data more probable beside these sizes, one after the other."""
+    """Forward selection of the faults that increase the likelihood at these sizes."""
     best, chosen = evidence.twice_log(sizes), tuple[str, ...]()
     while True:
         trials = {name: evidence.twice_log(sizes | {name: size}) for name, size in faults.items() if name not in sizes}
@@ -238,7 +236,7 @@ def find_systematic(system: DiscSystem) -> Systematic:
     places, (residual, by_pose, normal) = view.pixels(known), (part[rows] for part in view.pose_equations(known))
 
     def across(columns: Array) -> Array:
-        """(4 m k, c) of whitened columns (k, 4 m, c) what no pose takes."""
+        """(4 m k, c) the part of whitened columns (k, 4 m, c) that no pose absorbs."""
         taken = by_pose @ np.linalg.solve(normal, np.swapaxes(by_pose, 1, 2) @ columns)
         return np.asarray((columns - taken).reshape(residual.size, -1), float)
 
@@ -269,7 +267,7 @@ def find_systematic(system: DiscSystem) -> Systematic:
         evidence = Likelihood(data, groups | fields)
         value, sizes = _best_sizes(evidence, dict(start), sought)
         value, sizes, chosen = _with_faults(evidence, sizes, offered)
-        if chosen:  # what a fault explains is no field
+        if chosen:  # the fault has reduced the fields
             value, sizes = _best_sizes(evidence, start | {name: typical[name] for name in chosen}, sought)
         print_m, left = sizes["print"] if sizes["print"] > DOT_SIGMA else 0.0, max(1.0, evidence.left(sizes) / numbers)
         lens, dot = (sizes.get("lens", 0.0), share * extent), (sizes.get("dot", 0.0), DOT_LENGTH * extent)

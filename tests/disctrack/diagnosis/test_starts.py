@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from disctrack.diagnosis import diagnose, slip_start
+from disctrack.diagnosis import diagnose, motion_search
 from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.diagnosis.errors import ResidualTests
 from disctrack.diagnosis.large_faults import poses_with
@@ -113,7 +113,7 @@ def test_what_rolls_at_first_does_not_begin_in_slip(effects):
     trajectory = measured(effects, seed=100, n=150, theta_deg=20.0)
     system = DiscSystem(trajectory, PAPER)
     assert fit(system, system.base, system.start()).reduced_chi_square > FAR
-    assert not slip_start._slips_slowly(Settings(), system)
+    assert not motion_search._slips_slowly(Settings(), system)
 
 
 @pytest.mark.statistical

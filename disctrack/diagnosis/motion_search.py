@@ -1,8 +1,9 @@
-"""Recordings that begin in slip: the disc was hit, and rolls only after friction has stopped its sliding.
+"""The search for missing effects in a motion that rolls, or that slips first and rolls after friction has stopped it.
 
-Rolling from the first frame on is tried first. Where that fails, slip of mm/s is fitted, which no velocity shows; then
-the contact's velocity decides, which needs no model of the motion. Slip is fitted by its coefficient and the velocity
-at the first instant, and where no coefficient describes it, the diagnosis begins where rolling does.
+Rolling from the first frame on is tried first. If it fails, slip of mm/s is fitted, which is below the noise of the
+velocities; then the measured velocity at the contact decides, which needs no model. Slip is described by Coulomb's
+coefficient and the initial velocity of the centre. If no coefficient describes it, the diagnosis begins at the onset of
+rolling.
 """
 
 from dataclasses import replace
@@ -30,30 +31,27 @@ from disctrack.rolling import Model, Regime
 from disctrack.trajectory import Trajectory, part
 
 LEAST_SLIP = 12e-3  # [m/s] friction of 0.1 stops it in 12 ms
-LASTS = 5  # frames of slip at mm/s at least: contact velocities that are errors of a fit stop within one
+LASTS = 5  # frames of slip at mm/s at least: a contact velocity that is an error of the fit stops within one
 
 
-# what the model without slip makes of a recording that begins in it
-Rolling = tuple[Fit, HeldOut]
-# of a motion that may begin in slip, or was measured with a large fault; with slip in the model, where the disc slips
+Rolling = tuple[Fit, HeldOut]  # the model without slip, for a recording that begins with slip
+# system, with slip in its base if the disc slips at first; the answer of the search; and then the model without slip
 Answer = tuple[DiscSystem, Diagnosis, Rolling | None]
 
 
 def diagnose_motion(trajectory: Trajectory, model: Model, faults: Values, settings: Settings | None = None) -> Answer:
-    """Diagnose the motion, rolling or slipping at its start, with the times it has if pairs were lost.
+    """Diagnose a motion that rolls or slips at its start, with times corrected for pairs that both cameras lost.
 
     Raises AnalysisError.
     """
     jumps = clock_jumps(trajectory)
-    system, diagnosis, rolling = _with_these_times(
-        without_jumps(trajectory, jumps), model, faults, settings or Settings()
-    )
+    system, diagnosis, rolling = _at_true_times(without_jumps(trajectory, jumps), model, faults, settings or Settings())
     lost = tuple(f"frame {trajectory.frame[row]}: {in_words(n)}; counted with them" for row, n in jumps.items())
     return system, _noted(diagnosis, *lost, *system.notes), rolling
 
 
 def with_slip(system: DiscSystem, diagnosis: Diagnosis, rolling: Rolling | None) -> Diagnosis:
-    """The diagnosis with slip among what was found, and rolling from the first frame on as the model before."""
+    """The diagnosis with slip among the effects found, and rolling from the first frame on as the model before."""
     if rolling is None:
         return diagnosis
     (without, held_without), held, noise = rolling, diagnosis.held_out_before, diagnosis.noise
@@ -66,20 +64,20 @@ def with_slip(system: DiscSystem, diagnosis: Diagnosis, rolling: Rolling | None)
     return replace(beside(diagnosis, [found]), reason=reason, before=without, held_out_before=held_without)
 
 
-def _with_these_times(as_tracked: Trajectory, model: Model, faults: Values, settings: Settings) -> Answer:
+def _at_true_times(as_tracked: Trajectory, model: Model, faults: Values, settings: Settings) -> Answer:
     rolling = DiscSystem(with_noise_of_frames(as_tracked), model, known=faults)
     systematic = find_systematic(rolling)
-    # what fields leave in numbers that no pose takes is in the poses as well, and nothing that a motion could explain
+    # what the fields do not explain of the components that no pose absorbs is in the poses as well
     settings = replace(settings, at_noise=settings.at_noise * systematic.left)
     if (large := large_faults(as_tracked, rolling, systematic)) is not None:
         system, former = large
         without = system.start() | dict.fromkeys(system.known, 0.0) | dict(faults)
-        return system, _guided(system, without, settings, former, "the dots alone"), None
+        return system, _from_guess(system, without, settings, former, "the dots alone"), None
     rolling = rolling.again(systematic=systematic)
     return _rolling_or_slipping(settings, rolling, fit(rolling, rolling.base, rolling.start()))
 
 
-def _guided(system: DiscSystem, start: Values, settings: Settings, former: Former, source: str) -> Diagnosis:
+def _from_guess(system: DiscSystem, start: Values, settings: Settings, former: Former, source: str) -> Diagnosis:
     """The diagnosis by a search that begins with these explanations, and remarks on those of them that are found."""
     diagnosis = explain(system, start, settings, former=former)
     found = (f.candidate for f in diagnosis.found if any(f.candidate.name in names for names in former))
@@ -104,13 +102,11 @@ def _rolling_or_slipping(settings: Settings, rolling: DiscSystem, base: Fit) -> 
         return _slipping(settings, rolling, base, None)
     rolls = _at_noise(rolling, base, settings) or first_contact(first_motion(rolling, rolling.known))[0] <= LEAST_SLIP
     onset = None if rolls else _onset(rolling)
-    # shown are both: that it slips at the first frame, and that it rolls in the end
+    # the data show both slip at the first frame and rolling at the end
     if onset is None or not (onset.low > rolling.time[0] and np.isfinite(onset.high)):
-        if base.converged:
-            return rolling, explain(rolling, base.values, settings), None
-        guessed = _guided(rolling, base.values, settings, _by_clock(rolling), "the precession, which gravity sets")
-        return rolling, guessed, None
-    # the velocity at the contact is that of a rim as declared: where it is not round, what rolls seems to slip
+        former = {} if base.converged else _by_clock(rolling)
+        return rolling, _from_guess(rolling, base.values, settings, former, "the precession, which gravity sets"), None
+    # the velocity at the contact assumes the declared rim: if it is not round, a rolling disc seems to slip
     others = rolling.again(_without_slip(rolling))
     diagnosis = explain(others, base.values, settings)
     if diagnosis.verdict == "found":
@@ -119,10 +115,10 @@ def _rolling_or_slipping(settings: Settings, rolling: DiscSystem, base: Fit) -> 
 
 
 def _slips_slowly(settings: Settings, rolling: DiscSystem) -> bool:
-    """Does slip over the first frames bring a residual far above the noise down to it?
+    """Does slip during the first frames reduce residuals far above the noise to noise?
 
-    Friction below what rolling needs holds the contact's velocity at mm/s, which no first poses show; a fit does. Three
-    numbers that do away with all of it are not those of another effect.
+    With friction slightly below what rolling needs, the contact slips at mm/s, which the first poses do not show but a
+    fit does. That three quantities explain all residuals by chance is impossible.
     """
     slipping = rolling.again(freed=(slip_start(rolling.model),))
     try:
@@ -149,7 +145,7 @@ def _at_noise(system: DiscSystem, fit_: Fit, settings: Settings) -> bool:
 
 
 def _onset(rolling: DiscSystem) -> RollingOnset | None:
-    """When rolling begins, from the contact's velocity; None where the velocities cannot be had."""
+    """Onset of rolling, from the velocity at the contact; None if the velocities cannot be computed."""
     try:
         return rolling_onset(propagate(differentiate(part(rolling.trajectory, rolling.rows))))
     except AnalysisError:
@@ -157,7 +153,7 @@ def _onset(rolling: DiscSystem) -> RollingOnset | None:
 
 
 def _slipping(settings: Settings, rolling: DiscSystem, base: Fit, onset: RollingOnset | None) -> Answer:
-    """The diagnosis with slip at first, or of what comes after it where no coefficient of friction describes it."""
+    """The diagnosis with slip at first; or of the rolling after it, if no coefficient describes the slip."""
     system = rolling.again(freed=(slip_start(rolling.model),))
     diagnosis = explain(system, system.start(), settings)
     if diagnosis.verdict == "unexplained" and onset is not None:
@@ -171,12 +167,12 @@ def _slipping(settings: Settings, rolling: DiscSystem, base: Fit, onset: Rolling
 
 
 def _after_slip(settings: Settings, rolling: DiscSystem, onset: RollingOnset, slipping: Diagnosis) -> Answer | None:
-    """Diagnosis from the instant of rolling on; None where too little is left, or it is not explained either."""
+    """Diagnosis from the onset of rolling on; None if too few frames remain, or if it is unexplained too."""
     try:
         rows, notes = free_stretch(rolling.trajectory, onset.high)
     except AnalysisError:
         return None
-    system = rolling.again(_without_slip(rolling), rows=rows)  # the beginning has shown that its law is not Coulomb's
+    system = rolling.again(_without_slip(rolling), rows=rows)  # the first part has shown that its law is not Coulomb's
     system.notes = notes
     diagnosis = explain(system, system.start(), settings)
     if diagnosis.verdict == "unexplained":
@@ -184,7 +180,7 @@ def _after_slip(settings: Settings, rolling: DiscSystem, onset: RollingOnset, sl
     left = f"chi-square {slipping.after.reduced_chi_square:.3g}" if slipping.after.converged else "no fit"
     note = (
         f"the disc slips until {onset.time:.4f} s (95 %: {onset.low:.4f} to {onset.high:.4f} s), and no coefficient of "
-        f"friction describes that ({left}): this is the diagnosis of what comes after it"
+        f"friction describes that ({left}): the diagnosis is that of the motion after it"
     )
     return system, _noted(diagnosis, note), None
 
