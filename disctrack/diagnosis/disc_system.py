@@ -1,4 +1,4 @@
-"""The rolling disc as a system to diagnose: dots in both images, predicted by the rolling model and the rig."""
+"""The rolling disc as a system for the search: dots in both images, predicted by the rolling model and the rig."""
 
 from __future__ import annotations
 
@@ -40,22 +40,22 @@ from disctrack.track.refine.table_contact import thickness_tolerance
 from disctrack.trajectory import MarkerStatus, Trajectory
 
 RTOL = 1e-10  # of the integration: a millionth of the noise
-MIN_NUISANCE = 0.1  # a direction of the rig's covariance that moves all dots together by less than this many sigmas
+MIN_NUISANCE = 0.1  # sigmas by which a direction of the rig's covariance moves all dots together at least
 MAX_SWITCHES = (50, 200)  # and per second: slip at every extremum of a nutation of 30 Hz has 120; more is chatter
-# slip that hardly exceeds friction creeps: it follows within v / (3 mu g), and a step has to be as short
-TRIAL_SLIP_STEPS = 1_000  # for every frame, in a fit that is one trial among many; where slip is true, hundreds
-ROLLS = 0.2  # of that, where the disc cannot slip: a law that narrows to nothing, or drives it round ever faster
-MOST_WORK = 30_000  # for every frame: steps of the integrator and rows of derivatives, 10 us each; some laws take half
-USUAL = 700  # frames of a recording
-MOST_SIGMAS = 10.0  # of a size's tolerance, within which it is sought: else a wrong clock bends the disc to fit itself
-SLIP_STARTS = (0.9, 0.7, 0.5)  # of the friction that rolling needs at most
+# creep at small slip is stiff: its time constant is v / (3 mu g), and steps of the integrator have to be as short
+TRIAL_SLIP_STEPS = 1_000  # per frame, in one trial fit of many; true slip takes hundreds
+ROLLS = 0.2  # of that if the disc cannot slip: for laws with a vanishing width, or that accelerate the disc for ever
+MOST_WORK = 30_000  # per frame: steps of the integrator and rows of derivatives, 10 us each; some laws take half
+USUAL = 700  # frames, below which a recording may take as much work as with so many
+MOST_SIGMAS = 10.0  # of a size's tolerance, which bound its fit: it must not compensate for a wrong clock
+SLIP_STARTS = (0.9, 0.7, 0.5)  # initial guesses of mu over the largest friction that rolling needs
 
 
-Path = tuple[Array, Array]  # q and qdot of the disc as each camera meets it, both (2, n, 6)
+Path = tuple[Array, Array]  # q and qdot of the disc at the instants of each camera, both (2, n, 6)
 
 
 class DiscSystem(System):
-    """Dots of a rolling disc in two cameras; samples are frames, a row holds the whitened numbers of all dots."""
+    """Dots of a rolling disc in two cameras; samples are frames, a row holds the whitened coordinates of all dots."""
 
     frees_shapes = True
 
@@ -70,20 +70,20 @@ class DiscSystem(System):
         freed: tuple[Candidate, ...] = (),
         known: Values | None = None,
     ) -> None:
-        """Model : declared disc, gravity and effects; the parameters of its effects are fitted along.
+        """Model : declared disc, gravity and effects; the parameters of its effects are fitted in every fit.
 
-        candidates : all of the catalogue and of the measurement, if not given
-        rows : frames to take; those of `free_stretch` if not given
-        freed : faults, or slip at the start, that are known to be there: every fit moves their quantities
+        candidates : by default all effects and faults of the catalogues
+        rows : frames that are used; by default those of `free_stretch`
+        freed : slip at the start, if it is certain: every fit moves its quantities
         known : faults of the measurement that are held at these values; tolerances are about them
-        systematic : sizes of the dots' systematic errors, that are fitted along as fields with these sizes as priors
+        systematic : prior standard deviations of the random fields that are fitted as nuisances
         Raises AnalysisError.
         """
         self.systematic = systematic or Systematic()
         self.columns_known: dict[tuple[str, int], tuple[Array, list[Array]]] = {}  # by `starts`
         self.known = dict(known or {})
-        self.measured: Path | None = None  # in the place of a motion
-        self.notes: tuple[str, ...] = ()  # on the frames that were left out
+        self.measured: Path | None = None  # replaces the model of the motion
+        self.notes: tuple[str, ...] = ()  # on frames that were left out
         if rows is None:
             rows, self.notes = free_stretch(trajectory)
         self.model = model
@@ -101,14 +101,14 @@ class DiscSystem(System):
         self._whiten = np.where(self.used[..., None, None], whitening(safe), 0.0)
         self.weights = np.asarray(2.0 * self.used.sum((1, 2)), float)
         self.trial_steps = TRIAL_SLIP_STEPS * len(self.time)
-        self.budget = Budget(MOST_WORK * max(len(self.time), USUAL))  # a short one may take as long as the usual
+        self.budget = Budget(MOST_WORK * max(len(self.time), USUAL))
         if candidates is None:
             candidates = (*motion_candidates(model), *measurement_candidates(self.disc))
         of_freed = tuple(q for c in freed for q in c.quantities)
         self.starts_in_slip = any(q.name in SLIP_VELOCITY for q in of_freed)
         fitted = (*state_quantities(), *model_quantities(model), *of_freed)
         sizes = tuple(self._sizes({q.name for q in fitted}))
-        # where the rim levelled the table, each recording has a plane of its own, and that is no fault to be found
+        # a table determined from the rim has its own plane in each recording, which is no fault
         in_base = {q.name for q in (*of_freed, *(q for q in sizes if not q.belongs_to))}
         self.candidates = tuple(c for c in candidates if not in_base & set(c.names))
         nuisances, self._nuisance_columns = self._nuisances()
@@ -116,10 +116,10 @@ class DiscSystem(System):
         self.base = (*fitted, *sizes, *nuisances)
 
     def _sizes(self, fitted: Set[str]) -> Iterator[Quantity]:
-        """What the disc's sizes and its table may be off by, as priors: an effect is what goes beyond.
+        """Errors of the disc's sizes and of the table, with their tolerances as priors; an effect exceeds these.
 
-        Not those fitted anyway. The table's plane is known to its sigma, which the rig's covariance holds, but for what
-        it was moved by beyond that: where the disc rolls, a hollow is a slope and a height.
+        Without those that are `fitted` anyway. The uncertainty of the table's plane is in the covariance of the rig,
+        except for the amount by which tracking moved it: locally, a hollow is a slope and a height.
         """
         radius = MICROMETER if self.disc.radius_tolerance is None else self.disc.radius_tolerance
         half = 0.5 * thickness_tolerance(self.disc)
@@ -139,10 +139,10 @@ class DiscSystem(System):
                     yield replace(q, null=middle, prior_sigma=sigma, lower=lower, upper=upper, belongs_to=owner)
 
     def _nuisances(self) -> tuple[tuple[Quantity, ...], Array]:
-        """Errors common to all frames, with priors, and their whitened columns (n, 4 m, k).
+        """Nuisance parameters common to all frames, with priors, and their whitened columns (n, 4 m, k).
 
-        They are so small that their columns at the measured poses serve for every prediction. Directions of the
-        calibration's covariance are in units of their own sigma.
+        They are so small that columns at the measured poses are used for every prediction. Directions of the
+        calibration's covariance are in units of their standard deviation.
         """
         q, _ = self._as_measured(scene_faults(self.disc, self.known).right_delay_s)
         R, n = rotation_from_euler(*np.moveaxis(q[..., 3:], -1, 0)), len(self.time)
@@ -152,8 +152,8 @@ class DiscSystem(System):
         rig = self.whitened(by_rig) @ square_root(self.rig.covariance)
         _, singular, V = np.linalg.svd(triangle(rig.reshape(-1, rig.shape[-1])))
         shown = V[singular > MIN_NUISANCE]
-        rig = rig @ shown.T @ shown  # by the same numbers in all recordings of the rig
-        along = np.einsum("ncmap,cnpb->ncmab", by_point, R[..., :2])  # by the dots' places on the face
+        rig = rig @ shown.T @ shown  # the same parameters in all recordings of the rig
+        along = np.einsum("ncmap,cnpb->ncmab", by_point, R[..., :2])  # by the dots' positions on the face
         m, sizes = self.disc.n_markers, self.systematic
         dots = (self._whiten @ along)[:, :, :, :, None, :] * np.eye(m)[None, None, :, None, :, None]
         sigma, bias = float(np.hypot(DOT_SIGMA, sizes.print_m)), "bias common to all images of a dot"
@@ -167,7 +167,7 @@ class DiscSystem(System):
             ("dot_field", sizes.dot_px, sizes.dot_length_px, True, "mode of the dots' own residual fields", ()),
         ):
             if size > 0:
-                # for all of them, modes are kept down to where a field of ten sigmas of a single dot cannot be seen
+                # for several recordings, all modes that a field of ten sigmas of a single dot determines
                 sigmas = 10.0 if of_rig else size * self.per_px
                 shifts = size * field_columns(places, self.used, length, sigmas, own, of_rig)
                 columns.append(self.whitened(shifts))
@@ -180,7 +180,7 @@ class DiscSystem(System):
         return np.asarray(found.reshape(len(found), 2 * self.used[0].size, shifts.shape[-1]), float)
 
     def _as_measured(self, delay: float) -> Path:
-        """The measured motion, by a cubic through the poses; rows without a pose get what lies between."""
+        """The measured motion, by a cubic spline through the poses, which interpolates rows without a pose."""
         q = self.trajectory.q[self.rows]
         known = np.isfinite(q).all(axis=1)
         course = CubicSpline(self.time[known], q[known])
@@ -188,9 +188,9 @@ class DiscSystem(System):
         return course(times), course(times, 1)
 
     def about_poses(self, known: Values) -> DiscSystem:
-        """The same dots about their measured poses, which take the place of a motion, whatever its values.
+        """The same dots about the measured poses, which replace the model of the motion.
 
-        known : faults that the poses were found with
+        known : faults with which the poses were fitted
         """
         view, delay = copy(self), scene_faults(self.disc, known).right_delay_s
         view.measured, met = self._as_measured(delay), self.time + delay  # by the right camera
@@ -198,13 +198,13 @@ class DiscSystem(System):
         return view
 
     def start(self) -> dict[str, float]:
-        """Values of the base quantities from the measured poses, good enough for Gauss-Newton, and the known faults."""
+        """Initial guess of the base quantities from the measured poses, with the known faults."""
         return start_values(self, self.known)
 
     def again(self, candidates: tuple[Candidate, ...] | None = None, **other: Any) -> DiscSystem:
-        """Another question to the same recording and model, with the same budget; what is not given is as here.
+        """A system of the same recording and model, with the same budget; rows, fields and known faults as here.
 
-        But for the candidates, and what was taken for slip or freed: all of the catalogue, rolling, and none.
+        Candidates and freed quantities are the defaults if not given.
         """
         same = {"rows": self.rows, "systematic": self.systematic, "known": self.known}
         system = DiscSystem(self.trajectory, self.model, candidates, **{**same, **other})
@@ -212,7 +212,7 @@ class DiscSystem(System):
         return system
 
     def beginnings(self) -> tuple[DiscSystem, ...]:
-        """Parts over which a motion is followed that a fit of the whole would not find."""
+        """First parts of increasing length, for fits that do not converge for the whole recording."""
         found = []
         for stretch in STRETCHES:
             n = int(np.searchsorted(self.time, self.time[0] + stretch, side="right"))
@@ -226,7 +226,7 @@ class DiscSystem(System):
 
     @property
     def per_px(self) -> float:
-        """Sigmas of a dot's noise in a pixel, rms."""
+        """One pixel in units of the standard deviation of a dot, rms."""
         return float(np.sqrt(np.mean(self._whiten[self.used] ** 2) * 2)) if self.used.any() else 1.0
 
     @property
@@ -235,16 +235,16 @@ class DiscSystem(System):
         return float(1.0 / np.median(np.diff(self.time)))
 
     def scan(self, fitted: Fit, beside: Sequence[Quantity] | None = None) -> DiscScan | None:
-        """Answers to laws along the fitted motion; None where the disc slips.
+        """First-order gains of laws along the fitted motion; None if the disc slips.
 
-        beside : quantities to be fitted beside a law, if not those of the fit. What the others do is given back to the
-        residual to first order: so a law is looked for in their place, along a motion that follows the data.
+        beside : quantities fitted together with a law; by default those of the fit. The contribution of all others is
+            added to the residual to first order: the law is to replace them, along a motion that follows the data.
         """
         along = response(self, fitted)
         return None if along is None else DiscScan(self, fitted, beside, along)
 
     def knowing(self, law: LearnedLaw) -> DiscSystem:
-        """The same system, in whose values numbers of this law may be named."""
+        """The same system with this law in its model: its coefficients may be among the values."""
         known = copy(self)
         known.model = self.model.knowing(law.effect)
         return known
@@ -257,19 +257,19 @@ class DiscSystem(System):
         return self.model.with_values(effects)
 
     def starts(self, candidate: Candidate, values: Values, least: float = 0.0) -> Sequence[tuple[float, ...]]:
-        """For slip: of coefficients at which the motion would slip seldom, often, or mostly, that nearest to the data.
+        """For slip: the coefficient nearest to the data, of some with which the disc would slip seldom to mostly.
 
-        For others: values of the shape, where that has to be looked for.
+        For others: initial guesses of the shape, if it needs any.
         """
         if not candidate.threshold:
             return shape_guesses(self, candidate, values, least)
         motion = simulate(self.model_with(values), state_of(values), times=self.instants(values))
         tried = 1.0 / (np.array(SLIP_STARTS) * np.max(motion.friction_needed))
-        left = [np.sum(self.linearise({**values, SLIP: inverse}, [])[0] ** 2) for inverse in tried]
-        return [(float(tried[np.argmin(np.nan_to_num(left, nan=np.inf))]),)]
+        chi_squares = [np.sum(self.linearise({**values, SLIP: inverse}, [])[0] ** 2) for inverse in tried]
+        return [(float(tried[np.argmin(np.nan_to_num(chi_squares, nan=np.inf))]),)]
 
     def instants(self, values: Values) -> Array:
-        """(n,) true times of the frames [s], by the left camera."""
+        """(n,) true instants of the frames of the left camera [s]."""
         return self.start_time + scene_faults(self.disc, values).true_times(self.time - self.start_time, 1.0)
 
     def linearise(self, values: Values, names: Sequence[str]) -> tuple[Array, Array]:
@@ -293,28 +293,28 @@ class DiscSystem(System):
         return residual, derivative
 
     def pixels(self, values: Values) -> Array:
-        """Predicted images of the dots (n, 2, m, 2) [px], without the biases that nuisances stand for."""
+        """Predicted images of the dots (n, 2, m, 2) [px], without the nuisances."""
         return self._sight(self._path(values)[0], values).pixels
 
     def residual_px(self, values: Values) -> Array:
-        """What is left of the dots' images (n, 2, m, 2) [px]; zero where a dot is not used."""
+        """Residuals of the images of the dots (n, 2, m, 2) [px]; zero where a dot is not used."""
         whiten = np.where(self.used[..., None, None], self._whiten, np.eye(2))
         residual = self.linearise(values, [])[0].reshape(*self.observed.shape, 1)
         return np.asarray(np.linalg.solve(whiten, residual)[..., 0], float)
 
     def poses(self, values: Values) -> Array:
-        """Predicted coordinates q (n, 6) in the left camera's instants, in axes of the true table."""
+        """Predicted coordinates q (n, 6) at the instants of the left camera, in axes of the true table."""
         (q, _), *_ = self._path(values)
         return q[0]
 
     def pose_residual(self, values: Values) -> Array:
-        """(n, 6) part of the whitened residual that a free pose per frame would take: six numbers of variance 1."""
+        """(n, 6) part of the whitened residual that a free pose per frame absorbs, of variance 1."""
         return self.parts_of_residual(values)[0]
 
     def coordinate_errors(self, values: Values) -> tuple[Array, Array]:
         """Measured minus predicted coordinates and their standard deviations, both (n, 6); NaN without dots.
 
-        The difference that the dots show once everything else in `values` (cameras, pattern) is taken into account.
+        By one Gauss-Newton step of a free pose, with the cameras and the pattern at `values`.
         """
         r, J, normal = self.pose_equations(values)
         to_coordinates = np.tile(np.eye(6), (len(r), 1, 1))
@@ -327,14 +327,14 @@ class DiscSystem(System):
         return np.where(known, delta, np.nan), np.where(known, sigma, np.nan)
 
     def parts_of_residual(self, values: Values) -> tuple[Array, Array]:
-        """The part (n, 6) of the whitened residual that a free pose per frame would take, and the rest (n, 4 m)."""
+        """The part (n, 6) of the whitened residual that a free pose per frame absorbs, and the rest (n, 4 m)."""
         r, J, normal = self.pose_equations(values)
         gradient = np.swapaxes(J, 1, 2) @ r[..., None]
         pose = np.linalg.solve(np.linalg.cholesky(normal), gradient)[..., 0]
         return pose, r - (J @ np.linalg.solve(normal, gradient))[..., 0]
 
     def together(self, values: Values, width: int) -> Array:
-        """How each camera sees the disc moved (n, 4 m, 12): where it shakes, or exposes at another time."""
+        """Directions (n, 4 m, 12) of the dots by a motion of the disc in one camera: vibration, or clock jitter."""
         moved = self.pose_equations(values)[1].reshape(len(self.time), 2, width // 2, 6)
         enough = (self.used.sum(axis=-1) > 3)[..., None, None]
         moved = np.where(enough, moved, 0.0)
@@ -357,22 +357,22 @@ class DiscSystem(System):
         return np.array([values.get(name, 0.0) for name in self._nuisance_column])
 
     def _residual(self, pixels: Array, values: Values) -> Array:
-        """Whitened rows of observed minus predicted dots, the nuisances' part taken off."""
+        """Whitened rows of observed minus predicted dots, minus the contribution of the nuisances."""
         residual = self.whitened((self.observed - pixels)[..., None])[..., 0]
         weights = self._nuisance_values(values)
         return residual - self._nuisance_columns @ weights if weights.any() else residual
 
     def _path(self, values: Values, names: Sequence[str] = ()) -> tuple[Path, tuple[str, ...], Array]:
-        """Motion at the true instants of both cameras, and by which of the names it moves.
+        """Motion at the true instants of both cameras, the names on which it depends, and its derivatives by these.
 
-        Their derivatives (n, 6, k) are those of pose components, of the rotation by its vector.
+        The derivatives (n, 6, k) are of pose components, of the rotation as a rotation vector.
         """
         still = np.zeros((len(self.time), 6, 0))
         if self.measured is not None:
             return self.measured, (), still
         times, delay = self.instants(values), scene_faults(self.disc, values).right_delay_s
         model, state = self.model_with({k: v for k, v in values.items() if np.isfinite(v)}), state_of(values)
-        # a step of the fit may lead where no disc rolls, and where following it would take for ever
+        # a step of the fit may lead to states in which no disc rolls, or whose integration does not end
         fastest = 3 * np.sqrt(4 * model.gravity / (self.disc.radius * np.sin(THETA_END)))
         nowhere = not THETA_END < state.theta <= np.pi / 2 or max(abs(state.psidot), abs(state.omega3)) > fastest
         if nowhere or (self.starts_in_slip and model.effect("slip") is None):  # 1/mu = 0: no velocity is free
@@ -384,7 +384,7 @@ class DiscSystem(System):
             parameters[SLIP] = "slip.mu"
         limit = int(MAX_SWITCHES[0] + MAX_SWITCHES[1] * (times[-1] - times[0]))
         rolls = model.effect("slip") is None and model.effect("creep") is None
-        # more is no motion that can be followed
+        # a motion that needs more steps is given up
         left = int(min(self.budget.trial_left, self.trial_steps * (ROLLS if rolls else 1.0)))
         of_state = [n.partition(".")[2] for n in components]
         moving = sensitivities(model, state, times, tuple(parameters.values()), of_state, THETA_END, RTOL, limit, left)
@@ -401,7 +401,7 @@ class DiscSystem(System):
         return (q, qdot), moved, by_motion
 
     def _sight(self, path: Path, values: Values) -> Sight:
-        """The dots as both cameras meet them on this path."""
+        """The dots in both cameras along this path."""
         q, speed = path[0], path[1].copy()
         axes = euler_rate_axes_world(q[..., 3], q[..., 4])
         speed[..., 3:] = (axes @ speed[..., 3:, None])[..., 0]
@@ -416,6 +416,6 @@ class DiscSystem(System):
 
 
 def _nuisances(name: str, k: int, meaning: str, belongs_to: tuple[str, ...] = ()) -> list[Quantity]:
-    """Linear quantities in units of their own standard deviation."""
+    """Linear quantities in units of their standard deviation."""
     one = Quantity(name, "sigma", 0.1, prior_sigma=1.0, meaning=meaning, linear=True, belongs_to=belongs_to)
     return [replace(one, name=f"{name}.{i}") for i in range(k)]

@@ -1,14 +1,19 @@
-"""How well is a law known whose form was picked from a library? Its course over time, and what its form may be off by.
+"""Uncertainty of a law whose form was selected from a library: model discrepancy of its moment over time.
 
-A fit takes the form for exact: its sigmas are those of the coefficients. The true law has another form, of which the
-data show little. So the moment about the contact is taken for the law's plus a misfit (Kennedy and O'Hagan 2001: a
-discrepancy beside the parameters). Where the form is nearly right, it is a normal process with a correlation as long as
-a probe. Where it is another's, it is a sum: along each axis such a process, and some that change slowly beside the
-precession and its harmonics, as what depends on place and direction does; each of a size of its own, so that what the
-recording does not show may be as large as the law. All sizes are in proportion to the law's, and their probabilities
-follow from the residual. An edge or a blow shorter than a probe may be anywhere in it. That the form is another's is
-certain where the residual is not noise, or where it takes several to describe the data, and else as probable as laws of
-other kinds are that describe the data too. What a law's numbers could take up themselves is no misfit (Plumlee 2017).
+The standard deviations of a fit assume that the form of the law is exact. The true law may have another form, about
+which the data say little. So the moment about the contact is modelled as that of the law plus a discrepancy (Kennedy
+and O'Hagan 2001).
+
+- If the form is nearly right, the discrepancy is a Gaussian process with the correlation length of a probe.
+- If the form is wrong, it is a sum of processes along each axis: this one, and slow ones multiplied by the harmonics of
+  the precession, as of moments that depend on position and direction. Each has its own amplitude, so that a component
+  that the recording does not determine may be as large as the law. Features shorter than a probe, as an edge or a blow,
+  may be anywhere within it.
+
+Amplitudes are relative to the rms of the law; their posterior follows from the residual. The form is wrong with
+certainty if the residual is not noise or the data need a sum of several laws; otherwise with the posterior probability
+of the laws of other kinds that describe the data too. The part of the discrepancy that the coefficients of the law can
+describe is excluded, so that they stay identifiable (Plumlee 2017).
 """
 
 from collections.abc import Collection, Sequence
@@ -33,13 +38,13 @@ from disctrack.rolling import Motion, simulate
 from disctrack.rolling.model import body_constants
 from disctrack.rolling.motion import effect_wrench
 
-SIZES = np.logspace(-3, 0, 25)  # of a part of the misfit over the law's rms: before the data, each as probable
-HARMONICS = 2  # of the precession, beside which a part changes slowly
-SLOW = 1.0 / 3.0  # of the recording: correlation of a part that changes slowly
-SELDOM = 0.05  # probability that the form is another's, where no other describes the data
-SWEEPS = 4  # over the parts, the size of each judged beside the others
-STEP = 1e-4  # of a number, for the derivative of the course
-WITHIN = 8  # instants of a probe, at which laws are looked at
+SIZES = np.logspace(-3, 0, 25)  # amplitudes of a process over the law's rms, equally probable a priori
+HARMONICS = 2  # of the precession, with which slow processes are multiplied
+SLOW = 1.0 / 3.0  # correlation length of a slow process over the length of the recording
+LEAST_WRONG = 0.05  # probability that the form is wrong if no other describes the data
+SWEEPS = 4  # of coordinate ascent over the amplitudes
+STEP = 1e-4  # relative, for numerical derivatives
+WITHIN = 8  # instants per probe at which laws are evaluated
 
 
 def moment_about_contact(
@@ -47,7 +52,8 @@ def moment_about_contact(
 ) -> Array:
     """(n, 3) of the effects at `values` on a given motion [N m]; a force X at the centre counts as -r_OA x X.
 
-    A sharp edge on a flat table, as the arm goes; a tilt counts as the force by which gravity is another than declared.
+    The lever arm is that of a sharp edge on a flat table. A tilt counts as the force by which gravity differs from the
+    declared one.
     only : the effects of these names
     """
     model = system.model_with(values)
@@ -73,17 +79,18 @@ def with_form(
     fitted: Fit,
     law: LearnedLaw,
     noise: float,
-    remembers: bool = False,
+    correlated: bool = False,
     beside: Collection[str] = (),
 ) -> tuple[Fit, Fit, Course | None, float]:
-    """The fit with sigmas as probable as it is that the form is another's, and with those if it is; the laws' course.
+    """The fit with covariances averaged over right and wrong form, and with that of a wrong form; and the laws' moment.
 
-    The course is the moment about the contact of all laws of the fitted model, forces at the centre included, with what
-    the law's form may be off by; with it comes the rms of that over the law's own. Where the disc slips there is none.
+    The moment is that of all laws of the fitted model about the contact, forces at the centre included, with its
+    uncertainty including the discrepancy. Last, the rms of the discrepancy over that of the law. If the disc slips
+    there is no moment.
 
-    system : knows the law.   noise : variance of the residual's noise over that stated
-    remembers : what the fit leaves is not noise
-    beside : known effects that were found with the law: where they stand in with it, the misfit is of them all
+    system : its model contains the law.   noise : variance of the noise of the residual over that stated
+    correlated : the residual is not white noise
+    beside : known effects found together with the law, which may compensate for its form: part of the discrepancy
     """
     blocks = probe(system, fitted)
     if blocks is None:
@@ -92,7 +99,7 @@ def with_form(
     R = np.vstack([blocks.data / np.sqrt(noise), blocks.prior])
     course, own, by_number = _courses(system, fitted, {law.candidate.effect, *beside}, blocks.time)
     parts = _parts(system, fitted, blocks, float(np.sqrt(np.mean(np.sum(own**2, axis=1)))))
-    wrong = 1.0 if remembers else form_is_another(law, beside)
+    wrong = 1.0 if correlated else probability_of_wrong_form(law, beside)
     laws = by_number[:, np.any(by_number != 0.0, axis=0)]
     own_directions = span(laws)
     fitted_columns = span(R[:, :n])
@@ -117,31 +124,31 @@ def with_form(
 
 
 def absorbed(columns: Array, misfit: Array) -> Array:
-    """By how much the numbers of columns (m, n) give way to what others (m, k) do, in least squares: (n, k)."""
+    """(n, k) least-squares coefficients of columns (m, n) for each column of the misfit (m, k)."""
     length = np.linalg.norm(columns, axis=0)
     length = np.where(length > 0, length, 1.0)
     return np.asarray(np.linalg.lstsq(columns / length, misfit, rcond=DEPENDENT)[0] / length[:, None], float)
 
 
-def form_is_another(law: LearnedLaw, beside: Collection[str] = ()) -> float:
-    """Probability that the true law has another form than those of the library, where what is left is noise.
+def probability_of_wrong_form(law: LearnedLaw, beside: Collection[str] = ()) -> float:
+    """Probability that the true law is not in the library, given that the residual is noise.
 
-    A sum of several, or one with known effects `beside` it, is what a library makes of a law that it does not hold.
+    A sum of several families, or of one and known effects `beside` it, approximates a law that is not in the library.
     """
     if len(law.families) + len(beside) > 1:
         return 1.0
     own = _kinds(law)
     others = sum(odds for other, odds in law.others if not other.families or not _kinds(other) <= own)
-    return max(SELDOM, others / (1.0 + others))
+    return max(LEAST_WRONG, others / (1.0 + others))
 
 
 def _kinds(law: LearnedLaw) -> set[tuple[str, ...]]:
-    """Of what kind each family is, and on which components of moment and force it acts."""
+    """The kind of each family, and the components of moment and force on which it acts."""
     return {(f.kind, *sorted({component for parts in f.terms for component in parts})) for f in law.families}
 
 
 def _courses(system: DiscSystem, fitted: Fit, own: Collection[str], time: Array) -> tuple[Array, Array, Array]:
-    """All laws' moment (k, 3), that of the effects `own`, the former's derivative (3 k, n) by the fitted numbers."""
+    """Moment (k, 3) of all laws and of the effects `own`, and derivative (3 k, n) of the first by the quantities."""
     values = fitted.values
     motion = _motion(system, values, time)
     course = moment_about_contact(system, values, motion)
@@ -156,7 +163,7 @@ def _courses(system: DiscSystem, fitted: Fit, own: Collection[str], time: Array)
 
 
 def _among_others(system: DiscSystem, fitted: Fit, law: LearnedLaw, course: Array, time: Array) -> Array:
-    """Variance (k, 3) of the course over the laws that describe the data too, each with its odds."""
+    """Variance (k, 3) of the moment over the laws that describe the data too, weighted by their odds."""
     motion, total, spread = _motion(system, fitted.values, time), 1.0, np.zeros_like(course)
     for other, odds in law.others:
         moment = moment_about_contact(system.knowing(other), other.values, motion)[1:]
@@ -165,9 +172,9 @@ def _among_others(system: DiscSystem, fitted: Fit, law: LearnedLaw, course: Arra
 
 
 def _within_probes(system: DiscSystem, fitted: Fit, blocks: Probed, course: Array) -> Array:
-    """Mean square (k, 3), over the time of each probe, by which the laws differ from a smooth course through them all.
+    """Mean square (k, 3), over the time of each probe, of the laws minus a spline through their values at the probes.
 
-    What is shorter than a probe (an edge, a blow) moves the disc by its sum alone: another form has it elsewhere there.
+    The motion depends on the integral of features shorter than a probe (an edge, a blow), not on their position.
     """
     parts = (np.arange(WITHIN) + 0.5) / WITHIN - 0.5
     fine = blocks.time[:, None] + blocks.spacing * parts
@@ -177,13 +184,13 @@ def _within_probes(system: DiscSystem, fitted: Fit, blocks: Probed, course: Arra
 
 
 def _motion(system: DiscSystem, values: Values, time: Array) -> Motion:
-    """From the first frame on, at these times after it."""
+    """The fitted motion from the first frame on, at these later times."""
     times = np.concatenate([[float(system.instants(values)[0])], time])
     return simulate(system.model_with(values), state_of(values), times=times)
 
 
 def _parts(system: DiscSystem, fitted: Fit, blocks: Probed, size: float) -> list[Array]:
-    """Roots (3 k, m) of the covariances of the misfit's parts, axis by axis; their rms is that of the law, `size`."""
+    """Square roots (3 k, m) of the processes' covariances, axis by axis, with the rms of the law, `size`."""
     time, k = blocks.time, len(blocks.time)
     distance = time[:, None] - time
     short = np.linalg.cholesky(np.exp(-0.5 * (distance / blocks.spacing) ** 2) + 1e-6 * np.eye(k))
@@ -198,9 +205,9 @@ def _parts(system: DiscSystem, fitted: Fit, blocks: Probed, size: float) -> list
 
 
 def _second_moment(B: Array, right: Array, parts: Sequence[int], sizes: Array = SIZES) -> tuple[Array, float]:
-    """E[u u'] of right = B u + noise, and the rms of u; its parts u_i = f_i v_i with normal v_i of size 1.
+    """Second moment E[u u'] of right = B u + noise, and the rms of u, whose parts are u_i = f_i v_i with v_i ~ N(0, 1).
 
-    parts : how many columns each has. f_i is averaged over `sizes`, the others' at their rms.
+    parts : number of columns of each. The posterior of f_i over `sizes` is computed with the other parts at their rms.
     """
     edges = np.concatenate([[0], np.cumsum(parts)])
     own = [slice(a, b) for a, b in pairwise(edges)]

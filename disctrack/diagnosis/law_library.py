@@ -1,8 +1,8 @@
-"""Laws that no catalogue names, as they are asked of a residual: moments and forces by position, rate, attitude, time.
+"""Library of laws outside the catalogue: moments and forces as functions of position, rates, attitude and time.
 
-A family of terms shares what it means; each term sets components of the wrench by formulas in the names of
-records.KINEMATICS and gets a coefficient of its own. Numbers in braces are the shape of a law (where a gate stands, how
-fast something hums): a grid of them is looked over, and the best is fitted along with the coefficients.
+The terms of a family have one physical meaning; each term sets components of the wrench by formulas in the names of
+records.KINEMATICS, and has a coefficient. Numbers in braces are shape parameters of a law (the position of an edge, a
+frequency): a grid of them is searched, and the best is the initial guess of a fit of shape and coefficients.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.significance import as_sigmas, wald
 from disctrack.discrepancy.system import Candidate, Values
 
-MIN_SIGMAS = 3.0  # of a coefficient after the refit; what helped to first order may not help the motion
-WIDTHS = ("width", "softness", "length", "lasting")  # shapes that go with the amount
+MIN_SIGMAS = 3.0  # significance of a coefficient after the refit; a first-order gain may not be confirmed
+WIDTHS = ("width", "softness", "length", "lasting")  # shape parameters that correlate with the amplitude
 HIGHEST_HARMONIC = 4  # of the angles
 DRIFT_DEGREE = 4  # of the polynomials in time
 FASTEST_HUM = 150.0  # [Hz]
@@ -32,51 +32,51 @@ Parts = Mapping[str, str]  # component of the force -> formula
 
 @dataclass(frozen=True)
 class Family:
-    """Terms that belong together, each with a coefficient of its own."""
+    """Terms with one physical meaning, each with a coefficient."""
 
     title: str
     terms: tuple[Parts, ...]
     shape: Mapping[str, float] = field(default_factory=dict)  # numbers in braces, fitted along with the coefficients
-    kind: str = "moment"  # families of one kind are variations of one idea
-    names: tuple[str, ...] = ()  # of the coefficients, where they mean something by themselves
+    kind: str = "moment"  # families of one kind are variations of one another
+    names: tuple[str, ...] = ()  # of the coefficients, if they are physical quantities
 
     @property
     def n_numbers(self) -> int:
-        """Numbers that a fit would move."""
+        """Number of parameters."""
         return len(self.terms) + len(self.shape)
 
     def formulas(self) -> tuple[Parts, ...]:
-        """The terms with the shape's numbers in place."""
+        """The terms with the values of the shape parameters."""
         numbers = {k: f"({v!r})" for k, v in self.shape.items()}
         return tuple({c: f.format(**numbers) for c, f in parts.items()} for parts in self.terms)
 
 
 @dataclass(frozen=True)
 class LearnedLaw:
-    """Families of terms that describe what is missing."""
+    """A sum of families that describes the missing moment or force."""
 
     candidate: Candidate
-    effect: Any  # what the system has to know to predict with it
+    effect: Any  # as which the model of the system contains it
     families: tuple[Family, ...]
-    amounts: tuple[tuple[str, ...], ...] = ()  # names of each family's coefficients ...
-    shapes: tuple[tuple[str, ...], ...] = ()  # ... and of the numbers of its shape
-    values: Values = field(default_factory=dict)  # of everything, where its fit ended
-    alike: tuple[str, ...] = ()  # other laws that describe the data as well
-    others: tuple[tuple[LearnedLaw, float], ...] = ()  # laws that fit as well, however long, with their odds
-    looked: float = 0.0  # chi-square that each family pays for having been looked for among so many
+    amounts: tuple[tuple[str, ...], ...] = ()  # names of the coefficients of each family ...
+    shapes: tuple[tuple[str, ...], ...] = ()  # ... and of its shape parameters
+    values: Values = field(default_factory=dict)  # of all quantities of its fit
+    alike: tuple[str, ...] = ()  # indistinguishable laws of similar length
+    others: tuple[tuple[LearnedLaw, float], ...] = ()  # all laws that fit as well, with their odds
+    looked: float = 0.0  # chi-square that each family pays for multiple comparisons
 
     @property
     def title(self) -> str:
-        """What the law means, in words."""
+        """The law in words."""
         return "; and ".join(family.title for family in self.families)
 
     def is_significant(self, fitted: Fit) -> bool:
-        """Do the coefficients of each of its families differ from zero, in a fit whose sigmas hold all doubts?"""
+        """Are the coefficients of each family different from zero, given the covariances of the fit?"""
         return all(differ_from_zero(*fitted.amounts(names)) for names in self.amounts)
 
     @property
     def widths(self) -> set[str]:
-        """Numbers of the shapes that go with an amount: along their profiles only are they found."""
+        """Names of shape parameters that are fitted along their profile likelihood."""
         pairs = zip(self.families, self.shapes, strict=True)
         return {name for family, names in pairs for key, name in zip(family.shape, names, strict=True) if key in WIDTHS}
 
@@ -87,11 +87,11 @@ class LearnedLaw:
 
 
 def differ_from_zero(amounts: Array, covariance: Array) -> bool:
-    """Do amounts (k,) with this covariance (k, k), together?"""
+    """Are amounts (k,) with this covariance (k, k) jointly significant?"""
     return as_sigmas(wald(amounts, covariance), len(amounts)) > MIN_SIGMAS
 
 
-# Of the motion's own numbers: (words, formula).
+# Functions of the state: (words, formula).
 SCALARS = (
     ("constant", "1.0"),
     ("sign omega_z", "sign(omega_z, 0.1)"),
@@ -111,24 +111,24 @@ SCALARS = (
     ("1 / sin^2 theta", "1.0 / (sin_theta * sin_theta)"),
     ("time", "time"),
 )
-FOR_FORCES = 14  # of them, that are tried for forces, too
+
 _SPEED = "sqrt(v_n * v_n + v_m * v_m + 1e-12)"
-_X, _Y = "(x * cos(psi) + y * sin(psi))", "(y * cos(psi) - x * sin(psi))"  # the place along n0 and m0
-# the contact's place on the table: O minus (r cos theta - h sin theta) m0
+_X, _Y = "(x * cos(psi) + y * sin(psi))", "(y * cos(psi) - x * sin(psi))"  # the position along n0 and m0
+# position of the contact on the table: O minus (r cos theta - h sin theta) m0
 _ARM = "(radius * cos_theta - half_thickness * sin_theta)"
 _CONTACT_X, _CONTACT_Y = f"(x + {_ARM} * sin(psi))", f"(y - {_ARM} * cos(psi))"
 _ALONG = f"({_CONTACT_X} * cos({{direction}}) + {_CONTACT_Y} * sin({{direction}}))"
 
 
-# of the coefficients of a kind, where they mean something by themselves
+# of the coefficients of a kind, if they are physical quantities
 HALF = " of half a wave"
 NAMES = {"blow": ("impulse_x", "impulse_y", "impulse_z"), "blow M": ("impulse_n", "impulse_m", "impulse_k")}
 
 Shape = Mapping[str, float]
-# title, kind, terms; values of the shape at which they are looked at
+# title, kind, terms; grid of the shape parameters
 Row = tuple[str, str, tuple[Parts, ...]] | tuple[str, str, tuple[Parts, ...], Iterable[Shape]]
 
-# smallest and largest value of each number of a shape, and a sensible step
+# lower and upper bound of each shape parameter, and its scale
 SHAPES = {
     "rate": (0.0, np.inf, 0.1),
     "edge": (-np.inf, np.inf, 1e-4),
@@ -146,7 +146,7 @@ LOCKED = {"angle", "magnet", "bump phi", "bump psi"}  # kinds of families
 
 
 def locked(law: LearnedLaw) -> bool:
-    """Is it locked to an angle of the body or of the table?"""
+    """Is it a function of an angle of the body or of the table?"""
     return any(family.kind in LOCKED for family in law.families)
 
 
@@ -161,7 +161,7 @@ def along_y(formula: str = "1.0") -> Parts:
 
 
 def _sum(*parts: Parts) -> Parts:
-    """Forces that act together, by one number."""
+    """Sum of forces with one coefficient."""
     return {c: " + ".join(p[c] for p in parts) for c in parts[0]}
 
 
@@ -176,7 +176,7 @@ def _moment(formula: str) -> tuple[Parts, ...]:
 
 
 def _of_velocity(factor: str) -> Parts:
-    """A force against the velocity of the centre."""
+    """A force opposite to the velocity of the centre."""
     return {c: f"-v_{c[-1]}{factor}" for c in ("X_n", "X_m")}
 
 
@@ -196,13 +196,13 @@ def _by_rates() -> Iterator[Row]:
     for words, formula in SCALARS:
         for axis in MOMENTS:
             yield f"a moment M_{axis} by {words}", "moment", ({f"M_{axis}": formula},)
-    for words, formula in SCALARS[:FOR_FORCES]:
+    for words, formula in SCALARS:
         for c, kind in (("X_z", "lift"), ("X_n", "force"), ("X_m", "force")):
             yield f"a force {c} by {words}", kind, ({c: formula},)
 
 
 def _path_of_contact(q: Array, disc: Disc) -> Array:
-    """Places (N, 2) [m] where the disc touches the table: the numbers of _CONTACT_X and _CONTACT_Y."""
+    """Positions (N, 2) [m] of the contact on the table: the values of _CONTACT_X and _CONTACT_Y."""
     psi, theta = q[:, 3], q[:, 4]
     arm = disc.radius * np.cos(theta) - disc.half_thickness * np.sin(theta)
     return q[:, :2] + arm[:, None] * np.stack([np.sin(psi), -np.cos(psi)], axis=1)
@@ -220,7 +220,7 @@ def _angular() -> Iterator[Row]:
 
 
 def _places() -> Iterator[Row]:
-    """Forces by the place of the centre. A constant one is a tilt, and moves the point of rest."""
+    """Forces by the position of the centre. The constant ones are a tilt, and shift the point of equilibrium."""
 
     def towards(factor: str = "") -> Parts:
         return {"X_n": f"-{_X}{factor}", "X_m": f"-{_Y}{factor}"}
@@ -270,9 +270,9 @@ def _magnets() -> Iterator[Row]:
 
 
 def _drifts(time: Array) -> Iterator[Row]:
-    """What changes slowly: a draught, a table that settles, a magnet that is moved away; friction, as surfaces do.
+    """Polynomials in time: a draught, a table that settles, a magnet that is moved away; friction of a worn surface.
 
-    Friction that lags behind the motion follows no rate of the instant, and changes with time as its mean does.
+    Friction with a relaxation time is no function of the instantaneous rates; over time it changes as its mean does.
     """
     middle, half = 0.5 * float(time[0] + time[-1]), 0.5 * float(time[-1] - time[0])
     u = f"((time - {middle!r}) / {half!r})"
@@ -286,7 +286,7 @@ def _drifts(time: Array) -> Iterator[Row]:
 
 
 def _below_a_nutation(q: Array) -> Iterator[Row]:
-    # its tails end within some widths: one that falls as a power acts everywhere, and moves the edge
+    # a step with exponential tails: tails that fall as a power act everywhere, and bias the edge
     step = "1.0 / (1.0 + exp((sin_theta - {edge}) / {softness}))"
     edges = np.quantile(np.sin(q[:, 4]), np.linspace(0.05, 0.95, 13)).tolist()
     shapes = [{"edge": edge, "softness": max(0.03 * edge, 1e-3)} for edge in edges]
@@ -296,9 +296,9 @@ def _below_a_nutation(q: Array) -> Iterator[Row]:
 
 
 def _instants(time: Array) -> Iterator[Row]:
-    """What begins at an instant, and blows; a blow's numbers are its impulse.
+    """Forces that begin at an instant, and blows, whose coefficients are the impulse.
 
-    A blow is a bell, or half a wave as a soft hammer makes it (IEC 60068-2-27): in between lies what is met.
+    A blow is a Gaussian, or a half sine as of a soft hammer (IEC 60068-2-27): real ones lie between these.
     """
     after = "(0.5 + 0.5 * sign(time - {instant}, 0.002))"
     bell = "exp(-0.5 * ((time - {instant}) / {lasting}) ** 2) / (2.5066283 * {lasting})"
@@ -317,7 +317,7 @@ def _instants(time: Array) -> Iterator[Row]:
 
 
 def _edges(places: Array, shares: Array) -> list[Shape]:
-    """Straight edges: directions, and shares of the places (N, 2) that lie before them."""
+    """Straight edges: directions, and distances by quantiles of the positions (N, 2)."""
     found = list[Shape]()
     for angle in np.arange(0, 2 * np.pi, np.pi / 6).tolist():
         along = places @ np.array([np.cos(angle), np.sin(angle)])
@@ -326,7 +326,7 @@ def _edges(places: Array, shares: Array) -> list[Shape]:
 
 
 def _parts_of_the_table(q: Array, path: Array) -> Iterator[Row]:
-    """What acts beyond a straight edge, of the contact or of the centre."""
+    """Laws that act beyond a straight edge, by the position of the contact or of the centre."""
     step = f"(0.5 + 0.5 * sign({_ALONG} - {{edge}}, 1e-3))"
     of_contact = _edges(path, np.array([0.2, 0.4, 0.6, 0.8]))
     for axis, law in (("m", "1.0"), ("z", "sign(omega_z, 0.1)"), ("m", "1.0 / sin_theta")):
@@ -340,9 +340,9 @@ def _parts_of_the_table(q: Array, path: Array) -> Iterator[Row]:
 def _uneven(path: Array) -> Iterator[Row]:
     """A table that is not flat: ridges, grooves and steps, hills and dips.
 
-    The place of touch moves by r phidot along n0 only, so that a height H of the table acts as M_m = -F_z r H' / sin
-    theta, H' its slope along n0. The number is the profile's area or volume, or the step's height: it hardly depends
-    on the width.
+    The contact moves by r phidot along n0 only, so that a height H of the table acts as M_m = -F_z r H' / sin theta
+    with its slope H' along n0. The coefficient is the area or volume of the profile, or the height of the step, which
+    hardly depends on the width.
     """
     off = f"(({_ALONG} - {{edge}}) / {{length}})"
     slope = "radius / sin_theta * cos(psi - {direction})"
@@ -366,11 +366,11 @@ def _uneven(path: Array) -> Iterator[Row]:
 
 
 def _bumps() -> Iterator[Row]:
-    """Dents of the rim, once a turn of the disc, and of the table, once a precession: braking, or up and down again."""
+    """Dents of the rim, once per spin, and of the table, once per precession: braking, or up and down again."""
     wide = {width: np.arange(0, 2 * np.pi, max(width, 0.15)).tolist() for width in (0.08, 0.2, 0.5)}
     shapes = [{"angle": angle, "width": width} for width, angles in wide.items() for angle in angles]
     for angle, where in (("phi", "a spot of the rim"), ("psi", "a direction of the table")):
-        # over its width: what a dent does in all hardly depends on how wide it is
+        # over its width: the integral hardly depends on the width
         bell = f"exp((cos({angle} - {{angle}}) - 1.0) / ({{width}} * {{width}})) / {{width}}"
         slope = f"sin({angle} - {{angle}}) / ({{width}} * {{width}}) * {bell}"
         for axis, words, law in (("m", "", bell), ("n", "", bell), ("m", ", up and down,", slope)):
@@ -379,7 +379,7 @@ def _bumps() -> Iterator[Row]:
 
 
 def _hums(time: Array, frame_rate: float) -> Iterator[Row]:
-    """What swings with a frequency of its own: a table that vibrates, a field that alternates."""
+    """Oscillations of a given frequency: a table that vibrates, an alternating field."""
     span, waves = float(time[-1] - time[0]), ("cos({rate} * time)", "sin({rate} * time)")
     frequencies = np.arange(2.0 / span, min(FASTEST_HUM, 0.45 * frame_rate), 0.6 / span)
     shapes = [{"rate": rate} for rate in (2 * np.pi * frequencies).tolist()]

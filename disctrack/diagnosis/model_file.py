@@ -1,4 +1,4 @@
-"""The enlarged model as a scene file: what `simulate`, `render` and the next `diagnose` read."""
+"""The enlarged model as a scene file, which `simulate`, `render` and the next `diagnose` read."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -24,8 +24,8 @@ OF_TABLE = ("table_height.", "table_plane.")
 def declared_model(trajectory: Trajectory, choice: str = PAPER) -> tuple[Model, Values]:
     """Model by name or file: "paper" (rolling with the paper's k_m), "none" (no losses), or a saved model or scene.
 
-    Disc, gravity and air are those of the trajectory. With it come the faults of the measurement that are known
-    already. Raises AnalysisError, SceneError, ModelError.
+    Disc, gravity and air are those of the trajectory. Also the faults of the measurement that the file declares.
+    Raises AnalysisError, SceneError, ModelError.
     """
     bare = Model(trajectory.disc, trajectory.gravity, air_density=trajectory.air_density)
     if choice == PAPER:
@@ -42,9 +42,9 @@ def declared_model(trajectory: Trajectory, choice: str = PAPER) -> tuple[Model, 
 
 
 def model_toml(system: DiscSystem, values: Values, name: str) -> str:
-    """The fitted motion as a scene: disc, dots, gravity, first state, effects with their values, faults found.
+    """The fitted motion as a scene: disc, dots, gravity, initial state, effects with their values, faults found.
 
-    The cameras are like those of the recording, so that `render` shows it from where it was filmed.
+    The cameras are similar to those of the recording, so that `render` shows the same view.
     """
     rig, values = _above_the_table(system, values)
     model, trajectory = system.model_with(values), system.trajectory
@@ -83,24 +83,24 @@ def model_toml(system: DiscSystem, values: Values, name: str) -> str:
 
 
 def _rounded(number: float) -> float:
-    """In mm, or g, without the noise of a conversion."""
+    """In mm, or g, without the rounding error of the conversion."""
     return float(f"{1e3 * number:.12g}")
 
 
 def _settings_like(rig: StereoRig) -> RigSettings:
-    """Cameras like these, without seeded scatter.
+    """Cameras similar to these, without seeded scatter.
 
-    Like, not equal: a scene's cameras look straight at one point, and their pixels are as large there. Principal points
-    off the middle and unequal focal lengths are lost, the view is the same to some pixels.
+    The cameras of a scene point at one target and have the same scale there. Offsets of the principal points and
+    unequal focal lengths are lost; the view is the same to some pixels.
     """
     R = np.stack([R for R, _ in rig.camera_poses()])
     eyes = np.stack([-R.T @ t for R, t in rig.camera_poses()])
-    across = np.eye(3) - R[:, 2, :, None] * R[:, 2, None, :]  # of the optical axes; their nearest point is the target
+    across = np.eye(3) - R[:, 2, :, None] * R[:, 2, None, :]  # target: the point closest to both axes
     target = np.linalg.solve(across.sum(axis=0), np.einsum("cij,cj->i", across, eyes))
     away = eyes - target
     distance = np.linalg.norm(away, axis=1)
     x, y, z = (away / distance[:, None]).T
-    # image x of an upright camera is horizontal; the roll turns it within the image
+    # the image x axis of an upright camera is horizontal; roll is the rotation about the optical axis
     horizontal = np.stack([-y, x, 0 * x], axis=1) / np.hypot(x, y)[:, None]
     seen = np.einsum("cij,cj->ci", R, horizontal)
     focal = np.array([0.5 * (c.fx + c.fy) for c in rig.cameras])
@@ -123,11 +123,11 @@ def _pair(both: Array) -> tuple[float, float]:
 
 
 def _above_the_table(system: DiscSystem, values: Values) -> tuple[StereoRig, Values]:
-    """The rig in axes of the table that the motion found, and the values without what that table is off by.
+    """The rig in axes of the table as fitted, and the values without the corrections of that table.
 
-    Where tracking levelled the table by the disc's rim, each recording has a plane of its own (`DiscSystem.base`): by
-    paper on the face it seems too high. That is no fault of the board, and would be made twice where the file is
-    rendered and levelled again.
+    If the tracking determined the table from the rim of the disc, each recording has its own plane among the base
+    quantities of `DiscSystem`. Its correction is no fault of the board: in a rendering it would be applied twice, as
+    the table is determined again.
     """
     own = {q.name for q in system.base if q.name.startswith(OF_TABLE)}
     off = scene_faults(system.disc, {name: value for name, value in values.items() if name in own})

@@ -1,4 +1,4 @@
-"""Effects of the motion and faults of the measurement, from their two catalogues, as candidates of the engine."""
+"""Effects of the motion and faults of the measurement, from their two catalogues, as candidates of the search."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import replace
@@ -10,14 +10,14 @@ from disctrack.discrepancy.system import Candidate, Quantity, Values
 from disctrack.faults.catalogue import TYPICAL_STEPS, Fault, faults_of
 from disctrack.rolling import CATALOGUE, Effect, EffectParameter, Model, State
 
-# Parameters of one effect that act so differently that each part is a question of its own.
+# Effects whose parameters act so differently that each group is a candidate of its own.
 _PARTS: dict[str, dict[str, tuple[str, ...]]] = {
     "centre_of_mass": {"centre_of_mass": ("c_1", "c_2"), "centre_of_mass_axial": ("c_3",)},
     "rim": {"rim_oval": ("oval_c", "oval_s"), "rim_lobes": ("lobes_c", "lobes_s")},
 }
 SLIP = "slip.inverse_mu"
-THETA_END = np.radians(0.05)  # a trial fit may run into the collapse; the data end before it
-ROUGHEST = 100.0  # coefficient of friction of a disc that is known to slip; without an end to it none does
+THETA_END = np.radians(0.05)  # end of a simulation: a trial fit may run into the collapse, the data end before it
+ROUGHEST = 100.0  # upper bound of the coefficient of friction of a disc that is known to slip
 STATE_SCALES = dict.fromkeys(("x", "y"), 1e-6) | dict.fromkeys(("psi", "theta", "phi"), 1e-5)
 STATE_SCALES |= dict.fromkeys(("thetadot", "omega2", "omega3"), 1e-3)  # SI, as the steps of a fit
 SLIP_VELOCITY = ("state.v_x", "state.v_y")
@@ -33,12 +33,12 @@ def state_quantities() -> tuple[Quantity, ...]:
 
 
 def state_of(values: Values) -> State:
-    """Initial state among the values; with v_x, v_y the disc may slip at first."""
+    """The initial state in `values`; with v_x, v_y the disc may slip at first."""
     return State(**{k.partition(".")[2]: float(v) for k, v in values.items() if k.startswith("state.")})
 
 
 def slip_start(model: Model) -> Candidate:
-    """Velocity of the centre at the first instant, and 1/mu unless the model has a coefficient of friction already."""
+    """Initial velocity of the centre, and 1/mu unless the model has a coefficient of friction already."""
     usual, title = slip_candidate(CATALOGUE["slip"]), "the disc slips at first, with Coulomb friction |F_t| = mu F_z"
     inverse = () if model.effect("slip") else (replace(usual.quantities[0], lower=1.0 / ROUGHEST),)
     one = Quantity("", "m/s", 1e-3, meaning="velocity of the centre at the first instant")
@@ -47,7 +47,7 @@ def slip_start(model: Model) -> Candidate:
 
 
 def effect_quantity(effect: type[Effect], parameter: EffectParameter) -> Quantity:
-    """A parameter of an effect as the engine wants it."""
+    """A parameter of an effect as a quantity of a fit."""
     null = parameter.nominal if parameter.is_shape else parameter.null
     return Quantity(
         f"{effect.name}.{parameter.name}",
@@ -57,20 +57,20 @@ def effect_quantity(effect: type[Effect], parameter: EffectParameter) -> Quantit
         lower=parameter.lower,
         upper=parameter.upper,
         meaning=parameter.meaning,
-        typical=abs(parameter.nominal) or np.inf,  # a place may be anywhere
+        typical=abs(parameter.nominal) or np.inf,  # a position may be anywhere
         belongs_to=effect.belongs_to,
     )
 
 
 def model_quantities(model: Model) -> tuple[Quantity, ...]:
-    """Parameters of the effects that the model declares: they are fitted, in their bounds."""
+    """Parameters of the effects that the model declares: they are fitted within their bounds."""
     return tuple(
         effect_quantity(type(effect), p) for effect in model.effects for p in effect.parameters if not p.is_shape
     )
 
 
 def motion_candidates(model: Model, names: Sequence[str] | None = None) -> tuple[Candidate, ...]:
-    """Every effect of the catalogue that may be proposed and that the model does not have yet.
+    """Every effect of the catalogue that may be missing: a candidate that the model does not contain.
 
     names : only these effects, if given
     """
@@ -85,20 +85,21 @@ def motion_candidates(model: Model, names: Sequence[str] | None = None) -> tuple
         shape = tuple(effect_quantity(effect, p) for p in effect.parameters if p.is_shape)
         for name, members in _PARTS.get(effect.name, {effect.name: tuple(p.name for p in amounts)}).items():
             quantities = tuple(effect_quantity(effect, p) for p in amounts if p.name in members)
-            told = (name, effect.name, "motion", effect.title, effect.source, quantities)
-            found += [Candidate(*told, shape=shape, sought=effect.sought)] if quantities else []
+            if quantities:
+                words = effect.name, "motion", effect.title, effect.source
+                found.append(Candidate(name, *words, quantities, shape=shape, sought=effect.sought))
     return tuple(found)
 
 
 def slip_candidate(effect: type[Effect]) -> Candidate:
-    """Slip by 1/mu, which is zero where the disc never slips; without a derivative until it slips somewhere."""
+    """Slip with the quantity 1/mu, zero if the disc never slips; without a derivative until it slips somewhere."""
     meaning = "1 / coefficient of friction"
     inverse = Quantity(SLIP, "1", 0.1, lower=0.0, upper=1e3, typical=10.0, reciprocal="mu", meaning=meaning)
     return Candidate(effect.name, effect.name, "motion", effect.title, effect.source, (inverse,), threshold=True)
 
 
 def candidate_of_fault(fault: Fault) -> Candidate:
-    """A fault of the measurement as the engine wants it."""
+    """A fault of the measurement as a candidate."""
     several, (low, high) = len(fault.parts) > 1, fault.bounds
     one = Quantity(fault.name, fault.unit, fault.step, lower=low, upper=high, belongs_to=fault.belongs_to)
     one = replace(one, typical=TYPICAL_STEPS * fault.step)
@@ -110,5 +111,5 @@ def candidate_of_fault(fault: Fault) -> Candidate:
 
 
 def measurement_candidates(disc: Disc, names: Collection[str] | None = None) -> tuple[Candidate, ...]:
-    """Every fault that a search may find by its quantities alone.   names : only these faults, if given"""
+    """Every fault of the catalogue as a candidate.   names : only these faults, if given"""
     return tuple(candidate_of_fault(fault) for fault in faults_of(disc) if names is None or fault.name in names)

@@ -1,9 +1,9 @@
-"""A recording as its trajectory file has it, with its dots where they are taken to be.
+"""A recording as read from its trajectory file, with the positions of the dots that a diagnosis assumes.
 
-The tracking measures with the places that it found for the dots. When all dots are off by a little, as printed dots
-are, nothing is to be said about them. One dot that is off while the others are where they should be is a fault, and
-has to come out as one. Farther off than any printer puts it, it was declared wrongly: the tracking has said so, and how
-the dots move with a place is no longer linear.
+The tracking refines the positions of the dots on the face. Small errors of all dots are the scatter of a printer. A few
+displaced dots among correct ones are a fault, which the diagnosis has to find: their declared positions are restored.
+An error larger than that of any printer is a wrong declaration, which the tracking has reported, and for which the
+images are not linear in the position: there the refined positions stay.
 """
 
 from collections.abc import Iterable, Mapping
@@ -17,18 +17,18 @@ from disctrack.findings import Finding, Kind, doubts
 from disctrack.trajectory import Trajectory
 from disctrack.trajectory.file import read_details, read_provenance, read_trajectory
 
-MIN_MISPRINT_UM, MOST_MISPRINT_UM = 4.0, 300.0  # what the shapes of two dots may well differ by; and see above
+MIN_MISPRINT_UM, MOST_MISPRINT_UM = 4.0, 300.0  # scatter by the shapes of dots; and the largest error of a printer
 MIN_SIGMAS = 5.0
 
 
 @dataclass(frozen=True)
 class Recorded:
-    """A measured trajectory with what was declared beside it."""
+    """A measured trajectory with the declared names."""
 
     name: str
     trajectory: Trajectory
     surface: str = ""
-    disc: str = ""  # name of the disc, where sizes and mass do not tell it from others
+    disc: str = ""  # to distinguish discs of the same sizes and mass
 
 
 def read_recorded(path: Path) -> Recorded:
@@ -44,9 +44,9 @@ def read_recorded(path: Path) -> Recorded:
 
 
 def with_declared_dots(trajectory: Trajectory, details: Mapping[str, Any]) -> Trajectory:
-    """The trajectory with the dots where they were declared, if only a third of them at most are misprinted.
+    """The trajectory with the declared positions of the dots, if at most a third of them are misprinted.
 
-    details : of the tracking, which found dots displaced
+    details : of the tracking, with the displacements that it found
     """
     shift = np.asarray(details.get("marker_shift_um", ()), float)
     sigma = np.asarray(details.get("marker_shift_sigma_um", ()), float)
@@ -62,5 +62,5 @@ def with_declared_dots(trajectory: Trajectory, details: Mapping[str, Any]) -> Tr
 
 
 def wrong_declarations(findings: Iterable[Finding]) -> tuple[Finding, ...]:
-    """What is declared wrongly: a missing effect would be read into it. Dots are measured where they are."""
+    """Findings of wrong declarations, which would be mistaken for missing effects; but not of displaced dots."""
     return tuple(f for f in doubts(findings) if f.kind != Kind.DOTS_MISPLACED and any(r.key for r in f.remedies))

@@ -26,16 +26,16 @@ if TYPE_CHECKING:
     from disctrack.report.figures import Drawn
 
 SHOWN = 12  # laws that are drawn; all are in the JSON
-NAMED = 8  # recordings that are named on an axis; more are counted
+NAMED = 8  # recordings that are named on an axis; more are numbered
 MANY = (
-    "Standard deviation of an effect's size from the first so many recordings, once initial states, laws, calibration "
-    "and dots have taken their share. It falls with the root of their number until what they have in common, "
-    "calibration or dots, sets the limit. What was not found is smaller than the last column says."
+    "Standard deviation of an effect's size from the given number of recordings, marginalised over initial states, "
+    "laws, calibration and dots. It falls with the square root of the number, down to the limit by the calibration or "
+    "the dots that they share. The last column is an upper limit of effects that were not found."
 )
 
 
 def verdict_text(answer: TogetherDiagnosis) -> str:
-    """What is missing in all of them."""
+    """The effect missing in all recordings."""
     d, n, left_out = answer.diagnosis, len(answer.used), [r for r in answer.recordings if r.reason]
     of_all = f"{n} recordings together" + (f" ({len(left_out)} left out)" if left_out else "")
     effects = "; and ".join(effect_text(f, d) for f in d.found)
@@ -47,7 +47,7 @@ def verdict_text(answer: TogetherDiagnosis) -> str:
 
 
 def accuracy_text(answer: TogetherDiagnosis) -> str:
-    """What is left."""
+    """Size of the residuals."""
     d = answer.diagnosis
     if d.held_out_after is None:
         return ""
@@ -57,7 +57,7 @@ def accuracy_text(answer: TogetherDiagnosis) -> str:
 
 
 def misfits_text(answer: TogetherDiagnosis) -> str:
-    """Recordings that do not fit the others; empty where all do."""
+    """Recordings that are inconsistent with the others; empty if none is."""
     apart = [r.name for r in answer.recordings if r.reason and r.name not in answer.unusable]
     return f"{', '.join(apart)} {'does' if len(apart) == 1 else 'do'} not fit the others." if apart else ""
 
@@ -67,15 +67,15 @@ def _free(d: Diagnosis) -> list[Quantity]:
 
 
 def _dependence(x: Dependence) -> str:
-    """The hypothesis that describes the values of the groups best; all that were tested are in the page's table."""
+    """The hypothesis that describes the values of the groups best; a table of the page has all hypotheses."""
     if not x.hypotheses[0].holds:
-        return f"{x.quantity}: a value for each {x.by}, by no rule that was tested"
+        return f"{x.quantity}: a value for each {x.by}; every hypothesis is rejected"
     others = "".join(f"; or {h.text}: indistinguishable here" for h in alike(x.hypotheses))
     return f"{x.quantity}: {x.hypotheses[0].text}{others}"
 
 
 def as_json(answer: TogetherDiagnosis) -> dict[str, Any]:
-    """The keys of diagnosis.json as far as they apply; and recordings, bounds, dependences."""
+    """The keys of diagnosis.json that apply; and recordings, bounds, dependences."""
     d = answer.diagnosis
     before, after = ({"parameters": declared_json(fit)} for fit in (d.before, d.after))
     texts = verdict_text(answer), accuracy_text(answer), misfits_text(answer)
@@ -101,15 +101,15 @@ def _dependence_json(x: Dependence) -> dict[str, Any]:
 
 
 def _recording_json(r: OfRecording) -> dict[str, Any]:
-    told: dict[str, Any] = {"name": r.name, **r.labels, "left_out": r.reason}
+    found: dict[str, Any] = {"name": r.name, **r.labels, "left_out": r.reason}
     if (f := r.fits_in) is not None:
-        told |= {"chi_square_shared": f.chi_square, "difference_to_the_others": f.statistic}
-        told |= {"degrees": f.degrees, "p_value": f.p_value}
+        found |= {"chi_square_shared": f.chi_square, "difference_to_the_others": f.statistic}
+        found |= {"degrees": f.degrees, "p_value": f.p_value}
     if (a := r.alone) is not None:
         shared = [q.name for q in a.quantities if q.belongs_to and not np.isfinite(q.prior_sigma)]
         numbers = _known({name: (a.values[name], a.sigma(name)) for name in shared})
-        told["alone"] = {"chi_square": a.chi_square, "degrees": a.degrees_of_freedom, "parameters": numbers}
-    return told
+        found["alone"] = {"chi_square": a.chi_square, "degrees": a.degrees_of_freedom, "parameters": numbers}
+    return found
 
 
 def _bound_json(b: Bound) -> dict[str, Any]:
@@ -122,7 +122,7 @@ def _bound_json(b: Bound) -> dict[str, Any]:
 
 
 def report_of(answer: TogetherDiagnosis, drawn: Sequence[Drawn], files: Sequence[Path]) -> Report:
-    """All of the answer. files : that were written, page first"""
+    """The whole report.   files : that were written, page first"""
     d = answer.diagnosis
     effects = [f"{effect_text(f, d)}. {significance_text(f)}." for f in d.found]
     laws = [(q.name, Measured(d.after.values[q.name], d.after.sigma(q.name), q.unit)) for q in _free(d)]
@@ -175,7 +175,7 @@ def _recordings(answer: TogetherDiagnosis) -> Listing:
             cells += [f"{rounded(f.statistic)} / {f.degrees} (p {probability(f.p_value)})", ""]
         rows.append([r.name, *(r.labels.get(k, "") for k in kinds), *cells])
     header = ["recording", *kinds, "chi-square, shared", "its own", "difference / degrees", ""]
-    caption = "Chi-square per datum with the shared quantities, and with values of its own; their difference"
+    caption = "Chi-square per datum with the shared values of the quantities, and with its own; their difference"
     return Listing(header, rows, caption, classes=["failed" if r.reason else "ok" for r in answer.recordings])
 
 
@@ -195,8 +195,8 @@ def _by_number(answer: TogetherDiagnosis) -> Listing:
 
 
 def figures(answer: TogetherDiagnosis) -> tuple[Drawn, ...]:
-    """Every shared law: what each recording says alone, and what all say together."""
-    from matplotlib.ticker import MaxNLocator  # wanted on pages only
+    """Every shared law: its value by each recording alone, and by all together."""
+    from matplotlib.ticker import MaxNLocator  # needed for pages only
 
     from disctrack.report.figures import Drawn, panels
 
@@ -223,6 +223,6 @@ def figures(answer: TogetherDiagnosis) -> tuple[Drawn, ...]:
             axes.xaxis.set_major_locator(MaxNLocator(integer=True))
             axes.set_xlabel("recording, from 0")
         axes.set_ylabel(in_unit(q.stem.removeprefix(f"{q.owner}."), q.unit))
-        caption = "Each recording alone with its standard deviation; the band is two of all together."
+        caption = "Each recording alone, ± 1 σ; the band is ± 2 σ of all together."
         drawn.append(Drawn(f"{number:02d}_{q.name.replace('.', '_').split('[')[0]}", q.name, caption, figure))
     return tuple(drawn)

@@ -1,4 +1,4 @@
-"""The stage: trajectory files in; one page, one diagnosis.json and one sentence out."""
+"""The stage of the joint diagnosis: trajectory files in; one page, one diagnosis.json and one sentence out."""
 
 import os
 from collections.abc import Callable, Sequence
@@ -34,54 +34,54 @@ def run_together(
 ) -> Report:
     """Diagnose trajectory files together; write diagnosis.json and diagnosis.html with figures.
 
-    output : folder; without it `together_diagnosis` in the deepest folder that holds all files
-    settle : also compute which further recordings would settle what is left open
-    Files that cannot be read are left out, and told of.
+    output : folder; by default `together_diagnosis` in the deepest common folder of all files
+    settle : also compute which further recordings would answer the open questions
+    Files that cannot be read are left out, and reported.
     reuse : an earlier result that is complete and of the same files, model and version
-    returns : its report, with the page; `data["unusable"]` are recordings that could not be read, or not be fitted
-    Raises TrajectoryFileError where there is no such file, AnalysisError, SceneError, ModelError, OutputError.
+    returns : its report, with the page; `data["unusable"]` are recordings that could not be read or fitted
+    Raises TrajectoryFileError if there is no such file, AnalysisError, SceneError, ModelError, OutputError.
     """
     paths = [Path(p) for p in paths]
     for p in paths:
         keep(p)
     whole = [p.resolve() for p in paths]
     if twice := sorted(str(p) for p, q in zip(paths, whole, strict=True) if whole.count(q) > 1):
-        raise AnalysisError(f"{twice[0]}: given more than once. A recording speaks once: name each file once.")
-    common = Path(os.path.commonpath([p.parent for p in whole]))  # the deepest folder that holds all files
+        raise AnalysisError(f"{twice[0]}: given more than once. Each recording counts once: name each file once.")
+    common = Path(os.path.commonpath([p.parent for p in whole]))  # the deepest common folder
     folder = Path(output) if output is not None else common / FOLDER
     report, html = folder / "diagnosis.json", folder / "diagnosis.html"
     progress("reading")
     read, unread = _read(paths)
     if not read:
         raise AnalysisError("; ".join(f"{path}: {reason}" for path, reason in unread.items()))
-    made_from = {
+    inputs = {
         "model": content_of(model),
         "plan": settle,
         "files": [read_provenance(p).fingerprint for p in read],
         "unread": unread,
     }
-    origin = hash_of(made_from)
+    origin = hash_of(inputs)
     earlier = reusable(folder, origin) if reuse else None
     if earlier is not None:
         return earlier
     refuse_other(report, overwrite)
     refuse_input(report)
     names = [r.name for r in read.values()]
-    recordings = [  # those of one name are called after their files
+    recordings = [  # of the same name are named by their files
         replace(r, name=p.resolve().relative_to(common).as_posix()) if names.count(r.name) > 1 else r
         for p, r in read.items()
     ]
     result = diagnose_together(recordings, model, processes=processes, progress=progress, settle=settle, unread=unread)
     document = {"files": [str(p) for p in paths], **as_json(result)}
-    told = replace(report_of(result, figures(result), (html, report)), data=document)
-    files = write_page(html, told, ["png"])
+    summary = replace(report_of(result, figures(result), (html, report)), data=document)
+    files = write_page(html, summary, ["png"])
     write_whole(report, json_file(document))
-    remember(folder, origin, told, (report, html, *files))
-    return told
+    remember(folder, origin, summary, (report, html, *files))
+    return summary
 
 
 def _read(paths: Sequence[Path]) -> tuple[dict[Path, Recorded], dict[str, str]]:
-    """Recordings by their files, and why others cannot be read: one spoilt file is no reason to lose the rest."""
+    """Recordings by file, and why others cannot be read: one broken file does not stop the diagnosis of the rest."""
     read, unread = dict[Path, Recorded](), dict[str, str]()
     for path in paths:
         try:

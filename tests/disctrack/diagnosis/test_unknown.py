@@ -243,13 +243,13 @@ def test_a_sum_or_a_law_with_alternatives_of_another_form_is_taken_for_another_s
         )
 
     alone, other, other_axis = law(("angle", "M_n")), law(("hum", "X_n")), law(("angle", "M_z"))
-    assert form_misfit.form_is_another(alone) == form_misfit.SELDOM
-    assert form_misfit.form_is_another(law(("angle", "M_n"), ("hum", "X_n"))) == 1.0
-    assert form_misfit.form_is_another(alone, {"kz"}) == 1.0
+    assert form_misfit.probability_of_wrong_form(alone) == form_misfit.LEAST_WRONG
+    assert form_misfit.probability_of_wrong_form(law(("angle", "M_n"), ("hum", "X_n"))) == 1.0
+    assert form_misfit.probability_of_wrong_form(alone, {"kz"}) == 1.0
     for one in (other, other_axis, law(("angle", "M_n"), ("hum", "X_n")), law()):  # the last: known effects alone
-        assert form_misfit.form_is_another(law(("angle", "M_n"), others=[(one, 1.0)])) == pytest.approx(0.5)
+        assert form_misfit.probability_of_wrong_form(law(("angle", "M_n"), others=[(one, 1.0)])) == pytest.approx(0.5)
     same = [(law(("angle", "M_n")), 1.0)]  # a variation of the same idea, whose course is in the sigma anyway
-    assert form_misfit.form_is_another(law(("angle", "M_n"), others=same)) == form_misfit.SELDOM
+    assert form_misfit.probability_of_wrong_form(law(("angle", "M_n"), others=same)) == form_misfit.LEAST_WRONG
 
 
 @pytest.mark.slow
