@@ -108,7 +108,10 @@ class FrameReader:
             found = in_words(image.shape[::-1], 8 * image.itemsize)
             first = in_words(self.image_size, 8 * self.dtype.itemsize)
             raise RecordingError(f"{where}: {found}, but the first frame has {first}. Export it again.")
-        return _into(out, image)
+        if out is None or image is out:
+            return image
+        out[...] = image
+        return out
 
     def content_sha256(self, start: int, stop: int) -> str:
         """SHA-256 (hex) of what frames start..stop-1 are made from; equal if and only if the input is the same."""
@@ -163,9 +166,8 @@ def frames_in_parts(readers: Sequence[FrameReader], parts: Parts, where: str) ->
         (x, y, *size), (width, height) = part, reader.image_size
         if x + size[0] > width or y + size[1] > height:
             raise RecordingError(
-                f"{where}: [cameras] {reader.camera}_part is {list(part)}, columns {x} to {x + size[0] - 1} and rows "
-                f"{y} to {y + size[1] - 1}, but {reader.describe(0)} has {width} x {height} px. It is [x, y, width, "
-                "height] in pixels, from the upper left corner."
+                f"{where}: [cameras] {reader.camera}_part is {list(part)}, but {reader.describe(0)} has {width} x "
+                f"{height} px. It is [x, y, width, height] in pixels, from the upper left corner."
             )
         cut = changed(reader, partial(cut_out, part=part, where=where), str(list(part)))
         yield replace(cut, image_size=part[2:])
@@ -181,13 +183,6 @@ def room_for(out: NDArray | None, image_size: tuple[int, int], dtype: np.dtype) 
     if out is not None and out.shape == image_size[::-1] and out.dtype == dtype and out.flags.c_contiguous:
         return out
     return np.empty(image_size[::-1], dtype)
-
-
-def _into(out: Image | None, image: Image) -> Image:
-    if out is None or image is out:
-        return image
-    out[...] = image
-    return out
 
 
 _T = TypeVar("_T")

@@ -89,10 +89,8 @@ def iter_pair_blocks(
     width, height = left.image_size
     dtype = np.uint8 if left.bit_depth == 8 else np.uint16
     block = block or int(np.clip(BLOCK_BYTES // (2 * width * height * np.dtype(dtype).itemsize), 1, 256))
-    starts = list(range(start, stop, block))
-    stops = [*starts[1:], stop]
-    n_ahead = min(2, max(len(starts) - 1, 0))
-    ring = [np.empty((min(block, max(stop - start, 1)), 2, height, width), dtype) for _ in range(n_ahead + 1)]
+    parts = [range(first, min(first + block, stop)) for first in range(start, stop, block)]
+    ring = [np.empty((min(block, stop - start), 2, height, width), dtype) for _ in parts[:3]]
     pool = ThreadPoolExecutor(threads or default_threads(), thread_name_prefix="read")
     # what is read fastest in order has a thread of its own: two blocks at once would send it back and forth
     readers = left, right
@@ -100,7 +98,7 @@ def iter_pair_blocks(
 
     def submitted(number: int) -> list[Future[NotRead]]:
         """Reading of a block as tasks: a few frames each, or a camera's whole block where files are read in order."""
-        images, frames, tasks = ring[number % len(ring)], range(starts[number], stops[number]), []
+        images, frames, tasks = ring[number % 3], parts[number], []
         for camera, reader in enumerate(readers):
             size = 4 if reader.random_access else len(frames)
             for i in range(0, len(frames), size):
@@ -109,13 +107,12 @@ def iter_pair_blocks(
         return tasks
 
     try:
-        pending = [submitted(number) for number in range(min(n_ahead, len(starts)))]
-        for number, first in enumerate(starts):
-            if number + n_ahead < len(starts):
-                pending.append(submitted(number + n_ahead))
+        pending = [submitted(number) for number, _ in enumerate(parts[:2])]
+        for number, frames in enumerate(parts):
+            if number + 2 < len(parts):
+                pending.append(submitted(number + 2))
             unreadable = {place: why for future in pending.pop(0) for place, why in future.result().items()}
-            frames = np.arange(first, stops[number])
-            yield PairBlock(frames, ring[number % len(ring)][: len(frames)], unreadable)
+            yield PairBlock(np.array(frames), ring[number % 3][: len(frames)], unreadable)
     finally:
         for threads_of_one in {pool, *pools}:
             threads_of_one.shutdown(wait=True, cancel_futures=True)

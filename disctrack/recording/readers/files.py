@@ -53,9 +53,8 @@ def match_files(pattern: str, folder: Path, camera: str) -> list[Path]:
     found = glob.glob(os.path.join(glob.escape(str(folder)), pattern), recursive=True)
     files = [Path(name) for name in found if Path(name).suffix.lower() in SUFFIXES]
     if not files:
-        raise RecordingError(
-            f"{folder / pattern}: no image matched for the {camera} camera. {_what_is_there(pattern, folder)}"
-        )
+        there = _what_is_there((folder / pattern).parent)
+        raise RecordingError(f"{folder / pattern}: no image matched for the {camera} camera. {there}")
     for file in files:
         if fault := why_not_regular(file):
             raise RecordingError(f"{file} ({camera} camera): cannot be read: {fault}. Move it away.")
@@ -80,14 +79,12 @@ def folders_below(
             yield Path(place), inside, [name for name in names if not name.startswith(".")]
 
 
-def _what_is_there(pattern: str, folder: Path) -> str:
-    place = (folder / pattern).parent
+def _what_is_there(place: Path) -> str:
     if not place.is_dir():
         return f"There is no folder {place}."
     names = sorted(os.listdir(place), key=natural_key)
-    if not names:
-        return f"The folder {place} is empty."
-    return f"The folder holds {_listed(names)}; frames are {', '.join(sorted(SUFFIXES))}. Correct the pattern."
+    there = f"The folder holds {_listed(names)}" if names else f"The folder {place} is empty"
+    return f"{there}; frames are {', '.join(sorted(SUFFIXES))}. Correct the pattern."
 
 
 def natural_key(name: str) -> list[tuple[int, int, str]]:
@@ -126,8 +123,8 @@ def number_files(
         clocks = {step: column for step, column in clocks.items() if not _missing(column, step)} or clocks
     if len(clocks) > 1:
         raise RecordingError(
-            f"{files[0]} ...: the names of the {camera} frames hold several numbers that could count them. Say which "
-            f'with {NUMBER} in the pattern, e.g. {camera} = "{camera}/*_{NUMBER}.png".'
+            f"{files[0]} ...: several numbers in the names of the {camera} frames could count them. Say which with "
+            f'{NUMBER} in the pattern, e.g. {camera} = "{camera}/*_{NUMBER}.png".'
         )
     if not clocks:
         _refuse_clock(files, columns[-1], camera)
@@ -172,9 +169,7 @@ def _numbers_by_pattern(files: Sequence[Path], pattern: str) -> list[int]:
     matches = [form.match(file.name) for file in files]
     odd = [file for file, match in zip(files, matches, strict=True) if match is None]
     if odd:
-        raise RecordingError(
-            f"{_listed(odd)}: no number where the pattern {pattern} has {NUMBER}. Correct the pattern."
-        )
+        raise RecordingError(f"{_listed(odd)}: no number where {pattern} has {NUMBER}. Correct the pattern.")
     return [int(match[1]) for match in matches if match is not None]
 
 

@@ -89,9 +89,7 @@ def _open(handle: h5py.File, stack: h5py.Dataset, file: Path, camera: str) -> Fr
     if stack.external:
         raise RecordingError(f"{where}: its pixels lie in {stack.external[0][0]}. Write them into {file}.")
     stored = _frames_stored(stack)
-    if n == 0 or stored == 0:
-        raise RecordingError(f"{where}: a stack without frames.")
-    if stored < LEAST_PRESENT * n:  # a few that are missing are lost frames; a header may announce any number
+    if stored < max(LEAST_PRESENT * n, 1):  # a few that are missing are lost frames; a header may announce any number
         raise RecordingError(
             f"{where}: announces {n} frames, but at most {stored} were ever written. The recording was cut short: "
             "write it again, or give the data set its true length."
@@ -202,13 +200,11 @@ def _inflate(stack: h5py.Dataset, content: bytes, image: Image, where: str) -> N
     """Undo deflate and, before it, shuffle (all first bytes of the pixels, then all second ones)."""
     whole = inflated(content, image.nbytes)
     if whole is None:
-        raise RecordingError(
-            f"{where}: damaged (its {len(content)} compressed bytes do not hold the {image.nbytes} of an image). "
-            "Copy the file again."
-        )
+        said = f"its {len(content)} compressed bytes do not hold the {image.nbytes} of an image"
+        raise RecordingError(f"{where}: damaged ({said}). Copy the file again.")
     raw = np.frombuffer(whole, np.uint8)
-    if stack.shuffle and image.itemsize > 1:
-        raw = np.ascontiguousarray(raw.reshape(image.itemsize, -1).T).reshape(-1)
+    if stack.shuffle:
+        raw = raw.reshape(image.itemsize, -1).T.ravel()
     image[...] = raw.view(stack.dtype).reshape(image.shape)
 
 

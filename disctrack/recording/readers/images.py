@@ -6,7 +6,7 @@ Pages without compression are read at the speed of memory.
 import json
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from itertools import islice
@@ -163,41 +163,25 @@ _TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "\u00b5s": 1e-6, "\u03bcs": 1e-
 
 
 def _times(description: str, n: int) -> tuple[float | None, Array | None]:
-    """Frame rate [Hz] and time stamps [s] by ImageJ's or OME's notes, None where they say nothing."""
+    """Frame rate [Hz] and time stamps [s] by ImageJ's or OME's notes, None where they say nothing.
+
+    OME schema 2016-06: Pixels/@TimeIncrement, Pixels/Plane/@DeltaT, each with its unit.
+    """
     if description.startswith("ImageJ="):
-        interval, rate = (_positive(_number(_imagej(description).get(key))) for key in ("finterval", "fps"))
-        return (1.0 / interval if interval else rate), None
-    if "<OME" in description[:1000]:
-        return _ome_times(description, n)
-    return None, None
-
-
-def _ome_times(description: str, n: int) -> tuple[float | None, Array | None]:
-    """OME schema 2016-06: Pixels/@TimeIncrement, Pixels/Plane/@DeltaT, each with its unit (default s)."""
+        told = _imagej(description)
+        interval, rate = _seconds(told, "finterval"), _seconds(told, "fps")
+        return 1.0 / interval if interval > 0 else rate if rate > 0 else None, None
     try:
-        root = ElementTree.fromstring(description)
-    except (ElementTree.ParseError, ValueError):
+        pixels = next(ElementTree.fromstring(description).iterfind(".//{*}Pixels"))
+    except (ElementTree.ParseError, ValueError, StopIteration):  # no note, or another program's
         return None, None
-    pixels = next((item for item in root.iter() if item.tag.endswith("Pixels")), None)
-    if pixels is None:
-        return None, None
-
-    def seconds(item: ElementTree.Element, key: str) -> float:
-        return _number(item.get(key)) * _TIME_UNITS.get(item.get(f"{key}Unit", "s"), math.nan)
-
-    stamps = np.array([seconds(item, "DeltaT") for item in pixels if item.tag.endswith("Plane")])
-    stamps = stamps[np.isfinite(stamps)]
-    interval = _positive(seconds(pixels, "TimeIncrement"))
-    return 1.0 / interval if interval else None, stamps if len(stamps) == n else None
+    stamps = np.array([_seconds(plane.attrib, "DeltaT") for plane in pixels.iterfind("{*}Plane")])
+    stamps, interval = stamps[np.isfinite(stamps)], _seconds(pixels.attrib, "TimeIncrement")
+    return 1.0 / interval if interval > 0 else None, stamps if len(stamps) == n else None
 
 
-def _number(text: object) -> float:
-    """NaN where it is none."""
-    try:
-        return float(str(text))
-    except ValueError:
-        return math.nan
-
-
-def _positive(value: float) -> float | None:
-    return value if 0 < value < math.inf and 1.0 / value < math.inf else None
+def _seconds(told: Mapping[str, str], key: str) -> float:
+    """A number in the unit that stands beside it, of s where none does; NaN where there is none."""
+    with suppress(KeyError, ValueError):
+        return float(told[key]) * _TIME_UNITS[told.get(f"{key}Unit", "s")]
+    return math.nan

@@ -133,12 +133,9 @@ class _Video:
         stream, damage = container.streams.video[0], ""
         # what follows a fault of the container is not to be found
         with container, suppress(av.FFmpegError, OSError, ValueError):
-            try:
+            with suppress(OSError, ValueError):  # what cannot be sought is decoded from the beginning
                 if count:
                     container.seek(int(self.times[count]), stream=stream, backward=True)
-            except (OSError, ValueError):
-                yield from self._from(0)
-                return
             for packet in container.demux(stream):
                 if packet.is_keyframe and packet.size:
                     damage = ""
@@ -175,17 +172,13 @@ def _index(
 
     stamps: list[tuple[int | None, int | None, bool]] = []  # of presentation, of decoding; key frame
     checked = False
-    try:
+    with suppress(av.FFmpegError, OSError):  # the file is cut short or damaged there
         for packet in container.demux(container.streams.video[0]):
             if packet.size:
-                if codec == "ffv1" and not checked:
-                    checked = checksums_hold(bytes(packet))
+                checked = checked or (codec == "ffv1" and checksums_hold(bytes(packet)))
                 stamps.append((packet.pts, packet.dts, bool(packet.is_keyframe)))
-    except (av.FFmpegError, OSError) as error:
-        if not stamps:
-            raise RecordingError(f"{file}: damaged video ({error}). Copy it again.") from error
     if not stamps:
-        raise RecordingError(f"{file}: a video without frames. Export it again.")
+        raise RecordingError(f"{file}: a video without frames, or damaged. Copy or export it again.")
     *both, keys = zip(*stamps, strict=True)
     times = next((times for times in both if None not in times and len(set(times)) == len(times)), None)
     if times is None:
@@ -219,9 +212,8 @@ def checksums_hold(packet: bytes) -> bool:
 
 
 def _opened(file: Path, camera: str) -> InputContainer:
-    with told_as(
-        RecordingError, f"{file}: videos need PyAV", ImportError, then="Install it: pip install disctrack[video]"
-    ):
+    remedy = "Install it: pip install disctrack[video]"
+    with told_as(RecordingError, f"{file}: videos need PyAV", ImportError, then=remedy):
         import av
     with told_as(RecordingError, f"{file}: not a readable video for the {camera} camera", Exception):
         container = av.open(str(file), options=_CONTAINERS)
@@ -257,13 +249,12 @@ def _format_notes(frame: av.VideoFrame) -> Iterator[str]:
         yield f"luma of {name} (full range) is used as it is"
     elif name.startswith(("yuv", "nv", "p0", "uyvy", "yuyv")):
         yield f"luma of {name} is used as it is, not stretched: limited range has black at 16 and white at 235"
-    if name.startswith(("yuv4", "yuvj4")) and _depth(frame) == 8 and any(_varies(p) for p in frame.planes[1:3]):
+    if (
+        name.startswith(("yuv4", "yuvj4"))
+        and _depth(frame) == 8
+        and any(np.ptp(_rows(plane, plane.height)[:, : plane.width]) for plane in frame.planes[1:3])
+    ):
         yield "the video has colour: its luma is a mixture of what the sensor measured"
-
-
-def _varies(plane: VideoPlane) -> bool:
-    rows = _rows(plane, plane.height)[:, : plane.width]
-    return bool((rows != rows[0, 0]).any())
 
 
 def _rows(plane: VideoPlane, height: int) -> NDArray[np.uint8]:
@@ -273,12 +264,6 @@ def _rows(plane: VideoPlane, height: int) -> NDArray[np.uint8]:
         return np.frombuffer(memoryview(plane), np.uint8)[: size * height].reshape(height, size)
     first = plane.buffer_ptr + (height - 1) * plane.line_size  # bottom up: the plane says where the upper row lies
     return np.frombuffer(ctypes.string_at(first, size * height), np.uint8).reshape(height, size)[::-1]
-
-
-def _without_palette(frame: av.VideoFrame) -> bool:
-    """True where all entries are alike: a recorder of grey values left the palette out, and all would be black."""
-    colours = np.frombuffer(memoryview(frame.planes[1]), np.uint8)[:1024].reshape(256, 4)[:, :3]
-    return bool((colours == colours[0]).all())
 
 
 # Pixel formats whose first plane is the grey values, or begins with the first of them in every pair
@@ -294,8 +279,10 @@ def _luma(frame: av.VideoFrame, where: str) -> Image:
         return np.asarray(rows[:, first : step * frame.width : step])
     if name in ("gray10be", "gray12be", "gray14be", "gray16be"):
         return np.asarray(frame.to_ndarray(format=name)).astype(np.uint16)
-    if name == "pal8" and _without_palette(frame):
-        return _rows(frame.planes[0], frame.height)[:, : frame.width]
+    if name == "pal8":
+        colours = np.frombuffer(memoryview(frame.planes[1]), np.uint8)[:1024].reshape(256, 4)[:, :3]
+        if (colours == colours[0]).all():  # a recorder of grey values left the palette out: all would be black
+            return _rows(frame.planes[0], frame.height)[:, : frame.width]
     if name in ("rgb24", "bgr24", "bgr0", "rgba", "bgra", "argb", "gbrp", "pal8"):
         return as_grey(np.asarray(frame.to_ndarray(format="rgb24")), where)
     raise RecordingError(f"{where}: pixel format {name} is not read. Export as grey of 8, 10, 12 or 16 bit (ffv1).")
