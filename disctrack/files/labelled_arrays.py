@@ -92,18 +92,6 @@ def _create(group: h5py.Group, name: str, variable: Variable) -> h5py.Dataset:
 MOST_COMPRESSION = 1100
 
 
-def read_variables(group: h5py.Group, names: Collection[str] | None = None) -> dict[str, NDArray]:
-    """Every dataset of a group (not of its subgroups), or those of `names`, as an array; text as str.
-
-    Raises ValueError if a dataset claims to be larger than the file could hold.
-    """
-    return {
-        name: read_array(item)
-        for name, item in group.items()
-        if (names is None or name in names) and isinstance(item, h5py.Dataset)
-    }
-
-
 def read_array(dataset: h5py.Dataset) -> NDArray:
     """Text as str. Raises ValueError if the dataset claims to be larger than the file could hold."""
     if dataset.size * dataset.dtype.itemsize > MOST_COMPRESSION * dataset.file.id.get_filesize():

@@ -29,7 +29,7 @@ from calibration.rig_file import beside_cameras, complete_file, read_beside_came
 from disctrack.disc import Disc
 from disctrack.errors import OutputError, TrajectoryFileError, told_as
 from disctrack.files.json_text import json_text
-from disctrack.files.labelled_arrays import Variable, copy_without, flags, read_array, read_variables, write_variables
+from disctrack.files.labelled_arrays import Variable, copy_without, flags, read_array, write_variables
 from disctrack.files.software import software_version
 from disctrack.files.whole import refuse_existing, write_whole
 from disctrack.findings import Finding, finding_from_json, warn_of_doubts
@@ -255,9 +255,11 @@ def read_group(
     """
     with _reading(Path(path)) as file:
         if group not in file or not isinstance(file[group], h5py.Group):
-            there = ", ".join(name for name, item in file.items() if isinstance(item, h5py.Group))
-            raise TrajectoryFileError(f"no group '{group}'; it holds {there}. Run the stage that writes it.")
-        return read_variables(file[group], names=names), dict(file[group].attrs)
+            groups = ", ".join(name for name, item in file.items() if isinstance(item, h5py.Group))
+            raise TrajectoryFileError(f"no group '{group}'; it holds {groups}. Run the stage that writes it.")
+        there = {name: item for name, item in file[group].items() if names is None or name in names}
+        arrays = {name: read_array(item) for name, item in there.items() if isinstance(item, h5py.Dataset)}
+        return arrays, dict(file[group].attrs)
 
 
 def labelled(trajectory: Trajectory) -> tuple[dict[str, Variable], dict[str, Variable], dict[str, float]]:
@@ -367,16 +369,13 @@ _COORDINATES = {
 _NAMED_AXES = {
     "camera": (CAMERAS, "camera"),
     "axis": (("x", "y"), "pixel axis: x right, y down"),
-    "axis_2": (("x", "y"), "pixel axis"),
     "space_axis": (("x", "y", "z"), "axis of space"),
-    "space_axis_2": (("x", "y", "z"), "axis of space"),
     "quaternion_component": (("w", "x", "y", "z"), "quaternion component"),
     "pose_component": (POSE_COMPONENTS, "position, and rotation vector in world axes"),
-    "pose_component_2": (POSE_COMPONENTS, "position, and rotation vector in world axes"),
     "rig_parameter": (RIG_PARAMETERS, "parameter of the stereo rig"),
-    "rig_parameter_2": (RIG_PARAMETERS, "parameter of the stereo rig"),
     "distortion_coefficient": (("k1", "k2", "p1", "p2", "k3"), "Brown's coefficients as OpenCV's"),
 }
+_NAMED_AXES |= {f"{name}_2": _NAMED_AXES[name] for name in ("axis", "space_axis", "pose_component", "rig_parameter")}
 
 
 def _axes(trajectory: Trajectory) -> dict[str, Variable]:
@@ -443,7 +442,7 @@ def _reading(path: Path) -> contextlib.AbstractContextManager[h5py.File]:
 
 
 def _trajectory(file: h5py.File) -> Trajectory:
-    time, disc = _array(file, "time", "s"), _read_disc(file["disc"])
+    time, disc = _array(file, "time", "s"), _read_disc(file)
     lengths = {name: len(values) for name, (values, _) in _NAMED_AXES.items()}
     lengths |= {"time": len(time), "marker": disc.n_markers}
     found: dict[str, Any] = {}
@@ -474,9 +473,10 @@ def _array(file: h5py.File, place: str, unit: str) -> NDArray:
     return read_array(file[place])
 
 
-def _read_disc(group: h5py.Group) -> Disc:
-    sizes = {name.rpartition("_")[0]: float(group.attrs[name]) for name in _DISC_SIZES if name in group.attrs}
-    return Disc(marker_centres_body=read_variables(group)["marker_centres_body"], **sizes)
+def _read_disc(file: h5py.File) -> Disc:
+    told = file["disc"].attrs
+    sizes = {name.rpartition("_")[0]: float(told[name]) for name in _DISC_SIZES if name in told}
+    return Disc(marker_centres_body=_array(file, "disc/marker_centres_body", "m"), **sizes)
 
 
 def _rig(group: h5py.Group) -> StereoRig:
@@ -489,29 +489,23 @@ def _rig(group: h5py.Group) -> StereoRig:
 
 def _check_values(trajectory: Trajectory) -> None:
     """Raise ValueError, which names the first frame, where a value can be no measurement."""
-    frame, q, C = trajectory.frame, trajectory.q, trajectory.pose_covariance
-    with np.errstate(invalid="ignore"):
-        steps = np.diff(trajectory.time)
-        # beyond so many metres and radians, no disc was filmed and squares lose all digits
-        far = (np.abs(q) > np.repeat([1e3, 1e6], 3)) | np.isinf(q)
-    if not np.isfinite(trajectory.time).all() or (steps <= 0).any():
-        row = int(np.argmax(~(steps > 0))) + 1
-        raise ValueError(f"time does not increase at frame {frame[row]}: {trajectory.time[row]:g} s")
-    if far.any():
-        row, column = np.argwhere(far)[0]
-        raise ValueError(f"{COORDINATES[column]} of frame {frame[row]} is {q[row, column]:g}, which is no pose")
+    q, C, posed = trajectory.q, trajectory.pose_covariance, trajectory.measured
+    sound: Mask = np.asarray(np.isfinite(C).all(axis=(1, 2)))
+    sound[sound] = np.linalg.eigvalsh(C[sound])[:, 0] > 0
+    wrong = {
+        "time does not increase": ~(np.diff(trajectory.time, prepend=-np.inf) > 0) | ~np.isfinite(trajectory.time),
+        # who writes few digits rounds it
+        "quaternion is no rotation": posed & ~(np.abs(np.linalg.norm(trajectory.quaternion, axis=1) - 1) < 1e-3),
+        "pose_covariance is not positive definite": posed & ~sound,
+    }
+    # beyond so many metres and radians, no disc was filmed and squares lose all digits
+    wrong |= {f"{name} is of no pose": np.abs(q[:, i]) > (1e3 if i < 3 else 1e6) for i, name in enumerate(COORDINATES)}
     for known, status in ((FrameStatus, trajectory.frame_status), (MarkerStatus, trajectory.marker_status)):
-        unknown = ~np.isin(status, [*known])
-        if unknown.any():
-            raise ValueError(f"frame {frame[np.argwhere(unknown)[0][0]]} has an unknown status {status[unknown][0]}")
-    posed = np.flatnonzero(np.isfinite(q).all(axis=1))
-    off = np.abs(np.linalg.norm(trajectory.quaternion[posed], axis=1) - 1) > 1e-3  # who writes few digits rounds it
-    if off.any() or not np.isfinite(trajectory.quaternion[posed]).all():
-        raise ValueError(f"quaternion of frame {frame[posed[int(np.argmax(off))]]} is no rotation")
-    sound: Mask = np.asarray(np.isfinite(C[posed]).all(axis=(1, 2)))
-    sound[sound] = np.linalg.eigvalsh(C[posed][sound])[:, 0] > 0
-    if not sound.all():
-        raise ValueError(f"pose_covariance of frame {frame[posed[int(np.argmin(sound))]]} is not positive definite")
+        for strange in np.setdiff1d(status, [*known]):
+            wrong[f"unknown status {strange}"] = (status == strange).reshape(len(q), -1).any(axis=1)
+    for said, frames in wrong.items():
+        if frames.any():
+            raise ValueError(f"{said} at frame {trajectory.frame[np.argmax(frames)]}")
     sizes = (trajectory.disc.radius, trajectory.disc.half_thickness, trajectory.disc.mass, trajectory.frame_rate)
     if not (np.isfinite(sizes).all() and min(sizes) > 0):
         raise ValueError("radius, thickness, mass and frame rate must be above 0")
