@@ -29,10 +29,13 @@ class Key(NamedTuple):
 
     expected: str  # in words
     fits: Callable[[Any], bool]
-    needed: bool = True  # in its section, where that is there
-    between: tuple[float, float] | None = None  # of a number, both ends included, in the unit that the key names
-    example: str = ""  # what may stand there
+    example: str = ""  # what may stand there, of a key that is needed in its section, where that is there
     remark: str = ""  # that a first declaration has beside it
+
+    @property
+    def needed(self) -> bool:
+        """True where nothing may stand for it."""
+        return bool(self.example)
 
     def like(self, example: str, remark: str) -> Key:
         """The key with an example and a remark."""
@@ -43,10 +46,8 @@ def _in_range(value: object, least: float, most: float) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and least <= value <= most
 
 
-def _number(least: float, most: float, needed: bool = True) -> Key:
-    return Key(
-        f"a number from {least:g} to {most:g}", lambda value: _in_range(value, least, most), needed, (least, most)
-    )
+def _number(least: float, most: float) -> Key:
+    return Key(f"a number from {least:g} to {most:g}", lambda value: _in_range(value, least, most))
 
 
 def _whole(value: object, n: int, least: int, most: float) -> bool:
@@ -54,18 +55,17 @@ def _whole(value: object, n: int, least: int, most: float) -> bool:
     return isinstance(value, list) and len(value) == n and all(type(x) is int and least <= x <= most for x in value)
 
 
-def _text(example: str, needed: bool = False) -> Key:
-    return Key(example, lambda value: isinstance(value, str) and bool(value.strip()) and "\0" not in value, needed)
+def _text(expected: str) -> Key:
+    return Key(expected, lambda value: isinstance(value, str) and bool(value.strip()) and "\0" not in value)
 
 
 def _one_of(*words: str) -> Key:
     quoted = [f'"{word}"' for word in words]
-    return Key(f"{', '.join(quoted[:-1])} or {quoted[-1]}", lambda value: value in words, needed=False)
+    return Key(f"{', '.join(quoted[:-1])} or {quoted[-1]}", lambda value: value in words)
 
 
-def _counts(what: str, needed: bool = True) -> Key:
-    expected = f"two whole numbers from 1 to {MOST}, {what}, e.g. [9, 6]"
-    return Key(expected, lambda value: _whole(value, 2, 1, MOST), needed)
+def _counts(what: str) -> Key:
+    return Key(f"two whole numbers from 1 to {MOST}, {what}, e.g. [9, 6]", lambda value: _whole(value, 2, 1, MOST))
 
 
 def _are_centres(value: object) -> bool:
@@ -79,15 +79,13 @@ def _are_centres(value: object) -> bool:
 
 _FARTHEST = 1e4  # [mm] from the disc's centre
 _LABEL = _text('text in quotes, e.g. "rec_a"')
-_FILES = _text('a file pattern in quotes, e.g. "left/*.png"', needed=True)
-_MORE_FILES = _FILES._replace(needed=False)
-_TOLERANCE = _number(0, 2, needed=False)
+_FILES = _text('a file pattern in quotes, e.g. "left/*.png"')
+_TOLERANCE = _number(0, 2)
 _PART = Key(
     "[x, y, width, height] in pixels, a width and a height above 0",
     lambda value: _whole(value, 4, 0, math.inf) and min(value[2:]) > 0,
-    needed=False,
 )
-_VIEW = Key("a whole number from 0 to 100000", lambda value: _whole([value], 1, 0, 100_000), between=(0, 1e5))
+_VIEW = Key("a whole number from 0 to 100000", lambda value: _whole([value], 1, 0, 100_000))
 _CENTRES = Key(
     f"a list of [x, y] pairs, at least 3 and at most {MOST} of them, each number from {-_FARTHEST:g} to "
     f"{_FARTHEST:g}, e.g. [[26.0, 0.0], [13.0, 22.5], [-13.0, 22.5]]",
@@ -107,14 +105,14 @@ KEYS: dict[str, dict[str, Key]] = {
     "": {"name": _LABEL, "case": _LABEL, "surface": _LABEL},
     "cameras": {
         "frame_rate_hz": _number(0.1, 1e7).like("1000.0", "frames per second of the cameras"),
-        "left": _FILES,
-        "right": _FILES,
-        "exposure_us": _number(0, 1e7, needed=False),
-        "left_flat": _MORE_FILES,
-        "left_dark": _MORE_FILES,
+        "left": _FILES.like('"left/*.png"', ""),
+        "right": _FILES.like('"right/*.png"', ""),
+        "exposure_us": _number(0, 1e7),
+        "left_flat": _FILES,
+        "left_dark": _FILES,
         "left_part": _PART,
-        "right_flat": _MORE_FILES,
-        "right_dark": _MORE_FILES,
+        "right_flat": _FILES,
+        "right_dark": _FILES,
         "right_part": _PART,
     },
     "disc": {
@@ -139,10 +137,10 @@ KEYS: dict[str, dict[str, Key]] = {
             "[9, 6]", "long side first; count them"
         ),
         "square_mm": _number(0.01, 1e4).like("6.0", "side of a square, measured over many squares"),
-        "squares": _counts("columns and rows of squares, dark and light", needed=False),
-        "marker_mm": _number(0.01, 1e4, needed=False),
+        "squares": _counts("columns and rows of squares, dark and light"),
+        "marker_mm": _number(0.01, 1e4),
         "dictionary": _LABEL,
-        "rig": _MORE_FILES,
+        "rig": _FILES,
         "square_tolerance_mm": _TOLERANCE,
         "flatness_tolerance_mm": _TOLERANCE,
     },
@@ -153,7 +151,7 @@ KEYS: dict[str, dict[str, Key]] = {
         "board_thickness_tolerance_mm": _TOLERANCE,
     },
     "gravity": {"g_m_s2": _number(0.001, 1e3).like("9.81", "9.78 (equator) to 9.83")},
-    "air": {"pressure_hPa": _number(1e-9, 1e5, needed=False), "density_kg_m3": _number(1e-9, 1e3, needed=False)},
+    "air": {"pressure_hPa": _number(1e-9, 1e5), "density_kg_m3": _number(1e-9, 1e3)},
 }
 
 

@@ -139,7 +139,9 @@ def test_what_is_wrong_is_shown_with_what_was_expected(tmp_path, written, found,
     assert all(part in text for part in expected.split(".*"))
 
 
-NUMBERS = [(s, key, *meant.between) for s, keys in KEYS.items() for key, meant in keys.items() if meant.between]
+RANGE = re.compile(r"a (?:whole )?number from (\S+) to (\S+)")
+NUMBERS = [(s, key, *map(float, found.groups())) for s, keys in KEYS.items() for key, meant in keys.items()
+           if (found := RANGE.fullmatch(meant.expected))]  # fmt: skip
 CHARUCO = 'target = "charuco"\nsquares = [9, 6]\ndictionary = "4X4_50"'  # that marker_mm belongs to
 
 
