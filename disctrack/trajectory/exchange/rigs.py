@@ -21,6 +21,7 @@ from disctrack.files.inputs import read_regular
 from disctrack.files.toml_tree import MOST, toml_value
 from disctrack.files.whole import write_whole
 
+Table = Mapping[str, Any]
 MAX_BYTES = 50_000_000  # mrcal keeps the whole calibration in a camera's file
 
 
@@ -50,7 +51,7 @@ def camera_of(K: Array, D: Array, size: Array, where: str) -> Camera:
     return Camera.from_parameters(np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], *terms]), (int(size[0]), int(size[1])))
 
 
-def array_of(table: Mapping[str, Any], key: str, shape: tuple[int, ...], where: str) -> Array:
+def array_of(table: Table, key: str, shape: tuple[int, ...], where: str) -> Array:
     """The finite numbers under a key, in that shape. Raises RigFileError."""
     said = f"{where}: '{key}' is missing, or not numbers of shape {shape}"
     with told_as(RigFileError, said, KeyError, TypeError, ValueError):
@@ -90,32 +91,26 @@ def the_one(paths: Sequence[Path]) -> Path:
 
 def write_caliscope(path: Path, rig: StereoRig) -> None:
     """Cameras 0 (left) and 1 (right), lengths in metres. Raises OutputError."""
-    own = [f"cam_id = {number}\nrotation_count = 0" for number in (0, 1)]
-    _write_toml(path, rig, ("cameras.0", "cameras.1"), own, 5)
+    _write_toml(path, rig, {f"cameras.{number}": {"cam_id": number, "rotation_count": 0} for number in (0, 1)}, 5)
 
 
 def write_pose2sim(path: Path, rig: StereoRig) -> None:
     """Cameras cam_01 (left) and cam_02 (right), lengths in metres, without k3. Raises OutputError."""
-    names = ("cam_01", "cam_02")
-    own = [f'name = "{name}"' for name in names]
-    _write_toml(path, rig, names, own, 4, "[metadata]\nadjusted = false\nerror = 0.0\n")
+    end = "[metadata]\nadjusted = false\nerror = 0.0\n"
+    _write_toml(path, rig, {name: {"name": name} for name in ("cam_01", "cam_02")}, 4, end)
 
 
-def _write_toml(
-    path: Path, rig: StereoRig, tables: Sequence[str], own: Sequence[str], terms: int, end: str = ""
-) -> None:
+def _write_toml(path: Path, rig: StereoRig, tables: Mapping[str, Table], terms: int, end: str = "") -> None:
     text = ""
-    for table, more, camera, (R, t) in zip(tables, own, rig.cameras, rig.camera_poses(), strict=True):
-        text += (
-            f"[{table}]\n{more}\n"
-            f"size = {toml_value(camera.image_size)}\n"
-            f"matrix = {toml_value(camera.camera_matrix)}\n"
-            f"distortions = {toml_value(camera.distortion[:terms])}\n"
-            f"translation = {toml_value(t)}\n"
-            f"rotation = {toml_value(_rotation_vector(R))}\n"
-            "fisheye = false\n\n"
-        )
+    for (name, own), camera, (R, t) in zip(tables.items(), rig.cameras, rig.camera_poses(), strict=True):
+        table = {"size": camera.image_size, "matrix": camera.camera_matrix, "distortions": camera.distortion[:terms]}
+        table |= {"translation": t, "rotation": _rotation_vector(R), "fisheye": False}
+        text += f"[{name}]\n{_lines('{} = {}', {**own, **table})}\n"
     write_whole(path, (text + end).encode())
+
+
+def _lines(form: str, table: Mapping[str, object]) -> str:
+    return "".join(f"{form.format(key, toml_value(value))}\n" for key, value in table.items())
 
 
 def read_caliscope(path: Path, *, cameras: tuple[str, str] | None = None, world_is_table: bool = False) -> StereoRig:
@@ -152,29 +147,20 @@ def read_caliscope(path: Path, *, cameras: tuple[str, str] | None = None, world_
 
 def write_kalibr(path: Path, rig: StereoRig) -> None:
     """k3 and the world have no place there. Raises OutputError."""
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = rig.R_right_left, rig.t_right_left
     text = ""
     for number, camera in enumerate(rig.cameras):
-        text += (
-            f"cam{number}:\n"
-            f"  cam_overlaps: [{1 - number}]\n"
-            "  camera_model: pinhole\n"
-            f"  distortion_coeffs: {toml_value(camera.distortion[:4])}\n"
-            "  distortion_model: radtan\n"
-            f"  intrinsics: {toml_value(camera.parameters[:4])}\n"
-            f"  resolution: {toml_value(camera.image_size)}\n"
-            f"  rostopic: /cam{number}/image_raw\n"
-        )
-    text += "  T_cn_cnm1:\n" + "".join(f"  - {toml_value(row)}\n" for row in T)
-    write_whole(path, text.encode())
+        table: dict[str, object] = {"cam_overlaps": [1 - number], "camera_model": "pinhole", "distortion_model": "radtan"}
+        table |= {"distortion_coeffs": camera.distortion[:4], "intrinsics": camera.parameters[:4]}
+        table |= {"resolution": camera.image_size, "rostopic": f"/cam{number}/image_raw"}
+        text += f"cam{number}:\n{_lines('  {}: {}', table)}"
+    T = np.vstack([np.column_stack([rig.R_right_left, rig.t_right_left]), np.eye(4)[3]])
+    write_whole(path, (text + _lines("  {}: {}", {"T_cn_cnm1": T})).encode())
 
 
 def read_kalibr(path: Path) -> StereoRig:
     """cam0 and cam1 of a camchain. Raises RigFileError; OutputError where PyYAML is not installed."""
-    with told_as(
-        OutputError, f"{path}: Kalibr's YAML needs PyYAML", ImportError, then="Install it: pip install pyyaml"
-    ):
+    remedy = "Install it: pip install pyyaml"
+    with told_as(OutputError, f"{path}: Kalibr's YAML needs PyYAML", ImportError, then=remedy):
         import yaml
     with told_as(RigFileError, f"{path}: not YAML", Exception):
         chain = yaml.safe_load(content_of(path))
@@ -234,14 +220,13 @@ def read_mrcal(paths: Sequence[Path], *, world_is_table: bool = False) -> Stereo
             raise RigFileError(f"{path}: not a .cameramodel of mrcal: no dictionary")
         name = str(model.get("lensmodel", model.get("lens_model", "none")))
         if name not in _TERMS:
-            raise RigFileError(
-                f"{path}: lens model {name}; {', '.join(_TERMS)} can be read. mrcal-convert-lensmodel fits one"
-            )
-        numbers = array_of(model, "intrinsics", (4 + _TERMS[name],), str(path))
-        camera = camera_of(
-            _matrix(*numbers[:4]), numbers[4:], array_of(model, "imagersize", (2,), str(path)), str(path)
+            known = ", ".join(_TERMS)
+            raise RigFileError(f"{path}: lens model {name}; {known} can be read. mrcal-convert-lensmodel fits one")
+        numbers, size = (
+            array_of(model, key, (n,), str(path)) for key, n in (("intrinsics", 4 + _TERMS[name]), ("imagersize", 2))
         )
         rt = array_of(model, "extrinsics" if "extrinsics" in model else "rt_cam_ref", (6,), str(path))
+        camera = camera_of(_matrix(*numbers[:4]), numbers[4:], size, str(path))
         parts.append((camera, rotation_of(rt[:3], str(path)), rt[3:]))
     return rig_of(parts, world_is_table)
 
