@@ -33,25 +33,20 @@ def read_toml(path: Path, error: type[DiscTrackError]) -> dict[str, Any]:
     """The file's tree. Raises `error` with the file, what is wrong with it, and what to do."""
     with told_as(error, f"{path}: cannot be read", OSError, then="Give the path of a TOML file."):
         content = read_regular(path, MOST_TEXT)
-    text = ""
     try:
-        text = content.decode("utf-8")
-        return tomllib.loads(text)
-    except UnicodeDecodeError as reason:
-        raise error(f"{path}: byte {reason.start} is not UTF-8 text. Save the file as UTF-8.") from reason
-    except tomllib.TOMLDecodeError as reason:
+        return tomllib.loads(content.decode())
+    except (
+        ValueError,
+        RecursionError,
+    ) as reason:  # no text, no TOML, nested too deeply, a number of thousands of digits
         place = re.search(r"at line (\d+)", str(reason))
-        line = text.splitlines()[int(place[1]) - 1].strip()[:80] if place else ""
+        line = content.decode().splitlines()[int(place[1]) - 1].strip()[:80] if place else ""
         hint = " Numbers have a point: 37.5." if re.search(r"= *-?\d+,\d", line) else ""
         hint += " Folders are divided by /." if "\\" in line else ""
         raise error(
-            f"{path}: not valid TOML: {reason}{f': {line}' if line else ''}. Correct that line; if this is not a TOML "
-            f"file, give the right one.{hint}"
+            f"{path}: not valid TOML: {reason}{f': {line}' if line else ''}. Correct that, in UTF-8; if this is not a "
+            f"TOML file, give the right one.{hint}"
         ) from reason
-    except RecursionError as reason:
-        raise error(f"{path}: nested too deeply for a file of settings.") from reason
-    except ValueError as reason:  # e.g. an integer of thousands of digits, a date that does not exist
-        raise error(f"{path}: a value cannot be read: {reason}.") from reason
 
 
 def build(kind: Any, tree: dict[str, Any], where: str, section: str = "") -> Any:
