@@ -40,9 +40,20 @@ BUSY_FOR = 1.0  # [s] to wait for another batch before the recording is put back
 
 
 def do(job: Job) -> Row:
-    """Do a job. Never raises an Exception: what went wrong is in the row, and in the recording's folder."""
+    """Do a job. Never raises an Exception: what went wrong is in the row, and in the folder of the results."""
+    results = Path(job.results)
     try:
-        return make_rig(job) if job.kind == "rig" else make_recording(job)
+        with locked(results / LOCK, BUSY_FOR):
+            try:
+                return make_rig(job) if job.kind == "rig" else make_recording(job, results)
+            except Exception as error:
+                kind = Kind.OTHER
+                if isinstance(error, TrackingError):
+                    kind = error.findings[0].kind if error.findings else Kind.DISC_NOT_FOUND
+                row = failed(reason_of(error), kind)
+                with contextlib.suppress(DiscTrackError):  # or else the batch that runs now is the only one to know
+                    write_row(results, row)
+                return row
     except Timeout:
         return outcome(BUSY)
     except Exception as error:
@@ -50,33 +61,16 @@ def do(job: Job) -> Row:
 
 
 def make_rig(job: Job) -> Row:
-    """Calibrate into job.rig, unless the same was done before. Raises Timeout."""
-    path = Path(job.rig)
-    with locked(path.with_name(LOCK), BUSY_FOR):
-        source = source_of(read_recording(job.folder), job.options.calibration)
-        if is_rig_of(path, source) and not job.options.overwrite:
-            return outcome(SKIPPED)
-        calibrate_into(path, source, overwrite=True, figures=job.options.report)
+    """Calibrate into job.rig, unless the same was done before."""
+    source = source_of(read_recording(job.folder), job.options.calibration)
+    if is_rig_of(Path(job.rig), source) and not job.options.overwrite:
+        return outcome(SKIPPED)
+    calibrate_into(Path(job.rig), source, overwrite=True, figures=job.options.report)
     return outcome(MEASURED)
 
 
-def make_recording(job: Job) -> Row:
-    """Track, analyse and, if asked for, diagnose; what is done already with the same inputs is kept. Raises Timeout."""
-    results = Path(job.results)
-    with locked(results / LOCK, BUSY_FOR):
-        try:
-            return _make_recording(job, results)
-        except Exception as error:
-            kind = Kind.OTHER
-            if isinstance(error, TrackingError):
-                kind = error.findings[0].kind if error.findings else Kind.DISC_NOT_FOUND
-            row = failed(reason_of(error), kind)
-            with contextlib.suppress(DiscTrackError):  # or else the batch that runs now is the only one to know
-                write_row(results, row)
-            return row
-
-
-def _make_recording(job: Job, results: Path) -> Row:
+def make_recording(job: Job, results: Path) -> Row:
+    """Track, analyse and, if asked for, diagnose; what is done already with the same inputs is kept."""
     began, used = time.perf_counter(), time.process_time()
     recording = read_recording(job.folder)
     rig, pairs = read_rig(job.rig), open_pairs(recording)
