@@ -78,9 +78,8 @@ def _result(future: Future[Row]) -> Row:
     try:
         return future.result()
     except CancelledError as error:  # not by us
-        raise ClusterError(
-            "the connection to the cluster's scheduler was lost. What is finished is kept; the same command continues."
-        ) from error
+        said = "the connection to the cluster's scheduler was lost. What is finished is kept"
+        raise ClusterError(f"{said}; the same command continues.") from error
     except OSError as error:  # no memory, or no more processes allowed
         return failed(f"no process could be started for it: {reason_of(error)}")
     except Exception as error:  # a cluster's machines were lost too often, or could not even begin

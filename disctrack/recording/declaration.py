@@ -266,9 +266,7 @@ def read_recording(path: str | Path) -> Recording:
 def _air_density(file: Path, air: Mapping[str, float]) -> float:
     """[kg/m^3] as declared, or in proportion to the pressure at room temperature."""
     if "density_kg_m3" in air and "pressure_hPa" in air:
-        raise RecordingError(
-            f"{file}: [air] has both pressure_hPa and density_kg_m3; expected one of them. Keep the one you measured."
-        )
+        raise RecordingError(f"{file}: [air] has both pressure_hPa and density_kg_m3. Keep the one you measured.")
     return float(air.get("density_kg_m3", AIR_DENSITY * air.get("pressure_hPa", STANDARD_PRESSURE) / STANDARD_PRESSURE))
 
 
@@ -363,9 +361,7 @@ def _refuse_mixed_calibration(file: Path, calibration: Mapping[str, Any]) -> Non
     of_views = dict.fromkeys(key for keys in TARGET_KEYS.values() for key in keys)
     odd = [key for key in of_views if key in calibration and key not in own]
     if odd and by_rig:
-        raise RecordingError(
-            f"{file}: [calibration] has both rig and {', '.join(odd)}. Keep the rig file, or the chessboard views."
-        )
+        raise RecordingError(f"{file}: [calibration] has both rig and {', '.join(odd)}. Keep the rig, or the views.")
     if odd:
         named = " or ".join(f'target = "{name}"' for name, keys in TARGET_KEYS.items() if odd[0] in keys)
         raise RecordingError(

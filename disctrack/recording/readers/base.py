@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime
 from functools import partial
 from pathlib import Path
-from typing import TypeVar
+from typing import NoReturn, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -197,6 +197,14 @@ def first_readable(n: int, camera: str, decoded: Callable[[int], _T]) -> _T:
         except RecordingError as error:
             problem = problem or error
     raise RecordingError(f"none of the {n} {camera} frames can be read; the first: {problem}")
+
+
+def refuse_colour(where: str, found: str) -> NoReturn:
+    """Raise RecordingError for pixels that are no grey values."""
+    raise RecordingError(
+        f"{where}: {found}; expected grey values. A conversion here would mix what the sensor measured: export the "
+        "camera's grey values, or record with a monochrome camera."
+    )
 
 
 def only_file(files: Sequence[Path], camera: str) -> Path:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from calibration.kit.arrays import Array
 from disctrack.errors import RecordingError
-from disctrack.recording.readers.base import CameraHeader, FrameReader, only_file
+from disctrack.recording.readers.base import CameraHeader, FrameReader, in_words, only_file, refuse_colour
 from disctrack.recording.readers.raw import PixelLayout, RawFile, bit_depth_of, check_frame_size, raw_frames
 
 _FILE_HEADER = struct.Struct("<2sHHHiIiIIIIII")
@@ -95,15 +95,10 @@ def _layout(cine: _Cine) -> tuple[PixelLayout, int]:
     """How the pixels lie, and the bits that carry grey values. RecordingError for colours, and what is compressed."""
     filter_code = cine.field("CFA") & 0xFFFFFF  # the highest byte tells of grey heads
     if filter_code or cine.bits not in (8, 16):
-        raise RecordingError(
-            f"{cine.file}: a colour recording (filter code {filter_code}, {cine.bits} bit per pixel); expected grey "
-            "values. A conversion here would mix what the sensor measured: record with a monochrome camera."
-        )
+        refuse_colour(str(cine.file), f"a colour recording (filter code {filter_code}, {cine.bits} bit per pixel)")
     if cine.packing and cine.packing not in _PACKED:
-        raise RecordingError(
-            f"{cine.file}: images are packed in a way (biCompression {cine.packing}) that is not read. Save them "
-            "unpacked with 8 or 16 bit, or packed with 10 or 12 bit."
-        )
+        said = f"images are packed in a way (biCompression {cine.packing}) that is not read"
+        raise RecordingError(f"{cine.file}: {said}. Save them with 8 or 16 bit, or packed with 10 or 12.")
     packed, w, h = _PACKED.get(cine.packing, 0), cine.width, cine.height
     check_frame_size(w, h, str(cine.file), packed or cine.bits)
     if packed:
@@ -125,10 +120,8 @@ def _pixels(cine: _Cine, starts: NDArray[np.int64], layout: PixelLayout) -> NDAr
     """
     first = _pixels_of(cine, int(starts[0]), layout)
     if first < 0:
-        raise RecordingError(
-            f"{cine.file}: the first image does not have the {layout.frame_bytes} bytes of {layout.width} x "
-            f"{layout.height} px with {layout.stored_bits} bit. The file is damaged: export it again."
-        )
+        size = f"{layout.frame_bytes} bytes of {in_words((layout.width, layout.height), layout.stored_bits)}"
+        raise RecordingError(f"{cine.file}: the first image does not have the {size}: damaged. Export it again.")
     if (np.diff(starts) == first - starts[0] + layout.frame_bytes).all():
         return starts + (first - starts[0])
     return np.array([_pixels_of(cine, int(start), layout) for start in starts], np.int64)

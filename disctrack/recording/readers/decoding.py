@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from calibration.kit.arrays import Image
 from disctrack.errors import RecordingError, told_as
 from disctrack.recording.readers._pixel_kernels import undo_filters
-from disctrack.recording.readers.base import room_for
+from disctrack.recording.readers.base import refuse_colour, room_for
 from disctrack.recording.readers.raw import RawFile, check_frame_size
 from disctrack.recording.readers.tiff_pages import page_pixels, pages_of
 
@@ -65,10 +65,7 @@ def as_grey(image: NDArray, where: str) -> Image:
         raise RecordingError(f"{where}: has transparent pixels; expected grey values. Export it without alpha channel.")
     colours = image[..., : 3 if image.shape[2] >= 3 else 1]
     if (colours != colours[..., :1]).any():
-        raise RecordingError(
-            f"{where}: a colour image; expected grey values. Export the camera's grey values: a conversion here would "
-            "mix what the sensor measured."
-        )
+        refuse_colour(where, "a colour image")
     return np.ascontiguousarray(colours[..., 0])
 
 
@@ -109,9 +106,7 @@ def _png(content: bytes, where: str, out: NDArray | None) -> NDArray:
             break
         if zlib.crc32(view[position + 4 : stop]) != _number_at(content, stop):
             name = kind.decode("latin-1")
-            raise RecordingError(
-                f"{where}: the PNG is damaged: wrong checksum of chunk {name!r} at byte {position}. {_AGAIN}"
-            )
+            raise RecordingError(f"{where}: damaged: wrong checksum of chunk {name!r} at byte {position}. {_AGAIN}")
         chunks.setdefault(kind, []).append(view[position + 8 : stop])
         position = stop + 4
     if b"IEND" not in chunks or [len(header) for header in chunks.get(b"IHDR", ())] != [13]:

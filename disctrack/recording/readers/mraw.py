@@ -12,7 +12,7 @@ import numpy as np
 
 from disctrack.errors import RecordingError, told_as
 from disctrack.files.inputs import MOST_TEXT
-from disctrack.recording.readers.base import CameraHeader, FrameReader, only_file
+from disctrack.recording.readers.base import CameraHeader, FrameReader, only_file, refuse_colour
 from disctrack.recording.readers.files import content_of
 from disctrack.recording.readers.raw import PixelLayout, RawFile, bit_depth_of, check_frame_size, raw_frames
 
@@ -163,16 +163,11 @@ def _layout(entries: Entries) -> tuple[PixelLayout, int]:
     mosaic = kind == "raw" and re.search(r"-C\b", device)  # the type's letter: -M- monochrome, -C- colour
     if kind not in ("mono", "raw", "") or mosaic:
         found = "a colour mosaic" if mosaic else f"of colour type {kind[:20]!r}"
-        raise RecordingError(
-            f"{file}: the frames are {found} ({device[:60]}); expected grey values. A conversion here would mix what "
-            "the sensor measured: record with a monochrome camera."
-        )
+        refuse_colour(file, f"the frames are {found} ({device[:60]})")
     width, height = _whole(entries, "Image Width"), _whole(entries, "Image Height")
     bits, effective = _whole(entries, "Color Bit"), _whole(entries, "EffectiveBit Depth")
     if bits not in (8, 10, 12, 16):
-        raise RecordingError(
-            f"{file}: 'Color Bit' is {bits}; expected 8, 10, 12 or 16. Save the frames in one of these."
-        )
+        raise RecordingError(f"{file}: 'Color Bit' is {bits}; expected 8, 10, 12 or 16. Save the frames with 16.")
     check_frame_size(width, height, str(file), bits)
     high = bits == 16 and entries["EffectiveBit Side"].lower() == "higher"
     packed = bits if bits in (10, 12) else 0
@@ -184,10 +179,8 @@ def _header(entries: Entries) -> tuple[CameraHeader, list[str], tuple[str, ...]]
     """Settings of the recording, what about them cannot be, and what had to be assumed of the frames' times."""
     rate = _number(entries["Record Rate(fps)"])
     if rate is None:
-        shown = entries["Record Rate(fps)"][:40]
-        raise RecordingError(
-            f"{entries['file']}: 'Record Rate(fps)' is {shown!r}; expected a number above 0. {_EXPORT}"
-        )
+        said = f"'Record Rate(fps)' is {entries['Record Rate(fps)'][:40]!r}; expected a number above 0"
+        raise RecordingError(f"{entries['file']}: {said}. {_EXPORT}")
     remarks, doubts = [], []
     step, n = max(int(_number(entries["Save Step"]) or 1), 1), _whole(entries, "Total Frame")
     recorded = _number(entries["Original Total Frame"])

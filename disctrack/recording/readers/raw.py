@@ -23,7 +23,7 @@ from calibration.kit.arrays import Image
 from disctrack.errors import RecordingError, told_as
 from disctrack.files.inputs import open_regular
 from disctrack.recording.readers._pixel_kernels import unpack_10, unpack_12
-from disctrack.recording.readers.base import FrameReader, room_for
+from disctrack.recording.readers.base import FrameReader, in_words, room_for
 
 # A header may claim any size; no camera of this kind has more pixels, and reading one must not exhaust the memory.
 MOST_PIXELS = 1 << 27
@@ -83,10 +83,10 @@ class RawFile:
         if n < 1:
             raise RecordingError(f"{self} ({camera} camera): its header states no frame. Export it again.")
         if present < LEAST_PRESENT * n or present * layout.frame_bytes > self.size:
+            each = in_words((layout.width, layout.height), layout.stored_bits)
             raise RecordingError(
-                f"{self} ({camera} camera): the header states {n} frames of {layout.width} x {layout.height} px, "
-                f"{layout.stored_bits} bit, which need {n * layout.frame_bytes} bytes, but the file has {self.size}: "
-                "it is cut short, or the header is of another file. Copy both again."
+                f"{self} ({camera} camera): the header states {n} frames, {each} ({n * layout.frame_bytes} bytes), but "
+                f"the file has {self.size} bytes: cut short, or the header is of another file. Copy both again."
             )
 
 
@@ -196,6 +196,5 @@ def check_frame_size(width: int, height: int, where: str, bits: int = 8, n_bytes
             "file cannot hold. The header is damaged, or not of this format: copy or export it again."
         )
     if width * height * bits % 8:
-        raise RecordingError(
-            f"{where}: {width} x {height} px of {bits} bit do not fill whole bytes. Save them with 16 bit."
-        )
+        said = in_words((width, height), bits)
+        raise RecordingError(f"{where}: {said} do not fill whole bytes. Save them with 16 bit.")

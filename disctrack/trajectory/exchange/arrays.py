@@ -142,9 +142,7 @@ def read_stereo_parameters(path: Path, *, unit: float | None = None, world_is_ta
         found = loadmat(path)
     if "intrinsicMatrix1" not in found:
         there = ", ".join(name for name in found if not name.startswith("__"))
-        raise RigFileError(
-            f"{path}: holds {there or 'nothing'}; save what stereoParametersToOpenCV returns, by its names"
-        )
+        raise RigFileError(f"{path}: holds {there or 'nothing'}; save by name what stereoParametersToOpenCV returns")
     told = str(np.ravel(found.get("worldUnits", ""))[0]) if np.size(found.get("worldUnits", "")) else ""
     scale = unit if unit is not None else {"m": 1.0, "mm": 1e-3}.get(told)
     if scale is None:

@@ -224,9 +224,7 @@ def read_points(path: Path) -> Array:
     found = [re.fullmatch(r"\s*(.+)_cam(\d+)_([XY])\s*", name) for name in first.split(",")]
     names, cameras = dict.fromkeys(m[1] for m in found if m), {m[2] for m in found if m}
     if not found or not all(found) or len(found) != 2 * len(names) * len(cameras):
-        raise RigFileError(
-            f"{path}: the first line is '{first[:60]}'; expected NAME_cam1_X,NAME_cam1_Y,NAME_cam2_X,..."
-        )
+        raise RigFileError(f"{path}: the first line is '{first[:60]}'; expected NAME_cam1_X,NAME_cam1_Y,...")
     with told_as(RigFileError, f"{path}: not a table of numbers with {len(found)} columns", ValueError):
         values = np.array([[float(cell or "nan") for cell in line.split(",")] for line in lines if line.strip()])
         return values.reshape(len(values), len(names), len(cameras), 2).swapaxes(1, 2)

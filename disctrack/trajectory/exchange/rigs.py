@@ -149,7 +149,11 @@ def write_kalibr(path: Path, rig: StereoRig) -> None:
     """k3 and the world have no place there. Raises OutputError."""
     text = ""
     for number, camera in enumerate(rig.cameras):
-        table: dict[str, object] = {"cam_overlaps": [1 - number], "camera_model": "pinhole", "distortion_model": "radtan"}
+        table: dict[str, object] = {
+            "cam_overlaps": [1 - number],
+            "camera_model": "pinhole",
+            "distortion_model": "radtan",
+        }
         table |= {"distortion_coeffs": camera.distortion[:4], "intrinsics": camera.parameters[:4]}
         table |= {"resolution": camera.image_size, "rostopic": f"/cam{number}/image_raw"}
         text += f"cam{number}:\n{_lines('  {}: {}', table)}"
