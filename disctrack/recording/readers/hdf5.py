@@ -53,20 +53,15 @@ def _stack(handle: h5py.File, member: str, file: Path) -> h5py.Dataset:
     if _is_stack(item):
         return item
     stacks = stacks_of(handle)
-    names = ", ".join(stack.name for stack in stacks)
-    if member:
-        found = "nothing" if item is None else "a group"
-        if isinstance(item, h5py.Dataset):
-            found = f"a data set {item.shape} of {item.dtype}"
-        raise RecordingError(
-            f"{file}:{member} is {found}; expected frames (n, height, width) of 8 or 16 bit without sign. "
-            + (f"There are {names}." if stacks else "The file holds none.")
-        )
-    if not stacks:
-        raise RecordingError(f"{file}: holds no frames (n, height, width) of 8 or 16 bit without sign.")
-    if len(stacks) > 1:
-        raise RecordingError(f"{file}: holds several stacks of frames: {names}. Name one: {file.name}:{stacks[0].name}")
-    return stacks[0]
+    names = ", ".join(stack.name for stack in stacks) or "none"
+    if len(stacks) == 1 and not member:
+        return stacks[0]
+    found = f"{item.shape} of {item.dtype}" if isinstance(item, h5py.Dataset) else "nothing, or a group"
+    said = f":{member} is {found}" if member else ": one of several stacks, or none, is meant"
+    raise RecordingError(
+        f"{file}{said}; expected frames (n, height, width) of 8 or 16 bit without sign. There are {names}. "
+        f"Name one: {file.name}:/path."
+    )
 
 
 def stacks_of(handle: h5py.File) -> list[h5py.Dataset]:
@@ -77,23 +72,18 @@ def stacks_of(handle: h5py.File) -> list[h5py.Dataset]:
 
 
 def _open(handle: h5py.File, stack: h5py.Dataset, file: Path, camera: str) -> FrameReader:
-    n, height, width = stack.shape
-    where = f"{file}:{stack.name}"
+    (n, height, width), where = stack.shape, f"{file}:{stack.name}"
     check_frame_size(width, height, where)
     most = 4 * MOST_PIXELS  # bytes: the library takes a chunk at once, whatever the file's size
     if stack.chunks and np.prod(stack.chunks, dtype=float) * stack.dtype.itemsize > most:
-        raise RecordingError(
-            f"{where}: one chunk {stack.chunks} holds more than {most >> 20} MB, all of which is read for "
-            "any frame in it. Write it again with chunks of one frame."
-        )
+        said = f"one chunk {stack.chunks} holds more than {most >> 20} MB, all of which is read for any frame in it"
+        raise RecordingError(f"{where}: {said}. Write it again with chunks of one frame.")
     if stack.external:
         raise RecordingError(f"{where}: its pixels lie in {stack.external[0][0]}. Write them into {file}.")
     stored = _frames_stored(stack)
     if stored < max(LEAST_PRESENT * n, 1):  # a few that are missing are lost frames; a header may announce any number
-        raise RecordingError(
-            f"{where}: announces {n} frames, but at most {stored} were ever written. The recording was cut short: "
-            "write it again, or give the data set its true length."
-        )
+        said = f"announces {n} frames, but at most {stored} were ever written: cut short"
+        raise RecordingError(f"{where}: {said}. Write it again, or give the data set its true length.")
     _check_other_files(stack, file, where)
     rate, bits = _attribute(stack, "frame_rate"), _attribute(stack, "bit_depth")
     told: dict[str, Any] = {

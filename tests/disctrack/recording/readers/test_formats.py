@@ -158,7 +158,7 @@ def test_one_of_several_data_sets_must_be_named(tmp_path):
         file["left"], file["right"] = frames_of(8, 1), frames_of(8, 2)
         file["mask"] = np.ones((HEIGHT, WIDTH), np.uint8)
     assert_refused(tmp_path, "both.h5", r"several stacks.*/left, /right")
-    assert_refused(tmp_path, "both.h5:/mask", r"both\.h5:/mask is a data set.*There are /left, /right")
+    assert_refused(tmp_path, "both.h5:/mask", r"both\.h5:/mask is .* of uint8; expected.*There are /left, /right")
     assert_array_equal(open_frames("both.h5:/right", tmp_path, "right").read(3), frames_of(8, 2)[3])
 
 
