@@ -3,9 +3,9 @@
 import contextlib
 import errno
 import os
-import re
-import socket
+import secrets
 import tempfile
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -26,15 +26,15 @@ _REMEDIES = {
 def whole_file(path: Path, suffix: str = "", adds_to_input: bool = False) -> Iterator[Path]:
     """Path to write to; when the block ends without an error it becomes `path` in one step, otherwise it is removed.
 
-    A killed process leaves `<name>.<host>-<process>.part`, which the next one that writes
-    into the folder from this host clears away.
+    A killed process leaves `<name>.<eight digits>.part`, which is cleared away by the next one that writes into the
+    folder an hour later.
     suffix : end of the temporary name, for writers that derive the format from it
     adds_to_input : the content is that of the file with something added, as when a stage adds its group
     Raises OutputError if the disk is full, read-only or not ours, or if `path` is an input (`inputs.refuse_input`).
     """
     if not adds_to_input:
         refuse_input(path)
-    part = path.with_name(f"{path.name}.{_host()}-{os.getpid()}.part{suffix}")
+    part = path.with_name(f"{path.name}.{secrets.token_hex(4)}.part{suffix}")
     try:
         make_folder(path.parent)
         _clear_abandoned(path.parent)
@@ -86,30 +86,12 @@ def output_error(path: Path, error: OSError) -> OutputError:
     return OutputError(f"{path}: cannot be written: {remedy}.")
 
 
-def _host() -> str:
-    return re.sub(r"[^A-Za-z0-9_]", "_", socket.gethostname())
-
-
 def _clear_abandoned(folder: Path) -> None:
-    """Remove what processes of this host that no longer live have left half-written in the folder."""
-    for part in folder.glob("*.part*"):
-        found = re.fullmatch(rf".+\.{_host()}-(\d+)\.part.*", part.name)
-        if found and not process_lives(int(found[1])):
-            with contextlib.suppress(OSError):
+    """Remove half-written files to which nothing was written for an hour: who wrote them was killed."""
+    for part in folder.glob(f"*.{'[0-9a-f]' * 8}.part*"):
+        with contextlib.suppress(OSError):
+            if time.time() - part.stat().st_mtime > 3600.0:
                 part.unlink()
-
-
-def process_lives(process: int) -> bool:
-    """Whether this host has a process of this number."""
-    if os.name == "nt":  # signal 0 would end the process there; another's remains are left alone
-        return True
-    try:
-        os.kill(process, 0)
-    except (ProcessLookupError, OverflowError):
-        return False
-    except PermissionError:
-        return True
-    return True
 
 
 def _sync_folder(folder: Path) -> None:

@@ -369,6 +369,8 @@ def test_a_batch_killed_at_random_instants_leaves_only_whole_results_and_can_go_
         time.sleep(chance.uniform(0, duration))
         os.killpg(process.pid, signal.SIGKILL)
         process.communicate(timeout=PATIENCE)
+    for part in root.rglob("*.part*"):
+        os.utime(part, (0, 0))  # as a day later
     process = start(root)
     process.communicate(timeout=PATIENCE)
     assert process.returncode == 0
