@@ -125,16 +125,11 @@ def _claimed(path: Path) -> str:
 
 def _patterns(file: Path) -> list[str]:
     """A recording.toml and what it names, as absolute patterns; itself alone where it cannot be read."""
-    found = [os.path.normcase(glob.escape(str(file)))]
-    try:
+    found = [glob.escape(str(file))]
+    with contextlib.suppress(OSError, ValueError, RecursionError, AttributeError):  # AttributeError: no text there
         declared = tomllib.loads(read_regular(file, MOST_TEXT).decode())
-    except (OSError, ValueError, RecursionError):
-        return found
-    for section, keys in (("cameras", ("left", "right")), ("calibration", ("left", "right", "rig"))):
-        part = declared.get(section)
-        names = [part.get(key) for key in keys] if isinstance(part, dict) else []
-        for name in names:
-            if isinstance(name, str) and name:
-                below = os.path.normpath(os.path.join(glob.escape(str(file.parent)), name.replace("{number}", "*")))
-                found.append(os.path.normcase(below))
-    return found
+        for section, keys in (("cameras", ("left", "right")), ("calibration", ("left", "right", "rig"))):
+            for name in filter(None, map(declared.get(section, {}).get, keys)):
+                below = os.path.join(glob.escape(str(file.parent)), name.replace("{number}", "*"))
+                found.append(os.path.normpath(below))
+    return [os.path.normcase(pattern) for pattern in found]

@@ -37,12 +37,10 @@ def decode(content: bytes, where: str, out: NDArray | None = None) -> NDArray:
     if content.startswith(_PNG_SIGNATURE):
         return _png(content, where, out)
     if content[:4] in _TIFF_SIGNATURES:
-        source = RawFile(Path("TIFF content"), content)
-        try:
-            page = next(pages_of(source))
-        except (RecordingError, StopIteration) as error:
-            raise RecordingError(f"{where}: not a readable image, or damaged ({error}). {_AGAIN}") from error
-        return page_pixels(source, page, where)
+        source = RawFile(Path(where), content)
+        for page in pages_of(source):
+            return page_pixels(source, page, where)
+        raise RecordingError(f"{where}: a TIFF file without a page. {_AGAIN}")
     _check_length(content, where)
     return _by_opencv(content, where)
 

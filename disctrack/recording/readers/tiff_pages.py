@@ -85,7 +85,7 @@ def pages_of(source: RawFile) -> Iterator[Page]:
 
 def _page(page: tifffile.TiffPage, first: dict[str, tifffile.TiffPage]) -> Page:
     if int(page.imagewidth) < 0 or int(page.imagelength) < 0 or len(page.dataoffsets) != len(page.databytecounts):
-        raise RecordingError(f"the directory at byte {page.offset} is damaged")
+        raise ValueError(f"the directory at byte {page.offset}")
     coding = page.parent.byteorder + repr([page.tags.valueof(code) for code in _CODING])
     places, sizes = (tuple(map(int, numbers)) for numbers in (page.dataoffsets, page.databytecounts))
     return Page(places, sizes, coding, first.setdefault(coding, page), page.description)

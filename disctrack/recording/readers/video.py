@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ctypes
 import hashlib
-import os
 import threading
 import zlib
 from collections.abc import Generator, Iterator, Sequence
@@ -79,7 +78,7 @@ class _Video:
         self._frames: Generator[_Decoded, None, None] | None = None
         self._next = 0  # the next frame of the decoder is this one, or one that follows
         self._held: _Decoded = (-1, None, "")
-        self._content: bytes | None = None
+        self._content = b""
         with _opened(file, camera) as container:
             codec = container.streams.video[0].codec_context
             check_frame_size(codec.width, codec.height, str(file))
@@ -95,12 +94,9 @@ class _Video:
 
     def stored(self, index: int) -> bytes:
         """SHA-256 of the file, and the frame: compressed ones cannot be told apart without decoding them."""
-        if self._content is None:
-            try:
-                with self.file.open("rb") as stream:
-                    self._content = hashlib.file_digest(stream, "sha256").digest()
-            except OSError:  # the file went away: what was measured stays, but no other run will be taken for the same
-                self._content = b"unreadable" + os.urandom(16)
+        if not self._content:
+            with told_as(RecordingError, f"{self.file}: cannot be read", OSError), self.file.open("rb") as stream:
+                self._content = hashlib.file_digest(stream, "sha256").digest()
         return self._content + str(index).encode()
 
     def frame(self, index: int, where: str) -> av.VideoFrame:
