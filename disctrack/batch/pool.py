@@ -14,7 +14,6 @@ import signal
 import sys
 import tempfile
 import threading
-import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ThreadPoolExecutor, wait
 from multiprocessing.connection import Connection
@@ -38,8 +37,7 @@ if TYPE_CHECKING:
 
 CONNECT = 10.0  # [s] for a scheduler to answer
 LOOK = 0.1  # [s] after which Ctrl-C is heard at the latest
-# [s] that processes have to clear up, and after which they are asked once more
-_STOPPING, _ASK_AGAIN = 9.0, 2.0
+_CLEARING = 2.0  # [s] that processes have to clear up before they are asked once more
 
 
 def do_all(rigs: Sequence[Job], recordings: Sequence[Job], pool: Processes | Cluster) -> Iterator[tuple[Job, Row]]:
@@ -125,18 +123,15 @@ class Processes:
 
     def close(self) -> None:
         """End in order what still runs."""
-        until = time.monotonic() + _STOPPING
         self._ends = True
         self._threads.shutdown(wait=False, cancel_futures=True)
-        # asked once each: it may end by itself at any moment
-        living = [process for process in self._context.started if process.is_alive()]
-        for process in living:
-            process.terminate()
-        for process in living:
-            process.join(_ASK_AGAIN)
-            while process.is_alive():  # where it was, the request may have been swallowed
-                process.terminate() if time.monotonic() < until else process.kill()
-                process.join(_ASK_AGAIN)
+        # more than once: where a process was, the request may have been swallowed
+        for ask in (*[SpawnProcess.terminate] * 4, SpawnProcess.kill):
+            living = [process for process in self._context.started if process.is_alive()]
+            for process in living:
+                ask(process)
+            for process in living:
+                process.join(_CLEARING)
         self._threads.shutdown()
         self._folder.cleanup()
 

@@ -84,7 +84,6 @@ class FrameReader:
     notes: tuple[str, ...] = ()  # what the user should know about how the frames are read, one sentence each
     doubts: tuple[str, ...] = ()  # what had to be assumed of the frames' instants
     random_access: bool = True  # False where frames are read fastest in order, by one thread
-    one_file_each: bool = False  # so that the file's name tells the frame
     _digests: dict[int, bytes] = field(default_factory=dict)  # of frames whose content was seen
 
     def __post_init__(self) -> None:
@@ -95,7 +94,7 @@ class FrameReader:
 
     def describe(self, index: int) -> str:
         """Where frame `index` lies, for messages."""
-        return str(self.files[index]) if self.one_file_each else f"{self.files[index]}, frame {index}"
+        return f"{self.files[index]}, frame {index}"
 
     def read(self, index: int, out: Image | None = None) -> Image:
         """Frame `index`, (height, width) grey values as the camera wrote them; into `out` if given, and returned.

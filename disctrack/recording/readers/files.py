@@ -151,13 +151,12 @@ def check_continuation(files: Sequence[Path], camera: str) -> None:
     if len(files) < 2:
         return
     rest = files[1:] if files[1].stem.startswith(files[0].stem) else files
-    slots, numbers, _, _ = number_files(rest, camera)
-    absent = [number for number, file in zip(numbers or (), slots, strict=False) if file is None]
-    if absent or (numbers is not None and numbers.step != 1):
+    _, _, notes, doubts = number_files(rest, camera)
+    if notes or doubts:
         raise RecordingError(
-            f"{files[0]} ...: a {camera} stack that goes on in several files lacks number "
-            f"{absent[0] if absent else 'of every second one'}. How many frames it held is not known, so all that "
-            "follows would be shifted in time: copy it again, or measure the files before it."
+            f"{files[0]} ...: a {camera} stack that goes on in several files lacks one: {(*notes, *doubts)[0]}. How "
+            "many frames it held is not known, so all that follows would be shifted in time: copy it again, or measure "
+            "those before it."
         )
 
 

@@ -61,7 +61,6 @@ def open_images(files: Sequence[Path], camera: str, pattern: str = "") -> FrameR
         stored=stored,
         notes=(*notes, *([alike] if whole.ndim == 3 else [])),
         doubts=doubts,
-        one_file_each=True,
     )
 
 

@@ -79,18 +79,16 @@ def _pair_of(files: Sequence[Path], camera: str) -> tuple[Path, Path]:
     stem = only_file(sorted({file.with_suffix("") for file in files}), camera)
     with told_as(RecordingError, f"{stem.parent}: cannot be read", OSError):
         beside = {file.suffix.lower(): file for file in stem.parent.iterdir() if file.with_suffix("") == stem}
-    header = beside.get(".cihx", beside.get(".cih"))
-    if header is None:
-        raise RecordingError(
-            f"{files[0]}: there is no {stem.name}.cihx or .cih beside it for the {camera} camera. It states size and "
-            "depth of the frames: copy it from the camera's folder."
-        )
-    if ".mraw" not in beside:
-        raise RecordingError(
-            f"{header}: there is no {stem.name}.mraw beside it for the {camera} camera. Copy it from the camera's "
-            "folder, or name the image files that were exported instead."
-        )
-    return header, beside[".mraw"]
+    found = []
+    for suffixes in ((".cihx", ".cih"), (".mraw",)):
+        there = [beside[suffix] for suffix in suffixes if suffix in beside]
+        if not there:
+            raise RecordingError(
+                f"{files[0]}: there is no {stem.name}{' or '.join(suffixes)} beside it for the {camera} camera. Copy "
+                "it from the camera's folder, or name image files that were exported instead."
+            )
+        found.append(there[0])
+    return found[0], found[1]
 
 
 Entries = dict[str, str]  # of a header, by their names in the .cih, "" where there is none; and "file", its place
