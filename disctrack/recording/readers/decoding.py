@@ -38,9 +38,7 @@ def decode(content: bytes, where: str, out: NDArray | None = None) -> NDArray:
         return _png(content, where, out)
     if content[:4] in _TIFF_SIGNATURES:
         source = RawFile(Path(where), content)
-        for page in pages_of(source):
-            return page_pixels(source, page, where)
-        raise RecordingError(f"{where}: a TIFF file without a page. {_AGAIN}")
+        return page_pixels(source, next(pages_of(source)), where)
     _check_length(content, where)
     return _by_opencv(content, where)
 
@@ -103,8 +101,7 @@ def _png(content: bytes, where: str, out: NDArray | None) -> NDArray:
         if stop + 4 > end:
             break
         if zlib.crc32(view[position + 4 : stop]) != _number_at(content, stop):
-            name = kind.decode("latin-1")
-            raise RecordingError(f"{where}: damaged: wrong checksum of chunk {name!r} at byte {position}. {_AGAIN}")
+            raise RecordingError(f"{where}: damaged: wrong checksum of chunk {kind!r} at byte {position}. {_AGAIN}")
         chunks.setdefault(kind, []).append(view[position + 8 : stop])
         position = stop + 4
     if b"IEND" not in chunks or [len(header) for header in chunks.get(b"IHDR", ())] != [13]:

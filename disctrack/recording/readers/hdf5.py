@@ -15,17 +15,10 @@ import numpy as np
 
 from calibration.kit.arrays import Array, Image
 from disctrack.errors import RecordingError, told_as
+from disctrack.recording.readers import raw
 from disctrack.recording.readers.base import FrameReader, only_file, room_for
 from disctrack.recording.readers.decoding import inflated
-from disctrack.recording.readers.raw import (
-    LEAST_PRESENT,
-    MOST_PIXELS,
-    PixelLayout,
-    RawFile,
-    bit_depth_of,
-    check_frame_size,
-    raw_frames,
-)
+from disctrack.recording.readers.raw import PixelLayout, RawFile, bit_depth_of, check_frame_size, raw_frames
 
 _LARGEST_CACHE = 64 << 20  # bytes of decompressed chunks kept; more than one camera's chunk of many frames
 
@@ -74,14 +67,16 @@ def stacks_of(handle: h5py.File) -> list[h5py.Dataset]:
 def _open(handle: h5py.File, stack: h5py.Dataset, file: Path, camera: str) -> FrameReader:
     (n, height, width), where = stack.shape, f"{file}:{stack.name}"
     check_frame_size(width, height, where)
-    most = 4 * MOST_PIXELS  # bytes: the library takes a chunk at once, whatever the file's size
+    most = 4 * raw.MOST_PIXELS  # bytes: the library takes a chunk at once, whatever the file's size
     if stack.chunks and np.prod(stack.chunks, dtype=float) * stack.dtype.itemsize > most:
         said = f"one chunk {stack.chunks} holds more than {most >> 20} MB, all of which is read for any frame in it"
         raise RecordingError(f"{where}: {said}. Write it again with chunks of one frame.")
     if stack.external:
         raise RecordingError(f"{where}: its pixels lie in {stack.external[0][0]}. Write them into {file}.")
     stored = _frames_stored(stack)
-    if stored < max(LEAST_PRESENT * n, 1):  # a few that are missing are lost frames; a header may announce any number
+    if stored < max(
+        raw.LEAST_PRESENT * n, 1
+    ):  # a few that are missing are lost frames; a header may announce any number
         said = f"announces {n} frames, but at most {stored} were ever written: cut short"
         raise RecordingError(f"{where}: {said}. Write it again, or give the data set its true length.")
     _check_other_files(stack, file, where)
@@ -192,10 +187,10 @@ def _inflate(stack: h5py.Dataset, content: bytes, image: Image, where: str) -> N
     if whole is None:
         said = f"its {len(content)} compressed bytes do not hold the {image.nbytes} of an image"
         raise RecordingError(f"{where}: damaged ({said}). Copy the file again.")
-    raw = np.frombuffer(whole, np.uint8)
+    stored = np.frombuffer(whole, np.uint8)
     if stack.shuffle:
-        raw = raw.reshape(image.itemsize, -1).T.ravel()
-    image[...] = raw.view(stack.dtype).reshape(image.shape)
+        stored = stored.reshape(image.itemsize, -1).T.ravel()
+    image[...] = stored.view(stack.dtype).reshape(image.shape)
 
 
 def _stored_size(stack: h5py.Dataset, index: int) -> int:

@@ -88,8 +88,6 @@ def _open_stack(files: Sequence[Path], camera: str) -> FrameReader:
         pages += found
         sources += [file] * len(found)
         notes += [note] if note else []
-    if not pages:
-        raise RecordingError(f"{files[0]}: a TIFF file without a page that can be read. Export it again.")
     first = pages[0]
     rate, stamps = _times(first.description, len(pages))
     check_frame_size(first.plain.width, first.plain.height, str(files[0]))

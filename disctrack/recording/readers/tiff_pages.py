@@ -61,7 +61,7 @@ class Page:
 def pages_of(source: RawFile) -> Iterator[Page]:
     """The pages of a file but for thumbnails. Raises RecordingError where they break off, or there is none."""
     first: dict[str, tifffile.TiffPage] = {}  # of each coding
-    seen: set[int] = set()
+    seen, frames = set[int](), 0
     said = f"{source}: not a readable TIFF file, or damaged"
     with told_as(RecordingError, said, Exception), source.stream() as stream:
         tiff = tifffile.TiffFile(stream, name=str(source))
@@ -77,7 +77,10 @@ def pages_of(source: RawFile) -> Iterator[Page]:
             seen.add(page.offset)
             found = _page(page, first)
             if not page.subfiletype & tifffile.FILETYPE.REDUCEDIMAGE:
+                frames += 1
                 yield found
+        if not frames:
+            raise ValueError("it holds no page")
         link = source.bytes_at(tiff.pages.next_page_offset or 0, tiff.tiff.offsetsize, str(source))
         if any(link):
             raise RecordingError(f"{source}: the chain of pages breaks off, it is damaged. Copy it again.")
