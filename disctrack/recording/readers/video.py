@@ -31,9 +31,7 @@ _CONTAINERS = {"format_whitelist": "avi,matroska,webm,mov,mp4,m4a,3gp,3g2,mj2", 
 _LOSSLESS = frozenset({"ffv1", "rawvideo", "huffyuv", "ffvhuff", "utvideo", "magicyuv", "png", "tiff", "v210", "qtrle"})
 _DECODED_ON = 8  # frames: opening the file anew and seeking costs more than to decode these and drop them
 
-_Decoded: TypeAlias = (
-    "tuple[int, av.VideoFrame | None, str]"  # index of a frame, the frame or None, what is wrong with it
-)
+_Decoded: TypeAlias = "tuple[int, av.VideoFrame | None]"  # index of a frame, the frame; None behind the last one
 
 
 def open_video(files: Sequence[Path], camera: str) -> FrameReader:
@@ -77,7 +75,7 @@ class _Video:
         self._lock = threading.Lock()
         self._frames: Generator[_Decoded, None, None] | None = None
         self._next = 0  # the next frame of the decoder is this one, or one that follows
-        self._held: _Decoded = (-1, None, "")
+        self._held: _Decoded = (-1, None)
         self._content = b""
         with _opened(file, camera) as container:
             codec = container.streams.video[0].codec_context
@@ -103,57 +101,48 @@ class _Video:
         """The decoded frame. Raises RecordingError."""
         key = int(self._keys[np.searchsorted(self._keys, index, side="right") - 1])
         if self._frames is None or not min(key, index - _DECODED_ON) <= self._next <= index:
-            self._frames, self._held = self._from(key), (-1, None, "")
+            self._frames, self._held = self._from(key), (-1, None)
         self._next = index + 1
         try:
             while self._held[0] < index:
-                self._held = next(self._frames, (len(self.times), None, ""))
+                self._held = next(self._frames, (len(self.times), None))
         except RecordingError as error:  # the file is opened anew
             self._frames = None
             raise RecordingError(f"{where}: {error}") from error
-        position, frame, problem = self._held
-        if position > index:
-            raise RecordingError(f"{where}: the video does not hold this frame, or it is cut short. Copy it again.")
-        if frame is None:
-            raise RecordingError(f"{where}: cannot be decoded ({problem}). Copy or export the video again.")
+        position, frame = self._held
+        if position > index or frame is None:
+            raise RecordingError(f"{where}: the video does not hold this frame, or it is damaged there. Copy it again.")
         return frame
 
     def _from(self, count: int) -> Generator[_Decoded, None, None]:
-        """All frames from a key frame on in order, from the beginning where it cannot be found.
+        """All sound frames from a key frame on in order, from the beginning where it cannot be found.
 
-        After damage none is trusted up to the next key frame. Raises RecordingError where the file is no longer there.
+        After damage none is up to the next key frame. Raises RecordingError where the file is no longer there.
         """
         container = _opened(self.file, self.camera)
         import av
 
-        stream, damage = container.streams.video[0], ""
+        stream, sound = container.streams.video[0], True
         # what follows a fault of the container is not to be found
         with container, suppress(av.FFmpegError, OSError, ValueError):
             with suppress(OSError, ValueError):  # what cannot be sought is decoded from the beginning
                 if count:
                     container.seek(int(self.times[count]), stream=stream, backward=True)
             for packet in container.demux(stream):
-                if packet.is_keyframe and packet.size:
-                    damage = ""
+                if packet.size:
+                    sound = sound or bool(packet.is_keyframe)
+                    sound = sound and (not self._checked or checksums_hold(bytes(packet)))
                 frames: list[av.VideoFrame] = []
                 try:
-                    if self._checked and packet.size and not checksums_hold(bytes(packet)):
-                        damage = damage or "wrong checksum"
                     frames = packet.decode()
-                except (av.FFmpegError, OSError, ValueError) as error:
-                    damage = damage or str(error)
-                    if packet.size:
-                        yield self._position(packet, count), None, damage
-                        count += 1
+                except (av.FFmpegError, OSError, ValueError):
+                    sound, count = False, count + bool(packet.size)
                 for frame in frames:
-                    position = self._position(frame, count)
-                    problem = damage or ("marked as corrupt" if frame.is_corrupt else "")
-                    yield position, None if problem else frame, problem
-                    count = position + 1
-
-    def _position(self, item: av.Packet | av.VideoFrame, count: int) -> int:
-        """Index of a packet or frame by its time; by counting where the container has no times."""
-        return int(np.searchsorted(self.times, item.pts)) if self._timed and item.pts is not None else count
+                    if self._timed and frame.pts is not None:  # otherwise frames are counted
+                        count = int(np.searchsorted(self.times, frame.pts))
+                    if sound and not frame.is_corrupt:
+                        yield count, frame
+                    count += 1
 
 
 def _index(
