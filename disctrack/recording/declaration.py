@@ -232,10 +232,8 @@ def read_recording(path: str | Path) -> Recording:
     rate = float(cameras["frame_rate_hz"])
     exposure = float(cameras["exposure_us"]) / 1e6 if "exposure_us" in cameras else None
     if exposure is not None and exposure * rate > 1.001:
-        raise RecordingError(
-            f"{file}: [cameras] exposure_us is {1e6 * exposure:g}, longer than a frame: {1e6 / rate:g} µs at "
-            "frame_rate_hz. It is in microseconds: 0.2 ms is 200."
-        )
+        said = f"exposure_us is {1e6 * exposure:g}, longer than a frame: {1e6 / rate:g} µs at frame_rate_hz"
+        raise RecordingError(f"{file}: [cameras] {said}. It is in microseconds: 0.2 ms is 200.")
     _refuse_mixed_calibration(file, calibration)
     views, table = None, None
     if "rig" not in calibration:
@@ -335,16 +333,12 @@ def _disc(file: Path, disc: Mapping[str, Any], markers: Mapping[str, Any]) -> Di
     radius, diameter, centres = disc["radius_mm"], markers["diameter_mm"], markers["centres_mm"]
     for number, (x, y) in enumerate(centres):
         if math.hypot(x, y) + diameter / 2 > radius:
-            raise RecordingError(
-                f"{file}: [markers] centres_mm: dot {number} at ({x:g}, {y:g}) with diameter {diameter:g} reaches over "
-                f"the disc's rim (radius {radius:g}). Centres are in mm from the disc's centre."
-            )
+            said = f"dot {number} at ({x:g}, {y:g}) with diameter {diameter:g} reaches over the rim (radius {radius:g})"
+            raise RecordingError(f"{file}: [markers] centres_mm: {said}. They are in mm from the disc's centre.")
         for other, (u, v) in enumerate(centres[:number]):
-            if math.hypot(x - u, y - v) < diameter:
-                raise RecordingError(
-                    f"{file}: [markers] centres_mm: dots {other} and {number} overlap: "
-                    f"{math.hypot(x - u, y - v):g} mm apart with diameter {diameter:g}. Give each dot once."
-                )
+            if (apart := math.hypot(x - u, y - v)) < diameter:
+                said = f"dots {other} and {number} overlap: {apart:g} mm apart with diameter {diameter:g}"
+                raise RecordingError(f"{file}: [markers] centres_mm: {said}. Give each dot once.")
     tolerances = disc.get("radius_tolerance_mm"), disc.get("thickness_tolerance_mm")
     return disc_from_mm(radius, disc["thickness_mm"], disc["mass_g"], centres, diameter, *tolerances)
 

@@ -132,10 +132,10 @@ def number_files(
     numbers, by_number = range(min(column), max(column) + 1, step), dict(zip(column, files, strict=True))
     notes, doubts = [], []
     if missing := _missing(column, step):
-        notes.append(
-            f"{len(missing)} file{'s' * (len(missing) > 1)} missing in the sequence, the first is number "
-            f"{missing[0]}; this camera says nothing of these frames"
+        lost = (
+            f"{len(missing)} file{'s' * (len(missing) > 1)} missing in the sequence, the first is number {missing[0]}"
         )
+        notes.append(f"{lost}; this camera says nothing of these frames")
     if step > 1:
         doubts.append(
             f"the file numbers go in steps of {step}; they are taken as consecutive frames at frame_rate_hz. If that "

@@ -149,29 +149,18 @@ def _gain(flats: Sequence[FrameReader], darks: Sequence[FrameReader], offset: Ar
     flat, *dark = (f"{readers[0].describe(0)} ([cameras] {readers[0].camera})" for readers in (flats, darks) if readers)
     mean, clipped = _mean(flats)
     full, saturated = 2 ** flats[0].bit_depth, float(np.mean(clipped))
-    if saturated > MOST:
-        raise RecordingError(
-            f"{flat}: {100 * saturated:.2g} % of its pixels are saturated, so that their gains are not "
-            "known. Take it with less light, or a shorter exposure: half of full scale is good."
-        )
     answer = mean - offset
-    level = float(np.median(answer))
-    if dark and level <= 0:
-        raise RecordingError(
-            f"{flat} is not brighter (median {np.median(mean):.1f}) than {dark[0]} (median "
-            f"{np.median(offset):.1f}): are the two exchanged?"
-        )
-    if level < LEAST_LIGHT * full:
-        raise RecordingError(
-            f"{flat}: its median is {level:.1f} grey values above the dark image, of {full - 1}. That is too dark to "
-            "tell gains. Take it of an evenly lit white surface, at about half of full scale."
-        )
-    around = cv2.medianBlur(answer, 5)
+    level, around = float(np.median(answer)), cv2.medianBlur(answer, 5)
     dead = np.asarray((np.abs(answer - around) > ODD * around) | clipped | (answer <= 0.1 * level))
-    if dead.mean() > MOST:
-        raise RecordingError(
-            f"{flat}: {100 * dead.mean():.2g} % of its pixels hardly answer the light, or far more than their "
-            "neighbours. Take it out of focus, of an evenly lit white surface without an edge in view."
-        )
+    odd = f"{100 * dead.mean():.2g} % of its pixels hardly answer the light, or far more than their neighbours"
+    refusals = (
+        (saturated > MOST, f"{100 * saturated:.2g} % of its pixels are saturated. Take it at half of full scale."),
+        (level <= 0, f"it is not brighter than {' '.join(dark) or 'black'}: are the two exchanged?"),
+        (level < LEAST_LIGHT * full, f"a level of {level:.1f} of {full - 1} is too dark to tell gains; half is good."),
+        (dead.mean() > MOST, f"{odd}. Take it out of focus, of an evenly lit white surface without an edge in view."),
+    )
+    for wrong, said in refusals:
+        if wrong:
+            raise RecordingError(f"{flat}: {said}")
     gain = np.where(dead, 1.0, level / np.where(dead, 1.0, answer)).astype(np.float32)
     return gain, dead

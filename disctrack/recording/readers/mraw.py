@@ -153,10 +153,8 @@ def _layout(entries: Entries) -> tuple[PixelLayout, int]:
     """How the pixels lie, and the bits that carry grey values."""
     file = entries["file"]
     if entries["File Format"].lower() != "mraw":
-        raise RecordingError(
-            f"{file}: the frames were saved as {entries['File Format'][:20] or 'nothing known'}, not as MRAW. "
-            "Name the image files instead."
-        )
+        saved = entries["File Format"][:20] or "nothing known"
+        raise RecordingError(f"{file}: the frames were saved as {saved}, not as MRAW. Name the image files instead.")
     kind, device = entries["Color Type"].lower(), entries["Camera Type"]
     mosaic = kind == "raw" and re.search(r"-C\b", device)  # the type's letter: -M- monochrome, -C- colour
     if kind not in ("mono", "raw", "") or mosaic:
@@ -183,10 +181,8 @@ def _header(entries: Entries) -> tuple[CameraHeader, list[str], tuple[str, ...]]
     step, n = max(int(_number(entries["Save Step"]) or 1), 1), _whole(entries, "Total Frame")
     recorded = _number(entries["Original Total Frame"])
     if step > 1 and recorded is not None and (n - 1) * step >= recorded:
-        doubts.append(
-            f"the header says that one frame in {step} was saved, but {n} of {recorded:g} recorded frames are there; "
-            "taken as consecutive"
-        )
+        saved = f"one frame in {step} was saved, but {n} of {recorded:g} recorded frames are there"
+        doubts.append(f"the header says that {saved}; taken as consecutive")
         step = 1
     nanoseconds = _number(entries["Shutter Type2(nsec)"])
     exposure = nanoseconds / 1e9 if nanoseconds else _number(entries["Shutter Speed(s)"])

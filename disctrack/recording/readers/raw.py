@@ -62,18 +62,14 @@ class RawFile:
             self._stream.seek(offset)
             done = self._stream.readinto(buffer.data)
         if done < len(buffer):
-            raise RecordingError(
-                f"{where}: the file ends {len(buffer) - done} bytes before the end of what lies at byte {offset}. "
-                "It is cut short: copy it again from the camera."
-            )
+            said = f"ends {len(buffer) - done} bytes before the end of what lies at byte {offset}: it is cut short"
+            raise RecordingError(f"{where}: the file {said}. Copy it again from the camera.")
 
     def bytes_at(self, offset: int, size: int, where: str) -> bytes:
         """`size` bytes from `offset` on; errors as in `read_into`, and none is read if the file is too short."""
         if offset < 0 or size < 0 or offset + size > self.size:
-            raise RecordingError(
-                f"{where}: {size} bytes at byte {offset} are announced, but the file has {self.size}. "
-                "It is cut short or damaged: copy it again from the camera."
-            )
+            said = f"{size} bytes at byte {offset} are announced, but the file has {self.size}: cut short or damaged"
+            raise RecordingError(f"{where}: {said}. Copy it again from the camera.")
         buffer = np.empty(size, np.uint8)
         self.read_into(buffer, offset, where)
         return buffer.tobytes()

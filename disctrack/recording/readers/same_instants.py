@@ -210,19 +210,13 @@ def _between_cameras(left: Array, right: Array, period: float) -> Iterator[str]:
     offset = float(np.median(later))
     drift = float(index @ later / max(float(index @ index), 1.0)) / period
     rest = later - later.mean() - drift * period * index
-    if abs(offset) > SAME_INSTANT * period:
-        yield (
-            f"by the time stamps the right camera's frames are taken {1e6 * offset:.4g} µs after the left one's, "
-            f"{abs(offset) / period:.2g} of a frame: the cameras are not synchronised, or their clocks have other zeros"
-        )
-    if abs(drift) * len(later) > SAME_INSTANT:
-        yield (
-            f"by the time stamps the cameras' clocks drift apart by {1e6 * drift:+.3g} µs per second: each camera runs "
-            "on a clock of its own"
-        )
     worst = int(np.argmax(np.abs(rest)))
-    if abs(rest[worst]) > SAME_INSTANT * period:
-        yield (
-            f"by the time stamps the instants of the two cameras jitter by {1e6 * float(rest.std()):.3g} µs (rms), "
-            f"most at frame {worst}: {1e6 * float(rest[worst]):+.3g} µs"
-        )
+    later_by = f"{1e6 * offset:.4g} µs after the left one's, {abs(offset) / period:.2g} of a frame"
+    jitter = f"{1e6 * float(rest.std()):.3g} µs (rms), most at frame {worst}: {1e6 * float(rest[worst]):+.3g} µs"
+    for part, said in (
+        (offset / period, f"right camera's frames are taken {later_by}: not synchronised, or clocks of other zeros"),
+        (drift * len(later), f"cameras' clocks drift apart by {1e6 * drift:+.3g} µs per second: each has its own"),
+        (rest[worst] / period, f"instants of the two cameras jitter by {jitter}"),
+    ):
+        if abs(part) > SAME_INSTANT:
+            yield f"by the time stamps the {said}"

@@ -113,18 +113,14 @@ def _check(page: Page, where: str) -> None:
     like, width, height = page.like, page.plain.width, page.plain.height
     check_frame_size(width, height, where, n_bytes=sum(page.sizes))
     if like.compression not in _READ:
-        name = getattr(like.compression, "name", "unknown")
-        raise RecordingError(
-            f"{where}: its pixels are compressed by a method ({int(like.compression)}, {name}) that is not read; LZW "
-            "and deflate are. Export this image again."
-        )
+        method = f"{int(like.compression)}, {getattr(like.compression, 'name', 'unknown')}"
+        said = f"its pixels are compressed by a method ({method}) that is not read; LZW and deflate are"
+        raise RecordingError(f"{where}: {said}. Export this image again.")
     tile = int(like.tilewidth) * int(like.tilelength) * int(like.tiledepth) if like.is_tiled else 0
     n = int(np.prod(like.chunked, dtype=float)) if like.dtype is not None and like.shaped[1] == 1 else -1
     if n != len(page.places) or like.samplesperpixel > 4 or max(tile * n, sum(page.sizes)) > 4 * MOST_PIXELS:
-        raise RecordingError(
-            f"{where}: {len(page.places)} pieces of {sum(page.sizes)} bytes in all do not make up its {width} x "
-            f"{height} px; the page is damaged. Copy it again."
-        )
+        pieces = f"{len(page.places)} pieces of {sum(page.sizes)} bytes in all"
+        raise RecordingError(f"{where}: {pieces} do not make up its {width} x {height} px: damaged. Copy it again.")
 
 
 def _decoded(page: tifffile.TiffPage, pieces: list[bytes]) -> NDArray:
