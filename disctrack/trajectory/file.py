@@ -105,8 +105,7 @@ def write_trajectory(
     with h5py.File(buffer, "w", track_order=True) as file:
         write_variables(file, _root_variables(trajectory), _axes(trajectory))
         write_variables(file.create_group("markers", track_order=True), _variables(trajectory, "markers"))
-        told = "dots on the disc, body frame, as used"
-        dots = Variable(trajectory.disc.marker_centres_body, ("marker", "space_axis"), "m", told)
+        dots = Variable(trajectory.disc.marker_centres_body, ("marker", "space_axis"), "m", "dots, body frame, as used")
         write_variables(file.create_group("disc", track_order=True), {"marker_centres_body": dots})
         file["disc"].attrs.update(_disc_sizes(trajectory.disc))
         _write_rig(file.create_group("calibration", track_order=True), trajectory)
@@ -166,11 +165,9 @@ def kept_or_made(
         if there.fingerprint == provenance.fingerprint:
             return read_trajectory(path), read_details(path), False
         if other is not None:
-            raise OutputError(
-                f"{path}: exists, and is not the complete result of these images, settings and version "
-                f"({other(there) or f'made by {there.version}'}). Keep it and choose another place with -o, or replace "
-                "it with --overwrite."
-            )
+            made = other(there) or f"made by {there.version}"
+            said = f"exists, and is not the complete result of these images, settings and version ({made})"
+            raise OutputError(f"{path}: {said}. Choose another place with -o, or replace it with --overwrite.")
     trajectory, details = make()
     write_trajectory(path, trajectory, provenance, overwrite=True, details=details)
     return trajectory, details, True
@@ -398,15 +395,16 @@ def _variables(trajectory: Trajectory, group: str = "") -> dict[str, Variable]:
 
 
 def _root_variables(trajectory: Trajectory) -> dict[str, Variable]:
-    coordinates = {}
-    shared = "standard deviation shared by frames, calibration and systematic: "
-    for ending, what, values in (
-        ("", "", trajectory.q),
-        ("_sigma", "standard deviation, noise of this frame: ", trajectory.coordinate_sigma),
-        ("_sigma_calibration", shared, trajectory.calibration_sigma),
-    ):
-        for i, (name, (unit, told)) in enumerate(_COORDINATES.items()):
-            coordinates[name + ending] = Variable(values[:, i], ("time",), unit, what + told)
+    kinds = {
+        "": ("", trajectory.q),
+        "_sigma": ("standard deviation, noise of this frame: ", trajectory.coordinate_sigma),
+        "_sigma_calibration": ("standard deviation that frames share: ", trajectory.calibration_sigma),
+    }
+    coordinates = {
+        name + ending: Variable(values[:, i], ("time",), unit, what + told)
+        for ending, (what, values) in kinds.items()
+        for i, (name, (unit, told)) in enumerate(_COORDINATES.items())
+    }
     found = _variables(trajectory)
     return {"frame": found.pop("frame"), **coordinates, **found}
 
