@@ -37,10 +37,7 @@ def test_numbers_of_numpy_are_numbers():
     ("content", "message"),
     [
         (b"a = ", "not valid TOML"),
-        (
-            b"[disc]\nradius_mm = 37,5\n",
-            r"line 2, column 15\): radius_mm = 37,5. Correct that.* Numbers have a point",
-        ),
+        (b"[disc]\nradius_mm = 37,5\n", r"line 2, column 15\): radius_mm = 37,5. Correct.* Numbers have a point"),
         (b'left = "left\\*.png"', "Folders are divided by /"),
         (b"a = '\xff'", "byte 0xff in position 5.*in UTF-8"),
         (b"a = " + b"[" * 100_000, "recursion"),

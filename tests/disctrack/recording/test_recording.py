@@ -139,9 +139,8 @@ def test_what_is_wrong_is_shown_with_what_was_expected(tmp_path, written, found,
     assert all(part in text for part in expected.split(".*"))
 
 
-RANGE = re.compile(r"a (?:whole )?number from (\S+) to (\S+)")
-NUMBERS = [(s, key, *map(float, found.groups())) for s, keys in KEYS.items() for key, meant in keys.items()
-           if (found := RANGE.fullmatch(meant.expected))]  # fmt: skip
+ALL = [(s, key, meant.expected) for s, keys in KEYS.items() for key, meant in keys.items()]
+NUMBERS = [(*at, *map(float, ends)) for *at, said in ALL for ends in re.findall(r" number from (\S+) to (\S+)$", said)]
 CHARUCO = 'target = "charuco"\nsquares = [9, 6]\ndictionary = "4X4_50"'  # that marker_mm belongs to
 
 
