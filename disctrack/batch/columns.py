@@ -20,8 +20,6 @@ UNITS = ("m",) * 3 + ("rad",) * 3  # of COORDINATES
 
 PATHS = ("trajectory", "report", "diagnosis_report")  # columns of files that a recording's results may have
 
-# Reduced chi-square of the rolling model with k_m alone; what thousands of dots scatter by is far below.
-LACKS_SOMETHING = 1.5
 FALSE_DISCOVERY = 0.05  # share of false ones among the recordings in which something is said to be missing
 
 # Every column of the summary in order, and what it means.
@@ -131,25 +129,24 @@ def repeats_of(rows: Sequence[Row]) -> list[Row]:
     """Rows of REPEATS, one for each number that two or more recordings of a group determine."""
     different = {row["input_sha256"]: row for row in reversed(rows) if row["repeats"]}  # the first of each
     group_in = itemgetter("repeats")
-    grouped = groupby(sorted(different.values(), key=group_in), key=group_in)
     found = []
-    for group, alike in grouped:
+    for group, alike in groupby(sorted(different.values(), key=group_in), key=group_in):
         members = list(alike)
-        found += [_spread(group, fitted, members) for fitted in FITTED if fitted.repeated]
-    return [row for row in found if row["n"] > 1]
+        for fitted in (fitted for fitted in FITTED if fitted.repeated):
+            known = [row for row in members if row[fitted.column] is not None and row[fitted.sigma]]
+            found += [_spread(group, fitted, known)] if len(known) > 1 else []
+    return found
 
 
-def _spread(group: str, fitted: Fitted, rows: Sequence[Row]) -> Row:
-    known = [row for row in rows if row[fitted.column] is not None and row[fitted.sigma]]
+def _spread(group: str, fitted: Fitted, known: Sequence[Row]) -> Row:
     value, sigma = (np.array([row[name] for row in known], float) for name in (fitted.column, fitted.sigma))
-    n = len(known)
-    spread: Row = dict.fromkeys(REPEATS) | {"repeats": group, "quantity": fitted.column, "n": n}
-    if n < 2:
-        return spread
-    weight = sigma**-2
+    n, weight = len(known), sigma**-2
     mean = np.sum(weight * value) / weight.sum()
     chi_square = np.sum(weight * (value - mean) ** 2)
-    return spread | {
+    return {
+        "repeats": group,
+        "quantity": fitted.column,
+        "n": n,
         "mean": float(value.mean()),
         "standard_deviation": float(value.std(ddof=1)),
         "weighted_mean": float(mean),

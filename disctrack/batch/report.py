@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from urllib.parse import quote
 
-from disctrack.batch.columns import FALSE_DISCOVERY, FITTED, LACKS_SOMETHING, Fitted, Row, copies
+from disctrack.batch.columns import FALSE_DISCOVERY, FITTED, Fitted, Row, copies
 from disctrack.batch.records import FAILED, MEASURED, NOT_MEASURED, SKIPPED
 from disctrack.findings import Finding, Kind, Severity, of_kind
 from disctrack.frames import CAMERAS
@@ -132,5 +132,4 @@ def _with_sigma(row: Row, fitted: Fitted) -> str:
     if value is None or sigma is None:
         return "–"
     misfit = row[fitted.misfit] if fitted.misfit else None
-    lacks = f" (model: χ² {rounded(misfit)})" if misfit is not None and misfit > LACKS_SOMETHING else ""
-    return measured(fitted.scale * value, fitted.scale * sigma) + lacks
+    return measured(fitted.scale * value, fitted.scale * sigma) + (f" (model: χ² {rounded(misfit)})" if misfit else "")

@@ -26,7 +26,6 @@ from disctrack.recording.readers.files import IMAGES, match_files, split_member
 
 ODD = 0.5  # relative, by which a dead pixel's answer to light differs from its neighbours'; gains differ by 0.05
 LEAST_LIGHT = 0.1  # of full scale: a flat that is darker tells gains worse than they differ
-ENOUGH = 10  # images averaged, from which on the flat's own noise (1 % of one image) is below usual patterns
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,11 +120,8 @@ def _flat_field(flat_images: str | None, dark_images: str | None, folder: Path, 
     if flats:
         gain, dead = _gain(flats, darks, offset)
         n = sum(map(len, flats))
-        if n < ENOUGH:
-            notes.append(
-                f"[cameras] {camera}_flat is the mean of {n} image{'s' * (n > 1)}: its own noise "
-                f"becomes a pattern of the sensor. Average {ENOUGH} or more"
-            )
+        averaged = f"{camera}_flat is the mean of {n} image{'s' * (n > 1)}"
+        notes.append(f"[cameras] {averaged}, whose own noise becomes a pattern of the sensor: of ten it is small")
     if n := int(dead.sum()):
         notes.append(f"{camera} camera: {n} dead pixel{'s' * (n > 1)} by its flat image, replaced by their neighbours")
     digest = hashlib.sha256()

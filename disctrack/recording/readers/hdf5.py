@@ -136,12 +136,8 @@ def _check_other_files(stack: h5py.Dataset, file: Path, where: str) -> None:
 
 def _attribute(stack: h5py.Dataset, name: str) -> float | None:
     """A number among the attributes of the data set or of its group."""
-    for owner in (stack, stack.parent):
-        if name in owner.attrs:
-            value = np.asarray(owner.attrs[name])
-            if value.size == 1 and value.dtype.kind in "iuf" and np.isfinite(value).all():
-                return float(value.reshape(-1)[0])
-    return None
+    value = np.ravel(stack.attrs.get(name, stack.parent.attrs.get(name)))
+    return float(value[0]) if value.size == 1 and value.dtype.kind in "iuf" and np.isfinite(value[0]) else None
 
 
 def _timestamps(stack: h5py.Dataset, n: int, where: str) -> Array | None:

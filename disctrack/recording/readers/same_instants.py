@@ -17,10 +17,8 @@ from disctrack.recording.readers.base import CameraHeader, FrameReader
 
 RATE_ROUNDING_HZ = 0.5  # headers give the rate in whole Hz
 CLOCK_TOLERANCE = 1e-3  # relative: cameras whose frames are stamped may run off the nominal rate; the stamps count
-SAME_EXPOSURE = 0.01  # relative; the two cameras' clocks round to different ticks
 SAME_TAKE_S = 600.0  # computers' clocks, and the time that saving one camera after the other takes
-RATE_TOLERANCE = 0.01  # of the declared rate; a clock's error is a thousandth of that, a wrong unit far more
-LOST = 1.5  # periods between two frames: beyond, at least one is missing
+ALIKE = 0.01  # relative, of rates and exposures; a clock's error is a thousandth of that, a wrong unit far more
 SAME_INSTANT = 0.01  # of a period: at 60 rad/s and 1000 Hz the disc turns by 0.6 mrad in it
 
 
@@ -98,15 +96,15 @@ def _compared(left: CameraHeader, right: CameraHeader) -> Iterator[str]:
 
 
 def _differ(one: float, other: float) -> bool:
-    return abs(one - other) > SAME_EXPOSURE * max(one, other)
+    return abs(one - other) > ALIKE * max(one, other)
 
 
-def start_offset(left: CameraHeader, right: CameraHeader) -> tuple[float, str] | None:
+def start_offset(left: CameraHeader | None, right: CameraHeader | None) -> tuple[float, str] | None:
     """How much later [s] the right camera took its frame 0, and since when that is counted; None if not told.
 
     Absolute where both clocks follow a common time signal, otherwise from each camera's own trigger.
     """
-    if left.first_time is None or right.first_time is None:
+    if left is None or right is None or left.first_time is None or right.first_time is None:
         return None
     later = right.first_time - left.first_time
     if left.locked_clock and right.locked_clock and left.trigger_time and right.trigger_time:
@@ -158,9 +156,8 @@ def check_time_stamps(left: FrameReader, right: FrameReader, frame_rate: float) 
         else:
             usable.append(reader.timestamps)
             yield from map(warning, _lost_frames(reader.camera, reader.timestamps, frame_rate))
-    ours, theirs = left.header, right.header
-    offset = start_offset(ours, theirs) if ours is not None and theirs is not None else None
-    if len(usable) == 2 and len(usable[0]) == len(usable[1]) and (ours is None) == (theirs is None):
+    offset, headers = start_offset(left.header, right.header), {left.header is None, right.header is None}
+    if len(usable) == 2 and len(usable[0]) == len(usable[1]) and len(headers) == 1:
         theirs_shifted = usable[1] + (0.0 if offset is None else offset[0])
         slips = [*_slips(usable[0], theirs_shifted, 1.0 / frame_rate)]
         yield from map(doubt, slips)
@@ -176,16 +173,16 @@ def _fault(times: Array, frame_rate: float) -> str:
     back = np.flatnonzero(steps <= 0)
     if len(back):
         return f"they do not increase from frame {back[0]} to {back[0] + 1}"
-    if len(steps) and abs(float(np.median(steps)) * frame_rate - 1.0) > RATE_TOLERANCE:
+    if len(steps) and abs(float(np.median(steps)) * frame_rate - 1.0) > ALIKE:
         rate = 1.0 / float(np.median(steps))
         return f"they give {rate:.6g} frames/s, frame_rate_hz of {frame_rate:.6g} (are they in seconds?)"
     return ""
 
 
 def _lost_frames(camera: str, times: Array, frame_rate: float) -> Iterator[str]:
-    steps = np.diff(times) * frame_rate
-    gaps = np.flatnonzero(steps > LOST)
-    if lost := int(np.rint(steps[gaps] - 1).sum()):
+    missing = np.rint(np.diff(times) * frame_rate).astype(int) - 1
+    gaps = np.flatnonzero(missing > 0)
+    if lost := int(missing[gaps].sum()):
         yield f"{camera} camera: by its time stamps {lost} frame{'s' * (lost > 1)} missing, after frame {ranges(gaps)}"
 
 
