@@ -358,10 +358,8 @@ def _refuse_mixed_calibration(file: Path, calibration: Mapping[str, Any]) -> Non
         raise RecordingError(f"{file}: [calibration] has both rig and {', '.join(odd)}. Keep the rig, or the views.")
     if odd:
         named = " or ".join(f'target = "{name}"' for name, keys in TARGET_KEYS.items() if odd[0] in keys)
-        raise RecordingError(
-            f"{file}: [calibration] {odd[0]} belongs to {named}; the target here is "
-            f"{calibration.get('target', 'chessboard')}: {', '.join(own)}."
-        )
+        here = f"{calibration.get('target', 'chessboard')}: {', '.join(own)}"
+        raise RecordingError(f"{file}: [calibration] {odd[0]} belongs to {named}; the target here is {here}.")
 
 
 def _target(file: Path, calibration: Mapping[str, Any]) -> Target:

@@ -164,10 +164,8 @@ def frames_in_parts(readers: Sequence[FrameReader], parts: Parts, where: str) ->
             continue
         (x, y, *size), (width, height) = part, reader.image_size
         if x + size[0] > width or y + size[1] > height:
-            raise RecordingError(
-                f"{where}: [cameras] {reader.camera}_part is {list(part)}, but {reader.describe(0)} has {width} x "
-                f"{height} px. It is [x, y, width, height] in pixels, from the upper left corner."
-            )
+            said = f"{reader.camera}_part is {list(part)}, but {reader.describe(0)} has {width} x {height} px"
+            raise RecordingError(f"{where}: [cameras] {said}. It is [x, y, width, height] from the upper left corner.")
         cut = changed(reader, partial(cut_out, part=part, where=where), str(list(part)))
         yield replace(cut, image_size=part[2:])
 
@@ -200,10 +198,8 @@ def first_readable(n: int, camera: str, decoded: Callable[[int], _T]) -> _T:
 
 def refuse_colour(where: str, found: str) -> NoReturn:
     """Raise RecordingError for pixels that are no grey values."""
-    raise RecordingError(
-        f"{where}: {found}; expected grey values. A conversion here would mix what the sensor measured: export the "
-        "camera's grey values, or record with a monochrome camera."
-    )
+    remedy = "A conversion here would mix what the sensor measured: export grey values, or use a monochrome camera."
+    raise RecordingError(f"{where}: {found}; expected grey values. {remedy}")
 
 
 def only_file(files: Sequence[Path], camera: str) -> Path:

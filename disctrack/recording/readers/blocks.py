@@ -53,11 +53,9 @@ def check_pair(left: FrameReader, right: FrameReader) -> None:
         )
     if left.image_size != right.image_size or (left.bit_depth > 8) != (right.bit_depth > 8):
         ours, theirs = (in_words(reader.image_size, reader.bit_depth) for reader in (left, right))
-        instead = ", or declare parts of one size: [cameras] left_part and right_part"
-        raise RecordingError(
-            f"left images ({left.describe(0)}) have {ours}, right images ({right.describe(0)}) have {theirs}. Export "
-            f"both cameras alike{instead if left.image_size != right.image_size else ''}."
-        )
+        said = f"left images ({left.describe(0)}) have {ours}, right images ({right.describe(0)}) have {theirs}"
+        remedy = "Export both cameras alike; what differs in size may be cut: [cameras] left_part and right_part"
+        raise RecordingError(f"{said}. {remedy}.")
 
 
 def default_threads() -> int:

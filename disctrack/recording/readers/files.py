@@ -122,10 +122,8 @@ def number_files(
     if len(clocks) > 1:
         clocks = {step: column for step, column in clocks.items() if not _missing(column, step)} or clocks
     if len(clocks) > 1:
-        raise RecordingError(
-            f"{files[0]} ...: several numbers in the names of the {camera} frames could count them. Say which with "
-            f'{NUMBER} in the pattern, e.g. {camera} = "{camera}/*_{NUMBER}.png".'
-        )
+        said = f"several numbers in the names of the {camera} frames could count them"
+        raise RecordingError(f'{files[0]} ...: {said}. Say which, as in {camera} = "{camera}/*_{NUMBER}.png".')
     if not clocks:
         _refuse_clock(files, columns[-1], camera)
     ((step, column),) = clocks.items()
@@ -176,10 +174,8 @@ def _numbers_by_form(files: Sequence[Path], camera: str) -> list[list[int]]:
     """The runs of digits that differ among names of one form, each a number per file."""
     forms = [re.split(r"[0-9]+", file.stem) for file in files]
     if all(len(form) == 1 for form in forms):
-        raise RecordingError(
-            f"{_listed(files)}: the names of the {camera} frames hold no number, so nothing tells their order and "
-            "whether one is missing. Number them as the camera counted them."
-        )
+        said = f"the names of the {camera} frames hold no number, so nothing tells whether one is missing"
+        raise RecordingError(f"{_listed(files)}: {said}. Number them as the camera counted them.")
     groups = Counter(map(tuple, forms)).most_common()
     if len(groups) > 1:
         usual = list(groups[0][0])
@@ -218,10 +214,8 @@ def _refuse_clock(files: Sequence[Path], numbers: Sequence[int], camera: str) ->
     order = sorted(range(len(files)), key=lambda i: numbers[i])
     for a, b in pairwise(order):
         if numbers[a] == numbers[b]:
-            raise RecordingError(
-                f"{files[a]}, {files[b]}: two {camera} frames of number {numbers[a]}. Move one of them away, or write "
-                f"a pattern that leaves it out; {NUMBER} in the pattern says which digits count."
-            )
+            said = f"{files[a]}, {files[b]}: two {camera} frames of number {numbers[a]}"
+            raise RecordingError(f"{said}. Move one away, or say with {NUMBER} in the pattern which digits count.")
     steps = sorted(b - a for a, b in pairwise(sorted(numbers)))
     raise RecordingError(
         f"{_listed([files[i] for i in order])}: the numbers of the {camera} frames have no common step (differences "

@@ -81,10 +81,9 @@ def _corrected(reader: FrameReader, field: FlatField | None) -> FrameReader:
         field = FlatField(zero, zero + 1, None, reader.bit_depth, "none")
     frames, images = in_words(reader.image_size, reader.bit_depth), in_words(field.dark.shape[::-1], field.bit_depth)
     if frames != images:
-        raise RecordingError(
-            f"{reader.describe(0)}: {reader.camera} frames are {frames}, but [cameras] {reader.camera}_flat and "
-            f"{reader.camera}_dark have {images}. Take these with the settings of the recording, or leave them out."
-        )
+        said = f"{reader.camera} frames are {frames}, but [cameras] {reader.camera}_flat and _dark have {images}"
+        remedy = "Take these with the settings of the recording, or leave them out."
+        raise RecordingError(f"{reader.describe(0)}: {said}. {remedy}")
     notes = (*reader.notes, *field.notes)
     corrected = changed(reader, field.corrected, field.sha256)
     return replace(corrected, notes=notes, bit_depth=16, dtype=np.dtype(np.uint16))
@@ -110,10 +109,8 @@ def _flat_field(flat_images: str | None, dark_images: str | None, folder: Path, 
     for reader in flats + darks:
         found, expected = (in_words(one.image_size, one.bit_depth) for one in (reader, first))
         if found != expected:
-            raise RecordingError(
-                f"[cameras] {reader.camera}: {reader.describe(0)} is {found}, but {first.describe(0)} is {expected}. "
-                "Take both with the settings of the recording, or take the other one away."
-            )
+            said = f"{reader.describe(0)} is {found}, but {first.describe(0)} is {expected}"
+            raise RecordingError(f"[cameras] {reader.camera}: {said}. Take both with the settings of the recording.")
     offset = _mean(darks)[0] if darks else np.zeros(first.image_size[::-1], np.float32)
     gain, dead = np.ones_like(offset), np.zeros(offset.shape, bool)
     notes = []

@@ -187,10 +187,8 @@ def check_frame_size(width: int, height: int, where: str, bits: int = 8, n_bytes
     # even a black image does not shrink by more than this when compressed (deflate: 1032); small ones are let pass
     most = MOST_PIXELS if n_bytes is None else min(MOST_PIXELS, max(1 << 22, 1500 * n_bytes))
     if width <= 0 or height <= 0 or width * height > most:
-        raise RecordingError(
-            f"{where}: the header claims images of {width} x {height} px, which no camera of this kind has, or the "
-            "file cannot hold. The header is damaged, or not of this format: copy or export it again."
-        )
+        said = f"claims images of {width} x {height} px, which no camera of this kind has, or the file cannot hold"
+        raise RecordingError(f"{where}: the header {said}: damaged, or of another format. Copy or export it again.")
     if width * height * bits % 8:
         said = in_words((width, height), bits)
         raise RecordingError(f"{where}: {said} do not fill whole bytes. Save them with 16 bit.")

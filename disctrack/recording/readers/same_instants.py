@@ -40,15 +40,11 @@ def check_headers(
             continue
         stamped = 0.0 if header.first_time is None else CLOCK_TOLERANCE * header.frame_rate
         if abs(header.frame_rate - frame_rate) > max(RATE_ROUNDING_HZ, stamped):
-            raise RecordingError(
-                f"{declared}, but the {camera} camera's frames were recorded with {header.rate}, says {header.file}. "
-                "Every velocity would be wrong by their ratio: correct that."
-            )
+            said = f"the {camera} camera's frames were recorded with {header.rate}, says {header.file}"
+            raise RecordingError(f"{declared}, but {said}. Every velocity would be wrong by their ratio: correct that.")
         if exposure is not None and header.exposure is not None and _differ(header.exposure, exposure):
-            yield (
-                f"{declared_in}: [cameras] exposure_us is {1e6 * exposure:g}, the {camera} camera's header says "
-                f"{1e6 * header.exposure:g} µs ({header.file}); the declared one is used"
-            )
+            said = f"the {camera} camera's header says {1e6 * header.exposure:g} µs ({header.file})"
+            yield f"{declared_in}: [cameras] exposure_us is {1e6 * exposure:g}, {said}; the declared one is used"
     if left.header is not None and right.header is not None:
         yield from _compared(left.header, right.header)
 
@@ -76,23 +72,17 @@ def _compared(left: CameraHeader, right: CameraHeader) -> Iterator[str]:
             "Export the frames of the same instants, of the same take."
         )
     if left.trigger != right.trigger:  # equal modes count from the same event; of unequal ones nothing is known
-        yield (
-            f"the cameras were triggered in different modes: left {left.trigger or 'unknown'}, right "
-            f"{right.trigger or 'unknown'}. The headers do not say whether frame i of both shows the same instant"
-        )
+        modes = f"left {left.trigger or 'unknown'}, right {right.trigger or 'unknown'}"
+        yield f"the cameras were triggered in different modes: {modes}. Frame i of both may show different instants"
     if left.exposure is not None and right.exposure is not None and _differ(left.exposure, right.exposure):
-        yield (
-            f"the cameras exposed for different times: left {1e6 * left.exposure:g} µs, right "
-            f"{1e6 * right.exposure:g} µs. The middles of the exposures lie "
-            f"{0.5e6 * abs(left.exposure - right.exposure):g} µs apart if both begin together"
-        )
+        times = f"left {1e6 * left.exposure:g} µs, right {1e6 * right.exposure:g} µs"
+        apart = f"{0.5e6 * abs(left.exposure - right.exposure):g} µs apart if both begin together"
+        yield f"the cameras exposed for different times: {times}. The middles of the exposures lie {apart}"
     if left.recorded is not None and right.recorded is not None:
-        apart = abs((left.recorded - right.recorded).total_seconds())
-        if apart > SAME_TAKE_S:
-            yield (
-                f"the headers' dates lie {apart / 60:.0f} minutes apart: left {left.recorded:%Y-%m-%d %H:%M:%S}, right "
-                f"{right.recorded:%Y-%m-%d %H:%M:%S}. Are both files of the same take?"
-            )
+        seconds = abs((left.recorded - right.recorded).total_seconds())
+        if seconds > SAME_TAKE_S:
+            dates = f"left {left.recorded:%Y-%m-%d %H:%M:%S}, right {right.recorded:%Y-%m-%d %H:%M:%S}"
+            yield f"the headers' dates lie {seconds / 60:.0f} minutes apart: {dates}. Are both files of the same take?"
 
 
 def _differ(one: float, other: float) -> bool:
@@ -125,10 +115,8 @@ def check_same_numbers(left: FrameReader, right: FrameReader) -> Iterator[str]:
         f"{theirs[-1]} in steps of {theirs.step}"
     )
     if ours.step != theirs.step or not (ours[-1] < theirs[0] or theirs[-1] < ours[0]):
-        raise RecordingError(
-            f"{left.describe(0)}, {right.describe(0)}: {spans}, but equal numbers must be the same instant. Copy what "
-            "is missing, or number the frames of both cameras alike."
-        )
+        said = f"{left.describe(0)}, {right.describe(0)}: {spans}, but equal numbers must be the same instant"
+        raise RecordingError(f"{said}. Copy what is missing, or number the frames of both cameras alike.")
     yield f"{spans}: they are taken as pairs in their order, number {ours[0]} with {theirs[0]}"
 
 
