@@ -45,8 +45,7 @@ class Circle:
     rms: float  # [m] of the distances from the circle
     # [m] mean of r cos theta - h sin theta, the radius when the centre rests
     expected: Annotated[float, "locus_circle_expected_radius_m"]
-    start: float  # [s]
-    end: float  # [s]
+    interval: Annotated[tuple[float, float], "locus_circle_interval_s"]  # [s] first and last instant
 
 
 def rolling_onset(found: Propagated, until: float = np.inf) -> RollingOnset:
@@ -123,7 +122,7 @@ def locus_circle(found: Propagated, duration: float, until: float = np.inf) -> C
     frames = known[motion.time[known] >= motion.time[known[-1]] - duration] if known.size else known
     arc = float(np.ptp(motion.euler[frames, 0])) if frames.size else 0.0
     if arc < np.pi / 2 or frames.size < 8:
-        return Circle(np.full(2, np.nan), *(float("nan"),) * 7)
+        return Circle(np.full(2, np.nan), *(float("nan"),) * 5, (float("nan"), float("nan")))
     points = found.value[frames, PLACE]
     centre = points.mean(axis=0)
     for _ in range(30):  # Gauss-Newton, to rounding
@@ -149,6 +148,5 @@ def locus_circle(found: Propagated, duration: float, until: float = np.inf) -> C
         sigma_calibration=float(np.sqrt(max(0.0, per_rig @ motion.rig_covariance @ per_rig))),
         rms=rms,
         expected=float(np.mean(expected)),
-        start=float(motion.time[frames[0]]),
-        end=float(motion.time[frames[-1]]),
+        interval=(float(motion.time[frames[0]]), float(motion.time[frames[-1]])),
     )

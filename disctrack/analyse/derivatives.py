@@ -69,14 +69,10 @@ class MotionState(Brief):
 
     def displaced(self, step: Array) -> MotionState:
         """After a small change (18,) in the order of STATE."""
-        return MotionState(
-            self.position + step[0:3],
-            rotation_from_vector(step[3:6]) @ self.R_world_body,
-            self.velocity + step[6:9],
-            self.omega_world + step[9:12],
-            self.acceleration + step[12:15],
-            self.alpha_world + step[15:18],
-        )
+        shift, turn, *changes = step.reshape(6, 3)
+        rates = (self.velocity, self.omega_world, self.acceleration, self.alpha_world)
+        changed = (rate + change for rate, change in zip(rates, changes, strict=True))
+        return MotionState(self.position + shift, rotation_from_vector(turn) @ self.R_world_body, *changed)
 
 
 @dataclass(frozen=True, repr=False)
@@ -143,14 +139,10 @@ def differentiate(trajectory: Trajectory, breaks: Sequence[float] = ()) -> Measu
     found = (_differentiated(part(trajectory, rows), good[rows]) for rows in pieces)
     *of_frames, scales = zip(*found, strict=True)
     state, R, euler, covariance, sensitivity, length = map(np.concatenate, of_frames)
-    velocity, acceleration = state[:, 1], state[:, 2]
     return MeasuredMotion(
-        position=state[:, 0, :3],
-        R_world_body=R,
-        velocity=velocity[:, :3],
-        omega_world=velocity[:, 3:],
-        acceleration=acceleration[:, :3],
-        alpha_world=acceleration[:, 3:],
+        state[:, 0, :3],
+        R,
+        *(rate for order in (1, 2) for rate in np.split(state[:, order], 2, axis=1)),
         time=time,
         covariance=covariance,
         calibration_sensitivity=sensitivity,

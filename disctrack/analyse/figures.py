@@ -125,7 +125,8 @@ def contact_locus(analysis: Analysis) -> Iterator[Drawn]:
     circle, time = analysis.circle, analysis.motion.time
     if not np.isfinite(circle.radius):
         return
-    part = (time >= circle.start) & (time <= circle.end)
+    start, end = circle.interval
+    part = (time >= start) & (time <= end)
     x, y = (1e3 * analysis.series(name).value[part] for name in ("contact_x", "contact_y"))
     angle = np.linspace(0, 2 * np.pi, 361)
     around = 1e3 * (circle.centre + circle.radius * np.column_stack([np.cos(angle), np.sin(angle)]))
@@ -133,7 +134,7 @@ def contact_locus(analysis: Analysis) -> Iterator[Drawn]:
     figure = chart(X, (Y, [Curve(x, y, BLUE, "contact", "."), fitted]), size=SQUARE, equal=True)
     same_disc = np.isclose(analysis.trajectory.disc.radius, MA_2014.radius)
     caption = (
-        f"Contact point from {circle.start:.3f} to {circle.end:.3f} s with the fitted circle: radius "
+        f"Contact point from {start:.3f} to {end:.3f} s with the fitted circle: radius "
         f"{measured(circle.radius, circle.sigma, 'm')} (scatter) ± {measured(circle.sigma_calibration, unit='m')} "
         f"(calibration). With the centre at rest it would be r cos θ - h sin θ = {1e3 * circle.expected:.4f} mm on "
         f"average; the locus departs from the circle by {1e3 * circle.rms:.3f} mm rms."

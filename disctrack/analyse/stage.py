@@ -96,10 +96,9 @@ def write_analysis(path: Path, analysis: Analysis) -> None:
             for name, item in variables.items()
         }
 
-    circle, contact = analysis.circle, _attributes(analysis.onset) | _attributes(analysis.circle)
     attributes: dict[str, dict[str, object]] = {
         "motion": _motion_attributes(analysis),
-        "contact": contact | {"locus_circle_interval_s": np.array([circle.start, circle.end])},
+        "contact": _attributes(analysis.onset) | _attributes(analysis.circle),
         "energy": _attributes(analysis.energy),
     }
     groups: dict[str, Group] = {}

@@ -59,7 +59,6 @@ def simulate(
     rate: FrameRate = 1000.0,
     times: Times | None = None,
     theta_end: float = DEFAULT_THETA_END,
-    rtol: float = RTOL,
 ) -> Motion:
     """Motion from `state` over `duration` [s] at `rate` [Hz], or at the given `times`.
 
@@ -73,7 +72,7 @@ def simulate(
     """
     grid = _grid(duration, rate, times)
     assembly = Assembly(model, theta_end)
-    return Motion(model, assembly.body, follow(assembly, _start(state, theta_end), grid, rtol))
+    return Motion(model, assembly.body, follow(assembly, _start(state, theta_end), grid))
 
 
 def _grid(duration: float | None, rate: float, times: ArrayLike | None) -> Array:
@@ -158,14 +157,7 @@ class Assembly:
         return bool(self.constant("creep").real > FILM and self.constant("inverse_friction") == 0.0)
 
 
-def follow(
-    assembly: Assembly,
-    y: Numbers,
-    grid: Array,
-    rtol: float,
-    max_switches: int = MAX_SWITCHES,
-    max_steps: int = MOST_STEPS,
-) -> Path:
+def follow(assembly: Assembly, y: Numbers, grid: Array, max_steps: int = MOST_STEPS) -> Path:
     """Integrate through the regimes until the grid or the motion ends; complex if the assembly is."""
     y = np.array(y, assembly.scalar)
     t: complex = grid[0] * y.dtype.type(1.0)
@@ -184,7 +176,7 @@ def follow(
         event = _event_at_start(assembly, regime, t, y)
         if event < 0:
             system, atol = assembly.system(regime), ATOL[: len(y)]
-            Y, t, y, event, n = integrate.integrate(system, t, y, grid[i:], rtol, atol, max_steps - n_steps)
+            Y, t, y, event, n = integrate.integrate(system, t, y, grid[i:], RTOL, atol, max_steps - n_steps)
             n_steps, slip_steps = n_steps + n, slip_steps + (n if regime == SLIPPING else 0)
             if len(Y):  # none where the steps are used up before the first instant
                 add(grid[i : i + len(Y)], Y)
@@ -198,7 +190,7 @@ def follow(
             if end is None:
                 switches.append(Switch(float(np.real(t)), Regime(regime), Regime(new)))
                 regime = new
-                if len(switches) > max_switches:
+                if len(switches) > MAX_SWITCHES:
                     end = EndReason.CHATTER
     if not pieces:  # over at its start
         add(grid[:1], y[None])
@@ -277,16 +269,14 @@ def sensitivities(
     parameters: Sequence[str] = (),
     components: Sequence[str] | None = None,
     theta_end: float = DEFAULT_THETA_END,
-    rtol: float = RTOL,
-    max_switches: int = MAX_SWITCHES,
     max_steps: int = MOST_STEPS,
 ) -> Sensitivities:
     """D q(t), d qdot(t) by initial state and parameters.
 
     parameters : "effect.parameter" names; an effect that is not in the model is taken at its null value.
     components : of records.STATE_COMPONENTS; all that the state has if not given.
-    max_switches : between rolling and slip, beyond which the motion counts as over; then there are no derivatives.
-    max_steps : of the integrator, of all runs together; beyond them the rest is missing, too
+    max_steps : of the integrator, of all runs together; beyond them the rest is missing. So it is where slip and rolling
+        alternate without end
     """
     grid = _grid(None, 0.0, times)
     y0 = _start(state, theta_end)
@@ -296,7 +286,7 @@ def sensitivities(
     names = (*components, *parameters)
     found = np.full((len(grid), 20, 1 + len(names)), np.nan)  # q, qdot and state: the motion, then its derivatives
     assembly = Assembly(enlarged, theta_end)
-    path = follow(assembly, y0, grid, rtol, max_switches, max_steps)
+    path = follow(assembly, y0, grid, max_steps)
     spent, n_steps = path.slip_steps, path.n_steps
     found[: len(path.now), :, 0] = _numbers(path)
     if path.end is not EndReason.CHATTER:
@@ -313,7 +303,7 @@ def sensitivities(
             else:
                 values = {name: enlarged.values[name] + 1j * _SEED}
             moved = Assembly(enlarged, theta_end, complex, values)
-            run = follow(moved, y, grid, rtol, max_steps=max_steps - n_steps)
+            run = follow(moved, y, grid, max_steps - n_steps)
             spent, n_steps = spent + run.slip_steps, n_steps + run.n_steps
             found[: len(run.now), :, column] = _numbers(run).imag / _SEED
     q, qdot, _ = np.split(found[..., 0], [6, 12], axis=1)
@@ -374,7 +364,7 @@ def responses(
 
     That is Phi^-1 B (N, 8, 6) by COMPONENTS, per N m and per N. None where it does not roll over all of the times.
     """
-    motion = simulate(model, state, times=times, theta_end=theta_end, rtol=RTOL)
+    motion = simulate(model, state, times=times, theta_end=theta_end)
     if len(motion) < len(times) or np.any(motion.regime != ROLLING):
         return None
     found = sensitivities(model, state, times, (), ROLLING_COMPONENTS, theta_end)

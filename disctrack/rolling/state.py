@@ -48,11 +48,6 @@ class State:
         """Precession rate [rad/s]."""
         return float(self.omega2 / np.sin(self.theta))
 
-    @property
-    def phidot(self) -> float:
-        """Spin rate [rad/s]."""
-        return float(self.omega3 - self.omega2 / np.tan(self.theta))
-
     def moved(self, **changes: float) -> State:
         """Copy with some components replaced."""
         return replace(self, **changes)
