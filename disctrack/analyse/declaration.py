@@ -24,6 +24,7 @@ from operator import itemgetter
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
+from scipy.spatial.distance import pdist
 
 from calibration.cameras.camera import StereoRig, triangulate
 from calibration.kit.arrays import Array, evenly, robust_sigma
@@ -496,9 +497,7 @@ def scale_of_dots(trajectory: Trajectory, declared: Disc, square: float | None =
         return ()  # cameras that do not fit together tell no size
     rig = replace(trajectory.rig, lens_field=None)  # the trajectory's points are without it already
     seen = triangulate(pixels.swapaxes(0, 1).reshape(2, n * dots, 2), rig).reshape(n, dots, 3)
-    i, j = np.triu_indices(dots, 1)
-    expected = np.linalg.norm(declared.marker_centres_body[i] - declared.marker_centres_body[j], axis=1)
-    ratio = np.linalg.norm(seen[:, i] - seen[:, j], axis=2) / expected
+    ratio = np.array([pdist(places) for places in seen]) / pdist(declared.marker_centres_body)
     per_pair = np.array([np.median(r[np.isfinite(r)]) for r in ratio.T if np.isfinite(r).sum() >= min(5, n)])
     if len(per_pair) < MIN_BLOCKS:
         return ()

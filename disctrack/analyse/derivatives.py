@@ -140,9 +140,12 @@ def differentiate(trajectory: Trajectory, breaks: Sequence[float] = ()) -> Measu
     *of_frames, scales = zip(*found, strict=True)
     state, R, euler, covariance, sensitivity, length = map(np.concatenate, of_frames)
     return MeasuredMotion(
-        state[:, 0, :3],
-        R,
-        *(rate for order in (1, 2) for rate in np.split(state[:, order], 2, axis=1)),
+        position=state[:, 0, :3],
+        R_world_body=R,
+        velocity=state[:, 1, :3],
+        omega_world=state[:, 1, 3:],
+        acceleration=state[:, 2, :3],
+        alpha_world=state[:, 2, 3:],
         time=time,
         covariance=covariance,
         calibration_sensitivity=sensitivity,

@@ -157,7 +157,14 @@ class Assembly:
         return bool(self.constant("creep").real > FILM and self.constant("inverse_friction") == 0.0)
 
 
-def follow(assembly: Assembly, y: Numbers, grid: Array, max_steps: int = MOST_STEPS) -> Path:
+def follow(
+    assembly: Assembly,
+    y: Numbers,
+    grid: Array,
+    rtol: float = RTOL,
+    max_switches: int = MAX_SWITCHES,
+    max_steps: int = MOST_STEPS,
+) -> Path:
     """Integrate through the regimes until the grid or the motion ends; complex if the assembly is."""
     y = np.array(y, assembly.scalar)
     t: complex = grid[0] * y.dtype.type(1.0)
@@ -176,7 +183,7 @@ def follow(assembly: Assembly, y: Numbers, grid: Array, max_steps: int = MOST_ST
         event = _event_at_start(assembly, regime, t, y)
         if event < 0:
             system, atol = assembly.system(regime), ATOL[: len(y)]
-            Y, t, y, event, n = integrate.integrate(system, t, y, grid[i:], RTOL, atol, max_steps - n_steps)
+            Y, t, y, event, n = integrate.integrate(system, t, y, grid[i:], rtol, atol, max_steps - n_steps)
             n_steps, slip_steps = n_steps + n, slip_steps + (n if regime == SLIPPING else 0)
             if len(Y):  # none where the steps are used up before the first instant
                 add(grid[i : i + len(Y)], Y)
@@ -190,7 +197,7 @@ def follow(assembly: Assembly, y: Numbers, grid: Array, max_steps: int = MOST_ST
             if end is None:
                 switches.append(Switch(float(np.real(t)), Regime(regime), Regime(new)))
                 regime = new
-                if len(switches) > MAX_SWITCHES:
+                if len(switches) > max_switches:
                     end = EndReason.CHATTER
     if not pieces:  # over at its start
         add(grid[:1], y[None])
@@ -269,14 +276,16 @@ def sensitivities(
     parameters: Sequence[str] = (),
     components: Sequence[str] | None = None,
     theta_end: float = DEFAULT_THETA_END,
+    rtol: float = RTOL,
+    max_switches: int = MAX_SWITCHES,
     max_steps: int = MOST_STEPS,
 ) -> Sensitivities:
     """D q(t), d qdot(t) by initial state and parameters.
 
     parameters : "effect.parameter" names; an effect that is not in the model is taken at its null value.
     components : of records.STATE_COMPONENTS; all that the state has if not given.
-    max_steps : of the integrator, of all runs together; beyond them the rest is missing. So it is where slip and rolling
-        alternate without end
+    max_switches : between rolling and slip, beyond which the motion counts as over; then there are no derivatives.
+    max_steps : of the integrator, of all runs together; beyond them the rest is missing, too
     """
     grid = _grid(None, 0.0, times)
     y0 = _start(state, theta_end)
@@ -286,7 +295,7 @@ def sensitivities(
     names = (*components, *parameters)
     found = np.full((len(grid), 20, 1 + len(names)), np.nan)  # q, qdot and state: the motion, then its derivatives
     assembly = Assembly(enlarged, theta_end)
-    path = follow(assembly, y0, grid, max_steps)
+    path = follow(assembly, y0, grid, rtol, max_switches, max_steps)
     spent, n_steps = path.slip_steps, path.n_steps
     found[: len(path.now), :, 0] = _numbers(path)
     if path.end is not EndReason.CHATTER:
@@ -303,7 +312,7 @@ def sensitivities(
             else:
                 values = {name: enlarged.values[name] + 1j * _SEED}
             moved = Assembly(enlarged, theta_end, complex, values)
-            run = follow(moved, y, grid, max_steps - n_steps)
+            run = follow(moved, y, grid, rtol, max_steps=max_steps - n_steps)
             spent, n_steps = spent + run.slip_steps, n_steps + run.n_steps
             found[: len(run.now), :, column] = _numbers(run).imag / _SEED
     q, qdot, _ = np.split(found[..., 0], [6, 12], axis=1)

@@ -1,6 +1,5 @@
 """disctrack simulate: the motion of a scene into an HDF5 file that explains itself."""
 
-import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -71,13 +70,10 @@ def run_simulate(
     rate = scene.cameras.frame_rate_hz if rate is None else rate
     duration = max(scene.cameras.n_frames - 1, 1) / scene.cameras.frame_rate_hz if duration is None else duration
     motion = simulate(rolling_model(scene), rolling_start(scene), duration, rate=rate)
-    text = scene_path.read_text(encoding="utf-8")
-    settings = {"duration_s": duration, "rate_hz": rate}
     attributes = {
         "name": scene.name,
-        "scene": text,
-        "scene_sha256": hashlib.sha256(text.encode()).hexdigest(),
-        "settings": json.dumps(settings, sort_keys=True),
+        "scene": scene_path.read_text(encoding="utf-8"),
+        "settings": json.dumps({"duration_s": duration, "rate_hz": rate}),
     }
     write_motion(output, motion, attributes)
     return SimulationRun(output, motion, f"{output}\n{summary(motion)}\neffects: {effects_in_words(scene)}")

@@ -280,10 +280,6 @@ def _again(files: list[bytes], k: int) -> list[bytes]:
     return files[:middle] + k * [files[middle - 1]] + files[middle + k :]
 
 
-def _first_lost(files: list[bytes], k: int) -> list[bytes]:
-    return files[k:]
-
-
 def _last_lost(files: list[bytes], k: int) -> list[bytes]:
     """Of the other camera, so that both end together."""
     return files[:-k]
@@ -295,8 +291,7 @@ def _damaged(files: list[bytes], k: int) -> list[bytes]:
 
 
 def _exchanged(folder: Path, tree: Tree, size: float) -> None:
-    cameras = tree["cameras"]
-    cameras["left"], cameras["right"] = cameras["right"], cameras["left"]
+    tree["cameras"] |= dict(zip(CAMERAS, [tree["cameras"][camera] for camera in CAMERAS[::-1]], strict=True))
 
 
 def _images(
@@ -317,14 +312,6 @@ def _moved(image: NDArray, by: float) -> NDArray:
     shape = image.shape[::-1]
     moved = cv2.warpAffine(image, move, shape, flags=cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE)
     return moved if by else image
-
-
-def _mirrored(image: NDArray, size: float) -> NDArray:
-    return cv2.flip(image, 1)
-
-
-def _negative(image: NDArray, size: float) -> NDArray:
-    return cv2.bitwise_not(image)
 
 
 def _lit(image: NDArray, size: float) -> NDArray:
@@ -364,18 +351,24 @@ CHANGES = {
     "camera drifts": Planting((0.03, 0.3, 3.0), "px", MOVED, _images(_moved, "right", course=float)),
     "reversed": Planting((1,), "", (Kind.REVERSED,), _files(**dict.fromkeys(CAMERAS, lambda files, k: files[::-1]))),
     "exchanged": Planting((1,), "", (Kind.EXCHANGED,), _exchanged),
-    "mirrored": Planting((1,), "", (Kind.MIRRORED,), _images(_mirrored, "right")),
+    "mirrored": Planting((1,), "", (Kind.MIRRORED,), _images(lambda image, _: cv2.flip(image, 1), "right")),
     "radius": _wrong("disc", "radius_mm", Kind.RADIUS, *HEIGHT),
     "thickness": _wrong("disc", "thickness_mm", *HEIGHT),
     "dot diameter": _wrong("markers", "diameter_mm", Kind.DIAMETER),
     "gravity": _wrong("gravity", "g_m_s2", Kind.GRAVITY_OR_RATE),
     "square": _wrong("calibration", "square_mm", Kind.SQUARE),
-    "negative views": Planting((1,), "", _CALIBRATED, _images(_negative, *_VIEWS), of_views=True),
+    "negative views": Planting(
+        (1,), "", _CALIBRATED, _images(lambda image, _: cv2.bitwise_not(image), *_VIEWS), of_views=True
+    ),
     "repeated views": Planting(
         (2, 3, 6), "times", _CALIBRATED, _files(**dict.fromkeys(_VIEWS, lambda files, k: k * files)), of_views=True
     ),
     "views late in one": Planting(
-        (1, 2, 4), "views", _CALIBRATED, _files(board_left=_last_lost, board_right=_first_lost), of_views=True
+        (1, 2, 4),
+        "views",
+        _CALIBRATED,
+        _files(board_left=_last_lost, board_right=lambda files, k: files[k:]),
+        of_views=True,
     ),
 }
 

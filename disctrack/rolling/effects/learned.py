@@ -20,8 +20,8 @@ from calibration.kit.compiled import function_of
 from disctrack.rolling.effects.base import CATALOGUE, Effect, EffectParameter, ModelError, magnitude, sign
 from disctrack.rolling.records import KINEMATICS, LAW_COMPONENTS
 
-_NUMPY_FUNCTIONS = ("sqrt", "exp", "log", "sin", "cos")
-_FUNCTIONS = {"magnitude": "magnitude", "sign": "sign"} | {name: f"np.{name}" for name in _NUMPY_FUNCTIONS}
+_OF_NUMPY = {name: getattr(np, name) for name in ("sqrt", "exp", "log", "sin", "cos")}
+_FUNCTIONS: dict[str, object] = {"magnitude": magnitude, "sign": sign, **_OF_NUMPY}
 _ALLOWED = (
     ast.Expression, ast.BinOp, ast.UnaryOp, ast.Call, ast.Name, ast.Load, ast.Constant,
     ast.Add, ast.Sub, ast.Mult, ast.Div, ast.Pow, ast.USub, ast.UAdd,
@@ -69,8 +69,7 @@ def effect_from_formulas(
 
 @lru_cache(maxsize=64)  # the same formulas with other numbers are compiled once
 def _function(lines: str) -> Callable[..., None]:
-    namespace: dict[str, object] = {"np": np, "magnitude": magnitude, "sign": sign}
-    return function_of(f"def law(p, s, w):\n{lines}\n", "law", namespace)  # checked node by node in _translate
+    return function_of(f"def law(p, s, w):\n{lines}\n", "law", {**_FUNCTIONS})  # checked node by node in _translate
 
 
 def _translate(name: str, formula: str) -> tuple[str, list[str]]:
@@ -89,10 +88,8 @@ def _translate(name: str, formula: str) -> tuple[str, list[str]]:
         if isinstance(node, ast.Call) and not (isinstance(node.func, ast.Name) and node.func.id in _FUNCTIONS):
             known = ", ".join(_FUNCTIONS)
             raise ModelError(f"{name}: '{formula}': no function {ast.unparse(node.func)}; there are {known}")
-    for node in [n for n in ast.walk(tree) if isinstance(n, ast.Name)]:
-        if node in functions:
-            node.id = _FUNCTIONS[node.id]
-        elif node.id in KINEMATICS:
+    for node in [n for n in ast.walk(tree) if isinstance(n, ast.Name) and n not in functions]:
+        if node.id in KINEMATICS:
             node.id = f"s.{node.id}"
         else:
             parameters.append(node.id)
