@@ -207,9 +207,7 @@ class Planner:
                 system.model.gravity,
                 omega3=proposal.omega3,
                 nutation_amplitude=np.radians(NUTATION_SHARE * proposal.theta_deg),
-                x=float(np.nanmean(old.q[:, 0])),
-                y=float(np.nanmean(old.q[:, 1])),
-            )
+            ).moved(**dict(zip("xy", np.nanmean(old.q[:, :2], axis=0).tolist(), strict=True)))
         duration, rate = proposal.duration or float(np.ptp(system.time)), old.frame_rate * proposal.rate
         model = replace(system.model_with(values), **changed)
         motion = simulate(model, start, duration, rate=rate, theta_end=MIN_THETA)

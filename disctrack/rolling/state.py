@@ -62,12 +62,8 @@ def steady_precession(
     omega3: float | None = None,
     nutation_amplitude: float = 0.0,
     nutation_phase: float = 0.0,
-    psi: float = 0.0,
-    phi: float = 0.0,
-    x: float = 0.0,
-    y: float = 0.0,
 ) -> State:
-    """Rolling state of regular precession at nutation `theta` [rad], psidot > 0.
+    """Rolling state of regular precession at nutation `theta` [rad], psidot > 0; `moved` puts it anywhere.
 
     omega3 : spin q [rad/s]; without it the centre stays at rest, q = h p sin(theta) / r.
     nutation_amplitude, nutation_phase : to first order theta(t) = theta + amplitude cos(w t + phase), where w is
@@ -81,29 +77,12 @@ def steady_precession(
     offset = nutation_amplitude * np.cos(nutation_phase)
     thetadot = -nutation_amplitude * nutation_frequency(theta, disc, gravity, omega3) * np.sin(nutation_phase)
     d_omega2, d_omega3 = followers(theta, p, q, disc)
-    return State(
-        x=x,
-        y=y,
-        psi=psi,
-        theta=theta + offset,
-        phi=phi,
-        thetadot=thetadot,
-        omega2=p * np.sin(theta) + d_omega2 * offset,
-        omega3=q + d_omega3 * offset,
-    )
+    omega2, omega3 = p * np.sin(theta) + d_omega2 * offset, q + d_omega3 * offset
+    return State(theta=theta + offset, thetadot=thetadot, omega2=omega2, omega3=omega3)
 
 
 def struck_disc(
-    disc: Disc,
-    lateral: float,
-    vertical: float,
-    impulse: float,
-    *,
-    friction: float = 0.0,
-    psi: float = 0.0,
-    phi: float = 0.0,
-    x: float = 0.0,
-    y: float = 0.0,
+    disc: Disc, lateral: float, vertical: float, impulse: float, *, friction: float = 0.0, psi: float = 0.0
 ) -> State:
     """State just after an impulse on the upper face of the upright disc (Ma et al. 2014, figure 3 and table 1).
 
@@ -144,5 +123,5 @@ def struck_disc(
     # at theta = 90 deg: e1 = (cos psi, sin psi, 0), e3 = (sin psi, -cos psi, 0)
     v_x, v_y = float(v[0] * cp + v[2] * sp), float(v[0] * sp - v[2] * cp)
     w1, w2, w3 = (float(w) for w in omega)
-    state = State(x, y, psi, np.pi / 2, phi, w1, w2, w3, v_x, v_y)
+    state = State(psi=psi, theta=np.pi / 2, thetadot=w1, omega2=w2, omega3=w3, v_x=v_x, v_y=v_y)
     return state if normal > 0 else state.moved(z=disc.radius, v_z=float(v[1]))

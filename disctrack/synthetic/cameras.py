@@ -4,8 +4,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from calibration.cameras._brown import distorted
-from calibration.cameras.camera import Camera, StereoRig, placed_at
+from calibration.cameras.camera import Camera, StereoRig, placed_at, project
 from calibration.kit.arrays import Array
 from disctrack.errors import SceneError
 from disctrack.frames import rotation_from_vector
@@ -32,10 +31,7 @@ def views_of(rig: StereoRig) -> list[View]:
 
 def image_of(points_world: Array, view: View) -> Array:
     """Pixels (..., 2) of points (..., 3) [m]; for bounding boxes and truth only."""
-    points = np.asarray(points_world, float) @ view.R_camera_world.T + view.t_camera_world
-    flat, camera = points[..., :2] / points[..., 2:], view.camera
-    x, y, *_ = distorted(flat[..., 0], flat[..., 1], *camera.distortion)
-    return np.stack([camera.fx * x + camera.cx, camera.fy * y + camera.cy], axis=-1)
+    return project(points_world @ view.R_camera_world.T + view.t_camera_world, view.camera)
 
 
 def rig_of(scene: Scene) -> StereoRig:

@@ -103,7 +103,7 @@ def rolling_start(scene: Scene) -> State:
                 "if wanted, friction"
             )
         hit = [start.struck["lateral_mm"] * 1e-3, start.struck["vertical_mm"] * 1e-3, start.struck["impulse_N_s"]]
-        return struck_disc(disc, *hit, friction=start.struck.get("friction", 0.0), **place)
+        return struck_disc(disc, *hit, friction=start.struck.get("friction", 0.0), psi=place["psi"]).moved(**place)
     unknown = set(start.state) - set(State.__dataclass_fields__)
     if unknown:
         known = ", ".join(State.__dataclass_fields__)
@@ -115,9 +115,8 @@ def rolling_start(scene: Scene) -> State:
         omega3=None if np.isnan(start.omega3_rad_s) else start.omega3_rad_s,
         nutation_amplitude=np.radians(start.nutation_deg),
         nutation_phase=np.radians(start.nutation_phase_deg),
-        **place,
     )
-    return regular.moved(**start.state)
+    return regular.moved(**place | start.state)
 
 
 def simulate_scene(scene: Scene) -> Motion:

@@ -70,8 +70,8 @@ class Planting:
 
     sizes: Sequence[float]
     unit: str
-    named_by: tuple[Kind, ...]
     change: Change
+    named_by: tuple[Kind, ...]
     of_views: bool = False  # the recording is calibrated anew, by its own views
 
 
@@ -186,7 +186,7 @@ def _of_catalogue(ground: Ground) -> Iterator[tuple[Fault, Planting]]:
         sizes = [TYPICAL_STEPS * fault.step * size for size in SIZES]
         if fault.in_images:  # the square of an exposure, which ends before the next
             sizes = [size for size in sizes if size * recording.frame_rate**2 < 1]
-        yield fault, Planting(sizes, fault.unit, fault.named_by, partial(change, fault, ground))
+        yield fault, Planting(sizes, fault.unit, partial(change, fault, ground), fault.named_by)
 
 
 def _with(fault: Fault, size: float, disc: Disc, rate: float = 1.0) -> Faults:
@@ -333,42 +333,34 @@ def _wrong(section: str, key: str, *kinds: Kind) -> Planting:
         tree[section][key] *= 1 + size
 
     of_views = section == "calibration"
-    return Planting((1e-3, 1e-2, 1e-1) if of_views else (3e-3, 3e-2, 3e-1), "1", kinds, change, of_views)
+    return Planting((1e-3, 1e-2, 1e-1) if of_views else (3e-3, 3e-2, 3e-1), "1", change, kinds, of_views)
 
 
 _LOST = (Kind.DROPPED_FRAMES, Kind.DELAY, Kind.ONE_SIDED)
 _REPEATED = (Kind.REPEATED_IMAGES,)
-_CALIBRATED = (Kind.CALIBRATION,)
+_of_views = partial(Planting, named_by=(Kind.CALIBRATION,), of_views=True)
 _VIEWS = ("board_left", "board_right")
 CHANGES = {
-    "pairs lost by both": Planting((1, 3, 10), "pairs", (Kind.CLOCK_JUMP,), _files(left=_lost, right=_lost)),
-    "images lost by one": Planting((1, 3, 10, 20), "images", _LOST, _files(left=_last_lost, right=_lost)),
-    "pairs repeated": Planting((1, 3, 10), "pairs", _REPEATED, _files(left=_again, right=_again)),
-    "images repeated by one": Planting((1, 3, 10), "images", _REPEATED, _files(right=_again)),
-    "files damaged": Planting((1, 5, 50), "files", (Kind.UNREADABLE,), _files(right=_damaged)),
-    "glare": Planting((3, 30, 300), "grey values", (Kind.LIGHT, Kind.ONE_SIDED, *MOVED), _images(_lit, "right")),
-    "camera knocked": Planting((0.02, 0.2, 2.0), "px", MOVED, _images(_moved, "right", course=round)),
-    "camera drifts": Planting((0.03, 0.3, 3.0), "px", MOVED, _images(_moved, "right", course=float)),
-    "reversed": Planting((1,), "", (Kind.REVERSED,), _files(**dict.fromkeys(CAMERAS, lambda files, k: files[::-1]))),
-    "exchanged": Planting((1,), "", (Kind.EXCHANGED,), _exchanged),
-    "mirrored": Planting((1,), "", (Kind.MIRRORED,), _images(lambda image, _: cv2.flip(image, 1), "right")),
+    "pairs lost by both": Planting((1, 3, 10), "pairs", _files(left=_lost, right=_lost), (Kind.CLOCK_JUMP,)),
+    "images lost by one": Planting((1, 3, 10, 20), "images", _files(left=_last_lost, right=_lost), _LOST),
+    "pairs repeated": Planting((1, 3, 10), "pairs", _files(left=_again, right=_again), _REPEATED),
+    "images repeated by one": Planting((1, 3, 10), "images", _files(right=_again), _REPEATED),
+    "files damaged": Planting((1, 5, 50), "files", _files(right=_damaged), (Kind.UNREADABLE,)),
+    "glare": Planting((3, 30, 300), "grey values", _images(_lit, "right"), (Kind.LIGHT, Kind.ONE_SIDED, *MOVED)),
+    "camera knocked": Planting((0.02, 0.2, 2.0), "px", _images(_moved, "right", course=round), MOVED),
+    "camera drifts": Planting((0.03, 0.3, 3.0), "px", _images(_moved, "right", course=float), MOVED),
+    "reversed": Planting((1,), "", _files(**dict.fromkeys(CAMERAS, lambda files, k: files[::-1])), (Kind.REVERSED,)),
+    "exchanged": Planting((1,), "", _exchanged, (Kind.EXCHANGED,)),
+    "mirrored": Planting((1,), "", _images(lambda image, _: cv2.flip(image, 1), "right"), (Kind.MIRRORED,)),
     "radius": _wrong("disc", "radius_mm", Kind.RADIUS, *HEIGHT),
     "thickness": _wrong("disc", "thickness_mm", *HEIGHT),
     "dot diameter": _wrong("markers", "diameter_mm", Kind.DIAMETER),
     "gravity": _wrong("gravity", "g_m_s2", Kind.GRAVITY_OR_RATE),
     "square": _wrong("calibration", "square_mm", Kind.SQUARE),
-    "negative views": Planting(
-        (1,), "", _CALIBRATED, _images(lambda image, _: cv2.bitwise_not(image), *_VIEWS), of_views=True
-    ),
-    "repeated views": Planting(
-        (2, 3, 6), "times", _CALIBRATED, _files(**dict.fromkeys(_VIEWS, lambda files, k: k * files)), of_views=True
-    ),
-    "views late in one": Planting(
-        (1, 2, 4),
-        "views",
-        _CALIBRATED,
-        _files(board_left=_last_lost, board_right=lambda files, k: files[k:]),
-        of_views=True,
+    "negative views": _of_views((1,), "", _images(lambda image, _: cv2.bitwise_not(image), *_VIEWS)),
+    "repeated views": _of_views((2, 3, 6), "times", _files(**dict.fromkeys(_VIEWS, lambda files, k: k * files))),
+    "views late in one": _of_views(
+        (1, 2, 4), "views", _files(board_left=_last_lost, board_right=lambda files, k: files[k:])
     ),
 }
 

@@ -37,7 +37,7 @@ class TrueMotion(MotionState):
 def true_motion(theta_deg, duration, k_m=0.381e-7, nutation=0.05, spin=0.0) -> TrueMotion:
     """Rolling from theta to 0.5 deg; `nutation` is the first thetadot over psidot theta, `spin` added to omega_3."""
     theta = np.radians(theta_deg)
-    steady = steady_precession(theta, MA_2014, psi=0.3, phi=0.1, x=0.05, y=0.04)
+    steady = steady_precession(theta, MA_2014).moved(psi=0.3, phi=0.1, x=0.05, y=0.04)
     start = steady.moved(thetadot=nutation * steady.psidot * theta, omega3=steady.omega3 + spin)
     model = Model(MA_2014).with_values({"km.k_m": k_m})
     return of_simulation(simulate(model, start, duration, theta_end=np.radians(0.5)))

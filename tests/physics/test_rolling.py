@@ -46,7 +46,7 @@ def test_nutation_to_precession_ratio(disc, theta_deg, ratio):
 @pytest.mark.parametrize("omega3", [None, -2.0, 3.0])
 def test_steady_precession_stays_steady(theta_deg, omega3):
     theta = np.radians(theta_deg)
-    motion = rolling.simulate(IDEAL, steady_precession(theta, MA_2014, omega3=omega3, psi=0.4, x=0.01), 0.5)
+    motion = rolling.simulate(IDEAL, steady_precession(theta, MA_2014, omega3=omega3).moved(psi=0.4, x=0.01), 0.5)
     assert_allclose(motion.q[:, 4], theta, atol=1e-9)  # integration error over 20-200 rad of precession
 
 
@@ -155,7 +155,8 @@ def test_slip_ends_where_an_independent_integration_ends_it_and_rolling_goes_on(
 
 def test_a_stiff_table_does_not_change_when_the_disc_slips():
     """Sinking by a nanometre moves switches by microseconds, and slip that has just begun is no harder to follow."""
-    state = steady_precession(np.radians(20), MA_2014, omega3=1.0, nutation_amplitude=np.radians(0.5), psi=0.5, phi=1.0)
+    steady = steady_precession(np.radians(20), MA_2014, omega3=1.0, nutation_amplitude=np.radians(0.5))
+    state = steady.moved(psi=0.5, phi=1.0)
     stiff = slippery(0.1, CATALOGUE["km"](), CATALOGUE["table_yielding"](c=1e-8))
     motions = [rolling.simulate(m, state, 0.3) for m in (slippery(0.1, CATALOGUE["km"]()), stiff)]
     switches = [np.array([s.time for s in motion.switches]) for motion in motions]
@@ -283,7 +284,7 @@ def test_impact_balances_momentum_and_the_edge_does_not_go_down(a, b, friction):
 
 def test_struck_disc_slips_first_and_rolls_later_while_energy_falls():
     model = Model(MA_2014, effects=(CATALOGUE["km"](), CATALOGUE["slip"](mu=0.1)))
-    state = struck_disc(MA_2014, 0.020, 0.0105, 0.05, friction=0.1, x=0.03)
+    state = struck_disc(MA_2014, 0.020, 0.0105, 0.05, friction=0.1).moved(x=0.03)
     motion = rolling.simulate(model, state, 3.0)
     assert motion.regime[0] == Regime.SLIPPING
     assert motion.regime[-1] == Regime.ROLLING

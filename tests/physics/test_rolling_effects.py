@@ -94,10 +94,8 @@ def test_power_relative_to_the_published_rolling_friction(name):
         theta = np.radians(theta_deg)
         state = steady_precession(theta, MA_2014)
         z = MA_2014.radius * np.sin(theta) + MA_2014.half_thickness * np.cos(theta)
-        motion = instants(
-            np.array([[0, 0, z, 0, theta, 0]]),
-            np.array([[0, 0, 0, state.psidot, 0, state.omega3 - state.omega2 / np.tan(theta)]]),
-        )
+        phidot = state.omega3 - state.omega2 / np.tan(theta)
+        motion = instants(np.array([[0, 0, z, 0, theta, 0]]), np.array([[0, 0, 0, state.psidot, 0, phidot]]))
         load = [MA_2014.mass * 9.81]
         power = effect_power(CATALOGUE[name](), motion, load) / effect_power(CATALOGUE["km"](), motion, load)
         digits = len(f"{share:g}".split(".")[-1]) if share else 4

@@ -150,7 +150,9 @@ def test_motion_agrees_with_the_world_vector_integration(name):
     """Tolerances: accumulated errors of two integrators at 1e-11; with k_z, its sign smoothed over 0.01 rad/s."""
     tolerance = 1e-6 if name == "friction" else 2e-9
     model, oracle = pair(name)
-    state = rolling.steady_precession(np.radians(18), MA_2014, omega3=1.5, nutation_amplitude=np.radians(2), psi=0.3)
+    state = rolling.steady_precession(np.radians(18), MA_2014, omega3=1.5, nutation_amplitude=np.radians(2)).moved(
+        psi=0.3
+    )
     times = np.linspace(0, 0.25, 26)
     motion = rolling.simulate(model, state, times=times)
     solution = newton_euler.follow(oracle, newton_euler.state_from_angles(oracle, *state.array), times)
@@ -164,7 +166,9 @@ def test_motion_agrees_with_the_world_vector_integration(name):
 def test_a_table_that_gives_way_follows_the_load_of_the_rigid_one(slip, c):
     """The oracle's table moves as the load on a rigid one would let it sink: the same to first order in c."""
     rigid, oracle = model_with(K_M | COM_EFFECT), newton_euler.Disc(laws=[KM_LAW], com_body=COM)
-    start = rolling.steady_precession(np.radians(18), MA_2014, omega3=1.5, nutation_amplitude=np.radians(2), psi=0.3)
+    start = rolling.steady_precession(np.radians(18), MA_2014, omega3=1.5, nutation_amplitude=np.radians(2)).moved(
+        psi=0.3
+    )
     regime, fine, most = "rolling", np.linspace(0, 0.25, 1001), 1500 * c  # second order: 9e-5 and 9e-4
     if slip:  # friction's direction is held for 0.1 ms
         v_x, v_y = rolling.simulate(rigid, start, times=[0.0]).qdot[0, :2] + slip
@@ -192,7 +196,9 @@ def test_a_table_that_gives_way_follows_the_load_of_the_rigid_one(slip, c):
 def test_a_contact_that_creeps_is_one_that_slips_on_a_film(c, most):
     """The oracle slips with its inertia; ours follows the force by a series, by which 0.02 would err by a per cent."""
     rigid = model_with(K_M | COM_EFFECT)
-    start = rolling.steady_precession(np.radians(16), MA_2014, omega3=1.5, nutation_amplitude=np.radians(1), psi=0.3)
+    start = rolling.steady_precession(np.radians(16), MA_2014, omega3=1.5, nutation_amplitude=np.radians(1)).moved(
+        psi=0.3
+    )
     oracle = newton_euler.Disc(laws=[KM_LAW], com_body=COM, friction=lambda speed: speed / c)
     state = newton_euler.state_from_angles(oracle, *start.array)
     force = newton_euler.accelerations(oracle, state, "rolling")[2]

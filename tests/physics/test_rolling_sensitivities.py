@@ -22,7 +22,7 @@ from disctrack.rolling.records import ROLLING_COMPONENTS
 from disctrack.rolling.simulate import COMPONENTS, Assembly, moved_start, responses, symmetries
 from disctrack.synthetic.description import Scene
 
-STATE = steady_precession(np.radians(15), MA_2014, omega3=2.5, nutation_amplitude=0.03, psi=0.4, phi=-1.0, x=0.02)
+STATE = steady_precession(np.radians(15), MA_2014, omega3=2.5, nutation_amplitude=0.03).moved(psi=0.4, phi=-1.0, x=0.02)
 TIMES = np.linspace(0, 0.3, 31)
 MODEL = Model(MA_2014, effects=(CATALOGUE["km"](), CATALOGUE["slip"](mu=0.8)))
 PARAMETERS = [f"{e.name}.{p.name}" for e in CATALOGUE.values() for p in e.parameters if e.name != "slip"]

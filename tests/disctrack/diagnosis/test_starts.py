@@ -32,9 +32,8 @@ PAPER = Model(DISC).with_values({"km.k_m": K_M})
 
 def start(theta_deg=16.0, slip=None):
     """Regular precession; slip : (2,) velocity [m/s] by which the contact differs from rolling."""
-    state = steady_precession(
-        np.radians(theta_deg), DISC, omega3=1.0, nutation_amplitude=np.radians(0.4), psi=0.7, phi=-1.0, x=0.032, y=0.02
-    )
+    state = steady_precession(np.radians(theta_deg), DISC, omega3=1.0, nutation_amplitude=np.radians(0.4))
+    state = state.moved(psi=0.7, phi=-1.0, x=0.032, y=0.02)
     if slip is None:
         return state
     v = simulate(PAPER, state, times=[0.0, 1e-4]).qdot[0, :2]
