@@ -1,8 +1,9 @@
 """Images in memory: what the cameras of a rig see of discs and boards, with the look and the noise of a scene.
 
-Of a scene its disc, rig, motion and faults (but for occluders) are not used here.
+Of a scene its disc, rig, motion and faults (but for occluders and the place of the paper) are not used here.
 """
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -39,7 +40,8 @@ def expected_disc(
 
     def picture(i, c, stage):
         pose = partial(lambda at, rate, dt: at + dt[:, None] * rate, q[i], rates[i])
-        return expected_disc_image(pose, exposure, i, stage, scene, disc, visible=seen[i, c])
+        drawn = replace(disc, marker_centres_body=disc.marker_centres_body[seen[i, c]])
+        return expected_disc_image(pose, exposure, i, stage, scene, drawn)
 
     return np.array([[picture(i, c, stage) for c, stage in enumerate(stages(rig, scene))] for i in range(len(q))])
 

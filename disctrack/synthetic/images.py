@@ -4,10 +4,9 @@ from collections.abc import Callable
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from calibration.cameras.camera import Camera, StereoRig
-from calibration.kit.arrays import Array, Array32, Mask
+from calibration.kit.arrays import Array, Array32
 from disctrack.disc import Disc
 from disctrack.faults.keys import Occluder
 from disctrack.frames import CAMERAS, rotation_from_euler
@@ -56,18 +55,11 @@ def _stage(index: int, camera: Camera, R: bytes, t: bytes, scene: Scene) -> Stag
 
 
 def expected_disc_image(
-    pose: PoseOverExposure,
-    exposure: float,
-    frame: int,
-    stage: Stage,
-    scene: Scene,
-    disc: Disc,
-    paper_centre_body: ArrayLike = (0.0, 0.0),
-    visible: Mask | None = None,
+    pose: PoseOverExposure, exposure: float, frame: int, stage: Stage, scene: Scene, disc: Disc
 ) -> Array32:
     """Expected grey values (height, width) of one exposure [s]; `pose` gives q around mid exposure.
 
-    disc : the true one, its dots where they are printed   visible : (m,) of the dots
+    disc : the true one, with the dots that are on it, where they are printed
 
     Light is gathered at the nodes of a Gauss-Legendre rule over the exposure, at least one node per 0.8 px of motion:
     the mean and the variance of the path are exact from two nodes on.
@@ -83,12 +75,11 @@ def expected_disc_image(
         # the window with the reach of the blur on each side; padded coordinates start `pad` before the image
         table = stage.cells[y0 * s : (y1 + 2 * pad) * s, x0 * s : (x1 + 2 * pad) * s]
         body, face = np.zeros_like(table), np.zeros_like(table)  # share of the disc; grey of its face above its side
-        dots = disc.marker_centres_body[np.ones(disc.n_markers, bool) if visible is None else visible]
         whole, around = raster.body_shape(disc.radius, _top(disc)), _rims(disc.radius, _top(disc))
         for q_now, weight in zip(q, weights, strict=True):
             place = rotation_from_euler(*q_now[3:]), q_now[:3]
             _add(body, weight, stage, (x0, y0), place, whole, around)
-            for step, centre, radius in _face(stage, place, disc, dots, paper_centre_body, scene):
+            for step, centre, radius in _face(stage, place, disc, scene):
                 shape = raster.round_shape(centre[2], (centre[0], centre[1]), radius, disc.radius)
                 _add(face, weight * step, stage, (x0, y0), place, shape, centre + radius * _RING)
         cells = table + body * (scene.appearance.side - table) + face
@@ -120,12 +111,10 @@ def _add(
         raster.add_shape(near, step, rays, view.R_camera_world @ R, R.T @ (view.centre - t), shape)
 
 
-def _face(
-    stage: Stage, place: Place, disc: Disc, dots: Array, paper_centre: ArrayLike, scene: Scene
-) -> list[tuple[float, Array, float]]:
+def _face(stage: Stage, place: Place, disc: Disc, scene: Scene) -> list[tuple[float, Array, float]]:
     """The circles on the face that a camera sees: step of grey, centre in body axes, radius."""
-    (R, t), look = place, scene.appearance
-    top = _top(disc)
+    (R, t), look, top = place, scene.appearance, _top(disc)
+    paper = np.array([*scene.faults.pattern_offset_mm, 1e3 * top]) * 1e-3
     height = float(R[:, 2] @ (stage.view.centre - t))
     light = optics.face_brightness(np.sign(height) * R[:, 2], scene)
     if abs(height) <= top:
@@ -134,14 +123,17 @@ def _face(
         return [(look.underside * light - look.side, np.array([0.0, 0.0, -top]), disc.radius)]
     return [
         (look.rim * light - look.side, np.array([0.0, 0.0, top]), disc.radius),
-        ((look.paper - look.rim) * light, np.append(paper_centre, top), disc.radius - 1e-3 * look.rim_width_mm),
-        *(((look.dot - look.paper) * light, np.array([x, y, top]), disc.marker_diameter / 2) for x, y, _ in dots),
+        ((look.paper - look.rim) * light, paper, disc.radius - 1e-3 * look.rim_width_mm),
+        *(
+            ((look.dot - look.paper) * light, np.array([x, y, top]), disc.marker_diameter / 2)
+            for x, y, _ in disc.marker_centres_body
+        ),
     ]
 
 
 def _top(disc: Disc) -> float:
     """Height of the dots over the disc's middle [m]: half the thickness, unless the paper lies higher."""
-    return float(disc.marker_centres_body[:, 2].mean())
+    return float(disc.marker_centres_body[:, 2].mean() if disc.n_markers else disc.half_thickness)
 
 
 def _exposure_rule(pose: PoseOverExposure, exposure: float, stage: Stage, disc: Disc) -> tuple[Array, Array]:

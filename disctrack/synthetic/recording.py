@@ -14,7 +14,7 @@ from scipy.interpolate import PPoly
 
 from calibration.cameras.camera import StereoRig
 from calibration.kit.arguments import checked
-from calibration.kit.arrays import Array, Array32, Image, Mask
+from calibration.kit.arrays import Array, Array32, Image
 from calibration.rig_file import write_rig_group
 from disctrack.disc import AIR_DENSITY, Disc
 from disctrack.errors import OutputError, told_as
@@ -45,8 +45,6 @@ class Truth:
     rig: StereoRig  # while the chessboard was shown
     rig_while_filming: StereoRig  # while the disc was filmed
     disc: Disc  # with the true centres of the dots
-    paper_centre_body: Array  # (2,) [m]
-    markers_printed: Mask  # (m,) False for dots that have come off
     R_world_board: Array  # (v, 3, 3) of the calibration views
     t_world_board: Array  # (v, 3) [m]
     effects: dict[str, float]  # "effect.parameter" of the rolling model, SI
@@ -129,8 +127,6 @@ def true_disc_of(scene: Scene) -> Disc:
 def _truth(scene: Scene, pose: PPoly, n_frames: int, rig: StereoRig) -> Truth:
     rate, faults = true_frame_rate(scene), scene.faults
     time = faults.true_times(np.arange(n_frames) / rate, rate)
-    visible = np.ones(scene.declared_disc.n_markers, bool)
-    visible[list(faults.hidden_markers)] = False
     R, t = board_poses(scene, rig)
     return Truth(
         time=time,
@@ -141,8 +137,6 @@ def _truth(scene: Scene, pose: PPoly, n_frames: int, rig: StereoRig) -> Truth:
         rig=rig,
         rig_while_filming=cameras_with(faults, rig),
         disc=true_disc_of(scene),
-        paper_centre_body=np.array(faults.pattern_offset_mm) * 1e-3,
-        markers_printed=visible,
         R_world_board=R,
         t_world_board=t,
         effects=dict(rolling_model(scene).values) if scene.motion.kind == "rolling" else {},
@@ -164,12 +158,13 @@ def _boards(part: Path, scene: Scene, truth: Truth) -> Iterator[Job]:
 
 def _frames(part: Path, scene: Scene, pose: PPoly, truth: Truth) -> Iterator[Job]:
     exposure = 0.0 if scene.motion.kind == "static" else true_exposure(scene)
-    looks = (scene, truth.disc, truth.paper_centre_body, truth.markers_printed)
+    dots = np.delete(truth.disc.marker_centres_body, scene.faults.hidden_markers, axis=0)
+    drawn = replace(truth.disc, marker_centres_body=dots)
     for c, stage in enumerate(stages(truth.rig_while_filming, scene)):
         missing = (scene.faults.left, scene.faults.right)[c].missing_frames
         for i in sorted(set(range(len(truth.time))) - set(missing)):
             around = partial(lambda mid, dt: pose(mid + dt), truth.time[i] + c * _delay(scene))
-            picture = partial(expected_disc_image, around, exposure, i, stage, *looks)
+            picture = partial(expected_disc_image, around, exposure, i, stage, scene, drawn)
             yield part / stage.name / f"{i:06d}.png", partial(_exposed, picture, scene, [scene.seed, 4, c, i])
 
 
@@ -221,14 +216,16 @@ def recording_toml(scene: Scene) -> str:
 def _write_truth(path: Path, truth: Truth, scene: Scene) -> None:
     """Write `truth` and the scene it was rendered from."""
     pose, disc = ", ".join(f"{c} {'m' if c in 'xyz' else 'rad'}" for c in COORDINATES), truth.disc
+    paper, printed = np.array(scene.faults.pattern_offset_mm) * 1e-3, np.ones(disc.n_markers, np.uint8)
+    printed[list(scene.faults.hidden_markers)] = 0
     datasets = (
         ("time", truth.time, "s", "mid exposure of the left camera"),
         ("q", truth.q, pose, "pose at time, world frame = table"),
         ("qdot", truth.qdot, "m/s, rad/s", "rates of q at time"),
         ("q_right", truth.q_right, pose, "pose at the right camera's mid exposure"),
         ("markers_px", truth.markers_px, "px", "images of the dots' own centres (frame, camera, marker, xy)"),
-        ("disc/paper_centre_body", truth.paper_centre_body, "m", "centre of the paper on the upper face"),
-        ("disc/markers_printed", truth.markers_printed.astype(np.uint8), "1", "0: the dot has come off"),
+        ("disc/paper_centre_body", paper, "m", "centre of the paper on the upper face"),
+        ("disc/markers_printed", printed, "1", "0: the dot has come off"),
         ("disc/marker_centres_body", disc.marker_centres_body, "m", "true centres of the dots"),
         ("disc/declared_marker_centres_body", scene.declared_disc.marker_centres_body, "m", "as in recording.toml"),
         ("board/R_world_board", truth.R_world_board, "1", "orientation of the board in the calibration views"),

@@ -444,7 +444,6 @@ def test_images_with_a_fault_show_the_dots_where_the_truth_has_them(scene, tmp_p
     faultless = scene.declared_disc.marker_centres_body @ rotation_from_euler(*START[3:]).T + START[:3]
     assert np.abs(truth.markers_px[0] - rig_of(scene).project(faultless)).max() > 0.5
     assert_allclose(truth.q_right - truth.q, np.tile(VELOCITY * faults.right_delay_s, (4, 1)), atol=1e-12)
-    assert_allclose(truth.paper_centre_body, 1e-3 * np.array(faults.pattern_offset_mm))
 
 
 def test_wrong_frame_rate_stretches_the_motion(scene, tmp_path):
