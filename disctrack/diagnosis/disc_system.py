@@ -16,11 +16,11 @@ from disctrack.diagnosis.law_library import LearnedLaw
 from disctrack.diagnosis.missing_force import DiscScan, response
 from disctrack.diagnosis.motion import (
     SLIP,
-    SLIP_VELOCITY,
     THETA_END,
     measurement_candidates,
     model_quantities,
     motion_candidates,
+    slip_start,
     state_of,
     state_quantities,
 )
@@ -67,14 +67,14 @@ class DiscSystem(System):
         *,
         rows: slice | None = None,
         systematic: Systematic | None = None,
-        freed: tuple[Candidate, ...] = (),
+        slips: bool = False,
         known: Values | None = None,
     ) -> None:
         """Model : declared disc, gravity and effects; the parameters of its effects are fitted in every fit.
 
         candidates : by default all effects and faults of the catalogues
         rows : frames that are used; by default those of `free_stretch`
-        freed : slip at the start, if it is certain: every fit moves its quantities
+        slips : the disc slips at first: every fit moves the quantities of `slip_start`
         known : faults of the measurement that are held at these values; tolerances are about them
         systematic : prior standard deviations of the random fields that are fitted as nuisances
         Raises AnalysisError.
@@ -104,12 +104,11 @@ class DiscSystem(System):
         self.budget = Budget(MOST_WORK * max(len(self.time), USUAL))
         if candidates is None:
             candidates = (*motion_candidates(model), *measurement_candidates(self.disc))
-        of_freed = tuple(q for c in freed for q in c.quantities)
-        self.starts_in_slip = any(q.name in SLIP_VELOCITY for q in of_freed)
-        fitted = (*state_quantities(), *model_quantities(model), *of_freed)
+        self.slips, of_slip = slips, slip_start(model).quantities if slips else ()
+        fitted = (*state_quantities(), *model_quantities(model), *of_slip)
         sizes = tuple(self._sizes({q.name for q in fitted}))
         # a table determined from the rim has its own plane in each recording, which is no fault
-        in_base = {q.name for q in (*of_freed, *(q for q in sizes if not q.belongs_to))}
+        in_base = {q.name for q in (*of_slip, *(q for q in sizes if not q.belongs_to))}
         self.candidates = tuple(c for c in candidates if not in_base & set(c.names))
         nuisances, self._nuisance_columns = self._nuisances()
         self._nuisance_column = {q.name: i for i, q in enumerate(nuisances)}
@@ -204,7 +203,7 @@ class DiscSystem(System):
     def again(self, candidates: tuple[Candidate, ...] | None = None, **other: Any) -> DiscSystem:
         """A system of the same recording and model, with the same budget; rows, fields and known faults as here.
 
-        Candidates and freed quantities are the defaults if not given.
+        Candidates and `slips` are the defaults if not given.
         """
         same = {"rows": self.rows, "systematic": self.systematic, "known": self.known}
         system = DiscSystem(self.trajectory, self.model, candidates, **{**same, **other})
@@ -375,7 +374,7 @@ class DiscSystem(System):
         # a step of the fit may lead to states in which no disc rolls, or whose integration does not end
         fastest = 3 * np.sqrt(4 * model.gravity / (self.disc.radius * np.sin(THETA_END)))
         nowhere = not THETA_END < state.theta <= np.pi / 2 or max(abs(state.psidot), abs(state.omega3)) > fastest
-        if nowhere or (self.starts_in_slip and model.effect("slip") is None):  # 1/mu = 0: no velocity is free
+        if nowhere or (self.slips and model.effect("slip") is None):  # 1/mu = 0: no velocity is free
             nothing = np.full((2, len(times), 6), np.nan)
             return (nothing, nothing), (), still
         components = [n for n in names if n.startswith("state.")]

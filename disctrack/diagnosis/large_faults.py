@@ -80,7 +80,7 @@ def large_faults(as_tracked: Trajectory, system: DiscSystem, first: Systematic) 
     known, former = system.known, dict[frozenset[str], dict[str, float]]()
     likeliest, found = system, first
     for faults in (SINGLE, DOUBLE):
-        if not _is_large(likeliest, found):
+        if max(found.faults_px, found.lens_px, found.dot_px) < LARGE_PX:
             break
         former.clear()
         estimates = [(*_static_estimate(system.trajectory, names, known), names) for names in faults]
@@ -95,14 +95,6 @@ def large_faults(as_tracked: Trajectory, system: DiscSystem, first: Systematic) 
             former[frozenset(names)] = likeliest.start()
         found = find_systematic(likeliest)
     return (likeliest.again(systematic=found), former) if former else None
-
-
-def _is_large(system: DiscSystem, found: Systematic) -> bool:
-    """Do systematic errors of the dots move them by so much that they are no longer linear?"""
-    _, columns = system.about_poses(system.known).linearise(system.known, list(found.amounts))
-    moved = columns @ np.array(list(found.amounts.values()))
-    moved_px = float(np.sqrt(np.sum(moved**2) / np.sum(system.weights))) / system.per_px
-    return max(moved_px, found.lens_px, found.dot_px) >= LARGE_PX
 
 
 def _static_estimate(trajectory: Trajectory, names: Sequence[str], known: Values) -> tuple[float, dict[str, float]]:

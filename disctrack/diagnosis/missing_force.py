@@ -33,7 +33,6 @@ if TYPE_CHECKING:
 PROBES_PER_TURN = 7  # of the fastest angle, so that a moment locked to it is resolved
 MAX_PROBES = 90
 WIDTH = 0.7  # standard deviation of a probe over the spacing of the probes: their sum is flat to 1e-4
-CORRELATED = 0.3  # share of chi-square to first order, from which the report names the law that the moment follows
 INSTANTS_PER_SECOND = 1000.0  # of the responses: Simpson's rule errs by 0.4 % at 150 Hz
 INVISIBLE = 1e-8  # share of a column's power after projection, below which the data do not determine it
 CHUNK = 120  # families of the library that are evaluated at a time
@@ -108,9 +107,8 @@ def missing_text(system: DiscSystem, fit_: Fit) -> str:
     missing, _ = missing_moment(blocks)
     gains = scan.gains(family for family in scan.library() if not family.shape and family.n_numbers <= 2)
     best = max(gains, key=lambda g: g.gain)
-    text = f"missing in the model is {missing.text}"
-    share = best.gain / scan.chi_square
-    return f"{text}; {100 * share:.0f} % of it is described by {best.family.title}" if share > CORRELATED else text
+    share = 100 * best.gain / scan.chi_square
+    return f"missing in the model is {missing.text}; {share:.0f} % of it is described by {best.family.title}"
 
 
 def response(system: DiscSystem, fit_: Fit) -> Response | None:

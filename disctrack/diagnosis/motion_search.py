@@ -120,7 +120,7 @@ def _slips_slowly(settings: Settings, rolling: DiscSystem) -> bool:
     With friction slightly below what rolling needs, the contact slips at mm/s, which the first poses do not show but a
     fit does. That three quantities explain all residuals by chance is impossible.
     """
-    slipping = rolling.again(freed=(slip_start(rolling.model),))
+    slipping = rolling.again(slips=True)
     try:
         with slipping.budget.trial(slipping.trial_steps):
             alone = fit(slipping, slipping.base, slipping.start(), TRIAL)
@@ -154,7 +154,7 @@ def _onset(rolling: DiscSystem) -> RollingOnset | None:
 
 def _slipping(settings: Settings, rolling: DiscSystem, base: Fit, onset: RollingOnset | None) -> Answer:
     """The diagnosis with slip at first; or of the rolling after it, if no coefficient describes the slip."""
-    system = rolling.again(freed=(slip_start(rolling.model),))
+    system = rolling.again(slips=True)
     diagnosis = explain(system, system.start(), settings)
     if diagnosis.verdict == "unexplained" and onset is not None:
         later = _after_slip(settings, rolling, onset, diagnosis)

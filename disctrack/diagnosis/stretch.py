@@ -16,8 +16,7 @@ MIN_FRAMES = 40
 AT_REST = 0.3  # [rad/s] a rolling disc rotates at 3 rad/s or more, 10 ms after it was released
 REST_SIGMAS = 6.0  # of the rotation between two poses, below which it may be noise
 HAND = 0.005  # [s] next to a rest, in which a hand may still touch the disc
-FIRST_WINDOW = 0.02  # [s] in which the initial state is estimated from the poses
-FIRST_POSES = 6  # in it at least
+FIRST_POSES = 6  # among the first 20 frames at least, from which the initial state is estimated
 HELD = "the disc is at rest or held"
 OTHERWISE = ("the disc lies flat", HELD, "the disc slips")  # reasons why frames are not of a free motion
 
@@ -83,7 +82,6 @@ def at_rest(trajectory: Trajectory, measured: Rows) -> Mask:
 def _dense_start(time: Array, first: int) -> int:
     """The first frame from `first` on that is followed by enough others for an estimate of the state."""
     interval = float(np.median(np.diff(time))) if len(time) > 1 else 1.0
-    window = max(FIRST_WINDOW, 10 * interval)
-    following = np.searchsorted(time, time + window, side="right") - np.arange(len(time))
+    following = np.searchsorted(time, time + 20 * interval, side="right") - np.arange(len(time))
     dense = np.flatnonzero(following[first:] >= FIRST_POSES)
     return first + int(dense[0]) if dense.size else len(time)

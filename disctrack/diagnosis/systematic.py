@@ -10,12 +10,11 @@ components that no pose absorbs. The same fields, with these priors, are then fi
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from itertools import chain, pairwise
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 from scipy.stats import chi2
 
@@ -90,8 +89,7 @@ class Systematic:
     dot_px: float = 0.0  # rms of each dot's own field in each camera
     dot_length_px: float = 200.0
     print_m: float = 0.0  # rms error of the dots' positions on the face, per coordinate
-    gain: float = 0.0  # increase of twice the log likelihood over that of noise alone
-    amounts: dict[str, float] = field(default_factory=dict)  # of the faults of the measurement that were found
+    faults_px: float = 0.0  # rms by which faults of the measurement move the dots, per coordinate
     lens_places: tuple[Array, ...] = ()  # positions in each camera, of all recordings that share its field
     left: float = 1.0  # remaining variance over the noise, of the components that no pose absorbs
 
@@ -164,38 +162,28 @@ class Likelihood:
         columns = np.concatenate(list(groups.values()), axis=1)
         self._gram, self._inner, self._power = columns.T @ columns, columns.T @ data, float(data @ data)
 
-    def twice_log(self, sizes: Mapping[str, float]) -> float:
-        """Twice the log likelihood at these sizes, up to a constant; the size of all other groups is zero."""
-        root, known, *_ = self._solved(sizes)
-        return float(known @ known - 2 * np.sum(np.log(np.diag(root))) - self._power)
+    def at(self, sizes: Mapping[str, float]) -> tuple[float, dict[str, Array], float]:
+        """Twice the log likelihood at these sizes, up to a constant; the most probable numbers, and chi-square there.
 
-    def left(self, sizes: Mapping[str, float]) -> float:
-        """Chi-square of data and numbers at the most probable numbers."""
-        return self._power - float(np.sum(self._solved(sizes)[1] ** 2))
-
-    def amounts(self, sizes: Mapping[str, float], name: str) -> Array:
-        """Most probable numbers of one group, in the units of its columns."""
-        root, known, index, scaled = self._solved(sizes)
-        values = np.zeros(len(self._inner))
-        values[index] = scaled * solve_triangular(root, known, lower=True, trans=1)
-        return values[self._slices[name]]
-
-    def _solved(self, sizes: Mapping[str, float]) -> tuple[Array, Array, NDArray[np.intp], Array]:
-        scaled = np.zeros(len(self._inner))
-        for name, size in sizes.items():
-            scaled[self._slices[name]] = size
-        index = np.flatnonzero(scaled > 0)
-        scaled = scaled[index]
-        root = np.linalg.cholesky(self._gram[np.ix_(index, index)] * np.outer(scaled, scaled) + np.eye(len(index)))
-        return root, solve_triangular(root, scaled * self._inner[index], lower=True), index, scaled
+        The size of a group that is not named is zero. The numbers are by group, in the units of its columns.
+        """
+        scale = np.concatenate([np.full(part.stop - part.start, sizes.get(g, 0.0)) for g, part in self._slices.items()])
+        used, numbers = scale > 0, np.zeros(len(scale))
+        gram = self._gram[np.ix_(used, used)] * np.outer(scale[used], scale[used])
+        root = np.linalg.cholesky(gram + np.eye(len(gram)))
+        known = solve_triangular(root, (scale * self._inner)[used], lower=True)
+        numbers[used] = scale[used] * solve_triangular(root, known, lower=True, trans=1)
+        chi_square = self._power - float(known @ known)
+        twice_log = -chi_square - 2.0 * float(np.sum(np.log(np.diag(root))))
+        return twice_log, {name: numbers[part] for name, part in self._slices.items()}, chi_square
 
 
 Sizes = dict[str, float]
 
 
-def _best_sizes(evidence: Likelihood, sizes: Sizes, grids: Mapping[str, Array]) -> tuple[float, Sizes]:
+def _best_sizes(likelihood: Likelihood, sizes: Sizes, grids: Mapping[str, Array]) -> tuple[float, Sizes]:
     """Sizes of the groups in `grids` that maximise the likelihood, by coordinate ascent on their grids."""
-    best, before = evidence.twice_log(sizes), -np.inf
+    best, before = likelihood.at(sizes)[0], -np.inf
     while best - before >= 1.0:
         before = best
         for name, grid in grids.items():
@@ -203,7 +191,7 @@ def _best_sizes(evidence: Likelihood, sizes: Sizes, grids: Mapping[str, Array]) 
             for way in (grid[here + 1 :], grid[: max(here, 0)][::-1]):
                 for size in way.tolist():
                     trial = sizes | {name: size}
-                    value = evidence.twice_log(trial)
+                    value = likelihood.at(trial)[0]
                     if value <= best:
                         break
                     best, sizes = value, trial
@@ -211,12 +199,12 @@ def _best_sizes(evidence: Likelihood, sizes: Sizes, grids: Mapping[str, Array]) 
 
 
 def _with_faults(
-    evidence: Likelihood, sizes: Sizes, faults: Mapping[str, float]
+    likelihood: Likelihood, sizes: Sizes, faults: Mapping[str, float]
 ) -> tuple[float, Sizes, tuple[str, ...]]:
     """Forward selection of the faults that increase the likelihood at these sizes."""
-    best, chosen = evidence.twice_log(sizes), tuple[str, ...]()
+    best, chosen = likelihood.at(sizes)[0], tuple[str, ...]()
     while True:
-        trials = {name: evidence.twice_log(sizes | {name: size}) for name, size in faults.items() if name not in sizes}
+        trials = {name: likelihood.at(sizes | {name: size})[0] for name, size in faults.items() if name not in sizes}
         name = max(trials, key=lambda n: trials[n], default="")
         if not name or trials[name] < best + WORTH:
             return best, sizes, chosen
@@ -251,9 +239,9 @@ def find_systematic(system: DiscSystem) -> Systematic:
     def field(length: float, own: bool = False) -> Array:
         return across(view.whitened(field_columns(places, used, length, size, own))[rows])
 
-    of_poses = {fault.name: fault.names() for fault in system.faults if fault.of_poses_alone}
-    typical = {fault.name: TYPICAL_STEPS * fault.step for fault in system.faults}
-    faults = {name: columns_by(quantities) for name, quantities in of_poses.items()}
+    typical = {fault.name: TYPICAL_STEPS * fault.step for fault in system.faults if fault.of_poses_alone}
+    by_fault = {f.name: view.linearise(known, f.names())[1][rows] for f in system.faults if f.name in typical}
+    faults = {name: across(columns) for name, columns in by_fault.items()}
     faults = {name: columns for name, columns in faults.items() if np.linalg.norm(columns) * typical[name] > 3.0}
     groups = {"rig": columns_by([q.name for q in system.base if q.owner == "rig"]), **faults}
     groups["print"] = columns_by([f"dot_{i}.{axis}" for i in range(system.disc.n_markers) for axis in "xy"])
@@ -261,18 +249,20 @@ def find_systematic(system: DiscSystem) -> Systematic:
     steps: Array = size / view.per_px * 2.0 ** np.arange(-7, 4.5, 1.0)
     grids = {"print": DOT_SIGMA * 2.0 ** np.arange(7.0), "lens": steps, "dot": steps}
     start, offered = {"rig": 1.0, "print": DOT_SIGMA}, {name: typical[name] for name in faults}
-    nothing, best = Likelihood(data, groups).twice_log(start), Systematic(gain=-np.inf)
-    for share in (0.0, *LENS_LENGTHS):  # without any field, and with fields of the cameras as long
+    found, most = Systematic(), -np.inf
+    for share in (0.0, *LENS_LENGTHS):  # without any field, and with fields of the cameras of these lengths
         sought, fields = (grids, {"lens": field(share * extent)}) if share else ({}, {})
-        evidence = Likelihood(data, groups | fields)
-        value, sizes = _best_sizes(evidence, dict(start), sought)
-        value, sizes, chosen = _with_faults(evidence, sizes, offered)
-        if chosen:  # the fault has reduced the fields
-            value, sizes = _best_sizes(evidence, start | {name: typical[name] for name in chosen}, sought)
-        print_m, left = sizes["print"] if sizes["print"] > DOT_SIGMA else 0.0, max(1.0, evidence.left(sizes) / numbers)
+        likelihood = Likelihood(data, groups | fields)
+        value, sizes = _best_sizes(likelihood, dict(start), sought)
+        value, sizes, chosen = _with_faults(likelihood, sizes, offered)
+        if chosen:  # the faults have reduced the fields
+            value, sizes = _best_sizes(likelihood, start | {name: typical[name] for name in chosen}, sought)
+        if share and value < most + WORTH:
+            continue
+        _, amounts, chi_square = likelihood.at(sizes)
+        moved = float(np.linalg.norm(sum(by_fault[name] @ amounts[name] for name in chosen)))
         lens, dot = (sizes.get("lens", 0.0), share * extent), (sizes.get("dot", 0.0), DOT_LENGTH * extent)
-        amounts = (zip(of_poses[name], evidence.amounts(sizes, name).tolist(), strict=True) for name in chosen)
-        found = Systematic(*lens, *dot, print_m, value - nothing, dict(chain(*amounts)), left=left if share else 1.0)
-        if not share or (found.present and found.gain > best.gain + WORTH):
-            best = found
-    return best
+        print_m, left = sizes["print"] if sizes["print"] > DOT_SIGMA else 0.0, max(1.0, chi_square / numbers)
+        faults_px = moved / float(np.sqrt(np.sum(view.weights[rows]))) / view.per_px
+        found, most = Systematic(*lens, *dot, print_m, faults_px, left=left if share else 1.0), value
+    return found
