@@ -97,18 +97,19 @@ def with_form(
         return fitted, fitted, None, 0.0
     n, k = blocks.n_fitted, len(blocks.time)
     R = np.vstack([blocks.data / np.sqrt(noise), blocks.prior])
-    course, own, by_number = _courses(system, fitted, {law.candidate.effect, *beside}, blocks.time)
-    parts = _parts(system, fitted, blocks, float(np.sqrt(np.mean(np.sum(own**2, axis=1)))))
+    motion = _motion(system, fitted.values, blocks.time)
+    course = moment_about_contact(system, fitted.values, motion)[1:]
+    own = moment_about_contact(system, fitted.values, motion, {law.candidate.effect, *beside})[1:]
+    by_number = _by_number(system, fitted, motion, course)
+    lasts = SLOW * float(system.time[-1] - system.time[0])
+    parts = _parts(blocks, motion, lasts, float(np.sqrt(np.mean(np.sum(own**2, axis=1)))))
     wrong = 1.0 if correlated else probability_of_wrong_form(law, beside)
-    laws = by_number[:, np.any(by_number != 0.0, axis=0)]
-    own_directions = span(laws)
-    fitted_columns = span(R[:, :n])
+    own_directions, fitted_columns = span(by_number), span(R[:, :n])
     right = cleared(R[:, -1], fitted_columns)
     variance = np.sum((by_number @ fitted.covariance) * by_number, axis=1)
     mixed, another, misfit = fitted.covariance.copy(), fitted.covariance, 0.0
     for probability, some in ((1.0 - wrong, [np.concatenate(parts[:: HARMONICS + 2], axis=1)]), (wrong, parts)):
-        S = np.concatenate(some, axis=1)
-        S = cleared(S, own_directions)
+        S = cleared(np.concatenate(some, axis=1), own_directions)
         B = R[:, n:-1] @ S / (WIDTH * np.sqrt(2 * np.pi))  # neighbouring probes add up to this
         taken = absorbed(R[:, :n], B)
         second, size = _second_moment(cleared(B, fitted_columns), right, [part.shape[1] for part in some])
@@ -117,7 +118,7 @@ def with_form(
         another = fitted.covariance + taken @ second @ taken.T  # in the end that of all parts
         mixed += probability * (another - fitted.covariance)
         misfit += probability * size**2
-    variance = np.maximum(variance, 0.0).reshape(3, k).T + _among_others(system, fitted, law, course, blocks.time)
+    variance = np.maximum(variance, 0.0).reshape(3, k).T + _among_others(system, law, motion, course)
     variance += wrong * _within_probes(system, fitted, blocks, course)
     found = Course(blocks.time, course, np.sqrt(variance))
     return replace(fitted, covariance=mixed), replace(fitted, covariance=another), found, float(np.sqrt(misfit))
@@ -147,24 +148,21 @@ def _kinds(law: LearnedLaw) -> set[tuple[str, ...]]:
     return {(f.kind, *sorted({component for parts in f.terms for component in parts})) for f in law.families}
 
 
-def _courses(system: DiscSystem, fitted: Fit, own: Collection[str], time: Array) -> tuple[Array, Array, Array]:
-    """Moment (k, 3) of all laws and of the effects `own`, and derivative (3 k, n) of the first by the quantities."""
-    values = fitted.values
-    motion = _motion(system, values, time)
-    course = moment_about_contact(system, values, motion)
-    by_number = np.zeros((3 * len(time), len(fitted.names)))
+def _by_number(system: DiscSystem, fitted: Fit, motion: Motion, course: Array) -> Array:
+    """Derivative (3 k, n) of the moment of all laws, `course` (k, 3), by the fitted quantities, on a given motion."""
+    values, by_number = fitted.values, np.zeros((course.size, len(fitted.names)))
     for i, name in enumerate(fitted.names):
         if system.model.has_name(name) and fitted.sigma(name) > 0:
             step = STEP * max(abs(values[name]), fitted.sigma(name))
             step = step if values[name] + step <= fitted.quantities[i].upper else -step
-            moved = moment_about_contact(system, {**values, name: values[name] + step}, motion)
-            by_number[:, i] = ((moved - course) / step)[1:].T.ravel()
-    return course[1:], moment_about_contact(system, values, motion, own)[1:], by_number
+            moved = moment_about_contact(system, {**values, name: values[name] + step}, motion)[1:]
+            by_number[:, i] = ((moved - course) / step).T.ravel()
+    return by_number
 
 
-def _among_others(system: DiscSystem, fitted: Fit, law: LearnedLaw, course: Array, time: Array) -> Array:
+def _among_others(system: DiscSystem, law: LearnedLaw, motion: Motion, course: Array) -> Array:
     """Variance (k, 3) of the moment over the laws that describe the data too, weighted by their odds."""
-    motion, total, spread = _motion(system, fitted.values, time), 1.0, np.zeros_like(course)
+    total, spread = 1.0, np.zeros_like(course)
     for other, odds in law.others:
         moment = moment_about_contact(system.knowing(other), other.values, motion)[1:]
         total, spread = total + odds, spread + odds * (moment - course) ** 2
@@ -189,16 +187,16 @@ def _motion(system: DiscSystem, values: Values, time: Array) -> Motion:
     return simulate(system.model_with(values), state_of(values), times=times)
 
 
-def _parts(system: DiscSystem, fitted: Fit, blocks: Probed, size: float) -> list[Array]:
-    """Square roots (3 k, m) of the processes' covariances, axis by axis, with the rms of the law, `size`."""
-    time, k = blocks.time, len(blocks.time)
-    distance = time[:, None] - time
-    short = np.linalg.cholesky(np.exp(-0.5 * (distance / blocks.spacing) ** 2) + 1e-6 * np.eye(k))
-    lasts = SLOW * float(system.time[-1] - system.time[0])
+def _parts(blocks: Probed, motion: Motion, lasts: float, size: float) -> list[Array]:
+    """Square roots (3 k, m) of the processes' covariances, axis by axis, with the rms of the law, `size`.
+
+    lasts : correlation length of slow processes [s]
+    """
+    distance = blocks.time[:, None] - blocks.time
+    short = np.linalg.cholesky(np.exp(-0.5 * (distance / blocks.spacing) ** 2) + 1e-6 * np.eye(len(distance)))
     variance, modes = np.linalg.eigh(np.exp(-0.5 * (distance / lasts) ** 2))
     slow = modes[:, variance > 1e-3 * variance[-1]] * np.sqrt(variance[variance > 1e-3 * variance[-1]])
-    psi = _motion(system, fitted.values, time).q[1:, 3]
-    roots = [short, slow]
+    psi, roots = motion.q[1:, 3], [short, slow]
     for n in range(1, HARMONICS + 1):
         roots.append(np.column_stack([np.cos(n * psi)[:, None] * slow, np.sin(n * psi)[:, None] * slow]))
     return [size * np.kron(np.eye(3)[:, [axis]], root) for axis in range(3) for root in roots]

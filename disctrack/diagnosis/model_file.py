@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 
 from calibration.cameras.camera import StereoRig
-from calibration.kit.arrays import Array
 from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.discrepancy.system import Values
 from disctrack.errors import AnalysisError
@@ -105,21 +104,19 @@ def _settings_like(rig: StereoRig) -> RigSettings:
     seen = np.einsum("cij,cj->ci", R, horizontal)
     focal = np.array([0.5 * (c.fx + c.fy) for c in rig.cameras])
     lenses = zip(("k1", "k2", "p1", "p2", "k3"), zip(*(c.distortion for c in rig.cameras), strict=True), strict=True)
+    pairs = {
+        "distance_mm": 1e3 * distance,
+        "off_vertical_deg": np.degrees(np.arccos(z)),
+        "azimuth_deg": np.degrees(np.arctan2(y, x)),
+        "roll_deg": np.degrees(np.arctan2(seen[:, 1], seen[:, 0])),
+        **dict(lenses),
+    }
     return RigSettings(
         mm_per_px=float(np.mean(1e3 * distance / focal)),
-        distance_mm=_pair(1e3 * distance),
-        off_vertical_deg=_pair(np.degrees(np.arccos(z))),
-        azimuth_deg=_pair(np.degrees(np.arctan2(y, x))),
-        roll_deg=_pair(np.degrees(np.arctan2(seen[:, 1], seen[:, 0]))),
         target_mm=(1e3 * float(target[0]), 1e3 * float(target[1]), 1e3 * float(target[2])),
-        **{name: _pair(np.array(both)) for name, both in lenses},
         variation=0.0,
+        **{name: (float(left), float(right)) for name, (left, right) in pairs.items()},
     )
-
-
-def _pair(both: Array) -> tuple[float, float]:
-    left, right = both.tolist()
-    return left, right
 
 
 def _above_the_table(system: DiscSystem, values: Values) -> tuple[StereoRig, Values]:

@@ -140,7 +140,16 @@ class DiscMember:
             raise AnalysisError(
                 f"the rolling model cannot be fitted to it alone (chi-square {self.base.reduced_chi_square:.3g})"
             )
-        return self._member()
+        disc, air = system.disc, {"density of the air": _density(system.trajectory)}
+        return Member(
+            self.name,
+            system.base,
+            system.candidates,
+            self.base.values,
+            int(np.sum(system.weights)),
+            self.labels,
+            covariates=air | {"mass": disc.mass, "radius": disc.radius, "thickness": 2 * disc.half_thickness},
+        )
 
     def share(self, own: Sequence[str]) -> None:
         """Declare which quantities are its own; all others of the base are shared."""
@@ -176,23 +185,6 @@ class DiscMember:
 
     def _everything(self, shared: Values) -> dict[str, float]:
         return {**self.base.values, **self._reduction.own_values, **self.system.known, **shared}
-
-    def _member(self) -> Member:
-        system, disc = self.system, self.system.disc
-        return Member(
-            self.name,
-            system.base,
-            system.candidates,
-            self.base.values,
-            int(np.sum(system.weights)),
-            self.labels,
-            covariates={
-                "mass": disc.mass,
-                "radius": disc.radius,
-                "thickness": 2 * disc.half_thickness,
-                "density of the air": _density(system.trajectory),
-            },
-        )
 
 
 def _noise(trajectory: Trajectory) -> float:
