@@ -253,8 +253,7 @@ def test_fields_are_sized_from_the_dots_alone_and_faults_are_no_fields():
     assert 0.008 < found.lens_px < 0.05  # 0.02 px over the whole image; the dots see a part of it
     assert found.faults_px == 0.0
     alone = systematic_of(recording(laboratory=Laboratory(), faults=Faults(right_delay_s=2e-4))[0])
-    assert not alone.present
-    assert alone.faults_px > 0.03  # 0.2 ms, in which dots move by a tenth of a pixel
+    assert (alone.present, alone.faults_px > 0.03) == (False, True)  # 0.2 ms, in which dots move by a tenth of a pixel
     both = systematic_of(recording(faults=Faults(right_delay_s=2e-4))[0])
     assert both.lens_px > 0.008
     assert both.faults_px == pytest.approx(alone.faults_px, rel=0.1)
