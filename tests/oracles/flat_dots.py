@@ -8,7 +8,7 @@ from scipy.ndimage import gaussian_filter
 from calibration.cameras.camera import Camera, normalised_maps
 from calibration.kit.compiled import RULES, njit
 from disctrack.track.dots import _kernels as kernels
-from disctrack.track.dots.template import TYPICAL_BLUR_PX, dot_centres, face_of, typical_noise
+from disctrack.track.dots.template import TYPICAL_BLUR_PX, dot_centres, face_of, rough_noise
 
 
 @njit(cache=True, **RULES)
@@ -22,7 +22,7 @@ def look(images, views, face, expected, R, t, results, status):
 def locate_on_disc(image, camera, R, t, disc, *, maps=None, noise=None, blur_px=TYPICAL_BLUR_PX):
     """The disc's dots in an image (height, width); R (3, 3), t (3,), body -> camera, is its pose within a few px."""
     map_x, map_y = maps if maps is not None else normalised_maps(camera)
-    parameters = np.array(noise or typical_noise(image))
+    parameters = np.array(noise or rough_noise(image))
     results, status = np.full((1, disc.n_markers), np.nan, kernels.DOT), np.zeros((1, disc.n_markers), np.uint8)
     views = (map_x[None], map_y[None]), (camera.parameters[None], np.eye(3)[None], np.zeros((1, 3)))
     expected = np.array([blur_px]), parameters[None], kernels.Limits()

@@ -26,10 +26,11 @@ from disctrack.trajectory import MarkerStatus
 MEASURED, OUTSIDE, LOW_CONTRAST, OCCLUDED, NOT_CONVERGED, BLURRED, _, NOT_LOOKED_FOR = map(int, MarkerStatus)
 
 # Of a dot: pixel of its centre, covariance of that by the image's noise, and what is needed to judge the fit: reduced
-# chi-square of its grey values and their number; sigma of the edge [px], smear of its motion included; radius [m]; grey
-# value of the paper, and contrast with it, 1 - dark / light; share of the pixels that do not fit.
-_OF_DOT = ("u", "v", "var_u", "var_v", "cov_uv", "chi_square", "sigma", "radius", "level", "contrast")
-DOT = np.dtype([(name, float) for name in (*_OF_DOT, "clipped", "n_pixels")])
+# chi-square of its grey values, in the dot and beside it, and their number; sigma of the edge [px], smear of its motion
+# included; radius [m]; grey value of the paper, and contrast with it, 1 - dark / light; share of the pixels that do not
+# fit.
+_OF_DOT = ("u", "v", "var_u", "var_v", "cov_uv", "chi_square", "inside", "outside", "sigma", "radius", "level")
+DOT = np.dtype([(name, float) for name in (*_OF_DOT, "contrast", "clipped", "n_pixels")])
 
 
 class Limits(NamedTuple):
@@ -535,7 +536,14 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, centres, own, pix
     result.var_v = c * c * x[ROW.a] + 2 * c * d * x[ROW.b] + d * d * y[ROW.b]
     result.cov_uv = a * c * x[ROW.a] + (a * d + b * c) * x[ROW.b] + b * d * y[ROW.b]
     p[ROW.a], p[ROW.b], p[ROW.radius] = unit * p[ROW.a], unit * p[ROW.b], unit * p[ROW.radius]
-    result.chi_square = chi2 / max(n - n_clipped - 8, 1)
+    freedom, inside, n_inside = max(n - n_clipped - 8, 1), 0.0, 0.0
+    for i in range(n):
+        within = _1 if pixels[ROW.distance, i] < _0 else _0
+        n_inside += within
+        inside += within * pixels[ROW.residual, i] * pixels[ROW.residual, i]
+    result.chi_square = chi2 / freedom
+    result.inside = inside / max(n_inside, 1.0) * n / freedom
+    result.outside = (chi2 - inside) / max(n - n_inside, 1.0) * n / freedom
     result.sigma, result.radius = p[ROW.sigma], p[ROW.radius]
     result.level, result.contrast = light * p[ROW.level], p[ROW.contrast]
     result.clipped, result.n_pixels = n_clipped / n, n

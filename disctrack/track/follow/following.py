@@ -7,7 +7,6 @@ fails, going back over the frames before it was found again, and measuring blur 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -22,18 +21,17 @@ from disctrack.disc import Disc, symmetry_order
 from disctrack.frames import rotation_z
 from disctrack.track.dots import _kernels as kernels
 from disctrack.track.dots.acquisition import Pose, acquire
-from disctrack.track.dots.template import Edge, NoiseModel, face_of, measure_noise, no_more_than_left, typical_noise
-from disctrack.track.pose import dots_at, stacked
+from disctrack.track.dots.template import Edge, NoiseModel, face_of, noise_left, rough_noise
+from disctrack.track.pose import stacked
 from disctrack.trajectory import FrameStatus, MarkerStatus
 
 # A pair whose dots disagree by more than this with any rigid motion is lost: a tenth of a dot, ten times a poor rig
 MAX_PREDICTION_RMS_PX = 2.0
-NOISE_FRAMES = 12  # that blur is taken from, and every third of them for the noise
+NOISE_FRAMES = 12  # that blur and noise are taken from
 MIN_TO_BEGIN = 5  # dot images that must be measured where the disc is found anew: three fit anything
 # Frames over which the last motion is carried on, each of which costs one look at the dots; and at most between
 # searches, of which one costs as much as some 600
 PATIENCE = 60
-UNUSUAL = 2.0  # times the usual misfit; of dots in compressed video, one in twenty leaves 1.25 times the median
 MOST_USUAL = 0.1  # of the contrast: dots that leave more than this are not the declared ones
 REPEAT_REACH = 4  # frames back that an image is compared with: recorders repeat from buffers of a few
 
@@ -97,7 +95,6 @@ class Follower:
     disc: Disc
     maps: tuple[Array, Array]  # of its cameras
     edges: tuple[Edge, ...] = (Edge(), Edge())  # how those of the dots look in each camera
-    misfit: float = 1.0  # rms residual over the noise that dots usually leave: compressed edges leave 4 and more
     heading: Heading | None = None
     lost: int | None = 0  # frames since the last pose; None while the disc is followed
     failures: int = 0  # searches in vain, one after the other
@@ -119,9 +116,8 @@ def run(
 ) -> tuple[int, Heading]:
     """Follow the disc through images (n, 2, height, width); returns the frames before it was lost, and the heading.
 
-    limits : a dot is refused for a misfit that exceeds them, and is unusual in this recording
+    limits : beyond which a dot is refused
     """
-    limits = limits._replace(misfit=max(limits.misfit, UNUSUAL * follower.misfit))
     known = Heading(*((np.array(R, order="C"), np.array(t)) for R, t in heading))  # the loop moves them on
     blur, noise = np.array([edge.blur_px for edge in follower.edges]), np.array([edge.noise for edge in follower.edges])
     fixed = follower.maps, stacked(follower.rig), face_of(follower.disc), blur, noise, limits
@@ -267,7 +263,7 @@ def _search(follower: Follower, images: Image, readable: Mask) -> bool:
         following = pose[0] @ R.T @ pose[0], 2 * pose[1] - t
     heading = Heading.leading_to(pose, following)
     if not follower.measured:
-        _measure_blur_and_noise(follower, images, readable, pose, heading)
+        _measure_blur_and_noise(follower, images, readable, heading)
     if not _holds(follower, heading, images, readable):
         return False
     follower.heading = heading
@@ -288,47 +284,25 @@ def _nearest_alike(pose: Pose, following: Pose, disc: Disc) -> Pose:
     return alike[np.argmax(np.einsum("ij,nij->n", pose[0], alike))], t
 
 
-def _measure_blur_and_noise(follower: Follower, images: Image, readable: Mask, pose: Pose, heading: Heading) -> None:
+def _measure_blur_and_noise(follower: Follower, images: Image, readable: Mask, heading: Heading) -> None:
     """Measure the law of the cameras' noise and blur; where the disc is not there after all, nothing is kept."""
-    disc, edges, misfit, saturated = follower.disc, [Edge(), Edge()], 1.0, list(follower.saturated)
-    n = min(NOISE_FRAMES, len(images))
-
-    def flat_noise(camera: int, frames: Sequence[int], R: Array, t: Array) -> NoiseModel:
-        """Of flat parts beside and in the dots, at poses R, t of these frames."""
-        pixels, affine = dots_at(R, t, follower.rig, disc)
-        seen = [images[k, camera] for k in frames]
-        return measure_noise(seen, pixels[:, camera], affine[:, camera], disc, edges[camera].blur_px)
-
-    for camera in range(2):
-        # a first idea of the noise, or good dots of a noisy camera, or of more than 8 bits, would look like misfits;
-        # the pose found by blobs is good to a fraction of a pixel, and the flat parts keep off the edges by more
-        if readable[0, camera]:
-            edges[camera] = Edge(noise=flat_noise(camera, [0], pose[0][None], pose[1][None]))
-        elif readable[:n, camera].any():
-            edges[camera] = Edge(noise=typical_noise(images[int(np.argmax(readable[:n, camera])), camera]))
-    for blur_known in (False, True):  # the second time with the blur of the first, and the misfit that is usual
+    n, saturated = min(NOISE_FRAMES, len(images)), list(follower.saturated)
+    edges = [Edge(noise=rough_noise(images[seen.argmax(), camera])) for camera, seen in enumerate(readable[:n].T)]
+    # the second time with the blur of the first, and with what dots usually leave for noise
+    for limits in (kernels.Limits(blur=np.inf, share=MOST_USUAL), kernels.Limits()):
         # how the noise is taken to be tells why dots are refused, if they are
-        follower.edges, follower.misfit = tuple(edges), misfit
-        trial = empty_tables(n, disc.n_markers)
-        limits = kernels.Limits() if blur_known else kernels.Limits(blur=np.inf, share=MOST_USUAL)
+        follower.edges, trial = tuple(edges), empty_tables(n, follower.disc.n_markers)
         done, _ = run(follower, heading, images[:n], readable[:n], trial, limits)
         if done == 0 or not _enough(trial.status[:1]):
             return
-        good = trial.status[:done] == MarkerStatus.MEASURED
         for camera in range(2):
-            fits = trial.results[:done, camera][good[:, camera]]
-            if not len(fits):
-                continue
-            blur, level, contrast = (float(np.median(fits[name])) for name in ("sigma", "level", "contrast"))
-            edges[camera] = Edge(blur, level, contrast, edges[camera].noise)
-            misfit = max(misfit, float(np.sqrt(np.median(fits["chi_square"]))))
-            if blur_known:
-                flat = flat_noise(camera, range(0, done, 3), trial.R[:done:3], trial.t[:done:3])
-                noise = no_more_than_left(flat, edges[camera].noise, fits)
-                edges[camera] = edges[camera]._replace(noise=noise)
+            fits = trial.results[:done, camera][trial.status[:done, camera] == MarkerStatus.MEASURED]
+            if len(fits):
+                noise = noise_left(edges[camera].noise, fits)
+                blur, level, contrast = (float(np.median(fits[name])) for name in ("sigma", "level", "contrast"))
+                edges[camera] = Edge(blur, level, contrast, noise)
                 saturated[camera] = _saturated(images[:done, camera], fits, noise)
-    follower.edges, follower.misfit = tuple(edges), misfit
-    follower.saturated, follower.measured = tuple(saturated), True
+    follower.edges, follower.saturated, follower.measured = tuple(edges), tuple(saturated), True
 
 
 def _saturated(images: Image, fits: NDArray, noise: NoiseModel) -> int | None:

@@ -17,7 +17,6 @@ from calibration.kit.arrays import Array32, robust_sigma
 from calibration.kit.grey_levels import level_step
 from disctrack.errors import RecordingError
 from disctrack.recording.readers.base import FrameReader
-from disctrack.track.dots.template import photon_transfer
 
 Pair = tuple[NDArray, NDArray]
 
@@ -64,18 +63,14 @@ def _reduced(image: NDArray) -> Array32:
     return np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA), np.float32)
 
 
-def _noise(mean: Array32, difference: Array32, steep: Array32) -> Array32:
-    """Variance (h, w) of a difference of two reduced images at rest, read + gain * grey, from flat parts.
+def _noise(mean: Array32, difference: Array32, steep: Array32) -> float:
+    """Variance of a difference of two reduced images at rest, of flat parts at the grey value where it is largest.
 
     Medians, because the two images may already show motion; where things move, they move at edges.
     """
     flat = steep <= np.quantile(steep, 0.6)
-    grey, change = mean[flat], difference[flat]
-    alike = np.array_split(np.argsort(grey), NOISE_BINS)
-    levels = np.array([grey[part].mean() for part in alike])
-    variances = np.array([robust_sigma(change[part]) ** 2 for part in alike])
-    law = photon_transfer(levels, variances, np.ones(NOISE_BINS), 1.0)
-    return law.variance(np.asarray(mean, float)).astype(np.float32)
+    alike = np.array_split(difference[flat][np.argsort(mean[flat])], NOISE_BINS)
+    return max(1 / 12, *(robust_sigma(part) ** 2 for part in alike))
 
 
 def find_motion(left: FrameReader, right: FrameReader, start: int, stop: int, frame_rate: float) -> MotionSpan:
