@@ -14,7 +14,7 @@ from disctrack.track.dots.template import TYPICAL_BLUR_PX, dot_centres, face_of,
 @njit(cache=True, **RULES)
 def look(images, views, face, expected, R, t, results, status):
     """Compiled as what it calls."""
-    pixels, work = np.empty((16, 4096), np.float32), (np.empty((8, 8)), np.empty(8), np.empty(8), np.empty(8))
+    pixels, work = np.empty((16, 4096), np.float32), (np.empty((8, 8)), np.empty(8), np.empty(8))
     (maps, cameras), (sigma, noise, limits), seen = views, expected, np.ones(len(images), np.bool_)
     kernels._look(images, seen, maps, cameras, face, sigma, noise, limits, R, t, pixels, work, results, status)
 

@@ -353,18 +353,15 @@ def _whitened_ellipse(pixels, n, p, G, det, centroid, nodes, clip):
 
 @_part
 def _descend(pixels, n, p, G, det, px_per_unit, clip, work, blurred, centroid, nodes):
-    """Levenberg-Marquardt on the eight template parameters; returns converged, chi-square, clipped.
+    """Gauss-Newton on the eight template parameters; returns converged, chi-square, clipped.
 
     blurred: take the whole ellipse, with the expected radius as a prior, and not one edge at a time.
 
     On convergence the first matrix of work holds the Cholesky factor of J^T W J at the minimum.
     """
-    M, rhs, step, previous = work
-    damping, last, rejected, converged = 1e-7, np.inf, False, False
+    M, rhs, step = work
+    converged, chi2, n_clipped = False, 0.0, 0.0
     before = np.inf  # length of the last step: the ratio of two tells how fast the iteration contracts
-    chi2, n_clipped = 0.0, 0.0
-    for i in range(8):
-        previous[i] = p[i]
     for _ in range(_MAX_ITERATIONS + 1):
         if blurred:
             chi2, n_clipped = _whitened_ellipse(pixels, n, p, G, det, centroid, nodes, clip)
@@ -373,17 +370,6 @@ def _descend(pixels, n, p, G, det, px_per_unit, clip, work, blurred, centroid, n
             chi2, n_clipped = _whitened_model(pixels, n, p, G, det, clip)
         if converged:
             return True, chi2, n_clipped
-        # the Jacobian leaves out how the curvature moves, so chi-square may creep by a trifle at the minimum
-        if chi2 > 1.001 * last + 0.01 and not rejected:
-            for i in range(8):
-                p[i] = previous[i]
-            damping, rejected = max(1e-2, damping * 30.0), True
-            if damping > 1e6:
-                return False, chi2, n_clipped
-            continue
-        if not rejected:
-            damping = max(0.03 * damping, 1e-9)
-        last, rejected = chi2, False
         residual = pixels[ROW.residual]
         for j in range(0, 8, 2):  # two by two: what is loaded serves twice
             row, next_row = pixels[j], pixels[j + 1]
@@ -405,27 +391,26 @@ def _descend(pixels, n, p, G, det, px_per_unit, clip, work, blurred, centroid, n
             M[ROW.radius, ROW.radius] += _RADIUS_PRIOR**-2
             rhs[ROW.radius] += (1.0 - p[ROW.radius]) * _RADIUS_PRIOR**-2
         for i in range(8):
-            previous[i], step[i] = p[i], rhs[i]
-            M[i, i] *= 1.0 + damping
+            step[i] = rhs[i]
         if not solve_in_place(M, step):
             return False, chi2, n_clipped
         length = math.hypot(step[ROW.a], step[ROW.b])
         scale = min(1.0, 0.4 / max(length, 1e-30))
-        gain = 0.0
+        gain, sigma = 0.0, p[ROW.sigma]
         for i in range(8):
             p[i] += scale * step[i]
             gain += step[i] * rhs[i]
-        p[ROW.sigma] = min(max(p[ROW.sigma], 0.4 * previous[ROW.sigma], 0.2), 2.0 * previous[ROW.sigma])
+        p[ROW.sigma] = min(max(p[ROW.sigma], 0.4 * sigma, 0.2), 2.0 * sigma)
         if not (0.5 < p[ROW.radius] < 1.6 and p[ROW.sigma] < 20.0):
             return False, chi2, n_clipped
         length *= px_per_unit
         contraction = min(length / before, 1.0) if before < np.inf else 1.0
-        if length * contraction < _CONVERGED_PX and damping < 1e-3 and length < 0.1:
+        if length * contraction < _CONVERGED_PX and length < 0.1:
             if gain <= 0.5:
                 return True, chi2, n_clipped
             converged = True  # but the sums were taken before a step that mattered to them
         before = length
-    return False, last, 0.0
+    return False, chi2, 0.0
 
 
 @_part
@@ -436,8 +421,7 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, centres, own, pix
     plane; start (7,): expected centre and radius on the plane, pixel of that centre, and of the centroid of the dot's
     image; sigma: blur to start from [px]; noise (3,): variance = noise[0] + noise[1] grey, and the grey values' step;
     rim: radius of an edge about the plane's origin whose blur must not reach the pixels used, nor that of other dots,
-    whose `centres` (m, 3) those but its `own` are; pixels and work (matrix, right-hand side, step, parameters before
-    it) are scratch.
+    whose `centres` (m, 3) those but its `own` are; pixels and work (matrix, right-hand side, step) are scratch.
     p (8,) receives the template's parameters (a, b: shift on the plane from the expected centre), result (a DOT) the
     judgement of the fit and the centre's covariance in pixels. The caller projects the centre itself (U, V).
     """
@@ -448,7 +432,7 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, centres, own, pix
     for i in range(8):
         p[i] = 0.0
     p[ROW.radius], p[ROW.sigma] = 1.0, sigma
-    n, n_clipped, det, chi2, largest, light, settled = 0, 0.0, 0.0, 0.0, 0.0, 1.0, False
+    n, n_clipped, det, chi2, largest, settled = 0, 0.0, 0.0, 0.0, 0.0, False
     for selection in range(_MAX_SELECTIONS):
         if not (2.0 < u0 < width - 3.0 and 2.0 < v0 < height - 3.0):
             return OUTSIDE
@@ -481,22 +465,18 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, centres, own, pix
         if not (n >= 30 and math.isfinite(inside) and math.isfinite(outside)):
             return OCCLUDED
         if selection == 0:
-            light = max(inside, outside, 1e-6)  # the unit of grey from here on: no result depends on the file's own
-            p[ROW.level], p[ROW.contrast] = outside / light, 1.0 - inside / max(outside, 1e-6)
+            p[ROW.level], p[ROW.contrast] = outside, 1.0 - inside / max(outside, 1e-6)
         dark = p[ROW.level] * (1.0 - p[ROW.contrast])
-        read, gain, step2 = noise[0] / (light * light), noise[1] / light, noise[2] * noise[2] / (light * light)
+        read, gain, step2 = noise[0], noise[1], noise[2] * noise[2]
         if abs(p[ROW.level] - dark) < 4.0 * math.sqrt(max(read + gain * max(p[ROW.level], dark), 0.1 * step2)):
             return LOW_CONTRAST
-        in_light = 1.0 / light
         read_32, gain_32, floor = _f(read), _f(gain), _f(step2 / 12.0)
         level, step, inv_sigma = _f(p[ROW.level]), _f(dark - p[ROW.level]), _f(1.0 / p[ROW.sigma])
-        distance, weight, grey = pixels[ROW.distance], pixels[ROW.weight], pixels[ROW.grey]
+        distance, weight = pixels[ROW.distance], pixels[ROW.weight]
         for i in range(n):
             # weights from the expected grey value: the noisy one would pull the fit towards dark pixels
             s, bell = _edge_profile(distance[i] * inv_sigma)
             weight[i] = _1 / math.sqrt(max(read_32 + gain_32 * (level + step * s), floor))
-        for i in range(n):
-            grey[i] *= in_light  # a product in double precision, rounded once
         limit = np.inf
         while True:  # once, and again without the pixels that do not belong
             centroid = start[5] - u0, start[6] - v0
@@ -526,7 +506,7 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, centres, own, pix
         if settled:
             break
     # covariance of the shift on the plane: the leading corner of (J^T W J)^-1
-    M, x, y, _ = work
+    M, x, y = work
     for i in range(8):
         x[i], y[i] = 1.0 if i == ROW.a else 0.0, 1.0 if i == ROW.b else 0.0
     substitute(M, x)
@@ -545,7 +525,7 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, centres, own, pix
     result.inside = inside / max(n_inside, 1.0) * n / freedom
     result.outside = (chi2 - inside) / max(n - n_inside, 1.0) * n / freedom
     result.sigma, result.radius = p[ROW.sigma], p[ROW.radius]
-    result.level, result.contrast = light * p[ROW.level], p[ROW.contrast]
+    result.level, result.contrast = p[ROW.level], p[ROW.contrast]
     result.clipped, result.n_pixels = n_clipped / n, n
     return MEASURED
 
@@ -694,7 +674,7 @@ def track_frames(images, readable, maps, cameras, face, sigma, noise, limits, he
     (n, 3, 3), t_out (n, 3). Returns the number of frames followed; less than n where the disc was lost at that frame.
     """
     (R_last, t_last), (R_before, t_before), (R_older, t_older) = heading
-    pixels, work = np.empty((16, _PIXELS), np.float32), (np.empty((8, 8)), np.empty(8), np.empty(8), np.empty(8))
+    pixels, work = np.empty((16, _PIXELS), np.float32), (np.empty((8, 8)), np.empty(8), np.empty(8))
     R, t, R_expected, shape = np.empty((3, 3)), np.empty(3), np.empty((3, 3)), (2, face[0].shape[0])
     dots = np.empty((*shape, 2)), np.zeros((*shape, 2, 2)), np.empty(shape, np.bool_)
     filled = np.empty((*shape, 2)), np.empty((*shape, 2)), np.empty((*shape, 2, 6))
