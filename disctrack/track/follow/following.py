@@ -18,7 +18,7 @@ from calibration.cameras.camera import StereoRig, normalised_maps
 from calibration.kit.arrays import Array, Image, Mask
 from calibration.kit.grey_levels import saturation_level
 from disctrack.disc import Disc, symmetry_order
-from disctrack.frames import rotation_z
+from disctrack.frames import rotation_from_vector, rotation_z, vector_from_rotation
 from disctrack.track.dots import _kernels as kernels
 from disctrack.track.dots.acquisition import Pose, acquire
 from disctrack.track.dots.template import Edge, NoiseModel, face_of, noise_left, rough_noise
@@ -49,19 +49,12 @@ class Heading(NamedTuple):
         turn = last[0] @ before[0].T
         return cls(last, before, (turn.T @ before[0], 2 * before[1] - last[1]))
 
-    @classmethod
-    def leading_to(cls, pose: Pose, following: Pose | None) -> Heading:
-        """The next prediction is `pose`, the one after it `following`, or the same where that is not known."""
-        back = cls.steady(pose, following or pose).carried_on(2)
-        return cls.steady(back.before, back.last)
-
     def carried_on(self, steps: int) -> Heading:
         """As after so many more frames of the same motion."""
-        turn, shift = self.last[0] @ self.before[0].T, self.last[1] - self.before[1]
-        last, before = self.last, self.before
-        for _ in range(steps):
-            last, before = (turn @ last[0], last[1] + shift), last
-        return Heading.steady(last, before)
+        (R_last, t_last), (R_before, t_before) = self.last, self.before
+        turn = rotation_from_vector(steps * vector_from_rotation(R_last @ R_before.T))
+        shift = steps * (t_last - t_before)
+        return Heading.steady((turn @ R_last, t_last + shift), (turn @ R_before, t_before + shift))
 
 
 def maps_of(rig: StereoRig) -> tuple[Array, Array]:
@@ -249,31 +242,22 @@ def _go_back(follower: Follower, images: Image, readable: Mask, rows: Tables, fo
 
 
 def _search(follower: Follower, images: Image, readable: Mask) -> bool:
-    """Search the whole of the first pair (and of the second, for the velocity); at first also measure blur, noise."""
-    pose = _found(follower, images[0], readable[0])
+    """Search the whole of the first pair; at first also measure blur and noise.
+
+    The disc goes on as from the pair before, where it was seen in that, and else is taken to rest.
+    """
+    pose, _, reason = acquire(np.where(readable[0, :, None, None], images[0], 0), follower.rig, follower.disc)
+    follower.first_reason = follower.first_reason or reason
     if pose is None:
         return False
-    following = None
-    if len(images) > 1 and readable[1].any():
-        following = _found(follower, images[1], readable[1])
-        if following is not None:
-            following = _nearest_alike(pose, following, follower.disc)
-    elif follower.heading is not None and follower.lost == 0:  # pairs come one by one: as from the pair before
-        R, t = follower.heading.last
-        following = pose[0] @ R.T @ pose[0], 2 * pose[1] - t
-    heading = Heading.leading_to(pose, following)
+    before = pose if follower.heading is None or follower.lost != 0 else follower.heading.last
+    heading = Heading.steady(_nearest_alike(before, pose, follower.disc), before).carried_on(-1)
     if not follower.measured:
         _measure_blur_and_noise(follower, images, readable, heading)
     if not _holds(follower, heading, images, readable):
         return False
     follower.heading = heading
     return True
-
-
-def _found(follower: Follower, pair: Image, readable: Mask) -> Pose | None:
-    pose, _, reason = acquire(np.where(readable[:, None, None], pair, 0), follower.rig, follower.disc)
-    follower.first_reason = follower.first_reason or reason
-    return pose
 
 
 def _nearest_alike(pose: Pose, following: Pose, disc: Disc) -> Pose:
