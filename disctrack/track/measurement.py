@@ -32,16 +32,8 @@ from disctrack.recording.readers.blocks import NotRead, PairBlock, check_pair, d
 from disctrack.recording.readers.flat_field import flat_fielded, flat_fields
 from disctrack.recording.readers.same_instants import check_headers, check_same_numbers, check_time_stamps, usable_times
 from disctrack.track.follow.motion_span import MotionSpan, find_motion
-from disctrack.track.follow.tracking import (
-    Measurement,
-    ReadBlocks,
-    Taken,
-    TrackingSettings,
-    check_images,
-    prepare,
-    stretch_edges,
-    track,
-)
+from disctrack.track.follow.tracking import ReadBlocks, check_images, prepare, stretch_edges, track
+from disctrack.track.refine.assembly import Measurement, Taken, TrackingSettings
 from disctrack.trajectory import FrameStatus, at_full_length
 from disctrack.trajectory.file import Provenance
 
@@ -151,11 +143,10 @@ def measure(
         300
     """
     check_rig(rig, pairs)
-    settings = settings or TrackingSettings()
+    exposure, headers = exposures(recording, pairs)
+    settings = dataclasses.replace(settings or TrackingSettings(), exposure=exposure)
     if recording.table is not None:
         settings = dataclasses.replace(settings, table=recording.table.source)
-    exposure, headers = exposures(recording, pairs)
-    settings = dataclasses.replace(settings, exposure=exposure)
     stamps = usable_times(pairs.left, recording.frame_rate)
     with compiling("tracking", 15):  # not the camera's time: done once per installation
         prepare(np.uint8 if pairs.left.bit_depth == 8 else np.uint16)

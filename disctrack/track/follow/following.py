@@ -7,7 +7,6 @@ fails, going back over the frames before it was found again, and measuring blur 
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -59,8 +58,7 @@ class Heading(NamedTuple):
 
 def maps_of(rig: StereoRig) -> tuple[Array, Array]:
     """Undistorted normalised coordinates x and y (2, height, width) of the cameras' pixels, which take a while."""
-    with ThreadPoolExecutor(2) as pool:
-        maps_x, maps_y = zip(*pool.map(normalised_maps, rig.cameras), strict=True)
+    maps_x, maps_y = zip(*map(normalised_maps, rig.cameras), strict=True)
     return np.stack(maps_x), np.stack(maps_y)
 
 

@@ -26,15 +26,8 @@ from disctrack.disc import Disc, has_mirror_axis
 from disctrack.findings import NONSENSE, Finding, Kind, Remedy, Severity, Subject
 from disctrack.frames import CAMERAS, vector_from_rotation
 from disctrack.numbers import Measured
-from disctrack.track.dots.acquisition import (
-    BLOB_PX,
-    EPIPOLAR_PX,
-    MIN_EXPLAINED,
-    acquire,
-    expected_diameter_px,
-    rigid_motions,
-    seen_by_one_camera,
-)
+from disctrack.track.dots import acquisition
+from disctrack.track.dots.acquisition import BLOB_PX, MIN_EXPLAINED, acquire, rigid_motions, seen_by_one_camera
 from disctrack.track.judge.doubts import misplaced_dots
 from disctrack.track.pose import MIN_DOTS, DotsInFrames, dots_at
 from disctrack.track.refine.self_calibration import declared_places_kept, fit_shared
@@ -131,7 +124,7 @@ def moved_camera(pairs: NDArray, rig: StereoRig, disc: Disc) -> Iterator[Finding
 
 def _by_each_camera(pairs: NDArray, rig: StereoRig, disc: Disc) -> DotsInFrames:
     """Blobs that are the dots by one camera alone, in pairs (n, 2, height, width), with the poses by the left one."""
-    diameters = expected_diameter_px(rig, disc)
+    diameters = acquisition.expected_diameter_px(rig, disc)
     seen = [[seen_by_one_camera(pair[c], c, diameters[c], rig, disc) for c in (0, 1)] for pair in pairs]
     pixels = np.array([[side[0][:, :2] for side in pair] for pair in seen]).reshape(-1, 2, disc.n_markers, 2)
     R, t = (np.array([pair[0][k] for pair in seen]) for k in (1, 2))
@@ -183,7 +176,7 @@ def _seen_dots(pair: NDArray, rig: StereoRig, disc: Disc) -> Iterator[tuple[Mask
         ratios = apart(points) / apart(disc.marker_centres_body[which])
         scale = float(np.median(ratios))
         misfit = float(np.abs(rig.project(points) - pixels).max())
-        if misfit < EPIPOLAR_PX and scale > 0 and np.abs(ratios / scale - 1).max() < MISPLACED:
+        if misfit < acquisition.EPIPOLAR_PX and scale > 0 and np.abs(ratios / scale - 1).max() < MISPLACED:
             # uneven light shifts all blobs alike: more of them tell it no better
             uncertain = float(np.sqrt(2) * BLOB_PX / np.median(apart(pixels[0])))
             yield which, points, blobs[:, which, 2], Measured(scale, scale * uncertain), misfit
