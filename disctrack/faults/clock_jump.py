@@ -19,8 +19,7 @@ from disctrack.trajectory import Trajectory
 SIDE = 10  # frames on either side of a cut
 DEGREE = 6  # of the polynomials: half a turn in a stretch leaves a hundredth of the noise
 MOST_LOST = 12  # pairs, and frames without a pose at the cut
-STANDS_OUT = 30.0  # times the usual misfit of a stretch; of 168 numbers chance alone reaches 1.6
-EXPLAINED = 0.05  # of the misfit, that may be left by a jump
+STANDS_OUT = 30.0  # times what a jump leaves, and the usual misfit; of 168 numbers chance alone reaches 1.6
 UNEVEN = 0.1  # of a period: frames with time stamps of their own need no number
 
 
@@ -47,7 +46,7 @@ def clock_jumps(trajectory: Trajectory) -> dict[int, int]:
         misfit = np.stack([_misfit(stretch, around + k * (around >= 0)) for k in range(MOST_LOST + 1)], axis=-1)
         found += zip((rows + gap).tolist(), misfit, strict=True)
     usual = float(np.median([misfit[0] for _, misfit in found])) if found else 0.0
-    found = [(row, m) for row, m in found if m[0] > STANDS_OUT * usual and m.min() < EXPLAINED * m[0]]
+    found = [(row, m) for row, m in found if m[0] > STANDS_OUT * max(usual, m.min())]
     jumps: dict[int, int] = {}
     for row, misfit in sorted(found, key=lambda one: one[1].min() / one[1][0]):
         if all(abs(row - other) >= SIDE for other in jumps):

@@ -69,10 +69,6 @@ class DotsInFrames:
         parts = {name: getattr(self, name)[rows] for name in ("pixels", "covariance", "R", "t")}
         return replace(self, **parts)
 
-    def but(self, outlying: Mask) -> DotsInFrames:
-        """The frames with no pose for those that are outlying (n,)."""
-        return replace(self, t=np.where(outlying[:, None], np.nan, self.t))
-
     def shifted(self, shift: Array) -> DotsInFrames:
         """The pixels without what else moved them, rig and dots' places after the shift."""
         places = slice(N_RIG, N_RIG + 2 * self.disc.n_markers)

@@ -14,7 +14,6 @@ from disctrack.numbers import measured
 from disctrack.trajectory import FrameStatus, Trajectory
 
 Row = tuple[str, str]  # a heading, and what belongs to it
-LEAST_SIZE = 1e-5  # relative: a change of the rig's size that is worth a line
 
 
 def calibration_rows(found: StereoCalibration, problems: Sequence[str] = ()) -> list[Row]:
@@ -113,7 +112,7 @@ def _shared_lines(details: Mapping[str, Any]) -> Iterable[Row]:
     if shared := details.get("shared_sigma"):
         yield ("", _mostly(shared, "shared by frames"))
     size = details.get("size", {})
-    if abs(size.get("share", 0.0) * size.get("by_dots", 0.0)) > LEAST_SIZE:
+    if abs(size.get("share", 0.0) * size.get("by_dots", 0.0)) > size.get("sigma", np.inf):  # that is worth a line
         yield (
             "size",
             f"by the disc's dots lengths are {measured(100 * size['by_dots'], 100 * size['sigma'])} % longer than "

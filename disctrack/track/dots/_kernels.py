@@ -53,7 +53,6 @@ Rows = namedtuple(
 )
 ROW = Rows(*range(len(Rows._fields)))
 _PIXELS = 4096 + 64  # of a dot of 60 px; more are made room for. No power of two: rows would share lines of the cache
-_MAX_SELECTIONS = 4
 _CONVERGED_PX = 2e-4  # length of the step that would come next: a twentieth of the noise of the best dots
 # The pixels are chosen anew where the centre moved farther: a band that lies unevenly about the edge, by 0.25 to 0.7
 # px, shifts it by 3e-4 to 5e-4 px (dots declared off their places: in all frames alike)
@@ -432,7 +431,7 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, centres, own, pix
         p[i] = 0.0
     p[ROW.radius], p[ROW.sigma] = 1.0, sigma
     n, n_clipped, det, chi2, largest, settled = 0, 0.0, 0.0, 0.0, 0.0, False
-    for selection in range(_MAX_SELECTIONS):
+    for selection in range(_MAX_ITERATIONS):
         if not (2.0 < u0 < width - 3.0 and 2.0 < v0 < height - 3.0):
             return OUTSIDE
         det = _plane_gradient(map_x, map_y, P, int(u0 + 0.5), int(v0 + 0.5), unit, G)
@@ -493,7 +492,7 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, centres, own, pix
             settled = math.hypot(moved_u, moved_v) < _SETTLED_PX
             if not blurred and 1.0 / largest < _MIN_SEMI_MINOR * p[ROW.sigma]:
                 settled = False  # more blurred than expected: once more, by the other template
-            if not settled and selection < _MAX_SELECTIONS - 1:
+            if not settled and selection < _MAX_ITERATIONS - 1:
                 break
             # robust end: hot pixels and specks leave the sum; where the model misfits everywhere the limit follows
             limit = _CLIP_SIGMA * _CLIP_SIGMA * max(1.0, chi2 / n)

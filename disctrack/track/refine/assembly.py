@@ -150,8 +150,8 @@ def _shared(seen: DotsInFrames, workers: int) -> tuple[AsBuilt, AsBuilt | None, 
     # the dots miss the pose that fits best by far more than in others
     fits = fit_all(seen, workers, judged=False)
     outlying = outlying_frames((whitening(seen.covariance) @ fits.residuals_px[..., None])[..., 0])
-    faults = without_shared_faults(seen.but(outlying))
-    as_built = refine_as_built(seen.but(outlying))
+    ordinary = replace(seen, t=np.where(outlying[:, None], np.nan, seen.t))
+    faults, as_built = without_shared_faults(ordinary), refine_as_built(ordinary)
     if faults is not None and as_built.reduced_chi_square > FAULTY * max(1.0, faults.reduced_chi_square):
         as_built = faults  # dots refined alone would be moved to make up for wrong cameras
     return as_built, faults, outlying

@@ -203,8 +203,7 @@ def test_the_other_face_shows_no_dots(rendered_pairs):
 
 
 def test_what_dots_leave_is_the_sensors_law(rendered_pairs):
-    pairs = some(rendered_pairs, slice(0, 24, 2))
-    law = rough_noise(pairs.images[0, 0])
+    pairs, law = some(rendered_pairs, slice(0, 24, 2)), rough_noise(rendered_pairs.images[0, 0])
     for _ in range(2):
         dots = np.concatenate([each.dots for each in locate_all(pairs, pairs.images, law)[2]])
         law = noise_left(law, dots[np.isfinite(dots["u"])])
