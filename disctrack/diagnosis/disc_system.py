@@ -233,14 +233,14 @@ class DiscSystem(System):
         """Of the frames [Hz]."""
         return float(1.0 / np.median(np.diff(self.time)))
 
-    def scan(self, fitted: Fit, beside: Sequence[Quantity] | None = None) -> DiscScan | None:
+    def scan(self, fitted: Fit, base: Sequence[Quantity] | None = None) -> DiscScan | None:
         """First-order gains of laws along the fitted motion; None if the disc slips.
 
-        beside : quantities fitted together with a law; by default those of the fit. The contribution of all others is
+        base : quantities fitted together with a law; by default those of the fit. The contribution of all others is
             added to the residual to first order: the law is to replace them, along a motion that follows the data.
         """
         along = response(self, fitted)
-        return None if along is None else DiscScan(self, fitted, beside, along)
+        return None if along is None else DiscScan(self, fitted, base, along)
 
     def knowing(self, law: LearnedLaw) -> DiscSystem:
         """The same system with this law in its model: its coefficients may be among the values."""

@@ -80,7 +80,7 @@ def with_form(
     law: LearnedLaw,
     noise: float,
     correlated: bool = False,
-    beside: Collection[str] = (),
+    companions: Collection[str] = (),
 ) -> tuple[Fit, Fit, Course | None, float]:
     """The fit with covariances averaged over right and wrong form, and with that of a wrong form; and the laws' moment.
 
@@ -90,7 +90,7 @@ def with_form(
 
     system : its model contains the law.   noise : variance of the noise of the residual over that stated
     correlated : the residual is not white noise
-    beside : known effects found together with the law, which may compensate for its form: part of the discrepancy
+    companions : known effects found together with the law, which may compensate for its form: part of the discrepancy
     """
     blocks = probe(system, fitted)
     if blocks is None:
@@ -99,11 +99,11 @@ def with_form(
     R = np.vstack([blocks.data / np.sqrt(noise), blocks.prior])
     motion = _motion(system, fitted.values, blocks.time)
     course = moment_about_contact(system, fitted.values, motion)[1:]
-    own = moment_about_contact(system, fitted.values, motion, {law.candidate.effect, *beside})[1:]
+    own = moment_about_contact(system, fitted.values, motion, {law.candidate.effect, *companions})[1:]
     by_number = _by_number(system, fitted, motion, course)
     lasts = SLOW * float(system.time[-1] - system.time[0])
     parts = _parts(blocks, motion, lasts, float(np.sqrt(np.mean(np.sum(own**2, axis=1)))))
-    wrong = 1.0 if correlated else probability_of_wrong_form(law, beside)
+    wrong = 1.0 if correlated else probability_of_wrong_form(law, companions)
     own_directions, fitted_columns = span(by_number), span(R[:, :n])
     right = cleared(R[:, -1], fitted_columns)
     variance = np.sum((by_number @ fitted.covariance) * by_number, axis=1)
@@ -131,12 +131,12 @@ def absorbed(columns: Array, misfit: Array) -> Array:
     return np.asarray(np.linalg.lstsq(columns / length, misfit, rcond=DEPENDENT)[0] / length[:, None], float)
 
 
-def probability_of_wrong_form(law: LearnedLaw, beside: Collection[str] = ()) -> float:
+def probability_of_wrong_form(law: LearnedLaw, companions: Collection[str] = ()) -> float:
     """Probability that the true law is not in the library, given that the residual is noise.
 
-    A sum of several families, or of one and known effects `beside` it, approximates a law that is not in the library.
+    A sum of several families, or of one with known effects, approximates a law that is not in the library.
     """
-    if len(law.families) + len(beside) > 1:
+    if len(law.families) + len(companions) > 1:
         return 1.0
     own = _kinds(law)
     others = sum(odds for other, odds in law.others if not other.families or not _kinds(other) <= own)

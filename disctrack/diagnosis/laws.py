@@ -1,9 +1,9 @@
-"""Laws that no catalogue names: proposed by what they would gain to first order, and ranked by length as all else is.
+"""Laws outside the catalogue: proposed by their gain to first order, and compared by evidence with known effects.
 
-A system says how it answers to small forces along a fitted motion, and makes an effect of a law. The law that gains
-most is fitted in full beside its nearest alternatives, and the next is looked for in what it leaves, while each pays
-for its numbers and for having been looked for among so many. With the known effects that stay beside it, a law is an
-explanation; the answer is the shortest one.
+The response of a fitted motion to small forces gives the first-order gain of every law of a library. The law that
+gains most and its nearest alternatives are fitted, and a further term is searched for in the residuals. Each term pays
+an Occam factor for its parameters, and for multiple comparisons by the size of the library. A law together with the
+known effects that remain significant is an explanation; the answer is the shortest one.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from disctrack.discrepancy.significance import price_of_a_number
 from disctrack.discrepancy.system import Quantity, System
 
 MAX_TERMS = 3
-REFITTED = 5  # families that are fitted in full in each round ...
-OF_ONE_KIND = 2  # ... of them of one kind
-LONGER = 2  # of other kinds, that come nearest to the data in more numbers, beside known effects that describe them
-EXACT = 0.02  # of chi-square: what a first-order gain may err by where the motion is far from the data
-UNLIKELY = 1e-3  # odds below which a law does not count
+REFITTED = 5  # families that are fitted in each round ...
+OF_ONE_KIND = 2  # ... at most of one kind
+LONGER = 2  # further ones of other kinds with more parameters, if known effects describe the data
+EXACT = 0.02  # of chi-square: error of a first-order gain if the motion is far from the data
+UNLIKELY = 1e-3  # odds below which a law is dropped
 NEARLY = 20.0  # chi-square by which a refit may be better than the first order ...
-COARSE = 0.1  # ... and share of what is missing, by which one may be that moves a shape off the library's grid
+COARSE = 0.1  # ... and share of the excess, by which a refit of a shape between grid points may be better
 
 
 def learn(
@@ -88,15 +88,15 @@ def _leaves_noise(known: DiscSystem, fitted: Fit, noise: float) -> bool:
 
 
 def base_alone(base: Fit, along: Fit) -> Fit:
-    """The base fit, to start where the other one ended, without the effects that it has beyond the base."""
+    """The base fit with the other fit as initial guess, the effects outside the base at zero."""
     beyond = {q.name: q.null for q in along.quantities if q.name not in base.names}
     return replace(base, values=base.values | along.values | beyond)
 
 
 def shortest_to_first_order(system: DiscSystem, base: Fit, along: Fit, noise: float) -> float:
-    """Chi-square with all prices of the law without a shape that comes nearest; infinite where there is no first order.
+    """Length of the best law without shape parameters, to first order; infinite if the disc slips.
 
-    along : fit of known effects, in the place of which the law stands beside the base's
+    along : fit of known effects, which the law replaces
     """
     scan = system.scan(along, base.quantities)
     if scan is None:
@@ -114,10 +114,10 @@ def _odds(fitted: Fit, best: Fit, noise: float) -> float:
 def _worth_a_refit(
     worth: Sequence[Gain], chi_square: float, inexact: float, noise: float, price: float, against: float
 ) -> list[Gain]:
-    """The best ones, not more than some of a kind: to first order many of a kind are alike.
+    """The best ones, of each kind only a few: to first order many of one kind are alike.
 
-    inexact : chi-square of the motion along which they were looked for
-    against : as of `learn`
+    inexact : chi-square of the motion at which the gains were computed
+    against : as for `learn`
     """
     left = {id(g): (chi_square - g.gain) / noise for g in worth}
     if np.isfinite(against):
@@ -133,7 +133,7 @@ def _worth_a_refit(
             found.append(g)
             kinds.append(g.family.kind)
     if np.isfinite(against):
-        # what fits as well in more numbers is not named, but counts in what is known of the force
+        # laws that fit as well with more parameters are not named, but contribute to the uncertainty of the force
         others = (g for g in worth if g.family.kind not in kinds)
         found += sorted(others, key=lambda g: -g.gain)[:LONGER]
     return found
@@ -159,14 +159,14 @@ def _arrived(law: LearnedLaw, fitted: Fit) -> LearnedLaw:
 
 
 def with_law(system: System, base: Fit, law: LearnedLaw, held: Collection[str] = ()) -> Fit:
-    """The base model's fit with the law's numbers fitted along, but for those held."""
+    """Fit of the base model and the law's parameters, except those held."""
     moved = (q for q in law.candidate.quantities if q.name not in held)
     start = base.values | dict(law.values) | dict(zip(law.candidate.names, law.candidate.start, strict=True))
     return fit(system, (*base.quantities, *moved), start, TRIAL)
 
 
 def _one_by_one(system: System, base: Fit, law: LearnedLaw, widths: Sequence[Quantity]) -> Fit:
-    """The law's fit with its widths found along their profiles: in a short time a blow's width hardly shows."""
+    """The fit of a law whose widths are fitted along their profile likelihood, as the data hardly determine them."""
     fitted = with_law(system, base, law, law.widths)
     for q in widths:
         fitted = profiled(system, fitted, q, 0.3 * fitted.values[q.name])
@@ -174,9 +174,9 @@ def _one_by_one(system: System, base: Fit, law: LearnedLaw, widths: Sequence[Qua
 
 
 def without_idle_terms(system: DiscSystem, law: LearnedLaw, fitted: Fit) -> LearnedLaw:
-    """The law without the terms that the fit to the data itself finds to be zero, if it has others; else the same.
+    """The law without the terms that are not significant in its fit; unchanged if none is.
 
-    Terms that go together may each be open where their family is not: it is judged as a whole, and so are they.
+    Single terms of a family may be insignificant by correlation although the family is not: both are tested jointly.
     """
     kept, values = list[Family](), list[float]()
     for family, amounts, shapes in zip(law.families, law.amounts, law.shapes, strict=True):
@@ -194,9 +194,9 @@ def without_idle_terms(system: DiscSystem, law: LearnedLaw, fitted: Fit) -> Lear
 
 
 def busy_amounts(fitted: Fit, names: Sequence[str]) -> dict[int, float]:
-    """Those of the amounts that the data need, with their values while the others are zero; none if all are idle.
+    """Indices of the significant amounts, with their values if the others are zero; empty if none is significant.
 
-    One after the other goes, each judged with those before it out: of two that move together one may do for both.
+    Backward elimination: the least significant amount is removed, and the others are estimated again.
     """
     amounts, covariance = fitted.amounts(names)
     if not differ_from_zero(amounts, covariance):
@@ -215,27 +215,27 @@ def busy_amounts(fitted: Fit, names: Sequence[str]) -> dict[int, float]:
 
 @dataclass(frozen=True, kw_only=True)
 class WithLaw(Explanation):
-    """An explanation with a law: known effects that stay beside it, fitted together."""
+    """An explanation by a law and known effects, fitted together."""
 
     law: LearnedLaw
-    system: DiscSystem  # knows the law
+    system: DiscSystem  # its model contains the law
     kept: tuple[Found, ...]
 
     @property
     def effects(self) -> tuple[str, ...]:
-        """Names of its effects, and what the law means."""
+        """Names of its effects, and the law in words."""
         return (*super().effects, self.law.title)
 
 
 def explained_by_law(
     system: DiscSystem, diagnosis: Diagnosis, left: ResidualTests | None
 ) -> tuple[WithLaw | None, Diagnosis]:
-    """The explanation with a law if that is the shortest one; and the diagnosis with those with laws in its list.
+    """The explanation with a law if it is the shortest; and the diagnosis with all explanations with laws in its list.
 
-    Of those that describe the data as well as the shortest, the one that claims the fewest known effects.
+    Among indistinguishable ones, that with the fewest known effects.
     """
-    noise, beside = diagnosis.noise, _beside(system, diagnosis, left is not None and left.doubtful)
-    found = [_law_beside(system, diagnosis, kept) for kept in beside if system.budget.open()]
+    noise, subsets = diagnosis.noise, _subsets(system, diagnosis, left is not None and left.doubtful)
+    found = [_law_with(system, diagnosis, kept) for kept in subsets if system.budget.open()]
     answers = [a for a in found if a is not None and a.fit.converged]
     if not answers:
         return None, diagnosis
@@ -253,7 +253,7 @@ def explained_by_law(
 
 
 def _is_known(diagnosis: Diagnosis, by_law: Fit) -> bool:
-    """Does a single effect of the motion leave no more than the law, which then says the same in fewer numbers?"""
+    """Does a single known effect describe the data as well as the law?"""
     alone = sum(f.candidate.kind == "motion" for f in diagnosis.found) == 1
     return alone and diagnosis.after.cost <= by_law.cost
 
@@ -261,7 +261,7 @@ def _is_known(diagnosis: Diagnosis, by_law: Fit) -> bool:
 def _known(system: System, diagnosis: Diagnosis, many: int) -> float:
     """Length of the shortest explanation by known effects.
 
-    Of two that are as good, what is known: not more effects of the motion than the other takes have that credit.
+    Among equals known effects are preferred to a law, if they are not more effects of the motion than the law needs.
     """
     found = [f.candidate for f in diagnosis.found]
     answer = length(system, diagnosis.settings, diagnosis.noise, diagnosis.after, found)
@@ -269,42 +269,42 @@ def _known(system: System, diagnosis: Diagnosis, many: int) -> float:
     return min(its - CLASS_GAIN * (0 < sum(c.kind == "motion" for c in of) <= many) for its, of in lengths)
 
 
-def _beside(system: DiscSystem, diagnosis: Diagnosis, doubtful: bool) -> tuple[tuple[Found, ...], ...]:
-    """Sets of what was found, beside each of which a law is looked for in the place of the others.
+def _subsets(system: DiscSystem, diagnosis: Diagnosis, doubtful: bool) -> tuple[tuple[Found, ...], ...]:
+    """Subsets of the effects found with each of which a law is combined, to replace the others.
 
-    A single known effect has to compete where what it leaves is `doubtful`, or where a law comes as near to first
-    order: it may stand in for a law that is not known. So may each of several, or all. Faults of the measurement stay
-    beside the law, unless it makes them idle: no force displaces a dot on the face.
+    A known effect may approximate an unknown law. A single one is compared with laws if its residuals are `doubtful`,
+    or if a law describes the data as well to first order; of several effects, each and all are. Faults of the
+    measurement are kept together with the law, unless they become insignificant: no force displaces a dot on the face.
     """
     of_motion, faults = (
         tuple(f for f in diagnosis.found if (f.candidate.kind == "motion") == motion) for motion in (True, False)
     )
     if diagnosis.verdict == "nothing missing" or diagnosis.held_out_before is None:
         return ()
-    if diagnosis.verdict != "found":  # what was found describes most of it, and the law may be what is left
+    if diagnosis.verdict != "found":  # the effects found explain most of it, and a law may explain the rest
         return (faults, diagnosis.found) if of_motion else (faults,)
     if doubtful or len(of_motion) > 1:
         return (faults, *((*faults, f) for f in of_motion))
     if not of_motion:
         return ()
-    near = shortest_to_first_order(system, base_beside(diagnosis.before, faults), diagnosis.after, diagnosis.noise)
+    near = shortest_to_first_order(system, base_with(diagnosis.before, faults), diagnosis.after, diagnosis.noise)
     return (faults,) if of_motion[0].candidate.sought or near - CLASS_GAIN < _known(system, diagnosis, 1) else ()
 
 
 def judged_as(diagnosis: Diagnosis, system: System) -> System:
-    """The system with its noise as the diagnosis found it."""
+    """The system whitened by the noise that the diagnosis found."""
     return (diagnosis.judged or system).over(system)
 
 
-def base_beside(base: Fit, kept: Sequence[Found]) -> Fit:
-    """The base fit, with the quantities of these effects to be fitted along."""
+def base_with(base: Fit, kept: Sequence[Found]) -> Fit:
+    """The base fit with the quantities of these effects added to it."""
     quantities = {q.name: q for q in base.quantities} | {q.name: q for f in kept for q in f.candidate.quantities}
     return replace(base, quantities=tuple(quantities.values()))
 
 
-def _law_beside(system: DiscSystem, diagnosis: Diagnosis, kept: tuple[Found, ...]) -> WithLaw | None:
-    """The law that takes the place of what was found but for `kept`; None if there is none."""
-    noise, base = diagnosis.noise, base_beside(diagnosis.before, kept)
+def _law_with(system: DiscSystem, diagnosis: Diagnosis, kept: tuple[Found, ...]) -> WithLaw | None:
+    """The law that replaces the effects found, except `kept`; None if there is none."""
+    noise, base = diagnosis.noise, base_with(diagnosis.before, kept)
     nearest = diagnosis.nearest.fit if diagnosis.nearest else None
     along = diagnosis.after if diagnosis.found else nearest
     against = along.cost / noise if diagnosis.verdict == "found" and along else np.inf
@@ -318,23 +318,23 @@ def _law_beside(system: DiscSystem, diagnosis: Diagnosis, kept: tuple[Found, ...
         law, known = shorter, system.knowing(shorter)
         fitted = with_law(judged_as(diagnosis, known), base, law)
     judged, again = judged_as(diagnosis, known), list(kept)
-    for found in kept:  # in what the law leaves, is it still an effect?
+    for found in kept:  # is it still significant with the law?
         rest = [f for f in again if f is not found]
         enough = gain_of_memory(judged, fitted, noise, found.candidate, found.threshold)
         held = fitted.values | {q.name: q.null for q in found.candidate.quantities}
-        without = with_law(judged, base_beside(diagnosis.before, rest), replace(law, values=held))
+        without = with_law(judged, base_with(diagnosis.before, rest), replace(law, values=held))
         gain = (without.cost - fitted.cost) / noise
         if without.converged and gain < enough:
             again, fitted = rest, without
         else:
             again[again.index(found)] = replace(found, gain=float(gain), cannot_be_told_from=())
-    beside = tuple(f.candidate for f in again)
-    its = length(system, diagnosis.settings, noise, fitted, beside) + law.looked * len(law.families)
-    return WithLaw(candidates=beside, fit=fitted, length=its, law=law, system=known, kept=tuple(again))
+    known_effects = tuple(f.candidate for f in again)
+    its = length(system, diagnosis.settings, noise, fitted, known_effects) + law.looked * len(law.families)
+    return WithLaw(candidates=known_effects, fit=fitted, length=its, law=law, system=known, kept=tuple(again))
 
 
 def _others(best: WithLaw, answers: Sequence[WithLaw], diagnosis: Diagnosis) -> tuple[tuple[LearnedLaw, float], ...]:
-    """Whatever describes the data as well, with its odds: other laws, beside other effects, and known effects alone."""
+    """All that describes the data as well, with its odds: other laws, also with other effects, and known effects."""
     noise, others = diagnosis.noise, list(best.law.others)
     for other in answers:
         if other is not best and other.fit.converged:
@@ -342,6 +342,6 @@ def _others(best: WithLaw, answers: Sequence[WithLaw], diagnosis: Diagnosis) -> 
             others.append((replace(other.law, values=other.fit.values), share))
             others += [(law, share * its) for law, its in other.law.others]
     if diagnosis.verdict == "found":
-        nothing = replace(best.law, families=(), values=diagnosis.after.values)  # beside known effects
+        nothing = replace(best.law, families=(), values=diagnosis.after.values)  # by known effects alone
         others.append((nothing, _odds(diagnosis.after, best.fit, noise)))
     return tuple((law, share) for law, share in others if share > UNLIKELY)

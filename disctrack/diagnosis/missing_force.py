@@ -183,13 +183,13 @@ class DiscScan:
     as a shift of that state. Inner products of columns orthogonal to those of the fitted quantities, with orthonormal
     basis W, are the sums over frames of g' (D' D) g minus the products of the sums of W' D g.
 
-    beside : as for `DiscSystem.scan`
+    base : as for `DiscSystem.scan`
     """
 
-    def __init__(self, system: DiscSystem, fit_: Fit, beside: Sequence[Quantity] | None, along: Response) -> None:
+    def __init__(self, system: DiscSystem, fit_: Fit, base: Sequence[Quantity] | None, along: Response) -> None:
         self.motion, self._kernel, self._frames = along
         self._rate, self._disc = float(1.0 / np.median(np.diff(system.time))), system.disc
-        fitted = fit_.quantities if beside is None else tuple(beside)
+        fitted = fit_.quantities if base is None else tuple(base)
         moved = [q for q in fitted if not is_linear(q)]
         common = projection(system, fitted, fit_.values)
         values = fit_.values | dict(zip(common.names, common.null.tolist(), strict=True))
