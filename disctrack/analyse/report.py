@@ -10,7 +10,7 @@ import numpy as np
 
 from disctrack.analyse.analysis import Analysis
 from disctrack.analyse.power_laws import MODEL_EXPONENTS, Exponent, PowerLaws
-from disctrack.findings import Finding
+from disctrack.findings import carried
 from disctrack.numbers import Measured, measured, unit_text
 from disctrack.report.blocks import Cell, Facts, Figures, Listing, Report, Section
 from disctrack.trajectory import FrameStatus
@@ -24,13 +24,9 @@ ASYMPTOTIC_BELOW = np.radians(1.0)
 
 
 def report_of(
-    analysis: Analysis,
-    provenance: Provenance,
-    findings: Sequence[Finding] = (),
-    drawn: Sequence[Drawn] = (),
-    files: Sequence[Path] = (),
+    analysis: Analysis, provenance: Provenance, drawn: Sequence[Drawn], page: Path, trajectory_file: Path
 ) -> Report:
-    """All of an analysis. findings : of the measurement;  files : written, the page first, the trajectory last"""
+    """All of an analysis, and what was noticed in the measurement."""
 
     def section(title: str, numbers: tuple[str, ...], *blocks: Listing | str) -> Section:
         return Section(title, [*blocks, Figures([d for d in drawn if d.name.startswith(numbers)])])
@@ -41,7 +37,7 @@ def report_of(
         f"{provenance.recording}: from the trajectory to the physics",
         f"The disc {analysis.onset.verdict}. {_exponents_text(laws)}",
         _accuracy(analysis),
-        [*findings, *analysis.findings],
+        [*carried(trajectory.findings), *analysis.findings],
         facts=[
             (
                 "energy lost (± 1 σ)",
@@ -59,9 +55,9 @@ def report_of(
             section("Scaling laws of the last stage", ("14", "15", "16"), *_exponents(analysis)),
             Section("Method", [_method(analysis, provenance)]),
         ],
-        files=files,
-        page=files[0] if files else None,
-        then=f"disctrack diagnose {files[-1]}" if files else "",
+        files=(page, trajectory_file),
+        page=page,
+        then=f"disctrack diagnose {trajectory_file}",
         data={"frames": len(trajectory), "frames_with_a_pose": int(trajectory.measured.sum())},
     )
 

@@ -18,7 +18,6 @@ from disctrack.analyse.report import report_of
 from disctrack.errors import AnalysisError
 from disctrack.files.inputs import keep
 from disctrack.files.labelled_arrays import Variable
-from disctrack.findings import carried
 from disctrack.frames import euler_jacobian
 from disctrack.report.blocks import Report
 from disctrack.report.html import write_page
@@ -75,7 +74,7 @@ def run_analyse(
         raise AnalysisError(f"{path}: {error}") from error
     write_analysis(path, analysis)
     page = folder / "report.html"
-    summary = report_of(analysis, provenance, carried(trajectory.findings), all_figures(analysis), (page, path))
+    summary = report_of(analysis, provenance, all_figures(analysis), page, path)
     written = write_page(page, summary, ("png", "pdf") if figures else ())
     remember(folder, origin_of(path, {"window": window, "circle": circle_duration}), summary, (page, *written))
     return AnalyseOutcome(analysis, path, page, tuple(written), summary)

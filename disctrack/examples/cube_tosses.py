@@ -25,6 +25,7 @@ from scipy.integrate import cumulative_trapezoid
 from scipy.spatial.transform import Rotation
 
 from calibration.kit.arrays import Array, Mask
+from disctrack.analyse.derivatives import K as UP
 from disctrack.discrepancy.document import effect_text
 from disctrack.discrepancy.noise import SampleStretch, SmoothNoise, estimate
 from disctrack.discrepancy.score import INVISIBLE
@@ -41,7 +42,6 @@ SHORTEST = 9  # samples of a flight
 RELEASE = 5.0  # sigmas by which a first sample may stand off the smooth motion before it counts as still in the hand
 GLITCH = 20.0  # sigmas off the smooth motion that no effect explains: a hand, or a tag mistaken
 MAX_RELEASE = 6  # samples
-UP = np.array([0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True)
