@@ -20,7 +20,6 @@ from disctrack.recording.readers.base import FrameReader
 from disctrack.recording.readers.files import FORMATS, IMAGES, SUFFIXES, folders_below, natural_key
 from disctrack.recording.readers.hdf5 import stacks_of
 
-DEEPEST = 4  # folders below the recording that are looked into
 _OWN_FOLDERS = re.compile(r"(results|batch_results|.*_analysis|.*_diagnosis)$")
 _CALIBRATION_WORDS = re.compile(r"cal|chess|checker|board|target|views", re.IGNORECASE)
 # Words that tell the cameras apart, left first; numbers and single letters are compared by their order.
@@ -78,7 +77,7 @@ def find_sequences(folder: Path) -> list[Sequence]:
     found: list[Sequence] = []
     for place, below, unsorted in folders_below(folder, set()):
         inside, names = place.relative_to(folder), sorted(unsorted, key=natural_key)
-        below[:] = [name for name in below if len(inside.parts) < DEEPEST and not _OWN_FOLDERS.match(name)]
+        below[:] = [name for name in below if not _OWN_FOLDERS.match(name)]
         images = [name for name in names if Path(name).suffix.lower() in IMAGES]
         found += _image_sequences(folder, inside, images)
         headers = {Path(name).stem for name in names if Path(name).suffix.lower() in FORMATS["mraw"] - {".mraw"}}
