@@ -133,7 +133,7 @@ def thickness(disc: Disc, board: float, off: Finding) -> tuple[Finding, ...]:
         if fits > 0
     ]
     text = f"the disc's rim rolls {1e-3 * height:+.2f} mm from the table that the board gives"
-    return (_contradiction(suspects, text, explains=OFF),) if suspects else ()
+    return (_contradiction(suspects, text, OFF),) if suspects else ()
 
 
 def across(trajectory: Trajectory) -> Array:
@@ -196,16 +196,12 @@ Suspect: TypeAlias = tuple[float, Kind, Remedy]
 
 
 def _contradiction(
-    suspects: Sequence[Suspect],
-    text: str,
-    severity: Severity = Severity.DOUBT,
-    numbers: Mapping[str, Measured] | None = None,
-    explains: tuple[Kind, ...] = (),
+    suspects: Sequence[Suspect], text: str, explains: tuple[Kind, ...] = (), **numbers: Measured
 ) -> Finding:
     """Of the kind of the likeliest suspect, all of which it names."""
     likely = sorted(suspects, key=itemgetter(0))
     remedies = tuple(remedy for *_, remedy in likely)
-    return Finding(likely[0][1], severity, text, numbers=numbers or {}, remedies=remedies, explains=explains)
+    return Finding(likely[0][1], Severity.DOUBT, text, numbers=numbers, remedies=remedies, explains=explains)
 
 
 def _apart(one: float, other: float) -> float:
@@ -265,7 +261,7 @@ def motion_against_gravity(trajectory: Trajectory, height: float | None = None) 
         explains = (Kind.REVERSED, *OFF) if kind == Kind.RADIUS else (Kind.REVERSED,)
         if kind == Kind.RADIUS and not away:  # two laws agree about it
             severity = max(severity, Severity.WARNING)
-        return (_contradiction(suspects, text, severity, {"gravity": gravity}, explains),)
+        return (replace(_contradiction(suspects, text, explains, gravity=gravity), severity=severity),)
     if not _known(gravity):
         return ()
     blocks = np.arange(float(len(energy)))
@@ -277,7 +273,7 @@ def motion_against_gravity(trajectory: Trajectory, height: float | None = None) 
             "table's acts; expected a loss"
         )
         remedy = Remedy("[cameras] left, right", action="give the files in the order of time")
-        return (_contradiction([(0.0, Kind.REVERSED, remedy)], text, numbers={"growth": grown}),)
+        return (_contradiction([(0.0, Kind.REVERSED, remedy)], text, growth=grown),)
     return ()
 
 
@@ -456,7 +452,7 @@ def rise_of_centre(trajectory: Trajectory) -> tuple[Finding, ...]:
         (off, Kind.SQUARE, Remedy("[calibration] square_mm", action=f"times {disc.radius / slope.value:.4g}")),
     )
     text = f"the centre rises by {rise} per unit of sin(theta); expected the radius, {1e3 * disc.radius:.2f} mm"
-    return (_contradiction(suspects, text, numbers={"rise": rise}, explains=OFF),)
+    return (_contradiction(suspects, text, OFF, rise=rise),)
 
 
 def handedness(rig: StereoRig, disc: Disc) -> tuple[Finding, ...]:
@@ -525,7 +521,7 @@ def other_scale(scale: Measured, square: float | None = None, explains: tuple[Ki
     which = "[markers] centres_mm" if off < SIDE_TOLERANCE else "every length of [disc] and [markers]"
     lengths = (off, Kind.SQUARE, Remedy(which, action=f"times {rounded(factor, digits)}"))
     text = f"by both cameras the dots are {scale} times as far apart as declared{mixed}"
-    return _contradiction((board, lengths), text, numbers={"scale": scale}, explains=explains)
+    return _contradiction((board, lengths), text, explains, scale=scale)
 
 
 def unseen_dots(trajectory: Trajectory, declared: Disc) -> Iterator[Finding]:
