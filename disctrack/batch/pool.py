@@ -185,10 +185,7 @@ def _why_it_ended(process: SpawnProcess, said: Path) -> str:
     words = said.read_text("utf-8", "replace").split() if said.exists() else []
     code = process.exitcode
     if code == -getattr(signal, "SIGKILL", 9):
-        text = (
-            "its process was killed (signal 9), as the system does when memory runs out. Run fewer side by side "
-            "with -j, or give the machine more memory."
-        )
+        text = "its process was killed (signal 9), as the system does when memory runs out. Run fewer side by side: -j."
     elif code is not None and code < 0:
         text = f"its process was ended by signal {-code} ({signal.strsignal(-code)})."
     else:

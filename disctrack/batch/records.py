@@ -1,5 +1,6 @@
 """The row that is kept beside each recording's results: how far they are complete, of what they were made."""
 
+import contextlib
 import json
 from pathlib import Path
 
@@ -58,11 +59,8 @@ def is_done(folder: Path, row: Row | None, asked: Stages) -> bool:
     if row is None or row["status"] != MEASURED or not row.get("trajectory"):
         return False
     made = [(row["stages"].get(stage), value) for stage, value in asked.items()]
-    if not all(there == value or (value is False and there is True) for there, value in made):
-        return False
-    if not all((folder / row[file]).is_file() for file in PATHS if row.get(file)):
-        return False
-    try:
-        return read_provenance(folder / row["trajectory"]).fingerprint == row["fingerprint"]
-    except DiscTrackError:
-        return False
+    whole = all((folder / row[file]).is_file() for file in PATHS if row.get(file))
+    with contextlib.suppress(DiscTrackError):
+        same = read_provenance(folder / row["trajectory"]).fingerprint == row["fingerprint"]
+        return same and whole and all(there == value or (value is False and there is True) for there, value in made)
+    return False

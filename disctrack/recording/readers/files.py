@@ -135,10 +135,8 @@ def number_files(
         )
         notes.append(f"{lost}; this camera says nothing of these frames")
     if step > 1:
-        doubts.append(
-            f"the file numbers go in steps of {step}; they are taken as consecutive frames at frame_rate_hz. If that "
-            f"is the camera's own rate and every {step}th frame was kept, declare {step} times less"
-        )
+        said = f"the file numbers go in steps of {step}; they are taken as consecutive frames at frame_rate_hz"
+        doubts.append(f"{said}. If that is the camera's own rate, declare {step} times less")
     return tuple(map(by_number.get, numbers)), numbers, tuple(notes), tuple(doubts)
 
 
@@ -151,11 +149,9 @@ def check_continuation(files: Sequence[Path], camera: str) -> None:
     rest = files[1:] if files[1].stem.startswith(files[0].stem) else files
     _, _, notes, doubts = number_files(rest, camera)
     if notes or doubts:
-        raise RecordingError(
-            f"{files[0]} ...: a {camera} stack that goes on in several files lacks one: {(*notes, *doubts)[0]}. How "
-            "many frames it held is not known, so all that follows would be shifted in time: copy it again, or measure "
-            "those before it."
-        )
+        said = f"a {camera} stack that goes on in several files lacks one: {(*notes, *doubts)[0]}"
+        remedy = "What follows would be shifted in time: copy it again, or measure the files before it"
+        raise RecordingError(f"{files[0]} ...: {said}. {remedy}.")
 
 
 def _numbers_by_pattern(files: Sequence[Path], pattern: str) -> list[int]:
@@ -181,10 +177,9 @@ def _numbers_by_form(files: Sequence[Path], camera: str) -> list[list[int]]:
         usual = list(groups[0][0])
         odd = [file for file, form in zip(files, forms, strict=True) if form != usual]
         others = [file for file, form in zip(files, forms, strict=True) if form == usual]
-        raise RecordingError(
-            f"{_listed(odd)}: not named like the other {len(others)} {camera} frames ({_listed(others)}). It would be "
-            f"a frame of its own and shift those after it. Move it away{_pattern_hint(others, odd)}."
-        )
+        said = f"{_listed(odd)}: not named like the other {len(others)} {camera} frames ({_listed(others)})"
+        remedy = f"It would shift those after it: move it away{_pattern_hint(others, odd)}"
+        raise RecordingError(f"{said}. {remedy}.")
     runs = [re.findall(r"[0-9]+", file.stem) for file in files]
     columns = [[int(run) for run in column] for column in zip(*runs, strict=True)]
     return [column for column in columns if len(set(column)) > 1] or columns[-1:]
@@ -217,11 +212,9 @@ def _refuse_clock(files: Sequence[Path], numbers: Sequence[int], camera: str) ->
             said = f"{files[a]}, {files[b]}: two {camera} frames of number {numbers[a]}"
             raise RecordingError(f"{said}. Move one away, or say with {NUMBER} in the pattern which digits count.")
     steps = sorted(b - a for a, b in pairwise(sorted(numbers)))
-    raise RecordingError(
-        f"{_listed([files[i] for i in order])}: the numbers of the {camera} frames have no common step (differences "
-        f"from {steps[0]} to {steps[-1]}), like time stamps. Number the frames as the camera counted them, or say with "
-        f"{NUMBER} in the pattern which digits count; time stamps are read from HDF5, TIFF and camera files."
-    )
+    said = f"the numbers of the {camera} frames have no common step ({steps[0]} to {steps[-1]}), like time stamps"
+    remedy = f"Number the frames as the camera counted them, or say with {NUMBER} in the pattern which digits count"
+    raise RecordingError(f"{_listed([files[i] for i in order])}: {said}. {remedy}.")
 
 
 def _pattern_hint(usual: Sequence[Path], odd: Sequence[Path]) -> str:

@@ -133,10 +133,9 @@ def _without_directories(file: RawFile, first: Page) -> list[Page]:
     if n < 2 or size == 0:
         return [first]
     if first.plain_offset < 0:
-        raise RecordingError(
-            f"{file}: announces {n} frames in one directory, whose pixels are not plain (white is zero, rows "
-            "from another corner, compressed, or no grey values of 8 or 16 bit). Export it again, black as zero."
-        )
+        plain = "grey values of 8 or 16 bit, black as zero, upright, not compressed"
+        said = f"announces {n} frames in one directory, whose pixels are not plain; expected {plain}"
+        raise RecordingError(f"{file}: {said}. Export it again.")
     most = max(1, -(-file.size // size))  # of a file cut short the frames that begin in it; the next is the end
     start = first.plain_offset
     return [replace(first, places=(start + i * size,), sizes=(size,)) for i in range(min(n, most))]

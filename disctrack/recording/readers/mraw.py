@@ -83,10 +83,8 @@ def _pair_of(files: Sequence[Path], camera: str) -> tuple[Path, Path]:
     for suffixes in ((".cihx", ".cih"), (".mraw",)):
         there = [beside[suffix] for suffix in suffixes if suffix in beside]
         if not there:
-            raise RecordingError(
-                f"{files[0]}: there is no {stem.name}{' or '.join(suffixes)} beside it for the {camera} camera. Copy "
-                "it from the camera's folder, or name image files that were exported instead."
-            )
+            said = f"{files[0]}: there is no {stem.name}{' or '.join(suffixes)} beside it for the {camera} camera"
+            raise RecordingError(f"{said}. Copy it from the camera's folder, or name exported images instead.")
         found.append(there[0])
     return found[0], found[1]
 

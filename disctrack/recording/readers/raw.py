@@ -80,10 +80,11 @@ class RawFile:
             raise RecordingError(f"{self} ({camera} camera): its header states no frame. Export it again.")
         if present < LEAST_PRESENT * n or present * layout.frame_bytes > self.size:
             each = in_words((layout.width, layout.height), layout.stored_bits)
-            raise RecordingError(
-                f"{self} ({camera} camera): the header states {n} frames, {each} ({n * layout.frame_bytes} bytes), but "
-                f"the file has {self.size} bytes: cut short, or the header is of another file. Copy both again."
+            said = (
+                f"the header states {n} frames, {each} ({n * layout.frame_bytes} bytes), but the file has {self.size}"
             )
+            remedy = "It is cut short, or the header is of another file: copy both again."
+            raise RecordingError(f"{self} ({camera} camera): {said}. {remedy}")
 
 
 @dataclass(frozen=True)

@@ -52,25 +52,19 @@ def check_headers(
 def _compared(left: CameraHeader, right: CameraHeader) -> Iterator[str]:
     """What is doubtful. Raises RecordingError where frame i of both does not show the same instant."""
     if abs(left.frame_rate - right.frame_rate) > 1e-6 * left.frame_rate:
-        raise RecordingError(
-            f"the left camera's frames were recorded with {left.rate} ({left.file}), the right one's with {right.rate} "
-            f"({right.file}): frame i of both does not show the same instant. Record with one rate, or export with the "
-            "same step."
-        )
+        rates = f"{left.rate} ({left.file}), the right one's with {right.rate} ({right.file})"
+        said = f"the left camera's frames were recorded with {rates}: frame i of both does not show the same instant"
+        raise RecordingError(f"{said}. Record with one rate, or export with the same step.")
     numbers = left.first_frame, right.first_frame
     if left.trigger == right.trigger and None not in numbers and numbers[0] != numbers[1]:
-        raise RecordingError(
-            f"the left file begins with the camera's frame {numbers[0]} ({left.file}), the right one with frame "
-            f"{numbers[1]} ({right.file}), at the same trigger mode: frame i of both does not show the same instant. "
-            "Export the same range of frames from both cameras."
-        )
+        first = f"frame {numbers[0]} ({left.file}), the right one with frame {numbers[1]} ({right.file})"
+        said = f"the left file begins with the camera's {first}: frame i of both does not show the same instant"
+        raise RecordingError(f"{said}. Export the same range of frames from both cameras.")
     offset, period = start_offset(left, right), 1.0 / left.frame_rate
     if offset is not None and abs(offset[0]) > 0.5 * period:
-        raise RecordingError(
-            f"by the time stamps, counted from {offset[1]}, the first frame of the right camera ({right.file}) was "
-            f"taken {offset[0]:.4g} s after that of the left one ({left.file}); a frame lasts {period:.4g} s. "
-            "Export the frames of the same instants, of the same take."
-        )
+        later = f"taken {offset[0]:.4g} s after that of the left one ({left.file}); a frame lasts {period:.4g} s"
+        said = f"by the time stamps, counted from {offset[1]}, the first frame of the right camera ({right.file}) was"
+        raise RecordingError(f"{said} {later}. Export the frames of the same instants, of the same take.")
     if left.trigger != right.trigger:  # equal modes count from the same event; of unequal ones nothing is known
         modes = f"left {left.trigger or 'unknown'}, right {right.trigger or 'unknown'}"
         yield f"the cameras were triggered in different modes: {modes}. Frame i of both may show different instants"

@@ -39,10 +39,8 @@ def camera_of(K: Array, D: Array, size: Array, where: str) -> Camera:
     if K.shape != (3, 3) or not np.isfinite(K).all() or not (K[0, 0] > 0 and K[1, 1] > 0):
         raise RigFileError(f"{where}: {K.tolist()} is not a camera matrix")
     if not np.abs(K - [[K[0, 0], 0, K[0, 2]], [0, K[1, 1], K[1, 2]], [0, 0, 1]]).max() < 1e-9:
-        raise RigFileError(
-            f"{where}: the camera matrix is {K.tolist()}; expected fx, 0, cx; 0, fy, cy; 0, 0, 1: without skew "
-            "(MATLAB keeps it transposed, and R, too)"
-        )
+        said = f"the camera matrix is {K.tolist()}; expected fx, 0, cx; 0, fy, cy; 0, 0, 1: without skew"
+        raise RigFileError(f"{where}: {said} (MATLAB keeps it transposed, and R, too)")
     if not (size >= 1).all() or not (size < MOST).all():
         raise RigFileError(f"{where}: no image size")
     if len(D) > 14 or not np.isfinite(D).all() or np.any(D[5:] != 0):
