@@ -19,7 +19,7 @@ from disctrack.diagnosis.law_library import MIN_SIGMAS, Family, LearnedLaw, diff
 from disctrack.diagnosis.missing_force import Gain, law_of
 from disctrack.discrepancy.fit import TRIAL, Fit, fit
 from disctrack.discrepancy.search import CLASS_GAIN, FAR, Diagnosis, Explanation, Found, alike, gain_of_memory, length
-from disctrack.discrepancy.shape import profiled
+from disctrack.discrepancy.shape import WORTH_A_SHAPE, profiled
 from disctrack.discrepancy.significance import price_of_a_number
 from disctrack.discrepancy.system import Quantity, System
 
@@ -44,7 +44,8 @@ def learn(
     motion, in the place of what it has beyond the base
     against : chi-square over the noise that another explanation leaves; then only a law of a single term is sought, and
     only one that may, to first order, come as near to the data
-    to_noise : what is noise ends the search for further terms, which else goes on while each gains more than its price
+    to_noise : what is noise ends the search for further terms, which else goes on while each gains more than its price.
+    So does a term after which more than half of the excess chi-square is left, far from the noise
     """
     price, law, known = price_of_a_number(system.weights), None, system
     current, shortest = base, base.cost / noise
@@ -63,7 +64,7 @@ def learn(
             break
         shortest, along = min(lengths), None
         near = [one.title for (one, _), its in zip(trials, lengths, strict=True) if its - shortest < CLASS_GAIN]
-        law, current = trials.pop(lengths.index(shortest))
+        before, (law, current) = current, trials.pop(lengths.index(shortest))
         # how short a law is decides which is named; what the recording determines is what all that fit it agree in
         odds = [(one, _odds(t, current, noise)) for one, t in trials if t.converged]
         law = replace(
@@ -74,6 +75,9 @@ def learn(
         )
         known = system.knowing(law)
         enough = len(law.families) == MAX_TERMS or np.isfinite(against)
+        # far from the data, a sum whose terms each remove a small part approximates any motion
+        slow = current.excess(noise) > (1 - WORTH_A_SHAPE) * before.excess(noise)
+        enough |= slow and current.reduced_chi_square > FAR * noise
         if enough or (to_noise and _leaves_noise(known, current, noise)):
             break
         scan = known.scan(current)

@@ -138,6 +138,14 @@ def test_a_law_is_looked_for_along_the_motion_that_follows_the_data():
 
 
 @pytest.mark.statistical
+def test_far_from_the_data_a_law_whose_first_term_describes_little_has_no_other():
+    """A disc that slips on ice: no law of a rolling disc describes that, and three would take minutes."""
+    system, base = with_base_fit(recording("low_friction").trajectory)
+    law = learn(system, base, 1.0)
+    assert len(law.families) == 1
+
+
+@pytest.mark.statistical
 def test_a_strong_spring_is_no_law_in_fewer_numbers():
     """About the origin it is a force in proportion to the distance, with one number where the catalogue's has three."""
     result = diagnose(recording(Unknown(newton_euler.spring(0.8), duration=0.4)).trajectory)
