@@ -8,7 +8,7 @@ from scipy.ndimage import gaussian_filter
 from calibration.cameras.camera import Camera, normalised_maps
 from calibration.kit.compiled import RULES, njit
 from disctrack.track.dots import _kernels as kernels
-from disctrack.track.dots.template import TYPICAL_BLUR_PX, dot_centres, face_of, rough_noise
+from disctrack.track.dots.template import dot_centres, face_of, rough_noise
 
 
 @njit(cache=True, **RULES)
@@ -19,7 +19,7 @@ def look(images, views, face, expected, R, t, results, status):
     kernels._look(images, seen, maps, cameras, face, sigma, noise, limits, R, t, pixels, work, results, status)
 
 
-def locate_on_disc(image, camera, R, t, disc, *, maps=None, noise=None, blur_px=TYPICAL_BLUR_PX):
+def locate_on_disc(image, camera, R, t, disc, *, maps=None, noise=None, blur_px=0.8):
     """The disc's dots in an image (height, width); R (3, 3), t (3,), body -> camera, is its pose within a few px."""
     map_x, map_y = maps if maps is not None else normalised_maps(camera)
     parameters = np.array(noise or rough_noise(image))

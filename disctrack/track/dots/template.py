@@ -29,7 +29,6 @@ from calibration.kit.grey_levels import level_step
 from disctrack.disc import Disc
 from disctrack.trajectory import MarkerStatus
 
-TYPICAL_BLUR_PX = 0.8  # start value where nothing is known yet
 ACROSS, AROUND = 60, 32  # nodes of an edge
 SIZES, SHAPES = 5, np.geomspace(0.2, 1.0, 13)  # of dots (short over long axis) between which the pull is interpolated
 
@@ -49,7 +48,7 @@ class NoiseModel(NamedTuple):
 class Edge(NamedTuple):
     """How the edges of dots look in a camera; as they usually do, where nothing was measured."""
 
-    blur_px: float = TYPICAL_BLUR_PX  # sigma
+    blur_px: float = 0.8  # sigma
     level: float = 200.0  # grey value of the paper
     contrast: float = 0.85  # of the dots with it
     noise: NoiseModel = NoiseModel(1.0, 0.02)

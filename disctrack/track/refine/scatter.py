@@ -26,7 +26,7 @@ from disctrack.track.pose import DotsInFrames, PoseFits, whitening
 from disctrack.track.refine.self_calibration import DOT_SIGMA, AsBuilt, fit_shared
 from disctrack.track.side_by_side import MIN_FRAMES, SHARED_FRAMES, evenly
 
-LEAST_NOISE = 0.25  # of the variance that flat parts of the image tell: the rest may be the pixels' fixed pattern
+LEAST_NOISE = 0.25  # of the variance that the templates leave: the rest may be the pixels' fixed pattern
 # How far a camera may be off: far more than any that is still of use, and enough to bound what the disc does not tell.
 # [px, 1]; rotations [rad] and translations [m]; the delay is free within a frame period.
 _WIDE = {"fx": 20.0, "fy": 20.0, "cx": 10.0, "cy": 10.0, "k1": 0.05, "k2": 0.2, "k3": 0.5, "p1": 5e-3, "p2": 5e-3}
