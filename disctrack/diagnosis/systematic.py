@@ -20,6 +20,7 @@ from scipy.stats import chi2
 
 from calibration.kit.arrays import Array, Mask
 from disctrack.diagnosis.stretch import MIN_FRAMES
+from disctrack.discrepancy.noise import THIRD
 from disctrack.faults.catalogue import TYPICAL_STEPS
 from disctrack.track.side_by_side import evenly
 from disctrack.trajectory import MarkerStatus, Trajectory
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
     from disctrack.diagnosis.disc_system import DiscSystem
 
 
-INFLATED = 0.8  # variance from frame to frame over that stated, below which the latter contains systematic errors
+SURE = 4.0  # sigmas by which the scatter from frame to frame has to differ from the stated noise to replace it
 MARGIN = 0.6  # of a field's correlation length, by which its grid exceeds the positions
 DOT_SIGMA = 3e-7  # [m] a common bias of one dot's centre in all images: 1/800 px, below what edges of dots allow
 LENS_LENGTHS = (0.3, 0.6, 0.17)  # correlation lengths of a camera's field, over the extent of the positions
@@ -39,7 +40,7 @@ SEEN = 0.2  # sigmas by which a mode of a field moves all dots together at least
 
 
 def noise_over_stated(trajectory: Trajectory) -> float:
-    """Variance of the dots from frame to frame over that stated; 1 if too few frames follow each other.
+    """Variance of the dots from frame to frame over that stated; 1 if not significantly different, or unknown.
 
     From third differences in time of the residuals about the poses, which suppress the motion and all slow errors.
     """
@@ -57,7 +58,9 @@ def noise_over_stated(trajectory: Trajectory) -> float:
     # trimmed by the largest 5 %: single bad frames are outliers
     squares = np.sort(np.ravel(difference) ** 2)
     of_normal = chi2.cdf(chi2.ppf(0.95, 1), 3) / 0.95
-    return float(np.mean(squares[: int(0.95 * squares.size)]) / of_normal / 20.0 / free)
+    ratio = float(np.mean(squares[: int(0.95 * squares.size)]) / of_normal / 20.0 / free)
+    scatter = np.sqrt(2 * (1 + THIRD) / max(float(np.sum(np.maximum(numbers - 6.0, 0.0))), 1.0))
+    return ratio if ratio > 0 and abs(ratio - 1.0) > SURE * scatter else 1.0
 
 
 def with_noise_of_frames(trajectory: Trajectory) -> Trajectory:
@@ -67,7 +70,7 @@ def with_noise_of_frames(trajectory: Trajectory) -> Trajectory:
     significant.
     """
     ratio = noise_over_stated(trajectory)
-    return with_noise(trajectory, ratio) if 0 < ratio < INFLATED else trajectory
+    return with_noise(trajectory, ratio) if ratio < 1 else trajectory
 
 
 def with_noise(trajectory: Trajectory, ratio: float) -> Trajectory:

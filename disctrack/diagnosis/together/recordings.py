@@ -17,14 +17,13 @@ from disctrack.discrepancy.fit import Fit, fit, no_fit
 from disctrack.discrepancy.joint.crew import Crew
 from disctrack.discrepancy.joint.sharing import Member, Reduced, Reduction
 from disctrack.discrepancy.joint.together import TogetherDiagnosis, answer_together
-from disctrack.discrepancy.noise import THIRD, inflation
+from disctrack.discrepancy.noise import inflation
 from disctrack.discrepancy.system import Values
 from disctrack.errors import AnalysisError
 from disctrack.findings import Kind
 from disctrack.track.side_by_side import evenly
-from disctrack.trajectory import MarkerStatus, Trajectory
+from disctrack.trajectory import Trajectory
 
-SURE = 4.0  # sigmas by which the scatter of the frames has to differ from the stated noise to replace it
 Item = tuple[Recorded, Mapping[str, str], str]  # recording, its labels, the model
 
 
@@ -118,7 +117,7 @@ class DiscMember:
         wrong = [f for f in as_tracked.findings if f.kind == Kind.DENSITY] or wrong_declarations(as_tracked.findings)
         if wrong:
             raise AnalysisError("; ".join(f.sentence for f in wrong))
-        trajectory = with_noise(as_tracked, _noise(as_tracked))  # which sets the weight of the recording
+        trajectory = with_noise(as_tracked, noise_over_stated(as_tracked))  # which sets the weight of the recording
         declared, faults = declared_model(trajectory, model)
         self.system = DiscSystem(trajectory, declared, known=faults)
         self.systematic = find_systematic(self.system)
@@ -185,15 +184,6 @@ class DiscMember:
 
     def _everything(self, shared: Values) -> dict[str, float]:
         return {**self.base.values, **self._reduction.own_values, **self.system.known, **shared}
-
-
-def _noise(trajectory: Trajectory) -> float:
-    """Variance of the dots from frame to frame over that stated; 1 if the difference is not significant."""
-    ratio = noise_over_stated(trajectory)
-    if not 0 < ratio < np.inf:
-        return 1.0
-    numbers = 2.0 * np.sum(trajectory.marker_status == MarkerStatus.MEASURED) - 6.0 * np.sum(trajectory.measured)
-    return ratio if abs(ratio - 1.0) > SURE * np.sqrt(2 * (1 + THIRD) / max(numbers, 1.0)) else 1.0
 
 
 def in_common(members: Sequence[tuple[Mapping[str, str], Systematic, list[Array]]]) -> list[Systematic]:
