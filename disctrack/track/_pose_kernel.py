@@ -1,4 +1,4 @@
-"""Compiled fit of poses to their dots (numba): Gauss-Newton, one frame after the other; see `pose`."""
+"""Compiled fit of poses to their dots (numba): Levenberg-Marquardt, one frame after the other; see `pose`."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from calibration.kit.compiled import part as _part
 
 _entry = njit(cache=True, **RULES)  # called from Python
 
-_MAX_ITERATIONS = 20  # of poses and templates
+_MAX_ITERATIONS = 60
 
 
 @_part
-def _rotate_from_left(v, R):
-    """Make R exp([v]x) R by Rodrigues' formula."""
+def _rotate_from_left(v, R, out):
+    """Out = exp([v]x) R by Rodrigues' formula."""
     angle2 = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
     angle = math.sqrt(angle2)
     if angle < 1e-6:
@@ -28,9 +28,9 @@ def _rotate_from_left(v, R):
     for j in range(3):
         x, y, z = R[0, j], R[1, j], R[2, j]
         cx, cy, cz = v[1] * z - v[2] * y, v[2] * x - v[0] * z, v[0] * y - v[1] * x
-        R[0, j] = x + a * cx + b * (v[1] * cz - v[2] * cy)
-        R[1, j] = y + a * cy + b * (v[2] * cx - v[0] * cz)
-        R[2, j] = z + a * cz + b * (v[0] * cy - v[1] * cx)
+        out[0, j] = x + a * cx + b * (v[1] * cz - v[2] * cy)
+        out[1, j] = y + a * cy + b * (v[2] * cx - v[0] * cz)
+        out[2, j] = z + a * cz + b * (v[0] * cy - v[1] * cx)
 
 
 @_part
@@ -67,13 +67,14 @@ def _copy(out, values):
 
 @_part
 def _evaluate(observed, covariance, used, cameras, centres, reach, R, t, filled, sums):
-    """Fill pixels (2, m, 2), whitened residuals and Jacobian (2, m, 2, 6), zeros for dots not used.
+    """Fill pixels (2, m, 2), whitened residuals and Jacobian (2, m, 2, 6), zeros for dots not used; returns their cost.
 
     sums (7, 6): J^T J, and J^T r as the last row. A dot that is farther away than `reach` [px] has Huber's weight.
     """
     (pixels, residual, jacobian), (intrinsics, R_cw, t_cw) = filled, cameras
     J, row = np.empty((2, 3)), np.empty((2, 6))
     sums[:] = 0.0
+    cost = 0.0
     for c in range(2):
         for m in range(centres.shape[0]):
             u, v = _dot_by_pose(intrinsics[c], R_cw[c], t_cw[c], centres[m], R, t, J, row)
@@ -97,37 +98,49 @@ def _evaluate(observed, covariance, used, cameras, centres, reach, R, t, filled,
                 jacobian[c, m, 0, i], jacobian[c, m, 1, i] = w00 * row[0, i], w10 * row[0, i] + w11 * row[1, i]
             for axis in range(2):
                 r = residual[c, m, axis]
+                cost += (2.0 - weight) * r * r
                 for i in range(6):
                     slope = jacobian[c, m, axis, i]
                     sums[6, i] += slope * r
                     for j in range(i + 1):
                         sums[i, j] += slope * jacobian[c, m, axis, j]
+    return cost
 
 
 @_part
 def fit_pose(observed, covariance, used, cameras, centres, tolerance, reach, R, t, filled):
     """As `fit`, of one frame; returns whether it converged. Dots farther away than `reach` [px] pull no harder."""
-    sums, factor, step, small = np.empty((7, 6)), np.empty((6, 6)), np.zeros(6), False
-    for _ in range(_MAX_ITERATIONS if tolerance >= 0.0 else 1):
-        _rotate_from_left(step[3:6], R)
+    sums, trial_sums, damped, step = np.empty((7, 6)), np.empty((7, 6)), np.empty((6, 6)), np.zeros(6)
+    R_trial, t_trial = np.empty((3, 3)), np.empty(3)
+    cost, damping, solved, small = np.inf, 1e-7, True, False
+    for k in range(_MAX_ITERATIONS + 1 if tolerance >= 0.0 else 1):
+        _rotate_from_left(step[3:6], R, R_trial)
         for i in range(3):
-            t[i] += step[i]
-        _evaluate(observed, covariance, used, cameras, centres, reach, R, t, filled, sums)
+            t_trial[i] = t[i] + step[i]
+        new = _evaluate(observed, covariance, used, cameras, centres, reach, R_trial, t_trial, filled, trial_sums)
+        if k == 0 or (solved and (new < cost or (small and new <= cost * (1.0 + 1e-9) + 1e-12))):
+            cost, damping = new, max(0.1 * damping, 1e-10)
+            _copy(R, R_trial)
+            _copy(sums, trial_sums)
+            for i in range(3):
+                t[i] = t_trial[i]
+        else:
+            damping = max(30.0 * damping, 1e-4)
         if small:
             return True
-        _copy(factor, sums[:6])
+        _copy(damped, sums[:6])
         for i in range(6):
             step[i] = sums[6, i]
-            if factor[i, i] <= 1e-300:  # a parameter that no datum sees stays where it is
-                factor[i, i] = 1.0
-        if not solve_in_place(factor, step):
-            return False
+            damped[i, i] += damping * damped[i, i]
+            if damped[i, i] <= 1e-300:  # a parameter that no datum sees stays where it is
+                damped[i, i] = 1.0
+        solved = solve_in_place(damped, step)
         length2 = 0.0
         for i in range(6):
             length2 += sums[i, i] * step[i] * step[i]
             for j in range(i):
                 length2 += 2.0 * sums[i, j] * step[i] * step[j]
-        small = length2 < tolerance * tolerance
+        small = solved and length2 < tolerance * tolerance and damping < 1e-2
     return False
 
 
@@ -135,10 +148,9 @@ def fit_pose(observed, covariance, used, cameras, centres, tolerance, reach, R, 
 def fit(rows, observed, covariance, used, cameras, centres, tolerance, R, t, converged, filled):
     """Fit the poses of some rows (k,) of n frames, from R (n, 3, 3), t (n, 3) on, which are moved to the minimum.
 
-    observed (n, 2, m, 2), covariance (n, 2, m, 2, 2), used (n, 2, m); cameras as `pose.stacked` has them. A
-    pose has converged when its step is shorter than `tolerance` standard deviations of its own parameters,
-    sqrt(step^T J^T J step); a negative tolerance leaves it where it is. Starts are near: by half a radian and a
-    centimetre off, as good as all lead where damped steps lead.
+    observed (n, 2, m, 2), covariance (n, 2, m, 2, 2), used (n, 2, m); cameras as `pose.stacked` has them. Marquardt
+    1963, with Nielsen-like damping; a pose has converged when its Gauss-Newton step is shorter than `tolerance`
+    standard deviations of its own parameters, sqrt(step^T J^T J step); a negative tolerance leaves it where it is.
     Filled: converged (n,), and of the last pose tried, which is the pose where it converged, pixels (n, 2, m, 2) of all
     dots, NaN behind a camera; residuals (n, 2, m, 2), observed - pixels, and jacobian (n, 2, m, 2, 6), both whitened,
     with zeros for dots that are not used.

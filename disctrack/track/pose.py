@@ -1,4 +1,4 @@
-"""Pose of the disc from the dots seen by two cameras: Gauss-Newton on position and rotation.
+"""Pose of the disc from the dots seen by two cameras: Levenberg-Marquardt on position and rotation.
 
 The unknowns are a translation and a rotation vector in world axes that multiplies from the left, so that nothing is
 singular at theta = 0; psi, theta, phi follow at the border (`frames.euler_from_rotation`).

@@ -20,7 +20,7 @@ import numpy as np
 from calibration.cameras._projection import project_point
 from calibration.kit._cholesky import solve_in_place, substitute
 from calibration.kit.compiled import part as _part
-from disctrack.track._pose_kernel import _MAX_ITERATIONS, _copy, _entry, fit_pose
+from disctrack.track._pose_kernel import _copy, _entry, fit_pose
 from disctrack.trajectory import MarkerStatus
 
 MEASURED, OUTSIDE, LOW_CONTRAST, OCCLUDED, NOT_CONVERGED, BLURRED, _, NOT_LOOKED_FOR = map(int, MarkerStatus)
@@ -53,6 +53,7 @@ Rows = namedtuple(
 )
 ROW = Rows(*range(len(Rows._fields)))
 _PIXELS = 4096 + 64  # of a dot of 60 px; more are made room for. No power of two: rows would share lines of the cache
+_MAX_ITERATIONS = 20  # of a template, and selections of its pixels
 _CONVERGED_PX = 2e-4  # length of the step that would come next: a twentieth of the noise of the best dots
 # The pixels are chosen anew where the centre moved farther: a band that lies unevenly about the edge, by 0.25 to 0.7
 # px, shifts it by 3e-4 to 5e-4 px (dots declared off their places: in all frames alike)
