@@ -23,7 +23,7 @@ from disctrack.diagnosis.systematic import find_systematic, with_noise_of_frames
 from disctrack.discrepancy.fit import TRIAL, Fit, fit
 from disctrack.discrepancy.held_out import HeldOut, held_out, training_rows
 from disctrack.discrepancy.noise import noise_variance
-from disctrack.discrepancy.search import FAR, Diagnosis, Former, Found, Settings, beside, explain, threshold
+from disctrack.discrepancy.search import FAR, Diagnosis, Former, Found, Settings, explain, threshold, with_found
 from disctrack.discrepancy.system import Candidate, GivenUp, Values
 from disctrack.errors import AnalysisError
 from disctrack.faults.clock_jump import clock_jumps, in_words, without_jumps
@@ -61,7 +61,7 @@ def with_slip(system: DiscSystem, diagnosis: Diagnosis, rolling: Rolling | None)
     enough = threshold(system, diagnosis.settings, len(candidate.names))
     found = Found(candidate, float(gain), held_gain, enough, ())
     reason = f"with slip at the start, {diagnosis.reason}"
-    return replace(beside(diagnosis, [found]), reason=reason, before=without, held_out_before=held_without)
+    return replace(with_found(diagnosis, [found]), reason=reason, before=without, held_out_before=held_without)
 
 
 def _at_true_times(as_tracked: Trajectory, model: Model, faults: Values, settings: Settings) -> Answer:

@@ -9,7 +9,7 @@ from calibration.kit.arrays import Array
 from calibration.kit.brief import Brief
 from calibration.kit.least_squares import OwnNumbers, covariance_within, solve_bounded
 from disctrack.discrepancy.elimination import Own, Projection, is_linear, prior_rows, projection
-from disctrack.discrepancy.system import Quantity, System, Values
+from disctrack.discrepancy.system import GivenUp, Quantity, System, Values
 
 MAX_ITERATIONS = 40
 TRIAL = 15  # iterations of one fit among many: what describes the data is there by then, and others wander
@@ -110,6 +110,15 @@ def fit(system: System, quantities: Sequence[Quantity], start: Values, max_itera
             converged = bool(problem.expected < max(0.1, 1e-7 * problem.cost))
             break
     return problem.fit(converged, iteration)
+
+
+def attempt(system: System, quantities: Sequence[Quantity], start: Values, max_iterations: int = MAX_ITERATIONS) -> Fit:
+    """The fit of one hypothesis among many; `no_fit` where it takes more steps than such a trial may."""
+    try:
+        with system.budget.trial(system.trial_steps):
+            return fit(system, quantities, start, max_iterations)
+    except GivenUp:
+        return no_fit(quantities, start)
 
 
 class _Problem:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve, solve_toeplitz, solve_triangular
+from scipy.linalg import null_space, solve_toeplitz, solve_triangular
 from scipy.optimize import minimize
 
 from calibration.kit.arrays import Array, Mask
@@ -210,17 +210,14 @@ def estimate(stretches: Sequence[SampleStretch], start: SmoothNoise) -> SmoothNo
 
     A memory beyond a fifth of the longest stretch is not sought: such an error looks like the motion itself.
     """
-    # of large numbers that the bases explain, the likelihood would leave rounding
-    stretches = [
-        replace(s, values=s.values - s.basis @ np.linalg.lstsq(s.basis, s.values, rcond=None)[0]) for s in stretches
-    ]
+    cleared = [null_space(s.basis.T).T for s in stretches]  # rows orthogonal to what the model may absorb
     longest = 0.2 * max(float(np.ptp(s.time)) for s in stretches)
     bounds = [(np.log(1e-3 * x), np.log(1e3 * x)) for x in (start.white, start.smooth)]
     bounds.append((np.log(0.01 * longest), np.log(longest)))
 
     def cost(x: Array) -> float:
         noise = SmoothNoise(*np.exp(x).tolist())
-        return sum(_minus_log_likelihood(s, noise) for s in stretches)
+        return -sum(_log_likelihood(s, Q, noise) for s, Q in zip(stretches, cleared, strict=True))
 
     x = np.log([start.white, start.smooth, min(start.memory, 0.9 * longest)])
     options = {"xatol": 0.02, "fatol": 0.1, "maxiter": 160}
@@ -228,16 +225,13 @@ def estimate(stretches: Sequence[SampleStretch], start: SmoothNoise) -> SmoothNo
     return SmoothNoise(*np.exp(found.x).tolist())
 
 
-def _minus_log_likelihood(s: SampleStretch, noise: SmoothNoise) -> float:
+def _log_likelihood(s: SampleStretch, Q: Array, noise: SmoothNoise) -> float:
     K = noise.covariance(s.time)
     if s.part is not None:
         K = np.where(s.part[:, None] == s.part[None, :], K, 0.0)
-    factor = cho_factor(K, lower=True)
-    KB, Ky = cho_solve(factor, s.basis), cho_solve(factor, s.values)
-    inner = cho_factor(s.basis.T @ KB, lower=True)
-    quadratic = np.sum(s.values * Ky) - np.sum((KB.T @ s.values) * cho_solve(inner, KB.T @ s.values))
-    determinants = 2 * sum(float(np.sum(np.log(np.diag(f[0])))) for f in (factor, inner))
-    return 0.5 * float(quadratic + s.values.shape[1] * determinants)
+    root = np.linalg.cholesky(Q @ K @ Q.T)
+    white = solve_triangular(root, Q @ s.values, lower=True)
+    return -0.5 * float(np.sum(white**2)) - s.values.shape[1] * float(np.sum(np.log(np.diag(root))))
 
 
 _ORDERS = range(2, 7)  # of differences: the higher, the less of the motion is left in them

@@ -18,13 +18,13 @@ from scipy import stats
 
 from calibration.kit.arrays import Mask
 from calibration.kit.brief import Brief
-from disctrack.discrepancy.fit import Fit, fit, no_fit
+from disctrack.discrepancy.fit import Fit, attempt, fit
 from disctrack.discrepancy.held_out import HeldOut, held_out, training_rows
 from disctrack.discrepancy.noise import THIRD, inflation, noise_variance, whitened
 from disctrack.discrepancy.score import Linearisation, Score, angle, score_all
 from disctrack.discrepancy.shape import WORTH_A_SHAPE, with_free_shape, with_shape
 from disctrack.discrepancy.significance import TWO_SIDED, Chance, chance, price_of_a_number
-from disctrack.discrepancy.system import Candidate, GivenUp, Quantity, System, Values
+from disctrack.discrepancy.system import Candidate, Quantity, System, Values
 
 CLASS_GAIN = 10.0  # two explanations whose lengths differ by less are not told apart (odds of e^5)
 OBVIOUS = 5.0  # times its price: a gain that the fitted part alone may know
@@ -190,11 +190,15 @@ def with_shapes(system: System, diagnosis: Diagnosis) -> Diagnosis:
     return replace(diagnosis, held_out_after=held)
 
 
-def beside(diagnosis: Diagnosis, found: Sequence[Found], how: str = "") -> Diagnosis:
+def with_found(diagnosis: Diagnosis, found: Sequence[Found]) -> Diagnosis:
     """The diagnosis with what was found before its search among what was found."""
-    tried = [Tried(f.candidate, f.gain, f.gain, f.held_out_gain, f"chosen{how}") for f in found]
     verdict = "found" if diagnosis.verdict == "nothing missing" else diagnosis.verdict
-    return replace(diagnosis, verdict=verdict, found=(*found, *diagnosis.found), tried=(*tried, *diagnosis.tried))
+    tried = *_chosen(found), *diagnosis.tried
+    return replace(diagnosis, verdict=verdict, found=(*found, *diagnosis.found), tried=tried)
+
+
+def _chosen(found: Sequence[Found]) -> list[Tried]:
+    return [Tried(f.candidate, f.gain, f.gain, f.held_out_gain, "chosen") for f in found]
 
 
 def threshold(system: System, settings: Settings, k: int) -> float:
@@ -223,10 +227,10 @@ def length(system: System, settings: Settings, noise: float, fitted: Fit, picked
 
 def is_noise(fit_: Fit, settings: Settings, noise: float, gain: float = 0.0) -> bool:
     """Is what a fit leaves noise of this variance, once chi-square has fallen by a gain?"""
-    left, limit = (fit_.chi_square - gain) / max(fit_.degrees_of_freedom, 1), settings.at_noise
-    if settings.noise is None:  # in a short recording both chi-square and the noise found in it scatter
-        limit = max(limit, 1.0 + 4.0 * float(np.sqrt(2.0 * (1.0 + THIRD) / max(fit_.n_data, 1))))
-    return left <= limit * noise
+    # in a short recording chi-square scatters, and so does the noise where it is found in the same data
+    variance = 2.0 * (1.0 + (THIRD if settings.noise is None else 0.0)) / max(fit_.n_data, 1)
+    limit = max(settings.at_noise, 1.0 + 4.0 * float(np.sqrt(variance)))
+    return (fit_.chi_square - gain) / max(fit_.degrees_of_freedom, 1) <= limit * noise
 
 
 class _Search:
@@ -239,7 +243,7 @@ class _Search:
         self.noise = 1.0
         self.rough = system.several_minima
         self.pool: dict[frozenset[str], Explanation] = {}
-        self.refused: set[frozenset[str]] = set()  # they do not stand out from what they leave
+
         self.expanded: set[frozenset[str]] = set()
         self.scored: dict[frozenset[str], tuple[Linearisation, list[Score]]] = {}
         self.first: dict[str, tuple[float, Explanation]] = {}  # by effect: gain of its first refit, and that
@@ -288,7 +292,7 @@ class _Search:
         if not found:
             return "nothing missing", f"chi-square is {left}, and no effect gains more than noise does"
         ratio = self._held_out(after.fit).ratio_to_floor / np.sqrt(self.noise)
-        return "found", f"chi-square falls to {left}; the free run errs by {ratio:.2f} of its floor"
+        return "found", f"chi-square falls to {left}; the error of prediction is {ratio:.2f} of its floor"
 
     def _begun(self) -> Explanation | None:
         """The explanation in whose residual others are scored first; None where nothing follows the data.
@@ -311,7 +315,7 @@ class _Search:
             if not self._at_noise(best.fit) and not self._worth_naming(best):
                 return best, None
             if (smaller := self._without_idle(best)) is not None:
-                self.refused.add(best.names)
+                self.pool[best.names] = replace(best, credible=False)  # it does not stand out from its residual
                 self.pool.setdefault(smaller.names, smaller)
                 self._explore()
                 continue
@@ -373,8 +377,7 @@ class _Search:
 
     def _ranked(self) -> list[Explanation]:
         """Explanations that may be believed, shortest first."""
-        alive = [e for names, e in self.pool.items() if names not in self.refused and np.isfinite(self.length(e))]
-        return sorted(alive, key=self.length)
+        return sorted((e for e in self.pool.values() if np.isfinite(self.length(e))), key=self.length)
 
     def _explore(self) -> None:
         """Enlarge and shorten the shortest explanations, until none comes of it that is shorter."""
@@ -514,16 +517,7 @@ class _Search:
         known = self.pool[key].fit if key in self.pool else None
         if known is not None and (known.converged or not key):
             return known
-        values = dict(start)
-        for c in candidates:
-            for name, value in zip(c.names, c.start, strict=False):
-                values.setdefault(name, value)
-        quantities = self._quantities(candidates)
-        try:
-            with self.system.budget.trial(np.inf if patient else self.system.trial_steps):
-                return fit(self.system, quantities, values)
-        except GivenUp:
-            return no_fit(quantities, values)
+        return (fit if patient else attempt)(self.system, self._quantities(candidates), start)
 
     def _best_fit(self, current: Explanation, extra: Sequence[Candidate]) -> Fit | None:
         """Refit with the extra candidates; where one acts beyond a threshold only, from its start, if it has any."""
@@ -554,11 +548,7 @@ class _Search:
         if current.fit.reduced_chi_square < FAR * self.noise:
             return None
         for part in self.system.beginnings():
-            try:
-                with self.system.budget.trial(self.system.trial_steps):
-                    found = fit(part, quantities, values)
-            except GivenUp:
-                return None
+            found = attempt(part, quantities, values)
             if not found.converged or found.reduced_chi_square > AGREES * self.noise:
                 return None
             values = found.values
@@ -573,23 +563,23 @@ class _Search:
         return is_noise(fit_, self.settings, self.noise, gain)
 
     def _incredible(self, trial: Explanation, extra: Sequence[Candidate]) -> bool:
-        """Is an amount at the limit of what is ever met, or do forces or faults of the measurement undo each other?"""
+        """Is an amount at the limit of what is ever met, or do effects cancel each other in all that they predict?
+
+        Enough terms of opposite signs describe any motion that they were fitted to, as polynomials do: such a sum says
+        nothing of what acts.
+        """
         values = trial.fit.values
         limits = [(values[q.name], q) for c in extra if c.kind == "measurement" for q in c.quantities]
         if any(v != q.null and not q.lower < v < q.upper for v, q in limits):
             return True
-        if self.system.undo_each_other(trial.candidates, values, self.nothing.fit.values):
-            return True
-        faults = [c for c in trial.candidates if c.kind == "measurement"]
-        if len(faults) < 2:
+        if len(trial.candidates) < 2:
             return False
         signals = []
-        for c in faults:
+        for c in trial.candidates:
             amount = np.array([values[q.name] - q.null for q in c.quantities])
             signals.append(self.system.linearise(values, c.names)[1] @ amount)
-        return any(
-            np.sum((a + b) ** 2) < CANCELLING * min(np.sum(a**2), np.sum(b**2)) for a, b in combinations(signals, 2)
-        )
+        sums = [several for k in range(2, len(signals) + 1) for several in combinations(signals, k)]
+        return any(np.sum(sum(own) ** 2) < CANCELLING * min(np.sum(x**2) for x in own) for own in sums)
 
     def _without_idle(self, e: Explanation) -> Explanation | None:
         """Without the effect that gains least, if a residual with the memory of what is left may give it as much."""
@@ -634,45 +624,34 @@ class _Search:
         return Found(candidate, gain, held_gain, self.threshold(len(candidate.names)), tuple(alike))
 
     def _tried_all(self, scores: Sequence[Score], found: tuple[Found, ...]) -> tuple[Tried, ...]:
-        scored = {s.candidate.name for s in scores}
-        led_by = [f for f in found if f.candidate.name not in scored]  # in whose residual the others were scored
-        chosen = (Tried(f.candidate, f.gain, f.gain, f.held_out_gain, "chosen") for f in led_by)
-        return (*chosen, *(self._tried(s, found) for s in scores))
+        scored = {s.candidate.name for s in scores}  # in the residual of the other effects found, if there are such
+        others = [f for f in found if f.candidate.name not in scored]
+        return (*_chosen(others), *(self._tried(s, found) for s in scores))
 
     def _tried(self, score: Score, found: tuple[Found, ...]) -> Tried:
-        c = score.candidate
-        gain, trial = self.first.get(c.name, (None, None))
-        held = None
-        if trial is not None and trial.fit in self.free_runs:
-            held = self._held_out_gain(self.nothing, trial)
-        stuck = trial is not None and not trial.fit.converged
-        return Tried(c, score.gain / self.noise, gain, held, self._why(score, gain, held, trial, found), stuck)
-
-    def _why(
-        self, score: Score, gain: float | None, held: float | None, trial: Explanation | None, found: tuple[Found, ...]
-    ) -> str:
-        c = score.candidate
-        if any(c.name == f.candidate.name for f in found):
-            return "chosen"
-        for f in found:
-            if any(c.name == r.candidate.name for r in f.cannot_be_told_from):
-                return f"indistinguishable from {f.candidate.name}"
-        if c.threshold and trial is None:
-            return "nothing is left that it could explain; beyond its threshold it does nothing"
-        if not score.visible and trial is None:
-            return "leaves no trace in this recording that other fitted quantities do not absorb"
-        threshold = self.threshold(len(c.names))
-        gain = score.gain / self.noise if gain is None else gain
-        if gain <= threshold:
-            # beside an effect that was found, the first score says nothing of what may be there
-            bound = "" if found else _bounds(score)
-            return f"gains {gain:.3g}, noise alone reaches {threshold:.3g}{bound}"
-        if trial and not trial.fit.converged:
-            return "its refit does not converge"
-        if held is not None and held <= 0:
-            return "the free run over held-out data does not improve"
-        than_chosen = "less than what was chosen" if found else "too little of what is missing"
-        return f"gains {gain:.4g}, {than_chosen}"
+        c, limit, first_order = score.candidate, self.threshold(len(score.candidate.names)), score.gain / self.noise
+        refit_gain, trial = self.first.get(c.name, (None, None))
+        gain, held, stuck = first_order if refit_gain is None else refit_gain, None, False
+        if trial is not None:
+            stuck = not trial.fit.converged
+            held = self._held_out_gain(self.nothing, trial) if trial.fit in self.free_runs else None
+        same = {r.candidate.name: f.candidate.name for f in found for r in f.cannot_be_told_from}
+        if c.name in {f.candidate.name for f in found}:
+            reason = "chosen"
+        elif c.name in same:
+            reason = f"indistinguishable from {same[c.name]}"
+        elif not score.visible and trial is None:
+            reason = "leaves no trace in this recording that other fitted quantities do not absorb"
+        elif gain <= limit:
+            # together with an effect that was found, the first score says nothing of what may be there
+            reason = f"gains {gain:.3g}, noise alone reaches {limit:.3g}{'' if found else _bounds(score)}"
+        elif stuck:
+            reason = "its refit does not converge"
+        elif held is not None and held <= 0:
+            reason = "the prediction of held-out data does not improve"
+        else:
+            reason = f"gains {gain:.4g}, {'less than what was chosen' if found else 'too little of what is missing'}"
+        return Tried(c, first_order, refit_gain, held, reason, stuck)
 
 
 def _names(candidates: Sequence[Candidate]) -> frozenset[str]:

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from calibration.kit.arrays import Array
-from disctrack.discrepancy.fit import TRIAL, Fit, fit
+from disctrack.discrepancy.fit import TRIAL, Fit, attempt, fit
 from disctrack.discrepancy.score import Linearisation, score
 from disctrack.discrepancy.system import Candidate, GivenUp, Quantity, System
 
@@ -38,13 +38,10 @@ def with_free_shape(
     starts = [dict(zip(names, s, strict=True)) for s in system.starts(candidate, base.values, least)]
     if candidate.sought and not starts:
         return None
-    fits = []
-    for start in starts or _grid(candidate):
-        with suppress(GivenUp), system.budget.trial(system.trial_steps):
-            quantities = (*base.quantities, *candidate.quantities)
-            fits.append(fit(system, quantities, base.values | start, TRIAL))
-    fitted = min(fits, key=lambda f: f.cost, default=None)
-    if fitted is None or not fitted.cost < below:
+    quantities = *base.quantities, *candidate.quantities
+    fits = [attempt(system, quantities, base.values | start, TRIAL) for start in starts or _grid(candidate)]
+    fitted = min(fits, key=lambda f: f.cost)
+    if not fitted.cost < below:
         return None
     shape = replace(candidate, quantities=candidate.shape)
     gain, _ = Linearisation(system, fitted, [shape]).gain_of(shape.names)

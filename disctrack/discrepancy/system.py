@@ -164,13 +164,6 @@ class System:
         """Parts of the system from its first sample on, shorter ones first."""
         return ()
 
-    def undo_each_other(self, candidates: Sequence[Candidate], values: Values, before: Values) -> bool:
-        """Do some of these effects undo each other, or what the model has?
-
-        values, before : as fitted with and without them
-        """
-        return False
-
     @property
     def known_as(self) -> tuple[System, bytes]:
         """A system, and which of its rows this is: what is computed once for all that are the same."""
@@ -204,10 +197,6 @@ class Transformed(System):
     def starts(self, candidate: Candidate, values: Values, least: float = 0.0) -> Sequence[tuple[float, ...]]:
         """See System."""
         return self._system.starts(candidate, values, least)
-
-    def undo_each_other(self, candidates: Sequence[Candidate], values: Values, before: Values) -> bool:
-        """See System."""
-        return self._system.undo_each_other(candidates, values, before)
 
     def linearise(self, values: Values, names: Sequence[str]) -> tuple[Array, Array]:
         """See System."""

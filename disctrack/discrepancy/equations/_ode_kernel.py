@@ -32,16 +32,11 @@ _RAN_AWAY = 1e6  # times larger than all its states are: what becomes of such a 
 
 _SENSITIVITY_TOLERANCE = 1e-6  # relative to the largest so far: steps of a fit need no more
 
-_S6 = 6.0**0.5
-_RADAU_C = np.array([(4.0 - _S6) / 10.0, (4.0 + _S6) / 10.0, 1.0])
-_RADAU_A = np.array(
-    [
-        [(88.0 - 7.0 * _S6) / 360.0, (296.0 - 169.0 * _S6) / 1800.0, (-2.0 + 3.0 * _S6) / 225.0],
-        [(296.0 + 169.0 * _S6) / 1800.0, (88.0 + 7.0 * _S6) / 360.0, (-2.0 - 3.0 * _S6) / 225.0],
-        [(16.0 - _S6) / 36.0, (16.0 + _S6) / 36.0, 1.0 / 9.0],
-    ]
-)
-_RADAU_E = np.array([-13.0 - 7.0 * _S6, -13.0 + 7.0 * _S6, -1.0]) / 3.0
+_RADAU_C = np.array([4.0 - 6.0**0.5, 4.0 + 6.0**0.5, 10.0]) / 10.0  # nodes
+# collocation: the increments at the nodes give the coefficients of x, x^2, x^3, and its slope at the nodes is the rate
+_RADAU_Q = np.linalg.inv(_RADAU_C[:, None] ** [1, 2, 3])
+_RADAU_A = np.linalg.inv(_RADAU_C[:, None] ** [0, 1, 2] * [1, 2, 3] @ _RADAU_Q)
+_RADAU_E = np.array([-13.0 - 7.0 * 6.0**0.5, -13.0 + 7.0 * 6.0**0.5, -1.0]) / 3.0
 _REAL = 3.0 + 3.0 ** (2.0 / 3.0) - 3.0 ** (1.0 / 3.0)  # real eigenvalue of A^-1
 _NEWTON = 12  # steps of Newton's method; it converges in two to four or not at all
 _STIFF_TOLERANCE = 1e-8  # of a step: the estimate is of third order, and far above the error of fifth
@@ -230,12 +225,9 @@ def _implicit_step(rhs, t, step, z, drive, slope, size, W):
 @exact_part
 def _along_stages(W, z, x, out):
     """The implicit step's polynomial at the part x of it."""
-    c, d = _RADAU_C[0], _RADAU_C[1]
-    l1 = x * (x - d) * (x - 1.0) / (c * (c - d) * (c - 1.0))
-    l2 = x * (x - c) * (x - 1.0) / (d * (d - c) * (d - 1.0))
-    l3 = x * (x - c) * (x - d) / ((1.0 - c) * (1.0 - d))
+    part = x * (_RADAU_Q[0] + x * (_RADAU_Q[1] + x * _RADAU_Q[2]))
     for i in range(len(z)):
-        out[i] = z[i] + l1 * W[0, i] + l2 * W[1, i] + l3 * W[2, i]
+        out[i] = z[i] + part[0] * W[0, i] + part[1] * W[1, i] + part[2] * W[2, i]
 
 
 @entry

@@ -35,10 +35,8 @@ if TYPE_CHECKING:
     from disctrack.report.figures import Drawn
 
 OUTLIER, FEW = 8.0, 0.02  # standard deviations that no noise reaches; share of the samples, above which it is the noise
-FEWEST_RUNS = 4  # that are compared with each other
-ODD, MOST_ODD = 2.0, 0.3  # rms over the median of all runs; share of them, above which none is odd
+ODD = 2.0  # rms over the median of all runs, above which one is odd
 FAR_OFF = 10.0  # sigmas or times, by which a number has left what was declared of it
-FEWEST_LAGS = 3  # of the test of whiteness: shorter stretches say nothing
 
 
 @dataclass(frozen=True)
@@ -168,8 +166,7 @@ class Answer:
     def _odd_runs(self) -> list[str]:
         """Runs that leave far more than the others do: one of them alone may be what no term describes."""
         stretches = self.system.stretches
-        whole = not any(s.stretch for s in stretches)
-        if len(stretches) < FEWEST_RUNS or not whole or self.diagnosis.held_out_before is None:
+        if any(s.stretch for s in stretches) or self.diagnosis.held_out_before is None:
             return []
         residual, _ = self.judged.linearise(self.diagnosis.after.values, [])
         count = np.array([max(float(np.sum(self.judged.weights[rows])), 1.0) for rows in self.system.rows])
@@ -178,7 +175,7 @@ class Answer:
         by_noise = stats.chi2.isf(self.diagnosis.settings.false_alarm / len(left), count) / count
         odd = np.flatnonzero(left > level * np.maximum(ODD**2, by_noise))
         worst = [f"{stretches[i].name} ({np.sqrt(left[i] / level):.3g} times)" for i in odd[np.argsort(-left[odd])]]
-        if not worst or len(worst) > MOST_ODD * len(stretches):
+        if not worst:
             return []
         some = ", ".join(worst[:4]) + (", ..." if len(worst) > 4 else "")
         return [f"what is left is far more than in the other runs in {some}: look at what was different there"]
@@ -284,7 +281,7 @@ class Answer:
             for c in range(residual.shape[1]):
                 x = residual[rows, c][np.isfinite(s.data[:, c])]
                 lags = min(LAGS, len(x) // 4)
-                if lags >= FEWEST_LAGS:
+                if lags:
                     p_values.append(no_memory(float(ljung_box(x[:, None], lags)[0]), len(x), lags))
         return min(1.0, min(p_values) * len(p_values)) if p_values else float("nan")
 

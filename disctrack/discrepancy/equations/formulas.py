@@ -191,18 +191,11 @@ class Formulas:
 
         return evaluate
 
-    @cached_property
-    def jump_arguments(self) -> Any:
-        """(t, y, p, u) -> the arguments of all jumps, each (m,)."""
-        return self._along_motion(list(self.widths))
-
-    @cached_property
-    def scanned(self) -> Any:
-        """(t, y, p, u) -> what each shape of `along` is tried along, each (m,)."""
-        return self._along_motion(list(self.along.values()))
-
-    def _along_motion(self, expressions: Sequence[sympy.Expr]) -> Any:
-        return sympy.lambdify((_t, self.states, self.numbers, self.inputs), expressions, "numpy")
+    def along_motion(self, expressions: Iterable[sympy.Expr], t: Array, states: Array, p: Array, u: Any) -> list[Array]:
+        """Values, each (m,), of expressions at instants (m,) in states (m, n), with numbers p and inputs u."""
+        function = sympy.lambdify((_t, self.states, self.numbers, self.inputs), list(expressions), "numpy")
+        with np.errstate(all="ignore"):
+            return [np.broadcast_to(x, t.shape) for x in function(t, list(states.T), p, u)]
 
     def defaults(self) -> dict[str, float]:
         """Declared values of all numbers; the widths of jumps are 1 until they are known."""
@@ -232,18 +225,14 @@ def _with_late(knots: Array, pieces: Array, which: list[int], late: Array) -> tu
     # knots that agree but for rounding are one: a step between them would be as short
     shared = shared[np.concatenate([[True], np.diff(shared) > 1e-9 * np.median(np.diff(knots))])]
     shared = shared[(shared >= knots[0]) & (shared <= knots[-1])]
-    ends = np.zeros((len(both), 5, 2))
-    x = knots[-1] - knots[-2]
-    a, b, d, e, _ = np.moveaxis(both[..., -1], 1, 0)
-    ends[:, 3] = np.column_stack([both[:, 3, 0], ((a * x + b) * x + d) * x + e])
-    both = np.concatenate([ends[..., :1], both, ends[..., 1:]], axis=-1)
     found = np.zeros((len(both), 5, len(shared) - 1))
     middle = (shared[1:] + shared[:-1]) / 2
     for c, s in enumerate(np.concatenate([np.zeros(len(pieces)), late])):
-        piece = np.searchsorted(knots, middle - s, side="right")
+        piece = np.searchsorted(knots[1:-1], middle - s, side="right")
         a, b, d, e, step = both[c][:, piece]
-        x = shared[:-1] - s - knots[np.maximum(piece - 1, 0)]
+        x = np.clip(shared[:-1] - s, knots[0], knots[-1]) - knots[piece]
         found[c] = a, 3 * a * x + b, (3 * a * x + 2 * b) * x + d, ((a * x + b) * x + d) * x + e, step
+        found[c][[0, 1, 2, 4]] *= (middle - s > knots[0]) & (middle - s < knots[-1])
     return shared, found
 
 

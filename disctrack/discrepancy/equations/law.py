@@ -11,6 +11,7 @@ each, and these are joined two by two.
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import combinations, product
 from typing import Any
 
@@ -34,10 +35,10 @@ from disctrack.discrepancy.search import (
     Diagnosis,
     Explanation,
     Found,
-    Tried,
     alike,
     is_noise,
     length,
+    with_found,
 )
 from disctrack.discrepancy.significance import evidence
 from disctrack.discrepancy.system import Candidate, GivenUp, Quantity, System, Values
@@ -89,11 +90,16 @@ class Along:
 
 
 @dataclass(frozen=True, kw_only=True)
-class WithForce(Explanation):
-    """An explanation by a law, the last of its candidates, and known terms before it."""
+class LearnedForce(Explanation):
+    """An explanation by a learned law, the last of its candidates, and by known terms before it."""
 
     along: Along
-    alike: tuple[Along, ...] = ()  # others that are not longer by CLASS_GAIN
+    instead: Explanation  # the shortest by known terms alone
+    at_noise: bool  # are its residuals noise?
+    noise: float  # variance over that stated
+    system: EquationSystem  # that knows the law
+    judged: System  # the same with its noise as judged
+    alike: tuple[Along, ...] = ()  # laws that are not longer by CLASS_GAIN
 
     @property
     def candidate(self) -> Candidate:
@@ -101,27 +107,54 @@ class WithForce(Explanation):
         return self.candidates[-1]
 
     @property
-    def beside(self) -> tuple[Candidate, ...]:
+    def known(self) -> tuple[Candidate, ...]:
         """Known terms that were fitted with it."""
         return self.candidates[:-1]
 
+    @cached_property
+    def held_out(self) -> HeldOut:
+        """Prediction of the samples that judge the fit."""
+        return held_out(self.judged, self.fit.quantities, self.fit.values, self.system.training)
 
-@dataclass(frozen=True, kw_only=True)
-class LearnedForce(WithForce):
-    """A law with its course."""
+    @cached_property
+    def held(self) -> tuple[str, ...]:
+        """Parameters that are a part of the law, and held as declared."""
+        return tuple(sorted(_part_of_law(self.system.formulas, self.along, self.system.held)))
 
-    held_out: HeldOut
-    held: tuple[str, ...]  # parameters that are a part of the law, and held as declared
-    variable: Array  # (k,) from the least to the largest that is visited; of two (k, 2) along the motion
-    force: Array  # (k,) beyond the declared equations
-    sigma: Array  # (k,)
-    instead: Explanation  # the shortest by known terms alone
-    at_noise: bool  # is what it leaves noise?
-    system: EquationSystem  # that knows the law
+    @cached_property
+    def course(self) -> tuple[Array, Array, Array]:
+        """Where (k, 1 or 2) it is reported; the force (k,) there beyond the declared equations, and its sigma (k,)."""
+        law, fitted, own = self.along, self.fit, self.candidate.quantities
+        visited, k = _visited(self.system, law.variables, fitted.values), len(law.variables) - 1
+        at = np.linspace(visited.min(axis=0), visited.max(axis=0), POINTS[0])
+        if k:
+            at = visited[np.linspace(0, len(visited) - 1, POINTS[1]).astype(int)]
+        names = [*(q.name for q in own), *self.held]
+        force, columns = _course(self.system, law, names, fitted.values, at)
+        variance = np.einsum("ij,jk,ik->i", columns, fitted.amounts(names)[1], columns)
+        # waves finer than those that are fitted go on as the inverse square of their number
+        finer = (HARMONICS[0] / 6.0, np.pi / 16.0 * HARMONICS[1] ** 2)[k] * min(q.prior_sigma for q in own) ** 2
+        scale = max(self.noise, fitted.reduced_chi_square)
+        return at, force, np.sqrt(scale * np.maximum(variance, 0.0) + self.noise * finer)
+
+    @property
+    def variable(self) -> Array:
+        """(k,) from the smallest to the largest value visited; of two variables (k, 2) along the motion."""
+        return self.course[0] if len(self.along.variables) > 1 else self.course[0][:, 0]
+
+    @property
+    def force(self) -> Array:
+        """(k,) beyond the declared equations."""
+        return self.course[1]
+
+    @property
+    def sigma(self) -> Array:
+        """(k,) of the force."""
+        return self.course[2]
 
     def is_named(self, diagnosis: Diagnosis) -> bool:
-        """Is it this law that describes the data best, or comes nearest, beside all that is found?"""
-        stays = {f.candidate.name for f in diagnosis.found} <= {c.name for c in self.beside}
+        """Is this the law that describes the data best, or comes nearest, together with all that is found?"""
+        stays = {f.candidate.name for f in diagnosis.found} <= {c.name for c in self.known}
         return self.is_shorter and (self.at_noise or stays)
 
     @property
@@ -136,7 +169,7 @@ class LearnedForce(WithForce):
             "variable": self.along.variable,
             "jumps_with_its_sign": self.along.jumps,
             "beyond": list(self.held),
-            "beside": [c.name for c in self.beside],
+            "beside": [c.name for c in self.known],
             "at": self.variable,
             "force": self.force,
             "sigma": self.sigma,
@@ -183,8 +216,7 @@ def learn(
         for beside in [(c,) for c in over.beside()] if beside_known else [()]:
             trial = over.best(beside) if system.budget.open() else None
             if trial is not None and (law is None or trial.length < law.length):
-                law = over.told(trial)
-                tells = over.is_worth_telling(law)
+                law, tells = trial, over.is_worth_telling(trial)
     return law if tells else _nearest(one.system, diagnosis, judged)
 
 
@@ -203,10 +235,9 @@ def _nearest(system: EquationSystem, diagnosis: Diagnosis, judged: System | None
     known = replace(known, length=length(view, d.settings, noise, known.fit, known.candidates))
     left = replace(d, noise=noise, before=known.fit, held_out_before=before, ranked=(known,))
     over = _Competition(1, system, left, judged)
-    best = over.best(known.candidates)
-    if best is None or best.along.of_time:
+    law = over.best(known.candidates)
+    if law is None or law.along.of_time:
         return None
-    law = over.told(best)
     foretells = law.held_out.chi_square < before.chi_square  # itself, and not by being open
     return replace(law, at_noise=False) if foretells and law.is_shorter and over.is_worth_telling(law) else None
 
@@ -225,6 +256,7 @@ class _Competition:
         self.laws = tuple(_laws(system, self.begin, variables))
         self.looked = 2.0 * float(np.log(max(len(self.laws), 1)))
         self.shots = cut_short(system) if self.far else [system]
+        self.instead = next((e for e in diagnosis.ranked if e.candidates), Explanation((), base))
 
     def view(self, system: EquationSystem) -> System:
         """With the noise as judged, where the samples are those that were judged."""
@@ -239,13 +271,10 @@ class _Competition:
         return self.arrived(fitted) and is_noise(fitted, self.diagnosis.settings, self.noise)
 
     def beside(self) -> list[Candidate]:
-        """Known terms that may act with a law: those that were found or help most."""
-        d = self.diagnosis
-        tried = sorted(d.tried, key=lambda t: -(t.score if t.gain is None else t.gain))
-        nearest = d.nearest.candidates if d.nearest else ()
-        named = [c.name for c in (*(f.candidate for f in d.found), *nearest, *(t.candidate for t in tried))]
+        """Known terms that may act with a law: those of the shortest explanations."""
+        named = dict.fromkeys(c.name for e in self.diagnosis.ranked for c in e.candidates)
         own = {c.name: c for c in self.system.candidates}
-        return [own[name] for name in dict.fromkeys(named) if name in own][:WIDTH]
+        return [own[name] for name in named if name in own][:WIDTH]
 
     def is_worth_telling(self, law: LearnedForce) -> bool:
         """Does it describe the data, or nearly all of what is missing, and samples that it has not seen as well?
@@ -261,7 +290,7 @@ class _Competition:
         foretells = d.held_out_after is None or law.held_out.chi_square < d.held_out_after.chi_square
         return law.at_noise or (law.is_shorter and foretells and law.fit.excess(self.noise) < most)
 
-    def best(self, beside: tuple[Candidate, ...]) -> WithForce | None:
+    def best(self, beside: tuple[Candidate, ...]) -> LearnedForce | None:
         """The law that makes the data most probable beside these terms."""
         first = self.shots[0]
         values = self.begin
@@ -277,14 +306,14 @@ class _Competition:
         scans.sort(key=lambda scan: scan[0])
         if not scans:
             return None
-        trials, bars = [], [np.inf] * len(self.shots)
+        trials = []
         for length, law, quantities in scans[:REFITTED]:
             # along stretches that the declared equations do not follow the first order says little
             enough = ROUGHLY * scans[0][0] + WORTH if self.far else scans[0][0] + CLASS_GAIN
             if length > enough or not self.system.budget.open():
                 break
             with suppress(GivenUp), self.system.budget.trial(self.system.trial_steps):
-                if (trial := self._led(law, beside, quantities, values, bars)) is not None:
+                if (trial := self._led(law, beside, quantities, values)) is not None:
                     trials.append(trial)
         if not trials:
             return None
@@ -333,15 +362,12 @@ class _Competition:
         )
 
     def _led(
-        self, law: Along, beside: tuple[Candidate, ...], own: tuple[Quantity, ...], values: Values, bars: list[float]
-    ) -> WithForce | None:
-        """The law's fit to stretches that are joined two by two; None where it loses the data, or to another law.
-
-        bars : -2 log evidence of the best law so far in each of these; this one's are put in
-        """
+        self, law: Along, beside: tuple[Candidate, ...], own: tuple[Quantity, ...], values: Values
+    ) -> LearnedForce | None:
+        """The law's fit to stretches that are joined two by two; None where it loses the data."""
         first, numbers = _set(self.shots[0], law, values)
         now, evident = dict(values) | {q.name: 0.0 for q in own} | numbers, np.inf
-        for i, (system, longer) in enumerate(zip(self.shots, [*self.shots[1:], None], strict=True)):
+        for system, longer in zip(self.shots, [*self.shots[1:], None], strict=True):
             there = replace(system, widths=first.widths)
             others, view = self._others(there, beside), there if longer else self.view(there)
             for _ in range(1 if longer else ROUNDS):
@@ -352,13 +378,15 @@ class _Competition:
                 evident, own = self._evidence(there, law, beside, now)
                 if abs(before - evident) < 1.0:
                     break
-            if evident > bars[i] + WORTH:
-                return None
-            bars[i] = min(bars[i], evident)
+
         fitted = self._fitted(view, (*others, *own), now)
         # known numbers and terms are priced as where no law is; of the law, the evidence has paid
         prices = length(view, self.diagnosis.settings, self.noise, fitted, beside) - fitted.cost / self.noise
-        return WithForce((*beside, _candidate(law, own)), fitted, length=evident + prices, along=law)
+        known = _set(self.system, law, fitted.values)[0]
+        return LearnedForce(
+            (*beside, _candidate(law, own)), fitted, length=evident + prices, along=law, instead=self.instead,
+            at_noise=self.at_noise(fitted), noise=self.noise, system=known, judged=self.view(known),
+        )  # fmt: skip
 
     def _fitted(self, system: System, quantities: Sequence[Quantity], values: Values) -> Fit:
         """The fit; where its steps have to be halved again and again, with a region of trust for each number.
@@ -371,31 +399,6 @@ class _Competition:
         if self.arrived(found) or not ahead < FAR * self.noise:
             return found
         return fit(system, quantities, trusted(system, quantities, found.values), TRIAL)
-
-    def told(self, best: WithForce) -> LearnedForce:
-        """The law with its course, beside the known terms that describe the data too."""
-        law, fitted, own = best.along, best.fit, best.candidate.quantities
-        there = _set(self.system, law, fitted.values)[0]
-        held = held_out(self.view(there), fitted.quantities, fitted.values, there.training)
-        visited = _visited(there, law.variables, fitted.values)
-        k = len(law.variables) - 1
-        at = np.linspace(visited.min(axis=0), visited.max(axis=0), POINTS[0])
-        if k:
-            at = visited[np.linspace(0, len(visited) - 1, POINTS[1]).astype(int)]
-        # what a declared number has become is a part of the law, where it acts as such a one would
-        part = sorted(_part_of_law(there.formulas, law, there.held))
-        names = [*(q.name for q in own), *part]
-        force, columns = _course(there, law, names, fitted.values, at)
-        variance = np.einsum("ij,jk,ik->i", columns, fitted.amounts(names)[1], columns)
-        # waves finer than those that are fitted go on as the inverse square of their number
-        finer = (HARMONICS[0] / 6.0, np.pi / 16.0 * HARMONICS[1] ** 2)[k] * min(q.prior_sigma for q in own) ** 2
-        sigma = np.sqrt(max(self.noise, fitted.reduced_chi_square) * np.maximum(variance, 0.0) + self.noise * finer)
-        nothing = Explanation((), self.diagnosis.before)
-        instead = next((e for e in self.diagnosis.ranked if e.candidates), nothing)
-        return LearnedForce(
-            **vars(best), held_out=held, held=tuple(part), variable=at if k else at[:, 0], force=force, sigma=sigma,
-            instead=instead, at_noise=self.at_noise(fitted), system=there,
-        )  # fmt: skip
 
 
 def _laws(system: EquationSystem, values: Values, n: int) -> Iterator[Along]:
@@ -555,28 +558,21 @@ def with_law(diagnosis: Diagnosis, law: LearnedForce) -> Diagnosis:
     if not law.at_noise:
         return replace(diagnosis, reason=reason, nearest=replace(law, fit=with_memory(law.system, law.fit)))
     ranked = sorted((*diagnosis.ranked, law), key=lambda e: e.length)
-    diagnosis = replace(diagnosis, ranked=tuple(ranked), length=law.length)
-    if law.along.of_time:
-        tried = tuple(_instead(diagnosis, ()))
-        return replace(
-            diagnosis, verdict="unexplained", reason=reason, found=(), after=diagnosis.before, tried=tried,
-            held_out_after=diagnosis.held_out_before, nearest=law,
-        )  # fmt: skip
-    assert diagnosis.held_out_before is not None
+    known = () if law.along.of_time else law.known
+    outcomes = {f.candidate.name: "the law that was learned describes more" for f in diagnosis.found}
+    outcomes |= {c.name: "chosen" for c in known}
+    tried = [replace(t, reason=outcomes.get(t.candidate.name, t.reason)) for t in diagnosis.tried]
+    nothing = replace(
+        diagnosis, verdict="unexplained", reason=reason, found=(), after=diagnosis.before, tried=tuple(tried),
+        held_out_after=diagnosis.held_out_before, nearest=law, ranked=tuple(ranked), length=law.length,
+    )  # fmt: skip
+    if law.along.of_time or diagnosis.held_out_before is None:
+        return nothing
     held_gain = law.held_out.gain_over(diagnosis.held_out_before, diagnosis.noise)
     gain = (diagnosis.before.cost - law.fit.cost) / diagnosis.noise
-    found = tuple(Found(c, gain, held_gain, 0.0, ()) for c in law.candidates)
-    own = Tried(law.candidate, gain, gain, held_gain, "chosen")
-    tried = (own, *_instead(diagnosis, law.beside))
-    return replace(
-        diagnosis, verdict="found", reason=f"with a law that no term names, chi-square falls to {level}", found=found,
-        after=law.fit, held_out_after=law.held_out, tried=tried, nearest=None,
+    found = [Found(c, gain, held_gain, 0.0, ()) for c in law.candidates]
+    answer = replace(
+        nothing, verdict="found", reason=f"with a law that no term names, chi-square falls to {level}",
+        found=tuple(found[:-1]), after=law.fit, held_out_after=law.held_out, nearest=None,
     )  # fmt: skip
-
-
-def _instead(diagnosis: Diagnosis, beside: Sequence[Candidate]) -> Iterator[Tried]:
-    """What was tried, with those known terms chosen that stay beside a law."""
-    outcomes = {f.candidate.name: "the law that was learned describes more" for f in diagnosis.found}
-    outcomes |= {c.name: "chosen" for c in beside}
-    for tried in diagnosis.tried:
-        yield replace(tried, reason=outcomes.get(tried.candidate.name, tried.reason))
+    return with_found(answer, found[-1:])

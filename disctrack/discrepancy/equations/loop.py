@@ -89,37 +89,39 @@ def _first_answer(system: EquationSystem, settings: Settings) -> tuple[EquationS
     if held := redundant(start.system, start.values) if start.followed > 0.0 else ():
         whole = replace(whole, held=held)
         start = led(whole, declared)
-    if not start.followed:
-        ways = _leading(whole, declared, [(c.name,) for c in whole.candidates])
-        if not ways:
-            raise AnalysisError(_not_followed(whole, declared))
-        return _by_way_of(ways, whole, settings)
-    system, diagnosis = _searched(_sized(start.system, start.values), start.values, settings)
-    if start.whole:
-        return system, diagnosis, []
-    # stretches may be too short to tell what is missing: then by way of the terms that help most
-    found = tuple(f.candidate.name for f in diagnosis.found)
-    most = sorted(diagnosis.tried, key=lambda t: -t.score)[:WIDTH]
-    ways = _leading(whole, diagnosis.after.values, [found] if found else [(t.candidate.name,) for t in most])
-    if ways:
-        return _by_way_of(ways, whole, settings)
-    told = (
+    answer, values = None, declared
+    promising: list[tuple[str, ...]] = [(c.name,) for c in whole.candidates]
+    if start.followed:
+        answer = system, diagnosis = _searched(_sized(start.system, start.values), start.values, settings)
+        promising = _promising(diagnosis, start.whole)
+        values = {} if start.whole else diagnosis.after.values
+    # stretches may be too short to tell what is missing, and no step may lead to it: then by way of some terms
+    if ways := _leading(whole, values, promising):
+        names, values = next(iter(ways.items()))
+        system, diagnosis = _searched(_sized(whole, values), values, settings, ways)
+        note = f"the fit goes by way of {' and '.join(sorted(names))}: without it, longer stretches lose the data"
+        if {f.candidate.name for f in diagnosis.found} & frozenset().union(*ways):
+            note = "with what was found the model follows the whole runs, and they are judged whole"
+        return system, diagnosis, [] if start.whole else [note]
+    if answer is None:
+        raise AnalysisError(_not_followed(whole, declared))
+    note = (
         f"the model loses the data after {start.followed:.2g} s: runs are taken in {len(system.stretches)} stretches "
         f"of {lasting(system):.3g} s with an initial state each"
     )
-    return system, diagnosis, [told, *(["with it the model does not follow the whole runs"] if found else [])]
+    further = ["with it the model does not follow the whole runs"] if diagnosis.found else []
+    return system, diagnosis, [] if start.whole else [note, *further]
 
 
-def _by_way_of(
-    ways: dict[frozenset[str], dict[str, float]], whole: EquationSystem, settings: Settings
-) -> tuple[EquationSystem, Diagnosis, list[str]]:
-    """The search over whole runs, which the model follows with these terms."""
-    names, values = next(iter(ways.items()))
-    system, diagnosis = _searched(_sized(whole, values), values, settings, ways)
-    if {f.candidate.name for f in diagnosis.found} & frozenset().union(*ways):
-        return system, diagnosis, ["with what was found the model follows the whole runs, and they are judged whole"]
-    told = f"the fit goes by way of {' and '.join(sorted(names))}: without it, longer stretches lose the data"
-    return system, diagnosis, [told]
+def _promising(diagnosis: Diagnosis, whole: bool) -> list[tuple[str, ...]]:
+    """Terms by way of which a fit of whole runs may be reached; none where an answer of whole runs needs no better one.
+
+    Of an arm that friction stops, no step leads from a motion without end to the instant at which it stops.
+    """
+    if diagnosis.found or (whole and diagnosis.verdict != "unexplained"):
+        return [] if whole else [tuple(f.candidate.name for f in diagnosis.found)]
+    tried = [t for t in diagnosis.tried if not whole or (t.stuck and t.gain is not None and t.gain > 0)]
+    return [(t.candidate.name,) for t in sorted(tried, key=lambda t: -t.score)[:WIDTH]]
 
 
 def _searched(
@@ -141,12 +143,7 @@ def _searched(
         system = replace(system, held=(*system.held, *redundant(system, diagnosis.before.values)))
         values = trusted(system, system.base, diagnosis.before.values)
         diagnosis = explain(system, values, settings, system.training)
-    if diagnosis.verdict == "unexplained" and not diagnosis.found:
-        # of an arm that friction stops, no step leads from a motion without end to the instant at which it stops
-        stuck = [t for t in diagnosis.tried if t.stuck and t.gain is not None and t.gain > 0]
-        names = [(t.candidate.name,) for t in sorted(stuck, key=lambda t: -t.score)]
-        if ways := _leading(system, {}, names[:WIDTH]):
-            diagnosis = explain(system, diagnosis.before.values, settings, system.training, ways)
+
     sharper = _sharp_enough(system, diagnosis.after)
     if sharper is system:
         return system, diagnosis
@@ -169,9 +166,8 @@ def _aimed(system: EquationSystem, values: Mapping[str, float]) -> EquationSyste
     passed: list[list[Array]] = []
     for s, motion in zip(system.stretches, system.predictions(values), strict=True):
         if motion is not None:
-            p = system.numbers(values, s)
-            found = f.scanned(s.time, list(motion.states.T), p, system.inputs_of(s))
-            passed.append([np.broadcast_to(x, s.time.shape) for x in found])
+            p, u = system.numbers(values, s), system.inputs_of(s)
+            passed.append(f.along_motion(f.along.values(), s.time, motion.states, p, u))
     best: dict[str, tuple[float, dict[str, float]]] = {}
     amounts = [c for c in system.candidates if any(f.owner[n] == c.name for n in f.along)]
     here = no_fit(system.base, values)
@@ -186,10 +182,9 @@ def _aimed(system: EquationSystem, values: Mapping[str, float]) -> EquationSyste
             continue
         linear = Linearisation(there, here, amounts)
         for c in amounts:
-            gain, there_best = linear.gain_of(c.names)
+            gain, _ = linear.gain_of(c.names)
             if gain > best.get(c.name, (0.0, {}))[0]:
-                limits = {n: v for n, v in tried.items() if f.owner[n] == c.name}
-                best[c.name] = gain, limits | dict(zip(c.names, there_best.tolist(), strict=True))
+                best[c.name] = gain, {n: v for n, v in tried.items() if f.owner[n] == c.name}
     return replace(system, aims={n: v for _, aims in best.values() for n, v in aims.items()})
 
 
@@ -218,9 +213,7 @@ def _widths(system: EquationSystem, along: Sequence[tuple[Samples, Array]]) -> d
     square, count = np.zeros(len(f.widths)), 0
     for s, states in along:
         t, p = np.linspace(s.time[0], s.time[-1], len(states)), system.numbers({}, s)
-        with np.errstate(all="ignore"):
-            arguments = f.jump_arguments(t, list(states.T), p, system.inputs_of(s, t))
-        square += [float(np.nansum(np.broadcast_to(a, t.shape) ** 2)) for a in arguments]
+        square += [float(np.nansum(a**2)) for a in f.along_motion(f.widths, t, states, p, system.inputs_of(s, t))]
         count += len(states)
     size = np.sqrt(square / max(count, 1))
     return {w.name: JUMP * (x or 1.0) for w, x in zip(f.widths.values(), size, strict=True)}
@@ -313,9 +306,7 @@ def _with_memory(system: EquationSystem, diagnosis: Diagnosis, settings: Setting
         diagnosis = replace(_certain(system, diagnosis), reason=reason)
         return diagnosis, False, ["sigmas are those of what is left, not of the noise alone"]
     noise = float(share * size**2)
-    scatter = 1.0 + 4.0 * float(np.sqrt(2.0 / max(base.n_data, 1)))  # of chi-square in a short recording
-    known = replace(settings, noise=noise, at_noise=max(settings.at_noise, scatter))
-    again = explain(remembering, base.values, known, system.training, _former(diagnosis))
+    again = explain(remembering, base.values, replace(settings, noise=noise), system.training, _former(diagnosis))
     order = int(np.max(np.nonzero(coefficients)[1])) + 1
     text = f"what the model leaves remembers {order} sample{'s' if order > 1 else ''}; sigmas allow for that"
     return replace(again, judged=again.judged or remembering), True, [text]

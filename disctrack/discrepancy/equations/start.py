@@ -242,24 +242,19 @@ def trusted(system: System, quantities: Sequence[Quantity], declared: Mapping[st
     lower, upper = (np.array([getattr(q, side) for q in quantities]) for side in ("lower", "upper"))
     size = np.maximum(np.abs(null), [q.scale for q in quantities])
     start = np.clip([declared.get(name, q.null) for name, q in zip(names, quantities, strict=True)], lower, upper)
-    latest: dict[bytes, tuple[Array, Array]] = {}
 
-    def both(x: Array) -> tuple[Array, Array]:
-        if x.tobytes() not in latest:
-            values = dict(declared) | dict(zip(names, x.tolist(), strict=True))
-            residual, derivative = system.linearise(values, names)
-            right, matrix = prior_rows(quantities, values)
-            latest.clear()
-            latest[x.tobytes()] = (
-                np.concatenate([residual.ravel(), right]),
-                np.vstack([derivative.reshape(residual.size, -1), matrix]),
-            )
-        return latest[x.tobytes()]
+    def at(x: Array) -> dict[str, float]:
+        return dict(declared) | dict(zip(names, x.tolist(), strict=True))
 
-    if not all(np.isfinite(part).all() for part in both(start)):
+    def residual(x: Array) -> Array:
+        rows = np.concatenate([system.linearise(at(x), [])[0].ravel(), prior_rows(quantities, at(x))[0]])
+        return np.nan_to_num(rows, nan=_NOWHERE, posinf=_NOWHERE, neginf=-_NOWHERE)
+
+    def jacobian(x: Array) -> Array:
+        derivative = system.linearise(at(x), names)[1].reshape(-1, len(names))
+        return -np.nan_to_num(np.vstack([derivative, prior_rows(quantities, at(x))[1]]))
+
+    if not all(np.isfinite(part).all() for part in system.linearise(at(start), names)):
         return dict(declared)
-    found = least_squares(
-        lambda x: np.nan_to_num(both(x)[0], nan=_NOWHERE, posinf=_NOWHERE, neginf=-_NOWHERE), start,
-        lambda x: -np.nan_to_num(both(x)[1]), bounds=(lower, upper), x_scale=size, max_nfev=_ATTEMPTS,
-    )  # fmt: skip
-    return dict(declared) | dict(zip(names, found.x.tolist(), strict=True))
+    limits = lower, upper
+    return at(least_squares(residual, start, jacobian, limits, x_scale=size, max_nfev=_ATTEMPTS).x)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import combinations, pairwise
+from itertools import pairwise
 
 import numpy as np
 from scipy.interpolate import PPoly
@@ -14,7 +14,6 @@ from disctrack.discrepancy.equations import _ode_kernel as kernel
 from disctrack.discrepancy.equations.declared import Samples, Term
 from disctrack.discrepancy.equations.formulas import Formulas
 from disctrack.discrepancy.held_out import TRAIN_FRACTION
-from disctrack.discrepancy.search import CANCELLING
 from disctrack.discrepancy.system import Budget, Candidate, Quantity, System, Values
 from disctrack.errors import AnalysisError
 
@@ -23,7 +22,6 @@ MAX_STEPS = 400_000  # after which a motion is given up ...
 HARDER = 50  # ... or after so many times those of the motion from which a fit's step leads to it: it leads astray
 MOST_WORK = 2e8  # of an answer: steps of the integrator, times states and sensitivities, some 1 us each ...
 OF_ONE = 0.1  # ... and share of it, that one hypothesis among many may take
-LARGE = 5.0  # times all that moves the motion: terms each so large that their sum may be what describes it
 MOST_STATES = 80  # initial states that are fitted along where others would tell no more that is new
 EACH = "*"  # in the place of a stretch: each has a number of its own
 
@@ -48,7 +46,7 @@ class EquationSystem(System):
     promoted: Sequence[str] = ()  # terms that every fit has
     held: Sequence[str] = ()  # parameters that no fit moves
     typical: Mapping[str, float] = field(default_factory=dict)  # sizes of the terms' numbers that would surprise nobody
-    aims: Mapping[str, float] = field(default_factory=dict)  # by number that is tried along the motion: its start
+    aims: Mapping[str, float] = field(default_factory=dict)  # initial guesses of shapes that are fitted from the start
     budget: Budget = field(default_factory=lambda: Budget(MOST_WORK))  # of all that answer one question
     trial_steps = OF_ONE * MOST_WORK
     several_minima = frees_shapes = True  # what users declare may bend anyhow
@@ -67,8 +65,11 @@ class EquationSystem(System):
             self.training[rows] = fitted_rows(s)
         self._places: dict[str, dict[str, int]] = {}
         self._steps: dict[str, int] = {}  # by stretch: of the motion with which derivatives were asked for last
-        self._defaults = self.formulas.defaults() | self.widths | self._limits()
-        self._per = {name: p.per for name, p in self.formulas.declared.items() if p.per}
+        self._defaults = self.formulas.defaults() | self.widths | dict(self.aims)
+        self._declared = self.formulas.declared | {
+            name: replace(self.formulas.declared[name], value=value, shape=False) for name, value in self.aims.items()
+        }
+        self._per = {name: p.per for name, p in self._declared.items() if p.per}
         self.base = tuple(self._base())
         self.candidates = tuple(self._candidate(t) for t in self.formulas.terms if t.name not in self.promoted)
 
@@ -83,9 +84,9 @@ class EquationSystem(System):
                     q = Quantity(f"state.{name}[{s.name}]", unit, 1e-3 * size, value, prior_sigma=sigma,
                                  meaning="at the first sample")  # fmt: skip
                     found.append(replace(q, slot=f"state.{name}[{EACH}]", block=i) if several else q)
-        for name, p in self.formulas.declared.items():
+        for name, p in self._declared.items():
             term = self.formulas.owner[name]
-            if name in self.held or (p.shape and name not in self.aims) or (term and term not in self.promoted):
+            if name in self.held or p.shape or (term and term not in self.promoted):
                 continue
             found += self._with_slots(name, self._quantities(name)) if several else self._quantities(name)
         return found
@@ -103,14 +104,13 @@ class EquationSystem(System):
         ]
 
     def _quantities(self, name: str) -> list[Quantity]:
-        p = self.formulas.declared[name]
+        p = self._declared[name]
         scale = 1e-3 * abs(p.value) or 1e-3 * self.typical.get(name, 1.0)
         typical = p.typical or self.typical.get(name, np.inf)
         names = list(dict.fromkeys(self._name(name, s) for s in self.stretches))
         declared = None if self.formulas.owner[name] else p.value
-        null = self._limits().get(name, p.value)
         return [
-            Quantity(n, p.unit, scale, null, p.lower, p.upper, p.sigma, p.meaning, typical, declared=declared)
+            Quantity(n, p.unit, scale, p.value, p.lower, p.upper, p.sigma, p.meaning, typical, declared=declared)
             for n in names
         ]
 
@@ -124,43 +124,13 @@ class EquationSystem(System):
         return f"{name}[{s.groups[kind]}]"
 
     def _candidate(self, term: Term) -> Candidate:
-        own = {name: p for name, p in self.formulas.declared.items() if self.formulas.owner[name] == term.name}
-        aimed = [n for n in own if n in self.aims]
-        amounts = tuple(q for n, p in own.items() if not p.shape or n in aimed for q in self._quantities(n))
-        shape = tuple(q for n, p in own.items() if p.shape and n not in aimed for q in self._quantities(n))
+        own = {name: p for name, p in self._declared.items() if self.formulas.owner[name] == term.name}
+        amounts, shape = (
+            tuple(q for name, p in own.items() if p.shape == of_shape for q in self._quantities(name))
+            for of_shape in (False, True)
+        )
         kind = "motion" if term.rates else "measurement"
-        start = tuple(self.aims.get(q.stem, q.null) for q in amounts) if aimed else ()
-        return Candidate(term.name, term.name, kind, term.title or term.name, term.source, amounts, start, shape)
-
-    def _limits(self) -> dict[str, float]:
-        """Where the numbers lie that were tried along the motion: without their term's amount they move nothing."""
-        return {n: v for n, v in self.aims.items() if n in self.formulas.along}
-
-    def undo_each_other(self, candidates: Sequence[Candidate], values: Values, before: Values) -> bool:
-        """Are there terms far larger than all that moves the motion, of which next to nothing is left together?
-
-        Enough terms of opposite signs make any law, as polynomials do, over the motions that they were fitted to: such
-        a sum describes them and says nothing of what acts.   values : as fitted. One term alone is believed.
-        """
-        named = [c for c in candidates if c.kind != "measurement"]
-        absent = [{q.name: q.null for q in c.quantities} for c in named]
-        sums = [list(own) for k in range(2, len(named) + 1) for own in combinations(range(len(named)), k)]
-        everything, alone = np.zeros(len(self.sizes)), np.zeros((len(named), len(self.sizes)))
-        together = np.zeros((len(sums), len(self.sizes)))
-        for s in self.stretches if sums else ():
-            found = self.predict(values, s)
-            if found is None:
-                return False
-            rates, *without = (
-                self.formulas.rates_at(s, self.numbers({**values, **changed}, s), s.time, found.states)[0]
-                for changed in ({}, *absent)
-            )
-            acting = rates - np.array(without)
-            everything += np.sum(rates**2, axis=0)
-            alone += np.sum(acting**2, axis=1)
-            together += [np.sum(acting[own].sum(axis=0) ** 2, axis=0) for own in sums]
-        least = np.array([alone[own].min(axis=0) for own in sums]).reshape(together.shape)
-        return bool(np.any((together < CANCELLING * least) & (least > LARGE**2 * everything)))
+        return Candidate(term.name, term.name, kind, term.title or term.name, term.source, amounts, shape=shape)
 
     def linearise(self, values: Values, names: Sequence[str]) -> tuple[Array, Array]:
         """Whitened residual (n, w), data minus prediction, and the prediction's derivative (n, w, k)."""
@@ -205,14 +175,9 @@ class EquationSystem(System):
 
     def start_of(self, values: Values, s: Samples) -> Array:
         """(n,) states at the first sample."""
-        fallback = {k: v for k, (v, _) in s.known.items()}
-        return np.array(
-            [
-                values.get(f"state.{n}[{s.name}]", fallback.get(n, s.start.get(n, 0.0)))
-                for n in self.formulas.equations.states
-            ],
-            float,
-        )
+        declared = {**s.start, **{k: v for k, (v, _) in s.known.items()}}
+        states = self.formulas.equations.states
+        return np.array([values.get(f"state.{n}[{s.name}]", declared.get(n, 0.0)) for n in states], float)
 
     def predict(self, values: Values, s: Samples, names: Sequence[str] = ()) -> Prediction | None:
         """What a stretch should show, with its derivatives by quantities that it has (`names_of`).

@@ -8,6 +8,7 @@ may have any size, and nobody differs by it.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 
 import numpy as np
 from scipy import stats
@@ -23,9 +24,9 @@ from disctrack.discrepancy.system import Candidate
 
 SPOILT = 1e-2  # of the first one's statistic: by so much less the others may be judged wrongly where it moved the fit
 TWIN = 0.5  # of the statistic of the one that fits worst, from which on another may be the one that is wrong
-TWINS = 3  # of those that are looked at: a twin fits about as badly as the worst
+
 NOISE = 2.0  # median of some falls of chi-square over that of noise, up to which it is noise
-LEFT_ASIDE = 2.5  # median of the squares of normal numbers over that of their inner two thirds
+
 ALIKE_SHARE = 0.05  # of all that it tells, which is to first order
 STANDS_OUT = 0.05  # probability below which it tells something
 NAMED = 3  # effects that one recording may differ by
@@ -99,8 +100,8 @@ class Blocks:
         U = U[:, singular > DETERMINED]
         mine = U.T @ self.right[i], U.T @ self.matrix[i]
         together = np.concatenate([rest[0], mine[0]]), np.concatenate([rest[1], mine[1]])
-        least, rank = _least(*rest, scale)
-        both, rank_of_both = _least(*together, scale)
+        least, rank = _least(*rest)
+        both, rank_of_both = _least(*together)
         statistic, degrees = max(both - least, 0.0), U.shape[1] - (rank_of_both - rank)
         p = float(stats.chi2.sf(statistic, degrees)) if degrees > 0 else 1.0
         return FitsIn(statistic, max(degrees, 0), p, float(self.chi_square[i]))
@@ -120,24 +121,17 @@ class Blocks:
     def _difference(self, left: Array, columns: list[int], c: int) -> tuple[float, int]:
         """Left : (m, 2 c + 1) by the candidates' sizes in the others, in the recording itself, and what is left."""
         theirs, mine, right = left[:, columns], left[:, [c + j for j in columns]], left[:, -1]
-        one, rank_of_one = _least_seen(right, theirs + mine)
-        two, rank_of_two = _least_seen(right, np.concatenate([theirs, mine], axis=1))
+        one, rank_of_one = _least(right, theirs + mine)
+        two, rank_of_two = _least(right, np.concatenate([theirs, mine], axis=1))
         return max(one - two, 0.0), rank_of_two - rank_of_one
 
 
-def _least(right: Array, matrix: Array, scale: Array) -> tuple[float, int]:
-    """Smallest sum of squares of right - matrix x, and how many combinations of x the matrix determines."""
-    x, _, rank, _ = np.linalg.lstsq(matrix * scale, right, rcond=1e-12)
-    return float(np.sum((right - matrix @ (scale * x)) ** 2)), int(rank)
-
-
-def _least_seen(right: Array, matrix: Array) -> tuple[float, int]:
-    """Smallest sum of squares of right - matrix x, and how many combinations of its columns, of size one, are seen."""
+def _least(right: Array, matrix: Array) -> tuple[float, int]:
+    """Smallest sum of squares of right - matrix x, and how many combinations of the columns are determined."""
     length = np.linalg.norm(matrix, axis=0)
-    seen = length > INVISIBLE
-    U, singular, _ = np.linalg.svd(matrix[:, seen] / length[seen], full_matrices=False)
-    along = U[:, singular > INVISIBLE].T @ right
-    return float(right @ right - along @ along), len(along)
+    scaled = matrix[:, length > INVISIBLE] / length[length > INVISIBLE]
+    x, _, rank, _ = np.linalg.lstsq(scaled, right, rcond=INVISIBLE)
+    return float(np.sum((right - scaled @ x) ** 2)), int(rank)
 
 
 def against_the_others(blocks: Blocks, kept: list[int]) -> dict[int, FitsIn]:
@@ -192,12 +186,12 @@ def _scatter(blocks: Blocks, falls: dict[int, list[tuple[float, int]]]) -> list[
         return min((float(stats.chi2.logsf(x, degrees)) for x, degrees in fall if degrees > 0), default=0.0)
 
     calm = sorted(falls, key=lambda i: -stands_out(falls[i]))[: len(falls) - len(falls) // 3]
-    found = []
+    found, aside = [], float(stats.chi2.ppf(1 / 2, 1) / stats.chi2.ppf(1 / 3, 1))
     among = [blocks.differences(*each) for each in blocks.others(sorted(calm))] if len(calm) > 2 else []
     for k in range(len(blocks.candidates)):
         usual = [fall[k][0] / stats.chi2.median(fall[k][1]) for fall in among if fall[k][1] > 0]
         ratio = float(np.median(usual)) if usual else 1.0
-        found.append(LEFT_ASIDE * ratio if ratio > NOISE else 1.0)
+        found.append(aside * ratio if ratio > NOISE else 1.0)
     return found
 
 
@@ -225,9 +219,9 @@ def apart(
             break
         first = first or statistic
         alike = [i for i in kept if i != worst and judged[i].statistic > TWIN * statistic]
-        alike = sorted(alike, key=lambda i: -judged[i].statistic)[:TWINS]
-        twins = [i for i in alike if _either_fits(blocks, (i, worst), kept, level / n, SPOILT * first)]
-        for i in (worst, *twins[:1])[: most - len(named)]:
+        alike = sorted(alike, key=lambda i: -judged[i].statistic)
+        twins = (i for i in alike if _either_fits(blocks, (i, worst), kept, level / n, SPOILT * first))
+        for i in (worst, *islice(twins, 1))[: most - len(named)]:
             kept.remove(i)
             named[i] = judged[i].differs_by
     return named

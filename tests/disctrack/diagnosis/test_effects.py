@@ -111,7 +111,7 @@ def test_a_wrong_effect_offered_alone_is_refused_by_the_free_run():
     # of chi-square 1, noise alone reaches 8; the gain of 48 +- 14 would do, the loss of 90 +- 19 decides
     assert drag.gain > 16
     assert drag.held_out_gain < -30
-    assert drag.reason == "the free run over held-out data does not improve"
+    assert drag.reason == "the prediction of held-out data does not improve"
     right = explain(system := system_of(trajectory, ["drag_rotation", "centre_of_mass"]), system.start())
     assert [f.candidate.name for f in right.found] == ["centre_of_mass"]
 
