@@ -18,9 +18,9 @@ from disctrack.diagnosis.errors import ResidualTests, residual_tests
 from disctrack.diagnosis.law_library import MIN_SIGMAS, Family, LearnedLaw, differ_from_zero
 from disctrack.diagnosis.missing_force import Gain, law_of
 from disctrack.discrepancy.fit import TRIAL, Fit, fit
-from disctrack.discrepancy.search import CLASS_GAIN, FAR, Diagnosis, Explanation, Found, alike, gain_of_memory, length
-from disctrack.discrepancy.shape import WORTH_A_SHAPE, profiled
-from disctrack.discrepancy.significance import price_of_a_number
+from disctrack.discrepancy.search import CLASS_GAIN, FAR, Diagnosis, Explanation, Found, equivalent, length, noise_gain
+from disctrack.discrepancy.shape import WORTH_A_SHAPE, profile_fit
+from disctrack.discrepancy.significance import bic_penalty
 from disctrack.discrepancy.system import Quantity, System
 
 MAX_TERMS = 3
@@ -47,7 +47,7 @@ def learn(
     to_noise : what is noise ends the search for further terms, which else goes on while each gains more than its price.
     So does a term after which more than half of the excess chi-square is left, far from the noise
     """
-    price, law, known = price_of_a_number(system.weights), None, system
+    price, law, known = bic_penalty(system.weights), None, system
     current, shortest = base, base.cost / noise
     scan = system.scan(along, base.quantities) if along is not None else None
     along = along if scan is not None else None
@@ -105,7 +105,7 @@ def shortest_to_first_order(system: DiscSystem, base: Fit, along: Fit, noise: fl
     scan = system.scan(along, base.quantities)
     if scan is None:
         return np.inf
-    library, price = scan.library(), price_of_a_number(system.weights)
+    library, price = scan.library(), bic_penalty(system.weights)
     gains = scan.gains(family for family in library if not family.shape)
     nearest = min((scan.chi_square - g.gain) / noise + price * g.family.n_numbers for g in gains)
     return nearest + 2.0 * float(np.log(len(library))) + price * base.n_free
@@ -173,7 +173,7 @@ def _one_by_one(system: System, base: Fit, law: LearnedLaw, widths: Sequence[Qua
     """The fit of a law whose widths are fitted along their profile likelihood, as the data hardly determine them."""
     fitted = with_law(system, base, law, law.widths)
     for q in widths:
-        fitted = profiled(system, fitted, q, 0.3 * fitted.values[q.name])
+        fitted = profile_fit(system, fitted, q, 0.3 * fitted.values[q.name])
     return fitted
 
 
@@ -243,7 +243,7 @@ def explained_by_law(
     answers = [a for a in found if a is not None and a.fit.converged]
     if not answers:
         return None, diagnosis
-    best = min(alike(answers), key=lambda a: sum(f.candidate.kind == "motion" for f in a.kept))
+    best = min(equivalent(answers), key=lambda a: sum(f.candidate.kind == "motion" for f in a.kept))
     chi_square, at_noise = best.fit.reduced_chi_square, diagnosis.settings.at_noise * noise
     ranked = sorted((*diagnosis.ranked, *answers), key=lambda e: e.length)
     listed = replace(diagnosis, ranked=tuple(ranked), length=ranked[0].length)
@@ -324,7 +324,7 @@ def _law_with(system: DiscSystem, diagnosis: Diagnosis, kept: tuple[Found, ...])
     judged, again = judged_as(diagnosis, known), list(kept)
     for found in kept:  # is it still significant with the law?
         rest = [f for f in again if f is not found]
-        enough = gain_of_memory(judged, fitted, noise, found.candidate, found.threshold)
+        enough = noise_gain(judged, fitted, noise, found.candidate, found.threshold)
         held = fitted.values | {q.name: q.null for q in found.candidate.quantities}
         without = with_law(judged, base_with(diagnosis.before, rest), replace(law, values=held))
         gain = (without.cost - fitted.cost) / noise

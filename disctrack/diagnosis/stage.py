@@ -31,7 +31,7 @@ from disctrack.diagnosis.recorded import read_recorded
 from disctrack.diagnosis.supplement import supplement
 from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.held_out import held_out, training_rows
-from disctrack.discrepancy.noise import with_memory
+from disctrack.discrepancy.noise import with_autocorrelation
 from disctrack.discrepancy.score import Linearisation, score_all
 from disctrack.discrepancy.search import Diagnosis, Found, Settings
 from disctrack.discrepancy.significance import wald
@@ -87,7 +87,7 @@ def diagnose(trajectory: Trajectory, model: str = PAPER, settings: Settings | No
         system, learned, diagnosis, not_claimed = _with_law(system, diagnosis, found)
         tests, notes = residual_tests(system, diagnosis.after, diagnosis.noise), (*notes, *not_claimed)
     else:
-        diagnosis = replace(diagnosis, after=with_memory(judged_as(diagnosis, system), diagnosis.after))
+        diagnosis = replace(diagnosis, after=with_autocorrelation(judged_as(diagnosis, system), diagnosis.after))
     notes = (*notes, "" if system.budget.open() else USED_UP)
     diagnosis = with_slip(system, diagnosis, rolling)
     before = errors(system, diagnosis.before, diagnosis.held_out_before)
@@ -144,7 +144,7 @@ def _with_law(
     work = energy_balance(known, fitted.values)[f"by {law.candidate.name}"]
     power = -work / float(known.time[-1] - known.time[0])
     tests = residual_tests(known, fitted, noise)
-    as_found = known, with_memory(judged, fitted), law, noise, tests is not None and not tests.white
+    as_found = known, with_autocorrelation(judged, fitted), law, noise, tests is not None and not tests.white
     after, of_another, course, misfit = with_form(*as_found, _of_motion(kept))
     established, not_claimed = _for_any_form(kept, of_another, law.looked)
     if _of_motion(established):  # an effect that is significant with any form of the law is no part of its misfit

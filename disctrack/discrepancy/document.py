@@ -1,4 +1,4 @@
-"""A diagnosis of any system, not of the disc alone: in words, as the keys of diagnosis.json, and as tables."""
+"""A diagnosis of any system in words, as the keys of diagnosis.json, and as tables."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,12 +15,12 @@ from disctrack.discrepancy.system import Quantity
 from disctrack.numbers import Measured, measured, rounded, score
 from disctrack.report.blocks import Listing, Section
 
-STRONG = 0.9  # of a correlation, from which on a standard deviation alone misleads by more than twice
+STRONG = 0.9  # correlation, from which on a standard deviation alone misleads by more than a factor of two
 
 
 @dataclass(frozen=True)
 class Correlated:
-    """Two fitted quantities, and first + factor * second with the factor that makes it known best."""
+    """Two fitted quantities, and their best determined combination first + factor * second."""
 
     first: str
     second: str
@@ -31,7 +31,7 @@ class Correlated:
 
 
 def shown(q: Quantity, fit: Fit) -> tuple[str, Measured]:
-    """Name and size of a fitted quantity as people know it: 1 / mu of a friction is fitted, and mu is shown."""
+    """Name and size of a fitted quantity in its usual form: 1 / mu of a friction is fitted, and mu is shown."""
     value, sigma = fit.values[q.name], fit.sigma(q.name)
     if q.reciprocal and value > 0:
         return q.reciprocal, Measured(1.0 / value, sigma / value**2, q.unit)
@@ -39,12 +39,12 @@ def shown(q: Quantity, fit: Fit) -> tuple[str, Measured]:
 
 
 def effect_text(found: Found, diagnosis: Diagnosis) -> str:
-    """One effect with its size, and the alternatives that these data do not separate from it."""
+    """One effect with its size, and the alternatives that these data do not distinguish from it."""
     fit = diagnosis.after
-    # a free velocity at the first instant says nothing to people that the remark on slip does not
+    # initial velocities are part of the remark on slip
     amounts = [shown(q, fit) for q in found.candidate.quantities if not q.is_initial]
     sizes = ", ".join(f"{name} = {size}" for name, size in amounts)
-    text = f"{found.candidate.title} [{found.candidate.name}]: {sizes}{together_text(found, diagnosis)}"
+    text = f"{found.candidate.title} [{found.candidate.name}]: {sizes}{correlation_text(found, diagnosis)}"
     text += "".join(f"; {bound}" for bound in bounds(found, fit))
     if found.cannot_be_told_from:
         text += f"; indistinguishable here: {', '.join(r.candidate.name for r in found.cannot_be_told_from)}"
@@ -52,7 +52,7 @@ def effect_text(found: Found, diagnosis: Diagnosis) -> str:
 
 
 def significance_text(found: Found) -> str:
-    """What is lost without the effect."""
+    """Increase of chi-square without the effect, and its gain on held-out data."""
     if not np.isfinite(found.gain):
         return "Without it the model follows no part of the recording"  # so that there is no chi-square to compare
     sigmas = as_sigmas(found.gain, len(found.candidate.quantities))
@@ -63,12 +63,12 @@ def significance_text(found: Found) -> str:
 
 
 def bounds(found: Found, fit: Fit) -> list[str]:
-    """Numbers of the effect that may be zero: how large they may be, and what keeps them open."""
+    """Upper bounds of parameters of the effect that may be zero, and what limits them."""
     texts = []
     spread = np.array([fit.sigma(name) for name in fit.names])
     for q in found.candidate.quantities:
         name, size = shown(q, fit)
-        if q.is_initial or q.reciprocal or q.null != 0.0:  # a limit is no size
+        if q.is_initial or q.reciprocal or q.null != 0.0:  # not an amount
             continue
         if not size.sigma > 0 or abs(size.value) >= TWO_SIDED * size.sigma:
             continue
@@ -82,20 +82,20 @@ def bounds(found: Found, fit: Fit) -> list[str]:
     return texts
 
 
-def together(found: Found, fit: Fit) -> tuple[Correlated, ...]:
-    """Numbers of the effect that move together with each other or with those of a declared law."""
+def correlated_pairs(found: Found, fit: Fit) -> tuple[Correlated, ...]:
+    """Parameters of the effect that are strongly correlated with each other or with those of a declared law."""
     laws = [q.name for q in fit.quantities if not (np.isfinite(q.prior_sigma) or q.is_initial)]
     return correlated(fit, [q.name for q in found.candidate.quantities if not q.reciprocal], laws)
 
 
-def together_text(found: Found, diagnosis: Diagnosis) -> str:
-    """What their standard deviations alone do not say; a pair that an earlier effect's text has named is left out."""
+def correlation_text(found: Found, diagnosis: Diagnosis) -> str:
+    """Strong correlations, without pairs that the text of an earlier effect gives."""
     fit = diagnosis.after
     units = {q.name: q.unit for q in fit.quantities}
     earlier = takewhile(lambda effect: effect is not found, diagnosis.found)
-    named = {frozenset((pair.first, pair.second)) for effect in earlier for pair in together(effect, fit)}
+    named = {frozenset((pair.first, pair.second)) for effect in earlier for pair in correlated_pairs(effect, fit)}
     text = ""
-    for pair in together(found, fit):
+    for pair in correlated_pairs(found, fit):
         if frozenset((pair.first, pair.second)) in named:
             continue
         factor = f"{'+' if pair.factor >= 0 else '-'} {rounded(abs(pair.factor), 4)}"
@@ -105,7 +105,7 @@ def together_text(found: Found, diagnosis: Diagnosis) -> str:
 
 
 def correlated(fit: Fit, names: Sequence[str], among: Sequence[str]) -> tuple[Correlated, ...]:
-    """The strongest partner of each of `names`, from `among`; every pair once, and only where it is strong."""
+    """The strongest correlation of each of `names` with one of `among`, if it is strong; every pair once."""
     found: dict[frozenset[str], Correlated] = {}
     for first in names:
         pairs = [pair for second in among if second != first and (pair := _pair(fit, first, second))]
@@ -119,7 +119,7 @@ def _pair(fit: Fit, first: str, second: str) -> Correlated | None:
     if first not in fit.shared or second not in fit.shared:
         return None
     (a, cross), (_, b) = fit.amounts([first, second])[1]
-    if not (a > 0 and b > 0):  # one stands at a bound
+    if not (a > 0 and b > 0):  # one is at its bound
         return None
     factor = float(-cross / b)
     value = fit.values[first] + factor * fit.values[second]
@@ -128,13 +128,13 @@ def _pair(fit: Fit, first: str, second: str) -> Correlated | None:
 
 
 def parameters_json(quantities: Any, fit: Fit) -> list[dict[str, Any]]:
-    """Fitted numbers with their standard deviations."""
+    """Fitted parameters with their standard deviations."""
     named = [(q, *shown(q, fit)) for q in quantities]
     return [{"name": name, **vars(size), "meaning": q.meaning} for q, name, size in named]
 
 
 def effect_json(found: Found, after: Fit) -> dict[str, Any]:
-    """One effect found, of any system.   after : fit of the enlarged model"""
+    """One effect found.   after : fit of the extended model"""
     c = found.candidate
     return {
         "name": c.effect,
@@ -143,7 +143,7 @@ def effect_json(found: Found, after: Fit) -> dict[str, Any]:
         "title": c.title,
         "source": c.source,
         "parameters": parameters_json(c.quantities, after),
-        "correlated": [vars(pair) for pair in together(found, after)],
+        "correlated": [vars(pair) for pair in correlated_pairs(found, after)],
         "class": [
             {
                 "name": r.candidate.name,
@@ -161,7 +161,7 @@ def effect_json(found: Found, after: Fit) -> dict[str, Any]:
 
 
 def explanations_json(d: Diagnosis) -> list[dict[str, Any]]:
-    """Sets of effects that describe the data as shortly as the answer, with their odds against it."""
+    """Sets of effects that are indistinguishable from the answer, with their odds against it."""
     return [
         {"effects": list(names), "longer_by": longer, "odds": float(np.exp(-0.5 * longer))}
         for names, longer in d.explanations
@@ -169,13 +169,13 @@ def explanations_json(d: Diagnosis) -> list[dict[str, Any]]:
 
 
 def declared_json(fit: Fit, with_known: bool = False) -> dict[str, Any]:
-    """Numbers of the declared laws with their standard deviations.   with_known : of those with a prior, too"""
+    """Parameters of the declared laws with their standard deviations.   with_known : those with a prior, too"""
     laws = [q for q in fit.quantities if not q.is_initial and (with_known or not np.isfinite(q.prior_sigma))]
     return {q.name: {"value": fit.values[q.name], "sigma": fit.sigma(q.name), "unit": q.unit} for q in laws}
 
 
 def fit_errors(fit: Fit, held: HeldOut | None, noise: float = 1.0) -> dict[str, Any]:
-    """Keys `before` and `after` as far as every system has them; the system adds errors in its own units.
+    """Keys `before` and `after` that all systems have; the system adds errors in its own units.
 
     noise : variance of the noise over that stated; the chi-squares are in units of it
     """
@@ -194,7 +194,7 @@ def document(
     before: Mapping[str, Any] | None = None,
     after: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """All of a diagnosis in JSON's types; the keys are those that `disctrack diagnose` writes.
+    """The diagnosis in JSON types; the keys are those that `disctrack diagnose` writes.
 
     before, after : errors in the system's own units, if it has such
     """
@@ -224,9 +224,9 @@ def document(
 
 
 def tables(d: Diagnosis, hidden: tuple[str, ...] = ("state.", "learned.")) -> list[Section]:
-    """What competes with the answer, the fitted numbers before and after, and what was tried.
+    """Indistinguishable explanations, fitted parameters before and after, and the outcome of all candidates.
 
-    hidden : beginnings of the names of numbers that are not listed; a learned law is shown by its course
+    hidden : prefixes of the names of parameters that are not listed; a learned law is shown by its course
     """
     fitted = [q for q in d.after.quantities if not (q.name.startswith(hidden) or q.is_initial)]
     sides = [
@@ -243,20 +243,20 @@ def tables(d: Diagnosis, hidden: tuple[str, ...] = ("state.", "learned.")) -> li
 
 
 def explanations_table(d: Diagnosis) -> Listing:
-    """Sets of effects whose lengths the data do not separate; empty where there is only one."""
+    """Sets of effects that are indistinguishable from the answer; empty where there is only one."""
     sets = explanations_json(d)
     rows = [
         (", ".join(s["effects"]) or "nothing is missing", score(s["longer_by"]), rounded(s["odds"], 2)) for s in sets
     ]
     caption = (
-        "Longer by: -2 log evidence over that of the answer, which is chi-square, the price of the numbers and the "
-        "surprise of their values."
+        "Longer by: -2 log evidence minus that of the answer; it is chi-square, a penalty for each parameter, and the "
+        "prior of the sizes."
     )
     return Listing(("effects", "longer by", "odds against the answer"), rows if len(rows) > 1 else (), caption)
 
 
 def tried_table(d: Diagnosis) -> Listing:
-    """What became of every candidate; columns in which nothing stands are left out."""
+    """Outcome of every candidate; empty columns are omitted."""
     rows = [
         (t.candidate.title, t.candidate.name, score(t.score), score(t.gain), score(t.held_out_gain), t.reason)
         for t in d.tried

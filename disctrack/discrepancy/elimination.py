@@ -1,9 +1,8 @@
-"""Quantities that are taken out of a least-squares problem, so that a fit steps the others alone.
+"""Elimination of nuisance parameters from a least-squares problem, so that a fit steps the others alone.
 
-Linear ones with priors: errors of lenses, dots and calibration enter the prediction with derivatives that no step of a
-fit changes. There may be hundreds of them; every fit needs only what they cannot absorb (variable projection). And
-those that one block of rows has of its own (a run's initial state), eliminated block by block: fits, scores and free
-runs cost as much as there are blocks, not as their third power.
+Linear parameters with priors (errors of lenses, dots and calibration) have derivatives that do not change in a fit.
+There may be hundreds of them; they are projected out once (variable projection). Parameters of a single block of rows
+(a run's initial state) are eliminated block by block, so that the cost grows linearly with the number of blocks.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ def prior_rows(quantities: Sequence[Quantity], values: Values) -> tuple[Array, A
 
 @dataclass(frozen=True)
 class Projection:
-    """What a set of linear quantities (k) with priors can absorb of m whitened numbers."""
+    """Projection of m whitened numbers onto what a set of linear quantities (k) with priors can absorb."""
 
     names: tuple[str, ...]
     null: Array  # (k,)
@@ -45,30 +44,30 @@ class Projection:
     prior_rows: Array  # (k, k)
 
     def cleared(self, columns: Array) -> Array:
-        """(m + k, p): columns (m, p) without what the quantities absorb, and below what their priors then lack."""
+        """(m + k, p): columns (m, p) without what the quantities absorb, and the residuals of their priors."""
         if not self.names:
             return columns
         taken = self.rows.T @ columns
         return np.concatenate([columns - self.rows @ taken, -self.prior_rows @ taken])
 
     def absorbed(self, columns: Array) -> Array:
-        """(k, p) values of the quantities, less their nulls, that fit columns (m, p) best."""
+        """(k, p) best-fit values of the quantities minus their nulls, for columns (m, p)."""
         return self.scale[:, None] * solve_triangular(self.root, self.rows.T @ columns, lower=True, trans=1)
 
     @property
     def covariance(self) -> Array:
-        """(k, k) of the quantities if nothing else is unknown."""
+        """(k, k) of the quantities if all others are known."""
         inverse = self.scale[:, None] * solve_triangular(self.root, np.eye(len(self.names)), lower=True, trans=1)
         return np.asarray(inverse @ inverse.T, float)
 
 
 def is_linear(q: Quantity) -> bool:
-    """Is the quantity taken out beforehand? One without a prior never is."""
+    """Is the quantity projected out? It needs a prior."""
     return q.linear and bool(np.isfinite(q.prior_sigma))
 
 
 def projection(system: System, quantities: Sequence[Quantity], values: Values) -> Projection:
-    """Of the linear ones among the quantities; `values` of the others only have to lie where there is a prediction."""
+    """Projection of the linear ones among the quantities; at `values` there has to be a prediction."""
     linear = [q for q in quantities if is_linear(q)]
     names = tuple(q.name for q in linear)
     null, scale = np.array([q.null for q in linear]), np.array([q.prior_sigma for q in linear])
@@ -80,7 +79,7 @@ def projection(system: System, quantities: Sequence[Quantity], values: Values) -
     if key not in known:
         _, derivative = system.linearise(values, names)
         columns = derivative.reshape(-1, len(names)) * scale
-        if not np.isfinite(columns).all():  # no prediction here: the fit says so
+        if not np.isfinite(columns).all():  # no prediction: the fit will report it
             return Projection(names, null, scale, np.eye(len(names)), np.zeros_like(columns), np.eye(len(names)))
         root = np.linalg.cholesky(columns.T @ columns + np.eye(len(names)))
         rows = solve_triangular(root, columns.T, lower=True).T
@@ -91,7 +90,7 @@ def projection(system: System, quantities: Sequence[Quantity], values: Values) -
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """Rows with their own quantities."""
+    """Rows with quantities of their own."""
 
     rows: NDArray[np.intp]
     columns: list[int]  # slots
@@ -99,10 +98,10 @@ class Block:
 
 
 class Own:
-    """All blocks of a system with those of the given quantities that are their own."""
+    """All blocks of a system with the given quantities that belong to single blocks."""
 
     def __init__(self, system: System, quantities: Sequence[Quantity]) -> None:
-        """Those with a slot."""
+        """Quantities with a slot belong to single blocks."""
         own: dict[int, list[Quantity]] = {}
         for q in quantities:
             if q.slot:
@@ -119,10 +118,10 @@ class Own:
     def reduced(
         self, residual: Array, derivative: Array, values: Values, common: Projection
     ) -> tuple[Array, Array, tuple[OwnNumbers, ...]]:
-        """Least-squares problem (right (m,), matrix (m, k)) of the shared quantities, and the heads of all blocks.
+        """Least-squares problem (right (m,), matrix (m, k)) of the shared quantities, and each block's elimination.
 
-        It is compressed (m = k + 1 at most): the Q of all rows is dropped, and norms and angles of all combinations of
-        columns stay, once what linear quantities absorb is taken off.
+        It is the triangular factor of a QR decomposition (m = k + 1 at most) of what linear quantities do not absorb:
+        norms and inner products of all combinations of columns are kept.
 
         residual, derivative : (n, w), (n, w, slots + k) of a linearisation by [*slots, *shared names]
         common : linear quantities, of a system without blocks
@@ -144,7 +143,7 @@ class Own:
         return R[:, -1], R[:, :-1], tuple(heads)
 
     def cleared(self, derivative: Array, heads: Sequence[OwnNumbers]) -> Array:
-        """(n, w, k) by the shared quantities, the own ones moving along; derivative (n, w, slots + k)."""
+        """(n, w, k) total derivative by the shared quantities; derivative (n, w, slots + k) with the own ones held."""
         n = len(self.slots)
         found = derivative[..., n:].copy() if n else derivative
         for block, head in zip(self.blocks, heads, strict=True):
@@ -152,7 +151,7 @@ class Own:
         return found
 
     def moved(self, heads: Sequence[OwnNumbers], step: Array) -> dict[str, float]:
-        """Steps of all own quantities beside a step (k,) of the shared ones."""
+        """Steps of all own quantities that belong to a step (k,) of the shared ones."""
         found: dict[str, float] = {}
         for block, head in zip(self.blocks, heads, strict=True):
             own = head.step + head.by_shared @ step
@@ -160,7 +159,7 @@ class Own:
         return found
 
     def known(self, heads: Sequence[OwnNumbers]) -> dict[str, tuple[Array, Array]]:
-        """Rows of root and of by_shared, by quantity; none of a fit that never began."""
+        """Rows of root and of by_shared, by quantity; none of a fit that could not start."""
         return {
             q.name: (root, by_shared)
             for block, head in zip(self.blocks, heads, strict=bool(heads))

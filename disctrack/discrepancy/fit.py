@@ -1,4 +1,4 @@
-"""Gauss-Newton with bounds and priors; it has never heard of discs."""
+"""Gauss-Newton least squares with bounds and normal priors, for any system."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -12,8 +12,8 @@ from disctrack.discrepancy.elimination import Own, Projection, is_linear, prior_
 from disctrack.discrepancy.system import GivenUp, Quantity, System, Values
 
 MAX_ITERATIONS = 40
-TRIAL = 15  # iterations of one fit among many: what describes the data is there by then, and others wander
-TOLERANCE = 1e-3  # a fit has converged when a full step would lower chi-square by less, over what is left per datum
+TRIAL = 15  # iterations of a trial: an explanation that fits the data has converged by then
+TOLERANCE = 1e-3  # converged when a full step promises a smaller decrease of chi-square, over chi-square per datum
 _HALVINGS = 8
 
 
@@ -22,21 +22,21 @@ class Fit(Brief):
     """Minimum of chi-square, data and priors together."""
 
     quantities: tuple[Quantity, ...]
-    values: dict[str, float]  # of all quantities fitted, and of those that were held
-    covariance: Array  # (k, k) of the `shared` ones; zero rows for those that the data do not show
+    values: dict[str, float]  # of all fitted quantities, and of those that were held
+    covariance: Array  # (k, k) of the `shared` ones; zero rows for those that the data do not determine
     chi_square: float  # of the data alone
     penalty: float  # of the priors
     n_data: int
     converged: bool
     n_iterations: int
-    promised: float = 0.0  # chi-square that one more full step would lower, were the prediction linear
-    heads: tuple[OwnNumbers, ...] = ()  # of the quantities that blocks of rows have of their own
-    # of them by name: root (r,), and how it moves with the shared ones (k,); its variance is their sum's
+    promised: float = 0.0  # decrease of chi-square by one more full step, to first order
+    heads: tuple[OwnNumbers, ...] = ()  # elimination of the quantities that belong to single blocks of rows
+    # of these quantities by name: root (r,) of the conditional variance, and derivative (k,) by the shared quantities
     own: Mapping[str, tuple[Array, Array]] = field(default_factory=dict)
 
     @property
     def shared(self) -> tuple[str, ...]:
-        """Fitted quantities that no block of rows has of its own."""
+        """Fitted quantities that do not belong to a single block of rows."""
         return tuple(q.name for q in self.quantities if not q.slot)
 
     @property
@@ -70,18 +70,18 @@ class Fit(Brief):
             root, by_shared = self.own[name]
             return float(np.sqrt(root @ root + max(float(by_shared @ self.covariance @ by_shared), 0.0)))
         if name not in self.shared:
-            return 0.0  # of a fit that never began
+            return 0.0  # of a fit that could not start
         i = self.shared.index(name)
         return float(np.sqrt(max(self.covariance[i, i], 0.0)))
 
     def amounts(self, names: Sequence[str]) -> tuple[Array, Array]:
-        """How far shared quantities (k,) are from their nulls, and their covariance (k, k)."""
+        """Differences (k,) of shared quantities from their nulls, and their covariance (k, k)."""
         index = [self.shared.index(n) for n in names]
         nulls = {q.name: q.null for q in self.quantities}
         return np.array([self.values[n] - nulls[n] for n in names]), self.covariance[np.ix_(index, index)]
 
     def excess(self, noise: float) -> float:
-        """Chi-square beyond that of noise of this variance, in units of it."""
+        """Chi-square in excess of its expectation for noise of this variance, in units of it."""
         return self.chi_square / noise - self.degrees_of_freedom
 
     def covariance_with(self, name: str) -> Array:
@@ -92,10 +92,10 @@ class Fit(Brief):
 
 
 def fit(system: System, quantities: Sequence[Quantity], start: Values, max_iterations: int = MAX_ITERATIONS) -> Fit:
-    """Minimise chi-square over `quantities` from `start`; whatever else `start` holds stays as it is.
+    """Minimise chi-square over `quantities` from `start`; all other values of `start` are held.
 
-    A step that leads where there is no prediction, or uphill, is halved. `converged` is False where that does not help
-    or the iterations run out.
+    A step is halved where it increases chi-square or leads to where there is no prediction. `converged` is False where
+    that does not help, or after the last iteration.
     """
     problem = _Problem(system, quantities, start)
     converged, iteration = False, 0
@@ -106,7 +106,7 @@ def fit(system: System, quantities: Sequence[Quantity], start: Values, max_itera
             converged = True
             break
         if not problem.go(step):
-            # rounding of the prediction: no step lowers chi-square although the next one promises next to nothing
+            # at the rounding errors of the prediction no step decreases chi-square, and the next one promises little
             converged = bool(problem.expected < max(0.1, 1e-7 * problem.cost))
             break
     return problem.fit(converged, iteration)
@@ -122,7 +122,7 @@ def attempt(system: System, quantities: Sequence[Quantity], start: Values, max_i
 
 
 class _Problem:
-    """Residual, derivative and priors at some values, and the way to better ones."""
+    """Residuals, derivatives and priors at the current values, and the step to better ones."""
 
     def __init__(self, system: System, quantities: Sequence[Quantity], start: Values) -> None:
         self.system, self.quantities = system, tuple(quantities)
@@ -138,13 +138,13 @@ class _Problem:
         self.residual, self.derivative = system.linearise(self.values, [*self.own.slots, *self.names])
         self.n_data = int(np.sum(system.weights))
         self.cost = self._cost(self.values, self.residual, self.derivative)
-        self.expected = float("inf")  # gain of a full step, were the prediction linear
+        self.expected = float("inf")  # decrease of chi-square by a full step, to first order
         self.matrix, self.right = np.zeros((0, len(self.names))), np.zeros(0)
         self.heads: tuple[OwnNumbers, ...] = ()
 
     @property
     def x(self) -> Array:
-        """(k,) of the shared quantities that are stepped."""
+        """(k,) values of the shared quantities that are not linear."""
         return np.array([self.values[n] for n in self.names])
 
     def solve(self) -> Array:
@@ -158,14 +158,14 @@ class _Problem:
         return step
 
     def go(self, step: Array) -> bool:
-        """Take the step, or a part of it; False where none lowers chi-square."""
+        """Take the step, or a part of it; False where none decreases chi-square."""
         x, values, own = self.x, self.values, self.own.moved(self.heads, step)
         for halving in range(_HALVINGS):
             factor = 0.5**halving
             inside = np.clip(x + factor * step, self.lower, self.upper)
             trial = values | dict(zip(self.names, inside.tolist(), strict=True))
             trial |= {name: values[name] + factor * change for name, change in own.items()}
-            # derivatives cost many times more than the prediction, and most of all where the step led far off
+            # the prediction is tested first: derivatives cost many times more, above all after too long a step
             if not self._cost(trial, *self.system.linearise(trial, ())) < self.cost:
                 continue
             residual, derivative = self.system.linearise(trial, [*self.own.slots, *self.names])
@@ -180,17 +180,14 @@ class _Problem:
         return float(np.sum(prior_rows([*self.moved, *local], values)[0] ** 2))
 
     def _cost(self, values: Values, residual: Array, derivative: Array) -> float:
-        """Chi-square with priors, at the best values of the linear quantities; infinite where there is no prediction.
-
-        Nor is there one where it has no derivative.
-        """
+        """Chi-square with priors, minimised over the linear quantities; infinite without a prediction or derivative."""
         with np.errstate(over="ignore", invalid="ignore"):
             cost = float(np.sum(self.common.cleared(residual.reshape(-1, 1)) ** 2) + self._strain(values))
             usable = np.isfinite(cost) and np.isfinite(np.sum(derivative))
         return cost if usable else np.inf
 
     def fit(self, converged: bool, iterations: int) -> Fit:
-        """As it stands, with the linear quantities at their best."""
+        """The fit at the current values, with the best values of the linear quantities."""
         common, names, values = self.common, self.names, dict(self.values)
         covariance = covariance_within(self.matrix, self.right, self.x, self.lower, self.upper)
         penalty = 0.0
@@ -212,13 +209,13 @@ class _Problem:
 
 
 def no_fit(quantities: Sequence[Quantity], values: Values) -> Fit:
-    """What became of a fit that was given up: nothing that any other could be worse than."""
+    """A fit without a result, worse than any other."""
     k = sum(not q.slot for q in quantities)
     return Fit(tuple(quantities), dict(values), np.zeros((k, k)), np.inf, 0.0, 0, False, 0)
 
 
 def _joint(covariance: Array, common: Projection, derivative: Array) -> Array:
-    """Covariance of the moved quantities, and after them of the linear ones, from that of the former."""
+    """Joint covariance of the nonlinear quantities and, after them, the linear ones, from that of the former."""
     by_moved = -common.absorbed(derivative)
     across = by_moved @ covariance
     own = common.covariance + across @ by_moved.T

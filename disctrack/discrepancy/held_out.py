@@ -1,4 +1,4 @@
-"""Fit on the first part, free run over the rest: the judge that a flexible model cannot flatter."""
+"""Prediction of held-out data: fit to the first part, predict the rest; it penalises flexible models."""
 
 from __future__ import annotations
 
@@ -19,44 +19,44 @@ TRAIN_FRACTION = 0.65  # of the time
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Prediction of samples that the fit has not seen."""
+    """Prediction of held-out samples."""
 
     train: Fit
     test_rows: Mask  # (n,)
-    chi_square: float  # of the free run on the test rows; infinite where it ends too early
-    expected: float  # what noise and the fitted quantities' uncertainty make of it
-    log_density: float  # of the test data under the predictive distribution (up to a constant)
+    chi_square: float  # of the prediction of the test rows; infinite where there is none
+    expected: float  # expectation of it, by the noise and by the uncertainty of the fit
+    log_density: float  # held-out log predictive density, up to a constant
     n_data: int
 
     @property
     def ratio_to_floor(self) -> float:
-        """Rms of the free run's residual over what noise and uncertainty of the fit allow; 1 is perfect."""
+        """Rms prediction error over its expectation by noise and uncertainty of the fit (the noise floor)."""
         return float(np.sqrt(self.chi_square / self.expected)) if self.expected > 0 else float("nan")
 
     def gain_over(self, before: HeldOut, noise: float) -> float:
-        """Gain of twice the log density, in units of the noise, over another prediction of the same samples."""
+        """Gain of twice the log density over another prediction of the same samples, in units of the noise."""
         gain = 2 * (self.log_density - before.log_density) / noise
-        return -np.inf if np.isnan(gain) else float(gain)  # neither predicts anything
+        return -np.inf if np.isnan(gain) else float(gain)  # NaN where neither has a prediction
 
 
 def training_rows(system: System) -> Mask:
-    """(n,) True in the first part of the time that has data."""
+    """(n,) True in the first part of the time covered by data."""
     seen = system.time[system.weights > 0]
     return np.asarray(system.time <= seen[0] + TRAIN_FRACTION * (seen[-1] - seen[0]), bool)
 
 
 def held_out(system: System, quantities: Sequence[Quantity], start: Values, rows: Mask) -> HeldOut:
-    """Fit on `rows`, then predict the others from that fit alone.
+    """Fit to `rows`, then predict the other rows from that fit.
 
     The predictive distribution of the test data is normal with covariance 1 + J P J^T (P: covariance of the fit), so
-    that a quantity which the first part leaves open is not punished for it. Of quantities that a block of rows has of
-    its own and that the first part says nothing of (those of a run that is kept back), what they cannot move is judged.
+    that quantities which the first part does not determine are not penalised. Own quantities of a block that is held
+    out as a whole (a run's initial state) are projected out: what they cannot absorb is judged.
     """
     train = fit(subset(system, rows), quantities, start)
     test = ~rows & (system.weights > 0)
     own = Own(system, train.quantities)
     kept = [b for b in own.blocks if test[b.rows].any() and not (rows & (system.weights > 0))[b.rows].any()]
-    if kept:  # near their best values the prediction is linear in them
+    if kept:  # linearise at their best values
         alone = np.zeros(len(test), bool)
         alone[np.concatenate([b.rows for b in kept])] = True
         theirs = fit(subset(system, alone), [q for b in kept for q in b.quantities], train.values)
@@ -68,7 +68,7 @@ def held_out(system: System, quantities: Sequence[Quantity], start: Values, rows
         return HeldOut(train, test, np.inf, float(n_data), -np.inf, n_data)
     root = square_root(train.covariance)
     k = root.shape[1]
-    # B: the prediction's derivative by independent numbers of variance one that make up what the fit leaves open
+    # B: derivative of the prediction by independent standard normal numbers, which span the uncertainty of the fit
     both = np.zeros((*residual.shape, k + 1))
     m, w = int(np.sum(test)), residual.shape[1]
     by_shared = own.cleared(derivative, train.heads)[test].reshape(m * w, k)
@@ -82,40 +82,40 @@ def held_out(system: System, quantities: Sequence[Quantity], start: Values, rows
             known = [np.isfinite(q.prior_sigma) for q in block.quantities]
             away = [train.values[q.name] - q.null for q in block.quantities]
             part[:, k] += J @ np.where(known, away, 0.0)
-        part, R, B, free = _beside_own(part, J, head)
+        part, R, B, free = _own_marginalised(part, J, head)
         n_data -= free
         spread += float(np.sum(B * B))
         log_determinant += float(np.sum(np.log(np.abs(np.diag(R)[: B.shape[1]]))))
         predicted.append(R[B.shape[1] :, B.shape[1] :])
         parts.append(part)
     everything, whitened = np.concatenate(parts), np.concatenate(predicted)
-    R = _over_ones(whitened[:, :k], whitened[:, k:])
+    R = _stacked_triangle(whitened[:, :k], whitened[:, k:])
     quadratic = R[k, k] ** 2 if R.shape[0] > k else 0.0
     log_density = -0.5 * (quadratic + 2 * (np.sum(np.log(np.abs(np.diag(R)[:k]))) + log_determinant))
     expected = n_data + spread + float(np.sum(everything[:, :k] ** 2))
     return HeldOut(train, test, float(np.sum(everything[:, k] ** 2)), expected, float(log_density), n_data)
 
 
-def _beside_own(part: Array, J: Array, head: OwnNumbers) -> tuple[Array, Array, Array, int]:
-    """Rows (m, k + 1) of a block without what its own quantities may be; R of them beside the own ones; these; number.
+def _own_marginalised(part: Array, J: Array, head: OwnNumbers) -> tuple[Array, Array, Array, int]:
+    """Rows (m, k + 1) of a block without its undetermined own quantities; R with the own ones; these; number projected.
 
-    J : (m, p) by the own quantities. What nothing that was fitted determines (all of a run that is kept back) may be
-    what it likes and is cleared; the others are as uncertain as the fit leaves them.
+    J : (m, p) derivative by the own quantities. Directions that the fit does not determine (all of a run that is held
+    out) are projected out; the others have the covariance of the fit.
     """
     open_, largest = J @ head.open, np.linalg.norm(J, axis=0) @ np.abs(head.open)
     free = span(open_[:, np.linalg.norm(open_, axis=0) > INVISIBLE * largest])
     part, B = cleared(part, free), cleared(J @ head.root, free)
-    return part, _over_ones(B, part), B, free.shape[1]
+    return part, _stacked_triangle(B, part), B, free.shape[1]
 
 
-def _over_ones(B: Array, others: Array) -> Array:
-    """R of [B, others] over [1, 0]: the squares of B, which a run-away motion would make singular, are never formed."""
+def _stacked_triangle(B: Array, others: Array) -> Array:
+    """R of the QR decomposition of [B, others] over [1, 0]; B^T B, singular for a diverging motion, is never formed."""
     ones = np.eye(B.shape[1], B.shape[1] + others.shape[1])
     return triangle(np.concatenate([np.concatenate([B, others], axis=1), ones]))
 
 
 def square_root(covariance: Array) -> Array:
-    """R (k, k) with R R^T = covariance (k, k), which may be singular, of numbers of any sizes."""
+    """R (k, k) with R R^T = covariance (k, k), which may be singular and badly scaled."""
     if covariance.size == 0:  # a model without quantities
         return covariance
     scale = np.sqrt(np.maximum(np.diag(covariance), 0.0))

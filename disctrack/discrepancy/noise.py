@@ -1,12 +1,10 @@
-"""What noise is: how large, whether the numbers of a row share it, and whether it remembers.
+"""Noise model: variance, common errors of a row, and autocorrelation.
 
-Size: whatever a model of a well sampled motion lacks moves slowly from sample to sample; differences in time pass white
-noise and stop the rest. Rows: cameras that shake, clocks that jitter, frames in a wrong order look like a pose, and
-poses are what effects are read from; directions in which rows scatter more than independent noise does are weighted by
-what they scatter. Memory: where what is left lasts for many samples, an estimate scatters by the long-run variance of
-its influence function over that of independent samples (Newey and West 1987, with the bandwidth of Andrews 1991 for
-Bartlett's weights); or the data are whitened, by an autoregression or by the covariance of an error that changes
-smoothly.
+Variance: from differences in time, which pass white noise and suppress the slow residuals of a missing effect. Common
+errors: shaken cameras, jitter of clocks and exchanged frames look like changes of the pose, from which effects are
+inferred; directions in which rows scatter more than independent noise are weighted by their variance. Autocorrelation:
+the variance of an estimate is the long-run variance of its influence function (Newey and West 1987, with the bandwidth
+of Andrews 1991 for Bartlett's weights); or the data are whitened, by an autoregression or by a smooth covariance.
 """
 
 from __future__ import annotations
@@ -28,15 +26,14 @@ from disctrack.discrepancy.system import System, Transformed
 if TYPE_CHECKING:
     from disctrack.discrepancy.equations.declared import Samples
 
-MARGIN = 1.5  # over the largest eigenvalue that independent noise brings (Marchenko and Pastur's edge)
+MARGIN = 1.5  # over the largest eigenvalue of independent noise (Marchenko and Pastur's edge)
 THIRD = 2.31  # samples per independent one among third differences: 1 + 2 (15^2 + 6^2 + 1) / 20^2
 
 
 def third_differences(system: System, numbers: Array) -> tuple[Array, NDArray[np.intp]]:
-    """Third differences in time of (n, w) where four samples follow each other, (k, w), and their rows (k,).
+    """Third differences in time of (n, w) wherever four samples are consecutive, (k, w), and their rows (k,).
 
-    Whatever is missing in a model of a motion that is sampled well moves slowly from sample to sample; differences of
-    third order pass white noise (variance 20) and stop the rest.
+    They pass white noise (variance 20) and suppress what changes slowly from sample to sample.
     """
     present = system.weights > 0
     rows = np.flatnonzero(present[3:] & present[2:-1] & present[1:-2] & present[:-3])
@@ -44,10 +41,7 @@ def third_differences(system: System, numbers: Array) -> tuple[Array, NDArray[np
 
 
 def noise_variance(system: System, fit_: Fit) -> float:
-    """Variance of the fast part of the residual over that stated, from third differences in time.
-
-    1 where there are too few samples for that.
-    """
+    """Variance of the noise over that stated, from third differences of the residuals; 1 for too few samples."""
     difference, rows = third_differences(system, system.linearise(fit_.values, [])[0])
     if len(rows) < 20:
         return 1.0
@@ -55,9 +49,9 @@ def noise_variance(system: System, fit_: Fit) -> float:
 
 
 def common_modes(system: System, fit: Fit) -> tuple[Array, Array] | None:
-    """Directions (n, w, b) in which rows may scatter as a whole, and their variances (b,); None where none does.
+    """Directions (n, w, b) of common errors in each row, and their variances (b,); None where there are none.
 
-    Of all directions in which they may, each counts as it is seen to scatter, and none for less than single numbers do.
+    Principal axes of the possible directions; no variance is smaller than that of independent noise.
     """
     residual, _ = system.linearise(fit.values, [])
     single, rows = third_differences(system, residual)
@@ -76,7 +70,7 @@ def common_modes(system: System, fit: Fit) -> tuple[Array, Array] | None:
 
 
 def whitened(system: System, fit: Fit) -> System | None:
-    """The system with the scatter of its common modes brought down to that of other directions; None if it has none."""
+    """The system whitened in the directions of its common errors; None if it has none."""
     if (modes := common_modes(system, fit)) is None:
         return None
     vectors, variances = modes
@@ -84,14 +78,14 @@ def whitened(system: System, fit: Fit) -> System | None:
     return Transformed(system, lambda both: both - less @ both)
 
 
-SHORTEST = 40  # samples from which a memory is looked for
-SURE = 3.0  # standard deviations of the long-run variance itself, below which it says nothing
+SHORTEST = 40  # samples, below which autocorrelation is not estimated
+SURE = 3.0  # standard deviations of an estimated autocorrelation, below which it is not significant
 
 
 def inflation(system: System, fit: Fit) -> Array:
-    """(k,) by which the standard deviation of each fitted quantity grows; 1 where no memory is seen.
+    """(k,) inflation of the standard deviation of each fitted quantity by autocorrelation; 1 where none is significant.
 
-    Linear quantities with priors keep theirs; those that a block of rows has of its own grow by what that one leaves.
+    Linear quantities with priors keep theirs; that of a block's own quantity follows from the block's residuals.
     """
     factors = np.ones(len(fit.quantities))
     moved = [i for i, q in enumerate(fit.quantities) if not (is_linear(q) or q.slot)]
@@ -109,16 +103,16 @@ def inflation(system: System, fit: Fit) -> Array:
         mine = block.rows[system.weights[block.rows] > 0]
         if len(mine) >= SHORTEST:
             by_own = derivative[mine][..., block.columns] @ head.root @ head.root.T
-            factors[[place[q.name] for q in block.quantities]] = _grown(residual[mine], by_own, power, shares)
+            factors[[place[q.name] for q in block.quantities]] = _inflation(residual[mine], by_own, power, shares)
     derivative = own.cleared(derivative, fit.heads) if fit.heads else derivative
     common = projection(system, fit.quantities, fit.values)
     cleared = common.cleared(derivative.reshape(residual.size, -1))[: residual.size].reshape(derivative.shape)
-    factors[moved] = _grown(residual[rows], cleared[rows] @ covariance, power, shares)
+    factors[moved] = _inflation(residual[rows], cleared[rows] @ covariance, power, shares)
     return factors
 
 
-def _grown(residual: Array, by_number: Array, power: float, shares: Sequence[float]) -> Array:
-    """(k,) growth of numbers that move by `by_number` (n, w, k) with the residual (n, w), whose variance is `power`."""
+def _inflation(residual: Array, by_number: Array, power: float, shares: Sequence[float]) -> Array:
+    """(k,) inflation of estimates with influence `by_number` (n, w, k) of the residuals (n, w) of variance `power`."""
     influence = np.einsum("nw,nwk->nk", residual, by_number)
     alone = np.einsum("nwk,nwk->k", by_number, by_number)
     in_common, factors = alone.copy(), np.ones(len(alone))
@@ -133,15 +127,15 @@ def _grown(residual: Array, by_number: Array, power: float, shares: Sequence[flo
 
 
 def autocorrelation(residual: Array) -> list[float]:
-    """Of the numbers (n, w) of each row with the same ones of rows 1, 2, ... later; up to where none is seen any more.
+    """Of the columns of (n, w), averaged, at lags 1, 2, ... up to the first one that is not significant.
 
-    All numbers together tell it far better than the one series of a quantity's influence. A sensor's pattern of gains
-    and offsets is such a memory: images of a dot that lie within two pixels err alike.
+    The average of all columns is far more precise than the one series of a quantity's influence. A sensor's pattern of
+    gains and offsets is such a correlation: images of a dot within two pixels have nearly the same error.
     """
     found: list[float] = []
     power = float(np.sum(residual**2)) / max(int(np.count_nonzero(residual)), 1)
     for lag in range(1, len(residual) // 4):
-        products = residual[lag:] * residual[:-lag]  # of missing numbers zero
+        products = residual[lag:] * residual[:-lag]  # zero for missing data
         count = max(int(np.count_nonzero(products)), 1)
         share = float(np.sum(products)) / count / power if power > 0 else 0.0
         if share < SURE / np.sqrt(count):
@@ -151,7 +145,7 @@ def autocorrelation(residual: Array) -> list[float]:
 
 
 def long_run_variance(x: Array) -> tuple[float, float]:
-    """Variance of a sum of x (n,) over n, with its memory; and the relative standard deviation of that."""
+    """Variance of a sum of autocorrelated x (n,) over n; and the relative standard deviation of that estimate."""
     n = len(x)
     power = float(x @ x)
     if power == 0:
@@ -159,14 +153,12 @@ def long_run_variance(x: Array) -> tuple[float, float]:
     rho = float(np.clip((x[1:] @ x[:-1]) / power, -0.97, 0.97))
     alpha = 4 * rho**2 / ((1 - rho) ** 2 * (1 + rho) ** 2)
     width = int(np.clip(np.ceil(1.1447 * (alpha * n) ** (1 / 3)), 1, n // 4))
-    total = power
-    for lag in range(1, width):
-        total += 2 * (1 - lag / width) * float(x[lag:] @ x[:-lag])
+    total = power + sum(2 * (1 - lag / width) * float(x[lag:] @ x[:-lag]) for lag in range(1, width))
     return total / n, float(np.sqrt(4 * width / (3 * n)))
 
 
-def with_memory(system: System, fit: Fit) -> Fit:
-    """The fit with standard deviations that know the residual's size and memory; correlations stay."""
+def with_autocorrelation(system: System, fit: Fit) -> Fit:
+    """The fit with standard deviations scaled by size and autocorrelation of the residuals; correlations stay."""
     factors = inflation(system, fit) * np.sqrt(max(1.0, fit.reduced_chi_square))
     shared = factors[[not q.slot for q in fit.quantities]]
     size = dict(zip(fit.names, factors, strict=True))
@@ -185,19 +177,19 @@ class SmoothNoise:
     def covariance(self, time: Array) -> Array:
         """(n, n) of one stretch of samples; different stretches are independent."""
         apart = (time[:, None] - time[None, :]) / self.memory
-        # a share of 1e-9 keeps the Cholesky factor regular where the white part is next to nothing
+        # a share of 1e-9 keeps the Cholesky factor regular where the white part is very small
         floor = (self.white**2 + 1e-9 * self.smooth**2) * np.eye(len(time))
         return np.asarray(self.smooth**2 * np.exp(-0.5 * apart**2) + floor, float)
 
     def whitening(self, time: Array) -> Array:
-        """W (n, n), lower triangular, with W covariance W^T = 1: sample by sample what those before do not predict."""
+        """W (n, n), lower triangular, with W covariance W^T = 1: the normalised innovations of the samples."""
         root = np.linalg.cholesky(self.covariance(time))
         return np.asarray(solve_triangular(root, np.eye(len(time)), lower=True), float)
 
 
 @dataclass(frozen=True)
 class SampleStretch:
-    """Samples that share errors, and what a model may absorb of them."""
+    """Samples with correlated errors, and a basis of what a model may absorb of them."""
 
     time: Array  # (n,)
     values: Array  # (n, c) channels with the same statistics
@@ -206,11 +198,11 @@ class SampleStretch:
 
 
 def estimate(stretches: Sequence[SampleStretch], start: SmoothNoise) -> SmoothNoise:
-    """Restricted maximum likelihood: what is left in all stretches after their bases are cleared out.
+    """Restricted maximum likelihood: of all stretches, orthogonalised to their bases.
 
-    A memory beyond a fifth of the longest stretch is not sought: such an error looks like the motion itself.
+    The correlation time is at most a fifth of the longest stretch: slower errors look like the motion itself.
     """
-    cleared = [null_space(s.basis.T).T for s in stretches]  # rows orthogonal to what the model may absorb
+    cleared = [null_space(s.basis.T).T for s in stretches]  # rows orthogonal to the basis
     longest = 0.2 * max(float(np.ptp(s.time)) for s in stretches)
     bounds = [(np.log(1e-3 * x), np.log(1e3 * x)) for x in (start.white, start.smooth)]
     bounds.append((np.log(0.01 * longest), np.log(longest)))
@@ -234,20 +226,19 @@ def _log_likelihood(s: SampleStretch, Q: Array, noise: SmoothNoise) -> float:
     return -0.5 * float(np.sum(white**2)) - s.values.shape[1] * float(np.sum(np.log(np.diag(root))))
 
 
-_ORDERS = range(2, 7)  # of differences: the higher, the less of the motion is left in them
-FEWEST_DIFFERENCES = 3  # by which a channel's noise is estimated
-MAX_MEMORY = 24  # samples over which noise may remember
+_ORDERS = range(2, 7)  # of differences: higher ones suppress more of the motion
+MAX_MEMORY = 24  # largest order of an autoregression
 
 
 def with_noise(samples: Sequence[Samples]) -> list[Samples]:
-    """Runs whose sigma is known: where none was given, from the fast part of the channel's data in all runs."""
+    """Runs with sigmas: where none is given, estimated from differences of the channel's data in all runs."""
     found = list(samples)
     for c in range(samples[0].data.shape[1]):
         open_ = [i for i, s in enumerate(found) if np.isnan(s.sigma[:, c]).any()]
         if not open_:
             continue
         values = [found[i].data[:, c] for i in open_]
-        sigma = max(fast_part(values, [found[i].time for i in open_]), step_of(values) / np.sqrt(12.0))
+        sigma = max(noise_sigma(values, [found[i].time for i in open_]), quantisation(values) / np.sqrt(12.0))
         for i in open_:
             columns = found[i].sigma.copy()
             columns[:, c] = sigma
@@ -255,20 +246,20 @@ def with_noise(samples: Sequence[Samples]) -> list[Samples]:
     return found
 
 
-def fast_part(values: Sequence[Array], times: Sequence[Array] | None = None) -> float:
+def noise_sigma(values: Sequence[Array], times: Sequence[Array] | None = None) -> float:
     """Standard deviation of white noise on smooth signals, from divided differences in time.
 
-    times : of the values, if they are not evenly spaced
+    times : of the values, if these are not evenly spaced
     """
     times = times or [np.arange(len(v), dtype=float) for v in values]
     seen = [(t[p], v[p]) for t, v in zip(times, values, strict=True) for p in [np.isfinite(v)]]
     estimates, counts = [], []
     for order in _ORDERS:
         differences = np.concatenate([_divided(t, v, order) for t, v in seen])
-        if len(differences) >= FEWEST_DIFFERENCES:
+        if len(differences):
             estimates.append(float(np.sqrt(np.mean(differences**2))))
             counts.append(len(differences))
-    # the first order in which no more of the motion is left than its own scatter: higher ones scatter more
+    # the lowest order that is not larger than the next one by more than its scatter: higher orders scatter more
     best = next(
         (a for a, b, n in zip(estimates, estimates[1:], counts, strict=False) if a <= b * (1 + 2 / np.sqrt(n))),
         estimates[-1] if estimates else 0.0,
@@ -278,7 +269,7 @@ def fast_part(values: Sequence[Array], times: Sequence[Array] | None = None) -> 
 
 
 def _divided(time: Array, values: Array, order: int) -> Array:
-    """Divided differences, as large as the noise of one value."""
+    """Divided differences, normalised to the noise of one value."""
     if len(time) <= order:
         return np.zeros(0)
     t, y = (np.lib.stride_tricks.sliding_window_view(x, order + 1) for x in (time, values))
@@ -287,8 +278,8 @@ def _divided(time: Array, values: Array, order: int) -> Array:
     return np.asarray(np.sum(weight * y, axis=1) / np.linalg.norm(weight, axis=1), float)
 
 
-def step_of(values: Sequence[Array]) -> float:
-    """Step of an encoder or a converter, of which all values are multiples; 0 where there is none."""
+def quantisation(values: Sequence[Array]) -> float:
+    """Resolution of an encoder or a converter, of which all values are multiples; 0 where there is none."""
     levels = np.unique(np.concatenate([v[np.isfinite(v)] for v in values]))
     if len(levels) < 3:
         return 0.0
@@ -303,12 +294,12 @@ def step_of(values: Sequence[Array]) -> float:
     return step if whole.all() and many > 1.2 * len(levels) else 0.0
 
 
-def without_memory(system: System, rows: Sequence[slice], coefficients: Array, present: Mask) -> System:
-    """The system with every sample minus what those before it predict of its noise; gaps begin anew.
+def prewhitened(system: System, rows: Sequence[slice], coefficients: Array, present: Mask) -> System:
+    """The system prewhitened: of every sample, the prediction from the samples before it is subtracted.
 
     rows : of each stretch
-    coefficients : (w, order) of the autoregression of each channel's whitened residual
-    present : (n, w) where there are data
+    coefficients : (w, order) of the autoregression of each channel's residuals
+    present : (n, w) True where there are data
     """
 
     def innovations(both: Array) -> Array:
@@ -324,9 +315,9 @@ def without_memory(system: System, rows: Sequence[slice], coefficients: Array, p
 
 
 def autoregression(residual: Array, present: Mask, rows: Sequence[slice]) -> tuple[Array, float]:
-    """Coefficients (w, order) that make a residual (n, w) white, and its variance then over before.
+    """Coefficients (w, order) of an autoregression of residuals (n, w), and its innovation variance over theirs.
 
-    Yule and Walker's equations; the order is Schwarz's choice. Missing samples count as zeros.
+    Yule-Walker equations; the order by BIC. Missing samples count as zeros.
     """
     n = int(present.sum(axis=0).max())
     top = int(min(MAX_MEMORY, max(1, n // 40)))
@@ -347,8 +338,8 @@ def autoregression(residual: Array, present: Mask, rows: Sequence[slice]) -> tup
     return found, ratio
 
 
-def persistence(residual: Array, rows: Sequence[slice]) -> float:
-    """Samples until the autocorrelation of a residual (n, w) has fallen to 1/e, all channels and stretches together."""
+def correlation_lag(residual: Array, rows: Sequence[slice]) -> float:
+    """Lag (samples) at which the autocorrelation of residuals (n, w), over all channels and stretches, falls to 1/e."""
     longest = max(r.stop - r.start for r in rows)
     spectra = [np.abs(np.fft.rfft(residual[r], 2 * longest, axis=0)) ** 2 for r in rows]
     power = np.fft.irfft(np.sum(spectra, axis=0), axis=0).sum(axis=1)[:longest]

@@ -1,7 +1,7 @@
-"""Score test: what each effect would gain, and which effects look alike, from one linearisation.
+"""Score test: what each effect would gain, and which effects predict the same, from one linearisation.
 
-Every candidate's derivative columns are cleared of what the fitted quantities can absorb. To first order the best
-value, its sigma and the gain in chi-square follow from inner products, so that a whole catalogue costs one fit.
+The derivatives by every candidate are orthogonalised to those by the fitted quantities ("cleared"). To first order the
+best value, its sigma and the decrease of chi-square follow from inner products: a whole catalogue costs one fit.
 """
 
 from collections.abc import Sequence
@@ -15,13 +15,13 @@ from disctrack.discrepancy.elimination import Own, is_linear, prior_rows, projec
 from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.system import Candidate, System
 
-DEPENDENT = 1e-9  # singular value over the largest, below which columns are combinations of the others
-INVISIBLE = 1e-6  # share of a column left after clearing, below which the data say nothing about the effect
+DEPENDENT = 1e-9  # singular value over the largest, below which columns are linearly dependent
+INVISIBLE = 1e-6  # share of a column that is left after orthogonalisation, below which the data do not show the effect
 
 
 @dataclass(frozen=True)
 class Score:
-    """First-order answer for one candidate."""
+    """First-order result for one candidate."""
 
     candidate: Candidate
     values: Array  # (k,) best values within bounds
@@ -31,12 +31,12 @@ class Score:
 
 
 class Linearisation:
-    """All derivatives at one fit, compressed: residual and columns by name, priors included."""
+    """Residuals and all derivatives at one fit, compressed by a QR decomposition, with the rows of the priors."""
 
     def __init__(self, system: System, fit: Fit, candidates: Sequence[Candidate]) -> None:
-        """Linearise at the fit for its own quantities and for those of all candidates.
+        """Linearise at the fit by its own quantities and by those of all candidates.
 
-        A candidate may free what the fit holds within a prior: its column then stands beside that of the fit.
+        A candidate may free a quantity to which the fit gives a prior: there are then two columns of the same name.
         """
         held = {q.name: q.prior_sigma for q in fit.quantities}
         new = {q.name: q for c in candidates for q in c.quantities if q.prior_sigma > held.get(q.name, 0.0)}
@@ -48,14 +48,14 @@ class Linearisation:
         names = list(dict.fromkeys([*(q.name for q in self.fitted), *new]))
         residual, derivative = system.linearise(values, [*own.slots, *names])
         right, matrix, _ = own.reduced(residual, derivative, values, common)
-        # of a column that a block's own quantities take whole, rounding is left
+        # a column that a block's own quantities absorb completely is left with rounding errors
         before = np.linalg.norm(derivative[..., len(own.slots) :], axis=(0, 1))
         matrix[:, np.linalg.norm(matrix, axis=0) < DEPENDENT * before] = 0.0
         everything = [*self.fitted, *new.values()]
         prior, prior_matrix = prior_rows(everything, values)
         self.right = np.concatenate([right, prior])
         self.matrix = np.vstack([matrix[:, [names.index(q.name) for q in everything]], prior_matrix])
-        self.column = {q.name: i for i, q in enumerate(everything)}  # of what is there twice, the free one
+        self.column = {q.name: i for i, q in enumerate(everything)}  # of two columns of a name, the free one
         self.quantities = {q.name: q for q in everything}
         self.values = values | {name: q.null for name, q in new.items()}
         self._at = np.array([*(values[q.name] for q in self.fitted), *(q.null for q in new.values())])
@@ -63,21 +63,21 @@ class Linearisation:
         self.basis = np.linalg.qr(_normalised(self.matrix[:, free]))[0]
 
     def columns(self, names: Sequence[str]) -> Array:
-        """Columns (m, k) as they are."""
+        """Columns (m, k), not orthogonalised."""
         return self.matrix[:, [self.column[n] for n in names]]
 
     def cleared(self, columns: Array) -> Array:
-        """Columns without what the fitted quantities can absorb."""
+        """Columns orthogonalised to those of the fitted quantities."""
         return cleared(columns, self.basis)
 
     def seen(self, names: Sequence[str]) -> Array:
-        """(m, b) of these columns, without what the fitted quantities can absorb, those of which something is left."""
+        """(m, b) orthogonalised columns, without those that the fitted quantities absorb completely."""
         columns = self.columns(names)
         left = self.cleared(columns)
         return left[:, np.linalg.norm(left, axis=0) > INVISIBLE * np.maximum(np.linalg.norm(columns, axis=0), 1e-300)]
 
     def gain_of(self, names: Sequence[str]) -> tuple[float, Array]:
-        """Decrease of chi-square when these are fitted too, all within their bounds; and their values (k,)."""
+        """Decrease of chi-square if these are fitted too, all within their bounds; and their values (k,)."""
         mine = [self.column[n] for n in names]
         fitted = [i for i in range(len(self.fitted)) if i not in mine]
         A, x0 = self.matrix[:, [*fitted, *mine]], self._at[[*fitted, *mine]]
@@ -90,14 +90,14 @@ class Linearisation:
 
 
 def cleared(columns: Array, basis: Array) -> Array:
-    """Columns (m,) or (m, k) without what an orthonormal basis (m, b) can absorb."""
-    for _ in range(2):  # twice is enough (Kahan): the first pass leaves rounding of the size of what it removes
+    """Columns (m,) or (m, k) orthogonalised to an orthonormal basis (m, b)."""
+    for _ in range(2):  # twice is enough (Kahan): the first pass leaves rounding errors of the size of what it removes
         columns = columns - basis @ (basis.T @ columns)
     return columns
 
 
 def span(columns: Array) -> Array:
-    """(m, b) orthonormal basis of what columns (m, k) of any sizes span."""
+    """(m, b) orthonormal basis of the span of columns (m, k) of any sizes."""
     length = np.linalg.norm(columns, axis=0)
     U, singular, _ = np.linalg.svd(columns[:, length > 0] / length[length > 0], full_matrices=False)
     return np.asarray(U[:, singular > DEPENDENT * singular[0]] if singular.size else U, float)
@@ -118,7 +118,7 @@ def score(linear: Linearisation, candidate: Candidate) -> Score:
 
 
 def sigmas(columns: Array, basis: Array) -> Array:
-    """Standard deviations (k,) by columns (m, k) beside what `basis` spans; infinite where the data see nothing."""
+    """Standard deviations (k,) by columns (m, k), with `basis` fitted too; infinite where the data show nothing."""
     length = np.linalg.norm(columns, axis=0)
     left = cleared(columns, basis) / np.where(length > 0, length, 1.0)
     eigenvalues, vectors = np.linalg.eigh(left.T @ left)
@@ -134,9 +134,9 @@ def score_all(linear: Linearisation, candidates: Sequence[Candidate]) -> list[Sc
 
 
 def angle(linear: Linearisation, signal: Array, names: Sequence[str]) -> float:
-    """Angle [rad] between a predicted residual (m,) and what the named quantities can predict, both cleared.
+    """Angle [rad] between a signal (m,) and what the named quantities can predict, both orthogonalised.
 
-    0: no fit tells them apart; pi/2: nothing in common.
+    0: no fit distinguishes them; pi/2: orthogonal.
     """
     signal, basis = linear.cleared(signal), span(linear.seen(names))
     if not basis.size or not signal.any():

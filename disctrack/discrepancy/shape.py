@@ -1,8 +1,7 @@
-"""Exponents and scales of laws: found along their profiles, where the data determine them.
+"""Shape parameters of laws (exponents, scales), fitted along their profile likelihood where the data determine them.
 
-The search takes laws as they are written down, with the shape that their sources give. A law of another shape is then
-found as the nearest one, or not at all; so where much is left the shapes are tried free, and the shape of what was
-found is fitted along.
+The search uses laws in the shape that their sources give. A law of another shape is then found as a similar one, or not
+at all; therefore shapes are freed where the residuals stay large, and the shapes of the effects found are fitted too.
 """
 
 from contextlib import suppress
@@ -15,14 +14,14 @@ from disctrack.discrepancy.fit import TRIAL, Fit, attempt, fit
 from disctrack.discrepancy.score import Linearisation, score
 from disctrack.discrepancy.system import Candidate, GivenUp, Quantity, System
 
-MAX_TRIALS = 24  # values of a shape at which the rest is refitted
-ALONG = 5.0  # times the time of a trial, for all that follows from the best start
-HOPELESS = 0.02  # of what is still too much: a step that gains less does not lead to noise
-ENOUGH = 0.01  # of chi-square: a tenth of a sigma, beyond which a shape is not pursued
-STEEP = 1.0  # of chi-square above the lowest point, beyond which a neighbour says nothing of the valley's floor
-NARROW = 1e-6  # of a shape's size: as close as two values need to be
-WORTH_A_SHAPE = 0.5  # share of what is too much, that a law, and then its shape to first order, remove to be pursued
-DETERMINED = 0.3  # sigma over size, up to which a number is more than an order of magnitude
+MAX_TRIALS = 24  # points of a profile
+ALONG = 5.0  # times the steps of a trial, for all profiles from the best start
+HOPELESS = 0.02  # share of the excess over the goal: a step that gains less will not reach it
+ENOUGH = 0.01  # of chi-square: a tenth of a sigma, the precision of a minimum
+STEEP = 1.0  # of chi-square above the lowest point, beyond which a neighbour is no point of the same parabola
+NARROW = 1e-6  # of a shape's size: smallest distance of two points
+WORTH_A_SHAPE = 0.5  # share of the excess that a law, and then its shape to first order, must remove
+DETERMINED = 0.3  # sigma over size, up to which a shape parameter is determined
 
 
 def with_free_shape(
@@ -30,9 +29,9 @@ def with_free_shape(
 ) -> tuple[Candidate, Fit] | None:
     """The candidate with its shape free, and the fit with it; None where the data do not determine that shape.
 
-    least : gain to first order, below which no place that has to be looked for is worth a refit
-    below : cost that the best of the starts has to reach for its shape to be pursued
-    goal : as of `profiled`
+    least : first-order gain, below which an unknown location is not worth a refit
+    below : cost that the fit from the best start must reach
+    goal : see `profile_fit`
     """
     names = [q.name for q in candidate.shape]
     starts = [dict(zip(names, s, strict=True)) for s in system.starts(candidate, base.values, least)]
@@ -50,18 +49,18 @@ def with_free_shape(
     free = [(q, expected) for q in candidate.shape if np.isfinite(expected := expected_sigma(system, fitted, q))]
     with suppress(GivenUp), system.budget.trial(ALONG * system.trial_steps):
         for q, expected in free:
-            fitted = profiled(system, fitted, q, expected, goal)
+            fitted = profile_fit(system, fitted, q, expected, goal)
         if fitted.converged and all(is_determined(fitted, q) for q, _ in free):
             return replace(candidate, quantities=(*candidate.quantities, *(q for q, _ in free))), fitted
     return None
 
 
 def with_shape(system: System, fitted: Fit, candidate: Candidate) -> tuple[Fit, tuple[Quantity, ...], list[str]]:
-    """The fit with those numbers of the shape free that the data determine; these; and remarks on the others."""
+    """The fit with those shape parameters free that the data determine; these; and remarks on the others."""
     known, notes = list[Quantity](), list[str]()
     for q in candidate.shape:
         expected = expected_sigma(system, fitted, q)
-        trial = profiled(system, fitted, q, expected) if expected < _size(q, q.null) else None
+        trial = profile_fit(system, fitted, q, expected) if expected < _size(q, q.null) else None
         if trial is not None and is_determined(trial, q):
             fitted = trial
             known.append(q)
@@ -73,7 +72,7 @@ def with_shape(system: System, fitted: Fit, candidate: Candidate) -> tuple[Fit, 
 
 
 def _grid(candidate: Candidate) -> list[dict[str, float]]:
-    """Shapes to begin with: over the range of the first number, where it has one, or over two decades."""
+    """Initial guesses: a grid over the range of the first shape parameter, or over two decades."""
     q, values = candidate.shape[0], {s.name: s.null for s in candidate.shape}
     if np.isfinite(q.lower) and np.isfinite(q.upper):
         steps = q.lower + (q.upper - q.lower) * np.array([0.1, 0.25, 0.4, 0.6, 0.75, 0.9])
@@ -82,12 +81,13 @@ def _grid(candidate: Candidate) -> list[dict[str, float]]:
     return [values | {q.name: float(np.clip(v, q.lower, q.upper))} for v in steps]
 
 
-def profiled(system: System, fitted: Fit, q: Quantity, step: float, goal: float = np.inf) -> Fit:
-    """The fit with one more quantity free, found along its profile: the others are refitted at each value of it.
+def profile_fit(system: System, fitted: Fit, q: Quantity, step: float, goal: float = np.inf) -> Fit:
+    """The fit with one more quantity free, by minimising its profile: the others are refitted at each of its values.
 
-    An exponent and the amounts of two laws lie in a curved valley in which Gauss-Newton halves its steps for ever.
+    An exponent and the amounts of two laws are strongly correlated, and Gauss-Newton converges slowly in the curved
+    valley of chi-square.
 
-    goal : cost down to which it has to lead; where no step leads there, the search for the best one ends
+    goal : cost that is to be reached; the search ends where a step promises too little to reach it
     """
     points: dict[float, Fit] = {}
 
@@ -112,7 +112,7 @@ def profiled(system: System, fitted: Fit, q: Quantity, step: float, goal: float 
             target, gain = _vertex(x, y)
             side = 0 if y[0] > y[2] else 2
             if y[side] - y[1] > STEEP and (target - x[1]) * (x[side] - x[1]) <= 0:
-                # where another number comes to stand at its bound the profile has a kink: no parabola fits its sides
+                # where another quantity reaches its bound, the profile has a kink, and no parabola fits
                 target, gain = 0.5 * float(x[1] + x[side]), np.inf
             if gain < max(ENOUGH, HOPELESS * (y[1] - goal)) or x[2] - x[0] < NARROW * _size(q, float(x[1])):
                 break
@@ -124,12 +124,12 @@ def profiled(system: System, fitted: Fit, q: Quantity, step: float, goal: float 
                 break
     lowest = min(points.values(), key=lambda f: f.cost)
     joint = fit(system, (*fitted.quantities, q), lowest.values, max_iterations=4)
-    # along the profile nothing is left to gain, whatever Gauss-Newton says of the valley
+    # converged along the profile, whether or not the joint Gauss-Newton iteration is
     return replace(joint, converged=lowest.converged and joint.cost <= lowest.cost + ENOUGH)
 
 
 def _vertex(x: Array, y: Array) -> tuple[float, float]:
-    """Minimum of the parabola through three points, kept between them, and how far it lies below the middle one."""
+    """Minimum of the parabola through three points, and its depth below the middle one."""
     if not np.isfinite(y).all():
         return float(x[1]), 0.0
     a, b, _ = np.polyfit((x - x[1]) / (x[2] - x[0]), y - y[1], 2)
@@ -144,13 +144,13 @@ def _size(q: Quantity, value: float) -> float:
 
 
 def is_determined(fitted: Fit, q: Quantity) -> bool:
-    """Is this number of a shape more than an order of magnitude?"""
+    """Is this shape parameter known better than its order of magnitude?"""
     value, sigma = fitted.values[q.name], fitted.sigma(q.name)
     inside = q.lower < value < q.upper
     return inside and 0 < sigma < DETERMINED * _size(q, value)
 
 
 def expected_sigma(system: System, after: Fit, q: Quantity) -> float:
-    """Standard deviation to expect; infinite where the data do not see the number at all."""
+    """Expected standard deviation; infinite where the data do not show the quantity at all."""
     alone = Candidate(q.name, q.name, "shape", "", "", (q,))
     return float(score(Linearisation(system, after, [alone]), alone).sigma[0])

@@ -1,8 +1,8 @@
-"""How surprising a gain of chi-square is, and whether a residual is noise.
+"""Significance of a decrease of chi-square, with the trials penalty, and tests of white residuals.
 
-To first order all gains over a catalogue are lengths of projections of one vector of noise, and candidates overlap:
-fifty of them are fewer independent chances than fifty. So vectors of noise are drawn and put to the same candidates:
-the probability counts the looking, the overlap, and bounds that let an effect act one way only.
+To first order, the gains of all candidates are squared projections of one vector of noise. Candidates overlap, so there
+are fewer independent trials than candidates. The distribution of the largest gain is therefore simulated: it includes
+the number of trials, their correlation, and one-sided bounds.
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,11 +16,11 @@ from calibration.kit.arrays import Array
 from disctrack.discrepancy.score import Linearisation, Score, span
 
 TWO_SIDED = float(stats.norm.isf(0.025))  # sigmas: 95 % between both limits
-LARGE = 500.0  # chi-square beyond which its tail is taken from the asymptotic series: the probability underflows
+LARGE = 500.0  # chi-square, beyond which the tail probability underflows: asymptotic series
 
 
 def log_tail(gain: float, n: int) -> float:
-    """Logarithm of the probability with which noise gains so much by n numbers."""
+    """Logarithm of the probability that noise gains so much by n parameters."""
     if not gain > 0:
         return 0.0
     if gain < LARGE:
@@ -30,53 +30,54 @@ def log_tail(gain: float, n: int) -> float:
     return float((a - 1) * np.log(x) - x + np.log(series) - special.gammaln(a))
 
 
-def price_of_a_number(weights: Array) -> float:
-    """Chi-square that one more number has to gain, of samples with these weights (n,) (Schwarz 1978)."""
+def bic_penalty(weights: Array) -> float:
+    """BIC penalty of one more parameter, for samples with these weights (n,) (Schwarz 1978)."""
     return float(np.log(np.sum(weights)))
 
 
 def as_sigmas(gain: float, n: int) -> float:
-    """Sigmas whose two-sided probability is that of noise gaining so much by n numbers; for one, the root of the gain.
+    """Sigmas of a normal distribution with the same two-sided probability; for one parameter, the root of the gain.
 
-    No pay is taken here for having looked among many candidates: that is what thresholds are for.
+    Without a trials penalty: the thresholds include that.
     """
     return float(-special.ndtri_exp(log_tail(gain, n) - np.log(2.0))) if gain > 0 else 0.0
 
 
 def wald(amounts: Array, covariance: Array) -> float:
-    """Gain a' C^-1 a of amounts a (k,) with covariance C (k, k); what has no variance gains nothing (Wald 1943)."""
+    """Wald's statistic a' C^-1 a of amounts a (k,) with covariance C (k, k), without those of zero variance (1943)."""
     sigma = np.sqrt(np.diag(covariance))
-    safe = np.where(sigma > 0, sigma, np.inf)  # a number at its bound, or that the data do not show, tells nothing
+    safe = np.where(sigma > 0, sigma, np.inf)  # zero: at a bound, or not determined
     inverse = np.linalg.pinv(covariance / np.outer(safe, safe), rcond=1e-10, hermitian=True)
     return float((amounts / safe) @ inverse @ (amounts / safe))
 
 
 def evidence(shown: Array, along: Array, sizes: Array) -> Array:
-    """-2 log evidence (s,), but for a constant, of a normal process of these prior sizes (MacKay 1992).
+    """-2 log evidence (s,), up to a constant, of a Gaussian process with these prior sizes (s,) (MacKay 1992).
 
-    shown : (k,) singular values of what it adds to the whitened data, for size 1.   along : (k,) the residual there
+    shown : (k,) singular values of its whitened design matrix, for size 1
+    along : (k,) components of the residuals along the left singular vectors
     """
     power = (sizes[:, None] * shown) ** 2
     return np.asarray(np.sum(np.log1p(power) - along**2 * power / (1 + power), axis=1), float)
 
 
 DRAWS = 4000
-LAST = 40  # of the draws that are largest: beyond them the tail is that of one chance, times their number
+LAST = 40  # largest draws: beyond them the tail is that of a single trial times the effective number of trials
 SEED = 20261122
 
 
 @dataclass(frozen=True)
 class Chance:
-    """Of the largest gain."""
+    """Significance of the largest gain."""
 
     p_value: float  # uniform between 0 and 1 where nothing is missing
-    tests: float  # independent candidates that would have such a largest gain
+    tests: float  # effective number of independent trials
 
 
 def chance(linear: Linearisation, scores: Sequence[Score], noise: float, draws: int = DRAWS) -> Chance:
-    """Of the best of these scores, which were taken at `linear`. noise : variance over that stated.
+    """Significance of the best of these scores at `linear`.   noise : variance over that stated.
 
-    Candidates beyond a threshold have no first order and do not count.
+    Candidates with a threshold have no first-order score and do not count.
     """
     visible = [s for s in scores if s.visible and not s.candidate.threshold]
     if not visible:
@@ -89,20 +90,20 @@ def chance(linear: Linearisation, scores: Sequence[Score], noise: float, draws: 
         along = vectors @ basis
         quantities = [linear.quantities[n] for n in s.candidate.names]
         if len(quantities) == 1 and linear.values[quantities[0].name] <= quantities[0].lower:
-            along = np.maximum(along, 0.0)  # an effect that may only brake
+            along = np.maximum(along, 0.0)  # one-sided: an effect that may only brake
         tail = stats.chi2.logsf(np.sum(along**2, axis=1), len(s.candidate.names))
         np.maximum(largest, -tail, out=largest)
     return _among(observed, np.sort(largest))
 
 
 def _directions(linear: Linearisation, names: Sequence[str]) -> Array:
-    """Orthonormal (m, k) of what these can predict and the fitted quantities cannot; a single one keeps its sign."""
+    """Orthonormal (m, k) signals of these quantities, orthogonalised to the fitted ones; one alone keeps its sign."""
     seen = linear.seen(names)
     return seen / np.linalg.norm(seen) if seen.shape[1] == 1 else span(seen)
 
 
 def _among(observed: float, sorted_draws: Array) -> Chance:
-    """Share of the draws at or above what was observed; beyond the largest of them, by the tail of single chances."""
+    """Share of the draws that reach what was observed; beyond the largest of them, by the tail of single trials."""
     n = len(sorted_draws)
     last = float(sorted_draws[-min(LAST, n)])
     tests = min(LAST, n) / n * float(np.exp(last))
@@ -129,7 +130,7 @@ class Whiteness:
 
 
 def ljung_box(residual: Array, lags: int = LAGS) -> Array:
-    """Ljung and Box's statistic per channel of a residual (n, c): chi-square of `lags` degrees if it has no memory."""
+    """Ljung-Box statistic per channel of residuals (n, c): chi-square of `lags` degrees of freedom for white noise."""
     x = residual - residual.mean(axis=0)
     n = len(x)
     variance = np.sum(x * x, axis=0)
@@ -137,11 +138,11 @@ def ljung_box(residual: Array, lags: int = LAGS) -> Array:
     return np.asarray(n * (n + 2) * np.sum(rho**2 / (n - np.arange(1, lags + 1))[:, None], axis=0), float)
 
 
-def no_memory(statistic: float, n: int, lags: int = LAGS) -> float:
-    """Probability with which white noise of n samples has a statistic of Ljung and Box as large.
+def ljung_box_p_value(statistic: float, n: int, lags: int = LAGS) -> float:
+    """Probability that the Ljung-Box statistic of n samples of white noise is as large.
 
-    In short series the tail is heavier than chi-square's, whose 5e-6 is 1e-4 of 200 samples: a line in the periodogram
-    that is high by chance reaches all lags. Series of noise are drawn.
+    In short series the tail is heavier than that of chi-square (200 samples: 1e-4 where chi-square has 5e-6), as one
+    high line of the periodogram contributes to all lags. The distribution is simulated.
     """
     if n >= LONG:
         return float(stats.chi2.sf(statistic, lags))
@@ -155,19 +156,19 @@ def no_memory(statistic: float, n: int, lags: int = LAGS) -> float:
 
 @lru_cache(maxsize=8)
 def _drawn(n: int, lags: int) -> Array:
-    """Statistics of series of white noise, sorted."""
+    """Sorted statistics of simulated white noise."""
     return np.sort(ljung_box(np.random.default_rng(n).standard_normal((n, SERIES)), lags))
 
 
 def whiteness(residual: Array, rate: float, lines: Mapping[str, float], lags: int = LAGS) -> Whiteness:
-    """Ljung-Box and periodogram of a residual (n, c) sampled at `rate` [Hz]; gaps must have been taken out.
+    """Ljung-Box test and periodogram of residuals (n, c) sampled at `rate` [Hz], without gaps.
 
-    lines : frequencies [Hz] by name at which a physical effect would show
+    lines : frequencies [Hz] by name, at which a physical effect would show
     """
     n, channels = residual.shape
     lags = min(lags, max(1, n // 4))
     statistic = ljung_box(residual, lags)
-    p = min(1.0, channels * no_memory(float(statistic.max()), n, lags))
+    p = min(1.0, channels * ljung_box_p_value(float(statistic.max()), n, lags))
     frequency, power = signal.periodogram(residual, rate, detrend="constant", axis=0)
     frequency, power = frequency[1:], power[1:]
     mean = np.where(power.mean(axis=0) > 0, power.mean(axis=0), 1.0)

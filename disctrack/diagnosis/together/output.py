@@ -12,7 +12,7 @@ from disctrack.diagnosis.answer import unnamed
 from disctrack.diagnosis.pages.output import plan_json
 from disctrack.diagnosis.pages.report import planned_section
 from disctrack.discrepancy.document import declared_json, document, effect_text, significance_text, tried_table
-from disctrack.discrepancy.joint.covariates import alike
+from disctrack.discrepancy.joint.covariates import equivalent
 from disctrack.discrepancy.joint.together import Bound, Dependence, OfRecording, TogetherDiagnosis
 from disctrack.discrepancy.search import Diagnosis
 from disctrack.discrepancy.system import Quantity
@@ -70,7 +70,7 @@ def _dependence(x: Dependence) -> str:
     """The hypothesis that describes the values of the groups best; a table of the page has all hypotheses."""
     if not x.hypotheses[0].holds:
         return f"{x.quantity}: a value for each {x.by}; every hypothesis is rejected"
-    others = "".join(f"; or {h.text}: indistinguishable here" for h in alike(x.hypotheses))
+    others = "".join(f"; or {h.text}: indistinguishable here" for h in equivalent(x.hypotheses))
     return f"{x.quantity}: {x.hypotheses[0].text}{others}"
 
 
@@ -102,7 +102,7 @@ def _dependence_json(x: Dependence) -> dict[str, Any]:
 
 def _recording_json(r: OfRecording) -> dict[str, Any]:
     found: dict[str, Any] = {"name": r.name, **r.labels, "left_out": r.reason}
-    if (f := r.fits_in) is not None:
+    if (f := r.consistency) is not None:
         found |= {"chi_square_shared": f.chi_square, "difference_to_the_others": f.statistic}
         found |= {"degrees": f.degrees, "p_value": f.p_value}
     if (a := r.alone) is not None:
@@ -169,8 +169,8 @@ def _recordings(answer: TogetherDiagnosis) -> Listing:
     rows = []
     for r in answer.recordings:
         cells = ["", "", "", r.reason]
-        if r.fits_in is not None and r.alone is not None:
-            f, degrees = r.fits_in, max(r.alone.degrees_of_freedom, 1)
+        if r.consistency is not None and r.alone is not None:
+            f, degrees = r.consistency, max(r.alone.degrees_of_freedom, 1)
             cells = [rounded(chi_square / degrees, 4) for chi_square in (f.chi_square, r.alone.chi_square)]
             cells += [f"{rounded(f.statistic)} / {f.degrees} (p {probability(f.p_value)})", ""]
         rows.append([r.name, *(r.labels.get(k, "") for k in kinds), *cells])

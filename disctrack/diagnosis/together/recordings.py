@@ -125,7 +125,7 @@ class DiscMember:
             names = " or ".join(name for guess in large[1] for name in guess)
             raise AnalysisError(f"its dots show a large fault of the measurement ({names}): diagnose it alone")
 
-    def told(self) -> tuple[Mapping[str, str], Systematic, list[Array]]:
+    def summary(self) -> tuple[Mapping[str, str], Systematic, list[Array]]:
         """Labels, systematic errors, and positions of the dots in each camera [px], for `in_common`."""
         rows = evenly(np.arange(len(self.system.time)), MAX_FRAMES)
         used, places = self.system.used[rows], self.system.observed[rows]

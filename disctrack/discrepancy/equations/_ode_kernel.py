@@ -1,4 +1,4 @@
-"""Motion and its sensitivities from one set of equations: Dormand and Prince's method of order 8, dense output of 7.
+"""Integration of a motion with its sensitivities: Dormand and Prince's method of order 8, dense output of order 7.
 
 Steps follow the motion, not the sampling; between them the solution is a polynomial. Coefficients and error estimate:
 Hairer, Norsett & Wanner, Solving Ordinary Differential Equations I, sections II.5 and II.6, as SciPy's DOP853 has them.
@@ -27,34 +27,34 @@ RHS = types.void(_f, _v, _v, _v, _v, _v, _m, _m)
 RHS_TYPE = types.FunctionType(RHS)
 
 _STABLE = 6.1  # step times the fastest rate, up to which the method is stable (Hairer's code DOP853)
-_OFTEN = 15  # steps in a row at that limit, from which on it is the limit and not the error that holds them back
-_RAN_AWAY = 1e6  # times larger than all its states are: what becomes of such a motion nobody asks
+_OFTEN = 15  # consecutive steps at that limit, from which on stability and not accuracy limits them
+_RAN_AWAY = 1e6  # times the size of a state, beyond which a motion has diverged
 
-_SENSITIVITY_TOLERANCE = 1e-6  # relative to the largest so far: steps of a fit need no more
+_SENSITIVITY_TOLERANCE = 1e-6  # relative to the largest so far: enough for the steps of a fit
 
 _RADAU_C = np.array([4.0 - 6.0**0.5, 4.0 + 6.0**0.5, 10.0]) / 10.0  # nodes
-# collocation: the increments at the nodes give the coefficients of x, x^2, x^3, and its slope at the nodes is the rate
+# collocation: increments at the nodes -> coefficients of x, x^2, x^3; the slope at the nodes is the rate
 _RADAU_Q = np.linalg.inv(_RADAU_C[:, None] ** [1, 2, 3])
 _RADAU_A = np.linalg.inv(_RADAU_C[:, None] ** [0, 1, 2] * [1, 2, 3] @ _RADAU_Q)
 _RADAU_E = np.array([-13.0 - 7.0 * 6.0**0.5, -13.0 + 7.0 * 6.0**0.5, -1.0]) / 3.0
 _REAL = 3.0 + 3.0 ** (2.0 / 3.0) - 3.0 ** (1.0 / 3.0)  # real eigenvalue of A^-1
-_NEWTON = 12  # steps of Newton's method; it converges in two to four or not at all
-_STIFF_TOLERANCE = 1e-8  # of a step: the estimate is of third order, and far above the error of fifth
+_NEWTON = 12  # iterations of Newton's method; it converges in two to four or not at all
+_STIFF_TOLERANCE = 1e-8  # of a step: the estimate is of third order, far above the error of fifth order
 _CLOSE = 1e-3  # of the tolerance, to which Newton's method solves the stages
-_MILD = 2.0  # step times the fastest rate, below which the explicit method takes steps as long
+_MILD = 2.0  # step times the fastest rate, below which the explicit method can take steps of this length
 
 
 entry = njit(cache=True, error_model="numpy", nogil=True)
 
 
 class _Drive(NamedTuple):
-    """What a slope depends on beside instant and state, and room for what makes it up."""
+    """Arguments of the slope other than instant and state, and work arrays."""
 
     p: Array
     columns: Array
     knots: Array
     pieces: Array
-    piece: NDArray[np.int64]  # (1,) number of that of the inputs' which holds
+    piece: NDArray[np.int64]  # (1,) index of the current piece of the inputs
     u: Array
     u_rate: Array
     f: Array
@@ -71,7 +71,7 @@ def _drive(p, columns, n, knots, pieces):
 
 @exact_part
 def piece_at(t, knots):
-    """Index of the inputs' piece that holds at t and just after it; beyond the ends the last piece goes on."""
+    """Index of the piece of the inputs at t and just after it; beyond the ends the last piece is extrapolated."""
     return min(max(np.searchsorted(knots, t, side="right") - 1, 0), len(knots) - 2)
 
 
@@ -90,7 +90,7 @@ def inputs_at(t, i, knots, pieces, u, u_rate):
 
 @exact_part
 def _slope(t, z, out, rhs, drive):
-    """Z = (y, dy/da_1, dy/da_2, ...) one after the other -> dz/dt, with the inputs of one of their pieces."""
+    """Z = (y, dy/da_1, dy/da_2, ...) -> dz/dt, with the current piece of the inputs."""
     n, k = len(drive.f), len(drive.columns)
     inputs_at(t, drive.piece[0], drive.knots, drive.pieces, drive.u, drive.u_rate)
     rhs(t, z[:n], drive.p, drive.u, drive.u_rate, drive.f, drive.J, drive.P)
@@ -110,10 +110,10 @@ _step, _polynomial = dop853.method(_slope)
 
 @exact_part
 def _error(step, K, new, size, largest, tolerance, to_come):
-    """Largest error of a step over what is allowed, of the states and of each sensitivity; infinite without a value.
+    """Largest error of a step over its tolerance, of the states and of each sensitivity; infinite if not finite.
 
-    to_come : [s] of the motion, 0 in its first step. Of a sensitivity that sets in within the step (an overflow) no
-        error is small beside itself, however short the step; it is small beside what such a slope will have brought
+    to_come : [s] duration of the motion, 0 in its first step. A sensitivity that is zero until this step (an overflow)
+        has no size yet, to which its error could be relative: its slope times this duration is used
     """
     n, worst = len(size), 0.0
     for c in range(len(new) // n):
@@ -157,7 +157,7 @@ def _solve(M, b):
 
 @exact_part
 def _stages(rhs, t, step, z, Z, drive, F, J, P, M, left):
-    """What Newton's method has to make zero of stages z + Z (3 n, 1), with minus sign; M (3 n, 3 n) for its steps."""
+    """Negative residuals of the stage equations for stages z + Z (3 n, 1), and their Jacobian M (3 n, 3 n)."""
     n = len(drive.f)
     for s in range(3):
         at = t + _RADAU_C[s] * step
@@ -176,7 +176,7 @@ def _stages(rhs, t, step, z, Z, drive, F, J, P, M, left):
 
 @exact_part
 def _implicit_step(rhs, t, step, z, drive, slope, size, W):
-    """What each stage adds to states and sensitivities, W (3, len(z)), and the error over what is allowed.
+    """Increments of states and sensitivities at the stages, W (3, len(z)), and the error over its tolerance.
 
     slope : at (t, z), where `drive` holds its derivative by the states
     """
@@ -224,7 +224,7 @@ def _implicit_step(rhs, t, step, z, drive, slope, size, W):
 
 @exact_part
 def _along_stages(W, z, x, out):
-    """The implicit step's polynomial at the part x of it."""
+    """Collocation polynomial of the implicit step at the fraction x of it."""
     part = x * (_RADAU_Q[0] + x * (_RADAU_Q[1] + x * _RADAU_Q[2]))
     for i in range(len(z)):
         out[i] = z[i] + part[0] * W[0, i] + part[1] * W[1, i] + part[2] * W[2, i]
@@ -232,9 +232,9 @@ def _along_stages(W, z, x, out):
 
 @entry
 def integrate(rhs, z, p, columns, span, n, knots, pieces, size, tolerance, max_steps, samples, out):
-    """Fill out (m, len(z)) with the solution at samples (m,), which increase; how many steps that takes.
+    """Fill out (m, len(z)) with the solution at samples (m,), which increase; returns the number of steps.
 
-    Minus their number where it has no end.
+    Its negative where the integration fails.
 
     z : (n (1 + k),) states and their derivatives by k quantities at span[0]
     columns : (k,) index in p of each quantity; -1 for an initial state
@@ -257,11 +257,11 @@ def integrate(rhs, z, p, columns, span, n, knots, pieces, size, tolerance, max_s
         remaining = end - t
         last = remaining <= h * (1.0 + 1e-9)
         step = remaining if last else h
-        # inputs are smooth between their knots only: a step across one would be rejected more often than not
+        # inputs are smooth between their knots only: a step across a knot would mostly be rejected
         i = np.searchsorted(knots, t + 1e-12 * max(abs(t), 1.0), side="right")
         arrival = t + step
         if i < len(knots) and arrival > knots[i]:
-            arrival = knots[i]  # to the bit: on the other side of it the inputs are others
+            arrival = knots[i]  # exactly: the inputs change there
             step, last = arrival - t, False
         if step < 1e-15 * max(abs(t), 1e-3):
             return -taken
@@ -270,7 +270,7 @@ def integrate(rhs, z, p, columns, span, n, knots, pieces, size, tolerance, max_s
             _along_stages(W, z, 1.0, new)
         else:
             _step(rhs, drive, t, z, step, made)
-            # at a knot too the inputs of the piece before it hold for this step
+            # a step that ends at a knot uses the piece before it
             _slope(t + step, new, K[12], rhs, drive)
             worst, power = _error(step, K, new, size, largest, tolerance, 0.0 if first else end - span[0]), -0.125
         if not worst <= 1.0:
@@ -279,7 +279,7 @@ def integrate(rhs, z, p, columns, span, n, knots, pieces, size, tolerance, max_s
             if h < 1e-14 * (end - span[0]):
                 return -taken
             continue
-        # how fast nearby motions part or meet, from two estimates of the state at the end of the step
+        # stiffness: the fastest rate, from two estimates of the state at the end of the step
         apart, together = 0.0, 0.0
         for i in range(n):
             if abs(new[i]) > most:
@@ -291,7 +291,7 @@ def integrate(rhs, z, p, columns, span, n, knots, pieces, size, tolerance, max_s
         inside = False
         while filled < m and (samples[filled] <= t + step or last):
             x = (samples[filled] - t) / step
-            if abs(x - 1.0) <= 1e-12:  # as at every one with an input's knot
+            if abs(x - 1.0) <= 1e-12:  # as for every sample at a knot of the inputs
                 out[filled] = new
             elif stiff:
                 _along_stages(W, z, x, out[filled])
@@ -308,7 +308,7 @@ def integrate(rhs, z, p, columns, span, n, knots, pieces, size, tolerance, max_s
         if rejected:
             grow = min(1.0, grow)
         rejected = False
-        # a step cut short at a knot says nothing against the next
+        # a step shortened at a knot does not limit the next one
         h = h * grow if step >= h * 0.999 else max(h, step * grow)
         if stiff:
             _slope(t, z, K[0], rhs, drive)
@@ -344,7 +344,7 @@ def evaluate(function, times, states, p, knots, pieces, values, by_state, by_num
 
 @cache
 def prepare() -> None:
-    """Compile what Python calls for the arrays that it is called with, and for no others; or load it."""
+    """Compile the functions called from Python for these types only, or load them from the cache."""
     whole = types.int64
     wanted: tuple[tuple[Any, tuple[Any, ...]], ...] = (
         (integrate, (RHS_TYPE, _v, _v, whole[::1], _v, whole, _v, _cube, _v, _f, whole, _v, _m)),

@@ -1,4 +1,4 @@
-"""The answer of a diagnosis of equations: in words, in numbers, as JSON and as a page."""
+"""The result of a diagnosis of equations: in words, in numbers, as JSON and as a page."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from disctrack.discrepancy.document import document, effect_text, tables
 from disctrack.discrepancy.equations.declared import Equations, Run, Samples, Term, checked
 from disctrack.discrepancy.equations.forecast import Forecast, RunScore, free_run, scored
 from disctrack.discrepancy.equations.law import NAME, LearnedForce
-from disctrack.discrepancy.equations.loop import ask
+from disctrack.discrepancy.equations.loop import find_missing
 from disctrack.discrepancy.equations.system import EquationSystem, fitted_rows
 from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.search import Diagnosis, Settings, Verdict
-from disctrack.discrepancy.significance import LAGS, ljung_box, no_memory
+from disctrack.discrepancy.significance import LAGS, ljung_box, ljung_box_p_value
 from disctrack.discrepancy.system import Candidate, System
 from disctrack.errors import OutputError
 from disctrack.files.json_text import json_file, plain
@@ -34,18 +34,18 @@ from disctrack.report.terminal import full
 if TYPE_CHECKING:
     from disctrack.report.figures import Drawn
 
-OUTLIER, FEW = 8.0, 0.02  # standard deviations that no noise reaches; share of the samples, above which it is the noise
+OUTLIER, FEW = 8.0, 0.02  # standard deviations of an outlier; share of the samples, above which it is the noise
 ODD = 2.0  # rms over the median of all runs, above which one is odd
-FAR_OFF = 10.0  # sigmas or times, by which a number has left what was declared of it
+FAR_OFF = 10.0  # sigmas, or factor, by which a fitted parameter differs from its declared value
 
 
 @dataclass(frozen=True)
 class ChannelErrors:
-    """What a model leaves of one channel, in its own unit."""
+    """Errors of a model in one channel, in its own unit."""
 
-    rms: float  # over all that was fitted
-    held_out: float  # free run over the last part of every stretch, from a fit to the first
-    noise: float  # as found in what the model leaves
+    rms: float  # of the residuals of all samples
+    held_out: float  # rms prediction error of the held-out samples
+    noise: float  # sigma of the noise, estimated from the residuals
 
 
 @one_blas_thread
@@ -53,27 +53,27 @@ def diagnose(
     equations: Equations, runs: Run | Sequence[Run], terms: Sequence[Term] | None = None, *,
     settings: Settings | None = None,
 ) -> Answer:  # fmt: skip
-    """Fit the equations to the runs and look for what they lack.
+    """Fit the equations to the runs and search for what they lack.
 
-    runs : they share all parameters, but for those declared `per` run or group; initial states are each one's own
-    terms : what may be missing; the usual terms (`terms.usual`), if none are given
-    settings : how hard to look, and how sure to be
+    runs : they share all parameters, except those declared `per` run or group; each has its own initial state
+    terms : candidates; by default the usual terms (`terms.usual`)
+    settings : extent of the search, and its significance level
     Raises AnalysisError, which says what was found and what to do.
     """
-    return Answer(equations, *ask(equations, [runs] if isinstance(runs, Run) else list(runs), terms, settings))
+    return Answer(equations, *find_missing(equations, [runs] if isinstance(runs, Run) else list(runs), terms, settings))
 
 
 @dataclass(frozen=True)
 class Answer:
-    """What is missing, how much of it, and how sure that is."""
+    """Missing terms, with sizes and significance."""
 
     equations: Equations
-    diagnosis: Diagnosis  # the engine's answer
-    system: EquationSystem  # data and model in the stretches that were judged
-    judged: System  # the same with its noise as judged
-    remembers: bool  # is that noise with a memory?
-    remarks: tuple[str, ...]  # on the way to the answer
-    law: LearnedForce | None  # of one variable, that no term names, with its course; None where none describes the data
+    diagnosis: Diagnosis  # result of the search
+    system: EquationSystem  # data and model, in the stretches that were fitted
+    judged: System  # the same with its noise as estimated
+    autocorrelated: bool  # is that noise autocorrelated?
+    remarks: tuple[str, ...]  # of the search
+    law: LearnedForce | None  # a learned law; None where none describes the data
 
     @property
     def verdict(self) -> Verdict:
@@ -82,12 +82,12 @@ class Answer:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Remarks on the data and on what they do not tell."""
-        about = self._what_helps_most() + self._of_a_law() + self._unlike_declared() + self._not_white()
-        return (*self.remarks, *about, *self._far_off())
+        """Remarks on the data and on what they do not determine."""
+        about = self._nearest_notes() + self._law_notes() + self._departure_notes() + self._whiteness_notes()
+        return (*self.remarks, *about, *self._outlier_notes())
 
-    def _of_a_law(self) -> list[str]:
-        """What describes the data as well as the law that is named; or the law, where it is not."""
+    def _law_notes(self) -> list[str]:
+        """Alternatives to the learned law, where it is reported; else the law as an alternative."""
         law = self.law
         if law is None:
             return []
@@ -100,33 +100,33 @@ class Answer:
         if not law.is_shorter:
             notes.append(f"one law describes the data in place of {known} ({longer}): {text}")
         elif not named:
-            notes.append(f"nearer to the data than {known} comes one law, though not to the noise: {text}")
+            notes.append(f"one law comes nearer to the data than {known}, but its residuals are not noise: {text}")
         elif known:
             notes.append(f"of known terms {known} come nearest (the law: {longer})")
         if law.held and named:
-            notes.append(f"{' and '.join(law.held)} acts as a part of the law, and says nothing by itself")
+            notes.append(f"{' and '.join(law.held)} is a part of the law, and has no meaning by itself")
         if law.along.of_time:
             notes.append("a force that depends on time alone describes any motion, and is never what is missing")
-        if law.alike:
-            others = " or ".join(a.title for a in law.alike)
-            notes.append(f"these data cannot tell the law from {others}")
+        if law.equivalent:
+            others = " or ".join(a.title for a in law.equivalent)
+            notes.append(f"these data do not distinguish the law from {others}")
         return notes
 
-    def _what_helps_most(self) -> list[str]:
-        """Where no term is named: those that gain most, and what they leave."""
-        nearest, told = self.diagnosis.nearest, []
+    def _nearest_notes(self) -> list[str]:
+        """Where no term is found: those that gain most, and their residuals."""
+        nearest, helpful = self.diagnosis.nearest, []
         if nearest is None:
             return []
         for c in nearest.candidates:
             numbers = ((q.part, self.nearest.get(q.name, q.null)) for q in (*c.quantities, *c.shape))
             sizes = ", ".join(f"{name} = {value:.4g}" for name, value in numbers)
-            told.append(self._law_text(c) or f"{c.title} [{c.name}] ({sizes})")
+            helpful.append(self._law_text(c) or f"{c.title} [{c.name}] ({sizes})")
         left = self._errors(nearest.fit, None)
         sizes = ", ".join(f"{e.rms:.3g} of {self.before[c].rms:.3g} {self._unit(c)} of {c}" for c, e in left.items())
-        return [f"{' and '.join(told)} would help most and still leave {sizes}".replace(" 1 of", " of")]
+        return [f"{' and '.join(helpful)} would help most and still leave {sizes}".replace(" 1 of", " of")]
 
-    def _unlike_declared(self) -> list[str]:
-        """Numbers that have left what was declared of them: a wrong sign or unit makes up for itself so."""
+    def _departure_notes(self) -> list[str]:
+        """Fitted parameters far from their declared values, as by a wrong sign or unit."""
         notes, fitted = [], self.diagnosis.after
         for q in fitted.quantities:
             value, declared = fitted.values[q.name], q.null if np.isfinite(q.prior_sigma) else q.declared
@@ -136,35 +136,34 @@ class Answer:
             if (away := abs(value - declared) / q.prior_sigma) > FAR_OFF:
                 notes.append(f"{text}: {away:.0f} of its sigmas off")
             elif declared * value < 0 and abs(value) > FAR_OFF * self.sigmas[q.name]:
-                notes.append(f"{text}: its sign is another; look at the signs of the equations")
+                notes.append(f"{text}: its sign is another; check the signs of the equations")
             elif abs(value) > FAR_OFF * abs(declared) > 0 or abs(declared) > FAR_OFF * abs(value) > 0:
-                notes.append(f"{text}: its size is another; look at the units")
+                notes.append(f"{text}: another order of magnitude; check the units")
         return notes
 
     def _law_text(self, c: Candidate) -> str:
-        """The course of the law that was learned, if the candidate is that; else nothing."""
+        """The course of the learned law, if this is its candidate; else empty."""
         if self.law is None or c.name != self.law.candidate.name:
             return ""
         return self.law.text(self.equations.units)
 
     @property
     def nearest(self) -> dict[str, float]:
-        """All fitted numbers with the terms that help most, where they leave too much to be named; else empty."""
+        """All fitted parameters with the terms that help most, where their residuals are too large; else empty."""
         nearest = self.diagnosis.nearest
         return {n: nearest.fit.values[n] for n in nearest.fit.names} if nearest else {}
 
-    def _not_white(self) -> list[str]:
-        """Where what is left is called noise by its size: is it so by its memory?"""
+    def _whiteness_notes(self) -> list[str]:
+        """Residuals that are as small as noise, but not white."""
         if self.verdict == "unexplained" or not self.whiteness < self.diagnosis.settings.false_alarm:
             return []
-        chance = f"noise has so much with a probability of {self.whiteness:.1g}"
         return [
-            f"what is left is as large as the noise but has a memory ({chance}): something smaller is missing besides, "
-            "or the noise changes with time"
+            f"residuals are as small as the noise but autocorrelated (white noise: p = {self.whiteness:.1g}): "
+            "something smaller is missing, too, or the noise changes with time"
         ]
 
-    def _odd_runs(self) -> list[str]:
-        """Runs that leave far more than the others do: one of them alone may be what no term describes."""
+    def _odd_run_notes(self) -> list[str]:
+        """Runs with much larger residuals than the others."""
         stretches = self.system.stretches
         if any(s.stretch for s in stretches) or self.diagnosis.held_out_before is None:
             return []
@@ -178,11 +177,11 @@ class Answer:
         if not worst:
             return []
         some = ", ".join(worst[:4]) + (", ..." if len(worst) > 4 else "")
-        return [f"what is left is far more than in the other runs in {some}: look at what was different there"]
+        return [f"residuals are far larger than in the other runs in {some}: look at what was different there"]
 
-    def _far_off(self) -> list[str]:
-        """Single samples that what is left of all others does not reach: they make noise and sigmas too large."""
-        notes = self._odd_runs()
+    def _outlier_notes(self) -> list[str]:
+        """Odd runs, and single outliers, which make noise and sigmas too large."""
+        notes = self._odd_run_notes()
         if self.verdict == "unexplained":
             return notes
         predicted = self.predicted(self.diagnosis.after)
@@ -201,22 +200,22 @@ class Answer:
 
     @property
     def found(self) -> tuple[str, ...]:
-        """Names of the terms that are missing."""
+        """Names of the missing terms."""
         return tuple(f.candidate.name for f in self.diagnosis.found)
 
     @property
     def values(self) -> dict[str, float]:
-        """All fitted numbers of the enlarged model."""
+        """All fitted parameters of the extended model."""
         return {name: self.diagnosis.after.values[name] for name in self.diagnosis.after.names}
 
     @property
     def sigmas(self) -> dict[str, float]:
-        """Their standard deviations; zero for one that stands at a bound."""
+        """Their standard deviations."""
         return {name: self.diagnosis.after.sigma(name) for name in self.diagnosis.after.names}
 
     @cached_property
     def before(self) -> dict[str, ChannelErrors]:
-        """Errors by channel of the equations as declared."""
+        """Errors by channel of the equations as declared (and fitted)."""
         return self._errors(self.diagnosis.before, self.diagnosis.held_out_before)
 
     @cached_property
@@ -225,18 +224,18 @@ class Answer:
         return self._errors(self.diagnosis.after, self.diagnosis.held_out_after)
 
     def predicted(self, fit: Fit) -> list[tuple[Samples, Array]]:
-        """Every stretch with what its sensors should show (n, w); NaN where the motion cannot be followed."""
+        """Every stretch with its predicted sensor values (n, w); NaN where the motion cannot be integrated."""
         stretches = zip(self.system.stretches, self.system.predictions(fit.values), strict=True)
         return [(s, np.full(s.data.shape, np.nan) if p is None else p.seen) for s, p in stretches]
 
     def forecast(self, run: Run, *, window: float = 0.0, by: str = "after") -> Forecast:
-        """A free run of the model: what the sensors should show at the instants of a run, with a band.
+        """A free run of the model: predicted sensor values at the instants of a run, with sigmas.
 
-        A run of the same name as one that was fitted begins in that one's fitted state, and may be longer; another
-        begins as its `start` and `known` say. Its data are not looked at, but for their channels' names.
-        window : [s] from the first sample: data to which the initial state is fitted, those and no others
-        by : "after": with what was found, or, where nothing is, with the terms that help most; "before": the equations
-        as declared (and fitted)
+        A run of the same name as a fitted one starts from that one's fitted state, and may be longer; another starts
+        from its `start` and `known`. Its data are not used, except the names of their channels.
+        window : [s] from the first sample: the initial state is fitted to these data only
+        by : "after": with what was found, or else with the terms that help most; "before": the equations as declared
+        (and fitted)
         """
         d = self.diagnosis
         fitted, errors = (d.before, self.before) if by == "before" else (d.after, self.after)
@@ -267,14 +266,14 @@ class Answer:
             free = [(s.data - seen)[~fitted_rows(s)] for s, seen in self.predicted(held.train)]
             ahead = np.sqrt(np.nanmean(np.concatenate(free) ** 2, axis=0))
         noise = np.sqrt(np.nanmean(np.concatenate([s.sigma**2 for s in self.system.stretches]), axis=0))
-        if not self.remembers:  # the fast part of the data holds some of the motion, that of the residual less
+        if not self.autocorrelated:  # as estimated from the residuals, which contain less of the motion than the data
             noise = noise * np.sqrt(self.diagnosis.noise)
         both = zip(names, rms, ahead, noise, strict=True)
         return {name: ChannelErrors(float(r), float(a), float(n)) for name, r, a, n in both}
 
     @cached_property
     def whiteness(self) -> float:
-        """Probability that white noise remembers as much as what is left (Ljung and Box, every channel and stretch)."""
+        """Probability of such an autocorrelation in white noise (Ljung-Box, smallest of all channels and stretches)."""
         residual, _ = self.judged.linearise(self.diagnosis.after.values, [])
         p_values = []
         for rows, s in zip(self.system.rows, self.system.stretches, strict=True):
@@ -282,17 +281,17 @@ class Answer:
                 x = residual[rows, c][np.isfinite(s.data[:, c])]
                 lags = min(LAGS, len(x) // 4)
                 if lags:
-                    p_values.append(no_memory(float(ljung_box(x[:, None], lags)[0]), len(x), lags))
+                    p_values.append(ljung_box_p_value(float(ljung_box(x[:, None], lags)[0]), len(x), lags))
         return min(1.0, min(p_values) * len(p_values)) if p_values else float("nan")
 
     @property
     def sentence(self) -> str:
-        """The answer in plain words."""
+        """The result in words."""
         d = self.diagnosis
         if d.held_out_before is None:
             loose = [n for n, v in self.values.items() if "." not in n and not self.sigmas[n] < abs(v)]
             open_ = f" {', '.join(loose)} cannot be determined: declare a value or bounds." if loose else ""
-            return f"No answer: {d.reason}.{open_} Values from which to begin nearer to the truth may help."
+            return f"No answer: {d.reason}.{open_} Initial values nearer to the truth may help."
         level = ", ".join(
             f"{e.rms:.3g} {self._unit(c)} of {c} (noise {e.noise:.3g})".replace(" 1 of", " of")
             for c, e in self.after.items()
@@ -303,7 +302,7 @@ class Answer:
         if d.verdict == "found":
             return f"Missing: {effects}. With {'it' if len(d.found) == 1 else 'them'} the equations leave {level}."
         if effects:
-            return f"Something is missing that no term describes; nearest comes {effects}, which leaves {level}."
+            return f"Something is missing that no term describes; the nearest is {effects}, which leaves {level}."
         return f"Something is missing that no term describes: the equations leave {level}."
 
     def _unit(self, name: str) -> str:
@@ -314,7 +313,7 @@ class Answer:
         return "\n".join(full(self.report()))
 
     def report(self, drawn: Sequence[Drawn] = ()) -> Report:
-        """The whole self, for every writer."""
+        """The report, for every writer."""
         equations = [f"d{k}/dt = {v}" for k, v in self.equations.rates.items()]
         return Report(
             f"{self.equations.name}: what is missing?",
@@ -360,7 +359,8 @@ def _before_after(answer: Answer) -> Listing:
         b, a = answer.before[c], answer.after[c]
         unit = answer.equations.units.get(c, "1")
         rows.append((in_unit(f"rms of {c}", unit), *(rounded(x, 4) for x in (b.rms, a.rms, a.noise))))
-        rows.append((in_unit(f"free run of {c}, held out", unit), rounded(b.held_out, 4), rounded(a.held_out, 4), ""))
-    memory = f"p {probability(answer.whiteness)}"
-    rows.append(("Ljung-Box: probability of this autocorrelation in white noise", "", memory, ""))
+        named = in_unit(f"prediction error of {c}, held out", unit)
+        rows.append((named, rounded(b.held_out, 4), rounded(a.held_out, 4), ""))
+    white = f"p {probability(answer.whiteness)}"
+    rows.append(("Ljung-Box: probability of this autocorrelation in white noise", "", white, ""))
     return Listing(("", "before", "after", "noise"), rows)

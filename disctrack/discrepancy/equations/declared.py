@@ -1,4 +1,4 @@
-"""What a user declares: equations of motion, terms that they may lack, and runs of an experiment."""
+"""Declarations of the user: equations of motion, candidate terms, and runs of an experiment."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from disctrack.errors import AnalysisError, told_as
 
 @dataclass(frozen=True)
 class Parameter:
-    """A number of the model that a fit may move; SI or any units that belong together."""
+    """A parameter of the model; in SI or any consistent units."""
 
-    value: float  # where the fit starts; of a term: its value while the effect is absent
+    value: float  # initial guess of the fit; of a term: its value while the effect is absent
     unit: str = "1"
-    sigma: float = np.inf  # standard deviation to which it is known beforehand; infinite: not at all
+    sigma: float = np.inf  # standard deviation of a normal prior; infinite: no prior
     lower: float = -np.inf
     upper: float = np.inf
-    per: str = ""  # "run": each run has one of its own; a key of the runs' `groups`: each group has
-    typical: float | None = None  # of a term: size that would surprise nobody; None: a tenth of the motion's own forces
-    shape: bool = False  # of a term's law (an exponent, a scale): held at `value` until the term is found
-    along: str = ""  # of a shape: a formula whose values along the motion are tried for it (a limit, a speed)
+    per: str = ""  # "run": each run has a value of its own; a key of the runs' `groups`: each group has
+    typical: float | None = None  # of a term: its typical size; None: a tenth of the rms of its equation
+    shape: bool = False  # of a term: a shape parameter (an exponent, a scale), held at `value` until the term is found
+    along: str = ""  # of a shape: a formula whose values along the motion are initial guesses (a limit, a speed)
     meaning: str = ""
 
     def __post_init__(self) -> None:
@@ -41,18 +41,18 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Term:
-    """Something that the equations, or the picture that sensors give of them, may lack.
+    """A candidate term: something that the equations, or the models of the sensors, may lack.
 
-    Its formulas are added to what is declared; its parameters' own values (0, if not said) are those of its absence.
-    A parameter k may be written own_k in its formulas; a plain k there then is that of the equations.
+    Its formulas are added to the declared ones; the values of its parameters (0 by default) are those of its absence.
+    A parameter k may be written own_k in its formulas; then a plain k is the parameter of the equations.
     """
 
     name: str
     rates: Mapping[str, Formula] = field(default_factory=dict)  # by state: added to its equation
     observed: Mapping[str, Formula] = field(default_factory=dict)  # by channel: added to what the sensor shows
-    clock: Formula = 0.0  # added to the time that is written beside a sample, a formula in t
-    lag: Mapping[str, Formula] = field(default_factory=dict)  # by channel: how late the sensor is [s]
-    # by a name that stands in the rates: an input, and how much earlier it is taken [s]
+    clock: Formula = 0.0  # added to the recorded time of a sample, a formula in t
+    lag: Mapping[str, Formula] = field(default_factory=dict)  # by channel: lag of the sensor [s]
+    # by a name used in the rates: an input, and its delay [s]
     delayed: Mapping[str, tuple[str, Formula]] = field(default_factory=dict)
     parameters: Mapping[str, float | Parameter] = field(default_factory=dict)
     title: str = ""
@@ -61,14 +61,14 @@ class Term:
 
 @dataclass(frozen=True)
 class Equations:
-    """First-order differential equations, what is observed of them, and the numbers in them.
+    """First-order differential equations, their parameters, and the models of the sensors.
 
-    rates : by state, its derivative in time; with `mass`, the right-hand side of M(y) dy/dt = rates
+    rates : by state, its time derivative; with `mass`, the right-hand side of M(y) dy/dt = rates
     parameters : value, or Parameter; all are fitted
-    constants : numbers that no fit moves; a run may have its own
-    inputs : signals that are measured along and drive the motion; `u_rate` is the derivative of `u`
-    observed : by channel of the data, what its sensor shows; states of the same name, if not said
-    mass : entries of M by pairs of states (the matrix is symmetric, 1 on the diagonal and else 0 where not said)
+    constants : are not fitted; a run may have its own
+    inputs : measured signals that drive the motion; `u_rate` is the derivative of `u`
+    observed : by channel of the data, what its sensor shows; by default the state of the same name
+    mass : entries of M by pairs of states (symmetric; by default 1 on the diagonal and else 0)
     """
 
     rates: Mapping[str, Formula]
@@ -116,20 +116,20 @@ class Run:
 
     time : (n,) [s], increasing, not necessarily even
     data : (n,) by channel; NaN where a sample is missing
-    sigma : standard deviation of the noise by channel, a number or (n,); a channel that is not named, or None: found
-            from the data's fast part
+    sigma : standard deviation of the noise by channel, a number or (n,); None, or a channel that is not named:
+            estimated from differences of the data
     inputs : (m,) by input, without gaps
     input_time : (m,) [s] instants of the inputs, on the clock of `time` and from its first sample to its last; None:
             those of the samples
     constants : those that differ from the declared ones in this run
-    start : states at the first sample from which the fit begins, where the guess from the data is not wanted
+    start : initial guess of the states at the first sample, in place of an estimate from the data
     known : states at the first sample that are known: value, or (value, sigma)
-    hold : how inputs go on between their instants: "smooth" (cubic), "linear", or "hold" (a step at each)
-    groups : what the run belongs to, by kind of group: {"ball": "golf"}; a `Parameter(per="ball")` is one of each ball
-    noise : noise that remembers, of every channel, in place of sigma
-    fit_until : [s] since the first sample; what comes later judges what is fitted to the rest (0.65 of the run). 0: all
-            of it judges, by what no start of its own can explain
-    at_rest : True where nothing moved before the first sample: a sensor that lags then shows what it shows there
+    hold : interpolation of the inputs: "smooth" (cubic), "linear", or "hold" (zero-order hold)
+    groups : what the run belongs to, by kind of group: {"ball": "golf"}; each ball has its own `Parameter(per="ball")`
+    noise : autocorrelated noise of every channel, in place of sigma
+    fit_until : [s] since the first sample; later samples are held out (by default those after 0.65 of the run). 0: all
+            of them are held out, and only what no initial state can explain is judged
+    at_rest : True where nothing moved before the first sample: then a sensor with a lag shows its first value
     """
 
     time: ArrayLike
@@ -150,7 +150,7 @@ class Run:
     def thinned(self, every: int) -> Run:
         """One sample in `every`, with the inputs averaged over a quarter of the time between two of these.
 
-        A sample of a force in place of its mean would drive another motion.
+        Without averaging, the input would be aliased.
         """
         time = np.asarray(self.time if self.input_time is None else self.input_time, float)
         own = len(time) / len(np.asarray(self.time))
@@ -177,15 +177,15 @@ class Run:
 
 @dataclass(frozen=True)
 class Samples:
-    """A run that has been checked, or a stretch of one: plain arrays."""
+    """A checked run, or a stretch of one, as plain arrays."""
 
     run: str
-    stretch: int  # sample of its run with which it begins
+    stretch: int  # index of its first sample in the run
     time: Array  # (n,) [s] since the run's first sample
     data: Array  # (n, w) NaN where missing
     sigma: Array  # (n, w)
     knots: Array  # (m,) [s] of the inputs
-    pieces: Array  # (c, 5, m - 1) cubics, highest power first, and what is added to their slope
+    pieces: Array  # (c, 5, m - 1) cubics, highest power first, and a further slope (of a step)
     constants: Mapping[str, float]
     start: Mapping[str, float]
     known: Mapping[str, tuple[float, float]]
@@ -196,11 +196,11 @@ class Samples:
 
     @property
     def name(self) -> str:
-        """Run, and the sample with which it begins, where that is not the first: whatever its length."""
+        """Run, and the number of its first sample if that is not 1; whatever its length."""
         return self.run if self.stretch == 0 else f"{self.run}#{self.stretch + 1}"
 
     def part(self, first: int, last: int) -> Samples:
-        """Samples first <= i < last as a stretch with a start of its own."""
+        """Samples first <= i < last as a stretch with an initial state of its own."""
         rows = slice(first, last)
         own = first == 0
         return replace(
@@ -302,7 +302,7 @@ def _inputs(equations: Equations, run: Run, name: str, time: Array) -> tuple[Arr
         pieces[:, 2] = np.diff(values, axis=1) / np.diff(time)
         return time, pieces
     changes = np.flatnonzero(np.any(np.diff(pieces[:, 3], axis=1) != 0, axis=0)) + 1
-    # the rate of a step is spread over the sample that it begins: what it moves has felt all of it by then
+    # the derivative of a step is spread over the interval that it starts
     pieces[:, 4, changes] = (np.diff(pieces[:, 3], axis=1) / np.diff(time)[1:])[:, changes - 1]
     kept = np.unique(np.concatenate([[0], changes, changes + 1]))
     kept = kept[kept < len(time) - 1]

@@ -1,4 +1,4 @@
-"""Formulas as text or SymPy expressions, with names checked, and made smooth where they jump."""
+"""Formulas as text or SymPy expressions: parsed, with names checked, and smoothed where they jump."""
 
 import ast
 import difflib
@@ -50,7 +50,7 @@ def parsed(formula: Formula, symbols: Mapping[str, sympy.Symbol], what: str) -> 
             shown = formula if len(formula) < 200 else f"{formula[:200]} ..."
             raise AnalysisError(f"{what}: cannot read {shown!r} ({error}). Write it as in '-k*x - c*v**2'.") from error
     else:
-        # a user's own symbols are meant by their names
+        # symbols of the user are identified by their names
         found = sympy.sympify(formula, strict=True)
         found = found.xreplace({s: symbols[s.name] for s in found.free_symbols if s.name in symbols})
     unknown = sorted(s.name for s in found.free_symbols - set(symbols.values()))
@@ -61,7 +61,7 @@ def parsed(formula: Formula, symbols: Mapping[str, sympy.Symbol], what: str) -> 
 
 
 def unknown_name(name: str, known: Iterable[str]) -> str:
-    """'foo is not known', and the nearest name that is."""
+    """'foo is not known', and the nearest known name."""
     names = list(dict.fromkeys(known))
     near = difflib.get_close_matches(name, names, 1)
     hint = f"did you mean {near[0]!r}?" if near else f"known are {', '.join(names)}."
@@ -78,7 +78,7 @@ def _read(text: str, names: Mapping[str, Any]) -> Any:
 
 
 def _value(node: ast.expr, names: Mapping[str, Any]) -> Any:
-    """An expression by the kinds of syntax that formulas need; nothing else is ever evaluated."""
+    """Value of a syntax tree; only the syntax that formulas need is ever evaluated."""
     match node:
         case ast.Constant(value=bool() | int() | float() as value):
             return sympy.sympify(value)
@@ -87,7 +87,7 @@ def _value(node: ast.expr, names: Mapping[str, Any]) -> Any:
                 raise NameError(name=name)
             return names[name]
         case ast.BinOp(op=ast.Add() | ast.Sub()):
-            terms: list[Any] = []  # on one level, however many
+            terms: list[Any] = []  # without recursion: a sum may be long
             inner: ast.expr = node
             while isinstance(inner, ast.BinOp) and isinstance(inner.op, ast.Add | ast.Sub):
                 right = _value(inner.right, names)
@@ -120,12 +120,12 @@ def _power(base: Any, exponent: Any) -> Any:
 def smooth(
     expression: sympy.Expr, widths: dict[sympy.Expr, sympy.Symbol], moving: AbstractSet[sympy.Symbol] = frozenset()
 ) -> sympy.Expr:
-    """The expression with jumps made steep but smooth: sign(a) -> tanh(a / w), a step likewise.
+    """The expression with jumps smoothed: sign(a) -> tanh(a / w), and steps likewise.
 
-    A root of a sum of squares that all move has no slope where they vanish at once: sqrt(a) -> sqrt(a + w^2).
+    A root of a sum of squares of states has no derivative at zero: sqrt(a) -> sqrt(a + w^2).
 
-    A motion that crosses a jump has sensitivities that jump too; with a width they are those of the equations as they
-    are solved. `widths` gets a symbol for every argument that has none yet.
+    With a finite width, the sensitivities of a motion that crosses a jump are continuous and consistent with the
+    solution. `widths` gets a symbol for every new argument.
     """
 
     def width(argument: sympy.Expr) -> sympy.Symbol:
@@ -143,13 +143,13 @@ def smooth(
 
 
 def _vanishes(squares: sympy.Expr, moving: AbstractSet[sympy.Symbol]) -> bool:
-    """Is it a sum of squares of which none need stay?"""
+    """Is it a sum of squares that may all vanish?"""
     return bool(squares.is_nonnegative) and all(term.free_symbols & moving for term in squares.args)
 
 
 def source_of(name: str, inputs: Sequence[sympy.Symbol | tuple[str, Sequence[sympy.Symbol]]],
               outputs: Sequence[tuple[str, sympy.Expr]], zeroed: Sequence[str]) -> str:  # fmt: skip
-    """A Python function that numba compiles: scalars and arrays of symbols in, entries of arrays out."""
+    """Source of a function for numba: scalars and arrays of symbols in, entries of arrays out."""
     used = set().union(*(e.free_symbols for _, e in outputs)) if outputs else set()
     arguments, lines = [], []
     for given in inputs:

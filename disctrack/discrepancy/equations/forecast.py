@@ -1,4 +1,4 @@
-"""Free runs of a fitted model over runs that it has not seen: what their sensors should show, and how sure that is."""
+"""Free runs of a fitted model over further runs: predicted sensor values with their uncertainty."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -6,22 +6,22 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calibration.kit.arrays import Array
+from disctrack.discrepancy.equations import shooting
 from disctrack.discrepancy.equations.declared import Samples
-from disctrack.discrepancy.equations.start import guessed
 from disctrack.discrepancy.equations.system import EquationSystem
 from disctrack.discrepancy.fit import Fit, fit
 from disctrack.discrepancy.significance import TWO_SIDED
 
-OF_SIZE = 1e4  # scales of a state make up ten times its size: farther off is no guess from few samples
+OF_SIZE = 1e4  # prior sigma over the scale of a state: ten times its size
 
 
 @dataclass(frozen=True)
 class Forecast:
-    """What the sensors should show at the instants of a run, by channel; NaN where the motion cannot be followed."""
+    """Predicted sensor values at the instants of a run, by channel; NaN where the motion cannot be integrated."""
 
     time: Array  # (n,) [s] since the first sample
     values: Mapping[str, Array]  # (n,)
-    sigmas: Mapping[str, Array]  # (n,) of a sample: numbers, initial state, and what the model leaves
+    sigmas: Mapping[str, Array]  # (n,) of a sample: by parameters, initial state, and residuals of the fit
 
     def __getitem__(self, channel: str) -> Array:
         """Values of a channel (n,)."""
@@ -38,11 +38,11 @@ class RunScore:
 
 
 def free_run(system: EquationSystem, fitted: Fit, samples: Samples, left: Array, window: float) -> Forecast:
-    """Run the model from the fitted numbers.
+    """Integrate the model with the fitted parameters.
 
     system : with formulas and sizes; its stretches are not used
-    left : (w,) what the model leaves of each channel
-    window : [s] of the run to which its initial state is fitted; 0: it begins as the fit or the run says
+    left : (w,) rms of the residuals of each channel
+    window : [s] of the run to which its initial state is fitted; 0: it starts from the state of the fit or the run
     """
     alone = replace(system, stretches=[replace(samples, sigma=np.broadcast_to(left, samples.data.shape))])
     values, states = dict(fitted.values), [q for q in alone.base if q.is_initial]
@@ -53,7 +53,7 @@ def free_run(system: EquationSystem, fitted: Fit, samples: Samples, left: Array,
     if by_state:
         n = int(np.searchsorted(samples.time, window, side="right"))
         begin = replace(alone, stretches=[alone.stretches[0].part(0, n)])
-        begun = guessed(begin)[0]
+        begun = shooting.initial_guess(begin)[0]
         loose = [
             replace(q, null=begun[q.name], prior_sigma=OF_SIZE * q.scale) if np.isinf(q.prior_sigma) else q
             for q in states

@@ -1,4 +1,4 @@
-"""Declared equations and terms, differentiated and compiled: motion, sensors and clock as functions of numbers."""
+"""Declared equations and terms, differentiated and compiled: rates, sensors and clock as functions of parameters."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -16,14 +16,14 @@ from disctrack.discrepancy.equations.declared import Equations, Parameter, Sampl
 from disctrack.discrepancy.equations.expressions import Formula, checked_name, parsed, smooth, source_of, unknown_name
 from disctrack.errors import AnalysisError
 
-OWN = "own_"  # before the name of a term's parameter, in its formulas: not the equations' of that name
+OWN = "own_"  # prefix of a term's parameters in its formulas, where the equations use the same name
 
 
 _t = sympy.Symbol("t", real=True)
 
 
 class Formulas:
-    """Symbols of everything, with all terms added; compiled when first asked for.
+    """Symbolic equations with all terms added; compiled at first use.
 
     Numbers come in one array p: parameters of the model, of the terms, constants, widths of jumps.
     """
@@ -36,24 +36,24 @@ class Formulas:
         self.constants, own = _symbols(equations.constants), _symbols(equations.parameters)
         self.states, self.inputs = tuple(states.values()), tuple(inputs.values())
         self.input_rates = tuple(input_rates.values())
-        # numbers that a fit may move, by name of the quantity: symbol, what was declared, and the term whose it is
+        # parameters, by name of the quantity: symbol, declaration, and the term to which it belongs
         self.fitted, self.owner = dict(own), dict.fromkeys(own, "")
         self.declared = {name: _parameter(p) for name, p in equations.parameters.items()}
         still = {"t": _t, **input_rates, **self.constants, **own}
-        self._numbers = {**self.constants, **own}  # of what does not move
+        self._numbers = {**self.constants, **own}  # symbols that do not depend on time
         self._still, self._words = still, {**still, **states, **inputs}
-        # as declared: without terms, and not yet divided by the masses
+        # as declared: without terms, and not divided by the masses
         self.forces = tuple(parsed(f, self._words, f"equation of {name}") for name, f in equations.rates.items())
         masses = {pair: parsed(f, self._words, f"mass {pair}") for pair, f in equations.mass.items()}
         self.masses = tuple(masses.values())
         self._rates = dict(zip(states, self.forces, strict=True))
         self._seen = {c: parsed(f, self._words, f"observed {c}") for c, f in channels.items()}
-        # a term of a sensor may name the channel itself: what it shows as declared. A state of that name comes first
+        # a term of a sensor may use the channel's name for its declared formula, unless a state has that name
         self._shown = {symbol: self._seen[c] for c, symbol in _symbols(channels).items() if c not in self._words}
-        # by channel: true instant minus the time beside the sample, in t and numbers
+        # by channel: true minus recorded instant, in t and parameters
         self._late = dict.fromkeys(channels, sympy.Integer(0))
-        self.along: dict[str, sympy.Expr] = {}  # by name of a shape: values along the motion that are tried for it
-        # the last of the inputs: which of the first each is, how late [s]
+        self.along: dict[str, sympy.Expr] = {}  # by name of a shape: formula of its initial guesses along the motion
+        # the delayed inputs, which follow the others: index of the input, and delay [s]
         self.late_inputs: list[tuple[int, sympy.Expr]] = []
         for number, term in enumerate(terms, start=1):
             if term.name in {t.name for t in terms[: number - 1]} or "[" in term.name or "." in term.name:
@@ -67,7 +67,7 @@ class Formulas:
         self.observed = tuple(smooth(e, self.widths, moving) for e in self._seen.values())
 
     def _add(self, term: Term, prefix: str) -> None:
-        """Add a term's formulas to rates, sensors and clocks; its own numbers get symbols with the prefix."""
+        """Add a term's formulas to rates, sensors and clocks; symbols of its parameters have the prefix."""
         here, mine = f"term {term.name}", {name: _symbol(f"{prefix}{name}") for name in term.parameters}
         for name, p in term.parameters.items():
             checked_name(name, f"parameter of term {term.name}")
@@ -78,7 +78,7 @@ class Formulas:
                 self.along[quantity] = parsed(p.along, self._words, f"{here}, {name} along")
         marked = {f"{OWN}{name}": s for name, s in mine.items()}
         written = [*term.rates.values(), *term.observed.values(), *term.lag.values(), term.clock]
-        # where a term says which numbers are its own, other names are the equations'
+        # where a term marks its own parameters, other names are those of the equations
         mine = marked if any(OWN in str(f) for f in written) else mine | marked
         before: dict[str, sympy.Symbol] = {}
         for name, (u, f) in term.delayed.items():
@@ -106,7 +106,7 @@ class Formulas:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of all numbers in p."""
+        """Names of all entries of p."""
         return (*self.fitted, *self.constants, *(s.name for s in self.widths.values()))
 
     @cached_property
@@ -128,7 +128,7 @@ class Formulas:
         return self._evaluated(self.rhs, len(self.states), s, p, times, states)
 
     def sensors_at(self, s: Samples, p: Array, times: Array, states: Array) -> tuple[Array, Array, Array]:
-        """What sensors show (m, w) at instants (m,) in states (m, n), and its derivatives (m, w, n), (m, w, n_p)."""
+        """Sensor values (m, w) at instants (m,) in states (m, n), and their derivatives (m, w, n), (m, w, n_p)."""
         return self._evaluated(self._observe, len(self.channels), s, p, times, states)
 
     def _evaluated(
@@ -154,7 +154,7 @@ class Formulas:
         return _compiled_source(source, name)
 
     def _by_number(self, formula: sympy.Expr, number: sympy.Symbol) -> sympy.Expr:
-        """Derivative of a formula: a number may also say how late an input is."""
+        """Derivative of a formula by a parameter, which may also be the delay of an input."""
         found = formula.diff(number)
         first = len(self.inputs) - len(self.late_inputs)
         for u, rate, (_, late) in zip(self.inputs[first:], self.input_rates[first:], self.late_inputs, strict=True):
@@ -162,7 +162,7 @@ class Formulas:
         return found
 
     def driven(self, knots: Array, pieces: Array, p: Array) -> tuple[Array, Array]:
-        """Inputs of a run (`declared.Samples`) with those that act late, for numbers p."""
+        """Inputs of a run (`declared.Samples`) followed by the delayed ones, for parameters p."""
         if not self.late_inputs:
             return knots, pieces
         return _with_late(knots, pieces, [which for which, _ in self.late_inputs], np.array(self._how_late(p), float))
@@ -173,12 +173,12 @@ class Formulas:
 
     @cached_property
     def is_late(self) -> bool:
-        """True where any term moves the instants of the samples."""
+        """True where a term changes the instants of the samples."""
         return any(e != 0 for e in self.late)
 
     @cached_property
     def lateness(self) -> Any:
-        """(t (m,), p) -> true minus written instant (w, m) and its derivatives (w, n_fitted, m); NumPy."""
+        """(t (m,), p) -> true minus recorded instant (w, m) and its derivatives (w, n_fitted, m); NumPy."""
         fitted = list(self.fitted.values())
         flat = [*self.late, *(e.diff(s) for e in self.late for s in fitted)]
         function = sympy.lambdify((_t, self.numbers), flat, "numpy")
@@ -192,13 +192,13 @@ class Formulas:
         return evaluate
 
     def along_motion(self, expressions: Iterable[sympy.Expr], t: Array, states: Array, p: Array, u: Any) -> list[Array]:
-        """Values, each (m,), of expressions at instants (m,) in states (m, n), with numbers p and inputs u."""
+        """Values, each (m,), of expressions at instants (m,) in states (m, n), with parameters p and inputs u."""
         function = sympy.lambdify((_t, self.states, self.numbers, self.inputs), list(expressions), "numpy")
         with np.errstate(all="ignore"):
             return [np.broadcast_to(x, t.shape) for x in function(t, list(states.T), p, u)]
 
     def defaults(self) -> dict[str, float]:
-        """Declared values of all numbers; the widths of jumps are 1 until they are known."""
+        """Declared values of all entries of p; the widths of jumps are 1 until they are known."""
         found = {name: p.value for name, p in self.declared.items()} | dict(self.equations.constants)
         return found | {s.name: 1.0 for s in self.widths.values()}
 
@@ -212,7 +212,7 @@ def _symbols(names: Iterable[str]) -> dict[str, sympy.Symbol]:
 
 
 def _with_late(knots: Array, pieces: Array, which: list[int], late: Array) -> tuple[Array, Array]:
-    """Inputs, and some of them once more as they were `late` seconds ago, on knots that all of them share.
+    """Inputs followed by delayed copies of some of them, on common knots.
 
     knots (m,), pieces (c, 5, m - 1) : as `declared.Samples` has them
     which : index of the input that each late one is;  late : (len(which),) [s]
@@ -222,7 +222,7 @@ def _with_late(knots: Array, pieces: Array, which: list[int], late: Array) -> tu
     if not np.any(late):
         return knots, both
     shared = np.unique(np.concatenate([knots, *(knots + s for s in late)]))
-    # knots that agree but for rounding are one: a step between them would be as short
+    # knots that differ by rounding errors are one: an integration step could not fit between them
     shared = shared[np.concatenate([[True], np.diff(shared) > 1e-9 * np.median(np.diff(knots))])]
     shared = shared[(shared >= knots[0]) & (shared <= knots[-1])]
     found = np.zeros((len(both), 5, len(shared) - 1))
@@ -239,7 +239,7 @@ def _with_late(knots: Array, pieces: Array, which: list[int], late: Array) -> tu
 def _solved(
     states: list[str], masses: Mapping[tuple[str, str], sympy.Expr], forces: list[sympy.Expr]
 ) -> list[sympy.Expr]:
-    """M^-1 forces, where masses are declared; the states that these couple are solved together."""
+    """M^-1 forces, where masses are declared."""
     M = sympy.eye(len(states))
     for (a, b), mass in masses.items():
         i, j = states.index(a), states.index(b)
@@ -262,9 +262,9 @@ def _known(name: str, known: Iterable[str], where: str) -> None:
 
 @lru_cache(maxsize=64)
 def _compiled_source(source: str, name: str) -> Any:
-    """The same equations are compiled once, however many runs are asked about."""
+    """Compiled once for the same equations, however many runs there are."""
     kernel.prepare()
     scope: dict[str, object] = {k: getattr(math, k) for k in dir(math) if not k.startswith("_")}
     found = compiled(njit, kernel.RHS, function_of(source, name, scope), nogil=True)
-    # its address, once: asked for at every call, it takes as long as a short stretch's motion
+    # its address is looked up once: at every call, that would take as long as the integration of a short stretch
     return CompileResultWAP(found.get_compile_result(kernel.RHS))

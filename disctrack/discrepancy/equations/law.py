@@ -1,11 +1,10 @@
-"""A force that no term names, learned from what the equations leave: of one or two states or inputs, or of time.
+"""An unknown force learned from the residuals: a function of one or two states or inputs, or of time.
 
-The function is a normal process: a line, cosines over the range that the motion visits, and for velocities a jump at
-rest, each amplitude with a standard deviation that falls with its wave number (Solin & Sarkka 2020). How large and how
-smooth it is follows from the data (evidence, MacKay 1992); so does which equation it acts in, and along what. Two
-variables are looked at where no law of one is enough. It stands in the equations as any term does, with exact
-derivatives. Where the declared equations are far from the data, it is first learned over short stretches with a start
-each, and these are joined two by two.
+The function is a Gaussian process in a reduced-rank basis: a line, cosines over the range of the motion, and for
+velocities a jump at rest, each amplitude with a prior sigma that falls with its wave number (Solin & Sarkka 2020).
+Amplitude and smoothness maximise the marginal likelihood (MacKay 1992), which also selects the equation and the
+variables. Two variables are tried where one is not enough. The law is a term like any other, with exact derivatives.
+Where the declared equations are far from the data, it is learned by multiple shooting.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -19,14 +18,14 @@ import numpy as np
 from scipy import linalg
 
 from calibration.kit.arrays import Array
+from disctrack.discrepancy.equations import shooting
 from disctrack.discrepancy.equations.declared import Equations, Parameter, Term
 from disctrack.discrepancy.equations.expressions import Formula
 from disctrack.discrepancy.equations.formulas import Formulas
-from disctrack.discrepancy.equations.start import cut_short, guessed, near_declared, sizes_alike, trusted
 from disctrack.discrepancy.equations.system import MOST_STATES, EquationSystem
 from disctrack.discrepancy.fit import TRIAL, Fit, fit, no_fit
 from disctrack.discrepancy.held_out import HeldOut, held_out
-from disctrack.discrepancy.noise import with_memory
+from disctrack.discrepancy.noise import with_autocorrelation
 from disctrack.discrepancy.score import Linearisation
 from disctrack.discrepancy.search import (
     CLASS_GAIN,
@@ -35,7 +34,7 @@ from disctrack.discrepancy.search import (
     Diagnosis,
     Explanation,
     Found,
-    alike,
+    equivalent,
     is_noise,
     length,
     with_found,
@@ -44,30 +43,29 @@ from disctrack.discrepancy.significance import evidence
 from disctrack.discrepancy.system import Candidate, GivenUp, Quantity, System, Values
 
 NAME = "learned"  # of the term
-HARMONICS = (24, 8)  # of a law of one variable, and in any direction of one of two
-MARGIN = 0.2  # of the range that is visited, beyond it: what cosines do at their ends is not the law's
-SMOOTH = (0.7, 1.5, 3.0, 6.0)  # wave numbers from which on amplitudes fall ...
-FALLS = (1.5, 1.0)  # ... as these powers of 1 + (wave number over it) squared: without kinks, and with some
-FINE, STRAIGHT = 0.03, 1e4  # of the largest value: the variable's inverse hyperbolic sine beyond it, or itself
-SIZES = np.logspace(-4, 2, 31)  # prior sigma of the first amplitudes, over the rms of the equation that it stands in
-MOST_LAWS = 40  # that are looked at in any case
-REFITTED = 4  # laws that are fitted in full: the next one may wander for longer than these take
-WORTH = 50.0  # of -2 log evidence to first order: a law that is so much worse than another is not fitted ...
-ROUGHLY = 4.0  # ... times that of the other, where the declared equations are far from the data
-PLAUSIBLE = 4.0  # the same, by which a rougher law may be less probable than the best one
-ROUNDS = 3  # in which size and smoothness follow the fit, and the fit them
-POINTS = (61, 400)  # of the course that is told
-TURNING = 2  # times that a velocity changes its sign, from which on friction may jump with it
+HARMONICS = (24, 8)  # highest wave number of a law of one variable, and of two
+MARGIN = 0.2  # of the visited range, added at both ends: cosines have zero slope at the ends of their interval
+SMOOTH = (0.7, 1.5, 3.0, 6.0)  # wave numbers above which amplitudes fall ...
+FALLS = (1.5, 1.0)  # ... as these powers of 1 + (wave number over it) squared: smooth, and with kinks
+FINE, STRAIGHT = 0.03, 1e4  # scale of the variable's asinh over its largest value: finer near zero, or linear
+SIZES = np.logspace(-4, 2, 31)  # prior sigma of the first amplitudes over the rms of their equation
+MOST_LAWS = 40  # above which a law depends on variables of its own equation only
+REFITTED = 4  # laws that are fitted in full
+WORTH = 50.0  # of first-order -2 log evidence over the best law, up to which a law is fitted ...
+ROUGHLY = 4.0  # ... over this multiple of the best, where the declared equations are far from the data
+PLAUSIBLE = 4.0  # of -2 log evidence: a rougher prior may be less probable by so much
+ROUNDS = 3  # alternations of fitting the law and its prior
+POINTS = (61, 400)  # of the reported course, for one and two variables
 
 
 @dataclass(frozen=True)
 class Along:
-    """Where a law acts, and what it is a function of."""
+    """The equation in which a law acts, and the variables on which it depends."""
 
-    equation: str  # state whose equation it stands in
+    equation: str  # state of the equation
     variables: tuple[str, ...]  # one or two states or inputs; or "t" alone
-    jumps: bool = False  # with the variable's sign, as friction does
-    fine: bool = False  # of finer waves near zero, as drag that falls with speed has them
+    jumps: bool = False  # with the sign of the variable, as friction does
+    fine: bool = False  # with a finer resolution near zero, as for drag that falls with speed
 
     @property
     def title(self) -> str:
@@ -76,12 +74,12 @@ class Along:
 
     @property
     def variable(self) -> str:
-        """What it is a function of."""
+        """Its variables in words."""
         return " and ".join(self.variables)
 
     @property
     def of_time(self) -> bool:
-        """Of time alone, which any motion has, and which foretells nothing?"""
+        """A function of time alone, which fits any motion and predicts nothing?"""
         return self.variables == ("t",)
 
     def units(self, of_states: Mapping[str, str]) -> list[str]:
@@ -97,9 +95,9 @@ class LearnedForce(Explanation):
     instead: Explanation  # the shortest by known terms alone
     at_noise: bool  # are its residuals noise?
     noise: float  # variance over that stated
-    system: EquationSystem  # that knows the law
-    judged: System  # the same with its noise as judged
-    alike: tuple[Along, ...] = ()  # laws that are not longer by CLASS_GAIN
+    system: EquationSystem  # with the law as a term
+    judged: System  # the same with its noise as estimated
+    equivalent: tuple[Along, ...] = ()  # laws that are not longer by CLASS_GAIN
 
     @property
     def candidate(self) -> Candidate:
@@ -113,17 +111,17 @@ class LearnedForce(Explanation):
 
     @cached_property
     def held_out(self) -> HeldOut:
-        """Prediction of the samples that judge the fit."""
+        """Prediction of the held-out samples."""
         return held_out(self.judged, self.fit.quantities, self.fit.values, self.system.training)
 
     @cached_property
     def held(self) -> tuple[str, ...]:
-        """Parameters that are a part of the law, and held as declared."""
+        """Declared parameters that act as a part of the law: it is reported relative to their declared values."""
         return tuple(sorted(_part_of_law(self.system.formulas, self.along, self.system.held)))
 
     @cached_property
     def course(self) -> tuple[Array, Array, Array]:
-        """Where (k, 1 or 2) it is reported; the force (k,) there beyond the declared equations, and its sigma (k,)."""
+        """Places (k, 1 or 2); the force (k,) there, in addition to the declared equations; and its sigma (k,)."""
         law, fitted, own = self.along, self.fit, self.candidate.quantities
         visited, k = _visited(self.system, law.variables, fitted.values), len(law.variables) - 1
         at = np.linspace(visited.min(axis=0), visited.max(axis=0), POINTS[0])
@@ -132,7 +130,7 @@ class LearnedForce(Explanation):
         names = [*(q.name for q in own), *self.held]
         force, columns = _course(self.system, law, names, fitted.values, at)
         variance = np.einsum("ij,jk,ik->i", columns, fitted.amounts(names)[1], columns)
-        # waves finer than those that are fitted go on as the inverse square of their number
+        # variance of the truncated basis, whose amplitudes fall as the inverse square of the wave number
         finer = (HARMONICS[0] / 6.0, np.pi / 16.0 * HARMONICS[1] ** 2)[k] * min(q.prior_sigma for q in own) ** 2
         scale = max(self.noise, fitted.reduced_chi_square)
         return at, force, np.sqrt(scale * np.maximum(variance, 0.0) + self.noise * finer)
@@ -144,7 +142,7 @@ class LearnedForce(Explanation):
 
     @property
     def force(self) -> Array:
-        """(k,) beyond the declared equations."""
+        """(k,) in addition to the declared equations."""
         return self.course[1]
 
     @property
@@ -153,17 +151,17 @@ class LearnedForce(Explanation):
         return self.course[2]
 
     def is_named(self, diagnosis: Diagnosis) -> bool:
-        """Is this the law that describes the data best, or comes nearest, together with all that is found?"""
+        """Is the law reported as the best description, together with all known terms that were found?"""
         stays = {f.candidate.name for f in diagnosis.found} <= {c.name for c in self.known}
         return self.is_shorter and (self.at_noise or stays)
 
     @property
     def is_shorter(self) -> bool:
-        """Than the known terms that come nearest? Of two that the data do not tell apart, what is known is named."""
+        """Is it shorter than the best known terms? Of two that are indistinguishable, the known one is reported."""
         return self.length < self.instead.length - CLASS_GAIN
 
     def document(self) -> dict[str, Any]:
-        """Its course in JSON's types, with the names of what describes the data too."""
+        """Its course in JSON types, with the alternatives."""
         return {
             "equation": self.along.equation,
             "variable": self.along.variable,
@@ -175,55 +173,55 @@ class LearnedForce(Explanation):
             "sigma": self.sigma,
             "at_noise": self.at_noise,
             "minus_2_log_evidence": self.length,
-            "cannot_be_told_from": [{"equation": a.equation, "variable": a.variable} for a in self.alike],
+            "cannot_be_told_from": [{"equation": a.equation, "variable": a.variable} for a in self.equivalent],
             "known_terms": [c.name for c in self.instead.candidates],
             "minus_2_log_evidence_of_known_terms": self.instead.length,
         }
 
     def text(self, units: Mapping[str, str]) -> str:
-        """Its course at five places: over the range of one variable, or from the least to the largest by two."""
+        """Its course at five places: over the range of one variable, or from the smallest to the largest force."""
         places = self.variable.reshape(len(self.force), -1)
         order = np.argsort(self.force) if places.shape[1] > 1 else np.arange(len(places))
-        told = []
+        points = []
         for i in order[np.linspace(0, len(order) - 1, 5).round().astype(int)]:
             place = zip(places[i], self.along.units(units), strict=True)
             where = ", ".join(f"{x:.3g} {unit if unit != '1' else ''}".rstrip() for x, unit in place)
-            told.append(f"{self.force[i]:.3g}({self.sigma[i]:.2g}) at {where}")
+            points.append(f"{self.force[i]:.3g}({self.sigma[i]:.2g}) at {where}")
         held = f", beyond {' and '.join(self.held)} as declared" if self.held else ""
-        return f"{self.along.title} [{NAME}{held}]: {'; '.join(told)}"
+        return f"{self.along.title} [{NAME}{held}]: {'; '.join(points)}"
 
 
 def learn(
     system: EquationSystem, diagnosis: Diagnosis, channels: Mapping[str, Formula], judged: System | None = None
 ) -> LearnedForce | None:
-    """The law with which the data are most probable, beside known terms, or of two variables, where it takes them.
+    """The law of the largest evidence; together with a known term, or of two variables, where that is needed.
 
     channels : formulas of what is observed, without terms
-    judged : the system with its noise as judged, if that remembers
-    Where none describes the data, the one that comes nearest, beside known terms. None where no law describes most of
-    what is missing, where one known term describes it, or where there are too many runs.
+    judged : the system with its noise as estimated, if that is not white
+    Where no law leaves noise, the law nearest to the data, together with known terms. None where no law explains most
+    of the excess chi-square, where one known term explains it, or where there are too many runs.
     """
     if diagnosis.held_out_before is None or (diagnosis.verdict != "unexplained" and len(diagnosis.found) < 2):
         return None
-    if len(system.stretches) * len(system.formulas.states) > MOST_STATES:  # more than are fitted side by side
+    if len(system.stretches) * len(system.formulas.states) > MOST_STATES:  # too many initial states to fit
         return None
-    one, law, tells = _Competition(1, _knowing(system, channels, 1), diagnosis, judged), None, False
+    one, law, reportable = _Competition(1, _knowing(system, channels, 1), diagnosis, judged), None, False
     several = diagnosis.verdict == "unexplained" or len(diagnosis.found) > 2
-    for variables, beside_known in ((1, False), (1, True), (2, False))[: 3 if several else 1]:
-        if law is not None and tells and law.at_noise:
+    for variables, with_known in ((1, False), (1, True), (2, False))[: 3 if several else 1]:
+        if law is not None and reportable and law.at_noise:
             break
         over = one if variables == 1 else _Competition(2, _knowing(system, channels, 2), diagnosis, judged)
-        for beside in [(c,) for c in over.beside()] if beside_known else [()]:
-            trial = over.best(beside) if system.budget.open() else None
+        for known in [(c,) for c in over.known_terms()] if with_known else [()]:
+            trial = over.best(known) if system.budget.open() else None
             if trial is not None and (law is None or trial.length < law.length):
-                law, tells = trial, over.is_worth_telling(trial)
-    return law if tells else _nearest(one.system, diagnosis, judged)
+                law, reportable = trial, over.is_reportable(trial)
+    return law if reportable else _nearest(one.system, diagnosis, judged)
 
 
 def _nearest(system: EquationSystem, diagnosis: Diagnosis, judged: System | None) -> LearnedForce | None:
-    """The law that comes nearest beside the known terms that do, at the noise that these leave; it is no finding.
+    """The law that improves the best known terms, with their residuals taken for noise; it is no finding.
 
-    No law of a real system comes as near as good sensors see. None where known terms do not lead near the data.
+    With good sensors no model of a real system leaves noise. None where known terms do not come near the data.
     """
     known, d = diagnosis.ranked[0], diagnosis
     noise = max(d.noise, known.fit.reduced_chi_square)
@@ -233,17 +231,17 @@ def _nearest(system: EquationSystem, diagnosis: Diagnosis, judged: System | None
     view = system if judged is None else judged.over(system)
     before = held_out(view, known.fit.quantities, known.fit.values, system.training)
     known = replace(known, length=length(view, d.settings, noise, known.fit, known.candidates))
-    left = replace(d, noise=noise, before=known.fit, held_out_before=before, ranked=(known,))
-    over = _Competition(1, system, left, judged)
+    worse = replace(d, noise=noise, before=known.fit, held_out_before=before, ranked=(known,))
+    over = _Competition(1, system, worse, judged)
     law = over.best(known.candidates)
     if law is None or law.along.of_time:
         return None
-    foretells = law.held_out.chi_square < before.chi_square  # itself, and not by being open
-    return replace(law, at_noise=False) if foretells and law.is_shorter and over.is_worth_telling(law) else None
+    predicts = law.held_out.chi_square < before.chi_square  # by its values, and not by its uncertainty
+    return replace(law, at_noise=False) if predicts and law.is_shorter and over.is_reportable(law) else None
 
 
 class _Competition:
-    """Laws among each other and with the known terms that were found, by the evidence of the same samples."""
+    """Comparison of laws with each other and with known terms, by the evidence of the same samples."""
 
     def __init__(self, variables: int, system: EquationSystem, diagnosis: Diagnosis, judged: System | None) -> None:
         self.system, self.diagnosis, self.noise = system, diagnosis, diagnosis.noise
@@ -254,53 +252,53 @@ class _Competition:
         chi_square = float(np.sum(system.linearise(self.begin, [])[0] ** 2))
         self.far = not chi_square < FAR * self.noise * max(float(np.sum(system.weights)), 1.0)
         self.laws = tuple(_laws(system, self.begin, variables))
-        self.looked = 2.0 * float(np.log(max(len(self.laws), 1)))
-        self.shots = cut_short(system) if self.far else [system]
+        self.trials_penalty = 2.0 * float(np.log(max(len(self.laws), 1)))
+        self.shots = shooting.levels(system) if self.far else [system]
         self.instead = next((e for e in diagnosis.ranked if e.candidates), Explanation((), base))
 
     def view(self, system: EquationSystem) -> System:
-        """With the noise as judged, where the samples are those that were judged."""
+        """The system with the noise as estimated."""
         return system if self._judged is None else self._judged.over(system)
 
-    def arrived(self, fitted: Fit) -> bool:
-        """Could further steps gain no more than nothing? Along what only the prior holds, they go on for ever."""
+    def has_converged(self, fitted: Fit) -> bool:
+        """Is the promised gain insignificant? Along directions that only the prior determines, steps never end."""
         return fitted.converged or fitted.promised < CLASS_GAIN * self.noise
 
     def at_noise(self, fitted: Fit) -> bool:
-        """As the search has it."""
-        return self.arrived(fitted) and is_noise(fitted, self.diagnosis.settings, self.noise)
+        """As in the search."""
+        return self.has_converged(fitted) and is_noise(fitted, self.diagnosis.settings, self.noise)
 
-    def beside(self) -> list[Candidate]:
+    def known_terms(self) -> list[Candidate]:
         """Known terms that may act with a law: those of the shortest explanations."""
         named = dict.fromkeys(c.name for e in self.diagnosis.ranked for c in e.candidates)
         own = {c.name: c for c in self.system.candidates}
         return [own[name] for name in named if name in own][:WIDTH]
 
-    def is_worth_telling(self, law: LearnedForce) -> bool:
-        """Does it describe the data, or nearly all of what is missing, and samples that it has not seen as well?
+    def is_reportable(self, law: LearnedForce) -> bool:
+        """Does the law predict held-out data, and leave noise, or nearly all of the excess chi-square explained?
 
-        As known terms are asked: where it is not noise that is left, they must leave more, and foretell less.
+        If its residuals are not noise, it also has to be shorter than known terms, and to predict better.
         """
         d = self.diagnosis
-        if not self.arrived(law.fit) or d.held_out_before is None:
+        if not self.has_converged(law.fit) or d.held_out_before is None:
             return False
         if not law.held_out.gain_over(d.held_out_before, self.noise) > CLASS_GAIN:
             return False
         most = d.settings.unexplained_share * d.before.excess(self.noise)
-        foretells = d.held_out_after is None or law.held_out.chi_square < d.held_out_after.chi_square
-        return law.at_noise or (law.is_shorter and foretells and law.fit.excess(self.noise) < most)
+        predicts = d.held_out_after is None or law.held_out.chi_square < d.held_out_after.chi_square
+        return law.at_noise or (law.is_shorter and predicts and law.fit.excess(self.noise) < most)
 
-    def best(self, beside: tuple[Candidate, ...]) -> LearnedForce | None:
-        """The law that makes the data most probable beside these terms."""
+    def best(self, known: tuple[Candidate, ...]) -> LearnedForce | None:
+        """The law of the largest evidence, fitted together with these terms."""
         first = self.shots[0]
         values = self.begin
         if self.far:
-            values = self.begin | self.declared | guessed(first)[0]
-            values = fit(first, [near_declared(q) for q in first.base], values, TRIAL).values
+            values = self.begin | self.declared | shooting.initial_guess(first)[0]
+            values = fit(first, [shooting.with_weak_prior(q) for q in first.base], values, TRIAL).values
         scans = []
         for law in self.laws:
             there, numbers = _set(first, law, values)
-            length, quantities = self._evidence(there, law, beside, {**values, **numbers})
+            length, quantities = self._evidence(there, law, known, {**values, **numbers})
             if np.isfinite(length):
                 scans.append((length, law, quantities))
         scans.sort(key=lambda scan: scan[0])
@@ -308,103 +306,102 @@ class _Competition:
             return None
         trials = []
         for length, law, quantities in scans[:REFITTED]:
-            # along stretches that the declared equations do not follow the first order says little
+            # where the declared equations do not follow the data, the first order is a rough guide
             enough = ROUGHLY * scans[0][0] + WORTH if self.far else scans[0][0] + CLASS_GAIN
             if length > enough or not self.system.budget.open():
                 break
             with suppress(GivenUp), self.system.budget.trial(self.system.trial_steps):
-                if (trial := self._led(law, beside, quantities, values)) is not None:
+                if (trial := self._fit_over_levels(law, known, quantities, values)) is not None:
                     trials.append(trial)
         if not trials:
             return None
-        near = alike([trial for trial in trials if self.arrived(trial.fit)] or trials)
-        # a function of time describes any motion: one of the motion itself says more, and is tried by every other run
+        near = equivalent([trial for trial in trials if self.has_converged(trial.fit)] or trials)
+        # a function of time fits any motion: a function of the state says more, and is tested by every other run
         best = min(near, key=lambda trial: trial.along.of_time)
         others = (Along(t.along.equation, t.along.variables) for t in near if t.along.title != best.along.title)
-        return replace(best, alike=tuple(dict.fromkeys(others)))
+        return replace(best, equivalent=tuple(dict.fromkeys(others)))
 
-    def _others(self, system: EquationSystem, beside: Sequence[Candidate]) -> tuple[Quantity, ...]:
-        return (*system.base, *(q for c in beside for q in c.quantities))
+    def _others(self, system: EquationSystem, known: Sequence[Candidate]) -> tuple[Quantity, ...]:
+        return (*system.base, *(q for c in known for q in c.quantities))
 
     def _evidence(
-        self, system: EquationSystem, law: Along, beside: Sequence[Candidate], values: Values
+        self, system: EquationSystem, law: Along, known: Sequence[Candidate], values: Values
     ) -> tuple[float, tuple[Quantity, ...]]:
-        """-2 log evidence to first order, and the law's quantities with the priors that bring it."""
-        others, own = self._others(system, beside), _amplitudes(system, law)
+        """First-order -2 log evidence, and the law's quantities with the priors that maximise the evidence."""
+        others, own = self._others(system, known), _amplitudes(system, law)
         values = {q.name: q.null for q in (*others, *own)} | dict(values)
         view = self.view(system) if len(system.stretches) == len(self.system.stretches) else system
         linear = Linearisation(view, no_fit(others, values), [_candidate(law, own)])
         columns = linear.columns([q.name for q in own])
-        # the residual as it would be without the law
+        # residuals without the law
         right = linear.cleared(linear.right + columns @ np.array([values[q.name] for q in own]))
         columns = linear.cleared(columns)
         if not (np.isfinite(columns).all() and np.isfinite(right).all()):
             return np.inf, own
-        size, root, found = sizes_alike(system, values).get(own[0].name, 1.0), np.sqrt(self.noise), []
+        size, root, found = shooting.scales(system, values).get(own[0].name, 1.0), np.sqrt(self.noise), []
         basis = _basis(len(law.variables))
         waves = np.array([basis[q.part][1] for q in own])
         for smooth, fall in product(SMOOTH, FALLS):
             falls = (1.0 + (waves / smooth) ** 2) ** -fall  # prior sigma of each amplitude over that of the first
-            # the faster driver gives up where columns are alike
+            # the faster driver may fail for nearly equal columns
             U, singular, _ = linalg.svd(columns * falls, full_matrices=False, lapack_driver="gesvd")
             lengths = evidence(size * singular / root, U.T @ right / root, SIZES)
-            # columns of nothing: no size can be told from them
+            # zero columns do not determine a size
             if not (np.isfinite(lengths).all() and np.isfinite(right @ right / self.noise)):
                 return np.inf, own
             found.append((float(lengths.min()), SIZES[int(np.argmin(lengths))] * size * falls))
         shortest = min(length for length, _ in found)
-        # of those that the data do not refute the roughest: what it leaves open is not called known for being smooth
+        # the roughest of the plausible priors: a smooth one would understate the uncertainty between the data
         plausible = [prior for length, prior in found if length < shortest + PLAUSIBLE]
         prior = max(plausible, key=lambda prior: float(prior[np.argmax(waves)])) / root
-        quantities = zip(own, prior.tolist(), strict=True)  # of chi-squares that are not yet in units of the noise
-        return shortest + float(right @ right) / self.noise + self.looked, tuple(
+        quantities = zip(own, prior.tolist(), strict=True)  # chi-square of the fit is not in units of the noise
+        return shortest + float(right @ right) / self.noise + self.trials_penalty, tuple(
             replace(q, prior_sigma=sigma, scale=1e-3 * sigma) for q, sigma in quantities
         )
 
-    def _led(
-        self, law: Along, beside: tuple[Candidate, ...], own: tuple[Quantity, ...], values: Values
+    def _fit_over_levels(
+        self, law: Along, known: tuple[Candidate, ...], own: tuple[Quantity, ...], values: Values
     ) -> LearnedForce | None:
-        """The law's fit to stretches that are joined two by two; None where it loses the data."""
+        """The law fitted by multiple shooting, over longer and longer stretches; None where it loses the data."""
         first, numbers = _set(self.shots[0], law, values)
         now, evident = dict(values) | {q.name: 0.0 for q in own} | numbers, np.inf
         for system, longer in zip(self.shots, [*self.shots[1:], None], strict=True):
             there = replace(system, widths=first.widths)
-            others, view = self._others(there, beside), there if longer else self.view(there)
+            others, view = self._others(there, known), there if longer else self.view(there)
             for _ in range(1 if longer else ROUNDS):
                 fitted = self._fitted(view, (*others, *own), now)
-                if not fitted.reduced_chi_square < FAR * self.noise:  # joined, it leaves more
+                if not fitted.reduced_chi_square < FAR * self.noise:  # longer stretches leave more
                     return None
                 before, now = evident, dict(fitted.values)
-                evident, own = self._evidence(there, law, beside, now)
+                evident, own = self._evidence(there, law, known, now)
                 if abs(before - evident) < 1.0:
                     break
-
         fitted = self._fitted(view, (*others, *own), now)
-        # known numbers and terms are priced as where no law is; of the law, the evidence has paid
-        prices = length(view, self.diagnosis.settings, self.noise, fitted, beside) - fitted.cost / self.noise
-        known = _set(self.system, law, fitted.values)[0]
+        # declared parameters and known terms have their usual penalties; that of the law is part of the evidence
+        penalties = length(view, self.diagnosis.settings, self.noise, fitted, known) - fitted.cost / self.noise
+        there = _set(self.system, law, fitted.values)[0]
         return LearnedForce(
-            (*beside, _candidate(law, own)), fitted, length=evident + prices, along=law, instead=self.instead,
-            at_noise=self.at_noise(fitted), noise=self.noise, system=known, judged=self.view(known),
+            (*known, _candidate(law, own)), fitted, length=evident + penalties, along=law, instead=self.instead,
+            at_noise=self.at_noise(fitted), noise=self.noise, system=there, judged=self.view(there),
         )  # fmt: skip
 
     def _fitted(self, system: System, quantities: Sequence[Quantity], values: Values) -> Fit:
-        """The fit; where its steps have to be halved again and again, with a region of trust for each number.
+        """The Gauss-Newton fit; within a trust region where that does not converge near the data.
 
-        Amplitudes that the data hardly show may go far to first order, and shift the phase in second.
+        Poorly determined amplitudes may take large first-order steps, which shift the phase to second order.
         """
         found = fit(system, quantities, values, TRIAL)
-        # were the rest of the way linear
+        # after the full step, to first order
         ahead = (found.chi_square - found.promised) / max(found.degrees_of_freedom, 1)
-        if self.arrived(found) or not ahead < FAR * self.noise:
+        if self.has_converged(found) or not ahead < FAR * self.noise:
             return found
-        return fit(system, quantities, trusted(system, quantities, found.values), TRIAL)
+        return fit(system, quantities, shooting.trust_region(system, quantities, found.values), TRIAL)
 
 
 def _laws(system: EquationSystem, values: Values, n: int) -> Iterator[Along]:
-    """Every law of n variables that is looked for: in every equation of a force, along states, inputs, or time alone.
+    """Every law of n variables that is tried: in every equation of a force, of states, inputs, or time alone.
 
-    In a large system, along what stands in that equation already, and time.
+    In a large system, of the variables that its equation contains already, and time.
     """
     equations = system.formulas.equations
     moving = (*equations.states, *equations.inputs)
@@ -419,7 +416,7 @@ def _laws(system: EquationSystem, values: Values, n: int) -> Iterator[Along]:
             yield Along(equation, variables)
             if n == 1 and variables[0] in {equation, *velocities}:
                 yield Along(equation, variables, fine=True)
-                if np.sum(np.diff(np.sign(_visited(system, variables, values)[:, 0])) != 0) >= TURNING:
+                if {-1.0, 1.0} <= set(np.sign(_visited(system, variables, values)[:, 0]).tolist()):
                     yield Along(equation, variables, jumps=True)
 
 
@@ -429,7 +426,7 @@ def _forced(equations: Equations) -> list[str]:
 
 
 def _knowing(system: EquationSystem, channels: Mapping[str, Formula], n: int) -> EquationSystem:
-    """The same system with a law of n variables as one more term; where it acts, and along what, is said by numbers."""
+    """The system with a law of n variables as a further term; constants select its equation and its variables."""
     f = system.formulas
     e = f.equations
     words = {"sign": "sign"}
@@ -453,9 +450,9 @@ def _knowing(system: EquationSystem, channels: Mapping[str, Formula], n: int) ->
 
 
 def _basis(n: int) -> dict[str, tuple[str, float]]:
-    """Of a law of n variables, by amplitude: what it multiplies, by places {p} over the range and variables {x}.
+    """Basis functions of a law of n variables and their wave numbers, by the names of their amplitudes.
 
-    With it the wave number.
+    Formulas of the positions {p} within the ranges, and of the variables {x}.
     """
     most = HARMONICS[n - 1]
     found = {}
@@ -468,17 +465,17 @@ def _basis(n: int) -> dict[str, tuple[str, float]]:
 
 
 def _candidate(law: Along, own: tuple[Quantity, ...]) -> Candidate:
-    return Candidate(NAME, NAME, "motion", law.title, "learned from what is left", own)
+    return Candidate(NAME, NAME, "motion", law.title, "learned from the residuals", own)
 
 
 def _amplitudes(system: EquationSystem, law: Along) -> tuple[Quantity, ...]:
-    """Of the law, without priors as yet."""
+    """Amplitudes of the law, without priors."""
     own = (q for c in system.candidates if c.name == NAME for q in c.quantities)
     return tuple(q for q in own if law.jumps or q.part != "jump")
 
 
 def _set(system: EquationSystem, law: Along, values: Values) -> tuple[EquationSystem, dict[str, float]]:
-    """The system for one law, and the numbers that say where it acts and over which range."""
+    """The system for one law, and the constants that select its equation, variables and ranges."""
     numbers = {n: 0.0 for n in system.formulas.constants if n.startswith(f"{NAME}_")}
     numbers[f"{NAME}_on_{law.equation}"] = 1.0
     visited = _visited(system, law.variables, values)
@@ -497,7 +494,7 @@ def _set(system: EquationSystem, law: Along, values: Values) -> tuple[EquationSy
 
 
 def _visited(system: EquationSystem, variables: Sequence[str], values: Values) -> Array:
-    """States, inputs or time (n, k) at the samples of all stretches, one after the other."""
+    """States, inputs or time (n, k) at the samples of all stretches."""
     e, found = system.formulas.equations, [np.zeros((0, len(variables)))]
     for s, motion in zip(system.stretches, system.predictions(values), strict=True):
         states = dict(zip(e.states, motion.states.T if motion else [], strict=False))
@@ -509,7 +506,7 @@ def _visited(system: EquationSystem, variables: Sequence[str], values: Values) -
 
 
 def _part_of_law(f: Formulas, law: Along, held: Sequence[str]) -> set[str]:
-    """Parameters that act in the law's equation as a function of its variable alone, and nowhere else."""
+    """Parameters that act only in the law's equation, as a function of its variables alone."""
     here = f.equations.states.index(law.equation)
     forces = [*f.forces[:here], *f.forces[here + 1 :], *f.observed, *f.late, *f.masses]
     elsewhere = set().union(*(e.free_symbols for e in forces))
@@ -525,7 +522,7 @@ def _part_of_law(f: Formulas, law: Along, held: Sequence[str]) -> set[str]:
 
 
 def _course(system: EquationSystem, law: Along, names: Sequence[str], values: Values, at: Array) -> tuple[Array, Array]:
-    """What these numbers make at places (n, k), beyond their declared values, where the law acts; and each of them."""
+    """Force (n,) by these parameters, relative to the declared ones, at places (n, k); derivatives (n, names)."""
     f, s = system.formulas, system.stretches[0]
     states = np.tile(system.start_of(values, s), (len(at), 1))
     times = at[:, 0] if law.of_time else np.asarray(np.arange(len(at)) + 0.5, float)
@@ -547,16 +544,16 @@ def _course(system: EquationSystem, law: Along, names: Sequence[str], values: Va
 
 
 def with_law(diagnosis: Diagnosis, law: LearnedForce) -> Diagnosis:
-    """The answer with the law in place of known terms, and with those that act beside it.
+    """The answer with the law, and the known terms that were fitted with it, in place of what was found.
 
-    Where more than noise is left, it is the nearest description, and what was found stays; of a function of time alone,
-    which any motion has, nothing does.
+    Where its residuals are not noise, the law is the nearest description, and what was found stays. A function of time
+    alone, which fits any motion, is no finding.
     """
     level = f"{law.fit.reduced_chi_square:.3g} per degree of freedom at a noise of {diagnosis.noise:.3g}"
     at_first = f"{diagnosis.before.reduced_chi_square:.3g}"
     reason = f"chi-square stays at {at_first}, with a law that was learned at {level}"
     if not law.at_noise:
-        return replace(diagnosis, reason=reason, nearest=replace(law, fit=with_memory(law.system, law.fit)))
+        return replace(diagnosis, reason=reason, nearest=replace(law, fit=with_autocorrelation(law.system, law.fit)))
     ranked = sorted((*diagnosis.ranked, law), key=lambda e: e.length)
     known = () if law.along.of_time else law.known
     outcomes = {f.candidate.name: "the law that was learned describes more" for f in diagnosis.found}

@@ -1,4 +1,4 @@
-"""From equations and runs to an answer: what is missing, how much of it, and how sure that is."""
+"""From equations and runs to an answer: which terms are missing, their sizes and their significance."""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
@@ -7,21 +7,21 @@ import numpy as np
 from scipy.linalg import qr
 
 from calibration.kit.arrays import Array
+from disctrack.discrepancy.equations import shooting
 from disctrack.discrepancy.equations import terms as library
 from disctrack.discrepancy.equations.declared import Equations, Run, Samples, Term, checked
 from disctrack.discrepancy.equations.formulas import Formulas
 from disctrack.discrepancy.equations.law import LearnedForce, learn, with_law
-from disctrack.discrepancy.equations.start import LOST, ample, guessed, lasting, led, misfit, sizes_alike, trusted, turn
 from disctrack.discrepancy.equations.system import MOST_STATES, EquationSystem, fitted_rows
 from disctrack.discrepancy.fit import Fit, fit, no_fit
 from disctrack.discrepancy.noise import (
     autoregression,
-    fast_part,
-    persistence,
-    step_of,
-    with_memory,
+    correlation_lag,
+    noise_sigma,
+    prewhitened,
+    quantisation,
+    with_autocorrelation,
     with_noise,
-    without_memory,
 )
 from disctrack.discrepancy.score import Linearisation
 from disctrack.discrepancy.search import WIDTH, Diagnosis, Former, Settings, explain, with_shapes
@@ -29,27 +29,27 @@ from disctrack.discrepancy.significance import wald
 from disctrack.discrepancy.system import USED_UP, Candidate, System, Values
 from disctrack.errors import AnalysisError
 
-JUMP = 1e-3  # width of a jump over the rms of what jumps: it errs by 1e-6 of a friction's work
+JUMP = 1e-3  # width of a jump over the rms of its argument: an error of 1e-6 of the work of a friction
 SHARPER, SHARPEST = 0.1, 1e-6  # widths of a jump over the one before, and over the first
-BLUNT = 0.1  # of chi-square, by which a sharper jump may move the motion: numbers then move by 0.3 sigma at most
-REDUNDANT = 1e-5  # share of a parameter's effect left beside the others', below which the data cannot part them
-SLOW = 0.05  # of a turn of the motion: what is left and lasts longer is taken for the motion's own
-NO_SENSOR = 5.0  # times the noise that was declared or is seen from sample to sample: no sensor's error
-FORGOTTEN = float(np.arccos(np.exp(-1.0)) / (2 * np.pi))  # of its turn, after which an oscillation's memory is 1/e
+BLUNT = 0.1  # of chi-square, by which a sharper jump may change the motion: parameters change by 0.3 sigma at most
+REDUNDANT = 1e-5  # share of a parameter's effect that others cannot absorb, below which it is unidentifiable
+SLOW = 0.05  # of a period of the motion: residuals with a longer correlation time are not taken for noise
+NO_SENSOR = 5.0  # times the noise declared or estimated: larger residuals are no error of a sensor
+FORGOTTEN = float(np.arccos(np.exp(-1.0)) / (2 * np.pi))  # lag of autocorrelation 1/e of an oscillation, in periods
 SCANNED = 8  # values along the motion that are tried for a limit
-NEARLY = 0.2  # of the excess chi-square: what leaves less is named as the nearest description of what no term is
-STANDS = 8  # samples of the same largest or least value, above which a sensor stands at a limit
-USUAL_SHARE = 0.1  # of the rms of the motion's own forces: a term of that size would surprise nobody
+NEARLY = 0.2  # of the excess chi-square: an explanation that leaves less is given as the nearest description
+STANDS = 8  # equal extreme samples, above which a sensor may be at its limit
+USUAL_SHARE = 0.1  # of the rms of an equation: the typical size of a term
 
 
-def ask(
+def find_missing(
     equations: Equations, runs: Sequence[Run], terms: Sequence[Term] | None = None, settings: Settings | None = None
 ) -> tuple[Diagnosis, EquationSystem, System, bool, tuple[str, ...], LearnedForce | None]:
-    """Fit the equations to the runs and look for what they lack.
+    """Fit the equations to the runs and search for what they lack.
 
     terms : None: the usual ones (`terms.usual`)
-    returns : diagnosis, system in the stretches that were judged, the same with its noise as judged, whether that
-        remembers, remarks, and a learned law where one describes the data
+    returns : diagnosis, system in the stretches that were fitted, the same with its noise as estimated, whether that is
+        autocorrelated, remarks, and a learned law where one describes the data
     """
     settings = settings or Settings(unexplained_share=NEARLY)
     given = checked(equations, runs)
@@ -63,12 +63,12 @@ def ask(
     system, diagnosis, more = _first_answer(whole, settings)
     notes += more
     if not np.isfinite(diagnosis.before.chi_square):
-        raise AnalysisError(_not_followed(system, diagnosis.before.values))
-    diagnosis, remembers, of_memory = _with_memory(system, diagnosis, settings)
+        raise AnalysisError(_failure(system, diagnosis.before.values))
+    diagnosis, autocorrelated, on_noise = _prewhiten(system, diagnosis, settings)
     judged = diagnosis.judged or system
     law = learn(system, diagnosis, channels, None if judged is system else judged)
     named = law is not None and law.is_named(diagnosis)
-    notes += of_memory if remembers or not (law and named and law.at_noise) else []
+    notes += on_noise if autocorrelated or not (law and named and law.at_noise) else []
     if law is not None and named:
         judged = law.system if judged is system else judged.over(law.system)
         system, diagnosis = law.system, with_law(diagnosis, law)
@@ -79,44 +79,44 @@ def ask(
     if system.held:
         held = ", ".join(system.held)
         notes.append(f"{held} cannot be distinguished from other numbers by these data: held as declared")
-    return diagnosis, system, judged, remembers, tuple(notes), law
+    return diagnosis, system, judged, autocorrelated, tuple(notes), law
 
 
 def _first_answer(system: EquationSystem, settings: Settings) -> tuple[EquationSystem, Diagnosis, list[str]]:
-    """The search over as much as the model can be made to follow, and remarks on how far that is."""
-    whole, declared = _prepared(system)
-    start = led(whole, declared)
-    if held := redundant(start.system, start.values) if start.followed > 0.0 else ():
+    """The search over whole runs, or over stretches as long as the model follows them; and remarks on that."""
+    whole, declared = _with_guessed_sizes(system)
+    start = shooting.fitted_start(whole, declared)
+    if held := unidentifiable(start.system, start.values) if start.followed > 0.0 else ():
         whole = replace(whole, held=held)
-        start = led(whole, declared)
-    answer, values = None, declared
+        start = shooting.fitted_start(whole, declared)
+    values = declared
     promising: list[tuple[str, ...]] = [(c.name,) for c in whole.candidates]
     if start.followed:
-        answer = system, diagnosis = _searched(_sized(start.system, start.values), start.values, settings)
+        system, diagnosis = _searched(_with_sizes(start.system, start.values), start.values, settings)
         promising = _promising(diagnosis, start.whole)
         values = {} if start.whole else diagnosis.after.values
-    # stretches may be too short to tell what is missing, and no step may lead to it: then by way of some terms
-    if ways := _leading(whole, values, promising):
+    # stretches may be too short to show what is missing, and a fit without it may stop early: fit some terms first
+    if ways := _reached_by(whole, values, promising):
         names, values = next(iter(ways.items()))
-        system, diagnosis = _searched(_sized(whole, values), values, settings, ways)
-        note = f"the fit goes by way of {' and '.join(sorted(names))}: without it, longer stretches lose the data"
+        system, diagnosis = _searched(_with_sizes(whole, values), values, settings, ways)
+        note = f"the fit was reached with {' and '.join(sorted(names))}: without it the model loses longer stretches"
         if {f.candidate.name for f in diagnosis.found} & frozenset().union(*ways):
-            note = "with what was found the model follows the whole runs, and they are judged whole"
+            note = "with what was found the model follows the whole runs, and these were fitted"
         return system, diagnosis, [] if start.whole else [note]
-    if answer is None:
-        raise AnalysisError(_not_followed(whole, declared))
+    if not start.followed:
+        raise AnalysisError(_failure(whole, declared))
     note = (
-        f"the model loses the data after {start.followed:.2g} s: runs are taken in {len(system.stretches)} stretches "
-        f"of {lasting(system):.3g} s with an initial state each"
+        f"the model follows the data for {start.followed:.2g} s only: runs are in {len(system.stretches)} stretches "
+        f"of {shooting.longest_duration(system):.3g} s with an initial state each"
     )
     further = ["with it the model does not follow the whole runs"] if diagnosis.found else []
     return system, diagnosis, [] if start.whole else [note, *further]
 
 
 def _promising(diagnosis: Diagnosis, whole: bool) -> list[tuple[str, ...]]:
-    """Terms by way of which a fit of whole runs may be reached; none where an answer of whole runs needs no better one.
+    """Terms with which a fit of whole runs may be reached; none where the answer is one of whole runs already.
 
-    Of an arm that friction stops, no step leads from a motion without end to the instant at which it stops.
+    For an arm that friction stops, no fit gets from a motion that never ends to the instant of the stop.
     """
     if diagnosis.found or (whole and diagnosis.verdict != "unexplained"):
         return [] if whole else [tuple(f.candidate.name for f in diagnosis.found)]
@@ -127,39 +127,39 @@ def _promising(diagnosis: Diagnosis, whole: bool) -> list[tuple[str, ...]]:
 def _searched(
     system: EquationSystem, values: Mapping[str, float], settings: Settings, former: Former | None = None
 ) -> tuple[EquationSystem, Diagnosis]:
-    """The engine's search, with jumps as sharp as the motion asks, and limits where they tell most.
+    """The search of the engine, with initial guesses of shapes, and jumps that are sharp enough for the motion.
 
-    former : as of `explain`; then the values are those of one of these
+    former : see `explain`; then the values are those of one of these
     """
-    system = _aimed(system, values)
+    system = _with_guesses(system, values)
     scans = SCANNED * len(system.formulas.along)
-    if scans:  # each value that was looked at is a chance more
+    if scans:  # each value tried is a further trial
         share = len(system.candidates) / (len(system.candidates) + scans)
         settings = replace(settings, false_alarm=settings.false_alarm * share)
     values = {q.name: values[q.name] for q in system.base if q.name in values}
     diagnosis = explain(system, values, settings, system.training, former)
     if diagnosis.held_out_before is None and np.isfinite(diagnosis.before.chi_square):
-        # no step leads down: by way of others, and without what the data do not tell apart
-        system = replace(system, held=(*system.held, *redundant(system, diagnosis.before.values)))
-        values = trusted(system, system.base, diagnosis.before.values)
+        # not converged: hold unidentifiable parameters, and start from a trust-region fit
+        system = replace(system, held=(*system.held, *unidentifiable(system, diagnosis.before.values)))
+        values = shooting.trust_region(system, system.base, diagnosis.before.values)
         diagnosis = explain(system, values, settings, system.training)
 
-    sharper = _sharp_enough(system, diagnosis.after)
+    sharper = _with_sharp_jumps(system, diagnosis.after)
     if sharper is system:
         return system, diagnosis
-    return sharper, explain(sharper, diagnosis.before.values, settings, sharper.training, _former(diagnosis))
+    return sharper, explain(sharper, diagnosis.before.values, settings, sharper.training, _starts(diagnosis))
 
 
-def _former(diagnosis: Diagnosis) -> Former:
-    """What an answer found or came nearest by, as where fits of nearly the same system may begin."""
+def _starts(diagnosis: Diagnosis) -> Former:
+    """Explanations of an answer, as initial values for nearly the same system."""
     found = {frozenset(f.candidate.name for f in diagnosis.found): diagnosis.after.values}
     if (nearest := diagnosis.nearest) is not None:
         found[frozenset(nearest.effects)] = nearest.fit.values
     return {names: values for names, values in found.items() if names}
 
 
-def _aimed(system: EquationSystem, values: Mapping[str, float]) -> EquationSystem:
-    """With a start for every term that has a number to be tried along the motion, where it explains most."""
+def _with_guesses(system: EquationSystem, values: Mapping[str, float]) -> EquationSystem:
+    """With an initial guess of every shape that is tried along the motion: where its term gains most to first order."""
     f = system.formulas
     if not f.along:
         return system
@@ -177,7 +177,7 @@ def _aimed(system: EquationSystem, values: Mapping[str, float]) -> EquationSyste
             value = float(np.nanquantile(np.concatenate([x[i] for x in passed]), share))
             bounds = f.declared[name]
             tried[name] = float(np.clip(value, bounds.lower, bounds.upper))
-        there = replace(system, aims=tried)
+        there = replace(system, guesses=tried)
         if not np.isfinite(there.linearise(values, [n for c in amounts for n in c.names])[1]).all():
             continue
         linear = Linearisation(there, here, amounts)
@@ -185,30 +185,30 @@ def _aimed(system: EquationSystem, values: Mapping[str, float]) -> EquationSyste
             gain, _ = linear.gain_of(c.names)
             if gain > best.get(c.name, (0.0, {}))[0]:
                 best[c.name] = gain, {n: v for n, v in tried.items() if f.owner[n] == c.name}
-    return replace(system, aims={n: v for _, aims in best.values() for n, v in aims.items()})
+    return replace(system, guesses={n: v for _, guesses in best.values() for n, v in guesses.items()})
 
 
-def _leading(
+def _reached_by(
     system: EquationSystem, values: Values, terms: Collection[tuple[str, ...]]
 ) -> dict[frozenset[str], dict[str, float]]:
-    """Those with which, over longer and longer stretches, the model follows the data to their end; the best first."""
-    ways = {frozenset(names): led(replace(system, promoted=names), values) for names in terms}
+    """Terms with which multiple shooting reaches whole runs, with the values; the best first."""
+    ways = {frozenset(names): shooting.fitted_start(replace(system, promoted=names), values) for names in terms}
     whole = {names: way.values for names, way in ways.items() if way.whole}
-    return dict(sorted(whole.items(), key=lambda item: misfit(system, item[1])))
+    return dict(sorted(whole.items(), key=lambda item: shooting.misfits(system, item[1]).max()))
 
 
-def _prepared(system: EquationSystem) -> tuple[EquationSystem, dict[str, float]]:
-    """With sizes of states and widths of jumps read off the data, and initial states."""
-    values, sizes = guessed(system)
+def _with_guessed_sizes(system: EquationSystem) -> tuple[EquationSystem, dict[str, float]]:
+    """With sizes of states and widths of jumps estimated from the data; and the initial states."""
+    values, sizes = shooting.initial_guess(system)
     system = replace(system, sizes=sizes)
-    # states of the size that the data show, in place of a motion that is not known yet
+    # oscillating states of these sizes, as the motion is not known yet
     phase = 2 * np.pi * np.arange(64) / 64
     states = np.sqrt(2) * sizes * np.cos(phase[:, None] + np.arange(len(sizes)))
     return replace(system, widths=_widths(system, [(system.stretches[0], states)])), values
 
 
 def _widths(system: EquationSystem, along: Sequence[tuple[Samples, Array]]) -> dict[str, float]:
-    """Of every jump, from the rms of what jumps along these motions."""
+    """Of every jump, from the rms of its argument along these motions."""
     f = system.formulas
     square, count = np.zeros(len(f.widths)), 0
     for s, states in along:
@@ -219,10 +219,10 @@ def _widths(system: EquationSystem, along: Sequence[tuple[Samples, Array]]) -> d
     return {w.name: JUMP * (x or 1.0) for w, x in zip(f.widths.values(), size, strict=True)}
 
 
-def _sharp_enough(system: EquationSystem, fitted: Fit) -> EquationSystem:
-    """With jumps so sharp that sharper ones would move the motion by nothing that matters; mostly as it is.
+def _with_sharp_jumps(system: EquationSystem, fitted: Fit) -> EquationSystem:
+    """With jumps so sharp that even sharper ones would not change the motion significantly; mostly unchanged.
 
-    A thousandth of what jumps is much where a ball's contact is as short, or where a motion starts from rest.
+    The first width is too large where the contact of a ball is very short, or where a motion starts from rest.
     """
     first, share = system.widths, 1.0
     if not first or not np.isfinite(fitted.chi_square):
@@ -238,21 +238,21 @@ def _sharp_enough(system: EquationSystem, fitted: Fit) -> EquationSystem:
     return system
 
 
-def _sized(system: EquationSystem, values: Mapping[str, float]) -> EquationSystem:
-    """With sizes and widths of the motion as fitted, and what each term's numbers would typically be."""
+def _with_sizes(system: EquationSystem, values: Mapping[str, float]) -> EquationSystem:
+    """With sizes and widths from the fitted motion, and typical sizes of the terms' parameters."""
     found = [(s, m) for s, m in zip(system.stretches, system.predictions(values), strict=True) if m is not None]
     if not found:
         return system
     sizes = np.maximum(np.max([np.abs(m.states).max(axis=0) for _, m in found], axis=0), 1e-9 * system.sizes)
     system = replace(system, sizes=sizes, widths=_widths(system, [(s, m.states) for s, m in found]))
-    found_alike = sizes_alike(system, values)
+    found_alike = shooting.scales(system, values)
     typical = {name: USUAL_SHARE * size for name, size in found_alike.items() if system.formulas.owner[name]}
     return replace(system, typical=typical)
 
 
-def redundant(system: EquationSystem, values: Mapping[str, float]) -> tuple[str, ...]:
-    """Parameters that the data cannot part from others, to be held as declared."""
-    # of many runs with numbers of their own a few tell it
+def unidentifiable(system: EquationSystem, values: Mapping[str, float]) -> tuple[str, ...]:
+    """Parameters that these data do not distinguish from others; they are to be held as declared."""
+    # a few of many runs are enough
     every = -(-len(system.stretches) * len(system.formulas.states) // MOST_STATES)
     system = replace(system, stretches=system.stretches[::every])
     states = [q for q in system.base if q.is_initial]
@@ -273,14 +273,14 @@ def redundant(system: EquationSystem, values: Mapping[str, float]) -> tuple[str,
         open_ = [str(stems[left[j]]) for i, j in enumerate(order) if abs(R[i, i]) <= REDUNDANT]
         if not open_:
             break
-        weak.append(max(reversed(open_), key=open_.count))  # runs may leave one or the other of two open
+        weak.append(max(reversed(open_), key=open_.count))  # in different runs it may be either of two
     return tuple(sorted(weak))
 
 
-def _with_memory(system: EquationSystem, diagnosis: Diagnosis, settings: Settings) -> tuple[Diagnosis, bool, list[str]]:
-    """Search again with noise that remembers, where what is left of the best model does and is as small as noise.
+def _prewhiten(system: EquationSystem, diagnosis: Diagnosis, settings: Settings) -> tuple[Diagnosis, bool, list[str]]:
+    """Search again with autocorrelated noise, where the residuals are autocorrelated and small enough for noise.
 
-    returns : diagnosis, whether its noise remembers, and a remark on that
+    returns : diagnosis, whether its noise is autocorrelated, and a remark on that
     """
     if settings.noise is not None or diagnosis.held_out_before is None:
         return diagnosis, False, []
@@ -292,84 +292,85 @@ def _with_memory(system: EquationSystem, diagnosis: Diagnosis, settings: Setting
     if not coefficients.any():
         return diagnosis, False, []
     size = float(np.sqrt(np.sum(residual**2) / max(present.sum(), 1)))
-    memory = persistence(residual, system.rows) * float(np.median(np.diff(ample(system)[0].time)))
-    shortest_turn = min(min(turn(s), _pace(s)) for s in ample(system))
-    # so slow an error is the motion's own: that it can be predicted sample by sample does not make it noise
-    as_noise = diagnosis.verdict != "unexplained" or memory <= SLOW * shortest_turn
+    longest = shooting.longest_stretches(system)
+    lasting = correlation_lag(residual, system.rows) * float(np.median(np.diff(longest[0].time)))
+    shortest_period = min(min(shooting.period(s), _decorrelation_period(s)) for s in longest)
+    # slow residuals are errors of the model, although an autoregression can predict them
+    as_noise = diagnosis.verdict != "unexplained" or lasting <= SLOW * shortest_period
     as_noise &= size <= NO_SENSOR
-    remembering = without_memory(system, system.rows, coefficients, present)
-    base = fit(remembering, system.base, diagnosis.before.values) if as_noise else None
+    white = prewhitened(system, system.rows, coefficients, present)
+    base = fit(white, system.base, diagnosis.before.values) if as_noise else None
     if base is None or not base.converged:
         if diagnosis.verdict != "unexplained":
             return diagnosis, False, []
-        reason = f"what is left is {size:.3g} times the noise and lasts for {memory:.2g} s: no sensor's noise"
-        diagnosis = replace(_certain(system, diagnosis), reason=reason)
-        return diagnosis, False, ["sigmas are those of what is left, not of the noise alone"]
+        reason = f"residuals are {size:.3g} times the noise and correlated over {lasting:.2g} s: no sensor's noise"
+        diagnosis = replace(_with_residual_sigmas(system, diagnosis), reason=reason)
+        return diagnosis, False, ["sigmas are scaled to the residuals, which are larger than the noise"]
     noise = float(share * size**2)
-    again = explain(remembering, base.values, replace(settings, noise=noise), system.training, _former(diagnosis))
+    again = explain(white, base.values, replace(settings, noise=noise), system.training, _starts(diagnosis))
     order = int(np.max(np.nonzero(coefficients)[1])) + 1
-    text = f"what the model leaves remembers {order} sample{'s' if order > 1 else ''}; sigmas allow for that"
-    return replace(again, judged=again.judged or remembering), True, [text]
+    text = f"residuals are autocorrelated over {order} sample{'s' if order > 1 else ''}; sigmas allow for that"
+    return replace(again, judged=again.judged or white), True, [text]
 
 
-def _pace(s: Samples) -> float:
-    """Turn [s] of the oscillation that would lose its memory as fast as the data do, which an input may drive at will.
+def _decorrelation_period(s: Samples) -> float:
+    """Period [s] of the oscillation whose autocorrelation falls as fast as that of the data.
 
-    Of such data the strongest line is the slowest, and says nothing of how fast they change.
+    In data driven by an arbitrary input the strongest line is the slowest, and not the rate at which they change.
     """
     rows = np.isfinite(s.data)
     mean = np.nansum(s.data, axis=0) / np.maximum(rows.sum(axis=0), 1)  # a channel may show nothing in a stretch
     away = np.where(rows, (s.data - mean) / s.sigma, 0.0)
-    return persistence(away, [slice(0, len(away))]) * float(np.median(np.diff(s.time))) / FORGOTTEN
+    return correlation_lag(away, [slice(0, len(away))]) * float(np.median(np.diff(s.time))) / FORGOTTEN
 
 
-def _certain(system: EquationSystem, diagnosis: Diagnosis) -> Diagnosis:
-    """Sigmas, and gains by them (Wald's test), as what is left makes them."""
-    after, nearest = with_memory(system, diagnosis.after), diagnosis.nearest
+def _with_residual_sigmas(system: EquationSystem, diagnosis: Diagnosis) -> Diagnosis:
+    """Sigmas scaled by the residuals, and gains by Wald's test with these."""
+    after, nearest = with_autocorrelation(system, diagnosis.after), diagnosis.nearest
     gains = [wald(*after.amounts(f.candidate.names)) for f in diagnosis.found]
     return replace(
         diagnosis,
         found=tuple(replace(f, gain=gain) for f, gain in zip(diagnosis.found, gains, strict=True)),
-        before=with_memory(system, diagnosis.before),
+        before=with_autocorrelation(system, diagnosis.before),
         after=after,
-        nearest=None if nearest is None else replace(nearest, fit=with_memory(system, nearest.fit)),
+        nearest=None if nearest is None else replace(nearest, fit=with_autocorrelation(system, nearest.fit)),
     )
 
 
-def _not_followed(system: EquationSystem, values: Mapping[str, float]) -> str:
-    lost = misfit(system, dict(values))
+def _failure(system: EquationSystem, values: Mapping[str, float]) -> str:
+    lost = shooting.misfits(system, dict(values)).max()
     what = "is nothing like the data"
     if not np.isfinite(lost):
-        what = "has no value somewhere on the way (the root of a negative number, a division by zero, no end of growth)"
+        what = "has no value at some instant (the root of a negative number, a division by zero, unlimited growth)"
     elif not np.isfinite(system.linearise(values, [q.name for q in system.base])[1]).all():
         return (
-            "the motion can be followed, but not how it depends on its parameters: so it is where equations jump, as "
-            "at a stiff contact. Write the contact wider, or cut the data into runs without it."
+            "the motion can be integrated, but not its derivatives by the parameters, as where equations jump at a "
+            "contact. Write the contact wider, or cut the data into runs without it."
         )
     guess = ", ".join(f"{k.partition('.')[2]} = {v:.4g}" for k, v in list(values.items())[:4] if k.startswith("state."))
     return (
-        f"the model does not follow the data even over a short time (residual over {LOST:.0%} of the signal): "
+        f"the model does not follow the data even over a short time (residual over {shooting.LOST:.0%} of the signal): "
         f"as declared it {what}. Guessed start: {guess}. Check signs and units of the equations, declare parameters "
         "nearer to the truth, or give Run(start={...})."
     )
 
 
 def _sensor_notes(samples: Sequence[Samples], channel: int, name: str) -> list[str]:
-    """Steps in which a sensor shows, and limits at which it stands."""
+    """Notes on the resolution of a sensor, and on limits of its range."""
     notes = []
     values = [s.data[:, channel] for s in samples if np.isnan(s.sigma[:, channel]).any()]
-    step = step_of(values) if values else 0.0
-    if step and fast_part(values) < 3 * step:
-        notes.append(f"{name} stands on steps of {step:.4g}, which alone scatter by {step / np.sqrt(12):.3g}")
+    step = quantisation(values) if values else 0.0
+    if step and noise_sigma(values) < 3 * step:
+        notes.append(f"{name} has a resolution of {step:.4g}, a rounding noise of {step / np.sqrt(12):.3g}")
     everything = np.concatenate([s.data[:, channel] for s in samples])
     least, most = np.nanmin(everything, initial=np.inf), np.nanmax(everything, initial=-np.inf)
     if least == most:
         raise AnalysisError(f"{name} shows {most:g} at all times: its sensor is dead. Leave it out.")
-    for limit, which in ((most, "most"), (least, "least")):
+    for limit, which in ((most, "largest"), (least, "smallest")):
         count = int(np.sum(everything == limit))
         if not step and count > STANDS:  # noise repeats no value; an encoder at rest does
             notes.append(
-                f"{name} shows {limit:.4g}, the {which} of all, {count} times: where its sensor is dead or at its "
+                f"{name} shows its {which} value, {limit:.4g}, {count} times: where its sensor is dead or at its "
                 "limit, write NaN, or offer terms.sensor_limit"
             )
     return notes

@@ -17,7 +17,7 @@ from disctrack.report.palette import BLUE, MUTED, RED
 if TYPE_CHECKING:
     from disctrack.discrepancy.equations.answer import Answer
 
-_MOST_POINTS = 6000  # of a curve: a page shows no more
+_MOST_POINTS = 6000  # of a curve: more are not visible on a page
 _MOST_STRETCHES = 6
 
 
@@ -29,7 +29,7 @@ def write_answer(answer: Answer, path: Path) -> list[Path]:
 
 
 def _law(answer: Answer, law: LearnedForce) -> Drawn:
-    """The law that was learned with its band."""
+    """The learned law with its confidence band."""
     along, added = law.along, f"added to d{law.along.equation}/dt"
     named = ("time",) if along.of_time else along.variables
     labels = [in_unit(name, unit) for name, unit in zip(named, along.units(answer.equations.units), strict=True)]
@@ -42,11 +42,11 @@ def _law(answer: Answer, law: LearnedForce) -> Drawn:
         picture.colorbar(points, label=added)
         axes.set(xlabel=labels[0], ylabel=labels[1])
     held = f", beyond {' and '.join(law.held)} as declared" if law.held else ""
-    return Drawn("law", "law", f"{law.along.title}, learned from what is left{held}.", picture)
+    return Drawn("law", "law", f"{law.along.title}, learned from the residuals{held}.", picture)
 
 
 def _drawn(answer: Answer, channel: int, name: str) -> Drawn:
-    """Data and model, and what is left in time and frequency: the first stretches."""
+    """Data and model, and the residuals in time and frequency, of the first stretches."""
     unit = answer.equations.units.get(name, "")
     picture, (top, middle, bottom) = panels(9, 7, 3)
     sides = [answer.predicted(f)[:_MOST_STRETCHES] for f in (answer.diagnosis.before, answer.diagnosis.after)]
@@ -70,5 +70,5 @@ def _drawn(answer: Answer, channel: int, name: str) -> Drawn:
     for axes in (top, middle, bottom):
         if axes.get_legend_handles_labels()[1]:
             axes.legend(frameon=False, fontsize=8)
-    caption = f"{name}: measured, modelled, and what is left before and after, in time and in frequency."
+    caption = f"{name}: measured and modelled; residuals before and after, in time and in frequency."
     return Drawn(name, name, caption, picture)

@@ -18,38 +18,38 @@ from disctrack.discrepancy.system import Budget, Candidate, Quantity, System, Va
 from disctrack.errors import AnalysisError
 
 TOLERANCE = 1e-10  # of a step, relative to the size of a state
-MAX_STEPS = 400_000  # after which a motion is given up ...
-HARDER = 50  # ... or after so many times those of the motion from which a fit's step leads to it: it leads astray
-MOST_WORK = 2e8  # of an answer: steps of the integrator, times states and sensitivities, some 1 us each ...
-OF_ONE = 0.1  # ... and share of it, that one hypothesis among many may take
-MOST_STATES = 80  # initial states that are fitted along where others would tell no more that is new
-EACH = "*"  # in the place of a stretch: each has a number of its own
+MAX_STEPS = 400_000  # limit of an integration ...
+HARDER = 50  # ... and over the steps of the motion before a fit's step: a motion so much harder is rejected
+MOST_WORK = 2e8  # of an answer: steps of the integrator times states and sensitivities, some 1 us each ...
+OF_ONE = 0.1  # ... and share of it for one trial
+MOST_STATES = 80  # initial states that are fitted together: further stretches add little
+EACH = "*"  # in place of a stretch's name, where each has a quantity of its own
 
 
 @dataclass(frozen=True)
 class Prediction:
-    """Motion and sensors over one stretch."""
+    """Predicted motion and sensor values over one stretch."""
 
     states: Array  # (n, n_states) at the true instants of the first channel
-    seen: Array  # (n, w)
+    seen: Array  # (n, w) sensor values
     derivative: Array  # (n, w, k)
 
 
 @dataclass(eq=False, repr=False)
 class EquationSystem(System):
-    """Samples of all stretches, whose noise is known, with a row without data between two of them."""
+    """Samples of all stretches with known noise; a row without data separates consecutive stretches."""
 
     formulas: Formulas
     stretches: Sequence[Samples]
     sizes: Array  # (n,) of the states
     widths: dict[str, float]  # of jumps
-    promoted: Sequence[str] = ()  # terms that every fit has
-    held: Sequence[str] = ()  # parameters that no fit moves
-    typical: Mapping[str, float] = field(default_factory=dict)  # sizes of the terms' numbers that would surprise nobody
-    aims: Mapping[str, float] = field(default_factory=dict)  # initial guesses of shapes that are fitted from the start
-    budget: Budget = field(default_factory=lambda: Budget(MOST_WORK))  # of all that answer one question
+    promoted: Sequence[str] = ()  # terms that belong to the base model
+    held: Sequence[str] = ()  # parameters that are not fitted
+    typical: Mapping[str, float] = field(default_factory=dict)  # typical sizes of the terms' parameters
+    guesses: Mapping[str, float] = field(default_factory=dict)  # initial guesses of shapes, fitted at once
+    budget: Budget = field(default_factory=lambda: Budget(MOST_WORK))  # shared by all systems of one diagnosis
     trial_steps = OF_ONE * MOST_WORK
-    several_minima = frees_shapes = True  # what users declare may bend anyhow
+    several_minima = frees_shapes = True  # users may declare any equations
 
     def __post_init__(self) -> None:
         lengths = [len(s.time) for s in self.stretches]
@@ -64,10 +64,11 @@ class EquationSystem(System):
             self.weights[rows] = np.isfinite(s.data).sum(axis=1)
             self.training[rows] = fitted_rows(s)
         self._places: dict[str, dict[str, int]] = {}
-        self._steps: dict[str, int] = {}  # by stretch: of the motion with which derivatives were asked for last
-        self._defaults = self.formulas.defaults() | self.widths | dict(self.aims)
+        self._steps: dict[str, int] = {}  # by stretch: of the last integration with derivatives
+        self._defaults = self.formulas.defaults() | self.widths | dict(self.guesses)
         self._declared = self.formulas.declared | {
-            name: replace(self.formulas.declared[name], value=value, shape=False) for name, value in self.aims.items()
+            name: replace(self.formulas.declared[name], value=value, shape=False)
+            for name, value in self.guesses.items()
         }
         self._per = {name: p.per for name, p in self._declared.items() if p.per}
         self.base = tuple(self._base())
@@ -92,7 +93,7 @@ class EquationSystem(System):
         return found
 
     def _with_slots(self, name: str, quantities: Sequence[Quantity]) -> list[Quantity]:
-        """With a slot where a number without bounds belongs to one stretch alone."""
+        """With a slot for every quantity without bounds that belongs to a single stretch."""
         stretches: dict[str, list[int]] = {}
         for i, s in enumerate(self.stretches):
             stretches.setdefault(self._name(name, s), []).append(i)
@@ -115,7 +116,7 @@ class EquationSystem(System):
         ]
 
     def _name(self, name: str, s: Samples) -> str:
-        """Of the quantity that a number is in a stretch. Raises AnalysisError where its run is in no such group."""
+        """Name of a parameter's quantity in a stretch. Raises AnalysisError where its run has no such group."""
         if name not in self._per:
             return name
         kind = self._per[name]
@@ -133,7 +134,7 @@ class EquationSystem(System):
         return Candidate(term.name, term.name, kind, term.title or term.name, term.source, amounts, shape=shape)
 
     def linearise(self, values: Values, names: Sequence[str]) -> tuple[Array, Array]:
-        """Whitened residual (n, w), data minus prediction, and the prediction's derivative (n, w, k)."""
+        """See System."""
         residual = np.zeros((len(self.time), self._w))
         derivative = np.zeros((len(self.time), self._w, len(names)))
         for rows, s in zip(self.rows, self.stretches, strict=True):
@@ -156,11 +157,11 @@ class EquationSystem(System):
         return residual, derivative
 
     def predictions(self, values: Values) -> list[Prediction | None]:
-        """What every stretch should show; None where the motion cannot be followed to its end."""
+        """Predictions of all stretches; None where the motion cannot be integrated to the end."""
         return [self.predict(values, s) for s in self.stretches]
 
     def names_of(self, s: Samples) -> dict[str, int]:
-        """Quantities that move a stretch: the place of each in p, or -1 - i of the i-th state at the start."""
+        """Quantities of a stretch: the index of each in p, or -1 - i for the i-th initial state."""
         if s.name not in self._places:
             states, numbers = self.formulas.equations.states, self.formulas.names
             found = {f"state.{n}[{where}]": -1 - i for i, n in enumerate(states) for where in (s.name, EACH)}
@@ -169,7 +170,7 @@ class EquationSystem(System):
         return self._places[s.name]
 
     def numbers(self, values: Values, s: Samples) -> Array:
-        """(n_p,) all numbers of a stretch."""
+        """(n_p,) all parameters and constants of a stretch."""
         known = self._defaults | dict(s.constants)
         return np.array([values.get(self._name(n, s), values.get(n, v)) for n, v in known.items()], float)
 
@@ -180,9 +181,9 @@ class EquationSystem(System):
         return np.array([values.get(f"state.{n}[{s.name}]", declared.get(n, 0.0)) for n in states], float)
 
     def predict(self, values: Values, s: Samples, names: Sequence[str] = ()) -> Prediction | None:
-        """What a stretch should show, with its derivatives by quantities that it has (`names_of`).
+        """Prediction of a stretch, with derivatives by those of the quantities that it has (`names_of`).
 
-        None where the motion cannot be followed to its end.
+        None where the motion cannot be integrated to the end.
         """
         known = self.names_of(s) if names else {}
         own = [known[name] for name in names if name in known]
@@ -197,7 +198,7 @@ class EquationSystem(System):
         columns = np.array([max(which, -1) for which in own], np.int64)
         late, by_number = self._lateness(s, p)
         times, which_time = np.unique(s.time + late, return_inverse=True)
-        at = which_time.reshape(late.shape).T, np.arange(self._w)  # sensors that are late see other instants
+        at = which_time.reshape(late.shape).T, np.arange(self._w)  # sensors with a lag show earlier instants
         span = s.time[0], max(float(times[-1]), s.time[0] + 1e-9)
         most = MAX_STEPS if names else min(MAX_STEPS, HARDER * self._steps.get(s.name, MAX_STEPS))
         out = np.empty((len(times), len(z0)))
@@ -219,7 +220,7 @@ class EquationSystem(System):
                 derivative[..., j] += by_own[..., which]
         derivative = derivative[at]
         if k and f.is_late:
-            with np.errstate(invalid="ignore"):  # a motion that ran away has no slope
+            with np.errstate(invalid="ignore"):  # a diverging motion has no slope
                 slope = np.einsum("mwn,mn->mw", by_state, f.rates_at(s, p, times, states)[0])[at]
                 for j, which in enumerate(own):
                     if 0 <= which < by_number.shape[1]:
@@ -227,25 +228,25 @@ class EquationSystem(System):
         return Prediction(states[at[0][:, 0]], seen[at], derivative)
 
     def _lateness(self, s: Samples, p: Array) -> tuple[Array, Array]:
-        """True instants minus those written beside the samples (w, m), and their derivatives (w, n_fitted, m)."""
+        """True minus recorded instants of the samples (w, m), and their derivatives (w, n_fitted, m)."""
         if not self.formulas.is_late:
             return np.zeros((self._w, len(s.time))), np.zeros((self._w, 0, len(s.time)))
         late, by_number = self.formulas.lateness(s.time, p)
-        if s.at_rest:  # what was shown before the motion began is what is shown as it begins
+        if s.at_rest:  # before the first sample the sensor showed the initial state
             before = s.time + late <= s.time[0]
             late = np.where(before, s.time[0] - s.time, late)
             by_number = np.where(before[:, None], 0.0, by_number)
         return late, by_number
 
     def inputs_of(self, s: Samples, times: Array | None = None) -> list[Array]:
-        """Every input (m,) at instants of a stretch (at its samples, if not said); late ones as if they were not."""
+        """Every input (m,) at instants of a stretch (by default its samples); delayed ones without their delay."""
         if not len(s.pieces):
             return []
         found = list(PPoly(s.pieces[:, :4].transpose(1, 2, 0), s.knots)(s.time if times is None else times).T)
         return [*found, *(found[which] for which, _ in self.formulas.late_inputs)]
 
     def along(self, values: Values, s: Samples) -> tuple[Array, Array, Array, Array]:
-        """Rates (m, n), their derivatives (m, n, n_p), sensors (m, w), theirs (m, w, n_p) along a stretch's motion."""
+        """Along the motion of a stretch: rates (m, n) and sensors (m, w), each followed by its derivatives by p."""
         p, found = self.numbers(values, s), self.predict(values, s)
         states = np.zeros((len(s.time), len(self.formulas.states))) if found is None else found.states
         rates, _, by_number = self.formulas.rates_at(s, p, s.time, states)
@@ -254,14 +255,14 @@ class EquationSystem(System):
 
 
 def fitted_rows(s: Samples) -> Mask:
-    """(n,) True for the samples to which a fit is made that the others judge."""
+    """(n,) True for training samples; the others are held out."""
     if s.fit_until is not None:
         return np.asarray(s.time <= (s.fit_until or -np.inf), bool)
     return np.asarray(s.time - s.time[0] <= TRAIN_FRACTION * (s.time[-1] - s.time[0]), bool)
 
 
 def cut(s: Samples, duration: float) -> list[Samples]:
-    """A stretch in parts of so many seconds, that begin with data; those of twice the duration begin where some do."""
+    """A stretch in parts of this duration [s] that start with data; parts of twice the duration share their starts."""
     present = np.flatnonzero(np.isfinite(s.data).any(axis=1))
     new = np.flatnonzero(np.diff(np.floor((s.time[present] - s.time[0]) / duration))) + 1
     return [s.part(a, b) for a, b in pairwise([0, *present[new].tolist(), len(s.time)])]

@@ -1,8 +1,8 @@
-"""Terms that equations often lack, ready to be offered; any other is a `Term` of the user's own.
+"""Common candidate terms; users may declare others as `Term`.
 
 Amounts are accelerations (or generalised forces, where a mass matrix is declared) in the units of the equation to which
-a term is added. `v` is a velocity, `x` its coordinate; both may be formulas. A term's own numbers are written own_...,
-so that formulas which are handed in mean the equations' numbers of the same name.
+a term is added. `v` is a velocity, `x` its coordinate; both may be formulas. The parameters of a term are written
+own_..., so that formulas given as arguments refer to the parameters of the equations.
 """
 
 import re
@@ -33,7 +33,7 @@ def coulomb(v: str, load: str = "1", name: str = "") -> Term:
 
 
 def stribeck(v: str, name: str = "") -> Term:
-    """Dry friction that is larger at rest and in slow motion, up to a speed that is looked for."""
+    """Dry friction that is larger at rest and in slow motion, below a speed that is fitted."""
     speed = Parameter(1.0, lower=1e-12, shape=True, along=f"abs({v})")
     formula, title = f"-own_c*exp(-(({v})/own_speed)**2)*sign({v})", f"more friction on {v} in slow motion"
     return _on(v, formula, name or f"stribeck_{v}", title, "Stribeck 1902", c=_POSITIVE, speed=speed)
@@ -45,7 +45,7 @@ def viscous(v: str, name: str = "") -> Term:
 
 
 def deflected(v: str, x: str, name: str = "") -> Term:
-    """Viscous friction that grows with the square of the deflection; beside a negative one it keeps up a cycle."""
+    """Viscous friction proportional to the squared deflection; with a negative viscous one it sustains a cycle."""
     title = f"viscous friction on {v} by the square of {x}"
     return _on(v, f"-own_c*({x})**2*({v})", name or f"deflected_{v}", title, "van der Pol 1926", c=_ANY)
 
@@ -83,7 +83,7 @@ def cubic_spring(v: str, x: str, name: str = "") -> Term:
 
 
 def end_stop(v: str, x: str, side: int = 1, name: str = "") -> Term:
-    """A spring that is met beyond a place that is looked for: a stop, a bumper.   side : -1 where x cannot go lower"""
+    """A spring that acts beyond a fitted place: a stop, a bumper.   side : -1 for a lower limit of x"""
     place = Parameter(0.0, shape=True, along=x)
     formula = f"-{side}*own_k*Max({side}*(({x}) - own_place), 0)"
     return _on(v, formula, name or f"stop_{x}", f"stop on {x}", k=_POSITIVE, place=place)
@@ -103,7 +103,7 @@ def backlash(v: str, x: str, stiffness: str, onto: Mapping[str, str] | None = No
 
 
 def overflow(equations: Equations, level: str, into: str = "", name: str = "") -> Term:
-    """Above a level that is looked for, a share of what flows in runs over (1: the level cannot rise), into another.
+    """Above a fitted level, a share of the inflow runs over (1: the level cannot rise), into another state.
 
     level : a state; its declared equation is what flows in. What runs over is a flow in the unit of that equation.
     """
@@ -158,7 +158,7 @@ def sensor_curvature(channel: str, shown: str = "", name: str = "") -> Term:
 
 
 def sensor_limit(channel: str, shown: str = "", name: str = "") -> Term:
-    """Above a value that is looked for the sensor shows no more (share 1). `shown`: its formula, as for its scale."""
+    """Above a fitted value the sensor saturates (share 1).   shown : its formula, if a state has its name"""
     shown = shown or channel
     formula, title = f"-own_share*Max(({shown}) - own_top, 0)", f"{channel} is limited by its sensor"
     top = Parameter(0.0, shape=True, along=shown)
@@ -166,13 +166,13 @@ def sensor_limit(channel: str, shown: str = "", name: str = "") -> Term:
 
 
 def sensor_lag(channel: str, name: str = "") -> Term:
-    """The sensor shows what was a little earlier; seen only beside another sensor or a measured input."""
+    """The sensor has a lag; identifiable only with another sensor or a measured input."""
     tau = {"tau": Parameter(0.0, unit="s")}
     return Term(name or f"lag_{channel}", lag={channel: "own_tau"}, parameters=tau, title=f"{channel} late")
 
 
 def clock_rate(name: str = "clock_rate") -> Term:
-    """The time written beside the samples runs slow or fast."""
+    """The recorded time runs slow or fast."""
     r = {"r": Parameter(0.0, typical=1e-3)}
     return Term(name, clock="own_r*t", parameters=r, title="rate of the clock wrong")
 
@@ -190,20 +190,20 @@ def dead_zone(v: str, u: str, gain: str, name: str = "") -> Term:
 
 
 def saturation(v: str, u: str, gain: str, name: str = "") -> Term:
-    """Beyond a limit that is looked for the input acts no more (share 1); `gain` is its factor in the equation of v."""
+    """Beyond a fitted limit the input saturates (share 1); `gain` is its factor in the equation of v."""
     formula, title = f"-own_share*({gain})*sign({u})*Max(abs({u}) - own_limit, 0)", f"the input {u} saturates"
     limit = Parameter(0.0, lower=0.0, shape=True, along=f"abs({u})")
     return _on(v, formula, name or f"saturation_{u}", title, share=_SHARE, limit=limit)
 
 
 def input_delay(v: str, u: str, gain: str, name: str = "") -> Term:
-    """The measured input acts late; `gain` is its factor in the equation of v."""
+    """The measured input acts with a delay; `gain` is its factor in the equation of v."""
     tau, late, rates = {"tau": Parameter(0.0, unit="s")}, {"late": (u, "own_tau")}, {v: f"({gain})*(own_late - {u})"}
     return Term(name or f"delay_{u}", rates, delayed=late, parameters=tau, title=f"input {u} acts late")
 
 
 def usual(equations: Equations) -> tuple[Term, ...]:
-    """What is offered where the user offers nothing, by the structure of the equations; and what sensors do.
+    """Default terms, by the structure of the equations; and common errors of sensors.
 
     A coordinate is a state whose declared rate is another state: rates={"x": "v", "v": ...}; that one is a velocity, on
     which friction and springs act. Any other state is a level (of a tank, a charge, a temperature): it leaks, is fed,

@@ -1,1 +1,1 @@
-"""Many recordings as one system: what they share, how the search goes over all of them, and who does not fit."""
+"""Many recordings as one system: shared quantities, the search over all of them, and inconsistent recordings."""

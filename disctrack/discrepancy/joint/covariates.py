@@ -1,4 +1,4 @@
-"""How does the coefficient of a law depend on what was declared: on nothing, on the surface, on a power of the mass?"""
+"""Does the coefficient of a law depend on the surface, or on a power of the mass, or on nothing declared?"""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,23 +12,23 @@ from scipy.optimize import least_squares
 from calibration.kit.arrays import Array
 from disctrack.discrepancy.score import INVISIBLE
 
-LEVEL = 0.01  # probability below which a hypothesis is refused, and with which chance alone brings a dependence forth
+LEVEL = 0.01  # significance: probability below which a hypothesis is rejected, and of a dependence by chance
 
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """One way in which the values of the groups may hang together."""
+    """A relation between the values of the groups."""
 
     text: str
     numbers: dict[str, tuple[float, float]]  # constant and exponent with their standard deviations
     chi_square: float
     degrees: int
-    criterion: float  # chi-square and the price of its numbers
-    parts: int  # covariates and kinds that it goes by
+    criterion: float  # chi-square and the penalty of its parameters
+    parts: int  # number of covariates and kinds that it uses
 
     @property
     def p_value(self) -> float:
-        """Of values that scatter so much about it; NaN where it has as many numbers as there are groups."""
+        """Probability of the scatter of the values about it; NaN without degrees of freedom."""
         return float(stats.chi2.sf(self.chi_square, self.degrees)) if self.degrees > 0 else float("nan")
 
     @property
@@ -43,16 +43,16 @@ def hypotheses(
     covariates: Mapping[str, Sequence[float]],
     kinds: Mapping[str, Sequence[str]] | None = None,
 ) -> list[Hypothesis]:
-    """Constant, or a constant for each surface or disc; in proportion to powers of covariates; the best first.
+    """Constant, or a constant for each surface or disc; proportional to powers of covariates; the best first.
 
     values (g,), covariance (g, g) : of the coefficient in each group, fitted together
     covariates : by name, one number per group
     kinds : "surface" (or "disc") -> which one it is in each group
-    Generalised least squares, exact to first order of the groups' uncertainties. A number costs what the best of so
-    many hypotheses gains by chance with a probability of `LEVEL`: a dependence is put first where it gains more.
+    Generalised least squares. The penalty of a parameter is what the best of so many hypotheses gains by chance with
+    probability `LEVEL`: a dependence is ranked first only where it gains more.
     """
     n = len(values)
-    unit = float(np.mean(np.abs(values))) or 1.0  # a friction of 1e-8 m s^2 beside an exponent: numbers of one size
+    unit = float(np.mean(np.abs(values))) or 1.0  # coefficients may be 1e-8 and exponents 1: scale to the same size
     root = np.linalg.cholesky(covariance / unit**2)
     shapes = list(_shapes(n, covariates, kinds or {}))
     price = max(float(np.log(n)), float(stats.chi2.isf(LEVEL / max(len(shapes) - 1, 1), 1)))
@@ -96,7 +96,7 @@ def _text(kind: str, names: Sequence[str]) -> str:
 def _shapes(
     n: int, covariates: Mapping[str, Sequence[float]], kinds: Mapping[str, Sequence[str]]
 ) -> Iterator[tuple[str, tuple[str, ...], NDArray[np.intp], Array]]:
-    """Kind and covariates of each hypothesis that n groups test; which constant, and logarithms, by group."""
+    """Kind and covariates of each hypothesis that n groups can test; index of its constant and logarithms, by group."""
     usable = {k: x for k, v in covariates.items() if np.isfinite(x := np.asarray(v, float)).all() and (x > 0).all()}
     logarithms: dict[str, Array] = {k: np.log(x) - np.mean(np.log(x)) for k, x in usable.items()}
     names: list[tuple[str, ...]] = [(), *((k,) for k in logarithms), *combinations(logarithms, 2)]
@@ -109,15 +109,14 @@ def _shapes(
         for chosen in names:
             powers = np.array([logarithms[k] for k in chosen]).reshape(-1, n)
             columns = np.column_stack([level[:, None] == np.arange(constants), powers.T]).astype(float)
-            same = np.linalg.svd(columns, compute_uv=False).min() <= INVISIBLE * np.sqrt(
-                n
-            )  # as the others, or constant
-            if not chosen or (not same and n > columns.shape[1]):
+            # a covariate that is constant, or a combination of the others, is none
+            dependent = np.linalg.svd(columns, compute_uv=False).min() <= INVISIBLE * np.sqrt(n)
+            if not chosen or (not dependent and n > columns.shape[1]):
                 yield kind, chosen, level, powers
 
 
-def alike(found: Sequence[Hypothesis]) -> list[Hypothesis]:
-    """Those that describe the values as well as the first one, in as many numbers: nobody can tell which it is."""
+def equivalent(found: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """Hypotheses that fit as well as the first one, with as many parameters."""
     best, *rest = found
     near = best.chi_square + float(stats.chi2.isf(LEVEL, 1))
     return [h for h in rest if h.degrees == best.degrees and h.chi_square < near and best.degrees > 0 and h.holds]

@@ -1,7 +1,7 @@
-"""The recordings' data where the work is done: in this process, or dealt out to several.
+"""Objects that hold the recordings' data, in this process or distributed over several.
 
-Each recording stays with one process from beginning to end, and no recording sees another: answers do not depend on
-the number of processes. They end when they are closed, and with the process that started them.
+Each recording stays in one process, and recordings are independent: answers do not depend on the number of processes.
+These end when the crew is closed, and with the process that started them.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ ENDED_EARLY = (
 
 
 class Crew:
-    """Objects made by `build` from items, one for each, that answer calls of their methods."""
+    """Objects made by `build`, one for each item, whose methods are called remotely."""
 
     def __init__(self, build: Build, items: Sequence[Any], processes: int = 1) -> None:
-        """What `build` raises is kept in place of its object, as a DiscTrackError.
+        """An exception of `build` takes the place of its object, as a DiscTrackError.
 
-        build : a module's function or class, as it has to be found by other processes
+        build : a function or class of a module, which other processes can import
         """
-        self._kept = list(range(len(items)))  # numbers of the objects that are asked, in their order
+        self._kept = list(range(len(items)))  # indices of the objects that are called, in order
         self._here: dict[int, Any] = {}
         self._context, self._pools = Spawn(), list[ProcessPoolExecutor]()
         n = min(processes, len(items))
@@ -52,7 +52,7 @@ class Crew:
         self.close()
 
     def close(self) -> None:
-        """End the processes, whatever they do."""
+        """Terminate the processes."""
         for pool in self._pools:
             pool.shutdown(wait=False, cancel_futures=True)
         for process in self._context.started:
@@ -60,18 +60,18 @@ class Crew:
             process.join()
 
     def keep(self, numbers: Sequence[int]) -> None:
-        """From now on, number objects as these are counted: the others are asked nothing any more."""
+        """Call only these objects from now on; they are renumbered in this order."""
         self._kept = list(numbers)
 
     def call(
         self, method: str, arguments: Sequence[tuple[Any, ...]], numbers: Sequence[int] | None = None
     ) -> list[Any]:
-        """Results of a method of every object; a DiscTrackError takes the place of the result that it prevents.
+        """Results of a method of every object; an exception takes the place of its result, as a DiscTrackError.
 
-        numbers : of the objects that are asked, as they are counted now; all of them, if not given
+        numbers : indices of the objects that are called; by default all
         """
-        asked = self._kept if numbers is None else [self._kept[i] for i in numbers]
-        each = list(zip(asked, arguments, strict=True))
+        called = self._kept if numbers is None else [self._kept[i] for i in numbers]
+        each = list(zip(called, arguments, strict=True))
         if not self._pools:
             return [_answer(i, method, given, self._here) for i, given in each]
         try:
@@ -81,7 +81,7 @@ class Crew:
             raise AnalysisError(ENDED_EARLY) from error
 
 
-_objects: dict[int, Any] = {}  # of a process of its own
+_objects: dict[int, Any] = {}  # of a worker process
 
 
 def _begin(build: Build, items: dict[int, Any], objects: dict[int, Any] = _objects) -> None:
@@ -98,5 +98,5 @@ def _tried(function: Callable[..., Any], *arguments: Any) -> Any:
         return function(*arguments)
     except DiscTrackError as error:
         return error
-    except Exception as error:  # whatever is wrong with one recording, the others are diagnosed
+    except Exception as error:  # an error of one recording does not stop the others
         return AnalysisError(f"{type(error).__name__}: {error}")

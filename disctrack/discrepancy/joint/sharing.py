@@ -1,8 +1,8 @@
-"""Who shares what: quantities of single recordings, and those of many of which they are made.
+"""Shared quantities of many recordings, and the joint system of all recordings.
 
-For the search, many recordings are one system: its samples are recordings, its rows what each says of the shared. An
-initial state matters to nobody else: once it is eliminated, what is left is the least-squares problem in the shared
-quantities alone, a few dozen rows, however long the recording. Its minimum is followed as the shared quantities move.
+For the search, many recordings are one system, whose samples are recordings. The own quantities of a recording (its
+initial state) are eliminated; what remains is a least-squares problem in the shared quantities alone, a few dozen rows
+however long the recording. The own quantities are re-optimised whenever the shared ones change.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,26 +18,26 @@ from disctrack.discrepancy.fit import fit
 from disctrack.discrepancy.joint.crew import Crew
 from disctrack.discrepancy.system import Candidate, Quantity, System, Values
 
-EACH = "each its own"  # of the candidates whose amounts differ from group to group
+EACH = "each its own"  # mark of candidates with an amount for each group
 Reduced = tuple[Array, Array]  # right side (m,) and matrix (m, s) of the problem in the shared quantities
-LAWS = ("surface", "air")  # whose laws may well have the same constant with another disc, or on another surface
+LAWS = ("surface", "air")  # whose laws may have the same constant for another disc or surface
 
 
 @dataclass(frozen=True)
 class Member:
-    """What is to be known of one recording to combine it with others; light, as its data stay where they are."""
+    """Description of one recording, without its data."""
 
     name: str
     base: tuple[Quantity, ...]
     candidates: tuple[Candidate, ...]
-    start: Mapping[str, float]  # of the base quantities, fitted alone
+    start: Mapping[str, float]  # base quantities, as fitted to this recording alone
     n_data: int
-    labels: Mapping[str, str]  # "disc", "surface", "rig", "air" -> which one it was
+    labels: Mapping[str, str]  # "disc", "surface", "rig", "air" -> its name
     covariates: Mapping[str, float] = field(default_factory=dict)  # declared: "mass", "radius", ... in SI
 
 
 class Sharing:
-    """The shared quantities of some recordings, their candidates, and every member's part in them."""
+    """Shared quantities of recordings, their candidates, and the corresponding quantities of each member."""
 
     def __init__(self, members: Sequence[Member]) -> None:
         """Members : in the order of the recordings."""
@@ -46,7 +46,7 @@ class Sharing:
         self._groups: dict[str, dict[str, str]] = {}  # quantity of a law -> group -> shared name
         self._nulls: dict[str, float] = {}
         self._own: list[list[Quantity]] = [[] for _ in members]
-        # of each member: what it shares -> its own quantity, which is off its null by the sum of what these are off
+        # of each member: shared name -> its quantity, whose difference from null is the sum of theirs
         self.local: list[dict[str, str]] = [{} for _ in members]
         for i, member in enumerate(members):
             for q in member.base:
@@ -59,21 +59,18 @@ class Sharing:
         return {local: groups for local, groups in self._groups.items() if len(groups) > 1}
 
     def covariates_of(self, local: str) -> dict[str, list[float]]:
-        """Declared numbers by name, one for each group of this quantity.
-
-        Those that differ within a group are left out.
-        """
+        """Declared covariates by name, a value for each group of this quantity, if it is the same within the group."""
         declared = self._by_group(local, [m.covariates for m in self.members])
         return {name: numbers for name, numbers in sorted(declared.items()) if None not in numbers}
 
     def kinds_of(self, local: str) -> dict[str, list[str]]:
-        """Which disc, surface, ... each group of this quantity has, for those kinds that two groups have in common."""
+        """Disc, surface, ... of each group of this quantity, for kinds that some but not all groups have in common."""
         found = self._by_group(local, [m.labels for m in self.members])
         named = {kind: [label or f"no {kind} declared" for label in labels] for kind, labels in found.items()}
         return {kind: labels for kind, labels in named.items() if 1 < len(set(labels)) < len(labels)}
 
     def _by_group(self, local: str, of_members: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
-        """What is the same in all members of each group of a quantity: name -> one for each group."""
+        """Properties that are the same in all members of each group of a quantity: name -> value for each group."""
         each = list(zip(of_members, self.local, strict=True))
         groups = [[known for known, parts in each if shared in parts] for shared in self._groups[local].values()]
         found = {}
@@ -84,11 +81,11 @@ class Sharing:
         return found
 
     def group(self, member: Member, q: Quantity) -> str:
-        """Which of the groups that share a quantity like this the member belongs to; empty where there is one only."""
+        """Name of the member's group, among those that share this quantity; empty where there is a single one."""
         return ", ".join(member.labels.get(k, "") or f"no {k} declared" for k in self.differing(q))
 
     def differing(self, q: Quantity) -> list[str]:
-        """What sets apart the groups that share a quantity like this: "disc", "surface", ..."""
+        """Kinds in which the groups of this quantity differ: "disc", "surface", ..."""
         return [k for k in q.belongs_to if len({m.labels.get(k, "") for m in self.members}) > 1]
 
     def _alone(self, member: Member, q: Quantity) -> bool:
@@ -107,7 +104,7 @@ class Sharing:
             self._groups.setdefault(q.name, {})[group] = shared.name
 
     def _share(self, i: int, local: Quantity, group: str) -> Quantity:
-        # among many recordings none of the shared ones is taken out beforehand: their rows are no longer those of data
+        # shared quantities are not projected out beforehand: rows of the joint system are not rows of data
         shared = replace(local, name=f"{local.name}[{group}]" if group else local.name, linear=False)
         self._nulls[shared.name] = shared.null
         self.local[i][shared.name] = local.name
@@ -122,7 +119,7 @@ class Sharing:
         return tuple(variant for having in by_name.values() for variant in self._variants(having))
 
     def _variants(self, having: Mapping[int, Candidate]) -> list[Candidate]:
-        """The candidate with one number for all, and with one for each group, as far as that makes sense."""
+        """The candidate with one amount for all groups, or with an amount for each, or both."""
         first = next(iter(having.values()))
         groups = {self.group(self.members[i], q) for i, c in having.items() for q in c.quantities[:1]}
         variants = []
@@ -150,11 +147,11 @@ class Sharing:
         return variants
 
     def local_names(self, i: int, names: Sequence[str]) -> tuple[str, ...]:
-        """The member's quantities that these shared ones are part of."""
+        """The member's quantities to which these shared ones contribute."""
         return tuple(dict.fromkeys(self.local[i][name] for name in names if name in self.local[i]))
 
     def local_values(self, i: int, shared: Values) -> dict[str, float]:
-        """The member's shared quantities, those at null among them only where the base has them."""
+        """Values of the member's shared quantities; those at null are omitted, unless they belong to the base."""
         values: dict[str, float] = {}
         for name, local in self.local[i].items():
             null = self._nulls[name]
@@ -164,7 +161,7 @@ class Sharing:
         return values
 
     def start(self) -> dict[str, float]:
-        """Shared base quantities: the median of what their recordings give alone."""
+        """Initial values of the shared base quantities: the median over the recordings fitted alone."""
         found: dict[str, list[float]] = {name: [] for name in self.base}
         for member, parts in zip(self.members, self.local, strict=True):
             for name, local in parts.items():
@@ -174,17 +171,17 @@ class Sharing:
 
 
 class Reduction:
-    """A system in which some quantities of the base always take their best values."""
+    """A system with some base quantities profiled out: they always have their best values."""
 
     def __init__(self, system: System, own: Sequence[Quantity], start: Values) -> None:
-        """Own : quantities that have no bounds.   start : their values, from which their first fit begins."""
+        """Own : quantities without bounds.   start : their initial values."""
         self.system, self.own = system, tuple(own)
         self.moved = [q for q in own if not is_linear(q)]
         self._first = self.own_values = {q.name: start.get(q.name, q.null) for q in self.moved}
 
     def reduce(self, shared: Values, names: Sequence[str]) -> Reduced | None:
         """The problem in the shared quantities `names`, at the values `shared`; None where there is no prediction."""
-        for start in (self.own_values, self._first):  # where the point that was followed leads nowhere, from the first
+        for start in (self.own_values, self._first):  # from the latest values, or else from the first ones
             found = fit(self.system, self.own, {**shared, **start})
             if found.converged:
                 self.own_values = {name: found.values[name] for name in start}
@@ -206,7 +203,7 @@ class Reduction:
 
 
 class JointSystem(System):
-    """Recordings that share quantities. A row is a recording's least-squares problem in them, its own ones at best."""
+    """Recordings that share quantities. A row is the reduced least-squares problem of a recording."""
 
     def __init__(self, sharing: Sharing, crew: Crew) -> None:
         """Crew : of the members of the sharing, each with a method `reduce` (`Reduction`)."""
@@ -219,7 +216,7 @@ class JointSystem(System):
         self.candidates: tuple[Candidate, ...] = sharing.candidates
 
     def linearise(self, values: Values, names: Sequence[str]) -> tuple[Array, Array]:
-        """Rows (n, w) of the recordings' reduced problems, filled up with zeros, and their derivatives (n, w, k)."""
+        """Rows (n, w) of the reduced problems, padded with zeros, and their derivatives (n, w, k)."""
         sharing, n = self.sharing, len(self.time)
         local = [sharing.local_names(i, names) for i in range(n)]
         found = self._crew.call("reduce", [(sharing.local_values(i, values), local[i]) for i in range(n)])

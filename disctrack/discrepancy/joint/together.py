@@ -1,8 +1,8 @@
-"""Many recordings, one answer: which effect do they lack, all together?
+"""Joint diagnosis of many recordings.
 
-Every recording is prepared and fitted alone; what is the disc's, the surface's, the rig's or the air's is then shared,
-the search over effects is made with the summed evidence, and recordings that do not fit the others are named and left
-out. The cost is linear in the number of recordings.
+Every recording is prepared and fitted alone. Quantities of the disc, the surface, the rig or the air are then shared,
+the search over effects uses all recordings, and inconsistent recordings are named and left out. The cost is linear in
+the number of recordings.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -17,7 +17,7 @@ from calibration.kit.least_squares import triangle
 from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.joint.covariates import Hypothesis, hypotheses
 from disctrack.discrepancy.joint.crew import Crew
-from disctrack.discrepancy.joint.fitting_in import Blocks, FitsIn, apart
+from disctrack.discrepancy.joint.fitting_in import Blocks, Consistency, inconsistent
 from disctrack.discrepancy.joint.sharing import EACH, JointSystem, Member, Sharing
 from disctrack.discrepancy.score import Linearisation, score_all, sigmas, span
 from disctrack.discrepancy.search import Diagnosis, Settings, explain
@@ -25,48 +25,48 @@ from disctrack.discrepancy.significance import TWO_SIDED
 from disctrack.discrepancy.system import Candidate
 from disctrack.errors import AnalysisError, DiscTrackError
 
-TEST_EVERY = 3  # of the recordings, every so many is predicted from the others
-ROUNDS = 3  # of leaving recordings out
-NUMBERS = (1, 2, 5, 10, 20, 50, 100, 200, 500)  # of recordings, for which sigmas are told
-OWN_LEVEL = 1e-3  # probability that a recording which the model describes is said to be at odds with it
+TEST_EVERY = 3  # every third recording is held out
+ROUNDS = 3  # of removing inconsistent recordings
+NUMBERS = (1, 2, 5, 10, 20, 50, 100, 200, 500)  # of recordings, for which sigmas are reported
+OWN_LEVEL = 1e-3  # false-alarm probability of a note that a recording contradicts the model
 
 
 @dataclass(frozen=True)
 class OfRecording:
-    """What the joint diagnosis says of one recording."""
+    """Result for one recording."""
 
     name: str
     labels: dict[str, str]
-    reason: str  # why it was left out; empty where it was not
-    fits_in: FitsIn | None = None  # against all others, in the final model
-    alone: Fit | None = None  # the final model fitted to it alone; its sigmas know the memory of what is left
+    reason: str  # why it was left out; empty if it was not
+    consistency: Consistency | None = None  # against all others, in the final model
+    alone: Fit | None = None  # the final model fitted to it alone; sigmas with the autocorrelation of its residuals
 
 
 @dataclass(frozen=True)
 class Bound:
-    """What the recordings say of an effect, found or not."""
+    """Size and bounds of an effect, found or not."""
 
     candidate: Candidate
-    values: Array  # (k,) fitted to first order where it was not found
+    values: Array  # (k,) to first order where it was not found
     sigma: Array  # (k,)
     by_number: dict[int, Array]  # number of recordings, the first ones -> (k,) standard deviations
-    upper: float | None  # largest size of a single number compatible with the recordings (95 %)
+    upper: float | None  # upper bound (95 %) of an effect with a single parameter
 
 
 @dataclass(frozen=True)
 class Dependence:
-    """How a law's coefficient depends on what was declared."""
+    """Dependence of a law's coefficient on the groups of recordings."""
 
     quantity: str
     unit: str
-    by: str  # what sets the groups apart: "surface", "disc and surface", ...
+    by: str  # kinds in which the groups differ: "surface", "disc and surface", ...
     groups: dict[str, tuple[float, float]]  # value and standard deviation
     hypotheses: tuple[Hypothesis, ...]
 
 
 @dataclass(frozen=True)
 class TogetherDiagnosis:
-    """Answer for many recordings."""
+    """Result for many recordings."""
 
     diagnosis: Diagnosis
     system: JointSystem
@@ -74,12 +74,12 @@ class TogetherDiagnosis:
     bounds: tuple[Bound, ...]
     dependences: tuple[Dependence, ...]
     notes: tuple[str, ...]
-    unusable: tuple[str, ...] = ()  # recordings that were left out unheard, as they could not be read or fitted
-    plan: Any = None  # recordings that would settle what is open, where the system's own room knows them
+    unusable: tuple[str, ...] = ()  # recordings that could not be read or fitted
+    plan: Any = None  # proposed further recordings, if any
 
     @property
     def used(self) -> tuple[str, ...]:
-        """Names of the recordings that the answer rests on."""
+        """Names of the recordings that were used."""
         return tuple(m.name for m in self.system.sharing.members)
 
 
@@ -90,23 +90,23 @@ def answer_together(
     progress: Callable[[str], None],
     unread: Mapping[str, str],
 ) -> TogetherDiagnosis:
-    """What does the model lack, of all the crew's recordings together?
+    """Joint diagnosis of all recordings of the crew.
 
-    crew : objects with the methods `told`, `with_common` (a Member), `share`, `reduce` and `alone` (a Fit, and the same
-        with sigmas that know the memory of what is left)
+    crew : objects with the methods `summary`, `with_common` (a Member), `share`, `reduce` and `alone` (a Fit, and the
+        same with sigmas that allow for autocorrelated residuals)
     described : name and labels of each
-    in_common : of all that was told, what each is then given by `with_common`: errors that it shares with others
+    in_common : arguments of `with_common` for all recordings, by their summaries: errors that they share
     unread : further recordings that are reported as left out, and why
-    The crew is left with the recordings that the answer rests on.
+    The crew keeps the recordings that were used.
     Raises AnalysisError where fewer than two can be used.
     """
     settings = Settings(noise=1.0)
     names, n = [name for name, _ in described], len(described)
-    told = crew.call("told", [()] * n)
-    reasons = {i: str(t) for i, t in enumerate(told) if isinstance(t, DiscTrackError)}
+    summaries = crew.call("summary", [()] * n)
+    reasons = {i: str(s) for i, s in enumerate(summaries) if isinstance(s, DiscTrackError)}
     kept = [i for i in range(n) if i not in reasons]
     crew.keep(kept)
-    refitted = crew.call("with_common", [(s,) for s in in_common([told[i] for i in kept])])
+    refitted = crew.call("with_common", [(s,) for s in in_common([summaries[i] for i in kept])])
     reasons |= {i: str(m) for i, m in zip(kept, refitted, strict=True) if isinstance(m, DiscTrackError)}
     members: list[Member] = [m for m in refitted if not isinstance(m, DiscTrackError)]
     kept = [i for i in kept if i not in reasons]
@@ -120,7 +120,7 @@ def answer_together(
         system, diagnosis = _search(members, crew, settings, progress)
         most = len(members) - (2 * n + 2) // 3 if round_ < ROUNDS else 0
         effects = [c for c in system.candidates if not c.name.endswith(f"({EACH})")]
-        out = apart(system, diagnosis.after, settings.false_alarm, most, effects)
+        out = inconsistent(system, diagnosis.after, settings.false_alarm, most, effects)
         if not out:
             break
         for k, effect in out.items():
@@ -128,9 +128,9 @@ def answer_together(
         members = [m for k, m in enumerate(members) if k not in out]
         kept = [i for k, i in enumerate(kept) if k not in out]
     progress("each recording against the others")
-    diagnosis, alone = _with_memory(system, diagnosis, crew)
+    diagnosis, alone = _with_autocorrelation(system, diagnosis, crew)
     blocks = Blocks(system, diagnosis.after)
-    judged = {kept[k]: (blocks.fits_in(k, others), alone[k]) for k, others in blocks.others(range(len(kept)))}
+    judged = {kept[k]: (blocks.consistency(k, others), alone[k]) for k, others in blocks.others(range(len(kept)))}
     by_recording = (
         *(
             OfRecording(name, dict(labels), reasons.get(i, ""), *judged.get(i, ()))
@@ -155,7 +155,7 @@ def _search(
 
 
 def _without_variants(diagnosis: Diagnosis) -> Diagnosis:
-    """With one value for all, a value for each group is no alternative: it contains it."""
+    """Without alternatives that generalise the effect found: a value for each group in place of one for all."""
     found = [
         replace(f, cannot_be_told_from=tuple(
             r for r in f.cannot_be_told_from if r.candidate.name != f"{f.candidate.name} ({EACH})"
@@ -165,14 +165,14 @@ def _without_variants(diagnosis: Diagnosis) -> Diagnosis:
     return replace(diagnosis, found=tuple(found))
 
 
-def _with_memory(system: JointSystem, diagnosis: Diagnosis, crew: Crew) -> tuple[Diagnosis, list[Fit | None]]:
-    """Standard deviations that know the memory of what is left in each recording; and each recording fitted alone."""
+def _with_autocorrelation(system: JointSystem, diagnosis: Diagnosis, crew: Crew) -> tuple[Diagnosis, list[Fit | None]]:
+    """With sigmas that allow for autocorrelated residuals; and the fit of each recording alone."""
     after, sharing = diagnosis.after, system.sharing
     extra = [n for f in diagnosis.found for n in f.candidate.names]
-    asked = [
+    requested = [
         (sharing.local_values(i, after.values), sharing.local_names(i, extra)) for i in range(len(sharing.members))
     ]
-    alone = [None if isinstance(a, DiscTrackError) else a for a in crew.call("alone", asked)]
+    alone = [None if isinstance(a, DiscTrackError) else a for a in crew.call("alone", requested)]
     fitted = [(i, *fits) for i, fits in enumerate(alone) if fits is not None and fits[0].converged]
     growth = np.ones(len(after.quantities))
     for k, q in enumerate(after.quantities):
@@ -187,7 +187,7 @@ def _with_memory(system: JointSystem, diagnosis: Diagnosis, crew: Crew) -> tuple
 
 
 def _bounds(system: JointSystem, diagnosis: Diagnosis) -> tuple[Bound, ...]:
-    """Every candidate to first order beside what was found, and how its sigma falls with the number of recordings."""
+    """Every candidate to first order in the final model, and its sigma by the number of recordings."""
     after = diagnosis.after
     found = {f.candidate.name for f in diagnosis.found}
     n = len(system.time)
@@ -209,7 +209,7 @@ def _bounds(system: JointSystem, diagnosis: Diagnosis) -> tuple[Bound, ...]:
 
 
 def sigmas_of_first(system: JointSystem, fit_: Fit, numbers: Sequence[int]) -> dict[int, dict[str, Array]]:
-    """Standard deviations of every candidate's numbers from so many recordings, beside all that the fit moves."""
+    """Standard deviations of every candidate from the first `numbers` of recordings, with all quantities of the fit."""
     known = {q.name: q for q in fit_.quantities}
     new = {q.name: q for c in system.candidates for q in c.quantities if q.name not in known}
     everything = [*known.values(), *new.values()]
@@ -229,7 +229,7 @@ def sigmas_of_first(system: JointSystem, fit_: Fit, numbers: Sequence[int]) -> d
 
 
 def _dependences(system: JointSystem, diagnosis: Diagnosis) -> tuple[Dependence, ...]:
-    """Of every law with a value for each of several groups: how these hang together."""
+    """Of every law with a value for each of several groups: relations between these."""
     after, sharing = diagnosis.after, system.sharing
     found = []
     for local, groups in sharing.all_groups().items():
@@ -238,7 +238,7 @@ def _dependences(system: JointSystem, diagnosis: Diagnosis) -> tuple[Dependence,
             continue
         values, covariance = np.array([after.values[n] for n in names]), after.amounts(names)[1]
         q = after.quantities[after.names.index(names[0])]
-        if np.isfinite(q.prior_sigma):  # a tolerance, no law
+        if np.isfinite(q.prior_sigma):  # a tolerance and not a law
             continue
         tested = hypotheses(values, covariance, sharing.covariates_of(local), sharing.kinds_of(local))
         shown = {g: (after.values[n], after.sigma(n)) for g, n in groups.items()}
@@ -250,10 +250,10 @@ def _notes(recordings: Sequence[OfRecording], unusable: Sequence[str]) -> tuple[
     how = dict.fromkeys(unusable, "was left out: ")
     notes = [f"{r.name} {how.get(r.name, '')}{r.reason}" for r in recordings if r.reason]
     for r in recordings:
-        if r.fits_in is not None and r.fits_in.p_value * len(recordings) < OWN_LEVEL:
+        if r.consistency is not None and r.consistency.p_value * len(recordings) < OWN_LEVEL:
             notes.append(
-                f"{r.name} does not fit the others (p = {r.fits_in.p_value:.1g}), and yet is among them: more than a "
-                "third would have to go, and the sizes are those of no recording"
+                f"{r.name} does not fit the others (p = {r.consistency.p_value:.1g}), and yet is among them: more than "
+                "a third would have to go, and the sizes are those of no recording"
             )
         if r.alone is not None and r.alone.converged:
             ratio = r.alone.reduced_chi_square

@@ -6,7 +6,7 @@ from disctrack.diagnosis import DiscSystem, diagnose
 from disctrack.diagnosis.model_file import declared_model
 from disctrack.discrepancy.fit import fit
 from disctrack.discrepancy.search import explain
-from disctrack.discrepancy.shape import profiled
+from disctrack.discrepancy.shape import profile_fit
 from disctrack.validate.hidden import HiddenCase, recorded
 from tests.oracles.measured_disc import assert_found, assert_sized, measured, system_of, with_base_fit
 
@@ -17,7 +17,7 @@ def test_an_exponent_is_measured_along_its_profile():
     system = system_of(trajectory, model="none")
     (power,) = [c for c in system.candidates if c.name == "rolling_power"]
     nominal = fit(system, (*system.base, *power.quantities), system.start())
-    free = profiled(system, nominal, power.shape[0], 0.1)
+    free = profile_fit(system, nominal, power.shape[0], 0.1)
     assert free.converged
     assert_sized(free, {"rolling_power.p": 1.0}, 4, 4 * 0.05)
     assert free.reduced_chi_square < 1.1 < nominal.reduced_chi_square

@@ -12,12 +12,12 @@ from scipy.linalg import null_space
 from disctrack.discrepancy.equations import Equations, Parameter, Run, diagnose, terms
 from disctrack.discrepancy.equations.declared import checked
 from disctrack.discrepancy.equations.formulas import Formulas
-from disctrack.discrepancy.equations.loop import redundant
-from disctrack.discrepancy.equations.start import led, misfit
+from disctrack.discrepancy.equations.loop import unidentifiable
+from disctrack.discrepancy.equations.shooting import fitted_start, misfits
 from disctrack.discrepancy.equations.system import EquationSystem
 from disctrack.discrepancy.fit import fit
 from disctrack.discrepancy.held_out import held_out
-from disctrack.discrepancy.noise import inflation, with_memory
+from disctrack.discrepancy.noise import inflation, with_autocorrelation
 from disctrack.discrepancy.score import Linearisation, score_all
 from disctrack.discrepancy.system import subset
 
@@ -90,7 +90,7 @@ def test_scores_and_sigmas_that_know_the_memory_are_those_of_one_problem(answer)
         assert_allclose([*a.values, *a.sigma], [*b.values, *b.sigma], rtol=1e-4, atol=1e-9)
     c = whole.names.index("c")
     assert_allclose(inflation(system, fitted)[c], inflation(system, whole)[c], rtol=1e-4)
-    a, b = (with_memory(system, f) for f in (fitted, whole))
+    a, b = (with_autocorrelation(system, f) for f in (fitted, whole))
     assert_allclose(a.sigma("c"), b.sigma("c"), rtol=1e-4)
     assert a.sigma("c") > 1.5 * fitted.sigma("c")  # what is left is no white noise
     ratio = [a.sigma(n) / b.sigma(n) for n in whole.names if n != "c"]
@@ -151,7 +151,7 @@ def test_parameters_that_cannot_be_parted_are_told_beside_own_numbers(rng, per):
     answer = diagnose(twice, runs, [terms.coulomb("v")])
     assert any("cannot be distinguished from" in note for note in answer.notes)
     assert answer.system.held in (("m",), ("s",))
-    held = redundant(replace(answer.system, held=()), answer.values | {"m": 1.0, "s": 140.0})
+    held = unidentifiable(replace(answer.system, held=()), answer.values | {"m": 1.0, "s": 140.0})
     assert held in (("m",), ("s",))
 
 
@@ -182,9 +182,9 @@ def test_short_stretches_of_many_runs_lead_to_a_gain_of_the_other_sign(rng):
     driven = Equations({"x": "v", "v": "-k*x - c*v + g*u"}, {"k": 7.0, "c": 0.4, "g": 3.0}, inputs=["u"])
     compiled = Formulas(driven, [], {"x": "x"})
     system = EquationSystem(compiled, checked(driven, runs), np.ones(2), {})
-    start = led(system, {})
+    start = fitted_start(system, {})
     assert_allclose([start.values[n] for n in "kcg"], [9.0, 0.5, -4.0], rtol=0.01)
-    assert misfit(system, start.values) < 0.02
+    assert misfits(system, start.values).max() < 0.02
 
 
 @pytest.mark.statistical

@@ -15,7 +15,7 @@ from disctrack.discrepancy.fit import Fit, fit
 from disctrack.discrepancy.held_out import held_out, training_rows
 from disctrack.discrepancy.score import Linearisation, score_all
 from disctrack.discrepancy.search import Found, Settings, explain, length
-from disctrack.discrepancy.significance import as_sigmas, chance, ljung_box, no_memory, whiteness
+from disctrack.discrepancy.significance import as_sigmas, chance, ljung_box, ljung_box_p_value, whiteness
 from disctrack.discrepancy.system import Budget, Candidate, Quantity
 from tests.oracles.linear_system import Linear, Predicted, candidate, one
 
@@ -337,7 +337,7 @@ def test_the_tail_of_ljung_and_box_is_as_stated_in_short_series(rng):
     """Chi-square's is too thin: at 200 samples its 1e-3 is seen four times as often."""
     statistic = ljung_box(rng.standard_normal((200, 20_000)))
     for level in (0.05, 0.01, 1e-3):
-        seen = int(sum(no_memory(x, 200) < level for x in statistic if x > 25))
+        seen = int(sum(ljung_box_p_value(x, 200) < level for x in statistic if x > 25))
         assert stats.binomtest(seen, 20_000, level).proportion_ci(1 - 1e-4).high > 0.7 * level
         assert seen / 20_000 < 1.3 * level + 4 * np.sqrt(level / 20_000)
     assert np.mean(stats.chi2.sf(statistic, 20) < 1e-3) > 2.5e-3

@@ -20,7 +20,7 @@ from disctrack.discrepancy.equations import _ode_kernel as kernel
 from disctrack.discrepancy.equations.declared import checked
 from disctrack.discrepancy.equations.formulas import Formulas
 from disctrack.discrepancy.equations.system import EquationSystem
-from disctrack.discrepancy.noise import fast_part, step_of
+from disctrack.discrepancy.noise import noise_sigma, quantisation
 from disctrack.discrepancy.system import USED_UP
 from disctrack.errors import AnalysisError
 
@@ -184,7 +184,7 @@ def test_noise_that_remembers_is_no_effect_and_widens_sigmas():
         answer = diagnose(OSCILLATOR, Run(TIME, {"x": x + SIGMA * noise[100:]}), FIVE)
         claims += bool(answer.found)
         pulls.append((answer.values["omega"] - 12.0) / answer.sigmas["omega"])
-        assert any("remembers" in note or "what is left" in note for note in answer.notes)
+        assert any("autocorrelated" in note or "residuals" in note for note in answer.notes)
     assert claims == 0
     assert np.sqrt(np.mean(np.square(pulls))) < 2.0  # of five standard normals: exceeded once in 10 000
 
@@ -301,7 +301,7 @@ def test_the_noise_told_is_that_of_what_is_left():
     time = np.arange(500) * 0.06
     x = motion(lambda t, y: [y[1], -144 * y[0] - 0.3 * y[1]], [1.0, 0.0], time)[0]
     noisy = x + 1e-4 * np.random.default_rng(5).standard_normal(len(time))
-    assert fast_part([noisy]) > 3e-4
+    assert noise_sigma([noisy]) > 3e-4
     answer = diagnose(OSCILLATOR, Run(time, {"x": noisy}), [terms.coulomb("v")])
     assert answer.verdict == "nothing missing"
     assert answer.after["x"].noise == pytest.approx(1e-4, rel=0.2)
@@ -309,9 +309,9 @@ def test_the_noise_told_is_that_of_what_is_left():
 
 def test_the_noise_of_a_channel_is_found_in_its_data(rng):
     smooth = np.sin(2 * np.pi * np.arange(4000) / 200)
-    assert fast_part([smooth + 0.01 * rng.standard_normal(4000)]) == pytest.approx(0.01, rel=0.06)
-    assert step_of([np.round(smooth / 0.005) * 0.005]) == pytest.approx(0.005)
-    assert step_of([smooth + 0.01 * rng.standard_normal(4000)]) == 0.0
+    assert noise_sigma([smooth + 0.01 * rng.standard_normal(4000)]) == pytest.approx(0.01, rel=0.06)
+    assert quantisation([np.round(smooth / 0.005) * 0.005]) == pytest.approx(0.005)
+    assert quantisation([smooth + 0.01 * rng.standard_normal(4000)]) == 0.0
 
 
 @pytest.mark.parametrize(
@@ -381,7 +381,7 @@ def test_where_derivatives_have_no_end_it_is_said(rng):
     """A tank that runs empty: the root of its level has no derivative there."""
     time = np.arange(0, 50, 0.1)
     level = np.maximum(1 - 0.025 * time, 0.0) ** 2 + 1e-3 * rng.standard_normal(len(time))
-    with pytest.raises(AnalysisError, match="not how it depends on its parameters"):
+    with pytest.raises(AnalysisError, match="not its derivatives by the parameters"):
         diagnose(Equations({"h": "-k*sqrt(Max(h, 0))"}, {"k": 0.06}), Run(time, {"h": level}, 1e-3))
 
 
@@ -756,7 +756,7 @@ def test_few_samples_far_apart_of_a_reaction_whose_way_back_is_missing(rng):
         [100.0, 0.0, 0.0, 0.0], time,
     )  # fmt: skip
     seen = course + 0.1 * rng.standard_normal(course.shape)
-    assert 0.05 < fast_part([y[1:] for y in seen[[2, 3]]], [time[1:]] * 2) < 0.4
+    assert 0.05 < noise_sigma([y[1:] for y in seen[[2, 3]]], [time[1:]] * 2) < 0.4
     seen[:, 0] = np.nan
     run = Run(time, dict(zip("abcd", seen, strict=True)), known={"a": 100.0, "b": 0.0, "c": 0.0, "d": 0.0})
     equations = Equations(

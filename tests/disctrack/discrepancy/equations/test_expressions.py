@@ -82,7 +82,7 @@ def test_inputs_of_a_finer_clock_drive_the_motion_as_it_was_driven():
     # samples of the force are another force: its lines beyond half the rate come back as an error that remembers
     mine, theirs = (answer.after["x"].rms for answer in answers)
     assert mine < 1.2e-3 < 2.5e-3 < theirs
-    assert "remembers" in str(answers[1])
+    assert "autocorrelated" in str(answers[1])
 
 
 def test_an_input_has_to_last_as_long_as_the_data():

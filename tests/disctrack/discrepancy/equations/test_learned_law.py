@@ -101,7 +101,7 @@ def test_a_law_of_two_variables_is_learned_where_none_of_one_will_do(tmp_path):
     assert answer.after["x"].rms == pytest.approx(SIGMA, rel=0.1)
     told, page = answer.write(tmp_path)
     assert np.shape(json.loads(told.read_text())["law"]["at"]) == (len(law.force), 2)
-    assert "a force on v that is a function of x and v, learned from what is left" in page.read_text()
+    assert "a force on v that is a function of x and v, learned from the residuals" in page.read_text()
 
 
 @pytest.mark.parametrize("name", KNOWN)
@@ -171,7 +171,7 @@ def test_the_law_is_told_on_the_page_and_in_json(tmp_path):
     assert law["variable"] == "v"
     assert len(law["at"]) == len(law["force"]) == len(law["sigma"])
     assert law["known_terms"] == [c.name for c in answer.law.instead.candidates]
-    assert "a force on v that is a function of v, learned from what is left" in page.read_text()
+    assert "a force on v that is a function of v, learned from the residuals" in page.read_text()
 
 
 def test_a_law_that_leaves_more_than_the_sensor_scatters_is_no_finding_and_foretells():

@@ -11,9 +11,9 @@ import pytest
 from numpy.testing import assert_allclose
 
 from disctrack.discrepancy.fit import fit
-from disctrack.discrepancy.joint.covariates import alike, hypotheses
+from disctrack.discrepancy.joint.covariates import equivalent, hypotheses
 from disctrack.discrepancy.joint.crew import Crew
-from disctrack.discrepancy.joint.fitting_in import Blocks, apart
+from disctrack.discrepancy.joint.fitting_in import Blocks, inconsistent
 from disctrack.discrepancy.joint.sharing import JointSystem, Sharing
 from disctrack.discrepancy.search import Settings, explain
 from disctrack.errors import AnalysisError
@@ -63,9 +63,9 @@ def test_nothing_is_found_where_nothing_is_hidden(rng):
 def test_a_run_of_another_disc_among_them_is_named(rng):
     items = runs(rng, 12, run_7={"rate": 0.87})
     system, found = answer(items)
-    assert list(apart(system, found.after, 0.005)) == [7]
+    assert list(inconsistent(system, found.after, 0.005)) == [7]
     system, found = answer(runs(rng, 12))
-    assert list(apart(system, found.after, 0.005)) == []
+    assert list(inconsistent(system, found.after, 0.005)) == []
 
 
 def test_of_two_with_a_disc_of_their_own_that_disagree_both_are_named(rng):
@@ -73,15 +73,15 @@ def test_of_two_with_a_disc_of_their_own_that_disagree_both_are_named(rng):
     heavy = {"mass": 2.0, "rate": 0.5}
     two = {"run_6": heavy, "run_7": {**heavy, "rate": 0.6}}
     system, found = answer(runs(rng, 9, **two))
-    assert sorted(apart(system, found.after, 0.005)) == [6, 7]
+    assert sorted(inconsistent(system, found.after, 0.005)) == [6, 7]
     system, found = answer(runs(rng, 9, run_5=heavy, **two))
-    assert list(apart(system, found.after, 0.005)) == [7]
+    assert list(inconsistent(system, found.after, 0.005)) == [7]
 
 
 def named(items, **more):
     system, _ = joint(items)
     found = fit(system, system.base, system.sharing.start())
-    return apart(system, found, 0.005, **more), system.candidates
+    return inconsistent(system, found, 0.005, **more), system.candidates
 
 
 def test_a_run_with_a_fault_that_no_shared_number_takes_is_named_with_the_fault(rng):
@@ -107,8 +107,8 @@ def test_differences_in_an_effect_and_to_the_others_are_chi_squares_and_name_nob
         blocks = Blocks(system, found, system.candidates)
         for each in blocks.others(range(8)):
             falls.append(blocks.differences(*each))
-            judged.append(blocks.fits_in(*each))
-        false += bool(apart(system, found, 0.005, candidates=system.candidates))
+            judged.append(blocks.consistency(*each))
+        false += bool(inconsistent(system, found, 0.005, candidates=system.candidates))
     falls = np.array(falls)  # (320, candidates, 2)
     assert_allclose(falls[..., 1], np.tile([1, 2, 1], (320, 1)))
     # eight of seven are free; three standard errors
@@ -218,7 +218,7 @@ def test_covariates_that_go_together_are_told_as_alternatives_and_values_without
     covariates = {"mass": (radius**2).tolist(), "radius": radius.tolist()}
     sigma = 0.01 * np.ones(4)
     found = hypotheses(radius + 0.01 * rng.standard_normal(4), np.diag(sigma**2), covariates)
-    assert {found[0].text, *(h.text for h in alike(found))} == {
+    assert {found[0].text, *(h.text for h in equivalent(found))} == {
         "in proportion to a power of the radius", "in proportion to a power of the mass",
     }  # fmt: skip
     assert not any("mass and" in h.text or "radius and" in h.text for h in found)  # which nothing could tell apart

@@ -1,8 +1,8 @@
-"""Where a fit begins: in short stretches with a start each, joined two by two as far as the model follows the motion.
+"""Initial values of a fit, by multiple shooting (Bock 1981) over longer and longer stretches.
 
-Over many turns of an oscillation chi-square has many minima; over a fifth of one it has one, and all stretches together
-tell what the whole tells. A fit that begins there and is led to longer and longer stretches (multiple shooting, Bock
-1981) stays in it, for as long as the model can follow at all.
+Over many periods of an oscillation chi-square has many local minima; over a fifth of one it has a single one. The data
+are cut into such stretches, with an initial state each and common parameters. They are then joined two by two, and each
+fit starts from the one before, as far as the model follows the motion.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,17 +21,17 @@ from disctrack.discrepancy.fit import TRIAL, fit
 from disctrack.discrepancy.search import AGREES
 from disctrack.discrepancy.system import Quantity, System, Values
 
-FEWEST, SHORT = 10, 0.2  # samples, and share of a turn, of a short stretch: over it a step by any law is nearly linear
-LOST = 0.3  # rms of the residual over that of the signal, from which on the model no longer follows the motion
-LOOSE = 0.6  # the same where it is not followed in short stretches: most of it is still that of the model
+FEWEST, SHORT = 10, 0.2  # samples, and share of a period, of a short stretch: over it the motion is nearly linear
+LOST = 0.3  # rms of the residuals over that of the signal, above which the model does not follow the motion
+LOOSE = 0.6  # the same where it does not follow short stretches, but whole runs from a known initial state
 _WINDOWS = (8, 12, 18, 27, 40, 60, 90, 135, 200)  # samples of the local polynomial
-_ATTEMPTS = 100  # steps within regions of trust
-_NOWHERE = 1e8  # residual of what has no value
-_INSTANTS = 24  # at which the sizes of the states are looked at
+_ATTEMPTS = 100  # evaluations of a trust-region fit
+_NOWHERE = 1e8  # residual where there is no prediction
+_INSTANTS = 24  # at which the sizes of the states are estimated
 
 
 def local_polynomial(s: Samples, channel: int, first: int) -> tuple[float, float] | None:
-    """Value and slope of a channel at sample `first`, from a cubic over as many samples as it fits."""
+    """Value and slope of a channel at sample `first`, from a cubic over the largest window that it fits."""
     rows = first + np.flatnonzero(np.isfinite(s.data[first:, channel]))
     best = None
     for m in _WINDOWS:
@@ -49,20 +49,20 @@ def local_polynomial(s: Samples, channel: int, first: int) -> tuple[float, float
 
 
 def states_from_data(formulas: Formulas, s: Samples, p: Array, first: int, begin: Array) -> Array:
-    """States (n,) in which the sensors show what the data show at sample `first`, and change as they do.
+    """States (n,) whose predicted sensor values and slopes agree with the data at sample `first`.
 
-    What neither tells stays near `begin`.
+    States that these do not determine stay near `begin`.
     """
     w = len(formulas.channels)
     local = [local_polynomial(s, c, first) for c in range(w)]
     value_size = np.array([(np.std(x[np.isfinite(x)]) if np.isfinite(x).any() else 0.0) or 1.0 for x in s.data.T])
-    slope_size = value_size / max(turn(s), 1e-300) * 2 * np.pi
+    slope_size = value_size / max(period(s), 1e-300) * 2 * np.pi
 
     def misfit(y: Array, slopes: float) -> Array:
         t, y = np.array([s.time[first]]), y[None]
         h, H_y, _ = formulas.sensors_at(s, p, t, y)
         f = formulas.rates_at(s, p, t, y)[0]
-        with np.errstate(all="ignore"):  # a guess may lie where a logarithm or a root has no value
+        with np.errstate(all="ignore"):  # a guess may lie outside the domain of a logarithm or a root
             slope = H_y[0] @ f[0]
         parts = [1e-4 * (y[0] - begin) / np.maximum(np.abs(begin), 1.0)]
         for c, known in enumerate(local):
@@ -71,15 +71,15 @@ def states_from_data(formulas: Formulas, s: Samples, p: Array, first: int, begin
                 parts.append(slopes * np.array([slope[c] - known[1]]) / slope_size[c])
         return np.nan_to_num(np.concatenate(parts), nan=1e6, posinf=1e6, neginf=-1e6)
 
-    # first what is shown: slopes have other solutions besides, and are those of parameters not yet fitted
+    # values first: slopes may have several solutions, and depend on parameters that are not yet fitted
     for slopes in (0.0, 0.1):
         scale = np.maximum(np.abs(begin), 1e-3)
         begin = np.asarray(least_squares(misfit, begin, method="lm", x_scale=scale, args=(slopes,)).x, float)
     return begin
 
 
-def turn(s: Samples) -> float:
-    """Time [s] of one turn of the strongest oscillation in the data, at most half the run."""
+def period(s: Samples) -> float:
+    """Period [s] of the strongest oscillation in the data, at most half the run."""
     duration = float(s.time[-1] - s.time[0])
     grid = np.linspace(s.time[0], s.time[-1], int(min(len(s.time), 20_000)))
     best, found = 0.0, duration / 2
@@ -96,14 +96,14 @@ def turn(s: Samples) -> float:
     return found
 
 
-def ample(system: EquationSystem) -> list[Samples]:
-    """Stretches of half as many samples as the longest, or more: a few before a gap tell no turn."""
+def longest_stretches(system: EquationSystem) -> list[Samples]:
+    """Stretches with at least half as many samples as the longest: a few samples before a gap show no period."""
     most = max(len(s.time) for s in system.stretches)
     return [s for s in system.stretches if 2 * len(s.time) >= most]
 
 
-def guessed(system: EquationSystem) -> tuple[dict[str, float], Array]:
-    """Initial states of every stretch by the names of their quantities, and the sizes (n,) of the states."""
+def initial_guess(system: EquationSystem) -> tuple[dict[str, float], Array]:
+    """Initial states of every stretch by name, estimated from the data, and the sizes (n,) of the states."""
     f = system.formulas
     names = f.equations.states
     values: dict[str, float] = {}
@@ -124,8 +124,8 @@ def guessed(system: EquationSystem) -> tuple[dict[str, float], Array]:
     return values, np.asarray(np.maximum(sizes, floor), float)
 
 
-def sizes_alike(system: EquationSystem, values: Mapping[str, float]) -> dict[str, float]:
-    """Of every number that shows, the size at which it does as much as an equation, or a tenth of a sensor, in all."""
+def scales(system: EquationSystem, values: Mapping[str, float]) -> dict[str, float]:
+    """Natural scale of every parameter: where its effect is as large as its equation, or a tenth of a signal (rms)."""
     f = system.formulas
     n_fitted = len(f.fitted)
     own, acting = np.zeros(len(f.states)), np.zeros((len(f.states), n_fitted))
@@ -144,28 +144,23 @@ def sizes_alike(system: EquationSystem, values: Mapping[str, float]) -> dict[str
 
 @dataclass(frozen=True)
 class Start:
-    """Values from which Gauss-Newton converges, as far as the model follows the motion."""
+    """Initial values of a fit, and how far the model follows the motion from there."""
 
-    system: EquationSystem  # in stretches over which it does so safely
+    system: EquationSystem  # in stretches that the model follows
     values: dict[str, float]
-    followed: float  # [s] of the longest stretch over which it does
+    followed: float  # [s] duration of the longest stretch that it follows; 0: none
     whole: bool = False  # does it follow all runs to their end?
 
 
-def lasting(system: EquationSystem) -> float:
+def longest_duration(system: EquationSystem) -> float:
     """Duration [s] of the longest stretch."""
     return max(float(s.time[-1] - s.time[0]) for s in system.stretches)
 
 
-def misfit(system: EquationSystem, values: dict[str, float]) -> float:
-    """Largest over the channels: rms of the residual over that of the signal, all stretches together."""
-    return float(np.max(misfits(system, values)))
-
-
 def misfits(system: EquationSystem, values: dict[str, float]) -> Array:
-    """Of each channel (w,): rms of the residual over that of the signal, all stretches together.
+    """Rms of the residuals over that of the signal, of each channel (w,), over all stretches.
 
-    What the noise may make of a residual is taken off: before a motion sets in, there is nothing but noise to follow.
+    The contribution of the noise is subtracted: before a motion starts, there is nothing but noise.
     """
     square, size = np.zeros(len(system.formulas.channels)), np.zeros(len(system.formulas.channels))
     for s, found in zip(system.stretches, system.predictions(values), strict=True):
@@ -178,14 +173,14 @@ def misfits(system: EquationSystem, values: dict[str, float]) -> Array:
     return np.asarray(np.sqrt(square / np.maximum(size, 1e-300)), float)
 
 
-def cut_short(system: EquationSystem, share: float = SHORT) -> list[EquationSystem]:
-    """The stretches cut into shares of a turn, and these joined two by two until they are whole again.
+def levels(system: EquationSystem, share: float = SHORT) -> list[EquationSystem]:
+    """Levels of multiple shooting: runs in stretches of a share of a period, joined two by two until they are whole.
 
-    No more than MOST_STATES tell: those that begin where longer ones do.
+    At most MOST_STATES initial states are fitted: of the stretches that start where longer ones do.
     """
-    most, long = MOST_STATES / len(system.formulas.states), ample(system)
+    most, long = MOST_STATES / len(system.formulas.states), longest_stretches(system)
     spacing = min(float(np.median(np.diff(s.time))) for s in long)
-    duration = max(share * min(turn(s) for s in long), FEWEST * spacing)
+    duration = max(share * min(period(s) for s in long), FEWEST * spacing)
     levels: list[list[Samples]] = []
     while not levels or len(levels[-1]) > len(system.stretches):
         levels.append([part for s in system.stretches for part in cut(s, duration)])
@@ -195,47 +190,47 @@ def cut_short(system: EquationSystem, share: float = SHORT) -> list[EquationSyst
     return [*(replace(system, stretches=parts) for parts in some), system]
 
 
-def led(system: EquationSystem, values: Values) -> Start:
-    """Fit to short stretches that are joined two by two to the whole, or until the model loses the motion."""
-    for share in (SHORT, SHORT / 4):  # what turns and drifts, or is chaotic, may be followed for less
-        found = _led(cut_short(system, share), values)
+def fitted_start(system: EquationSystem, values: Values) -> Start:
+    """Fit short stretches, and longer and longer ones, until these are whole or the model no longer follows them."""
+    for share in (SHORT, SHORT / 4):  # a drifting or chaotic motion is followed over shorter stretches only
+        found = _fit_over_levels(levels(system, share), values)
         if found.followed > 0.0:
             return found
-    # short stretches do not tell a state that no sensor shows, as a known start of the whole may
-    at_once = trusted(system, [near_declared(q) for q in system.base], guessed(system)[0] | dict(values))
-    # one of several sensors may show little but what is missing
-    followed = lasting(system) if np.median(misfits(system, at_once)) <= LOOSE else 0.0
+    # short stretches may not determine an unobserved state, where the known initial state of whole runs does
+    at_once = trust_region(system, [with_weak_prior(q) for q in system.base], initial_guess(system)[0] | dict(values))
+    # a median: one of several sensors may show little but the missing effect
+    followed = longest_duration(system) if np.median(misfits(system, at_once)) <= LOOSE else 0.0
     return Start(system, at_once, followed, followed > 0.0)
 
 
-def _led(systems: Sequence[EquationSystem], values: Values) -> Start:
-    now = dict(values) | guessed(systems[0])[0]
+def _fit_over_levels(systems: Sequence[EquationSystem], values: Values) -> Start:
+    now = dict(values) | initial_guess(systems[0])[0]
     now |= fit(systems[0], [q for q in systems[0].base if q.is_initial], now, TRIAL).values
     reached: list[tuple[EquationSystem, dict[str, float]]] = []
     for part in systems:
-        trial = now | fit(part, [near_declared(q) for q in part.base], now, TRIAL).values
-        if not misfit(part, trial) <= LOST:
+        trial = now | fit(part, [with_weak_prior(q) for q in part.base], now, TRIAL).values
+        if not misfits(part, trial).max() <= LOST:
             break
-        now = trial  # a longer stretch begins where the first of those does that it is made of
+        now = trial  # a longer stretch has the initial state of its first part
         reached.append((part, now))
     if not reached:
         return Start(systems[0], trial, 0.0)
     whole = len(reached) == len(systems)
-    # near the end of what it can follow chi-square is full of minima: half of that is safe
+    # near the longest stretch that is followed chi-square has many minima: half of that duration is safe
     chosen, values = reached[-1 if whole else max(len(reached) - 2, 0)]
-    return Start(chosen, values, lasting(reached[-1][0]), whole)
+    return Start(chosen, values, longest_duration(reached[-1][0]), whole)
 
 
-def near_declared(q: Quantity) -> Quantity:
-    """Of a parameter that the data may not tell, one that stays near; of a term's number zero is the absence."""
+def with_weak_prior(q: Quantity) -> Quantity:
+    """The quantity with a weak prior about its declared value, which the data may not determine."""
     return q if q.declared is None else replace(q, prior_sigma=min(q.prior_sigma, max(abs(q.null), q.scale)))
 
 
-def trusted(system: System, quantities: Sequence[Quantity], declared: Mapping[str, float]) -> dict[str, float]:
-    """Quantities fitted within a region of trust that grows and shrinks with its success.
+def trust_region(system: System, quantities: Sequence[Quantity], declared: Mapping[str, float]) -> dict[str, float]:
+    """Values of a trust-region fit.
 
-    Gauss-Newton's halved steps end where a parameter far off (a gain of the wrong sign) has to pass through values with
-    which nothing moves.
+    Gauss-Newton with halved steps may stop where a parameter that is far off (a gain of the wrong sign) has to pass
+    through zero, where nothing moves.
     """
     names = [q.name for q in quantities]
     null = np.array([q.null for q in quantities])
