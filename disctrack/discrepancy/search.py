@@ -260,11 +260,14 @@ class _Search:
             return _refusal(base, self.settings)
         linear, scores = self._scored(first)
         by_chance = chance(linear, scores, self.noise) if scores else None
-        best, alike = self._selected()
+        best, alternatives = self._selected()
         if self.system.frees_shapes and first is self.base_model and self._add_free_shapes(best):
-            best, alike = self._selected()
-        after = self.base_model if alike is None else best
-        found = tuple(self._found(best, c, r) for c, r in zip(best.candidates, alike or (), strict=alike is not None))
+            best, alternatives = self._selected()
+        after = self.base_model if alternatives is None else best
+        found = tuple(
+            self._found(best, c, r)
+            for c, r in zip(best.candidates, alternatives or (), strict=alternatives is not None)
+        )
         ranked = tuple(replace(e, length=self.length(e)) for e in self._ranked())
         return Diagnosis(
             *self._verdict(after, found),
@@ -276,7 +279,7 @@ class _Search:
             self.noise,
             self._all_outcomes(scores, found),
             self.settings,
-            best if alike is None else None,
+            best if alternatives is None else None,
             ranked,
             self.length(after),
             chance=by_chance,
@@ -308,7 +311,7 @@ class _Search:
     def _selected(self) -> tuple[Explanation, list[list[Alternative]] | None]:
         """The selected explanation, and the alternatives of each of its effects; None where it explains too little."""
         self._explore()
-        alike: list[list[Alternative]] = []
+        alternatives: list[list[Alternative]] = []
         while (best := self._best_supported()).candidates:
             if not self._at_noise(best.fit) and not self._explains_most(best):
                 return best, None
@@ -317,11 +320,11 @@ class _Search:
                 self.pool.setdefault(smaller.names, smaller)
                 self._explore()
                 continue
-            alike = [self._alternatives(best, c) for c in best.candidates]
+            alternatives = [self._alternatives(best, c) for c in best.candidates]
             self._explore()
             if self._best_supported() is best:
                 break
-        return best, alike
+        return best, alternatives
 
     def _add_free_shapes(self, best: Explanation) -> bool:
         """Add explanations by laws of free shape, in place of all effects or of a faint one; True if there are any.
@@ -614,11 +617,11 @@ class _Search:
                 found.append(Alternative(candidate, angles[candidate.name], loss, other.fit))
         return found
 
-    def _found(self, e: Explanation, candidate: Candidate, alike: list[Alternative]) -> Found:
+    def _found(self, e: Explanation, candidate: Candidate, alternatives: list[Alternative]) -> Found:
         without = self._fit(*_without(e, candidate), patient=True)
         held_gain = self._held_out(e.fit).gain_over(self._held_out(without), self.noise)
         gain = (without.cost - e.fit.cost) / self.noise
-        return Found(candidate, gain, held_gain, self.threshold(len(candidate.names)), tuple(alike))
+        return Found(candidate, gain, held_gain, self.threshold(len(candidate.names)), tuple(alternatives))
 
     def _all_outcomes(self, scores: Sequence[Score], found: tuple[Found, ...]) -> tuple[Tried, ...]:
         scored = {s.candidate.name for s in scores}  # the others are effects of the explanation that was first

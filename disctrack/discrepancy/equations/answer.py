@@ -225,8 +225,8 @@ class Answer:
 
     def predicted(self, fit: Fit) -> list[tuple[Samples, Array]]:
         """Every stretch with its predicted sensor values (n, w); NaN where the motion cannot be integrated."""
-        stretches = zip(self.system.stretches, self.system.predictions(fit.values), strict=True)
-        return [(s, np.full(s.data.shape, np.nan) if p is None else p.seen) for s, p in stretches]
+        found = self.system.predictions(fit.values)
+        return [(s, np.full(s.data.shape, np.nan) if p is None else p.seen) for s, p in found]
 
     def forecast(self, run: Run, *, window: float = 0.0, by: str = "after") -> Forecast:
         """A free run of the model: predicted sensor values at the instants of a run, with sigmas.

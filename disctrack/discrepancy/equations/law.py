@@ -496,7 +496,7 @@ def _set(system: EquationSystem, law: Along, values: Values) -> tuple[EquationSy
 def _visited(system: EquationSystem, variables: Sequence[str], values: Values) -> Array:
     """States, inputs or time (n, k) at the samples of all stretches."""
     e, found = system.formulas.equations, [np.zeros((0, len(variables)))]
-    for s, motion in zip(system.stretches, system.predictions(values), strict=True):
+    for s, motion in system.predictions(values):
         states = dict(zip(e.states, motion.states.T if motion else [], strict=False))
         known = {"t": s.time, **dict(zip(e.inputs, system.inputs_of(s), strict=False)), **states}
         if known.keys() >= {*variables}:

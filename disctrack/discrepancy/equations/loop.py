@@ -164,7 +164,7 @@ def _with_guesses(system: EquationSystem, values: Mapping[str, float]) -> Equati
     if not f.along:
         return system
     passed: list[list[Array]] = []
-    for s, motion in zip(system.stretches, system.predictions(values), strict=True):
+    for s, motion in system.predictions(values):
         if motion is not None:
             p, u = system.numbers(values, s), system.inputs_of(s)
             passed.append(f.along_motion(f.along.values(), s.time, motion.states, p, u))
@@ -240,14 +240,13 @@ def _with_sharp_jumps(system: EquationSystem, fitted: Fit) -> EquationSystem:
 
 def _with_sizes(system: EquationSystem, values: Mapping[str, float]) -> EquationSystem:
     """With sizes and widths from the fitted motion, and typical sizes of the terms' parameters."""
-    found = [(s, m) for s, m in zip(system.stretches, system.predictions(values), strict=True) if m is not None]
+    found = [(s, m) for s, m in system.predictions(values) if m is not None]
     if not found:
         return system
     sizes = np.maximum(np.max([np.abs(m.states).max(axis=0) for _, m in found], axis=0), 1e-9 * system.sizes)
     system = replace(system, sizes=sizes, widths=_widths(system, [(s, m.states) for s, m in found]))
-    found_alike = shooting.scales(system, values)
-    typical = {name: USUAL_SHARE * size for name, size in found_alike.items() if system.formulas.owner[name]}
-    return replace(system, typical=typical)
+    scales, owner = shooting.scales(system, values), system.formulas.owner
+    return replace(system, typical={name: USUAL_SHARE * size for name, size in scales.items() if owner[name]})
 
 
 def unidentifiable(system: EquationSystem, values: Mapping[str, float]) -> tuple[str, ...]:

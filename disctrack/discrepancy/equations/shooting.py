@@ -130,8 +130,11 @@ def scales(system: EquationSystem, values: Mapping[str, float]) -> dict[str, flo
     n_fitted = len(f.fitted)
     own, acting = np.zeros(len(f.states)), np.zeros((len(f.states), n_fitted))
     shown, seen = np.zeros(len(f.channels)), np.zeros((len(f.channels), n_fitted))
-    for s in system.stretches:
-        rates, by_number, h, H_p = system.along(values, s)
+    for s, motion in system.predictions(values):
+        p = system.numbers(values, s)
+        states = np.zeros((len(s.time), len(f.states))) if motion is None else motion.states
+        rates, _, by_number = f.rates_at(s, p, s.time, states)
+        h, _, H_p = f.sensors_at(s, p, s.time, states)
         own += np.sum(rates**2, axis=0)
         acting += np.sum(by_number[..., :n_fitted] ** 2, axis=0)
         shown += np.sum((h - h.mean(axis=0)) ** 2, axis=0)
@@ -163,7 +166,7 @@ def misfits(system: EquationSystem, values: dict[str, float]) -> Array:
     The contribution of the noise is subtracted: before a motion starts, there is nothing but noise.
     """
     square, size = np.zeros(len(system.formulas.channels)), np.zeros(len(system.formulas.channels))
-    for s, found in zip(system.stretches, system.predictions(values), strict=True):
+    for s, found in system.predictions(values):
         if found is None:
             return np.full_like(size, np.inf)
         noise = np.where(np.isfinite(s.data), s.sigma**2, 0.0).sum(axis=0)

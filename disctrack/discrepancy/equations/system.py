@@ -156,9 +156,9 @@ class EquationSystem(System):
             derivative[rows.start : rows.stop, :, columns] = found.derivative * weight
         return residual, derivative
 
-    def predictions(self, values: Values) -> list[Prediction | None]:
-        """Predictions of all stretches; None where the motion cannot be integrated to the end."""
-        return [self.predict(values, s) for s in self.stretches]
+    def predictions(self, values: Values) -> list[tuple[Samples, Prediction | None]]:
+        """All stretches with their predictions; None where the motion cannot be integrated to the end."""
+        return [(s, self.predict(values, s)) for s in self.stretches]
 
     def names_of(self, s: Samples) -> dict[str, int]:
         """Quantities of a stretch: the index of each in p, or -1 - i for the i-th initial state."""
@@ -244,14 +244,6 @@ class EquationSystem(System):
             return []
         found = list(PPoly(s.pieces[:, :4].transpose(1, 2, 0), s.knots)(s.time if times is None else times).T)
         return [*found, *(found[which] for which, _ in self.formulas.late_inputs)]
-
-    def along(self, values: Values, s: Samples) -> tuple[Array, Array, Array, Array]:
-        """Along the motion of a stretch: rates (m, n) and sensors (m, w), each followed by its derivatives by p."""
-        p, found = self.numbers(values, s), self.predict(values, s)
-        states = np.zeros((len(s.time), len(self.formulas.states))) if found is None else found.states
-        rates, _, by_number = self.formulas.rates_at(s, p, s.time, states)
-        shown, _, shown_by_number = self.formulas.sensors_at(s, p, s.time, states)
-        return rates, by_number, shown, shown_by_number
 
 
 def fitted_rows(s: Samples) -> Mask:

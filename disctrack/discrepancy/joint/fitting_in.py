@@ -32,7 +32,7 @@ DETERMINED = 3.0  # prior sigma over the sigma by the recording alone, from whic
 
 
 @dataclass(frozen=True)
-class Consistency:
+class ConsistencyTest:
     """One recording against all others."""
 
     statistic: float  # decrease of chi-square if it has its own values of the shared quantities
@@ -82,7 +82,7 @@ class Blocks:
         for i, *rest in zip(kept, before, reversed(after), strict=True):
             yield i, np.concatenate(rest)
 
-    def consistency(self, i: int, others: Array) -> Consistency:
+    def consistency(self, i: int, others: Array) -> ConsistencyTest:
         """Recording i against the others.
 
         Chi-square of the combinations of shared quantities that the recording determines, against the prediction of the
@@ -102,7 +102,7 @@ class Blocks:
         both, rank_of_both = _least(*together)
         statistic, degrees = max(both - least, 0.0), U.shape[1] - (rank_of_both - rank)
         p = float(stats.chi2.sf(statistic, degrees)) if degrees > 0 else 1.0
-        return Consistency(statistic, max(degrees, 0), p, float(self.chi_square[i]))
+        return ConsistencyTest(statistic, max(degrees, 0), p, float(self.chi_square[i]))
 
     def differences(self, i: int, others: Array) -> list[tuple[float, int]]:
         """Of each candidate: decrease of chi-square if recording i has a size of its own, and degrees of freedom.
@@ -132,13 +132,13 @@ def _least(right: Array, matrix: Array) -> tuple[float, int]:
     return float(np.sum((right - scaled @ x) ** 2)), int(rank)
 
 
-def all_consistencies(blocks: Blocks, kept: list[int]) -> dict[int, Consistency]:
+def all_consistencies(blocks: Blocks, kept: list[int]) -> dict[int, ConsistencyTest]:
     """Each recording of `kept` against the others, by shared quantities or by the most significant candidates.
 
     Where the size of a candidate has intrinsic scatter over all recordings, as in every laboratory a little, its
     chi-square is scaled by it. p is the smaller one of both tests, with the trials penalty of the candidates.
     """
-    found, falls = dict[int, Consistency](), dict[int, list[tuple[float, int]]]()
+    found, falls = dict[int, ConsistencyTest](), dict[int, list[tuple[float, int]]]()
     for i, others in blocks.others(kept):
         found[i], falls[i] = blocks.consistency(i, others), blocks.differences(i, others)
     scatter = _scatter(blocks, falls)
@@ -168,8 +168,8 @@ def _named_difference(blocks: Blocks, standing: Sequence[tuple[float, int, int]]
     most = max((difference for difference, _, _ in standing), default=0.0)
     if most < shared or not standing:
         return ""
-    alike = [(d, -x, k) for x, d, k in standing if most - x < max(CLASS_GAIN, ALIKE_SHARE * most)]
-    first, *others = (blocks.candidates[k] for _, _, k in sorted(alike)[:NAMED])
+    similar = [(d, -x, k) for x, d, k in standing if most - x < max(CLASS_GAIN, ALIKE_SHARE * most)]
+    first, *others = (blocks.candidates[k] for _, _, k in sorted(similar)[:NAMED])
     return f"{first.title} [{first.name}]" + "".join(f" or [{c.name}]" for c in others)
 
 
@@ -215,9 +215,9 @@ def inconsistent(
         if judged[worst].p_value * n > level or statistic < REFIT_SHARE * first:
             break
         first = first or statistic
-        alike = [i for i in kept if i != worst and judged[i].statistic > TWIN * statistic]
-        alike = sorted(alike, key=lambda i: -judged[i].statistic)
-        twins = (i for i in alike if _interchangeable(blocks, (i, worst), kept, level / n, REFIT_SHARE * first))
+        similar = [i for i in kept if i != worst and judged[i].statistic > TWIN * statistic]
+        similar = sorted(similar, key=lambda i: -judged[i].statistic)
+        twins = (i for i in similar if _interchangeable(blocks, (i, worst), kept, level / n, REFIT_SHARE * first))
         for i in (worst, *islice(twins, 1))[: most - len(named)]:
             kept.remove(i)
             named[i] = judged[i].differs_by

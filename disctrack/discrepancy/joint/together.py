@@ -17,7 +17,7 @@ from calibration.kit.least_squares import triangle
 from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.joint.covariates import Hypothesis, hypotheses
 from disctrack.discrepancy.joint.crew import Crew
-from disctrack.discrepancy.joint.fitting_in import Blocks, Consistency, inconsistent
+from disctrack.discrepancy.joint.fitting_in import Blocks, ConsistencyTest, inconsistent
 from disctrack.discrepancy.joint.sharing import EACH, JointSystem, Member, Sharing
 from disctrack.discrepancy.score import Linearisation, score_all, sigmas, span
 from disctrack.discrepancy.search import Diagnosis, Settings, explain
@@ -38,7 +38,7 @@ class OfRecording:
     name: str
     labels: dict[str, str]
     reason: str  # why it was left out; empty if it was not
-    consistency: Consistency | None = None  # against all others, in the final model
+    consistency: ConsistencyTest | None = None  # against all others, in the final model
     alone: Fit | None = None  # the final model fitted to it alone; sigmas with the autocorrelation of its residuals
 
 

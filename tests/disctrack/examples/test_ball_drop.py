@@ -68,7 +68,7 @@ def test_quadratic_drag_is_named_and_sized_where_heights_are_good(rng):
     # the motion is that of the closed form: of each ball with its own number, and of the camera that bends it
     system = found.together.system
     values = {f"state.h[{ball},2]": 45.0 for ball in BALLS} | {"quadratic_drag.k[foam]": 0.05, "perspective.b": 1e-3}
-    seen = dict(zip((s.run for s in system.stretches), system.predictions(values), strict=True))
+    seen = {s.run: found for s, found in system.predictions(values)}
     h = 45 + fallen(0.05, TIME)
     assert_allclose(seen["foam,2"].seen[:, 0], h + 1e-3 * (h - 30) ** 2, atol=1e-7)
     h = 45 + free(0.0, TIME)
