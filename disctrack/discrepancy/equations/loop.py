@@ -177,6 +177,8 @@ def _with_guesses(system: EquationSystem, values: Mapping[str, float]) -> Equati
             value = float(np.nanquantile(np.concatenate([x[i] for x in passed]), share))
             bounds = f.declared[name]
             tried[name] = float(np.clip(value, bounds.lower, bounds.upper))
+        if not np.isfinite(list(tried.values())).all():
+            continue
         there = replace(system, guesses=tried)
         if not np.isfinite(there.linearise(values, [n for c in amounts for n in c.names])[1]).all():
             continue
