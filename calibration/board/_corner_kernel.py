@@ -29,7 +29,6 @@ N_CORNER = (
 )
 FLAT = 0.995  # |S| above which a pixel lies inside a square and shows the image's noise alone
 MIN_BLUR = 0.3  # px, just above the square pixel's own: edges may be sharper, by sharpening, than any lens makes them
-NEAR = 0.3  # sigmas that a full step may still move the corner where no smaller residual is found
 _FAR = 5.0  # sigmas from an edge: S has reached its level to 6e-7
 _X, _W = np.polynomial.legendre.leggauss(8)
 _N_NODES = len(_X)
@@ -222,14 +221,10 @@ def fit_corners(image, windows, starts, known, noise, iterations, tolerance):  #
             trial[4] = min(max(trial[4], 0.5 * p[4], MIN_BLUR), 2.0 * p[4])
             reach = math.hypot(trial[0] - window[4], trial[1] - window[5])
             possible &= reach < window[12] and abs(math.cos(trial[3] - trial[2])) < 0.985
-        for axis in range(3):  # of the inverse the columns of x and y; and what is left to go
+        for axis in range(2):  # of the inverse the columns of x and y
             for i in range(N_CORNER):
-                step[i] = g[i] if axis == 2 else 1.0 if i == axis else 0.0
+                step[i] = 1.0 if i == axis else 0.0
             enough &= solve_damped(H, 0.0, step, L)
-            if axis < 2:
-                covariance[c, 0, axis], covariance[c, 1, axis] = step[0], step[1]
-        # it may be small beside the error: the box's share of the slope is approximate
-        square = NEAR**2 * max(sums[0] / max(sums[1], 1.0), 1.0)
-        near = step[0] ** 2 < square * covariance[c, 0, 0] and step[1] ** 2 < square * covariance[c, 1, 1]
-        converged[c] = enough and (done or near)
+            covariance[c, 0, axis], covariance[c, 1, axis] = step[0], step[1]
+        converged[c] = enough and done
     return found, covariance, all_sums, converged

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from calibration.board._corner_kernel import N_CORNER, fit_corners
@@ -28,7 +29,6 @@ FIRST_REACH = 85.0  # px, of the first fit's window: what it is to tell, blur an
 EDGE_MARGIN = 3.0  # in sigmas of the blur, between the window and the next edge
 MAX_CHI_SQUARE = 25.0  # edge pixels, reduced: beyond, it is not the image of two crossing edges
 BAD_WINDOW = 3.0  # whole window, reduced, against the view's median: beyond, a smaller window is tried
-MIN_CONTRAST_RATIO = 0.25  # of the view's median: below, the corner is covered or in glare
 ROUGHER = 0.7  # scatter of saddle points about a smooth grid over that of the fits: below, the fits are not trusted
 MAX_DISPLACEMENT = 0.2  # of a square, from the corner's neighbours: beyond, another feature was fitted
 WINDOW = 0.35  # of a square: half width of the window of the saddle point
@@ -166,22 +166,16 @@ def _measured_noise(sums: Array) -> Array:
 
     The median over the corners, so that a square with dirt or writing does not count as noise.
     """
-    floor = 1.0 / 12.0  # quantisation to whole grey values
-    levels = []
+    floor, levels = 1.0 / 12.0, []  # quantisation to whole grey values
     for r2, grey, n in ((2, 3, 4), (5, 6, 7)):
         use = sums[sums[:, n] >= 20]
-        levels.append(np.median(use[:, [r2, grey]] / use[:, n : n + 1], axis=0) if len(use) else None)
-    dark, light = levels
-    if dark is None or light is None or not light[1] > dark[1]:
-        either = dark if dark is not None else light
-        return np.array([max(float(either[0]), floor) if either is not None else 1.0, 0.0])
-    low, high = max(dark[0], floor), max(light[0], floor)
-    slope = max((high - low) / (light[1] - dark[1]), 0.0)
-    if slope == 0.0:
-        return np.array([0.5 * (low + high), 0.0])
-    if low - slope * dark[1] < floor:
-        return np.array([floor, max((high - floor) / light[1], 0.0)])
-    return np.array([low - slope * dark[1], slope])
+        levels += [np.median(use[:, [r2, grey]] / use[:, n : n + 1], axis=0)] if len(use) else []
+    if not levels:
+        return np.array([1.0, 0.0])
+    square, grey = np.transpose(levels)
+    terms = np.stack([np.ones_like(grey), grey], axis=1)[:, : len(levels)]  # one level tells no slope
+    beyond = np.append(scipy.optimize.nnls(terms, np.maximum(square - floor, 0.0))[0], 0.0)
+    return np.array([floor + beyond[0], beyond[1]])
 
 
 def _line_curvature(points: Array, ok: Mask, angles: Array, inner_corners: tuple[int, int]) -> Array:
@@ -241,18 +235,14 @@ def _judged(
     edge_pixels = sums[:, 1] - sums[:, 4] - sums[:, 7]
     with np.errstate(invalid="ignore", divide="ignore"):
         chi_square = sums[:, 8] / np.maximum(edge_pixels, 1.0)
-    contrast = 2 * np.abs(found[:, 6])
     converged = ended & np.isfinite(by_noise).all((1, 2)) & seen
-    typical = float(np.median(contrast[converged])) if converged.any() else 0.0
     spread = float(np.median(chi_square[converged])) if converged.any() else 1.0
     chi_limit = MAX_CHI_SQUARE * max(spread, 1.0)  # compressed images have correlated noise: judge against the view
-    faint = converged & (contrast < MIN_CONTRAST_RATIO * typical)
     displaced = _displacement(found[:, :2], converged, axes, counts)
-    fine = converged & (displaced < MAX_DISPLACEMENT) & ~faint & (chi_square < chi_limit)
+    fine = converged & (displaced < MAX_DISPLACEMENT) & (chi_square < chi_limit)
     covariance = by_noise * np.maximum(chi_square, 1.0)[:, None, None]
-    points, reasons = found[:, :2].copy(), np.where(faint, "covered, or in glare", "").astype(object)
-    saddles = saddle_points(grey, np.where(fine[:, None], points, rough), spacing * min(plain / WINDOW, 1.0))
-    expected, sigma = smooth_grid(np.where(fine[:, None], points, saddles), counts, seen)
+    saddles = saddle_points(grey, np.where(fine[:, None], found[:, :2], rough), spacing * min(plain / WINDOW, 1.0))
+    expected, sigma = smooth_grid(np.where(fine[:, None], found[:, :2], saddles), counts, seen)
     by_saddles, sigma_saddle = smooth_grid(saddles, counts, seen)
     if sigma_saddle < ROUGHER * sigma and fine.any():  # the saddle points lie smoother than the fine fits do
         fine = np.zeros_like(fine)
@@ -262,17 +252,17 @@ def _judged(
     covariance = np.maximum(min(sigma / stated, 1.0) ** 2, 1 / np.maximum(chi_square, 1.0))[:, None, None] * covariance
     sigma_saddle = max(sigma_saddle, LEAST_SIGMA)
     off = np.linalg.norm(saddles - expected, axis=-1)
-    stands = ~fine & ~faint & seen & (off < min(MAX_DISPLACEMENT * spacing, 4 * sigma_saddle))
-    points[~fine] = saddles[~fine]
-    covariance[~fine] = sigma_saddle**2 * np.eye(2)
-    for i in np.flatnonzero(~fine & ~stands & ~faint & seen):
-        reasons[i] = f"{off[i]:.1f} px from where the other corners put it (they scatter by {sigma_saddle:.2f} px)"
+    stands = ~fine & seen & (off < min(MAX_DISPLACEMENT * spacing, 4 * sigma_saddle))
+    reasons = [
+        f"{px:.1f} px from where the other corners put it (they scatter by {sigma_saddle:.2f} px)" if lost else ""
+        for px, lost in zip(off, ~fine & ~stands & seen, strict=True)
+    ]
     return CornerView(
         image_size=(grey.shape[1], grey.shape[0]),
-        points=points,
-        covariance=covariance,
+        points=np.where(fine[:, None], found[:, :2], saddles),
+        covariance=np.where(fine[:, None, None], covariance, sigma_saddle**2 * np.eye(2)),
         accepted=fine | stands,
-        reasons=tuple(str(reason) for reason in reasons),
+        reasons=tuple(reasons),
     )
 
 
