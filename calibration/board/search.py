@@ -30,9 +30,8 @@ def located(
 ) -> list[CornerView | BoardNotFound]:
     """The target in every image.
 
-    A sample over all of them is searched first. Where most of it does not show the target to the quick search but
-    another board, that is reason enough not to search on; where the slow search finds none either, the others are
-    searched quickly.
+    All are searched quickly, and slowly those without it. Where a sample over all of them shows another board, or where
+    none does quickly and of a sample none slowly, that is reason enough not to search on.
     """
     views: dict[int, CornerView | BoardNotFound] = {}
 
@@ -56,14 +55,13 @@ def located(
         return [index for index in indices if isinstance(views[index], BoardNotFound)]
 
     sample = evenly(len(images), VIEWS_TRIED)
-    quickly = lost(sample, False)
-    if shown := other_board([images[i] for i in sample], [i in quickly for i in sample], target):
+    without = lost(sample, False)
+    if shown := other_board([images[i] for i in sample], [i in without for i in sample], target):
         return [BoardNotFound(f"{target} is not in it. {shown}")] * len(images)
-    without, others = lost(quickly, True), sorted(set(range(len(images))) - set(sample))
-    promising = without != sample
-    elsewhere = lost(others, promising)
-    if not promising and elsewhere != others:
-        lost([*without, *elsewhere], True)
+    without += lost(sorted(set(range(len(images))) - set(sample)), False)
+    tried = [without[i] for i in evenly(len(without), VIEWS_TRIED)]
+    if len(without) < len(images) or lost(tried, True) != tried:
+        lost(without, True)
     return [views[index] for index in range(len(images))]
 
 

@@ -22,7 +22,7 @@ OFTEN = 0.3  # of the views, in which such a pixel differs from its neighbours
 
 
 def stuck_pixels(images: Sequence[NDArray] | NDArray, of_board: bool = False) -> Mask | None:
-    """(height, width) True where a pixel of grey images (n, height, width) keeps its value and does not see.
+    """True where a pixel of images, (height, width) or (height, width, channels), keeps its value and does not see.
 
     That is one that is off its neighbours in all images. Of views of a board its squares are as dark as a dead pixel
     and as light as a hot one, so that none differs from its neighbours in every view: it does OFTEN, and while the
@@ -44,7 +44,7 @@ def stuck_pixels(images: Sequence[NDArray] | NDArray, of_board: bool = False) ->
 
 
 def _changed(images: Sequence[NDArray] | NDArray) -> NDArray[np.int32]:
-    """(height, width) by how much each pixel changes over the images."""
+    """By how much each pixel changes over the images."""
     return reduce(np.maximum, images).astype(np.int32) - reduce(np.minimum, images)
 
 
@@ -57,18 +57,14 @@ def repaired_views(views: Sequence[NDArray], camera: str) -> tuple[list[NDArray]
     first = views[0] if len(views) else np.zeros((0, 0))
     if any(view.shape != first.shape or view.dtype not in (np.uint8, np.uint16) for view in views) or first.ndim > 3:
         return list(views), ""
-    channels = [np.moveaxis(np.atleast_3d(view), 2, 0) for view in views]
-    masks = [
-        stuck_pixels([np.ascontiguousarray(c) for c in side], of_board=True) for side in zip(*channels, strict=True)
-    ]
-    blind = {k: mask for k, mask in enumerate(masks) if mask is not None}
-    if not blind:
+    blind = stuck_pixels(views, of_board=True)
+    if blind is None:
         return list(views), ""
     mended = [view.copy() for view in views]
-    for view in mended:
-        for k, mask in blind.items():
-            repair(np.atleast_3d(view)[..., k], mask)
-    n = int(np.any([*blind.values()], axis=0).sum())
+    for view in map(np.atleast_3d, mended):
+        for channel, mask in enumerate(np.moveaxis(np.atleast_3d(blind), 2, 0)):
+            repair(view[..., channel], mask)
+    n = int(np.atleast_3d(blind).any(axis=2).sum())
     return mended, f"{camera} camera: {n} pixels show one value in all views; their neighbours stand in for them"
 
 
