@@ -25,7 +25,6 @@ CELLS = 10  # of the spline's grid along the longer side of the image
 # Standard deviations of a coefficient that are tried: of the part that varies within cells, and of the smooth one
 SIZES_PX = ((0.003, 0.01), (0.003, 0.03), (0.01, 0.03), (0.01, 0.1), (0.03, 0.1))
 BETTER = 2.5  # standard errors by which the views that were left out must be met better
-LEAST_GAIN = 0.03  # and part of their chi-square: less is not worth its parameters
 
 
 def fit_lens_field(refinement: Refinement, nominal: Array) -> tuple[LensField | None, Refinement]:
@@ -56,7 +55,7 @@ def fit_lens_field(refinement: Refinement, nominal: Array) -> tuple[LensField | 
             step = np.append(-_solved(train[np.ix_(free, free)], precision)[0], 1.0)
             chi_square[k, test] = [float(np.sum((of_views[v][:, free] @ step) ** 2)) for v in test]
     gain = chi_square[0] - chi_square[1]
-    if gain.mean() < max(BETTER * gain.std() / np.sqrt(len(views) - 1), LEAST_GAIN * chi_square[0].mean()):
+    if gain.mean() < BETTER * gain.std() / np.sqrt(len(views) - 1):
         return None, refinement
     field = replace(field, coefficients=solution[-field.coefficients.size :].reshape(field.coefficients.shape))
     o = refinement.observations

@@ -17,7 +17,6 @@ from calibration.kit.arrays import Array, Array32, evenly
 from calibration.kit.errors import CalibrationError
 
 MOST_K1 = 10.0  # of a lens that exists; beyond, the views do not tell of it
-ONE_PLACE = 1e-3  # of the board's distance: rays that meet at 0.06 deg tell no distance
 WIDE = 0.8  # half the image's diagonal in focal lengths, 77 deg across: below, the polynomial describes ordinary lenses
 # Misfit of the median view, rational over polynomial. A 150 deg lens had 0.25 to 0.73, eight ordinary cameras, of 8 to
 # 20 views, 0.98 to 1.00.
@@ -93,7 +92,7 @@ def start_stereo(
     both = [v for v in poses[0] if v in poses[1]]
     R_pair, t_pair = pairs.R_right_left, pairs.t_right_left
     between, distance = (float(np.median(np.linalg.norm(t, axis=-1))) for t in (t_pair, [poses[0][v][1] for v in both]))
-    if between < ONE_PLACE * distance:  # then no distance can be told
+    if between < FLOOR * distance:  # rays that meet at 0.06 deg tell no distance
         raise CalibrationError(
             f"the left and the right images show the board from one place (the cameras would stand {1e3 * between:.2g} "
             f"mm apart, the board {1e3 * distance:.3g} mm away): do both patterns name the images of one camera?"

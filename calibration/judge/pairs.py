@@ -30,7 +30,6 @@ from calibration.kit.arrays import Array
 from calibration.kit.least_squares import scaled_solve
 
 MOVED = 2.0  # times what corners' scatter makes of a board at rest, and times that scatter, that motion is named
-LEAST_PAIRS = 6  # fewer cannot judge one another: one tells how the cameras stand, and a median is of the others
 # Times as far apart as pairs of one side. None of 400 synthetic sets of boards that moved reaches 2; of 31 photographed
 # ones two have 8.8 and 4.5, where OpenCV's rig of one side misses the other's pairs as well, and the next one 2.2.
 STEP = 4.0
@@ -150,7 +149,7 @@ def judge_pairs(observations: Observations, fit: Refinement, table_view: int | N
     count = np.bincount(image)
     rms = np.sqrt(np.bincount(image, square) / count)
     typical = float(np.median(rms))
-    is_bad = (rms > TOO_FAR * typical) & (len(rms) >= LEAST_PAIRS)
+    is_bad = (rms > TOO_FAR * typical) & (len(rms) >= 2 * MIN_VIEWS)
     bad = {
         divmod(int(i), 2): f"RMS {own:.3f} px by itself, the median image has {typical:.3f} px: blurred, or the board "
         "was found wrongly"
@@ -211,7 +210,7 @@ def compared(observations: Observations, pairs: Pairs, table_view: int | None, f
     """
     model, views, sides = pairs.model, pairs.views, []
     R_pair = model.rig.R_right_left
-    if len(views) < LEAST_PAIRS:
+    if len(views) < 2 * MIN_VIEWS:  # one tells how the cameras stand, and a median is of the others
         return pairs
     for index, (R, t) in enumerate(model.rig.camera_poses()):
         mine = observations[observations.camera == index]

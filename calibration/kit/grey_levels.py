@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 # Fewer different values than this may share a factor by chance.
 _ENOUGH_LEVELS = 16
 # At the saturation level pixels pile up: so many times more of them than at any of the levels just below.
-_PILE, _PILE_PIXELS, _LEVELS_BELOW = 8, 30, 8
+_PILE, _PILE_PIXELS = 8, 30
 # Gains of neighbouring pixels that differ by more are a colour filter: odd and even rows of one sensor by a few 0.1 %,
 # light that falls off by a half across the image, by less than 0.1 %.
 _MOSAIC = 0.02
@@ -55,7 +55,7 @@ def saturation_level(images: NDArray) -> int | None:
     levels = np.flatnonzero(counts)
     if len(levels) < _ENOUGH_LEVELS or counts[-1] < _PILE_PIXELS:
         return None
-    below = counts[levels[-1 - _LEVELS_BELOW : -1]]
+    below = counts[levels[-_ENOUGH_LEVELS:-1]]
     found = levels[-1] == full_scale(images) or counts[-1] >= _PILE * int(below.max())
     return int(levels[-1]) if found else None
 
