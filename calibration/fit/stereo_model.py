@@ -126,23 +126,17 @@ def board_basis(nominal: Array, board: str) -> Array:
 
 def predict_pixels(model: StereoModel, observations: Observations) -> Array:
     """Pixels (m, 2) alone."""
-    _, arm, t = _arms(model, observations)
-    return model.rig.project(arm + t)[observations.camera, np.arange(len(observations))]
+    return predict(model, observations)[0]
 
 
 def predict(model: StereoModel, observations: Observations) -> tuple[Array, Array, Array, Array]:
     """Pixels (m, 2) and derivatives: d/d stereo (m, 2, 24), d/d view pose (m, 2, 6), d/d target point (m, 2, 3)."""
-    R, arm, t = _arms(model, observations)
+    R, t = (of[observations.view, observations.camera] for of in (model.R_left_board, model.t_left_board))
+    arm = np.einsum("mij,mj->mi", R, model.points[observations.point])
     seen = observations.camera, np.arange(len(observations))
     pixels, d_left, d_rig = (of_both[seen] for of_both in model.rig.project_with_jacobians(arm + t))
     d_pose = np.concatenate([by_turning(d_left, arm), d_left], axis=-1)
     return pixels, d_rig[..., :N_STEREO], d_pose, d_left @ R
-
-
-def _arms(model: StereoModel, observations: Observations) -> tuple[Array, Array, Array]:
-    """Rotation (m, 3, 3) of the board, its point turned by it (m, 3), and the board's place (m, 3)."""
-    R, t = (of[observations.view, observations.camera] for of in (model.R_left_board, model.t_left_board))
-    return R, np.einsum("mij,mj->mi", R, model.points[observations.point]), t
 
 
 def moved(model: StereoModel, stereo: Array, poses: Array, displacement: Array) -> StereoModel:
