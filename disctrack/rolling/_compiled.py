@@ -1,8 +1,8 @@
 """Compiled functions that call each other by address.
 
-The integrator, the equations of motion and the law of every effect are compiled separately, and meet only through
-addresses: a new effect costs the compilation of one small function, never that of the integrator. The records' field
-names are part of each signature. A call by address costs about 3 ns.
+The integrator, the equations of motion and the law of every effect are compiled separately, and call each other only by
+address. A new effect requires the compilation of one small function, not of the integrator. The field names of the
+records are part of each signature. A call by address takes about 3 ns.
 """
 
 import operator
@@ -37,12 +37,12 @@ def _call(typingctx, address, pointers):  # type: ignore[no-untyped-def]
     return types.void(types.int64, pointers), codegen
 
 
-call: Any = _call  # the type checker takes an intrinsic for what numba calls while compiling
+call: Any = _call  # the type checker sees the signature that numba uses while compiling
 
 
 @lower_builtin(operator.truediv, types.complex128, types.complex128)
 def _divided(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-    """Complex division that is NaN where the divisor is zero: numba's own raises, which a C function cannot hand on."""
+    """Complex division, NaN if the divisor is zero: numba's own raises an error, which a C function cannot pass on."""
 
     def ratio(a: complex, b: complex) -> complex:  # Smith 1962
         if b.real == 0.0 and b.imag == 0.0:
@@ -75,11 +75,11 @@ def compile_system(function: Callable[..., None], scalar: type) -> Any:
     return _compile(function, types.void(v, v, v, types.CPointer(types.int64), *records))
 
 
-@lru_cache(maxsize=256)  # the catalogue several times over; whoever calls a law holds it himself
+@lru_cache(maxsize=256)  # several times the size of the catalogue; callers keep their own reference to a law
 def compile_law(function: Callable[..., None], parameters: tuple[str, ...], helpers: tuple, scalar: type) -> Any:
     """law(p, s, w) as C function for parameters of these names; `helpers` are Python functions that it may call.
 
-    s and w are the same record: what a law may read, and where it writes.
+    s and w are the same record: a law reads its kinematics and adds to its wrench.
     """
     for helper in helpers:
         register_jitable(helper)

@@ -6,35 +6,36 @@ D = r_GA = r_OA - r_OG, omega the angular velocity of the body, Omega that of th
     m a_G = F + m g + X,      J omegadot + omega x J omega = D x F + M - r_OG x X,      M = M_0 + F_z L
     r_OA = a - rho k,         a = -(r - rho) e2 - (h - rho) e3          (rho: radius of the rounded edge, 0 = sharp)
 
-Contact keeps A at the table's height, rolling also at rest: v_O = -omega x r_OA, and d(r_OA)/dt = Omega x a since k is
-constant, hence  F = f0 - m omegadot x D  with  f0 = m (omega x (omega x r_OG) - omega x (Omega x a)) - m g - X,  and
+In contact A stays at the height of the table; in rolling it is at rest: v_O = -omega x r_OA. As k is constant,
+d(r_OA)/dt = Omega x a. Hence  F = f0 - m omegadot x D  with  f0 = m (omega x (omega x r_OG) - omega x (Omega x a)) -
+m g - X,  and
 
     rolling    [J + m (|D|^2 - D D') + m L (D x k)'] omegadot = -omega x J omega + D x f0 + M_0 + L f0_z - r_OG x X
     slipping   F = F_z d,  d = k - mu v_A / |v_A|,   F_z = f0_z - m (D x k) . omegadot
                [J + m (D x d + L) (D x k)'] omegadot = -omega x J omega + (D x d + L) f0_z + M_0 - r_OG x X
     flying     F = 0, M = M_0
 
-On a table of curvature kappa, a sphere about C = n_0 / kappa that passes through the origin with the normal n_0, the
-disc touches at the point of its rim that is farthest from C. With W = kappa (C - P), P the centre of the rim's circle,
-and W_f its part in the face, the contact lies in the direction e = -W_f / |W_f|, the normal is n = W - kappa r e in
-place of k, and |n| = 1 gives the height of O; nothing of this is singular at kappa = 0. Omega x a becomes the rate of
-r_OA, and in slip n . v_A = 0 is differentiated with the rate of n. A rim with the support function p(beta), beta the
-angle of e in the body, is touched at p e + p' e3 x e (both at once: to first order in kappa p'). F_z stands for n . F.
+Curved table: a sphere of curvature kappa about C = n_0 / kappa through the origin, where its normal is n_0. The contact
+is the point of the rim farthest from C. Let W = kappa (C - P), P the centre of the rim's circle, and W_f the projection
+of W on the face. Then the contact is in the direction e = -W_f / |W_f|, the normal n = W - kappa r e replaces k, and
+|n| = 1 determines the height of O. None of these is singular at kappa = 0. Omega x a becomes the rate of r_OA; in
+slip, n . v_A = 0 is differentiated with the rate of n. A rim with the support function p(beta), beta the angle of e in
+the body, has its contact at p e + p' e3 x e (with a curved table: to first order in kappa p'). F_z means n . F.
 
-A table that moves by u(t) is at rest in its own axes, where gravity is g - u''. If it gives way by c F_z, then to first
-order in the compliance c the load is that of the rigid table, whose course F_z', F_z'' along the motion is had by
-differences over LOAD_STEP; slip that friction would turn within that time keeps its direction beside n0 in it.
-A contact that creeps, v_A = -c F_t / F_z, is a table that slides by as much under a rolling disc: v_A follows the force
-within c / (3 g) to c / g, and is had in powers of that time over the motion's, by the same differences. Where that is
-no short time (c above FILM) v_A is a state of its own, as in slip: a disc on a film that is sheared.
-A surface that moves under the disc (a belt, a turntable), v = v_0 + Omega k x A, is in the same way a table that slides
-with the velocity of the surface where the disc touches it; A is its place there, which moves as the disc rolls.
+Moving table, displacement u(t): in its own axes gravity is g - u''. Compliant table, which sinks by c F_z: to first
+order in c the load is that of a rigid table. Its derivatives F_z', F_z'' along the motion are differences over
+LOAD_STEP, in which slip that friction would turn within that time keeps its direction relative to n0.
+Creep, v_A = -c F_t / F_z, is equivalent to a table that slides with v_A under a rolling disc. v_A follows the force
+with a time constant of c / (3 g) to c / g, and is expanded in the ratio of this time to that of the motion, with the
+same differences. If this time is not short (c above FILM), v_A is part of the state, as in slip: a sheared film.
+Moving surface (belt, turntable), v = v_0 + Omega k x A: equivalent to a table that slides with the velocity of the
+surface at the contact A, which moves as the disc rolls.
 
 F_z contains omegadot, so laws proportional to the load are solved together with it. For a homogeneous disc with a sharp
 edge this is Ma et al. (2014), (2.6), (2.8) and (2.9), with (2.3) corrected to zdot = (r cos theta - h sin theta)
-thetadot, and (2.7) taken with Omega, the rate of the frame, not omega, that of the body.
+thetadot, and (2.7) with Omega, the rate of the frame, instead of omega, that of the body.
 
-The functions are written for float and for complex numbers: an imaginary part of 1e-30 carries an exact derivative.
+The functions accept float and complex numbers: an imaginary part of 1e-30 carries an exact derivative.
 """
 
 from __future__ import annotations
@@ -51,22 +52,22 @@ from disctrack.rolling.records import Record, Regime
 
 Vector: TypeAlias = tuple[complex, complex, complex]  # all numbers may be real
 State: TypeAlias = Sequence[complex]
-# r_OA, the normal, the height of O; and what only an uneven rim or table asks for: W, its part in the face over its
-# length, that length, and the rim's support there
+# r_OA, the normal, the height of O; and, for an uneven rim or table only: W, its unit projection on the face (-e), the
+# length of the projection, and the support function with its derivatives
 Contact: TypeAlias = tuple[Vector, Vector, complex, tuple[Vector, Vector, complex, Vector]]
 Forced: TypeAlias = tuple[complex, complex, complex, complex, complex, complex, complex]
 
 ROLLING, SLIPPING, FLYING = map(int, Regime)
 EVENTS = ("theta_end", "load", "grip", "upright")
-STICK_SPEED = 1e-7  # [m/s]; 1e-4 of what the tracking can see, and 1e-8 of the disc's speeds
-LOAD_STEP = 1e-4  # [s]; (200 rad/s times it)^2 / 12 = 3e-5 of F_z'', and rounding 1e-8 N/s^2
-CREEP_PASSES = 3  # each adds a power of c times the motion's rate over 3 g to what is known of creep
+STICK_SPEED = 1e-7  # [m/s]; 1e-4 of the resolution of the tracking, and 1e-8 of the disc's speeds
+LOAD_STEP = 1e-4  # [s]; errors: (200 rad/s times it)^2 / 12 = 3e-5 of F_z'', and rounding 1e-8 N/s^2
+CREEP_PASSES = 3  # orders of the expansion of creep, in c / (3 g) times the rate of the motion
 FILM = 2e-3  # [m/s] of creep: (c / g times rates of 100 rad/s)^3 is 1e-5 of v_A, and steps of 0.1 ms are stable
-NEAR_CONTACT = 1e-10  # [m] of a step of Newton's method: what is left then is its square over the radius
-LIFT_OFF_GAP = 1e-12  # [m]; a landing is a fall below this, so that the start of a flight is not one
+NEAR_CONTACT = 1e-10  # [m] step at which Newton's method stops; the error is its square over the radius
+LIFT_OFF_GAP = 1e-12  # [m] below which the disc has landed; not zero, which is the gap at the start of a flight
 
-# table: integers shared by all functions: regime, number of laws, address of the record `now` of all that is known of
-# the instant, then the address of each law and of its parameters.
+# table: integers shared by all functions: regime, number of laws, address of the record `now` (records.INSTANT), then
+# the addresses of each law and of its parameters.
 
 
 @exact_part
@@ -106,7 +107,7 @@ def _solve(rows: tuple[Vector, Vector, Vector], b: Vector) -> Vector:
 
 @exact_part
 def _support(body: Record, cb: complex, sb: complex) -> Vector:
-    """Support function of the rim, less its edge's radius, and two derivatives; by cosine and sine of the angle."""
+    """Support function of the rim minus the edge radius, and two derivatives, from cosine and sine of the angle."""
     c2, s2 = cb * cb - sb * sb, 2.0 * sb * cb
     c3, s3 = c2 * cb - s2 * sb, s2 * cb + c2 * sb
     two, three = body.oval_c * c2 + body.oval_s * s2, body.lobes_c * c3 + body.lobes_s * s3
@@ -122,7 +123,7 @@ def _support(body: Record, cb: complex, sb: complex) -> Vector:
 
 @exact_part
 def _contact(body: Record, now: Record) -> Contact:
-    """From place and angles in the record."""
+    """Contact geometry from the position and the angles in the record."""
     s, c = now.sin_theta, now.cos_theta
     zero, kappa, rho = 0.0 * s, body.curvature, body.edge_radius
     if body.uneven == 0.0:
@@ -135,12 +136,12 @@ def _contact(body: Record, now: Record) -> Contact:
     level = _nodal(-(now.x * cp + now.y * sp), now.x * sp - now.y * cp, zero, s, c)
     z = (body.radius - rho) * s + arm3 * c + rho
     W, across, w, p = n0, n0, 1.0 + zero, (z, z, z)
-    for _ in range(6):  # Newton's method; the first guess errs by the table's slope
+    for _ in range(6):  # Newton's method; the relative error of the initial guess is of the order of the table's slope
         D = (level[0], level[1] - z * s, level[2] - z * c + arm3)
         W = _add(n0, _scale(kappa, D))
         w = np.sqrt(W[0] * W[0] + W[1] * W[1])
         across = (W[0] / w, W[1] / w, zero)  # -e
-        # e in body axes: nodal axes turned back by the spin
+        # e in body axes: nodal axes rotated by minus the spin
         p = _support(body, -(cf * across[0] + sf * across[1]), -(cf * across[1] - sf * across[0]))
         gap = 2.0 * _dot(n0, D) + kappa * _dot(D, D) + 2.0 * p[0] * w + kappa * p[0] * p[0] + (2.0 - kappa * rho) * rho
         by_z = -2.0 * upright - 2.0 * kappa * (s * D[1] + c * D[2]) - 2.0 * kappa * p[0] * s * across[1]
@@ -157,7 +158,7 @@ def _contact(body: Record, now: Record) -> Contact:
 
 @exact_part
 def _contact_rates(body: Record, now: Record, y: State, at: Contact) -> tuple[Vector, Vector]:
-    """Rates of r_OA and of the normal, as vectors; nodal components."""
+    """Rates of the vectors r_OA and normal, in nodal components."""
     s, c, rho, kappa = now.sin_theta, now.cos_theta, body.edge_radius, body.curvature
     arm, normal, _, (W, across, w, p) = at
     if body.uneven == 0.0:
@@ -167,7 +168,7 @@ def _contact_rates(body: Record, now: Record, y: State, at: Contact) -> tuple[Ve
     e3 = (0.0 * s, 0.0 * s, 1.0 + 0.0 * s)
     e3_rate = _cross(omega, e3)
     W_rate = _scale(-kappa, _add(v, _scale(arm3, e3_rate)))
-    in_face = _add(W_rate, _scale(-W[2], e3_rate))  # less its part along e3, which the next line takes off
+    in_face = _add(W_rate, _scale(-W[2], e3_rate))  # rate of the projection, apart from a part along e3
     e = _scale(-1.0, across)
     along = _cross(e3, e)
     e_rate = _scale(-1.0 / w, _add(in_face, _scale(-_dot(across, in_face), across)))
@@ -202,7 +203,7 @@ def _kinematics(regime: int, t: complex, y: State, body: Record, k: Record) -> C
     if regime != ROLLING:
         k.v_n, k.v_m = y[8] * cp + y[9] * sp, y[9] * cp - y[8] * sp
         rise = (k.v_n + turn_n) * k.normal_n + (k.v_m + turn_m) * k.normal_m
-        k.v_z = -turn_z - rise / k.normal_z  # the point at the contact stays on the table
+        k.v_z = -turn_z - rise / k.normal_z  # the material point at the contact moves along the table
     if regime == FLYING:
         k.z, k.v_z = y[10], y[11]
     k.slip_n, k.slip_m = k.v_n + turn_n, k.v_m + turn_m
@@ -227,7 +228,7 @@ def _apply_laws(table: Addresses, now: Record) -> None:
 
 @exact_part
 def _inertia_rows(body: Record, s: complex, c: complex) -> tuple[Vector, Vector, Vector]:
-    """Inertia about G in nodal axes, from body axes turned by the spin angle of this sine and cosine."""
+    """Inertia about G in nodal axes; s, c : sine and cosine of the spin."""
     J11 = c * c * body.J_11 - 2 * c * s * body.J_12 + s * s * body.J_22
     J22 = s * s * body.J_11 + 2 * c * s * body.J_12 + c * c * body.J_22
     J12 = c * s * (body.J_11 - body.J_22) + (c * c - s * s) * body.J_12
@@ -273,7 +274,7 @@ def _accelerations(regime: int, y: State, body: Record, now: Record, at: Contact
         if regime == SLIPPING:
             slip_z = -(now.slip_n * now.normal_n + now.slip_m * now.normal_m) / now.normal_z
             slip = _nodal(now.slip_n, now.slip_m, slip_z, s, c)
-            speed = body.creep  # over F_t / F_z: on a film, and with Coulomb's friction
+            speed = body.creep  # |v_A| over F_t / F_z: of the film, or from Coulomb's law
             if body.inverse_friction != 0.0:
                 speed = body.inverse_friction * np.sqrt(_dot(slip, slip))
             d = _add(k, _scale(-1.0 / speed, slip))
@@ -298,7 +299,7 @@ def _accelerations(regime: int, y: State, body: Record, now: Record, at: Contact
 
 @exact_part
 def _state(regime: int, y: Numbers) -> State:
-    """All twelve components; zeros for those that a regime does not have: so that all below is compiled once."""
+    """All twelve components, zeros for those that the regime lacks, so that the functions below are compiled once."""
     zero = 0.0 * y[0]
     v_x, v_y = (y[8], y[9]) if regime != ROLLING else (zero, zero)
     z, v_z = (y[10], y[11]) if regime == FLYING else (zero, zero)
@@ -307,9 +308,9 @@ def _state(regime: int, y: Numbers) -> State:
 
 @exact_part
 def _rates_of(y: State, now: Record) -> State:
-    """Of all twelve components, on a table at rest."""
+    """Rates of all twelve components, on a table at rest."""
     c, sp, cp = now.cos_theta, now.sin_psi, now.cos_psi
-    # components of a vector in a turning frame: rate of the components = (rate of the vector) - Omega x vector
+    # rotating frame: rate of the components = (rate of the vector) - Omega x vector
     relative = _cross((y[5], y[6], now.psidot * c), (y[5], y[6], y[7]))
     return (
         now.v_n * cp - now.v_m * sp, now.v_n * sp + now.v_m * cp, now.psidot, now.thetadot, now.phidot,
@@ -319,8 +320,8 @@ def _rates_of(y: State, now: Record) -> State:
 
 
 @exact_part
-def _moved(y: State, h: float, rate: State) -> State:
-    """The state after h along these rates."""
+def _euler_step(y: State, h: float, rate: State) -> State:
+    """The state after an Euler step h with these rates."""
     return (
         y[0] + h * rate[0], y[1] + h * rate[1], y[2] + h * rate[2], y[3] + h * rate[3], y[4] + h * rate[4],
         y[5] + h * rate[5], y[6] + h * rate[6], y[7] + h * rate[7], y[8] + h * rate[8], y[9] + h * rate[9],
@@ -329,11 +330,11 @@ def _moved(y: State, h: float, rate: State) -> State:
 
 
 @exact_part
-def _flow(t: complex, y: State, forced: Forced, table: Addresses, body: Record, now: Record) -> State:
-    """Rates of the state on a rigid table; fills the record on the way.
+def _rigid_table_rates(t: complex, y: State, forced: Forced, table: Addresses, body: Record, now: Record) -> State:
+    """Rates of the state on a rigid table; also fills the record.
 
-    forced : acceleration of the contact along i and j, the rate of that; then a slip along n0 and m0 that takes the
-        place of the state's own, and the share to which it does
+    forced : acceleration of the contact along i and j, and its rate; then a slip along n0 and m0 that replaces the slip
+        of the state, and the weight with which it does
     """
     at = _kinematics(table[0], t, y, body, now)
     slip_n, slip_m, share = forced[4:]
@@ -345,73 +346,73 @@ def _flow(t: complex, y: State, forced: Forced, table: Addresses, body: Record, 
 
 
 @exact_part
-def _load_and_pull(now: Record) -> Vector:
-    """F_z, and friction along i and j over N: what the normal of a hollow supports is none."""
+def _load_and_friction(now: Record) -> Vector:
+    """F_z, and friction along i and j over N, without the horizontal part of the normal force."""
     sp, cp = now.sin_psi, now.cos_psi
     F_n, F_m = now.F_n - now.N * now.normal_n, now.F_m - now.N * now.normal_m
     return now.F_z, (F_n * cp - F_m * sp) / now.N, (F_n * sp + F_m * cp) / now.N
 
 
 @exact_part
-def _ahead(
+def _load_after(
     h: float, rate: State, t: complex, y: State, forced: Forced, table: Addresses, body: Record, now: Record
 ) -> Vector:
-    """`_load_and_pull` after h, by the midpoint of the way there."""
+    """`_load_and_friction` after h, by the midpoint method."""
     for part in (0.5 * h, h):
         a_x, a_y, j_x, j_y, slip_n, slip_m, share = forced
         later = (a_x + part * j_x, a_y + part * j_y, j_x, j_y, slip_n, slip_m, share)
-        rate = _flow(t + part, _moved(y, part, rate), later, table, body, now)
-    return _load_and_pull(now)
+        rate = _rigid_table_rates(t + part, _euler_step(y, part, rate), later, table, body, now)
+    return _load_and_friction(now)
 
 
 @exact_part
-def _course(
+def _load_derivatives(
     t: complex, y: State, forced: Forced, table: Addresses, body: Record, now: Record
 ) -> tuple[Vector, Vector, Vector]:
-    """`_load_and_pull` along the motion, and its first two derivatives by time."""
+    """`_load_and_friction` along the motion, and its first two time derivatives."""
     h = LOAD_STEP
-    rate = _flow(t, y, forced, table, body, now)
-    at_once = _load_and_pull(now)
-    after = _ahead(h, rate, t, y, forced, table, body, now)
-    before = _ahead(-h, rate, t, y, forced, table, body, now)
-    rise = _scale(0.5 / h, _add(after, _scale(-1.0, before)))
-    bend = _scale(1.0 / (h * h), _add(_add(after, before), _scale(-2.0, at_once)))
-    return at_once, rise, bend
+    rate = _rigid_table_rates(t, y, forced, table, body, now)
+    at_once = _load_and_friction(now)
+    after = _load_after(h, rate, t, y, forced, table, body, now)
+    before = _load_after(-h, rate, t, y, forced, table, body, now)
+    first = _scale(0.5 / h, _add(after, _scale(-1.0, before)))
+    second = _scale(1.0 / (h * h), _add(_add(after, before), _scale(-2.0, at_once)))
+    return at_once, first, second
 
 
 @exact_part
-def _giving_way(t: complex, y: State, table: Addresses, body: Record, now: Record) -> tuple[complex, Vector, Vector]:
-    """By how much the table is moved where it gives way to the load, and the contact creeps.
+def _table_motion(t: complex, y: State, table: Addresses, body: Record, now: Record) -> tuple[complex, Vector, Vector]:
+    """Motion of the table by its compliance and the creep of the contact; zeros if there is neither, and in flight.
 
-    Its height; its velocity and its acceleration along i, j and upwards: zeros where neither is, or the disc flies.
+    Its height, then its velocity and its acceleration along i, j and upwards.
     """
-    regime, sinks, nothing = table[0], body.compliance, 0.0 * y[0]
-    creep = body.creep if regime == ROLLING else nothing
-    forced = (nothing, nothing, nothing, nothing, nothing, nothing, nothing)
-    if regime == FLYING or (sinks == 0.0 and creep == 0.0):
-        return nothing, (nothing, nothing, nothing), (nothing, nothing, nothing)
+    regime, compliance, zero = table[0], body.compliance, 0.0 * y[0]
+    creep = body.creep if regime == ROLLING else zero
+    forced = (zero, zero, zero, zero, zero, zero, zero)
+    if regime == FLYING or (compliance == 0.0 and creep == 0.0):
+        return zero, (zero, zero, zero), (zero, zero, zero)
     if regime == SLIPPING and body.inverse_friction != 0.0:
-        # slip that creeps follows its force at once, and turns any way within LOAD_STEP: its direction is held then
+        # slow slip follows its force at once and may turn by any angle within LOAD_STEP: its direction is kept
         _kinematics(regime, t, y, body, now)
         slow = 3.0 * LOAD_STEP * now.gravity / body.inverse_friction
         speed2, slow2 = now.slip_n * now.slip_n + now.slip_m * now.slip_m, slow * slow
         share = slow2 * slow2 / (slow2 * slow2 + speed2 * speed2)
-        forced = (nothing, nothing, nothing, nothing, now.slip_n, now.slip_m, share)
-    pull, rise, bend = _course(t, y, forced, table, body, now)
+        forced = (zero, zero, zero, zero, now.slip_n, now.slip_m, share)
+    force, first, second = _load_derivatives(t, y, forced, table, body, now)
     for _ in range(CREEP_PASSES - 1 if creep != 0.0 else 0):
-        # the force that accelerates what creeps is part of the force by which it creeps
-        forced = (-creep * rise[1], -creep * rise[2], -creep * bend[1], -creep * bend[2], nothing, nothing, nothing)
-        pull, rise, bend = _course(t, y, forced, table, body, now)
-    velocity = (-creep * pull[1], -creep * pull[2], -sinks * rise[0])
-    return -sinks * pull[0], velocity, (-creep * rise[1], -creep * rise[2], -sinks * bend[0])
+        # the force that accelerates the creeping disc is part of the force that causes the creep
+        forced = (-creep * first[1], -creep * first[2], -creep * second[1], -creep * second[2], zero, zero, zero)
+        force, first, second = _load_derivatives(t, y, forced, table, body, now)
+    velocity = (-creep * force[1], -creep * force[2], -compliance * first[0])
+    return -compliance * force[0], velocity, (-creep * first[1], -creep * first[2], -compliance * second[0])
 
 
 @exact_part
-def _moving(y: State, body: Record, now: Record, at: Contact) -> tuple[complex, complex, complex, complex]:
-    """Velocity along i and j of the surface at the contact, and its rate as the contact moves along; no laws asked."""
-    nothing, turn = 0.0 * y[0], body.surface_turn
+def _surface_velocity(y: State, body: Record, now: Record, at: Contact) -> tuple[complex, complex, complex, complex]:
+    """Velocity along i and j of the surface at the moving contact, and its rate; it does not depend on the laws."""
+    zero, turn = 0.0 * y[0], body.surface_turn
     if turn == 0.0:
-        return nothing + body.surface_vx, nothing + body.surface_vy, nothing, nothing
+        return zero + body.surface_vx, zero + body.surface_vy, zero, zero
     s, c, sp, cp, arm = now.sin_theta, now.cos_theta, now.sin_psi, now.cos_psi, at[0]
     arm_rate, _ = _contact_rates(body, now, y, at)
     at_n, at_m = arm[0], c * arm[1] - s * arm[2]
@@ -425,13 +426,13 @@ def _moving(y: State, body: Record, now: Record, at: Contact) -> tuple[complex, 
 def _margins(regime: int, body: Record, now: Record, at: Contact) -> tuple[complex, complex, complex, complex]:
     """Margins (EVENTS) that are positive while the regime lasts.
 
-    theta_end: nutation above its end. load: N, or in flight the gap. grip: rolling N - |F_t|/mu, slipping the slip
-    speed. upright: the lower rim alone touches; beyond pi/2 it would be the other one.
+    theta_end: nutation minus its end value. load: N, or in flight the gap. grip: in rolling N - |F_t|/mu, in slip the
+    slip speed. upright: pi/2 - theta; beyond pi/2 the other rim touches.
     """
     load, grip = now.N, 1.0 + 0.0 * now.theta
     if regime == ROLLING:
         grip = now.N - body.inverse_friction * now.F_t
-    if regime == SLIPPING and body.inverse_friction != 0.0:  # on a film nothing sticks
+    if regime == SLIPPING and body.inverse_friction != 0.0:  # on a film the disc never sticks
         grip = np.sqrt(now.slip_n * now.slip_n + now.slip_m * now.slip_m) - STICK_SPEED
     if regime == FLYING:
         load = now.z - at[2] + LIFT_OFF_GAP
@@ -439,14 +440,14 @@ def _margins(regime: int, body: Record, now: Record, at: Contact) -> tuple[compl
 
 
 def rates(t: Numbers, y: Numbers, out: Numbers, table: Addresses, body: Record, now: Record) -> None:
-    """Time derivative of the state, then the margins; fills the record on the way."""
+    """Time derivative of the state, then the margins; also fills the record."""
     regime, state = table[0], _state(table[0], y)
-    sunk, (v_x, v_y, v_z), (a_x, a_y, a_z) = _giving_way(t[0], state, table, body, now)
+    sinking, (v_x, v_y, v_z), (a_x, a_y, a_z) = _table_motion(t[0], state, table, body, now)
     at = _kinematics(regime, t[0], state, body, now)
     _apply_laws(table, now)
-    turning = _moving(state, body, now, at)
-    v_x, v_y, a_x, a_y = v_x + turning[0], v_y + turning[1], a_x + turning[2], a_y + turning[3]
-    now.table_z = now.table_z + sunk
+    surface = _surface_velocity(state, body, now, at)
+    v_x, v_y, a_x, a_y = v_x + surface[0], v_y + surface[1], a_x + surface[2], a_y + surface[3]
+    now.table_z = now.table_z + sinking
     now.table_vx, now.table_vy, now.table_vz = now.table_vx + v_x, now.table_vy + v_y, now.table_vz + v_z
     now.table_ax, now.table_ay, now.table_az = now.table_ax + a_x, now.table_ay + a_y, now.table_az + a_z
     _accelerations(regime, state, body, now, at)

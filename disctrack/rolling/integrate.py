@@ -1,9 +1,9 @@
 """Runge-Kutta method of order 8 with dense output and events, compiled.
 
-It has never heard of discs: the system is a C function by address that gives rates and event margins. Numbers may be
-complex: an imaginary part of 1e-30 on a starting value or a parameter is carried along as the exact derivative of the
-solution. The step control then looks at the real parts with the tolerances of the real solution, and at the imaginary
-parts relative to their own largest size: a law whose amount is zero shows nowhere else.
+It is independent of the disc: the system is the address of a C function that computes rates and event margins. Numbers
+may be complex: an imaginary part of 1e-30 of an initial value or a parameter becomes the exact derivative of the
+solution. The step control then applies the tolerances of the real solution to the real parts, and a tolerance relative
+to their maximum to the imaginary parts: a law whose amount is zero changes only these.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from calibration.kit.compiled import exact_part, njit
 from disctrack.rolling._compiled import call
 from disctrack.rolling.records import Records
 
-RTOL_IMAGINARY = 1e-7  # error of fifth order per step; the derivatives then hold to about 1e-9 of their size
+RTOL_IMAGINARY = 1e-7  # fifth-order error per step; the relative error of the derivatives is then about 1e-9
 
 
 class CompiledSystem(NamedTuple):
-    """Address of f(t, y, out, a, b, c), which writes rates and then margins, and the addresses a, b, c for it."""
+    """Address of f(t, y, out, a, b, c), which writes rates and then margins, and the addresses a, b, c."""
 
     function: int
     a: int
@@ -34,12 +34,12 @@ class CompiledSystem(NamedTuple):
 def integrate(
     system: CompiledSystem, t0: complex, y0: Numbers, grid: Array, rtol: float, atol: Array, max_steps: int
 ) -> tuple[Numbers, complex, Numbers, int, int]:
-    """Solve dy/dt = f(t, y) from (t0, y0) to the grid's points, until a margin that was positive runs out.
+    """Solve dy/dt = f(t, y) from (t0, y0) to the grid's points, until a positive margin falls to zero.
 
     grid : (n_grid,) increasing, none before t0.   atol : (n,)
-    Returns y at the grid points that were reached (n_filled, n), instant and state of the event, or at the last grid
-    point, the number of the margin that ran out, or -1, and that of the steps. Where neither an event nor the last grid
-    point is reached, the step became too small, a number not finite, or the steps were too many.
+    Returns y at the grid points that were reached (n_filled, n), instant and state of the event or at the last grid
+    point, the index of the margin of the event or -1, and the number of steps. If neither an event nor the last grid
+    point is reached, the step became too small, a number is not finite, or the steps were too many.
     """
     solution = np.full((len(grid), len(y0)), np.nan, y0.dtype)
     t, y = np.array([t0], y0.dtype), y0.copy()
@@ -48,7 +48,7 @@ def integrate(
 
 
 def evaluate(system: CompiledSystem, t: Numbers, Y: Numbers, instant: Records) -> tuple[Numbers, Numbers, Records]:
-    """Call a system at many states: rates, margins, and a record (1,) that it fills as it is after each call.
+    """Evaluate a system at many states: rates, margins, and copies of the record (1,) that each call fills.
 
     t : (N,), Y : (N, n) -> (N, n), (N, n_margins), (N,)
     """
@@ -61,7 +61,7 @@ def evaluate(system: CompiledSystem, t: Numbers, Y: Numbers, instant: Records) -
 
 @exact_part
 def _assign(target: Numbers, values: Numbers) -> None:
-    """As target[:] = values, for which numba compiles the text of an error besides: a second."""
+    """Same as target[:] = values, for which numba also compiles an error message, which takes a second."""
     for i in range(target.size):
         target[i] = values[i]
 
@@ -87,7 +87,7 @@ def _evaluate(system: CompiledSystem, t: Numbers, Y: Numbers, out: Numbers, inst
 def _error(y: Numbers, h: float, rtol: float, atol: Array, size: Array, made: dop853.Step) -> float:
     """Hairer's combination of the embedded errors of order 5 and 3, in units of the tolerance.
 
-    Or, where it is more, the error of order 5 of the imaginary parts; `size` (1,) is their largest so far in atol.
+    Or, if larger, the error of order 5 of the imaginary parts; `size` (1,) is their maximum so far, in units of atol.
     """
     sum5, sum3, worst = 0.0, 0.0, 0.0
     for k in range(y.size):
@@ -113,7 +113,7 @@ def _error(y: Numbers, h: float, rtol: float, atol: Array, size: Array, made: do
 
 @exact_part
 def _fill(F: Numbers, t: complex, y: Numbers, h: complex, grid: Array, i_grid: int, solution: Numbers) -> int:
-    """Write the grid points from number i_grid up to the end of the step; returns the number of the next one."""
+    """Fill the grid points from index i_grid to the end of the step; returns the index of the next one."""
     while i_grid < grid.size and grid[i_grid] <= (t + h).real:
         dop853.along(F, y, (grid[i_grid] - t) / h, solution[i_grid])
         i_grid += 1
@@ -122,7 +122,7 @@ def _fill(F: Numbers, t: complex, y: Numbers, h: complex, grid: Array, i_grid: i
 
 @exact_part
 def _first_step(y: Numbers, f: Numbers, atol: Array) -> float:
-    """A hundredth of the time in which the fastest component changes by its own size."""
+    """A hundredth of the shortest time in which a component changes by its own magnitude."""
     fastest = 0.0
     for k in range(y.size):
         fastest = max(fastest, abs(f[k].real) / (atol[k] * 1e6 + abs(y[k].real)))
@@ -130,8 +130,8 @@ def _first_step(y: Numbers, f: Numbers, atol: Array) -> float:
 
 
 @exact_part
-def _ran_out(K: Numbers, n: int) -> int:
-    """Number of the first margin that was positive at the step's start and is no longer at its end, or -1."""
+def _first_event(K: Numbers, n: int) -> int:
+    """Index of the first margin that is positive at the start of the step but not at its end, or -1."""
     for e in range(n, K.shape[1]):
         if K[0, e].real > 0.0 and K[dop853.N, e].real <= 0.0:
             return e - n
@@ -142,16 +142,16 @@ def _ran_out(K: Numbers, n: int) -> int:
 def _locate(
     system: CompiledSystem, t_box: Numbers, t: complex, y: Numbers, h: complex, event: int, made: dop853.Step
 ) -> tuple[int, float]:
-    """Which margin runs out first within a step, and at which part of it, by bisection along the step's polynomial.
+    """The first event within a step and the fraction of the step, by bisection with the interpolating polynomial.
 
-    event : number of the first margin that has run out at the step's end
+    event : index of the first margin that is not positive at the end of the step
     """
     low, high = 0.0, 1.0
-    for _ in range(50):  # to rounding
+    for _ in range(50):  # to rounding error
         trial = 0.5 * (low + high)
         dop853.along(made.F, y, trial, made.stage)
         _rates(t + trial * h, made.stage, made.K[dop853.N], system, t_box)
-        found = _ran_out(made.K, y.size)
+        found = _first_event(made.K, y.size)
         if found < 0:
             low = trial
         else:
@@ -170,8 +170,8 @@ def _dop853(
     max_steps: int,
     solution: Numbers,
 ) -> tuple[np.signedinteger, int, int]:
-    """Fills the solution, moves t_last (1,) and y (n,); grid points reached, event or -1, steps."""
-    n, unit = y.size, 0.0 * y[0] + 1.0  # one, in the kind of number of the state
+    """Fills the solution, updates t_last (1,) and y (n,); returns grid points reached, event or -1, steps."""
+    n, unit = y.size, 0.0 * y[0] + 1.0  # one, in the number type of the state
     t_box, made = t_last.copy(), dop853.room(y, n + system.n_margins)
     K = made.K
     size, t, i_grid = np.zeros(1), t_last[0], np.int64(0)
@@ -189,14 +189,14 @@ def _dop853(
             continue
         _step(system, t_box, t, y, h, made)
         error = _error(y, h.real, rtol, atol, size, made)
-        if not error <= 1.0:  # also when not a number
+        if not error <= 1.0:  # also if NaN
             h_next = h.real * (max(0.2, 0.9 * error**-0.125) if np.isfinite(error) else 0.1)
             if h_next < 1e-15:
                 return i_grid, -1, steps
             continue
         h_next = h.real * (5.0 if error == 0.0 else min(5.0, 0.9 * error**-0.125))
         _rates(t + h, made.end, K[dop853.N], system, t_box)
-        event = _ran_out(K, n)
+        event = _first_event(K, n)
         if event >= 0:
             _polynomial(system, t_box, t, y, h, made)
             event, part = _locate(system, t_box, t, y, h, event, made)

@@ -16,7 +16,7 @@ from disctrack.rolling.effects.base import Effect, EffectParameter, effect_class
 from disctrack.rolling.effects.learned import effect_from_formulas
 from disctrack.rolling.records import BODY, UNEVEN
 
-DEFAULT_THETA_END = np.radians(0.5)  # where the disc of Ma et al. (2014) comes to lie on its paper
+DEFAULT_THETA_END = np.radians(0.5)  # nutation at which the disc of Ma et al. (2014) touches its paper
 
 
 @checked
@@ -29,10 +29,10 @@ class Model:
     """
 
     disc: Disc
-    gravity: Gravity = 9.81  # [m/s^2] along -k, unless an effect says otherwise
+    gravity: Gravity = 9.81  # [m/s^2] along -k, unless an effect changes it
     effects: tuple[Effect, ...] = ()
     air_density: Density = AIR_DENSITY  # [kg/m^3]
-    laws: tuple[type[Effect], ...] = ()  # by formula, that parameters may name beside those of the catalogue
+    laws: tuple[type[Effect], ...] = ()  # by formula; their parameters may be used like those of the catalogue
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "effects", tuple(self.effects))
@@ -57,12 +57,12 @@ class Model:
         return next((e for e in self.effects if e.name == name), None)
 
     def with_effects(self, *effects: Effect) -> Model:
-        """Copy in which these effects replace those of the same name, or are appended."""
+        """Copy with these effects appended, or in place of those of the same name."""
         new = {e.name: e for e in self.effects} | {e.name: e for e in effects}
         return replace(self, effects=tuple(new.values()))
 
     def with_values(self, values: Mapping[str, float]) -> Model:
-        """Copy with new values by "effect.parameter"; an effect that is not in the model is added, absent otherwise."""
+        """Copy with new values by "effect.parameter"; effects not in the model are added, other parameters at null."""
         new = {e.name: dict(e.values) for e in self.effects}
         for full_name, value in values.items():
             effect, parameter = self.split_name(full_name)
@@ -70,7 +70,7 @@ class Model:
         return replace(self, effects=tuple(self.effect_class(name)(**v) for name, v in new.items()))
 
     def knowing(self, *laws: type[Effect]) -> Model:
-        """Copy whose parameters may also be those of these laws; they replace laws of the same name."""
+        """Copy that also accepts parameters of these laws, which replace laws of the same name."""
         new = {law.name: law for law in self.laws} | {law.name: law for law in laws}
         return replace(self, laws=tuple(new.values()))
 
@@ -80,7 +80,7 @@ class Model:
         return next((e for e in own if e.name == name), None) or effect_class(name)
 
     def split_name(self, full_name: str) -> tuple[type[Effect], str]:
-        """(effect, "parameter") of "effect.parameter"; raises ModelError where no effect has such a parameter."""
+        """(effect, "parameter") of "effect.parameter"; raises ModelError if no effect has this parameter."""
         name, _, parameter = full_name.partition(".")
         effect = self.effect_class(name)
         known = [p.name for p in effect.parameters]
@@ -89,7 +89,7 @@ class Model:
         return effect, parameter
 
     def has_name(self, full_name: str) -> bool:
-        """Is this the name of a parameter that the model has or may take?"""
+        """Is this the name of a parameter that the model has or accepts?"""
         try:
             self.split_name(full_name)
         except ModelError:
@@ -98,7 +98,7 @@ class Model:
 
 
 def body_constants(model: Model, theta_end: float, values: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """Constants of records.BODY with all adjustments; numbers are complex where `values` (by full name) are."""
+    """Constants of records.BODY after all adjustments; complex if they depend on complex `values` (by full name)."""
     disc = model.disc
     body = SimpleNamespace(**dict.fromkeys(BODY, 0.0))
     body.mass, body.radius, body.half_thickness = disc.mass, disc.radius, disc.half_thickness
@@ -115,7 +115,7 @@ def body_constants(model: Model, theta_end: float, values: Mapping[str, Any] | N
 
 
 def effect_values(effect: Effect, values: Mapping[str, Any] | None) -> dict[str, Any]:
-    """Parameter values of one effect, those in `values` (by full name) taking precedence."""
+    """Parameter values of one effect; `values` (by full name) take precedence."""
     given = values or {}
     return {name: given.get(f"{effect.name}.{name}", value) for name, value in effect.values.items()}
 
@@ -123,10 +123,10 @@ def effect_values(effect: Effect, values: Mapping[str, Any] | None) -> dict[str,
 def effects_from_tables(
     tables: Mapping[str, Mapping[str, float]], formulas: Mapping[str, Mapping[str, str]] | None = None
 ) -> tuple[Effect, ...]:
-    """Effects of nested tables {effect: {parameter: value}}, as a scene or a saved model has them.
+    """Effects from nested tables {effect: {parameter: value}}, as in a scene or a saved model.
 
-    An effect named without any number has its nominal size. Once one is given, amounts that are not are null; shapes
-    of a law (an exponent) are nominal. Raises ModelError.
+    An effect with an empty table has nominal values. Otherwise missing amounts are null, and missing shape parameters
+    (an exponent) nominal. Raises ModelError.
     formulas : {effect: {component: formula}} of effects that are not in the catalogue (effects.learned)
     """
     laws = {name: effect_from_formulas(name, law) for name, law in (formulas or {}).items()}

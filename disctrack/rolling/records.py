@@ -1,13 +1,13 @@
-"""The quantities that the equations of motion and the effects share, by name.
+"""Named quantities shared by the equations of motion and the effects.
 
-They travel as NumPy records, so that compiled code and plain Python read them alike: `s.psidot`, `w.M_m`.
+They are NumPy records, so that compiled code and plain Python access them in the same way: `s.psidot`, `w.M_m`.
 
-State vector y (SI, radians), of which each regime integrates the first 8, 10 or 12 entries:
+State vector y (SI, radians); the regimes integrate its first 8, 10 or 12 entries:
     rolling   x, y, psi, theta, phi, omega1 = thetadot, omega2 = psidot sin(theta), omega3 = psidot cos(theta) + phidot
     slipping  the same, and v_x, v_y: the horizontal velocity of the geometric centre O in world axes
     flying    the same, and z, v_z of O
-    x, y belong to O. omega is in the nodal frame (frames.py); omega2 stays small and smooth where psidot grows without
-    bound. In contact z follows from theta, and in rolling the velocity of O from omega, so they cannot drift.
+    x, y are the position of O. omega is in the nodal frame (frames.py); omega2 stays small and smooth when psidot grows
+    without bound. In contact z follows from theta, and in rolling the velocity of O from omega: they cannot drift.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Record: TypeAlias = "np.recarray[Any, Any]"  # the numbers of one kind below, read and written by name
-Records: TypeAlias = NDArray[np.void]  # many of them
+Records: TypeAlias = NDArray[np.void]  # an array of them
 
 
 class Regime(IntEnum):
@@ -33,7 +33,7 @@ class Regime(IntEnum):
 ROLLING_COMPONENTS = ("x", "y", "psi", "theta", "phi", "thetadot", "omega2", "omega3")
 STATE_COMPONENTS = (*ROLLING_COMPONENTS, "v_x", "v_y", "z", "v_z")
 
-# Read by the laws of the effects. Vectors are in the contact frame (n0, m0, k), n0 = e1, m0 = k x n0.
+# Input of the laws of the effects. Vectors are in the contact frame (n0, m0, k), n0 = e1, m0 = k x n0.
 KINEMATICS = (
     "time",
     *"xyz",  # O in world axes [m]
@@ -58,7 +58,7 @@ KINEMATICS = (
     *(f"normal_{a}" for a in "nmz"),  # of the table at the contact
 )
 
-# Written by the laws: contact moment M + F_z * load, external force X at O; (n0, m0, k).
+# Output of the laws: contact moment M + F_z * load, external force X at O; (n0, m0, k).
 LAW_COMPONENTS = (
     *(f"M_{a}" for a in "nmz"),  # moments that do not depend on the load [N m]
     *(f"load_{a}" for a in "nmz"),  # moments per unit of normal force: lever arms [m]
@@ -66,41 +66,41 @@ LAW_COMPONENTS = (
 )
 WRENCH = (
     *LAW_COMPONENTS,
-    *(f"table_{a}" for a in "xyz"),  # where the table is, in the axes of cameras at rest [m]; q is relative to it
+    *(f"table_{a}" for a in "xyz"),  # displacement of the table in axes of the cameras [m]; q is relative to the table
     *(f"table_v{a}" for a in "xyz"),  # its velocity [m/s]
     *(f"table_a{a}" for a in "xyz"),  # and acceleration [m/s^2]
-    *(f"field_{a}" for a in "xyz"),  # uniform field beside gravity, world axes [m/s^2]: it pulls at the centre of mass
+    *(f"field_{a}" for a in "xyz"),  # uniform field besides gravity, world axes [m/s^2]; acts at the centre of mass
 )
 
 # Solved from the equations of motion.
-ANSWERS = (
+SOLUTION = (
     *(f"F_{a}" for a in "nmz"),  # contact force on the disc [N]
-    "N",  # its part along the normal of the table at the contact: F_z on a flat one
-    "F_t",  # and the size of the rest, which friction has to supply
+    "N",  # its component along the normal of the table at the contact: F_z on a flat table
+    "F_t",  # magnitude of its tangential component, which friction has to supply
     *(f"a_{a}" for a in "nmz"),  # acceleration of O relative to the table [m/s^2]
     *(f"alpha_{i}" for i in "123"),  # angular acceleration along e1, e2, e3 [rad/s^2]
 )
 
-ANGLES = ("sin_psi", "cos_psi", "sin_phi", "cos_phi")  # read by the equations alone: laws that turn with psi say so
+ANGLES = ("sin_psi", "cos_psi", "sin_phi", "cos_phi")  # for the equations only: laws have to use psi, which is detected
 
-INSTANT = KINEMATICS + WRENCH + ANSWERS + ANGLES  # all that the equations of motion know at one instant: one record
+INSTANT = KINEMATICS + WRENCH + SOLUTION + ANGLES  # all quantities of the equations of motion at one instant
 
 # Constants of one body on one table. Inertia about the centre of mass in body axes.
 BODY = (
     "mass",
-    "radius",  # r: the contact runs on the circle of this radius ...
-    "half_thickness",  # ... this far below O along -e3
+    "radius",  # r of the contact circle ...
+    "half_thickness",  # ... and its distance from O along -e3
     "edge_radius",  # of the rounded edge; 0 = sharp
     *(f"oval_{a}" for a in "cs"),  # rim's support function r + oval_c cos 2 beta + oval_s sin 2 beta + ...
     *(f"lobes_{a}" for a in "cs"),  # ... + lobes_c cos 3 beta + lobes_s sin 3 beta, by the angle beta in the body [m]
-    "flat_depth",  # of a flat of the rim: support function less depth exp(sharpness (cos(beta - angle) - 1)) [m]
-    "flat_cos",  # of its angle in the body
+    "flat_depth",  # of a flat of the rim: support function minus depth exp(sharpness (cos(beta - angle) - 1)) [m]
+    "flat_cos",  # cosine and sine of its angle in the body
     "flat_sin",
     "flat_sharpness",  # 1 / width^2 [1/rad^2]
-    "compliance",  # of the table: it sinks by so much per load [m/N]
+    "compliance",  # of the table [m/N]
     "creep",  # of the contact: velocity over F_t / F_z [m/s]
     *(f"surface_v{a}" for a in "xy"),  # velocity of the table's surface at the origin [m/s] ...
-    "surface_turn",  # ... and its rate of turn about the vertical [rad/s]
+    "surface_turn",  # ... and its angular velocity about the vertical [rad/s]
     "curvature",  # of the table, a sphere through the origin: positive in a hollow [1/m]
     *(f"slope_{a}" for a in "xy"),  # of the table at the origin, descending towards i, and j
     *(f"com_{i}" for i in "123"),  # centre of mass from O in body axes [m]
@@ -110,7 +110,7 @@ BODY = (
     "air_density",  # [kg/m^3]
     "inverse_friction",  # 1/mu of Coulomb's law; 0 = never slips
     "theta_end",  # the motion ends here [rad]
-    "uneven",  # 1 unless a round rim rolls on a level, flat table: all of these are 0 then
+    "uneven",  # 1 if any of UNEVEN is not 0, otherwise 0: a round rim on a level, flat table
 )
 UNEVEN = ("curvature", "slope_x", "slope_y", "oval_c", "oval_s", "lobes_c", "lobes_s", "flat_depth")
 

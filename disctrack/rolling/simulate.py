@@ -1,15 +1,15 @@
-"""From a model and a state to the motion: pure rolling, slip and flight, with the switches found; and its derivatives.
+"""Simulation of a model from an initial state, through pure rolling, slip and flight, and its derivatives.
 
-The derivatives, by the initial state and by the parameters of the effects, are exact. Each column is one more run of
-the same compiled integrator with an imaginary part of 1e-30 on one number (complex-step derivative): no difference is
-taken, and the way in which the instants of the switches between rolling, slip and flight move is included. Columns
-that follow from a symmetry of the model are written down: where nothing tells one place or direction of the table, or
-one angle of the body from another, a motion that begins elsewhere is the same motion there.
+The derivatives with respect to the initial state and the parameters of the effects are exact. Each column is another
+run of the same compiled integrator with an imaginary part of 1e-30 on one number (complex-step derivative). They
+include the dependence of the instants of the switches between rolling, slip and flight. Columns that follow from a
+symmetry of the model are not integrated: if the model does not depend on the position or direction on the table, or on
+the spin angle, a motion with another initial value is the same motion, displaced or rotated.
 
-From those by the state follow first-order responses of a rolling motion to any moment and force, without another run:
-with the fundamental matrix Phi(t) = dy(t)/dy(0) of the state and B(t), what a unit of moment or force adds to its rate,
-a small wrench f(t) moves the state by Phi(t) times the integral of Phi(s)^-1 B(s) f(s) ds (variation of constants). So
-hundreds of laws can be asked for what each would do, for the price of some sums.
+The derivatives with respect to the state determine first-order responses of a rolling motion to any moment and force.
+Let Phi(t) = dy(t)/dy(0) be the fundamental matrix, and B(t) the derivative of the state's rate by moment and force.
+Then a small wrench f(t) moves the state by Phi(t) times the integral of Phi(s)^-1 B(s) f(s) ds (variation of
+constants). The responses to hundreds of laws thus need no further integration.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -37,16 +37,16 @@ from disctrack.rolling.motion import EndReason, Motion, Path, Switch, columns, c
 from disctrack.rolling.records import BODY, INSTANT, ROLLING_COMPONENTS, STATE_COMPONENTS, Records, Regime, record_dtype
 from disctrack.rolling.state import State, steady_precession
 
-RTOL = 1e-11  # of the integrator; keeps the energy without losses to 1e-11 over 1.5 s
-# m, m, rad, rad, rad, rad/s x 3, m/s x 2, m, m/s: about 1e-12 of what moves
+RTOL = 1e-11  # of the integrator; without dissipation the energy is constant to 1e-11 over 1.5 s
+# m, m, rad, rad, rad, rad/s x 3, m/s x 2, m, m/s: about 1e-12 of the typical values
 ATOL = np.array([1e-13, 1e-13, 1e-12, 1e-13, 1e-12, 1e-11, 1e-11, 1e-11, 1e-13, 1e-13, 1e-13, 1e-13])
-MAX_SWITCHES = 2000  # of slip and rolling: more is chatter
-MOST_STEPS = 1_000_000  # of the integrator, over all stretches
-COMPONENTS = ("M_n", "M_m", "M_z", "X_n", "X_m", "X_z")  # of a moment and a force that responses are asked for
+MAX_SWITCHES = 2000  # between slip and rolling; more is chatter
+MOST_STEPS = 1_000_000  # of the integrator, over all regimes
+COMPONENTS = ("M_n", "M_m", "M_z", "X_n", "X_m", "X_z")  # of moment and force in `responses`
 _PROBE = effect_from_formulas("probe", {c: f"{c}_given" for c in COMPONENTS})
-_SEED = 1e-30  # imaginary part; its square is far below the smallest rounding
-_ASKEW = ("com_1", "com_2", "J_12", "J_13", "J_23")  # of a body that is not the same all round its axis
-# What a law reads that tells one direction of the table from another.
+_SEED = 1e-30  # imaginary part; its square is far below rounding errors
+_ASKEW = ("com_1", "com_2", "J_12", "J_13", "J_23")  # nonzero in a body without symmetry about its axis
+# Kinematics with which a law depends on a direction of the table.
 _OF_DIRECTION = {"x", "y", "psi", *(f"{v}{a}" for v in ("table_", "table_v", "table_a", "field_") for a in "xy")}
 
 
@@ -62,9 +62,9 @@ def simulate(
 ) -> Motion:
     """Motion from `state` over `duration` [s] at `rate` [Hz], or at the given `times`.
 
-    The state holds at the first of the times (0 with `duration`). The motion ends early, with the reason in `end`,
-    where the nutation falls to `theta_end` [rad], the disc stands up, or it lands after a loss of contact; then only
-    the times before are there. Raises ModelError for a state or times that make no sense.
+    The state is that at the first of the times (0 with `duration`). The motion ends early, with the reason in `end`, if
+    the nutation falls to `theta_end` [rad], the disc stands up, or it lands after a loss of contact. Then it has only
+    the times before its end. Raises ModelError for an invalid state or invalid times.
 
         >>> disc = read_recording("clip").disc
         >>> simulate(Model(disc), steady_precession(0.1, disc), duration=0.1).q.shape
@@ -111,9 +111,9 @@ def _start(state: State, theta_end: float) -> Array:
 
 
 class Assembly:
-    """Records, addresses and compiled functions of one model; owns the memory that the addresses point to.
+    """Records, addresses and compiled functions of one model; owns the memory at these addresses.
 
-    Not shared between threads: the instant is scratch space.
+    Not thread-safe: `instant` is scratch space.
     """
 
     def __init__(self, model: Model, theta_end: float, scalar: type = float, values: Mapping[str, Any] | None = None):
@@ -144,7 +144,7 @@ class Assembly:
         return integrate.CompiledSystem(self._rates.address, a, b, c, len(EVENTS))
 
     def at(self, regime: int, t: ArrayLike, Y: Numbers) -> tuple[Numbers, Numbers, Records]:
-        """Rates (N, n), margins (N, 4) and all that is known (N,) at states Y (N, n), or at one (n,)."""
+        """Rates (N, n), margins (N, 4) and records.INSTANT (N,) at states Y (N, n), or at one (n,)."""
         return integrate.evaluate(self.system(regime), np.atleast_1d(t), np.atleast_2d(Y), self.instant)
 
     def constant(self, name: str) -> Any:
@@ -153,7 +153,7 @@ class Assembly:
 
     @property
     def on_a_film(self) -> bool:
-        """Does the contact creep so fast that its velocity is a state of its own? Coulomb's friction goes first."""
+        """Does the contact creep so fast that its velocity is part of the state? Coulomb friction takes precedence."""
         return bool(self.constant("creep").real > FILM and self.constant("inverse_friction") == 0.0)
 
 
@@ -169,13 +169,13 @@ def follow(
     y = np.array(y, assembly.scalar)
     t: complex = grid[0] * y.dtype.type(1.0)
     regime = (len(y) - 8) // 2
-    pieces: list[tuple[Records, Array]] = []
+    segments: list[tuple[Records, Array]] = []
     switches: list[Switch] = []
     end: EndReason | None = None
     i, slip_steps, n_steps = 0, 0, 0
 
     def add(times: Array, Y: Numbers) -> None:
-        pieces.append((assembly.at(regime, times, Y)[2], np.full(len(times), regime, np.uint8)))
+        segments.append((assembly.at(regime, times, Y)[2], np.full(len(times), regime, np.uint8)))
 
     while end is None:
         if regime == ROLLING and assembly.on_a_film:
@@ -185,7 +185,7 @@ def follow(
             system, atol = assembly.system(regime), ATOL[: len(y)]
             Y, t, y, event, n = integrate.integrate(system, t, y, grid[i:], rtol, atol, max_steps - n_steps)
             n_steps, slip_steps = n_steps + n, slip_steps + (n if regime == SLIPPING else 0)
-            if len(Y):  # none where the steps are used up before the first instant
+            if len(Y):  # empty if the steps are used up before the first instant
                 add(grid[i : i + len(Y)], Y)
             i += len(Y)
             if event < 0:
@@ -199,27 +199,27 @@ def follow(
                 regime = new
                 if len(switches) > max_switches:
                     end = EndReason.CHATTER
-    if not pieces:  # over at its start
+    if not segments:  # the motion ends at its start
         add(grid[:1], y[None])
-    now, regimes = (np.concatenate(parts) for parts in zip(*pieces, strict=True))
+    now, regimes = (np.concatenate(parts) for parts in zip(*segments, strict=True))
     return Path(now, regimes, switches, end, t, y, slip_steps, n_steps)
 
 
 def _event_at_start(assembly: Assembly, regime: int, t: complex, y: Numbers) -> int:
-    """An event that holds already where a stretch starts, or -1: the regime is not the one that physics allows."""
+    """Index of an event that has already occurred at the start of a regime, so that the regime is wrong; or -1."""
     margins = assembly.at(regime, t, y)[1][0].real
-    if regime == SLIPPING and not margins[EVENTS.index("grip")] > 0:  # without slip the direction of friction is open,
-        return EVENTS.index("grip")  # and the load with it
-    margins[EVENTS.index("upright")] += -1e-12 * np.sign(y[5].real)  # at exactly 90 deg the direction decides
+    if regime == SLIPPING and not margins[EVENTS.index("grip")] > 0:  # at zero slip the direction of friction and
+        return EVENTS.index("grip")  # the load are undetermined
+    margins[EVENTS.index("upright")] += -1e-12 * np.sign(y[5].real)  # at exactly 90 deg the nutation rate decides
     failed = np.flatnonzero(~(margins > 0))
     return int(failed[0]) if failed.size else -1
 
 
 def _complex_instant(assembly: Assembly, regime: int, event: int, t: complex, y: Numbers) -> tuple[complex, Numbers]:
-    """Event moved in imaginary time to where the margin's imaginary part vanishes too.
+    """Complex instant and state of an event, at which the imaginary part of the margin vanishes too.
 
-    The instant depends on the parameters; to first order, which is all that imaginary parts of 1e-30 know, the state
-    moves along its rates.
+    The instant depends on the parameters. To first order, which is exact for imaginary parts of 1e-30, the state moves
+    along its rates.
     """
     probe = 1e-20  # [s]; its square is far below rounding
     (rates,), (margins,), _ = assembly.at(regime, t, y)
@@ -232,7 +232,7 @@ def _complex_instant(assembly: Assembly, regime: int, event: int, t: complex, y:
 def _switch(
     assembly: Assembly, regime: int, event: int, t: complex, y: Numbers
 ) -> tuple[EndReason | None, int, Numbers]:
-    """What follows an event: (reason to end or None, next regime, its state)."""
+    """Consequence of an event: (reason to end or None, next regime, its state)."""
     name = EVENTS[event]
     if name == "theta_end":
         return EndReason.NUTATION, regime, y
@@ -246,7 +246,7 @@ def _switch(
     _, (margins,), now = assembly.at(ROLLING, t, y[:8])
     if regime == SLIPPING and margins[event].real > 0:
         return None, ROLLING, y[:8]
-    # begins to slip, against the friction force that rolling would have needed
+    # slip begins opposite to the friction force that rolling would need
     F_n, F_m = now["F_n"][0], now["F_m"][0]
     cp, sp = np.cos(y[2]), np.sin(y[2])
     scale = -2 * STICK_SPEED / np.sqrt(F_n * F_n + F_m * F_m)
@@ -256,17 +256,17 @@ def _switch(
 
 @dataclass(frozen=True)
 class Sensitivities:
-    """Motion at n times and its derivatives with respect to k numbers; NaN after the end of the motion."""
+    """Motion at n times and its derivatives with respect to k quantities; NaN after the end of the motion."""
 
     time: Array  # (n,)
     q: Array  # (n, 6)
     qdot: Array  # (n, 6)
     names: tuple[str, ...]  # (k,) components of the state, then "effect.parameter"
-    dq: Array  # (n, 6, k) in the unit of q per unit of the number
+    dq: Array  # (n, 6, k) in the unit of q per unit of the quantity
     dqdot: Array  # (n, 6, k)
     dstate: Array  # (n, 8, k) of records.ROLLING_COMPONENTS
     slip_steps: int = 0  # of the integrator in slip, over all runs
-    n_steps: int = 0  # of it in all
+    n_steps: int = 0  # of the integrator in total
 
 
 def sensitivities(
@@ -280,17 +280,17 @@ def sensitivities(
     max_switches: int = MAX_SWITCHES,
     max_steps: int = MOST_STEPS,
 ) -> Sensitivities:
-    """D q(t), d qdot(t) by initial state and parameters.
+    """Derivatives of q(t) and qdot(t) with respect to initial state and parameters.
 
-    parameters : "effect.parameter" names; an effect that is not in the model is taken at its null value.
-    components : of records.STATE_COMPONENTS; all that the state has if not given.
-    max_switches : between rolling and slip, beyond which the motion counts as over; then there are no derivatives.
-    max_steps : of the integrator, of all runs together; beyond them the rest is missing, too
+    parameters : "effect.parameter" names; an effect that is not in the model has its null value.
+    components : of records.STATE_COMPONENTS; by default all that the state has.
+    max_switches : between rolling and slip; with more, the motion ends and has no derivatives.
+    max_steps : of the integrator, in all runs together; after these the derivatives are NaN.
     """
     grid = _grid(None, 0.0, times)
     y0 = _start(state, theta_end)
-    lacking = {effect.name: effect for effect, _ in map(model.split_name, parameters) if not model.effect(effect.name)}
-    enlarged = model.with_effects(*(effect.absent() for effect in lacking.values()))
+    added = {effect.name: effect for effect, _ in map(model.split_name, parameters) if not model.effect(effect.name)}
+    enlarged = model.with_effects(*(effect.absent() for effect in added.values()))
     components = tuple(STATE_COMPONENTS[: len(y0)] if components is None else components)
     names = (*components, *parameters)
     found = np.full((len(grid), 20, 1 + len(names)), np.nan)  # q, qdot and state: the motion, then its derivatives
@@ -299,12 +299,12 @@ def sensitivities(
     spent, n_steps = path.slip_steps, path.n_steps
     found[: len(path.now), :, 0] = _numbers(path)
     if path.end is not EndReason.CHATTER:
-        same = symmetries(enlarged, assembly) - ({"psi"} if len(y0) > 8 else set())  # a slip at the start turns, too
+        same = symmetries(enlarged, assembly) - ({"psi"} if len(y0) > 8 else set())  # initial slip has a direction
         for column, name in enumerate(names, start=1):
             if name in same and column <= len(components):
                 found[: len(path.now), :, column] = [float(name == n) for n in _NUMBERS]
                 if name == "psi":
-                    _turn(found[..., column], found[..., 0])
+                    _rotate(found[..., column], found[..., 0])
                 continue
             y, values = y0.astype(complex), {}
             if column <= len(components):
@@ -324,19 +324,19 @@ _NUMBERS = (*COORDINATES, *(f"{c}dot" for c in COORDINATES), *ROLLING_COMPONENTS
 
 
 def _numbers(path: Path) -> Numbers:
-    """(n, 20) of a path."""
+    """(n, 20) q, qdot and state of a path."""
     return np.concatenate([*path.as_seen, columns(path.now, *ROLLING_COMPONENTS)], axis=1)
 
 
-def _turn(column: Array, motion: Array) -> None:
-    """Add to a column what a turn of the motion about the vertical through where it begins moves: K x v."""
+def _rotate(column: Array, motion: Array) -> None:
+    """Set the derivative K x v of a rotation of the motion about the vertical through its initial position."""
     moved = motion[:, :2] - motion[0, :2]
-    for first, (x, y) in ((0, moved.T), (6, motion[:, 6:8].T), (12, moved.T)):  # place, velocity, place in the state
+    for first, (x, y) in ((0, moved.T), (6, motion[:, 6:8].T), (12, moved.T)):  # x, y of q, qdot and the state
         column[:, first], column[:, first + 1] = -y, x
 
 
 def symmetries(model: Model, assembly: Assembly) -> set[str]:
-    """Those of x, y, psi, phi at the start on which nothing depends but where, and which way round, the motion is."""
+    """Those of the initial x, y, psi, phi that only displace or rotate the motion."""
     if any(assembly.constant(name) != 0.0 for name in ("uneven", "surface_vx", "surface_vy", "surface_turn")):
         return set()
     reads = {name for e in model.effects if e.law is not None for name in _names(type(e).law.__code__)}
@@ -349,29 +349,29 @@ def symmetries(model: Model, assembly: Assembly) -> set[str]:
 
 
 def _names(code: CodeType) -> Iterator[str]:
-    """All attributes and globals that a function names, and the functions and comprehensions within it."""
+    """All names of attributes and globals in a function, and in functions and comprehensions within it."""
     yield from code.co_names
     for inside in code.co_consts:
         if isinstance(inside, CodeType):
             yield from _names(inside)
 
 
-def moved_start(time: Array, kernel: Array, courses: Array) -> Array:
-    """(N, 8, p) displacement of the initial state that stands for what wrenches (N, 6, p) have done up to then.
+def moved_start(time: Array, kernel: Array, wrenches: Array) -> Array:
+    """(N, 8, p) displacement of the initial state that is equivalent to wrenches (N, 6, p) up to each instant.
 
-    The state itself has moved by Phi times this; so has every prediction by its derivative by the initial state.
-    time, kernel : of `responses`
+    The state moves by Phi times this displacement, and every prediction by its derivative with respect to the initial
+    state times it.   time, kernel : of `responses`
     """
     per_instant = kernel * np.gradient(time)[:, None, None]
-    return np.asarray(cumulative_simpson(np.einsum("nkc,ncp->nkp", per_instant, courses), axis=0, initial=0.0))
+    return np.asarray(cumulative_simpson(np.einsum("nkc,ncp->nkp", per_instant, wrenches), axis=0, initial=0.0))
 
 
 def responses(
     model: Model, state: State, times: Array, theta_end: float = DEFAULT_THETA_END
 ) -> tuple[Motion, Array] | None:
-    """Motion from `state` at times[0], at N times (nearly) equally far apart, and how it answers to what moves it.
+    """Motion from `state` at times[0], at N (nearly) equally spaced times, and its response to moments and forces.
 
-    That is Phi^-1 B (N, 8, 6) by COMPONENTS, per N m and per N. None where it does not roll over all of the times.
+    The response is Phi^-1 B (N, 8, 6) by COMPONENTS, per N m and per N. None if the disc does not roll at all times.
     """
     motion = simulate(model, state, times=times, theta_end=theta_end)
     if len(motion) < len(times) or np.any(motion.regime != ROLLING):
@@ -383,7 +383,7 @@ def responses(
 
 
 def _per_wrench(model: Model, states: Array, times: Array) -> Array:
-    """(N, 8, 6) derivative of the state's rate by moment and force, on which it depends linearly."""
+    """(N, 8, 6) derivative of the state's rate with respect to moment and force, on which it depends linearly."""
     rates = []
     for row in np.vstack([np.zeros(len(COMPONENTS)), np.eye(len(COMPONENTS))]):
         probe = _PROBE(**{f"{c}_given": x for c, x in zip(COMPONENTS, row, strict=True)})
@@ -392,7 +392,7 @@ def _per_wrench(model: Model, states: Array, times: Array) -> Array:
 
 
 def prepare() -> None:
-    """Compile integrator, equations of motion and the catalogue's laws for real and complex states, or load them."""
+    """Compile or load integrator, equations of motion and laws of the catalogue, for real and complex states."""
     for kind in CATALOGUE.values():
         if kind.law is not None:
             for scalar in (float, complex):

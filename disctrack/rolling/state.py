@@ -1,4 +1,4 @@
-"""States of motion from which a simulation starts: any, regular precession, a disc hit by a ball."""
+"""Initial states of a simulation: arbitrary, regular precession, a disc hit by a ball."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from disctrack.errors import ModelError
 @checked
 @dataclass(frozen=True)
 class State:
-    """State of the disc: eight numbers in pure rolling, and the velocity and height of O where it is not rolling.
+    """State of the disc: eight numbers in pure rolling; in slip and flight also the velocity and height of O.
 
-    Without v_x, v_y the disc rolls; with them it slides at the contact (or sticks, if they agree with rolling); with z
-    and v_z too it is in the air.
+    Without v_x, v_y the disc rolls. With them it slips at the contact (or sticks, if they agree with rolling). With z
+    and v_z in addition it is in the air.
 
         >>> State(theta=0.1).theta
         0.1
@@ -39,7 +39,7 @@ class State:
 
     @property
     def array(self) -> Array:
-        """Components that are given: (8,), (10,) or (12,)."""
+        """Components that are not None: (8,), (10,) or (12,)."""
         given = [value for value in astuple(self) if value is not None]
         return np.array(given, float)
 
@@ -63,12 +63,12 @@ def steady_precession(
     nutation_amplitude: float = 0.0,
     nutation_phase: float = 0.0,
 ) -> State:
-    """Rolling state of regular precession at nutation `theta` [rad], psidot > 0; `moved` puts it anywhere.
+    """Rolling state of regular precession at nutation `theta` [rad], psidot > 0, at the origin; see `moved`.
 
-    omega3 : spin q [rad/s]; without it the centre stays at rest, q = h p sin(theta) / r.
-    nutation_amplitude, nutation_phase : to first order theta(t) = theta + amplitude cos(w t + phase), where w is
-        `nutation_frequency`; omega2 and omega3 are changed along with it, as the linear motion requires.
-    Raises ModelError where no regular precession exists.
+    omega3 : spin q [rad/s]; by default that of a centre at rest, q = h p sin(theta) / r.
+    nutation_amplitude, nutation_phase : to first order theta(t) = theta + amplitude cos(w t + phase), w from
+        `nutation_frequency`; omega2 and omega3 change with it as in the linearised motion.
+    Raises ModelError if no regular precession exists.
 
         >>> float(steady_precession(0.1, read_recording("clip").disc).theta)
         0.1
@@ -86,12 +86,12 @@ def struck_disc(
 ) -> State:
     """State just after an impulse on the upper face of the upright disc (Ma et al. 2014, figure 3 and table 1).
 
-    lateral, vertical : the point hit, a along e1 and b upwards from the middle of the face [m].
-    impulse : of the ball on the disc [N s], along -e3 (it falls so that the hit face looks up).
-    friction : coefficient for the impulse of the table; the table's normal impulse keeps the lower rim from going down.
+    lateral, vertical : the point of impact, a along e1 and b upwards from the centre of the face [m].
+    impulse : of the ball on the disc [N s], along -e3 (the disc falls with the hit face up).
+    friction : coefficient for the impulse of the table, whose normal impulse prevents the lower rim from sinking.
 
-    Returns a state with the velocity of O, slipping in general. Raises ModelError where the impulse would not tip the
-    disc over, the point lies outside the face or the friction is below 0.
+    Returns a state with the velocity of O, slipping in general. Raises ModelError if the impulse does not tip the disc
+    over, the point lies outside the face or the friction is negative.
     """
     if not friction >= 0:
         raise ModelError(f"a coefficient of friction of {friction:.4g}; it is 0 or above")
@@ -100,18 +100,18 @@ def struck_disc(
             f"the point ({lateral * 1e3:.4g}, {vertical * 1e3:.4g}) mm lies outside the face of radius "
             f"{disc.radius * 1e3:.4g} mm"
         )
-    # Nodal axes at theta = 90 deg: e2 is vertical; the contact is the lower edge of the face that will look down.
+    # Nodal axes at theta = 90 deg: e2 is vertical; the contact is on the edge of the face that will be the lower one.
     arm = np.array([0.0, -disc.radius, -disc.half_thickness])
     hit = np.array([lateral, vertical, disc.half_thickness])
     J = np.array([disc.moment_diametral, disc.moment_diametral, disc.moment_axial])
     ball = np.array([0.0, 0.0, -impulse])
     v0, omega0 = ball / disc.mass, np.cross(hit, ball) / J
     v, omega, normal = v0, omega0, 0.0
-    for _ in range(30):  # fixed point for the direction of friction; each gains a factor of about (h/r)^2
+    for _ in range(30):  # fixed-point iteration for the direction of friction; the error falls by about (h/r)^2 each
         slip = (v + np.cross(omega, arm)) * [1.0, 0.0, 1.0]
-        push = np.array([0.0, 1.0, 0.0]) - friction * slip / max(float(np.linalg.norm(slip)), 1e-12)
-        dv, domega = push / disc.mass, np.cross(arm, push) / J
-        # the table's normal impulse N >= 0 is just large enough that the edge does not go down
+        impulse_per_normal = np.array([0.0, 1.0, 0.0]) - friction * slip / max(float(np.linalg.norm(slip)), 1e-12)
+        dv, domega = impulse_per_normal / disc.mass, np.cross(arm, impulse_per_normal) / J
+        # the table's normal impulse N >= 0 just prevents the edge from moving down
         down = (v0 + np.cross(omega0, arm))[1]
         normal = max(0.0, float(-down / (dv + np.cross(domega, arm))[1]))
         v, omega = v0 + normal * dv, omega0 + normal * domega

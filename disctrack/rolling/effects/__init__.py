@@ -1,4 +1,4 @@
-"""Effects that a model of the motion may have or lack; every module of this package is read: a new file suffices."""
+"""Optional effects of a model of the motion. All modules of this package are imported: a new file is sufficient."""
 
 from importlib import import_module
 from pkgutil import iter_modules

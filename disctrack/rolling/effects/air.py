@@ -16,7 +16,7 @@ AIR_VISCOSITY = 1.81e-5  # [Pa s] at 20 degC; it does not depend on the density
     candidate=False,  # one recording knows the product of density and coefficient only
 )
 def air(body: Record, p: Record) -> None:
-    """The density that every law of the air reads is another one than declared."""
+    """The density of the air, which all laws of the air use, differs from the declared one."""
     body.air_density = body.air_density * p.density
 
 
@@ -39,7 +39,7 @@ def air_moffatt(p: Record, s: Record, w: Record) -> None:
     belongs_to=("air",),
 )
 def air_bildsten(p: Record, s: Record, w: Record) -> None:
-    """Boundary layers on disc and table that are thinner than the gap: theta above about 0.5 deg."""
+    """Boundary layers on disc and table, thinner than the gap: valid for theta above about 0.5 deg."""
     r2 = s.radius * s.radius
     layer = np.sqrt(s.air_density * AIR_VISCOSITY) * r2 * r2  # rho sqrt(nu) = sqrt(rho mu)
     w.M_m -= p.beta * layer * s.psidot * np.sqrt(magnitude(s.psidot)) / s.sin_theta
@@ -98,7 +98,7 @@ def drag_rotation(p: Record, s: Record, w: Record) -> None:
     airborne=True,
 )
 def drag_linear(p: Record, s: Record, w: Record) -> None:
-    """Force -c v_O on the disc as a whole."""
+    """Force -c v_O on the whole disc."""
     w.X_n -= p.c * s.v_n
     w.X_m -= p.c * s.v_m
     w.X_z -= p.c * s.v_z

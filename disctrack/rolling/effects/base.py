@@ -1,4 +1,4 @@
-"""What an effect is: a named part with parameters that is added to the ideal rolling disc.
+"""An effect: a named term with parameters that is added to the ideal rolling disc.
 
 To add one, write a function with its name in a module of this package, under `@effect(title, source, parameters ...)`:
 
@@ -7,13 +7,13 @@ To add one, write a function with its name in a module of this package, under `@
                          and complex numbers alike: no `if`, no `abs`; use `magnitude`, `sign`, `np.sqrt`, `np.exp`.
     name(body, p)        changes the body's constants (records.BODY) before the motion starts
 
-It becomes a class of effects in CATALOGUE, from where simulation, fitting and diagnosis take it (a law by formula is no
-part of it: a model that may use one carries it, Model.laws). A compiled law is kept as long as its own file and the
-helpers' do not change.
+The decorator adds a class of effects to CATALOGUE, which simulation, fitting and diagnosis use. (Laws by formula are
+not in the catalogue but in the model, Model.laws.) A compiled law is cached until its own file or that of the helpers
+changes.
 
 Signs: M is the moment of the table on the disc at the contact, in (n0, m0, k). Its power is
-M_n thetadot - M_m phidot sin(theta) + M_z omega_z + X . v_O. For a passive law it is never positive (for one in psidot
-if psidot phidot < 0, as in rolling down): its amounts have the lower bound 0.
+M_n thetadot - M_m phidot sin(theta) + M_z omega_z + X . v_O. The power of a passive law is never positive (of a law in
+psidot if psidot phidot < 0, as during the descent): its amounts have the lower bound 0.
 """
 
 from __future__ import annotations
@@ -27,25 +27,25 @@ import numpy as np
 from disctrack.errors import ModelError
 
 CATALOGUE: dict[str, type[Effect]] = {}
-SLOWEST_ROLLING = 1e-3  # [rad/s] rolling rate below which its direction is smoothed; the disc's is above 1
+SLOWEST_ROLLING = 1e-3  # [rad/s] rolling rate below which its direction is smoothed; discs roll faster than 1 rad/s
 
 
 @dataclass(frozen=True)
 class EffectParameter:
-    """One number of an effect."""
+    """One parameter of an effect."""
 
     name: str
     unit: str
-    nominal: float  # a physically sensible size, and the scale for fits
+    nominal: float  # typical value, and the scale in fits
     meaning: str
     null: float = 0.0  # value at which the effect is absent
     lower: float = -np.inf
     upper: float = np.inf
-    is_shape: bool = False  # exponent or scale of the law: meaningless without the amount, not fitted by default
+    is_shape: bool = False  # exponent or scale of the law: undetermined at zero amount, not fitted by default
 
 
 def magnitude(x: Any) -> Any:
-    """|x| that is analytic away from 0, so that imaginary parts carry the derivative."""
+    """|x|, analytic for x != 0, so that imaginary parts carry the derivative."""
     return np.sqrt(x * x)
 
 
@@ -55,7 +55,7 @@ def sign(x: Any, width: float) -> Any:
 
 
 def rolling_rates(s: Any) -> Any:
-    """Horizontal angular velocity along n0 and m0, and its size, smoothed where the disc hardly rolls [rad/s]."""
+    """Horizontal angular velocity along n0 and m0, and its magnitude, smoothed near zero [rad/s]."""
     roll_n, roll_m = s.thetadot, -s.phidot * s.sin_theta
     return roll_n, roll_m, np.sqrt(roll_n * roll_n + roll_m * roll_m + SLOWEST_ROLLING * SLOWEST_ROLLING)
 
@@ -71,17 +71,17 @@ class Effect:
     source: ClassVar[str]
     parameters: ClassVar[tuple[EffectParameter, ...]]
     airborne: ClassVar[bool] = False  # acts also without contact
-    sought: ClassVar[bool] = False  # the first shape among its parameters may lie anywhere: an angle, a frequency
+    sought: ClassVar[bool] = False  # its first shape parameter (an angle, a frequency) needs a global search
     candidate: ClassVar[bool] = True  # may be proposed as an explanation; False for tools
-    # What must be the same in two recordings for them to share its parameters: "disc", "surface", "rig", "air"; ()
-    # where every recording has its own, ("nature",) where all have the same
+    # Recordings share the parameters if these are the same: "disc", "surface", "rig", "air". () = never shared,
+    # ("nature",) = always shared
     belongs_to: ClassVar[tuple[str, ...]] = ("disc", "surface")
     law: ClassVar[Any] = None  # static method law(p, s, w), or None
-    formulas: ClassVar[dict[str, str] | None] = None  # of an effect written as formulas (effects.learned)
+    formulas: ClassVar[dict[str, str] | None] = None  # of an effect defined by formulas (effects.learned)
     adjust: ClassVar[Any] = None  # static method adjust(body, p), or None
 
     def __init__(self, **values: float) -> None:
-        """Values by parameter name, in the parameter's unit; those not given take their nominal value."""
+        """Values by parameter name, in the parameter's unit; by default nominal values."""
         known = [p.name for p in self.parameters]
         for given in values:
             if given not in known:
@@ -90,10 +90,10 @@ class Effect:
         for p in self.parameters:
             value = self._values[p.name]
             if not p.lower <= value <= p.upper or not (np.isfinite(value) or value == p.null):
-                feeds = self.law is not None and value < p.lower == 0
+                would_supply_energy = self.law is not None and value < p.lower == 0
                 raise ModelError(
                     f"{self.name}.{p.name} = {value:g} {p.unit} is outside [{p.lower:g}, {p.upper:g}]"
-                    + (": a passive effect cannot feed the disc with energy" if feeds else "")
+                    + (": a passive effect cannot feed the disc with energy" if would_supply_energy else "")
                 )
 
     @property
@@ -103,7 +103,7 @@ class Effect:
 
     @classmethod
     def absent(cls) -> Effect:
-        """The effect with its amounts at null: it changes nothing, but its sensitivities can be asked for."""
+        """The effect with its amounts at null: the motion does not change, but has sensitivities to the parameters."""
         return cls(**{p.name: p.nominal if p.is_shape else p.null for p in cls.parameters})
 
     def __eq__(self, other: object) -> bool:
@@ -121,7 +121,7 @@ class Effect:
 def effect(title: str, source: str, *parameters: EffectParameter, **traits: Any) -> Callable[[Any], type[Effect]]:
     """Make a law (p, s, w) or an adjustment (body, p) an effect of the catalogue; traits: fields of `Effect`."""
 
-    def entered(function: Any) -> type[Effect]:
+    def register(function: Any) -> type[Effect]:
         name, adjusts = function.__name__, function.__code__.co_argcount == 2
         members = {
             "name": name,
@@ -138,11 +138,11 @@ def effect(title: str, source: str, *parameters: EffectParameter, **traits: Any)
         CATALOGUE[name] = type(name, (Effect,), own | members | traits)
         return CATALOGUE[name]
 
-    return entered
+    return register
 
 
 def effect_class(name: str) -> type[Effect]:
-    """Class of the catalogue's effect of this name; raises ModelError naming what there is."""
+    """Class of the catalogue's effect of this name; raises ModelError with the known names."""
     if name not in CATALOGUE:
         raise ModelError(f"there is no effect '{name}'; the catalogue has {', '.join(sorted(CATALOGUE))}")
     return CATALOGUE[name]

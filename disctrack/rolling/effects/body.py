@@ -1,4 +1,4 @@
-"""The disc, the table and gravity differ from what was declared."""
+"""Deviations of the disc, the table and gravity from their declaration."""
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from disctrack.rolling.records import Record
     belongs_to=("rig", "surface"),
 )
 def table_tilt(body: Record, p: Record) -> None:
-    """Gravity is not along k: the table descends towards (i, j) with these slopes."""
+    """Gravity is not along -k: the table descends along i and j with these slopes."""
     g = -body.g_z
     body.g_x = g * p.tilt_x
     body.g_y = g * p.tilt_y
@@ -54,7 +54,7 @@ def centre_of_mass(body: Record, p: Record) -> None:
     EffectParameter("r_error", "m", 1e-5, "contact radius minus the declared one", lower=-5e-3, upper=5e-3),
 )
 def contact_radius(body: Record, p: Record) -> None:
-    """The circle of contact has another radius; mass and inertia stay."""
+    """The radius of the contact circle differs from the declared one; mass and inertia are unchanged."""
     body.radius = body.radius + p.r_error
 
 
@@ -64,7 +64,7 @@ def contact_radius(body: Record, p: Record) -> None:
     EffectParameter("h_error", "m", 1e-5, "half thickness minus the declared one", lower=-2e-3, upper=5e-3),
 )
 def contact_height(body: Record, p: Record) -> None:
-    """The contact circle lies at another distance below the centre; mass and inertia stay."""
+    """The distance of the contact circle below the centre differs; mass and inertia are unchanged."""
     body.half_thickness = body.half_thickness + p.h_error
 
 
@@ -74,7 +74,7 @@ def contact_height(body: Record, p: Record) -> None:
     EffectParameter("rho", "m", 1e-4, "radius of the edge", lower=0.0, upper=3e-3),
 )
 def edge_radius(body: Record, p: Record) -> None:
-    """The edge is a quarter of a torus: the contact wanders over it with the nutation."""
+    """The edge is a quarter of a torus; the contact moves along it as the nutation changes."""
     body.edge_radius = body.edge_radius + p.rho
 
 
@@ -101,7 +101,7 @@ def table_curved(body: Record, p: Record) -> None:
     EffectParameter("lobes_s", "m", 1e-5, "three waves, sine", lower=-1e-3, upper=1e-3),
 )
 def rim(body: Record, p: Record) -> None:
-    """The rim is no circle: its distance from the axis, tangent by tangent, has two and three waves around."""
+    """The rim is not a circle: its support function has harmonics of order two and three."""
     body.oval_c, body.oval_s = body.oval_c + p.oval_c, body.oval_s + p.oval_s
     body.lobes_c, body.lobes_s = body.lobes_c + p.lobes_c, body.lobes_s + p.lobes_s
 
@@ -115,7 +115,7 @@ def rim(body: Record, p: Record) -> None:
     sought=True,
 )
 def rim_flat(body: Record, p: Record) -> None:
-    """A flat of the rim: over its width the contact nears the axis, and the disc dips once a turn."""
+    """The rim has a flat, where the contact is nearer to the axis: the disc descends there once per turn."""
     body.flat_depth = body.flat_depth + p.depth
     body.flat_cos, body.flat_sin = np.cos(p.angle), np.sin(p.angle)
     body.flat_sharpness = 1.0 / (p.width * p.width)
@@ -128,7 +128,7 @@ def rim_flat(body: Record, p: Record) -> None:
     belongs_to=("surface",),
 )
 def table_yielding(body: Record, p: Record) -> None:
-    """The table, or a mat on it, sinks in proportion to the load: under its mean, and with its course."""
+    """The table, or a mat on it, sinks in proportion to the instantaneous load."""
     body.compliance = body.compliance + p.c
 
 
@@ -139,7 +139,7 @@ def table_yielding(body: Record, p: Record) -> None:
     belongs_to=("disc", "surface"),
 )
 def creep(body: Record, p: Record) -> None:
-    """The contact gives way to friction: it moves along the table, in proportion to the force over the load."""
+    """The contact moves along the table with a velocity proportional to friction over load."""
     body.creep = body.creep + p.c
 
 
@@ -152,7 +152,7 @@ def creep(body: Record, p: Record) -> None:
     belongs_to=("rig", "surface"),
 )
 def surface_moves(body: Record, p: Record) -> None:
-    """The contact moves with the table's surface, which turns or slides under cameras at rest."""
+    """The contact moves with the surface of the table, which turns or slides relative to the cameras."""
     body.surface_vx, body.surface_vy = body.surface_vx + p.v_x, body.surface_vy + p.v_y
     body.surface_turn = body.surface_turn + p.rate
 
@@ -197,5 +197,5 @@ def inertia_product(body: Record, p: Record) -> None:
     belongs_to=("disc", "surface"),
 )
 def slip(body: Record, p: Record) -> None:
-    """Coulomb friction of finite coefficient: the disc slips where rolling would need more."""
+    """Coulomb friction with a finite coefficient: the disc slips if rolling needs a larger one."""
     body.inverse_friction = 1.0 / p.mu  # acts through the constraint force, not through the wrench of a law

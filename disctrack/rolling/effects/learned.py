@@ -1,9 +1,9 @@
-"""Effects written as formulas: laws that a residual suggested, or that one wants to try without programming.
+"""Effects defined by formulas: laws found from a residual, or laws to try without programming.
 
     effect_from_formulas("braking", {"load_z": "-c * sign(omega_z, 0.01) * sin_theta**2"})
 
-makes an effect "braking" with the parameter c. A formula uses the names of records.KINEMATICS, numbers of
-the effect (every other name) and sqrt, exp, log, sin, cos, magnitude(x) = |x|, sign(x, width). It gives one of the
+defines an effect "braking" with the parameter c. A formula uses the names of records.KINEMATICS, parameters of the
+effect (every other name) and sqrt, exp, log, sin, cos, magnitude(x) = |x|, sign(x, width). Its value is one of the
 components that a law may set (records.WRENCH): M_n, M_m, M_z [N m]; load_n, load_m, load_z, moments per normal force
 [m]; X_n, X_m, X_z [N].
 """
@@ -36,10 +36,10 @@ def effect_from_formulas(
     title: str = "",
     source: str = "learned from a residual",
 ) -> type[Effect]:
-    """Effect class whose law adds these formulas to the wrench; no part of the catalogue: models carry it.
+    """Effect class whose law adds these formulas to the wrench. It is part of a model, not of the catalogue.
 
-    formulas : component of the wrench -> formula.   parameters : those not given have unit "SI", nominal 1, no bounds.
-    Raises ModelError for a formula that cannot be read and for a name of the catalogue.
+    formulas : component of the wrench -> formula.   parameters : by default unit "SI", nominal 1, no bounds.
+    Raises ModelError for an invalid formula and for a name of the catalogue.
     """
     if name in CATALOGUE:
         raise ModelError(f"there is an effect '{name}' already, with another law: choose another name")
@@ -67,13 +67,13 @@ def effect_from_formulas(
     return type(f"Formula_{name}", (Effect,), members)
 
 
-@lru_cache(maxsize=64)  # the same formulas with other numbers are compiled once
+@lru_cache(maxsize=64)  # formulas that differ only in values are compiled once
 def _function(lines: str) -> Callable[..., None]:
     return function_of(f"def law(p, s, w):\n{lines}\n", "law", {**_FUNCTIONS})  # checked node by node in _translate
 
 
 def _translate(name: str, formula: str) -> tuple[str, list[str]]:
-    """Formula with s. and p. before its names, and the names that are parameters."""
+    """Formula with the prefixes s. and p. of its names, and the names of the parameters."""
     try:
         tree = ast.parse(formula, mode="eval")
     except SyntaxError as error:

@@ -15,9 +15,9 @@ from disctrack.rolling.records import Record
     ),
 )
 def kz(p: Record, s: Record, w: Record) -> None:
-    """M_z = -k_z F_z sgn(omega_z), the sign softened by creep: what the contact gives before it turns as a whole.
+    """M_z = -k_z F_z sgn(omega_z), the sign smoothed: at small rates the contact creeps and does not slide fully.
 
-    How soft it is matters where the pivoting dies out: omega_s = 0.01 in place of 0.001 rad/s moves k_z by 0.2 %.
+    The smoothing matters when the pivoting dies out: omega_s = 0.01 instead of 0.001 rad/s changes k_z by 0.2 %.
     """
     w.load_z -= p.k_z * sign(s.omega_z, p.omega_s)
 
@@ -28,7 +28,7 @@ def kz(p: Record, s: Record, w: Record) -> None:
     EffectParameter("k", "m s", 1e-5, "lever arm per pivoting rate", lower=0.0),
 )
 def pivoting_viscous(p: Record, s: Record, w: Record) -> None:
-    """M_z = -k F_z omega_z: pivoting superposed on slip or creep."""
+    """M_z = -k F_z omega_z: pivoting superimposed on slip or creep."""
     w.load_z -= p.k * s.omega_z
 
 
@@ -40,6 +40,6 @@ def pivoting_viscous(p: Record, s: Record, w: Record) -> None:
     EffectParameter("a", "m", 75e-6, "radius of the contact", lower=1e-7, is_shape=True),
 )
 def pivoting_contensou(p: Record, s: Record, w: Record) -> None:
-    """M_z = -k F_z omega_z / sqrt(omega_z^2 + omega_s^2 + (v_A/a)^2): at most k F_z, softened by creep and slip."""
+    """M_z = -k F_z omega_z / sqrt(omega_z^2 + omega_s^2 + (v_A/a)^2): at most k F_z, reduced by creep and slip."""
     slip2 = (s.slip_n * s.slip_n + s.slip_m * s.slip_m) / (p.a * p.a)
     w.load_z -= p.k * s.omega_z / np.sqrt(s.omega_z * s.omega_z + p.omega_s * p.omega_s + slip2)

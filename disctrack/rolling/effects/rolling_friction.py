@@ -12,7 +12,7 @@ from disctrack.rolling.records import Record
     EffectParameter("k_m", "m s^2", 0.381e-7, "lever arm per squared precession rate", lower=0.0),
 )
 def km(p: Record, s: Record, w: Record) -> None:
-    """M_m = -k_m F_z psidot |psidot|: rolling friction growing with the square of the precession rate."""
+    """M_m = -k_m F_z psidot |psidot|: rolling friction proportional to the square of the precession rate."""
     w.load_m -= p.k_m * s.psidot * magnitude(s.psidot)
 
 
@@ -22,7 +22,7 @@ def km(p: Record, s: Record, w: Record) -> None:
     EffectParameter("k", "m s^2", 0.381e-7, "lever arm per squared precession rate", lower=0.0),
 )
 def km_e2(p: Record, s: Record, w: Record) -> None:
-    """The paper's moment turned into the direction of e2, perpendicular to the axis."""
+    """The paper's moment, but along e2, perpendicular to the axis."""
     moment = p.k * s.psidot * magnitude(s.psidot)
     w.load_m -= moment * s.cos_theta  # e2 = cos(theta) m0 + sin(theta) k
     w.load_z -= moment * s.sin_theta
@@ -56,7 +56,7 @@ def rolling_power(p: Record, s: Record, w: Record) -> None:
     EffectParameter("mu_c", "1", 1.06e-3, "coefficient of contour friction", lower=0.0),
 )
 def contour_dry(p: Record, s: Record, w: Record) -> None:
-    """Generalised force -mu_c F_z r sgn(phidot) on phi: the contour slides dry past the contact."""
+    """Generalised force -mu_c F_z r sgn(phidot) on phi: dry friction along the contour."""
     w.load_m += p.mu_c * s.radius * sign(s.phidot, 1e-3) / s.sin_theta
 
 
@@ -76,7 +76,7 @@ def contour_viscous(p: Record, s: Record, w: Record) -> None:
     EffectParameter("delta", "m", 1e-5, "lever arm: half width of the contact", lower=0.0),
 )
 def rolling_classical(p: Record, s: Record, w: Record) -> None:
-    """Moment delta F_z against the horizontal angular velocity, independent of its size."""
+    """Moment delta F_z opposite to the horizontal angular velocity, independent of its magnitude."""
     n, m, rate = rolling_rates(s)
     w.load_n -= p.delta * n / rate
     w.load_m -= p.delta * m / rate
@@ -88,7 +88,7 @@ def rolling_classical(p: Record, s: Record, w: Record) -> None:
     EffectParameter("c", "m s", 1e-6, "lever arm per rolling rate", lower=0.0),
 )
 def rolling_viscous(p: Record, s: Record, w: Record) -> None:
-    """Moment against the horizontal angular velocity, proportional to it."""
+    """Moment opposite to the horizontal angular velocity, and proportional to it."""
     w.load_n -= p.c * s.thetadot
     w.load_m += p.c * s.phidot * s.sin_theta
 
@@ -99,7 +99,7 @@ def rolling_viscous(p: Record, s: Record, w: Record) -> None:
     EffectParameter("a", "N m", 2e-5, "moment", lower=0.0),
 )
 def rolling_adhesive(p: Record, s: Record, w: Record) -> None:
-    """Moment against the horizontal angular velocity that no load changes: what it costs to part the surfaces again."""
+    """Moment opposite to the horizontal angular velocity, whatever the load: the surfaces have to be separated."""
     n, m, rate = rolling_rates(s)
     w.M_n -= p.a * n / rate
     w.M_m -= p.a * m / rate

@@ -1,4 +1,4 @@
-"""Forces that the table and what stands on it exert: springs and threads, magnets below it, vibration."""
+"""Forces and motions of the table: springs, threads, magnets below it, vibration, settling."""
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from disctrack.rolling.records import Record
     airborne=True,
 )
 def spring(p: Record, s: Record, w: Record) -> None:
-    """A force towards a point of the table, in proportion to the distance: X = F - k (x, y), towards F / k."""
+    """Force towards the point F / k of the table, proportional to the distance: X = F - k (x, y)."""
     X_x, X_y = p.F_x - p.k * s.x, p.F_y - p.k * s.y
     w.X_n += X_x * np.cos(s.psi) + X_y * np.sin(s.psi)
     w.X_m += X_y * np.cos(s.psi) - X_x * np.sin(s.psi)
@@ -33,9 +33,9 @@ def spring(p: Record, s: Record, w: Record) -> None:
     candidate=False,
 )
 def table_vibration(p: Record, s: Record, w: Record) -> None:
-    """The table swings with one frequency, and the cameras with it: in their axes gravity swings.
+    """Table and cameras vibrate together at one frequency: gravity oscillates in their axes.
 
-    In a diagnosis it is found without being named beforehand, with its frequency, as a force that swings.
+    A diagnosis finds it as an oscillating force, with its frequency, although it is not among the candidates.
     """
     c, d = np.cos(2 * np.pi * p.frequency * s.time), np.sin(2 * np.pi * p.frequency * s.time)
     w.field_x -= p.a_cos_x * c + p.a_sin_x * d
@@ -54,7 +54,7 @@ def table_vibration(p: Record, s: Record, w: Record) -> None:
     sought=True,
 )
 def table_shaken(p: Record, s: Record, w: Record) -> None:
-    """The table swings with one frequency, and the cameras, which stand elsewhere, see it."""
+    """The table vibrates at one frequency relative to the cameras, which are at rest."""
     rate = 2 * np.pi * p.frequency
     c, d = np.cos(rate * s.time), np.sin(rate * s.time)
     u_x, u_y, u_z = p.u_cos_x * c + p.u_sin_x * d, p.u_cos_y * c + p.u_sin_y * d, p.u_cos_z * c + p.u_sin_z * d
@@ -76,7 +76,7 @@ def table_shaken(p: Record, s: Record, w: Record) -> None:
     airborne=True,
 )
 def table_settles(p: Record, s: Record, w: Record) -> None:
-    """The height of the table in the axes of the cameras changes with time, and no force with it but by a_z."""
+    """The height of the table in the axes of the cameras changes with time; only a_z causes a force."""
     w.table_z += (p.v_z + 0.5 * p.a_z * s.time) * s.time
     w.table_vz += p.v_z + p.a_z * s.time
     w.table_az += p.a_z
