@@ -1,4 +1,4 @@
-"""The disc as an object: its size, its inertia, the dots on its upper face, and how it rolls where nothing is lost.
+"""The disc: its size, its inertia, the dots on its upper face, and its regular precession without losses.
 
 Regular precession is row e1 of the equations at constant nutation, psidot = p and omega3 = q (Ma et al. 2014, (2.11),
 corrected: I3 s + m r h c without the factor sin theta, I2 = J1 + m h^2 in place of J1):
@@ -17,7 +17,7 @@ from calibration.kit.arrays import Array, Mask
 from calibration.kit.brief import Brief
 from disctrack.errors import ModelError
 
-AIR_DENSITY = 1.2  # [kg/m^3] where no other is declared: at 1013.25 hPa and 20 degC
+AIR_DENSITY = 1.2  # [kg/m^3] default, at 1013.25 hPa and 20 degC
 STANDARD_PRESSURE = 1013.25  # [hPa]
 
 
@@ -39,7 +39,7 @@ class Disc(Brief):
     mass: Mass  # m [kg]
     marker_centres_body: Array  # (n_markers, 3) [m]; third component +h for dots on the upper face
     marker_diameter: Length  # [m]
-    # Standard deviations of radius and thickness 2h as declared [m]; None: not declared
+    # declared standard deviations of radius and thickness 2h [m]; None: not declared
     radius_tolerance: float | None = None
     thickness_tolerance: float | None = None
 
@@ -49,7 +49,7 @@ class Disc(Brief):
             raise ModelError(f"marker_centres_body has the shape {shape}: expected (dots, 3), in metres")
 
     def facts(self) -> dict[str, str]:
-        """What a glance should tell (`Brief`)."""
+        """Short summary (`Brief`)."""
         size = f"{2e3 * self.radius:g} mm, thickness {2e3 * self.half_thickness:g} mm"
         return {"diameter": size, "mass": f"{1e3 * self.mass:g} g", "dots": str(self.n_markers)}
 
@@ -64,7 +64,7 @@ class Disc(Brief):
         return self.mass * self.radius**2 / 2
 
     def resting_height(self, theta: ArrayLike) -> Array:
-        """Height of the centre [m] when the rim touches the table, r sin theta + h |cos theta|; theta (...) [rad]."""
+        """Height of the centre [m] if the rim touches the table, r sin theta + h |cos theta|; theta (...) [rad]."""
         return self.radius * np.sin(theta) + self.half_thickness * np.abs(np.cos(theta))
 
     def arm_to_contact(self, e2: Array, e3: Array) -> Array:
@@ -106,13 +106,13 @@ def disc_from_mm(
 
 
 def _onto_itself(disc: Disc, places: Array) -> Mask:
-    """Whether each dot of layouts (..., n, 2) [m] lies, to a tenth of its diameter, where the disc has one."""
+    """Whether all dots of layouts (..., n, 2) [m] coincide with dots of the disc to a tenth of their diameter."""
     gaps = np.linalg.norm(places[..., None, :] - disc.marker_centres_body[:, :2], axis=-1)
     return np.asarray(gaps.min(axis=-1).max(axis=-1) < 0.1 * disc.marker_diameter)
 
 
 def symmetry_order(disc: Disc) -> int:
-    """Number of turns about e3 that map the layout of the dots onto itself (1: none but the full turn).
+    """Order of the rotational symmetry of the layout of the dots about e3 (1: no symmetry).
 
     With an order n > 1 the spin angle phi is known only modulo 2 pi / n.
     """
@@ -126,9 +126,9 @@ def symmetry_order(disc: Disc) -> int:
 
 
 def has_mirror_axis(disc: Disc) -> bool:
-    """True where the layout of the dots looks the same in a mirror, so that the dots do not tell left from right."""
+    """True if the layout of the dots is mirror-symmetric, so that it does not reveal a mirrored image."""
     z = disc.marker_centres_body[:, 0] + 1j * disc.marker_centres_body[:, 1]
-    far = z[np.argmax(np.abs(z))]  # goes to another dot, or stays
+    far = z[np.argmax(np.abs(z))]  # its mirror image is a dot, possibly itself
     mirrored = np.exp(1j * (np.angle(far) + np.angle(z)))[:, None] * np.conj(z)
     return bool(_onto_itself(disc, np.stack([mirrored.real, mirrored.imag], axis=-1)).any())
 
@@ -138,7 +138,9 @@ def precession_rate(
 ) -> tuple[float, float]:
     """(p, q) = (psidot, omega3) of regular precession at nutation theta [rad]; p > 0 [rad/s].
 
-    Of the two solutions at given omega3 the faster is returned: the one that goes over into the centre at rest.
+    omega3 : by default that of a centre at rest
+    Of the two solutions at given omega3, the faster one is returned, which includes the centre at rest.
+    Raises ModelError if there is no solution.
     """
     s, c, r, h, m = np.sin(theta), np.cos(theta), disc.radius, disc.half_thickness, disc.mass
     I2, I3 = disc.moment_diametral + m * h**2, disc.moment_axial + m * r**2
@@ -163,7 +165,7 @@ def precession_rate(
 
 
 def nutation_frequency(theta: float, disc: Disc, gravity: float = 9.81, omega3: float | None = None) -> float:
-    """Circular frequency [rad/s] of small nutation oscillations about regular precession, no friction."""
+    """Angular frequency [rad/s] of small nutation oscillations about regular precession, without friction."""
     p, q = precession_rate(theta, disc, gravity, omega3)
     r, h, m, J1 = disc.radius, disc.half_thickness, disc.mass, disc.moment_diametral
     I1, I2, I3 = J1 + m * (r**2 + h**2), J1 + m * h**2, disc.moment_axial + m * r**2
@@ -197,7 +199,7 @@ def followers(theta: float, p: float, q: float, disc: Disc) -> tuple[float, floa
 _HEXAGON = np.radians(60.0 * np.arange(6))
 
 # Radius, thickness and mass as in Ma et al. 2014, section 3a. The layout of the dots is not published; this one has
-# no rotational symmetry (the sixth dot sits at half radius), so that the spin angle is determined.
+# no rotational symmetry (the sixth dot is at half the radius), so that the spin angle is determined.
 MA_2014 = disc_from_mm(
     radius_mm=37.5,
     thickness_mm=6.0,

@@ -1,4 +1,4 @@
-"""The errors that disctrack raises on purpose; `cli` alone turns them into a line and an exit code."""
+"""The errors that disctrack raises; only `cli` turns them into a line and an exit code."""
 
 import errno
 from collections.abc import Iterator
@@ -14,25 +14,25 @@ _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 class AnalysisError(DiscTrackError):
-    """A trajectory does not hold enough for what was asked of it."""
+    """A trajectory does not contain enough data for an analysis."""
 
 
 class ClusterError(DiscTrackError):
-    """The machines that were to share the work cannot be used."""
+    """The machines of a cluster cannot be used."""
 
 
 class RecordingError(DiscTrackError):
-    """A recording folder, its recording.toml or its images cannot be used as they are."""
+    """A recording folder, its recording.toml or its images cannot be used."""
 
 
 class SceneError(DiscTrackError):
-    """A scene file cannot be read, or asks for something impossible."""
+    """A scene file cannot be read, or describes an impossible scene."""
 
 
 class TrackingError(DiscTrackError):
     """The disc cannot be found or followed in the images.
 
-    told : what to do where nothing is known of the cause;  findings : the cause, as far as it was seen
+    told : advice if the cause is unknown;  findings : the likely cause
     """
 
     def __init__(self, text: str, told: str = "", findings: tuple[Any, ...] = ()) -> None:
@@ -45,7 +45,7 @@ class TrackingError(DiscTrackError):
 
 
 class OutputError(DiscTrackError):
-    """A result cannot be written where it was asked for."""
+    """A result cannot be written to its destination."""
 
 
 class TrajectoryFileError(DiscTrackError):
@@ -58,7 +58,7 @@ class ModelError(DiscTrackError):
 
 @contextmanager
 def told_as(error: type[DiscTrackError], said: str, *kinds: type[Exception], then: str = "") -> Iterator[None]:
-    """What is raised within of these kinds, by a library mostly, becomes an error of ours: `said`, why, what to do."""
+    """Convert exceptions of these kinds, mostly of libraries, into an error of ours: `said`, reason, `then`."""
     try:
         yield
     except DiscTrackError:
@@ -69,11 +69,11 @@ def told_as(error: type[DiscTrackError], said: str, *kinds: type[Exception], the
 
 
 def reason_of(error: BaseException) -> str:
-    """What to tell about an error, whatever it is, in one line."""
+    """Message for any error, in one line."""
     if isinstance(error, DiscTrackError):
         text = str(error)
     elif isinstance(error, MemoryError):
-        text = "out of memory. Close other programs, run fewer side by side (-j), or measure fewer --frames at once."
+        text = "out of memory. Close other programs, run fewer in parallel (-j), or measure fewer --frames at once."
     elif isinstance(error, OSError):
         text = f"{f'{error.filename}: ' if error.filename else ''}{error.strerror or error}."
         text += " Free some space, or choose another place with -o." if error.errno in _NO_ROOM else ""

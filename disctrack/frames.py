@@ -1,27 +1,27 @@
 """Conventions, and the rotations that follow from them.
 
-This docstring is the one home of the conventions; every other file obeys it silently.
+This docstring defines the conventions of all files.
 
-World frame I = (O, i, j, k): k up, the table is z = 0 (Ma et al. 2014, section 2a). The calibration's table view fixes
-    origin and heading (`calibration.judge.tolerances`).
+World frame I = (O, i, j, k): k up, the table is z = 0 (Ma et al. 2014, section 2a). The table view of the calibration
+    defines origin and heading (`calibration.judge.tolerances`).
 Body frame: fixed to the disc, origin at its centre O, third axis e3 out of the upper face.
 Nodal frame R_O = (e1, e2, e3): follows precession and nutation, not spin. e1 = (cos psi, sin psi, 0) is horizontal,
     e2 = e3 x e1 points from the contact A towards B; r_OA = -r e2 - h e3, the thickness is 2h.
 Contact frame R_A = (n0, m0, k): n0 = e1, m0 = k x n0.
 Rotation body -> world: R_world_body = Rz(psi) Rx(theta) Rz(phi), points_world = points_body @ R_world_body.T + t.
-    psi precession, theta nutation in [0, pi], phi spin. R_a_b maps components in b to components in a: names that
-    touch must match (R_left_body = R_left_world @ R_world_body).
+    psi precession, theta nutation in [0, pi], phi spin. R_a_b maps components in b to components in a: adjacent
+    names must match (R_left_body = R_left_world @ R_world_body).
 Small rotations: a rotation vector in world axes that multiplies from the left, R = exp([v]x) R_estimate. Pose
-    covariances are in (x, y, z, v_x, v_y, v_z): regular at theta = 0, where psi and phi each lose their meaning.
+    covariances are in (x, y, z, v_x, v_y, v_z): regular at theta = 0, where psi and phi are undetermined.
 Generalized coordinates q = (x, y, z, psi, theta, phi), rates qdot = dq/dt; omega_world = thetadot e1 + psidot k +
     phidot e3.
-Quaternions (w, x, y, z), body to world, scalar part not negative at the first frame and continuous from there.
-Units: SI and radians inside. Another unit has a suffix (radius_mm, theta_deg) and is converted where a file is read or
+Quaternions (w, x, y, z), body to world, scalar part not negative at the first frame, continuous afterwards.
+Units: SI and radians inside. Other units have a suffix (radius_mm, theta_deg) and are converted when a file is read or
     a page is printed.
 Pixels: (0, 0) is the centre of the top-left pixel, x right, y down; points are (x, y), images are [y, x].
 Camera frame: x right, y down, z along the view: points_camera = R_camera_world @ points_world + t_camera_world.
-Arrays: many of a thing on leading axes, components last; image points are (n_frames, n_cameras, n_markers, 2) with
-    camera 0 = left, 1 = right. A frame without an answer is NaN with a status, never a missing row.
+Arrays: components on the last axis; image points are (n_frames, n_cameras, n_markers, 2) with
+    camera 0 = left, 1 = right. A frame without a result is NaN with a status, never a missing row.
 """
 
 from collections.abc import Callable
@@ -66,7 +66,7 @@ def rotation_from_euler(psi: ArrayLike, theta: ArrayLike, phi: ArrayLike) -> Arr
 def euler_from_rotation(R_world_body: Array) -> Array:
     """(psi, theta, phi) of R_world_body (..., 3, 3) -> (..., 3) [rad]; psi and phi in (-pi, pi], theta in [0, pi].
 
-    At theta = 0 (and pi) psi and phi cannot be told apart; then psi = 0 and phi takes the whole turn.
+    At theta = 0 and pi only psi + phi or psi - phi is determined; then psi = 0 and phi is the whole rotation.
     """
     R = np.asarray(R_world_body, float)
     sine = np.hypot(R[..., 0, 2], R[..., 1, 2])
@@ -78,10 +78,10 @@ def euler_from_rotation(R_world_body: Array) -> Array:
 
 
 def unwrap_euler(euler: Array) -> Array:
-    """Angles continuous in time: (n, 3) psi, theta, phi [rad], NaN rows allowed and bridged.
+    """Angles continuous in time: (n, 3) psi, theta, phi [rad], also across NaN rows.
 
-    psi + phi (the turn of the body about the vertical for small theta) is well determined even where psi and phi are
-    not, so psi is unwrapped first and phi is then given the branch that keeps psi + phi continuous.
+    psi + phi (the rotation of the body about the vertical for small theta) is well determined even if psi and phi are
+    not: psi is unwrapped first, then the branch of phi is chosen so that psi + phi is continuous.
     """
     result = np.array(euler, float)
     good = np.flatnonzero(np.isfinite(result).all(axis=-1))
@@ -139,12 +139,12 @@ def quaternion_from_rotation(R: Array) -> Array:
     return np.roll(_known_rotations(R, 4, lambda turn: turn.as_quat()), 1, axis=-1)  # SciPy has the scalar part last
 
 
-def _known_rotations(R: Array, size: int, told: Callable[..., Array]) -> Array:
-    """What SciPy tells of R (..., 3, 3), (..., size); NaN in, NaN out."""
+def _known_rotations(R: Array, size: int, convert: Callable[..., Array]) -> Array:
+    """Conversion (..., size) of R (..., 3, 3) by SciPy; NaN in, NaN out."""
     R = np.asarray(R, float)
     found = np.full((*R.shape[:-2], size), np.nan)
     known = np.isfinite(R).all(axis=(-2, -1))
-    found[known] = told(scipy.spatial.transform.Rotation.from_matrix(R[known]))
+    found[known] = convert(scipy.spatial.transform.Rotation.from_matrix(R[known]))
     return found
 
 
@@ -157,7 +157,7 @@ def rotation_from_quaternion(q: Array) -> Array:
 
 
 def continuous_quaternions(q: Array) -> Array:
-    """Signs of (n, 4) chosen so that neighbours lie in the same half space; NaN rows are passed over."""
+    """(n, 4) with signs chosen so that successive quaternions have a positive product; NaN rows are skipped."""
     q = np.array(q, float)
     good = np.flatnonzero(np.isfinite(q).all(axis=-1))
     if good.size == 0:

@@ -1,4 +1,4 @@
-"""Numbers as people write them: the one place where a value and its standard deviation are rounded."""
+"""Rounding and formatting of numbers, with their standard deviations and units."""
 
 from dataclasses import dataclass
 from math import floor, inf, isfinite, log10, nan
@@ -11,7 +11,7 @@ _LONGEST = 7  # digits before or after the point; powers of ten beyond
 
 @dataclass(frozen=True)
 class Measured:
-    """A number, its standard deviation if that is known, and their unit (SI, or as declared; "" for none)."""
+    """A number, its standard deviation if known, and their unit (SI, or as declared; "" for none)."""
 
     value: float
     sigma: float = nan
@@ -46,7 +46,7 @@ def measured(value: float, sigma: float = nan, unit: str = "") -> str:
 
 
 def rounded(value: float | None, digits: int = 3) -> str:
-    """The number with so many digits, powers of ten where it is very large or small; nothing for None."""
+    """The number with this many digits, in powers of ten if very large or small; empty for None."""
     if value is None or value != value:
         return ""
     if abs(value) == inf:
@@ -61,19 +61,19 @@ def rounded(value: float | None, digits: int = 3) -> str:
 
 
 def score(value: float | None) -> str:
-    """A decrease of chi-square: tenths are of no interest below, nor above thousands."""
+    """A decrease of chi-square to tenths, above a thousand to four digits."""
     return rounded(value, 4) if value is None or not abs(value) < 1000 else _fixed(value, 1)
 
 
 def probability(p: float) -> str:
-    """The relation and the number, to stand behind "p": "= 0.57"."""
+    """Relation and number, to follow "p": "= 0.57"."""
     if not isfinite(p):
         return "unknown"
-    return "< 10⁻³⁰⁰" if p < 1e-300 else f"= {rounded(p, 2)}"  # beyond the range of the numbers it is computed with
+    return "< 10⁻³⁰⁰" if p < 1e-300 else f"= {rounded(p, 2)}"  # below the range of floating-point numbers
 
 
 def unit_text(unit: str) -> str:
-    """A unit as it is set: "m s^2" is m s², "rad s-1" rad/s, and "1" nothing."""
+    """A unit as printed: m s² for "m s^2", rad/s for "rad s-1", empty for "1"."""
     if unit in ("1", ""):
         return ""
     unit = unit.replace("^2", "²").replace("^3", "³")

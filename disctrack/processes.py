@@ -1,4 +1,4 @@
-"""Processes beside this one: how they begin, whatever they do."""
+"""How child processes are started."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from collections.abc import Iterator
 from multiprocessing.context import SpawnContext, SpawnProcess
 from types import ModuleType
 
-# Of processes side by side: one thread each, more would wait for one another.
+# For parallel processes: one thread each, more would compete for the cores.
 ONE_THREAD = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL", "BLIS", "NUMEXPR", "NUMBA")}
 ONE_THREAD |= {"VECLIB_MAXIMUM_THREADS": "1", "OPENCV_FOR_THREADS_NUM": "1"}
 _STARTING = threading.Lock()
-_GRACE = 3.0  # [s] to clear up, where nobody ends it
+_GRACE = 3.0  # [s] to clean up after SIGTERM, before the process exits
 
 
 @contextlib.contextmanager
@@ -34,7 +34,7 @@ def quietly() -> Iterator[None]:
             if kinds:
                 from multiprocessing.resource_tracker import ensure_running  # not on Windows
 
-                ensure_running()  # it begins with the first process, and leaves Ctrl-C unblocked
+                ensure_running()  # it starts with the first process, and unblocks Ctrl-C
                 signal.pthread_sigmask(signal.SIG_BLOCK, kinds)
             yield
         finally:
@@ -47,7 +47,7 @@ def quietly() -> Iterator[None]:
 
 
 def end_with_parent() -> None:
-    """In a new process: it ends when the one that started it does, by way of what it does on SIGTERM."""
+    """Called in a new process: sends it SIGTERM when its parent ends."""
     threading.Thread(target=_wait_and_end, daemon=True).start()
 
 
@@ -67,12 +67,12 @@ class _Process(SpawnProcess):
 
 
 class Spawn(SpawnContext):
-    """Remembers its processes: their exit codes tell why they ended."""
+    """Context that keeps a list of its processes, for their exit codes."""
 
     def __init__(self) -> None:
         self.started: list[SpawnProcess] = []
 
     def Process(self, *given: object, **named: object) -> SpawnProcess:  # type: ignore[override]
-        """As the context's, begun quietly."""
+        """A process of the context, started `quietly`."""
         self.started.append(_Process(*given, **named))  # type: ignore[arg-type]
         return self.started[-1]

@@ -1,7 +1,7 @@
-"""Signs of life on stderr: a bar where there is work to count, a line with its time when a stage ends.
+"""Progress on stderr: a bar for countable work, and a line with its duration at the end of a stage.
 
-On a terminal a bar or the name of the stage stands there while it lasts and vanishes at its end. Where stderr is no
-terminal (a log, a pipe) there are no bars, and the lines are the same.
+On a terminal, a bar or the name of the stage is shown until its end. If stderr is no terminal (a log, a pipe) there are
+no bars; the lines are the same.
 """
 
 import contextlib
@@ -15,21 +15,21 @@ from tqdm import tqdm
 
 @contextlib.contextmanager
 def progress_bar(what: str, total: int, unit: str) -> Iterator[Callable[[int], None]]:
-    """Function that is told how many more are done. The bar vanishes at the end; a line with the time stays.
+    """Yields a function to be called with the number of further units done; at the end prints a line with the time.
 
-    What is reported beyond the total is not shown.
+    Units beyond the total are not shown.
     """
     began = time.perf_counter()
     with tqdm(total=total, desc=what, unit=f" {unit}", disable=None, leave=False) as bar:
         yield lambda n: bar.update(max(0, min(n, total - bar.n))) and None
-    _tell(began, f"{what}: {total} {unit}{'' if total == 1 else 's'}")
+    _print_duration(began, f"{what}: {total} {unit}{'' if total == 1 else 's'}")
 
 
 @contextlib.contextmanager
 def steps(what: str) -> Iterator[Callable[[str], None]]:
-    """Name the stage and its age while it lasts (terminals only), and write a line with its time when it ends well.
+    """Show the stage and its elapsed time (terminals only), and print a line with its duration if it succeeds.
 
-    Yields a function that is told which step begins, for terminals to show with the stage's age.
+    Yields a function to be called with the name of each step, which terminals show as well.
     """
     began, over = time.perf_counter(), threading.Event()
     with tqdm(desc=what, bar_format="{desc} ... {elapsed}", disable=None, leave=False) as bar:
@@ -45,31 +45,31 @@ def steps(what: str) -> Iterator[Callable[[str], None]]:
         finally:
             over.set()
             ticking.join()
-    _tell(began, what)
+    _print_duration(began, what)
 
 
 @contextlib.contextmanager
 def compiling(what: str, seconds: int) -> Iterator[None]:
-    """Say on stderr what is compiled and for how long, as soon as the compiler begins; nothing where it is only loaded.
+    """Print on stderr what is compiled and for how long, when the compiler starts; nothing if the cache is loaded.
 
-    seconds: of processor time that it took where it was measured.
+    seconds : estimate of the processor time
     """
-    from calibration.kit.compiled import one_at_a_time  # numba: those who call this have it, others need not wait
+    from calibration.kit.compiled import one_at_a_time  # late, as it imports numba
 
     began = time.perf_counter()
-    told = f"compiling the inner loops of {what}: once per installation, about {seconds} s of a free core"
-    said: list[str] = []
+    message = f"compiling the inner loops of {what}: once per installation, about {seconds} s of a free core"
+    printed: list[str] = []
 
-    def tell() -> None:
-        if not said:
-            print(told, file=sys.stderr, flush=True)
-        said.append(told)
+    def announce() -> None:
+        if not printed:
+            print(message, file=sys.stderr, flush=True)
+        printed.append(message)
 
-    with one_at_a_time(tell, what):
+    with one_at_a_time(announce, what):
         yield
-    if said:
-        _tell(began, f"inner loops of {what} compiled")
+    if printed:
+        _print_duration(began, f"inner loops of {what} compiled")
 
 
-def _tell(began: float, what: str) -> None:
+def _print_duration(began: float, what: str) -> None:
     print(f"{time.perf_counter() - began:7.1f} s  {what}", file=sys.stderr, flush=True)

@@ -16,14 +16,14 @@ from disctrack.findings import Finding, Kind, Severity, of_kind
 from disctrack.numbers import measured
 from disctrack.trajectory import Trajectory, part
 
-WINDOWS = np.array([0.2, 0.3, 0.4, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0])  # [s] before t_f, for the exponents' dependence
-CIRCLE_DURATION = 0.6  # [s], as for the paper's figure 9
-EXPECTED_NOISE_SCALE = (0.7, 1.5)  # found over stated variance of the poses: outside, the report says so
+WINDOWS = np.array([0.2, 0.3, 0.4, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0])  # [s] before t_f, to vary the fit
+CIRCLE_DURATION = 0.6  # [s], as in figure 9 of the paper
+EXPECTED_NOISE_SCALE = (0.7, 1.5)  # estimated over stated variance of the poses; outside, the report warns
 
 
 @dataclass(frozen=True, repr=False)
 class Analysis(Brief):
-    """Everything that the analysis of one trajectory gives.
+    """All results of the analysis of one trajectory.
 
     >>> analysis = run_analyse("clip/results/trajectory.h5", overwrite=True).analysis
     >>> bool(analysis.energy.loss > 0)
@@ -39,19 +39,19 @@ class Analysis(Brief):
     laws: PowerLaws  # of the last stage
     laws_by_window: tuple[PowerLaws, ...]  # one per entry of WINDOWS
     nutation_count: NutationCount
-    findings: tuple[Finding, ...]  # of the analysis alone
+    findings: tuple[Finding, ...]  # of the analysis only
 
     def facts(self) -> dict[str, str]:
-        """What a glance should tell (`Brief`)."""
-        told = {
+        """Short summary (`Brief`)."""
+        facts = {
             "frames": f"{int(self.motion.known.sum())} of {len(self.motion)}",
             "contact": self.onset.verdict,
             "energy lost": measured(self.energy.loss, self.energy.loss_sigma, "J"),
         }
         laws = self.laws
         if laws.determined:
-            told |= {"t_f": measured(laws.t_f, laws.t_f_sigma, "s"), "n_theta": str(laws.n_theta)}
-        return told
+            facts |= {"t_f": measured(laws.t_f, laws.t_f_sigma, "s"), "n_theta": str(laws.n_theta)}
+        return facts
 
     def series(self, name: str) -> DerivedSeries:
         """The derived quantity of this name."""
@@ -62,8 +62,8 @@ def analyse(trajectory: Trajectory, window: float = WINDOW, circle_duration: flo
     """Motion, contact, energy and scaling laws of a trajectory.
 
     window, circle_duration : [s] before t_f for the exponents, before the end for the circle
-    Of a trajectory of which only a part was tracked, that part is analysed; the result has its length.
-    Raises AnalysisError when the trajectory has no table frame, or too few poses.
+    If only a part of the trajectory was tracked, the result has the length of that part.
+    Raises AnalysisError if the trajectory has no table frame, or too few poses.
     """
     if not trajectory.rig.world_is_table:
         raise AnalysisError(
@@ -71,15 +71,15 @@ def analyse(trajectory: Trajectory, window: float = WINDOW, circle_duration: flo
             "vertical are known. Name the view whose board lies on the table ([table] in recording.toml), calibrate "
             "and track again."
         )
-    looked_for = np.flatnonzero(trajectory.looked_for)
-    if looked_for.size not in (0, len(trajectory)):
-        trajectory = part(trajectory, slice(int(looked_for[0]), int(looked_for[-1]) + 1))
+    tracked = np.flatnonzero(trajectory.looked_for)
+    if tracked.size not in (0, len(trajectory)):
+        trajectory = part(trajectory, slice(int(tracked[0]), int(tracked[-1]) + 1))
     motion = differentiate(trajectory)
     found = propagate(motion)
     until, sense = _end_of_rolling(motion, found.value[:, COLUMN["psidot"]])
     onset = rolling_onset(found, until)
-    if onset.low > motion.time[motion.known][0]:  # the acceleration jumps where slip ends
-        del motion, found  # the new ones need not stand beside them
+    if onset.low > motion.time[motion.known][0]:  # the acceleration jumps when slip ends
+        del motion, found  # to save memory
         motion = differentiate(trajectory, breaks=(onset.time,))
         found = propagate(motion)
     psi, psidot = sense * motion.euler[:, 0], sense * found.value[:, COLUMN["psidot"]]
@@ -100,7 +100,7 @@ def analyse(trajectory: Trajectory, window: float = WINDOW, circle_duration: flo
 
 
 def _end_of_rolling(motion: MeasuredMotion, psidot: Array) -> tuple[float, float]:
-    """Instant [s] at which the precession is stopped (or the recording ends), and the sense of the precession."""
+    """Instant [s] at which the precession is stopped (or the recording ends), and the sign of the precession."""
     if not np.isfinite(psidot).any():
         return np.inf, 1.0
     sense = float(np.sign(np.nansum(psidot))) or 1.0
@@ -108,7 +108,7 @@ def _end_of_rolling(motion: MeasuredMotion, psidot: Array) -> tuple[float, float
 
 
 def _findings(trajectory: Trajectory, motion: MeasuredMotion, onset: RollingOnset) -> Iterator[str]:
-    """What an experimenter should know before using the numbers, beyond what the measurement's own findings say."""
+    """Warnings of the analysis, in addition to the findings of the tracking."""
     frames = trajectory.looked_for
     n, missing, unknown = (int(rows.sum()) for rows in (frames, frames & ~motion.measured, frames & ~motion.known))
     if missing:

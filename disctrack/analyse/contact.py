@@ -1,4 +1,4 @@
-"""What the contact tells: since when the disc rolls, and the circle that its locus runs on."""
+"""From the contact: the onset of rolling, and the circle of the contact locus."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -8,25 +8,25 @@ import numpy as np
 from calibration.kit.arrays import Array
 from disctrack.analyse.quantities import SIGMAS, Propagated, from_to
 
-SLIP, PLACE = from_to("slip_n", "slip_m"), from_to("contact_x", "contact_y")
+SLIP, CONTACT = from_to("slip_n", "slip_m"), from_to("contact_x", "contact_y")
 
-# What a calibrated radius, thickness and table (1e-4 each) leave of slip at the rates of a rolling disc (1 to 5 m/s at
-# the edge) is a few tenths of a millimetre per second: slip below this is rolling for every purpose.
+# Errors of radius, thickness and table of 1e-4 each, at 1 to 5 m/s of the edge, appear as a slip of some tenths of a
+# millimetre per second: smaller slip counts as rolling.
 SLIP_TOLERANCE = 0.5e-3  # [m/s]
-# Noise of a smoothed velocity is independent after about 0.6 l (half a period of the smoother's cut-off).
+# Noise of a smoothed velocity decorrelates after about 0.6 l (half a period of the smoother's cut-off).
 INDEPENDENT_AFTER_LENGTHS = 0.6
 
 
 @dataclass(frozen=True)
 class RollingOnset:
-    """Since when the disc rolls without slip, as a probability over the frames."""
+    """Onset of rolling without slip, from a posterior over the frames."""
 
-    # [s] median; the first frame when slip before it is not shown; NaN when it does not roll
+    # [s] median; the first frame if no slip is significant; NaN if the disc does not roll
     time: Annotated[float, "rolling_onset_s"]
     low: Annotated[float, "rolling_onset_low_s"]  # [s] 2.5 % point
     high: Annotated[float, "rolling_onset_high_s"]  # [s] 97.5 % point
-    probability: Annotated[float, "rolling_probability"]  # that there is pure rolling at the end of the recording
-    # [m] path of slip before the onset (of the whole recording when it never rolls)
+    probability: Annotated[float, "rolling_probability"]  # of pure rolling at the end of the recording
+    # [m] path of slip before the onset (of the whole recording if the disc never rolls)
     slip_distance: Annotated[float, "slip_distance_m"]
     slip_distance_sigma: Annotated[float, "slip_distance_sigma_m"]  # [m]
     n_late_slips: int  # frames after the onset whose slip exceeds 5 sigma
@@ -37,13 +37,13 @@ class RollingOnset:
 class Circle:
     """Circle fitted to the contact locus in the plane of the table."""
 
-    centre: Annotated[Array, "locus_circle_centre_m"]  # (2,) [m]; NaN when the arc does not determine it
+    centre: Annotated[Array, "locus_circle_centre_m"]  # (2,) [m]; NaN if the arc does not determine it
     radius: Annotated[float, "locus_circle_radius_m"]  # [m]
-    # [m] of the radius, noise and what the locus does beside a circle
+    # [m] of the radius, from noise and the deviation of the locus from a circle
     sigma: Annotated[float, "locus_circle_radius_sigma_m"]
     sigma_calibration: Annotated[float, "locus_circle_radius_sigma_calibration_m"]  # [m]
     rms: float  # [m] of the distances from the circle
-    # [m] mean of r cos theta - h sin theta, the radius when the centre rests
+    # [m] mean of r cos theta - h sin theta, the radius if the centre is at rest
     expected: Annotated[float, "locus_circle_expected_radius_m"]
     interval: Annotated[tuple[float, float], "locus_circle_interval_s"]  # [s] first and last instant
 
@@ -52,8 +52,8 @@ def rolling_onset(found: Propagated, until: float = np.inf) -> RollingOnset:
     """Change from slip to rolling: posterior over the first rolling frame, flat prior, slip of unknown size before it.
 
     Before the onset each slip component has variance s^2 + noise, s unknown between 4 SLIP_TOLERANCE and 10 m/s; after
-    it, SLIP_TOLERANCE^2 + noise. Neighbouring frames share noise: their likelihoods count by the independent share.
-    until : end of the rolling motion [s]; a disc that is being stopped, or lies still, says nothing about rolling
+    it, SLIP_TOLERANCE^2 + noise. Noise of neighbouring frames is correlated: likelihoods are weighted accordingly.
+    until : end of the rolling motion [s]; later frames, of a disc that is braked or at rest, are not used
     """
     motion = found.motion
     frames = np.flatnonzero(np.isfinite(found.value[:, SLIP]).all(axis=1) & (motion.time <= until))
@@ -100,7 +100,7 @@ def _log_normal(v: Array, C: Array, extra: float) -> Array:
 
 
 def _slip_distance(time: Array, v: Array, C: Array, share: Array) -> tuple[float, float]:
-    """Integral of |v| and its sigma; the square of the noise, which adds to |v|, is taken off first."""
+    """Integral of |v| and its sigma; the variance of the noise is subtracted from |v|^2."""
     if len(time) < 2:
         return 0.0, 0.0
     noise2 = np.trace(C, axis1=1, axis2=2)
@@ -114,18 +114,18 @@ def _slip_distance(time: Array, v: Array, C: Array, share: Array) -> tuple[float
 def locus_circle(found: Propagated, duration: float, until: float = np.inf) -> Circle:
     """Circle through the contact points of the last `duration` seconds before `until`, least squares of distances.
 
-    Its sigma comes from the scatter about the circle with as many independent points as half turns; radii of arcs
-    below a quarter turn are not given.
+    The sigma is from the scatter about the circle with one independent point per half turn; for arcs below a quarter
+    turn the radius is NaN.
     """
     motion = found.motion
-    known = np.flatnonzero(np.isfinite(found.value[:, PLACE]).all(axis=1) & (motion.time <= until))
+    known = np.flatnonzero(np.isfinite(found.value[:, CONTACT]).all(axis=1) & (motion.time <= until))
     frames = known[motion.time[known] >= motion.time[known[-1]] - duration] if known.size else known
     arc = float(np.ptp(motion.euler[frames, 0])) if frames.size else 0.0
     if arc < np.pi / 2 or frames.size < 8:
         return Circle(np.full(2, np.nan), *(float("nan"),) * 5, (float("nan"), float("nan")))
-    points = found.value[frames, PLACE]
+    points = found.value[frames, CONTACT]
     centre = points.mean(axis=0)
-    for _ in range(30):  # Gauss-Newton, to rounding
+    for _ in range(30):  # Gauss-Newton, to round-off
         offset = points - centre
         distance = np.linalg.norm(offset, axis=1)
         J = np.column_stack([offset / distance[:, None], np.ones(len(frames))])
@@ -135,9 +135,9 @@ def locus_circle(found: Propagated, duration: float, until: float = np.inf) -> C
     gain = by_distance[2]
     rms = float(np.sqrt(np.mean((distance - radius) ** 2)))
     independent = min(len(frames), max(4.0, arc / np.pi))
-    noise = found.covariance(frames, PLACE).sum(axis=(1, 2)).mean() / 2
+    noise = found.covariance(frames, CONTACT).sum(axis=(1, 2)).mean() / 2
     variance = gain @ gain * len(frames) / independent * max(rms**2, float(noise))
-    sensitivity = found.jacobian[frames, PLACE] @ motion.calibration_sensitivity[frames]
+    sensitivity = found.jacobian[frames, CONTACT] @ motion.calibration_sensitivity[frames]
     per_rig = gain @ np.einsum("ni,nir->nr", J[:, :2], sensitivity)
     theta = motion.euler[frames, 1]
     expected = motion.disc.radius * np.cos(theta) - motion.disc.half_thickness * np.sin(theta)

@@ -2,17 +2,17 @@
 
 Three laws hold whatever the friction is, and each contains declared numbers:
 
-- moments about the centre along e1, where the only force is the table's, at the contact A:
+- moments about the centre along e1, if the only contact force is that of the table at A:
   e1 . (J alpha + omega x J omega) = e1 . (r_OA x m (a + g k)). Time is counted in frames, so that the gravity which
-  satisfies it goes as the square of the frame rate and as the radius; the mass cancels. It holds in rolling, in slip
-  and in the air; not while something else touches the disc, nor at rest on a patch.
-- rigidity: dots seen by both cameras are as far apart as their declared centres, on the scale of the chessboard.
-- geometry: the centre of a disc on its rim rises by r sin(theta) + h cos(theta), over one plane, which is the table.
+  satisfies it is proportional to the square of the frame rate and to the radius; the mass cancels. It holds in
+  rolling, in slip and in free flight, but not while something else touches the disc, or at rest on a patch.
+- rigidity: the distances of the dots, triangulated, equal those of their declared centres in units of the chessboard.
+- geometry: the centre of a disc on its rim is r sin(theta) + h cos(theta) above one plane, the table.
 
-A mirrored world obeys all three. It is told by what has a left and a right: dots without an axis of symmetry, which are
-not found in it; and the cameras, of which the left one stands on the left.
+A mirrored world satisfies all three. It is recognised by chirality: dots without an axis of symmetry are not found in
+it, and the left camera is on the right.
 
-A finding names the declared numbers that could be wrong, likeliest first, what was seen, and what was expected.
+A finding names the declared numbers that could be wrong, most likely first, the observation and the expectation.
 """
 
 from __future__ import annotations
@@ -42,30 +42,29 @@ if TYPE_CHECKING:
     from disctrack.recording.declaration import Recording
 
 
-SIDEWAYS = 0.5  # cosine of the angle up to which a baseline is one from left to right
+SIDEWAYS = 0.5  # smallest cosine between the baseline and the direction to the right
 USUAL_RATES = np.outer(10.0 ** np.arange(1, 7), [1, 1.2, 1.25, 1.5, 2, 2.4, 2.5, 3, 4, 5, 6, 7.5, 8]).ravel()  # [Hz]
-STRETCHES, BLOCK = 4, 20  # stretches looked at, frames that give one estimate
-MIN_BLOCKS = 5  # to judge them by their scatter: a stretch
-# Below, the disc may lie on a patch of its face and the weight has no arm; above, the arm of the weight is short.
+STRETCHES, BLOCK = 4, 20  # number of stretches that are analysed; frames per estimate
+MIN_BLOCKS = 5  # estimates that determine their scatter; blocks per stretch
+# Below, the disc may lie on a patch of its face, so that the weight has no lever arm; above, the arm is short.
 THETA_RANGE = np.radians(1.0), np.radians(60.0)
-# What honest discs and tables may do: rounded edges and tables that lean by a degree shift the balance by 3 % at most.
-BALANCE = 0.10
-NOTED = 0.01  # from which on it, or energy that grows, is worth a word
-SCALE = 5e-3  # of printed dots against a printed board, paper and toner included
+BALANCE = 0.10  # relative; rounded edges and a table tilted by a degree shift the balance by 3 % at most
+NOTED = 0.01  # relative deviation of the balance, or growth of the energy, that is reported
+SCALE = 5e-3  # relative, of printed dots to a printed board, with paper and toner
 BY_SCALE = (Kind.DOTS_MISPLACED, Kind.RADIUS, Kind.THICKNESS, Kind.BOARD_THICKNESS, Kind.GRAVITY_OR_RATE, *MISFITS)
-SIDE_TOLERANCE = 0.06  # of a length: beyond, dots that were printed to another scale would have another size, too
+SIDE_TOLERANCE = 0.06  # of a length: at a larger difference of the print's scale the dots also differ in size
 RISE = 0.03  # of the radius: a rounded or bevelled edge of a millimetre
-MIN_LEAN = np.radians(2.0)  # of a plane: boards and tables lean by less
-SEEN_RARELY = 0.1  # share of the images
-MOST_HEIGHT = 3e-3  # [m] of the rim's plane from the foot of a board that lies on it, its thickness wrong or not
-CLAIM_POSITION = 5e-6  # [m] the accuracy that is claimed: Ma et al. 2014, end of section 3
-LAB_FRAME = 20e-6  # [m] to which it is known where a board on a table lies, with no particular care
-OFF = (Kind.TABLE_DISAGREES, Kind.ACCURACY)  # a wrong height is seen so
+MIN_LEAN = np.radians(2.0)  # of a plane: boards and tables are tilted by less
+SEEN_RARELY = 0.1  # fraction of the images
+MOST_HEIGHT = 3e-3  # [m] from the rim's plane to the lower face of a board that lies on it, of uncertain thickness
+CLAIM_POSITION = 5e-6  # [m] the claimed accuracy: Ma et al. 2014, end of section 3
+LAB_FRAME = 20e-6  # [m] accuracy of the position of a board on a table, without particular care
+OFF = (Kind.TABLE_DISAGREES, Kind.ACCURACY)  # consequences of a wrong height
 UNITS = {1e3: "mm and m", 1e2: "m and cm", 10.0: "cm and mm", 25.4: "inches and mm", 2.0: "radius and diameter"}
 
 
 class Boards(NamedTuple):
-    """Where the board was in the calibration's views, as the left camera's axes have it."""
+    """Poses of the board in the views of the calibration, in axes of the left camera."""
 
     places: Mapping[int, tuple[Array, Array]]  # number of the view: R_left_board (3, 3), t_left_board (3,) [m]
     table_view: int | None
@@ -81,10 +80,11 @@ def contradictions(
     boards: Boards | None = None,
     blur_px: Sequence[float] = (),
 ) -> tuple[Finding, ...]:
-    """Every check that this trajectory allows, and after them what was noticed by the tracking.
+    """Every check that this trajectory allows, then the findings of the tracking.
 
-    disc : as declared, before its dots were refined;  recording : all that was declared, where it is at hand
-    boards : in the calibration's views;  blur_px : of the dots' edges in either camera
+    disc : as declared, before its dots were refined;  recording : the whole declaration, if available
+    noticed : findings of the tracking
+    boards : in the views of the calibration;  blur_px : of the edges of the dots, per camera
     """
     disc, board = disc or trajectory.disc, None if recording is None else recording.chessboard
     square = None if board is None else board.square
@@ -94,7 +94,7 @@ def contradictions(
         found += handedness(trajectory.rig, disc)
         off = next((f for f in noticed if f.kind == Kind.TABLE_DISAGREES), None)
         height = None if off is None else 1e-6 * off.numbers["height"].value
-        # on another plane than the declared one neither heights nor the direction of gravity mean anything
+        # with a wrong table plane, neither heights nor the direction of gravity are known
         elsewhere = another_plane(trajectory, boards)
         found += elsewhere or [*rise_of_centre(trajectory), *motion_against_gravity(trajectory, height)]
         if recording is not None and recording.table is not None and off is not None and not elsewhere:
@@ -104,7 +104,7 @@ def contradictions(
 
 
 def with_square(findings: Sequence[Finding], recording: Recording | None) -> tuple[Finding, ...]:
-    """Findings of the images alone, which know no board: of another scale, with the square that would fit."""
+    """Findings of the tracking, which does not know the board: a wrong scale also suggests the matching square."""
     if recording is None or recording.chessboard is None:
         return tuple(findings)
     square = recording.chessboard.square
@@ -115,9 +115,9 @@ def with_square(findings: Sequence[Finding], recording: Recording | None) -> tup
 
 
 def thickness(disc: Disc, board: float, off: Finding) -> tuple[Finding, ...]:
-    """Thickness of the board, or of the disc, that puts the rim on the table.
+    """Thickness of the board, or of the disc, with which the rim is on the table.
 
-    board : [m] as declared;  off : what was noticed of the table
+    board : [m] as declared;  off : the finding on the height of the table
     """
     if not off.doubtful:
         return ()
@@ -127,7 +127,7 @@ def thickness(disc: Disc, board: float, off: Finding) -> tuple[Finding, ...]:
         ("[disc] thickness_mm", Kind.THICKNESS, 2e3 * disc.half_thickness, 2e3 * disc.half_thickness + 1e-3 * height),
     )
     suspects = [
-        # nobody measures a thickness of nothing: it was forgotten
+        # zero is not a measured thickness: it was forgotten
         (_apart(fits, size) if size else 0.0, kind, Remedy(key, f"{fits:.2f}", f"{size:g}"))
         for key, kind, size, fits in sizes
         if fits > 0
@@ -137,7 +137,7 @@ def thickness(disc: Disc, board: float, off: Finding) -> tuple[Finding, ...]:
 
 
 def across(trajectory: Trajectory) -> Array:
-    """(2,) [px] by how much a dot is wide along its narrow side, in the middle of the recording."""
+    """(2,) [px] minor axis of the image of a dot in each camera, in the middle of the recording."""
     rows = np.flatnonzero(trajectory.measured)
     row, rig = rows[len(rows) // 2], trajectory.rig
     R, t = map(np.array, zip(*rig.camera_poses(), strict=True))
@@ -148,7 +148,7 @@ def across(trajectory: Trajectory) -> Array:
 
 
 def unsharp(trajectory: Trajectory, blur_px: Sequence[float]) -> Iterator[Finding]:
-    """Dots so narrow that the blur of opposite edges overlaps, and positions less certain than claimed."""
+    """Dots so narrow that the blur of opposite edges overlaps, and positions less accurate than claimed."""
     if not trajectory.measured.any():
         return
     for camera, blur, width in zip(CAMERAS, blur_px, across(trajectory), strict=True):
@@ -176,7 +176,7 @@ def unsharp(trajectory: Trajectory, blur_px: Sequence[float]) -> Iterator[Findin
 
 
 def lost_pairs(trajectory: Trajectory) -> Iterator[Finding]:
-    """Pairs that both cameras lost while the files were numbered on."""
+    """Image pairs that both cameras dropped while the files were numbered consecutively."""
     for row, lost in clock_jumps(trajectory).items():
         frame = int(trajectory.frame[row])
         yield Finding(
@@ -190,15 +190,15 @@ def lost_pairs(trajectory: Trajectory) -> Iterator[Finding]:
         )
 
 
-# A declared number that may be wrong: how far what fits is from an ordinary value, natural logarithm; its kind; what to
-# change. The nearest is the likeliest.
+# A declared number that may be wrong: |ln| of the fitting value over an ordinary one; kind; remedy. The smallest is the
+# most likely.
 Suspect: TypeAlias = tuple[float, Kind, Remedy]
 
 
 def _contradiction(
     suspects: Sequence[Suspect], text: str, explains: tuple[Kind, ...] = (), **numbers: Measured
 ) -> Finding:
-    """Of the kind of the likeliest suspect, all of which it names."""
+    """A finding that names all suspects, of the kind of the most likely one."""
     likely = sorted(suspects, key=itemgetter(0))
     remedies = tuple(remedy for *_, remedy in likely)
     return Finding(likely[0][1], Severity.DOUBT, text, numbers=numbers, remedies=remedies, explains=explains)
@@ -214,27 +214,27 @@ def _typical(estimates: Array, unit: str = "") -> Measured:
 
 
 def _slope(x: Array, y: Array) -> tuple[Measured, float]:
-    """Slope of y over x, and the scatter about the line; frames in the air, or in a hand, count less.
+    """Slope of y over x, and the scatter about the line; outliers, as of a disc in the air or in a hand, count less.
 
-    Its sigma grows with the memory of what the line leaves: a push, or a curve, has few independent points.
+    The sigma takes the autocorrelation of the residuals into account: a push, or a curve, has few independent points.
     """
     weight = np.ones(len(x))
     for _ in range(6):
         slope, offset = np.polyfit(x, y, 1, w=np.sqrt(weight))
-        left = y - slope * x - offset
-        weight = _doubting(left)
-    scatter, memory = robust_sigma(left), np.maximum(np.corrcoef(left[:-1], left[1:])[0, 1], 0.0)
-    sigma = scatter / np.std(x) * np.sqrt((1 + memory) / (1 - memory) / len(x))
+        residual = y - slope * x - offset
+        weight = _robust_weights(residual)
+    scatter, rho = robust_sigma(residual), np.maximum(np.corrcoef(residual[:-1], residual[1:])[0, 1], 0.0)
+    sigma = scatter / np.std(x) * np.sqrt((1 + rho) / (1 - rho) / len(x))
     return Measured(float(slope), float(sigma)), scatter
 
 
 def _known(found: Measured) -> bool:
-    """Whether a positive number is told from zero."""
+    """Whether a positive number is significant."""
     return found.value > SIGMAS * found.sigma
 
 
 def _beyond(found: Measured, expected: float, tolerance: float) -> bool:
-    """Whether what was found differs from what is expected by more than its sigmas and a share of it."""
+    """Whether a number differs from the expected one by more than its sigmas and a relative tolerance."""
     differs = _known(found) and abs(found.value - expected) > SIGMAS * found.sigma
     return bool(differs and _apart(found.value, expected) > np.log1p(tolerance))
 
@@ -242,8 +242,8 @@ def _beyond(found: Measured, expected: float, tolerance: float) -> bool:
 def motion_against_gravity(trajectory: Trajectory, height: float | None = None) -> tuple[Finding, ...]:
     """Gravity and frame rate, and an energy that grows, on some stretches of the recording.
 
-    What else acts on the disc, a hand or a push, differs from block to block: nothing is known then.
-    height : [m] of the disc's lowest point above the board's table, where that is no table for it
+    Other forces, of a hand or a push, differ from block to block: then nothing is significant.
+    height : [m] of the disc's lowest point above the declared table, if they disagree
     """
     found, energy = balance(trajectory)
     if len(found) < MIN_BLOCKS:
@@ -259,7 +259,7 @@ def motion_against_gravity(trajectory: Trajectory, height: float | None = None) 
         severity = Severity.DOUBT if _beyond(gravity, g, BALANCE) else Severity.NOTE
         away, kind, _ = min(suspects, key=itemgetter(0))
         explains = (Kind.REVERSED, *OFF) if kind == Kind.RADIUS else (Kind.REVERSED,)
-        if kind == Kind.RADIUS and not away:  # two laws agree about it
+        if kind == Kind.RADIUS and not away:  # two laws give the same radius
             severity = max(severity, Severity.WARNING)
         return (replace(_contradiction(suspects, text, explains, gravity=gravity), severity=severity),)
     if not _known(gravity):
@@ -278,7 +278,7 @@ def motion_against_gravity(trajectory: Trajectory, height: float | None = None) 
 
 
 def _of_gravity(trajectory: Trajectory, gravity: Measured, height: float | None) -> tuple[Suspect, ...]:
-    """Which declared numbers would explain that the balance holds with this gravity."""
+    """Declared numbers that, if wrong, explain this gravity of the balance."""
     g, rate = trajectory.gravity, trajectory.frame_rate
     ratio = gravity.value / g
     true_rate = rate / np.sqrt(ratio)
@@ -297,11 +297,11 @@ def _of_gravity(trajectory: Trajectory, gravity: Measured, height: float | None)
 
 
 def _radius_suspected(trajectory: Trajectory, ratio: float, height: float | None) -> Suspect:
-    """First of all where the rim is on the table with a radius nearer to that of the rates than to the declared one."""
+    """The most likely suspect if heights of the rim give nearly the same radius as the balance, unlike the declared."""
     z, theta = trajectory.q[trajectory.measured][:, [2, 4]].T
     disc, would_be, misfit = trajectory.disc, trajectory.disc.radius / ratio, _apart(ratio, 1.0)
     by_rim = float(np.median((z - disc.half_thickness * np.abs(np.cos(theta))) / np.sin(theta)))
-    # where the table is moved towards the disc's, by how far it was off
+    # if the tracking shifted the table to the disc: from that shift
     by_table = by_rim if height is None else disc.radius + height / float(np.median(np.sin(theta)))
     for radius, better in ((by_rim, by_rim), (by_table, would_be)):
         if trajectory.rig.world_is_table and radius > 0 and _apart(radius, would_be) < 0.5 * misfit:
@@ -311,7 +311,7 @@ def _radius_suspected(trajectory: Trajectory, ratio: float, height: float | None
 
 
 def density(disc: Disc) -> tuple[Finding, ...]:
-    """A disc lighter than a hard foam or heavier than osmium: mass, radius or thickness is in another unit."""
+    """A disc lighter than a hard foam or heavier than osmium: mass, radius or thickness is in a wrong unit."""
     found = disc.mass / (2 * np.pi * disc.radius**2 * disc.half_thickness)
     if 50.0 < found < 23e3:
         return ()
@@ -325,7 +325,7 @@ def density(disc: Disc) -> tuple[Finding, ...]:
 
 
 def balance(trajectory: Trajectory) -> tuple[Array, Array]:
-    """Gravity [m/s^2] with which the moments about the centre balance along e1, and energy [J]: (blocks,) in order."""
+    """Gravity [m/s^2] that satisfies the balance of moments along e1, and energy [J]: (blocks,) in order of time."""
     found = [(np.empty(0), np.empty(0))]
     for rows in _stretches(trajectory):
         with suppress(AnalysisError):
@@ -335,7 +335,7 @@ def balance(trajectory: Trajectory) -> tuple[Array, Array]:
 
 
 def _stretches(trajectory: Trajectory) -> list[slice]:
-    """Some stretches without a large gap in time, evenly spread over the frames in which the disc was measured."""
+    """Some stretches without large gaps, evenly distributed over the frames in which the disc was measured."""
     rows = np.flatnonzero(trajectory.measured)
     if len(rows) < BLOCK:
         return []
@@ -350,7 +350,7 @@ def _stretches(trajectory: Trajectory) -> list[slice]:
 
 
 def _blocks(motion: MeasuredMotion) -> tuple[Array, Array]:
-    """Medians of gravity and energy over blocks of frames of one stretch, where the balance determines gravity."""
+    """Gravity and mean energy of blocks of frames of one stretch, if the balance determines gravity."""
     disc = motion.disc
     m = disc.mass
     e1, e2, e3 = motion.axes()
@@ -363,35 +363,35 @@ def _blocks(motion: MeasuredMotion) -> tuple[Array, Array]:
     arm = disc.arm_to_contact(e2, e3)
     spin = np.cross(motion.omega_world, disc.times_inertia(motion.omega_world, e3))
     moment = disc.times_inertia(motion.alpha_world, e3) + spin
-    left = np.sum(e1 * (moment - m * np.cross(arm, motion.acceleration)), axis=1)
+    needed = np.sum(e1 * (moment - m * np.cross(arm, motion.acceleration)), axis=1)
     weight = m * np.sum(e1 * np.cross(arm, K), axis=1)
     energy = quantities(motion, disc, motion.gravity)[:, COLUMN["total"]] + m * motion.gravity * disc.half_thickness
     blocks = [rows[good[rows]] for rows in np.split(np.arange(len(good)), range(BLOCK, len(good), BLOCK))]
     blocks = [rows for rows in blocks if len(rows) > BLOCK // 2]
-    gravity = [left[rows] @ weight[rows] / (weight[rows] @ weight[rows]) for rows in blocks]
+    gravity = [needed[rows] @ weight[rows] / (weight[rows] @ weight[rows]) for rows in blocks]
     return np.array(gravity), np.array([energy[rows].mean() for rows in blocks])
 
 
-def _doubting(residual: Array) -> Array:
-    """Weights by which frames in the air, or in a hand, count less."""
+def _robust_weights(residual: Array) -> Array:
+    """Cauchy weights (n,), small for outliers."""
     return np.asarray(1 / (1 + (residual / (2 * np.median(np.abs(residual)) + 1e-9)) ** 2))
 
 
 def another_plane(trajectory: Trajectory, boards: Boards | None = None) -> tuple[Finding, ...]:
-    """Whether the rim rolls on a plane far from z = 0: the board of the table view did not lie on the table."""
+    """Whether the rim rolls on a plane tilted against z = 0: the board of the table view did not lie on the table."""
     rows, disc = trajectory.measured, trajectory.disc
     centre, e3 = trajectory.q[rows, :3], rotation_from_quaternion(trajectory.quaternion[rows])[:, :, 2]
     if len(centre) < BLOCK:
         return ()
     start = normal = e3.mean(axis=0) / np.linalg.norm(e3.mean(axis=0))  # it precesses about the normal
     weight = np.ones(len(centre))
-    for _ in range(10):  # lowest points as seen from the plane through the last ones
+    for _ in range(10):  # lowest points with respect to the normal of the plane through the previous ones
         lowest = centre + lowest_arm(e3, normal, disc)
         middle = weight @ lowest / weight.sum()
         normal = np.linalg.svd(np.sqrt(weight)[:, None] * (lowest - middle), full_matrices=False)[2][2]
         normal = normal * np.sign(normal @ start)
         gap = (lowest - middle) @ normal
-        weight = _doubting(gap)
+        weight = _robust_weights(gap)
     side, ahead = np.linalg.svd(normal[None])[2][1:] @ e3.T
     turned, precessed = np.arccos(np.clip(normal[2], -1, 1)), np.ptp(np.unwrap(np.arctan2(ahead, side)))
     rolls = precessed > 2.0 and np.median(e3 @ normal) < np.cos(THETA_RANGE[0])
@@ -406,22 +406,22 @@ def another_plane(trajectory: Trajectory, boards: Boards | None = None) -> tuple
         f"{np.degrees(turned):.1f} deg from that of its board"
     )
     action = "name the view in which the board lies flat on the table" if lies is None else ""
-    told = ["" if view is None else str(view) for view in (lies, declared)]
-    remedy = Remedy("[table] view", told[0], told[1], action)
+    fits, named = ("" if view is None else str(view) for view in (lies, declared))
+    remedy = Remedy("[table] view", fits, named, action)
     of = Subject(view=declared)
     return (Finding(Kind.TABLE_VIEW, Severity.DOUBT, text, of, remedies=(remedy,), explains=OFF),)
 
 
 def lowest_arm(e3: Array, normal: Array, disc: Disc) -> Array:
-    """From the centre to the disc's lowest points against a normal (n, 3) [m], by the axis e3 (n, 3)."""
+    """Vectors (n, 3) [m] from the centre to the lowest point of the disc with respect to a normal; e3 : (n, 3)."""
     cosine = (e3 @ normal)[:, None]
-    down = cosine * e3 - normal  # in the disc's plane
+    down = cosine * e3 - normal  # in the plane of the disc
     along = disc.radius * down / np.linalg.norm(down, axis=1, keepdims=True)
     return np.asarray(along - disc.half_thickness * np.sign(cosine) * e3)
 
 
 def _view_on_plane(rig: StereoRig, boards: Boards, normal: Array, middle: Array) -> int | None:
-    """The view whose board lies on the plane in the world; None where none does."""
+    """The view whose board lies on this plane of the world frame; None if there is none."""
     found = []
     for view, (R_left_board, t_left_board) in boards.places.items():
         axis = rig.R_left_world.T @ R_left_board[:, 2]
@@ -433,11 +433,11 @@ def _view_on_plane(rig: StereoRig, boards: Boards, normal: Array, middle: Array)
 
 
 def rise_of_centre(trajectory: Trajectory) -> tuple[Finding, ...]:
-    """The radius from height against sin(theta), where the nutation varies enough."""
+    """The radius from the slope of height over sin(theta), if the nutation varies enough."""
     q = trajectory.q[trajectory.measured]
     theta, disc = q[:, 4], trajectory.disc
     q = q[(theta > THETA_RANGE[0]) & (theta < THETA_RANGE[1])]
-    # rolling round a table that leans, a disc of steady nutation seems to swing by twice as much
+    # on a tilted table, a disc of steady nutation seems to oscillate by twice the tilt
     if len(q) < BLOCK or np.ptp(np.sin(q[:, 4])) < 2 * MIN_LEAN:
         return ()
     s = np.sin(q[:, 4])
@@ -456,10 +456,9 @@ def rise_of_centre(trajectory: Trajectory) -> tuple[Finding, ...]:
 
 
 def handedness(rig: StereoRig, disc: Disc) -> tuple[Finding, ...]:
-    """Whether the left camera stands on the left as both look at the table, where the dots do not tell left from right.
+    """Whether the left camera is on the left in viewing direction, if the dots do not reveal a mirrored world.
 
-    In a mirrored world it stands on the right. No verdict where the cameras stand one behind the other, or face each
-    other.
+    In a mirrored world it is on the right. No verdict if one camera is behind the other, or they face each other.
     """
     if not has_mirror_axis(disc):
         return ()  # the dots would not have been found
@@ -482,7 +481,7 @@ def handedness(rig: StereoRig, disc: Disc) -> tuple[Finding, ...]:
 
 
 def scale_of_dots(trajectory: Trajectory, declared: Disc, square: float | None = None) -> tuple[Finding, ...]:
-    """Distances of the dots, by both cameras alone, over those of their declared centres."""
+    """Ratio of the triangulated distances of the dots to those of their declared centres."""
     rows = np.flatnonzero(trajectory.measured)
     rows = rows[evenly(len(rows), 50)]
     good = (trajectory.marker_status[rows] == MarkerStatus.MEASURED).all(axis=1)
@@ -490,23 +489,23 @@ def scale_of_dots(trajectory: Trajectory, declared: Disc, square: float | None =
     n, _, dots, _ = pixels.shape
     contradicted = trajectory.frame_status == FrameStatus.CONTRADICTED
     if not np.isfinite(pixels).any() or contradicted.sum() > trajectory.measured.sum():
-        return ()  # cameras that do not fit together tell no size
-    rig = replace(trajectory.rig, lens_field=None)  # the trajectory's points are without it already
+        return ()  # inconsistent cameras determine no size
+    rig = replace(trajectory.rig, lens_field=None)  # the pixels of the trajectory are already corrected for it
     seen = triangulate(pixels.swapaxes(0, 1).reshape(2, n * dots, 2), rig).reshape(n, dots, 3)
     ratio = np.array([pdist(places) for places in seen]) / pdist(declared.marker_centres_body)
     per_pair = np.array([np.median(r[np.isfinite(r)]) for r in ratio.T if np.isfinite(r).sum() >= min(5, n)])
     if len(per_pair) < MIN_BLOCKS:
         return ()
     typical = _typical(per_pair)
-    # pairs of dots share dots: as many are independent as there are dots
+    # pairs share dots: there are only as many independent distances as dots
     scale = replace(typical, sigma=max(typical.sigma * np.sqrt(len(per_pair) / dots), 1e-4))
     return (other_scale(scale, square),) if _beyond(scale, 1.0, SCALE) else ()
 
 
 def other_scale(scale: Measured, square: float | None = None, explains: tuple[Kind, ...] = BY_SCALE) -> Finding:
-    """Dots that are so many times as far apart as declared. square : [m] of the board as declared"""
+    """Distances of the dots differ from the declared ones by this factor. square : [m] of the board as declared"""
     factor, off = scale.value, _apart(scale.value, 1.0)
-    uncertain = max(3 * scale.sigma / factor, 0.01 * min(off, 1.0))  # no template fits dots that are far from declared
+    uncertain = max(3 * scale.sigma / factor, 0.01 * min(off, 1.0))  # templates do not fit dots far from declared
     digits, mixed = 1 + int(np.log10(factor / scale.sigma)), ""
     for unit, words in UNITS.items():
         if abs(off / np.log(unit) - 1) < 0.02:
@@ -525,13 +524,13 @@ def other_scale(scale: Measured, square: float | None = None, explains: tuple[Ki
 
 
 def unseen_dots(trajectory: Trajectory, declared: Disc) -> Iterator[Finding]:
-    """Dots that are hardly ever measured: declared in the wrong place, or not as printed."""
+    """Dots that are hardly ever measured: their declared position is wrong, or they are printed differently."""
     status = trajectory.marker_status[trajectory.measured]
     if not len(status):
         return
     share = np.mean(status == MarkerStatus.MEASURED, axis=0).max(axis=0)
     rest = replace(declared, marker_centres_body=declared.marker_centres_body[share >= SEEN_RARELY])
-    # three dots fit nearly anything; those of a symmetric layout do not tell how far the disc has turned
+    # three dots fit nearly anything; a symmetric layout does not determine the rotation of the disc
     spoils = rest.n_markers < 4 or symmetry_order(rest) > symmetry_order(declared)
     for dot in np.flatnonzero(share < SEEN_RARELY) if (share > 0.5).sum() >= 3 else ():
         kinds, counts = np.unique(status[:, :, dot], return_counts=True)
@@ -547,7 +546,7 @@ def unseen_dots(trajectory: Trajectory, declared: Disc) -> Iterator[Finding]:
 
 
 def turned_board(inner_corners: Sequence[int]) -> tuple[Finding, ...]:
-    """Corners counted along the short side first turn the axes of the table by 90 deg."""
+    """Corners counted along the short side first rotate the axes of the table by 90 deg."""
     first, second = inner_corners
     if first >= second:
         return ()

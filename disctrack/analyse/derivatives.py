@@ -1,9 +1,9 @@
 """From poses to velocities and accelerations, with their covariance.
 
 Position is differentiated in R^3. Rotation is differentiated on its own manifold: relative to the pose of the frame in
-question, M_k = R_k R_i^T, the vector s_k = vee((M_k - M_k^T) / 2) is the rotation vector to second order, a linear
-function of R_k, regular at every angle; at frame i its first two derivatives are the angular velocity and the angular
-acceleration in world axes. Euler rates are then read off the angular velocity, never off the Euler angles.
+question, M_k = R_k R_i^T, the vector s_k = vee((M_k - M_k^T) / 2) is the rotation vector to second order, linear in
+R_k and regular at every angle; at frame i its first two derivatives are the angular velocity and the angular
+acceleration in world axes. Euler rates follow from the angular velocity, not from differences of Euler angles.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ K = np.array([0.0, 0.0, 1.0])
 VECTORS = ("position", "rotation", "velocity", "omega", "acceleration", "alpha")
 STATE = tuple(f"{vector}_{axis}" for vector in VECTORS for axis in "xyz")
 N_STATE = len(STATE)  # 18
-# Of POSE_COMPONENTS, those of unlike spectra, which light and view make scatter in a way of their own
+# POSE_COMPONENTS by groups, which differ in spectrum and noise
 CHANNELS = {"horizontal position": [0, 1], "height": [2], "tilt": [3, 4], "turn about the vertical": [5]}
-MIN_FRAMES = 12  # a line and a curvature per channel, and enough left over to judge the noise
-# Of the image's longer side: what repeats is as smooth as half a cell of the splines that have taken out the lens
+MIN_FRAMES = 12  # a line and a curvature per channel, and enough degrees of freedom to estimate the noise
+# Of the longer side of the image: systematic errors are as smooth as half a cell of the splines that correct the lens
 SYSTEMATIC_LENGTH = 0.1
-KNOWN_FRACTION = 0.25  # of the process' own variance of the first derivative: above it the samples say too little
+KNOWN_FRACTION = 0.25  # of the prior variance of the first derivative: above, the samples do not determine it
 
 
 @dataclass(frozen=True, repr=False)
@@ -68,7 +68,7 @@ class MotionState(Brief):
         return e1, e2, e3
 
     def displaced(self, step: Array) -> MotionState:
-        """After a small change (18,) in the order of STATE."""
+        """The state after a small change (18,) in the order of STATE."""
         shift, turn, *changes = step.reshape(6, 3)
         rates = (self.velocity, self.omega_world, self.acceleration, self.alpha_world)
         changed = (rate + change for rate, change in zip(rates, changes, strict=True))
@@ -77,20 +77,20 @@ class MotionState(Brief):
 
 @dataclass(frozen=True, repr=False)
 class MeasuredMotion(MotionState):
-    """Pose and its first two derivatives in every frame; NaN where the samples do not determine them."""
+    """Pose and its first two derivatives in every frame; NaN if the samples do not determine them."""
 
     time: Array  # (n,) [s]
     covariance: Array  # (n, 18, 18) in the order of STATE, from the noise of the poses; rotation as in frames.py
     calibration_sensitivity: Array  # (n, 18, 30) d STATE / d RIG_PARAMETERS, common to all frames
-    measured: Mask  # (n,) False where the frame was bridged
+    measured: Mask  # (n,) False if the frame was bridged
     euler: Array  # (n, 3) psi, theta, phi [rad], unwrapped
-    length: Array  # (n, 4) length of the process per group [s]
-    noise_scale: Array  # (4,) variance found in the data over variance stated, per group
+    length: Array  # (n, 4) length scale l of the process per group [s]
+    noise_scale: Array  # (4,) estimated over stated variance of the noise, per group
     disc: Disc
     gravity: float  # [m/s^2]
     rig_covariance: Array  # (30, 30)
-    systematic_covariance: Array  # (n, 6, 6) of the pose: what repeats beside the noise and is not the rig's
-    systematic_pace: float  # [1/s] of its change: the dots' speed in the image over SYSTEMATIC_LENGTH
+    systematic_covariance: Array  # (n, 6, 6) of the pose: correlated errors that are neither noise nor of the rig
+    systematic_pace: float  # [1/s] rate of their change: speed of the dots in the image over SYSTEMATIC_LENGTH
 
     def __len__(self) -> int:
         return len(self.time)
@@ -102,13 +102,13 @@ class MeasuredMotion(MotionState):
 
     @property
     def known(self) -> Mask:
-        """(n,) True where the motion is a number."""
+        """(n,) True if the motion is determined."""
         return np.asarray(np.isfinite(self.omega_world).all(axis=1))
 
     def systematic_at(self, frames: NDArray[np.int64]) -> Array:
-        """(f, 18, 18) covariance of STATE by what repeats, as of a stationary error that changes at its pace w:
+        """(f, 18, 18) covariance of STATE by systematic errors, stationary with a squared-exponential covariance.
 
-        of itself S, of its rate w^2 S, of that one's rate 3 w^4 S, and -w^2 S between the first and the last.
+        With their pace w: S of the pose, w^2 S of its rate, 3 w^4 S of its second derivative, -w^2 S between both.
         """
         S, w2 = self.systematic_covariance[frames], self.systematic_pace**2
         C = np.zeros((len(frames), N_STATE, N_STATE))
@@ -123,10 +123,9 @@ class MeasuredMotion(MotionState):
 def differentiate(trajectory: Trajectory, breaks: Sequence[float] = ()) -> MeasuredMotion:
     """Velocities and accelerations of a measured trajectory.
 
-    breaks : instants [s] at which the acceleration jumps (slip ends, something is hit); before and after are
-    differentiated apart, with the larger sigmas that ends have. A break that leaves fewer than MIN_FRAMES poses on a
-    side is passed over.
-    Raises AnalysisError when too few frames have a pose, or time does not increase.
+    breaks : instants [s] at which the acceleration jumps (end of slip, impact); both sides are differentiated
+    separately, with the larger sigmas of ends. A break with fewer than MIN_FRAMES poses on a side is ignored.
+    Raises AnalysisError if too few frames have a pose, or time does not increase.
 
         >>> motion = differentiate("clip/results/trajectory.h5")
         >>> motion.velocity.shape
@@ -162,7 +161,7 @@ def differentiate(trajectory: Trajectory, breaks: Sequence[float] = ()) -> Measu
 
 
 def _between(breaks: Sequence[float], time: Array, good: Mask) -> list[slice]:
-    """The rows between the breaks that leave poses enough on both sides."""
+    """The rows between the breaks that have enough poses on both sides."""
     starts = [0]
     for row in np.searchsorted(time, sorted(breaks)):
         if min(good[starts[-1] : row].sum(), good[row:].sum()) >= MIN_FRAMES:
@@ -171,7 +170,7 @@ def _between(breaks: Sequence[float], time: Array, good: Mask) -> list[slice]:
 
 
 def _differentiated(trajectory: Trajectory, good: Mask) -> tuple[Array, ...]:
-    """Of frames without a break: state (n, 3 orders, 6), R, Euler angles, covariance, sensitivity, length, noise scale.
+    """Without breaks: state (n, 3 orders, 6), R, Euler angles, covariance, sensitivity, length, noise scale.
 
     good : (n,) frames with a pose
     """
@@ -182,7 +181,7 @@ def _differentiated(trajectory: Trajectory, good: Mask) -> tuple[Array, ...]:
     length, amplitude2, noise_scale = map(np.array, zip(*processes, strict=True))  # (4, n), (4, n), (4,)
     scale = np.sqrt(np.repeat(noise_scale, [len(channels) for channels in CHANNELS.values()]))
     samples.covariance *= np.outer(scale, scale)
-    # some frames at a time: the windows of all at once would be larger than all the rest
+    # in parts, to limit the memory for the windows
     parts = np.split(np.arange(len(good)), range(SEGMENT, len(good), SEGMENT))
     found = (_smoothed(samples, length, amplitude2, rows) for rows in parts)
     state, R, covariance, sensitivity = map(np.concatenate, zip(*found, strict=True))
@@ -197,7 +196,7 @@ def _differentiated(trajectory: Trajectory, good: Mask) -> tuple[Array, ...]:
 
 
 def _filled(matrices: Array, good: Mask, otherwise: float) -> Array:
-    """(n, k, l) with that of the nearest good frame where there is none; a number where none is known."""
+    """(n, k, l) with missing matrices replaced by those of the nearest good frame, or by a number if there is none."""
     known = np.flatnonzero(good & np.isfinite(matrices).all(axis=(1, 2)))
     if not known.size:
         return np.full_like(matrices, otherwise)
@@ -206,7 +205,7 @@ def _filled(matrices: Array, good: Mask, otherwise: float) -> Array:
 
 
 def _pace(trajectory: Trajectory) -> float:
-    """[1/s] at which errors that depend on the place in the image change, the dots' rms over the recording."""
+    """[1/s] rate of change of errors that depend on the position in the image: rms of all dots and frames."""
     with np.errstate(invalid="ignore"):
         step = np.diff(trajectory.markers_px, axis=0) / np.diff(trajectory.time)[:, None, None, None]
     if not np.isfinite(step).any():
@@ -216,10 +215,10 @@ def _pace(trajectory: Trajectory) -> float:
 
 
 class _Samples:
-    """What is differentiated; time in frame intervals."""
+    """Poses to be differentiated; time in frame intervals."""
 
     def __init__(self, trajectory: Trajectory, good: Mask) -> None:
-        """Of frames (n,) with a pose: in gaps rotations are those of the nearest frame, without weight."""
+        """Good : (n,) frames with a pose; in gaps, rotations of the nearest frame are placeholders without weight."""
         time = np.asarray(trajectory.time, float)
         self.interval = float(np.median(np.diff(time)))  # [s]
         self.ticks = (time - time[0]) / self.interval
@@ -227,7 +226,7 @@ class _Samples:
         self.position = np.where(good[:, None], trajectory.q[:, :3], 0.0)
         self.R = _filled(rotation_from_quaternion(trajectory.quaternion), good, np.nan)
         self.covariance = np.where(good[:, None, None], trajectory.pose_covariance, 0.0)
-        # a pose from one camera depends on the rig in another way, and the jump must not be differentiated
+        # a pose from one camera depends differently on the rig; that jump must not be differentiated
         by_both = good & (trajectory.frame_status == FrameStatus.MEASURED)
         self.sensitivity = _filled(trajectory.calibration_sensitivity, by_both, np.nan)
 
@@ -247,7 +246,7 @@ def _require_samples(time: Array, good: Mask) -> None:
 
 
 def _segments(samples: _Samples) -> tuple[list[tuple[Array, Array, Array]], Array]:
-    """Overlapping segments (times, data, variance), and the middles that they stand for."""
+    """Overlapping segments (times, data, variance), and their centres."""
     n = len(samples.ticks)
     starts = np.arange(0, max(1, n - SEGMENT // 2), SEGMENT // 2)
     segments, centres = [], []
@@ -288,8 +287,8 @@ def _smoothed(
 ) -> tuple[Array, Array, Array, Array]:
     """Some frames: state (k, 3 orders, 6), R (k, 3, 3), covariance (k, 18, 18), sensitivity (k, 18, 30), per interval.
 
-    By weights (k, 6, 3, w) of the samples round them, and what these leave open (k, 6, 3, 3). NaN in a gap where that
-    is more than KNOWN_FRACTION of the slope's own variance.
+    From weights (k, 6, 3, w) of the samples in their windows; the remaining prior covariance (k, 6, 3, 3) is added. NaN
+    in a gap if this exceeds KNOWN_FRACTION of the prior variance of the slope.
     length, amplitude2 : (4, n) of the groups' processes
     """
     k, half = len(rows), int(np.ceil(HALF_WINDOW_LENGTHS * length.max()))
@@ -303,7 +302,7 @@ def _smoothed(
         unknown |= ~np.isfinite(open_fraction) | (~samples.good[rows] & (open_fraction > KNOWN_FRACTION))
     window = np.clip(rows[:, None] + np.arange(-half, half + 1), 0, len(samples.ticks) - 1)
     R = samples.R[rows]
-    for _ in range(2):  # the second time relative to the smoothed pose itself, where s and the rotation vector agree
+    for _ in range(2):  # the second time relative to the smoothed pose, at which s is the rotation vector
         s, _ = _sine_vectors(samples.R[window], R[:, None])
         R = rotation_from_vector(np.einsum("kcw,kwc->kc", weights[:, 3:, 0], s)) @ R
     s, gain = _sine_vectors(samples.R[window], R[:, None])
@@ -325,7 +324,7 @@ def _smoothed(
 
 
 def _rates_of_turned_frame(sensitivity: Array, omega_world: Array, alpha_world: Array) -> None:
-    """Complete, in place, d omega and d alpha for a rotation error delta(t) that turns the frame: R' = exp(delta) R.
+    """Complete d omega and d alpha, in place, for a rotation error delta(t) of the frame: R' = exp(delta) R.
 
     omega' = omega + delta' + delta x omega,  alpha' = alpha + delta'' + delta' x omega + delta x alpha.
     """

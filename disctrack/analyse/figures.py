@@ -1,4 +1,4 @@
-"""Figures of an analysis in the manner of the paper's figures 4 to 16, drawn from this recording."""
+"""Figures of an analysis, as figures 4 to 16 of the paper."""
 
 from collections.abc import Iterator
 
@@ -13,27 +13,27 @@ from disctrack.report.figures import Curve, Drawn, chart
 from disctrack.report.palette import AMBER, BLUE, GREEN, INK, MUTED, RED
 
 TIME, X, Y = "time (s)", "x (mm)", "y (mm)"
-SQUARE = (5.4, 4.8)  # [in] of what lies in a plane
+SQUARE = (5.4, 4.8)  # [in] of figures in a plane
 
 
 def all_figures(analysis: Analysis) -> tuple[Drawn, ...]:
-    """Every figure that this recording has something to show in."""
+    """Every figure for which this recording has data."""
     drawn = [*path_of_centre(analysis)]
-    if np.isfinite(analysis.series("psidot").value).sum() > 1:  # else no direction of the tilt is known anywhere
+    if np.isfinite(analysis.series("psidot").value).sum() > 1:  # else the direction of the tilt is unknown throughout
         drawn += [path_of_contact(analysis), *rates(analysis), *contact(analysis), *energy(analysis)]
     drawn += [*nutation_count(analysis), *contact_locus(analysis), *power_laws(analysis)]
     return tuple(sorted(drawn, key=lambda figure: figure.name))
 
 
 def _series(analysis: Analysis, name: str, colour: str, label: str = "", scale: float = 1.0) -> Curve:
-    """A derived quantity over time with its band, noise and calibration together."""
+    """A derived quantity over time with a band from noise and calibration."""
     series = analysis.series(name)
     sigma = np.hypot(series.sigma, series.sigma_calibration)
     return Curve(analysis.motion.time, scale * series.value, colour, label, sigma=scale * sigma)
 
 
 def _level(time: Array, value: float, colour: str = MUTED, label: str = "", style: str = "-") -> Curve:
-    """A level to compare with."""
+    """A constant level for comparison."""
     return Curve(time[[0, -1]], np.full(2, value), colour, label, style)
 
 
@@ -91,7 +91,7 @@ def nutation_count(analysis: Analysis) -> Iterator[Drawn]:
 
 
 def contact(analysis: Analysis) -> Iterator[Drawn]:
-    """Slip with a confidence in place of the threshold by eye of the paper's figure 8, and the forces of the table."""
+    """Paper's figure 8, slip, with a confidence interval of the onset instead of a threshold; forces of the table."""
     time, onset = analysis.motion.time, analysis.onset
     n, m = analysis.series("slip_n"), analysis.series("slip_m")
     sigma = np.sqrt(n.sigma**2 + m.sigma**2 + n.sigma_calibration**2 + m.sigma_calibration**2)
@@ -104,7 +104,7 @@ def contact(analysis: Analysis) -> Iterator[Drawn]:
         axes.legend(frameon=False, fontsize=9, loc="upper right")
     path = measured(onset.slip_distance, onset.slip_distance_sigma, "m")
     caption = (
-        f"Speed of the disc's own point at the contact. The disc {onset.verdict} (probability of rolling at the end: "
+        f"Speed of the material point at the contact. The disc {onset.verdict} (probability of rolling at the end: "
         f"{onset.probability:.3f}){f'; path of slip {path}' if onset.slip_distance > 0 else ''}."
     )
     yield Drawn("08_slip", "Slip at the contact", caption, figure)
@@ -148,7 +148,7 @@ def rates(analysis: Analysis) -> Iterator[Drawn]:
     time, sigma = analysis.motion.time, analysis.series("psidot").sigma
     figure = chart(TIME, ("precession rate (rad/s)", [_series(analysis, "psidot", BLUE)]))
     caption = (
-        f"Read off the angular velocity, band ± 3 σ. σ grows as 1 / sin θ: from {np.nanmin(sigma):.3f} to "
+        f"From the angular velocity, band ± 3 σ. σ grows as 1 / sin θ: from {np.nanmin(sigma):.3f} to "
         f"{np.nanmax(sigma):.3f} rad/s."
     )
     yield Drawn("10_precession_rate", "Precession rate", caption, figure)
@@ -169,7 +169,7 @@ def rates(analysis: Analysis) -> Iterator[Drawn]:
 
 
 def energy(analysis: Analysis) -> Iterator[Drawn]:
-    """Paper's figure 13; where the energy sits, and the power lost."""
+    """Paper's figure 13; parts of the energy, and the power."""
     time = analysis.motion.time
     level = Curve(time, 1e3 * analysis.series("adiabatic").value, RED, "3/2 m g r sin θ", "--")
     total = _series(analysis, "total", BLUE, "mechanical energy", 1e3)
@@ -186,14 +186,14 @@ def energy(analysis: Analysis) -> Iterator[Drawn]:
     above = [Curve(time, 1e3 * analysis.series(name).value, colour, label) for name, colour, label in parts]
     below = [_series(analysis, "power", BLUE, scale=1e3), _level(time, 0.0)]
     figure = chart(TIME, ("energy (mJ)", above), ("dE/dt (mW)", below), size=(7.2, 5.0), heights=(3, 2))
-    caption = "Where the energy sits (above), and the rate at which the sum changes (below, band ± 3 σ)."
+    caption = "Parts of the energy (above), and the rate of change of their sum (below, band ± 3 σ)."
     yield Drawn("13b_energy_parts", "Parts of the energy and power", caption, figure)
 
 
 def power_laws(analysis: Analysis) -> Iterator[Drawn]:
-    """Paper's figures 14 to 16: energy, nutation, precession rate against the time left, with the models' slopes."""
+    """Paper's figures 14 to 16: energy, nutation, precession rate over the time to collapse, with model slopes."""
     laws = analysis.laws
-    left, ends = laws.t_f - analysis.motion.time, np.log(np.array(laws.window))
+    to_collapse, ends = laws.t_f - analysis.motion.time, np.log(np.array(laws.window))
     total, theta, psidot = analysis.series("total").value, analysis.motion.euler[:, 1], analysis.series("psidot").value
     drawn = (
         ("14_energy_law", "the energy", total, laws.n_energy, 1.0, "ln E, E in J"),
@@ -202,14 +202,14 @@ def power_laws(analysis: Analysis) -> Iterator[Drawn]:
     )  # fmt: skip
     for name, title, value, exponent, of_theta, label in drawn:
         with np.errstate(invalid="ignore"):
-            shown = (left > 0) & (value > 0)
+            shown = (to_collapse > 0) & (value > 0)
         if not np.isfinite(exponent.value) or shown.sum() < 2:
             continue
-        ln_left, ln_value = np.log(left[shown]), np.log(value[shown])
-        fitted = (ends.min() <= ln_left) & (ln_left <= ends.max())
-        line = np.mean((ln_value - exponent.value * ln_left)[fitted]) + exponent.value * ends
+        ln_time, ln_value = np.log(to_collapse[shown]), np.log(value[shown])
+        fitted = (ends.min() <= ln_time) & (ln_time <= ends.max())
+        line = np.mean((ln_value - exponent.value * ln_time)[fitted]) + exponent.value * ends
         said = f"fit, {measured(exponent.value, exponent.half)} (95 %)"
-        curves = [Curve(ln_left, ln_value, BLUE, "measured", "."), Curve(ends, line, RED, said)]
+        curves = [Curve(ln_time, ln_value, BLUE, "measured", "."), Curve(ends, line, RED, said)]
         for (_, n), style in zip(MODEL_EXPONENTS, (":", "--", "-.", "-"), strict=True):
             slope = of_theta * n
             below = line.mean() - 0.35 * np.sign(of_theta)

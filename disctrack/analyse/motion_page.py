@@ -1,7 +1,7 @@
-"""The motion to play with: one HTML file that needs neither server nor network.
+"""Interactive page of the motion: one HTML file that needs neither server nor network.
 
-Disc in 3-D with the path of its contact, camera pictures with the fit drawn on them, nutation, precession rate and
-energy with a common cursor, and the residuals of the frame under it. The drawing is in `report/motion.js`.
+Disc in 3-D with the path of its contact, camera images with the fit, nutation, precession rate and energy with a common
+cursor, and the residuals of the frame at the cursor. `report/motion.js` draws it.
 """
 
 import base64
@@ -30,7 +30,7 @@ MOST_PICTURES = 80
 
 
 def motion_html(analysis: Analysis, name: str, drawn: Drawn | None = None) -> str:
-    """The whole page. drawn : gives the picture of a frame, where the images are at hand"""
+    """The whole page. drawn : returns the picture of a frame, if the images are available"""
     content = page_data(analysis, drawn)
     data = json.dumps(content, separators=(",", ":")).replace("</", "<\\/")
     script = files("disctrack.report").joinpath("motion.js").read_text(encoding="utf-8")
@@ -64,7 +64,7 @@ def motion_html(analysis: Analysis, name: str, drawn: Drawn | None = None) -> st
 
 
 def page_data(analysis: Analysis, drawn: Drawn | None = None) -> dict[str, Any]:
-    """What the page draws, of JSON's types; lengths in mm, angles in degrees, None where nothing is known."""
+    """Data of the page in types of JSON; lengths in mm, angles in degrees, None if unknown."""
     trajectory = analysis.trajectory
     rows = np.arange(0, len(trajectory), _stride(trajectory))
     energy, psidot = analysis.series("total"), analysis.series("psidot")

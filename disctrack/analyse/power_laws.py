@@ -1,9 +1,9 @@
-"""Scaling laws of the last stage: theta, psidot and energy as powers of the time that is left.
+"""Scaling laws of the last stage: theta, psidot and energy as powers of the time to collapse.
 
-theta(t) = C (t_f - t)^n_theta exp(oscillation), psidot and the energy alike. The instant t_f of collapse is a parameter
-of the fit, shared by theta and psidot: 5 ms in it move n_theta by 0.026. The nutation, 5 to 40 % of theta, is part of
-the model, as harmonics of a phase that follows the precession angle; it would otherwise enter the exponents through
-the phases at which the window happens to begin and end.
+theta(t) = C (t_f - t)^n_theta exp(oscillation), similarly psidot and the energy. The instant t_f of collapse is fitted,
+common to theta and psidot: a change of 5 ms moves n_theta by 0.026. The nutation oscillation, 5 to 40 % of theta, is
+modelled by harmonics of a phase proportional to the precession angle. Otherwise it would bias the exponents, depending
+on its phase at both ends of the window.
 """
 
 from __future__ import annotations
@@ -25,21 +25,21 @@ from disctrack.disc import Disc, nutation_frequency, precession_rate
 from disctrack.errors import ModelError
 from disctrack.numbers import Measured
 
-# (name, n_theta): the power lost goes with theta^a on slow steady precession, n_theta = 1 / (1 - a), n_E = n_theta,
-# n_psidot = -n_theta / 2
+# (name, n_theta): in slow steady precession the dissipated power is proportional to theta^a, n_theta = 1 / (1 - a),
+# n_E = n_theta, n_psidot = -n_theta / 2
 MODEL_EXPONENTS = (
     ("Moffatt 2000, shear of the air layer", 1 / 3),
     ("Bildsten 2002, boundary layer of the air", 4 / 9),
     ("Leine 2009, viscous friction along the contour", 1 / 2),
     ("Ma et al. 2014, rolling moment with psidot squared", 2 / 3),
 )
-WINDOW = 0.5  # [s] before t_f, as for the paper's table 2
+WINDOW = 0.5  # [s] before t_f, as in table 2 of the paper
 MIN_PERIODS = 5  # of nutation, in a window
-MAX_TF_SIGMA = 0.3  # of t_f, over the shortest time left
+MAX_TF_SIGMA = 0.3  # sigma of t_f over the shortest time to collapse
 RATIO_RANGE = (0.72, 0.95)  # nutation over precession frequency: thin disc 0.7746, 3 mm at 60 degrees 0.89
 HARMONICS = ((1, 3), (2, 2))  # (harmonic, terms of its amplitude in a polynomial of the phase)
-BRAKE_DROP = 0.05  # relative fall of psidot below its peak that is taken for the brake at the very end
-BRAKE_MARGIN = 0.01  # [s] left out before that peak
+BRAKE_DROP = 0.05  # relative decrease of psidot below its peak that indicates braking at the very end
+BRAKE_MARGIN = 0.01  # [s] excluded before that peak
 
 
 NAN = float("nan")
@@ -63,16 +63,16 @@ class Exponent(Measured):
         return self.value + self.half
 
     def agrees_with(self, other: float) -> bool:
-        """True when `other` lies inside the confidence interval."""
+        """True if `other` is inside the confidence interval."""
         return self.low <= other <= self.high
 
 
 @dataclass(frozen=True, repr=False)
 class PowerLaws(Brief):
-    """Exponents over one window; NaN with a reason where the data do not determine them."""
+    """Exponents over one window; NaN with a reason if the data do not determine them."""
 
-    reason: Annotated[str, "reason_undetermined"] = ""  # empty when determined
-    # [s] longest and shortest time left, t_f - t
+    reason: Annotated[str, "reason_undetermined"] = ""  # empty if determined
+    # [s] longest and shortest time to collapse, t_f - t
     window: Annotated[tuple[float, float], "window_s"] = (NAN, NAN)
     n_periods: float = NAN  # of nutation in the window
     t_f: Annotated[float, "t_f_s"] = NAN  # [s]
@@ -80,11 +80,11 @@ class PowerLaws(Brief):
     n_theta: Exponent = Exponent()
     n_psidot: Exponent = Exponent()
     n_energy: Exponent = Exponent()
-    n_theta_per_t_f: float = NAN  # [1/s] change of n_theta for a given change of t_f
+    n_theta_per_t_f: float = NAN  # [1/s] d n_theta / d t_f
 
     @property
     def determined(self) -> bool:
-        """True when the exponents are numbers."""
+        """True if the exponents are numbers."""
         return not self.reason
 
 
@@ -96,7 +96,7 @@ class NutationCount:
     count: Array  # (n,) 0, 1, 2, ...
     slope: Annotated[float, "nutation_over_precession_counted"]  # NaN with fewer than 4 maxima
     sigma: Annotated[float, "nutation_over_precession_counted_sigma"]
-    # of small oscillations at the first and the last nutation of this disc
+    # for small oscillations at the first and the last nutation of this disc
     expected: Annotated[tuple[float, float], "nutation_over_precession_expected"]
 
 
@@ -106,9 +106,9 @@ def fit_power_laws(
     """Exponents over the last `window` seconds before t_f.
 
     time [s], psi [rad] unwrapped, theta [rad], psidot [rad/s], energy [J] : (n,), NaN where unknown
-    The energy's exponent is fitted at the t_f of theta and psidot, with that t_f's error carried over: an energy of
-    spin that remains at the end would pull at t_f. Confidence intervals come from the scatter of whole nutation
-    periods (cluster-robust covariance), so that neighbouring frames do not count as independent.
+    The exponent of the energy is fitted with t_f of theta and psidot, whose error is propagated: a spin energy that
+    remains at the end would bias t_f. Confidence intervals are from the scatter of whole nutation periods
+    (cluster-robust covariance), so that neighbouring frames do not count as independent.
     """
     usable = np.isfinite(psi) & (theta > 0) & (psidot > 0)
     end = power_law_end(time, psi, psidot) if usable.any() else np.inf
@@ -123,8 +123,8 @@ def fit_power_laws(
     for _ in range(4):
         chosen = usable & (fit.t_f - time <= window)
         if chosen.sum() < MIN_FRAMES:
-            still = fit.t_f - end
-            how_far = f"about {still:.2g} s" if still < 5 * np.ptp(time) else "long"
+            missing = fit.t_f - end
+            how_far = f"about {missing:.2g} s" if missing < 5 * np.ptp(time) else "long"
             return PowerLaws(
                 f"the recording ends {how_far} before collapse, outside the window of the last {window:g} s: record "
                 "closer to the end, or ask for a longer window"
@@ -136,13 +136,13 @@ def fit_power_laws(
 
 
 def power_law_end(time: Array, psi: Array, psidot: Array) -> float:
-    """Last instant [s] of the law: the end of the recording, or shortly before psidot breaks down.
+    """Last instant [s] of the law: the end of the recording, or shortly before psidot collapses.
 
-    At the very end a paper patch or the flat face touches the table and brakes the precession within 20 ms. What counts
-    is psidot averaged over a turn, so that the nutation does not look like a brake.
+    At the very end a paper patch or the flat face touches the table and brakes the precession within 20 ms. The
+    criterion is psidot averaged over a turn, so that the nutation does not count as braking.
     """
     known = np.flatnonzero(np.isfinite(psidot) & np.isfinite(psi))
-    turned = np.maximum.accumulate(psi[known])  # a disc that has stopped jitters
+    turned = np.maximum.accumulate(psi[known])  # the angle of a stopped disc only fluctuates
     before = np.interp(turned - 2 * np.pi, turned, time[known], left=np.nan)
     mean = 2 * np.pi / (time[known] - before)  # over the turn that ends here
     if not np.isfinite(mean).any():
@@ -155,14 +155,14 @@ def power_law_end(time: Array, psi: Array, psidot: Array) -> float:
 
 @dataclass(frozen=True)
 class _Fit:
-    """Variable projection: t_f and the nutation ratio outside, everything linear inside."""
+    """Variable projection: nonlinear parameters t_f and nutation ratio, all others linear."""
 
     time: Array
-    psi: Array  # without the nutation's own ripple
+    psi: Array  # without the oscillation by nutation
     data: Array  # (2, n) ln theta, ln psidot
     t_f: float
     ratio: float
-    scale: Array  # (2, 1) rms of each, its weight
+    scale: Array  # (2, 1) rms residual of each, for its weight
 
     @property
     def phase(self) -> Array:
@@ -184,40 +184,40 @@ class _Fit:
         return np.stack(columns, axis=1)
 
     def linear(self, data: Array) -> tuple[Array, Array]:
-        """Linear parameters (p, k) for data (k, n), and what they leave (k, n)."""
+        """Linear parameters (p, k) for data (k, n), and residuals (k, n)."""
         A = self.design()
         found = np.asarray(np.linalg.lstsq(A, data.T, rcond=None)[0], float)
         return found, data - (A @ found).T
 
-    def misfit(self) -> Array:
+    def residual(self) -> Array:
         """Weighted (2 n,)."""
         return np.asarray(self.linear(self.data)[1] / self.scale).ravel()
 
     def refined(self) -> _Fit:
-        """The likeliest t_f and ratio; weights by what they leave."""
-        shortest = self.time[-1]
-        left = max(self.t_f - shortest, 1e-4)
+        """The fit with optimal t_f and ratio, and weights from its residuals."""
+        end = self.time[-1]
+        to_collapse = max(self.t_f - end, 1e-4)
 
         def at(x: Array) -> _Fit:
-            return replace(self, t_f=float(shortest + left * np.exp(x[0])), ratio=float(x[1]))
+            return replace(self, t_f=float(end + to_collapse * np.exp(x[0])), ratio=float(x[1]))
 
         bounds = [-4.0, RATIO_RANGE[0]], [4.0, RATIO_RANGE[1]]
-        found = least_squares(lambda x: at(x).misfit(), [0.0, self.ratio], bounds=bounds, x_scale=[0.1, 0.01])
+        found = least_squares(lambda x: at(x).residual(), [0.0, self.ratio], bounds=bounds, x_scale=[0.1, 0.01])
         fit = at(found.x)
         rms = np.sqrt(np.mean(fit.linear(fit.data)[1] ** 2, axis=1, keepdims=True))
         return replace(fit, scale=np.maximum(rms, 1e-12))
 
 
 def _fitted(time: Array, psi: Array, data: Array, near: _Fit | None = None) -> _Fit:
-    """The fit to ln theta and ln psidot (2, n); near : one to other frames of the same motion."""
+    """The fit to ln theta and ln psidot (2, n); near : a fit to other frames, as initial guess."""
     span = np.ptp(time)
-    # the nutation's own ripple on psi would, in the phase, make the harmonics carry a part of the trend: a polynomial
-    # of this degree follows any power law over the window to 1e-3 rad, and no oscillation of MIN_PERIODS
-    left = np.log(time[-1] - time + 0.05 * span)
-    psi = Polynomial.fit(left, psi, 5)(left)
+    # psi oscillates with the nutation; in the phase, this would correlate the harmonics with the trend. A polynomial of
+    # this degree follows any power law over the window to 1e-3 rad, but no oscillation of MIN_PERIODS
+    ln_time = np.log(time[-1] - time + 0.05 * span)
+    psi = Polynomial.fit(ln_time, psi, 5)(ln_time)
 
     def best(tried: list[_Fit]) -> _Fit:
-        return min(tried, key=lambda fit: float(np.sum(fit.misfit() ** 2)))
+        return min(tried, key=lambda fit: float(np.sum(fit.residual() ** 2)))
 
     if near is None:
         ends = time[-1] + span * np.geomspace(2e-3, 3.0, 30)
@@ -230,7 +230,7 @@ def _fitted(time: Array, psi: Array, data: Array, near: _Fit | None = None) -> _
 
 
 def _judged(fit: _Fit, ln_energy: Array) -> PowerLaws:
-    """Exponents with their confidence, or why there are none. ln_energy : (1, n)"""
+    """Exponents with confidence intervals, or the reason why they are not determined. ln_energy : (1, n)"""
     longest, shortest = float(fit.t_f - fit.time[0]), float(fit.t_f - fit.time[-1])
     periods = float(np.ptp(fit.phase)) / (2 * np.pi)
     linear, sigma, t_f_sigma = _linear_with_sigma(fit)
@@ -251,9 +251,9 @@ def _judged(fit: _Fit, ln_energy: Array) -> PowerLaws:
 
     of_energy = Exponent()
     if np.isfinite(ln_energy).all():
-        found, left = fit.linear(ln_energy)
-        own = _clustered(fit.design()[None], left, fit.period)[1, 1]
-        of_energy = exponent(found[1, 0], np.sqrt(own + (_per_t_f(fit, ln_energy) * t_f_sigma) ** 2))
+        found, residual = fit.linear(ln_energy)
+        variance = _clustered(fit.design()[None], residual, fit.period)[1, 1]
+        of_energy = exponent(found[1, 0], np.sqrt(variance + (_per_t_f(fit, ln_energy) * t_f_sigma) ** 2))
     return PowerLaws(
         "",
         (longest, shortest),
@@ -269,7 +269,7 @@ def _judged(fit: _Fit, ln_energy: Array) -> PowerLaws:
 
 def _linear_with_sigma(fit: _Fit) -> tuple[Array, Array, float]:
     """Linear parameters (p, 2) of theta and psidot with their cluster-robust sigmas (2, p), and that of t_f."""
-    A, (linear, left) = fit.design(), fit.linear(fit.data)
+    A, (linear, residual) = fit.design(), fit.linear(fit.data)
     n, p = A.shape
     J = np.zeros((2, n, 2 * p + 2))
     for j in range(2):
@@ -277,16 +277,16 @@ def _linear_with_sigma(fit: _Fit) -> tuple[Array, Array, float]:
     for column, name in enumerate(("t_f", "ratio")):
         up, down = (replace(fit, **{name: getattr(fit, name) + d}).design() for d in (1e-6, -1e-6))
         J[:, :, 2 * p + column] = (((up - down) / 2e-6) @ linear).T / fit.scale
-    sigma = np.sqrt(np.diagonal(_clustered(J, left / fit.scale, fit.period)))
+    sigma = np.sqrt(np.diagonal(_clustered(J, residual / fit.scale, fit.period)))
     return linear, sigma[: 2 * p].reshape(2, p), float(sigma[2 * p])
 
 
 def _clustered(J: Array, residual: Array, cluster: NDArray[np.int64]) -> Array:
     """Covariance of the parameters from residuals that are correlated within clusters; J (k, n, p), residual (k, n).
 
-    Jackknife over the clusters, linearised: leaving out cluster g moves the parameters by
-    (J^T J)^-1 J_g^T (I - H_g)^-1 r_g, with H_g = J_g (J^T J)^-1 J_g^T. Without (I - H_g)^-1 a fit of many parameters to
-    few periods would look as good as its residuals.
+    Linearised jackknife over the clusters: without cluster g the parameters change by
+    (J^T J)^-1 J_g^T (I - H_g)^-1 r_g, with H_g = J_g (J^T J)^-1 J_g^T. The factor (I - H_g)^-1 corrects the residuals,
+    which are too small if many parameters are fitted to few periods.
     """
     bread = np.linalg.pinv(np.einsum("knp,knq->pq", J, J), rcond=1e-13)
     numbers = np.unique(cluster)
@@ -300,7 +300,7 @@ def _clustered(J: Array, residual: Array, cluster: NDArray[np.int64]) -> Array:
 
 
 def _per_t_f(fit: _Fit, data: Array) -> float:
-    """Change of the exponent of data (1, n) with t_f [1/s]."""
+    """Derivative of the exponent of data (1, n) with respect to t_f [1/s]."""
     step = 1e-3 * (fit.t_f - fit.time[-1])
     up, down = (replace(fit, t_f=fit.t_f + d).linear(data)[0][1, 0] for d in (step, -step))
     return float((up - down) / (2 * step))
@@ -309,7 +309,7 @@ def _per_t_f(fit: _Fit, data: Array) -> float:
 def count_nutation(psi: Array, theta: Array, theta_sigma: Array, disc: Disc) -> NutationCount:
     """Maxima of theta counted against turns of precession (paper's figure 7), with the slope of a straight line.
 
-    A maximum counts when it stands more than 6 sigma above its neighbourhood. The line's sigma comes from its scatter.
+    Maxima have a prominence of more than 6 sigma. The sigma of the slope is from the scatter about the line.
     """
     known = np.flatnonzero(np.isfinite(theta) & np.isfinite(psi))
     if known.size < 8:
@@ -336,8 +336,7 @@ def _parabola_top(x: Array, y: Array) -> float:
 def nutation_ratio(theta: float, disc: Disc) -> float:
     """Frequency of small nutations over that of the precession, about steady precession with the centre at rest.
 
-    sqrt(3/5) for a thin disc at small theta, eq. (2.15). Gravity sets the rates, not their ratio; NaN where a disc
-    cannot precess so.
+    sqrt(3/5) for a thin disc at small theta, eq. (2.15); independent of gravity. NaN if there is no such precession.
     """
     try:
         return nutation_frequency(theta, disc) / precession_rate(theta, disc)[0]

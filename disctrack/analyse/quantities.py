@@ -1,14 +1,13 @@
-"""Rates, contact, forces and energy of a motion, each with two uncertainties that must not be mixed.
+"""Rates, contact, forces and energy of a motion, each with two uncertainties.
 
 A is the lowest point of the lower edge, r_OA = -r e2 - h e3. Components are along n0 = e1, m0 = k x n0 and k.
-Against the printed equations of Ma et al. 2014: the first line of (2.3) is the n0 component and its second the m0
-component (the labels are exchanged), and its third line has r thetadot cos theta, because z = r sin theta + h cos
-theta; (2.10) has its datum at rest, m g (z - h) instead of m g z, or a power law in the time to the end is not
-possible.
+Departures from the equations as printed in Ma et al. 2014: the first line of (2.3) is the n0 component and its second
+the m0 component (the labels are exchanged), and its third line has r thetadot cos theta, because z = r sin theta + h
+cos theta; (2.10) has its datum at rest, m g (z - h) instead of m g z, as a power law in the time to collapse requires.
 
-Noise differs from frame to frame; the calibration's error is one and the same in all frames, and what else repeats
-(`MeasuredMotion.systematic_at`) changes with the motion only. The first averages out, the others do not: every derived
-quantity carries the two apart.
+Noise is independent between frames and averages out. The error of the calibration is common to all frames, and other
+systematic errors (`MeasuredMotion.systematic_at`) change slowly with the motion: they do not average out. Every derived
+quantity has both uncertainties separately.
 """
 
 from collections.abc import Sequence
@@ -24,10 +23,10 @@ from disctrack.analyse.derivatives import K, MeasuredMotion, MotionState
 from disctrack.disc import Disc, precession_rate
 from disctrack.errors import ModelError
 
-# Steps of central differences in the order of STATE: far above round-off, far below the scale on which the derived
-# quantities bend (sin theta of a disc at rest on its patch is 1e-2). They are quadratic at most in the rates.
+# Steps of central differences in the order of STATE: far above round-off, far below the scale of the curvature of the
+# derived quantities (sin theta of a disc at rest on its patch is 1e-2). These are at most quadratic in the rates.
 STEPS = np.repeat([1e-6, 1e-6, 1e-4, 1e-3, 1e-2, 1.0], 3)
-SIGMAS = 5.0  # of its own, below which a number is not told from zero; of theta, the direction of precession neither
+SIGMAS = 5.0  # standard deviations from zero of a significant number; with a smaller theta, e1 is undetermined
 # By group of the file: name, unit, meaning; in the order of `quantities`
 QUANTITIES = {
     "motion": (
@@ -75,11 +74,11 @@ def from_to(first: str, last: str) -> slice:
 
 
 def quantities(state: MotionState, disc: Disc, gravity: float) -> Array:
-    """All of QUANTITIES (n, 28); the Euler rates are read off omega itself.
+    """All of QUANTITIES (n, 28); Euler rates are from omega.
 
-    slip : of the disc's own point at the contact, v_O + omega x r_OA, eq. (2.3); locus : of the moving point of touch,
-    v_O + Omega_R x r_OA, where Omega_R = thetadot e1 + psidot k turns the nodal frame, in which r_OA is constant
-    force : of the table, from Newton's law with nothing else acting, eq. (2.6)
+    slip : of the material point at the contact, v_O + omega x r_OA, eq. (2.3); locus : of the moving point of touch,
+    v_O + Omega_R x r_OA, where Omega_R = thetadot e1 + psidot k is the angular velocity of the nodal frame
+    force : of the table, from Newton's law without other forces, eq. (2.6)
     """
     m, J1, J3, s = disc.mass, disc.moment_diametral, disc.moment_axial, state.sine
     n0, e2, e3 = state.axes()
@@ -118,14 +117,14 @@ class DerivedSeries(Brief):
     long_name: str
     value: Array  # (n,)
     sigma: Array  # (n,) from the noise of the poses
-    sigma_calibration: Array  # (n,) from the rig, common to all frames, and from what else repeats
+    sigma_calibration: Array  # (n,) from the rig, common to all frames, and other systematic errors
 
 
 @dataclass(frozen=True)
 class Propagated:
-    """Values with the covariance that noise and calibration give them.
+    """Values with their covariance from noise and calibration.
 
-    Kept is their derivative; covariances, several times as large, are made for the frames that are asked for.
+    Only the derivatives are stored; covariances, several times as large, are computed on demand.
     """
 
     value: Array  # (n, k)
@@ -133,7 +132,7 @@ class Propagated:
     motion: MeasuredMotion
 
     def covariance(self, frames: NDArray[np.int64], columns: slice = slice(None), shared: bool = False) -> Array:
-        """(f, c, c) of some values in some frames: noise, or what all share: of the rig, and what else repeats."""
+        """(f, c, c) of some values in some frames by noise, or, if `shared`, by the rig and other systematic errors."""
         motion, J = self.motion, self.jacobian[frames][:, columns]
         if not shared:
             return np.asarray(J @ motion.covariance[frames] @ J.swapaxes(1, 2))
@@ -142,7 +141,7 @@ class Propagated:
         return np.asarray(by_rig + J @ motion.systematic_at(frames) @ J.swapaxes(1, 2))
 
     def series(self, names: Sequence[tuple[str, str, str]]) -> tuple[DerivedSeries, ...]:
-        """The columns one by one; names are (name, unit, long_name)."""
+        """The columns as series; names are (name, unit, long_name)."""
         motion, J, every = self.motion, self.jacobian, np.arange(len(self.value))
         S = J @ motion.calibration_sensitivity
         noise = np.sum(J @ motion.covariance * J, axis=-1)
@@ -154,9 +153,9 @@ class Propagated:
 
 
 def propagate(motion: MeasuredMotion) -> Propagated:
-    """All of QUANTITIES (n, 28), with noise and calibration carried through their derivatives.
+    """All of QUANTITIES (n, 28), with first-order propagation of noise and calibration.
 
-    NaN where the motion is unknown, and where theta is so small against its own sigma that e1 has no direction.
+    NaN if the motion is unknown, or theta is below SIGMAS of its standard deviation, so that e1 is undetermined.
     """
     resolved, columns = motion.sine > SIGMAS * motion.tilt_sigma, []
     for step in np.diag(STEPS):
@@ -175,14 +174,14 @@ TOTAL, LEVEL = COLUMN["total"], COLUMN["precession_level"]
 class Energy(Brief):
     """Energy of a recording."""
 
-    loss: Annotated[float, "loss_J"]  # [J] from the first to the last known frame, positive when lost
+    loss: Annotated[float, "loss_J"]  # [J] from the first to the last known frame, positive for a loss
     loss_sigma: Annotated[float, "loss_sigma_J"]  # [J] noise
     # [J]; most of the calibration's error is common to both ends and cancels
     loss_sigma_calibration: Annotated[float, "loss_sigma_calibration_J"]
-    # mean of psidot^2 sin theta over 4 g / r, over whole nutation periods if there are any
+    # psidot^2 sin theta over 4 g / r, mean over the turns of precession
     level_ratio: Annotated[float, "precession_level_over_4g_r"]
-    level_ratio_sigma: Annotated[float, "precession_level_over_4g_r_sigma"]  # from the scatter about it
-    # what steady precession of this disc with its centre at rest has at the median theta
+    level_ratio_sigma: Annotated[float, "precession_level_over_4g_r_sigma"]  # from the scatter of its means per turn
+    # of steady precession of this disc with its centre at rest, at the median theta
     level_ratio_steady: Annotated[float, "precession_level_over_4g_r_steady"]
 
 
@@ -192,7 +191,7 @@ def energy_of(found: Propagated) -> Energy:
     try:
         typical = float(np.median(motion.euler[known, 1])) if known.any() else float("nan")
         steady = precession_rate(typical, motion.disc, motion.gravity)[0] ** 2 * np.sin(typical)
-    except ModelError:  # a disc that stands nearly upright does not precess with its centre at rest
+    except ModelError:  # no steady precession of a nearly upright disc with its centre at rest
         steady = float("nan")
     over = 4 * motion.gravity / motion.disc.radius
     ratios = _level_ratio(motion, found.value[:, LEVEL] / over)
@@ -215,7 +214,7 @@ def _loss(found: Propagated) -> tuple[float, float, float]:
 
 
 def _level_ratio(motion: MeasuredMotion, ratio: Array) -> tuple[float, float]:
-    """Mean of a ratio (n,), weighted evenly over the turns of precession, and its scatter per turn."""
+    """Mean of a ratio (n,) with equal weights of the turns of precession, and its standard error from their means."""
     known = np.flatnonzero(np.isfinite(ratio))
     if known.size < 2:
         return float("nan"), float("nan")

@@ -19,14 +19,14 @@ from disctrack.trajectory.file import Provenance
 if TYPE_CHECKING:
     from disctrack.report.figures import Drawn
 
-# Below, sin and cos of the nutation are its first terms to 2e-4, and the exponents of the models are those of the law.
+# Below, sin and cos of the nutation equal their leading terms to 2e-4, so that the asymptotic exponents hold.
 ASYMPTOTIC_BELOW = np.radians(1.0)
 
 
 def report_of(
     analysis: Analysis, provenance: Provenance, drawn: Sequence[Drawn], page: Path, trajectory_file: Path
 ) -> Report:
-    """All of an analysis, and what was noticed in the measurement."""
+    """All results of an analysis, and the findings of the measurement."""
 
     def section(title: str, numbers: tuple[str, ...], *blocks: Listing | str) -> Section:
         return Section(title, [*blocks, Figures([d for d in drawn if d.name.startswith(numbers)])])
@@ -70,7 +70,7 @@ def _exponents_text(laws: PowerLaws) -> str:
 
 
 def _accuracy(analysis: Analysis) -> str:
-    """Of the velocities, and of the lab frame."""
+    """Accuracy of the velocities, and of the lab frame."""
     sigma = np.sqrt(np.diagonal(analysis.motion.covariance, axis1=1, axis2=2))
     velocity = measured(float(np.nanmedian(sigma[:, 6:9])), unit="m/s")
     turn = measured(float(np.nanmedian(sigma[:, 9:12])), unit="rad/s")
@@ -78,7 +78,7 @@ def _accuracy(analysis: Analysis) -> str:
 
 
 def _lab_frame(analysis: Analysis) -> str:
-    """What the calibration leaves of the lab frame, at the worst axis."""
+    """Uncertainty of the lab frame from the calibration, for the worst axis."""
     covariance = analysis.trajectory.calibration_covariance[analysis.trajectory.measured]
     sigma = np.sqrt(np.median(np.diagonal(covariance, axis1=1, axis2=2), axis=0))
     if not np.any(sigma > 0):
@@ -94,7 +94,7 @@ def _status_table(analysis: Analysis) -> Listing:
 
 
 def _at_95(exponent: Exponent) -> Cell:
-    """The exponent with half of its confidence interval: of two degrees of freedom 4.3 sigmas."""
+    """The exponent with half of its confidence interval: 4.3 sigmas for two degrees of freedom."""
     if not np.isfinite(exponent.value):
         return "not determined"
     return measured(exponent.value, exponent.half)
@@ -115,9 +115,9 @@ def _exponents(analysis: Analysis) -> list[Listing | str]:
         f"Window: from {first:.3f} s to {last:.3f} s before t_f = {measured(laws.t_f, laws.t_f_sigma)} s (1 σ; "
         f"{laws.n_periods:.1f} nutation periods). 5 ms in t_f would move the exponent of θ by "
         f"{5e-3 * laws.n_theta_per_t_f:.3f}. The 95 % intervals are Student's t with few degrees of freedom, and so "
-        "wider than two standard deviations. They are those of a power law over this window; how far the law itself "
-        "bends shows in the dependence on the window. The models' exponents hold as the nutation goes to zero; above "
-        f"{np.degrees(ASYMPTOTIC_BELOW):.0f} degree the same law has another slope: there agreement alone is marked."
+        "wider than two standard deviations. They are for a power law over this window; the dependence on the window "
+        "shows deviations from a power law. The exponents of the models hold in the limit of zero nutation; above "
+        f"{np.degrees(ASYMPTOTIC_BELOW):.0f} degree the same law has another slope: there only agreement is marked."
     )
     header = ("exponent of", "95 %", "1 σ", *(name.split(",")[0] for name, _ in MODEL_EXPONENTS))
     return [
@@ -128,17 +128,17 @@ def _exponents(analysis: Analysis) -> list[Listing | str]:
 
 
 def _agreement(exponent: Exponent, model: float, asymptotic: bool) -> str:
-    """A model's exponent and whether the confidence interval holds it; no "no" where the law bends by itself."""
+    """Exponent of a model and whether the confidence interval contains it; above ASYMPTOTIC_BELOW never "no"."""
     if exponent.agrees_with(model):
         return f"{model:.3f} yes"
     return f"{model:.3f} no" if asymptotic else f"{model:.3f} as θ → 0"
 
 
 def _largest_nutation(analysis: Analysis) -> float:
-    """In the window of the exponents [rad]."""
+    """Largest nutation in the window of the exponents [rad]."""
     laws, motion = analysis.laws, analysis.motion
-    left = laws.t_f - motion.time
-    inside = motion.known & (left >= min(laws.window)) & (left <= max(laws.window))
+    to_collapse = laws.t_f - motion.time
+    inside = motion.known & (to_collapse >= min(laws.window)) & (to_collapse <= max(laws.window))
     return float(motion.euler[inside, 1].max()) if inside.any() else np.inf
 
 
@@ -153,7 +153,7 @@ def _windows_table(fits: Sequence[PowerLaws]) -> Listing:
         if fit.determined
     ]
     caption = "As the paper's tables 2 and 3, this recording, for several windows (value ± 1 σ)."
-    different = list(dict.fromkeys(rows))  # windows longer than the recording repeat each other
+    different = list(dict.fromkeys(rows))  # windows longer than the recording give equal rows
     return Listing(("t_f - t (s)", "n_E", "n_θ", "n_ψ̇", "t_f (s)"), different, caption)
 
 

@@ -1,10 +1,10 @@
 """Value, first and second derivative of a sampled curve by Gaussian-process regression in moving windows.
 
 The curve is a stationary Gaussian process with covariance A^2 exp(-tau^2 / 2 l^2) on top of an unknown straight line
-(Rasmussen & Williams 2006, sections 2.2, 2.7, 9.4). Its spectrum falls so steeply that the estimator passes everything
-below a cut-off without loss and nothing above: at the signal-to-noise ratios of a tracked disc (1e3 to 1e4) the
-variance it predicts is the noise that passes, and the bias is far below it. Length l and amplitude A are found where
-they change, by restricted maximum likelihood in overlapping segments; the scale of the noise, in all segments together.
+(Rasmussen & Williams 2006, sections 2.2, 2.7, 9.4). Its spectrum falls so steeply that the estimator is a low-pass
+filter with a sharp cut-off: at the signal-to-noise ratios of a tracked disc (1e3 to 1e4) the predicted variance is
+that of the transmitted noise, and the bias is far below it. Length l and amplitude A vary with time: they are estimated
+by restricted maximum likelihood in overlapping segments. The scale of the noise is common to all segments.
 
 On simulated motion this is more accurate than local polynomials, which have one window for slow and fast motion, and
 than a state-space smoother with an integrated Wiener process, whose spectrum falls too slowly.
@@ -20,11 +20,11 @@ from calibration.kit.arrays import Array
 
 LENGTHS = 2.0 * 1.15 ** np.arange(20)  # l in frame intervals: 2 (content up to the Nyquist rate) to 28
 RATIOS = 10.0 ** np.arange(0.0, 10.1, 0.5)  # (A / sigma)^2
-SEGMENT = 96  # frames in which l and A are taken as constant: 48 or 64 make the variance too small by a factor 2
-MAX_SLOPE = 0.25  # of l, in intervals per interval
-HALF_WINDOW_LENGTHS = 3.0  # half width of a window in l; 4 would gain 3 % in scatter and cost twice the time
-MIN_WINDOW_SAMPLES = 4  # a line and a curvature, and one to spare
-NOISE_SCALES = 2.0 ** np.arange(-3.0, 3.01, 0.05)  # variance found over variance stated
+SEGMENT = 96  # frames in which l and A are constant; with 48 or 64 the variance is too small by a factor 2
+MAX_SLOPE = 0.25  # of l over time
+HALF_WINDOW_LENGTHS = 3.0  # half width of a window in l; 4 reduces the scatter by 3 % at twice the time
+MIN_WINDOW_SAMPLES = 4  # a line, a curvature, and one degree of freedom
+NOISE_SCALES = 2.0 ** np.arange(-3.0, 3.01, 0.05)  # estimated over stated variance
 
 
 def kernel(lag: Array, length: float) -> Array:
@@ -33,15 +33,14 @@ def kernel(lag: Array, length: float) -> Array:
 
 
 def fit_process(segments: Sequence[tuple[Array, Array, Array]], centres: Array, n: int) -> tuple[Array, Array, float]:
-    """Of a group of channels: length (n,) in intervals, A^2 (n,), and the variance found over that stated.
+    """For a group of channels: length (n,) in intervals, A^2 (n,), and the estimated over the stated variance.
 
     segments : per segment: sample times (m,) in intervals, data (c, m), stated variances (c, m); m may differ
-    centres : (n_segments,) sample index that each segment stands for
-    n : number of samples to spread the answers over
-    Between two segments the logarithms are interpolated.
+    centres : (n_segments,) sample index at the centre of each segment
+    n : number of samples of the result; between two centres the logarithms are interpolated
     """
     best, where = np.empty((2, len(segments), len(NOISE_SCALES)))
-    for i, (t, data, variance) in enumerate(segments):  # 0.4 MB each: of a long recording only the maxima are kept
+    for i, (t, data, variance) in enumerate(segments):  # 0.4 MB each: only the maxima are kept
         likelihood = _segment_likelihood(_modes(_on_grid(t).tobytes()), data, variance).reshape(len(NOISE_SCALES), -1)
         best[i], where[i] = likelihood.max(axis=1), likelihood.argmax(axis=1)
     scale_index = int(np.argmax(best.sum(axis=0)))
@@ -52,15 +51,15 @@ def fit_process(segments: Sequence[tuple[Array, Array, Array]], centres: Array, 
     sample = np.arange(n)
     between = np.interp(sample, centres, length_index.astype(float))
     length = np.exp(np.interp(between, np.arange(len(LENGTHS)), np.log(LENGTHS)))
-    # A disc's motion is a sum of near-sinusoids, smoother than any sample of the process: the likelihood prefers an l
-    # that is a little too long. One step shorter the predicted variance of accelerations is that of their errors.
+    # The motion of a disc is a sum of near-sinusoids, smoother than samples of the process: the likelihood prefers an l
+    # slightly too long. With the next shorter one, the predicted variance of accelerations agrees with their errors.
     allowed = np.searchsorted(LENGTHS, np.sqrt(1.15) * _sloped(length), side="right") - 1  # nearest of the grid
     amplitude2 = np.exp(np.interp(sample, centres, np.log(amplitude2)))
     return LENGTHS[np.maximum(allowed - 1, 0)], amplitude2, float(NOISE_SCALES[scale_index])
 
 
 def _sloped(length: Array) -> Array:
-    """Lengths (n,) cut to a slope of MAX_SLOPE: a long window must not reach into motion that asks for a short one."""
+    """Lengths (n,) limited to a slope of MAX_SLOPE: a long window must not reach into motion that needs a short one."""
     ramp = MAX_SLOPE * np.arange(len(length))
     ahead = np.minimum.accumulate(length - ramp) + ramp
     behind = np.minimum.accumulate((length + ramp)[::-1])[::-1] - ramp
@@ -68,14 +67,14 @@ def _sloped(length: Array) -> Array:
 
 
 def _on_grid(lag: Array) -> Array:
-    """Times of a uniform recording as whole numbers, free of round-off, so that equal windows are seen to be equal."""
+    """Times of a uniform recording as integers without round-off, so that equal windows compare equal."""
     whole = np.round(lag)
     return np.where(np.abs(lag - whole) < 1e-6, whole, lag)
 
 
 @lru_cache(maxsize=64)
 def _modes(times_as_bytes: bytes) -> list[tuple[Array, Array]]:
-    """Per length, eigenvalues (m - 2,) and vectors (m, m - 2) of the kernel on what is orthogonal to straight lines."""
+    """Per length, eigenvalues (m - 2,) and vectors (m, m - 2) of the kernel in the complement of straight lines."""
     times = np.frombuffer(times_as_bytes)
     basis = np.stack([np.ones_like(times), times - times.mean()], axis=1)
     complement = np.linalg.qr(basis, mode="complete")[0][:, 2:]
@@ -90,7 +89,7 @@ def _modes(times_as_bytes: bytes) -> list[tuple[Array, Array]]:
 def _segment_likelihood(modes: list[tuple[Array, Array]], data: Array, variance: Array) -> Array:
     """Restricted log-likelihood (scales, lengths, ratios), summed over the channels.
 
-    In the process' own modes, A and the noise scale cost one division each.
+    In eigenvectors of the kernel, A and the noise scale need one division each.
     """
     sigma2 = variance.mean(axis=1)
     total = np.zeros((len(NOISE_SCALES), len(LENGTHS), len(RATIOS)))
@@ -111,17 +110,17 @@ def window_weights(lag: Array, noise_ratio: Array, length: float) -> tuple[Array
 
     lag : (u, w) times of the samples relative to the point, in intervals
     noise_ratio : (u, w) noise variance over A^2; infinite where there is no sample
-    returns : weights (u, 3, w) per interval^order; prior (u, 3, 3), the covariance in units of A^2 that would remain
-        without noise: what the samples leave open in gaps and at the ends
+    returns : weights (u, 3, w) per interval^order; prior (u, 3, 3), the covariance in units of A^2 that
+        remains without noise: in gaps and at the ends the samples do not determine the curve
     """
     seen = np.isfinite(noise_ratio)
     mask = seen.astype(float)
     k, l2, a = kernel(lag, length), length**2, 1 / length**2
-    # of value, slope and curvature at lag 0 with the values at `lag` (u, 3, w), and with each other (3, 3)
+    # covariance of value, slope and curvature at lag 0 with the values at `lag` (u, 3, w), and among each other (3, 3)
     cross = np.stack([k, lag / l2 * k, (lag**2 / l2 - 1) / l2 * k], axis=1) * mask[:, None, :]
     own = np.array([[1.0, 0.0, -a], [0.0, a, 0.0], [-a, 0.0, 3 * a * a]])
-    alike = lag[:1] if (lag == lag[0]).all() else lag  # of frames at one interval all windows are
-    K = kernel(alike[:, :, None] - alike[:, None, :], length) * mask[:, :, None] * mask[:, None, :]
+    distinct = lag[:1] if (lag == lag[0]).all() else lag  # with uniform frames all windows are equal
+    K = kernel(distinct[:, :, None] - distinct[:, None, :], length) * mask[:, :, None] * mask[:, None, :]
     diagonal = np.arange(lag.shape[1])
     sigma = K.copy()
     sigma[:, diagonal, diagonal] += np.where(seen, noise_ratio, 1.0)
@@ -150,10 +149,10 @@ def moving_weights(
 
     times : (n,) in sample intervals; variance : (n,) of the noise, infinite where there is no sample
     length, amplitude2 : (n,) as of `fit_process`
-    points : (k,) which samples
+    points : (k,) indices of these samples
     Derivatives are per interval. The ends are windows whose outer samples are missing. Windows with the same length,
-    ratio and pattern of noise share one solution; noise is told apart in factors of two for this purpose (weights may
-    be slightly off the optimum, their covariance is exact). A window with fewer than MIN_WINDOW_SAMPLES samples has
+    ratio and pattern of noise share one solution; for this, noise is classified in factors of two (weights may be
+    slightly off the optimum, their covariance is exact). A window with fewer than MIN_WINDOW_SAMPLES samples has
     no weight and an infinite prior covariance.
     """
     n, w = len(times), half_window

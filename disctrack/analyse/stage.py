@@ -1,4 +1,4 @@
-"""From a trajectory file to the physics: motion, contact, energy and scaling laws, into the file and into a report."""
+"""From a trajectory file to the physics: adds motion, contact, energy and scaling laws, and writes a report."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -28,7 +28,7 @@ from disctrack.trajectory.reuse import origin_of, refuse_other, remember
 
 @dataclass(frozen=True, repr=False)
 class AnalyseOutcome(Brief):
-    """What `run_analyse` did."""
+    """Results of `run_analyse`."""
 
     analysis: Analysis
     file: Path  # the trajectory, with the new groups
@@ -37,7 +37,7 @@ class AnalyseOutcome(Brief):
     summary: Report
 
     def facts(self) -> dict[str, str]:
-        """What a glance should tell (`Brief`)."""
+        """Short summary (`Brief`)."""
         return {**self.analysis.facts(), "report": str(self.report)}
 
 
@@ -53,15 +53,15 @@ def run_analyse(
 ) -> AnalyseOutcome:
     """Analyse the trajectory file, add the groups to it, write report.html.
 
-    output : folder for the report; without it, `<name>_analysis` beside the file
+    output : folder for the report; by default `<name>_analysis` next to the file
     figures : also write every figure of the report as PNG and PDF
-    Raises TrajectoryFileError, AnalysisError, OutputError (also when there is a report and not `overwrite`).
+    Raises TrajectoryFileError, AnalysisError, OutputError (also if a report exists and not `overwrite`).
 
         >>> outcome = run_analyse("clip/results/trajectory.h5", overwrite=True)
         >>> outcome.report.name
         'report.html'
     """
-    from disctrack.analyse.figures import all_figures  # matplotlib is wanted here only
+    from disctrack.analyse.figures import all_figures  # matplotlib is needed here only
 
     path = trajectory_in(Path(path))
     keep(path)
@@ -83,13 +83,13 @@ def run_analyse(
 def write_analysis(path: Path, analysis: Analysis) -> None:
     """Add the groups motion, contact, energy and scaling to the trajectory file, replacing older ones.
 
-    Frames outside the part that was tracked are NaN.
+    Frames outside the tracked part are NaN.
     """
     file_time = read_group(path, "/", ("time",))[0]["time"]
     first = int(np.searchsorted(file_time, analysis.motion.time[0] - 1e-9))
 
     def whole(variables: dict[str, Variable]) -> dict[str, Variable]:
-        """Those of the frames from `first` on as those of all frames of the file."""
+        """Series from frame `first` on, extended to all frames of the file."""
         return {
             name: replace(item, data=among(len(file_time), first, np.asarray(item.data)))
             for name, item in variables.items()
@@ -113,7 +113,7 @@ def write_analysis(path: Path, analysis: Analysis) -> None:
 
 
 def _attributes(result: object) -> dict[str, object]:
-    """Of a result, the fields that are annotated with their name in the file, by that name."""
+    """Fields of a result that are annotated with their name in the file, by that name."""
     hints = get_type_hints(type(result), include_extras=True).items()
     return {hint.__metadata__[0]: getattr(result, name) for name, hint in hints if hasattr(hint, "__metadata__")}
 
