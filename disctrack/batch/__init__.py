@@ -1,9 +1,9 @@
-"""Many recordings: found, planned, measured side by side, summed up.
+"""Measurement of many recordings in parallel, with a summary.
 
-`plan` (which folders are recordings; each rig once, then one job per recording) -> `pool` (who works, what waits;
-`measure` is what they do) -> `records` (kept beside the results) -> `columns`, `report` (of all).
-`run` is the whole, and writes the summary. Results are judged by content: the hash of inputs, settings and version,
-never by their mere existence.
+`plan` (finds recordings; one job per rig, then one per recording) -> `pool` (distributes the jobs to processes;
+`measure` does one job) -> `records` (stored with the results) -> `columns`, `report` (of all recordings).
+`run` does all of this and writes the summary. Results are reused if the hash of inputs, settings and version is equal,
+not because they exist.
 """
 
 from disctrack.batch.plan import BatchOptions, find_recordings

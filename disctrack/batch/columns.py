@@ -1,6 +1,6 @@
-"""The columns of the summary, and of recordings that repeat one experiment: mean and spread of what was fitted to each.
+"""Columns of the summary, and mean and spread of the fitted numbers over recordings that repeat one experiment.
 
-As tables 2 and 3 of Ma et al. (2014), with what the paper leaves open: how much of the spread is the measurement's.
+As tables 2 and 3 of Ma et al. (2014); in addition, the spread is compared with the uncertainty of the measurement.
 """
 
 from collections.abc import Sequence
@@ -14,29 +14,29 @@ from scipy.special import gammaincc
 from disctrack.frames import CAMERAS, COORDINATES
 from disctrack.recording.declaration import Recording
 
-Row = dict[str, Any]  # column -> value of JSON's types, None where it is not known
+Row = dict[str, Any]  # column -> value in JSON types, None if not known
 
 UNITS = ("m",) * 3 + ("rad",) * 3  # of COORDINATES
 
-PATHS = ("trajectory", "report", "diagnosis_report")  # columns of files that a recording's results may have
+PATHS = ("trajectory", "report", "diagnosis_report")  # columns with paths of files among a recording's results
 
-FALSE_DISCOVERY = 0.05  # share of false ones among the recordings in which something is said to be missing
+FALSE_DISCOVERY = 0.05  # accepted rate of false discoveries among the recordings with a missing effect
 
-# Every column of the summary in order, and what it means.
+# Columns of the summary in order, and their meanings.
 COLUMNS: dict[str, str] = {
     "recording": "folder below the batch's, with slashes",
     "name": "as recording.toml says",
-    "repeats": "what recordings that repeat one experiment have in common: case, surface and disc as declared",
+    "repeats": "common to recordings that repeat one experiment: case, surface and disc as declared",
     "status": "measured, skipped (done already), failed, or not measured",
-    "reason": "why it failed, or what is missing although it was measured",
-    "severity": "of the gravest finding: note, warning, or doubt, where numbers may be wrong beyond their sigmas",
+    "reason": "why it failed, or which of its results are missing or doubtful",
+    "severity": "of the gravest finding: note, warning, or doubt (numbers may be wrong beyond their sigmas)",
     "finding": "its kind",
-    "pairs": "image pairs that were to be measured, without the rest before and after the motion",
+    "pairs": "image pairs to be measured, without the rest before and after the motion",
     "pairs_measured": "pairs with a pose",
-    "duration_s": "from the first of them to the last",
+    "duration_s": "from the first of these pairs to the last",
     "k_m_m_s2": "lever arm of the rolling friction per squared precession rate, fitted to the dots [m s^2]",
-    "k_m_sigma_m_s2": "its standard deviation, larger by the root of the next column where that exceeds 1",
-    "k_m_reduced_chi_square": "of that fit; far from 1, the model lacks something and k_m takes a part of it",
+    "k_m_sigma_m_s2": "its standard deviation, multiplied by the root of the next column if that exceeds 1",
+    "k_m_reduced_chi_square": "of that fit; far from 1, an effect is missing in the model and k_m is biased by it",
     "k_m_undetermined": "why there is no k_m",
     "n_energy": "exponent of the energy in t_f - t",
     "n_energy_sigma": "",
@@ -56,12 +56,12 @@ COLUMNS: dict[str, str] = {
         f"{n}_sigma_calibration_{u}": "from the rig, common to all frames"
         for n, u in zip(COORDINATES, UNITS, strict=True)
     },
-    "diagnosis": "verdict, where a diagnosis was requested",
+    "diagnosis": "verdict, if a diagnosis was requested",
     "diagnosis_sentence": "",
     "diagnosis_p_value": "probability that noise alone produces so large a decrease of chi-square",
-    "diagnosis_false_discovery": "share of false ones among the recordings whose p value is as small (at most)",
-    "seconds": "that the measurement took",
-    "processor_seconds": "the same, of a processor, all threads",
+    "diagnosis_false_discovery": "rate of false discoveries among the recordings with this or a smaller p value",
+    "seconds": "duration of the measurement",
+    "processor_seconds": "processor time of the measurement, all threads",
     "folder": "of the recording; this and the following paths are relative to the summary's folder",
     "trajectory": "",
     "report": "",
@@ -69,22 +69,22 @@ COLUMNS: dict[str, str] = {
     "rig": "",
     "input_sha256": "of the images, the rig and their names in the result file",
     "fingerprint": "of inputs, settings and version",
-    "version": "of disctrack that measured it",
+    "version": "of the disctrack that measured it",
 }
 
 
 class Fitted(NamedTuple):
-    """A number that a recording determines, as the page shows it."""
+    """A number that a recording determines, and its form on the page."""
 
     column: str
     sigma: str  # column of its standard deviation
     label: str
     scale: float = 1.0  # on the page
     misfit: str = ""  # column of the reduced chi-square of its model
-    repeated: bool = True  # recordings of one experiment agree in it
+    repeated: bool = True  # is expected to be equal in recordings of one experiment
 
 
-# t_f is not compared: it depends on when somebody started the cameras.
+# t_f is not compared: it depends on the instant at which the cameras were started.
 FITTED = (
     Fitted("k_m_m_s2", "k_m_sigma_m_s2", "k_m from the dots (10⁻⁸ m s²)", 1e8, "k_m_reduced_chi_square"),
     Fitted("n_energy", "n_energy_sigma", "n_E"),
@@ -95,7 +95,7 @@ FITTED = (
 
 
 def copies(rows: Sequence[Row]) -> list[str]:
-    """Names of recordings of the same images and rig, "a, b" each: in means and repeats one counts as several."""
+    """Names "a, b" of recordings with the same images and rig: in means, one recording counts as several."""
     alike: dict[str, list[str]] = {}
     for row in rows:
         if row["input_sha256"]:
@@ -103,22 +103,22 @@ def copies(rows: Sequence[Row]) -> list[str]:
     return [", ".join(names) for names in alike.values() if len(names) > 1]
 
 
-# What is known of one number of one group, and what it means.
+# Columns of the statistics of one number over one group, and their meanings.
 REPEATS: dict[str, str] = {
-    "repeats": "what the recordings have in common: case, surface and disc as declared",
+    "repeats": "common to the recordings: case, surface and disc as declared",
     "quantity": "a column of the recordings",
-    "n": "recordings that determine it; those of the same images count once",
-    "mean": "all alike",
+    "n": "recordings that determine it; recordings of the same images count once",
+    "mean": "unweighted",
     "standard_deviation": "over the recordings, n - 1 in the denominator",
     "weighted_mean": "weights 1 / sigma^2",
     "weighted_mean_sigma": "from the stated sigmas",
     "reduced_chi_square": "squared spread over stated variance, n - 1 degrees of freedom; far above 1, they disagree",
-    "p_value": "probability of a larger one if all measured the same number, each within its sigma",
+    "p_value": "probability of a larger chi-square if all measure the same number with their stated sigmas",
 }
 
 
 def group_of(recording: Recording) -> str:
-    """Case and surface, as far as they are declared, and the disc: recordings alike in these repeat one experiment."""
+    """Case and surface if declared, and the disc: recordings that agree in these repeat one experiment."""
     declared, disc = recording.declared, recording.disc
     sizes = f"disc of {1e3 * disc.radius:g} x {2e3 * disc.half_thickness:g} mm, {1e3 * disc.mass:g} g"
     labels = (declared.get("case"), declared.get("surface"), declared.get("disc", {}).get("name"), sizes)
@@ -127,7 +127,7 @@ def group_of(recording: Recording) -> str:
 
 def repeats_of(rows: Sequence[Row]) -> list[Row]:
     """Rows of REPEATS, one for each number that two or more recordings of a group determine."""
-    different = {row["input_sha256"]: row for row in reversed(rows) if row["repeats"]}  # the first of each
+    different = {row["input_sha256"]: row for row in reversed(rows) if row["repeats"]}  # the first of each input
     group_in = itemgetter("repeats")
     found = []
     for group, alike in groupby(sorted(different.values(), key=group_in), key=group_in):

@@ -1,4 +1,4 @@
-"""One process at a time works on a recording, on this machine or on another that shares the disk."""
+"""Locks: one process at a time works on a recording, on this machine or on another that shares the disk."""
 
 import contextlib
 import errno
@@ -11,17 +11,17 @@ from filelock import BaseFileLock, FileLock, SoftFileLock, Timeout
 from disctrack.files.whole import make_folder, output_error
 
 _NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
-SILENT_FOR = 12 * 3600.0  # [s] after which a lock counts as abandoned, where the disk knows no locks
+SILENT_FOR = 12 * 3600.0  # [s] after which a lock counts as abandoned, on a disk without locks
 
 
 @contextlib.contextmanager
 def locked(path: Path, wait: float = 0.0) -> Iterator[None]:
-    """Hold the lock `path`, a file that is there while it is held.
+    """Hold the lock `path`, a file that exists while the lock is held.
 
-    The operating system frees the lock when its holder ends, however it ends, so a file that a killed process left
-    has no effect. On a disk without locks the existence of `<path>.holder` is the lock, and the host and process named
-    in it tell whether it is still valid; one of another host is, for SILENT_FOR.
-    wait : [s] to wait for another holder. Raises Timeout where that holds it still, OutputError.
+    The operating system releases the lock when its holder ends in any way, so a file left by a killed process has no
+    effect. On a disk without locks the file `<path>.holder` is the lock: it names host and process, and is valid while
+    that process runs, or for SILENT_FOR if the host is another one.
+    wait : [s] to wait for another holder. Raises Timeout if that still holds the lock, OutputError.
     """
     make_folder(path.parent)
     lock: BaseFileLock = FileLock(path, timeout=wait, fallback_to_soft=False)
@@ -46,5 +46,5 @@ def locked(path: Path, wait: float = 0.0) -> Iterator[None]:
     finally:
         if not isinstance(lock, SoftFileLock):
             with contextlib.suppress(OSError):
-                path.unlink()  # before it is free: who locks the removed file notices that it is no longer there
+                path.unlink()  # before the release: a process that locks the removed file notices the removal
         lock.release()

@@ -1,6 +1,6 @@
-"""What one process does with one job: calibrate a rig, or take a recording from its images to its report.
+"""One job in one process: calibrate a rig, or measure a recording, from its images to its report.
 
-The numbers of its row are with sigmas, in SI units; NaN where one is not known, which is kept as None.
+The numbers of its row are in SI units and have sigmas; unknown numbers are NaN, which is stored as None.
 """
 
 import contextlib
@@ -36,11 +36,11 @@ from disctrack.trajectory import Trajectory
 from disctrack.trajectory.file import Details, kept_or_made
 
 LOCK = ".batch.lock"
-BUSY_FOR = 1.0  # [s] to wait for another batch before the recording is put back: longer than to look for it again
+BUSY_FOR = 1.0  # [s] to wait for another batch before the job is put back; longer than a cycle of the queue
 
 
 def do(job: Job) -> Row:
-    """Do a job. Never raises an Exception: what went wrong is in the row, and in the folder of the results."""
+    """Do a job. Never raises an Exception: errors are reported in the row, which is stored with the results."""
     results = Path(job.results)
     try:
         with locked(results / LOCK, BUSY_FOR):
@@ -51,7 +51,7 @@ def do(job: Job) -> Row:
                 if isinstance(error, TrackingError):
                     kind = error.findings[0].kind if error.findings else Kind.DISC_NOT_FOUND
                 row = failed(reason_of(error), kind)
-                with contextlib.suppress(DiscTrackError):  # or else the batch that runs now is the only one to know
+                with contextlib.suppress(DiscTrackError):  # if this fails, only the running batch reports the error
                     write_row(results, row)
                 return row
     except Timeout:
@@ -61,7 +61,7 @@ def do(job: Job) -> Row:
 
 
 def make_rig(job: Job) -> Row:
-    """Calibrate into job.rig, unless the same was done before."""
+    """Calibrate and write job.rig, unless it is already the result of the same inputs."""
     source = source_of(read_recording(job.folder), job.options.calibration)
     if is_rig_of(Path(job.rig), source) and not job.options.overwrite:
         return outcome(SKIPPED)
@@ -70,7 +70,7 @@ def make_rig(job: Job) -> Row:
 
 
 def make_recording(job: Job, results: Path) -> Row:
-    """Track, analyse and, if asked for, diagnose; what is done already with the same inputs is kept."""
+    """Track, analyse and, if requested, diagnose; existing results of the same inputs are kept."""
     began, used = time.perf_counter(), time.process_time()
     recording = read_recording(job.folder)
     rig, pairs = read_rig(job.rig), open_pairs(recording)
@@ -81,7 +81,7 @@ def make_recording(job: Job, results: Path) -> Row:
         return found.trajectory, found.details
 
     trajectory, _, fresh = kept_or_made(path, provenance, measured, job.options.overwrite)
-    kept = None if fresh else read_row(results)  # is_done: of this provenance, as the trajectory is
+    kept = None if fresh else read_row(results)  # is_done checks that it has the trajectory's provenance
     if kept is not None and is_done(results, kept, job.options.stages):
         return kept | {"status": SKIPPED}
     row: Row = plain(_after_tracking(results, path, trajectory, job)) | {
@@ -99,7 +99,7 @@ def make_recording(job: Job, results: Path) -> Row:
 
 
 def _after_tracking(results: Path, path: Path, trajectory: Trajectory, job: Job) -> Row:
-    """Analysis, loss coefficient, diagnosis; one of them that is not possible is a reason, not a failure."""
+    """Analysis, loss coefficient, diagnosis; if one is not possible, `reason` says why, and the status is MEASURED."""
     row = {"trajectory": path.name, "stages": job.options.stages, **tracked_numbers(trajectory)}
     noticed = leading(trajectory.findings)
     missing = [f.sentence for f in noticed if f.doubtful or f.kind == Kind.UNREADABLE]
@@ -134,7 +134,7 @@ def _analyse(path: Path, trajectory: Trajectory, job: Job) -> tuple[Analysis, Pa
 
 
 def tracked_numbers(trajectory: Trajectory) -> Row:
-    """Pairs, misfit in the images and median sigmas."""
+    """Numbers of pairs, misfit in the images and median sigmas."""
     looked_for = trajectory.looked_for
     numbers: Row = {
         "pairs": int(looked_for.sum()),
@@ -169,8 +169,8 @@ def analysed_numbers(analysis: Analysis) -> Row:
 def friction_numbers(trajectory: Trajectory) -> Row:
     """The paper's k_m [m s^2] fitted to the dots of all frames, with the reduced chi-square of that model.
 
-    Where that is far from 1, the model lacks something and k_m takes a part of it: sigma is then larger by its root,
-    and no more than a hint. `k_m_undetermined` says why there is no k_m.
+    If that is far from 1, an effect is missing in the model and k_m is biased by it: sigma is then multiplied by the
+    root of chi-square, which is only indicative. `k_m_undetermined` says why there is no k_m.
     """
     try:
         model, faults = declared_model(trajectory)
@@ -189,7 +189,7 @@ def friction_numbers(trajectory: Trajectory) -> Row:
 
 
 def diagnosed_numbers(document: Row) -> Row:
-    """Verdict of a diagnosis.json, and the probability of such a gain by chance."""
+    """Verdict of a diagnosis.json, and the probability of such a decrease of chi-square by chance."""
     return {
         "diagnosis": str(document.get("verdict", "")),
         "diagnosis_sentence": str(document.get("sentence", "")),

@@ -1,4 +1,4 @@
-"""Which folders are recordings, and what is to be done: each rig once, then one job per recording."""
+"""Search for recordings, and the jobs: one for each rig, then one for each recording."""
 
 import os
 from collections import Counter
@@ -18,23 +18,23 @@ from disctrack.recording.declaration import FILE_NAME, Recording, read_recording
 from disctrack.recording.readers.files import FORMATS, IMAGES, SUFFIXES, folders_below, natural_key
 from disctrack.track.measurement import open_pairs
 
-RESULTS = "results"  # beside a recording's images
-FOLDER = "batch_results"  # of a batch, for what belongs to no single recording
-_FILMS = SUFFIXES - IMAGES - FORMATS["hdf5"]  # of which two in a folder may be the cameras
+RESULTS = "results"  # in the folder of a recording
+FOLDER = "batch_results"  # of a batch, for files that are common to all recordings
+_FILMS = SUFFIXES - IMAGES - FORMATS["hdf5"]  # of films; two in one folder may be those of the cameras
 
 
 @dataclass(frozen=True)
 class FoundRecordings:
-    """Recordings below some folders."""
+    """Recordings at and below the searched folders."""
 
-    base: Path  # the deepest folder that holds all folders searched
+    base: Path  # the deepest folder that contains all searched folders
     recordings: tuple[Path, ...]  # folders with a recording.toml, each once, in natural order of their names
-    problems: tuple[str, ...]  # folders that could not be looked into
-    undeclared: tuple[Path, ...] = ()  # that hold two folders of images or two films, and no recording.toml
-    output: Path | None = None  # folder for all results; None: beside each recording
+    problems: tuple[str, ...]  # folders that could not be read
+    undeclared: tuple[Path, ...] = ()  # folders with two folders of images or two films, and without recording.toml
+    output: Path | None = None  # folder for all results; None: in the folder of each recording
 
     def name(self, recording: Path) -> str:
-        """The recording's place below `base`, with slashes: unique, printable, and the same on every machine."""
+        """The recording's path relative to `base`, with slashes: unique, printable, and equal on every machine."""
         relative = Path(os.path.relpath(recording, self.base)).as_posix()
         return printable(recording.name if relative == "." and len(self.recordings) == 1 else relative)
 
@@ -49,9 +49,9 @@ class FoundRecordings:
 
 
 def find_recordings(folders: Sequence[str | Path], output: str | Path | None = None) -> FoundRecordings:
-    """Folders at and below `folders` that hold a recording.toml; links are followed, each folder is looked at once.
+    """Folders at and below `folders` that contain a recording.toml; links are followed, each folder is read once.
 
-    output : folder for the results, which is not searched, as `results` of a recording and `batch_results` never are
+    output : folder for the results, which is not searched; nor are `results` of a recording and `batch_results`
     Raises RecordingError if a folder does not exist or if there is no recording at all.
     """
     roots = [Path(folder).resolve() for folder in folders]
@@ -63,7 +63,7 @@ def find_recordings(folders: Sequence[str | Path], output: str | Path | None = N
     seen = set() if apart is None else {apart} - set(roots)
     found: list[Path] = []
     undeclared: set[Path] = set()
-    of_images = Counter[Path]()  # folders with images in each folder
+    of_images = Counter[Path]()  # number of folders with images in each folder
     for place, inside, names in (folder for root in roots for folder in folders_below(root, seen, unread.append)):
         suffixes = [Path(name).suffix.lower() for name in names]
         is_recording = FILE_NAME in names
@@ -90,15 +90,15 @@ def find_recordings(folders: Sequence[str | Path], output: str | Path | None = N
 
 @dataclass(frozen=True)
 class BatchOptions:
-    """What a user chose about every recording."""
+    """Settings of the user for all recordings."""
 
     distortion: str = "auto"  # see CalibrationSettings
     board: str = "auto"
     window: float = WINDOW  # [s] before t_f, for the exponents
     report: bool = True  # report.html and figures of each recording
     diagnose: bool = False
-    together: bool = False  # one diagnosis of all recordings, besides
-    overwrite: bool = False  # measure anew what is done already
+    together: bool = False  # in addition, one diagnosis of all recordings
+    overwrite: bool = False  # replace existing results
 
     @property
     def calibration(self) -> CalibrationSettings:
@@ -107,7 +107,7 @@ class BatchOptions:
 
     @property
     def stages(self) -> Stages:
-        """What is asked for beyond the trajectory."""
+        """Requested stages after the trajectory, with their settings."""
         return {"window_s": self.window, "report": self.report, "diagnose": self.diagnose}
 
 
@@ -118,19 +118,19 @@ class Job:
     kind: str  # "rig" or "recording"
     name: str  # of the recording; for a rig, the first recording that needs it
     folder: str  # of that recording
-    results: str  # folder for what comes out
-    rig: str  # rig file: what a "rig" makes and a "recording" uses
+    results: str  # folder of the results
+    rig: str  # rig file: output of a "rig", input of a "recording"
     options: BatchOptions
-    threads: int = 1  # that read images
+    threads: int = 1  # for reading images
 
 
 def make_plan(
     found: FoundRecordings, recordings: Sequence[Path], options: BatchOptions
 ) -> tuple[list[Job], list[Job], dict[str, Row], tuple[Path, ...]]:
-    """Read every recording.toml, count the images, and find who shares a rig by the content of the views.
+    """Read every recording.toml, count the images, and group recordings with equal calibration views by rig.
 
-    returns : jobs of rigs and of recordings, what fails before it begins by the recording's name, and folders of images
-        that no recording.toml speaks of
+    returns : jobs of rigs and of recordings, rows of recordings that fail before they begin, by name, and folders of
+        images that no recording.toml declares
     """
     rigs: dict[str, Job] = {}
     jobs: list[Job] = []
@@ -143,24 +143,24 @@ def make_plan(
             about = Kind.READING
             undeclared = tuple(place for place in undeclared if not _has_views_of(place, recording))
             jobs.append(_job(found, recording, name, options, rigs))
-        except Exception as error:  # whatever is wrong with one recording, the others are measured
+        except Exception as error:  # an error of one recording must not stop the others
             failures[name] = failed(reason_of(error), about)
     needed = {job.rig for job in jobs}
     return [job for path, job in rigs.items() if path in needed], jobs, failures, undeclared
 
 
 def _has_views_of(place: Path, recording: Recording) -> bool:
-    """Do the views that many recordings may share lie in this folder?"""
+    """Are the calibration views, which recordings may share, in this folder?"""
     return recording.views is not None and (recording.folder / recording.views.left).resolve().is_relative_to(place)
 
 
 def _job(found: FoundRecordings, recording: Recording, name: str, options: BatchOptions, rigs: dict[str, Job]) -> Job:
     folder = recording.folder
-    open_pairs(recording)  # raises where there is nothing to measure
+    open_pairs(recording)  # raises if there is nothing to measure
     results = found.results(folder)
     if recording.rig_file is not None:
         return Job("recording", name, str(folder), str(results), str(recording.rig_file), options)
-    # named by the content of all that it depends on
+    # the folder's name is the hash of all inputs of the calibration
     made_from = source_of(recording, options.calibration).provenance.fingerprint[:16]
     rig = found.common / "rigs" / made_from / "rig.h5"
     rigs.setdefault(str(rig), Job("rig", name, str(folder), str(rig.parent), str(rig), options))

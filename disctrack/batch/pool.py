@@ -1,6 +1,6 @@
-"""All jobs, done by processes of this machine or of a cluster: what is ready, what waits, what is tried again.
+"""Distribution of jobs to processes of this machine or of a cluster, with repetition of failed ones.
 
-Every job is done in a process of its own kind: one that crashes or is killed takes its own job with it and no other.
+Each process does one job at a time: if it crashes or is killed, only that job is lost.
 """
 
 from __future__ import annotations
@@ -36,16 +36,16 @@ if TYPE_CHECKING:
     from distributed import Client
 
 CONNECT = 10.0  # [s] for a scheduler to answer
-LOOK = 0.1  # [s] after which Ctrl-C is heard at the latest
-_CLEARING = 2.0  # [s] that processes have to clear up before they are asked once more
+LOOK = 0.1  # [s] between checks for Ctrl-C
+_CLEARING = 2.0  # [s] that processes have to clean up before the next request to end
 
 
 def do_all(rigs: Sequence[Job], recordings: Sequence[Job], pool: Processes | Cluster) -> Iterator[tuple[Job, Row]]:
-    """Do every job; yields each recording that is finished for good. Raises ClusterError.
+    """Do every job; yields each recording with its final row. Raises ClusterError.
 
-    Rigs come first; a recording without its rig fails for the rig's reason. A job at which another batch works is asked
-    for again until that one is done with it. A job whose process died gets a second try at the end, alone, when there
-    is most memory.
+    Rigs come first; a recording whose rig failed fails for the same reason. A job that another batch is working on is
+    submitted again until that batch is done. A job whose process died is repeated once at the end, alone, with the most
+    memory available.
     """
     no_rig = {rig.rig: row["reason"] for rig, row in _finished(rigs, pool) if row["status"] == FAILED}
     for job in recordings:
@@ -55,7 +55,7 @@ def do_all(rigs: Sequence[Job], recordings: Sequence[Job], pool: Processes | Clu
 
 
 def _finished(jobs: Sequence[Job], pool: Processes | Cluster) -> Iterator[tuple[Job, Row]]:
-    """Do the jobs, as many side by side as the pool can; yields each as it ends for good."""
+    """Do the jobs in parallel; yields each with its final row when it ends."""
     running, died, again = {pool.submit(job): job for job in jobs}, list[Job](), list[Job]()
     while running:
         for future in wait(running, LOOK, FIRST_COMPLETED).done:
@@ -72,35 +72,35 @@ def _finished(jobs: Sequence[Job], pool: Processes | Cluster) -> Iterator[tuple[
 
 
 def _result(future: Future[Row]) -> Row:
-    """Row of a job that has ended. Raises ClusterError where nothing further can be done."""
+    """Row of a job that has ended. Raises ClusterError if the batch cannot continue."""
     try:
         return future.result()
-    except CancelledError as error:  # not by us
+    except CancelledError as error:  # by the scheduler
         said = "the connection to the cluster's scheduler was lost. What is finished is kept"
         raise ClusterError(f"{said}; the same command continues.") from error
     except OSError as error:  # no memory, or no more processes allowed
         return failed(f"no process could be started for it: {reason_of(error)}")
-    except Exception as error:  # a cluster's machines were lost too often, or could not even begin
+    except Exception as error:  # the machines of a cluster were lost too often, or could not start the job
         return failed(f"it could not be done ({type(error).__name__}: {' '.join(str(error).split())[:300]}).")
 
 
 class Processes:
-    """Processes of this machine, a thread for each, which gives it one job after the other."""
+    """Processes of this machine, each with a thread that sends it one job after the other."""
 
     def __init__(self, size: int) -> None:
         self._threads = ThreadPoolExecutor(size, thread_name_prefix="batch")
-        self._own = threading.local()  # the process that a thread keeps
+        self._own = threading.local()  # the process of a thread
         self._context = Spawn()
         self._ends = False
         self._folder = tempfile.TemporaryDirectory(prefix="disctrack-")
         self._said = (Path(self._folder.name) / str(i) for i in itertools.count())
 
     def submit(self, job: Job) -> Future[Row]:
-        """Begin a job; its future raises OSError where no process can be started for it."""
+        """Submit a job; its future raises OSError if no process can be started."""
         return self._threads.submit(self.done, job)
 
     def done(self, job: Job) -> Row:
-        """Do a job in this thread's process; its row says where that ended before the job did, and why."""
+        """Do a job in this thread's process; if the process dies, the row is DIED with the reason."""
         if self._ends:
             return outcome(DIED, "the batch ended")
         process, jobs, said = getattr(self._own, "kept", None) or self._begun()
@@ -114,18 +114,18 @@ class Processes:
         return row
 
     def _begun(self) -> tuple[SpawnProcess, Connection, Path]:
-        """A new process, what it is told jobs by, and the file for whatever its libraries print. Raises OSError."""
+        """A new process, the connection for jobs, and the file for its printed output. Raises OSError."""
         (jobs, its_end), said = self._context.Pipe(), next(self._said)
         process = self._context.Process(target=_work, args=(its_end, said))
         process.start()
-        its_end.close()  # with the process its own goes, too: that ends what waits for an answer
+        its_end.close()  # so that the connection closes when the process ends, which ends `recv`
         return process, jobs, said
 
     def close(self) -> None:
-        """End in order what still runs."""
+        """End running processes after they have cleaned up."""
         self._ends = True
         self._threads.shutdown(wait=False, cancel_futures=True)
-        # more than once: where a process was, the request may have been swallowed
+        # repeatedly: code that a process was running may have suppressed the request
         for ask in (*[SpawnProcess.terminate] * 4, SpawnProcess.kill):
             living = [process for process in self._context.started if process.is_alive()]
             for process in living:
@@ -140,28 +140,28 @@ class Cluster:
     """Workers of a dask.distributed scheduler. Each of them must see the recordings under the same paths."""
 
     def __init__(self, address: str) -> None:
-        """Raises ClusterError if dask.distributed is not installed or nobody answers."""
+        """Connect. Raises ClusterError if dask.distributed is not installed or no scheduler answers."""
         self._client = connect(address)
-        self._executor = self._client.get_executor(pure=False)  # a job that is tried again is another task
+        self._executor = self._client.get_executor(pure=False)  # a repeated job is a new task
 
     def submit(self, job: Job) -> Future[Row]:
-        """Begin a job; its future raises what is wrong with the cluster."""
+        """Submit a job; its future raises errors of the cluster."""
         future: Future[Row] = self._executor.submit(do_alone, job)
         return future
 
     def close(self) -> None:
-        """End in order what still runs."""
+        """Cancel running jobs and disconnect."""
         with contextlib.suppress(Exception):  # the scheduler may have gone
             self._executor.shutdown(wait=False)
             self._client.close()
 
 
 def connect(address: str) -> Client:
-    """Client of the scheduler. Raises ClusterError if dask.distributed is not installed or nobody answers."""
+    """Client of the scheduler. Raises ClusterError if dask.distributed is not installed or no scheduler answers."""
     remedy = "Install disctrack[cluster], here and on the cluster's machines, or leave --cluster out."
     with told_as(ClusterError, "--cluster needs dask.distributed", ImportError, then=remedy):
         import distributed
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what matters of it is told here
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # relevant errors are reported by ClusterError
     remedy = "Give the address that dask-scheduler printed, e.g. tcp://host:8786."
     said = f"--cluster {address}: no scheduler answers"
     with told_as(ClusterError, said, OSError, ValueError, TypeError, then=remedy):
@@ -173,14 +173,14 @@ def connect(address: str) -> Client:
 
 
 def do_alone(job: Job) -> Row:
-    """Do a job on one of a cluster's machines, in a process of its own."""
-    multiprocessing.current_process().daemon = False  # dask's workers are, and Python allows daemons no processes
+    """Do a job on a machine of the cluster, in a separate process."""
+    multiprocessing.current_process().daemon = False  # dask's workers are daemons, which may not start processes
     with contextlib.closing(Processes(1)) as here:
         return here.done(job)
 
 
 def _why_it_ended(process: SpawnProcess, said: Path) -> str:
-    """Signal or exit code, and the last that it said."""
+    """Signal or exit code, and the end of its printed output."""
     process.join()
     words = said.read_text("utf-8", "replace").split() if said.exists() else []
     code = process.exitcode
@@ -194,23 +194,23 @@ def _why_it_ended(process: SpawnProcess, said: Path) -> str:
 
 
 def _work(jobs: Connection, said: Path) -> None:
-    """In a new process: what its libraries print goes into a file, and it ends with the batch that started it."""
+    """Main loop of a new process: redirect printed output to a file, end with the parent, do jobs."""
     signal.signal(signal.SIGTERM, _stop)
     output = os.open(said, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
     for stream in (1, 2):
         os.dup2(output, stream)
-    cv2.setNumThreads(1)  # the others have the cores
+    cv2.setNumThreads(1)  # the other cores are used by other processes
     end_with_parent()
     while True:
-        job = jobs.recv()  # struck here, it ends in order, and gives back what it has of the system
+        job = jobs.recv()  # if ended here by SIGTERM, the process exits normally and releases its resources
         try:
             row = do(job)
-        except SystemExit:  # half-written files are gone
+        except SystemExit:  # after half-written files were removed
             signal.signal(signal.SIGTERM, signal.SIG_DFL)
             signal.raise_signal(signal.SIGTERM)
         jobs.send(row)
 
 
 def _stop(number: int, frame: FrameType | None) -> None:
-    """Leave by way of the blocks that remove half-written files."""
+    """Raise SystemExit, so that `finally` blocks remove half-written files."""
     sys.exit(128 + number)

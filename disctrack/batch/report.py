@@ -1,4 +1,4 @@
-"""A batch as a report: it links the single reports, compares the recordings, and says what is wrong with some."""
+"""Report of a batch: links to the single reports, comparison of the recordings, and their problems."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -11,7 +11,7 @@ from disctrack.frames import CAMERAS
 from disctrack.numbers import measured, probability, rounded
 from disctrack.report.blocks import Listing, Markup, Report, Section
 
-SAID = {SKIPPED: "measured before"}  # which is read long after the batch that found it done
+SAID = {SKIPPED: "measured before"}  # words for a status whose name only suits the running batch
 
 
 def report_of(
@@ -21,10 +21,10 @@ def report_of(
     together: str = "",
     files: Sequence[Path] = (),
 ) -> Report:
-    """All of a batch.
+    """Report of all recordings of a batch.
 
-    repeats : as `repeats_of` gives them; others : findings that are not about single recordings
-    together : page of the diagnosis of all, relative to the batch's own, where there is one
+    repeats : from `repeats_of`; others : findings that do not belong to a single recording
+    together : page of the diagnosis of all, relative to that of the batch; "" if there is none
     """
     header = ("recording", "", "status", "pairs", *(f.label for f in FITTED), "rms (px)", "χ²", "diagnosis")
     classes = [row["status"].split()[0] for row in rows]
@@ -52,7 +52,7 @@ def report_of(
 
 
 def counts(rows: Sequence[Row]) -> dict[str, int]:
-    """How many recordings have which status."""
+    """Number of recordings of each status."""
     statuses = [row["status"] for row in rows]
     return {status: statuses.count(status) for status in (MEASURED, SKIPPED, FAILED, NOT_MEASURED)}
 
@@ -73,7 +73,7 @@ def _verdict(rows: Sequence[Row]) -> str:
 
 
 def _noticed(rows: Sequence[Row]) -> Iterator[Finding]:
-    """Why recordings have no result, or one that is not all it could be."""
+    """Reasons of recordings with missing or incomplete results."""
     for row in (row for row in rows if row["reason"]):
         severity = max(Severity.WARNING, Severity[(row["severity"] or "note").upper()])
         severity = Severity.REFUSAL if row["status"] in (FAILED, NOT_MEASURED) else severity
@@ -127,7 +127,7 @@ def _cells(row: Row) -> list[str]:
 
 
 def _with_sigma(row: Row, fitted: Fitted) -> str:
-    """A fitted number, with the chi-square of its model where that says that the number is not the whole story."""
+    """A fitted number with its sigma, and the reduced chi-square of its model if it has one."""
     value, sigma = row[fitted.column], row[fitted.sigma]
     if value is None or sigma is None:
         return "–"

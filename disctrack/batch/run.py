@@ -1,6 +1,6 @@
-"""A batch from end to end: find, plan, do, sum up.
+"""A complete batch: find recordings, plan jobs, do them, write the summary.
 
-The summary has a row for each recording, as JSON and as CSV, merged from all who took part.
+The summary has one row per recording, as JSON and as CSV, merged from all processes and shards.
 """
 
 import contextlib
@@ -38,32 +38,32 @@ from disctrack.trajectory.file import read_provenance
 
 INTERRUPTED = "interrupted before it was done"
 SCHEMA, SCHEMA_VERSION = "disctrack batch summary", 1
-TOGETHER = "together/diagnosis.html"  # of all recordings, below the folder of the summary
+TOGETHER = "together/diagnosis.html"  # diagnosis of all recordings, relative to the folder of the summary
 
 
 @dataclass(frozen=True)
 class BatchOutcome:
-    """What a batch did."""
+    """Result of a batch."""
 
-    rows: tuple[Row, ...]  # of the recordings that were this batch's to do
-    files: tuple[Path, ...]  # summary.json, summary.csv, repeats.csv, index.html; none where they could not be written
-    problems: tuple[str, ...]  # besides those of single recordings
+    rows: tuple[Row, ...]  # of the recordings of this batch or shard
+    files: tuple[Path, ...]  # summary.json, summary.csv, repeats.csv, index.html; none if they could not be written
+    problems: tuple[str, ...]  # other than those of single recordings
     interrupted: bool = False
     together: str = ""  # verdict of the diagnosis of all recordings together
-    undeclared: tuple[str, ...] = ()  # folders of images that no recording.toml speaks of
+    undeclared: tuple[str, ...] = ()  # folders of images that no recording.toml declares
 
     @property
     def failed(self) -> bool:
-        """Some recording has no result, or the summary none."""
+        """True if a recording has no result, or the batch has a problem."""
         return bool(self.problems) or any(row["status"] in (FAILED, NOT_MEASURED) for row in self.rows)
 
     @property
     def incomplete(self) -> bool:
-        """Some recording was measured, but not all of it could be used."""
+        """True if some results of a recording are missing or doubtful."""
         return any(row["reason"] for row in self.rows)
 
     def report(self) -> Report:
-        """What became of the recordings."""
+        """Report of the recordings and the problems."""
         others = [*of_kind(Kind.OTHER, Severity.WARNING, self.problems)]
         others += of_kind(
             Kind.OTHER, Severity.NOTE, [f"{name}: left out, images and no {FILE_NAME}" for name in self.undeclared]
@@ -84,13 +84,13 @@ def run_batch(
 ) -> BatchOutcome:
     """Measure all recordings at and below `folders`.
 
-    output : folder for all results, in the order of the recordings' own folders; without it, each recording's own
-    `results`, and `batch_results` in the deepest folder common to all
-    side_by_side : processes; without it, one per core
+    output : folder for all results, with subfolders as the recordings have; by default, `results` in each recording,
+    and `batch_results` in the deepest folder common to all
+    side_by_side : number of processes; by default one per core
     shard : (i, n), for every n-th recording from the i-th (1 to n) on
     cluster : address of a dask.distributed scheduler
-    Raises RecordingError if there is nothing to measure, OutputError, ClusterError. What is wrong with one recording
-    is in its row.
+    Raises RecordingError if there is nothing to measure, OutputError, ClusterError. Errors of single recordings are
+    reported in their rows.
 
         >>> run_batch(["clip"], side_by_side=1).rows[0]["pairs_measured"]
         300
@@ -98,7 +98,7 @@ def run_batch(
     options = options or BatchOptions()
     cores = default_threads()
     n = side_by_side or cores
-    # before the work: a wrong address must be told at once
+    # before the work, so that a wrong address is reported at once
     pool = Processes(n) if cluster is None else Cluster(cluster)
     with contextlib.closing(pool):
         found = find_recordings(folders, output)
@@ -109,13 +109,13 @@ def run_batch(
         mine = found.recordings[first - 1 :: step]
         rigs, jobs, records, undeclared = make_plan(found, mine, options)
         if cluster is None:
-            # cores that no other recording uses read images ahead
+            # cores that are not used by other recordings read images ahead
             threads = max(1, cores // max(1, min(n, len(jobs))))
             jobs = [replace(job, threads=threads) for job in jobs]
         stopped = _do(rigs, jobs, records, pool)
     for job in jobs:
         records.setdefault(job.name, outcome(NOT_MEASURED, stopped))
-    whole = shard is None  # or else whoever sums up the shards
+    whole = shard is None  # only then the diagnosis of all together is made here
     done = _summed_up(found, mine, records, options, stopped == INTERRUPTED, n if whole else 0)
     return replace(done, undeclared=tuple(os.path.relpath(place, found.base) for place in undeclared))
 
@@ -123,13 +123,13 @@ def run_batch(
 def summarise_batch(
     folders: Sequence[Path], options: BatchOptions | None = None, output: str | Path | None = None
 ) -> BatchOutcome:
-    """The summary of what lies on the disk; nothing is measured. Raises RecordingError."""
+    """Write the summary of the results on the disk, without measuring. Raises RecordingError."""
     found = find_recordings(folders, output)
     return _summed_up(found, found.recordings, {}, options or BatchOptions(), False, default_threads())
 
 
 def _do(rigs: list[Job], jobs: list[Job], records: dict[str, Row], pool: Processes | Cluster) -> str:
-    """Fill `records` with what becomes of the recordings; returns why some have none."""
+    """Do the jobs and put their rows into `records`; returns why the batch stopped early, otherwise ""."""
     n = len(jobs) + len(records)
     try:
         with progress_bar("batch", len(jobs), "recording") as advance:
@@ -152,7 +152,7 @@ def _summed_up(
     interrupted: bool,
     processes: int,
 ) -> BatchOutcome:
-    """Processes : for the diagnosis of all together; 0: not now."""
+    """Diagnosis of all together and summary; processes : for that diagnosis, 0 to omit it."""
     problems = [f"not searched: {problem}" for problem in found.problems]
     said = ""
     if options.together and processes and not interrupted:
@@ -161,12 +161,12 @@ def _summed_up(
             said = diagnose_all(found.common, measured, processes)
         except AnalysisError as error:
             problems.append(f"together: {error}")
-        except KeyboardInterrupt:  # what was measured is summed up all the same
+        except KeyboardInterrupt:  # the summary is written nevertheless
             interrupted = True
     files: tuple[Path, ...] = ()
     try:
         rows, files = write_summary(found, records, options)
-    except OutputError as error:  # the results themselves may be safe all the same
+    except OutputError as error:  # the results of the recordings may be complete nevertheless
         problems.append(str(error))
         rows = rows_of(found, records)
     files += (found.common / TOGETHER,) if said else ()
@@ -176,11 +176,11 @@ def _summed_up(
 
 
 def diagnose_all(folder: Path, rows: Sequence[Row], processes: int) -> str:
-    """Verdict of one diagnosis of all measured trajectories, made in a folder beside the summary unless it is there.
+    """Verdict of one diagnosis of all measured trajectories, reused if it exists in its folder below the summary.
 
-    Raises AnalysisError where there is none.
+    Raises AnalysisError if it is not possible.
     """
-    from disctrack.diagnosis.together.stage import run_together  # draws figures: only where they are wanted
+    from disctrack.diagnosis.together.stage import run_together  # imports the figures, which few batches need
 
     trajectories = [folder / row["trajectory"] for row in rows if row["trajectory"]]
     if len(trajectories) < 2:
@@ -188,12 +188,12 @@ def diagnose_all(folder: Path, rows: Sequence[Row], processes: int) -> str:
     try:
         whole = (folder / TOGETHER).parent
         return run_together(trajectories, whole, overwrite=True, reuse=True, processes=processes).verdict
-    except Exception as error:  # the single results are worth more than their combination
+    except Exception as error:  # must not prevent the summary of the single results
         raise AnalysisError(f"the recordings could not be diagnosed: {reason_of(error)}") from error
 
 
 def rows_of(found: FoundRecordings, records: Mapping[str, Row]) -> list[Row]:
-    """A row for every recording: from `records` (by name) where it took part now, else from what lies on the disk."""
+    """A row for every recording: from `records` (by name) if it is there, otherwise from the disk."""
     rows = []
     for folder in found.recordings:
         name = found.name(folder)
@@ -203,7 +203,7 @@ def rows_of(found: FoundRecordings, records: Mapping[str, Row]) -> list[Row]:
 
 
 def _on_the_disk(folder: Path, results: Path) -> Row:
-    """With a reason where the declaration is no longer the one that was measured."""
+    """The stored row of a recording, with a reason if its declaration has changed since the measurement."""
     row = read_row(results)
     if row is None:
         return outcome(NOT_MEASURED, "not measured yet, or by another shard that has not come to it")
@@ -217,7 +217,7 @@ def _on_the_disk(folder: Path, results: Path) -> Row:
 
 
 def _row(found: FoundRecordings, folder: Path, name: str, known: Row) -> Row:
-    """All columns; paths relative to the summary's folder."""
+    """The row with all columns, and paths relative to the summary's folder."""
     row: Row = {column: known.get(column) for column in COLUMNS} | {"recording": name}
     paths = {what: found.results(folder) / row[what] for what in PATHS if row[what]}
     paths |= {"folder": folder} | ({"rig": Path(row["rig"])} if row["rig"] else {})
@@ -236,8 +236,8 @@ def write_summary(
 ) -> tuple[list[Row], tuple[Path, ...]]:
     """Write summary.json, summary.csv, repeats.csv and index.html; returns the rows and the files.
 
-    Shards that end at the same time write one after the other, each with all that is on the disk by then: the last one
-    has everything. Raises OutputError.
+    Shards that end at the same time write one after the other, each with all results on the disk: the last summary is
+    complete. Raises OutputError.
     """
     wait = 300.0  # [s] for another process that writes the summary
     said = f"{found.common}: another process has been writing the summary for {wait:g} s"
@@ -274,12 +274,12 @@ def _write(found: FoundRecordings, rows: Sequence[Row], options: BatchOptions) -
 
 
 def with_false_discovery(rows: Sequence[Row]) -> list[Row]:
-    """The rows with the share of false findings among all that are as improbable: the more that look, the more find.
+    """The rows with the false discovery rate of their p values: with many recordings, chance produces small ones.
 
-    Who believes every finding whose share is below 0.05 has 5 % false ones among them on average, if their noise is
-    independent or goes together (Benjamini and Hochberg 1995, Benjamini and Yekutieli 2001).
+    If all findings with a rate below 0.05 are accepted, 5 % of them are false on average, for noise that is independent
+    or positively correlated (Benjamini and Hochberg 1995, Benjamini and Yekutieli 2001).
     """
-    from scipy.stats import false_discovery_control  # only where wanted
+    from scipy.stats import false_discovery_control  # slow to import, and seldom needed
 
     tested = [row for row in rows if row["diagnosis_p_value"] is not None]
     shares = false_discovery_control([row["diagnosis_p_value"] for row in tested])
@@ -288,7 +288,7 @@ def with_false_discovery(rows: Sequence[Row]) -> list[Row]:
 
 
 def as_csv(columns: Iterable[str], rows: Sequence[Row]) -> bytes:
-    """The rows as a table that a spreadsheet shows as it is."""
+    """The rows as a table; text cells are protected from evaluation as formulas."""
     text = io.StringIO()
     writer = csv.DictWriter(text, list(columns))
     writer.writeheader()

@@ -1,4 +1,4 @@
-"""The measured motion of one recording, with what is needed to judge every frame of it."""
+"""The measured motion of one recording, with uncertainties and the status of every frame."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 class FrameStatus(IntEnum):
-    """Why a frame has a pose, or has none; `sentence` is what a report prints.
+    """Whether a frame has a pose, and why not; reports print `sentence`.
 
     >>> bool((read_trajectory("clip").frame_status == FrameStatus.MEASURED).all())
     True
@@ -54,17 +54,17 @@ class FrameStatus(IntEnum):
 
     @property
     def has_pose(self) -> bool:
-        """True where the pose is a number, perhaps with a large sigma."""
+        """True if the frame has a pose, perhaps with a large sigma."""
         return self in (FrameStatus.MEASURED, FrameStatus.ONE_CAMERA, FrameStatus.FEW_MARKERS)
 
     @property
     def looked_for(self) -> bool:
-        """True where a pose was looked for, found or not."""
+        """True if the frame was processed, with or without success."""
         return self not in (FrameStatus.NOT_PROCESSED, FrameStatus.STILL)
 
 
 class MarkerStatus(IntEnum):
-    """Why a dot has a centre, or has none.
+    """Whether a dot has a measured centre, and why not.
 
     >>> MarkerStatus(int(read_trajectory("clip").marker_status[0, 0, 0])).name
     'MEASURED'
@@ -73,18 +73,18 @@ class MarkerStatus(IntEnum):
     MEASURED = 0
     OUTSIDE = 1  # its window leaves the image
     LOW_CONTRAST = 2
-    OCCLUDED = 3  # the grey values do not look like a dot: hidden in part, or a glare edge across it
+    OCCLUDED = 3  # the grey values do not fit a dot: partly hidden, or crossed by the edge of a glare
     NOT_CONVERGED = 4
     BLURRED = 5
-    REJECTED = 6  # disagrees with the other dots of the frame
+    REJECTED = 6  # inconsistent with the other dots of the frame
     NOT_LOOKED_FOR = 7
 
 
 @dataclass(frozen=True, repr=False)
 class Trajectory(Brief):
-    """Pose of the disc in every frame of a recording; always as long as the recording.
+    """Pose of the disc in every frame of a recording; arrays are as long as the recording.
 
-    n frames, m markers. NaN where there is no answer; `frame_status` tells why.
+    n frames, m markers. NaN for missing values; `frame_status` gives the reason.
 
         >>> trajectory = read_trajectory("clip")
         >>> trajectory.q.shape, trajectory.coordinate_sigma.shape
@@ -94,67 +94,67 @@ class Trajectory(Brief):
     read_by: ClassVar[str] = "disctrack.trajectory.file:read_trajectory"
     held_as: ClassVar[str] = "trajectory"
 
-    time: Array  # (n,) [s], mid exposure of frame i is i / frame_rate unless the camera said otherwise
+    time: Array  # (n,) [s] of mid exposure: i / frame_rate for frame i, or the camera's timestamps
     frame: NDArray[np.int64]  # (n,) number of the frame in its sequence
     q: Array  # (n, 6) x, y, z [m], psi, theta, phi [rad] unwrapped
-    pose_covariance: Array  # (n, 6, 6) noise of this frame, in POSE_COMPONENTS (frames.py); calibration not included
+    pose_covariance: Array  # (n, 6, 6) noise of this frame, in POSE_COMPONENTS (frames.py); without calibration
     calibration_sensitivity: Array  # (n, 6, 30) d pose / d RIG_PARAMETERS at fixed pixels; common to all frames
     systematic_covariance: (
-        Array  # (n, 6, 6) what repeats or varies slowly and is not the rig's: dots' misfit beyond noise
+        Array  # (n, 6, 6) constant and slowly varying errors other than the rig's: misfit of the dots beyond noise
     )
     quaternion: Array  # (n, 4) w, x, y, z; body to world, continuous
     frame_status: NDArray[np.uint8]  # (n,) FrameStatus
     reprojection_rms_px: Array  # (n, 2) per camera
     reduced_chi_square: Array  # (n,) of the pose fit
-    markers_px: Array  # (n, 2, m, 2) centres: images of the dots' own centres, not of the ellipses'
+    markers_px: Array  # (n, 2, m, 2) images of the dots' centres, not centres of the ellipses
     markers_covariance_px2: Array  # (n, 2, m, 2, 2)
     markers_residual_px: Array  # (n, 2, m, 2) observed - projected
     marker_status: NDArray[np.uint8]  # (n, 2, m) MarkerStatus
-    disc: Disc  # with the marker centres that were used (refined ones if they were refined)
+    disc: Disc  # with the marker centres that the fits used, refined or declared
     rig: StereoRig
     frame_rate: float  # [Hz]
     gravity: float  # [m/s^2]
     air_density: float = AIR_DENSITY  # [kg/m^3]
-    # Sizes by which the table's plane was moved from the board's to where the disc rolls, as far as their sigmas do not
-    # allow it: height at the origin [m], slopes along x and y. The board is bent, or the table is not flat
+    # Shift of the table's plane from the board to the plane on which the disc rolls, beyond its uncertainty: height at
+    # the origin [m], slopes along x and y. If not zero, the board is bent or the table is not flat
     table_moved: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    findings: tuple[Finding, ...] = ()  # what was noticed when it was measured
+    findings: tuple[Finding, ...] = ()  # of the measurement
 
     def __len__(self) -> int:
         return len(self.time)
 
     def facts(self) -> dict[str, str]:
-        """What a glance should tell (`Brief`)."""
-        told = {"frames": f"{len(self)} at {self.frame_rate:g} Hz", "measured": f"{int(self.measured.sum())}"}
+        """Summary for `repr` (`Brief`)."""
+        shown = {"frames": f"{len(self)} at {self.frame_rate:g} Hz", "measured": f"{int(self.measured.sum())}"}
         good = self.measured
         if good.any():
             theta = np.degrees(self.q[good, 4])
             sigma = np.nanmedian(self.coordinate_sigma[good], axis=0)
-            told |= {
+            shown |= {
                 "theta": f"{theta[0]:.3g} to {theta[-1]:.3g} deg",
                 "sigma": f"{1e6 * sigma[:3].max():.2g} µm, theta {np.degrees(sigma[4]) * 1e3:.2g} mdeg",
             }
-        return told | {"disc": f"{2e3 * self.disc.radius:g} mm, {self.disc.n_markers} dots"}
+        return shown | {"disc": f"{2e3 * self.disc.radius:g} mm, {self.disc.n_markers} dots"}
 
     def to_xarray(self) -> xarray.Dataset:
-        """The trajectory as an `xarray.Dataset` with time, units and both sigmas; the disc's sizes are attributes."""
+        """The trajectory as `xarray.Dataset` with time, units and both sigmas; the disc's sizes are attributes."""
         from disctrack.trajectory.file import to_xarray
 
         return to_xarray(self)
 
     @property
     def looked_for(self) -> Mask:
-        """(n,) True where a pose was looked for, found or not."""
+        """(n,) True if the frame was processed, with or without success."""
         return np.isin(self.frame_status, [int(status) for status in FrameStatus if status.looked_for])
 
     @property
     def measured(self) -> Mask:
-        """(n,) True where there is a pose."""
+        """(n,) True if the frame has a pose."""
         return np.asarray(np.isfinite(self.q).all(axis=1))
 
     @property
     def calibration_covariance(self) -> Array:
-        """(n, 6, 6) part of the pose's covariance that frames share: the rig's, and `systematic_covariance`."""
+        """(n, 6, 6) covariance of pose errors common to frames: from the rig, and `systematic_covariance`."""
         S = self.calibration_sensitivity
         return S @ self.rig.covariance @ np.swapaxes(S, -1, -2) + self.systematic_covariance
 
@@ -165,12 +165,12 @@ class Trajectory(Brief):
 
     @property
     def calibration_sigma(self) -> Array:
-        """(n, 6) standard deviation of q that frames share [m, rad]: from the rig, and systematic."""
+        """(n, 6) standard deviation of the errors of q that are common to frames [m, rad]."""
         return coordinate_sigma(self.q, self.calibration_covariance)
 
 
 def _changed(trajectory: Trajectory, change: Callable[[str, NDArray], NDArray]) -> Trajectory:
-    """With its arrays, all of which have a row for each frame, changed; change : name, array -> array"""
+    """Copy with `change` (name, array -> array) applied to all arrays, which have one row per frame."""
     arrays = {name: value for name, value in vars(trajectory).items() if isinstance(value, np.ndarray)}
     changed: dict[str, Any] = {name: change(name, value) for name, value in arrays.items()}
     return replace(trajectory, **changed)
@@ -182,14 +182,14 @@ def part(trajectory: Trajectory, rows: slice) -> Trajectory:
 
 
 def joined(pieces: Sequence[Trajectory]) -> Trajectory:
-    """Successive parts of one recording as one trajectory; what is not of a frame is as the first has it."""
+    """Successive parts of one recording as one trajectory; fields without frames are those of the first part."""
     return _changed(pieces[0], lambda name, value: np.concatenate([vars(piece)[name] for piece in pieces]))
 
 
 def at_full_length(part: Trajectory, n: int, start: int, timestamps: Array | None = None) -> Trajectory:
-    """The trajectory of frames start.. as one of all n frames; the others are NaN with the status NOT_PROCESSED.
+    """Extend a trajectory of frames start.. to all n frames; the others are NaN with the status NOT_PROCESSED.
 
-    timestamps (n,) [s] where the camera wrote them; otherwise frames are evenly spaced.
+    timestamps (n,) [s] if the camera wrote them; otherwise frames are evenly spaced.
     """
     if len(part) == n:
         return part
@@ -203,7 +203,7 @@ _FILL = {"frame_status": FrameStatus.NOT_PROCESSED, "marker_status": MarkerStatu
 
 
 def among(n: int, start: int, rows: NDArray, fill: float | None = None) -> NDArray:
-    """Rows of frames start.. among those of n frames; of the others NaN, 0 where numbers are whole, or `fill`."""
+    """Rows of frames start.. in an array of n frames; the others are `fill`, by default NaN, or 0 for integers."""
     empty = np.nan if rows.dtype.kind == "f" else 0
     whole = np.full((n, *rows.shape[1:]), empty if fill is None else fill, rows.dtype)
     whole[start : start + len(rows)] = rows
@@ -213,7 +213,7 @@ def among(n: int, start: int, rows: NDArray, fill: float | None = None) -> NDArr
 def coordinate_sigma(q: Array, pose_covariance: Array) -> Array:
     """(n, 6) standard deviations of q (n, 6) from the covariance (n, 6, 6) of POSE_COMPONENTS, in the units of q.
 
-    NaN where q is, or where an angle is free.
+    NaN if q is NaN, or if an angle is undetermined.
     """
     J = euler_jacobian(q[:, 3], q[:, 4])
     rotation = np.einsum("nij,njk,nik->ni", J, pose_covariance[:, 3:, 3:], J)

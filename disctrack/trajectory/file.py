@@ -1,4 +1,4 @@
-"""The trajectory file: HDF5 that explains itself, written whole, and read back equal.
+"""The trajectory file: self-describing HDF5, written completely or not at all; reading restores equal objects.
 
 Layout (axes in brackets): at the root time, frame, x y z psi theta phi with their sigmas, quaternion, pose_covariance,
 reprojection_rms_px, status; groups `markers`, `disc`, `calibration`, and those that later stages add (`write_groups`).
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 SCHEMA = "disctrack trajectory"
 SCHEMA_VERSION = 1
-Details = dict[str, Any]  # numbers of the run that made a trajectory, of JSON's types
+Details = dict[str, Any]  # numbers of the run that made a trajectory, in JSON types
 _DEPENDENCIES = ("numpy", "scipy", "opencv-contrib-python-headless", "h5py", "numba")
 _CONVENTIONS = {
     "frame_convention": "world: k up, table z = 0; origin and heading from the calibration's table view; "
@@ -58,7 +58,7 @@ _CONVENTIONS = {
 @checked
 @dataclass(frozen=True, repr=False)
 class Provenance(Brief):
-    """What a result was made from; equal fingerprints mean that making it again would give it again.
+    """Inputs, settings and software version of a result; equal fingerprints mean equal results.
 
     >>> Provenance("by hand", inputs={}, settings={}).recording
     'by hand'
@@ -66,12 +66,12 @@ class Provenance(Brief):
 
     recording: str  # name
     inputs: Mapping[str, str]  # what -> SHA-256 (hex) of its content
-    settings: Mapping[str, Any]  # everything that was chosen, of JSON's types
+    settings: Mapping[str, Any]  # all of the run, in JSON types
     version: str = field(default_factory=software_version)
 
     @property
     def declared(self) -> dict[str, object]:
-        """What recording.toml said; empty where it is not kept."""
+        """Content of recording.toml; empty if it is not in the settings."""
         kept = self.settings.get("recording")
         return dict(kept) if isinstance(kept, dict) else {}
 
@@ -90,9 +90,9 @@ def write_trajectory(
     overwrite: bool = False,
     details: Details | None = None,
 ) -> None:
-    """Write the whole file, or nothing. Raises OutputError if it exists and may not be overwritten, or cannot be.
+    """Write the whole file, or nothing. Raises OutputError if it exists without `overwrite`, or cannot be written.
 
-    details : numbers of the run (blur, noise, ...), of JSON's types; see `read_details`
+    details : numbers of the run (blur, noise, ...), in JSON types; see `read_details`
 
         >>> trajectory = read_trajectory("clip")
         >>> write_trajectory("copy.h5", trajectory, Provenance("copy", inputs={}, settings={}))
@@ -101,7 +101,7 @@ def write_trajectory(
     """
     path = Path(path)
     refuse_existing(path, overwrite)
-    buffer = io.BytesIO()  # a disk that fills up fails in one plain write, not inside the HDF5 library
+    buffer = io.BytesIO()  # so that a full disk raises an error in one plain write, not inside the HDF5 library
     with h5py.File(buffer, "w", track_order=True) as file:
         write_variables(file, _root_variables(trajectory), _axes(trajectory))
         write_variables(file.create_group("markers", track_order=True), _variables(trajectory, "markers"))
@@ -121,9 +121,9 @@ def write_trajectory(
 
 @checked
 def read_trajectory(path: str | Path) -> Trajectory:
-    """The trajectory that was written. Raises TrajectoryFileError if the file is missing, damaged or another's.
+    """Read a trajectory. Raises TrajectoryFileError if the file is missing, damaged or of another kind.
 
-    path : of the file, or of the folder that holds it, itself or in its `results`
+    path : file, or folder that contains trajectory.h5 or results/trajectory.h5
 
         >>> len(read_trajectory("clip/results/trajectory.h5"))
         300
@@ -135,7 +135,7 @@ def read_trajectory(path: str | Path) -> Trajectory:
 
 
 def trajectory_in(path: Path) -> Path:
-    """A folder stands for the trajectory in it, or in its results. Raises TrajectoryFileError where there is none."""
+    """Path of the trajectory file, for a folder as for a file. Raises TrajectoryFileError if a folder has none."""
     if not path.is_dir():
         return path
     for file in (path / "trajectory.h5", path / "results" / "trajectory.h5"):
@@ -151,11 +151,11 @@ def kept_or_made(
     overwrite: bool = False,
     other: Callable[[Provenance], str] | None = None,
 ) -> tuple[Trajectory, Details, bool]:
-    """Trajectory and details as the file has them if that is a result of this provenance, or made now and written.
+    """Trajectory and details from the file if its provenance is equal; otherwise make and write them.
 
-    overwrite : make it, whatever is there
-    other : what to say of the result of another provenance, which is then refused; without it, that is replaced
-    returns : also, True if it was made now. Raises OutputError for what may not be replaced
+    overwrite : make it in any case
+    other : describes a result of another provenance for the error message; without it, such a result is replaced
+    returns : also True if it was made now. Raises OutputError if an existing file may not be replaced
     """
     if path.exists() and not overwrite:
         try:
@@ -174,7 +174,7 @@ def kept_or_made(
 
 
 def read_provenance(path: Path) -> Provenance:
-    """What the file was made from. Raises TrajectoryFileError."""
+    """Provenance of the file's trajectory. Raises TrajectoryFileError."""
     with _reading(path) as file:
         return Provenance(
             recording=str(file.attrs["recording"]),
@@ -191,7 +191,7 @@ def read_details(path: Path) -> Details:
 
 
 def read_findings(path: Path) -> tuple[Finding, ...]:
-    """What was noticed in the measurement. Raises TrajectoryFileError."""
+    """Findings of the measurement. Raises TrajectoryFileError."""
     with _reading(path) as file:
         return _findings(file)
 
@@ -200,7 +200,7 @@ def _findings(file: h5py.File) -> tuple[Finding, ...]:
     return tuple(finding_from_json(document) for document in json.loads(file.attrs["findings"]))
 
 
-# What a stage adds to a trajectory file: variables, and attributes as of `write_attributes`
+# A stage adds to a trajectory file: variables, and attributes for `write_attributes`
 Group = tuple[Mapping[str, Variable], Mapping[str, Any]]
 
 
@@ -212,7 +212,7 @@ def write_group(
     axes: Mapping[str, Variable] | None = None,
     attributes: Mapping[str, Any] | None = None,
 ) -> None:
-    """Add a stage's group to a trajectory file, or replace it; as `write_groups`.
+    """Add a stage's group to a trajectory file, or replace it, as `write_groups` does.
 
     >>> own = {"own": Variable(np.zeros(300), ("time",), "m/s", "a speed of my own")}
     >>> write_group("clip/results/trajectory.h5", "mine", own)
@@ -221,10 +221,10 @@ def write_group(
 
 
 def write_groups(path: Path, groups: Mapping[str, Group], axes: Mapping[str, Variable] | None = None) -> None:
-    """Add groups of a stage to a trajectory file, all or none; older ones of these names go, and all else stays.
+    """Add groups of a stage to a trajectory file, all or none; they replace groups of the same names.
 
-    The file is written anew without what was replaced: it does not grow, and is whole at every instant.
-    axes : those that only these groups use
+    The file is rewritten without the replaced groups, so it does not grow, and is complete at every instant.
+    axes : used by these groups only
     Raises TrajectoryFileError, OutputError.
     """
     buffer = io.BytesIO()
@@ -242,9 +242,9 @@ def write_groups(path: Path, groups: Mapping[str, Group], axes: Mapping[str, Var
 def read_group(
     path: str | Path, group: str, names: Collection[str] | None = None
 ) -> tuple[dict[str, NDArray], dict[str, Any]]:
-    """Arrays and attributes of one group. Raises TrajectoryFileError that names the groups there are.
+    """Arrays and attributes of one group. Raises TrajectoryFileError that lists the groups of the file.
 
-    names : the arrays that are wanted, where not all are
+    names : of the arrays to read; by default all
 
         >>> variables, attributes = read_group("clip/results/trajectory.h5", "markers")
         >>> variables["centre_px"].shape
@@ -260,7 +260,7 @@ def read_group(
 
 
 def labelled(trajectory: Trajectory) -> tuple[dict[str, Variable], dict[str, Variable], dict[str, float]]:
-    """Variables of the file's root and of its dots (`marker_...`), the axes, and the numbers of the whole recording."""
+    """Variables of the file's root and of its dots (`marker_...`), axes, and numbers of the whole recording."""
     dots = {f"marker_{name}": item for name, item in _variables(trajectory, "markers").items()}
     sizes = _disc_sizes(trajectory.disc).items()
     numbers = _recording_numbers(trajectory) | {f"disc_{name}": value for name, value in sizes}
@@ -268,9 +268,9 @@ def labelled(trajectory: Trajectory) -> tuple[dict[str, Variable], dict[str, Var
 
 
 def to_xarray(trajectory: Trajectory) -> xarray.Dataset:
-    """`xarray.Dataset` with the root of the trajectory file and its dots (`marker_...`).
+    """`xarray.Dataset` of the variables of the file's root and of its dots (`marker_...`).
 
-    Raises OutputError where xarray is not installed.
+    Raises OutputError if xarray is not installed.
     """
     with told_as(OutputError, "to_xarray needs xarray", ImportError, then="Install it: pip install xarray"):
         import xarray
@@ -284,7 +284,7 @@ def to_xarray(trajectory: Trajectory) -> xarray.Dataset:
     return xarray.Dataset({name: described(item) for name, item in variables.items()}, coordinates, numbers)
 
 
-# Numbers of the whole recording: attribute of a Trajectory, and of the file's root
+# Numbers of the whole recording: attribute of Trajectory -> attribute of the file's root
 _NUMBERS = {"frame_rate": "frame_rate_hz", "gravity": "gravity_m_s2", "air_density": "air_density_kg_m3"}
 
 
@@ -313,7 +313,7 @@ def _versions() -> dict[str, str]:
     return {"python": platform.python_version(), **versions(_DEPENDENCIES)}
 
 
-# The file's layout. Of every array of a Trajectory: its place, axes, unit and meaning
+# The file's layout: place, axes, unit and meaning of every array of a Trajectory
 _POSE2 = ("time", "pose_component", "pose_component_2")
 _DOTS = ("time", "camera", "marker", "axis")
 _SPACE2 = ("space_axis", "space_axis_2")
@@ -339,7 +339,7 @@ _LAYOUT: dict[str, tuple[str, tuple[str, ...], str, str]] = {
                                 "m or rad per unit of the parameter", "d pose / d rig parameter at fixed pixels"),
 }  # fmt: skip
 _FLAGS = {"frame_status": flags(FrameStatus), "marker_status": flags(MarkerStatus)}
-# Of the rig: cameras side by side, and axes of what is beside them
+# Of the rig: variables with one row per camera, and axes of the other variables
 _OF_CAMERAS = {
     "camera_matrix": (("camera", *_SPACE2), "px", "pinhole matrix K"),
     "distortion": (("camera", "distortion_coefficient"), "1", "Brown distortion on normalised coordinates"),
@@ -385,12 +385,12 @@ def _axes(trajectory: Trajectory) -> dict[str, Variable]:
 
 
 def _variables(trajectory: Trajectory, group: str = "") -> dict[str, Variable]:
-    """Those of one group, or of the root, as the layout has them."""
+    """Variables of one group, or of the root, according to the layout."""
     found = {}
-    for attribute, (place, dims, unit, told) in _LAYOUT.items():
+    for attribute, (place, dims, unit, meaning) in _LAYOUT.items():
         home, _, name = place.rpartition("/")
         if home == group:
-            found[name] = Variable(getattr(trajectory, attribute), dims, unit, told, _FLAGS.get(attribute, {}))
+            found[name] = Variable(getattr(trajectory, attribute), dims, unit, meaning, _FLAGS.get(attribute, {}))
     return found
 
 
@@ -401,15 +401,15 @@ def _root_variables(trajectory: Trajectory) -> dict[str, Variable]:
         "_sigma_calibration": ("standard deviation that frames share: ", trajectory.calibration_sigma),
     }
     coordinates = {
-        name + ending: Variable(values[:, i], ("time",), unit, what + told)
+        name + ending: Variable(values[:, i], ("time",), unit, what + meaning)
         for ending, (what, values) in kinds.items()
-        for i, (name, (unit, told)) in enumerate(_COORDINATES.items())
+        for i, (name, (unit, meaning)) in enumerate(_COORDINATES.items())
     }
     found = _variables(trajectory)
     return {"frame": found.pop("frame"), **coordinates, **found}
 
 
-# Attributes of the group `disc`: a field of Disc and its unit; tolerances where they are declared
+# Attributes of the group `disc`: a field of Disc and its unit; tolerances only if declared
 _DISC_SIZES = (
     "radius_m", "half_thickness_m", "mass_kg", "marker_diameter_m", "radius_tolerance_m", "thickness_tolerance_m"
 )  # fmt: skip
@@ -464,7 +464,7 @@ def _trajectory(file: h5py.File) -> Trajectory:
 
 
 def _array(file: h5py.File, place: str, unit: str) -> NDArray:
-    """Raises ValueError where numbers are in another unit than this program writes."""
+    """Values of a dataset. Raises ValueError if their unit is not the one that this program writes."""
     found = str(file[place].attrs.get("units", unit))
     if found != unit:
         raise ValueError(f"{place} is in {found!r}; expected {unit!r}")
@@ -472,8 +472,8 @@ def _array(file: h5py.File, place: str, unit: str) -> NDArray:
 
 
 def _read_disc(file: h5py.File) -> Disc:
-    told = file["disc"].attrs
-    sizes = {name.rpartition("_")[0]: float(told[name]) for name in _DISC_SIZES if name in told}
+    stored = file["disc"].attrs
+    sizes = {name.rpartition("_")[0]: float(stored[name]) for name in _DISC_SIZES if name in stored}
     return Disc(marker_centres_body=_array(file, "disc/marker_centres_body", "m"), **sizes)
 
 
@@ -486,17 +486,17 @@ def _rig(group: h5py.Group) -> StereoRig:
 
 
 def _check_values(trajectory: Trajectory) -> None:
-    """Raise ValueError, which names the first frame, where a value can be no measurement."""
+    """Raise ValueError with the first frame whose values are impossible."""
     q, C, posed = trajectory.q, trajectory.pose_covariance, trajectory.measured
     sound: Mask = np.asarray(np.isfinite(C).all(axis=(1, 2)))
     sound[sound] = np.linalg.eigvalsh(C[sound])[:, 0] > 0
     wrong = {
         "time does not increase": ~(np.diff(trajectory.time, prepend=-np.inf) > 0) | ~np.isfinite(trajectory.time),
-        # who writes few digits rounds it
+        # tolerance for files of other programs that write few digits
         "quaternion is no rotation": posed & ~(np.abs(np.linalg.norm(trajectory.quaternion, axis=1) - 1) < 1e-3),
         "pose_covariance is not positive definite": posed & ~sound,
     }
-    # beyond so many metres and radians, no disc was filmed and squares lose all digits
+    # larger values in metres and radians are no pose of a filmed disc, and their squares lose all digits
     wrong |= {f"{name} is of no pose": np.abs(q[:, i]) > (1e3 if i < 3 else 1e6) for i, name in enumerate(COORDINATES)}
     for known, status in ((FrameStatus, trajectory.frame_status), (MarkerStatus, trajectory.marker_status)):
         for strange in np.setdiff1d(status, [*known]):

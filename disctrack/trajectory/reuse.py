@@ -1,4 +1,4 @@
-"""Results of the stages after a trajectory are reused where they are complete, of the same origin and version."""
+"""Reuse of results of the stages after a trajectory, if they are complete and of the same origin and version."""
 
 import contextlib
 import hashlib
@@ -19,22 +19,22 @@ FILE_NAME, SUMMARY = "made_from.json", "summary.txt"
 
 
 def origin_of(trajectory: Path, settings: Mapping[str, Any]) -> str:
-    """SHA-256 (hex) of what a result is made from. Raises TrajectoryFileError."""
+    """SHA-256 (hex) of the trajectory's fingerprint, the settings and the version. Raises TrajectoryFileError."""
     return hash_of([read_provenance(trajectory).fingerprint, dict(settings)])
 
 
 def content_of(name: str) -> str:
-    """Of the file of this name where there is one, or else the name itself."""
+    """Content of the file of this name if it exists, otherwise the name itself."""
     return Path(name).read_text(encoding="utf-8") if Path(name).is_file() else name
 
 
 def hash_of(content: Any) -> str:
-    """SHA-256 (hex) of something of JSON's types, and of the version."""
+    """SHA-256 (hex) of content in JSON types, and of the version."""
     return hashlib.sha256(json.dumps([content, software_version()], sort_keys=True).encode()).hexdigest()
 
 
 def remember(folder: Path, origin: str, report: Report, files: Sequence[Path]) -> None:
-    """Keep beside the results what they were made from, their report, and all of it as summary.txt. OutputError."""
+    """Store origin and report of the results in their folder, and the report as summary.txt. Raises OutputError."""
     names = [file.relative_to(folder).as_posix() for file in files if file.is_relative_to(folder)]
     content = {
         "origin": origin,
@@ -48,7 +48,7 @@ def remember(folder: Path, origin: str, report: Report, files: Sequence[Path]) -
 
 
 def reusable(folder: Path, origin: str) -> Report | None:
-    """The report of the results in the folder, if they are all there and of this origin; None otherwise."""
+    """The report of the results in the folder, if all files exist and are of this origin; otherwise None."""
     try:
         content = _content(folder)
         whole = content["origin"] == origin and all((folder / name).is_file() for name in content["files"])
@@ -58,9 +58,9 @@ def reusable(folder: Path, origin: str) -> Report | None:
 
 
 def refuse_other(report: Path, overwrite: bool) -> None:
-    """Raise OutputError where there is a report that may not be replaced, with what sets it apart from a new one."""
+    """Raise OutputError if a report exists without `overwrite`; the message says how it differs from a new one."""
     other, here = "", software_version()
-    with contextlib.suppress(OSError, ValueError, KeyError, TypeError):  # what does not say who made it
+    with contextlib.suppress(OSError, ValueError, KeyError, TypeError):  # the version is not stated
         made_by = _content(report.parent)["version"]
         other = f", made by version {made_by} (this is {here})"
         if made_by == here:
