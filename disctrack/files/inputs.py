@@ -1,6 +1,6 @@
-"""Inputs are ordinary files of bounded size; and no output replaces one, or lies where the next run takes it for one.
+"""Inputs are regular files of bounded size; outputs neither replace them, nor match the patterns of a recording.
 
-What a command has read, or what a recording names, is kept whatever the user allows.
+Files that a command has read, or that a recording declares, are protected even with --overwrite.
 """
 
 import contextlib
@@ -15,7 +15,7 @@ from pathlib import Path
 from disctrack.errors import OutputError
 
 RECORDING_FILE = "recording.toml"
-MOST_TEXT = 16 << 20  # [bytes] of a file that people write, or a camera beside its frames; real ones have 100 kB
+MOST_TEXT = 16 << 20  # [bytes] of a text file, written by people or by a camera with its frames; real ones have 100 kB
 MOST_IMAGE = 1 << 30  # [bytes] of a file with one image
 _KINDS = {
     stat.S_IFIFO: "a named pipe", stat.S_IFCHR: "a device", stat.S_IFBLK: "a device", stat.S_IFSOCK: "a socket",
@@ -24,9 +24,9 @@ _KINDS = {
 
 
 def open_regular(path: Path) -> int:
-    """Descriptor of a file to be read. Raises OSError, at once also before what would make a reader wait for ever.
+    """Descriptor of a file to be read. Raises OSError, also for files on which reading might never end.
 
-    A pipe waits for somebody to write, a device may have no end; a link may lead to either.
+    A pipe waits for a writer, a device may have no end; a link may lead to either.
     """
     descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_BINARY", 0) | getattr(os, "O_NONBLOCK", 0))
     if fault := _not_regular(os.fstat(descriptor)):
@@ -36,7 +36,7 @@ def open_regular(path: Path) -> int:
 
 
 def read_regular(path: Path, most: int) -> bytes:
-    """Content of a file of at most so many bytes. Raises OSError, also where it is no regular file or a larger one."""
+    """Content of a file of at most `most` bytes. Raises OSError, also if it is not a regular file, or is larger."""
     with open(open_regular(path), "rb") as stream:
         content = stream.read(min(os.fstat(stream.fileno()).st_size, most) + 1)
     if len(content) > most:
@@ -45,7 +45,7 @@ def read_regular(path: Path, most: int) -> bytes:
 
 
 def why_not_regular(path: Path) -> str:
-    """What a path leads to instead of a regular file; "" where it leads to one, or to nothing."""
+    """Why a path is not a regular file; "" if it is one, or does not exist."""
     try:
         return _not_regular(path.stat())
     except (OSError, ValueError):
@@ -62,7 +62,7 @@ _read: dict[tuple[int, int], Path] | None = None  # by device and inode; None ou
 
 @contextlib.contextmanager
 def inputs_kept() -> Iterator[None]:
-    """Within the block nothing that `keep` is told of can be replaced. A library's user may do as he likes."""
+    """Within the block, files passed to `keep` cannot be replaced. Outside of commands there is no protection."""
     global _read
     before, _read = _read, {}
     try:
@@ -72,7 +72,7 @@ def inputs_kept() -> Iterator[None]:
 
 
 def keep(path: Path) -> None:
-    """Tell of a file that the command reads and does not itself make."""
+    """Register a file that the command reads and does not write itself."""
     if _read is not None and (file := _file(path)) is not None:
         _read[file] = path
 
@@ -80,25 +80,25 @@ def keep(path: Path) -> None:
 def refuse_input(path: Path) -> None:
     """Raise OutputError if an output of this name would replace an input, also through links or another spelling."""
     file = _file(path)
-    # an input that the command has written anew is another file: the inode of the old one may be anybody's since then
+    # an input that the command has rewritten is another file: the old inode may have been reused
     if _read and file in _read and _file(_read[file]) == file:
         also = f" (as {_read[file]})" if _read[file] != path else ""
         raise OutputError(f"{path}: is read by this command{also}, and no output replaces an input. {_ELSEWHERE}")
-    if told := _claimed(path):
-        raise OutputError(f"{path}: {told}. {_ELSEWHERE}")
+    if reason := _claimed(path):
+        raise OutputError(f"{path}: {reason}. {_ELSEWHERE}")
 
 
 _ELSEWHERE = "Choose another place with -o."
 
 
 def _name(path: Path) -> str:
-    """The place that a path means, without links on the way to it; the last step may be a link itself."""
+    """Absolute path with links in its folders resolved; the last component may be a link."""
     path = Path(os.path.abspath(path))
     return os.path.normcase(os.path.join(os.path.realpath(path.parent), path.name))
 
 
 def _file(path: Path) -> tuple[int, int] | None:
-    """The file itself, whatever its names; None where there is none."""
+    """Device and inode, equal for all names of a file; None if it does not exist."""
     try:
         status = path.stat()
     except (OSError, ValueError):
@@ -107,9 +107,9 @@ def _file(path: Path) -> tuple[int, int] | None:
 
 
 def _claimed(path: Path) -> str:
-    """Why a recording in the folders above wants no output there: it names the path, or is it, or has its frames there.
+    """Why a recording in a parent folder forbids this output; "" if none does.
 
-    "" where there is none.
+    The path is its recording.toml, matches a pattern in it, or is in the folder of its frames.
     """
     place = Path(_name(path))
     for folder in place.parents:
@@ -124,7 +124,7 @@ def _claimed(path: Path) -> str:
 
 
 def _patterns(file: Path) -> list[str]:
-    """A recording.toml and what it names, as absolute patterns; itself alone where it cannot be read."""
+    """A recording.toml and the files that it declares, as absolute patterns; only itself if it cannot be read."""
     found = [glob.escape(str(file))]
     with contextlib.suppress(OSError, ValueError, RecursionError, AttributeError):  # AttributeError: no text there
         declared = tomllib.loads(read_regular(file, MOST_TEXT).decode())

@@ -1,4 +1,4 @@
-"""JSON as every file of ours has it: no NaN, no infinity, no NumPy."""
+"""Strict JSON for all our files: without NaN, infinity and NumPy types."""
 
 import json
 from dataclasses import is_dataclass
@@ -8,9 +8,9 @@ import numpy as np
 
 
 def plain(item: Any) -> Any:
-    """The item of JSON's types: null for a number that is not finite, lists for tuples and arrays, text for keys.
+    """The item in JSON types: None for numbers that are not finite, lists for tuples and arrays, text for keys.
 
-    Of a dataclass, its fields by their names.
+    A dataclass becomes a dictionary of its fields.
     """
     if isinstance(item, dict) or is_dataclass(item):
         return {str(key): plain(value) for key, value in (item if isinstance(item, dict) else vars(item)).items()}
@@ -24,10 +24,10 @@ def plain(item: Any) -> Any:
 
 
 def json_text(document: Any, indent: int | None = None) -> str:
-    """The document as JSON that every reader takes."""
+    """The document as strict JSON."""
     return json.dumps(plain(document), indent=indent, allow_nan=False)
 
 
 def json_file(document: Any) -> bytes:
-    """The document as a file for people and programs."""
+    """The document as content of an indented file."""
     return (json_text(document, indent=1) + "\n").encode()

@@ -1,6 +1,6 @@
-"""Arrays with names, axes and units in HDF5: what xarray, netCDF and pandas open without being told anything.
+"""Arrays with names, axes and units in HDF5, readable by xarray, netCDF and pandas without options.
 
-Every axis is a dimension scale at the root of the file; a variable of any group refers to it by name.
+Every axis is a dimension scale at the root of the file; variables of all groups refer to it by name.
 """
 
 from collections.abc import Collection, Mapping
@@ -18,7 +18,7 @@ class Variable:
 
     data: ArrayLike
     dims: tuple[str, ...]
-    units: str  # "1" where there is none
+    units: str  # "1" if dimensionless
     long_name: str
     attributes: Mapping[str, Any] = field(default_factory=dict)
 
@@ -26,7 +26,7 @@ class Variable:
 def write_variables(
     group: h5py.Group, variables: Mapping[str, Variable], axes: Mapping[str, Variable] | None = None
 ) -> None:
-    """Datasets with dimension scales. Axes that the file's root does not have yet come from `axes`.
+    """Write datasets with dimension scales. Axes that the file's root does not have yet are taken from `axes`.
 
     Raises ValueError if an axis is unknown or a length does not fit.
     """
@@ -45,10 +45,10 @@ def write_variables(
 
 
 def copy_without(source: h5py.File, target: h5py.File, groups: Collection[str], axes: Collection[str]) -> None:
-    """All of a file but these groups of its root, and those of these axes that nothing else refers to."""
-    there: list[str] = []
-    source.visit(there.append)
-    kept = [source[path] for path in there if path.partition("/")[0] not in groups]
+    """Copy a file except these groups of its root, and except those of these axes that no other variable uses."""
+    paths: list[str] = []
+    source.visit(paths.append)
+    kept = [source[path] for path in paths if path.partition("/")[0] not in groups]
     axes_of = {
         item.name: [dimension[0].name for dimension in item.dims if len(dimension)]
         for item in kept
@@ -58,7 +58,7 @@ def copy_without(source: h5py.File, target: h5py.File, groups: Collection[str], 
     for name in source:
         if name not in groups and (name not in axes or f"/{name}" in needed):
             source.copy(name, target)
-            # references between scales and datasets mean nothing in another file
+            # references between scales and datasets are invalid in another file
             target[name].attrs.pop("REFERENCE_LIST", None)
     target.attrs.update(source.attrs)
     for name, names in axes_of.items():
@@ -88,19 +88,19 @@ def _create(group: h5py.Group, name: str, variable: Variable) -> h5py.Dataset:
     return dataset
 
 
-# The most that gzip can squeeze: a damaged file that claims more than this times its own size is not read into memory.
+# Above the largest compression ratio of gzip: a dataset larger than this times the file's size is damaged, and not read
 MOST_COMPRESSION = 1100
 
 
 def read_array(dataset: h5py.Dataset) -> NDArray:
-    """Text as str. Raises ValueError if the dataset claims to be larger than the file could hold."""
+    """Values of a dataset, text as str. Raises ValueError if its stated size is larger than the file can hold."""
     if dataset.size * dataset.dtype.itemsize > MOST_COMPRESSION * dataset.file.id.get_filesize():
         raise ValueError(f"{dataset.name} claims {dataset.shape} values, more than the file can hold")
     return dataset.asstr()[()] if h5py.check_string_dtype(dataset.dtype) else dataset[()]
 
 
 def flags(enum: type) -> dict[str, Any]:
-    """CF attributes of an array that holds members of an IntEnum."""
+    """CF attributes of an array of members of an IntEnum."""
     members = list(enum)  # type: ignore[call-overload]
     return {
         "flag_values": np.array([int(member) for member in members], np.uint8),

@@ -1,7 +1,7 @@
-"""TOML files: read with errors that name them; settings as frozen dataclasses from such a tree, and back to text.
+"""TOML files: reading with errors that name the file; conversion to frozen dataclasses, and back to text.
 
 Fields may be bool, int, float, str, tuples, dictionaries by name, and dataclasses; a Path is not part of the file.
-Numbers of a field that is `limited` lie within its limits, all others within +-MOST.
+Numbers are within the limits of a `limited` field, otherwise within +-MOST.
 """
 
 import json
@@ -20,17 +20,17 @@ import numpy as np
 from disctrack.errors import DiscTrackError, SceneError, told_as
 from disctrack.files.inputs import MOST_TEXT, read_regular
 
-MOST = 1e7  # no length, angle, rate, grey value or number of frames of a laboratory is larger in its unit
-NOT_NEGATIVE, POSITIVE = (0.0, MOST), (1 / MOST, MOST)  # of what is positive, the reciprocal is a number, too
+MOST = 1e7  # of a number; lengths, angles, rates, grey values and frame counts of a laboratory are smaller
+NOT_NEGATIVE, POSITIVE = (0.0, MOST), (1 / MOST, MOST)  # the reciprocal of a positive number is within the limits, too
 
 
 def limited(default: Any, limits: tuple[float, float]) -> Any:
-    """Field of a dataclass whose numbers lie within limits."""
+    """Field of a dataclass whose numbers must be within limits."""
     return field(default=default, metadata={"limits": limits})
 
 
 def read_toml(path: Path, error: type[DiscTrackError]) -> dict[str, Any]:
-    """The file's tree. Raises `error` with the file, what is wrong with it, and what to do."""
+    """Content of the file. Raises `error` with the file, the problem, and a remedy."""
     with told_as(error, f"{path}: cannot be read", OSError, then="Give the path of a TOML file."):
         content = read_regular(path, MOST_TEXT)
     try:
@@ -38,7 +38,7 @@ def read_toml(path: Path, error: type[DiscTrackError]) -> dict[str, Any]:
     except (
         ValueError,
         RecursionError,
-    ) as reason:  # no text, no TOML, nested too deeply, a number of thousands of digits
+    ) as reason:  # not text, not TOML, nested too deeply, or a number of thousands of digits
         place = re.search(r"at line (\d+)", str(reason))
         line = content.decode().splitlines()[int(place[1]) - 1].strip()[:80] if place else ""
         hint = " Numbers have a point: 37.5." if re.search(r"= *-?\d+,\d", line) else ""
@@ -52,7 +52,7 @@ def read_toml(path: Path, error: type[DiscTrackError]) -> dict[str, Any]:
 def build(kind: Any, tree: dict[str, Any], where: str, section: str = "") -> Any:
     """Instance of the dataclass `kind` from nested dictionaries; `where` (the file) and `section` are for messages.
 
-    Raises SceneError for an unknown key, naming the nearest known one, and for a value of the wrong kind.
+    Raises SceneError for an unknown key, with the nearest known one, and for a value of the wrong type.
     """
     hints = typing.get_type_hints(kind)
     known = {f.name: f for f in fields(kind) if hints[f.name] is not Path}
@@ -67,7 +67,7 @@ def build(kind: Any, tree: dict[str, Any], where: str, section: str = "") -> Any
 
 
 def _convert(hint: Any, value: Any, where: str, key: str, f: Field) -> Any:
-    """`value` of the field f as the annotation `hint` wants it: number, string, tuple, dataclass, or mapping."""
+    """`value` of the field f converted to its annotation `hint`: number, string, tuple, dataclass, or mapping."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if is_dataclass(hint) and isinstance(value, dict):
         return build(hint, value, where, key)
@@ -120,5 +120,5 @@ def toml_value(value: Any) -> str:
 
 
 def _text(value: str) -> str:
-    # JSON's escapes are TOML's, but for the pairs by which it writes what lies beyond 16 bits, and for DEL
+    # JSON escapes are valid TOML, except surrogate pairs, which are avoided here, and DEL, which TOML must escape
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")

@@ -1,4 +1,4 @@
-"""Files that are either whole or not there: written under another name, closed, flushed to the disk, renamed."""
+"""Files that are either complete or absent: written under a temporary name, flushed to the disk, renamed."""
 
 import contextlib
 import errno
@@ -24,13 +24,13 @@ _REMEDIES = {
 
 @contextlib.contextmanager
 def whole_file(path: Path, suffix: str = "", adds_to_input: bool = False) -> Iterator[Path]:
-    """Path to write to; when the block ends without an error it becomes `path` in one step, otherwise it is removed.
+    """Temporary path to write to; it is renamed to `path` if the block ends without an error, otherwise removed.
 
-    A killed process leaves `<name>.<eight digits>.part`, which is cleared away by the next one that writes into the
-    folder an hour later.
+    A killed process leaves `<name>.<eight digits>.part`. The next process that writes into the folder more than an hour
+    later removes it.
     suffix : end of the temporary name, for writers that derive the format from it
-    adds_to_input : the content is that of the file with something added, as when a stage adds its group
-    Raises OutputError if the disk is full, read-only or not ours, or if `path` is an input (`inputs.refuse_input`).
+    adds_to_input : the file is an input whose content is kept and extended, e.g. by the group of a stage
+    Raises OutputError if the folder is full, read-only or forbidden, or if `path` is an input (`inputs.refuse_input`).
     """
     if not adds_to_input:
         refuse_input(path)
@@ -51,13 +51,13 @@ def whole_file(path: Path, suffix: str = "", adds_to_input: bool = False) -> Ite
 
 
 def write_whole(path: Path, content: bytes | memoryview, adds_to_input: bool = False) -> None:
-    """Write `content` to `path`, whole or not at all. Raises OutputError."""
+    """Write `content` to `path`, completely or not at all. Raises OutputError."""
     with whole_file(path, adds_to_input=adds_to_input) as part, part.open("wb") as stream:
         stream.write(content)
 
 
 def refuse_existing(path: Path, overwrite: bool, what: str = "") -> None:
-    """Raise OutputError where there is something already that may not be replaced; `what` says more of it."""
+    """Raise OutputError if `path` exists and may not be replaced; `what` describes it in the message."""
     if path.exists() and not overwrite:
         raise OutputError(f"{path}: exists{what}. Choose another name or folder, or replace it with --overwrite.")
 
@@ -71,7 +71,7 @@ def make_folder(folder: Path) -> None:
 
 
 def check_writable(folder: Path) -> None:
-    """Create the folder and a file in it for a moment: a long run must not end at the door. Raises OutputError."""
+    """Create the folder and a temporary file in it, to detect errors before a long run. Raises OutputError."""
     make_folder(folder)
     try:
         with tempfile.TemporaryFile(dir=folder):
@@ -81,13 +81,13 @@ def check_writable(folder: Path) -> None:
 
 
 def output_error(path: Path, error: OSError) -> OutputError:
-    """What to tell when `path` cannot be written."""
+    """Error with a remedy, if `path` cannot be written."""
     remedy = _REMEDIES.get(error.errno or 0, f"{error.strerror or error}. Choose another place with -o")
     return OutputError(f"{path}: cannot be written: {remedy}.")
 
 
 def _clear_abandoned(folder: Path) -> None:
-    """Remove half-written files to which nothing was written for an hour: who wrote them was killed."""
+    """Remove half-written files that did not change for an hour: their processes were killed."""
     for part in folder.glob(f"*.{'[0-9a-f]' * 8}.part*"):
         with contextlib.suppress(OSError):
             if time.time() - part.stat().st_mtime > 3600.0:
@@ -95,7 +95,7 @@ def _clear_abandoned(folder: Path) -> None:
 
 
 def _sync_folder(folder: Path) -> None:
-    """The new name reaches the disk, too; not every file system can do that for a folder."""
+    """Flush the new name to the disk, if the file system can do this for a folder."""
     with contextlib.suppress(OSError):
         descriptor = os.open(folder, os.O_RDONLY)
         try:

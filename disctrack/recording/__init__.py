@@ -1,1 +1,1 @@
-"""What a recording declares: `recording.toml` read into frozen dataclasses in SI units."""
+"""The declaration of a recording, `recording.toml`, and readers of its frames."""

@@ -25,20 +25,20 @@ MOST = 100  # dots of a disc; corners or squares along a side of a target
 
 
 class Key(NamedTuple):
-    """What may stand at a key."""
+    """Valid values of a key."""
 
     expected: str  # in words
     fits: Callable[[Any], bool]
-    example: str = ""  # what may stand there, of a key that is needed in its section, where that is there
-    remark: str = ""  # that a first declaration has beside it
+    example: str = ""  # only of a key without a default, which is required if its section is there
+    remark: str = ""  # comment in a generated declaration
 
     @property
     def needed(self) -> bool:
-        """True where nothing may stand for it."""
+        """True if the key has no default."""
         return bool(self.example)
 
     def like(self, example: str, remark: str) -> Key:
-        """The key with an example and a remark."""
+        """The same key with an example and a remark."""
         return self._replace(example=example, remark=remark)
 
 
@@ -51,7 +51,7 @@ def _number(least: float, most: float) -> Key:
 
 
 def _whole(value: object, n: int, least: int, most: float) -> bool:
-    """Is this a list of n whole numbers in a range?"""
+    """True for a list of n whole numbers in a range."""
     return isinstance(value, list) and len(value) == n and all(type(x) is int and least <= x <= most for x in value)
 
 
@@ -92,15 +92,15 @@ _CENTRES = Key(
     _are_centres,
 )
 
-# What declares views of each kind of calibration target.
+# Keys of the calibration views of each kind of target.
 TARGET_KEYS: dict[str, tuple[str, ...]] = {
     "chessboard": ("left", "right", "inner_corners", "square_mm"),
     "charuco": ("left", "right", "squares", "square_mm", "marker_mm", "dictionary"),
 }
 
-# Every key that a recording.toml may hold, in the order of the reference example. Ranges are wide enough for a coin and
-# for a mill stone, narrow enough that a wrong unit or a slip of the pen is told before it becomes a wrong answer.
-# A calibration is either views or a rig; the keys of a target are needed where it is that one.
+# All keys of a recording.toml, in the order of the reference example. Ranges include a coin and a mill stone, but
+# exclude many wrong units and typing errors.
+# A calibration is either views or a rig; the keys of a target are needed if the views show that target.
 KEYS: dict[str, dict[str, Key]] = {
     "": {"name": _LABEL, "case": _LABEL, "surface": _LABEL},
     "cameras": {
@@ -166,16 +166,16 @@ class CalibrationViews:
 
 @dataclass(frozen=True)
 class TableView:
-    """The view whose board lies flat on the table: it defines the lab frame."""
+    """The view in which the board lies flat on the table: it defines the lab frame."""
 
     view: int  # index among the calibration views
-    board_thickness: float  # [m] the printed face lies at this height
-    source: str = "both"  # what tells where the table is: "board", "disc" (where its rim rolls) or "both"
+    board_thickness: float  # [m] height of the printed face
+    source: str = "both"  # the table's plane is determined from: "board", "disc" (path of its rim) or "both"
 
 
 @dataclass(frozen=True, repr=False)
 class Recording(Brief):
-    """What recording.toml declares, in SI units; exactly one of `views` and `rig_file` is given.
+    """Content of recording.toml in SI units; exactly one of `views` and `rig_file` is given.
 
     >>> recording = read_recording("clip")
     >>> recording.frame_rate, recording.gravity
@@ -187,21 +187,21 @@ class Recording(Brief):
     folder: Path
     name: str
     frame_rate: float  # [Hz]
-    exposure: float | None  # [s] of both cameras; None where it is not declared
+    exposure: float | None  # [s] of both cameras; None if not declared
     left: str  # file pattern, or one video file, relative to the folder
     right: str
     disc: Disc
     views: CalibrationViews | None
-    table: TableView | None  # None only where a rig file brings the lab frame with it
+    table: TableView | None  # None only if a rig file defines the lab frame
     rig_file: Path | None
     gravity: float  # [m/s^2]
     board_tolerances: BoardTolerances
-    declared: Mapping[str, Any]  # recording.toml as it was written, for the record kept with the results
-    air_density: float = AIR_DENSITY  # [kg/m^3] round the disc
-    # left, right: file patterns, or folders of images to be averaged, that show the gain and the offset of a camera's
-    # pixels: of an evenly lit surface, and without any light
+    declared: Mapping[str, Any]  # unchanged content of recording.toml, which is stored with the results
+    air_density: float = AIR_DENSITY  # [kg/m^3]
+    # left, right: file patterns or folders of images to be averaged, for the flat field (evenly lit surface) and the
+    # dark image (no light) of a camera
     sensors: tuple[tuple[str | None, str | None], ...] = ((None, None), (None, None))
-    parts: Parts = (None, None)  # left, right: where a camera's images are a part of the files'
+    parts: Parts = (None, None)  # left, right: rectangle of the stored images that is a camera's image
 
     @property
     def file(self) -> Path:
@@ -218,7 +218,7 @@ class Recording(Brief):
 def read_recording(path: str | Path) -> Recording:
     """Recording from its folder (or from its recording.toml).
 
-    Raises RecordingError that names the file, the key, what was found, what was expected and what to do.
+    Raises RecordingError with the file, the key, the value, the expected value and a remedy.
 
         >>> read_recording("clip").disc.n_markers
         6
@@ -262,14 +262,14 @@ def read_recording(path: str | Path) -> Recording:
 
 
 def _air_density(file: Path, air: Mapping[str, float]) -> float:
-    """[kg/m^3] as declared, or in proportion to the pressure at room temperature."""
+    """[kg/m^3] as declared, or proportional to the declared pressure, at room temperature."""
     if "density_kg_m3" in air and "pressure_hPa" in air:
         raise RecordingError(f"{file}: [air] has both pressure_hPa and density_kg_m3. Keep the one you measured.")
     return float(air.get("density_kg_m3", AIR_DENSITY * air.get("pressure_hPa", STANDARD_PRESSURE) / STANDARD_PRESSURE))
 
 
 def _recording_file(path: Path) -> Path:
-    said = f"{path!s:.200}: not a usable path"  # a name too long, or with a null character
+    said = f"{path!s:.200}: not a usable path"  # e.g. a name that is too long, or contains a null character
     with told_as(RecordingError, said, OSError, ValueError, then="Give a recording's folder."):
         if path.is_dir():
             path = path / FILE_NAME
@@ -283,7 +283,7 @@ def _recording_file(path: Path) -> Path:
 
 
 def _refuse_odd(file: Path, declared: Mapping[str, Any]) -> None:
-    """Raise RecordingError for a key that nobody knows, and for a value that cannot be a known one's."""
+    """Raise RecordingError for an unknown key, and for an invalid value."""
     for key, value in declared.items():
         section, entries = (key, value) if key and key in KEYS else ("", {key: value})
         if not isinstance(entries, dict):
@@ -299,7 +299,7 @@ def _refuse_odd(file: Path, declared: Mapping[str, Any]) -> None:
 
 
 def _nearest(name: str, section: str, kind: str = "key") -> str:
-    """What the writer probably meant: a name in the same section first, then anywhere."""
+    """Hint at the name that was probably meant: first in the same section, then in all others."""
     here = list(KEYS[section]) if section or kind == "key" else [s for s in KEYS if s]
     elsewhere = {key: f" of [{home}]" for home, keys in KEYS.items() for key in keys if home}
     for known in (dict.fromkeys(here, ""), elsewhere):
@@ -309,7 +309,7 @@ def _nearest(name: str, section: str, kind: str = "key") -> str:
 
 
 def _refuse_missing(file: Path, declared: Mapping[str, Any]) -> None:
-    """One message names all keys without a default that sections which are there lack."""
+    """Raise RecordingError for a missing section, or with all missing keys that have no default."""
     needed = {section: [key for key, meant in keys.items() if meant.needed] for section, keys in KEYS.items()}
     by_rig, needed["calibration"] = _calibrated_by(declared.get("calibration", {}))
     for section, keys in needed.items():
@@ -324,7 +324,7 @@ def _refuse_missing(file: Path, declared: Mapping[str, Any]) -> None:
 def _shown(value: object) -> str:
     try:
         text = repr(value)
-    except (ValueError, RecursionError):  # integers of thousands of digits, arrays in arrays in arrays
+    except (ValueError, RecursionError):  # integers of thousands of digits, deeply nested arrays
         text = type(value).__name__
     return text if len(text) <= 60 else text[:57] + "..."
 
@@ -344,13 +344,13 @@ def _disc(file: Path, disc: Mapping[str, Any], markers: Mapping[str, Any]) -> Di
 
 
 def _calibrated_by(calibration: Mapping[str, object]) -> tuple[bool, list[str]]:
-    """Is it a rig, and the keys of what it is otherwise: views of a target."""
+    """True if by a rig file, and otherwise the keys of its views."""
     by_rig = "rig" in calibration
     return by_rig, [] if by_rig else list(TARGET_KEYS.get(str(calibration.get("target", "chessboard")), ()))
 
 
 def _refuse_mixed_calibration(file: Path, calibration: Mapping[str, Any]) -> None:
-    """Raise RecordingError for keys of another target, and for views beside a rig."""
+    """Raise RecordingError for keys of another target, and for views in addition to a rig."""
     by_rig, own = _calibrated_by(calibration)
     of_views = dict.fromkeys(key for keys in TARGET_KEYS.values() for key in keys)
     odd = [key for key in of_views if key in calibration and key not in own]
@@ -375,7 +375,7 @@ def _target(file: Path, calibration: Mapping[str, Any]) -> Target:
 
 
 def _tolerances(calibration: Mapping[str, float], table: Mapping[str, float]) -> BoardTolerances:
-    """None for what is not declared; that of the squares needs their size, which a rig file does without."""
+    """Tolerances, None if not declared; that of the squares is relative to their size, which a rig file lacks."""
     lengths = calibration.get("flatness_tolerance_mm"), table.get("board_thickness_tolerance_mm")
     flatness, thickness = (None if length is None else length * 1e-3 for length in lengths)
     square, side = calibration.get("square_tolerance_mm"), calibration.get("square_mm")

@@ -1,4 +1,4 @@
-"""A recording.toml as text: with remarks that help people, and what is left to fill in; and how two of them differ."""
+"""Text of a recording.toml with remarks and with keys to fill in; differences between two declarations."""
 
 import json
 from collections.abc import Iterator, Mapping
@@ -18,10 +18,10 @@ HEADINGS = {  # of the sections, in their order
     "gravity": "",
     "air": "",
 }
-# Sections whose keys with a default hold for another recording of the same disc and board
+# Sections whose optional keys are also valid for another recording of the same disc and board
 ALIKE = ("disc", "calibration", "table")
 
-_MOST_TOLD = 5  # differences that are told one by one
+_MOST_LISTED = 5  # differences; more are only counted
 
 Told = dict[tuple[str, str], tuple[Any, str]]  # (section, key) -> value, None if not known; and a remark
 
@@ -29,16 +29,16 @@ Told = dict[tuple[str, str], tuple[Any, str]]  # (section, key) -> value, None i
 def declaration_text(
     name: str, told: Told, known: Mapping[str, float], example: Mapping[str, Any]
 ) -> tuple[str, tuple[str, ...]]:
-    """Text of the recording.toml, and the keys that nobody told.
+    """Text of the recording.toml, and the keys that are missing.
 
-    told : what is known of this recording;  known : by key;  example : another's, of the same disc and board
+    told : values of this recording;  known : values by key;  example : declaration with the same disc and board
     """
     lines = [
         "# Lengths in mm, masses in g, times in s. Every key: disctrack/docs/recording-toml.md",
         f"name = {toml_value(name)}",
     ]
     missing = []
-    by_rig = {"calibration", "table"} if ("calibration", "rig") in told else set()  # what a rig file stands for
+    by_rig = {"calibration", "table"} if ("calibration", "rig") in told else set()  # sections replaced by a rig file
     for section, heading in HEADINGS.items():
         if section in by_rig - {"calibration"}:
             continue
@@ -61,19 +61,19 @@ def _aligned(text: str, remark: str) -> str:
 
 
 def changed_since(folder: Path, measured: Mapping[str, object]) -> str:
-    """Keys of the folder's recording.toml whose values are no longer those declared when it was measured.
+    """Keys of the folder's recording.toml whose values have changed since the measurement.
 
-    measured : the tree of the declaration that the trajectory file keeps, if it does
-    returns  : "[calibration] square_mm 6.1 (6.0 when it was measured)", several by commas; empty where all is the
-        same, or where there is no declaration that was kept, or can be read
+    measured : declaration stored in the trajectory file; empty if there is none
+    returns  : "[calibration] square_mm 6.1 (6.0 when it was measured)", separated by commas; empty if nothing has
+        changed, if `measured` is empty, or if the file cannot be read
     """
     try:
         now = json.loads(json.dumps(read_toml(folder / FILE_NAME, RecordingError), default=str))
     except (OSError, RecordingError):
         return ""
     found = list(_differences(now, measured)) if measured else []
-    more = [f"and {len(found) - _MOST_TOLD} more"] if len(found) > _MOST_TOLD else []
-    return ", ".join([*found[:_MOST_TOLD], *more])
+    more = [f"and {len(found) - _MOST_LISTED} more"] if len(found) > _MOST_LISTED else []
+    return ", ".join([*found[:_MOST_LISTED], *more])
 
 
 def _differences(now: Mapping[str, object], then: Mapping[str, object], section: str = "") -> Iterator[str]:

@@ -1,1 +1,1 @@
-"""Trajectories, rigs and points in the formats of other programs: a function or two, and a row in `formats`."""
+"""Trajectories, rigs and points in the formats of other programs: per format, functions and a row in `formats`."""

@@ -1,13 +1,13 @@
 """Formats of named arrays: OpenCV's YAML or XML files, and MAT files of version 5 for MATLAB and Octave.
 
-A rig is kept as the arguments of a function: in OpenCV's files under the names of its stereo sample (M1 D1 M2 D2 R T),
-in a MAT file, into which objects cannot be written, under those of MATLAB's own function:
+A rig is stored as the arguments of a function: in OpenCV's files under the names of its stereo sample (M1 D1 M2 D2 R
+T), in a MAT file, which cannot hold objects, under those of MATLAB's function:
 
     s = load('rig.mat');
     stereoParams = stereoParametersFromOpenCV(s.intrinsicMatrix1, s.distortionCoefficients1, s.intrinsicMatrix2, ...
         s.distortionCoefficients2, s.rotationOfCamera2, s.translationOfCamera2, s.imageSize, WorldUnits=s.worldUnits);
 
-Back again: save what stereoParametersToOpenCV returns under these names. MATLAB counts rows before columns.
+For the reverse, save the values of stereoParametersToOpenCV under these names. MATLAB's image size is (rows, columns).
 A trajectory is one struct.
 """
 
@@ -38,7 +38,7 @@ _MAT += ["rotationOfCamera2", "translationOfCamera2"]
 def write_opencv(path: Path, rig: StereoRig) -> None:
     """Write intrinsics and extrinsics; lengths in metres. Raises OutputError.
 
-    M1 D1 M2 D2 R T are what cv2.stereoRectify takes; R_left_world and t_left_world hold the world frame.
+    M1 D1 M2 D2 R T are arguments of cv2.stereoRectify; R_left_world and t_left_world define the world frame.
     """
     with whole_file(path, suffix=path.suffix) as part:
         storage = cv2.FileStorage(str(part), cv2.FILE_STORAGE_WRITE)
@@ -60,11 +60,11 @@ def read_opencv(
 ) -> StereoRig:
     """A rig from one file, or from two (intrinsics.yml and extrinsics.yml of OpenCV's sample).
 
-    image_size : (width, height) [px], needed where the files do not tell it
-    unit : [m] length of the file's unit (0.025 where T is in squares of 25 mm); default: metres if the file says so
-    world_is_table : True if R_left_world and t_left_world are those of the table, k up, whether or not the file says so
+    image_size : (width, height) [px], needed if the files do not contain it
+    unit : [m] length of the file's unit (0.025 if T is in squares of 25 mm); default: metres if the file says so
+    world_is_table : True if R_left_world and t_left_world are those of the table, k up, whatever the file says
 
-    The covariance is zero: such files carry none. Raises RigFileError.
+    The covariance is zero, as such files contain none. Raises RigFileError.
     """
     nodes: dict[str, Any] = {"unit": "", "world_is_table": False}
     for path in paths:
@@ -86,7 +86,7 @@ def read_opencv(
 
 
 def _nodes(path: Path) -> dict[str, Any]:
-    """What a file holds of a rig. Raises RigFileError."""
+    """Entries of a file that belong to a rig. Raises RigFileError."""
     text = content_of(path)
     found: dict[str, Any] = {}
     with told_as(RigFileError, f"{path}: not a stereo rig in OpenCV's YAML, XML or JSON format", Exception):
@@ -103,10 +103,10 @@ def _nodes(path: Path) -> dict[str, Any]:
 
 
 def write_mat(path: Path, trajectory: Trajectory) -> None:
-    """Every variable of the trajectory file's root and the dots, in SI and radians; NaN where there is no answer.
+    """Write all variables of the trajectory file's root and of the dots, in SI and radians; NaN for missing values.
 
     disctrack.q (n, 6) with disctrack.q_names, q_sigma (this frame's noise), q_sigma_calibration (common to all frames);
-    disctrack.units tells the unit of every field. Raises OutputError.
+    disctrack.units holds the unit of every field. Raises OutputError.
     """
     variables, _, numbers = labelled(trajectory)
     disc = {name.removeprefix("disc_"): value for name, value in numbers.items() if name.startswith("disc_")}
@@ -126,25 +126,25 @@ def write_mat(path: Path, trajectory: Trajectory) -> None:
 
 
 def write_stereo_parameters(path: Path, rig: StereoRig) -> None:
-    """Arguments of stereoParametersFromOpenCV in metres; the world frame beside them. Raises OutputError."""
+    """Write arguments of stereoParametersFromOpenCV in metres, and the world frame. Raises OutputError."""
     size = np.array(rig.left.image_size[::-1], float)[None]
     _save(path, {"worldUnits": "m", "imageSize": size} | _numbers(rig, _MAT))
 
 
 def read_stereo_parameters(path: Path, *, unit: float | None = None, world_is_table: bool = False) -> StereoRig:
-    """A rig of such a MAT file.
+    """A rig from a MAT file with these arguments.
 
-    unit : [m] of translationOfCamera2 where the file has no worldUnits that tell it
-    world_is_table : True if the world of R_left_world is the table, k up, whether or not the file says so
+    unit : [m] of translationOfCamera2 if the file has no worldUnits
+    world_is_table : True if the world of R_left_world is the table, k up, whatever the file says
     Raises RigFileError.
     """
     with told_as(RigFileError, f"{path}: not a MAT file of version 5", Exception, then="Save it with -v6 or -v7."):
         found = loadmat(path)
     if "intrinsicMatrix1" not in found:
-        there = ", ".join(name for name in found if not name.startswith("__"))
-        raise RigFileError(f"{path}: holds {there or 'nothing'}; save by name what stereoParametersToOpenCV returns")
-    told = str(np.ravel(found.get("worldUnits", ""))[0]) if np.size(found.get("worldUnits", "")) else ""
-    scale = unit if unit is not None else {"m": 1.0, "mm": 1e-3}.get(told)
+        names = ", ".join(name for name in found if not name.startswith("__"))
+        raise RigFileError(f"{path}: holds {names or 'nothing'}; save by name what stereoParametersToOpenCV returns")
+    stated = str(np.ravel(found.get("worldUnits", ""))[0]) if np.size(found.get("worldUnits", "")) else ""
+    scale = unit if unit is not None else {"m": 1.0, "mm": 1e-3}.get(stated)
     if scale is None:
         raise RigFileError(f"{path}: does not say in which unit translationOfCamera2 is; give it (0.001 for mm)")
     size = array_of(found, "imageSize", (2,), str(path))[::-1]
@@ -165,9 +165,9 @@ def _stereo_rig(
     world_is_table: bool,
     where: str,
 ) -> StereoRig:
-    """A rig kept as OpenCV's functions have it: names of K and D of both cameras, of R and t from left to right.
+    """A rig from arguments of OpenCV's functions; names : of K and D of both cameras, of R and t from left to right.
 
-    Beside them, where the file has them, R_left_world, t_left_world and world_is_table. unit : [m]
+    Also uses R_left_world, t_left_world and world_is_table if found. unit : [m]
     Raises RigFileError.
     """
     *of_cameras, R, t = names
@@ -190,7 +190,7 @@ def _stereo_rig(
 
 
 def _numbers(rig: StereoRig, names: Sequence[str]) -> dict[str, Any]:
-    """The inverse of `_stereo_rig`, in metres: the world beside what stands under `names`."""
+    """The inverse of `_stereo_rig`, in metres: values of `names`, and the world frame."""
     of_cameras = [number for camera in rig.cameras for number in (camera.camera_matrix, np.array([camera.distortion]))]
     numbers = dict(zip(names, (*of_cameras, rig.R_right_left, rig.t_right_left[:, None]), strict=True))
     world = {"R_left_world": rig.R_left_world, "t_left_world": rig.t_left_world[:, None]}

@@ -1,4 +1,4 @@
-"""The table of formats, and conversion by it."""
+"""The table of formats, and conversion between them."""
 
 import os
 from collections.abc import Callable, Iterable, Sequence
@@ -26,7 +26,7 @@ from disctrack.trajectory.exchange.lens import BROWN, within_brown
 from disctrack.trajectory.exchange.rigs import content_of, the_one
 from disctrack.trajectory.file import read_trajectory, trajectory_in
 
-OWN = (".h5", ".nc")  # netCDF-4 is HDF5: other programs go by the second name
+OWN = (".h5", ".nc")  # netCDF-4 is HDF5: other programs recognise it by .nc
 FOUR = BROWN[:4]
 
 
@@ -35,16 +35,16 @@ class Format:
     """One format of another program."""
 
     name: str
-    endings: tuple[str, ...]  # of file names; the longest that fits is meant
+    endings: tuple[str, ...]  # of file names; the longest match counts
     holds: str  # "trajectory", "rig" or "points"
     write: Callable[[Path, Any], object]  # path, Trajectory or StereoRig
-    # path (or `paths`, where a rig may lie in several files) -> StereoRig, or points (n, 2, m, 2); what else it takes
-    # by name may be told by the user: world_is_table, cameras, image_size, unit
+    # path (or `paths`, if a rig may be in several files) -> StereoRig, or points (n, 2, m, 2); its other arguments may
+    # be given by the user: world_is_table, cameras, image_size, unit
     read: Callable[..., Any] | None
-    lost: str  # what of ours it has no place for
-    # Terms of a lens that it holds, by which the others are fitted; None: it holds points without any lens
+    lost: str  # data of ours that it cannot store
+    # Distortion coefficients that it stores, fitted in place of the others; None: points are without distortion
     terms: tuple[str, ...] | None = BROWN
-    mark: str = ""  # text by which a file is told from others of its ending
+    mark: str = ""  # text that distinguishes a file from others with the same ending
 
 
 SIGMAS = "sigmas but one of the place, the rig, the dots in the images"
@@ -76,7 +76,7 @@ ROWS = (
 
 
 class Converted(NamedTuple):
-    """What was written, and what the format could not hold."""
+    """Written files, and notes on data that the format cannot store."""
 
     paths: tuple[Path, ...]
     notes: tuple[str, ...]
@@ -89,15 +89,15 @@ def convert(
     *,
     form: str | None = None,
     overwrite: bool = False,
-    **told: Any,
+    **stated: Any,
 ) -> Converted:
-    """A trajectory, its points or a rig from and to another program's format, by the ending of the target.
+    """Convert a trajectory, its points or a rig from or to another program's format, by the ending of the target.
 
-    source : our trajectory or rig file, a recording's folder, or a foreign rig (two files where it keeps one a camera)
-    form : name of the target's format in `ROWS`, where the ending does not tell
-    told : what a foreign rig does not say of itself: world_is_table, cameras (two names), image_size (width, height)
+    source : our trajectory or rig file, a recording's folder, or a foreign rig (two files if it has one per camera)
+    form : name of the target's format in `ROWS`, if the ending is ambiguous
+    stated : properties missing in a foreign rig file: world_is_table, cameras (two names), image_size (width, height)
         [px], unit [m]
-    Raises DiscTrackError that names the formats there are.
+    Raises DiscTrackError that lists the known formats.
 
         >>> convert("clip/results/rig.h5", "rig.yml").paths
         (PosixPath('rig.yml'),)
@@ -108,11 +108,11 @@ def convert(
         keep(one)
     refuse_existing(path, overwrite)
     refuse_input(path)
-    told = {name: value for name, value in told.items() if value}
+    stated = {name: value for name, value in stated.items() if value}
     if not _is_ours(paths[0]):
-        value = read_foreign(paths, **told)
-    elif told:
-        raise OutputError(f"{_options(told)}: says nothing about {paths[0]}, a file of ours; leave it out")
+        value = read_foreign(paths, **stated)
+    elif stated:
+        raise OutputError(f"{_options(stated)}: says nothing about {paths[0]}, a file of ours; leave it out")
     else:
         value = _own(paths)
     if path.suffix in OWN and form is None:
@@ -132,30 +132,30 @@ def convert(
     return Converted(written, tuple(notes))
 
 
-def read_foreign(paths: Sequence[Path], **told: Any) -> Any:
-    """A StereoRig, or points (n, 2, m, 2) [px], of another program; told: as of `convert`. Raises DiscTrackError."""
+def read_foreign(paths: Sequence[Path], **stated: Any) -> Any:
+    """A StereoRig, or points (n, 2, m, 2) [px], of another program; stated: as in `convert`. Raises DiscTrackError."""
     first = paths[0]
     head = content_of(first)[:4096] if first.suffix in (".csv", ".yaml", ".yml") else ""
     readable = [row for row in ROWS if row.read]
     row = _fitting(readable, first, head)
     if row is None or row.read is None:
         raise OutputError(f"{first}: no file of ours, and no format of this name is read; known are {_known(readable)}")
-    asked = signature(row.read).parameters
-    idle = [word for word in told if word not in asked]
+    accepted = signature(row.read).parameters
+    idle = [word for word in stated if word not in accepted]
     if idle:
         raise OutputError(f"{_options(idle)}: says nothing about {first} as {row.name}; leave it out")
-    return row.read(paths if "paths" in asked else the_one(paths), **told)
+    return row.read(paths if "paths" in accepted else the_one(paths), **stated)
 
 
 def _fitting(rows: Sequence[Format], path: Path, head: str = "") -> Format | None:
-    """The format that a file fits best, by what stands in it, then by its name; None where it fits none."""
+    """The format that matches a file best, by its content, then by its name; None if there is no match."""
     ends = [max((len(e) for e in row.endings if path.name.lower().endswith(e)), default=0) for row in rows]
     ranks = [(len(row.mark) * (row.mark in head), end) for row, end in zip(rows, ends, strict=True)]
     return rows[ranks.index(max(ranks))] if any(max(ranks)) else None
 
 
 def _row_for(path: Path, form: str | None, value: Any) -> Format:
-    """The format to write. Raises OutputError that names those there are."""
+    """The format to write. Raises OutputError that lists the known ones."""
     if isinstance(value, np.ndarray):
         raise OutputError(f"{path}: points are read in Python, with `read_foreign`, and written of a trajectory")
     kinds = ("trajectory", "points", "rig") if isinstance(value, Trajectory) else ("rig",)
@@ -177,9 +177,9 @@ def _known(rows: Iterable[Format]) -> str:
     return ", ".join(f"{row.endings[0]} ({row.name})" for row in rows)
 
 
-def _options(told: Iterable[str]) -> str:
+def _options(stated: Iterable[str]) -> str:
     names = {"world_is_table": "table", "unit": "unit-mm"}
-    return ", ".join(f"--{names.get(word, word).replace('_', '-')}" for word in told)
+    return ", ".join(f"--{names.get(word, word).replace('_', '-')}" for word in stated)
 
 
 def _is_ours(path: Path) -> bool:

@@ -1,4 +1,4 @@
-"""A lens field, or terms that a format has no place for, put into Brown's coefficients that it has."""
+"""Approximation of a lens field, or of coefficients that a format lacks, by Brown's coefficients that it stores."""
 
 from dataclasses import replace
 
@@ -11,10 +11,10 @@ BROWN = ("k1", "k2", "p1", "p2", "k3")
 
 
 def within_brown(rig: StereoRig, terms: tuple[str, ...]) -> tuple[StereoRig, str]:
-    """The rig without a lens field and with no other terms than these, and what that costs, in words.
+    """The rig without a lens field and with these coefficients only, and the error of this in words.
 
-    Of each camera fx, fy, cx, cy and the terms are fitted to where its lens shows the rays of a whole image. Nothing is
-    changed, and nothing said, where the rig needs no more than the terms.
+    Of each camera fx, fy, cx, cy and the coefficients are fitted to the images of rays through the whole image. If the
+    rig needs only these coefficients, it is returned unchanged, with "".
     """
     lost = [name for name in BROWN if name not in terms and any(c.distortion[BROWN.index(name)] for c in rig.cameras)]
     if rig.lens_field is None and not lost:
@@ -28,7 +28,7 @@ def within_brown(rig: StereoRig, terms: tuple[str, ...]) -> tuple[StereoRig, str
 
 
 def _refitted(rig: StereoRig, number: int, terms: tuple[str, ...]) -> tuple[Camera, Array]:
-    """The camera, and by how much (n, 2) [px] it shows the rays of an image elsewhere."""
+    """The fitted camera, and the shifts (n, 2) [px] of the images of rays."""
     camera, field = rig.cameras[number], rig.lens_field
     free = np.array([name not in BROWN or name in terms for name in INTRINSIC_PARAMETERS])
     x, y = (np.linspace(0, size - 1, 40) for size in camera.image_size)
@@ -37,7 +37,7 @@ def _refitted(rig: StereoRig, number: int, terms: tuple[str, ...]) -> tuple[Came
     good = np.isfinite(flat).all(axis=1)
     rays, seen = np.column_stack([flat, np.ones(len(flat))])[good], seen[good]
     values = np.where(free, camera.parameters, 0.0)
-    for _ in range(20):  # steps of Gauss and Newton
+    for _ in range(20):  # Gauss-Newton steps
         found, _, slopes = project_with_jacobians(rays, Camera.from_parameters(values, camera.image_size))
         J = slopes[..., free].reshape(found.size, -1)
         values[free] += np.linalg.lstsq(J, (seen - found).ravel(), rcond=None)[0]

@@ -1,4 +1,4 @@
-"""A trajectory as other programs keep it: tables, points in space and in images, rotations."""
+"""A trajectory in formats of other programs: tables, points in space and in images, rotations."""
 
 import csv
 import io
@@ -21,7 +21,7 @@ from disctrack.trajectory.exchange.rigs import content_of
 
 
 def body_points(trajectory: Trajectory) -> tuple[Array, list[str]]:
-    """World places (n, k, 3) [m] of centre, tips of body axes of one radius, and dots; their names."""
+    """World positions (n, k, 3) [m] of centre, tips of body axes of length radius, and dots; their names."""
     disc = trajectory.disc
     body = np.concatenate([np.zeros((1, 3)), disc.radius * np.eye(3), disc.marker_centres_body])
     labels = ["CENTRE", "AXIS_1", "AXIS_2", "AXIS_3", *(f"DOT_{i}" for i in range(disc.n_markers))]
@@ -35,17 +35,17 @@ def rotations(trajectory: Trajectory) -> Array:
 
 
 def place_sigma_mm(trajectory: Trajectory) -> Array:
-    """(n,) one sigma of the place; -1 in frames without a pose, as programs mark what was not seen."""
+    """(n,) one sigma of the position [mm]; -1, the usual mark of missing points, in frames without a pose."""
     sigma = np.sqrt(np.einsum("nii->n", trajectory.pose_covariance[:, :3, :3]))
     return np.where(trajectory.measured, 1e3 * sigma, -1.0)
 
 
 @checked
 def write_csv(path: str | Path, trajectory: Trajectory, overwrite: bool = False) -> None:
-    """The trajectory as a table for people: millimetres and degrees, one row per frame, empty where unknown.
+    """Write the trajectory as a table in millimetres and degrees, one row per frame, empty if unknown.
 
-    Of every coordinate its value, the sigma of the frame's own noise, and the sigma that all frames share through the
-    calibration. Coordinates have seven decimals however many turns the angles have counted, sigmas seven digits.
+    Columns of every coordinate: value, sigma from the noise of the frame, and sigma from the calibration, common to all
+    frames. Coordinates have seven decimals, whatever the number of turns of an angle; sigmas have seven digits.
 
         >>> write_csv("table.csv", read_trajectory("clip"))
     """
@@ -71,19 +71,19 @@ _UNITS = ("mm", "mm", "mm", "deg", "deg", "deg")
 
 
 def write_c3d(path: Path, trajectory: Trajectory) -> None:
-    """Dots, centre and the tips of the body axes as points in mm, world axes, z up; times at the frame rate.
+    """Write dots, centre and tips of the body axes as points in mm, world axes, z up, at the frame rate.
 
-    The body axes are points one radius from the centre (AXIS_1, AXIS_2 in the face, AXIS_3 out of it), from which any
-    program builds the rigid body; a point's residual is its one-sigma in mm, -1 in frames without a pose. C3D keeps
-    single precision: 1e-4 mm at 1 m. Raises OutputError, also where ezc3d is not installed.
+    The tips are one radius from the centre (AXIS_1, AXIS_2 in the face, AXIS_3 out of it), so that a program can define
+    the rigid body. The residual of a point is one sigma in mm, -1 in frames without a pose. C3D has single precision:
+    1e-4 mm at 1 m. Raises OutputError, also if ezc3d is not installed.
     """
     with told_as(OutputError, f"{path}: C3D needs ezc3d", ImportError, then="Install it: pip install ezc3d"):
         import ezc3d
     points, labels = body_points(trajectory)
     file = ezc3d.c3d()
     described = [_DESCRIPTIONS.get(label, "centre of a dot") for label in labels]
-    told = {"UNITS": ["mm"], "RATE": [float(trajectory.frame_rate)], "LABELS": labels, "DESCRIPTIONS": described}
-    for name, value in told.items():
+    header = {"UNITS": ["mm"], "RATE": [float(trajectory.frame_rate)], "LABELS": labels, "DESCRIPTIONS": described}
+    for name, value in header.items():
         file["parameters"]["POINT"][name]["value"] = value
     data = np.ones((4, len(labels), len(trajectory)))
     data[:3] = np.where(trajectory.measured, 1e3 * np.moveaxis(points, 0, -1).swapaxes(0, 1), np.nan)
@@ -106,10 +106,9 @@ _DESCRIPTIONS = {
 
 
 def write_trc(path: Path, trajectory: Trajectory) -> None:
-    """TRC, the points of motion capture that OpenSim and Pose2Sim read: those of `body_points` in metres.
+    """Write `body_points` in metres as TRC, the motion capture format of OpenSim and Pose2Sim.
 
-    OpenSim's axes are y up: written are (Y, Z, X) of the world, as Pose2Sim turns them. Empty where there is none.
-    Raises OutputError.
+    OpenSim has y up: world (Y, Z, X) are written, as in Pose2Sim. Missing points are empty. Raises OutputError.
     """
     points, labels = body_points(trajectory)
     n, k, rate = len(points), len(labels), f"{trajectory.frame_rate:g}"
@@ -131,10 +130,10 @@ def write_trc(path: Path, trajectory: Trajectory) -> None:
 
 
 def write_qtm(path: Path, trajectory: Trajectory) -> None:
-    """A 6DOF file as Qualisys Track Manager exports a rigid body: DISC, in millimetres and degrees.
+    """Write the rigid body DISC as a 6DOF file of Qualisys Track Manager, in millimetres and degrees.
 
     R = Rx(roll) Ry(pitch) Rz(yaw), and Rot[0...8] is R column by column. Frames count from 1. The residual is one sigma
-    of the place [mm]. A frame without a pose has zeros and residual -1. Raises OutputError.
+    of the position [mm]. A frame without a pose has zeros and residual -1. Raises OutputError.
     """
     known, R = trajectory.measured, rotations(trajectory)
     values = np.zeros((len(known), 18))
@@ -163,9 +162,9 @@ _QTM_COLUMNS = (
 
 
 def write_transformations(path: Path, trajectory: Trajectory) -> None:
-    """XMALab's rigid body: a row for each frame, the matrix (4, 4) from body to world column by column, in millimetres.
+    """Write XMALab's rigid body: one row per frame, the matrix (4, 4) body -> world column by column, in millimetres.
 
-    NaN without a pose. Raises OutputError.
+    NaN in frames without a pose. Raises OutputError.
     """
     T = np.zeros((len(trajectory), 4, 4))
     T[:, :3, :3], T[:, :3, 3], T[:, 3, 3] = rotations(trajectory), 1e3 * trajectory.q[:, :3], 1.0
@@ -183,21 +182,21 @@ _TRANSFORMATION = (
 
 
 def _table(names: Sequence[str], columns: ArrayLike, separator: str = ",") -> bytes:
-    """Heading and numbers (n, names), NaN where there is none; ten digits."""
+    """Heading and numbers (n, names) with ten digits; NaN for missing ones."""
     rows = [separator.join(names), *(separator.join(f"{v:.10g}" for v in row) for row in np.asarray(columns, float))]
     return ("\n".join(rows) + "\n").replace("nan", "NaN").encode()
 
 
 def _write_points(path: Path, points: Array, names: Sequence[str]) -> None:
-    """Points (n, cameras, m, 2) with m names; NaN where a dot has no centre."""
+    """Write points (n, cameras, m, 2) with m names; NaN for missing ones."""
     headings = [f"{name}_cam{c}_{axis}" for name in names for c in range(1, points.shape[1] + 1) for axis in "XY"]
     write_whole(path, _table(headings, points.swapaxes(1, 2).reshape(len(points), -1)))
 
 
 def write_points(path: Path, trajectory: Trajectory) -> None:
-    """XMALab's DOT_i_camJ_X, DOT_i_camJ_Y [px]: dots as the images show them, lens and all, from 0 at the top left.
+    """Write XMALab's DOT_i_camJ_X, DOT_i_camJ_Y [px]: dots in the images, with distortion, from 0 at the top left.
 
-    XMALab asks on import: "distorted", no offset, not inverted. Raises OutputError.
+    Options for XMALab's import: "distorted", no offset, not inverted. Raises OutputError.
     """
     points, field = trajectory.markers_px, trajectory.rig.lens_field
     if field is not None:
@@ -206,9 +205,9 @@ def write_points(path: Path, trajectory: Trajectory) -> None:
 
 
 def write_xypts(path: Path, trajectory: Trajectory) -> None:
-    """DLTdv8's ptI_camJ_X, ptI_camJ_Y [px], from 1 at the top left, without the lens' distortion. Raises OutputError.
+    """Write DLTdv8's ptI_camJ_X, ptI_camJ_Y [px], from 1 at the top left, without distortion. Raises OutputError.
 
-    They belong to coefficients of the direct linear transformation, which describe a camera without a lens.
+    They belong to coefficients of the direct linear transformation, which describe a camera without distortion.
     """
     rig, seen = trajectory.rig, trajectory.markers_px
     straight = [
@@ -219,7 +218,7 @@ def write_xypts(path: Path, trajectory: Trajectory) -> None:
 
 
 def read_points(path: Path) -> Array:
-    """Points (n, cameras, m, 2) of a table with such headings; NaN where there is none. Raises RigFileError."""
+    """Points (n, cameras, m, 2) from a table with such headings; NaN for missing ones. Raises RigFileError."""
     first, *lines = content_of(path).splitlines() or [""]
     found = [re.fullmatch(r"\s*(.+)_cam(\d+)_([XY])\s*", name) for name in first.split(",")]
     names, cameras = dict.fromkeys(m[1] for m in found if m), {m[2] for m in found if m}

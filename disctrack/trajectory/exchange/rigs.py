@@ -1,8 +1,8 @@
-"""Rigs from and to formats with a table of numbers for each camera, and where it stands from a common reference.
+"""Rigs from and to formats with one table per camera: intrinsics, and pose relative to a common reference.
 
-All keep x_camera = R x_reference + t and pixels that count from the centre of the top-left one, as here, unless their
-section says otherwise. None has a place for the covariance: a rig that comes back has none, and poses measured with it
-lack the calibration's part of the sigma.
+All use x_camera = R x_reference + t, and pixel (0, 0) is the centre of the top-left pixel, as here, unless their
+section says otherwise. None stores the covariance: a rig that is read has none, and the sigmas of poses measured with
+it are without the uncertainty of the calibration.
 """
 
 import ast
@@ -22,19 +22,19 @@ from disctrack.files.toml_tree import MOST, toml_value
 from disctrack.files.whole import write_whole
 
 Table = Mapping[str, Any]
-MAX_BYTES = 50_000_000  # mrcal keeps the whole calibration in a camera's file
+MAX_BYTES = 50_000_000  # of a file; mrcal stores the whole calibration in the file of a camera
 
 
 def rig_of(parts: Sequence[tuple[Camera, Array, Array]], world_is_table: bool) -> StereoRig:
-    """From each camera with R (3, 3), t (3,) [m] from the reference to its axes, left first."""
+    """Rig from each camera with R (3, 3), t (3,) [m] from the reference to its axes, left first."""
     (left, *_), (right, *_) = parts
     return StereoRig(left, right, **placed_at([(R, t) for _, R, t in parts]), world_is_table=world_is_table)
 
 
 def camera_of(K: Array, D: Array, size: Array, where: str) -> Camera:
-    """From another program's camera matrix, up to 14 lens terms of OpenCV's order, and image size (width, height).
+    """Camera from a camera matrix, up to 14 distortion coefficients in OpenCV's order, and image size (width, height).
 
-    Raises RigFileError; `where` begins what it says.
+    Raises RigFileError, whose message begins with `where`.
     """
     if K.shape != (3, 3) or not np.isfinite(K).all() or not (K[0, 0] > 0 and K[1, 1] > 0):
         raise RigFileError(f"{where}: {K.tolist()} is not a camera matrix")
@@ -50,7 +50,7 @@ def camera_of(K: Array, D: Array, size: Array, where: str) -> Camera:
 
 
 def array_of(table: Table, key: str, shape: tuple[int, ...], where: str) -> Array:
-    """The finite numbers under a key, in that shape. Raises RigFileError."""
+    """The finite numbers of a key, in this shape. Raises RigFileError."""
     said = f"{where}: '{key}' is missing, or not numbers of shape {shape}"
     with told_as(RigFileError, said, KeyError, TypeError, ValueError):
         value = np.asarray(table[key], float).reshape(shape)
@@ -60,9 +60,9 @@ def array_of(table: Table, key: str, shape: tuple[int, ...], where: str) -> Arra
 
 
 def rotation_of(rotation: Array, where: str) -> Array:
-    """(3, 3) from a matrix or a rotation vector. Raises RigFileError; `where` begins what it says."""
+    """(3, 3) from a matrix or a rotation vector. Raises RigFileError, whose message begins with `where`."""
     R = np.asarray(cv2.Rodrigues(rotation.reshape(3))[0] if rotation.size == 3 else rotation, float)
-    whole = R.size == 9 and np.abs(R).max() < 2  # not above: numbers may be of any size in a file
+    whole = R.size == 9 and np.abs(R).max() < 2  # larger numbers in a file could overflow
     R = R.reshape(3, 3) if whole else np.zeros((3, 3))
     if not np.abs(R @ R.T - np.eye(3)).max() < 1e-6 or np.linalg.det(R) < 0:
         raise RigFileError(f"{where}: {rotation.tolist()} is not a rotation")
@@ -76,24 +76,24 @@ def content_of(path: Path) -> str:
 
 
 def the_one(paths: Sequence[Path]) -> Path:
-    """Of a format that keeps everything in one file. Raises RigFileError."""
+    """The only path, for formats with a single file. Raises RigFileError."""
     if len(paths) != 1:
         raise RigFileError(f"{len(paths)} files given ({', '.join(map(str, paths))}); one is converted at a time")
     return paths[0]
 
 
 # --- Caliscope's camera_array.toml, Pose2Sim's Calib.toml, Anipose's calibration.toml (read only) ---------------------
-# Of each camera size, matrix, distortions in OpenCV's order; rotation (a vector), translation from the reference.
-# Caliscope numbers its cameras in [cameras]; Pose2Sim and Anipose name them at the top, Pose2Sim with k1 k2 p1 p2 only.
+# Per camera: size, matrix, distortions in OpenCV's order; rotation (a vector), translation from the reference.
+# Caliscope numbers cameras in [cameras]; Pose2Sim and Anipose name them at the top level, Pose2Sim without k3.
 
 
 def write_caliscope(path: Path, rig: StereoRig) -> None:
-    """Cameras 0 (left) and 1 (right), lengths in metres. Raises OutputError."""
+    """Write cameras 0 (left) and 1 (right), lengths in metres. Raises OutputError."""
     _write_toml(path, rig, {f"cameras.{number}": {"cam_id": number, "rotation_count": 0} for number in (0, 1)}, 5)
 
 
 def write_pose2sim(path: Path, rig: StereoRig) -> None:
-    """Cameras cam_01 (left) and cam_02 (right), lengths in metres, without k3. Raises OutputError."""
+    """Write cameras cam_01 (left) and cam_02 (right), lengths in metres, without k3. Raises OutputError."""
     end = "[metadata]\nadjusted = false\nerror = 0.0\n"
     _write_toml(path, rig, {name: {"name": name} for name in ("cam_01", "cam_02")}, 4, end)
 
@@ -114,9 +114,9 @@ def _lines(form: str, table: Mapping[str, object]) -> str:
 def read_caliscope(path: Path, *, cameras: tuple[str, str] | None = None, world_is_table: bool = False) -> StereoRig:
     """Two cameras of such a file.
 
-    cameras : their names ("0", "1"; "cam_0", ...) where the file has more than two; left first
-    world_is_table : True if the file's reference is the table, k up; otherwise the heights mean nothing
-    Raises RigFileError that names what the file holds.
+    cameras : their names ("0", "1"; "cam_0", ...) if the file has more than two; left first
+    world_is_table : True if the file's reference is the table, k up; otherwise heights are meaningless
+    Raises RigFileError that lists the cameras of the file.
     """
     with told_as(RigFileError, f"{path}: not TOML", ValueError):
         content = tomllib.loads(content_of(path))
@@ -140,11 +140,11 @@ def read_caliscope(path: Path, *, cameras: tuple[str, str] | None = None, world_
 
 
 # --- Kalibr's camchain YAML: cam0 (left), cam1 (right), pinholes with radtan or no distortion -------------------------
-# cam1 holds T_cn_cnm1 (4, 4), from cam0's axes to its own, in metres. Kalibr knows no world.
+# cam1 has T_cn_cnm1 (4, 4), from cam0's axes to its own, in metres. Kalibr has no world frame.
 
 
 def write_kalibr(path: Path, rig: StereoRig) -> None:
-    """k3 and the world have no place there. Raises OutputError."""
+    """Write the rig without k3 and world frame. Raises OutputError."""
     text = ""
     for number, camera in enumerate(rig.cameras):
         table: dict[str, object] = {
@@ -160,7 +160,7 @@ def write_kalibr(path: Path, rig: StereoRig) -> None:
 
 
 def read_kalibr(path: Path) -> StereoRig:
-    """cam0 and cam1 of a camchain. Raises RigFileError; OutputError where PyYAML is not installed."""
+    """A rig from cam0 and cam1 of a camchain. Raises RigFileError; OutputError if PyYAML is not installed."""
     remedy = "Install it: pip install pyyaml"
     with told_as(OutputError, f"{path}: Kalibr's YAML needs PyYAML", ImportError, then=remedy):
         import yaml
@@ -181,7 +181,7 @@ def read_kalibr(path: Path) -> StereoRig:
     return rig_of(parts, world_is_table=False)
 
 
-# --- mrcal's .cameramodel, a file for each camera, where the lens model is Brown's ------------------------------------
+# --- mrcal's .cameramodel, one file per camera, with Brown's lens model -----------------------------------------------
 
 _TERMS = {"LENSMODEL_PINHOLE": 0, "LENSMODEL_OPENCV4": 4, "LENSMODEL_OPENCV5": 5}
 
@@ -233,15 +233,15 @@ def read_mrcal(paths: Sequence[Path], *, world_is_table: bool = False) -> Stereo
     return rig_of(parts, world_is_table)
 
 
-# --- Direct linear transformation: the dltcoefs.csv of DLTdv8 and easyWand, a column of eleven for each camera --------
+# --- Direct linear transformation: the dltcoefs.csv of DLTdv8 and easyWand, a column of 11 numbers per camera ---------
 #     u = (L1 X + L2 Y + L3 Z + L4) / (L9 X + L10 Y + L11 Z + 1),  v = (L5 X + L6 Y + L7 Z + L8) / (the same)
-# X, Y, Z are in metres. It describes a camera without a lens, and counts pixels from 1 at the top left.
+# X, Y, Z are in metres. It describes a camera without distortion; pixels count from 1 at the top left.
 
 _FROM_ONE = np.array([[1.0, 0.0, 1.0], [0.0, 1.0, 1.0], [0.0, 0.0, 1.0]])  # pixels from 0 -> pixels from 1
 
 
 def write_dlt(path: Path, rig: StereoRig) -> None:
-    """Coefficients of both cameras (11 rows, left and right). Raises OutputError."""
+    """Write the coefficients of both cameras (11 rows, left and right). Raises OutputError."""
     columns = []
     for camera, (R, t) in zip(rig.cameras, rig.camera_poses(), strict=True):
         P = _FROM_ONE @ camera.camera_matrix @ np.column_stack([R, t])
@@ -252,11 +252,11 @@ def write_dlt(path: Path, rig: StereoRig) -> None:
 def read_dlt(
     path: Path, *, image_size: tuple[int, int] | None = None, unit: float = 1.0, world_is_table: bool = False
 ) -> StereoRig:
-    """Two cameras without distortion from their coefficients; (width, height) [px] stands in no such file.
+    """Two cameras without distortion from their coefficients; image_size (width, height) [px] is not in the file.
 
     unit : [m] length of the coefficients' unit
     world_is_table : True if their axes are the table's, z up
-    Raises RigFileError, also where a camera is skewed: eleven free coefficients need not be a pinhole's.
+    Raises RigFileError, also for a skewed camera, which eleven free coefficients may describe.
     """
     with told_as(RigFileError, f"{path}: not a table of DLT coefficients", ValueError):
         L = np.array([[float(cell) for cell in line.split(",")] for line in content_of(path).split()])
@@ -267,7 +267,7 @@ def read_dlt(
     parts = []
     for number, column in enumerate(L.T, start=1):
         P = np.linalg.inv(_FROM_ONE) @ np.append(column, 1.0).reshape(3, 4)
-        P *= np.sign(np.linalg.det(P[:, :3]))  # it is known up to its sign
+        P *= np.sign(np.linalg.det(P[:, :3]))  # its sign is arbitrary
         K, R, (*centre, scale) = cv2.decomposeProjectionMatrix(P)[:3]
         t = -R @ np.ravel(centre) / scale * unit
         parts.append((camera_of(K / K[2, 2], np.zeros(0), np.array(image_size), f"{path}, camera {number}"), R, t))
