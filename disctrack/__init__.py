@@ -4,7 +4,7 @@ The public verbs in the order of the measurement; each is imported when it is fi
 
     recording = read_recording("clip")                          # what recording.toml declares
     found, problems = calibrate_recording(recording)            # -> StereoCalibration, views that could not be read
-    pairs = open_pairs(recording)                               # both cameras' frames, checked to belong together
+    pairs = open_pairs(recording)                               # frames of both cameras, checked for consistency
     measurement = measure(recording, found.rig, pairs)          # -> Measurement with .trajectory
     write_trajectory(path, measurement.trajectory, trajectory_provenance(recording, found.rig, pairs, None))
     trajectory = read_trajectory(path)
@@ -12,14 +12,14 @@ The public verbs in the order of the measurement; each is imported when it is fi
     diagnosed = run_diagnose(path)                              # -> .result.sentence; `diagnose` on a Trajectory
     batch = run_batch([folder])                                 # all of this for many recordings, -> .rows, .files
 
-Frames in memory, and frames as they come from a camera:
+Frames in memory, and live frames from a camera:
 
     measurement = measure_pairs(images, rig, disc, frame_rate)  # images (n, 2, height, width)
     tracker = Tracker(rig, disc); pose = tracker.next(left, right)
 
-The other way round: `simulate(model, state)` gives a motion, `run_simulate` and `run_render` take a scene file.
+Forward models: `simulate(model, state)` returns a motion, `run_simulate` and `run_render` take a scene file.
 
-Conventions (frames, angles, units, pixels) have one home: the docstring of disctrack.frames.
+Conventions (frames, angles, units, pixels) are in the docstring of disctrack.frames.
 """
 
 from typing import TYPE_CHECKING

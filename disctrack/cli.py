@@ -1,9 +1,8 @@
 # PYTHON_ARGCOMPLETE_OK
-"""The command line: a shell round the stages, and the one place where an error becomes a line and an exit code.
+"""The command line, which runs the stages and converts errors to a line and an exit code.
 
-A new subcommand is a line in COMMANDS, its arguments in `disctrack.commands.options`, and a module of its name in
-`disctrack.commands` with `run(arguments) -> exit code`, or nothing where all is done; it is imported only when it is
-called.
+A subcommand is a line in COMMANDS, its arguments in `disctrack.commands.options`, and a module of its name in
+`disctrack.commands` with `run(arguments) -> exit code`, or None for DONE; it is imported only when it is called.
 """
 
 import argparse
@@ -24,13 +23,13 @@ from disctrack.files.software import __version__
 from disctrack.files.text import printable
 from disctrack.findings import DoubtWarning
 
-# The matrices here are small: threads of the linear algebra wait for one another and cost up to ten times what they
-# save. It must stand before numpy is loaded; a user's own setting is kept.
+# The matrices are small: threads of the linear algebra wait for each other, up to ten times longer than they save. Set
+# before numpy is loaded; a setting of the user is kept.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-# A damaged image is reported once, in our words with file and frame, not in the decoder's log as well.
+# A damaged image is reported once, with file and frame, and not in the log of the decoder.
 os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
 
-# In the order of the measurement: name -> (its arguments, what it does).
+# In the order of the measurement: name -> (arguments, summary).
 COMMANDS: dict[str, tuple[Callable[[argparse.ArgumentParser], None], str]] = {
     "sample": (options.add_sample, "a small recording with known truth, to try the other commands on"),
     "init": (options.add_init, "folder of frames -> a commented recording.toml"),
@@ -62,8 +61,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _answer(words: Sequence[str], received: Sequence[int]) -> int:
     try:
-        _print_what_the_terminal_knows()
-        _keep_compiled_loops_somewhere()
+        _escape_unprintable_characters()
+        _find_writable_cache()
         parser, commands = _parser()
         arguments, unknown = parser.parse_known_args(words)
         if unknown:
@@ -71,35 +70,35 @@ def _answer(words: Sequence[str], received: Sequence[int]) -> int:
         if arguments.command is None:
             parser.print_help()
             return USAGE
-        if sys.stderr.isatty():  # what is imported now takes seconds
+        if sys.stderr.isatty():  # the following imports take seconds
             print(f"{arguments.command} ...", end="\r", file=sys.stderr, flush=True)
-        from disctrack.files.inputs import inputs_kept  # here, so that --help does not wait for what it imports
+        from disctrack.files.inputs import inputs_kept  # late, so that --help is fast
 
         command = importlib.import_module(f"disctrack.commands.{arguments.command.replace('-', '_')}")
         with inputs_kept(), catch_warnings():
-            simplefilter("ignore", DoubtWarning)  # reports say it
+            simplefilter("ignore", DoubtWarning)  # reports contain them
             return int(command.run(arguments) or DONE)
     except KeyboardInterrupt:
-        return _say_interrupted(received)
-    except BrokenPipeError:  # the reader of our output has gone: `disctrack ... | head`
+        return _print_interruption(received)
+    except BrokenPipeError:  # the output pipe is closed: `disctrack ... | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return FAILED
     except Exception as error:
         if os.environ.get(TRACEBACK_VARIABLE):
             raise
-        return _say_interrupted(received) if received else _tell(error)
+        return _print_interruption(received) if received else _print_error(error)
 
 
 @contextmanager
 def _interruptions() -> Iterator[list[int]]:
-    """Signals received: Ctrl-C, and what queueing systems and closed terminals send, all end a command in order.
+    """Signals received: Ctrl-C and signals of queueing systems and closed terminals end a command properly.
 
-    Compiled libraries that are struck while they are loaded turn KeyboardInterrupt into an error of their own, which
-    would be told as ours.
+    Compiled libraries that are interrupted during loading turn KeyboardInterrupt into another error, which would be
+    reported as ours.
     """
     received: list[int] = []
     if threading.current_thread() is not threading.main_thread():
-        yield received  # signals are the main thread's
+        yield received  # only the main thread handles signals
         return
 
     def interrupt(number: int, frame: FrameType | None) -> None:
@@ -108,25 +107,25 @@ def _interruptions() -> Iterator[list[int]]:
 
     kinds = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
     before = {kind: signal.getsignal(kind) for kind in kinds}
-    heeded = [kind for kind in kinds if before[kind] in (signal.default_int_handler, signal.SIG_DFL)]
-    for kind in heeded:  # what the caller handles or, as nohup does, ignores, stays his
+    handled = [kind for kind in kinds if before[kind] in (signal.default_int_handler, signal.SIG_DFL)]
+    for kind in handled:  # handlers of the caller, and signals ignored by nohup, are kept
         signal.signal(kind, interrupt)
     try:
         yield received
     finally:
-        for kind in heeded:
+        for kind in handled:
             signal.signal(kind, before[kind])
 
 
-def _print_what_the_terminal_knows() -> None:
-    """A name that a terminal or log has no letters for is printed as escapes; it must not end a measurement."""
+def _escape_unprintable_characters() -> None:
+    """Print characters that the encoding of a terminal or log lacks as escapes instead of raising an error."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
 
 
-def _keep_compiled_loops_somewhere() -> None:
-    """Where neither the installation nor the user's home can be written to, numba would refuse to start."""
+def _find_writable_cache() -> None:
+    """Set a cache folder for numba, which does not start if neither installation nor home are writable."""
     here = os.path.dirname(os.path.abspath(__file__))
     if "NUMBA_CACHE_DIR" in os.environ or "numba" in sys.modules or os.access(here, os.W_OK):
         return
@@ -136,36 +135,36 @@ def _keep_compiled_loops_somewhere() -> None:
     name = f"disctrack-{os.getuid()}" if hasattr(os, "getuid") else "disctrack"
     folder = os.path.join(tempfile.gettempdir(), name)
     os.makedirs(folder, mode=0o700, exist_ok=True)
-    if hasattr(os, "getuid") and os.stat(folder).st_uid != os.getuid():  # compiled code of others is not run
+    if hasattr(os, "getuid") and os.stat(folder).st_uid != os.getuid():  # compiled code of other users is not run
         folder = tempfile.mkdtemp(prefix=name)
     os.environ["NUMBA_CACHE_DIR"] = folder
-    os.environ.setdefault("MPLCONFIGDIR", os.path.join(folder, "matplotlib"))  # found fonts
+    os.environ.setdefault("MPLCONFIGDIR", os.path.join(folder, "matplotlib"))  # list of fonts
     print(f"compiled inner loops are kept in {folder}: installation and home are read-only", file=sys.stderr)
 
 
-def _tell(error: Exception) -> int:
-    from disctrack.errors import DiscTrackError, reason_of  # here, so that --help does not wait for what it imports
+def _print_error(error: Exception) -> int:
+    from disctrack.errors import DiscTrackError, reason_of  # late, so that --help is fast
 
-    return _say(reason_of(error), FAILED if isinstance(error, (DiscTrackError, OSError, MemoryError)) else INTERNAL)
+    return _report(reason_of(error), FAILED if isinstance(error, (DiscTrackError, OSError, MemoryError)) else INTERNAL)
 
 
-def _say_interrupted(received: Sequence[int]) -> int:
+def _print_interruption(received: Sequence[int]) -> int:
     kind = received[0] if received else signal.SIGINT
     how = "interrupted" if kind == signal.SIGINT else f"ended by {signal.Signals(kind).name}"
-    code = 128 + kind  # as shells count
+    code = 128 + kind  # the convention of shells
     try:
-        return _say(f"{how}. No half-written file is left; the same command continues.", code)
+        return _report(f"{how}. No half-written file is left; the same command continues.", code)
     except OSError:  # the terminal has been closed
         return code
 
 
-def _say(message: str, code: int) -> int:
+def _report(message: str, code: int) -> int:
     print(f"disctrack: {printable(' '.join(message.split()))}", file=sys.stderr, flush=True)
     return code
 
 
 def _parser() -> tuple[argparse.ArgumentParser, dict[str, argparse.ArgumentParser]]:
-    """Parser of all, and that of each subcommand; a shell completes their words where argcomplete is installed."""
+    """The parser, and that of each subcommand; with argcomplete installed, shells complete commands and options."""
     parser = argparse.ArgumentParser(
         prog="disctrack",
         description="Six degrees of freedom of a spinning, rolling disc from two synchronised high-speed cameras.",
@@ -179,7 +178,7 @@ def _parser() -> tuple[argparse.ArgumentParser, dict[str, argparse.ArgumentParse
         description = f"{summary[0].upper()}{summary[1:]}."
         commands[name] = subparsers.add_parser(name, help=summary, description=description)
         add_arguments(commands[name])
-    if "_ARGCOMPLETE" in os.environ:  # a shell asks
+    if "_ARGCOMPLETE" in os.environ:  # called by a shell for completion
         with suppress(ImportError):
             importlib.import_module("argcomplete").autocomplete(parser)
     return parser, commands

@@ -1,7 +1,7 @@
-"""What the program noticed about a measurement, as data.
+"""Findings about a measurement, as data.
 
-A stage makes a `Finding` where it sees something, with its sentence from the room's own module of messages; later
-stages read kinds, severities and numbers, never text. `leading` leaves out what another finding explains.
+Each stage creates a `Finding` with a sentence; later stages read kinds, severities and numbers, never the text.
+`leading` removes findings that another one explains.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ from disctrack.numbers import Measured
 
 
 class Severity(IntEnum):
-    """How grave it is; a stage that tells a doubt ends with exit code 3, a refusal with 1."""
+    """How serious a finding is; a command that reports a doubt ends with exit code 3, a refusal with 1."""
 
-    NOTE = 0  # good to know
-    WARNING = 1  # makes the result worse than it could be, within the stated sigmas
+    NOTE = 0  # for information
+    WARNING = 1  # the result is less accurate than possible, but within the stated sigmas
     DOUBT = 2  # the result may be wrong by more than the stated sigmas
     REFUSAL = 3  # there is no result
 
 
 class Kind(Enum):
-    """What was noticed; the value stands in files."""
+    """Kind of a finding; the value is written to files."""
 
-    # what is declared
+    # the declaration
     SQUARE = "square"  # the chessboard's squares and the lengths of disc and dots are on different scales
     DIAMETER = "diameter of the dots"
     RADIUS = "radius"
@@ -41,54 +41,54 @@ class Kind(Enum):
     DOT_UNSEEN = "dot unseen"
     SYMMETRIC_DOTS = "symmetric dots"
     # the table
-    TABLE_VIEW = "table view"  # the board of the declared view does not lie where the disc rolls
+    TABLE_VIEW = "table view"  # the board of the declared view does not lie on the table
     BOARD_THICKNESS = "board thickness"
-    TABLE_DISAGREES = "table disagrees"  # the disc does not roll on the board's, beyond the tolerances of both
+    TABLE_DISAGREES = "table disagrees"  # the disc rolls on another plane than the board's, beyond both tolerances
     # the cameras
     EXCHANGED = "exchanged cameras"
     MIRRORED = "mirrored images"
     HANDEDNESS = "handedness"
     CAMERA_MOVED = "camera moved"
     CAMERAS_CONTRADICT = "cameras contradict each other"
-    ONE_SIDED = "one camera only"  # the dots of the other make no sense
-    DOTS_MISFIT = "dots misfit"  # in all frames, by more than their own scatter
+    ONE_SIDED = "one camera only"  # the dots of the other camera are implausible
+    DOTS_MISFIT = "dots misfit"  # in all frames, by more than their intrinsic scatter
     DOTS_SCATTER = "dots scatter"
     POSES_SCATTER = "poses scatter"
     EXPOSURE = "exposure"
     SENSOR = "sensor"  # colour filter, stuck pixels
-    LIGHT = "light"  # clipped, or none
+    LIGHT = "light"  # overexposed, or none
     SHARPNESS = "sharpness"
     ACCURACY = "accuracy"
     # the clock
     DELAY = "delay"
     DROPPED_FRAMES = "dropped frames"  # by one camera
-    CLOCK_JUMP = "clock jump"  # pairs lost by both cameras
+    CLOCK_JUMP = "clock jump"  # image pairs dropped by both cameras
     REPEATED_IMAGES = "repeated images"
     TIME_STAMPS = "time stamps"
-    # the files, and the rest
-    READING = "reading"  # how the frames are read
+    # the files, and others
+    READING = "reading"  # of the frames
     HEADERS = "camera headers"
     UNREADABLE = "unreadable images"
     FRAMES_LOST = "frames lost"
     DISC_NOT_FOUND = "disc not found"
     DECLARATION = "declaration"
-    CALIBRATION = "calibration"  # and views of the board that it does not use
+    CALIBRATION = "calibration"  # also views of the board that are not used
     ANALYSIS = "analysis"
     DIAGNOSIS = "diagnosis"
-    OTHER = "other"  # and of a file that another version wrote
+    OTHER = "other"  # also a kind from a file of another version
 
     @classmethod
     def _missing_(cls, value: object) -> Kind:
-        """A kind that this version does not know."""
+        """OTHER for a kind that this version does not know."""
         return cls.OTHER
 
 
-# What else is noticed where two images that are not of one instant, or places that are not the dots', make a pose;
+# Consequences if a pose is fitted to images of different instants, or to positions that are not those of the dots;
 MISFITS = (
     Kind.DOTS_MISFIT, Kind.DOTS_SCATTER, Kind.POSES_SCATTER, Kind.CAMERAS_CONTRADICT, Kind.ONE_SIDED,
     Kind.TABLE_DISAGREES, Kind.SHARPNESS, Kind.ACCURACY, Kind.FRAMES_LOST,
 )  # fmt: skip
-# and where the images are not those of the declared cameras at all, so that no pose is right
+# and if the images are not of the declared cameras, so that no pose is correct
 NONSENSE = (
     *MISFITS, Kind.SQUARE, Kind.DIAMETER, Kind.RADIUS, Kind.THICKNESS, Kind.GRAVITY_OR_RATE,
     Kind.REVERSED, Kind.DOTS_MISPLACED, Kind.DOT_UNSEEN, Kind.TABLE_VIEW, Kind.BOARD_THICKNESS, Kind.DELAY,
@@ -98,10 +98,10 @@ NONSENSE = (
 
 @dataclass(frozen=True)
 class Remedy:
-    """What would mend it: a declared number with the one that would fit, or what to do."""
+    """How to correct it: a declared number with the one that would fit, or an action."""
 
     key: str = ""  # as in recording.toml
-    fits: str = ""  # what the key would have to be, in its unit
+    fits: str = ""  # the value of the key that would fit, in its unit
     declared: str = ""
     action: str = ""  # or a remark on the number
 
@@ -113,7 +113,7 @@ class Remedy:
 
 @dataclass(frozen=True)
 class Subject:
-    """What it is about, as far as it is about less than the whole recording."""
+    """The part of the recording that a finding is about; by default all of it."""
 
     stage: str = ""  # name of a command: check, calibrate, track, analyse, diagnose
     camera: str = ""  # left or right
@@ -124,45 +124,45 @@ class Subject:
 
 @dataclass(frozen=True)
 class Finding:
-    """Something noticed."""
+    """An observation about a measurement."""
 
     kind: Kind
     severity: Severity
-    text: str  # what was seen, one sentence without its full stop; for people only
+    text: str  # the observation, a sentence without full stop; for people only
     subject: Subject = Subject()
     numbers: Mapping[str, Measured] = field(default_factory=dict)
-    remedies: tuple[Remedy, ...] = ()  # likeliest first
-    explains: tuple[Kind, ...] = ()  # consequences: not told beside this one
+    remedies: tuple[Remedy, ...] = ()  # most likely first
+    explains: tuple[Kind, ...] = ()  # its consequences, which are not reported in addition
 
     @property
     def sentence(self) -> str:
-        """What to change first, then what was seen."""
-        told = [str(remedy) for remedy in self.remedies]
-        if not told:
+        """The remedy, then the observation."""
+        remedies = [str(remedy) for remedy in self.remedies]
+        if not remedies:
             return self.text
         if not self.remedies[0].key:
-            advice = "; or ".join(told)
+            advice = "; or ".join(remedies)
             return f"{self.text.removesuffix('.')}. {advice[:1].upper()}{advice[1:]}"
-        return f"{'; or '.join(told)}: {self.text}"
+        return f"{'; or '.join(remedies)}: {self.text}"
 
     @property
     def grave(self) -> str:
-        """How grave it is, in a word."""
+        """The severity in a word."""
         return self.severity.name.lower()
 
     @property
     def doubtful(self) -> bool:
-        """True where the result may be wrong by more than its sigmas."""
+        """True if the result may be wrong by more than its sigmas."""
         return self.severity >= Severity.DOUBT
 
     def as_json(self) -> dict[str, Any]:
-        """Of JSON's types, with the sentence."""
+        """The finding in types of JSON, with its sentence."""
         words = {"kind": self.kind.value, "severity": self.grave, "sentence": self.sentence}
         return {**asdict(self), **words, "explains": [kind.value for kind in self.explains]}
 
 
 def of_kind(kind: Kind, severity: Severity, texts: Iterable[str]) -> tuple[Finding, ...]:
-    """Findings of which no more is known than their sentences."""
+    """Findings that consist only of a sentence."""
     return tuple(Finding(kind, severity, text) for text in texts)
 
 
@@ -185,7 +185,7 @@ def _number(value: float, sigma: float | None, unit: str) -> Measured:
 
 
 def leading(findings: Iterable[Finding]) -> tuple[Finding, ...]:
-    """The causes alone, one line each, gravest first: no finding explains them; each as grave as what it explains."""
+    """Only the causes, most severe first: no other finding explains them. Each has the severity of its consequences."""
     rest: list[Finding] = []
     for finding in sorted(findings, key=lambda f: -f.severity):
         rest += [finding] if finding not in rest else []
@@ -206,7 +206,7 @@ def _explains(one: Finding, other: Finding) -> bool:
 
 
 def carried(findings: Iterable[Finding]) -> tuple[Finding, ...]:
-    """Of a measurement, the causes that the stages after it repeat: all but notes."""
+    """The causes that later stages repeat: all except notes."""
     return tuple(finding for finding in leading(findings) if finding.severity > Severity.NOTE)
 
 
@@ -216,17 +216,17 @@ def doubts(findings: Iterable[Finding]) -> tuple[Finding, ...]:
 
 
 def in_doubt(findings: Iterable[Finding]) -> bool:
-    """True where a result with these findings may be wrong by more than its sigmas."""
+    """True if a result with these findings may be wrong by more than its sigmas."""
     return any(finding.doubtful for finding in findings)
 
 
 class DoubtWarning(UserWarning):
-    """A result that may be wrong by more than its sigmas; for Python, as commands have words of their own."""
+    """A result that may be wrong by more than its sigmas; commands print findings instead."""
 
 
 def warn_of_doubts(findings: Iterable[Finding]) -> None:
-    """A Python warning for each cause that puts the result in doubt, at the line that called one of the packages."""
-    within = ("disctrack", "calibration", "contextlib")  # the last decorates functions of ours
+    """A Python warning for each cause that puts the result in doubt, at the line of the caller outside our packages."""
+    within = ("disctrack", "calibration", "contextlib")  # the last wraps functions of ours
     level, frame = 1, sys._getframe()
     while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] in within:
         level, frame = level + 1, frame.f_back

@@ -1,4 +1,4 @@
-"""The picture of a calibration: what the corners leave unexplained, and which part of the images they cover."""
+"""The figure of a calibration: residuals of the corners, and their coverage of the images."""
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -16,14 +16,14 @@ _SHADES = LinearSegmentedColormap.from_list("coverage", ["#e8f1f8", "#a9c6dc"])
 
 
 def residuals_figure(found: StereoCalibration) -> Figure:
-    """Observed - predicted corners as arrows in each image, over the cells that hold any, and their rms per view."""
+    """Residuals of the corners as arrows in each image, over the cells that contain any, and their rms per view."""
     figure = Figure(figsize=(12, 9))
     lay_out(figure, (2, 2), gaps=(0.7, 0.7))
     grid = figure.add_gridspec(2, 2, height_ratios=(3, 1))
     refinement = found.refinement
     lengths = np.linalg.norm(refinement.residuals[refinement.kept], axis=1)
     typical = float(np.median(lengths)) or 1.0
-    # so that the typical arrow is about 1/40 of the image's width; one leading digit, to be read at a glance
+    # the typical arrow is about 1/40 of the image width; one significant digit
     scale = float(f"{found.rig.left.image_size[0] / 40 / typical:.0e}")
     for camera, name in enumerate(CAMERAS):
         axes = figure.add_subplot(grid[0, camera])
@@ -39,7 +39,7 @@ def residuals_figure(found: StereoCalibration) -> Figure:
 
 
 def _image_frame(axes: Axes, found: StereoCalibration, camera: int) -> None:
-    """An image's outline, its cells the darker the more corners they hold; distortion is a guess in the others."""
+    """Outline of an image, with cells shaded by their number of corners; in empty cells distortion is extrapolated."""
     width, height = found.rig.cameras[camera].image_size
     counts = cells_of(found.refinement, camera)
     edges = [np.linspace(-0.5, size - 0.5, n + 1) for size, n in zip((width, height), counts.shape, strict=True)]
@@ -52,7 +52,7 @@ def _image_frame(axes: Axes, found: StereoCalibration, camera: int) -> None:
 
 
 def _arrows(axes: Axes, found: StereoCalibration, camera: int, scale: float, most: float) -> None:
-    """Arrows `scale` times as long as residuals; of corners that were not used, as long as `most` [px] at most."""
+    """Arrows `scale` times as long as residuals, which are cut to `most` [px] for corners that were not used."""
     refinement, mine = found.refinement, found.refinement.observations.camera == camera
     for select, colour, longest in (
         (refinement.kept, COLOURS[CAMERAS[camera]], np.inf),

@@ -1,4 +1,4 @@
-"""Calibration from files to a file: where the views come from, reuse of a rig, the rig file, the pictures."""
+"""Calibration from files to a file: source of the views, reuse of a rig, the rig file, the figure."""
 
 import dataclasses
 import json
@@ -31,7 +31,7 @@ from disctrack.trajectory.file import Provenance
 
 @dataclass(frozen=True)
 class CalibrationSource:
-    """Everything that a calibration depends on."""
+    """All inputs of a calibration."""
 
     name: str
     views: TargetImages
@@ -41,13 +41,13 @@ class CalibrationSource:
     settings: CalibrationSettings
 
     def calibrated(self, progress: Progress | None) -> tuple[StereoCalibration, tuple[str, ...]]:
-        """`calibrate_views` from it."""
+        """Result of `calibrate_views`."""
         table = self.table_view, self.board_thickness
         return calibrate_views(self.views, self.board, *table, self.settings, progress)
 
     @property
     def provenance(self) -> Provenance:
-        """Reads the views' content."""
+        """Identity of the inputs; reads the content of the views."""
         return Provenance(
             recording=self.name,
             inputs={"calibration views": self.views.sha256()},
@@ -63,7 +63,7 @@ class CalibrationSource:
 
 
 def source_of(recording: Recording, settings: CalibrationSettings) -> CalibrationSource:
-    """Views, board and table of a recording that has them."""
+    """Views, board and table of a recording. Raises RecordingError if it names a rig file instead."""
     views, table = recording.views, recording.table
     if views is None or table is None:
         raise RecordingError(
@@ -84,7 +84,7 @@ def source_of(recording: Recording, settings: CalibrationSettings) -> Calibratio
 def calibrate_recording(
     recording: Recording, settings: CalibrationSettings | None = None, progress: Progress | None = None
 ) -> tuple[StereoCalibration, tuple[str, ...]]:
-    """`calibrate_views` with the views, board and table that a recording names. RecordingError without them.
+    """`calibrate_views` with the views, board and table of a recording. Raises RecordingError without them.
 
     >>> found, problems = calibrate_recording("clip")
     >>> round(found.rig.baseline, 4)
@@ -94,7 +94,7 @@ def calibrate_recording(
 
 
 def boards_in(rig_file: Path, recording: Recording) -> Boards | None:
-    """Where the board was in the views of a rig file; None where that does not say. Raises RigFileError."""
+    """Poses of the board in the views of a rig file; None if it has none. Raises RigFileError."""
     _, record = read_rig_file(rig_file)
     if record is None:
         return None
@@ -102,7 +102,7 @@ def boards_in(rig_file: Path, recording: Recording) -> Boards | None:
 
 
 def boards_of(record: Record, views: TargetImages | None) -> Boards:
-    """Where the board was in views; their numbers are those in `views`, of which not all may have been looked at."""
+    """Poses of the board; views are numbered as in `views`, of which only some may have been used."""
     known = {} if views is None else {str(view): i for i, view in enumerate(views.left)}
     found = [known.get(left, i) for i, (left, _) in enumerate(record["view_names"])]
     places = dict(zip(found, zip(record["R_left_board"], record["t_left_board"], strict=True), strict=False))
@@ -110,16 +110,16 @@ def boards_of(record: Record, views: TargetImages | None) -> Boards:
     return Boards(places, view, record["board_thickness"], noticed_in(record))
 
 
-def noticed_in(told: Mapping[str, Any]) -> tuple[Finding, ...]:
-    """What a calibration says of itself, its `doubts` and `warnings`, as findings."""
-    grave = (Severity.DOUBT, "doubts"), (Severity.WARNING, "warnings")
+def noticed_in(record: Mapping[str, Any]) -> tuple[Finding, ...]:
+    """`doubts` and `warnings` of a calibration as findings."""
+    kinds = (Severity.DOUBT, "doubts"), (Severity.WARNING, "warnings")
     return tuple(
-        finding for severity, name in grave for finding in of_kind(Kind.CALIBRATION, severity, told.get(name, ()))
+        finding for severity, name in kinds for finding in of_kind(Kind.CALIBRATION, severity, record.get(name, ()))
     )
 
 
 def given_rig(file: Path) -> tuple[StereoRig, Report]:
-    """A rig that a recording shares with others, and what to tell about it. Raises RigFileError."""
+    """A rig from a file, and its report. Raises RigFileError."""
     keep(file)
     rig = read_rig(file)
     return rig, Report("", f"{file}: baseline {rig.baseline * 1e3:.3f} mm.")
@@ -128,23 +128,23 @@ def given_rig(file: Path) -> tuple[StereoRig, Report]:
 def calibrate_into(
     path: Path, source: CalibrationSource, overwrite: bool, figures: bool, force: bool = False
 ) -> tuple[StereoRig, Report]:
-    """Calibrate, or reuse the rig that is there; write rig and picture.
+    """Calibrate, or reuse an existing rig; write rig and figure.
 
-    force : write a rig that is beyond use, too; CalibrationError without
-    returns : the rig, what to tell about it, and the files it went to
-    Raises OutputError if `path` holds something else and may not be replaced.
+    force : also write an unusable rig; otherwise raises CalibrationError
+    returns : the rig, and a report with the files that were written
+    Raises OutputError if `path` contains something else and may not be replaced.
     """
     refuse_input(path)
     provenance = source.provenance
     if path.exists() and not overwrite:
-        told = _reusable(path, provenance)
-        if told is None:
+        summarised = _reusable(path, provenance)
+        if summarised is None:
             raise OutputError(
                 f"{path}: exists, and is not the complete result of these views, settings and version. Keep it and "
                 "choose another place with -o, or replace it with --overwrite."
             )
-        told["rows"].append(("reused", f"{path}: complete result of the same views, settings and version"))
-        return read_rig(path), _report(told, [path])
+        summarised["rows"].append(("reused", f"{path}: complete result of the same views, settings and version"))
+        return read_rig(path), _report(summarised, [path])
     found, problems = _calibrate(source)
     found = dataclasses.replace(found, warnings=(*problems, *found.warnings))
     if found.assessment.beyond_use and not force:
@@ -153,7 +153,7 @@ def calibrate_into(
             f"{source.views.place}: the rig is beyond use and was not written. {said}. Take better views; `disctrack "
             "calibrate --force` writes it as it is."
         )
-    told = {
+    summarised = {
         "verdict": f"{found.assessment.verdict}.",
         "accuracy": found.assessment.figures,
         "rows": summary.calibration_rows(found, problems),
@@ -165,7 +165,7 @@ def calibrate_into(
         "inputs_sha256": json.dumps(dict(provenance.inputs)),
         "settings": json.dumps(dict(provenance.settings)),
         "software_version": provenance.version,
-        "summary": json.dumps(told),
+        "summary": json.dumps(summarised),
     }
     write_whole(path, rig_bytes(found, attributes=attributes))
     files = [path]
@@ -175,12 +175,12 @@ def calibrate_into(
 
         prefix = "calibration" if path.stem == "rig" else f"{path.stem}_calibration"
         files.append(save_figure(residuals_figure(found), path.with_name(f"{prefix}_residuals.png")))
-    return found.rig, _report(told, files)
+    return found.rig, _report(summarised, files)
 
 
-def _report(told: Mapping[str, Any], files: Sequence[Path]) -> Report:
-    """What a calibration tells, from what its rig file keeps of it."""
-    return Report("", told["verdict"], told["accuracy"], noticed_in(told), blocks=[Facts(told["rows"])], files=files)
+def _report(kept: Mapping[str, Any], files: Sequence[Path]) -> Report:
+    """The report of a calibration, from the summary in its rig file."""
+    return Report("", kept["verdict"], kept["accuracy"], noticed_in(kept), blocks=[Facts(kept["rows"])], files=files)
 
 
 def is_rig_of(path: Path, source: CalibrationSource) -> bool:
@@ -192,10 +192,10 @@ def is_rig_of(path: Path, source: CalibrationSource) -> bool:
 
 
 def _reusable(path: Path, provenance: Provenance) -> dict[str, Any] | None:
-    """What is told of the rig in `path` if it was made, completely, from the same; None otherwise."""
+    """Summary of the rig in `path` if it is complete and from the same inputs; None otherwise."""
     said = f"{path}: exists and is not a readable rig file"
     remedy = "Move it away, or replace it with --overwrite."
-    with told_as(RigFileError, said, Exception, then=remedy):  # the HDF5 library raises many kinds on damaged files
+    with told_as(RigFileError, said, Exception, then=remedy):  # on damaged files, the HDF5 library raises many kinds
         check_seal(path)
         with h5py.File(path, "r") as file:
             same = file.attrs.get("fingerprint") == provenance.fingerprint and int(file.attrs.get("complete", 0)) == 1

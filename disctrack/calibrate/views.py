@@ -1,4 +1,4 @@
-"""The calibration views of a recording, or of two file patterns, brought to the calibration."""
+"""The calibration views of a recording, or of two file patterns."""
 
 import hashlib
 from dataclasses import dataclass
@@ -20,12 +20,12 @@ from disctrack.recording.readers.decoding import decode
 from disctrack.recording.readers.files import IMAGES, content_of, file_number, match_files, split_member
 from disctrack.recording.readers.flat_field import FlatField, FlatFields, flat_fields
 
-MOST_VIEWS = 500  # ten times what a calibration needs; corners of one more take as long as those of the first
+MOST_VIEWS = 500  # ten times as many as a calibration needs; the time is proportional to the number
 
 
 @dataclass(frozen=True)
 class FrameView:
-    """A view that is one frame of a file that holds many."""
+    """A view that is one frame of a file with many."""
 
     file: Path
     reader: FrameReader
@@ -36,7 +36,7 @@ class FrameView:
 
     @property
     def name(self) -> str:
-        """The frame, for messages that name the file apart."""
+        """The frame, for messages that already name the file."""
         return f"frame {self.index}"
 
 
@@ -45,19 +45,19 @@ View = Path | FrameView
 
 @dataclass(frozen=True, repr=False)
 class TargetImages(Brief):
-    """Synchronised views; number i of the left and of the right show the board in the same place."""
+    """Synchronised views; views i of left and right show the board in the same pose."""
 
     left: tuple[View, ...]
     right: tuple[View, ...]
-    fields: FlatFields = (None, None)  # by which grey views of the frames' own size are corrected
-    parts: Parts = (None, None)  # that are looked at
+    fields: FlatFields = (None, None)  # corrections of grey views of the size of the frames
+    parts: Parts = (None, None)  # of the images that are used
 
     def __len__(self) -> int:
         return len(self.left)
 
     @property
     def place(self) -> Path:
-        """Where the left views lie, for messages."""
+        """Location of the left views, for messages."""
         first = self.left[0]
         return first.file if isinstance(first, FrameView) else first.parent
 
@@ -83,8 +83,8 @@ def find_views(
 ) -> TargetImages:
     """Views that the two patterns match, paired by their order: a file each, or all frames of one file each.
 
-    fields : of the two cameras, where their views are to be corrected for the pixels' gains and offsets
-    parts : of the images that are the cameras'; images of a part's own size are taken whole
+    fields : of both cameras, if their views are to be corrected for gains and offsets of the pixels
+    parts : of the images that belong to each camera; images of the size of their part are used whole
     Raises RecordingError if they do not pair up.
 
         >>> len(find_views("calibration/left/*.png", "calibration/right/*.png", "clip"))
@@ -97,7 +97,7 @@ def find_views(
         for side, own, other in zip(sides, numbers, reversed(numbers), strict=True)
     ]
     views = TargetImages(sides[0], sides[1], fields, parts)
-    # where no number is in common, the two cameras count from different starts
+    # without common numbers, the cameras count from different starts
     if len(sides[0]) != len(sides[1]) or 0 < len(alone[0]) < len(sides[0]):
         odd = [f"{camera} {', '.join(names[:3])}" for camera, names in zip(CAMERAS, alone, strict=True) if names]
         raise RecordingError(
@@ -115,7 +115,7 @@ def declared_views(recording: Recording, declared: CalibrationViews) -> TargetIm
 
 
 def views_of(pattern: str, folder: Path, camera: str, most: float = MOST_VIEWS) -> tuple[View, ...]:
-    """Those of one camera, a file each or all frames of one. Raises RecordingError, also where they are too many."""
+    """Views of one camera, a file each or all frames of one file. Raises RecordingError, also if there are too many."""
     files = match_files(split_member(pattern)[0], folder, camera)
     suffix = files[0].suffix.lower()
     if suffix in IMAGES and not (len(files) == 1 and suffix in (".tif", ".tiff")):
@@ -140,7 +140,7 @@ def calibrate_views(
     settings: CalibrationSettings | None = None,
     progress: Progress | None = None,
 ) -> tuple[StereoCalibration, tuple[str, ...]]:
-    """Calibrate from files; views that cannot be read are left out, and named in the second item.
+    """Calibrate from files; unreadable views are skipped, and named in the second item.
 
     table_view : index among all views; board_thickness [m]
     Raises RecordingError if the table view cannot be read, CalibrationError if the views do not allow a calibration.
@@ -176,14 +176,14 @@ def calibrate_views(
 
 
 def pixels_of(view: View) -> NDArray:
-    """Grey values or colours of a view as they are stored. Raises RecordingError."""
+    """Grey values or colours of a view as stored. Raises RecordingError."""
     if isinstance(view, FrameView):
         return view.reader.read(view.index)
     return decode(content_of(view, str(view)), str(view))
 
 
 def _pixels(view: View, flat: FlatField | None, part: Part | None) -> NDArray:
-    """Grey values or colours of a view. Raises RecordingError, which begins with the file or names the frame."""
+    """Corrected grey values or colours of a view. Raises RecordingError, which names the file or frame."""
     image = pixels_of(view)
     whole = flat.corrected(image) if flat is not None and flat.fits(image) else image
     return whole if part is None else cut_out(whole, part, str(view))

@@ -1,4 +1,4 @@
-"""What the commands share: options, checks before the work, files after it."""
+"""Common parts of the commands: options, checks, reports and output files."""
 
 import argparse
 import os
@@ -35,16 +35,16 @@ RESULTS = "results"
 
 
 def calibration_settings(arguments: argparse.Namespace) -> CalibrationSettings:
-    """The options of a calibration as they were given."""
+    """Settings of the calibration from the options."""
     return CalibrationSettings(distortion=arguments.distortion, board=arguments.board)
 
 
 def track_into(
     path: Path, recording: Recording, rig: StereoRig, rig_file: Path, pairs: ImagePairs, arguments: argparse.Namespace
 ) -> Report:
-    """Track, or reuse what is there; write trajectory, table, pictures, video.
+    """Track, or reuse an existing result; write trajectory, table, pictures, video.
 
-    Raises OutputError if `path` holds something else and may not be replaced.
+    Raises OutputError if `path` contains something else and may not be replaced.
     """
     settings = TrackingSettings(first_pass=not (arguments.all or arguments.frames))
     rows = [("recording", f"{recording.name}: {len(pairs)} pairs at {recording.frame_rate:g} Hz")]
@@ -77,12 +77,12 @@ def track_into(
 
 
 def recording_of(trajectory: Path) -> Path | None:
-    """The folder of the recording in whose folder or results a trajectory lies."""
+    """The folder of the recording whose folder or results contain a trajectory; None if there is none."""
     return next((place for place in trajectory.absolute().parents[:2] if (place / FILE_NAME).is_file()), None)
 
 
-def tell_stale(trajectory: Path) -> None:
-    """Say on stderr where the recording.toml beside a trajectory is no longer the one that it was measured with."""
+def warn_if_stale(trajectory: Path) -> None:
+    """Print on stderr if the recording.toml of a trajectory has changed since the measurement."""
     folder, kept = recording_of(trajectory), read_provenance(trajectory).declared
     if folder is not None and (changed := changed_since(folder, kept)):
         place = relative(folder)
@@ -93,10 +93,10 @@ def tell_stale(trajectory: Path) -> None:
         )
 
 
-def tell(report: Report, arguments: argparse.Namespace, folder: Path, *, reused: bool = False) -> int:
-    """Show a report as the options ask for it. folder : where all of it lies as summary.txt, if it does
+def finish(report: Report, arguments: argparse.Namespace, folder: Path, *, reused: bool = False) -> int:
+    """Print a report according to the options. folder : that may contain the complete report as summary.txt
 
-    returns : INCOMPLETE where images could not be read, or the result is in doubt, which is said on stderr
+    returns : INCOMPLETE if images could not be read, or the result is in doubt, which is printed on stderr
     """
     show_report(report, arguments, folder, reused=reused)
     spoilt = [finding for finding in report.findings if finding.doubtful or finding.kind == Kind.UNREADABLE]
@@ -108,7 +108,7 @@ def tell(report: Report, arguments: argparse.Namespace, folder: Path, *, reused:
 
 
 def show_report(report: Report, arguments: argparse.Namespace, folder: Path, *, reused: bool = False) -> None:
-    """Print a report as the options ask for it."""
+    """Print a report according to the options."""
     if arguments.json:
         print(json_text(document(report), indent=1))
     elif not arguments.quiet:
@@ -125,7 +125,7 @@ def show_report(report: Report, arguments: argparse.Namespace, folder: Path, *, 
 
 
 def link_pages_of(trajectory: Path) -> None:
-    """Let the pages that were made of a recording name each other."""
+    """Link the pages of a recording with each other."""
     folder, stem = trajectory.parent, trajectory.stem
     link_pages({
         "analysis": folder / f"{stem}_analysis" / "report.html",
@@ -138,7 +138,7 @@ def link_pages_of(trajectory: Path) -> None:
 def _companions(
     path: Path, trajectory: Trajectory, pairs: ImagePairs, arguments: argparse.Namespace, fresh: bool
 ) -> Iterator[Path]:
-    """Table, pictures and video beside the trajectory; those that a reused result already has are kept."""
+    """Table, pictures and video next to the trajectory; those of a reused result are kept."""
     prefix = "" if path.stem == "trajectory" else f"{path.stem}_"
     if arguments.csv:
         write_csv(path.with_suffix(".csv"), trajectory, overwrite=True)

@@ -23,15 +23,15 @@ from disctrack.trajectory.reuse import origin_of, reusable
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Analyse, write, and say what was found; returns the exit code."""
+    """Analyse, write files and print the report; returns the exit code."""
     path = trajectory_in(arguments.trajectory)
     folder = arguments.output or path.parent / f"{path.stem}_analysis"
-    outputs.tell_stale(path)
+    outputs.warn_if_stale(path)
     known = reusable(folder, origin_of(path, {"window": arguments.window, "circle": arguments.circle}))
     page = folder / "motion.html"
-    asked = [page, *([folder / "figures"] if arguments.figures else [])]
-    if known is not None and not arguments.overwrite and all(place.exists() for place in asked):
-        return outputs.tell(known, arguments, folder, reused=True)
+    requested = [page, *([folder / "figures"] if arguments.figures else [])]
+    if known is not None and not arguments.overwrite and all(place.exists() for place in requested):
+        return outputs.finish(known, arguments, folder, reused=True)
     with steps("analyse"):
         outcome = run_analyse(
             path,
@@ -44,11 +44,11 @@ def run(arguments: argparse.Namespace) -> int:
     with steps("motion.html"):
         _write_motion_page(page, outcome.analysis, path, arguments.recording)
     outputs.link_pages_of(path)
-    return outputs.tell(replace(outcome.summary, files=(*outcome.summary.files, page)), arguments, folder)
+    return outputs.finish(replace(outcome.summary, files=(*outcome.summary.files, page)), arguments, folder)
 
 
 def _write_motion_page(page: Path, analysis: Analysis, trajectory: Path, recording: Path | None) -> None:
-    """The interactive page, with pictures where the images of this trajectory are at hand."""
+    """The interactive page, with pictures if the images of this trajectory are available."""
     folder, n = recording or outputs.recording_of(trajectory), len(analysis.trajectory)
     drawn = None
     try:

@@ -1,4 +1,4 @@
-"""`disctrack batch`: many recordings side by side."""
+"""`disctrack batch`: many recordings in parallel."""
 
 import argparse
 import sys
@@ -12,7 +12,7 @@ from disctrack.files.text import printable
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Measure, say what became of each recording; returns the exit code."""
+    """Measure, and print the result of each recording; returns the exit code."""
     options = BatchOptions(**{field.name: getattr(arguments, field.name) for field in fields(BatchOptions)})
     if arguments.summary_only:
         outcome = summarise_batch(arguments.folders, options, arguments.output)
@@ -20,13 +20,13 @@ def run(arguments: argparse.Namespace) -> int:
         how = arguments.jobs, arguments.shard, arguments.cluster
         outcome = run_batch(arguments.folders, options, arguments.output, *how)
     outputs.show_report(outcome.report(), arguments, Path())
-    _tell_problems(outcome)
+    _print_problems(outcome)
     if outcome.interrupted:
         raise KeyboardInterrupt
     return FAILED if outcome.failed else INCOMPLETE if outcome.incomplete else DONE
 
 
-def _tell_problems(outcome: BatchOutcome) -> None:
+def _print_problems(outcome: BatchOutcome) -> None:
     sys.stdout.flush()
     for problem in outcome.problems:
         print(f"disctrack: {printable(problem)}", file=sys.stderr)

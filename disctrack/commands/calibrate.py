@@ -21,12 +21,12 @@ def run(arguments: argparse.Namespace) -> int:
         source = _source_of_patterns(arguments)
         path = arguments.output or Path("rig.h5")
     else:
-        _refuse_words_beside_a_recording(arguments)
+        _refuse_options_with_recording(arguments)
         source = source_of(read_recording(arguments.recording), outputs.calibration_settings(arguments))
         path = arguments.output or arguments.recording / outputs.RESULTS / "rig.h5"
     outputs.check_writable(path.parent)
     _, report = calibrate_into(path, source, arguments.overwrite, not arguments.no_figures, arguments.force)
-    return outputs.tell(report, arguments, path.parent)
+    return outputs.finish(report, arguments, path.parent)
 
 
 def _source_of_patterns(arguments: argparse.Namespace) -> CalibrationSource:
@@ -44,7 +44,7 @@ def _source_of_patterns(arguments: argparse.Namespace) -> CalibrationSource:
     )
 
 
-def _refuse_words_beside_a_recording(arguments: argparse.Namespace) -> None:
+def _refuse_options_with_recording(arguments: argparse.Namespace) -> None:
     given = [option for option in VIEWS + TABLE if _given(arguments, option) is not None]
     if given:
         raise RecordingError(

@@ -10,7 +10,7 @@ from disctrack.progress import steps
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Look, draw, report; exit code 1 where a run would fail or mislead."""
+    """Examine, draw, report; exit code 1 if a run would fail or its result be in doubt."""
     with steps("check") as step:
         seen = run_check(arguments.recording, step)
     files = []

@@ -27,16 +27,16 @@ def run(arguments: argparse.Namespace) -> int:
         return _together(paths, arguments)
     path = paths[0]
     folder = arguments.output or path.parent / f"{path.stem}_diagnosis"
-    outputs.tell_stale(path)
+    outputs.warn_if_stale(path)
     known = reusable(folder, origin_of(path, {"model": content_of(arguments.model), "plan": arguments.plan}))
     more = arguments.figures and not (folder / "figures").is_dir()
     if known is not None and not (arguments.overwrite or more):
-        return outputs.tell(known, arguments, folder, reused=True)
+        return outputs.finish(known, arguments, folder, reused=True)
     findings = carried(read_findings(path))
     if wrong_declarations(findings) and not arguments.anyway:
         said = "Not diagnosed: a number is declared wrong, and a missing effect would be read into it."
         then = f"mend it and run again; or `disctrack diagnose {outputs.relative(path)} --anyway`"
-        return outputs.tell(Report("", said, findings=findings, then=then), arguments, folder)
+        return outputs.finish(Report("", said, findings=findings, then=then), arguments, folder)
     with compiling("the simulation of motions", 30):
         rolling.prepare()
     with steps("diagnose"):
@@ -49,14 +49,14 @@ def run(arguments: argparse.Namespace) -> int:
             figures=arguments.figures,
         )
     outputs.link_pages_of(path)
-    return outputs.tell(outcome.summary, arguments, folder)
+    return outputs.finish(outcome.summary, arguments, folder)
 
 
 def _together(paths: list[Path], arguments: argparse.Namespace) -> int:
-    """One answer for several files."""
+    """Diagnose several files jointly."""
     for path in paths:
-        with contextlib.suppress(TrajectoryFileError):  # told of below
-            outputs.tell_stale(path)
+        with contextlib.suppress(TrajectoryFileError):  # reported below
+            outputs.warn_if_stale(path)
     with compiling("the simulation of motions", 30):
         rolling.prepare()
     with steps(f"diagnose {len(paths)} recordings together") as step:
@@ -70,7 +70,7 @@ def _together(paths: list[Path], arguments: argparse.Namespace) -> int:
             processes=arguments.jobs or default_threads(),
             progress=step,
         )
-    code = outputs.tell(report, arguments, report.files[0].parent)
+    code = outputs.finish(report, arguments, report.files[0].parent)
     if unusable := report.data["unusable"]:
         print(
             f"disctrack: {len(unusable)} recording{'s' * (len(unusable) > 1)} could not be used (see above).",

@@ -8,10 +8,10 @@ from disctrack.first_look.declare import run_init
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Look, write, and tell what is left to fill in."""
+    """Write the file, and print the values from the files and the keys to fill in."""
     known = {key: getattr(arguments, key) for key in UNKNOWN_TO_FILES if getattr(arguments, key) is not None}
-    file, told, notes, missing = run_init(arguments.folder, known, arguments.like)
-    rows = [(s, f"{key} = {toml_value(value)}  {remark}".rstrip()) for (s, key), (value, remark) in told.items()]
+    file, found, notes, missing = run_init(arguments.folder, known, arguments.like)
+    rows = [(s, f"{key} = {toml_value(value)}  {remark}".rstrip()) for (s, key), (value, remark) in found.items()]
     rows += [*(("note", note) for note in notes), ("written", str(file))]
     rows += [("fill in", ", ".join(missing))] if missing else []
     for heading, text in (*rows, ("then", f"disctrack check {arguments.folder}")):

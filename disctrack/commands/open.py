@@ -18,7 +18,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def last_page(folder: Path) -> Path:
-    """The newest page of a recording, of its results, or of a batch. Raises OutputError where there is none."""
+    """The newest page of a recording, of its results, or of a batch. Raises OutputError if there is none."""
     pages = [page for below in FOLDERS for name in PAGES for page in (folder / below).glob(name)]
     if not pages:
         raise OutputError(f"{folder}: no page of results; `disctrack analyse {folder}` writes one")

@@ -1,6 +1,6 @@
-"""What each command may be given.
+"""Arguments of each command.
 
-Nothing but the parser is imported here, so that --help and a mistyped option are answered at once.
+Only argparse is imported here, so that --help and errors of usage are fast.
 """
 
 import argparse
@@ -24,7 +24,7 @@ EXTRA_FIGURES = "also write every figure of the report as PNG and PDF, into figu
 
 
 def _number(kind: Callable[[str], float], least: float, what: str) -> Callable[[str], float]:
-    """What reads a finite number from `least` on."""
+    """Parser of a finite number that is at least `least`."""
 
     def read(text: str) -> float:
         try:
@@ -45,7 +45,7 @@ _length_or_zero = _number(float, 0, "a length in mm")
 
 
 def _value(options: Options, usage: str, read: Callable[[str], object], what: str, **more: Any) -> None:
-    """What is given as in "-j --jobs N"."""
+    """An option with a value; usage : as "-j --jobs N"."""
     *names, shown = usage.split()
     options.add_argument(*names, type=read, metavar=shown, help=what, **more)
 
@@ -270,7 +270,7 @@ def _output_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _tracking_options(parser: argparse.ArgumentParser) -> None:
-    """Options that `run` and `track` have in common."""
+    """Common options of `run` and `track`."""
     part = parser.add_mutually_exclusive_group()
     what = "measure frames A to B-1, no others; the file keeps the recording's length"
     _value(part, "--frames A:B", _frame_range, what)
@@ -283,7 +283,7 @@ def _tracking_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _calibration_options(parser: argparse.ArgumentParser) -> None:
-    """Options that `run` and `calibrate` have in common."""
+    """Common options of `run` and `calibrate`."""
     group = parser.add_argument_group("calibration")
     group.add_argument("--distortion", default="auto", metavar="TERMS", help="Brown's terms, e.g. 'k1 k2'; auto: all")
     group.add_argument("--board", default="auto", metavar="SHAPE", help="flat, warped or free; auto: by held-out error")

@@ -11,7 +11,7 @@ from disctrack.report.figures import save_figure
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Draw both sheets, and say what to declare of them."""
+    """Draw both sheets, and print what to declare."""
     disc, corners, square_mm = MA_2014, (9, 6), 10.0
     if arguments.recording is not None:
         recording = read_recording(arguments.recording)

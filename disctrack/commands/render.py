@@ -1,4 +1,4 @@
-"""`disctrack render`: a scene as the pair of cameras would have recorded it, with what is true of it beside it."""
+"""`disctrack render`: a scene as recorded by a pair of cameras, with its true motion."""
 
 import argparse
 import sys
@@ -13,7 +13,7 @@ from disctrack.synthetic.recording import run_render
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Render, write, and say what."""
+    """Render, write, and print a summary."""
     if arguments.defaults:
         print(scene_toml(Scene()), end="")
         return
@@ -25,7 +25,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def rendered(file: Path, folder: Path, truth_file: Path | None, quiet: bool) -> None:
-    """Render the scene file into the folder, with a bar, and say what was written."""
+    """Render the scene file into the folder, with a progress bar, and print the files."""
     with tqdm(unit="image", file=sys.stderr, disable=quiet or None) as bar:
 
         def progress(done: int, total: int) -> None:

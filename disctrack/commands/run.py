@@ -43,4 +43,4 @@ def run(arguments: argparse.Namespace) -> int:
         page=summary,
     )
     write_whole(summary, ("\n".join(full(report)) + "\n").encode())
-    return outputs.tell(report, arguments, folder)
+    return outputs.finish(report, arguments, folder)

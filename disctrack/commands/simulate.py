@@ -8,7 +8,7 @@ from disctrack.synthetic.simulation import run_simulate
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Simulate, write, and say how the motion went."""
+    """Simulate, write, and print a summary of the motion."""
     if arguments.list_effects:
         print(catalogue_table(), end="")
         return

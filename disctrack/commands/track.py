@@ -25,4 +25,4 @@ def run(arguments: argparse.Namespace) -> int:
     pairs = pipeline.open_pairs(recording, arguments.frames or (None, None))
     refuse_input(path)
     outputs.check_writable(path.parent)
-    return outputs.tell(outputs.track_into(path, recording, rig, rig_file, pairs, arguments), arguments, path.parent)
+    return outputs.finish(outputs.track_into(path, recording, rig, rig_file, pairs, arguments), arguments, path.parent)

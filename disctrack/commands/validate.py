@@ -1,4 +1,4 @@
-"""`disctrack validate`: poses and diagnosis put to the test on recordings with known truth."""
+"""`disctrack validate`: tests of poses and diagnosis on recordings with known truth."""
 
 import argparse
 import shlex
@@ -18,7 +18,7 @@ from disctrack.validate.tables import Validation, measure_all, write_into, write
 
 def run(arguments: argparse.Namespace) -> int:
     """Validate, write, print the verdict; exit code 1 if a check failed."""
-    make_folder(arguments.output)  # a place that cannot be written to should be known before the work
+    make_folder(arguments.output)  # fails early if it is not writable
     validation = _validation(arguments)
     print(validation.headline if validation.name == "validation" else validation.markdown())
     files = write_validation(arguments.output, validation)

@@ -1,4 +1,4 @@
-"""`disctrack warm-up`: compile the inner loops ahead of the first recording, as when the image of a cluster is made."""
+"""`disctrack warm-up`: compile the inner loops before the first recording, as for a container image."""
 
 import argparse
 from collections.abc import Callable, Sequence
@@ -20,7 +20,7 @@ from disctrack.track.follow.tracking import prepare
 
 def run(arguments: argparse.Namespace) -> None:
     """Compile the inner loops of all stages, in two processes."""
-    # with the seconds of processor time that each took where it was measured
+    # with estimates of the processor time [s]
     parts: list[tuple[str, int, list[Callable[[], object]]]] = [
         ("tracking", 40, [partial(prepare, kind) for kind in (np.uint8, np.uint16)]),
         ("the simulation of motions", 30, [rolling.prepare]),

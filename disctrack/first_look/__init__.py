@@ -1,1 +1,1 @@
-"""Before the first run: what lies in a folder, a recording.toml for it, what a run would trip over, what to print."""
+"""Before the first run: sequences in a folder, a recording.toml for it, problems of a run, sheets to print."""

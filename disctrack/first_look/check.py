@@ -1,7 +1,7 @@
 """Problems that a run would meet, found on a few views and a few frames in seconds.
 
-Each step looks at one thing, says what was seen and adds findings. A step that cannot be made because an earlier one
-failed is left out and named.
+Each step examines one topic, records its observations and adds findings. A step that depends on a failed one is
+skipped, which is reported.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -28,45 +28,45 @@ from disctrack.track.measurement import ImagePairs, check_rig, exposures, images
 from disctrack.track.run_summary import left_out, sigma_text
 from disctrack.trajectory import Trajectory, joined
 
-KEYS_EXPLAINED = Path(__file__).resolve().parents[1] / "docs" / "recording-toml.md"  # it is installed with the package
-VIEWS_LOOKED_AT = 12  # of the chessboard: half of what a good rig takes
-PLACES = (0.1, 0.45, 0.9)  # of the recording where frames are looked at
-FRAMES_AT_EACH = 60  # a jump of the clock in the middle leaves some on either side
+KEYS_EXPLAINED = Path(__file__).resolve().parents[1] / "docs" / "recording-toml.md"  # installed with the package
+VIEWS_LOOKED_AT = 12  # of the chessboard: half as many as a good rig needs
+PLACES = (0.1, 0.45, 0.9)  # fractions of the recording at which frames are examined
+FRAMES_AT_EACH = 60  # enough to detect a jump of the clock
 
 
 @dataclass
 class Check:
-    """What was seen; pictures for the page."""
+    """Observations and findings; images for the picture."""
 
     recording: Recording | None = None
-    seen: list[tuple[str, str]] = field(default_factory=list)  # headings, and what was seen
+    seen: list[tuple[str, str]] = field(default_factory=list)  # heading, observation
     findings: list[Finding] = field(default_factory=list)
     calibration: StereoCalibration | None = None
     boards: Boards | None = None
     shown: list[tuple[Trajectory, int, NDArray]] = field(default_factory=list)  # trajectory, row, images (2, h, w)
-    raw: list[NDArray] = field(default_factory=list)  # pairs in which the disc was not found
+    raw: list[NDArray] = field(default_factory=list)  # image pairs in which the disc was not found
     not_read: NotRead = field(default_factory=dict)
 
     def add(self, kind: Kind, text: str, advice: str = "", severity: Severity = Severity.REFUSAL) -> None:
-        """Add a finding, by default what a run would end with."""
+        """Add a finding, by default one that a run would fail with."""
         remedies = (Remedy(action=advice),) if advice else ()
         self.findings.append(Finding(kind, severity, text, Subject("check"), remedies=remedies))
 
     def images(self, pairs: ImagePairs, frames: Iterable[int]) -> list[NDArray]:
-        """(2, h, w) images of each of these frames; those that cannot be read are left out, and named."""
+        """(2, h, w) images of these frames; unreadable ones are skipped, and recorded in `not_read`."""
         blocks = (block for i in frames for block in pairs.reading(self.not_read)(i, i + 1))
         return [block.images[0].copy() for block in blocks if not block.unreadable]
 
     @contextmanager
     def refusing(self, kind: Kind, advice: str = "") -> Iterator[None]:
-        """An error that ends this step would end a run."""
+        """Convert an error that ends this step to a finding: a run would fail with it."""
         try:
             yield
         except DiscTrackError as error:
             self.add(kind, str(error), advice)
 
     def report(self, files: Sequence[Path] = ()) -> Report:
-        """The causes, and with `-v` what was seen."""
+        """The causes, and, with `-v`, all observations."""
         findings = leading(self.findings)
         verdict = "A run would meet no problem."
         if in_doubt(findings):
@@ -81,9 +81,9 @@ class Check:
 
 
 def run_check(folder: Path, progress: Callable[[str], None] = lambda step: None) -> Check:
-    """Look at a recording's declaration, frames, views, light and motion.
+    """Examine declaration, frames, views, light and motion of a recording.
 
-    progress is called with what is looked at next. Raises nothing that belongs to the recording: that is a remark.
+    progress is called with the name of each step. Errors of the recording are findings and not raised.
     """
     seen, pairs, rig = Check(), None, None
     progress("declaration")
@@ -184,7 +184,7 @@ def _motion(seen: Check, recording: Recording, rig: StereoRig, pairs: ImagePairs
             noticed += getattr(error, "findings", ())
             seen.raw += seen.images(pairs, [frames.start])
         if any(Kind.DISC_NOT_FOUND in finding.explains for finding in noticed):
-            break  # the images are not those of the declared cameras: no other place tells more
+            break  # the images are not of the declared cameras: so are those elsewhere
     measured = sum(int(tracking.trajectory.measured.sum()) for _, tracking in done)
     if not done:
         seen.add(Kind.DISC_NOT_FOUND, "the disc was found nowhere; compare [markers] with the picture", lost)
@@ -202,8 +202,8 @@ def _motion(seen: Check, recording: Recording, rig: StereoRig, pairs: ImagePairs
     whole = joined([tracking.trajectory for _, tracking in done])
     blur_px = done[len(done) // 2][1].details["blur_px"]
     for finding in contradictions(whole, recording.disc, recording, noticed, seen.boards, blur_px):
-        graver = Severity.DOUBT if finding.kind == Kind.DOT_UNSEEN else finding.severity
-        seen.findings.append(replace(finding, severity=graver))
+        severity = Severity.DOUBT if finding.kind == Kind.DOT_UNSEEN else finding.severity
+        seen.findings.append(replace(finding, severity=severity))
     if measured:
         for camera, blur, width in zip(CAMERAS, blur_px, across(whole), strict=True):
             seen.seen.append(("sharpness", f"{camera}: dots {width:.1f} px across, blur {blur:.2f} px (sigma)"))
@@ -211,7 +211,7 @@ def _motion(seen: Check, recording: Recording, rig: StereoRig, pairs: ImagePairs
 
 
 def _once(findings: Iterable[Finding]) -> list[Finding]:
-    """Of the places looked at, one finding for each kind and camera: the gravest."""
+    """The most severe finding of each kind and camera."""
     first: dict[tuple[Kind, str], Finding] = {}
     for finding in sorted(findings, key=lambda f: -f.severity):
         first.setdefault((finding.kind, finding.subject.camera), finding)

@@ -1,7 +1,7 @@
-"""A recording.toml for a folder of frames: what the files tell is filled in, what they cannot tell is left to the user.
+"""A recording.toml for a folder of frames: values known from the files are filled in, others are left to the user.
 
-A value that no file tells stands as a comment with FILL IN: the declaration is refused until it is given, so that no
-guess of ours becomes a measurement.
+An unknown value is a comment with FILL IN: the declaration is refused until it is given, so that no guess enters a
+measurement.
 """
 
 from collections.abc import Mapping
@@ -24,10 +24,10 @@ from disctrack.recording.readers.base import FrameReader
 def run_init(
     folder: Path, known: Mapping[str, float] | None = None, like: Path | None = None
 ) -> tuple[Path, Told, list[str], tuple[str, ...]]:
-    """Write recording.toml into a folder of frames. Returns it, what the files tell, notes, and keys left to fill in.
+    """Write recording.toml into a folder of frames. Returns it, values from the files, notes, and keys to fill in.
 
-    known : values by key that the user gave; like : another recording.toml, or its folder, of the same disc,
-    board and table, from which everything is taken that the files do not tell
+    known : values of the user by key; like : another recording.toml, or its folder, of the same disc, board and table,
+    for values that the files do not contain
     Raises RecordingError if no two cameras are found, OutputError if there is a recording.toml already.
     """
     folder = Path(folder)
@@ -35,18 +35,18 @@ def run_init(
     if file.exists():
         raise OutputError(f"{file}: exists. Edit it, or move it away; `disctrack check {folder}` names what it lacks.")
     example = {} if like is None else read_toml(like / FILE_NAME if like.is_dir() else like, RecordingError)
-    told, notes = look_into(folder)
+    found, notes = look_into(folder)
     given = {"gravity": {"g_m_s2": 9.81}} | example
-    text, missing = declaration_text(folder.resolve().name, told, known or {}, given)
+    text, missing = declaration_text(folder.resolve().name, found, known or {}, given)
     write_whole(file, text.encode())
-    return file, told, notes, missing
+    return file, found, notes, missing
 
 
 def look_into(folder: Path) -> tuple[Told, list[str]]:
-    """What the frames of a folder tell, and notes. Raises RecordingError if no two cameras can be told apart."""
+    """Values known from the files of a folder, and notes. Raises RecordingError if no two cameras are recognised."""
     sequences = find_sequences(folder)
     pairs, half = pair_cameras(sequences), None
-    # one camera: a sequence without a partner, or partners that are unlike; two and two are two cameras
+    # one camera: a sequence without partner, or partners of different content; two pairs are two cameras
     named = any(pair.named for pair in pairs)
     unlike = not named and (2 * len(pairs) < len(sequences) or any(pair.shows_the_board_once for pair in pairs))
     if unlike and (half := _side_by_side(sequences)):
@@ -66,36 +66,36 @@ def look_into(folder: Path) -> tuple[Told, list[str]]:
             f"--left '{folder / views.left.pattern}' --right '{folder / views.right.pattern}' "
             f"--corners {corners[0]}x{corners[1]} --square-mm SIDE -o rig.h5"
         )
-    told, notes = _of_frames(frames)
+    found, notes = _of_frames(frames)
     if len(candidates) > 1:
         others = ", ".join(pair.left.pattern for pair in candidates if pair is not frames)
         notes.append(f"the longest of several pairs is taken for the recording; also there: {others}")
     if half is not None:
         width, height = half
-        told["cameras", "left_part"] = [0, 0, width, height], ""
-        told["cameras", "right_part"] = [width, 0, width, height], ""
+        found["cameras", "left_part"] = [0, 0, width, height], ""
+        found["cameras", "right_part"] = [width, 0, width, height], ""
         notes.append("each image holds two views side by side, as the board in both halves shows")
     if views is not None:
         left, right, count = views.left.pattern, views.right.pattern, len(views.left)
-        told["calibration", "left"], told["calibration", "right"] = (left, f"{count} views"), (right, "")
+        found["calibration", "left"], found["calibration", "right"] = (left, f"{count} views"), (right, "")
         if inner_corners is None:
             notes.append(f"{left}: {board_seen}")
         else:
-            told["calibration", "inner_corners"] = list(inner_corners), f"long side first; {board_seen}"
-    elif (rig_file := _rig_beside(folder)) is not None:
-        told["calibration", "rig"] = rig_file, "a rig that was calibrated before"
+            found["calibration", "inner_corners"] = list(inner_corners), f"long side first; {board_seen}"
+    elif (rig_file := _rig_near(folder)) is not None:
+        found["calibration", "rig"] = rig_file, "a rig that was calibrated before"
     else:
         said = "no views of a chessboard are there: put them into calibration/left and calibration/right, or name a rig"
         notes.append(said)
-    return told, notes
+    return found, notes
 
 
 def _of_frames(frames: CameraPair) -> tuple[Told, list[str]]:
-    """What the cameras' frames tell, and notes."""
+    """Values known from the frames of the cameras, and notes."""
     left, right = frames.left.open(), frames.right.open("right")
     width, height = left.image_size
     described, notes = f"{len(left)} frames of {width} x {height} px, {left.bit_depth} bit", []
-    told: Told = {
+    found: Told = {
         ("cameras", "left"): (frames.left.pattern, described),
         ("cameras", "right"): (frames.right.pattern, ""),
         ("table", "view"): (0, ""),
@@ -105,10 +105,10 @@ def _of_frames(frames: CameraPair) -> tuple[Told, list[str]]:
         notes.append(f"{many}: a run wants as many of both, of the same instants")
     rate, source = _frame_rate(left, right)
     if rate is not None:
-        told["cameras", "frame_rate_hz"] = rate, f"frames per second, {source}"
+        found["cameras", "frame_rate_hz"] = rate, f"frames per second, {source}"
     if not frames.named:
         notes.append(f"which camera is left is a guess by the order of names: {frames.left.pattern} is taken for left")
-    return told, notes
+    return found, notes
 
 
 def _no_two_cameras(folder: Path, sequences: list[Sequence]) -> RecordingError:
@@ -120,7 +120,7 @@ def _no_two_cameras(folder: Path, sequences: list[Sequence]) -> RecordingError:
 
 
 def _side_by_side(sequences: list[Sequence]) -> tuple[int, int] | None:
-    """Width and height [px] of half an image, where there are images whose two halves both show a chessboard."""
+    """Width and height [px] of half an image, if both halves of some images show a chessboard."""
     for sequence in sorted(sequences, key=len):
         halves = [np.array_split(image, 2, axis=1) for image in sequence.some_images()]
         if any(left.shape != right.shape for left, right in halves):
@@ -129,16 +129,16 @@ def _side_by_side(sequences: list[Sequence]) -> tuple[int, int] | None:
         if size is None:
             continue
         seen = [all(not isinstance(find_corners(half, size), BoardNotFound) for half in both) for both in halves]
-        if 2 * sum(seen) > len(seen):  # half of a board passes for a smaller one in some
+        if 2 * sum(seen) > len(seen):  # in some images, half of a board looks like a smaller one
             height, width = halves[0][0].shape[:2]
             return width, height
     return None
 
 
 def _views_among(pairs: list[CameraPair], side_by_side: int) -> tuple[CameraPair | None, tuple[int, int] | None, str]:
-    """The pair that shows the chessboard: by its names, else by what is in the images, shortest first.
+    """The pair that shows the chessboard: by its names, else by the content of its images, shortest first.
 
-    side_by_side : how many cameras' images stand beside each other in one
+    side_by_side : number of cameras whose images are combined in one, side by side
     """
     named = [pair for pair in pairs if pair.looks_like_calibration]
     others = sorted((pair for pair in pairs if pair not in named), key=lambda pair: len(pair.left))
@@ -169,8 +169,8 @@ def _frame_rate(left: FrameReader, right: FrameReader) -> tuple[float | None, st
     return None, ""
 
 
-def _rig_beside(folder: Path) -> str | None:
-    """A rig file of disctrack in the folder or the one above."""
+def _rig_near(folder: Path) -> str | None:
+    """A rig file of disctrack in the folder or its parent."""
     for place, shown in ((folder, ""), (folder.parent, "../")):
         for file in sorted(place.glob("*.h5")):
             try:

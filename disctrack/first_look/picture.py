@@ -1,4 +1,4 @@
-"""The picture of a check: the table view with the axes it defines, and frames with what was found in them."""
+"""The picture of a check: the table view with the axes it defines, and frames with the fitted disc."""
 
 from pathlib import Path
 
@@ -17,7 +17,7 @@ from disctrack.track.video_overlay import draw_pair
 
 
 def check_figure(seen: Check) -> Figure | None:
-    """Table view and frames, left and right; None where nothing could be read."""
+    """Table view and frames, left and right; None if nothing could be read."""
     table = _table_view(seen)
     frames = [
         (f"frame {trajectory.frame[row]}", draw_pair(images, trajectory, row)[..., ::-1])
@@ -69,6 +69,6 @@ def _draw_table(axes: Axes, images: tuple[NDArray, NDArray], seen: Check) -> Non
 
 
 def _shown(image: NDArray) -> NDArray[np.uint8]:
-    """(h, w, 3) for the eye, stretched to 8 bit and reduced."""
+    """(h, w, 3) for display, stretched to 8 bit and reduced."""
     grey = np.asarray(cv2.normalize(image.astype(np.float32), None, 0, 255, cv2.NORM_MINMAX), np.uint8)  # type: ignore[call-overload]
     return np.asarray(np.repeat(reduced(grey)[0][..., None], 3, axis=-1), np.uint8)

@@ -1,4 +1,4 @@
-"""What a folder holds: sequences of frames, which two of them are the cameras, which two show the chessboard."""
+"""Sequences of frames in a folder: which two are of the cameras, which two show the chessboard."""
 
 import re
 from collections import defaultdict
@@ -22,7 +22,7 @@ from disctrack.recording.readers.hdf5 import stacks_of
 
 _OWN_FOLDERS = re.compile(r"(results|batch_results|.*_analysis|.*_diagnosis)$")
 _CALIBRATION_WORDS = re.compile(r"cal|chess|checker|board|target|views", re.IGNORECASE)
-# Words that tell the cameras apart, left first; numbers and single letters are compared by their order.
+# Words for the two cameras, left first; numbers and single letters are compared by their order.
 _SIDES = (("left", "right"), ("l", "r"), ("links", "rechts"), ("gauche", "droite"), ("izquierda", "derecha"))
 _TOKEN = re.compile(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])|[0-9]+|[^A-Za-z0-9]+")
 
@@ -44,34 +44,34 @@ class Sequence:
         return open_frames(self.pattern, self.folder, camera)
 
     def some_images(self) -> list[NDArray]:
-        """A few over its length; views may be in colour. Raises RecordingError."""
+        """A few images, evenly distributed; views may be in colour. Raises RecordingError."""
         views = views_of(self.pattern, self.folder, "left", most=np.inf)
         return [pixels_of(views[i]) for i in evenly(len(views), VIEWS_TRIED)]
 
 
 @dataclass(frozen=True)
 class CameraPair:
-    """Two sequences whose names differ by the camera alone."""
+    """Two sequences whose names differ only by the camera."""
 
     left: Sequence
     right: Sequence
-    named: bool  # True where the names say which is left
+    named: bool  # True if the names say which is left
 
     @property
     def looks_like_calibration(self) -> bool:
-        """True where the names speak of a calibration."""
+        """True if both names contain a word of calibration."""
         return bool(_CALIBRATION_WORDS.search(self.left.pattern) and _CALIBRATION_WORDS.search(self.right.pattern))
 
     @cached_property
     def shows_the_board_once(self) -> bool:
-        """Does one show a chessboard and the other none, so that they are views and frames of one camera?"""
+        """True if only one shows a chessboard: they are views and frames of one camera."""
         return (
             not self.named and len({board_size(side.some_images())[0] is None for side in (self.left, self.right)}) > 1
         )
 
 
 def find_sequences(folder: Path) -> list[Sequence]:
-    """Sequences of frames in the folder and below, results of earlier runs left out."""
+    """Sequences of frames in the folder and below, without results of earlier runs."""
     if not folder.is_dir():
         raise RecordingError(f"{folder}: no such folder. Give the folder that holds the frames.")
     found: list[Sequence] = []
@@ -91,7 +91,7 @@ def find_sequences(folder: Path) -> list[Sequence]:
 
 
 def pair_cameras(sequences: Iterable[Sequence]) -> list[CameraPair]:
-    """Pairs of sequences whose names differ in one word or number, each sequence in one pair at most."""
+    """Pairs of sequences whose names differ in one word or number, each sequence in at most one pair."""
     waiting = sorted(sequences, key=lambda sequence: natural_key(sequence.pattern))
     pairs = []
     while waiting:
@@ -114,18 +114,18 @@ def pair_cameras(sequences: Iterable[Sequence]) -> list[CameraPair]:
 
 
 def _image_sequences(folder: Path, inside: Path, names: list[str]) -> list[Sequence]:
-    """Images of one folder, grouped by what is left of their names when the counting number is taken out."""
-    alike: dict[tuple[str, ...], list[list[str]]] = defaultdict(list)
+    """Images of one folder, grouped by their names without the frame number."""
+    by_words: dict[tuple[str, ...], list[list[str]]] = defaultdict(list)
     for name in names:
         parts = re.split(r"([0-9]+)", name)
-        alike[tuple(parts[::2])].append(parts)
+        by_words[tuple(parts[::2])].append(parts)
     groups: dict[tuple[str, str], int] = defaultdict(int)
-    for members in alike.values():
+    for members in by_words.values():
         runs = list(zip(*(parts[1::2] for parts in members), strict=True))
         counter = max(range(len(runs)), key=lambda k: (len(set(runs[k])), len(runs[k][0]), k), default=None)
         for parts in members:
             shown, suffix = list(parts), Path("".join(parts)).suffix.lower()
-            if counter is not None and (len(members) > 1 or suffix not in (".tif", ".tiff")):  # which may be stacks
+            if counter is not None and (len(members) > 1 or suffix not in (".tif", ".tiff")):  # these may be stacks
                 shown[2 * counter + 1] = "*"
             groups["".join(shown), suffix] += 1
     suffixes = [suffix for _, suffix in groups]
@@ -138,16 +138,16 @@ def _image_sequences(folder: Path, inside: Path, names: list[str]) -> list[Seque
 
 
 def _stacks(file: Path) -> list[str]:
-    """Paths of the data sets in an HDF5 file that can be frames: (n, height, width) of 8 or 16 bit."""
+    """Paths of data sets of an HDF5 file that may be frames: (n, height, width) of 8 or 16 bit."""
     try:
         with h5py.File(file, "r") as opened:
             return sorted((stack.name for stack in stacks_of(opened)), key=natural_key)
-    except OSError:  # not HDF5, or damaged: no frames to name
+    except OSError:  # not HDF5, or damaged
         return []
 
 
 def _difference(tokens: list[str], other: Sequence, first: Sequence) -> tuple[str, str] | None:
-    """The one token in which the other's name differs, as (ours, theirs); None if there is none, or more than one."""
+    """The token in which the other name differs, as (ours, theirs); None unless there is exactly one."""
     theirs = _TOKEN.findall(other.pattern)
     if other.kind != first.kind or len(theirs) != len(tokens):
         return None
@@ -159,13 +159,13 @@ def _difference(tokens: list[str], other: Sequence, first: Sequence) -> tuple[st
 
 
 def _as_many(one: Sequence, other: Sequence) -> bool:
-    """Whether two sequences may be of one motion by their files; a few may be missing in one of them."""
+    """Whether the numbers of files allow that two sequences are of one motion; some may be missing."""
     few, many = sorted((one.files, other.files))
     return 2 * few >= many
 
 
 def _sides(ours: str, theirs: str) -> tuple[str, str]:
-    """The words that tell the cameras apart: "camleft" and "camright" differ in "left" and "right"."""
+    """The differing ends of two words: "left" and "right" of "camleft" and "camright"."""
     common = next((i for i, (a, b) in enumerate(zip(ours, theirs, strict=False)) if a != b), 0)
     return ours[common:].lower(), theirs[common:].lower()
 

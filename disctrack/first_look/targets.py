@@ -1,4 +1,4 @@
-"""The declared dots and board as PDF, true to scale: drawn from recording.toml, so that print and declaration agree."""
+"""The declared dots and board as PDF, true to scale: from recording.toml, so that print and declaration agree."""
 
 from collections.abc import Iterator
 
@@ -11,7 +11,7 @@ from disctrack.disc import Disc
 from disctrack.errors import OutputError
 
 PAPERS_MM = {"a4": (210.0, 297.0), "a3": (297.0, 420.0), "letter": (215.9, 279.4)}
-MARGIN_MM = 8.0  # that printers leave white
+MARGIN_MM = 8.0  # that printers cannot print
 RULER_MM = 100.0
 GAP_MM = 4.0  # between two discs on a sheet
 _CREDIT = 'print at 100 %, not "fit to page"; the bar must measure 100.0 mm'
@@ -35,7 +35,7 @@ def dots_figure(disc: Disc, paper: str = "a4", dark: bool = True) -> Figure:
         axes.add_patch(Circle((x, y), diameter / 2, facecolor=ground, edgecolor="#999999", linewidth=0.3))
         for u, v in disc.marker_centres_body[:, :2] * 1e3:
             axes.add_patch(Circle((x + u, y + v), disc.marker_diameter * 500, facecolor=ink, linewidth=0))
-        # outside the rim: what lies on the face would be taken for a dot
+        # outside the rim: marks on the face could be detected as dots
         for dx, dy in ((1, 0), (0, 1), (-1, 0), (0, -1)):
             r = np.array([diameter / 2 + 0.5, diameter / 2 + 2.5])
             axes.plot(x + dx * r, y + dy * r, color="#999999", linewidth=0.4)
@@ -44,9 +44,9 @@ def dots_figure(disc: Disc, paper: str = "a4", dark: bool = True) -> Figure:
 
 
 def board_figure(inner_corners: tuple[int, int], square_mm: float, paper: str = "a4") -> Figure:
-    """Chessboard with a light rim of one square and more. Raises OutputError if it does not fit."""
+    """Chessboard with a light rim of at least one square. Raises OutputError if it does not fit."""
     columns, rows = inner_corners
-    turned = columns > rows  # so that the long side lies along the paper's
+    turned = columns > rows  # so that its long side is along that of the paper
     size = np.array([rows + 1, columns + 1] if turned else [columns + 1, rows + 1]) * square_mm
     width, height = PAPERS_MM[paper]
     across = size + 2 * square_mm  # with the rim
@@ -69,7 +69,7 @@ def board_figure(inner_corners: tuple[int, int], square_mm: float, paper: str = 
 
 
 def _places(width: float, height: float, diameter: float) -> Iterator[tuple[float, float]]:
-    """Centres [mm] of the discs on a sheet, the strip of the ruler left free."""
+    """Centres [mm] of the discs on a sheet, outside the strip of the ruler."""
     pitch, rim = diameter + GAP_MM, MARGIN_MM + 3 + diameter / 2
     for y in np.arange(MARGIN_MM + 14 + rim, height - rim + 1e-9, pitch):
         for x in np.arange(rim, width - rim + 1e-9, pitch):

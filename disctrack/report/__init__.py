@@ -1,1 +1,1 @@
-"""What a stage tells its user: blocks that it fills, numbers as people write them, and the writers."""
+"""Reports of the stages: their blocks, and writers for terminal, HTML and JSON."""

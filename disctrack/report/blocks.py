@@ -1,6 +1,6 @@
-"""What a report is made of: each stage fills these blocks, and the writers set them (terminal, HTML, JSON).
+"""Blocks of a report: each stage fills them, and the writers format them (terminal, HTML, JSON).
 
-A paragraph is a string, and a list of sentences a list of strings; all else is one of the classes.
+A paragraph is a string, a list of sentences a list of strings; other blocks are instances of the classes.
 """
 
 from __future__ import annotations
@@ -21,19 +21,19 @@ Cell = str | Measured
 
 
 class Markup(str):
-    """HTML that goes into a page as it is; no other writer shows it."""
+    """HTML that is put into a page unchanged; other writers omit it."""
 
 
 @dataclass(frozen=True)
 class Facts:
-    """Named numbers and short answers, one below the other; a row without a name belongs to the one above it."""
+    """List of named numbers and short answers; a row without a name belongs to the one above."""
 
     rows: Sequence[tuple[str, Cell]]
 
 
 @dataclass(frozen=True)
 class Listing:
-    """Rows of numbers and words; a row without a header names what stands in it."""
+    """A table of numbers and words; a column without header contains the names of the rows."""
 
     header: Sequence[str]
     rows: Sequence[Sequence[Cell]]
@@ -44,14 +44,14 @@ class Listing:
 
 @dataclass(frozen=True)
 class Figures:
-    """Figures with their captions, on pages only."""
+    """Figures with captions, on pages only."""
 
     drawn: Sequence[Drawn]
 
 
 @dataclass(frozen=True)
 class Section:
-    """Blocks under a heading; nothing where all are empty."""
+    """Blocks under a heading; omitted if all are empty."""
 
     title: str
     blocks: Sequence[Any]  # Block
@@ -59,26 +59,26 @@ class Section:
 
 @dataclass(frozen=True)
 class Report:
-    """What a stage tells: its answer first, then how good it is, then everything else."""
+    """Report of a stage: verdict, accuracy, then details."""
 
     title: str  # of the page
     verdict: str
     accuracy: str = ""  # in one line
     findings: Sequence[Finding] = ()
-    facts: Sequence[tuple[str, Cell]] = ()  # the few numbers that come first on a page
+    facts: Sequence[tuple[str, Cell]] = ()  # the few numbers at the top of a page
     blocks: Sequence[Any] = ()  # Block
     files: Sequence[Path] = ()
-    page: Path | None = None  # where to read on
+    page: Path | None = None  # with the details
     then: str = ""  # the next command
-    data: Mapping[str, Any] = field(default_factory=dict)  # of the stage, for programs: a part of the JSON document
+    data: Mapping[str, Any] = field(default_factory=dict)  # of the stage, for programs: part of the JSON document
 
     def graver_first(self) -> list[Finding]:
-        """The findings as they are told; a cause stays before what it explains."""
+        """The findings, most severe first; the order within a severity is kept."""
         return sorted(self.findings, key=lambda f: -f.severity)
 
 
 def is_empty(block: Any) -> bool:
-    """True where a block has nothing to show."""
+    """True if a block has no content."""
     if isinstance(block, (str, list)):
         return not block
     content = next(value for name, value in vars(block).items() if name not in ("title", "header"))
@@ -86,14 +86,14 @@ def is_empty(block: Any) -> bool:
 
 
 def figures_in(blocks: Iterable[Any]) -> Iterator[Drawn]:
-    """All figures of the blocks, in their order."""
+    """All figures of the blocks, in order."""
     for block in blocks:
         yield from block.drawn if isinstance(block, Figures) else []
         yield from figures_in(block.blocks) if isinstance(block, Section) else []
 
 
 def document(report: Report) -> dict[str, Any]:
-    """The report in JSON's types."""
+    """The report in types of JSON."""
     found = {
         "title": report.title,
         "verdict": report.verdict,
@@ -110,7 +110,7 @@ def document(report: Report) -> dict[str, Any]:
 
 
 def restored(kept: Mapping[str, Any], data: Mapping[str, Any]) -> Report:
-    """A report from its document, made without the stage's own data, and these."""
+    """The report from its document and the data of its stage."""
     findings = [finding_from_json(finding) for finding in kept["findings"]]
     files = [Path(file) for file in kept["files"]]
     page = Path(kept["page"]) if kept["page"] else None
@@ -134,7 +134,7 @@ def _block(block: Any) -> dict[str, Any] | None:
         facts: dict[str, list[object]] = {}
         for name, value in block.rows:
             facts.setdefault(name or next(reversed(facts), ""), []).append(_cell(value))
-        return {"facts": {name: told if len(told) > 1 else told[0] for name, told in facts.items()}}
+        return {"facts": {name: cells if len(cells) > 1 else cells[0] for name, cells in facts.items()}}
     if isinstance(block, Listing):
         rows = [[_cell(cell) for cell in row] for row in block.rows]
         return {"caption": block.caption or block.folded, "header": list(block.header), "rows": rows}

@@ -1,4 +1,4 @@
-"""Figures: how axes look, how they are written, and how a page shows them."""
+"""Figures: style of axes, files, and embedding in pages."""
 
 import base64
 import io
@@ -20,12 +20,12 @@ from disctrack.report.palette import GRID, INK, MUTED
 DPI = 150
 NO_TITLE = (0.95, 0.15, 0.55, 0.15)  # margins [in] of labelled axes
 BAND = 3.0  # sigmas shown as a band
-LARGE = 400_000  # [bytes] vector graphics beyond it go into a page as a bitmap: thousands of points
+LARGE = 400_000  # [bytes] larger vector graphics, of thousands of points, are embedded as a bitmap
 
 
 @dataclass(frozen=True)
 class Drawn:
-    """One figure with what is said below it."""
+    """One figure with its caption."""
 
     name: str  # of the file
     title: str
@@ -41,8 +41,8 @@ class Curve:
     y: Array
     colour: str
     label: str = ""
-    style: str = "-"  # as matplotlib has it: "--", ":", ".", "o"
-    sigma: Array | None = None  # with a band of BAND of these
+    style: str = "-"  # of matplotlib: "--", ":", ".", "o"
+    sigma: Array | None = None  # if given, a band of ± BAND sigmas is drawn
 
 
 def chart(
@@ -52,9 +52,9 @@ def chart(
     equal: bool = False,
     heights: Sequence[float] | None = None,
 ) -> Figure:
-    """Curves over one abscissa, row by row: the ordinate's label, and what is drawn.
+    """Curves over a common abscissa. rows : label of the ordinate, curves.
 
-    size : [in];  equal : one scale along both axes, for places in a plane;  heights : of the rows, relative
+    size : [in];  equal : same scale of both axes, for positions in a plane;  heights : of the rows, relative
     """
     figure, found = panels(*size, len(rows), margins=NO_TITLE, sharex=True, height_ratios=heights)
     for axes, (y_label, curves) in zip(found, rows, strict=True):
@@ -86,7 +86,7 @@ def dress(axes: Axes) -> None:
 
 
 def plain_powers(axis: Axis) -> None:
-    """Numbers on a logarithmic axis: 3 and 20, not 3 × 10⁰ and 2 × 10¹; powers of ten where it spans many."""
+    """Numbers on a logarithmic axis: 3 and 20, not 3 × 10⁰ and 2 × 10¹; powers of ten if it spans many."""
     low, high = sorted(axis.get_view_interval())
     if low > 1e-3 and high < 1e5 and high < 1e3 * low:
         axis.set_major_formatter("{x:g}")
@@ -104,7 +104,7 @@ def panels(
 ) -> tuple[Figure, list[Axes]]:
     """A figure [in] with its axes row by row, dressed; options as for matplotlib's `subplots`.
 
-    margins : as for `lay_out`, where what stands at the edges is known; without them all labels are measured
+    margins : as for `lay_out`; by default from the size of all labels
     """
     figure = Figure(figsize=(width, height), layout="constrained" if margins is None else None)
     if margins is not None:
@@ -121,7 +121,7 @@ def lay_out(
     margins: tuple[float, float, float, float] = (0.8, 0.2, 0.6, 0.7),
     gaps: tuple[float, float] = (0.9, 0.6),
 ) -> None:
-    """Place a grid of axes by hand: measuring the labels, as matplotlib can, takes longer than drawing all of them.
+    """Place a grid of axes with fixed margins: matplotlib's automatic layout takes longer than drawing.
 
     shape : rows, columns; margins : left, right, bottom, top [in]; gaps : between columns, between rows [in]
     """
@@ -134,7 +134,7 @@ def lay_out(
 
 
 def save_figure(figure: Figure, path: Path) -> Path:
-    """Write a figure whole; the format follows from the name. Raises OutputError."""
+    """Write a figure atomically; the format is that of the suffix. Raises OutputError."""
     FigureCanvasAgg(figure)
     undated = {"CreationDate": None} if path.suffix == ".pdf" else None
     with whole_file(path) as part:
@@ -160,7 +160,7 @@ def draw(
 
 
 def _inline(figure: Figure) -> str:
-    """The figure as a data URI: vector graphics, or a bitmap where those would be larger."""
+    """The figure as a data URI: vector graphics, or a bitmap if those exceed LARGE."""
     for kind, metadata in (("svg", {"Date": None}), ("png", None)):
         buffer = io.BytesIO()
         figure.savefig(buffer, format=kind, dpi=DPI, metadata=metadata)

@@ -1,6 +1,6 @@
-"""A report as a page of HTML that needs no other file: one style for light, dark, phone and print.
+"""A report as a self-contained HTML page, with one style for light, dark, phone and print.
 
-Text is escaped here; what is HTML already is a `Markup`.
+Text is escaped here, except `Markup`.
 """
 
 import os
@@ -15,16 +15,16 @@ from disctrack.files.whole import write_whole
 from disctrack.report.blocks import Cell, Facts, Figures, Listing, Markup, Report, Section, figures_in, is_empty
 from disctrack.report.palette import AMBER, BLUE, GRID, INK, RED
 
-SENTENCE = 48  # characters of a cell from which on it is no number, name or link
+SENTENCE = 48  # characters; a longer cell is a sentence, not a number, name or link
 
 
 def write_page(path: Path, report: Report, kinds: Sequence[str] = ()) -> list[Path]:
-    """Write the page, and of its figures files of these kinds ("png", "pdf"); returns those. Raises OutputError."""
+    """Write the page, and files of its figures of these kinds ("png", "pdf"); returns those. Raises OutputError."""
     drawn = [*figures_in(report.blocks)]
     files: list[Path] = []
     pictures: dict[str, str] = {}
     if drawn:
-        from disctrack.report.figures import draw  # matplotlib is wanted here only
+        from disctrack.report.figures import draw  # late, as it imports matplotlib
 
         files, pictures = draw(path.parent, drawn, kinds)
     write_whole(path, page(report, pictures).encode())
@@ -32,7 +32,7 @@ def write_page(path: Path, report: Report, kinds: Sequence[str] = ()) -> list[Pa
 
 
 def page(report: Report, pictures: Mapping[str, str], head: str = "") -> str:
-    """The whole page. pictures : a data URI per figure's name;  head : HTML for its head"""
+    """The whole page. pictures : name of a figure -> data URI;  head : HTML for its head"""
     title = escape(report.title)
     findings = "".join(f"<li class={f.grave}><b>{f.grave}</b>{_text(f.sentence)}</li>" for f in report.graver_first())
     tiles = "".join(
@@ -54,15 +54,15 @@ def page(report: Report, pictures: Mapping[str, str], head: str = "") -> str:
 
 
 def link_pages(pages: Mapping[str, Path]) -> None:
-    """Write into every one of these pages that there is links to the others. pages : by what they show"""
-    there = {name: path for name, path in pages.items() if path.is_file()}
-    for own in (path for path in there.values() if path.suffix == ".html"):
+    """Write links to the other pages into each existing page. pages : title -> file"""
+    existing = {name: path for name, path in pages.items() if path.is_file()}
+    for own in (path for path in existing.values() if path.suffix == ".html"):
         content = own.read_text(encoding="utf-8")
         before, start, rest = content.partition(NAV[0])
         _, end, after = rest.partition(NAV[1])
         links = "".join(
             f'<a href="{quote(Path(os.path.relpath(path, own.parent)).as_posix())}">{escape(name)}</a>'
-            for name, path in there.items()
+            for name, path in existing.items()
             if path != own
         )
         if end:
@@ -77,7 +77,7 @@ def _text(said: Cell) -> str:
 
 
 def _html(block: Any, pictures: Mapping[str, str]) -> str:
-    """A block; nothing where there is nothing to show."""
+    """HTML of a block; empty if it has no content."""
     if is_empty(block):
         return ""
     if isinstance(block, Section):
@@ -100,7 +100,7 @@ def _html(block: Any, pictures: Mapping[str, str]) -> str:
 
 
 def _table(listing: Listing) -> str:
-    """A table that scrolls by itself where the screen is narrow; a column with sentences wraps."""
+    """A table that scrolls on narrow screens; a column with sentences wraps."""
     kinds = [f" class={escape(kind, quote=True)}" for kind in listing.classes] or [""] * len(listing.rows)
     said = [" class=said" if any(map(_sentence, column)) else "" for column in zip(*listing.rows, strict=True)]
     top = "".join(f"<th>{escape(cell)}</th>" for cell in listing.header)

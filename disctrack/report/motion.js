@@ -1,5 +1,5 @@
 "use strict";
-// The motion to play with: disc in 3-D, camera pictures, curves with one cursor, residuals. No library, no network.
+// Interactive page of the motion: disc in 3-D, camera images, curves with one cursor, residuals. No library, no network.
 (() => {
   const D = JSON.parse(document.getElementById("motion-data").textContent);
   const $ = (id) => document.getElementById(id);

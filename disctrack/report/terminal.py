@@ -1,4 +1,4 @@
-"""A report for a terminal: at most ten lines, or all of it."""
+"""A report as text for a terminal: at most ten lines, or complete."""
 
 import os
 import shutil
@@ -14,12 +14,12 @@ from disctrack.report.blocks import Cell, Facts, Listing, Markup, Report, Sectio
 MOST_LINES = 10
 WIDTH = 100  # of lines in a file, and at most in a terminal
 _HEAD = 13  # characters of the first column
-_MOST_OF_ONE = 4  # lines of the verdict, and of one finding; the rest stands in `full`
+_MOST_OF_ONE = 4  # lines of the verdict, and of one finding; `full` has all
 _COLOURS = {"refusal": "31;1", "doubt": "31;1", "warning": "33", "verdict": "1"}
 
 
 def short(report: Report, width: int = WIDTH, *, colour: bool = False) -> list[str]:
-    """What puts the result in doubt, verdict, accuracy, other findings, page and next, in at most MOST_LINES."""
+    """Doubts, verdict, accuracy, other findings, page and next command, in at most MOST_LINES."""
     first = _cut(_entry("verdict", report.verdict, width)) + _cut(_entry("accuracy", report.accuracy, width), 2)
     last = _entry("page", "" if report.page is None else str(report.page), width) + _entry("next", report.then, width)
     entries = [_cut(_entry(finding.grave, finding.sentence, width)) for finding in report.graver_first()]
@@ -33,7 +33,7 @@ def short(report: Report, width: int = WIDTH, *, colour: bool = False) -> list[s
 
 
 def full(report: Report, width: int = WIDTH) -> list[str]:
-    """All of it."""
+    """The complete report."""
     first = _entry("verdict", report.verdict, width) + _entry("accuracy", report.accuracy, width)
     lines = [report.title, ""] if report.title else []
     lines += _around(first, [_entry(f.grave, f.sentence, width) for f in report.graver_first()], report)
@@ -45,13 +45,13 @@ def full(report: Report, width: int = WIDTH) -> list[str]:
 
 
 def _around(result: list[str], entries: list[list[str]], report: Report) -> list[str]:
-    """The result between the entries of the findings that put it in doubt, which are the first, and of the others."""
+    """Entries of the doubts, then the result, then entries of the other findings."""
     n = sum(finding.doubtful for finding in report.findings)
     return [*chain(*entries[:n]), *result, *chain(*entries[n:])]
 
 
 def show(report: Report, *, verbose: bool = False) -> None:
-    """Print the report; in colour where stdout is a terminal and NO_COLOR is not set (https://no-color.org)."""
+    """Print the report; in colour if stdout is a terminal and NO_COLOR is not set (https://no-color.org)."""
     width = min(WIDTH, shutil.get_terminal_size((WIDTH, 24)).columns)
     colour = sys.stdout.isatty() and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
     lines = full(report, width) if verbose else short(report, width, colour=colour)
@@ -59,7 +59,7 @@ def show(report: Report, *, verbose: bool = False) -> None:
 
 
 def _cut(lines: list[str], most: int = _MOST_OF_ONE) -> list[str]:
-    """No more lines than that; where there were more, the last one says so."""
+    """At most so many lines; an ellipsis marks omitted ones."""
     return lines if len(lines) <= most else [*lines[: most - 1], f"{lines[most - 1].rpartition(' ')[0]} …"]
 
 
@@ -69,7 +69,7 @@ def _coloured(line: str) -> str:
 
 
 def _entry(head: str, said: str, width: int) -> list[str]:
-    """A heading and what belongs to it, wrapped beside it; nothing where nothing is said."""
+    """A heading with its text, wrapped to its right; empty without text."""
     if not said or isinstance(said, Markup):
         return []
     return _wrapped(said, max(width, 40), f"{head:<{_HEAD}} ", " " * (_HEAD + 1))
@@ -105,7 +105,7 @@ def _facts(rows: Iterable[tuple[str, Cell]], width: int) -> list[str]:
 
 
 def _table(listing: Listing, width: int) -> list[str]:
-    """Columns as wide as what stands in them; the last one, which may hold sentences, as long as it is."""
+    """Columns as wide as their content; the last one, which may contain sentences, is not wrapped."""
     rows: list[Sequence[str]] = [listing.header]
     for row in listing.rows:
         rows.append(["" if isinstance(cell, Markup) else printable(str(cell)) for cell in row])

@@ -84,10 +84,10 @@ def test_a_read_only_home_and_installation_get_a_cache_of_their_own(monkeypatch,
         monkeypatch.setenv(name, "")  # so that it is as before after the test
         monkeypatch.delenv(name)
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    cli._keep_compiled_loops_somewhere()
+    cli._find_writable_cache()
     assert "NUMBA_CACHE_DIR" not in os.environ  # this checkout can be written to
     monkeypatch.setattr(os, "access", lambda path, mode: False)
-    cli._keep_compiled_loops_somewhere()
+    cli._find_writable_cache()
     folder = os.environ["NUMBA_CACHE_DIR"]
     assert os.path.isdir(folder)
     assert folder.startswith(str(tmp_path))
