@@ -431,7 +431,7 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, centres, own, pix
     for i in range(8):
         p[i] = 0.0
     p[ROW.radius], p[ROW.sigma] = 1.0, sigma
-    n, n_clipped, det, chi2, largest, settled = 0, 0.0, 0.0, 0.0, 0.0, False
+    n, n_clipped, det, chi2, largest, light, settled = 0, 0.0, 0.0, 0.0, 0.0, 1.0, False
     for selection in range(_MAX_ITERATIONS):
         if not (2.0 < u0 < width - 3.0 and 2.0 < v0 < height - 3.0):
             return OUTSIDE
@@ -464,18 +464,22 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, centres, own, pix
         if not (n >= 30 and math.isfinite(inside) and math.isfinite(outside)):
             return OCCLUDED
         if selection == 0:
-            p[ROW.level], p[ROW.contrast] = outside, 1.0 - inside / max(outside, 1e-6)
+            light = max(inside, outside, 1e-6)  # the unit of grey from here on: no result depends on the file's own
+            p[ROW.level], p[ROW.contrast] = outside / light, 1.0 - inside / max(outside, 1e-6)
         dark = p[ROW.level] * (1.0 - p[ROW.contrast])
-        read, gain, step2 = noise[0], noise[1], noise[2] * noise[2]
+        read, gain, step2 = noise[0] / (light * light), noise[1] / light, noise[2] * noise[2] / (light * light)
         if abs(p[ROW.level] - dark) < 4.0 * math.sqrt(max(read + gain * max(p[ROW.level], dark), 0.1 * step2)):
             return LOW_CONTRAST
+        in_light = 1.0 / light
         read_32, gain_32, floor = _f(read), _f(gain), _f(step2 / 12.0)
         level, step, inv_sigma = _f(p[ROW.level]), _f(dark - p[ROW.level]), _f(1.0 / p[ROW.sigma])
-        distance, weight = pixels[ROW.distance], pixels[ROW.weight]
+        distance, weight, grey = pixels[ROW.distance], pixels[ROW.weight], pixels[ROW.grey]
         for i in range(n):
             # weights from the expected grey value: the noisy one would pull the fit towards dark pixels
             s, bell = _edge_profile(distance[i] * inv_sigma)
             weight[i] = _1 / math.sqrt(max(read_32 + gain_32 * (level + step * s), floor))
+        for i in range(n):
+            grey[i] *= in_light  # a product in double precision, rounded once
         limit = np.inf
         while True:  # once, and again without the pixels that do not belong
             centroid = start[5] - u0, start[6] - v0
@@ -524,7 +528,7 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, centres, own, pix
     result.inside = inside / max(n_inside, 1.0) * n / freedom
     result.outside = (chi2 - inside) / max(n - n_inside, 1.0) * n / freedom
     result.sigma, result.radius = p[ROW.sigma], p[ROW.radius]
-    result.level, result.contrast = p[ROW.level], p[ROW.contrast]
+    result.level, result.contrast = light * p[ROW.level], p[ROW.contrast]
     result.clipped, result.n_pixels = n_clipped / n, n
     return MEASURED
 
