@@ -1,4 +1,4 @@
-"""What can be wrong with a measurement: one catalogue, as `disctrack.rolling.effects` is one of the motion.
+"""Faults of a measurement: their catalogue, as `disctrack.rolling.effects` is that of the motion.
 
-`catalogue`: an entry a fault. `dots`: what faults do to the images of a disc's dots. `keys`: where a scene holds them.
+`catalogue`: one entry per fault. `dots`: effect of faults on the images of the dots. `keys`: their keys in a scene.
 """

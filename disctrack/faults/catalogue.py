@@ -1,10 +1,10 @@
-"""The faults, one by one: quantities, where a scene holds each, and its words.
+"""Catalogue of the faults: quantities, keys in a scene, and descriptions.
 
-An entry says in `key` which of a scene's `Faults` its numbers are; where that is not all, in `to_key`, `from_key` how a
-scene states them, and in `along` what they do to the dots. Candidates of the diagnosis, scenes, saved models,
-planted faults and the page of faults are made from these entries.
+`key` is the key of the fault in a scene's `Faults`. If the numbers differ from its value by more than a factor,
+`to_key` and `from_key` convert them. `along` computes the effect on the dots if differences are not suitable.
+Candidates of the diagnosis, scenes, saved models, planted faults and the page of faults are built from these entries.
 
-Quantities are addressed by name, as parameters of the effects of the motion are: "right_turned.rotation_x". Null is
+Quantities are addressed by name, like parameters of the effects of the motion: "right_turned.rotation_x". Null is
 always zero: as calibrated, as declared.
 """
 
@@ -24,52 +24,52 @@ from disctrack.frames import CAMERAS
 
 MOVED = (Kind.CAMERA_MOVED, Kind.DOTS_MISFIT, Kind.CAMERAS_CONTRADICT, Kind.TABLE_DISAGREES)
 HEIGHT = (Kind.TABLE_DISAGREES, Kind.THICKNESS, Kind.BOARD_THICKNESS)
-TYPICAL_STEPS = 30  # a fault of so many steps surprises nobody: 1/3 px, 0.02 deg, 0.3 mm, 0.3 ms
+TYPICAL_STEPS = 30  # size of an ordinary fault: 1/3 px, 0.02 deg, 0.3 mm, 0.3 ms
 
 
 @dataclass(frozen=True)
 class Fault:
-    """One thing that may be wrong about the measurement."""
+    """One possible fault of the measurement."""
 
     name: str
-    title: str  # what it is
-    source: str  # what it comes from
-    parts: tuple[str, ...]  # its numbers
+    title: str  # a sentence
+    source: str  # its cause
+    parts: tuple[str, ...]  # names of its numbers
     unit: str
-    step: float  # of a fit: a hundredth of a pixel or so in the image
+    step: float  # in fits: about a hundredth of a pixel in the image
     meaning: str
     key: str  # of a scene's `Faults`, in the unit of its name: "table_height_mm", "left.rotation_deg"
     null: float = 0.0
-    bounds: tuple[float, float] = (-np.inf, np.inf)  # beyond which no laboratory's lies
-    belongs_to: tuple[str, ...] = ("rig",)  # what two recordings must have in common to share it
-    in_images: bool = False  # adds its number times `column` to the dots' images
-    of_poses_alone: bool = True  # may show in dots about free poses, without a model of the motion
-    along: Callable[["Fault", str, Sight], Array] | None = None  # the column of a part; None: by difference
-    to_key: Callable[[Array, Any, float], Any] | None = None  # numbers, the key so far, declared rate [Hz] -> the key
+    bounds: tuple[float, float] = (-np.inf, np.inf)  # range in any laboratory
+    belongs_to: tuple[str, ...] = ("rig",)  # what recordings that share it have in common
+    in_images: bool = False  # its number times `column` is added to the images of the dots
+    of_poses_alone: bool = True  # is visible in the dots of free poses, without a model of the motion
+    along: Callable[["Fault", str, Sight], Array] | None = None  # the column of a part; None: by differences
+    to_key: Callable[[Array, Any, float], Any] | None = None  # numbers, old value, declared rate [Hz] -> value of key
     from_key: Callable[[Any, float], Any] | None = None
-    each: str = ""  # "camera": either camera has its own; "dot": each dot; the title has a gap for it
-    seen: str = ""  # what a user notices
+    each: str = ""  # "camera": a fault of each camera; "dot": of each dot, inserted in the title
+    seen: str = ""  # symptom for the user
     remedy: str = ""
-    declared: str = ""  # the key of recording.toml that would explain it
-    named_by: tuple[Kind, ...] = ()  # findings of a run that are about it; none: it does not show in one
+    declared: str = ""  # the key of recording.toml whose wrong value has the same effect
+    named_by: tuple[Kind, ...] = ()  # findings of a run that report it; empty if a run cannot detect it
 
     @property
     def factor(self) -> float:
-        """By which its numbers are those of the scene's key but for null."""
+        """(Value of the scene's key - null) over the number."""
         return {"deg": float(np.degrees(1.0)), "mm": 1e3}.get(self.key.rpartition("_")[2], 1.0)
 
     def names(self) -> tuple[str, ...]:
-        """Of its quantities."""
+        """Names of its quantities."""
         return tuple(f"{self.name}.{part}" for part in self.parts)
 
     def numbers(self, values: Mapping[str, float]) -> Array:
-        """Its numbers among the values; zero where they are not."""
+        """Its numbers among the values, by default zero."""
         return np.array([float(values.get(name, 0.0)) for name in self.names()])
 
     def column(self, part: str, sight: Sight) -> Array:
-        """Derivative (n, 2, m, 2) of the dots' images by one of its numbers.
+        """Derivative (n, 2, m, 2) of the images of the dots with respect to one of its numbers.
 
-        By central difference: what is altered acts smoothly and nearly linearly, and this holds to 1e-8 of it.
+        By central differences, with a relative error of 1e-8, as the images are smooth and nearly linear in it.
         """
         if self.along is not None:
             return self.along(self, part, sight)
@@ -80,7 +80,7 @@ class Fault:
         return (sides[0] - sides[1]) / (2 * self.step)
 
     def to_scene(self, faults: Faults, v: Array, rate: float) -> Faults:
-        """The scene's faults with these numbers; rate : declared [Hz]."""
+        """Faults of a scene with these numbers; rate : declared [Hz]."""
         camera, _, key = self.key.rpartition(".")
         place: Any = getattr(faults, camera) if camera else faults
         if self.to_key is not None:
@@ -102,7 +102,7 @@ class Fault:
 
 
 def _images(sight: Sight, faults: Faults) -> Array:
-    """Images of the dots with these faults; the motion up to the true instant of an exposure is taken for straight."""
+    """Images of the dots with these faults; the motion until the true instant of an exposure is linearised."""
     since = sight.time - sight.time[0]
     late = faults.true_times(since, 1.0) - since
     by_camera = np.stack([late, late + faults.right_delay_s])
@@ -118,13 +118,13 @@ def _of_one_dot(fault: Fault, part: str, sight: Sight) -> Array:
 
 
 def _blurred(fault: Fault, part: str, sight: Sight) -> Array:
-    """Second derivative of the dots' images by differences over neighbouring frames."""
+    """Second time derivative of the images of the dots over 24, by differences of neighbouring frames."""
     twice = np.gradient(np.gradient(sight.pixels, sight.time, axis=0), sight.time, axis=0)
     return np.asarray(twice, float) / 24
 
 
 def _with_row(dot: int, n: int, v: Array, rows: tuple[Any, ...], rate: float) -> tuple[Any, ...]:
-    """Places of n dots, of which a scene has a row each or none at all, with those of one."""
+    """Rows of a scene for n dots, or no rows, with the row of one dot replaced."""
     places = list(rows or [(0.0, 0.0)] * n)
     places[dot] = tuple(float(1e3 * x) for x in v)
     return tuple(places)
@@ -215,7 +215,7 @@ FAULTS = (
 
 
 def faults_of(disc: Disc) -> tuple[Fault, ...]:
-    """All that may be wrong about the measurement of this disc."""
+    """All faults of the catalogue for a measurement of this disc."""
     return _faults_of(disc.n_markers)
 
 
@@ -225,7 +225,7 @@ def _faults_of(n_markers: int) -> tuple[Fault, ...]:
 
 
 def _each(fault: Fault, n_markers: int) -> Iterator[Fault]:
-    """A fault of a camera, or of a dot, for each of them; any other as it is."""
+    """A fault of a camera or a dot for each of these; other faults unchanged."""
     if fault.each == "camera":
         for camera in CAMERAS:
             name, title, key = f"{camera}_{fault.name}", fault.title.format(camera), f"{camera}.{fault.key}"
@@ -239,7 +239,7 @@ def _each(fault: Fault, n_markers: int) -> Iterator[Fault]:
 
 
 def scene_faults(disc: Disc, values: Mapping[str, float], rate: float = 1.0) -> Faults:
-    """Faults of a scene with this disc, this declared frame rate [Hz] and these values; those absent are null."""
+    """Faults of a scene with this disc, this declared frame rate [Hz] and these values, which are null by default."""
     found = Faults()
     for fault in faults_of(disc):
         v = fault.numbers(values)

@@ -1,9 +1,9 @@
-"""Pairs that both cameras lost, and whose files were numbered on as if nothing had happened: the clock jumps.
+"""Clock jumps: image pairs lost by both cameras, with files numbered without a gap.
 
-Nothing else moves a disc so: from one frame to the next, position and attitude are where the same motion has them some
-frames later. Over a stretch on both sides of a cut, a polynomial in the frames' numbers cannot follow; one in numbers
-that are higher by k after the cut can, with one k for all twelve numbers of the pose. A blow changes velocities, a
-camera that moved changes places: neither is a later pose of the same motion.
+A jump has a unique signature: the pose in the next frame is that of the same motion some frames later. Around a jump,
+a polynomial in the frame numbers does not fit the pose. A polynomial in frame numbers increased by k after the jump
+does, with the same k for all twelve numbers of the pose. A blow changes velocities, a moved camera positions: neither
+yields a later pose of the same motion.
 """
 
 from collections.abc import Iterator, Mapping
@@ -17,21 +17,21 @@ from disctrack.frames import rotation_from_quaternion
 from disctrack.trajectory import Trajectory
 
 SIDE = 10  # frames on either side of a cut
-DEGREE = 6  # of the polynomials: half a turn in a stretch leaves a hundredth of the noise
+DEGREE = 6  # of the polynomials: half a turn in 2 SIDE frames has a misfit of a hundredth of the noise
 MOST_LOST = 12  # pairs, and frames without a pose at the cut
-STANDS_OUT = 30.0  # times what a jump leaves, and the usual misfit; of 168 numbers chance alone reaches 1.6
-UNEVEN = 0.1  # of a period: frames with time stamps of their own need no number
+STANDS_OUT = 30.0  # misfit over that with a jump, and over the median; noise alone in 168 numbers reaches 1.6
+UNEVEN = 0.1  # of a period: irregularity of frames with time stamps of their own
 
 
 def in_words(lost: int) -> str:
-    """What a jump is, by which so many pairs were lost."""
+    """Description of a jump with so many lost pairs."""
     return f"the clock jumps by {lost} frame{'s' * (lost > 1)}: both cameras lost as many pairs there"
 
 
 def clock_jumps(trajectory: Trajectory) -> dict[int, int]:
-    """First row after every jump of the recording, in the order of time -> pairs that were lost there.
+    """First row after each jump, in order of time -> number of lost pairs.
 
-    None where the frames have uneven times of their own.
+    Empty if the frames have time stamps of their own.
     """
     period = 1.0 / trajectory.frame_rate
     if len(trajectory) < 2 * SIDE or np.abs(np.diff(trajectory.time) / period - 1).max() > UNEVEN:
@@ -55,7 +55,7 @@ def clock_jumps(trajectory: Trajectory) -> dict[int, int]:
 
 
 def _cuts(seen: NDArray[np.bool_]) -> Iterator[tuple[int, NDArray[np.intp]]]:
-    """Frames without a pose at a cut, and the rows behind which such a cut lies with SIDE poses on either side."""
+    """Numbers of frames without a pose at a cut, and the rows that follow SIDE poses and precede such a cut."""
     whole = np.convolve(seen, np.ones(SIDE), "valid") == SIDE  # rows i .. i + SIDE - 1
     for gap in range(MOST_LOST + 1):
         n = len(seen) - 2 * SIDE - gap + 1
@@ -68,7 +68,7 @@ def _cuts(seen: NDArray[np.bool_]) -> Iterator[tuple[int, NDArray[np.intp]]]:
 
 
 def _misfit(stretches: Array, numbers: Array) -> Array:
-    """(n,) squares that polynomials in these frame numbers leave of the columns of stretches (n, 2 SIDE, columns)."""
+    """(n,) sums of squared residuals of polynomials in these frame numbers; stretches : (n, 2 SIDE, columns)."""
     scaled = 2 * (numbers - numbers[0]) / (numbers[-1] - numbers[0]) - 1
     basis, _ = np.linalg.qr(np.polynomial.chebyshev.chebvander(scaled, DEGREE))
     left = stretches - basis @ (basis.T @ stretches)
@@ -76,7 +76,7 @@ def _misfit(stretches: Array, numbers: Array) -> Array:
 
 
 def without_jumps(trajectory: Trajectory, jumps: Mapping[int, int]) -> Trajectory:
-    """The trajectory with the times and numbers that its frames have if these pairs were lost."""
+    """The trajectory with times and frame numbers corrected for these lost pairs."""
     lost = np.zeros(len(trajectory), np.int64)
     for row, pairs in jumps.items():
         lost[row:] += pairs

@@ -1,4 +1,4 @@
-"""Clocks, cameras, dots and table as faults leave them, and the images of the dots that follow from that."""
+"""Cameras, dots and table with faults, and the resulting images of the dots."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -13,7 +13,7 @@ from disctrack.frames import rotation_from_vector, rotation_z
 
 
 def centres_with(faults: Faults, disc: Disc) -> Array:
-    """(m, 3) where the dots are on the body [m]."""
+    """(m, 3) true centres of the dots in body axes [m]."""
     centres = disc.marker_centres_body.copy()
     centres[:, :2] += 1e-3 * np.array(faults.misprint_mm or np.zeros((disc.n_markers, 2)))
     turn = rotation_z(np.radians(faults.pattern_turn_deg))[:2, :2]
@@ -22,16 +22,16 @@ def centres_with(faults: Faults, disc: Disc) -> Array:
 
 
 def cameras_with(faults: Faults, rig: StereoRig) -> StereoRig:
-    """The rig while the disc was filmed, in axes of the true table.
+    """The rig during the recording of the disc, in axes of the true table.
 
-    As calibrated, but for what became of the cameras since, and for a table that is not where the calibration's table
-    view says.
+    It differs from the calibrated rig by changes of the cameras since, and by a table that differs from the table view
+    of the calibration.
     """
     tilt = rotation_from_vector(np.radians([*faults.table_turn_deg, 0.0]))
     lift = np.array([0.0, 0.0, 1e-3 * faults.table_height_mm])
     cameras, poses = [], []
     for camera, (R, t), fault in zip(rig.cameras, rig.camera_poses(), (faults.left, faults.right), strict=True):
-        turn = rotation_from_vector(np.radians(fault.rotation_deg)).T  # the camera turns, its picture turns back
+        turn = rotation_from_vector(np.radians(fault.rotation_deg)).T  # the image rotates opposite to the camera
         poses.append((turn @ R @ tilt, turn @ (t + R @ lift - 1e-3 * np.array(fault.translation_mm))))
         parameters = camera.parameters
         parameters[:2] *= fault.focal_scale
@@ -43,7 +43,7 @@ def cameras_with(faults: Faults, rig: StereoRig) -> StereoRig:
 
 @dataclass(frozen=True)
 class Sight:
-    """Dots of a moving disc as both cameras meet them: what a fault needs to tell what it does to them."""
+    """Dots of a moving disc in both cameras: input for the effect of a fault on them."""
 
     time: Array  # (n,) [s] of the frames, by the declared clock
     R: Array  # (2, n, 3, 3), t (2, n, 3) body -> world, at the instants of each camera
@@ -53,13 +53,13 @@ class Sight:
     disc: Disc
     values: Mapping[str, float]
     pixels: Array  # (n, 2, m, 2) of the dots, predicted
-    by_pose: Array  # (n, 2, m, 2, 6) how they move with the POSE_COMPONENTS
+    by_pose: Array  # (n, 2, m, 2, 6) their derivatives by the POSE_COMPONENTS
 
 
 def predict(R: Array, t: Array, rig: StereoRig, disc: Disc, faults: Faults) -> tuple[Array, Array]:
-    """Images of the dots' centres (n, 2, m, 2) and how they move with the pose (n, 2, m, 2, 6), POSE_COMPONENTS.
+    """Images of the centres of the dots (n, 2, m, 2), and derivatives (n, 2, m, 2, 6) by the POSE_COMPONENTS.
 
-    R (2, n, 3, 3), t (2, n, 3): poses per camera, body -> world. What is wrong with clocks or images has no part in it.
+    R (2, n, 3, 3), t (2, n, 3): poses per camera, body -> world. Faults of clocks and images are not included.
     """
     centres, rig = centres_with(faults, disc), cameras_with(faults, rig)
     pixels, by_pose = [], []
@@ -75,8 +75,8 @@ def predict(R: Array, t: Array, rig: StereoRig, disc: Disc, faults: Faults) -> t
 def ellipse_centre_shift(R: Array, t: Array, rig: StereoRig, disc: Disc) -> Array:
     """Centre of the dots' images minus image of their centres (n, 2, m, 2) [px]; R (n, 3, 3), t (n, 3).
 
-    The image of a circle is an ellipse, to the lens' distortion; its centre is that of the area inside, here by a rule
-    over four points that is exact to third order.
+    The image of a circle is an ellipse, apart from lens distortion. Its centre is the centroid of its area, here by a
+    quadrature with four points that is exact to third order.
     """
     arms = np.sqrt(0.125) * disc.marker_diameter * np.array([[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0], [0, 0, 0]])
     body = (disc.marker_centres_body[:, None] + arms).reshape(-1, 3)

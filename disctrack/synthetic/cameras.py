@@ -1,4 +1,4 @@
-"""The true rig and the poses of the chessboard that a scene stands for: seeded, so that every recording has its own."""
+"""The true rig of a scene and the poses of its chessboard, drawn from the seed."""
 
 from typing import Any, NamedTuple
 
@@ -12,7 +12,7 @@ from disctrack.synthetic.description import Scene
 
 
 class View(NamedTuple):
-    """One camera and where it stands: x_camera = R_camera_world x_world + t_camera_world."""
+    """One camera and its pose: x_camera = R_camera_world x_world + t_camera_world."""
 
     camera: Camera
     R_camera_world: Array  # (3, 3)
@@ -20,12 +20,12 @@ class View(NamedTuple):
 
     @property
     def centre(self) -> Array:
-        """(3,) of projection, in the world [m]."""
+        """(3,) centre of projection in the world [m]."""
         return -self.R_camera_world.T @ self.t_camera_world
 
 
 def views_of(rig: StereoRig) -> list[View]:
-    """The cameras of a rig where they stand."""
+    """The cameras of a rig with their poses."""
     return [View(camera, *pose) for camera, pose in zip(rig.cameras, rig.camera_poses(), strict=True)]
 
 
@@ -35,7 +35,7 @@ def image_of(points_world: Array, view: View) -> Array:
 
 
 def rig_of(scene: Scene) -> StereoRig:
-    """The rig as it was while it was calibrated, with the table as world."""
+    """The rig during its calibration, with the table as world."""
     rng = np.random.default_rng([scene.seed, 1])
     left, right = (_camera(scene, index, rng) for index in (0, 1))
     places: dict[str, Any] = placed_at([(view.R_camera_world, view.t_camera_world) for view in (left, right)])
@@ -43,7 +43,7 @@ def rig_of(scene: Scene) -> StereoRig:
 
 
 def _camera(scene: Scene, index: int, rng: np.random.Generator) -> View:
-    """One camera, looking at the target from where the settings say, all with the seeded scatter."""
+    """One camera that looks at the target, with the pose and lens of the settings plus the seeded scatter."""
     s, scatter = scene.rig, scene.rig.variation * rng.standard_normal(16)
     target = np.array(s.target_mm) * 1e-3 + 2e-3 * scatter[0:3]
     distance = s.distance_mm[index] * 1e-3 + 0.01 * scatter[3]
@@ -73,8 +73,8 @@ def _camera(scene: Scene, index: int, rng: np.random.Generator) -> View:
 def board_poses(scene: Scene, rig: StereoRig) -> tuple[Array, Array]:
     """R_world_board (n, 3, 3) and t_world_board (n, 3) [m] of the calibration views; view 0 lies flat on the table.
 
-    The others are drawn at random until all squares lie inside both images and the board is not seen flatter than 65
-    degrees off its normal. Raises SceneError where the rig leaves no room for that.
+    The others are drawn at random until all squares lie inside both images and both cameras are within 65 degrees of
+    the board's normal. Raises SceneError if too few are found.
     """
     board, rng = scene.board, np.random.default_rng([scene.seed, 2])
     middle = (np.array([*board.inner_corners, 1.0]) - 1) / 2 * board.square_mm * 1e-3

@@ -1,9 +1,9 @@
-"""What a synthetic recording shows: every property of cameras, light, disc, board, motion and faults, with its default.
+"""The scene of a synthetic recording: properties of cameras, light, disc, board, motion and faults, with defaults.
 
-A scene is a tree of frozen dataclasses and a TOML file of the same shape. Grey values are those of an 8-bit sensor
-(0 to 255) whatever the bit depth. Lengths in mm, angles in degrees, times in s, as the names say; all that a key does
-not say takes the default below, which resembles the experiment of Ma et al. 2014, section 3 (1000 pairs/s of 512 x 512,
-0.25 mm per pixel). Every random choice follows from `seed`.
+A scene is a tree of frozen dataclasses and a TOML file of the same structure. Grey values are those of an 8-bit sensor
+(0 to 255) for every bit depth. Lengths in mm, angles in degrees, times in s, as the names say. Missing keys have the
+defaults below, which resemble the experiment of Ma et al. 2014, section 3 (1000 pairs/s of 512 x 512, 0.25 mm per
+pixel). All random numbers follow from `seed`.
 """
 
 import math
@@ -18,7 +18,7 @@ from disctrack.faults.keys import Faults, Pair, Triple
 from disctrack.files.toml_tree import MOST, NOT_NEGATIVE, POSITIVE, build, limited, read_toml, toml_lines
 
 Pose = tuple[float, float, float, float, float, float]
-MOST_PIXELS = 16384  # a side
+MOST_PIXELS = 16384  # per side of an image
 
 
 @dataclass(frozen=True)
@@ -35,12 +35,12 @@ class CameraSettings:
 
 @dataclass(frozen=True)
 class RigSettings:
-    """Where the cameras stand and what lenses they have; `variation` scales the seeded differences between rigs."""
+    """Poses and lenses of the cameras; `variation` scales the seeded differences between rigs."""
 
-    mm_per_px: float = limited(0.25, POSITIVE)  # at the point both cameras look at
+    mm_per_px: float = limited(0.25, POSITIVE)  # at the target
     distance_mm: tuple[float, float] = limited((420.0, 420.0), POSITIVE)
     off_vertical_deg: Pair = (42.0, 42.0)
-    azimuth_deg: Pair = (-122.0, -53.0)  # of the camera seen from the target, from world axis i towards j
+    azimuth_deg: Pair = (-122.0, -53.0)  # direction from the target to the camera, from world axis i towards j
     roll_deg: Pair = (0.0, 0.0)
     target_mm: Triple = (32.0, 20.0, 4.0)  # world point on both optical axes, before variation
     k1: Pair = (-0.11, -0.12)
@@ -54,11 +54,11 @@ class RigSettings:
 
 @dataclass(frozen=True)
 class OpticsSettings:
-    """Blur and fall-off of the lenses."""
+    """Blur and vignetting of the lenses."""
 
-    # standard deviation of the Gaussian point spread, left and right, without the pixel
+    # standard deviation of the Gaussian point spread function, left and right, without that of the pixel
     blur_px: tuple[float, float] = limited((0.60, 0.65), (0.2, MOST))
-    vignetting: float = limited(0.04, NOT_NEGATIVE)  # loss of light at the image's corner
+    vignetting: float = limited(0.04, NOT_NEGATIVE)  # relative loss of light at the corners of the image
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class SensorSettings:
 
 @dataclass(frozen=True)
 class GlareSettings:
-    """A reflex of a lamp in a lens: a Gaussian spot fixed in the image, moving with neither disc nor table."""
+    """A reflection of a lamp in a lens: a Gaussian spot fixed in the image."""
 
     camera: str = "left"
     centre_px: Pair = (256.0, 256.0)
@@ -84,10 +84,10 @@ class GlareSettings:
 
 @dataclass(frozen=True)
 class LightSettings:
-    """The lamp: a gradient over the table, and how far brightness follows the face's inclination to it."""
+    """The lamp: gradient over the table, and dependence of the brightness of a face on its inclination."""
 
     gradient_per_m: Pair = (0.0, 0.0)  # relative change of brightness per metre along world i, j
-    # share of light that comes from `direction`; the rest comes from everywhere
+    # share of light from `direction`; the rest is diffuse
     directed: float = limited(0.10, (0, 1))
     direction: Triple = (0.2, 0.3, 1.0)
     glare: tuple[GlareSettings, ...] = ()
@@ -95,15 +95,15 @@ class LightSettings:
 
 @dataclass(frozen=True)
 class ImperfectionSettings:
-    """What every laboratory has and nobody declares; off by default. Lenses and sensors are drawn by the seed."""
+    """Usual undeclared imperfections of a laboratory; off by default. Lenses and sensors are drawn from the seed."""
 
-    # rms per axis of a smooth displacement beyond the lens' polynomial
+    # rms per axis of a smooth displacement in addition to the lens' distortion polynomial
     lens_field_px: float = limited(0.0, NOT_NEGATIVE)
-    board_bow_mm: float = 0.0  # middle of the board above its short sides (negative: below)
+    board_bow_mm: float = 0.0  # height of the middle of the board over its short sides
     board_stretch: float = 0.0  # relative, of the squares along the long side
     pixel_gain: float = limited(0.0, NOT_NEGATIVE)  # rms of the pixels' gains about 1
     column_offset_dn: float = limited(0.0, NOT_NEGATIVE)  # rms of the columns' offsets
-    response_curve: float = 0.0  # largest departure of grey values from a straight line, of full scale
+    response_curve: float = 0.0  # largest nonlinearity of grey values, relative to full scale
 
 
 @dataclass(frozen=True)
@@ -120,7 +120,7 @@ class AppearanceSettings:
     board_black: float = 20.0
     table: float = 85.0
     table_streaks: float = limited(3.0, NOT_NEGATIVE)  # standard deviation of the brushed texture
-    table_blotches: float = limited(2.0, NOT_NEGATIVE)  # standard deviation of the soft spots
+    table_blotches: float = limited(2.0, NOT_NEGATIVE)  # standard deviation of the smooth spots
     streak_direction_deg: float = 90.0  # from world axis i
 
 
@@ -152,41 +152,41 @@ class BoardSettings:
     n_views: int = limited(20, (1, MOST))
     inner_corners: tuple[int, int] = limited((9, 6), (2, MOST))
     square_mm: float = limited(8.0, POSITIVE)
-    margin_mm: float = limited(8.0, NOT_NEGATIVE)  # white paper round the squares
+    margin_mm: float = limited(8.0, NOT_NEGATIVE)  # white paper around the squares
     thickness_mm: float = limited(3.0, NOT_NEGATIVE)
     max_tilt_deg: float = limited(38.0, NOT_NEGATIVE)
     max_turn_deg: float = limited(35.0, NOT_NEGATIVE)
     shift_mm: float = limited(22.0, NOT_NEGATIVE)
-    height_mm: Pair = (5.0, 40.0)  # of the board's middle above the table in the tilted views
+    height_mm: Pair = (5.0, 40.0)  # range of the height of the board's middle above the table in the tilted views
 
 
 @dataclass(frozen=True)
 class RollingMotion:
-    """Motion from the rolling model: regular precession with a nutation oscillation, losing energy to the effects."""
+    """Motion of the rolling model: regular precession with a nutation oscillation, with dissipation by the effects."""
 
     theta_deg: float = 20.0
     psi_deg: float = 0.0
     phi_deg: float = 0.0
     centre_mm: Pair = (32.0, 20.0)  # of the disc at the first frame
-    omega3_rad_s: float = math.nan  # spin about the axis; nan: as much as keeps the centre at rest
-    nutation_deg: float = 0.05  # amplitude of the oscillation on top of regular precession
+    omega3_rad_s: float = math.nan  # spin about the axis; nan: that of a centre at rest
+    nutation_deg: float = 0.05  # amplitude of the oscillation about regular precession
     nutation_phase_deg: float = 0.0
     state: dict[str, float] = field(default_factory=dict)  # components of rolling.State [SI] that replace the above
-    struck: dict[str, float] = field(default_factory=dict)  # in place of all that: upright and at rest, hit by a ball;
+    struck: dict[str, float] = field(default_factory=dict)  # instead of the above: upright and at rest, hit by a ball;
     # lateral_mm, vertical_mm from the middle of the upper face, impulse_N_s, friction of the table during the impact
     effects: dict[str, dict[str, float]] = field(
         default_factory=lambda: {"km": {"k_m": 0.381e-7}, "kn": {"k_n": 0.381e-7}, "kz": {"k_z": 1e-5}}
     )
-    # by their names in rolling.CATALOGUE; who names one names all, and numbers not given are zero (effects_from_tables)
+    # by names in rolling.CATALOGUE; a scene that names one replaces all, missing amounts are zero (effects_from_tables)
     formulas: dict[str, dict[str, str]] = field(default_factory=dict)  # laws of further effects: component -> formula
 
 
 @dataclass(frozen=True)
 class MotionSettings:
-    """One source of motion: poses (one frame each), a table over time, or the rolling model.
+    """Source of the motion: poses (one frame each), a table over time, or the rolling model.
 
-    Poses are rows of x, y, z [mm], psi, theta, phi [deg]; `table` names a CSV or NPY file beside the scene with rows
-    t [s], x, y, z [m], psi, theta, phi [rad] (cubic spline between them).
+    Poses are rows of x, y, z [mm], psi, theta, phi [deg]; `table` is a CSV or NPY file next to the scene, with rows
+    t [s], x, y, z [m], psi, theta, phi [rad] (interpolated by a cubic spline).
     """
 
     kind: str = "static"  # static, table or rolling
@@ -197,9 +197,9 @@ class MotionSettings:
 
 @dataclass(frozen=True)
 class RenderSettings:
-    """Fineness of the computation, not of the scene."""
+    """Accuracy and speed of the computation."""
 
-    subpixels: int = limited(5, (2, MOST))  # cells per pixel and axis where an edge passes
+    subpixels: int = limited(5, (2, MOST))  # cells per pixel and axis at an edge
     threads: int = limited(2, (1, MOST))
     png_compression: int = limited(3, (0, 9))  # 0 to 9
 
@@ -225,11 +225,11 @@ class Scene:
     faults: Faults = field(default_factory=Faults)
     imperfections: ImperfectionSettings = field(default_factory=ImperfectionSettings)
     render: RenderSettings = field(default_factory=RenderSettings)
-    folder: Path = Path()  # where files named in the scene are looked for; set by load_scene
+    folder: Path = Path()  # to which file names in the scene are relative; set by load_scene
 
     @property
     def declared_disc(self) -> Disc:
-        """The disc that recording.toml describes."""
+        """The disc as declared in recording.toml."""
         d = self.disc
         return disc_from_mm(
             d.radius_mm, d.thickness_mm, d.mass_g, [list(c) for c in self.markers.centres_mm], self.markers.diameter_mm
@@ -237,31 +237,30 @@ class Scene:
 
 
 def load_scene(path: str | Path) -> Scene:
-    """Scene of a TOML file; what it does not say takes its default.
+    """Scene from a TOML file; missing keys have their defaults.
 
-    Raises SceneError for a file that cannot be read, an unknown key (naming the nearest known one) and a value of the
-    wrong kind.
+    Raises SceneError for a file that cannot be read, an unknown key (with the nearest known one) and an invalid value.
     """
     path = Path(path)
     return scene_from_tree(read_toml(path, SceneError), where=str(path), folder=path.parent)
 
 
 def scene_from_tree(tree: dict[str, Any], where: str = "scene", folder: Path = Path()) -> Scene:
-    """Scene of nested dictionaries as tomllib returns them; errors as in `load_scene`."""
+    """Scene from nested dictionaries as returned by tomllib; errors as in `load_scene`."""
     scene = replace(build(Scene, tree, where), folder=folder)
-    for bad, key, found, expected in _complaints(scene):
+    for bad, key, found, expected in _checks(scene):
         if bad:
             raise SceneError(f"{where}: {key} = {found}; expected {expected}")
     return scene
 
 
 def scene_toml(scene: Scene) -> str:
-    """All of `scene` as a TOML file that `load_scene` reads back to the same scene (but for its folder)."""
+    """Text of a TOML file from which `load_scene` restores the same scene, except for its folder."""
     return "\n".join(toml_lines(scene)).lstrip() + "\n"
 
 
-def _complaints(scene: Scene) -> Iterator[tuple[bool, str, object, str]]:
-    """Is something so, its key, what was found, what was expected."""
+def _checks(scene: Scene) -> Iterator[tuple[bool, str, object, str]]:
+    """Whether a value is invalid, its key, the value, the expected one."""
     centres, hidden, misprints = scene.markers.centres_mm, scene.faults.hidden_markers, scene.faults.misprint_mm
     n = len(centres)
     reach_mm = max((math.hypot(x, y) for x, y in centres), default=0.0) + scene.markers.diameter_mm / 2

@@ -1,4 +1,4 @@
-"""Images of the disc and of the chessboard before the table, as the pair of cameras takes them."""
+"""Images of the disc and of the chessboard on the table, in both cameras."""
 
 from collections.abc import Callable
 from functools import lru_cache
@@ -19,28 +19,28 @@ PoseOverExposure = Callable[[Array], Array]  # (k,) times [s] from mid exposure 
 
 
 class Stage:
-    """One camera and all that stands still before it, computed once."""
+    """One camera with everything in its image that does not move, computed once."""
 
     def __init__(self, index: int, view: View, scene: Scene) -> None:
-        """Of the camera of this number, and of the sections of the scene that say how it looks."""
+        """Index : of the camera.   scene : its sections on motion and disc are not used"""
         sigma, size = scene.optics.blur_px[index], view.camera.image_size
         self.name, self.view, self.s = CAMERAS[index], view, scene.render.subpixels
         self.pad, self.weights = optics.blur_reach(sigma), optics.blur_weights(sigma, self.s)
         self.rays = optics.corner_rays(view.camera, self.pad, scene.imperfections.lens_field_px, (scene.seed, 9, index))
-        self.cells = optics.table_cells(view, self.pad, self.s, scene)  # table in the cells of the padded image
-        # (height, width) blurred table, before lamp and vignetting
+        self.cells = optics.table_cells(view, self.pad, self.s, scene)  # sharp table in the cells of the padded image
+        # (height, width) blurred table, without lamp and vignetting
         self.table = optics.blur_to_pixels(self.cells, self.weights, self.s)
         self.factor, self.glare = optics.illumination(view, self.name, scene)
         self.pattern = sensor_pattern(scene.imperfections, size, [scene.seed, 10, index])
         self.hot = hot_pixels(scene.sensor, size, np.random.default_rng([scene.seed, 5, index]))
 
     def finish(self, irradiance: Array32) -> Array32:
-        """Lamp, vignetting and glare on a blurred image, as a sensor with its pattern and its hot pixels has it."""
+        """Blurred image with lamp, vignetting and glare, and with the pattern and the hot pixels of the sensor."""
         return self.pattern(irradiance * self.factor + self.glare) + self.hot
 
 
 def stages(rig: StereoRig, scene: Scene) -> tuple[Stage, ...]:
-    """A stage for each camera; cached, so that calls with the same rig and look share the table."""
+    """A stage for each camera; cached, so that calls with the same rig and appearance share the table."""
     sections = ("seed", "rig", "optics", "sensor", "light", "appearance", "imperfections", "render")
     look = Scene(**{name: getattr(scene, name) for name in sections})
     return tuple(
@@ -57,12 +57,12 @@ def _stage(index: int, camera: Camera, R: bytes, t: bytes, scene: Scene) -> Stag
 def expected_disc_image(
     pose: PoseOverExposure, exposure: float, frame: int, stage: Stage, scene: Scene, disc: Disc
 ) -> Array32:
-    """Expected grey values (height, width) of one exposure [s]; `pose` gives q around mid exposure.
+    """Expected grey values (height, width) of one exposure [s]; `pose` returns q around mid exposure.
 
-    disc : the true one, with the dots that are on it, where they are printed
+    disc : the true one, with the dots at their true positions
 
-    Light is gathered at the nodes of a Gauss-Legendre rule over the exposure, at least one node per 0.8 px of motion:
-    the mean and the variance of the path are exact from two nodes on.
+    Light is integrated over the exposure by Gauss-Legendre quadrature, with at least one node per 0.8 px of motion. The
+    mean and variance of the path are exact for two or more nodes.
     """
     nodes, weights = _exposure_rule(pose, exposure, stage, disc)
     q = pose(nodes * exposure)
@@ -72,9 +72,9 @@ def expected_disc_image(
     x0, y0, x1, y1 = (0, 0, width, height) if rods else _window(_outline(q, disc, stage.view), pad + 1, width, height)
     image = stage.table.copy()
     if x0 < x1 and y0 < y1:
-        # the window with the reach of the blur on each side; padded coordinates start `pad` before the image
+        # the window plus the radius of the blur on each side; padded coordinates start `pad` before the image
         table = stage.cells[y0 * s : (y1 + 2 * pad) * s, x0 * s : (x1 + 2 * pad) * s]
-        body, face = np.zeros_like(table), np.zeros_like(table)  # share of the disc; grey of its face above its side
+        body, face = np.zeros_like(table), np.zeros_like(table)  # coverage by the disc; grey of its face minus its side
         whole, around = raster.body_shape(disc.radius, _top(disc)), _rims(disc.radius, _top(disc))
         for q_now, weight in zip(q, weights, strict=True):
             place = rotation_from_euler(*q_now[3:]), q_now[:3]
@@ -97,11 +97,11 @@ def _add(
 ) -> None:
     """Add a shape of a body to a window of the stage's padded cells.
 
-    corner : x, y of the window's first pixel   around : (k, 3) points of the body among which the shape lies [m]
+    corner : x, y of the window's first pixel   around : (k, 3) points of the body that enclose the shape [m]
     """
     (R, t), view, s = place, stage.view, stage.s
     pixels = image_of(around @ R.T + t, view) + stage.pad
-    low = np.floor(pixels.min(axis=0)).astype(int) - 2  # 2: the arcs between the points
+    low = np.floor(pixels.min(axis=0)).astype(int) - 2  # margin for the arcs between the points
     high = np.ceil(pixels.max(axis=0)).astype(int) + 3
     (left, top), (x, y) = np.maximum(low, corner), corner
     right, bottom = np.minimum(high, corner + np.array(cells.shape[::-1]) // s)
@@ -112,7 +112,7 @@ def _add(
 
 
 def _face(stage: Stage, place: Place, disc: Disc, scene: Scene) -> list[tuple[float, Array, float]]:
-    """The circles on the face that a camera sees: step of grey, centre in body axes, radius."""
+    """Circles on the face that is visible to a camera: step of grey, centre in body axes, radius."""
     (R, t), look, top = place, scene.appearance, _top(disc)
     paper = np.array([*scene.faults.pattern_offset_mm, 1e3 * top]) * 1e-3
     height = float(R[:, 2] @ (stage.view.centre - t))
@@ -132,15 +132,15 @@ def _face(stage: Stage, place: Place, disc: Disc, scene: Scene) -> list[tuple[fl
 
 
 def _top(disc: Disc) -> float:
-    """Height of the dots over the disc's middle [m]: half the thickness, unless the paper lies higher."""
+    """Height of the dots over the centre of the disc [m]: half the thickness plus that of the paper."""
     return float(disc.marker_centres_body[:, 2].mean() if disc.n_markers else disc.half_thickness)
 
 
 def _exposure_rule(pose: PoseOverExposure, exposure: float, stage: Stage, disc: Disc) -> tuple[Array, Array]:
-    """Nodes in units of the exposure (from -1/2 to 1/2) and weights of sum 1."""
+    """Quadrature nodes in units of the exposure, from -1/2 to 1/2, and weights with the sum 1."""
     outline = _outline(pose(np.array([-0.5, 0.5]) * exposure), disc, stage.view)
     path_px = float(np.max(np.linalg.norm(outline[1] - outline[0], axis=-1)))
-    # one below 0.02 px: its variance, path^2 / 12, is 5e-5 of the blur's
+    # one node if the path is below 0.02 px: its variance, path^2 / 12, is 5e-5 of that of the blur
     nodes, weights = np.polynomial.legendre.leggauss(1 if path_px < 0.02 else 2 + int(path_px / 0.8))
     return nodes / 2, weights / 2
 
@@ -160,13 +160,13 @@ def _outline(q: Array, disc: Disc, view: View) -> Array:
 
 
 def _window(outline: Array, margin: int, width: int, height: int) -> tuple[int, int, int, int]:
-    low = np.floor(outline.min(axis=(0, 1))).astype(int) - margin - 2  # 2: the arcs between the points
+    low = np.floor(outline.min(axis=(0, 1))).astype(int) - margin - 2  # margin for the arcs between the points
     high = np.ceil(outline.max(axis=(0, 1))).astype(int) + margin + 3
     return max(low[0], 0), max(low[1], 0), min(high[0], width), min(high[1], height)
 
 
 def _draw_rod(cells: Array32, corner: tuple[int, int], s: int, rod: Occluder) -> None:
-    """Lay a straight rod over the cells; its edges are linear over one cell."""
+    """Draw a straight rod over the cells, with edges that are linear over one cell."""
     y = (np.arange(cells.shape[0]) + 0.5) / s - 0.5 + corner[0] - rod.centre_px[1]
     x = (np.arange(cells.shape[1]) + 0.5) / s - 0.5 + corner[1] - rod.centre_px[0]
     c, n = np.cos(np.radians(rod.angle_deg)), np.sin(np.radians(rod.angle_deg))

@@ -1,4 +1,4 @@
-"""From the motion section of a scene to the pose of the disc at any instant: at rest, by a table, or rolling."""
+"""Pose of the disc of a scene at any instant: at rest, from a table, or from the rolling model."""
 
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline, CubicSpline, PPoly
@@ -7,23 +7,23 @@ from disctrack.errors import SceneError, told_as
 from disctrack.rolling import Model, Motion, State, effects_from_tables, simulate, steady_precession, struck_disc
 from disctrack.synthetic.description import RollingMotion, Scene
 
-_SAMPLES_PER_FRAME = 4  # of the simulated motion; a cubic between them errs by 3e-8 of a nutation oscillation
+_SAMPLES_PER_FRAME = 4  # of the simulated motion; error of cubic interpolation: 3e-8 of a nutation oscillation
 
 
 def true_frame_rate(scene: Scene) -> float:
-    """Frames per second that the cameras really took [Hz]."""
+    """True frame rate of the cameras [Hz]."""
     return scene.faults.frame_rate_hz or scene.cameras.frame_rate_hz
 
 
 def true_exposure(scene: Scene) -> float:
-    """Time over which a frame is exposed [s]."""
+    """True exposure of a frame [s]."""
     return scene.faults.exposure_s or scene.cameras.exposure_s
 
 
 def motion_of(scene: Scene) -> tuple[PPoly, int]:
-    """Motion that the scene asks for: q (k, 6) at times (k,) [s], and the number of frames for which it is known.
+    """Motion of the scene, q (k, 6) at times (k,) [s], and the number of frames that it covers.
 
-    SI and radians, angles not wrapped. Raises SceneError where it cannot be had.
+    SI and radians, angles not wrapped. Raises SceneError if there is no such motion.
     """
     return {"static": _static, "table": _table, "rolling": _rolling}[scene.motion.kind](scene)
 
@@ -55,7 +55,7 @@ def _rolling(scene: Scene) -> tuple[PPoly, int]:
 
 
 def _margin(scene: Scene) -> tuple[float, float]:
-    """Time needed before the first and after the last mid exposure of the left camera [s]."""
+    """Duration of the motion before the first and after the last mid exposure of the left camera [s]."""
     half, delay = true_exposure(scene) / 2, scene.faults.right_delay_s
     return half + max(-delay, 0.0), half + max(delay, 0.0)
 
@@ -80,7 +80,7 @@ def rolling_model(scene: Scene) -> Model:
 
 
 def effects_in_words(scene: Scene) -> str:
-    """The effects of a rolling scene with their sizes, and which of the usual ones it leaves out."""
+    """The effects of a rolling scene with their sizes, and the default effects that it lacks."""
     model = rolling_model(scene)
     named = ", ".join(f"{k} = {v:g} {model.parameters[k].unit}" for k, v in model.values.items()) or "none"
     without = ", ".join(name for name in RollingMotion().effects if model.effect(name) is None)
@@ -88,9 +88,9 @@ def effects_in_words(scene: Scene) -> str:
 
 
 def rolling_start(scene: Scene) -> State:
-    """State at the beginning: regular precession with a nutation oscillation, changed by the scene's `state`.
+    """Initial state: regular precession with a nutation oscillation, modified by the scene's `state`.
 
-    Or, with `struck`, the upright disc just after a ball has hit it.
+    With `struck` it is the upright disc just after the impact of a ball.
     """
     start, disc = scene.motion.rolling, scene.declared_disc
     x, y = np.array(start.centre_mm) * 1e-3
@@ -120,7 +120,7 @@ def rolling_start(scene: Scene) -> State:
 
 
 def simulate_scene(scene: Scene) -> Motion:
-    """The rolling model's motion, four samples per frame; it ends early where the disc comes to rest."""
+    """The motion of the rolling model, four samples per frame; it ends early if the disc comes to rest."""
     before, after = _margin(scene)
     step = 1 / (_SAMPLES_PER_FRAME * true_frame_rate(scene))
     first = -int(np.ceil(before / step + 1e-9))

@@ -1,4 +1,4 @@
-"""The lens and the light: rays through the pixels' corners, blur over the cells, the table's texture, the lamp."""
+"""Lens and light: rays through the corners of the pixels, blur of the cells, texture of the table, lamp."""
 
 from collections.abc import Callable
 from functools import lru_cache
@@ -17,7 +17,7 @@ from disctrack.synthetic.raster import between
 _TEXTURE_SIZE = 1024  # texels per side
 _TEXEL = 0.25e-3  # [m]; the texture repeats after 256 mm
 _N_WAVES = 5
-_PERIODS = 0.4, 1.4  # of the waves that make up a field, along the image's longer side
+_PERIODS = 0.4, 1.4  # range of the number of periods of a wave along the longer side of the image
 
 
 @lru_cache(maxsize=8)
@@ -25,9 +25,9 @@ def corner_rays(camera: Camera, pad: int, field_px: float = 0.0, key: tuple[int,
     """Directions (x/z, y/z) through the pixels' corners: (height + 2 pad + 1, width + 2 pad + 1, 2).
 
     Corner [pad, pad] is the pixel position (-1/2, -1/2). Within a pixel directions are interpolated between its four
-    corners: for |k1| = 0.2 and f = 1700 px the error is below 1e-4 px. Raises SceneError where the distortion folds
-    inside the picture.
-    field_px : rms per axis of a smooth field by which the lens' image points lie off, drawn by the key
+    corners: for |k1| = 0.2 and f = 1700 px the error is below 1e-4 px. Raises SceneError if the distortion is not
+    invertible within the image.
+    field_px : rms per axis of a smooth displacement of the image points, drawn from the key
     """
     width, height = (n + 2 * pad + 1 for n in camera.image_size)
     pixels = np.asarray(np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1) - pad - 0.5, float)
@@ -40,7 +40,7 @@ def corner_rays(camera: Camera, pad: int, field_px: float = 0.0, key: tuple[int,
 
 
 def smooth_field(rng: np.random.Generator, image_size: tuple[int, int], rms_px: float) -> Callable[[Array], Array]:
-    """Of pixels (..., 2), by how much they lie off (..., 2): a sum of waves, of this rms per axis over the image."""
+    """Function of pixels (..., 2) that returns displacements (..., 2), a sum of waves with this rms per axis."""
     size = np.array(image_size, float)
     turns = 2 * np.pi * rng.uniform(*_PERIODS, (_N_WAVES, 1)) / size.max()
     angles = rng.uniform(0, 2 * np.pi, _N_WAVES)
@@ -55,21 +55,21 @@ def smooth_field(rng: np.random.Generator, image_size: tuple[int, int], rms_px: 
 
 
 def table_points(view: View, pad: int) -> Array:
-    """Where the rays through the pixels' corners meet the plane z = 0: (..., 2) x, y [m] in the world."""
+    """Intersections of the rays through the corners of the pixels with the plane z = 0: (..., 2) world x, y [m]."""
     rays = corner_rays(view.camera, pad)
     directions = np.concatenate([rays, np.ones((*rays.shape[:-1], 1))], axis=-1) @ view.R_camera_world
     with np.errstate(divide="ignore", invalid="ignore"):
         distance = -view.centre[2] / directions[..., 2]
     points = view.centre[:2] + distance[..., None] * directions[..., :2]
-    return np.where((distance > 0)[..., None], points, 10.0)  # above the horizon: far away
+    return np.where((distance > 0)[..., None], points, 10.0)  # a distant point for rays above the horizon
 
 
 def blur_weights(sigma: float, s: int) -> Array32:
-    """Weights of the cells around a pixel: Gaussian point spread (sigma [px]) seen by a square pixel.
+    """Weights of the cells around a pixel: Gaussian point spread function (sigma [px]) convolved with a square pixel.
 
-    (2 reach s + s,) for pixels -reach ... reach. The function G * box at the cells' centres, normalised. Light at u
-    from a cell's centre is laid down as 1 there and +-u / 2 on its neighbours (`raster`), which has the second
-    moment -u^2 about its true place, -1 / (12 s^2) px^2 on average: that is added to sigma^2.
+    (2 reach s + s,) for pixels -reach ... reach: the convolution at the centres of the cells, normalised. Light at
+    distance u from the centre of a cell is deposited as 1 there and +-u / 2 in its neighbours (`raster`). That has the
+    second moment -u^2 about its true position, -1 / (12 s^2) px^2 on average, which is compensated in sigma^2.
     """
     reach = blur_reach(sigma)
     widened = np.sqrt(sigma**2 + 1 / (12 * s**2))
@@ -80,20 +80,20 @@ def blur_weights(sigma: float, s: int) -> Array32:
 
 
 def blur_reach(sigma: float) -> int:
-    """Pixels beyond which the point spread is left out: 4.5 sigma."""
+    """Radius of the truncated point spread function [px]: 4.5 sigma."""
     return int(np.ceil(4.5 * sigma + 0.5))
 
 
 def blur_to_pixels(cells: Array32, weights: Array32, s: int) -> Array32:
     """Pixels (rows - 2 reach, columns - 2 reach) from the cells of (rows, columns) pixels."""
-    for _ in range(2):  # along the columns, then along the rows
+    for _ in range(2):  # separable: along the columns, then along the rows
         cells = (np.lib.stride_tricks.sliding_window_view(cells, len(weights), axis=0)[::s] @ weights).T
     return cells
 
 
 @lru_cache(maxsize=4)
 def _texture(seed: int, streaks: float, blotches: float, direction_deg: float) -> Array:
-    """Brushed surface, zero mean, periodic: noise smoothed by 6 mm along the brush, 0.25 mm across, and soft spots."""
+    """Periodic brushed surface, zero mean: noise smoothed by 6 mm along the brush, 0.25 mm across, and spots."""
     rng = np.random.default_rng([seed, 77])
     fx, fy = np.meshgrid(*(2 * [np.fft.fftfreq(_TEXTURE_SIZE, _TEXEL)]), indexing="xy")
     c, s = np.cos(np.radians(direction_deg)), np.sin(np.radians(direction_deg))
@@ -107,7 +107,7 @@ def _texture(seed: int, streaks: float, blotches: float, direction_deg: float) -
 
 
 def table_cells(view: View, pad: int, s: int, scene: Scene) -> Array32:
-    """Grey values of the bare table in every cell of the padded image: (rows * s, columns * s)."""
+    """Grey values of the empty table in all cells of the padded image: (rows * s, columns * s)."""
     look = scene.appearance
     points = table_points(view, pad)
     if look.table_streaks == 0 and look.table_blotches == 0:
@@ -118,7 +118,7 @@ def table_cells(view: View, pad: int, s: int, scene: Scene) -> Array32:
 
 @njit(cache=True, nogil=True)
 def _textured_cells(points: Array, s: int, grey: float, texture: Array) -> Array32:
-    """Texture at the cells' centres, bilinear between the pixels' corners on the table and between texels; 0.1 s."""
+    """Texture at the centres of the cells, bilinear between corners of pixels and between texels; takes 0.1 s."""
     n = texture.shape[0] - 1
     cells = np.empty((s * (points.shape[0] - 1), s * (points.shape[1] - 1)), dtype=np.float32)
     for row in range(cells.shape[0]):
@@ -132,7 +132,7 @@ def _textured_cells(points: Array, s: int, grey: float, texture: Array) -> Array
 
 
 def illumination(view: View, camera: str, scene: Scene) -> tuple[Array32, Array32]:
-    """Factor and addition (height, width) per pixel: lamp's gradient and vignetting; glare."""
+    """Factor (lamp and vignetting) and addend (glare) of each pixel, (height, width)."""
     width, height = view.camera.image_size
     y, x = np.mgrid[0:height, 0:width].astype(float)
     corners = table_points(view, 0)
@@ -151,7 +151,7 @@ def illumination(view: View, camera: str, scene: Scene) -> tuple[Array32, Array3
 
 
 def face_brightness(normal_world: Array, scene: Scene) -> float:
-    """Light on a flat face relative to a horizontal one: diffuse share plus Lambert's cosine."""
+    """Illumination of a flat face relative to a horizontal one: diffuse light plus Lambert's cosine law."""
     direction = np.array(scene.light.direction) / np.linalg.norm(scene.light.direction)
     cosine = max(float(normal_world @ direction), 0.0) / direction[2]
     return 1 - scene.light.directed + scene.light.directed * cosine

@@ -1,12 +1,12 @@
-"""Shapes in the cells of one camera's sensor: what the lens would draw of them without blur.
+"""Rasterisation of shapes in the cells of one camera's sensor, before blur.
 
-What a camera sees is painted in steps: the body over the table, its face over the body, the paper over the face, dots
-over the paper; the sheet of a chessboard over the table, black squares over the sheet. Each lies within the one before,
-so that light adds: every shape adds its step of grey times the area that it covers of a cell.
+An image is composed of layers: the body over the table, its face over the body, the paper over the face, dots over the
+paper; or the sheet of a chessboard over the table, black squares over the sheet. Each layer lies within the one below.
+So light is additive: every shape adds its step of grey times the area of a cell that it covers.
 
-A pixel that no edge crosses is covered or not. A crossed pixel is cut into s x s cells, and in each the area follows
-from signed distances at its corners and its centre: that on either side of a straight line, and its first moments, are
-exact; curvature is allowed for in second order. The error of a blurred edge is of third order in the cell's size.
+A pixel without an edge is covered or not. A pixel with an edge is divided into s x s cells. The covered area of a cell
+follows from signed distances at its corners and its centre. Area and first moments are exact for a straight edge, and
+corrected for curvature to second order. The error of a blurred edge is of third order in the size of the cells.
 """
 
 from typing import Any
@@ -21,15 +21,15 @@ _RULES: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
 part = njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **_RULES)  # called by compiled functions only
 
 _ROUND, _BODY, _SHEET = 0.0, 1.0, 2.0
-_FAR = -1e3  # [m] signed distance of a ray that does not meet the plane ahead of the camera
-_CLEAR, _CLEAR_OF_TIPS = 0.6, 1.0  # of the spread of a pixel's corners, beyond which no edge crosses it: 1/2 if it
-# were straight, 1 for a right angle that reaches in between two of the corners
-_BENT = 0.02  # of that spread in a cell: more between its centre and its corners' mean, and the edge has a corner there
-_SAMPLES = 16  # a side, of a cell with a corner
+_FAR = -1e3  # [m] signed distance of a ray that does not meet the plane in front of the camera
+_CLEAR, _CLEAR_OF_TIPS = 0.6, 1.0  # mean distance over the range at a pixel's corners, above which no edge crosses it:
+# 1/2 for a straight edge, 1 for a right angle that enters between two of the corners
+_BENT = 0.02  # difference of centre and mean of the corners over their range, above which the edge has a corner
+_SAMPLES = 16  # per side, of a cell with such a corner
 
 
 def round_shape(height: float, centre: tuple[float, float], radius: float, within: float) -> Array:
-    """A circle in the plane z = height of a body, as far as it lies `within` that distance from its axis [m]."""
+    """A circle in the plane z = height of a body, restricted to distances from the axis below `within` [m]."""
     return np.array([_ROUND, height, *centre, radius, within, 0.0, 0.0])
 
 
@@ -39,7 +39,7 @@ def body_shape(radius: float, half_thickness: float) -> Array:
 
 
 def sheet_shape(x: tuple[float, float], y: tuple[float, float], bow: tuple[float, float, float]) -> Array:
-    """The rectangle x[0] ... x[1], y[0] ... y[1] of a sheet that lies bow[0] (1 - u^2) above its plane.
+    """The rectangle x[0] ... x[1], y[0] ... y[1] of a sheet with the height bow[0] (1 - u^2) over its plane.
 
     u = (x - bow[1]) / bow[2]; all in metres
     """
@@ -60,7 +60,7 @@ def half_plane(f0: float, a: float, b: float) -> tuple[float, float, float]:
         return 1.0, 0.0, 0.0
     if f0 <= -0.5 * (A + B):
         return 0.0, 0.0, 0.0
-    if B < 1e-3 * A:  # as good as parallel to a side; the sums below would cancel
+    if B < 1e-3 * A:  # nearly parallel to a side: the sums below would cancel
         area = min(max(f0 / A + 0.5, 0.0), 1.0)
         m, n = 0.5 * area * (1.0 - area), B / (12.0 * A)
     else:
@@ -78,7 +78,7 @@ def half_plane(f0: float, a: float, b: float) -> tuple[float, float, float]:
 
 @part
 def between(grid: Array, row: int, column: int, p: float, q: float, k: int) -> float:
-    """Number k at row fraction p, column fraction q between the points (row, column) and (row + 1, column + 1)."""
+    """Bilinear value of component k at row + p, column + q."""
     upper = (1 - q) * grid[row, column, k] + q * grid[row, column + 1, k]
     lower = (1 - q) * grid[row + 1, column, k] + q * grid[row + 1, column + 1, k]
     return (1 - p) * upper + p * lower
@@ -86,7 +86,7 @@ def between(grid: Array, row: int, column: int, p: float, q: float, k: int) -> f
 
 @part
 def _foot(eye: Array, dx: float, dy: float, dz: float, height: float) -> tuple[float, float, bool]:
-    """Point (x, y) of the ray eye + t d in the plane z = height, and whether it lies ahead."""
+    """Point (x, y) of the ray eye + t d in the plane z = height, and whether t > 0."""
     if dz == 0.0:
         return 0.0, 0.0, False
     t = (height - eye[2]) / dz
@@ -108,7 +108,7 @@ def _distance(rx: float, ry: float, R: Array, eye: Array, shape: Array) -> float
     if shape[0] == _SHEET:
         x, y, ahead = _foot(eye, dx, dy, dz, 0.0)
         if shape[5] != 0.0:
-            for _ in range(3):  # the height changes little along the ray
+            for _ in range(3):  # fixed-point iteration: the height changes little along the ray
                 u = (x - shape[6]) / shape[7]
                 x, y, ahead = _foot(eye, dx, dy, dz, shape[5] * (1.0 - u * u))
         return min(min(x - shape[1], shape[2] - x), min(y - shape[3], shape[4] - y)) if ahead else _FAR
@@ -118,7 +118,7 @@ def _distance(rx: float, ry: float, R: Array, eye: Array, shape: Array) -> float
         if ahead:
             found = max(found, radius - np.sqrt(x * x + y * y))
     across = dx * dx + dy * dy
-    if across > 1e-18 and abs(eye[2] - (eye[0] * dx + eye[1] * dy) / across * dz) <= h:  # passes the axis inside
+    if across > 1e-18 and abs(eye[2] - (eye[0] * dx + eye[1] * dy) / across * dz) <= h:  # nearest to the axis inside
         found = max(found, radius - abs(eye[0] * dy - eye[1] * dx) / np.sqrt(across))
     return found
 
@@ -131,9 +131,9 @@ def _at(rays: Array, row: int, column: int, p: float, q: float, R: Array, eye: A
 
 @part
 def _deposit(cells: Array32, y: int, x: int, value: float, moment_x: float, moment_y: float) -> None:
-    """Add light to a cell, its first moments to the neighbours: else an edge would lie on the cells' lattice.
+    """Add light to a cell and its first moments to the neighbours.
 
-    The error of a blurred edge falls from second to third order in the cell's size.
+    This reduces the error of a blurred edge from second to third order in the size of the cells.
     """
     cells[y, x] += value
     if moment_x != 0.0 and 0 < x < cells.shape[1] - 1:
@@ -148,8 +148,8 @@ def _deposit(cells: Array32, y: int, x: int, value: float, moment_x: float, mome
 def _add_crossed(
     cells: Array32, step: float, s: int, row: int, column: int, rays: Array, R: Array, eye: Array, shape: Array
 ) -> None:  # fmt: skip
-    """Add a shape in the cells of a pixel that its edge crosses."""
-    f = np.empty((2, s + 1))  # at the cells' corners, upper and lower line
+    """Add a shape to the cells of a pixel with an edge."""
+    f = np.empty((2, s + 1))  # distances at the corners of the cells, upper and lower line
     for i in range(-1, s):
         for j in range(s + 1):
             f[0, j], f[1, j] = f[1, j], _at(rays, row, column, (i + 1) / s, j / s, R, eye, shape)
@@ -175,12 +175,12 @@ def add_shape(cells: Array32, step: float, rays: Array, R: Array, eye: Array, sh
     """Add `step` times the covered part of each cell to `cells`.
 
     cells : (rows * s, columns * s) of some pixels   rays : (rows + 1, columns + 1, 2) at the corners of these
-    R, eye : R_camera_body, and the camera's centre in body axes [m]   shape : as `round_shape` and the others give it
+    R, eye : R_camera_body, and the camera's centre in body axes [m]   shape : of `round_shape` and the like
     """
     rows, columns = rays.shape[0] - 1, rays.shape[1] - 1
     s = cells.shape[0] // rows
     clear = _CLEAR_OF_TIPS if shape[0] == _SHEET else _CLEAR
-    f = np.empty((2, columns + 1))  # at the pixels' corners, upper and lower line
+    f = np.empty((2, columns + 1))  # distances at the corners of the pixels, upper and lower line
     for row in range(-1, rows):
         for k in range(columns + 1):
             f[0, k], f[1, k] = f[1, k], _distance(rays[row + 1, k, 0], rays[row + 1, k, 1], R, eye, shape)
@@ -196,6 +196,6 @@ def add_shape(cells: Array32, step: float, rays: Array, R: Array, eye: Array, sh
 
 
 def prepare() -> None:
-    """Compile what draws, or load it."""
+    """Compile or load the rasteriser."""
     number, row = types.float64, types.float64[::1]
     add_shape.compile((types.float32[:, :], number, number[:, :, :], number[:, ::1], row, row))

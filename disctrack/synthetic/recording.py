@@ -1,4 +1,4 @@
-"""A whole recording on disk, as the pair of cameras would have written it, and the truth apart from it."""
+"""A complete synthetic recording on disk, and the truth in a separate file."""
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -28,22 +28,22 @@ from disctrack.synthetic.images import expected_board_image, expected_disc_image
 from disctrack.synthetic.motion import motion_of, rolling_model, true_exposure, true_frame_rate
 from disctrack.synthetic.sensor import digitise
 
-Progress = Callable[[int, int], None]  # images done, images in all
+Progress = Callable[[int, int], None]  # images done, total number of images
 
 TRUTH_NAME = "truth.h5"  # for validation only, no stage of the measurement reads it
 
 
 @dataclass(frozen=True)
 class Truth:
-    """What is true of a recording, SI and radians."""
+    """True values of a recording, SI and radians."""
 
     time: Array  # (n,) mid exposure of the left camera's frames [s]
     q: Array  # (n, 6) at `time`, angles not wrapped
     qdot: Array  # (n, 6) rates at `time`
     q_right: Array  # (n, 6) at the right camera's mid exposure; equals q unless that camera is delayed
     frame_rate: float  # true one [Hz]
-    rig: StereoRig  # while the chessboard was shown
-    rig_while_filming: StereoRig  # while the disc was filmed
+    rig: StereoRig  # during the calibration
+    rig_while_filming: StereoRig  # during the recording of the disc
     disc: Disc  # with the true centres of the dots
     R_world_board: Array  # (v, 3, 3) of the calibration views
     t_world_board: Array  # (v, 3) [m]
@@ -51,7 +51,7 @@ class Truth:
 
     @property
     def markers_px(self) -> Array:
-        """(n, 2, m, 2) images of the dots' own centres at mid exposure, whether visible or not."""
+        """(n, 2, m, 2) images of the centres of the dots at mid exposure, visible or not."""
         pixels = []
         for q, view in zip((self.q, self.q_right), views_of(self.rig_while_filming), strict=True):
             R = rotation_from_euler(*q[:, 3:].T)
@@ -59,7 +59,7 @@ class Truth:
         return np.stack(pixels, axis=1)
 
 
-Job = tuple[Path, Callable[[], Image]]  # a file, and how its image is taken
+Job = tuple[Path, Callable[[], Image]]  # a file, and the function that renders its image
 
 
 def write_recording(
@@ -69,12 +69,12 @@ def write_recording(
     truth_path: str | Path | None = None,
     progress: Progress | None = None,
 ) -> Truth:
-    """Render `scene` into a new recording folder, and what is true of it into an HDF5 file.
+    """Render `scene` into a new recording folder, and write its truth to an HDF5 file.
 
-    truth_path : None: truth.h5 in the folder; recording.toml does not name it, so that no reader finds it by that
+    truth_path : by default truth.h5 in the folder, which recording.toml does not mention
 
-    The folder appears under its name when all is written. Raises OutputError where it exists already or cannot be
-    written, SceneError where the scene cannot be rendered.
+    The folder gets its name when it is complete. Raises OutputError if it exists already or cannot be written,
+    SceneError if the scene cannot be rendered.
     """
     folder = Path(folder)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
@@ -84,8 +84,8 @@ def write_recording(
         raise OutputError(f"{target}: exists; choose another name for the truth or remove it")
     pose, n_frames = motion_of(scene)
     truth = _truth(scene, pose, n_frames, rig_of(scene))
-    said = f"{folder}: the recording cannot be written"
-    with told_as(OutputError, said, OSError, then="Check the disk and the rights."):
+    message = f"{folder}: the recording cannot be written"
+    with told_as(OutputError, message, OSError, then="Check the disk and the rights."):
         folder.parent.mkdir(parents=True, exist_ok=True)
         with TemporaryDirectory(prefix=f"{folder.name}.", suffix=".part", dir=folder.parent) as place:
             part = Path(place, "recording")
@@ -116,7 +116,7 @@ def run_render(
 
 
 def true_disc_of(scene: Scene) -> Disc:
-    """The disc with its dots where they really are."""
+    """The disc with its dots at their true positions."""
     disc, faults = scene.declared_disc, scene.faults
     drawn = np.random.default_rng([scene.seed, 6]).standard_normal((disc.n_markers, 2))
     centres = disc.marker_centres_body.copy()
@@ -144,16 +144,16 @@ def _truth(scene: Scene, pose: PPoly, n_frames: int, rig: StereoRig) -> Truth:
 
 
 def _delay(scene: Scene) -> float:
-    """By which the right camera exposes later [s]; a pose at rest has frames, but no time."""
+    """Delay of the right camera [s]; zero for poses at rest."""
     return 0.0 if scene.motion.kind == "static" else scene.faults.right_delay_s
 
 
 def _boards(part: Path, scene: Scene, truth: Truth) -> Iterator[Job]:
     for c, stage in enumerate(stages(truth.rig, scene)):
         for view, (R, t) in enumerate(zip(truth.R_world_board, truth.t_world_board, strict=True)):
-            picture = partial(expected_board_image, R, t, stage, scene)
+            render = partial(expected_board_image, R, t, stage, scene)
             path = part / "calibration" / stage.name / f"{view:02d}.png"
-            yield path, partial(_exposed, picture, scene, [scene.seed, 3, c, view])
+            yield path, partial(_exposed, render, scene, [scene.seed, 3, c, view])
 
 
 def _frames(part: Path, scene: Scene, pose: PPoly, truth: Truth) -> Iterator[Job]:
@@ -164,17 +164,17 @@ def _frames(part: Path, scene: Scene, pose: PPoly, truth: Truth) -> Iterator[Job
         missing = (scene.faults.left, scene.faults.right)[c].missing_frames
         for i in sorted(set(range(len(truth.time))) - set(missing)):
             around = partial(lambda mid, dt: pose(mid + dt), truth.time[i] + c * _delay(scene))
-            picture = partial(expected_disc_image, around, exposure, i, stage, scene, drawn)
-            yield part / stage.name / f"{i:06d}.png", partial(_exposed, picture, scene, [scene.seed, 4, c, i])
+            render = partial(expected_disc_image, around, exposure, i, stage, scene, drawn)
+            yield part / stage.name / f"{i:06d}.png", partial(_exposed, render, scene, [scene.seed, 4, c, i])
 
 
-def _exposed(picture: Callable[[], Array32], scene: Scene, key: list[int]) -> Image:
-    """Own noise for every image, so that neither order nor number of threads matters."""
-    return digitise(picture(), scene.sensor, scene.cameras.bit_depth, np.random.default_rng(key))
+def _exposed(render: Callable[[], Array32], scene: Scene, key: list[int]) -> Image:
+    """Image with noise of its own seed, so that it does not depend on the order or the number of threads."""
+    return digitise(render(), scene.sensor, scene.cameras.bit_depth, np.random.default_rng(key))
 
 
 def _write_all(jobs: list[Job], scene: Scene, progress: Progress | None) -> None:
-    # noisy pictures have no repeats worth searching for: run lengths give smaller files, sooner
+    # noisy images have no repeated patterns: run-length encoding is faster, and the files are smaller
     settings = [cv2.IMWRITE_PNG_COMPRESSION, scene.render.png_compression]
     settings += [cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]
 
@@ -190,9 +190,9 @@ def _write_all(jobs: list[Job], scene: Scene, progress: Progress | None) -> None
 
 
 def recording_toml(scene: Scene) -> str:
-    """What the experimenter declares: nothing of the scene's faults.
+    """The declaration of the experimenter, without the faults of the scene.
 
-    A scene without imperfections is exact, and says so; with them, the tolerances are the usual ones.
+    Without imperfections the declared sizes are exact, with tolerances of zero; otherwise the tolerances are the usual.
     """
     board, cameras = scene.board, scene.cameras
     views = {"left": "calibration/left/*.png", "right": "calibration/right/*.png"}
@@ -205,16 +205,16 @@ def recording_toml(scene: Scene) -> str:
         "gravity": {"g_m_s2": scene.gravity_m_s2},
         "air": {} if scene.air_density_kg_m3 == AIR_DENSITY else {"density_kg_m3": scene.air_density_kg_m3},
     }
-    told = {(section, key): (value, "") for section, values in declared.items() for key, value in values.items()}
+    declaration = {(section, key): (value, "") for section, values in declared.items() for key, value in values.items()}
     if scene.imperfections == ImperfectionSettings():
         tolerances = [(section, key) for section, keys in KEYS.items() for key in keys if "_tolerance_" in key]
-        told |= dict.fromkeys(tolerances, (0.0, "here, what is declared is exact"))
-    told["table", "view"] = 0, "in this view, counted from 0, the board lies flat on the table"
-    return declaration_text(scene.name, told, {}, {})[0]
+        declaration |= dict.fromkeys(tolerances, (0.0, "here, what is declared is exact"))
+    declaration["table", "view"] = 0, "in this view, counted from 0, the board lies flat on the table"
+    return declaration_text(scene.name, declaration, {}, {})[0]
 
 
 def _write_truth(path: Path, truth: Truth, scene: Scene) -> None:
-    """Write `truth` and the scene it was rendered from."""
+    """Write `truth` and its scene."""
     pose, disc = ", ".join(f"{c} {'m' if c in 'xyz' else 'rad'}" for c in COORDINATES), truth.disc
     paper, printed = np.array(scene.faults.pattern_offset_mm) * 1e-3, np.ones(disc.n_markers, np.uint8)
     printed[list(scene.faults.hidden_markers)] = 0

@@ -1,4 +1,4 @@
-"""disctrack simulate: the motion of a scene into an HDF5 file that explains itself."""
+"""disctrack simulate: write the motion of a scene to a self-describing HDF5 file."""
 
 import json
 from collections.abc import Mapping
@@ -33,11 +33,11 @@ _CONVENTIONS = {
 
 @dataclass(frozen=True, repr=False)
 class SimulationRun(Brief):
-    """What `run_simulate` did."""
+    """Result of `run_simulate`."""
 
     path: Path
     motion: Motion
-    summary: str  # some lines for people
+    summary: str  # some lines of text
 
 
 @checked
@@ -49,10 +49,10 @@ def run_simulate(
     rate: float | None = None,
     overwrite: bool = False,
 ) -> SimulationRun:
-    """Simulate the rolling motion of a scene and write it, whole or not at all.
+    """Simulate the rolling motion of a scene and write it completely or not at all.
 
-    duration [s], rate [Hz] : those of the scene's cameras (n_frames, frame_rate_hz) if not given. The file ends earlier
-    where the motion does. Raises SceneError, ModelError, OutputError.
+    duration [s], rate [Hz] : by default those of the scene's cameras (n_frames, frame_rate_hz). The motion may end
+    earlier. Raises SceneError, ModelError, OutputError.
 
         >>> run_simulate("scene.toml", "motion.h5", duration=0.01).path.name
         'motion.h5'
@@ -80,7 +80,7 @@ def run_simulate(
 
 
 def summary(motion: Motion) -> str:
-    """The motion in some lines, for people."""
+    """The motion in some lines of text."""
     theta, psidot, energy = np.degrees(motion.q[:, 4]), motion.qdot[:, 3], motion.energy * 1e3
     needed = motion.friction_needed[(motion.regime != Regime.FLYING) & ~np.isnan(motion.friction_needed)]
     hold = f"rolling needs a friction coefficient of {needed.max():.3g}" if needed.size else "never held by the table"
@@ -105,7 +105,7 @@ _NODAL_FRAME = {"2": "e2, psidot sin(theta)", "3": "e3, psidot cos(theta) + phid
 
 
 def write_motion(path: Path, motion: Motion, attributes: Mapping[str, str]) -> None:
-    """Write a motion as HDF5 that xarray and netCDF readers open: root, groups motion, energy, contact, effects."""
+    """Write a motion as HDF5, readable by xarray and netCDF: root, groups motion, energy, contact, model."""
     axes = {
         "time": Variable(motion.time, ("time",), "s", "time"),
         "quaternion_component": Variable(np.array(list("wxyz")), ("quaternion_component",), "1", "component"),
@@ -120,8 +120,8 @@ def write_motion(path: Path, motion: Motion, attributes: Mapping[str, str]) -> N
 
 
 def _variables(motion: Motion) -> dict[str, dict[str, Variable]]:
-    """By group, as datasets of the file."""
-    # group, values, name, components with their words, unit, meaning; component and words stand in place of {}
+    """Datasets of the file by group."""
+    # group, values, name, components with their words, unit, meaning; component and words replace {}
     layout = (
         ("", motion.q[:, :3], "{}", _WORLD, "m", "{} of the geometric centre, world frame"),
         ("", motion.q[:, 3:], "{}", _ANGLES, "rad", "{}"),
@@ -145,9 +145,9 @@ def _variables(motion: Motion) -> dict[str, dict[str, Variable]]:
     found: dict[str, dict[str, Variable]] = {group: {} for group, *_ in layout}
     for group, values, name, components, unit, meaning in layout:
         columns = values.reshape(len(motion), -1).T
-        for (component, words), column in zip(components.items(), columns, strict=False):  # a slip has no third
-            told = meaning.format(words)
-            found[group][name.format(component)] = Variable(column, ("time",), unit, told)
+        for (component, words), column in zip(components.items(), columns, strict=False):  # slip has two components
+            described = meaning.format(words)
+            found[group][name.format(component)] = Variable(column, ("time",), unit, described)
     quaternion = continuous_quaternions(quaternion_from_rotation(rotation_from_euler(*motion.q[:, 3:].T)))
     dims = ("time", "quaternion_component")
     found[""]["quaternion"] = Variable(quaternion, dims, "1", "orientation, body to world, continuous")

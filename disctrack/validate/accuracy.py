@@ -1,4 +1,4 @@
-"""The accuracy claim of 0.005 mm and 0.05 deg put to the test: the numbers, and the sentence that follows from them."""
+"""Test of the claimed accuracy of 0.005 mm and 0.05 deg: the numbers, and a sentence that follows from them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,45 +13,45 @@ from disctrack.validate.rendered import EXPOSURE, STATIC, STRATA_DEG, RenderedOu
 from disctrack.validate.tables import Validation, table
 
 CLAIM_ROTATION = np.radians(0.05)  # Ma et al. 2014, end of section 3
-REGULAR_DEG = 5.0  # psi and phi are summed up from here on; below, 1/sin(theta) is all there is to see
-LAW_DEG = 20.0  # at larger nutation the cameras' directions matter more than 1/sin(theta)
+REGULAR_DEG = 5.0  # smallest nutation for statistics of psi and phi; below, their errors grow as 1/sin(theta)
+LAW_DEG = 20.0  # largest nutation for the fit of 1/sin(theta); above, errors depend more on the cameras' directions
 CONSISTENT = (0.8, 1.25)
 _UM, _MDEG = 1e6, 180e3 / np.pi
 
 
 @dataclass(frozen=True)
 class AccuracyRow:
-    """Errors of one quantity [m or rad]: everything, and its two shares measured on the same images."""
+    """Errors of one quantity [m or rad]: in total, and from noise and calibration, from the same images."""
 
     quantity: str
     n: int
     bias: float
-    scatter: float  # about the bias
-    within_95: float  # 95 % of |error| lie within
-    noise_rms: float  # through the true cameras
-    calibration_rms: float  # difference of the recordings' own and the true cameras
-    claim: float  # that 95 % of the errors lie within
+    scatter: float  # standard deviation
+    within_95: float  # 95 % quantile of |error|
+    noise_rms: float  # with the true cameras
+    calibration_rms: float  # of the difference between calibrated and true cameras
+    claim: float  # for the 95 % quantile
 
 
 @dataclass(frozen=True)
 class SightCount:
-    """Static poses by the number of cameras that can see the upper face."""
+    """Static poses by the number of cameras that see the upper face."""
 
     cameras: int
     n: int
     found: int
-    gross: int  # found, but another pose altogether
+    gross: int  # found, but a wrong pose
     position: float  # [m] rms per axis
     rotation: float  # [rad] rms per axis
 
 
 @dataclass(frozen=True)
 class Accuracy:
-    """All that recordings, some with static poses, showed."""
+    """Summary of recordings, some with static poses."""
 
     rows: dict[str, tuple[AccuracyRow, ...]]  # by name of the recordings
     sights: tuple[SightCount, ...]
-    consistency: dict[str, Consistency]  # of the noise in each part, and of the calibration
+    consistency: dict[str, Consistency]  # of the noise for each name, and of the calibration
     law: float  # [rad] c of sigma(psi) = c / sin(theta)
 
     @property
@@ -61,7 +61,7 @@ class Accuracy:
 
 
 def sum_up(outcomes: Sequence[RenderedOutcome]) -> Accuracy:
-    """Errors count where both cameras see the face."""
+    """Errors of the poses in which both cameras see the face."""
     names = dict.fromkeys(outcome.name for outcome in outcomes)
     pairs = {name: [outcome.seen_by_both for outcome in outcomes if outcome.name == name] for name in names}
     both = {name: [joined(errors) for errors in zip(*some, strict=True)] for name, some in pairs.items()}
@@ -95,7 +95,7 @@ def _rows(own: PoseErrors, true: PoseErrors) -> tuple[AccuracyRow, ...]:
 
 
 def _strata_table(own: PoseErrors, law: float) -> str:
-    """Root mean squares of the poses in each stratum of nutation."""
+    """Rms errors of the poses in each stratum of nutation."""
     theta, rows = np.degrees(own.q[:, 4]), []
     for low, high in STRATA_DEG:
         some = own.part((theta >= low) & (theta < high))
@@ -104,8 +104,8 @@ def _strata_table(own: PoseErrors, law: float) -> str:
             by_law = _MDEG * law / np.sin(np.radians(np.sqrt(low * high)))
             rows.append([f"{low:g}-{high:g}", len(some.q), _UM * _rms(some.of("position")), *angles, by_law])
     head = ["theta [deg]", "n", "position [µm]", "rotation [mdeg]", "theta [mdeg]", "psi [mdeg]", "phi [mdeg]"]
-    law_said = f"{_MDEG * law:.2f} / sin(theta)"
-    return table("As a function of nutation (static poses)", [*head, law_said], rows, "Root mean squares.", ".2f")
+    law_column = f"{_MDEG * law:.2f} / sin(theta)"
+    return table("As a function of nutation (static poses)", [*head, law_column], rows, "Root mean squares.", ".2f")
 
 
 def _sight(own: PoseErrors, cameras: int) -> SightCount:
@@ -118,7 +118,7 @@ def _rms(errors: Array) -> float:
 
 
 def verdict(accuracy: Accuracy) -> str:
-    """Where the claim holds, where it cannot, and by which factor it is beaten; all from the numbers."""
+    """In which cases the claim holds and in which not, from the numbers."""
     rows = {row.quantity: row for row in accuracy.rows[STATIC]}
     position = max(rows[name].within_95 for name in "xyz")
     rotation = rows["rotation"].within_95
@@ -138,7 +138,7 @@ def verdict(accuracy: Accuracy) -> str:
 
 
 def complaints(accuracy: Accuracy) -> tuple[str, ...]:
-    """What a validation must not show; empty when all is well."""
+    """Failures of the validation; empty if there are none."""
     found = [f"{s.gross} of {s.n} poses seen by {s.cameras} cameras are wrong" for s in accuracy.sights if s.gross]
     two = accuracy.sights[0]
     if two.found < two.n:
@@ -147,7 +147,7 @@ def complaints(accuracy: Accuracy) -> tuple[str, ...]:
         beyond = [r.quantity for r in rows if not r.within_95 <= r.claim and r.quantity not in ("psi", "phi")]
         found += [f"{kind}: 95 % of {quantity} lie beyond the claim" for quantity in beyond]
     for name, value in accuracy.consistency.items():
-        slack = 3 * value.uncertainty  # with few poses or rigs chance alone leaves the band
+        slack = 3 * value.uncertainty  # for the sampling error with few poses or rigs
         if value.n and not CONSISTENT[0] - slack <= value.value <= CONSISTENT[1] + slack:
             found.append(
                 f"{name}: squared error over predicted variance is {value.value:.2f} +- {value.uncertainty:.2f}"
@@ -156,7 +156,7 @@ def complaints(accuracy: Accuracy) -> tuple[str, ...]:
 
 
 def accuracy_validation(outcomes: Sequence[RenderedOutcome]) -> Validation:
-    """All tables of recordings with static poses, with the verdict on top."""
+    """All tables of recordings with static poses, and the verdict."""
     accuracy = sum_up(outcomes)
     tables = [_accuracy_table(name, rows) for name, rows in accuracy.rows.items()]
     static = joined(outcome.seen_by_both[0] for outcome in outcomes if outcome.name == STATIC)
@@ -165,11 +165,11 @@ def accuracy_validation(outcomes: Sequence[RenderedOutcome]) -> Validation:
     head = ["cameras", "poses", "found", "wrong", "position rms [µm]", "rotation rms [mdeg]"]
     note = "0 cameras: the dots are seen at a grazing angle. There a pose need not be found; none may be wrong."
     tables.append(table("Who sees the face (static poses)", head, sights, note, ".2f"))
-    honest = [[name, c.value, c.uncertainty, c.n] for name, c in accuracy.consistency.items()]
+    consistency_rows = [[name, c.value, c.uncertainty, c.n] for name, c in accuracy.consistency.items()]
     head = ["squared error over predicted variance", "value", "standard error", "poses or rigs"]
     corners = ", ".join(f"{outcome.corners_px:.4f}" for outcome in outcomes)
     note = f"Target {CONSISTENT[0]} to {CONSISTENT[1]} within 3 standard errors. Corner rms by recording: {corners} px."
-    tables.append(table("Errors against stated uncertainty", head, honest, note, ".2f"))
+    tables.append(table("Errors against stated uncertainty", head, consistency_rows, note, ".2f"))
     warnings = sorted({warning for outcome in outcomes for warning in outcome.warnings})
     return Validation("validation", verdict(accuracy), tables, [accuracy], complaints(accuracy), warnings)
 
@@ -191,16 +191,16 @@ def _accuracy_table(name: str, rows: Sequence[AccuracyRow]) -> str:
 
 
 def imperfect_validation(outcomes: Sequence[RenderedOutcome]) -> Validation:
-    """Mean errors of recordings of an imperfect laboratory, with what is stated for them."""
-    lines, honest = [], []
+    """Mean errors of recordings in an imperfect laboratory, with their stated uncertainty."""
+    lines, consistency_rows = [], []
     unit = np.array(3 * [_UM] + 3 * [_MDEG])
     for outcome in outcomes:
         mean, sigma = outcome.own.mean()
-        honest.append((mean / sigma) ** 2)
+        consistency_rows.append((mean / sigma) ** 2)
         means = [f"{e:.2f} +- {s:.2f}" for e, s in zip(mean * unit, sigma * unit, strict=True)]
         repeating = ", ".join(f"{rms:.4f}" for rms in outcome.systematic_px)
         lines.append([outcome.seed, *means, outcome.own.frame_to_frame(), repeating])
-    lines.append(["squared error over variance", *np.mean(honest, axis=0), "", ""])
+    lines.append(["squared error over variance", *np.mean(consistency_rows, axis=0), "", ""])
     head = ["seed", *POSE_COMPONENTS, "frame to frame, squared over stated", "repeating, px"]
     note = (
         "Mean error +- what is stated for it, in µm and mdeg. Below 1: the stated sigmas, which hold what board and "

@@ -1,6 +1,6 @@
-"""How often does the diagnosis find, name and size what is hidden, how small may it be, and does it cry wolf?
+"""Power of the diagnosis: how often it finds hidden effects, their smallest size, and the rate of false positives.
 
-The measured trajectory with hidden effects (`hidden`), which does not tell of them, is handed to the diagnosis.
+The diagnosis gets the measured trajectory with hidden effects (`hidden`), without any information about them.
 """
 
 from collections.abc import Sequence
@@ -16,16 +16,16 @@ from disctrack.discrepancy.significance import wald
 from disctrack.validate.hidden import HiddenCase, Values, recorded
 from disctrack.validate.tables import Validation, table
 
-ENOUGH = 3.0  # [sigma] a coefficient may be off
-AT_NOISE, HELD_OUT = 1.1, 1.2  # reduced chi-square, free run over its floor
+ENOUGH = 3.0  # [sigma] largest error of a coefficient that counts as correct
+AT_NOISE, HELD_OUT = 1.1, 1.2  # largest reduced chi-square, and prediction error over the noise floor
 LEVELS = (0.5, 0.2, 0.05, 0.01, 0.005)
 
 
 class Verdict:
-    """What became of one case."""
+    """Outcome of one case."""
 
     def __init__(self, case: HiddenCase) -> None:
-        """Plant, diagnose, compare what is true of each planted effect with what is claimed."""
+        """Plant the effects, diagnose, and compare the truth of each effect with the claims."""
         truths, planted, trajectory = recorded(case)
         began = perf_counter()
         result = diagnose(trajectory)
@@ -34,34 +34,34 @@ class Verdict:
         pulls = [_pull_of(result, truth) for truth in truths]
         left = [(e.reduced_chi_square, e.ratio_to_floor) for e in (result.before, result.after) if e] or [(nan, nan)]
         self.case, self.n, self.verdict = case, len(trajectory), d.verdict
-        # every effect claimed, its class after it in brackets
+        # every effect claimed, followed by its indistinguishable alternatives in brackets
         self.found = tuple(
             _with_class(f.candidate.name, [r.candidate.name for r in f.cannot_be_told_from]) for f in d.found
         )
-        self.named = None not in pulls  # every hidden effect is among those claimed, or in the class of one
-        # largest error of a coefficient in its sigmas; NaN where it is not named
+        self.named = None not in pulls  # every hidden effect is claimed, or an alternative of a claim
+        # largest error of a coefficient in its sigmas; NaN if none is named
         self.pull = max((p for p in pulls if p is not None), default=nan)
-        self.extra = max(len(d.found) - len(truths), 0)  # claims beyond those hidden
+        self.extra = max(len(d.found) - len(truths), 0)  # number of claims in excess of hidden effects
         self.chi_square = left[0][0], left[-1][0]  # reduced, before and after
-        self.free_run = left[0][1], left[-1][1]  # over its floor, before and after
-        self.gain = (d.before.cost - d.after.cost) / d.noise  # of chi-square by all effects claimed
-        # that noise alone would let some effect gain as much as the best one does; NaN: not known
+        self.free_run = left[0][1], left[-1][1]  # prediction error over the noise floor, before and after
+        self.gain = (d.before.cost - d.after.cost) / d.noise  # decrease of chi-square by all effects claimed
+        # probability that noise alone produces the improvement of the best effect; NaN: not known
         self.p_value = d.chance.p_value if d.chance else nan
-        # of the hidden effects the least, in sigmas, with all others fitted beside it (NaN: not known); and what a
-        # claim takes
-        self.stands_out, self.needed = _standing_out(result, truths, planted)
+        # expected significance of the weakest hidden effect in sigmas, with all others fitted (NaN: not known), and
+        # that required for a claim
+        self.stands_out, self.needed = _expected_significance(result, truths, planted)
 
     @property
     def can_be_told(self) -> bool:
-        """Does the recording determine every hidden effect beside the others, so that it may be asked for?
+        """Does the recording determine every hidden effect together with the others?
 
-        What stands out by less than a claim takes leaves a bound only, whoever looks.
+        A less significant effect than a claim requires has an upper bound only.
         """
         return not self.stands_out < self.needed
 
     @property
     def at_noise(self) -> bool:
-        """Is what is left noise, in the fit and in the free run?"""
+        """Are the residuals of the fit and of the free run noise?"""
         return self.chi_square[1] <= AT_NOISE and self.free_run[1] <= HELD_OUT
 
     @property
@@ -71,20 +71,20 @@ class Verdict:
 
     @property
     def found_from(self) -> float:
-        """Size from which a single effect would stand out by what a claim takes in this recording: found in half."""
+        """Size of a single effect with just the required expected significance: it is found in half of the cases."""
         size, *others = self.case.hidden.values()
-        return size * self.needed / self.stands_out if self.case.asked and not others else float("nan")
+        return size * self.needed / self.stands_out if self.case.has_effects and not others else float("nan")
 
 
 def _with_class(name: str, others: Sequence[str]) -> str:
     return f"{name} ({', '.join(others)})" if others else name
 
 
-def _standing_out(result: DiscDiagnosis, truths: Sequence[Values], planted: Values) -> tuple[float, float]:
-    """By how many sigmas the least of the planted effects stands out of the joint model, and how many a claim takes.
+def _expected_significance(result: DiscDiagnosis, truths: Sequence[Values], planted: Values) -> tuple[float, float]:
+    """Significance of the weakest planted effect in the joint model, and that required for a claim, in sigmas.
 
-    Fisher's information at the truth: the gain is a' C^-1 a for amounts a with covariance C, all else fitted along, the
-    other planted effects, too. NaN where the joint model has no fit, or the catalogue no such numbers.
+    From the Fisher information at the truth: the decrease of chi-square is a' C^-1 a for amounts a with covariance C,
+    with all other quantities fitted. NaN if the joint fit does not converge, or the catalogue lacks an effect.
     """
     system, d = result.system, result.diagnosis
     meant = [next((c for c in system.candidates if set(truth) <= set(c.names)), None) for truth in truths]
@@ -106,11 +106,11 @@ def _standing_out(result: DiscDiagnosis, truths: Sequence[Values], planted: Valu
 
 
 def _pull_of(result: DiscDiagnosis, truth: Values) -> float | None:
-    """Largest pull of the true values where the effect, or a class that holds it, is claimed; None: it is not."""
+    """Largest pull of the true values if the effect, or one indistinguishable from it, is claimed; otherwise None."""
     d = result.diagnosis
     claims = [_pull(d.after, truth) for f in d.found if set(truth) <= set(f.candidate.names)]
     others = [a for f in d.found for a in f.cannot_be_told_from if set(truth) <= set(a.candidate.names)]
-    # two claims may have it in their classes: it is in the place of one of them that it fits
+    # if it is an alternative of several claims, the one with the smallest pull is correct
     return min(claims or [_pull(other.fit, truth) for other in others], default=None)
 
 
@@ -119,8 +119,8 @@ def _pull(fit: Fit, truth: Values) -> float:
 
 
 def what_was_wrong(v: Verdict) -> str:
-    """One line on a case that did not come out as it should; empty where it did."""
-    right = v.within and v.at_noise if v.case.asked else v.verdict == "nothing missing"
+    """One line about a case with a wrong result; empty if the result is right."""
+    right = v.within and v.at_noise if v.case.has_effects else v.verdict == "nothing missing"
     if right and not v.extra:
         return ""
     return (
@@ -131,16 +131,16 @@ def what_was_wrong(v: Verdict) -> str:
 
 
 def diagnosis_validation(verdicts: Sequence[Verdict]) -> Validation:
-    """How often what was hidden was named and sized, and how often something was claimed where nothing was hidden."""
-    asked = [v for v in verdicts if v.case.asked]
-    controls = [v for v in verdicts if not v.case.asked]
-    told = [v for v in asked if v.can_be_told]
+    """Rates of named hidden effects with correct sizes, and of claims in recordings without hidden effects."""
+    hidden = [v for v in verdicts if v.case.has_effects]
+    controls = [v for v in verdicts if not v.case.has_effects]
+    known = [v for v in hidden if v.can_be_told]
     claimed = [v for v in controls if v.verdict != "nothing missing"]
     headline = []
-    if asked:
+    if hidden:
         headline.append(
-            f"Named {sum(v.named for v in asked)} of {len(asked)}; {sum(v.named for v in told)} of {len(told)} that "
-            f"their recordings determine; something claimed besides in {sum(v.extra > 0 for v in asked)}."
+            f"Named {sum(v.named for v in hidden)} of {len(hidden)}; {sum(v.named for v in known)} of {len(known)} "
+            f"that their recordings determine; something claimed besides in {sum(v.extra > 0 for v in hidden)}."
         )
     if controls:
         headline.append(
@@ -170,7 +170,7 @@ def _rates_table(verdicts: Sequence[Verdict]) -> str:
 
 
 def _levels_table(p_values: Sequence[float]) -> str:
-    """Are the stated probabilities true where nothing is hidden? With exact intervals (Clopper and Pearson 1934)."""
+    """Calibration of the p-values without hidden effects, with exact intervals (Clopper and Pearson 1934)."""
     p = np.asarray(p_values)[np.isfinite(p_values)]
     rows = []
     for level in LEVELS if len(p) else ():

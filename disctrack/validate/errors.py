@@ -1,4 +1,4 @@
-"""Measured against true poses: their differences, and how these compare with what is stated."""
+"""Differences of measured and true poses, and their consistency with the stated covariance."""
 
 from __future__ import annotations
 
@@ -11,28 +11,28 @@ from calibration.kit.arrays import Array, Mask
 from disctrack.frames import COORDINATES, rotation_from_euler, rotation_from_quaternion, vector_from_rotation
 from disctrack.trajectory import Trajectory
 
-GROSS_POSITION = 0.5e-3  # [m] and
-GROSS_ROTATION = np.radians(1.0)  # beyond: not an error of measurement but another pose
+GROSS_POSITION = 0.5e-3  # [m], above which a pose is wrong, not inaccurate
+GROSS_ROTATION = np.radians(1.0)  # likewise
 
 
 @dataclass(frozen=True)
 class PoseErrors:
-    """Differences measured - true of n poses; NaN where there is no answer."""
+    """Differences measured - true of n poses; NaN without a measured pose."""
 
     q: Array  # (n, 6) true
     error: Array  # (n, 6) POSE_COMPONENTS [m, rad]: position, rotation vector in world axes
     angles: Array  # (n, 3) psi, theta, phi [rad], in (-pi, pi]
-    covariance: Array  # (n, 6, 6) reported, this pose's noise
-    calibration_covariance: Array  # (n, 6, 6) reported, the rig's share
+    covariance: Array  # (n, 6, 6) reported, of the noise
+    calibration_covariance: Array  # (n, 6, 6) reported, of the calibration
 
     @property
     def found(self) -> Mask:
-        """(n,) True where a pose was reported."""
+        """(n,) True if a pose is reported."""
         return np.asarray(np.isfinite(self.error).all(axis=1))
 
     @property
     def gross(self) -> Mask:
-        """(n,) True where what was reported is another pose altogether."""
+        """(n,) True if the reported pose is wrong."""
         size = [np.linalg.norm(self.error[:, part], axis=1) for part in (slice(0, 3), slice(3, 6))]
         with np.errstate(invalid="ignore"):
             return np.asarray((size[0] > GROSS_POSITION) | (size[1] > GROSS_ROTATION))
@@ -52,19 +52,19 @@ class PoseErrors:
         return columns[quantity][self.usable].ravel()
 
     def mean(self) -> tuple[Array, Array]:
-        """Mean error (6,) of the usable poses, and what is stated for what they share (6,)."""
+        """Mean error (6,) of the usable poses, and the stated uncertainty of their common error (6,)."""
         usable = self.part(self.usable)
         variance = np.median(np.diagonal(usable.calibration_covariance, axis1=1, axis2=2), axis=0)
         return usable.error.mean(axis=0), np.sqrt(variance)
 
     def frame_to_frame(self) -> float:
-        """Bends of the errors along a smooth motion, squared, over the variance stated for a frame's noise."""
+        """Variance of the errors from their second differences, over the stated variance of the noise of a frame."""
         usable = self.part(self.usable)
-        bends = np.diff(usable.error, 2, axis=0) ** 2 / 6.0
-        return float(np.mean(bends / np.diagonal(usable.covariance, axis1=1, axis2=2)[1:-1]))
+        variances = np.diff(usable.error, 2, axis=0) ** 2 / 6.0
+        return float(np.mean(variances / np.diagonal(usable.covariance, axis1=1, axis2=2)[1:-1]))
 
     def part(self, rows: Mask) -> PoseErrors:
-        """The poses where `rows` (n,) is True."""
+        """The poses of these rows (n,)."""
         return PoseErrors(*(values[rows] for values in vars(self).values()))
 
 
@@ -85,11 +85,11 @@ def joined(parts: Iterable[PoseErrors]) -> PoseErrors:
 
 @dataclass(frozen=True)
 class Consistency:
-    """Normalised squared error per degree of freedom: 1 where the reported covariance is the true one."""
+    """Normalised squared error per degree of freedom: 1 if the reported covariance is correct."""
 
     value: float
     uncertainty: float  # standard error of `value` if it were 1
-    n: int  # poses, or rigs, that are independent
+    n: int  # number of independent poses or rigs
 
 
 def _consistency(values: Sequence[float] | Array) -> Consistency:
@@ -109,11 +109,11 @@ def noise_consistency(comparison: PoseErrors) -> Consistency:
 
 
 def calibration_consistency(pairs: Iterable[tuple[PoseErrors, PoseErrors]]) -> Consistency:
-    """Squared calibration error over its reported variance, from the same images measured through two rigs.
+    """Squared calibration error over its reported variance, from the same images measured with two rigs.
 
-    pairs : poses of each recording through its own calibration and through the true cameras. The image noise is in
-    both, so that their difference is the calibration's share alone. It is common to a recording: each one counts once,
-    as the mean over its poses of d^T C^-1 d / 6.
+    pairs : poses of each recording with its own calibration and with the true cameras. Both have the same image noise,
+    so their difference d is the calibration error alone. It is common to a recording, which therefore counts once, with
+    the mean over its poses of d^T C^-1 d / 6.
     """
     values = []
     for own, true in pairs:

@@ -1,8 +1,8 @@
-"""Effects to hide in measured trajectories: what is planted, one by one, and the recording with all of it.
+"""Effects to hide in measured trajectories, and recordings with them.
 
-Every case draws a motion, a rig with a calibration error of its own, and the noise of the dots (`points`).
-An effect is hidden by the name of the candidate that means it, in the candidate's numbers and units. Every size is one
-that a careful experimenter would still overlook; directions and signs are drawn, passive effects keep theirs.
+Every case has a random motion, a rig with its own calibration error, and noise of the dots (`points`). An effect has
+the name, quantities and units of the diagnosis' candidate. Its size is one that a careful experimenter would overlook.
+Directions and signs are random, except for the signs of passive effects.
 """
 
 from collections import defaultdict
@@ -25,8 +25,7 @@ from disctrack.synthetic.motion import rolling_start
 from disctrack.trajectory import Trajectory
 from disctrack.validate.points import ORDINARY, Laboratory, measured
 
-# [SI] where what would surprise nobody (`Quantity.typical`) is more than twice what a careful experimenter would
-# overlook, or less than half of it
+# [SI] sizes that a careful experimenter would overlook, if they differ from `Quantity.typical` more than twofold
 OVERLOOKED = {
     "table_tilt": np.radians(0.35),
     "kz": 6e-5,
@@ -46,32 +45,32 @@ OVERLOOKED = {
     "pattern_scale": 1e-3,
     "ellipse_centre": 1.0,
 }
-CONTROLS = {"nothing": 1.0, "prints": DOT_SIGMA, "laboratory": 1.0}  # hide nothing that may be claimed
-NOT_HIDDEN = ("km", "slip", "surface_moves", "table_settles", "clock_drift")  # the first is in every model
-INVISIBLE = ("pattern_rotation",)  # no recording of one disc shows it, and nothing should be said
-FIRST_ALONE = ("spring", "table_curved")  # of the candidate's numbers
+CONTROLS = {"nothing": 1.0, "prints": DOT_SIGMA, "laboratory": 1.0}  # cases in which nothing should be claimed
+NOT_HIDDEN = ("km", "slip", "surface_moves", "table_settles", "clock_drift")  # km is in every model
+INVISIBLE = ("pattern_rotation",)  # not determined by recordings of one disc: nothing should be claimed
+FIRST_ALONE = ("spring", "table_curved")  # only the first quantity of the candidate is planted
 DURATION = (0.4, 0.9)  # [s]
-FLATTEST_DEG = 0.9  # the last frame's nutation: below, the disc touches its paper
+FLATTEST_DEG = 0.9  # smallest nutation of the last frame: below, the disc touches its paper
 Values = dict[str, float]  # by name of a quantity
 
 
 @dataclass(frozen=True)
 class HiddenCase:
-    """What is hidden, effect -> size, in the recording of a seed; controls hide nothing that may be claimed."""
+    """Hidden effects with sizes in the recording of a seed; in controls nothing should be claimed."""
 
     hidden: Mapping[str, float]
     seed: int
     rate: float = 1000.0  # [Hz]
 
     @property
-    def asked(self) -> bool:
-        """Is there something that the diagnosis should name?"""
+    def has_effects(self) -> bool:
+        """Is there an effect that the diagnosis should name?"""
         return any(name not in CONTROLS for name in self.hidden)
 
 
 @cache
 def _catalogue() -> Mapping[str, list[Candidate]]:
-    """What the diagnosis calls by a name, of one camera or dot each where it is theirs."""
+    """Candidates of the diagnosis by name; one per camera or dot if they have their own."""
     disc, found = Scene().declared_disc, defaultdict[str, list[Candidate]](list)
     for candidate in (*motion_candidates(Model(disc)), *measurement_candidates(disc)):
         found[sub(r"^(left|right)_|_\d$", "", candidate.name)].append(candidate)
@@ -79,23 +78,23 @@ def _catalogue() -> Mapping[str, list[Candidate]]:
 
 
 def sizes() -> dict[str, float]:
-    """Of every effect that is hidden."""
+    """Size of every effect that can be hidden."""
     typical = {name: alike[0].quantities[0].typical for name, alike in _catalogue().items() if name not in NOT_HIDDEN}
     return typical | OVERLOOKED
 
 
 def alike(name: str) -> Sequence[Candidate]:
-    """What the diagnosis calls by this name; nothing of a control. Raises DiscTrackError."""
+    """Candidates of the diagnosis with this name; empty for a control. Raises DiscTrackError."""
     if name not in sizes() | CONTROLS:
         raise DiscTrackError(f"there is no effect '{name}' to hide; there are {', '.join(sizes() | CONTROLS)}")
     return _catalogue().get(name, ())
 
 
 def plant(name: str, size: float, rng: Generator) -> tuple[Values, Values]:
-    """An effect of this size [SI], of one camera or dot drawn among those there are, with a sign or a direction.
+    """An effect of this size [SI] with random sign or direction, if applicable of a random camera or dot.
 
-    returns : what is true of the diagnosis' quantities then, and all that goes into the data: "effect.parameter" of the
-        motion, "fault.part" of the measurement
+    returns : true values of the diagnosis' quantities, and all planted values: "effect.parameter" of the motion,
+        "fault.part" of the measurement
     """
     candidates = alike(name)
     if not candidates:
@@ -110,12 +109,12 @@ def plant(name: str, size: float, rng: Generator) -> tuple[Values, Values]:
         numbers = np.array([size if passive else size * rng.choice([-1.0, 1.0])])
     numbers = np.abs(numbers) if passive else numbers
     truth = {q.name: float(number) for q, number in zip(quantities, numbers, strict=True)}
-    beside = {"rim_flat.angle": rng.uniform(0, 2 * np.pi)} if name == "rim_flat" else {}
-    return truth, truth | beside
+    shape = {"rim_flat.angle": rng.uniform(0, 2 * np.pi)} if name == "rim_flat" else {}
+    return truth, truth | shape
 
 
 def draw(seed: int, planted: Values, rate: float = HiddenCase.rate) -> Scene:
-    """A motion that lasts as long as it is filmed, whatever is planted in it."""
+    """A random motion that, with the planted effects, lasts for the whole recording."""
     rng = np.random.default_rng([seed, 31])
     disc = Scene().declared_disc
     faults = scene_faults(disc, planted, rate)
@@ -132,7 +131,7 @@ def draw(seed: int, planted: Values, rate: float = HiddenCase.rate) -> Scene:
         scene = Scene(seed=seed, cameras=CameraSettings(rate, n), motion=motion_of, faults=faults)
         try:
             motion = simulate(model, rolling_start(scene), duration=1.03 * n / rate + 0.01, rate=rate)
-        except DiscTrackError:  # no such precession
+        except DiscTrackError:  # no regular precession exists
             continue
         if len(motion) > 1.02 * n and motion.q[-1, 4] > np.radians(FLATTEST_DEG):
             return scene
@@ -140,7 +139,7 @@ def draw(seed: int, planted: Values, rate: float = HiddenCase.rate) -> Scene:
 
 
 def recorded(case: HiddenCase) -> tuple[list[Values], Values, Trajectory]:
-    """What is true of each planted effect's quantities, all that is planted, and the recording with it."""
+    """True values of the quantities of each planted effect, all planted values, and the recording."""
     rng = np.random.default_rng([case.seed, 32])
     parts = [plant(name, size, rng) for name, size in case.hidden.items()]
     planted = {name: value for _, values in parts for name, value in values.items()}
@@ -152,7 +151,7 @@ def recorded(case: HiddenCase) -> tuple[list[Values], Values, Trajectory]:
 def hidden_cases(
     names: Sequence[str], seeds: Sequence[int], pairs: int = 0, rate: float = HiddenCase.rate
 ) -> Iterator[HiddenCase]:
-    """Each effect ("NAME" or "NAME=SIZE"; none: all) with each seed; or pairs drawn at random, a seed each."""
+    """Each effect ("NAME" or "NAME=SIZE"; by default all) with each seed; or random pairs, each with its own seed."""
     hidden = [_sized(name) for name in names] or [*sizes().items()]
     if not pairs:
         yield from (HiddenCase({name: size}, seed, rate) for name, size in hidden for seed in seeds)

@@ -1,9 +1,9 @@
-"""What becomes of a measurement when something is wrong with it that nobody declares.
+"""Effect of undeclared faults on a measurement, and their detection.
 
-Faults are planted at three sizes, from just visible to gross, into recordings of different make. Those of the catalogue
-are rendered into the images of a scene; of a recording that was filmed, the rig and what is declared are made wrong by
-as much. Faults of files and of declared numbers are planted into both. Each recording is then run as its user would, in
-a process of its own, and its poses are compared with the truth, or with those that are found without the fault.
+Faults are planted at three sizes, from just visible to gross, into different recordings. Faults of the catalogue are
+rendered into the images of a scene; for a filmed recording, the rig and the declaration are changed instead. Faults of
+files and of declared numbers are planted into both. Each recording is then processed by `disctrack run` in a process of
+its own. Its poses are compared with the truth, or with those without the fault.
 """
 
 import os
@@ -41,24 +41,24 @@ from disctrack.validate.errors import compare
 from disctrack.validate.rendered import rolling_scene, scene_of
 from disctrack.validate.tables import Validation, table
 
-PAIRS = 100  # from so many on gravity and frame rate are judged
-THETA_DEG = 9.0  # of the scene
-SIZES = (0.1, 1.0, 10.0)  # times what surprises nobody: just visible, ordinary, gross
-MOST_SIGMAS = 5.0  # of six components of a hundred poses chance alone reaches 4.1
-Tree = dict[str, Any]  # of a recording.toml
-# Of a recording that may be spoilt, its declaration, which is written afterwards, and the size; returns the true poses,
-# where they are others
+PAIRS = 100  # the minimum for a test of gravity and frame rate
+THETA_DEG = 9.0  # nutation of the scene
+SIZES = (0.1, 1.0, 10.0)  # times an ordinary size: just visible, ordinary, gross
+MOST_SIGMAS = 5.0  # noise alone reaches 4.1 in six components of a hundred poses
+Tree = dict[str, Any]  # content of a recording.toml
+# Arguments: a copy of a recording, its declaration, which is written afterwards, and the size; returns the true poses
+# if they differ
 Change = Callable[[Path, Tree, float], Array | None]
 
 
 @dataclass(frozen=True)
 class Ground:
-    """A recording in which nothing is wrong."""
+    """A recording without faults."""
 
     recording: Path  # its folder
     rig: Path
-    scene: Scene | None  # that it was rendered from
-    q: Array  # (n, 6) by frame: the truth, or what is found
+    scene: Scene | None  # None if it was filmed
+    q: Array  # (n, 6) by frame: true or measured
 
 
 FaultCase = tuple[Ground, str, float]  # a recording, a fault, its size
@@ -66,31 +66,31 @@ FaultCase = tuple[Ground, str, float]  # a recording, a fault, its size
 
 @dataclass(frozen=True)
 class Planting:
-    """A fault as it is planted."""
+    """A way to plant a fault."""
 
     sizes: Sequence[float]
     unit: str
     change: Change
     named_by: tuple[Kind, ...]
-    of_views: bool = False  # the recording is calibrated anew, by its own views
+    of_views: bool = False  # the recording is calibrated again with its own views
 
 
 @dataclass(frozen=True)
 class FaultOutcome:
-    """What became of it."""
+    """Outcome of a planted fault."""
 
     make: str
     fault: str
     size: float
     unit: str
     worst: float  # largest error of a pose in its stated sigmas; 0 without a pose
-    told: str  # the finding that names the fault; in brackets, another one
+    told: str  # the finding that names the fault; in brackets if it names another one
     named: bool
-    code: int  # of exit
+    code: int  # exit code
 
     @property
     def complaint(self) -> str:
-        """What must not be; empty where all is well."""
+        """Failure of the validation; empty if there is none."""
         where = f"{self.make}: {self.fault} of {self.size:.3g} {self.unit}"
         if self.code not in (0, 1, 3):
             return f"{where}: exit code {self.code}"
@@ -100,7 +100,7 @@ class FaultOutcome:
 
 
 def untouched(folder: Path, recordings: Sequence[Path], seed: int = 29) -> Iterator[Ground]:
-    """A rendered recording and the first pairs of each of these, run without any fault."""
+    """A rendered recording, and the first pairs of each of these recordings, processed without any fault."""
     scene = rolling_scene(scene_of(seed, quick=True), "rendered", THETA_DEG, PAIRS, np.random.default_rng([seed, 34]))
     scene = replace(scene, cameras=replace(scene.cameras, exposure_s=Scene().cameras.exposure_s))
     truth = write_recording(folder / "rendered", scene)
@@ -119,12 +119,12 @@ def _ground(folder: Path, scene: Scene | None, q: Array | None) -> Ground:
 
 
 def fault_cases(grounds: Sequence[Ground]) -> list[FaultCase]:
-    """Every fault at all of its sizes in each recording."""
+    """Every fault with all its sizes in each recording."""
     return [(ground, name, size) for ground in grounds for name, p in plantings(ground).items() for size in p.sizes]
 
 
 def plant_and_run(case: FaultCase) -> FaultOutcome:
-    """Plant, run, compare; nothing is left on the disk."""
+    """Plant, run, compare; all files are removed."""
     ground, fault, size = case
     planting = plantings(ground)[fault]
     folder = ground.recording.with_name(f"{ground.recording.name} {fault} {size:g}")
@@ -142,7 +142,7 @@ def plant_and_run(case: FaultCase) -> FaultOutcome:
 
 
 def _run(folder: Path) -> tuple[int, list[Finding], Trajectory | None]:
-    """Exit code, findings and poses of `disctrack run`; why it was refused is a finding, too."""
+    """Exit code, findings and poses of `disctrack run`; the reason of a refusal is a finding, too."""
     words = ["run", str(folder), "--json", "--no-figures", "--no-video", "--overwrite"]
     ended = subprocess.run([sys.executable, "-m", "disctrack", *words], capture_output=True, text=True, check=False)
     try:
@@ -155,7 +155,7 @@ def _run(folder: Path) -> tuple[int, list[Finding], Trajectory | None]:
 
 
 def _said(findings: Sequence[Finding]) -> str:
-    """The gravest finding in short."""
+    """The most severe finding, shortened."""
     return "".join(f"{f.kind.value}, {f.grave}: {f.text}"[:160].replace("\n", " ") for f in findings[:1])
 
 
@@ -174,23 +174,23 @@ def plantings(ground: Ground) -> dict[str, Planting]:
 
 
 def _of_catalogue(ground: Ground) -> Iterator[tuple[Fault, Planting]]:
-    """One camera and one dot stand for the others."""
+    """Faults of the catalogue; of those of a camera or a dot, only one."""
     others = "right" if ground.scene is None else "left"
     recording = read_recording(ground.recording)
     for fault in faults_of(recording.disc):
         alike = fault.name.startswith((others, "misprint")) and fault.name != "misprint_0"
-        declarable = not fault.in_images and fault.key != "right_delay_s"  # rig, disc, dots, rate: as if declared wrong
+        declarable = not fault.in_images and fault.key != "right_delay_s"  # equivalent to a wrong declaration
         if not fault.named_by or alike or (ground.scene is None and not declarable):
             continue
         change = _declared_wrong if ground.scene is None else _rendered
         sizes = [TYPICAL_STEPS * fault.step * size for size in SIZES]
-        if fault.in_images:  # the square of an exposure, which ends before the next
+        if fault.in_images:  # the square of an exposure, which is shorter than the period
             sizes = [size for size in sizes if size * recording.frame_rate**2 < 1]
         yield fault, Planting(sizes, fault.unit, partial(change, fault, ground), fault.named_by)
 
 
 def _with(fault: Fault, size: float, disc: Disc, rate: float = 1.0) -> Faults:
-    """The fault alone, its numbers all alike; rate : declared [Hz]."""
+    """The fault alone, with equal numbers; rate : declared [Hz]."""
     values = dict.fromkeys(fault.names(), size / np.sqrt(len(fault.parts)))
     return scene_faults(disc, values, rate)
 
@@ -204,7 +204,7 @@ def _rendered(fault: Fault, ground: Ground, folder: Path, tree: Tree, size: floa
 
 
 def _declared_wrong(fault: Fault, ground: Ground, folder: Path, tree: Tree, size: float) -> None:
-    """As if what is declared were true but for the fault."""
+    """Change the declaration and the rig so that the unchanged images have the fault."""
     disc, rig = read_recording(ground.recording).disc, read_rig(ground.rig)
     wrong = _with(fault, -size, disc)
     tree["markers"]["centres_mm"] = (1e3 * centres_with(wrong, disc)[:, :2]).tolist()
@@ -215,7 +215,7 @@ def _declared_wrong(fault: Fault, ground: Ground, folder: Path, tree: Tree, size
 
 
 def _copied(recording: Recording, folder: Path, rig: Path | None = None) -> Tree:
-    """The first pairs in a new folder, numbered anew, with this rig or views of their own; returns what is declared."""
+    """Copy the first pairs to a new folder, renumbered, with this rig or their own views; returns the declaration."""
     tree: Tree = {name: dict(part) if isinstance(part, dict) else part for name, part in recording.declared.items()}
     for camera, pattern in zip(CAMERAS, (recording.left, recording.right), strict=True):
         tree["cameras"][camera] = _put(sorted(recording.folder.glob(pattern))[:PAIRS], folder / camera)
@@ -226,7 +226,7 @@ def _copied(recording: Recording, folder: Path, rig: Path | None = None) -> Tree
 
 
 def _put(files: Sequence[Path], folder: Path) -> str:
-    """Copy images, numbered as they come; returns their pattern."""
+    """Copy images, numbered in this order; returns their pattern."""
     folder.mkdir(parents=True)
     for number, file in enumerate(files):
         shutil.copy(file, folder / f"{number:06d}{file.suffix}")
@@ -240,27 +240,27 @@ def declare(folder: Path, tree: Tree) -> None:
 
 
 def reordered(folder: Path, change: Callable[[list[bytes]], Iterable[bytes]]) -> None:
-    """Files of a folder in another order, without some, with some again or with other contents: numbered anew."""
+    """Reorder, remove, repeat or change the files of a folder, and renumber them."""
     files = sorted(folder.iterdir())
     contents = [file.read_bytes() for file in files]
     for file in files:
-        file.unlink()  # it may be a link to another's
+        file.unlink()  # it may be a link to a file of another recording
     for number, content in enumerate(change(contents)):
         (folder / f"{number:06d}{files[0].suffix}").write_bytes(content)
 
 
 def redrawn(folder: Path, change: Callable[[NDArray, float], NDArray]) -> None:
-    """Change images; the number is the share of the recording before each."""
+    """Change images; the second argument of `change` is the share of the recording before the image."""
     files = sorted(folder.iterdir())
     for number, file in enumerate(files):
         image = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
         assert image is not None
-        file.unlink()  # it may be a link to another's
+        file.unlink()  # it may be a link to a file of another recording
         cv2.imwrite(str(file), change(image, number / len(files)))
 
 
 def _files(**orders: Callable[[list[bytes], int], list[bytes]]) -> Change:
-    """By folder, the order of its files, which the size is given to."""
+    """Change of the files of folders; orders : by folder, a function of the files and the size."""
 
     def change(folder: Path, tree: Tree, size: float) -> None:
         for name, order in orders.items():
@@ -270,23 +270,23 @@ def _files(**orders: Callable[[list[bytes], int], list[bytes]]) -> Change:
 
 
 def _lost(files: list[bytes], k: int) -> list[bytes]:
-    """In the middle."""
+    """Remove k files in the middle."""
     return files[: len(files) // 2] + files[len(files) // 2 + k :]
 
 
-def _again(files: list[bytes], k: int) -> list[bytes]:
-    """In the middle the recorder writes one image again and again."""
+def _repeated_image(files: list[bytes], k: int) -> list[bytes]:
+    """Replace k files in the middle by copies of the one before."""
     middle = len(files) // 2
     return files[:middle] + k * [files[middle - 1]] + files[middle + k :]
 
 
 def _last_lost(files: list[bytes], k: int) -> list[bytes]:
-    """Of the other camera, so that both end together."""
+    """Remove the last k files, so that both cameras have the same number."""
     return files[:-k]
 
 
 def _damaged(files: list[bytes], k: int) -> list[bytes]:
-    """The end of the last files was never written."""
+    """Truncate the last k files."""
     return files[:-k] + [file[: len(file) // 2] for file in files[-k:]]
 
 
@@ -297,7 +297,7 @@ def _exchanged(folder: Path, tree: Tree, size: float) -> None:
 def _images(
     change: Callable[[NDArray, float], NDArray], *folders: str, course: Callable[[float], float] = lambda share: 1.0
 ) -> Change:
-    """What becomes of images by the size, of which each has as much as the share of the recording before it tells."""
+    """Change of all images of folders; course : factor on the size, from the share of the recording before an image."""
 
     def of_all(folder: Path, tree: Tree, size: float) -> None:
         for name in folders:
@@ -306,16 +306,16 @@ def _images(
     return of_all
 
 
-def _moved(image: NDArray, by: float) -> NDArray:
-    """In either direction [px]."""
+def _shifted(image: NDArray, by: float) -> NDArray:
+    """Shift an image along x and y [px]."""
     move = np.array([[1.0, 0.0, by], [0.0, 1.0, by]])
     shape = image.shape[::-1]
     moved = cv2.warpAffine(image, move, shape, flags=cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE)
     return moved if by else image
 
 
-def _lit(image: NDArray, size: float) -> NDArray:
-    """By a lamp's reflex of size grey values of 8 bits at most."""
+def _with_glare(image: NDArray, size: float) -> NDArray:
+    """Add the reflection of a lamp with a maximum of `size` grey values of 8 bits."""
     height, width = image.shape
     y, x = np.mgrid[:height, :width]
     spot = np.exp(-8.0 * ((x / width - 0.6) ** 2 + (y / height - 0.5) ** 2))
@@ -324,7 +324,7 @@ def _lit(image: NDArray, size: float) -> NDArray:
 
 
 def _wrong(section: str, key: str, *kinds: Kind) -> Planting:
-    """A declared number is wrong by a share of itself; tolerances are the usual ones."""
+    """A wrong declared number, with relative errors as sizes and the default tolerances."""
 
     def change(folder: Path, tree: Tree, size: float) -> None:
         for part in (tree["disc"], tree.get("table", {}), tree["calibration"]):
@@ -343,12 +343,12 @@ _VIEWS = ("board_left", "board_right")
 CHANGES = {
     "pairs lost by both": Planting((1, 3, 10), "pairs", _files(left=_lost, right=_lost), (Kind.CLOCK_JUMP,)),
     "images lost by one": Planting((1, 3, 10, 20), "images", _files(left=_last_lost, right=_lost), _LOST),
-    "pairs repeated": Planting((1, 3, 10), "pairs", _files(left=_again, right=_again), _REPEATED),
-    "images repeated by one": Planting((1, 3, 10), "images", _files(right=_again), _REPEATED),
+    "pairs repeated": Planting((1, 3, 10), "pairs", _files(left=_repeated_image, right=_repeated_image), _REPEATED),
+    "images repeated by one": Planting((1, 3, 10), "images", _files(right=_repeated_image), _REPEATED),
     "files damaged": Planting((1, 5, 50), "files", _files(right=_damaged), (Kind.UNREADABLE,)),
-    "glare": Planting((3, 30, 300), "grey values", _images(_lit, "right"), (Kind.LIGHT, Kind.ONE_SIDED, *MOVED)),
-    "camera knocked": Planting((0.02, 0.2, 2.0), "px", _images(_moved, "right", course=round), MOVED),
-    "camera drifts": Planting((0.03, 0.3, 3.0), "px", _images(_moved, "right", course=float), MOVED),
+    "glare": Planting((3, 30, 300), "grey values", _images(_with_glare, "right"), (Kind.LIGHT, Kind.ONE_SIDED, *MOVED)),
+    "camera knocked": Planting((0.02, 0.2, 2.0), "px", _images(_shifted, "right", course=round), MOVED),
+    "camera drifts": Planting((0.03, 0.3, 3.0), "px", _images(_shifted, "right", course=float), MOVED),
     "reversed": Planting((1,), "", _files(**dict.fromkeys(CAMERAS, lambda files, k: files[::-1])), (Kind.REVERSED,)),
     "exchanged": Planting((1,), "", _exchanged, (Kind.EXCHANGED,)),
     "mirrored": Planting((1,), "", _images(lambda image, _: cv2.flip(image, 1), "right"), (Kind.MIRRORED,)),
@@ -366,7 +366,7 @@ CHANGES = {
 
 
 def faults_validation(outcomes: Sequence[FaultOutcome]) -> Validation:
-    """What is named from which size on in each recording, and what must not be."""
+    """Smallest size of each fault that is named in each recording, and failures."""
     off = [o for o in outcomes if o.worst > MOST_SIGMAS]
     headline = (
         f"Of {len(outcomes)} planted faults {len(off)} move a pose by more than {MOST_SIGMAS:g} stated sigmas; "
@@ -377,7 +377,7 @@ def faults_validation(outcomes: Sequence[FaultOutcome]) -> Validation:
 
 
 def _limits(outcomes: Sequence[FaultOutcome]) -> str:
-    """A line for each fault; what one camera or the other has is one."""
+    """One row per fault; those of the left and the right camera are one fault."""
     makes = list(dict.fromkeys(o.make for o in outcomes))
     groups: dict[tuple[str, str], list[FaultOutcome]] = {}
     for o in outcomes:

@@ -1,10 +1,9 @@
-"""Measured recordings of a disc without images: true motion, true cameras, noise on the dots, poses fitted.
+"""Measured recordings of a disc without images: poses fitted to projected dots of a true motion, with noise.
 
-What is planted goes through other formulas than those of the diagnosis: cameras, table and dots through the renderer's
-`faults`, clocks through the instants at which the motion is simulated, exposures through a mean over instants. The rig
-that the trajectory carries differs from the true one by an error drawn from its covariance. A laboratory's residual
-lens field is a sum of waves as in the renderer's; glare moves each dot in its own way; the board that the table was
-taken from was bowed.
+Planted effects use other formulas than the diagnosis: cameras, table and dots those of the renderer's `faults`; clocks
+change the instants of the simulation; exposures are a mean over instants. The rig of the trajectory differs from the
+true one by an error drawn from its covariance. The residual lens field of a laboratory is a sum of waves, as in the
+renderer; glare displaces each dot independently; the table is determined from a bowed board.
 """
 
 from collections.abc import Callable
@@ -29,26 +28,26 @@ from disctrack.track.pose import DotsInFrames, fit_poses
 from disctrack.track.refine.assembly import Taken, status_of, trajectory_of
 from disctrack.trajectory import Trajectory
 
-Motion = Callable[[Array], Array]  # instants (k,) [s] -> coordinates q (k, 6)
+Motion = Callable[[Array], Array]  # times (k,) [s] -> coordinates q (k, 6)
 
-SIGMA_PX = 0.006  # of a dot's centre: 0.5 um and 1.3 mdeg per pose, as in the reference recordings
+SIGMA_PX = 0.006  # of the centre of a dot: 0.5 um and 1.3 mdeg per pose, as in the reference recordings
 CORNER_SIGMA_PX = 0.01
-STATION = 0.002  # [s] after the motion's first instant at which the first frame is taken
+STATION = 0.002  # [s] time of the first frame after the start of the motion
 
 
 @dataclass(frozen=True)
 class Laboratory:
-    """What is wrong with every laboratory; all off by default."""
+    """Usual errors of a laboratory; all off by default."""
 
     lens_px: float = 0.0  # rms of each camera's smooth residual field, per coordinate
-    glare_px: float = 0.0  # rms of a field of its own for each dot and camera
-    print_m: float = 0.0  # rms of the dots' places, per coordinate
-    board_bow_m: float = 0.0  # height of the table in the calibrated axes is off by about this ...
-    board_tilt: float = 0.0  # ... and its plane is turned by about this [rad]
+    glare_px: float = 0.0  # rms of an independent field for each dot and camera
+    print_m: float = 0.0  # rms error of the dots' positions, per coordinate
+    board_bow_m: float = 0.0  # standard deviation of the height of the table in the calibrated axes ...
+    board_tilt: float = 0.0  # ... and of its tilt about x and y [rad]
     board_scale: float = 0.0  # relative error of the squares
 
 
-# A lens with 0.02 px, a board bowed by 60 um with squares 0.02 % too long, a printer, glare and gradients of light.
+# Lens of 0.02 px, board with a bow of 60 um and squares 0.02 % too long, printer, glare and gradients of light.
 ORDINARY = Laboratory(0.02, 0.004, 3e-6, 40e-6, 1.2e-4, 1e-4)
 
 
@@ -63,7 +62,7 @@ def rig_covariance(rig: StereoRig, scene: Scene) -> Array:
         arm = corners @ R.T
         _, by_point, by_rig = rig.project_with_jacobians(arm + t)
         by_pose = np.concatenate([by_point, np.cross(arm[:, None], by_point)], axis=-1)
-        by_pose = by_pose if number else 0.0 * by_pose  # of the first view the pose is known
+        by_pose = by_pose if number else 0.0 * by_pose  # the pose of the first view is known
         rows.append(np.concatenate([by_pose, by_rig, np.zeros_like(by_rig[..., :1])], axis=-1).reshape(-1, N_RIG + 7))
     return CORNER_SIGMA_PX**2 * normal_of_rows(np.stack(rows), 6).covariances()[0]
 
@@ -76,18 +75,18 @@ def measured(
     sigma_px: float = SIGMA_PX,
     noise_seed: int | None = None,
 ) -> Trajectory:
-    """Trajectory of the disc of a scene that rolls down, begun at random psi and phi; it does not tell of the faults.
+    """Trajectory of the disc of a scene, with random initial psi and phi, as measured without knowledge of the faults.
 
-    motion : in place of the rolling model's
-    noise_seed : of the motion's start and the noise; the scene's is then that of the errors of calibration and
-        laboratory alone, equal for recordings of one day
+    motion : by default that of the rolling model
+    noise_seed : of initial angles and noise; errors of calibration and laboratory then depend on the seed of the scene
+        only, so that recordings of one day share them
     """
     rng = np.random.default_rng([20261121, scene.seed if noise_seed is None else noise_seed])
     of_rig = rng if noise_seed is None else np.random.default_rng([20261122, scene.seed])
     n, declared_rate = scene.cameras.n_frames, scene.cameras.frame_rate_hz
     believed_rig = rig_of(scene)
     covariance = rig_covariance(believed_rig, scene)
-    # drawn as correlations: k3 has a sigma of 100, a rotation one of 1e-4, and rounding must not mix them
+    # drawn from the correlations: k3 has a sigma of 100, a rotation of 1e-4, and rounding errors must not mix them
     sigma = np.sqrt(np.diag(covariance))
     error = sigma * of_rig.multivariate_normal(np.zeros(N_RIG), covariance / np.outer(sigma, sigma), method="eigh")
     scene = _in_the_laboratory(scene, laboratory, of_rig)
@@ -109,20 +108,20 @@ def measured(
     seen = DotsInFrames(believed_rig, declared, pixels, dots, rotation_from_euler(*q[:, 3:].T), q[:, :3])
     fits = fit_poses(seen, reject_outliers=False)
     taken = Taken(range(n), declared_rate, scene.gravity_m_s2)
-    good = np.zeros(pixels.shape[:-1], np.uint8)  # the status of frames, and of their dots
+    good = np.zeros(pixels.shape[:-1], np.uint8)  # status of frames and dots
     found = trajectory_of(seen, fits, np.zeros((n, 6, 6)), status_of(good[:, 0, 0], fits), good, taken)
-    # of a bowed board the rim tells the tracking by how much the table is another
+    # with a bowed board, tracking determines the displacement of the table from the rim
     return replace(found, table_moved=(laboratory.board_bow_m, laboratory.board_tilt, laboratory.board_tilt))
 
 
 def _in_the_laboratory(scene: Scene, lab: Laboratory, rng: np.random.Generator) -> Scene:
-    """The scene with errors of the board and of the dots' places among its faults."""
+    """The scene with errors of the board and of the positions of the dots as faults."""
     if lab == Laboratory():
         return scene
     height, scale, x, y = rng.standard_normal(4)
     f, tilt = scene.faults, np.degrees(lab.board_tilt)
     pattern_scale = f.pattern_scale + lab.board_scale * scale
-    # the error of a print is that of the dot itself, whatever the pattern is scaled by
+    # misprints are errors of the final position: the scale of the pattern is divided out
     prints = 1e3 * lab.print_m * rng.standard_normal((scene.declared_disc.n_markers, 2)) / pattern_scale
     faults = replace(
         f,
@@ -135,7 +134,7 @@ def _in_the_laboratory(scene: Scene, lab: Laboratory, rng: np.random.Generator) 
 
 
 def _shifted_dots(rng: np.random.Generator, pixels: Array, size: tuple[int, int], laboratory: Laboratory) -> Array:
-    """Centres (n, 2, m, 2) as such a laboratory finds them."""
+    """Centres (n, 2, m, 2) with the errors of lens and glare."""
     found = pixels.copy()
     for camera in range(2):
         found[:, camera] += smooth_field(rng, size, laboratory.lens_px)(pixels[:, camera])
@@ -146,13 +145,13 @@ def _shifted_dots(rng: np.random.Generator, pixels: Array, size: tuple[int, int]
 
 def _rolling(scene: Scene, psi: float, phi: float) -> Motion:
     model, start = rolling_model(scene), rolling_start(scene).moved(psi=psi, phi=phi)
-    return lambda times: simulate(model, start, times=np.r_[0.0, times] - STATION).q[1:]  # laws count from that frame
+    return lambda times: simulate(model, start, times=np.r_[0.0, times] - STATION).q[1:]  # t = 0 at first frame
 
 
 def _exposed(motion: Motion, times: Array, faults: Faults, rig: StereoRig, disc: Disc) -> Array:
     """Images of the dots (n, 2, m, 2), averaged over the exposure."""
     exposure, share = faults.exposure_s, faults.ellipse_centre_share
-    # exact to the seventh power of time
+    # exact for polynomials of degree seven in time
     nodes, weights = np.polynomial.legendre.leggauss(4) if exposure else (np.zeros(1), np.array([2.0]))
     images = 0.0
     for node, weight in zip(nodes, weights, strict=True):

@@ -1,8 +1,7 @@
-"""Recordings that are rendered, measured and compared with their truth: each with its own rig and chessboards.
+"""Rendered recordings, measured and compared with their truth, each with its own rig and chessboards.
 
-A case is a scene with the name of what it shows; whatever it plants (faults, imperfections, light) is in all of its
-images. The recording is a folder like any other and passes through the readers, the calibration and the tracking as the
-user's would. Only the truth and the reported numbers enter a comparison.
+A case is a named scene, with its faults, imperfections and light in all images. Reading, calibration and tracking of
+the recording are those of any user's recording. A comparison uses only the truth and the reported numbers.
 """
 
 import tempfile
@@ -32,19 +31,19 @@ STATIC = "static poses"
 ROLLING = "rolling at 8 to 12 deg"
 FINAL = "rolling to rest at 0.5 deg"
 IMPERFECT = "rolling in an imperfect laboratory"
-EXPOSURE = 0.5e-3  # [s] half the time between frames: rolling at 10 deg smears the outer dots over 0.6 px
-# With the friction coefficient k_m of Ma et al. 2014, equation (5.3), alone the disc comes to rest by
-TO_REST = (7.93, 1.5)  # (5.11): theta [deg] this time [s] before the end, and theta goes as time^(2/3)
-# Nutation [deg]: the error of psi and phi goes as 1/sin(theta), so the strata are about even in log(theta).
+EXPOSURE = 0.5e-3  # [s] half the time between frames: rolling at 10 deg blurs the outer dots over 0.6 px
+# With the friction coefficient k_m of Ma et al. 2014, equation (5.3), alone the disc comes to rest according to
+TO_REST = (7.93, 1.5)  # (5.11): theta [deg] this time [s] before the end; theta is proportional to time^(2/3)
+# Nutation [deg]: the error of psi and phi is proportional to 1/sin(theta), so strata are about equal in log(theta).
 STRATA_DEG = ((0.5, 1.0), (1.0, 2.0), (2.0, 5.0), (5.0, 10.0), (10.0, 20.0), (20.0, 40.0), (40.0, 60.0), (60.0, 85.0))
-FIELD_RADIUS = 25e-3  # [m] of the disc's centre about the middle of the field, where the dots stay in both images
-BORDER_PX = 14  # a dot's window needs some pixels around it
-SMALLEST_SEMI_MINOR_PX = 3.2  # a dot seen flatter than this is all edge: its blurred middle shows no black
+FIELD_RADIUS = 25e-3  # [m] largest distance of the disc from the middle of the field, with all dots in both images
+BORDER_PX = 14  # for the window around a dot
+SMALLEST_SEMI_MINOR_PX = 3.2  # below, the blurred centre of a dot is not black
 
 
 @dataclass(frozen=True)
 class RenderedOutcome:
-    """What one recording showed, measured through its own calibration and through the true cameras."""
+    """Errors of one recording, measured with its own calibration and with the true cameras."""
 
     name: str
     seed: int
@@ -52,17 +51,17 @@ class RenderedOutcome:
     own: PoseErrors
     true: PoseErrors
     cameras: NDArray[np.int64]  # (n,) that see the upper face
-    systematic_px: tuple[float, float]  # of each camera, that repeats from frame to frame
+    systematic_px: tuple[float, float]  # of each camera, common to all frames
     warnings: tuple[str, ...]
 
     @property
     def seen_by_both(self) -> tuple[PoseErrors, PoseErrors]:
-        """Through the own calibration and through the true cameras, where both see the face."""
+        """Errors with the own calibration and with the true cameras, of poses in which both cameras see the face."""
         return self.own.part(self.cameras == 2), self.true.part(self.cameras == 2)
 
 
 def scene_of(seed: int, quick: bool = False) -> Scene:
-    """The scene of one recording: the paper's format; quick: a quarter of the pixels and fewer chessboard views."""
+    """The scene of one recording in the paper's format; quick: a quarter of the pixels and fewer chessboard views."""
     scene = Scene(name=f"validation {seed}", seed=seed)
     if not quick:
         return scene
@@ -75,7 +74,7 @@ def scene_of(seed: int, quick: bool = False) -> Scene:
 
 
 def rendered_cases(n: int | None, seed: int, quick: bool = False, imperfect: bool = False) -> list[Scene]:
-    """Of n sets of recordings (None: as many as it takes), seeds counting up; quick: small images, few of everything.
+    """Scenes of n sets of recordings (None: enough) with consecutive seeds; quick: small images, few frames.
 
     A set has one recording of an imperfect laboratory, or three of an ideal one.
     """
@@ -83,14 +82,14 @@ def rendered_cases(n: int | None, seed: int, quick: bool = False, imperfect: boo
     scenes = [scene_of(seed + k, quick) for k in range(n)]
     if imperfect:
         return [imperfect_case(scene, 60 if quick else 200) for scene in scenes]
-    # static poses, frames of either stretch of rolling: shared out, but at least a dozen of each in a recording
+    # static poses and frames of each rolling recording: distributed over the sets, with at least a dozen in each
     totals = (40, 24) if quick else (96, 90)
     counts = [max(12, -(-total // n)) for total in totals]
     return [case for scene in scenes for case in ideal_cases(scene, *counts)]
 
 
 def ideal_cases(scene: Scene, n_static: int, n_rolling: int) -> list[Scene]:
-    """Static poses of every attitude, and two recordings of rolling."""
+    """Static poses of all attitudes, and two rolling recordings."""
     rng = np.random.default_rng([scene.seed, 8])
     q = static_poses(n_static, scene, rng)
     start = rng.uniform(8, 12)
@@ -104,14 +103,14 @@ def ideal_cases(scene: Scene, n_static: int, n_rolling: int) -> list[Scene]:
 
 
 def at_rest(scene: Scene, q: Array) -> Scene:
-    """The scene with poses q (n, 6) at rest, a frame each."""
+    """The scene with static poses q (n, 6), one frame each."""
     rows = (q * np.r_[np.full(3, 1e3), np.full(3, 180 / np.pi)]).tolist()
     poses = tuple((x, y, z, psi, theta, phi) for x, y, z, psi, theta, phi in rows)
     return replace(scene, name=STATIC, motion=replace(scene.motion, kind="static", poses=poses))
 
 
 def imperfect_case(scene: Scene, frames: int) -> Scene:
-    """Rolling in a laboratory with what every one has and nobody declares; every second board is bowed downwards."""
+    """Rolling in a laboratory with the usual imperfections; every second board is bowed downwards."""
     rng = np.random.default_rng([scene.seed, 11])
     width, height = scene.cameras.image_size
     spots = tuple(
@@ -136,7 +135,7 @@ def imperfect_case(scene: Scene, frames: int) -> Scene:
 
 
 def rolling_scene(scene: Scene, name: str, theta_deg: float, n: int, rng: np.random.Generator) -> Scene:
-    """The scene with n frames of rolling from `theta_deg` on, starting at random psi and phi."""
+    """The scene with n frames of rolling from nutation `theta_deg` and random psi and phi."""
     x, y = scene.rig.target_mm[:2]
     start = replace(
         scene.motion.rolling,
@@ -144,7 +143,7 @@ def rolling_scene(scene: Scene, name: str, theta_deg: float, n: int, rng: np.ran
         psi_deg=rng.uniform(-180, 180),
         phi_deg=rng.uniform(-180, 180),
         centre_mm=(x, y),
-        effects={"km": {}},  # as large as it is published
+        effects={"km": {}},  # with the published coefficient
     )
     return replace(
         scene,
@@ -155,7 +154,7 @@ def rolling_scene(scene: Scene, name: str, theta_deg: float, n: int, rng: np.ran
 
 
 def render_and_measure(scene: Scene) -> RenderedOutcome:
-    """Render the recording, calibrate from its own chessboards, measure it twice; nothing is left on the disk."""
+    """Render the recording, calibrate with its own chessboards, measure it twice; all files are removed."""
     with tempfile.TemporaryDirectory(prefix="disctrack-validate-") as folder:
         truth = render(Path(folder) / "recording", scene)
         recording = read_recording(Path(folder) / "recording")
@@ -176,7 +175,7 @@ def render_and_measure(scene: Scene) -> RenderedOutcome:
 
 
 def render(folder: Path, scene: Scene) -> Truth:
-    """Write a recording; a pair without images follows each pose at rest, so that each is found without a prior."""
+    """Write a recording; an empty pair follows each static pose, so that it is found without a prediction."""
     truth = write_recording(folder, scene)
     if scene.motion.kind == "static":
         for camera in CAMERAS:
@@ -187,16 +186,16 @@ def render(folder: Path, scene: Scene) -> Truth:
 
 
 def locate(recording: Recording, rig: StereoRig) -> Measurement:
-    """The disc in all pairs, through these cameras."""
+    """Measure the disc in all pairs with these cameras."""
     pairs = open_pairs(recording)
     return track(pairs.reading({}), Taken(range(len(pairs)), recording.frame_rate), rig, recording.disc)
 
 
 def static_poses(n: int, scene: Scene, rng: np.random.Generator) -> Array:
-    """(n, 6) poses q on the table, by increasing nutation: strata in turn, all psi and phi, anywhere in the field.
+    """(n, 6) poses q on the table in order of nutation, evenly from all strata, with random psi, phi and position.
 
-    Places where a dot would leave an image are drawn again; at large nutation the disc looks away from the cameras for
-    half of all psi, and such poses stay in. Raises SceneError where the field has no room for the disc.
+    Positions with a dot outside an image are drawn again. At large nutation the disc faces away from the cameras for
+    half of all psi; such poses are included. Raises SceneError if the disc does not fit into the field.
     """
     rig, disc, middle = rig_of(scene), scene.declared_disc, 1e-3 * np.array(scene.rig.target_mm[:2])
     poses = [_pose(np.radians(STRATA_DEG[i % len(STRATA_DEG)]), rig, disc, middle, rng) for i in range(n)]
@@ -207,7 +206,7 @@ def _pose(stratum: Array, rig: StereoRig, disc: Disc, middle: Array, rng: np.ran
     for attempt in range(400):
         psi, phi, direction = rng.uniform(-np.pi, np.pi, 3)
         theta = np.exp(rng.uniform(*np.log(stratum)))
-        # the field shrinks slowly, for small images and long strides of the rim
+        # the field shrinks slowly with the attempts, for small images and large nutation
         reach = FIELD_RADIUS * np.sqrt(rng.uniform()) * (1 - attempt / 500)
         x, y = middle + reach * np.array([np.cos(direction), np.sin(direction)])
         q = np.array([x, y, disc.resting_height(theta), psi, theta, phi])
@@ -226,10 +225,10 @@ def _inside(q: Array, rig: StereoRig, disc: Disc) -> bool:
 
 
 def cameras_in_sight(q: Array, rig: StereoRig, disc: Disc) -> NDArray[np.int64]:
-    """(n,) cameras that see enough dots for a pose of their own, 2, 1 or 0, in the poses q (n, 6).
+    """(n,) number of cameras that see enough dots for a pose, 0 to 2, in the poses q (n, 6).
 
-    The upper face must be turned to the camera, and a dot's image, an ellipse of semi-minor axis
-    f R cos(gamma) / distance, must not be flatter than SMALLEST_SEMI_MINOR_PX.
+    The upper face must face the camera. The image of a dot is an ellipse whose semi-minor axis
+    f R cos(gamma) / distance must be above SMALLEST_SEMI_MINOR_PX.
     """
     R = rotation_from_euler(*q[:, 3:].T)
     dots = disc.marker_centres_body @ np.swapaxes(R, 1, 2) + q[:, None, :3]

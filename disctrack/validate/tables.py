@@ -1,4 +1,4 @@
-"""What a validation hands over, and its one writer: Markdown for people, JSON for programs, a section of a page."""
+"""The result of a validation, and its output as Markdown, as JSON and as a section of a page."""
 
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -21,9 +21,9 @@ Outcome = TypeVar("Outcome")
 
 
 def table(title: str, head: Sequence[str], rows: Iterable[Sequence[object]], note: str = "", form: str = ".3g") -> str:
-    """Rows of text and numbers below a head as Markdown, with a title above and a note below.
+    """Markdown table of text and numbers with a title above and a note below.
 
-    form : of numbers that are not whole; a dash stands where there is none
+    form : format of floats; a dash replaces those that are not finite
     """
 
     def text(cell: object) -> str:
@@ -38,17 +38,17 @@ def table(title: str, head: Sequence[str], rows: Iterable[Sequence[object]], not
 
 @dataclass(frozen=True)
 class Validation:
-    """What was planted, measured and compared, summed up."""
+    """Summary of planted, measured and compared cases."""
 
     name: str
     headline: str
-    tables: Sequence[str]  # as `table` makes them
-    outcomes: Sequence[object]  # one for each case, or sums over them
-    complaints: Sequence[str] = ()  # what a validation must not show
-    remarks: Sequence[str] = ()  # what a reader should look at
+    tables: Sequence[str]  # from `table`
+    outcomes: Sequence[object]  # one per case, or summaries
+    complaints: Sequence[str] = ()  # failures
+    remarks: Sequence[str] = ()  # for the attention of the reader
 
     def markdown(self) -> str:
-        """The headline, what is wrong, and all tables."""
+        """The headline, failures, remarks and all tables."""
         lists = ["\n".join(f"- {line}" for line in lines) + "\n" for lines in (self.complaints, self.remarks) if lines]
         return "\n".join([f"{self.headline}\n", *lists, *self.tables])
 
@@ -56,7 +56,7 @@ class Validation:
 def measure_all(
     measure: Callable[[Case], Outcome], cases: Sequence[Case], processes: int, say: Callable[[str], object]
 ) -> list[Outcome]:
-    """Outcomes in the order of the cases; `say` is told how far it is and since when."""
+    """Outcomes in the order of the cases; `say` gets messages on the progress."""
     began, outcomes = perf_counter(), []
     with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
         for outcome in map(measure, cases) if processes == 1 else pool.map(measure, cases):
@@ -77,7 +77,7 @@ def write_validation(folder: Path, validation: Validation) -> list[Path]:
 
 
 def write_into(page: Path, validation: Validation, command: str) -> None:
-    """Put the tables, with date, version and command, between the page's marks of this validation, or at its end."""
+    """Write the tables, with date, version and command, between the page's marks of this validation, or at its end."""
     begin, end = f"<!-- validation: {validation.name} -->", f"<!-- end of {validation.name} -->"
     text = page.read_text(encoding="utf-8") if page.exists() else ""
     before, begun, rest = text.partition(begin)
