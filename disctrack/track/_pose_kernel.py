@@ -67,9 +67,9 @@ def _copy(out, values):
 
 @_part
 def _evaluate(observed, covariance, used, cameras, centres, reach, R, t, filled, sums):
-    """Fill pixels (2, m, 2), whitened residuals and Jacobian (2, m, 2, 6), zeros for dots not used; returns their cost.
+    """Fill pixels (2, m, 2), whitened residuals and Jacobian (2, m, 2, 6), zeros for dots not used; returns the cost.
 
-    sums (7, 6): J^T J, and J^T r as the last row. A dot that is farther away than `reach` [px] has Huber's weight.
+    sums (7, 6): J^T J, and J^T r as the last row. A dot with a residual above `reach` [px] has Huber's weight.
     """
     (pixels, residual, jacobian), (intrinsics, R_cw, t_cw) = filled, cameras
     J, row = np.empty((2, 3)), np.empty((2, 6))
@@ -79,7 +79,7 @@ def _evaluate(observed, covariance, used, cameras, centres, reach, R, t, filled,
         for m in range(centres.shape[0]):
             u, v = _dot_by_pose(intrinsics[c], R_cw[c], t_cw[c], centres[m], R, t, J, row)
             pixels[c, m, 0], pixels[c, m, 1] = u, v
-            # W with W C W^T = 1, as `pose.whitening` has it; no weight where C is not a covariance
+            # W with W C W^T = 1, as in `pose.whitening`; zero weight if C is not a covariance
             a, b = covariance[c, m, 0, 0], covariance[c, m, 0, 1]
             remaining = covariance[c, m, 1, 1] - b * b / a
             good = used[c, m] and a > 0.0 and 0.0 < remaining < np.inf
@@ -109,7 +109,7 @@ def _evaluate(observed, covariance, used, cameras, centres, reach, R, t, filled,
 
 @_part
 def fit_pose(observed, covariance, used, cameras, centres, tolerance, reach, R, t, filled):
-    """As `fit`, of one frame; returns whether it converged. Dots farther away than `reach` [px] pull no harder."""
+    """As `fit`, for one frame; returns whether it converged. Beyond `reach` [px] the cost is linear (Huber)."""
     sums, trial_sums, damped, step = np.empty((7, 6)), np.empty((7, 6)), np.empty((6, 6)), np.zeros(6)
     R_trial, t_trial = np.empty((3, 3)), np.empty(3)
     cost, damping, solved, small = np.inf, 1e-7, True, False
@@ -132,7 +132,7 @@ def fit_pose(observed, covariance, used, cameras, centres, tolerance, reach, R, 
         for i in range(6):
             step[i] = sums[6, i]
             damped[i, i] += damping * damped[i, i]
-            if damped[i, i] <= 1e-300:  # a parameter that no datum sees stays where it is
+            if damped[i, i] <= 1e-300:  # a parameter that no dot depends on is kept
                 damped[i, i] = 1.0
         solved = solve_in_place(damped, step)
         length2 = 0.0
@@ -146,14 +146,14 @@ def fit_pose(observed, covariance, used, cameras, centres, tolerance, reach, R, 
 
 @_entry
 def fit(rows, observed, covariance, used, cameras, centres, tolerance, R, t, converged, filled):
-    """Fit the poses of some rows (k,) of n frames, from R (n, 3, 3), t (n, 3) on, which are moved to the minimum.
+    """Fit the poses of some rows (k,) of n frames; R (n, 3, 3), t (n, 3) are the initial guess, and are updated.
 
-    observed (n, 2, m, 2), covariance (n, 2, m, 2, 2), used (n, 2, m); cameras as `pose.stacked` has them. Marquardt
-    1963, with Nielsen-like damping; a pose has converged when its Gauss-Newton step is shorter than `tolerance`
-    standard deviations of its own parameters, sqrt(step^T J^T J step); a negative tolerance leaves it where it is.
-    Filled: converged (n,), and of the last pose tried, which is the pose where it converged, pixels (n, 2, m, 2) of all
-    dots, NaN behind a camera; residuals (n, 2, m, 2), observed - pixels, and jacobian (n, 2, m, 2, 6), both whitened,
-    with zeros for dots that are not used.
+    observed (n, 2, m, 2), covariance (n, 2, m, 2, 2), used (n, 2, m); cameras as from `pose.stacked`. Marquardt 1963,
+    with Nielsen-like damping. A pose has converged when its Gauss-Newton step is shorter than `tolerance` standard
+    deviations of its parameters, sqrt(step^T J^T J step); with a negative tolerance the model is only evaluated.
+    Filled: converged (n,), and for the last pose tried (the solution if converged) pixels (n, 2, m, 2) of all dots, NaN
+    behind a camera; residuals (n, 2, m, 2), observed - pixels, and jacobian (n, 2, m, 2, 6), both whitened, with zeros
+    for dots that are not used.
     """
     pixels, residuals, jacobian = filled
     for f in rows:

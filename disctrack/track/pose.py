@@ -1,7 +1,7 @@
 """Pose of the disc from the dots seen by two cameras: Levenberg-Marquardt on position and rotation.
 
-The unknowns are a translation and a rotation vector in world axes that multiplies from the left, so that nothing is
-singular at theta = 0; psi, theta, phi follow at the border (`frames.euler_from_rotation`).
+The unknowns are a translation and a rotation vector in world axes, applied from the left, so that theta = 0 is not
+singular; psi, theta, phi are computed from the result (`frames.euler_from_rotation`).
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from calibration.kit.least_squares import normal_of_rows
 from disctrack.disc import Disc
 from disctrack.track import _pose_kernel as kernel
 
-MIN_DOTS = 3  # six unknowns, two numbers per dot
-# A dot is refused when chi-square falls without it by more than twice this, times what is usual for the other dots:
-# chance alone does it once in 3e5 dots.
+MIN_DOTS = 3  # six unknowns, two coordinates per dot
+# A dot is an outlier if chi-square decreases without it by more than twice this, times the reduced chi-square of the
+# other dots: by chance once in 3e5 dots.
 OUTLIER_CHI_SQUARE = 25.0
 TOLERANCE = 1e-3  # standard deviations: the Gauss-Newton step at which a pose has converged
 
 
 @dataclass(frozen=True)
 class PoseFits:
-    """Poses of n frames with what is needed to judge them."""
+    """Poses of n frames, with covariances and residuals."""
 
     R_world_body: Array  # (n, 3, 3); NaN where there is no pose
     t_world_body: Array  # (n, 3) [m]
@@ -40,15 +40,16 @@ class PoseFits:
 
     @property
     def reduced_chi_square(self) -> Array:
-        """(n,) chi-square per degree of freedom; NaN where nothing is left over."""
+        """(n,) chi-square per degree of freedom; NaN if there is none."""
         return np.where(self.degrees_of_freedom > 0, self.chi_square / np.maximum(self.degrees_of_freedom, 1), np.nan)
 
 
 @dataclass(frozen=True)
 class DotsInFrames:
-    """Dots seen in n frames, poses right within a few pixels, and what moves all beside rig and places of the dots.
+    """Dots seen in n frames, and poses to within a few pixels.
 
-    A `shift` (30 + 2m + j,) of what the frames share: RIG_PARAMETERS, the dots' places in body axes, anything else.
+    Methods take a `shift` (30 + 2m + j,) of the shared parameters: RIG_PARAMETERS, positions of the dots in body axes,
+    and j further ones.
     """
 
     rig: StereoRig
@@ -57,7 +58,7 @@ class DotsInFrames:
     covariance: Array  # (n, 2, m, 2, 2) [px^2]
     R: Array  # (n, 3, 3); NaN where there is no pose
     t: Array  # (n, 3) [m]
-    further: Array | None = None  # (n, 2, m, 2, j) derivatives of the pixels by anything else
+    further: Array | None = None  # (n, 2, m, 2, j) derivatives of the pixels by the further parameters
 
     @property
     def posed(self) -> Mask:
@@ -70,7 +71,7 @@ class DotsInFrames:
         return replace(self, **parts)
 
     def shifted(self, shift: Array) -> DotsInFrames:
-        """The pixels without what else moved them, rig and dots' places after the shift."""
+        """Rig and positions of the dots after the shift, and pixels without the effect of the further parameters."""
         places = slice(N_RIG, N_RIG + 2 * self.disc.n_markers)
         moved = np.column_stack([shift[places].reshape(-1, 2), np.zeros(self.disc.n_markers)])
         pixels = self.pixels if self.further is None else self.pixels - self.further @ shift[places.stop :]
@@ -78,17 +79,16 @@ class DotsInFrames:
         return replace(self, rig=self.rig.perturbed(shift[:N_RIG]), disc=disc, pixels=pixels)
 
     def fitted(self, shift: Array, reject: bool) -> tuple[DotsInFrames, PoseFits]:
-        """The frames with the poses that go with the shift; where a fit fails, the pose before."""
+        """The frames with poses fitted after the shift; if a fit fails, the pose is kept."""
         fits = fit_poses(self.shifted(shift), reject_outliers=reject, with_sensitivity=False)
         ok = fits.converged
         R = np.where(ok[:, None, None], fits.R_world_body, self.R)
         return replace(self, R=R, t=np.where(ok[:, None], fits.t_world_body, self.t)), fits
 
     def normal(self, shift: Array, used: Mask, free: Mask) -> tuple[Array, Array, float]:
-        """Normal matrix (k, k) and gradient (k,) of the free ones of what is shared, every frame's pose eliminated.
+        """Normal matrix (k, k) and gradient (k,) of the free shared parameters, with the poses eliminated; chi-square.
 
-        used : (n, 2, m) dots that count; free : (30 + 2m + j,)
-        And chi-square, by which the decrease that a shared number explains can be judged.
+        used : (n, 2, m) dots that are included; free : (30 + 2m + j,)
         """
         moved = self.shifted(shift)
         arm, W = moved.disc.marker_centres_body @ np.swapaxes(self.R, 1, 2), whitening(self.covariance)
@@ -97,7 +97,7 @@ class DotsInFrames:
         by_pose = W @ np.concatenate([by_point, by_turning(by_point, arm[:, None])], axis=-1)
         by_shared = np.zeros((*projected.shape, len(free)))
         by_shared[..., :N_RIG] = W @ by_rig
-        # a step of a dot on the body moves its image as the same step of the body, turned into the body's axes
+        # displacing a dot on the body moves its image as displacing the body does, in body axes
         by_place = by_pose[..., :3] @ self.R[:, None, None, :, :2]
         for k in range(self.disc.n_markers):
             by_shared[:, :, k, :, N_RIG + 2 * k : N_RIG + 2 * k + 2] = by_place[:, :, k]
@@ -123,19 +123,19 @@ def marker_pixels(R: Array, t: Array, rig: StereoRig, centres_body: Array) -> tu
 
 
 def dots_at(R: Array, t: Array, rig: StereoRig, disc: Disc) -> tuple[Array, Array]:
-    """Images of a disc's dots (n, 2, m, 2), and maps (n, 2, m, 2, 2) [px/m] from its plane to the image there."""
+    """Images of a disc's dots (n, 2, m, 2), and affine maps (n, 2, m, 2, 2) [px/m] from its plane to the image."""
     pixels, J = marker_pixels(R, t, rig, disc.marker_centres_body)
-    return pixels, J[..., :3] @ R[:, None, None, :, :2]  # a step in the plane moves a dot as it moves the disc
+    return pixels, J[..., :3] @ R[:, None, None, :, :2]  # displacing a dot moves its image as displacing the disc does
 
 
 def stacked(rig: StereoRig) -> tuple[Array, Array, Array]:
-    """Of the cameras: INTRINSIC_PARAMETERS (2, 9), R_camera_world (2, 3, 3), t_camera_world (2, 3)."""
+    """INTRINSIC_PARAMETERS (2, 9), R_camera_world (2, 3, 3), t_camera_world (2, 3) of the cameras."""
     R, t = zip(*rig.camera_poses(), strict=True)
     return np.stack([camera.parameters for camera in rig.cameras]), np.stack(R), np.stack(t)
 
 
 def whitening(covariance: Array) -> Array:
-    """W (..., 2, 2) with W C W^T = 1 for covariances C (..., 2, 2); zeros where C is not a covariance."""
+    """W (..., 2, 2) with W C W^T = 1 for covariances C (..., 2, 2); zeros if C is not a covariance."""
     a, b, c = covariance[..., 0, 0], covariance[..., 0, 1], covariance[..., 1, 1]
     with np.errstate(invalid="ignore", divide="ignore"):
         l11, l22 = np.sqrt(a), np.sqrt(c - b * b / a)
@@ -145,10 +145,10 @@ def whitening(covariance: Array) -> Array:
 
 
 def fit_poses(seen: DotsInFrames, *, reject_outliers: bool = True, with_sensitivity: bool = True) -> PoseFits:
-    """Fit the poses of n frames at once, from those on that they have.
+    """Fit the poses of n frames at once, with the poses in `seen` as initial guess.
 
-    A frame with fewer than three dot images, or without a start, is NaN. One camera alone is enough for a pose; its
-    covariance tells how much worse it is. `seen.further` is not looked at.
+    A frame with fewer than three dot images, or without an initial guess, is NaN. One camera alone determines a pose,
+    with a larger covariance. `seen.further` is not used.
     """
     n, rig = len(seen.t), seen.rig
     there = np.asarray(np.isfinite(seen.pixels).all(-1))
@@ -192,13 +192,13 @@ def fit_poses(seen: DotsInFrames, *, reject_outliers: bool = True, with_sensitiv
 
 
 def _strike_worst_dot(residual: Array, JW: Array, used: Mask, rows: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Strike the worst outlier of each of the rows from `used`; returns the rows that must be fitted again.
+    """Remove the worst outlier of each of the rows from `used`; returns the rows that must be fitted again.
 
     residual (n, 2, m, 2), JW (n, 2, m, 2, 6): whitened, zeros for dots that are not used
     """
     count = used[rows].sum((1, 2))
     chi_square = np.sum(residual[rows] ** 2, axis=(1, 2, 3))
-    # a dot's part is at most the whole: of other frames none can be an outlier
+    # the decrease by one dot is at most chi-square itself: no other frame can have an outlier
     far = np.flatnonzero((chi_square > 2 * OUTLIER_CHI_SQUARE) & (count > MIN_DOTS + 1))
     if not len(far):
         return rows[far]
@@ -208,14 +208,14 @@ def _strike_worst_dot(residual: Array, JW: Array, used: Mask, rows: NDArray[np.i
     possible = np.linalg.cond(normal) < 1e16
     inverse = np.linalg.inv(np.where(possible[:, None, None], normal, np.eye(6)))
     leverage = JW @ inverse[:, None] @ np.swapaxes(JW, 2, 3)
-    # by what chi-square falls without the dot: its residual, freed of its own pull on the pose (two numbers)
+    # decrease of chi-square without the dot: r^T (1 - leverage)^-1 r
     left_out = np.eye(2) - leverage
-    left_out[np.linalg.det(left_out) < 1e-9] = 1e300 * np.eye(2)  # nothing but this dot fixes the pose there
+    left_out[np.linalg.det(left_out) < 1e-9] = 1e300 * np.eye(2)  # the pose is not determined without this dot
     drop = np.einsum("ndi,ndi->nd", residual, np.linalg.solve(left_out, residual[..., None])[..., 0])
     worst = drop.argmax(axis=1)
     largest = drop[np.arange(len(rows)), worst]
-    # what is usual for the frame's other dots: a rig that is off by a little must not strike good ones, and no pose may
-    # depend on which other frames are in the run
+    # relative to the other dots of the frame: a small error of the rig must not remove good dots, and a pose must not
+    # depend on the other frames in the call
     usual = np.maximum(1.0, (chi_square - largest) / np.maximum(2 * count - 8, 1))
     struck = possible & (largest > 2 * OUTLIER_CHI_SQUARE * usual)
     used.reshape(len(used), -1)[rows[struck], worst[struck]] = False

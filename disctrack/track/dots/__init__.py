@@ -1,1 +1,1 @@
-"""Where the dots are: in one image, and without any prior in two."""
+"""Positions of the dots in one image, and search for the disc in two images without a prior."""

@@ -1,12 +1,12 @@
-"""Compiled inner loops of marker location and tracking (numba); their meaning is told in `dots` and `tracking`.
+"""Compiled inner loops of marker location and tracking (numba), explained in `template` and `following`.
 
-They are compiled because a recording needs about 12 fits of 700 pixels per pair at the camera's own rate of 1000
-pairs/s. What is done per pixel is written so that the compiler makes vector code of it: loops over rows of single
-precision without a branch, in pixels as the unit of length (rounding moves a centre by less than 1e-6 px).
+They are compiled because each pair needs about 12 fits of 700 pixels, at the camera's rate of 1000 pairs/s. Loops over
+pixels are written so that the compiler vectorises them: rows of single precision, no branches, and pixels as the unit
+of length (rounding moves a centre by less than 1e-6 px).
 
-What compiling costs grows with every function and with every level of calls, for each level is optimised anew with all
-that it calls. So there are few of them; whole slices are not assigned (the text of the error that numba prepares for
-unequal shapes takes longer to compile than the loop); and only what Python calls has a way in from Python.
+The compile time grows with every function and every level of calls, as each level is optimised together with all that
+it calls. So there are few functions; slices are not assigned (the error message that numba prepares for unequal shapes
+takes longer to compile than a loop); and only functions that Python calls are Python entry points.
 """
 
 from __future__ import annotations
@@ -25,51 +25,50 @@ from disctrack.trajectory import MarkerStatus
 
 MEASURED, OUTSIDE, LOW_CONTRAST, OCCLUDED, NOT_CONVERGED, BLURRED, _, NOT_LOOKED_FOR = map(int, MarkerStatus)
 
-# Of a dot: pixel of its centre, covariance of that by the image's noise, and what is needed to judge the fit: reduced
-# chi-square of its grey values, in the dot and beside it, and their number; sigma of the edge [px], smear of its motion
-# included; radius [m]; grey value of the paper, and contrast with it, 1 - dark / light; share of the pixels that do not
-# fit.
+# Result of one dot: centre [px] and its covariance by the image noise; reduced chi-square of the grey values, in total,
+# inside and outside the edge; sigma of the edge [px], motion blur included; radius [m]; grey value of the paper, and
+# contrast with it, 1 - dark / light; fraction of clipped pixels; number of pixels.
 _OF_DOT = ("u", "v", "var_u", "var_v", "cov_uv", "chi_square", "inside", "outside", "sigma", "radius", "level")
 DOT = np.dtype([(name, float) for name in (*_OF_DOT, "contrast", "clipped", "n_pixels")])
 
 
 class Limits(NamedTuple):
-    """When a converged fit is refused."""
+    """Limits beyond which a converged fit is refused."""
 
     misfit: float = 6.0  # rms residual over the pixel noise; speckle of real print reaches 3
-    share: float = 0.02  # rms residual over the contrast: a misfit counts only if it exceeds this too
-    clipped: float = 0.15  # part of the pixels that do not fit: an object in front of the dot
-    radius: float = 0.20  # relative departure of the fitted radius
-    blur: float = 3.0  # fitted blur, in typical blurs (plus 1 px): an image smeared beyond use
+    share: float = 0.02  # rms residual over the contrast: a misfit must exceed this, too
+    clipped: float = 0.15  # fraction of clipped pixels: an object in front of the dot
+    radius: float = 0.20  # relative deviation of the fitted radius
+    blur: float = 3.0  # fitted blur in typical blurs (plus 1 px): motion blur beyond use
 
 
-# What is kept of every pixel, (16, n) in single precision; the first eight are the template's parameters, too: of a
-# pixel these rows are derivatives by the parameter, over the pixel's sigma
+# Rows of numbers per pixel, (16, n) in single precision. The first eight are also the parameters of the template; these
+# rows hold the derivatives by the parameters, over the pixel's sigma
 Rows = namedtuple(
     "Rows",
     "a b radius sigma level slope_x slope_y contrast "  # a, b: shift of the centre on the plane
-    "x y offset_x offset_y "  # from the expected centre: place on the plane [px], in the image [10 px]
-    "grey distance residual weight",  # distance from the edge [px]; residual over the pixel's sigma, and one over that
+    "x y offset_x offset_y "  # from the expected centre: position on the plane [px], in the image [10 px]
+    "grey distance residual weight",  # distance from the edge [px]; residual over sigma, and 1 / sigma of the pixel
 )
 ROW = Rows(*range(len(Rows._fields)))
-_PIXELS = 4096 + 64  # of a dot of 60 px; more are made room for. No power of two: rows would share lines of the cache
-_MAX_ITERATIONS = 20  # of a template, and selections of its pixels
-_CONVERGED_PX = 2e-4  # length of the step that would come next: a twentieth of the noise of the best dots
-# The pixels are chosen anew where the centre moved farther: a band that lies unevenly about the edge, by 0.25 to 0.7
-# px, shifts it by 3e-4 to 5e-4 px (dots declared off their places: in all frames alike)
+_PIXELS = 4096 + 64  # for a dot of 60 px; grows if needed. Not a power of two, or rows would share cache lines
+_MAX_ITERATIONS = 20  # of a fit, and of selections of its pixels
+_CONVERGED_PX = 2e-4  # predicted length of the next step: a twentieth of the noise of the best dots
+# Shift of the centre above which the pixels are selected again: a band that is off the edge by 0.25 to 0.7 px shifts
+# the centre by 3e-4 to 5e-4 px (the same in all frames, if dots are declared at wrong positions)
 _SETTLED_PX = 0.2
 _CLIP_SIGMA = 5.0
-# Semi-minor axis in blurs, or in pixels: below, the two long edges melt into one another and what one edge looks like
-# errs by more than the centre's sigma; the whole blurred ellipse is the template then, 10 to 20 times as slow.
+# Semi-minor axis in blurs, or in pixels. Below, the two long edges overlap, and the model of a single edge errs by more
+# than the centre's sigma; the template is then the whole blurred ellipse, 10 to 20 times as slow.
 _MIN_SEMI_MINOR = 4.5
-_RADIUS_PRIOR = 0.1  # relative standard deviation: a blot's size, darkness and blur cannot be told apart
-_NODES = 64  # at most, over the length of an ellipse
-# [rad] farther from the expected attitude a pair is looked at once more: 3e-3 move centres by 4e-4 to 1e-3 px, in every
-# frame alike where the prediction lags
+_RADIUS_PRIOR = 0.1  # relative standard deviation: size, contrast and blur of a small blurred dot are degenerate
+_NODES = 64  # at most, along an ellipse
+# [rad] difference from the expected attitude above which the dots are located again: 3e-3 shifts centres by 4e-4 to
+# 1e-3 px, in every frame alike if the prediction lags
 _ATTITUDE_TOLERANCE = 6e-4
-_FOLLOWED_PX = 0.05  # of a dot that the disc is followed by
+_FOLLOWED_PX = 0.05  # sigma added to a dot while the disc is followed
 
-# numba takes a literal for double precision, and with it all that it touches
+# for numba a literal has double precision, and so has every expression with it
 _f = np.float32
 _0, _1, _2, _HALF, _TINY = _f(0), _f(1), _f(2), _f(0.5), _f(1e-15)
 _LEAST_BEND = _f(-0.3)
@@ -109,7 +108,7 @@ def _plane_gradient(map_x, map_y, P, iu, iv, unit, G):
 
 @_part
 def _edge_distance(dx, dy, radius, g00, g01, g10, g11, det2):
-    """Signed distance [px] of a pixel from the dot's edge (positive outside), with what its derivatives need.
+    """Signed distance [px] of a pixel from the dot's edge (positive outside), with terms for its derivatives.
 
     rho = |(dx, dy)| on the plane, F = rho - radius, g = |grad_u F|. To second order the foot point lies at
     d = F/g (1 + t), t = h F/(2 g^2); inside, 1/(1 - t) has the same order and keeps its sign in slender ellipses.
@@ -126,7 +125,7 @@ def _edge_distance(dx, dy, radius, g00, g01, g10, g11, det2):
     F = rho - radius
     bend = _HALF * along * along * F * inv_rho * inv_g2 * inv_g2
     curvature = det2 * inv_rho * inv_g2 * inv_g
-    shrink = _1 / (_1 - max(bend, _LEAST_BEND))  # the expansion ends well before the dot's own centre, where rho = 0
+    shrink = _1 / (_1 - max(bend, _LEAST_BEND))  # the expansion fails at the dot's centre, where rho = 0
     outside = rho > radius
     factor = _1 + bend if outside else shrink
     slope = _1 + _2 * bend if outside else shrink * shrink
@@ -135,7 +134,7 @@ def _edge_distance(dx, dy, radius, g00, g01, g10, g11, det2):
 
 @_part
 def _edge_profile(z):
-    """Fraction of the dot seen z sigmas outside its edge, and the bell that is minus its slope; both to 5e-7."""
+    """Blurred step z sigmas outside the edge, and the Gaussian that is minus its derivative; both to 5e-7."""
     z2 = min(z * z, _Z2_MAX)
     e = _EXP[0] + z2 * (_EXP[1] + z2 * (_EXP[2] + z2 * (_EXP[3] + z2 * (_EXP[4] + z2 * (_EXP[5] + z2 * _EXP[6])))))
     e *= e
@@ -149,9 +148,9 @@ def _edge_profile(z):
 
 @_part
 def _select_pixels(image, map_x, map_y, P, start, window, rim, centres, own, G, steepest, p, u0, v0, pixels):
-    """Fill the first rows of pixels with those in a band round the edge; returns number, mean grey in and outside.
+    """Select the pixels in a band around the edge; returns their number and the mean grey value inside and outside.
 
-    steepest: the longest step that one pixel can mean on the plane, in radii of the dot.
+    steepest: largest length of a pixel on the plane, in radii of the dot.
     """
     (x_lo, x_hi, y_lo, y_hi), unit = window, start[2]
     band = 3.0 * p[ROW.sigma] + 1.0
@@ -161,9 +160,9 @@ def _select_pixels(image, map_x, map_y, P, start, window, rim, centres, own, G, 
     X0, X1, X2, Y0, Y1, Y2 = P[0, 0], P[0, 1], P[0, 2], P[1, 0], P[1, 1], P[1, 2]
     w0, w1, w2 = unit * P[2, 0], unit * P[2, 1], unit * P[2, 2]
     width = x_hi + 1 - x_lo
-    n = width * (y_hi + 1 - y_lo)  # pixels that are to be chosen from, in the rows of derivatives
+    n = width * (y_hi + 1 - y_lo)  # candidate pixels, stored in the rows of derivatives
     for y in range(y_lo, y_hi + 1):
-        # views, for an index that is a sum might be negative, and is looked at one by one
+        # views: an index that is a sum might be negative, and numba would check every one
         xs, ys, greys = map_x[y, x_lo:], map_y[y, x_lo:], image[y, x_lo:]
         first = (y - y_lo) * width
         X_row, Y_row, grey_row = pixels[0, first:], pixels[1, first:], pixels[4, first:]
@@ -173,7 +172,7 @@ def _select_pixels(image, map_x, map_y, P, start, window, rim, centres, own, G, 
             X_row[k] = (X0 * xs[k] + X1 * ys[k] + X2) * w - x_from
             Y_row[k] = (Y0 * xs[k] + Y1 * ys[k] + Y2) * w - y_from
             x_row[k], y_row[k], grey_row[k] = 0.1 * (x_lo + k - u0), 0.1 * (y - v0), greys[k]
-    # which of the dot's surroundings can come near any pixel at all
+    # is the rim or another dot near enough to affect any pixel?
     reach = unit * (outer + math.hypot(p[ROW.a], p[ROW.b]))
     blur = p[ROW.sigma] * steepest * unit
     crowded = math.hypot(start[0], start[1]) + reach > rim - 2.5 * blur
@@ -189,7 +188,7 @@ def _select_pixels(image, map_x, map_y, P, start, window, rim, centres, own, G, 
     kept, nearest, farthest = 0, _f(-band - 1.0), _f(band)
     for i in range(n):
         d = pixels[5, i]
-        good = nearest < d < farthest  # not so for NaN either: a pixel without a ray
+        good = nearest < d < farthest  # False also for NaN: a pixel without a ray
         if crowded and good:
             X, Y = start[0] + unit * pixels[0, i], start[1] + unit * pixels[1, i]
             blur = p[ROW.sigma] * unit / pixels[6, i]
@@ -215,10 +214,10 @@ def _select_pixels(image, map_x, map_y, P, start, window, rim, centres, own, G, 
 
 @_part
 def _lit(pixels, i, covered, level, slope_x, slope_y, contrast, limit):
-    """Fill a pixel's residual and derivatives by the light, `covered` by the dot so far.
+    """Fill a pixel's residual and its derivatives by the light; `covered`: fraction of the pixel covered by the dot.
 
-    Returns the light, the weight (0 where the squared residual exceeds the limit), what it adds to chi-square, and 1
-    where it is clipped.
+    Returns the light, the weight (0 if the squared residual exceeds the limit), the contribution to chi-square, and 1
+    if the pixel is clipped.
     """
     x, y = pixels[ROW.offset_x, i], pixels[ROW.offset_y, i]
     light = level + slope_x * x + slope_y * y
@@ -240,7 +239,7 @@ def _whitened_model(pixels, n, p, G, det, clip):
 
     model = (level + slopes . offset) * (1 - contrast * S(z)), S the blurred edge: erfc of the distance over sigma.
     Pixels whose squared whitened residual exceeds clip get zeros. Returns chi-square (clipped pixels count as clip),
-    and their number.
+    and the number of clipped pixels.
     """
     g00, g01, g10, g11, det2 = _f(G[0, 0]), _f(G[0, 1]), _f(G[1, 0]), _f(G[1, 1]), _f(det * det)
     near_x, near_y = _f(G[2, 0]), _f(G[2, 1])
@@ -254,12 +253,12 @@ def _whitened_model(pixels, n, p, G, det, clip):
         d, slope, nx, ny, inv_g, curvature = _edge_distance(
             pixels[ROW.x, i] - a, pixels[ROW.y, i] - b, radius, g00, g01, g10, g11, det2
         )
-        # the gradient was taken at the dot's centre: perspective changes the scale over the dot, and what counts is the
-        # scale half way between the pixel and the edge (at the pixel itself it would shift centres by 5e-4 px)
+        # the gradient is that at the dot's centre, but perspective changes the scale over the dot: the distance follows
+        # from the scale half way between pixel and edge (the scale at the pixel would shift centres by 5e-4 px)
         half = half_step * d * inv_g
         mid_x, mid_y = x - half * (g00 * nx + g10 * ny), y - half * (g01 * nx + g11 * ny)
         d *= _1 + near_x * mid_x + near_y * mid_y
-        # a curved edge blurred by sigma looks shifted inwards by sigma^2 / (2 radius of curvature)
+        # blur by sigma shifts a curved edge inwards by sigma^2 / (2 radius of curvature)
         z = d * inv_sigma + half_sigma * curvature
         s, bell = _edge_profile(z)
         light, weight, squared, clipped = _lit(pixels, i, s, level, slope_x, slope_y, contrast, limit)
@@ -273,9 +272,9 @@ def _whitened_model(pixels, n, p, G, det, clip):
 
 @_part
 def _image_centroid(camera, point, R, radius, J):
-    """Centroid u, v [px] of the image of a circle about a point (3,) in the plane of R's first columns, camera axes.
+    """Centroid u, v [px] of the image of a circle about a point (3,), in the plane of the first columns of R.
 
-    By a rule over four points that is exact to the third order; J (2, 3) is scratch.
+    Point and R are in camera axes. A quadrature over four points, exact to the third order; J (2, 3) is scratch.
     """
     whole, sum_u, sum_v = 0.0, 0.0, 0.0
     for k in range(4):
@@ -292,9 +291,10 @@ def _image_centroid(camera, point, R, radius, J):
 
 @_part
 def _whitened_ellipse(pixels, n, p, G, det, centroid, nodes, clip):
-    """As `_whitened_model` by the integral of the Gaussian over the whole ellipse; nodes (3, _NODES) is scratch.
+    """As `_whitened_model`, with the integral of the Gaussian over the whole ellipse; nodes (3, _NODES) is scratch.
 
-    Along the long axis x = a sin t, where the trapezoidal rule converges exponentially; across it the error function.
+    Along the long axis x = a sin t, for which the trapezoidal rule converges exponentially; across it the error
+    function.
     """
     i00, i01, i10, i11 = G[1, 1] / det, -G[0, 1] / det, -G[1, 0] / det, G[0, 0] / det  # plane -> pixel
     c00, c01, c11 = i00 * i00 + i01 * i01, i00 * i10 + i01 * i11, i10 * i10 + i11 * i11
@@ -327,15 +327,15 @@ def _whitened_ellipse(pixels, n, p, G, det, centroid, nodes, clip):
         along, across = along_x * from_u + along_y * from_v, along_x * from_v - along_y * from_u
         covered, d_along, d_across, edge = _0, _0, _0, _0
         for k in range(n_nodes):
-            beside = along - nodes[0, k]
-            if beside * beside > _Z2_MAX:
+            z = along - nodes[0, k]
+            if z * z > _Z2_MAX:
                 continue
-            _, bell = _edge_profile(beside)
+            _, bell = _edge_profile(z)
             above, bell_above = _edge_profile(-across - nodes[1, k])
             below, bell_below = _edge_profile(nodes[1, k] - across)
             column = nodes[2, k] * bell
             covered += column * (above - below)
-            d_along -= beside * column * (above - below)
+            d_along -= z * column * (above - below)
             d_across += column * (bell_above - bell_below)
             edge += bell * (bell_above + bell_below)
         edge *= round_edge
@@ -352,15 +352,15 @@ def _whitened_ellipse(pixels, n, p, G, det, centroid, nodes, clip):
 
 @_part
 def _descend(pixels, n, p, G, det, px_per_unit, clip, work, blurred, centroid, nodes):
-    """Gauss-Newton on the eight template parameters; returns converged, chi-square, clipped.
+    """Gauss-Newton on the eight template parameters; returns converged, chi-square, number of clipped pixels.
 
-    blurred: take the whole ellipse, with the expected radius as a prior, and not one edge at a time.
+    blurred: the model is the whole ellipse, with the expected radius as a prior, instead of single edges.
 
     On convergence the first matrix of work holds the Cholesky factor of J^T W J at the minimum.
     """
     M, rhs, step = work
     converged, chi2, n_clipped = False, 0.0, 0.0
-    before = np.inf  # length of the last step: the ratio of two tells how fast the iteration contracts
+    before = np.inf  # length of the last step: the ratio of two lengths is the contraction of the iteration
     for _ in range(_MAX_ITERATIONS + 1):
         if blurred:
             chi2, n_clipped = _whitened_ellipse(pixels, n, p, G, det, centroid, nodes, clip)
@@ -370,7 +370,7 @@ def _descend(pixels, n, p, G, det, px_per_unit, clip, work, blurred, centroid, n
         if converged:
             return True, chi2, n_clipped
         residual = pixels[ROW.residual]
-        for j in range(0, 8, 2):  # two by two: what is loaded serves twice
+        for j in range(0, 8, 2):  # two rows at a time: each value loaded is used twice
             row, next_row = pixels[j], pixels[j + 1]
             for k in range(0, j + 1, 2):
                 column, next_column = pixels[k], pixels[k + 1]
@@ -407,27 +407,27 @@ def _descend(pixels, n, p, G, det, px_per_unit, clip, work, blurred, centroid, n
         if length * contraction < _CONVERGED_PX and length < 0.1:
             if gain <= 0.5:
                 return True, chi2, n_clipped
-            converged = True  # but the sums were taken before a step that mattered to them
+            converged = True  # evaluate once more: the last step changed the sums
         before = length
     return False, chi2, 0.0
 
 
 @_part
 def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, centres, own, pixels, work, p, result):
-    """Fit the image of one circular dot to the grey values round its edge. Returns a MarkerStatus code.
+    """Fit the image of one circular dot to the grey values around its edge. Returns a MarkerStatus code.
 
     image (H, W); map_x, map_y (H, W): normalised coordinates of every pixel; P (3, 3): normalised image -> target
     plane; start (7,): expected centre and radius on the plane, pixel of that centre, and of the centroid of the dot's
-    image; sigma: blur to start from [px]; noise (3,): variance = noise[0] + noise[1] grey, and the grey values' step;
-    rim: radius of an edge about the plane's origin whose blur must not reach the pixels used, nor that of other dots,
-    whose `centres` (m, 3) those but its `own` are; pixels and work (matrix, right-hand side, step) are scratch.
+    image; sigma: initial guess of the blur [px]; noise (3,): variance = noise[0] + noise[1] grey, and the grey-value
+    step; rim: radius of the face on the plane; centres (m, 3) of all dots, `own` the index of this one: pixels that the
+    blur of the rim or of another dot reaches are not used; pixels and work (matrix, right-hand side, step) are scratch.
     p (8,) receives the template's parameters (a, b: shift on the plane from the expected centre), result (a DOT) the
-    judgement of the fit and the centre's covariance in pixels. The caller projects the centre itself (U, V).
+    quality of the fit and the centre's covariance in pixels. The caller projects the centre (u, v).
     """
     height, width = image.shape
     G = np.empty((3, 2))
     nodes = np.empty((3, _NODES), np.float32)
-    u0, v0, unit = start[3], start[4], start[2]  # all lengths on the plane are in radii of the dot
+    u0, v0, unit = start[3], start[4], start[2]  # lengths on the plane are in radii of the dot
     for i in range(8):
         p[i] = 0.0
     p[ROW.radius], p[ROW.sigma] = 1.0, sigma
@@ -441,7 +441,7 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, centres, own, pix
         if not abs(det) > 1e-9 * norm2:
             return BLURRED
         blur = max(p[ROW.sigma], 1.0)
-        if 1.0 / largest < blur:  # even that template fails: nothing but a blot is left
+        if 1.0 / largest < blur:  # semi-minor axis below the blur: the template of the ellipse fails, too
             return BLURRED
         blurred = 1.0 / largest < _MIN_SEMI_MINOR * blur
         band = 3.0 * p[ROW.sigma] + 1.0
@@ -475,13 +475,13 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, centres, own, pix
         level, step, inv_sigma = _f(p[ROW.level]), _f(dark - p[ROW.level]), _f(1.0 / p[ROW.sigma])
         distance, weight, grey = pixels[ROW.distance], pixels[ROW.weight], pixels[ROW.grey]
         for i in range(n):
-            # weights from the expected grey value: the noisy one would pull the fit towards dark pixels
+            # weights from the expected grey value: weights from the noisy one would bias the fit towards dark pixels
             s, bell = _edge_profile(distance[i] * inv_sigma)
             weight[i] = _1 / math.sqrt(max(read_32 + gain_32 * (level + step * s), floor))
         for i in range(n):
             grey[i] *= in_light  # a product in double precision, rounded once
         limit = np.inf
-        while True:  # once, and again without the pixels that do not belong
+        while True:  # once with all pixels, once without outliers
             centroid = start[5] - u0, start[6] - v0
             converged, chi2, n_clipped = _descend(
                 pixels, n, p, G, det, largest / abs(det), limit, work, blurred, centroid, nodes
@@ -496,10 +496,10 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, centres, own, pix
             u0, v0 = u0 + moved_u, v0 + moved_v
             settled = math.hypot(moved_u, moved_v) < _SETTLED_PX
             if not blurred and 1.0 / largest < _MIN_SEMI_MINOR * p[ROW.sigma]:
-                settled = False  # more blurred than expected: once more, by the other template
+                settled = False  # more blurred than expected: fit the ellipse instead
             if not settled and selection < _MAX_ITERATIONS - 1:
                 break
-            # robust end: hot pixels and specks leave the sum; where the model misfits everywhere the limit follows
+            # outliers (hot pixels, specks) are clipped; the limit grows with the rms residual of all pixels
             limit = _CLIP_SIGMA * _CLIP_SIGMA * max(1.0, chi2 / n)
             worst = _0
             for i in range(n):
@@ -535,10 +535,10 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, centres, own, pix
 
 @_part
 def _judge_dot(result, radius, typical_sigma, noise, limits):
-    """Refuse a converged fit that does not look like the dot.
+    """Refuse a converged fit that does not match the dot.
 
-    A misfit counts when it is large beside the noise and beside the contrast: the template's own small errors must not
-    condemn the dots of a sensor that hardly has any noise.
+    A misfit must be large compared with both the noise and the contrast: small errors of the template must not reject
+    the dots of a sensor with very low noise.
     """
     misfit = math.sqrt(max(result.chi_square, 0.0))
     step = abs(result.contrast * result.level)
@@ -555,10 +555,10 @@ def _judge_dot(result, radius, typical_sigma, noise, limits):
 
 @_part
 def _look(images, readable, maps, cameras, face, sigma, noise, limits, R, t, pixels, work, results, status):
-    """Locate and judge the dots in the images (cameras, H, W) of one instant, the disc being near the pose R, t.
+    """Locate and judge the dots in the images (cameras, H, W) of one instant, with the disc near the pose R, t.
 
-    Filled: results (cameras, m) of DOT, status (cameras, m); u, v are the image of the dot's own centre, not the centre
-    of its elliptical image.
+    Filled: results (cameras, m) of DOT, status (cameras, m); u, v are the image of the dot's centre, not the centre of
+    its elliptical image.
     """
     (centres, radius, rim), (intrinsics, R_cw, t_cw) = face, cameras
     m = centres.shape[0]
@@ -586,7 +586,7 @@ def _look(images, readable, maps, cameras, face, sigma, noise, limits, R, t, pix
             if facing <= 0.0:  # the camera sees the other face
                 status[c, i] = OCCLUDED
                 continue
-            for k in range(3):  # P = M^-1 by cofactors, but for a factor, which says nothing of places on a plane
+            for k in range(3):  # P = M^-1 by cofactors, up to a factor, which does not matter for a homography
                 for j in range(3):
                     a, b, d, e = (j + 1) % 3, (j + 2) % 3, (k + 1) % 3, (k + 2) % 3
                     P[k, j] = M[a, d] * M[b, e] - M[a, e] * M[b, d]
@@ -604,10 +604,10 @@ def _look(images, readable, maps, cameras, face, sigma, noise, limits, R, t, pix
 
 @_part
 def _predict(last, before, older, t_last, t_before, t_older, R, t):
-    """The next pose if turn and shift change once more as they did: turn D1 D0^T D1 after D0 and then D1.
+    """Extrapolate the pose with constant second differences: rotation D1 D0^T D1 after D0 and D1.
 
-    A disc that rolls is as far beside it as its third differences, not its second: what a prediction is off by follows
-    the acceleration, and so does what it leaves of itself in the centres (band and shape of the template), 1e-4 px.
+    The error is the third difference of the motion. An extrapolation with constant velocity would err in proportion to
+    the acceleration, and bias the centres with it (by the template's band and shape), by 1e-4 px.
     """
     for i in range(3):
         t[i] = 3.0 * (t_last[i] - t_before[i]) + t_older[i]
@@ -619,7 +619,7 @@ def _predict(last, before, older, t_last, t_before, t_older, R, t):
 
 @_part
 def _turn_on(to, since, R):
-    """Turn R as `since` was turned into `to`: R = to since^T R."""
+    """Apply the rotation from `since` to `to`: R = to since^T R."""
     for j in range(3):
         x, y, z = R[0, j], R[1, j], R[2, j]
         a = since[0, 0] * x + since[1, 0] * y + since[2, 0] * z
@@ -631,7 +631,7 @@ def _turn_on(to, since, R):
 
 @_part
 def _orthonormalise(R, work):
-    """One Newton step to R (3 - R^T R) / 2; without it R R_before^T R would treble any departure in every frame."""
+    """One Newton step, R (3 - R^T R) / 2; without it R R_before^T R would triple the rounding error in every frame."""
     _copy(work, R)
     _turn_on(R, R, work)
     for i in range(3):
@@ -641,9 +641,9 @@ def _orthonormalise(R, work):
 
 @_part
 def _settle(results, status, cameras, centres, R, t, dots, filled):
-    """Move the pose R, t onto the dots of one pair; returns the rms residual [px], negative without an answer.
+    """Fit the pose R, t to the dots of one pair; returns the rms residual [px], negative if the fit fails.
 
-    A prediction need not follow the noise of the best dots, nor, beyond a pixel, a wrong one.
+    A prediction needs no exact weights: each dot has sigma _FOLLOWED_PX at least, and Huber's weight beyond a pixel.
     """
     observed, covariance, used = dots
     count = 0
@@ -671,10 +671,10 @@ def track_frames(images, readable, maps, cameras, face, sigma, noise, limits, he
     """Follow the disc through a block of pairs, each predicted from the three before (`_predict`).
 
     images (n, 2, H, W); readable (n, 2); maps: x and y (2, H, W) undistorted normalised coordinates of the cameras'
-    pixels; cameras as `pose.stacked` has them, face as `template.face_of`; sigma (2,) [px] of the dots' edges in each
-    camera; noise (2, 3): variance = noise[0] + noise[1] grey, and the grey values' step; heading: the
-    last three poses ((R, t), ...), which are updated. Filled: results (n, 2, m) of DOT, status (n, 2, m), R_out
-    (n, 3, 3), t_out (n, 3). Returns the number of frames followed; less than n where the disc was lost at that frame.
+    pixels; cameras as from `pose.stacked`, face as from `template.face_of`; sigma (2,) [px] of the dots' edges in each
+    camera; noise (2, 3): variance = noise[0] + noise[1] grey, and the grey-value step; heading: the last three poses
+    ((R, t), ...), which are updated. Filled: results (n, 2, m) of DOT, status (n, 2, m), R_out (n, 3, 3), t_out (n, 3).
+    Returns the number of frames followed; less than n if the disc was lost at that frame.
     """
     (R_last, t_last), (R_before, t_before), (R_older, t_older) = heading
     pixels, work = np.empty((16, _PIXELS), np.float32), (np.empty((8, 8)), np.empty(8), np.empty(8))

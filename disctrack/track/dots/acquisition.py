@@ -1,8 +1,8 @@
-"""Find and number the dots without any prior: blobs in both images, then the one rigid motion that explains them.
+"""Find and identify the dots without a prior: blobs in both images, then the rigid motion that explains most of them.
 
-Stereo first: blobs that meet in space give points, and triples of points with the mutual distances of three dots give
-candidate motions. If one camera sees too little, three blobs of the other give candidate poses (perspective three-point
-problem), and of mirror twins the one that touches the table is taken.
+Stereo first: pairs of blobs are triangulated, and triples of points with the mutual distances of three dots give
+candidate poses. If one camera sees too few dots, three blobs of the other give candidate poses (perspective three-point
+problem). Of mirror-image solutions the one that touches the table is chosen.
 """
 
 from collections.abc import Sequence
@@ -21,8 +21,8 @@ from disctrack.frames import CAMERAS, euler_from_rotation, rotation_from_vector
 from disctrack.track.pose import DotsInFrames, fit_poses, marker_pixels
 
 MAX_BLOBS = 24
-EPIPOLAR_PX = 4.0  # centroids of blobs err by up to 1 px under glare, the rig by little
-INLIER_DIAMETERS = 0.35  # a blob belongs to a dot if it lies within this part of a dot's diameter
+EPIPOLAR_PX = 4.0  # centroids of blobs err by up to 1 px under glare, the rig by much less
+INLIER_DIAMETERS = 0.35  # largest distance between a blob and its dot, in diameters of the dot
 MIN_EXPLAINED = 4
 BLOB_PX = 0.5  # standard deviation of a blob's centroid under uneven light
 CANDIDATES = 40  # poses that are refined
@@ -31,17 +31,17 @@ Pose = tuple[Array, Array]  # R_world_body (3, 3), t_world_body (3,) [m]
 
 
 def dot_blobs(image: NDArray[np.generic], expected_diameter_px: float) -> Array:
-    """Centroids and areas (k, 3) of round-ish blobs, dark on light and light on dark, most elliptical first.
+    """Centroids and areas (k, 3) of elliptical blobs, dark on light and light on dark, most elliptical first.
 
-    x, y [px], area [px^2]. A blob's pixels differ from the mean of their surroundings (so uneven light does not
-    matter), and its area must be that of the ellipse with the same second moments.
+    x, y [px], area [px^2]. The threshold is relative to the local mean, so uneven light does not matter. The area of a
+    blob must be that of the ellipse with the same second moments.
     """
-    grey = np.asarray(image, np.float32) / np.float32(level_step(image))  # images of any depth alike, to the last bit
+    grey = np.asarray(image, np.float32) / np.float32(level_step(image))  # same result for any bit depth
     block = 2 * int(1.25 * expected_diameter_px) + 1
     smooth = cv2.GaussianBlur(grey, (0, 0), 1.0)
     mean = cv2.blur(smooth, (block, block), borderType=cv2.BORDER_REPLICATE)
     spread = np.median(np.abs(smooth - mean))
-    # against the surroundings, so that a glare gradient does not matter; dim images keep a floor of three spreads
+    # relative to the local mean, against gradients of glare; three spreads at least, for dim images
     threshold = np.maximum(0.12 * mean, 3.0 * spread)
     found = []
     for mask in (smooth < mean - threshold, smooth > mean + threshold):
@@ -72,7 +72,7 @@ def _elliptical_components(mask: NDArray[np.uint8], diameter: float) -> list[tup
 
 
 def expected_diameter_px(rig: StereoRig, disc: Disc) -> list[float]:
-    """Diameter of a dot's image in each camera where its axis meets the table, or 0.5 m away without a table."""
+    """Diameter of a dot's image in each camera, at the point of its axis on the table, or at 0.5 m without a table."""
     result = []
     for camera, (R, t) in zip(rig.cameras, rig.camera_poses(), strict=True):
         distance = (R.T @ t)[2] / R[2, 2] if rig.world_is_table and R[2, 2] < -0.05 else 0.5
@@ -83,10 +83,11 @@ def expected_diameter_px(rig: StereoRig, disc: Disc) -> list[float]:
 def acquire(
     pair: Sequence[NDArray] | NDArray, rig: StereoRig, disc: Disc, by_one: bool = True
 ) -> tuple[Pose | None, int, str]:
-    """Find the disc in the images of both cameras, wherever it is and however it is turned.
+    """Find the disc in the images of both cameras, at any position and attitude.
 
-    by_one : by the dots of either camera, too, where both together show too few; that takes four times as long
-    The pose, good to a fraction of a pixel; dot images explained by blobs, both cameras together; why none was found.
+    by_one : use the dots of a single camera, too, if both together show too few; that takes four times as long
+    returns : the pose, to a fraction of a pixel, or None; number of dot images explained by blobs, in both cameras
+        together; the reason if no pose was found
     """
     diameters = expected_diameter_px(rig, disc)
     blobs = [dot_blobs(image, diameter)[:, :2] for image, diameter in zip(pair, diameters, strict=True)]
@@ -116,26 +117,27 @@ def acquire_from_blobs(
 def seen_by_one_camera(
     image: NDArray[np.generic], camera: int, diameter_px: float, rig: StereoRig, disc: Disc
 ) -> tuple[Array, Array, Array]:
-    """Blobs of about that diameter that are the dots by one camera alone, and the pose R_world_body, t_world_body.
+    """Dots identified by one camera among blobs of about this diameter, and the pose R_world_body, t_world_body.
 
-    The blobs are x, y [px], area [px^2], (n_markers, 3), NaN for dots that are not seen. What one camera sees is the
-    same on every scale: neither baseline nor table matter.
+    The blobs are x, y [px], area [px^2], (n_markers, 3), NaN for dots that are not seen. A single camera does not
+    determine the scale: neither baseline nor table matter.
     """
     blobs = dot_blobs(image, diameter_px)
     best = np.full((disc.n_markers, 3), np.nan), np.eye(3), np.zeros(3)
     for R, t in _candidates_from_one_camera(blobs[:, :2], camera, rig, disc):
         gap = _gaps(R[None], t[None], blobs[:, :2], camera, rig, disc)[0]
         seen, nearest = gap.min(axis=1) < 1, gap.argmin(axis=1)
-        one_each = len(set(nearest[seen])) == seen.sum()  # a disc far off, or edge on, has many dots in one blob
+        one_each = len(set(nearest[seen])) == seen.sum()  # a distant or edge-on disc has many dots in one blob
         if one_each and seen.sum() > np.isfinite(best[0][:, 0]).sum():
             best = np.where(seen[:, None], blobs[nearest], np.nan), R, t
     return best
 
 
 def _gaps(R: Array, t: Array, blobs: Array, camera: int, rig: StereoRig, disc: Disc) -> Array:
-    """(n, m, k) how far blobs (k, 2) lie from the dots of poses R (n, 3, 3), t (n, 3) in a camera's image.
+    """(n, m, k) distances of blobs (k, 2) from the dots of poses R (n, 3, 3), t (n, 3) in a camera's image.
 
-    A blob belongs to a dot below 1, that is INLIER_DIAMETERS; infinite behind the camera, or where the face looks away.
+    In units of INLIER_DIAMETERS: below 1 a blob belongs to a dot. Infinite behind the camera, or if the face is turned
+    away.
     """
     pixels = marker_pixels(R, t, rig, disc.marker_centres_body)[0][:, camera]
     R_cw, t_cw = rig.camera_poses()[camera]
@@ -146,7 +148,7 @@ def _gaps(R: Array, t: Array, blobs: Array, camera: int, rig: StereoRig, disc: D
 
 
 def _score(gap: Array) -> Array:
-    """(n,) dots that blobs lie on, by their nearest (n, m): 1 for its centre, 0 where it belongs to none."""
+    """(n,) scores of poses from the distances (n, m) of the nearest blobs: per dot 1 at its centre, 0 beyond 1."""
     return np.asarray(np.sum(np.clip(1 - gap**2, 0, None), axis=1))
 
 
@@ -159,7 +161,7 @@ def _candidates_from_stereo(blobs: list[Array], rig: StereoRig, disc: Disc) -> l
         points = triangulate(pixels, rig)
         error = np.linalg.norm(rig.project(points) - pixels, axis=-1).max(axis=0)
     keep = error < EPIPOLAR_PX
-    if rig.world_is_table:  # a dot is neither below the table nor above a disc that stands on its edge
+    if rig.world_is_table:  # a dot is neither below the table nor higher than a disc that stands on its edge
         keep &= (points[:, 2] > -3e-3) & (points[:, 2] < 2.1 * disc.radius + 2 * disc.half_thickness)
     points = points[keep][np.argsort(error[keep])][:MAX_BLOBS]
     if len(points) < 3:
@@ -170,7 +172,7 @@ def _candidates_from_stereo(blobs: list[Array], rig: StereoRig, disc: Disc) -> l
     apart = np.abs(_sides(points[orders]) / _sides(triples)[:, None] - 1.0).max(axis=2)
     dots, order = np.nonzero(apart < SIDE_TOLERANCE)
     R, t = rigid_motions(triples[dots], points[orders[order]])
-    # score by the points that fall on dots; keep the distinct best
+    # the score counts the dots with a point near them
     predicted = centres @ np.swapaxes(R, 1, 2) + t[:, None]
     gap = np.linalg.norm(predicted[:, :, None] - points[None, None], axis=-1).min(axis=2)
     return _best(R, t, _score(gap / (INLIER_DIAMETERS * disc.marker_diameter)))
@@ -203,7 +205,7 @@ def _candidates_from_one_camera(blobs: Array, camera: int, rig: StereoRig, disc:
     rays = normalise(blobs, rig.cameras[camera])
     R_cw, t_cw = rig.camera_poses()[camera]
     centres = disc.marker_centres_body
-    # three dots far apart carry the most; the widest triples are tried first
+    # triples of dots far apart determine the pose best, and are tried first
     triples = sorted(
         combinations(range(len(centres)), 3),
         key=lambda k: -np.linalg.norm(np.cross(centres[k[1]] - centres[k[0]], centres[k[2]] - centres[k[0]])),
@@ -220,7 +222,7 @@ def _candidates_from_one_camera(blobs: Array, camera: int, rig: StereoRig, disc:
         R, t = np.concatenate([R, turned]), np.concatenate([t, placed])
         score = np.append(score, _score(_gaps(turned, placed, blobs, camera, rig, disc).min(axis=2)))
         if score.max(initial=0.0) > len(centres) - 1.0:
-            break  # all dots but for what blobs err by: no other triple knows better
+            break  # all dots are explained to the accuracy of blobs: no other triple does better
     good = score > MIN_EXPLAINED - 0.5
     return _best(R[good], t[good], score[good])
 
@@ -228,13 +230,13 @@ def _candidates_from_one_camera(blobs: Array, camera: int, rig: StereoRig, disc:
 def _best_explanation(
     candidates: list[Pose], blobs: list[Array], rig: StereoRig, disc: Disc
 ) -> tuple[Pose | None, int]:
-    """Refine the candidates on the blobs they explain; the best, if any is good, and dot images that it explains."""
+    """Fit the candidates to the blobs they explain; the best pose, or None, and the number of dot images explained."""
     if not candidates:
         return None, 0
     R, t = (np.array(parts) for parts in zip(*candidates, strict=True))
     shape = len(R), 2, disc.n_markers
     covariance = np.broadcast_to(BLOB_PX**2 * np.eye(2), (*shape, 2, 2))
-    for _ in range(2):  # once with the triple's pose, once with the refined one
+    for _ in range(2):  # match with the pose of the triple, then with the refined one
         matched = np.full((*shape, 2), np.nan)
         for camera, points in enumerate(blobs):
             if len(points):
@@ -246,7 +248,7 @@ def _best_explanation(
         t = np.where(fits.converged[:, None], fits.t_world_body, t)
     explained = np.isfinite(matched).all(-1).sum((1, 2))
     rms = BLOB_PX * np.sqrt(fits.chi_square / np.maximum(explained, 1))
-    # a dot that should be seen and is not costs as much as a badly placed one, or half a thickness off the table
+    # each dot explained is worth 2 px of rms; each half thickness off the table costs 0.5 px
     cost = rms - 2.0 * explained
     if rig.world_is_table:
         gap = np.abs(t[:, 2] - disc.resting_height(euler_from_rotation(R)[:, 1]))

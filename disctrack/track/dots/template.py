@@ -1,20 +1,20 @@
-"""The circle template: where the centre of a round dot lies in an image, to a hundredth of a pixel and without bias.
+"""The circle template: the centre of a round dot in an image, to a hundredth of a pixel and without bias.
 
-Model of the grey values round one dot, fitted by weighted least squares in a band about its edge:
+Model of the grey values around one dot, fitted by weighted least squares in a band around its edge:
 
     I(u) = (L + g . (u - u0)) (1 - c S(d(u) / sigma + kappa sigma / 2))
 
 L, g light and its gradient, c contrast (negative for a light dot on dark), S(z) = erfc(z / sqrt 2) / 2 the edge of a
 step blurred by optics, pixel and motion (sigma), d the signed distance in pixels from the edge, kappa the edge's
-curvature (a blurred curved edge seems shifted inwards by kappa sigma^2 / 2). d comes from the exact map of every pixel
-onto the plane of the dots (distortion and perspective), where the dot is a circle of radius R about its centre: so the
-result is the image of the dot's own centre. The centre of the ellipse differs from it by 0.02-0.13 px here.
+curvature (blur shifts a curved edge inwards by kappa sigma^2 / 2). d comes from the exact map of every pixel onto the
+plane of the dots (distortion and perspective), in which the dot is a circle of radius R about its centre: so the result
+is the image of the dot's centre. The centre of the ellipse differs from it by 0.02-0.13 px here.
 Free per dot: centre (2), R, sigma, L, g (2), c. R and sigma do not couple with the centre (even against odd), so a dot
 printed too large, or motion blur, costs no accuracy.
 
-A change of the image that the template has no name for goes, in part, into the centre: by how much depends on the size
-and shape of the dot's image, its blur, contrast and noise, and is tabulated here (`pulls`). Odd changes only: size,
-blur and grey values take up the even ones.
+A change of the image that is not in the model biases the centre. The bias depends on the size and shape of the dot's
+image, its blur, contrast and noise, and is tabulated here (`pulls`). Only odd changes matter: size, blur and grey
+values absorb the even ones.
 """
 
 import math
@@ -29,8 +29,8 @@ from calibration.kit.grey_levels import level_step
 from disctrack.disc import Disc
 from disctrack.trajectory import MarkerStatus
 
-ACROSS, AROUND = 60, 32  # nodes of an edge
-SIZES, SHAPES = 5, np.geomspace(0.2, 1.0, 13)  # of dots (short over long axis) between which the pull is interpolated
+ACROSS, AROUND = 60, 32  # nodes across and along an edge
+SIZES, SHAPES = 5, np.geomspace(0.2, 1.0, 13)  # grid of the table of biases; a shape is short over long axis
 
 
 class NoiseModel(NamedTuple):
@@ -38,7 +38,7 @@ class NoiseModel(NamedTuple):
 
     read: float
     gain: float
-    step: float = 1.0  # between neighbouring grey values: 16 where 12 bits fill the upper end of 16
+    step: float = 1.0  # between neighbouring grey values: 16 if 12 bits are stored in the upper end of 16
 
     def variance(self, grey: Array) -> Array:
         """Variance [grey^2] at mean grey values of any shape; never below that of rounding, step^2 / 12."""
@@ -46,41 +46,41 @@ class NoiseModel(NamedTuple):
 
 
 class Edge(NamedTuple):
-    """How the edges of dots look in a camera; as they usually do, where nothing was measured."""
+    """Blur, grey values and noise at the edges of dots in a camera; the defaults are typical values."""
 
     blur_px: float = 0.8  # sigma
     level: float = 200.0  # grey value of the paper
-    contrast: float = 0.85  # of the dots with it
+    contrast: float = 0.85  # of the dots with the paper
     noise: NoiseModel = NoiseModel(1.0, 0.02)
 
 
 def rough_noise(image: Image) -> NoiseModel:
-    """The same at all grey values, by second differences of neighbouring pixels, most of which lie in flat parts."""
+    """Noise independent of the grey value, from second differences of pixels, most of which lie in flat regions."""
     sigma = robust_sigma(np.diff(np.asarray(image, np.float32), 2)) / np.sqrt(6.0)
     return NoiseModel(sigma**2, 0.0, float(level_step(image)))
 
 
-def noise_left(assumed: NoiseModel, results: NDArray) -> NoiseModel:
-    """The law through what dots leave on the dark and on the light side of their edges: noise, and misfit if any.
+def residual_noise(assumed: NoiseModel, results: NDArray) -> NoiseModel:
+    """Noise model from the residuals on the dark and on the light side of the dots' edges; includes any misfit.
 
-    results (k,) of fits that took the noise as `assumed`. Half of each side lies in the edge itself, so that a law far
-    from the assumed one is found in two steps.
+    results (k,) of fits with the `assumed` noise. Half of the pixels of each side lie within the blurred edge, so a
+    noise far from the assumed one needs two iterations.
     """
     grey = results["level"] * np.stack([1.0 - results["contrast"], np.ones(len(results))])
-    left = assumed.variance(grey) * np.stack([results["inside"], results["outside"]])
-    mean, variance = np.median(grey, axis=1), np.median(left, axis=1)
+    residual = assumed.variance(grey) * np.stack([results["inside"], results["outside"]])
+    mean, variance = np.median(grey, axis=1), np.median(residual, axis=1)
     gain, read = np.polyfit(mean, variance, 1)
-    if gain < 0:  # noise that does not grow with light: a constant says all
+    if gain < 0:  # noise that does not grow with light is modelled as constant
         gain, read = 0.0, variance.mean()
-    # a negative intercept is a clipped black level: keep the law above it, `variance` holds the floor
+    # a negative intercept is due to a clipped black level; `variance` has a floor
     return NoiseModel(float(read), float(gain), assumed.step)
 
 
 def face_of(disc: Disc) -> tuple[Array, float, float]:
-    """The dots' centres (m, 3) and radius, and the radius within which the face is one even background for them [m].
+    """Centres (m, 3) and radius of the dots, and the radius of the uniform background around the disc's axis [m].
 
-    Paper ends, and edges are bevelled, a few per cent inside the disc's radius; a dot printed farther out than that
-    moves the limit with it.
+    The paper ends, or the bevel begins, a few per cent inside the disc's radius; dots printed farther out extend the
+    limit.
     """
     centres = np.ascontiguousarray(disc.marker_centres_body)
     outermost = float(np.hypot(*centres[:, :2].T).max()) + 0.5 * disc.marker_diameter
@@ -89,24 +89,24 @@ def face_of(disc: Disc) -> tuple[Array, float, float]:
 
 
 def dot_centres(results: NDArray, status: NDArray[np.uint8]) -> tuple[NDArray, Array, Array]:
-    """The kernels' table of results (..., m) of DOT, NaN unless their status (..., m) is MEASURED; the dots' centres.
+    """Results (..., m) of DOT from the kernels, NaN unless their status (..., m) is MEASURED, and the dots' centres.
 
-    These are pixels (..., m, 2) and their covariance (..., m, 2, 2) [px^2].
+    Centres are pixels (..., m, 2) with covariance (..., m, 2, 2) [px^2].
     """
     known = results.copy()
     known[status != MarkerStatus.MEASURED] = np.nan
     pixels = np.stack([known["u"], known["v"]], axis=-1)
     covariance = np.stack([known[name] for name in ("var_u", "cov_uv", "cov_uv", "var_v")], axis=-1)
-    # grey values that scatter more than the noise model says (print, speckle, compression) scatter the centre too
+    # excess scatter of grey values over the noise model (print, speckle, compression) increases that of the centre
     covariance *= np.maximum(known["chi_square"], 1.0)[..., None]
     return known, pixels, covariance.reshape(*status.shape, 2, 2)
 
 
 def pulls(radius: float, affine: Array, edge: Edge) -> tuple[Array, Array]:
-    """Shifts (n, m, 2, 5) by changes of the image, along its long and its short axis, and rotations into these.
+    """Biases (n, m, 2, 5) of centres by changes of the image, along its long and short axes, and rotations into these.
 
-    affine (n, m, 2, 2) [px/m] from the plane of dots of this radius [m] to the image; NaN where it is. What `_response`
-    tells is linear in the dots' size and in the logarithm of their shape.
+    affine (n, m, 2, 2) [px/m] from the plane of dots of this radius [m] to the image; NaN gives NaN. `_response` is
+    interpolated linearly in the dots' size and in the logarithm of their shape.
     """
     long, short, axes = axes_of(affine)
     size, shape = radius * np.sqrt(long * short), short / long
@@ -122,16 +122,16 @@ def pulls(radius: float, affine: Array, edge: Edge) -> tuple[Array, Array]:
 
 
 def _response(sizes: Array, edge: Edge) -> Array:
-    """(sizes, SHAPES, 2, 5) what the template takes for a shift, along the long axis and the short one.
+    """(sizes, SHAPES, 2, 5) shifts of the fitted centre along the long axis and the short one.
 
-    By a contrast that grows by 1 per px along the axis, see `dot_shifts`: shifts in px^2. By an exposure, over T^2 / 24
-    and products of velocity v and growth G: shifts along axis 1 go by v1 G11, v1 G22, v2 G12, v2 G21; along axis 2 by
-    v2 G22, v2 G11, v1 G21, v1 G12: the others vanish by symmetry. Of d_tt and v_n^2 the parts by v and G u together are
-    2 t.v d(n.Gu)/ds, where the terms of the bend cancel, and 2 n.v n.Gu.
+    The first is by a contrast that grows by 1 per px along the axis, see `dot_shifts`: shifts in px^2. The others are
+    by an exposure, over T^2 / 24 and products of velocity v and growth G: along axis 1 by v1 G11, v1 G22, v2 G12,
+    v2 G21; along axis 2 by v2 G22, v2 G11, v1 G21, v1 G12. All others vanish by symmetry. The terms of d_tt and v_n^2
+    with both v and G u are 2 t.v d(n.Gu)/ds, in which the terms with the curvature cancel, and 2 n.v n.Gu.
 
-    sizes : [px] root of the half axes' product. Least squares over the template's band of pixels, weighted by their
-    noise, of centre and slope of the light together; what else is fitted (size, blur, grey values) is even about the
-    centre.
+    sizes : [px] root of the half axes' product. Linear least squares for centre and slope of the light together, over
+    the template's band of pixels, weighted by their noise. The other parameters (size, blur, grey values) are even
+    about the centre, and do not couple.
     """
     sigma, level, contrast, noise = edge
     d = np.linspace(-3.0 * sigma - 2.0, 3.0 * sigma + 1.0, ACROSS)  # [px] as `_kernels` selects its pixels
@@ -160,7 +160,7 @@ def _response(sizes: Array, edge: Edge) -> Array:
 
 
 def axes_of(affine: Array) -> tuple[Array, Array, Array]:
-    """Long and short half axes of the images of a unit circle by maps (..., 2, 2), and rotations into them."""
+    """Long and short half axes of the image of a unit circle under maps (..., 2, 2), and rotations into these axes."""
     xx, yy = np.moveaxis(np.sum(affine**2, axis=-1), -1, 0)
     xy = np.sum(affine[..., 0, :] * affine[..., 1, :], axis=-1)
     long = np.sqrt(0.5 * (xx + yy) + np.hypot(0.5 * (xx - yy), xy))

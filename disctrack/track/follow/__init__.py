@@ -1,1 +1,1 @@
-"""The disc followed through blocks of image pairs."""
+"""The disc is followed from pair to pair through the recording."""

@@ -1,8 +1,8 @@
-"""Following the disc through blocks of pairs: by its motion while it is seen, by what is known of it after a loss.
+"""Following the disc through blocks of pairs, and recovery after a loss.
 
-The loop over frames is one compiled call per block (`_kernels.track_frames`); here stands what happens at its ends:
-finding the disc at the start, carrying its motion on while it is hidden, searching at growing intervals where that
-fails, going back over the frames before it was found again, and measuring blur and noise.
+The loop over frames is one compiled call per block (`_kernels.track_frames`). This module does the rest: it finds the
+disc at the start, extrapolates its motion while it is hidden, searches at growing intervals if that fails, follows it
+backwards from where it was found again, and measures blur and noise.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ from disctrack.disc import Disc, symmetry_order
 from disctrack.frames import rotation_from_vector, rotation_z, vector_from_rotation
 from disctrack.track.dots import _kernels as kernels
 from disctrack.track.dots.acquisition import Pose, acquire
-from disctrack.track.dots.template import Edge, NoiseModel, face_of, noise_left, rough_noise
+from disctrack.track.dots.template import Edge, NoiseModel, face_of, residual_noise, rough_noise
 from disctrack.track.pose import stacked
 from disctrack.trajectory import FrameStatus, MarkerStatus
 
-# A pair whose dots disagree by more than this with any rigid motion is lost: a tenth of a dot, ten times a poor rig
+# rms residual of a pair above which the disc is lost: a tenth of a dot, ten times that of a poor rig
 MAX_PREDICTION_RMS_PX = 2.0
-NOISE_FRAMES = 12  # that blur and noise are taken from
-MIN_TO_BEGIN = 5  # dot images that must be measured where the disc is found anew: three fit anything
-# Frames over which the last motion is carried on, each of which costs one look at the dots; and at most between
-# searches, of which one costs as much as some 600
+NOISE_FRAMES = 12  # from which blur and noise are measured
+MIN_TO_BEGIN = 5  # dot images that a newly found pose needs: three fit any pose
+# Frames over which the last motion is extrapolated, each at the cost of one fit of the dots; also the longest wait
+# between searches, each of which costs as much as some 600 fits
 PATIENCE = 60
-MOST_USUAL = 0.1  # of the contrast: dots that leave more than this are not the declared ones
-REPEAT_REACH = 4  # frames back that an image is compared with: recorders repeat from buffers of a few
+MOST_USUAL = 0.1  # largest rms residual of declared dots, over the contrast
+REPEAT_REACH = 4  # preceding frames with which an image is compared: recorders repeat from buffers of a few
 
 
 class Heading(NamedTuple):
@@ -44,12 +44,12 @@ class Heading(NamedTuple):
 
     @classmethod
     def steady(cls, last: Pose, before: Pose) -> Heading:
-        """The next prediction makes their turn and shift once more, as if they had been made before, too."""
+        """Heading of constant velocity: the turn and shift between these poses are repeated."""
         turn = last[0] @ before[0].T
         return cls(last, before, (turn.T @ before[0], 2 * before[1] - last[1]))
 
     def carried_on(self, steps: int) -> Heading:
-        """As after so many more frames of the same motion."""
+        """Heading after so many more frames with constant velocity."""
         (R_last, t_last), (R_before, t_before) = self.last, self.before
         turn = rotation_from_vector(steps * vector_from_rotation(R_last @ R_before.T))
         shift = steps * (t_last - t_before)
@@ -57,21 +57,21 @@ class Heading(NamedTuple):
 
 
 def maps_of(rig: StereoRig) -> tuple[Array, Array]:
-    """Undistorted normalised coordinates x and y (2, height, width) of the cameras' pixels, which take a while."""
+    """Undistorted normalised coordinates x and y (2, height, width) of the cameras' pixels; slow to compute."""
     maps_x, maps_y = zip(*map(normalised_maps, rig.cameras), strict=True)
     return np.stack(maps_x), np.stack(maps_y)
 
 
 @dataclass
 class Tables:
-    """What is kept of every pair until the poses are fitted: 1.2 kB with six dots."""
+    """Results of every pair, kept until the poses are fitted: 1.2 kB per pair with six dots."""
 
     results: NDArray  # (n, 2, m) of `_kernels.DOT`
     status: NDArray[np.uint8]  # (n, 2, m)
     R: Array  # (n, 3, 3)
     t: Array  # (n, 3)
     frame_status: NDArray[np.uint8]  # (n,)
-    digest: NDArray[np.uint64]  # (n, 2) of some of each image's rows; 0 where there is no image
+    digest: NDArray[np.uint64]  # (n, 2) checksum of some rows of each image; 0 if there is no image
 
     def part(self, rows: slice) -> Tables:
         """Views of some rows."""
@@ -80,21 +80,21 @@ class Tables:
 
 @dataclass
 class Follower:
-    """One stretch of the recording: what is known of the disc between its blocks."""
+    """State of the tracking of one stretch of the recording, between its blocks."""
 
     rig: StereoRig
     disc: Disc
-    maps: tuple[Array, Array]  # of its cameras
-    edges: tuple[Edge, ...] = (Edge(), Edge())  # how those of the dots look in each camera
+    maps: tuple[Array, Array]  # as from `maps_of`
+    edges: tuple[Edge, ...] = (Edge(), Edge())  # of the dots in each camera
     heading: Heading | None = None
     lost: int | None = 0  # frames since the last pose; None while the disc is followed
-    failures: int = 0  # searches in vain, one after the other
+    failures: int = 0  # failed searches in a row
     waited: int = 0  # frames since the last of them
-    measured: bool = False  # blur and noise known
+    measured: bool = False  # blur and noise are known
     acquisitions: int = 0
-    first_reason: str = ""
+    first_reason: str = ""  # why the first search failed
     saturated: tuple[int | None, ...] = (None, None)  # grey value at which the dots' brighter side is clipped
-    first_row: int = 0  # of the tables
+    first_row: int = 0  # of the stretch in the tables
 
 
 def run(
@@ -105,11 +105,12 @@ def run(
     rows: Tables,
     limits: kernels.Limits = kernels.Limits(),  # noqa: B008  # a tuple
 ) -> tuple[int, Heading]:
-    """Follow the disc through images (n, 2, height, width); returns the frames before it was lost, and the heading.
+    """Follow the disc through images (n, 2, height, width).
 
     limits : beyond which a dot is refused
+    returns : number of frames until the disc was lost, and the heading there
     """
-    known = Heading(*((np.array(R, order="C"), np.array(t)) for R, t in heading))  # the loop moves them on
+    known = Heading(*((np.array(R, order="C"), np.array(t)) for R, t in heading))  # copies: the loop updates them
     blur, noise = np.array([edge.blur_px for edge in follower.edges]), np.array([edge.noise for edge in follower.edges])
     fixed = follower.maps, stacked(follower.rig), face_of(follower.disc), blur, noise, limits
     filled = rows.results, rows.status, rows.R, rows.t
@@ -118,7 +119,7 @@ def run(
 
 
 def empty_tables(n: int, m: int) -> Tables:
-    """Tables of n pairs and m dots in which nothing was looked for."""
+    """Tables of n pairs and m dots before any search."""
     return Tables(
         results=np.full((n, 2, m), np.nan, kernels.DOT),
         status=np.full((n, 2, m), MarkerStatus.NOT_LOOKED_FOR, np.uint8),
@@ -130,18 +131,18 @@ def empty_tables(n: int, m: int) -> Tables:
 
 
 def follow_block(follower: Follower, images: Image, readable: Mask, tables: Tables, start: int) -> None:
-    """Fill the tables' rows from `start` on with what n pairs show; images (n, 2, height, width), readable (n, 2)."""
+    """Fill n rows of the tables, from `start` on; images (n, 2, height, width), readable (n, 2)."""
     n, i = len(images), 0
     rows = tables.part(slice(start, start + n))
-    # an image of one camera alone that is a copy of an earlier one: no two are equal, by their noise. Where both are,
-    # nothing may have moved: that is judged by the motion
+    # a copy of an earlier image in one camera is a fault, as noise makes all images differ. If both cameras repeat,
+    # the disc may be at rest: that is decided later, from the motion
     rows.digest[...] = np.where(readable, _digests(images), 0)
     repeated = repeats(tables.digest[max(follower.first_row, start - REPEAT_REACH) : start + n])[-n:]
     readable = readable & (~repeated | repeated.all(axis=1, keepdims=True))
     while i < n:
         anew = follower.lost is not None
         seen = bool(readable[i].any())
-        if not seen:  # what was searched in vain before tells nothing of what comes after
+        if not seen:  # earlier failures do not predict what comes after a gap
             follower.failures = 0
         if not seen or (anew and not recover(follower, images[i:], readable[i:])):
             rows.frame_status[i] = FrameStatus.MARKERS_NOT_FOUND if seen else FrameStatus.UNREADABLE
@@ -159,9 +160,9 @@ def follow_block(follower: Follower, images: Image, readable: Mask, tables: Tabl
 
 
 def _digests(images: Image) -> NDArray[np.uint64]:
-    """(n, 2) sums over words of rows enough of each image (n, 2, height, width) to tell noise from noise; not 0.
+    """(n, 2) checksums of images (n, 2, height, width), never 0: sums of words over some rows, which differ by noise.
 
-    What it costs is fetching the rows: of large images fewer will do.
+    The cost is that of reading the rows from memory: fewer of large images suffice.
     """
     rows = np.ascontiguousarray(images[:, :, :: 16 if images.shape[2] < 512 else 32])
     words = rows.reshape(*rows.shape[:2], -1).view(np.uint8)
@@ -170,7 +171,7 @@ def _digests(images: Image) -> NDArray[np.uint64]:
 
 
 def repeats(digest: NDArray[np.uint64]) -> Mask:
-    """(n, 2) True where a camera's image is one of those REPEAT_REACH frames before; digest (n, 2), 0 for no image."""
+    """(n, 2) True if an image equals one of the REPEAT_REACH before it; digest (n, 2), 0 if there is no image."""
     repeated = np.zeros(digest.shape, bool)
     for back in range(1, min(REPEAT_REACH, len(digest) - 1) + 1):
         repeated[back:] |= (digest[back:] == digest[:-back]) & (digest[back:] != 0)
@@ -178,10 +179,10 @@ def repeats(digest: NDArray[np.uint64]) -> Mask:
 
 
 def recover(follower: Follower, images: Image, readable: Mask) -> bool:
-    """Set a heading that leads to the disc in the first of the pairs; False where it is not found.
+    """Set a heading that predicts the disc in the first of the pairs; False if it is not found.
 
-    First its last motion is carried on, with no acceleration, which one bad pose would have spoilt: that costs no more
-    than any other frame; then it is searched for in the whole images, after waits that grow by a frame each time.
+    First the last motion is extrapolated, at the cost of one frame. Velocity is constant, as one bad pose would spoil
+    an acceleration. Then the whole images are searched, after waits that grow by a frame with each failure.
     """
     if follower.heading is not None and follower.lost is not None and follower.lost <= PATIENCE:
         carried = follower.heading.carried_on(follower.lost)
@@ -198,7 +199,7 @@ def recover(follower: Follower, images: Image, readable: Mask) -> bool:
 
 
 def _holds(follower: Follower, heading: Heading, images: Image, readable: Mask) -> bool:
-    """True where the first of the pairs shows dots enough at the place where the heading leads."""
+    """True if enough dots are measured in the first of the pairs at the predicted pose."""
     trial = empty_tables(1, follower.disc.n_markers)
     done, _ = run(follower, heading, images[:1], readable[:1], trial)
     if done and _enough(trial.status):
@@ -213,13 +214,13 @@ def _holds(follower: Follower, heading: Heading, images: Image, readable: Mask) 
 
 
 def _enough(status: NDArray[np.uint8]) -> bool:
-    """True where a pose with dots of this status (1, 2, m) is not chance."""
+    """True if a pose with dots of this status (1, 2, m) cannot be due to chance."""
     found = int(np.sum(status == MarkerStatus.MEASURED))
     return found >= min(MIN_TO_BEGIN, status.shape[-1])
 
 
 def _go_back(follower: Follower, images: Image, readable: Mask, rows: Tables, found: int) -> None:
-    """Follow the disc backwards from where it was found anew, through frames of the block that have no pose."""
+    """Follow the disc backwards from frame `found`, through preceding frames of the block without a pose."""
     first = found
     while first > 0 and rows.frame_status[first - 1] == FrameStatus.MARKERS_NOT_FOUND:
         first -= 1
@@ -240,9 +241,9 @@ def _go_back(follower: Follower, images: Image, readable: Mask, rows: Tables, fo
 
 
 def _search(follower: Follower, images: Image, readable: Mask) -> bool:
-    """Search the whole of the first pair; at first also measure blur and noise.
+    """Search the whole images of the first pair; the first time also measure blur and noise.
 
-    The disc goes on as from the pair before, where it was seen in that, and else is taken to rest.
+    The velocity is that from the pose of the pair before, or zero if there is none.
     """
     pose, _, reason = acquire(np.where(readable[0, :, None, None], images[0], 0), follower.rig, follower.disc)
     follower.first_reason = follower.first_reason or reason
@@ -259,7 +260,7 @@ def _search(follower: Follower, images: Image, readable: Mask) -> bool:
 
 
 def _nearest_alike(pose: Pose, following: Pose, disc: Disc) -> Pose:
-    """Of the poses at which the dots look as at `following`, the one with the least turn from `pose`."""
+    """Of the poses equivalent to `following` by symmetry of the dots, the one with the least turn from `pose`."""
     R, t = following
     order = symmetry_order(disc)
     alike = R @ rotation_z(2 * np.pi * np.arange(order) / order)
@@ -267,12 +268,12 @@ def _nearest_alike(pose: Pose, following: Pose, disc: Disc) -> Pose:
 
 
 def _measure_blur_and_noise(follower: Follower, images: Image, readable: Mask, heading: Heading) -> None:
-    """Measure the law of the cameras' noise and blur; where the disc is not there after all, nothing is kept."""
+    """Measure noise and blur of the cameras; `measured` stays False if the disc is not seen."""
     n, saturated = min(NOISE_FRAMES, len(images)), list(follower.saturated)
     edges = [Edge(noise=rough_noise(images[seen.argmax(), camera])) for camera, seen in enumerate(readable[:n].T)]
-    # the second time with the blur of the first, and with what dots usually leave for noise
+    # the second time with the blur and the residual noise of the first
     for limits in (kernels.Limits(blur=np.inf, share=MOST_USUAL), kernels.Limits()):
-        # how the noise is taken to be tells why dots are refused, if they are
+        # kept also if the fit fails: the status of the dots depends on the noise assumed
         follower.edges, trial = tuple(edges), empty_tables(n, follower.disc.n_markers)
         done, _ = run(follower, heading, images[:n], readable[:n], trial, limits)
         if done == 0 or not _enough(trial.status[:1]):
@@ -280,7 +281,7 @@ def _measure_blur_and_noise(follower: Follower, images: Image, readable: Mask, h
         for camera in range(2):
             fits = trial.results[:done, camera][trial.status[:done, camera] == MarkerStatus.MEASURED]
             if len(fits):
-                noise = noise_left(edges[camera].noise, fits)
+                noise = residual_noise(edges[camera].noise, fits)
                 blur, level, contrast = (float(np.median(fits[name])) for name in ("sigma", "level", "contrast"))
                 edges[camera] = Edge(blur, level, contrast, noise)
                 saturated[camera] = _saturated(images[:done, camera], fits, noise)
@@ -288,7 +289,7 @@ def _measure_blur_and_noise(follower: Follower, images: Image, readable: Mask, h
 
 
 def _saturated(images: Image, fits: NDArray, noise: NoiseModel) -> int | None:
-    """Grey value at which the brighter side of the edges of dots (k,) of DOT is clipped; None where it is not."""
+    """Grey value at which the brighter side of the edges of dots (k,) of DOT is clipped; None if it is not."""
     saturation = saturation_level(images)
     level = float(np.median(fits["level"] * (1.0 - np.minimum(fits["contrast"], 0.0))))
     if saturation is None or saturation - level >= 3.0 * np.sqrt(noise.variance(np.array(level))):

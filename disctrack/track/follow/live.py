@@ -1,7 +1,7 @@
-"""Poses while the camera runs: one pair in, one pose out, with the state that links them.
+"""Poses while the camera runs: one pair in, one pose out, with the state of the tracking kept in between.
 
-The same compiled loop as for recordings, a pair at a time; what `track` learns from the whole recording (the dots as
-printed, their scatter) is not known yet, so the disc should be one that was measured before.
+The same compiled loop as for recordings, one pair at a time. What `track` estimates from a whole recording (positions
+of the dots, their scatter) is not known yet: so use a disc that was measured before.
 """
 
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ from disctrack.trajectory import FrameStatus, coordinate_sigma
 
 @dataclass(frozen=True, repr=False)
 class LivePose:
-    """Pose of the disc in one pair, with what is needed to judge it; NaN where `status` has no pose.
+    """Pose of the disc in one pair, with its quality; NaN if `status` has no pose.
 
     >>> tracker, pairs = Tracker("clip/results/rig.h5", read_trajectory("clip")), open_pairs("clip")
     >>> pose = tracker.next(pairs.left.read(0), pairs.right.read(0))
@@ -33,7 +33,7 @@ class LivePose:
     ((6,), (6,))
     """
 
-    frame: int  # pairs since the tracker was made
+    frame: int  # number of the pair, from 0
     q: Array  # (6,) x, y, z [m], psi, theta, phi [rad]; angles unwrapped since the disc was last found
     R_world_body: Array  # (3, 3)
     covariance: Array  # (6, 6) noise of this pair, in POSE_COMPONENTS (frames.py); calibration not included
@@ -59,11 +59,11 @@ class LivePose:
 
 
 class Tracker:
-    """Follows the disc through pairs as they come.
+    """Follows the disc through a live sequence of pairs.
 
     rig, disc : of the set-up, from `read_rig` and a trajectory or recording; nothing is refined over the sequence
-    The first pairs compile (once per installation) and search the disc; after that a pair takes
-    about a millisecond. A pair in which the disc is not found is answered with a status, and searched anew at the next.
+    With the first pairs the code is compiled (once per installation) and the disc is searched for; later pairs take
+    about a millisecond each. If the disc is not found, `status` says so, and the next pair is searched.
 
         >>> tracker, pairs = Tracker("clip/results/rig.h5", read_trajectory("clip")), open_pairs("clip")
         >>> tracker.next(pairs.left.read(0), pairs.right.read(0)).status.name
@@ -102,7 +102,7 @@ class Tracker:
         return np.stack([left, right])[None]
 
     def _pose(self, rows: Tables) -> LivePose:
-        """What the rows say of one pair; a pair without a pose is one without dots."""
+        """Pose of one pair from its row of the tables; without a pose the pair has no dots either."""
         followed = rows.frame_status
         if followed[0] != FrameStatus.MEASURED:
             self._angles, rows = None, empty_tables(1, self.disc.n_markers)

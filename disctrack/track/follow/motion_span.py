@@ -1,9 +1,9 @@
-"""Where the motion of a recording starts and ends, from a few of its frames, before anything is measured.
+"""Start and end of the motion in a recording, from a few of its frames, before anything is measured.
 
-From each end of the recording, frames at intervals are held against the frame at that end until one differs: what lies
-before it, less a margin, is rest. Only the ends are looked at, so a recording that moves throughout costs eight pairs,
-and a pause in the middle stays. "Differs" means more than noise, a change of the light as a whole, or trembling below
-VIBRATION_PX: anything else counts as motion, a hand as well as the disc, so that doubt costs time and not data.
+From each end of the recording, frames at intervals are compared with the frame at that end until one differs: all
+before it, minus a margin, is rest. Only the ends are searched, so a recording without rest costs eight pairs, and a
+pause in the middle is kept. A frame differs if it changes by more than noise, a global change of brightness, or
+vibration below VIBRATION_PX. All else counts as motion, also a hand, so that doubt costs time and not data.
 """
 
 from collections.abc import Callable, Iterator
@@ -20,26 +20,26 @@ from disctrack.recording.readers.base import FrameReader
 
 Pair = tuple[NDArray, NDArray]
 
-STRIDE = 16  # frames between two looks; irregular by up to 5, so that no turn of the disc comes back to every look
-MARGIN = 0.25  # [s] kept before the last frame at rest: a disc that tips over starts below what can be seen
+STRIDE = 16  # frames between two samples; irregular by up to 5, so that no period of the disc is in step with them
+MARGIN = 0.25  # [s] kept before the last frame at rest: a disc that tips over starts too slowly to be seen
 THRESHOLD = 5.0  # sigmas; of 65 000 pixels 0.04 exceed it by chance
-MIN_PIXELS = 12  # of a quarter of the image's pixels: fewer are hot pixels or an insect
-VIBRATION_PX = 0.03  # a fan's trembling; motion shows from THRESHOLD times this on, summed since rest
+MIN_PIXELS = 12  # in the image of half size: fewer are hot pixels or an insect
+VIBRATION_PX = 0.03  # by a fan; motion is detected from THRESHOLD times this displacement on
 NOISE_BINS = 16
 
 
 @dataclass(frozen=True)
 class MotionSpan:
-    """Frames start..stop-1 hold everything that moves, with a margin at either end."""
+    """Frames start..stop-1 contain all motion, with a margin at either end."""
 
     start: int
     stop: int
-    looked_at: int  # pairs read for this
+    looked_at: int  # number of pairs read
     verdict: str
 
 
 def still_scene(first: NDArray, second: NDArray) -> Callable[[NDArray], bool]:
-    """Of one camera's view at rest: whether more has changed in an image than noise and the brightness of the whole."""
+    """Test for motion from two images at rest: has an image changed by more than noise and global brightness?"""
     mean = _reduced(first)
     steep = np.hypot(cv2.Sobel(mean, -1, 1, 0, scale=0.125), cv2.Sobel(mean, -1, 0, 1, scale=0.125))
     tremble = 0.5 * VIBRATION_PX * steep  # the reduced image has half the pixels per side
@@ -57,16 +57,16 @@ def still_scene(first: NDArray, second: NDArray) -> Callable[[NDArray], bool]:
 
 
 def _reduced(image: NDArray) -> Array32:
-    """Means of two by two pixels, in steps of the grey value: images of any depth alike."""
+    """Means of two by two pixels, in steps of the grey value, so that the bit depth does not matter."""
     height, width = image.shape[0] // 2, image.shape[1] // 2
     whole = image[: 2 * height, : 2 * width].astype(np.float32) / np.float32(level_step(image))
     return np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA), np.float32)
 
 
 def _noise(mean: Array32, difference: Array32, steep: Array32) -> float:
-    """Variance of a difference of two reduced images at rest, of flat parts at the grey value where it is largest.
+    """Variance of the difference of two reduced images at rest, in flat regions; the largest over the grey values.
 
-    Medians, because the two images may already show motion; where things move, they move at edges.
+    A robust estimate, because something may already move; motion changes the image at edges.
     """
     flat = steep <= np.quantile(steep, 0.6)
     alike = np.array_split(difference[flat][np.argsort(mean[flat])], NOISE_BINS)
@@ -74,9 +74,9 @@ def _noise(mean: Array32, difference: Array32, steep: Array32) -> float:
 
 
 def find_motion(left: FrameReader, right: FrameReader, start: int, stop: int, frame_rate: float) -> MotionSpan:
-    """The part of frames start..stop-1 in which something moves, with a margin of MARGIN seconds at either end.
+    """The part of frames start..stop-1 with motion, and a margin of MARGIN seconds at either end.
 
-    Frames that cannot be read are passed over.
+    Frames that cannot be read are skipped.
     """
     margin = max(int(np.ceil(MARGIN * frame_rate)), 2 * STRIDE)
     if stop - start < 2 * margin:
@@ -92,7 +92,7 @@ def find_motion(left: FrameReader, right: FrameReader, start: int, stop: int, fr
 
 
 def _last_still(left: FrameReader, right: FrameReader, frames: range) -> tuple[int | None, int]:
-    """Last of the frames, from the first on, that shows what the first shows, None where all do; pairs looked at."""
+    """Last of the sampled frames before one that differs from the first, None if none does; number of pairs read."""
     scenes: list[Pair] = []
     last, looked = frames[0], 0
     for frame in _looks(frames):
@@ -111,7 +111,7 @@ def _last_still(left: FrameReader, right: FrameReader, frames: range) -> tuple[i
 
 
 def _looks(frames: range) -> Iterator[int]:
-    """Frames to look at: two neighbours, one in STRIDE, and the last."""
+    """Frames that are sampled: the first two, one in STRIDE, and the last."""
     yield from frames[:2]
     for offset in (STRIDE * i + 5 * i * i % 11 - 5 for i in range(1, len(frames) // STRIDE + 1)):
         if offset < len(frames) - 1:

@@ -1,6 +1,6 @@
-"""From pairs of images to the trajectory: stretches that are followed side by side, and joined.
+"""From pairs of images to the trajectory: stretches of the recording are followed in parallel, and joined.
 
-The disc is followed through each stretch in `following`; what comes of it is put together in `assembly`.
+The disc is followed through each stretch in `following`; the trajectory is assembled in `assembly`.
 """
 
 from collections.abc import Callable, Iterable
@@ -29,14 +29,14 @@ from disctrack.track.refine.assembly import Measurement, Taken, TrackingSettings
 from disctrack.track.side_by_side import evenly, stretches
 from disctrack.trajectory import FrameStatus, MarkerStatus
 
-SHORTEST_SPLIT = 1000  # pairs; a stretch must outweigh its own search for the disc, and measuring blur and noise
-# [m] off its declared place from which on a dot is looked for again, where it is. With wrong places the attitude is
-# wrong that templates are made for: places 0.1 mm off, rms, shift centres by 0.3e-3 to 2e-3 px, in all frames alike.
+SHORTEST_SPLIT = 1000  # pairs; shorter stretches do not repay the search for the disc and the noise measurement
+# [m] displacement of a dot from its declared position above which all dots are located again. Wrong positions give the
+# template a wrong attitude: an rms displacement of 0.1 mm shifts centres by 0.3e-3 to 2e-3 px, in all frames alike.
 LOOK_AGAIN = 60e-6
-DECLARED = (Kind.DOTS_MISPLACED, Kind.TABLE_DISAGREES)  # of numbers, not of images
-APART, PAIRED = 10, 60  # frames without dots of both cameras, from which on others are paired; of so many
-PAIRS_TRIED = 12  # for pixels that do not see, and for what is wrong where no disc is found
-MAX_EDGE_TURN = np.radians(25.0)  # by which the poses on both sides of an edge may miss each other's prediction
+DECLARED = (Kind.DOTS_MISPLACED, Kind.TABLE_DISAGREES)  # findings about declared numbers, not about images
+APART, PAIRED = 10, 60  # frames: contradictory ones in a row that start a test for dropped frames; length of the test
+PAIRS_TRIED = 12  # for the search of stuck pixels, and of the cause if the disc is not found
+MAX_EDGE_TURN = np.radians(25.0)  # largest error of the prediction across the edge of two stretches
 
 
 ReadBlocks = Callable[[int, int], Iterable[PairBlock]]  # pairs start ... stop-1, in order
@@ -62,10 +62,10 @@ def track(
 ) -> Measurement:
     """Measure the disc's pose in every pair of a recording.
 
-    read_blocks(start, stop) gives the pairs start..stop-1 in blocks, in order; taken: which to measure (step 1).
-    workers: threads that follow stretches of a long recording side by side; the result is the same to the last bit for
-    any number of them. progress(n) is called when n more pairs are done, from any thread but one at a time.
-    Raises TrackingError if the images do not belong to the rig or if the disc is found in no pair at all.
+    read_blocks(start, stop) yields the pairs start..stop-1 in blocks, in order; taken: the pairs to measure (step 1).
+    workers: threads that follow stretches of a long recording in parallel; the result does not depend on their number,
+    to the last bit. progress(n) is called when n more pairs are done, from any thread but one at a time.
+    Raises TrackingError if the images do not belong to the rig or if the disc is found in no pair.
     """
     settings, pairs = settings or TrackingSettings(), taken.pairs
     _check_dots(disc)
@@ -73,9 +73,9 @@ def track(
     begin = Follower(rig, disc, maps_of(rig))
     edges = stretch_edges(pairs, disc)
 
-    def measured(looked_for: Disc, progress: Callable[[int], object]) -> Measurement:
-        """With the dots looked for at the places of a disc."""
-        followers, tables = _followed(read_blocks, edges, replace(begin, disc=looked_for), workers, progress)
+    def measured(expected: Disc, progress: Callable[[int], object]) -> Measurement:
+        """With the dots expected at the positions of a disc."""
+        followers, tables = _followed(read_blocks, edges, replace(begin, disc=expected), workers, progress)
         if not np.isfinite(tables.t).any():
             raise _not_found(followers, pairs, why_not_seen(_some(read_blocks, pairs), rig, disc))
         for follower in followers:
@@ -83,17 +83,17 @@ def track(
         return assemble(followers, tables, settings, taken, workers)
 
     tracking = measured(disc, progress)
-    slips = _slips(tracking, read_blocks, pairs, begin)
-    for slip in slips:
-        read_blocks = _without(read_blocks, frames.CAMERAS.index(slip.subject.camera), slip.subject.frames[0][0])
+    dropped = _dropped(tracking, read_blocks, pairs, begin)
+    for finding in dropped:
+        read_blocks = _without(read_blocks, frames.CAMERAS.index(finding.subject.camera), finding.subject.frames[0][0])
         tracking = measured(disc, lambda n: None)
     found = tracking.trajectory.disc
     if np.abs(found.marker_centres_body - disc.marker_centres_body).max() > LOOK_AGAIN and not _faulty(
         tracking.trajectory.findings
     ):
         tracking = measured(found, lambda n: None)
-    noticed = (*slips, *tracking.trajectory.findings)
-    arranged = why_not_seen(_senseless(tracking, noticed, read_blocks, pairs), rig, disc)
+    noticed = (*dropped, *tracking.trajectory.findings)
+    arranged = why_not_seen(_conflicts(tracking, noticed, read_blocks, pairs), rig, disc)
     return replace(tracking, trajectory=replace(tracking.trajectory, findings=(*arranged, *noticed, *stuck)))
 
 
@@ -103,7 +103,7 @@ def _faulty(noticed: Iterable[Finding]) -> bool:
 
 
 def _check_dots(disc: Disc) -> None:
-    """Raise TrackingError unless they tell a pose."""
+    """Raise TrackingError unless the dots determine a pose."""
     spread = disc.marker_centres_body - disc.marker_centres_body.mean(axis=0)
     if disc.n_markers < 3 or np.linalg.matrix_rank(spread, tol=0.1 * disc.marker_diameter) < 2:
         raise TrackingError(
@@ -113,8 +113,8 @@ def _check_dots(disc: Disc) -> None:
         )
 
 
-def _slips(tracking: Measurement, read_blocks: ReadBlocks, pairs: range, begin: Follower) -> tuple[Finding, ...]:
-    """Images left out by one camera, by the pairing that fits the frames after it."""
+def _dropped(tracking: Measurement, read_blocks: ReadBlocks, pairs: range, begin: Follower) -> tuple[Finding, ...]:
+    """Images left out by one camera, from the pairing that fits the frames after the gap."""
     apart = _apart(tracking) | (max(tracking.details["systematic_px"]) > MEETING_PX / 2)
     long = stretches(apart, APART)
     if not len(long) or Kind.DELAY in {finding.kind for finding in tracking.trajectory.findings}:
@@ -128,14 +128,14 @@ def _slips(tracking: Measurement, read_blocks: ReadBlocks, pairs: range, begin: 
 
 
 def _apart(tracking: Measurement) -> Mask:
-    """(n,) frames in which dots were looked for in both images, and make no sense together."""
+    """(n,) frames that were searched in both images, and whose dots contradict each other."""
     status = tracking.trajectory.frame_status
     looked = (tracking.trajectory.marker_status != MarkerStatus.NOT_LOOKED_FOR).any(axis=2).all(axis=1)
     return looked & ((status == FrameStatus.ONE_CAMERA) | (status == FrameStatus.CONTRADICTED))
 
 
 def _without(read_blocks: ReadBlocks, camera: int, since: int) -> ReadBlocks:
-    """The same, but for a camera's images from a frame on."""
+    """The same blocks without a camera's images from frame `since` on."""
 
     def without(block: PairBlock) -> PairBlock:
         gone = {(int(frame), camera): "of another instant" for frame in block.frames if frame >= since}
@@ -144,24 +144,24 @@ def _without(read_blocks: ReadBlocks, camera: int, since: int) -> ReadBlocks:
     return lambda start, stop: map(without, read_blocks(start, stop))
 
 
-def _senseless(tracking: Measurement, noticed: tuple[Finding, ...], read_blocks: ReadBlocks, pairs: range) -> NDArray:
-    """(k, 2, height, width) images in which the dots make no sense as declared; none where they do."""
+def _conflicts(tracking: Measurement, noticed: tuple[Finding, ...], read_blocks: ReadBlocks, pairs: range) -> NDArray:
+    """(k, 2, height, width) images whose dots contradict the declaration; none if the recording agrees with it."""
     kinds = {finding.kind for finding in noticed}
     status = tracking.trajectory.frame_status
     contradicted = Kind.ONE_SIDED in kinds or 2 * np.sum(status == FrameStatus.CONTRADICTED) > len(status)
     far = _faulty(noticed) and max(tracking.details["systematic_px"]) > MEETING_PX
-    if not (contradicted or far) or Kind.DROPPED_FRAMES in kinds:  # which makes cameras contradict each other
+    if not (contradicted or far) or Kind.DROPPED_FRAMES in kinds:  # dropped frames explain the contradiction
         return _some(read_blocks, pairs[:0])
     rows = np.flatnonzero(_apart(tracking) | (far & (status == FrameStatus.MEASURED)))
     return _some(read_blocks, pairs[rows[0] :] if len(rows) else pairs[:0])
 
 
 def _not_found(followers: list[Follower], pairs: range, why: tuple[Finding, ...]) -> TrackingError:
-    """The disc was seen in no pair."""
+    """Error if the disc was found in no pair."""
     reason = next((f.first_reason for f in followers if f.first_reason), "")
     end = "" if reason.endswith("?") else "."
-    told = f"First search: {reason.rstrip('.')}{end} {MOVED}" if reason else "No image could be read"
-    return TrackingError(f"the disc was found in none of the pairs {pairs.start}-{pairs.stop - 1}", told, why)
+    text = f"First search: {reason.rstrip('.')}{end} {MOVED}" if reason else "No image could be read"
+    return TrackingError(f"the disc was found in none of the pairs {pairs.start}-{pairs.stop - 1}", text, why)
 
 
 def _followed(
@@ -171,21 +171,21 @@ def _followed(
     workers: int,
     progress: Callable[[int], object],
 ) -> tuple[list[Follower], Tables]:
-    """The disc followed through the stretches between edges; arguments as of `track`."""
+    """Follow the disc through the stretches between the edges; other arguments as for `track`."""
     first = edges[0]
     tables = empty_tables(edges[-1] - first, begin.disc.n_markers)
     followers = [replace(begin, first_row=edge - first) for edge in edges[:-1]]
-    given_up, telling = Event(), Lock()
+    given_up, reporting = Event(), Lock()
 
-    def follow(k: int, tell: Callable[[int], object]) -> None:
+    def follow(k: int, report: Callable[[int], object]) -> None:
         """Follow the disc through one of the stretches."""
         for block in read_blocks(edges[k], edges[k + 1]):
             if given_up.is_set():
                 break
             check_images(block.images.shape[:1:-1], begin.rig)
             follow_block(followers[k], block.images, block.readable, tables, int(block.frames[0]) - first)
-            with telling:
-                tell(len(block.images))
+            with reporting:
+                report(len(block.images))
 
     with ThreadPoolExecutor(max(1, workers), thread_name_prefix="track") as pool:
         try:
@@ -195,27 +195,27 @@ def _followed(
             raise
     for k in range(1, len(followers)):
         start, before = edges[k] - first, followers[k - 1]
-        if _torn(tables, start):  # another branch of phi was found: go on from the stretch before
+        if _discontinuous(tables, start):  # another branch of phi was found: continue from the stretch before
             followers[k] = replace(before, lost=None, first_row=start)
-            gone = tables.part(slice(start, edges[k + 1] - first))
+            stretch = tables.part(slice(start, edges[k + 1] - first))
             for name, empty in vars(empty_tables(1, begin.disc.n_markers)).items():
-                getattr(gone, name)[...] = empty
+                getattr(stretch, name)[...] = empty
             follow(k, lambda n: None)
     return followers, tables
 
 
 def _some(read_blocks: ReadBlocks, pairs: range) -> NDArray:
-    """(k, 2, height, width) images of some of the pairs, from all over them, that can be read."""
+    """(k, 2, height, width) images of some of the pairs, evenly spread, that can be read."""
     chosen = evenly(np.array(pairs), PAIRS_TRIED).tolist()
     found = [block.images[block.readable.all(axis=1)].copy() for i in chosen for block in read_blocks(i, i + 1)]
     return np.concatenate(found) if found else np.zeros((0, 2, 1, 1), np.uint8)
 
 
 def stretch_edges(pairs: range, disc: Disc) -> list[int]:
-    """First pairs of the stretches that a recording is followed in, and the end of the last.
+    """First pairs of the stretches into which a recording is divided, and the end of the last.
 
-    They depend on the length alone, so that the result does not depend on who follows them. Where the dots leave phi
-    open by a symmetry, every new start could choose another branch: then there is one stretch.
+    They depend on the length alone, so that the result does not depend on the number of threads. If phi is ambiguous
+    by a symmetry of the dots, every new start could choose another branch: then there is one stretch.
     """
     n, count = len(pairs), 1
     while n >= SHORTEST_SPLIT * count**2 and symmetry_order(disc) == 1:
@@ -224,8 +224,8 @@ def stretch_edges(pairs: range, disc: Disc) -> list[int]:
 
 
 def _as_one_sensor(read_blocks: ReadBlocks, pairs: range) -> tuple[ReadBlocks, list[Finding]]:
-    """Blocks without a colour filter's pattern and pixels that do not see, and both as findings."""
-    # from all over the recording: within a millisecond a disc moves by less than a pixel, and edges look stuck, too
+    """Blocks corrected for a colour filter's pattern and stuck pixels, and both as findings."""
+    # evenly spread: within a millisecond the disc moves by less than a pixel, and its edges would look stuck, too
     images = _some(read_blocks, pairs)
     sensors, said = [], []
     for camera, name in enumerate(frames.CAMERAS):
@@ -257,14 +257,14 @@ def _as_one_sensor(read_blocks: ReadBlocks, pairs: range) -> tuple[ReadBlocks, l
 
 
 def _without_mosaic(images: NDArray, gains: NDArray) -> NDArray:
-    """Images (..., height, width), uint8 or uint16, as a sensor without the filter gives them; gains (2, 2)."""
+    """Images (..., height, width), uint8 or uint16, divided by the gains (2, 2) of the colour filter."""
     height, width = images.shape[-2:]
     pattern = np.tile(gains, (height // 2 + 1, width // 2 + 1))[:height, :width]
     return np.clip(np.rint(images / pattern), 0, np.iinfo(images.dtype).max).astype(images.dtype)
 
 
-def _torn(tables: Tables, edge: int) -> bool:
-    """True where the poses before row `edge` do not lead to its own: two starts took different dots for the same."""
+def _discontinuous(tables: Tables, edge: int) -> bool:
+    """True if the poses before row `edge` do not predict its pose: the two searches numbered the dots differently."""
     rows = slice(edge - 2, edge + 1)
     if not (tables.frame_status[rows] == FrameStatus.MEASURED).all():
         return False
@@ -274,7 +274,7 @@ def _torn(tables: Tables, edge: int) -> bool:
 
 
 def check_images(size: tuple[int, ...], rig: StereoRig, which: str = "images") -> None:
-    """Raise TrackingError unless images of this width and height [px] have the size that the rig was calibrated at."""
+    """Raise TrackingError unless this width and height [px] is the image size at which the rig was calibrated."""
     for name, camera in zip(frames.CAMERAS, rig.cameras, strict=True):
         if camera.image_size != size:
             raise TrackingError(

@@ -12,7 +12,7 @@ from calibration.cameras.camera import normalised_maps
 from disctrack import MarkerStatus, frames
 from disctrack.synthetic.cameras import rig_of
 from disctrack.synthetic.description import Scene
-from disctrack.track.dots.template import NoiseModel, noise_left, rough_noise
+from disctrack.track.dots.template import NoiseModel, residual_noise, rough_noise
 from tests.disctrack.conftest import RenderedPairs, disc_on_table
 from tests.oracles.flat_dots import locate_on_disc, locate_on_plane
 from tests.rendering import expected_disc, render_disc
@@ -206,7 +206,7 @@ def test_what_dots_leave_is_the_sensors_law(rendered_pairs):
     pairs, law = some(rendered_pairs, slice(0, 24, 2)), rough_noise(rendered_pairs.images[0, 0])
     for _ in range(2):
         dots = np.concatenate([each.dots for each in locate_all(pairs, pairs.images, law)[2]])
-        law = noise_left(law, dots[np.isfinite(dots["u"])])
+        law = residual_noise(law, dots[np.isfinite(dots["u"])])
     # the median of some hundred dots of 700 pixels, half of which lie in the edge
     assert_allclose(law.variance(np.array([25.0, 185.0])), SENSOR_NOISE.variance(np.array([25.0, 185.0])), rtol=0.1)
 
