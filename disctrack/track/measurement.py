@@ -1,7 +1,4 @@
-"""The measurement from end to end: a recording's files, or frames in memory, become a trajectory.
-
-With what is needed to reuse results.
-"""
+"""The complete measurement: a recording's files, or frames in memory, become a trajectory with its provenance."""
 
 import dataclasses
 import hashlib
@@ -38,9 +35,9 @@ from disctrack.trajectory import FrameStatus, at_full_length
 from disctrack.trajectory.file import Provenance
 
 Progress = Callable[[int], None]
-Images = NDArray[np.generic]  # of any real type; uint8 and uint16 are measured where they are
+Images = NDArray[np.generic]  # of any real type; uint8 and uint16 are not copied
 
-WHOLE_BELOW = 2.0  # [s] a recording as short as this was cut to what is wanted, and rest in it is wanted too
+WHOLE_BELOW = 2.0  # [s] shorter recordings were cut by the user, and are measured including rest
 BLOCK = 64  # pairs in memory
 
 
@@ -52,13 +49,13 @@ class ImagePairs:
     right: FrameReader
     start: int
     stop: int
-    findings: tuple[Finding, ...] = ()  # how the frames are read, and what had to be assumed of their instants
+    findings: tuple[Finding, ...] = ()  # about reading the frames, and assumptions about their times
 
     def __len__(self) -> int:
         return self.stop - self.start
 
     def reading(self, not_read: NotRead, threads: int | None = None) -> ReadBlocks:
-        """What gives pairs start..stop-1 in blocks; images that cannot be read are put into `not_read`."""
+        """Function that yields pairs start..stop-1 in blocks; images that cannot be read are added to `not_read`."""
 
         def read_blocks(start: int, stop: int) -> Iterator[PairBlock]:
             for block in iter_pair_blocks(self.left, self.right, start, stop, threads=threads):
@@ -68,10 +65,10 @@ class ImagePairs:
         return read_blocks
 
     def camera_headers(self) -> dict[str, Any]:
-        """Under "camera_headers" what the cameras wrote about themselves (exposure, trigger, ...), if anything."""
+        """Settings that the cameras wrote (exposure, trigger, ...) under "camera_headers", if any."""
         both = zip(CAMERAS, (self.left.header, self.right.header), strict=True)
-        told = {name: header.as_dict() for name, header in both if header is not None}
-        return {"camera_headers": told} if told else {}
+        headers = {name: header.as_dict() for name, header in both if header is not None}
+        return {"camera_headers": headers} if headers else {}
 
     def inputs(self) -> dict[str, str]:
         """SHA-256 of each camera's frames."""
@@ -84,8 +81,8 @@ class ImagePairs:
 def open_pairs(recording: Recording, frames: tuple[int | None, int | None] = (None, None)) -> ImagePairs:
     """Open both cameras. frames: first and one past the last frame to measure, None for the recording's ends.
 
-    Raises RecordingError if images are missing, do not belong together, or the range holds no frame; or if a camera's
-    own header contradicts the other's, or the declared frame rate.
+    Raises RecordingError if images are missing or do not belong together, if the range contains no frame, or if the
+    header of a camera contradicts that of the other or the declared frame rate.
 
         >>> len(open_pairs("clip", frames=(100, 200)))
         100
@@ -116,7 +113,7 @@ def open_pairs(recording: Recording, frames: tuple[int | None, int | None] = (No
 
 
 def check_rig(rig: StereoRig, pairs: ImagePairs) -> None:
-    """Raise TrackingError that names the file unless the rig was calibrated at the recording's image size."""
+    """Raise TrackingError, with the file's name, unless the rig was calibrated at the recording's image size."""
     for reader in (pairs.left, pairs.right):
         check_images(reader.image_size, rig, f"{reader.describe(pairs.start)}: {reader.camera} images")
 
@@ -134,8 +131,8 @@ def measure(
 ) -> Measurement:
     """Track the disc through the pairs; the trajectory has the length of the recording.
 
-    Images that cannot be read are lost frames, named in the result. progress is called with the pairs done.
-    boards : of the calibration's views, with what was noticed in it
+    Images that cannot be read are lost, and listed in the result. progress is called with the number of pairs done.
+    boards : of the calibration's views, with its findings
     Raises TrackingError if the disc is found in no frame.
 
         >>> measurement = measure("clip", "clip/results/rig.h5", open_pairs("clip"))
@@ -148,7 +145,7 @@ def measure(
     if recording.table is not None:
         settings = dataclasses.replace(settings, table=recording.table.source)
     stamps = usable_times(pairs.left, recording.frame_rate)
-    with compiling("tracking", 15):  # not the camera's time: done once per installation
+    with compiling("tracking", 15):  # once per installation, not counted as measuring time
         prepare(np.uint8 if pairs.left.bit_depth == 8 else np.uint16)
     began = time.perf_counter()
     span = _span(pairs, recording.frame_rate, settings)
@@ -195,9 +192,9 @@ def measure_pairs(
     """Measure the disc's pose in every pair; every frame is measured (no rest is left out).
 
     images     : (n, 2, height, width) grey values, left and right; or the pair of arrays (n, height, width)
-    rig, disc  : or what holds them: the path of a rig file, a calibration, a recording
-    frame_rate : [Hz]; timestamps (n,) [s], increasing, where the camera wrote them
-    gravity    : [m/s^2], kept with the trajectory for the physics
+    rig, disc  : or objects with them: the path of a rig file, a calibration, a recording
+    frame_rate : [Hz]; timestamps (n,) [s], increasing, if the camera wrote them
+    gravity    : [m/s^2], stored with the trajectory for the analysis
     Raises TrackingError if the arrays are not such images, do not belong to the rig, or show the disc in no pair.
 
         >>> pairs = open_pairs("clip")
@@ -217,7 +214,7 @@ def measure_pairs(
     def read_blocks(start: int, stop: int) -> Iterator[PairBlock]:
         for first in range(start, stop, BLOCK):
             rows = slice(first, min(first + BLOCK, stop))
-            # pairs that lie together are measured where they are: of their pixels the dots' alone are looked at
+            # a contiguous array is not copied: only the pixels of the dots are read
             together = isinstance(images, np.ndarray) and images.flags.carray
             pair = images[rows] if together else np.stack([left[rows], right[rows]], axis=1)
             yield PairBlock(np.arange(rows.start, rows.stop), pair)
@@ -257,10 +254,10 @@ def _tracked(
     threads: int,
     progress: Progress,
 ) -> Measurement:
-    """The disc tracked through the span; stamps : of all frames [s]."""
-    not_read: NotRead = {}  # some are tried twice
+    """Track the disc through the span; stamps : times of all frames [s]."""
+    not_read: NotRead = {}  # a dictionary, as some images are read twice
     tracked = range(span.start, span.stop)
-    workers = 1  # stretches that are followed side by side: one per core, where frames can be read anywhere
+    workers = 1  # stretches followed in parallel: one per core, if frames can be read in any order
     if pairs.left.random_access and pairs.right.random_access:
         workers = max(1, min(threads, len(stretch_edges(tracked, recording.disc)) - 1))
     reading = pairs.reading(not_read, max(1, threads // workers))  # each worker has its own three blocks
@@ -276,7 +273,7 @@ def _tracked(
 
 
 def images_lost(not_read: NotRead) -> tuple[Finding, ...]:
-    """What is to be said of images that could not be read."""
+    """Finding about images that could not be read."""
     if not not_read:
         return ()
     n, where = len(not_read), "their frames rest on one camera or none"
@@ -285,7 +282,7 @@ def images_lost(not_read: NotRead) -> tuple[Finding, ...]:
 
 
 def refuse_unreadable(recording: Recording, lost: NotRead, n: int, error: TrackingError) -> None:
-    """Raise RecordingError where most of n images cannot be read: that is why no disc was found in them."""
+    """Raise RecordingError if most of n images cannot be read, as this explains why no disc was found."""
     if 2 * len(lost) > n:
         raise RecordingError(
             f"{recording.folder}: the files cannot be read: {len(lost)} of {n} images, the first: {lost[min(lost)]} "
@@ -294,7 +291,7 @@ def refuse_unreadable(recording: Recording, lost: NotRead, n: int, error: Tracki
 
 
 def exposures(recording: Recording, pairs: ImagePairs) -> tuple[tuple[float, float] | None, tuple[str, ...]]:
-    """Of both cameras [s], None where nobody tells it; and where it is from, to be told."""
+    """Exposures of both cameras [s], None if not stated; and a note on their source."""
     if recording.exposure is not None:
         return (recording.exposure, recording.exposure), ()
     headers = pairs.left.header, pairs.right.header
@@ -305,7 +302,7 @@ def exposures(recording: Recording, pairs: ImagePairs) -> tuple[tuple[float, flo
 
 
 def _span(pairs: ImagePairs, frame_rate: float, settings: TrackingSettings) -> MotionSpan:
-    """What is to be tracked of the pairs."""
+    """Pairs that are tracked."""
     if not settings.first_pass:
         return MotionSpan(pairs.start, pairs.stop, 0, "every frame, as requested")
     if len(pairs) < WHOLE_BELOW * frame_rate:
@@ -319,7 +316,7 @@ def _span(pairs: ImagePairs, frame_rate: float, settings: TrackingSettings) -> M
 def trajectory_provenance(
     recording: Recording, rig: StereoRig, pairs: ImagePairs, settings: TrackingSettings | None
 ) -> Provenance:
-    """What the trajectory is made from; reads the images' content where it was not read yet.
+    """Inputs and settings of the trajectory; reads the images, unless their hash is known.
 
     >>> recording, rig = read_recording("clip"), read_rig("clip/results/rig.h5")
     >>> sorted(trajectory_provenance(recording, rig, open_pairs(recording), None).inputs)
@@ -338,6 +335,6 @@ def trajectory_provenance(
 
 
 def rig_sha256(rig: StereoRig) -> str:
-    """SHA-256 (hex) of a rig's numbers, to the last bit."""
+    """SHA-256 (hex) of all numbers of a rig, at full precision."""
     numbers = json.dumps(dataclasses.asdict(rig), default=lambda value: value.tolist())
     return hashlib.sha256(numbers.encode()).hexdigest()

@@ -13,7 +13,7 @@ Free per dot: centre (2), R, sigma, L, g (2), c. R and sigma do not couple with 
 printed too large, or motion blur, costs no accuracy.
 
 A change of the image that is not in the model biases the centre. The bias depends on the size and shape of the dot's
-image, its blur, contrast and noise, and is tabulated here (`pulls`). Only odd changes matter: size, blur and grey
+image, its blur, contrast and noise, and is tabulated here (`biases`). Only odd changes matter: size, blur and grey
 values absorb the even ones.
 """
 
@@ -102,7 +102,7 @@ def dot_centres(results: NDArray, status: NDArray[np.uint8]) -> tuple[NDArray, A
     return known, pixels, covariance.reshape(*status.shape, 2, 2)
 
 
-def pulls(radius: float, affine: Array, edge: Edge) -> tuple[Array, Array]:
+def biases(radius: float, affine: Array, edge: Edge) -> tuple[Array, Array]:
     """Biases (n, m, 2, 5) of centres by changes of the image, along its long and short axes, and rotations into these.
 
     affine (n, m, 2, 2) [px/m] from the plane of dots of this radius [m] to the image; NaN gives NaN. `_response` is

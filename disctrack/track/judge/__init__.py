@@ -1,1 +1,1 @@
-"""Which dots, poses and declarations are to be believed."""
+"""Tests of dots, poses and declared numbers for errors."""

@@ -1,16 +1,16 @@
-"""Cameras that contradict each other for a part of the recording: one of them left out images, or moved a little.
+"""Cameras that contradict each other in part of the recording: one of them dropped images, or moved a little.
 
-**Left out.** A camera that leaves out an image is ahead of the other from there on: its dots lie where they will be one
-frame later. To first order they are displaced by their velocity in the image times the delay; what of that a change of
-the pose makes up for is no sign of it.
+**Dropped images.** A camera that drops an image is ahead of the other from there on: its dots are where they should be
+one frame later. To first order they are displaced by their velocity in the image times the delay. The part of this
+that a change of the pose can absorb does not count.
 
-**Moved.** In stretches of the recording a turn of the right camera against the left one is fitted beside a free pose
-for every frame. A turn across the epipolar lines shows at once, one along them hardly, as the poses make up for it: so
-the turn in the direction that the dots know best, its scatter between stretches included, tells whether a camera moved.
-What moves it there moves it elsewhere, too: the poses are as uncertain as a turn of either camera by as much about any
-axis makes them. What a lens or misprinted dots leave depends on the disc's place: as a rule it comes back, and is part
-of the scatter; where it does not, as the disc settles, it is as much in other directions, and a turn is hardly any of
-it.
+**Moved camera.** In stretches of the recording, a rotation of the right camera relative to the left one is fitted
+together with a free pose for every frame. A rotation across the epipolar lines is well determined; one along them
+hardly, as the poses absorb it. So the best determined rotation is tested, against its scatter between stretches. A
+camera that moved in this direction may have moved in others: the poses are given the uncertainty of an equal rotation
+of either camera about any axis. Residuals of a lens or of misprinted dots depend on the position of the disc. Usually
+they recur, and are part of the scatter. If they do not, as the disc settles, they are as large in other directions, and
+a rotation explains hardly any of them.
 """
 
 from dataclasses import replace
@@ -26,17 +26,17 @@ from disctrack.numbers import Measured
 from disctrack.track.pose import DotsInFrames, PoseFits
 from disctrack.track.side_by_side import FEW, SHARED_FRAMES, evenly
 
-# Share of the square of a misfit that a delay explains, from which on it is its cause; and below which it has no part
-# in it: what a camera that moved leaves looks a little like one
+# Fraction of a squared misfit explained by a delay above which the delay is its cause, and below which it is not even
+# part of it: the residuals of a moved camera resemble those of a delay a little
 LATE, HARDLY = 0.9, 0.3
 STRETCHES = 20
-SURE = 5.0  # sigmas of the difference before and after; a drift, whose scatter is its own, reaches 7
+SURE = 5.0  # sigmas of the difference before and after; a linear drift, its own scatter, reaches 7
 
 
 def left_out(ahead: int, pairs: range, first: int) -> Finding:
-    """One camera left out images at a row of the pairs, or before: the right one where `ahead` is positive.
+    """Finding: one camera dropped images at row `first` of the pairs, or before; the right one if `ahead` is positive.
 
-    ahead : frames by which it is ahead of the other
+    ahead : frames by which the right camera is ahead of the left one
     """
     n, (camera, other), frame = abs(ahead), CAMERAS[::-1] if ahead > 0 else CAMERAS, pairs[first]
     text = (
@@ -50,11 +50,11 @@ def left_out(ahead: int, pairs: range, first: int) -> Finding:
 
 
 def frames_ahead(left: Array, right: Array) -> int:
-    """Frames by which the right camera is ahead of the left; 0 where they see one disc at once, or none tells.
+    """Frames by which the right camera is ahead of the left; 0 if they are synchronous, or if this is not determined.
 
-    left, right : (n, 3, 3) attitudes of the disc as each camera alone sees them, NaN where it does not. They are those
-    of one motion where the median of what is between them is less than half of what the disc turns in a frame, and that
-    they were taken at once explains next to nothing of it.
+    left, right : (n, 3, 3) attitudes of the disc by each camera alone, NaN if not available. A shift is accepted if the
+    median angle between the attitudes is less than half the rotation per frame, and its square less than 1 - LATE of
+    that without a shift.
     """
 
     def apart(a: Array, b: Array) -> float:
@@ -73,9 +73,9 @@ def frames_ahead(left: Array, right: Array) -> int:
 
 
 def delay_of_right(seen: DotsInFrames, rows: NDArray[np.intp]) -> tuple[float, float]:
-    """Frame periods by which the right camera is ahead of the left in these frames, and the share of misfit explained.
+    """Frame periods by which the right camera is ahead in these frames, and the fraction of the misfit explained by it.
 
-    (0, 0) where no frame has both its neighbours.
+    (0, 0) if no frame has both neighbours.
     """
     inside = rows[(rows > 0) & (rows < len(seen.t) - 1)]
     rows = evenly(inside[seen.posed[inside]], SHARED_FRAMES)
@@ -85,16 +85,16 @@ def delay_of_right(seen: DotsInFrames, rows: NDArray[np.intp]) -> tuple[float, f
     used = np.isfinite(some.pixels + velocity).all(axis=-1)
     used &= used.sum(axis=(1, 2), keepdims=True) >= 4
     free = np.append(np.zeros(N_RIG + 2 * seen.disc.n_markers, bool), True)
-    ((by_itself,),), (across,), whole = some.normal(np.zeros(len(free)), used, free)
-    if not (whole > 0 and by_itself > 0):
+    ((normal,),), (gradient,), whole = some.normal(np.zeros(len(free)), used, free)
+    if not (whole > 0 and normal > 0):
         return 0.0, 0.0
-    return float(across / by_itself), float(across**2 / (by_itself * whole))
+    return float(gradient / normal), float(gradient**2 / (normal * whole))
 
 
-def camera_course(seen: DotsInFrames, fits: PoseFits, pairs: range) -> tuple[Array, tuple[Finding, ...]]:
-    """What a camera that moved makes the poses uncertain by (n, 6, 6), zero for none, and what is to be told of it.
+def camera_motion(seen: DotsInFrames, fits: PoseFits, pairs: range) -> tuple[Array, tuple[Finding, ...]]:
+    """Covariance (n, 6, 6) of the poses by the motion of a camera, zero if none moved, and the finding.
 
-    seen, fits : with the covariances of the dots' own noise
+    seen, fits : with the covariances of the dots' noise
     """
     by_both: Mask = np.asarray(fits.used.sum(axis=2).min(axis=1) > 0)
     rows = evenly(np.flatnonzero(fits.converged & by_both), SHARED_FRAMES)
@@ -103,19 +103,19 @@ def camera_course(seen: DotsInFrames, fits: PoseFits, pairs: range) -> tuple[Arr
     parts = np.array_split(rows, STRETCHES)
     free = np.arange(N_RIG + 2 * seen.disc.n_markers) < N_RIG
     either = _turns(seen.rig)
-    told = [seen.at(part).normal(np.zeros(len(free)), fits.used[part], free) for part in parts]
-    normals, gradients, squares = zip(*told, strict=True)
+    sums = [seen.at(part).normal(np.zeros(len(free)), fits.used[part], free) for part in parts]
+    normals, gradients, squares = zip(*sums, strict=True)
     right = either[:, 3:]
     best = right @ np.linalg.eigh(right.T @ sum(normals) @ right)[1][:, -1]
-    known = np.array([best @ normal @ best for normal in normals])
-    course = np.array([best @ gradient for gradient in gradients]) / known
-    sure, first = max((_difference(course, cut), cut) for cut in range(2, STRETCHES - 1))
-    # of chi-square beyond the noise: what a turn throughout would explain, and beside it one that changes
-    constant = (known @ course) ** 2 / known.sum()
-    explained, misfit = known @ course**2 - constant, sum(squares) - fits.degrees_of_freedom[rows].sum()
-    if sure < SURE or explained < HARDLY * (misfit - constant):
+    weight = np.array([best @ normal @ best for normal in normals])
+    angle = np.array([best @ gradient for gradient in gradients]) / weight  # in each stretch
+    significance, first = max((_difference(angle, cut), cut) for cut in range(2, STRETCHES - 1))
+    # decrease of chi-square by a constant rotation, and the further decrease if it varies; excess over the noise
+    constant = (weight @ angle) ** 2 / weight.sum()
+    explained, misfit = weight @ angle**2 - constant, sum(squares) - fits.degrees_of_freedom[rows].sum()
+    if significance < SURE or explained < HARDLY * (misfit - constant):
         return np.zeros((6, 6)), ()
-    turn, frame = float(np.ptp(course)), pairs[parts[first][0]]
+    turn, frame = float(np.ptp(angle)), pairs[parts[first][0]]
     by_turn = turn * fits.sensitivity @ either
     text = (
         f"a camera moved by {turn * seen.rig.right.fx:.3f} px while the disc was filmed, most of it at frame {frame}, "
@@ -128,7 +128,7 @@ def camera_course(seen: DotsInFrames, fits: PoseFits, pairs: range) -> tuple[Arr
 
 
 def _turns(rig: StereoRig) -> Array:
-    """(30, 6) of the RIG_PARAMETERS by turns of the left and of the right camera about their own centres, own axes."""
+    """(30, 6) d RIG_PARAMETERS / d rotation of the left and of the right camera, about its centre, in its own axes."""
     by = np.zeros((N_RIG, 6))
     by[WORLD_TURN, :3], by[WORLD_SHIFT, :3] = np.eye(3), np.cross(np.eye(3), rig.t_left_world).T
     by[PAIR_TURN, :3] = -rig.R_right_left
@@ -136,9 +136,9 @@ def _turns(rig: StereoRig) -> Array:
     return by
 
 
-def _difference(course: Array, cut: int) -> float:
-    """Of the means before and after, in sigmas."""
-    before, after = course[:cut], course[cut:]
+def _difference(values: Array, cut: int) -> float:
+    """Difference of the means before and after the cut, in sigmas."""
+    before, after = values[:cut], values[cut:]
     square = len(before) * before.var() + len(after) * after.var()
-    variance = square / (len(course) - 2) * (1 / len(before) + 1 / len(after))
+    variance = square / (len(values) - 2) * (1 / len(before) + 1 / len(after))
     return float(abs(after.mean() - before.mean()) / np.sqrt(variance))

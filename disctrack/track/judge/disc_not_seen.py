@@ -1,14 +1,14 @@
-"""Why the disc is not seen as declared: images are mirrored or exchanged, a camera was moved, or the dots are others.
+"""Why the disc is not seen as declared: images mirrored or exchanged, a moved camera, or wrongly declared dots.
 
-Tried only where the dots make no sense as declared. Each way in which a camera's setup or an export program may have
-arranged the images is undone, and the disc searched for anew.
+Used only if the dots contradict the declaration. Each transformation that a camera or an export program may have
+applied to the images is undone, and the disc is searched for again.
 
-Of a camera that was moved, each camera alone still sees the dots as declared. From blobs in some pairs, one pose for
-each pair and one turn and shift of the right camera for all are fitted (`self_calibration.fit_shared`): to a tenth of a
-degree and a millimetre or two, as the two make up for each other; enough to say what happened.
+If a camera was moved, each camera alone still sees the dots as declared. From blobs in some pairs, a pose for each pair
+and one rotation and shift of the right camera are fitted (`self_calibration.fit_shared`): to a tenth of a degree and a
+millimetre or two, as the two are correlated. That is enough to say what happened.
 
-Dots may be there, and unlike the declared ones: one camera alone numbers them, on any scale and of any size. What both
-see of a dot tells where it is in the unit of the rig, to some 0.2 mm: enough to say which declared number is wrong.
+If other dots than declared are seen, each camera alone can identify them, at any scale and size. Triangulation of both
+images gives their positions in the unit of the rig, to some 0.2 mm: enough to say which declared number is wrong.
 """
 
 from collections.abc import Callable, Iterator
@@ -38,15 +38,15 @@ MIRRORED: dict[str, Turn] = {
     "mirrored top to bottom": np.flipud,
     "turned by 180 deg": np.flip,
 }
-TURN, SHIFT = np.radians(1.0), 2e-3  # [rad], [m] what cameras suffer without anybody's notice: prior sigmas
-DOT_DIAMETERS_PX = (6.0, 18.0, 54.0, 162.0)  # the search for blobs takes those of a seventh to twice the diameter
+TURN, SHIFT = np.radians(1.0), 2e-3  # [rad], [m] prior sigmas of an unnoticed motion of a camera
+DOT_DIAMETERS_PX = (6.0, 18.0, 54.0, 162.0)  # each search finds blobs of a seventh to twice the diameter
 SIZE_TOLERANCE = 0.15  # blur and threshold make a blob larger or smaller than its dot
-MISPLACED = 0.2  # of the distance between two dots: places measured with a ruler, not dots numbered wrongly
-MEETING_PX = 1.0  # beyond, cameras or clocks do not fit together, and what both see is no place and no pose
+MISPLACED = 0.2  # relative error of distances between dots: measured with a ruler, say; beyond, wrongly identified
+MEETING_PX = 1.0  # misfit beyond which cameras or clocks contradict each other, and stereo gives no positions
 
 
 def why_not_seen(pairs: NDArray, rig: StereoRig, disc: Disc) -> tuple[Finding, ...]:
-    """What explains it first, if anything; pairs (n, 2, height, width) from all over the recording."""
+    """The first explanation that holds, if any; pairs (n, 2, height, width) evenly spread over the recording."""
     few = pairs[:: max(1, len(pairs) // 2)][:2]
     explained = chain(
         (finding for pair in few for finding in arrangement_found(pair, rig, disc)),
@@ -57,9 +57,9 @@ def why_not_seen(pairs: NDArray, rig: StereoRig, disc: Disc) -> tuple[Finding, .
 
 
 def arrangement_found(pair: NDArray, rig: StereoRig, disc: Disc) -> Iterator[Finding]:
-    """What was done to the images, where undoing it shows the disc.
+    """The transformation of the images without which the disc is found.
 
-    pair : (2, height, width). All but one of the dots must be found in both cameras, and more than as declared.
+    pair : (2, height, width). All dots but one must be found in both cameras, and more than in the images as declared.
     """
     enough = max(acquire(pair, rig, disc)[1] + 1, 2 * disc.n_markers - 2)
     ways = list(_ways(pair, disc))
@@ -76,7 +76,7 @@ def arrangement_found(pair: NDArray, rig: StereoRig, disc: Disc) -> Iterator[Fin
 
 
 def _ways(pair: NDArray, disc: Disc) -> Iterator[tuple[str, tuple[NDArray, NDArray], Disc]]:
-    """What may have been done, and the images with that undone."""
+    """Possible transformations of the images, with the images and the disc after undoing them."""
     left, right = pair
     yield "the left and right images are exchanged", (right, left), disc
     for what, turn in MIRRORED.items():
@@ -91,9 +91,9 @@ def _ways(pair: NDArray, disc: Disc) -> Iterator[tuple[str, tuple[NDArray, NDArr
 
 
 def moved_camera(pairs: NDArray, rig: StereoRig, disc: Disc) -> Iterator[Finding]:
-    """How the right camera moved against the left one, where that explains what is seen.
+    """Motion of the right camera relative to the left one, if it explains the dots.
 
-    pairs : (n, 2, height, width), from all over the recording; both cameras must see the dots in most of them
+    pairs : (n, 2, height, width), evenly spread; both cameras must see the dots in most of them
     """
     seen = _by_each_camera(pairs, rig, disc)
     by_both = np.isfinite(seen.pixels).all(-1).sum(axis=2) >= MIN_EXPLAINED
@@ -121,7 +121,7 @@ def moved_camera(pairs: NDArray, rig: StereoRig, disc: Disc) -> Iterator[Finding
 
 
 def _by_each_camera(pairs: NDArray, rig: StereoRig, disc: Disc) -> DotsInFrames:
-    """Blobs that are the dots by one camera alone, in pairs (n, 2, height, width), with the poses by the left one."""
+    """Dots identified among blobs by each camera alone, in pairs (n, 2, height, width), with poses by the left one."""
     diameters = acquisition.expected_diameter_px(rig, disc)
     seen = [[seen_by_one_camera(pair[c], c, diameters[c], rig, disc) for c in (0, 1)] for pair in pairs]
     pixels = np.array([[side[0][:, :2] for side in pair] for pair in seen]).reshape(-1, 2, disc.n_markers, 2)
@@ -130,7 +130,7 @@ def _by_each_camera(pairs: NDArray, rig: StereoRig, disc: Disc) -> DotsInFrames:
 
 
 def unlike_declared(pair: NDArray, rig: StereoRig, disc: Disc) -> tuple[Finding, ...]:
-    """Which declared number makes no sense, and what it should be, where that is seen.
+    """Which declared number contradicts the images, and its value, if it can be determined.
 
     pair : (2, height, width), images of the left and the right camera
     """
@@ -141,7 +141,7 @@ def unlike_declared(pair: NDArray, rig: StereoRig, disc: Disc) -> tuple[Finding,
     if abs(np.log(scale.value)) > SIDE_TOLERANCE:
         return (other_scale(scale, explains=NONSENSE),)
     (R,), (t,) = rigid_motions(disc.marker_centres_body[None, which], points[None])
-    # by the middle one of the searches: one for blobs far smaller than the dots finds what is darkest in them
+    # median of the searches: a search for blobs much smaller than the dots finds only their darkest parts
     (affine,) = dots_at(R[None], t[None], rig, disc)[1]
     expected = np.pi / 4 * disc.marker_diameter**2 * np.abs(np.linalg.det(affine))
     sizes = [np.median(np.sqrt(areas / expected[:, numbered])) for numbered, _, areas, *_ in several]
@@ -157,11 +157,11 @@ def unlike_declared(pair: NDArray, rig: StereoRig, disc: Disc) -> tuple[Finding,
 
 
 def _seen_dots(pair: NDArray, rig: StereoRig, disc: Disc) -> Iterator[tuple[Mask, Array, Array, Measured, float]]:
-    """Dots that both cameras number alike, by the searches for blobs of several sizes, as far as they find any.
+    """Dots identified by both cameras, from searches for blobs of several sizes that succeed.
 
-    yields : which of the declared dots (m,), k of them; their places (k, 3) [m] in the rig's world and unit; areas
-        (2, k) [px^2] of their blobs; their distances over those declared; misfit [px] of the blobs against one point in
-        space, the largest
+    yields : which of the declared dots were found (m,), k of them; their positions (k, 3) [m] in the rig's world and
+        unit; areas (2, k) [px^2] of their blobs; scale of their distances over those declared; the largest
+        reprojection error [px] of the triangulated points
     """
     for diameter in DOT_DIAMETERS_PX:
         blobs = np.stack([seen_by_one_camera(pair[camera], camera, diameter, rig, disc)[0] for camera in (0, 1)])
@@ -175,6 +175,6 @@ def _seen_dots(pair: NDArray, rig: StereoRig, disc: Disc) -> Iterator[tuple[Mask
         scale = float(np.median(ratios))
         misfit = float(np.abs(rig.project(points) - pixels).max())
         if misfit < acquisition.EPIPOLAR_PX and scale > 0 and np.abs(ratios / scale - 1).max() < MISPLACED:
-            # uneven light shifts all blobs alike: more of them tell it no better
+            # uneven light shifts all blobs alike: more blobs do not reduce the error
             uncertain = float(np.sqrt(2) * BLOB_PX / np.median(apart(pixels[0])))
             yield which, points, blobs[:, which, 2], Measured(scale, scale * uncertain), misfit

@@ -1,4 +1,4 @@
-"""What a run says about its own result: what makes it worse, and what puts it in question."""
+"""Findings of the tracking about its own result: what increases its uncertainty, and what makes it doubtful."""
 
 from collections.abc import Iterator
 
@@ -22,15 +22,15 @@ from disctrack.track.side_by_side import FEW, stretches
 from disctrack.trajectory import FrameStatus, Trajectory
 
 MISPLACED_MM = 0.15  # a printer that stretches a sheet by 0.5 % moves a dot 26 mm off the centre by 0.13 mm
-FAULTY = 2.0  # times the variance of the noise, from which on a scatter has another cause
-ORDINARY_PX = 0.03  # rms of systematic misfit that good lenses have beyond their polynomial: no camera has moved
-HOPELESS = 25.0  # times the variance of the noise: no result of such dots is right within its sigmas
-NO_TOLERANCE = 0.4e-3  # [m] between the board's table and the disc's: a number declared wrong, or cameras that moved
+FAULTY = 2.0  # times the variance of the noise, above which scatter has another cause
+ORDINARY_PX = 0.03  # rms of systematic misfit that good lenses have beyond their polynomial
+HOPELESS = 25.0  # times the variance of the noise, above which no result is right within its sigmas
+NO_TOLERANCE = 0.4e-3  # [m] between the tables by board and by disc: beyond, a wrong declaration or moved cameras
 MOVED = "Was a camera moved or turned after its calibration? Then calibrate again."
 
 
 def repeated_images(repeated: Mask, trajectory: Trajectory) -> Iterator[Finding]:
-    """Images that are copies of earlier ones, as (n, 2), and frames that are lost because both are."""
+    """Images that repeat earlier ones, `repeated` (n, 2), and frames that are lost because both images repeat."""
     alone = repeated & ~repeated.all(axis=1, keepdims=True)
     for camera, copies in zip(frames.CAMERAS, alone.T, strict=True):
         if copies.any():
@@ -51,7 +51,7 @@ def repeated_images(repeated: Mask, trajectory: Trajectory) -> Iterator[Finding]
 
 
 def _named(trajectory: Trajectory, chosen: Mask, shortest: int = 1) -> tuple[str, tuple[tuple[int, int], ...]]:
-    """Stretches of at least so many of the frames chosen (n,): in words, and first and last of each."""
+    """Runs of at least `shortest` of the frames chosen (n,): in words, and first and last frame of each."""
     long = stretches(chosen, shortest)
     rows = [row for first, end in long for row in range(first, end)]
     where = [(int(trajectory.frame[first]), int(trajectory.frame[end - 1])) for first, end in long]
@@ -59,7 +59,7 @@ def _named(trajectory: Trajectory, chosen: Mask, shortest: int = 1) -> tuple[str
 
 
 def off_the_table(trajectory: Trajectory, severity: Severity = Severity.WARNING) -> tuple[Finding, ...]:
-    """Where the disc's lowest point lies if not on the table, or scatters about it by more than its noise."""
+    """Distance of the disc's lowest point from the table, if it is not zero or scatters by more than the noise."""
     if not (trajectory.rig.world_is_table and trajectory.measured.any()):
         return ()
     z, psi, theta = trajectory.q[trajectory.measured, 2:5].T
@@ -80,7 +80,7 @@ def off_the_table(trajectory: Trajectory, severity: Severity = Severity.WARNING)
 
 
 def misplaced_dots(declared: Disc, found: Array) -> tuple[Finding, ...]:
-    """Dots whose places (m, 3) [m] are not where a printer puts them, and what to declare."""
+    """Dots whose positions (m, 3) [m] differ from the declared ones by more than a printer errs; what to declare."""
     away = 1e3 * np.linalg.norm(found - declared.marker_centres_body, axis=1)
     far = np.flatnonzero(away > MISPLACED_MM)
     if not len(far):
@@ -99,18 +99,18 @@ def misplaced_dots(declared: Disc, found: Array) -> tuple[Finding, ...]:
 
 
 def _shaken(factor: Array, trajectory: Trajectory) -> tuple[Finding, ...]:
-    """Poses that scatter far more than their dots tell, with how far."""
+    """Poses that scatter far more than the noise of the dots predicts, and by how much."""
     variance = np.nanmedian(np.diagonal(trajectory.pose_covariance[trajectory.measured], axis1=1, axis2=2), axis=0)
-    told = []
+    over = []
     for name, group in CHANNELS.items():
         if factor[group[0]] > FAULTY:
             times, sigma = np.sqrt(factor[group[0]]), np.sqrt(np.mean(variance[group]))
             length = f"{1e6 * sigma:.1f} µm" if group[0] < 3 else f"{1e3 * np.degrees(sigma):.1f} mdeg"
-            told.append(f"{name} by {length} ({times:.1f} times)")
-    if not told:
+            over.append(f"{name} by {length} ({times:.1f} times)")
+    if not over:
         return ()
     text = (
-        f"from frame to frame poses scatter more than their dots explain: {', '.join(told)}. Dots that err alike leave "
+        f"from frame to frame poses scatter more than their dots explain: {', '.join(over)}. Dots that err alike leave "
         "no residual: a camera or the table trembles, or the frames were compressed as video. The sigmas follow"
     )
     explains = Kind.DOTS_SCATTER, Kind.TABLE_DISAGREES, Kind.FRAMES_LOST, Kind.ACCURACY
@@ -118,14 +118,14 @@ def _shaken(factor: Array, trajectory: Trajectory) -> tuple[Finding, ...]:
 
 
 def _misfit(seen: str, ahead: float, explained: float, frame_rate: float) -> Finding:
-    """What makes the two cameras contradict each other in all frames: a delay moves dots as they are fast."""
+    """Why the two cameras contradict each other in all frames: a delay, or a moved or refocused camera."""
     if explained < LATE:
         lags = "" if explained < HARDLY else ", or one lags"
         text = (
             f"{seen}: a camera moved or was refocused since the calibration{lags} (a delay between the two would "
             f"explain {100 * explained:.0f} % of it). `disctrack diagnose` names it with its size; calibrate again"
         )
-        # now this, now that dot is struck, which shakes the poses
+        # different dots are rejected from frame to frame, which adds scatter to the poses
         explains = Kind.POSES_SCATTER, Kind.TABLE_DISAGREES, Kind.FRAMES_LOST, Kind.ACCURACY
         return Finding(Kind.DOTS_MISFIT, Severity.DOUBT, text, explains=explains)
     early, late = frames.CAMERAS[::-1] if ahead > 0 else frames.CAMERAS
@@ -154,7 +154,7 @@ def doubts_of(
     trajectory: Trajectory,
     seen: DotsInFrames,
 ) -> tuple[Finding, ...]:
-    """What a tracking says about its own result.
+    """All findings of the tracking about its own result.
 
     seen : the dots, with the poses that were fitted to them
     """
@@ -183,7 +183,7 @@ def doubts_of(
 
 
 def _table_disagrees(table: TableFromDisc | None, trajectory: Trajectory) -> tuple[Finding, ...]:
-    """Board and disc that differ about the table by more than their tolerances; else a disc that is not on it."""
+    """Disagreement of board and disc about the table beyond their tolerances; else a disc that is not on the table."""
     apart = table is not None and abs(table.plane[0]) > NO_TOLERANCE
     severity = Severity.DOUBT if apart else Severity.WARNING
     if table is None or table.probability >= scipy.special.erfc(FROM_SIGMAS / np.sqrt(2)):
@@ -200,20 +200,20 @@ def _table_disagrees(table: TableFromDisc | None, trajectory: Trajectory) -> tup
 
 
 def _lost(trajectory: Trajectory) -> Iterator[Finding]:
-    """Frames whose poses no motion joins to the others, whose dots contradict each other; most of the frames lost."""
+    """Runs of frames whose poses do not continue the motion, or whose dots contradict each other; most frames lost."""
     status = trajectory.frame_status
-    told, where = _named(trajectory, status == FrameStatus.JUMPED, FEW)
+    shown, where = _named(trajectory, status == FrameStatus.JUMPED, FEW)
     if where:
         text = (
-            f"no motion leads from the other frames to frames {told}, which are refused: both cameras lost pairs "
+            f"no motion leads from the other frames to frames {shown}, which are refused: both cameras lost pairs "
             "there and the files were numbered on, the frames are in another order or of another recording, or the "
             "frame rate is far too high"
         )
         of = Subject("track", frames=where)
         yield Finding(Kind.CLOCK_JUMP, Severity.DOUBT, text, of, explains=(Kind.FRAMES_LOST,))
-    told, where = _named(trajectory, status == FrameStatus.CONTRADICTED, FEW)
+    shown, where = _named(trajectory, status == FrameStatus.CONTRADICTED, FEW)
     if where:
-        text = f"frames {told} are refused: the dots of the two cameras contradict each other"
+        text = f"frames {shown} are refused: the dots of the two cameras contradict each other"
         yield Finding(Kind.CAMERAS_CONTRADICT, Severity.DOUBT, text, explains=(Kind.FRAMES_LOST,))
     reasons = [s for s in FrameStatus if s.looked_for and not s.has_pose and s != FrameStatus.UNREADABLE]
     counts = {reason: int(np.sum(status == reason)) for reason in reasons}
@@ -224,10 +224,10 @@ def _lost(trajectory: Trajectory) -> Iterator[Finding]:
 
 
 def _one_sided(trajectory: Trajectory) -> Iterator[Finding]:
-    """Frames that rest on one camera: most of them, or a stretch."""
+    """Frames measured by one camera: most of them, or runs of them."""
     by_one = trajectory.frame_status == FrameStatus.ONE_CAMERA
     one, both = int(by_one.sum()), int(np.sum(trajectory.frame_status == FrameStatus.MEASURED))
-    told, where = _named(trajectory, by_one, FEW)
+    shown, where = _named(trajectory, by_one, FEW)
     if one > both:
         text = (
             f"the dots of only one camera make sense in {one} of {one + both} measured frames: are left and right "
@@ -237,7 +237,7 @@ def _one_sided(trajectory: Trajectory) -> Iterator[Finding]:
         yield Finding(Kind.ONE_SIDED, Severity.DOUBT, text, explains=explains)
     elif where:
         text = (
-            f"frames {told} rest on one camera, with its larger sigma: the other was covered, sees the disc edge-on, "
+            f"frames {shown} rest on one camera, with its larger sigma: the other was covered, sees the disc edge-on, "
             "or lost images and is at another instant from there on"
         )
         yield Finding(Kind.ONE_SIDED, Severity.NOTE, text, Subject("track", frames=where))

@@ -1,8 +1,8 @@
-"""Which dots and poses are to be believed: each by its own residuals, by its neighbours, by the other camera.
+"""Tests for outliers among dots and poses: by their residuals, by neighbouring frames, by the other camera.
 
-A fault of the measurement (glare, a shadow, a repeated or exchanged image) is found where it does what noise does
-not. Levels are those of chi-square distributions; what is usual, in a recording whose dots or lens are not perfect, is
-taken from the frames around, so that a frame is judged by its neighbours and by nothing far away.
+A fault of the measurement (glare, a shadow, a repeated or exchanged image) is found if noise cannot explain it. Levels
+are those of chi-square distributions. The typical misfit, in a recording whose dots or lens are not perfect, is the
+local median over the frames around, so that only neighbours affect the result of a frame.
 """
 
 import warnings
@@ -20,27 +20,27 @@ from disctrack.track.pose import PoseFits
 from disctrack.track.side_by_side import FEW, stretches
 from disctrack.trajectory import FrameStatus
 
-BLOCK = 16  # frames whose median is what is usual, with those of the blocks on both sides: half may be at fault
-SIGMAS = 4.0  # beyond which a dot's misfit is hardly chance (6e-5): such a dot loses its weight, and no frame is lost
-# Square of a centre's shift over that of the misfit, both in sigmas: a disturbance is taken for a shift in one part and
-# shows in the other. Of random glare, shadows, dirt and edges of a hand over dots the largest ratio was 1.96.
+BLOCK = 16  # frames; the running median is over three blocks, of which half may be faulty
+SIGMAS = 4.0  # misfit above which a dot's covariance is increased; by chance once in 16 000
+# Square of a centre's shift over that of its misfit, both in sigmas: part of a disturbance is absorbed as a shift, the
+# rest is misfit. The largest ratio for random glare, shadows, dirt and edges of a hand over dots was 1.96.
 HIDDEN_SHARE = 2.0
-CHANCE = 1e-6  # of a frame without fault to be refused by its chi-square: one in a thousand recordings of a thousand
-SUSPECT = 1e-3  # below this chance a frame's covariance follows its residuals
-OUTLYING = 6.0  # times the median reduced chi-square: of 18 degrees of freedom one in 10^14
-GREATEST_BLOW = 3.0  # [m/s] by which the disc's velocity may change between two frames: a fall from half a metre
-MOST_STRUCK = 0.2  # part of a frame's dots that may be struck as outliers: more, and it is open which are right
+CHANCE = 1e-6  # probability that chi-square rejects a good frame: one in a thousand recordings of a thousand frames
+SUSPECT = 1e-3  # probability below which a frame's covariance is scaled by its residuals
+OUTLYING = 6.0  # times the median reduced chi-square: with 18 degrees of freedom one in 10^14
+GREATEST_BLOW = 3.0  # [m/s] change of the disc's velocity between two frames: a fall from half a metre
+MOST_STRUCK = 0.2  # largest fraction of a frame's dots rejected as outliers: beyond, the good ones are not known
 
 
 def unexpected_misfit(misfit: NDArray[np.floating], n_pixels: NDArray[np.floating]) -> Array:
-    """Factor (n, 2, m), at least 1, on the covariance of dots whose surroundings are not as declared.
+    """Factor (n, 2, m), at least 1, on the covariance of dots whose image is disturbed.
 
-    misfit : (n, 2, m) reduced chi-square of the grey values about the template, NaN where there is no dot
-    n_pixels : (n, 2, m) grey values that it was taken over
-    Glare, a shadow's edge, dirt or a hand raise a dot's misfit over that of the same dot in the frames around (and
-    over twice that of the camera's other dots, for what stays). The excess times the number of pixels is the square of
-    the disturbance in sigmas; HIDDEN_SHARE times that may be the square of the centre's shift. What disturbs a dot may
-    reach the image's other dots, and shift them by ten sigmas without showing by itself: there, a small excess counts.
+    misfit : (n, 2, m) reduced chi-square of the grey values about the template, NaN if there is no dot
+    n_pixels : (n, 2, m) number of grey values
+    Glare, a shadow's edge, dirt or a hand increase a dot's misfit over that of the same dot in the frames around; a
+    lasting one, over twice that of the camera's other dots. The excess times the number of pixels is the square of the
+    disturbance in sigmas; the square of the centre's shift may be HIDDEN_SHARE times as large. A disturbance may reach
+    other dots of the image, and shift them by ten sigmas without a significant misfit: for these a small excess counts.
     """
     shown, pixels = np.asarray(misfit, float), np.asarray(n_pixels, float)
     own, spread = _usual(shown)
@@ -50,13 +50,13 @@ def unexpected_misfit(misfit: NDArray[np.floating], n_pixels: NDArray[np.floatin
         chance = np.maximum(spread / own, np.sqrt(2.0 / pixels)) * expected
         above = (shown - expected) / chance
         disturbed = (above > SIGMAS).any(axis=2)
-        # one sigma for the other dots of an image in which something is: glare is larger than a dot
+        # one sigma for the other dots of a disturbed image: glare is larger than a dot
         excess = np.where(above > np.where(disturbed, 1.0, SIGMAS)[..., None], shown - expected, 0.0)
         return 1.0 + HIDDEN_SHARE * np.nan_to_num(excess * pixels / np.maximum(shown, 1.0))
 
 
 def _usual(values: Array) -> tuple[Array, Array]:
-    """Running median over time and its robust spread, of values (n, ...) with NaN; same shape, by blocks of frames."""
+    """Running median over time and robust spread about it, of values (n, ...) with NaN; same shape, by blocks."""
     n, blocks = len(values), -(-len(values) // BLOCK) + 2
     padded = np.full((blocks * BLOCK, *values.shape[1:]), np.nan)
     padded[BLOCK : BLOCK + n] = values
@@ -69,19 +69,19 @@ def _usual(values: Array) -> tuple[Array, Array]:
 
 
 def _nanmedian(values: Array) -> Array:
-    """Median along axis 1 without NaN; NaN where there is nothing, without a warning."""
+    """Median along axis 1 without NaN; NaN if there is no value, without a warning."""
     with warnings.catch_warnings(action="ignore", category=RuntimeWarning):
         return np.asarray(np.nanmedian(values, axis=1))
 
 
 def outlying_frames(residuals: Array) -> Mask:
-    """(n,) True where a frame's dots miss the tracked pose by far more than is usual: it must not teach the others.
+    """(n,) True for frames whose residuals are far above the median: they are excluded from shared estimates.
 
-    residuals : (n, 2, m, 2) of the dots about the tracked pose, in their sigmas; NaN where a dot was not seen
-    What all frames share (printed dots, lens, a camera that moved before) shows in all of them, and changes slowly with
-    the place of the disc. A fault of some frames sets in from one frame to the next: the recording is cut where the
-    residuals jump, and a part whose misfit stands far above that of the part beside it is at fault, however long it
-    is. So it is found that a camera left out an image early on; a calibration that is off is no fault of frames.
+    residuals : (n, 2, m, 2) of the dots about the tracked pose, in their sigmas; NaN if a dot was not seen
+    Errors that all frames share (printed dots, lens, a camera moved earlier) vary slowly with the position of the disc.
+    A fault of some frames starts from one frame to the next: the recording is divided where the residuals jump, and a
+    part with a much larger misfit than the adjacent part is faulty, whatever its length. This detects an image that a
+    camera dropped early on; a wrong calibration is not a fault of single frames.
     """
     seen: Mask = np.asarray(np.isfinite(residuals).all(-1))
     freedom = 2 * seen.sum((1, 2)) - 6
@@ -96,9 +96,9 @@ def outlying_frames(residuals: Array) -> Mask:
 
 
 def _at_fault_since_a_jump(residuals: Array, reduced: Array) -> Mask:
-    """(n,) True in parts of the recording that begin or end with a jump of the residuals and stand out by their misfit.
+    """(n,) True in parts of the recording that begin or end with a jump of the residuals, and have a large misfit.
 
-    reduced : (n,) chi-square of the frames in which both cameras tell, NaN in the others
+    reduced : (n,) reduced chi-square of the frames in which both cameras see two dots at least, NaN in the others
     """
     rows = np.flatnonzero(np.isfinite(reduced))
     step = residuals[rows[1:]] - residuals[rows[:-1]]
@@ -107,7 +107,7 @@ def _at_fault_since_a_jump(residuals: Array, reduced: Array) -> Mask:
     change = square / np.maximum(2 * both.sum((1, 2)) - 6, 1)
     usual = np.fmax(_usual(change[:, None])[0][:, 0], 1.0)
     pieces = np.split(rows, np.flatnonzero((change > OUTLYING * usual) & (np.diff(rows) <= BLOCK)) + 1)
-    long = np.array([len(piece) >= 2 for piece in pieces])  # one frame alone is no measure for the others
+    long = np.array([len(piece) >= 2 for piece in pieces])  # a single frame is no reference for the others
     if not long.any():
         return np.zeros(len(reduced), bool)
     first, last = (
@@ -123,9 +123,9 @@ def _at_fault_since_a_jump(residuals: Array, reduced: Array) -> Mask:
 
 
 def _unconnected(n: int, pieces: list[NDArray[np.intp]], best: int, fits: Callable[[int, int, int], bool]) -> Mask:
-    """(n,) True in the pieces of a recording that agree neither with the best of them nor with one that does.
+    """(n,) True in the pieces of a recording that are not connected with the best one by a chain of fitting pieces.
 
-    fits(left, right, kept) compares a piece with the nearest that is kept already, which is one of the two.
+    fits(left, right, kept) compares a piece with the nearest one accepted, `kept`, which is one of the two.
     """
     apart = np.zeros(n, bool)
     for others in (range(best + 1, len(pieces)), range(best - 1, -1, -1)):
@@ -141,21 +141,20 @@ def _unconnected(n: int, pieces: list[NDArray[np.intp]], best: int, fits: Callab
 def judge_poses(
     fits: PoseFits, repeated: Mask, outlying: Mask, period: float, radius: float
 ) -> tuple[PoseFits, NDArray[np.uint8]]:
-    """Judge every pose by its residuals and by the motion of its neighbours.
+    """Test every pose by its residuals and by the motion of its neighbours.
 
-    Returns the poses without those that are refused, their covariances, altered, as their residuals have them, and of n
-    frames MEASURED, or why the pose is refused (REPEATED, CONTRADICTED or JUMPED).
+    fits : with their final covariances and chi-squares; repeated (n,): both images equal those of an earlier frame;
+    outlying (n,): frames excluded from medians; period [s] of the frames; radius [m] of the disc
 
-    fits : with the covariances and chi-squares scaled as they will be told; repeated (n,): both images are those of a
-    frame before; outlying (n,): frames by which no other is to be judged; period [s] of the frames; radius [m] of the
-    disc
+    Returns the poses without the rejected ones, with covariances (altered in place) scaled by their residuals, and the
+    status of n frames: MEASURED, or why the pose is rejected (REPEATED, CONTRADICTED or JUMPED).
     """
-    struck = (np.isfinite(fits.residuals_px).all(-1) & ~fits.used).sum(axis=(1, 2))  # dots left out as outliers
+    struck = (np.isfinite(fits.residuals_px).all(-1) & ~fits.used).sum(axis=(1, 2))  # dots rejected as outliers
     status = np.full(len(struck), FrameStatus.MEASURED, np.uint8)
     freedom = fits.degrees_of_freedom
     reduced = np.where(outlying, np.nan, fits.reduced_chi_square)
     middle = max(1.0, float(np.nanmedian(reduced))) if np.isfinite(reduced).any() else 1.0
-    # a fault that lasts is usual where it is, but not in the rest of the recording
+    # a lasting fault raises the local median, so that of the whole recording limits it
     usual = np.clip(np.nan_to_num(_usual(reduced[:, None])[0][:, 0], nan=middle), 1.0, OUTLYING * middle)
     with np.errstate(invalid="ignore"):
         square = fits.chi_square / usual
@@ -164,46 +163,46 @@ def judge_poses(
     total = fits.used.sum(axis=(1, 2)) + struck
     contradicted = (chance < CHANCE) | (struck > np.maximum(MOST_STRUCK * total, 1))
     rest = _at_rest(fits)
-    lost = repeated & ~_still_over_the_repeats(repeated, rest)
+    lost = repeated & ~_repeats_at_rest(repeated, rest)
     good = replace(fits, converged=fits.converged & ~contradicted & ~lost)
     *one_sided, both = (
         departure(good, weights) for weights in (differences(3, -3), differences(3, 0), differences(4, -2))
     )
     nearest = np.fmin(*one_sided)
     moved = nearest / _quiet(nearest, rest)
-    # next to an end or a gap, a quadratic is all there is, and it follows a slow camera's frames far worse
+    # next to an end or a gap only the quadratic is available, which is far less accurate at a low frame rate
     inner = np.fmin.reduce([*one_sided, both])
     moved = np.where(np.isnan(both), moved, inner / _quiet(inner, rest))
     with np.errstate(invalid="ignore"):
-        jumped = moved > _of_six(CHANCE) * 2.0  # the smallest of three, in motion that is not quite steady
-    status[jumped | torn_off(good, period, radius)] = FrameStatus.JUMPED
+        jumped = moved > _of_six(CHANCE) * 2.0  # a factor 2, as the motion is not quite smooth
+    status[jumped | disconnected_frames(good, period, radius)] = FrameStatus.JUMPED
     status[contradicted] = FrameStatus.CONTRADICTED
     status[lost] = FrameStatus.REPEATED
-    status[~fits.converged] = FrameStatus.MEASURED  # nothing to judge
+    status[~fits.converged] = FrameStatus.MEASURED  # no pose to test
     fits.covariance[...] *= np.maximum(np.nan_to_num(factor, nan=1.0), 1.0)[:, None, None]
     return replace(fits, converged=fits.converged & (status == FrameStatus.MEASURED)), status
 
 
 def _of_six(chance: float) -> float:
-    """What chi-square of six degrees of freedom exceeds by that chance."""
+    """Value that chi-square of six degrees of freedom exceeds with this probability."""
     return float(scipy.special.chdtri(6, chance))
 
 
 def _quiet(moved: Array, rest: Mask) -> Array:
-    """(n,) how many times farther than noise makes them, at least once, poses usually are from where others lead."""
-    # a disc at rest does not tell how smooth its motion will be
+    """(n,) running median of squared departures over that of pure noise, at least 1."""
+    # frames at rest are excluded, as they do not represent the motion
     usual = _usual(np.where(rest, np.nan, moved)[:, None])[0][:, 0]
     return np.fmax(usual / _of_six(0.5), 1.0)
 
 
 def departure(fits: PoseFits, weights: Mapping[int, float]) -> Array:
-    """Squared length (n,), in its sigmas, of a sum of each frame's neighbours (and its own pose, 0): offset -> weight.
+    """Squared length (n,), in sigmas, of a weighted sum of neighbouring poses; weights: offset (0: the pose) -> weight.
 
-    The weights' sum is 0, so that the sum is a pose's distance from where the others lead: third differences from
-    before and from after carry the quadratic through three neighbours on by a frame. A blow changes the velocity
-    between two frames, so each of them agrees with its own side; a pose that agrees with neither lies on no motion.
-    Fourth ones hold the cubic through two neighbours on either side, which follows a motion that changes quickly from
-    frame to frame far better. NaN where one of the poses is missing.
+    The weights add up to 0, so that the sum is the distance of a pose from the prediction by the others. One-sided
+    third differences predict by the quadratic through three neighbours on one side. A blow changes the velocity
+    between two frames, and each of them still agrees with its own side; a pose that agrees with neither side is an
+    outlier. Central fourth differences predict by the cubic through two neighbours on either side, which is far more
+    accurate for fast motion. NaN if one of the poses is missing.
     """
     square = np.full(len(fits.converged), np.nan)
     rows, away, spread = sums_over_time(fits, weights)
@@ -212,14 +211,14 @@ def departure(fits: PoseFits, weights: Mapping[int, float]) -> Array:
 
 
 def differences(order: int, first: int) -> dict[int, float]:
-    """Weights of a difference of this order over successive frames: offset -> weight, from the first offset on."""
+    """Weights of a finite difference of this order, from offset `first` on: offset -> weight."""
     return {first + k: (-1.0) ** k * comb(order, k) for k in range(order + 1)}
 
 
 def sums_over_time(fits: PoseFits, weights: Mapping[int, float]) -> tuple[NDArray[np.intp], Array, Array]:
-    """Weighted sums of neighbours as in `departure`.
+    """Weighted sums of neighbouring poses as in `departure`.
 
-    returns : frames (k,); sums (k, 6) in POSE_COMPONENTS; the covariance (k, 6, 6) that noise gives them
+    returns : frames (k,); sums (k, 6) in POSE_COMPONENTS; their covariance (k, 6, 6) by noise
     """
     R, t, C, offsets = fits.R_world_body, fits.t_world_body, fits.covariance, np.array([*weights])
     rows = np.arange(max(-offsets.min(), 0), len(t) - max(offsets.max(), 0))
@@ -228,33 +227,33 @@ def sums_over_time(fits: PoseFits, weights: Mapping[int, float]) -> tuple[NDArra
     away, spread = np.zeros((len(rows), 6)), np.zeros((len(rows), 6, 6))
     for offset, weight in weights.items():
         near = rows + offset
-        turn = vector_from_rotation(R[near] @ back)  # by little, from there
+        turn = vector_from_rotation(R[near] @ back)  # small
         away += weight * np.concatenate([t[near], turn], axis=1)
         spread += weight**2 * C[near]
     return rows, away, spread
 
 
-def torn_off(fits: PoseFits, period: float, radius: float) -> Mask:
-    """(n,) True for frames that no motion joins to the longest piece of motion, or to what is joined to that.
+def disconnected_frames(fits: PoseFits, period: float, radius: float) -> Mask:
+    """(n,) True for frames that are not connected with the longest piece of continuous motion, directly or by others.
 
-    Between two frames the disc may be hit: its centre's velocity changes by GREATEST_BLOW, its turn by that over the
-    radius. A pose farther than that from where the frames before lead, and the frames after, begins another motion.
-    Over frames without a pose, too: where a false motion ends, the true one goes on.
+    A blow may change the velocity of the disc's centre by GREATEST_BLOW between two frames, and the angular velocity by
+    that over the radius. A pose farther than this from the predictions by the frames before and after starts another
+    motion. Gaps without a pose are bridged: after a false motion the true one continues.
     """
     rows = np.flatnonzero(fits.converged)
-    pieces = np.split(rows, np.flatnonzero(_torn(fits, rows[:-1], rows[1:], period, radius)) + 1)
+    pieces = np.split(rows, np.flatnonzero(_broken(fits, rows[:-1], rows[1:], period, radius)) + 1)
     longest = int(np.argmax([len(piece) for piece in pieces]))
 
-    def leads_on(left: int, right: int, kept: int) -> bool:
-        return not _torn(fits, pieces[left][-1:], pieces[right][:1], period, radius)[0]
+    def continues(left: int, right: int, kept: int) -> bool:
+        return not _broken(fits, pieces[left][-1:], pieces[right][:1], period, radius)[0]
 
-    return _unconnected(len(fits.converged), pieces, longest, leads_on)
+    return _unconnected(len(fits.converged), pieces, longest, continues)
 
 
-def _torn(fits: PoseFits, last: NDArray[np.intp], first: NDArray[np.intp], period: float, radius: float) -> Mask:
-    """(k,) True where no motion leads from frames `last` (k,) to the later frames `first` (k,).
+def _broken(fits: PoseFits, last: NDArray[np.intp], first: NDArray[np.intp], period: float, radius: float) -> Mask:
+    """(k,) True if no possible motion leads from frames `last` (k,) to the later frames `first` (k,).
 
-    Neither at the velocity before the gap nor at that after it; False where neither is known.
+    Neither with the velocity before the gap nor with that after it; False if neither is known.
     """
     miss = np.full((2, len(last)), np.nan)
     n, R, t = len(fits.converged), fits.R_world_body, fits.t_world_body
@@ -279,23 +278,23 @@ def _torn(fits: PoseFits, last: NDArray[np.intp], first: NDArray[np.intp], perio
     return np.asarray(np.nan_to_num(np.fmin(*miss)) > 1.0)
 
 
-def _still_over_the_repeats(repeated: Mask, rest: Mask) -> Mask:
-    """(n,) True in repeats of a disc that lies still; False where a recorder stuck while the disc moved.
+def _repeats_at_rest(repeated: Mask, rest: Mask) -> Mask:
+    """(n,) True in repeats of a disc at rest; False if the recorder repeated images while the disc moved.
 
-    One repeat is still where the frames around it are. In a longer run the frames in between are alike whatever the
-    disc did: it is still where rest, or the recording's end, lies on one side of it.
+    A single repeat is at rest if the frames around it are. The frames within a longer run are equal in any case: the
+    run is at rest if the disc rests, or the recording ends, on one side of it.
     """
     n = len(repeated)
     still = np.zeros(n, bool)
     for first, end in stretches(repeated):  # a handful, if any
-        before, after = first - 2, end  # `rest` of a frame is about the frames on both sides of it
+        before, after = first - 2, end  # `rest` of a frame compares the frames on both sides of it
         alone = end - first == 1
         still[first:end] = rest[first] if alone else before < 0 or after >= n or rest[before] or rest[after]
     return still
 
 
 def _at_rest(fits: PoseFits) -> Mask:
-    """(n,) True where the poses before and after differ by no more than their noise: then a repeat shows no fault."""
+    """(n,) True if the poses before and after differ by no more than their noise: then a repeat is no fault."""
     with np.errstate(invalid="ignore"):
         rest = departure(fits, {-1: -1, 1: 1}) < _of_six(SUSPECT)
     if len(rest) > 1:

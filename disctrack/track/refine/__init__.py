@@ -1,1 +1,1 @@
-"""What all frames share is refined over the whole sequence."""
+"""Refinement over the whole sequence of the parameters that all frames share."""

@@ -1,4 +1,4 @@
-"""From what was followed to the trajectory: what all frames share is refined, all poses are fitted and judged."""
+"""From the dots of the followed frames to the trajectory: shared parameters are refined, poses fitted and tested."""
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
@@ -15,7 +15,7 @@ from disctrack.findings import Finding
 from disctrack.recording.readers.blocks import NotRead
 from disctrack.track.dots.template import dot_centres
 from disctrack.track.follow.following import Follower, Tables, repeats
-from disctrack.track.judge.cameras import camera_course
+from disctrack.track.judge.cameras import camera_motion
 from disctrack.track.judge.doubts import FAULTY, doubts_of, repeated_images
 from disctrack.track.judge.outlier_tests import judge_poses, outlying_frames, unexpected_misfit
 from disctrack.track.pose import MIN_DOTS, DotsInFrames, PoseFits, dots_at, fit_poses, whitening
@@ -29,16 +29,16 @@ from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
 
 @dataclass(frozen=True)
 class TrackingSettings:
-    """What a user may choose; the whole of it is written into the result."""
+    """Options of the tracking; all are stored with the result."""
 
-    table: str = "both"  # board, disc or both: what tells where the table is (table_contact.py)
-    exposure: tuple[float, float] | None = None  # [s] of the left and the right camera; None: as the dots' smear tells
-    first_pass: bool = True  # leave out what lies still before the motion starts and after it ends (motion_span.py)
+    table: str = "both"  # board, disc or both: what determines the table (table_contact.py)
+    exposure: tuple[float, float] | None = None  # [s] of the left and the right camera; None: from motion blur
+    first_pass: bool = True  # leave out the rest before and after the motion (motion_span.py)
 
 
 @dataclass(frozen=True, repr=False)
 class Measurement(Brief):
-    """A tracked recording, with what was noticed in `trajectory.findings`.
+    """A tracked recording; problems are in `trajectory.findings`.
 
     >>> measurement = measure("clip", "clip/results/rig.h5", open_pairs("clip", (0, 40)))
     >>> measurement.trajectory.q.shape, measurement.unreadable
@@ -51,19 +51,19 @@ class Measurement(Brief):
     seconds: float = 0.0  # spent on reading and tracking
 
     def facts(self) -> dict[str, str]:
-        """What a glance should tell (`Brief`)."""
-        told = self.trajectory.facts()
-        return told | {"unreadable images": f"{len(self.unreadable)}"} if self.unreadable else told
+        """Facts for a short representation (`Brief`)."""
+        facts = self.trajectory.facts()
+        return facts | {"unreadable images": f"{len(self.unreadable)}"} if self.unreadable else facts
 
 
 @dataclass(frozen=True)
 class Taken:
-    """Which pairs are measured, when they were taken, and under which gravity."""
+    """Which pairs are measured, their times, and gravity."""
 
     pairs: range
     frame_rate: float  # [Hz]
     gravity: float = 9.81  # [m/s^2]
-    stamps: Array | None = None  # (n,) [s] where the camera wrote them
+    stamps: Array | None = None  # (n,) [s] written by the camera
 
     @property
     def time(self) -> Array:
@@ -74,17 +74,17 @@ class Taken:
 def assemble(
     followers: list[Follower], tables: Tables, settings: TrackingSettings, taken: Taken, workers: int = 1
 ) -> Measurement:
-    """Trajectory of frames that were followed in one piece or in several; alters `tables`, which nobody else holds.
+    """Trajectory of frames that were followed in one stretch or in several; alters `tables`.
 
-    workers : threads; the result is the same to the last bit for any number of them
+    workers : threads; the result does not depend on their number, to the last bit
     """
     first = next((follower for follower in followers if follower.measured), followers[0])
     rig, disc = first.rig, first.disc
-    repeated = repeats(tables.digest)  # over the edges of stretches, too
+    repeated = repeats(tables.digest)  # across the edges of stretches, too
     tables.status[repeated & ~repeated.all(axis=1, keepdims=True)] = MarkerStatus.NOT_LOOKED_FOR
     dots, pixels, covariance = dot_centres(tables.results, tables.status)
     seen = DotsInFrames(rig, disc, pixels, covariance, tables.R, tables.t)
-    exposure, of_exposure = _as_they_were(seen, dots, first, settings, taken)
+    exposure, of_exposure = _correct_dots(seen, dots, first, settings, taken)
     as_built, faults, outlying = _shared(seen, workers)
     seen = replace(seen, rig=as_built.rig, disc=as_built.disc)
     fits = fit_all(seen, workers)
@@ -93,13 +93,13 @@ def assemble(
     again = np.asarray(repeated.all(axis=1))
     fits, verdicts = judge_poses(fits, again, outlying, 1 / taken.frame_rate, disc.radius)
     status = np.where(verdicts == FrameStatus.MEASURED, status_of(tables.frame_status, fits), verdicts)
-    course, of_course = camera_course(seen, fits, taken.pairs)
-    systematic += course
+    by_motion, of_motion = camera_motion(seen, fits, taken.pairs)
+    systematic += by_motion
     moved = by_pattern(as_built, fits.R_world_body)
     fits, systematic, rig, table = table_from_disc(fits, systematic, as_built.rig, disc, settings.table, moved)
     moved = by_pattern(as_built, fits.R_world_body, off_centre(table, np.arccos(fits.R_world_body[:, 2, 2]), disc))
     systematic += moved @ moved.swapaxes(1, 2)
-    # after the table: what poses scatter beside their dots need not be white, and frames do not average it there
+    # after the table: the excess scatter of the poses may be correlated, and would not average out in its fit
     *_, shaken = scatter_of_poses(fits)
     fits.covariance[...] *= np.sqrt(np.outer(shaken, shaken))
     shared = _shared_sigma(fits, systematic, rig, moved)
@@ -109,12 +109,12 @@ def assemble(
         trajectory = replace(trajectory, table_moved=table.beyond)
     doubts = doubts_of(first, scatter, shaken, table, trajectory, seen)
     details = {
-        "exposure_s": list(exposure),  # that the dots were moved by
+        "exposure_s": list(exposure),  # for which the dots were corrected
         "blur_px": [edge.blur_px for edge in first.edges],
         "noise": [edge.noise._asdict() for edge in first.edges],
-        "pose_variance_factor": shaken.round(3).tolist(),  # of the poses about a smooth motion over what dots tell
+        "pose_variance_factor": shaken.round(3).tolist(),  # scatter about a smooth motion over that by the dots
         "shared_sigma": shared,
-        "acquisitions": sum(f.acquisitions for f in followers),  # times the disc was searched for and found
+        "acquisitions": sum(f.acquisitions for f in followers),  # number of successful searches
         "variance_factor": scatter.whole,
         "noise_factor": scatter.noise,
         "systematic_px": list(scatter.systematic_px),
@@ -122,16 +122,16 @@ def assemble(
     }
     if table is not None:
         details["table"] = table.details(trajectory.q[:, 4], seen.disc)
-    findings = (*repeated_images(repeated, trajectory), *of_exposure, *of_course, *doubts)
+    findings = (*repeated_images(repeated, trajectory), *of_exposure, *of_motion, *doubts)
     return Measurement(replace(trajectory, findings=findings), details)
 
 
-def _as_they_were(
+def _correct_dots(
     seen: DotsInFrames, dots: NDArray, first: Follower, settings: TrackingSettings, taken: Taken
 ) -> tuple[tuple[float, float], tuple[Finding, ...]]:
-    """Move the dots to where they were in the middle of the exposure but for glare and lenses, and tell the exposure.
+    """Correct the dots for exposure, glare and lens field; returns the exposure [s] and findings about it.
 
-    seen : altered; what misfits beyond noise is in the covariances then.  dots (n, 2, m) of `_kernels.DOT`
+    seen : altered; covariances are increased for misfit beyond noise.  dots (n, 2, m) of `_kernels.DOT`
     """
     where, of = dots_at(seen.R, seen.t, seen.rig, seen.disc), (0.5 * seen.disc.marker_diameter, first.edges)
     found = exposure_by_smear(*where, taken.time, dots["sigma"])
@@ -146,35 +146,35 @@ def _as_they_were(
 
 
 def _shared(seen: DotsInFrames, workers: int) -> tuple[AsBuilt, AsBuilt | None, Mask]:
-    """What the frames share, what is wrong with it, and which frames (n,) are outlying and do not enter."""
-    # the dots miss the pose that fits best by far more than in others
+    """Rig and disc as refined, the same with free cameras and delay, and outlying frames (n,), which are excluded."""
+    # frames whose dots are much farther from the best pose than in others
     fits = fit_all(seen, workers, judged=False)
     outlying = outlying_frames((whitening(seen.covariance) @ fits.residuals_px[..., None])[..., 0])
     ordinary = replace(seen, t=np.where(outlying[:, None], np.nan, seen.t))
     faults, as_built = without_shared_faults(ordinary), refine_as_built(ordinary)
     if faults is not None and as_built.reduced_chi_square > FAULTY * max(1.0, faults.reduced_chi_square):
-        as_built = faults  # dots refined alone would be moved to make up for wrong cameras
+        as_built = faults  # dots refined alone would absorb the errors of the cameras
     return as_built, faults, outlying
 
 
 def _scattered(
     fits: PoseFits, covariance: Array, faults: AsBuilt | None, outlying: Mask
 ) -> tuple[PoseFits, Array, Scatter]:
-    """Poses and dots with covariances of the noise they have, the part (n, 6, 6) that repeats, and what was found."""
+    """Poses with covariances scaled to the noise found, systematic covariance (n, 6, 6), and the scatter."""
     ordinary = replace(
         fits,
         degrees_of_freedom=np.where(outlying, 0, fits.degrees_of_freedom),
         used=fits.used & ~outlying[:, None, None],
     )
     scatter = split_scatter(ordinary, covariance, None if faults is None else faults.reduced_chi_square)
-    covariance[...] *= scatter.noise  # in place: nobody else holds them
+    covariance[...] *= scatter.noise  # in place
     systematic = fits.covariance * scatter.systematic
     fits.covariance[...] *= scatter.noise
     return replace(fits, chi_square=fits.chi_square / scatter.whole), systematic, scatter
 
 
 def fit_all(seen: DotsInFrames, workers: int = 1, judged: bool = True) -> PoseFits:
-    """The poses of all frames, some hundreds at a time: what a fit needs beside its result is five times as large."""
+    """Poses of all frames, some hundred at a time: temporary arrays are five times as large as the result."""
 
     def fitted(rows: slice) -> PoseFits:
         return fit_poses(seen.at(rows), reject_outliers=judged, with_sensitivity=judged)
@@ -186,14 +186,14 @@ def fit_all(seen: DotsInFrames, workers: int = 1, judged: bool = True) -> PoseFi
         for name, value in vars(fitted(rows)).items():
             whole[name][rows] = value
 
-    # NumPy lets go of the interpreter where arrays are large: parts of some hundred frames are worked on side by side
+    # NumPy releases the GIL for large arrays: parts of some hundred frames run in parallel
     with ThreadPoolExecutor(workers, thread_name_prefix="part") as pool:
         list(pool.map(fill, parts(n)))
     return PoseFits(**whole)
 
 
 def _shared_sigma(fits: PoseFits, systematic: Array, rig: StereoRig, moved: Array) -> list[list[object]]:
-    """Of the pose's components: the part of sigma that frames share, over the recording, and most of it from what.
+    """Shared part of the sigma of each component of the pose, over the recording, and its largest cause.
 
     moved : (n, 6, 3) of `by_pattern`
     """
@@ -208,7 +208,7 @@ def _shared_sigma(fits: PoseFits, systematic: Array, rig: StereoRig, moved: Arra
 
 
 def status_of(followed: NDArray[np.uint8], fits: PoseFits) -> NDArray[np.uint8]:
-    """(n,) what the fits make of frames in which the disc was followed; the others keep their status."""
+    """(n,) status by the fits of frames in which the disc was followed; the others keep their status."""
     status, was = followed.copy(), followed == FrameStatus.MEASURED
     per_camera = fits.used.sum(axis=2)
     total = per_camera.sum(axis=1)
@@ -226,9 +226,9 @@ def trajectory_of(
     located: NDArray[np.uint8],
     taken: Taken,
 ) -> Trajectory:
-    """The trajectory of poses that were fitted to dots; what is refused is taken out of the arrays of `fits`, too.
+    """The trajectory of the fitted poses; rejected poses become NaN in the arrays of `fits`, too.
 
-    systematic : (n, 6, 6) covariance of what repeats; status (n,) FrameStatus; located (n, 2, m) MarkerStatus
+    systematic : (n, 6, 6) covariance of errors that repeat; status (n,) FrameStatus; located (n, 2, m) MarkerStatus
     """
     euler = frames.unwrap_euler(frames.euler_from_rotation(fits.R_world_body))
     euler[~fits.converged] = np.nan

@@ -1,15 +1,15 @@
-"""How much the dots scatter about their poses, and the poses from frame to frame beside what their dots tell.
+"""Scatter of the dots about the fitted poses, and of the poses about a smooth motion.
 
-**Dots**, once everything that the frames share may be wrong: cameras, printed dots, clock. A camera that was moved or
-that lags leaves residuals many times the noise. Taken for noise they would hide every effect that is smaller, the fault
-itself included, and dots would be moved to make up for it. So the noise of the dots is what remains after a free
-refinement of the two cameras, the dots' places and the delay of the right camera, with one pose per frame: nothing slow
-or systematic can pass it, and it needs no model of the motion.
+**Dots**, with all shared parameters free: cameras, printed dots, clock. A camera that was moved or that lags causes
+residuals many times the noise. If they counted as noise, they would hide every smaller effect and the fault itself, and
+the dots would be displaced to compensate. So the noise of the dots is the residual of a free refinement of the two
+cameras, the positions of the dots and the delay of the right camera, with one pose per frame. Slow or systematic errors
+are absorbed, and no model of the motion is needed.
 
-**Poses**, as dots that err alike leave no residual: a camera or table that trembles, an encoder that moves blocks of
-the image together. The motion tells: it is smooth, and what it is not is noise, whatever the dots say. In sixth
-differences of the poses white noise is 30 times itself, and what precesses by an angle a per frame is a^6 of itself: at
-SLOW, 0.3 um of 5 mm. So only frames are counted between which the disc precesses by less.
+**Poses**, as common errors of the dots leave no residual: a vibrating camera or table, an encoder that moves blocks of
+the image together. The motion is smooth, and any other part of the poses is noise, whatever the dots say. Sixth
+differences amplify white noise by 30 (rms), and reduce a precession by an angle a per frame to a^6: at SLOW, 0.3 um of
+5 mm. So only frames with slower precession are used.
 """
 
 from dataclasses import dataclass, replace
@@ -26,22 +26,22 @@ from disctrack.track.pose import DotsInFrames, PoseFits, whitening
 from disctrack.track.refine.self_calibration import DOT_SIGMA, AsBuilt, fit_shared
 from disctrack.track.side_by_side import MIN_FRAMES, SHARED_FRAMES, evenly
 
-LEAST_NOISE = 0.25  # of the variance that the templates leave: the rest may be the pixels' fixed pattern
-# How far a camera may be off: far more than any that is still of use, and enough to bound what the disc does not tell.
-# [px, 1]; rotations [rad] and translations [m]; the delay is free within a frame period.
+LEAST_NOISE = 0.25  # of the residual variance of the templates: the rest may be fixed-pattern noise
+# Prior sigmas of the errors of a camera: far larger than in any useful rig, and small enough to bound what the dots do
+# not determine. [px, 1]; rotations [rad] and translations [m]; the delay is free within a frame period.
 _WIDE = {"fx": 20.0, "fy": 20.0, "cx": 10.0, "cy": 10.0, "k1": 0.05, "k2": 0.2, "k3": 0.5, "p1": 5e-3, "p2": 5e-3}
 _WIDE_POSE = np.repeat([0.02, 0.01], 3)
 SLOW = 0.2  # [rad] of precession from frame to frame
-KEPT = 0.8  # of the squares: blows and smears are cut off with the largest
-# Successive sixth differences are correlated by -0.86, 0.54, -0.24, ...: n tell as much as n / 3.2 independent ones
-# (the sum of the squared correlations); without those that are cut off, n / 4.5 (4000 samples of white noise).
+KEPT = 0.8  # fraction of the squares: the largest, with blows and motion blur, are trimmed
+# Successive sixth differences are correlated by -0.86, 0.54, -0.24, ...: n of them are equivalent to n / 3.2
+# independent ones (sum of the squared correlations); after trimming, to n / 4.5 (4000 samples of white noise).
 WORTH = 4.5
 
 
 def without_shared_faults(frames: DotsInFrames) -> AsBuilt | None:
-    """The dots refined together with cameras and delay, with a free pose for each of n successive frames.
+    """The dots refined together with cameras and delay, with a free pose for each frame.
 
-    None if fewer than MIN_FRAMES frames, with both their neighbours, are complete.
+    None if fewer than MIN_FRAMES frames are complete together with both neighbours.
     """
     rig, disc, pixels = frames.rig, frames.disc, frames.pixels
     complete = np.asarray(np.isfinite(pixels).all((1, 2, 3)) & frames.posed)
@@ -65,20 +65,20 @@ def without_shared_faults(frames: DotsInFrames) -> AsBuilt | None:
 
 @dataclass(frozen=True)
 class Scatter:
-    """Variance of the dots about the fitted poses over what the image noise predicts, and what it is made of."""
+    """Variance of the dots about the fitted poses over the prediction by image noise, and its components."""
 
     whole: float  # at least 1
-    free: float  # at least 1, where cameras, dots and delay are free
-    noise: float  # from one frame to the next
-    systematic: float  # the rest: repeats, or varies slowly
-    systematic_px: tuple[float, float]  # rms of that rest per axis, left and right camera
+    free: float  # with free cameras, dots and delay; at least 1
+    noise: float  # independent from frame to frame
+    systematic: float  # the rest, which repeats or varies slowly
+    systematic_px: tuple[float, float]  # rms of the rest per axis, left and right camera
 
 
 def split_scatter(fits: PoseFits, markers_covariance_px2: Array, by_free_cameras: float | None) -> Scatter:
-    """What the dots do not fit, as noise and as what repeats.
+    """Split the residuals of the dots into noise and systematic misfit.
 
-    by_free_cameras : reduced chi-square of `without_shared_faults`, if that is known
-    Where no three successive frames are complete, all that passes a refinement of what frames share is noise.
+    by_free_cameras : reduced chi-square of `without_shared_faults`, if known
+    Without complete triples of successive frames, all residuals of the free refinement count as noise.
     """
     whole = trimmed_reduced_chi_square(fits)
     free = max(1.0, whole if by_free_cameras is None else by_free_cameras)
@@ -87,26 +87,26 @@ def split_scatter(fits: PoseFits, markers_covariance_px2: Array, by_free_cameras
         whole = max(1.0, whole)
         noise = min(whole, free)
     noise = max(noise, LEAST_NOISE)
-    # chance alone: both are means over n frames, the second differences of overlapping triples tell half as much
+    # three sigmas of chance: both are means over n frames, but overlapping triples have half the information
     freedom = float(np.sum(fits.degrees_of_freedom[fits.degrees_of_freedom >= 6]))
     by_chance = 3.0 * noise * np.sqrt(6.0 / max(freedom, 1.0))
     systematic = whole - noise if whole - noise > by_chance else 0.0
     systematic_px = 0.0, 0.0
     if systematic:
-        share = systematic / whole * 2 * float(fits.used.sum()) / freedom  # the poses take their part of the residuals
-        seen = (fits.residuals_px[:, camera][fits.used[:, camera]] for camera in (0, 1))  # nothing: it sees no dot
-        # of a normal distribution the median square is 0.455 variances; smears and objects in view do not count
+        share = systematic / whole * 2 * float(fits.used.sum()) / freedom  # the poses absorb part of the residuals
+        seen = (fits.residuals_px[:, camera][fits.used[:, camera]] for camera in (0, 1))  # empty if it sees no dot
+        # robust: the median square of a normal distribution is 0.455 times the variance
         left, right = (float(np.sqrt(np.median(one**2) / 0.455 * share)) if one.size else 0.0 for one in seen)
         systematic_px = left, right
     return Scatter(max(1.0, whole), free, noise, systematic, systematic_px)
 
 
 def frame_to_frame_chi_square(fits: PoseFits, markers_covariance_px2: Array) -> float | None:
-    """Reduced chi-square of the dots by what changes from one frame to the next alone; None where too few tell.
+    """Reduced chi-square of the dots by changes from frame to frame alone; None if too few frames qualify.
 
-    Second differences in time of the residuals about the fitted poses, (r[i-1] - 2 r[i] + r[i+1]) / sqrt(6), hold the
-    noise of single frames in full. What repeats, or changes slowly beside the frame rate, is not in them: the lens
-    beyond its polynomial, misprinted dots, gradients of light. The motion is not either, as every frame has its pose.
+    Second differences in time of the residuals about the fitted poses, (r[i-1] - 2 r[i] + r[i+1]) / sqrt(6), contain
+    the full noise of single frames. They exclude errors that repeat or vary slowly (lens beyond its polynomial,
+    misprinted dots, gradients of light), and the motion, as every frame has its own pose.
     """
     same = (fits.used[:-2] & fits.used[1:-1] & fits.used[2:]).sum((1, 2)) * 2 - 6
     steady = (fits.used[:-2] == fits.used[1:-1]).all((1, 2)) & (fits.used[2:] == fits.used[1:-1]).all((1, 2))
@@ -120,45 +120,45 @@ def frame_to_frame_chi_square(fits: PoseFits, markers_covariance_px2: Array) -> 
 
 
 def trimmed_reduced_chi_square(fits: PoseFits) -> float:
-    """Mean reduced chi-square of the frames, without the twentieth that fits worst (smears, objects in view)."""
+    """Mean reduced chi-square of the frames, without the worst 5 % (motion blur, objects in view)."""
     reduced = fits.reduced_chi_square[fits.degrees_of_freedom >= 6]
     return 1.0 if len(reduced) < MIN_FRAMES else _trimmed_mean(reduced)
 
 
 def _trimmed_mean(reduced: Array) -> float:
     kept = np.sort(reduced)[: int(0.95 * len(reduced))]
-    # the 5 % that are cut hold more than 5 % of the sum: 18 degrees of freedom lose 4 % of their mean
+    # trimming lowers the mean by 4 % (18 degrees of freedom)
     return float(kept.mean() / 0.96)
 
 
 def scatter_of_poses(fits: PoseFits) -> tuple[Array, Array, Array]:
-    """Variance of the poses from frame to frame over what their dots, as the covariances have it, tell.
+    """Variance of the poses from frame to frame over the prediction by their covariances, from sixth differences.
 
-    From sixth differences: (4,) found, by CHANNELS, NaN where no frames are slow enough; (4,) its sigma by chance;
-    (6,) at least 1, for the variances of POSE_COMPONENTS: the part of the excess that is no chance.
+    returns : (4,) the ratio, by CHANNELS, NaN if too few frames are slow enough; (4,) its sigma by chance; (6,) factors
+        on the variances of POSE_COMPONENTS, at least 1: the significant part of the excess
     """
     found, sigma, factor = np.full(4, np.nan), np.full(4, np.nan), np.ones(6)
     rows, away, spread = sums_over_time(fits, differences(6, -3))
     slow = _precession(fits.R_world_body, rows) < SLOW
     square = away[slow] ** 2 / np.diagonal(spread[slow], axis1=1, axis2=2)
-    if len(square) < 8 * WORTH:  # the variance of so few independent ones chance alone doubles now and then
+    if len(square) < 8 * WORTH:  # with so few independent ones the variance doubles by chance now and then
         return found, sigma, factor
-    # what is kept of chi-square with one degree of freedom has this mean
+    # mean of the trimmed chi-square distribution with one degree of freedom
     mean = scipy.special.chdtr(3, scipy.special.chdtri(1, 1 - KEPT)) / KEPT
     kept = np.sort(square, axis=0)[: int(KEPT * len(square))].mean(axis=0) / mean
     for i, part in enumerate(CHANNELS.values()):
         found[i], sigma[i] = kept[part].mean(), np.sqrt(2 * WORTH / (len(square) * len(part)))
         excess = found[i] - 1.0
-        # nothing below three sigmas, all of what is far above
+        # no excess below three sigmas, all of it far above
         factor[part] = 1.0 + max(excess - (3.0 * sigma[i]) ** 2 / excess, 0.0) if excess > 0 else 1.0
     return found, sigma, factor
 
 
 def _precession(R: Array, rows: NDArray[np.intp]) -> Array:
-    """Largest angle [rad] per frame by which the disc's axis turns about the vertical, in the seven frames around."""
+    """Largest precession [rad per frame] in the seven frames around each of the rows."""
     axis = R[rows[:, None] + np.arange(-3, 4), :2, 2]
     tilt = np.linalg.norm(axis, axis=2)
     with np.errstate(divide="ignore", invalid="ignore"):
-        # a disc that lies flat has no direction to precess in, and none is measured: it is not slow
+        # the precession of a disc that lies flat is not defined, and does not count as slow
         turn = 2.0 * np.linalg.norm(np.diff(axis, axis=1), axis=2) / (tilt[:, 1:] + tilt[:, :-1])
     return np.asarray(turn.max(axis=1))

@@ -1,20 +1,21 @@
-"""What all frames of a recording share, refined over the whole sequence: the dots' places, the rig within its sigma.
+"""Self-calibration: parameters that all frames share, refined over the whole sequence.
 
-Printed dots are off by tens of micrometres, the rig by its calibration's sigma; both leave the same residual in every
-frame, and a few hundred frames of a moving disc determine them far better than the calibration did. Shared parameters
-s and one pose per frame are fitted together; the poses are eliminated frame by frame (Schur complement):
+These are the positions of the dots, and the rig within its sigma. Printed dots are off by tens of micrometres, the rig
+by its calibration's sigma. Both cause the same residual in every frame, and a few hundred frames of a moving disc
+determine them far better than the calibration. Shared parameters s and one pose per frame are fitted together; the
+poses are eliminated frame by frame (Schur complement):
 
     (sum_i C_i^T C_i - C_i^T P_i (P_i^T P_i)^-1 P_i^T C_i + prior^-1) ds = sum_i C_i^T (1 - P_i (...)^-1 P_i^T) r_i
 
-P, C: whitened Jacobians by the pose and by s. Priors: the rig's own covariance; DOT_SIGMA for every dot in the plane
-of the face. Gauge: moving or turning the whole pattern on the disc cannot be told from moving the disc. The pattern is
-moved and turned to where the sum of the dots' displacements is smallest: if one dot is misprinted, the others stay
-where they were declared, and the centre of mass with them; the cameras do not see it.
+P, C: whitened Jacobians by the pose and by s. Priors: the rig's covariance; DOT_SIGMA for every dot in the plane of the
+face. Gauge: a shift or rotation of the whole pattern on the disc is equivalent to a motion of the disc. The pattern is
+placed such that the sum of the dots' displacements is smallest: if one dot is misprinted, the others, and the centre of
+mass, which the cameras do not see, stay as declared.
 
-The pattern of the dots is a second ruler beside the board: by how much it comes out larger than declared is the error
-of the rig's size or of the pattern's. Each has a variance, the rig's in its allowance for the board's size, the
-pattern's from how regular it is: one that is stretched or sheared by little was hardly drawn to a wrong size. The rig's
-size is moved by its share.
+The pattern of the dots is a second ruler, next to the board: if it measures larger than declared, the scale of the rig
+or that of the pattern is wrong. Both scales have a variance: that of the rig is in its allowance for the board's size,
+that of the pattern follows from its regularity, as a pattern with little stretch and shear hardly has a wrong size. The
+scale of the rig is corrected by its share.
 """
 
 from __future__ import annotations
@@ -32,28 +33,28 @@ from disctrack.disc import Disc
 from disctrack.track.pose import DotsInFrames, PoseFits
 from disctrack.track.side_by_side import MIN_FRAMES, SHARED_FRAMES, evenly
 
-DOT_SIGMA = 50e-6  # [m] how far a printed dot may lie from its declared place: tens of micrometres are usual
-# The template's and the camera model's own errors (0.002 px) repeat from frame to frame, so that a long recording must
-# not be taken for as many independent measurements: this much is added to every dot's sigma per shared direction.
+DOT_SIGMA = 50e-6  # [m] prior sigma of a printed dot about its declared position: tens of micrometres are usual
+# Errors of the template and of the camera model (0.002 px) repeat from frame to frame, so the frames of a long
+# recording are not independent: this is added to every dot's sigma per shared direction.
 SYSTEMATIC_PX = 0.002
-SIZE_FLOOR = 3e-6  # relative, of the dots as a ruler: metal and paper grow by some 1e-5 per kelvin
+SIZE_FLOOR = 3e-6  # relative, of the dots as a ruler: metal and paper expand by some 1e-5 per kelvin
 ITERATIONS = 3
-MANY_DOTS = 5  # from which one may be left out
-SUM_OF_LENGTHS = 1.35  # variance of the pattern's place by the sum of lengths over that by the sum of squares
+MANY_DOTS = 5  # least number of dots of which the worst may be left out
+SUM_OF_LENGTHS = 1.35  # variance of the pattern's position by the sum of lengths over that by the sum of squares
 
 
 @dataclass(frozen=True)
 class AsBuilt:
-    """Rig and disc after the refinement, and what it changed."""
+    """Rig and disc after the refinement, and the changes."""
 
-    rig: StereoRig  # with the covariance that remains
+    rig: StereoRig  # with its remaining covariance
     disc: Disc
     marker_shift: Array  # (m, 3) [m] refined minus declared, body axes; third component 0
     marker_shift_sigma: Array  # (m, 2) [m] of the dots against each other
     reduced_chi_square: float = float("nan")  # of the dots about their poses
-    size: float = 0.0  # relative, by which dots that are as declared make all lengths longer than the board does
+    size: float = 0.0  # relative excess of lengths by the dots (if as declared) over those by the board
     size_sigma: float = float("nan")  # of the dots as a ruler
-    size_share: float = 0.0  # of that, which the rig has been made larger by
+    size_share: float = 0.0  # fraction of the excess by which the rig was enlarged
 
     @property
     def details(self) -> dict[str, Any]:
@@ -66,7 +67,7 @@ class AsBuilt:
 
     @classmethod
     def moved(cls, rig: StereoRig, disc: Disc, shift: Array, covariance: Array, reduced_chi_square: float) -> AsBuilt:
-        """Dots moved by the part of displacements (m, 2) of covariance (2m, 2m) that is theirs, not their sigma's."""
+        """Dots displaced by the significant part of `shift` (m, 2), of covariance (2m, 2m)."""
         motions = _pattern_motions(disc).reshape(-1, 3)
         keep = np.eye(len(covariance)) - motions @ np.linalg.pinv(motions)
         sigma = np.sqrt(np.diag(keep @ covariance @ keep)).reshape(-1, 2)
@@ -76,9 +77,9 @@ class AsBuilt:
 
 
 def refine_as_built(frames: DotsInFrames) -> AsBuilt:
-    """Refine the dots' places, and the rig's size, from the dots of n frames.
+    """Refine the positions of the dots, and the scale of the rig, from the dots of n frames.
 
-    Frames with fewer than all dots serve too. Fewer than MIN_FRAMES frames leave everything as declared.
+    Incomplete frames are used, too. With fewer than MIN_FRAMES frames everything stays as declared.
     """
     rig, disc = frames.rig, frames.disc
     enough = frames.posed & (np.isfinite(frames.pixels).all(-1).sum((1, 2)) >= 4)
@@ -98,25 +99,25 @@ def refine_as_built(frames: DotsInFrames) -> AsBuilt:
 def fit_shared(
     frames: DotsInFrames, sigma: Array, repeats: float = 0.0
 ) -> tuple[Array, Array, list[float], DotsInFrames]:
-    """Fit what the frames share by Gauss-Newton, with a free pose for every frame.
+    """Fit the shared parameters by Gauss-Newton, with a free pose for every frame.
 
-    sigma : (30 + 2m + j,) of the prior about zero; what has none is not free
-    repeats : [px] errors that are common to all frames: they bound what these tell together
-    returns : shift (30 + 2m + j,) of RIG_PARAMETERS, of the dots' places, of anything else; its covariance, zero where
-        it was not free; reduced chi-square before each step; the frames with the poses before the last one
+    sigma : (30 + 2m + j,) of the prior about zero; parameters with sigma 0 are held
+    repeats : [px] errors common to all frames, which limit the accuracy of many frames together
+    returns : shift (30 + 2m + j,) of RIG_PARAMETERS, positions of the dots, and further parameters; its covariance,
+        zero for parameters held; reduced chi-square before each step; the frames with the poses before the last step
     """
     shift, reduced, free = np.zeros(len(sigma)), [], sigma > 0
     information = np.diag(sigma[free] ** -2)
     variance = float(np.nanmedian(0.5 * np.trace(frames.covariance, axis1=-2, axis2=-1)))
-    share = variance / (variance + len(frames.t) * repeats**2)  # n frames count at most as (sigma / repeats)^2 frames
+    share = variance / (variance + len(frames.t) * repeats**2)  # at most (sigma / repeats)^2 effective frames
     for iteration in range(ITERATIONS):
         frames, fits = frames.fitted(shift, reject=iteration > 0)
         ok = fits.converged
         reduced.append(float(fits.chi_square[ok].sum() / max(fits.degrees_of_freedom[ok].sum(), 1)))
         used = fits.used & ok[:, None, None]
         normal, gradient, _ = frames.normal(shift, used, free)
-        # dots that scatter more than the image noise alone makes them tell accordingly less, whatever is common to them
-        scale = share / _scatter_left(fits, normal, gradient)
+        # excess scatter of the dots over the image noise reduces their weight
+        scale = share / _residual_scatter(fits, normal, gradient)
         matrix = scale * normal + information
         shift[free] += scaled_solve(matrix, scale * gradient - information @ shift[free])
     covariance = np.zeros((len(shift), len(shift)))
@@ -125,10 +126,10 @@ def fit_shared(
 
 
 def share_of_places(disc: Disc, shift: Array, sigma: Array) -> float:
-    """Part of displacements (m, 2) of sigma (m, 2) to believe in: 1 - noise / power, or 0 (James and Stein 1961).
+    """Shrinkage factor of displacements (m, 2) of sigma (m, 2): 1 - noise / power, or 0 (James and Stein 1961).
 
-    Power and noise are those of the displacements against each other. What is found of dots that lie where they were
-    declared is noise, and keeps them there; of dots that are off by ten times as much, 1 % is left out.
+    Power and noise are those of the relative displacements of the dots. Dots at their declared positions show only
+    noise, and stay there; displacements of ten sigmas are reduced by 1 %.
     """
     motions = _pattern_motions(disc).reshape(-1, 3)
     own = shift.reshape(-1) - motions @ (np.linalg.pinv(motions) @ shift.reshape(-1))
@@ -136,19 +137,19 @@ def share_of_places(disc: Disc, shift: Array, sigma: Array) -> float:
 
 
 def pattern_place(disc: Disc, shift: Array, sigma: Array) -> tuple[float, float]:
-    """Variances of the pattern's displacement, per axis [m^2], and of its turn [rad^2]: what the gauge leaves open.
+    """Variances of the shift, per axis [m^2], and rotation [rad^2] of the pattern, which the images do not determine.
 
-    shift : (m, 3) [m] of the dots from their declared places as `declared_places_kept` has them; sigma (m, 2) [m]
+    shift : (m, 3) [m] of the dots from their declared positions, from `declared_places_kept`; sigma (m, 2) [m]
 
-    Dots that lie off their places against each other by s, rms per axis, lie off them as a whole by s / sqrt(m). The
-    dot that is off most is left out of s: one that was declared wrongly says nothing of the others. A sum of lengths is
-    less efficient than one of squares, and s has few degrees of freedom (both by simulation, test_self_calibration.py).
+    If the dots err relative to each other by s, rms per axis, the pattern as a whole errs by s / sqrt(m). The worst dot
+    is left out of s: a wrongly declared one does not represent the others. A sum of lengths is less efficient than one
+    of squares, and s has few degrees of freedom (both by simulation, test_self_calibration.py).
     """
     m = disc.n_markers
     squares = np.sort(np.sum(shift[:, :2] ** 2, axis=1))
     freedom = 2 * m - 3
     if m >= MANY_DOTS:
-        # of the sum of m exponentially distributed squares, the largest is this share
+        # expected fraction of the largest in a sum of m exponentially distributed squares
         squares = squares[:-1] / (1.0 - np.sum(1.0 / np.arange(1, m + 1)) / m)
         freedom -= 2
     found = float(squares.sum()) / (2 * m - 3)
@@ -157,9 +158,9 @@ def pattern_place(disc: Disc, shift: Array, sigma: Array) -> tuple[float, float]
 
 
 def by_pattern(as_built: AsBuilt, R: Array, off_centre: float = 0.0) -> Array:
-    """(n, 6, 3) change of poses R (n, 3, 3) whose dots are off as a whole, too, by one sigma of each way of it.
+    """(n, 6, 3) change of poses R (n, 3, 3) by one sigma of each shift and of the rotation of the whole pattern.
 
-    off_centre : [m] by which the pattern may be off the disc's centre beside that, as the table tells
+    off_centre : [m] additional sigma of the pattern's centre, from the table
     """
     place, turn = pattern_place(as_built.disc, as_built.marker_shift, as_built.marker_shift_sigma)
     place += off_centre**2
@@ -167,7 +168,7 @@ def by_pattern(as_built: AsBuilt, R: Array, off_centre: float = 0.0) -> Array:
 
 
 def motions_of_pattern(R: Array, disc: Disc) -> Array:
-    """(n, 6, 3) how poses R (n, 3, 3) change when the pattern is displaced along e1, e2 and turned about its middle."""
+    """(n, 6, 3) change of poses R (n, 3, 3) by a shift of the pattern along e1, e2 and a rotation about its centre."""
     x, y = disc.marker_centres_body[:, :2].mean(axis=0)
     motions = np.zeros((len(R), 6, 3))
     motions[:, :3, :2] = R[:, :, :2]
@@ -177,13 +178,13 @@ def motions_of_pattern(R: Array, disc: Disc) -> Array:
 
 
 def pattern_size(disc: Disc, shift: Array, covariance: Array) -> tuple[float, float]:
-    """By how much lengths are too short, relative, if the dots are as declared; and the dots' sigma as a ruler.
+    """By how much lengths are too short, relative, if the dots are as declared; and the sigma of the dots as a ruler.
 
-    shift : (m, 2) [m] refined minus declared places of covariance (2m, 2m); SIZE_FLOOR is added
+    shift : (m, 2) [m] refined minus declared positions, of covariance (2m, 2m)
 
-    The sigma has two parts beside the floor: of dots that are misplaced at random, as those left by displacement, turn,
-    size, stretch and shear are, which holds the refinement's errors as well and is no less than these; and of a pattern
-    whose two sides are off by what stretch and shear show.
+    The variance has three parts: random errors of the dots, from the residuals after displacement, rotation, size,
+    stretch and shear, and not below the variance of the refinement; errors of the two sides of the pattern, from
+    stretch and shear; and SIZE_FLOOR.
     """
     d = _from_middle(disc)
     columns = np.stack([d, d * [0.5, -0.5], 0.5 * d[:, ::-1]], axis=-1).reshape(-1, 3)
@@ -191,40 +192,40 @@ def pattern_size(disc: Disc, shift: Array, covariance: Array) -> tuple[float, fl
     inverse = np.linalg.pinv(columns)
     size, stretch, shear = (inverse @ shift.reshape(-1))[:3]
     refined = float((inverse @ covariance @ inverse.T)[0, 0])
-    left = shift.reshape(-1) - columns @ (inverse @ shift.reshape(-1))
-    freedom = max(len(left) - 6, 1)
-    random = float(left @ left) / freedom / float(np.sum(d**2))
-    # stretch and shear have the variance 2 v of two sides, the size, their mean, has v / 2
+    residual = shift.reshape(-1) - columns @ (inverse @ shift.reshape(-1))
+    freedom = max(len(residual) - 6, 1)
+    random = float(residual @ residual) / freedom / float(np.sum(d**2))
+    # sides of variance v give stretch and shear the variance 2 v, and the size, their mean, v / 2
     drawn = (stretch**2 + shear**2) / 8.0
     return -float(size), float(np.sqrt(max(random, refined) + drawn + SIZE_FLOOR**2))
 
 
 def sized_by_pattern(rig: StereoRig, size: float, sigma: float) -> tuple[StereoRig, float]:
-    """The rig with all lengths longer by its share of `size` +- `sigma`, and that share; see the module."""
+    """The rig with its scale corrected by its share of `size` +- `sigma`, and that share; see the module."""
     by_size = [i for i, a in enumerate(rig.allowances) if a.cause == SIZE and a.shift[PAIR_SHIFT].any()]
     if not by_size:
         return rig, 0.0
     shift = rig.allowances[by_size[0]].shift
     own = float(np.linalg.norm(shift[PAIR_SHIFT])) / rig.baseline
     share = own**2 / (own**2 + sigma**2)
-    left = np.sqrt(1.0 - share)
+    remaining = np.sqrt(1.0 - share)
     allowances = list(rig.allowances)
-    allowances[by_size[0]] = replace(allowances[by_size[0]], shift=left * shift)
-    covariance = rig.covariance - (1.0 - left**2) * np.outer(shift, shift)
+    allowances[by_size[0]] = replace(allowances[by_size[0]], shift=remaining * shift)
+    covariance = rig.covariance - (1.0 - remaining**2) * np.outer(shift, shift)
     grown = rig.perturbed(share * size / own * shift)
     return replace(grown, covariance=covariance, allowances=tuple(allowances)), share
 
 
 def _from_middle(disc: Disc) -> Array:
-    """(m, 2) [m] from the middle of the dots."""
+    """(m, 2) [m] positions of the dots relative to their mean."""
     d: Array = disc.marker_centres_body[:, :2] - disc.marker_centres_body[:, :2].mean(axis=0)
     return d
 
 
 def declared_places_kept(disc: Disc, shift: Array) -> Array:
-    """Displacements (m, 3) that differ from `shift` (m, 2) by a displacement and a turn of the whole pattern only.
+    """Displacements (m, 3) that differ from `shift` (m, 2) only by a shift and a rotation of the whole pattern.
 
-    Of all these the one with the smallest sum of lengths: as many dots as possible stay where they were declared.
+    Of these the one with the smallest sum of lengths: as many dots as possible stay at their declared positions.
     """
     motions = _pattern_motions(disc)
     rest = shift
@@ -241,7 +242,7 @@ def declared_places_kept(disc: Disc, shift: Array) -> Array:
 
 
 def _pattern_motions(disc: Disc) -> Array:
-    """Displacement (m, 2, 3) of the dots by a unit displacement and turn of the whole pattern."""
+    """Displacement (m, 2, 3) of the dots by a unit shift and rotation of the whole pattern."""
     x, y = disc.marker_centres_body[:, :2].T
     one, zero = np.ones_like(x), np.zeros_like(x)
     motions = np.stack([np.stack([one, zero, -y], -1), np.stack([zero, one, x], -1)], axis=1)
@@ -249,10 +250,10 @@ def _pattern_motions(disc: Disc) -> Array:
     return motions
 
 
-def _scatter_left(fits: PoseFits, normal: Array, gradient: Array) -> float:
-    """Reduced chi-square, at least 1, that the best step of what frames share will leave: the dots' own scatter.
+def _residual_scatter(fits: PoseFits, normal: Array, gradient: Array) -> float:
+    """Reduced chi-square, at least 1, predicted after the best step of the shared parameters: the dots' scatter.
 
-    Before that step, dots declared in wrong places look like noise a hundred times the pixels', and hold it up.
+    Before this step, dots declared at wrong positions look like a hundred times the noise, and would damp it.
     """
     chi_square, freedom = fits.chi_square[fits.converged].sum(), fits.degrees_of_freedom[fits.converged].sum()
     explained = gradient @ np.linalg.lstsq(normal, gradient, rcond=1e-12)[0]
