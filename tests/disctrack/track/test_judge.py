@@ -8,7 +8,7 @@ import pytest
 from disctrack.faults.keys import CameraFault, Faults
 from disctrack.findings import Kind
 from disctrack.frames import rotation_from_vector
-from disctrack.track.judge.cameras import camera_course, frames_ahead
+from disctrack.track.judge.cameras import camera_motion, frames_ahead
 from disctrack.track.refine.assembly import fit_all
 from tests.oracles.measured_disc import dots_of, measured
 
@@ -21,7 +21,7 @@ def judged(trajectory):
     seen = dots_of(trajectory)
     fits = fit_all(seen)
     seen = replace(seen, R=fits.R_world_body, t=fits.t_world_body)
-    return fits, camera_course(seen, fits, range(N))
+    return fits, camera_motion(seen, fits, range(N))
 
 
 @pytest.mark.parametrize("camera", [0, 1])
