@@ -1,24 +1,23 @@
-"""The table from the disc: a rolling rim touches it along a circle, and a circle spans a plane.
+"""The table from the disc: a rolling rim touches the table along a circle, which determines a plane.
 
 With the plane z = c + a (x - x0) + b (y - y0) in world axes, (x0, y0) the middle of the contacts, and its normal
 n = (-a, -b, 1) / |...|, the disc's lowest point A lies above it by n . (A - (x0, y0, c)), where
 
     A = t - r e2 - h e3 (e2 up the disc's slope against n); to first order gap = z_A - c - a (x_A - x0) - b (y_A - y0).
 
-Height and slopes follow from the gaps of all frames, better than from a board: that lies on the table with its
-thickness and its bow. Both have a covariance (the cameras' errors are in both, and count once: the poses' sensitivity
-to the rig), and they are combined as those say. Only the world frame is moved; the cameras stay as calibrated relative
-to each other.
+Height and slopes follow from the gaps of all frames, more accurately than from a board, with its thickness and bow.
+Both planes have a covariance (common errors of the cameras count once: the poses' sensitivity to the rig), and are
+combined by their weights. Only the world frame is moved; the cameras stay as calibrated relative to each other.
 
-How far board and disc differ also tells how well both were made: two errors hardly cancel. So what was assumed of the
-board, and apart from it of the disc, without being declared, is narrowed to the difference that is seen.
+The difference between board and disc also bounds the errors of both, as two errors hardly cancel. So tolerances of the
+board, and separately of the disc, that are assumed and not declared are reduced to the observed difference.
 
-Where they differ by more than both sigmas allow, the one that bends is as a rule the board. It may be the table itself:
-a hollow that is rolled along is a slope there; a wrong radius or thickness, a camera that moved, a sheet of dots off
-the disc's centre look alike. So what is moved beyond the sigmas is in the sigma of the world's table, and of the dots'
-place on the disc (`off_centre`); it is kept, and whoever fits the motion lets the table's plane free by so much.
+If they differ by more than both sigmas allow, usually the board is bent. But the table may have a hollow, which is a
+slope along the track; a wrong radius or thickness, a camera that moved, or a sheet of dots off the disc's centre have
+the same effect. So the part of the correction beyond the sigmas is added to the sigma of the table, and to that of the
+dots' position on the disc (`off_centre`). It is stored, and fits of the motion free the table's plane by this amount.
 
-This is geometry alone. A table that is not level leans in the world and against gravity; here the world leans with it.
+This is geometry alone. If the table is not level, the world frame is tilted with it against gravity.
 """
 
 from dataclasses import dataclass, replace
@@ -39,30 +38,30 @@ from disctrack.track.side_by_side import parts
 
 OF_PATTERN = "where the dots are on the disc"
 DISAGREEMENT = "board and disc disagree about the table"
-MIN_FRAMES = 30  # fewer poses of a rolling disc lie too near each other: their plane would take up what moves them all
-# Below, the direction of the contact is noise; above, a disc stands on its rim and may well slide or fall.
+MIN_FRAMES = 30  # fewer poses are too close together: their plane would absorb common errors
+# Below, the direction of the contact is noise; above, the disc stands on its rim and may slide or fall.
 THETA_RANGE = np.radians(0.7), np.radians(85.0)
-MAX_SCATTER = 30e-6  # [m] of the gaps about their plane: beyond, the disc jumps or the poses are not those of a disc
-NOISY = 6.0  # times what noise and misfit of the poses explain, as far as that is more
-# Standard deviations [m] of radius and thickness where none is declared: 0.02 %, and a micrometer's
+MAX_SCATTER = 30e-6  # [m] of the gaps about their plane: beyond, the disc jumps or the poses are wrong
+NOISY = 6.0  # the same limit relative to the predicted scatter of the poses; the larger one applies
+# Standard deviations [m] of radius and thickness if not declared: 0.02 %, and that of a micrometer gauge
 ASSUMED_RADIUS, ASSUMED_THICKNESS = 7.5e-6, 3e-6
-FROM_SIGMAS = 3.0  # of both on, board and disc disagree
-STEEP = 0.1  # slope of a plane that is no table: the board of the declared view lay elsewhere
-PLACES = 6.0  # at which the cameras' smooth errors are independent, in a whole turn of the contact
+FROM_SIGMAS = 3.0  # combined sigmas above which board and disc disagree
+STEEP = 0.1  # slope above which the plane is not the table: the board of the declared view lay elsewhere
+PLACES = 6.0  # number of independent values of the cameras' smooth errors in a whole turn of the contact
 
 
 @dataclass(frozen=True)
 class TableFromDisc:
-    """The plane that the rim touched, in the axes of the board's table, and what was made of it."""
+    """The plane touched by the rim, in the axes of the board's table, and the correction of the world frame."""
 
-    source: str  # "board", "disc" or "both": what the world's table is
+    source: str  # "board", "disc" or "both": what determines the world's table
     plane: Array  # (3,) height in the middle of the contacts [m], slopes along x and y, against the table by the board
     middle: Array  # (2,) [m] of the contacts, x and y
-    sigma: Array  # (3,) of the plane by the disc: noise, what repeats, tolerances of the disc
-    board_sigma: Array  # (3,) of the table by the board, the rig's covariance
+    sigma: Array  # (3,) of the plane by the disc: noise, systematic errors, tolerances of the disc
+    board_sigma: Array  # (3,) of the table by the board, from the rig's covariance
     applied: Array  # (3,) by which the world was moved
-    beyond: tuple[float, float, float]  # sizes of what of this both sigmas do not allow: at the origin [m], slopes
-    probability: float  # that board and disc differ by as much if both sigmas are right
+    beyond: tuple[float, float, float]  # part of this that exceeds both sigmas: at the origin [m], slopes
+    probability: float  # of a difference as large if both sigmas are right
 
     @property
     def sentence(self) -> str:
@@ -77,9 +76,9 @@ class TableFromDisc:
         return f"{told}; {used} ([table] from)"
 
     def details(self, theta: Array, disc: Disc) -> dict[str, Any]:
-        """Of JSON's types, with the distance of the dots' middle from the disc's that no sigma would hold [m].
+        """Fields as JSON types, with the distance [m] of the dots' centre from the disc's that would be significant.
 
-        theta : (n,) as of `off_centre`. From that distance on board and disc disagree.
+        theta : (n,) as for `off_centre`. Above this distance board and disc disagree.
         """
         fields = {name: v.tolist() if isinstance(v, np.ndarray) else v for name, v in vars(self).items()}
         lean = FROM_SIGMAS * np.hypot(self.sigma, self.board_sigma)[1:].max()
@@ -90,14 +89,14 @@ class TableFromDisc:
 def table_from_disc(
     fits: PoseFits, systematic: Array, rig: StereoRig, disc: Disc, source: str = "both", by_pattern: Array | None = None
 ) -> tuple[PoseFits, Array, StereoRig, TableFromDisc | None]:
-    """Poses, their systematic covariance and rig with the world's table where board and disc have it.
+    """Poses, their systematic covariance and rig, in a world whose table is that of board, disc or both.
 
-    fits : with the covariances of the frames' noise; systematic (n, 6, 6). What is returned holds their arrays, altered
-    source : "board", "disc" or "both"; with "board" nothing is moved, and the difference is told
-    by_pattern : (n, 6, k) how poses change by one sigma of the pattern's own place on the disc, which is not in
-        `systematic`: a pattern off the centre by d lifts and lowers the rim by d sin(theta) as the disc turns, which
-        looks like a table that leans while phi follows -psi
-    None, and nothing changed, where the rig has no table or the disc did not touch one near it.
+    fits : with the covariances of the frames' noise; systematic (n, 6, 6). The arrays of both are altered and returned
+    source : "board", "disc" or "both"; with "board" nothing is moved, and the difference is reported
+    by_pattern : (n, 6, k) change of the poses by one sigma of the pattern's position on the disc, which is not in
+        `systematic`: a pattern off the centre by d moves the rim up and down by d sin(theta) as the disc turns, which
+        looks like a tilted table while phi follows -psi
+    None, and nothing changed, if the rig has no table or the disc did not touch one near it.
     """
     by_pattern = np.zeros((len(systematic), 6, 0)) if by_pattern is None else by_pattern
     found = _contacts(fits, systematic, disc, by_pattern) if rig.world_is_table else None
@@ -105,7 +104,7 @@ def table_from_disc(
         return fits, systematic, rig, None
     plane, middle, H, noise, by_disc, by_place = found
     noise = noise + by_place @ by_place.T
-    # a thicker disc lifts the centre between its faces by half of what it lifts the dots by, which are measured
+    # excess thickness lifts the dots, which are measured, by twice as much as the disc's centre
     of_dots, narrower = np.array([1.0, 2.0]), np.ones(2)
     V, board = noise + (by_disc * of_dots**2) @ by_disc.T, H @ rig.covariance @ H.T
     chance = float(scipy.special.chdtrc(3, np.linalg.solve(board + V, plane) @ plane))
@@ -114,18 +113,18 @@ def table_from_disc(
         rig, narrower = _narrowed(rig, by_disc * of_dots, disc, plane, H, noise)
         by_disc = by_disc * narrower
         V, board = noise + (by_disc * of_dots**2) @ by_disc.T, H @ rig.covariance @ H.T
-    # where they differ by more than three of both sigmas, it is the board that bends and lies on dust
+    # a difference above three combined sigmas is attributed to the board: it bends, and lies on dust
     allowed = np.diag(board + V)
     excess = np.where(plane**2 > FROM_SIGMAS**2 * allowed, plane**2 - allowed, 0.0)
     more = board + np.diag(excess)
-    # of what the plane is as these cameras see the disc: errors that both share do not count
+    # weight of the plane by the disc, as these cameras see it: common errors cancel
     gain = more @ np.linalg.inv(more + V) if source == "both" else np.eye(3) * (source == "disc")
     beyond = np.minimum(excess, (gain @ plane) ** 2)
     in_doubt = np.sqrt(beyond) * (source == "both")
     beyond[0] += middle**2 @ beyond[1:]  # at the origin
     height, slope_x, slope_y = np.sqrt(beyond).tolist()
     told = TableFromDisc(source, plane, middle, of_disc, of_board, gain @ plane, (height, slope_x, slope_y), chance)
-    # of the disc's thickness, what the board's share of the height leaves, and what no sigma allows
+    # remaining variance of the height by the disc's thickness, and by the part beyond the sigmas
     left = ((1.0 - gain[0, 0]) * narrower[1] * thickness_tolerance(disc) / 2.0) ** 2 + in_doubt[0] ** 2
     e3 = np.nan_to_num(fits.R_world_body[..., 2])
     systematic[:, :3, :3] += left * e3[:, :, None] * e3[:, None, :]
@@ -140,7 +139,7 @@ def _as_sure_as_both(
 ) -> StereoRig:
     """The rig with covariance and allowances of a world whose table is moved by gain @ plane.
 
-    in_doubt : (3,) of the plane, that neither sigma allows
+    in_doubt : (3,) part of the correction of the plane beyond both sigmas
     """
     turn = rig.R_left_world
     M = np.zeros((N_RIG, 3))  # d RIG_PARAMETERS / d plane: the world is moved onto it
@@ -160,9 +159,9 @@ def _as_sure_as_both(
 
 
 def off_centre(table: TableFromDisc | None, theta: Array, disc: Disc) -> float:
-    """Distance [m] of the dots' middle from the disc's that would make the table lean by what no sigma allows.
+    """Distance [m] of the dots' centre from the disc's that would explain the tilt of the table beyond the sigmas.
 
-    theta : (n,) nutation [rad]; rolling round, the rim rises by that distance times sin(theta) on one side.
+    theta : (n,) nutation [rad]; in a turn, the rim rises by this distance times sin(theta) on one side.
     """
     if table is None or table.source != "both":
         return 0.0
@@ -182,9 +181,9 @@ def thickness_tolerance(disc: Disc) -> float:
 def _narrowed(
     rig: StereoRig, by_disc: Array, disc: Disc, plane: Array, H: Array, noise: Array
 ) -> tuple[StereoRig, Array]:
-    """Rig with what was assumed of it as small as `plane` is, and factors (2,) on what was assumed of the disc's sizes.
+    """Rig with assumed tolerances reduced to the size of `plane`, and factors (2,) on those assumed for the disc.
 
-    Height or slopes, whichever would show it best, tell of an assumption; nothing becomes larger.
+    Each tolerance is compared with the height or slope on which it has the most significant effect; none increases.
     """
     shifts = np.array([a.shift for a in rig.allowances]).reshape(-1, N_RIG)
     of_board = np.array([a.assumed for a in rig.allowances], bool)
@@ -192,11 +191,11 @@ def _narrowed(
     declared = by_disc[:, ~of_disc]
     known = rig.covariance - (shifts.T * of_board) @ shifts
     told = np.diag(H @ known @ H.T + noise + declared @ declared.T)
-    seen = np.maximum(plane**2, told)  # less than what can be told is not known
+    seen = np.maximum(plane**2, told)  # differences below the sigma are not resolved
 
     def factors(columns: Array, assumed: Mask) -> Array:
         whole = np.maximum(np.sum(columns[:, assumed] ** 2, axis=1), 1e-300)  # (3,)
-        most = np.argmax(columns**2 / told[:, None], axis=0)  # where it would show best
+        most = np.argmax(columns**2 / told[:, None], axis=0)  # component with the most significant effect
         return np.where(assumed, np.sqrt(np.minimum(1.0, seen / whole))[most], 1.0)
 
     scale = factors(H @ shifts.T, of_board)
@@ -209,7 +208,7 @@ def _contacts(
     fits: PoseFits, systematic: Array, disc: Disc, by_pattern: Array
 ) -> tuple[Array, Array, Array, Array, Array, Array] | None:
     """See `TableFromDisc`: plane, middle, d plane / d RIG_PARAMETERS (3, 30), covariance of the plane by noise, its
-    departures for one tolerance of radius and thickness (3, 2), by the pattern's place (3, k).
+    changes by one tolerance of radius and thickness (3, 2), and by the pattern's position (3, k).
     """
     with np.errstate(invalid="ignore"):
         theta = np.arccos(np.clip(fits.R_world_body[:, 2, 2], -1, 1))
@@ -218,7 +217,7 @@ def _contacts(
         return None
     R, t = fits.R_world_body[rows], fits.t_world_body[rows]
     plane, kept = np.zeros(3), np.ones(len(rows), bool)
-    wide = STEEP * np.array([disc.radius, 1.0, 1.0])  # bounds what a short arc of contacts leaves open
+    wide = STEEP * np.array([disc.radius, 1.0, 1.0])  # prior sigmas, for short arcs of contacts
     middle = np.median(t + lowest_arm(R[..., 2], K, disc), axis=0)[:2]
     for _ in range(6):
         normal = np.array([-plane[1], -plane[2], 1.0])
@@ -227,7 +226,7 @@ def _contacts(
         contact = t + arm
         gap = (contact - [*middle, plane[0]]) @ normal
         A = np.column_stack([np.ones(len(rows)), contact[:, :2] - middle])
-        information = A[kept].T @ A[kept] + np.diag((1e-6 / wide) ** 2)  # beside gaps that scatter by a micrometre
+        information = A[kept].T @ A[kept] + np.diag((1e-6 / wide) ** 2)  # for gaps with a scatter of a micrometre
         step = np.linalg.solve(information, A[kept].T @ gap[kept])
         plane = plane + step
         left = gap - A @ step
@@ -257,12 +256,12 @@ def _contacts(
 def _on_plane(
     fits: PoseFits, systematic: Array, rig: StereoRig, table: TableFromDisc
 ) -> tuple[PoseFits, Array, StereoRig]:
-    """Everything in the axes of a world moved onto the table; the origin moves along k alone."""
+    """Poses, covariances and rig in the axes of a world moved onto the table; the origin moves along k only."""
     height, a, b = table.applied
     Q = frames.rotation_from_vector(np.array([b, -a, 0.0]))  # R_old_new
     shift = np.array([0.0, 0.0, height - table.applied[1:] @ table.middle])
     both = np.kron(np.eye(2), Q.T)
-    for rows in parts(len(systematic)):  # in place: of a long recording these are the largest arrays
+    for rows in parts(len(systematic)):  # in place: these are the largest arrays of a long recording
         fits.sensitivity[rows] = both @ fits.sensitivity[rows]
         for covariance in (fits.covariance, systematic):
             covariance[rows] = both @ covariance[rows] @ both.T
