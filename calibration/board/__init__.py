@@ -1,1 +1,1 @@
-"""From an image to a board's corners: the targets, how they are found, and where exactly each corner lies."""
+"""Detection of a calibration target in an image, and subpixel location of its corners."""

@@ -5,14 +5,14 @@ with h = u / sigma, k = v / sigma and rho the cosine between the edges' normals,
 
     S(h, k; rho) = E[sign(h + n1) sign(k + n2)] = 4 Phi2(h, k; rho) - 2 Phi(h) - 2 Phi(k) + 1,
 
-exact for any angle between the edges (the product of two error functions is so only at 90 degrees). sigma^2 holds the
-variance 1/12 of the square pixel; its fourth cumulant, which a Gaussian lacks, is added by Edgeworth's term. Lines stay
-lines under perspective, so the corner is where they cross, without bias; lens distortion bends them by a known
-curvature. Light that falls off over the window multiplies both levels, and is fitted; light that is added (glare,
-a lens that flares) takes more of the dark squares' share, so that the contrast changes over the window. Left out, that
-shifts a corner along its gradient, 0.1 grey values per px by 0.004 px; it is known from the other corners.
+exact for any angle between the edges (a product of two error functions is exact only at 90 degrees). sigma^2 contains
+the variance 1/12 of the square pixel; an Edgeworth term adds its fourth cumulant, which a Gaussian lacks. Perspective
+maps lines to lines, so the intersection of the edges is an unbiased corner; the curvature of the edges by lens
+distortion is known. A gradient of the illumination multiplies both levels, and is fitted. Added light (glare, lens
+flare) raises the dark level by the larger fraction, so that the contrast changes over the window. If neglected, a
+gradient of 0.1 grey values per px shifts the corner by 0.004 px; it is known from the other corners.
 
-numba, because one view is some 10^6 evaluations of this model: 0.05 s compiled.
+Compiled with numba: one view takes some 10^6 evaluations of this model, 0.05 s.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ from calibration.kit.compiled import njit, part
 N_CORNER = (
     9  # x, y [px], two edge angles [rad], blur sigma [px], mean grey, half contrast, relative light gradient [1/px]
 )
-FLAT = 0.995  # |S| above which a pixel lies inside a square and shows the image's noise alone
-MIN_BLUR = 0.3  # px, just above the square pixel's own: edges may be sharper, by sharpening, than any lens makes them
-_FAR = 5.0  # sigmas from an edge: S has reached its level to 6e-7
+FLAT = 0.995  # |S| above which a pixel lies inside a square, where the residual is the image noise
+MIN_BLUR = 0.3  # px, just above that of the square pixel: sharpened edges may be sharper than any lens makes them
+_FAR = 5.0  # sigmas from an edge, beyond which S is constant to 6e-7
 _X, _W = np.polynomial.legendre.leggauss(8)
 _N_NODES = len(_X)
 _SQRT_HALF = math.sqrt(0.5)
 
-# What only compiled code calls has no way in from Python: that would cost as much compiling again. Nor are whole slices
-# assigned: the text of the error that numba prepares for unequal shapes takes longer to compile than a loop. A literal
-# is given as a number of NumPy's: numba compiles a function once for each literal, and once for its type.
+# Compile time: functions that only compiled code calls have no Python wrapper, which would double it. Loops replace
+# assignments of slices, as numba's error message for unequal shapes takes longer to compile than a loop. Literals are
+# passed as NumPy scalars: numba compiles a function for every literal, but once for a type.
 
 
 @part
@@ -66,7 +66,7 @@ def blurred_saddle(h, k, rho, table, out):  # type: ignore[no-untyped-def]
     if near_k:
         S_k = 0.7978845608028654 * math.exp(-0.5 * k * k) * math.erf((h - rho * k) / s * _SQRT_HALF)
     square = h * h + k * k
-    if square - 2.0 * abs(rho * h * k) < 30.0:  # elsewhere the integrand stays below exp(-15)
+    if square - 2.0 * abs(rho * h * k) < 30.0:  # otherwise the integrand is below exp(-15)
         S_rho = 2.0 / (math.pi * s) * math.exp(-0.5 * (square - 2.0 * rho * h * k) / (s * s))
         for n in range(_N_NODES):
             S += table[n, 0] * math.exp(-(square - 2.0 * h * k * table[n, 1]) * table[n, 2])
@@ -75,15 +75,15 @@ def blurred_saddle(h, k, rho, table, out):  # type: ignore[no-untyped-def]
 
 @part
 def normal_equations(image, window, p, known, noise, weights, first_pass, H, g):  # type: ignore[no-untyped-def]
-    """Weighted sums of one corner; H (9, 9) and g (9,) are filled. Returns chi-square, and sums over pixels.
+    """Normal equations of one corner, written to H (9, 9) and g (9,). Returns chi-square and sums over pixels.
 
-    weights : of the window's pixels; filled in the first pass from the noise at the model's grey values, then left, so
-    that chi-square is one function of p and Gauss-Newton's step goes down on it
+    weights : of the window's pixels; set in the first pass from the noise at the model's grey values, then constant, so
+    that chi-square is a fixed function of p, which Gauss-Newton steps decrease
 
-    known (4,): bends of the two edges [1/px]; relative gradient of the contrast against the light's [1/px]
+    known (4,): curvatures of the two edges [1/px]; relative gradient of contrast minus that of illumination [1/px]
     window (14,): x0, x1, y0, y1 [px, inclusive]; centre x, y; inverse of the local axes, row by row; half widths along
-    i and j [squares]; largest step [px]; distance from both edges [squares] beyond which the light squares are
-    not plain (a marker), positive if they lie where i j > 0, negative if where i j < 0.
+    i and j [squares]; largest step [px]; distance from both edges [squares] beyond which the light squares contain
+    a marker, positive if the light squares have i j > 0, negative if i j < 0.
     """
     gradient, S4 = np.zeros(N_CORNER), np.zeros(4)
     H[:] = 0.0
@@ -116,7 +116,7 @@ def normal_equations(image, window, p, known, noise, weights, first_pass, H, g):
             if abs(h) > _FAR and abs(k) > _FAR:
                 S = 1.0 if h * k > 0 else -1.0
                 base = p[5] + half * S
-                first = 5  # an even level tells nothing of the edges
+                first = 5  # a constant level does not depend on the edges
             else:
                 blurred_saddle(h, k, rho, table, S4)
                 S, S_h, S_k = S4[0], S4[1], S4[2]
@@ -177,9 +177,9 @@ def solve_damped(H, damping, rhs, L):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def fit_corners(image, windows, starts, known, noise, iterations, tolerance):  # type: ignore[no-untyped-def]
-    """Levenberg-Marquardt on many corners of one image.
+    """Levenberg-Marquardt fits of all corners of one image.
 
-    Parameters (n, 9), covariances (n, 2, 2) of x and y, sums (n, 9) as `normal_equations` has them, converged (n,).
+    Returns parameters (n, 9), covariances (n, 2, 2) of x and y, sums (n, 9) of `normal_equations`, converged (n,).
     """
     n, found = starts.shape[0], starts.copy()
     covariance, all_sums, converged = np.zeros((n, 2, 2)), np.zeros((n, N_CORNER)), np.zeros(n, np.bool_)
@@ -203,7 +203,7 @@ def fit_corners(image, windows, starts, known, noise, iterations, tolerance):  #
                 H, H_new = H_new, H
                 g, g_new = g_new, g
                 damping = max(damping * 0.1, 1e-9)
-                # the blur as clamped: edges sharper than the pixel hold it at its lower bound
+                # change of the clamped blur: edges sharper than the pixel keep it at its lower bound
                 done = k > 0 and abs(step[0]) < tolerance and abs(step[1]) < tolerance
                 done = done and abs(p[4] - blur) < 10 * tolerance
             else:
@@ -211,7 +211,7 @@ def fit_corners(image, windows, starts, known, noise, iterations, tolerance):  #
             enough = sums[1] >= 4 * N_CORNER
             if done or damping > 1e8 or not enough:
                 break
-            if p[4] <= MIN_BLUR and g[4] < 0.0:  # held at its bound, so that the others go to their own minimum
+            if p[4] <= MIN_BLUR and g[4] < 0.0:  # fixed at its bound, so that the others reach their minimum
                 H[4, :4], H[5:, 4], H[4, 4], g[4] = 0.0, 0.0, 1.0, 0.0
             for i in range(N_CORNER):
                 step[i] = g[i]
@@ -221,7 +221,7 @@ def fit_corners(image, windows, starts, known, noise, iterations, tolerance):  #
             trial[4] = min(max(trial[4], 0.5 * p[4], MIN_BLUR), 2.0 * p[4])
             reach = math.hypot(trial[0] - window[4], trial[1] - window[5])
             possible &= reach < window[12] and abs(math.cos(trial[3] - trial[2])) < 0.985
-        for axis in range(2):  # of the inverse the columns of x and y
+        for axis in range(2):  # columns x and y of the inverse
             for i in range(N_CORNER):
                 step[i] = 1.0 if i == axis else 0.0
             enough &= solve_damped(H, 0.0, step, L)

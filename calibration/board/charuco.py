@@ -1,6 +1,6 @@
 """Inner corners of a ChArUco board in one image: OpenCV reads the markers, `corner_fit` locates the corners.
 
-The board may be partly out of view or covered, or printed as a negative: every marker says where it belongs.
+The board may be partly out of view or covered, or printed as a negative: every marker has a known position.
 """
 
 from dataclasses import replace
@@ -17,13 +17,13 @@ from calibration.kit.errors import CalibrationError
 
 
 def find_charuco(image: NDArray, board: CharucoBoard) -> CornerView | BoardNotFound:
-    """Locate the inner corners of a ChArUco board; those that are not in view are not accepted, without a reason.
+    """Locate the inner corners of a ChArUco board; corners out of view are not accepted, with an empty reason.
 
     image : (h, w) or (h, w, 3) as OpenCV reads it; see `chessboard.luminance`
     """
     values, notes = luminance(image)
     corners, ids = _detected(as_8_bit(values), board)
-    if len(ids) < LEAST_POINTS:  # prints with light and dark exchanged are about, too: their markers say so
+    if len(ids) < LEAST_POINTS:  # some prints are negatives, which their markers reveal
         negative = np.asarray(values.max() - values, values.dtype)
         found, numbers = _detected(as_8_bit(negative), board)
         if len(numbers) > len(ids):
@@ -55,7 +55,7 @@ def _detected(grey: NDArray[np.uint8], board: CharucoBoard) -> tuple[Array, NDAr
         raise CalibrationError(f"dictionary {board.dictionary!r} is not one of OpenCV's: {known}, ...")
     grey, scale = reduced(grey)
     best: tuple[Array, NDArray[np.intp]] = (np.zeros((0, 2)), np.zeros(0, np.intp))
-    # before OpenCV 4.6 boards with an even number of rows began with a light square: such prints are about
+    # boards with an even number of rows began with a light square before OpenCV 4.6; such prints exist
     for legacy in (False, True) if board.squares[1] % 2 == 0 else (False,):
         pattern = cv2.aruco.CharucoBoard(
             board.squares, board.square, board.marker, cv2.aruco.getPredefinedDictionary(number)

@@ -17,27 +17,26 @@ from calibration.kit.arrays import Array
 from calibration.kit.errors import ArgumentError
 from calibration.kit.grey_levels import level_step
 
-MARGIN = 1.15  # squares from the outermost corners: just outside the printed ones
-SEARCH_SIZE = 1600  # px: larger images are reduced for the rough search, which takes seconds on them otherwise
-MIN_ALTERNATION = 0.6  # share of neighbouring squares that are dark and light in turn, less those that are not
-LEAST_CORNERS = 12  # 3 x 4: what is smaller is found by chance among dots and shadows
-MOST_UNEVEN = 1.6  # a square to the next one: perspective and lenses stay below 1.3, a line passed over gives 2
-MIN_ACCEPTED = 0.5  # share of corners that must hold for a view to count as found
+MARGIN = 1.15  # squares from the outermost corners: just outside the printed squares
+SEARCH_SIZE = 1600  # px, to which larger images are reduced for the rough search, which would take seconds
+MIN_ALTERNATION = 0.6  # fraction of neighbouring squares that alternate minus fraction that do not
+LEAST_CORNERS = 12  # 3 x 4: smaller boards are detected by chance among dots and shadows
+MOST_UNEVEN = 1.6  # ratio of neighbouring squares: perspective and lenses stay below 1.3, a skipped line gives 2
+MIN_ACCEPTED = 0.5  # fraction of corners that must be accepted in a view
 
 
 @dataclass(frozen=True)
 class BoardNotFound:
-    """A view without the board, and why."""
+    """A view in which the board was not found, with the reason."""
 
     reason: str
 
 
 def luminance(image: NDArray) -> tuple[NDArray, tuple[str, ...]]:
-    """Grey values (h, w) of an image as cv2.IMREAD_UNCHANGED gives it, and a note where information was left out.
+    """Grey values (h, w) of an image as cv2.IMREAD_UNCHANGED returns it, and a note if information was discarded.
 
-    Grey images, 8 or 16 bit, are taken in their own step: one whose values are multiples of a step is that image,
-    whatever the step. Three equal channels are one grey image. Colour becomes luminance (0.114 B + 0.587 G + 0.299 R)
-    in float; transparency is dropped.
+    Grey images, 8 or 16 bit, are divided by the common factor of their values. Three equal channels are one grey image.
+    Colour becomes luminance (0.114 B + 0.587 G + 0.299 R) in float; transparency is dropped.
     """
     image = np.asarray(image)
     if image.dtype not in (np.uint8, np.uint16, np.float32, np.float64):
@@ -57,7 +56,7 @@ def find_corners(image: NDArray, inner_corners: tuple[int, int], thorough: bool 
 
     image : (h, w) or (h, w, 3) uint8 or uint16, blue-green-red order as OpenCV reads it; see `luminance`
     inner_corners : counts along the board's i and j; see `Board` for the order of the corners
-    thorough : search with OpenCV's slow finder where its quick one sees nothing
+    thorough : search with OpenCV's slow finder if its quick one finds nothing
     """
     grey, notes = luminance(image)
     start = _rough_corners(as_8_bit(grey), inner_corners, thorough)
@@ -72,9 +71,9 @@ def find_corners(image: NDArray, inner_corners: tuple[int, int], thorough: bool 
 
 
 def board_in(grey: NDArray, thorough: bool = False) -> tuple[int, int] | None:
-    """Inner corners (long side, short side) of the whole chessboard in an image of grey values, of whatever size.
+    """Inner corners (long side, short side) of the whole chessboard, of any size, in an image of grey values.
 
-    thorough : OpenCV's exhaustive search, 0.3 s for 1280 x 720; without it parts of a board are often all it sees
+    thorough : OpenCV's exhaustive search, 0.3 s for 1280 x 720; without it, often only a part of a board is found
     """
     flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_NORMALIZE_IMAGE | (cv2.CALIB_CB_EXHAUSTIVE if thorough else 0)
     found, corners, squares = cv2.findChessboardCornersSBWithMeta(as_8_bit(grey), (3, 3), flags)
@@ -91,7 +90,7 @@ def board_in(grey: NDArray, thorough: bool = False) -> tuple[int, int] | None:
 
 
 def _view_at(start: Array, values: Array, inner_corners: tuple[int, int]) -> CornerView | BoardNotFound:
-    """The view whose corners lie within about a pixel of `start` (n, 2), in any of the board's orders."""
+    """Corners of the view; `start` (n, 2) is their position to about a pixel, in any order of the board."""
     rough = _orient(start, values, inner_corners)
     if isinstance(rough, BoardNotFound):
         return rough
@@ -116,15 +115,15 @@ def as_8_bit(grey: NDArray) -> NDArray[np.uint8]:
 
 
 def reduced(grey: NDArray, largest: int = SEARCH_SIZE) -> tuple[NDArray, float]:
-    """The image, or a smaller one whose longer side has the largest size allowed [px]; and its scale."""
+    """The image, scaled down if its longer side exceeds `largest` [px], and the scale."""
     scale = min(1.0, largest / max(grey.shape))
     small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1.0 else grey
     return np.asarray(small), scale
 
 
 def _rough_corners(grey: NDArray[np.uint8], inner_corners: tuple[int, int], thorough: bool) -> Array | None:
-    """Corners (n, 2) [px] to about a pixel in any of the board's orders, or None."""
-    if min(grey.shape) < 2 * min(inner_corners):  # no square would have a pixel to itself
+    """Corners (n, 2) [px] to about a pixel, in any order of the board, or None."""
+    if min(grey.shape) < 2 * min(inner_corners):  # squares would be smaller than a pixel or two
         return None
     grey, scale = reduced(grey)
     quick, slow = cv2.findChessboardCorners, cv2.findChessboardCornersSB
@@ -132,19 +131,19 @@ def _rough_corners(grey: NDArray[np.uint8], inner_corners: tuple[int, int], thor
     tried = [(quick, 1, flags)]
     if thorough:
         tried.append((slow, 1, exhaustive))
-    if thorough and 2 * max(grey.shape) <= SEARCH_SIZE:  # squares of 5 to 10 px need finer pixels
+    if thorough and 2 * max(grey.shape) <= SEARCH_SIZE:  # squares of 5 to 10 px have to be enlarged
         tried += [(quick, 2, flags), (slow, 1, exhaustive | cv2.CALIB_CB_ACCURACY)]
     for find, finer, how in tried:
         image = grey if finer == 1 else cv2.resize(grey, None, fx=finer, fy=finer, interpolation=cv2.INTER_CUBIC)
         found, corners = find(image, inner_corners, None, how)
-        # finders take a part of a board for all of it
+        # finders may mistake a part of a board for the whole
         if found and _even(grid := np.asarray(corners, np.float64).reshape(*inner_corners[::-1], 2)):
             return (grid.reshape(-1, 2) + 0.5) / (scale * finer) - 0.5
     return None
 
 
 def _even(grid: NDArray) -> bool:
-    """Whether no line of corners (rows, columns, 2) was passed over."""
+    """Whether the grid of corners (rows, columns, 2) has no skipped line."""
     for along in (grid, grid.swapaxes(0, 1)):
         step = np.median(np.linalg.norm(np.diff(along, axis=0), axis=-1), axis=1)
         if len(step) > 1 and (np.abs(np.diff(np.log(np.maximum(step, 1e-9)))) > np.log(MOST_UNEVEN)).any():
@@ -153,7 +152,7 @@ def _even(grid: NDArray) -> bool:
 
 
 def _orient(corners: Array, grey: Array, inner_corners: tuple[int, int]) -> Array | BoardNotFound:
-    """Order the corners as `Board` says: seen from the printed side, and corner 0 beside a dark corner square."""
+    """Order the corners as `Board` defines: seen from the printed side, with a dark corner square at corner 0."""
     columns, rows = inner_corners
     grid = corners.reshape(rows, columns, 2)
     i_px, j_px = grid[:, 1:].mean((0, 1)) - grid[:, :-1].mean((0, 1)), grid[1:].mean((0, 1)) - grid[:-1].mean((0, 1))
@@ -168,8 +167,8 @@ def _orient(corners: Array, grey: Array, inner_corners: tuple[int, int]) -> Arra
             "number of the board's inner corners, or it is no chessboard"
         )
     dark = [corners[order] for order, sign in zip(orders, signs, strict=True) if sign > 0]
-    # where the colouring leaves several orders, i to the right in this image; the stereo pair makes the cameras agree.
-    # With such counts all corner squares may be light: the print begins with one
+    # if the colouring allows several orders, i points right in this image; the stereo pair makes the cameras agree.
+    # With such counts all corner squares may be light, if the print begins with a light one
     return max(
         dark or [corners[order] for order in orders],
         key=lambda c: float((c[columns - 1] - c[0]) @ np.array([1.0, -1e-3])),
@@ -177,9 +176,9 @@ def _orient(corners: Array, grey: Array, inner_corners: tuple[int, int]) -> Arra
 
 
 def _first_square_is_dark(corners: Array, grey: Array, inner_corners: tuple[int, int]) -> float:
-    """Above 0 if the square outside corner 0 is dark, below if it is light; 1 where the squares at all corners agree.
+    """Positive if the square outside corner 0 is dark, negative if light; +-1 if the squares at all corners agree.
 
-    Neighbours are compared with each other, so that a shadow across the board does not count.
+    Neighbouring squares are compared, so that a shadow across the board has no effect.
     """
     columns, rows = inner_corners
     axes = local_axes(corners, np.ones(len(corners), bool), inner_corners)
@@ -190,7 +189,7 @@ def _first_square_is_dark(corners: Array, grey: Array, inner_corners: tuple[int,
 
 
 def _larger_board(grey: Array, view: CornerView, inner_corners: tuple[int, int]) -> str | None:
-    """A message if full lines of further corners lie beyond a side: the board is larger than was declared."""
+    """A message if full lines of corners continue beyond a side: the board is larger than declared."""
     columns, rows = inner_corners
     grid = view.points.reshape(rows, columns, 2)
     axes = local_axes(view.points, view.accepted, inner_corners)
@@ -220,9 +219,9 @@ def _crosses(grey: Array, line: Array, axes: Array, least: float) -> bool:
 
 
 def _saddles(grey: Array, points: Array, axes: Array, aside: float = 0.3) -> Array:
-    """(n,) By how much two opposite squares are lighter than the two others at points (n, 2), or these, below 0.
+    """(n,) Grey values of two opposite squares at points (n, 2) minus those of the two others.
 
-    NaN where they do not lie in the image; axes, aside : as of `squares_round`
+    NaN outside the image; axes, aside : as in `squares_round`
     """
     a, b = squares_round(grey, points, axes, aside).transpose(1, 0, 2)
     lighter, darker = a.min(axis=1) - b.max(axis=1), b.min(axis=1) - a.max(axis=1)
@@ -230,9 +229,9 @@ def _saddles(grey: Array, points: Array, axes: Array, aside: float = 0.3) -> Arr
 
 
 def negatives(images: Sequence[NDArray], views: Sequence[CornerView | BoardNotFound], board: Board) -> str:
-    """What makes images of a chessboard look like negatives, in words; "" where nothing does.
+    """Reason for which images of a chessboard appear to be negatives, in words; "" if there is none.
 
-    Its own marks cannot: the colouring of a negative is that of the board turned by 180 deg.
+    The pattern itself gives no evidence: the colouring of a negative is that of the board turned by 180 deg.
     """
     dark = [
         margin_is_dark(image, view, board.inner_corners)
@@ -250,7 +249,7 @@ def negatives(images: Sequence[NDArray], views: Sequence[CornerView | BoardNotFo
 def margin_is_dark(image: NDArray, view: CornerView, inner_corners: tuple[int, int]) -> bool:
     """Whether the paper just outside a chessboard's squares is as dark as the dark squares.
 
-    False where too little of it is in view.
+    False if too little of it is in view.
     """
     grid = view.points.reshape(*inner_corners[::-1], 2)
     edges = (np.rot90(grid, side)[:2] for side in range(4))

@@ -1,12 +1,12 @@
-"""The corners of one view, fitted to the grey values of their own two edges (`_corner_kernel`) and tested.
+"""Fit and test of the corners of one view; each is fitted to the grey values around its two edges (`_corner_kernel`).
 
-Windows reach almost to the neighbouring edges whatever the size and slant of the squares. The noise of the image is
-measured inside the squares, so that every corner has a variance and a chi-square of its own.
+Windows extend almost to the neighbouring edges, for any size and slant of the squares. The image noise is measured
+inside the squares, which gives every corner a variance and a chi-square.
 
-Where the image of a corner is not that of two crossing edges, OpenCV's saddle point stands in. Compression, sharpening,
-half-tone print and dirt leave a corner where it was, but not its edges. How far such a corner may be trusted is read
-from the view itself: the image of a flat grid is a smooth function of its two indices, and what the corners scatter
-about it is their error.
+If the image of a corner is not that of two crossing edges, OpenCV's saddle point replaces the fit. Compression,
+sharpening, half-tone print and dirt change the edges, but not the position of the corner. The uncertainty of such
+corners is estimated from the view: the image of a flat grid is a smooth function of its two indices, and the scatter of
+the corners about it is their error.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ from calibration.board._corner_kernel import N_CORNER, fit_corners
 from calibration.board.target import LEAST_POINTS
 from calibration.kit.arrays import Array, Mask
 
-LEAST_SIGMA = 0.05  # px, of a corner that no model fits
-MAX_WINDOW = 0.85  # of a square: the next edge, blurred, must stay outside
+LEAST_SIGMA = 0.05  # px, least standard deviation of a corner that no model fits
+MAX_WINDOW = 0.85  # of a square: excludes the blurred neighbouring edge
 MIN_WINDOW = 0.3
-FIRST_REACH = 85.0  # px, of the first fit's window: what it is to tell, blur and noise and places, it tells as well
-EDGE_MARGIN = 3.0  # in sigmas of the blur, between the window and the next edge
-MAX_CHI_SQUARE = 25.0  # edge pixels, reduced: beyond, it is not the image of two crossing edges
-BAD_WINDOW = 3.0  # whole window, reduced, against the view's median: beyond, a smaller window is tried
-ROUGHER = 0.7  # scatter of saddle points about a smooth grid over that of the fits: below, the fits are not trusted
-MAX_DISPLACEMENT = 0.2  # of a square, from the corner's neighbours: beyond, another feature was fitted
+FIRST_REACH = 85.0  # px, largest window of the first fit: sufficient for blur, noise and positions
+EDGE_MARGIN = 3.0  # sigmas of the blur between the window and the next edge
+MAX_CHI_SQUARE = 25.0  # reduced, of the edge pixels; above, the image is not that of two crossing edges
+BAD_WINDOW = 3.0  # reduced chi-square of a window over the view's median, above which a smaller window is tried
+ROUGHER = 0.7  # scatter of saddle points about a smooth grid over that of the fits, below which fits are rejected
+MAX_DISPLACEMENT = 0.2  # of a square, from the position predicted by neighbours; above, another feature was fitted
 WINDOW = 0.35  # of a square: half width of the window of the saddle point
 
 
 def prepare() -> None:
-    """Compile the fit of corners, or load it: some seconds once per installation, then nothing."""
+    """Compile the fit of corners, some seconds once per installation, or load it."""
     fit_corners(np.zeros((8, 8)), np.zeros((0, 14)), np.zeros((0, N_CORNER)), np.zeros((0, 4)), np.zeros(2), 1, 1e-2)
 
 
@@ -45,13 +45,13 @@ class CornerView:
 
     image_size: tuple[int, int]  # width, height [px]
     points: Array  # (n, 2) [px]
-    covariance: Array  # (n, 2, 2) [px^2] from the image's own noise, enlarged where the edges fit badly
+    covariance: Array  # (n, 2, 2) [px^2] from the image noise, enlarged if the edges fit badly
     accepted: Mask  # (n,)
-    reasons: tuple[str, ...]  # (n,) why a corner was rejected; "" where it holds, or was not in view
+    reasons: tuple[str, ...]  # (n,) why a corner was rejected; "" if it is accepted or out of view
     notes: tuple[str, ...] = ()
 
     def reordered(self, order: NDArray[np.intp]) -> CornerView:
-        """The same view with corner order[i] in place i: for boards whose colouring allows several orders."""
+        """The same view with corner order[i] at index i, for boards whose colouring allows several orders."""
         arrays = {name: getattr(self, name)[order] for name in ("points", "covariance", "accepted")}
         return replace(self, reasons=tuple(self.reasons[i] for i in order), **arrays)
 
@@ -63,10 +63,10 @@ def fit_view(
     seen: Mask | None = None,
     plain: float = 1.0,
 ) -> CornerView:
-    """Fit every corner twice: first to learn blur, noise, bends of the lines and changes of contrast, then with them.
+    """Fit every corner twice: first to estimate blur, noise, curvature and contrast gradients, then with these.
 
-    rough : (n, 2) [px] of all corners; where one is not `seen` (n,), the place where the others put it
-    plain : how far, in squares, the light squares are plain on either side of an edge: markers leave a margin
+    rough : (n, 2) [px] of all corners; those that are not `seen` (n,) are interpolated from the others
+    plain : width in squares of the light squares' plain margin, between an edge and a marker
     """
     noise, blur, known = np.array([1.0, 0.0]), 1.0, np.zeros((len(rough), 4))
     seen = np.ones(len(rough), bool) if seen is None else seen
@@ -94,7 +94,7 @@ _Fit = tuple[Array, Array, Array, Mask]  # what the kernel returns for the corne
 
 
 def _chi_square(fit: _Fit) -> Array:
-    """Reduced chi-square over the whole window (n,); inf where there was no fit."""
+    """Reduced chi-square over the whole window (n,); inf without a fit."""
     _, _, sums, converged = fit
     with np.errstate(invalid="ignore", divide="ignore"):
         value = sums[:, 0] / np.maximum(sums[:, 1] - N_CORNER, 1.0)
@@ -104,7 +104,7 @@ def _chi_square(fit: _Fit) -> Array:
 def _mend_with_smaller_windows(
     grey: Array, fit: _Fit, windows: Array, starts: Array, known: Array, noise: Array
 ) -> None:
-    """Fit again, in place, nearer to the corner where something else reaches into the window: a dirty square."""
+    """Repeat fits, in place, with smaller windows if something else lies in the window, such as a dirty square."""
     for factor in (0.6, 0.35):
         chi_square = _chi_square(fit)
         bad = np.flatnonzero(chi_square > BAD_WINDOW * max(float(np.median(chi_square)), 1.0))
@@ -119,9 +119,9 @@ def _mend_with_smaller_windows(
 
 
 def _windows(points: Array, axes: Array, blur: float, shape: tuple[int, ...], plain: Array, most: float) -> Array:
-    """Window of every corner as the kernel wants it (n, 14); plain (n,) with the sign of the light quadrants.
+    """Window (n, 14) of every corner for the kernel; plain (n,) with the sign of the light quadrants.
 
-    most : [px] half width across an edge, at most
+    most : [px] largest half width across an edge
     """
     A = np.swapaxes(axes, 1, 2)  # columns are the images of i and j
     inverse = np.linalg.inv(A)
@@ -136,13 +136,13 @@ def _windows(points: Array, axes: Array, blur: float, shape: tuple[int, ...], pl
     low, high = np.clip(low, 0, size - 1), np.clip(high, -1, size - 1)
     step = 0.5 * between.min(axis=1)
     box = [low[:, 0], high[:, 0], low[:, 1], high[:, 1], points, inverse.reshape(-1, 4), half, step]
-    near = (EDGE_MARGIN * blur + 0.7) / between.min(axis=1)  # the marker's edge, blurred, stays outside
+    near = (EDGE_MARGIN * blur + 0.7) / between.min(axis=1)  # excludes the blurred edge of the marker
     clear = np.where(np.abs(plain) < 1, np.maximum(np.abs(plain) - near, 0.5 * np.abs(plain)), 1.0)
     return np.column_stack([*box, clear * np.sign(plain)])
 
 
 def _starts(grey: Array, points: Array, axes: Array, blur: float, aside: float) -> Array:
-    """Start values (n, 9): levels from the four squares round the corner, so many squares aside of both edges."""
+    """Initial guesses (n, 9); grey levels from the four squares at the corner, `aside` squares from both edges."""
     levels = squares_round(grey, points, axes, aside)
     same, other = np.where(np.isnan(levels), levels[..., ::-1], levels).mean(-1).T
     starts = np.zeros((len(points), N_CORNER))
@@ -156,7 +156,7 @@ def _starts(grey: Array, points: Array, axes: Array, blur: float, aside: float) 
 
 
 def _displacement(found: Array, seen: Mask, axes: Array, inner_corners: tuple[int, int]) -> Array:
-    """(n,) Distance of every corner from where the others put it, in squares."""
+    """(n,) Distance of every corner from the position predicted by the others, in squares."""
     places, _ = smooth_grid(found, inner_corners, seen)
     return np.asarray(np.linalg.norm(found - places, axis=-1) / np.linalg.norm(axes, axis=-1).max(-1), np.float64)
 
@@ -164,7 +164,7 @@ def _displacement(found: Array, seen: Mask, axes: Array, inner_corners: tuple[in
 def _measured_noise(sums: Array) -> Array:
     """Noise (a, b), variance = a + b grey, from the residuals inside dark and light squares.
 
-    The median over the corners, so that a square with dirt or writing does not count as noise.
+    Medians over the corners: squares with dirt or writing have no effect.
     """
     floor, levels = 1.0 / 12.0, []  # quantisation to whole grey values
     for r2, grey, n in ((2, 3, 4), (5, 6, 7)):
@@ -173,16 +173,15 @@ def _measured_noise(sums: Array) -> Array:
     if not levels:
         return np.array([1.0, 0.0])
     square, grey = np.transpose(levels)
-    terms = np.stack([np.ones_like(grey), grey], axis=1)[:, : len(levels)]  # one level tells no slope
+    terms = np.stack([np.ones_like(grey), grey], axis=1)[:, : len(levels)]  # a slope needs two levels
     beyond = np.append(scipy.optimize.nnls(terms, np.maximum(square - floor, 0.0))[0], 0.0)
     return np.array([floor + beyond[0], beyond[1]])
 
 
 def _line_curvature(points: Array, ok: Mask, angles: Array, inner_corners: tuple[int, int]) -> Array:
-    """Bend of the board's lines at every corner (n, 2) [1/px], half the second derivative across each edge.
+    """Curvature of the board's lines at every corner (n, 2) [1/px]: half the second derivative across each edge.
 
-    A parabola along each row and column of corners: lens distortion bends a line by far less than a corner's own
-    window could tell.
+    From parabolas through rows and columns of corners: the window of one corner does not determine it.
     """
     columns, rows = inner_corners
     index = np.arange(columns * rows).reshape(rows, columns)
@@ -196,16 +195,16 @@ def _line_curvature(points: Array, ok: Mask, angles: Array, inner_corners: tuple
             direction = direction / np.linalg.norm(direction)
             d = points[use] - points[use].mean(0)
             bend = np.polyfit(d @ direction, d @ np.array([-direction[1], direction[0]]), 2)[0]
-            # an edge angle may point either way along its line, the kernel's normal follows it
+            # the direction of an edge angle along its line is arbitrary, and determines the kernel's normal
             edge = np.stack([np.cos(angles[line, axis]), np.sin(angles[line, axis])], axis=-1)
             curvature[line, axis] = bend * np.sign(edge @ direction)
     return curvature
 
 
 def _contrast_gradient(points: Array, ok: Mask, levels: Array) -> Array:
-    """Relative gradient (n, 2) [1/px] of the contrast, over the light's, at every corner, by a polynomial over all.
+    """Relative gradient (n, 2) [1/px] of contrast over illumination at every corner, from a polynomial over all.
 
-    levels : (n, 2) mean grey and half contrast. Of light that falls off their ratio is the same everywhere.
+    levels : (n, 2) mean grey and half contrast; their ratio is constant if only the illumination varies
     """
     use = ok & (levels[:, 0] > 0) & (levels[:, 1] != 0)
     ratio = np.zeros(len(points))
@@ -217,7 +216,7 @@ def _contrast_gradient(points: Array, ok: Mask, levels: Array) -> Array:
     x, y = ((points - centre) / scale).T
     powers = [(i, k - i) for k in range(degree + 1) for i in range(k + 1)]
     A = np.stack([x**i * y**j for i, j in powers], axis=1)
-    for _ in range(3):  # dirt and shadows in single squares are no gradient
+    for _ in range(3):  # rejects dirt and shadows in single squares
         c = np.linalg.lstsq(A[use], ratio[use], rcond=None)[0]
         left = np.abs(ratio - A @ c)
         use &= left <= 4.0 * 1.4826 * np.median(left[use]) + 1e-12
@@ -229,7 +228,7 @@ def _contrast_gradient(points: Array, ok: Mask, levels: Array) -> Array:
 def _judged(
     grey: Array, fit: _Fit, axes: Array, rough: Array, counts: tuple[int, int], seen: Mask, plain: float
 ) -> CornerView:
-    """Test every corner; where the fine model does not hold, the saddle point stands in with its own covariance."""
+    """Test every corner; if the edge model fails, the saddle point replaces it, with its own covariance."""
     found, by_noise, sums, ended = fit
     spacing = float(np.median(np.linalg.norm(axes, axis=-1)))
     edge_pixels = sums[:, 1] - sums[:, 4] - sums[:, 7]
@@ -237,17 +236,17 @@ def _judged(
         chi_square = sums[:, 8] / np.maximum(edge_pixels, 1.0)
     converged = ended & np.isfinite(by_noise).all((1, 2)) & seen
     spread = float(np.median(chi_square[converged])) if converged.any() else 1.0
-    chi_limit = MAX_CHI_SQUARE * max(spread, 1.0)  # compressed images have correlated noise: judge against the view
+    chi_limit = MAX_CHI_SQUARE * max(spread, 1.0)  # compressed images have correlated noise: relative to the view
     displaced = _displacement(found[:, :2], converged, axes, counts)
     fine = converged & (displaced < MAX_DISPLACEMENT) & (chi_square < chi_limit)
     covariance = by_noise * np.maximum(chi_square, 1.0)[:, None, None]
     saddles = saddle_points(grey, np.where(fine[:, None], found[:, :2], rough), spacing * min(plain / WINDOW, 1.0))
     expected, sigma = smooth_grid(np.where(fine[:, None], found[:, :2], saddles), counts, seen)
     by_saddles, sigma_saddle = smooth_grid(saddles, counts, seen)
-    if sigma_saddle < ROUGHER * sigma and fine.any():  # the saddle points lie smoother than the fine fits do
+    if sigma_saddle < ROUGHER * sigma and fine.any():  # the saddle points scatter less than the fits
         fine = np.zeros_like(fine)
         expected, sigma = by_saddles, sigma_saddle
-    # edges that fit badly on both sides alike leave the corner where it is: no more error than the grid's scatter shows
+    # a misfit that is equal on both sides of an edge does not move the corner: the error is the scatter about the grid
     stated = float(np.sqrt(np.median(np.trace(covariance[fine], axis1=1, axis2=2)) / 2)) if fine.any() else sigma
     covariance = np.maximum(min(sigma / stated, 1.0) ** 2, 1 / np.maximum(chi_square, 1.0))[:, None, None] * covariance
     sigma_saddle = max(sigma_saddle, LEAST_SIGMA)
@@ -267,9 +266,9 @@ def _judged(
 
 
 def saddle_points(grey: Array, points: Array, spacing: float) -> Array:
-    """Saddle points (n, 2) [px] next to the given ones, by the directions of the grey values' gradients.
+    """Saddle points (n, 2) [px] next to the given ones, from the directions of the grey values' gradients.
 
-    A point outside the image stays where it is.
+    Points outside the image are unchanged.
     """
     half = int(np.clip(round(WINDOW * spacing), 2, 15))
     image = grey.astype(np.float32)
@@ -291,16 +290,16 @@ def local_axes(points: Array, ok: Mask, inner_corners: tuple[int, int]) -> Array
 
 
 def squares_round(grey: Array, points: Array, axes: Array, aside: float) -> Array:
-    """(n, 2, 2) grey values of two opposite squares round points (n, 2), and of the two others; NaN out of view.
+    """(n, 2, 2) grey values of two opposite squares at points (n, 2), and of the two others; NaN out of view.
 
-    aside : how far from both edges, in squares; axes (n, 2, 2) of a square
+    aside : distance from both edges in squares; axes : (n, 2, 2) of a square
     """
     signs = np.array([[1.0, 1.0], [-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0]])
     return grey_at(grey, points[:, None] + aside * signs @ axes).reshape(-1, 2, 2)
 
 
 def grey_at(image: NDArray, places: Array) -> Array:
-    """Grey values (...), means of an image's channels, of the pixels at places (..., 2); NaN out of view."""
+    """Grey values (...), averaged over the channels, of the pixels at places (..., 2); NaN out of view."""
     inside = np.all((places >= 0) & (places <= np.array(image.shape[1::-1]) - 1), axis=-1)
     x, y = np.moveaxis(np.rint(np.where(inside[..., None], places, 0.0)).astype(int), -1, 0)
     return np.where(inside, image[y, x].reshape(*x.shape, -1).mean(axis=-1), np.nan)
@@ -313,15 +312,15 @@ def _indices(inner_corners: tuple[int, int]) -> Array:
 
 
 def degree_for(n: int, most: int) -> int:
-    """Of a polynomial in two coordinates by n corners: three for each of its coefficients."""
+    """Degree of a polynomial in two coordinates that n corners determine, with three corners per coefficient."""
     return max(d for d in range(most + 1) if 3 * (d + 1) * (d + 2) <= 2 * n or d == 0)
 
 
 def smooth_grid(points: Array, inner_corners: tuple[int, int], seen: Mask) -> tuple[Array, float]:
-    """Where the other corners put each corner (n, 2) [px], and the sigma per axis of the corners' scatter about it.
+    """Smooth grid through the corners (n, 2) [px], and the sigma per axis of the corners' scatter about it.
 
-    A homography and, for the lens, a low polynomial of the two indices; few bad corners do not move them, and those
-    not `seen` (n,) do not count, unless too few are.
+    Robust fit of a homography and, for the lens, a low polynomial of the two indices; corners that are not `seen` (n,)
+    are used only if the others are too few.
     """
     columns, rows = inner_corners
     seen = seen if seen.sum() >= LEAST_POINTS else np.ones(len(points), bool)

@@ -1,4 +1,4 @@
-"""A calibration target in many images: the quick search first; and which other board they show where it is not."""
+"""Search for a calibration target in many images; if it is missing, search for the board that they show instead."""
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
@@ -20,9 +20,9 @@ from calibration.board.target import Board, Target
 from calibration.kit.arrays import evenly
 
 Progress = Callable[[str, int, int], None]
-LEAST_VIEWS = 2  # that must show the whole board
-SIZES_TRIED = 3  # of those that several images seem to show
-VIEWS_TRIED = 8  # over a whole set: what most of them show is the board; without one, the slow search waits
+LEAST_VIEWS = 2  # with the whole board, for its size to be believed
+SIZES_TRIED = 3  # most frequent board sizes that are tested
+VIEWS_TRIED = 8  # sample of a set of images; if it shows no board, the slow search of the others is skipped
 
 
 def located(
@@ -30,8 +30,8 @@ def located(
 ) -> list[CornerView | BoardNotFound]:
     """The target in every image.
 
-    All are searched quickly, and slowly those without it. Where a sample over all of them shows another board, or where
-    none does quickly and of a sample none slowly, that is reason enough not to search on.
+    The quick search is tried in all images, the slow one in those without a result. The search ends early if a sample
+    of the images shows another board, or if the quick search found nothing and the slow one fails in a sample.
     """
     views: dict[int, CornerView | BoardNotFound] = {}
 
@@ -48,9 +48,9 @@ def located(
             progress("corners", len(views), len(images))
 
     def lost(among: Iterable[int], thorough: bool) -> list[int]:
-        """Those in which it is not found."""
+        """Images in which it is not found."""
         indices = list(among)
-        with ThreadPoolExecutor(2) as pool:  # OpenCV and the fit of corners leave the interpreter to the other
+        with ThreadPoolExecutor(2) as pool:  # OpenCV and the fit of corners release the interpreter lock
             list(pool.map(locate, indices, [thorough] * len(indices)))
         return [index for index in indices if isinstance(views[index], BoardNotFound)]
 
@@ -66,9 +66,9 @@ def located(
 
 
 def other_board(images: Sequence[NDArray], refused: Sequence[bool], target: Target) -> str:
-    """The chessboard that most images show in place of the declared one, in words; "" if there is none.
+    """The chessboard that most images show instead of the declared one, in words; "" if there is none.
 
-    refused : whether the declared one was not found in them; where it was, a rim may have passed for a line of it
+    refused : whether the declared one was not found in an image; if it was, its rim may be mistaken for a line
     """
     without = [image for image, lost in zip(images, refused, strict=True) if lost]
     if not isinstance(target, Board) or 2 * len(without) <= len(images):
@@ -83,9 +83,9 @@ def other_board(images: Sequence[NDArray], refused: Sequence[bool], target: Targ
 
 
 def board_size(images: Sequence[NDArray], largest: int = SEARCH_SIZE) -> tuple[tuple[int, int] | None, int]:
-    """Inner corners (long side, short side) that most images show, and how many of them show these; None if none.
+    """Inner corners (long side, short side) of the board in most images, or None; and the number of these images.
 
-    largest : [px] larger images are reduced to that: OpenCV's search takes 0.3 s at 800 x 600, 5.5 s at 4000 x 3000
+    largest : [px] to which images are reduced: OpenCV's search takes 0.3 s at 800 x 600, 5.5 s at 4000 x 3000
     """
     greys = [reduced(luminance(image)[0], largest)[0] for image in images]
     seen: dict[tuple[int, int], int] = {}
@@ -93,7 +93,7 @@ def board_size(images: Sequence[NDArray], largest: int = SEARCH_SIZE) -> tuple[t
         sizes = [board_in(grey, thorough) for grey in greys]
         counts = Counter(size for size in sizes if size)
         often = [size for size, n in counts.most_common(SIZES_TRIED) if n >= LEAST_VIEWS] or list(counts)[:SIZES_TRIED]
-        # a shadow hides a line of the board, a rim passes for one more: the whole board is what most corners are on
+        # a shadow may hide a line, a rim may appear as another: the whole board is the size with most corners in total
         seen |= {size: counts[size] + _found(size, greys, sizes) for size in often}
         if 2 * max(seen.values(), default=0) >= len(images):
             break
@@ -102,6 +102,6 @@ def board_size(images: Sequence[NDArray], largest: int = SEARCH_SIZE) -> tuple[t
 
 
 def _found(size: tuple[int, int], greys: Sequence[NDArray], sizes: Sequence[tuple[int, int] | None]) -> int:
-    """How many images of another size, or of none, show a board of this one where it is asked for."""
+    """Number of images with another size, or none, in which a search for this size succeeds."""
     others = [grey for grey, found in zip(greys, sizes, strict=True) if found != size]
     return sum(not isinstance(find_corners(grey, size), BoardNotFound) for grey in others)

@@ -1,4 +1,4 @@
-"""The calibration target, a chessboard plain or with markers: which points it carries, and where.
+"""The calibration target, a plain chessboard or one with markers, and the positions of its points.
 
 Board axes of every target: i to the right and j upwards as the pattern stands upright, k out of the print.
 """
@@ -13,7 +13,7 @@ from calibration.kit.arguments import checked
 from calibration.kit.arrays import Array
 from calibration.kit.errors import CalibrationError
 
-LEAST_POINTS = 8  # of a view: fewer do not tell its pose
+LEAST_POINTS = 8  # of a view: fewer do not determine its pose
 
 
 @checked
@@ -41,7 +41,7 @@ class Board:
 
     @property
     def orders(self) -> list[NDArray[np.intp]]:
-        """The turns in its plane after which it looks the same, as orders of its points; the first is none."""
+        """Symmetries (rotations in its plane) as orders of its points; the first is the identity."""
         columns, rows = self.inner_corners
         orders = board_orders(self.inner_corners)
         if (columns + rows) % 2:
@@ -53,7 +53,7 @@ class Board:
 
 
 def board_orders(inner_corners: tuple[int, int]) -> list[NDArray[np.intp]]:
-    """The turns of a chessboard in its own plane that map its corners onto themselves: 2, or 4 for a square board."""
+    """Symmetries of a chessboard (rotations in its plane) as orders of its corners: 2, or 4 for a square board."""
     columns, rows = inner_corners
     index = np.arange(columns * rows).reshape(rows, columns)
     turns = (0, 1, 2, 3) if columns == rows else (0, 2)
@@ -91,7 +91,7 @@ class CharucoBoard:
 
     @property
     def orders(self) -> list[NDArray[np.intp]]:
-        """As of a chessboard: its markers are told apart whichever way they lie."""
+        """The identity alone: its markers determine the orientation."""
         return [np.arange(len(self.points))]
 
     def __str__(self) -> str:
@@ -99,7 +99,7 @@ class CharucoBoard:
 
 
 def _grid(counts: tuple[int, int]) -> Array:
-    """(n, 3) places along i first, then along j."""
+    """(n, 3) positions, along i first, then along j."""
     j, i = np.mgrid[: counts[1], : counts[0]]
     return np.stack([i.ravel(), j.ravel(), np.zeros(i.size)], axis=-1)
 
@@ -116,11 +116,11 @@ _KINDS: dict[str, type[Target]] = {"chessboard": Board, "charuco": CharucoBoard}
 
 
 def described(target: Target) -> dict[str, Any]:
-    """Kind and fields, as `target_of` takes them."""
+    """Kind and fields, the argument of `target_of`."""
     return {"target": next(name for name, kind in _KINDS.items() if isinstance(target, kind)), **asdict(target)}
 
 
 def target_of(description: dict[str, Any]) -> Target:
-    """The target that `described` wrote down."""
+    """Inverse of `described`."""
     fields = dict(description)
     return _KINDS[fields.pop("target")](**fields)

@@ -1,1 +1,1 @@
-"""The camera model and the pair of cameras: projection with derivatives, causes of uncertainty, foreign files."""
+"""The camera model and the stereo pair: projection with derivatives, causes of uncertainty, lens field."""

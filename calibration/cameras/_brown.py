@@ -1,4 +1,4 @@
-"""Brown's distortion: one formula for arrays of NumPy and for compiled loops."""
+"""Brown's distortion, in a form for both NumPy arrays and compiled loops."""
 
 from calibration.kit.arrays import Array
 
@@ -6,7 +6,7 @@ from calibration.kit.arrays import Array
 def distorted(
     a: Array, b: Array, k1: float, k2: float, p1: float, p2: float, k3: float
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """Normalised coordinates as the lens shows them: xd, yd, dxd/da, dxd/db (= dyd/da), dyd/db."""
+    """Distorted normalised coordinates and derivatives: xd, yd, dxd/da, dxd/db (= dyd/da), dyd/db."""
     r2 = a * a + b * b
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
     slope = k1 + r2 * (2 * k2 + 3 * k3 * r2)  # d radial / d r2

@@ -1,7 +1,7 @@
-"""Pinhole cameras with Brown distortion, alone and as a stereo pair, with every derivative that a fit needs.
+"""Pinhole cameras with Brown distortion, single and as a stereo pair, with the derivatives for fits.
 
 Pixel (0, 0) is the centre of the top-left pixel; a camera's axes are x right, y down, z along the view. Distortion is
-Brown's with OpenCV's coefficients in OpenCV's order, so that numbers can be exchanged with it.
+Brown's with OpenCV's coefficients in OpenCV's order.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from calibration.kit.arrays import Array
 from calibration.kit.brief import Brief
 from calibration.kit.least_squares import solve_each
 
-CAMERA_NAMES = ("left", "right")  # for people, and in files
+CAMERA_NAMES = ("left", "right")  # in messages and files
 INTRINSIC_PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 N_INTRINSIC = len(INTRINSIC_PARAMETERS)
 _AXES = "xyz"
@@ -29,7 +29,7 @@ RIG_PARAMETERS = (
     *(f"{place}_{axis}" for place in _PLACES for axis in _AXES),
 )
 N_RIG = len(RIG_PARAMETERS)  # 30
-# Which of them are of what: the cameras' own; the right one against the left one; the world against the left one
+# Slices of RIG_PARAMETERS: intrinsics of each camera; pose right <- left; pose left <- world
 OF_CAMERAS = slice(0, N_INTRINSIC), slice(N_INTRINSIC, 2 * N_INTRINSIC)
 PAIR_TURN, PAIR_SHIFT, WORLD_TURN, WORLD_SHIFT = (
     slice(first, first + len(_AXES)) for first in range(len(CAMERA_NAMES) * N_INTRINSIC, N_RIG, len(_AXES))
@@ -50,7 +50,7 @@ class Camera:
 
     @property
     def camera_matrix(self) -> Array:
-        """The 3 x 3 matrix K of the textbooks."""
+        """Camera matrix K (3, 3)."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     @property
@@ -66,7 +66,7 @@ class Camera:
 
 
 def project(points_camera: Array, camera: Camera) -> Array:
-    """Pixels (..., 2) of points (..., 3) given in the camera's own axes; NaN behind the camera."""
+    """Pixels (..., 2) of points (..., 3) in camera axes; NaN behind the camera."""
     a, b, _ = _on_unit_depth(points_camera)
     xd, yd, *_ = distorted(a, b, *camera.distortion)
     return np.stack([camera.fx * xd + camera.cx, camera.fy * yd + camera.cy], axis=-1)
@@ -98,22 +98,22 @@ def _on_unit_depth(points_camera: Array) -> tuple[Array, Array, Array]:
     return X * inverse, Y * inverse, inverse
 
 
-NEWTON_PX = 1e-6  # the last step of Newton's method
-_AT_ONCE = 16384  # points whose numbers stay in a core's cache: a whole image takes 2.5 times as long
+NEWTON_PX = 1e-6  # step at which Newton's method has converged
+_AT_ONCE = 16384  # points per block, which fits in a core's cache: 2.5 times as fast as a whole image at once
 
 
 def normalise(pixels: Array, camera: Camera) -> Array:
     """Undistorted normalised coordinates (..., 2) of pixels (..., 2): the inverse of `project` up to depth.
 
-    NaN where Newton's method on the distortion does not come to within 1e-6 px (beyond the radius at which the
-    distortion polynomial folds).
+    NaN if Newton's method on the distortion does not converge to 1e-6 px (beyond the radius at which the distortion
+    polynomial folds).
     """
     pixels = np.asarray(pixels, float)
     if pixels.size > 2 * _AT_ONCE:
         parts = np.array_split(pixels.reshape(-1, 2), pixels.size // (2 * _AT_ONCE) + 1)
         return np.concatenate([normalise(part, camera) for part in parts]).reshape(pixels.shape)
     a, b = x, y = (pixels[..., 0] - camera.cx) / camera.fx, (pixels[..., 1] - camera.cy) / camera.fy
-    with np.errstate(all="ignore"):  # beyond the fold the iteration may run away; it is judged below
+    with np.errstate(all="ignore"):  # beyond the fold the iteration may diverge, which is tested below
         for _ in range(20):
             xd, yd, xd_a, xd_b, yd_b = distorted(a, b, *camera.distortion)
             rx, ry = x - xd, y - yd
@@ -122,15 +122,15 @@ def normalise(pixels: Array, camera: Camera) -> Array:
             step_a, step_b = (yd_b * rx - xd_b * ry) * inverse, (xd_a * ry - xd_b * rx) * inverse
             a, b = a + step_a, b + step_b
             px2 = camera.fx * camera.fy * (step_a * step_a + step_b * step_b)
-            if np.fmax.reduce(px2, axis=None, initial=0.0) < NEWTON_PX**2:  # NaN-blind; what is left is its square
+            if np.fmax.reduce(px2, axis=None, initial=0.0) < NEWTON_PX**2:  # ignores NaN; the next step is quadratic
                 break
-        # both slopes are positive up to the fold; beyond it are roots that no ray goes to
+        # both slopes are positive up to the fold; roots beyond it belong to no ray
         good = (px2 < NEWTON_PX**2) & (det > 0) & (xd_a + yd_b > 0)
     return np.where(good[..., None], np.stack([a, b], axis=-1), np.nan)
 
 
 def normalised_maps(camera: Camera) -> tuple[Array, Array]:
-    """Undistorted normalised coordinates x, y of every pixel, each (height, width); NaN where it has no ray."""
+    """Undistorted normalised coordinates x, y of every pixel, each (height, width); NaN for pixels without a ray."""
     width, height = camera.image_size
     maps = normalise(np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1), camera)
     return np.ascontiguousarray(maps[..., 0]), np.ascontiguousarray(maps[..., 1])
@@ -138,22 +138,22 @@ def normalised_maps(camera: Camera) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class Allowance:
-    """A part of a rig's covariance that no image tells: what the sizes of a board or a disc may be off by."""
+    """A part of a rig's covariance that images do not determine: the tolerance of a size of the board or the disc."""
 
     cause: str  # as in "the board's thickness"
-    shift: Array  # (30,) of RIG_PARAMETERS by one standard deviation
-    assumed: bool = False  # neither declared nor measured: a default, which other evidence may narrow
+    shift: Array  # (30,) change of RIG_PARAMETERS for one standard deviation of the size
+    assumed: bool = False  # a default, neither declared nor measured, which other evidence may reduce
 
 
 @checked
 @dataclass(frozen=True, repr=False)
 class StereoRig(Brief):
-    """Two calibrated cameras and the world (lab) frame they look at.
+    """Two calibrated cameras and their pose in the world (lab) frame.
 
     points_left = R_left_world @ points_world + t_left_world;  points_right = R_right_left @ points_left + t_right_left.
     `covariance` is that of RIG_PARAMETERS, rotations as rotation vectors that multiply the estimate from the left
-    (R = exp([v]x) R_estimate); zero rows belong to parameters that were not estimated. It is common to all frames.
-    A rig without a table view has the left camera's axes for a world (`world_is_table` False).
+    (R = exp([v]x) R_estimate); rows of parameters that were not estimated are zero. It is common to all frames.
+    In a rig without a table view, the world axes are those of the left camera (`world_is_table` False).
     """
 
     read_by: ClassVar[str] = "calibration.rig_file:read_rig"
@@ -167,12 +167,12 @@ class StereoRig(Brief):
     t_left_world: Array = field(default_factory=lambda: np.zeros(3))  # (3,) [m]
     covariance: Array = field(default_factory=lambda: np.zeros((N_RIG, N_RIG)))  # (30, 30)
     world_is_table: bool = False
-    # What the lenses do beyond the polynomial: measured points are corrected by it before anything else (`splines`)
+    # Distortion beyond the polynomial (`splines`): measured points are corrected by it first
     lens_field: LensField | None = None
-    allowances: tuple[Allowance, ...] = ()  # parts of the covariance, by cause; the views' own is what is left
+    allowances: tuple[Allowance, ...] = ()  # parts of the covariance, by cause; the remainder is due to the views
 
     def facts(self) -> dict[str, str]:
-        """What a glance should tell (`Brief`)."""
+        """Main results (`Brief`)."""
         sizes = [" x ".join(str(n) for n in camera.image_size) for camera in self.cameras]
         return {
             "images": f"{sizes[0]} px" if sizes[0] == sizes[1] else f"{sizes[0]} and {sizes[1]} px",
@@ -215,7 +215,7 @@ class StereoRig(Brief):
         for i, (R, t) in enumerate(((np.eye(3), np.zeros(3)), (self.R_right_left, self.t_right_left))):
             turned = points_left @ R.T
             pixel, d_point, d_rig[..., i, :, :, OF_CAMERAS[i]] = project_with_jacobians(turned + t, self.cameras[i])
-            if i:  # the first camera's axes are those of the pair
+            if i:  # the pair has the axes of the first camera
                 d_rig[..., i, :, :, PAIR_TURN] = by_turning(d_point, turned)
                 d_rig[..., i, :, :, PAIR_SHIFT] = d_point
                 d_point = d_point @ R
@@ -244,7 +244,7 @@ class StereoRig(Brief):
 
 
 def by_turning(d_point: Array, arm: Array) -> Array:
-    """D pixel / d rotation vector (..., 2, 3) when the arm (..., 3) turns, from d pixel / d point (..., 2, 3).
+    """D pixel / d rotation vector (..., 2, 3) for a rotation of the arm (..., 3), from d pixel / d point (..., 2, 3).
 
     d_point @ (v x arm) = (arm x d_point) . v
     """
@@ -254,7 +254,7 @@ def by_turning(d_point: Array, arm: Array) -> Array:
 
 
 def placed_at(poses: Sequence[tuple[Array, Array]]) -> dict[str, Any]:
-    """Fields of a StereoRig whose cameras, left and right, stand so: R (3, 3), t (3,) from world to camera axes."""
+    """Fields of a StereoRig from the poses of its cameras: R (3, 3), t (3,) from world to camera axes."""
     (R_left, t_left), (R_right, t_right) = poses
     R = R_right @ R_left.T
     return {"R_right_left": R, "t_right_left": t_right - R @ t_left, "R_left_world": R_left, "t_left_world": t_left}
@@ -264,7 +264,7 @@ def rotation_from_vector(v: Array) -> Array:
     """Rodrigues' formula: rotation vectors (..., 3) [rad] -> (..., 3, 3)."""
     v = np.asarray(v, float)
     square = np.sum(v * v, axis=-1)
-    small = square < 1e-12  # of which the series is exact
+    small = square < 1e-12  # for which the series is exact to rounding
     angle = np.sqrt(np.where(small, 1.0, square))
     first = np.where(small, 1.0, np.sin(angle) / angle)[..., None, None]
     second = np.where(small, 0.5, (1 - np.cos(angle)) / angle**2)[..., None, None]
@@ -276,9 +276,9 @@ def rotation_from_vector(v: Array) -> Array:
 
 @checked
 def triangulate(pixels: Array, rig: StereoRig) -> Array:
-    """World points (n, 3) [m] seen at pixels (2 cameras, n, 2), least squares in pixels; NaN where not seen twice.
+    """World points (n, 3) [m] of pixels (2 cameras, n, 2), least squares in pixels; NaN unless seen by both cameras.
 
-    pixels : as the images show them; the lens field of the rig, if it has one, is taken off first
+    pixels : as measured; a lens field of the rig is subtracted first
     """
     if rig.lens_field is not None:
         pixels = rig.lens_field.corrected(pixels)
@@ -289,7 +289,7 @@ def triangulate(pixels: Array, rig: StereoRig) -> Array:
     good = np.asarray(np.isfinite(b).all(axis=(-2, -1)), bool)
     points = np.full((len(good), 3), np.nan)
     points[good] = solve_each(A[good], b[good])[..., 0]
-    for _ in range(10):  # Gauss-Newton: the linear solution is off by the noise times the perspective
+    for _ in range(10):  # Gauss-Newton: the error of the linear solution is the noise times the perspective
         found, d_world, _ = rig.project_with_jacobians(points[good])
         J = np.moveaxis(d_world, 0, 1).reshape(-1, 4, 3)
         step = solve_each(J, np.moveaxis(pixels[:, good] - found, 0, 1).reshape(-1, 4, 1))[..., 0]
@@ -300,10 +300,10 @@ def triangulate(pixels: Array, rig: StereoRig) -> Array:
 
 
 def causes(rig: StereoRig, shift: Array, further: Mapping[str, Array] | None = None) -> tuple[Array, list[str]]:
-    """Standard deviation (k,) of quantities by the rig, and for each what contributes most: views, or sizes of a board.
+    """Standard deviation (k,) of quantities due to the rig, and the largest cause of each: views, or sizes of a board.
 
     shift : (n, k, 30) their derivative by RIG_PARAMETERS at n places, over which variances are averaged
-    further : variances (k,) by other causes
+    further : variances (k,) due to other causes
     """
 
     def variance(C: Array) -> Array:

@@ -1,8 +1,8 @@
-"""A smooth displacement of the image beyond what the distortion's polynomial describes.
+"""A smooth displacement of the image that the distortion polynomial does not describe.
 
     pixel = projection + sum_k c_k B_k(pixel)         B: products of uniform cubic B-splines, a coefficient per axis
 
-As in splined camera models; here it takes up some hundredths of a pixel that vary over a third of the image.
+As in splined camera models; typically some hundredths of a pixel that vary over a third of the image.
 """
 
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ import scipy
 
 from calibration.kit.arrays import Array
 
-_STEPS = 12  # each takes the slope of the field, some hundredths, off the error
+_STEPS = 12  # of a fixed point that converges by the slope of the field, some hundredths, per step
 
 
 @dataclass(frozen=True)
@@ -29,21 +29,21 @@ class LensField:
         return np.asarray(splines(np.asarray(pixels, float)[..., ::-1]), np.float64)
 
     def splines(self, pixels: Array) -> Array:
-        """The (ny nx) splines of an axis at pixels (n, 2)."""
+        """Values (n, ny nx) of the splines of an axis at pixels (n, 2)."""
         shape = self.coefficients.shape[2:]
         return self._sums(np.eye(shape[0] * shape[1]).reshape(*shape, -1), pixels)
 
     def displacement(self, pixels: Array, camera: int) -> Array:
-        """By how much [px] (..., 2) an image point at `pixels` (..., 2) lies off the polynomial's; NaN stays NaN."""
+        """Displacement [px] (..., 2) of image points at `pixels` (..., 2) from the polynomial; NaN stays NaN."""
         return self._sums(np.moveaxis(self.coefficients[camera], 0, -1), pixels)
 
     def corrected(self, pixels: Array) -> Array:
-        """Pixels (..., 2 cameras, m, 2) where the polynomial alone would have them."""
+        """Pixels (..., 2 cameras, m, 2) without the displacement, as the polynomial alone predicts them."""
         moved = [self.displacement(pixels[..., camera, :, :], camera) for camera in (0, 1)]
         return pixels - np.stack(moved, axis=-3)
 
     def distorted(self, pixels: Array) -> Array:
-        """Inverse of `corrected`: where the lens shows them, to 1e-9 px for fields of some pixels."""
+        """Inverse of `corrected`, to 1e-9 px for fields of some pixels."""
         seen = np.asarray(pixels, float)
         for _ in range(_STEPS):
             seen = seen + pixels - self.corrected(seen)

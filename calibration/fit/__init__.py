@@ -1,1 +1,1 @@
-"""From corners to cameras: the model, a start, prior knowledge, least squares, and which terms the views support."""
+"""From corners to cameras: model, initial guess, priors, least squares, and model selection."""

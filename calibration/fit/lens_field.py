@@ -1,10 +1,10 @@
-"""What a lens does beyond its polynomial: a smooth displacement of the image, found from the views of the board.
+"""Fit of the lens field, a smooth displacement of the image beyond the distortion polynomial, to views of the board.
 
-The coefficients of the splines (`splines`) have a normal prior; cameras, poses and the board's shape are refined with
-them, and have none, so that the field holds only what those cannot. It is a sum of one that is smooth over two cells
-of its grid, and of a smaller one that varies within them. How large both are is told by all views together, by their
-marginal likelihood (MacKay 1992): a view at the edge of the images, which no other reaches, says nothing of that when
-it is left out. The field is kept if views that were left out are met better with it.
+The coefficients of the splines (`splines`) have a normal prior. Cameras, poses and the board's shape are refined with
+them and have no prior here, so that the field describes only what these cannot. It is the sum of a field that is smooth
+over two cells of its grid, and of a smaller one that varies within a cell. The sizes of both maximise the marginal
+likelihood of all views (MacKay 1992), not the held-out error: a held-out view at the edge of the image covers an area
+that no other view covers. The field is kept if it reduces the held-out error.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from calibration.kit.arrays import Array
 from calibration.kit.least_squares import eliminate
 
 CELLS = 10  # of the spline's grid along the longer side of the image
-# Standard deviations of a coefficient that are tried: of the part that varies within cells, and of the smooth one
+# Prior standard deviations of a coefficient that are tried: of the part that varies within cells, of the smooth part
 SIZES_PX = ((0.003, 0.01), (0.003, 0.03), (0.01, 0.03), (0.01, 0.1), (0.03, 0.1))
-BETTER = 2.5  # standard errors by which the views that were left out must be met better
+BETTER = 2.5  # standard errors by which the held-out chi-square must decrease
 
 
 def fit_lens_field(refinement: Refinement, nominal: Array) -> tuple[LensField | None, Refinement]:
-    """The field of both lenses, and the refinement of observations that it has corrected.
+    """The field of both lenses, and the refinement of the observations corrected by it.
 
-    None, and the refinement as it is, where a field does not help on views that were left out.
+    None, and the unchanged refinement, if a field does not reduce the held-out error.
 
     nominal : (n, 3) [m] the target's points as declared
     """
@@ -45,9 +45,9 @@ def fit_lens_field(refinement: Refinement, nominal: Array) -> tuple[LensField | 
     priors = [_precision(field, *sizes) for sizes in SIZES_PX]
     of_views = [_rows_of(refinement, used[used.view == view], field) for view in views]
     total = np.sum([rows.T @ rows for rows in of_views], axis=0)
-    solution, prior = _likeliest(total, priors)
+    solution, prior = _most_likely(total, priors)
     others = np.append(np.arange(len(solution) - field.coefficients.size), len(solution))
-    chi_square = np.zeros((2, len(views)))  # of each view, left out: without a field, and with one
+    chi_square = np.zeros((2, len(views)))  # held-out, of each view: without a field, and with one
     for fold in range(FOLDS):
         test = range(fold, len(views), FOLDS)
         train = total - np.sum([of_views[v].T @ of_views[v] for v in test], axis=0)
@@ -65,19 +65,18 @@ def fit_lens_field(refinement: Refinement, nominal: Array) -> tuple[LensField | 
 
 
 def _precision(grid: LensField, sigma: float, smooth: float) -> Array:
-    """Inverse covariance (ny nx, ny nx) of an axis' coefficients [px^-2].
+    """Prior precision (ny nx, ny nx) of an axis' coefficients [px^-2].
 
-    Independent ones of sigma [px]; and beside them what those of a grid of twice the spacing, of `smooth` [px], come to
-    on this one, roughly: half their variance along each axis, alike over two steps. So what varies within a few cells
-    is small, and zero where no corner lies.
+    Independent coefficients of `sigma` [px], plus a smooth part: roughly that of coefficients of `smooth` [px] on a
+    grid of twice the spacing, with half their variance along each axis and a correlation over two steps.
     """
     steps = (np.subtract.outer(np.arange(n), np.arange(n)) for n in grid.coefficients.shape[2:])
     together = np.kron(*(0.5 * np.exp(-0.25 * step**2) for step in steps))
     return np.asarray(np.linalg.inv(sigma**2 * np.eye(len(together)) + smooth**2 * together), np.float64)
 
 
-def _likeliest(total: Array, priors: list[Array]) -> tuple[Array, Array]:
-    """Parameters (s,) under that of the priors (precisions) under which all corners are likeliest, and that prior."""
+def _most_likely(total: Array, priors: list[Array]) -> tuple[Array, Array]:
+    """The prior (a precision) with the largest marginal likelihood: parameters (s,) under it, and the prior."""
     found = []
     for prior in priors:
         solution, volume = _solved(total, prior)
@@ -86,7 +85,7 @@ def _likeliest(total: Array, priors: list[Array]) -> tuple[Array, Array]:
 
 
 def _rows_of(refinement: Refinement, seen: Observations, grid: LensField) -> Array:
-    """Rows (r, s + 1) of a view, [cameras, board, field | residual], its pose projected out."""
+    """Rows (r, s + 1) of a view, [cameras, board, field | residual], with its pose eliminated."""
     problem, each = refinement.problem, np.arange(len(seen))
     splines, values = np.zeros((len(seen), 2, 4, grid.coefficients.size // 4)), grid.splines(seen.pixels)
     for axis in (0, 1):
@@ -97,9 +96,9 @@ def _rows_of(refinement: Refinement, seen: Observations, grid: LensField) -> Arr
 
 
 def _solved(square: Array, precision: Array) -> tuple[Array, float]:
-    """Parameters (s,), the last of them the field with its prior, and the log determinant of their normal matrix.
+    """Parameters (s,), the last of which are the field, and the log determinant of their normal matrix.
 
-    precision : the prior's, the same of every camera and axis
+    precision : prior of the field, the same for every camera and axis
     """
     matrix, first = square[:-1, :-1].copy(), len(square) - 1 - 4 * len(precision)
     matrix[first:, first:] += np.kron(np.eye(4), precision)

@@ -1,6 +1,6 @@
-"""Cameras, stereo pose, board shape and board poses as a problem of least squares, whose blocks are the views.
+"""Least-squares problem of cameras, stereo pose, board shape and board poses; its blocks are the views.
 
-The six numbers of a board's pose are its view's own, 12 where its two images show it in two places.
+The parameters of one view alone are the six of the board's pose, or 12 if its two images have separate poses.
 """
 
 from __future__ import annotations
@@ -22,44 +22,44 @@ from calibration.kit.least_squares import Minimum, Normal, normal_of_rows
 
 @dataclass(frozen=True)
 class Problem:
-    """What a refinement needs besides a start."""
+    """All inputs of a refinement except the initial guess."""
 
     observations: Observations  # sorted by view
     weights: Array  # (m, 2, 2) inverse covariance [1/px^2]
     stereo_basis: Array  # (24, s1) free directions of intrinsics and stereo pose
     shape_basis: Array  # (n, 3, s2) free directions of the target's points
-    apart: Mask  # (n_views,) whose two images have places of the board that nothing ties
-    huber: float = np.inf  # residuals beyond this many sigmas count linearly
+    apart: Mask  # (n_views,) views whose two images have independent poses of the board
+    huber: float = np.inf  # sigmas beyond which residuals count linearly
     prior: Prior | None = None  # of the cameras
-    motion: BoardMotion | None = None  # of the boards between the two exposures, for a model that has such places
+    motion: BoardMotion | None = None  # of the boards between the two exposures, for a model with two poses per view
 
     @property
     def n_views(self) -> int:
-        """Views, seen or not."""
+        """Number of views, with or without observations."""
         return len(self.apart)
 
     @property
     def n_own(self) -> int:
-        """Numbers of a view's own: of one place of the board, or of two."""
+        """Number of parameters of one view: of one pose of the board, or of two."""
         return 6 if self.motion is None and not self.apart.any() else 12
 
     def seeing(self, observations: Observations, extra: float) -> Problem:
-        """The same with other observations, whose covariances are by `extra` [px^2] larger in both axes."""
+        """The same with other observations, and `extra` [px^2] added to their covariances in both axes."""
         return replace(self, observations=observations, weights=inverse_covariance(observations.covariance, extra))
 
     def with_shape(self, nominal: Array, basis: Array) -> Problem:
-        """The same with points (n, 3) that may move along `basis` (n, 3, s2), and what is known of that beforehand."""
+        """The same with points (n, 3) that may move along `basis` (n, 3, s2), with their prior."""
         prior = self.prior and replace(self.prior, board=board_prior(nominal, basis))
         return replace(self, shape_basis=basis, prior=prior)
 
     def rows(self, model: StereoModel, beyond: Array | None = None) -> tuple[Array, NDArray[np.intp], Array]:
-        """Whitened rows (r, c) of all data, which view each is of (r,), and chi-square, or Huber's loss, by view.
+        """Whitened rows (r, c) of all data, the view of each (r,), and chi-square, or Huber's loss, of each view.
 
-        Columns: pose of the board, or both where some views have two | stereo | shape | beyond (m, 2, b) | residual.
-        NaN where a point lies behind its camera.
+        Columns: pose of the board, or both if some views have two | stereo | shape | beyond (m, 2, b) | residual.
+        NaN for points behind their camera.
         """
         o, V = self.observations, self.n_views
-        with np.errstate(all="ignore"):  # a step may put a board anywhere
+        with np.errstate(all="ignore"):  # a step may move a board behind its camera
             pixels, d_stereo, d_pose, d_point = predict(model, o)
             if self.n_own == 12:
                 place = o.camera * (self.apart[o.view] | (self.motion is not None))
@@ -71,8 +71,8 @@ class Problem:
             x, y = np.moveaxis(np.concatenate(columns, axis=-1), 1, 0)
             sigmas = np.sqrt(quadratic(self.weights, residual))
             within = np.minimum(sigmas, self.huber)
-            heeded = np.minimum(self.huber / np.maximum(sigmas, 1e-300), 1.0)
-            root = np.linalg.cholesky(self.weights * heeded[:, None, None])[..., None]  # its transpose whitens
+            robust = np.minimum(self.huber / np.maximum(sigmas, 1e-300), 1.0)
+            root = np.linalg.cholesky(self.weights * robust[:, None, None])[..., None]  # its transpose whitens
             rows = np.concatenate([root[:, 0, 0] * x + root[:, 1, 0] * y, root[:, 1, 1] * y])
             view = np.tile(o.view, 2)
             costs: Array = np.bincount(o.view, within * (2.0 * sigmas - within), V).astype(float)
@@ -105,7 +105,7 @@ class Problem:
 
 
 def quadratic(matrix: Array, vector: Array) -> Array:
-    """v^T M v of (m, 2, 2) and (m, 2)."""
+    """v^T M v (m,) for M (m, 2, 2) and v (m, 2)."""
     value: Array = np.einsum("mi,mij,mj->m", vector, matrix, vector)
     return value
 
@@ -116,7 +116,7 @@ def inverse_covariance(covariance: Array, extra: float) -> Array:
 
 
 def minimise(problem: Problem, start: StereoModel, **how: Any) -> Minimum[StereoModel]:
-    """`least_squares.minimise` from a start that shows every board before its camera."""
+    """`least_squares.minimise`. Raises CalibrationError if the initial guess has a board behind its camera."""
     found = least_squares.minimise(problem.linearise, problem.stepped, start, **how)
     if not found.iterations:
         raise CalibrationError(

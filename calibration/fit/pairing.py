@@ -1,10 +1,10 @@
-"""Which images of the two cameras show the board in one place: as stored, turned, mirrored, in another order, late.
+"""Which images of the two cameras are pairs: as stored, with the board turned, mirrored, in another order, delayed.
 
-Each image alone, by a rough camera, has the board at a place, and a pair of them tells how the cameras stand. Right
-pairs tell of one place of the cameras, wrong ones of as many as there are; so every hypothesis of which image belongs
-to which is as likely as the places that its pairs tell of lie together. Distances are in pixels, by the covariance of
-the two places of the board: what a pair tells badly (a shift along the axis) counts as little as it is known. As some
-boards were moved, errors have long tails: a pair's evidence is minus the logarithm of its squared distance.
+Each image alone, with a rough camera, gives a pose of the board, and two images give the relative pose of the cameras.
+Correct pairs agree on one relative pose, wrong pairs do not; the likelihood of a hypothesis about which images belong
+together is the agreement of its pairs. Distances are in pixels, weighted by the covariance of the two poses of the
+board: poorly determined directions (a shift along the axis) have little weight. As some boards were moved, errors have
+long tails: the log likelihood of a pair is minus the logarithm of its squared distance.
 """
 
 from __future__ import annotations
@@ -22,44 +22,43 @@ from calibration.fit.stereo_model import Observations, StereoModel
 from calibration.kit.arrays import Array, Mask, evenly
 from calibration.kit.errors import CalibrationError
 
-FLOOR = 1e-3  # of the image's longer side: rough cameras put boards no better; views that differ by less are one
-NEARER = 3.0  # times that the pairs of another hypothesis lie together better than those stored, to be believed
-BY_CHANCE = 2.0  # times that pairs lie together better than images of other pairs do: less is no agreement
-# Times the usual distance: of another place. Of Gaussian motions (F of 6 and 24 degrees of freedom) one in 10^9 is as
-# far; the motions of hand-held boards have longer tails.
+FLOOR = 1e-3  # of the image's longer side: accuracy of poses by rough cameras; views that differ by less are identical
+NEARER = 3.0  # ratio of distances, stored over another hypothesis, above which the other one is believed
+BY_CHANCE = 2.0  # ratio of distances, images of other pairs over pairs, below which pairs do not agree
+# Outliers, in usual distances. Of Gaussian motions (F of 6 and 24 degrees of freedom) one in 10^9 is as far; the
+# motions of hand-held boards have longer tails.
 TOO_FAR = 5.0
-MOST_LATE = 8  # views by which the two cameras may differ
-MIN_VIEWS = 3  # Zhang: fewer do not determine a camera, and so many pairs agree by chance
-GOOD_VIEWS = 8  # fewer judge neither lenses nor one another
-MOST_TRIED = 30  # pairs whose place is tried for all, views that OpenCV is given: time grows with the cube of them
+MOST_LATE = 8  # largest delay between the two cameras, in views
+MIN_VIEWS = 3  # Zhang: fewer do not determine a camera; as few pairs may agree by chance
+GOOD_VIEWS = 8  # fewer are not enough to test lenses, or views against each other
+MOST_TRIED = 30  # pairs whose relative pose is tried, views used by OpenCV: its time grows with their third power
 Pose = tuple[Array, Array]  # rotation (3, 3) and translation (3,) of the board in a camera's axes
 Names = Sequence[tuple[str, str]]
 Views = tuple[list[CornerView | BoardNotFound], list[CornerView | BoardNotFound]]
 
 
 @dataclass(frozen=True)
-class BoardPlaces:
-    """Where one camera alone has the board in n images, and how well it knows."""
+class BoardPoses:
+    """Poses of the board in n images of one camera, from that camera alone."""
 
     R: Array  # (n, 3, 3) board to camera
     middle: Array  # (n, 3) [m] of the board
-    covariance: Array  # (n, 6, 6) of a turn and a shift of the middle, times the points, by a pixel of scatter
+    covariance: Array  # (n, 6, 6) of rotation and shift of the middle, for 1 px of noise, times the number of points
 
-    def __getitem__(self, index: NDArray) -> BoardPlaces:
-        return BoardPlaces(self.R[index], self.middle[index], self.covariance[index])
+    def __getitem__(self, index: NDArray) -> BoardPoses:
+        return BoardPoses(self.R[index], self.middle[index], self.covariance[index])
 
-    def turned(self, turn: Array, mirror: bool = False) -> BoardPlaces:
-        """With the board turned about its middle (3, 3), and the camera's x reversed."""
+    def turned(self, turn: Array, mirror: bool = False) -> BoardPoses:
+        """With the board rotated (3, 3) about its middle, and, if `mirror`, the camera's x reversed."""
         F = np.diag([-1.0 if mirror else 1.0, 1.0, 1.0])
-        B = _both(-F if mirror else F, F)  # a turn is an axial vector
-        return BoardPlaces(F @ self.R @ turn, self.middle @ F, B @ self.covariance @ B.T)
+        B = _both(-F if mirror else F, F)  # a rotation is an axial vector
+        return BoardPoses(F @ self.R @ turn, self.middle @ F, B @ self.covariance @ B.T)
 
 
 def count_once(views: Views, names: Names, table_view: int | None) -> None:
-    """Leave out, in place, views that show the board where another one does: they say no more of cameras than that one.
+    """Leave out, in place, views that repeat another view, such as copies of a file or a video of a board at rest.
 
-    Copies of a file, and frames of a video in which the board rests, are such. Raises CalibrationError where one
-    camera's images show the board in one place and the other's do not.
+    Raises CalibrationError if images of one camera repeat each other while the other's do not.
     """
     same = [_same_place(side) for side in views]
     found = np.array([[isinstance(view, CornerView) for view in side] for side in views])
@@ -84,7 +83,7 @@ def count_once(views: Views, names: Names, table_view: int | None) -> None:
 
 
 def _same_place(side: Sequence[CornerView | BoardNotFound]) -> Mask:
-    """(n, n) whether two images of a camera show the board in one place; or both do not show it."""
+    """(n, n) whether two images of a camera show the board in the same place, or neither shows it."""
     found = np.array([isinstance(view, CornerView) for view in side], bool)
     same = ~found[:, None] & ~found
     views = [view for view in side if isinstance(view, CornerView)]
@@ -96,8 +95,8 @@ def _same_place(side: Sequence[CornerView | BoardNotFound]) -> Mask:
     return same
 
 
-def places_of(poses: Mapping[int, Pose], seen_by: Observations, points: Array, camera: Camera) -> BoardPlaces:
-    """Of images whose poses are known. seen_by : the camera;  points : (n, 3) [m] of the target"""
+def poses_of(poses: Mapping[int, Pose], seen_by: Observations, points: Array, camera: Camera) -> BoardPoses:
+    """Poses with covariances. seen_by : observations of the camera;  points : (n, 3) [m] of the target"""
     middle = points.mean(0)
     found: list[tuple[Array, Array, Array]] = []
     for view, (R, t) in poses.items():
@@ -105,13 +104,13 @@ def places_of(poses: Mapping[int, Pose], seen_by: Observations, points: Array, c
         d_point = project_with_jacobians(seen, camera)[1]
         J = np.concatenate([by_turning(d_point, seen - at), d_point], axis=-1).reshape(-1, 6)
         information = J.T @ J / len(seen)
-        information += 1e-9 * np.diag(np.diag(information))  # of points on a line, one turn is not seen at all
+        information += 1e-9 * np.diag(np.diag(information))  # points on a line leave one rotation undetermined
         found.append((R, at, np.linalg.inv(information)))
-    return BoardPlaces(*(np.stack(part) for part in zip(*found, strict=True)))
+    return BoardPoses(*(np.stack(part) for part in zip(*found, strict=True)))
 
 
-def apart(left: BoardPlaces, right: BoardPlaces, R_pair: Array, t_pair: Array) -> Array:
-    """(m, n) [px] by which n pairs are off m places of the right camera against the left: (m, 3, 3) and (m, 3) [m]."""
+def apart(left: BoardPoses, right: BoardPoses, R_pair: Array, t_pair: Array) -> Array:
+    """(m, n) [px] distances of n pairs from m relative poses of the right camera: (m, 3, 3) and (m, 3) [m]."""
     back = np.swapaxes(R_pair, 1, 2)[:, None]
     turn = rotation_vectors(back @ right.R @ np.swapaxes(left.R, 1, 2))
     shift = (back @ (right.middle - t_pair[:, None])[..., None])[..., 0] - left.middle
@@ -121,29 +120,29 @@ def apart(left: BoardPlaces, right: BoardPlaces, R_pair: Array, t_pair: Array) -
     return np.asarray(np.sqrt(np.maximum(np.sum(step * known, axis=-1), 0.0)), np.float64)
 
 
-def told_by(left: BoardPlaces, right: BoardPlaces) -> tuple[Array, Array]:
-    """How the cameras stand by each pair alone: R_right_left (n, 3, 3) and t_right_left (n, 3) [m]."""
+def relative_poses(left: BoardPoses, right: BoardPoses) -> tuple[Array, Array]:
+    """Relative pose of the cameras from each pair alone: R_right_left (n, 3, 3) and t_right_left (n, 3) [m]."""
     R = right.R @ np.swapaxes(left.R, 1, 2)
     return R, right.middle - np.einsum("nij,nj->ni", R, left.middle)
 
 
-Paired = tuple[list[int], BoardPlaces, list[BoardPlaces]]  # left views, and where each camera has the board in pairs
+Paired = tuple[list[int], BoardPoses, list[BoardPoses]]  # left views; poses of the board in both cameras
 
 
 @dataclass(frozen=True)
 class Pairs:
-    """Which pairs show the board in one place, as cameras see it that have a place of it for each image."""
+    """Which views are pairs: their two images, each with its own pose of the board, agree with the other pairs."""
 
-    model: StereoModel  # its boards where each image alone has them
-    views: NDArray[np.intp]  # of which both images tell that
-    odd: dict[int, str] = field(default_factory=dict)  # view -> why its two images are not taken for one place
-    bad_images: dict[tuple[int, int], str] = field(default_factory=dict)  # (view, camera) -> why not even alone
-    # Where a camera was moved between the views: the stretches of pairs before and after such steps, and of each step
-    # turn [rad], shift [m], and [px] between pairs on either side of it and between those of one side, in the right
-    # image: root mean square of the usual two
+    model: StereoModel  # with a pose of the board for each image alone
+    views: NDArray[np.intp]  # with such poses in both images
+    odd: dict[int, str] = field(default_factory=dict)  # view -> why its two images are no pair
+    bad_images: dict[tuple[int, int], str] = field(default_factory=dict)  # (view, camera) -> why it is not used at all
+    # If a camera was moved between views: the stretches of pairs before and after each step; and for each step its
+    # rotation [rad], shift [m], and the typical distance [px] in the right image between pairs on opposite sides, and
+    # between pairs on one side
     stretches: tuple[tuple[int, ...], ...] = ()
     steps: tuple[tuple[float, float, float, float], ...] = ()
-    kept: int = 0  # the stretch that tells how the cameras stand
+    kept: int = 0  # the stretch that determines the stereo pose
 
     @property
     def others(self) -> tuple[int, ...]:
@@ -152,11 +151,11 @@ class Pairs:
 
     @property
     def apart(self) -> set[int]:
-        """Views whose two images are used each for its own camera."""
+        """Views whose images are used separately, each for its own camera."""
         return {*self.odd, *self.others}
 
     def joined(self, observations: Observations) -> StereoModel:
-        """The model with one place for both images but of those apart: by the image that shows more of the board."""
+        """The model with one pose per pair, from the image that shows more of the board; views apart keep two."""
         R, t = self.model.R_left_board.copy(), self.model.t_left_board.copy()
         image = 2 * observations.view + observations.camera
         both = np.setdiff1d(np.arange(len(R)), [*self.apart])
@@ -167,74 +166,74 @@ class Pairs:
 
 @dataclass(frozen=True)
 class Pairing:
-    """The likeliest place of the right camera against the left one, and the pairs by it."""
+    """The most likely relative pose of the cameras, and the pairs' agreement with it."""
 
     R_right_left: Array  # (3, 3)
     t_right_left: Array  # (3,) [m]
-    order: NDArray[np.intp]  # (n,) number of the board's turn in the right image of each pair
+    order: NDArray[np.intp]  # (n,) index of the board's symmetry in the right image of each pair
     distance: Array  # (n,) [px]
-    evidence: float  # mean over the pairs, in units of the logarithm of a squared distance
+    evidence: float  # mean log likelihood of the pairs
     floor: float  # [px]
 
     @property
     def usual(self) -> float:
-        """[px] Distance of pairs that agree: the best half of them."""
+        """[px] Typical distance of pairs that agree: the median of the better half."""
         return max(float(np.quantile(self.distance, 0.25)), self.floor)
 
     @property
     def agrees(self) -> Mask:
-        """(n,) pairs that tell of this place."""
+        """(n,) pairs that agree with this relative pose."""
         return self.distance < TOO_FAR * self.usual
 
     def is_likelier(self, stored: Pairing) -> bool:
-        """True if it is to be believed against the pairs as they are stored."""
+        """True if it is clearly more likely than the pairs as stored."""
         beyond = stored.evidence + 2.0 * np.log(NEARER)
         return self.evidence > beyond and 2 * int(self.agrees.sum()) > len(self.distance)
 
 
-def likeliest(left: BoardPlaces, turns_of_right: Sequence[BoardPlaces], floor: float) -> Pairing:
-    """The place of the cameras that pairs tell of; turns_of_right : with the board in each of its attitudes."""
+def most_likely(left: BoardPoses, turns_of_right: Sequence[BoardPoses], floor: float) -> Pairing:
+    """The most likely relative pose of the cameras; turns_of_right : with the board in each of its symmetries."""
     n = len(left.R)
     tried = np.array(evenly(n, MOST_TRIED))
-    told = [told_by(left[tried], right[tried]) for right in turns_of_right]
-    R, t = (np.concatenate(part) for part in zip(*told, strict=True))
+    poses = [relative_poses(left[tried], right[tried]) for right in turns_of_right]
+    R, t = (np.concatenate(part) for part in zip(*poses, strict=True))
     distance = np.stack([apart(left, right, R, t) for right in turns_of_right])  # (orders, candidates, n)
     nearest = distance.min(axis=0)
-    own = np.tile(tried, len(told))
+    own = np.tile(tried, len(poses))
     likelihood = -np.log(floor**2 + nearest**2)
-    likelihood[np.arange(len(own)), own] = 0.0  # each lies at the place that it tells of
+    likelihood[np.arange(len(own)), own] = 0.0  # a pair agrees with its own relative pose exactly
     best = int(np.argmax(likelihood.sum(axis=1)))
     order, near = distance[:, best].argmin(axis=0), nearest[best]
     found = Pairing(R[best], t[best], order, near, float(likelihood[best].sum() / max(n - 1, 1)), floor)
-    shifts = np.stack([told_by(left, right)[1] for right in turns_of_right])[order, np.arange(n)]
+    shifts = np.stack([relative_poses(left, right)[1] for right in turns_of_right])[order, np.arange(n)]
     return replace(found, t_right_left=np.median(shifts[found.agrees], axis=0))
 
 
 def board_turns(n: int) -> list[Array]:
-    """(3, 3) each: the n turns of a grid of points in its plane that map it onto itself, in the order of `orders`."""
+    """The n symmetries of a grid of points as rotations (3, 3) in its plane, in the order of `orders`."""
     quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     return [np.linalg.matrix_power(quarter, k * 4 // n) for k in range(n)]
 
 
 def paired(
-    sides: tuple[BoardPlaces, BoardPlaces],
+    sides: tuple[BoardPoses, BoardPoses],
     views: tuple[Sequence[int], Sequence[int]],
     nominal: Array,
     n_orders: int,
     floor: float,
     names: Names,
 ) -> tuple[Pairing, tuple[str, ...]]:
-    """The pairs as they are stored, and what is to be said of them. Raises CalibrationError where they are no pairs.
+    """The pairs as stored, and warnings about them. Raises CalibrationError if they are no pairs.
 
-    sides : where each camera alone has the board; views : the numbers of these images, ascending
-    names : (left, right) of all views; n_orders : of the target's points that look the same
+    sides : poses of the board in the images of each camera; views : ascending numbers of these images
+    names : (left, right) of all views; n_orders : number of symmetries of the target
     """
     (left, right), is_square = sides, np.allclose(*np.ptp(nominal, axis=0)[:2])
     as_seen = [right.turned(turn) for turn in board_turns(n_orders)]
     mirrored = [right.turned(turn @ np.diag([-1.0, 1.0, 1.0]), True) for turn in board_turns(4 if is_square else 2)]
     place = [{view: i for i, view in enumerate(side)} for side in views]
 
-    def pairs_of(right_of: NDArray, among: Sequence[int] = views[0], turns: Sequence[BoardPlaces] = as_seen) -> Paired:
+    def pairs_of(right_of: NDArray, among: Sequence[int] = views[0], turns: Sequence[BoardPoses] = as_seen) -> Paired:
         both = [v for v in among if right_of[v] in place[1]]
         b = np.array([place[1][right_of[v]] for v in both], int)
         return both, left[np.array([place[0][v] for v in both], int)], [one[b] for one in turns]
@@ -244,18 +243,18 @@ def paired(
     n = len(both)
     if not n:
         raise CalibrationError("no view shows the target to both cameras: the pair cannot be calibrated")
-    stored = likeliest(of_left, of_right, floor)
+    stored = most_likely(of_left, of_right, floor)
     if n < MIN_VIEWS or (stored.agrees.all() and stored.usual < TOO_FAR * floor):
         return stored, ()
     shifts = [k for k in range(-MOST_LATE, MOST_LATE + 1) if abs(k) < n - MIN_VIEWS]
     orders = [(f"{abs(k)} {'late' if k > 0 else 'early'}", number + k) for k in shifts if k]
     orders += [("in reversed order", number[::-1] + k) for k in shifts]
     tried = [("", number, pairs_of(number, turns=mirrored)), *((how, by, pairs_of(by)) for how, by in orders)]
-    others = [(how, by, which, likeliest(a, b, floor)) for how, by, (which, a, b) in tried if len(which) > MIN_VIEWS]
+    others = [(how, by, which, most_likely(a, b, floor)) for how, by, (which, a, b) in tried if len(which) > MIN_VIEWS]
     if others:
         how, by, which, found = max(others, key=lambda one: one[-1].evidence)
         if found.is_likelier(stored):
-            raise CalibrationError(_told(how, found, stored, [(names[v][0], names[by[v]][1]) for v in which]))
+            raise CalibrationError(_reason(how, found, stored, [(names[v][0], names[by[v]][1]) for v in which]))
     _require_agreement(stored, [found.evidence for how, _, _, found in others if how])
     notes = _late(pairs_of, [v for v, fits in zip(both, stored.agrees, strict=True) if not fits], stored, names)
     if notes and 2 * stored.agrees.sum() <= n:
@@ -263,10 +262,10 @@ def paired(
     return stored, notes
 
 
-def _told(how: str, found: Pairing, stored: Pairing, names: Names) -> str:
-    """Why pairs of these names are believed against those stored, and what to do.
+def _reason(how: str, found: Pairing, stored: Pairing, names: Names) -> str:
+    """Why pairs of these names are more likely than those stored, and what to do.
 
-    how : the right views come; "": as stored, with the images of one camera mirrored
+    how : delay or order of the right views; "": as stored, with the images of one camera mirrored
     """
     if not how:
         return (
@@ -285,7 +284,7 @@ def _told(how: str, found: Pairing, stored: Pairing, names: Names) -> str:
 
 
 def _require_agreement(stored: Pairing, others: Sequence[float]) -> None:
-    """Raise CalibrationError where pairs lie together no better than those of other orders, with this evidence, do."""
+    """Raise CalibrationError if the pairs agree no better than pairs in other orders; others : their evidence."""
     n = len(stored.distance)
     if n < GOOD_VIEWS or not others or stored.usual < TOO_FAR * stored.floor:
         return
@@ -300,7 +299,7 @@ def _require_agreement(stored: Pairing, others: Sequence[float]) -> None:
 def _late(
     pairs_of: Callable[[NDArray, Sequence[int]], Paired], odd: Sequence[int], found: Pairing, names: Names
 ) -> tuple[str, ...]:
-    """A warning about pairs, of those that do not fit, that would with a later or an earlier right view."""
+    """Warnings about pairs among the `odd` that would agree with a later or an earlier right view."""
     rest, told = list(odd), []
     for k in sorted(range(-MOST_LATE, MOST_LATE + 1), key=abs)[1:]:
         both, left, turns = pairs_of(np.arange(len(names)) + k, rest)
@@ -317,13 +316,13 @@ def _late(
 
 
 def _both(turn: Array, shift: Array) -> Array:
-    """(..., 6, 6) of rotations (..., 3, 3) of a turn and of a shift."""
+    """(..., 6, 6) block diagonal matrix of rotations (..., 3, 3) for a rotation vector and for a shift."""
     B = np.zeros((*turn.shape[:-2], 6, 6))
     B[..., :3, :3], B[..., 3:, 3:] = turn, shift
     return B
 
 
 def rotation_vectors(R: Array) -> Array:
-    """Rotation vectors (..., 3) [rad] of rotations (..., 3, 3); of half turns, some vector as long as pi."""
+    """Rotation vectors (..., 3) [rad] of rotations (..., 3, 3); the sign is arbitrary for half turns."""
     turns = scipy.spatial.transform.Rotation.from_matrix(R.reshape(-1, 3, 3))
     return np.asarray(turns.as_rotvec(), np.float64).reshape(R.shape[:-1])

@@ -1,14 +1,14 @@
-"""What is known of cameras and boards before any view was taken; it decides where few views leave something open.
+"""Priors of cameras and boards, which matter if few views leave parameters undetermined.
 
-Sensors are etched to better than 1e-5, so pixels are square unless somebody has resized the images, and the lens stands
-over the middle of the sensor to a few percent unless somebody has cropped them; no radial term moves the image's corner
-by much more than a tenth of its distance from the middle. These priors have Cauchy's tails, which let go of what the
-views contradict. Focal lengths, tangential terms and the board's shape have normal ones: with tails of its own a board
-that is 4 % longer along one side and pixels that are 4 % wider explain three views a little better than a bent sheet.
+Sensors are accurate to better than 1e-5, so pixels are square unless images were resized. The lens is centred on the
+sensor to a few percent unless images were cropped. A radial term moves the image's corner by about a tenth of its
+distance from the middle at most. These priors are Cauchy distributions, whose tails let the views contradict them.
+Focal lengths, tangential terms and the board's shape have normal priors: with tails for the board as well, a board 4 %
+longer along one side with pixels 4 % wider would explain three views slightly better than a bent board.
 
-The sizes are those of photographed lenses and boards where views determine them (29 to 59 numbers each): k1, k2, k3 at
-the corner 0.065, 0.073, 0.073 rms, 0.24 at most; tangential 0.0027; the middle 1.4 % of the diagonal; bends, stretch
-and shear of boards 0.3 % rms, 1.3 % at most. With ten good views little of this is felt.
+The widths are those found for lenses and boards in photographs that determine them (29 to 59 values each): k1, k2, k3
+at the corner 0.065, 0.073, 0.073 rms, 0.24 at most; tangential 0.0027; principal point 1.4 % of the diagonal; bends,
+stretch and shear of boards 0.3 % rms, 1.3 % at most. With ten good views the priors have little effect.
 """
 
 from dataclasses import dataclass
@@ -20,14 +20,15 @@ from calibration.cameras.camera import N_INTRINSIC, OF_CAMERAS
 from calibration.fit.stereo_model import N_STEREO, StereoModel, board_basis
 from calibration.kit.arrays import Array
 
-FOCAL = 0.7  # of the logarithm of the focal length over the image's longer side: 28 to 90 deg across, as lenses are
-ASPECT = 1e-3  # of fx / fy against 1
-CENTRE = 0.02  # of the principal point against the middle of the image, in its diagonals
-RADIAL = 0.1  # of what one radial term does at the image's corner, in its distance from the middle
-TANGENTIAL = 0.003  # the same of a tangential term
-BEND = 1e-2  # of what each smooth term of a board's bend does at its rim, in half the board's size
-STRETCH = 5e-3  # relative: longer along one side than along the other, or sheared
-MISPRINT = 1e-3  # of a point in the board's plane beyond that, in half the board's size
+# Standard deviations, or widths of Cauchy distributions.
+FOCAL = 0.7  # of the logarithm of the focal length over the image's longer side: fields of view of 28 to 90 deg
+ASPECT = 1e-3  # of fx / fy - 1
+CENTRE = 0.02  # of the principal point minus the middle of the image, in image diagonals
+RADIAL = 0.1  # of the displacement of the image's corner by one radial term, over its distance from the middle
+TANGENTIAL = 0.003  # the same for a tangential term
+BEND = 1e-2  # of the height at the board's rim for each smooth bending term, in half the board's size
+STRETCH = 5e-3  # relative, of the difference of lengths along the two sides, and of shear
+MISPRINT = 1e-3  # of other displacements of a point in the board's plane, in half the board's size
 RIPPLE = 3e-3  # the same out of the plane
 
 
@@ -35,16 +36,16 @@ RIPPLE = 3e-3  # the same out of the plane
 class Prior:
     """Deviations `rows @ parameters - at`, in sigmas, of the intrinsics of each camera of a `StereoModel`.
 
-    Focal lengths come beside them, by their logarithms. The target's shape is normal about the declared points.
+    Focal lengths are added by their logarithms. The target's shape is normal about the declared points.
     """
 
     rows: Array  # (2, 8, 9)
     at: Array  # (2, 8)
-    # Of the target: its points as declared (n, 3) [m]; the parameters of its shape, as far as that is refined, from the
-    # displacements of these (s2, 3 n); and their information (s2, s2)
+    # Of the target: its declared points (n, 3) [m]; the matrix from displacements of these to the refined parameters of
+    # the shape (s2, 3 n); and the information matrix of these parameters (s2, s2)
     board: tuple[Array, Array, Array]
-    # Beside corners that are weighted by their noise, where views disagree by this much more (4 to 70 times in variance
-    # on photographs), a prior counts that many times.
+    # Corners are weighted by their noise. If the scatter of the views exceeds that (4 to 70 times in variance for
+    # photographs), the prior is multiplied by the same factor.
     weight: float = 1.0
 
     def normal(self, model: StereoModel, stereo_basis: Array) -> Array:
@@ -59,7 +60,7 @@ class Prior:
             J = np.vstack([rows, focal])
             z = np.append(rows @ camera.parameters - at, np.log(max(f, 1e-300) / max(camera.image_size)) / FOCAL)
             weight, cost = np.ones(len(z)), cost + float(z @ z)
-            for group in (slice(0, 1), slice(1, 3), slice(3, 6)):  # each of one Cauchy distribution, the others normal
+            for group in (slice(0, 1), slice(1, 3), slice(3, 6)):  # each a Cauchy distribution, the others normal
                 square = float(z[group] @ z[group])
                 weight[group] = 1.0 / (1.0 + square)
                 cost += float(np.log1p(square)) - square
@@ -74,9 +75,9 @@ class Prior:
 
 
 def priors_of(model: StereoModel, nominal: Array, shape_basis: Array) -> Prior:
-    """Of the two cameras, which are needed to some percent for the scale of the terms, and of the board.
+    """Prior of the two cameras and of the board; the cameras of the model set the scale of the terms.
 
-    nominal : (n, 3) [m] the target's points as declared; shape_basis : (n, 3, s2) directions in which they may move
+    nominal : (n, 3) [m] the declared points of the target; shape_basis : (n, 3, s2) directions in which they may move
     """
     rows, at = np.zeros((2, 8, N_INTRINSIC)), np.zeros((2, 8))
     for camera, own, middle in zip(model.rig.cameras, rows, at, strict=True):
@@ -92,7 +93,7 @@ def priors_of(model: StereoModel, nominal: Array, shape_basis: Array) -> Prior:
 
 
 def board_prior(nominal: Array, shape_basis: Array) -> tuple[Array, Array, Array]:
-    """`Prior.board` of a shape along `shape_basis` (n, 3, s2): of the smooth part and of the rest, apart."""
+    """`Prior.board` for a shape along `shape_basis` (n, 3, s2); the smooth part and the rest are independent."""
     basis, smooth = (b.reshape(nominal.size, -1) for b in (shape_basis, board_basis(nominal, "warped")))
     size = float(np.abs(nominal - nominal.mean(0)).max())
     along = np.linalg.pinv(smooth) @ basis

@@ -1,11 +1,11 @@
-"""One least-squares refinement of both cameras, their mutual pose, all board poses and, if wanted, the board itself.
+"""Joint least-squares refinement of both cameras, their relative pose, all board poses and optionally the board.
 
-Outliers are rejected and the noise that the points' own covariances leave unexplained is measured on the way. Which
-shape of the board the data support is chosen by the error on views that the fit has not seen.
+Outliers are rejected, and the noise beyond the stated covariances of the points is estimated. The model of the board's
+shape is selected by cross-validation.
 
-The lens is not chosen so. A term that the views do not tell from zero is not zero for that: left out, it would put its
-error into all others, which nothing would say (1.8 to 2.3 times the stated variance by three to eight views). All terms
-are fitted, and `priors` knows how large they are in lenses.
+The distortion model is not selected in this way. A term that is not significant need not be zero: without it, its error
+would bias all other parameters unnoticed (1.8 to 2.3 times the stated variance with three to eight views). All terms
+are fitted, with `priors` of their usual size.
 """
 
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ import scipy
 
 from calibration.board.target import LEAST_POINTS
 from calibration.cameras.camera import triangulate
-from calibration.fit.board_motion import BoardMotion, learnt
+from calibration.fit.board_motion import BoardMotion, updated
 from calibration.fit.normal_equations import Normal, Problem, inverse_covariance, minimise, quadratic
 from calibration.fit.priors import priors_of
 from calibration.fit.stereo_model import (
@@ -31,12 +31,12 @@ from calibration.kit.arguments import checked
 from calibration.kit.arrays import Array, Mask
 from calibration.kit.errors import CalibrationError
 
-FREE_ROUNDS = 6  # of rejection, in which a point may come back; in as many more it may not, so that they come to an end
-MOST_DISAGREEMENT = 100.0  # of views among each other that is believed, and the least: few of them tell it badly
+FREE_ROUNDS = 6  # of rejection in which points may be accepted again; not in as many more, so that the rounds end
+MOST_DISAGREEMENT = 100.0  # bound of the disagreement of views, which few views determine poorly
 FOLDS = 5
-NEGLIGIBLE = 1e-5  # of chi-square, still to be gained: of 10^4 points, a third of a sigma of one parameter
+NEGLIGIBLE = 1e-5  # relative decrease of chi-square: for 10^4 points, a third of a sigma of one parameter
 TRUNCATE = 30.0  # squared sigmas: one bad corner must not decide between two models
-SIMPLER_WITHIN = 0.25  # standard errors of the paired difference that a simpler model may be worse
+SIMPLER_WITHIN = 0.25  # standard errors of the paired difference by which a simpler model may be worse
 
 
 @dataclass(frozen=True)
@@ -45,11 +45,11 @@ class Refinement:
 
     model: StereoModel
     terms: Terms
-    observations: Observations  # all that were given
+    observations: Observations  # including the rejected ones
     kept: Mask  # (m,)
-    residuals: Array  # (m, 2) observed - predicted [px], of the rejected ones too
-    unexplained_sigma: float  # [px per axis] added to the corners' own noise so that the residuals are explained
-    chi_square: float  # reduced, with the points' own covariances alone
+    residuals: Array  # (m, 2) observed - predicted [px], including the rejected ones
+    unexplained_sigma: float  # [px per axis] added to the stated noise so that the reduced chi-square is 1
+    chi_square: float  # reduced, with the stated covariances alone
     normal: Normal  # at the minimum, of the kept observations
     problem: Problem
     iterations: int
@@ -57,14 +57,14 @@ class Refinement:
 
     @property
     def disagreement(self) -> float:
-        """Variance of the parameters as the views disagree about them, over what the corners' noise predicts.
+        """Variance of the parameters from the scatter of views, over that predicted by the corners' noise.
 
-        1 for a right model, and more where errors are common to the corners of a view.
+        1 for a correct model, larger if errors are common to the corners of a view.
         """
         return self.normal.disagreement(self.problem.stereo_basis.shape[1])
 
     def rms(self, select: Mask | None = None) -> float:
-        """Root mean square distance [px] of the kept observations, or of some of them."""
+        """Root mean square distance [px] of observed from predicted points, of those kept or also selected."""
         use = self.kept if select is None else self.kept & select
         return float(np.sqrt(np.mean(np.sum(self.residuals[use] ** 2, axis=-1)))) if use.any() else float("nan")
 
@@ -92,16 +92,16 @@ def refine_stereo(
     priors: bool = True,
     motion: BoardMotion | None = None,
 ) -> Refinement:
-    """Refine everything `terms` frees, from image points of any flat target.
+    """Refine all free parameters of `terms` from image points of a flat target.
 
     observations : image points with covariances, of any target with known points: corners of squares or dots
-    start : cameras, stereo pose and board poses to a few percent and degrees, see `calibration.fit.start`; where it has
-        two places of a board, so has what is refined
-    nominal : (n, 3) [m] the target's points as declared
-    reject_beyond : sigmas, after the noise that the residuals themselves show: of 10^4 good points none lies beyond
-    begin : an earlier refinement of the same observations with other terms: spares the robust start
-    priors : whether what is known of cameras and boards beforehand counts, see `priors`
-    motion : about how far boards moved between the two exposures of a pair; None: they did not, or as `begin` has it
+    start : cameras, stereo pose and board poses to a few percent and degrees, see `calibration.fit.start`; a view with
+        two poses of the board keeps two
+    nominal : (n, 3) [m] the declared points of the target
+    reject_beyond : sigmas, with the noise estimated from the residuals; of 10^4 good points none exceeds the default
+    begin : an earlier refinement of the same observations with other terms, which replaces the robust start
+    priors : whether the priors of cameras and boards are used, see `priors`
+    motion : approximate motion of boards between the two exposures of a pair; None: none, or that of `begin`
 
     Raises CalibrationError if the views cannot determine the parameters.
     """
@@ -120,8 +120,8 @@ def refine_stereo(
     rough = replace(problem, motion=motion)
     problem, model, kept, extra, dof, total = _settled(rough, model, kept, extra, reject_beyond)
     used = observations[kept]
-    # noise and points are settled: now the minimum itself, and once more with the noise that is seen there, so that
-    # nothing is left of where the rough rounds happened to stop
+    # with noise and points fixed, the exact minimum; then again with the noise estimated there, so that the result does
+    # not depend on where the rough rounds stopped
     for _ in range(2):
         problem = problem.seeing(used, extra)
         minimum = minimise(problem, model, tolerance=1e-14, damping=1e-6)
@@ -147,10 +147,10 @@ def refine_stereo(
 def _settled(
     problem: Problem, model: StereoModel, kept: Mask, extra: float, reject_beyond: float
 ) -> tuple[Problem, StereoModel, Mask, float, float, int]:
-    """Rounds of a rough fit until noise, points, boards' motion and the prior's weight belong together.
+    """Rounds of rough fits until noise, accepted points, motion of the boards and weight of the prior are consistent.
 
-    problem : of all observations, of which those `kept` are fitted first; extra : [px^2] beside their own noise
-    returns : problem and model, points that were fitted, extra variance, degrees of freedom, steps that were taken
+    problem : of all observations, of which those `kept` are fitted first; extra : [px^2] in addition to their noise
+    returns : problem and model, points that were fitted, extra variance, degrees of freedom, number of steps
     """
     observations, total = problem.observations, 0
     place = 2 * observations.view + observations.camera * problem.apart[observations.view]  # of the board
@@ -162,7 +162,7 @@ def _settled(
         model, total = minimum.model, total + minimum.iterations
         steady = True
         if motion is not None:
-            moves, determined = learnt(motion, model, minimum.normal.covariances()[1], problem.apart)
+            moves, determined = updated(motion, model, minimum.normal.covariances()[1], problem.apart)
             dof, steady = dof - determined, moves.is_near(motion)
             problem = replace(problem, motion=moves)
         if prior is not None:
@@ -173,16 +173,16 @@ def _settled(
         before, extra = extra, _extra_variance(residuals[kept], used.covariance, dof)
         good = _mahalanobis2(residuals, observations.covariance, extra) < reject_beyond**2
         good = good & kept if turn >= FREE_ROUNDS else good
-        good &= np.bincount(place, good)[place] >= min(LEAST_POINTS, len(model.points))  # fewer tell no place
+        good &= np.bincount(place, good)[place] >= min(LEAST_POINTS, len(model.points))  # fewer determine no pose
         if steady and abs(extra - before) <= 0.01 * before + 1e-10 and bool((good == kept).all()):
             break
-        if turn < 2 * FREE_ROUNDS - 1:  # what is returned belongs to the points that were fitted
+        if turn < 2 * FREE_ROUNDS - 1:  # the returned values are those of the fitted points
             kept = good
     return problem, model, kept, extra, dof, total
 
 
 def _robust_start(problem: Problem, model: StereoModel) -> tuple[StereoModel, float]:
-    """Huber's fit with the noise set by the median residual, and the extra variance [px^2] it shows."""
+    """Huber fit with the noise estimated from the median residual, and the extra variance [px^2]."""
     observations = problem.observations
     for _ in range(2):
         extra = _median_variance(observations.pixels - predict_pixels(model, observations))
@@ -192,7 +192,7 @@ def _robust_start(problem: Problem, model: StereoModel) -> tuple[StereoModel, fl
 
 
 def _median_variance(residuals: Array) -> float:
-    """Variance per axis that puts the median of squared 2-D residuals where a Gaussian has it, 2 ln 2 sigma^2."""
+    """Variance per axis from the median of squared 2-D residuals, 2 ln 2 sigma^2 for a Gaussian."""
     return float(np.median(np.sum(residuals**2, axis=-1)) / (2 * np.log(2))) + 1e-12
 
 
@@ -201,8 +201,8 @@ def _mahalanobis2(residuals: Array, covariance: Array, extra: float) -> Array:
 
 
 def _extra_variance(residuals: Array, covariance: Array, dof: float) -> float:
-    """Variance per axis [px^2] which, added to the points' own, makes chi-square equal to the degrees of freedom."""
-    own, axes = np.linalg.eigh(covariance)  # of each point: along its axes what is added is a plain sum
+    """Variance per axis [px^2] which, added to the covariances, makes chi-square equal to the degrees of freedom."""
+    own, axes = np.linalg.eigh(covariance)  # the extra variance adds to the eigenvalues of each point
     squares = np.einsum("mij,mi->mj", axes, residuals) ** 2
 
     def excess(extra: float) -> float:
@@ -220,16 +220,16 @@ class TermsTried:
 
     terms: Terms
     n_parameters: int  # shared by all views
-    rms_px: float  # on the views that were fitted
-    held_out_rms_px: float  # on views left out, each with its own pose fitted
-    held_out_error: float  # [m] the same of corners in space, rms over those views; NaN where both cameras saw none
+    rms_px: float  # of the fitted views
+    held_out_rms_px: float  # of held-out views, with their poses fitted
+    held_out_error: float  # [m] the same for corners in space, rms over those views; NaN if no view has both cameras
     held_out_chi_square: float  # per observation, truncated, in units of the noise of this comparison
-    noise_px: float  # sigma per axis of this comparison beyond the corners' own noise: the least of its models
-    per_view: Array  # (n_views,) the same, NaN where a view was not used
+    noise_px: float  # sigma per axis beyond the corners' noise, for all models: the least of them
+    per_view: Array  # (n_views,) held-out chi-square of each view, NaN if it was not used
 
 
 def error_in_space(model: StereoModel, seen: Observations) -> float:
-    """Rms distance [m] of a view's corners, triangulated, from the board where they put it best; NaN by one camera."""
+    """Rms distance [m] of a view's triangulated corners from the board fitted to them; NaN with one camera."""
     left, right = (seen[seen.camera == camera] for camera in (0, 1))
     common, a, b = np.intersect1d(left.point, right.point, return_indices=True)
     found = triangulate(np.stack([left.pixels[a], right.pixels[b]]), model.rig)
@@ -243,16 +243,16 @@ def error_in_space(model: StereoModel, seen: Observations) -> float:
 
 
 def fit_poses(problem: Problem, model: StereoModel) -> StereoModel:
-    """Poses of the target in the views of the problem's observations, everything else held."""
+    """The model with the poses of the target fitted to the problem's observations, everything else fixed."""
     nothing = problem.stereo_basis[:, :0], problem.shape_basis[..., :0]
     poses = replace(problem, stereo_basis=nothing[0], shape_basis=nothing[1], prior=None, huber=3.0)
     return minimise(poses, model, iterations=12, tolerance=NEGLIGIBLE, damping=1e-7, rough=True).model
 
 
 def candidate(refinement: Refinement, quietest: Refinement) -> TermsTried:
-    """The row of one fitted model: each view left out in turn, its own pose fitted.
+    """Cross-validation of one fitted model; in held-out views the pose is fitted.
 
-    The noise, the points that count in distances and the boards' motion are those of another fit, for all candidates.
+    Noise, points for distances and motion of the boards are those of `quietest`, the same for all candidates.
     """
     o, problem = refinement.observations, replace(refinement.problem, motion=quietest.problem.motion)
     used, sigma, views = o[refinement.kept], quietest.unexplained_sigma, np.unique(problem.observations.view)
@@ -283,7 +283,7 @@ def candidate(refinement: Refinement, quietest: Refinement) -> TermsTried:
 
 
 def is_near(row: TermsTried, best: TermsTried) -> bool:
-    """Whether a model's held-out chi-square is not clearly worse than the least."""
+    """Whether a model's held-out chi-square is not significantly worse than the best."""
     difference = row.per_view - best.per_view
     difference = difference[np.isfinite(difference)]
     error = float(np.std(difference) / np.sqrt(max(len(difference) - 1, 1)))
@@ -297,9 +297,9 @@ def choose_board(
     tried: Sequence[Terms],
     motion: BoardMotion | None = None,
 ) -> tuple[Refinement, tuple[TermsTried, ...]]:
-    """Choose what the board's shape may be: of the terms `tried`, the simplest first; one alone is taken, not chosen.
+    """Select the model of the board's shape among the terms `tried`, simplest first; a single one is used unchanged.
 
-    Returns the refinement of the chosen terms and the table of what was compared. motion : as in `refine_stereo`
+    Returns the refinement with the selected terms and the table of candidates. motion : as in `refine_stereo`
     """
     fits: list[Refinement] = []
     for terms in tried:

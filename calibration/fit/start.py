@@ -1,6 +1,6 @@
-"""Rough cameras and poses to start the refinement from: OpenCV per camera, then the pair that most views agree on.
+"""Initial guess for the refinement: each camera by OpenCV, then the relative pose on which most views agree.
 
-Lenses that are wider than the model are told from here: Brown's polynomial against OpenCV's rational one.
+Lenses too wide for the model are detected here: Brown's polynomial is compared with OpenCV's rational model.
 """
 
 from collections.abc import Sequence
@@ -11,22 +11,22 @@ from numpy.typing import NDArray
 
 from calibration.board.target import LEAST_POINTS
 from calibration.cameras.camera import CAMERA_NAMES, Camera, StereoRig, rotation_from_vector
-from calibration.fit.pairing import FLOOR, GOOD_VIEWS, MOST_TRIED, Names, Pairs, board_turns, paired, places_of
+from calibration.fit.pairing import FLOOR, GOOD_VIEWS, MOST_TRIED, Names, Pairs, board_turns, paired, poses_of
 from calibration.fit.stereo_model import Observations, StereoModel
 from calibration.kit.arrays import Array, Array32, evenly
 from calibration.kit.errors import CalibrationError
 
-MOST_K1 = 10.0  # of a lens that exists; beyond, the views do not tell of it
-WIDE = 0.8  # half the image's diagonal in focal lengths, 77 deg across: below, the polynomial describes ordinary lenses
-# Misfit of the median view, rational over polynomial. A 150 deg lens had 0.25 to 0.73, eight ordinary cameras, of 8 to
-# 20 views, 0.98 to 1.00.
+MOST_K1 = 10.0  # larger than in any real lens: above, the views do not determine it
+WIDE = 0.8  # half the image diagonal in focal lengths, 77 deg: the polynomial describes ordinary lenses below
+# Ratio of misfits of the median view, rational over polynomial: 0.25 to 0.73 for a 150 deg lens, 0.98 to 1.00 for eight
+# ordinary cameras with 8 to 20 views.
 CLEARLY = 0.85
 
 
 def for_opencv(
     observations: Observations, index: int, nominal: Array
 ) -> tuple[list[int], list[Array32], list[Array32]]:
-    """Views that a camera sees well enough, and in each the target's points and their images, as OpenCV wants them."""
+    """Views with enough points in one camera, and for each the target's points and their images in OpenCV's format."""
     mine = observations[observations.camera == index]
     seen = [(int(v), mine[mine.view == v]) for v in np.unique(mine.view)]
     seen = [(v, o) for v, o in seen if len(o) >= LEAST_POINTS]
@@ -37,15 +37,15 @@ def for_opencv(
 def start_camera(
     observations: Observations, index: int, nominal: Array, image_size: tuple[int, int]
 ) -> tuple[Camera, dict[int, tuple[Array, Array]], float]:
-    """One camera, {view: (R, t) of the board in it} and the squared misfit [px^2], by OpenCV and with k1 alone."""
+    """One camera, {view: (R, t) of the board in it} and the squared misfit [px^2], by OpenCV with k1 alone."""
     name, (views, objects, images) = CAMERA_NAMES[index], for_opencv(observations, index, nominal)
     flags = cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3
     w, h = image_size
     guess = np.array([[float(max(w, h)), 0, 0.5 * (w - 1)], [0, float(max(w, h)), 0.5 * (h - 1)], [0, 0, 1]])
     threads = cv2.getNumThreads()
-    cv2.setNumThreads(1)  # its threads add up their views as they end: the last digits would be others in every run
+    cv2.setNumThreads(1)  # the order of sums over threads is not reproducible: last digits would vary
     try:
-        # views that leave k1 open still tell of a plain camera, and the refinement knows what cameras are like
+        # views that do not determine k1 still determine a camera without it, and the refinement has priors
         for plainer in (0, cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_PRINCIPAL_POINT | cv2.CALIB_FIX_ASPECT_RATIO):
             rms, K, distortion, turns, shifts = cv2.calibrateCamera(
                 objects, images, image_size, guess.copy(), np.zeros(5), flags=flags | plainer
@@ -76,23 +76,23 @@ def start_stereo(
     names: Names,
     orders: Sequence[NDArray[np.intp]] | None = None,
 ) -> tuple[Pairs, dict[int, NDArray[np.intp]], tuple[str, ...]]:
-    """Rough cameras, how they stand to each other, and which images are pairs.
+    """Rough cameras, their relative pose, and which images are pairs.
 
-    names : (left, right) of all views; orders : in which the target looks the same; only as it is without
-    returns also : of pairs, in which order the right image shows the target's points; and notes about them
-    Raises CalibrationError where the images do not tell a camera, or are no pairs; see `pairing`.
+    names : (left, right) of all views; orders : symmetries of the target; by default the identity
+    returns also : order of the target's points in the right image of each pair; and notes about the pairs
+    Raises CalibrationError if the images do not determine a camera, or are no pairs; see `pairing`.
     """
     orders, n_views = orders or [np.arange(len(nominal))], len(names)
     begun = [start_camera(observations, index, nominal, size) for index, size in enumerate(image_sizes)]
     cameras, poses, _ = zip(*begun, strict=True)
     sides = [observations[observations.camera == index] for index in (0, 1)]
-    places = [places_of(seen, o, nominal, camera) for o, (camera, seen, _) in zip(sides, begun, strict=True)]
+    places = [poses_of(seen, o, nominal, camera) for o, (camera, seen, _) in zip(sides, begun, strict=True)]
     floor = FLOOR * max(max(size) for size in image_sizes)
     pairs, notes = paired((places[0], places[1]), (list(poses[0]), list(poses[1])), nominal, len(orders), floor, names)
     both = [v for v in poses[0] if v in poses[1]]
     R_pair, t_pair = pairs.R_right_left, pairs.t_right_left
     between, distance = (float(np.median(np.linalg.norm(t, axis=-1))) for t in (t_pair, [poses[0][v][1] for v in both]))
-    if between < FLOOR * distance:  # rays that meet at 0.06 deg tell no distance
+    if between < FLOOR * distance:  # rays with a convergence of 0.06 deg determine no distance
         raise CalibrationError(
             f"the left and the right images show the board from one place (the cameras would stand {1e3 * between:.2g} "
             f"mm apart, the board {1e3 * distance:.3g} mm away): do both patterns name the images of one camera?"
@@ -112,9 +112,9 @@ def start_stereo(
 
 
 def too_wide(observations: Observations, nominal: Array, cameras: tuple[Camera, Camera]) -> tuple[tuple[str, str], ...]:
-    """What is to be said, and by what, of every lens that the rational model describes far better than a polynomial.
+    """Warnings, with their evidence, about lenses that the rational model describes far better than the polynomial.
 
-    nominal : (n, 3) [m] the target's points as declared; cameras : as they start the refinement
+    nominal : (n, 3) [m] the declared points of the target; cameras : initial guess of the refinement
     """
     found = []
     for index, camera in enumerate(cameras):

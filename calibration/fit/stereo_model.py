@@ -1,4 +1,4 @@
-"""What predicts the image of a flat target in two cameras: parameters, observations, derivatives."""
+"""Model of the images of a flat target in two cameras: parameters, observations, derivatives."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ N_STEREO = PAIR_SHIFT.stop  # left and right intrinsics, rotation and translatio
 @checked
 @dataclass(frozen=True)
 class Observations:
-    """Image points of target points, flat over everything that was seen."""
+    """Image points of target points of all views and cameras, in flat arrays."""
 
     view: NDArray[np.intp]  # (m,) 0..n_views-1
     camera: NDArray[np.intp]  # (m,) 0 left, 1 right
@@ -54,22 +54,22 @@ class Observations:
 
 @dataclass(frozen=True)
 class StereoModel:
-    """Everything that predicts where the target's points appear."""
+    """All parameters that predict the images of the target's points."""
 
-    rig: StereoRig  # the cameras; its world is the left one's axes
+    rig: StereoRig  # the cameras; world axes are those of the left one
     R_left_board: Array  # (n_views, 2, 3, 3) of the board at each camera's exposure, in the left camera's axes
     t_left_board: Array  # (n_views, 2, 3) [m]
     points: Array  # (n, 3) target points in board axes [m], as refined
 
     @property
     def apart(self) -> Mask:
-        """(n_views,) whose images show the board each at a place of its own."""
+        """(n_views,) views whose two images have different poses of the board."""
         return np.asarray(np.ptp(self.t_left_board, axis=1).any(axis=1), bool)
 
 
 @dataclass(frozen=True)
 class Terms:
-    """What the refinement may change."""
+    """Free parameters of the refinement."""
 
     distortion: str = RICHEST  # one of DISTORTION_MODELS, the same for both cameras
     board: str = "flat"  # one of BOARD_MODELS
@@ -84,7 +84,7 @@ class Terms:
 
     @property
     def free(self) -> Mask:
-        """(24,) of intrinsics and stereo pose."""
+        """(24,) which of intrinsics and stereo pose are free."""
         free = {*INTRINSIC_PARAMETERS[:4], *self.distortion.split()}
         own = np.array([name in free for name in INTRINSIC_PARAMETERS])
         return np.concatenate([own, own, np.ones(6, bool)])
@@ -97,11 +97,11 @@ class Terms:
 def board_basis(nominal: Array, board: str) -> Array:
     """(n, 3, n_shape): displacement of the target's points [m] per unit of each shape parameter [m].
 
-    flat: none. warped: out of the plane as x^2, x y, y^2 over the half size, and in it longer along one side or
-    sheared, as a print that the paper's feed has drawn out. free: every coordinate of every point.
-    Shift, turn and scale of the target as a whole are taken out: no image can tell them from a changed pose and
-    baseline. So the mean plane stays the declared one, and the size the likeliest: of sides that are off by equal and
-    opposite parts, since each was made as well as the other.
+    flat: none. warped: out of the plane as x^2, x y, y^2 over the half size; in the plane stretch of one side against
+    the other, and shear, as of a print stretched by the paper feed. free: every coordinate of every point.
+    Shift, rotation and scale of the whole target are excluded: they are equivalent to another pose and baseline. So the
+    mean plane is the declared one, and errors of the two sides are equal and opposite, the most likely size if both
+    were made equally well.
     """
     n = len(nominal)
     if board == "flat":
@@ -125,7 +125,7 @@ def board_basis(nominal: Array, board: str) -> Array:
 
 
 def predict_pixels(model: StereoModel, observations: Observations) -> Array:
-    """Pixels (m, 2) alone."""
+    """Pixels (m, 2) without derivatives."""
     return predict(model, observations)[0]
 
 
@@ -153,7 +153,7 @@ def moved(model: StereoModel, stereo: Array, poses: Array, displacement: Array) 
 
 
 def restricted(model: StereoModel, nominal: Array, terms: Terms) -> StereoModel:
-    """The model with the terms that are not free put to zero: distortion, deviation of the board, fx - fy."""
+    """The model with terms that are not free set to zero: distortion, deformation of the board, fx - fy."""
     basis = board_basis(nominal, terms.board).reshape(nominal.size, -1)
     shape = np.linalg.pinv(basis) @ (model.points - nominal).reshape(-1)
     held = np.zeros(N_RIG)

@@ -22,7 +22,7 @@ import numpy as np
 from calibration.board.target import LEAST_POINTS
 from calibration.cameras.camera import CAMERA_NAMES
 from calibration.fit.board_motion import LEAST, BoardMotion, motions
-from calibration.fit.pairing import MIN_VIEWS, TOO_FAR, Names, Pairs, apart, places_of, rotation_vectors, told_by
+from calibration.fit.pairing import MIN_VIEWS, TOO_FAR, Names, Pairs, apart, poses_of, relative_poses, rotation_vectors
 from calibration.fit.refinement import Refinement, fit_poses
 from calibration.fit.start import start_camera
 from calibration.fit.stereo_model import Observations, predict, predict_pixels
@@ -216,11 +216,11 @@ def compared(observations: Observations, pairs: Pairs, table_view: int | None, f
         mine = observations[observations.camera == index]
         poses = zip(R @ model.R_left_board[views, index], model.t_left_board[views, index] @ R.T + t, strict=True)
         sides.append(
-            places_of(dict(zip(views.tolist(), poses, strict=True)), mine, model.points, model.rig.cameras[index])
+            poses_of(dict(zip(views.tolist(), poses, strict=True)), mine, model.points, model.rig.cameras[index])
         )
     tells = np.all([np.isfinite(side.covariance).all(axis=(1, 2)) for side in sides], axis=0)
     views, (left, right) = views[tells], (side[tells] for side in sides)
-    R, t = told_by(left, right)
+    R, t = relative_poses(left, right)
     between = apart(left, right, R, t)
     between = 0.5 * (between + between.T)
     np.fill_diagonal(between, np.nan)

@@ -129,8 +129,8 @@ def test_boards_that_were_held_still_count_for_more_than_those_that_moved():
     still, moving = (moved_boards.pairs(rig, 6, seed, shift=size, turn=size) for seed, size in ((1, 0.0), (2, 2e-3)))
     left, right = (np.concatenate(both) for both in zip(still, moving, strict=True))
     found = calibrated_from(left, right)
-    heeded = found.refinement.problem.motion.heeded
-    assert heeded[:6].min() > 1.5 * heeded[6:].max()
+    pair_weights = found.refinement.problem.motion.pair_weights
+    assert pair_weights[:6].min() > 1.5 * pair_weights[6:].max()
     error, C = errors(found, rig)
     # the six still pairs alone
     alone, _ = errors(calibrated_from(left[:6], right[:6]), rig)
