@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from calibration.kit.public import imported_when_used
 
-# The physics needs the camera model and the errors, not the image library behind the others.
+# The physics imports the camera model and the errors without the image library of the others.
 if TYPE_CHECKING:
     from calibration.board.chessboard import BoardNotFound as BoardNotFound
     from calibration.board.chessboard import CornerView as CornerView

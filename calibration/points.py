@@ -1,4 +1,4 @@
-"""Calibration from corners that another program located: points and one sigma."""
+"""Calibration from corners located by another program, with one sigma for all."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -13,8 +13,8 @@ from calibration.kit.arguments import Thickness, checked
 from calibration.kit.errors import CalibrationError
 from calibration.stereo import CalibrationSettings, StereoCalibration, calibrate_from_corners
 
-LARGEST_SQUARE = 0.5  # m: beyond, millimetres were given for metres
-OVERSTATED = 0.7  # times the declared sigma: corners that scatter by less were declared worse than they are
+LARGEST_SQUARE = 0.5  # m: above, the value was given in millimetres
+OVERSTATED = 0.7  # scatter of corners over the declared sigma, below which the sigma is too large
 _NOT_SEEN = BoardNotFound("no corners were given")
 
 
@@ -29,15 +29,15 @@ def calibrate_from_points(
     table_view: int | None = None,
     board_thickness: Thickness = 0.0,
 ) -> StereoCalibration:
-    """Calibrate a stereo pair from corners located elsewhere, item i of both lists from the same place of the board.
+    """Calibrate a stereo pair from corners located elsewhere; items i of both lists show the board in the same place.
 
     left, right : per view (n, 2) [px] in the order of `Board.points`, pixel (0, 0) the centre of the top-left pixel;
-        None where the camera did not see the board
+        None if the camera did not see the board
     image_size : (width, height) [px] of both cameras, or of each
-    sigma_px : standard deviation of a corner per axis; what the residuals show beyond it is found and added, and a
-        warning tells where they show less
+    sigma_px : standard deviation of a corner per axis; further noise is estimated from the residuals and added; a
+        warning is given if the residuals are smaller
 
-    Raises CalibrationError that names camera, view and corner of what cannot be right.
+    Raises CalibrationError that names camera, view and corner of invalid data.
     """
     if len(left) != len(right):
         raise CalibrationError(f"{len(left)} left and {len(right)} right views: give None where a camera saw no board")

@@ -1,4 +1,4 @@
-"""Rig files: HDF5 that explains itself, with the corners it came from: it can be judged and redone years later."""
+"""Rig files: self-describing HDF5 with the corners used, so that a calibration can be checked and repeated later."""
 
 import contextlib
 import io
@@ -33,13 +33,13 @@ from calibration.stereo import StereoCalibration
 
 SCHEMA = "disctrack stereo rig"
 SCHEMA_VERSION = 1
-MAX_VALUES = 50_000_000  # of one dataset: beyond, the file is not a rig whatever it says
+MAX_VALUES = 50_000_000  # of one dataset: with more, the file is no rig
 
 
 class Dataset(NamedTuple):
-    """What a dataset of a rig file holds."""
+    """Description of a dataset of a rig file."""
 
-    shape: tuple[int | str, ...]  # a name is a size that the file itself tells
+    shape: tuple[int | str, ...]  # a name is a size that is read from the file
     units: str = ""
     description: str = ""
     kind: str = "f"  # of its values, as NumPy abbreviates it
@@ -71,7 +71,7 @@ _BESIDE_CAMERAS = {
     ),
     "lens_field_spacing": Dataset((), "px", "of the splines' grid"),
 }
-_SELDOM = ("allowances", "lens_field", "lens_field_spacing")  # of these, what not every rig has
+_SELDOM = ("allowances", "lens_field", "lens_field_spacing")  # those that are optional
 _OF_RECORD = {
     "board_points": Dataset(("points", 3), "m", "target points in board axes as refined"),
     "board_thickness": Dataset((), "m", "from the table to the printed face"),
@@ -94,14 +94,14 @@ _LONG = {  # of these, what is a dataset, as an attribute has 64 kB at most
     "rejected_corners": "JSON list of view, camera, corner, reason",
     "board": "JSON object: kind of target and its fields, lengths in m",
 }
-# What a rig file holds beside the rig, where it comes from, by its names there: the arrays of `_OF_RECORD`, what is in
-# JSON, and `table_view`, None without one. Observations are all located corners that were offered to the refinement;
-# those of the right images of views `apart` refer to places of the board n_views + 0, 1, ...
+# The origin of a rig, by its names in a rig file: the arrays of `_OF_RECORD`, entries in JSON, and `table_view`, None
+# without one. Observations are all located corners, including the rejected ones; those of the right images of views
+# `apart` refer to board poses n_views + 0, 1, ...
 Record = dict[str, Any]
 
 
 def record_of(calibration: StereoCalibration) -> Record:
-    """What is worth keeping of a calibration, without the images."""
+    """The record of a calibration, without the images."""
     r = calibration.refinement
     tried = ("n_parameters", "rms_px", "held_out_rms_px", "held_out_chi_square", "noise_px")
     figures = {
@@ -118,11 +118,11 @@ def record_of(calibration: StereoCalibration) -> Record:
         "assessment": asdict(calibration.assessment),
     }
     model, seen = r.model, r.observations
-    apart = np.flatnonzero(model.apart)  # the right images' places come behind those of the views
+    apart = np.flatnonzero(model.apart)  # poses of the right images follow those of the views
     place = np.arange(len(model.apart))
     place[apart] = len(place) + np.arange(len(apart))
     R, t = (np.concatenate([of[:, 0], of[apart, 1]]) for of in (model.R_left_board, model.t_left_board))
-    told = {
+    document = {
         "settings": asdict(calibration.settings),
         "figures": figures,
         "versions": versions(("disctrack", "numpy", "scipy", "opencv-contrib-python-headless", "numba", "h5py")),
@@ -132,7 +132,7 @@ def record_of(calibration: StereoCalibration) -> Record:
         "apart": apart.tolist(),
     }
     return {
-        **json.loads(json.dumps(told, default=lambda o: o.item() if hasattr(o, "item") else str(o))),
+        **json.loads(json.dumps(document, default=lambda o: o.item() if hasattr(o, "item") else str(o))),
         **vars(seen),
         **{name: getattr(calibration, name) for name in ("board_points", "table_view", "board_thickness")},
         "pixels_covariance": seen.covariance,
@@ -146,7 +146,7 @@ def record_of(calibration: StereoCalibration) -> Record:
 
 
 def versions(packages: Sequence[str]) -> dict[str, str]:
-    """Those of packages that are installed."""
+    """Versions of those packages that are installed."""
     found = {}
     for name in packages:
         with contextlib.suppress(metadata.PackageNotFoundError):
@@ -159,7 +159,7 @@ def versions(packages: Sequence[str]) -> dict[str, str]:
 
 @checked
 def write_rig(path: str | os.PathLike[str], content: StereoRig | StereoCalibration) -> None:
-    """Write a rig file: whole or not at all (a temporary file beside it, fsync, rename).
+    """Write a rig file, completely or not at all (by a temporary file in its folder, fsync, rename).
 
     Raises RigFileError if it cannot be written.
 
@@ -182,9 +182,9 @@ def write_rig(path: str | os.PathLike[str], content: StereoRig | StereoCalibrati
 
 
 def rig_bytes(content: StereoRig | StereoCalibration, attributes: Mapping[str, Any] = {}) -> memoryview:
-    """A rig file, made in memory: the HDF5 library crashes where a disk is full.
+    """A rig file in memory, as the HDF5 library crashes if a disk is full.
 
-    attributes : of the root, beside its own
+    attributes : of the root, in addition to its own
     """
     buffer = io.BytesIO()
     with h5py.File(buffer, "w") as file:
@@ -210,7 +210,7 @@ def put_array(group: h5py.Group, name: str, value: Any, row: Dataset) -> None:
 
 
 def write_rig_group(group: h5py.Group, rig: StereoRig) -> None:
-    """A rig as datasets of an HDF5 group. (A trajectory file holds the same numbers with labelled axes.)"""
+    """Write a rig as datasets of an HDF5 group. (A trajectory file has the same numbers with labelled axes.)"""
     group.attrs["world"] = "table, k up" if rig.world_is_table else "axes of the left camera"
     group.attrs["world_is_table"] = int(rig.world_is_table)
     for name, camera in zip(CAMERA_NAMES, rig.cameras, strict=True):
@@ -222,7 +222,7 @@ def write_rig_group(group: h5py.Group, rig: StereoRig) -> None:
 
 
 def beside_cameras(rig: StereoRig) -> dict[str, tuple[Any, Dataset, dict[str, str]]]:
-    """What a rig has beside its cameras: by name of the dataset its values, what they are, attributes.
+    """Everything in a rig except its cameras: name of the dataset -> values, description, attributes.
 
     `read_beside_cameras` reads it from any group.
     """
@@ -238,9 +238,9 @@ def beside_cameras(rig: StereoRig) -> dict[str, tuple[Any, Dataset, dict[str, st
 
 
 def write_attributes(group: h5py.Group, document: Mapping[str, Any]) -> None:
-    """A document as HDF5 has it: numbers, texts and lists of them (texts a line each) as attributes, objects as groups.
+    """A document in HDF5: numbers, texts and lists of them (texts one per line) as attributes, objects as groups.
 
-    What HDF5 has no attribute for, a list of objects or nothing at all, is left out.
+    Lists of objects and None, which are not possible as attributes, are left out.
     """
     for key, value in document.items():
         name = str(key).replace("/", "|")
@@ -283,7 +283,7 @@ def read_rig(path: str | os.PathLike[str]) -> StereoRig:
 
 
 def read_rig_file(path: str | os.PathLike[str]) -> tuple[StereoRig, Record | None]:
-    """The rig, and where it comes from; None of one that was imported without its corners.
+    """The rig and its record, which is None if the rig was imported without corners.
 
     Raises RigFileError if the file is missing, damaged or something else.
     """
@@ -296,9 +296,9 @@ def read_rig_file(path: str | os.PathLike[str]) -> tuple[StereoRig, Record | Non
 def complete_file(
     path: Path, kind: str, schema: str, version: int, command: str, raised: type[Exception]
 ) -> Iterator[h5py.File]:
-    """A sealed HDF5 file of ours, open for reading; whatever is wrong with it is `raised` with its name.
+    """A sealed HDF5 file of the packages, open for reading; all problems are `raised` with its name.
 
-    kind, schema, version : what it must be;  command : of disctrack, that makes one
+    kind, schema, version : required values;  command : of disctrack, which writes such files
     """
     if not path.is_file():
         raise raised(f"{path}: no such {kind} file; `disctrack {command}` makes one")
@@ -315,7 +315,7 @@ def complete_file(
             yield file
     except raised as error:
         raise raised(f"{path}: {error}") from error
-    except Exception as error:  # the HDF5 library raises many kinds on damaged files
+    except Exception as error:  # the HDF5 library raises many kinds of errors for damaged files
         reason = " ".join(str(error).split())[:200]
         raise raised(
             f"{path}: cannot be read as a {kind} file ({type(error).__name__}: {reason}): damaged, cut short or "
@@ -324,7 +324,7 @@ def complete_file(
 
 
 def _get(group: h5py.Group, name: str, row: Dataset, sizes: Mapping[str, int] | None = None) -> NDArray:
-    """A dataset after a look at its shape and kind, so that no hostile size is ever read; unknown sizes are free."""
+    """A dataset, read after a check of its shape and kind against excessive sizes; unknown sizes are free."""
     if name not in group:
         raise RigFileError(f"{group.name}/{name} is missing; present: {', '.join(group)}")
     dataset = group[name]
@@ -341,16 +341,16 @@ def _get(group: h5py.Group, name: str, row: Dataset, sizes: Mapping[str, int] | 
 
 
 def read_rig_group(group: h5py.Group) -> StereoRig:
-    """Inverse of `write_rig_group`. Raises RigFileError on content that is not a rig."""
+    """Inverse of `write_rig_group`. Raises RigFileError if the content is not a rig."""
     return read_beside_cameras(
         group, [[_get(group, f"{name}_{what}", row) for what, row in _OF_CAMERA.items()] for name in CAMERA_NAMES]
     )
 
 
 def read_beside_cameras(group: h5py.Group, of_cameras: Iterable[Sequence[NDArray]]) -> StereoRig:
-    """A rig whose group has all that `beside_cameras` names; of_cameras : parameters and image size of each.
+    """A rig from a group with the datasets of `beside_cameras`; of_cameras : parameters and image size of each.
 
-    Raises RigFileError on content that is not a rig.
+    Raises RigFileError if the content is not a rig.
     """
     cameras = []
     for name, (parameters, (width, height)) in zip(CAMERA_NAMES, of_cameras, strict=True):

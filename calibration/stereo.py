@@ -16,7 +16,7 @@ from calibration.fit.refinement import Refinement, TermsTried
 from calibration.fit.start import start_stereo, too_wide
 from calibration.fit.stereo_model import BOARD_MODELS, RICHEST, Observations, Terms
 from calibration.judge.assessment import Assessment, assess, stereo_covariance
-from calibration.judge.pairs import compared, motion_between_exposures, moved_told, zoomed
+from calibration.judge.pairs import camera_moved, compared, motion_between_exposures, zoomed
 from calibration.judge.tolerances import (
     BoardShape,
     BoardTolerances,
@@ -34,30 +34,30 @@ from calibration.kit.stuck_pixels import repaired_views
 from calibration.kit.threads import one_blas_thread
 from calibration.stereo_fit import JointFit, fit_jointly
 
-LEAST_SEEN = 12  # images of every point of the target, to free its place: from three pairs alone it fits their errors
-Image = tuple[str, str]  # the name of one that is not used, and why
+LEAST_SEEN = 12  # images of every point of the target, to refine its position: with few pairs it would fit their errors
+Image = tuple[str, str]  # name of an unused image, and the reason
 
 
 @checked
 @dataclass(frozen=True)
 class CalibrationSettings:
-    """What the user may decide."""
+    """Options of a calibration."""
 
     distortion: str = "auto"  # all terms, with priors; or one of stereo_model.DISTORTION_MODELS
-    board: str = "auto"  # decided by held-out error; or one of stereo_model.BOARD_MODELS
+    board: str = "auto"  # selected by held-out error; or one of stereo_model.BOARD_MODELS
     tolerances: BoardTolerances = field(default_factory=BoardTolerances)
 
     def __post_init__(self) -> None:
         free = RICHEST if self.distortion == "auto" else self.distortion
-        Terms(free, "flat" if self.board == "auto" else self.board)  # raises CalibrationError on what it does not know
+        Terms(free, "flat" if self.board == "auto" else self.board)  # raises CalibrationError for unknown names
 
 
 @dataclass(frozen=True, repr=False)
 class StereoCalibration(Brief):
-    """A calibrated rig and everything needed to judge it, or to do it again without the images."""
+    """A calibrated rig and all data needed to assess it, or to repeat the calibration without the images."""
 
     rig: StereoRig  # with covariance (30, 30)
-    refinement: Refinement  # observations, residuals, what was kept
+    refinement: Refinement  # observations, residuals, which were kept
     board: Target
     settings: CalibrationSettings
     table_view: int | None
@@ -67,11 +67,11 @@ class StereoCalibration(Brief):
     candidates: tuple[TermsTried, ...]  # cross-validation table; the chosen terms are refinement.terms
     assessment: Assessment
     warnings: tuple[str, ...] = field(default=())
-    doubts: tuple[str, ...] = ()  # what may make the rig wrong by more than its sigmas
-    apart: tuple[int, ...] = ()  # views whose two images are not taken for one place of the board
+    doubts: tuple[str, ...] = ()  # reasons for which errors of the rig may exceed its sigmas
+    apart: tuple[int, ...] = ()  # views whose two images are used separately
 
     def facts(self) -> dict[str, str]:
-        """What a glance should tell (`Brief`)."""
+        """Main results (`Brief`)."""
         used = len(self.view_names) - len(self.rejected_views)
         return {
             "views": f"{used} of {len(self.view_names)}",
@@ -82,8 +82,8 @@ class StereoCalibration(Brief):
 
     @property
     def rejected_views(self) -> dict[int, str]:
-        """View -> why none of its two images is used."""
-        return {v: _told(images) for v, images in _not_used(self.corner_views, self.view_names).items()}
+        """View -> why neither of its two images is used."""
+        return {v: _with_reasons(images) for v, images in _not_used(self.corner_views, self.view_names).items()}
 
     @property
     def reasons(self) -> dict[str, list[str]]:
@@ -93,7 +93,7 @@ class StereoCalibration(Brief):
 
     @property
     def board_points(self) -> Array:
-        """(n, 3) [m] as refined; the declared ones where the board is taken as flat."""
+        """(n, 3) [m] as refined; the declared ones if the board is assumed to be flat."""
         return self.refinement.model.points
 
     @property
@@ -108,13 +108,13 @@ class StereoCalibration(Brief):
 
     @property
     def rms_per_view_px(self) -> Array:
-        """(n_views, 2 cameras) [px]; NaN where a view was not used."""
+        """(n_views, 2 cameras) [px]; NaN if a view was not used."""
         image = 2 * self.refinement.observations.view + self.refinement.observations.camera
         return np.array([self.refinement.rms(image == i) for i in range(2 * len(self.view_names))]).reshape(-1, 2)
 
     @property
     def lens_rms_px(self) -> tuple[float, ...]:
-        """Root mean square per axis of the lens field of each camera, where corners are used; () without one."""
+        """Root mean square per axis of the lens field of each camera, at the used corners; () without one."""
         field, r = self.rig.lens_field, self.refinement
         pixels = [r.observations.pixels[r.kept & (r.observations.camera == c)] for c in range(len(CAMERA_NAMES))]
         moved = [field.displacement(seen, c) for c, seen in enumerate(pixels)] if field else []
@@ -127,7 +127,7 @@ class StereoCalibration(Brief):
             for v, view in enumerate(views):
                 if isinstance(view, CornerView):
                     found = np.flatnonzero(~view.accepted & [reason != "" for reason in view.reasons])
-                    rejected += [(v, camera, int(i), view.reasons[i]) for i in found]  # without one: not in view
+                    rejected += [(v, camera, int(i), view.reasons[i]) for i in found]  # no reason: not in view
         r, o = self.refinement, self.refinement.observations
         for i in np.flatnonzero(~r.kept):
             distance = float(np.linalg.norm(r.residuals[i]))
@@ -148,15 +148,15 @@ def calibrate_stereo(
     names: Sequence[tuple[str, str]] | None = None,
     progress: Progress | None = None,
 ) -> StereoCalibration:
-    """Calibrate from images; image i of the left and of the right show the board in the same place.
+    """Calibrate from images; images i of the left and of the right camera show the board in the same place.
 
     left_images, right_images : grey or colour images as OpenCV reads them unchanged, 8 or 16 bit
-    table_view : index of the view whose board lies flat on the table; None leaves the left camera's axes as the world
+    table_view : index of the view whose board lies flat on the table; None: world axes are those of the left camera
     board_thickness : [m] from the table to the printed face
     names : (left, right) name of every view, for messages
     progress : called as progress(stage, done, total)
 
-    Raises CalibrationError when the views do not allow a calibration; single bad views are left out with a reason.
+    Raises CalibrationError if the views do not allow a calibration; single bad views are left out with a reason.
     """
     if len(left_images) != len(right_images):
         raise CalibrationError(
@@ -191,7 +191,7 @@ def check_sizes(left: Sequence[NDArray], right: Sequence[NDArray], names: Sequen
 
 @contextmanager
 def _determined() -> Iterator[None]:
-    """A singular problem is an error that says what to do."""
+    """Turn the error of a singular problem into a CalibrationError that says what to do."""
     try:
         yield
     except np.linalg.LinAlgError as error:
@@ -212,7 +212,7 @@ def calibrate_from_corners(
     board_thickness: Thickness = 0.0,
     names: Sequence[tuple[str, str]] | None = None,
 ) -> StereoCalibration:
-    """`calibrate_stereo` from corners that were located before."""
+    """`calibrate_stereo` from located corners."""
     settings = settings or CalibrationSettings()
     names = tuple(names or [(f"left {i}", f"right {i}") for i in range(len(left_views))])
     views = (list(left_views), list(right_views))
@@ -228,13 +228,13 @@ def calibrate_from_corners(
                 views[camera][v] = BoardNotFound(why)
         return calibrate_from_corners(*views, board, settings, table_view, board_thickness, names)
     seen = np.bincount(observations.point, minlength=len(board.points))
-    shapes = BOARD_MODELS if seen.min() >= LEAST_SEEN else BOARD_MODELS[:-1]  # the points tell a place each, or not
+    shapes = BOARD_MODELS if seen.min() >= LEAST_SEEN else BOARD_MODELS[:-1]  # without free points if too few
     distortion = RICHEST if settings.distortion == "auto" else settings.distortion
     tried = [Terms(distortion, shape) for shape in (shapes if settings.board == "auto" else (settings.board,))]
     fit = fit_jointly(observations, start, board.points, tried, table_view)
     for (v, camera), why in fit.pairs.bad_images.items():
         views[camera][v] = BoardNotFound(why)
-    apart = _told_apart(fit, names, table_view)
+    apart = _warnings_of_pairs(fit, names, table_view)
     _require_fitted(fit, _not_used(views, names), apart, wide, table_view)
     rig, assessment, shape_note = _judged(fit, board, shapes, settings, table_view, board_thickness, wide)
     return StereoCalibration(
@@ -254,9 +254,9 @@ def calibrate_from_corners(
 
 
 def _begin(views: Views, board: Target, names: Names) -> tuple[Pairs, list[str]]:
-    """Rough cameras and poses, and what is to be said of the pairs.
+    """Rough cameras and poses, and notes about the pairs.
 
-    A board that looks the same after a turn gets one order of its corners in both cameras, in place.
+    For a symmetric board, the order of corners in the right views is changed, in place, to that of the left ones.
     """
     sizes = tuple(next(v.image_size for v in side if isinstance(v, CornerView)) for side in views)
     start, orders, notes = start_stereo(_observations(views), board.points, (sizes[0], sizes[1]), names, board.orders)
@@ -277,9 +277,9 @@ def _judged(
     board_thickness: float,
     wide: Sequence[tuple[str, str]],
 ) -> tuple[StereoRig, Assessment, list[str]]:
-    """The rig with its covariance, how good it is, and a warning if the board's shape is not the one taken.
+    """The rig with its covariance, its assessment, and a warning if the board has another shape than the refined one.
 
-    shapes : that the board's points tell
+    shapes : board models that the views determine
     """
     refinement, note = fit.refinement, []
     inflation = max(refinement.disagreement, 1.0)
@@ -288,7 +288,7 @@ def _judged(
     covariance = stereo_covariance(refinement, moved and moved[1])
     if refinement.terms.board in shapes:
         left_out, sigmas = shape_left_out(refinement, board.points, shapes, inflation)
-        covariance, note = covariance + left_out, [_not_as_told(settings.board, shape, sigmas)] if sigmas > 1.0 else []
+        covariance, note = covariance + left_out, [_other_shape(settings.board, shape, sigmas)] if sigmas > 1.0 else []
     origin = on_the_table(board.points, shape)
     rig = rig_with_covariance(refinement, table_view, board_thickness, inflation, covariance, origin)
     rig = replace(rig, lens_field=fit.lens_field)
@@ -305,9 +305,9 @@ def _require_fitted(
     wide: Sequence[tuple[str, str]],
     table_view: int | None,
 ) -> None:
-    """Raises CalibrationError where the table view is lost, or too few views are left."""
+    """Raises CalibrationError if the table view cannot be used, or too few views can."""
     if table_view is not None and (table_view in not_used or table_view in fit.pairs.apart):
-        reason = _told(not_used[table_view]) if table_view in not_used else apart[0]
+        reason = _with_reasons(not_used[table_view]) if table_view in not_used else apart[0]
         raise CalibrationError(
             f"the table view {table_view} cannot be used ({reason}): without it there is no lab frame. Name another "
             "view whose board lies flat on the table, or take it again."
@@ -337,7 +337,7 @@ def _not_used(views: tuple[Sequence[CornerView | BoardNotFound], ...], names: Na
 
 
 def _used_alone(views: Views, names: Names) -> list[str]:
-    """Warnings about views that only one camera can use, and what was noted of images."""
+    """Warnings about views that only one camera can use, and notes about images."""
     alone = _by_reason(image for images in _lost(views, names) if len(images) == 1 for image in images)
     warnings = [
         f"{', '.join(which)}: left out, the other image of the pair is used for its own camera: {reason}"
@@ -368,12 +368,12 @@ def _by_reason(images: Iterable[Image]) -> dict[str, list[str]]:
     return found
 
 
-def _told(images: Iterable[Image]) -> str:
+def _with_reasons(images: Iterable[Image]) -> str:
     return "; ".join(f"{' and '.join(which)}: {reason}" for reason, which in _by_reason(images).items())
 
 
 def _listed(images: Iterable[Image]) -> str:
-    """Each reason once, with the first image that it holds for; three reasons at most."""
+    """Each reason once, with the first image that has it; three reasons at most."""
     reasons = _by_reason(images)
     shown = [
         f"{which[0]}{f' and {len(which) - 1} more' if len(which) > 1 else ''}: {reason}"
@@ -402,24 +402,24 @@ def _choice_of_origin(board: Target) -> str:
     )
 
 
-def _told_apart(fit: JointFit, names: Names, table_view: int | None) -> list[str]:
-    """Warnings about pairs whose images are used each for its own camera."""
-    told = [moved_told(fit.pairs, names, table_view)] if fit.pairs.steps else []
+def _warnings_of_pairs(fit: JointFit, names: Names, table_view: int | None) -> list[str]:
+    """Warnings about pairs whose images are used separately, each for its own camera."""
+    moved = [camera_moved(fit.pairs, names, table_view)] if fit.pairs.steps else []
     apart = {v: why for v, why in fit.pairs.odd.items() if v not in fit.pairs.others}
     if not apart:
-        return told
+        return moved
     shown = [f"{names[v][0]} and {names[v][1]} ({why})" for v, why in list(apart.items())[:3]]
     more = f" and {len(apart) - 3} more" if len(apart) > 3 else ""
     return [
-        *told,
+        *moved,
         f"{'; '.join(shown)}{more}: the two images do not show the board in one place: it moved between the "
         "exposures, or they are not a pair. Each image is used for its own camera, none of them for how the cameras "
         "stand to each other",
     ]
 
 
-def _not_as_told(board: str, shape: BoardShape, sigmas: float) -> str:
-    """A warning about a board that has another shape than the refinement gave it."""
+def _other_shape(board: str, shape: BoardShape, sigmas: float) -> str:
+    """A warning about a board that has another shape than the refined one."""
     taken, do = (
         (f"{board}, requested,", ": leave its shape to the views (board auto)") if board != "auto" else ("simple", "")
     )

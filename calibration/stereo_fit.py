@@ -1,4 +1,4 @@
-"""The rounds of a joint fit of both cameras: the board's shape, which images are pairs, what moved, the lenses."""
+"""Stages of the joint fit of both cameras: board shape, selection of pairs, motion of the board, lens field."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -15,11 +15,11 @@ from calibration.kit.arrays import Array
 
 @dataclass(frozen=True)
 class JointFit:
-    """What `fit_jointly` arrives at."""
+    """Result of `fit_jointly`."""
 
-    refinement: Refinement  # of observations that the field of the lenses has corrected, where there is one
+    refinement: Refinement  # of the observations, corrected by the lens field if there is one
     lens_field: LensField | None
-    candidates: tuple[TermsTried, ...]  # of which its terms were chosen
+    candidates: tuple[TermsTried, ...]  # among which its terms were selected
     pairs: Pairs
     motion: PairMotion | None  # of the boards between the exposures
 
@@ -31,20 +31,20 @@ def fit_jointly(
     tried: Sequence[Terms],
     table_view: int | None,
 ) -> JointFit:
-    """Refine, judge the pairs by what is refined, and refine again; then see whether boards moved, or lenses bend.
+    """Refine, test the pairs with the result, and refine again; then estimate motion of boards and the lens field.
 
-    start : by rough cameras: that one was moved is seen best by those that no pair has pulled yet
-    tried : terms with the board's shapes to choose of, simplest first
-    table_view : where a camera was moved, the cameras' places are those at it
+    start : from rough cameras, which are best to detect that a camera was moved, as no pair has biased them
+    tried : terms with candidate board shapes, simplest first
+    table_view : determines the stereo pose if a camera was moved
     """
-    # rough poses may be degrees off: refined cameras judge those anew that do not agree
+    # rough poses may be wrong by degrees: odd pairs are tested again with refined cameras
     used = replace(start, odd={}) if start.steps else start
 
     def refined(by: Pairs, motion: BoardMotion | None = None) -> tuple[Refinement, tuple[TermsTried, ...]]:
         return choose_board(observations, by.joined(observations), nominal, tried, motion)
 
     refinement, candidates = refined(used)
-    # once: it is by a place of the board for each image, and finds as many by cameras that no bad pair pulls any more
+    # once is enough: images have separate poses of the board, and cameras without bad pairs give the same result
     pairs = judge_pairs(observations, refinement, table_view)
     if pairs.apart != used.apart or pairs.bad_images:
         for view, camera in pairs.bad_images:
@@ -55,7 +55,7 @@ def fit_jointly(
     motion = found and found[0]
     likely = motion is not None and motion.is_likely
     if found is not None and motion is not None and likely and field is not None:
-        # a field puts boards elsewhere for each camera, too, and what is left of it does: by the scatter before it
+        # an (incomplete) lens field moves boards differently in each camera, too: use the scatter before it
         left, _ = motion_between_exposures(corrected) or found
         motion = replace(left, scatter=max(motion.scatter, left.scatter))
         likely = motion.is_seen

@@ -122,7 +122,7 @@ def normalise(pixels: Array, camera: Camera) -> Array:
             step_a, step_b = (yd_b * rx - xd_b * ry) * inverse, (xd_a * ry - xd_b * rx) * inverse
             a, b = a + step_a, b + step_b
             px2 = camera.fx * camera.fy * (step_a * step_a + step_b * step_b)
-            if np.fmax.reduce(px2, axis=None, initial=0.0) < NEWTON_PX**2:  # ignores NaN; the next step is quadratic
+            if np.fmax.reduce(px2, axis=None, initial=0.0) < NEWTON_PX**2:  # ignores NaN; convergence is quadratic
                 break
         # both slopes are positive up to the fold; roots beyond it belong to no ray
         good = (px2 < NEWTON_PX**2) & (det > 0) & (xd_a + yd_b > 0)

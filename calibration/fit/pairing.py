@@ -300,19 +300,19 @@ def _late(
     pairs_of: Callable[[NDArray, Sequence[int]], Paired], odd: Sequence[int], found: Pairing, names: Names
 ) -> tuple[str, ...]:
     """Warnings about pairs among the `odd` that would agree with a later or an earlier right view."""
-    rest, told = list(odd), []
+    rest, notes = list(odd), []
     for k in sorted(range(-MOST_LATE, MOST_LATE + 1), key=abs)[1:]:
         both, left, turns = pairs_of(np.arange(len(names)) + k, rest)
         off = np.min([apart(left, right, found.R_right_left[None], found.t_right_left[None])[0] for right in turns], 0)
         which = [v for v, distance in zip(both, off, strict=True) if distance < TOO_FAR * found.usual]
         rest = [v for v in rest if v not in which]
         if len(which) >= MIN_VIEWS:
-            told.append(
+            notes.append(
                 f"{names[which[0]][0]} to {names[which[-1]][0]}: {len(which)} pairs agree with the others if the right "
                 f"view {abs(k)} {'later' if k > 0 else 'earlier'} is taken ({names[which[0] + k][1]} in place of "
                 f"{names[which[0]][1]}): a frame was lost there. Name or move the files so that pairs have one number"
             )
-    return tuple(told)
+    return tuple(notes)
 
 
 def _both(turn: Array, shift: Array) -> Array:

@@ -1,1 +1,1 @@
-"""Whether a fit can be believed: which pairs show the board in one place, the board's sizes, how good the rig is."""
+"""Assessment of a fit: which views are pairs, tolerances of the board, accuracy of the rig."""

@@ -1,4 +1,4 @@
-"""How good a calibration is: consistency of its parts, coverage, uncertainty in px and mm, and a verdict in words."""
+"""Assessment of a calibration: consistency, coverage, uncertainty in px and mm, and a verdict in words."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -12,53 +12,53 @@ from calibration.judge.pairs import PairMotion
 from calibration.kit.arrays import Array
 from calibration.kit.least_squares import solve_each
 
-MIN_COVERAGE = 0.35  # share of the image's 8 x 8 cells with a corner: below, distortion is extrapolated elsewhere
-MIN_TILT_SPREAD_DEG = 20.0  # between the boards' normals: below, focal length and distance cannot be told apart
-# The verdict in one word, and up to which part of a point's distance: 0.05, 0.5, 5 mm at half a metre. Images of half
-# the size, or of half the noise, say as much about cameras that are as wrong.
+MIN_COVERAGE = 0.35  # fraction of the image's 8 x 8 cells with a corner: with less, distortion is extrapolated
+MIN_TILT_SPREAD_DEG = 20.0  # between the boards' normals: with less, focal length and distance are degenerate
+# The verdict in one word, and the largest error over a point's distance: 0.05, 0.5, 5 mm at half a metre. Errors are
+# compared in space, not in px, which depend on the size of the images.
 GRADES = {"excellent": 1e-4, "good": 1e-3, "usable": 1e-2, "poor": np.inf}
-BEYOND_USE = 0.05  # of a point's distance: no rig to be kept unasked
-TWICE = 2.0  # what is expected: views that disagree so much, or fit so badly when left out, leave something out of it
+BEYOND_USE = 0.05  # error over a point's distance, above which a rig is kept only on request
+TWICE = 2.0  # times the expected disagreement or held-out error of views, above which the model is incomplete
 
 
 @dataclass(frozen=True)
 class Assessment:
     """Figures and words about a calibration."""
 
-    stereo_misfit_px: float  # of views left out of the fit, one place of the board for both images; NaN where none was
-    held_out_error: float  # [m] of corners of such views, triangulated, against the board where they put it best
-    triangulation_sigma: tuple[float, float]  # [m] of points, rms and greatest, by all of the calibration's uncertainty
-    length_sigma: tuple[float, float]  # relative, of a length or displacement: by the views; and with the board's size
-    direction_sigma: float  # [rad] of a line across the table's board, or of the turn of a body as large
-    place_sigma: tuple[tuple[float, str], ...]  # of x, y, z of points [m], with the board's sizes; most of it from what
+    stereo_misfit_px: float  # of held-out views, with one pose of the board for both images; NaN if there are none
+    held_out_error: float  # [m] distance of triangulated corners of such views from the board fitted to them
+    triangulation_sigma: tuple[float, float]  # [m] of points, rms and largest, from the whole calibration covariance
+    length_sigma: tuple[float, float]  # relative, of a length or displacement: from the views; with the board's size
+    direction_sigma: float  # [rad] of a line across the table's board, or of the rotation of a body as large
+    place_sigma: tuple[tuple[float, str], ...]  # of x, y, z of points [m], with the board's sizes; and its main cause
     distance: float  # [m] of the points from the left camera
-    pairs: int  # views that both cameras saw and the fit uses
+    pairs: int  # fitted views with both cameras
     motion: PairMotion | None  # of the board between the exposures of a pair
-    inflation: float  # of the covariance, from the scatter of views
-    coverage: tuple[float, ...]  # of each camera: share of 8 x 8 image cells with a corner
-    tilt_spread_deg: float  # greatest angle between two boards' normals
+    inflation: float  # factor on the covariance, from the scatter of views
+    coverage: tuple[float, ...]  # of each camera: fraction of 8 x 8 image cells with a corner
+    tilt_spread_deg: float  # largest angle between two boards' normals
     grade: str = ""  # of GRADES
-    verdict: str = ""  # the same with its reason: one sentence without its full stop
-    figures: str = ""  # what a user gets on the table, and the misfit of views left out
+    verdict: str = ""  # grade and reason: one sentence without full stop
+    figures: str = ""  # accuracy on the table, and held-out misfit
     warnings: tuple[str, ...] = ()
 
     @property
     def beyond_use(self) -> bool:
-        """True where lengths mean next to nothing: such a rig is kept only by consent."""
+        """True if lengths are meaningless: such a rig is kept only on request."""
         worst = max(self.triangulation_sigma[0], np.nan_to_num(self.held_out_error)) / self.distance
         return not worst < BEYOND_USE
 
 
 def stereo_covariance(refinement: Refinement, common: Array | None = None) -> Array:
-    """Covariance (s1, s1) of the free stereo parameters, from the corners' noise and from how the views disagree.
+    """Covariance (s1, s1) of the free stereo parameters, from the corners' noise and the disagreement of the views.
 
-    common : (n_views, s, s) covariance of what else the views' gradients contain, see `pairs`
+    common : (n_views, s, s) covariance of other contributions to the views' gradients, see `pairs`
 
-    Errors that are common to a view weigh more in some directions than in others: a board that moves between the two
-    exposures spoils the pair's pose, not the focal lengths. The views' shifts, whitened by what noise would make of
-    them, are shrunk towards equal directions as far as so few views scatter (Ledoit and Wolf 2004). No direction is
-    taken for better known than the geometric mean of all: of two dozen variances by so few views the smallest are small
-    by chance. Nothing gets smaller than by the corners' noise.
+    Errors common to a view affect some directions more than others: motion of the board between the two exposures
+    affects the stereo pose, not the focal lengths. The covariance of the views' shifts, whitened by that expected from
+    noise, is shrunk towards a multiple of the identity (Ledoit and Wolf 2004). No direction gets a variance below the
+    geometric mean of all: of two dozen variances from few views the smallest are small by chance. The result is never
+    smaller than that of the corners' noise.
     """
     problem = refinement.problem
     s1, views = problem.stereo_basis.shape[1], len(np.unique(problem.observations.view))
@@ -76,17 +76,19 @@ def stereo_covariance(refinement: Refinement, common: Array | None = None) -> Ar
     beyond = root @ directions * np.sqrt(np.maximum(np.maximum(factor, least) - 1.0, 0.0))
     by_common = 0.0 if common is None else inverse.T @ (common.sum(0) * scale[:, None] * scale) @ inverse
     at_minimum = inverse[:s1] + by_common
-    share = s1 / max(float(np.trace(np.linalg.solve(at_minimum, expected))), 1e-12)  # noise moves fewer than all
+    share = s1 / max(
+        float(np.trace(np.linalg.solve(at_minimum, expected))), 1e-12
+    )  # noise moves fewer than s1 directions
     by_prior = np.zeros((s1, s1))
-    if problem.prior is not None:  # it was weighted as if it were one of views that disagree as much
-        told = max(problem.prior.weight - 1.0, 0.0) * refinement.normal.prior[:-1, :-1] * scale[:, None] * scale
-        by_prior = inverse.T @ told @ inverse
+    if problem.prior is not None:  # its weight was multiplied by the disagreement of the views
+        extra = max(problem.prior.weight - 1.0, 0.0) * refinement.normal.prior[:-1, :-1] * scale[:, None] * scale
+        by_prior = inverse.T @ extra @ inverse
     result: Array = (at_minimum + share * beyond @ beyond.T + by_prior) * scale[:s1, None] * scale[:s1]
     return result
 
 
 def cells_of(refinement: Refinement, camera: int) -> Array:
-    """(8, 8) how many used corners lie in each cell of a grid on the image, along x and along y."""
+    """(8, 8) number of used corners in each cell of a grid on the image, along x and along y."""
     o = refinement.observations
     pixels = o.pixels[refinement.kept & (o.camera == camera)]
     edges = [np.linspace(-0.5, size - 0.5, 9) for size in refinement.model.rig.cameras[camera].image_size]
@@ -94,16 +96,16 @@ def cells_of(refinement: Refinement, camera: int) -> Array:
 
 
 def tilt_spread(refinement: Refinement) -> float:
-    """Greatest angle between the normals of two boards [deg]."""
+    """Largest angle between the normals of two boards [deg]."""
     views = np.unique(refinement.observations.view[refinement.kept])
     normals = refinement.model.R_left_board[views, 0, :, 2]
     return float(np.degrees(np.arccos(np.clip(normals @ normals.T, -1, 1))).max())
 
 
 def point_uncertainty(rig: StereoRig, points_world: Array) -> Array:
-    """Standard deviations (n, 3) [m] of triangulated points (n, 3) [m] from the calibration alone.
+    """Standard deviations (n, 3) [m] of triangulated points (n, 3) [m] due to the calibration alone.
 
-    A point's error is what a perfect image of it would give through this rig.
+    That is, for images without noise.
     """
     shift = _shifts_of_points(rig, points_world)
     return np.sqrt(np.maximum(np.einsum("nip,pq,niq->ni", shift, rig.covariance, shift), 0.0))
@@ -118,7 +120,7 @@ def _shifts_of_points(rig: StereoRig, points_world: Array) -> Array:
 
 
 def measurement_volume(refinement: Refinement, table_view: int | None) -> Array:
-    """Points (n, 3) [m] in world axes over which uncertainty is told: the board of the table view and above it."""
+    """Points (n, 3) [m] in world axes for which uncertainty is stated: the board of the table view and above it."""
     points = refinement.model.points
     if table_view is not None:
         size = np.ptp(points, axis=0)[:2].min()
@@ -131,8 +133,8 @@ def measurement_volume(refinement: Refinement, table_view: int | None) -> Array:
 def length_uncertainty(rig: StereoRig, points_world: Array) -> tuple[float, float]:
     """Standard deviations of a line across the points (n, 3) [m]: relative of its length, and its direction [rad].
 
-    From the calibration alone; means over the three axes of space, of a line as long as the points' scatter.
-    Displacements have the same.
+    Due to the calibration alone; means over the three axes, for a line as long as the points' scatter. They also hold
+    for displacements.
     """
     middle, size = points_world.mean(0), float(np.sqrt(np.mean(np.var(points_world, axis=0)) * 3))
     shift = _shifts_of_points(rig, middle + 0.5 * size * np.concatenate([np.eye(3), -np.eye(3)]))
@@ -152,10 +154,10 @@ def assess(
     motion: PairMotion | None,
     wide: Sequence[tuple[str, str]],
 ) -> Assessment:
-    """Collect the figures and judge them.
+    """Compute the figures and the verdict.
 
-    chosen : the row of the terms that were taken; rig : its covariance by the views alone; rig_with_board : and with
-    the tolerances of the board; wide : what `start.too_wide` found
+    chosen : the row of the selected terms; rig : with the covariance due to the views alone; rig_with_board : including
+    the tolerances of the board; wide : result of `start.too_wide`
     """
     kept = refinement.observations[refinement.kept]
     both = np.intersect1d(kept.view[kept.camera == 0], kept.view[kept.camera == 1])
@@ -177,15 +179,15 @@ def assess(
         coverage=tuple(float(np.mean(cells_of(refinement, camera) > 0)) for camera in range(len(CAMERA_NAMES))),
         tilt_spread_deg=tilt_spread(refinement),
     )
-    grade, verdict, told = _judgement(found, refinement, chosen, wide)
-    return replace(found, grade=grade, verdict=verdict, figures=_figures(found, refinement.rms()), warnings=told)
+    grade, verdict, warnings = _judgement(found, refinement, chosen, wide)
+    return replace(found, grade=grade, verdict=verdict, figures=_figures(found, refinement.rms()), warnings=warnings)
 
 
 def _judgement(
     found: Assessment, refinement: Refinement, chosen: TermsTried, wide: Sequence[tuple[str, str]]
 ) -> tuple[str, str, tuple[str, ...]]:
-    """The worst of what the figures say, with the reason; and all of it that asks for something to be done."""
-    told, reasons = [": ".join(what) for what in wide], [(3, what) for what, _ in wide]
+    """The worst grade of all figures, its reason, and warnings about figures that need action."""
+    warnings, reasons = [": ".join(what) for what in wide], [(3, what) for what, _ in wide]
     errors = found.triangulation_sigma[0], found.held_out_error
     for error, what in zip(errors, ("a point is uncertain by", "views left out of the fit are off by"), strict=True):
         if np.isfinite(share := error / found.distance):
@@ -193,7 +195,7 @@ def _judgement(
             reasons.append((int(np.searchsorted([*GRADES.values()], share)), part))
     if (motion := found.motion) is not None and motion.is_seen and refinement.problem.motion is not None:
         reasons.append((2, "the two images of a pair do not show the board in one place"))
-        told.append(
+        warnings.append(
             "the pairs are not synchronised, or the lenses are not as modelled: the two images of a pair differ as if "
             f"the board had moved by {motion.distance * 1e3:.2g} mm between them ({motion.pixels:.2g} px; corners "
             f"scatter by {motion.scatter:.2g} px). The refinement gives every board a motion of its own; the sigmas "
@@ -201,12 +203,12 @@ def _judgement(
         )
     for name, share in zip(CAMERA_NAMES, found.coverage, strict=True):
         if share < MIN_COVERAGE:
-            told.append(
+            warnings.append(
                 f"{name} camera: corners cover {100 * share:.0f} % of the image (good: above "
                 f"{100 * MIN_COVERAGE:.0f} %); outside them the distortion is extrapolated: show the board there too"
             )
     if found.tilt_spread_deg < MIN_TILT_SPREAD_DEG:
-        told.append(
+        warnings.append(
             f"the boards' normals differ by {found.tilt_spread_deg:.1f} deg at most (good: above "
             f"{MIN_TILT_SPREAD_DEG:.0f} deg): focal lengths and distances are badly determined; tilt the board about "
             "two axes"
@@ -214,26 +216,26 @@ def _judgement(
     if found.pairs < GOOD_VIEWS:
         reasons.append((2 if found.pairs > 3 else 3, f"only {found.pairs} views were seen by both cameras"))
     if (n_views := len(np.unique(refinement.observations.view[refinement.kept]))) < GOOD_VIEWS:
-        told.append(f"{n_views} views are few (good: 15 to 40)")
+        warnings.append(f"{n_views} views are few (good: 15 to 40)")
     if found.inflation > TWICE:
-        told.append(
+        warnings.append(
             f"the views disagree {found.inflation**0.5:.1f} times more than their corners' noise allows; the "
             "uncertainties were enlarged by that: the board moved or bent between views, or the lenses are not as "
             "modelled"
         )
     if chosen.held_out_rms_px > TWICE * chosen.rms_px:
         reasons.append((2, "views left out of the fit are met far worse than those fitted"))
-        told.append(
+        warnings.append(
             f"views that were left out fit at {chosen.held_out_rms_px:.3f} px, those fitted at {chosen.rms_px:.3f} px: "
             "more and more varied views are needed"
         )
     if not refinement.converged:
-        told.append("the refinement did not converge: the result is not the least-squares minimum")
+        warnings.append("the refinement did not converge: the result is not the least-squares minimum")
     worst, why = max(
         reasons, key=lambda item: item[0], default=(3, "nothing shows how good it is")
-    )  # the first of equal
+    )  # the first if several are equal
     grade = [*GRADES][worst]
-    return grade, f"{grade.capitalize()}: {why}", tuple(told)
+    return grade, f"{grade.capitalize()}: {why}", tuple(warnings)
 
 
 def _figures(found: Assessment, rms: float) -> str:

@@ -1,17 +1,16 @@
-"""What each pair of images says, with a place of the board in each: how the cameras stand, and how the board moved.
+"""Relative pose of the cameras and motion of the board from each pair of images, with separate poses of the board.
 
-Pairs that say otherwise of the cameras than the others are told by one matrix, the distances (`pairing.apart`) between
-what any two say. A pair far from most others is none; a camera that was moved while the views were taken makes a step,
-in the order in which they were taken, where all else scatters. Distances are in pixels, as a pair's images would see
-them, so that what a pair tells badly (a shift along the axis) counts as little as it is known.
+Pairs that disagree with the others are found from one matrix, the distances (`pairing.apart`) between the relative
+poses of any two pairs. A pair far from most others is no pair; a camera that was moved between views makes a step in
+the sequence of views, everything else makes scatter. Distances are in pixels, weighted by the covariance of each pair:
+poorly determined directions (a shift along the axis) have little weight.
 
-All boards may have moved at random between the two exposures. To first order a pair says that its board moved by m (a
-turn, and a shift of its middle), with covariance C by the corners; less W s of it where the shared parameters take a
-step s. If m ~ N(0, S), the sizes in S are those of restricted maximum likelihood (Patterson and Thompson 1971). The
-estimate with m = 0 stays where no pair shows a motion for itself: where a few views tell, it is the steadier one, and
-by pairs that were synchronised the better one; its covariance contains S, as that of any estimate whose weights are not
-those of the errors. What lies in one image as a whole for another reason, errors that neighbouring corners share or a
-lens beyond its polynomial, is in S likewise.
+All boards may have moved at random between the two exposures. To first order, the motion of a pair's board (a rotation,
+and a shift of its middle) is m - W s with covariance C from the corners, where s is a step of the shared parameters. If
+m ~ N(0, S), the sizes in S are estimated by restricted maximum likelihood (Patterson and Thompson 1971). The estimate
+with m = 0 is kept if single pairs show no significant motion: it is more stable with few views, and better for
+synchronised pairs. Its covariance contains S, as its weights are not those of the errors. S also contains other errors
+common to an image, such as correlated errors of neighbouring corners, or distortion beyond the polynomial.
 """
 
 from dataclasses import dataclass, replace
@@ -29,36 +28,36 @@ from calibration.fit.stereo_model import Observations, predict, predict_pixels
 from calibration.kit.arrays import Array
 from calibration.kit.least_squares import scaled_solve
 
-MOVED = 2.0  # times what corners' scatter makes of a board at rest, and times that scatter, that motion is named
-# Times as far apart as pairs of one side. None of 400 synthetic sets of boards that moved reaches 2; of 31 photographed
-# ones two have 8.8 and 4.5, where OpenCV's rig of one side misses the other's pairs as well, and the next one 2.2.
+MOVED = 2.0  # times the scatter of corners, and the motion expected from it, above which motion is reported
+# Ratio of distances between pairs on opposite sides of a step and on one side. It is below 2 in 400 synthetic sets with
+# random motion. Of 31 photographed sets, two have 8.8 and 4.5, and OpenCV confirms the steps; the next one has 2.2.
 STEP = 4.0
-BY_ZOOM = 1.3  # times less squared misfit by two focal lengths; one and the same lens has 1.05
+BY_ZOOM = 1.3  # ratio of squared misfits, one focal length over two; an unchanged lens has 1.05
 
 
 @dataclass(frozen=True)
 class PairMotion:
-    """How far the board moved between the two exposures of a pair: root median square over the pairs."""
+    """Motion of the board between the two exposures of a pair: root median square over the pairs."""
 
     distance: float  # [m]
     pixels: float  # [px] in the right image
-    scatter: float  # [px] of the corners within an image, about a pose of its own
-    at_rest: float  # [px] what this scatter alone would give for `pixels`
-    likely: float  # [px] rms of the likely size: cameras that few views leave open have taken up a part of `pixels`
-    size: BoardMotion  # that is the most likely one by all pairs together
+    scatter: float  # [px] of the corners of an image about its own pose
+    at_rest: float  # [px] value of `pixels` expected from this scatter alone
+    likely: float  # [px] rms of `size`; with few views, part of the motion in `pixels` is absorbed by the cameras
+    size: BoardMotion  # most likely size given all pairs
 
     @property
     def is_seen(self) -> bool:
-        """True if the usual pair is far beyond what corners that scatter so would show of a board at rest."""
+        """True if the median pair moves significantly more than the scatter of corners explains."""
         return self.pixels > self._enough
 
     @property
     def is_likely(self) -> bool:
-        """True if it is by all pairs together, where the usual one shows more than nothing: few pairs hide it."""
+        """True if the median pair, or all pairs together, move significantly; few pairs may hide it in the median."""
         return self.is_seen or (self.likely > self._enough and self.pixels > self.at_rest)
 
     def as_random(self, points: Array) -> BoardMotion:
-        """As a random motion of boards with these points (n, 3) [m], roughly: what is begun with."""
+        """Initial guess of the random motion of boards with these points (n, 3) [m]."""
         reach = float(np.sqrt(np.mean(np.sum((points - points.mean(0)) ** 2, axis=1))))
         return BoardMotion(self.distance / reach, self.distance)
 
@@ -68,11 +67,11 @@ class PairMotion:
 
 
 def motion_between_exposures(refinement: Refinement) -> tuple[PairMotion, Array] | None:
-    """What the pairs say of the board's motion between their exposures; None with fewer than three of them.
+    """Motion of the board between the exposures of the pairs; None with fewer than three pairs.
 
-    Of the views that are not apart, by images that have points enough, about a minimum.
-    returns also : (n_views, s, s) covariance of what motions of the likely size add to each view's gradient by the
-        shared numbers
+    From the pairs with enough points in both images, linearised at the minimum.
+    returns also : (n_views, s, s) covariance that motions of the likely size add to each view's gradient with respect
+        to the shared parameters
     """
     problem, model = refinement.problem, refinement.model
     o, n_views = problem.observations, problem.n_views
@@ -84,9 +83,9 @@ def motion_between_exposures(refinement: Refinement) -> tuple[PairMotion, Array]
     normal = free.linearise(model)
     carried = normal.carried()
     m, J = (of[pairs] for of in motions(model))
-    told = J @ carried[pairs]  # (n, 6, s + 1) [W | m]
-    told[..., -1] += m
-    m, W = told[..., -1], told[..., :-1]
+    rows = J @ carried[pairs]  # (n, 6, s + 1) [W | m]
+    rows[..., -1] += m
+    m, W = rows[..., -1], rows[..., :-1]
     C = J @ np.linalg.solve(normal.own_held()[pairs], np.swapaxes(J, 1, 2))
     freedom = max(2 * len(o) - 6 * len(np.unique(2 * o.view + o.camera)), 1)
     square, s = normal.eliminated(carried=carried), W.shape[-1]
@@ -96,11 +95,11 @@ def motion_between_exposures(refinement: Refinement) -> tuple[PairMotion, Array]
     d_pose, squares = predict(about, right)[2], np.zeros((n_views, 6, 6))
     np.add.at(squares, right.view, np.swapaxes(d_pose, 1, 2) @ d_pose)
     back = np.linalg.inv(J[:, :, 6:])
-    # m^T square_px m is a motion's mean square displacement [px^2] in the right image
+    # m^T square_px m is the mean square displacement [px^2] in the right image by a motion m
     square_px = np.swapaxes(back, 1, 2) @ (squares[pairs] / seen[1][pairs, None, None]) @ back
-    taken = np.r_[: problem.stereo_basis.shape[1], s]  # of a board as it is: known better than motions move it
+    taken = np.r_[: problem.stereo_basis.shape[1], s]  # with fixed board shape, whose uncertainty is small
     distance = float(np.median(np.linalg.norm(model.t_left_board[pairs, 0], axis=1)))
-    size = _likely_size(told[..., taken], noise * C, square[np.ix_(taken, taken)] / noise, distance)
+    size = _likely_size(rows[..., taken], noise * C, square[np.ix_(taken, taken)] / noise, distance)
     gradients, known = np.zeros((n_views, s, s)), np.linalg.solve(C, W)
     gradients[pairs] = np.swapaxes(known, 1, 2) @ (known / size.weights[:, None])
     found = PairMotion(
@@ -114,20 +113,20 @@ def motion_between_exposures(refinement: Refinement) -> tuple[PairMotion, Array]
     return found, gradients
 
 
-def _likely_size(told: Array, C: Array, alone: Array, distance: float) -> BoardMotion:
-    """The most likely size of random motions; about a minimum with one place of the board for both images.
+def _likely_size(rows: Array, C: Array, alone: Array, distance: float) -> BoardMotion:
+    """The most likely size of random motions, linearised at a minimum with one pose of the board for both images.
 
-    With P the inverse covariance of the motions where everything shared is free, a variance is right where the
-    squares of P m that belong to it are in sum the trace of P, and grows or falls by their ratio.
+    With P the inverse covariance of the motions with all shared parameters free, a variance is the most likely one if
+    the sum of its squares of P m is its part of the trace of P. The fixed point multiplies it by their ratio.
 
-    told : (n, 6, s + 1) [W | m]; alone : (s + 1, s + 1) products of [shared | residual] by all images, and by the prior
+    rows : (n, 6, s + 1) [W | m]; alone : (s + 1, s + 1) products of [shared | residual] of all images, and the prior
     """
     least = np.square([LEAST, LEAST * distance])
     variances = 1e6 * least
-    for _ in range(100):  # what tends to zero gets there by a part each time
+    for _ in range(100):  # a variance that tends to zero decreases slowly
         known = np.linalg.inv(C + np.diag(np.repeat(variances, 3)))
-        into = np.swapaxes(known @ told, 1, 2)
-        square = alone + (into @ told).sum(0)
+        into = np.swapaxes(known @ rows, 1, 2)
+        square = alone + (into @ rows).sum(0)
         inverse = scaled_solve(square[:-1, :-1], np.eye(len(square) - 1))
         P = known - np.swapaxes(into[:, :-1], 1, 2) @ inverse @ into[:, :-1]
         Pm = np.append(-inverse @ square[:-1, -1], 1.0) @ into
@@ -137,9 +136,9 @@ def _likely_size(told: Array, C: Array, alone: Array, distance: float) -> BoardM
 
 
 def judge_pairs(observations: Observations, fit: Refinement, table_view: int | None) -> Pairs:
-    """Images that do not even fit alone, and of the others what pairs say: `compared`, by the cameras of a fit.
+    """Images that do not fit even alone, and a comparison of the other pairs (`compared`) with the fitted cameras.
 
-    observations : with the views' numbers; fit : of the same, some pairs perhaps apart
+    observations : with the views' numbers; fit : of the same, possibly with pairs apart
     """
     o, sigma = observations[np.argsort(observations.view, kind="stable")], max(fit.unexplained_sigma, 1e-3)
     problem = replace(fit.problem.seeing(o, sigma**2), motion=None, apart=np.ones_like(fit.problem.apart))
@@ -159,8 +158,8 @@ def judge_pairs(observations: Observations, fit: Refinement, table_view: int | N
     return compared(observations, Pairs(alone, views, bad_images=bad), table_view)
 
 
-def moved_told(pairs: Pairs, names: Names, table_view: int | None) -> str:
-    """That a camera was moved, in words, for whoever took the views."""
+def camera_moved(pairs: Pairs, names: Names, table_view: int | None) -> str:
+    """A warning that a camera was moved between views."""
     steps = "; ".join(
         f"from {names[view][0]} and {names[view][1]} on the cameras stand otherwise to each other than before, by "
         f"{np.degrees(turn):.2g} deg and {1e3 * shift:.2g} mm ({pixels:.2g} px, where the pairs on either side agree "
@@ -178,9 +177,9 @@ def moved_told(pairs: Pairs, names: Names, table_view: int | None) -> str:
 
 
 def zoomed(observations: Observations, pairs: Pairs, nominal: Array) -> dict[int, str]:
-    """Cameras whose focal length is another one in the other stretches, and what is to be said of their images there.
+    """Cameras whose focal length changed in the other stretches, with the reason to reject their images there.
 
-    A camera with other focal lengths in both parts, alone and roughly, must fit clearly better than one for all views.
+    For each camera alone, a rough fit with two focal lengths must be clearly better than one for all views.
     """
     found = {}
     other = np.isin(observations.view, pairs.others)
@@ -199,18 +198,18 @@ def zoomed(observations: Observations, pairs: Pairs, nominal: Array) -> dict[int
 
 
 def compared(observations: Observations, pairs: Pairs, table_view: int | None, floor: float = 0.0) -> Pairs:
-    """The pairs by how each says that the cameras stand: in which stretches, and which say otherwise than most of one.
+    """The pairs compared by their relative poses of the cameras: stretches between steps, and outliers in each stretch.
 
-    Some of it is in every pair, as boards bend and lenses are not as modelled. A pair is odd where it is TOO_FAR times
-    as far from the others as the median pair of its stretch; so never more than half of them are. Too few pairs tell
-    nothing of one another, nor of a camera that was moved.
+    All pairs differ a little, as boards bend and lenses differ from the model. A pair is odd if its distance from the
+    others is TOO_FAR times that of the median pair of its stretch, so at most half of the pairs are odd. Too few pairs
+    are returned unchanged.
 
-    table_view : its stretch tells how the cameras stand; None: the one with the most pairs does
-    floor : of the image's longer side: pairs that differ by less agree, whatever the others do
+    table_view : its stretch determines the stereo pose; None: the stretch with the most pairs
+    floor : distance, over the image's longer side, below which pairs agree in any case
     """
     model, views, sides = pairs.model, pairs.views, []
     R_pair = model.rig.R_right_left
-    if len(views) < 2 * MIN_VIEWS:  # one tells how the cameras stand, and a median is of the others
+    if len(views) < 2 * MIN_VIEWS:  # a median distance needs several other pairs
         return pairs
     for index, (R, t) in enumerate(model.rig.camera_poses()):
         mine = observations[observations.camera == index]
@@ -218,8 +217,8 @@ def compared(observations: Observations, pairs: Pairs, table_view: int | None, f
         sides.append(
             poses_of(dict(zip(views.tolist(), poses, strict=True)), mine, model.points, model.rig.cameras[index])
         )
-    tells = np.all([np.isfinite(side.covariance).all(axis=(1, 2)) for side in sides], axis=0)
-    views, (left, right) = views[tells], (side[tells] for side in sides)
+    known = np.all([np.isfinite(side.covariance).all(axis=(1, 2)) for side in sides], axis=0)
+    views, (left, right) = views[known], (side[known] for side in sides)
     R, t = relative_poses(left, right)
     between = apart(left, right, R, t)
     between = 0.5 * (between + between.T)
@@ -233,7 +232,7 @@ def compared(observations: Observations, pairs: Pairs, table_view: int | None, f
         for k in np.flatnonzero(off > TOO_FAR * usual):
             odd[int(views[stretch[k]])] = f"{off[k]:.2g} px apart, where the others agree to {usual:.2g} px"
     for (_, pixels, scatter), (before, after) in zip(cuts, pairwise(stretches), strict=True):
-        # in plain units: boards that moved scatter a turn and a shift that nearly cancel in the image
+        # plain units: random motions contain rotations and shifts that nearly cancel in the image
         turn = np.median(rotation_vectors(R[after] @ R_pair.T), axis=0)
         turn -= np.median(rotation_vectors(R[before] @ R_pair.T), axis=0)
         shift = np.median(t[after], axis=0) - np.median(t[before], axis=0)
@@ -241,21 +240,22 @@ def compared(observations: Observations, pairs: Pairs, table_view: int | None, f
     kept = int(np.argmax([len(stretch) for stretch in stretches]))
     if table_view is not None:
         kept = int(np.searchsorted([views[at] for at, _, _ in cuts], table_view, "right"))
-    told = tuple(tuple(views[stretch].tolist()) for stretch in stretches)
-    return replace(pairs, odd=odd, stretches=told, steps=tuple(steps), kept=kept)
+    of_views = tuple(tuple(views[stretch].tolist()) for stretch in stretches)
+    return replace(pairs, odd=odd, stretches=of_views, steps=tuple(steps), kept=kept)
 
 
 def _cuts(between: Array) -> list[tuple[int, float, float]]:
-    """Where n pairs part, in order: the clearest step, then those on either side of it; as in `Pairs.steps`.
+    """Steps in the sequence of n pairs, in order: the most significant one, then those on either side of it.
 
-    between : (n, n) [px] by which what the pairs tell of the cameras differs; NaN on the diagonal
+    Each has the index of its first pair, and the two distances [px] of `Pairs.steps`.
+    between : (n, n) [px] distances between the relative poses of two pairs; NaN on the diagonal
     """
     n, place = len(between), np.arange(len(between))
-    if n < 2 * MIN_VIEWS:  # fewer on a side are not a place of the cameras, but boards that moved
+    if n < 2 * MIN_VIEWS:  # fewer on a side may be boards that moved, not a camera
         return []
 
     def to_sides(cut: int) -> tuple[Array, Array]:
-        """Median distances (n,) of each pair to those of its own side, and to those of the other."""
+        """Median distances (n,) of each pair from those on its side, and from those on the other."""
         same = (place[:, None] < cut) == (place < cut)
         own, other = (np.nanmedian(np.where(which, between, np.nan), axis=1) for which in (same, ~same))
         return own, other

@@ -1,11 +1,11 @@
-"""The rig in the lab frame, the table under one view, with its covariance: by the views, and by the board's sizes.
+"""The rig in the lab frame, on the table under one view, with covariances due to the views and to the board's sizes.
 
-Views of a board show its shape: how much longer it is along one side than along the other, how it is bent, how far
-corners are off a regular grid. They do not show its size, nor the face it lies on. Where no tolerance was declared,
-what is seen sets the size of what is not: e_x and e_y, by which the two sides are too long, are taken for normal with
-one variance v, of which the views tell one number, d = e_x - e_y. So v = d^2 / 2, e_x = -e_y = d / 2, and their mean,
-the size of the board, is 0 +- |d| / 2; a board whose sides are equally long to 0.0003 % was made to about that. One
-number tells a variance within a factor of ten only; whoever knows better declares a tolerance, which is used as it is.
+Views of a board determine its shape: the ratio of its sides, its bend, and deviations of corners from a regular grid.
+They do not determine its size, nor its underside. Without a declared tolerance, the measured errors set the scale of
+the unknown ones: the relative errors e_x and e_y of the two sides are assumed normal with one variance v, of which the
+views determine one number, d = e_x - e_y. So v = d^2 / 2, e_x = -e_y = d / 2, and their mean, the error of the board's
+size, is 0 +- |d| / 2. A board whose sides agree to 0.0003 % is assumed to be that accurate. One number determines a
+variance only within a factor of ten; a declared tolerance is used unchanged.
 """
 
 from dataclasses import dataclass, replace
@@ -19,43 +19,41 @@ from calibration.fit.stereo_model import N_STEREO, board_basis
 from calibration.kit.arrays import Array
 from calibration.kit.least_squares import scaled_solve
 
-ASSUMED_THICKNESS = 20e-6  # [m] standard deviation, a calliper's
+ASSUMED_THICKNESS = 20e-6  # [m] standard deviation of a calliper
 SIZE, FLATNESS, THICKNESS = "the board's size", "the board's flatness", "the board's thickness"
 
 
 @dataclass(frozen=True)
 class BoardTolerances:
-    """Standard deviations as declared; None: not declared, so that the views tell, or a default for the thickness."""
+    """Declared standard deviations; None: estimated from the views, or a default for the thickness."""
 
-    square: float | None = None  # relative, of lengths along one side, in the mean over the board
-    flatness: float | None = None  # [m] of the printed face as it lies on the table, against the plane through it
+    square: float | None = None  # relative, of lengths along one side, averaged over the board
+    flatness: float | None = None  # [m] of the printed face on the table, about its mean plane
     thickness: float | None = None  # [m]
 
 
 @dataclass(frozen=True)
 class BoardShape:
-    """A board against the declared one, as far as its views tell."""
+    """Deviation of the board from the declared one, as determined by its views."""
 
-    stretch: float  # relative: lengths along i beyond those along j
+    stretch: float  # relative difference of lengths along i and along j
     stretch_sigma: float
-    lift: float  # [m] of the mean plane of the printed face above where a face as bent would touch a table
+    lift: float  # [m] height of the mean plane of the printed face above its lowest part, which touches a table
     lift_sigma: float
     misprint: float  # [m] rms per coordinate of the corners in their plane, beyond stretch and shear; 0 if not refined
-    refined: bool  # the calibration's board has this shape; else it was taken as flat, and this is what that leaves
+    refined: bool  # True if the calibration's board has this shape; else the board was assumed to be flat
 
 
 def board_shape(refinement: Refinement, nominal: Array, inflation: float) -> BoardShape:
-    """The smooth part of a board's shape with its sigma, whichever model of the board was refined.
+    """The smooth part of the board's shape with its sigma, for any refined model of the board.
 
-    nominal : (n, 3) [m] the target's points as declared, on a grid
+    nominal : (n, 3) [m] the declared points of the target, on a grid
     inflation : factor on the covariance that follows from the points' noise
     """
     n, warp = len(nominal), board_basis(nominal, "warped")
     free, s1 = refinement.terms.board == "free", refinement.problem.stereo_basis.shape[1]
     basis, to_smooth = board_basis(nominal, "free") if free else warp, np.linalg.pinv(warp.reshape(3 * n, -1))
-    normal = refinement.problem.with_shape(nominal, basis).linearise(
-        refinement.model
-    )  # with a step beyond a flat board
+    normal = refinement.problem.with_shape(nominal, basis).linearise(refinement.model)  # with a step from a flat board
     departure = (refinement.model.points - nominal + basis @ normal.step()[0][s1:]).reshape(-1)
     found, onto = to_smooth @ departure, to_smooth @ basis.reshape(3 * n, -1)
     C = onto @ normal.covariances()[0][s1:, s1:] @ onto.T
@@ -76,11 +74,11 @@ def board_shape(refinement: Refinement, nominal: Array, inflation: float) -> Boa
 def shape_left_out(
     refinement: Refinement, nominal: Array, boards: tuple[str, ...], inflation: float
 ) -> tuple[Array, float]:
-    """What a board of more freedom than the refined one's would change: covariance (s1, s1) of the stereo parameters.
+    """Effect of a more general shape of the board than the refined one: covariance (s1, s1) of the stereo parameters.
 
-    One step of a refinement with each further shape of `boards`, simplest first: a board that is taken for flat and is
-    not pulls the cameras by what the step takes back. As much of it counts as is no noise (of chi-square, its expected
-    part is taken off). The second item is the largest of these shifts, in the parameters' own sigmas.
+    From one step of a refinement with each further shape of `boards`, simplest first, which is minus the bias due to
+    the simpler shape. The step expected from noise is subtracted (in chi-square). The second item is the largest of
+    these shifts, in sigmas of the parameters.
     """
     problem, s1 = refinement.problem, refinement.problem.stereo_basis.shape[1]
     sigma = np.sqrt(inflation * np.diag(refinement.normal.covariances()[0])[:s1])
@@ -99,7 +97,7 @@ def shape_left_out(
 
 
 def _over_the_board(nominal: Array, heights: Array) -> Array:
-    """Heights (n, k) of smooth shapes at the corners, continued to the outer edge of the squares beyond them."""
+    """Heights (n, k) of smooth shapes at the corners, extrapolated to the outer edge of the outer squares."""
     x, y = (nominal - nominal.mean(0))[:, :2].T
 
     def terms(x: Array, y: Array) -> Array:
@@ -113,14 +111,14 @@ def _over_the_board(nominal: Array, heights: Array) -> Array:
 
 
 def on_the_table(nominal: Array, shape: BoardShape) -> Array:
-    """(3,) [m] of the world's origin above the table by one declared thickness, in the axes of a board of this shape.
+    """(3,) [m] point one declared thickness above the world's origin, in the axes of a board of this shape.
 
-    Below its corner 0, which a stretch has moved, and where its lowest parts are.
+    It is below corner 0, which a stretch moves, at the height of the lowest parts of the printed face.
     """
     if not shape.refined:
         return np.zeros(3)
     middle = nominal.mean(0)
-    x, y = -0.5 * shape.stretch, 0.5 * shape.stretch  # of the middle against its corner 0
+    x, y = -0.5 * shape.stretch, 0.5 * shape.stretch  # of the middle relative to corner 0
     return np.array([x * middle[0], y * middle[1], -shape.lift])
 
 
@@ -132,11 +130,11 @@ def with_tolerances(
     tolerances: BoardTolerances,
     shape: BoardShape,
 ) -> StereoRig:
-    """The rig with what the board's sizes may be off by in its covariance, and listed by cause.
+    """The rig with the tolerances of the board's sizes added to its covariance, and listed by cause.
 
-    A board that is larger by s makes every length longer: t -> (1 + s) t, cameras and world alike. One that is longer
-    along one side than was seen has its corner 0, the world's origin, elsewhere. One that is bent or thicker lifts the
-    table, or turns it about the board's middle by flatness / half its side.
+    A board larger by s scales all lengths: t -> (1 + s) t, for cameras and world. A further stretch of one side moves
+    corner 0, the world's origin. A bent or thicker board shifts the table in z, or tilts it about the board's middle by
+    flatness / half its side.
 
     nominal : (n, 3) [m] corners in board axes, whose origin the world has, and whose x and y
     """
@@ -170,7 +168,7 @@ def with_tolerances(
         allow(THICKNESS, thickness * R[:, 2])
         allow(FLATNESS, flatness * R[:, 2])
         for axis, across in ((0, [0.0, -1.0, 0.0]), (1, [1.0, 0.0, 0.0])):
-            # turned about the board's other side, so that z grows along this one; the middle stays where it is
+            # rotation about the board's other side, so that z increases along this one; the middle is fixed
             slope = flatness / half[axis]
             allow(FLATNESS, -slope * middle[axis] * R[:, 2], turn=slope * R @ across)
     D = np.reshape([a.shift for a in found], (-1, N_RIG))
@@ -196,20 +194,20 @@ def rig_with_covariance(
     """The rig at the minimum, its world on the table of one view, with the covariance of all RIG_PARAMETERS.
 
     inflation : factor on the covariance that follows from the points' noise
-    origin : (3,) [m] that lies one thickness above the world's, in board axes; corner 0 without
-    stereo : covariance of the free stereo parameters where it is known better, see `assessment.stereo_covariance`
+    origin : (3,) [m] point one thickness above the world's origin, in board axes; by default corner 0
+    stereo : better estimate of the covariance of the free stereo parameters, see `assessment.stereo_covariance`
     """
     model, basis = refinement.model, refinement.problem.stereo_basis
     n_free, rig = basis.shape[1], model.rig
     shared, poses, cross = refinement.normal.covariances()
-    view, M = table_view or 0, np.zeros((6, 6))  # d world / d pose of the board; without a table nothing is told of it
+    view, M = table_view or 0, np.zeros((6, 6))  # d world / d pose of the board; zero without a table
     free, shifted = shared[:n_free, :n_free], cross[view, :n_free, :6]  # of the pose at the left camera's exposure
-    follows = np.linalg.solve(free, shifted).T  # how the pose follows the stereo parameters
+    follows = np.linalg.solve(free, shifted).T  # derivative of the pose by the stereo parameters
     if table_view is not None:
         R, t = model.R_left_board[table_view, 0], model.t_left_board[table_view, 0]
         R_left_world, t_left_world = table_pose(R, t if origin is None else t + R @ origin, board_thickness)
         rig = replace(rig, R_left_world=R_left_world, t_left_world=t_left_world, world_is_table=True)
-        # t_world = t - h R k: turning R by v shifts it by -v x (h R k) = (h R k) x v
+        # t_world = t - h R k: a rotation v of R shifts it by -v x (h R k) = (h R k) x v
         M = np.eye(6)
         M[3:, :3] = np.cross(board_thickness * R[:, 2], np.eye(3)).T
     by_stereo = np.concatenate([basis, M @ follows])

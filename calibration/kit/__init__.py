@@ -1,1 +1,1 @@
-"""What all modules of both packages use: array types, errors, least squares, short views, grey and stuck pixels."""
+"""Tools of both packages: array types, errors, arguments, least squares, compiled functions, grey and stuck pixels."""

@@ -1,4 +1,4 @@
-"""Compiled solution of small symmetric equations, for the loops of both packages."""
+"""Compiled solution of small symmetric systems, for the loops of both packages."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from calibration.kit.compiled import part
 
 @part
 def substitute(L, x):  # type: ignore[no-untyped-def]
-    """Replace x by the solution of L L^T x = x for a Cholesky factor L (lower triangle)."""
+    """Replace the right-hand side x by (L L^T)^-1 x for a Cholesky factor L (lower triangle)."""
     n = L.shape[0]
     for i in range(n):
         s = x[i]
@@ -25,9 +25,9 @@ def substitute(L, x):  # type: ignore[no-untyped-def]
 
 @part
 def solve_in_place(M, x):  # type: ignore[no-untyped-def]
-    """Solve the symmetric positive definite M x = x by Cholesky; False where M (lower triangle) is not so.
+    """Replace x by M^-1 x for symmetric M (lower triangle) by Cholesky; False if M is not positive definite.
 
-    M becomes its factor.
+    M is replaced by its factor.
     """
     for i in range(M.shape[0]):
         for j in range(i + 1):

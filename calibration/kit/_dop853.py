@@ -1,8 +1,8 @@
 """Runge-Kutta method of order 8 with dense output of order 7, compiled (coefficients: SciPy's DOP853).
 
-Hairer, Norsett & Wanner, Solving Ordinary Differential Equations I, sections II.5 and II.6. One step and the polynomial
-through it: how long it is, and what else ends it, is for whoever integrates. Numbers are real, or complex where
-imaginary parts carry derivatives.
+Hairer, Norsett & Wanner, Solving Ordinary Differential Equations I, sections II.5 and II.6. This is one step and the
+polynomial through it; step size control and events are left to the caller. Numbers are real, or complex if imaginary
+parts carry derivatives.
 """
 
 from typing import NamedTuple
@@ -13,7 +13,7 @@ from scipy.integrate import DOP853
 from calibration.kit.arrays import Numbers
 from calibration.kit.compiled import exact_part
 
-N = DOP853.n_stages  # 12; stage 12 is the rate at the end of the step, stages 13 to 15 serve the dense output
+N = DOP853.n_stages  # 12; stage 12 is the rate at the end of the step, stages 13 to 15 are for the dense output
 A = np.zeros((N + 4, N + 4))
 A[:N, :N] = DOP853.A[:N, :N]
 A[N + 1 :] = DOP853.A_EXTRA
@@ -22,17 +22,17 @@ B, E3, E5, D = (np.ascontiguousarray(a) for a in (DOP853.B, DOP853.E3, DOP853.E5
 
 
 class Step(NamedTuple):
-    """Room for what makes up a step."""
+    """Work arrays of a step."""
 
     K: Numbers  # (16, n or more) rates at the stages
-    F: Numbers  # (7, n) of the polynomial through the step
-    stage: Numbers  # (n,) at the last stage: a second estimate of ...
-    end: Numbers  # (n,) ... where the step ends
+    F: Numbers  # (7, n) coefficients of the polynomial through the step
+    stage: Numbers  # (n,) state at the last stage: a second estimate of ...
+    end: Numbers  # (n,) ... the state at the end of the step
 
 
 @exact_part
 def room(y: Numbers, width: int) -> Step:
-    """For states (n,) whose rates come with other numbers, `width` in all."""
+    """Work arrays for states (n,) if the function of rates writes `width` numbers."""
     return Step(np.zeros((N + 4, width), y.dtype), np.zeros((7, y.size), y.dtype), y.copy(), y.copy())
 
 
@@ -50,8 +50,8 @@ def method(rates):
     """`step(system, own, t, y, h, made)` and `polynomial(...)` for rates(t, y, out, system, own).
 
     `rates` is a compiled function; it writes the rate of y (n,) into the first n numbers of `out`.
-    step : K[1] to K[11] of a step from y, whose rate is K[0], and its end
-    polynomial : F, once the rate at the step's end is in K[12]; the last stages are worked out for it, and `stage` used
+    step : sets K[1] to K[11] of a step from y, whose rate is K[0], and its end
+    polynomial : sets F, with the rate at the step's end in K[12]; computes the last stages, and overwrites `stage`
     """
 
     @exact_part
@@ -82,7 +82,7 @@ def method(rates):
 
 @exact_part
 def along(F: Numbers, y: Numbers, x: complex, out: Numbers) -> None:
-    """The step's polynomial at the part x of it, by nested factors x, 1 - x, x, ..."""
+    """The step's polynomial at the fraction x of the step, by nested factors x, 1 - x, x, ..."""
     for k in range(y.size):
         total = 0.0 * F[0, k]
         for i in range(7):

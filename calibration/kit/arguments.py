@@ -1,8 +1,8 @@
-"""What the public functions are given: taken where it makes sense, refused at once where it does not.
+"""Conversion and check of the arguments of public functions, from their annotations.
 
-`checked` reads annotations. An object of the packages may be given as the file that holds it, or as a result that
-carries it: a class names its reader in `read_by`, and the attribute that holds it elsewhere in `held_as`. A number has
-the unit and the range of its `Range`. What an annotation says beyond that is left to the function.
+An object of the packages may be given as the file that contains it, or as a result that contains it: its class states
+the reader in `read_by`, and the attribute of other results in `held_as`. A number has the unit and the bounds of its
+`Range`. Other conditions are checked by the functions.
 """
 
 import functools
@@ -40,17 +40,17 @@ class Range:
         return f"a number from {self.least:g}{most}, in {self.unit}"
 
     def take(self, number: Numbers) -> Numbers:
-        """What was given. Raises ValueError."""
+        """The number, unchanged. Raises ValueError."""
         if not np.all(np.isfinite(number) & (self.least <= number) & (number <= self.most)):
             raise ValueError
         return number
 
 
-FrameRate = Annotated[float, Range("Hz", 1e-3, 1e8)]  # beyond what any camera does
+FrameRate = Annotated[float, Range("Hz", 1e-3, 1e8)]  # more than any camera has
 Seconds = Annotated[float, Range("s", 1e-6)]
 Gravity = Annotated[float, Range("m/s^2", 1e-3, 100.0)]
 Thickness = Annotated[float, Range("m", 0.0, 1.0)]
-Length = Annotated[float, Range("m", 1e-12, 10.0)]  # a disc may be as thin as theory has it
+Length = Annotated[float, Range("m", 1e-12, 10.0)]  # a disc may be as thin as in theory
 Mass = Annotated[float, Range("kg", 1e-6, 1e4)]
 Density = Annotated[float, Range("kg/m^3", 0.0, 1e3)]
 Threads = Annotated[int, Range("threads", 1, 10_000)]
@@ -58,7 +58,7 @@ Times = Annotated[ArrayLike, Range("s")]
 
 
 def checked(target: T) -> T:
-    """A function, or a class when it is made, with arguments as its annotations want them. Raises ArgumentError."""
+    """A function or class whose arguments are converted to their annotations. Raises ArgumentError."""
     if isinstance(target, type):
         target.__init__ = checked(target.__init__)  # type: ignore[misc]
         return cast("T", target)
@@ -82,7 +82,7 @@ def checked(target: T) -> T:
 
 @functools.cache
 def _hints(function: Callable[..., Any]) -> dict[str, Any]:
-    """Annotations of the parameters that stand for one value."""
+    """Annotations of the parameters that take one value."""
     hints = get_type_hints(function, include_extras=True)
     several = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
     parameters = inspect.signature(function).parameters.items()
@@ -97,11 +97,11 @@ def _as(value: Any, kind: Any, name: str) -> Any:
 
 
 def _fit(value: Any, kind: Any) -> Any:
-    """The value as the kind. Raises TypeError, ValueError."""
+    """The value converted to the kind. Raises TypeError, ValueError."""
     return value if isinstance(kind, type) and type(value) is kind else _rule(kind)[0](value)
 
 
-Rule = tuple[Callable[[Any], Any], str]  # how a value is taken (TypeError, ValueError), and what is expected, in words
+Rule = tuple[Callable[[Any], Any], str]  # converter (raises TypeError, ValueError), and what is expected, in words
 
 
 @functools.cache
@@ -132,15 +132,15 @@ def _rule(kind: Any) -> Rule:
 
 
 def _first_that_fits(value: Any, options: tuple[Any, ...]) -> Any:
-    """The value as the first of several kinds that it fits."""
-    for option in sorted(options, key=lambda option: type(value) is not option):  # before what it may stand for
+    """The value converted to the first of several kinds that is possible."""
+    for option in sorted(options, key=lambda option: type(value) is not option):  # its own type first
         with suppress(TypeError, ValueError):
             return _fit(value, option)
     raise TypeError
 
 
 def _collection(value: Any, kind: type, parts: tuple[Any, ...]) -> Any:
-    """A collection with members that fit; an array is one, text is none."""
+    """A collection with converted members; an array is a collection, text is not."""
     if kind is tuple and parts[-1] is not ...:
         if not isinstance(value, tuple | list):
             raise TypeError
@@ -157,7 +157,7 @@ def _collection(value: Any, kind: type, parts: tuple[Any, ...]) -> Any:
 
 
 def _object(value: Any, kind: type) -> Any:
-    """An object of a class, or what stands for it."""
+    """An object of a class, also from its file or from a result that contains it."""
     if getattr(kind, "_is_protocol", False) or isinstance(value, kind):
         return value
     if (reader := getattr(kind, "read_by", "")) and isinstance(value, str | os.PathLike):
@@ -169,7 +169,7 @@ def _object(value: Any, kind: type) -> Any:
 
 
 def _of(*kinds: type, into: Callable[[Any], Any] = lambda value: value) -> Callable[[Any], Any]:
-    """A value of one of these types; True is no number."""
+    """Converter for a value of one of these types; True is no number."""
 
     def taken(value: Any) -> Any:
         if not isinstance(value, kinds) or (isinstance(value, bool | np.bool_) and bool not in kinds):
@@ -206,9 +206,9 @@ def _short(value: Any) -> str:
 
 
 def grey_values(image: Any, name: str) -> NDArray[Any]:
-    """An image or many, of any real type, as uint8 or uint16: fractions of 1 as 65535ths, other numbers rounded.
+    """One or more images of any real type as uint8 or uint16: fractions of 1 are scaled by 65535, others rounded.
 
-    Raises ArgumentError where a value is none, negative, or above 65535.
+    Raises ArgumentError if a value is NaN, negative, or above 65535.
     """
     pixels = np.asarray(image)
     if pixels.dtype in (np.uint8, np.uint16):

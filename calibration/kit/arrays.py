@@ -1,4 +1,4 @@
-"""Types of the arrays that both packages speak of."""
+"""Array types of both packages."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-Numbers = NDArray[np.inexact[Any]]  # real, or complex where imaginary parts carry derivatives
+Numbers = NDArray[np.inexact[Any]]  # real, or complex if imaginary parts carry derivatives
 Array32 = NDArray[np.float32]
-Image = NDArray[np.uint8] | NDArray[np.uint16]  # one image or a stack of them, as a camera gives it
+Image = NDArray[np.uint8] | NDArray[np.uint16]  # one image or a stack, as a camera records it
 
 
 def robust_sigma(values: NDArray[np.floating]) -> float:
-    """Standard deviation by the median absolute deviation, which a few wild values do not change."""
+    """Standard deviation from the median absolute deviation, robust against outliers."""
     return 1.4826 * float(np.median(np.abs(values - np.median(values))))
 
 
 def evenly(n: int, most: int) -> list[int]:
-    """Numbers of at most `most` of n things, evenly over them."""
+    """Indices of at most `most` of n items, evenly spaced."""
     return sorted({round(i) for i in np.linspace(0, n - 1, min(n, most))})

@@ -1,4 +1,4 @@
-"""How results show themselves: a few facts on one line, or as a small table in a notebook."""
+"""Short representation of results: a few facts on one line, or a small table in a notebook."""
 
 from collections.abc import Mapping
 from enum import Enum
@@ -21,12 +21,12 @@ def ranges(numbers: ArrayLike) -> str:
 
 
 class Brief:
-    """A result that is shown by a few facts. Dataclasses that inherit it take `repr=False`."""
+    """A result with a short representation. Dataclasses that inherit it need `repr=False`."""
 
     def facts(self) -> Mapping[str, str]:
-        """What a glance should tell, heading -> value with its unit: here all that the result holds.
+        """Main results, heading -> value with its unit; by default all fields.
 
-        Numbers and words as they are, arrays by their shape, parts by their name; what holds nothing is left out.
+        Numbers and words unchanged, arrays by their shape, parts by their name; empty fields are left out.
         """
         shown = {name: _outlined(value) for name, value in vars(self).items()}
         return {name: text for name, text in shown.items() if text}
@@ -39,7 +39,7 @@ class Brief:
         return f"<table><caption>{type(self).__name__}</caption>{rows}</table>"
 
 
-LONGEST = 60  # characters of a word that is shown whole
+LONGEST = 60  # characters of a text that is shown whole
 
 
 def _outlined(value: Any) -> str:

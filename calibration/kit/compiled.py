@@ -1,8 +1,8 @@
-"""numba for both packages, and where its machine code is kept: compiled when first asked for, loaded from then on.
+"""numba for both packages, with its cache: functions are compiled at the first call, and loaded afterwards.
 
-numba looks at a function's own file alone to tell whether what it kept still holds. Some functions here call those of
-other files (the renderer's raster, the fit of poses, helpers of the effects' laws), so machine code lies in a folder
-that is named after the contents of every file with compiled functions: other sources, another folder.
+To validate its cache, numba looks only at the file of a function. Some functions call those of other files (the
+renderer's raster, the fit of poses, helpers of the effects' laws), so the cache is in a folder named by a hash of all
+files with compiled functions.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from filelock import FileLock
 from numba.core import event
 
 T = TypeVar("T")
-njit: Any = numba.njit  # types of a decorated function say nothing of how it is called
+njit: Any = numba.njit  # a decorated function has other types than its source
 cfunc: Any = numba.cfunc
 config: Any = numba.config
-# No NaN is ever tested inside these sums, so the fast floating-point rules change the last digit only.
+# These functions never test for NaN, so the fast floating-point rules change the last digits only.
 RULES: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": {"contract", "arcp", "nsz", "reassoc"}}
-# Called from compiled code, always inlined: of a function that is not, two copies may be optimised differently (its own
-# and its caller's), and which of them runs would depend on whether the code was compiled now or loaded.
+# Called from compiled code, always inlined: otherwise two copies (its own and its caller's) may be optimised
+# differently, and which of them runs would depend on whether the code was just compiled or loaded.
 part: Any = njit(**RULES, no_cpython_wrapper=True, no_cfunc_wrapper=True, forceinline=True)
-# Called from compiled code, too, without fast rules and not forced inline: what is integrated over thousands of steps.
+# Called from compiled code, without fast rules and not forced inline: for integrations over thousands of steps.
 exact_part = njit(error_model="numpy", nogil=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 
 WITH_COMPILED = (
@@ -40,15 +40,15 @@ WITH_COMPILED = (
 
 
 def _folder() -> Path:
-    """In the folder of NUMBA_CACHE_DIR, else beside the packages, else in the user's cache."""
+    """Folder in NUMBA_CACHE_DIR, else next to the packages, else in the user's cache."""
     home, sources = Path(__file__).parents[2], sha256()
     for file in sorted({file for pattern in WITH_COMPILED for file in home.glob(pattern)}):
         sources.update(file.read_bytes())
-    beside = Path(__file__).parent / "__pycache__"
+    local = Path(__file__).parent / "__pycache__"
     if config.CACHE_DIR:
         kept = Path(config.CACHE_DIR)
-    elif os.access(beside if beside.is_dir() else beside.parent, os.W_OK):
-        kept = beside
+    elif os.access(local if local.is_dir() else local.parent, os.W_OK):
+        kept = local
     else:
         kept = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "disctrack"
     return kept / f"compiled-{sources.hexdigest()[:16]}"
@@ -61,18 +61,18 @@ config.CACHE_DIR = str(FOLDER)
 def compiled(
     decorator: Callable[..., Callable[..., T]], signature: object, function: Callable[..., None], **rules: bool
 ) -> T:
-    """A function compiled for one signature; its machine code is kept where the function is in a file."""
+    """A function compiled for one signature; its machine code is cached if the function is in a file."""
     # error_model: a division by zero gives inf or nan, as in NumPy; the integrator then refuses the step
     try:
         return decorator(signature, cache=True, error_model="numpy", **rules)(function)
-    except RuntimeError:  # numba: "no locator available": typed at a prompt, or no file can be written
+    except RuntimeError:  # numba: "no locator available": defined at a prompt, or the folder is not writable
         return decorator(signature, error_model="numpy", **rules)(function)
 
 
 def function_of(text: str, name: str, names: dict[str, object]) -> Callable[..., None]:
-    """The function of this name in a text that the caller has checked.   names : what the text may use
+    """The function of this name in a text that the caller has checked.   names : global names of the text
 
-    Of a function that is in no file numba keeps no machine code, so the text gets one where that can be written.
+    The text is written to a file if possible, as numba caches only functions from files.
     """
     file = FOLDER / "texts" / sha256(text.encode()).hexdigest()[:16]
     with suppress(OSError):
@@ -97,12 +97,12 @@ class _BeforeCompiling(event.Listener):
 
 @contextmanager
 def one_at_a_time(tell: Callable[[], None] = lambda: None, what: str = "") -> Iterator[None]:
-    """Hold a lock while functions are compiled or loaded: of many processes one compiles, the others load its code.
+    """Hold a lock while functions are compiled or loaded: one of several processes compiles, the others load its code.
 
-    `tell` is called before whatever is compiled, and not where all is loaded; `what` has a lock of its own.
+    `tell` is called before compiling, and not if everything is loaded; each `what` has its own lock.
     """
     lock = FileLock(FOLDER / f"{what}.lock", is_singleton=True)
-    with suppress(OSError, NotImplementedError):  # a file system without locks: each compiles for itself
+    with suppress(OSError, NotImplementedError):  # a file system without locks: every process compiles
         FOLDER.mkdir(parents=True, exist_ok=True)
         lock.acquire()
     try:

@@ -1,13 +1,13 @@
-"""What can go wrong, as classes a caller can tell apart.
+"""Classes of errors.
 
-Every message says which file, frame or camera, what was found, what was expected and what to do.
+Every message states the file, frame or camera, what was found, what was expected and what to do.
 """
 
 
 class DiscTrackError(Exception):
     """Base of every error this distribution raises on purpose.
 
-    It lives here, not in `disctrack`, because imports point from `disctrack` to `calibration` only.
+    It is defined here, not in `disctrack`, because `calibration` never imports `disctrack`.
 
         >>> try:
         ...     read_recording("nowhere")
@@ -18,12 +18,12 @@ class DiscTrackError(Exception):
 
 
 class ArgumentError(DiscTrackError, TypeError, ValueError):
-    """A function was given something else than it takes."""
+    """An argument of a function is not valid."""
 
 
 class CalibrationError(DiscTrackError):
-    """The cameras cannot be calibrated from what was given."""
+    """The cameras cannot be calibrated from the given data."""
 
 
 class RigFileError(DiscTrackError):
-    """A rig file cannot be read, or does not hold a stereo rig."""
+    """A rig file cannot be read, or does not contain a stereo rig."""

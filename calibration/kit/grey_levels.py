@@ -1,25 +1,25 @@
-"""What the grey values of an image can be: their step, their full scale, and where pixels saturate.
+"""Grey levels of images: step, full scale, saturation, and the pattern of a colour filter.
 
-A camera of 12 bits writes files of 16 bits, with the values as they are or shifted to the upper end; an 8-bit image may
-have been multiplied by 257. The step between neighbouring values is what rounding costs, and it is the unit in which
-images of any depth look alike. A sensor with a colour filter writes grey values, too, in a pattern of 2 x 2 gains.
+A camera of 12 bits writes files of 16 bits, with unchanged values or shifted to the upper end; an 8-bit image may have
+been multiplied by 257. The step between neighbouring values sets the rounding error, and is the natural unit of grey
+values. A sensor with a colour filter may also write grey images, with a pattern of 2 x 2 gains.
 """
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-# Fewer different values than this may share a factor by chance.
+# Number of different values below which they may share a factor by chance.
 _ENOUGH_LEVELS = 16
-# At the saturation level pixels pile up: so many times more of them than at any of the levels just below.
+# Ratio of the number of pixels at the saturation level to that at any of the levels just below.
 _PILE, _PILE_PIXELS = 8, 30
-# Gains of neighbouring pixels that differ by more are a colour filter: odd and even rows of one sensor by a few 0.1 %,
-# light that falls off by a half across the image, by less than 0.1 %.
+# Difference of gains of neighbouring pixels, above which they indicate a colour filter: odd and even rows of a sensor
+# differ by a few 0.1 %, illumination that halves across the image gives less than 0.1 %.
 _MOSAIC = 0.02
 
 
 def level_step(image: NDArray) -> int:
-    """Largest whole number that divides all grey values of an image; 1 for 8-bit images and for those of few levels."""
+    """Greatest common divisor of the grey values of an image; 1 for 8-bit images and for those with few levels."""
     if image.dtype != np.uint16:
         return 1
     values = np.flatnonzero(np.bincount(image.reshape(-1), minlength=2))
@@ -28,7 +28,7 @@ def level_step(image: NDArray) -> int:
 
 
 def full_scale(image: NDArray) -> int:
-    """Largest grey value of the camera that took an image: of 8 bits, or of as few more as the image needs."""
+    """Largest grey value of the camera, with the fewest bits, but at least 8, that the image needs."""
     if image.dtype == np.uint8:
         return 255
     step = level_step(image)
@@ -37,7 +37,7 @@ def full_scale(image: NDArray) -> int:
 
 
 def _counts(images: NDArray) -> NDArray[np.int64]:
-    """How many pixels have each grey value, up to the largest."""
+    """Number of pixels with each grey value, up to the largest."""
     bins = int(images.max()) + 1 if images.size else 1  # cv2 is ten times as fast as bincount, and counts in singles
     counts = np.zeros(bins, np.int64)
     for image in np.atleast_2d(images).reshape(-1, *np.atleast_2d(images).shape[-2:]):
@@ -46,10 +46,10 @@ def _counts(images: NDArray) -> NDArray[np.int64]:
 
 
 def saturation_level(images: NDArray) -> int | None:
-    """Grey value at which pixels saturate, where it shows: the largest, if it is full scale or pixels pile up there.
+    """Grey value at which pixels saturate: the largest, if it is full scale or has far more pixels than those below.
 
-    images : any shape, uint8 or uint16; several images of a recording together show it sooner. None where it does not
-    show: then nothing is clipped, or nearly nothing.
+    images : any shape, uint8 or uint16; better detected in several images of a recording. None if it is not detected:
+    then hardly any pixel is saturated.
     """
     counts = _counts(images)
     levels = np.flatnonzero(counts)
@@ -61,10 +61,10 @@ def saturation_level(images: NDArray) -> int | None:
 
 
 def mosaic_gains(images: NDArray) -> NDArray | None:
-    """(2, 2) gains, of mean 1, of the pixels at even and odd rows and columns where a colour filter sets them apart.
+    """(2, 2) gains, with mean 1, of pixels in even and odd rows and columns, if they indicate a colour filter.
 
     images : (n, height, width) of a grey scene, uint8 or uint16. The gains are medians over the lighter half of each
-    image. None where any two images tell of different patterns, or of none.
+    image. None if any two images have different patterns, or have no pattern.
     """
     found = []
     for image in images:
@@ -75,7 +75,7 @@ def mosaic_gains(images: NDArray) -> NDArray | None:
         if not light.any():
             return None
         found.append([[np.median(plane[light] / mean[light]) for plane in row] for row in planes])
-        if np.ptp(found[-1]) < 0.25 * _MOSAIC:  # a filter shows in every image
+        if np.ptp(found[-1]) < 0.25 * _MOSAIC:  # a filter is visible in every image
             return None
     if not found:
         return None

@@ -1,15 +1,15 @@
-"""Least squares with numbers that all data share, and numbers that each block of data has of its own.
+"""Least squares with shared parameters and parameters of single blocks of data (here called own).
 
     chi-square(s, p_1, ..., p_n) = sum_b |r_b - C_b s - P_b p_b|^2 + priors
 
-The own numbers p_b are eliminated block by block (Schur's complement; Triggs et al. 2000, Bundle Adjustment: A Modern
-Synthesis, section 6), so that a problem costs as much as there are blocks, not as their third power. Two ways:
+The own parameters p_b are eliminated block by block (Schur complement; Triggs et al. 2000, Bundle Adjustment: A Modern
+Synthesis, section 6), so that the cost is linear in the number of blocks, not cubic. There are two ways:
 
 - `Normal`: the normal equations of thousands of small blocks at once, and Levenberg-Marquardt on them (`minimise`).
-- `eliminate`: the rows of one block by QR, which does not square the condition and keeps what a block leaves open.
+- `eliminate`: QR of the rows of one block; does not square the condition number, and finds undetermined directions.
 
-Everywhere residuals are observed minus predicted, in standard deviations, and derivatives are those of the prediction.
-Robust weights are for whoever linearises: rows times the root of the weight, and the loss itself as the cost.
+Residuals are observed minus predicted, in standard deviations; derivatives are those of the prediction. Robust weights
+are applied by the caller: rows times the square root of the weight, and the loss itself as the cost.
 """
 
 from __future__ import annotations
@@ -23,44 +23,44 @@ import scipy
 
 from calibration.kit.arrays import Array
 
-# Of chi-square: a thousandth of a sigma. Rounding hides so much where no step is taken any more: chi-square is a sum of
-# squared differences of pixels that are a million times as large.
+# Rounding error of chi-square, a thousandth of a sigma: it is a sum of squared differences of pixel coordinates that
+# are a million times as large.
 ROUNDED_AWAY = 1e-6
-UNDETERMINED = 1e-12  # singular value over the largest, below which data do not determine a direction
-NEAR = 1e-3  # sigmas from a bound, within which a number stands at it
+UNDETERMINED = 1e-12  # singular value over the largest, below which a direction is undetermined
+NEAR = 1e-3  # sigmas from a bound, within which a parameter is at the bound
 
 
 @dataclass(frozen=True)
 class Normal:
-    """Normal equations of one linearisation: k own numbers of each of n blocks, and s shared ones.
+    """Normal equations of one linearisation: k own parameters of each of n blocks, and s shared ones.
 
-    Everything is products of whitened rows [own | shared | residual]: information, gradient and chi-square in one.
-    An own number that no data of its block show stays where it is, as if it were known to one of its units.
+    They are products of whitened rows [own | shared | residual], which contain information, gradient and chi-square.
+    An own parameter on which no data of its block depend is fixed, with a variance of 1.
     """
 
     products: Array  # (n, k + s + 1, k + s + 1) of each block's data
     k: int
-    costs: Array  # (n,) chi-square, or whatever loss takes its place; inf where there is no prediction
-    prior: Array  # (s + 1, s + 1) [shared | residual] of what is known beforehand, its loss in the place of chi-square
+    costs: Array  # (n,) chi-square, or a robust loss; inf without a prediction
+    prior: Array  # (s + 1, s + 1) [shared | residual] of the prior, with its loss in the place of chi-square
 
     @property
     def cost(self) -> float:
-        """Of all blocks and the prior; inf where a prediction failed."""
+        """Sum over all blocks and the prior; inf if a prediction failed."""
         return float(self.costs.sum() + self.prior[-1, -1])
 
     def own_held(self, damping: float = 0.0) -> Array:
-        """(n, k, k) of the own numbers, with a one on the diagonal where no data show a number."""
+        """(n, k, k) information of the own parameters, with a one on the diagonal for those without data."""
         own = self.products[:, : self.k, : self.k]
         diagonal = np.einsum("nii->ni", own)
         held: Array = own + (damping * diagonal + (diagonal == 0.0))[..., None] * np.eye(self.k)
         return held
 
     def carried(self, damping: float = 0.0) -> Array:
-        """(n, k, s + 1) how the own numbers follow the shared ones, and their step at fixed shared ones."""
+        """(n, k, s + 1) response of the own parameters to the shared ones, and their step at fixed shared ones."""
         return np.asarray(np.linalg.solve(self.own_held(damping), self.products[:, : self.k, self.k :]), float)
 
     def eliminated(self, damping: float = 0.0, carried: Array | None = None) -> Array:
-        """(s + 1, s + 1) products of [shared | residual] with the prior, the own numbers at their best."""
+        """(s + 1, s + 1) products of [shared | residual] with the prior, with the own parameters eliminated."""
         carried, k = self.carried(damping) if carried is None else carried, self.k
         total = self.products[:, k:, k:].sum(0) + self.prior
         total[:-1, :-1] += damping * np.diag(np.diag(total)[:-1])
@@ -69,19 +69,19 @@ class Normal:
         return result
 
     def step(self, damping: float = 0.0) -> tuple[Array, Array]:
-        """Damped step of the shared numbers (s,) and of the own ones (n, k)."""
+        """Damped step of the shared parameters (s,) and of the own ones (n, k)."""
         carried = self.carried(damping)
         square = self.eliminated(damping, carried)
         step = scaled_solve(square[:-1, :-1], square[:-1, -1])
         return step, carried[..., -1] - carried[..., :-1] @ step
 
     def gain(self, shared: Array, own: Array) -> float:
-        """What an undamped step promises to take from the cost."""
+        """Predicted decrease of the cost by an undamped step."""
         gradient = self.products[:, self.k : -1, -1].sum(0) + self.prior[:-1, -1]
         return float(shared @ gradient + np.sum(own * self.products[:, : self.k, -1]))
 
     def covariances(self) -> tuple[Array, Array, Array]:
-        """Of the shared numbers (s, s), of each block's own (n, k, k), and between shared and own (n, s, k)."""
+        """Covariances of the shared parameters (s, s), of each block's own (n, k, k), and between both (n, s, k)."""
         carried = self.carried()
         information = self.eliminated(carried=carried)[:-1, :-1]
         shared = scaled_solve(information, np.eye(len(information)))
@@ -89,19 +89,19 @@ class Normal:
         return shared, np.linalg.inv(self.own_held()) - carried[..., :-1] @ cross, cross
 
     def shifts(self, first: int, common: Array | None = None) -> tuple[Array, Array, Array, Array]:
-        """What each block, left out in turn, says of the `first` shared numbers, each in units of a `scale`.
+        """Shifts of the `first` shared parameters if each block is left out in turn, in units of a `scale`.
 
         To first order the shift is H^-1 g_b with g_b the block's gradient at the common minimum; noise alone gives
-        E[g_b g_b^T] = H_b - H_b H^-1 H_b. The prior is no block, and part of H alone.
+        E[g_b g_b^T] = H_b - H_b H^-1 H_b. The prior is not a block, but part of H.
 
-        common : (n, s, s) covariance of what else the blocks' gradients contain, apart from their data's noise
+        common : (n, s, s) covariance of contributions to the blocks' gradients other than the noise of the data
         returns : shifts (n, first), the sum of the expected g_b g_b^T (s, s), H^-1 (s, first), and the scale (s,)
         """
         k = self.k
         squares = self.products[:, k:, k:] - np.swapaxes(self.products[:, :k, k:], 1, 2) @ self.carried()
         information, gradient = squares[:, :-1, :-1], squares[:, :-1, -1]
         total = information.sum(0) + self.prior[:-1, :-1]
-        scale = 1.0 / np.sqrt(np.diag(total))  # the numbers' units differ by 10^6
+        scale = 1.0 / np.sqrt(np.diag(total))  # the parameters' units differ by 10^6
         information, gradient = information * scale[:, None] * scale, gradient * scale
         inverse = np.linalg.inv(total * scale[:, None] * scale)
         expected = (information - information @ inverse @ information).sum(0)
@@ -114,29 +114,29 @@ class Normal:
         return gradient @ covariance, expected, covariance, scale
 
     def disagreement(self, first: int) -> float:
-        """Variance of the `first` shared numbers as the blocks disagree about them, over what noise predicts."""
+        """Variance of the `first` shared parameters from the scatter of blocks, over that predicted by noise."""
         shift, spread, covariance, _ = self.shifts(first)
-        metric = np.linalg.inv(covariance[:first])  # the others are nuisance: the shifts of the first ones only
+        metric = np.linalg.inv(covariance[:first])  # the others are nuisance parameters
         seen = float(np.einsum("ni,ij,nj->", shift, metric, shift))
         expected = float(np.sum(metric * (covariance.T @ spread @ covariance)))
         return seen / expected if expected > 0 else float("nan")
 
 
 def normal_of_rows(rows: Array, k: int) -> Normal:
-    """Normal equations of rows (n, m, k + s + 1): [own | shared | residual], zero where a block has fewer."""
+    """Normal equations of rows (n, m, k + s + 1): [own | shared | residual], padded with zeros."""
     products = np.swapaxes(rows, 1, 2) @ rows
     return Normal(products, k, products[:, -1, -1], np.zeros(2 * (rows.shape[-1] - k,)))
 
 
 def scaled_solve(A: Array, b: Array) -> Array:
-    """Solve A x = b after scaling A to a unit diagonal: the numbers' units differ by 10^6. LinAlgError if singular."""
+    """Solve A x = b after scaling A to a unit diagonal, as units differ by 10^6. LinAlgError if singular."""
     scale = 1.0 / np.sqrt(np.maximum(np.diag(A), 1e-300))
     columns = scale if b.ndim == 1 else scale[:, None]
     return np.linalg.solve(A * scale[:, None] * scale, b * columns) * columns
 
 
 def solve_each(A: Array, b: Array) -> Array:
-    """Argmin |A x - b| of each of many small systems (n, m, k) and (n, m, j): x (n, k, j)."""
+    """Argmin |A x - b| for each of many small systems (n, m, k) and (n, m, j): x (n, k, j)."""
     transposed = np.swapaxes(A, -1, -2)
     return np.asarray(np.linalg.solve(transposed @ A, transposed @ b), float)
 
@@ -146,11 +146,11 @@ Model = TypeVar("Model")
 
 @dataclass(frozen=True)
 class Minimum(Generic[Model]):
-    """Where Levenberg-Marquardt ended."""
+    """Result of Levenberg-Marquardt."""
 
     model: Model
     normal: Normal
-    iterations: int  # 0 where the start has no prediction
+    iterations: int  # 0 if the start has no prediction
     converged: bool
 
 
@@ -163,16 +163,16 @@ def minimise(
     damping: float = 1e-3,
     rough: bool = False,
 ) -> Minimum[Model]:
-    """Levenberg-Marquardt; converged when the cost to be gained by a full step is below tolerance x cost.
+    """Levenberg-Marquardt; converged if the predicted gain of a full step is below tolerance x cost.
 
-    The predicted gain g^T H^-1 g is free of the numbers' units, and a vanishing gradient is what it says.
+    The predicted gain g^T H^-1 g does not depend on units, and vanishes with the gradient.
 
-    stepped : the model after a step of the shared numbers (s,) and of the own ones (n, k)
-    rough : a step that gains less than the tolerance is taken unseen, and `normal` is the one before it: for those who
-        want the model alone
+    stepped : the model after a step of the shared parameters (s,) and of the own ones (n, k)
+    rough : a last step below the tolerance is taken without evaluation, and `normal` is that before it; for callers
+        that need the model alone
     """
     model, normal = start, linearise(start)
-    to_gain = np.inf  # by the last step that was hardly damped
+    to_gain = np.inf  # predicted at the last step with little damping
     if not np.isfinite(normal.cost):
         return Minimum(model, normal, 0, False)
     for iteration in range(1, iterations + 1):
@@ -198,9 +198,9 @@ def minimise(
 
 
 def triangle(matrix: Array) -> Array:
-    """R of the QR decomposition of a tall matrix (m, k), in pieces of rows that stay in the processor's cache.
+    """R of the QR decomposition of a tall matrix (m, k), in blocks of rows that fit in the processor's cache.
 
-    Its diagonal is positive: signs are open, and noise that is drawn for the rows would be another with other signs.
+    Its diagonal is made positive: otherwise the signs are arbitrary, and with them noise that is drawn for the rows.
     """
     m, k = matrix.shape
     piece = 8 * max(k, 1)
@@ -214,19 +214,19 @@ def triangle(matrix: Array) -> Array:
 
 @dataclass(frozen=True)
 class OwnNumbers:
-    """The own numbers (k) of one block, at the shared ones (s)."""
+    """The own parameters (k) of one block, given the shared ones (s)."""
 
     root: Array  # (k, r): root @ root.T is their covariance at given shared ones
-    open: Array  # (k, k - r) directions that nothing determines: no step goes along them
-    by_shared: Array  # (k, s) how their best values move with the shared ones
+    open: Array  # (k, k - r) undetermined directions, along which no step is made
+    by_shared: Array  # (k, s) derivative of their best values by the shared ones
     step: Array  # (k,) to their best values ...
-    gain: float  # ... by which chi-square falls
+    gain: float  # ... and the decrease of chi-square by it
 
 
 def eliminate(rows: Array, k: int) -> tuple[OwnNumbers, Array]:
-    """Own numbers of a block of rows (m, k + s + 1), [own | shared | residual], and the rows [shared | residual] left.
+    """Own parameters of a block of rows (m, k + s + 1), [own | shared | residual], and the reduced rows.
 
-    What is left is what the block says of the shared numbers at its best own ones, in k + s + 1 rows at most.
+    The reduced rows [shared | residual], at most k + s + 1, have the own parameters eliminated.
     """
     R = triangle(rows)
     head = R[:k, :k]
@@ -242,7 +242,7 @@ def eliminate(rows: Array, k: int) -> tuple[OwnNumbers, Array]:
 
 
 def solve_bounded(right: Array, matrix: Array, lower: Array, upper: Array) -> Array:
-    """Argmin |right - matrix x| with lower <= x <= upper; where directions are undetermined, the shortest x."""
+    """Argmin |right - matrix x| with lower <= x <= upper; the shortest x if directions are undetermined."""
     length = np.linalg.norm(matrix, axis=0)
     if length.size == 0:
         return np.zeros(0)
@@ -251,7 +251,7 @@ def solve_bounded(right: Array, matrix: Array, lower: Array, upper: Array) -> Ar
     x = np.asarray(np.linalg.lstsq(scaled, right, rcond=UNDETERMINED)[0] * scale, float)
     if bool(np.all((x >= lower) & (x <= upper))):
         return x
-    with np.errstate(invalid="ignore", over="ignore"):  # far from any solution products of large numbers overflow
+    with np.errstate(invalid="ignore", over="ignore"):  # far from a solution products of large numbers overflow
         bounds = (lower / scale, upper / scale)
         inside = scipy.optimize.lsq_linear(scaled, right, bounds, tol=1e-12)
         found = np.asarray(inside.x * scale, float)
@@ -261,10 +261,10 @@ def solve_bounded(right: Array, matrix: Array, lower: Array, upper: Array) -> Ar
 
 
 def covariance_within(matrix: Array, right: Array, x: Array, lower: Array, upper: Array) -> Array:
-    """Covariance of numbers about x, some of which stand at a bound; zero rows for those that nothing shows.
+    """Covariance of parameters about x, some of which are at a bound; zero rows for undetermined ones.
 
-    A number at a bound is not known to lie there: the data allow what a normal distribution leaves inside the bound
-    (its second moment about the bound), and whatever moves together with it is uncertain by that much more.
+    A parameter at a bound is still uncertain: its variance is the second moment about the bound of the normal
+    distribution truncated there, which also adds to the variance of correlated parameters.
     """
     k = len(x)
     covariance = np.zeros((k, k))
@@ -292,7 +292,7 @@ def covariance_within(matrix: Array, right: Array, x: Array, lower: Array, upper
 
 
 def _within_bound(beyond: float) -> float:
-    """Rms distance from a bound, of a normal number with mean `beyond` sigmas outside of it and known to lie inside."""
+    """Rms distance from a bound of a truncated normal variable, whose mean is `beyond` sigmas outside the bound."""
     t = max(beyond, 0.0)
     if t > 8.0:  # the exponential tail
         return float(np.sqrt(2.0) / t)
@@ -301,6 +301,6 @@ def _within_bound(beyond: float) -> float:
 
 
 def _covariance(matrix: Array) -> Array:
-    """Inverse of the normal matrix of rows (m, k); directions that are not determined get no variance."""
+    """Inverse of the normal matrix of rows (m, k); undetermined directions get zero variance."""
     known = eliminate(np.column_stack([matrix, np.zeros(len(matrix))]), matrix.shape[1])[0]
     return np.asarray(known.root @ known.root.T, float)

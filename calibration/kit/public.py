@@ -1,4 +1,4 @@
-"""Names of a package that are imported when they are first used: who asks for one does not wait for the others."""
+"""Lazy import of the public names of a package."""
 
 import ast
 from collections.abc import Callable
@@ -8,9 +8,9 @@ from typing import Any
 
 
 def imported_when_used(file: str) -> tuple[Callable[[str], Any], list[str]]:
-    """The package's `__getattr__` and its public names, from the imports `name as name` that its own file states.
+    """The package's `__getattr__` and its public names, from the imports `name as name` in its file.
 
-    They stand under TYPE_CHECKING, for type checkers, so that each name and its module are stated once.
+    These are under TYPE_CHECKING, for type checkers, so that each name and its module are stated once.
     """
     imports = [node for node in ast.walk(ast.parse(Path(file).read_bytes())) if isinstance(node, ast.ImportFrom)]
     module_of = {name.asname: str(node.module) for node in imports for name in node.names if name.asname}

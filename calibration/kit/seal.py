@@ -1,6 +1,6 @@
-"""A seal behind HDF5 files: damaged bytes, on which the HDF5 library may hang or crash, never reach it.
+"""A checksum at the end of HDF5 files, checked before reading: the HDF5 library may hang or crash on damaged files.
 
-HDF5 keeps its own length and takes no notice of what follows; where it writes to a file, it cuts that off.
+HDF5 stores its own length and ignores what follows; if it writes to a file, it cuts that off.
 """
 
 import io
@@ -18,7 +18,7 @@ def _seal(content: bytes | memoryview) -> bytes:
 
 
 def sealed(buffer: io.BytesIO) -> memoryview:
-    """A file in memory, with the checksum of all its bytes behind them."""
+    """A file in memory, with the checksum of all its bytes appended."""
     seal = _seal(buffer.getbuffer())
     buffer.seek(0, os.SEEK_END)
     buffer.write(seal)
@@ -26,7 +26,7 @@ def sealed(buffer: io.BytesIO) -> memoryview:
 
 
 def check_seal(path: Path) -> None:
-    """Raises ValueError where a sealed file has changed; OSError where it cannot be read."""
+    """Raises ValueError if a sealed file has changed; OSError if it cannot be read."""
     content, n = np.memmap(path, np.uint8, "r"), len(_seal(b""))
     end = content[-n:].tobytes()
     if end.startswith(_MARK) and end != _seal(content[:-n].data):

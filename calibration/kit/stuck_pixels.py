@@ -1,7 +1,7 @@
-"""Pixels of a sensor that do not see: hot, dead or stuck at a value, found in images of a scene that moves.
+"""Defective pixels of a sensor (hot, dead or stuck at a value), found in images of a moving scene.
 
-A dot or a corner is fitted to a thousand pixels; one that is off by half the range, at the same place in every image,
-pulls it by more than the noise of all others. Cameras replace such pixels by their neighbours; many do not.
+A dot or a corner is fitted to a thousand pixels; one pixel that is wrong by half the range, in every image, shifts it
+by more than the noise of all others. Some cameras replace such pixels by their neighbours; many do not.
 """
 
 from collections.abc import Sequence
@@ -13,21 +13,21 @@ from numpy.typing import NDArray
 
 from calibration.kit.arrays import Mask
 
-OFF = 0.12  # of the images' range, by which a pixel differs from the median of its neighbours in every image
-STEADY = 0.04  # of the range: it changes by no more than that, whatever passes
+OFF = 0.12  # of the images' range: least difference of a pixel from the median of its neighbours
+STEADY = 0.04  # of the range: largest change of a stuck pixel over the images
 MIN_IMAGES = 4
 MOST = 0.01  # of all pixels: more are a pattern of the scene
-PASSED = 0.3  # of the range, by which the light around a pixel changed: squares, or a board and what is behind it
-OFTEN = 0.3  # of the views, in which such a pixel differs from its neighbours
+PASSED = 0.3  # of the range: least change of the surroundings, by squares, or by a board and its background
+OFTEN = 0.3  # of the views: least fraction in which such a pixel differs from its neighbours
 
 
 def stuck_pixels(images: Sequence[NDArray] | NDArray, of_board: bool = False) -> Mask | None:
-    """True where a pixel of images, (height, width) or (height, width, channels), keeps its value and does not see.
+    """True for stuck pixels of images (height, width) or (height, width, channels).
 
-    That is one that is off its neighbours in all images. Of views of a board its squares are as dark as a dead pixel
-    and as light as a hot one, so that none differs from its neighbours in every view: it does OFTEN, and while the
-    light around it changes; a pixel of what rests behind the board may be left as it is by an edge that comes near.
-    None without any, or where so many are that they are the scene.
+    They are constant and differ from their neighbours in all images. In views of a board, squares are as dark as a
+    dead pixel and as light as a hot one, so a stuck pixel differs from its neighbours only OFTEN, while its
+    surroundings change; pixels of the background may be constant near an edge of the board.
+    None if there are none, or so many that they belong to the scene.
     """
     if len(images) < MIN_IMAGES:
         return None
@@ -44,15 +44,15 @@ def stuck_pixels(images: Sequence[NDArray] | NDArray, of_board: bool = False) ->
 
 
 def _changed(images: Sequence[NDArray] | NDArray) -> NDArray[np.int32]:
-    """By how much each pixel changes over the images."""
+    """Range of each pixel's values over the images."""
     return reduce(np.maximum, images).astype(np.int32) - reduce(np.minimum, images)
 
 
 def repaired_views(views: Sequence[NDArray], camera: str) -> tuple[list[NDArray], str]:
-    """One camera's views of a board with such pixels replaced in copies, and what is to be said of it ("": none).
+    """Copies of one camera's views of a board with stuck pixels replaced, and a warning ("": none).
 
-    views : grey (height, width) or colour (height, width, channels), of one size and type; each channel by itself.
-    Of a sensor under a colour filter each value is mixed from several pixels, and a blind one spreads a little.
+    views : grey (height, width) or colour (height, width, channels), of one size and type; channels are independent.
+    With a colour filter each value is interpolated from several pixels, so that a stuck one affects its neighbours.
     """
     first = views[0] if len(views) else np.zeros((0, 0))
     if any(view.shape != first.shape or view.dtype not in (np.uint8, np.uint16) for view in views) or first.ndim > 3:

@@ -1,7 +1,7 @@
-"""One thread for BLAS in our own hot parts, whoever calls them: a script, a notebook, a batch or the command line.
+"""One BLAS thread in the time-critical functions of both packages, for all callers.
 
-Their matrices are small. Threads that wait for each other's part of a small product cost more processor time than the
-product, and many times more on a busy machine.
+Their matrices are small: synchronising threads costs more processor time than the product, and many times more on a
+busy machine.
 """
 
 from __future__ import annotations
@@ -15,5 +15,5 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def one_blas_thread(function: Function) -> Function:
-    """The function, with one thread for linear algebra until it returns; the caller's own setting holds again then."""
+    """The function, with one thread for linear algebra until it returns; then the caller's setting is restored."""
     return cast(Function, threadpool_limits.wrap(limits=1, user_api="blas")(function))
