@@ -1,4 +1,4 @@
-"""Frames of one camera, whatever file they lie in: one small module per format, one interface."""
+"""Frames of one camera from files of any format: one small module per format, one interface."""
 
 from importlib import import_module
 from pathlib import Path
@@ -11,10 +11,10 @@ from disctrack.recording.readers.files import FORMATS, IMAGES, NUMBER, match_fil
 
 @checked
 def open_frames(pattern: str, folder: str | Path, camera: str) -> FrameReader:
-    """Reader of one camera's frames: a file pattern, relative to `folder`.
+    """Reader of one camera's frames.
 
-    pattern : `left/*.png`, `left.mkv`, `stack.tif`, or `frames.h5:/left` for a data set in an HDF5 file;
-        `left/*_{number}_a.png` where the names alone do not tell which digits count the frames
+    pattern : of files, relative to `folder`: `left/*.png`, `left.mkv`, `stack.tif`, or `frames.h5:/left` for a data
+        set in an HDF5 file; `left/*_{number}_a.png` if it is ambiguous which digits count the frames
     camera  : "left" or "right", for messages
     Raises RecordingError if nothing matches, or if no frame can be read.
 
@@ -30,6 +30,6 @@ def open_frames(pattern: str, folder: str | Path, camera: str) -> FrameReader:
     opener = getattr(import_module(f"disctrack.recording.readers.{module}"), f"open_{module}")
     reader: FrameReader = opener(files, camera, member) if member else opener(files, camera)
     reader.notes, reader.doubts = (
-        tuple(f"{camera} camera: {sentence}" for sentence in told) for told in (reader.notes, reader.doubts)
+        tuple(f"{camera} camera: {sentence}" for sentence in words) for words in (reader.notes, reader.doubts)
     )
     return reader

@@ -1,6 +1,6 @@
-"""Compiled loops over stored pixels: row filters of PNG, 10 and 12 bits without a gap, and the codes of LZW.
+"""Compiled loops over stored pixels: row filters of PNG, packed pixels of 10 and 12 bits, and codes of LZW.
 
-Bits lie with the most significant one first.
+The most significant bit comes first.
 """
 
 import numpy as np
@@ -10,7 +10,7 @@ from calibration.kit.compiled import njit
 
 
 def prepare() -> None:
-    """Compile what undoes the row filters of PNG, or load it."""
+    """Compile `undo_filters`, or load it from the cache."""
     undo_filters(np.frombuffer(bytes(2), np.uint8).reshape(1, 2), 1, np.empty((1, 1), np.uint8))
 
 
@@ -27,7 +27,7 @@ def undo_filters(rows: NDArray, pixel_bytes: int, out: NDArray) -> bool:  # prag
             for i in range(stride):
                 out[y, i] = rows[y, i + 1]
         elif kind == 1:
-            for lane in range(pixel_bytes):  # a sum in a register: reading what was just stored costs four times more
+            for lane in range(pixel_bytes):  # a sum in a register takes a quarter of the time of a stored one
                 total = np.uint8(0)
                 for i in range(lane, stride, pixel_bytes):
                     total = np.uint8(total + rows[y, i + 1])
@@ -81,19 +81,19 @@ def unpack_10(packed: NDArray, out: NDArray) -> None:  # pragma: no cover (compi
 
 @njit(nogil=True, cache=True)
 def lzw_codes_follow(packed: NDArray) -> bool:  # pragma: no cover (compiled)
-    """False where a code (TIFF 6.0, section 13) stands for a string that no code before it has made.
+    """False if a code (TIFF 6.0, section 13) refers to a string that is not in the table yet.
 
-    imagecodecs takes such a code at its word, and reads whatever lies in memory there.
+    imagecodecs does not check this, and would read arbitrary memory.
     """
-    follows, width, known, at = False, 9, 258, 0  # of the table: entries, and bits of a code
+    follows, width, known, at = False, 9, 258, 0  # known: entries of the table; width: bits of a code
     while at + width <= 8 * packed.size:
         code = 0
         for bit in range(at, at + width):
             code = 2 * code + ((packed[bit // 8] >> (7 - bit % 8)) & 1)
         at += width
-        if code == 257:  # the end
+        if code == 257:  # end of information
             return True
-        if code == 256:  # the table begins anew
+        if code == 256:  # clear table
             follows, width, known = False, 9, 258
             continue
         if code > known or (code > 255 and not follows):

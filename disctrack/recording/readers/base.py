@@ -1,4 +1,4 @@
-"""What all readers have in common; a format says where a frame lies, and how its bytes become grey values."""
+"""Common part of all readers; a format defines where a frame is stored, and how its bytes become grey values."""
 
 import hashlib
 from collections.abc import Callable, Iterator, Sequence
@@ -17,23 +17,23 @@ from disctrack.errors import RecordingError
 
 @dataclass(frozen=True)
 class CameraHeader:
-    """What a camera wrote beside its frames of one recording; None, or an empty text, where the file does not tell."""
+    """Header that a camera wrote for one recording; None, or empty text, for missing entries."""
 
-    file: str  # that holds the header
+    file: str  # that contains the header
     device: str  # make, model, number
     frame_rate: float  # [Hz] of the frames in the file
-    step: int  # one frame in so many of those recorded is in the file
+    step: int  # every step-th recorded frame is in the file
     exposure: float | None = None  # [s]
     trigger: str = ""  # trigger mode
-    first_frame: int | None = None  # the camera's own number of frame 0; trigger modes differ in what is counted from
+    first_frame: int | None = None  # the camera's number of frame 0; its origin depends on the trigger mode
     first_time: float | None = None  # [s] from the trigger to frame 0, by the camera's clock
     trigger_time: float | None = None  # [s] since 1970, UTC, by the camera's clock
-    locked_clock: bool = False  # to a common time signal (IRIG)
+    locked_clock: bool = False  # True if the clock follows a common time signal (IRIG)
     recorded: datetime | None = None  # by the clock of the camera or its computer
 
     @property
     def rate(self) -> str:
-        """Rate of the frames in the file, and how it came about."""
+        """Rate of the frames in the file, with the recording rate if only some frames were saved."""
         every = f" ({self.step * self.frame_rate:g} Hz, one frame in {self.step} saved)" if self.step > 1 else ""
         return f"{self.frame_rate:g} Hz{every}"
 
@@ -51,15 +51,15 @@ class CameraHeader:
         return ", ".join(part for part in parts if part)
 
     def as_dict(self) -> dict[str, object]:
-        """What the header says, of JSON's types, without the file's place."""
-        told = asdict(self) | {"recorded": self.recorded.isoformat() if self.recorded else None}
-        del told["file"]
-        return told
+        """Entries of the header in JSON types, without the file's path."""
+        entries = asdict(self) | {"recorded": self.recorded.isoformat() if self.recorded else None}
+        del entries["file"]
+        return entries
 
 
 @dataclass(eq=False, kw_only=True)
 class FrameReader:
-    """Frames of one camera in order. Opening it reads no more than headers; frames are read when asked for.
+    """Frames of one camera in order. Opening reads only headers; frames are read on request.
 
     `read` may be called from several threads at once.
 
@@ -69,22 +69,22 @@ class FrameReader:
     """
 
     camera: str  # left or right
-    files: Sequence[object]  # in which each frame lies, as messages name it
+    files: Sequence[object]  # file of each frame, for messages
     image_size: tuple[int, int]  # width, height [px]
     dtype: np.dtype  # of grey values in memory
-    # a frame's grey values, in the array that is given or anywhere else. RecordingErrors begin with the text
+    # grey values of a frame, in the given array or in another one. RecordingErrors begin with the text
     decoded: Callable[[int, Image | None, str], Image]
-    stored: Callable[[int], bytes | memoryview]  # what a frame is made from. Raises RecordingError
-    coding: str = ""  # by what, beside size and type, that becomes grey values
-    bit_depth: int = 0  # bits that carry grey values: 8 (uint8), or 9 to 16 (uint16); 0 stands for all of the type's
-    timestamps: Array | None = None  # (n,) [s] by the camera's clock, where the file has them
-    frame_rate: float | None = None  # [Hz] where the file states the camera's own, not that of a player
-    header: CameraHeader | None = None  # where the format has one
-    numbers: range | None = None  # of the frames, where they have some
-    notes: tuple[str, ...] = ()  # what the user should know about how the frames are read, one sentence each
-    doubts: tuple[str, ...] = ()  # what had to be assumed of the frames' instants
-    random_access: bool = True  # False where frames are read fastest in order, by one thread
-    _digests: dict[int, bytes] = field(default_factory=dict)  # of frames whose content was seen
+    stored: Callable[[int], bytes | memoryview]  # stored bytes of a frame. Raises RecordingError
+    coding: str = ""  # of the stored bytes, in addition to size and type
+    bit_depth: int = 0  # significant bits of grey values: 8 (uint8), or 9 to 16 (uint16); 0: all bits of the type
+    timestamps: Array | None = None  # (n,) [s] by the camera's clock, if in the file
+    frame_rate: float | None = None  # [Hz] of the camera, if stated in the file; not that of a player
+    header: CameraHeader | None = None  # if the format has one
+    numbers: range | None = None  # of the frames, if they are numbered
+    notes: tuple[str, ...] = ()  # for the user, on the reading of the frames, one sentence each
+    doubts: tuple[str, ...] = ()  # assumptions on the instants of the frames
+    random_access: bool = True  # False if reading is fastest in order, by one thread
+    _digests: dict[int, bytes] = field(default_factory=dict)  # of frames whose content was already hashed
 
     def __post_init__(self) -> None:
         self.bit_depth = self.bit_depth or 8 * self.dtype.itemsize
@@ -93,13 +93,13 @@ class FrameReader:
         return len(self.files)
 
     def describe(self, index: int) -> str:
-        """Where frame `index` lies, for messages."""
+        """File and number of frame `index`, for messages."""
         return f"{self.files[index]}, frame {index}"
 
     def read(self, index: int, out: Image | None = None) -> Image:
-        """Frame `index`, (height, width) grey values as the camera wrote them; into `out` if given, and returned.
+        """Frame `index`, (height, width) grey values as the camera wrote them; copied into `out` if given.
 
-        Raises RecordingError with file, camera, frame, what was found and what to do.
+        Raises RecordingError with file, camera, frame, problem and remedy.
         """
         where = f"{self.files[index]} ({self.camera} camera, frame {index})"
         image = self.decoded(index, out, where)
@@ -113,7 +113,7 @@ class FrameReader:
         return out
 
     def content_sha256(self, start: int, stop: int) -> str:
-        """SHA-256 (hex) of what frames start..stop-1 are made from; equal if and only if the input is the same."""
+        """SHA-256 (hex) of the stored bytes and the coding of frames start..stop-1: equal only for equal input."""
         total = hashlib.sha256(f"{self.image_size} {self.dtype} {self.bit_depth} {self.coding}".encode())
         for index in range(start, stop):
             total.update(self._digest(index))
@@ -129,24 +129,24 @@ class FrameReader:
 
 
 def changed(reader: FrameReader, change: Callable[[Image], Image], by: str) -> FrameReader:
-    """Frames of a reader that are changed after they are read; in all else that reader.
+    """A reader that applies `change` to every frame, with all other properties of `reader`.
 
-    by : all that tells how they are changed, for the digest of the content
+    by : identifies the change, for the hash of the content
     """
     coding = f"{reader.coding} {reader.image_size} {reader.bit_depth} {by}"
     return replace(reader, decoded=lambda index, out, where: change(reader.read(index)), coding=coding)
 
 
-# x, y, width, height [px]: columns and rows of an image as the images of a camera. Of one sensor behind mirrors, or of
-# two cameras' images that are stored in one
+# x, y, width, height [px]: rectangle of a stored image that is the image of a camera, for one sensor with mirrors, or
+# for images of two cameras that are stored as one
 Part = tuple[int, int, int, int]
 Parts = tuple[Part | None, ...]  # of the left and of the right camera
 
 
 def cut_out(image: NDArray, part: Part, where: str) -> NDArray:
-    """The part of an image (h, w) or (h, w, channels); an image of the part's own size is that part already.
+    """The part of an image (h, w) or (h, w, channels); an image of the part's size is returned whole.
 
-    Raises RecordingError, which begins with `where`, if it is cut.
+    Raises RecordingError, which begins with `where`, if the image does not contain the part.
     """
     x, y, width, height = part
     found = image[y : y + height, x : x + width] if image.shape[:2] != (height, width) else image
@@ -157,7 +157,7 @@ def cut_out(image: NDArray, part: Part, where: str) -> NDArray:
 
 
 def frames_in_parts(readers: Sequence[FrameReader], parts: Parts, where: str) -> Iterator[FrameReader]:
-    """Both cameras' readers, of the declared parts. Raises RecordingError, which begins with `where`, if one is cut."""
+    """Both readers, cut to the declared parts. Raises RecordingError, which begins with `where`, if one is outside."""
     for reader, part in zip(readers, parts, strict=True):
         if part is None:
             yield reader
@@ -171,12 +171,12 @@ def frames_in_parts(readers: Sequence[FrameReader], parts: Parts, where: str) ->
 
 
 def in_words(image_size: tuple[int, ...], bit_depth: int) -> str:
-    """Size (width, height) and depth of images."""
+    """Size (width, height) and depth of images in words."""
     return f"{image_size[0]} x {image_size[1]} px of {bit_depth} bit"
 
 
 def room_for(out: NDArray | None, image_size: tuple[int, int], dtype: np.dtype) -> NDArray:
-    """`out` where an image (width, height) can be decoded straight into it; another array of its type otherwise."""
+    """`out` if an image (width, height) can be decoded directly into it; otherwise a new array."""
     if out is not None and out.shape == image_size[::-1] and out.dtype == dtype and out.flags.c_contiguous:
         return out
     return np.empty(image_size[::-1], dtype)
@@ -186,7 +186,7 @@ _T = TypeVar("_T")
 
 
 def first_readable(n: int, camera: str, decoded: Callable[[int], _T]) -> _T:
-    """What `decoded` gives of the first of n frames that it can decode. Raises RecordingError if there is none."""
+    """Result of `decoded` for the first of n frames that can be decoded. Raises RecordingError if there is none."""
     problem: RecordingError | None = None
     for index in range(n):
         try:
@@ -197,13 +197,13 @@ def first_readable(n: int, camera: str, decoded: Callable[[int], _T]) -> _T:
 
 
 def refuse_colour(where: str, found: str) -> NoReturn:
-    """Raise RecordingError for pixels that are no grey values."""
+    """Raise RecordingError for pixels that are not grey values."""
     remedy = "A conversion here would mix what the sensor measured: export grey values, or use a monochrome camera."
     raise RecordingError(f"{where}: {found}; expected grey values. {remedy}")
 
 
 def only_file(files: Sequence[Path], camera: str) -> Path:
-    """The one file that a camera's pattern may match, where a file holds all its frames."""
+    """The only file of a camera, for formats with all frames in one file. Raises RecordingError if there are more."""
     if len(files) != 1:
         raise RecordingError(f"{files[0]} and {len(files) - 1} more match for the {camera} camera; name one recording.")
     return files[0]

@@ -1,4 +1,4 @@
-"""Blocks of image pairs, read ahead by several threads in bounded memory."""
+"""Blocks of image pairs, read ahead by several threads with bounded memory."""
 
 import os
 from collections.abc import Iterator
@@ -14,7 +14,7 @@ from disctrack.errors import RecordingError
 from disctrack.frames import CAMERAS
 from disctrack.recording.readers.base import FrameReader, in_words
 
-BLOCK_BYTES = 16 << 20  # large enough to hide the switch between blocks, small enough for six of them in 100 MB
+BLOCK_BYTES = 16 << 20  # of a block: large enough for a negligible overhead, small enough for six blocks in 100 MB
 
 
 NotRead = dict[tuple[int, int], str]  # why an image could not be read, by frame and camera (0 left, 1 right)
@@ -24,16 +24,16 @@ NotRead = dict[tuple[int, int], str]  # why an image could not be read, by frame
 class PairBlock:
     """Consecutive image pairs.
 
-    `images` may be a buffer that is filled anew: it is valid until the next block is asked for; copy what must stay.
+    `images` may be a buffer that is reused: it is valid until the next block is requested; copy it to keep it.
     """
 
     frames: NDArray[np.int64]  # (n,)
-    images: NDArray  # (n, 2 cameras, height, width) uint8 or uint16; 0 where not readable
+    images: NDArray  # (n, 2 cameras, height, width) uint8 or uint16; 0 if not readable
     unreadable: NotRead = field(default_factory=dict)
 
     @property
     def readable(self) -> Mask:
-        """(n, 2) True where the image could be read."""
+        """(n, 2) True if the image could be read."""
         good = np.ones(self.images.shape[:2], bool)
         for frame, camera in self.unreadable:
             good[frame - self.frames[0], camera] = False
@@ -71,10 +71,10 @@ def iter_pair_blocks(
     block: int | None = None,
     threads: Threads | None = None,
 ) -> Iterator[PairBlock]:
-    """Pairs start..stop-1 in blocks of `block` pairs, two blocks read ahead while the caller works on a third.
+    """Pairs start..stop-1 in blocks of `block` pairs; two blocks are read ahead while the caller processes a third.
 
-    An image that cannot be read is named in the block's `unreadable`; the others are delivered. The default block
-    holds BLOCK_BYTES, so that the memory is independent of the recording's length and of the image size.
+    An image that cannot be read is listed in the block's `unreadable`. The default block has BLOCK_BYTES, so that the
+    memory does not depend on the recording's length or the image size.
     Raises RecordingError if the two sequences do not belong together (`check_pair`).
 
         >>> pairs = open_pairs("clip")
@@ -89,12 +89,12 @@ def iter_pair_blocks(
     parts = [range(first, min(first + block, stop)) for first in range(start, stop, block)]
     ring = [np.empty((min(block, stop - start), 2, height, width), dtype) for _ in parts[:3]]
     pool = ThreadPoolExecutor(threads or default_threads(), thread_name_prefix="read")
-    # what is read fastest in order has a thread of its own: two blocks at once would send it back and forth
+    # a file that is read fastest in order has its own thread: reading two blocks at once would seek back and forth
     readers = left, right
     pools = [pool if r.random_access else ThreadPoolExecutor(1, thread_name_prefix="read") for r in readers]
 
     def submitted(number: int) -> list[Future[NotRead]]:
-        """Reading of a block as tasks: a few frames each, or a camera's whole block where files are read in order."""
+        """Tasks that read a block: a few frames each, or a camera's whole block if its file is read in order."""
         images, frames, tasks = ring[number % 3], parts[number], []
         for camera, reader in enumerate(readers):
             size = 4 if reader.random_access else len(frames)

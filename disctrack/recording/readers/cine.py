@@ -1,8 +1,8 @@
 """Phantom recordings (.cine): uncompressed grey values of 8, 10, 12 or 16 bit, with the time of every frame.
 
 Layout after "The Cine File Format" of Vision Research: file header, bitmap header, camera setup, tagged blocks of
-information, a table of where each image lies, images. Every number is little-endian. Lengths and offsets are checked
-against the file's size before anything is read or made of that size.
+information, table of image offsets, images. All numbers are little-endian. Lengths and offsets are checked against the
+file's size before memory is allocated or read.
 """
 
 import struct
@@ -21,7 +21,7 @@ from disctrack.recording.readers.raw import PixelLayout, RawFile, bit_depth_of, 
 _FILE_HEADER = struct.Struct("<2sHHHiIiIIIIII")
 _BITMAP_HEADER = struct.Struct("<IiiHHII")
 _BLOCK_HEADER = struct.Struct("<IHH")
-# Field of the camera setup (4 bytes): its offset. Fields beyond the setup's stated length are not in the file.
+# Fields (4 bytes) of the camera setup: offsets. Fields beyond the stated length of the setup are not in the file.
 _SETUP_FIELDS = {
     "Serial": 743,
     "FrameRate": 768,
@@ -33,12 +33,12 @@ _SETUP_FIELDS = {
     "EDRShutterNs": 1572,
 }
 _FRACTION = 0xFFFFFFFC  # of a second, in 2**-32 s; the two lowest bits are flags
-# Way of packing (biCompression): bits per stored pixel; 0 is none.
+# Packing (biCompression): bits per stored pixel; 0 means unpacked.
 _PACKED = {256: 10, 1024: 12}
 
 
 def open_cine(files: Sequence[Path], camera: str) -> FrameReader:
-    """Frames of one camera. Raises RecordingError if the file is damaged, compressed or of colours."""
+    """Frames of one camera. Raises RecordingError if the file is damaged, compressed or in colour."""
     file = RawFile(only_file(files, camera))
     cine = _Cine(file)
     layout, depth = _layout(cine)
@@ -70,7 +70,7 @@ class _Cine:
         self.first_image, self.n_images, bitmap_at, setup_at, self.table, *time = rest
         if mark != b"CI" or version > 1:
             raise RecordingError(f"{file}: not a cine file of a known version. Export the recording again.")
-        if compression == 1:  # 0: as they are; 2: as the sensor has them, which is grey without a colour filter
+        if compression == 1:  # 0: uncompressed; 2: raw sensor values, which are grey without a colour filter
             raise RecordingError(f"{file}: a compressed cine (JPEG). Save it uncompressed: cine raw.")
         self.clock_is_free, self.trigger_second = bool(time[0] & 1), time[1]  # [s] since 1970
         self.trigger = (time[0] & _FRACTION) * 2.0**-32  # [s] after that
@@ -86,14 +86,14 @@ class _Cine:
         self.blocks = setup_at + length  # where they begin
 
     def field(self, name: str) -> int:
-        """A field of the camera setup, or 0 where the file's setup is older than the field."""
+        """A field of the camera setup; 0 if the file's version of the setup does not have it."""
         offset = _SETUP_FIELDS[name]
         return int.from_bytes(self.setup[offset : offset + 4], "little") if offset + 4 <= len(self.setup) else 0
 
 
 def _layout(cine: _Cine) -> tuple[PixelLayout, int]:
-    """How the pixels lie, and the bits that carry grey values. RecordingError for colours, and what is compressed."""
-    filter_code = cine.field("CFA") & 0xFFFFFF  # the highest byte tells of grey heads
+    """Layout of the pixels, and their significant bits. Raises RecordingError for colour or unknown packing."""
+    filter_code = cine.field("CFA") & 0xFFFFFF  # the highest byte describes grey heads
     if filter_code or cine.bits not in (8, 16):
         refuse_colour(str(cine.file), f"a colour recording (filter code {filter_code}, {cine.bits} bit per pixel)")
     if cine.packing and cine.packing not in _PACKED:
@@ -106,17 +106,17 @@ def _layout(cine: _Cine) -> tuple[PixelLayout, int]:
         depth = 12 if packed == 10 else bit_depth_of(12, cine.field("RealBPP") or 12)
         return PixelLayout(w, h, np.dtype("<u2"), packed, table=table), depth
     row = w * cine.bits // 8
-    padding = -row % 4  # none, or as in a bitmap up to a multiple of 4, whichever gives the stated size
+    padding = -row % 4  # to a multiple of 4 as in a bitmap, or none, according to the stated size
     padding = padding if cine.image_bytes == (row + padding) * h else 0
     layout = PixelLayout(w, h, np.dtype(f"<u{cine.bits // 8}"), padding=padding, bottom_up=cine.bottom_up)
     return layout, bit_depth_of(cine.bits, cine.field("RealBPP") or cine.bits)
 
 
 def _pixels(cine: _Cine, starts: NDArray[np.int64], layout: PixelLayout) -> NDArray[np.int64]:
-    """(n,) where each image's pixels begin; -1 where there is no image of the right size.
+    """(n,) offsets of each image's pixels; -1 if there is no image of the right size.
 
-    A record is the length of its note, the note, the size of the image, the pixels. Records that lie as far apart as
-    the first is long have notes of the same length.
+    A record is the length of its annotation, the annotation, the size of the image, the pixels. If the distances of all
+    records equal the length of the first, all annotations have the same length.
     """
     first = _pixels_of(cine, int(starts[0]), layout)
     if first < 0:
@@ -128,7 +128,7 @@ def _pixels(cine: _Cine, starts: NDArray[np.int64], layout: PixelLayout) -> NDAr
 
 
 def _pixels_of(cine: _Cine, start: int, layout: PixelLayout) -> int:
-    """Where the pixels of the record at `start` begin, or -1 if it is damaged or beyond the end of the file."""
+    """Offset of the pixels of the record at `start`; -1 if it is damaged or beyond the end of the file."""
     where = f"{cine.file}: image at byte {start}"
     try:
         (note,) = struct.unpack("<I", cine.file.bytes_at(start, 4, where))
@@ -153,9 +153,9 @@ def linear_from_10_bits() -> NDArray[np.uint16]:
 
 
 def _times(cine: _Cine) -> tuple[Array | None, int, list[str]]:
-    """(n,) [s] from the trigger to each frame by the camera's clock, or None and why they are not used.
+    """Times (n,) [s] since the trigger by the camera's clock, step of saved frames, and doubts.
 
-    Between them, of how many recorded frames one was saved: the setup does not tell.
+    Times are None if they are not usable. The step follows from the times, as the setup does not contain it.
     """
     block, n = _block_of_times(cine), cine.n_images
     if block is None:
@@ -175,7 +175,7 @@ def _times(cine: _Cine) -> tuple[Array | None, int, list[str]]:
 
 
 def _block_of_times(cine: _Cine) -> tuple[int, int] | None:
-    """Offset and size of what is in block 1002, a tagged one between the setup and the table of images."""
+    """Offset and size of the content of the tagged block 1002, between the setup and the table of images."""
     position = cine.blocks
     for _ in range(1000):  # real files have two or three
         if position + _BLOCK_HEADER.size > min(cine.table, cine.file.size):

@@ -1,8 +1,8 @@
-"""Image files as pixels: container and checksums are verified, and nothing is converted that would be lost.
+"""Decoding of image files: container and checksums are verified, and there is no lossy conversion.
 
-Grey PNG files are decoded straight into the caller's memory: libpng inflates row by row; here the whole image is
+Grey PNG files are decoded directly into the caller's memory. libpng inflates row by row; here the whole image is
 inflated at once and the row filters are undone in one compiled pass, in half the time. Other kinds of PNG (palette,
-colour, interlaced, fewer than 8 bits) are left to OpenCV.
+colour, interlaced, fewer than 8 bits) are decoded by OpenCV.
 """
 
 import struct
@@ -27,9 +27,9 @@ _AGAIN = "Copy or export this image again."
 
 
 def decode(content: bytes, where: str, out: NDArray | None = None) -> NDArray:
-    """Pixels of an image file's content as stored: (h, w) or (h, w, channels), any depth; in `out` where it fits.
+    """Pixels of an image file's content as stored: (h, w) or (h, w, channels), any depth; in `out` if it fits.
 
-    Container and checksums are verified first: a decoder may return a torn image without a word.
+    Container and checksums are verified first: a decoder may return an incomplete image without an error.
     Raises RecordingError that begins with `where`.
     """
     if not content:
@@ -52,7 +52,7 @@ def _by_opencv(content: bytes, where: str) -> NDArray:
 
 
 def as_grey(image: NDArray, where: str) -> Image:
-    """(h, w) of 8 or 16 bits: equal channels become one. Raises RecordingError where something would be lost."""
+    """(h, w) of 8 or 16 bits: equal channels become one. Raises RecordingError if information would be lost."""
     if image.dtype not in (np.uint8, np.uint16):
         raise RecordingError(f"{where}: pixels of type {image.dtype}; expected 8 or 16 bit grey values.")
     if image.ndim == 2:
@@ -66,7 +66,7 @@ def as_grey(image: NDArray, where: str) -> Image:
 
 
 def _check_length(content: bytes, where: str) -> None:
-    """Formats without checksums have an end or a length to check."""
+    """Check end marker or length of formats without checksums. Raises RecordingError."""
     if content.startswith(b"\xff\xd8"):
         if b"\xff\xd9" not in content[-1024:]:
             raise RecordingError(f"{where}: the JPEG file is truncated (no end marker). {_AGAIN}")
@@ -80,7 +80,7 @@ def _check_length(content: bytes, where: str) -> None:
 
 
 def _jpeg_size(content: bytes) -> tuple[int, int]:
-    """Width and height by the frame header (ITU-T T.81, B.2.2); 0 where there is none before the scan."""
+    """Width and height from the frame header (ITU-T T.81, B.2.2); 0 if there is none before the scan."""
     position = 2
     while position + 9 <= len(content) and content[position] == 0xFF:
         marker, length = content[position + 1], int.from_bytes(content[position + 2 : position + 4], "big")
@@ -127,7 +127,7 @@ def _number_at(content: bytes, position: int) -> int:
 
 
 def inflated(stream: bytes, size: int) -> bytes | bytearray | None:
-    """The `size` bytes that a zlib stream holds, never more; None where it holds another number or is damaged."""
+    """The `size` bytes of a zlib stream; None if it is damaged, or has another number of bytes."""
     try:
         whole: bytes | bytearray = imagecodecs.deflate_decode(stream, out=size)
     except imagecodecs.DeflateError:

@@ -1,7 +1,7 @@
-"""Which files a pattern means, in which order, and the clock in their names: which run of digits counts the frames.
+"""Files that match a pattern, their order, and their frame numbers: the digits in the names that count the frames.
 
-Time is a frame's place in the sequence, so a gap that is closed would shift all that follows, and a file that does not
-belong would be a frame of its own. Where names leave a doubt, nothing is guessed: the files are named.
+The time of a frame follows from its position in the sequence: an unnoticed gap, or a file that is not a frame, would
+shift all later frames. If the names are ambiguous, an error lists the files.
 """
 
 import fnmatch
@@ -17,7 +17,7 @@ from pathlib import Path
 from disctrack.errors import RecordingError, told_as
 from disctrack.files.inputs import MOST_IMAGE, keep, read_regular, why_not_regular
 
-# Suffixes of each format, by the module that reads it with `open_MODULE`: (files, camera) -> FrameReader
+# Suffixes of each format, by the module whose function `open_MODULE`, (files, camera) -> FrameReader, reads it
 FORMATS = {
     "images": frozenset({".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg"}),
     "video": frozenset({".avi", ".mp4", ".mkv", ".mov"}),
@@ -28,12 +28,12 @@ FORMATS = {
 SUFFIXES = frozenset().union(*FORMATS.values())
 IMAGES = FORMATS["images"]
 NUMBER = "{number}"  # in a pattern: these digits count the frames
-MOST_SLOTS_PER_FILE = 100  # a sequence with fewer of its frames is no recording, but time stamps or a slip of the pen
+MOST_SLOTS_PER_FILE = 100  # frame numbers per file; if more are missing, the digits are time stamps or typing errors
 _SHOWN = 3
 
 
 def split_member(pattern: str) -> tuple[str, str]:
-    """Pattern of the files and what else a pattern says, "" for most.
+    """File pattern, and data set or numbering pattern, "" if there is none.
 
     "frames.h5:/left" is ("frames.h5", "/left"), "a/{number}.png" is ("a/*.png", "a/{number}.png").
     """
@@ -48,7 +48,7 @@ def split_member(pattern: str) -> tuple[str, str]:
 def match_files(pattern: str, folder: Path, camera: str) -> list[Path]:
     """Image or video files that the pattern matches, in natural order (2 before 10).
 
-    Raises RecordingError if there is none, naming what lies there instead.
+    Raises RecordingError if there is none, with the content of the folder.
     """
     found = glob.glob(os.path.join(glob.escape(str(folder)), pattern), recursive=True)
     files = [Path(name) for name in found if Path(name).suffix.lower() in SUFFIXES]
@@ -67,9 +67,9 @@ def folders_below(
 ) -> Iterator[tuple[Path, list[str], list[str]]]:
     """The folder and all below it, each once, with the names of folders and files in it.
 
-    The names of folders may be taken out, as of `os.walk`: those are not looked into.
-    seen : folders, without links on the way to them, that are not looked into again; grows
-    failed : is told of folders that cannot be read
+    Folders whose names the caller removes from the list are not visited, as with `os.walk`.
+    seen : resolved paths of folders that are not visited again; grows
+    failed : is called for folders that cannot be read
     """
     for place, inside, names in os.walk(root, onerror=failed, followlinks=True):
         real = Path(place).resolve()
@@ -88,19 +88,19 @@ def _what_is_there(place: Path) -> str:
 
 
 def natural_key(name: str) -> list[tuple[int, int, str]]:
-    """Sort key in which runs of digits count as numbers: frame_2 before frame_10."""
+    """Sort key that compares runs of digits as numbers: frame_2 before frame_10."""
     parts = re.split(r"([0-9]+)", name)
     return [(1, int(part), part) if part.isdigit() else (0, 0, part) for part in parts]
 
 
 def file_number(file: Path) -> int | None:
-    """The last run of digits in a file's name, which is the frame's number as the camera counted; None without one."""
+    """The last run of digits in a file's name, the camera's number of the frame; None if there is none."""
     runs = re.findall(r"[0-9]+", file.stem)
     return int(runs[-1]) if runs else None
 
 
 def content_of(file: Path, where: str, most: int = MOST_IMAGE) -> bytes:
-    """Of a file of at most so many bytes. Raises RecordingError that begins with `where`."""
+    """Content of a file of at most `most` bytes. Raises RecordingError that begins with `where`."""
     with told_as(RecordingError, f"{where}: cannot be read", OSError, then="Copy it again."):
         return read_regular(file, most)
 
@@ -108,17 +108,17 @@ def content_of(file: Path, where: str, most: int = MOST_IMAGE) -> bytes:
 def number_files(
     files: Sequence[Path], camera: str, pattern: str = ""
 ) -> tuple[tuple[Path | None, ...], range | None, tuple[str, ...], tuple[str, ...]]:
-    """Files on their places in time (None where a number is missing), their numbers, what to know, and what is assumed.
+    """Files in temporal order (None for missing numbers), their numbers, notes, and doubts.
 
-    pattern : tells by {number} which digits count; "" where the names must tell it themselves
-    Raises RecordingError that names the files if their names are not of one form, hold no number or one number twice,
-    or if the numbers have no common step.
+    pattern : {number} in it marks the digits that count the frames; "" to find them from the names
+    Raises RecordingError with the files if the names have different forms, no number, or the same number twice, or if
+    the numbers have no common step.
     """
     if len(files) == 1:
         number = file_number(files[0])
         return tuple(files), None if number is None else range(number, number + 1), (), ()
     columns = [_numbers_by_pattern(files, pattern)] if pattern else _numbers_by_form(files, camera)
-    clocks = {step: column for column in columns if (step := _common_step(column, asked=bool(pattern)))}
+    clocks = {step: column for column in columns if (step := _common_step(column, given=bool(pattern)))}
     if len(clocks) > 1:
         clocks = {step: column for step, column in clocks.items() if not _missing(column, step)} or clocks
     if len(clocks) > 1:
@@ -141,9 +141,7 @@ def number_files(
 
 
 def check_continuation(files: Sequence[Path], camera: str) -> None:
-    """Raise RecordingError unless stacks that go on in the next file are numbered without a gap (the first may have
-    no number).
-    """
+    """Raise RecordingError unless the files of a stack are numbered without a gap (the first may have no number)."""
     if len(files) < 2:
         return
     rest = files[1:] if files[1].stem.startswith(files[0].stem) else files
@@ -167,7 +165,7 @@ def _numbers_by_pattern(files: Sequence[Path], pattern: str) -> list[int]:
 
 
 def _numbers_by_form(files: Sequence[Path], camera: str) -> list[list[int]]:
-    """The runs of digits that differ among names of one form, each a number per file."""
+    """Numbers of the files, for each run of digits that differs among names of one form. Raises RecordingError."""
     forms = [re.split(r"[0-9]+", file.stem) for file in files]
     if all(len(form) == 1 for form in forms):
         said = f"the names of the {camera} frames hold no number, so nothing tells whether one is missing"
@@ -185,11 +183,11 @@ def _numbers_by_form(files: Sequence[Path], camera: str) -> list[list[int]]:
     return [column for column in columns if len(set(column)) > 1] or columns[-1:]
 
 
-def _common_step(numbers: Sequence[int], asked: bool) -> int | None:
-    """Step of numbers that count frames, some of which may be missing; None for anything else, as time stamps.
+def _common_step(numbers: Sequence[int], given: bool) -> int | None:
+    """Step of numbers that count frames, some of which may be missing; None for others, such as time stamps.
 
-    A camera that counts by d leaves d as the most frequent difference; stamps that jitter have a common divisor that
-    no two of them differ by. asked: the user says that these are the numbers.
+    If a camera counts in steps of d, d is the most frequent difference. The greatest common divisor of jittering time
+    stamps is not. given : the user declares that these are the numbers.
     """
     ordered = sorted(numbers)
     steps = Counter(b - a for a, b in pairwise(ordered))
@@ -198,7 +196,7 @@ def _common_step(numbers: Sequence[int], asked: bool) -> int | None:
     step = math.gcd(*steps)
     if (ordered[-1] - ordered[0]) // step >= MOST_SLOTS_PER_FILE * len(ordered):
         return None
-    return step if asked or steps[step] == max(steps.values()) else None
+    return step if given or steps[step] == max(steps.values()) else None
 
 
 def _missing(numbers: Sequence[int], step: int) -> list[int]:
@@ -218,7 +216,7 @@ def _refuse_clock(files: Sequence[Path], numbers: Sequence[int], camera: str) ->
 
 
 def _pattern_hint(usual: Sequence[Path], odd: Sequence[Path]) -> str:
-    """A pattern that takes the usual files only, if there is a simple one."""
+    """Hint at a pattern that matches the usual files only."""
     names = [re.sub(r"[0-9]", "[0-9]", re.sub(r"([\[*?])", r"[\1]", file.name)) for file in usual]
     folder = usual[0].parent.name
     alike = len(set(names)) == 1 and len({file.parent for file in usual}) == 1

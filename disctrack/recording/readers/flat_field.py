@@ -1,10 +1,10 @@
-"""Dark and flat images of a camera: each pixel's offset and gain taken out of its frames.
+"""Dark and flat images of a camera: correction of the frames for offset and gain of each pixel.
 
     corrected = (frame - dark) m / (flat - dark),   m the median of flat - dark
 
-so that grey values keep their level. They are handed on with 16 bits, whatever the camera has: rounded to whole grey
-values, a pixel would be off by the same part of one in every frame, which is a pattern again. A pixel that is clipped
-stays so. One that hardly answers the light, or far more than its neighbours, is dead: it gets the median of these.
+so that the level of grey values does not change. Corrected frames have 16 bits for any camera: rounding to its grey
+values would cause an equal error of a pixel in every frame, which is a fixed pattern again. Clipped pixels stay
+clipped. A pixel with a response far below or above its neighbours' is dead, and gets the median of these.
 """
 
 import glob
@@ -24,27 +24,27 @@ from disctrack.recording.readers import open_frames
 from disctrack.recording.readers.base import FrameReader, changed, in_words
 from disctrack.recording.readers.files import IMAGES, match_files, split_member
 
-ODD = 0.5  # relative, by which a dead pixel's answer to light differs from its neighbours'; gains differ by 0.05
-LEAST_LIGHT = 0.1  # of full scale: a flat that is darker tells gains worse than they differ
+ODD = 0.5  # relative difference of a dead pixel's response from its neighbours'; gains differ by 0.05
+LEAST_LIGHT = 0.1  # level of a flat over full scale; below, the errors of gains exceed their differences
 
 
 @dataclass(frozen=True, eq=False)
 class FlatField:
-    """What is taken out of one camera's frames."""
+    """Correction of one camera's frames."""
 
     dark: Array32  # (height, width) [grey]
     gain: Array32  # (height, width) factor
     dead: Mask | None  # (height, width)
     bit_depth: int  # of the frames as the camera wrote them
-    sha256: str  # (hex) of the images it was made from
+    sha256: str  # (hex) of the dark and flat images
     notes: tuple[str, ...] = ()
 
     def fits(self, image: Image) -> bool:
-        """Is this a grey image of the camera's size and depth?"""
+        """True for a grey image of the camera's size and depth."""
         return image.shape == self.dark.shape and image.dtype == (np.uint8 if self.bit_depth == 8 else np.uint16)
 
     def corrected(self, image: Image) -> Image:
-        """(height, width) uint16, full scale 65535, with offsets and gains taken out."""
+        """(height, width) uint16, full scale 65535, corrected for offsets and gains."""
         signal = cv2.subtract(image, self.dark, dtype=cv2.CV_32F)
         scale = 2.0 ** (16 - self.bit_depth)
         found: Image = np.asarray(cv2.multiply(signal, self.gain, scale=scale, dtype=cv2.CV_16U), np.uint16)
@@ -58,17 +58,17 @@ FlatFields = tuple[FlatField | None, ...]  # of the left and of the right camera
 
 
 def flat_fields(folder: Path, patterns: Sequence[tuple[str | None, str | None]]) -> FlatFields:
-    """Of the left and of the right camera, None where nothing is declared. Raises RecordingError.
+    """Corrections of the left and of the right camera, None if not declared. Raises RecordingError.
 
-    patterns : of each camera its flat and its dark images, relative to `folder`: a file, a pattern, or a folder
+    patterns : flat and dark images of each camera, relative to `folder`: a file, a pattern, or a folder
     """
     return tuple(_flat_field(*images, folder, camera) for images, camera in zip(patterns, CAMERAS, strict=True))
 
 
 def flat_fielded(readers: Sequence[FrameReader], fields: FlatFields) -> list[FrameReader]:
-    """Both cameras' readers, with frames corrected where there is a field; the other's are brought to 16 bits, too.
+    """Both cameras' readers with corrected frames; if only one has a field, the other's are converted to 16 bits.
 
-    Raises RecordingError where dark and flat images do not fit the frames.
+    Raises RecordingError if dark and flat images do not fit the frames.
     """
     if fields == (None, None):
         return list(readers)
@@ -90,7 +90,7 @@ def _corrected(reader: FrameReader, field: FlatField | None) -> FrameReader:
 
 
 def _readers(pattern: str | None, folder: Path, camera: str, kind: str) -> list[FrameReader]:
-    """Of one file, or of each image that lies in a folder or matches a pattern; none where nothing is declared."""
+    """Readers of one file, or of each image in a folder or of a pattern; none if not declared."""
     if pattern is None:
         return []
     if (folder / pattern).is_dir():
@@ -128,7 +128,7 @@ def _flat_field(flat_images: str | None, dark_images: str | None, folder: Path, 
 
 
 def _mean(readers: Sequence[FrameReader]) -> tuple[Array32, Mask]:
-    """Of all frames, and which pixels are clipped in more than a twentieth of them."""
+    """Mean of all frames, and the pixels that are clipped in more than 5 % of them."""
     total, n, full = np.zeros(readers[0].image_size[::-1]), sum(map(len, readers)), 2 ** readers[0].bit_depth - 1
     clipped = np.zeros(total.shape, np.int64)
     for image in (reader.read(index) for reader in readers for index in range(len(reader))):
@@ -138,13 +138,13 @@ def _mean(readers: Sequence[FrameReader]) -> tuple[Array32, Mask]:
 
 
 def _gain(flats: Sequence[FrameReader], darks: Sequence[FrameReader], offset: Array32) -> tuple[Array32, Mask]:
-    """Factors on the pixels' signals, and which pixels are dead. Raises RecordingError."""
+    """Factors for the pixels' signals, and the dead pixels. Raises RecordingError."""
     flat, *dark = (f"{readers[0].describe(0)} ([cameras] {readers[0].camera})" for readers in (flats, darks) if readers)
     mean, clipped = _mean(flats)
     full, saturated = 2 ** flats[0].bit_depth, float(np.mean(clipped))
-    answer = mean - offset
-    level, around = float(np.median(answer)), cv2.medianBlur(answer, 5)
-    dead = np.asarray((np.abs(answer - around) > ODD * around) | clipped | (answer <= 0.1 * level))
+    response = mean - offset
+    level, around = float(np.median(response)), cv2.medianBlur(response, 5)
+    dead = np.asarray((np.abs(response - around) > ODD * around) | clipped | (response <= 0.1 * level))
     odd = f"{100 * dead.mean():.2g} % of its pixels hardly answer the light, or far more than their neighbours"
     refusals = (
         (saturated > MOST, f"{100 * saturated:.2g} % of its pixels are saturated. Take it at half of full scale."),
@@ -155,5 +155,5 @@ def _gain(flats: Sequence[FrameReader], darks: Sequence[FrameReader], offset: Ar
     for wrong, said in refusals:
         if wrong:
             raise RecordingError(f"{flat}: {said}")
-    gain = np.where(dead, 1.0, level / np.where(dead, 1.0, answer)).astype(np.float32)
+    gain = np.where(dead, 1.0, level / np.where(dead, 1.0, response)).astype(np.float32)
     return gain, dead

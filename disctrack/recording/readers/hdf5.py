@@ -1,8 +1,8 @@
 """Frames in an HDF5 file: a data set (n, height, width) of 8 or 16 bit whole numbers.
 
-recording.toml names it `frames.h5:/path`, or the file alone where it holds only one such data set. Attributes of the
-data set (or of its group) that are understood: `frame_rate` [Hz], `bit_depth`; and `timestamps` [s], an attribute or a
-data set (n,) beside it. A data set that lies in one piece is read at the speed of memory.
+recording.toml names it `frames.h5:/path`, or the file alone if it has only one such data set. Used attributes of the
+data set (or of its group): `frame_rate` [Hz], `bit_depth`; and `timestamps` [s], an attribute, or a data set (n,) in
+the same group. A contiguous data set is read at the speed of memory.
 """
 
 import threading
@@ -20,7 +20,7 @@ from disctrack.recording.readers.base import FrameReader, only_file, room_for
 from disctrack.recording.readers.decoding import inflated
 from disctrack.recording.readers.raw import PixelLayout, RawFile, bit_depth_of, check_frame_size, raw_frames
 
-_LARGEST_CACHE = 64 << 20  # bytes of decompressed chunks kept; more than one camera's chunk of many frames
+_LARGEST_CACHE = 64 << 20  # bytes for decompressed chunks; more than a usual chunk of many frames
 
 
 def open_hdf5(files: Sequence[Path], camera: str, member: str = "") -> FrameReader:
@@ -41,7 +41,7 @@ def _is_stack(item: object) -> bool:
 
 
 def _stack(handle: h5py.File, member: str, file: Path) -> h5py.Dataset:
-    """The data set of this name, or the only one that may be frames."""
+    """The data set of this name, or the only one that may be frames. Raises RecordingError."""
     item = handle.get(member) if member else None
     if _is_stack(item):
         return item
@@ -67,7 +67,7 @@ def stacks_of(handle: h5py.File) -> list[h5py.Dataset]:
 def _open(handle: h5py.File, stack: h5py.Dataset, file: Path, camera: str) -> FrameReader:
     (n, height, width), where = stack.shape, f"{file}:{stack.name}"
     check_frame_size(width, height, where)
-    most = 4 * raw.MOST_PIXELS  # bytes: the library takes a chunk at once, whatever the file's size
+    most = 4 * raw.MOST_PIXELS  # bytes: the library reads whole chunks, whatever the file's size
     if stack.chunks and np.prod(stack.chunks, dtype=float) * stack.dtype.itemsize > most:
         said = f"one chunk {stack.chunks} holds more than {most >> 20} MB, all of which is read for any frame in it"
         raise RecordingError(f"{where}: {said}. Write it again with chunks of one frame.")
@@ -76,12 +76,12 @@ def _open(handle: h5py.File, stack: h5py.Dataset, file: Path, camera: str) -> Fr
     stored = _frames_stored(stack)
     if stored < max(
         raw.LEAST_PRESENT * n, 1
-    ):  # a few that are missing are lost frames; a header may announce any number
+    ):  # a few missing frames are allowed; the header of a damaged file may state any number
         said = f"announces {n} frames, but at most {stored} were ever written: cut short"
         raise RecordingError(f"{where}: {said}. Write it again, or give the data set its true length.")
     _check_other_files(stack, file, where)
     rate, bits = _attribute(stack, "frame_rate"), _attribute(stack, "bit_depth")
-    told: dict[str, Any] = {
+    common: dict[str, Any] = {
         "camera": camera,
         "bit_depth": bit_depth_of(8 * stack.dtype.itemsize, int(bits or 0)),
         "timestamps": _timestamps(stack, n, where),
@@ -93,26 +93,26 @@ def _open(handle: h5py.File, stack: h5py.Dataset, file: Path, camera: str) -> Fr
         layout = PixelLayout(width, height, stack.dtype)
         handle.close()
         starts = offset + layout.frame_bytes * np.arange(n)
-        return raw_frames(files=[RawFile(file)] * n, offsets=starts, layout=layout, **told)
+        return raw_frames(files=[RawFile(file)] * n, offsets=starts, layout=layout, **common)
     together, n_filters = stack.chunks[0] if stack.chunks else 1, stack.id.get_create_plist().get_nfilters()
     deflated = stack.compression == "gzip" and n_filters == 1 + stack.shuffle
     slow = f"chunks of {together} frames are decompressed anew for each of them; chunks of one frame are read faster"
     apart = bool(whole and deflated and stack.chunks == (1, height, width))
     decoded = _decoding(stack, apart)
     return FrameReader(
-        files=cast(Sequence[str], np.broadcast_to(where, n)),  # a virtual one may announce any n
+        files=cast(Sequence[str], np.broadcast_to(where, n)),  # no list: a virtual data set may state any n
         image_size=(int(width), int(height)),
         dtype=stack.dtype.newbyteorder("="),
         decoded=decoded,
         stored=lambda index: decoded(index, None, "").data,
         random_access=apart,
         notes=(slow,) if together > max(1, _LARGEST_CACHE // (width * height * stack.dtype.itemsize)) else (),
-        **told,
+        **common,
     )
 
 
 def _frames_stored(stack: h5py.Dataset) -> int:
-    """Most frames that can have been written, by the space they take."""
+    """Upper limit of the number of written frames, from the storage size."""
     if stack.is_virtual:
         return int(stack.shape[0])
     if stack.chunks is None:
@@ -121,13 +121,13 @@ def _frames_stored(stack: h5py.Dataset) -> int:
 
 
 def _fills_its_bytes(stack: h5py.Dataset) -> bool:
-    """False where a pixel's bits lie somewhere within its bytes: the library brings them to where they belong."""
+    """False if a pixel's bits are only a part of its bytes: then the library has to convert them."""
     kind = stack.id.get_type()
     return bool(kind.get_precision() == 8 * kind.get_size() and kind.get_offset() == 0)
 
 
 def _check_other_files(stack: h5py.Dataset, file: Path, where: str) -> None:
-    """Raise RecordingError where pixels lie in other files that are not there: the library would deliver zeros."""
+    """Raise RecordingError if pixels are in other files that do not exist: the library would return zeros."""
     sources = stack.virtual_sources() if stack.is_virtual else ()
     for name in sorted({source.file_name for source in sources} - {"."}):
         if "%" not in name and not (file.parent / name).exists() and not Path(name).exists():
@@ -152,10 +152,10 @@ def _timestamps(stack: h5py.Dataset, n: int, where: str) -> Array | None:
 
 
 def _decoding(stack: h5py.Dataset, apart: bool) -> Callable[[int, Image | None, str], Image]:
-    """What gives a frame of a data set in chunks, with or without compression.
+    """Function that decodes a frame of a data set in chunks, with or without compression.
 
-    The library does one thing at a time. Where each frame is a chunk, compressed by deflate as most are (`apart`), it
-    delivers the compressed bytes only, and frames are inflated side by side: with random access.
+    The library is not parallel. If each frame is a chunk compressed by deflate (`apart`), it only reads the compressed
+    bytes, and frames are inflated in parallel, with random access.
     """
     lock, dtype, (_, height, width) = threading.Lock(), stack.dtype.newbyteorder("="), stack.shape
 
@@ -167,7 +167,7 @@ def _decoding(stack: h5py.Dataset, apart: bool) -> Callable[[int, Image | None, 
                 raise RecordingError(f"{where}: was never written to the file. Copy or write it again.")
             if apart and size <= 2 * image.nbytes:
                 mask, content = stack.id.read_direct_chunk((index, 0, 0))
-                content = None if mask else content  # some filter was left out
+                content = None if mask else content  # if a filter was not applied, the library has to decode the chunk
             if content is None:
                 stack.read_direct(image, np.s_[index])
         if content is not None:
@@ -190,7 +190,7 @@ def _inflate(stack: h5py.Dataset, content: bytes, image: Image, where: str) -> N
 
 
 def _stored_size(stack: h5py.Dataset, index: int) -> int:
-    """Bytes of the frame's chunks; 0 where one is missing: the library would deliver zeros without a word."""
+    """Bytes of the frame's chunks; 0 if one is missing, for which the library would return zeros without an error."""
     if stack.chunks is None:
         return 1
     (frames, rows, columns), (_, height, width) = stack.chunks, stack.shape

@@ -1,6 +1,6 @@
-"""Images in files: one PNG, TIFF, BMP or JPEG file per frame, or TIFF files of many pages that continue one another.
+"""Image files: one PNG, TIFF, BMP or JPEG file per frame, or a sequence of TIFF files with many pages each.
 
-Pages without compression are read at the speed of memory.
+Uncompressed pages are read at the speed of memory.
 """
 
 import json
@@ -29,9 +29,9 @@ from disctrack.recording.readers.tiff_pages import Page, page_pixels, pages_of
 def open_images(files: Sequence[Path], camera: str, pattern: str = "") -> FrameReader:
     """One file per frame, or TIFF files of many pages each. Raises RecordingError if no frame can be read.
 
-    A missing number among the files is a frame that cannot be read. Size and depth are those of the first frame that
-    can be read.
-    pattern : tells by {number} which digits of the names count the frames; "" where the names alone must
+    A missing number among the files is a frame that cannot be read. Size and depth are those of the first readable
+    frame.
+    pattern : {number} in it marks the digits that count the frames; "" to find them from the names
     """
     if files[0].suffix.lower() in (".tif", ".tiff") and (_is_stack(files[0]) or _is_stack(files[-1])):
         check_continuation(files, camera)
@@ -65,7 +65,7 @@ def open_images(files: Sequence[Path], camera: str, pattern: str = "") -> FrameR
 
 
 def _is_stack(file: Path) -> bool:
-    """True for a TIFF file that holds more than one frame; False also for what is no TIFF file at all."""
+    """True for a TIFF file with more than one frame; False also for a file that is not TIFF."""
     found = 0
     try:
         for page in islice(pages_of(RawFile(file)), 2):
@@ -78,7 +78,7 @@ def _is_stack(file: Path) -> bool:
 def _open_stack(files: Sequence[Path], camera: str) -> FrameReader:
     """Frames of all pages of the files, in order. Raises RecordingError if no page can be read.
 
-    The frame rate is taken from the notes of ImageJ or OME in the first page, time stamps from those of OME.
+    The frame rate is taken from the description by ImageJ or OME in the first page, time stamps from that by OME.
     """
     pages: list[Page] = []
     sources: list[RawFile] = []
@@ -91,12 +91,12 @@ def _open_stack(files: Sequence[Path], camera: str) -> FrameReader:
     first = pages[0]
     rate, stamps = _times(first.description, len(pages))
     check_frame_size(first.plain.width, first.plain.height, str(files[0]))
-    told: dict[str, Any] = {"camera": camera, "files": sources, "notes": tuple(notes)}
-    told |= {"timestamps": stamps, "frame_rate": rate}
-    beyond = 2**62  # the end of any file: a damaged directory may name an offset that no integer holds
+    common: dict[str, Any] = {"camera": camera, "files": sources, "notes": tuple(notes)}
+    common |= {"timestamps": stamps, "frame_rate": rate}
+    beyond = 2**62  # the end of any file: offsets in a damaged directory may exceed 64 bits
     offsets = np.array([min(page.plain_offset, beyond) for page in pages], np.int64)
     if (offsets >= 0).all() and all(page.coding == first.coding for page in pages):
-        return raw_frames(offsets=offsets, layout=first.plain, **told)
+        return raw_frames(offsets=offsets, layout=first.plain, **common)
 
     def pixels(index: int, out: Image | None, where: str) -> Image:
         return as_grey(page_pixels(sources[index], pages[index], where), where)
@@ -107,12 +107,12 @@ def _open_stack(files: Sequence[Path], camera: str) -> FrameReader:
         dtype=image.dtype,
         decoded=pixels,
         stored=lambda index: pages[index].coding.encode() + b"".join(pages[index].pieces(sources[index], "")),
-        **told,
+        **common,
     )
 
 
 def _pages(file: RawFile) -> tuple[list[Page], str | None]:
-    """Frames of one file, and a note where the chain of directories breaks off."""
+    """Frames of one file, and a note if the chain of directories is broken."""
     pages: list[Page] = []
     note = None
     try:
@@ -128,7 +128,7 @@ def _pages(file: RawFile) -> tuple[list[Page], str | None]:
 
 
 def _without_directories(file: RawFile, first: Page) -> list[Page]:
-    """All frames of a file with one directory, as ImageJ writes stacks: the others follow the first without a gap."""
+    """All frames of a file with one directory, as in stacks by ImageJ: they follow the first without a gap."""
     n, size = _pages_announced(first.description), first.plain.frame_bytes
     if n < 2 or size == 0:
         return [first]
@@ -136,14 +136,14 @@ def _without_directories(file: RawFile, first: Page) -> list[Page]:
         plain = "grey values of 8 or 16 bit, black as zero, upright, not compressed"
         said = f"announces {n} frames in one directory, whose pixels are not plain; expected {plain}"
         raise RecordingError(f"{file}: {said}. Export it again.")
-    most = max(1, -(-file.size // size))  # of a file cut short the frames that begin in it; the next is the end
+    most = max(1, -(-file.size // size))  # a truncated file has the frames that begin in it
     start = first.plain_offset
     return [replace(first, places=(start + i * size,), sizes=(size,)) for i in range(min(n, most))]
 
 
 def _pages_announced(description: str) -> int:
-    """Frames behind one directory by ImageJ's note, or by that of tifffile where it left out the others."""
-    with suppress(ValueError, TypeError, KeyError, OverflowError, RecursionError):  # no note of that kind
+    """Number of frames of one directory by the description of ImageJ, or of tifffile if truncated; otherwise 0."""
+    with suppress(ValueError, TypeError, KeyError, OverflowError, RecursionError):  # another description
         if description.startswith("ImageJ="):
             return int(_imagej(description)["images"])
         *several, _, _ = json.loads(description)["shape"]
@@ -159,25 +159,25 @@ _TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "\u00b5s": 1e-6, "\u03bcs": 1e-
 
 
 def _times(description: str, n: int) -> tuple[float | None, Array | None]:
-    """Frame rate [Hz] and time stamps [s] by ImageJ's or OME's notes, None where they say nothing.
+    """Frame rate [Hz] and time stamps [s] from the description by ImageJ or OME, None if they are missing.
 
     OME schema 2016-06: Pixels/@TimeIncrement, Pixels/Plane/@DeltaT, each with its unit.
     """
     if description.startswith("ImageJ="):
-        told = _imagej(description)
-        interval, rate = _seconds(told, "finterval"), _seconds(told, "fps")
+        entries = _imagej(description)
+        interval, rate = _seconds(entries, "finterval"), _seconds(entries, "fps")
         return 1.0 / interval if interval > 0 else rate if rate > 0 else None, None
     try:
         pixels = next(ElementTree.fromstring(description).iterfind(".//{*}Pixels"))
-    except (ElementTree.ParseError, ValueError, StopIteration):  # no note, or another program's
+    except (ElementTree.ParseError, ValueError, StopIteration):  # none, or by another program
         return None, None
     stamps = np.array([_seconds(plane.attrib, "DeltaT") for plane in pixels.iterfind("{*}Plane")])
     stamps, interval = stamps[np.isfinite(stamps)], _seconds(pixels.attrib, "TimeIncrement")
     return 1.0 / interval if interval > 0 else None, stamps if len(stamps) == n else None
 
 
-def _seconds(told: Mapping[str, str], key: str) -> float:
-    """A number in the unit that stands beside it, of s where none does; NaN where there is none."""
+def _seconds(entries: Mapping[str, str], key: str) -> float:
+    """A time in the unit of the entry `keyUnit`, by default s; NaN if it is missing."""
     with suppress(KeyError, ValueError):
-        return float(told[key]) * _TIME_UNITS[told.get(f"{key}Unit", "s")]
+        return float(entries[key]) * _TIME_UNITS[entries.get(f"{key}Unit", "s")]
     return math.nan

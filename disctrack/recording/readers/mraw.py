@@ -1,4 +1,4 @@
-"""Photron recordings: a header, .cih (text) or .cihx (XML), beside an .mraw file of frames without a gap."""
+"""Photron recordings: a header, .cih (text) or .cihx (XML), and an .mraw file of contiguous frames."""
 
 import contextlib
 import math
@@ -16,7 +16,7 @@ from disctrack.recording.readers.base import CameraHeader, FrameReader, only_fil
 from disctrack.recording.readers.files import content_of
 from disctrack.recording.readers.raw import PixelLayout, RawFile, bit_depth_of, check_frame_size, raw_frames
 
-# Where the entries that matter lie: name in the .cih, path below <cih> in the .cihx.
+# Entries that are used: name in the .cih, path below <cih> in the .cihx.
 _ENTRIES = {
     "Camera Type": "deviceInfo/deviceName",
     "User Defined Camera Name": "basicInfo/cameraName",
@@ -38,14 +38,14 @@ _ENTRIES = {
     "Date": "fileInfo/date",
     "Time": "fileInfo/time",
 }
-# Codes of the trigger modes in a .cihx; those above have parameters in their low bytes and are compared as numbers.
+# Names of the trigger codes 0 to 7 in a .cihx; higher codes contain parameters and are shown as numbers.
 _TRIGGERS = ("Start", "Center", "End", "Random", "Manual", "Random Reset", "Random Center", "Random Manual")
 
 
 def open_mraw(files: Sequence[Path], camera: str) -> FrameReader:
     """Frames of one camera. files: the header, or the .mraw file, or both.
 
-    Raises RecordingError if header or frames are missing, do not fit each other, or are not grey values.
+    Raises RecordingError if header or frames are missing or inconsistent, or if pixels are not grey values.
     """
     header_file, data_file = _pair_of(files, camera)
     entries = _entries(header_file)
@@ -75,7 +75,7 @@ def open_mraw(files: Sequence[Path], camera: str) -> FrameReader:
 
 
 def _pair_of(files: Sequence[Path], camera: str) -> tuple[Path, Path]:
-    """Header and frames, from one of them or both. PFV writes either header, or both alike: .cihx is taken."""
+    """Files of header and frames, from one of them or both. If PFV wrote both headers, .cihx is used."""
     stem = only_file(sorted({file.with_suffix("") for file in files}), camera)
     with told_as(RecordingError, f"{stem.parent}: cannot be read", OSError):
         beside = {file.suffix.lower(): file for file in stem.parent.iterdir() if file.with_suffix("") == stem}
@@ -89,7 +89,7 @@ def _pair_of(files: Sequence[Path], camera: str) -> tuple[Path, Path]:
     return found[0], found[1]
 
 
-Entries = dict[str, str]  # of a header, by their names in the .cih, "" where there is none; and "file", its place
+Entries = dict[str, str]  # of a header, by their names in the .cih, "" if missing; and "file", its path
 
 
 def _entries(file: Path) -> Entries:
@@ -102,7 +102,7 @@ def _entries(file: Path) -> Entries:
 
 
 def _whole(entries: Entries, name: str) -> int:
-    """A number of at least 0; RecordingError where there is none."""
+    """A whole number of at least 0. Raises RecordingError if there is none."""
     found = entries[name]
     if not re.fullmatch(r"[0-9]{1,15}", found):
         raise RecordingError(f"{entries['file']}: '{name}' is {found[:40]!r}; expected a whole number. {_EXPORT}")
@@ -110,7 +110,7 @@ def _whole(entries: Entries, name: str) -> int:
 
 
 def _number(text: str) -> float | None:
-    """A positive finite number, or None. "1/800" is one, too."""
+    """A positive finite number, or None; fractions such as "1/800" are allowed."""
     with contextlib.suppress(ValueError, ZeroDivisionError):
         numerator, _, denominator = text.partition("/")
         value = float(numerator) / (float(denominator) if denominator else 1.0)
@@ -122,9 +122,9 @@ _EXPORT = "Export the recording again, or copy its header again."
 
 
 def _from_xml(content: bytes, file: Path) -> dict[str, str]:
-    """The XML between <cih> and </cih>, which lies in a binary container.
+    """Entries of the XML between <cih> and </cih>, which is in a binary container.
 
-    What stands before is left out, and with it every document type that could define entities.
+    Content before it is omitted, so that no document type can define entities.
     """
     start, stop = content.find(b"<cih>"), content.rfind(b"</cih>")
     if start < 0 or stop < start:
@@ -133,13 +133,13 @@ def _from_xml(content: bytes, file: Path) -> dict[str, str]:
         root = ElementTree.fromstring(content[start : stop + len(b"</cih>")].decode("utf-8", "replace"))
     texts = {name: (root.findtext(path) or "").strip() for name, path in _ENTRIES.items()}
     texts["Trigger Mode"] = _trigger_name(texts["Trigger Mode"], root.findtext("recordInfo/triggerMode/pdcMode") or "")
-    rate = texts["Shutter Speed(s)"]  # here it is 1/s
+    rate = texts["Shutter Speed(s)"]  # in a .cihx it is in 1/s
     texts["Shutter Speed(s)"] = f"1/{rate}" if rate else ""
     return texts
 
 
 def _trigger_name(mode: str, pdc_mode: str) -> str:
-    """Name of a trigger mode; newer cameras write the code into the highest byte of `pdcMode`."""
+    """Name of a trigger mode; newer cameras store the code in the highest byte of `pdcMode`."""
     code = mode.strip() or pdc_mode.strip()
     if not re.fullmatch(r"[0-9]{1,10}", code):
         return code[:40]
@@ -148,7 +148,7 @@ def _trigger_name(mode: str, pdc_mode: str) -> str:
 
 
 def _layout(entries: Entries) -> tuple[PixelLayout, int]:
-    """How the pixels lie, and the bits that carry grey values."""
+    """Layout of the pixels, and their significant bits. Raises RecordingError."""
     file = entries["file"]
     if entries["File Format"].lower() != "mraw":
         saved = entries["File Format"][:20] or "nothing known"
@@ -170,7 +170,7 @@ def _layout(entries: Entries) -> tuple[PixelLayout, int]:
 
 
 def _header(entries: Entries) -> tuple[CameraHeader, list[str], tuple[str, ...]]:
-    """Settings of the recording, what about them cannot be, and what had to be assumed of the frames' times."""
+    """Settings of the recording, notes on impossible ones, and doubts about the times of the frames."""
     rate = _number(entries["Record Rate(fps)"])
     if rate is None:
         said = f"'Record Rate(fps)' is {entries['Record Rate(fps)'][:40]!r}; expected a number above 0"

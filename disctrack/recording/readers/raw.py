@@ -1,8 +1,8 @@
-"""Frames whose pixels lie in a file as they are, or packed, at known places: read at the speed of memory.
+"""Frames of uncompressed or packed pixels at known offsets in a file, read at the speed of memory.
 
-Bytes go from the system's file cache straight into the caller's array by positioned reads. A memory map would need the
-same copy and its page faults, and a file that is cut short or a network that goes away would end the process instead of
-raising an error.
+Positioned reads copy bytes from the system's file cache directly into the caller's array. A memory map would need the
+same copy and page faults, and a truncated file or a lost network connection would end the process instead of raising an
+error.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ from disctrack.files.inputs import open_regular
 from disctrack.recording.readers._pixel_kernels import unpack_10, unpack_12
 from disctrack.recording.readers.base import FrameReader, in_words, room_for
 
-# A header may claim any size; no camera of this kind has more pixels, and reading one must not exhaust the memory.
+# Of an image: more than any camera of this kind has, and few enough not to exhaust the memory.
 MOST_PIXELS = 1 << 27
-# A file that was cut short is worth measuring while most of it is there; a header that promises far more than the file
-# holds is not believed: all that follows is sized by it.
+# Of the frames that a header states, the part that a truncated file must contain: below, the header is taken as wrong,
+# since all arrays have the length that it states.
 LEAST_PRESENT = 0.5
 
 
 class RawFile:
     """A file that stays open and is read at any offset, by several threads at once.
 
-    content : of the file, where that was read already
+    content : of the file, if it was read before
     Raises RecordingError if it cannot be opened.
     """
 
@@ -50,13 +50,13 @@ class RawFile:
         return str(self.path)
 
     def stream(self) -> io.FileIO | io.BytesIO:
-        """The file from its beginning, for a library; it is closed apart."""
+        """A new stream of the file for a library, which the caller closes."""
         return io.FileIO(open_regular(self.path)) if self._content is None else io.BytesIO(self._content)
 
     def read_into(self, buffer: NDArray[np.uint8], offset: int, where: str) -> None:
         """Fill `buffer` (n,) with the bytes from `offset` on.
 
-        Raises RecordingError that begins with `where` if the file ends before, or cannot be read any more.
+        Raises RecordingError that begins with `where` if the file ends earlier or can no longer be read.
         """
         with self._lock, told_as(RecordingError, f"{where}: cannot be read", OSError, then="Copy the file again."):
             self._stream.seek(offset)
@@ -66,7 +66,7 @@ class RawFile:
             raise RecordingError(f"{where}: the file {said}. Copy it again from the camera.")
 
     def bytes_at(self, offset: int, size: int, where: str) -> bytes:
-        """`size` bytes from `offset` on; errors as in `read_into`, and none is read if the file is too short."""
+        """`size` bytes from `offset` on; errors as in `read_into`; no memory is allocated if the file is too short."""
         if offset < 0 or size < 0 or offset + size > self.size:
             said = f"{size} bytes at byte {offset} are announced, but the file has {self.size}: cut short or damaged"
             raise RecordingError(f"{where}: {said}. Copy it again from the camera.")
@@ -75,7 +75,7 @@ class RawFile:
         return buffer.tobytes()
 
     def check_announced(self, camera: str, layout: PixelLayout, n: int, present: int) -> None:
-        """Raise RecordingError unless frames are announced, and `present` of the n, most of them, are in the file."""
+        """Raise RecordingError unless n > 0 and `present`, the number of frames in the file, is most of n."""
         if n < 1:
             raise RecordingError(f"{self} ({camera} camera): its header states no frame. Export it again.")
         if present < LEAST_PRESENT * n or present * layout.frame_bytes > self.size:
@@ -89,33 +89,33 @@ class RawFile:
 
 @dataclass(frozen=True)
 class PixelLayout:
-    """How the pixels of one frame lie in the file."""
+    """Layout of the pixels of one frame in the file."""
 
     width: int  # [px]
     height: int
-    dtype: np.dtype  # of a pixel in the file, with the order of its bytes; or of what packed ones become
-    packed_bits: int = 0  # 10 or 12 where pixels lie without a gap, most significant bit first
+    dtype: np.dtype  # of a pixel in the file, with its byte order; for packed pixels, of the unpacked ones
+    packed_bits: int = 0  # bits per pixel, 10 or 12, if packed, most significant bit first; otherwise 0
     padding: int = 0  # bytes after each row; packed rows have none
     bottom_up: bool = False
-    table: NDArray[np.uint16] | None = None  # grey value of each stored one
+    table: NDArray[np.uint16] | None = None  # grey value of each stored value
 
     @property
     def stored_bits(self) -> int:
-        """Of a pixel."""
+        """Bits of a pixel in the file."""
         return self.packed_bits or 8 * self.dtype.itemsize
 
     @property
     def frame_bytes(self) -> int:
-        """Of one frame."""
+        """Bytes of one frame in the file."""
         return self.width * self.height * self.stored_bits // 8 + self.padding * self.height
 
     @property
     def is_plain(self) -> bool:
-        """True where the bytes of the file are the image, but for their order in a pixel."""
+        """True if the bytes of the file are the image, except for the byte order."""
         return not (self.packed_bits or self.padding or self.bottom_up) and self.table is None
 
     def count_whole(self, offsets: NDArray[np.integer], ends: NDArray[np.integer] | int) -> int:
-        """How many of the frames at offsets (n,) lie wholly before the ends of their files."""
+        """Number of frames at offsets (n,) that are completely within their files."""
         return int(np.sum((offsets >= 0) & (offsets <= np.subtract(ends, self.frame_bytes))))
 
     def decode(self, stored: NDArray[np.uint8], out: Image) -> None:
@@ -135,12 +135,12 @@ def raw_frames(
     offsets: NDArray[np.integer],
     layout: PixelLayout,
     notes: tuple[str, ...] = (),
-    **told: Any,
+    **others: Any,
 ) -> FrameReader:
-    """Frames of equal size at known places in one or several files.
+    """Frames of equal size at known offsets in one or several files.
 
-    Frame i begins at byte offsets[i] of files[i]; it is lost where that is below 0, or where the file ends before its
-    end.   told : other fields of the reader
+    Frame i begins at byte offsets[i] of files[i]; it is lost if that is negative, or if the file ends within the frame.
+    others : fields of the reader
     """
     n, image_size, dtype = len(offsets), (layout.width, layout.height), layout.dtype.newbyteorder("=")
     if lost := n - layout.count_whole(offsets, np.array([file.size for file in files])):
@@ -170,22 +170,22 @@ def raw_frames(
         stored=lambda index: filled(index, "").data,
         coding=f"{layout.stored_bits} {layout.dtype.str} {layout.bottom_up} {layout.table is not None}",
         notes=notes,
-        **told,
+        **others,
     )
 
 
 def bit_depth_of(stored_bits: int, effective_bits: int) -> int:
-    """Bits that carry grey values: as the header says where that is possible, else as stored."""
+    """Significant bits of grey values: as stated by the header if that is possible, otherwise all stored bits."""
     return effective_bits if 8 < effective_bits <= stored_bits else stored_bits
 
 
 def check_frame_size(width: int, height: int, where: str, bits: int = 8, n_bytes: int | None = None) -> None:
-    """Raise RecordingError, beginning with `where`, unless a header's image is one that a camera can have.
+    """Raise RecordingError, beginning with `where`, unless the image size in a header is possible.
 
     bits    : of a pixel in the file; those of a frame must fill whole bytes
-    n_bytes : of what is compressed in any way, and must be able to hold that many pixels
+    n_bytes : size of a compressed image, which limits its number of pixels
     """
-    # even a black image does not shrink by more than this when compressed (deflate: 1032); small ones are let pass
+    # above the largest compression ratio, that of a black image (deflate: 1032); small images are always accepted
     most = MOST_PIXELS if n_bytes is None else min(MOST_PIXELS, max(1 << 22, 1500 * n_bytes))
     if width <= 0 or height <= 0 or width * height > most:
         said = f"claims images of {width} x {height} px, which no camera of this kind has, or the file cannot hold"

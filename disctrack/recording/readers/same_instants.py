@@ -1,7 +1,7 @@
-"""Can two cameras have recorded the same motion, frame i of both at the same instant?
+"""Checks that frame i of both cameras shows the same instant.
 
-Their headers, the numbers in their files' names and the time stamps that files keep are compared. What cannot
-be is an error; doubt leads to a warning, with the frames' numbers, and to evenly spaced frames.
+Headers, numbers in the file names, and time stamps of both cameras are compared. A contradiction is an error; a doubt
+is a warning with the numbers of the frames, and frames are assumed to be evenly spaced.
 """
 
 from collections.abc import Iterator
@@ -16,10 +16,10 @@ from disctrack.findings import Finding, Kind, Severity
 from disctrack.recording.readers.base import CameraHeader, FrameReader
 
 RATE_ROUNDING_HZ = 0.5  # headers give the rate in whole Hz
-CLOCK_TOLERANCE = 1e-3  # relative: cameras whose frames are stamped may run off the nominal rate; the stamps count
-SAME_TAKE_S = 600.0  # computers' clocks, and the time that saving one camera after the other takes
-ALIKE = 0.01  # relative, of rates and exposures; a clock's error is a thousandth of that, a wrong unit far more
-SAME_INSTANT = 0.01  # of a period: at 60 rad/s and 1000 Hz the disc turns by 0.6 mrad in it
+CLOCK_TOLERANCE = 1e-3  # relative deviation from the nominal rate for cameras with time stamps, which are used instead
+SAME_TAKE_S = 600.0  # between the headers' dates: differences of clocks, and saving one camera after the other
+ALIKE = 0.01  # relative tolerance of rates and exposures; clock errors are 1000 times smaller, wrong units far larger
+SAME_INSTANT = 0.01  # tolerance in periods: at 60 rad/s and 1000 Hz the disc turns by 0.6 mrad in this time
 
 
 def check_headers(
@@ -27,9 +27,8 @@ def check_headers(
 ) -> Iterator[str]:
     """Compare the cameras' headers with each other, and with the declared frame rate [Hz] and exposure [s].
 
-    Yields warnings. Raises RecordingError where frame i of both cannot belong together, or cannot have been taken at
-    the declared rate. Formats without a header pass, with a warning where they state another rate: it may be that of a
-    player.
+    Yields warnings. Raises RecordingError if frame i of both cannot be of the same instant, or if the rate is not the
+    declared one. For formats without a header, another rate is only a warning: it may be that of a player.
     """
     for reader in (left, right):
         header, camera, rate = reader.header, reader.camera, reader.frame_rate
@@ -50,7 +49,7 @@ def check_headers(
 
 
 def _compared(left: CameraHeader, right: CameraHeader) -> Iterator[str]:
-    """What is doubtful. Raises RecordingError where frame i of both does not show the same instant."""
+    """Yields warnings. Raises RecordingError if frame i of both does not show the same instant."""
     if abs(left.frame_rate - right.frame_rate) > 1e-6 * left.frame_rate:
         rates = f"{left.rate} ({left.file}), the right one's with {right.rate} ({right.file})"
         said = f"the left camera's frames were recorded with {rates}: frame i of both does not show the same instant"
@@ -65,7 +64,7 @@ def _compared(left: CameraHeader, right: CameraHeader) -> Iterator[str]:
         later = f"taken {offset[0]:.4g} s after that of the left one ({left.file}); a frame lasts {period:.4g} s"
         said = f"by the time stamps, counted from {offset[1]}, the first frame of the right camera ({right.file}) was"
         raise RecordingError(f"{said} {later}. Export the frames of the same instants, of the same take.")
-    if left.trigger != right.trigger:  # equal modes count from the same event; of unequal ones nothing is known
+    if left.trigger != right.trigger:  # equal modes count from the same event, different ones may not
         modes = f"left {left.trigger or 'unknown'}, right {right.trigger or 'unknown'}"
         yield f"the cameras were triggered in different modes: {modes}. Frame i of both may show different instants"
     if left.exposure is not None and right.exposure is not None and _differ(left.exposure, right.exposure):
@@ -84,9 +83,9 @@ def _differ(one: float, other: float) -> bool:
 
 
 def start_offset(left: CameraHeader | None, right: CameraHeader | None) -> tuple[float, str] | None:
-    """How much later [s] the right camera took its frame 0, and since when that is counted; None if not told.
+    """Delay [s] of the right camera's frame 0, and the origin of its times; None if unknown.
 
-    Absolute where both clocks follow a common time signal, otherwise from each camera's own trigger.
+    Absolute if both clocks follow a common time signal, otherwise relative to each camera's own trigger.
     """
     if left is None or right is None or left.first_time is None or right.first_time is None:
         return None
@@ -97,9 +96,9 @@ def start_offset(left: CameraHeader | None, right: CameraHeader | None) -> tuple
 
 
 def check_same_numbers(left: FrameReader, right: FrameReader) -> Iterator[str]:
-    """What is doubtful about pairing two sequences by their order; frame i of both must be the same instant.
+    """Yields warnings about pairing two sequences by their order; frame i of both must be the same instant.
 
-    Raises RecordingError where both count with the same numbers, but do not begin with the same.
+    Raises RecordingError if the ranges of numbers overlap but begin differently, or if the steps differ.
     """
     ours, theirs = left.numbers, right.numbers
     if ours is None or theirs is None or (ours[0], ours.step) == (theirs[0], theirs.step):
@@ -115,17 +114,16 @@ def check_same_numbers(left: FrameReader, right: FrameReader) -> Iterator[str]:
 
 
 def usable_times(reader: FrameReader, frame_rate: float) -> Array | None:
-    """Time stamps (n,) [s] of a reader, or None where there are none that fit the declared frame rate [Hz]."""
+    """Time stamps (n,) [s] of a reader; None if there are none, or if they do not fit the declared frame rate [Hz]."""
     times = reader.timestamps
     return None if times is None or _fault(times, frame_rate) else times
 
 
 def check_time_stamps(left: FrameReader, right: FrameReader, frame_rate: float) -> Iterator[Finding]:
-    """Doubts: stamps that are not used and why, frames of one camera that the other has not; and warnings: frames lost
-    by each camera, and cameras that do not run together.
+    """Yields doubts (unused stamps with the reason, frames lost by one camera only) and warnings.
 
-    frame_rate [Hz] as declared. Times count from frame 0 where the file has a camera's header, which tells how they lie
-    to the other camera's.
+    The warnings are on lost frames of each camera, and on cameras that are not synchronised. frame_rate [Hz] as
+    declared. If the files have headers, times count from frame 0, and the headers give the delay between the cameras.
     """
     doubt, warning = (partial(Finding, Kind.TIME_STAMPS, how) for how in (Severity.DOUBT, Severity.WARNING))
     usable: list[Array] = []
@@ -147,7 +145,7 @@ def check_time_stamps(left: FrameReader, right: FrameReader, frame_rate: float) 
 
 
 def _fault(times: Array, frame_rate: float) -> str:
-    """Why time stamps cannot be used; "" where they can."""
+    """Why time stamps cannot be used; "" if they can."""
     bad = np.flatnonzero(~np.isfinite(times))
     if len(bad):
         return f"that of frame {bad[0]} is not a number"
@@ -169,9 +167,9 @@ def _lost_frames(camera: str, times: Array, frame_rate: float) -> Iterator[str]:
 
 
 def _slips(left: Array, right: Array, period: float) -> Iterator[str]:
-    """From where on frame i of both cameras is not the same instant, if anywhere."""
+    """Message with the frame from which frame i of both cameras is not the same instant, if there is one."""
     later = right - left
-    # against the first frames: what the clocks' zeros differ by is constant, lost frames come on top
+    # relative to the first frames: the clocks may have different zeros, which is a constant
     slips = np.rint((later - later[0]) / period).astype(int)
     changes = np.flatnonzero(np.diff(slips)) + 1
     if len(changes):
@@ -183,7 +181,7 @@ def _slips(left: Array, right: Array, period: float) -> Iterator[str]:
 
 
 def _between_cameras(left: Array, right: Array, period: float) -> Iterator[str]:
-    """How the right camera's times differ from the left one's: a constant, a drift, the rest."""
+    """Messages on differences between the cameras' times: a constant, a drift, jitter."""
     later = right - left
     index = np.arange(len(later)) - 0.5 * (len(later) - 1)
     offset = float(np.median(later))

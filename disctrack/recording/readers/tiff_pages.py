@@ -1,7 +1,7 @@
-"""Pages of TIFF files: tifffile reads their directories, imagecodecs their pieces.
+"""Pages of TIFF files: tifffile reads their directories, imagecodecs decodes their strips and tiles.
 
-Both take a file at its word. Here nothing is read or made that the file cannot hold, whatever its numbers say, and what
-a damaged file makes of it is an error that names the file.
+Neither validates a file. Here sizes and offsets are checked against the file before anything is read or allocated, and
+a damaged file raises an error that names it.
 """
 
 import logging
@@ -17,33 +17,33 @@ from disctrack.errors import RecordingError, told_as
 from disctrack.recording.readers._pixel_kernels import lzw_codes_follow
 from disctrack.recording.readers.raw import MOST_PIXELS, PixelLayout, RawFile, check_frame_size
 
-logging.getLogger("tifffile").addHandler(logging.NullHandler())  # it logs what it finds odd; here that is an error
+logging.getLogger("tifffile").addHandler(logging.NullHandler())  # it logs faults of a file; here they are errors
 
 _LZW = tifffile.COMPRESSION.LZW
 _READ = {tifffile.COMPRESSION[name] for name in ("NONE", "LZW", "JPEG", "ADOBE_DEFLATE", "PACKBITS", "DEFLATE")}
-# Tags by which the pixels of two pages are decoded alike.
+# Tags that determine the decoding of the pixels.
 _CODING = (256, 257, 258, 259, 262, 266, 274, 277, 278, 284, 317, 320, 322, 323, 338, 339, 347)
 
 
 @dataclass(frozen=True)
 class Page:
-    """One page: where its directory and the pieces of its pixels lie."""
+    """One page: offsets and coding of its strips or tiles."""
 
     places: tuple[int, ...]  # byte offsets of strips or tiles
     sizes: tuple[int, ...]  # [bytes]
-    coding: str  # all by which the pixels are decoded
-    like: tifffile.TiffPage  # the first page of the file with this coding; of it no more than the coding is meant
+    coding: str  # all tags that determine the decoding of the pixels
+    like: tifffile.TiffPage  # the first page of the file with this coding, used for its coding only
     description: str
 
     @property
     def plain(self) -> PixelLayout:
-        """How the pixels lie where they lie as they are."""
+        """Layout of the pixels if they are uncompressed and contiguous."""
         dtype = np.dtype(self.like.dtype).newbyteorder(self.like.parent.byteorder)
         return PixelLayout(int(self.like.imagewidth), int(self.like.imagelength), dtype)
 
     @property
     def plain_offset(self) -> int:
-        """Where grey values of whole bytes lie, upright, one after the other and as they are; -1 if they do not."""
+        """Offset of the pixels if they are upright, uncompressed, contiguous grey values of whole bytes; else -1."""
         page, plain = self.like, self.plain
         grey = page.photometric == tifffile.PHOTOMETRIC.MINISBLACK and page.samplesperpixel == 1 and page.fillorder == 1
         whole = page.bitspersample in (8, 16) and plain.dtype.kind == "u"
@@ -54,13 +54,13 @@ class Page:
         return self.places[0] if one or (follow and sum(self.sizes) == plain.frame_bytes) else -1
 
     def pieces(self, source: RawFile, where: str) -> list[bytes]:
-        """Strips or tiles as they are stored. Raises RecordingError."""
+        """Stored bytes of the strips or tiles. Raises RecordingError."""
         return [source.bytes_at(a, n, where) for a, n in zip(self.places, self.sizes, strict=True)]
 
 
 def pages_of(source: RawFile) -> Iterator[Page]:
-    """The pages of a file but for thumbnails. Raises RecordingError where they break off, or there is none."""
-    first: dict[str, tifffile.TiffPage] = {}  # of each coding
+    """The pages of a file without thumbnails. Raises RecordingError if their chain is broken, or if there is none."""
+    first: dict[str, tifffile.TiffPage] = {}  # first page of each coding
     seen, frames = set[int](), 0
     said = f"{source}: not a readable TIFF file, or damaged"
     with told_as(RecordingError, said, Exception), source.stream() as stream:
@@ -72,7 +72,7 @@ def pages_of(source: RawFile) -> Iterator[Page]:
                 break
             if page.offset in seen:
                 raise RecordingError(f"{source}: the chain of pages turns back to byte {page.offset}.")
-            if not isinstance(page, tifffile.TiffPage):  # others know less of themselves; nobody wanted them
+            if not isinstance(page, tifffile.TiffPage):  # lightweight pages, which tifffile makes on request only
                 raise TypeError("no page of its own")
             seen.add(page.offset)
             found = _page(page, first)
@@ -99,7 +99,7 @@ def _orientation(page: tifffile.TiffPage) -> int:
 
 
 def page_pixels(source: RawFile, page: Page, where: str) -> NDArray:
-    """Pixels of a page, (height, width) or (height, width, channels), upright and light is more; a palette looked up.
+    """Pixels of a page, (height, width) or (height, width, channels), upright, with black as 0 and palettes applied.
 
     Raises RecordingError that begins with `where`.
     """
@@ -109,7 +109,7 @@ def page_pixels(source: RawFile, page: Page, where: str) -> NDArray:
 
 
 def _check(page: Page, where: str) -> None:
-    """Raise RecordingError unless a page's numbers fit each other, and its pixels are compressed in a known way."""
+    """Raise RecordingError unless a page's sizes are consistent and its compression is known."""
     like, width, height = page.like, page.plain.width, page.plain.height
     check_frame_size(width, height, where, n_bytes=sum(page.sizes))
     if like.compression not in _READ:

@@ -26,19 +26,19 @@ if TYPE_CHECKING:  # an optional package
     from av.container import InputContainer
     from av.video.plane import VideoPlane
 
-# Nothing but containers for frames: a play list under a video's name could make the library open other files.
+# Only containers of frames: a play list named like a video could make the library open other files.
 _CONTAINERS = {"format_whitelist": "avi,matroska,webm,mov,mp4,m4a,3gp,3g2,mj2", "protocol_whitelist": "file"}
 _LOSSLESS = frozenset({"ffv1", "rawvideo", "huffyuv", "ffvhuff", "utvideo", "magicyuv", "png", "tiff", "v210", "qtrle"})
-_DECODED_ON = 8  # frames: opening the file anew and seeking costs more than to decode these and drop them
+_DECODED_ON = 8  # frames to be skipped by decoding, which is faster than reopening the file and seeking
 
-_Decoded: TypeAlias = "tuple[int, av.VideoFrame | None]"  # index of a frame, the frame; None behind the last one
+_Decoded: TypeAlias = "tuple[int, av.VideoFrame | None]"  # index of a frame, the frame; None after the last one
 
 
 def open_video(files: Sequence[Path], camera: str) -> FrameReader:
-    """Reader of one video. Raises RecordingError if PyAV is not installed or the file is no video.
+    """Reader of one video. Raises RecordingError if PyAV is not installed or the file is not a video.
 
-    Grey values are the luma plane as it is stored, not stretched from limited to full range. There are no time stamps:
-    those of the container are a player's, not the camera's.
+    Grey values are the stored luma plane, not stretched from limited to full range. There are no time stamps: those of
+    the container are for a player, not from the camera.
     """
     file = only_file(files, camera)
     video = _Video(file, camera)
@@ -65,33 +65,33 @@ def open_video(files: Sequence[Path], camera: str) -> FrameReader:
 
 
 class _Video:
-    """Frames of a video in order of presentation. Best read forwards, by one thread.
+    """Frames of a video in order of presentation. Reading is fastest forwards, by one thread.
 
-    They are found by their time in the container: going back starts at the key frame before.
+    Frames are identified by their time in the container; reading backwards starts at the preceding key frame.
     """
 
     def __init__(self, file: Path, camera: str) -> None:
         self.file, self.camera = file, camera
         self._lock = threading.Lock()
         self._frames: Generator[_Decoded, None, None] | None = None
-        self._next = 0  # the next frame of the decoder is this one, or one that follows
+        self._next = 0  # lower limit of the index of the decoder's next frame
         self._held: _Decoded = (-1, None)
         self._content = b""
         with _opened(file, camera) as container:
             codec = container.streams.video[0].codec_context
             check_frame_size(codec.width, codec.height, str(file))
             self.codec = str(codec.name)
-            # in order of presentation, in units of the container; without usable times frames are counted
+            # in order of presentation, in units of the container; frame numbers if the times are not usable
             self.times, self._keys, self._timed, self._checked = _index(container, self.codec, file)
 
     def decoded(self, index: int, out: Image | None, where: str) -> Image:
-        """Grey values of a frame, where `out` is given in the decoder's memory. Raises RecordingError."""
+        """Grey values of a frame, in the decoder's memory if `out` is given. Raises RecordingError."""
         with self._lock:
             image = _luma(self.frame(index, where), where)
             return image.copy() if out is None else image
 
     def stored(self, index: int) -> bytes:
-        """SHA-256 of the file, and the frame: compressed ones cannot be told apart without decoding them."""
+        """SHA-256 of the file, and the index: compressed frames cannot be distinguished without decoding."""
         if not self._content:
             with told_as(RecordingError, f"{self.file}: cannot be read", OSError), self.file.open("rb") as stream:
                 self._content = hashlib.file_digest(stream, "sha256").digest()
@@ -106,7 +106,7 @@ class _Video:
         try:
             while self._held[0] < index:
                 self._held = next(self._frames, (len(self.times), None))
-        except RecordingError as error:  # the file is opened anew
+        except RecordingError as error:  # the next call reopens the file
             self._frames = None
             raise RecordingError(f"{where}: {error}") from error
         position, frame = self._held
@@ -115,17 +115,17 @@ class _Video:
         return frame
 
     def _from(self, count: int) -> Generator[_Decoded, None, None]:
-        """All sound frames from a key frame on in order, from the beginning where it cannot be found.
+        """All undamaged frames in order, from a key frame on, or from the beginning if seeking fails.
 
-        After damage none is up to the next key frame. Raises RecordingError where the file is no longer there.
+        After damage, frames up to the next key frame are omitted. Raises RecordingError if the file no longer exists.
         """
         container = _opened(self.file, self.camera)
         import av
 
         stream, sound = container.streams.video[0], True
-        # what follows a fault of the container is not to be found
+        # frames after a fault of the container cannot be found
         with container, suppress(av.FFmpegError, OSError, ValueError):
-            with suppress(OSError, ValueError):  # what cannot be sought is decoded from the beginning
+            with suppress(OSError, ValueError):  # if seeking fails, decode from the beginning
                 if count:
                     container.seek(int(self.times[count]), stream=stream, backward=True)
             for packet in container.demux(stream):
@@ -148,10 +148,10 @@ class _Video:
 def _index(
     container: InputContainer, codec: str, file: Path
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], bool, bool]:
-    """Times of all packets, and the indices at which decoding can begin; 0 is one.
+    """Times of all packets, and the indices at which decoding can begin, including 0; then two flags.
 
-    Are the times the container's (in those without usable ones, frames are counted); do packets carry checksums, that
-    the decoder does not enforce?
+    The first is True if the times are the container's, False if they are frame numbers. The second is True if packets
+    have checksums that the decoder does not enforce. Raises RecordingError.
     """
     import av
 
@@ -173,17 +173,17 @@ def _index(
     return np.array(times, np.int64)[presented], first_of_all, True, checked
 
 
-# zlib computes the CRC of FFV1 with the bits of every byte in the other order
+# zlib computes the CRC of FFV1 from bytes with reversed bits
 _REVERSED = np.packbits(np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1)[:, ::-1], axis=1).ravel()
 _FOOTER = 8
 
 
 def checksums_hold(packet: bytes) -> bool:
-    """True if a packet of FFV1 is a chain of slices whose checksums are right.
+    """True if a packet of FFV1 is a chain of slices with correct checksums.
 
-    The decoder reports a wrong one to its log alone and delivers the damaged frame. RFC 9043, section 4.9: each slice
-    ends in its size (24 bits), and with error detection in an error status (8 bits) and a parity that makes the CRC of
-    the whole slice zero (polynomial 0x04C11DB7, start 0, most significant bit first).
+    The decoder only logs a wrong one, and returns the damaged frame. RFC 9043, section 4.9: each slice ends with its
+    size (24 bits), and with error detection also an error status (8 bits) and a parity that makes the CRC of the whole
+    slice zero (polynomial 0x04C11DB7, start 0, most significant bit first).
     """
     content, stop = np.frombuffer(packet, np.uint8), len(packet)
     while stop:
@@ -205,13 +205,13 @@ def _opened(file: Path, camera: str) -> InputContainer:
         codec = container.streams.video[0].codec_context
         if codec is None:
             raise ValueError("no decoder for it")
-        codec.thread_type = "NONE"  # the other camera's file is decoded beside this one
+        codec.thread_type = "NONE"  # the other camera's file is decoded in parallel
         codec.options = {"err_detect": "explode", "max_pixels": str(MOST_PIXELS)}
         return container
 
 
 def _gap_doubts(times: NDArray[np.int64]) -> Iterator[str]:
-    """A doubt where the container's clock skips: the recorder lost frames there."""
+    """A doubt if the container's clock skips, because the recorder lost frames."""
     steps = np.diff(times)
     if len(steps) < 3:
         return
@@ -228,7 +228,7 @@ def _depth(frame: av.VideoFrame) -> int:
 
 
 def _format_notes(frame: av.VideoFrame) -> Iterator[str]:
-    """What the user should know of the pixel format."""
+    """Notes for the user on the pixel format."""
     name = frame.format.name
     if name.startswith("yuvj") or (name.startswith("yuv") and frame.color_range == 2):
         yield f"luma of {name} (full range) is used as it is"
@@ -243,15 +243,15 @@ def _format_notes(frame: av.VideoFrame) -> Iterator[str]:
 
 
 def _rows(plane: VideoPlane, height: int) -> NDArray[np.uint8]:
-    """Bytes of a plane's rows (height, bytes), the upper first; a view of its memory where that begins with them."""
+    """Bytes of a plane's rows (height, bytes), the upper first; a view of its memory if it is stored in this order."""
     size = abs(plane.line_size)
     if plane.line_size >= 0:
         return np.frombuffer(memoryview(plane), np.uint8)[: size * height].reshape(height, size)
-    first = plane.buffer_ptr + (height - 1) * plane.line_size  # bottom up: the plane says where the upper row lies
+    first = plane.buffer_ptr + (height - 1) * plane.line_size  # bottom up: the plane's pointer is to the upper row
     return np.frombuffer(ctypes.string_at(first, size * height), np.uint8).reshape(height, size)[::-1]
 
 
-# Pixel formats whose first plane is the grey values, or begins with the first of them in every pair
+# Pixel formats whose first plane contains the grey values
 _FIRST_PLANE = ("gray", "yuv", "yuyv", "nv12", "nv16", "nv21", "nv24", "p0", "uyvy")
 
 
@@ -266,7 +266,7 @@ def _luma(frame: av.VideoFrame, where: str) -> Image:
         return np.asarray(frame.to_ndarray(format=name)).astype(np.uint16)
     if name == "pal8":
         colours = np.frombuffer(memoryview(frame.planes[1]), np.uint8)[:1024].reshape(256, 4)[:, :3]
-        if (colours == colours[0]).all():  # a recorder of grey values left the palette out: all would be black
+        if (colours == colours[0]).all():  # grey values without a palette: all would be black
             return _rows(frame.planes[0], frame.height)[:, : frame.width]
     if name in ("rgb24", "bgr24", "bgr0", "rgba", "bgra", "argb", "gbrp", "pal8"):
         return as_grey(np.asarray(frame.to_ndarray(format="rgb24")), where)
