@@ -574,10 +574,9 @@ class _Search:
             return True
         if len(trial.candidates) < 2:
             return False
-        signals = []
-        for c in trial.candidates:
-            amount = np.array([values[q.name] - q.null for q in c.quantities])
-            signals.append(self.system.linearise(values, c.names)[1] @ amount)
+        amounts = {q.name: values[q.name] - q.null for c in trial.candidates for q in c.quantities}
+        parts = dict(zip(amounts, np.moveaxis(self.system.linearise(values, list(amounts))[1], -1, 0), strict=True))
+        signals = [sum(amounts[name] * parts[name] for name in c.names) for c in trial.candidates]
         sums = [several for k in range(2, len(signals) + 1) for several in combinations(signals, k)]
         return any(np.sum(sum(own) ** 2) < CANCELLING * min(np.sum(x**2) for x in own) for own in sums)
 

@@ -1,7 +1,7 @@
 """Declared equations and terms, differentiated and compiled: rates, sensors and clock as functions of parameters."""
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cached_property, lru_cache
 from typing import Any
 
@@ -191,11 +191,24 @@ class Formulas:
 
         return evaluate
 
-    def along_motion(self, expressions: Iterable[sympy.Expr], t: Array, states: Array, p: Array, u: Any) -> list[Array]:
-        """Values, each (m,), of expressions at instants (m,) in states (m, n), with parameters p and inputs u."""
+    @cached_property
+    def jump_arguments(self) -> Callable[..., list[Array]]:
+        """(t (m,), states (m, n), p, inputs) -> the arguments of all jumps, each (m,)."""
+        return self._along_motion(self.widths)
+
+    @cached_property
+    def shape_guesses(self) -> Callable[..., list[Array]]:
+        """(t (m,), states (m, n), p, inputs) -> the values that are tried for the shapes of `along`, each (m,)."""
+        return self._along_motion(self.along.values())
+
+    def _along_motion(self, expressions: Iterable[sympy.Expr]) -> Callable[..., list[Array]]:
         function = sympy.lambdify((_t, self.states, self.numbers, self.inputs), list(expressions), "numpy")
-        with np.errstate(all="ignore"):
-            return [np.broadcast_to(x, t.shape) for x in function(t, list(states.T), p, u)]
+
+        def evaluate(t: Array, states: Array, p: Array, u: Sequence[Array]) -> list[Array]:
+            with np.errstate(all="ignore"):
+                return [np.broadcast_to(x, t.shape) for x in function(t, list(states.T), p, u)]
+
+        return evaluate
 
     def defaults(self) -> dict[str, float]:
         """Declared values of all entries of p; the widths of jumps are 1 until they are known."""
