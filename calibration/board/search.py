@@ -59,9 +59,9 @@ def located(
     if shown := other_board([images[i] for i in sample], [i in without for i in sample], target):
         return [BoardNotFound(f"{target} is not in it. {shown}")] * len(images)
     without += lost(sorted(set(range(len(images))) - set(sample)), False)
-    tried = [without[i] for i in evenly(len(without), VIEWS_TRIED)]
-    if len(without) < len(images) or lost(tried, True) != tried:
-        lost(without, True)
+    tried = without if len(without) < len(images) else sample
+    if lost(tried, True) != tried:
+        lost([i for i in without if i not in tried], True)
     return [views[index] for index in range(len(images))]
 
 
