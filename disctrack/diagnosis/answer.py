@@ -58,8 +58,8 @@ class DiscDiagnosis(Brief):
     def facts(self) -> dict[str, str]:
         """The main facts (`Brief`)."""
         d = self.diagnosis
-        chi = " before, ".join(f"{fit.reduced_chi_square:.4g}" for fit in (d.before, d.after))
-        return {"verdict": d.verdict, "says": self.sentence, "reduced chi-square": f"{chi} after"}
+        chi_square = f"{d.before.reduced_chi_square:.4g} before, {d.after.reduced_chi_square:.4g} after"
+        return {"verdict": d.verdict, "says": self.sentence, "reduced chi-square": chi_square}
 
     @property
     def has_more(self) -> bool:

@@ -27,7 +27,6 @@ from disctrack.findings import NONSENSE, Finding, Kind, Remedy, Severity, Subjec
 from disctrack.frames import CAMERAS, vector_from_rotation
 from disctrack.numbers import Measured
 from disctrack.track.dots import acquisition
-from disctrack.track.dots.acquisition import BLOB_PX, MIN_EXPLAINED, acquire, rigid_motions, seen_by_one_camera
 from disctrack.track.judge.doubts import misplaced_dots
 from disctrack.track.pose import MIN_DOTS, DotsInFrames, dots_at
 from disctrack.track.refine.self_calibration import declared_places_kept, fit_shared
@@ -61,9 +60,9 @@ def arrangement_found(pair: NDArray, rig: StereoRig, disc: Disc) -> Iterator[Fin
 
     pair : (2, height, width). All dots but one must be found in both cameras, and more than in the images as declared.
     """
-    enough = max(acquire(pair, rig, disc)[1] + 1, 2 * disc.n_markers - 2)
+    enough = max(acquisition.acquire(pair, rig, disc)[1] + 1, 2 * disc.n_markers - 2)
     ways = list(_ways(pair, disc))
-    dots = [acquire(images, rig, layout, by_one=False)[1] for _, images, layout in ways]
+    dots = [acquisition.acquire(images, rig, layout, by_one=False)[1] for _, images, layout in ways]
     best = dots.index(max(dots))
     if dots[best] >= enough:
         text, _, layout = ways[best]
@@ -96,14 +95,14 @@ def moved_camera(pairs: NDArray, rig: StereoRig, disc: Disc) -> Iterator[Finding
     pairs : (n, 2, height, width), evenly spread; both cameras must see the dots in most of them
     """
     seen = _by_each_camera(pairs, rig, disc)
-    by_both = np.isfinite(seen.pixels).all(-1).sum(axis=2) >= MIN_EXPLAINED
+    by_both = np.isfinite(seen.pixels).all(-1).sum(axis=2) >= acquisition.MIN_EXPLAINED
     seen = seen.at(np.flatnonzero(by_both.all(axis=1)))
     if 2 * len(seen.t) < len(pairs) or len(seen.t) < MIN_DOTS:
         return
     sigma = np.zeros(N_RIG + 2 * disc.n_markers)
     sigma[PAIR_TURN], sigma[PAIR_SHIFT] = TURN, SHIFT
     found, _, reduced, _ = fit_shared(seen, sigma)
-    rms, moved = BLOB_PX * np.sqrt(reduced), rig.perturbed(found[:N_RIG])
+    rms, moved = acquisition.BLOB_PX * np.sqrt(reduced), rig.perturbed(found[:N_RIG])
     turn = np.linalg.norm(vector_from_rotation(moved.R_right_left @ rig.R_right_left.T))
     shift = np.linalg.norm(moved.t_right_left - rig.t_right_left)
     if rms[-1] < MEETING_PX < rms[0]:
@@ -123,10 +122,11 @@ def moved_camera(pairs: NDArray, rig: StereoRig, disc: Disc) -> Iterator[Finding
 def _by_each_camera(pairs: NDArray, rig: StereoRig, disc: Disc) -> DotsInFrames:
     """Dots identified among blobs by each camera alone, in pairs (n, 2, height, width), with poses by the left one."""
     diameters = acquisition.expected_diameter_px(rig, disc)
-    seen = [[seen_by_one_camera(pair[c], c, diameters[c], rig, disc) for c in (0, 1)] for pair in pairs]
+    seen = [[acquisition.seen_by_one_camera(pair[c], c, diameters[c], rig, disc) for c in (0, 1)] for pair in pairs]
     pixels = np.array([[side[0][:, :2] for side in pair] for pair in seen]).reshape(-1, 2, disc.n_markers, 2)
     R, t = (np.array([pair[0][k] for pair in seen]) for k in (1, 2))
-    return DotsInFrames(rig, disc, pixels, np.broadcast_to(BLOB_PX**2 * np.eye(2), (*pixels.shape, 2)), R, t)
+    covariance = np.broadcast_to(acquisition.BLOB_PX**2 * np.eye(2), (*pixels.shape, 2))
+    return DotsInFrames(rig, disc, pixels, covariance, R, t)
 
 
 def unlike_declared(pair: NDArray, rig: StereoRig, disc: Disc) -> tuple[Finding, ...]:
@@ -140,7 +140,7 @@ def unlike_declared(pair: NDArray, rig: StereoRig, disc: Disc) -> tuple[Finding,
     which, points, _, scale, misfit_px = max(several, key=lambda found: found[0].sum())
     if abs(np.log(scale.value)) > SIDE_TOLERANCE:
         return (other_scale(scale, explains=NONSENSE),)
-    (R,), (t,) = rigid_motions(disc.marker_centres_body[None, which], points[None])
+    (R,), (t,) = acquisition.rigid_motions(disc.marker_centres_body[None, which], points[None])
     # median of the searches: a search for blobs much smaller than the dots finds only their darkest parts
     (affine,) = dots_at(R[None], t[None], rig, disc)[1]
     expected = np.pi / 4 * disc.marker_diameter**2 * np.abs(np.linalg.det(affine))
@@ -164,9 +164,11 @@ def _seen_dots(pair: NDArray, rig: StereoRig, disc: Disc) -> Iterator[tuple[Mask
         reprojection error [px] of the triangulated points
     """
     for diameter in DOT_DIAMETERS_PX:
-        blobs = np.stack([seen_by_one_camera(pair[camera], camera, diameter, rig, disc)[0] for camera in (0, 1)])
+        blobs = np.stack(
+            [acquisition.seen_by_one_camera(pair[camera], camera, diameter, rig, disc)[0] for camera in (0, 1)]
+        )
         which: Mask = np.asarray(np.isfinite(blobs).all((0, 2)))
-        if which.sum() < MIN_EXPLAINED:
+        if which.sum() < acquisition.MIN_EXPLAINED:
             continue
         pixels = blobs[:, which, :2]
         points = triangulate(pixels, rig)
@@ -176,5 +178,5 @@ def _seen_dots(pair: NDArray, rig: StereoRig, disc: Disc) -> Iterator[tuple[Mask
         misfit = float(np.abs(rig.project(points) - pixels).max())
         if misfit < acquisition.EPIPOLAR_PX and scale > 0 and np.abs(ratios / scale - 1).max() < MISPLACED:
             # uneven light shifts all blobs alike: more blobs do not reduce the error
-            uncertain = float(np.sqrt(2) * BLOB_PX / np.median(apart(pixels[0])))
+            uncertain = float(np.sqrt(2) * acquisition.BLOB_PX / np.median(apart(pixels[0])))
             yield which, points, blobs[:, which, 2], Measured(scale, scale * uncertain), misfit
