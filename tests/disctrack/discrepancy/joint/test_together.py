@@ -55,6 +55,7 @@ def test_an_effect_below_one_run_s_reach_is_found_in_thirty(rng):
     assert abs(together.after.values["drag.c"] - 0.06) < 3 * together.after.sigma("drag.c")
 
 
+@pytest.mark.statistical
 def test_nothing_is_found_where_nothing_is_hidden(rng):
     claimed = [answer(runs(rng, 30))[1].found for _ in range(5)]
     assert sum(bool(f) for f in claimed) == 0  # 0.005 each
