@@ -59,8 +59,8 @@ def is_done(folder: Path, row: Row | None, requested: Stages) -> bool:
     if row is None or row["status"] != MEASURED or not row.get("trajectory"):
         return False
     made = [(row["stages"].get(stage), value) for stage, value in requested.items()]
-    whole = all((folder / row[file]).is_file() for file in PATHS if row.get(file))
+    suffices = all(there == value or (value is False and there is True) for there, value in made)
     with contextlib.suppress(DiscTrackError):
-        same = read_provenance(folder / row["trajectory"]).fingerprint == row["fingerprint"]
-        return same and whole and all(there == value or (value is False and there is True) for there, value in made)
+        whole = suffices and all((folder / row[file]).is_file() for file in PATHS if row.get(file))
+        return whole and read_provenance(folder / row["trajectory"]).fingerprint == row["fingerprint"]
     return False
