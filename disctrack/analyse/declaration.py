@@ -24,7 +24,7 @@ from operator import itemgetter
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
-from scipy.spatial.distance import pdist
+import scipy
 
 from calibration.cameras.camera import StereoRig, triangulate
 from calibration.kit.arrays import Array, evenly, robust_sigma
@@ -434,13 +434,12 @@ def _view_on_plane(rig: StereoRig, boards: Boards, normal: Array, middle: Array)
 
 def rise_of_centre(trajectory: Trajectory) -> tuple[Finding, ...]:
     """The radius from the slope of height over sin(theta), if the nutation varies enough."""
-    q = trajectory.q[trajectory.measured]
-    theta, disc = q[:, 4], trajectory.disc
-    q = q[(theta > THETA_RANGE[0]) & (theta < THETA_RANGE[1])]
-    # on a tilted table, a disc of steady nutation seems to oscillate by twice the tilt
-    if len(q) < BLOCK or np.ptp(np.sin(q[:, 4])) < 2 * MIN_LEAN:
-        return ()
+    q, disc = trajectory.q[trajectory.measured], trajectory.disc
+    q = q[(q[:, 4] > THETA_RANGE[0]) & (q[:, 4] < THETA_RANGE[1])]
     s = np.sin(q[:, 4])
+    # on a tilted table, a disc of steady nutation seems to oscillate by twice the tilt
+    if len(q) < BLOCK or np.ptp(s) < 2 * MIN_LEAN:
+        return ()
     z = q[:, 2] - disc.half_thickness * np.cos(q[:, 4])
     slope, scatter = _slope(s, z)
     rise = Measured(1e3 * slope.value, 1e3 * slope.sigma, "mm")
@@ -492,7 +491,8 @@ def scale_of_dots(trajectory: Trajectory, declared: Disc, square: float | None =
         return ()  # inconsistent cameras determine no size
     rig = replace(trajectory.rig, lens_field=None)  # the pixels of the trajectory are already corrected for it
     seen = triangulate(pixels.swapaxes(0, 1).reshape(2, n * dots, 2), rig).reshape(n, dots, 3)
-    ratio = np.array([pdist(places) for places in seen]) / pdist(declared.marker_centres_body)
+    distances = scipy.spatial.distance.pdist
+    ratio = np.array([distances(places) for places in seen]) / distances(declared.marker_centres_body)
     per_pair = np.array([np.median(r[np.isfinite(r)]) for r in ratio.T if np.isfinite(r).sum() >= min(5, n)])
     if len(per_pair) < MIN_BLOCKS:
         return ()
