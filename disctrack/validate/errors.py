@@ -83,18 +83,11 @@ def joined(parts: Iterable[PoseErrors]) -> PoseErrors:
     return PoseErrors(*map(np.concatenate, zip(*(vars(part).values() for part in parts), strict=True)))
 
 
-@dataclass(frozen=True)
-class Consistency:
-    """Normalised squared error per degree of freedom: 1 if the reported covariance is correct."""
-
-    value: float
-    uncertainty: float  # standard error of `value` if it were 1
-    n: int  # number of independent poses or rigs
-
-
-def _consistency(values: Sequence[float] | Array) -> Consistency:
+def _consistency(values: Sequence[float] | Array) -> dict[str, float]:
+    """Normalised squared error per degree of freedom, 1 if the reported covariance is correct; its error if it were."""
     n = len(values)
-    return Consistency(float(np.mean(values)) if n else float("nan"), float(np.sqrt(2 / (6 * max(n, 1)))), n)
+    mean = float(np.mean(values)) if n else float("nan")
+    return {"value": mean, "standard error": float(np.sqrt(2 / (6 * max(n, 1)))), "poses or rigs": n}
 
 
 def _normalised(errors: Array, covariance: Array) -> Array:
@@ -102,13 +95,13 @@ def _normalised(errors: Array, covariance: Array) -> Array:
     return np.einsum("ni,ni->n", errors, np.linalg.solve(covariance, errors[..., None])[..., 0]) / 6
 
 
-def noise_consistency(comparison: PoseErrors) -> Consistency:
+def noise_consistency(comparison: PoseErrors) -> dict[str, float]:
     """Mean of e^T C^-1 e / 6 with C the reported noise covariance; e must be free of calibration errors."""
     ok = comparison.usable
     return _consistency(_normalised(comparison.error[ok], comparison.covariance[ok]))
 
 
-def calibration_consistency(pairs: Iterable[tuple[PoseErrors, PoseErrors]]) -> Consistency:
+def calibration_consistency(pairs: Iterable[tuple[PoseErrors, PoseErrors]]) -> dict[str, float]:
     """Squared calibration error over its reported variance, from the same images measured with two rigs.
 
     pairs : poses of each recording with its own calibration and with the true cameras. Both have the same image noise,

@@ -70,7 +70,7 @@ def write_validation(folder: Path, validation: Validation) -> list[Path]:
     make_folder(folder)
     files = [folder / f"{validation.name}.md", folder / f"{validation.name}.json"]
     write_whole(files[0], validation.markdown().encode())
-    tree = {"units": "SI, radians", "headline": validation.headline, "complaints": validation.complaints}
+    tree = {"units": "SI, radians unless named", "headline": validation.headline, "complaints": validation.complaints}
     outcomes = [vars(outcome) for outcome in validation.outcomes]
     write_whole(files[1], json_file(tree | {"outcomes": outcomes}))
     return files
