@@ -7,7 +7,8 @@ Three laws hold whatever the friction is, and each contains declared numbers:
   satisfies it is proportional to the square of the frame rate and to the radius; the mass cancels. It holds in
   rolling, in slip and in free flight, but not while something else touches the disc, or at rest on a patch.
 - rigidity: the distances of the dots, triangulated, equal those of their declared centres in units of the chessboard.
-- geometry: the centre of a disc on its rim is r sin(theta) + h cos(theta) above one plane, the table.
+- geometry: the centre of a disc on its rim is r sin(theta) + h cos(theta) above one plane, the table. If that gives
+  the same radius as the moments, the radius is wrong, and not gravity or the rate.
 
 A mirrored world satisfies all three. It is recognised by chirality: dots without an axis of symmetry are not found in
 it, and the left camera is on the right.
@@ -53,7 +54,6 @@ NOTED = 0.01  # relative deviation of the balance, or growth of the energy, that
 SCALE = 5e-3  # relative, of printed dots to a printed board, with paper and toner
 BY_SCALE = (Kind.DOTS_MISPLACED, Kind.RADIUS, Kind.THICKNESS, Kind.BOARD_THICKNESS, Kind.GRAVITY_OR_RATE, *MISFITS)
 SIDE_TOLERANCE = 0.06  # of a length: at a larger difference of the print's scale the dots also differ in size
-RISE = 0.03  # of the radius: a rounded or bevelled edge of a millimetre
 MIN_LEAN = np.radians(2.0)  # of a plane: boards and tables are tilted by less
 SEEN_RARELY = 0.1  # fraction of the images
 MOST_HEIGHT = 3e-3  # [m] from the rim's plane to the lower face of a board that lies on it, of uncertain thickness
@@ -96,7 +96,7 @@ def contradictions(
         height = None if off is None else 1e-6 * off.numbers["height"].value
         # with a wrong table plane, neither heights nor the direction of gravity are known
         elsewhere = another_plane(trajectory, boards)
-        found += elsewhere or [*rise_of_centre(trajectory), *motion_against_gravity(trajectory, height)]
+        found += elsewhere or motion_against_gravity(trajectory, height)
         if recording is not None and recording.table is not None and off is not None and not elsewhere:
             found += thickness(disc, recording.table.board_thickness, off)
     found += () if board is None else turned_board(board.inner_corners)
@@ -213,21 +213,6 @@ def _typical(estimates: Array, unit: str = "") -> Measured:
     return Measured(float(np.median(estimates)), robust_sigma(estimates) * np.sqrt(np.pi / 2 / len(estimates)), unit)
 
 
-def _slope(x: Array, y: Array) -> tuple[Measured, float]:
-    """Slope of y over x, and the scatter about the line; outliers, as of a disc in the air or in a hand, count less.
-
-    The sigma takes the autocorrelation of the residuals into account: a push, or a curve, has few independent points.
-    """
-    weight = np.ones(len(x))
-    for _ in range(6):
-        slope, offset = np.polyfit(x, y, 1, w=np.sqrt(weight))
-        residual = y - slope * x - offset
-        weight = _robust_weights(residual)
-    scatter, rho = robust_sigma(residual), np.maximum(np.corrcoef(residual[:-1], residual[1:])[0, 1], 0.0)
-    sigma = scatter / np.std(x) * np.sqrt((1 + rho) / (1 - rho) / len(x))
-    return Measured(float(slope), float(sigma)), scatter
-
-
 def _known(found: Measured) -> bool:
     """Whether a positive number is significant."""
     return found.value > SIGMAS * found.sigma
@@ -264,10 +249,9 @@ def motion_against_gravity(trajectory: Trajectory, height: float | None = None) 
         return (replace(_contradiction(suspects, text, explains, gravity=gravity), severity=severity),)
     if not _known(gravity):
         return ()
-    blocks = np.arange(float(len(energy)))
-    slope, _ = _slope(blocks, energy)
-    if _known(slope) and slope.value * blocks[-1] > NOTED * energy[0]:
-        grown = Measured(1e3 * slope.value * blocks[-1], 1e3 * slope.sigma * blocks[-1], "mJ")
+    (growth, _), covariance = np.polyfit(np.linspace(0, 1, len(energy)), 1e3 * energy, 1, cov=True)
+    grown = Measured(float(growth), float(np.sqrt(covariance[0, 0])), "mJ")
+    if _known(grown) and grown.value > 1e3 * NOTED * energy[0]:
         text = (
             f"the mechanical energy, {1e3 * energy[0]:.4g} mJ at first, grows by {grown} though no force but the "
             "table's acts; expected a loss"
@@ -372,11 +356,6 @@ def _blocks(motion: MeasuredMotion) -> tuple[Array, Array]:
     return np.array(gravity), np.array([energy[rows].mean() for rows in blocks])
 
 
-def _robust_weights(residual: Array) -> Array:
-    """Cauchy weights (n,), small for outliers."""
-    return np.asarray(1 / (1 + (residual / (2 * np.median(np.abs(residual)) + 1e-9)) ** 2))
-
-
 def another_plane(trajectory: Trajectory, boards: Boards | None = None) -> tuple[Finding, ...]:
     """Whether the rim rolls on a plane tilted against z = 0: the board of the table view did not lie on the table."""
     rows, disc = trajectory.measured, trajectory.disc
@@ -391,7 +370,7 @@ def another_plane(trajectory: Trajectory, boards: Boards | None = None) -> tuple
         normal = np.linalg.svd(np.sqrt(weight)[:, None] * (lowest - middle), full_matrices=False)[2][2]
         normal = normal * np.sign(normal @ start)
         gap = (lowest - middle) @ normal
-        weight = _robust_weights(gap)
+        weight = 1 / (1 + (gap / (2 * np.median(np.abs(gap)) + 1e-9)) ** 2)  # Cauchy's
     side, ahead = np.linalg.svd(normal[None])[2][1:] @ e3.T
     turned, precessed = np.arccos(np.clip(normal[2], -1, 1)), np.ptp(np.unwrap(np.arctan2(ahead, side)))
     rolls = precessed > 2.0 and np.median(e3 @ normal) < np.cos(THETA_RANGE[0])
@@ -430,28 +409,6 @@ def _view_on_plane(rig: StereoRig, boards: Boards, normal: Array, middle: Array)
         found.append((float(np.arccos(min(abs(float(axis @ normal)), 1.0))), height, view))
     lean, height, view = min(found, default=(np.inf, np.inf, 0))
     return view if lean < MIN_LEAN and height < MOST_HEIGHT else None
-
-
-def rise_of_centre(trajectory: Trajectory) -> tuple[Finding, ...]:
-    """The radius from the slope of height over sin(theta), if the nutation varies enough."""
-    q, disc = trajectory.q[trajectory.measured], trajectory.disc
-    q = q[(q[:, 4] > THETA_RANGE[0]) & (q[:, 4] < THETA_RANGE[1])]
-    s = np.sin(q[:, 4])
-    # on a tilted table, a disc of steady nutation seems to oscillate by twice the tilt
-    if len(q) < BLOCK or np.ptp(s) < 2 * MIN_LEAN:
-        return ()
-    z = q[:, 2] - disc.half_thickness * np.cos(q[:, 4])
-    slope, scatter = _slope(s, z)
-    rise = Measured(1e3 * slope.value, 1e3 * slope.sigma, "mm")
-    if scatter > SIGMAS * LAB_FRAME or not _beyond(rise, 1e3 * disc.radius, RISE):
-        return ()
-    off = _apart(rise.value, 1e3 * disc.radius)
-    suspects = (
-        (off, Kind.RADIUS, Remedy("[disc] radius_mm", f"{rise.value:.4g}", f"{1e3 * disc.radius:g}")),
-        (off, Kind.SQUARE, Remedy("[calibration] square_mm", action=f"times {disc.radius / slope.value:.4g}")),
-    )
-    text = f"the centre rises by {rise} per unit of sin(theta); expected the radius, {1e3 * disc.radius:.2f} mm"
-    return (_contradiction(suspects, text, OFF, rise=rise),)
 
 
 def handedness(rig: StereoRig, disc: Disc) -> tuple[Finding, ...]:
