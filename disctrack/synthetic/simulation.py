@@ -22,7 +22,6 @@ from disctrack.rolling.simulate import simulate
 from disctrack.synthetic.description import load_scene
 from disctrack.synthetic.motion import effects_in_words, rolling_model, rolling_start
 
-SCHEMA, SCHEMA_VERSION = "disctrack motion", 1
 _CONVENTIONS = {
     "frame_convention": "world: k up, table z = 0; contact frame: n0 = (cos psi, sin psi, 0), m0 = k x n0, k",
     "euler_convention": "R_world_body = Rz(psi) Rx(theta) Rz(phi); psi precession, theta nutation, phi spin; rad",
@@ -105,7 +104,7 @@ _NODAL_FRAME = {"2": "e2, psidot sin(theta)", "3": "e3, psidot cos(theta) + phid
 
 
 def write_motion(path: Path, motion: Motion, attributes: Mapping[str, str]) -> None:
-    """Write a motion as HDF5, readable by xarray and netCDF: root, groups motion, energy, contact, model."""
+    """Write a motion as HDF5, readable by xarray and netCDF: root, groups motion, energy, contact, effects."""
     axes = {
         "time": Variable(motion.time, ("time",), "s", "time"),
         "quaternion_component": Variable(np.array(list("wxyz")), ("quaternion_component",), "1", "component"),
@@ -113,8 +112,11 @@ def write_motion(path: Path, motion: Motion, attributes: Mapping[str, str]) -> N
     with whole_file(path) as part, h5py.File(part, "w", track_order=True) as file:
         for group, variables in _variables(motion).items():
             write_variables(file.create_group(group, track_order=True) if group else file, variables, axes)
-        _write_model(file, motion)
-        file.attrs.update(schema=SCHEMA, schema_version=SCHEMA_VERSION, software="disctrack")
+        # "effect.parameter", in the units of `disctrack simulate --list-effects`; the scene has the rest of the model
+        file.create_group("effects").attrs.update(motion.model.values)
+        file.attrs.update(schema="disctrack motion", schema_version=2, software="disctrack")
+        file.attrs["switches_time_s"] = np.array([s.time for s in motion.switches])
+        file.attrs["switches_to"] = [s.after.name.lower() for s in motion.switches] or [""]
         file.attrs.update(software_version=__version__, end=motion.end.name, end_reason=motion.end.value)
         file.attrs.update({"end_time_s": motion.end_time, **_CONVENTIONS, **attributes, "complete": 1})
 
@@ -153,24 +155,3 @@ def _variables(motion: Motion) -> dict[str, dict[str, Variable]]:
     found[""]["quaternion"] = Variable(quaternion, dims, "1", "orientation, body to world, continuous")
     found["contact"]["regime"] = Variable(motion.regime, ("time",), "1", "state of the contact", flags(Regime))
     return found
-
-
-def _write_model(file: h5py.File, motion: Motion) -> None:
-    group = file.create_group("model", track_order=True)
-    disc, model = motion.model.disc, motion.model
-    group.attrs.update(
-        {
-            "radius_m": disc.radius,
-            "half_thickness_m": disc.half_thickness,
-            "mass_kg": disc.mass,
-            "moment_diametral_kg_m2": disc.moment_diametral,
-            "moment_axial_kg_m2": disc.moment_axial,
-            "gravity_m_s2": model.gravity,
-        }
-    )
-    for effect in model.effects:
-        child = group.create_group(effect.name)
-        child.attrs.update({"title": effect.title, "source": effect.source, **effect.values})
-        child.attrs.update({f"{p.name}_unit": p.unit for p in effect.parameters})
-    group.attrs["switches_time_s"] = np.array([s.time for s in motion.switches])
-    group.attrs["switches_to"] = [s.after.name.lower() for s in motion.switches] or [""]

@@ -60,7 +60,7 @@ def test_motion_file_holds_the_motion_with_units(simulated, tmp_path):
             assert_allclose(file[name][()], run.motion.q[:, i])
         assert_allclose(file["energy/total"][()], run.motion.energy)
         assert_allclose(file["contact/F_z"][()], run.motion.contact_force[:, 2])
-        assert file["model/kz"].attrs["k_z"] == 6e-5
+        assert file["effects"].attrs["kz.k_z"] == 6e-5
 
         def has_units(name, item):
             if isinstance(item, h5py.Dataset):
