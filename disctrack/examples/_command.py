@@ -1,4 +1,4 @@
-"""What all examples share: their command line, their files, and how errors end."""
+"""Common parts of the examples: command line, output files, errors."""
 
 import argparse
 from collections.abc import Callable, Mapping, Sequence
@@ -19,8 +19,7 @@ from disctrack.report.blocks import Report, Section
 from disctrack.report.terminal import full
 
 GRAVITY = 9.81  # [m/s^2] as declared
-# What an example has to say: a report, whose document is diagnosis.json, and answers, each on a page of its own in a
-# folder of that name
+# Result of an example: a report, whose document is diagnosis.json, and answers by the name of the folder of their page
 Outcome = tuple[Report, Mapping[str, Answer]]
 
 
@@ -28,10 +27,10 @@ def effect(
     name: str, kind: str, title: str, unit: str, typical: float, *parts: str,
     bounds: tuple[float, float] = (-np.inf, np.inf), source: str = "",
 ) -> Candidate:  # fmt: skip
-    """An effect that a system of one's own may lack: its numbers `parts` are zero where it is absent.
+    """Candidate of a system with the quantities `parts`, which are zero if the effect is absent.
 
     kind : "motion" or "measurement"
-    typical : size that would surprise nobody
+    typical : usual size
     """
     one = Quantity(name, unit, 0.1 * typical, 0.0, *bounds, typical=typical)
     return Candidate(name, name, kind, title, source, tuple(replace(one, name=f"{name}.{part}") for part in parts))
@@ -40,19 +39,19 @@ def effect(
 def report_of(
     d: Diagnosis, model: str, sentence: str, own: Sequence[Section], sides: Sequence[Mapping[str, object]] = ()
 ) -> Report:
-    """Of a system of one's own: its blocks before those that every diagnosis has.
+    """Report of a diagnosis: its own blocks, then those of every diagnosis.
 
-    sides : errors before and after in its own units
+    sides : errors before and after, in units of the example
     """
     data = document(d, model, sentence, *sides)
     return Report(f"{model}: what is missing?", sentence, blocks=[*own, *tables(d)], data=data)
 
 
 def command(example: Callable[..., Outcome], data: str = "", words: Sequence[str] | None = None) -> None:
-    """Run one example: print its report, write diagnosis.json and pages where asked for; an error ends the program.
+    """Run one example: print its report, with -o write diagnosis.json and pages; an error ends the program.
 
-    data : what the example reads from the folder that it is given; none, if its data come with the sources
-    words : of the command line, if not those of the program
+    data : files that the example reads from the given folder; empty if its data are part of the package
+    words : of the command line; by default those of the program
     """
     parser = argparse.ArgumentParser(description=example.__doc__)
     if data:

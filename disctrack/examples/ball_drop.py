@@ -1,10 +1,10 @@
-"""Balls dropped from a height (de Silva et al. 2020): gravity alone lacks drag. Can its law be told?
+"""Balls dropped from a height (de Silva et al. 2020): gravity alone lacks drag. Is its law identifiable?
 
     python -m disctrack.examples.ball_drop FOLDER [-o DIR]
 
 FOLDER holds `ball_drops.csv` (ball, drop, t_s, height_m). Every ball was dropped twice: laws are fitted to drop 1 and
-to the first 1.2 s of drop 2, and judged on the rest. All balls together, and each alone; what two drops of one ball do
-not have in common is noise with a memory.
+to the first 1.2 s of drop 2, and tested on the rest; for all balls together, and for each alone. Differences between
+the two drops of a ball are autocorrelated noise.
 Data: Frontiers in Artificial Intelligence 3:25; 11 balls.
 """
 
@@ -23,15 +23,15 @@ from disctrack.examples._command import GRAVITY, Outcome, command
 from disctrack.numbers import rounded, score
 from disctrack.report.blocks import Listing, Report, Section
 
-ACCELERATION_DEGREE = 4  # of the polynomial in time that all drops of a ball share: any drag, to 1 mm
-SEEN = 1.2  # [s] of a second drop from which the rest is predicted, as in the published comparison
+ACCELERATION_DEGREE = 4  # of the polynomial in time for the acceleration of all drops of a ball: any drag, to 1 mm
+SEEN = 1.2  # [s] of a second drop that are fitted; the rest is predicted, as in the published comparison
 FALL = Equations(
     {"h": "v", "v": "-g"},
     constants={"g": GRAVITY},
     units={"h": "m", "v": "m/s"},
     name=f"free fall, g = {GRAVITY} m/s^2",
 )
-DRAG = {  # by name: force per mass with a number of its own for every ball; the constant one takes its sign from a fall
+DRAG = {  # by name: force per mass, with one coefficient per ball; the constant one has the sign for a falling ball
     "constant_drag": ("k", Parameter(0.0, "m/s^2", lower=0.0, typical=1.0, per="ball")),
     "linear_drag": ("-k*v", Parameter(0.0, "1/s", lower=0.0, typical=0.1, per="ball")),
     "quadratic_drag": ("-k*v*abs(v)", Parameter(0.0, "1/m", lower=0.0, typical=0.01, per="ball")),
@@ -64,16 +64,16 @@ def read_drops(folder: Path) -> list[Run]:
 
 
 def _by_ball(drops: Sequence[Run]) -> dict[str, list[Run]]:
-    """Drops of one ball follow each other."""
+    """Drops of each ball, which are neighbours in the list."""
     return {ball: list(takes) for ball, takes in groupby(drops, lambda run: run.groups["ball"])}
 
 
 def height_noise(drops: Sequence[Run]) -> SmoothNoise:
-    """Noise of a height [m] and [s], from what drops of one ball do not have in common.
+    """Noise of a height [m] and [s], from the differences between the drops of each ball.
 
-    All drops of a ball share an acceleration that is a polynomial in time; start and velocity are each drop's own. What
-    is left (grain of the pixels, a hand that throws, wind, a scale that differs from take to take) is no law of the
-    ball. One drop alone shows less of it.
+    The acceleration of all drops of a ball is one polynomial in time; each drop has an initial height and velocity. The
+    residuals (pixel size, release by hand, wind, a scale that differs between recordings) do not depend on the law of
+    drag. A single drop shows only a part of them.
     """
     stretches = []
     for takes in _by_ball(drops).values():
@@ -88,7 +88,7 @@ def height_noise(drops: Sequence[Run]) -> SmoothNoise:
 
 
 def ask(drops: Sequence[Run], noise: SmoothNoise, terms: Sequence[Term], equations: Equations = FALL) -> Answer:
-    """What the equations lack for these drops. The noise is that of all balls, and takes of one may differ."""
+    """Diagnosis of the equations with these drops. The noise is that of all balls."""
     at_noise = 1 + 3 * np.sqrt(2 / sum(np.size(d.time) for d in drops))  # three sigmas of a reduced chi-square
     settings = Settings(noise=1.0, unexplained_share=0.2, at_noise=float(at_noise))
     return diagnose(equations, [replace(d, noise=noise) for d in drops], terms, settings=settings)
@@ -96,23 +96,23 @@ def ask(drops: Sequence[Run], noise: SmoothNoise, terms: Sequence[Term], equatio
 
 @dataclass(frozen=True)
 class BallAnswer:
-    """Everything asked of a set of drops."""
+    """All results for a set of drops."""
 
     noise: SmoothNoise
     together: Answer
     alone: Mapping[str, Answer]
-    # laws of drag, alone and with what a fall with them may lack: length over that of the shortest, which stands first
+    # laws of drag, alone and with other effects: length minus that of the shortest, which is the first
     forms: Mapping[tuple[str, ...], float]
     errors: Mapping[str, Array]  # by law, and "gravity alone": `errors_on_second_drops`
 
     @property
     def undecided(self) -> tuple[tuple[str, ...], ...]:
-        """Forms that the data do not tell from the shortest."""
+        """Forms that the data do not distinguish from the shortest."""
         return tuple(effects for effects, over in self.forms.items() if over < CLASS_GAIN)
 
     @property
     def identifiable(self) -> bool:
-        """True if all that remain in question share one law of drag."""
+        """True if all of these have the same law of drag."""
         return len({effects[0] for effects in self.undecided}) == 1
 
 
@@ -137,9 +137,9 @@ def analyse_drops(drops: Sequence[Run]) -> BallAnswer:
 
 
 def errors_on_second_drops(drops: Sequence[Run], equations: Equations) -> Array:
-    """(2,) medians of the balls' rms [m] on drop 2, by least squares with a law fitted to drop 1.
+    """(2,) medians over the balls of the rms [m] on drop 2, by least squares with a law fitted to drop 1.
 
-    Its start is fitted to the whole drop; or to the first SEEN seconds, and the error taken after them.
+    The initial state is fitted to the whole drop; or to its first SEEN seconds, with the error of the rest.
     """
     first, second = ([replace(d, sigma=1.0, fit_until=None) for d in drops if d.groups["drop"] == k] for k in "12")
     answer = diagnose(equations, first, (), settings=Settings(noise=1.0))
@@ -171,7 +171,7 @@ def report(answer: BallAnswer) -> Report:
     return Report(
         "Falling balls: what does gravity alone lack?",
         sentence(answer),
-        f"noise of a height: {n.white:.3f} m white and {n.smooth:.3f} m with a memory of {n.memory:.2f} s",
+        f"noise of a height: {n.white:.3f} m white, {n.smooth:.3f} m with a correlation time of {n.memory:.2f} s",
         blocks=[
             Section(
                 "Median of the balls' rms on the second drop (m)",

@@ -1,12 +1,12 @@
-"""Public benchmarks of system identification with their official splits: what is missing, and how well is it foretold?
+"""Public benchmarks of system identification with their official splits: what is missing, how good are predictions?
 
     python -m disctrack.examples.benchmarks FOLDER [-o DIR]
 
 FOLDER holds files as published (nonlinearbenchmark.org), those of at least one of them: `DATA_EMPS.mat` and
-`DATA_EMPS_PULSES.mat`, a positioning system whose friction is withheld; `dataBenchmark.mat` or `.csv`, two tanks in a
-row, which may run over; `DATAUNIF.mat`, electric drives coupled by a belt; `SNLS80mV.mat`, the circuit called
-Silverbox. The textbook's equations are fitted to the part for estimation; the other is foretold by a free run that
-begins in what the official window shows, and compared with the best published.
+`DATA_EMPS_PULSES.mat`, a positioning system whose friction is withheld; `dataBenchmark.mat` or `.csv`, two tanks in
+series, which may overflow; `DATAUNIF.mat`, electric drives coupled by a belt; `SNLS80mV.mat`, the circuit called
+Silverbox. Textbook equations are fitted to the part for estimation; the test part is predicted by a free run from an
+initial state fitted to the official window, and its error compared with the best published one.
 """
 
 from collections.abc import Callable, Sequence
@@ -32,19 +32,19 @@ Records = dict[str, tuple[ArrayLike, Array, Array]]  # by name, time [s], input,
 
 @dataclass(frozen=True)
 class Benchmark:
-    """One system, with the way from its files to records of one input and one output."""
+    """One system, with the function that reads records of one input and one output from its files."""
 
     name: str
     files: tuple[str, ...]  # without .mat or .csv
     equations: Equations
     offered: Sequence[Term] | None
     records: Callable[..., list[Records]]  # of the columns of each file: for estimation and for the test
-    window: float  # [s] of a test that may tell its start
+    window: float  # [s] of a test, to which the initial state is fitted
     unit: str
-    scale: float  # units in one of the data's
+    scale: float  # units per unit of the data
     published: float  # best error [unit]
     run: Callable[..., Run] = Run  # of a record
-    every: int = 1  # of so many samples one is fitted
+    every: int = 1  # every n-th sample is fitted
 
 
 def columns(path: Path) -> Columns:
@@ -76,7 +76,7 @@ def _speeds(d: Columns) -> list[Records]:
 def _voltages(d: Columns) -> list[Records]:
     multisine = slice(40_650, 127_400)
     u, y = d["V1"][multisine], d["V2"][multisine]
-    part = int(0.75 * len(u))  # for estimation, of which so many samples tell all
+    part = int(0.75 * len(u))  # for estimation, of which 3000 samples suffice
     return [{"": (np.arange(len(y[rows])) / 610.35, u[rows], y[rows])} for rows in (slice(3000), slice(part, None))]
 
 
@@ -117,14 +117,14 @@ BENCHMARKS = (
 
 
 def present(folder: Path, benchmark: Benchmark) -> list[Path]:
-    """Files of a benchmark in the folder, whatever their letters' case; empty where one is missing."""
+    """Files of a benchmark in the folder, in upper or lower case; empty if one is missing."""
     there = {p.stem.lower(): p for p in sorted(folder.iterdir()) if p.suffix.lower() in (".mat", ".csv")}
     found = [there[name.lower()] for name in benchmark.files if name.lower() in there]
     return found if len(found) == len(benchmark.files) else []
 
 
 def runs_of(b: Benchmark, files: Sequence[Columns]) -> tuple[list[Run], list[Run]]:
-    """For estimation, and for the test."""
+    """Runs for estimation and for the test."""
     (u, *_), (y, *_) = b.equations.inputs, b.equations.observed or b.equations.rates
     train, test = (
         [b.run(time, {y: seen}, inputs={u: given}, name=name) for name, (time, given, seen) in records.items()]
@@ -145,7 +145,7 @@ def measured(benchmark: Benchmark, paths: Sequence[Path]) -> tuple[Answer, dict[
 
 
 def example(folder: Path) -> Outcome:
-    """What do textbook equations of public benchmarks lack, and how well do they foretell the official test parts?"""
+    """What do textbook equations of public benchmarks lack, and how well do they predict the official test parts?"""
     rows, answers, data = [], dict[str, Answer](), dict[str, object]()
     for b in BENCHMARKS:
         if paths := present(folder, b):
@@ -156,9 +156,9 @@ def example(folder: Path) -> Outcome:
             answers[b.name], data[b.name] = answer, answer.document() | {"test": n}
     if not answers:
         wanted = "; ".join(" and ".join(b.files) for b in BENCHMARKS)
-        raise AnalysisError(f"{folder}: no benchmark is there. Wanted are the files of at least one: {wanted}.")
+        raise AnalysisError(f"{folder}: no benchmark found; expected the files of at least one: {wanted}.")
     header = ("", "error of the test", "best published", "within 95 % band", "processor", "missing")
-    said = "The test parts are foretold by free runs; their first samples tell how they begin."
+    said = "The test parts are predicted by free runs from initial states fitted to their first samples."
     return Report("Public benchmarks", said, blocks=[Listing(header, rows)], data=data), answers
 
 

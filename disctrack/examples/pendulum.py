@@ -2,9 +2,9 @@
 
     python -m disctrack.examples.pendulum FOLDER [-o DIR]
 
-FOLDER holds `single_free_swing.npz` (time_s, angle_rad from the upright position). The authors fit the first 36.668 s
-and keep the rest for validation; so is it done here. Only the ratios stiffness = a1 g m1 / (m1 a1^2 + I1) and viscous =
-k1 / (m1 a1^2 + I1) of their numbers can be told from a free swing.
+FOLDER holds `single_free_swing.npz` (time_s, angle_rad from the upright position). As the authors do, the first
+36.668 s are fitted, and the rest is for validation. A free swing determines only the ratios stiffness = a1 g m1 / (m1
+a1^2 + I1) and viscous = k1 / (m1 a1^2 + I1) of their parameters.
 """
 
 from dataclasses import replace
@@ -41,7 +41,7 @@ MISSING = (
 
 
 def example(folder: Path) -> Outcome:
-    """What does a pendulum with viscous friction lack, and does what is found predict the rest of its swing?"""
+    """What does a pendulum with viscous friction lack, and do the effects found predict the rest of its swing?"""
     with np.load(folder / "single_free_swing.npz") as file:
         time, angle = file["time_s"], file["angle_rad"] - np.pi  # from hanging
     fitted = time <= FITTED_S
@@ -51,9 +51,9 @@ def example(folder: Path) -> Outcome:
         left = angle - answer.forecast(Run(time, {"angle": angle}, name="swing"), by=side)["angle"]
         rms[side] = [float(np.sqrt(np.mean(left[rows] ** 2))) for rows in (fitted, ~fitted)]
     data = {**answer.document(), "kept_back_rms_rad": {side: kept_back for side, (_, kept_back) in rms.items()}}
-    rms["the step of the encoder allows"] = [STEP / np.sqrt(12)] * 2
+    rms["quantisation of the encoder"] = [STEP / np.sqrt(12)] * 2
     rows = [(name, *(rounded(1e3 * x) for x in both)) for name, both in rms.items()]
-    header = ("", f"fitted, 0 to {FITTED_S} s", "kept back, from there to 55 s, predicted")
+    header = ("", f"fitted, 0 to {FITTED_S} s", "predicted, from there to 55 s")
     kept = Section("Rms of measured minus modelled (mrad)", [Listing(header, rows)])
     report = answer.report()
     return replace(report, blocks=[kept, *report.blocks], data=data), {"swing": answer}

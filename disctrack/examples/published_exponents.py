@@ -1,23 +1,22 @@
-"""What is missing in the published exponents of Ma et al. (2014)? Tables 2 and 3 under the engine of diagnosis.
+"""What is missing in the published exponents of Ma et al. (2014)? A diagnosis of tables 2 and 3.
 
     python -m disctrack.examples.published_exponents [-o DIR]
 
 The tables give the exponents of nutation, precession rate and energy in t_f - t for nine trials on steel and eight on
-glass. On glass they contradict the paper's 2/3 and -1/3. The engine fits the paper's model to all of them, looks
-through the catalogue of motions and through what the reading may do wrong, and says which effects would remove the
-contradiction, and which of them these tables cannot tell apart.
+glass. On glass they contradict the paper's 2/3 and -1/3. The diagnosis fits the paper's model to all of them, tries
+the effects of the catalogue and errors of the evaluation, and reports which would remove the contradiction, and which
+of these are indistinguishable with these tables.
 
-Exponents are read off the rolling model as Ma et al. obtained them. The motion is simulated from a nutation of some
-degrees down to collapse. Nutation, precession rate and energy are taken every millisecond while the time left, t_f - t,
-lies in the paper's window; straight lines through their logarithms against ln(t_f - t) have the exponents for slopes.
-The paper does not remove the nutation oscillation; its phase differs from trial to trial, so that it enters the mean of
-a series to second order only. It is left out.
+The exponents of the rolling model are obtained as by Ma et al. The motion is simulated from a nutation of some degrees
+to collapse. Nutation, precession rate and energy are sampled every millisecond while the time left, t_f - t, is in the
+paper's window; the exponents are the slopes of straight lines through their logarithms against ln(t_f - t). The paper
+does not remove the nutation oscillation. Its phase differs between trials, so that its effect on the mean of a series
+is of second order; it is neglected.
 
-A row is one trial: each exponent cleared of what those before it in the same trial predict (Cholesky), so that all
-numbers are independent with variance one. One more row per surface is the time that the last stage lasts: the paper's
-k_m is that with which its simulation collapses at the measured instant, which is all that k_m can say once another law
-acts beside it. The tables' own t_f count from the blow that starts the disc, through seconds of slip; a rolling disc
-has nothing to say to them.
+A row is one trial, whitened by the Cholesky factor of its covariance. One more row per surface is the duration of the
+last stage: with the paper's k_m, its simulation collapses at the measured instant. If another law acts, this is the
+only information in k_m. The t_f of the tables are counted from the impact that starts the disc, and include seconds of
+slip; they are not used.
 """
 
 from collections.abc import Mapping, Sequence
@@ -45,8 +44,8 @@ THIN_DISC = np.array([2 / 3, 2 / 3, -1 / 3])  # a rolling moment proportional to
 SETTINGS = Settings(noise=1.0, shortlist=12, max_effects=2)  # the trials' own scatter is the noise
 DURATION_SIGMA = 0.03  # of ln duration: simulation and measurement of figures 17 and 18 end within 50 ms of 1.5 s
 SPIN = "state.omega3"  # at the start of the last stage; each series has its own
-SPIN_AT_REST = 0.97  # [rad/s] omega_3 at 8 deg when the centre stays at rest, h psidot sin(theta) / r
-SPIN_SIGMA = 2.0  # [rad/s]: the centre then runs on a circle of 1 mm
+SPIN_AT_REST = 0.97  # [rad/s] omega_3 at 8 deg with the centre at rest, h psidot sin(theta) / r
+SPIN_SIGMA = 2.0  # [rad/s]: the centre then moves on a circle of 1 mm
 # k_m [m s^2], section 5c; and time left [s] where the fits of tables 2 and 3 begin, section 4a
 TRIALS = {"steel": (0.381e-7, 0.5), "glass": (0.28e-7, 0.3)}
 LAST_STAGE = 1.5  # [s] simulated in section 5c
@@ -54,12 +53,12 @@ STEP = 0.1  # of a quantity's scale, for differences: the simulation is smooth t
 FRAME = 1e-3  # [s] between pairs of the paper's cameras
 SHORTEST = float(np.exp(-3))  # [s] time left where the curves of the paper's figures 14 to 16 end
 END_SHARE = 1e-3  # of the start nutation, where the simulation ends: 0.05 ms before collapse with the paper's k_m
-MAX_DURATION = 8.0  # [s]; a motion that has not ended by then is no answer
+MAX_DURATION = 8.0  # [s] of a simulation that has not reached the end
 
 
 @dataclass(frozen=True)
 class Series:
-    """Trials on one surface: what rolls where, which part of the record is fitted, and what was found."""
+    """Trials on one surface: disc, model, window of the fit, and results."""
 
     surface: str
     k_m: float  # [m s^2] of the paper's model
@@ -70,7 +69,7 @@ class Series:
     ln_duration: float = np.nan  # of the last stage, from that nutation on
 
 
-# What the experimenter may do wrong
+# Errors of the measurement and the evaluation
 READING = (
     effect("t_f", "measurement", "the instant called t_f is not that of collapse", "s", 0.01, "bias",
            bounds=(-0.045, 0.045), source="section 4a"),
@@ -98,7 +97,7 @@ class LastStage:
         state = steady_precession(series.start, series.disc, GRAVITY, omega3=omega3)
         motion = simulate(model, state, MAX_DURATION, rate=1 / FRAME, theta_end=END_SHARE * series.start)
         curves = _observed(motion, series.disc)
-        # a strong moment can stop the precession in the very last milliseconds; what is read lies before
+        # a strong moment can stop the precession in the last milliseconds, after the window
         n = int(np.argmin(np.append(np.isfinite(curves).all(axis=1), False)))
         ended = motion.end is EndReason.NUTATION and n > 1
         self.duration = motion.end_time if ended else float("nan")  # [s] from the start to collapse
@@ -106,15 +105,15 @@ class LastStage:
         self.curve = CubicSpline(motion.time[:n], curves[:n], axis=0, extrapolate=False) if ended else None
 
     def outcomes(self, reading: Mapping[str, float] = NO_ERRORS) -> Array:
-        """(4,) The exponents and ln duration as the experimenter has them; NaN where no collapse is seen."""
+        """(4,) Exponents with errors of the evaluation, and ln duration; NaN without a collapse."""
         if self.curve is None:
             return np.full(4, np.nan)
         wrong, disc = {**NO_ERRORS, **reading}, self.series.disc
-        # a fixed number of instants, so that nothing jumps when a quantity of the fit moves
+        # a fixed number of instants, so that the result is a continuous function of all quantities
         n = round((self.series.longest - SHORTEST) / FRAME) + 1
         left = np.linspace(self.series.longest, SHORTEST + wrong["cut.shift"], n)
         time = self.duration + wrong["t_f.bias"] - left
-        half = np.sqrt(wrong["smoothing.square"] / 12)  # two points stand for the mean to third order
+        half = np.sqrt(wrong["smoothing.square"] / 12)  # the mean of two points is correct to third order
         ln_theta, ln_psidot, energy = (0.5 * (self.curve(time - half) + self.curve(time + half))).T
         theta, psidot = np.exp(ln_theta) + wrong["theta_zero.shift"], np.exp(ln_psidot)
         rate_variance = wrong["attitude_noise.variance"] / (2 * FRAME**2)  # of central differences
@@ -145,9 +144,9 @@ def exponents_on(surface: str) -> Array:
 
 
 def sample_covariance(exponents: Array) -> Array:
-    """Covariance (k, k) of one trial, widened so that its inverse is unbiased (Hartlap, Simon & Schneider 2007).
+    """Covariance (k, k) of one trial, scaled so that its inverse is unbiased (Hartlap, Simon & Schneider 2007).
 
-    With the sample covariance as it is, chi-square of n = 8 trials of three numbers would be 7/3 of what it should be.
+    With the sample covariance, chi-square of n = 8 trials of three numbers would be too large by a factor of 7/3.
     """
     n, k = exponents.shape
     return np.asarray(np.cov(exponents.T) * (n - 1) / (n - k - 2), float)
@@ -165,7 +164,7 @@ def published_series() -> tuple[Series, ...]:
 
 
 def exponent_candidates(surfaces: Sequence[str]) -> tuple[Candidate, ...]:
-    """The catalogue of motions that roll, laws of the contact per surface; and what the reading may do wrong."""
+    """Effects of the catalogue for rolling discs, laws of the contact per surface; errors of the evaluation."""
 
     def on_each(c: Candidate) -> Candidate:
         return replace(c, quantities=tuple(replace(q, name=f"{q.name}@{s}") for q in c.quantities for s in surfaces))
@@ -181,10 +180,10 @@ def exponent_candidates(surfaces: Sequence[str]) -> tuple[Candidate, ...]:
 
 
 class ExponentSystem(System):
-    """Several series of trials with their model, for the engine."""
+    """Several series of trials with their model."""
 
     def __init__(self, series: Sequence[Series]) -> None:
-        """Of each series its trials, of which the first part is fitted, and at last the duration."""
+        """Rows: for each series its trials, the first part of which is fitted, then the duration."""
         self.series = tuple(series)
         self.candidates = exponent_candidates([s.surface for s in series])
         self._stages: dict[tuple[object, ...], LastStage] = {}
@@ -227,8 +226,8 @@ class ExponentSystem(System):
     def outcomes(self, index: int, values: Values) -> Array:
         """(4,) predicted means of one series: EXPONENTS, ln duration.
 
-        Base quantities that are not among the values are at their null. Of values that stand with and without the
-        surface in their names the series sees the sum.
+        Base quantities that are not among the values are at their null. Values of one quantity with and without the
+        surface in their names are added.
         """
         series, own = self.series[index], dict[str, float]()
         for name, value in ({q.name: q.null for q in self.base} | dict(values)).items():
@@ -245,9 +244,9 @@ class ExponentSystem(System):
 
 
 def sigmas_off(exponents: Array, predicted: Array) -> float:
-    """How far the mean of trials (n, k) is off a prediction (k,) without error: Hotelling's T-squared of all together.
+    """Deviation of the mean of trials (n, k) from a prediction (k,) without error, by Hotelling's T-squared.
 
-    In sigmas: those that a normal variable of the same probability would be off.
+    In sigmas of a normal variable with the same probability.
     """
     n, k = exponents.shape
     difference = exponents.mean(axis=0) - predicted
@@ -257,12 +256,12 @@ def sigmas_off(exponents: Array, predicted: Array) -> float:
 
 
 def left_by(system: ExponentSystem, fit: Fit) -> list[float]:
-    """How many sigmas the trials on every surface are off the prediction of a fit."""
+    """Deviation of the trials on each surface from the prediction of a fit, in sigmas."""
     return [sigmas_off(s.exponents, system.outcomes(i, fit.values)[:3]) for i, s in enumerate(system.series)]
 
 
 def in_question(d: Diagnosis) -> dict[str, Fit]:
-    """Fits to all trials of the effects that may be the one, by name."""
+    """Fits to all trials of the effect found and its indistinguishable alternatives, by name."""
     alternatives = {r.candidate.name: r.fit for f in d.found for r in f.cannot_be_told_from}
     return {f.candidate.name: d.after for f in d.found} | alternatives
 
@@ -283,7 +282,7 @@ def sentence(system: ExponentSystem, d: Diagnosis) -> str:
 
 
 def tables_of(system: ExponentSystem, d: Diagnosis) -> list[Section]:
-    """Means of the trials, and how far off they are what each effect in question predicts."""
+    """Means of the trials, and their deviations from the predictions of each effect in question."""
     means = [("thin disc", *(rounded(x, 4) for x in THIN_DISC))]
     for s in system.series:
         both = zip(s.exponents.mean(axis=0), stats.sem(s.exponents), strict=True)

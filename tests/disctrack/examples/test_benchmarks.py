@@ -1,4 +1,4 @@
-"""Public benchmarks from the files of their authors: what is withheld is found, and the test part is foretold."""
+"""Public benchmarks from the files of their authors: withheld friction is found, and the test part is predicted."""
 
 import json
 
@@ -25,7 +25,7 @@ def positions(rng, path, frequencies):
 
 
 @pytest.mark.statistical
-def test_friction_of_the_positioning_system_is_found_and_its_test_part_is_foretold(rng, tmp_path, capsys):
+def test_friction_of_the_positioning_system_is_found_and_its_test_part_is_predicted(rng, tmp_path, capsys):
     positions(rng, tmp_path / "DATA_EMPS.mat", (0.3, 0.7))
     positions(rng, tmp_path / "data_emps_pulses.mat", (0.4, 1.1))
     command(example, "files", [str(tmp_path), "-o", str(tmp_path / "out")])
@@ -35,4 +35,4 @@ def test_friction_of_the_positioning_system_is_found_and_its_test_part_is_foreto
     assert found["test"]["error"] < 0.1  # mm, of a path of some 100
     with pytest.raises(SystemExit):
         command(example, "files", [str(tmp_path / "out")])
-    assert "no benchmark is there" in capsys.readouterr().err
+    assert "no benchmark found" in capsys.readouterr().err
