@@ -2,13 +2,13 @@
 
     python -m disctrack.examples.cube_tosses FOLDER [-o DIR]
 
-FOLDER holds `cube_tosses.npz`. Two thirds of the tosses are fitted, every third judges; copies of a toss are taken out
-(the published tosses are turned about the vertical, each by an angle of its own, and some stand there twice). Free
-flight sees gravity, frame rate and scale of the lengths as one number; cubes at rest tell them apart.
+FOLDER holds `cube_tosses.npz`. Two thirds of the tosses are fitted, every third is held out; copies of a toss are
+removed (the published tosses are rotated about the vertical by different angles, and some are included twice). Free
+flight determines one combination of gravity, frame rate and scale of the lengths; cubes at rest determine the scale.
 
 Base model: the centre of the tags is the centre of mass and falls with the declared gravity; a uniform cube turns at a
-constant angular velocity. Place, velocity, attitude and angular velocity are each flight's own. Every effect is small;
-its residual is reckoned to first order along the smooth motion of the flight.
+constant angular velocity. Each flight has its own position, velocity, attitude and angular velocity. Effects are small;
+they are linearised about the smooth motion of the flight.
 
 Data: Pfrommer, Halm & Posa, "ContactNets", CoRL 2020: 570 tosses of a cube onto a table, poses from tags on its faces
 at 148 Hz. Lengths of the file are half widths of the cube; here they are metres, by the declared half width.
@@ -16,7 +16,7 @@ at 148 Hz. Lengths of the file are half widths of the cube; here they are metres
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import groupby, pairwise
+from itertools import groupby, islice, pairwise
 from pathlib import Path
 
 import numpy as np
@@ -37,11 +37,9 @@ from disctrack.report.blocks import Listing, Section
 
 HALF_WIDTH = 0.0524  # [m] as declared
 FRAME_RATE = 148.0  # [Hz]
-CLEARANCE = 0.12  # [half widths] of the lowest corner, from which on nothing touches: several times what contacts show
+CLEARANCE = 0.12  # [half widths] of the lowest corner in free flight: several times the clearance during contacts
 SHORTEST = 9  # samples of a flight
-RELEASE = 5.0  # sigmas by which a first sample may stand off the smooth motion before it counts as still in the hand
-GLITCH = 20.0  # sigmas off the smooth motion that no effect explains: a hand, or a tag mistaken
-MAX_RELEASE = 6  # samples
+RELEASE = 5.0  # [sigma] largest deviation of the first sample; beyond, the cube is still in the hand
 
 
 @dataclass(frozen=True)
@@ -60,7 +58,7 @@ class Toss:
 
 @dataclass(frozen=True)
 class Flight:
-    """A stretch of a toss in free flight, with the smooth motion about which effects are reckoned."""
+    """The part of a toss in free flight, with the smooth motion about which effects are linearised."""
 
     toss: Toss
     time: Array  # (n,) from the middle [s]
@@ -74,7 +72,7 @@ class Flight:
 
     @property
     def off(self) -> Array:
-        """(n, 6) distances from the smooth motion [m], turns as they move the middle of a face."""
+        """(n, 6) deviations from the smooth motion [m]; of the attitude, as displacements of the middle of a face."""
         return np.concatenate([self.position - self.path, HALF_WIDTH * self.turn], axis=1)
 
     @property
@@ -103,9 +101,9 @@ def read_tosses(folder: Path) -> tuple[Toss, ...]:
 
 
 def without_copies(tosses: Sequence[Toss]) -> tuple[Toss, ...]:
-    """Tosses without those that are others turned about the vertical.
+    """Tosses without copies, which are other tosses rotated about the vertical.
 
-    Such copies have the same heights to the last digit; in a comparison with held-out tosses they would be cheats.
+    Copies have the same heights to the last digit. They would spoil the test on held-out tosses.
     """
     first: dict[bytes, Toss] = {}
     for toss in tosses:
@@ -114,22 +112,18 @@ def without_copies(tosses: Sequence[Toss]) -> tuple[Toss, ...]:
 
 
 def flights(tosses: Sequence[Toss]) -> tuple[Flight, ...]:
-    """The first flight of every toss, but for those that are too short, or not smooth.
+    """The first flight of every toss, without those that are too short or not smooth.
 
-    A flight begins with the first sample that keeps to the smooth motion of the others (before, a hand still holds the
-    cube; the very first sample is never taken) and lasts until a corner comes as low as CLEARANCE.
+    A flight begins with the first sample that agrees with the smooth motion of the others (before, the cube is still in
+    the hand; the very first sample is not used) and ends when a corner is as low as CLEARANCE.
     """
     ends = [int(np.argmin(np.append(toss.clearance > CLEARANCE, False))) for toss in tosses]
     whole = [smooth_flight(t, 1, n) for t, n in zip(tosses, ends, strict=True) if n - 1 >= SHORTEST]
     sigma = 1.4826 * float(np.median([np.median(np.abs(f.off)[2:-2]) for f in whole]))
-    found = []
+    found = list[Flight]()
     for toss, end in zip(tosses, ends, strict=True):
-        for first in range(1, min(MAX_RELEASE, end - SHORTEST) + 1):
-            flight = smooth_flight(toss, first, end)
-            off = np.abs(flight.off).max(axis=1) / sigma
-            if off[0] <= RELEASE and off.max() <= GLITCH:
-                found.append(flight)
-                break
+        flown = (smooth_flight(toss, first, end) for first in range(1, end - SHORTEST + 1))
+        found += islice((f for f in flown if np.abs(f.off[0]).max() <= RELEASE * sigma), 1)
     return tuple(found)
 
 
@@ -195,14 +189,14 @@ COLUMN = {q.name: i for i, q in enumerate(QUANTITIES)}
 
 
 def _columns(seen: Array, changes: Mapping[str, ArrayLike]) -> Array:
-    """(..., k + 1) changes of what is seen (...) by QUANTITIES, zero where none is named, and that itself."""
+    """(..., k + 1) derivatives of observations (...) by QUANTITIES, zero if not named, and the observations."""
     return np.stack([*(np.broadcast_to(changes.get(name, 0.0), seen.shape) for name in COLUMN), seen], axis=-1)
 
 
 def flown(f: Flight) -> Array:
-    """(n, 6, k + 1 + 12) by QUANTITIES, measured minus base model [m], [rad], and by what is the flight's own.
+    """(n, 6, k + 1 + 12): derivatives by QUANTITIES, measured minus base model [m], [rad], derivatives by own motion.
 
-    That is place, velocity, attitude and angular velocity, three numbers each.
+    The own motion of a flight: position, velocity, attitude and angular velocity, three numbers each.
     """
     fallen = f.position + GRAVITY / 2 * f.time[:, None] ** 2 * UP
     seen = np.concatenate([fallen, f.turn], axis=1)
@@ -213,9 +207,9 @@ def flown(f: Flight) -> Array:
 
 
 def at_rest(flights: Sequence[Flight]) -> Array:
-    """(m, 3, k + 1) of every toss the cube at rest, by QUANTITIES and as measured.
+    """(m, 3, k + 1) of the cube at rest after each toss: derivatives by QUANTITIES, and the measured values.
 
-    How much resting cubes differ once all candidates have taken their share is the noise.
+    The noise is the scatter of the residuals of a fit of all candidates.
     """
     rows = np.array([_columns(*_rested(f)) for f in flights])
     for c in range(3):
@@ -226,7 +220,7 @@ def at_rest(flights: Sequence[Flight]) -> Array:
 
 
 def _flown(f: Flight) -> dict[str, Array]:
-    """Change of position [m] and turn in axes of the body [rad] (n, 6) of a flight, by a unit of each quantity."""
+    """Derivatives (n, 6) of position [m] and rotation in body axes [rad] of a flight by each quantity."""
 
     def moved(position: Array | float, turn: Array | float = 0.0) -> Array:
         still = np.zeros(f.path.shape)
@@ -236,12 +230,12 @@ def _flown(f: Flight) -> dict[str, Array]:
         return moved(integrated(integrated(np.broadcast_to(acceleration, f.path.shape))))
 
     def twisted(acceleration: Array) -> Array:
-        """By an angular acceleration, world axes. R = R_smooth exp(eta): eta' = R_smooth^T (change of omega)."""
+        """Effect of an angular acceleration, world axes. R = R_smooth exp(eta), eta' = R_smooth^T (change of omega)."""
         change = integrated(np.broadcast_to(acceleration, f.path.shape))
         return moved(0.0, integrated(f.in_body(change)))
 
     def turned(angle: Array) -> Array:
-        """About the vertical, place and attitude."""
+        """Position and attitude rotated about the vertical."""
         return moved(np.cross(UP, f.path) * angle[:, None], f.in_body(UP * angle[:, None]))
 
     speed, omega = np.linalg.norm(f.velocity, axis=1)[:, None], f.in_body(f.omega)
@@ -254,7 +248,7 @@ def _flown(f: Flight) -> dict[str, Array]:
         "quadratic_drag.k": pushed(-f.velocity * speed),
         "side_force.c": pushed(np.cross(UP, f.velocity)),
         "magnus.c": pushed(np.cross(f.omega, f.velocity)),
-        # the room turns by Omega t: place and attitude turn along, and so does the angular velocity
+        # the world axes turn by Omega t, and with them position, attitude and angular velocity
         "frame_rotation.rate": turned(f.time),
         "rotational_drag.k": twisted(-f.omega),
         "side_torque.c": twisted(np.cross(UP, f.omega)),
@@ -269,7 +263,7 @@ def _flown(f: Flight) -> dict[str, Array]:
         for i in range(3):
             found[f"face_bias.{a}_{i + 1}"] = moved(axis * np.abs(of_body[i, 2])[:, None])
     for i in range(3):
-        # the tags' centre is seen, which stands off by minus the offset of the centre of mass
+        # the centre of the tags is observed; from the centre of mass it is displaced by minus the offset
         found[f"centre_of_mass.c_{i + 1}"] = moved(-of_body[i].T)
     for i, j in ((0, 0), (1, 1), (0, 1), (0, 2), (1, 2)):  # J = J_0 (1 + E): omega' = -omega x (E omega), axes of body
         E = np.zeros((3, 3))
@@ -281,9 +275,9 @@ def _flown(f: Flight) -> dict[str, Array]:
 
 
 def _rested(f: Flight) -> tuple[Array, dict[str, Sequence[float]]]:
-    """Where a toss ends, on a face: height over the declared half width [m] and the face's normal along and across.
+    """Cube at rest on a face: height minus the declared half width [m], and the face's normal along and across.
 
-    (3,), and their change by a unit of each quantity.
+    (3,), and their derivatives by each quantity.
     """
     position, rotation, level = f.toss.position[-REST:], f.toss.rotation[-REST:], f.axes[:2]
     place, up = position.mean(axis=0), rotation[-1, 2]
@@ -302,17 +296,17 @@ def _rested(f: Flight) -> tuple[Array, dict[str, Sequence[float]]]:
 
 
 HELD_OUT = 3  # every third toss
-FIRST_NOISE = {  # channels whose noise is alike, and where the search for it begins
+FIRST_NOISE = {  # groups of channels with equal noise, and its initial guess
     "horizontal": (slice(0, 2), SmoothNoise(2e-5, 5e-5, 0.03)),
     "vertical": (slice(2, 3), SmoothNoise(2e-5, 3e-5, 0.03)),
     "turn": (slice(3, 6), SmoothNoise(2e-4, 3e-4, 0.03)),
 }
-# The covariance of the noise is that of the data already. Eight effects at most.
+# The data are whitened already. Eight effects at most.
 SETTINGS = Settings(noise=1.0, unexplained_share=0.2, max_effects=8)
 
 
 class CubeTosses(System):
-    """All that flights tell beside what their own motion absorbs, and cubes at rest: one number of variance one a row.
+    """Flights, orthogonal to their own motion, and cubes at rest, as rows of one number with variance one.
 
     seen : (n,) measured minus base model
     effects : (n, k) its change by QUANTITIES, in all of which it is linear
@@ -322,7 +316,7 @@ class CubeTosses(System):
     base = ()
 
     def __init__(self, flights: Sequence[Flight]) -> None:
-        """Measure the noise, and whiten."""
+        """Estimate the noise, and whiten the data with it."""
         self.flights, self._flown, self._at_rest = flights, [flown(f) for f in flights], at_rest(flights)
         self.noise = {name: noise for name, (_, noise) in FIRST_NOISE.items()}
         for _ in range(2):
@@ -336,7 +330,7 @@ class CubeTosses(System):
         return left[:, None], self.effects[:, None, [COLUMN[n] for n in names]]
 
     def residuals(self, values: Values) -> list[Array]:
-        """Measured minus predicted (n, 6) [m], [rad] of every flight, its own motion by least squares."""
+        """Residuals (n, 6) [m], [rad] of every flight, with its own motion by least squares."""
         found = []
         for rows in self._flown:
             effects, seen, own = np.split(rows.reshape(-1, rows.shape[-1]), [len(COLUMN), len(COLUMN) + 1], axis=1)
@@ -352,7 +346,7 @@ class CubeTosses(System):
                 white[:, channels] = np.tensordot(self.noise[name].whitening(f.time), rows[:, channels], axes=1)
             effects, own = np.split(white.reshape(-1, rows.shape[-1]), [len(COLUMN) + 1], axis=1)
             beside_own = np.linalg.qr(own, mode="complete")[0][:, own.shape[1] :].T @ effects
-            # of an effect that the flight's own motion absorbs, rounding is left
+            # rounding errors of an effect that the flight's own motion absorbs
             beside_own[:, np.linalg.norm(beside_own, axis=0) < INVISIBLE * np.linalg.norm(effects, axis=0)] = 0.0
             parts += [beside_own, rest]
             training += [not _kept_back(f)] * (len(beside_own) + len(rest))
@@ -360,11 +354,11 @@ class CubeTosses(System):
         self.effects, self.seen = everything[:, :-1], everything[:, -1]
         self.training: Mask = np.array(training)  # (n,) False for every third toss
         self.weights = np.ones(len(everything))
-        self.time = np.arange(len(everything), dtype=float)  # only an order: tosses have no common clock
+        self.time = np.arange(len(everything), dtype=float)  # an order only: tosses have no common clock
 
     def _measured_noise(self) -> dict[str, SmoothNoise]:
-        """Noise of each group of channels, from what is left when all candidates together have taken their share."""
-        # some make up for each other: of all amounts that do as well, those that would surprise least
+        """Noise of each group of channels, from the residuals of a fit of all candidates together."""
+        # some compensate each other: the solution that is smallest in units of the usual sizes
         size = np.array([q.typical for q in QUANTITIES])
         amounts = size * np.linalg.lstsq(self.effects * size, self.seen, rcond=1e-9)[0]
         left = self.residuals(dict(zip(COLUMN, amounts.tolist(), strict=True)))
@@ -380,7 +374,7 @@ def _kept_back(flight: Flight) -> bool:
 
 
 def _noise(left: Sequence[Array], channels: slice, start: SmoothNoise) -> SmoothNoise:
-    """Noise of channels of all flights; those of one length share instants: their samples stand side by side."""
+    """Noise of channels of all flights; flights of equal length share their instants, and are columns of one array."""
     stretches = []
     for n, alike in groupby(sorted(left, key=len), key=len):
         time = np.arange(n) / FRAME_RATE
@@ -390,12 +384,12 @@ def _noise(left: Sequence[Array], channels: slice, start: SmoothNoise) -> Smooth
 
 
 def diagnosed(system: CubeTosses) -> Diagnosis:
-    """What the base model lacks."""
+    """Effects that the base model lacks."""
     return explain(system, {}, SETTINGS, system.training)
 
 
 def rms_of(system: CubeTosses, values: Values) -> dict[str, float]:
-    """Rms of measured minus predicted of the held-out flights, per group of channels [m], [rad]."""
+    """Rms residuals of the held-out flights, per group of channels [m], [rad]."""
     residuals = zip(system.flights, system.residuals(values), strict=True)
     left = [x for flight, x in residuals if _kept_back(flight)]
     freedom = sum(len(x) - 2 for x in left)
@@ -404,7 +398,7 @@ def rms_of(system: CubeTosses, values: Values) -> dict[str, float]:
 
 
 def errors(system: CubeTosses, d: Diagnosis) -> tuple[dict[str, float], dict[str, float]]:
-    """`rms_of` the base model, and of what was found with values fitted to the other flights."""
+    """`rms_of` the base model, and of the effects found with values fitted to the other flights."""
     held = d.held_out_after
     return rms_of(system, {}), rms_of(system, held.train.values if held else {})
 
@@ -426,8 +420,8 @@ def example(folder: Path) -> Outcome:
         rows.append((f"rms {group} ({unit})", *(rounded(size * x) for x in numbers)))
     copies, left_out = len(published) - len(tosses), len(tosses) - len(system.flights)
     caption = (
-        f"{len(system.flights)} flights, each with its cube at rest; {left_out} tosses are left out (too short, or not "
-        f"smooth), and {copies} copies of others, turned about the vertical."
+        f"{len(system.flights)} flights, each with its cube at rest; without {left_out} tosses that are too short or "
+        f"not smooth, and {copies} copies of others, rotated about the vertical."
     )
     blocks = [Section("Every third toss, held out", [Listing(("", "before", "after", "white noise"), rows, caption)])]
     model = f"g = {GRAVITY} m/s^2, uniform cube, {FRAME_RATE:g} Hz, half width {HALF_WIDTH} m"
