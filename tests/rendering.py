@@ -13,7 +13,7 @@ from calibration import StereoRig
 from disctrack import Disc, Model, simulate, steady_precession
 from disctrack.synthetic.description import Scene
 from disctrack.synthetic.images import expected_board_image, expected_disc_image, stages
-from disctrack.synthetic.sensor import digitise
+from disctrack.synthetic.optics import digitise
 
 SMALL_SCENE = """
 [cameras]

@@ -13,7 +13,6 @@ from disctrack.frames import CAMERAS, rotation_from_euler
 from disctrack.synthetic import optics, raster
 from disctrack.synthetic.cameras import View, image_of, views_of
 from disctrack.synthetic.description import Scene
-from disctrack.synthetic.sensor import hot_pixels, sensor_pattern
 
 PoseOverExposure = Callable[[Array], Array]  # (k,) times [s] from mid exposure -> (k, 6) q
 
@@ -31,8 +30,8 @@ class Stage:
         # (height, width) blurred table, without lamp and vignetting
         self.table = optics.blur_to_pixels(self.cells, self.weights, self.s)
         self.factor, self.glare = optics.illumination(view, self.name, scene)
-        self.pattern = sensor_pattern(scene.imperfections, size, [scene.seed, 10, index])
-        self.hot = hot_pixels(scene.sensor, size, np.random.default_rng([scene.seed, 5, index]))
+        self.pattern = optics.sensor_pattern(scene.imperfections, size, [scene.seed, 10, index])
+        self.hot = optics.hot_pixels(scene.sensor, size, np.random.default_rng([scene.seed, 5, index]))
 
     def finish(self, irradiance: Array32) -> Array32:
         """Blurred image with lamp, vignetting and glare, and with the pattern and the hot pixels of the sensor."""

@@ -26,7 +26,7 @@ from disctrack.synthetic.cameras import board_poses, image_of, rig_of, views_of
 from disctrack.synthetic.description import ImperfectionSettings, Scene, load_scene, scene_toml
 from disctrack.synthetic.images import expected_board_image, expected_disc_image, stages
 from disctrack.synthetic.motion import motion_of, rolling_model, true_exposure, true_frame_rate
-from disctrack.synthetic.sensor import digitise
+from disctrack.synthetic.optics import digitise
 
 Progress = Callable[[int, int], None]  # images done, total number of images
 

@@ -21,9 +21,8 @@ from disctrack.recording.declaration import read_recording
 from disctrack.synthetic import description
 from disctrack.synthetic.cameras import rig_of
 from disctrack.synthetic.motion import motion_of
-from disctrack.synthetic.optics import corner_rays
+from disctrack.synthetic.optics import corner_rays, digitise, sensor_pattern
 from disctrack.synthetic.recording import recording_toml, write_recording
-from disctrack.synthetic.sensor import digitise, sensor_pattern
 from tests.rendering import expected_disc, render_board, render_disc
 
 PLAIN = description.Scene(
