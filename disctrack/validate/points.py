@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from calibration.board.target import Board
 from calibration.cameras.camera import N_RIG, StereoRig
 from calibration.kit.arrays import Array
 from calibration.kit.least_squares import normal_of_rows
@@ -53,11 +54,7 @@ ORDINARY = Laboratory(0.02, 0.004, 3e-6, 40e-6, 1.2e-4, 1e-4)
 
 def rig_covariance(rig: StereoRig, scene: Scene) -> Array:
     """(30, 30) from the corners of the scene's chessboard views, the first of which defines the world."""
-    board = scene.board
-    nx, ny = board.inner_corners
-    corners = np.stack(np.meshgrid(np.arange(nx), np.arange(ny)), -1).reshape(-1, 2) * board.square_mm * 1e-3
-    corners = np.column_stack([corners, np.zeros(len(corners))])
-    rows = []
+    corners, rows = Board(scene.board.inner_corners, scene.board.square_mm * 1e-3).points, []
     for number, (R, t) in enumerate(zip(*board_poses(scene, rig), strict=True)):
         arm = corners @ R.T
         _, by_point, by_rig = rig.project_with_jacobians(arm + t)
