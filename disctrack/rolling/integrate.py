@@ -31,22 +31,6 @@ class CompiledSystem(NamedTuple):
     n_margins: int
 
 
-def integrate(
-    system: CompiledSystem, t0: complex, y0: Numbers, grid: Array, rtol: float, atol: Array, max_steps: int
-) -> tuple[Numbers, complex, Numbers, int, int]:
-    """Solve dy/dt = f(t, y) from (t0, y0) to the grid's points, until a positive margin falls to zero.
-
-    grid : (n_grid,) increasing, none before t0.   atol : (n,)
-    Returns y at the grid points that were reached (n_filled, n), instant and state of the event or at the last grid
-    point, the index of the margin of the event or -1, and the number of steps. If neither an event nor the last grid
-    point is reached, the step became too small, a number is not finite, or the steps were too many.
-    """
-    solution = np.full((len(grid), len(y0)), np.nan, y0.dtype)
-    t, y = np.array([t0], y0.dtype), y0.copy()
-    n_filled, event, n_steps = _dop853(system, t, y, grid, rtol, atol, max_steps, solution)
-    return solution[:n_filled], t[0], y, event, n_steps
-
-
 def evaluate(system: CompiledSystem, t: Numbers, Y: Numbers, instant: Records) -> tuple[Numbers, Numbers, Records]:
     """Evaluate a system at many states: rates, margins, and copies of the record (1,) that each call fills.
 
@@ -112,15 +96,6 @@ def _error(y: Numbers, h: float, rtol: float, atol: Array, size: Array, made: do
 
 
 @exact_part
-def _fill(F: Numbers, t: complex, y: Numbers, h: complex, grid: Array, i_grid: int, solution: Numbers) -> int:
-    """Fill the grid points from index i_grid to the end of the step; returns the index of the next one."""
-    while i_grid < grid.size and grid[i_grid] <= (t + h).real:
-        dop853.along(F, y, (grid[i_grid] - t) / h, solution[i_grid])
-        i_grid += 1
-    return i_grid
-
-
-@exact_part
 def _first_step(y: Numbers, f: Numbers, atol: Array) -> float:
     """A hundredth of the shortest time in which a component changes by its own magnitude."""
     fastest = 0.0
@@ -160,26 +135,25 @@ def _locate(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _dop853(
-    system: CompiledSystem,
-    t_last: Numbers,
-    y: Numbers,
-    grid: Array,
-    rtol: float,
-    atol: Array,
-    max_steps: int,
-    solution: Numbers,
-) -> tuple[np.signedinteger, int, int]:
-    """Fills the solution, updates t_last (1,) and y (n,); returns grid points reached, event or -1, steps."""
-    n, unit = y.size, 0.0 * y[0] + 1.0  # one, in the number type of the state
-    t_box, made = t_last.copy(), dop853.room(y, n + system.n_margins)
+def integrate(
+    system: CompiledSystem, t0: complex, y0: Numbers, grid: Array, rtol: float, atol: Array, max_steps: int
+) -> tuple[Numbers, complex, Numbers, int, int]:
+    """Solve dy/dt = f(t, y) from (t0, y0) to the grid's points, until a positive margin falls to zero.
+
+    grid : (n_grid,) increasing, none before t0.   atol : (n,)
+    Returns y at the grid points that were reached (n_filled, n), instant and state of the event or at the last grid
+    point, the index of the margin of the event or -1, and the number of steps. If neither an event nor the last grid
+    point is reached, the step became too small, a number is not finite, or the steps were too many.
+    """
+    y, n, unit = y0.copy(), y0.size, 0.0 * y0[0] + 1.0  # one, in the number type of the state
+    solution = np.empty((grid.size, n), y0.dtype)
+    t_box, made = np.empty(1, y0.dtype), dop853.room(y, n + system.n_margins)
     K = made.K
-    size, t, i_grid = np.zeros(1), t_last[0], np.int64(0)
+    size, t, i_grid, event, steps = np.zeros(1), t0 * unit, np.int64(0), -1, 0
     _rates(t, y, K[0], system, t_box)
     h_next = _first_step(y, K[0], atol)
-    for steps in range(max_steps):
-        if i_grid == grid.size:
-            return i_grid, -1, steps
+    while event < 0 and i_grid < grid.size and steps < max_steps and h_next >= 1e-15:
+        steps += 1
         room = grid[-1] - t
         h = room if room.real <= h_next else h_next * unit
         if room.real < 1e-15:  # the last points coincide with t up to rounding
@@ -191,8 +165,6 @@ def _dop853(
         error = _error(y, h.real, rtol, atol, size, made)
         if not error <= 1.0:  # also if NaN
             h_next = h.real * (max(0.2, 0.9 * error**-0.125) if np.isfinite(error) else 0.1)
-            if h_next < 1e-15:
-                return i_grid, -1, steps
             continue
         h_next = h.real * (5.0 if error == 0.0 else min(5.0, 0.9 * error**-0.125))
         _rates(t + h, made.end, K[dop853.N], system, t_box)
@@ -205,11 +177,10 @@ def _dop853(
             _rates(t + h, made.end, K[dop853.N], system, t_box)
         if grid[i_grid] <= (t + h).real:
             _polynomial(system, t_box, t, y, h, made)
-            i_grid = _fill(made.F, t, y, h, grid, i_grid, solution)
+            while i_grid < grid.size and grid[i_grid] <= (t + h).real:
+                dop853.along(made.F, y, (grid[i_grid] - t) / h, solution[i_grid])
+                i_grid += 1
         t = t + h
-        t_last[0] = t
         _assign(y, made.end)
-        if event >= 0:
-            return i_grid, event, steps
         _assign(K[0], K[dop853.N])
-    return i_grid, -1, max_steps
+    return solution[:i_grid], t, y, event, steps

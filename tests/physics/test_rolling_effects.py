@@ -50,7 +50,7 @@ def test_a_passive_effect_never_feeds_energy(name, rng):
 
 def test_a_law_of_the_wrong_sign_is_noticed(rng):
     effect = CATALOGUE["kz"](k_z=1e-5)
-    effect._values["k_z"] = -1e-5
+    effect.values["k_z"] = -1e-5
     assert largest_power(effect, rng) > 1e-4
 
 

@@ -86,20 +86,15 @@ class Effect:
         for given in values:
             if given not in known:
                 raise ModelError(f"effect '{self.name}' has no parameter '{given}'; it has {', '.join(known)}")
-        self._values = {p.name: float(values.get(p.name, p.nominal)) for p in self.parameters}
+        self.values = {p.name: float(values.get(p.name, p.nominal)) for p in self.parameters}
         for p in self.parameters:
-            value = self._values[p.name]
+            value = self.values[p.name]
             if not p.lower <= value <= p.upper or not (np.isfinite(value) or value == p.null):
                 would_supply_energy = self.law is not None and value < p.lower == 0
                 raise ModelError(
                     f"{self.name}.{p.name} = {value:g} {p.unit} is outside [{p.lower:g}, {p.upper:g}]"
                     + (": a passive effect cannot feed the disc with energy" if would_supply_energy else "")
                 )
-
-    @property
-    def values(self) -> dict[str, float]:
-        """Parameter values by name."""
-        return dict(self._values)
 
     @classmethod
     def absent(cls) -> Effect:
@@ -109,13 +104,13 @@ class Effect:
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Effect):
             return NotImplemented
-        return (self.name, self.formulas, self._values) == (other.name, other.formulas, other._values)
+        return (self.name, self.formulas, self.values) == (other.name, other.formulas, other.values)
 
     def __hash__(self) -> int:
-        return hash((self.name, tuple(self._values.items())))
+        return hash((self.name, tuple(self.values.items())))
 
     def __repr__(self) -> str:
-        return f"{type(self).__name__}({', '.join(f'{k}={v!r}' for k, v in self._values.items())})"
+        return f"{type(self).__name__}({', '.join(f'{k}={v!r}' for k, v in self.values.items())})"
 
 
 def effect(title: str, source: str, *parameters: EffectParameter, **traits: Any) -> Callable[[Any], type[Effect]]:
