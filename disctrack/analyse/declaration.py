@@ -319,18 +319,11 @@ def balance(trajectory: Trajectory) -> tuple[Array, Array]:
 
 
 def _stretches(trajectory: Trajectory) -> list[slice]:
-    """Some stretches without large gaps, evenly distributed over the frames in which the disc was measured."""
+    """Some stretches, evenly distributed over the frames from the first to the last in which the disc was measured."""
     rows = np.flatnonzero(trajectory.measured)
-    if len(rows) < BLOCK:
-        return []
-    gaps = np.diff(trajectory.time[rows])
-    pieces = np.split(rows, np.flatnonzero(gaps > BLOCK * np.median(gaps)) + 1)
-    found = [
-        slice(int(start), int(min(start + MIN_BLOCKS * BLOCK, piece[-1] + 1)))
-        for piece in pieces
-        for start in range(piece[0], piece[-1] + 1 - BLOCK, MIN_BLOCKS * BLOCK)
-    ]
-    return [found[i] for i in evenly(len(found), STRETCHES)]
+    end, length = int(rows.max(initial=-1)) + 1, MIN_BLOCKS * BLOCK
+    starts = range(int(rows.min(initial=end)), end - BLOCK, length)
+    return [slice(start, min(start + length, end)) for start in (starts[i] for i in evenly(len(starts), STRETCHES))]
 
 
 def _blocks(motion: MeasuredMotion) -> tuple[Array, Array]:
