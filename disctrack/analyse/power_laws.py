@@ -35,7 +35,6 @@ MODEL_EXPONENTS = (
 )
 WINDOW = 0.5  # [s] before t_f, as in table 2 of the paper
 MIN_PERIODS = 5  # of nutation, in a window
-MAX_TF_SIGMA = 0.3  # sigma of t_f over the shortest time to collapse
 RATIO_RANGE = (0.72, 0.95)  # nutation over precession frequency: thin disc 0.7746, 3 mm at 60 degrees 0.89
 HARMONICS = ((1, 3), (2, 2))  # (harmonic, terms of its amplitude in a polynomial of the phase)
 BRAKE_DROP = 0.05  # relative decrease of psidot below its peak that indicates braking at the very end
@@ -234,15 +233,8 @@ def _judged(fit: _Fit, ln_energy: Array) -> PowerLaws:
     longest, shortest = float(fit.t_f - fit.time[0]), float(fit.t_f - fit.time[-1])
     periods = float(np.ptp(fit.phase)) / (2 * np.pi)
     linear, sigma, t_f_sigma = _linear_with_sigma(fit)
-    reason = ""
     if periods < MIN_PERIODS:
         reason = f"only {periods:.1f} nutation periods in the window, {MIN_PERIODS} are needed"
-    elif not t_f_sigma < MAX_TF_SIGMA * shortest:
-        reason = (
-            f"t_f is known only to {1e3 * t_f_sigma:.1f} ms with {1e3 * shortest:.1f} ms left at the end of the data: "
-            "record closer to the end"
-        )
-    if reason:
         return PowerLaws(reason, (longest, shortest), periods, fit.t_f, t_f_sigma)
     quantile = float(stdtrit(max(2.0, fit.period.max() + 1 - 4.0), 0.975))
 
