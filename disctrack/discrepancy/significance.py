@@ -62,8 +62,20 @@ def evidence(shown: Array, along: Array, sizes: Array) -> Array:
 
 
 DRAWS = 4000
-LAST = 40  # largest draws: beyond them the tail is that of a single trial times the effective number of trials
+LAST = 40  # largest draws: beyond them the tail is taken for exponential
 SEED = 20261122
+
+
+def tail(observed: float, draws: Array, scale: float | None = None) -> float:
+    """Probability that a value as large is drawn; draws (n,) : simulated and sorted.
+
+    scale : by which the logarithm of the tail falls by 1; by default that of the largest draws
+    """
+    last = float(draws[-LAST])
+    if observed < last:
+        return float(1.0 - np.searchsorted(draws, observed) / len(draws))
+    scale = float(np.mean(draws[-LAST:] - last)) if scale is None else scale
+    return LAST / len(draws) * float(np.exp(-(observed - last) / scale))
 
 
 @dataclass(frozen=True)
@@ -91,9 +103,11 @@ def chance(linear: Linearisation, scores: Sequence[Score], noise: float, draws: 
         quantities = [linear.quantities[n] for n in s.candidate.names]
         if len(quantities) == 1 and linear.values[quantities[0].name] <= quantities[0].lower:
             along = np.maximum(along, 0.0)  # one-sided: an effect that may only brake
-        tail = stats.chi2.logsf(np.sum(along**2, axis=1), len(s.candidate.names))
-        np.maximum(largest, -tail, out=largest)
-    return _among(observed, np.sort(largest))
+        of_one = stats.chi2.logsf(np.sum(along**2, axis=1), len(s.candidate.names))
+        np.maximum(largest, -of_one, out=largest)
+    largest.sort()
+    tests = LAST / draws * float(np.exp(largest[-LAST]))  # beyond it the tail is that of so many single trials
+    return Chance(tail(observed, largest, 1.0), tests)
 
 
 def _directions(linear: Linearisation, names: Sequence[str]) -> Array:
@@ -102,20 +116,8 @@ def _directions(linear: Linearisation, names: Sequence[str]) -> Array:
     return seen / np.linalg.norm(seen) if seen.shape[1] == 1 else span(seen)
 
 
-def _among(observed: float, sorted_draws: Array) -> Chance:
-    """Share of the draws that reach what was observed; beyond the largest of them, by the tail of single trials."""
-    n = len(sorted_draws)
-    last = float(sorted_draws[-min(LAST, n)])
-    tests = min(LAST, n) / n * float(np.exp(last))
-    if observed < last:
-        above = n - int(np.searchsorted(sorted_draws, observed))
-        return Chance(above / n, tests)
-    return Chance(float(tests * np.exp(-observed)), tests)
-
-
 LAGS = 20
 LONG = 1500  # samples from which on the statistic's distribution is the asymptotic one even in its tail
-SERIES, TAIL = 6000, 0.01  # series of noise, and the share of them beyond which the tail is taken for exponential
 
 
 @dataclass(frozen=True)
@@ -146,18 +148,13 @@ def ljung_box_p_value(statistic: float, n: int, lags: int = LAGS) -> float:
     """
     if n >= LONG:
         return float(stats.chi2.sf(statistic, lags))
-    draws = _drawn(int(2.0 ** (np.floor(2 * np.log2(n)) / 2)), lags)
-    start = float(draws[-int(TAIL * SERIES)])
-    if statistic < start:
-        return float(1.0 - np.searchsorted(draws, statistic) / SERIES)
-    scale = float(np.mean(draws[draws >= start] - start))
-    return TAIL * float(np.exp(-(statistic - start) / scale))
+    return tail(statistic, _drawn(int(2.0 ** (np.floor(2 * np.log2(n)) / 2)), lags))
 
 
 @lru_cache(maxsize=8)
 def _drawn(n: int, lags: int) -> Array:
     """Sorted statistics of simulated white noise."""
-    return np.sort(ljung_box(np.random.default_rng(n).standard_normal((n, SERIES)), lags))
+    return np.sort(ljung_box(np.random.default_rng(n).standard_normal((n, DRAWS)), lags))
 
 
 def whiteness(residual: Array, rate: float, lines: Mapping[str, float], lags: int = LAGS) -> Whiteness:
