@@ -126,7 +126,7 @@ class Whiteness:
 
     ljung_box: Array  # (c,) statistic per channel
     p_value: float  # smallest over the channels, times their number (Bonferroni), at most 1
-    peak_frequency: Array  # (c,) [Hz] highest line of the periodogram
+    peak_frequency_hz: Array  # (c,) highest line of the periodogram
     peak_p_value: Array  # (c,) probability of one as high in white noise
     peak_near: tuple[str, ...]  # (c,) which of the named frequencies it lies at, or ""
 

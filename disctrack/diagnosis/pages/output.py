@@ -31,15 +31,11 @@ def _errors(errors: Errors | None, ahead: list[Ahead]) -> dict[str, Any]:
         return {}
     found = asdict(errors)
     tests, ratio = found.pop("whiteness"), found.pop("ratio_to_floor")
-    by_component = {
-        name: dict(zip(POSE_COMPONENTS, plain(values), strict=True))
-        for name, values in tests.items()
-        if name != "p_value"
-    }
-    by_component["peak_frequency_hz"] = by_component.pop("peak_frequency")
+    p_value = tests.pop("p_value")
+    by_component = {name: dict(zip(POSE_COMPONENTS, plain(values), strict=True)) for name, values in tests.items()}
     return found | {
         "held_out": {"ratio_to_noise_floor": ratio, "free_run": ahead},
-        "whiteness": {"p_value": tests["p_value"], **by_component},
+        "whiteness": {"p_value": p_value, **by_component},
     }
 
 

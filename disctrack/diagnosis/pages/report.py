@@ -111,7 +111,7 @@ def _line(errors: Errors) -> str:
     w = errors.whiteness
     i = int(np.argmin(w.peak_p_value))
     near = f" ({w.peak_near[i]})" if w.peak_near[i] else ""
-    return f"{w.peak_frequency[i]:.4g} Hz{near}, p {probability(min(1.0, w.peak_p_value[i] * len(w.peak_p_value)))}"
+    return f"{w.peak_frequency_hz[i]:.4g} Hz{near}, p {probability(min(1.0, w.peak_p_value[i] * len(w.peak_p_value)))}"
 
 
 def _laws(result: DiscDiagnosis) -> list[Row]:
