@@ -16,7 +16,6 @@ from calibration.kit import _dop853 as dop853
 from calibration.kit.arrays import Array, Numbers
 from calibration.kit.compiled import exact_part, njit
 from disctrack.rolling._compiled import call
-from disctrack.rolling.records import Records
 
 RTOL_IMAGINARY = 1e-7  # fifth-order error per step; the relative error of the derivatives is then about 1e-9
 
@@ -29,18 +28,6 @@ class CompiledSystem(NamedTuple):
     b: int
     c: int
     n_margins: int
-
-
-def evaluate(system: CompiledSystem, t: Numbers, Y: Numbers, instant: Records) -> tuple[Numbers, Numbers, Records]:
-    """Evaluate a system at many states: rates, margins, and copies of the record (1,) that each call fills.
-
-    t : (N,), Y : (N, n) -> (N, n), (N, n_margins), (N,)
-    """
-    out = np.zeros((len(t), Y.shape[1] + system.n_margins), Y.dtype)
-    found = np.zeros(len(t), instant.dtype)
-    rows = found.view(Y.dtype).reshape(len(t), -1)
-    _evaluate(system, t.astype(Y.dtype), np.ascontiguousarray(Y), out, instant.view(Y.dtype), rows)
-    return out[:, : Y.shape[1]], out[:, Y.shape[1] :], found
 
 
 @exact_part
@@ -60,7 +47,8 @@ _step, _polynomial = dop853.method(_rates)
 
 
 @njit(cache=True, error_model="numpy")
-def _evaluate(system: CompiledSystem, t: Numbers, Y: Numbers, out: Numbers, instant: Numbers, found: Numbers) -> None:
+def evaluate(system: CompiledSystem, t: Numbers, Y: Numbers, out: Numbers, instant: Numbers, found: Numbers) -> None:
+    """Rates and margins `out` of states Y (N, n) at t (N,); `found` are copies of the record that each call fills."""
     t_box = t[:1].copy()
     for i in range(len(t)):
         _rates(t[i], Y[i], out[i], system, t_box)

@@ -121,7 +121,7 @@ class Assembly:
         constants = body_constants(model, theta_end, values)
         self.scalar = scalar
         self.body = np.array([tuple(constants[name] for name in BODY)], record_dtype(BODY, scalar))
-        self.instant = np.zeros(1, record_dtype(INSTANT, scalar))
+        self.instant: Records = np.zeros(1, record_dtype(INSTANT, scalar))
         self._rates = compile_system(rates, scalar)
         self._laws, calls, in_air = [], [], []
         for effect in model.effects:
@@ -145,7 +145,12 @@ class Assembly:
 
     def at(self, regime: int, t: ArrayLike, Y: Numbers) -> tuple[Numbers, Numbers, Records]:
         """Rates (N, n), margins (N, 4) and records.INSTANT (N,) at states Y (N, n), or at one (n,)."""
-        return integrate.evaluate(self.system(regime), np.atleast_1d(t), np.atleast_2d(Y), self.instant)
+        t, Y = np.atleast_1d(t).astype(Y.dtype), np.ascontiguousarray(np.atleast_2d(Y))
+        out: Numbers = np.zeros((len(Y), Y.shape[1] + len(EVENTS)), Y.dtype)
+        found = np.repeat(self.instant, len(Y))
+        rows = found.view(Y.dtype).reshape(len(Y), -1)
+        integrate.evaluate(self.system(regime), t, Y, out, self.instant.view(Y.dtype), rows)
+        return out[:, : Y.shape[1]], out[:, Y.shape[1] :], found
 
     def constant(self, name: str) -> Any:
         """One of records.BODY."""

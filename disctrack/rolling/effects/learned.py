@@ -55,8 +55,6 @@ def effect_from_formulas(
     if unused or not lines:
         raise ModelError(f"{name}: no formula uses {', '.join(sorted(unused)) or 'anything: there is none'}")
     members = {
-        "__doc__": title or f"Law by formula: {formulas}",
-        "__module__": __name__,
         "name": name,
         "title": title or "; ".join(f"{k} = {v}" for k, v in formulas.items()),
         "source": source,
