@@ -216,23 +216,18 @@ def recording_toml(scene: Scene) -> str:
 def _write_truth(path: Path, truth: Truth, scene: Scene) -> None:
     """Write `truth` and its scene."""
     pose, disc = ", ".join(f"{c} {'m' if c in 'xyz' else 'rad'}" for c in COORDINATES), truth.disc
-    paper, printed = np.array(scene.faults.pattern_offset_mm) * 1e-3, np.ones(disc.n_markers, np.uint8)
-    printed[list(scene.faults.hidden_markers)] = 0
     datasets = (
         ("time", truth.time, "s", "mid exposure of the left camera"),
         ("q", truth.q, pose, "pose at time, world frame = table"),
         ("qdot", truth.qdot, "m/s, rad/s", "rates of q at time"),
         ("q_right", truth.q_right, pose, "pose at the right camera's mid exposure"),
         ("markers_px", truth.markers_px, "px", "images of the dots' own centres (frame, camera, marker, xy)"),
-        ("disc/paper_centre_body", paper, "m", "centre of the paper on the upper face"),
-        ("disc/markers_printed", printed, "1", "0: the dot has come off"),
         ("disc/marker_centres_body", disc.marker_centres_body, "m", "true centres of the dots"),
-        ("disc/declared_marker_centres_body", scene.declared_disc.marker_centres_body, "m", "as in recording.toml"),
         ("board/R_world_board", truth.R_world_board, "1", "orientation of the board in the calibration views"),
         ("board/t_world_board", truth.t_world_board, "m", "lower left inner corner in the calibration views"),
     )
     with h5py.File(path, "w") as file:
-        file.attrs["schema"], file.attrs["schema_version"] = "disctrack truth", 2
+        file.attrs["schema"], file.attrs["schema_version"] = "disctrack truth", 3
         file.attrs["scene"] = scene_toml(scene)  # renders the same recording again
         file.attrs["frame_rate_hz"] = truth.frame_rate
         for place, values, units, text in datasets:
