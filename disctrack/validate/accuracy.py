@@ -13,7 +13,6 @@ from disctrack.validate.tables import Validation, table
 
 PER_SI = {"µm": 1e6, "mdeg": 180e3 / np.pi}
 CLAIM = {"µm": 1e6 * CLAIM_POSITION, "mdeg": 50.0}  # for 95 % of the errors: Ma et al. 2014, end of section 3
-REGULAR_DEG = 5.0  # smallest nutation for statistics of psi and phi; below, their errors grow as 1/sin(theta)
 LAW_DEG = 20.0  # largest nutation for the fit of 1/sin(theta); above, errors depend more on the cameras' directions
 CONSISTENT = (0.8, 1.25)
 Row = dict[str, float]  # numbers by the heads of their columns; lengths and angles in the units named there
@@ -55,10 +54,8 @@ def _rms(errors: Array) -> float:
 def _rows(own: PoseErrors, true: PoseErrors) -> Iterator[tuple[str, Row]]:
     """Errors of each quantity: in total, and from noise and calibration, from the same images."""
     both = own.usable & true.usable
-    regular = both & (own.q[:, 4] > np.radians(REGULAR_DEG))
     for name in (*COORDINATES, "rotation"):
-        at = regular if name in ("psi", "phi") and regular.any() else both
-        e, f = own.part(at).of(name), true.part(at).of(name)
+        e, f = own.part(both).of(name), true.part(both).of(name)
         n, e, f = len(e), *(values if values.size else np.array([np.nan]) for values in (e, f))
         unit, d = ("µm", e - f) if name in "xyz" else ("mdeg", np.angle(np.exp(1j * (e - f))))
         # noise : with the true cameras
@@ -136,9 +133,7 @@ def accuracy_validation(outcomes: Sequence[RenderedOutcome]) -> Validation:
     """All tables of recordings with static poses, and the verdict."""
     accuracy, tables = Accuracy(outcomes), []
     for name, rows in accuracy.rows.items():
-        note = "Rotation: the rotation vector between measured and true attitude."
-        if rows["psi [mdeg]"]["n"] < rows["theta [mdeg]"]["n"]:
-            note += f" psi and phi from {REGULAR_DEG:.0f} deg of nutation on."
+        note = "Rotation: the rotation vector between measured and true attitude. psi and phi: see below, by nutation."
         if name != STATIC:
             note = f"Exposure {1e3 * EXPOSURE:g} ms, corrected for by the smear of the dots."
         tables.append(_table(f"{name[0].upper()}{name[1:]}", "quantity", rows, note))
