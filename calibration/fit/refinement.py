@@ -22,6 +22,7 @@ from calibration.kit.arrays import Array, Mask
 from calibration.kit.errors import CalibrationError
 
 FREE_ROUNDS = 6  # of rejection in which points may be accepted again; not in as many more, so that the rounds end
+MOST_DISAGREEMENT = 100.0  # bound of the disagreement of views, which few views determine poorly
 FOLDS = 5
 NEGLIGIBLE = 1e-5  # relative decrease of chi-square: for 10^4 points, a third of a sigma of one parameter
 
@@ -127,8 +128,9 @@ def _settled(
         seen = len(np.unique(place[kept]))
         minimum = minimise(problem, model, tolerance=1e-5, damping=1e-6, rough=True)
         model, total = minimum.model, total + minimum.iterations
-        disagreement = max(float(np.nan_to_num(minimum.normal.disagreement(N_STEREO))), 1.0)
-        likeliest, determined = prior.likeliest(minimum.normal, model, disagreement)
+        disagreement = float(np.nan_to_num(minimum.normal.disagreement(N_STEREO)))
+        weight = min(max(disagreement, 1.0 / MOST_DISAGREEMENT), MOST_DISAGREEMENT)
+        likeliest, determined = prior.likeliest(minimum.normal, model, weight)
         steady, dof = likeliest.misprint == prior.misprint, 2 * len(used) - N_STEREO - 6 * seen - determined
         problem = replace(problem, prior=likeliest)
         if motion is not None:
