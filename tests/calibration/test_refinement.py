@@ -121,6 +121,7 @@ def test_thickness_of_the_board_moves_the_origin_down_and_couples_it_to_the_tilt
         assert_allclose(shift, np.cross(arm, np.eye(3)[axis]), atol=1e-6)
 
 
+@pytest.mark.statistical
 def test_gross_outliers_are_rejected_and_do_no_harm(rng):
     scene = make_scene(inner_corners=(6, 5))
     o = scene.observations(0.02, rng)
