@@ -8,7 +8,7 @@ from pathlib import Path
 
 from filelock import BaseFileLock, FileLock, SoftFileLock, Timeout
 
-from disctrack.files.whole import make_folder, output_error
+from disctrack.files.whole import make_folder, writing
 
 _NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
 SILENT_FOR = 12 * 3600.0  # [s] after which a lock counts as abandoned, on a disk without locks
@@ -39,8 +39,9 @@ def locked(path: Path, wait: float = 0.0) -> Iterator[None]:
             lock.acquire()
     except Timeout:
         raise
-    except OSError as error:
-        raise output_error(path, error) from error
+    except OSError:
+        with writing(path):
+            raise
     try:
         yield
     finally:

@@ -73,14 +73,12 @@ def _create(group: h5py.Group, name: str, variable: Variable) -> h5py.Dataset:
         raise ValueError(f"{name}: {data.ndim} axes, but {len(variable.dims)} names for them")
     if data.dtype == bool or data.dtype.kind not in "iufU":
         raise ValueError(f"{name}: arrays of {data.dtype} are not written; use uint8 or a float")
+    options: dict[str, object] = {}
     if data.dtype.kind == "U":
-        dataset = group.create_dataset(name, data=data.astype(object), dtype=h5py.string_dtype())
-    elif data.ndim == 0 or data.size == 0:
-        dataset = group.create_dataset(name, data=data)
-    else:
-        dataset = group.create_dataset(
-            name, data=data, compression="gzip", compression_opts=1, shuffle=True, fletcher32=True
-        )
+        data, options = data.astype(object), {"dtype": h5py.string_dtype()}
+    elif data.ndim and data.size:
+        options = {"compression": "gzip", "compression_opts": 1, "shuffle": True, "fletcher32": True}
+    dataset = group.create_dataset(name, data=data, **options)
     dataset.attrs["units"] = variable.units
     dataset.attrs["long_name"] = variable.long_name
     for key, value in variable.attributes.items():

@@ -35,10 +35,8 @@ def read_toml(path: Path, error: type[DiscTrackError]) -> dict[str, Any]:
         content = read_regular(path, MOST_TEXT)
     try:
         return tomllib.loads(content.decode())
-    except (
-        ValueError,
-        RecursionError,
-    ) as reason:  # not text, not TOML, nested too deeply, or a number of thousands of digits
+    # not text, not TOML, nested too deeply, or a number of thousands of digits
+    except (ValueError, RecursionError) as reason:
         place = re.search(r"at line (\d+)", str(reason))
         line = content.decode().splitlines()[int(place[1]) - 1].strip()[:80] if place else ""
         hint = " Numbers have a point: 37.5." if re.search(r"= *-?\d+,\d", line) else ""

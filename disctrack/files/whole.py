@@ -1,7 +1,6 @@
 """Files that are either complete or absent: written under a temporary name, flushed to the disk, renamed."""
 
 import contextlib
-import errno
 import os
 import secrets
 import tempfile
@@ -9,17 +8,8 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from disctrack.errors import OutputError
+from disctrack.errors import OutputError, told_as
 from disctrack.files.inputs import refuse_input
-
-_REMEDIES = {
-    errno.ENOSPC: "the disk is full. Free some space, or choose another place with -o",
-    errno.EDQUOT: "your quota is used up. Free some space, or choose another place with -o",
-    errno.EFBIG: "the file would exceed the size limit of this account or disk. Choose another place with -o",
-    errno.EROFS: "the disk is read-only. Choose another place with -o",
-    errno.EACCES: "no permission to write there. Choose another place with -o",
-    errno.EPERM: "no permission to write there. Choose another place with -o",
-}
 
 
 @contextlib.contextmanager
@@ -36,15 +26,13 @@ def whole_file(path: Path, suffix: str = "", adds_to_input: bool = False) -> Ite
         refuse_input(path)
     part = path.with_name(f"{path.name}.{secrets.token_hex(4)}.part{suffix}")
     try:
-        make_folder(path.parent)
-        _clear_abandoned(path.parent)
-        yield part
-        with part.open("rb+") as stream:
-            os.fsync(stream.fileno())
-        os.replace(part, path)
-        _sync_folder(path.parent)
-    except OSError as error:
-        raise output_error(path, error) from error
+        with writing(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            _clear_abandoned(path.parent)
+            yield part
+            with part.open("rb+") as stream:
+                os.fsync(stream.fileno())
+            os.replace(part, path)
     finally:
         with contextlib.suppress(OSError):
             part.unlink(missing_ok=True)
@@ -64,26 +52,20 @@ def refuse_existing(path: Path, overwrite: bool, what: str = "") -> None:
 
 def make_folder(folder: Path) -> None:
     """Create the folder and its parents. Raises OutputError."""
-    try:
+    with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise output_error(folder, error) from error
 
 
 def check_writable(folder: Path) -> None:
     """Create the folder and a temporary file in it, to detect errors before a long run. Raises OutputError."""
     make_folder(folder)
-    try:
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        raise output_error(folder, error) from error
+    with writing(folder), tempfile.TemporaryFile(dir=folder):
+        pass
 
 
-def output_error(path: Path, error: OSError) -> OutputError:
-    """Error with a remedy, if `path` cannot be written."""
-    remedy = _REMEDIES.get(error.errno or 0, f"{error.strerror or error}. Choose another place with -o")
-    return OutputError(f"{path}: cannot be written: {remedy}.")
+def writing(path: Path) -> contextlib.AbstractContextManager[None]:
+    """Within the block, an OSError means that `path` cannot be written, and becomes an OutputError."""
+    return told_as(OutputError, f"{path}: cannot be written", OSError, then="Choose another place with -o.")
 
 
 def _clear_abandoned(folder: Path) -> None:
@@ -92,13 +74,3 @@ def _clear_abandoned(folder: Path) -> None:
         with contextlib.suppress(OSError):
             if time.time() - part.stat().st_mtime > 3600.0:
                 part.unlink()
-
-
-def _sync_folder(folder: Path) -> None:
-    """Flush the new name to the disk, if the file system can do this for a folder."""
-    with contextlib.suppress(OSError):
-        descriptor = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)

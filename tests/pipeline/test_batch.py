@@ -232,7 +232,7 @@ def test_without_room_there_is_a_reason_and_nothing_half_written(room, one, reco
     with largest_file(room):
         result = stage.do(one)
     assert result["status"] == "failed"
-    assert "would exceed the size limit" in result["reason"]
+    assert "File too large" in result["reason"]
     assert [file.name for file in results.iterdir()] == (["batch.json"] if room > 1000 else [])
 
 
@@ -262,7 +262,7 @@ def test_a_read_only_folder_is_told_at_once_and_results_may_go_elsewhere(
     monkeypatch.setattr(Path, "mkdir", unless_there)
     said, errors = cli("batch", recording, *FAST, code=1)
     assert said == ""
-    assert "batch_results: cannot be written: no permission" in errors
+    assert "batch_results: cannot be written: Permission denied" in errors
     assert "-o" in errors
     assert "another place with -o" in stage.do(jobs_of(recording)[0])["reason"]
     cli("batch", recording, "-o", tmp_path / "out", *FAST)
