@@ -11,7 +11,6 @@ import io
 import os
 import signal
 import sys
-import tempfile
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -62,7 +61,6 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _answer(words: Sequence[str], received: Sequence[int]) -> int:
     try:
         _escape_unprintable_characters()
-        _find_writable_cache()
         parser, commands = _parser()
         arguments, unknown = parser.parse_known_args(words)
         if unknown:
@@ -122,24 +120,6 @@ def _escape_unprintable_characters() -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
-
-
-def _find_writable_cache() -> None:
-    """Set a cache folder for numba, which does not start if neither installation nor home are writable."""
-    here = os.path.dirname(os.path.abspath(__file__))
-    if "NUMBA_CACHE_DIR" in os.environ or "numba" in sys.modules or os.access(here, os.W_OK):
-        return
-    home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~")
-    if os.path.isdir(home) and os.access(home, os.W_OK):
-        return
-    name = f"disctrack-{os.getuid()}" if hasattr(os, "getuid") else "disctrack"
-    folder = os.path.join(tempfile.gettempdir(), name)
-    os.makedirs(folder, mode=0o700, exist_ok=True)
-    if hasattr(os, "getuid") and os.stat(folder).st_uid != os.getuid():  # compiled code of other users is not run
-        folder = tempfile.mkdtemp(prefix=name)
-    os.environ["NUMBA_CACHE_DIR"] = folder
-    os.environ.setdefault("MPLCONFIGDIR", os.path.join(folder, "matplotlib"))  # list of fonts
-    print(f"compiled inner loops are kept in {folder}: installation and home are read-only", file=sys.stderr)
 
 
 def _print_error(error: Exception) -> int:

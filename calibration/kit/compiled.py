@@ -8,6 +8,7 @@ files with compiled functions.
 from __future__ import annotations
 
 import os
+import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from hashlib import sha256
@@ -40,18 +41,25 @@ WITH_COMPILED = (
 
 
 def _folder() -> Path:
-    """Folder in NUMBA_CACHE_DIR, else next to the packages, else in the user's cache."""
+    """Folder in NUMBA_CACHE_DIR; otherwise next to the packages, in the user's cache, or among temporary files."""
     home, sources = Path(__file__).parents[2], sha256()
     for file in sorted({file for pattern in WITH_COMPILED for file in home.glob(pattern)}):
         sources.update(file.read_bytes())
-    local = Path(__file__).parent / "__pycache__"
-    if config.CACHE_DIR:
-        kept = Path(config.CACHE_DIR)
-    elif os.access(local if local.is_dir() else local.parent, os.W_OK):
-        kept = local
-    else:
-        kept = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "disctrack"
+    own = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "disctrack"
+    user = getattr(os, "getuid", int)()  # Windows states 0 for the owner of a file
+    places = Path(__file__).parent / "__pycache__", own, Path(tempfile.gettempdir()) / f"disctrack-{user}"
+    kept = Path(
+        config.CACHE_DIR or next((place for place in places if _is_own(place, user)), None) or tempfile.mkdtemp()
+    )
     return kept / f"compiled-{sources.hexdigest()[:16]}"
+
+
+def _is_own(place: Path, user: int) -> bool:
+    """True for a folder that can be written to and belongs to this user: compiled code of other users is not run."""
+    with suppress(OSError):
+        place.mkdir(mode=0o700, parents=True, exist_ok=True)
+        return os.access(place, os.W_OK) and place.stat().st_uid == user
+    return False
 
 
 FOLDER = _folder()

@@ -78,23 +78,16 @@ def test_every_file_with_a_compiled_loop_that_is_kept_counts_for_what_is_kept():
             assert not re.search(r"import numba|from numba import .*\b(n?jit|cfunc)\b", source), file
 
 
-def test_a_read_only_home_and_installation_get_a_cache_of_their_own(monkeypatch, tmp_path, capsys):
-    monkeypatch.delitem(sys.modules, "numba", raising=False)
-    for name in ("NUMBA_CACHE_DIR", "MPLCONFIGDIR"):
-        monkeypatch.setenv(name, "")  # so that it is as before after the test
-        monkeypatch.delenv(name)
+def test_a_read_only_home_and_installation_get_a_cache_of_their_own(monkeypatch, tmp_path):
+    monkeypatch.setattr(compiled.config, "CACHE_DIR", "")
+    assert (
+        compiled._folder().parent == Path(compiled.__file__).parent / "__pycache__"
+    )  # this checkout can be written to
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    cli._find_writable_cache()
-    assert "NUMBA_CACHE_DIR" not in os.environ  # this checkout can be written to
-    monkeypatch.setattr(os, "access", lambda path, mode: False)
-    cli._find_writable_cache()
-    folder = os.environ["NUMBA_CACHE_DIR"]
-    assert os.path.isdir(folder)
-    assert folder.startswith(str(tmp_path))
-    assert os.environ["MPLCONFIGDIR"].startswith(folder)  # what matplotlib finds of fonts is kept there, too
-    said = capsys.readouterr().err.splitlines()
-    assert len(said) == 1
-    assert folder in said[0]
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path).is_relative_to(tmp_path))
+    folder = compiled._folder().parent
+    assert folder.parent == tmp_path
+    assert folder.stat().st_mode & 0o777 == 0o700
 
 
 @pytest.mark.statistical
