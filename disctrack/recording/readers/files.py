@@ -176,8 +176,8 @@ def _numbers_by_form(files: Sequence[Path], camera: str) -> list[list[int]]:
         odd = [file for file, form in zip(files, forms, strict=True) if form != usual]
         others = [file for file, form in zip(files, forms, strict=True) if form == usual]
         said = f"{_listed(odd)}: not named like the other {len(others)} {camera} frames ({_listed(others)})"
-        remedy = f"It would shift those after it: move it away{_pattern_hint(others, odd)}"
-        raise RecordingError(f"{said}. {remedy}.")
+        remedy = f"move it away, or write a pattern that leaves it out; {NUMBER} says which digits count"
+        raise RecordingError(f"{said}. It would shift those after it: {remedy}.")
     runs = [re.findall(r"[0-9]+", file.stem) for file in files]
     columns = [[int(run) for run in column] for column in zip(*runs, strict=True)]
     return [column for column in columns if len(set(column)) > 1] or columns[-1:]
@@ -213,16 +213,6 @@ def _refuse_clock(files: Sequence[Path], numbers: Sequence[int], camera: str) ->
     said = f"the numbers of the {camera} frames have no common step ({steps[0]} to {steps[-1]}), like time stamps"
     remedy = f"Number the frames as the camera counted them, or say with {NUMBER} in the pattern which digits count"
     raise RecordingError(f"{_listed([files[i] for i in order])}: {said}. {remedy}.")
-
-
-def _pattern_hint(usual: Sequence[Path], odd: Sequence[Path]) -> str:
-    """Hint at a pattern that matches the usual files only."""
-    names = [re.sub(r"[0-9]", "[0-9]", re.sub(r"([\[*?])", r"[\1]", file.name)) for file in usual]
-    folder = usual[0].parent.name
-    alike = len(set(names)) == 1 and len({file.parent for file in usual}) == 1
-    if not alike or any(fnmatch.fnmatch(file.name, names[0]) for file in odd):
-        return f", or write a pattern that leaves it out; {NUMBER} says which digits count"
-    return f', or write a pattern that leaves it out, as "{folder}/{names[0]}"'
 
 
 def _listed(files: Sequence[Path | str]) -> str:

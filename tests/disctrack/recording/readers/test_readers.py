@@ -90,8 +90,6 @@ def test_a_file_that_is_not_named_like_the_others_is_named_not_measured(tmp_path
     with pytest.raises(RecordingError) as caught:
         open_frames("left/*.png", tmp_path, "left")
     assert f"{stray}.png: not named like the other 11 left frames" in str(caught.value)
-    pattern = str(caught.value).split('as "')[1].split('"')[0]  # the pattern that is proposed works
-    assert len(open_frames(pattern, tmp_path, "left")) == 11
 
 
 @pytest.mark.parametrize(
