@@ -175,18 +175,13 @@ def _stereo_rig(
         camera_of(array_of(found, K, (3, 3), where), array_of(found, D, (-1,), where), size, f"{where}: {K}, {D}")
         for K, D, size in zip(of_cameras[::2], of_cameras[1::2], sizes, strict=True)
     ]
-    world: dict[str, Any] = {"R_left_world": np.eye(3), "t_left_world": np.zeros(3), "world_is_table": 0.0} | dict(
-        found
-    )
-    return StereoRig(
-        cameras[0],
-        cameras[1],
-        rotation_of(array_of(found, R, (-1,), where), f"{where}: {R}"),
-        array_of(found, t, (3,), where) * unit,
-        rotation_of(array_of(world, "R_left_world", (-1,), where), f"{where}: R_left_world"),
-        array_of(world, "t_left_world", (3,), where) * unit,
-        world_is_table=world_is_table or bool(np.ravel(world["world_is_table"])[0]),
-    )
+    world = {"R_left_world": np.eye(3), "t_left_world": np.zeros(3), "world_is_table": 0.0, **found}
+    places: dict[str, Any] = {}
+    for rotation, translation, between in ((R, t, "right_left"), ("R_left_world", "t_left_world", "left_world")):
+        places[f"R_{between}"] = rotation_of(array_of(world, rotation, (-1,), where), f"{where}: {rotation}")
+        places[f"t_{between}"] = unit * array_of(world, translation, (3,), where)
+    is_table = world_is_table or bool(np.ravel(world["world_is_table"])[0])
+    return StereoRig(cameras[0], cameras[1], **places, world_is_table=is_table)
 
 
 def _numbers(rig: StereoRig, names: Sequence[str]) -> dict[str, Any]:

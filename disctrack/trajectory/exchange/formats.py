@@ -14,16 +14,13 @@ import numpy as np
 
 from calibration.cameras.camera import StereoRig
 from calibration.kit.arguments import checked
-from calibration.kit.seal import check_seal
-from calibration.rig_file import SCHEMA as RIG
 from calibration.rig_file import read_rig, write_rig
-from disctrack.errors import OutputError, TrajectoryFileError, told_as
+from disctrack.errors import OutputError, RigFileError
 from disctrack.files.inputs import keep, refuse_input
 from disctrack.files.whole import refuse_existing, write_whole
 from disctrack.trajectory import Trajectory
 from disctrack.trajectory.exchange import arrays, motion, rigs
-from disctrack.trajectory.exchange.lens import BROWN, within_brown
-from disctrack.trajectory.exchange.rigs import content_of, the_one
+from disctrack.trajectory.exchange.rigs import BROWN, content_of, the_one, within_brown
 from disctrack.trajectory.file import read_trajectory, trajectory_in
 
 OWN = (".h5", ".nc")  # netCDF-4 is HDF5: other programs recognise it by .nc
@@ -187,13 +184,11 @@ def _is_ours(path: Path) -> bool:
 
 
 def _own(paths: Sequence[Path]) -> Trajectory | StereoRig:
-    path, schema = the_one(paths), None
-    if path.is_file() and h5py.is_hdf5(path):
-        with told_as(TrajectoryFileError, f"{path}: damaged", ValueError, then="Take the original."):
-            check_seal(path)
-        with h5py.File(path, "r") as file:
-            schema = file.attrs.get("schema")
-    return read_rig(path) if schema == RIG else read_trajectory(path)
+    path = the_one(paths)
+    try:
+        return read_rig(path)
+    except RigFileError:
+        return read_trajectory(path)
 
 
 def _write_own(path: Path, value: Any, source: Path) -> None:
