@@ -150,10 +150,10 @@ def _job(found: FoundRecordings, recording: Recording, name: str, options: Batch
     folder = recording.folder
     open_pairs(recording)  # raises if there is nothing to measure
     results = found.results(folder)
-    if recording.rig_file is not None:
-        return Job("recording", name, str(folder), str(results), str(recording.rig_file), options)
-    # the folder's name is the hash of all inputs of the calibration
-    made_from = source_of(recording).provenance.fingerprint[:16]
-    rig = found.common / "rigs" / made_from / "rig.h5"
-    rigs.setdefault(str(rig), Job("rig", name, str(folder), str(rig.parent), str(rig), options))
+    rig = recording.rig_file
+    if rig is None:
+        # the folder's name is the hash of all inputs of the calibration
+        made_from = source_of(recording).provenance.fingerprint[:16]
+        rig = found.common / "rigs" / made_from / "rig.h5"
+        rigs.setdefault(str(rig), Job("rig", name, str(folder), str(rig.parent), str(rig), options))
     return Job("recording", name, str(folder), str(results), str(rig), options)

@@ -20,7 +20,6 @@ from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING
 
 import cv2
 
@@ -31,9 +30,6 @@ from disctrack.batch.records import BUSY, DIED, FAILED, failed, outcome
 from disctrack.errors import ClusterError, reason_of, told_as
 from disctrack.findings import Kind
 from disctrack.processes import Spawn, end_with_parent
-
-if TYPE_CHECKING:
-    from distributed import Client
 
 CONNECT = 10.0  # [s] for a scheduler to answer
 LOOK = 0.1  # [s] between checks for Ctrl-C
@@ -140,9 +136,21 @@ class Cluster:
     """Workers of a dask.distributed scheduler. Each of them must see the recordings under the same paths."""
 
     def __init__(self, address: str) -> None:
-        """Connect. Raises ClusterError if dask.distributed is not installed or no scheduler answers."""
-        self._client = connect(address)
+        """Connect. Raises ClusterError if dask.distributed is not installed, or without a scheduler or workers."""
+        remedy = "Install disctrack[cluster], here and on the cluster's machines, or leave --cluster out."
+        with told_as(ClusterError, "--cluster needs dask.distributed", ImportError, then=remedy):
+            import distributed
+        logging.getLogger("distributed").setLevel(logging.CRITICAL)  # relevant errors are reported by ClusterError
+        remedy = "Give the address that dask-scheduler printed, e.g. tcp://host:8786."
+        said = f"--cluster {address}: no scheduler answers"
+        with told_as(ClusterError, said, OSError, ValueError, TypeError, then=remedy):
+            self._client = distributed.Client(address, timeout=CONNECT, set_as_default=False)
         self._executor = self._client.get_executor(pure=False)  # a repeated job is a new task
+        if not self._client.scheduler_info()["workers"]:
+            self.close()
+            raise ClusterError(
+                f"--cluster {address}: the scheduler has no workers. Start dask-worker on some machines."
+            )
 
     def submit(self, job: Job) -> Future[Row]:
         """Submit a job; its future raises errors of the cluster."""
@@ -154,22 +162,6 @@ class Cluster:
         with contextlib.suppress(Exception):  # the scheduler may have gone
             self._executor.shutdown(wait=False)
             self._client.close()
-
-
-def connect(address: str) -> Client:
-    """Client of the scheduler. Raises ClusterError if dask.distributed is not installed or no scheduler answers."""
-    remedy = "Install disctrack[cluster], here and on the cluster's machines, or leave --cluster out."
-    with told_as(ClusterError, "--cluster needs dask.distributed", ImportError, then=remedy):
-        import distributed
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # relevant errors are reported by ClusterError
-    remedy = "Give the address that dask-scheduler printed, e.g. tcp://host:8786."
-    said = f"--cluster {address}: no scheduler answers"
-    with told_as(ClusterError, said, OSError, ValueError, TypeError, then=remedy):
-        client = distributed.Client(address, timeout=CONNECT, set_as_default=False)
-    if not client.scheduler_info()["workers"]:
-        client.close()
-        raise ClusterError(f"--cluster {address}: the scheduler has no workers. Start dask-worker on some machines.")
-    return client
 
 
 def do_alone(job: Job) -> Row:

@@ -42,10 +42,8 @@ def read_row(folder: Path) -> Row | None:
     """The row that is stored in the folder; None if it is missing or cannot be read."""
     try:
         row: Row = json.loads((folder / RECORD).read_text(encoding="utf-8"))
-        if row.pop("schema") != SCHEMA or row.pop("schema_version") > SCHEMA_VERSION:
-            return None
-        # in the first version, numbers and files were separate
-        return {**row.pop("numbers", {}), **row.pop("files", {}), **outcome(row["status"], row["reason"]), **row}
+        same = row.pop("schema") == SCHEMA and row.pop("schema_version") == SCHEMA_VERSION
+        return row | outcome(row["status"], row["reason"]) if same else None
     except (OSError, ValueError, TypeError, KeyError, AttributeError):
         return None
 

@@ -25,7 +25,7 @@ from disctrack.batch.columns import COLUMNS, FITTED, copies, repeats_of
 from disctrack.batch.locks import locked
 from disctrack.batch.plan import BatchOptions, Job, find_recordings
 from disctrack.batch.pool import Cluster, do_all
-from disctrack.batch.records import BUSY, DIED, FAILED, MEASURED, failed, outcome, read_row
+from disctrack.batch.records import BUSY, DIED, FAILED, MEASURED, failed, outcome
 from disctrack.batch.report import report_of
 from disctrack.batch.run import as_csv, with_false_discovery, write_summary
 from disctrack.errors import ClusterError, RecordingError, reason_of
@@ -159,8 +159,8 @@ def cluster(monkeypatch):
         (future.set_exception if isinstance(answer, Exception) else future.set_result)(answer)
         return future
 
-    client = SimpleNamespace(submit=submit, get_executor=lambda pure: client)
-    monkeypatch.setattr("disctrack.batch.pool.connect", lambda address: client)
+    client = SimpleNamespace(submit=submit, get_executor=lambda pure: client, scheduler_info=lambda: {"workers": "a"})
+    monkeypatch.setitem(sys.modules, "distributed", SimpleNamespace(Client=lambda address, **more: client))
     return client
 
 
@@ -293,19 +293,6 @@ def test_a_summary_lists_repeats_beside_the_recordings(tmp_path):
     (repeat,) = json.loads((found.common / "summary.json").read_text())["repeats"]
     assert (repeat["quantity"], repeat["n"]) == ("n_theta", 2)
     assert "Repeats" in (found.common / "index.html").read_text()
-
-
-def test_a_row_that_the_first_version_kept_is_read(tmp_path):
-    """It kept columns, and the files that are columns, apart."""
-    kept = {"schema": "disctrack batch record", "schema_version": 1, "fingerprint": "f", "stages": {"report": True}}
-    kept |= {"status": MEASURED, "reason": "", "files": {"trajectory": "trajectory.h5"}, "numbers": {"pairs": 20}}
-    (tmp_path / "batch.json").write_text(json.dumps(kept))
-    row = read_row(tmp_path)
-    assert (row["status"], row["trajectory"], row["pairs"], row["stages"]) == (
-        MEASURED, "trajectory.h5", 20, {"report": True},
-    )  # fmt: skip
-    (tmp_path / "batch.json").write_text(json.dumps(kept | {"schema_version": 3}))
-    assert read_row(tmp_path) is None
 
 
 def test_false_discoveries_are_counted_among_the_recordings_that_were_diagnosed():
