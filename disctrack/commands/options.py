@@ -4,6 +4,7 @@ Only argparse is imported here, so that --help and errors of usage are fast.
 """
 
 import argparse
+import re
 from argparse import _ActionsContainer as Options  # a parser, or a group of its options
 from collections.abc import Callable
 from pathlib import Path
@@ -42,6 +43,22 @@ _positive = _number(int, 1, "a whole number above 0")
 _seed = _number(int, 0, "a whole number from 0 on")
 _positive_number = _number(float, 1e-300, "a positive number")
 _length_or_zero = _number(float, 0, "a length in mm")
+
+
+def _two(form: str, what: str) -> Callable[[str], tuple[int | None, ...]]:
+    """Parser of two whole numbers in a form; None for an empty one."""
+
+    def read(text: str) -> tuple[int | None, ...]:
+        if not (match := re.fullmatch(form, text.lower())):
+            raise argparse.ArgumentTypeError(f"'{text}' is {what}")
+        return tuple(int(number) if number else None for number in match.groups())
+
+    return read
+
+
+_corners = _two(r"([2-9]|[1-9]\d+)x([2-9]|[1-9]\d+)", "no grid of inner corners; give e.g. 9x6")
+_shard = _two(r"([1-9]\d*)/([1-9]\d*)", "no shard; give e.g. 2/8 for the second of eight (1/8 to 8/8)")
+_frame_range = _two(r"(-?\d+)?:(-?\d+)?", "no range; give first:last, e.g. 100:200 or 100:")
 
 
 def _value(options: Options, usage: str, read: Callable[[str], object], what: str, **more: Any) -> None:
@@ -241,20 +258,6 @@ def add_validate(parser: argparse.ArgumentParser) -> None:
     _flag(parser, "--quiet", "no line for every recording")
 
 
-def _corners(text: str) -> tuple[int, int]:
-    first, times, second = text.lower().partition("x")
-    if not (times and first.isdecimal() and second.isdecimal() and min(int(first), int(second)) >= 2):
-        raise argparse.ArgumentTypeError(f"'{text}' is no grid of inner corners; give e.g. 9x6")
-    return int(first), int(second)
-
-
-def _shard(text: str) -> tuple[int, int]:
-    number, slash, of = text.partition("/")
-    if not (slash and number.isdecimal() and of.isdecimal() and 1 <= int(number) <= int(of)):
-        raise argparse.ArgumentTypeError(f"'{text}' is no shard; give e.g. 2/8 for the second of eight (1/8 to 8/8)")
-    return int(number), int(of)
-
-
 def _last_seconds(parser: argparse.ArgumentParser, name: str, default: float, what: str) -> None:
     _value(parser, f"{name} S", _positive_number, f"{what} (default: %(default)s)", default=default)
 
@@ -277,13 +280,3 @@ def _tracking_options(parser: argparse.ArgumentParser) -> None:
     _flag(parser, "--no-figures", "no pictures")
     _flag(parser, "--no-video", "no overlay video")
     _value(parser, "--threads THREADS", _positive, "threads that read and track (default: one per core)")
-
-
-def _frame_range(text: str) -> tuple[int | None, int | None]:
-    first, colon, last = text.partition(":")
-    try:
-        if not colon:
-            raise ValueError
-        return (int(first) if first else None), (int(last) if last else None)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"'{text}' is no range; give first:last, e.g. 100:200 or 100:") from None

@@ -33,16 +33,9 @@ def rendered(file: Path, folder: Path, truth_file: Path | None, quiet: bool) -> 
             bar.update(done - bar.n)
 
         truth = run_render(file, folder, truth_file, progress)
-    written = [f"{name} {len(files)}" for name, files in _files(folder).items()]
-    print(
-        f"{folder}: {len(truth.time)} frames at {truth.frame_rate:g} Hz ({', '.join(written)} images), "
-        f"{len(truth.R_world_board)} views of the chessboard"
-    )
+    views = f"{len(truth.R_world_board)} views of the chessboard"
+    print(f"{folder}: {len(truth.time)} pairs of frames at {truth.frame_rate:g} Hz, {views}")
     scene = load_scene(file)
     if scene.motion.kind == "rolling":
         print(f"effects: {effects_in_words(scene)}")
     print(f"truth, for comparison only: {truth_file or folder / 'truth.h5'}")
-
-
-def _files(folder: Path) -> dict[str, list[Path]]:
-    return {name: list((folder / name).glob("*.png")) for name in ("left", "right")}

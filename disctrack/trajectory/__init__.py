@@ -39,11 +39,7 @@ class FrameStatus(IntEnum):
     NOT_PROCESSED = 6, "not processed"
     STILL = 7, "left out: nothing moves before the start or after the end; --all measures them, too"
     REPEATED = 8, "both images are copies of earlier ones, while the disc moves: the recorder lost this frame"
-    CONTRADICTED = (
-        9,
-        "refused: the dots contradict each other by more than their noise explains (glare, a hand, a repeated or "
-        "exchanged image)",
-    )
+    CONTRADICTED = 9, "refused: the dots contradict each other beyond their noise (glare, a hand, an exchanged image)"
     JUMPED = 10, "refused: no motion leads from the frames before or after to this pose (exchanged frames?)"
 
     def __new__(cls, value: int, sentence: str = "") -> FrameStatus:
@@ -99,9 +95,8 @@ class Trajectory(Brief):
     q: Array  # (n, 6) x, y, z [m], psi, theta, phi [rad] unwrapped
     pose_covariance: Array  # (n, 6, 6) noise of this frame, in POSE_COMPONENTS (frames.py); without calibration
     calibration_sensitivity: Array  # (n, 6, 30) d pose / d RIG_PARAMETERS at fixed pixels; common to all frames
-    systematic_covariance: (
-        Array  # (n, 6, 6) constant and slowly varying errors other than the rig's: misfit of the dots beyond noise
-    )
+    # (n, 6, 6) constant and slowly varying errors other than the rig's: misfit of the dots beyond noise
+    systematic_covariance: Array
     quaternion: Array  # (n, 4) w, x, y, z; body to world, continuous
     frame_status: NDArray[np.uint8]  # (n,) FrameStatus
     reprojection_rms_px: Array  # (n, 2) per camera

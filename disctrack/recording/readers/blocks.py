@@ -94,12 +94,11 @@ def iter_pair_blocks(
     pools = [pool if r.random_access else ThreadPoolExecutor(1, thread_name_prefix="read") for r in readers]
 
     def submitted(number: int) -> list[Future[NotRead]]:
-        """Tasks that read a block: a few frames each, or a camera's whole block if its file is read in order."""
+        """Tasks that read a few frames of a block each."""
         images, frames, tasks = ring[number % 3], parts[number], []
         for camera, reader in enumerate(readers):
-            size = 4 if reader.random_access else len(frames)
-            for i in range(0, len(frames), size):
-                part = images[i : i + size, camera], reader, camera, frames[i : i + size]
+            for i in range(0, len(frames), 4):
+                part = images[i : i + 4, camera], reader, camera, frames[i : i + 4]
                 tasks.append(pools[camera].submit(_fill, *part))
         return tasks
 

@@ -74,9 +74,8 @@ def _open(handle: h5py.File, stack: h5py.Dataset, file: Path, camera: str) -> Fr
     if stack.external:
         raise RecordingError(f"{where}: its pixels lie in {stack.external[0][0]}. Write them into {file}.")
     stored = _frames_stored(stack)
-    if stored < max(
-        raw.LEAST_PRESENT * n, 1
-    ):  # a few missing frames are allowed; the header of a damaged file may state any number
+    # a few missing frames are allowed; the header of a damaged file may state any number
+    if stored < max(raw.LEAST_PRESENT * n, 1):
         said = f"announces {n} frames, but at most {stored} were ever written: cut short"
         raise RecordingError(f"{where}: {said}. Write it again, or give the data set its true length.")
     _check_other_files(stack, file, where)
