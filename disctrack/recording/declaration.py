@@ -271,10 +271,8 @@ def _air_density(file: Path, air: Mapping[str, float]) -> float:
 def _recording_file(path: Path) -> Path:
     said = f"{path!s:.200}: not a usable path"  # e.g. a name that is too long, or contains a null character
     with told_as(RecordingError, said, OSError, ValueError, then="Give a recording's folder."):
-        if path.is_dir():
+        if path.name != FILE_NAME and not path.is_file():
             path = path / FILE_NAME
-        elif not path.exists() and path.name != FILE_NAME:
-            raise RecordingError(f"{path}: no such folder. Give the folder that holds {FILE_NAME}.")
         if fault := why_not_regular(path):
             raise RecordingError(f"{path}: cannot be read: {fault}. Give a recording's folder.")
         if not path.is_file():
@@ -311,9 +309,10 @@ def _nearest(name: str, section: str, kind: str = "key") -> str:
 def _refuse_missing(file: Path, declared: Mapping[str, Any]) -> None:
     """Raise RecordingError for a missing section, or with all missing keys that have no default."""
     needed = {section: [key for key, meant in keys.items() if meant.needed] for section, keys in KEYS.items()}
-    by_rig, needed["calibration"] = _calibrated_by(declared.get("calibration", {}))
+    kind, own = _calibrated_by(declared.get("calibration", {}))
+    needed["calibration"] = list(own)
     for section, keys in needed.items():
-        if keys and section not in declared and not (section == "table" and by_rig):
+        if keys and section not in declared and not (section == "table" and kind == "rig"):
             raise RecordingError(f"{file}: section [{section}] is missing; it holds {', '.join(KEYS[section])}.")
     names = [f"[{s}] {key}" for s, keys in needed.items() for key in keys if s in declared and key not in declared[s]]
     if names:
@@ -343,23 +342,19 @@ def _disc(file: Path, disc: Mapping[str, Any], markers: Mapping[str, Any]) -> Di
     return disc_from_mm(radius, disc["thickness_mm"], disc["mass_g"], centres, diameter, *tolerances)
 
 
-def _calibrated_by(calibration: Mapping[str, object]) -> tuple[bool, list[str]]:
-    """True if by a rig file, and otherwise the keys of its views."""
-    by_rig = "rig" in calibration
-    return by_rig, [] if by_rig else list(TARGET_KEYS.get(str(calibration.get("target", "chessboard")), ()))
+def _calibrated_by(calibration: Mapping[str, object]) -> tuple[str, tuple[str, ...]]:
+    """Kind of a calibration, by a target of its views or by "rig", and the keys that it needs."""
+    kind = "rig" if "rig" in calibration else str(calibration.get("target", "chessboard"))
+    return kind, TARGET_KEYS.get(kind, ("rig",))
 
 
 def _refuse_mixed_calibration(file: Path, calibration: Mapping[str, Any]) -> None:
     """Raise RecordingError for keys of another target, and for views in addition to a rig."""
-    by_rig, own = _calibrated_by(calibration)
-    of_views = dict.fromkeys(key for keys in TARGET_KEYS.values() for key in keys)
-    odd = [key for key in of_views if key in calibration and key not in own]
-    if odd and by_rig:
-        raise RecordingError(f"{file}: [calibration] has both rig and {', '.join(odd)}. Keep the rig, or the views.")
-    if odd:
-        named = " or ".join(f'target = "{name}"' for name, keys in TARGET_KEYS.items() if odd[0] in keys)
-        here = f"{calibration.get('target', 'chessboard')}: {', '.join(own)}"
-        raise RecordingError(f"{file}: [calibration] {odd[0]} belongs to {named}; the target here is {here}.")
+    kind, own = _calibrated_by(calibration)
+    if odd := [key for keys in TARGET_KEYS.values() for key in keys if key in calibration and key not in own]:
+        both = f"both {own[-1 if kind == 'rig' else 2]} and {', '.join(dict.fromkeys(odd))}"
+        remedy = f"By {kind}, it has {', '.join(own)}: keep one kind."
+        raise RecordingError(f"{file}: [calibration] has {both}, of different kinds of calibration. {remedy}")
 
 
 def _target(file: Path, calibration: Mapping[str, Any]) -> Target:

@@ -249,7 +249,7 @@ PATTERNS = "calibrate --left {r}/l*.png --right {r}/r*.png --corners 9x6 --squar
 @pytest.mark.parametrize(
     ("spoil", "words", "said"),
     [
-        (nothing, "run {r}/nowhere", "no such folder"),
+        (nothing, "run {r}/nowhere", "nowhere/recording.toml: not found"),
         (nothing, "analyse {r}", r"no results/trajectory.h5 in this folder; 'disctrack run .*recording' makes it"),
         (lambda r: edit(r, '"left/*.png"', '"left/*.tif"'), "run {r}", r"no image matched for the left .*000000\.png"),
         (lambda r: edit(r, '"left/*.png"', '"lfet/*.png"'), "run {r}", "There is no folder"),
@@ -263,12 +263,12 @@ PATTERNS = "calibrate --left {r}/l*.png --right {r}/r*.png --corners 9x6 --squar
         (lambda r: (r / "mine.h5").write_text("dear"), "track {r} -o {r}/mine.h5", "--overwrite"),
         (nothing, "track {r} --frames 30:40", "holds no frame; the recording has 24"),
         (nothing, "track {r} --frames 9:5", "holds no frame; the recording has 24"),
-        (nothing, "calibrate", "--left, --right, --corners, --square-mm missing"),
+        (nothing, "calibrate", "neither a recording nor views.*and --left, --right, --corners, --square-mm"),
         (nothing, PATTERNS, "no image matched for the left camera"),
         (another_scene, "render {r}/left.toml --quiet", "not an empty folder"),
         (nothing, "simulate {r}/nowhere.toml", "nowhere.toml"),
-        (nothing, "calibrate {r} --table-view 2", "--table-view.*recording.toml says this"),
-        (nothing, "calibrate {r} --left l*.png --square-mm 8", "--left.*recording.toml says this"),
+        (nothing, "calibrate {r} --table-view 2", "--table-view given.*recording.toml says all"),
+        (nothing, "calibrate {r} --left l*.png --square-mm 8", "--left, --square-mm given.*recording.toml"),
     ],
 )
 def test_what_cannot_be_done_is_said_in_one_line(recording, capsys, spoil, words, said):
