@@ -6,7 +6,6 @@ no bars; the lines are the same.
 
 import contextlib
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
 
@@ -27,24 +26,13 @@ def progress_bar(what: str, total: int, unit: str) -> Iterator[Callable[[int], N
 
 @contextlib.contextmanager
 def steps(what: str) -> Iterator[Callable[[str], None]]:
-    """Show the stage and its elapsed time (terminals only), and print a line with its duration if it succeeds.
+    """Show the stage (terminals only), and print a line with its duration if it succeeds.
 
     Yields a function to be called with the name of each step, which terminals show as well.
     """
-    began, over = time.perf_counter(), threading.Event()
-    with tqdm(desc=what, bar_format="{desc} ... {elapsed}", disable=None, leave=False) as bar:
-
-        def tick() -> None:
-            while not over.wait(1.0):
-                bar.refresh()
-
-        ticking = threading.Thread(target=tick, daemon=True)
-        ticking.start()
-        try:
-            yield lambda step: bar.set_description_str(f"{what}: {step}")
-        finally:
-            over.set()
-            ticking.join()
+    began = time.perf_counter()
+    with tqdm(desc=what, bar_format="{desc} ...", disable=None, leave=False) as bar:
+        yield lambda step: bar.set_description_str(f"{what}: {step}")
     _print_duration(began, what)
 
 
