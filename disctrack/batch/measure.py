@@ -105,9 +105,13 @@ def _after_tracking(results: Path, path: Path, trajectory: Trajectory, job: Job)
     missing = [f.sentence for f in noticed if f.doubtful or f.kind == Kind.UNREADABLE]
     row |= {"severity": noticed[0].grave, "finding": noticed[0].kind.value} if noticed else {}
     try:
-        analysis, report = _analyse(path, trajectory, job)
+        if job.options.report:
+            analysed = run_analyse(path, window=job.options.window, overwrite=True)
+            analysis, row["report"] = analysed.analysis, analysed.report.relative_to(results).as_posix()
+        else:
+            analysis = analyse(trajectory, job.options.window)
+            write_analysis(path, analysis)
         row |= analysed_numbers(analysis)
-        row |= {"report": report.relative_to(results).as_posix()} if report is not None else {}
     except AnalysisError as error:
         missing.append(f"not analysed: {reason_of(error)}")
     row |= friction_numbers(trajectory)
@@ -122,15 +126,6 @@ def _after_tracking(results: Path, path: Path, trajectory: Trajectory, job: Job)
         except AnalysisError as error:
             missing.append(f"not diagnosed: {reason_of(error)}")
     return row | outcome(MEASURED, "; ".join(missing))
-
-
-def _analyse(path: Path, trajectory: Trajectory, job: Job) -> tuple[Analysis, Path | None]:
-    if job.options.report:
-        outcome = run_analyse(path, window=job.options.window, overwrite=True)
-        return outcome.analysis, outcome.report
-    analysis = analyse(trajectory, job.options.window)
-    write_analysis(path, analysis)
-    return analysis, None
 
 
 def tracked_numbers(trajectory: Trajectory) -> Row:

@@ -193,12 +193,18 @@ def diagnose_all(folder: Path, rows: Sequence[Row], processes: int) -> str:
 
 
 def rows_of(found: FoundRecordings, records: Mapping[str, Row]) -> list[Row]:
-    """A row for every recording: from `records` (by name) if it is there, otherwise from the disk."""
+    """A row with all columns for every recording: from `records` (by name) if it is there, otherwise from the disk.
+
+    Paths are relative to the summary's folder.
+    """
     rows = []
     for folder in found.recordings:
-        name = found.name(folder)
-        row = records[name] if name in records else _on_the_disk(folder, found.results(folder))
-        rows.append(_row(found, folder, name, row))
+        name, results = found.name(folder), found.results(folder)
+        known = records[name] if name in records else _on_the_disk(folder, results)
+        row: Row = {column: known.get(column) for column in COLUMNS} | {"recording": name}
+        paths = {what: results / row[what] for what in PATHS if row[what]} | {"folder": folder}
+        paths |= {"rig": Path(row["rig"])} if row["rig"] else {}
+        rows.append(row | {what: _relative(path, found.common) for what, path in paths.items()})
     return rows
 
 
@@ -214,14 +220,6 @@ def _on_the_disk(folder: Path, results: Path) -> Row:
     changed = changed_since(folder, read_provenance(results / row["trajectory"]).declared)
     stale = f"{FILE_NAME} has changed: {changed}; the batch without --summary-only measures it anew" if changed else ""
     return row | outcome(SKIPPED, "; ".join(filter(None, [stale, row["reason"]])))
-
-
-def _row(found: FoundRecordings, folder: Path, name: str, known: Row) -> Row:
-    """The row with all columns, and paths relative to the summary's folder."""
-    row: Row = {column: known.get(column) for column in COLUMNS} | {"recording": name}
-    paths = {what: found.results(folder) / row[what] for what in PATHS if row[what]}
-    paths |= {"folder": folder} | ({"rig": Path(row["rig"])} if row["rig"] else {})
-    return row | {what: _relative(path, found.common) for what, path in paths.items()}
 
 
 def _relative(path: Path, folder: Path) -> str:
