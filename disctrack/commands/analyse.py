@@ -1,6 +1,7 @@
 """`disctrack analyse`: from a trajectory file to the physics."""
 
 import argparse
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -49,19 +50,14 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _write_motion_page(page: Path, analysis: Analysis, trajectory: Path, recording: Path | None) -> None:
     """The interactive page, with pictures if the images of this trajectory are available."""
-    folder, n = recording or outputs.recording_of(trajectory), len(analysis.trajectory)
-    drawn = None
-    try:
-        pairs = None if folder is None else open_pairs(read_recording(folder))
-        if pairs is not None and len(pairs) != n:
-            raise RecordingError(
-                f"{folder}: {len(pairs)} pairs, but {trajectory} has {n} frames: it was measured from another "
-                "recording."
-            )
-        drawn = None if pairs is None else partial(_drawn, analysis.trajectory, pairs)
-    except RecordingError:
-        if recording is not None:
-            raise
+    drawn, n = None, len(analysis.trajectory)
+    if folder := recording or outputs.recording_of(trajectory):
+        with suppress(*([] if recording else [RecordingError])):
+            pairs = open_pairs(read_recording(folder))
+            if len(pairs) != n:
+                said = f"{len(pairs)} pairs, but {trajectory} has {n} frames: it was measured from another recording"
+                raise RecordingError(f"{folder}: {said}.")
+            drawn = partial(_drawn, analysis.trajectory, pairs)
     write_whole(page, motion_html(analysis, read_provenance(trajectory).recording, drawn).encode())
 
 

@@ -5,7 +5,7 @@ import sys
 from dataclasses import fields
 from pathlib import Path
 
-from disctrack.batch import BatchOptions, BatchOutcome, run_batch, summarise_batch
+from disctrack.batch import BatchOptions, run_batch, summarise_batch
 from disctrack.commands import DONE, FAILED, INCOMPLETE
 from disctrack.commands import _outputs as outputs
 from disctrack.files.text import printable
@@ -20,17 +20,13 @@ def run(arguments: argparse.Namespace) -> int:
         how = arguments.jobs, arguments.shard, arguments.cluster
         outcome = run_batch(arguments.folders, options, arguments.output, *how)
     outputs.show_report(outcome.report(), arguments, Path())
-    _print_problems(outcome)
-    if outcome.interrupted:
-        raise KeyboardInterrupt
-    return FAILED if outcome.failed else INCOMPLETE if outcome.incomplete else DONE
-
-
-def _print_problems(outcome: BatchOutcome) -> None:
     sys.stdout.flush()
     for problem in outcome.problems:
         print(f"disctrack: {printable(problem)}", file=sys.stderr)
-    if outcome.failed and not outcome.interrupted:
+    if outcome.interrupted:
+        raise KeyboardInterrupt
+    if outcome.failed:
         print("disctrack: not everything was measured (see above). The same command tries it again.", file=sys.stderr)
-    elif outcome.incomplete and not outcome.interrupted:
+    elif outcome.incomplete:
         print("disctrack: some of the input could not be used (see above).", file=sys.stderr)
+    return FAILED if outcome.failed else INCOMPLETE if outcome.incomplete else DONE

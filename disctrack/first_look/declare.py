@@ -157,15 +157,12 @@ def _views_among(pairs: list[CameraPair], side_by_side: int) -> tuple[CameraPair
 
 def _frame_rate(left: FrameReader, right: FrameReader) -> tuple[float | None, str]:
     for camera, reader in (("left", left), ("right", right)):
-        header = reader.header
-        if header is not None:
-            return header.frame_rate, f"says {Path(header.file).name}"
+        if reader.frame_rate is not None:
+            return float(reader.frame_rate), f"stated by the {camera} file"
         if reader.timestamps is not None and len(reader.timestamps) > 2:
             step = float(np.median(np.diff(reader.timestamps)))
             if np.isfinite(step) and step > 0:
                 return float(f"{1 / step:.6g}"), f"by the time stamps of the {camera} frames"
-        if reader.frame_rate is not None:
-            return float(reader.frame_rate), f"stated by the {camera} file"
     return None, ""
 
 
