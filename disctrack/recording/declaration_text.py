@@ -9,14 +9,11 @@ from disctrack.errors import RecordingError
 from disctrack.files.toml_tree import read_toml, toml_value
 from disctrack.recording.declaration import FILE_NAME, KEYS
 
-HEADINGS = {  # of the sections, in their order
+HEADINGS = {  # of sections
     "cameras": "frame i of the left and of the right must show the same instant",
-    "disc": "",
     "markers": "round dots on the upper face, all of one size",
     "calibration": "synchronised views of a flat chessboard",
     "table": "the lab frame: k up from the table, which is z = 0",
-    "gravity": "",
-    "air": "",
 }
 # Sections whose optional keys are also valid for another recording of the same disc and board
 ALIKE = ("disc", "calibration", "table")
@@ -39,8 +36,8 @@ def declaration_text(
     ]
     missing = []
     by_rig = {"calibration", "table"} if ("calibration", "rig") in told else set()  # sections replaced by a rig file
-    for section, heading in HEADINGS.items():
-        if section in by_rig - {"calibration"}:
+    for section in KEYS:
+        if section in by_rig - {"calibration"} or not section:
             continue
         rows = []
         given = {} if section in by_rig else {**example.get(section, {}), **known}
@@ -52,7 +49,7 @@ def declaration_text(
             elif meant.needed and section not in by_rig:
                 missing.append(f"[{section}] {key}")
                 rows.append(_aligned(f"# {key} = {meant.example}", f"FILL IN: {meant.remark}"))
-        lines += ["", _aligned(f"[{section}]", heading), *rows] if rows else []
+        lines += ["", _aligned(f"[{section}]", HEADINGS.get(section, "")), *rows] if rows else []
     return "\n".join(lines) + "\n", tuple(missing)
 
 
