@@ -18,12 +18,13 @@ from disctrack.analyse.report import report_of
 from disctrack.errors import AnalysisError
 from disctrack.files.inputs import keep
 from disctrack.files.labelled_arrays import Variable
+from disctrack.files.whole import refuse_existing
 from disctrack.frames import euler_jacobian
 from disctrack.report.blocks import Report
 from disctrack.report.html import write_page
 from disctrack.trajectory import among
 from disctrack.trajectory.file import Group, read_group, read_provenance, read_trajectory, trajectory_in, write_groups
-from disctrack.trajectory.reuse import origin_of, refuse_other, remember
+from disctrack.trajectory.reuse import origin_of, remember
 
 
 @dataclass(frozen=True, repr=False)
@@ -66,7 +67,7 @@ def run_analyse(
     path = trajectory_in(Path(path))
     keep(path)
     folder = Path(output) if output is not None else path.parent / f"{path.stem}_analysis"
-    refuse_other(folder / "report.html", overwrite)
+    refuse_existing(folder / "report.html", overwrite)
     trajectory, provenance = read_trajectory(path), read_provenance(path)
     try:
         analysis = analyse(trajectory, window, circle_duration)

@@ -39,13 +39,13 @@ from disctrack.discrepancy.system import USED_UP
 from disctrack.errors import AnalysisError
 from disctrack.files.inputs import keep, refuse_input
 from disctrack.files.json_text import json_file
-from disctrack.files.whole import write_whole
+from disctrack.files.whole import refuse_existing, write_whole
 from disctrack.findings import carried
 from disctrack.report.blocks import Report
 from disctrack.report.html import write_page
 from disctrack.trajectory import Trajectory
 from disctrack.trajectory.file import trajectory_in
-from disctrack.trajectory.reuse import content_of, origin_of, refuse_other, remember
+from disctrack.trajectory.reuse import content_of, origin_of, remember
 
 
 @dataclass(frozen=True, repr=False)
@@ -214,7 +214,7 @@ def run_diagnose(
     keep(Path(model))
     folder = Path(output) if output is not None else path.parent / f"{path.stem}_diagnosis"
     report, page, toml = (folder / name for name in ("diagnosis.json", "diagnosis.html", "model.toml"))
-    refuse_other(report, overwrite)
+    refuse_existing(report, overwrite)
     for file in (report, toml):
         refuse_input(file)
     recorded, origin = read_recorded(path), origin_of(path, {"model": content_of(model), "plan": settle})

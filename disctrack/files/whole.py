@@ -44,10 +44,10 @@ def write_whole(path: Path, content: bytes | memoryview, adds_to_input: bool = F
         stream.write(content)
 
 
-def refuse_existing(path: Path, overwrite: bool, what: str = "") -> None:
-    """Raise OutputError if `path` exists and may not be replaced; `what` describes it in the message."""
+def refuse_existing(path: Path, overwrite: bool) -> None:
+    """Raise OutputError if `path` exists and may not be replaced."""
     if path.exists() and not overwrite:
-        raise OutputError(f"{path}: exists{what}. Choose another name or folder, or replace it with --overwrite.")
+        raise OutputError(f"{path}: exists. Choose another name or folder, or replace it with --overwrite.")
 
 
 def make_folder(folder: Path) -> None:

@@ -316,7 +316,7 @@ def _span(pairs: ImagePairs, frame_rate: float, settings: TrackingSettings) -> M
 def trajectory_provenance(
     recording: Recording, rig: StereoRig, pairs: ImagePairs, settings: TrackingSettings | None
 ) -> Provenance:
-    """Inputs and settings of the trajectory; reads the images, unless their hash is known.
+    """Inputs and settings of the trajectory; reads the images.
 
     >>> recording, rig = read_recording("clip"), read_rig("clip/results/rig.h5")
     >>> sorted(trajectory_provenance(recording, rig, open_pairs(recording), None).inputs)

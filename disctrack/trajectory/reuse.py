@@ -1,6 +1,5 @@
 """Reuse of results of the stages after a trajectory, if they are complete and of the same origin and version."""
 
-import contextlib
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
@@ -10,7 +9,7 @@ from typing import Any
 
 from disctrack.files.json_text import json_file, plain
 from disctrack.files.software import software_version
-from disctrack.files.whole import refuse_existing, write_whole
+from disctrack.files.whole import write_whole
 from disctrack.report.blocks import Report, document, restored
 from disctrack.report.terminal import full
 from disctrack.trajectory.file import read_provenance
@@ -38,7 +37,6 @@ def remember(folder: Path, origin: str, report: Report, files: Sequence[Path]) -
     names = [file.relative_to(folder).as_posix() for file in files if file.is_relative_to(folder)]
     content = {
         "origin": origin,
-        "version": software_version(),
         "report": document(replace(report, data={})),
         "data": plain(report.data),
         "files": names,
@@ -50,23 +48,8 @@ def remember(folder: Path, origin: str, report: Report, files: Sequence[Path]) -
 def reusable(folder: Path, origin: str) -> Report | None:
     """The report of the results in the folder, if all files exist and are of this origin; otherwise None."""
     try:
-        content = _content(folder)
+        content = json.loads((folder / FILE_NAME).read_text(encoding="utf-8"))
         whole = content["origin"] == origin and all((folder / name).is_file() for name in content["files"])
         return restored(content["report"], content["data"]) if whole else None
     except (OSError, ValueError, KeyError, TypeError):
         return None
-
-
-def refuse_other(report: Path, overwrite: bool) -> None:
-    """Raise OutputError if a report exists without `overwrite`; the message says how it differs from a new one."""
-    other, here = "", software_version()
-    with contextlib.suppress(OSError, ValueError, KeyError, TypeError):  # the version is not stated
-        made_by = _content(report.parent)["version"]
-        other = f", made by version {made_by} (this is {here})"
-        if made_by == here:
-            other = ", made from another trajectory, or with other settings"
-    refuse_existing(report, overwrite, other)
-
-
-def _content(folder: Path) -> Any:
-    return json.loads((folder / FILE_NAME).read_text(encoding="utf-8"))

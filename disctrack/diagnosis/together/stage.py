@@ -12,11 +12,11 @@ from disctrack.diagnosis.together.recordings import diagnose_together
 from disctrack.errors import AnalysisError, TrajectoryFileError
 from disctrack.files.inputs import keep, refuse_input
 from disctrack.files.json_text import json_file
-from disctrack.files.whole import write_whole
+from disctrack.files.whole import refuse_existing, write_whole
 from disctrack.report.blocks import Report
 from disctrack.report.html import write_page
 from disctrack.trajectory.file import read_provenance
-from disctrack.trajectory.reuse import content_of, hash_of, refuse_other, remember, reusable
+from disctrack.trajectory.reuse import content_of, hash_of, remember, reusable
 
 FOLDER = "together_diagnosis"
 
@@ -64,7 +64,7 @@ def run_together(
     earlier = reusable(folder, origin) if reuse else None
     if earlier is not None:
         return earlier
-    refuse_other(report, overwrite)
+    refuse_existing(report, overwrite)
     refuse_input(report)
     names = [r.name for r in read.values()]
     recordings = [  # of the same name are named by their files

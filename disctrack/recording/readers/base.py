@@ -2,7 +2,7 @@
 
 import hashlib
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from datetime import datetime
 from functools import partial
 from pathlib import Path
@@ -84,7 +84,6 @@ class FrameReader:
     notes: tuple[str, ...] = ()  # for the user, on the reading of the frames, one sentence each
     doubts: tuple[str, ...] = ()  # assumptions on the instants of the frames
     random_access: bool = True  # False if reading is fastest in order, by one thread
-    _digests: dict[int, bytes] = field(default_factory=dict)  # of frames whose content was already hashed
 
     def __post_init__(self) -> None:
         self.bit_depth = self.bit_depth or 8 * self.dtype.itemsize
@@ -116,16 +115,11 @@ class FrameReader:
         """SHA-256 (hex) of the stored bytes and the coding of frames start..stop-1: equal only for equal input."""
         total = hashlib.sha256(f"{self.image_size} {self.dtype} {self.bit_depth} {self.coding}".encode())
         for index in range(start, stop):
-            total.update(self._digest(index))
-        return total.hexdigest()
-
-    def _digest(self, index: int) -> bytes:
-        if index not in self._digests:
             try:
-                self._digests[index] = hashlib.sha256(self.stored(index)).digest()
+                total.update(hashlib.sha256(self.stored(index)).digest())
             except RecordingError:
-                return b"unreadable"
-        return self._digests[index]
+                total.update(b"unreadable")
+        return total.hexdigest()
 
 
 def changed(reader: FrameReader, change: Callable[[Image], Image], by: str) -> FrameReader:

@@ -44,12 +44,10 @@ def check_pair(left: FrameReader, right: FrameReader) -> None:
     """Raise RecordingError unless both sequences have the same number of frames and size, and 8 bit or more."""
     if len(left) != len(right):
         short = CAMERAS[int(len(right) < len(left))]
-        last = min(len(left), len(right)) - 1
         said = f"left has {len(left)} frames ({left.describe(0)} ...), right has {len(right)} ({right.describe(0)} ...)"
-        remedy = f"Frame i of both must belong together: bring the missing {short} images, or move surplus ones away"
-        pair = f" (the last pair would be {left.describe(last)} with {right.describe(last)})."
+        remedy = f"Frame i of both must belong together: bring the missing {short} images, or move surplus ones away."
         notes = "".join(f" Note: {note}." for reader in (left, right) for note in reader.notes)
-        raise RecordingError(f"{said}. {remedy}{pair}{notes}")
+        raise RecordingError(f"{said}. {remedy}{notes}")
     if left.image_size != right.image_size or (left.bit_depth > 8) != (right.bit_depth > 8):
         ours, theirs = (in_words(reader.image_size, reader.bit_depth) for reader in (left, right))
         said = f"left images ({left.describe(0)}) have {ours}, right images ({right.describe(0)}) have {theirs}"
