@@ -1,6 +1,5 @@
 """The errors that disctrack raises; only `cli` turns them into a line and an exit code."""
 
-import errno
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -9,8 +8,6 @@ from calibration.kit.errors import ArgumentError as ArgumentError
 from calibration.kit.errors import CalibrationError as CalibrationError
 from calibration.kit.errors import DiscTrackError
 from calibration.kit.errors import RigFileError as RigFileError
-
-_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 class AnalysisError(DiscTrackError):
@@ -76,7 +73,6 @@ def reason_of(error: BaseException) -> str:
         text = "out of memory. Close other programs, run fewer in parallel (-j), or measure fewer --frames at once."
     elif isinstance(error, OSError):
         text = f"{f'{error.filename}: ' if error.filename else ''}{error.strerror or error}."
-        text += " Free some space, or choose another place with -o." if error.errno in _NO_ROOM else ""
     else:
         text = f"internal error ({type(error).__name__}: {error}); DISCTRACK_TRACEBACK=1 shows where. Please report it."
     return " ".join(text.split())

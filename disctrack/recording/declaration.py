@@ -297,13 +297,11 @@ def _refuse_odd(file: Path, declared: Mapping[str, Any]) -> None:
 
 
 def _nearest(name: str, section: str, kind: str = "key") -> str:
-    """Hint at the name that was probably meant: first in the same section, then in all others."""
+    """Hint at the name that was probably meant, in the same section or in another."""
     here = list(KEYS[section]) if section or kind == "key" else [s for s in KEYS if s]
-    elsewhere = {key: f" of [{home}]" for home, keys in KEYS.items() for key in keys if home}
-    for known in (dict.fromkeys(here, ""), elsewhere):
-        for close in difflib.get_close_matches(name, known, 1):
-            return f"Did you mean '{close}'{known[close]}?"
-    return f"Known here: {', '.join(here)}."
+    known = {key: f" of [{home}]" for home, keys in KEYS.items() for key in keys if home} | dict.fromkeys(here, "")
+    close = difflib.get_close_matches(name, known, 1)
+    return f"Did you mean '{close[0]}'{known[close[0]]}?" if close else f"Known here: {', '.join(here)}."
 
 
 def _refuse_missing(file: Path, declared: Mapping[str, Any]) -> None:

@@ -3,7 +3,6 @@
 import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from difflib import get_close_matches
 from functools import partial
 from inspect import signature
 from pathlib import Path
@@ -163,10 +162,7 @@ def _row_for(path: Path, form: str | None, value: Any) -> Format:
         return row
     named = {row.name.lower(): row for row in rows}
     if form.lower() not in named:
-        near = get_close_matches(form.lower(), named, 1, 0.5)
-        hint = f" Did you mean '{named[near[0]].name}'?" if near else ""
-        known = ", ".join(row.name for row in rows)
-        raise OutputError(f"{form}: no format for a {kinds[0]}.{hint} Known are {known}")
+        raise OutputError(f"{form}: no format for a {kinds[0]}; known are {', '.join(row.name for row in rows)}")
     return named[form.lower()]
 
 

@@ -412,7 +412,7 @@ def test_convert_goes_by_the_ending_and_replaces_nothing(rig, trajectory, tmp_pa
         (("rig.h5", "new.toml", "--table"), "--table: says nothing about"),
         (("rig.h5", "rig.toml"), "exists"),
         (("rig.h5", "rig.docx"), ".cameramodel (mrcal)"),
-        (("rig.h5", "any.txt", "--as", "kalib"), "Did you mean 'Kalibr'?"),
+        (("rig.h5", "any.txt", "--as", "kalib"), "known are OpenCV, Kalibr"),
         (("rig.h5", "rig.c3d"), "no format of this name for a rig"),
         (("none.yml", "back.h5"), "none.yml"),
     ):
