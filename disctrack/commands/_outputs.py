@@ -142,14 +142,11 @@ def _companions(
         from disctrack.report.figures import save_figure
         from disctrack.track.pictures import FIGURES
 
-        pictures = {path.with_name(f"{prefix}{name}.png"): make for name, make in FIGURES.items()}
-        missing = [picture for picture in pictures if fresh or not picture.exists()]
-        if missing:
-            with progress_bar("figures", len(missing), "figure") as advance:
-                for picture in missing:
-                    save_figure(pictures[picture](trajectory), picture)
-                    advance(1)
-        yield from pictures
+        for name, make in FIGURES.items():
+            picture = path.with_name(f"{prefix}{name}.png")
+            if fresh or not picture.exists():
+                save_figure(make(trajectory), picture)
+            yield picture
     if not arguments.no_video:
         video = path.with_name(f"{prefix}overlay.mp4")
         if fresh or not video.exists():

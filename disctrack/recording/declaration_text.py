@@ -18,8 +18,6 @@ HEADINGS = {  # of sections
 # Sections whose optional keys are also valid for another recording of the same disc and board
 ALIKE = ("disc", "calibration", "table")
 
-_MOST_LISTED = 5  # differences; more are only counted
-
 Told = dict[tuple[str, str], tuple[Any, str]]  # (section, key) -> value, None if not known; and a remark
 
 
@@ -68,9 +66,7 @@ def changed_since(folder: Path, measured: Mapping[str, object]) -> str:
         now = json.loads(json.dumps(read_toml(folder / FILE_NAME, RecordingError), default=str))
     except (OSError, RecordingError):
         return ""
-    found = list(_differences(now, measured)) if measured else []
-    more = [f"and {len(found) - _MOST_LISTED} more"] if len(found) > _MOST_LISTED else []
-    return ", ".join([*found[:_MOST_LISTED], *more])
+    return ", ".join(_differences(now, measured)) if measured else ""
 
 
 def _differences(now: Mapping[str, object], then: Mapping[str, object], section: str = "") -> Iterator[str]:

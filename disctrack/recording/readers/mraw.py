@@ -38,8 +38,10 @@ _ENTRIES = {
     "Date": "fileInfo/date",
     "Time": "fileInfo/time",
 }
-# Names of the trigger codes 0 to 7 in a .cihx; higher codes contain parameters and are shown as numbers.
-_TRIGGERS = ("Start", "Center", "End", "Random", "Manual", "Random Reset", "Random Center", "Random Manual")
+# Names of the trigger codes 0 to 7 in a .cihx, which newer cameras store in the highest byte of `pdcMode`. Higher codes
+# contain parameters and are shown as numbers.
+_NAMES = ("Start", "Center", "End", "Random", "Manual", "Random Reset", "Random Center", "Random Manual")
+_TRIGGERS = {str(code << shift): name for code, name in enumerate(_NAMES) for shift in (0, 24)}
 
 
 def open_mraw(files: Sequence[Path], camera: str) -> FrameReader:
@@ -132,19 +134,11 @@ def _from_xml(content: bytes, file: Path) -> dict[str, str]:
     with told_as(RecordingError, f"{file}: the XML in it is damaged", ElementTree.ParseError, ValueError, then=_EXPORT):
         root = ElementTree.fromstring(content[start : stop + len(b"</cih>")].decode("utf-8", "replace"))
     texts = {name: (root.findtext(path) or "").strip() for name, path in _ENTRIES.items()}
-    texts["Trigger Mode"] = _trigger_name(texts["Trigger Mode"], root.findtext("recordInfo/triggerMode/pdcMode") or "")
+    code = texts["Trigger Mode"] or (root.findtext("recordInfo/triggerMode/pdcMode") or "").strip()
+    texts["Trigger Mode"] = _TRIGGERS.get(code, code)
     rate = texts["Shutter Speed(s)"]  # in a .cihx it is in 1/s
     texts["Shutter Speed(s)"] = f"1/{rate}" if rate else ""
     return texts
-
-
-def _trigger_name(mode: str, pdc_mode: str) -> str:
-    """Name of a trigger mode; newer cameras store the code in the highest byte of `pdcMode`."""
-    code = mode.strip() or pdc_mode.strip()
-    if not re.fullmatch(r"[0-9]{1,10}", code):
-        return code[:40]
-    number = int(code) if mode.strip() else int(code) >> 24 if int(code) % (1 << 24) == 0 else len(_TRIGGERS)
-    return _TRIGGERS[number] if number < len(_TRIGGERS) else f"mode {code}"
 
 
 def _layout(entries: Entries) -> tuple[PixelLayout, int]:
