@@ -26,22 +26,19 @@ def locked(path: Path, wait: float = 0.0) -> Iterator[None]:
     make_folder(path.parent)
     lock: BaseFileLock = FileLock(path, timeout=wait, fallback_to_soft=False)
     try:
-        try:
-            lock.acquire()
-        except OSError as error:
-            if error.errno not in _NO_LOCKS:
-                raise
-            holder = path.with_name(f"{path.name}.holder")
-            with contextlib.suppress(FileNotFoundError):
-                if time.time() - holder.stat().st_mtime > SILENT_FOR:
-                    holder.unlink()
-            lock = SoftFileLock(holder, timeout=wait)
-            lock.acquire()
+        lock.acquire()
     except Timeout:
         raise
-    except OSError:
+    except OSError as error:
         with writing(path):
-            raise
+            if error.errno not in _NO_LOCKS:
+                raise
+        holder = path.with_name(f"{path.name}.holder")
+        with contextlib.suppress(FileNotFoundError):
+            if time.time() - holder.stat().st_mtime > SILENT_FOR:
+                holder.unlink()
+        lock = SoftFileLock(holder, timeout=wait)
+        lock.acquire()
     try:
         yield
     finally:

@@ -1,7 +1,7 @@
 """`disctrack warm-up`: compile the inner loops before the first recording, as for a container image."""
 
 import argparse
-from collections.abc import Callable, Sequence
+import sys
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from multiprocessing import get_context
@@ -12,30 +12,17 @@ from calibration.board import corner_fit
 from calibration.kit.compiled import FOLDER
 from disctrack import rolling
 from disctrack.discrepancy.equations import _ode_kernel
-from disctrack.progress import compiling
 from disctrack.recording.readers import _pixel_kernels
 from disctrack.synthetic import raster
 from disctrack.track.follow.tracking import prepare
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Compile the inner loops of all stages, in two processes."""
-    # with estimates of the processor time [s]
-    parts: list[tuple[str, int, list[Callable[[], object]]]] = [
-        ("tracking", 40, [partial(prepare, kind) for kind in (np.uint8, np.uint16)]),
-        ("the simulation of motions", 30, [rolling.prepare]),
-        ("rendering", 10, [raster.prepare]),
-        ("corners", 8, [corner_fit.prepare]),
-        ("equations", 5, [_ode_kernel.prepare]),
-        ("readers", 1, [_pixel_kernels.prepare]),
-    ]
+    """Compile the inner loops of all stages, in two processes, the longest first."""
+    parts = [partial(prepare, np.uint8), *(module.prepare for module in (rolling, raster, corner_fit))]
+    parts += [_ode_kernel.prepare, _pixel_kernels.prepare, partial(prepare, np.uint16)]
+    print("compiling the inner loops: once per installation, about 100 s of a free core", file=sys.stderr, flush=True)
     with ProcessPoolExecutor(2, get_context("spawn")) as pool:
-        for part in [pool.submit(_compiled, *part) for part in parts]:
+        for part in [pool.submit(part) for part in parts]:
             part.result()
     print(f"inner loops are compiled: kept in {FOLDER}")
-
-
-def _compiled(what: str, seconds: int, functions: Sequence[Callable[[], object]]) -> None:
-    with compiling(what, seconds):
-        for function in functions:
-            function()
