@@ -45,11 +45,12 @@ _positive_number = _number(float, 1e-300, "a positive number")
 _length_or_zero = _number(float, 0, "a length in mm")
 
 
-def _two(form: str, what: str) -> Callable[[str], tuple[int | None, ...]]:
-    """Parser of two whole numbers in a form; None for an empty one."""
+def _two(form: str, what: str, ordered: bool = False) -> Callable[[str], tuple[int | None, ...]]:
+    """Parser of two whole numbers in a form; None for an empty one.   ordered : the first is not above the second"""
 
     def read(text: str) -> tuple[int | None, ...]:
-        if not (match := re.fullmatch(form, text.lower())):
+        match = re.fullmatch(form, text.lower())
+        if not match or (ordered and int(match[1]) > int(match[2])):
             raise argparse.ArgumentTypeError(f"'{text}' is {what}")
         return tuple(int(number) if number else None for number in match.groups())
 
@@ -57,7 +58,7 @@ def _two(form: str, what: str) -> Callable[[str], tuple[int | None, ...]]:
 
 
 _corners = _two(r"([2-9]|[1-9]\d+)x([2-9]|[1-9]\d+)", "no grid of inner corners; give e.g. 9x6")
-_shard = _two(r"([1-9]\d*)/([1-9]\d*)", "no shard; give e.g. 2/8 for the second of eight (1/8 to 8/8)")
+_shard = _two(r"([1-9]\d*)/([1-9]\d*)", "no shard; give e.g. 2/8 for the second of eight (1/8 to 8/8)", ordered=True)
 _frame_range = _two(r"(-?\d+)?:(-?\d+)?", "no range; give first:last, e.g. 100:200 or 100:")
 
 

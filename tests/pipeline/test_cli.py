@@ -263,12 +263,12 @@ PATTERNS = "calibrate --left {r}/l*.png --right {r}/r*.png --corners 9x6 --squar
         (lambda r: (r / "mine.h5").write_text("dear"), "track {r} -o {r}/mine.h5", "--overwrite"),
         (nothing, "track {r} --frames 30:40", "holds no frame; the recording has 24"),
         (nothing, "track {r} --frames 9:5", "holds no frame; the recording has 24"),
-        (nothing, "calibrate", "neither a recording nor views.*and --left, --right, --corners, --square-mm"),
+        (nothing, "calibrate", "--left, --right, --corners, --square-mm missing"),
         (nothing, PATTERNS, "no image matched for the left camera"),
         (another_scene, "render {r}/left.toml --quiet", "not an empty folder"),
         (nothing, "simulate {r}/nowhere.toml", "nowhere.toml"),
-        (nothing, "calibrate {r} --table-view 2", "--table-view given.*recording.toml says all"),
-        (nothing, "calibrate {r} --left l*.png --square-mm 8", "--left, --square-mm given.*recording.toml"),
+        (nothing, "calibrate {r} --table-view 2", "--table-view.*recording.toml says this"),
+        (nothing, "calibrate {r} --left l*.png --square-mm 8", "--left.*recording.toml says this"),
     ],
 )
 def test_what_cannot_be_done_is_said_in_one_line(recording, capsys, spoil, words, said):
@@ -310,6 +310,7 @@ def test_a_terminal_without_the_letters_of_a_name_does_not_end_the_work(tmp_path
         ["analyse", "x", "--frobnicate"],
         ["batch"],
         ["batch", "x", "--shard", "0/3"],
+        ["batch", "x", "--shard", "4/3"],
         ["batch", "x", "--shard", "x"],
         ["batch", "x", "-j", "0"],
     ],
