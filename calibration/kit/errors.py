@@ -13,7 +13,7 @@ class DiscTrackError(Exception):
         ...     read_recording("nowhere")
         ... except DiscTrackError as error:
         ...     print(str(error).partition(":")[0])
-        nowhere
+        nowhere/recording.toml
     """
 
 
