@@ -213,6 +213,21 @@ def _typical(estimates: Array, unit: str = "") -> Measured:
     return Measured(float(np.median(estimates)), robust_sigma(estimates) * np.sqrt(np.pi / 2 / len(estimates)), unit)
 
 
+def _slope(x: Array, y: Array) -> Measured:
+    """Slope of y over x; outliers, as of a disc in the air or in a hand, count less.
+
+    The sigma takes the autocorrelation of the residuals into account: a push, or a curve, has few independent points.
+    """
+    weight = np.ones(len(x))
+    for _ in range(6):
+        slope, offset = np.polyfit(x, y, 1, w=np.sqrt(weight))
+        residual = y - slope * x - offset
+        weight = _robust_weights(residual)
+    scatter, rho = robust_sigma(residual), np.maximum(np.corrcoef(residual[:-1], residual[1:])[0, 1], 0.0)
+    sigma = scatter / np.std(x) * np.sqrt((1 + rho) / (1 - rho) / len(x))
+    return Measured(float(slope), float(sigma))
+
+
 def _known(found: Measured) -> bool:
     """Whether a positive number is significant."""
     return found.value > SIGMAS * found.sigma
@@ -249,8 +264,7 @@ def motion_against_gravity(trajectory: Trajectory, height: float | None = None) 
         return (replace(_contradiction(suspects, text, explains, gravity=gravity), severity=severity),)
     if not _known(gravity):
         return ()
-    (growth, _), covariance = np.polyfit(np.linspace(0, 1, len(energy)), 1e3 * energy, 1, cov=True)
-    grown = Measured(float(growth), float(np.sqrt(covariance[0, 0])), "mJ")
+    grown = replace(_slope(np.linspace(0, 1, len(energy)), 1e3 * energy), unit="mJ")
     if _known(grown) and grown.value > 1e3 * NOTED * energy[0]:
         text = (
             f"the mechanical energy, {1e3 * energy[0]:.4g} mJ at first, grows by {grown} though no force but the "
@@ -349,6 +363,11 @@ def _blocks(motion: MeasuredMotion) -> tuple[Array, Array]:
     return np.array(gravity), np.array([energy[rows].mean() for rows in blocks])
 
 
+def _robust_weights(residual: Array) -> Array:
+    """Cauchy weights (n,), small for outliers."""
+    return np.asarray(1 / (1 + (residual / (2 * np.median(np.abs(residual)) + 1e-9)) ** 2))
+
+
 def another_plane(trajectory: Trajectory, boards: Boards | None = None) -> tuple[Finding, ...]:
     """Whether the rim rolls on a plane tilted against z = 0: the board of the table view did not lie on the table."""
     rows, disc = trajectory.measured, trajectory.disc
@@ -363,7 +382,7 @@ def another_plane(trajectory: Trajectory, boards: Boards | None = None) -> tuple
         normal = np.linalg.svd(np.sqrt(weight)[:, None] * (lowest - middle), full_matrices=False)[2][2]
         normal = normal * np.sign(normal @ start)
         gap = (lowest - middle) @ normal
-        weight = 1 / (1 + (gap / (2 * np.median(np.abs(gap)) + 1e-9)) ** 2)  # Cauchy's
+        weight = _robust_weights(gap)
     side, ahead = np.linalg.svd(normal[None])[2][1:] @ e3.T
     turned, precessed = np.arccos(np.clip(normal[2], -1, 1)), np.ptp(np.unwrap(np.arctan2(ahead, side)))
     rolls = precessed > 2.0 and np.median(e3 @ normal) < np.cos(THETA_RANGE[0])

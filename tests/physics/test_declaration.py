@@ -12,7 +12,14 @@ from scipy.ndimage import gaussian_filter1d
 
 from calibration.cameras.camera import Camera, StereoRig, placed_at
 from disctrack import MarkerStatus, Trajectory, frames
-from disctrack.analyse.declaration import balance, contradictions, handedness, other_scale, unseen_dots
+from disctrack.analyse.declaration import (
+    balance,
+    contradictions,
+    handedness,
+    motion_against_gravity,
+    other_scale,
+    unseen_dots,
+)
 from disctrack.findings import Kind, Severity
 from tests.physics.conftest import as_tracked, true_motion
 
@@ -107,6 +114,18 @@ def test_a_film_that_runs_backwards_gains_energy(theta, seconds):
     (finding,) = contradictions(backwards)
     assert finding.kind == Kind.REVERSED
     assert "in the order of time" in finding.sentence
+
+
+@pytest.mark.statistical
+def test_a_push_between_the_stretches_that_are_looked_at_is_no_film_that_runs_backwards():
+    """It raises the energy once; a disc that hardly loses any rolls before and after it."""
+    before, after = (true_motion(theta, 0.302, 1e-9) for theta in (10.0, 12.0))
+    parts = {k: np.concatenate([getattr(m, k)[:300] for m in (before, after)]) for k in ("R_world_body", "position")}
+    pushed = as_tracked(replace(before, time=1e-3 * np.arange(600), **parts), np.random.default_rng(0))
+    gravity, energy = balance(pushed)
+    assert energy[-5:].mean() > 1.05 * energy[:5].mean()
+    assert abs(np.median(gravity) / 9.81 - 1) < 2e-3
+    assert motion_against_gravity(pushed) == ()
 
 
 def test_a_hand_that_turns_the_disc_and_a_disc_at_rest_give_no_verdict():

@@ -33,22 +33,24 @@ def listening(path):
         os.chdir(here)
 
 
-ODD = pytest.mark.parametrize("made", [pipe, endless, listening, os.mkdir])
+ODD = pytest.mark.parametrize(
+    ("made", "kind"), [(pipe, "a named pipe"), (endless, "a device"), (listening, "a socket"), (os.mkdir, "a folder")]
+)
 
 
 @ODD
 @pytest.mark.parametrize("name", ["0.png", "a.tif", "a.h5", "a.mkv", "a.cine", "a.cihx"])
-def test_what_is_no_regular_file_is_refused_at_once_by_name(tmp_path, made, name):
+def test_what_is_no_regular_file_is_refused_at_once_by_name(tmp_path, made, kind, name):
     """At once: reading a pipe that nobody writes to would never end."""
     made(tmp_path / name)
-    with pytest.raises(RecordingError, match=rf"{name}.*cannot be read: it is a folder, .*not a regular file"):
+    with pytest.raises(RecordingError, match=rf"{name}.*cannot be read: it is {kind}, not a regular file"):
         open_frames(name, tmp_path, "left")
 
 
 @ODD
-def test_a_declaration_is_a_regular_file(tmp_path, made):
+def test_a_declaration_is_a_regular_file(tmp_path, made, kind):
     made(tmp_path / "recording.toml")
-    with pytest.raises(RecordingError, match="not a regular file"):
+    with pytest.raises(RecordingError, match=f"it is {kind}"):
         read_recording(tmp_path)
 
 
@@ -59,10 +61,10 @@ def test_a_frame_that_became_a_pipe_is_a_lost_frame(tmp_path):
     reader = open_frames("*.png", tmp_path, "left")
     (tmp_path / "1.png").unlink()
     pipe(tmp_path / "1.png")
-    with pytest.raises(RecordingError, match=r"frame 1.*not a regular file"):
+    with pytest.raises(RecordingError, match=r"frame 1.*a named pipe"):
         reader.read(1)
     assert np.array_equal(reader.read(2), frame)
-    with pytest.raises(RecordingError, match="not a regular file"):
+    with pytest.raises(RecordingError, match="a named pipe"):
         RawFile(tmp_path / "1.png")
 
 
