@@ -125,7 +125,7 @@ def differentiate(trajectory: Trajectory, breaks: Sequence[float] = ()) -> Measu
 
     breaks : instants [s] at which the acceleration jumps (end of slip, impact); both sides are differentiated
     separately, with the larger sigmas of ends. A break with fewer than MIN_FRAMES poses on a side is ignored.
-    Raises AnalysisError if too few frames have a pose.
+    Raises AnalysisError if too few frames have a pose, or time does not increase.
 
         >>> motion = differentiate("clip/results/trajectory.h5")
         >>> motion.velocity.shape
@@ -133,11 +133,7 @@ def differentiate(trajectory: Trajectory, breaks: Sequence[float] = ()) -> Measu
     """
     time = np.asarray(trajectory.time, float)
     good = trajectory.measured & np.isfinite(trajectory.pose_covariance).all(axis=(1, 2))
-    if good.sum() < MIN_FRAMES:
-        raise AnalysisError(
-            f"only {int(good.sum())} of {len(good)} frames have a pose, but at least {MIN_FRAMES} are needed to tell "
-            "motion from noise: track more frames, or look at frame_status for why the poses are missing."
-        )
+    _require_samples(time, good)
     pieces = _between(breaks, time, good)
     found = (_differentiated(part(trajectory, rows), good[rows]) for rows in pieces)
     *of_frames, scales = zip(*found, strict=True)
@@ -233,6 +229,20 @@ class _Samples:
         # a pose from one camera depends differently on the rig; that jump must not be differentiated
         by_both = good & (trajectory.frame_status == FrameStatus.MEASURED)
         self.sensitivity = _filled(trajectory.calibration_sensitivity, by_both, np.nan)
+
+
+def _require_samples(time: Array, good: Mask) -> None:
+    if good.sum() < MIN_FRAMES:
+        raise AnalysisError(
+            f"only {int(good.sum())} of {len(good)} frames have a pose, but at least {MIN_FRAMES} are needed to tell "
+            "motion from noise: track more frames, or look at frame_status for why the poses are missing."
+        )
+    backwards = np.flatnonzero(~(np.diff(time) > 0))
+    if backwards.size:
+        raise AnalysisError(
+            f"time does not increase from frame {backwards[0]} to {backwards[0] + 1} "
+            f"({time[backwards[0]]} s to {time[backwards[0] + 1]} s): sort the frames, or correct the frame rate."
+        )
 
 
 def _segments(samples: _Samples) -> tuple[list[tuple[Array, Array, Array]], Array]:

@@ -189,6 +189,12 @@ def test_too_few_poses_are_an_error_that_says_so(missing, rng):
         differentiate(as_tracked(truth, rng, missing=missing))
 
 
+def test_a_time_that_does_not_increase_is_an_error_that_says_where(rng):
+    truth = true_motion(theta_deg=25, duration=0.6, nutation=0.1)[:200]
+    with pytest.raises(AnalysisError, match="time does not increase from frame 198 to 199"):
+        differentiate(replace(as_tracked(truth, rng), time=np.append(truth.time[:-1], truth.time[-2])))
+
+
 @pytest.mark.statistical
 def test_what_repeats_in_the_poses_is_carried_to_the_rates(rng):
     """A smooth error with the stated variance and pace: of pose and rates within their stated sigma, chi-square."""
