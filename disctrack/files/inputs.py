@@ -17,6 +17,10 @@ from disctrack.errors import OutputError
 RECORDING_FILE = "recording.toml"
 MOST_TEXT = 16 << 20  # [bytes] of a text file, written by people or by a camera with its frames; real ones have 100 kB
 MOST_IMAGE = 1 << 30  # [bytes] of a file with one image
+_KINDS = {
+    stat.S_IFIFO: "a named pipe", stat.S_IFCHR: "a device", stat.S_IFBLK: "a device", stat.S_IFSOCK: "a socket",
+    stat.S_IFDIR: "a folder",
+}  # fmt: skip
 
 
 def open_regular(path: Path) -> int:
@@ -49,7 +53,8 @@ def why_not_regular(path: Path) -> str:
 
 
 def _not_regular(status: os.stat_result) -> str:
-    return "" if stat.S_ISREG(status.st_mode) else "it is a folder, pipe, socket or device, not a regular file"
+    kind = stat.S_IFMT(status.st_mode)
+    return "" if kind == stat.S_IFREG else f"it is {_KINDS.get(kind, 'something else')}, not a regular file"
 
 
 _read: dict[tuple[int, int], Path] | None = None  # by device and inode; None outside a command

@@ -3,6 +3,7 @@
 import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from difflib import get_close_matches
 from functools import partial
 from inspect import signature
 from pathlib import Path
@@ -13,8 +14,10 @@ import numpy as np
 
 from calibration.cameras.camera import StereoRig
 from calibration.kit.arguments import checked
+from calibration.kit.seal import check_seal
+from calibration.rig_file import SCHEMA as RIG
 from calibration.rig_file import read_rig, write_rig
-from disctrack.errors import OutputError, RigFileError
+from disctrack.errors import OutputError, TrajectoryFileError, told_as
 from disctrack.files.inputs import keep, refuse_input
 from disctrack.files.whole import refuse_existing, write_whole
 from disctrack.trajectory import Trajectory
@@ -162,7 +165,10 @@ def _row_for(path: Path, form: str | None, value: Any) -> Format:
         return row
     named = {row.name.lower(): row for row in rows}
     if form.lower() not in named:
-        raise OutputError(f"{form}: no format for a {kinds[0]}; known are {', '.join(row.name for row in rows)}")
+        near = get_close_matches(form.lower(), named, 1, 0.5)
+        hint = f" Did you mean '{named[near[0]].name}'?" if near else ""
+        known = ", ".join(row.name for row in rows)
+        raise OutputError(f"{form}: no format for a {kinds[0]}.{hint} Known are {known}")
     return named[form.lower()]
 
 
@@ -180,11 +186,13 @@ def _is_ours(path: Path) -> bool:
 
 
 def _own(paths: Sequence[Path]) -> Trajectory | StereoRig:
-    path = the_one(paths)
-    try:
-        return read_rig(path)
-    except RigFileError:
-        return read_trajectory(path)
+    path, schema = the_one(paths), None
+    if path.is_file() and h5py.is_hdf5(path):
+        with told_as(TrajectoryFileError, f"{path}: damaged", ValueError, then="Take the original."):
+            check_seal(path)
+        with h5py.File(path, "r") as file:
+            schema = file.attrs.get("schema")
+    return read_rig(path) if schema == RIG else read_trajectory(path)
 
 
 def _write_own(path: Path, value: Any, source: Path) -> None:

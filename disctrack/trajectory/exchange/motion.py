@@ -81,7 +81,8 @@ def write_c3d(path: Path, trajectory: Trajectory) -> None:
         import ezc3d
     points, labels = body_points(trajectory)
     file = ezc3d.c3d()
-    header = {"UNITS": ["mm"], "RATE": [float(trajectory.frame_rate)], "LABELS": labels}
+    described = [_DESCRIPTIONS.get(label, "centre of a dot") for label in labels]
+    header = {"UNITS": ["mm"], "RATE": [float(trajectory.frame_rate)], "LABELS": labels, "DESCRIPTIONS": described}
     for name, value in header.items():
         file["parameters"]["POINT"][name]["value"] = value
     data = np.ones((4, len(labels), len(trajectory)))
@@ -94,6 +95,14 @@ def write_c3d(path: Path, trajectory: Trajectory) -> None:
     file.add_parameter("DISC", "MASS", 1e3 * trajectory.disc.mass)
     with whole_file(path, suffix=".c3d") as part:
         file.write(str(part))
+
+
+_DESCRIPTIONS = {
+    "CENTRE": "centre of mass",
+    "AXIS_1": "centre + radius * first body axis",
+    "AXIS_2": "centre + radius * second body axis",
+    "AXIS_3": "centre + radius * normal of the upper face",
+}
 
 
 def write_trc(path: Path, trajectory: Trajectory) -> None:

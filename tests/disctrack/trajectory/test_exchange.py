@@ -276,6 +276,15 @@ def test_whatever_a_library_makes_of_a_file_is_told_as_ours(tmp_path, name, cont
         formats.read_foreign([tmp_path / name])
 
 
+def test_a_damaged_rig_is_told_as_a_damaged_file_and_not_as_another_kind(rig, tmp_path, capsys):
+    write_rig(tmp_path / "rig.h5", rig)
+    content = bytearray((tmp_path / "rig.h5").read_bytes())
+    content[len(content) // 2] ^= 1
+    (tmp_path / "rig.h5").write_bytes(content)
+    assert main(["convert", str(tmp_path / "rig.h5"), str(tmp_path / "rig.yml")]) == 1
+    assert "rig.h5: damaged" in capsys.readouterr().err
+
+
 def test_what_a_file_does_not_tell_may_be_told(rig, tmp_path):
     rigs.write_caliscope(tmp_path / "rig.toml", rig)
     text = (tmp_path / "rig.toml").read_text()
@@ -412,7 +421,7 @@ def test_convert_goes_by_the_ending_and_replaces_nothing(rig, trajectory, tmp_pa
         (("rig.h5", "new.toml", "--table"), "--table: says nothing about"),
         (("rig.h5", "rig.toml"), "exists"),
         (("rig.h5", "rig.docx"), ".cameramodel (mrcal)"),
-        (("rig.h5", "any.txt", "--as", "kalib"), "known are OpenCV, Kalibr"),
+        (("rig.h5", "any.txt", "--as", "kalib"), "Did you mean 'Kalibr'?"),
         (("rig.h5", "rig.c3d"), "no format of this name for a rig"),
         (("none.yml", "back.h5"), "none.yml"),
     ):
