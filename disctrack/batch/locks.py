@@ -26,19 +26,22 @@ def locked(path: Path, wait: float = 0.0) -> Iterator[None]:
     make_folder(path.parent)
     lock: BaseFileLock = FileLock(path, timeout=wait, fallback_to_soft=False)
     try:
-        lock.acquire()
-    except Timeout:
-        raise
-    except OSError as error:
-        with writing(path):
+        try:
+            lock.acquire()
+        except OSError as error:
             if error.errno not in _NO_LOCKS:
                 raise
-        holder = path.with_name(f"{path.name}.holder")
-        with contextlib.suppress(FileNotFoundError):
-            if time.time() - holder.stat().st_mtime > SILENT_FOR:
-                holder.unlink()
-        lock = SoftFileLock(holder, timeout=wait)
-        lock.acquire()
+            holder = path.with_name(f"{path.name}.holder")
+            with contextlib.suppress(FileNotFoundError):
+                if time.time() - holder.stat().st_mtime > SILENT_FOR:
+                    holder.unlink()
+            lock = SoftFileLock(holder, timeout=wait)
+            lock.acquire()
+    except Timeout:
+        raise
+    except OSError:
+        with writing(path):
+            raise
     try:
         yield
     finally:

@@ -1,7 +1,6 @@
 """`disctrack analyse`: from a trajectory file to the physics."""
 
 import argparse
-from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -52,12 +51,15 @@ def _write_motion_page(page: Path, analysis: Analysis, trajectory: Path, recordi
     """The interactive page, with pictures if the images of this trajectory are available."""
     drawn, n = None, len(analysis.trajectory)
     if folder := recording or outputs.recording_of(trajectory):
-        with suppress(*([] if recording else [RecordingError])):
+        try:
             pairs = open_pairs(read_recording(folder))
             if len(pairs) != n:
                 said = f"{len(pairs)} pairs, but {trajectory} has {n} frames: it was measured from another recording"
                 raise RecordingError(f"{folder}: {said}.")
             drawn = partial(_drawn, analysis.trajectory, pairs)
+        except RecordingError:
+            if recording is not None:
+                raise
     write_whole(page, motion_html(analysis, read_provenance(trajectory).recording, drawn).encode())
 
 

@@ -66,7 +66,7 @@ class Model:
         new = {e.name: dict(e.values) for e in self.effects}
         for full_name, value in values.items():
             effect, parameter = self.split_name(full_name)
-            new.setdefault(effect.name, effect.absent().values)[parameter] = value
+            new.setdefault(effect.name, dict(effect.absent().values))[parameter] = value
         return replace(self, effects=tuple(self.effect_class(name)(**v) for name, v in new.items()))
 
     def knowing(self, *laws: type[Effect]) -> Model:

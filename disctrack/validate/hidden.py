@@ -125,7 +125,7 @@ def draw(seed: int, planted: Values, rate: float = HiddenCase.rate) -> Scene:
         nutation = theta * float(rng.uniform(0.02, 0.1))
         omega3 = float(rng.uniform(-2.0, 3.0))  # [rad/s]
         model = Model(disc).with_values({"km.k_m": float(rng.uniform(0.2e-7, 0.5e-7))} | of_motion)
-        effects = {effect.name: effect.values for effect in model.effects}
+        effects = {effect.name: dict(effect.values) for effect in model.effects}
         rolling = RollingMotion(theta_deg=theta, nutation_deg=nutation, omega3_rad_s=omega3, effects=effects)
         motion_of = MotionSettings("rolling", rolling=rolling)
         scene = Scene(seed=seed, cameras=CameraSettings(rate, n), motion=motion_of, faults=faults)

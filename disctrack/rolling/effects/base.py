@@ -18,7 +18,7 @@ psidot if psidot phidot < 0, as during the descent): its amounts have the lower 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -86,7 +86,7 @@ class Effect:
         for given in values:
             if given not in known:
                 raise ModelError(f"effect '{self.name}' has no parameter '{given}'; it has {', '.join(known)}")
-        self.values = {p.name: float(values.get(p.name, p.nominal)) for p in self.parameters}
+        self.values: Mapping[str, float] = {p.name: float(values.get(p.name, p.nominal)) for p in self.parameters}
         for p in self.parameters:
             value = self.values[p.name]
             if not p.lower <= value <= p.upper or not (np.isfinite(value) or value == p.null):
