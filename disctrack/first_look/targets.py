@@ -46,8 +46,9 @@ def dots_figure(disc: Disc, paper: str = "a4", dark: bool = True) -> Figure:
 def board_figure(inner_corners: tuple[int, int], square_mm: float, paper: str = "a4") -> Figure:
     """Chessboard with a light rim of at least one square. Raises OutputError if it does not fit."""
     columns, rows = inner_corners
-    size = np.array([columns + 1, rows + 1]) * square_mm
-    width, height = sorted(PAPERS_MM[paper], reverse=columns > rows)  # the long sides of board and paper are parallel
+    turned = columns > rows  # so that its long side is along that of the paper
+    size = np.array([rows + 1, columns + 1] if turned else [columns + 1, rows + 1]) * square_mm
+    width, height = PAPERS_MM[paper]
     across = size + 2 * square_mm  # with the rim
     room = np.array([width - 2 * MARGIN_MM, height - 2 * MARGIN_MM - 14])
     if (across > room).any():
@@ -57,10 +58,12 @@ def board_figure(inner_corners: tuple[int, int], square_mm: float, paper: str = 
         )
     figure, axes = _sheet(width, height)
     left, bottom = (width - size[0]) / 2, (height - size[1]) / 2 + 5
-    for i, j in np.ndindex(columns + 1, rows + 1):
-        if (i + j) % 2 == 0:  # the square outside corner 0 is dark
-            place = (left + i * square_mm, bottom + j * square_mm)
-            axes.add_patch(Rectangle(place, square_mm, square_mm, facecolor="black", lw=0, snap=False))
+    for i in range(columns + 1):
+        for j in range(rows + 1):
+            if (i + j) % 2 == 0:  # the square outside corner 0 is dark
+                x, y = (rows - j, i) if turned else (i, j)
+                place = (left + x * square_mm, bottom + y * square_mm)
+                axes.add_patch(Rectangle(place, square_mm, square_mm, facecolor="black", lw=0, snap=False))
     _footer(axes, width, f"{columns} x {rows} inner corners, squares of {square_mm:g} mm; {_CREDIT}")
     return figure
 
