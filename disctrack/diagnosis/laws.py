@@ -148,25 +148,19 @@ def _refitted(system: DiscSystem, base: Fit, law: LearnedLaw | None, current: Fi
     before = law.families if law else ()
     values = [current.values[n] for n in law.candidate.names] if law else []
     enlarged = law_of(system.model, (*before, new.family), np.array([*values, *new.values, *new.family.shape.values()]))
-    start = replace(enlarged, values=current.values)
+    enlarged = replace(enlarged, values=current.values | dict(enlarged.values))
     known = system.knowing(enlarged)
-    fitted = with_law(known, base, start)
+    fitted = with_law(known, base, enlarged)
     widths = [q for q in enlarged.candidate.quantities if q.name in enlarged.widths]
     if not fitted.converged and widths:
-        fitted = min(fitted, _one_by_one(known, base, start, widths), key=lambda f: (not f.converged, f.cost))
-    return _arrived(enlarged, fitted), fitted
-
-
-def _arrived(law: LearnedLaw, fitted: Fit) -> LearnedLaw:
-    start = tuple(fitted.values[n] for n in law.candidate.names)
-    return replace(law, candidate=replace(law.candidate, start=start), values=fitted.values)
+        fitted = min(fitted, _one_by_one(known, base, enlarged, widths), key=lambda f: (not f.converged, f.cost))
+    return replace(enlarged, values=fitted.values), fitted
 
 
 def with_law(system: System, base: Fit, law: LearnedLaw, held: Collection[str] = ()) -> Fit:
     """Fit of the base model and the law's parameters, except those held."""
     moved = (q for q in law.candidate.quantities if q.name not in held)
-    start = base.values | dict(law.values) | dict(zip(law.candidate.names, law.candidate.start, strict=True))
-    return fit(system, (*base.quantities, *moved), start, TRIAL)
+    return fit(system, (*base.quantities, *moved), base.values | dict(law.values), TRIAL)
 
 
 def _one_by_one(system: System, base: Fit, law: LearnedLaw, widths: Sequence[Quantity]) -> Fit:
@@ -194,7 +188,8 @@ def without_idle_terms(system: DiscSystem, law: LearnedLaw, fitted: Fit) -> Lear
     if not kept or len(values) == len(law.candidate.quantities):
         return law
     shorter = law_of(system.model, kept, np.array(values))
-    return replace(shorter, values=fitted.values, alike=law.alike, others=law.others, looked=law.looked)
+    started = fitted.values | dict(shorter.values)
+    return replace(shorter, values=started, alike=law.alike, others=law.others, looked=law.looked)
 
 
 def busy_amounts(fitted: Fit, names: Sequence[str]) -> dict[int, float]:

@@ -290,5 +290,6 @@ def law_of(model: Model, chosen: Sequence[Family], values: Array) -> LearnedLaw:
         quantities.append(Quantity(f"{name}.{p.name}", "SI", step, p.null, p.lower, p.upper, meaning=p.meaning))
     title, source = "; ".join(f"{k} = {v}" for k, v in formulas.items()), "regression on the residual of this recording"
     effect = effect_from_formulas(name, formulas, tuple(numbers), title=title, source=source)
-    candidate = Candidate(name, name, "motion", effect.title, effect.source, tuple(quantities), tuple(begin))
-    return LearnedLaw(candidate, effect, tuple(chosen), tuple(coefficients), tuple(shapes))
+    candidate = Candidate(name, name, "motion", effect.title, effect.source, tuple(quantities))
+    started = dict(zip(candidate.names, begin, strict=True))
+    return LearnedLaw(candidate, effect, tuple(chosen), tuple(coefficients), tuple(shapes), started)

@@ -16,18 +16,14 @@ from calibration.kit.arrays import Array
 from disctrack.discrepancy.score import Linearisation, Score, span
 
 TWO_SIDED = float(stats.norm.isf(0.025))  # sigmas: 95 % between both limits
-LARGE = 500.0  # chi-square, beyond which the tail probability underflows: asymptotic series
 
 
 def log_tail(gain: float, n: int) -> float:
     """Logarithm of the probability that noise gains so much by n parameters."""
     if not gain > 0:
         return 0.0
-    if gain < LARGE:
-        return float(stats.chi2.logsf(gain, n))
-    x, a = gain / 2, n / 2  # Gamma(a, x) = x^(a-1) e^-x (1 + (a-1)/x + (a-1)(a-2)/x^2 + ...)
-    series = 1 + (a - 1) / x + (a - 1) * (a - 2) / x**2 + (a - 1) * (a - 2) * (a - 3) / x**3
-    return float((a - 1) * np.log(x) - x + np.log(series) - special.gammaln(a))
+    x, a = gain / 2, n / 2  # Gamma(a, x) = x^a e^-x U(1, 1 + a, x), which does not underflow before its logarithm
+    return min(float(a * np.log(x) - x + np.log(special.hyperu(1.0, 1.0 + a, x)) - special.gammaln(a)), 0.0)
 
 
 def bic_penalty(weights: Array) -> float:

@@ -72,7 +72,6 @@ class Candidate:
     title: str
     source: str
     quantities: tuple[Quantity, ...]
-    start: tuple[float, ...] = ()  # initial guess of a refit, if not the null
     shape: tuple[Quantity, ...] = ()  # shape parameters (an exponent, a scale): held at null until the effect is found
     sought: bool = False  # its first shape parameter may lie anywhere: refitted from the starts of the system only
     threshold: bool = False  # acts beyond a threshold: no derivative at null; refitted from the starts of the system

@@ -142,8 +142,7 @@ class Sharing:
                     self._groups.setdefault(q.name, {})[group] = shared.name
             name = f"{first.name} ({EACH})" if one_for_all else first.name
             title = f"{first.title}, with a value for each group" if one_for_all else first.title
-            start = first.start * len(groups)
-            variants.append(replace(first, name=name, quantities=tuple(new.values()), title=title, start=start))
+            variants.append(replace(first, name=name, quantities=tuple(new.values()), title=title))
         return variants
 
     def local_names(self, i: int, names: Sequence[str]) -> tuple[str, ...]:

@@ -27,7 +27,6 @@ from disctrack.errors import AnalysisError, DiscTrackError
 
 TEST_EVERY = 3  # every third recording is held out
 ROUNDS = 3  # of removing inconsistent recordings
-NUMBERS = (1, 2, 5, 10, 20, 50, 100, 200, 500)  # of recordings, for which sigmas are reported
 OWN_LEVEL = 1e-3  # false-alarm probability of a note that a recording contradicts the model
 
 
@@ -191,7 +190,7 @@ def _bounds(system: JointSystem, diagnosis: Diagnosis) -> tuple[Bound, ...]:
     after = diagnosis.after
     found = {f.candidate.name for f in diagnosis.found}
     n = len(system.time)
-    numbers = sorted({k for k in NUMBERS if k < n} | {n})
+    numbers = sorted({2**k for k in range(n.bit_length())} | {n})  # for which sigmas are reported
     whole = Linearisation(system, after, system.candidates)
     scores = {s.candidate.name: s for s in score_all(whole, system.candidates)}
     first = sigmas_of_first(system, after, numbers)

@@ -91,7 +91,7 @@ def test_a_term_that_the_refit_finds_to_be_zero_is_dropped(amounts, left, title)
     assert shorter.title == title
     if len(left) == 1:
         assert shorter.formulas == {"M_z": f"c_0 * ({pair.terms[left[0]]['M_z']})"}
-        assert shorter.candidate.start == (amounts[left[0]],)
+        assert [shorter.values[name] for name in shorter.candidate.names] == [amounts[left[0]]]
 
 
 def test_of_terms_that_move_together_those_stay_that_do_for_all(rng):
