@@ -76,7 +76,7 @@ class LearnedLaw:
 
     @property
     def widths(self) -> set[str]:
-        """Names of shape parameters that are fitted along their profile likelihood."""
+        """Names of shape parameters that are held until the others are fitted."""
         pairs = zip(self.families, self.shapes, strict=True)
         return {name for family, names in pairs for key, name in zip(family.shape, names, strict=True) if key in WIDTHS}
 

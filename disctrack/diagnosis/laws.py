@@ -19,9 +19,9 @@ from disctrack.diagnosis.law_library import MIN_SIGMAS, Family, LearnedLaw, diff
 from disctrack.diagnosis.missing_force import Gain, law_of
 from disctrack.discrepancy.fit import TRIAL, Fit, fit
 from disctrack.discrepancy.search import CLASS_GAIN, FAR, Diagnosis, Explanation, Found, equivalent, length, noise_gain
-from disctrack.discrepancy.shape import WORTH_A_SHAPE, profile_fit
+from disctrack.discrepancy.shape import WORTH_A_SHAPE
 from disctrack.discrepancy.significance import bic_penalty
-from disctrack.discrepancy.system import Quantity, System
+from disctrack.discrepancy.system import System
 
 MAX_TERMS = 3
 REFITTED = 5  # families that are fitted in each round ...
@@ -151,9 +151,10 @@ def _refitted(system: DiscSystem, base: Fit, law: LearnedLaw | None, current: Fi
     enlarged = replace(enlarged, values=current.values | dict(enlarged.values))
     known = system.knowing(enlarged)
     fitted = with_law(known, base, enlarged)
-    widths = [q for q in enlarged.candidate.quantities if q.name in enlarged.widths]
-    if not fitted.converged and widths:
-        fitted = min(fitted, _one_by_one(known, base, enlarged, widths), key=lambda f: (not f.converged, f.cost))
+    if not fitted.converged and enlarged.widths:  # the data hardly determine these: freed last
+        narrow = with_law(known, base, enlarged, enlarged.widths)
+        wide = with_law(known, base, replace(enlarged, values=narrow.values))
+        fitted = min(fitted, wide, key=lambda f: (not f.converged, f.cost))
     return replace(enlarged, values=fitted.values), fitted
 
 
@@ -161,14 +162,6 @@ def with_law(system: System, base: Fit, law: LearnedLaw, held: Collection[str] =
     """Fit of the base model and the law's parameters, except those held."""
     moved = (q for q in law.candidate.quantities if q.name not in held)
     return fit(system, (*base.quantities, *moved), base.values | dict(law.values), TRIAL)
-
-
-def _one_by_one(system: System, base: Fit, law: LearnedLaw, widths: Sequence[Quantity]) -> Fit:
-    """The fit of a law whose widths are fitted along their profile likelihood, as the data hardly determine them."""
-    fitted = with_law(system, base, law, law.widths)
-    for q in widths:
-        fitted = profile_fit(system, fitted, q, 0.3 * fitted.values[q.name])
-    return fitted
 
 
 def without_idle_terms(system: DiscSystem, law: LearnedLaw, fitted: Fit) -> LearnedLaw:

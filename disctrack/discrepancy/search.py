@@ -23,7 +23,7 @@ from disctrack.discrepancy.held_out import HeldOut, held_out, training_rows
 from disctrack.discrepancy.noise import THIRD, inflation, noise_variance, whitened
 from disctrack.discrepancy.score import Linearisation, Score, angle, score_all
 from disctrack.discrepancy.shape import WORTH_A_SHAPE, with_free_shape, with_shape
-from disctrack.discrepancy.significance import TWO_SIDED, Chance, bic_penalty, chance
+from disctrack.discrepancy.significance import FALSE_ALARM, TWO_SIDED, Chance, bic_penalty, chance
 from disctrack.discrepancy.system import Candidate, Quantity, System, Values
 
 CLASS_GAIN = 10.0  # two explanations whose lengths differ by less are indistinguishable (odds of e^5)
@@ -44,7 +44,7 @@ Verdict = Literal["nothing missing", "found", "unexplained"]
 class Settings:
     """Extent of the search, and its significance level."""
 
-    false_alarm: float = 0.005  # probability that noise alone produces a finding, over all candidates
+    false_alarm: float = FALSE_ALARM  # over all candidates
     max_effects: int = 3
     shortlist: int = 8  # further effects that are refitted in full for each explanation
     judged: int = 4  # explanations that may be tested on held-out data
@@ -353,8 +353,7 @@ class _Search:
 
     def _with_free_shape(self, e: Explanation, candidate: Candidate, least: float, below: float) -> None:
         """Add the explanation with one more law, its shape free, if its residuals are noise."""
-        goal = self.settings.at_noise * self.noise * e.fit.degrees_of_freedom + e.fit.penalty
-        answer = with_free_shape(self.system, e.fit, candidate, least, below, goal)
+        answer = with_free_shape(self.system, e.fit, candidate, least, below)
         if answer is not None and self._at_noise(answer[1]):
             new = Explanation((*e.candidates, answer[0]), answer[1])
             self.pool.setdefault(new.names, new)

@@ -15,6 +15,7 @@ from scipy import signal, special, stats
 from calibration.kit.arrays import Array
 from disctrack.discrepancy.score import Linearisation, Score, span
 
+FALSE_ALARM = 0.005  # probability that noise alone produces a finding, over all that is tested
 TWO_SIDED = float(stats.norm.isf(0.025))  # sigmas: 95 % between both limits
 
 

@@ -11,8 +11,7 @@ from scipy.optimize import least_squares
 
 from calibration.kit.arrays import Array
 from disctrack.discrepancy.score import INVISIBLE
-
-LEVEL = 0.01  # significance: probability below which a hypothesis is rejected, and of a dependence by chance
+from disctrack.discrepancy.significance import FALSE_ALARM
 
 
 @dataclass(frozen=True)
@@ -34,7 +33,7 @@ class Hypothesis:
     @property
     def holds(self) -> bool:
         """Is it compatible with the values?"""
-        return self.degrees <= 0 or self.p_value > LEVEL
+        return self.degrees <= 0 or self.p_value > FALSE_ALARM
 
 
 def hypotheses(
@@ -49,13 +48,13 @@ def hypotheses(
     covariates : by name, one number per group
     kinds : "surface" (or "disc") -> which one it is in each group
     Generalised least squares. The penalty of a parameter is what the best of so many hypotheses gains by chance with
-    probability `LEVEL`: a dependence is ranked first only where it gains more.
+    probability `FALSE_ALARM`: a dependence is ranked first only where it gains more.
     """
     n = len(values)
     unit = float(np.mean(np.abs(values))) or 1.0  # coefficients may be 1e-8 and exponents 1: scale to the same size
     root = np.linalg.cholesky(covariance / unit**2)
     shapes = list(_shapes(n, covariates, kinds or {}))
-    price = max(float(np.log(n)), float(stats.chi2.isf(LEVEL / max(len(shapes) - 1, 1), 1)))
+    price = max(float(np.log(n)), float(stats.chi2.isf(FALSE_ALARM / max(len(shapes) - 1, 1), 1)))
 
     def tested(kind: str, names: Sequence[str], level: NDArray[np.intp], powers: Array) -> Hypothesis:
         """Level : (g,) which of the constants.   powers (k, g) : logarithms of covariates over geometric means."""
@@ -118,5 +117,5 @@ def _shapes(
 def equivalent(found: Sequence[Hypothesis]) -> list[Hypothesis]:
     """Hypotheses that fit as well as the first one, with as many parameters."""
     best, *rest = found
-    near = best.chi_square + float(stats.chi2.isf(LEVEL, 1))
+    near = best.chi_square + float(stats.chi2.isf(FALSE_ALARM, 1))
     return [h for h in rest if h.degrees == best.degrees and h.chi_square < near and best.degrees > 0 and h.holds]

@@ -21,13 +21,12 @@ from disctrack.discrepancy.joint.fitting_in import Blocks, ConsistencyTest, inco
 from disctrack.discrepancy.joint.sharing import EACH, JointSystem, Member, Sharing
 from disctrack.discrepancy.score import Linearisation, score_all, sigmas, span
 from disctrack.discrepancy.search import Diagnosis, Settings, explain
-from disctrack.discrepancy.significance import TWO_SIDED
+from disctrack.discrepancy.significance import FALSE_ALARM, TWO_SIDED
 from disctrack.discrepancy.system import Candidate
 from disctrack.errors import AnalysisError, DiscTrackError
 
 TEST_EVERY = 3  # every third recording is held out
 ROUNDS = 3  # of removing inconsistent recordings
-OWN_LEVEL = 1e-3  # false-alarm probability of a note that a recording contradicts the model
 
 
 @dataclass(frozen=True)
@@ -249,7 +248,7 @@ def _notes(recordings: Sequence[OfRecording], unusable: Sequence[str]) -> tuple[
     how = dict.fromkeys(unusable, "was left out: ")
     notes = [f"{r.name} {how.get(r.name, '')}{r.reason}" for r in recordings if r.reason]
     for r in recordings:
-        if r.consistency is not None and r.consistency.p_value * len(recordings) < OWN_LEVEL:
+        if r.consistency is not None and r.consistency.p_value * len(recordings) < FALSE_ALARM:
             notes.append(
                 f"{r.name} does not fit the others (p = {r.consistency.p_value:.1g}), and yet is among them: more than "
                 "a third would have to go, and the sizes are those of no recording"
@@ -257,6 +256,6 @@ def _notes(recordings: Sequence[OfRecording], unusable: Sequence[str]) -> tuple[
         if r.alone is not None and r.alone.converged:
             ratio = r.alone.reduced_chi_square
             excess = (ratio - 1) / np.sqrt(2 / r.alone.degrees_of_freedom)
-            if stats.norm.sf(excess) * len(recordings) < OWN_LEVEL and ratio > 1.1:
+            if stats.norm.sf(excess) * len(recordings) < FALSE_ALARM and ratio > 1.1:
                 notes.append(f"{r.name} is not described by the model even alone (chi-square {ratio:.3g})")
     return tuple(notes)

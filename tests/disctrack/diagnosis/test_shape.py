@@ -6,18 +6,17 @@ from disctrack.diagnosis import DiscSystem, diagnose
 from disctrack.diagnosis.model_file import declared_model
 from disctrack.discrepancy.fit import fit
 from disctrack.discrepancy.search import explain
-from disctrack.discrepancy.shape import profile_fit
 from disctrack.validate.hidden import HiddenCase, recorded
 from tests.oracles.measured_disc import assert_found, assert_sized, measured, system_of, with_base_fit
 
 
 @pytest.mark.statistical
-def test_an_exponent_is_measured_along_its_profile():
+def test_an_exponent_is_measured_from_its_nominal_value_on():
     trajectory = measured({"rolling_power.k": 4e-4, "rolling_power.p": 1.0}, k_m=0.0, seed=72, n=250, theta_deg=5.0)
     system = system_of(trajectory, model="none")
     (power,) = [c for c in system.candidates if c.name == "rolling_power"]
     nominal = fit(system, (*system.base, *power.quantities), system.start())
-    free = profile_fit(system, nominal, power.shape[0], 0.1)
+    free = fit(system, (*nominal.quantities, power.shape[0]), nominal.values)
     assert free.converged
     assert_sized(free, {"rolling_power.p": 1.0}, 4, 4 * 0.05)
     assert free.reduced_chi_square < 1.1 < nominal.reduced_chi_square
