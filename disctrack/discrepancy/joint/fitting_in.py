@@ -8,7 +8,6 @@ is no difference.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import islice
 
 import numpy as np
 from scipy import stats
@@ -23,10 +22,8 @@ from disctrack.discrepancy.search import CLASS_GAIN
 from disctrack.discrepancy.system import Candidate
 
 REFIT_SHARE = 1e-2  # of the first statistic: smaller ones need another fit, as the first recording biased this one
-TWIN = 0.5  # of the largest statistic, from which on another recording may be the wrong one
 NOISE = 2.0  # median decrease of chi-square over that of noise, up to which it is noise
 ALIKE_SHARE = 0.05  # of a statistic: first-order statistics that differ by less are equal
-SIGNIFICANT = 0.05  # probability below which an effect differs
 NAMED = 3  # effects that are named for one recording
 DETERMINED = 3.0  # prior sigma over the sigma by the recording alone, from which the recording determines a quantity
 
@@ -151,7 +148,7 @@ def all_consistencies(blocks: Blocks, kept: list[int]) -> dict[int, ConsistencyT
         if not significant:
             continue
         (p, minus, degrees, k), own = min(significant), found[i]
-        words = _named_difference(blocks, [(-x, d, k) for p, x, d, k in significant if p < SIGNIFICANT], own.statistic)
+        words = _named_difference(blocks, [(-x, d, k) for _, x, d, k in significant], own.statistic)
         if (p, minus) < (own.p_value, -own.statistic):
             own = replace(own, statistic=-minus / scatter[k], degrees=degrees, p_value=min(p, 1.0))
         found[i] = replace(own, differs_by=words)
@@ -162,11 +159,11 @@ def _named_difference(blocks: Blocks, standing: Sequence[tuple[float, int, int]]
     """The most significant effects, those with the fewest parameters first; none where shared quantities differ more.
 
     By chi-square without scaling, as the scatter may be a nonlinear effect of this very recording.
-    standing : decrease of chi-square, its degrees of freedom, and index of each significant candidate
+    standing : decrease of chi-square, its degrees of freedom, and index of each candidate
     shared : decrease of chi-square with own values of the shared quantities
     """
-    most = max((difference for difference, _, _ in standing), default=0.0)
-    if most < shared or not standing:
+    most = max(difference for difference, _, _ in standing)
+    if most < shared:
         return ""
     similar = [(d, -x, k) for x, d, k in standing if most - x < max(CLASS_GAIN, ALIKE_SHARE * most)]
     first, *others = (blocks.candidates[k] for _, _, k in sorted(similar)[:NAMED])
@@ -210,15 +207,15 @@ def inconsistent(
     most = n // 3 if most is None else most
     while len(kept) > 2 and len(named) < most:
         judged = all_consistencies(blocks, kept)
-        worst = max(judged, key=lambda i: (-judged[i].p_value, judged[i].statistic / max(judged[i].degrees, 1)))
+        worst, second, *_ = sorted(
+            kept, key=lambda i: (judged[i].p_value, -judged[i].statistic / max(judged[i].degrees, 1))
+        )
         statistic = judged[worst].statistic
         if judged[worst].p_value * n > level or statistic < REFIT_SHARE * first:
             break
         first = first or statistic
-        similar = [i for i in kept if i != worst and judged[i].statistic > TWIN * statistic]
-        similar = sorted(similar, key=lambda i: -judged[i].statistic)
-        twins = (i for i in similar if _interchangeable(blocks, (i, worst), kept, level / n, REFIT_SHARE * first))
-        for i in (worst, *islice(twins, 1))[: most - len(named)]:
+        twins = _interchangeable(blocks, (second, worst), kept, level / n, REFIT_SHARE * first)
+        for i in (worst, *[second] * twins)[: most - len(named)]:
             kept.remove(i)
             named[i] = judged[i].differs_by
     return named
