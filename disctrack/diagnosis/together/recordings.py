@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 
 from calibration.kit.arrays import Array
-from calibration.kit.least_squares import triangle
 from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.diagnosis.large_faults import large_faults
 from disctrack.diagnosis.model_file import PAPER, declared_model
@@ -66,14 +65,12 @@ def _plan(answer: TogetherDiagnosis, crew: Crew) -> Plan | None:
     everything = {q.name: q for q in (*tested, *after.quantities)}
     parts = reversed(sharing.local[longest].items())  # of a sum of shared quantities the first one is kept
     names = {there: shared for shared, there in parts if shared in everything}
-    others = [n for n in everything if n not in set(names.values())]
+    others = [q for n, q in everything.items() if n not in set(names.values())]
     values = {n: q.null for n, q in everything.items()} | after.values
-    _, derivative = system.linearise(values, [*others, *names.values()])
-    rows = derivative.reshape(-1, derivative.shape[-1])
-    priors = np.zeros((len(others), rows.shape[1]))
-    priors[:, : len(others)] = np.diag([1.0 / everything[n].prior_sigma for n in others])
-    R = triangle(np.concatenate([rows, priors]))
-    information = tuple(names), R[len(others) :, len(others) :]
+    known = Reduction(system, others, values).reduce(values, tuple(names.values()))
+    if known is None:
+        return None
+    information = tuple(names), known[1]
     extra = sharing.local_names(longest, [n for f in diagnosis.found for n in f.candidate.names])
     arguments = sharing.local_values(longest, after.values), extra, questions, information
     (found,) = crew.call("planned", [arguments], [longest])
