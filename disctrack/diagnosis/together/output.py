@@ -25,7 +25,6 @@ from disctrack.report.palette import AMBER, BLUE, MUTED
 if TYPE_CHECKING:
     from disctrack.report.figures import Drawn
 
-SHOWN = 12  # laws that are drawn; all are in the JSON
 NAMED = 8  # recordings that are named on an axis; more are numbered
 MANY = (
     "Standard deviation of an effect's size from the given number of recordings, marginalised over initial states, "
@@ -203,7 +202,7 @@ def figures(answer: TogetherDiagnosis) -> tuple[Drawn, ...]:
     sharing, after = answer.system.sharing, answer.diagnosis.after
     used = [r for r in answer.recordings if not r.reason]
     drawn = []
-    for number, q in enumerate(_free(answer.diagnosis)[:SHOWN], start=1):
+    for number, q in enumerate(_free(answer.diagnosis), start=1):
         points = []
         for i, a in enumerate(r.alone for r in used):
             for local in sharing.local_names(i, [q.name]):

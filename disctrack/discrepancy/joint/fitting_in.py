@@ -21,11 +21,9 @@ from disctrack.discrepancy.score import INVISIBLE
 from disctrack.discrepancy.search import CLASS_GAIN
 from disctrack.discrepancy.system import Candidate
 
-REFIT_SHARE = 1e-2  # of the first statistic: smaller ones need another fit, as the first recording biased this one
 NOISE = 2.0  # median decrease of chi-square over that of noise, up to which it is noise
-ALIKE_SHARE = 0.05  # of a statistic: first-order statistics that differ by less are equal
+REFIT_SHARE = 1e-2  # of a statistic: its error to first order, below which another fit has to decide
 NAMED = 3  # effects that are named for one recording
-DETERMINED = 3.0  # prior sigma over the sigma by the recording alone, from which the recording determines a quantity
 
 
 @dataclass(frozen=True)
@@ -92,7 +90,7 @@ class Blocks:
         free = 1.0 / INVISIBLE / np.where(length > 0, length, 1.0)
         scale = np.where(np.isfinite(self._sigma), self._sigma, free)
         U, singular, _ = np.linalg.svd(self.matrix[i] * scale, full_matrices=False)
-        U = U[:, singular > DETERMINED]
+        U = U[:, singular > 1.0]
         mine = U.T @ self.right[i], U.T @ self.matrix[i]
         together = np.concatenate([rest[0], mine[0]]), np.concatenate([rest[1], mine[1]])
         least, rank = _least(*rest)
@@ -165,7 +163,7 @@ def _named_difference(blocks: Blocks, standing: Sequence[tuple[float, int, int]]
     most = max(difference for difference, _, _ in standing)
     if most < shared:
         return ""
-    similar = [(d, -x, k) for x, d, k in standing if most - x < max(CLASS_GAIN, ALIKE_SHARE * most)]
+    similar = [(d, -x, k) for x, d, k in standing if most - x < max(CLASS_GAIN, REFIT_SHARE * most)]
     first, *others = (blocks.candidates[k] for _, _, k in sorted(similar)[:NAMED])
     return f"{first.title} [{first.name}]" + "".join(f" or [{c.name}]" for c in others)
 

@@ -26,7 +26,6 @@ from disctrack.discrepancy.system import Candidate
 from disctrack.errors import AnalysisError, DiscTrackError
 
 TEST_EVERY = 3  # every third recording is held out
-ROUNDS = 3  # of removing inconsistent recordings
 
 
 @dataclass(frozen=True)
@@ -109,14 +108,14 @@ def answer_together(
     members: list[Member] = [m for m in refitted if not isinstance(m, DiscTrackError)]
     kept = [i for i in kept if i not in reasons]
     unusable = (*(names[i] for i in reasons), *unread)
-    for round_ in range(ROUNDS + 1):
+    while True:
         if len(kept) < 2:
             left_out = {names[i]: reason for i, reason in reasons.items()} | dict(unread)
             said = "; ".join(f"{name}: {reason}" for name, reason in list(left_out.items())[:5])
             raise AnalysisError(f"fewer than two recordings can be diagnosed together. {said}")
         crew.keep(kept)
         system, diagnosis = _search(members, crew, settings, progress)
-        most = len(members) - (2 * n + 2) // 3 if round_ < ROUNDS else 0
+        most = len(members) - (2 * n + 2) // 3
         effects = [c for c in system.candidates if not c.name.endswith(f"({EACH})")]
         out = inconsistent(system, diagnosis.after, settings.false_alarm, most, effects)
         if not out:
