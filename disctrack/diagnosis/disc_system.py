@@ -80,7 +80,6 @@ class DiscSystem(System):
         Raises AnalysisError.
         """
         self.systematic = systematic or Systematic()
-        self.columns_known: dict[tuple[str, int], tuple[Array, list[Array]]] = {}  # by `starts`
         self.known = dict(known or {})
         self.measured: Path | None = None  # replaces the model of the motion
         self.notes: tuple[str, ...] = ()  # on frames that were left out
@@ -352,13 +351,10 @@ class DiscSystem(System):
         normal[self.weights < 6] = np.eye(6)
         return r, J, normal
 
-    def _nuisance_values(self, values: Values) -> Array:
-        return np.array([values.get(name, 0.0) for name in self._nuisance_column])
-
     def _residual(self, pixels: Array, values: Values) -> Array:
         """Whitened rows of observed minus predicted dots, minus the contribution of the nuisances."""
         residual = self.whitened((self.observed - pixels)[..., None])[..., 0]
-        weights = self._nuisance_values(values)
+        weights = np.array([values.get(name, 0.0) for name in self._nuisance_column])
         return residual - self._nuisance_columns @ weights if weights.any() else residual
 
     def _path(self, values: Values, names: Sequence[str] = ()) -> tuple[Path, tuple[str, ...], Array]:

@@ -33,7 +33,6 @@ ANGLES = 48  # round the rim: 7.5 deg apart, half the width of a flat
 PEAKS = 6  # highest peaks of the spectrum that are tried
 PADDED = 8  # zero padding of the spectrum, in lengths of the recording
 REFITS = 2  # initial guesses that are returned
-NEAR = 10.0  # [sigma] rms difference of two motions, up to which the derivatives by a small effect are the same
 SLOW = 3.0  # periods of a vibration in the recording at least
 
 
@@ -88,15 +87,9 @@ def shape_guesses(system: DiscSystem, candidate: Candidate, values: Values, leas
     priors = np.diag([1.0 / q.prior_sigma for q in system.base])
     basis = span(np.concatenate([derivative.reshape(-1, len(priors)), priors]))
     r, no_prior = residual.ravel(), np.zeros((len(priors), len(candidate.names)))
-    by_amounts = system.columns_known.get((candidate.name, r.size))
-    # reused for motions so close to each other that the derivatives are the same
-    if by_amounts is None or float(np.mean((r - by_amounts[0]) ** 2)) >= NEAR**2:
-        null = {q.name: q.null for q in (*candidate.quantities, *rest)} | dict(values)
-        by_amounts = r, [system.linearise({**null, first.name: float(x)}, candidate.names)[1] for x in places]
-        if first.unit == "rad":  # the grid does not depend on the residual
-            system.columns_known[candidate.name, r.size] = by_amounts
-    gains = []
-    for derivatives in by_amounts[1]:
+    null, gains = {q.name: q.null for q in (*candidate.quantities, *rest)} | dict(values), list[float]()
+    for x in places:
+        _, derivatives = system.linearise({**null, first.name: float(x)}, candidate.names)
         left = cleared(np.concatenate([derivatives.reshape(len(r), -1), no_prior]), basis)[: len(r)]
         amounts, *_ = np.linalg.lstsq(left, r, rcond=1e-10)
         inside = all(q.lower <= q.null + a <= q.upper for q, a in zip(candidate.quantities, amounts, strict=True))

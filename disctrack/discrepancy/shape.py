@@ -4,16 +4,14 @@ The search uses laws in the shape that their sources give. A law of another shap
 at all; therefore shapes are freed where the residuals stay large, and the shapes of the effects found are fitted too.
 """
 
-from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
 
 from disctrack.discrepancy.fit import TRIAL, Fit, attempt, fit
 from disctrack.discrepancy.score import Linearisation, score
-from disctrack.discrepancy.system import Candidate, GivenUp, Quantity, System
+from disctrack.discrepancy.system import Candidate, Quantity, System
 
-ALONG = 5.0  # times the steps of a trial, for the fit of a shape from the best start
 WORTH_A_SHAPE = 0.5  # share of the excess that a law must remove before its shape is fitted too
 DETERMINED = 0.3  # sigma over size, up to which a shape parameter is determined
 
@@ -36,11 +34,10 @@ def with_free_shape(
     if not fitted.cost < below:
         return None
     free = [q for q in candidate.shape if np.isfinite(expected_sigma(system, fitted, q))]
-    with suppress(GivenUp), system.budget.trial(ALONG * system.trial_steps):
-        fitted = fit(system, (*fitted.quantities, *free), fitted.values)
-        if fitted.converged and all(is_determined(fitted, q) for q in free):
-            return replace(candidate, quantities=(*candidate.quantities, *free)), fitted
-    return None
+    fitted = attempt(system, (*fitted.quantities, *free), fitted.values)
+    if not (fitted.converged and all(is_determined(fitted, q) for q in free)):
+        return None
+    return replace(candidate, quantities=(*candidate.quantities, *free)), fitted
 
 
 def with_shape(system: System, fitted: Fit, candidate: Candidate) -> tuple[Fit, tuple[Quantity, ...], list[str]]:
